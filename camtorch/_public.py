@@ -1,6 +1,7 @@
 """The names that `camtorch` shows: this file imports what `camtorch/__init__.py` hands out at first use."""
 
 from camtorch import augment, data, io, lenses, models, plot
+from camtorch.boards.finding import BoardObservations, find_board
 from camtorch.calibration.calibrate import Calibration, calibrate
 from camtorch.calibration.from_rays import fit
 from camtorch.calibration.pnp import solve_pnp
@@ -34,6 +35,7 @@ from camtorch.warp.warp import Warp
 
 __all__ = [
     "BirdsEye",
+    "BoardObservations",
     "Calibration",
     "Camera",
     "CameraFileError",
@@ -60,6 +62,7 @@ __all__ = [
     "calibrate_rig",
     "cat",
     "data",
+    "find_board",
     "fit",
     "io",
     "lenses",

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from camtorch.boards.boards import Board
 from camtorch.boards.corners import image_points
+from camtorch.boards.finding import gather
 from camtorch.boards.turns import agreeing, reordered
 from camtorch.calibration import selection
 from camtorch.calibration.calibrate import Calibration, calibrate
@@ -21,7 +22,7 @@ from camtorch.calibration.rig import RigCalibration, calibrate_rig
 from camtorch.camera import MODELS, as_model
 from camtorch.cli import targets
 from camtorch.cli.board import read_board
-from camtorch.cli.searching import Views, found_corners, gather, read_frames, usable_views
+from camtorch.cli.searching import Views, found_corners, read_frames, usable_views
 from camtorch.cli.terminal import note, progress
 from camtorch.io import CameraFileError, formats
 from camtorch.report.report import require_packages, write_report

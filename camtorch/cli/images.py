@@ -2,112 +2,28 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 from torch import Tensor
 
-from camtorch._photographs import ORIENTATION, load_stored, stored_size
+from camtorch._photographs import ORIENTATION, ImageFileError, read_stored
+from camtorch._photographs import size_of as size_of
 from camtorch.cli import targets
 from camtorch.cli.terminal import note
 from camtorch.io.writing import replacing
 from camtorch.warp.warp import Warp
 
-_DEEP = ("I;16", "I;16B", "I;16L", "I;16N", "I")
-_DEEPEST = 65535
 _KEEP_ORIENTATION = ("AVIF", "JPEG", "MPO", "PNG", "TIFF", "WEBP")
 _OTHER_SIZES = ("ICO", "ICNS")  # formats that hold an image in sizes of their own
 
 
-class ImageFileError(ValueError):
-    """An image file that cannot be read or written. The text names the file and the reason."""
-
-
 def read(path: Path, tell: Callable[[str], None] = note) -> tuple[Tensor, int | None]:
-    """An image as stored, and its Exif orientation: it is not turned, for calibrations know stored pixels.
-
-    Notes, which `tell` gets, say what is left out: the lower bits of deep colours, which Pillow does not read, and all
-    but the first image of several.
-
-    Returns:
-        (C, H, W) uint8 with C = 1 grey, 2 grey and alpha, 3 RGB or 4 RGBA; or (1, H, W) uint16 for deep grey images.
-        Other kinds of image (palette, CMYK, ...) come as RGB or RGBA.
-
-    Raises:
-        ImageFileError: no such file, no image, a damaged one, floating-point pixels, or more than 16 bits deep.
-    """
-    try:
-        with _opened(path) as opened:
-            count, cut = getattr(opened, "n_frames", 1), _is_cut(opened)
-            orientation = opened.getexif().get(ORIENTATION)
-            image = load_stored(opened)
-            if count > 1:
-                tell(f"{path} holds {count} images; only the first is taken")
-            if cut:
-                tell(f"{path} has 16 bits a colour; only the upper 8 are read")
-            if image.mode in _DEEP and "transparency" in image.info:
-                tell(f"{path} is grey of 16 bits with transparency, which is not read")
-            return _pixels(path, image), orientation
-    except FileNotFoundError:
-        reason = "no such file"
-    except UnidentifiedImageError:
-        reason = "not an image that Pillow can read"
-    except Image.DecompressionBombError:
-        reason = f"more than {2 * (Image.MAX_IMAGE_PIXELS or 0) / 1e6:.0f} million pixels, which are not read"
-    except ImageFileError:
-        raise
-    except (OSError, SyntaxError, ValueError, EOFError) as error:
-        reason = getattr(error, "strerror", None) or str(error)
-    raise ImageFileError(f"{path}: {reason}")
-
-
-def size_of(path: Path) -> tuple[int, int] | None:
-    """(height, width) of what its first bytes say is an image; None of anything else."""
-    try:
-        with _opened(path) as image:
-            return stored_size(image)
-    except (OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError):
-        return None
-
-
-def _opened(path: Path) -> Image.Image:
-    with warnings.catch_warnings():
-        # of a large photograph, which is what the user named
-        warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-        return Image.open(path)
-
-
-def _is_cut(image: Image.Image) -> bool:
-    """Whether Pillow reads 16 bits as 8, before it does: its decoders' arguments tell."""
-    for tile in () if image.mode in _DEEP else getattr(image, "tile", ()):
-        arguments = tile[3] if isinstance(tile[3], tuple) else (tile[3],)
-        if any(isinstance(argument, str) and ";16" in argument for argument in arguments):
-            return True
-        if tile[0] == "ppm" and isinstance(arguments[-1], int) and arguments[-1] > 255:
-            return True
-    return False
-
-
-def _pixels(path: Path, image: Image.Image) -> Tensor:
-    if image.mode == "F":
-        raise ImageFileError(f"{path}: floating-point pixels; 8-bit and 16-bit images can be read")
-    if image.mode in _DEEP:
-        deep = np.asarray(image)
-        low, high = int(deep.min()), int(deep.max())
-        if low < 0 or high > _DEEPEST:
-            raise ImageFileError(f"{path}: pixels from {low} to {high}; 8-bit and 16-bit images can be read")
-        return torch.from_numpy(deep.astype(np.uint16))[None]
-    clear = "transparency" in image.info or image.mode in ("PA", "RGBa", "La")
-    if clear or image.mode not in ("L", "LA", "RGB", "RGBA"):
-        colours = "L" if image.mode in ("1", "L", "La") else "RGB"
-        image = image.convert(colours + "A" if clear else colours)
-    pixels = torch.from_numpy(np.array(image))
-    return pixels[None] if pixels.ndim == 2 else pixels.permute(2, 0, 1)
+    """`read_stored`, which says in notes what is left out."""
+    return read_stored(path, tell)
 
 
 def check_target(path: Path, *, force: bool, inputs: tuple[Path | None, ...] = ()) -> None:

@@ -7,7 +7,6 @@ time, as `board.mp4#t=12.345`, in seconds.
 
 from __future__ import annotations
 
-import glob
 import os
 import re
 from collections import Counter
@@ -21,12 +20,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from camtorch._photographs import ImageFileError
 from camtorch.boards.boards import Board, Chessboard, opencv
 from camtorch.boards.corners import Corners, ImageCorners, read_corners, write_corners
 from camtorch.boards.detection import NOT_FOUND, detect, largest_chessboard
-from camtorch.cli import images, videos
+from camtorch.boards.finding import read_grey
+from camtorch.cli import videos
 from camtorch.cli.terminal import note, progress
-from camtorch.jobs.inputs import IMAGES, hash_of, natural
+from camtorch.jobs.inputs import hash_of, natural
 
 _LEAST_VIEWS = 3
 _TRIED_ANEW = 5  # images in which a board of another size is looked for
@@ -41,29 +42,6 @@ Views = dict[str, dict[str, ImageCorners]]
 
 
 # -- which images
-
-
-def gather(words: Iterable[str]) -> list[Path]:
-    """Images, each once, in natural order, of files, folders (not those in them), and patterns.
-
-    Raises:
-        ValueError: a word that means no image.
-    """
-    found: dict[str, Path] = {}
-    for word in words:
-        path = Path(word)
-        if path.is_dir():
-            paths = [p for p in path.iterdir() if p.suffix.lower() in IMAGES and p.is_file()]
-            if not paths:
-                raise ValueError(f"{word}: a folder without images")
-        elif os.path.lexists(word) or not glob.has_magic(word):
-            paths = [path]
-        else:
-            paths = [p for p in map(Path, glob.glob(word, recursive=True)) if p.is_file()]
-            if not paths:
-                raise ValueError(f"{word}: no file has such a name")
-        found |= {os.path.abspath(p): p for p in paths}
-    return sorted(found.values(), key=natural)
 
 
 def together(cameras: Mapping[str, Sequence[Path]], how: str | None) -> tuple[dict[str, dict[str, Path]], str]:
@@ -200,24 +178,14 @@ def _searched_one(path: Path, board: Board, known: Mapping[str | Path, ImageCorn
         digest = hash_of(path)
         if digest in known:
             return replace(known[digest], path=path)
-        grey = read_grey(path)
-    except (images.ImageFileError, OSError) as error:
+        grey = read_grey(path, note)
+    except (ImageFileError, OSError) as error:
         if isinstance(error, FileNotFoundError) and at_path is not None:
             return replace(at_path, path=path)
         reason = getattr(error, "strerror", None) or str(error).removeprefix(f"{path}: ")
         return ImageCorners(path, None, nothing, reason)
     found = detect(board, grey)
     return ImageCorners(path, grey.shape, found.pixels, found.reason, digest)
-
-
-def read_grey(path: Path) -> NDArray[np.uint8] | NDArray[np.uint16]:
-    """(H, W) of an image file, as stored."""
-    pixels = images.read(path)[0].numpy()
-    if len(pixels) < 3:
-        return np.ascontiguousarray(pixels[0])
-    red, green, blue = pixels[:3].astype(np.float32)
-    grey: np.ndarray = np.rint(0.299 * red + 0.587 * green + 0.114 * blue).astype(np.uint8)
-    return grey
 
 
 def usable_views(corners: Corners) -> tuple[Views, dict[str, tuple[int, int]]]:
@@ -264,7 +232,7 @@ def _advice(corners: Corners) -> str:
     if not isinstance(board, Chessboard):
         return ""
     unseen = [image for image in corners.images if image.image_size and not image.seen and image.path.exists()]
-    greys = {image.path: read_grey(image.path) for image in unseen[:_TRIED_ANEW]}
+    greys = {image.path: read_grey(image.path, note) for image in unseen[:_TRIED_ANEW]}
     sizes = Counter(filter(None, map(largest_chessboard, greys.values())))
     # of one image that shows a part of the board, another one shows the whole
     for other, _ in sorted(sizes.items(), key=lambda size: (size[1], size[0].columns * size[0].rows), reverse=True):

@@ -15,6 +15,7 @@ from PIL import Image
 import camtorch as ct
 from camtorch.boards.boards import AprilGrid, Chessboard
 from camtorch.boards.corners import Corners, ImageCorners, read_corners, write_corners
+from camtorch.boards.finding import gather
 from camtorch.boards.turns import agreeing, reordered, turns_of
 from camtorch.calibration.selection import select
 from camtorch.cli import searching
@@ -109,7 +110,7 @@ def test_a_folder_of_photographs_becomes_a_camera(photographs, capsys, monkeypat
     Path("other").mkdir()
     for index in range(1, 5):
         Path(f"{index}.png").rename(f"other/{9 - index}.png")
-    images = {"": searching.gather(["other/[0-9].png"])}
+    images = {"": gather(["other/[0-9].png"])}
     again = searching.found_corners(images, None, Path("corners.json"), None, measured=False, force=False)
     assert [image.path.name for image in again.images] == ["5.png", "6.png", "7.png", "8.png"]
     assert all(image.seen > 40 for image in again.images)
@@ -295,10 +296,10 @@ def test_images_come_in_natural_order():
     for name in ("a10.png", "a9.jpg", "a1.PNG", "notes.txt"):
         Path(name).touch()
     Path("folder").mkdir()
-    assert [str(path) for path in searching.gather(["."])] == ["a1.PNG", "a9.jpg", "a10.png"]
-    assert [str(path) for path in searching.gather(["a?.*", "a10.png", "a9.jpg"])] == ["a1.PNG", "a9.jpg", "a10.png"]
+    assert [str(path) for path in gather(["."])] == ["a1.PNG", "a9.jpg", "a10.png"]
+    assert [str(path) for path in gather(["a?.*", "a10.png", "a9.jpg"])] == ["a1.PNG", "a9.jpg", "a10.png"]
     Path("[1].png").touch()
-    assert searching.gather(["[1].png"]) == [Path("[1].png")]
+    assert gather(["[1].png"]) == [Path("[1].png")]
 
 
 @pytest.mark.parametrize(
