@@ -67,6 +67,13 @@ def restore(camera: Camera) -> None:
                 parameter.copy_(with_frozen(parameter, frozen))
 
 
+def saved(camera: Camera, destination: Any, prefix: str) -> None:
+    """After a state was saved, which shares the memory of the Parameters: its metadata say what is frozen."""
+    restore(camera)
+    if (names := frozen_names(camera)) and hasattr(destination, "_metadata"):
+        destination._metadata[prefix[:-1]]["frozen"] = names
+
+
 def loaded(camera: Camera, metadata: dict[str, Any]) -> None:
     """After a state was loaded: what is frozen has the values of the state, and what the state says is frozen too."""
     names = {*frozen_names(camera), *metadata.get("frozen", ())}

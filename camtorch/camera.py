@@ -24,7 +24,7 @@ from camtorch._arguments import (
 )
 from camtorch._editing import edited_by, quarter_turns
 from camtorch._evaluation import evaluated, mapped
-from camtorch._freezing import INTRINSICS, PREFIX, freeze, frozen_names, loaded, restore, with_frozen
+from camtorch._freezing import INTRINSICS, PREFIX, freeze, frozen_names, loaded, saved, with_frozen
 from camtorch._module import BatchedModule, Memo, remade, typed_as
 from camtorch._numbers import (
     camera_of_fov,
@@ -41,6 +41,7 @@ from camtorch.optics.lens import Lens
 from camtorch.projection.depth import backproject
 from camtorch.projection.explanation import explain
 from camtorch.projection.fields import local_pinhole, over_image, patch_centres, perspective_field, plucker
+from camtorch.projection.polyline import project_polyline
 from camtorch.projection.project import Project
 from camtorch.projection.rays import field_of_view
 from camtorch.projection.rows import Cameras
@@ -273,17 +274,11 @@ class Camera(BatchedModule):
         """Let parameters stay as they are while the others learn: `camera.freeze("fx", "fy", "k3")`.
 
         They have no gradient, and neither weight decay nor the momentum of an optimizer moves them; `ct.fit` and
-        `ct.calibrate` hold them where they start from the camera. States, pickles and `copy.deepcopy` keep them frozen.
-        What is made from the camera, as by `resize` or `clone`, sends its gradients to what learns here.
+        `ct.calibrate` hold them where they start from the camera. States, pickles and `copy.deepcopy` keep them frozen;
+        what is made from the camera, as by `resize` or `clone`, sends its gradients to what learns here.
 
         Args:
             names: "fx", "fy", "cx", "cy", and of `distortion_names`; all parameters if there are none.
-
-        Returns:
-            The camera itself.
-
-        Raises:
-            ValueError: an unknown name. TypeError: a parameter that `torch.nn.utils.parametrize` makes; a `Mixed`.
         """
         freeze(self, names, True)
         return self
@@ -294,10 +289,8 @@ class Camera(BatchedModule):
         return self
 
     def _save_to_state_dict(self, destination: Any, prefix: str, keep_vars: bool) -> None:
-        restore(self)
         super()._save_to_state_dict(destination, prefix, keep_vars)
-        if (names := frozen_names(self)) and hasattr(destination, "_metadata"):
-            destination._metadata[prefix[:-1]]["frozen"] = names
+        saved(self, destination, prefix)
 
     def _load_from_state_dict(self, *arguments: Any) -> None:
         super()._load_from_state_dict(*arguments)
@@ -326,11 +319,7 @@ class Camera(BatchedModule):
 
     @property
     def height(self) -> int:
-        """Of the image, in pixels.
-
-        Raises:
-            ValueError: the camera has no image size.
-        """
+        """Of the image, in pixels; a ValueError where the camera has no image size."""
         return self._size_for("height")[0]
 
     @property
@@ -422,6 +411,21 @@ class Camera(BatchedModule):
             ray projects to this pixel. An invalid pixel gets the optical axis (0, 0, 1) and zero gradient.
         """
         return mapped(self, Unproject, pixels, "pixels", 2)
+
+    def project_polyline(self, points: Numbers, extrinsics: Extrinsics | None = None) -> list[Tensor]:
+        """The curves that straight edges in space become: a 3D box in a fisheye's image, a lane, a horizon.
+
+        Pieces are within 0.1 px of the curve and at most 20 px long. Edges are cut where `valid` ends (not at the
+        border of the image), at the seam of a panorama, and 16 times the image's larger side from its middle.
+
+        Args:
+            points: (N, 3), finite, joined in their order; of the camera's frame, or of the world's.
+            extrinsics: camera from world. The camera and its pose are single.
+
+        Returns:
+            Pixels (M, 2) of each curve; none where nothing is seen. Where an edge is cut has no gradient.
+        """
+        return project_polyline(self, points, extrinsics)
 
     def _evaluate(
         self,
@@ -688,8 +692,8 @@ class Camera(BatchedModule):
             parts.append(f"distortion=({' '.join(self.distortion_names)})")
         if self.image_size:
             parts.append(f"image_size={self.image_size}")
-        frozen = frozen_names(self)
-        return ", ".join([*parts, f"frozen=({', '.join(frozen)})"] if frozen else parts)
+        parts += [f"frozen=({', '.join(frozen)})"] if (frozen := frozen_names(self)) else []
+        return ", ".join(parts)
 
 
 def _add_model(model: type[Camera]) -> None:

@@ -1,0 +1,99 @@
+"""Edges in space as the curves that a lens makes of them."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from camtorch._arguments import Numbers, as_points
+from camtorch.extrinsics import Extrinsics
+
+if TYPE_CHECKING:
+    from camtorch.camera import Camera
+
+_FIRST = 32  # pieces of an edge, of equal angles, before any is divided
+_LONGEST, _NEAR = 20.0, 0.05  # px: between points, and from a piece to its curve
+_SMALLEST = 1e-11  # pieces of an edge, of its angle: where it is cut
+_FARTHEST = 16.0  # times the image: a pinhole sees what is 90 degrees from its axis infinitely far away
+_ROUNDS = 60
+
+
+def project_polyline(camera: Camera, points: Numbers, extrinsics: Extrinsics | None) -> list[Tensor]:
+    """See `Camera.project_polyline`."""
+    owner = f"{type(camera).__name__}.project_polyline"
+    if camera.batch_shape:
+        raise ValueError(f"{owner}: takes a single camera; got batch dims {tuple(camera.batch_shape)}: use camera[i]")
+    points, _ = as_points(points, "points", 3, torch.Size(), camera._tensors, owner)
+    if points.ndim != 2 or len(points) < 2:
+        raise ValueError(f"{owner}: points must be (N, 3), two or more; got shape {tuple(points.shape)}")
+    if not bool(torch.isfinite(points).all()):
+        raise ValueError(f"{owner}: points must be finite; got {points.detach().tolist()!s:.200}")
+    if extrinsics is not None:
+        if not isinstance(extrinsics, Extrinsics) or extrinsics.batch_shape:
+            raise TypeError(f"{owner}: extrinsics must be one Extrinsics, camera from world; got {extrinsics!r:.100}")
+        points = extrinsics(points)
+    edges = _Edges(points.double())
+    middle, reach = _region(camera)
+
+    def seen(places: Tensor) -> tuple[Tensor, Tensor]:
+        pixels, valid = camera.project(edges.at(places))
+        return pixels, valid & ((pixels - middle).norm(dim=-1) < reach)
+
+    with torch.no_grad():
+        places = torch.linspace(0, edges.count, _FIRST * edges.count + 1, dtype=torch.float64, device=points.device)
+        for _ in range(_ROUNDS):
+            pixels, valid = seen(places)
+            both = valid[1:] & valid[:-1]
+            start, step = places[:-1], places.diff()
+            chord = pixels.diff(dim=0)
+            length = chord.norm(dim=-1)
+            away = torch.zeros_like(length)
+            for share in (0.25, 0.5, 0.75):
+                offset = seen(start + share * step)[0] - pixels[:-1]
+                across = (chord[:, 0] * offset[:, 1] - chord[:, 1] * offset[:, 0]).abs()
+                away = torch.maximum(away, torch.where(length > 0, across / length.clamp(min=1e-30), 0.0))
+            divided = torch.where(both, (length > _LONGEST) | (away > _NEAR), valid[1:] != valid[:-1])
+            divided &= step > _SMALLEST * edges.count
+            if not bool(divided.any()):
+                break
+            places = torch.cat((places, (start + step / 2)[divided])).sort().values
+        # the two ends of what stays longer belong to two curves, as those at the seam of a panorama
+        linked = both & (length <= _LONGEST)
+        ends = torch.cat((linked.new_zeros(1), linked)) != torch.cat((linked, linked.new_zeros(1)))
+        runs = ends.nonzero()[:, 0].reshape(-1, 2).tolist()
+    return [camera.project(edges.at(places[a : b + 1]))[0].to(points.dtype) for a, b in runs]
+
+
+class _Edges:
+    """Straight edges between points (N, 3), of which places 0 to N - 1 go on by equal angles, seen by the camera."""
+
+    def __init__(self, points: Tensor):
+        self.count = len(points) - 1
+        self.start, self.way = points[:-1], points.diff(dim=0)
+        with torch.no_grad():
+            square = self.way.square().sum(-1).clamp(min=1e-300)
+            self.foot = -(self.start * self.way).sum(-1) / square  # where an edge is nearest to the camera
+            self.near = ((self.start + self.foot[:, None] * self.way).norm(dim=-1) / square.sqrt()).clamp(min=1e-9)
+            self.low, high = (torch.atan((end - self.foot) / self.near) for end in (0.0, 1.0))
+            self.angle = high - self.low
+
+    def at(self, places: Tensor) -> Tensor:
+        """(K, 3)."""
+        edge = places.long().clamp(max=self.count - 1)
+        share = places - edge
+        along = self.foot[edge] + self.near[edge] * torch.tan(self.low[edge] + share * self.angle[edge])
+        # the ends as they are
+        along = torch.where(share == 0, 0.0, torch.where(share == 1, 1.0, along.clamp(0, 1)))
+        return self.start[edge] + along[:, None] * self.way[edge]
+
+
+def _region(camera: Camera) -> tuple[Tensor, float]:
+    """The middle of the image, and how far from it curves go on."""
+    fx, fy, cx, cy = camera.intrinsics.detach().double().tolist()
+    if camera.image_size is None:
+        return torch.tensor([cx, cy], dtype=torch.float64, device=camera.intrinsics.device), _FARTHEST * max(fx, fy)
+    height, width = camera.image_size
+    middle = torch.tensor([width / 2, height / 2], dtype=torch.float64, device=camera.intrinsics.device)
+    return middle, _FARTHEST * max(height, width)
