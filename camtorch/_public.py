@@ -1,6 +1,6 @@
 """The names that `camtorch` shows: this file imports what `camtorch/__init__.py` hands out at first use."""
 
-from camtorch import augment, data, io, lenses, models, plot
+from camtorch import augment, cabin, data, io, lenses, models, plot
 from camtorch.boards.finding import BoardObservations, find_board
 from camtorch.calibration.calibrate import Calibration, calibrate
 from camtorch.calibration.from_rays import fit
@@ -58,6 +58,7 @@ __all__ = [
     "TiedFocal",
     "Warp",
     "augment",
+    "cabin",
     "calibrate",
     "calibrate_rig",
     "cat",

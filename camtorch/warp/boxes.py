@@ -68,7 +68,7 @@ def _inside(warp: Warp, corners: Tensor, like: Tensor) -> tuple[Tensor, Tensor]:
         if warp.batch_shape:
             lead = len(shown), *[1] * (corners.ndim - 3), len(lattice)
             shown, seen = shown.reshape(*lead, 2), seen.reshape(lead)
-        return lattice, _within(corners, shown) & seen
+        return lattice, within(corners, shown) & seen
 
 
 def corners_of(boxes: Tensor) -> Tensor:
@@ -97,7 +97,7 @@ def _area(corners: Tensor) -> Tensor:
     return (x * next_y - next_x * y).sum(-1) / 2
 
 
-def _within(corners: Tensor, points: Tensor) -> Tensor:
+def within(corners: Tensor, points: Tensor) -> Tensor:
     """(..., N) bool: whether points (..., N, 2) are inside closed polygons (..., K, 2), by the edges to their right."""
     x, y = points.unsqueeze(-2).unbind(-1)
     x1, y1 = corners.unsqueeze(-3).unbind(-1)
