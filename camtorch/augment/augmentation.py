@@ -160,8 +160,8 @@ class Augmentation(SampleTransform):
     `rotation` (B, 3, 3) comes out: `ray_after = R ray_before`, over all augmentations that the sample went through.
     Everything else stays as it is; unknown names that hold real numbers are refused, as they might be geometry.
 
-    Turning the camera and changing its lens move all of it exactly. Moving the camera elsewhere would not be exact:
-    near things shift against far ones, which no warp of an image can do, so no augmentation does it.
+    Turning the camera and changing its lens move all of it exactly. Moving the camera elsewhere shifts near things
+    against far ones, which takes depth: `RandomMount(shift=...)` does it for samples that have some.
 
     Gradients go to images, labels and a camera that learns; what a lens is jittered by counts as given, and so does
     what it is zoomed by for `min_filled`.
@@ -467,12 +467,11 @@ class Augmentation(SampleTransform):
         """
         sample = self._given(sample, fields)
         named, batched, count, camera = self._batch(sample)
-        of_sample = self._boxes_of(named) if self.crops else None
         if draw is None:
             numbers = self._numbers(count, self.p, self.same_on_batch, generator)
-            change = self._change(camera, self.with_boxes(numbers, of_sample))
+            change = self._change(camera, self._of_sample(numbers, named))
         else:
-            change = self.change(camera, self.with_boxes(draw, of_sample))
+            change = self.change(camera, self._of_sample(draw, named))
         if change.count != count:
             raise ValueError(f"{self._name}: the draw is for {change.count} samples, here are {count}")
         if not torch.compiler.is_compiling():
@@ -512,11 +511,10 @@ class Augmentation(SampleTransform):
             raise ValueError(f"{self._name}: the change is of {change.count} samples, here are {count}")
         return self._moved(sample, named, batched, change)
 
-    @staticmethod
-    def _boxes_of(named: Named) -> Any:
-        """The boxes among a sample's fields: those of that name, or the first of that kind."""
-        found = {name: value for name, (kind, value) in named.items() if kind == "boxes"}
-        return found.get("boxes", next(iter(found.values()), None))
+    def _of_sample(self, draw: Mapping[str, Any], named: Named) -> Mapping[str, Any]:
+        """A draw with what it needs of a sample: boxes are those of that name, or the first of that kind."""
+        found: dict[str, Any] = {name: value for name, (kind, value) in named.items() if kind == "boxes"}
+        return self.with_boxes(draw, found.get("boxes", next(iter(found.values()), None)))
 
     if TYPE_CHECKING:
 

@@ -18,6 +18,7 @@ from camtorch.mixed import Listed, Mixed
 from camtorch.warp.affine import AffineWarp, MirrorWarp, after
 from camtorch.warp.boxes import corners_of, in_order
 from camtorch.warp.sampling import Mode, Options
+from camtorch.warp.shifted import ShiftedWarp
 from camtorch.warp.shutter import Shutters
 from camtorch.warp.warp import Warp
 
@@ -71,6 +72,8 @@ def _rows_of_warp(warp: Warp, camera: Camera, index: list[int]) -> Warp:
     rotation, target = warp.rotation, _rows_of(warp.target, index)
     if rotation is not None and rotation.ndim == 3:
         rotation = rotation[index]
+    if isinstance(warp, ShiftedWarp):
+        return warp.rows_of(camera, target, rotation, index)
     if isinstance(warp, AffineWarp):
         matrix = warp.matrix if warp.matrix.ndim == 2 else warp.matrix[index]
         return AffineWarp(camera, target, matrix, rotation, **warp.options)
@@ -389,6 +392,26 @@ class Change:
 
         return self.each(rays, move, lambda camera, rows: rows)
 
+    def positions(self, points: Tensor) -> Tensor:
+        """Points (count, *N, 3) of the camera frame: as `rays`, and those of a camera that moves shift."""
+
+        def move(part: Part, warp: Warp, rows: Tensor) -> Tensor:
+            if isinstance(warp, ShiftedWarp):
+                return warp.transform_positions(rows)
+            return rows.clone() if warp.rotation is None else warp.transform_rays(rows)
+
+        return self.each(points, move, lambda camera, rows: rows)
+
+    def distance(self, distance: Tensor) -> Tensor:
+        """Distance from the camera (count, C, H, W); 0 where nothing is known."""
+
+        def move(part: Part, warp: Warp, rows: Tensor) -> Tensor:
+            if isinstance(warp, ShiftedWarp):
+                return narrow(warp.moved_distance(widen(rows)), rows.dtype)
+            return warp.pin()(rows, mode="nearest", padding_mode="zeros", fill=0.0)
+
+        return self.each(distance, move, lambda camera, rows: rows)
+
     def depth(self, depth: Tensor) -> Tensor:
         """Depth along z (count, 1, H, W), positive in front; 0 where nothing is known.
 
@@ -407,6 +430,8 @@ class Change:
             wide = widen(rows)
             before, after = (ahead(camera, wide) for camera in (warp.source, warp.target))
             distance = torch.where(before.abs() > 1e-6, wide / before, 0.0)
+            if isinstance(warp, ShiftedWarp):
+                return narrow(warp.moved_distance(distance) * after, rows.dtype)
             moved = warp.pin()(distance, mode="nearest", padding_mode="zeros", fill=0.0) * after
             return narrow(moved, rows.dtype)
 

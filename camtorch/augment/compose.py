@@ -113,6 +113,10 @@ class Compose(Augmentation):
                         f"to {self._name} itself"
                     )
             drawn = {key.rpartition(".")[2] for key in part.ranges}
+            if "shift_x" in drawn:
+                raise ValueError(
+                    f"{self._name}: a shift needs the depth of its own image; {type(part).__name__} with it goes before"
+                )
             if "rates" in drawn and parts[i + 1 :]:
                 raise ValueError(
                     f"{self._name}: what comes after the rolling shutter of {type(part).__name__} would move its "

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from difflib import get_close_matches
 from functools import lru_cache
 from typing import Any, ClassVar, Literal
@@ -19,14 +20,17 @@ from camtorch._numbers import joined, split, wide
 from camtorch._opaque import CameraNumbers, opaque
 from camtorch._tracing import in_graph
 from camtorch.augment.augmentation import Augmentation, Range, as_range
+from camtorch.augment.change import Part
 from camtorch.augment.filling import enough, scaled
 from camtorch.augment.presets import PRESETS, PresetName
+from camtorch.augment.sample import Named
 from camtorch.camera import Camera
 from camtorch.lenses.drawing import covering, drawn
 from camtorch.models import MODELS, KannalaBrandt
 from camtorch.projection.rays import field_of_view, image_lattice, polar_rays, reach
 from camtorch.rotations import mount_elements
 from camtorch.warp.boxes import along_edges
+from camtorch.warp.shifted import ShiftedWarp
 from camtorch.warp.shutter import RollingShutter
 from camtorch.warp.vignetting import vignetting
 from camtorch.warp.warp import Warp
@@ -40,6 +44,9 @@ _SMALL = 0.1  # decentering, prism and tilt, whose images are lopsided, move les
 _STEP = 1e-4
 _PARTS = 1.0, -1.0, 0.5, -0.5, 0.25, -0.25, 0.125, -0.125  # of a step, in the order in which they are tried
 _REAL = "real"
+_SHIFTS = "shift_x", "shift_y", "shift_z"
+_DEPTHS = {"depth": "of_depth", "distance": "of_distance"}
+"""Fields of samples that say how far away things are, and their names in a draw."""
 _FOCAL, _CENTRE, _DISTORTION, _CROP = (0.95, 1.05), (-0.02, 0.02), (-0.02, 0.02), (0.9, 1.0)
 _LENS_FOCAL, _LENS_CENTRE, _LENS_DISTORTION = (0.9, 1.1), (-0.03, 0.03), (-0.05, 0.05)
 _USUAL = _FOCAL, _CENTRE, _DISTORTION, _CROP, _LENS_FOCAL, _LENS_CENTRE, _LENS_DISTORTION
@@ -360,6 +367,11 @@ class RandomMount(RandomCamera):
 
     Args are those of `RandomCamera`: yaw, pitch, roll in degrees, zoom, and all options. On a pinhole camera this is
     the homography K' R K^-1.
+
+    `shift=(dx, dy, dz)` also moves the camera: right, down and forward by lengths of the unit of the depth, each a
+    range, or a number for as much to either side. It is for some centimetres, and for samples that have `depth` or
+    `distance`: near things shift against far ones, which no image alone says. What stood behind something is empty and
+    not valid; pixels move by their depth, points and poses exactly, and there is no `inverse`.
     """
 
     def __init__(
@@ -369,6 +381,7 @@ class RandomMount(RandomCamera):
         pitch: RangeLike | None = (-10.0, 10.0),
         roll: RangeLike | None = (-10.0, 10.0),
         zoom: RangeLike | None = (1.0, 1.0),
+        shift: Sequence[RangeLike] | None = None,
         **options: Any,
     ):
         if isinstance(options.get("fov"), str):
@@ -377,6 +390,45 @@ class RandomMount(RandomCamera):
             )
         none = self._without(options, "focal", "centre", "distortion", "crop")
         super().__init__(yaw=yaw, pitch=pitch, roll=roll, zoom=zoom, **none, **options)
+        if shift is None:
+            return
+        if isinstance(shift, (str, int, float)) or len(shift) != len(_SHIFTS):
+            raise TypeError(f"{self._name}: shift must be three lengths or ranges (dx, dy, dz); got {shift!r}")
+        for name in ("chromatic", "rates"):
+            if name in self.ranges:
+                raise ValueError(f"{self._name}: with shift there is no {name}")
+        self.ranges |= {name: as_range(each, "shift", self._name) for name, each in zip(_SHIFTS, shift, strict=True)}
+
+    def _of_sample(self, draw: Mapping[str, Any], named: Named) -> Mapping[str, Any]:
+        draw = super()._of_sample(draw, named)
+        if _SHIFTS[0] not in self.ranges:
+            return draw
+        for kind, key in _DEPTHS.items():
+            for found, value in named.values():
+                if found == kind and isinstance(value, Tensor):
+                    return {**draw, key: value if value.ndim == 4 else value[:, None]}
+        raise ValueError(
+            f"{self._name}: shift moves the camera, and near things against far ones: the sample needs depth (B, 1, H, "
+            f"W) or distance; it has {', '.join(named)}. Without it yaw, pitch, roll and zoom are exact"
+        )
+
+    def _checked_draw(self, draw: Mapping[str, Tensor]) -> Mapping[str, Any]:
+        return {**super()._checked_draw(draw), **{key: draw[key] for key in _DEPTHS.values() if key in draw}}
+
+    def _part(self, rows: list[int] | None, source: Camera, draw: Mapping[str, Any]) -> Part:
+        if _SHIFTS[0] not in self.ranges:
+            return super()._part(rows, source, draw)
+        depth = {key: draw[key] for key in _DEPTHS.values() if key in draw}
+        if not depth:
+            raise ValueError(f"{self._name}: shift needs the sample's depth; call the augmentation with the sample")
+        (key, values), count = depth.popitem(), len(draw["apply"])
+        part = super()._part(rows, source, {name: v for name, v in draw.items() if name not in (*_SHIFTS, key)})
+        assert part.warp is not None
+        shift = torch.stack([torch.as_tensor(draw[name]) for name in _SHIFTS], -1).expand(count, 3)
+        kind = next(kind for kind, name in _DEPTHS.items() if name == key)
+        kind = "z" if kind == "depth" else kind
+        warp = ShiftedWarp(source, part.target, part.warp.rotation, values, kind, shift, **self.options)
+        return replace(part, warp=warp)
 
 
 class RandomLens(RandomCamera):

@@ -86,7 +86,9 @@ def _planes(move: Move) -> Move:
 
 
 def _pose(change: Change, pose: Tensor, options: Mapping[str, float]) -> Tensor:
-    top = _mirrored_head(change, change.rays(pose[..., :3, :], _columns, _columns), options)
+    turned = change.rays(pose[..., :3, :], _columns, _columns)
+    turned = torch.cat((turned[..., :3], change.positions(pose[..., :3, 3]).to(turned)[..., None]), -1)
+    top = _mirrored_head(change, turned, options)
     return torch.cat((top, pose[..., 3:, :].to(top)), -2)
 
 
@@ -120,6 +122,10 @@ def _rays(change: Change, rays: Tensor, options: Mapping[str, float]) -> Tensor:
     return change.rays(rays)
 
 
+def _positions(change: Change, points: Tensor, options: Mapping[str, float]) -> Tensor:
+    return change.positions(points)
+
+
 def _pixels(change: Change, pixels: Tensor, options: Mapping[str, float]) -> tuple[Tensor, Tensor]:
     return change.points(pixels)
 
@@ -133,19 +139,19 @@ KINDS = {
     "image": Field(3, 3, (), "(B, C, H, W)", lambda change, images, _: change.images(images), True),
     "mask": Field(2, 3, (), _MASKS, _planes(lambda change, masks, given: change.labels(masks, given["mask_fill"]))),
     "depth": Field(2, 3, (), f"{_DEPTHS} z", _planes(lambda change, depth, _: change.depth(depth))),
-    "distance": Field(2, 3, (), f"{_DEPTHS} the ray", _planes(lambda change, distance, _: change.labels(distance))),
+    "distance": Field(2, 3, (), f"{_DEPTHS} the ray", _planes(lambda change, distance, _: change.distance(distance))),
     "keypoints": Field(2, 3, (2,), "(B, N, 2) pixels x, y", _pixels, True),
     "polygons": Field(3, 3, (2,), "(B, M, K, 2) corners x, y", _pixels, True),
     "boxes": Field(2, 2, (4,), "(B, M, 4) pixels x1, y1, x2, y2", lambda change, boxes, _: change.boxes(boxes), True),
     "landmarks": Field(2, 3, (2, 3), "(B, N, 2) pixels or (B, N, 3) points of the camera frame", _pixels, True),
-    "points": Field(1, _MANY, (3,), "(B, *N, 3) points of the camera frame", _rays),
+    "points": Field(1, _MANY, (3,), "(B, *N, 3) points of the camera frame", _positions),
     "gaze": _DIRECTIONS,
     "directions": _DIRECTIONS,
     "pitch_yaw": Field(1, _MANY, (2,), _PITCH_YAW, lambda c, angles, _: c.rays(angles, from_pitch_yaw, to_pitch_yaw)),
     "head_pose": _POSE,
     "pose": _POSE,
     "rvec": Field(1, 1, (3,), "(B, 3), a rotation vector, camera from head", _rotation_vector),
-    "tvec": Field(1, 1, (3,), "(B, 3), a point of the camera frame", _rays),
+    "tvec": Field(1, 1, (3,), "(B, 3), a point of the camera frame", _positions),
     "rotation": Field(2, 2, (3,), "(B, 3, 3), turned so far", lambda c, turn, _: c.rays(turn, _columns, _columns)),
 }
 _SINGLE_FILE = ("keypoints", "landmarks")  # which OpenCV has as (N, 1, 2)
@@ -193,7 +199,7 @@ def _holds_reals(value: object) -> bool:
 
 def moves(kind: str, value: Tensor) -> Move:
     """How values of a kind move."""
-    return _rays if kind == "landmarks" and value.shape[-1] == 3 else KINDS[kind].move
+    return _positions if kind == "landmarks" and value.shape[-1] == 3 else KINDS[kind].move
 
 
 def as_tensor(value: object, name: str, kind: str, owner: str) -> Tensor:

@@ -1,0 +1,141 @@
+"""A mount that moves, by the depth of the sample: against what a camera at the new place sees."""
+
+import pytest
+import torch
+
+import camtorch as ct
+import camtorch.augment.numpy
+
+CENTRE, RADIUS = (0.05, 0.02, 0.75), 0.17  # of a ball before a slanted wall
+WALL, AWAY = (0.1, -0.05, 1.0), 1.3
+
+
+def lens(size=(120, 160)):
+    focal = 0.45 * size[1]
+    numbers = [focal, focal, (size[1] - 1) / 2, (size[0] - 1) / 2], [0.02, -0.004, 0.001, 0.0]
+    camera = ct.KannalaBrandt(*(torch.tensor(n, dtype=torch.float64) for n in numbers), image_size=size)
+    return camera.requires_grad_(False)
+
+
+def seen(camera, start, rays):
+    """Colours (..., 1) and distances (...) of unit rays from a place, all in the frame of the camera before."""
+    centre, wall = (torch.tensor(v, dtype=torch.float64) for v in (CENTRE, WALL))
+    along = (rays * (centre - start)).sum(-1)
+    square = along**2 - ((centre - start) ** 2).sum() + RADIUS**2
+    ball = torch.where(square > 0, along - square.clamp(min=0).sqrt(), torch.inf)
+    slope = (rays * wall).sum(-1)
+    flat = torch.where(slope > 0.05, (AWAY - (start * wall).sum()) / slope.clamp(min=0.05), torch.inf)
+    distance = torch.minimum(ball, flat)
+    at = start + distance[..., None] * rays
+    colour = 0.5 + 0.2 * torch.sin(9 * at[..., 0]) + 0.2 * torch.cos(7 * at[..., 1] + 3 * at[..., 2])
+    return torch.where(ball < flat, 1 - colour, colour), distance
+
+
+def sample_of(camera):
+    rays, valid = camera.rays()
+    image, distance = seen(camera, torch.zeros(3, dtype=torch.float64), rays)
+    known = valid & torch.isfinite(distance)
+    return {
+        "image": torch.where(known, image, 0.0)[None],
+        "distance": torch.where(known, distance, 0.0)[None],
+        "camera": camera,
+    }
+
+
+@pytest.mark.parametrize("kind", ["distance", "depth"])
+def test_the_image_is_what_a_camera_there_sees(kind):
+    camera = lens((240, 320))
+    sample = sample_of(camera)
+    if kind == "depth":
+        sample["depth"] = sample.pop("distance") * camera.rays()[0][..., 2].clamp(min=0)
+    generator = torch.Generator().manual_seed(0)
+    directions = torch.randn(60, 3, generator=generator, dtype=torch.float64)
+    points = torch.tensor(CENTRE) + RADIUS * torch.nn.functional.normalize(directions, dim=-1)
+    facing = (points * (points - torch.tensor(CENTRE))).sum(-1) < -0.3 * RADIUS * points.norm(dim=-1)
+    points = points[facing]
+    sample |= {"points": points, "keypoints": camera.project(points)[0], "gaze": points, "boxes": torch.empty(0, 4)}
+    sample["pose"] = torch.eye(4, dtype=torch.float64)
+    augment = ct.augment.RandomMount(
+        yaw=5, pitch=5, roll=5, shift=((0.03, 0.04), (-0.03, -0.02), 0.02), valid_mask=True
+    )
+    torch.manual_seed(1)
+    out = augment(sample)
+    rotation, target = out["rotation"], out["camera"]
+    shift = augment.last.parts[0].warp.shift[0]
+    assert 0.03 <= shift[0] <= 0.04
+    rays = target.rays()[0]
+    image, distance = seen(camera, shift, rays @ rotation)
+    good = out["image_valid"][0]
+    assert good.double().mean() > 0.8
+    # pixels at the rim of the ball show both, in the two images each its own part
+    edge = torch.nn.functional.max_pool2d(distance[None, None], 3, 1, 1) + torch.nn.functional.max_pool2d(
+        -distance[None, None], 3, 1, 1
+    )
+    inner = good & (edge[0, 0] < 0.05)
+    error = (out["image"][0] - image)[inner]
+    assert -10 * (error**2).mean().log10() > 40
+    moved = out[kind][0]
+    want = distance if kind == "distance" else distance * rays[..., 2]
+    assert (moved - want)[inner].abs().median() < 1e-3
+    torch.testing.assert_close(out["points"], (points - shift) @ rotation.T)
+    torch.testing.assert_close(out["gaze"], points @ rotation.T)
+    torch.testing.assert_close(out["pose"][:3, 3], -rotation @ shift)
+    pixels = target.project(out["points"])[0]
+    assert out["keypoints_valid"].all()
+    assert (out["keypoints"] - pixels).norm(dim=-1).max() < 0.1
+
+
+def test_what_was_hidden_is_empty_and_not_valid():
+    camera = lens((360, 480))
+    sample = sample_of(camera)
+    augment = ct.augment.RandomMount(
+        yaw=None, pitch=None, roll=None, shift=((0.05, 0.05), (0, 0), (0, 0)), valid_mask=True, fill=-1
+    )
+    out = augment(sample)
+    rays, _ = camera.rays()
+    shift = torch.tensor([0.05, 0, 0], dtype=torch.float64)
+    distance = seen(camera, shift, rays)[1]
+    points = shift + distance[..., None] * rays
+    before = seen(camera, torch.zeros(3, dtype=torch.float64), torch.nn.functional.normalize(points, dim=-1))[1]
+    hidden = points.norm(dim=-1) > before + 0.1
+    # pixels at the rim show both
+    hidden = -torch.nn.functional.max_pool2d(-hidden.double()[None, None], 3, 1, 1)[0, 0] > 0
+    assert hidden.sum() > 20
+    assert out["image_valid"][0][hidden].double().mean() < 0.1
+    assert (out["image"][0][~out["image_valid"][0]] == -1).all()
+
+
+def test_batches_half_precision_and_arrays():
+    camera = lens()
+    sample = sample_of(camera)
+    batch = {name: torch.stack((value, value)).float() for name, value in sample.items() if name != "camera"}
+    augment = ct.augment.RandomMount(
+        yaw=3, pitch=None, roll=None, shift=(0.02, 0.02, 0.02), p=0.5, camera=camera.float()
+    )
+    for seed in range(4):
+        torch.manual_seed(seed)
+        out = augment(batch, keypoints=torch.full((2, 1, 2), 80.0), boxes=torch.tensor([[[70.0, 50, 90, 70]]] * 2))
+        assert out["image"].shape == batch["image"].shape
+        assert torch.isfinite(out["keypoints"]).all()
+        assert out["boxes_valid"].all()
+    arrays = {name: value[0].numpy() for name, value in batch.items()}
+    out = ct.augment.numpy.Transform(augment)(image=arrays["image"][0], distance=arrays["distance"][0])
+    assert out["image"].shape == (120, 160)
+
+
+def test_without_depth_it_says_so():
+    augment = ct.augment.RandomMount(shift=(0.02, 0.02, 0), camera=lens())
+    with pytest.raises(ValueError, match="needs depth"):
+        augment(image=torch.zeros(1, 120, 160))
+    with pytest.raises(ValueError, match="depth"):
+        augment.change(None, augment.draw(1))
+    with pytest.raises(ValueError, match="goes before"):
+        ct.augment.Compose([augment])
+    with pytest.raises(TypeError, match="three lengths"):
+        ct.augment.RandomMount(shift=0.02)
+    with pytest.raises(ValueError, match="chromatic"):
+        ct.augment.RandomMount(shift=(0.02, 0, 0), chromatic=0.01)
+    sample = sample_of(lens())
+    out = augment(sample)
+    with pytest.raises(ValueError, match="no inverse"):
+        augment.inverse(out)
