@@ -313,7 +313,8 @@ def _rescale(add: Add) -> None:
 
 def _projection(add: Add) -> None:
     """What a dewarped image shows."""
-    add("--projection", choices=("perspective", "cylindrical", "equirectangular"), default="perspective")
+    ways = ("perspective", "stereographic", "cylindrical", "equirectangular")
+    add("--projection", choices=ways, default="perspective")
     text = "horizontal field of view of the new image; by default that of the old one, up to 120 in perspective"
     add("--fov", type=float, metavar="DEGREES", help=text)
     add("--size", type=words.size, metavar="WxH", help="size of the new image; by default the old one's")

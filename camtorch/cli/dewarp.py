@@ -26,6 +26,7 @@ from camtorch.warp.warp import Warp
 _SLASHES = ("/", os.sep)
 _TOLERANCE = 0.001  # pixels that nobody sees, for a lattice of positions also where a calibration is in float64
 _MOST_KEPT = 4  # warps of images of different sizes
+_MUCH = 0.6  # of a photograph: where a dewarped one shows less, it is said what shows more
 _LARGE = 32e6  # pixels, from where on their map is not kept, and one in 64 tells how much is filled
 
 
@@ -130,6 +131,8 @@ def _single(arguments: argparse.Namespace, source: Path) -> None:
     with bar("dewarping", item.size, "frames" if is_video else "images") as shown:
         facts = work(item, Listener(tell, lambda done: shown.update(done - shown.n)))
     end = f", {facts['frames']} frames" if is_video else f" and shows {100 * facts['shown']:.0f} % of the photograph"
+    if not is_video and facts["shown"] < _MUCH and arguments.projection == "perspective" and arguments.fov is None:
+        end += "; --projection stereographic or cylindrical shows more, and --fov says how much"
     print(f"{output}: {_told(arguments, facts)}{end}")
 
 

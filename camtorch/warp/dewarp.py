@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Literal
 
 import torch
@@ -11,22 +11,37 @@ from torch import Tensor, nn
 
 from camtorch._arguments import as_fov, as_image_size, broadcast_shapes
 from camtorch.camera import Camera
-from camtorch.models import Cylindrical, Equirectangular, Pinhole
+from camtorch.models import UCM, Cylindrical, Equirectangular, Pinhole
 from camtorch.projection.rays import around_ends, image_lattice
 from camtorch.rotations import as_rotation
 from camtorch.warp.sampling import Fill, Mode, PaddingMode
 from camtorch.warp.shutter import RollingShutter
 from camtorch.warp.warp import Warp, as_sized
 
-Projection = Literal["perspective", "cylindrical", "equirectangular"]
+Projection = Literal["perspective", "stereographic", "cylindrical", "equirectangular"]
 
 _WIDEST_PERSPECTIVE = 2 * math.tan(math.radians(60))  # beyond 120 degrees the rim is stretched more than fourfold
+_WIDEST_STEREOGRAPHIC = 4 * math.tan(math.radians(55))  # beyond 220 degrees it is stretched more than threefold
+
+
+def _stereographic(intrinsics: Tensor, image_size: tuple[int, int] | None = None) -> UCM:
+    """The unified camera of alpha = 1/2: r = 2 f tan(theta / 2)."""
+    alpha = nn.Parameter(intrinsics.new_full((*intrinsics.shape[:-1], 1), 0.5), requires_grad=False)
+    return UCM(intrinsics, alpha, image_size=image_size)
+
+
 # projection: the model, and the widest and the tallest range of its plane that is chosen without being asked for
-_PROJECTIONS: dict[str, tuple[type[Pinhole | Cylindrical | Equirectangular], float, float]] = {
+_PROJECTIONS: dict[str, tuple[Callable[..., Camera], float, float]] = {
     "perspective": (Pinhole, _WIDEST_PERSPECTIVE, _WIDEST_PERSPECTIVE),
+    "stereographic": (_stereographic, _WIDEST_STEREOGRAPHIC, _WIDEST_STEREOGRAPHIC),
     "cylindrical": (Cylindrical, 2 * math.pi, 2 * math.tan(math.radians(50))),
     "equirectangular": (Equirectangular, 2 * math.pi, math.pi),
 }
+_PLANES: dict[str, tuple[float, Callable[[float], float]]] = {
+    "perspective": (180, lambda angle: 2 * math.tan(angle / 2)),
+    "stereographic": (359, lambda angle: 4 * math.tan(angle / 4)),
+}
+"""Those that go on in all directions: below which fov, and how wide the plane of a fov in radians is."""
 _LINE_SAMPLES = 257
 _SEAM = 1e-3  # radians beside it
 
@@ -36,12 +51,13 @@ class Dewarp(Warp):
 
     Args:
         camera: the camera of the given images, with image_size; with a batch dim the target gets one as well.
-        projection: "perspective" (straight lines stay straight; up to about 120 degrees), "cylindrical" (vertical lines
-            do, for wide views) or "equirectangular" (everything).
+        projection: "perspective" (straight lines stay straight; up to about 120 degrees), "stereographic" (small shapes
+            keep their form at the rim too, as faces do; wide views), "cylindrical" (vertical lines stay straight; wide
+            views) or "equirectangular" (everything).
         fov: horizontal field of view of the target in degrees, centred on its axis. By default the target shows
-            what the image's middle row and column show, and never more than 120 degrees in perspective. A panorama is
-            then as wide as the middle row, so that it has no empty sides, and a whole turn where that is one; for how
-            far it shows up and down its image_size has the say.
+            what the image's middle row and column show, and never more than 120 degrees in perspective, 220 in
+            stereographic. A panorama is then as wide as the middle row, so that it has no empty sides, and a whole turn
+            where that is one; for how far it shows up and down its image_size has the say.
         image_size: (height, width) of the target; the source's by default.
         rotation: (3, 3) or (B, 3, 3), `ray_target = R ray_source`: where the target looks.
         mode, padding_mode, fill, antialias, tolerance, shutter: as `Warp` takes them.
@@ -50,8 +66,8 @@ class Dewarp(Warp):
     lens folds inside the image or sees past 90 degrees.
 
     Raises:
-        ValueError: an unknown projection, a fov that is not below 180 degrees for perspective, or up to 360, one up to
-            2 pi, which seems to be in radians, and as `Warp`.
+        ValueError: an unknown projection, a fov that is not below 180 degrees for perspective, 359 for stereographic,
+            or up to 360, one up to 2 pi, which seems to be in radians, and as `Warp`.
     """
 
     def __init__(
@@ -78,9 +94,8 @@ class Dewarp(Warp):
         with torch.no_grad():
             if fov is not None:
                 height, width = size
-                most = 180 if projection == "perspective" else 360
-                angle = math.radians(as_fov(fov, "Dewarp", most, f" for {projection}"))
-                plane_width = 2 * math.tan(angle / 2) if projection == "perspective" else angle
+                most, of_plane = _PLANES.get(projection, (360, lambda angle: angle))
+                plane_width = of_plane(math.radians(as_fov(fov, "Dewarp", most, f" for {projection}")))
                 focal = camera.intrinsics.new_tensor(width / plane_width)
                 centre = camera.intrinsics.new_tensor([(width - 1) / 2, (height - 1) / 2])
                 intrinsics = torch.cat((focal.expand(2), centre))
@@ -107,7 +122,7 @@ def _fitted(camera: Camera, projection: str, size: tuple[int, int], rotation: Te
     limit = plane.intrinsics.new_tensor([widest, tallest]) / 2
     target = limit.new_tensor([size[1], size[0]])
     (across, of_across), (down, of_down) = middle_lines(camera, rotation, plane, limit, _LINE_SAMPLES)
-    if projection == "perspective":  # either line counts both ways
+    if projection in _PLANES:  # either line counts both ways
         points, shown = torch.cat((across, down), -2), torch.cat((of_across, of_down), -1)
         shown = shown.unsqueeze(-1).expand(points.shape)
     else:  # over a pole the longitude jumps
@@ -117,12 +132,12 @@ def _fitted(camera: Camera, projection: str, size: tuple[int, int], rotation: Te
     some = shown.any(-2)
     low = torch.where(some, torch.where(shown, points, torch.inf).amin(-2), -1.0)
     high = torch.where(some, torch.where(shown, points, -torch.inf).amax(-2), 1.0)
-    if projection != "perspective":
+    if projection not in _PLANES:
         whole = _sees_backward(camera, rotation)
         ends = torch.stack((whole, torch.zeros_like(whole)), -1)
         low, high = torch.where(ends, -limit, low), torch.where(ends, limit, high)
     extent = torch.maximum(high - low, 1e-3 * limit)
-    if projection == "perspective":  # all that is shown fits in, unless that takes a wider image than the widest
+    if projection in _PLANES:  # all that is shown fits in, unless that takes a wider image than the widest
         focal = torch.maximum((target / extent).amin(-1), (target / (2 * limit)).amax(-1)).unsqueeze(-1)
     else:
         focal = (target / extent)[..., :1]

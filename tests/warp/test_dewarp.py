@@ -8,7 +8,7 @@ from cameras import FEW_REAL, real
 
 import camtorch as ct
 
-PROJECTIONS = ("perspective", "cylindrical", "equirectangular")
+PROJECTIONS = ("perspective", "stereographic", "cylindrical", "equirectangular")
 
 
 @pytest.mark.parametrize("projection", PROJECTIONS)
@@ -20,13 +20,13 @@ def test_real_lenses_fill_most_of_the_image(key, name, projection):
     assert dewarp.target.image_size == dewarp.source.image_size
     mask = dewarp.valid_mask()
     assert mask.double().mean() > 0.5
-    if projection != "perspective":  # as wide as the lens: neither side is empty
+    if projection in PROJECTIONS[2:]:  # as wide as the lens: neither side is empty
         if abs(dewarp.source.cy - 37) < 2:  # else the middle row is not that of the principal point
             assert dewarp.target.fov[0].item() == pytest.approx(dewarp.source.fov[0].item(), rel=0.01)
         assert mask[..., 1:-1].any(-2).all()
 
 
-@pytest.mark.parametrize("projection", PROJECTIONS[1:])
+@pytest.mark.parametrize("projection", PROJECTIONS[2:])
 @pytest.mark.parametrize("roll", [0.0, 90.0])
 def test_a_panorama_is_as_wide_as_a_lens_that_ends_within_the_image(projection, roll):
     camera = ct.KannalaBrandt([214.6, 214.6, 319.5, 239.5], [-0.1163], image_size=(480, 640))  # folds at 97 degrees
@@ -38,7 +38,7 @@ def test_a_panorama_is_as_wide_as_a_lens_that_ends_within_the_image(projection, 
     assert dewarp.valid_mask().double().mean() > 0.97
 
 
-@pytest.mark.parametrize("projection", PROJECTIONS[1:])
+@pytest.mark.parametrize("projection", PROJECTIONS[2:])
 @pytest.mark.parametrize("angles", [(0, 0, 0), (60, 0, 0), (0, 40, 0), (0, 0, 90)])
 def test_a_whole_turn_stays_whole(projection, angles):
     rotation = ct.augment.mount_rotation(*torch.tensor(angles, dtype=torch.float64))
@@ -58,7 +58,7 @@ def test_opencv_issue_23961(projection):
     camera = ct.KannalaBrandt.from_matrix(matrix, lens, image_size=(1200, 1900), ignore_skew=True)
     dewarp = ct.Dewarp(camera, projection=projection)
     mask = dewarp.valid_mask()[0, 0]
-    if projection == "perspective":
+    if projection in PROJECTIONS[:2]:
         assert 0.3 < mask.double().mean() < 0.8  # the disc that the lens sees, on black
     else:
         assert mask.double().mean() > 0.8  # from its left to its right
@@ -76,12 +76,14 @@ def test_a_lens_of_220_degrees(projection):
     dewarp = ct.Dewarp(camera, projection=projection)
     width = 640 / float(dewarp.target.intrinsics[0])
     # 120 degrees in perspective; the others show all that the lens sees
-    expected = 2 * math.tan(math.radians(60)) if projection == "perspective" else math.radians(220)
+    planes = {"perspective": 2 * math.tan(math.radians(60)), "stereographic": 4 * math.tan(math.radians(55))}
+    expected = planes.get(projection, math.radians(220))
     assert width == pytest.approx(expected, rel=0.01)
 
 
 @pytest.mark.parametrize(
-    ("projection", "degrees"), [("perspective", 90), ("cylindrical", 200), ("equirectangular", 360)]
+    ("projection", "degrees"),
+    [("perspective", 90), ("stereographic", 150), ("cylindrical", 200), ("equirectangular", 360)],
 )
 def test_fov_is_the_horizontal_field_of_view(projection, degrees):
     camera = ct.KannalaBrandt([200.0, 200.0, 319.5, 239.5], [0.0], image_size=(480, 640))
@@ -91,6 +93,20 @@ def test_fov_is_the_horizontal_field_of_view(projection, degrees):
     left, right = target.unproject(edges)[0].unbind(0)
     angle = math.atan2(right[0], right[2]) - math.atan2(left[0], left[2])
     assert angle % (2 * math.pi) == pytest.approx(math.radians(degrees) % (2 * math.pi), abs=1e-5)
+
+
+def test_stereographic_keeps_small_shapes():
+    """A small square of the scene is a square of the image wherever it is: the map is conformal."""
+    camera = ct.KannalaBrandt.from_fov(180, image_size=(480, 640)).double()
+    target = ct.Dewarp(camera, projection="stereographic").target
+    rays = target.unproject(torch.tensor([[20.0, 240], [500, 100], [320, 240]], dtype=torch.float64))[0]
+    for ray in rays:
+        across = torch.linalg.cross(ray, torch.tensor([0.3, 0.8, 0.1], dtype=torch.float64))
+        across = 1e-5 * across / across.norm()
+        down = torch.linalg.cross(ray, across)
+        first, second = (target.project(ray + step)[0] - target.project(ray - step)[0] for step in (across, down))
+        assert abs(float(first @ second) / float(first @ first)) < 1e-4
+        assert float(first.norm() / second.norm()) == pytest.approx(1, abs=1e-4)
 
 
 def test_the_default_shows_an_undistorted_camera_as_it_is():
