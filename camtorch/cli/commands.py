@@ -314,7 +314,8 @@ def _rescale(add: Add) -> None:
 def _projection(add: Add) -> None:
     """What a dewarped image shows."""
     ways = ("perspective", "stereographic", "cylindrical", "equirectangular")
-    add("--projection", choices=ways, default="perspective")
+    text = "keeps lines straight (the default), shapes, upright lines; or shows all around"
+    add("--projection", choices=ways, default="perspective", help=text)
     text = "horizontal field of view of the new image; by default that of the old one, up to 120 in perspective"
     add("--fov", type=float, metavar="DEGREES", help=text)
     add("--size", type=words.size, metavar="WxH", help="size of the new image; by default the old one's")

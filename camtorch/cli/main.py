@@ -57,7 +57,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         with open(os.devnull, "w") as nobody, contextlib.redirect_stderr(nobody):
             return main(argv)
     try:
-        arguments = _parser().parse_args(argv)
+        arguments = make_parser().parse_args(argv)
         module = f"camtorch.cli.{arguments.command}"
         if commands.uses_processes(arguments):
             pool.prepare(module)  # they import what they need while this one does
@@ -84,7 +84,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     return status
 
 
-def _parser() -> argparse.ArgumentParser:
+def make_parser() -> argparse.ArgumentParser:
+    """The command's options, from which the page of commands is made too."""
     parser = _Parser(prog="camtorch", description="Cameras as layers for PyTorch.")
     parser.add_argument("--version", action=_Version, nargs=0, help="show what is installed and exit")
     commands.add_all(parser.add_subparsers(title="commands", dest="command", required=True, metavar="COMMAND"))

@@ -4,6 +4,7 @@ import functools
 import importlib.util
 import json
 import re
+import runpy
 import shlex
 import shutil
 import sys
@@ -189,3 +190,10 @@ def test_links_of_the_root_lead_somewhere():
         if not (ROOT / path).exists() or (anchor and anchor not in anchors):
             broken.append((page, target))
     assert not broken
+
+
+def test_the_page_of_commands_is_what_the_parser_knows():
+    made = runpy.run_path(str(ROOT / "docs" / "make_commands.py"))
+    assert made["PAGE"].read_text(encoding="utf-8") == made["text"](), "python docs/make_commands.py makes it anew"
+    for name in ("dewarp", "rectify", "birdseye", "lenses", "calibrate"):
+        assert f"## camtorch {name}\n" in made["text"]()
