@@ -10,8 +10,8 @@ from camtorch.cli.main import make_parser
 PAGE = Path(__file__).parent / "commands.md"
 HEAD = """# All commands and options
 
-Made from what the command itself knows, by `python docs/make_commands.py`.
-[The command line](guides/command-line.md) says what each is for, with examples. Sizes are WIDTHxHEIGHT and angles degrees.
+Made from what the command itself knows, by `python docs/make_commands.py`. What each is for, with examples:
+[the command line](guides/command-line.md). Sizes are WIDTHxHEIGHT and angles degrees.
 """
 
 
