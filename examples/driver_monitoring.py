@@ -1,0 +1,230 @@
+"""From images of drivers with boxes to landmarks, head pose and gaze (some minutes): what a plain crop costs.
+
+Drivers sit all over the image of a camera of 130 degrees. Two equal networks learn from crops of their faces: plain
+ones, the square around the box, and those of `ct.augment.BoxCrop`, a camera that looks at the face, and that turns its
+labels along. What they find is compared in the camera's frame, by how far from the axis the face was.
+
+    python examples/driver_monitoring.py -o driver_monitoring.png
+    python examples/driver_monitoring.py --labels annotations.json  # landmarks of a data set that ct.data.read reads
+"""
+
+import argparse
+import time
+from itertools import pairwise
+from typing import Any
+
+import matplotlib.pyplot as plt
+import torch
+import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
+from scenes import cabin, faces
+from torch import Tensor, nn
+
+import camtorch as ct
+
+SIDE, MARGIN = 64, 0.15
+SIZE = (240, 320)
+MOUNT = (50.0, 28.0, 10.0)  # degrees of yaw, pitch and roll by which the camera looks past the driver
+CROPS = {"plain": "plain crops", "look_at": "crops that look at the face"}
+BANDS = (0, 15, 30, 45, 60)  # degrees from the axis
+Sample = dict[str, Any]
+
+
+# -- data
+
+
+def rendered(count: int, camera: ct.Camera, generator: torch.Generator) -> Sample:
+    """Drivers anywhere in the image, with boxes of their faces, landmarks, gaze and head poses."""
+    parts = []
+    while sum(len(part["gaze"]) for part in parts) < count:
+        drivers = cabin.random_drivers(25, generator)
+        turns = ((2 * torch.rand(25, 3, generator=generator) - 1) * torch.tensor(MOUNT)).double()
+        mount = ct.augment.mount_rotation(*turns.unbind(-1))
+        points, outline = (p @ mount.mT for p in (faces.points_of(drivers), drivers.face_box_points()))
+        (pixels, valid), (rim, _) = camera.project(points), camera.project(outline)
+        whole = (valid & camera.contains(pixels)).all(-1)
+        image = cabin.render(camera, drivers, mount[:, None].expand(-1, camera.height, 3, 3), samples=1)
+        pose = torch.eye(4).repeat(25, 1, 1).double()
+        pose[:, :3] = mount @ drivers.pose[:, :3]
+        part = {
+            "image": (255 * image).round().byte(),
+            "boxes": torch.cat((rim.amin(1), rim.amax(1)), -1)[:, None].float(),
+            "keypoints": pixels[:, : len(faces.NAMES)].float(),
+            "gaze": (mount @ drivers.gaze[..., None])[..., 0].float(),
+            "head_pose": pose.float(),
+        }
+        parts.append({name: value[whole] for name, value in part.items()})
+    return {name: torch.cat([part[name] for part in parts])[:count] for name in parts[0]}
+
+
+def read(path: str) -> list[Sample]:
+    """Samples of a file of labels with one face each: `image`, `boxes` and `keypoints`, of any sizes."""
+    found = []
+    for sample in ct.data.read(path):
+        if "boxes" not in sample:  # the box of the landmarks
+            points = sample["keypoints"]
+            sample["boxes"] = torch.cat((points.amin(-2), points.amax(-2)), -1).reshape(1, 4)
+        found.append(sample)
+    return found
+
+
+# -- crops
+
+
+def look_at(batch: Sample, jitter: float = 1.0) -> Sample:
+    """Crops of a camera that looks at each face, and the labels as that camera has them."""
+    ranges = {name: jitter * degrees for name, degrees in (("yaw", 2.0), ("pitch", 2.0), ("roll", 10.0))}
+    crop = ct.augment.BoxCrop((SIDE, SIDE), margin=MARGIN, zoom=0.1 * jitter, **ranges)
+    out: Sample = crop(batch)
+    return out
+
+
+def plain(batch: Sample, jitter: float = 1.0) -> Sample:
+    """The square around each box, scaled; directions stay those of the camera, which nobody told of the crop."""
+    camera, boxes = batch["camera"], batch["boxes"][:, 0]
+    low, high = boxes.split(2, -1)
+    chance = jitter * (2 * torch.rand(len(boxes), 3) - 1)
+    side = (1 + 2 * MARGIN) * (high - low).amax(-1, keepdim=True) * (1 + 0.1 * chance[:, :1])
+    middle = (low + high) / 2 + 0.06 * side * chance[:, 1:]
+    focal, centre = camera.intrinsics.expand(len(boxes), 4).split(2, -1)
+    numbers = torch.cat((focal * SIDE / side, (centre - middle) * SIDE / side + (SIDE - 1) / 2), -1)
+    near = camera.expand(len(boxes)).replace(numbers, image_size=(SIDE, SIDE))
+    warp = ct.Warp(camera, near)
+    keypoints = near.project(camera.unproject(batch["keypoints"])[0])[0]
+    return {**batch, "image": warp(batch["image"]), "keypoints": keypoints, "rotation": torch.eye(3)}
+
+
+WAYS = {"plain": plain, "look_at": look_at}
+
+
+# -- learning
+
+
+class Network(nn.Module):
+    """Crops (B, 3, SIDE, SIDE) to keypoints (B, N, 2) and to unit vectors of gaze and of the nose (B, 3)."""
+
+    def __init__(self, count: int) -> None:
+        super().__init__()
+        layers: list[nn.Module] = []
+        channels = (3, 16, 32, 32, 48, 64, 64)
+        for inputs, outputs, stride in zip(channels, channels[1:], (2, 2, 1, 2, 1, 2), strict=False):
+            layers += [nn.Conv2d(inputs, outputs, 3, stride, 1, bias=False), nn.GroupNorm(4, outputs), nn.ReLU()]
+        self.see = nn.Sequential(*layers, nn.Flatten(), nn.Linear(64 * (SIDE // 16) ** 2, 128), nn.ReLU())
+        self.keypoints, self.looks = nn.Linear(128, 2 * count), nn.Linear(128, 6)
+
+    def forward(self, images: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Keypoints, gaze, nose."""
+        seen = self.see((images.float() / 255 - 0.5).contiguous(memory_format=torch.channels_last))
+        keypoints = 20 * self.keypoints(seen).unflatten(1, (-1, 2)) + (SIDE - 1) / 2
+        ahead = torch.tensor([0.0, 0.0, 1.0])
+        gaze, nose = (F.normalize(v - ahead, dim=-1) for v in self.looks(seen).split(3, -1))
+        return keypoints, gaze, nose
+
+
+def nose_of(sample: Sample) -> Tensor:
+    """(B, 3): where noses point."""
+    pose: Tensor = sample["head_pose"]
+    return -pose[:, :3, 2]
+
+
+def train(way: str, data: Sample, camera: ct.Camera, steps: int) -> Network:
+    """A network that learns from crops of one kind."""
+    torch.manual_seed(0)
+    network = Network(data["keypoints"].shape[1])
+    optimizer = torch.optim.AdamW(network.parameters(), weight_decay=1e-4)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, 5e-3, total_steps=steps, pct_start=0.2)
+    for step in range(1, steps + 1):
+        index = torch.randint(len(data["image"]), (32,))
+        batch = WAYS[way]({**{name: value[index] for name, value in data.items()}, "camera": camera})
+        keypoints, gaze, nose = network(batch["image"])
+        loss = F.smooth_l1_loss(keypoints, batch["keypoints"], beta=2.0)
+        if "gaze" in batch:
+            loss = loss + 20 * ((gaze - batch["gaze"]).norm(dim=-1) + (nose - nose_of(batch)).norm(dim=-1)).mean()
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        schedule.step()
+        if step % 300 == 0 or step == steps:
+            print(f"{CROPS[way]:<28} step {step} of {steps}, loss {loss.item():.2f}", flush=True)
+    return network
+
+
+@torch.no_grad()
+def errors(way: str, network: Network, data: Sample, camera: ct.Camera) -> dict[str, Tensor]:
+    """Degrees that gaze and nose are off, and landmarks in parts of the eyes' distance, all of them (B,)."""
+    batch = WAYS[way]({**data, "camera": camera}, jitter=0.0)
+    keypoints, gaze, nose = network(batch["image"])
+    off = (keypoints - batch["keypoints"]).norm(dim=-1).mean(-1)
+    eyes = (batch["keypoints"][:, :2].mean(1) - batch["keypoints"][:, 2:4].mean(1)).norm(dim=-1)
+    found = {"landmarks": off / eyes}
+    if "gaze" in data:
+        for name, one, true in (("gaze", gaze, data["gaze"]), ("head", nose, nose_of(data))):
+            back = (batch["rotation"].mT @ one[..., None])[..., 0]  # into the camera's own frame
+            found[name] = torch.rad2deg(2 * torch.asin(((back - true).norm(dim=-1) / 2).clamp(max=1)))
+    return found
+
+
+def by_angle(values: Tensor, data: Sample, camera: ct.Camera) -> list[float]:
+    """Medians by how far from the axis faces are, in `BANDS`."""
+    rays = camera.unproject(data["boxes"][:, 0].unflatten(-1, (2, 2)).mean(1))[0]
+    angle = torch.rad2deg(torch.acos(rays[:, 2].clamp(-1, 1)))
+    return [float(values[(angle >= low) & (angle < high)].median()) for low, high in pairwise(BANDS)]
+
+
+def run(images: int = 500, count: int = 240, steps: int = 1500) -> dict[str, dict[str, list[float]]]:
+    """Render, train both, and measure: error -> way of cropping -> median in each band."""
+    start, generator = time.time(), torch.Generator().manual_seed(0)
+    camera = ct.KannalaBrandt.from_fov(130, image_size=SIZE).requires_grad_(False)
+    print(f"rendering {images} images to learn from and {count} to test", flush=True)
+    data, test = (rendered(n, camera, generator) for n in (images, count))
+    found: dict[str, dict[str, list[float]]] = {}
+    for way in CROPS:
+        for name, values in errors(way, train(way, data, camera, steps), test, camera).items():
+            found.setdefault(name, {})[way] = by_angle(values, test, camera)
+    print(f"\n{'median by degrees from the axis':<40}" + "".join(f"{f'{a} to {b}':>10}" for a, b in pairwise(BANDS)))
+    for name, ways in found.items():
+        for way, row in ways.items():
+            scale, unit = (100, "%") if name == "landmarks" else (1, "deg")
+            print(f"{f'{name}, {CROPS[way]}':<40}" + "".join(f"{f'{scale * v:.1f} {unit}':>10}" for v in row))
+    print(f"{time.time() - start:.0f} seconds")
+    return found
+
+
+def learn_landmarks(path: str, steps: int = 600) -> Network:
+    """Landmarks of a file of labels, by crops that look at each face; of an unknown camera 60 degrees are a guess."""
+    crops = []
+    for sample in read(path):
+        height, width = sample["image"].shape[-2:]
+        camera = sample.get("camera") or ct.Pinhole.from_fov(60, image_size=(height, width)).requires_grad_(False)
+        kept = {name: sample[name] for name in ("image", "boxes", "keypoints")}
+        crops.append(ct.augment.BoxCrop((2 * SIDE, 2 * SIDE), margin=2 * MARGIN, camera=camera)(kept))
+    data = {name: torch.stack([crop[name] for crop in crops]) for name in ("image", "keypoints")}
+    data["boxes"] = torch.stack([crop["boxes"][:1] for crop in crops])
+    near = ct.Pinhole.from_fov(20, image_size=(2 * SIDE, 2 * SIDE)).requires_grad_(False)  # crops look at the middle
+    print(f"{len(crops)} samples of {path}, {data['keypoints'].shape[1]} landmarks", flush=True)
+    return train("look_at", data, near, steps)
+
+
+def draw(found: dict[str, dict[str, list[float]]], output: str) -> None:
+    """Error over angle, for both."""
+    names = [name for name in ("head", "gaze", "landmarks") if name in found]
+    figure, axes = plt.subplots(1, len(names), figsize=(4 * len(names), 3.2), layout="constrained")
+    middles = [(low + high) / 2 for low, high in pairwise(BANDS)]
+    for axis, name in zip(axes, names, strict=True):
+        for way, colour in (("plain", "#8a8f98"), ("look_at", "#1e64f0")):
+            axis.plot(middles, found[name][way], "o-", color=colour, label=CROPS[way])
+        axis.set(title=name, xlabel="degrees from the axis", ylim=(0, None))
+        axis.set_ylabel("parts of the eyes' distance" if name == "landmarks" else "degrees, median")
+    axes[0].legend(frameon=False)
+    figure.savefig(output, dpi=100)
+    plt.close(figure)
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("-o", "--output", default="driver_monitoring.png")
+    parser.add_argument("--labels", help="a file that ct.data.read reads: landmarks are learned from it instead")
+    arguments = parser.parse_args()
+    if arguments.labels:
+        learn_landmarks(arguments.labels)
+    else:
+        draw(run(), arguments.output)
