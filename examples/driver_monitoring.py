@@ -34,7 +34,7 @@ Sample = dict[str, Any]
 
 def rendered(count: int, camera: ct.Camera, generator: torch.Generator) -> Sample:
     """Drivers anywhere in the image, with boxes of their faces, landmarks, gaze and head poses."""
-    parts = []
+    parts: list[Sample] = []
     while sum(len(part["gaze"]) for part in parts) < count:
         drivers = cabin.random_drivers(25, generator)
         turns = ((2 * torch.rand(25, 3, generator=generator) - 1) * torch.tensor(MOUNT)).double()
@@ -72,7 +72,9 @@ def read(path: str) -> list[Sample]:
 
 def look_at(batch: Sample, jitter: float = 1.0) -> Sample:
     """Crops of a camera that looks at each face, and the labels as that camera has them."""
-    ranges = {name: jitter * degrees for name, degrees in (("yaw", 2.0), ("pitch", 2.0), ("roll", 10.0))}
+    ranges: dict[str, Any] = {
+        name: jitter * degrees for name, degrees in (("yaw", 2.0), ("pitch", 2.0), ("roll", 10.0))
+    }
     crop = ct.augment.BoxCrop((SIDE, SIDE), margin=MARGIN, zoom=0.1 * jitter, **ranges)
     out: Sample = crop(batch)
     return out

@@ -4,6 +4,7 @@ import math
 
 import birds_eye
 import dewarp_room
+import driver_monitoring
 import numpy as np
 import predict_camera
 import pytest
@@ -183,6 +184,41 @@ def test_a_small_run_tries_all_networks_in_all_tests(tmp_path):
     assert all(list(result.curves) == list(train_faces.TESTS) for result in results.values())
     train_faces.draw(results, test, str(tmp_path / "faces.png"))
     assert is_a_figure(tmp_path / "faces.png")
+
+
+# -- driver_monitoring
+
+
+@pytest.fixture(scope="module")
+def drivers_of_a_fisheye():
+    camera = ct.KannalaBrandt.from_fov(130, image_size=(60, 80)).requires_grad_(False)
+    return camera, driver_monitoring.rendered(6, camera, torch.Generator().manual_seed(0))
+
+
+@pytest.mark.parametrize("way", driver_monitoring.WAYS)
+def test_both_crops_have_true_labels(way, drivers_of_a_fisheye):
+    """Landmarks lie as far from the gaze, by angle, as they do in the camera's image, and the box is in the middle."""
+    camera, data = drivers_of_a_fisheye
+    before = (camera.unproject(data["keypoints"])[0] * data["gaze"][:, None]).sum(-1)
+    crop = driver_monitoring.WAYS[way]({**data, "camera": camera}, jitter=0.0)
+    assert crop["image"].shape == (6, 3, SIDE, SIDE)
+    if way == "look_at":
+        after = (crop["camera"].unproject(crop["keypoints"])[0] * crop["gaze"][:, None]).sum(-1)
+        torch.testing.assert_close(after, before, atol=1e-4, rtol=0)
+        assert not torch.equal(crop["gaze"], data["gaze"])
+    assert bool(((crop["keypoints"] > -1) & (crop["keypoints"] < SIDE)).all())
+    assert (crop["keypoints"].mean(1) - SIDE / 2).abs().max() < SIDE / 4
+
+
+@pytest.mark.slow
+def test_a_small_run_measures_both_crops(tmp_path, monkeypatch):
+    monkeypatch.setattr(driver_monitoring, "SIZE", (60, 80))
+    found = driver_monitoring.run(images=8, count=60, steps=2)
+    assert {name: list(ways) for name, ways in found.items()} == {
+        name: list(driver_monitoring.CROPS) for name in ("landmarks", "gaze", "head")
+    }
+    driver_monitoring.draw(found, str(tmp_path / "drivers.png"))
+    assert is_a_figure(tmp_path / "drivers.png")
 
 
 # -- the scenes and OpenCV
