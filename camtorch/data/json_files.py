@@ -9,7 +9,7 @@ import re
 from array import array
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 import torch
@@ -19,21 +19,22 @@ from camtorch.augment.landmarks import LANDMARKS, TableLike
 from camtorch.augment.sample import KINDS, Sample
 from camtorch.camera import Camera
 from camtorch.data.columns import camera_of
-from camtorch.data.labelled import Samples, image_at, named_image, numbers_of, text_of
+from camtorch.data.labelled import Samples, failing_at, image_at, named_image, numbers_of, text_of
 from camtorch.models import BrownConrady, Pinhole
 
 Json = dict[str, Any]
-_TOKEN = re.compile(rb'"[^"\\]*(?:\\.[^"\\]*)*"|[][{}]', re.DOTALL)
-_COCO = ("keypoints", "bbox")
+_STRING = rb'"[^"\\]*(?:\\.[^"\\]*)*"'
+# a whole object without others in it, as most entries are; a string; a bracket
+_TOKEN = re.compile(rb'\{[^{}"]*(?:%b[^{}"]*)*\}|%b|[][{}]' % (_STRING, _STRING), re.DOTALL)
 
 
 class Coco(Samples):
     """COCO's keypoints: a sample for each annotation: a person, a face. Images without any have none.
 
     `keypoints` (N, 2), of which `keypoints_valid` are labelled, and `boxes` (1, 4): COCO has them between the edges of
-    pixels, so half a pixel is taken off. Outlines are left out. What `camtorch augment --dataset` adds is
-    read too: an image's `camera`, and an annotation's `gaze`, `head_pose` and other fields of a sample. The file is
-    known by where its entries begin, 16 bytes for each, and is not kept.
+    pixels, so half a pixel is taken off. Outlines are left out. What `camtorch augment --dataset` adds is read too: an
+    image's `camera`, and an annotation's `gaze`, `head_pose` and other fields of a sample. The file is known by where
+    its entries begin and end, 16 bytes for each, and is not kept.
     """
 
     def __init__(self, path: Path):
@@ -42,121 +43,105 @@ class Coco(Samples):
         for name in ("images", "annotations"):
             if name not in self._spans:
                 raise ValueError(f'{path}: a list "{name}" was expected, with objects in it')
-        ids = [self._entry("images", i)[0].get("id") for i in range(len(self._spans["images"]))]
-        if not all(isinstance(one, int) for one in ids) and not all(isinstance(one, str) for one in ids):
+        with path.open("rb") as file:
+            ids = [self._entry(file, "images", i)[0].get("id") for i in range(len(self._spans["images"]))]
+            groups = [self._entry(file, "categories", i)[0] for i in range(len(self._spans.get("categories", ())))]
+        if len({type(one) for one in ids}) > 1 or not isinstance(ids[0], (int, str)):
             raise ValueError(f"{path}: images: all need an id, a number; got {ids[:3]!r:.60}")
         self._order = np.argsort(np.asarray(ids), kind="stable")
-        self._ids = np.asarray(ids)[self._order]
+        self._ids, self._kind = np.asarray(ids)[self._order], type(ids[0])
         self._count = len(self._spans["annotations"])
-        names = [
-            self._entry("categories", i)[0].get("keypoints") for i in range(len(self._spans.get("categories", ())))
-        ]
-        self.landmarks = next((_table(some) for some in names if isinstance(some, list)), None)
+        self.landmarks = next((_table(one["keypoints"]) for one in groups if one.get("keypoints")), None)
 
-    def _entry(self, name: str, i: int) -> tuple[Json, str]:
+    def _entry(self, file: BinaryIO, name: str, i: int) -> tuple[Json, _Place]:
         """An entry of a list, and where it is."""
         start, end = self._spans[name][i].tolist()
-        with self.path.open("rb") as file:
-            file.seek(start)
-            content = file.read(end - start)
-        try:
-            return json.loads(text_of(content, "")), f"{self.path}, {name}[{i}]"
-        except (ValueError, RecursionError) as error:
-            line = getattr(error, "lineno", 1) + _lines_before(self.path, start)
-            raise ValueError(f"{self.path}, line {line}, {name}[{i}]: no JSON: {error}") from None
+        place = _Place(self.path, f"{name}[{i}]", start)
+        file.seek(start)
+        content = text_of(file.read(end - start), place)
+        with failing_at(place, "no JSON: ", ValueError, RecursionError):
+            return json.loads(content), place
 
     def _sample(self, number: int) -> Sample:
-        one, place = self._entry("annotations", number)
-        try:
-            return self._read(one, place)
-        except ValueError as error:
-            line = _lines_before(self.path, int(self._spans["annotations"][number, 0])) + 1
-            raise ValueError(str(error).replace(f"{self.path}, ", f"{self.path}, line {line}, ", 1)) from None
+        with self.path.open("rb") as file:
+            return self._read(file, *self._entry(file, "annotations", number))
 
-    def _read(self, one: Json, place: str) -> Sample:
+    def _read(self, file: BinaryIO, one: Json, place: _Place) -> Sample:
         key: Any = one.get("image_id")
-        is_like = isinstance(key, str if self._ids.dtype.kind == "U" else int)
-        at = int(np.searchsorted(self._ids, key)) if is_like else len(self._ids)
+        at = int(np.searchsorted(self._ids, key)) if type(key) is self._kind else len(self._ids)
         if at == len(self._ids) or self._ids[at] != key:
             raise ValueError(f"{place}: no image has the id {key!r:.60}")
-        entry, where = self._entry("images", int(self._order[at]))
-        stem = self.path.stem
-        folders = ("", "images", stem, stem.rpartition("_")[2], f"images/{stem.rpartition('_')[2]}")
+        entry, where = self._entry(file, "images", int(self._order[at]))
+        year = self.path.stem.rpartition("_")[2]  # of person_keypoints_train2017
+        folders = ("", "images", self.path.stem, year, f"images/{year}")
         path = named_image(self.path, entry.get("file_name"), folders, where)
         sample: Sample = {"image": image_at(path)}
-        for name in _COCO:
-            step = 3 if name == "keypoints" else 4
-            if one.get(name):
-                numbers = numbers_of(one[name], place, name)
-                if numbers.ndim != 1 or len(numbers) % step or (name == "bbox" and len(numbers) != step):
-                    raise ValueError(
-                        f"{place}: {name} must be a list of numbers, {step} for each; got {one[name]!r:.80}"
-                    )
-                sample[name] = numbers.reshape(-1, step)
+        for name, value in one.items():
+            step = {"keypoints": 3, "bbox": 4}.get(name)
+            if value and (step or name in KINDS):
+                numbers = numbers_of(value, place, name)
+                if step and (numbers.ndim != 1 or len(numbers) % step or (step == 4 and len(numbers) != 4)):
+                    raise ValueError(f"{place}: {name} must be a list of numbers, {step} for each; got {value!r:.80}")
+                sample[name] = numbers.reshape(-1, step) if step else numbers
         if "keypoints" in sample:
             rows = sample["keypoints"]
             sample |= {"keypoints": rows[:, :2].clone(), "keypoints_valid": rows[:, 2] > 0}
         if "bbox" in sample:
             corner, size = sample.pop("bbox").split(2, 1)
             sample["boxes"] = torch.cat((corner, corner + size), 1) - 0.5
-        for name, value in one.items():
-            if name in KINDS and name not in sample and value:
-                sample[name] = numbers_of(value, place, name)
         if entry.get("camera") is not None:
-            sample["camera"] = _stated(entry["camera"], where)
+            with failing_at(where, "camera: ", ValueError, TypeError, KeyError, AttributeError):
+                sample["camera"] = camera_of(entry["camera"], "camera")
         return {**sample, "path": str(path), "category_id": one.get("category_id", -1)}
 
 
-def _stated(parts: Any, place: str) -> Camera:
-    try:
-        return camera_of(parts, "camera")
-    except (ValueError, TypeError, KeyError, AttributeError) as error:
-        raise ValueError(f"{place}: camera: {error}") from None
+class _Place:
+    """Where in a file an entry is; its line is counted when an error names it."""
+
+    def __init__(self, path: Path, name: str, offset: int):
+        self._path, self._name, self._offset = path, name, offset
+
+    def __str__(self) -> str:
+        line, left = 1, self._offset
+        with self._path.open("rb") as file:
+            while left > 0 and (block := file.read(min(left, 1 << 20))):
+                line, left = line + block.count(b"\n"), left - len(block)
+        return f"{self._path}, line {line}{self._name and ', '}{self._name}"
 
 
 def _entries(path: Path) -> dict[str, np.ndarray[Any, Any]]:
     """Where the objects in the lists of a file's object begin and end: name -> (n, 2) bytes."""
     spans: dict[str, array[int]] = {}
-    depth, key, name, start = 0, b"", "", 0
-    with path.open("rb") as file:
-        if not path.stat().st_size:
-            raise ValueError(f"{path}, line 1: the file is empty")
-        with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
-            for match in _TOKEN.finditer(data):
-                token = match.group()
-                if token in (b"{", b"["):
-                    depth += 1
-                    if depth == 2:
-                        name = key[1:-1].decode(errors="replace") if token == b"[" else ""
-                    elif depth == 3:
-                        start = match.start()
-                elif token in (b"}", b"]"):
-                    depth -= 1
-                    if depth == 2 and name and token == b"}":
-                        spans.setdefault(name, array("q")).extend((start, match.end()))
-                elif depth == 1:
-                    key = token
+    depth, key, name, start, size = 0, b"", "", 0, path.stat().st_size
+    if not size:
+        raise ValueError(f"{path}, line 1: the file is empty")
+    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+        for match in _TOKEN.finditer(data):
+            token = match.group()
+            if token in (b"{", b"["):
+                depth += 1
+                if depth == 2:
+                    name = key[1:-1].decode(errors="replace") if token == b"[" else ""
+                elif depth == 3:
+                    start = match.start()
+            elif token[:1] == b'"':
+                key = token if depth == 1 else key
+            else:
+                whole = token[:1] == b"{"
+                depth -= not whole
+                if depth == 2 and name and token[-1:] == b"}":
+                    spans.setdefault(name, array("q")).extend((match.start() if whole else start, match.end()))
     if depth:
-        line = _lines_before(path, path.stat().st_size) + 1
-        raise ValueError(f"{path}, line {line}: the file is cut short: {depth} brackets are open at its end")
+        raise ValueError(f"{_Place(path, '', size)}: the file is cut short: {depth} brackets are open at its end")
     return {name: np.frombuffer(found, np.int64).reshape(-1, 2) for name, found in spans.items()}
 
 
-def _lines_before(path: Path, offset: int) -> int:
-    count = 0
-    with path.open("rb") as file:
-        while offset > 0 and (block := file.read(min(offset, 1 << 20))):
-            count, offset = count + block.count(b"\n"), offset - len(block)
-    return count
-
-
 def _table(names: list[Any]) -> TableLike | None:
-    """Of the names of keypoints, those with left and right in them; else the table that is known of as many."""
-    places = {str(name).lower(): i for i, name in enumerate(names)}
-    pairs = [(i, places[other]) for name, i in places.items() if (other := name.replace("left", "right")) in places]
-    pairs = [(i, j) for i, j in pairs if i != j]
+    """The table that is known of so many keypoints; else pairs of left and right in their names."""
     known = [name for name, table in LANDMARKS.items() if len(table) == len(names)]
-    return known[0] if known and not (pairs and known != ["coco17"]) else pairs or None
+    places = {str(name): i for i, name in enumerate(names)}
+    sides = [(i, places.get(name.replace("left", "right"), i)) for name, i in places.items()]
+    return known[0] if known else [(i, other) for i, other in sides if i != other] or None
 
 
 # -- OpenLABEL
@@ -177,10 +162,8 @@ class Vcd(Samples):
 
     def __init__(self, path: Path):
         super().__init__(path)
-        try:
-            content = json.loads(text_of(path.read_bytes(), str(path)))
-        except (json.JSONDecodeError, RecursionError) as error:
-            raise ValueError(f"{path}, line {getattr(error, 'lineno', 1)}: no whole JSON: {error}") from None
+        with failing_at(path, "no whole JSON: ", json.JSONDecodeError, RecursionError):
+            content = json.loads(text_of(path.read_bytes(), path))
         root = _object(content, "openlabel", str(path)) or _object(content, "vcd", str(path))
         self._root, self._place = root, str(path)
         frames = _object(root, "frames", self._place)
@@ -221,7 +204,9 @@ class Vcd(Samples):
         sample["actions"] = [str(actions.get(uid, {}).get("type", "")) for uid in _object(content, "actions", place)]
         pinhole = self._properties(stream).get("intrinsics_pinhole") if stream else None
         if pinhole is not None:
-            sample["camera"] = _pinhole(pinhole, f"{self._place}, streams.{stream}.intrinsics_pinhole")
+            where = f"{self._place}, streams.{stream}.intrinsics_pinhole"
+            with failing_at(where, "", ValueError, TypeError, KeyError, AttributeError):
+                sample["camera"] = _pinhole(pinhole)
         return sample
 
     def _geometry(self, content: Json, kind: str, stream: str, place: str) -> Iterator[tuple[str, Any, str]]:
@@ -237,11 +222,8 @@ class Vcd(Samples):
                     yield f"{whose}/{item.get('name', '')}", item["val"], where
 
     def _image(self, uri: str, at: int, place: str) -> Tensor:
-        name = uri if not Path(uri).is_absolute() and ".." not in Path(uri).parts else Path(uri).name
-        try:
-            path = named_image(self.path, name, ("",), place)
-        except ValueError:
-            path = named_image(self.path, Path(name).name, ("",), place)
+        folder = "" if Path(uri).is_absolute() or ".." in Path(uri).parts else str(Path(uri).parent)
+        path = named_image(self.path, Path(uri).name, ("", folder), place)
         return image_at(path) if path.suffix.lower() in (".jpg", ".jpeg", ".png", ".bmp") else _video_frame(path, at)
 
 
@@ -258,15 +240,12 @@ def _corners(values: Tensor) -> Tensor:
     return torch.cat((middle - size / 2, middle + size / 2), 1)
 
 
-def _pinhole(told: Any, place: str) -> Camera:
-    try:
-        K = np.reshape(told.get("camera_matrix", told.get("camera_matrix_3x4")), (3, 4))[:, :3]  # noqa: N806
-        lens = told.get("distortion_coeffs", told.get("distortion_coeffs_1xN")) or None
-        size = told["height_px"], told["width_px"]
-        camera = (BrownConrady if lens else Pinhole).from_matrix(K.astype(np.float64), lens, image_size=size)
-        return camera.requires_grad_(False)
-    except (ValueError, TypeError, KeyError, AttributeError) as error:
-        raise ValueError(f"{place}: {error}") from None
+def _pinhole(told: Json) -> Camera:
+    K = np.reshape(told["camera_matrix" if "camera_matrix" in told else "camera_matrix_3x4"], (3, 4))[:, :3]  # noqa: N806
+    lens = told.get("distortion_coeffs", told.get("distortion_coeffs_1xN")) or None
+    size = told["height_px"], told["width_px"]
+    camera = (BrownConrady if lens else Pinhole).from_matrix(K.astype(np.float64), lens, image_size=size)
+    return camera.requires_grad_(False)
 
 
 def _video_frame(path: Path, number: int) -> Tensor:
@@ -275,14 +254,12 @@ def _video_frame(path: Path, number: int) -> Tensor:
         av = importlib.import_module("av")
     except ImportError:
         raise ImportError(f'{path}: videos need PyAV: pip install "camtorch[video]"') from None
-    try:
-        with av.open(str(path)) as container:
-            stream = container.streams.video[0]
-            seconds = number / stream.average_rate
-            container.seek(int(seconds / stream.time_base) + (stream.start_time or 0), stream=stream)
-            for frame in container.decode(stream):
-                if (frame.pts - (stream.start_time or 0)) * stream.time_base > seconds - 1 / (2 * stream.average_rate):
-                    return torch.from_numpy(frame.to_ndarray(format="rgb24").transpose(2, 0, 1).copy())
-    except (av.error.FFmpegError, IndexError, TypeError, ZeroDivisionError) as error:
-        raise ValueError(f"{path}: not a whole video: {error}") from None
+    errors = av.error.FFmpegError, IndexError, TypeError, ZeroDivisionError
+    with failing_at(path, "not a whole video: ", *errors), av.open(str(path)) as container:
+        stream = container.streams.video[0]
+        seconds, begin = number / stream.average_rate, stream.start_time or 0
+        container.seek(int(seconds / stream.time_base) + begin, stream=stream)
+        for frame in container.decode(stream):
+            if (frame.pts - begin) * stream.time_base > seconds - 1 / (2 * stream.average_rate):
+                return torch.from_numpy(frame.to_ndarray(format="rgb24").transpose(2, 0, 1).copy())
     raise ValueError(f"{path}: the video ends before frame {number}")

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
 import torch
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 from torch import Tensor
 from torch.utils.data import Dataset
 
@@ -83,16 +84,15 @@ def files_in(path: Path, *endings: str, within: str | None = None) -> list[str]:
 # -- images
 
 
-def image_at(path: Path) -> Tensor:
-    """An image as it is stored: uint8 (3, H, W) RGB; grey ones (1, H, W) uint8, or uint16 if they are that deep."""
-    try:
-        with Image.open(path) as opened:
-            image = load_stored(opened)
-            array = np.array(image if image.mode in ("L", "I;16") else image.convert("RGB"))
-    except (OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError) as error:
-        missing = isinstance(error, FileNotFoundError)
-        reason = "not an image that Pillow can read" if isinstance(error, UnidentifiedImageError) else error
-        raise ValueError(f"{path}: {'no such image' if missing else reason}") from None
+def image_at(path: Path, *, is_mask: bool = False) -> Tensor:
+    """An image as it is stored: uint8 (3, H, W) RGB; grey ones (1, H, W) uint8, or uint16 if they are that deep.
+
+    Of a mask with a palette its numbers, and no colours.
+    """
+    kinds = OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError
+    with failing_at(path, "", *kinds), Image.open(path) as opened:
+        image = load_stored(opened)
+        array = np.array(image if image.mode in ("L", "I;16", "P" if is_mask else "L") else image.convert("RGB"))
     return torch.from_numpy(array[None] if array.ndim == 2 else np.ascontiguousarray(array.transpose(2, 0, 1)))
 
 
@@ -105,7 +105,7 @@ def image_beside(path: Path, folder: Path | None = None) -> Path:
     raise ValueError(f"{path}: no image beside it; it would be {named[0]}, or end with {', '.join(_IMAGES[1:4])}")
 
 
-def named_image(labels: Path, name: Any, folders: Iterable[str], place: str) -> Path:
+def named_image(labels: Path, name: Any, folders: Iterable[str], place: object) -> Path:
     """The file that labels name, in these folders beside the labels, or up to three folders above."""
     parts = PurePosixPath(name if isinstance(name, str) and "\0" not in name else "")
     if parts.is_absolute() or ".." in parts.parts or not parts.name:
@@ -149,22 +149,26 @@ class Lines:
             return text_of(file.read(int(self._bounds[number + 1] - self._bounds[number])), place).strip(), place
 
 
-def text_of(content: bytes, place: str) -> str:
+def text_of(content: bytes, place: object) -> str:
     """As UTF-8.
 
     Raises:
         ValueError: another encoding.
     """
+    with failing_at(place, "not text in UTF-8: ", UnicodeDecodeError):
+        return content.decode("utf-8-sig")
+
+
+@contextmanager
+def failing_at(place: object, what: str, *kinds: type[Exception]) -> Iterator[None]:
+    """Errors of these kinds in the block are a ValueError that names the place."""
     try:
-        text = content.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise ValueError(f"{place}: not text in UTF-8: {error.reason}; got {content[:20]!r}") from None
-    if "\0" in text:
-        raise ValueError(f"{place}: not text in UTF-8, but seemingly in UTF-16; got {content[:20]!r}")
-    return text
+        yield
+    except kinds as error:
+        raise ValueError(f"{place}: {what}{error}") from None
 
 
-def numbers_of(words: Sequence[Any], place: str, what: str) -> Tensor:
+def numbers_of(words: Sequence[Any], place: object, what: str) -> Tensor:
     """Finite numbers, of words or of JSON, as float32.
 
     Raises:
@@ -174,7 +178,7 @@ def numbers_of(words: Sequence[Any], place: str, what: str) -> Tensor:
         if any(isinstance(word, bool) for word in words):
             raise ValueError
         values = np.asarray(words, np.float64)
-        if not np.isfinite(values).all() or (np.abs(values) > np.finfo(np.float32).max).any():
+        if not (np.abs(values) <= np.finfo(np.float32).max).all():
             raise ValueError
     except (TypeError, ValueError, OverflowError):
         raise ValueError(f"{place}: {what} must be finite numbers; got {words!s:.80}") from None

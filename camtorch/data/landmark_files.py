@@ -96,7 +96,7 @@ class Lapa(FileSamples):
             raise ValueError(f"{path}, line 1: 106, the number of points, was expected; got {lines[:1]!r:.80}")
         points, root = _points(path, lines[1:], 106), path.parent.parent
         image = image_beside(path, root / "images")
-        mask = image_at(root / "labels" / f"{path.stem}.png")
+        mask = image_at(root / "labels" / f"{path.stem}.png", is_mask=True)
         return {"image": image_at(image), "keypoints": points, "mask": mask[0], "path": str(image)}
 
 

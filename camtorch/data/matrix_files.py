@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from camtorch.augment.sample import Sample, from_pitch_yaw
-from camtorch.data.labelled import FileSamples, image_at, image_beside, numbers_of
+from camtorch.data.labelled import FileSamples, failing_at, image_at, image_beside, numbers_of
 from camtorch.models import Pinhole
 from camtorch.rotations import rotation_matrix
 
@@ -67,14 +67,11 @@ def _matlab(path: Path, names: tuple[str, ...]) -> dict[str, np.ndarray[Any, Any
     if is_hdf:
         with _hdf(path) as arrays:
             return {name: np.asarray(arrays[name]).T for name in names if name in arrays}
-    try:
-        loadmat = importlib.import_module("scipy.io").loadmat
-    except ImportError:
-        raise ImportError(f'{path}: files of Matlab need scipy: pip install "camtorch[datasets]"') from None
-    try:
+    loadmat = _imported("scipy.io", path).loadmat
+    with failing_at(
+        path, "not a whole file of Matlab: ", Exception
+    ):  # scipy has many kinds of errors for damaged files
         found = loadmat(path, variable_names=names)
-    except Exception as error:  # of damaged files scipy has many kinds
-        raise ValueError(f"{path}: not a whole file of Matlab: {error}") from None
     return {name: np.asarray(found[name]) for name in names if name in found}
 
 
@@ -130,12 +127,14 @@ _FIELDS = {"face_head_pose": "pitch_yaw_head", "face_mat_norm": "rotation"}
 @contextmanager
 def _hdf(path: Path) -> Iterator[Any]:
     """A file of HDF5; what goes wrong with it in the block is a ValueError that names it."""
+    open_file = _imported("h5py", path).File
+    with failing_at(path, "not a whole file of HDF5: ", OSError, KeyError, RuntimeError), open_file(path, "r") as file:
+        yield file
+
+
+def _imported(name: str, path: Path) -> Any:
     try:
-        open_file = importlib.import_module("h5py").File
+        return importlib.import_module(name)
     except ImportError:
-        raise ImportError(f'{path}: files of HDF5 need h5py: pip install "camtorch[datasets]"') from None
-    try:
-        with open_file(path, "r") as file:
-            yield file
-    except (OSError, KeyError, RuntimeError) as error:
-        raise ValueError(f"{path}: not a whole file of HDF5: {error}") from None
+        package = name.partition(".")[0]
+        raise ImportError(f'{path}: to read it needs {package}: pip install "camtorch[datasets]"') from None

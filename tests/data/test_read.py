@@ -64,6 +64,10 @@ def lapa(root):
     for i in range(2):
         picture(root / "train" / "images" / f"{i}.png")
         picture(root / "train" / "labels" / f"{i}.png", mask)
+        if i == 0:  # with colours for eyes
+            coloured = Image.fromarray(mask, "P")
+            coloured.putpalette(list(range(30, 63)))
+            coloured.save(root / "train" / "labels" / "0.png")
         text(root / "train" / "landmarks" / f"{i}.txt", 106, *map(row, points(106, i)))
     text(root / "readme.txt", "106 points")
     return root, {"keypoints": points(106, 0), "mask": mask}
@@ -307,7 +311,7 @@ def test_images_are_opened_when_their_sample_is_asked_for(dataset, tmp_path):
     for image in tmp_path.rglob("*.png"):
         image.unlink()
     if name != "eth_xgaze":
-        with pytest.raises(ValueError, match=r"no image beside|no file|no such image"):
+        with pytest.raises(ValueError, match=r"no image beside|no file|No such file"):
             samples[0]
 
 
@@ -397,7 +401,7 @@ def test_faults_in_json_name_file_and_line(tmp_path):
     path, _ = vcd(tmp_path)
     whole = path.read_text()
     path.write_text(whole[:-40])
-    assert "line 1: no whole JSON" in message(path)
+    assert re.search(r"no whole JSON: .* line 1 ", message(path))
     for old, new, told in (
         ("[10, 11, 4, 6]", "[10, 11, 4]", "frames.2.objects.0: bbox must be 4 numbers"),
         ("[10, 11, 4, 6]", '[10, 11, 4, "a"]', "bbox must be finite numbers"),
@@ -447,7 +451,7 @@ def test_a_format_that_is_not_seen_is_an_error_that_lists_them(tmp_path):
     with pytest.raises(ValueError, match="seems to be of 300w and 300w_lp; format= one of"):
         ct.data.read(tmp_path)
     assert len(ct.data.read(tmp_path, "300w")) == 2
-    with pytest.raises(ValueError, match="format must be one of coco, .*; got 'yolo'"):
+    with pytest.raises(ValueError, match=r"format must be one of coco, .*; got 'yolo'"):
         ct.data.read(tmp_path, "yolo")
     with pytest.raises(ValueError, match="is a folder"):
         ct.data.read(tmp_path, "coco")
@@ -461,5 +465,5 @@ def test_a_missing_package_is_named_with_its_extra(tmp_path, monkeypatch):
 
     monkeypatch.setattr(importlib, "import_module", missing)
     for path, package in zip(paths, ("scipy", "h5py"), strict=True):
-        with pytest.raises(ImportError, match=rf'need {package}: pip install "camtorch\[datasets\]"'):
+        with pytest.raises(ImportError, match=rf'needs {package}: pip install "camtorch\[datasets\]"'):
             ct.data.read(path, {"scipy": "300w_lp", "h5py": "eth_xgaze"}[package])[0]
