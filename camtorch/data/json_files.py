@@ -7,7 +7,6 @@ import json
 import mmap
 import re
 from array import array
-from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -155,89 +154,71 @@ class Vcd(Samples):
     the camera's stream, or is not said. `actions`: the types of those in this frame, as "gaze_zone/front". `camera`:
     of a stream's `intrinsics_pinhole`. `frame` is the number in the file, `stream` the name of the camera.
 
-    `image` is the frame of the stream's video (by PyAV, `camtorch[video]`), where the file says which and it is there
-    by its path or its name: the DMD's `frame_shift` counts from the first frame of the camera that began first. A
-    picture as `uri` is taken for all frames. A stream without `uri` has no image. The file is read at once.
+    `image` is the frame of the stream's video (by PyAV, `camtorch[video]`), which lies by its path or its name beside
+    the file: the DMD's `frame_shift` counts from the first frame of the camera that began first. A sample has none
+    where a video has not begun or has ended, and of a stream without `uri`. A picture as `uri` is taken for all frames.
+    The file is read at once.
     """
 
     def __init__(self, path: Path):
         super().__init__(path)
         with failing_at(path, "no whole JSON: ", json.JSONDecodeError, RecursionError):
             content = json.loads(text_of(path.read_bytes(), path))
-        root = _object(content, "openlabel", str(path)) or _object(content, "vcd", str(path))
-        self._root, self._place = root, str(path)
-        frames = _object(root, "frames", self._place)
-        if not frames or not all(re.fullmatch("[0-9]{1,15}", number) for number in frames):
-            raise ValueError(
-                f"{path}: frames by their numbers were expected, as OpenLABEL has them; got {list(frames)[:3]}"
-            )
-        self._frames = sorted(frames, key=int)
-        streams = _object(root, "streams", self._place)
-        self._streams = [name for name in streams if streams[name].get("type", "camera") == "camera"] or [""]
+        with failing_at(path, "not as OpenLABEL has it: ", ValueError, TypeError, KeyError, AttributeError):
+            self._root: Json = content.get("openlabel") or content["vcd"]
+            self._frames = sorted(self._root["frames"], key=int)
+            streams = self._root.get("streams", {})
+            self._streams = [name for name, one in streams.items() if one.get("type", "camera") == "camera"] or [""]
+            self._shifts = {
+                name: self._properties(name).get("sync", {}).get("frame_shift", 0) for name in self._streams
+            }
+            self._first = min(0, *self._shifts.values(), 0)
         self._count = len(self._frames) * len(self._streams)
-        shifts = [self._properties(name).get("sync", {}).get("frame_shift", 0) for name in self._streams]
-        self._first = min(0, *shifts, 0)
 
     def _properties(self, stream: str) -> Json:
-        one = _object(_object(self._root, "streams", self._place), stream, self._place)
-        return _object(one, "stream_properties", f"{self._place}, streams.{stream}")
+        properties: Json = self._root.get("streams", {}).get(stream, {}).get("stream_properties", {})
+        return properties
 
     def _sample(self, number: int) -> Sample:
         frame, stream = self._frames[number // len(self._streams)], self._streams[number % len(self._streams)]
-        place = f"{self._place}, frames.{frame}"
-        content = _object(self._root["frames"], frame, place)
-        sample: Sample = {"frame": int(frame), "stream": stream}
-        uri = _object(_object(self._root, "streams", place), stream, place).get("uri")
+        place = f"{self.path}, frames.{frame}"
+        with failing_at(place, "not as OpenLABEL has it: ", TypeError, KeyError, AttributeError):
+            return self._read(frame, stream, place)
+
+    def _read(self, frame: str, stream: str, place: str) -> Sample:
+        content, sample = self._root["frames"][frame], Sample(frame=int(frame), stream=stream)
+        uri = self._root.get("streams", {}).get(stream, {}).get("uri")
         if uri:
-            sync = self._properties(stream).get("sync", {})
-            at = int(frame) - sync.get("frame_shift", 0) + self._first
-            sample["image"] = self._image(uri, at, place)
-        for kind, field, count in (("bbox", "box", 4), ("point2d", "point", 2)):
-            found = list(self._geometry(content, kind, stream, place))
-            if found:
-                values = torch.stack([numbers_of(value, where, kind) for _, value, where in found])
-                if values.shape[1:] != (count,):
-                    raise ValueError(f"{found[0][2]}: {kind} must be {count} numbers; got {found[0][1]!r:.60}")
-                sample["boxes" if count == 4 else "keypoints"] = _corners(values) if count == 4 else values
-                sample[f"{field}_names"] = [name for name, *_ in found]
-        actions = _object(self._root, "actions", place)
-        sample["actions"] = [str(actions.get(uid, {}).get("type", "")) for uid in _object(content, "actions", place)]
-        pinhole = self._properties(stream).get("intrinsics_pinhole") if stream else None
+            image = self._image(uri, int(frame) - self._shifts[stream] + self._first, place)
+            sample |= {} if image is None else {"image": image}
+        for kind, count in (("bbox", 4), ("point2d", 2)):
+            names, values = [], []
+            for uid, one in content.get("objects", {}).items():
+                whose = self._root["objects"][uid]["type"]
+                for item in one.get("object_data", {}).get(kind, ()):
+                    if item.get("coordinate_system", stream) == stream or not stream:
+                        names.append(f"{whose}/{item.get('name', '')}")
+                        values.append(numbers_of(item["val"], f"{place}.objects.{uid}", kind))
+                        if values[-1].shape != (count,):
+                            raise ValueError(
+                                f"{place}.objects.{uid}: {kind} must be {count} numbers; got {item['val']}"
+                            )
+            if kind == "bbox" and values:
+                middle, size = torch.stack(values).split(2, 1)
+                sample |= {"boxes": torch.cat((middle - size / 2, middle + size / 2), 1), "box_names": names}
+            elif values:
+                sample |= {"keypoints": torch.stack(values), "point_names": names}
+        sample["actions"] = [self._root["actions"][uid]["type"] for uid in content.get("actions", {})]
+        pinhole = self._properties(stream).get("intrinsics_pinhole")
         if pinhole is not None:
-            where = f"{self._place}, streams.{stream}.intrinsics_pinhole"
-            with failing_at(where, "", ValueError, TypeError, KeyError, AttributeError):
+            with failing_at(f"{self.path}, streams.{stream}.intrinsics_pinhole", "", ValueError, TypeError, KeyError):
                 sample["camera"] = _pinhole(pinhole)
         return sample
 
-    def _geometry(self, content: Json, kind: str, stream: str, place: str) -> Iterator[tuple[str, Any, str]]:
-        """Name, value and place of the boxes or points of a frame, of all objects."""
-        known = _object(self._root, "objects", place)
-        for uid, one in _object(content, "objects", place).items():
-            where = f"{place}.objects.{uid}"
-            whose = _object(known, uid, where).get("type", uid)
-            for item in _object(one, "object_data", where).get(kind, ()):
-                if not isinstance(item, Mapping) or "val" not in item:
-                    raise ValueError(f"{where}: {kind} must be an object with a val; got {item!r:.60}")
-                if item.get("coordinate_system", stream) in (stream, ""):
-                    yield f"{whose}/{item.get('name', '')}", item["val"], where
-
-    def _image(self, uri: str, at: int, place: str) -> Tensor:
+    def _image(self, uri: str, at: int, place: str) -> Tensor | None:
         folder = "" if Path(uri).is_absolute() or ".." in Path(uri).parts else str(Path(uri).parent)
         path = named_image(self.path, Path(uri).name, ("", folder), place)
         return image_at(path) if path.suffix.lower() in (".jpg", ".jpeg", ".png", ".bmp") else _video_frame(path, at)
-
-
-def _object(parent: Any, name: str, place: str) -> Json:
-    """An entry that is an object, or {} if there is none."""
-    value = parent.get(name, {}) if isinstance(parent, Mapping) else parent
-    if not isinstance(value, dict):
-        raise ValueError(f"{place}: {name} must be an object; got {value!r:.60}")
-    return value
-
-
-def _corners(values: Tensor) -> Tensor:
-    middle, size = values.split(2, 1)
-    return torch.cat((middle - size / 2, middle + size / 2), 1)
 
 
 def _pinhole(told: Json) -> Camera:
@@ -248,8 +229,8 @@ def _pinhole(told: Json) -> Camera:
     return camera.requires_grad_(False)
 
 
-def _video_frame(path: Path, number: int) -> Tensor:
-    """A frame of a video of a constant rate, by its number from 0."""
+def _video_frame(path: Path, number: int) -> Tensor | None:
+    """A frame of a video of a constant rate, by its number from 0; None if it has not begun, or has ended."""
     try:
         av = importlib.import_module("av")
     except ImportError:
@@ -258,8 +239,9 @@ def _video_frame(path: Path, number: int) -> Tensor:
     with failing_at(path, "not a whole video: ", *errors), av.open(str(path)) as container:
         stream = container.streams.video[0]
         seconds, begin = number / stream.average_rate, stream.start_time or 0
-        container.seek(int(seconds / stream.time_base) + begin, stream=stream)
-        for frame in container.decode(stream):
-            if (frame.pts - begin) * stream.time_base > seconds - 1 / (2 * stream.average_rate):
-                return torch.from_numpy(frame.to_ndarray(format="rgb24").transpose(2, 0, 1).copy())
-    raise ValueError(f"{path}: the video ends before frame {number}")
+        if number >= 0 and not (stream.frames and number >= stream.frames):
+            container.seek(int(seconds / stream.time_base) + begin, stream=stream)
+            for frame in container.decode(stream):
+                if (frame.pts - begin) * stream.time_base > seconds - 1 / (2 * stream.average_rate):
+                    return torch.from_numpy(frame.to_ndarray(format="rgb24").transpose(2, 0, 1).copy())
+    return None

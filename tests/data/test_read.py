@@ -303,6 +303,11 @@ def test_frames_of_each_camera_by_their_shift(tmp_path):
     assert grey == pytest.approx([8 * 6, 8 * 10], abs=4)
     assert [one["actions"] for one in samples] == [["gaze_zone/front"]] * 4
     assert samples[1]["box_names"] == ["driver/shape", "phone/shape"]
+    # in frame 2 the face's had not begun; in frame 31 the body's has ended
+    assert ["image" in one for one in samples] == [False, True, True, True]
+    content["openlabel"]["frames"]["31"] = {}
+    path.write_text(json.dumps(content))
+    assert ["image" in one for one in ct.data.read(path)][-2:] == [True, False]
 
 
 def test_images_are_opened_when_their_sample_is_asked_for(dataset, tmp_path):
@@ -405,8 +410,10 @@ def test_faults_in_json_name_file_and_line(tmp_path):
     for old, new, told in (
         ("[10, 11, 4, 6]", "[10, 11, 4]", "frames.2.objects.0: bbox must be 4 numbers"),
         ("[10, 11, 4, 6]", '[10, 11, 4, "a"]', "bbox must be finite numbers"),
+        ('"val": [10', '"value": [10', "frames.2: not as OpenLABEL has it: 'val'"),
         ("[30, 0, 16, 0, ", "[30, 0, 16, ", "intrinsics_pinhole: cannot reshape"),
-        ('"frames"', '"frame"', "frames by their numbers were expected"),
+        ('"frames"', '"frame"', "not as OpenLABEL has it: 'frames'"),
+        ('"10": {', '"ten": {', "not as OpenLABEL has it: invalid literal"),
     ):
         path.write_text(whole.replace(old, new))
         assert told in message(path)
