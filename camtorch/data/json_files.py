@@ -203,11 +203,12 @@ class Vcd(Samples):
                             raise ValueError(
                                 f"{place}.objects.{uid}: {kind} must be {count} numbers; got {item['val']}"
                             )
-            if kind == "bbox" and values:
-                middle, size = torch.stack(values).split(2, 1)
+            found = torch.stack(values) if values else torch.zeros(0, count)
+            if kind == "bbox":
+                middle, size = found.split(2, 1)
                 sample |= {"boxes": torch.cat((middle - size / 2, middle + size / 2), 1), "box_names": names}
-            elif values:
-                sample |= {"keypoints": torch.stack(values), "point_names": names}
+            else:
+                sample |= {"keypoints": found, "point_names": names}
         sample["actions"] = [self._root["actions"][uid]["type"] for uid in content.get("actions", {})]
         pinhole = self._properties(stream).get("intrinsics_pinhole")
         if pinhole is not None:
