@@ -30,9 +30,7 @@ TRAINING_SETS = {
     "affine": "... with RandomAffine",
     "camtorch": "... with camtorch",
     "camtorch_rays": "... with camtorch and rays",
-    "own_rays": "the limit: these cameras and rays",
 }
-MOUNTS_EACH = 8  # of each driver, in the images of the test's own lenses
 TESTS = {
     "seen": "the same camera",
     "mounts": "other lenses and mounts",
@@ -93,18 +91,6 @@ def warped(seen: Photographs, index: Tensor, warp: ct.Warp, whole: Tensor) -> Sa
 AUGMENTATIONS: dict[str, Augment] = {"plain": plain, "affine": by_affine, "camtorch": by_camera}
 
 
-def of_own(own: Samples) -> Augment:
-    """Images of the cameras of the test themselves, of the same drivers: what augmentation can come up to."""
-
-    def some(seen: Photographs, index: Tensor, generator: torch.Generator) -> Samples:
-        which = index + len(seen.image) * torch.randint(
-            len(own.image) // len(seen.image), index.shape, generator=generator
-        )
-        return Samples(*(values[which] for values in own))
-
-    return some
-
-
 # -- learning
 
 
@@ -160,18 +146,10 @@ class Result(NamedTuple):
     """By the test: a step, and what `medians` was after it."""
 
 
-def train(
-    name: str,
-    network: Network,
-    seen: Photographs,
-    tests: dict[str, Samples],
-    augmentations: dict[str, Augment],
-    steps: int,
-    seed: int,
-) -> Result:
+def train(name: str, network: Network, seen: Photographs, tests: dict[str, Samples], steps: int, seed: int) -> Result:
     """Train a network on batches of 32 photographs, augmented on the fly, and look how it does."""
     generator = torch.Generator().manual_seed(seed)
-    augment = partial(augmentations[name.removesuffix("_rays")], seen)
+    augment = partial(AUGMENTATIONS[name.removesuffix("_rays")], seen)
     network.with_rays = name.endswith("_rays")
     optimizer = torch.optim.AdamW(network.parameters(), weight_decay=1e-4)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, 5e-3, total_steps=steps, pct_start=0.2)
@@ -205,8 +183,6 @@ def run(images: int = 400, count: int = 150, steps: int = 1500, seed: int = 0) -
     drivers, others = (cabin.random_drivers(n, generator) for n in (images, count))
     seen = faces.photograph(drivers)
     mounts, shutter = (faces.by_others(others, generator, rolling=rolling) for rolling in (False, True))
-    own = [faces.by_others(drivers, generator, rolling=i % 2 > 0) for i in range(MOUNTS_EACH)]
-    augmentations = {**AUGMENTATIONS, "own": of_own(Samples(*map(torch.cat, zip(*own, strict=True))))}
     tests = {"seen": faces.by_teacher(others), "mounts": mounts, "shutter": shutter}
     torch.manual_seed(seed)
     first = Network()
@@ -215,10 +191,7 @@ def run(images: int = 400, count: int = 150, steps: int = 1500, seed: int = 0) -
     torch.set_num_threads(1)
     try:
         with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
-            jobs = [
-                pool.submit(train, name, copy.deepcopy(first), seen, tests, augmentations, steps, seed)
-                for name in TRAINING_SETS
-            ]
+            jobs = [pool.submit(train, n, copy.deepcopy(first), seen, tests, steps, seed) for n in TRAINING_SETS]
             results = dict(zip(TRAINING_SETS, (job.result() for job in jobs), strict=True))
     finally:
         torch.set_num_threads(threads)

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from camtorch.cli import cameras, dataset, images, labels, sheet
+from camtorch.cli import cameras, coco, dataset, images, labels, sheet
 from camtorch.cli.commands import SHEET, SHEET_COUNT
 from camtorch.cli.terminal import note
 
@@ -67,7 +67,9 @@ def _photograph(arguments: argparse.Namespace) -> sheet.LabelledImage:
     image, orientation = images.read(arguments.image)
     height, width = image.shape[-2:]
     entries = None if arguments.labels is None else labels.read_json(arguments.labels)
-    if entries is None or "camera" not in entries:
+    if entries is not None and "images" in entries:
+        entries = coco.labels_of(arguments.labels, arguments.image, (height, width))
+    if entries is None or entries.get("camera") is None:
         camera, _ = cameras.read_posed(arguments.image, (height, width), arguments)
     elif arguments.camera is None:
         try:

@@ -68,6 +68,29 @@ def read(path: Path) -> DataSet:
     return DataSet(path, content, images, of)
 
 
+def labels_of(path: Path, image: Path, size: tuple[int, int]) -> Json:
+    """Keypoints that are labelled and boxes of one image, and its camera if stated, as a JSON of a sample has them.
+
+    Raises:
+        LabelsError: `read`'s; not one image of this name. ValueError: what is not as COCO has it.
+    """
+    data = read(path)
+    named = [one for one in data.images if PurePosixPath(one["file_name"]).name == image.name]
+    if len(named) != 1:
+        raise LabelsError(f"{path}: {len(named)} images have the name {image.name}")
+    keypoints: list[list[float]] = []
+    boxes: list[list[float]] = []
+    for i, one in data.annotations[named[0]["id"]]:
+        try:
+            parts = _Parts.of({**one, "segmentation": []}, size)
+        except (ValueError, TypeError) as error:
+            raise LabelsError(f"{path}: annotations[{i}]: {error}") from None
+        if parts.keypoints is not None:
+            keypoints += parts.keypoints[np.asarray(one["keypoints"][2::3]) > 0].tolist()
+        boxes += [] if parts.box is None else parts.box.tolist()
+    return {"keypoints": keypoints, "boxes": boxes, "camera": named[0].get("camera")}
+
+
 def _fault_of(image: Any, known: Mapping[Any, object]) -> str:
     """What is wrong with an entry of an image."""
     if not isinstance(image, dict) or not isinstance(image.get("id"), (int, str)):

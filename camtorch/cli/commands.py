@@ -138,7 +138,7 @@ def _augment(commands: Commands) -> None:
     add = command.add_argument
     text = "the image; the folder of images of a data set"
     add("image", type=words.path, nargs="?", metavar="IMAGE", help=text)
-    text = "of IMAGE: JSON of keypoints, boxes, gaze_from in pixels, gaze, and perhaps its camera"
+    text = "of IMAGE: JSON of keypoints, boxes, gaze_from in pixels, gaze, and perhaps its camera; or as for --dataset"
     add("--labels", type=words.path, metavar="FILE", help=text)
     add("--preset", default="none", metavar="NAME", help="whose lens the other cameras have")
     add("--list", action="store_true", help="print the presets, and nothing else")

@@ -71,6 +71,7 @@ def labels_of(entries: Json, path: Path, camera: Camera) -> Labels:
         LabelsError: numbers that are none, a box whose corners are swapped, a gaze of no direction, or from a pixel
             that has no ray.
     """
+    entries = {name: value for name, value in entries.items() if value is not None}
     values = {name: _numbers(path, name, entries[name]) for name in _SHAPES if name in entries}
     has_gaze = "gaze" in values and "gaze_from" in values
     shown = {name for name in values if has_gaze or not name.startswith("gaze")}
@@ -83,30 +84,36 @@ def labels_of(entries: Json, path: Path, camera: Camera) -> Labels:
         if name in values and valid is not None:
             if not isinstance(valid, list) or len(valid) != len(values[name]):
                 raise LabelsError(f"{path}: {name}_valid: must be a list, true or false for each of {name}")
-            values[name] = values[name][np.asarray(valid, bool)]
+            values[name] = values[name][np.asarray(valid, bool).reshape(len(valid), -1).all(1)]
     boxes = values.get("boxes", np.zeros((0, 4)))
     for box in boxes[(boxes[:, :2] > boxes[:, 2:]).any(1)].tolist():
         raise LabelsError(f"{path}: boxes: x1 <= x2 and y1 <= y2 must hold; got {box}")
     eyes = gaze = torch.zeros(0, 3, dtype=torch.float64)
     if has_gaze and entries.get("gaze_valid", True) and entries.get("gaze_from_valid", True):
         gaze = torch.from_numpy(values["gaze"])
-        if not gaze.norm() > 1e-6:
+        if not (gaze.norm(dim=-1) > 1e-6).all():
             raise LabelsError(f"{path}: gaze: a direction has a length; got {entries['gaze']}")
         eyes, seen = camera.unproject(torch.from_numpy(values["gaze_from"]))
         if not bool(seen):
             raise LabelsError(f"{path}: gaze_from: the camera has no ray at {entries['gaze_from']}")
-        eyes, gaze = eyes.double(), gaze / gaze.norm()
+        eyes, gaze = eyes.double().expand_as(gaze), gaze / gaze.norm(dim=-1, keepdim=True)
     keypoints = values.get("keypoints", np.zeros((0, 2)))
     return Labels(torch.from_numpy(keypoints), torch.from_numpy(boxes), eyes, gaze)
 
 
 def _numbers(path: Path, name: str, entry: Any) -> np.ndarray[Any, Any]:
     count, has_many, shape = _SHAPES[name]
+    has_many |= name == "gaze" and _is_nested(entry)  # of several, from the same pixel
     for row in entry if has_many and isinstance(entry, list) else [entry]:
+        row = row[0] if name == "keypoints" and _is_nested(row) and len(row) == 1 else row  # as OpenCV has them
         numbers: list[Any] = row if isinstance(row, list) and len(row) == count else [None]
         if not all(type(n) in (int, float) and abs(n) <= _FARTHEST for n in numbers):
             raise LabelsError(f"{path}: {name}: must be {shape}, numbers between -1e6 and 1e6; got {_short(row)}")
     return np.asarray(entry, np.float64).reshape(-1, count)
+
+
+def _is_nested(value: Any) -> bool:
+    return isinstance(value, list) and bool(value) and isinstance(value[0], list)
 
 
 def _short(value: object) -> str:

@@ -5,7 +5,9 @@ What a sample becomes follows from the sample, its key, a seed and the epoch, wh
 
 from camtorch.data.batches import MapBatches
 from camtorch.data.columns import from_columns, to_columns
+from camtorch.data.files import read
+from camtorch.data.labelled import Samples
 from camtorch.data.samples import MapSamples
 from camtorch.data.seeded import Key, Seeded, generator
 
-__all__ = ["Key", "MapBatches", "MapSamples", "Seeded", "from_columns", "generator", "to_columns"]
+__all__ = ["Key", "MapBatches", "MapSamples", "Samples", "Seeded", "from_columns", "generator", "read", "to_columns"]

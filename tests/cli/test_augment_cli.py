@@ -1,5 +1,6 @@
 import json
 import math
+import re
 from pathlib import Path
 
 import numpy as np
@@ -248,3 +249,35 @@ def test_the_labels_of_a_data_set_are_those_of_an_image(folder, capsys):
     new = json.loads(Path("new/in.json").read_text())
     augment("new/in.png", "--labels", "new/in.json", "-n", 1, "-o", "again.png")
     assert f" of {sum(new['keypoints_valid'])} points" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("entries", "points"),
+    [
+        ({"keypoints": [[[20, 30]], [[60, 20]]], "keypoints_valid": [[True], [False]]}, 1),  # OpenCV's shape
+        ({"keypoints": [[20, 30], [60, 20]], "boxes": None, "gaze": None, "camera": None}, 2),
+        ({"keypoints": [[20, 30]], "gaze": [[0, 0, -1], [0.1, 0, -1]], "gaze_from": [40, 30]}, 1),
+    ],
+)
+def test_forms_that_a_data_set_may_have_are_those_of_an_image(folder, capsys, entries, points):
+    Path("in.json").write_text(json.dumps(entries))
+    augment(".", "--dataset", ".", "--camera", "camera.yml", "-o", "new", "--jobs", 1)
+    left = int(np.sum(json.loads(Path("new/in.json").read_text())["keypoints_valid"]))
+    for name, camera, count in (("in", ("--camera", "camera.yml"), points), ("new/in", (), left)):
+        capsys.readouterr()
+        augment(f"{name}.png", "--labels", f"{name}.json", *camera, "-n", 1, "-o", "sheet.png", "--force")
+        assert f" of {count} points" in capsys.readouterr().out
+
+
+def test_of_a_file_of_coco_the_image_is_shown_whose_name_it_is(folder, capsys):
+    numbers = ct.data.to_columns(camera(), "")
+    stated = {name[1:]: value if isinstance(value, str) else value.tolist() for name, value in numbers.items()}
+    images = [{"id": i, "file_name": f"{name}.png", "camera": stated} for i, name in enumerate(("in", "other"))]
+    face = {"image_id": 0, "bbox": [10, 20, 30, 20], "keypoints": [20, 30, 2, 0, 0, 0, 60, 20, 1]}
+    content = {"images": images, "annotations": [{"id": 1, **face}, {"id": 2, **face, "image_id": 1}]}
+    Path("coco.json").write_text(json.dumps(content))
+    augment("in.png", "--labels", "coco.json", "-n", 1)
+    assert re.search(r"of 2 points, \d of 1 boxes", capsys.readouterr().out)
+    Path("third.png").write_bytes(Path("in.png").read_bytes())
+    error = refused(capsys, "augment", "third.png", "--labels", "coco.json", "-o", "third-sheet.png")
+    assert "coco.json: 0 images have the name third.png" in error

@@ -126,7 +126,7 @@ def folder(tmp_path, monkeypatch, request):
 )
 @pytest.mark.parametrize(("page", "line", "code"), [*blocks("python")])
 def test_a_block_runs_by_itself(page, line, code, folder):
-    for name in ("albumentations", "pycolmap", "ray"):
+    for name in ("albumentations", "h5py", "pycolmap", "ray"):
         if re.search(rf"^import {name}\b", code, re.M) and importlib.util.find_spec(name) is None:
             pytest.skip(f"{name} is not installed")
     exec(compile("\n" * (line - 1) + code, str(page), "exec"), {"__name__": "__main__"})

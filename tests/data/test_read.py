@@ -1,0 +1,476 @@
+"""Label files of data sets, made here as their authors describe them, come out as samples that augmentations take."""
+
+import importlib
+import json
+import pickle
+import re
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from torch.utils.data import DataLoader
+
+import camtorch as ct
+from camtorch.augment.landmarks import LANDMARKS
+
+SIZE = (24, 32)
+IMAGE = np.random.default_rng(0).integers(0, 255, (*SIZE, 3), np.uint8)
+
+
+def picture(path, array=IMAGE):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(array).save(path)
+    return path
+
+
+def points(count, seed=1):
+    return np.random.default_rng(seed).uniform(2, 20, (count, 2)).round(3)
+
+
+def text(path, *lines):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text("".join(f"{line}\n" for line in lines))
+    return path
+
+
+def row(*values):
+    return " ".join(str(value) for value in np.concatenate([np.ravel(v) for v in values]).tolist())
+
+
+# -- a data set of each format: what is read, and what comes out
+
+
+def wflw(root):
+    for name in ("0--Parade/a.png", "1--Car/b.png"):
+        picture(root / "WFLW_images" / name)
+    lines = [
+        f"{row(points(98, i))} 3 4 20 21 0 0 1 0 0 {i} {name}"
+        for i, name in enumerate(("0--Parade/a.png", "1--Car/b.png"))
+    ]
+    labels = root / "WFLW_annotations" / "list_98pt_rect_attr_train_test" / "list_98pt_rect_attr_train.txt"
+    return text(labels, *lines), {"keypoints": points(98, 0), "boxes": [[3, 4, 20, 21]]}
+
+
+def pts(root):
+    for i in range(2):
+        picture(root / f"indoor_{i}.png")
+        text(root / f"indoor_{i}.pts", "version: 1", "n_points:  68", "{", *map(row, points(68, i) + 1), "}")
+    return root, {"keypoints": points(68, 0)}
+
+
+def lapa(root):
+    mask = IMAGE[..., 0] % 11
+    for i in range(2):
+        picture(root / "train" / "images" / f"{i}.png")
+        picture(root / "train" / "labels" / f"{i}.png", mask)
+        if i == 0:  # with colours for eyes
+            coloured = Image.fromarray(mask, "P")
+            coloured.putpalette(list(range(30, 63)))
+            coloured.save(root / "train" / "labels" / "0.png")
+        text(root / "train" / "landmarks" / f"{i}.txt", 106, *map(row, points(106, i)))
+    text(root / "readme.txt", "106 points")
+    return root, {"keypoints": points(106, 0), "mask": mask}
+
+
+def mat(root):
+    io = pytest.importorskip("scipy.io")
+    for i in range(2):
+        picture(root / f"AFW_{i}.png")
+        pose = np.array([[0.3, -0.5, 0.2, 9, 8, 7, 1e-3]])
+        io.savemat(root / f"AFW_{i}.mat", {"pt2d": points(68, i).T + 1, "Pose_Para": pose, "Exp_Para": np.ones(29)})
+    return root, {"keypoints": points(68, 0)}
+
+
+def xgaze(root):
+    h5py = pytest.importorskip("h5py")
+    rng = np.random.default_rng(2)
+    patches, angles = rng.integers(0, 255, (3, 224, 224, 3), np.uint8), rng.uniform(-0.5, 0.5, (3, 2))
+    root.mkdir(exist_ok=True)
+    for name, rows in (("subject0000.h5", slice(0, 1)), ("subject0003.h5", slice(1, 3))):
+        with h5py.File(root / name, "w") as file:
+            file["face_patch"], file["face_gaze"] = patches[rows], angles[rows]
+            file["face_head_pose"] = -angles[rows]
+            file["face_mat_norm"] = np.eye(3)[None].repeat(len(patches[rows]), 0)
+    gaze = ct.augment.from_pitch_yaw(torch.tensor(angles[0])).numpy()
+    return root, {"image": patches[0][..., ::-1], "gaze": gaze, "pitch_yaw_head": -angles[0], "rotation": np.eye(3)}
+
+
+def coco(root):
+    picture(root / "train2017" / "a.png")
+    entry = {"id": 7, "file_name": "a.png", "width": 32, "height": 24, "license": 1}
+    person = {"id": 1, "image_id": 7, "category_id": 1, "bbox": [2, 3, 10, 12], "iscrowd": 0, "area": 5.5}
+    body = np.column_stack([points(17), np.arange(17) % 3])
+    person |= {"keypoints": body.ravel().tolist(), "segmentation": [[1, 2, 3, 4, 5, 6]], "caption": 'a "[{ \\ é'}
+    second = {"id": 2, "image_id": 7, "category_id": 1, "bbox": [0, 0, 1, 1], "gaze": [0, 0, -1]}
+    names = ["nose", *(f"{side}_{part}" for part in "abcdefgh" for side in ("left", "right"))]
+    content = {
+        "info": {"year": 2017, "x": {"y": [{}]}},
+        "images": [entry],
+        "annotations": [person, second],
+        "categories": [{"id": 1, "name": "person", "keypoints": names, "skeleton": [[1, 2]]}],
+    }
+    path = root / "annotations" / "person_keypoints_train2017.json"
+    path.parent.mkdir()
+    path.write_text(json.dumps(content, ensure_ascii=False, indent=1), encoding="utf-8")
+    boxes, valid = [[1.5, 2.5, 11.5, 14.5]], np.arange(17) % 3 > 0
+    return path, {"keypoints": points(17), "keypoints_valid": valid, "boxes": boxes}
+
+
+def vcd(root):
+    picture(root / "gA" / "face.png")
+    intrinsics = {"width_px": 32, "height_px": 24, "camera_matrix": [30, 0, 16, 0, 0, 31, 12, 0, 0, 0, 1, 0]}
+    stream = {"type": "camera", "uri": "gA/face.png", "stream_properties": {"intrinsics_pinhole": intrinsics}}
+    face = {"bbox": [{"name": "shape", "val": [10, 11, 4, 6]}], "point2d": [{"name": "chin", "val": [3.5, 4.5]}]}
+    other = {"bbox": [{"name": "shape", "val": [1, 1, 1, 1], "coordinate_system": "body_camera"}]}
+    root_object = {
+        "metadata": {"schema_version": "1.0.0"},
+        "streams": {"face_camera": stream},
+        "objects": {"0": {"name": "3", "type": "driver"}, "1": {"name": "", "type": "phone"}},
+        "actions": {"4": {"name": "", "type": "gaze_zone/front"}},
+        "frames": {
+            "10": {"actions": {"4": {}}},
+            "2": {"objects": {"0": {"object_data": face}, "1": {"object_data": other}}, "actions": {"4": {}}},
+        },
+    }
+    path = root / "gA_1_s1_ann.json"
+    path.write_text(json.dumps({"openlabel": root_object}))
+    return path, {"boxes": [[8, 8, 12, 14]], "keypoints": [[3.5, 4.5]]}
+
+
+SETS = {"wflw": wflw, "300w": pts, "lapa": lapa, "300w_lp": mat, "eth_xgaze": xgaze, "coco": coco, "vcd": vcd}
+LENGTHS = {"eth_xgaze": 3}
+TABLES = {"wflw": "wflw98", "300w": "ibug68", "300w_lp": "ibug68", "lapa": "lapa106", "coco": "coco17"}
+
+
+@pytest.fixture(params=SETS)
+def dataset(request, tmp_path):
+    path, expected = SETS[request.param](tmp_path / "set" if request.param == "eth_xgaze" else tmp_path)
+    return request.param, path, expected
+
+
+def test_samples_are_what_the_file_says(dataset):
+    name, path, expected = dataset
+    samples = ct.data.read(path)
+    assert samples.format == name == ct.data.read(str(path), name).format
+    assert len(samples) == len(list(samples)) == LENGTHS.get(name, 2)
+    expected = {"image": IMAGE} | expected
+    expected["image"] = expected["image"].transpose(2, 0, 1)
+    for field, value in expected.items():
+        found = samples[0][field]
+        assert isinstance(found, torch.Tensor)
+        torch.testing.assert_close(found.double(), torch.as_tensor(np.array(value)).double(), rtol=0, atol=1e-5)
+    assert samples[-1].keys() == samples[len(samples) - 1].keys()
+    for beyond in (len(samples), -len(samples) - 1):
+        with pytest.raises(IndexError):
+            samples[beyond]
+    assert name in repr(samples)
+
+
+def test_augmentations_take_samples_and_mirror_them_twice_into_themselves(dataset):
+    name, path, _ = dataset
+    samples = ct.data.read(path)
+    assert samples.landmarks == TABLES.get(name)
+    sample = samples[0]
+    camera = sample.get("camera") or ct.Pinhole.from_fov(60, image_size=sample["image"].shape[1:])
+    turned = ct.augment.RandomMount(yaw=1, min_filled=0.9, camera=camera)(sample)
+    assert turned["image"].shape == sample["image"].shape
+    flip = ct.augment.HorizontalFlip(p=1.0, landmarks=samples.landmarks)
+    back = flip(flip(sample))
+    for field in ("image", "keypoints", "boxes", "gaze", "head_pose", "mask", "pitch_yaw_head"):
+        if field in sample:
+            torch.testing.assert_close(back[field], sample[field], atol=1e-4, rtol=0)
+
+
+def test_loaders_take_samples_in_workers(dataset):
+    _, path, _ = dataset
+    samples = pickle.loads(pickle.dumps(ct.data.read(path)))
+    loader = DataLoader(samples, batch_size=1, num_workers=2, collate_fn=list)
+    read = [batch[0] for batch in loader]
+    for one, other in zip(read, samples, strict=True):
+        assert torch.equal(one["image"], other["image"])
+
+
+# -- what the formats have of their own
+
+
+def test_wflw_attributes_and_lists_without_boxes(tmp_path):
+    path, _ = wflw(tmp_path)
+    names = ("pose", "expression", "illumination", "make_up", "occlusion", "blur")
+    assert ct.data.read(path)[1]["attributes"] == dict(zip(names, (0, 0, 1, 0, 0, 1), strict=True))
+    short = text(tmp_path / "list_98pt_test.txt", f"{row(points(98))} 0--Parade/a.png")
+    sample = ct.data.read(short)[0]
+    assert sample["keypoints"].shape == (98, 2)
+    assert "boxes" not in sample
+
+
+def test_head_pose_points_the_nose_where_pose_para_says(tmp_path):
+    io = pytest.importorskip("scipy.io")
+    picture(tmp_path / "a.png")
+    for pitch, yaw, roll in ((0, 0, 0), (0.4, 0, 0), (0, 0.5, 0), (0, 0, 0.3), (0.2, -0.7, 0.4)):
+        io.savemat(
+            tmp_path / "a.mat",
+            {
+                "pt2d": np.ones((2, 21)),
+                "pt3d_68": np.ones((3, 68)) * 5,
+                "Pose_Para": [[pitch, yaw, roll, 1, 2, 3, 0.1]],
+            },
+        )
+        sample = ct.data.read(tmp_path / "a.mat")[0]
+        # 3DDFA's own matrices, in its frame, y up and z out of the image
+        c, s = np.cos, np.sin
+        x = np.array([[1, 0, 0], [0, c(pitch), s(pitch)], [0, -s(pitch), c(pitch)]])
+        y = np.array([[c(yaw), 0, -s(yaw)], [0, 1, 0], [s(yaw), 0, c(yaw)]])
+        z = np.array([[c(roll), s(roll), 0], [-s(roll), c(roll), 0], [0, 0, 1]])
+        turned = np.diag([1, -1, -1])
+        expected = turned @ x @ y @ z @ turned
+        np.testing.assert_allclose(sample["head_pose"][:3, :3], expected, atol=1e-6)
+        assert sample["keypoints"].tolist() == [[4, 4]] * 68  # of AFLW2000, whose pt2d are 21
+        nose = sample["head_pose"][:3, :3] @ torch.tensor([0.0, 0, -1])
+        if roll == 0 and not (pitch and yaw):
+            torch.testing.assert_close(ct.augment.to_pitch_yaw(nose), torch.tensor([pitch, yaw]).float())
+
+
+def test_matlab_7_3_is_read_as_hdf5(tmp_path):
+    h5py = pytest.importorskip("h5py")
+    picture(tmp_path / "a.png")
+    with h5py.File(tmp_path / "a.mat", "w", userblock_size=512) as file:
+        file["pt2d"], file["Pose_Para"] = points(68) + 1, np.zeros((7, 1))
+    with (tmp_path / "a.mat").open("r+b") as file:
+        file.write(b"MATLAB 7.3 MAT-file".ljust(512))
+    torch.testing.assert_close(ct.data.read(tmp_path)[0]["keypoints"], torch.tensor(points(68)).float())
+
+
+def test_the_camera_of_normalised_faces_is_the_authors(tmp_path):
+    camera = ct.data.read(xgaze(tmp_path)[0])[2]["camera"]
+    assert camera.image_size == (224, 224)
+    assert camera.intrinsics.tolist() == [960, 960, 112, 112]
+    assert not camera.intrinsics.requires_grad
+
+
+def test_coco_reads_what_a_data_set_of_other_cameras_states(tmp_path):
+    path, _ = coco(tmp_path)
+    content = json.loads(path.read_text(encoding="utf-8"))
+    camera = ct.Pinhole.from_fov(70, image_size=SIZE)
+    parts = {name.removeprefix("camera_"): value for name, value in ct.data.to_columns(camera).items()}
+    content["images"][0]["camera"] = {k: v if isinstance(v, str) else v.tolist() for k, v in parts.items()}
+    path.write_text(json.dumps(content))
+    sample = ct.data.read(path)[1]
+    torch.testing.assert_close(sample["camera"].intrinsics.float(), camera.intrinsics.detach())
+    assert sample["gaze"].tolist() == [0, 0, -1]
+    assert "keypoints" not in sample
+
+
+@pytest.mark.parametrize("count", [68, 5])
+def test_coco_tables_of_other_keypoints(tmp_path, count):
+    path, _ = coco(tmp_path)
+    content = json.loads(path.read_text(encoding="utf-8"))
+    content["categories"][0]["keypoints"] = ["left_eye", "right_eye", "nose", "right_ear", "left_ear"]
+    if count == 68:
+        content["categories"][0]["keypoints"] = [str(i) for i in range(68)]
+    path.write_text(json.dumps(content))
+    table = ct.data.read(path).landmarks
+    if count == 68:
+        assert LANDMARKS[table] == LANDMARKS["ibug68"]
+    else:
+        assert sorted(map(sorted, table)) == [[0, 1], [3, 4]]
+
+
+def test_frames_of_each_camera_by_their_shift(tmp_path):
+    av = pytest.importorskip("av")
+    path, _ = vcd(tmp_path)
+    for name in ("face.mp4", "body.mp4"):
+        with av.open(str(tmp_path / name), "w") as container:
+            stream = container.add_stream("mpeg4", rate=25)
+            stream.width, stream.height, stream.pix_fmt = 32, 32, "yuv420p"
+            for i in range(30):
+                frame = av.VideoFrame.from_ndarray(np.full((32, 32, 3), 8 * i, np.uint8), format="rgb24")
+                container.mux(stream.encode(frame))
+            container.mux(stream.encode())
+    content = json.loads(path.read_text())
+    content["openlabel"]["streams"] = {
+        "face_camera": {"type": "camera", "uri": "gone/face.mp4", "stream_properties": {"sync": {"frame_shift": 0}}},
+        "body_camera": {"type": "camera", "uri": "body.mp4", "stream_properties": {"sync": {"frame_shift": -4}}},
+        "lidar": {"type": "lidar"},
+    }
+    path.write_text(json.dumps(content))
+    samples = ct.data.read(path)
+    assert [(one["frame"], one["stream"]) for one in samples] == [
+        (frame, f"{name}_camera") for frame in (2, 10) for name in ("face", "body")
+    ]
+    # the body's camera began four frames before the face's, and so did the numbers
+    grey = [float(one["image"].float().mean()) for one in samples if one["frame"] == 10]
+    assert grey == pytest.approx([8 * 6, 8 * 10], abs=4)
+    assert [one["actions"] for one in samples] == [["gaze_zone/front"]] * 4
+    assert samples[1]["box_names"] == ["driver/shape", "phone/shape"]
+    # in frame 2 the face's had not begun; in frame 31 the body's has ended
+    assert ["image" in one for one in samples] == [False, True, True, True]
+    content["openlabel"]["frames"]["31"] = {}
+    path.write_text(json.dumps(content))
+    assert ["image" in one for one in ct.data.read(path)][-2:] == [True, False]
+
+
+def test_images_are_opened_when_their_sample_is_asked_for(dataset, tmp_path):
+    name, path, _ = dataset
+    samples = ct.data.read(path)
+    for image in tmp_path.rglob("*.png"):
+        image.unlink()
+    if name != "eth_xgaze":
+        with pytest.raises(ValueError, match=r"no image beside|no file|No such file"):
+            samples[0]
+
+
+def test_many_lines_are_known_by_where_they_begin(tmp_path):
+    picture(tmp_path / "a.png")
+    line = f"{row(points(98).round())} a.png\r\n".encode()
+    path = tmp_path / "list.txt"
+    path.write_bytes((line + b"\r\n") * 20_000)
+    samples = ct.data.read(path)
+    assert len(samples) == 20_000
+    assert len(pickle.dumps(samples)) < 60_000 * 16 + 1000
+    assert torch.equal(samples[19_999]["keypoints"], samples[0]["keypoints"])
+
+
+# -- files that are not what they should be
+
+
+def message(path, index=0, format=None):
+    with pytest.raises(ValueError, match=re.escape(path.name)) as caught:
+        ct.data.read(path, format)[index]
+    return str(caught.value)
+
+
+def test_faults_in_text_name_file_and_line(tmp_path):
+    path, _ = wflw(tmp_path)
+    lines = path.read_text().splitlines()
+    path.write_text("\n".join([lines[0], "", lines[1][:700]]))
+    assert ct.data.read(path)[0]["keypoints"].shape == (98, 2)
+    assert ", line 3: 98 points, a box" in message(path, 1)
+    path.write_text("\n".join([lines[0], "nan " + lines[1].partition(" ")[2]]))
+    assert ", line 2: points must be finite numbers" in message(path, 1)
+    path.write_text(lines[0].replace(" 0 0 1 0 0 0 ", " 0 0 2 0 0 0 "))
+    assert ", line 1: attributes must be 0 or 1" in message(path)
+    path.write_text(lines[0].replace("0--Parade", "../x"))
+    assert "within the folder of images" in message(path)
+    path.write_text(lines[0], encoding="utf-16")
+    assert "line 1: not text in UTF-8" in message(path, format="wflw")
+    path.write_bytes(b"")
+    assert len(ct.data.read(path, "wflw")) == 0
+
+    pts(tmp_path / "300w")
+    face = tmp_path / "300w" / "indoor_0.pts"
+    whole = face.read_text()
+    for content, told in (
+        (whole[:300], "the file is cut short"),
+        (whole.replace("68", "66", 1), "line 2: 68 points were expected; got n_points"),
+        (whole.replace("{\n", "{\n1 2\n"), "line 72: 68 points were expected; got 69"),
+        (whole.replace("{\n", "{\n1 2 3\n"), "line 4: a point is x y"),
+        ("", "line 1: version: 1"),
+    ):
+        face.write_text(content)
+        assert told in message(face)
+    face.write_bytes(whole.encode("latin-1") + b"\xe9")
+    assert "not text in UTF-8" in message(face)
+
+    lapa(tmp_path / "lapa")
+    face = tmp_path / "lapa" / "train" / "landmarks" / "0.txt"
+    whole = face.read_text()
+    face.write_text(whole.replace("106\n", "98\n"))
+    assert "line 1: 106, the number of points" in message(face, format="lapa")
+    face.write_text(whole.rsplit("\n", 3)[0])
+    assert "line 105: 106 points were expected; got 104" in message(face)
+
+
+def test_faults_in_json_name_file_and_line(tmp_path):
+    path, _ = coco(tmp_path)
+    whole = path.read_text(encoding="utf-8")
+    content = json.loads(whole)
+    path.write_text(whole[:-400])
+    assert f"line {whole[:-400].count(chr(10)) + 1}: the file is cut short" in message(path)
+    person = content["annotations"][0]
+    for change, told in (
+        ({"image_id": 8}, "no image has the id 8"),
+        ({"image_id": "7"}, "no image has the id '7'"),
+        ({"bbox": [1, 2, 3]}, "bbox must be a list of numbers, 4 for each"),
+        ({"keypoints": [1, 2]}, "keypoints must be a list of numbers, 3 for each"),
+        ({"keypoints": [None] * 51}, "keypoints must be finite numbers"),
+    ):
+        content["annotations"][0] = person | change
+        path.write_text(json.dumps(content, indent=1))
+        assert re.search(rf"line \d+, annotations\[0\]: {re.escape(told)}", message(path))
+    path.write_text(json.dumps(content, indent=1).replace('"category_id": 1', '"category_id": 1 1', 1))
+    assert re.search(r"line \d+, annotations\[0\]: no JSON", message(path))
+    path.write_text('{"images": [1], "annotations": []}')
+    assert 'a list "images" was expected' in message(path)
+
+    path, _ = vcd(tmp_path)
+    whole = path.read_text()
+    path.write_text(whole[:-40])
+    assert re.search(r"no whole JSON: .* line 1 ", message(path))
+    for old, new, told in (
+        ("[10, 11, 4, 6]", "[10, 11, 4]", "frames.2.objects.0: bbox must be 4 numbers"),
+        ("[10, 11, 4, 6]", '[10, 11, 4, "a"]', "bbox must be finite numbers"),
+        ('"val": [10', '"value": [10', "frames.2: not as OpenLABEL has it: 'val'"),
+        ("[30, 0, 16, 0, ", "[30, 0, 16, ", "intrinsics_pinhole: cannot reshape"),
+        ('"frames"', '"frame"', "not as OpenLABEL has it: 'frames'"),
+        ('"10": {', '"ten": {', "not as OpenLABEL has it: invalid literal"),
+    ):
+        path.write_text(whole.replace(old, new))
+        assert told in message(path)
+
+
+def test_faults_in_arrays_name_the_file(tmp_path):
+    io = pytest.importorskip("scipy.io")
+    mat(tmp_path / "lp")
+    path = tmp_path / "lp" / "AFW_0.mat"
+    whole = path.read_bytes()
+    for content in (whole[:300], whole[:100], b"", b"x" * 500):
+        path.write_bytes(content)
+        message(path)
+    io.savemat(path, {"pt2d": np.ones((2, 21)), "Pose_Para": np.ones((1, 7))})
+    assert "pt2d (2, 68) or pt3d_68 (3, 68) was expected" in message(path)
+    io.savemat(path, {"pt2d": np.full((2, 68), np.nan), "Pose_Para": np.ones((1, 7))})
+    assert "points must be finite numbers" in message(path)
+    io.savemat(path, {"pt2d": np.ones((2, 68))})
+    assert "Pose_Para (1, 7) was expected" in message(path)
+
+
+def test_faults_in_hdf5_name_the_file(tmp_path):
+    h5py = pytest.importorskip("h5py")
+    xgaze(tmp_path)
+    path = tmp_path / "subject0000.h5"
+    path.write_bytes(path.read_bytes()[:700])
+    assert "not a whole file of HDF5" in message(path)
+    with h5py.File(path, "w") as file:
+        file["face_patch"], file["face_gaze"] = np.zeros((2, 8, 8, 3), np.uint8), np.zeros((3, 2))
+    assert "face_gaze (N, 2)" in message(path)
+
+
+def test_a_format_that_is_not_seen_is_an_error_that_lists_them(tmp_path):
+    with pytest.raises(FileNotFoundError, match="no file or folder"):
+        ct.data.read(tmp_path / "nowhere")
+    unknown = text(tmp_path / "unknown.txt", "1 2 3")
+    for path in (unknown, tmp_path):
+        with pytest.raises(ValueError, match=r"no known format; format= one of coco, wflw, 300w"):
+            ct.data.read(path)
+    pts(tmp_path)
+    (tmp_path / "a.mat").touch()
+    with pytest.raises(ValueError, match="seems to be of 300w and 300w_lp; format= one of"):
+        ct.data.read(tmp_path)
+    assert len(ct.data.read(tmp_path, "300w")) == 2
+    with pytest.raises(ValueError, match=r"format must be one of coco, .*; got 'yolo'"):
+        ct.data.read(tmp_path, "yolo")
+    with pytest.raises(ValueError, match="is a folder"):
+        ct.data.read(tmp_path, "coco")
+
+
+def test_a_missing_package_is_named_with_its_extra(tmp_path, monkeypatch):
+    paths = mat(tmp_path)[0], xgaze(tmp_path / "x")[0]
+
+    def missing(name):
+        raise ImportError(name)
+
+    monkeypatch.setattr(importlib, "import_module", missing)
+    for path, package in zip(paths, ("scipy", "h5py"), strict=True):
+        with pytest.raises(ImportError, match=rf'needs {package}: pip install "camtorch\[datasets\]"'):
+            ct.data.read(path, {"scipy": "300w_lp", "h5py": "eth_xgaze"}[package])[0]
