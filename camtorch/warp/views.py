@@ -27,6 +27,7 @@ FACES = ("front", "right", "back", "left", "up", "down")
 _HALF = 0.5  # px, that a view reaches beyond the middle of its outermost pixels
 _EDGE = 1e-3  # px
 _ALONG = 65  # samples of an edge of a box, and of the steps to either side of the farthest of them
+_HALVES = 50  # of the step between two samples, between which the image of a lens ends
 _ROUNDS = 3  # of such samples: 2e-6 of an edge
 _VIRTUAL = Pinhole([1.0, 1.0, 0.0, 0.0]).detach()
 _STRAIGHT_UP = 1e-6  # radians from the y axis: what float32 cameras leave of none
@@ -314,9 +315,35 @@ def looking_at(
         slopes = torch.where(seen[..., None], slopes, -math.inf)
         slopes = slopes.expand(-1, -1, 2, -1, -1).diagonal(dim1=2, dim2=4).mT  # (B, 4, 2, K)
         best, index = slopes.max(-1)
+        if half == 0.5:
+            farthest = _where_lenses_end(camera, start, edge, share, seen, rotation, farthest)
         farthest = torch.maximum(farthest, best.amax(1))
         place, half = share.expand(*best.shape, -1).gather(-1, index[..., None])[..., 0], 2 * half / (_ALONG - 1)
     refuse(~torch.isfinite(farthest).all(-1), "has no ray on its outline")
     sides = farthest.new_tensor(size[::-1])
     focal = (sides / 2 / farthest).amin(-1, keepdim=True).expand(-1, 2)
     return torch.cat((focal, ((sides - 1) / 2).expand_as(focal)), -1), rotation
+
+
+def _where_lenses_end(
+    camera: Camera, start: Tensor, edge: Tensor, share: Tensor, seen: Tensor, rotation: Tensor, farthest: Tensor
+) -> Tensor:
+    """`farthest` (B, 2) with the slopes of the last rays of edges, near which they may grow without bounds.
+
+    Between neighbours of samples (B, 4, 1, K) of which one has a ray.
+    """
+    box, side, _, left = (seen[..., 1:] != seen[..., :-1]).nonzero(as_tuple=True)
+    if not len(box):
+        return farthest
+    low, high = share[box, side, 0, left], share[box, side, 0, left + 1]
+    first = seen[box, side, 0, left]
+    inner, outer = torch.where(first, low, high), torch.where(first, high, low)
+    own = camera[box.tolist()] if camera.batch_shape else camera
+    for _ in range(_HALVES):
+        middle = (inner + outer) / 2
+        has_ray = rays_of(own, start[box, side, 0, 0] + middle[:, None] * edge[box, side, 0, 0])[1]
+        inner, outer = torch.where(has_ray, middle, inner), torch.where(has_ray, outer, middle)
+    rays = rays_of(own, start[box, side, 0, 0] + inner[:, None] * edge[box, side, 0, 0])[0]
+    turned = (rotation[box] @ rays[..., None])[..., 0]
+    slopes = turned[:, :2].abs() / turned[:, 2:].clamp(min=1e-9)
+    return farthest.scatter_reduce(0, box[:, None].expand(-1, 2), slopes, "amax")

@@ -57,7 +57,7 @@ def test_the_axis_is_the_middle_and_the_outline_touches_a_side(key):
     sides = pixels.new_tensor(SIZE[::-1])
     beyond = torch.where(seen[..., None], (pixels - (sides - 1) / 2).abs() - sides / 2, -torch.inf)
     assert beyond.max() < 1e-3
-    # an outline that the lens cuts off may end between two samples
+    # an outline that the lens cuts off may end between two samples of this test
     whole = seen.all(-1)
     assert beyond.amax((1, 2))[whole].min() > -1e-2
 
