@@ -133,6 +133,8 @@ def turn(rotation: Tensor | None, rays: Tensor, name: str) -> Tensor:
 def mount_rotation(yaw: Tensor, pitch: Tensor, roll: Tensor) -> Tensor:
     """(*B, 3, 3), `ray_after = R ray_before`, of a camera that turns right, then looks up, then leans right.
 
+    The angles of heads, in radians and of another order, are those of `ct.head_rotation`.
+
     Args:
         yaw: (*B,) degrees, about the camera's y axis; pitch about its new x axis, roll about its new z axis.
         pitch: likewise.
