@@ -2,23 +2,25 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from camtorch._arguments import Numbers, broadcast_shapes, no_camera, working_dtype
+from camtorch._arguments import Numbers, as_number, broadcast_shapes, no_camera, working_dtype
+from camtorch._module import remade
 from camtorch._threads import on_one_thread
 from camtorch.calibration.batches import as_tensor, as_vectors, learns, root_of, rows_of
-from camtorch.calibration.bundle import Bundle, Free, Poses, Sight, State
+from camtorch.calibration.ransac import consensus
 from camtorch.calibration.rays import poses_from_rays
 from camtorch.camera import Camera
 from camtorch.extrinsics import Extrinsics
+from camtorch.least_squares.equations import Equations, System, triangle_of_few
 from camtorch.least_squares.implicit import attached
-from camtorch.least_squares.levenberg_marquardt import minimise
+from camtorch.least_squares.levenberg_marquardt import minimise, rounding_of
 from camtorch.mixed import Mixed
-from camtorch.rotations import rotation_matrix, rotation_vector
+from camtorch.rotations import rotation_matrix, rotation_vector, skew_matrix, small_turn
 
 _LEAST = 4  # points
 _FEW = 5  # points, that may have minima far from where they start
@@ -28,27 +30,60 @@ _STEPS, _FEW_STEPS = 40, 8  # at most; towards a minimum that is rarely the bett
 _DAMPING = 1e-8  # at first: a start is nearly the optimum
 _SETTLED = 1e-7  # of the variance: the squared distance to the optimum, in standard deviations, that ends a search
 _NOTHING = 1e-9  # px, that rounding may leave
+_LINE = 1e-6  # of the extent of points: less across is none
+_TURNS = 3  # of fitting to inliers, and counting them again
 _LOST = 1e3  # px, that a point without a pixel counts as where starts are compared
 
 
-class Pose(NamedTuple):
-    """What `solve_pnp` returns."""
+class _Pose(NamedTuple):
+    extrinsics: Extrinsics
+    rms: Tensor
+    valid: Tensor
+
+
+class Pose(_Pose):
+    """What `solve_pnp` returns; it unpacks into the first three."""
 
     extrinsics: Extrinsics
     """Camera from object, batch *B."""
     rms: Tensor
-    """(*B,) px: the root of the weighted mean over the seen points of the squared distance; infinite where invalid."""
+    """(*B,) px: the root of the weighted mean over the inliers of the squared distance; infinite where invalid."""
     valid: Tensor
     """(*B,) bool."""
+    inliers: Tensor
+    """(*B, N) bool: the points that the pose was found from; none where invalid."""
+    covariance: Tensor
+    """(*B, 6, 6) of (w, dt) where R = exp([w]x) R_found and t = t_found + dt, in radians and the points' unit, for
+    noise of the variance that the inliers leave, the sum of squares over 2 N - 6; NaN where invalid. No graph."""
+
+    def __new__(cls, extrinsics: Extrinsics, rms: Tensor, valid: Tensor, inliers: Tensor, covariance: Tensor) -> Pose:
+        """All five."""
+        pose = super().__new__(cls, extrinsics, rms, valid)
+        pose.inliers, pose.covariance = inliers, covariance
+        return pose
+
+    def __getnewargs__(self) -> tuple[Any, ...]:
+        return (*self, self.inliers, self.covariance)
 
 
 @on_one_thread
-def solve_pnp(camera: Camera, object_points: Numbers, pixels: Numbers, *, weights: Numbers | None = None) -> Pose:
+def solve_pnp(
+    camera: Camera,
+    object_points: Numbers,
+    pixels: Numbers,
+    *,
+    weights: Numbers | None = None,
+    threshold: float | None = None,
+) -> Pose:
     """The pose, camera from object, under which known points are seen nearest to pixels: least squares in px.
 
     Any camera model, rays of any angle, four points or more, on a plane or not, and no start: closed forms on rays give
     it (`camtorch.calibration.rays`), the Levenberg-Marquardt method the optimum. Points on a plane may have two
     minima: both are refined, and the better one is returned.
+
+    With a threshold some points may be anywhere: poses of triples of points are compared by how many others agree
+    (RANSAC on rays, `camtorch.calibration.ransac`), and the best one is refined by these alone. The triples are always
+    the same, torch's random state is not touched. From six points that agree on, it is not chance.
 
     Pose and rms have first derivatives by pixels, points, weights and the camera's parameters, by the implicit function
     theorem at the optimum, whatever led there. All is computed in float64 and returned in the widest dtype that came
@@ -60,21 +95,34 @@ def solve_pnp(camera: Camera, object_points: Numbers, pixels: Numbers, *, weight
         pixels: (*B, N, 2). NaN is unseen, as is a pixel that the camera has no ray for. OpenCV's points (N, 1, 2), and
             (N, 1, 3), are N points.
         weights: (*B, N) of the squared residuals, not negative, 0 for unseen; all 1 if left out.
+        threshold: px, how far from its pixel a point may be seen that belongs to the pose; by default all do. Three or
+            four times the standard deviation of the noise keeps nearly all that belong.
 
     Returns:
-        A `Pose`: extrinsics (camera from object, batch *B), rms (*B,) in px and valid (*B,) bool. A row is invalid, its
-        pose finite and without a meaning, if less than four points are seen or all of them on one line, if a point or
-        a parameter is not finite, or if no minimum was found that has all seen points in the camera's view.
+        A `Pose`: extrinsics (camera from object, batch *B), rms (*B,) in px and valid (*B,) bool; beside these three
+        its attributes inliers (*B, N) bool and covariance (*B, 6, 6). A row is invalid, its
+        pose finite and without a meaning, if less than four points are seen, or agree, or all of them on one line, if a
+        point or a parameter is not finite, or if no minimum was found that has all seen points in the camera's view.
 
     Raises:
         TypeError: no camera, or no numbers. ValueError: shapes that do not fit, less than four points, negative
-            weights.
+            weights, a threshold that is not positive.
     """
+    if threshold is not None:
+        threshold = as_number(threshold, "threshold", "solve_pnp")
+        if threshold <= 0:
+            raise ValueError(f"solve_pnp: threshold must be positive, in px; got {threshold:g}")
     if isinstance(camera, Mixed):
-        return _of_each_model(camera, object_points, pixels, weights)
+        return _of_each_model(camera, object_points, pixels, weights, threshold)
     task = _Task.of(camera, object_points, pixels, weights)
     with torch.no_grad():
-        unknowns, valid = _solved(task)
+        if threshold is None:
+            unknowns, valid = _solved(task)
+        else:
+            unknowns, inliers = _agreed(task, threshold)
+            task, valid = task.of_inliers(inliers), inliers.any(-1)
+        inliers = (task.weights > 0) & valid[:, None]
+        covariance = _covariance(task, unknowns, valid)
     if learns([camera], task.points, task.pixels, task.weights):
         unknowns = attached(task.cost, unknowns, valid)
     mean = 2 * task.cost(unknowns) / task.weights.sum(-1).clamp(min=torch.finfo(torch.float64).tiny)
@@ -82,10 +130,14 @@ def solve_pnp(camera: Camera, object_points: Numbers, pixels: Numbers, *, weight
     translation = translation - (rotation_matrix(rotation) @ task.middles[..., None])[..., 0]
     rotation, translation = (t.to(task.dtype).view(*task.batch, 3) for t in (rotation, translation))
     rms, valid = root_of(mean, valid).to(task.dtype).view(task.batch), valid.view(task.batch)
-    return Pose(Extrinsics(rotation[..., None], translation), rms, valid)
+    inliers = inliers.view(*task.batch, inliers.shape[-1])
+    covariance = covariance.to(task.dtype).view(*task.batch, 6, 6)
+    return Pose(Extrinsics(rotation[..., None], translation), rms, valid, inliers, covariance)
 
 
-def _of_each_model(camera: Mixed, object_points: Numbers, pixels: Numbers, weights: Numbers | None) -> Pose:
+def _of_each_model(
+    camera: Mixed, object_points: Numbers, pixels: Numbers, weights: Numbers | None, threshold: float | None
+) -> Pose:
     """`solve_pnp` of each group, whose poses are put together again."""
     owner, count, device = "solve_pnp", len(camera), camera.intrinsics.device
     points = as_vectors(object_points, "object_points", 3, owner, device)
@@ -98,10 +150,10 @@ def _of_each_model(camera: Mixed, object_points: Numbers, pixels: Numbers, weigh
     found = []
     for rows, group in camera.groups:
         mine = [field[rows] if field.shape[:-2] == (count,) else field for field in fields]
-        pose, rms, valid = solve_pnp(group, mine[0], mine[1], weights=mine[2][..., 0])
-        found.append((pose.rotation, pose.translation, rms, valid))
-    rotation, translation, rms, valid = (camera._in_order(torch.cat(parts)) for parts in zip(*found, strict=True))
-    return Pose(Extrinsics(rotation[..., None], translation), rms, valid)
+        pose = solve_pnp(group, mine[0], mine[1], weights=mine[2][..., 0], threshold=threshold)
+        found.append((pose.extrinsics.rotation, pose.extrinsics.translation, *pose[1:], pose.inliers, pose.covariance))
+    rotation, translation, *others = (camera._in_order(torch.cat(parts)) for parts in zip(*found, strict=True))
+    return Pose(Extrinsics(rotation[..., None], translation), *others)
 
 
 class _Task(NamedTuple):
@@ -164,6 +216,10 @@ class _Task(NamedTuple):
         seen_at, given = torch.where(seen[..., None], seen_at, 0.0), torch.where(seen, given, 0.0)
         return cls(rows, points, seen_at, given, rays, middles, batch, dtype)
 
+    def of_inliers(self, inliers: Tensor) -> _Task:
+        """Of some of the points, bool (B, N)."""
+        return self._replace(weights=torch.where(inliers, self.weights, 0.0))
+
     def cost(self, unknowns: Tensor) -> Tensor:
         """(B,) half the sum of squares at rotation vectors and translations (B, 6)."""
         seen = self.points @ rotation_matrix(unknowns[:, :3]).mT + unknowns[:, None, 3:]
@@ -213,30 +269,134 @@ class _Found(NamedTuple):
         return whole
 
 
+def _agreed(task: _Task, threshold: float) -> tuple[Tensor, Tensor]:
+    """(B, 6): the rotation vectors and translations of least cost of the inliers, bool (B, N): none where invalid."""
+    given = task.weights > 0
+    slopes = _slopes(task.camera, task.rays)[2]
+    rotations, translations = consensus(task.points.detach(), task.rays, slopes, given, threshold)[:2]
+    inliers = torch.zeros_like(given)
+    for _ in range(_TURNS):
+        pixels, mapped = task.camera.project(task.points @ rotations.mT + translations[:, None])
+        near = given & mapped & ((pixels - task.pixels).square().sum(-1) < threshold**2)
+        (rows,) = (near != inliers).any(-1).nonzero(as_tuple=True)
+        if len(rows) == 0:
+            break
+        inliers[rows] = near[rows]
+        found = _refined(task.of_inliers(inliers), rows, rotations[rows], translations[rows])
+        rotations[rows], translations[rows] = found.rotations, found.translations
+        inliers[rows] &= (torch.isfinite(found.costs) & _spread(task.points[rows], inliers[rows]))[:, None]
+    return torch.cat((rotation_vector(rotations), translations), -1), inliers
+
+
+def _spread(points: Tensor, inliers: Tensor) -> Tensor:
+    """(B,) bool: whether there are enough inliers, which are on no line."""
+    weights = inliers.to(points)
+    counts = weights.sum(-1)
+    centred = points - (weights[..., None] * points).sum(-2, keepdim=True) / counts.clamp(min=1)[:, None, None]
+    variances = torch.linalg.eigvalsh((weights[..., None] * centred).mT @ centred)
+    enough: Tensor = (counts >= _LEAST) & (variances[:, 1] > _LINE**2 * variances[:, 2])
+    return enough
+
+
+def _slopes(camera: Camera, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Pixels, whether there is one, and their derivatives (B, N, 2, 3) by points (B, N, 3) of rows of a camera."""
+    with torch.inference_mode(False), torch.enable_grad():
+        tensors = {name: getattr(camera, name).detach().clone() for name in camera.tensor_names}
+        camera = remade(camera, **tensors)
+        leaf = points.detach().clone().requires_grad_()
+        pixels, valid = camera.project(leaf)
+        ones = torch.ones_like(pixels[..., 0])
+        u, v = (torch.autograd.grad(p, leaf, ones, retain_graph=True)[0] for p in pixels.unbind(-1))
+    return pixels.detach(), valid, torch.stack((u, v), -2)
+
+
+def _camera_of(camera: Camera, rows: Tensor) -> Camera:
+    """Some rows of a camera that has them."""
+    return camera[rows] if camera.batch_shape else camera
+
+
+class _Reprojection:
+    """Poses of some rows of a task, for `minimise`: states are rotations (R, 3, 3) and translations (R, 3)."""
+
+    def __init__(self, task: _Task, rows: Tensor):
+        self.points, self.pixels, self.weights = (t.detach()[rows] for t in task[1:4])
+        self.camera = _camera_of(task.camera, rows)
+        self.rounding = rounding_of(self.pixels, self.weights)
+
+    def _of(self, rows: Tensor) -> tuple[Camera, Tensor, Tensor, Tensor]:
+        return _camera_of(self.camera, rows), self.points[rows], self.pixels[rows], self.weights[rows]
+
+    def cost(self, state: tuple[Tensor, ...], rows: Tensor) -> Tensor:
+        """(R,)."""
+        camera, points, seen_at, weights = self._of(rows)
+        pixels, valid = camera.project(points @ state[0].mT + state[1][:, None])
+        squares = torch.where(valid, (pixels - seen_at).square().sum(-1), _LOST**2)
+        total = (squares * weights).sum(-1)
+        return torch.where(torch.isfinite(total), total, torch.inf)
+
+    def linearised(self, state: tuple[Tensor, ...], rows: Tensor) -> System:
+        """At a state."""
+        block = self.rows_of(state, rows)
+        equations = Equations(triangle_of_few(block)[:, None], block.new_zeros(len(block), 1, 1))
+        return System(equations, 6, torch.zeros(len(block), 0, dtype=torch.bool, device=block.device))
+
+    def rows_of(self, state: tuple[Tensor, ...], rows: Tensor) -> Tensor:
+        """(R, 2 N, 7): the derivatives of the residuals by turn and shift, and the residuals."""
+        camera, points, seen_at, weights = self._of(rows)
+        turned = points @ state[0].mT
+        pixels, valid, slopes = _slopes(camera, turned + state[1][:, None])
+        turns = torch.linalg.cross(turned[:, :, None].expand_as(slopes), slopes)
+        root = torch.where(valid, weights, 0.0).sqrt()[..., None, None]
+        residuals = torch.where(valid[..., None], pixels - seen_at, 0.0)[..., None]
+        return (torch.cat((turns, slopes, residuals), -1) * root).flatten(1, 2)
+
+    def sees(self, state: tuple[Tensor, ...]) -> Tensor:
+        """(B,) bool: whether all points that were seen are in view."""
+        valid = self.camera.project(self.points @ state[0].mT + state[1][:, None])[1]
+        return (valid | (self.weights == 0)).all(-1)
+
+    def moved(self, state: tuple[Tensor, ...], step: tuple[Tensor, ...], rows: Tensor) -> tuple[Tensor, ...]:
+        """The state a step further."""
+        turn, shift = step[0][:, 0].split(3, -1)
+        return small_turn(turn) @ state[0], state[1] + shift
+
+
 def _refined(task: _Task, rows: Tensor, rotations: Tensor, translations: Tensor, steps: int = _STEPS) -> _Found:
     """The minima that starts (R, ...) for some rows of the task lead to."""
     if len(rows) == 0:
         return _Found(translations[:, 0], rotations, translations)
-    points, pixels, weights = (t.detach()[rows, None] for t in task[1:4])
-    parameters = torch.cat(task.camera._tensors, -1).detach()
-    parameters = parameters[None] if parameters.ndim == 1 else parameters[rows]
-    boards = Poses(rotations[:, None], translations[:, None])
-    start = State((parameters,), Poses.none(len(rows), 1, points), boards, points.new_zeros(len(rows), 2))
-    nothing = torch.zeros(parameters.shape[-1], dtype=torch.bool, device=points.device)
-    problem = Bundle([Sight(task.camera, points, pixels, weights)], start, Free((nothing,), (False,)), None, 1.0)
-    counts = (weights > 0).sum((-1, -2))
+    problem = _Reprojection(task, rows)
+    counts = (problem.weights > 0).sum(-1)
     found = minimise(
         problem,
-        problem.flat(start),
+        (rotations, translations),
         tolerance=_SETTLED / (2 * counts - 6).clamp(min=1),
         tiny=_NOTHING**2 * counts,
         going=counts >= _LEAST,
         steps=steps,
         damping=_DAMPING,
     )
-    complete = (problem.look(0, found.state).valid | (weights == 0)).all(-1)[:, 0]
-    rotations, translations = found.state[:2]
-    return _Found(torch.where(found.converged & complete, found.cost, torch.inf), rotations[:, 0], translations[:, 0])
+    rotations, translations = found.state
+    complete = problem.sees(found.state)
+    return _Found(torch.where(found.converged & complete, found.cost, torch.inf), rotations, translations)
+
+
+def _covariance(task: _Task, unknowns: Tensor, valid: Tensor) -> Tensor:
+    """(B, 6, 6) of turns and shifts, of the points as they were passed."""
+    every = torch.arange(len(unknowns), device=unknowns.device)
+    rotation, translation = rotation_matrix(unknowns[:, :3]), unknowns[:, 3:]
+    block = _Reprojection(task, every).rows_of((rotation, translation), every)
+    normal = block.mT @ block
+    size = normal.diagonal(dim1=-2, dim2=-1)[:, :6]
+    scale = torch.where(size > 0, size, 1.0).rsqrt()
+    inverse = torch.linalg.inv_ex(normal[:, :6, :6] * scale[:, :, None] * scale[:, None])[0]
+    counts = (task.weights > 0).sum(-1)
+    variance = normal[:, 6, 6] / (2 * counts - 6).clamp(min=1)
+    inverse = inverse * scale[:, :, None] * scale[:, None] * variance[:, None, None]
+    # what turns about the points' middle moves their origin
+    carried = torch.eye(6, dtype=unknowns.dtype, device=unknowns.device).repeat(len(unknowns), 1, 1)
+    carried[:, 3:, :3] = skew_matrix((rotation @ task.middles[..., None])[..., 0])
+    return torch.where(valid[:, None, None], carried @ inverse @ carried.mT, torch.nan)
 
 
 def _mirrored(
