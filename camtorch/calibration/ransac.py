@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import ctypes
+import struct
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
+from camtorch._threads import spread, thread_count
+from camtorch.native.library import library
 from camtorch.rotations import skew_matrix, small_turn
 
 LEAST = 4  # points that make a pose
@@ -16,6 +20,8 @@ _FIRST, _NEXT = 192, 1024  # samples of the rounds
 _SURE = 10.0  # samples without an outlier, to be expected, that end the search
 _TRIED, _STEPS = 8, 3  # the best poses of a round, and how often each is fitted to the points near it
 _AT_ONCE = 1 << 19  # numbers of a tensor
+_SHARED = 1 << 16  # points of samples that threads are woken for
+_Agreement = struct.Struct("12qdq").pack  # `Agreement` of native/consensus.h
 
 # The squared sides (0, 1), (1, 2) and (2, 0) of a triangle with corners s_i along rays r_i are, with e = |r_i - r_j|^2,
 # (s_i - s_j)^2 + e s_i s_j: quadratic forms of p = s_0 - s_2, q = s_1 - s_2 and w = s_2. Of the first term; and of the
@@ -108,37 +114,67 @@ def consensus(points: Tensor, rays: Tensor, slopes: Tensor, seen: Tensor, thresh
     counts, order = seen.sum(-1), (~seen).long().argsort(dim=-1, stable=True)
     batch, count = seen.shape
     best = torch.eye(3, 4, dtype=points.dtype, device=points.device).repeat(batch, 1, 1)
-    costs = points.new_full((batch,), count * threshold**2)
+    costs, agree = points.new_full((batch,), count * threshold**2), torch.zeros_like(counts)
+    search = _Search(lines, order, counts, best, costs, agree)
+    compiled = library() if points.is_cpu else None
     generator = torch.Generator().manual_seed(0)
-    drawn, (going,) = 0, (counts >= LEAST).nonzero(as_tuple=True)
-    while len(going):
-        samples = _FIRST if drawn == 0 else _NEXT
-        drawn += samples
-        numbers = torch.rand(samples, 3, generator=generator, dtype=torch.float64).to(points.device)
-        agree = torch.zeros_like(going)
-        for part in torch.arange(len(going)).split(max(1, _AT_ONCE // (12 * samples * count))):
-            rows = going[part.to(going.device)]
-            three = order[rows].gather(-1, _triples(numbers, counts[rows]).flatten(1)).unflatten(-1, (samples, 3))
-            every = rows[:, None, None]
-            poses = poses_of_three(points[every, three].flatten(0, 1), rays[every, three].flatten(0, 1))
-            some = lines.of(rows)
-            forms = some.forms()
-            poses = poses.view(len(rows), -1, 3, 4)
-            order_of = some.squares(poses, forms).sum(-1).topk(_TRIED, largest=False).indices
-            poses = poses.take_along_dim(order_of[..., None, None], 1)
-            poses = torch.cat((poses.nan_to_num(0.0, 0.0, 0.0), best[rows, None]), 1)
-            for _ in range(_STEPS):
-                poses = some.fitted(poses, forms)
-            squares = some.squares(poses, forms)
-            cost, index = squares.sum(-1).min(-1)
-            agree[part.to(agree.device)] = (squares[torch.arange(len(rows)), index] < threshold**2).sum(-1)
-            better = cost < costs[rows]
-            best[rows[better]] = poses[torch.arange(len(rows)), index][better]
-            costs[rows] = torch.where(better, cost, costs[rows])
-        share, few = agree.clamp(min=_TOLD).to(costs), counts[going].clamp(min=_TOLD).to(costs)
+    drawn, (rows,) = 0, (counts >= LEAST).nonzero(as_tuple=True)
+    while len(rows):
+        numbers = torch.rand(_NEXT if drawn else _FIRST, 3, generator=generator, dtype=torch.float64)
+        if compiled is not None:
+            search.compiled_round(rows, numbers, compiled)
+        else:
+            search.round(rows, numbers.to(points.device))
+        drawn += len(numbers)
+        share, few = agree[rows].clamp(min=_TOLD).to(costs), counts[rows].clamp(min=_TOLD).to(costs)
         share = share * (share - 1) * (share - 2) / (few * (few - 1) * (few - 2))
-        going = going[drawn * share < _SURE]
+        rows = rows[drawn * share < _SURE]
     return Consensus(best[..., :3], best[..., 3], costs)
+
+
+class _Search(NamedTuple):
+    """What rounds of samples read, and what they leave: the best poses (B, 3, 4), costs and points near them (B,)."""
+
+    lines: _Lines
+    order: Tensor  # (B, N), those seen first
+    counts: Tensor  # (B,), how many they are
+    best: Tensor
+    costs: Tensor
+    agree: Tensor
+
+    def round(self, rows: Tensor, numbers: Tensor) -> None:
+        """One for some rows, by numbers (H, 3) in [0, 1)."""
+        samples, count = len(numbers), self.order.shape[-1]
+        for part in rows.split(max(1, _AT_ONCE // (12 * samples * count))):
+            lines, every = self.lines.of(part), part[:, None, None]
+            three = self.order[part].gather(-1, _triples(numbers, self.counts[part]).flatten(1))
+            three = three.unflatten(-1, (samples, 3))
+            rays = self.lines.measures[:, 2]
+            poses = poses_of_three(self.lines.points[every, three].flatten(0, 1), rays[every, three].flatten(0, 1))
+            forms, poses = lines.forms(), poses.view(len(part), -1, 3, 4)
+            chosen = lines.squares(poses, forms).sum(-1).topk(_TRIED, largest=False).indices
+            poses = poses.take_along_dim(chosen[..., None, None], 1).nan_to_num(0.0, 0.0, 0.0)
+            poses = torch.cat((poses, self.best[part, None]), 1)
+            for _ in range(_STEPS):
+                poses = lines.fitted(poses, forms)
+            squares = lines.squares(poses, forms)
+            cost, index = squares.sum(-1).min(-1)
+            (better,) = (cost < self.costs[part]).nonzero(as_tuple=True)
+            index, part = index[better], part[better]
+            self.best[part], self.costs[part] = poses[better, index], cost[better]
+            self.agree[part] = (squares[better, index] < lines.threshold**2).sum(-1)
+
+    def compiled_round(self, rows: Tensor, numbers: Tensor, compiled: ctypes.CDLL) -> None:
+        """The same by native/consensus.c."""
+        points, measures = self.lines.points.mT.contiguous(), self.lines.measures.mT.contiguous()
+        read = (points, measures, self.order, self.counts, numbers, self.best, self.costs, self.agree, rows)
+        following, count = ctypes.c_int64(0), self.order.shape[-1]
+        call = _Agreement(
+            *(t.data_ptr() for t in read),
+            *(len(rows), count, len(numbers), self.lines.threshold**2, ctypes.addressof(following)),
+        )
+        work = len(rows) * len(numbers) * count
+        spread(lambda: compiled.camtorch_consensus(call), min(thread_count(), len(rows), 1 + work // _SHARED))
 
 
 def _triples(numbers: Tensor, counts: Tensor) -> Tensor:
