@@ -31,7 +31,7 @@ _DAMPING = 1e-8  # at first: a start is nearly the optimum
 _SETTLED = 1e-7  # of the variance: the squared distance to the optimum, in standard deviations, that ends a search
 _NOTHING = 1e-9  # px, that rounding may leave
 _LINE = 1e-6  # of the extent of points: less across is none
-_TURNS = 3  # of fitting to inliers, and counting them again
+_TURNS, _CHOICES = 12, 6  # steps by inliers, at most, and before how many of them they are chosen again
 _LOST = 1e3  # px, that a point without a pixel counts as where starts are compared
 
 
@@ -116,20 +116,20 @@ def solve_pnp(
         return _of_each_model(camera, object_points, pixels, weights, threshold)
     task = _Task.of(camera, object_points, pixels, weights)
     with torch.no_grad():
-        if threshold is None:
-            unknowns, valid = _solved(task)
-        else:
-            unknowns, inliers = _agreed(task, threshold)
-            task, valid = task.of_inliers(inliers), inliers.any(-1)
-        inliers = (task.weights > 0) & valid[:, None]
-        covariance = _covariance(task, unknowns, valid)
+        found = _solved(task) if threshold is None else _agreed(task, threshold)
+        inliers = found.inliers & found.valid[:, None]
+        rotation, translation, mean = rotation_vector(found.rotations), found.translations, found.normal[:, 6, 6]
+        moved = (found.rotations @ task.middles[..., None])[..., 0]
+        covariance = _covariance(found, moved)
+    task = task._replace(weights=torch.where(inliers, task.weights, 0.0))
     if learns([camera], task.points, task.pixels, task.weights):
-        unknowns = attached(task.cost, unknowns, valid)
-    mean = 2 * task.cost(unknowns) / task.weights.sum(-1).clamp(min=torch.finfo(torch.float64).tiny)
-    rotation, translation = unknowns.split(3, -1)
-    translation = translation - (rotation_matrix(rotation) @ task.middles[..., None])[..., 0]
-    rotation, translation = (t.to(task.dtype).view(*task.batch, 3) for t in (rotation, translation))
-    rms, valid = root_of(mean, valid).to(task.dtype).view(task.batch), valid.view(task.batch)
+        unknowns = attached(task.cost, torch.cat((rotation, translation), -1), found.valid)
+        mean = 2 * task.cost(unknowns)
+        rotation, translation = unknowns.split(3, -1)
+        moved = (rotation_matrix(rotation) @ task.middles[..., None])[..., 0]
+    mean = mean / task.weights.sum(-1).clamp(min=torch.finfo(torch.float64).tiny)
+    rotation, translation = (t.to(task.dtype).view(*task.batch, 3) for t in (rotation, translation - moved))
+    rms, valid = root_of(mean, found.valid).to(task.dtype).view(task.batch), found.valid.view(task.batch)
     inliers = inliers.view(*task.batch, inliers.shape[-1])
     covariance = covariance.to(task.dtype).view(*task.batch, 6, 6)
     return Pose(Extrinsics(rotation[..., None], translation), rms, valid, inliers, covariance)
@@ -216,10 +216,6 @@ class _Task(NamedTuple):
         seen_at, given = torch.where(seen[..., None], seen_at, 0.0), torch.where(seen, given, 0.0)
         return cls(rows, points, seen_at, given, rays, middles, batch, dtype)
 
-    def of_inliers(self, inliers: Tensor) -> _Task:
-        """Of some of the points, bool (B, N)."""
-        return self._replace(weights=torch.where(inliers, self.weights, 0.0))
-
     def cost(self, unknowns: Tensor) -> Tensor:
         """(B,) half the sum of squares at rotation vectors and translations (B, 6)."""
         seen = self.points @ rotation_matrix(unknowns[:, :3]).mT + unknowns[:, None, 3:]
@@ -228,8 +224,21 @@ class _Task(NamedTuple):
         return 0.5 * (torch.where(valid, squares, 0.0) * self.weights).sum(-1)
 
 
-def _solved(task: _Task) -> tuple[Tensor, Tensor]:
-    """(B, 6): the rotation vectors and translations of least cost, and whether they are."""
+class _Optimum(NamedTuple):
+    """Rotations (B, 3, 3), translations (B, 3), whether they are one, and which points (B, N) they are of.
+
+    normal: (B, 7, 7), the weighted products of the residuals' derivatives by turn and shift, and of the residuals.
+    """
+
+    rotations: Tensor
+    translations: Tensor
+    valid: Tensor
+    inliers: Tensor
+    normal: Tensor
+
+
+def _solved(task: _Task) -> _Optimum:
+    """The poses of least cost of all that is seen."""
     points, pixels, weights = (t.detach() for t in task[1:4])
     starts = poses_from_rays(points, task.rays, weights)
     seen_at, mapped = task.camera.project(starts.moved(points).flatten(1, 2))
@@ -250,7 +259,9 @@ def _solved(task: _Task) -> tuple[Tensor, Tensor]:
     (rows,) = (few & starts.valid[:, 0] & ~starts.valid[:, 1]).nonzero(as_tuple=True)
     flat, turned, moved = _mirrored(points[rows], weights[rows], found.rotations[rows], found.translations[rows])
     found = found.or_better(rows[flat], _refined(task, rows[flat], turned[flat], moved[flat]))
-    return torch.cat((rotation_vector(found.rotations), found.translations), -1), torch.isfinite(found.costs)
+    problem = _Reprojection(task, every)
+    normal = _normal(*problem.linear((found.rotations, found.translations), every), weights)
+    return _Optimum(found.rotations, found.translations, torch.isfinite(found.costs), weights > 0, normal)
 
 
 class _Found(NamedTuple):
@@ -269,23 +280,32 @@ class _Found(NamedTuple):
         return whole
 
 
-def _agreed(task: _Task, threshold: float) -> tuple[Tensor, Tensor]:
-    """(B, 6): the rotation vectors and translations of least cost of the inliers, bool (B, N): none where invalid."""
+def _agreed(task: _Task, threshold: float) -> _Optimum:
+    """The poses of least cost of the points on which most agree: steps of Gauss and Newton by what is near before."""
     given = task.weights > 0
-    slopes = _slopes(task.camera, task.rays)[2]
-    rotations, translations = consensus(task.points.detach(), task.rays, slopes, given, threshold)[:2]
+    every = torch.arange(len(given), device=given.device)
+    problem = _Reprojection(task, every)
+    slopes = _derivatives(problem.camera, task.rays)[2]
+    rotations, translations, _ = consensus(problem.points, task.rays, slopes, given, threshold)
     inliers = torch.zeros_like(given)
-    for _ in range(_TURNS):
-        pixels, mapped = task.camera.project(task.points @ rotations.mT + translations[:, None])
-        near = given & mapped & ((pixels - task.pixels).square().sum(-1) < threshold**2)
-        (rows,) = (near != inliers).any(-1).nonzero(as_tuple=True)
-        if len(rows) == 0:
+    for number in range(_TURNS):
+        residuals, mapped, columns = problem.linear((rotations, translations), every)
+        before = inliers
+        if number < _CHOICES:
+            inliers = given & mapped & (residuals.square().sum(-1) < threshold**2)
+        normal = _normal(residuals, mapped, columns, torch.where(inliers, problem.weights, 0.0))
+        inverse, _ = _inverse(normal)
+        step = -(inverse @ normal[:, :6, 6:])[..., 0]
+        gain, cost = -(step * normal[:, :6, 6]).sum(-1), normal[:, 6, 6]
+        rounding = 2 * (cost * problem.rounding).sqrt() + problem.rounding
+        tolerance = _SETTLED / (2 * inliers.sum(-1) - 6).clamp(min=1)
+        settled = (gain <= torch.maximum(tolerance * cost, rounding)) & (inliers == before).all(-1)
+        step = torch.where(torch.isfinite(step).all(-1, keepdim=True), step, 0.0)
+        rotations, translations = small_turn(step[:, :3]) @ rotations, translations + step[:, 3:]
+        if bool(settled.all()):
             break
-        inliers[rows] = near[rows]
-        found = _refined(task.of_inliers(inliers), rows, rotations[rows], translations[rows])
-        rotations[rows], translations[rows] = found.rotations, found.translations
-        inliers[rows] &= (torch.isfinite(found.costs) & _spread(task.points[rows], inliers[rows]))[:, None]
-    return torch.cat((rotation_vector(rotations), translations), -1), inliers
+    settled &= _spread(problem.points, inliers)
+    return _Optimum(rotations, translations, settled, inliers, normal)
 
 
 def _spread(points: Tensor, inliers: Tensor) -> Tensor:
@@ -298,21 +318,32 @@ def _spread(points: Tensor, inliers: Tensor) -> Tensor:
     return enough
 
 
-def _slopes(camera: Camera, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Pixels, whether there is one, and their derivatives (B, N, 2, 3) by points (B, N, 3) of rows of a camera."""
+def _derivatives(camera: Camera, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Pixels, whether there is one, and derivatives (B, N, 2, 3) by points (B, N, 3) of a frozen camera."""
     with torch.inference_mode(False), torch.enable_grad():
-        tensors = {name: getattr(camera, name).detach().clone() for name in camera.tensor_names}
-        camera = remade(camera, **tensors)
         leaf = points.detach().clone().requires_grad_()
         pixels, valid = camera.project(leaf)
         ones = torch.ones_like(pixels[..., 0])
-        u, v = (torch.autograd.grad(p, leaf, ones, retain_graph=True)[0] for p in pixels.unbind(-1))
-    return pixels.detach(), valid, torch.stack((u, v), -2)
+        slopes = [torch.autograd.grad(p, leaf, ones, retain_graph=True)[0] for p in pixels.unbind(-1)]
+    return pixels.detach(), valid, torch.stack(slopes, -2)
 
 
-def _camera_of(camera: Camera, rows: Tensor) -> Camera:
-    """Some rows of a camera that has them."""
-    return camera[rows] if camera.batch_shape else camera
+def _normal(residuals: Tensor, valid: Tensor, columns: Tensor, weights: Tensor) -> Tensor:
+    """(B, 7, 7), see `_Optimum`."""
+    root = torch.where(valid, weights, 0.0).sqrt()[..., None, None]
+    rows = (torch.cat((columns, residuals[..., None]), -1) * root).flatten(1, 2)
+    normal: Tensor = rows.mT @ rows
+    return normal
+
+
+def _inverse(normal: Tensor) -> tuple[Tensor, Tensor]:
+    """(B, 6, 6) of what a normal equation has for its unknowns, whose units differ, and whether there was none (B,)."""
+    normal = normal[:, :6, :6]
+    scale = normal.diagonal(dim1=-2, dim2=-1)
+    scale = torch.where(scale > 0, scale, 1.0).rsqrt()
+    scale = scale[:, :, None] * scale[:, None]
+    inverse, failed = torch.linalg.inv_ex(normal * scale)
+    return inverse * scale, failed
 
 
 class _Reprojection:
@@ -320,11 +351,16 @@ class _Reprojection:
 
     def __init__(self, task: _Task, rows: Tensor):
         self.points, self.pixels, self.weights = (t.detach()[rows] for t in task[1:4])
-        self.camera = _camera_of(task.camera, rows)
+        with torch.inference_mode(False):
+            tensors = {name: getattr(task.camera, name).detach().clone() for name in task.camera.tensor_names}
+        self.camera = remade(task.camera, **{name: t[rows] if t.ndim > 1 else t for name, t in tensors.items()})
         self.rounding = rounding_of(self.pixels, self.weights)
 
     def _of(self, rows: Tensor) -> tuple[Camera, Tensor, Tensor, Tensor]:
-        return _camera_of(self.camera, rows), self.points[rows], self.pixels[rows], self.weights[rows]
+        whole = len(rows) == len(self.points)
+        camera = self.camera if whole or not self.camera.batch_shape else self.camera[rows]
+        points, pixels, weights = (t if whole else t[rows] for t in (self.points, self.pixels, self.weights))
+        return camera, points, pixels, weights
 
     def cost(self, state: tuple[Tensor, ...], rows: Tensor) -> Tensor:
         """(R,)."""
@@ -334,21 +370,21 @@ class _Reprojection:
         total = (squares * weights).sum(-1)
         return torch.where(torch.isfinite(total), total, torch.inf)
 
+    def linear(self, state: tuple[Tensor, ...], rows: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Residuals (R, N, 2), whether there is a pixel, and derivatives (R, N, 2, 6) by turn and shift."""
+        camera, points, seen_at, _ = self._of(rows)
+        turned = points @ state[0].mT
+        pixels, valid, slopes = _derivatives(camera, turned + state[1][:, None])
+        turns = torch.linalg.cross(turned[:, :, None].expand_as(slopes), slopes)
+        return torch.where(valid[..., None], pixels - seen_at, 0.0), valid, torch.cat((turns, slopes), -1)
+
     def linearised(self, state: tuple[Tensor, ...], rows: Tensor) -> System:
         """At a state."""
-        block = self.rows_of(state, rows)
+        residuals, valid, columns = self.linear(state, rows)
+        root = torch.where(valid, self._of(rows)[3], 0.0).sqrt()[..., None, None]
+        block = (torch.cat((columns, residuals[..., None]), -1) * root).flatten(1, 2)
         equations = Equations(triangle_of_few(block)[:, None], block.new_zeros(len(block), 1, 1))
         return System(equations, 6, torch.zeros(len(block), 0, dtype=torch.bool, device=block.device))
-
-    def rows_of(self, state: tuple[Tensor, ...], rows: Tensor) -> Tensor:
-        """(R, 2 N, 7): the derivatives of the residuals by turn and shift, and the residuals."""
-        camera, points, seen_at, weights = self._of(rows)
-        turned = points @ state[0].mT
-        pixels, valid, slopes = _slopes(camera, turned + state[1][:, None])
-        turns = torch.linalg.cross(turned[:, :, None].expand_as(slopes), slopes)
-        root = torch.where(valid, weights, 0.0).sqrt()[..., None, None]
-        residuals = torch.where(valid[..., None], pixels - seen_at, 0.0)[..., None]
-        return (torch.cat((turns, slopes, residuals), -1) * root).flatten(1, 2)
 
     def sees(self, state: tuple[Tensor, ...]) -> Tensor:
         """(B,) bool: whether all points that were seen are in view."""
@@ -381,22 +417,14 @@ def _refined(task: _Task, rows: Tensor, rotations: Tensor, translations: Tensor,
     return _Found(torch.where(found.converged & complete, found.cost, torch.inf), rotations, translations)
 
 
-def _covariance(task: _Task, unknowns: Tensor, valid: Tensor) -> Tensor:
-    """(B, 6, 6) of turns and shifts, of the points as they were passed."""
-    every = torch.arange(len(unknowns), device=unknowns.device)
-    rotation, translation = rotation_matrix(unknowns[:, :3]), unknowns[:, 3:]
-    block = _Reprojection(task, every).rows_of((rotation, translation), every)
-    normal = block.mT @ block
-    size = normal.diagonal(dim1=-2, dim2=-1)[:, :6]
-    scale = torch.where(size > 0, size, 1.0).rsqrt()
-    inverse = torch.linalg.inv_ex(normal[:, :6, :6] * scale[:, :, None] * scale[:, None])[0]
-    counts = (task.weights > 0).sum(-1)
-    variance = normal[:, 6, 6] / (2 * counts - 6).clamp(min=1)
-    inverse = inverse * scale[:, :, None] * scale[:, None] * variance[:, None, None]
-    # what turns about the points' middle moves their origin
-    carried = torch.eye(6, dtype=unknowns.dtype, device=unknowns.device).repeat(len(unknowns), 1, 1)
-    carried[:, 3:, :3] = skew_matrix((rotation @ task.middles[..., None])[..., 0])
-    return torch.where(valid[:, None, None], carried @ inverse @ carried.mT, torch.nan)
+def _covariance(found: _Optimum, middles: Tensor) -> Tensor:
+    """(B, 6, 6) of turns, and shifts of the origin, from which the points' middles (B, 3) lie in the camera's axes."""
+    inverse, failed = _inverse(found.normal)
+    variance = found.normal[:, 6, 6] / (2 * found.inliers.sum(-1) - 6).clamp(min=1)
+    carried = torch.eye(6, dtype=middles.dtype, device=middles.device).repeat(len(middles), 1, 1)
+    carried[:, 3:, :3] = skew_matrix(middles)
+    covariance = carried @ (inverse * variance[:, None, None]) @ carried.mT
+    return torch.where((found.valid & (failed == 0))[:, None, None], covariance, torch.nan)
 
 
 def _mirrored(
