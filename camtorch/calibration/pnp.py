@@ -289,8 +289,11 @@ def _agreed(task: _Task, threshold: float) -> _Optimum:
     rotations, translations, _ = consensus(problem.points, task.rays, slopes, given, threshold)
     inliers = torch.zeros_like(given)
     for number in range(_TURNS):
-        residuals, mapped, columns = problem.linear((rotations, translations), every)
-        before = inliers
+        state, before = (rotations, translations), inliers
+        if number % 2 == 0:  # a step hardly changes the derivatives
+            residuals, mapped, columns = problem.linear(state, every)
+        else:
+            residuals, mapped = problem.residuals(state)
         if number < _CHOICES:
             inliers = given & mapped & (residuals.square().sum(-1) < threshold**2)
         normal = _normal(residuals, mapped, columns, torch.where(inliers, problem.weights, 0.0))
@@ -313,19 +316,24 @@ def _spread(points: Tensor, inliers: Tensor) -> Tensor:
     weights = inliers.to(points)
     counts = weights.sum(-1)
     centred = points - (weights[..., None] * points).sum(-2, keepdim=True) / counts.clamp(min=1)[:, None, None]
-    variances = torch.linalg.eigvalsh((weights[..., None] * centred).mT @ centred)
-    enough: Tensor = (counts >= _LEAST) & (variances[:, 1] > _LINE**2 * variances[:, 2])
+    moments = (weights[..., None] * centred).mT @ centred
+    # of eigenvalues a > b > c, (a + b + c)^2 and 2 (a b + b c + c a)
+    whole = moments.diagonal(dim1=-2, dim2=-1).sum(-1).square()
+    enough: Tensor = (counts >= _LEAST) & (whole - moments.square().sum((-1, -2)) > 2 * _LINE**2 * whole)
     return enough
 
 
 def _derivatives(camera: Camera, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Pixels, whether there is one, and derivatives (B, N, 2, 3) by points (B, N, 3) of a frozen camera."""
     with torch.inference_mode(False), torch.enable_grad():
-        leaf = points.detach().clone().requires_grad_()
+        # each point twice: all derivatives by one pass backward
+        leaf = torch.cat((points.detach(), points.detach()), -2).requires_grad_()
         pixels, valid = camera.project(leaf)
-        ones = torch.ones_like(pixels[..., 0])
-        slopes = [torch.autograd.grad(p, leaf, ones, retain_graph=True)[0] for p in pixels.unbind(-1)]
-    return pixels.detach(), valid, torch.stack(slopes, -2)
+        by = torch.zeros_like(pixels)
+        count = points.shape[-2]
+        by[:, :count, 0] = by[:, count:, 1] = 1.0
+        (slopes,) = torch.autograd.grad(pixels, leaf, by)
+    return pixels[:, :count].detach(), valid[:, :count], slopes.unflatten(1, (2, count)).transpose(1, 2)
 
 
 def _normal(residuals: Tensor, valid: Tensor, columns: Tensor, weights: Tensor) -> Tensor:
@@ -386,10 +394,10 @@ class _Reprojection:
         equations = Equations(triangle_of_few(block)[:, None], block.new_zeros(len(block), 1, 1))
         return System(equations, 6, torch.zeros(len(block), 0, dtype=torch.bool, device=block.device))
 
-    def sees(self, state: tuple[Tensor, ...]) -> Tensor:
-        """(B,) bool: whether all points that were seen are in view."""
-        valid = self.camera.project(self.points @ state[0].mT + state[1][:, None])[1]
-        return (valid | (self.weights == 0)).all(-1)
+    def residuals(self, state: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
+        """(B, N, 2) of all rows, and whether there is a pixel."""
+        pixels, valid = self.camera.project(self.points @ state[0].mT + state[1][:, None])
+        return torch.where(valid[..., None], pixels - self.pixels, 0.0), valid
 
     def moved(self, state: tuple[Tensor, ...], step: tuple[Tensor, ...], rows: Tensor) -> tuple[Tensor, ...]:
         """The state a step further."""
@@ -413,7 +421,7 @@ def _refined(task: _Task, rows: Tensor, rotations: Tensor, translations: Tensor,
         damping=_DAMPING,
     )
     rotations, translations = found.state
-    complete = problem.sees(found.state)
+    complete = (problem.residuals(found.state)[1] | (problem.weights == 0)).all(-1)
     return _Found(torch.where(found.converged & complete, found.cost, torch.inf), rotations, translations)
 
 

@@ -16,7 +16,7 @@ from camtorch.rotations import skew_matrix, small_turn
 
 LEAST = 4  # points that make a pose
 _TOLD = 6  # points that agree by chance too rarely to be looked for in vain
-_FIRST, _NEXT = 192, 1024  # samples of the rounds
+_FIRST, _NEXT = 512, 1024  # samples of the rounds
 _SURE = 10.0  # samples without an outlier, to be expected, that end the search
 _TRIED, _STEPS = 8, 3  # the best poses of a round, and how often each is fitted to the points near it
 _AT_ONCE = 1 << 19  # numbers of a tensor

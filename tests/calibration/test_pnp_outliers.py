@@ -89,6 +89,19 @@ def test_rows_are_alone_and_draws_are_always_the_same():
         assert torch.equal(one.inliers, whole.inliers[row])
 
 
+def test_compiled_rounds_are_those_of_torch(monkeypatch):
+    camera, target, seen, *_ = problems(130, 6, 20, 0.6)
+    seen[0, 3:] = torch.nan
+    seen[1, ::3] = torch.nan
+    compiled = ct.solve_pnp(camera, target, seen, threshold=THRESHOLD)
+    monkeypatch.setattr("camtorch.calibration.ransac.library", lambda: None)
+    pose = ct.solve_pnp(camera, target, seen, threshold=THRESHOLD)
+    assert torch.equal(pose.inliers, compiled.inliers)
+    assert torch.equal(pose.valid, compiled.valid)
+    found = pose.extrinsics.matrix()[1:], compiled.extrinsics.matrix()[1:]
+    torch.testing.assert_close(*found, rtol=0, atol=1e-6)
+
+
 def test_what_does_not_agree_is_invalid():
     camera, target, seen, *_ = problems(60, 5, 12, 0.0)
     target, seen = target.clone(), seen.clone()
