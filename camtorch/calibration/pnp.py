@@ -25,6 +25,7 @@ from camtorch.rotations import rotation_matrix, rotation_vector, skew_matrix, sm
 _LEAST = 4  # points
 _FEW = 5  # points, that may have minima far from where they start
 _WORSE, _MUCH_WORSE = 4.0, 100.0  # times the cost of the best start, beyond which none became the best; of few points
+_MOVE = 1e-6  # of rays, whose pixels' difference is a derivative
 _THIN = 0.1  # of the extent of points: what is thinner may have the minima of a plane
 _STEPS, _FEW_STEPS = 40, 8  # at most; towards a minimum that is rarely the better one
 _DAMPING = 1e-8  # at first: a start is nearly the optimum
@@ -227,7 +228,8 @@ class _Task(NamedTuple):
 class _Optimum(NamedTuple):
     """Rotations (B, 3, 3), translations (B, 3), whether they are one, and which points (B, N) they are of.
 
-    normal: (B, 7, 7), the weighted products of the residuals' derivatives by turn and shift, and of the residuals.
+    normal: (B, 7, 7), the weighted products of the residuals' derivatives by turn and shift, and of the residuals;
+    inverse: (B, 6, 6), of the former.
     """
 
     rotations: Tensor
@@ -235,6 +237,7 @@ class _Optimum(NamedTuple):
     valid: Tensor
     inliers: Tensor
     normal: Tensor
+    inverse: Tensor
 
 
 def _solved(task: _Task) -> _Optimum:
@@ -261,7 +264,8 @@ def _solved(task: _Task) -> _Optimum:
     found = found.or_better(rows[flat], _refined(task, rows[flat], turned[flat], moved[flat]))
     problem = _Reprojection(task, every)
     normal = _normal(*problem.linear((found.rotations, found.translations), every), weights)
-    return _Optimum(found.rotations, found.translations, torch.isfinite(found.costs), weights > 0, normal)
+    valid = torch.isfinite(found.costs)
+    return _Optimum(found.rotations, found.translations, valid, weights > 0, normal, _inverse(normal))
 
 
 class _Found(NamedTuple):
@@ -285,8 +289,12 @@ def _agreed(task: _Task, threshold: float) -> _Optimum:
     given = task.weights > 0
     every = torch.arange(len(given), device=given.device)
     problem = _Reprojection(task, every)
-    slopes = _derivatives(problem.camera, task.rays)[2]
-    rotations, translations, _ = consensus(problem.points, task.rays, slopes, given, threshold)
+    # differences do where poses are only looked for
+    moves = _MOVE * torch.eye(4, 3, dtype=task.rays.dtype, device=task.rays.device)  # the last one: none
+    pixels, seen = problem.camera.project((task.rays[:, :, None] + moves).flatten(1, 2))
+    pixels, seen = pixels.unflatten(1, (given.shape[1], 4)), seen.unflatten(1, (given.shape[1], 4)).all(-1)
+    slopes = ((pixels[:, :, :3] - pixels[:, :, 3:]) / _MOVE).mT
+    rotations, translations, _ = consensus(problem.points, task.rays, slopes, given & seen, threshold)
     inliers = torch.zeros_like(given)
     for number in range(_TURNS):
         state, before = (rotations, translations), inliers
@@ -297,7 +305,7 @@ def _agreed(task: _Task, threshold: float) -> _Optimum:
         if number < _CHOICES:
             inliers = given & mapped & (residuals.square().sum(-1) < threshold**2)
         normal = _normal(residuals, mapped, columns, torch.where(inliers, problem.weights, 0.0))
-        inverse, _ = _inverse(normal)
+        inverse = _inverse(normal)
         step = -(inverse @ normal[:, :6, 6:])[..., 0]
         gain, cost = -(step * normal[:, :6, 6]).sum(-1), normal[:, 6, 6]
         rounding = 2 * (cost * problem.rounding).sqrt() + problem.rounding
@@ -308,7 +316,7 @@ def _agreed(task: _Task, threshold: float) -> _Optimum:
         if bool(settled.all()):
             break
     settled &= _spread(problem.points, inliers)
-    return _Optimum(rotations, translations, settled, inliers, normal)
+    return _Optimum(rotations, translations, settled, inliers, normal, inverse)
 
 
 def _spread(points: Tensor, inliers: Tensor) -> Tensor:
@@ -344,14 +352,14 @@ def _normal(residuals: Tensor, valid: Tensor, columns: Tensor, weights: Tensor) 
     return normal
 
 
-def _inverse(normal: Tensor) -> tuple[Tensor, Tensor]:
-    """(B, 6, 6) of what a normal equation has for its unknowns, whose units differ, and whether there was none (B,)."""
+def _inverse(normal: Tensor) -> Tensor:
+    """(B, 6, 6) of what is for the unknowns, whose units differ; not finite where there is none."""
     normal = normal[:, :6, :6]
     scale = normal.diagonal(dim1=-2, dim2=-1)
     scale = torch.where(scale > 0, scale, 1.0).rsqrt()
     scale = scale[:, :, None] * scale[:, None]
     inverse, failed = torch.linalg.inv_ex(normal * scale)
-    return inverse * scale, failed
+    return torch.where((failed == 0)[:, None, None], inverse * scale, torch.nan)
 
 
 class _Reprojection:
@@ -427,12 +435,11 @@ def _refined(task: _Task, rows: Tensor, rotations: Tensor, translations: Tensor,
 
 def _covariance(found: _Optimum, middles: Tensor) -> Tensor:
     """(B, 6, 6) of turns, and shifts of the origin, from which the points' middles (B, 3) lie in the camera's axes."""
-    inverse, failed = _inverse(found.normal)
     variance = found.normal[:, 6, 6] / (2 * found.inliers.sum(-1) - 6).clamp(min=1)
     carried = torch.eye(6, dtype=middles.dtype, device=middles.device).repeat(len(middles), 1, 1)
     carried[:, 3:, :3] = skew_matrix(middles)
-    covariance = carried @ (inverse * variance[:, None, None]) @ carried.mT
-    return torch.where((found.valid & (failed == 0))[:, None, None], covariance, torch.nan)
+    covariance = carried @ (found.inverse * variance[:, None, None]) @ carried.mT
+    return torch.where(found.valid[:, None, None], covariance, torch.nan)
 
 
 def _mirrored(

@@ -118,6 +118,7 @@ def test_what_does_not_agree_is_invalid():
     assert torch.isfinite(pose.extrinsics.matrix()).all()
     assert pose_of_all.valid.all()
     assert pose_of_all.inliers.all()
+    assert ct.solve_pnp(camera, target[:0], seen[:0], threshold=THRESHOLD).inliers.shape == (0, 12)
 
 
 def test_a_pose_is_three_with_two_beside():
