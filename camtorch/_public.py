@@ -9,7 +9,7 @@ from camtorch.calibration.rig import RigCalibration, calibrate_rig
 from camtorch.calibration.triangulate import triangulate
 from camtorch.camera import Camera
 from camtorch.convert.conversion import Conversion
-from camtorch.extrinsics import Extrinsics
+from camtorch.extrinsics import Extrinsics, head_angles, head_rotation
 from camtorch.io import CameraFileError, load, save
 from camtorch.maps.formats import load_map
 from camtorch.maps.lookup import LookupMap
@@ -65,6 +65,8 @@ __all__ = [
     "data",
     "find_board",
     "fit",
+    "head_angles",
+    "head_rotation",
     "io",
     "lenses",
     "load",

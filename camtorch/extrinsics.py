@@ -11,6 +11,7 @@ from torch import Tensor
 from camtorch._arguments import (
     Numbers,
     as_batch,
+    as_coordinates,
     as_real,
     as_rows,
     as_vectors,
@@ -156,6 +157,65 @@ class Extrinsics(BatchedModule):
         if self.batch_shape or rotation is None or translation is None:
             return f"batch_shape={tuple(self.batch_shape)}"
         return f"rotation={rotation.tolist()}, translation={translation.tolist()}"
+
+
+def head_angles(pose: Extrinsics | Numbers) -> Tensor:
+    """Pitch, yaw and roll (..., 3) in radians of heads that a camera sees.
+
+    The head's frame has x to the image's right, y down and z away from the camera when the head faces it, so that the
+    identity faces the camera. R = Ry(yaw) Rx(-pitch) Rz(roll), right-handed turns about the camera's axes: the nose
+    points along R (0, 0, -1), whose pitch and yaw these are as of a gaze (`ct.augment.to_pitch_yaw`, the signs of
+    ETH-XGaze), and a positive roll leans clockwise in the image about that axis. Where the nose points straight up or
+    down, roll is 0. Values and gradients are finite everywhere. `camtorch.rotations.mount_rotation`, which turns
+    cameras, has another order: yaw, pitch, roll, in degrees.
+
+    Args:
+        pose: camera from head: Extrinsics, a `Pose` of `ct.solve_pnp`, or matrices (..., 4, 4) or (..., 3, 3).
+
+    Raises:
+        TypeError: no numbers. ValueError: another shape, matrices that are no rotations.
+    """
+    pose = getattr(pose, "extrinsics", pose)
+    if isinstance(pose, Extrinsics):
+        matrix = rotation_matrix(pose.rotation.expand(*pose.batch_shape, 3))
+    else:
+        matrix = as_real(pose, "pose", "head_angles")
+        if matrix.shape[-2:] not in ((3, 3), (4, 4)):
+            raise ValueError(
+                "head_angles: pose must be Extrinsics, a Pose, (..., 4, 4) or (..., 3, 3); "
+                f"got shape {tuple(matrix.shape)}"
+            )
+        matrix = matrix[..., :3, :3]
+        check_rotation(matrix, "pose", "head_angles")
+    matrix = matrix.to(torch.promote_types(matrix.dtype, torch.float32))
+    cosine2 = matrix[..., 1, 0].square() + matrix[..., 1, 1].square()
+    straight = cosine2 <= (8 * torch.finfo(matrix.dtype).eps) ** 2
+    cosine = torch.where(straight, 1.0, cosine2).sqrt()
+    pitch = torch.atan2(matrix[..., 1, 2], torch.where(straight, 0.0, cosine))
+    # of a vector that is short, the direction is that of another
+    over = torch.where(straight, -matrix[..., 2, 0], matrix[..., 0, 2])
+    yaw = torch.atan2(over, torch.where(straight, matrix[..., 0, 0], matrix[..., 2, 2]))
+    lean = torch.where(straight, 0.0, matrix[..., 1, 0])
+    roll = torch.atan2(lean, torch.where(straight, 1.0, matrix[..., 1, 1]))
+    return torch.stack((pitch, yaw, roll), -1)
+
+
+def head_rotation(angles: Numbers) -> Tensor:
+    """Rotations (..., 3, 3), camera from head, of pitch, yaw and roll (..., 3) in radians: `head_angles` the other way.
+
+    Raises:
+        TypeError: no numbers. ValueError: another shape.
+    """
+    angles = as_coordinates(angles, "angles", 3, "head_rotation", means=", pitch, yaw and roll in radians")
+    angles = angles.to(torch.promote_types(angles.dtype, torch.float32))
+    (cp, cy, cr), (sp, sy, sr) = angles.cos().unbind(-1), angles.sin().unbind(-1)
+    rows = (
+        *(cy * cr - sy * sp * sr, -cy * sr - sy * sp * cr, sy * cp),
+        *(cp * sr, cp * cr, sp),
+        *(-sy * cr - cy * sp * sr, sy * sr - cy * sp * cr, cy * cp),
+    )
+    matrix: Tensor = torch.stack(rows, -1).unflatten(-1, (3, 3))
+    return matrix
 
 
 def _are_matrices(rotation: Tensor, translation: Tensor) -> bool:

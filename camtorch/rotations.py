@@ -29,6 +29,21 @@ def rotation_matrix(rotation: Tensor) -> Tensor:
     return matrix
 
 
+def small_turn(rotation: Tensor) -> Tensor:
+    """(*B, 3, 3) rotations of rotation vectors (*B, 3) by Cayley's formula: quick, and right to second order."""
+    half = rotation / 2
+    skew = skew_matrix(half)
+    eye = torch.eye(3, dtype=half.dtype, device=half.device)
+    return eye + (2 / (1 + (half * half).sum(-1)))[..., None, None] * (skew + skew @ skew)
+
+
+def skew_matrix(vectors: Tensor) -> Tensor:
+    """(*B, 3, 3) that take x to v x of vectors v (*B, 3): the cross product."""
+    eye = torch.eye(3, dtype=vectors.dtype, device=vectors.device)
+    matrix: Tensor = torch.linalg.cross(vectors[..., None, :], eye.expand(*vectors.shape, 3)).mT
+    return matrix
+
+
 def rotation_vector(matrix: Tensor) -> Tensor:
     """(*B, 3, 3) rotation matrices to (*B, 3) rotation vectors with an angle up to pi.
 
@@ -132,6 +147,8 @@ def turn(rotation: Tensor | None, rays: Tensor, name: str) -> Tensor:
 
 def mount_rotation(yaw: Tensor, pitch: Tensor, roll: Tensor) -> Tensor:
     """(*B, 3, 3), `ray_after = R ray_before`, of a camera that turns right, then looks up, then leans right.
+
+    The angles of heads, in radians and of another order, are those of `ct.head_rotation`.
 
     Args:
         yaw: (*B,) degrees, about the camera's y axis; pitch about its new x axis, roll about its new z axis.

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from camtorch.rotations import rotation_matrix
+from camtorch.rotations import small_turn
 
 _PAIRS = ((0, 1, 2), (1, 3, 4), (2, 4, 5))  # of symmetric matrices, the place among six entries
 _FLAT = 1e-6  # of the points' extent: less counts as none
@@ -199,7 +199,7 @@ class _Distances(NamedTuple):
             normal = mapped @ slopes.mT
             scale = normal.diagonal(dim1=-2, dim2=-1).sum(-1)
             normal = normal + (damping * scale + _TINY)[..., None, None] * eye
-            turned = rotation_matrix(-torch.linalg.solve_ex(normal, gradient)[0][..., 0]) @ rotations
+            turned = small_turn(-torch.linalg.solve_ex(normal, gradient)[0][..., 0]) @ rotations
             turned_costs = self.of_rotations(turned)
             better = turned_costs < costs
             rotations = torch.where(better[..., None, None], turned, rotations)

@@ -1,4 +1,5 @@
 /* The entry points: each is that of the best variant that this CPU can run. */
+#include "consensus.h"
 #include "geometry.h"
 #include "sampler.h"
 
@@ -8,7 +9,8 @@
     int64_t geometry_##variant(const Rows *);                                                                          \
     int64_t moves_##variant(const Move *);                                                                             \
     int64_t lattices_##variant(const Lattices *);                                                                      \
-    void domain_##variant(const Domain *);
+    void domain_##variant(const Domain *);                                                                             \
+    void consensus_##variant(const Agreement *);
 DECLARED(baseline)
 #ifdef HAS_AVX2
 DECLARED(avx2)
@@ -69,3 +71,5 @@ EXPORTED int64_t camtorch_moves(const Move *move) { CALLED(moves, move) }
 EXPORTED int64_t camtorch_lattices(const Lattices *given) { CALLED(lattices, given) }
 
 EXPORTED void camtorch_domain(const Domain *domain) { CALLED(domain, domain) }
+
+EXPORTED void camtorch_consensus(const Agreement *given) { CALLED(consensus, given) }

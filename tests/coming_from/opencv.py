@@ -172,8 +172,10 @@ def solve_pnp():
         close(found.rotation, rvec[:, 0], 1e-5)
         close(found.translation, tvec[:, 0], 1e-5)
     seen[0] += 50.0
-    found, *_ = ct.solve_pnp(brown(), board, seen[:, 0], weights=np.array([0.0] + [1.0] * 11))
-    close(found.translation, TVEC[:, 0], 1e-5)
+    pose = ct.solve_pnp(brown(), board, seen[:, 0], threshold=2)
+    *_, inliers = cv2.solvePnPRansac(board, seen, K, D5, reprojectionError=2)
+    assert pose.inliers.nonzero()[:, 0].tolist() == inliers[:, 0].tolist() == list(range(1, 12))
+    close(pose.extrinsics.translation, TVEC[:, 0], 1e-5)
 
 
 @row("cv2.triangulatePoints", slow=True)
