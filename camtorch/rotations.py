@@ -12,16 +12,17 @@ from camtorch._arguments import Numbers, as_own, as_real, as_rows, as_values, ch
 from camtorch.optics.special import angle_per_radius, cos_root, cosc_root, sinc_root
 
 
-def rotation_matrix(rotation: Tensor) -> Tensor:
+def rotation_matrix(rotation: Tensor, order: int = 2) -> Tensor:
     """(*B, 3) rotation vectors to (*B, 3, 3) matrices.
 
     Rodrigues' formula with sin(angle)/angle and (1 - cos(angle))/angle^2 as analytic functions of the squared angle.
-    kornia's axis_angle_to_rotation_matrix is off by 7e-14 at 0.01 radians, and its derivatives by more.
+    kornia's axis_angle_to_rotation_matrix is off by 7e-14 at 0.01 radians, and its derivatives by more. order: of the
+    derivatives that shall be exact.
     """
     x, y, z = rotation.unbind(-1)
     xx, yy, zz = x * x, y * y, z * z
     angle2 = xx + yy + zz
-    s, c = sinc_root(angle2), cosc_root(angle2)
+    s, c = sinc_root(angle2, order), cosc_root(angle2, order)
     xy, yz, zx = c * x * y, c * y * z, c * z * x
     x, y, z = s * x, s * y, s * z
     rows = (1 - c * (yy + zz), xy - z, zx + y, xy + z, 1 - c * (zz + xx), yz - x, zx - y, yz + x, 1 - c * (xx + yy))

@@ -199,7 +199,8 @@ class _Distances(NamedTuple):
             normal = mapped @ slopes.mT
             scale = normal.diagonal(dim1=-2, dim2=-1).sum(-1)
             normal = normal + (damping * scale + _TINY)[..., None, None] * eye
-            turned = rotation_matrix(-torch.linalg.solve_ex(normal, gradient)[0][..., 0]) @ rotations
+            step = -torch.linalg.solve_ex(normal, gradient)[0][..., 0]
+            turned = rotation_matrix(step, order=1) @ rotations
             turned_costs = self.of_rotations(turned)
             better = turned_costs < costs
             rotations = torch.where(better[..., None, None], turned, rotations)

@@ -11,7 +11,9 @@ from torch import Tensor
 from torch.autograd import forward_ad
 
 from camtorch._arguments import columns
+from camtorch._evaluation import compiled_of
 from camtorch.optics.backprojection import Inverted
+from camtorch.projection import compiled
 
 if TYPE_CHECKING:
     from camtorch.camera import Camera
@@ -34,6 +36,27 @@ class SensorJacobians(NamedTuple):
     points: SensorPoints
     by_ray: Tensor
     by_k: Tensor
+
+
+def pixel_jacobians(camera: Camera, points: Tensor) -> tuple[Tensor, Tensor]:
+    """The exact derivatives of pixels by points (C, N, 3) and by the parameters of cameras (C,), which are intrinsics
+    and coefficients: (C, N, 2, 3) and (C, N, 2, 4 + n). They mean nothing where a point is not valid.
+    """
+    made = compiled_of([camera], points)
+    if made is not None and (places := made[0].plan.places) is not None:
+        by_point, by_parameters = compiled.project_jacobians(made[0], points)
+        if not made[0].plan.is_all:
+            zeros = by_parameters.new_zeros(*by_parameters.shape[:-1], 4 + camera.distortion.shape[-1])
+            at = torch.cat((torch.arange(4, device="cpu"), 4 + places))
+            by_parameters = zeros.index_add_(-1, at, by_parameters)
+        return by_point.nan_to_num(0.0, 0.0, 0.0), by_parameters.nan_to_num(0.0, 0.0, 0.0)
+    intrinsics = camera.intrinsics.view(-1, 4)
+    found = sensor_jacobians(camera, camera.distortion.view(len(intrinsics), -1), points)
+    focal = torch.diag_embed(intrinsics[:, None, :2])
+    by_focal = torch.diag_embed(torch.stack(found.points[:2], -1))
+    by_k, by_point = (focal @ by.permute(0, 3, 1, 2) for by in (found.by_k, found.by_ray))
+    by_centre = torch.eye(2, dtype=points.dtype, device=points.device).expand_as(by_focal)
+    return by_point, torch.cat((by_focal, by_centre, by_k), -1)
 
 
 def to_sensor(camera: Camera | type[Camera], k: Tensor, rays: Tensor) -> SensorPoints:

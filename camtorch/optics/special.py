@@ -62,14 +62,14 @@ def sinc_root(t: Tensor, order: int = 2) -> Tensor:
     return torch.sin(angle) / angle
 
 
-def cosc_root(t: Tensor) -> Tensor:
+def cosc_root(t: Tensor, order: int = 2) -> Tensor:
     """(1 - cos(theta)) / theta^2 of t = theta^2."""
 
     def half_angle(angle: Tensor) -> Tensor:  # 1 - cos cancels, sin^2 of the half does not
         ratio = torch.sin(angle / 2) / angle
         return 2 * ratio * ratio
 
-    return _blend(t, _COSC, half_angle)
+    return _blend(t, _COSC, half_angle) if order > 1 else half_angle(root(t))
 
 
 def atan2(y: Tensor, x: Tensor) -> Tensor:
