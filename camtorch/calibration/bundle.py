@@ -387,18 +387,20 @@ class Bundle:
         batch, views, count = points.shape[:3]
         parameters = state.parameters[c]
         lead = (1, batch * views * count) if self.are_shared[c] else (batch, views * count)
-        by_point, by_parameters = (
-            by.view(batch, views, count, 2, -1) for by in pixel_jacobians(look.camera, points.reshape(*lead, 3))
-        )
+        learnt = [(g, i) for g, (camera, i) in enumerate(self.columns) if camera == c and i < parameters.shape[-1]]
+        at = [g for g, _ in learnt]
+        found = pixel_jacobians(look.camera, points.reshape(*lead, 3), any(i >= 4 for _, i in learnt))
+        by_point, by_k = (by.reshape(batch, views, count, 2, by.shape[-1]) for by in found)
         by_first = by_point if c == 0 else by_point @ state.mounts.rotations[:, c, None, None]
         columns = []
         if self.width == 6:
             columns.append(torch.linalg.cross(turned[..., None, :].expand_as(by_first), by_first, dim=-1))
         columns.append(by_first)
-        at = []
-        learnt = [(g, i) for g, (camera, i) in enumerate(self.columns) if camera == c and i < parameters.shape[-1]]
-        at += [g for g, _ in learnt]
-        columns.append(by_parameters[..., [i for _, i in learnt]])
+        if learnt:
+            focal, centre = parameters[:, None, None, :2], parameters[:, None, None, 2:4]
+            by_focal = torch.diag_embed((look.residuals + sight.pixels - centre) / focal)
+            by_centre = torch.eye(2, dtype=focal.dtype, device=focal.device).expand_as(by_focal)
+            columns.append(torch.cat((by_focal, by_centre, by_k), -1)[..., [i for _, i in learnt]])
         mine = [g for g, (camera, i) in enumerate(self.columns) if camera == c and i >= parameters.shape[-1]]
         if mine:
             at += mine

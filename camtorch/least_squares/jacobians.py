@@ -38,25 +38,20 @@ class SensorJacobians(NamedTuple):
     by_k: Tensor
 
 
-def pixel_jacobians(camera: Camera, points: Tensor) -> tuple[Tensor, Tensor]:
-    """The exact derivatives of pixels by points (C, N, 3) and by the parameters of cameras (C,), which are intrinsics
-    and coefficients: (C, N, 2, 3) and (C, N, 2, 4 + n). They mean nothing where a point is not valid.
+def pixel_jacobians(camera: Camera, points: Tensor, learns: bool) -> tuple[Tensor, Tensor]:
+    """The exact derivatives of pixels by points (C, N, 3), and by the coefficients of cameras (C,) if one learns.
+
+    (C, N, 2, 3) and (C, N, 2, n), which mean nothing where a point is not valid.
     """
-    made = compiled_of([camera], points)
-    if made is not None and (places := made[0].plan.places) is not None:
-        by_point, by_parameters = compiled.project_jacobians(made[0], points)
-        if not made[0].plan.is_all:
-            zeros = by_parameters.new_zeros(*by_parameters.shape[:-1], 4 + camera.distortion.shape[-1])
-            at = torch.cat((torch.arange(4, device="cpu"), 4 + places))
-            by_parameters = zeros.index_add_(-1, at, by_parameters)
-        return by_point.nan_to_num(0.0, 0.0, 0.0), by_parameters.nan_to_num(0.0, 0.0, 0.0)
+    if not learns and (made := compiled_of([camera], points)) is not None:
+        ones = torch.eye(2, dtype=points.dtype, device="cpu")[:, :, None, None].expand(2, 2, *points.shape[:2])
+        rows = [compiled.project_vjp(made[0], points, one, True, False)[0] for one in ones]
+        by_point = torch.stack([row for row in rows if row is not None], -2)
+        return by_point.nan_to_num(0.0, 0.0, 0.0), points.new_zeros(*by_point.shape[:-1], 0)
     intrinsics = camera.intrinsics.view(-1, 4)
     found = sensor_jacobians(camera, camera.distortion.view(len(intrinsics), -1), points)
-    focal = torch.diag_embed(intrinsics[:, None, :2])
-    by_focal = torch.diag_embed(torch.stack(found.points[:2], -1))
-    by_k, by_point = (focal @ by.permute(0, 3, 1, 2) for by in (found.by_k, found.by_ray))
-    by_centre = torch.eye(2, dtype=points.dtype, device=points.device).expand_as(by_focal)
-    return by_point, torch.cat((by_focal, by_centre, by_k), -1)
+    focal = intrinsics[:, None, :2, None]
+    return found.by_ray.permute(0, 3, 1, 2) * focal, found.by_k.permute(0, 3, 1, 2) * focal
 
 
 def to_sensor(camera: Camera | type[Camera], k: Tensor, rays: Tensor) -> SensorPoints:

@@ -493,21 +493,6 @@ def project_vjp(
     return results, None if sums is None else sums.sum(1).to(native.dtype)
 
 
-def project_jacobians(native: Native, points: Tensor) -> tuple[Tensor, Tensor]:
-    """The derivatives of pixels by points (C, N, 2, 3), and by the cameras' numbers (C, N, 2, 4 + n), in the order of
-    `project_vjp`; zero where a point (C, N, 3) is not valid.
-    """
-    cameras, count, _ = points.shape
-    by_points = torch.empty(2, cameras, count, 3, dtype=native.dtype, device="cpu")
-    # a tile for each point, whose sums are its own
-    sums = torch.zeros(2, cameras, count, 4 + native.parameters, dtype=torch.float64, device="cpu")
-    ones = torch.eye(2, dtype=native.dtype, device="cpu")[:, :, None, None].expand(2, 2, cameras, count)
-    for results, own, one in zip(by_points, sums, ones, strict=True):
-        rows = points.data_ptr(), *points.stride(), *_points(results), 0, 0
-        _call(native, cameras, count, PROJECT_VJP, (*rows, *_cotangents(one, cameras, count), own.data_ptr()), 1)
-    return by_points.movedim(0, 2), sums.movedim(0, 2).to(native.dtype)
-
-
 def unproject_vjp(
     native: Native, valid: Tensor, solution: Tensor, cotangents: Tensor, want_pixels: bool, want_parameters: bool
 ) -> tuple[Tensor | None, Tensor | None]:
@@ -683,14 +668,14 @@ def _address(tensor: Tensor | None) -> int:
     return 0 if tensor is None else tensor.data_ptr()
 
 
-def _call(native: Native, cameras: int, count: int, direction: int, rows: tuple[int, ...], tile: int = _TILE) -> int:
-    """rows: what of `Rows` is between its cameras and its count; tile: points that have sums of their own."""
+def _call(native: Native, cameras: int, count: int, direction: int, rows: tuple[int, ...]) -> int:
+    """rows: what of `Rows` is between its cameras and its count."""
     assert cameras == native.cameras
     run, points = _entry("camtorch_geometry", c_int64), cameras * count
     if points < _SHARED:
-        return run(_Rows(native.pointer, *rows, count, tile, direction, 0)) if points else 0
+        return run(_Rows(native.pointer, *rows, count, _TILE, direction, 0)) if points else 0
     following = c_int64(0)
-    call = _Rows(native.pointer, *rows, count, tile, direction, addressof(following))
+    call = _Rows(native.pointer, *rows, count, _TILE, direction, addressof(following))
     left: list[int] = []
     spread(lambda: left.append(run(call)), min(thread_count(), -(-count // _TILE) * cameras))
     return sum(left)
