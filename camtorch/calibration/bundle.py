@@ -7,6 +7,8 @@ complement, without the squares of a normal equation. Time and memory grow with 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import torch
@@ -17,9 +19,9 @@ from camtorch._module import remade
 from camtorch.camera import Camera, fixed_camera
 from camtorch.convert.fitting import bounds
 from camtorch.least_squares.equations import Equations, System, padded, triangle_of_few
-from camtorch.least_squares.jacobians import sensor_jacobians
+from camtorch.least_squares.jacobians import pixel_jacobians
 from camtorch.least_squares.levenberg_marquardt import FIRST_DAMPING, minimise, rounding_of
-from camtorch.rotations import rotation_matrix
+from camtorch.rotations import small_turn
 
 LOSSES = ("huber", "cauchy")
 _SETTLED = 1e-10  # of the variance: the squared distance to the optimum, in standard deviations, that ends a search
@@ -107,7 +109,8 @@ class Free(NamedTuple):
     bend: bool = False
 
 
-class Adjusted(NamedTuple):
+@dataclass(frozen=True)
+class Adjusted:
     """An optimum, or where the search ended.
 
     residuals: of each camera (B, V, N, 2), projected minus observed. valid: (B, V, N) bool, of the points of any weight
@@ -120,7 +123,13 @@ class Adjusted(NamedTuple):
     residuals: tuple[Tensor, ...]
     valid: tuple[Tensor, ...]
     weights: tuple[Tensor, ...]
-    equations: Equations
+    problem: Bundle
+
+    @cached_property
+    @torch.no_grad()
+    def equations(self) -> Equations:
+        """There, linearised."""
+        return self.problem.equations(self.problem.flat(self.state))
 
 
 @torch.no_grad()
@@ -153,7 +162,7 @@ def adjust(
         damping=damping,
         progress=progress,
     )
-    looks = [problem.look(c, found.state) for c in range(len(sights))]
+    looks = problem.looks(found.state, torch.arange(len(found.cost), device=found.cost.device))
     return Adjusted(
         problem.state(found.state),
         found.cost,
@@ -161,7 +170,7 @@ def adjust(
         tuple(look.residuals for look in looks),
         tuple(look.valid for look in looks),
         tuple(look.weights for look in looks),
-        problem.equations(found.state),
+        problem,
     )
 
 
@@ -196,7 +205,7 @@ def bent(points: Tensor, bend: Tensor) -> tuple[Tensor, Tensor]:
 class _Look(NamedTuple):
     """What a camera makes of a state: residuals (B, V, N, 2), valid, weights of the squares and cost (B, V, N).
 
-    frames: the points in it, see `Bundle.points`.
+    frames: the points in it, see `Bundle.points`. camera: as it is in that state.
     """
 
     residuals: Tensor
@@ -204,6 +213,7 @@ class _Look(NamedTuple):
     weights: Tensor
     cost: Tensor
     frames: tuple[Tensor, Tensor, Tensor]
+    camera: Camera
 
 
 class Bundle:
@@ -223,9 +233,11 @@ class Bundle:
     low: Tensor
     high: Tensor
     is_bounded: bool
+    _last: tuple[tuple[Tensor, ...], list[_Look]] | None
 
     def __init__(self, sights: Sequence[Sight], state: State, free: Free, loss: str | None, loss_scale: float):
         self.free, self.loss, self.loss_scale = free, loss, loss_scale
+        self._last = None
         batch = state.boards.translations.shape[0]
         self.sights = [
             s._replace(**{name: getattr(s, name).expand(batch, *getattr(s, name).shape[1:]) for name in s._fields[1:]})
@@ -309,7 +321,14 @@ class Bundle:
         cost, slope = robust(self.loss, self.loss_scale, residuals.square().sum(-1))
         lost = robust(self.loss, self.loss_scale, torch.full_like(cost, _LOST**2))[0]
         cost = torch.where(valid, cost, lost) * sight.weights
-        return _Look(residuals, valid, torch.where(valid, slope * sight.weights, 0.0), cost, frames)
+        return _Look(residuals, valid, torch.where(valid, slope * sight.weights, 0.0), cost, frames, camera)
+
+    def looks(self, flat: Sequence[Tensor], rows: Tensor) -> list[_Look]:
+        """Of all cameras: those of the last state again if it is that."""
+        given = rows, *flat
+        if self._last is None or not all(map(torch.equal, given, self._last[0])):
+            self._last = given, [self.look(c, flat, rows) for c in range(len(self.sights))]
+        return self._last[1]
 
     def sight(self, c: int, rows: Tensor | None) -> Sight:
         """Of some problems."""
@@ -320,7 +339,7 @@ class Bundle:
 
     def cost(self, flat: Sequence[Tensor], rows: Tensor) -> Tensor:
         """(R,)."""
-        total = torch.stack([self.look(c, flat, rows).cost.sum((-1, -2)) for c in range(len(self.sights))]).sum(0)
+        total = torch.stack([look.cost.sum((-1, -2)) for look in self.looks(flat, rows)]).sum(0)
         return torch.where(torch.isfinite(total), total, torch.inf)
 
     # -- the linear problem
@@ -339,10 +358,11 @@ class Bundle:
 
     def equations(self, flat: Sequence[Tensor], rows: Tensor | None = None) -> Equations:
         """The triangles of a state."""
+        rows = torch.arange(len(flat[0]), device=flat[0].device) if rows is None else rows
         state, width, total = self.state(flat), self.width, len(self.columns)
         parts = []
-        for c in range(len(self.sights)):
-            block, at = self._rows_of(c, flat, state, rows)
+        for c, look in enumerate(self.looks(flat, rows)):
+            block, at = self._rows_of(c, look, state, rows)
             if total == 0:
                 parts.append(block)
                 continue
@@ -360,31 +380,27 @@ class Bundle:
         shared = torch.linalg.qr(padded(left), mode="r").R
         return Equations(triangle[..., :width, :], shared, self.columns)
 
-    def _rows_of(self, c: int, flat: Sequence[Tensor], state: State, rows: Tensor | None) -> tuple[Tensor, list[int]]:
+    def _rows_of(self, c: int, look: _Look, state: State, rows: Tensor) -> tuple[Tensor, list[int]]:
         """The rows (B, V, 2 N, L + F + 1) of a camera, and which of the shared unknowns its F columns are."""
-        sight, look = self.sight(c, rows), self.look(c, flat, rows)
+        sight = self.sight(c, rows)
         turned, first, points = look.frames
         batch, views, count = points.shape[:3]
         parameters = state.parameters[c]
         lead = (1, batch * views * count) if self.are_shared[c] else (batch, views * count)
-        k = parameters[: lead[0], 4:]
-        found = sensor_jacobians(self.cameras[c], k, points.reshape(*lead, 3))
-        a, b = (p.view(batch, views, count) for p in found.points[:2])
-        focal = parameters[:, :2].view(batch, 1, 1, 2, 1)
-        by_point = found.by_ray.permute(0, 3, 1, 2).reshape(batch, views, count, 2, 3) * focal
+        learnt = [(g, i) for g, (camera, i) in enumerate(self.columns) if camera == c and i < parameters.shape[-1]]
+        at = [g for g, _ in learnt]
+        found = pixel_jacobians(look.camera, points.reshape(*lead, 3), any(i >= 4 for _, i in learnt))
+        by_point, by_k = (by.reshape(batch, views, count, 2, by.shape[-1]) for by in found)
         by_first = by_point if c == 0 else by_point @ state.mounts.rotations[:, c, None, None]
         columns = []
         if self.width == 6:
             columns.append(torch.linalg.cross(turned[..., None, :].expand_as(by_first), by_first, dim=-1))
         columns.append(by_first)
-        at = []
-        zero, one = torch.zeros_like(a), torch.ones_like(a)
-        usual = ((a, zero), (zero, b), (one, zero), (zero, one))
-        by_k = found.by_k.permute(0, 3, 1, 2).reshape(batch, views, count, 2, k.shape[-1]) * focal
-        for g, (camera, i) in enumerate(self.columns):
-            if camera == c and i < parameters.shape[-1]:
-                at.append(g)
-                columns.append(torch.stack(usual[i], -1)[..., None] if i < 4 else by_k[..., i - 4, None])
+        if learnt:
+            focal, centre = parameters[:, None, None, :2], parameters[:, None, None, 2:4]
+            by_focal = torch.diag_embed((look.residuals + sight.pixels - centre) / focal)
+            by_centre = torch.eye(2, dtype=focal.dtype, device=focal.device).expand_as(by_focal)
+            columns.append(torch.cat((by_focal, by_centre, by_k), -1)[..., [i for _, i in learnt]])
         mine = [g for g, (camera, i) in enumerate(self.columns) if camera == c and i >= parameters.shape[-1]]
         if mine:
             at += mine
@@ -404,7 +420,7 @@ class Bundle:
         of_views, shared = step
         boards, mounts, bend = state.boards, state.mounts, state.bend
         if self.width == 6:
-            turned = rotation_matrix(of_views[..., :3]) @ boards.rotations
+            turned = small_turn(of_views[..., :3]) @ boards.rotations
             boards = Poses(turned, boards.translations + of_views[..., 3:])
         else:
             boards = boards._replace(translations=boards.translations + of_views)
@@ -420,7 +436,7 @@ class Bundle:
                 i -= parameters[c].shape[-1]
                 (turn if i < 3 else shift)[:, c, i % 3] += shared[:, g]
         if any(self.free.mounts):
-            mounts = Poses(rotation_matrix(turn) @ mounts.rotations, mounts.translations + shift)
+            mounts = Poses(small_turn(turn) @ mounts.rotations, mounts.translations + shift)
         return self.flat(State(tuple(parameters), mounts, boards, bend))
 
 

@@ -345,7 +345,7 @@ def _turned(lens: _Lens, some: Observations) -> _Lens:
     sight = Sight(lens.model, *(t[0, rows].repeat(2, *[1] * (t.ndim - 2))[:, None] for t in sight[1:]))
     free = Free((torch.zeros(lens.parameters.shape[-1], dtype=torch.bool, device="cpu"),), (False,))
     state = _state(lens.parameters, both)
-    ended = adjust([sight], state, free, loss="cauchy", loss_scale=lens.scale, steps=_STEPS)
+    ended = adjust([sight], state, free, loss="cauchy", loss_scale=lens.scale, steps=_FEW_STEPS)
     halves = slice(len(rows)), slice(len(rows), None)
     a, b = (Poses(*(t[half].transpose(0, 1) for t in ended.state.boards)) for half in halves)
     better = Poses.where(ended.cost[halves[0]] <= ended.cost[halves[1]], a, b)
