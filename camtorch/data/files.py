@@ -59,7 +59,7 @@ def read(path: str | os.PathLike[str], format: str | None = None) -> Samples:
     Raises:
         ValueError: a file that is not of the format, cut short, or in another encoding, here or when a sample is asked
             for; the text names the file and the line. A format that is not known or not seen. FileNotFoundError: no
-            such path. ImportError: Matlab's files need scipy, HDF5 h5py, `pip install "camtorch[datasets]"`.
+            such path. ImportError: files of HDF5 need h5py, `pip install "camtorch[datasets]"`.
     """
     check_path(path, "read")
     found = Path(path)

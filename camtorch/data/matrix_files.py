@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import importlib
+import struct
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -61,18 +63,49 @@ _SHAPES = ((2, 68), (3, 68))
 
 
 def _matlab(path: Path, names: tuple[str, ...]) -> dict[str, np.ndarray[Any, Any]]:
-    """Arrays of a file of Matlab, by scipy, or by h5py if it is of version 7.3, which is HDF5."""
+    """Arrays of numbers by their names, of a file of Matlab 5 to 7.3, of which the last is HDF5.
+
+    The older form is read here: scipy's reader ends the process at some damaged files. Source: MAT-File Format, The
+    MathWorks; elements of a kind and a number of bytes, the matrices among them compressed or not.
+    """
     with path.open("rb") as file:
-        is_hdf = file.read(10) == b"MATLAB 7.3"
-    if is_hdf:
+        content = file.read(_LARGEST)
+    if content[:10] == b"MATLAB 7.3":
         with _hdf(path) as arrays:
             return {name: np.asarray(arrays[name]).T for name in names if name in arrays}
-    loadmat = _imported("scipy.io", path).loadmat
-    with failing_at(
-        path, "not a whole file of Matlab: ", Exception
-    ):  # scipy has many kinds of errors for damaged files
-        found = loadmat(path, variable_names=names)
-    return {name: np.asarray(found[name]) for name in names if name in found}
+    if content[:6] != b"MATLAB" or content[126:128] != b"IM":
+        raise ValueError(f"{path}: not a file of Matlab, or of one older than version 5; it begins {content[:20]!r}")
+    found = {}
+    with failing_at(path, "not a whole file of Matlab: ", ValueError, KeyError, struct.error, zlib.error):
+        for kind, part in _elements(content[128:]):
+            if kind == _COMPRESSED:
+                kind, part = next(_elements(zlib.decompressobj().decompress(part, _LARGEST)), (0, b""))
+            parts = list(_elements(part)) if kind == _MATRIX else []
+            if len(parts) > 3 and (name := parts[2][1].decode("latin-1")) in names:
+                shape, numbers = np.frombuffer(parts[1][1], "<i4"), np.frombuffer(parts[3][1], _NUMBERS[parts[3][0]])
+                found[name] = numbers.reshape(shape.tolist(), order="F")
+    return found
+
+
+def _elements(content: bytes) -> Iterator[tuple[int, bytes]]:
+    """The kind and the bytes of each element, of which small ones lie within eight bytes."""
+    at = 0
+    while at < len(content):
+        kind, size = struct.unpack_from("<II", content, at)
+        if kind >> 16:
+            kind, size, begin, after = kind & 0xFFFF, kind >> 16, at + 4, at + 8
+        else:
+            begin = at + 8
+            after = begin + size + (0 if kind == _COMPRESSED else -size % 8)
+        if begin + size > len(content):
+            raise ValueError(f"{size} bytes were expected, and {len(content) - begin} are left")
+        yield kind, content[begin : begin + size]
+        at = after
+
+
+_MATRIX, _COMPRESSED = 14, 15
+_NUMBERS = {1: "i1", 2: "u1", 3: "<i2", 4: "<u2", 5: "<i4", 6: "<u4", 7: "<f4", 9: "<f8", 12: "<i8", 13: "<u8"}
+_LARGEST = 1 << 26  # bytes; those of 300W-LP have some thousands
 
 
 class XGaze(FileSamples):
@@ -127,14 +160,9 @@ _FIELDS = {"face_head_pose": "pitch_yaw_head", "face_mat_norm": "rotation"}
 @contextmanager
 def _hdf(path: Path) -> Iterator[Any]:
     """A file of HDF5; what goes wrong with it in the block is a ValueError that names it."""
-    open_file = _imported("h5py", path).File
+    try:
+        open_file = importlib.import_module("h5py").File
+    except ImportError:
+        raise ImportError(f'{path}: to read it needs h5py: pip install "camtorch[datasets]"') from None
     with failing_at(path, "not a whole file of HDF5: ", OSError, KeyError, RuntimeError), open_file(path, "r") as file:
         yield file
-
-
-def _imported(name: str, path: Path) -> Any:
-    try:
-        return importlib.import_module(name)
-    except ImportError:
-        package = name.partition(".")[0]
-        raise ImportError(f'{path}: to read it needs {package}: pip install "camtorch[datasets]"') from None
