@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import operator
+import os
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
@@ -113,10 +114,12 @@ def named_image(labels: Path, name: Any, folders: Iterable[str], place: object) 
     above = [labels.parent, *labels.resolve().parent.parents][: _UP + 1]
     for root in above:
         for folder in folders:
-            if (root / folder / parts).is_file():
+            if os.path.isfile(root / folder / parts):  # False, too, for names that no file can have
                 return root / folder / parts
     where = ", ".join(repr(folder) for folder in folders if folder)
-    raise ValueError(f"{place}: no file {name!r} in {labels.parent} or in {where} there or up to {_UP} folders above")
+    raise ValueError(
+        f"{place}: no file {name!r:.200} in {labels.parent} or in {where} there or up to {_UP} folders above"
+    )
 
 
 # -- text and numbers

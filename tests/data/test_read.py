@@ -353,6 +353,8 @@ def test_faults_in_text_name_file_and_line(tmp_path):
     assert ", line 1: attributes must be 0 or 1" in message(path)
     path.write_text(lines[0].replace("0--Parade", "../x"))
     assert "within the folder of images" in message(path)
+    path.write_text(lines[0].replace("0--Parade", 999 * "x"))
+    assert "line 1: no file 'xxx" in message(path)
     path.write_text(lines[0], encoding="utf-16")
     assert "line 1: not text in UTF-8" in message(path, format="wflw")
     path.write_bytes(b"")
