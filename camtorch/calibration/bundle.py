@@ -15,12 +15,14 @@ import torch
 from torch import Tensor
 from torch.nn.utils.parametrize import type_before_parametrizations
 
+from camtorch._evaluation import compiled_of
 from camtorch._module import remade
 from camtorch.camera import Camera, fixed_camera
 from camtorch.convert.fitting import bounds
 from camtorch.least_squares.equations import Equations, System, padded, triangle_of_few
-from camtorch.least_squares.jacobians import pixel_jacobians
+from camtorch.least_squares.jacobians import sensor_jacobians
 from camtorch.least_squares.levenberg_marquardt import FIRST_DAMPING, minimise, rounding_of
+from camtorch.projection import compiled
 from camtorch.rotations import small_turn
 
 LOSSES = ("huber", "cauchy")
@@ -389,7 +391,7 @@ class Bundle:
         lead = (1, batch * views * count) if self.are_shared[c] else (batch, views * count)
         learnt = [(g, i) for g, (camera, i) in enumerate(self.columns) if camera == c and i < parameters.shape[-1]]
         at = [g for g, _ in learnt]
-        found = pixel_jacobians(look.camera, points.reshape(*lead, 3), any(i >= 4 for _, i in learnt))
+        found = _pixel_jacobians(look.camera, points.reshape(*lead, 3), any(i >= 4 for _, i in learnt))
         by_point, by_k = (by.reshape(batch, views, count, 2, by.shape[-1]) for by in found)
         by_first = by_point if c == 0 else by_point @ state.mounts.rotations[:, c, None, None]
         columns = []
@@ -446,3 +448,19 @@ def _template(model: type[Camera] | Camera, parameters: Tensor) -> Camera:
     made = fixed_camera(kind, parameters[0, :4], parameters[0, 4:])
     made._warned = True  # a step that is refused may have gone anywhere
     return made
+
+
+def _pixel_jacobians(camera: Camera, points: Tensor, learns: bool) -> tuple[Tensor, Tensor]:
+    """The exact derivatives of pixels by points (C, N, 3), and by the coefficients of cameras (C,) if one learns.
+
+    (C, N, 2, 3) and (C, N, 2, n), which mean nothing where a point is not valid.
+    """
+    if not learns and (made := compiled_of([camera], points)) is not None:
+        ones = torch.eye(2, dtype=points.dtype, device="cpu")[:, :, None, None].expand(2, 2, *points.shape[:2])
+        rows = [compiled.project_vjp(made[0], points, one, True, False)[0] for one in ones]
+        by_point = torch.stack([row for row in rows if row is not None], -2)
+        return by_point.nan_to_num(0.0, 0.0, 0.0), points.new_zeros(*by_point.shape[:-1], 0)
+    intrinsics = camera.intrinsics.view(-1, 4)
+    found = sensor_jacobians(camera, camera.distortion.view(len(intrinsics), -1), points)
+    focal = intrinsics[:, None, :2, None]
+    return found.by_ray.permute(0, 3, 1, 2) * focal, found.by_k.permute(0, 3, 1, 2) * focal

@@ -11,9 +11,7 @@ from torch import Tensor
 from torch.autograd import forward_ad
 
 from camtorch._arguments import columns
-from camtorch._evaluation import compiled_of
 from camtorch.optics.backprojection import Inverted
-from camtorch.projection import compiled
 
 if TYPE_CHECKING:
     from camtorch.camera import Camera
@@ -36,22 +34,6 @@ class SensorJacobians(NamedTuple):
     points: SensorPoints
     by_ray: Tensor
     by_k: Tensor
-
-
-def pixel_jacobians(camera: Camera, points: Tensor, learns: bool) -> tuple[Tensor, Tensor]:
-    """The exact derivatives of pixels by points (C, N, 3), and by the coefficients of cameras (C,) if one learns.
-
-    (C, N, 2, 3) and (C, N, 2, n), which mean nothing where a point is not valid.
-    """
-    if not learns and (made := compiled_of([camera], points)) is not None:
-        ones = torch.eye(2, dtype=points.dtype, device="cpu")[:, :, None, None].expand(2, 2, *points.shape[:2])
-        rows = [compiled.project_vjp(made[0], points, one, True, False)[0] for one in ones]
-        by_point = torch.stack([row for row in rows if row is not None], -2)
-        return by_point.nan_to_num(0.0, 0.0, 0.0), points.new_zeros(*by_point.shape[:-1], 0)
-    intrinsics = camera.intrinsics.view(-1, 4)
-    found = sensor_jacobians(camera, camera.distortion.view(len(intrinsics), -1), points)
-    focal = intrinsics[:, None, :2, None]
-    return found.by_ray.permute(0, 3, 1, 2) * focal, found.by_k.permute(0, 3, 1, 2) * focal
 
 
 def to_sensor(camera: Camera | type[Camera], k: Tensor, rays: Tensor) -> SensorPoints:
