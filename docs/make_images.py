@@ -26,7 +26,13 @@ from drawings.pages import EXAMPLES, IMAGES
 
 from camtorch.plot.axes import COLOURS
 
-SCRIPTS = {"room": "dewarp_room", "stereo": "stereo_room", "surround": "birds_eye", "camera": "predict_camera"}
+SCRIPTS = {
+    "room": "dewarp_room",
+    "stereo": "stereo_room",
+    "surround": "birds_eye",
+    "camera": "predict_camera",
+    "drivers": "driver_monitoring",
+}
 """Name of the file -> the example that draws it."""
 
 

@@ -20,6 +20,7 @@ from camtorch.augment.edits import (
     VerticalFlip,
 )
 from camtorch.augment.face import FaceNormalizer
+from camtorch.augment.face_model import face_points
 from camtorch.augment.landmarks import LANDMARKS
 from camtorch.augment.presets import PRESETS, Preset
 from camtorch.augment.random_camera import RandomCamera, RandomLens, RandomMount
@@ -50,6 +51,7 @@ __all__ = [
     "Rotate90",
     "VerticalFlip",
     "collate",
+    "face_points",
     "from_pitch_yaw",
     "mount_rotation",
     "outlines",

@@ -133,7 +133,7 @@ def solve_pnp(
     rms, valid = root_of(mean, found.valid).to(task.dtype).view(task.batch), found.valid.view(task.batch)
     inliers = inliers.view(*task.batch, inliers.shape[-1])
     covariance = covariance.to(task.dtype).view(*task.batch, 6, 6)
-    return Pose(Extrinsics(rotation[..., None], translation), rms, valid, inliers, covariance)
+    return Pose(_fixed(rotation, translation), rms, valid, inliers, covariance)
 
 
 def _of_each_model(
@@ -154,7 +154,13 @@ def _of_each_model(
         pose = solve_pnp(group, mine[0], mine[1], weights=mine[2][..., 0], threshold=threshold)
         found.append((pose.extrinsics.rotation, pose.extrinsics.translation, *pose[1:], pose.inliers, pose.covariance))
     rotation, translation, *others = (camera._in_order(torch.cat(parts)) for parts in zip(*found, strict=True))
-    return Pose(Extrinsics(rotation[..., None], translation), *others)
+    return Pose(_fixed(rotation, translation), *others)
+
+
+def _fixed(rotation: Tensor, translation: Tensor) -> Extrinsics:
+    """A pose that does not learn by itself; gradients go to what it was found from."""
+    made = Extrinsics(rotation[..., None], translation)
+    return made if rotation.requires_grad else made.requires_grad_(False)
 
 
 class _Task(NamedTuple):

@@ -291,7 +291,32 @@ def learn() -> Image.Image:
     return tiles(panels, 2)
 
 
+def head_pose() -> Image.Image:
+    """What a pinhole camera, assumed for a lens of 130 degrees, makes of a head that faces the camera's axis."""
+    lens = ct.KannalaBrandt.from_fov(130, image_size=(480, 640)).double().requires_grad_(False)
+    assumed = ct.Pinhole(lens.intrinsics.detach(), image_size=(480, 640)).requires_grad_(False)
+    face, degrees = ct.augment.face_points(), torch.linspace(0, 60, 31, dtype=torch.float64)
+    away = torch.deg2rad(degrees)
+    places = 0.6 * torch.stack((away.sin(), 0 * away, away.cos()), -1)
+    pixels, _ = lens.project(face + places[:, None])
+    true, wrong = (ct.solve_pnp(camera, face, pixels) for camera in (lens, assumed))
+    figure, axes = plt.subplots(1, 2, figsize=(9, 3), layout="constrained", facecolor=PAGE)
+    for pose, colour, title in ((true, "#1e64f0", "its own lens"), (wrong, "#e21d48", "a pinhole assumed")):
+        pitch, yaw, _ = torch.rad2deg(ct.head_angles(pose)).unbind(-1)
+        axes[0].plot(degrees, yaw, color=colour, label=f"yaw, {title}")
+        axes[0].plot(degrees, pitch, "--", color=colour, label=f"pitch, {title}")
+        axes[1].plot(degrees, 100 * pose.extrinsics.translation.norm(dim=-1), color=colour, label=title)
+    axes[0].set_ylabel("degrees off (the truth is 0)")
+    axes[1].set_ylabel("distance, cm (the truth is 60)")
+    for axis in axes:
+        axis.set_xlabel("degrees of the head from the axis")
+        axis.legend(frameon=False, fontsize="small")
+        axis.set_facecolor(PAGE)
+    return drawn(figure)
+
+
 PICTURES = {
+    "head-pose": head_pose,
     "overview": overview,
     "overview-phone": functools.partial(overview, 2),
     "photograph": photograph_dewarped,

@@ -147,3 +147,16 @@ def test_what_cannot_be_normalised_says_why(pinhole):
         normalizer.inverse(gaze=torch.rand(2, 3))
     with pytest.raises(ValueError, match="no camera"):
         FaceNormalizer()(batch())
+
+
+def test_the_generic_face_is_symmetric_and_of_the_size_of_a_face():
+    points = ct.augment.face_points()
+    mirrored = points[list(ct.augment.LANDMARKS["ibug68"])] * torch.tensor([-1.0, 1.0, 1.0])
+    torch.testing.assert_close(mirrored, points, atol=0, rtol=0)
+    pupils = points[[36, 37, 38, 39, 40, 41]].mean(0), points[[42, 43, 44, 45, 46, 47]].mean(0)
+    assert 0.055 < (pupils[1] - pupils[0])[0] < 0.07
+    assert points[30, 2] == points[:, 2].min()  # the tip of the nose is nearest to who looks at it
+    assert points[8, 1] == points[:, 1].max()  # and the chin the lowest
+    camera = ct.Pinhole.from_fov(40, image_size=(480, 640)).double()
+    pose = ct.solve_pnp(camera, points, camera.project(points + torch.tensor([0.0, 0.02, 0.6]))[0])
+    assert ct.head_angles(pose).abs().max() < 1e-6
