@@ -60,7 +60,7 @@ def freeze(camera: Camera, names: Sequence[str], frozen: bool) -> None:
 
 def restore(camera: Camera) -> None:
     """Bring Parameters back to the frozen values, as they are about to be saved or to learn."""
-    for tensor in camera.tensor_names:
+    for tensor, _ in _tensors_of(camera):
         frozen, parameter = camera._buffers.get(PREFIX + tensor), camera._parameters.get(tensor)
         if frozen is not None and isinstance(parameter, nn.Parameter):
             with torch.no_grad():
@@ -77,11 +77,12 @@ def saved(camera: Camera, destination: Any, prefix: str) -> None:
 def loaded(camera: Camera, metadata: dict[str, Any]) -> None:
     """After a state was loaded: what is frozen has the values of the state, and what the state says is frozen too."""
     names = {*frozen_names(camera), *metadata.get("frozen", ())}
-    for tensor in camera.tensor_names:
+    for tensor, _ in _tensors_of(camera):
         camera._buffers.pop(PREFIX + tensor, None)
     if names:
         freeze(camera, sorted(names), True)
 
 
 def _tensors_of(camera: Camera) -> tuple[tuple[str, tuple[str, ...]], ...]:
-    return ("intrinsics", INTRINSICS), ("distortion", tuple(camera.distortion_names))
+    """What holds them, and the names of its columns; a Mixed has none of its own."""
+    return () if camera.is_mixed else (("intrinsics", INTRINSICS), ("distortion", tuple(camera.distortion_names)))
