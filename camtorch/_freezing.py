@@ -37,6 +37,8 @@ def freeze(camera: Camera, names: Sequence[str], frozen: bool) -> None:
     owner = f"{type(camera).__name__}.{'freeze' if frozen else 'unfreeze'}"
     if camera.is_mixed:
         raise TypeError(f"{owner}: a Mixed has no parameters of its own; freeze the cameras that it is made of")
+    if len(names) == 1 and isinstance(names[0], (list, tuple)):
+        names = names[0]
     known = [name for _, each in _tensors_of(camera) for name in each]
     for name in names:
         if name not in known:

@@ -41,7 +41,7 @@ REGIONS: dict[str, tuple[tuple[float, float, float], ...]] = {
     "left_mirror": ((0.75, 0.85, -0.15), (0.75, 0.6, -0.15), (0.75, 0.6, 0.02), (0.75, 0.85, 0.02)),
     "right_mirror": ((0.85, -1.42, -0.15), (0.85, -1.7, -0.15), (0.85, -1.7, 0.02), (0.85, -1.42, 0.02)),
     "left_window": ((0.6, 0.65, -0.15), (-0.4, 0.65, -0.15), (-0.4, 0.65, 0.3), (0.6, 0.65, 0.3)),
-    "passenger": ((-0.2, -0.6, -0.7), (0.4, -0.6, -0.7), (0.4, -0.6, 0.1), (-0.2, -0.6, 0.1)),
+    "passenger": ((-0.2, -0.6, -0.7), (0.4, -0.6, -0.7), (0.4, -0.6, -0.1), (-0.2, -0.6, -0.1)),
     "lap": ((0.05, 0.25, -0.6), (0.45, 0.25, -0.6), (0.45, -0.25, -0.6), (0.05, -0.25, -0.6)),
 }
 """Name -> the corners of a region that drivers look at, in the car's frame."""
@@ -91,11 +91,11 @@ class Regions:
     """
 
     names: tuple[str, ...]
-    """Of the regions, in the order of their numbers."""
+    """Of the regions, in the order of their numbers, and at last "elsewhere", which is `names[-1]`."""
 
     def __init__(self, polygons: Mapping[str, Numbers] | None = None, *, right_hand_drive: bool = False):
         flipped = torch.tensor([1.0, -1.0 if right_hand_drive and polygons is None else 1.0, 1.0], dtype=torch.float64)
-        self.names, self._planes = tuple(REGIONS if polygons is None else polygons), []
+        self.names, self._planes = (*(REGIONS if polygons is None else polygons), "elsewhere"), []
         for name, given in (REGIONS if polygons is None else polygons).items():
             corners = as_coordinates(given, f"polygons[{name!r}]", 3, "Regions").detach().double() * flipped
             if corners.ndim != 2 or len(corners) < 3 or not bool(torch.isfinite(corners).all()):
@@ -112,7 +112,7 @@ class Regions:
                 )
             self._planes.append((middle, axes, along[:, :2]))
 
-    def region_of(self, gaze: Numbers, eye: Numbers, pose: Extrinsics | Numbers | None = None) -> Tensor:
+    def region_of(self, gaze: Numbers, eye: Numbers, pose: Mount | Extrinsics | Numbers | None = None) -> Tensor:
         """The number of the region that a gaze meets first.
 
         The answer does not depend on the camera: where an augmentation turns gaze, eye and pose together, as it does
@@ -121,10 +121,10 @@ class Regions:
         Args:
             gaze: (..., 3), of any length, in the camera's frame, or in the car's without a pose.
             eye: (..., 3) from where, in the same frame.
-            pose: camera from car: an `Extrinsics`, or (..., 4, 4). None: gaze and eye are in the car's frame.
+            pose: camera from car: an `Extrinsics`, a `Mount`, or (..., 4, 4). None: both are in the car's frame.
 
         Returns:
-            (...) int64, the place in `names`; -1 where it meets none, or is not finite.
+            (...) int64, the place in `names`; -1, "elsewhere", where it meets none, or is not finite.
         """
         ray, start = _in_car(gaze, eye, pose, "region_of")
         nearest = ray.new_full(ray.shape[:-1], torch.inf)
@@ -141,15 +141,16 @@ class Regions:
         return found
 
     def __repr__(self) -> str:
-        return f"Regions({', '.join(self.names)})"
+        return f"Regions({', '.join(self.names[:-1])})"
 
 
-def head_share(gaze: Numbers, head: Numbers, pose: Extrinsics | Numbers | None = None) -> Tensor:
+def head_share(gaze: Numbers, head: Numbers, pose: Mount | Extrinsics | Numbers | None = None) -> Tensor:
     """Which part of a glance away from straight ahead the head makes: "owl" near 1, "lizard" near 0.
 
     Euro NCAP calls those who turn the head to look owls, and those who move the eyes alone lizards (Mulhall et al.,
     European NCAP driver state monitoring protocols, 2022). The angle of gaze from the car's x axis is compared with how
-    far the nose went in the same direction; more than 1 is a head that goes further than the eyes.
+    far the nose went in the same direction; more than 1 is a head that goes further than the eyes, and below 0 one that
+    goes the other way.
 
     Args:
         gaze: (..., 3) in the camera's frame, or in the car's without a pose.
@@ -179,10 +180,13 @@ def _from_ahead(rays: Tensor) -> Tensor:
     return angles
 
 
-def _in_car(gaze: Numbers, eye: Numbers, pose: Extrinsics | Numbers | None, owner: str) -> tuple[Tensor, Tensor]:
+def _in_car(
+    gaze: Numbers, eye: Numbers, pose: Mount | Extrinsics | Numbers | None, owner: str
+) -> tuple[Tensor, Tensor]:
     """Unit gaze and eye, float64, in the car's frame."""
     ray, start = (as_coordinates(v, n, 3, owner).detach().double() for v, n in ((gaze, "gaze"), (eye, "eye")))
     if pose is not None:
+        pose = pose.extrinsics if isinstance(pose, Mount) else pose
         matrix = (pose.matrix() if isinstance(pose, Extrinsics) else as_values(pose, "pose", owner)).detach().double()
         if matrix.ndim < 2 or matrix.shape[-2:] != (4, 4):
             raise ValueError(f"{owner}: pose must be an Extrinsics or (..., 4, 4); got shape {tuple(matrix.shape)}")

@@ -63,6 +63,7 @@ def read(path: str) -> list[Sample]:
         if "boxes" not in sample:  # the box of the landmarks
             points = sample["keypoints"]
             sample["boxes"] = torch.cat((points.amin(-2), points.amax(-2)), -1).reshape(1, 4)
+        sample["image"] = sample["image"].expand(3, -1, -1)  # grey ones have one channel
         found.append(sample)
     return found
 

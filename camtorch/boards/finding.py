@@ -39,6 +39,11 @@ class BoardObservations(NamedTuple):
     image_size: tuple[int, int]
     """(height, width)."""
 
+    def __repr__(self) -> str:
+        seen = sum(int(np.isfinite(pixels[:, 0]).sum()) for pixels in self.image_points)
+        height, width = self.image_size
+        return f"BoardObservations({len(self.names)} images of {width} x {height}, {seen} points)"
+
 
 def find_board(images: Any, board: Any, *, square: float = 1.0, **options: Any) -> BoardObservations:
     """Find a board in images: the finder of `camtorch calibrate`, for calibrations in Python.

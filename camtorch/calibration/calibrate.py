@@ -487,8 +487,11 @@ def _result(
     parameters = state.parameters[camera][0]
     arguments = (parameters[:4], parameters[4:]) if asked.count else (parameters[:4],)
     rotations, translations = (t[0] for t in _seen_from(state, camera))
+    found = asked.kind(*arguments, image_size=layout.image_size)
+    if asked.start is not None and (frozen := frozen_names(asked.start)):
+        found.freeze(*frozen)
     return Calibration(
-        camera=asked.kind(*arguments, image_size=layout.image_size),
+        camera=found,
         extrinsics=Extrinsics(rotation_vector(rotations).unsqueeze(-1), translations - rotations @ search.middle),
         rms=_rms(residuals, seen.seen),
         sigma=float(sigma),

@@ -32,7 +32,10 @@ def project_polyline(camera: Camera, points: Numbers, extrinsics: Extrinsics | N
         raise ValueError(f"{owner}: points must be finite; got {points.detach().tolist()!s:.200}")
     if extrinsics is not None:
         if not isinstance(extrinsics, Extrinsics) or extrinsics.batch_shape:
-            raise TypeError(f"{owner}: extrinsics must be one Extrinsics, camera from world; got {extrinsics!r:.100}")
+            raise TypeError(
+                f"{owner}: extrinsics must be one Extrinsics, camera from world, as pose.extrinsics of solve_pnp or "
+                f"ct.Extrinsics.from_matrix(matrix); got {type(extrinsics).__name__}"
+            )
         points = extrinsics(points)
     edges = _Edges(points.double())
     middle, reach = _region(camera)
