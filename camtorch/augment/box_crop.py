@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from camtorch._arguments import as_image_size, as_number, as_whole
+from camtorch._arguments import as_image_size, as_whole
 from camtorch.augment.augmentation import Augmentation, EditOptions, as_range
 from camtorch.camera import Camera
 from camtorch.rotations import mount_rotation
-from camtorch.warp.views import check_extents, looking_at, pinhole
+from camtorch.warp.views import as_margin, check_extents, looking_at, pinhole
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
@@ -67,9 +67,7 @@ class BoxCrop(Augmentation):
         size = as_image_size(image_size, name)
         if size is None:
             raise TypeError(f"{name}: image_size must be two integers (height, width); got None")
-        self.image_size, self.margin = size, as_number(margin, "margin", name)
-        if self.margin <= -0.5:
-            raise ValueError(f"{name}: margin must be more than -0.5, which leaves nothing of a box; got {margin!r}")
+        self.image_size, self.margin = size, as_margin(margin, name)
         self.crops = {"box": as_whole(index, "index", name)}
 
     def new_camera(self, source: Camera, values: Mapping[str, Tensor]) -> tuple[Camera, Tensor | None]:

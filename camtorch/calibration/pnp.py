@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
 import torch
@@ -111,7 +112,7 @@ def solve_pnp(
     """
     if threshold is not None:
         threshold = as_number(threshold, "threshold", "solve_pnp")
-        if threshold <= 0:
+        if not 0 < threshold < math.inf:
             raise ValueError(f"solve_pnp: threshold must be positive, in px; got {threshold:g}")
     if isinstance(camera, Mixed):
         return _of_each_model(camera, object_points, pixels, weights, threshold)

@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d
 
 from camtorch.camera import Camera
-from camtorch.projection.depth import depth_scale
+from camtorch.projection.depth import as_depth, depth_scale
 from camtorch.warp.grid import Sampling, to_positions
 from camtorch.warp.panorama import rays_of, seam_of, seen_by
 from camtorch.warp.sampling import PaddingMode
@@ -53,6 +53,7 @@ class ShiftedWarp(Warp):
         super().__init__(source, target, **options)
         self.turned_by(rotation)
         count = len(shift)
+        as_depth(depth, kind, source._size_for("RandomMount"), "RandomMount", depth.device)
         with torch.no_grad():
             rays, has_ray = _rays(source)
             length, known = depth_scale(depth[:, 0].to(rays), rays, has_ray, kind)

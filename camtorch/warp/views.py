@@ -245,13 +245,21 @@ def look_at(camera: Camera, boxes: Numbers, image_size: Sequence[int], *, margin
         raise TypeError(f"{owner}: image_size must be two integers (height, width); got None")
     rows = given if given.ndim == 2 else given.expand(*(batch or (1,)), 4)
     check_extents(rows, camera, "boxes", owner)
-    intrinsics, rotation = looking_at(camera, rows, size, as_number(margin, "margin", owner), owner)
+    intrinsics, rotation = looking_at(camera, rows, size, as_margin(margin, owner), owner)
     if given.ndim == 1 and not batch:
         intrinsics, rotation = intrinsics[0], rotation[0]
     intrinsics, rotation = (
         t.to(torch.promote_types(camera.intrinsics.dtype, torch.float32)) for t in (intrinsics, rotation)
     )
     return Warp(camera, pinhole(intrinsics, size)).turned_by(rotation)
+
+
+def as_margin(value: object, owner: str) -> float:
+    """A checked margin around a box, in parts of its sides."""
+    margin = as_number(value, "margin", owner)
+    if not -0.5 < margin < math.inf:
+        raise ValueError(f"{owner}: margin must be finite, and more than -0.5, which leaves nothing; got {value!r}")
+    return margin
 
 
 def pinhole(intrinsics: Tensor, size: tuple[int, int]) -> Pinhole:

@@ -231,5 +231,6 @@ def test_samples_without_the_box_are_refused():
         ct.augment.BoxCrop(SIZE, camera=camera)(image=image)
     with pytest.raises(ValueError, match="sample 1 has 0 boxes"):
         ct.augment.BoxCrop(SIZE, camera=camera)(image=image, boxes=boxes)
-    with pytest.raises(ValueError, match="margin"):
-        ct.augment.BoxCrop(SIZE, margin=-0.5)
+    for margin in (-0.5, float("nan")):
+        with pytest.raises(ValueError, match="margin"):
+            ct.augment.BoxCrop(SIZE, margin=margin)

@@ -129,6 +129,8 @@ def test_without_depth_it_says_so():
         augment(image=torch.zeros(1, 120, 160))
     with pytest.raises(ValueError, match="depth"):
         augment.change(None, augment.draw(1))
+    with pytest.raises(ValueError, match="floating point"):
+        augment(image=torch.zeros(1, 120, 160), depth=torch.full((1, 120, 160), 600, dtype=torch.int32))
     with pytest.raises(ValueError, match="goes before"):
         ct.augment.Compose([augment])
     with pytest.raises(TypeError, match="three lengths"):
