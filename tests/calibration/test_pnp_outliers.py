@@ -121,6 +121,16 @@ def test_what_does_not_agree_is_invalid():
     assert ct.solve_pnp(camera, target[:0], seen[:0], threshold=THRESHOLD).inliers.shape == (0, 12)
 
 
+def test_many_points_without_a_pose_come_to_an_end():
+    camera = ct.Pinhole.from_fov(60, image_size=(480, 640)).double().requires_grad_(False)
+    generator = torch.Generator().manual_seed(0)
+    points = torch.rand(300, 3, generator=generator, dtype=torch.float64)
+    pixels = 400 * torch.rand(300, 2, generator=generator, dtype=torch.float64)
+    pose = ct.solve_pnp(camera, points, pixels, threshold=0.5)
+    assert torch.isfinite(pose.extrinsics.translation).all()
+    assert pose.inliers.sum() < 30
+
+
 def test_a_pose_is_three_with_two_beside():
     camera, target, seen, *_ = problems(60, 3, 12, 0.0)
     pose = ct.solve_pnp(camera, target, seen)
