@@ -6,7 +6,10 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
+
+from camtorch._module import is_parameter
+from camtorch._tracing import in_transform, is_concrete, is_recorded
 
 if TYPE_CHECKING:
     from camtorch.camera import Camera
@@ -16,9 +19,38 @@ PREFIX = "_frozen_"
 """Of the buffers of the values that stay: NaN where one learns. Derived cameras have none."""
 
 
+class _Masked:
+    """A hook of a Parameter: no gradient of what is frozen."""
+
+    __torch_unserializable__ = True  # it comes anew where the copy of a camera is looked at
+
+    def __init__(self, learns: Tensor):
+        self.learns = learns
+
+    def __call__(self, gradient: Tensor) -> Tensor:
+        return torch.where(self.learns.to(gradient.device), gradient, 0.0)
+
+
 def with_frozen(tensor: Tensor, frozen: Tensor) -> Tensor:
-    """What learns from the Parameter, which weight decay and momentum may move, and the rest as it was frozen."""
-    return torch.where(frozen.isnan(), tensor, frozen)
+    """The Parameter, of which what is frozen is as it was, and has no gradient; of another tensor the like of it.
+
+    An optimizer's weight decay and momentum move values that have no gradient, which go back as soon as they are
+    looked at.
+    """
+    learns = frozen.isnan()
+    if not is_parameter(tensor) or not is_concrete(tensor) or in_transform() or is_recorded():
+        return torch.where(learns, tensor, frozen)
+    values = torch.where(learns, tensor.detach(), frozen)
+    if not torch.equal(values, tensor.detach()):
+        tensor.data.copy_(values)
+    if tensor.requires_grad and not _hooks_of(tensor):
+        tensor.register_hook(_Masked(learns))
+    return tensor
+
+
+def _hooks_of(tensor: Tensor) -> list[int]:
+    """The keys of this file's hooks."""
+    return [key for key, hook in (tensor._backward_hooks or {}).items() if isinstance(hook, _Masked)]
 
 
 def frozen_names(camera: Camera) -> tuple[str, ...]:
@@ -50,8 +82,10 @@ def freeze(camera: Camera, names: Sequence[str], frozen: bool) -> None:
             continue
         if "parametrizations" in camera._modules and tensor in camera.parametrizations:  # type: ignore[operator]
             raise TypeError(f"{owner}: {tensor} is parametrized; torch's remove_parametrizations makes it plain first")
-        restore(camera)
-        values = getattr(camera, tensor).detach().clone()
+        held = getattr(camera, tensor)
+        for key in _hooks_of(held):
+            del held._backward_hooks[key]  # type: ignore[union-attr]
+        values = held.detach().clone()
         now = torch.full_like(values, torch.nan) if before is None else before.clone()
         now[..., chosen] = values[..., chosen] if frozen else torch.nan
         if bool(now.isnan().all()):
@@ -60,18 +94,10 @@ def freeze(camera: Camera, names: Sequence[str], frozen: bool) -> None:
             camera.put(PREFIX + tensor, now)
 
 
-def restore(camera: Camera) -> None:
-    """Bring Parameters back to the frozen values, as they are about to be saved or to learn."""
-    for tensor, _ in _tensors_of(camera):
-        frozen, parameter = camera._buffers.get(PREFIX + tensor), camera._parameters.get(tensor)
-        if frozen is not None and isinstance(parameter, nn.Parameter):
-            with torch.no_grad():
-                parameter.copy_(with_frozen(parameter, frozen))
-
-
 def saved(camera: Camera, destination: Any, prefix: str) -> None:
     """After a state was saved, which shares the memory of the Parameters: its metadata say what is frozen."""
-    restore(camera)
+    for tensor, _ in _tensors_of(camera):
+        getattr(camera, tensor)  # by which it is as it was frozen
     if (names := frozen_names(camera)) and hasattr(destination, "_metadata"):
         destination._metadata[prefix[:-1]]["frozen"] = names
 

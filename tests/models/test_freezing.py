@@ -34,7 +34,9 @@ def loss(camera, seed=0):
 @each_kind
 def test_what_is_frozen_has_no_gradient_and_the_rest_has_its_own(key):
     plain, camera = spread(key), spread(key)
+    held = camera.intrinsics
     assert camera.freeze(*names_of(camera)) is camera
+    assert camera.intrinsics is held  # the Parameter, of which an optimizer may hold
     frozen = is_frozen(camera)
     parts = [p for p in (camera.intrinsics, camera.distortion) if p.requires_grad]
     for one in (plain, camera):
@@ -67,6 +69,39 @@ def test_no_optimizer_moves_it(key, make):
     assert (now != before)[:4][~frozen[:4]].all()
     camera.unfreeze()
     assert torch.equal(numbers(camera), now)
+
+
+def test_what_is_frozen_later_or_less_has_the_gradient_that_it_should():
+    camera = spread("kannala_brandt").freeze("fx")
+    loss(camera).backward()
+    camera.freeze("k1").unfreeze("fx")
+    camera.zero_grad()
+    loss(camera).backward()
+    assert camera.intrinsics.grad[0] != 0
+    assert camera.distortion.grad.tolist()[0] == 0
+    camera.unfreeze()
+    camera.zero_grad()
+    loss(camera).backward()
+    assert (camera.distortion.grad != 0).all()
+    for again in (copy.deepcopy(camera.freeze("k2")), pickle.loads(pickle.dumps(camera))):
+        again.zero_grad()
+        loss(again).backward()
+        assert again.distortion.grad[1] == 0
+        assert again.distortion.grad[0] != 0
+
+
+def test_compiled_and_functional_calls_hold_it():
+    camera = spread("kannala_brandt").freeze("fx", "k3")
+    points = torch.randn(9, 3, dtype=torch.float64) * 0.2 + torch.tensor([0.0, 0, 1])
+    want = camera.project(points)[0]
+    other = {"intrinsics": camera.intrinsics.detach() * 2}
+    moved = torch.func.functional_call(camera, other, (points,))[0]
+    middle = camera.cx.detach(), 2 * camera.cx.detach()
+    torch.testing.assert_close(moved[:, 0] - middle[1], want.detach()[:, 0] - middle[0])  # fx stays, cx does not
+    slope = torch.func.grad(
+        lambda values: torch.func.functional_call(camera, {"intrinsics": values}, (points,))[0].sum()
+    )
+    assert slope(camera.intrinsics.detach())[0] == 0
 
 
 def test_copies_pickles_and_states_keep_it():
