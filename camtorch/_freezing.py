@@ -84,7 +84,7 @@ def freeze(camera: Camera, names: Sequence[str], frozen: bool) -> None:
             raise TypeError(f"{owner}: {tensor} is parametrized; torch's remove_parametrizations makes it plain first")
         held = getattr(camera, tensor)
         for key in _hooks_of(held):
-            del held._backward_hooks[key]  # type: ignore[union-attr]
+            del held._backward_hooks[key]
         values = held.detach().clone()
         now = torch.full_like(values, torch.nan) if before is None else before.clone()
         now[..., chosen] = values[..., chosen] if frozen else torch.nan

@@ -45,6 +45,7 @@ class BoxCrop(Augmentation):
 
     image_size: tuple[int, int]
     crops: Mapping[str, int]
+    margin: float
 
     def __init__(
         self,

@@ -397,7 +397,8 @@ class RandomMount(RandomCamera):
         for name in ("chromatic", "rates"):
             if name in self.ranges:
                 raise ValueError(f"{self._name}: with shift there is no {name}")
-        self.ranges |= {name: as_range(each, "shift", self._name) for name, each in zip(_SHIFTS, shift, strict=True)}
+        for name, each in zip(_SHIFTS, shift, strict=True):
+            self.ranges[name] = as_range(each, "shift", self._name)
 
     def _of_sample(self, draw: Mapping[str, Any], named: Named) -> Mapping[str, Any]:
         draw = super()._of_sample(draw, named)

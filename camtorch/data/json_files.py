@@ -36,6 +36,8 @@ class Coco(Samples):
     its entries begin and end, 16 bytes for each, and is not kept.
     """
 
+    landmarks: TableLike | None
+
     def __init__(self, path: Path):
         super().__init__(path)
         self._spans = _entries(path)

@@ -7,6 +7,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from camtorch.augment.landmarks import TableLike
 from camtorch.augment.sample import Sample
 from camtorch.data.labelled import (
     FileSamples,
@@ -28,7 +29,7 @@ class Wflw(Samples):
     The lists of its subsets, `list_98pt_test`, have the points and the name alone.
     """
 
-    landmarks = "wflw98"
+    landmarks: TableLike | None = "wflw98"
 
     def __init__(self, path: Path):
         super().__init__(path)
@@ -62,7 +63,8 @@ class Pts(FileSamples):
     That the files count from one, as Matlab, is what menpo takes them for too, a library of some of 300W's authors.
     """
 
-    landmarks, endings = "ibug68", (".pts",)
+    landmarks: TableLike | None = "ibug68"
+    endings: tuple[str, ...] = (".pts",)
 
     def _sample(self, number: int) -> Sample:
         path = Path(self._files[number])
@@ -87,7 +89,9 @@ class Lapa(FileSamples):
     8 inside of the mouth, 9 lower lip, 10 hair. A mirror leaves these numbers.
     """
 
-    landmarks, endings, within = "lapa106", (".txt",), "landmarks"
+    landmarks: TableLike | None = "lapa106"
+    endings: tuple[str, ...] = (".txt",)
+    within: str | None = "landmarks"
 
     def _sample(self, number: int) -> Sample:
         path = Path(self._files[number])

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from camtorch.augment.landmarks import TableLike
 from camtorch.augment.sample import Sample, from_pitch_yaw
 from camtorch.data.labelled import FileSamples, failing_at, image_at, image_beside, numbers_of
 from camtorch.models import Pinhole
@@ -36,7 +37,8 @@ class Mat(FileSamples):
     no distance: the translation is 0, and there is no camera.
     """
 
-    landmarks, endings = "ibug68", (".mat",)
+    landmarks: TableLike | None = "ibug68"
+    endings: tuple[str, ...] = (".mat",)
 
     def _sample(self, number: int) -> Sample:
         path = Path(self._files[number])
@@ -118,7 +120,7 @@ class XGaze(FileSamples):
     224 pixels and 0.3 m for those of 448, principal point in the middle, at (W / 2, H / 2).
     """
 
-    endings = (".h5", ".hdf5")
+    endings: tuple[str, ...] = (".h5", ".hdf5")
 
     def __init__(self, path: Path):
         super().__init__(path)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -35,7 +35,8 @@ class ShiftedWarp(Warp):
         shift: (B, 3), how far the camera moves, in its own frame.
     """
 
-    is_an_operator = False
+    is_an_operator: ClassVar[bool] = False
+    batch_shape: torch.Size
     shift: Tensor
     distance: Tensor
     """(B, H, W): along the rays of the source; 0 where it is not known."""

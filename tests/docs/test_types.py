@@ -26,7 +26,7 @@ TOLERATED = (
     r"\"(findChessboardCornersSB|remap)\"",  # likewise
     r"\"Tensor \| None\" has no attribute|\"(isfinite|abs)\" is not a known attribute of \"None\"",  # torch's, of .grad
     r"parameter \"dataset\"|\"DataLoader\" has incompatible type|annotation for \"sampler\"",  # torch's, of DataLoader
-    r"webdataset|onnxruntime|\"ray|albumentations|torchvision",  # without types, or not installed
+    r"webdataset|onnxruntime|h5py|\"ray|albumentations|torchvision",  # without types, or not installed
     r"\"NDArray\[float64\] \| None\"|\"allclose\"",  # pycolmap's
 )
 
