@@ -182,7 +182,8 @@ def pinned(warp: Warp) -> Sampling | Lattice | None:
 
 def _reach(warp: Warp, padding: PaddingMode) -> PaddingMode:
     """The padding that positions are for which serve the warp's own, and this one."""
-    return max(warp.padding_mode, padding, key=PADDINGS.index)
+    # of equal words compilers know no max by a key
+    return PADDINGS[max(PADDINGS.index(warp.padding_mode), PADDINGS.index(padding))]
 
 
 def _is_operator(warp: Warp) -> bool:
