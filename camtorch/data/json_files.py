@@ -158,7 +158,7 @@ class Vcd(Samples):
 
     `image` is the frame of the stream's video (by PyAV, `camtorch[video]`), which lies by its path or its name beside
     the file: the DMD's `frame_shift` counts from the first frame of the camera that began first. A sample has none
-    where a video has not begun or has ended, and of a stream without `uri`. A picture as `uri` is taken for all frames.
+    where a video has not begun or has ended, and of a stream without `uri`. An image as `uri` is taken for all frames.
     The file is read at once.
     """
 
