@@ -146,7 +146,10 @@ TABLES = {"wflw": "wflw98", "300w": "ibug68", "300w_lp": "ibug68", "lapa": "lapa
 
 @pytest.fixture(params=SETS)
 def dataset(request, tmp_path):
-    path, expected = SETS[request.param](tmp_path / "set" if request.param == "eth_xgaze" else tmp_path)
+    # images are looked for up to three folders above, where another one of that name may lie
+    folder = tmp_path / "one" / "of" / "three"
+    folder.mkdir(parents=True)
+    path, expected = SETS[request.param](folder / "set" if request.param == "eth_xgaze" else folder)
     return request.param, path, expected
 
 
