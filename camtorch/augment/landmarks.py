@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -102,6 +103,7 @@ def as_table(value: TableLike, owner: str) -> Table:
     return Table(tuple(order), not pairs)
 
 
+_FACES = {68: "ibug68", 98: "wflw98", 106: "lapa106"}  # numbers of points that hardly anything else has
 _HOLD = ("keypoints", "landmarks", "points")  # kinds of fields that may be landmarks
 _LEFT, _RIGHT = "_left", "_right"
 
@@ -155,6 +157,13 @@ class Mirroring:
         """
         table = self._named.get(name) if self._named is not None else self._one
         if table is None:
+            if self._named is self._one is None and kind in _HOLD[:2] and (meant := _FACES.get(count)):
+                warnings.warn(
+                    f"{self.owner}: {name} holds {count} points and mirrored faces keep their order: point 0 is then "
+                    f"on the other side. landmarks={meant!r}, if that is their order, puts them right; "
+                    "landmarks={} says that they shall keep it",
+                    stacklevel=2,
+                )
             return None
         order = table.of(count)
         # 3D points may be others

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import os
 import re
 from pathlib import Path
@@ -24,7 +25,9 @@ FORMATS: dict[str, type[Samples]] = {
 _OF_SUFFIX = {".pts": "300w", ".mat": "300w_lp", ".h5": "eth_xgaze", ".hdf5": "eth_xgaze"}
 
 
-def read(path: str | os.PathLike[str], format: str | None = None) -> Samples:
+def read(
+    path: str | os.PathLike[str], format: str | None = None, *, images: str | os.PathLike[str] | None = None
+) -> Samples:
     """The samples of a data set's label files, read one by one as they are asked for.
 
         samples = ct.data.read("300W/01_Indoor")
@@ -52,6 +55,7 @@ def read(path: str | os.PathLike[str], format: str | None = None) -> Samples:
     Args:
         path: of a file or a folder.
         format: one of these; by default it is seen from suffixes and the first lines.
+        images: the folder of the images, for `"coco"`, `"wflw"` and `"vcd"`, whose labels name them.
 
     Returns:
         Samples: `len`, `[i]`, iteration; `samples.landmarks` is the table that a mirror needs.
@@ -64,14 +68,23 @@ def read(path: str | os.PathLike[str], format: str | None = None) -> Samples:
     check_path(path, "read")
     found = Path(path)
     if format is not None and format not in FORMATS:
-        raise ValueError(f"read: format must be one of {', '.join(FORMATS)}; got {format!r}")
+        close = difflib.get_close_matches(str(format).lower(), FORMATS, 1)
+        meant = f"; did you mean {close[0]!r}?" if close else ""
+        raise ValueError(f"read: format must be one of {', '.join(FORMATS)}; got {format!r}{meant}")
     if not found.exists():
         raise FileNotFoundError(f"read: no file or folder {str(found)!r}")
     name = _format_of(found) if format is None else format
-    if found.is_dir() and name in ("coco", "wflw", "vcd"):
+    named = name in ("coco", "wflw", "vcd")
+    if found.is_dir() and named:
         raise ValueError(f"read: the labels of {name} are a file; {str(found)!r} is a folder")
+    if images is not None:
+        check_path(images, "read")
+        if not named:
+            raise ValueError(f"read: images of {name} lie beside the labels; images= is for coco, wflw and vcd")
+        if not Path(images).is_dir():
+            raise FileNotFoundError(f"read: no folder of images {str(images)!r}")
     samples = FORMATS[name](found)
-    samples.format = name
+    samples.format, samples.images = name, None if images is None else Path(images)
     return samples
 
 

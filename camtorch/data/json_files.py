@@ -75,7 +75,7 @@ class Coco(Samples):
         entry, where = self._entry(file, "images", int(self._order[at]))
         year = self.path.stem.rpartition("_")[2]  # of person_keypoints_train2017
         folders = ("", "images", self.path.stem, year, f"images/{year}")
-        path = named_image(self.path, entry.get("file_name"), folders, where)
+        path = named_image(self, entry.get("file_name"), folders, where)
         sample: Sample = {"image": image_at(path)}
         for name, value in one.items():
             step = {"keypoints": 3, "bbox": 4}.get(name)
@@ -220,7 +220,7 @@ class Vcd(Samples):
 
     def _image(self, uri: str, at: int, place: str) -> Tensor | None:
         folder = "" if Path(uri).is_absolute() or ".." in Path(uri).parts else str(Path(uri).parent)
-        path = named_image(self.path, Path(uri).name, ("", folder), place)
+        path = named_image(self, Path(uri).name, ("", folder), place)
         return image_at(path) if path.suffix.lower() in (".jpg", ".jpeg", ".png", ".bmp") else _video_frame(path, at)
 
 

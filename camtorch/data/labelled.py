@@ -33,6 +33,8 @@ class Samples(Dataset[Sample]):
 
     path: Path
     format: str
+    images: Path | None = None
+    """The folder of the images, where labels name them; None: it is looked for, see `ct.data.read`."""
     landmarks: TableLike | None = None
     """Of the keypoints, which change places in a mirror: for `landmarks=` of the augmentations. None: not known."""
     _count: int
@@ -106,20 +108,20 @@ def image_beside(path: Path, folder: Path | None = None) -> Path:
     raise ValueError(f"{path}: no image beside it; it would be {named[0]}, or end with {', '.join(_IMAGES[1:4])}")
 
 
-def named_image(labels: Path, name: Any, folders: Iterable[str], place: object) -> Path:
-    """The file that labels name, in these folders beside the labels, or up to three folders above."""
+def named_image(samples: Samples, name: Any, folders: Iterable[str], place: object) -> Path:
+    """The file that labels name, in the folder of images, or these beside the labels or up to three folders above."""
     parts = PurePosixPath(name if isinstance(name, str) and "\0" not in name else "")
     if parts.is_absolute() or ".." in parts.parts or not parts.name:
         raise ValueError(f"{place}: the name of a file within the folder of images was expected; got {name!r:.60}")
-    above = [labels.parent, *labels.resolve().parent.parents][: _UP + 1]
-    for root in above:
+    labels = samples.path
+    roots = [labels.parent, *labels.resolve().parent.parents][: _UP + 1] if samples.images is None else [samples.images]
+    for root in roots:
         for folder in folders:
             if os.path.isfile(root / folder / parts):  # False, too, for names that no file can have
                 return root / folder / parts
     where = ", ".join(repr(folder) for folder in folders if folder)
-    raise ValueError(
-        f"{place}: no file {name!r:.200} in {labels.parent} or in {where} there or up to {_UP} folders above"
-    )
+    there = "there" if samples.images else f"there or up to {_UP} folders above; read(..., images=FOLDER) says where"
+    raise ValueError(f"{place}: no file {name!r:.200} in {roots[0]} or in {where} {there}")
 
 
 # -- text and numbers

@@ -47,7 +47,7 @@ class Wflw(Samples):
                 f"{place}: 98 points, a box, six attributes and the name of an image are 207 words, or 197 without box "
                 f"and attributes; got {len(line.split())}"
             )
-        image = named_image(self.path, words[-1], ("", "WFLW_images", "images"), place)
+        image = named_image(self, words[-1], ("", "WFLW_images", "images"), place)
         sample: Sample = {"keypoints": numbers_of(words[:196], place, "points").reshape(98, 2)}
         if not is_short:
             sample["boxes"] = numbers_of(words[196:200], place, "a box").reshape(1, 4)

@@ -441,6 +441,14 @@ def test_landmarks_by_field_and_by_pairs():
             A.HorizontalFlip(landmarks=bad)
 
 
+def test_a_mirrored_face_without_a_table_is_told():
+    sample = {"image": torch.zeros(1, *SIZE), "keypoints": torch.rand(98, 2) * 40}
+    with pytest.warns(UserWarning, match="keypoints holds 98 points .* landmarks='wflw98'"):
+        A.HorizontalFlip(p=1.0)(sample)
+    kept = A.HorizontalFlip(p=1.0, landmarks={})(sample)["keypoints"]
+    assert torch.equal(kept[:, 1], sample["keypoints"][:, 1])
+
+
 def test_left_and_right_change_places():
     image, left, right = torch.zeros(6, 1, *SIZE), torch.randn(6, 3), torch.randn(6, 3)
     flip = A.HorizontalFlip()

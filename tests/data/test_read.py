@@ -4,6 +4,7 @@ import importlib
 import json
 import pickle
 import re
+import shutil
 
 import numpy as np
 import pytest
@@ -193,6 +194,23 @@ def test_loaders_take_samples_in_workers(dataset):
     read = [batch[0] for batch in loader]
     for one, other in zip(read, samples, strict=True):
         assert torch.equal(one["image"], other["image"])
+
+
+def test_images_may_lie_elsewhere(dataset, tmp_path):
+    name, path, _ = dataset
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    if name not in ("coco", "wflw", "vcd"):
+        with pytest.raises(ValueError, match="lie beside the labels"):
+            ct.data.read(path, images=elsewhere)
+        return
+    alone = shutil.copy(path, elsewhere)
+    samples = ct.data.read(alone, images=tmp_path / "one" / "of" / "three")
+    assert torch.equal(samples[0]["image"], ct.data.read(path)[0]["image"])
+    with pytest.raises(ValueError, match="elsewhere"):
+        ct.data.read(path, images=elsewhere)[0]
+    with pytest.raises(FileNotFoundError, match="no folder of images"):
+        ct.data.read(path, images=tmp_path / "none")
 
 
 # -- what the formats have of their own
