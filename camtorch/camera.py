@@ -419,7 +419,8 @@ class Camera(BatchedModule):
         border of the image), at the seam of a panorama, and 16 times the image's larger side from its middle.
 
         Args:
-            points: (N, 3), finite, joined in their order; of the camera's frame, or of the world's.
+            points: (N, 3), finite, joined in their order, or (E, N, 3), E such lines, as the twelve edges (12, 2, 3) of
+                a box; of the camera's frame, or of the world's.
             extrinsics: camera from world. The camera and its pose are single.
 
         Returns:

@@ -26,8 +26,10 @@ def project_polyline(camera: Camera, points: Numbers, extrinsics: Extrinsics | N
     if camera.batch_shape:
         raise ValueError(f"{owner}: takes a single camera; got batch dims {tuple(camera.batch_shape)}: use camera[i]")
     points, _ = as_points(points, "points", 3, torch.Size(), camera._tensors, owner)
-    if points.ndim != 2 or len(points) < 2:
-        raise ValueError(f"{owner}: points must be (N, 3), two or more; got shape {tuple(points.shape)}")
+    if points.ndim not in (2, 3) or points.shape[-2] < 2:
+        raise ValueError(
+            f"{owner}: points must be (N, 3), two or more, or (E, N, 3), lines; got shape {tuple(points.shape)}"
+        )
     if not bool(torch.isfinite(points).all()):
         raise ValueError(f"{owner}: points must be finite; got {points.detach().tolist()!s:.200}")
     if extrinsics is not None:
@@ -37,6 +39,8 @@ def project_polyline(camera: Camera, points: Numbers, extrinsics: Extrinsics | N
                 f"ct.Extrinsics.from_matrix(matrix); got {type(extrinsics).__name__}"
             )
         points = extrinsics(points)
+    if points.ndim == 3:
+        return [curve for line in points for curve in project_polyline(camera, line, None)]
     edges = _Edges(points.double())
     middle, reach = _region(camera)
 
