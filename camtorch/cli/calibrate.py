@@ -45,6 +45,8 @@ def run(arguments: argparse.Namespace) -> None:
         targets.check(arguments.corners, force=False)
     if arguments.report is not None:
         require_packages()
+    if {"fx", "fy"} & set((arguments.fixed or "").split(",")):
+        raise ValueError("--fixed: the command knows no focal length to hold; in Python ct.calibrate(start=camera) does")
     format, candidates = _writable(arguments.output, arguments.format, arguments.model, arguments.count)
     corners = found_corners(
         cameras,

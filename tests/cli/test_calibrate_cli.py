@@ -142,6 +142,12 @@ def corners_of(board=BOARD, count=8, **more):
     return Corners(board, board.points(), images)
 
 
+def test_no_focal_length_is_held(capsys):
+    write_corners(corners_of(count=3), "corners.json")
+    calibrate("--corners", "corners.json", "--fixed", "fx,k3", expect=2)
+    assert "--fixed: the command knows no focal length to hold" in capsys.readouterr().err
+
+
 def test_corners_of_another_tool_need_no_image(capsys):
     """Two of the files are others saved again, which are named and count once."""
     corners = corners_of(count=6)
