@@ -46,7 +46,7 @@ def run(arguments: argparse.Namespace) -> None:
     if arguments.report is not None:
         require_packages()
     if {"fx", "fy"} & set((arguments.fixed or "").split(",")):
-        raise ValueError("--fixed: the command knows no focal length to hold; in Python ct.calibrate(start=camera) does")
+        raise ValueError("--fixed: no focal length is known to be held; in Python ct.calibrate(start=camera) has one")
     format, candidates = _writable(arguments.output, arguments.format, arguments.model, arguments.count)
     corners = found_corners(
         cameras,

@@ -145,7 +145,7 @@ def corners_of(board=BOARD, count=8, **more):
 def test_no_focal_length_is_held(capsys):
     write_corners(corners_of(count=3), "corners.json")
     calibrate("--corners", "corners.json", "--fixed", "fx,k3", expect=2)
-    assert "--fixed: the command knows no focal length to hold" in capsys.readouterr().err
+    assert "--fixed: no focal length is known to be held" in capsys.readouterr().err
 
 
 def test_corners_of_another_tool_need_no_image(capsys):
