@@ -19,7 +19,7 @@ from typing import Any, NoReturn
 
 from camtorch import __version__
 from camtorch.cli import commands
-from camtorch.cli.terminal import note, say
+from camtorch.cli.terminal import note, say, shown
 from camtorch.jobs import pool
 from camtorch.native import library
 
@@ -61,7 +61,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         module = f"camtorch.cli.{arguments.command}"
         if commands.uses_processes(arguments):
             pool.prepare(module)  # they import what they need while this one does
-        with _interrupts_end_the_process():
+        with _interrupts_end_the_process(), shown("loading PyTorch"):
             command = importlib.import_module(module)
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", UserWarning)

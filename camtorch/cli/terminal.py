@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 
@@ -16,6 +17,19 @@ def say(text: str) -> None:
 def note(text: object) -> None:
     """What the user should know though the work goes on."""
     say(f"note: {text}")
+
+
+@contextlib.contextmanager
+def shown(what: str) -> Iterator[None]:
+    """Say on a terminal what goes on, while it does."""
+    is_terminal = sys.stderr.isatty()
+    if is_terminal:
+        print(f"camtorch: {what}", end="", file=sys.stderr, flush=True)
+    try:
+        yield
+    finally:
+        if is_terminal:
+            print("\r\x1b[K", end="", file=sys.stderr, flush=True)  # the line is gone
 
 
 def bar(what: str, total: float, unit: str = "", **options: Any) -> Any:

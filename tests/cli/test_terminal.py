@@ -35,6 +35,15 @@ def test_work_of_more_than_a_moment_shows_how_far_it_is_and_leaves_nothing(monke
     assert not told.split("\r")[-1]
 
 
+@pytest.mark.parametrize("stream", [Terminal, io.StringIO])
+def test_what_goes_on_is_said_on_a_terminal_and_gone_afterwards(monkeypatch, stream):
+    stderr = stream()
+    monkeypatch.setattr(sys, "stderr", stderr)
+    with terminal.shown("loading"):
+        assert stderr.getvalue() == ("camtorch: loading" if stderr.isatty() else "")
+    assert stderr.getvalue().endswith("\r\x1b[K") == stderr.isatty()
+
+
 def test_messages_are_one_line_and_do_not_steer_the_terminal(capsys):
     terminal.note("what\n  pillow said")
     assert capsys.readouterr().err == "camtorch: note: what pillow said\n"
