@@ -1,11 +1,13 @@
 """A camera of Blender as the Python script that makes it; written alone.
 
-Lenses other than pinhole are Cycles' FISHEYE_LENS_POLYNOMIAL, whose angle is -(k0 + k1 r + ... + k4 r^4) of the
-distance r in millimetres on the sensor: `fisheye_lens_polynomial_to_direction` of `kernel/camera/projection.h`. Where
-the shifts of perspective cameras count in widths of the image, those of panoramas count in its width and height.
+Panoramas are EQUIRECTANGULAR; lenses other than pinhole are Cycles' FISHEYE_LENS_POLYNOMIAL, whose angle is
+-(k0 + k1 r + ... + k4 r^4) of the distance r in millimetres on the sensor (`kernel/camera/projection.h`). The shifts of
+perspective cameras count in widths of the image, those of the others in its width and height.
 """
 
 from __future__ import annotations
+
+import math
 
 from camtorch.io import poses
 from camtorch.io.protocol import Names
@@ -24,28 +26,39 @@ def files(rig: Rig, path: str) -> dict[str, bytes]:
     name, camera = lossy.only_camera(rig)
     extrinsics = lossy.all_posed(rig)[name]
     height, width = lossy.size(name, camera)
-    result, fit = lossy.closest(name, camera, {"pinhole": None, "f_theta_backward": 3})
+    whole = camera.key == "equirectangular"
+    models: dict[str, int | None] = {"equirectangular": None} if whole else {"pinhole": None, "f_theta_backward": 3}
+    result, fit = lossy.closest(name, camera, models)
     fx, fy, cx, cy = result.camera.intrinsics.tolist()
     right, up = ((width - 1) / 2 - cx) / width, (cy - (height - 1) / 2) / height
-    lens = [f"data.shift_x, data.shift_y = {right!r}, "]
+    lens = [
+        f"data.shift_x, data.shift_y = {right!r}, {up!r}",
+        'scene.render.engine, data.type = "CYCLES", "PANO"',
+        'lens = data if hasattr(data, "fisheye_fov") else data.cycles  # before Blender 5',
+    ]
     if result.camera.key == "pinhole":
         length = fx * _SENSOR / width
         if not _LENSES[0] <= length <= _LENSES[1]:
             lossy.fail(name, f"a focal length of {fx / width:g} widths of the image, which Blender has not")
-        lens[0] += repr(up * height * fx / fy / width)
-        lens.append(f"data.lens = {length!r}")
-    else:
-        lens[0] += repr(up)
+        up *= height * fx / (fy * width)
+        lens = [f"data.shift_x, data.shift_y = {right!r}, {up!r}", f"data.lens = {length!r}"]
+    elif whole:
+        across, down = width / (2 * fx), height / (2 * fy)
+        if max(across, 2 * down) > math.pi * (1 + 1e-6):
+            lossy.fail(name, "more than 360 x 180 degrees, which Blender has not")
         lens += [
-            'scene.render.engine, data.type = "CYCLES", "PANO"',
-            'lens = data if hasattr(data, "fisheye_fov") else data.cycles  # before Blender 5',
+            'lens.panorama_type = "EQUIRECTANGULAR"',
+            f"lens.longitude_min, lens.longitude_max = {-across!r}, {across!r}",
+            f"lens.latitude_min, lens.latitude_max = {-down!r}, {down!r}",
+        ]
+    else:
+        unit = width / (_SENSOR * fx)
+        polynomial = [0.0, *(-value * unit**i for i, value in enumerate([1.0, *result.camera.distortion.tolist()], 1))]
+        lens += [
             'lens.panorama_type = "FISHEYE_LENS_POLYNOMIAL"',
             f"lens.fisheye_fov = {2 * float(result.max_angle)!r}",
-            "lens.fisheye_polynomial_k0 = 0.0",
+            *(f"lens.fisheye_polynomial_k{i} = {value!r}" for i, value in enumerate(polynomial)),
         ]
-        unit = width / (_SENSOR * fx)
-        for i, value in enumerate([1.0, *result.camera.distortion.tolist()], 1):
-            lens.append(f"lens.fisheye_polynomial_k{i} = {-value * unit**i!r}")
     rows = (poses.matrices(extrinsics, undo=True).numpy() * poses.UPRIGHT + 0.0).tolist()
     text = f'''"""Adds a camera to the scene of Blender: {fit}. Written by camtorch."""
 

@@ -23,6 +23,8 @@ NAMES = Names("rays", "a ray field", (".npz", ".exr"), ("*.exr",))
 def files(rig: Rig, path: str) -> dict[str, bytes]:
     """The rays of one camera, which loses its name. Raises what `as_exr` raises."""
     lossy = Lossy(path, NAMES.title)
+    if not path.lower().endswith(NAMES.suffixes):
+        lossy.fail("name", f"files of ray fields are called {' or '.join(NAMES.suffixes)}")
     lossy.no_pose(rig)
     name, camera = lossy.only_camera(rig)
     lossy.size(name, camera)

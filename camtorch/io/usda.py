@@ -30,12 +30,8 @@ _SQUARE = {
     "f_theta_backward": (3, "Ftheta", "k0 k1 k2 k3 k4"),
 }
 # key -> of those, the one that may hold it exactly
-_HELD = {
-    "kannala_brandt": "fisheye624",
-    "fisheye62": "fisheye624",
-    "fisheye624": "fisheye624",
-    "f_theta_backward": "f_theta_backward",
-}
+_HELD = dict.fromkeys(("kannala_brandt", "fisheye62", "fisheye624"), "fisheye624")
+_HELD["f_theta_backward"] = "f_theta_backward"
 _APERTURE = 36.0  # any: what counts is its ratio to the focal length
 
 _HEAD = """#usda 1.0

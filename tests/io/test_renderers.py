@@ -29,13 +29,15 @@ LENSES = {
     "stereographic": ct.Stereographic(float64(CORE), float64([0.0]), image_size=SIZE),
     "equisolid": ct.Equisolid(float64(CORE), float64([0.0] * 4), image_size=SIZE),
     "orthographic_fisheye": ct.OrthographicFisheye(float64([60.0, 60, 39, 30]), float64([0.0]), image_size=SIZE),
+    "equirectangular": ct.Equirectangular(float64([14.0, 20, 38.3, 31.2]), image_size=SIZE),
     "double_sphere": ct.DoubleSphere(float64(CORE), float64([-0.2, 0.6]), image_size=SIZE),
 }
 EXACT = {
     "usda": {*list(LENSES)[:7]},
-    "carla": {*LENSES} - {"rational", "kannala_brandt_5", "fisheye624", "double_sphere"},
-    "blender": {"pinhole", "f_theta_backward", "f_theta_backward_2"},
+    "carla": {*LENSES} - {"rational", "kannala_brandt_5", "fisheye624", "equirectangular", "double_sphere"},
+    "blender": {"pinhole", "equirectangular", "f_theta_backward", "f_theta_backward_2"},
 }
+SLOW = {"brown_conrady", "rational", "orthographic_fisheye"}
 POSE = ct.Extrinsics(float64([0.3, -0.2, 0.5]), float64([1.0, 2.0, -3.0]))
 
 
@@ -141,10 +143,14 @@ def by_blender(text, rays):
         plane = rays[:, :2] / rays[:, 2:] * data.lens
         shift = data.shift_x, -data.shift_y * width / aspect / height
     else:
+        shift = data.shift_x, -data.shift_y
+        if data.panorama_type == "EQUIRECTANGULAR":
+            angles = np.stack((np.arctan2(rays[:, 0], rays[:, 2]), np.arcsin(-rays[:, 1])), -1)
+            low = np.array([data.longitude_min, data.latitude_max])
+            return ((angles - low) / ([data.longitude_max, data.latitude_min] - low) - shift) * (width, height)
         theta, azimuth = polar(rays)
         assert data.fisheye_fov >= 2 * theta.max() - 1e-9
         plane = azimuth * radius_of([-getattr(data, f"fisheye_polynomial_k{i}") for i in range(5)], theta)[:, None]
-        shift = data.shift_x, -data.shift_y
     sensor = np.array([data.sensor_width, data.sensor_width * height * aspect / width])
     return (plane / sensor + 0.5 - shift) * (width, height)
 
@@ -153,8 +159,16 @@ BY = {"usda": by_usd, "carla": by_carla, "blender": by_blender}
 SUFFIX = {"usda": ".usda", "carla": ".json", "blender": ".py"}
 
 
-@pytest.mark.parametrize("format", BY)
-@pytest.mark.parametrize("lens", LENSES)
+CASES = [
+    # fits of Blender's polynomial to lenses that are nothing like it
+    pytest.param(lens, format, marks=[pytest.mark.slow] * (format == "blender" and lens in SLOW))
+    for lens in LENSES
+    for format in BY
+    if lens != "equirectangular" or format == "blender"
+]
+
+
+@pytest.mark.parametrize(("lens", "format"), CASES)
 def test_renderers_see_what_the_camera_sees(lens, format, tmp_path):
     camera, path = LENSES[lens], tmp_path / f"camera{SUFFIX[format]}"
     if lens in EXACT[format]:
@@ -242,6 +256,7 @@ POSED = ct.Rig({"a": BATCH[0]}, {"a": POSE})
         ("rays", POSED, "its extrinsics would be lost"),
         ("usda", PAIR, "a-b: a_b, which it is called in USD, is another camera, too"),
         ("usda", ct.Rig({"a": BATCH[0], "b": BATCH[0]}), "a: no extrinsics"),
+        ("blender", ct.Equirectangular([12.0, 13, 40, 30], image_size=SIZE), "more than 360 x 180 degrees"),
         ("blender", ct.Pinhole([1.0, 1, 40, 30], image_size=SIZE), "a focal length of 0.0125 widths"),
     ],
 )
@@ -272,6 +287,8 @@ def test_names_stay_names(name, tmp_path):
 
 
 def test_what_is_written_only_is_not_read(tmp_path):
+    with pytest.raises(ct.CameraFileError, match=r"files of ray fields are called \.npz or \.exr"):
+        ct.save(LENSES["pinhole"], tmp_path / "a.txt", "rays")
     for name in ("a.usda", "a.exr"):
         ct.save(LENSES["pinhole"], tmp_path / name)
         with pytest.raises(ct.CameraFileError, match="a file for renderers, which is written only"):
