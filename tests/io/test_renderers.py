@@ -65,10 +65,13 @@ def opencv(x, y, k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4):
     return a, y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y + s3 * r2 + s4 * r2 * r2
 
 
+def rows_of(text):
+    return np.array(json.loads(re.search(r"xformOp:transform = (.+)", text)[1].replace("(", "[").replace(")", "]")))
+
+
 def by_usd(text, rays):
     """Pixels, (0, 0) the outer corner; the prim has x right, y up, looks along -z, and its matrix acts on rows."""
-    rows = json.loads(re.search(r"xformOp:transform = (.+)", text)[1].replace("(", "[").replace(")", "]"))
-    rays = rays @ np.linalg.inv(np.array(rows)[:3, :3]) * (1, -1, -1)
+    rays = rays @ np.linalg.inv(rows_of(text)[:3, :3]) * (1, -1, -1)
     found = dict(re.findall(r"\w+ (?:omni:lensdistortion:)?(?:\w+:)?(\w+) = (.+)", text))
     value = {key: json.loads(v) for key, v in found.items() if re.fullmatch(r"[-\d.e]+", v)}
     model = json.loads(found["model"])
@@ -189,11 +192,14 @@ def test_renderers_see_what_the_camera_sees(lens, format, tmp_path):
 
 @pytest.mark.parametrize("key", ["f_theta_backward", "pinhole"])
 def test_a_pose_is_that_of_the_object(key, tmp_path):
-    ct.save(ct.Rig({"front": LENSES[key]}, {"front": POSE}), tmp_path / "a.py", "blender")
+    rig = ct.Rig({"front": LENSES[key]}, {"front": POSE})
+    ct.save(rig, tmp_path / "a.py", "blender")
+    ct.save(rig, tmp_path / "a.usda")
     _, _, item = in_blender((tmp_path / "a.py").read_text())
     assert item.name == "front"
     expected = np.linalg.inv(POSE.matrix().detach().numpy()) @ np.diag([1, -1, -1, 1])
     assert np.allclose(item.matrix_world, expected, rtol=0, atol=1e-14)
+    assert np.allclose(rows_of((tmp_path / "a.usda").read_text()), expected.T, rtol=0, atol=1e-14)
 
 
 def test_usd_reads_the_scene(tmp_path):
