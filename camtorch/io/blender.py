@@ -1,4 +1,4 @@
-"""A camera of Blender as the Python script that makes it; written alone.
+"""A camera of Blender as the Python script that makes it; written only.
 
 Panoramas are EQUIRECTANGULAR; lenses other than pinhole are Cycles' FISHEYE_LENS_POLYNOMIAL, whose angle is
 -(k0 + k1 r + ... + k4 r^4) of the distance r in millimetres on the sensor (`kernel/camera/projection.h`). The shifts of

@@ -1,4 +1,4 @@
-"""Attributes of CARLA's `sensor.camera.rt_lens` (Unreal Engine 5), as JSON; written alone.
+"""Attributes of CARLA's `sensor.camera.rt_lens` (Unreal Engine 5), as JSON; written only.
 
 `for key, value in json.load(file)["attributes"].items(): blueprint.set_attribute(key, value)` makes the camera.
 Focal lengths and centre are parts of the image's width and height, whose edges are 0 and 1. Source: CARLA,

@@ -1,4 +1,4 @@
-"""The ray of each pixel, exact for every lens: `.npz` of `directions` and `valid`, or `.exr`; written alone.
+"""The ray of each pixel, exact for every lens: `.npz` of `directions` and `valid`, or `.exr`; written only.
 
 Directions (H, W, 3) are float32 unit vectors in the camera's own frame, x right, y down, z forward: red, green and blue
 of an EXR, which OpenEXR writes. Pixels without a ray have the direction 0 0 0.
