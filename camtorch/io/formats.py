@@ -11,7 +11,24 @@ import fnmatch
 import os
 
 from camtorch.camera import Camera
-from camtorch.io import aria, basalt, camtorch_json, colmap, kalibr, mrcal, nerfstudio, ocamcalib, opencv, ros
+from camtorch.io import (
+    aria,
+    basalt,
+    camodocal,
+    camtorch_json,
+    colmap,
+    gyroflow,
+    kalibr,
+    metashape,
+    mrcal,
+    nerfstudio,
+    nuscenes,
+    ocamcalib,
+    opencv,
+    openmvg,
+    ros,
+    woodscape,
+)
 from camtorch.io._errors import CameraFileError
 from camtorch.io.parsing import parse_mapping, path_of, read_bytes
 from camtorch.io.protocol import ContentFormat, KeyFormat
@@ -20,8 +37,21 @@ from camtorch.io.writing import replacing
 from camtorch.rig import Rig
 
 # in the order in which they are asked
-_BY_CONTENT: tuple[ContentFormat, ...] = (colmap, ocamcalib)
-_BY_KEYS: tuple[KeyFormat, ...] = (camtorch_json, aria, basalt, mrcal, nerfstudio, ros, kalibr, opencv)
+_BY_CONTENT: tuple[ContentFormat, ...] = (colmap, metashape, nuscenes, ocamcalib)
+_BY_KEYS: tuple[KeyFormat, ...] = (
+    camtorch_json,
+    aria,
+    basalt,
+    mrcal,
+    nerfstudio,
+    ros,
+    kalibr,
+    woodscape,
+    gyroflow,
+    camodocal,
+    openmvg,
+    opencv,
+)
 
 NAMES_BY_FORMAT = {names.format: names for names in (*(m.NAMES for m in _BY_CONTENT), *(m.NAMES for m in _BY_KEYS))}
 FORMATS = tuple(NAMES_BY_FORMAT)
