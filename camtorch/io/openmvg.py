@@ -14,7 +14,7 @@ from camtorch.io.record import Record, one_of
 from camtorch.io.writing import Lossy
 from camtorch.rig import Rig
 
-NAMES = Names("openmvg", "OpenMVG", (".json",), (), ("sfm_data.json",))
+NAMES = Names("openmvg", "OpenMVG", (".json",), ("sfm_data*.json",))
 
 # polymorphic_name -> key of the coefficients, key of the model
 _MODELS = {
