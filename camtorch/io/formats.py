@@ -15,17 +15,23 @@ from camtorch.io import (
     aria,
     basalt,
     blender,
+    camodocal,
     camtorch_json,
     carla,
     colmap,
+    gyroflow,
     kalibr,
+    metashape,
     mrcal,
     nerfstudio,
+    nuscenes,
     ocamcalib,
     opencv,
+    openmvg,
     rays,
     ros,
     usda,
+    woodscape,
 )
 from camtorch.io._errors import CameraFileError
 from camtorch.io.parsing import parse_mapping, path_of, read_bytes
@@ -35,8 +41,21 @@ from camtorch.io.writing import replacing
 from camtorch.rig import Rig
 
 # in the order in which they are asked
-_BY_CONTENT: tuple[ContentFormat, ...] = (colmap, ocamcalib)
-_BY_KEYS: tuple[KeyFormat, ...] = (camtorch_json, aria, basalt, mrcal, nerfstudio, ros, kalibr, opencv)
+_BY_CONTENT: tuple[ContentFormat, ...] = (colmap, metashape, nuscenes, ocamcalib)
+_BY_KEYS: tuple[KeyFormat, ...] = (
+    camtorch_json,
+    aria,
+    basalt,
+    mrcal,
+    nerfstudio,
+    ros,
+    kalibr,
+    woodscape,
+    gyroflow,
+    camodocal,
+    openmvg,
+    opencv,
+)
 
 # what renderers take, and nothing here reads
 _WRITTEN: tuple[WrittenFormat, ...] = (usda, carla, blender, rays)
@@ -53,9 +72,10 @@ def load(path: str | os.PathLike[str], format: str | None = None) -> Rig:
     A calibration is a measurement: nothing of it learns until `.requires_grad_()` says so.
 
     Args:
-        path: a file of OpenCV, ROS, Kalibr, COLMAP, Nerfstudio, Project Aria, Basalt, mrcal, OCamCalib or camtorch; an
-            archive of `numpy.savez(path, K=K, D=D)`; or the folder of a COLMAP or Nerfstudio reconstruction. COLMAP's
-            images beside the cameras are read with them.
+        path: a file of OpenCV, ROS, Kalibr, COLMAP, Nerfstudio, Project Aria, Basalt, mrcal, OCamCalib, WoodScape,
+            Gyroflow, camodocal, Metashape, nuScenes, OpenMVG or camtorch; an archive of
+            `numpy.savez(path, K=K, D=D)`; or the folder of a COLMAP or Nerfstudio reconstruction. COLMAP's images
+            beside the cameras are read with them.
         format: its format, one of the keys of `camtorch.save`; found from content and name if left out.
 
     Returns:
@@ -111,11 +131,11 @@ def save(rig: Rig | Camera, path: str | os.PathLike[str], format: str | None = N
         rig: a `Rig`, or one camera.
         path: the file, which may be a link: then what it points to is replaced. With COLMAP it may be a folder, where
             poses go to an images file beside the cameras; with Nerfstudio one that exists.
-        format: "opencv", "ros", "kalibr", "colmap", "nerfstudio", "aria", "basalt", "mrcal", "ocamcalib" or
-            "camtorch"; written only, "usda", "carla", "blender" or "rays". If left out: the format that the rig was
-            loaded from if its files end like this one, else what the name says (`transforms.json`, `camchain.yaml`,
-            `camera_info.yaml`, `.cameramodel`, `.xml`, `cameras.txt`, `.bin`, `.usda`, `.exr`), else camtorch's own for
-            `.json`.
+        format: "opencv", "ros", "kalibr", "colmap", "nerfstudio", "aria", "basalt", "mrcal", "ocamcalib",
+            "woodscape", "gyroflow", "camodocal", "metashape" or "camtorch"; written only, "usda", "carla", "blender" or
+            "rays". If left out: the format that the rig was loaded from if its files end like this one, else what the
+            name says (`transforms.json`, `camchain.yaml`, `camera_info.yaml`, `.cameramodel`, `.xml`, `cameras.txt`,
+            `.bin`, `.usda`, `.exr`), else camtorch's own for `.json`.
 
     Raises:
         CameraFileError: something that the format cannot hold; it says what would be lost.

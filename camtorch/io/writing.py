@@ -136,6 +136,13 @@ def number(value: float) -> str:
     return re.sub(r"^(-?\d+)e", r"\1.0e", text)
 
 
+def multiple(quotient: float, divisor: float) -> float:
+    """What divided by the divisor gives the quotient, to the last bit if any number does."""
+    product = quotient * divisor
+    near = (product, math.nextafter(product, math.inf), math.nextafter(product, -math.inf))
+    return next((value for value in near if value / divisor == quotient), product)
+
+
 def listed(values: Sequence[float]) -> str:
     """[1.0, 2.0]"""
     return f"[{', '.join(map(number, values))}]"
