@@ -2,7 +2,8 @@
 
 Cameras look along -z there, y up; matrices act on rows; pixel centres are at 0.5; attributes are float32. Source:
 `omni.usd.schema.omni_lens_distortion` 1.0.0 has names, types and units, and Newton's reader of such cameras
-the pixel centres. Lenses of other models become one of OpenCV's two schemas; not every renderer takes OpenCvPinhole's coefficients.
+the pixel centres. Lenses of other models become one of OpenCV's two schemas; not every renderer takes the coefficients
+of OpenCvPinhole.
 """
 
 from __future__ import annotations
