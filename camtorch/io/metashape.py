@@ -54,6 +54,11 @@ def read(path: str, content: bytes) -> Rig:
     names = _names(path, sensors)
     cameras = {}
     for sensor, name in zip(sensors, names, strict=True):
+        added = sensor.find("corrections")
+        if added is not None and len(added):
+            Record(path, None, f"sensor {name:.60}").fail(
+                "corrections beside its calibration, which no model here has; optimise without additional corrections"
+            )
         found = sensor.findall("calibration")
         best = next((one for one in reversed(found) if one.get("class") == "adjusted"), found[-1])
         cameras[name] = _camera(Record(path, {"type": sensor.get("type"), **_values(best)}, f"sensor {name:.60}"))

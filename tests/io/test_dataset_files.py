@@ -131,6 +131,7 @@ def test_sensors_and_images_of_metashape_that_are_called_the_same_get_their_ids(
         ("metashape_cameras.xml", "0.5 0 0 -1 -0.25", "0.5 0 0 2 -0.25", r"camera fisheye\.jpg: no rotation"),
         ("metashape_cameras.xml", "2 0 0 0 1<", "2 0 0 0<", r"camera fisheye\.jpg\.transform: 15 numbers where 16"),
         ("metashape_cameras.xml", ">0.12354192447331316<", ">1e300<", r"component\.transform: a number beyond 1e\+100"),
+        ("metashape_cameras.xml", "<covariance>", "<corrections><a/></corrections><covariance>", "corrections beside"),
         ("metashape_cameras.xml", "</document>", "<chunk/></document>", "2 chunks; one is read"),
         ("woodscape.json", "radial_poly", "other", r"intrinsic\.model: 'other' is not known here"),
         ("woodscape.json", "339.749", "0", r"intrinsic\.k1: 0, where the focal length belongs"),
