@@ -70,7 +70,7 @@ static int numbers_of(const Part *part) {
     if (part->kind == UNIFIED)
         count = !!(part->flags & HAS_XI) + !!(part->flags & HAS_ALPHA) + !!(part->flags & HAS_BETA);
     if (part->kind == FOV || part->kind == ONE_DIVISION) count = 1;
-    if (part->kind == TILT) count = 9;
+    if (part->kind == HOMOGRAPHY) count = 9;
     if (part->kind == SHEAR) count = 2;
     if (part->kind == PLANAR) count = 2 * !!(part->flags & TANGENTIAL) + 4 * !!(part->flags & PRISM);
     if (part->factor == RADIUS_TABLE) return count + 4 * part->n;

@@ -15,7 +15,7 @@ enum { PERSPECTIVE, EQUIDISTANT, EQUISOLID, UNIFIED, FOV, ONE_DIVISION, INVERTED
 enum { HAS_XI = 1, HAS_ALPHA = 2, HAS_BETA = 4, TRANSVERSE = 8 };
 
 /* Stages of a lens on that plane */
-enum { PLANAR = 16, TILT, SHEAR };
+enum { PLANAR = 16, HOMOGRAPHY, SHEAR };
 /* Flags of the planar stage */
 enum { TANGENTIAL = 1, PRISM = 2 };
 

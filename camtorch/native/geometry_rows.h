@@ -385,11 +385,12 @@ static void T(start)(const T(Camera) *c, int first, int n, const R *u, const R *
     EACH(i) a[i] = u[i], b[i] = v[i];
     for (int j = c->stages; j >= first; j--) {
         const R *k = c->numbers[j];
-        if (c->parts[j].kind == TILT) {
+        if (c->parts[j].kind == HOMOGRAPHY) {
+            R m[9];
+            T(adjugate)(k, m);
             EACH(i) {
-                /* R's transpose is its inverse */
-                const R p = (a[i] + k[2]) / k[8], q = (b[i] + k[5]) / k[8], one = 1 / (k[2] * p + k[5] * q + k[8]);
-                a[i] = (k[0] * p + k[3] * q + k[6]) * one, b[i] = (k[1] * p + k[4] * q + k[7]) * one;
+                const R p = a[i], q = b[i], one = 1 / (m[6] * p + m[7] * q + m[8]);
+                a[i] = (m[0] * p + m[1] * q + m[2]) * one, b[i] = (m[3] * p + m[4] * q + m[5]) * one;
             }
         } else if (c->parts[j].kind == SHEAR) {
             const R area = 1 - k[0] * k[1];
