@@ -42,9 +42,10 @@ class FTheta(FreePolynomial):
 
 
 class FThetaSheared(FTheta):
-    """NVIDIA's f-theta camera with all of its linear part: (u, v) = f (x + e y, d x + y) + c of the (x, y) of `FTheta`.
+    """NVIDIA's f-theta camera with all of its linear part: of `FTheta`'s (x, y), (u, v) = f (x + e y, d x + y) + c.
 
-    The [[c, d], [e, 1]] of files comes in through `from_polynomial`: d here is the files' e, e their d / c, c is fx / fy.
+    The [[c, d], [e, 1]] of files comes in through `from_polynomial`: d here is their e, e is their d / c, and c is
+    fx / fy.
 
     Distortion: d e k2 k3 ..., d and e of the linear part as of `OCamCalib`, then those of `FTheta`, at least one; 5 if
     left out. Source: NVIDIA's nvidia-ncore, `FThetaCameraModel`. On the axis see `FTheta`. See `Camera` for shapes,
