@@ -117,7 +117,7 @@ def render(rig: Rig, path: str) -> str:
     cameras, extrinsics = {}, {}
     for name, camera in rig.cameras.items():
         intrinsics, distortion = _rows(camera.intrinsics, camera.distortion)
-        entry = {"model": plain_model(type(camera)).key, "intrinsics": _values(lossy, name, intrinsics)}
+        entry: dict[str, Any] = {"model": plain_model(type(camera)).key, "intrinsics": _values(lossy, name, intrinsics)}
         if camera.configuration:
             entry["configuration"] = {name: list(value) for name, value in camera.configuration.items()}
         if camera.distortion.shape[-1]:

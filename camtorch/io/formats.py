@@ -11,7 +11,7 @@ import fnmatch
 import os
 
 from camtorch.camera import Camera
-from camtorch.io import aria, basalt, camtorch_json, colmap, kalibr, mrcal, nerfstudio, ocamcalib, opencv, ros
+from camtorch.io import aria, basalt, camtorch_json, colmap, kalibr, mrcal, ncore, nerfstudio, ocamcalib, opencv, ros
 from camtorch.io._errors import CameraFileError
 from camtorch.io.parsing import parse_mapping, path_of, read_bytes
 from camtorch.io.protocol import ContentFormat, KeyFormat
@@ -21,7 +21,7 @@ from camtorch.rig import Rig
 
 # in the order in which they are asked
 _BY_CONTENT: tuple[ContentFormat, ...] = (colmap, ocamcalib)
-_BY_KEYS: tuple[KeyFormat, ...] = (camtorch_json, aria, basalt, mrcal, nerfstudio, ros, kalibr, opencv)
+_BY_KEYS: tuple[KeyFormat, ...] = (camtorch_json, aria, basalt, mrcal, ncore, nerfstudio, ros, kalibr, opencv)
 
 NAMES_BY_FORMAT = {names.format: names for names in (*(m.NAMES for m in _BY_CONTENT), *(m.NAMES for m in _BY_KEYS))}
 FORMATS = tuple(NAMES_BY_FORMAT)
@@ -33,7 +33,7 @@ def load(path: str | os.PathLike[str], format: str | None = None) -> Rig:
     A calibration is a measurement: nothing of it learns until `.requires_grad_()` says so.
 
     Args:
-        path: a file of OpenCV, ROS, Kalibr, COLMAP, Nerfstudio, Project Aria, Basalt, mrcal, OCamCalib or camtorch; an
+        path: a file of OpenCV, ROS, Kalibr, COLMAP, Nerfstudio, Project Aria, Basalt, mrcal, ncore, OCamCalib or camtorch; an
             archive of `numpy.savez(path, K=K, D=D)`; or the folder of a COLMAP or Nerfstudio reconstruction. COLMAP's
             images beside the cameras are read with them.
         format: its format, one of the keys of `camtorch.save`; found from content and name if left out.
@@ -84,7 +84,7 @@ def save(rig: Rig | Camera, path: str | os.PathLike[str], format: str | None = N
         rig: a `Rig`, or one camera.
         path: the file, which may be a link: then what it points to is replaced. With COLMAP it may be a folder, where
             poses go to an images file beside the cameras; with Nerfstudio one that exists.
-        format: "opencv", "ros", "kalibr", "colmap", "nerfstudio", "aria", "basalt", "mrcal", "ocamcalib" or
+        format: "opencv", "ros", "kalibr", "colmap", "nerfstudio", "aria", "basalt", "mrcal", "ncore", "ocamcalib" or
             "camtorch". If left out:
             the format that the rig was loaded from if its files end like this one, else what the name says
             (`transforms.json`, `camchain.yaml`, `camera_info.yaml`, `.cameramodel`, `.xml`, `cameras.txt`, `.bin`),
