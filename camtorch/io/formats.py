@@ -33,9 +33,9 @@ def load(path: str | os.PathLike[str], format: str | None = None) -> Rig:
     A calibration is a measurement: nothing of it learns until `.requires_grad_()` says so.
 
     Args:
-        path: a file of OpenCV, ROS, Kalibr, COLMAP, Nerfstudio, Project Aria, Basalt, mrcal, ncore, OCamCalib or camtorch; an
-            archive of `numpy.savez(path, K=K, D=D)`; or the folder of a COLMAP or Nerfstudio reconstruction. COLMAP's
-            images beside the cameras are read with them.
+        path: a file of OpenCV, ROS, Kalibr, COLMAP, Nerfstudio, Project Aria, Basalt, mrcal, ncore, OCamCalib or
+            camtorch; an archive of `numpy.savez(path, K=K, D=D)`; or the folder of a COLMAP or Nerfstudio
+            reconstruction. COLMAP's images beside the cameras are read with them.
         format: its format, one of the keys of `camtorch.save`; found from content and name if left out.
 
     Returns:

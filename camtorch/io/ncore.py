@@ -12,16 +12,14 @@ from camtorch.camera import Camera
 from camtorch.io.protocol import Names
 from camtorch.io.record import Record, one_of
 from camtorch.io.writing import Lossy, as_json
-from camtorch.models import MODELS
 from camtorch.rig import Rig
 from camtorch.windshield import Windshield
 
 NAMES = Names("ncore", "ncore", (".json",), ("*ncore*.json",))
 
-_FORWARD, _BACKWARD = "ANGLE_TO_PIXELDIST", "PIXELDIST_TO_ANGLE"
 _POLYNOMIALS = {
-    _FORWARD: ("angle_to_pixeldist_poly", "f_theta"),
-    _BACKWARD: ("pixeldist_to_angle_poly", "f_theta_backward"),
+    "ANGLE_TO_PIXELDIST": ("angle_to_pixeldist_poly", "f_theta"),
+    "PIXELDIST_TO_ANGLE": ("pixeldist_to_angle_poly", "f_theta_backward"),
 }
 _PINHOLES = ("opencv-pinhole", "pinhole", "ideal-pinhole")
 
@@ -47,7 +45,8 @@ def parse(record: Record) -> Rig:
                 one_of(place[key], ("bivariate-windshield",))
         try:
             polynomials = (np.array(shield[f"{way}_poly"].numbers()) for way in ("horizontal", "vertical"))
-            camera = camera.behind(Windshield(*polynomials))
+            # frozen, so that the coefficients of both are the camera's own
+            camera = camera.requires_grad_(False).behind(Windshield(*polynomials).requires_grad_(False))
         except ValueError as error:
             shield.fail(error)
     return Rig({"camera": camera})
@@ -55,7 +54,7 @@ def parse(record: Record) -> Rig:
 
 def _f_theta(values: Record) -> Camera:
     """Its principal point is in pixels whose centres are integers; those of the other models lie at 0.5."""
-    polynomial, key = _POLYNOMIALS[one_of(values["reference_poly"], _POLYNOMIALS)]
+    polynomial, kind = _POLYNOMIALS[one_of(values["reference_poly"], _POLYNOMIALS)]
     coefficients = values[polynomial]
     constant, *rest = coefficients.numbers() or [0.0]
     if constant:
@@ -64,15 +63,14 @@ def _f_theta(values: Record) -> Camera:
     while len(rest) > 2 and not rest[-1]:  # which files fill up
         rest.pop()
     try:
-        made: Camera = MODELS[key].from_polynomial(  # type: ignore[attr-defined]
+        return kind.from_polynomial(
             np.array(values["principal_point"].numbers(2)),
             np.array(rest),
             linear_cde=linear if any(linear) else (1.0, 0.0, 0.0),  # as ncore takes zeros
             image_size=values["resolution"].size(),
         )
     except ValueError as error:
-        coefficients.fail(error)
-    return made
+        return coefficients.fail(error)
 
 
 def _of_opencv(values: Record, kind: str) -> Camera:
@@ -97,7 +95,7 @@ def render(rig: Rig, path: str) -> str:
     name, camera = lossy.only_camera(rig)
     height, width = lossy.size(name, camera)
     key, (fx, fy, cx, cy), k = lossy.model(name, camera, {"pinhole", "brown_conrady", "kannala_brandt"})
-    values = {
+    values: dict[str, Any] = {
         "resolution": [width, height],
         "shutter_type": "GLOBAL",
         "external_distortion_parameters": None,
