@@ -18,8 +18,8 @@ from camtorch.windshield import Windshield
 NAMES = Names("ncore", "ncore", (".json",), ("*ncore*.json",))
 
 _POLYNOMIALS = {
-    "ANGLE_TO_PIXELDIST": ("angle_to_pixeldist_poly", "f_theta"),
-    "PIXELDIST_TO_ANGLE": ("pixeldist_to_angle_poly", "f_theta_backward"),
+    "ANGLE_TO_PIXELDIST": ("angle_to_pixeldist_poly", FTheta),
+    "PIXELDIST_TO_ANGLE": ("pixeldist_to_angle_poly", FThetaBackward),
 }
 _PINHOLES = ("opencv-pinhole", "pinhole", "ideal-pinhole")
 
