@@ -12,6 +12,7 @@ from camtorch.camera import Camera
 from camtorch.io.protocol import Names
 from camtorch.io.record import Record, one_of
 from camtorch.io.writing import Lossy, as_json
+from camtorch.models import FTheta, FThetaBackward
 from camtorch.rig import Rig
 from camtorch.windshield import Windshield
 

@@ -316,8 +316,8 @@ void THIS(domain)(const Domain *d) {
         Lens lens = {d, first, numbers + numbers_of(d->parts), d->constants + c * d->constant_count};
         Part factor;
         if (d->is_chart) {
-            factor = d->parts[0], factor.kind = PLANAR, factor.flags = 0;
-            lens.part = &factor, lens.numbers = numbers;
+            factor = d->parts[0], factor.kind = PLANAR, factor.flags = factor.map = 0;
+            lens.part = &factor, lens.numbers = numbers + numbers_of_map(d->parts);
         }
         double fold = 0, table[2 + 2 * NODES];
         const int has_factor = lens.part->factor != NO_FACTOR;

@@ -313,7 +313,7 @@ static void T(lens_vjp)(const T(Camera) *c, int n, const R *restrict a, const R 
     for (int j = 1; j < c->stages; j++) T(stage)(c, j, n, x[j - 1], y[j - 1], x[j], y[j], NULL);
     for (int j = c->stages; j >= 1; j--) {
         const R *k = c->numbers[j];
-        double *part = sums ? sums + (k - c->numbers[0]) : NULL;
+        double *part = sums ? sums + (k - c->map) : NULL;
         if (c->parts[j].kind == HOMOGRAPHY) T(homography_vjp)(k, n, x[j - 1], y[j - 1], gu, gv, part);
         else if (c->parts[j].kind == SHEAR) {
             if (part) part[0] += T(dot)(n, gv, x[j - 1]), part[1] += T(dot)(n, gu, y[j - 1]);

@@ -97,8 +97,6 @@ class Bending(RayMap):
     behind, to which the model does not apply, behind.
     """
 
-    code: ClassVar[int | None] = 2
-
     def __init__(self, horizontal: Sequence[Tensor], vertical: Sequence[Tensor]):
         self.parameters: tuple[Tensor, ...] = (*horizontal, *vertical)
         self.count = len(horizontal)

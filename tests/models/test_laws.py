@@ -9,6 +9,7 @@ from cameras import (
     FEW_REAL,
     KEYS,
     NOT_ANALYTIC,
+    OFF_AXIS,
     RANGES,
     RARE_ARE_SLOW,
     REAL,
@@ -248,6 +249,8 @@ def test_derivatives_of_unproject(key, camera_of):
 @pytest.mark.parametrize("offset", [0.0, 1e-300, 1e-12, 1e-7])
 def test_derivatives_at_the_axis(key, offset):
     """On the axis a camera without even terms is a pinhole camera, first derivatives included."""
+    if key in OFF_AXIS:
+        pytest.skip("its lens is about another axis")
     camera = spread(key)
     # a table has its slope in the lens
     slope = 1 if key == "tabulated" else axis_slope(key, camera.distortion.tolist())
