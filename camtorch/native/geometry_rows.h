@@ -156,6 +156,12 @@ static void T(shrunk)(int n, R *restrict x, R *restrict y, R *restrict z, R *res
     }
 }
 
+static void T(change)(const T(Camera) *c, int n, T(Seen) *s) {
+    if (!c->parts->map) return;
+    T(shrunk)(n, s->x, s->y, s->z, s->shrink);
+    T(product)(c->map, 1, 3, n, s->x, s->y, s->z);
+}
+
 /* Adds the sums of the products of components, row by row */
 static void T(outer)(int n, const R *x, const R *y, const R *z, const R *p, const R *q, const R *r, double *sums) {
     const R *rows[] = {x, y, z}, *columns[] = {p, q, r};
@@ -225,10 +231,6 @@ static int T(see)(const T(Camera) *c, int keeps, int count, int n, T(Seen) *s) {
     const R inner2 = c->inner2;
     I outside = 0;
     int waiting = 0;
-    if (c->parts->map) {
-        T(shrunk)(n, s->x, s->y, s->z, s->shrink);
-        T(product)(c->map, 1, 3, n, s->x, s->y, s->z);
-    }
     T(see_all)(c, keeps, later ? c->usable ? INFINITY : -1 : inner2, n, swapped ? s->y : s->x, swapped ? s->x : s->y,
                s->z, s->shrink, s->scale, swapped ? s->b : s->a, swapped ? s->a : s->b, s->ok);
     if (!later) return 0;
@@ -252,6 +254,7 @@ static int T(see)(const T(Camera) *c, int keeps, int count, int n, T(Seen) *s) {
 
 /* Points `s` to pixels, -1 where they are not `ok`. How many wait for limits */
 static int T(pixels_of)(const T(Camera) *c, int count, int n, T(Seen) *s, R *restrict u, R *restrict v) {
+    T(change)(c, n, s);
     const int waiting = T(see)(c, 0, count, n, s);
     const R fx = c->fx, fy = c->fy, cx = c->cx, cy = c->cy;
     if (c->is_radial) { /* most often */
@@ -306,6 +309,7 @@ static void T(project_vjp)(const T(Camera) *c, const Rows *rows, int64_t camera,
     T(Seen) s;
     ALIGNED R gu[BLOCK], gv[BLOCK], gx[BLOCK], gy[BLOCK], gz[BLOCK], by_angle[BLOCK];
     T(load_points)(points, from, count, n, s.x, s.y, s.z);
+    T(change)(c, n, &s);
     T(see)(c, 1, count, n, &s);
     const R *to_u = T(load)(cotangents, by[1], count, n, gx, 0);
     const R *to_v = T(load)(cotangents + by[2], by[1], count, n, gy, 0);
