@@ -143,9 +143,13 @@ def model_behind(model: type[CameraT], counts: Sequence[int]) -> type[CameraT]:
         signs = {(letter, i): "-" if (i % 2 == 0) == (letter == "h") else "" for letter, _, i, _ in of_shield}
         turned = {f"{k}{n}": signs[k, i] + place["v" if k == "h" else "h", j, i] for k, n, i, j in of_shield}
 
+    # of which models without distortion have one of their own
+    general = next(cls for cls in reversed(model.__mro__) if "optics" in vars(cls)).__init__
+
     class Behind(model):  # type: ignore[misc, valid-type]
         __qualname__ = f"{model.__qualname__}BehindWindshield{across}x{down}"
         configuration = MappingProxyType({"windshield": (across, down)})
+        __init__ = general
         distortion_names = (*model.distortion_names, *names)
         default_count = model.default_count + added
         fit_counts = tuple(count + added for count in model.fit_counts)
