@@ -11,7 +11,19 @@ import fnmatch
 import os
 
 from camtorch.camera import Camera
-from camtorch.io import aria, basalt, camtorch_json, colmap, kalibr, mrcal, ncore, nerfstudio, ocamcalib, opencv, ros
+from camtorch.io import (
+    aria,
+    basalt,
+    camtorch_json,
+    colmap,
+    kalibr,
+    mrcal,
+    ncore,
+    nerfstudio,
+    ocamcalib,
+    opencv,
+    ros,
+)
 from camtorch.io._errors import CameraFileError
 from camtorch.io.parsing import parse_mapping, path_of, read_bytes
 from camtorch.io.protocol import ContentFormat, KeyFormat
