@@ -144,12 +144,12 @@ def model_behind(model: type[CameraT], counts: Sequence[int]) -> type[CameraT]:
         turned = {f"{k}{n}": signs[k, i] + place["v" if k == "h" else "h", j, i] for k, n, i, j in of_shield}
 
     # of which models without distortion have one of their own
-    general = next(cls for cls in reversed(model.__mro__) if "optics" in vars(cls)).__init__
+    general: Any = next(cls for cls in reversed(model.__mro__) if "optics" in vars(cls))
 
     class Behind(model):  # type: ignore[misc, valid-type]
         __qualname__ = f"{model.__qualname__}BehindWindshield{across}x{down}"
         configuration = MappingProxyType({"windshield": (across, down)})
-        __init__ = general
+        __init__ = general.__init__
         distortion_names = (*model.distortion_names, *names)
         default_count = model.default_count + added
         fit_counts = tuple(count + added for count in model.fit_counts)
@@ -186,8 +186,9 @@ def model_behind(model: type[CameraT], counts: Sequence[int]) -> type[CameraT]:
     Behind.__name__ = f"{model.__name__}BehindWindshield"
     Behind.odd_in_x, Behind.odd_in_y = model.odd_in_x | odd_in_x, model.odd_in_y | odd_in_y
     Behind.key = f"{model.key} behind a windshield"  # for messages; MODELS has no such
-    _models[model, across, down] = Behind
-    return Behind
+    made: type[CameraT] = Behind
+    _models[model, across, down] = made
+    return made
 
 
 def behind(camera: CameraT, shield: Windshield) -> CameraT:
