@@ -23,6 +23,7 @@ from camtorch.io import (
     kalibr,
     metashape,
     mrcal,
+    ncore,
     nerfstudio,
     nuscenes,
     ocamcalib,
@@ -47,6 +48,7 @@ _BY_KEYS: tuple[KeyFormat, ...] = (
     aria,
     basalt,
     mrcal,
+    ncore,
     nerfstudio,
     ros,
     kalibr,
@@ -72,8 +74,8 @@ def load(path: str | os.PathLike[str], format: str | None = None) -> Rig:
     A calibration is a measurement: nothing of it learns until `.requires_grad_()` says so.
 
     Args:
-        path: a file of OpenCV, ROS, Kalibr, COLMAP, Nerfstudio, Project Aria, Basalt, mrcal, OCamCalib, WoodScape,
-            Gyroflow, camodocal, Metashape, nuScenes, OpenMVG or camtorch; an archive of
+        path: a file of OpenCV, ROS, Kalibr, COLMAP, Nerfstudio, Project Aria, Basalt, mrcal, ncore, OCamCalib,
+            WoodScape, Gyroflow, camodocal, Metashape, nuScenes, OpenMVG or camtorch; an archive of
             `numpy.savez(path, K=K, D=D)`; or the folder of a COLMAP or Nerfstudio reconstruction. COLMAP's images
             beside the cameras are read with them.
         format: its format, one of the keys of `camtorch.save`; found from content and name if left out.
@@ -131,8 +133,8 @@ def save(rig: Rig | Camera, path: str | os.PathLike[str], format: str | None = N
         rig: a `Rig`, or one camera.
         path: the file, which may be a link: then what it points to is replaced. With COLMAP it may be a folder, where
             poses go to an images file beside the cameras; with Nerfstudio one that exists.
-        format: "opencv", "ros", "kalibr", "colmap", "nerfstudio", "aria", "basalt", "mrcal", "ocamcalib",
-            "woodscape", "gyroflow", "camodocal", "metashape" or "camtorch"; written only, "usda", "carla", "blender" or
+        format: "opencv", "ros", "kalibr", "colmap", "nerfstudio", "aria", "basalt", "mrcal", "ncore",
+            "ocamcalib", "woodscape", "gyroflow", "camodocal", "metashape" or "camtorch"; written only, "usda", "carla", "blender" or
             "rays". If left out: the format that the rig was loaded from if its files end like this one, else what the
             name says (`transforms.json`, `camchain.yaml`, `camera_info.yaml`, `.cameramodel`, `.xml`, `cameras.txt`,
             `.bin`, `.usda`, `.exr`), else camtorch's own for `.json`.
