@@ -32,7 +32,7 @@ def variant(model: type[CameraT], text: str) -> type[CameraT]:
     counts = [int(count) for count in found.groups()] if found else []
     if not counts or any(order_of(count) is None for count in counts):
         raise ValueError(
-            f"{model.__name__}: there is no variant {text!r:.60}; windshield=N,M is one, N and M of 1, 3, 6, 10, 15, ..."
+            f"{model.__name__}: there is no variant {text!r:.60}; windshield=N,M is one, N and M of 1, 3, 6, 10, ..."
         )
     return behind_windshield(model, *counts)
 
