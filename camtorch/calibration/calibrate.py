@@ -426,7 +426,7 @@ def results(
     views = torch.stack([one.seen.any(-1) for one in given]).any(0)
     parameters = len(adjusted.equations.columns) + 6 * int(views.sum())
     loss, loss_scale = searches[0].loss, searches[0].loss_scale
-    inliers, sigma, noise = _noise_of(residuals, seen, valid, loss, loss_scale, parameters)
+    inliers, sigma, noise = noise_of(residuals, seen, valid, loss, loss_scale, parameters)
     # views that repeat others widen what is uncertain as if there were so many less
     again = repeats(given, [r[0] for r in adjusted.residuals])
     noise = noise * math.sqrt(len(views) / (len(views) - len(again)))
@@ -437,16 +437,16 @@ def results(
         cameras.append(_result(adjusted, c, search, layout, own, sigma, noise, (object_points, passed)))
     for camera, ends in zip(cameras, optima, strict=True):
         camera.twins = () if ends is None else ends.twins(camera)
-    return Results(adjusted, cameras, _rms(residuals, seen), float(sigma), noise)
+    return Results(adjusted, cameras, rms_of(residuals, seen), float(sigma), noise)
 
 
-def _rms(residuals: Tensor, seen: Tensor) -> float:
+def rms_of(residuals: Tensor, seen: Tensor) -> float:
     """Px per point."""
     lengths = torch.where(seen, torch.linalg.vector_norm(residuals, dim=-1), 0.0)
     return float((lengths.square().sum() / seen.sum().clamp(min=1)).sqrt())
 
 
-def _noise_of(
+def noise_of(
     residuals: Tensor, seen: Tensor, valid: Tensor, loss: str | None, loss_scale: float, free: int
 ) -> tuple[Tensor, Tensor, Tensor]:
     """The inliers, bool (V, N), sigma, and the noise that makes the covariance; without a loss both are one number.
@@ -493,7 +493,7 @@ def _result(
     return Calibration(
         camera=found,
         extrinsics=Extrinsics(rotation_vector(rotations).unsqueeze(-1), translations - rotations @ search.middle),
-        rms=_rms(residuals, seen.seen),
+        rms=rms_of(residuals, seen.seen),
         sigma=float(sigma),
         residuals=layout.restore(torch.where(valid[..., None], residuals, torch.nan)),
         inliers=layout.restore(inliers),
