@@ -170,6 +170,8 @@ def calibrate_hand_eye(
             '"in_hand" for a camera on the hand and "to_hand" for one that looks at it'
         )
     free = Free((asked.free.to(like.device),), (True,), bend=bend)
+    if bool(asked.free.any()):
+        parameters = parameters.expand(sets, -1)
     state = State((parameters,), mounts, worlds, like.new_zeros(sets, 2))
     found = []
     for part in torch.arange(sets, device=like.device).split(max(1, _NUMBERS // (60 * whole.seen[0].numel()))):
