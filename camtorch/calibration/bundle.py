@@ -92,8 +92,9 @@ class Sight(NamedTuple):
 
     def mapped(self, change: Callable[[Tensor], Tensor]) -> Sight:
         """With a change to all tensors of problems."""
+        points, pixels, weights = map(change, self[1:4])
         motions = self.motions and Poses(*map(change, self.motions))
-        return Sight(self.model, *map(change, self[1:4]), motions, self.prior)
+        return Sight(self.model, points, pixels, weights, motions, self.prior)
 
 
 class State(NamedTuple):
@@ -260,15 +261,7 @@ class Bundle:
         self.free, self.loss, self.loss_scale = free, loss, loss_scale
         self._last = None
         batch = state.boards.translations.shape[0]
-        self.sights = [
-            Sight(
-                s.model,
-                *(t.expand(batch, *t.shape[1:]) for t in s[1:4]),
-                s.motions and s.motions.expand(batch),
-                s.prior,
-            )
-            for s in sights
-        ]
+        self.sights = [s.mapped(lambda t: t.expand(batch, *t.shape[1:])) for s in sights]
         self.cameras = [_template(s.model, p) for s, p in zip(sights, state.parameters, strict=True)]
         self.rounding = torch.stack([rounding_of(s.pixels, s.weights) for s in self.sights]).sum(0)
         # a camera that does not learn, and is that of all problems, sees them in one row

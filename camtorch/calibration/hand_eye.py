@@ -146,7 +146,11 @@ def calibrate_hand_eye(
     sets = batch.numel()
 
     def in_sets(values: Tensor) -> Tensor:  # with zeros for the views that are left out
-        return values.new_zeros(sets * views, *values.shape[1:]).index_copy(0, rows, values).unflatten(0, (sets, views))
+        return (
+            values.new_zeros(sets * views, *values.shape[1:])
+            .index_copy(0, rows, values)
+            .view(sets, views, *values.shape[1:])
+        )
 
     rows, like = layout.views, seen.pixels
     whole = Observations(*(in_sets(t) for t in search.seen))
@@ -194,7 +198,7 @@ def _as_hands(poses: Any, owner: str) -> Tensor:
                 poses = Extrinsics.from_matrix(turns, shifts.reshape(turns.shape[:-1]))
             else:
                 poses = Extrinsics.from_matrix(_as_float64(poses, 4, "robot_poses", owner))
-        matrices = poses.matrix().detach().double()
+        matrices: Tensor = poses.matrix().detach().double()
     except (ValueError, RuntimeError) as error:
         raise ValueError(
             f"{owner}: robot_poses must be rigid poses (V, 4, 4), Extrinsics, or a pair (R, t), (V, 3, 3) and "
@@ -261,7 +265,8 @@ def _closed_form(boards: Poses, motions: Poses, has: Tensor) -> tuple[Poses, Pos
 def _nearest_rotation(matrix: Tensor) -> Tensor:
     """(B, 3, 3): of a matrix up to its scale and sign."""
     left, _, right = torch.linalg.svd(matrix * torch.linalg.det(matrix).sign()[:, None, None])
-    return left @ right
+    nearest: Tensor = left @ right
+    return nearest
 
 
 def _result(
