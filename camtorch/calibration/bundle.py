@@ -386,7 +386,7 @@ class Bundle:
         state, width, total = self.state(flat), self.width, len(self.columns)
         parts = []
         for c, look in enumerate(self.looks(flat, rows)):
-            block, at = self._rows_of(c, look, state, rows)
+            block, at = self.rows_of(c, look, state, rows)
             if total == 0:
                 parts.append(block)
                 continue
@@ -418,7 +418,7 @@ class Bundle:
                 found.append(rows)
         return found
 
-    def _rows_of(self, c: int, look: _Look, state: State, rows: Tensor) -> tuple[Tensor, list[int]]:
+    def rows_of(self, c: int, look: _Look, state: State, rows: Tensor) -> tuple[Tensor, list[int]]:
         """The rows (B, V, 2 N, L + F + 1) of a camera, and which of the shared unknowns its F columns are."""
         sight = self.sight(c, rows)
         turned, first, points = look.frames

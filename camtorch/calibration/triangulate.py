@@ -179,10 +179,15 @@ def moved_by_calibration(
         boards = Poses.none(1, count, like)._replace(translations=(some @ turn.mT + shift)[None])
         state = State(parameters, Poses(turns[None], shifts[None]), boards, like.new_zeros(1, 2))
         bundle = Bundle(sights, state, free, None, 1.0)
-        found = bundle.equations(bundle.flat(state))
-        rows = like.new_tensor([columns.index((which[c], i)) for c, i in found.columns]).long()
-        view = found.view[0, :, :3]
-        step = torch.linalg.solve_triangular(view[..., :3], view[..., 3:-1] @ calibration.factor[rows], upper=True)
+        one = torch.arange(1, device=like.device)
+        normal, right = like.new_zeros(count, 3, 3), like.new_zeros(count, 3, like.shape[-1])
+        for c, look in enumerate(bundle.looks(bundle.flat(state), one)):
+            (block,), at = bundle.rows_of(c, look, state, one)
+            by_point, rest = block[..., :3], block[..., 3:-1]
+            cols = [columns.index((which[c], bundle.columns[g][1])) for g in at]
+            normal += by_point.mT @ by_point
+            right += by_point.mT @ (rest @ calibration.factor[cols])
+        step, _ = torch.linalg.solve_ex(normal, right)  # of three unknowns, which squares do no harm
         moved.append(turn.mT @ -step)
     return torch.cat(moved) if moved else like.new_zeros(0, 3, 0)
 
