@@ -33,8 +33,7 @@ STEPS = 300
 _MANY = 100  # coefficients
 _OUTLIER = 3.0  # standard deviations
 _ROUNDS = 20
-_FIRST_SIGMA, _SAME_SIGMA = 0.3, 0.01  # px, and the relative change, of the noise beside a prior
-_CONTRADICTED = 3.0  # standard deviations
+_SAME_WIDTH, _CONTRADICTED = 0.01, 3.0  # of a prior: a change that is none, and times its own that it has to be told
 _SECOND_LOOKS = 3  # at the poses
 _AS_GOOD = 9.0  # variances: the difference of two costs that three standard deviations explain
 _APART, _SAME = 5.0, 1e-3  # standard deviations, and part of the parameter, of two optima
@@ -367,28 +366,30 @@ class Search:
     ) -> Adjusted:
         """The optimum by what this camera saw and what was known; `prior` becomes what that counts in px.
 
-        It counts by the noise that the residuals show. A prior that the optimum is further from than its own standard
-        deviations is widened until it is not.
+        It counts by the noise that views show by themselves. A prior that the optimum is further from than its own
+        standard deviations is widened until it is not.
         """
-        learns, wide = int(self.asked.free.sum()), 1.0
-        sigma = known.root.new_tensor(_FIRST_SIGMA)
+        free, learns, wide = self.free(bend), max(int(self.asked.free.sum()), 1), 1.0
+        alone = self.alone(bend)
+        residuals, seen, valid = alone.residuals[0][0], self.seen.seen, alone.valid[0][0]
+        _, sigma, _ = noise_of(
+            residuals, seen, valid, self.loss, self.loss_scale, unknowns([self.sight], alone, len(seen))
+        )
+        self.misfit = misfit(alone, sigma)
+        sigma = sigma * self.misfit
         self.prior = known.prior(sigma)
-        adjusted = self.alone(bend, progress)
+        adjusted = min(
+            (self.alone(bend, progress), self.adjusted([self.sight], alone.state, free, steps=STEPS)),
+            key=lambda found: float(found.cost),
+        )
         for _ in range(_ROUNDS):
-            before = sigma / wide
-            seen = self.seen.seen
-            told = unknowns([self.sight], adjusted, len(seen))
-            _, sigma, _ = noise_of(
-                adjusted.residuals[0][0], seen, adjusted.valid[0][0], self.loss, self.loss_scale, told
-            )
+            before = wide
             away = known.root @ (adjusted.state.parameters[0][0] - known.centre)
-            wide = max(1.0, float(away.square().sum() / max(learns, 1)) ** 0.5)
-            self.misfit = misfit(adjusted, sigma)
-            sigma = sigma * self.misfit
-            if abs(float(sigma / wide / before) - 1) < _SAME_SIGMA:
+            wide = max(1.0, float(away.square().sum() / learns) ** 0.5)
+            if abs(wide / before - 1) < _SAME_WIDTH:
                 break
             self.prior = known.prior(sigma / wide)
-            adjusted = self.adjusted([self.sight], adjusted.state, self.free(bend), steps=STEPS, progress=progress)
+            adjusted = self.adjusted([self.sight], adjusted.state, free, steps=STEPS, progress=progress)
         if wide > _CONTRADICTED:
             python_warnings.warn(
                 f"{self.owner}: the views contradict prior, by {wide:.3g} standard deviations, and it counts so much "

@@ -81,7 +81,7 @@ def as_known(
     root = _usual(model, centre, size)
     if len(values) > 1:
         offsets = (values - centre) @ root.mT
-        total, members = offsets.shape[-1], len(offsets)
+        total, number = offsets.shape[-1], len(offsets)
         middle, eye = offsets.median(0).values, torch.eye(offsets.shape[-1]).to(offsets)
         shape = eye  # at first: those that are far from most are no reason to find them near
         for _ in range(_ROUNDS):
@@ -89,10 +89,10 @@ def as_known(
             weights = (_TAILS + total) / (_TAILS + distance)
             middle = (weights @ offsets) / weights.sum()
             scatter = (weights[:, None] * (offsets - middle)).mT @ (offsets - middle)
-            scale = (1 + scatter.trace() / total) / members
-            shape = (total * scale * eye + scatter) / (total + members - 1)
+            scale = (1 + scatter.trace() / total) / number
+            shape = (total * scale * eye + scatter) / (total + number - 1)
         centre = centre + torch.linalg.lstsq(root, middle[:, None], driver="gelsd").solution[:, 0]
-        root = torch.linalg.cholesky(torch.linalg.inv((1 + 1 / members) * shape)).mT @ root
+        root = torch.linalg.cholesky(torch.linalg.inv((1 + 1 / number) * shape)).mT @ root
     centre, root = centre.to(like), root.to(like)
     camera = fixed_camera(model, centre[:4], centre[4:], size)
     return Known(camera, centre, root)
