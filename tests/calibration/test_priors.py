@@ -35,13 +35,21 @@ def error_of(camera):
     return float(off.detach().square().sum(-1).mean().sqrt())
 
 
+@pytest.mark.slow
 def test_a_prior_makes_up_for_missing_views():
-    """Three views with it are better than without; a single one, which leaves a camera open, than the prior itself."""
-    with_it, without = (
-        sum(error_of(calibrated(3, prior, seed=seed).camera) for seed in range(1, 5)) for prior in (COPY, None)
-    )
-    assert with_it < 0.85 * without
-    assert error_of(calibrated(1, COPY).camera) < error_of(COPY.resize(*SIZE))
+    """Three views with it are better than without, and one is better than the prior itself; both on average."""
+
+    def mean(views, prior):
+        return sum(error_of(calibrated(views, prior, seed=seed).camera) for seed in range(1, 7)) / 6
+
+    assert mean(3, COPY) < 0.75 * mean(3, None)
+    assert mean(1, COPY) < 0.75 * error_of(COPY.resize(*SIZE))
+
+
+def test_a_single_view_is_enough_with_a_prior():
+    straight = calibrated(1, COPY)
+    assert straight.converged
+    assert ((straight.camera.intrinsics.detach() - TRUTH.intrinsics).abs() < 3 * straight.std[:4]).all()
 
 
 def test_many_views_decide():
