@@ -27,7 +27,7 @@ _LEAST_VIEWS = 3
 _ONE_AXIS = 1e-3  # radians: the robot's turns about a second axis, at least
 _ROUNDS = 6  # of the start, in which views that disagree count less
 _OTHER_WAY, _FAR_OFF = 5.0, math.radians(1)  # times better with the poses inverted, while they are off by this
-_USUAL_NOISE, _OPEN = 0.1, 0.02  # px; radians, and part of a focal length, that it leaves uncertain
+_USUAL_NOISE, _OPEN = 0.1, 0.02  # px; radians that it leaves uncertain
 _NUMBERS = 4_000_000  # that are adjusted together
 
 
@@ -141,7 +141,8 @@ def calibrate_hand_eye(
     if len(layout.shapes) != math.prod((*batch, views)):
         raise ValueError(f"{owner}: robot_poses are {views}, and image_points {len(layout.shapes)} views")
     asked = as_model(model, count, start, fixed, owner)
-    told = as_options(loss, loss_scale, bend, progress, owner)
+    tell = as_options(loss, loss_scale, bend, progress, owner)
+    told = None if tell is None else lambda number, cost: tell(number, cost.sum())
     search = Search(owner, asked, seen, middle_of([seen]), layout, loss, loss_scale)
     sets = batch.numel()
 
@@ -293,12 +294,11 @@ def _result(
     moved = worlds[..., :3] @ search.middle
     factor[:, -3:] = factor[:, -3:] + skew_matrix(moved) @ factor[:, -6:-3]
     worlds = torch.cat((worlds[..., :3], (worlds[..., 3] - moved)[..., None]), -1)
-    usual = _USUAL_NOISE * torch.linalg.vector_norm(factor, dim=-1)
-    loose = (usual[:, count : count + 3].amax(-1) > _OPEN) | ((usual[:, :2] / parameters[:, :2]).amax(-1) > _OPEN)
+    loose = _USUAL_NOISE * torch.linalg.vector_norm(factor[:, count : count + 3], dim=-1).amax(-1) > _OPEN
     if not batch and bool(loose):
         raise ValueError(
-            f"{search.owner}: these views and poses leave the camera, or its pose on the robot, undetermined. Turn the "
-            'hand by 20 degrees and more about different axes, tilt the board to all sides, or hold the camera: "all"'
+            f"{search.owner}: these views leave the camera's pose on the robot undetermined. Turn the hand by 20 degrees "
+            'and more about different axes, tilt the board, hold the camera (fixed="all"), and give board and robot one unit'
         )
     inliers, sigma, noise, rms = [], [], [], []
     for b, seen in enumerate(whole.seen):

@@ -210,7 +210,7 @@ def calibrated_pair():
     return ct.calibrate_rig(models, board, dict(zip(models, pixels, strict=True)), image_sizes=sizes)
 
 
-# drcal (mrcal's fork on PyPI) on the same corners, triangulate(method=triangulate_geometric, stabilize_coords=False): by
+# drcal (of PyPI) on the same corners, triangulate(method=triangulate_geometric, stabilize_coords=False): by
 # pixels of 0.5 px, and by the calibration with its 0.29879 px
 DRCAL_PIXELS = [
     [0.00052674, 0.00047649, 0.0037183],
