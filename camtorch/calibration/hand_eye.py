@@ -297,8 +297,9 @@ def _result(
     loose = _USUAL_NOISE * torch.linalg.vector_norm(factor[:, count : count + 3], dim=-1).amax(-1) > _OPEN
     if not batch and bool(loose):
         raise ValueError(
-            f"{search.owner}: these views leave the camera's pose on the robot undetermined. Turn the hand by 20 degrees "
-            'and more about different axes, tilt the board, hold the camera (fixed="all"), and give board and robot one unit'
+            f"{search.owner}: these views leave open where the camera is on the robot. Turn the hand by 20 degrees and "
+            'more about different axes, tilt the board, or hold the camera: fixed="all"; the board must be in the unit '
+            "of the robot"
         )
     inliers, sigma, noise, rms = [], [], [], []
     for b, seen in enumerate(whole.seen):

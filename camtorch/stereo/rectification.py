@@ -255,19 +255,11 @@ class Rectification(GeometryModule):
                 raise ValueError(f"{owner}: calibration is of one pair; this is a batch")
             pose = self.extrinsics.matrix().detach().double()
             poses = torch.stack((torch.eye(4).to(pose), pose))
-            chosen = points[good] @ self.frame.left.detach()  # in the frame of the left camera
+            rig = (self.source_left, self.source_right), poses[:, :3, :3], poses[:, :3, 3]
             parts = []
-            for some in chosen.split(_TOGETHER):
-                both = torch.ones(2, len(some), dtype=torch.bool, device=some.device)
-                moved = moved_by_calibration(
-                    calibration,
-                    (self.source_left, self.source_right),
-                    poses[:, :3, :3],
-                    poses[:, :3, 3],
-                    some,
-                    both,
-                    owner,
-                )
+            for some in (points[good] @ self.frame.left.detach()).split(_TOGETHER):  # in the left camera's frame
+                seen = torch.ones(2, len(some), dtype=torch.bool, device=some.device)
+                moved = moved_by_calibration(calibration, *rig, some, seen, owner)
                 along = some / torch.linalg.vector_norm(some, dim=-1, keepdim=True)
                 parts.append((along[:, None] @ moved).square().sum((-1, -2)))
             variance[good] += torch.cat(parts) if parts else 0.0
