@@ -15,6 +15,7 @@ from camtorch.optics.charts import (
 )
 from camtorch.optics.lens import Lens, Planar, Stage, Tilt
 from camtorch.optics.radial import AnglePerRadius, Polynomial, RadialFactor, RadiusPolynomial, RadiusTable, Rational
+from camtorch.optics.surface import Surface
 from camtorch.optics.unified import Unified
 
 __all__ = [
@@ -37,6 +38,7 @@ __all__ = [
     "Rational",
     "SphereChart",
     "Stage",
+    "Surface",
     "Tilt",
     "Transverse",
     "Unified",
