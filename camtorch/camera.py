@@ -144,6 +144,10 @@ class Camera(BatchedModule):
     """The coefficients that change sign when the scene is mirrored left to right."""
     odd_in_y: ClassVar[frozenset[str]] = frozenset()
     """Likewise top to bottom."""
+    mirror_x: ClassVar[Mapping[str, str]] = {}
+    """Where more than signs change then: the coefficients that others become, {"a": "-b"} is a = -b."""
+    mirror_y: ClassVar[Mapping[str, str]] = {}
+    """Likewise top to bottom."""
     quarter_turn: ClassVar[Mapping[str, str] | None] = {}
     """The coefficients that others become when the image is turned clockwise by a quarter: {"p2": "-p1"} is p2 = -p1.
 
@@ -347,6 +351,24 @@ class Camera(BatchedModule):
     @staticmethod
     def defined(k: Sequence[Tensor]) -> Tensor | None:
         """Positive where the formula exists for the coefficients, tensors of one shape; None where it always does."""
+        return None
+
+    @classmethod
+    def variant(cls, text: str) -> type[Camera]:
+        """The class of the key `key:text`, of a model that is a family of classes.
+
+        Raises:
+            ValueError: it has none of that text.
+        """
+        raise ValueError(f"{cls.__name__} has no variants; got {text!r:.60}")
+
+    @classmethod
+    def smoothness(cls) -> Tensor | None:
+        """(R, n) rows whose products with the coefficients are small in a smooth lens, float64.
+
+        A model that states them has a lens that is linear in its coefficients, and coefficients enough to take the
+        place of the intrinsics, which fits then hold. None: the coefficients are few.
+        """
         return None
 
     def _model_name(self) -> str:
@@ -725,6 +747,9 @@ def as_model(model: type[Camera] | str, owner: str) -> type[Camera]:
         TypeError: no camera model. ValueError: an unknown key.
     """
     if isinstance(model, str):
+        key, _, text = model.partition(":")
+        if text and key in MODELS:
+            return MODELS[key].variant(text)
         if model not in MODELS:
             keys = {name.lower(): key for key, cls in MODELS.items() for name in (key, cls.__name__)} | _ELSEWHERE
             close = difflib.get_close_matches(model.lower(), keys, 1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 from camtorch.extrinsics import Extrinsics
@@ -9,6 +10,7 @@ from camtorch.io import poses
 from camtorch.io.protocol import Names
 from camtorch.io.record import Record, one_of
 from camtorch.io.writing import Lossy, number
+from camtorch.models import Splined
 from camtorch.rig import Rig
 
 NAMES = Names("mrcal", "mrcal", (".cameramodel",), ("*.cameramodel",))
@@ -21,6 +23,8 @@ _MODELS = {
     "LENSMODEL_STEREOGRAPHIC": ("stereographic", 0),
     **{f"LENSMODEL_OPENCV{count}": ("brown_conrady", count) for count in (4, 5, 8, 12, 14)},
 }
+_SPLINED_NAME = "LENSMODEL_SPLINED_STEREOGRAPHIC_order={}_Nx={}_Ny={}_fov_x_deg={}"
+_SPLINED = re.compile(r"LENSMODEL_SPLINED_STEREOGRAPHIC_order=(\d+)_Nx=(\d+)_Ny=(\d+)_fov_x_deg=(\d+)")
 
 
 def matches(keys: dict[str, Any]) -> bool:
@@ -31,7 +35,7 @@ def matches(keys: dict[str, Any]) -> bool:
 def parse(record: Record) -> Rig:
     """The camera; the rig is mrcal's reference. The valid region and the optimization inputs are not read."""
     name = record["lens_model" if "lens_model" in record else "lensmodel"]
-    key, count = _MODELS[one_of(name, _MODELS)]
+    key, count = _splined(name) or _MODELS[one_of(name, [*_MODELS, _SPLINED_NAME.format(3, 16, 11, 120)])]
     values = record["intrinsics"].numbers(4 + count)
     camera = record["intrinsics"].camera(key, values[:4], values[4:], record["imagersize"].size())
     extrinsics: dict[str, Extrinsics] = {}
@@ -42,16 +46,35 @@ def parse(record: Record) -> Rig:
     return Rig({"camera": camera}, extrinsics)
 
 
+def _splined(name: Record) -> tuple[str, int] | None:
+    """The key and number of coefficients of a splined lens; None of another one."""
+    found = _SPLINED.fullmatch(name.text())
+    if found is None:
+        return None
+    if max(map(len, found.groups())) > 4:
+        name.fail(f"{name.value!r:.100}: no grid of that size is read")
+    order, columns, rows, fov_x = map(int, found.groups())
+    try:
+        model = Splined.with_grid(order=order, columns=columns, rows=rows, fov_x=fov_x)
+    except ValueError as error:
+        name.fail(error)
+    return model.key, model.default_count
+
+
 def render(rig: Rig, path: str) -> str:
     """The text of a file."""
     lossy = Lossy(path, NAMES.title)
     name, camera = lossy.only_camera(rig)
     lossy.no_images(rig)
     height, width = lossy.size(name, camera)
-    key, intrinsics, distortion = lossy.model(name, camera, {key for key, _ in _MODELS.values()})
+    known = {key for key, _ in _MODELS.values()} | {camera.key if isinstance(camera, Splined) else Splined.key}
+    key, intrinsics, distortion = lossy.model(name, camera, known)
     if key == "stereographic":  # without the polynomial
         distortion = lossy.at_most(name, camera, distortion, (0,))
-    model = next(model for model, (k, count) in _MODELS.items() if k == key and count == len(distortion))
+    if isinstance(camera, Splined):
+        model = _SPLINED_NAME.format(camera.order, camera.columns, camera.rows, camera.fov_x)
+    else:
+        model = next(model for model, (k, count) in _MODELS.items() if k == key and count == len(distortion))
     rotation, translation = [0.0] * 3, [0.0] * 3
     if name in rig.extrinsics:
         rotation, translation = lossy.pose(name, rig.extrinsics[name])

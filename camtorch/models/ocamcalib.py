@@ -38,6 +38,7 @@ class Shear(Stage):
     """(x + e y, d x + y): a sensor out of line with the lens."""
 
     code: ClassVar[int | None] = 18
+    is_affine = True
 
     def __init__(self, d: Tensor, e: Tensor):
         self.parameters: tuple[Tensor, ...] = (d, e)

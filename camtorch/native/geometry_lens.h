@@ -252,6 +252,117 @@ static void T(tilt_vjp)(const R *k, int n, const R *restrict a, const R *restric
     EACH(i) gu[i] = ga[i], gv[i] = gb[i];
 }
 
+/* The first of the four control points along an axis that have a part in a surface there, and their weights; if wanted,
+   by how much these change from control point to control point. Of order 2 one of them is 0 */
+INLINE R T(spline)(const int order, const int slopes, R position, R size, R *w0, R *w1, R *w2, R *w3, R *s0, R *s1,
+                   R *s2, R *s3) {
+    const R most = size - (R)order;
+    R cell = (R)(IS_DOUBLE ? floor(order == 3 ? position : position + 0.5)
+                           : floorf((float)(order == 3 ? position : position + (R)0.5)));
+    cell = cell > 1 ? cell : 1, cell = cell < most ? cell : most;
+    const R x = position - cell, y = 1 - x, sixth = (R)(1 / 6.0);
+    if (order == 3) {
+        *w0 = y * y * y * sixth, *w1 = ((3 * x - 6) * x * x + 4) * sixth, *w2 = (((3 - 3 * x) * x + 3) * x + 1) * sixth;
+        *w3 = x * x * x * sixth;
+        if (slopes) {
+            *s0 = -y * y / 2, *s1 = (3 * x - 4) * x / 2, *s2 = (1 + (2 - 3 * x) * x) / 2, *s3 = x * x / 2;
+        }
+        return cell - 1;
+    }
+    const R first = ((4 * x - 4) * x + 1) / 8, middle = (3 - 4 * x * x) / 4, last = ((4 * x + 4) * x + 1) / 8;
+    const int moved = cell > size - 3; /* or the fourth would be none of them */
+    *w0 = moved ? 0 : first, *w1 = moved ? first : middle, *w2 = moved ? middle : last, *w3 = moved ? last : 0;
+    if (slopes) {
+        const R left = x - (R)0.5, right = x + (R)0.5;
+        *s0 = moved ? 0 : left, *s1 = moved ? left : -2 * x, *s2 = moved ? -2 * x : right, *s3 = moved ? right : 0;
+    }
+    return moved ? cell - 2 : cell - 1;
+}
+
+/* Of points of a surface: where their 4 x 4 control points begin, and the weights of these along a and b */
+typedef struct {
+    ALIGNED R a[4][BLOCK], b[4][BLOCK], da[4][BLOCK], db[4][BLOCK];
+    ALIGNED I at[BLOCK];
+} T(Weights);
+
+INLINE void T(weights_by)(const Part *part, const R *k, const int order, const int slopes, int n, const R *restrict a,
+                          const R *restrict b, T(Weights) *restrict w) {
+    const R columns = (R)part->n, rows = (R)part->m, sa = k[0], sb = k[1];
+    const R first_a = (columns - 1) / 2, first_b = (rows - 1) / 2, ca = k[2], cb = k[3];
+    EACH(i) {
+        const R column = T(spline)(order, slopes, (a[i] - ca) * sa + first_a, columns, w->a[0] + i, w->a[1] + i, w->a[2] + i,
+                                   w->a[3] + i, w->da[0] + i, w->da[1] + i, w->da[2] + i, w->da[3] + i);
+        const R row = T(spline)(order, slopes, (b[i] - cb) * sb + first_b, rows, w->b[0] + i, w->b[1] + i, w->b[2] + i,
+                                w->b[3] + i, w->db[0] + i, w->db[1] + i, w->db[2] + i, w->db[3] + i);
+        w->at[i] = 2 * ((I)row * part->n + (I)column);
+    }
+}
+
+static NOT_INLINE void T(weights)(const Part *part, const R *k, int slopes, int n, const R *a, const R *b, T(Weights) *w) {
+    if (part->flags == 3) {
+        if (slopes) T(weights_by)(part, k, 3, 1, n, a, b, w);
+        else T(weights_by)(part, k, 3, 0, n, a, b, w);
+    } else if (slopes) T(weights_by)(part, k, 2, 1, n, a, b, w);
+    else T(weights_by)(part, k, 2, 0, n, a, b, w);
+}
+
+/* Weighted sums over four rows of four control points, (x, y) in turn */
+INLINE void T(rows_of)(const R *restrict from, int64_t width, R w0, R w1, R w2, R w3, R *restrict sums) {
+    for (int k = 0; k < 8; k++)
+        sums[k] = w0 * from[k] + w1 * from[width + k] + (w2 * from[2 * width + k] + w3 * from[3 * width + k]);
+}
+
+static void T(surface)(const Part *part, const R *k, int n, const R *restrict a, const R *restrict b, R *restrict u,
+                       R *restrict v, T(Jacobian) *restrict to) {
+    T(Weights) w;
+    const int64_t width = 2 * (int64_t)part->n;
+    const R sa = k[0], sb = k[1];
+    T(weights)(part, k, to != NULL, n, a, b, &w);
+    for (int i = 0; i < n; i++) {
+        R sums[8];
+        const R *from = k + 4 + w.at[i], w0 = w.a[0][i], w1 = w.a[1][i], w2 = w.a[2][i], w3 = w.a[3][i];
+        T(rows_of)(from, width, w.b[0][i], w.b[1][i], w.b[2][i], w.b[3][i], sums);
+        u[i] = a[i] + (w0 * sums[0] + w1 * sums[2] + (w2 * sums[4] + w3 * sums[6]));
+        v[i] = b[i] + (w0 * sums[1] + w1 * sums[3] + (w2 * sums[5] + w3 * sums[7]));
+        if (!to) continue;
+        const R s0 = w.da[0][i], s1 = w.da[1][i], s2 = w.da[2][i], s3 = w.da[3][i];
+        to->ua[i] = 1 + sa * (s0 * sums[0] + s1 * sums[2] + (s2 * sums[4] + s3 * sums[6]));
+        to->va[i] = sa * (s0 * sums[1] + s1 * sums[3] + (s2 * sums[5] + s3 * sums[7]));
+        T(rows_of)(from, width, w.db[0][i], w.db[1][i], w.db[2][i], w.db[3][i], sums);
+        to->ub[i] = sb * (w0 * sums[0] + w1 * sums[2] + (w2 * sums[4] + w3 * sums[6]));
+        to->vb[i] = 1 + sb * (w0 * sums[1] + w1 * sums[3] + (w2 * sums[5] + w3 * sums[7]));
+    }
+}
+
+/* Cells and centre are constants: their sums stay 0 */
+static void T(surface_vjp)(const Part *part, const R *k, int n, const R *restrict a, const R *restrict b,
+                           R *restrict gu, R *restrict gv, double *sums) {
+    ALIGNED R u[BLOCK], v[BLOCK];
+    T(Jacobian) to;
+    T(surface)(part, k, n, a, b, u, v, &to);
+    if (sums) {
+        T(Weights) w;
+        T(weights)(part, k, 0, n, a, b, &w);
+        for (int i = 0; i < n; i++)
+            for (int q = 0; q < 4; q++) {
+                double *at = sums + 4 + w.at[i] + 2 * (int64_t)part->n * q;
+                const R x = w.b[q][i] * gu[i], y = w.b[q][i] * gv[i];
+                for (int p = 0; p < 4; p++) at[2 * p] += w.a[p][i] * x, at[2 * p + 1] += w.a[p][i] * y;
+            }
+    }
+    EACH(i) {
+        const R along = gu[i] * to.ua[i] + gv[i] * to.va[i];
+        gv[i] = gu[i] * to.ub[i] + gv[i] * to.vb[i], gu[i] = along;
+    }
+}
+
+/* In cells, positive up to the edge of a surface and a hair behind */
+INLINE R T(surface_edge)(const Part *part, const R *k, R a, R b) {
+    const R across = (R)(part->n - part->flags) / 2 + (R)1e-4 - T(absolute)((a - k[2]) * k[0]);
+    const R down = (R)(part->m - part->flags) / 2 + (R)1e-4 - T(absolute)((b - k[3]) * k[1]);
+    return across < down ? across : across == across ? down : -1;
+}
+
 static void T(stage)(const T(Camera) *c, int stage, int n, const R *a, const R *b, R *u, R *v, T(Jacobian) *to) {
     const Part *part = c->parts + stage;
     const R *k = c->numbers[stage];
@@ -259,7 +370,8 @@ static void T(stage)(const T(Camera) *c, int stage, int n, const R *a, const R *
     else if (part->kind == SHEAR) {
         EACH(i) u[i] = a[i] + k[1] * b[i], v[i] = b[i] + k[0] * a[i];
         if (to) EACH(i) to->ua[i] = to->vb[i] = 1, to->ub[i] = k[1], to->va[i] = k[0];
-    } else T(planar)(c, stage, n, a, b, u, v, to);
+    } else if (part->kind == SURFACE) T(surface)(part, k, n, a, b, u, v, to);
+    else T(planar)(c, stage, n, a, b, u, v, to);
 }
 
 /* Where the stages from `first` on send points, not in place; the Jacobian of all of them; if wanted, `least`: positive
@@ -282,6 +394,8 @@ static void T(lens)(const T(Camera) *c, int first, int n, const R *a, const R *b
             if (c->parts[j].kind == TILT) EACH(i) margin[i] = k[6] * x[i] + k[7] * y[i] + k[8];
             else if (c->parts[j].factor == RATIONAL) {
                 EACH(i) margin[i] = T(horner)(k + c->parts[j].n, c->parts[j].m, x[i] * x[i] + y[i] * y[i], NULL);
+            } else if (c->parts[j].kind == SURFACE && c->ends) {
+                EACH(i) margin[i] = T(surface_edge)(c->parts + j, k, x[i], y[i]);
             } else EACH(i) margin[i] = INFINITY;
             EACH(i) {
                 /* a turn by half a circle has a positive determinant too: the trace tells it */
@@ -318,7 +432,8 @@ static void T(lens_vjp)(const T(Camera) *c, int n, const R *restrict a, const R 
                 const R w = gu[i] + k[0] * gv[i];
                 gv[i] += k[1] * gu[i], gu[i] = w;
             }
-        } else T(planar_vjp)(c, j, n, x[j - 1], y[j - 1], gu, gv, part);
+        } else if (c->parts[j].kind == SURFACE) T(surface_vjp)(c->parts + j, k, n, x[j - 1], y[j - 1], gu, gv, part);
+        else T(planar_vjp)(c, j, n, x[j - 1], y[j - 1], gu, gv, part);
     }
 }
 

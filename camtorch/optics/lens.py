@@ -56,6 +56,8 @@ class Stage:
     """What of a first stage is tabulated, to start the inverse from."""
     is_radial = False
     """Whether that is the whole stage."""
+    is_affine = False
+    """Whether lines stay lines, and parallels parallel: then its inverse is never left open."""
 
     def __call__(self, a: Tensor, b: Tensor) -> Planes2:
         """Where points are sent."""

@@ -129,8 +129,8 @@ class SurfaceAt(StageAt):
             weights = y * y * y, (3 * x - 6) * xx + 4, ((3 - 3 * x) * x + 3) * x + 1, xx * x
             slopes = -y * y / 2, (3 * x - 4) * x / 2, (1 + (2 - 3 * x) * x) / 2, xx / 2
             return cell.long() - 1, torch.stack(weights, -1) / 6, torch.stack(slopes, -1)
-        weights = (4 * x - 4) * x + 1, 6 - 8 * x * x, (4 * x + 4) * x + 1
-        return cell.long() - 1, torch.stack(weights, -1) / 8, torch.stack((x - 0.5, -2 * x, x + 0.5), -1)
+        few = (4 * x - 4) * x + 1, 6 - 8 * x * x, (4 * x + 4) * x + 1
+        return cell.long() - 1, torch.stack(few, -1) / 8, torch.stack((x - 0.5, -2 * x, x + 0.5), -1)
 
     @cached_property
     def _patch(self) -> tuple[Tensor, ...]:
