@@ -40,6 +40,7 @@ each_kind = pytest.mark.parametrize("key", sorted(DISTINCT))
 
 # Coefficients drawn, plausible and wild, by the first letters of their names: up to that size, or between two numbers
 RANGES = {
+    "splined": {"x": (0.01, 0.1), "y": (0.01, 0.1)},
     "fov": {"omega": ((0.2, 1.2), (-3.0, 3.0))},
     "division": {"lambda": ((-0.4, 0.2), (-3.0, 3.0))},
     "equisolid": {"k": (0.05, 0.5)},

@@ -252,86 +252,106 @@ static void T(tilt_vjp)(const R *k, int n, const R *restrict a, const R *restric
     EACH(i) gu[i] = ga[i], gv[i] = gb[i];
 }
 
-/* The first of the four control points along an axis that have a part in a surface there, and their weights; if wanted,
-   by how much these change from control point to control point. Of order 2 one of them is 0 */
-INLINE R T(spline)(const int order, const int slopes, R position, R size, R *w0, R *w1, R *w2, R *w3, R *s0, R *s1,
-                   R *s2, R *s3) {
-    const R most = size - (R)order;
-    R cell = (R)(IS_DOUBLE ? floor(order == 3 ? position : position + 0.5)
-                           : floorf((float)(order == 3 ? position : position + (R)0.5)));
-    cell = cell > 1 ? cell : 1, cell = cell < most ? cell : most;
-    const R x = position - cell, y = 1 - x, sixth = (R)(1 / 6.0);
-    if (order == 3) {
-        *w0 = y * y * y * sixth, *w1 = ((3 * x - 6) * x * x + 4) * sixth, *w2 = (((3 - 3 * x) * x + 3) * x + 1) * sixth;
-        *w3 = x * x * x * sixth;
-        if (slopes) {
-            *s0 = -y * y / 2, *s1 = (3 * x - 4) * x / 2, *s2 = (1 + (2 - 3 * x) * x) / 2, *s3 = x * x / 2;
-        }
-        return cell - 1;
-    }
-    const R first = ((4 * x - 4) * x + 1) / 8, middle = (3 - 4 * x * x) / 4, last = ((4 * x + 4) * x + 1) / 8;
-    const int moved = cell > size - 3; /* or the fourth would be none of them */
-    *w0 = moved ? 0 : first, *w1 = moved ? first : middle, *w2 = moved ? middle : last, *w3 = moved ? last : 0;
-    if (slopes) {
-        const R left = x - (R)0.5, right = x + (R)0.5;
-        *s0 = moved ? 0 : left, *s1 = moved ? left : -2 * x, *s2 = moved ? -2 * x : right, *s3 = moved ? right : 0;
-    }
-    return moved ? cell - 2 : cell - 1;
-}
+/* Weights of four control points in a row, each twice, as polynomials of the place in a cell; and by how much they change
+   from control point to control point. Of order 2 the fourth, or at the end of a row the first, has no part */
+#define TWICE(a, b, c, d) {a, a, b, b, c, c, d, d}
+static const R T(cubic)[4][8] = {TWICE((R)(1 / 6.0), (R)(4 / 6.0), (R)(1 / 6.0), 0), TWICE((R)-0.5, 0, (R)0.5, 0),
+                                 TWICE((R)0.5, -1, (R)0.5, 0), TWICE((R)(-1 / 6.0), (R)0.5, (R)-0.5, (R)(1 / 6.0))};
+static const R T(quadratic)[2][4][8] = {
+    {TWICE((R)0.125, (R)0.75, (R)0.125, 0), TWICE((R)-0.5, 0, (R)0.5, 0), TWICE((R)0.5, -1, (R)0.5, 0), {0}},
+    {TWICE(0, (R)0.125, (R)0.75, (R)0.125), TWICE(0, (R)-0.5, 0, (R)0.5), TWICE(0, (R)0.5, -1, (R)0.5), {0}}};
 
-/* Of points of a surface: where their 4 x 4 control points begin, and the weights of these along a and b */
+/* Points in their cells: where their 4 x 4 control points begin, how far into the cell they are, and its polynomials */
 typedef struct {
-    ALIGNED R a[4][BLOCK], b[4][BLOCK], da[4][BLOCK], db[4][BLOCK];
-    ALIGNED I at[BLOCK];
-} T(Weights);
+    ALIGNED R x[BLOCK], y[BLOCK];
+    ALIGNED int32_t at[BLOCK], last_x[BLOCK], last_y[BLOCK];
+} T(Cells);
 
-INLINE void T(weights_by)(const Part *part, const R *k, const int order, const int slopes, int n, const R *restrict a,
-                          const R *restrict b, T(Weights) *restrict w) {
-    const R columns = (R)part->n, rows = (R)part->m, sa = k[0], sb = k[1];
-    const R first_a = (columns - 1) / 2, first_b = (rows - 1) / 2, ca = k[2], cb = k[3];
+static void T(cells)(const Part *part, const R *k, int n, const R *restrict a, const R *restrict b, T(Cells) *restrict to) {
+    const int order = part->flags;
+    const R columns = (R)part->n, rows = (R)part->m, sa = k[0], sb = k[1], ca = k[2], cb = k[3], half = order == 3 ? 0 : (R)0.5;
+    const R first_a = (columns - 1) / 2, first_b = (rows - 1) / 2, most_a = columns - (R)order, most_b = rows - (R)order;
+    const int32_t width = part->n, shift = order == 3 ? 0 : 2, last_a = width - shift, last_b = part->m - shift;
     EACH(i) {
-        const R column = T(spline)(order, slopes, (a[i] - ca) * sa + first_a, columns, w->a[0] + i, w->a[1] + i, w->a[2] + i,
-                                   w->a[3] + i, w->da[0] + i, w->da[1] + i, w->da[2] + i, w->da[3] + i);
-        const R row = T(spline)(order, slopes, (b[i] - cb) * sb + first_b, rows, w->b[0] + i, w->b[1] + i, w->b[2] + i,
-                                w->b[3] + i, w->db[0] + i, w->db[1] + i, w->db[2] + i, w->db[3] + i);
-        w->at[i] = 2 * ((I)row * part->n + (I)column);
+        const R p = (a[i] - ca) * sa + first_a, q = (b[i] - cb) * sb + first_b;
+        R column = IS_DOUBLE ? (R)floor(p + half) : (R)floorf((float)(p + half));
+        R row = IS_DOUBLE ? (R)floor(q + half) : (R)floorf((float)(q + half));
+        column = column > 1 ? column : 1, column = column < most_a ? column : most_a;
+        row = row > 1 ? row : 1, row = row < most_b ? row : most_b;
+        to->x[i] = p - column, to->y[i] = q - row;
+        const int32_t at_x = (int32_t)column, at_y = (int32_t)row;
+        to->last_x[i] = at_x >= last_a, to->last_y[i] = at_y >= last_b;
+        to->at[i] = 2 * ((at_y - 1 - to->last_y[i]) * width + at_x - 1 - to->last_x[i]);
     }
 }
 
-static NOT_INLINE void T(weights)(const Part *part, const R *k, int slopes, int n, const R *a, const R *b, T(Weights) *w) {
-    if (part->flags == 3) {
-        if (slopes) T(weights_by)(part, k, 3, 1, n, a, b, w);
-        else T(weights_by)(part, k, 3, 0, n, a, b, w);
-    } else if (slopes) T(weights_by)(part, k, 2, 1, n, a, b, w);
-    else T(weights_by)(part, k, 2, 0, n, a, b, w);
+/* One of eight weights */
+INLINE R T(weight)(const R (*c)[8], int j, R x) { return c[0][j] + x * (c[1][j] + x * (c[2][j] + x * c[3][j])); }
+
+/* Two control points, or two weights twice: a vector, where the compiler has such */
+#if defined(__GNUC__)
+typedef R T(Pair) __attribute__((vector_size(4 * sizeof(R))));
+
+INLINE T(Pair) T(pair)(const R *from) {
+    T(Pair) to;
+    memcpy(&to, from, sizeof to);
+    return to;
 }
 
-/* Weighted sums over four rows of four control points, (x, y) in turn */
-INLINE void T(rows_of)(const R *restrict from, int64_t width, R w0, R w1, R w2, R w3, R *restrict sums) {
-    for (int k = 0; k < 8; k++)
-        sums[k] = w0 * from[k] + w1 * from[width + k] + (w2 * from[2 * width + k] + w3 * from[3 * width + k]);
+INLINE T(Pair) T(weights)(const R (*c)[8], int half, R x) {
+    return T(pair)(c[0] + half) + x * (T(pair)(c[1] + half) + x * (T(pair)(c[2] + half) + x * T(pair)(c[3] + half)));
 }
+
+INLINE T(Pair) T(slopes)(const R (*c)[8], int half, R x) {
+    return T(pair)(c[1] + half) + x * (2 * T(pair)(c[2] + half) + x * (3 * T(pair)(c[3] + half)));
+}
+
+/* Of two columns, the sum over four rows by their weights */
+INLINE T(Pair) T(rows_of)(const R *from, int64_t width, T(Pair) low, T(Pair) high) {
+    return low[0] * T(pair)(from) + low[2] * T(pair)(from + width) + (high[0] * T(pair)(from + 2 * width) + high[2] * T(pair)(from + 3 * width));
+}
+
+#else
+INLINE R T(slope)(const R (*c)[8], int j, R x) { return c[1][j] + x * (2 * c[2][j] + x * 3 * c[3][j]); }
+#endif
 
 static void T(surface)(const Part *part, const R *k, int n, const R *restrict a, const R *restrict b, R *restrict u,
                        R *restrict v, T(Jacobian) *restrict to) {
-    T(Weights) w;
+    T(Cells) c;
     const int64_t width = 2 * (int64_t)part->n;
-    const R sa = k[0], sb = k[1];
-    T(weights)(part, k, to != NULL, n, a, b, &w);
+    const R sa = k[0], sb = k[1], (*first)[8] = part->flags == 3 ? T(cubic) : T(quadratic)[0];
+    T(cells)(part, k, n, a, b, &c);
     for (int i = 0; i < n; i++) {
-        R sums[8];
-        const R *from = k + 4 + w.at[i], w0 = w.a[0][i], w1 = w.a[1][i], w2 = w.a[2][i], w3 = w.a[3][i];
-        T(rows_of)(from, width, w.b[0][i], w.b[1][i], w.b[2][i], w.b[3][i], sums);
-        u[i] = a[i] + (w0 * sums[0] + w1 * sums[2] + (w2 * sums[4] + w3 * sums[6]));
-        v[i] = b[i] + (w0 * sums[1] + w1 * sums[3] + (w2 * sums[5] + w3 * sums[7]));
-        if (!to) continue;
-        const R s0 = w.da[0][i], s1 = w.da[1][i], s2 = w.da[2][i], s3 = w.da[3][i];
-        to->ua[i] = 1 + sa * (s0 * sums[0] + s1 * sums[2] + (s2 * sums[4] + s3 * sums[6]));
-        to->va[i] = sa * (s0 * sums[1] + s1 * sums[3] + (s2 * sums[5] + s3 * sums[7]));
-        T(rows_of)(from, width, w.db[0][i], w.db[1][i], w.db[2][i], w.db[3][i], sums);
-        to->ub[i] = sb * (w0 * sums[0] + w1 * sums[2] + (w2 * sums[4] + w3 * sums[6]));
-        to->vb[i] = 1 + sb * (w0 * sums[1] + w1 * sums[3] + (w2 * sums[5] + w3 * sums[7]));
+        const R *from = k + 4 + c.at[i], (*by_x)[8] = first + 4 * c.last_x[i], (*by_y)[8] = first + 4 * c.last_y[i];
+#if defined(__GNUC__)
+        const T(Pair) x0 = T(weights)(by_x, 0, c.x[i]), x1 = T(weights)(by_x, 4, c.x[i]);
+        const T(Pair) y0 = T(weights)(by_y, 0, c.y[i]), y1 = T(weights)(by_y, 4, c.y[i]);
+        const T(Pair) s0 = T(rows_of)(from, width, y0, y1), s1 = T(rows_of)(from + 4, width, y0, y1);
+        const T(Pair) sum = s0 * x0 + s1 * x1;
+        u[i] = sum[0] + sum[2], v[i] = sum[1] + sum[3];
+        if (to) {
+            const T(Pair) across = s0 * T(slopes)(by_x, 0, c.x[i]) + s1 * T(slopes)(by_x, 4, c.x[i]);
+            const T(Pair) d0 = T(slopes)(by_y, 0, c.y[i]), d1 = T(slopes)(by_y, 4, c.y[i]);
+            const T(Pair) down = T(rows_of)(from, width, d0, d1) * x0 + T(rows_of)(from + 4, width, d0, d1) * x1;
+            to->ua[i] = across[0] + across[2], to->va[i] = across[1] + across[3];
+            to->ub[i] = down[0] + down[2], to->vb[i] = down[1] + down[3];
+        }
+#else
+        u[i] = v[i] = 0;
+        if (to) to->ua[i] = to->ub[i] = to->va[i] = to->vb[i] = 0;
+        for (int q = 0; q < 8; q += 2)
+            for (int p = 0; p < 8; p += 2) {
+                const R *at = from + q / 2 * width + p, w = T(weight)(by_x, p, c.x[i]), down = T(weight)(by_y, q, c.y[i]);
+                u[i] += w * down * at[0], v[i] += w * down * at[1];
+                if (!to) continue;
+                const R across = T(slope)(by_x, p, c.x[i]) * down, along = T(slope)(by_y, q, c.y[i]) * w;
+                to->ua[i] += across * at[0], to->va[i] += across * at[1];
+                to->ub[i] += along * at[0], to->vb[i] += along * at[1];
+            }
+#endif
     }
+    EACH(i) u[i] += a[i], v[i] += b[i];
+    if (to) EACH(i) to->ua[i] = to->ua[i] * sa + 1, to->va[i] *= sa, to->ub[i] *= sb, to->vb[i] = to->vb[i] * sb + 1;
 }
 
 /* Cells and centre are constants: their sums stay 0 */
@@ -341,14 +361,16 @@ static void T(surface_vjp)(const Part *part, const R *k, int n, const R *restric
     T(Jacobian) to;
     T(surface)(part, k, n, a, b, u, v, &to);
     if (sums) {
-        T(Weights) w;
-        T(weights)(part, k, 0, n, a, b, &w);
-        for (int i = 0; i < n; i++)
-            for (int q = 0; q < 4; q++) {
-                double *at = sums + 4 + w.at[i] + 2 * (int64_t)part->n * q;
-                const R x = w.b[q][i] * gu[i], y = w.b[q][i] * gv[i];
-                for (int p = 0; p < 4; p++) at[2 * p] += w.a[p][i] * x, at[2 * p + 1] += w.a[p][i] * y;
-            }
+        T(Cells) c;
+        const R(*first)[8] = part->flags == 3 ? T(cubic) : T(quadratic)[0];
+        T(cells)(part, k, n, a, b, &c);
+        for (int i = 0; i < n; i++) {
+            const R(*by_x)[8] = first + 4 * c.last_x[i], (*by_y)[8] = first + 4 * c.last_y[i];
+            for (int q = 0; q < 4; q++)
+                for (int j = 0; j < 8; j++)
+                    sums[4 + c.at[i] + 2 * (int64_t)part->n * q + j] +=
+                        T(weight)(by_y, 2 * q, c.y[i]) * T(weight)(by_x, j, c.x[i]) * (j % 2 ? gv[i] : gu[i]);
+        }
     }
     EACH(i) {
         const R along = gu[i] * to.ua[i] + gv[i] * to.va[i];
