@@ -99,8 +99,10 @@ def _fit_linear(
     weights = (observations.weights * seen.covered)[:, None]
     slope = (by_k[:, :, free[4:]] * (parameters[:, :2, None] * weights)[:, :, None]).movedim(2, -1).flatten(1, 2)
     slight = _SMOOTH * parameters[:, :2].mean(-1)[:, None, None] * smooth
-    missing = torch.cat((-_residuals(observations._replace(weights=weights[:, 0]), parameters, seen).flatten(1), -(slight @ parameters[:, 4:, None])[..., 0]), -1)
-    found = torch.linalg.lstsq(torch.cat((slope, slight[..., free[4:]]), 1), missing[..., None]).solution[..., 0]
+    errors = _residuals(observations._replace(weights=weights[:, 0]), parameters, seen).flatten(1)
+    missing = -torch.cat((errors, (slight @ parameters[:, 4:, None])[..., 0]), -1)
+    rows = torch.cat((slope, slight[..., free[4:]]), 1)
+    found = torch.linalg.lstsq(rows, missing[..., None]).solution[..., 0]
     parameters[:, 4:][:, free[4:]] += found
     return parameters
 

@@ -92,7 +92,9 @@ class Splined(Camera):
     def variant(cls, text: str) -> type[Splined]:
         found = _VARIANT.fullmatch(f"Splined:{text}")
         if found is None:
-            raise ValueError(f"'splined:order=3,columns=16,rows=11,fov_x=120' is how a grid is written; got {text!r:.60}")
+            raise ValueError(
+                f"'splined:order=3,columns=16,rows=11,fov_x=120' is how a grid is written; got {text!r:.60}"
+            )
         order, columns, rows, fov_x = map(int, found.groups())
         return cls.with_grid(order=order, columns=columns, rows=rows, fov_x=fov_x)
 
@@ -131,14 +133,14 @@ def _of_grid(order: int, columns: int, rows: int, fov_x: int) -> dict[str, Any]:
     def mirror(turn: str, place: Any) -> Mapping[str, str]:
         signs = {axis: "-" if axis == turn else "" for axis in "xy"}
         pairs = [(i, j) for j in range(rows) for i in range(columns)]
-        return {f"{w}{i}_{j}": f"{signs[w]}{w}{'%d_%d' % place(i, j)}" for i, j in pairs for w in "xy"}
+        return {f"{w}{i}_{j}": f"{signs[w]}{w}{place(i, j)}" for i, j in pairs for w in "xy"}
 
     return {
         "optics": staticmethod(optics),
         "default_count": 2 * columns * rows,
         "distortion_names": tuple(f"{w}{i}_{j}" for j in range(rows) for i in range(columns) for w in "xy"),
-        "mirror_x": mirror("x", lambda i, j: (columns - 1 - i, j)),
-        "mirror_y": mirror("y", lambda i, j: (i, rows - 1 - j)),
+        "mirror_x": mirror("x", lambda i, j: f"{columns - 1 - i}_{j}"),
+        "mirror_y": mirror("y", lambda i, j: f"{i}_{rows - 1 - j}"),
     }
 
 
