@@ -28,6 +28,7 @@ from camtorch.rotations import small_turn
 LOSSES = ("huber", "cauchy")
 _SETTLED = 1e-10  # of the variance: the squared distance to the optimum, in standard deviations, that ends a search
 _NOTHING = 1e-11  # px
+_SMOOTH = 0.02  # of a pixel of error: one of a surface's second differences, see `Camera.smoothness`
 _LOST = 1e3  # px, that a point counts as which was seen and has no pixel
 
 
@@ -230,6 +231,7 @@ class Bundle:
     are_shared: list[bool]
     fixed: list[Camera | None]
     learns_bend: bool
+    added: list[Tensor | None]
     columns: tuple[tuple[int, int], ...]
     unknowns: int
     low: Tensor
@@ -256,6 +258,11 @@ class Bundle:
             for camera, p, shared in zip(self.cameras, state.parameters, self.are_shared, strict=True)
         ]
         self.learns_bend = free.bend
+        self.added = [
+            None if rows is None else torch.nn.functional.pad(_SMOOTH * float(p[0, :2].mean()) * rows.to(p), (4, 0))
+            for rows, p in zip((camera.smoothness() for camera in self.cameras), state.parameters, strict=True)
+        ]
+        """Of each camera rows (R, 4 + n) whose products with its parameters are residuals more, or None."""
         self.columns = tuple(
             [(c, int(i)) for c, f in enumerate(free.parameters) for i in f.nonzero()[:, 0]]
             + [(c, len(free.parameters[c]) + i) for c, learns in enumerate(free.mounts) if learns for i in range(6)]
@@ -342,6 +349,9 @@ class Bundle:
     def cost(self, flat: Sequence[Tensor], rows: Tensor) -> Tensor:
         """(R,)."""
         total = torch.stack([look.cost.sum((-1, -2)) for look in self.looks(flat, rows)]).sum(0)
+        for added, parameters in zip(self.added, flat[5:], strict=True):
+            if added is not None:
+                total = total + (parameters @ added.mT).square().sum(-1)
         return torch.where(torch.isfinite(total), total, torch.inf)
 
     # -- the linear problem
@@ -379,6 +389,13 @@ class Bundle:
             return Equations(triangle_of_few(block), block.new_zeros(len(block), 1, 1), ())
         triangle = torch.linalg.qr(padded(block), mode="r").R
         left = triangle[..., width:, width:].flatten(1, 2)
+        for c, added in enumerate(self.added):
+            if added is not None:
+                mine = [(g, i) for g, (camera, i) in enumerate(self.columns) if camera == c and i < added.shape[-1]]
+                more = left.new_zeros(len(left), len(added), total + 1)
+                more[..., [g for g, _ in mine]] = added[:, [i for _, i in mine]]
+                more[..., total] = state.parameters[c] @ added.mT
+                left = torch.cat((left, more), 1)
         shared = torch.linalg.qr(padded(left), mode="r").R
         return Equations(triangle[..., :width, :], shared, self.columns)
 

@@ -73,6 +73,8 @@ def as_model(
     if start is not None:
         if not isinstance(start, Camera):
             raise TypeError(f"{owner}: start must be a camera; got {type(start).__name__}")
+        if model.smoothness() is not None and not start.batch_shape and type_before_parametrizations(start) is not model:
+            start = start.convert(model).camera
         if type_before_parametrizations(start) is not model or start.batch_shape.numel() != 1:
             raise ValueError(
                 f"{owner}: start must be one {model.__name__}, as start.convert({model.__name__}).camera is; got "
@@ -82,7 +84,7 @@ def as_model(
             raise ValueError(f"{owner}: count={count}, and the start has {start.distortion.shape[-1]} coefficients")
         count = start.distortion.shape[-1]
     count = model.default_count if count is None else as_whole(count, "count", owner)
-    names = model.names_of(count) if 0 <= count <= _MANY else None
+    names = model.names_of(count) if 0 <= count <= max(_MANY, model.default_count) else None
     if names is None:
         limit = f", here {_MANY} at most" if count > _MANY else ""
         raise ValueError(f"{owner}: {model.__name__} takes {model.counts_text()}{limit}; got count={count}")
@@ -90,6 +92,8 @@ def as_model(
     if not isinstance(fixed, Collection) or isinstance(fixed, Mapping):
         raise TypeError(f'{owner}: fixed must be names of parameters, as ("cx", "cy"), or "all"; got {fixed!r}')
     fixed = (names if fixed == "all" else (fixed,)) if isinstance(fixed, str) else tuple(fixed)
+    if start is not None and model.smoothness() is not None:
+        fixed = (*fixed, *INTRINSICS)
     unknown = [name for name in fixed if not isinstance(name, str) or name not in names]
     if unknown:
         raise ValueError(
@@ -322,6 +326,11 @@ class Search:
         def optimum(state: State) -> Adjusted:
             return self.adjusted([self.sight], state, self.free(bend), steps=STEPS, progress=progress)
 
+        if asked.start is None and asked.kind.smoothness() is not None:
+            raise ValueError(
+                f"{self.owner}: {asked.kind.__name__} learns a surface over another lens; give start=a camera of any "
+                'model, such as calibrate("kannala_brandt", ...).camera'
+            )
         if asked.start is None:
             fixed = [name for name, free in zip(asked.names, asked.free.tolist(), strict=True) if not free]
             first = start_from_nothing(seen, asked.kind, asked.count, size, fixed, self.loss, self.loss_scale)
