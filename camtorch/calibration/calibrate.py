@@ -33,6 +33,7 @@ STEPS = 300
 _MANY = 100  # coefficients
 _OUTLIER = 3.0  # standard deviations
 _ROUNDS = 20
+_SMOOTH = 0.02  # of a pixel of error: one of a surface's second differences, see `Camera.smoothness`
 _SAME_WIDTH, _CONTRADICTED = 0.01, 3.0  # of a prior: a change that is none, and times its own that it has to be told
 _SECOND_LOOKS = 3  # at the poses
 _AS_GOOD = 9.0  # variances: the difference of two costs that three standard deviations explain
@@ -77,6 +78,12 @@ def as_model(
     if start is not None:
         if not isinstance(start, Camera):
             raise TypeError(f"{owner}: start must be a camera; got {type(start).__name__}")
+        if (
+            model.smoothness() is not None
+            and not start.batch_shape
+            and type_before_parametrizations(start) is not model
+        ):
+            start = start.convert(model).camera
         if type_before_parametrizations(start) is not model or start.batch_shape.numel() != 1:
             raise ValueError(
                 f"{owner}: start must be one {model.__name__}, as start.convert({model.__name__}).camera is; got "
@@ -86,7 +93,7 @@ def as_model(
             raise ValueError(f"{owner}: count={count}, and the start has {start.distortion.shape[-1]} coefficients")
         count = start.distortion.shape[-1]
     count = model.default_count if count is None else as_whole(count, "count", owner)
-    names = model.names_of(count) if 0 <= count <= _MANY else None
+    names = model.names_of(count) if 0 <= count <= max(_MANY, model.default_count) else None
     if names is None:
         limit = f", here {_MANY} at most" if count > _MANY else ""
         raise ValueError(f"{owner}: {model.__name__} takes {model.counts_text()}{limit}; got count={count}")
@@ -94,6 +101,8 @@ def as_model(
     if not isinstance(fixed, Collection) or isinstance(fixed, Mapping):
         raise TypeError(f'{owner}: fixed must be names of parameters, as ("cx", "cy"), or "all"; got {fixed!r}')
     fixed = (names if fixed == "all" else (fixed,)) if isinstance(fixed, str) else tuple(fixed)
+    if start is not None and model.smoothness() is not None:
+        fixed = (*fixed, *INTRINSICS)
     unknown = [name for name in fixed if not isinstance(name, str) or name not in names]
     if unknown:
         raise ValueError(
@@ -282,6 +291,8 @@ def calibrate(
         adjusted = search.alone(bend, told)
     else:
         asked = as_model(model, count, start, (), owner)
+        if asked.kind.smoothness() is not None:
+            raise ValueError(f"{owner}: {asked.kind.__name__} takes no prior; start=camera is what it begins with")
         known = as_known(prior, asked.kind, asked.count, layout.image_size, owner, seen.pixels)
         asked = as_model(asked.kind, None, asked.start or known.camera, fixed, owner)
         search = Search(owner, asked, seen, middle_of([seen]), layout, loss, loss_scale)
@@ -321,6 +332,13 @@ class Search:
     misfit: float = 1.0
     """See `misfit`, beside a prior."""
 
+    def __post_init__(self) -> None:
+        smooth = self.asked.kind.smoothness()
+        if smooth is not None and self.asked.start is not None:  # where nothing is seen a surface goes on as it came
+            focal = float(self.asked.start.intrinsics.detach()[..., :2].mean())
+            root = torch.nn.functional.pad(_SMOOTH * focal * smooth.to(self.given.pixels), (4, 0))
+            self.prior = Prior(root.new_zeros(root.shape[-1]), root)
+
     @cached_property
     def seen(self) -> Observations:
         """What was given, with the boards about their middle."""
@@ -344,6 +362,11 @@ class Search:
         def optimum(state: State) -> Adjusted:
             return self.adjusted([self.sight], state, self.free(bend), steps=STEPS, progress=progress)
 
+        if asked.start is None and asked.kind.smoothness() is not None:
+            raise ValueError(
+                f"{self.owner}: {asked.kind.__name__} learns a surface over another lens; give start=a camera of any "
+                'model, such as calibrate("kannala_brandt", ...).camera'
+            )
         if asked.start is None:
             fixed = [name for name, free in zip(asked.names, asked.free.tolist(), strict=True) if not free]
             first = start_from_nothing(seen, asked.kind, asked.count, size, fixed, self.loss, self.loss_scale)
