@@ -48,6 +48,10 @@ static int T(moved)(const Move *move, const T(Between) *b, int count, int n, R *
         return left;
     }
     EACH(i) u[i] = ok[i] ? u[i] : -1, v[i] = ok[i] ? v[i] : -1;
+    if (move->form == ON_IMAGE) {
+        const R low = (R)-0.5, right = (R)(move->width - 0.5), below = (R)(move->height - 0.5);
+        EACH(i) ok[i] &= (u[i] >= low) & (u[i] <= right) & (v[i] >= low) & (v[i] <= below);
+    }
     return left;
 }
 
@@ -86,7 +90,7 @@ static int64_t T(moves)(const Move *move) {
 /* All pixels of some cells, `number` of the first one; where what is mapped ends in one, those around it are next */
 static int T(squares)(const Lattices *given, const T(Between) *b, int32_t *cells, const int64_t *places, int count,
                       int64_t number) {
-    const int64_t rows = given->cells->rows, columns = given->cells->columns;
+    const int64_t rows = given->cells.rows, columns = given->cells.columns;
     const int n = count * SQUARE;
     ALIGNED R u[BLOCK], v[BLOCK];
     ALIGNED I ok[BLOCK];
@@ -115,7 +119,7 @@ static int T(squares)(const Lattices *given, const T(Between) *b, int32_t *cells
 
 static int T(lattice)(const Lattices *given, int64_t camera, T(Between) *b) {
     const Move *move = &given->move;
-    Classification asked = *given->cells;
+    Classification asked = given->cells;
     const int64_t cells = asked.rows * asked.columns, nodes = (asked.rows + 5) * (asked.columns + 5);
     const R *at = (const R *)move->results + camera * move->result_strides[0];
     int left = 0;

@@ -5,9 +5,9 @@ from __future__ import annotations
 import ctypes
 import functools
 import math
+import struct
 from collections.abc import Sequence
-from ctypes import addressof, byref, c_double, c_float, c_int32, c_int64, c_void_p
-from typing import NamedTuple
+from ctypes import addressof, byref, c_float, c_int32, c_int64, c_void_p
 
 import torch
 from torch import Tensor
@@ -20,10 +20,14 @@ EMPTY, CUBIC, TODO = -2, -1, 0
 """Cells of a lattice: one that shows nothing, one between whose nodes lie cubics, one that wants exact positions."""
 
 _MODES = {"nearest": 0, "bilinear": 1, "bicubic": 2}
-_PADDINGS = {"zeros": 0, "border": 1, "reflection": 2}
+PADDINGS = {"zeros": 0, "border": 1, "reflection": 2}
 _TYPES = {torch.uint8: 0, torch.bool: 1, torch.uint16: 2, torch.float32: 3}
 _BYTES = {1: 4, 2: 5, 4: 6, 8: 7}
 _TILE = 1 << 15  # pixels of a tile, some 0.1 ms a channel
+CLASSIFICATION = "12q3di2q"
+"""`Classification` of sampler.h."""
+_Classification = struct.Struct(CLASSIFICATION).pack
+SCRATCH = 25  # numbers of float32 for each column of a lattice and eight more
 _WORTH = 8  # pixels that may be copied for one that is made: interpolated one by one they would take longer
 
 
@@ -61,33 +65,6 @@ class _Job(ctypes.Structure):
         ("padding", c_int32),
         ("tile_rows", c_int32),
         ("next", c_int64),
-    )
-
-
-class _Classification(ctypes.Structure):
-    """`Classification` of sampler.h."""
-
-    memory: Tensor
-    """That of its scratch."""
-
-    _fields_ = (
-        ("nodes", c_void_p),
-        ("node_strides", c_int64 * 2),
-        ("mapped", c_void_p),
-        ("mapped_stride", c_int64),
-        ("rim", c_void_p),
-        ("rim_stride", c_int64),
-        ("count", c_int64),
-        ("rows", c_int64),
-        ("columns", c_int64),
-        ("height", c_int64),
-        ("width", c_int64),
-        ("source_height", c_double),
-        ("source_width", c_double),
-        ("tolerance", c_double),
-        ("padding", c_int32),
-        ("cells", c_void_p),
-        ("scratch", c_void_p),
     )
 
 
@@ -166,7 +143,7 @@ def sample(
         if exact.shape[1]:
             job.exact, job.exact_stride = exact.data_ptr(), exact.stride(0)
     job.type = _BYTES[images.dtype.itemsize] if mode == "nearest" else _TYPES[images.dtype]
-    job.mode, job.padding = _MODES[mode], _PADDINGS[padding]
+    job.mode, job.padding = _MODES[mode], PADDINGS[padding]
     job.tile_rows = max(_TILE // width // 8, 1) * 8
     tiles = -(-height // job.tile_rows) * count
     pointer = byref(job)
@@ -207,60 +184,36 @@ def _empty(shape: tuple[int, ...], dtype: torch.dtype, layout: torch.memory_form
     return torch.empty(shape, dtype=dtype, device="cpu", memory_format=layout)
 
 
-class Probed(NamedTuple):
-    """What is known of a lattice by its nodes and by the rim of the target, and what is asked of its cells."""
+def classify(
+    nodes: Tensor,
+    mapped: Tensor,
+    rim: Tensor,
+    size: tuple[int, int],
+    source: tuple[int, int],
+    tolerance: float,
+    padding: str,
+) -> tuple[Tensor, int]:
+    """Which cells of a lattice are `EMPTY`, `CUBIC` or `TODO`. There is a library.
 
-    nodes: Tensor
-    """(B, 2, n + 5, m + 5), positions; the last two dims without gaps."""
-    mapped: Tensor
-    """(B, n + 5, m + 5) bool, likewise."""
-    rim: Tensor
-    """(B, 2 (w + h)) bool, contiguous: which pixels of the target's rim are mapped: those of the top row, the bottom
-    row, the left column, the right column."""
-    size: tuple[int, int]
-    """(h, w) of the target."""
-    source: tuple[int, int]
-    """(height, width) of the source."""
-    tolerance: float
-    """In pixels of the source."""
-    padding: str
-    """"zeros", "border" or "reflection", of what is to be sampled."""
-
-
-def classify(probed: Probed) -> tuple[Tensor, int]:
-    """Which cells of a lattice are `EMPTY`, `CUBIC` or `TODO`. Nodes are of float32. There is a library.
+    Args:
+        nodes: (B, 2, n + 5, m + 5) of float32, positions; the last two dims without gaps.
+        mapped: (B, n + 5, m + 5) bool, likewise.
+        rim: (B, 2 (w + h)) bool, contiguous: which pixels of the target's rim are mapped: those of the top row, the
+            bottom row, the left column, the right column.
+        size: (h, w) of the target.
+        source: (height, width) of the source.
+        tolerance: in pixels of the source.
+        padding: "zeros", "border" or "reflection", of what is to be sampled.
 
     Returns:
         (B, n, m) int32, contiguous; and how many cells are `TODO` in the image with the most of them.
     """
     native = library()
     assert native is not None  # who calls has looked
-    cells, asked = classification(probed)
-    return cells, native.camtorch_classify(byref(asked))
-
-
-def classification(probed: Probed) -> tuple[Tensor, _Classification]:
-    """The cells (B, n, m) int32, and what the compiled code is asked of them."""
-    nodes, mapped, rim = probed[:3]
     count, rows, columns = nodes.shape[0], nodes.shape[2] - 5, nodes.shape[3] - 5
     cells = torch.empty(count, rows, columns, dtype=torch.int32, device="cpu")
-    scratch = torch.empty(count, 25 * (columns + 8), dtype=torch.float32, device="cpu")
-    asked = _Classification(
-        nodes.data_ptr(),
-        nodes.stride()[:2],
-        mapped.data_ptr(),
-        mapped.stride(0),
-        rim.data_ptr(),
-        rim.stride(0),
-        count,
-        rows,
-        columns,
-        *probed.size,
-        *map(float, probed.source),
-        probed.tolerance,
-        _PADDINGS[probed.padding],
-        cells.data_ptr(),
-        scratch.data_ptr(),
-    )
-    asked.memory = scratch
-    return cells, asked
+    scratch = torch.empty(SCRATCH * (columns + 8), dtype=torch.float32, device="cpu")
+    given = (nodes, *nodes.stride()[:2]), (mapped, mapped.stride(0)), (rim, rim.stride(0))
+    places = [part if isinstance(part, int) else part.data_ptr() for parts in given for part in parts]
+    asked = (*places, count, rows, columns, *size, *source, tolerance, PADDINGS[padding])
+    return cells, native.camtorch_classify(_Classification(*asked, cells.data_ptr(), scratch.data_ptr()))

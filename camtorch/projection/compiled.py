@@ -9,6 +9,7 @@ import struct
 import threading
 from collections.abc import Callable, Sequence
 from ctypes import addressof, byref, c_double, c_int32, c_int64, c_void_p
+from itertools import accumulate
 from typing import TYPE_CHECKING, NamedTuple
 
 import torch
@@ -19,7 +20,7 @@ from camtorch._arguments import columns
 from camtorch._threads import spread, thread_count
 from camtorch.native import memory
 from camtorch.native.library import library
-from camtorch.native.sampler import Probed, classification
+from camtorch.native.sampler import CLASSIFICATION, PADDINGS, SCRATCH
 from camtorch.optics.backprojection import FURTHEST
 
 if TYPE_CHECKING:
@@ -82,8 +83,8 @@ class _Cameras(ctypes.Structure):
 
 _Rows = struct.Struct("20q").pack  # `Rows` of geometry.h
 _Move = struct.Struct("6q2d12q").pack  # `Move` of geometry.h
-_Lattices = struct.Struct("6q2d17q").pack  # `Lattices`
-POSITIONS, PIXELS = range(2)
+_Lattices = struct.Struct(f"6q2d12q{CLASSIFICATION}4q").pack  # `Lattices`
+POSITIONS, PIXELS, ON_IMAGE = range(3)
 _LEFT_FROM, _LEFT_TO, LEFT_MOST = 1, 2, 4
 _NO_ROWS = (0, 0, 0, 0)
 
@@ -541,19 +542,16 @@ class Between:
     def rows(self, pixels: Tensor, form: int) -> tuple[Tensor, Tensor]:
         """Pixels (C or 1, N, 2) to (C, N, 2), and valid (C, N).
 
-        form: `POSITIONS` as of `grid_sample`, -9 where there is none; or `PIXELS`, -1 where there is none.
+        form: `POSITIONS` as of `grid_sample`, -9 where there is none; `PIXELS`, -1 where there is none; or `ON_IMAGE`,
+            the same, of which only those on the image are valid.
         """
         count = pixels.shape[1]
         result = torch.empty(self.cameras, count, 2, dtype=self._start.dtype, device="cpu")
         valid = torch.empty(self.cameras, count, dtype=torch.bool, device="cpu")
         rows = *_rows_of(pixels), result.data_ptr(), 2 * count, 2, 1, valid.data_ptr(), count, _TILE
-        run, tiles = _entry("camtorch_moves", c_int64), -(-count // _TILE) * self.cameras
-
-        def call(following: int) -> int:
-            left: int = run(_Move(*self._given, form, *self._size, *rows, following))
-            return left
-
-        self._left(call, tiles if self.cameras * count >= _SHARED else 1)
+        call = _Move(*self._given, form, *self._size, *rows, addressof(_kept.counters))
+        tiles = -(-count // _TILE) * self.cameras
+        self._run("camtorch_moves", call, tiles if self.cameras * count >= _SHARED else 1)
         return result, valid
 
     def lattices(
@@ -572,61 +570,57 @@ class Between:
         """
         cameras, dtype, count = self.cameras, self._start.dtype, probes.shape[1]
         n, m = (-(-side // 8) for side in size)
-        nodes, shape = (n + 5) * (m + 5), (cameras, 2, n + 5, m + 5)
+        nodes, most, is_double = (n + 5) * (m + 5), cameras * n * m, dtype == torch.float64
         result = torch.empty(cameras, 2, count, dtype=dtype, device="cpu")
-        valid = torch.empty(cameras, count, dtype=torch.bool, device="cpu")
-        exact = _kept_memory(2 * cameras * n * m * 64, dtype)  # of which parts are written
-        narrow = None if dtype == torch.float32 else torch.empty(shape, dtype=torch.float32, device="cpu")
-        made = result.as_strided(shape, (2 * count, count, m + 5, 1))
-        mapped, rim = valid.as_strided((cameras, n + 5, m + 5), (count, m + 5, 1)), valid[:, nodes:]
-        cells, asked = classification(Probed(made, mapped, rim, size, self._size, tolerance, padding))
-        rows = *_rows_of(probes), result.data_ptr(), 2 * count, 1, count, valid.data_ptr(), count, count
-        run, used = _entry("camtorch_lattices", c_int64), c_int64(0)
-
-        def call(following: int) -> int:
-            more = addressof(asked), first_row, _address(narrow), exact.data_ptr(), addressof(used)
-            left: int = run(_Lattices(*self._given, POSITIONS, *self._size, *rows, following, *more))
-            return left
-
-        if self._left(call, cameras, used):
+        cells = torch.empty(cameras, n, m, dtype=torch.int32, device="cpu")
+        # for this call alone: exact positions, of which parts are written; nodes in float32; scratch; what is mapped
+        sizes = 128 * most * dtype.itemsize, 8 * cameras * nodes * is_double, 4 * SCRATCH * cameras * (m + 8)
+        kept = _kept_memory(sum(sizes) + cameras * count)
+        exact, narrow, scratch, valid = accumulate(sizes, initial=kept.data_ptr())
+        at, used = result.data_ptr(), addressof(_kept.counters)
+        rows = *_rows_of(probes), at, 2 * count, 1, count, valid, count, count, used
+        asked = at, 2 * count, count, valid, count, valid + nodes, count, cameras, n, m, *size
+        how = *self._size, tolerance, PADDINGS[padding], cells.data_ptr(), scratch
+        more = first_row, narrow if is_double else 0, exact, used + 8
+        call = _Lattices(*self._given, POSITIONS, *self._size, *rows, *asked, *how, *more)
+        if self._run("camtorch_lattices", call, cameras):
             return None
-        parts = exact[: 2 * cameras * n * m * 64].view(2, -1, 8, 8)[:, : used.value]
-        return Lattices(made, cells, parts.clone())
+        found = kept[: sizes[0]].view(dtype).view(2, most, 8, 8)[:, : _kept.counters[1]].clone()
+        return Lattices(result.as_strided((cameras, 2, n + 5, m + 5), (2 * count, count, m + 5, 1)), cells, found)
 
-    def _left(self, call: Callable[[int], int], tiles: int, used: c_int64 | None = None) -> int:
-        """Flags of what is not made. call: with where the next tile stands."""
-        shared = thread_count() if tiles > 1 else 1
+    def _run(self, name: str, call: bytes, tiles: int) -> int:
+        """Flags of what is not made. call: whose next tile, and number of places, are this thread's counters."""
+        run, threads, counters = _entry(name, c_int64), min(thread_count(), tiles) if tiles > 1 else 1, _kept.counters
         while True:
-            following, left = c_int64(0), list[int]()
-            place = addressof(following)
-            if used is not None:
-                used.value = 0
-            spread(lambda: left.append(call(place)), min(shared, tiles))  # noqa: B023 (which is called at once)
+            left: list[int] = []
+            counters[:] = 0, 0
+            spread(lambda: left.append(run(call)), threads)  # noqa: B023 (which is called at once)
             flags = functools.reduce(operator.or_, left)
             if not flags & (_LEFT_FROM | _LEFT_TO):
-                break
+                return flags
             for flag, native in ((_LEFT_FROM, self._start), (_LEFT_TO, self._end)):
                 if flags & flag:
                     native.follow()
-        return flags
 
 
 class _Kept(threading.local):
-    memory: Tensor | None = None
+    def __init__(self) -> None:
+        self.memory: Tensor | None = None
+        self.counters = (c_int64 * 2)()
 
 
 _kept = _Kept()
 _MOST_KEPT = 1 << 22  # bytes
 
 
-def _kept_memory(count: int, dtype: torch.dtype) -> Tensor:
-    """At least so many numbers, for this call of this thread: the same memory as before, unless they are many."""
-    if count * dtype.itemsize > _MOST_KEPT:
-        return torch.empty(count, dtype=dtype, device="cpu")
-    if _kept.memory is None or len(_kept.memory) < count * dtype.itemsize:
+def _kept_memory(count: int) -> Tensor:
+    """At least so many bytes, for this call of this thread: the same memory as before, unless they are many."""
+    if count > _MOST_KEPT:
+        return torch.empty(count, dtype=torch.uint8, device="cpu")
+    if _kept.memory is None or len(_kept.memory) < count:
         with torch.inference_mode(False):
-            _kept.memory = torch.empty(count * dtype.itemsize, dtype=torch.uint8, device="cpu")
-    return _kept.memory[: count * dtype.itemsize].view(dtype)
+            _kept.memory = torch.empty(count, dtype=torch.uint8, device="cpu")
+    return _kept.memory
 
 
 def _rows_of(pixels: Tensor) -> tuple[int, int, int, int]:

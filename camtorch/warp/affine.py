@@ -263,7 +263,7 @@ class AffineWarp(MirrorWarp):
 
     # -- labels
 
-    def _move(self, pixels: Numbers, back: bool = False) -> tuple[Tensor, Tensor]:
+    def _move(self, pixels: Numbers, back: bool = False, on_image: bool = False) -> tuple[Tensor, Tensor]:
         pixels = as_values(pixels, "pixels", "Warp", self.matrix.device)
         pixels = pixels if pixels.is_floating_point() else pixels.to(self.source.intrinsics.dtype)
         valid = torch.isfinite(pixels).all(-1)
@@ -273,7 +273,8 @@ class AffineWarp(MirrorWarp):
             matrix = matrix.reshape(-1, *[1] * (pixels.ndim - 2), 2, 3)
         moved = (matrix[..., :2] * wide.unsqueeze(-2)).sum(-1) + matrix[..., 2]
         dtype = torch.promote_types(pixels.dtype, torch.float32)
-        return torch.where(valid.unsqueeze(-1), moved, -1.0).to(dtype), valid
+        moved = torch.where(valid.unsqueeze(-1), moved, -1.0).to(dtype)
+        return moved, valid & self.target.contains(moved) if on_image else valid
 
 
 def _alike(kinds: list[Any]) -> list[tuple[slice, Any]]:

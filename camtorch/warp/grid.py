@@ -15,7 +15,7 @@ from camtorch._threads import on_one_thread
 from camtorch._tracing import in_graph, in_memory, in_transform, is_concrete, is_recorded, may_look
 from camtorch.camera import Camera
 from camtorch.native.library import native_available
-from camtorch.native.sampler import CUBIC, EMPTY, TODO, Probed, classify
+from camtorch.native.sampler import CUBIC, EMPTY, TODO, classify
 from camtorch.projection.compiled import POSITIONS, Between
 from camtorch.rotations import turn
 from camtorch.warp.moving import between
@@ -329,7 +329,7 @@ def on_lattice(
     positions, mapped = exact(pixels)  # (B, 1, N, 2)
     lattice = positions[:, 0, :nodes].movedim(-1, 1).contiguous().unflatten(2, (n + 5, m + 5))
     mapped, rim = mapped[:, 0, :nodes].unflatten(1, (n + 5, m + 5)), mapped[:, 0, nodes:]
-    cells, most = classify(Probed(lattice.float(), mapped, rim, (height, width), size, tolerance, padding))
+    cells, most = classify(lattice.float(), mapped, rim, (height, width), size, tolerance, padding)
     if most > n * m / 2:
         return None
     computed = like.new_empty(2, 0, STEP, STEP)

@@ -297,15 +297,16 @@ class Warp(GeometryModule):
             pixels of the same shape, and valid (B, *N) bool: the source pixel has a ray, and the target sees
             it on its image. Pixels off the image keep their place; those without one get (-1, -1).
         """
-        moved, mapped = self._move(pixels)
-        return moved, mapped & self.target.contains(moved)
+        return self._move(pixels, on_image=True)
 
-    def _move(self, pixels: Numbers, back: bool = False) -> tuple[Tensor, Tensor]:
-        """Pixels of the source to the target's image, or back, and whether they have a place there, on it or not."""
+    def _move(self, pixels: Numbers, back: bool = False, on_image: bool = False) -> tuple[Tensor, Tensor]:
+        """Pixels of the source to the target's image, or back, and whether they have a place there, on it or not; see
+        `moved_pixels`.
+        """
         (source, target), rotation = self._in_motion, self.rotation
         if back:
             source, target, rotation = target, source, None if rotation is None else rotation.mT
-        return moved_pixels(source, target, rotation, pixels)
+        return moved_pixels(source, target, rotation, pixels, on_image)
 
     def transform_boxes(self, boxes: Numbers) -> tuple[Tensor, Tensor]:
         """Move boxes (B, *N, 4), or (*N, 4): x1, y1, x2, y2 in pixel-centre coordinates.

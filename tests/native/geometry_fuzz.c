@@ -85,7 +85,7 @@ static int moved(const Cameras *cameras, int64_t tile) {
     Move move = {0};
     void *turns = filled(d, 9 * c, 1, 0), *narrow = NULL, *valid = malloc((size_t)(c * n));
     int64_t following = 0, used = 0;
-    move.from = move.to = cameras, move.cameras = c, move.form = fits ? POSITIONS : below(2);
+    move.from = move.to = cameras, move.cameras = c, move.form = fits ? POSITIONS : below(3);
     if (below(2)) move.turns = turns, move.turn_stride = 9 * below(2);
     move.height = 1 + (double)below(500), move.width = 1 + (double)below(500);
     void *pixels = rows_of(d, c, n, 2, move.row_strides, 300), *results;
@@ -108,7 +108,7 @@ static int moved(const Cameras *cameras, int64_t tile) {
         asked.count = c, asked.rows = rows, asked.columns = columns, asked.height = height, asked.width = width;
         asked.source_height = move.height, asked.source_width = move.width, asked.tolerance = share() * 0.1;
         asked.padding = (int32_t)below(3), asked.cells = cells, asked.scratch = scratch;
-        Lattices lattices = {move, &asked, below(50), narrow, exact, &used};
+        Lattices lattices = {move, asked, below(50), narrow, exact, &used};
         const int64_t left = lattices_fuzzed(&lattices);
         fine &= used >= 0 && used <= c * rows * columns;
         for (int64_t i = 0; !left && i < c * rows * columns; i++) fine &= cells[i] >= CELL_EMPTY && cells[i] < used;
