@@ -386,6 +386,8 @@ class Augmentation(SampleTransform):
     @staticmethod
     def _like(source: Camera, values: Mapping[str, Any]) -> dict[str, Tensor]:
         """The values as tensors in the source's dtype and on its device."""
+        if not values:
+            return {}
         dtype = torch.promote_types(source.intrinsics.dtype, torch.float32)
         return {name: torch.as_tensor(value).to(source.intrinsics.device, dtype) for name, value in values.items()}
 
@@ -475,7 +477,7 @@ class Augmentation(SampleTransform):
         if change.count != count:
             raise ValueError(f"{self._name}: the draw is for {change.count} samples, here are {count}")
         if not torch.compiler.is_compiling():
-            self.last = change
+            self.__dict__["last"] = change  # as nn.Module would, after some questions
             if count and any(found == "image" for found, _ in named.values()):
                 self.tell_of_empty_images(camera)
         return self._moved(sample, named, batched, change)

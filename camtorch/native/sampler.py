@@ -7,7 +7,6 @@ import functools
 import math
 import struct
 from collections.abc import Sequence
-from ctypes import addressof, byref, c_float, c_int32, c_int64, c_void_p
 
 import torch
 from torch import Tensor
@@ -24,48 +23,13 @@ PADDINGS = {"zeros": 0, "border": 1, "reflection": 2}
 _TYPES = {torch.uint8: 0, torch.bool: 1, torch.uint16: 2, torch.float32: 3}
 _BYTES = {1: 4, 2: 5, 4: 6, 8: 7}
 _TILE = 1 << 15  # pixels of a tile, some 0.1 ms a channel
+_packed = struct.Struct("35q4iq").pack  # `Job` of sampler.h
+_Job = ctypes.c_char * struct.calcsize("35q4iq")
 CLASSIFICATION = "12q3di2q"
 """`Classification` of sampler.h."""
 _Classification = struct.Struct(CLASSIFICATION).pack
 SCRATCH = 25  # numbers of float32 for each column of a lattice and eight more
 _WORTH = 8  # pixels that may be copied for one that is made: interpolated one by one they would take longer
-
-
-class _Job(ctypes.Structure):
-    """`Job` of sampler.h."""
-
-    _fields_ = (
-        ("source", c_void_p),
-        ("result", c_void_p),
-        ("source_strides", c_int64 * 4),
-        ("result_strides", c_int64 * 4),
-        ("count", c_int64),
-        ("channels", c_int64),
-        ("source_height", c_int64),
-        ("source_width", c_int64),
-        ("height", c_int64),
-        ("width", c_int64),
-        ("fill", c_void_p),
-        ("fill_elements", c_void_p),
-        ("grid", c_void_p),
-        ("grid_strides", c_int64 * 4),
-        ("grid_is_double", c_int64),
-        ("mapped", c_void_p),
-        ("mapped_stride", c_int64),
-        ("nodes", c_void_p),
-        ("node_strides", c_int64 * 2),
-        ("cells", c_void_p),
-        ("cell_stride", c_int64),
-        ("rows", c_int64),
-        ("columns", c_int64),
-        ("exact", c_void_p),
-        ("exact_stride", c_int64),
-        ("type", c_int32),
-        ("mode", c_int32),
-        ("padding", c_int32),
-        ("tile_rows", c_int32),
-        ("next", c_int64),
-    )
 
 
 def takes(dtype: torch.dtype, mode: str) -> bool:
@@ -121,33 +85,27 @@ def sample(
         if not fits:
             result.copy_(made)
         return
-    job = _Job()
-    job.source, job.source_strides = images.data_ptr(), steps
-    job.result, job.result_strides = result.data_ptr(), made_steps
-    job.count, job.channels, job.height, job.width = count, channels, height, width
-    job.source_height, job.source_width = images.shape[-2:]
-    values = (c_float * channels)(*fill)
-    elements = None if images.dtype == torch.float32 else _elements(tuple(fill), images.dtype)
-    job.fill = addressof(values)
-    job.fill_elements = job.fill if elements is None else elements.data_ptr()
+    on_grid, on_lattice, masks, tile_rows = [0] * 6, [0] * 9, [0] * 2, max(_TILE // width // 8, 1) * 8
     if grid is not None:
-        job.grid, job.grid_is_double = grid.data_ptr(), grid.dtype == torch.float64
-        job.grid_strides = _shared(grid), *grid.stride()[1:]
+        on_grid = [grid.data_ptr(), _shared(grid), *grid.stride()[1:], grid.dtype == torch.float64]
         if mapped is not None:
             mapped = mapped.contiguous()
-            job.mapped, job.mapped_stride = mapped.data_ptr(), _shared(mapped)
+            masks = [mapped.data_ptr(), _shared(mapped)]
     if nodes is not None and cells is not None and exact is not None:
-        job.nodes, job.node_strides = nodes.data_ptr(), (_shared(nodes), nodes.stride(1))
-        job.cells, job.cell_stride = cells.data_ptr(), _shared(cells)
-        job.rows, job.columns = cells.shape[1:]
-        if exact.shape[1]:
-            job.exact, job.exact_stride = exact.data_ptr(), exact.stride(0)
-    job.type = _BYTES[images.dtype.itemsize] if mode == "nearest" else _TYPES[images.dtype]
-    job.mode, job.padding = _MODES[mode], PADDINGS[padding]
-    job.tile_rows = max(_TILE // width // 8, 1) * 8
-    tiles = -(-height // job.tile_rows) * count
-    pointer = byref(job)
-    spread(lambda: native.camtorch_sample(pointer), min(thread_count(), tiles))
+        (_, rows, columns), at = cells.shape, (exact.data_ptr(), exact.stride(0)) if exact.shape[1] else (0, 0)
+        on_lattice = [nodes.data_ptr(), _shared(nodes), nodes.stride(1), cells.data_ptr(), _shared(cells)]
+        on_lattice += [rows, columns, *at]
+    fills = _fills(tuple(fill), images.dtype)
+    kind = _BYTES[images.dtype.itemsize] if mode == "nearest" else _TYPES[images.dtype]
+    job = _Job.from_buffer_copy(
+        _packed(
+            *(images.data_ptr(), result.data_ptr(), *steps, *made_steps, count, channels, *images.shape[-2:]),
+            *(height, width, *fills[:2], *on_grid, *masks, *on_lattice),
+            *(kind, _MODES[mode], PADDINGS[padding], tile_rows, 0),
+        )
+    )
+    tiles = -(-height // tile_rows) * count
+    spread(lambda: native.camtorch_sample(job), min(thread_count(), tiles))
 
 
 def _shared(tensor: Tensor) -> int:
@@ -156,14 +114,17 @@ def _shared(tensor: Tensor) -> int:
 
 
 @functools.lru_cache(maxsize=64)
-def _elements(fill: tuple[float, ...], dtype: torch.dtype) -> Tensor:
-    """The values as pixels, (C,): rounded and in range, true from one half on."""
+def _fills(fill: tuple[float, ...], dtype: torch.dtype) -> tuple[int, int, Tensor, Tensor]:
+    """Where values lie in float32, and as pixels: rounded, in range, true from one half on; and who holds them."""
+    values = torch.tensor(fill, dtype=torch.float32, device="cpu")
     if dtype == torch.bool:
-        return torch.tensor([value >= 0.5 for value in fill], device="cpu")
-    if not dtype.is_floating_point:
-        low, high = torch.iinfo(dtype).min, torch.iinfo(dtype).max
-        fill = tuple(min(max(round(value), low), high) for value in fill)
-    return torch.tensor(fill, dtype=dtype, device="cpu")
+        elements = torch.tensor([value >= 0.5 for value in fill], device="cpu")
+    else:
+        if not dtype.is_floating_point:
+            low, high = torch.iinfo(dtype).min, torch.iinfo(dtype).max
+            fill = tuple(min(max(round(value), low), high) for value in fill)
+        elements = torch.tensor(fill, dtype=dtype, device="cpu")
+    return values.data_ptr(), elements.data_ptr(), values, elements
 
 
 def layout(images: Tensor) -> torch.memory_format:

@@ -201,21 +201,21 @@ class Lenses:
     plan: Plan
     cameras: int
     dtype: torch.dtype
-    fields: dict[str, int]
-    """Where what `Cameras` of geometry.h has of them lies."""
-    table: int | None
-    azimuths: tuple[int, int] | None
+    struct: _Cameras
+    """What it has of them; pointers that are not set are of what is not yet known."""
     _kept: list[object]
 
     def __init__(self, plan: Plan, optics_of: Optics, k: Tensor, domain: Callable[[], Domain]):
         """See `native_of`."""
         self.plan, self._optics_of, self._k, self._kept = plan, optics_of, k, [k]
         self._slow_domain, self.cameras, self.dtype = domain, len(k), k.dtype
-        self.fields, self.table, self.azimuths = {}, None, None
+        self.struct = struct = _Cameras()
+        struct.parts, struct.part_count, struct.parameter_count = addressof(plan.parts), plan.count, plan.parameters
+        struct.is_double, struct.cameras = self.dtype == torch.float64, self.cameras
         if plan.parameters:
-            self.fields["parameters"] = self._keep(plan.parameters_of(optics_of, k))
+            struct.parameters = self._keep(plan.parameters_of(optics_of, k))
         if plan.places is None and (constants := _constants(optics_of(columns(k))[1])):
-            self.fields |= {"constants": self._keep_columns(constants), "constant_count": len(constants)}
+            struct.constants, struct.constant_count = self._keep_columns(constants), len(constants)
         if plan.is_chart:
             self._add_chart()
         if plan.has_stages:
@@ -267,43 +267,46 @@ class Lenses:
         table, inner2 = torch.empty(self.cameras, _TABLE, dtype=self.dtype, device="cpu"), self._new(1)
         place = self._keep(table)
         self._ask({"inner2": inner2, "table": place, "is_chart": True})
-        self.fields |= {"chart_inner2": inner2, "chart_table": place, "chart_most2": self._keep(table[:, 1])}
+        struct = self.struct
+        struct.chart_inner2, struct.chart_table, struct.chart_most2 = inner2, place, self._keep(table[:, 1])
 
     def _add_domain(self) -> None:
         plan = self.plan
         if plan.is_chart:  # whose end is that of a search
             domain = self._slow_domain()
-            self.fields |= {"inner2": self._keep(domain.inner2), "usual2": self._keep(domain.usual2)}
+            self.struct.inner2, self.struct.usual2 = self._keep(domain.inner2), self._keep(domain.usual2)
             return
         wanted = {"inner2": self._new(1), "usual2": self._new(1)}
         if plan.has_rest:
             wanted |= {"circle2": self._new(1), "stagewise": self._new(1, torch.bool)}
-        self.fields |= wanted
+        for name, place in wanted.items():
+            setattr(self.struct, name, place)
         radii = {} if plan.is_radial else {"radii": self._keep(plan.radii(lambda: self._optics()[0], _RADII, self._k))}
         self._ask(wanted | radii)
 
     def inverse_table(self) -> int:
         """What the inverse of the radial factor starts from; it is made when it is first asked for."""
-        if self.table is None:
+        if self.struct.table is None:
             table = self._new(_TABLE)
             self._ask({"table": table})
-            self.table = table  # when it is whole, for another thread may be looking
-        return self.table
+            self.struct.table = table  # when it is whole, for another thread may be looking
+        return int(self.struct.table)
 
     def followed(self) -> tuple[int, int]:
         """The limits of each azimuth, and where the lens sends it: asked for only when a point lies far out."""
-        if self.azimuths is None:
+        struct = self.struct
+        if struct.limits2 is None:
             chart, like = self._optics()[0], self._k.double()
             wanted = {"limits2": self._new(_AZIMUTHS), "extent": self._new(_EXTENT)}
-            wanted |= {name: place for name, place in self.fields.items() if name in ("circle2", "stagewise")}
+            wanted |= {name: place for name in ("circle2", "stagewise") if (place := getattr(struct, name)) is not None}
             for name, count in (("radii", _RADII), ("even", _FOLLOWED), ("coarse", _FOLLOWED // 2)):
                 wanted[name] = self._keep(self.plan.radii(lambda: chart, count, like))
             if self.plan.is_chart:
                 end = chart.end(self.dtype)
                 wanted["ends"] = self._keep_ends(end)
             self._ask(wanted)
-            self.azimuths = wanted["limits2"], wanted["extent"]
-        return self.azimuths
+            struct.extent, struct.limits2 = wanted["extent"], wanted["limits2"]
+        return struct.limits2, struct.extent
 
     def _keep(self, tensor: Tensor) -> int:
         tensor = tensor.contiguous()
@@ -342,20 +345,11 @@ class Native:
 
     def __init__(self, lenses: Lenses, intrinsics: Tensor, usable: Tensor | None):
         """See `native_of`."""
-        self._lenses, self.plan, self.struct = lenses, lenses.plan, _Cameras()
+        self._lenses, self.plan, self.struct = lenses, lenses.plan, _Cameras.from_buffer_copy(lenses.struct)
         self._kept = intrinsics.contiguous(), None if usable is None else (usable > 0).contiguous()
-        struct, plan = self.struct, self.plan
-        struct.parts, struct.part_count = addressof(plan.parts), plan.count
-        self.cameras, self.dtype = len(intrinsics), intrinsics.dtype
-        struct.is_double, struct.cameras = self.dtype == torch.float64, self.cameras
-        self.parameters = struct.parameter_count = plan.parameters
-        struct.intrinsics, struct.usable = map(_address, self._kept)
-        struct.table = lenses.table
-        if lenses.azimuths is not None:
-            struct.limits2, struct.extent = lenses.azimuths
-        for name, value in lenses.fields.items():
-            setattr(struct, name, value)
-        self.pointer = addressof(struct)
+        self.cameras, self.dtype, self.parameters = len(intrinsics), intrinsics.dtype, lenses.plan.parameters
+        self.struct.intrinsics, self.struct.usable = map(_address, self._kept)
+        self.pointer = addressof(self.struct)
 
     def add_table(self) -> None:
         """Have what the inverse starts from."""

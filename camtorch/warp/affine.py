@@ -65,10 +65,10 @@ class MirrorWarp(Warp):
         """Warped images, as of `Warp.forward`; smaller ones of them where they shrink."""
         plain = not (torch.compiler.is_compiling() or in_transform()) and is_concrete(self.target.intrinsics)
         if self._decides and plain:
-            sampler, inputs = checked(self, images, mode, padding_mode, fill), self._inputs()
+            sampler = checked(self, images, mode, padding_mode, fill)
             smooth = sampler.mode != "nearest" and images.dtype != torch.bool
-            if smooth and route_of(self, inputs, images, sampler.mode) == "kept":
-                where = positions(self, inputs, "kept", sampler.padding_mode)
+            if smooth and route_of(self, images, sampler.mode) == "kept":
+                where = positions(self, "kept", sampler.padding_mode)
                 if self._halvings is None:
                     self._halvings = _halvings(where, self.source._size_for("Warp"))
                 if any(self._halvings):

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, cast
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from camtorch._arguments import Numbers, as_coordinates, as_whole, broadcast_shapes, check_devices, no_camera
 from camtorch._module import GeometryModule, Memo, typed_as
@@ -49,6 +49,16 @@ def as_sized(camera: Camera, name: str, owner: str) -> Camera:
     if camera.image_size is None:
         raise ValueError(f"{owner}: the {name} needs an image_size=(height, width)")
     return camera
+
+
+def _part(held: str, name: str) -> Any:
+    """The property of a part of a module, in the dict where it mostly is: `nn.Module.__getattr__` looks in all."""
+
+    def part(module: nn.Module) -> Any:
+        parts = module.__dict__[held]
+        return parts[name] if name in parts else nn.Module.__getattr__(module, name)
+
+    return property(part)
 
 
 class Warp(GeometryModule):
@@ -91,7 +101,6 @@ class Warp(GeometryModule):
     _decides = False  # for itself where to antialias
     is_an_operator: ClassVar[bool] = True
     """Whether compiled code calls it as one: the cameras and the rotation are all there is to it."""
-    rotation: Tensor | None
     batch_shape: torch.Size
     mode: Mode
     padding_mode: PaddingMode
@@ -99,8 +108,9 @@ class Warp(GeometryModule):
     _memos: dict[PaddingMode, Memo]
     _constants: Memo
     _pinned: Sampling | Lattice | None
-    source: Camera
-    target: Camera
+    source: Camera = _part("_modules", "source")
+    target: Camera = _part("_modules", "target")
+    rotation: Tensor | None = _part("_buffers", "rotation")
     fill: tuple[float, ...]
     antialias: bool
     shutter: RollingShutter | None
@@ -151,7 +161,7 @@ class Warp(GeometryModule):
             shutter=shutter,
             target_shutter=target_shutter,
             batch_shape=batch,
-            _memos={padding: Memo() for padding in PADDINGS},
+            _memos={},
             _pinned=None,
             _constants=Memo(),
         )
@@ -257,16 +267,18 @@ class Warp(GeometryModule):
     def pin(self) -> Warp:
         """Have the grid computed once and for all, with its graph: for a warp whose cameras are not to change."""
         if self._pinned is None:
-            self._pinned = routes.pinned(self)
+            self.__dict__["_pinned"] = routes.pinned(self)  # as nn.Module would, after some questions
         return self
 
     # -- what its positions follow from
 
     def _inputs(self) -> list[Tensor]:
         """All tensors that they depend on."""
-        shutters = [t for each in (self.shutter, self.target_shutter) if each is not None for t in each.tensors]
-        turned = [] if self.rotation is None else [self.rotation]
-        return [*self.source._tensors, *self.target._tensors, *turned, *shutters]
+        rotation, found = self.rotation, [*self.source._tensors, *self.target._tensors]
+        found += [] if rotation is None else [rotation]
+        for shutter in (self.shutter, self.target_shutter):
+            found += [] if shutter is None else shutter.tensors
+        return found
 
     def _locate(self, rows: range, padding: PaddingMode, tolerance: float) -> Sampling | Lattice:
         """Those of some rows of the target, which serve a padding, within a tolerance."""
@@ -274,9 +286,7 @@ class Warp(GeometryModule):
 
     def _sampling(self) -> Sampling:
         """Those of all pixels, one by one."""
-        inputs = self._inputs()
-        route = routes.route_of(self, inputs)
-        where = routes.positions(self, inputs, "graph" if route == "graph" else "kept")
+        where = routes.positions(self, "graph" if routes.route_of(self) == "graph" else "kept")
         return where.pixels if isinstance(where, Lattice) else where
 
     @property
