@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from functools import partial
 from itertools import chain
 from typing import TYPE_CHECKING, Any
@@ -241,7 +242,8 @@ def new_cameras(memo: Memo, model: type[Camera], intrinsics: Tensor, distortion:
     if in_transform():  # what a transform makes dies with it
         return Cameras(model, intrinsics, distortion)
     # what inference mode makes could not be used in a graph later
-    with torch.inference_mode(False):
+    outside = torch.inference_mode(False) if torch.is_inference_mode_enabled() else nullcontext()
+    with outside:
         memo.result = cameras = Cameras(model, intrinsics, distortion)
     return cameras
 

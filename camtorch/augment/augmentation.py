@@ -117,17 +117,19 @@ def draw(
     rows = min(count, 1) if same else count
     device = generator.device if generator is not None else torch.device("cpu")
     gate: Any = torch.rand(rows, generator=generator, device=device) < p if 0 < p < 1 else None
-    gate = torch.full((rows,), p >= 1, device=device) if gate is None else gate
-    sizes = [rows * (interval.size or 1) for interval in ranges.values()]
+    total = rows * sum(interval.size or 1 for interval in ranges.values())
     # in float64, so that what is drawn is what every precision sees
-    shares: Any = torch.rand(sum(sizes), generator=generator, dtype=torch.float64, device=device) if sizes else gate
+    shares: Any = torch.rand(total, generator=generator, dtype=torch.float64, device=device)
     if device.type == "cpu" and not torch.compiler.is_compiling():
-        gate, shares = gate.numpy(), shares.numpy()
+        gate, shares = np.full(rows, p >= 1) if gate is None else gate.numpy(), shares.numpy()
+    elif gate is None:
+        gate = torch.full((rows,), p >= 1, device=device)
     values, start = {"apply": gate}, 0
-    for (name, interval), size in zip(ranges.items(), sizes, strict=True):
-        value = interval.low + (interval.high - interval.low) * shares[start : start + size]
-        values[name] = value if interval.size is None else value.reshape(rows, interval.size)
-        start += size
+    for name, interval in ranges.items():
+        shape = (rows,) if interval.size is None else (rows, interval.size)
+        end = start + math.prod(shape)
+        values[name] = interval.low + (interval.high - interval.low) * shares[start:end].reshape(shape)
+        start = end
     return values if rows == count else {name: value[[0] * count] for name, value in values.items()}
 
 

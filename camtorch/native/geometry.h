@@ -112,7 +112,7 @@ enum { LEFT_FROM = 1, LEFT_TO = 2, LEFT_MOST = 4 };
 typedef struct {
     const Cameras *from, *to;
     const void *turns;   /* (c, 3, 3), or NULL */
-    int64_t turn_stride; /* 0: one for all */
+    int64_t turn_strides[3]; /* by camera, 0 for one that serves all; by row and column */
     int64_t cameras, form;
     double height, width; /* of the image of `to` */
     const void *rows;     /* pixels (c, n) and results, strides as of `Rows` */

@@ -11,8 +11,10 @@ static void T(between)(const Move *move, int64_t index, T(Between) *b) {
     if (b->index == index) return;
     if (is_first || move->from->cameras > 1) T(prepare)(move->from, move->from->cameras > 1 ? index : 0, &b->from);
     if (is_first || move->to->cameras > 1) T(prepare)(move->to, move->to->cameras > 1 ? index : 0, &b->to);
-    if (move->turns && (is_first || move->turn_stride))
-        memcpy(b->turn, (const R *)move->turns + index * move->turn_stride, sizeof b->turn);
+    const int64_t *strides = move->turn_strides;
+    if (move->turns && (is_first || strides[0]))
+        for (int i = 0; i < 9; i++)
+            b->turn[i] = ((const R *)move->turns)[index * strides[0] + i / 3 * strides[1] + i % 3 * strides[2]];
     b->index = index;
 }
 

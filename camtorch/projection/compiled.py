@@ -82,8 +82,8 @@ class _Cameras(ctypes.Structure):
 
 
 _Rows = struct.Struct("20q").pack  # `Rows` of geometry.h
-_Move = struct.Struct("6q2d12q").pack  # `Move` of geometry.h
-_Lattices = struct.Struct(f"6q2d12q{CLASSIFICATION}4q").pack  # `Lattices`
+_Move = struct.Struct("8q2d12q").pack  # `Move` of geometry.h
+_Lattices = struct.Struct(f"8q2d12q{CLASSIFICATION}4q").pack  # `Lattices`
 POSITIONS, PIXELS, ON_IMAGE = range(3)
 _LEFT_FROM, _LEFT_TO, LEFT_MOST = 1, 2, 4
 _NO_ROWS = (0, 0, 0, 0)
@@ -524,14 +524,14 @@ class Between:
 
     def __init__(self, start: Native, end: Native, turns: Tensor | None, size: tuple[int, int], is_batch: bool):
         """turns: (3, 3) or (C, 3, 3), of their dtype. size: (height, width) of the others' image."""
-        turns, self.is_batch = None if turns is None else turns.contiguous(), is_batch
-        self._start, self._end, self._turns = start, end, turns
-        count = 1 if turns is None or turns.ndim == 2 else len(turns)
+        self._start, self._end, self._turns, self.is_batch = start, end, turns, is_batch
+        count, strides = (1, (0, 0)) if turns is None else (turns.numel() // 9, turns.stride())
         self.cameras = max(start.cameras, end.cameras, count)
         if start.plan.has_factor and start.struct.table is None:
             start.add_table()
         self._size = size
-        self._given = start.pointer, end.pointer, _address(turns), 9 * (count > 1), self.cameras
+        by_camera = strides[0] if count > 1 else 0
+        self._given = start.pointer, end.pointer, _address(turns), by_camera, *strides[-2:], self.cameras
 
     def rows(self, pixels: Tensor, form: int) -> tuple[Tensor, Tensor]:
         """Pixels (C or 1, N, 2) to (C, N, 2), and valid (C, N).

@@ -42,14 +42,13 @@ class Cameras:
     def __init__(self, model: type[Camera], intrinsics: Tensor, distortion: Tensor):
         """Of concrete values (C, 4), (C, n)."""
         self._model, self._learns = model, distortion.requires_grad
-        with torch.no_grad():
-            self.given = intrinsics.detach().clone(), distortion.detach().clone()
-            values, self.usable = self.given, None
-            if not (_are_plain(model, *self.given) or holds(usable := _usable(model, *self.given))):
-                ideal = _ideal(model, *self.given)
-                values = torch.where(usable, self.given[0], ideal[0]), torch.where(usable, self.given[1], ideal[1])
-                self.usable = usable.to(intrinsics.dtype)  # (C, 1)
-            self.intrinsics, self.k = values
+        self.given = values = intrinsics.detach().clone(), distortion.detach().clone()
+        self.usable = None
+        if not (_are_plain(model, *values) or holds(usable := _usable(model, *values))):
+            ideal = _ideal(model, *values)
+            values = torch.where(usable, values[0], ideal[0]), torch.where(usable, values[1], ideal[1])
+            self.usable = usable.to(intrinsics.dtype)  # (C, 1)
+        self.intrinsics, self.k = values
 
     @cached_property
     def domain(self) -> Domain:

@@ -86,7 +86,11 @@ static int moved(const Cameras *cameras, int64_t tile) {
     void *turns = filled(d, 9 * c, 1, 0), *narrow = NULL, *valid = malloc((size_t)(c * n));
     int64_t following = 0, used = 0;
     move.from = move.to = cameras, move.cameras = c, move.form = fits ? POSITIONS : below(3);
-    if (below(2)) move.turns = turns, move.turn_stride = 9 * below(2);
+    if (below(2)) {
+        const int64_t back = below(2);
+        move.turns = turns, move.turn_strides[0] = 9 * below(2);
+        move.turn_strides[1] = back ? 1 : 3, move.turn_strides[2] = back ? 3 : 1;
+    }
     move.height = 1 + (double)below(500), move.width = 1 + (double)below(500);
     void *pixels = rows_of(d, c, n, 2, move.row_strides, 300), *results;
     move.rows = pixels, move.count = n, move.tile = tile, move.valid = valid;
