@@ -134,9 +134,7 @@ def compiled_of(cameras: Sequence[Camera], *values: Tensor) -> tuple[list[Native
     for camera, (intrinsics, distortion) in zip(cameras, pairs, strict=True):
         if intrinsics.dtype != dtype or distortion.dtype != dtype:
             return None
-        if intrinsics.ndim == distortion.ndim == 1:
-            intrinsics, distortion = intrinsics[None], distortion[None]
-        else:
+        if not intrinsics.ndim == distortion.ndim == 1:
             batch, is_batch = camera.batch_shape, True
             if len(batch) != 1:
                 return None

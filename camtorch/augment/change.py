@@ -315,7 +315,7 @@ class Change:
                 red, blue = part.shades
                 fills = warp.fill if len(warp.fill) == 3 else [None] * 3
                 colours = enumerate(zip((red, warp, blue), fills, strict=True))
-                moved = torch.cat([w.pin().forward(rows[:, i : i + 1], fill=fill, **options) for i, (w, fill) in colours], 1)
+                moved = torch.cat([w.pin()(rows[:, i : i + 1], fill=fill, **options) for i, (w, fill) in colours], 1)
             else:
                 moved = warp.pin().forward(rows, **options)
             return moved if part.light is None else narrow(widen(moved) * part.light.to(moved.device), rows.dtype)

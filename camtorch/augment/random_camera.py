@@ -225,7 +225,7 @@ class RandomCamera(Augmentation):
     def _warp(
         self, source: Camera, target: Camera, rotation: Tensor | None, shutter: RollingShutter | None = None
     ) -> Warp:
-        return Warp(source, target, **self.options, target_shutter=shutter).turned_by(rotation)
+        return Warp.unchecked(source, target, self.options, None, shutter).turned_by(rotation)
 
     def _seen_through(self, warp: Warp, values: Mapping[str, Tensor]) -> tuple[tuple[Warp, Warp] | None, Tensor | None]:
         shades = light = None

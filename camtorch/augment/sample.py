@@ -482,9 +482,9 @@ class SampleTransform(nn.Module):
                 raise ValueError(f"{self._name}: {name} has batch dims {shape}, the samples are {count}")
             for field, (found, value) in named.items():
                 if found in IMAGES:
-                    images = value if isinstance(value, list) else [value if batched else value[0]]
-                    for image in images[i : i + 1] if several and isinstance(value, list) else images:
-                        self._check_size(field, tuple(image.shape), name, one.image_size)
+                    shapes = [v.shape for v in value] if isinstance(value, list) else [value.shape[not batched :]]
+                    for shape in shapes[i : i + 1] if several and isinstance(value, list) else shapes:
+                        self._check_size(field, tuple(shape), name, one.image_size)
 
     def _check_size(self, field: str, shape: tuple[int, ...], name: str, size: tuple[int, int]) -> None:
         if shape[-2:] == size:

@@ -579,8 +579,11 @@ class Between:
         call = _Lattices(*self._given, POSITIONS, *self._size, *rows, *asked, *how, *more)
         if self._run("camtorch_lattices", call, cameras):
             return None
-        found = kept[: sizes[0]].view(dtype).view(2, most, 8, 8)[:, : _kept.counters[1]].clone()
-        return Lattices(result.as_strided((cameras, 2, n + 5, m + 5), (2 * count, count, m + 5, 1)), cells, found)
+        if count := _kept.counters[1]:
+            found = kept[: sizes[0]].view(dtype).view(2, most, 8, 8)[:, :count].clone()
+        else:
+            found = torch.empty(2, 0, 8, 8, dtype=dtype, device="cpu")
+        return Lattices(result.as_strided((cameras, 2, n + 5, m + 5), (*result.stride()[:2], m + 5, 1)), cells, found)
 
     def _run(self, name: str, call: bytes, tiles: int) -> int:
         """Flags of what is not made. call: whose next tile, and number of places, are this thread's counters."""

@@ -28,8 +28,8 @@ def between(start: Camera, end: Camera, rotation: Tensor | None, like: Tensor) -
     if made is None:
         return None
     (one, other), is_batch = made
-    rotation = None if rotation is None else rotation.detach().to(like.dtype)
-    is_batch = is_batch or (rotation is not None and rotation.ndim == 3)
+    if rotation is not None:
+        is_batch, rotation = is_batch or rotation.ndim == 3, rotation.to(like.dtype)
     return Between(one, other, rotation, end._size_for("Warp"), is_batch)
 
 
@@ -42,8 +42,7 @@ def moved_pixels(
     if isinstance(pixels, Tensor) and pixels.ndim > 0 and pixels.shape[-1] == 2:
         ready = between(start, end, rotation, pixels)
         if ready is not None and ((pixels.ndim > 1 and len(pixels) == ready.cameras) or not ready.is_batch):
-            rows = pixels.detach().reshape(ready.cameras, -1, 2)
-            moved, valid = ready.rows(rows, ON_IMAGE if on_image else PIXELS)
+            moved, valid = ready.rows(pixels.reshape(ready.cameras, -1, 2), ON_IMAGE if on_image else PIXELS)
             return moved.view(pixels.shape), valid.view(pixels.shape[:-1])
     rays, has_ray = rays_of(start, pixels)
     moved, mapped = seen_by(end, turn(rotation, rays, "pixels"))

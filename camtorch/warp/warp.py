@@ -150,6 +150,18 @@ class Warp(GeometryModule):
                 "Warp: source, target, rotation and shutters may each have one batch dim, of one size; "
                 f"got {', '.join(map(str, shapes))}"
             )
+        self._set(source, target, options, shutter, target_shutter)
+        self.turned_by(rotation)
+
+    def _set(
+        self,
+        source: Camera,
+        target: Camera,
+        options: Options,
+        shutter: RollingShutter | None = None,
+        target_shutter: RollingShutter | None = None,
+    ) -> None:
+        parts = (source, target, shutter, target_shutter)
         super().__init__(
             source=source,
             target=target,
@@ -160,13 +172,26 @@ class Warp(GeometryModule):
             _tolerance=options["tolerance"],
             shutter=shutter,
             target_shutter=target_shutter,
-            batch_shape=batch,
+            batch_shape=broadcast_shapes(*[part.batch_shape for part in parts if part is not None]),
             _memos={},
             _pinned=None,
             _constants=Memo(),
         )
-        self._set_rotation(rotation)
         seam_of(source)  # while its values may be looked at: traced code asks for it too
+
+    @classmethod
+    def unchecked(cls, *given: Any) -> Self:
+        """A warp, without a rotation as yet, of arguments as of `_set` that are known to be right."""
+        warp = cls.__new__(cls)
+        warp._set(*given)
+        return warp
+
+    def turned_by(self, rotation: Tensor | None) -> Self:
+        """This warp, made without a rotation, with one that is not checked: (3, 3) or (B, 3, 3)."""
+        self.put("rotation", rotation, persistent=rotation is not None and not rotation.requires_grad)
+        if rotation is not None and rotation.shape[:-2] != self.batch_shape:
+            self.batch_shape = broadcast_shapes(self.batch_shape, rotation.shape[:-2])
+        return self
 
     @property
     def tolerance(self) -> float:
@@ -175,16 +200,6 @@ class Warp(GeometryModule):
             return self._tolerance
         single = all(camera.intrinsics.dtype == torch.float32 for camera in (self.source, self.target))
         return _SINGLE if single else 0.0
-
-    def _set_rotation(self, rotation: Tensor | None) -> None:
-        self.put("rotation", rotation, persistent=rotation is not None and not rotation.requires_grad)
-
-    def turned_by(self, rotation: Tensor | None) -> Self:
-        """This warp, made without a rotation, with one that is not checked: (3, 3) or (B, 3, 3)."""
-        self._set_rotation(rotation)
-        if rotation is not None and rotation.shape[:-2] != self.batch_shape:
-            self.batch_shape = broadcast_shapes(self.batch_shape, rotation.shape[:-2])
-        return self
 
     # -- images
 
