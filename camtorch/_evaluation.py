@@ -7,7 +7,6 @@ import warnings
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from functools import partial
-from itertools import chain
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -122,10 +121,12 @@ def compiled_of(cameras: Sequence[Camera], *values: Tensor) -> tuple[list[Native
     None where `evaluated` would take another regime, where the result would have a graph, and of cameras that are more
     than one model, or behind a shutter.
     """
-    if any(not isinstance(camera, nn.Module) or camera.is_mixed for camera in cameras):
-        return None
-    pairs, dtype, is_batch = [camera._tensors for camera in cameras], values[0].dtype, False
-    inputs = [*values, *chain.from_iterable(pairs)]
+    pairs, dtype, is_batch, inputs = [], values[0].dtype, False, [*values]
+    for camera in cameras:
+        if not isinstance(camera, nn.Module) or camera.is_mixed:
+            return None
+        pairs.append(camera._tensors)
+        inputs += pairs[-1]
     if not (dtype.is_floating_point and is_eager(*inputs)):
         return None
     if torch.is_grad_enabled() and any(t.requires_grad for t in inputs):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from operator import methodcaller
 from typing import TYPE_CHECKING, Any, ClassVar, ParamSpec, TypeVar, cast
 
 import torch
@@ -35,14 +36,13 @@ def typed_as(forward: Callable[P, R]) -> Callable[[Callable[..., Any]], Callable
 
 
 _BARE = nn.Module().__dict__
-_CONTAINERS = [(name, type(value)) for name, value in _BARE.items() if isinstance(value, (dict, set))]
+_CONTAINERS = {"_own": {}, **{name: value for name, value in _BARE.items() if isinstance(value, (dict, set))}}
+_copied = methodcaller("copy")
 
 
 def _containers() -> dict[str, Any]:
     """The empty dicts and sets of a module, each its own."""
-    state: dict[str, Any] = {name: make() for name, make in _CONTAINERS}
-    state["_own"] = {}
-    return state
+    return dict(zip(_CONTAINERS, map(_copied, _CONTAINERS.values()), strict=True))
 
 
 class GeometryModule(nn.Module):

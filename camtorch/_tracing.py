@@ -116,7 +116,8 @@ def is_eager(*tensors: Tensor) -> bool:
     """Whether nothing is traced, transformed or recorded, and all values are what lies in the CPU's memory."""
     if torch.compiler.is_compiling() or in_transform() or is_recorded() or forward_ad._current_level >= 0:
         return False
-    return all(map(in_memory, tensors))
+    keys_of = torch._C._dispatch_keys
+    return all(keys_of(tensor).raw_repr() == _PLAIN or in_memory(tensor) for tensor in tensors)
 
 
 def may_look(tensor: Tensor) -> bool:

@@ -368,7 +368,8 @@ class Augmentation(SampleTransform):
             target, rotation = scaled(target, factor), None if rotation is None else turned
             self._tell_of_too_few(found, self.min_filled)
             self._tell_of_zoom(source, target, factor, found)
-        more = self._like(source, {name: value for name, value in values.items() if name in self.beside_the_camera})
+        beside = self.beside_the_camera.intersection(values)
+        more = self._like(source, {name: values[name] for name in values if name in beside}) if beside else {}
         warp = self._warp(source, target, rotation, self._shutter(more))
         return Part(rows, warp, source, *self._seen_through(warp, more))
 
@@ -377,7 +378,7 @@ class Augmentation(SampleTransform):
         as one map then serves them all.
         """
         values = {name: value for name, value in draw.items() if name != "apply"}
-        if not source.batch_shape and all(len(value) == 1 or _are_alike(value) for value in values.values()):
+        if not source.batch_shape and (len(draw["apply"]) == 1 or all(map(_are_alike, values.values()))):
             values = {name: value[0] for name, value in values.items()}
         return values
 
@@ -388,8 +389,6 @@ class Augmentation(SampleTransform):
     @staticmethod
     def _like(source: Camera, values: Mapping[str, Any]) -> dict[str, Tensor]:
         """The values as tensors in the source's dtype and on its device."""
-        if not values:
-            return {}
         dtype = torch.promote_types(source.intrinsics.dtype, torch.float32)
         return {name: torch.as_tensor(value).to(source.intrinsics.device, dtype) for name, value in values.items()}
 

@@ -458,7 +458,7 @@ def as_one(camera: Camera | Sequence[Camera]) -> Camera:
 
 def alone(camera: Camera) -> Camera:
     """A batch of one as the camera that it holds, which serves any number of samples."""
-    return camera[0] if tuple(camera.batch_shape) == (1,) else camera
+    return camera[0] if camera.batch_shape == (1,) else camera
 
 
 def _eye(like: Tensor) -> Tensor:

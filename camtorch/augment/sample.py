@@ -454,13 +454,14 @@ class SampleTransform(nn.Module):
                 if not predicted:
                     check_values(found, which, item, self._name)
             value = items if several else value if batched else value.unsqueeze(0)
-            named[name], count = (found, value), len(value) if count < 0 else count
-            if len(value) != count:
-                raise ValueError(f"{self._name}: {name} is of {len(value)} samples, other fields are of {count}")
+            own = len(value) if several else value.shape[0]
+            named[name], count = (found, value), own if count < 0 else count
+            if own != count:
+                raise ValueError(f"{self._name}: {name} is of {own} samples, other fields are of {count}")
         self._check_cameras(camera, count, named, batched)
         tensors = (v for _, value in named.values() for v in (value if isinstance(value, list) else [value]))
-        device = next((tensor.device for tensor in tensors), torch.device("cpu"))
-        camera = alone(as_one(camera))
+        first, camera = next(tensors, None), alone(as_one(camera))
+        device = torch.device("cpu") if first is None else first.device
         camera = camera if camera.intrinsics.device == device else camera.each(lambda t: t.to(device))
         return named, batched, count, camera
 

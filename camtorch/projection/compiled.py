@@ -347,7 +347,7 @@ class Native:
         """See `native_of`."""
         self._lenses, self.plan, self.struct = lenses, lenses.plan, _Cameras.from_buffer_copy(lenses.struct)
         self._kept = intrinsics.contiguous(), None if usable is None else (usable > 0).contiguous()
-        self.cameras, self.dtype, self.parameters = len(intrinsics), intrinsics.dtype, lenses.plan.parameters
+        self.cameras, self.dtype, self.parameters = intrinsics.shape[0], intrinsics.dtype, lenses.plan.parameters
         self.struct.intrinsics, self.struct.usable = map(_address, self._kept)
         self.pointer = addressof(self.struct)
 
@@ -374,7 +374,7 @@ def native_of(
         usable: the mask (C, 1) of the cameras that are usable, None if all are.
         domain: makes that of the lenses, for what the compiled geometry does not do.
     """
-    if library() is None or not intrinsics.is_cpu or not len(k):
+    if library() is None or not intrinsics.is_cpu or not k.shape[0]:
         return None
     plan = _plan(optics_of, k)
     return None if plan is None else Native(_lenses_of(plan, optics_of, k, domain), intrinsics, usable)
@@ -614,7 +614,7 @@ def _kept_memory(count: int) -> Tensor:
     """At least so many bytes, for this call of this thread: the same memory as before, unless they are many."""
     if count > _MOST_KEPT:
         return torch.empty(count, dtype=torch.uint8, device="cpu")
-    if _kept.memory is None or len(_kept.memory) < count:
+    if _kept.memory is None or _kept.memory.shape[0] < count:
         with torch.inference_mode(False):
             _kept.memory = torch.empty(count, dtype=torch.uint8, device="cpu")
     return _kept.memory
@@ -623,7 +623,7 @@ def _kept_memory(count: int) -> Tensor:
 def _rows_of(pixels: Tensor) -> tuple[int, int, int, int]:
     """Where pixels (C or 1, N, 2) lie, and their strides."""
     camera, point, component = pixels.stride()
-    return pixels.data_ptr(), camera if len(pixels) > 1 else 0, point, component
+    return pixels.data_ptr(), camera if pixels.shape[0] > 1 else 0, point, component
 
 
 def _empty(size: tuple[int, int, int], dtype: torch.dtype) -> Tensor:

@@ -41,7 +41,7 @@ def moved_pixels(
     """
     if isinstance(pixels, Tensor) and pixels.ndim > 0 and pixels.shape[-1] == 2:
         ready = between(start, end, rotation, pixels)
-        if ready is not None and ((pixels.ndim > 1 and len(pixels) == ready.cameras) or not ready.is_batch):
+        if ready is not None and ((pixels.ndim > 1 and pixels.shape[0] == ready.cameras) or not ready.is_batch):
             moved, valid = ready.rows(pixels.reshape(ready.cameras, -1, 2), ON_IMAGE if on_image else PIXELS)
             return moved.view(pixels.shape), valid.view(pixels.shape[:-1])
     rays, has_ray = rays_of(start, pixels)
