@@ -89,7 +89,8 @@ def _held(name: str, doc: str) -> Any:
             found = buffers.get(name)
             if found is None:
                 raise AttributeError(f"{type(camera).__name__} has no {name}")
-        return with_frozen(found, buffers[of_frozen]) if of_frozen in buffers else found
+        frozen = buffers.get(of_frozen)
+        return found if frozen is None else with_frozen(found, frozen)
 
     of_frozen = PREFIX + name
     return property(tensor, doc=doc)

@@ -454,7 +454,7 @@ class SampleTransform(nn.Module):
                 if not predicted:
                     check_values(found, which, item, self._name)
             value = items if several else value if batched else value.unsqueeze(0)
-            own = len(value) if several else value.shape[0]
+            own = len(items) if several else items[0].shape[0] if batched else 1
             named[name], count = (found, value), own if count < 0 else count
             if own != count:
                 raise ValueError(f"{self._name}: {name} is of {own} samples, other fields are of {count}")

@@ -174,7 +174,6 @@ def classify(
     count, rows, columns = nodes.shape[0], nodes.shape[2] - 5, nodes.shape[3] - 5
     cells = torch.empty(count, rows, columns, dtype=torch.int32, device="cpu")
     scratch = torch.empty(SCRATCH * (columns + 8), dtype=torch.float32, device="cpu")
-    given = (nodes, *nodes.stride()[:2]), (mapped, mapped.stride(0)), (rim, rim.stride(0))
-    places = [part if isinstance(part, int) else part.data_ptr() for parts in given for part in parts]
-    asked = (*places, count, rows, columns, *size, *source, tolerance, PADDINGS[padding])
+    places = *nodes.stride()[:2], mapped.data_ptr(), mapped.stride(0), rim.data_ptr(), rim.stride(0)
+    asked = (nodes.data_ptr(), *places, count, rows, columns, *size, *source, tolerance, PADDINGS[padding])
     return cells, native.camtorch_classify(_Classification(*asked, cells.data_ptr(), scratch.data_ptr()))

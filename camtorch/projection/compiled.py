@@ -590,7 +590,7 @@ class Between:
         run, threads, counters = _entry(name, c_int64), min(thread_count(), tiles) if tiles > 1 else 1, _kept.counters
         while True:
             left: list[int] = []
-            counters[:] = 0, 0
+            counters[:] = [0, 0]
             spread(lambda: left.append(run(call)), threads)  # noqa: B023 (which is called at once)
             flags = functools.reduce(operator.or_, left)
             if not flags & (_LEFT_FROM | _LEFT_TO):
