@@ -85,6 +85,8 @@ def _held(name: str, doc: str) -> Any:
     def tensor(camera: Camera) -> Tensor:
         found: Tensor | None = camera._parameters.get(name)
         buffers = camera._buffers
+        if found is not None and not buffers:
+            return found
         if found is None:
             found = buffers.get(name)
             if found is None:
