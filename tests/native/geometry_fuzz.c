@@ -122,7 +122,8 @@ static int moved(const Cameras *cameras, int64_t tile) {
         const int64_t camera = at / (2 * n), point = at / 2 % n;
         const int64_t place = camera * move.result_strides[0] + point * move.result_strides[1] + at % 2 * move.result_strides[2];
         const double value = d ? ((double *)results)[place] : ((float *)results)[place];
-        fine &= fits || ((uint8_t *)valid)[camera * n + point] == 1 || isfinite(value);
+        /* what is moved off the image has its place, which may be too far for a number */
+        fine &= fits || move.form == ON_IMAGE || ((uint8_t *)valid)[camera * n + point] == 1 || isfinite(value);
     }
     free(turns), free(narrow), free(valid), free(pixels), free(results);
     return fine;
