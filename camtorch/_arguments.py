@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from camtorch._tracing import has_tangent, in_graph, in_transform, is_concrete, is_recorded, keeps_graph, may_look
+from camtorch._tracing import in_graph, is_concrete, is_eager, keeps_graph, may_look
 
 Numbers: TypeAlias = "Tensor | np.ndarray[Any, Any] | np.number[Any] | float | list[Any] | tuple[Any, ...]"
 """What users pass as numbers: a tensor, an array, a number, or lists of them."""
@@ -70,9 +70,7 @@ def values_of(tensor: Tensor) -> Tensor | None:
 
 def are_numbers(*tensors: Tensor) -> bool:
     """Whether nothing records what is computed of tensors, which lie in the CPU's memory and may be looked at."""
-    if torch.compiler.is_compiling() or in_transform() or is_recorded() or keeps_graph(*tensors):
-        return False
-    return all(t.is_cpu and type(t) in _PLAIN and not has_tangent(t) for t in tensors)
+    return is_eager(*tensors) and not keeps_graph(*tensors) and all(type(t) in _PLAIN for t in tensors)
 
 
 _PLAIN = Tensor, nn.Parameter

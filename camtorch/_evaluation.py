@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -23,6 +24,7 @@ from camtorch._tracing import (
     in_memory,
     in_transform,
     is_concrete,
+    is_eager,
     is_exporting,
     is_recorded,
     keeps_graph,
@@ -96,7 +98,7 @@ def evaluated(
                 "What a frozen camera or warp keeps is a constant: camera.rays() and warp(images), with "
                 "requires_grad_(False) and called once before the export"
             )
-        if rows.is_cpu and in_memory(rows) and not is_recorded():
+        if in_memory(rows) and not is_recorded():
             cameras = cameras_of(intrinsics, distortion)
             if (made := cameras.native) is not None:
                 learns = rows.requires_grad or intrinsics.requires_grad or distortion.requires_grad
@@ -112,31 +114,37 @@ def evaluated(
     return direction.traced(type(camera), *inputs, cameras_of(*inputs[1:]) if known else None, order)
 
 
-def compiled_of(cameras: Sequence[Camera], *values: Tensor) -> list[Native] | None:
-    """The compiled geometry of cameras (B,), or of one, each, for values of the dtype of the first of them.
+def compiled_of(cameras: Sequence[Camera], *values: Tensor) -> tuple[list[Native], bool] | None:
+    """The compiled geometry of cameras (B,), or of one, each, for values of the dtype of the first of them; and whether
+    any of them is a batch.
 
     None where `evaluated` would take another regime, where the result would have a graph, and of cameras that are more
     than one model, or behind a shutter.
     """
-    inputs, dtype = [*values], values[0].dtype
+    pairs, dtype, is_batch, inputs = [], values[0].dtype, False, [*values]
     for camera in cameras:
-        if not isinstance(camera, nn.Module) or camera.is_mixed or len(camera.batch_shape) > 1:
+        if not isinstance(camera, nn.Module) or camera.is_mixed:
             return None
-        inputs += camera._tensors
-    if not _is_plain(inputs) or is_recorded() or not all(map(in_memory, inputs)):
+        pairs.append(camera._tensors)
+        inputs += pairs[-1]
+    if not (dtype.is_floating_point and is_eager(*inputs)):
         return None
     if torch.is_grad_enabled() and any(t.requires_grad for t in inputs):
         return None
-    if not dtype.is_floating_point or any(t.dtype != dtype for t in inputs[len(values) :]):
-        return None
     made = []
-    for camera in cameras:
-        lead = camera.batch_shape or (1,)
-        native = rows_of(camera, *(t.expand(*lead, t.shape[-1]) for t in camera._tensors)).native
+    for camera, (intrinsics, distortion) in zip(cameras, pairs, strict=True):
+        if intrinsics.dtype != dtype or distortion.dtype != dtype:
+            return None
+        if not intrinsics.ndim == distortion.ndim == 1:
+            batch, is_batch = camera.batch_shape, True
+            if len(batch) != 1:
+                return None
+            intrinsics, distortion = (t.expand(*batch, t.shape[-1]) for t in (intrinsics, distortion))
+        native = rows_of(camera, intrinsics, distortion).native
         if native is None:
             return None
         made.append(native)
-    return made
+    return made, is_batch
 
 
 class _Native(Function):
@@ -233,7 +241,8 @@ def new_cameras(memo: Memo, model: type[Camera], intrinsics: Tensor, distortion:
     if in_transform():  # what a transform makes dies with it
         return Cameras(model, intrinsics, distortion)
     # what inference mode makes could not be used in a graph later
-    with torch.inference_mode(False):
+    outside = torch.inference_mode(False) if torch.is_inference_mode_enabled() else nullcontext()
+    with outside:
         memo.result = cameras = Cameras(model, intrinsics, distortion)
     return cameras
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from operator import methodcaller
 from typing import TYPE_CHECKING, Any, ClassVar, ParamSpec, TypeVar, cast
 
 import torch
@@ -35,14 +36,13 @@ def typed_as(forward: Callable[P, R]) -> Callable[[Callable[..., Any]], Callable
 
 
 _BARE = nn.Module().__dict__
-_CONTAINERS = [(name, type(value)) for name, value in _BARE.items() if isinstance(value, (dict, set))]
+_CONTAINERS = {"_own": {}, **{name: value for name, value in _BARE.items() if isinstance(value, (dict, set))}}
+_copied = methodcaller("copy")
 
 
 def _containers() -> dict[str, Any]:
     """The empty dicts and sets of a module, each its own."""
-    state: dict[str, Any] = {name: make() for name, make in _CONTAINERS}
-    state["_own"] = {}
-    return state
+    return dict(zip(_CONTAINERS, map(_copied, _CONTAINERS.values()), strict=True))
 
 
 class GeometryModule(nn.Module):
@@ -324,7 +324,10 @@ def remade(module: Made, **changes: Any) -> Made:
     for name, tensor in tensors.items():
         if tensor.shape[-1]:
             tensor = fixed(tensor)
-            made.put(name, tensor if is_parameter(tensor) else _widened(tensor))
+            if is_parameter(tensor):
+                state["_parameters"][name] = state["_own"][name] = tensor
+            else:
+                made.put(name, _widened(tensor))
         else:
             made.put(name, tensor.detach() if tensor.requires_grad else tensor)
     return made
@@ -382,10 +385,10 @@ class Memo:
     capacity: int
     result: Any = None
     """The one that was asked for last, of whatever inputs."""
+    _kept: Sequence[tuple[tuple[Any, ...], list[Tensor], Any]] = ()  # the last one used is first
 
     def __init__(self, capacity: int = 1) -> None:
         self.capacity = capacity
-        self._kept: list[tuple[tuple[Any, ...], list[Tensor], Any]] = []  # the last one used is first
 
     def __call__(self, inputs: Sequence[Tensor], options: tuple[Any, ...], compute: Callable[[], Any]) -> Any:
         """`compute()` without a graph, or its kept result; it depends on the tensors `inputs` and on `options`."""
@@ -416,7 +419,7 @@ class Memo:
         return tuple(t.clone() for t in self(inputs, options, compute))
 
     def __getstate__(self) -> dict[str, Any]:
-        return {"capacity": self.capacity, "_kept": []}
+        return {"capacity": self.capacity}
 
 
 def same(a: Tensor, b: Tensor) -> bool:

@@ -129,12 +129,15 @@ def split(intrinsics: Tensor, xp: Any) -> Sequence[Any]:
     return intrinsics.tolist() if intrinsics.ndim == 1 else intrinsics.detach().double().numpy().T
 
 
+_FLOATS = {float, np.float64}
+
+
 def joined(numbers: Sequence[Any], like: Tensor, xp: Any) -> Tensor:
     """(*B, n) of n tensors (*B,); or of numbers and arrays, in the dtype of a tensor."""
     if xp is torch:
         return torch.stack(torch.broadcast_tensors(*numbers), -1).to(like.dtype)
     kind = np.float64 if like.dtype == torch.float64 else np.float32
-    if all(isinstance(number, float) for number in numbers):
+    if _FLOATS.issuperset(map(type, numbers)):
         return torch.from_numpy(np.array(numbers, kind))
     return torch.from_numpy(np.stack(np.broadcast_arrays(*numbers), -1).astype(kind))
 

@@ -87,7 +87,10 @@ def on_one_thread(function: Callable[P, R]) -> Callable[P, R]:
     def call(*args: P.args, **kwargs: P.kwargs) -> R:
         if torch.compiler.is_compiling() or _in_jit_trace() or _limits is None or _mine.threads:
             return function(*args, **kwargs)
-        _mine.threads = torch.get_num_threads()
+        threads = torch.get_num_threads()
+        if threads == 1:
+            return function(*args, **kwargs)
+        _mine.threads = threads
         openmp, mkl = _limits  # torch.set_num_threads reaches other threads as well
         openmp(1)
         of_mkl = mkl(1)  # which splits what torch has not split

@@ -112,6 +112,14 @@ def converted(tensor: Tensor, dtype: torch.dtype) -> Tensor:
         return tensor.to(dtype)
 
 
+def is_eager(*tensors: Tensor) -> bool:
+    """Whether nothing is traced, transformed or recorded, and all values are what lies in the CPU's memory."""
+    if torch.compiler.is_compiling() or in_transform() or is_recorded() or forward_ad._current_level >= 0:
+        return False
+    keys_of = torch._C._dispatch_keys
+    return all(keys_of(tensor).raw_repr() == _PLAIN or in_memory(tensor) for tensor in tensors)
+
+
 def may_look(tensor: Tensor) -> bool:
     """Whether the values may be looked at and that costs next to nothing, to take a shorter way with a whole block."""
     return tensor.is_cpu and is_concrete(tensor) and 0 not in tensor.shape

@@ -87,11 +87,14 @@ def _held(name: str, doc: str) -> Any:
 
     def tensor(camera: Camera) -> Tensor:
         found: Tensor | None = camera._parameters.get(name)
+        buffers = camera._buffers
+        if found is not None and not buffers:
+            return found
         if found is None:
-            found = camera._buffers.get(name)
+            found = buffers.get(name)
             if found is None:
                 raise AttributeError(f"{type(camera).__name__} has no {name}")
-        frozen = camera._buffers.get(of_frozen)
+        frozen = buffers.get(of_frozen)
         return found if frozen is None else with_frozen(found, frozen)
 
     of_frozen = PREFIX + name
@@ -306,10 +309,10 @@ class Camera(BatchedModule):
     @property
     def batch_shape(self) -> torch.Size:
         """*B, the batch dims of the parameters."""
-        intrinsics, distortion = self.intrinsics.shape, self.distortion.shape
-        if len(intrinsics) == len(distortion) == 1:
+        intrinsics, distortion = self.intrinsics, self.distortion
+        if intrinsics.ndim == distortion.ndim == 1:
             return _NO_BATCH
-        return broadcast_shapes(intrinsics[:-1], distortion[:-1])
+        return broadcast_shapes(intrinsics.shape[:-1], distortion.shape[:-1])
 
     @property
     def K(self) -> Tensor:  # noqa: N802 (the field's name for it)

@@ -117,17 +117,19 @@ def draw(
     rows = min(count, 1) if same else count
     device = generator.device if generator is not None else torch.device("cpu")
     gate: Any = torch.rand(rows, generator=generator, device=device) < p if 0 < p < 1 else None
-    gate = torch.full((rows,), p >= 1, device=device) if gate is None else gate
-    sizes = [rows * (interval.size or 1) for interval in ranges.values()]
+    total = rows * sum(interval.size or 1 for interval in ranges.values())
     # in float64, so that what is drawn is what every precision sees
-    shares: Any = torch.rand(sum(sizes), generator=generator, dtype=torch.float64, device=device) if sizes else gate
+    shares: Any = torch.rand(total, generator=generator, dtype=torch.float64, device=device)
     if device.type == "cpu" and not torch.compiler.is_compiling():
-        gate, shares = gate.numpy(), shares.numpy()
+        gate, shares = np.array([p >= 1] * rows, dtype=bool) if gate is None else gate.numpy(), shares.numpy()
+    elif gate is None:
+        gate = torch.full((rows,), p >= 1, device=device)
     values, start = {"apply": gate}, 0
-    for (name, interval), size in zip(ranges.items(), sizes, strict=True):
-        value = interval.low + (interval.high - interval.low) * shares[start : start + size]
-        values[name] = value if interval.size is None else value.reshape(rows, interval.size)
-        start += size
+    for name, interval in ranges.items():
+        shape = (rows,) if interval.size is None else (rows, interval.size)
+        end = start + math.prod(shape)
+        values[name] = interval.low + (interval.high - interval.low) * shares[start:end].reshape(shape)
+        start = end
     return values if rows == count else {name: value[[0] * count] for name, value in values.items()}
 
 
@@ -366,7 +368,8 @@ class Augmentation(SampleTransform):
             target, rotation = scaled(target, factor), None if rotation is None else turned
             self._tell_of_too_few(found, self.min_filled)
             self._tell_of_zoom(source, target, factor, found)
-        more = self._like(source, {name: value for name, value in values.items() if name in self.beside_the_camera})
+        beside = self.beside_the_camera.intersection(values)
+        more = self._like(source, {name: values[name] for name in values if name in beside}) if beside else {}
         warp = self._warp(source, target, rotation, self._shutter(more))
         return Part(rows, warp, source, *self._seen_through(warp, more))
 
@@ -375,7 +378,7 @@ class Augmentation(SampleTransform):
         as one map then serves them all.
         """
         values = {name: value for name, value in draw.items() if name != "apply"}
-        if not source.batch_shape and all(len(value) == 1 or _are_alike(value) for value in values.values()):
+        if not source.batch_shape and (len(draw["apply"]) == 1 or all(map(_are_alike, values.values()))):
             values = {name: value[0] for name, value in values.items()}
         return values
 
@@ -475,7 +478,7 @@ class Augmentation(SampleTransform):
         if change.count != count:
             raise ValueError(f"{self._name}: the draw is for {change.count} samples, here are {count}")
         if not torch.compiler.is_compiling():
-            self.last = change
+            self.__dict__["last"] = change  # as nn.Module would, after some questions
             if count and any(found == "image" for found, _ in named.values()):
                 self.tell_of_empty_images(camera)
         return self._moved(sample, named, batched, change)

@@ -317,7 +317,7 @@ class Change:
                 colours = enumerate(zip((red, warp, blue), fills, strict=True))
                 moved = torch.cat([w.pin()(rows[:, i : i + 1], fill=fill, **options) for i, (w, fill) in colours], 1)
             else:
-                moved = warp.pin()(rows, **options)
+                moved = warp.pin().forward(rows, **options)
             return moved if part.light is None else narrow(widen(moved) * part.light.to(moved.device), rows.dtype)
 
         return self.each(images, move, lambda camera, rows: rows)
@@ -326,7 +326,7 @@ class Change:
         """Masks (count, C, H, W) of any dtype, the nearest value of each; `fill` where nothing is seen."""
 
         def move(part: Part, warp: Warp, rows: Tensor) -> Tensor:
-            return warp.pin()(rows, mode=mode, padding_mode="zeros", fill=fill)
+            return warp.pin().forward(rows, mode=mode, padding_mode="zeros", fill=fill)
 
         return self.each(masks, move, lambda camera, rows: rows)
 
@@ -458,7 +458,7 @@ def as_one(camera: Camera | Sequence[Camera]) -> Camera:
 
 def alone(camera: Camera) -> Camera:
     """A batch of one as the camera that it holds, which serves any number of samples."""
-    return camera[0] if tuple(camera.batch_shape) == (1,) else camera
+    return camera[0] if camera.batch_shape == (1,) else camera
 
 
 def _eye(like: Tensor) -> Tensor:

@@ -236,10 +236,11 @@ def _tensor(array: Array) -> Tensor:
     """A tensor in the memory of an array, where torch can read it there; for reading alone."""
     # torch takes neither other byte orders nor long doubles, nor strides that are negative or end within a number
     dtype = array.dtype.newbyteorder("=") if array.dtype.itemsize <= 8 else np.dtype(np.float64)
-    whole = array.flags.aligned and all(step >= 0 and step % array.itemsize == 0 for step in array.strides)
+    flags, steps = array.flags, array.strides
+    whole = flags.aligned and (flags.c_contiguous or all(step >= 0 and step % array.itemsize == 0 for step in steps))
     if array.dtype != dtype or not whole:
         return torch.from_numpy(_dense(array, dtype))
-    return torch.from_numpy(array if array.flags.writeable else np.asarray(_Lent(array)))
+    return torch.from_numpy(array if flags.writeable else np.asarray(_Lent(array)))
 
 
 def _dense(array: Array, dtype: np.dtype[Any]) -> Array:

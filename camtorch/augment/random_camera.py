@@ -44,6 +44,7 @@ _SMALL = 0.1  # decentering, prism and tilt, whose images are lopsided, move les
 _STEP = 1e-4
 _PARTS = 1.0, -1.0, 0.5, -0.5, 0.25, -0.25, 0.125, -0.125  # of a step, in the order in which they are tried
 _REAL = "real"
+_TURNS = "yaw", "pitch", "roll"
 _SHIFTS = "shift_x", "shift_y", "shift_z"
 _DEPTHS = {"depth": "of_depth", "distance": "of_distance"}
 """Fields of samples that say how far away things are, and their names in a draw."""
@@ -205,25 +206,26 @@ class RandomCamera(Augmentation):
         lens = () if self.like is None else self.like._tensors
         if are_numbers(*source._tensors, *lens) and not any(isinstance(value, Tensor) for value in values.values()):
             # a hundred operations on some numbers, for each of which torch takes microseconds
-            return self._made(source, values, np)
+            of_one = all(isinstance(values.get(name, 0.0), float) for name in (*_TURNS, "fov"))
+            return self._made(source, values, math if of_one else np)
         like = wide(source.intrinsics.detach())
         return self._made(source, {name: torch.as_tensor(value).to(like) for name, value in values.items()}, torch)
 
     def _made(self, source: Camera, values: Mapping[str, Any], xp: Any) -> tuple[Camera, Tensor | None]:
-        """The same by tensors, or by arrays in float64, with the functions of torch or of numpy."""
+        """The same by tensors, arrays in float64, or numbers: with the functions of torch, of numpy or of math."""
         target = self._target(source, values, xp)
-        names = "yaw", "pitch", "roll"
-        if not any(name in values for name in names):
+        none = next((0 * values[name] for name in _TURNS if name in values), None)
+        if none is None:
             return target, None
-        angle = next(values[name] for name in names if name in values)
-        angles = [xp.deg2rad(values.get(name, 0 * angle)) for name in names]
+        angles = [values.get(name, none) * (math.pi / 180) for name in _TURNS]
         elements = mount_elements([xp.cos(a) for a in angles], [xp.sin(a) for a in angles])
-        return target, joined(elements, source.intrinsics, xp).unflatten(-1, (3, 3))
+        rotation = joined(elements, source.intrinsics, xp)
+        return target, rotation.view(*rotation.shape[:-1], 3, 3)
 
     def _warp(
         self, source: Camera, target: Camera, rotation: Tensor | None, shutter: RollingShutter | None = None
     ) -> Warp:
-        return Warp(source, target, **self.options, target_shutter=shutter).turned_by(rotation)
+        return Warp.unchecked(source, target, self.options, None, shutter).turned_by(rotation)
 
     def _seen_through(self, warp: Warp, values: Mapping[str, Tensor]) -> tuple[tuple[Warp, Warp] | None, Tensor | None]:
         shades = light = None
@@ -348,7 +350,7 @@ def _sized(base: Camera, size: tuple[int, int], fov: Any, xp: Any) -> Sequence[A
         cx, cy = (cx - (width - 1) / 2) * scale + across, (cy - (height - 1) / 2) * scale + down
     if fov is None:
         return fx, fy, cx, cy
-    half = xp.deg2rad(fov / 2)
+    half = fov * (math.pi / 360)
     sine, cosine = xp.sin(half), xp.cos(half)
     ends = [joined((end, 0 * sine, cosine), base.intrinsics, xp) for end in (-sine, sine)]
     rays = torch.stack(ends, -2)

@@ -454,13 +454,14 @@ class SampleTransform(nn.Module):
                 if not predicted:
                     check_values(found, which, item, self._name)
             value = items if several else value if batched else value.unsqueeze(0)
-            named[name], count = (found, value), len(value) if count < 0 else count
-            if len(value) != count:
-                raise ValueError(f"{self._name}: {name} is of {len(value)} samples, other fields are of {count}")
+            own = len(items) if several else items[0].shape[0] if batched else 1
+            named[name], count = (found, value), own if count < 0 else count
+            if own != count:
+                raise ValueError(f"{self._name}: {name} is of {own} samples, other fields are of {count}")
         self._check_cameras(camera, count, named, batched)
         tensors = (v for _, value in named.values() for v in (value if isinstance(value, list) else [value]))
-        device = next((tensor.device for tensor in tensors), torch.device("cpu"))
-        camera = alone(as_one(camera))
+        first, camera = next(tensors, None), alone(as_one(camera))
+        device = torch.device("cpu") if first is None else first.device
         camera = camera if camera.intrinsics.device == device else camera.each(lambda t: t.to(device))
         return named, batched, count, camera
 
@@ -482,9 +483,9 @@ class SampleTransform(nn.Module):
                 raise ValueError(f"{self._name}: {name} has batch dims {shape}, the samples are {count}")
             for field, (found, value) in named.items():
                 if found in IMAGES:
-                    images = value if isinstance(value, list) else [value if batched else value[0]]
-                    for image in images[i : i + 1] if several and isinstance(value, list) else images:
-                        self._check_size(field, tuple(image.shape), name, one.image_size)
+                    shapes = [v.shape for v in value] if isinstance(value, list) else [value.shape[not batched :]]
+                    for shape in shapes[i : i + 1] if several and isinstance(value, list) else shapes:
+                        self._check_size(field, tuple(shape), name, one.image_size)
 
     def _check_size(self, field: str, shape: tuple[int, ...], name: str, size: tuple[int, int]) -> None:
         if shape[-2:] == size:

@@ -495,7 +495,7 @@ def _pixel_jacobians(camera: Camera, points: Tensor, learns: bool) -> tuple[Tens
     """
     if not learns and (made := compiled_of([camera], points)) is not None:
         ones = torch.eye(2, dtype=points.dtype, device="cpu")[:, :, None, None].expand(2, 2, *points.shape[:2])
-        rows = [compiled.project_vjp(made[0], points, one, True, False)[0] for one in ones]
+        rows = [compiled.project_vjp(made[0][0], points, one, True, False)[0] for one in ones]
         by_point = torch.stack([row for row in rows if row is not None], -2)
         return by_point.nan_to_num(0.0, 0.0, 0.0), points.new_zeros(*by_point.shape[:-1], 0)
     intrinsics = camera.intrinsics.view(-1, 4)

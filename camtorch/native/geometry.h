@@ -101,8 +101,9 @@ typedef struct {
     int64_t *next; /* the tile that whoever is free takes; NULL: one caller takes all */
 } Rows;
 
-/* What is made of pixels that are moved: positions as of grid_sample, OUTSIDE where there is none; or pixels, -1 there */
-enum { POSITIONS, PIXELS };
+/* What is made of pixels that are moved: positions as of grid_sample, OUTSIDE where there is none; or pixels, -1 there, of
+   which ON_IMAGE leaves those on the image of `to` valid alone */
+enum { POSITIONS, PIXELS, ON_IMAGE };
 /* What is left to do: pixels wait for the extent of `from`, points for the limits of `to`; most cells of a lattice want
    exact positions */
 enum { LEFT_FROM = 1, LEFT_TO = 2, LEFT_MOST = 4 };
@@ -114,7 +115,7 @@ enum { LEFT_FROM = 1, LEFT_TO = 2, LEFT_MOST = 4 };
 typedef struct {
     const Cameras *from, *to;
     const void *turns;   /* (c, 3, 3), or NULL */
-    int64_t turn_stride; /* 0: one for all */
+    int64_t turn_strides[3]; /* by camera, 0 for one that serves all; by row and column */
     int64_t cameras, form;
     double height, width; /* of the image of `to` */
     const void *rows;     /* pixels (c, n) and results, strides as of `Rows` */
@@ -130,7 +131,7 @@ typedef struct {
    are those of the first camera */
 typedef struct {
     Move move;
-    const Classification *cells;
+    Classification cells;
     int64_t first_row; /* of the target, where cells begin */
     float *narrow;     /* (c, 2, nodes), the nodes in float, or NULL: they are */
     /* (2, c rows columns, 8, 8): positions of all pixels of the cells that `classify` leaves, NaN where there is none,

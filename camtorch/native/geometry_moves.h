@@ -11,8 +11,10 @@ static void T(between)(const Move *move, int64_t index, T(Between) *b) {
     if (b->index == index) return;
     if (is_first || move->from->cameras > 1) T(prepare)(move->from, move->from->cameras > 1 ? index : 0, &b->from);
     if (is_first || move->to->cameras > 1) T(prepare)(move->to, move->to->cameras > 1 ? index : 0, &b->to);
-    if (move->turns && (is_first || move->turn_stride))
-        memcpy(b->turn, (const R *)move->turns + index * move->turn_stride, sizeof b->turn);
+    const int64_t *strides = move->turn_strides;
+    if (move->turns && (is_first || strides[0]))
+        for (int i = 0; i < 9; i++)
+            b->turn[i] = ((const R *)move->turns)[index * strides[0] + i / 3 * strides[1] + i % 3 * strides[2]];
     b->index = index;
 }
 
@@ -48,6 +50,10 @@ static int T(moved)(const Move *move, const T(Between) *b, int count, int n, R *
         return left;
     }
     EACH(i) u[i] = ok[i] ? u[i] : -1, v[i] = ok[i] ? v[i] : -1;
+    if (move->form == ON_IMAGE) {
+        const R low = (R)-0.5, right = (R)(move->width - 0.5), below = (R)(move->height - 0.5);
+        EACH(i) ok[i] &= (u[i] >= low) & (u[i] <= right) & (v[i] >= low) & (v[i] <= below);
+    }
     return left;
 }
 
@@ -86,7 +92,7 @@ static int64_t T(moves)(const Move *move) {
 /* All pixels of some cells, `number` of the first one; where what is mapped ends in one, those around it are next */
 static int T(squares)(const Lattices *given, const T(Between) *b, int32_t *cells, const int64_t *places, int count,
                       int64_t number) {
-    const int64_t rows = given->cells->rows, columns = given->cells->columns;
+    const int64_t rows = given->cells.rows, columns = given->cells.columns;
     const int n = count * SQUARE;
     ALIGNED R u[BLOCK], v[BLOCK];
     ALIGNED I ok[BLOCK];
@@ -115,7 +121,7 @@ static int T(squares)(const Lattices *given, const T(Between) *b, int32_t *cells
 
 static int T(lattice)(const Lattices *given, int64_t camera, T(Between) *b) {
     const Move *move = &given->move;
-    Classification asked = *given->cells;
+    Classification asked = given->cells;
     const int64_t cells = asked.rows * asked.columns, nodes = (asked.rows + 5) * (asked.columns + 5);
     const R *at = (const R *)move->results + camera * move->result_strides[0];
     int left = 0;

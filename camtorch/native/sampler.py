@@ -5,9 +5,8 @@ from __future__ import annotations
 import ctypes
 import functools
 import math
+import struct
 from collections.abc import Sequence
-from ctypes import addressof, byref, c_double, c_float, c_int32, c_int64, c_void_p
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -20,75 +19,17 @@ EMPTY, CUBIC, TODO = -2, -1, 0
 """Cells of a lattice: one that shows nothing, one between whose nodes lie cubics, one that wants exact positions."""
 
 _MODES = {"nearest": 0, "bilinear": 1, "bicubic": 2}
-_PADDINGS = {"zeros": 0, "border": 1, "reflection": 2}
+PADDINGS = {"zeros": 0, "border": 1, "reflection": 2}
 _TYPES = {torch.uint8: 0, torch.bool: 1, torch.uint16: 2, torch.float32: 3}
 _BYTES = {1: 4, 2: 5, 4: 6, 8: 7}
 _TILE = 1 << 15  # pixels of a tile, some 0.1 ms a channel
+_packed = struct.Struct("35q4iq").pack  # `Job` of sampler.h
+_Job = ctypes.c_char * struct.calcsize("35q4iq")
+CLASSIFICATION = "12q3di2q"
+"""`Classification` of sampler.h."""
+_Classification = struct.Struct(CLASSIFICATION).pack
+SCRATCH = 25  # numbers of float32 for each column of a lattice and eight more
 _WORTH = 8  # pixels that may be copied for one that is made: interpolated one by one they would take longer
-
-
-class _Job(ctypes.Structure):
-    """`Job` of sampler.h."""
-
-    _fields_ = (
-        ("source", c_void_p),
-        ("result", c_void_p),
-        ("source_strides", c_int64 * 4),
-        ("result_strides", c_int64 * 4),
-        ("count", c_int64),
-        ("channels", c_int64),
-        ("source_height", c_int64),
-        ("source_width", c_int64),
-        ("height", c_int64),
-        ("width", c_int64),
-        ("fill", c_void_p),
-        ("fill_elements", c_void_p),
-        ("grid", c_void_p),
-        ("grid_strides", c_int64 * 4),
-        ("grid_is_double", c_int64),
-        ("mapped", c_void_p),
-        ("mapped_stride", c_int64),
-        ("nodes", c_void_p),
-        ("node_strides", c_int64 * 2),
-        ("cells", c_void_p),
-        ("cell_stride", c_int64),
-        ("rows", c_int64),
-        ("columns", c_int64),
-        ("exact", c_void_p),
-        ("exact_stride", c_int64),
-        ("type", c_int32),
-        ("mode", c_int32),
-        ("padding", c_int32),
-        ("tile_rows", c_int32),
-        ("next", c_int64),
-    )
-
-
-class _Classification(ctypes.Structure):
-    """`Classification` of sampler.h."""
-
-    memory: Tensor
-    """That of its scratch."""
-
-    _fields_ = (
-        ("nodes", c_void_p),
-        ("node_strides", c_int64 * 2),
-        ("mapped", c_void_p),
-        ("mapped_stride", c_int64),
-        ("rim", c_void_p),
-        ("rim_stride", c_int64),
-        ("count", c_int64),
-        ("rows", c_int64),
-        ("columns", c_int64),
-        ("height", c_int64),
-        ("width", c_int64),
-        ("source_height", c_double),
-        ("source_width", c_double),
-        ("tolerance", c_double),
-        ("padding", c_int32),
-        ("cells", c_void_p),
-        ("scratch", c_void_p),
-    )
 
 
 def takes(dtype: torch.dtype, mode: str) -> bool:
@@ -144,33 +85,27 @@ def sample(
         if not fits:
             result.copy_(made)
         return
-    job = _Job()
-    job.source, job.source_strides = images.data_ptr(), steps
-    job.result, job.result_strides = result.data_ptr(), made_steps
-    job.count, job.channels, job.height, job.width = count, channels, height, width
-    job.source_height, job.source_width = images.shape[-2:]
-    values = (c_float * channels)(*fill)
-    elements = None if images.dtype == torch.float32 else _elements(tuple(fill), images.dtype)
-    job.fill = addressof(values)
-    job.fill_elements = job.fill if elements is None else elements.data_ptr()
+    on_grid, on_lattice, masks, tile_rows = [0] * 6, [0] * 9, [0] * 2, max(_TILE // width // 8, 1) * 8
     if grid is not None:
-        job.grid, job.grid_is_double = grid.data_ptr(), grid.dtype == torch.float64
-        job.grid_strides = _shared(grid), *grid.stride()[1:]
+        on_grid = [grid.data_ptr(), _shared(grid), *grid.stride()[1:], grid.dtype == torch.float64]
         if mapped is not None:
             mapped = mapped.contiguous()
-            job.mapped, job.mapped_stride = mapped.data_ptr(), _shared(mapped)
+            masks = [mapped.data_ptr(), _shared(mapped)]
     if nodes is not None and cells is not None and exact is not None:
-        job.nodes, job.node_strides = nodes.data_ptr(), (_shared(nodes), nodes.stride(1))
-        job.cells, job.cell_stride = cells.data_ptr(), _shared(cells)
-        job.rows, job.columns = cells.shape[1:]
-        if exact.shape[1]:
-            job.exact, job.exact_stride = exact.data_ptr(), exact.stride(0)
-    job.type = _BYTES[images.dtype.itemsize] if mode == "nearest" else _TYPES[images.dtype]
-    job.mode, job.padding = _MODES[mode], _PADDINGS[padding]
-    job.tile_rows = max(_TILE // width // 8, 1) * 8
-    tiles = -(-height // job.tile_rows) * count
-    pointer = byref(job)
-    spread(lambda: native.camtorch_sample(pointer), min(thread_count(), tiles))
+        (_, rows, columns), at = cells.shape, (exact.data_ptr(), exact.stride(0)) if exact.shape[1] else (0, 0)
+        on_lattice = [nodes.data_ptr(), _shared(nodes), nodes.stride(1), cells.data_ptr(), _shared(cells)]
+        on_lattice += [rows, columns, *at]
+    fills = _fills(tuple(fill), images.dtype)
+    kind = _BYTES[images.dtype.itemsize] if mode == "nearest" else _TYPES[images.dtype]
+    job = _Job.from_buffer_copy(
+        _packed(
+            *(images.data_ptr(), result.data_ptr(), *steps, *made_steps, count, channels, *images.shape[-2:]),
+            *(height, width, *fills[:2], *on_grid, *masks, *on_lattice),
+            *(kind, _MODES[mode], PADDINGS[padding], tile_rows, 0),
+        )
+    )
+    tiles = -(-height // tile_rows) * count
+    spread(lambda: native.camtorch_sample(job), min(thread_count(), tiles))
 
 
 def _shared(tensor: Tensor) -> int:
@@ -179,14 +114,17 @@ def _shared(tensor: Tensor) -> int:
 
 
 @functools.lru_cache(maxsize=64)
-def _elements(fill: tuple[float, ...], dtype: torch.dtype) -> Tensor:
-    """The values as pixels, (C,): rounded and in range, true from one half on."""
+def _fills(fill: tuple[float, ...], dtype: torch.dtype) -> tuple[int, int, Tensor, Tensor]:
+    """Where values lie in float32, and as pixels: rounded, in range, true from one half on; and who holds them."""
+    values = torch.tensor(fill, dtype=torch.float32, device="cpu")
     if dtype == torch.bool:
-        return torch.tensor([value >= 0.5 for value in fill], device="cpu")
-    if not dtype.is_floating_point:
-        low, high = torch.iinfo(dtype).min, torch.iinfo(dtype).max
-        fill = tuple(min(max(round(value), low), high) for value in fill)
-    return torch.tensor(fill, dtype=dtype, device="cpu")
+        elements = torch.tensor([value >= 0.5 for value in fill], device="cpu")
+    else:
+        if not dtype.is_floating_point:
+            low, high = torch.iinfo(dtype).min, torch.iinfo(dtype).max
+            fill = tuple(min(max(round(value), low), high) for value in fill)
+        elements = torch.tensor(fill, dtype=dtype, device="cpu")
+    return values.data_ptr(), elements.data_ptr(), values, elements
 
 
 def layout(images: Tensor) -> torch.memory_format:
@@ -207,60 +145,35 @@ def _empty(shape: tuple[int, ...], dtype: torch.dtype, layout: torch.memory_form
     return torch.empty(shape, dtype=dtype, device="cpu", memory_format=layout)
 
 
-class Probed(NamedTuple):
-    """What is known of a lattice by its nodes and by the rim of the target, and what is asked of its cells."""
+def classify(
+    nodes: Tensor,
+    mapped: Tensor,
+    rim: Tensor,
+    size: tuple[int, int],
+    source: tuple[int, int],
+    tolerance: float,
+    padding: str,
+) -> tuple[Tensor, int]:
+    """Which cells of a lattice are `EMPTY`, `CUBIC` or `TODO`. There is a library.
 
-    nodes: Tensor
-    """(B, 2, n + 5, m + 5), positions; the last two dims without gaps."""
-    mapped: Tensor
-    """(B, n + 5, m + 5) bool, likewise."""
-    rim: Tensor
-    """(B, 2 (w + h)) bool, contiguous: which pixels of the target's rim are mapped: those of the top row, the bottom
-    row, the left column, the right column."""
-    size: tuple[int, int]
-    """(h, w) of the target."""
-    source: tuple[int, int]
-    """(height, width) of the source."""
-    tolerance: float
-    """In pixels of the source."""
-    padding: str
-    """"zeros", "border" or "reflection", of what is to be sampled."""
-
-
-def classify(probed: Probed) -> tuple[Tensor, int]:
-    """Which cells of a lattice are `EMPTY`, `CUBIC` or `TODO`. Nodes are of float32. There is a library.
+    Args:
+        nodes: (B, 2, n + 5, m + 5) of float32, positions; the last two dims without gaps.
+        mapped: (B, n + 5, m + 5) bool, likewise.
+        rim: (B, 2 (w + h)) bool, contiguous: which pixels of the target's rim are mapped: those of the top row, the
+            bottom row, the left column, the right column.
+        size: (h, w) of the target.
+        source: (height, width) of the source.
+        tolerance: in pixels of the source.
+        padding: "zeros", "border" or "reflection", of what is to be sampled.
 
     Returns:
         (B, n, m) int32, contiguous; and how many cells are `TODO` in the image with the most of them.
     """
     native = library()
     assert native is not None  # who calls has looked
-    cells, asked = classification(probed)
-    return cells, native.camtorch_classify(byref(asked))
-
-
-def classification(probed: Probed) -> tuple[Tensor, _Classification]:
-    """The cells (B, n, m) int32, and what the compiled code is asked of them."""
-    nodes, mapped, rim = probed[:3]
     count, rows, columns = nodes.shape[0], nodes.shape[2] - 5, nodes.shape[3] - 5
     cells = torch.empty(count, rows, columns, dtype=torch.int32, device="cpu")
-    scratch = torch.empty(count, 25 * (columns + 8), dtype=torch.float32, device="cpu")
-    asked = _Classification(
-        nodes.data_ptr(),
-        nodes.stride()[:2],
-        mapped.data_ptr(),
-        mapped.stride(0),
-        rim.data_ptr(),
-        rim.stride(0),
-        count,
-        rows,
-        columns,
-        *probed.size,
-        *map(float, probed.source),
-        probed.tolerance,
-        _PADDINGS[probed.padding],
-        cells.data_ptr(),
-        scratch.data_ptr(),
-    )
-    asked.memory = scratch
-    return cells, asked
+    scratch = torch.empty(SCRATCH * (columns + 8), dtype=torch.float32, device="cpu")
+    places = *nodes.stride()[:2], mapped.data_ptr(), mapped.stride(0), rim.data_ptr(), rim.stride(0)
+    asked = (nodes.data_ptr(), *places, count, rows, columns, *size, *source, tolerance, PADDINGS[padding])
+    return cells, native.camtorch_classify(_Classification(*asked, cells.data_ptr(), scratch.data_ptr()))

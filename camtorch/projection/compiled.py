@@ -9,6 +9,7 @@ import struct
 import threading
 from collections.abc import Callable, Sequence
 from ctypes import addressof, byref, c_double, c_int32, c_int64, c_void_p
+from itertools import accumulate
 from typing import TYPE_CHECKING, NamedTuple
 
 import torch
@@ -19,7 +20,7 @@ from camtorch._arguments import columns
 from camtorch._threads import spread, thread_count
 from camtorch.native import memory
 from camtorch.native.library import library
-from camtorch.native.sampler import Probed, classification
+from camtorch.native.sampler import CLASSIFICATION, PADDINGS, SCRATCH
 from camtorch.optics.backprojection import FURTHEST
 
 if TYPE_CHECKING:
@@ -85,9 +86,9 @@ class _Cameras(ctypes.Structure):
 
 
 _Rows = struct.Struct("20q").pack  # `Rows` of geometry.h
-_Move = struct.Struct("6q2d12q").pack  # `Move` of geometry.h
-_Lattices = struct.Struct("6q2d17q").pack  # `Lattices`
-POSITIONS, PIXELS = range(2)
+_Move = struct.Struct("8q2d12q").pack  # `Move` of geometry.h
+_Lattices = struct.Struct(f"8q2d12q{CLASSIFICATION}4q").pack  # `Lattices`
+POSITIONS, PIXELS, ON_IMAGE = range(3)
 _LEFT_FROM, _LEFT_TO, LEFT_MOST = 1, 2, 4
 _NO_ROWS = (0, 0, 0, 0)
 
@@ -204,21 +205,21 @@ class Lenses:
     plan: Plan
     cameras: int
     dtype: torch.dtype
-    fields: dict[str, int]
-    """Where what `Cameras` of geometry.h has of them lies."""
-    table: int | None
-    azimuths: tuple[int, int] | None
+    struct: _Cameras
+    """What it has of them; pointers that are not set are of what is not yet known."""
     _kept: list[object]
 
     def __init__(self, plan: Plan, optics_of: Optics, k: Tensor, domain: Callable[[], Domain]):
         """See `native_of`."""
         self.plan, self._optics_of, self._k, self._kept = plan, optics_of, k, [k]
         self._slow_domain, self.cameras, self.dtype = domain, len(k), k.dtype
-        self.fields, self.table, self.azimuths = {}, None, None
+        self.struct = struct = _Cameras()
+        struct.parts, struct.part_count, struct.parameter_count = addressof(plan.parts), plan.count, plan.parameters
+        struct.is_double, struct.cameras = self.dtype == torch.float64, self.cameras
         if plan.parameters:
-            self.fields["parameters"] = self._keep(plan.parameters_of(optics_of, k))
+            struct.parameters = self._keep(plan.parameters_of(optics_of, k))
         if plan.places is None and (constants := _constants(optics_of(columns(k))[1])):
-            self.fields |= {"constants": self._keep_columns(constants), "constant_count": len(constants)}
+            struct.constants, struct.constant_count = self._keep_columns(constants), len(constants)
         if plan.is_chart:
             self._add_chart()
         if plan.has_stages:
@@ -271,43 +272,46 @@ class Lenses:
         table, inner2 = torch.empty(self.cameras, _TABLE, dtype=self.dtype, device="cpu"), self._new(1)
         place = self._keep(table)
         self._ask({"inner2": inner2, "table": place, "is_chart": True})
-        self.fields |= {"chart_inner2": inner2, "chart_table": place, "chart_most2": self._keep(table[:, 1])}
+        struct = self.struct
+        struct.chart_inner2, struct.chart_table, struct.chart_most2 = inner2, place, self._keep(table[:, 1])
 
     def _add_domain(self) -> None:
         plan = self.plan
         if plan.is_chart:  # whose end is that of a search
             domain = self._slow_domain()
-            self.fields |= {"inner2": self._keep(domain.inner2), "usual2": self._keep(domain.usual2)}
+            self.struct.inner2, self.struct.usual2 = self._keep(domain.inner2), self._keep(domain.usual2)
             return
         wanted = {"inner2": self._new(1), "usual2": self._new(1)}
         if plan.has_rest:
             wanted |= {"circle2": self._new(1), "stagewise": self._new(1, torch.bool)}
-        self.fields |= wanted
+        for name, place in wanted.items():
+            setattr(self.struct, name, place)
         radii = {} if plan.is_radial else {"radii": self._keep(plan.radii(lambda: self._optics()[0], _RADII, self._k))}
         self._ask(wanted | radii)
 
     def inverse_table(self) -> int:
         """What the inverse of the radial factor starts from; it is made when it is first asked for."""
-        if self.table is None:
+        if self.struct.table is None:
             table = self._new(_TABLE)
             self._ask({"table": table})
-            self.table = table  # when it is whole, for another thread may be looking
-        return self.table
+            self.struct.table = table  # when it is whole, for another thread may be looking
+        return int(self.struct.table)
 
     def followed(self) -> tuple[int, int]:
         """The limits of each azimuth, and where the lens sends it: asked for only when a point lies far out."""
-        if self.azimuths is None:
+        struct = self.struct
+        if struct.limits2 is None:
             chart, like = self._optics()[0], self._k.double()
             wanted = {"limits2": self._new(_AZIMUTHS), "extent": self._new(_EXTENT)}
-            wanted |= {name: place for name, place in self.fields.items() if name in ("circle2", "stagewise")}
+            wanted |= {name: place for name in ("circle2", "stagewise") if (place := getattr(struct, name)) is not None}
             for name, count in (("radii", _RADII), ("even", _FOLLOWED), ("coarse", _FOLLOWED // 2)):
                 wanted[name] = self._keep(self.plan.radii(lambda: chart, count, like))
             if self.plan.is_chart:
                 end = chart.end(self.dtype)
                 wanted["ends"] = self._keep_ends(end)
             self._ask(wanted)
-            self.azimuths = wanted["limits2"], wanted["extent"]
-        return self.azimuths
+            struct.extent, struct.limits2 = wanted["extent"], wanted["limits2"]
+        return struct.limits2, struct.extent
 
     def _keep(self, tensor: Tensor) -> int:
         tensor = tensor.contiguous()
@@ -346,20 +350,11 @@ class Native:
 
     def __init__(self, lenses: Lenses, intrinsics: Tensor, usable: Tensor | None):
         """See `native_of`."""
-        self._lenses, self.plan, self.struct = lenses, lenses.plan, _Cameras()
+        self._lenses, self.plan, self.struct = lenses, lenses.plan, _Cameras.from_buffer_copy(lenses.struct)
         self._kept = intrinsics.contiguous(), None if usable is None else (usable > 0).contiguous()
-        struct, plan = self.struct, self.plan
-        struct.parts, struct.part_count = addressof(plan.parts), plan.count
-        self.cameras, self.dtype = len(intrinsics), intrinsics.dtype
-        struct.is_double, struct.cameras = self.dtype == torch.float64, self.cameras
-        self.parameters = struct.parameter_count = plan.parameters
-        struct.intrinsics, struct.usable = map(_address, self._kept)
-        struct.table = lenses.table
-        if lenses.azimuths is not None:
-            struct.limits2, struct.extent = lenses.azimuths
-        for name, value in lenses.fields.items():
-            setattr(struct, name, value)
-        self.pointer = addressof(struct)
+        self.cameras, self.dtype, self.parameters = intrinsics.shape[0], intrinsics.dtype, lenses.plan.parameters
+        self.struct.intrinsics, self.struct.usable = map(_address, self._kept)
+        self.pointer = addressof(self.struct)
 
     def add_table(self) -> None:
         """Have what the inverse starts from."""
@@ -384,7 +379,7 @@ def native_of(
         usable: the mask (C, 1) of the cameras that are usable, None if all are.
         domain: makes that of the lenses, for what the compiled geometry does not do.
     """
-    if library() is None or not intrinsics.is_cpu or not len(k):
+    if library() is None or not intrinsics.is_cpu or not k.shape[0]:
         return None
     plan = _plan(optics_of, k)
     return None if plan is None else Native(_lenses_of(plan, optics_of, k, domain), intrinsics, usable)
@@ -549,31 +544,28 @@ class Between:
 
     def __init__(self, start: Native, end: Native, turns: Tensor | None, size: tuple[int, int], is_batch: bool):
         """turns: (3, 3) or (C, 3, 3), of their dtype. size: (height, width) of the others' image."""
-        turns, self.is_batch = None if turns is None else turns.contiguous(), is_batch
-        self._start, self._end, self._turns = start, end, turns
-        count = 1 if turns is None or turns.ndim == 2 else len(turns)
+        self._start, self._end, self._turns, self.is_batch = start, end, turns, is_batch
+        count, strides = (1, (0, 0)) if turns is None else (turns.numel() // 9, turns.stride())
         self.cameras = max(start.cameras, end.cameras, count)
         if start.plan.has_factor and start.struct.table is None:
             start.add_table()
         self._size = size
-        self._given = start.pointer, end.pointer, _address(turns), 9 * (count > 1), self.cameras
+        by_camera = strides[0] if count > 1 else 0
+        self._given = start.pointer, end.pointer, _address(turns), by_camera, *strides[-2:], self.cameras
 
     def rows(self, pixels: Tensor, form: int) -> tuple[Tensor, Tensor]:
         """Pixels (C or 1, N, 2) to (C, N, 2), and valid (C, N).
 
-        form: `POSITIONS` as of `grid_sample`, -9 where there is none; or `PIXELS`, -1 where there is none.
+        form: `POSITIONS` as of `grid_sample`, -9 where there is none; `PIXELS`, -1 where there is none; or `ON_IMAGE`,
+            the same, of which only those on the image are valid.
         """
         count = pixels.shape[1]
         result = torch.empty(self.cameras, count, 2, dtype=self._start.dtype, device="cpu")
         valid = torch.empty(self.cameras, count, dtype=torch.bool, device="cpu")
         rows = *_rows_of(pixels), result.data_ptr(), 2 * count, 2, 1, valid.data_ptr(), count, _TILE
-        run, tiles = _entry("camtorch_moves", c_int64), -(-count // _TILE) * self.cameras
-
-        def call(following: int) -> int:
-            left: int = run(_Move(*self._given, form, *self._size, *rows, following))
-            return left
-
-        self._left(call, tiles if self.cameras * count >= _SHARED else 1)
+        call = _Move(*self._given, form, *self._size, *rows, addressof(_kept.counters))
+        tiles = -(-count // _TILE) * self.cameras
+        self._run("camtorch_moves", call, tiles if self.cameras * count >= _SHARED else 1)
         return result, valid
 
     def lattices(
@@ -592,67 +584,66 @@ class Between:
         """
         cameras, dtype, count = self.cameras, self._start.dtype, probes.shape[1]
         n, m = (-(-side // 8) for side in size)
-        nodes, shape = (n + 5) * (m + 5), (cameras, 2, n + 5, m + 5)
+        nodes, most, is_double = (n + 5) * (m + 5), cameras * n * m, dtype == torch.float64
         result = torch.empty(cameras, 2, count, dtype=dtype, device="cpu")
-        valid = torch.empty(cameras, count, dtype=torch.bool, device="cpu")
-        exact = _kept_memory(2 * cameras * n * m * 64, dtype)  # of which parts are written
-        narrow = None if dtype == torch.float32 else torch.empty(shape, dtype=torch.float32, device="cpu")
-        made = result.as_strided(shape, (2 * count, count, m + 5, 1))
-        mapped, rim = valid.as_strided((cameras, n + 5, m + 5), (count, m + 5, 1)), valid[:, nodes:]
-        cells, asked = classification(Probed(made, mapped, rim, size, self._size, tolerance, padding))
-        rows = *_rows_of(probes), result.data_ptr(), 2 * count, 1, count, valid.data_ptr(), count, count
-        run, used = _entry("camtorch_lattices", c_int64), c_int64(0)
-
-        def call(following: int) -> int:
-            more = addressof(asked), first_row, _address(narrow), exact.data_ptr(), addressof(used)
-            left: int = run(_Lattices(*self._given, POSITIONS, *self._size, *rows, following, *more))
-            return left
-
-        if self._left(call, cameras, used):
+        cells = torch.empty(cameras, n, m, dtype=torch.int32, device="cpu")
+        # for this call alone: exact positions, of which parts are written; nodes in float32; scratch; what is mapped
+        sizes = 128 * most * dtype.itemsize, 8 * cameras * nodes * is_double, 4 * SCRATCH * cameras * (m + 8)
+        kept = _kept_memory(sum(sizes) + cameras * count)
+        exact, narrow, scratch, valid = accumulate(sizes, initial=kept.data_ptr())
+        at, used = result.data_ptr(), addressof(_kept.counters)
+        rows = *_rows_of(probes), at, 2 * count, 1, count, valid, count, count, used
+        asked = at, 2 * count, count, valid, count, valid + nodes, count, cameras, n, m, *size
+        how = *self._size, tolerance, PADDINGS[padding], cells.data_ptr(), scratch
+        more = first_row, narrow if is_double else 0, exact, used + 8
+        call = _Lattices(*self._given, POSITIONS, *self._size, *rows, *asked, *how, *more)
+        if self._run("camtorch_lattices", call, cameras):
             return None
-        parts = exact[: 2 * cameras * n * m * 64].view(2, -1, 8, 8)[:, : used.value]
-        return Lattices(made, cells, parts.clone())
+        if count := _kept.counters[1]:
+            found = kept[: sizes[0]].view(dtype).view(2, most, 8, 8)[:, :count].clone()
+        else:
+            found = torch.empty(2, 0, 8, 8, dtype=dtype, device="cpu")
+        return Lattices(result.as_strided((cameras, 2, n + 5, m + 5), (*result.stride()[:2], m + 5, 1)), cells, found)
 
-    def _left(self, call: Callable[[int], int], tiles: int, used: c_int64 | None = None) -> int:
-        """Flags of what is not made. call: with where the next tile stands."""
-        shared = thread_count() if tiles > 1 else 1
+    def _run(self, name: str, call: bytes, tiles: int) -> int:
+        """Flags of what is not made. call: whose next tile, and number of places, are this thread's counters."""
+        run, threads, counters = _entry(name, c_int64), min(thread_count(), tiles) if tiles > 1 else 1, _kept.counters
         while True:
-            following, left = c_int64(0), list[int]()
-            place = addressof(following)
-            if used is not None:
-                used.value = 0
-            spread(lambda: left.append(call(place)), min(shared, tiles))  # noqa: B023 (which is called at once)
+            left: list[int] = []
+            counters[:] = [0, 0]
+            spread(lambda: left.append(run(call)), threads)  # noqa: B023 (which is called at once)
             flags = functools.reduce(operator.or_, left)
             if not flags & (_LEFT_FROM | _LEFT_TO):
-                break
+                return flags
             for flag, native in ((_LEFT_FROM, self._start), (_LEFT_TO, self._end)):
                 if flags & flag:
                     native.follow()
-        return flags
 
 
 class _Kept(threading.local):
-    memory: Tensor | None = None
+    def __init__(self) -> None:
+        self.memory: Tensor | None = None
+        self.counters = (c_int64 * 2)()
 
 
 _kept = _Kept()
 _MOST_KEPT = 1 << 22  # bytes
 
 
-def _kept_memory(count: int, dtype: torch.dtype) -> Tensor:
-    """At least so many numbers, for this call of this thread: the same memory as before, unless they are many."""
-    if count * dtype.itemsize > _MOST_KEPT:
-        return torch.empty(count, dtype=dtype, device="cpu")
-    if _kept.memory is None or len(_kept.memory) < count * dtype.itemsize:
+def _kept_memory(count: int) -> Tensor:
+    """At least so many bytes, for this call of this thread: the same memory as before, unless they are many."""
+    if count > _MOST_KEPT:
+        return torch.empty(count, dtype=torch.uint8, device="cpu")
+    if _kept.memory is None or _kept.memory.shape[0] < count:
         with torch.inference_mode(False):
-            _kept.memory = torch.empty(count * dtype.itemsize, dtype=torch.uint8, device="cpu")
-    return _kept.memory[: count * dtype.itemsize].view(dtype)
+            _kept.memory = torch.empty(count, dtype=torch.uint8, device="cpu")
+    return _kept.memory
 
 
 def _rows_of(pixels: Tensor) -> tuple[int, int, int, int]:
     """Where pixels (C or 1, N, 2) lie, and their strides."""
     camera, point, component = pixels.stride()
-    return pixels.data_ptr(), camera if len(pixels) > 1 else 0, point, component
+    return pixels.data_ptr(), camera if pixels.shape[0] > 1 else 0, point, component
 
 
 def _empty(size: tuple[int, int, int], dtype: torch.dtype) -> Tensor:

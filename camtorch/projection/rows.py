@@ -40,16 +40,17 @@ class Cameras:
     usable: Tensor | None
 
     def __init__(self, model: type[Camera], intrinsics: Tensor, distortion: Tensor):
-        """Of concrete values (C, 4), (C, n)."""
+        """Of concrete values (C, 4), (C, n); or (4,), (n,) of one."""
         self._model, self._learns = model, distortion.requires_grad
-        with torch.no_grad():
-            self.given = intrinsics.detach().clone(), distortion.detach().clone()
-            values, self.usable = self.given, None
-            if not (_are_plain(model, *self.given) or holds(usable := _usable(model, *self.given))):
-                ideal = _ideal(model, *self.given)
-                values = torch.where(usable, self.given[0], ideal[0]), torch.where(usable, self.given[1], ideal[1])
-                self.usable = usable.to(intrinsics.dtype)  # (C, 1)
-            self.intrinsics, self.k = values
+        self._alone = values = intrinsics.detach().clone(), distortion.detach().clone()
+        if intrinsics.ndim == 1:
+            values = values[0][None], values[1][None]
+        self.given, self.usable = values, None
+        if not (_are_plain(model, *values) or holds(usable := _usable(model, *values))):
+            ideal = _ideal(model, *values)
+            values = torch.where(usable, values[0], ideal[0]), torch.where(usable, values[1], ideal[1])
+            self.usable = usable.to(intrinsics.dtype)  # (C, 1)
+        self.intrinsics, self.k = values
 
     @cached_property
     def domain(self) -> Domain:
@@ -58,7 +59,8 @@ class Cameras:
 
     def are(self, intrinsics: Tensor, distortion: Tensor) -> bool:
         """Whether they are those of these values."""
-        for now, then in ((intrinsics, self.given[0]), (distortion, self.given[1])):
+        given = self.given if intrinsics.ndim == 2 else self._alone
+        for now, then in ((intrinsics, given[0]), (distortion, given[1])):
             if now.dtype != then.dtype or now.device != then.device or not torch.equal(now, then):
                 return False
         return True

@@ -65,10 +65,10 @@ class MirrorWarp(Warp):
         """Warped images, as of `Warp.forward`; smaller ones of them where they shrink."""
         plain = not (torch.compiler.is_compiling() or in_transform()) and is_concrete(self.target.intrinsics)
         if self._decides and plain:
-            sampler, inputs = checked(self, images, mode, padding_mode, fill), self._inputs()
+            sampler = checked(self, images, mode, padding_mode, fill)
             smooth = sampler.mode != "nearest" and images.dtype != torch.bool
-            if smooth and route_of(self, inputs, images, sampler.mode) == "kept":
-                where = positions(self, inputs, "kept", sampler.padding_mode)
+            if smooth and route_of(self, images, sampler.mode) == "kept":
+                where = positions(self, "kept", sampler.padding_mode)
                 if self._halvings is None:
                     self._halvings = _halvings(where, self.source._size_for("Warp"))
                 if any(self._halvings):
@@ -263,7 +263,7 @@ class AffineWarp(MirrorWarp):
 
     # -- labels
 
-    def _move(self, pixels: Numbers, back: bool = False) -> tuple[Tensor, Tensor]:
+    def _move(self, pixels: Numbers, back: bool = False, on_image: bool = False) -> tuple[Tensor, Tensor]:
         pixels = as_values(pixels, "pixels", "Warp", self.matrix.device)
         pixels = pixels if pixels.is_floating_point() else pixels.to(self.source.intrinsics.dtype)
         valid = torch.isfinite(pixels).all(-1)
@@ -273,7 +273,8 @@ class AffineWarp(MirrorWarp):
             matrix = matrix.reshape(-1, *[1] * (pixels.ndim - 2), 2, 3)
         moved = (matrix[..., :2] * wide.unsqueeze(-2)).sum(-1) + matrix[..., 2]
         dtype = torch.promote_types(pixels.dtype, torch.float32)
-        return torch.where(valid.unsqueeze(-1), moved, -1.0).to(dtype), valid
+        moved = torch.where(valid.unsqueeze(-1), moved, -1.0).to(dtype)
+        return moved, valid & self.target.contains(moved) if on_image else valid
 
 
 def _alike(kinds: list[Any]) -> list[tuple[slice, Any]]:

@@ -12,10 +12,10 @@ import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
 from torch import Tensor
 
 from camtorch._threads import on_one_thread
-from camtorch._tracing import in_graph, in_memory, in_transform, is_concrete, is_recorded, may_look
+from camtorch._tracing import in_graph, in_transform, is_concrete, is_eager, may_look
 from camtorch.camera import Camera
 from camtorch.native.library import native_available
-from camtorch.native.sampler import CUBIC, EMPTY, TODO, Probed, classify
+from camtorch.native.sampler import CUBIC, EMPTY, TODO, classify
 from camtorch.projection.compiled import POSITIONS, Between
 from camtorch.rotations import turn
 from camtorch.warp.moving import between
@@ -150,9 +150,8 @@ def locate(
         rows: of the target.
         padding: see `on_lattice`.
     """
-    plain = not in_transform() and is_concrete(target.intrinsics) and target.intrinsics.is_cpu
     if not antialias:
-        if tolerance and plain:
+        if tolerance and not torch.compiler.is_compiling():
             lattice = on_lattice(source, target, rotation, tolerance, rows, padding)
             if lattice is not None:
                 return lattice
@@ -215,7 +214,7 @@ def tabulate(
 
 
 def _native(source: Camera, target: Camera, rotation: Tensor | None, like: Tensor) -> Between | None:
-    return between(target, source, None if rotation is None else rotation.mT, like.detach())
+    return between(target, source, None if rotation is None else rotation.mT, like)
 
 
 def _like(target: Camera) -> Tensor:
@@ -317,11 +316,13 @@ def on_lattice(
     """
     like, (height, width) = _like(target), (len(rows), target._size_for("Warp")[1])
     n, m = math.ceil(height / STEP), math.ceil(width / STEP)  # cells
-    if min(n, m) < _FEWEST or not native_available() or not in_memory(like) or is_recorded():
+    if min(n, m) < _FEWEST or not native_available():
+        return None
+    native = _native(source, target, rotation, like)
+    if native is None and not is_eager(like):
         return None
     nodes, seam, size = (n + 5) * (m + 5), seam_of(source), source._size_for("Warp")
     pixels = _kept_probes(rows, width, like.dtype) if nodes <= _MOST_KEPT else _probes(rows, width, like)
-    native = _native(source, target, rotation, like)
     if native is not None:
         made = native.lattices(pixels, (height, width), rows.start, tolerance, padding)
         return None if made is None else Lattice(*made, (height, width), seam)
@@ -329,7 +330,7 @@ def on_lattice(
     positions, mapped = exact(pixels)  # (B, 1, N, 2)
     lattice = positions[:, 0, :nodes].movedim(-1, 1).contiguous().unflatten(2, (n + 5, m + 5))
     mapped, rim = mapped[:, 0, :nodes].unflatten(1, (n + 5, m + 5)), mapped[:, 0, nodes:]
-    cells, most = classify(Probed(lattice.float(), mapped, rim, (height, width), size, tolerance, padding))
+    cells, most = classify(lattice.float(), mapped, rim, (height, width), size, tolerance, padding)
     if most > n * m / 2:
         return None
     computed = like.new_empty(2, 0, STEP, STEP)

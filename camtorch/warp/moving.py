@@ -8,7 +8,7 @@ from torch import Tensor
 from camtorch._arguments import Numbers
 from camtorch._evaluation import compiled_of
 from camtorch.camera import Camera
-from camtorch.projection.compiled import PIXELS, Between
+from camtorch.projection.compiled import ON_IMAGE, PIXELS, Between
 from camtorch.rotations import turn
 from camtorch.warp.panorama import rays_of, seam_of, seen_by
 
@@ -27,23 +27,25 @@ def between(start: Camera, end: Camera, rotation: Tensor | None, like: Tensor) -
     made = compiled_of((start, end), like, *(() if rotation is None else (rotation,)))
     if made is None:
         return None
-    rotation = None if rotation is None else rotation.detach().to(like.dtype)
-    is_batch = bool(start.batch_shape or end.batch_shape or (rotation is not None and rotation.ndim == 3))
-    one, other = made
+    (one, other), is_batch = made
+    if rotation is not None:
+        is_batch, rotation = is_batch or rotation.ndim == 3, rotation.to(like.dtype)
     return Between(one, other, rotation, end._size_for("Warp"), is_batch)
 
 
-def moved_pixels(start: Camera, end: Camera, rotation: Tensor | None, pixels: Numbers) -> tuple[Tensor, Tensor]:
-    """Pixels (B, *N, 2), or (*N, 2), of one camera to another's, (-1, -1) without a place there, and whether they have.
-
-    Arguments as of `between`.
+def moved_pixels(
+    start: Camera, end: Camera, rotation: Tensor | None, pixels: Numbers, on_image: bool = False
+) -> tuple[Tensor, Tensor]:
+    """Pixels (B, *N, 2), or (*N, 2), of one camera to another's, (-1, -1) without a place there, and whether they have;
+    with `on_image`, whether that is on the image. Other arguments as of `between`.
     """
     if isinstance(pixels, Tensor) and pixels.ndim > 0 and pixels.shape[-1] == 2:
         ready = between(start, end, rotation, pixels)
-        if ready is not None and ((pixels.ndim > 1 and len(pixels) == ready.cameras) or not ready.is_batch):
-            moved, valid = ready.rows(pixels.detach().reshape(ready.cameras, -1, 2), PIXELS)
-            return moved.reshape(pixels.shape), valid.reshape(pixels.shape[:-1])
+        if ready is not None and ((pixels.ndim > 1 and pixels.shape[0] == ready.cameras) or not ready.is_batch):
+            moved, valid = ready.rows(pixels.reshape(ready.cameras, -1, 2), ON_IMAGE if on_image else PIXELS)
+            return moved.view(pixels.shape), valid.view(pixels.shape[:-1])
     rays, has_ray = rays_of(start, pixels)
     moved, mapped = seen_by(end, turn(rotation, rays, "pixels"))
     valid = mapped & has_ray
-    return torch.where(valid.unsqueeze(-1), moved, -1.0), valid
+    moved = torch.where(valid.unsqueeze(-1), moved, -1.0)
+    return moved, valid & end.contains(moved) if on_image else valid

@@ -50,7 +50,7 @@ class ProxyWarp(Warp):
         mapped = mapped & has_ray & met
         return to_positions(seen, mapped, self.source._size_for("Warp")), mapped
 
-    def _move(self, pixels: Numbers, back: bool = False) -> tuple[Tensor, Tensor]:
+    def _move(self, pixels: Numbers, back: bool = False, on_image: bool = False) -> tuple[Tensor, Tensor]:
         source, target, carried = self.source, self.target, self._to_target
         if back:
             source, target, carried = target, source, self._to_source
@@ -58,7 +58,8 @@ class ProxyWarp(Warp):
         directions, met = carried(rays)
         seen, mapped = seen_by(target, directions)
         valid = mapped & has_ray & met
-        return torch.where(valid.unsqueeze(-1), seen, -1.0), valid
+        seen = torch.where(valid.unsqueeze(-1), seen, -1.0)
+        return seen, valid & target.contains(seen) if on_image else valid
 
 
 def turned(rotation: Tensor, rays: Tensor) -> Tensor:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Literal
 
 import torch
 from torch import Tensor
 
-from camtorch._module import is_constant, with_values
+from camtorch._module import Memo, is_constant, with_values
 from camtorch._tracing import (
     in_graph,
     in_jit_trace,
@@ -36,7 +36,7 @@ _MOST_KEPT = 1 << 25  # pixels of a grid; longer ones, of 256 MB in float32, are
 _STRIP = 1 << 21  # pixels of such a strip
 
 
-def route_of(warp: Warp, inputs: Sequence[Tensor], images: Tensor | None = None, mode: Mode = "nearest") -> Route:
+def route_of(warp: Warp, images: Tensor | None = None, mode: Mode = "nearest") -> Route:
     """The route of a call; the lattice and the native sampler are chosen below, by `locate` and `render`.
 
     * "exposure": the target's shutter blurs, so that the images are the mean of warps at several moments;
@@ -47,27 +47,25 @@ def route_of(warp: Warp, inputs: Sequence[Tensor], images: Tensor | None = None,
 
     Args:
         warp: the warp that is called.
-        inputs: all tensors that its positions depend on.
         images: to be warped; None where positions alone are asked for.
         mode: in which they are sampled.
     """
-    learns = warp._pinned is None and keeps_graph(*inputs)
+    learns = warp._pinned is None and torch.is_grad_enabled() and keeps_graph(*warp._inputs())
     if images is not None:
         shutter = warp.target_shutter
         if mode != "nearest" and shutter is not None and shutter.blurs:
             return "exposure"
         learns = learns and images.dtype.is_floating_point
-        if not learns and _is_operator(warp) and compiled.takes(images, inputs):
+        if not learns and _is_operator(warp) and compiled.takes(images, warp._inputs()):
             return "operator"
-    if not learns and _is_long(warp, inputs) and (images is None or not in_graph(images)):
+    if not learns and _is_long(warp) and (images is None or not in_graph(images)):
         return "strips"
     return "graph" if learns else "kept"
 
 
 def warped(warp: Warp, images: Tensor, sampler: Sampler) -> Tensor:
     """The images of a warp; those given are checked."""
-    inputs = warp._inputs()
-    route = route_of(warp, inputs, images, sampler.mode)
+    route = route_of(warp, images, sampler.mode)
     if route == "exposure":
         assert warp.target_shutter is not None
         shutters = warp.target_shutter.exposed()
@@ -87,10 +85,10 @@ def warped(warp: Warp, images: Tensor, sampler: Sampler) -> Tensor:
             with torch.no_grad():
                 render(images, where, *sampler, kept, result[:, :, rows])
         return result
-    return render(images, positions(warp, inputs, route, sampler.padding_mode), *sampler)
+    return render(images, positions(warp, route, sampler.padding_mode), *sampler)
 
 
-def positions(warp: Warp, inputs: list[Tensor], route: Route, padding: PaddingMode = "zeros") -> Sampling | Lattice:
+def positions(warp: Warp, route: Route, padding: PaddingMode = "zeros") -> Sampling | Lattice:
     """Where all pixels of the target sample the source's image, by the route "graph" or "kept"."""
     if route == "graph":
         if in_jit_trace():
@@ -108,9 +106,8 @@ def positions(warp: Warp, inputs: list[Tensor], route: Route, padding: PaddingMo
 
     forms = [None if shutter is None else shutter.form for shutter in (warp.shutter, warp.target_shutter)]
     options = warp.source._form, warp.target._form, *forms, warp.rotation is None, warp.antialias, warp.tolerance
-    kept: Sampling | Lattice
-    memo = warp._memos[reach if warp.tolerance else "zeros"]  # what is exact serves all
-    kept = memo(inputs, options, lambda: _computed(warp, reach))
+    memo = warp._memos.setdefault(reach if warp.tolerance else "zeros", Memo())  # what is exact serves all
+    kept: Sampling | Lattice = memo(warp._inputs(), options, lambda: _computed(warp, reach))
     return kept
 
 
@@ -151,10 +148,9 @@ def in_strips(
 @torch.no_grad()
 def valid_mask(warp: Warp) -> Tensor:
     """See `Warp.valid_mask`."""
-    inputs = warp._inputs()
-    if route_of(warp, inputs) == "strips":
+    if route_of(warp) == "strips":
         return torch.cat([_on_image(warp, where) for _, where in strips(warp)], 2)
-    return _on_image(warp, positions(warp, inputs, "kept"))
+    return _on_image(warp, positions(warp, "kept"))
 
 
 def _on_image(warp: Warp, where: Sampling | Lattice) -> Tensor:
@@ -170,14 +166,13 @@ def pinned(warp: Warp) -> Sampling | Lattice | None:
     """The positions that a warp keeps from now on, with their graph; None where they are not to be kept."""
     # what a transform makes dies with it; what inference mode makes could not be used in a graph later; the operator
     # of compiled code keeps its own
-    inputs = warp._inputs()
-    if _is_operator(warp) and compiled.takes(warp.target.intrinsics.detach(), inputs):
+    if _is_operator(warp) and compiled.takes(warp.target.intrinsics.detach(), warp._inputs()):
         return None
     if in_transform() or torch.is_inference_mode_enabled():
         return None
-    if keeps_graph(*inputs):
-        return positions(warp, inputs, "graph")
-    return positions(warp, inputs, "kept") if is_exporting() else _computed(warp, warp.padding_mode)
+    if torch.is_grad_enabled() and keeps_graph(*warp._inputs()):
+        return positions(warp, "graph")
+    return positions(warp, "kept") if is_exporting() else _computed(warp, warp.padding_mode)
 
 
 def _reach(warp: Warp, padding: PaddingMode) -> PaddingMode:
@@ -194,14 +189,14 @@ def _is_operator(warp: Warp) -> bool:
     return plain and not (warp.source.is_mixed or warp.target.is_mixed)
 
 
-def _is_long(warp: Warp, inputs: Sequence[Tensor]) -> bool:
+def _is_long(warp: Warp) -> bool:
     """Whether the grid is not to be made at once, nor kept."""
     # compared first, sizes that a program leaves open would be bounded in it
     if warp._pinned is not None or torch.compiler.is_compiling():
         return False
     if math.prod((*warp.batch_shape, *warp.target._size_for("Warp"))) <= _MOST_KEPT:
         return False
-    return not in_transform() and all(t.is_cpu and is_concrete(t) for t in inputs)
+    return not in_transform() and all(t.is_cpu and is_concrete(t) for t in warp._inputs())
 
 
 def _constant(warp: Warp, padding: PaddingMode) -> Sampling | None:
@@ -210,15 +205,15 @@ def _constant(warp: Warp, padding: PaddingMode) -> Sampling | None:
     if not is_pinned and not is_constant(warp):
         return None
     with set_aside() if is_pinned else with_values(warp):
-        inputs = warp._inputs()
 
         def own() -> Sampling:
-            where = positions(warp, inputs, "kept", padding)
+            where = positions(warp, "kept", padding)
             where = where.pixels if isinstance(where, Lattice) else where
             grid, mapped = (t.detach().clone(memory_format=torch.contiguous_format) for t in where[:2])
             return where._replace(grid=grid, mapped=mapped)
 
         if is_pinned:
             return own()
-        constant: Sampling = warp._constants(inputs, (_reach(warp, padding), warp.antialias, warp.tolerance), own)
+        options = _reach(warp, padding), warp.antialias, warp.tolerance
+        constant: Sampling = warp._constants(warp._inputs(), options, own)
         return constant

@@ -14,7 +14,7 @@ from torch import Tensor
 from camtorch._arguments import as_flag, as_number, shown
 from camtorch._dtypes import SIGNED, narrow, wide_dtype, widen
 from camtorch._threads import thread_count
-from camtorch._tracing import converted, in_graph, in_memory, in_transform, is_concrete, is_recorded, may_look
+from camtorch._tracing import converted, in_transform, is_concrete, is_eager, may_look
 from camtorch.native import sampler
 from camtorch.native.library import native_available
 from camtorch.warp.grid import Lattice, Sampling, is_plain
@@ -74,9 +74,8 @@ def render(
     images = images if cameras == 1 else images.expand(count, -1, -1, -1)
     if isinstance(where, Sampling) and mode == "nearest":
         where = where._replace(scale=None)
-    if not dtype.is_floating_point:
-        images = images.detach()
-        where = where._replace(grid=where.grid.detach()) if isinstance(where, Sampling) else where
+    if isinstance(where, Sampling) and not dtype.is_floating_point:
+        where = where._replace(grid=where.grid.detach())
     how = Sampler(mode, padding_mode, fill)
     result = _natively(images, where, how, out)
     if result is None:
@@ -121,13 +120,11 @@ def _natively(images: Tensor, where: Sampling | Lattice, how: Sampler, out: Tens
     It wants the library, memory of the CPU, no graph and no transform, nobody who records what torch does, a dtype that
     it knows, and no antialiasing.
     """
-    if torch.compiler.is_compiling() or is_recorded() or in_transform():
-        return None
     mode, padding_mode, fill = how
     positions = where.nodes if isinstance(where, Lattice) else where.grid
-    if not (native_available() and sampler.takes(images.dtype, mode) and all(map(in_memory, (images, positions)))):
+    if not (native_available() and sampler.takes(images.dtype, mode) and is_eager(images, positions)):
         return None
-    if (isinstance(where, Sampling) and where.scale is not None) or any(map(in_graph, (images, positions))):
+    if (isinstance(where, Sampling) and where.scale is not None) or images.requires_grad or positions.requires_grad:
         return None
     values = fill * images.shape[1] if len(fill) == 1 else fill
     if isinstance(where, Lattice):

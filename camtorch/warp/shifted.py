@@ -92,7 +92,7 @@ class ShiftedWarp(Warp):
             to_positions(seen.clone(), mapped, self.source._size_for("Warp")), mapped, None, seam_of(self.source)
         )
 
-    def _move(self, pixels: Any, back: bool = False) -> tuple[Tensor, Tensor]:
+    def _move(self, pixels: Any, back: bool = False, on_image: bool = False) -> tuple[Tensor, Tensor]:
         if back:
             seen, mapped = self._surface()
             u, v = pixels.round().long().unbind(-1)
@@ -105,7 +105,8 @@ class ShiftedWarp(Warp):
         length = _between(self.distance.to(rays), pixels.detach())
         moved, mapped = seen_by(self.target, self.transform_positions(rays * length[..., None]))
         valid = has_ray & mapped & (length > 0)
-        return torch.where(valid[..., None], moved, -1.0), valid
+        moved = torch.where(valid[..., None], moved, -1.0)
+        return moved, valid & self.target.contains(moved) if on_image else valid
 
     @torch.no_grad()
     def _surface(self) -> tuple[Tensor, Tensor]:

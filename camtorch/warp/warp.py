@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, cast
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from camtorch._arguments import Numbers, as_coordinates, as_whole, broadcast_shapes, check_devices, no_camera
 from camtorch._module import GeometryModule, Memo, typed_as
@@ -49,6 +49,16 @@ def as_sized(camera: Camera, name: str, owner: str) -> Camera:
     if camera.image_size is None:
         raise ValueError(f"{owner}: the {name} needs an image_size=(height, width)")
     return camera
+
+
+def _part(held: str, name: str) -> Any:
+    """The property of a part of a module, in the dict where it mostly is: `nn.Module.__getattr__` looks in all."""
+
+    def part(module: nn.Module) -> Any:
+        parts = module.__dict__[held]
+        return parts[name] if name in parts else nn.Module.__getattr__(module, name)
+
+    return property(part)
 
 
 class Warp(GeometryModule):
@@ -91,7 +101,6 @@ class Warp(GeometryModule):
     _decides = False  # for itself where to antialias
     is_an_operator: ClassVar[bool] = True
     """Whether compiled code calls it as one: the cameras and the rotation are all there is to it."""
-    rotation: Tensor | None
     batch_shape: torch.Size
     mode: Mode
     padding_mode: PaddingMode
@@ -99,8 +108,9 @@ class Warp(GeometryModule):
     _memos: dict[PaddingMode, Memo]
     _constants: Memo
     _pinned: Sampling | Lattice | None
-    source: Camera
-    target: Camera
+    source: Camera = _part("_modules", "source")
+    target: Camera = _part("_modules", "target")
+    rotation: Tensor | None = _part("_buffers", "rotation")
     fill: tuple[float, ...]
     antialias: bool
     shutter: RollingShutter | None
@@ -140,6 +150,18 @@ class Warp(GeometryModule):
                 "Warp: source, target, rotation and shutters may each have one batch dim, of one size; "
                 f"got {', '.join(map(str, shapes))}"
             )
+        self._set(source, target, options, shutter, target_shutter)
+        self.turned_by(rotation)
+
+    def _set(
+        self,
+        source: Camera,
+        target: Camera,
+        options: Options,
+        shutter: RollingShutter | None = None,
+        target_shutter: RollingShutter | None = None,
+    ) -> None:
+        parts = (source, target, shutter, target_shutter)
         super().__init__(
             source=source,
             target=target,
@@ -150,13 +172,26 @@ class Warp(GeometryModule):
             _tolerance=options["tolerance"],
             shutter=shutter,
             target_shutter=target_shutter,
-            batch_shape=batch,
-            _memos={padding: Memo() for padding in PADDINGS},
+            batch_shape=broadcast_shapes(*[part.batch_shape for part in parts if part is not None]),
+            _memos={},
             _pinned=None,
             _constants=Memo(),
         )
-        self._set_rotation(rotation)
         seam_of(source)  # while its values may be looked at: traced code asks for it too
+
+    @classmethod
+    def unchecked(cls, *given: Any) -> Self:
+        """A warp, without a rotation as yet, of arguments as of `_set` that are known to be right."""
+        warp = cls.__new__(cls)
+        warp._set(*given)
+        return warp
+
+    def turned_by(self, rotation: Tensor | None) -> Self:
+        """This warp, made without a rotation, with one that is not checked: (3, 3) or (B, 3, 3)."""
+        self.put("rotation", rotation, persistent=rotation is not None and not rotation.requires_grad)
+        if rotation is not None and rotation.shape[:-2] != self.batch_shape:
+            self.batch_shape = broadcast_shapes(self.batch_shape, rotation.shape[:-2])
+        return self
 
     @property
     def tolerance(self) -> float:
@@ -165,16 +200,6 @@ class Warp(GeometryModule):
             return self._tolerance
         single = all(camera.intrinsics.dtype == torch.float32 for camera in (self.source, self.target))
         return _SINGLE if single else 0.0
-
-    def _set_rotation(self, rotation: Tensor | None) -> None:
-        self.put("rotation", rotation, persistent=rotation is not None and not rotation.requires_grad)
-
-    def turned_by(self, rotation: Tensor | None) -> Self:
-        """This warp, made without a rotation, with one that is not checked: (3, 3) or (B, 3, 3)."""
-        self._set_rotation(rotation)
-        if rotation is not None and rotation.shape[:-2] != self.batch_shape:
-            self.batch_shape = broadcast_shapes(self.batch_shape, rotation.shape[:-2])
-        return self
 
     # -- images
 
@@ -257,16 +282,18 @@ class Warp(GeometryModule):
     def pin(self) -> Warp:
         """Have the grid computed once and for all, with its graph: for a warp whose cameras are not to change."""
         if self._pinned is None:
-            self._pinned = routes.pinned(self)
+            self.__dict__["_pinned"] = routes.pinned(self)  # as nn.Module would, after some questions
         return self
 
     # -- what its positions follow from
 
     def _inputs(self) -> list[Tensor]:
         """All tensors that they depend on."""
-        shutters = [t for each in (self.shutter, self.target_shutter) if each is not None for t in each.tensors]
-        turned = [] if self.rotation is None else [self.rotation]
-        return [*self.source._tensors, *self.target._tensors, *turned, *shutters]
+        rotation, found = self.rotation, [*self.source._tensors, *self.target._tensors]
+        found += [] if rotation is None else [rotation]
+        for shutter in (self.shutter, self.target_shutter):
+            found += [] if shutter is None else shutter.tensors
+        return found
 
     def _locate(self, rows: range, padding: PaddingMode, tolerance: float) -> Sampling | Lattice:
         """Those of some rows of the target, which serve a padding, within a tolerance."""
@@ -274,9 +301,7 @@ class Warp(GeometryModule):
 
     def _sampling(self) -> Sampling:
         """Those of all pixels, one by one."""
-        inputs = self._inputs()
-        route = routes.route_of(self, inputs)
-        where = routes.positions(self, inputs, "graph" if route == "graph" else "kept")
+        where = routes.positions(self, "graph" if routes.route_of(self) == "graph" else "kept")
         return where.pixels if isinstance(where, Lattice) else where
 
     @property
@@ -297,15 +322,16 @@ class Warp(GeometryModule):
             pixels of the same shape, and valid (B, *N) bool: the source pixel has a ray, and the target sees
             it on its image. Pixels off the image keep their place; those without one get (-1, -1).
         """
-        moved, mapped = self._move(pixels)
-        return moved, mapped & self.target.contains(moved)
+        return self._move(pixels, on_image=True)
 
-    def _move(self, pixels: Numbers, back: bool = False) -> tuple[Tensor, Tensor]:
-        """Pixels of the source to the target's image, or back, and whether they have a place there, on it or not."""
+    def _move(self, pixels: Numbers, back: bool = False, on_image: bool = False) -> tuple[Tensor, Tensor]:
+        """Pixels of the source to the target's image, or back, and whether they have a place there, on it or not; see
+        `moved_pixels`.
+        """
         (source, target), rotation = self._in_motion, self.rotation
         if back:
             source, target, rotation = target, source, None if rotation is None else rotation.mT
-        return moved_pixels(source, target, rotation, pixels)
+        return moved_pixels(source, target, rotation, pixels, on_image)
 
     def transform_boxes(self, boxes: Numbers) -> tuple[Tensor, Tensor]:
         """Move boxes (B, *N, 4), or (*N, 4): x1, y1, x2, y2 in pixel-centre coordinates.

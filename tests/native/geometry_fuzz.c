@@ -85,8 +85,12 @@ static int moved(const Cameras *cameras, int64_t tile) {
     Move move = {0};
     void *turns = filled(d, 9 * c, 1, 0), *narrow = NULL, *valid = malloc((size_t)(c * n));
     int64_t following = 0, used = 0;
-    move.from = move.to = cameras, move.cameras = c, move.form = fits ? POSITIONS : below(2);
-    if (below(2)) move.turns = turns, move.turn_stride = 9 * below(2);
+    move.from = move.to = cameras, move.cameras = c, move.form = fits ? POSITIONS : below(3);
+    if (below(2)) {
+        const int64_t back = below(2);
+        move.turns = turns, move.turn_strides[0] = 9 * below(2);
+        move.turn_strides[1] = back ? 1 : 3, move.turn_strides[2] = back ? 3 : 1;
+    }
     move.height = 1 + (double)below(500), move.width = 1 + (double)below(500);
     void *pixels = rows_of(d, c, n, 2, move.row_strides, 300), *results;
     move.rows = pixels, move.count = n, move.tile = tile, move.valid = valid;
@@ -108,7 +112,7 @@ static int moved(const Cameras *cameras, int64_t tile) {
         asked.count = c, asked.rows = rows, asked.columns = columns, asked.height = height, asked.width = width;
         asked.source_height = move.height, asked.source_width = move.width, asked.tolerance = share() * 0.1;
         asked.padding = (int32_t)below(3), asked.cells = cells, asked.scratch = scratch;
-        Lattices lattices = {move, &asked, below(50), narrow, exact, &used};
+        Lattices lattices = {move, asked, below(50), narrow, exact, &used};
         const int64_t left = lattices_fuzzed(&lattices);
         fine &= used >= 0 && used <= c * rows * columns;
         for (int64_t i = 0; !left && i < c * rows * columns; i++) fine &= cells[i] >= CELL_EMPTY && cells[i] < used;
@@ -118,7 +122,8 @@ static int moved(const Cameras *cameras, int64_t tile) {
         const int64_t camera = at / (2 * n), point = at / 2 % n;
         const int64_t place = camera * move.result_strides[0] + point * move.result_strides[1] + at % 2 * move.result_strides[2];
         const double value = d ? ((double *)results)[place] : ((float *)results)[place];
-        fine &= fits || ((uint8_t *)valid)[camera * n + point] == 1 || isfinite(value);
+        /* what is moved off the image has its place, which may be too far for a number */
+        fine &= fits || move.form == ON_IMAGE || ((uint8_t *)valid)[camera * n + point] == 1 || isfinite(value);
     }
     free(turns), free(narrow), free(valid), free(pixels), free(results);
     return fine;

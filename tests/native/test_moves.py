@@ -63,6 +63,7 @@ def test_a_batch_moves_as_each_alone_and_in_any_memory(key):
     warp = ct.Warp(cameras, straight, turns)
     pixels = pixel_lattice(cameras[0], 7, 9).expand(len(cameras), -1, -1)
     found = warp.transform_points(pixels)
+    assert torch.equal(found[1], straight.contains(found[0]))  # what has no place is at (-1, -1)
     for rows in (pixels.contiguous(), pixels.movedim(-1, 0).contiguous().movedim(0, -1), pixels.flip(1).flip(1)):
         again = warp.transform_points(rows)
         assert all(map(torch.equal, found, again))

@@ -349,7 +349,7 @@ def test_no_read_outside_and_nothing_undefined_in_any_variant(tmp_path):
 
 
 def kept(warp):
-    return routes.positions(warp, warp._inputs(), "kept")
+    return routes.positions(warp, "kept")
 
 
 def test_lattices_of_a_batch_of_cameras_and_images():
