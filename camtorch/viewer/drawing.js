@@ -269,11 +269,15 @@ const Viewer = (() => {
       context.closePath();
       context.fill();
       context.stroke(); // no gap to the next one
-    } else if (depth < 5 && corners.length === 4) {
-      const middle = (p, q) => p.map((w, n) => (w + q[n]) / 2), [a, b, c, d] = corners;
+    } else if (depth < 4 && corners.length === 4) {
+      const [height, width] = state.size, middle = (p, q) => p.map((w, n) => (w + q[n]) / 2), [a, b, c, d] = corners;
       const [ab, bc, cd, da, all] = [middle(a, b), middle(b, c), middle(c, d), middle(d, a), middle(a, c)];
+      const isNear = (corner) => {
+        const pixel = camera.project(...corner);
+        return pixel && Math.abs(pixel[0] - width / 2) < 2 * width && Math.abs(pixel[1] - height / 2) < 2 * height;
+      };
       for (const part of [[a, ab, all, da], [ab, b, bc, all], [all, bc, c, cd], [da, all, cd, d]])
-        if (part.some((corner) => camera.project(...corner))) drawFace(context, part, colour, scale, depth + 1);
+        if (part.some(isNear)) drawFace(context, part, colour, scale, depth + 1);
     }
   }
 
@@ -352,7 +356,7 @@ const Viewer = (() => {
     if (canvas.height !== source.height) canvas.height = source.height;
     context.setTransform(1, 0, 0, 1, 0, 0);
     context.drawImage(source, 0, 0);
-    const scale = canvas.width / width, line = canvas.width / 420 / scale;
+    const scale = canvas.width / width, line = (1.5 * width) / (canvas.clientWidth || 640);
     context.setTransform(scale, 0, 0, canvas.height / height, scale / 2, scale / 2); // to the middles of pixels
     const rim = camera.rim();
     context.fillStyle = "rgba(90, 96, 102, 0.72)";
@@ -616,7 +620,7 @@ const Viewer = (() => {
     const [u, v] = [seen.map((p) => p[0]), seen.map((p) => p[1])];
     const enclosing = whole && [Math.min(...u), Math.min(...v), Math.max(...u), Math.max(...v)];
     context.setTransform(1, 0, 0, 1, 0.5, 0.5);
-    drawLabels(context, labels.points.map(moved), outline, enclosing, width / 420);
+    drawLabels(context, labels.points.map(moved), outline, enclosing, (1.5 * width) / (canvas.clientWidth || 640));
     context.setTransform(1, 0, 0, 1, 0, 0);
   }
 

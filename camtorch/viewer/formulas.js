@@ -10,8 +10,10 @@ const Formulas = (() => {
   const AZIMUTHS = 336;
   const HALF_TURN = Math.PI * (1 - EPS);
 
+  const hypot = (a, b) => Math.sqrt(a * a + b * b); // numbers here are far from overflowing
+
   const unit = (x, y, z) => {
-    const length = Math.hypot(x, y, z);
+    const length = Math.sqrt(x * x + y * y + z * z);
     return [x / length, y / length, z / length];
   };
 
@@ -20,13 +22,13 @@ const Formulas = (() => {
   function polynomialOf(coefficients, power) {
     // 1 + c0 x^power + c1 x^(2 power) + ..., and its derivative
     return (x) => {
-      const t = x ** power;
+      const t = power === 2 ? x * x : x;
       let value = 0, slope = 0;
       for (let i = coefficients.length - 1; i >= 0; i--) {
         slope = slope * t + (i + 1) * coefficients[i];
         value = (value + coefficients[i]) * t;
       }
-      return [1 + value, power * x ** (power - 1) * slope];
+      return [1 + value, power === 2 ? 2 * x * slope : slope];
     };
   }
 
@@ -195,13 +197,13 @@ const Formulas = (() => {
     end: Math.min(end, Math.PI),
     radii: (count) => radiiOf(count, Math.min(end, Math.PI), Math.min(end, Math.PI)),
     to: (x, y, z) => {
-      const rho = Math.hypot(x, y);
+      const rho = hypot(x, y);
       if (!(z > 0 || rho > 1e-140)) return null;
       const scale = rho > 0 ? Math.atan2(rho, z) / rho : 1 / z;
       return [x * scale, y * scale];
     },
     back: (a, b) => {
-      const theta = Math.hypot(a, b);
+      const theta = hypot(a, b);
       if (!(theta < Math.PI)) return null;
       const scale = theta > 0 ? Math.sin(theta) / theta : 1;
       return [a * scale, b * scale, Math.cos(theta)];
@@ -235,14 +237,14 @@ const Formulas = (() => {
     return {
       end: FAR,
       to: (x, y, z) => {
-        const rho = Math.hypot(x, y);
+        const rho = hypot(x, y);
         if (!tangent) return perspective().to(x, y, z);
         if (!(FAR * z > Math.max(Math.abs(x), Math.abs(y)) || rho > 1e-140)) return null;
         const scale = rho > 0 ? Math.atan2(Math.abs(tangent) * rho, z) / (Math.abs(omega) * rho) : slope / z;
         return [x * scale, y * scale];
       },
       back: (a, b) => {
-        const angle = Math.abs(omega) * Math.hypot(a, b);
+        const angle = Math.abs(omega) * hypot(a, b);
         if (!(angle < Math.PI && Math.max(Math.abs(a), Math.abs(b)) < FAR / 2)) return null;
         const scale = (angle > 0 ? Math.sin(angle) / angle : 1) / slope;
         return unit(a * scale, b * scale, Math.cos(angle));
@@ -323,13 +325,13 @@ const Formulas = (() => {
       end,
       radii,
       to: (x, y, z) => {
-        const point = plain.to(x, y, z), theta = point ? Math.hypot(...point) : 0;
+        const point = plain.to(x, y, z), theta = point ? hypot(point[0], point[1]) : 0;
         if (!point || !(theta < most * (1 - 16 * EPS))) return null;
         const scale = theta > 0 ? inverse(theta) / theta : 1;
         return [point[0] * scale, point[1] * scale];
       },
       back: (a, b) => {
-        const r = Math.hypot(a, b), theta = radial.image(r)[0];
+        const r = hypot(a, b), theta = radial.image(r)[0];
         if (!(r < fold * (1 - 32 * EPS) && theta < Math.min(most, Math.PI))) return null;
         return r > 0 ? plain.back((a * theta) / r, (b * theta) / r) : [0, 0, 1];
       },
@@ -340,7 +342,7 @@ const Formulas = (() => {
     end: Infinity,
     panorama: [Math.PI, FAR],
     to: (x, y, z) => {
-      const across = Math.hypot(x, z);
+      const across = hypot(x, z);
       return FAR * across > Math.abs(y) ? [Math.atan2(x, z), y / across] : null;
     },
     back: (a, b) => (Math.abs(a) < HALF_TURN && Math.abs(b) < FAR ? unit(Math.sin(a), b, Math.cos(a)) : null),
@@ -350,7 +352,7 @@ const Formulas = (() => {
     end: Infinity,
     panorama: [Math.PI, Math.PI / 2],
     to: (x, y, z) => {
-      const across = Math.hypot(x, z);
+      const across = hypot(x, z);
       return across > 1e-140 ? [Math.atan2(x, z), Math.atan2(y, across)] : null;
     },
     back: (a, b) =>
@@ -448,10 +450,10 @@ const Formulas = (() => {
     const end = Math.min(fold, chart.end);
     return {
       end: () => end,
-      contains: (a, b) => Math.hypot(a, b) < end * (1 - 4 * EPS),
+      contains: (a, b) => hypot(a, b) < end * (1 - 4 * EPS),
       to: (a, b) => stage.at(a, b),
       back: (u, v) => {
-        const s = Math.hypot(u, v), r = inverse(s);
+        const s = hypot(u, v), r = inverse(s);
         if (r === null || !(r < end * (1 - 16 * EPS))) return null;
         return s > 0 ? [(u * r) / s, (v * r) / s] : [0, 0];
       },
@@ -476,7 +478,7 @@ const Formulas = (() => {
     }
     const sector = (a, b) => ((Math.atan2(b, a) / (2 * Math.PI) + 1) * AZIMUTHS) % AZIMUTHS;
     const contains = (a, b, orientation) =>
-      Math.hypot(a, b) < limits[Math.floor(sector(a, b)) % AZIMUTHS] && orientation > 0;
+      hypot(a, b) < limits[Math.floor(sector(a, b)) % AZIMUTHS] && orientation > 0;
 
     const newton = (u, v, a, b) => {
       // each step is shortened until the next one by the same Jacobian is shorter, and it stays inside
@@ -485,8 +487,8 @@ const Formulas = (() => {
       for (let i = 0; i < 60; i++) {
         const [x, y, ua, ub, va, vb] = at, determinant = ua * vb - ub * va;
         const solve = (p, q) => [(vb * p - ub * q) / determinant, (ua * q - va * p) / determinant];
-        const [da, db] = solve(u - x, v - y), size = Math.hypot(da, db);
-        if (size <= 8 * EPS * (0.01 + Math.hypot(a, b))) return [a, b];
+        const [da, db] = solve(u - x, v - y), size = hypot(da, db);
+        if (size <= 8 * EPS * (0.01 + hypot(a, b))) return [a, b];
         const trial = lensAt(stages, a + length * da, b + length * db);
         const nearer = Math.hypot(...solve(u - trial[0], v - trial[1])) < size;
         if (nearer && contains(a + length * da, b + length * db, trial[6])) {
@@ -494,7 +496,7 @@ const Formulas = (() => {
           [at, length] = [trial, Math.min(1, 4 * length)];
         } else if ((length /= 4) < 1e-9) break;
       }
-      return Math.hypot(at[0] - u, at[1] - v) <= 1e-9 * (1 + Math.hypot(u, v)) ? [a, b] : null;
+      return hypot(at[0] - u, at[1] - v) <= 1e-9 * (1 + hypot(u, v)) ? [a, b] : null;
     };
 
     // the image of the rim, by direction: beyond the furthest of it there is nothing to look for
@@ -506,11 +508,11 @@ const Formulas = (() => {
     }
 
     const back = (u, v) => {
-      if (!open && Math.hypot(u, v) > 1.01 * furthest) return null;
+      if (!open && hypot(u, v) > 1.01 * furthest) return null;
       let [a, b] = [u, v];
       for (const stage of [...stages.slice(1)].reverse()) [a, b] = stage.start(a, b);
       if (usual) {
-        const s = Math.hypot(a, b), r = usual.inverse(Math.min(s, usual.most));
+        const s = hypot(a, b), r = usual.inverse(Math.min(s, usual.most));
         if (s > 0) [a, b] = [(a * r) / s, (b * r) / s];
       } else [a, b] = stages[0].start(a, b);
       const first = newton(u, v, a, b);

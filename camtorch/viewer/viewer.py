@@ -107,11 +107,17 @@ def _described(camera: Camera) -> dict[str, Any]:
         raise ValueError(f"write_viewer: this camera has no pixels: {trouble[0]}: {trouble[1]}")
     return {
         "model": camera.key,
-        "intrinsics": intrinsics.tolist(),
-        "distortion": distortion.tolist(),
+        "intrinsics": _numbers(camera.intrinsics),
+        "distortion": _numbers(camera.distortion),
         "names": list(camera.distortion_names)[: len(distortion)],
         "image_size": list(size),
     }
+
+
+def _numbers(values: torch.Tensor) -> list[float]:
+    """As they would be written: 0.1 of float32 is 0.1, not 0.10000000149."""
+    values = values.detach().cpu()
+    return [float(str(value)) for value in (values if values.dtype == torch.float64 else values.float()).numpy()]
 
 
 @cache
