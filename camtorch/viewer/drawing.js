@@ -930,6 +930,12 @@ const Viewer = (() => {
         if (camera.reach(0) < 0.5 * RADIAN) tell("With these coefficients the lens folds at its axis: it has no rays to the right.", true);
       } catch (error) {
         trouble = error.message;
+        if (!camera) {
+          // of the address; no page is to be blank
+          choose({ model: state.model, ...DATA.models[state.model] });
+          frame();
+          return tell(`${error.message} The page shows its own ${DATA.models[state.model].class}.`, true);
+        }
         tell(trouble, true);
         ask("view");
       }
@@ -952,6 +958,7 @@ const Viewer = (() => {
       keepAddress();
     }
     waiting.view = false;
+    return undefined;
   }
 
   function guarded() {
