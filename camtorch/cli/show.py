@@ -40,6 +40,8 @@ def run(arguments: argparse.Namespace) -> None:
         if other.image_size not in (None, camera.image_size):
             sizes = f"{other.width}x{other.height}, but {path} for {camera.width}x{camera.height}"
             raise ValueError(f"{against} is for {sizes}: cameras of one image are compared")
+    if html is not None:
+        write_viewer(camera, html, photograph)
     for name, camera in cameras.items():
         if camera.batch_shape:
             raise ValueError(f"{path}: {name} is a batch of {tuple(camera.batch_shape)} cameras; single ones are shown")
@@ -55,7 +57,6 @@ def run(arguments: argparse.Namespace) -> None:
         _draw(output, camera, other, f"{path.name}: {which}, {camera.width} x {camera.height}")
         print(f"{output}: distortion, radius over angle{', difference' if other is not None else ''}")
     if html is not None:
-        write_viewer(camera, html, photograph)
         print(f"{html}: the lens, live, to be opened in a browser")
 
 

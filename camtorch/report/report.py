@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
 import torch
-from torch import Tensor
 
 import camtorch.plot as plot
 from camtorch._arguments import check_path
@@ -31,8 +30,6 @@ from camtorch.plot.calibrations import sightings
 from camtorch.projection.rays import image_lattice
 
 if TYPE_CHECKING:
-    from PIL import Image
-
     Images: TypeAlias = Sequence[Any] | None
     Names: TypeAlias = Sequence[str] | None
 
@@ -253,7 +250,9 @@ def _photograph(shots: _Shots, number: int) -> dict[str, str]:
     image, name, note = "", shots.names[number], marks.title.split(", ", 1)[1]
     if shots.images[number] is not None:
         try:
-            image = _as_url("image/jpeg", as_jpeg(shots.images[number], (height, width), name, "write_report", _SIDE, _QUALITY))
+            image = _as_url(
+                "image/jpeg", as_jpeg(shots.images[number], (height, width), name, "write_report", _SIDE, _QUALITY)
+            )
         except OSError as error:
             note += f"; no photograph: {error.strerror or error}"
     return {"id": f"{shots.prefix}view-{number}", "name": name, "note": note, "image": image, "marks": marks.url}

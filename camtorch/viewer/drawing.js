@@ -352,10 +352,12 @@ const Viewer = (() => {
 
   function drawLeft() {
     const canvas = $("left"), context = canvas.getContext("2d"), [height, width] = state.size;
-    if (canvas.width !== source.width) canvas.width = source.width;
-    if (canvas.height !== source.height) canvas.height = source.height;
+    const larger = Math.max(1, SCENE / Math.max(source.width, source.height)); // lines are fine on small photographs too
+    const [across, down] = [source.width, source.height].map((side) => Math.round(larger * side));
+    if (canvas.width !== across) canvas.width = across;
+    if (canvas.height !== down) canvas.height = down;
     context.setTransform(1, 0, 0, 1, 0, 0);
-    context.drawImage(source, 0, 0);
+    context.drawImage(source, 0, 0, across, down);
     const scale = canvas.width / width, line = (1.5 * width) / (canvas.clientWidth || 640);
     context.setTransform(scale, 0, 0, canvas.height / height, scale / 2, scale / 2); // to the middles of pixels
     const rim = camera.rim();
@@ -927,7 +929,9 @@ const Viewer = (() => {
         drawCurve();
         offerFormats();
         ask("view");
-        if (camera.reach(0) < 0.5 * RADIAN) tell("With these coefficients the lens folds at its axis: it has no rays to the right.", true);
+        const reach = camera.reach(0), end = onCircle(reach * (1 - 1e-6), 0);
+        if (!end || end[0] - state.intrinsics[2] < 0.05 * state.size[1])
+          tell(`With these coefficients the lens folds ${(reach / RADIAN).toFixed(2)}° from its axis: nearly no pixel has a ray.`, true);
       } catch (error) {
         trouble = error.message;
         if (!camera) {

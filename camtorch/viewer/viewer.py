@@ -94,7 +94,8 @@ def _described(camera: Camera) -> dict[str, Any]:
         hint = ". Of a rig it takes rig.camera, or one of rig.cameras" if has_one else ""
         raise TypeError(f"write_viewer: camera must be a camera of one model; got {type(camera).__name__}{hint}")
     if camera.batch_shape:
-        raise ValueError(f"write_viewer: camera must be a single one; got a batch {tuple(camera.batch_shape)}: camera[0]?")
+        shape = tuple(camera.batch_shape)
+        raise ValueError(f"write_viewer: camera must be a single one, as camera[0] is; got a batch {shape}")
     if camera.key not in models():
         raise ValueError(
             f"write_viewer: the page has no formulas of {camera.key or type(camera).__name__}; it knows "
@@ -122,7 +123,7 @@ def _numbers(values: torch.Tensor) -> list[float]:
 
 @cache
 def models() -> dict[str, dict[str, Any]]:
-    """Of each model that the page knows: a real camera, its class, the names of its coefficients, how many there may be."""
+    """Of each model that the page knows: a real camera, its class, names of coefficients, and how many there may be."""
     known = {}
     for key, preset in json.loads(_file("presets.json")).items():
         kind = MODELS[key]

@@ -16,7 +16,6 @@ SIDE = 33
 # in JavaScript: the results of lenses as `asked` describes them
 ANSWERS = """(lenses) => lenses.map(({ model, intrinsics, distortion, pixels, points }) => {
   const camera = new Formulas.Camera(model, intrinsics, distortion);
-  const back = (ray) => ray && camera.project(...ray);
   return { rays: pixels.map((p) => camera.unproject(...p)), pixels: points.map((p) => camera.project(...p)) };
 })"""
 
@@ -29,7 +28,8 @@ def preset(key):
 
 def drawn(key, which, seed):
     """A camera with coefficients from the ranges of the laws: plausible for 0, wild for 1."""
-    pick, names, sums, values = random.Random(f"{key} {seed}"), ct.MODELS[key].names_of(ct.MODELS[key].default_count), {}, []
+    pick, sums, values = random.Random(f"{key} {seed}"), {}, []
+    names = ct.MODELS[key].names_of(ct.MODELS[key].default_count)
     for name in names:
         prefix = max((p for p in RANGES[key] if name.startswith(p)), key=len, default=None)
         if prefix is None:
@@ -50,8 +50,8 @@ def lenses_of(key):
     """A preset, real calibrations, and drawn ones."""
     found = [preset(key)]
     if key in CALIBRATIONS:
-        intrinsics, distortion, size = CALIBRATIONS[key]
-        found.append(make(key, *(torch.tensor(v, dtype=torch.float64) for v in (intrinsics, distortion)), image_size=size))
+        *numbers, size = CALIBRATIONS[key]
+        found.append(make(key, *(torch.tensor(v, dtype=torch.float64) for v in numbers), image_size=size))
     found += [golden_camera(case) for case in GOLDEN[key]["cameras"][:3]] if key in GOLDEN else []
     if key in RANGES:
         found += [drawn(key, which, seed) for which in (0, 1) for seed in range(3)]

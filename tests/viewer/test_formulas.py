@@ -20,8 +20,8 @@ FORMULAS = Path(viewer.__file__).with_name("formulas.js")
 MOST_BYTES = 400_000
 
 
-def fisheye(**options):
-    return ct.KannalaBrandt([280.0, 280.0, 319.5, 239.5], [0.02, -0.01, 0.003, -0.001], image_size=(480, 640), **options)
+def fisheye():
+    return ct.KannalaBrandt([280.0, 280.0, 319.5, 239.5], [0.02, -0.01, 0.003, -0.001], image_size=(480, 640))
 
 
 @pytest.fixture(scope="module")
@@ -102,7 +102,8 @@ def unpacked(packed):
     planes = zlib.decompress(base64.b64decode(packed["numbers"]), -15)
     columns, at, count = [], 0, packed["count"]
     for width in packed["widths"]:
-        code = sum(np.frombuffer(planes, np.uint8, count, at + i * count).astype(np.int64) << 8 * i for i in range(width))
+        rows = np.frombuffer(planes, np.uint8, count * width, at).reshape(width, count).astype(np.int64)
+        code = sum(row << 8 * i for i, row in enumerate(rows))
         columns.append((code >> 1) ^ -(code & 1))
         at += width * count
     assert at == len(planes)

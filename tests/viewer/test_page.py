@@ -25,10 +25,10 @@ pytestmark = [
     pytest.mark.skipif(CHROMIUM is None, reason="no Chromium is installed here"),
 ]
 
-ARGUMENTS = (
-    "--no-sandbox --use-gl=angle --use-angle=swiftshader --enable-unsafe-swiftshader --disable-quic --no-first-run "
-    "--disable-background-networking --disable-component-update --disable-sync"
-).split()
+ARGUMENTS = [
+    *("--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-quic"),
+    *("--no-first-run", "--disable-background-networking", "--disable-component-update", "--disable-sync"),
+]
 SECOND = 1000
 
 
@@ -98,7 +98,9 @@ def test_every_model_is_shown_by_its_address(key, opened):
     assert tab.inner_text("#message") == ""
     # every file that it offers is that camera
     camera = preset(key)
-    for name, text in tab.evaluate("() => Object.keys(Viewer.FORMATS).map((name) => Viewer.file(name)).filter(Boolean)"):
+    files = tab.evaluate("() => Object.keys(Viewer.FORMATS).map(Viewer.file).filter(Boolean)")
+    assert files
+    for name, text in files:
         loaded = read(name, text)
         assert type(loaded) is type(camera)
         assert loaded.image_size == camera.image_size
@@ -140,12 +142,16 @@ def test_the_lines_run_and_make_the_image_on_the_right(way, renderer, opened, tm
     names = {}
     exec(tab.inner_text("#python"), names)
     made, seen = names["moved"][0].permute(1, 2, 0).double().numpy(), names["warp"].valid_mask()[0, 0].numpy()
-    assert seen.mean() > 0.2
+    assert seen.mean() > 0.1
     assert names["there"].all()
-    inner = seen & np.roll(seen, 3, 0) & np.roll(seen, -3, 0) & np.roll(seen, 3, 1) & np.roll(seen, -3, 1)
+    # away from the rim of the photograph, where Python blends with the black around it
+    inner, edge = seen.copy(), ~seen
+    for step in (-12, -8, -4, 4, 8, 12):
+        for axis in (0, 1):
+            inner &= np.roll(seen, step, axis)
+            edge &= np.roll(~seen, step, axis)
     assert np.abs(shown - made)[inner].max() < (12 if renderer == "webgl" else 25)  # the nearest pixel by canvas
-    grey = (np.abs(shown - [84, 92, 97]) < 1.5).all(-1)
-    assert (grey == ~seen)[inner | ~np.roll(seen, 3, 0)].mean() > 0.98
+    assert ((np.abs(shown - [84, 92, 97]) < 1.5).all(-1))[edge].all()
 
 
 def test_the_command_runs(opened, tmp_path, monkeypatch):
@@ -202,7 +208,7 @@ def test_trouble_is_a_sentence(opened, tmp_path):
     assert tab.inner_text("#python") == "# Focal lengths must be above 0."
     number.fill("130")
     tab.get_by_label("k1, as a number").fill("-1000")
-    tab.locator("#message.trouble").filter(has_text="folds at its axis").wait_for()
+    tab.locator("#message.trouble").filter(has_text=re.compile(r"folds 1.05° from its axis")).wait_for()
     tab.click("#reset")
     settled(tab)
     assert tab.inner_text("#message") == ""
@@ -259,7 +265,7 @@ def test_real_lenses_are_found_by_name(opened):
     tab.locator("#found button").first.click()
     settled(tab)
     text = tab.inner_text("#python")
-    title = next(line for line in text.splitlines() if line.startswith("# GoPro")).removeprefix("# ").partition(": numbers")[0]
+    title = re.search(r"^# (GoPro.*): numbers rounded", text, re.M)[1]
     shown = read(*tab.evaluate("Viewer.file('camtorch (JSON)')"))
     exact = [lens.camera() for lens in ct.lenses.search(title) if lens.name == title]
     rays = torch.nn.functional.normalize(torch.tensor([[0.3, 0.2, 1], [0.5, -0.4, 1.0], [0, 0, 1]]).double(), dim=-1)
