@@ -33,6 +33,7 @@ from camtorch.warp.shutter import RollingShutter
 from camtorch.warp.surround import Surround, surround
 from camtorch.warp.vignetting import vignetting
 from camtorch.warp.warp import Warp
+from camtorch.windshield import Windshield
 
 __all__ = [
     "BirdsEye",
@@ -58,6 +59,7 @@ __all__ = [
     "Surround",
     "TiedFocal",
     "Warp",
+    "Windshield",
     "augment",
     "cabin",
     "calibrate",

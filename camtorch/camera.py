@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import inspect
 from collections.abc import Callable, Mapping, Sequence
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, cast
 
 import torch
@@ -46,6 +47,7 @@ from camtorch.projection.project import Project
 from camtorch.projection.rays import field_of_view
 from camtorch.projection.rows import Cameras
 from camtorch.projection.unproject import Unproject
+from camtorch.windshield import Windshield, behind, model_behind
 
 if TYPE_CHECKING:
     from typing_extensions import Self, TypeVar
@@ -128,6 +130,8 @@ class Camera(BatchedModule):
 
     key: ClassVar[str] = ""
     """Under which `ct.MODELS` and files know the model; without one of its own a class cannot be saved."""
+    configuration: ClassVar[Mapping[str, Any]] = MappingProxyType({})
+    """What `configured` made the class with, of a model with the key: files hold it beside that."""
     default_count: ClassVar[int] = 0
     """How many coefficients, those of `ideal`, a camera has that is made without distortion."""
     defined_text: ClassVar[str] = ""
@@ -197,6 +201,25 @@ class Camera(BatchedModule):
         )
         self.hold("intrinsics", intrinsics, (*batch, 4))
         self.hold("distortion", distortion, (*batch, count))
+
+    @classmethod
+    def configured(cls, **configuration: Any) -> type[Self]:
+        """The class of this model's cameras in a configuration: `windshield=(n, m)` of those behind a `Windshield` of
+        so many coefficients. The same class for the same configuration.
+
+        Raises:
+            ValueError, TypeError: no configuration that the model has.
+        """
+        counts = configuration.pop("windshield", None)
+        if configuration or cls.configuration:
+            raise ValueError(f"{cls.__name__}: it has no configuration {shown(configuration)}")
+        return model_behind(cls, counts)
+
+    def __reduce_ex__(self, protocol: Any) -> Any:
+        made = super().__reduce_ex__(protocol)
+        if not self.configuration:
+            return made
+        return _of_configuration, (plain_model(type(self)), dict(self.configuration)), *made[2:]
 
     @classmethod
     def from_matrix(
@@ -634,6 +657,18 @@ class Camera(BatchedModule):
 
     # -- another model
 
+    def behind(self, shield: Windshield) -> Self:
+        """The camera that looks through a windshield: what it projects goes through the shield first.
+
+        Its coefficients are this camera's, then the shield's, h0 h1 ... of `horizontal` and v0 v1 ... of `vertical`. As
+        of an edited image its gradients go to both where they learn. A ray is valid if it is ahead of the camera, as
+        the one that it becomes, if the shield does not fold there, and if this camera sees what it becomes.
+
+        Raises:
+            TypeError: no `Windshield`; a `Mixed`; a camera that is behind one. ValueError: batch dims that do not fit.
+        """
+        return behind(self, shield)
+
     def convert(
         self,
         model: type[Model] | str,
@@ -695,6 +730,17 @@ class Camera(BatchedModule):
             parts.append(f"image_size={self.image_size}")
         parts += [f"frozen=({', '.join(frozen)})"] if (frozen := frozen_names(self)) else []
         return ", ".join(parts)
+
+
+def plain_model(model: type[Camera]) -> type[Camera]:
+    """The model that `configured` made this one of, or itself."""
+    return next(cls for cls in model.__mro__ if issubclass(cls, Camera) and not cls.configuration)
+
+
+def _of_configuration(model: type[Camera], configuration: dict[str, Any]) -> Camera:
+    """An empty camera, for a pickle to fill."""
+    kind = model.configured(**configuration)
+    return kind.__new__(kind)
 
 
 def _add_model(model: type[Camera]) -> None:

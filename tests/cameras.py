@@ -52,6 +52,10 @@ RANGES = {
     "f_theta": {"k": (0.1, 0.5)},
     "f_theta_backward": {"k": (0.1, 0.5)},
     "woodscape": {"k": (0.1, 0.5)},
+    "f_theta_sheared": {"d": (0.01, 0.3), "e": (0.01, 0.3), "k": (0.1, 0.5)},
+    "f_theta_backward_sheared": {"d": (0.01, 0.3), "e": (0.01, 0.3), "k": (0.1, 0.5)},
+    "cahvor": {"alpha": (0.02, 0.3), "beta": (0.02, 0.3), "r": (0.05, 0.5)},
+    "cahvore": {"alpha": (0.02, 0.3), "beta": (0.02, 0.3), "r": (0.05, 0.5), "linearity": ((0.3, 1.0), (-1.5, 1.5))},
     "ucm": {"alpha": ((0.0, 1.0), (-1.0, 1.5))},
     "eucm": {"alpha": ((0.0, 1.0), (-1.0, 1.5)), "beta": ((0.5, 1.5), (0.01, 20.0))},
     "double_sphere": {"alpha": ((0.0, 1.0), (-0.5, 1.5)), "xi": ((-0.3, 0.6), (-0.9, 3.0))},
@@ -82,6 +86,35 @@ CALIBRATIONS = {
         ),
         (480, 752),
     ),
+    # cameras in the tests of nvidia-ncore, one by its angles and one by its pixels, whose polynomials are in pixels:
+    # 3139.48583984375, 164.5725860595703, ...; 0.0005380856455303729, -1.2021251771798802e-09, ...
+    "f_theta_sheared": (
+        (3139.48583984375 * 1.0000840425491333, 3139.48583984375, 1909.3092041015625, 1103.27880859375),
+        (
+            -7.300000288523734e-05,
+            -2.8000000384054147e-05 / 1.0000840425491333,
+            *(
+                w / 3139.48583984375
+                for w in (164.5725860595703, -442.12896728515625, 259.5827331542969, 153.66644287109375)
+            ),
+        ),
+        (2168, 3848),
+    ),
+    "f_theta_backward_sheared": (
+        (1.1 / 0.0005380856455303729, 1 / 0.0005380856455303729, 1904.948486328125, 1090.5164794921875),
+        (
+            0.02,
+            -0.01 / 1.1,
+            *(
+                w / 0.0005380856455303729**i
+                for i, w in enumerate((-1.2021251771798802e-09, 4.5657002484267295e-12, -5.581118088908714e-16), 2)
+            ),
+        ),
+        (2168, 3848),
+    ),
+    # of the size of those in mrcal's tests
+    "cahvor": ((1761.18, 1761.25, 1965.71, 1087.52), (0.02, -0.03, -0.002, 0.04, -0.01), (2200, 4000)),
+    "cahvore": ((842.3, 850.1, 1965.71, 1087.52), (0.02, -0.03, -0.002, 0.03, -0.01, 0.34), (2200, 4000)),
     # KITTI-360, calibration/image_02.yaml
     "mei": (
         (1336.3220825849971, 1335.7883350012958, 716.94323510126321, 705.76498308221585),
@@ -92,7 +125,11 @@ CALIBRATIONS = {
 
 
 # Cameras with one continuous derivative on the axis, and no second one
-NOT_ANALYTIC = {"f_theta", "f_theta_backward", "ocamcalib", "woodscape"}
+NOT_ANALYTIC = {
+    *("f_theta", "f_theta_backward", "f_theta_backward_sheared", "f_theta_sheared", "ocamcalib", "woodscape"),
+}
+# Cameras whose lens has an axis of its own
+OFF_AXIS = {"cahvor", "cahvore"}
 
 
 def constants(camera):

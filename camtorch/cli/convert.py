@@ -39,10 +39,11 @@ def run(arguments: argparse.Namespace) -> None:
     # camtorch's own JSON holds every model; the format that the rig comes from may not
     stays = rig.format if arguments.model is None or path.suffix != ".json" else None
     changed = Rig(cameras, None if alone else rig.extrinsics, images=rig.images, format=stays)
-    for name in formats.rendered(changed, path, arguments.format):
+    contents = formats.rendered(changed, path, arguments.format)
+    for name in contents:
         targets.check(Path(name), force=arguments.force, inputs=_read(arguments.input))
     path.parent.mkdir(parents=True, exist_ok=True)
-    formats.save(changed, path, arguments.format)
+    formats.write(contents, path)
     print("\n".join(notes))
     if alone and len(rig.extrinsics):
         note(f"{path}: {arguments.name} alone; its pose is left out")

@@ -1,6 +1,6 @@
 """`load` and `save`: each format is asked whether a file is its own; none is known here but by its module.
 
-To add a format, write one file beside this one, as `protocol.py` says, and name it in one of the two lists below.
+To add a format, write one file beside this one, as `protocol.py` says, and name it in one of the lists below.
 `Record` reads values, with errors that say where they stand; `parsing.decoded` gives the text of a content; `poses`
 has rotations; `writing.Lossy` says what would be lost.
 """
@@ -11,20 +11,61 @@ import fnmatch
 import os
 
 from camtorch.camera import Camera
-from camtorch.io import aria, basalt, camtorch_json, colmap, kalibr, mrcal, nerfstudio, ocamcalib, opencv, ros
+from camtorch.io import (
+    aria,
+    basalt,
+    blender,
+    camodocal,
+    camtorch_json,
+    carla,
+    colmap,
+    gyroflow,
+    kalibr,
+    metashape,
+    mrcal,
+    ncore,
+    nerfstudio,
+    nuscenes,
+    ocamcalib,
+    opencv,
+    openmvg,
+    rays,
+    ros,
+    usda,
+    woodscape,
+)
 from camtorch.io._errors import CameraFileError
 from camtorch.io.parsing import parse_mapping, path_of, read_bytes
-from camtorch.io.protocol import ContentFormat, KeyFormat
+from camtorch.io.protocol import ContentFormat, KeyFormat, WrittenFormat
 from camtorch.io.record import Record
 from camtorch.io.writing import replacing
 from camtorch.rig import Rig
 
 # in the order in which they are asked
-_BY_CONTENT: tuple[ContentFormat, ...] = (colmap, ocamcalib)
-_BY_KEYS: tuple[KeyFormat, ...] = (camtorch_json, aria, basalt, mrcal, nerfstudio, ros, kalibr, opencv)
+_BY_CONTENT: tuple[ContentFormat, ...] = (colmap, metashape, nuscenes, ocamcalib)
+_BY_KEYS: tuple[KeyFormat, ...] = (
+    camtorch_json,
+    aria,
+    basalt,
+    mrcal,
+    ncore,
+    nerfstudio,
+    ros,
+    kalibr,
+    woodscape,
+    gyroflow,
+    camodocal,
+    openmvg,
+    opencv,
+)
 
-NAMES_BY_FORMAT = {names.format: names for names in (*(m.NAMES for m in _BY_CONTENT), *(m.NAMES for m in _BY_KEYS))}
+# what renderers take, and nothing here reads
+_WRITTEN: tuple[WrittenFormat, ...] = (usda, carla, blender, rays)
+
+READ = {names.format: names for names in (*(m.NAMES for m in _BY_CONTENT), *(m.NAMES for m in _BY_KEYS))}
+NAMES_BY_FORMAT = READ | {m.NAMES.format: m.NAMES for m in _WRITTEN}
 FORMATS = tuple(NAMES_BY_FORMAT)
+_NOT_READ = {s for m in _WRITTEN for s in m.NAMES.suffixes} - {".npz"} - {s for n in READ.values() for s in n.suffixes}
 
 
 def load(path: str | os.PathLike[str], format: str | None = None) -> Rig:
@@ -33,9 +74,10 @@ def load(path: str | os.PathLike[str], format: str | None = None) -> Rig:
     A calibration is a measurement: nothing of it learns until `.requires_grad_()` says so.
 
     Args:
-        path: a file of OpenCV, ROS, Kalibr, COLMAP, Nerfstudio, Project Aria, Basalt, mrcal, OCamCalib or camtorch; an
-            archive of `numpy.savez(path, K=K, D=D)`; or the folder of a COLMAP or Nerfstudio reconstruction. COLMAP's
-            images beside the cameras are read with them.
+        path: a file of OpenCV, ROS, Kalibr, COLMAP, Nerfstudio, Project Aria, Basalt, mrcal, ncore, OCamCalib,
+            WoodScape, Gyroflow, camodocal, Metashape, nuScenes, OpenMVG or camtorch; an archive of
+            `numpy.savez(path, K=K, D=D)`; or the folder of a COLMAP or Nerfstudio reconstruction. COLMAP's images
+            beside the cameras are read with them.
         format: its format, one of the keys of `camtorch.save`; found from content and name if left out.
 
     Returns:
@@ -48,8 +90,10 @@ def load(path: str | os.PathLike[str], format: str | None = None) -> Rig:
         ValueError: an unknown format. TypeError: no path.
     """
     path, format = path_of(path, "load", "calibration file"), _known(format)
+    if format is not None and format not in READ:
+        raise ValueError(f"format: {format!r} is written only; read are {', '.join(sorted(READ))}")
     if os.path.isdir(path):
-        names = [name for names in NAMES_BY_FORMAT.values() for name in names.in_folder]
+        names = [name for names in READ.values() for name in names.in_folder]
         found = next((name for name in names if os.path.exists(os.path.join(path, name))), None)
         if found is None:
             raise CameraFileError(path, "folder", f"has none of {', '.join(names)}")
@@ -69,6 +113,8 @@ def _read(path: str, content: bytes, format: str | None) -> tuple[Rig, str]:
     for by_content in _BY_CONTENT:
         if format == by_content.NAMES.format or (format is None and by_content.matches(path, content)):
             return by_content.read(path, content), by_content.NAMES.format
+    if format is None and path.lower().endswith(tuple(_NOT_READ)):
+        raise CameraFileError(path, "content", "a file for renderers, which is written only: load what it was made of")
     keys = parse_mapping(path, content)
     for by_keys in _BY_KEYS:
         if format == by_keys.NAMES.format or (format is None and by_keys.matches(keys)):
@@ -80,21 +126,29 @@ def _read(path: str, content: bytes, format: str | None) -> tuple[Rig, str]:
 def save(rig: Rig | Camera, path: str | os.PathLike[str], format: str | None = None) -> None:
     """Write cameras to a calibration file; what stood there before is replaced as a whole, or stays.
 
+    Of what renderers take ("usda", "carla", "blender"), a lens that the format has no model for is the closest one that
+    it has: a warning says how far off that is, as the file does.
+
     Args:
         rig: a `Rig`, or one camera.
         path: the file, which may be a link: then what it points to is replaced. With COLMAP it may be a folder, where
             poses go to an images file beside the cameras; with Nerfstudio one that exists.
-        format: "opencv", "ros", "kalibr", "colmap", "nerfstudio", "aria", "basalt", "mrcal", "ocamcalib" or
-            "camtorch". If left out:
-            the format that the rig was loaded from if its files end like this one, else what the name says
-            (`transforms.json`, `camchain.yaml`, `camera_info.yaml`, `.cameramodel`, `.xml`, `cameras.txt`, `.bin`),
-            else camtorch's own for `.json`.
+        format: "opencv", "ros", "kalibr", "colmap", "nerfstudio", "aria", "basalt", "mrcal", "ncore",
+            "ocamcalib", "woodscape", "gyroflow", "camodocal", "metashape" or "camtorch"; written only, "usda", "carla",
+            "blender" or "rays". If left out: the format that the rig was loaded from if its files end like this one,
+            else what the name says (`transforms.json`, `camchain.yaml`, `camera_info.yaml`, `.cameramodel`, `.xml`,
+            `cameras.txt`, `.bin`, `.usda`, `.exr`), else camtorch's own for `.json`.
 
     Raises:
         CameraFileError: something that the format cannot hold; it says what would be lost.
-        ValueError: an unknown format, or a suffix that does not say which. OSError: it cannot be written.
+        ValueError: an unknown format, or a suffix that does not say which. OSError: it cannot be written. ImportError:
+            OpenEXR is missing, which writes `.exr`.
     """
-    contents = rendered(rig, path, format)
+    write(rendered(rig, path, format), path)
+
+
+def write(contents: dict[str, bytes], path: str | os.PathLike[str]) -> None:
+    """Write what `rendered` gave for that path."""
     for name in contents:
         folder = os.path.dirname(name)
         if os.path.normpath(folder or ".") == os.path.normpath(path):
@@ -128,7 +182,7 @@ def rendered(rig: Rig | Camera, path: str | os.PathLike[str], format: str | None
             raise ValueError(f"{path}: is a folder; {format} is one file, so name it")
         path = next(filter(os.path.exists, inside), inside[-1])
     try:
-        for by_content in _BY_CONTENT:
+        for by_content in (*_BY_CONTENT, *_WRITTEN):
             if by_content.NAMES.format == format:
                 return by_content.files(rig, path)
         by_keys = next(module for module in _BY_KEYS if module.NAMES.format == format)

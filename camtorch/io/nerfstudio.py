@@ -28,7 +28,6 @@ _MODELS = {
     "FISHEYE624": "fisheye624",
     "EQUIRECTANGULAR": "equirectangular",
 }
-_AXES = np.array([1.0, -1.0, -1.0, 1.0])  # of Nerfstudio's cameras by ours
 _RADIAL = ("k1", "k2", "k3", "k4", "k5", "k6")
 _TANGENTIAL = ("p1", "p2")
 _CORE = ("fl_x", "fl_y", "cx", "cy", "w", "h", "camera_angle_x", "camera_angle_y", "x_fov", "y_fov")
@@ -63,7 +62,7 @@ def parse(record: Record) -> Rig:
             found.extend(row)
     if not found:
         return Rig(cameras)
-    rows = np.array(found).reshape(-1, 4, 4) * _AXES
+    rows = np.array(found).reshape(-1, 4, 4) * poses.UPRIGHT
     batch = poses.from_matrices(lambda row: frames[row]["transform_matrix"], rows, undo=True)
     return Rig(cameras, (list(names), batch), images={name: camera for name, camera in names.items() if camera})
 
@@ -145,7 +144,7 @@ def render(rig: Rig, path: str) -> str:
     if shared:
         whole.update(next(iter(written.values())))
     whole["frames"] = []
-    matrices = (poses.matrices(poses.all_of(rig, lossy), undo=True).numpy() * _AXES + 0.0).tolist()
+    matrices = (poses.matrices(poses.all_of(rig, lossy), undo=True).numpy() * poses.UPRIGHT + 0.0).tolist()
     for name, rows in zip(rig.extrinsics, matrices, strict=True):
         own = {} if shared else written[rig.images.get(name, name)]
         whole["frames"].append({"file_path": name, **own, "transform_matrix": rows})

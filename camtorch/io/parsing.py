@@ -113,7 +113,7 @@ def _from_text(path: str | os.PathLike[str], content: bytes) -> Any:
     if _is_literal(text):
         return _from_literal(path, text)
     if re.match(r"\s*\{", text):
-        return _from_json(path, text)
+        return parse_json(path, text)
     if re.match(r"\s*<", text):
         return parse_storage(path, content)
     return _from_yaml(path, text)
@@ -122,8 +122,12 @@ def _from_text(path: str | os.PathLike[str], content: bytes) -> Any:
 # -- JSON
 
 
-def _from_json(path: str | os.PathLike[str], text: str) -> Any:
-    # more values than are worth their memory
+def parse_json(path: str | os.PathLike[str], text: str) -> Any:
+    """The value of a text of JSON, all numbers floats.
+
+    Raises:
+        CameraFileError: no JSON, a key twice, more values than are worth their memory. RecursionError: nested deeply.
+    """
     size = text.count(",") + 3 * text.count("[") + 6 * text.count("{") + 5 * text.count(":")
     if size > max(_MOST_JSON_UNITS, len(text) // _BYTES_PER_UNIT):
         raise CameraFileError(path, "content", "too many values")

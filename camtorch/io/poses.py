@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -20,6 +21,8 @@ Place = Record | Callable[[int], Record]
 
 _ORTHOGONAL = 1e-3  # as Extrinsics.from_matrix
 _FARTHEST = 1e100
+UPRIGHT = np.array([1.0, -1.0, -1.0, 1.0])
+"""The axes of a camera that looks along -z, y up, by ours: a factor of the columns of a matrix, world from camera."""
 
 
 def as_float64(values: Any) -> Tensor:

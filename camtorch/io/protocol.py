@@ -46,18 +46,22 @@ class KeyFormat(Protocol):
         """The text of a file. Raises CameraFileError for what the format cannot hold."""
 
 
-class ContentFormat(Protocol):
-    """A module that reads and writes files of any other kind, one or several of them."""
+class WrittenFormat(Protocol):
+    """A module that writes files of any other kind, one or several of them."""
 
     @property
     def NAMES(self) -> Names:  # noqa: N802
         """What it and its files are called."""
+
+    def files(self, rig: Rig, path: str) -> dict[str, bytes]:
+        """The contents of the files to write, by their paths. Raises CameraFileError for what they cannot hold."""
+
+
+class ContentFormat(WrittenFormat, Protocol):
+    """One that also reads them."""
 
     def matches(self, path: str, content: bytes) -> bool:
         """Whether this is such a file."""
 
     def read(self, path: str, content: bytes) -> Rig:
         """The cameras of a file, in float64, with what lies beside it. Raises CameraFileError."""
-
-    def files(self, rig: Rig, path: str) -> dict[str, bytes]:
-        """The contents of the files to write, by their paths. Raises CameraFileError for what they cannot hold."""

@@ -13,13 +13,13 @@ import json
 import math
 import os
 import tempfile
-from types import ModuleType
 from typing import Any
 
 import numpy as np
 import torch
 
 from camtorch._arguments import shown
+from camtorch.io.exr import as_exr, needed
 from camtorch.maps.exact import Exact
 from camtorch.maps.lookup import LookupMap
 from camtorch.maps.protocol import MOST_PIXELS, SIZES, MapFormat, Options, checked
@@ -73,27 +73,12 @@ class STMap(MapFormat):
         return LookupMap(torch.from_numpy(positions), size, self.name, {"v": way})
 
 
-def _needed(name: str, package: str) -> ModuleType:
-    try:
-        return __import__(name)
-    except ImportError:
-        raise ImportError(f'STMaps need {package}: pip install "camtorch[maps]"') from None
-
-
 def _as_exr(pixels: np.ndarray, facts: dict[str, Any]) -> bytes:
-    openexr = _needed("OpenEXR", "OpenEXR")
-    header = {"compression": openexr.ZIP_COMPRESSION, "type": openexr.scanlineimage}
-    header |= {_PREFIX + key: value for key, value in facts.items()}
-    planes = {channel: np.ascontiguousarray(pixels[..., i]) for i, channel in enumerate("RGB")}
-    with tempfile.TemporaryDirectory() as folder:  # it writes to names alone
-        file = os.path.join(folder, "map.exr")
-        openexr.File(header, planes).write(file)
-        with open(file, "rb") as written:
-            return written.read()
+    return as_exr(pixels, {_PREFIX + key: value for key, value in facts.items()})
 
 
 def _from_exr(content: bytes) -> tuple[list[np.ndarray], dict[str, Any]]:
-    openexr = _needed("OpenEXR", "OpenEXR")
+    openexr = needed("OpenEXR", "EXR")
     with tempfile.TemporaryDirectory() as folder:
         file = os.path.join(folder, "map.exr")
         with open(file, "wb") as copy:
@@ -116,14 +101,14 @@ def _check_size(count: int) -> None:
 
 
 def _as_tiff(pixels: np.ndarray, facts: dict[str, Any]) -> bytes:
-    tifffile = _needed("tifffile", "tifffile")
+    tifffile = needed("tifffile", "TIFF")
     file = io.BytesIO()
     tifffile.imwrite(file, pixels, photometric="rgb", description=json.dumps(facts), metadata=None, software="camtorch")
     return file.getvalue()
 
 
 def _from_tiff(content: bytes) -> tuple[list[np.ndarray], dict[str, Any]]:
-    tifffile = _needed("tifffile", "tifffile")
+    tifffile = needed("tifffile", "TIFF")
     with tifffile.TiffFile(io.BytesIO(content)) as file:
         page = file.pages[0]
         _check_size(math.prod(page.shape))

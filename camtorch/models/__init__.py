@@ -7,14 +7,16 @@ another thing.
 
 from camtorch.camera import MODELS
 from camtorch.models.brown_conrady import BrownConrady
+from camtorch.models.cahvor import CAHVOR
+from camtorch.models.cahvore import CAHVORE
 from camtorch.models.cylindrical import Cylindrical
 from camtorch.models.division import Division
 from camtorch.models.double_sphere import DoubleSphere
 from camtorch.models.equirectangular import Equirectangular
 from camtorch.models.equisolid import Equisolid
 from camtorch.models.eucm import EUCM
-from camtorch.models.f_theta import FTheta
-from camtorch.models.f_theta_backward import FThetaBackward
+from camtorch.models.f_theta import FTheta, FThetaSheared
+from camtorch.models.f_theta_backward import FThetaBackward, FThetaBackwardSheared
 from camtorch.models.fisheye62 import Fisheye62
 from camtorch.models.fisheye624 import Fisheye624, FisheyeRadTanThinPrism
 from camtorch.models.fov import FOV
@@ -32,6 +34,8 @@ from camtorch.models.ucm import UCM
 from camtorch.models.woodscape import WoodScape
 
 __all__ = [
+    "CAHVOR",
+    "CAHVORE",
     "EUCM",
     "FOV",
     "MODELS",
@@ -44,6 +48,8 @@ __all__ = [
     "Equisolid",
     "FTheta",
     "FThetaBackward",
+    "FThetaBackwardSheared",
+    "FThetaSheared",
     "Fisheye62",
     "Fisheye624",
     "FisheyeRadTanThinPrism",

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, ClassVar, cast
 
 import torch
 
-from camtorch._arguments import Numbers, as_batch, as_number, as_real, fails
+from camtorch._arguments import Numbers, as_batch, as_number, as_real, fails, holds, is_list
 from camtorch.camera import Camera
 
 if TYPE_CHECKING:
@@ -38,13 +38,18 @@ class FreePolynomial(Camera):
     default_count = 3
     fit_counts: ClassVar[tuple[int, ...]] = (3, 5, 7)
 
+    sheared: ClassVar[type[FreePolynomial] | None] = None
+    """The model that has d e too, which come first."""
+    shear_names: ClassVar[tuple[str, ...]] = ()
+
     @classmethod
     def names_of(cls, count: int) -> tuple[str, ...] | None:
-        return tuple(f"k{i}" for i in range(2, count + 2)) or None
+        first = cls.shear_names
+        return (*first, *(f"k{i}" for i in range(2, count + 2 - len(first)))) if count > len(first) else None
 
     @classmethod
     def counts_text(cls) -> str:
-        return "n >= 1 (k2 k3 ...)"
+        return f"n >= {len(cls.shear_names) + 1} ({' '.join((*cls.shear_names, 'k2', 'k3'))} ...)"
 
     @classmethod
     def from_polynomial(
@@ -53,6 +58,7 @@ class FreePolynomial(Camera):
         coefficients: Numbers,
         *,
         aspect_ratio: float = 1.0,
+        linear_cde: Numbers = (1.0, 0.0, 0.0),
         image_size: Sequence[int] | None = None,
     ) -> Self:
         """From a polynomial without a leading 1: k1 theta + k2 theta^2 + ... pixels.
@@ -62,11 +68,15 @@ class FreePolynomial(Camera):
         Args:
             centre: (*B, 2) cx, cy, the pixel of the axis.
             coefficients: (*B, n), n >= 2: k1, k2, ...; k1 > 0 makes the focal length.
-            aspect_ratio: fy / fx.
+            aspect_ratio: fy / fx, for c = 1.
+            linear_cde: (*B, 3) c, d, e of NVIDIA's files: the pixel is [[c, d], [e, 1]] r(theta) (cos phi, sin phi)
+                from the centre. Where d or e is not zero, or learns, the camera is an `FThetaSheared`, or an
+                `FThetaBackwardSheared`; c goes into fx.
             image_size: (height, width) in pixels.
 
         Raises:
-            ValueError: fewer than two coefficients, or a first one that is not positive.
+            ValueError: fewer than two coefficients, or a first one that is not positive; c that is not positive, c <=
+                d e, which is no camera; a model that has no d and e.
         """
         aspect_ratio = as_number(aspect_ratio, "aspect_ratio", cls.__name__)
         centre = as_real(centre, "centre", cls.__name__)
@@ -81,10 +91,30 @@ class FreePolynomial(Camera):
                 f"{cls.__name__}: the first coefficient, of the first power, must be positive; got {first.tolist()}. "
                 "A constant before it, which is zero, is left out"
             )
-        as_batch(cls.__name__, centre=centre.shape, coefficients=coefficients.shape)
+        linear = as_real(linear_cde, "linear_cde", cls.__name__)
+        if linear.ndim == 0 or linear.shape[-1] != 3:
+            raise ValueError(f"{cls.__name__}: linear_cde must be (*B, 3) = c, d, e; got shape {tuple(linear.shape)}")
+        if is_list(linear_cde):  # in the precision of what it belongs to
+            linear = torch.tensor(linear_cde, dtype=coefficients.dtype, device=coefficients.device)
+        c, d, e = linear.split(1, -1)
+        if fails((c > 0) & (c > d * e)):
+            raise ValueError(
+                f"{cls.__name__}: linear_cde = c, d, e must have c > 0 and c > d e; got {linear.tolist()}. Files that "
+                "have zeros mean 1, 0, 0"
+            )
+        batch = as_batch(cls.__name__, centre=centre.shape, coefficients=coefficients.shape, linear_cde=linear.shape)
+        is_straight = linear_cde == (1.0, 0.0, 0.0) if isinstance(linear_cde, tuple) else False
+        is_straight = is_straight or (not linear.requires_grad and holds(linear[..., 1:] == 0))
         focal, distortion = cls._scaled(coefficients)
-        both = torch.broadcast_tensors(torch.cat((focal, focal * aspect_ratio), -1), centre)
-        return cls(torch.cat(both, -1), distortion, image_size=image_size)
+        focal = torch.cat((focal * c, focal.expand(*batch, 1) * aspect_ratio), -1)
+        intrinsics = torch.cat(torch.broadcast_tensors(focal, centre), -1)
+        kind: type[FreePolynomial] | None = cls if cls.shear_names or is_straight else cls.sheared
+        if kind is None:
+            raise ValueError(f"{cls.__name__}: it has no d and e, which are {linear.tolist()}; FTheta takes them")
+        if kind.shear_names:
+            shear = torch.cat((e, d / c), -1)
+            distortion = torch.cat([w.to(focal).expand(*batch, w.shape[-1]) for w in (shear, distortion)], -1)
+        return cast("Self", kind(intrinsics, distortion, image_size=image_size))
 
     @classmethod
     def _scaled(cls, coefficients: Tensor) -> tuple[Tensor, Tensor]:

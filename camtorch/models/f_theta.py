@@ -1,12 +1,13 @@
 """The f-theta fisheye camera: r is a free polynomial of the angle, r = theta (1 + k2 theta + k3 theta^2 + ...)."""
 
 from collections.abc import Sequence
+from types import MappingProxyType
 from typing import ClassVar
 
 from torch import Tensor
 
 from camtorch.models._polynomial import FreePolynomial
-from camtorch.optics import Chart, Equidistant, Lens, Planar, RadiusPolynomial
+from camtorch.optics import Chart, Equidistant, Lens, Planar, RadiusPolynomial, Shear
 
 
 class FTheta(FreePolynomial):
@@ -21,7 +22,8 @@ class FTheta(FreePolynomial):
 
     Distortion: k2 k3 ... by the power of theta, any number of them, at least one; 3 if left out. The same as
     `WoodScape`, which has three, and NVIDIA DriveWorks `ftheta` where its polynomial gives pixels of angles
-    (`fw-poly`); one that gives angles of pixels is `FThetaBackward`. See `Camera` for shapes, conventions and errors.
+    (`fw-poly`); one that gives angles of pixels is `FThetaBackward`. Files of NVIDIA have a linear part beside it, for
+    which `from_polynomial` makes an `FThetaSheared`. See `Camera` for shapes, conventions and errors.
     """
 
     key = "f_theta"
@@ -37,3 +39,31 @@ class FTheta(FreePolynomial):
     @classmethod
     def _scaled(cls, coefficients: Tensor) -> tuple[Tensor, Tensor]:
         return coefficients[..., :1], coefficients[..., 1:] / coefficients[..., :1]
+
+
+class FThetaSheared(FTheta):
+    """NVIDIA's f-theta camera with all of its linear part: of `FTheta`'s (x, y), (u, v) = f (x + e y, d x + y) + c.
+
+    The [[c, d], [e, 1]] of files comes in through `from_polynomial`: d here is their e, e is their d / c, and c is
+    fx / fy.
+
+    Distortion: d e k2 k3 ..., d and e of the linear part as of `OCamCalib`, then those of `FTheta`, at least one; 5 if
+    left out. Source: NVIDIA's nvidia-ncore, `FThetaCameraModel`. On the axis see `FTheta`. See `Camera` for shapes,
+    conventions and errors.
+    """
+
+    key = "f_theta_sheared"
+    shear_names = ("d", "e")
+    distortion_names: tuple[str, ...] = (*shear_names, *FTheta.distortion_names)
+    default_count = 5
+    fit_counts: ClassVar[tuple[int, ...]] = (5, 7, 9)
+    odd_in_x = odd_in_y = frozenset(shear_names)
+    quarter_turn = MappingProxyType({"d": "-e", "e": "-d"})
+    special_cases = (("f_theta", tuple(f"k{i}" for i in range(2, 33))),)
+
+    @staticmethod
+    def optics(k: Sequence[Tensor]) -> tuple[Chart, Lens]:
+        return Equidistant(), Lens(Planar(RadiusPolynomial(k[2:])), Shear(*k[:2]))
+
+
+FTheta.sheared = FThetaSheared

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from types import MappingProxyType
+from typing import ClassVar
 
 from torch import Tensor
 
 from camtorch.models._polynomial import FreePolynomial
-from camtorch.optics import Chart, Inverted, Lens, RadiusPolynomial
+from camtorch.optics import Chart, Inverted, Lens, RadiusPolynomial, Shear
 
 
 class FThetaBackward(FreePolynomial):
@@ -19,7 +21,8 @@ class FThetaBackward(FreePolynomial):
 
     Distortion: k2 k3 ... by the power of r, any number of them, at least one; 3 if left out. A polynomial of pixels
     comes in through `from_polynomial`. The same as NVIDIA DriveWorks `ftheta` where its polynomial gives angles of
-    pixels (`bw-poly`). On the axis see `FTheta`. See `Camera` for shapes, conventions and errors.
+    pixels (`bw-poly`), and as nvidia-ncore's, whose linear part makes it an `FThetaBackwardSheared`. On the axis see
+    `FTheta`. See `Camera` for shapes, conventions and errors.
     """
 
     key = "f_theta_backward"
@@ -33,3 +36,27 @@ class FThetaBackward(FreePolynomial):
         focal = 1 / coefficients[..., :1]
         powers = range(2, coefficients.shape[-1] + 1)
         return focal, coefficients[..., 1:] * focal ** coefficients.new_tensor(list(powers))
+
+
+class FThetaBackwardSheared(FThetaBackward):
+    """`FThetaBackward` with all of NVIDIA's linear part: (u, v) = f (x + e y, d x + y) + c.
+
+    Distortion: d e k2 k3 ..., d and e as of `FThetaSheared`, then those of `FThetaBackward`, at least one; 5 if left
+    out. See `Camera` for shapes, conventions and errors.
+    """
+
+    key = "f_theta_backward_sheared"
+    shear_names = ("d", "e")
+    distortion_names: tuple[str, ...] = (*shear_names, *FThetaBackward.distortion_names)
+    default_count = 5
+    fit_counts: ClassVar[tuple[int, ...]] = (5, 7, 9)
+    odd_in_x = odd_in_y = frozenset(shear_names)
+    quarter_turn = MappingProxyType({"d": "-e", "e": "-d"})
+    special_cases = (("f_theta_backward", tuple(f"k{i}" for i in range(2, 33))),)
+
+    @staticmethod
+    def optics(k: Sequence[Tensor]) -> tuple[Chart, Lens]:
+        return Inverted(RadiusPolynomial, k[2:]), Lens(Shear(*k[:2]))
+
+
+FThetaBackward.sheared = FThetaBackwardSheared

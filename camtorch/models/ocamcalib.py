@@ -11,8 +11,7 @@ from torch import Tensor
 
 from camtorch._arguments import Numbers, as_real, fails
 from camtorch.camera import Camera
-from camtorch.optics import AnglePerRadius, Chart, Inverted, Lens, RadiusPolynomial, Stage
-from camtorch.optics.lens import StageAt
+from camtorch.optics import AnglePerRadius, Chart, Inverted, Lens, RadiusPolynomial, Shear
 from camtorch.optics.radial import RadialFactor
 from camtorch.optics.special import first_root
 
@@ -32,41 +31,6 @@ class AngleOfAllPowers(AnglePerRadius):
     def closed_fold(self) -> Tensor:
         """The first root of D - r D', to which d(theta)/dr is in proportion."""
         return first_root(*(-i * c for i, c in enumerate(self.parameters)))
-
-
-class Shear(Stage):
-    """(x + e y, d x + y): a sensor out of line with the lens."""
-
-    code: ClassVar[int | None] = 18
-
-    def __init__(self, d: Tensor, e: Tensor):
-        self.parameters: tuple[Tensor, ...] = (d, e)
-
-    def __call__(self, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
-        d, e = self.parameters
-        return a + e * b, b + d * a
-
-    def at(self, a: Tensor, b: Tensor, order: int = 1, t: Tensor | None = None) -> ShearAt:
-        """The stage at points."""
-        return ShearAt(self, a, b)
-
-    def lower_bound(self, radius: Tensor) -> tuple[Tensor, Tensor]:
-        d, e = self.parameters
-        # of the symmetric part the eigenvalues are 1 + (d + e) / 2 and 1 - (d + e) / 2
-        return (1 - (d + e).abs() / 2).expand_as(radius), radius * (1 + torch.maximum(d.abs(), e.abs()))
-
-    def start(self, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
-        d, e = self.parameters
-        return (u - e * v) / (1 - d * e), (v - d * u) / (1 - d * e)
-
-
-class ShearAt(StageAt):
-    """A `Shear` at points."""
-
-    @property
-    def jacobian(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        d, e = (w + torch.zeros_like(self.a) for w in self.stage.parameters)
-        return torch.ones_like(d), e, d, torch.ones_like(e)
 
 
 class OCamCalib(Camera):

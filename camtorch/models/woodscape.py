@@ -25,6 +25,7 @@ class WoodScape(FTheta):
     key = "woodscape"
     special_cases = ()
     fit_counts = ()
+    sheared = None
 
     @classmethod
     def names_of(cls, count: int) -> tuple[str, ...] | None:

@@ -39,7 +39,7 @@ enum { PADDED = 8 };      /* numbers of a factor that loops are made for */
 #define EACH(i) for (int i = 0; i < (n & -LANES); i++)
 
 /* Charts that have loops of their own: unified ones of alpha 0, of alpha 1 and no xi, and of no xi */
-enum { SHIFTED = SPHERE + 1, SPHERICAL, ENHANCED };
+enum { SHIFTED = LINEARITY + 1, SPHERICAL, ENHANCED };
 /* Factors that have: polynomials of few numbers and of some, and so on; any other one */
 enum { FEW, SOME, RATIO, ROOTS, ANGLES, ALL, ANY };
 
@@ -51,7 +51,7 @@ enum { FEW, SOME, RATIO, ROOTS, ANGLES, ALL, ANY };
         WAY(PERSPECTIVE, __VA_ARGS__) WAY(EQUIDISTANT, __VA_ARGS__) WAY(EQUISOLID, __VA_ARGS__)                        \
         WAY(UNIFIED, __VA_ARGS__) WAY(FOV, __VA_ARGS__) WAY(ONE_DIVISION, __VA_ARGS__) WAY(INVERTED, __VA_ARGS__)      \
         WAY(CYLINDER, __VA_ARGS__) WAY(SPHERE, __VA_ARGS__) WAY(SHIFTED, __VA_ARGS__) WAY(SPHERICAL, __VA_ARGS__)      \
-        WAY(ENHANCED, __VA_ARGS__)                                                                                     \
+        WAY(ENHANCED, __VA_ARGS__) WAY(LINEARITY, __VA_ARGS__)                                                                                  \
     }
 #define FORM(name, made, n, m, ...) CASE(name, enum { kind = made, count = n, below = m }; __VA_ARGS__)
 #define EACH_FORM(given, ...)                                                                                          \
@@ -64,13 +64,16 @@ enum { FEW, SOME, RATIO, ROOTS, ANGLES, ALL, ANY };
 
 int32_t THIS(classify)(const Classification *);
 
+/* How many numbers the map before a chart has */
+static int numbers_of_map(const Part *part) { return part->map == TURN ? 9 : part->map == BEND ? part->across + part->down : 0; }
+
 /* How many numbers a part has: the `parameters` of its chart or stage */
 static int numbers_of(const Part *part) {
-    int count = 0;
+    int count = numbers_of_map(part);
     if (part->kind == UNIFIED)
-        count = !!(part->flags & HAS_XI) + !!(part->flags & HAS_ALPHA) + !!(part->flags & HAS_BETA);
-    if (part->kind == FOV || part->kind == ONE_DIVISION) count = 1;
-    if (part->kind == TILT) count = 9;
+        count += !!(part->flags & HAS_XI) + !!(part->flags & HAS_ALPHA) + !!(part->flags & HAS_BETA);
+    if (part->kind == FOV || part->kind == ONE_DIVISION || part->kind == LINEARITY) count += 1;
+    if (part->kind == HOMOGRAPHY) count = 9;
     if (part->kind == SHEAR) count = 2;
     if (part->kind == PLANAR) count = 2 * !!(part->flags & TANGENTIAL) + 4 * !!(part->flags & PRISM);
     if (part->factor == RADIUS_TABLE) return count + 4 * part->n;

@@ -10,12 +10,15 @@
 #include "sampler.h"
 
 /* Charts: rays to a plane; the numbers of each are its `parameters` */
-enum { PERSPECTIVE, EQUIDISTANT, EQUISOLID, UNIFIED, FOV, ONE_DIVISION, INVERTED, CYLINDER, SPHERE };
+enum { PERSPECTIVE, EQUIDISTANT, EQUISOLID, UNIFIED, FOV, ONE_DIVISION, INVERTED, CYLINDER, SPHERE, LINEARITY };
 /* Flags of charts: which of xi, alpha, beta are numbers, and whether x and y change places */
 enum { HAS_XI = 1, HAS_ALPHA = 2, HAS_BETA = 4, TRANSVERSE = 8 };
 
+/* Maps of rays before a chart, whose numbers come before the chart's: none, a rotation, a windshield of n and m numbers */
+enum { NO_MAP, TURN, BEND };
+
 /* Stages of a lens on that plane */
-enum { PLANAR = 16, TILT, SHEAR };
+enum { PLANAR = 16, HOMOGRAPHY, SHEAR };
 /* Flags of the planar stage */
 enum { TANGENTIAL = 1, PRISM = 2 };
 
@@ -34,7 +37,7 @@ enum { EXTENT = RADII + AZIMUTHS * RADII + AZIMUTHS };
 
 /* A chart or a stage */
 typedef struct {
-    int32_t kind, flags, factor, n, m;
+    int32_t kind, flags, factor, n, m, map, across, down; /* the last two of a windshield */
     double constant; /* alpha of a unified chart that does not learn it */
 } Part;
 

@@ -44,7 +44,7 @@ static int defined_at(const Camera_double *c, double a, double b) {
     for (int j = 1; j <= c->stages; j++) {
         const double *k = c->numbers[j];
         const Part *part = c->parts + j;
-        if (part->kind == TILT && !(k[6] * x[0] + k[7] * y[0] + k[8] > 0)) return 0;
+        if (part->kind == HOMOGRAPHY && !(k[6] * x[0] + k[7] * y[0] + k[8] > 0)) return 0;
         if (part->factor == RATIONAL && !(horner_double(k + part->n, part->m, x[0] * x[0] + y[0] * y[0], NULL) > 0)) return 0;
         stage_double(c, j, LANES, x, y, u, v, NULL);
         memcpy(x, u, LANES * sizeof(double)), memcpy(y, v, LANES * sizeof(double));

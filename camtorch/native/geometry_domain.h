@@ -220,16 +220,19 @@ static void bound_planar(const Lens *lens, int n, double *radius, double *least)
     }
 }
 
-static void bound_tilt(const double *k, int n, double *radius, double *least) {
+static void bound_homography(const double *k, int n, double *radius, double *least) {
     const double slope = hypot(k[6], k[7]), across = hypot(k[0], k[3]), along = hypot(k[1], k[4]);
     const double size = (across > along ? across : along) * sqrt(2), shift = hypot(k[2], k[5]);
+    double m[9];
+    adjugate_double(k, m);
+    const double area = k[6] * m[2] + k[7] * m[5] + k[8] * m[8];
     for (int i = 0; i < n; i++) {
-        const double nearest = k[8] - slope * radius[i];
+        const double nearest = k[8] - slope * radius[i], lowest = nearest < area ? nearest : area;
         /* past the horizon nothing is certain */
-        const double seen = k[8] * (size * radius[i] + shift) / (nearest > 0 ? nearest : NAN);
-        const double turned = k[8] * (k[0] + k[4]) - slope * seen;
-        least[i] = turned == turned ? nearest < turned ? nearest : turned : NAN;
-        radius[i] = seen + shift;
+        const double seen = (size * radius[i] + shift) / (nearest > 0 ? nearest : NAN);
+        const double turned = k[0] + k[4] - slope * seen;
+        least[i] = turned == turned ? lowest < turned ? lowest : turned : NAN;
+        radius[i] = seen;
     }
 }
 
@@ -240,7 +243,7 @@ static void bound_lens(const Lens *lens, int first, int n, double *radius, doubl
     for (int j = 1; j < lens->of->part_count; j++) {
         stage.part = lens->of->parts + j;
         if (j >= first) {
-            if (stage.part->kind == TILT) bound_tilt(stage.numbers, n, radius, here);
+            if (stage.part->kind == HOMOGRAPHY) bound_homography(stage.numbers, n, radius, here);
             else if (stage.part->kind == SHEAR) {
                 const double d = stage.numbers[0], e = stage.numbers[1];
                 const double wider = 1 + (fabs(d) > fabs(e) ? fabs(d) : fabs(e));
@@ -313,8 +316,8 @@ void THIS(domain)(const Domain *d) {
         Lens lens = {d, first, numbers + numbers_of(d->parts), d->constants + c * d->constant_count};
         Part factor;
         if (d->is_chart) {
-            factor = d->parts[0], factor.kind = PLANAR, factor.flags = 0;
-            lens.part = &factor, lens.numbers = numbers;
+            factor = d->parts[0], factor.kind = PLANAR, factor.flags = factor.map = 0;
+            lens.part = &factor, lens.numbers = numbers + numbers_of_map(d->parts);
         }
         double fold = 0, table[2 + 2 * NODES];
         const int has_factor = lens.part->factor != NO_FACTOR;

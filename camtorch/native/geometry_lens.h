@@ -216,46 +216,49 @@ static void T(planar_vjp)(const T(Camera) *c, int j, int n, const R *restrict a,
     }
 }
 
-/* The homography of a tilted sensor, R = k row by row: ((r00 a + r01 b + r02) r22 / depth - r02, ...) */
-static void T(tilt)(const R *k, int n, const R *restrict a, const R *restrict b, R *restrict u, R *restrict v,
-                    T(Jacobian) *restrict to) {
+/* The projective map of a matrix k, row by row */
+static void T(homography)(const R *k, int n, const R *restrict a, const R *restrict b, R *restrict u, R *restrict v,
+                          T(Jacobian) *restrict to) {
     EACH(i) {
-        const R one = 1 / (k[6] * a[i] + k[7] * b[i] + k[8]), scale = k[8] * one;
-        const R x = scale * (k[0] * a[i] + k[1] * b[i] + k[2]), y = scale * (k[3] * a[i] + k[4] * b[i] + k[5]);
-        u[i] = x - k[2], v[i] = y - k[5];
+        const R one = 1 / (k[6] * a[i] + k[7] * b[i] + k[8]);
+        const R x = one * (k[0] * a[i] + k[1] * b[i] + k[2]), y = one * (k[3] * a[i] + k[4] * b[i] + k[5]);
+        u[i] = x, v[i] = y;
         if (to) {
-            to->ua[i] = (k[8] * k[0] - x * k[6]) * one, to->ub[i] = (k[8] * k[1] - x * k[7]) * one;
-            to->va[i] = (k[8] * k[3] - y * k[6]) * one, to->vb[i] = (k[8] * k[4] - y * k[7]) * one;
+            to->ua[i] = (k[0] - x * k[6]) * one, to->ub[i] = (k[1] - x * k[7]) * one;
+            to->va[i] = (k[3] - y * k[6]) * one, to->vb[i] = (k[4] - y * k[7]) * one;
         }
     }
 }
 
-static void T(tilt_vjp)(const R *k, int n, const R *restrict a, const R *restrict b, R *restrict gu, R *restrict gv,
-                        double *sums) {
-    ALIGNED R rows[3][BLOCK], of_scale[BLOCK], ga[BLOCK], gb[BLOCK];
+static void T(homography_vjp)(const R *k, int n, const R *restrict a, const R *restrict b, R *restrict gu,
+                              R *restrict gv, double *sums) {
+    ALIGNED R rows[3][BLOCK];
     EACH(i) {
-        const R one = 1 / (k[6] * a[i] + k[7] * b[i] + k[8]), scale = k[8] * one;
-        const R x = scale * (k[0] * a[i] + k[1] * b[i] + k[2]), y = scale * (k[3] * a[i] + k[4] * b[i] + k[5]);
-        ga[i] = gu[i] * (k[8] * k[0] - x * k[6]) * one + gv[i] * (k[8] * k[3] - y * k[6]) * one;
-        gb[i] = gu[i] * (k[8] * k[1] - x * k[7]) * one + gv[i] * (k[8] * k[4] - y * k[7]) * one;
-        of_scale[i] = gu[i] * x + gv[i] * y;
-        rows[0][i] = scale * gu[i], rows[1][i] = scale * gv[i], rows[2][i] = -one * of_scale[i];
+        const R one = 1 / (k[6] * a[i] + k[7] * b[i] + k[8]);
+        const R x = one * (k[0] * a[i] + k[1] * b[i] + k[2]), y = one * (k[3] * a[i] + k[4] * b[i] + k[5]);
+        const R p = gu[i] * one, q = gv[i] * one, w = -(p * x + q * y);
+        gu[i] = p * k[0] + q * k[3] + w * k[6], gv[i] = p * k[1] + q * k[4] + w * k[7];
+        rows[0][i] = p, rows[1][i] = q, rows[2][i] = w;
     }
-    if (sums) {
+    for (int j = 0; sums && j < 3; j++) {
+        sums[3 * j] += T(dot)(n, rows[j], a), sums[3 * j + 1] += T(dot)(n, rows[j], b);
+        sums[3 * j + 2] += T(total)(n, rows[j]);
+    }
+}
+
+/* The inverse matrix times the determinant */
+INLINE void T(adjugate)(const R *k, R *m) {
+    for (int i = 0; i < 3; i++)
         for (int j = 0; j < 3; j++) {
-            sums[3 * j] += T(dot)(n, rows[j], a), sums[3 * j + 1] += T(dot)(n, rows[j], b);
-            sums[3 * j + 2] += T(total)(n, rows[j]);
+            const int p = (j + 1) % 3, q = (j + 2) % 3, r = (i + 1) % 3, s = (i + 2) % 3;
+            m[3 * i + j] = k[3 * p + r] * k[3 * q + s] - k[3 * p + s] * k[3 * q + r];
         }
-        sums[2] -= T(total)(n, gu), sums[5] -= T(total)(n, gv);
-        sums[8] += T(total)(n, of_scale) / k[8];
-    }
-    EACH(i) gu[i] = ga[i], gv[i] = gb[i];
 }
 
 static void T(stage)(const T(Camera) *c, int stage, int n, const R *a, const R *b, R *u, R *v, T(Jacobian) *to) {
     const Part *part = c->parts + stage;
     const R *k = c->numbers[stage];
-    if (part->kind == TILT) T(tilt)(k, n, a, b, u, v, to);
+    if (part->kind == HOMOGRAPHY) T(homography)(k, n, a, b, u, v, to);
     else if (part->kind == SHEAR) {
         EACH(i) u[i] = a[i] + k[1] * b[i], v[i] = b[i] + k[0] * a[i];
         if (to) EACH(i) to->ua[i] = to->vb[i] = 1, to->ub[i] = k[1], to->va[i] = k[0];
@@ -279,7 +282,7 @@ static void T(lens)(const T(Camera) *c, int first, int n, const R *a, const R *b
         if (least) {
             const R *k = c->numbers[j];
             ALIGNED R margin[BLOCK];
-            if (c->parts[j].kind == TILT) EACH(i) margin[i] = k[6] * x[i] + k[7] * y[i] + k[8];
+            if (c->parts[j].kind == HOMOGRAPHY) EACH(i) margin[i] = k[6] * x[i] + k[7] * y[i] + k[8];
             else if (c->parts[j].factor == RATIONAL) {
                 EACH(i) margin[i] = T(horner)(k + c->parts[j].n, c->parts[j].m, x[i] * x[i] + y[i] * y[i], NULL);
             } else EACH(i) margin[i] = INFINITY;
@@ -310,8 +313,8 @@ static void T(lens_vjp)(const T(Camera) *c, int n, const R *restrict a, const R 
     for (int j = 1; j < c->stages; j++) T(stage)(c, j, n, x[j - 1], y[j - 1], x[j], y[j], NULL);
     for (int j = c->stages; j >= 1; j--) {
         const R *k = c->numbers[j];
-        double *part = sums ? sums + (k - c->numbers[0]) : NULL;
-        if (c->parts[j].kind == TILT) T(tilt_vjp)(k, n, x[j - 1], y[j - 1], gu, gv, part);
+        double *part = sums ? sums + (k - c->map) : NULL;
+        if (c->parts[j].kind == HOMOGRAPHY) T(homography_vjp)(k, n, x[j - 1], y[j - 1], gu, gv, part);
         else if (c->parts[j].kind == SHEAR) {
             if (part) part[0] += T(dot)(n, gv, x[j - 1]), part[1] += T(dot)(n, gu, y[j - 1]);
             EACH(i) {

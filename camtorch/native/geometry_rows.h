@@ -15,7 +15,9 @@ static void T(prepare)(const Cameras *all, int64_t camera, T(Camera) *c) {
     const R *intrinsics = (const R *)all->intrinsics + 4 * camera;
     memset(c, 0, sizeof *c);
     c->parts = all->parts, c->stages = (int)all->part_count - 1;
+    c->map = numbers;
     for (int j = 0; j <= c->stages; j++) c->numbers[j] = numbers, numbers += numbers_of(c->parts + j);
+    c->numbers[0] += numbers_of_map(c->parts);
     c->constants = (const R *)all->constants + camera * all->constant_count;
     c->fx = intrinsics[0], c->fy = intrinsics[1], c->cx = intrinsics[2], c->cy = intrinsics[3];
     c->usable = !all->usable || all->usable[camera];
@@ -134,6 +136,52 @@ static int T(beyond)(const T(Camera) *c, int count, int n, T(Seen) *s) {
     return c->limits2 ? 0 : some && places[0] < count ? some : 0;
 }
 
+/* -- the map of rays before a chart, in place; optics/ray_maps.py */
+
+static void T(product)(const R *m, int across, int down, int n, R *restrict x, R *restrict y, R *restrict z) {
+    const R a = m[0], b = m[across], c = m[2 * across], d = m[down], e = m[down + across], f = m[down + 2 * across];
+    const R g = m[2 * down], h = m[2 * down + across], k = m[2 * (down + across)];
+    EACH(i) {
+        const R p = x[i], q = y[i], r = z[i];
+        x[i] = a * p + b * q + c * r, y[i] = d * p + e * q + f * r, z[i] = g * p + h * q + k * r;
+    }
+}
+
+/* Points times `shrink`, zeros where they are too near to the origin; see `see_by` */
+static void T(shrunk)(int n, R *restrict x, R *restrict y, R *restrict z, R *restrict shrink) {
+    EACH(i) {
+        const R size = T(most)(T(most)(T(absolute)(x[i]), T(absolute)(y[i])), T(absolute)(z[i]));
+        const R factor = size > FLOOR ? T(shrink)(size) : 0;
+        x[i] *= factor, y[i] *= factor, z[i] *= factor, shrink[i] = factor;
+    }
+}
+
+static void T(change)(const T(Camera) *c, int n, T(Seen) *s) {
+    if (!c->parts->map) return;
+    T(shrunk)(n, s->x, s->y, s->z, s->shrink);
+    T(product)(c->map, 1, 3, n, s->x, s->y, s->z);
+}
+
+/* Adds the sums of the products of components, row by row */
+static void T(outer)(int n, const R *x, const R *y, const R *z, const R *p, const R *q, const R *r, double *sums) {
+    const R *rows[] = {x, y, z}, *columns[] = {p, q, r};
+    for (int i = 0; i < 9; i++) sums[i] += T(dot)(n, rows[i / 3], columns[i % 3]);
+}
+
+/* The cotangents of points of those of what they become; adds those of the numbers */
+static void T(change_vjp)(const T(Camera) *c, int n, T(Seen) *s, R *restrict gx, R *restrict gy, R *restrict gz,
+                          double *sums) {
+    T(shrunk)(n, s->x, s->y, s->z, s->shrink);
+    EACH(i) {
+        const int ok = s->ok[i] != 0;
+        s->x[i] = ok ? s->x[i] : 0, s->y[i] = ok ? s->y[i] : 0, s->z[i] = ok ? s->z[i] : 1;
+        s->shrink[i] = ok ? s->shrink[i] : 0;
+    }
+    if (sums) T(outer)(n, gx, gy, gz, s->x, s->y, s->z, sums);
+    T(product)(c->map, 3, 1, n, gx, gy, gz);
+    EACH(i) gx[i] *= s->shrink[i], gy[i] *= s->shrink[i], gz[i] *= s->shrink[i];
+}
+
 /* Points of covered rays on the chart's plane, the centre elsewhere; keeps: rays, the axis elsewhere, and their scale too.
 
    Rays are points times `shrink`, a power of two, with their largest component from 1 to 2. No ray are those that are
@@ -206,6 +254,7 @@ static int T(see)(const T(Camera) *c, int keeps, int count, int n, T(Seen) *s) {
 
 /* Points `s` to pixels, -1 where they are not `ok`. How many wait for limits */
 static int T(pixels_of)(const T(Camera) *c, int count, int n, T(Seen) *s, R *restrict u, R *restrict v) {
+    T(change)(c, n, s);
     const int waiting = T(see)(c, 0, count, n, s);
     const R fx = c->fx, fy = c->fy, cx = c->cx, cy = c->cy;
     if (c->is_radial) { /* most often */
@@ -260,6 +309,7 @@ static void T(project_vjp)(const T(Camera) *c, const Rows *rows, int64_t camera,
     T(Seen) s;
     ALIGNED R gu[BLOCK], gv[BLOCK], gx[BLOCK], gy[BLOCK], gz[BLOCK], by_angle[BLOCK];
     T(load_points)(points, from, count, n, s.x, s.y, s.z);
+    T(change)(c, n, &s);
     T(see)(c, 1, count, n, &s);
     const R *to_u = T(load)(cotangents, by[1], count, n, gx, 0);
     const R *to_v = T(load)(cotangents + by[2], by[1], count, n, gy, 0);
@@ -280,11 +330,17 @@ static void T(project_vjp)(const T(Camera) *c, const Rows *rows, int64_t camera,
         T(radial)(c->factors, n, gx, gy, gz);
         EACH(i) by_angle[i] = 1 / (gy[i] + 2 * gx[i] * gz[i]);
     }
-    if (sums) T(to_plane_sums)(c, n, s.x, s.y, s.z, s.scale, by_angle, gu, gv, sums);
-    if (!rows->results) return;
+    const int of_map = numbers_of_map(c->parts);
+    if (sums) T(to_plane_sums)(c, n, s.x, s.y, s.z, s.scale, by_angle, gu, gv, sums + of_map);
+    if (!rows->results && !of_map) return;
     const int swapped = c->swapped;
     T(unsee)(c, n, swapped ? s.y : s.x, swapped ? s.x : s.y, s.z, s.shrink, s.scale, by_angle, swapped ? gv : gu,
              swapped ? gu : gv, swapped ? gy : gx, swapped ? gx : gy, gz);
+    if (of_map) {
+        T(load_points)(points, from, count, n, s.x, s.y, s.z);
+        T(change_vjp)(c, n, &s, gx, gy, gz, sums);
+        if (!rows->results) return;
+    }
     T(store)((R *)rows->results + camera * to[0] + first * to[1], to, 3, count, gx, gy, gz);
 }
 
@@ -385,11 +441,12 @@ static void T(start)(const T(Camera) *c, int first, int n, const R *u, const R *
     EACH(i) a[i] = u[i], b[i] = v[i];
     for (int j = c->stages; j >= first; j--) {
         const R *k = c->numbers[j];
-        if (c->parts[j].kind == TILT) {
+        if (c->parts[j].kind == HOMOGRAPHY) {
+            R m[9];
+            T(adjugate)(k, m);
             EACH(i) {
-                /* R's transpose is its inverse */
-                const R p = (a[i] + k[2]) / k[8], q = (b[i] + k[5]) / k[8], one = 1 / (k[2] * p + k[5] * q + k[8]);
-                a[i] = (k[0] * p + k[3] * q + k[6]) * one, b[i] = (k[1] * p + k[4] * q + k[7]) * one;
+                const R p = a[i], q = b[i], one = 1 / (m[6] * p + m[7] * q + m[8]);
+                a[i] = (m[0] * p + m[1] * q + m[2]) * one, b[i] = (m[3] * p + m[4] * q + m[5]) * one;
             }
         } else if (c->parts[j].kind == SHEAR) {
             const R area = 1 - k[0] * k[1];
@@ -552,6 +609,10 @@ static void T(solutions)(const T(Camera) *c, int n, R *restrict u, R *restrict v
         }
     } else T(cover)(c, n, u, v, known, ok);
     T(rays)(c, n, u, v, ok, x, y, z);
+    if (c->parts->map) {
+        T(product)(c->map, 3, 1, n, x, y, z);
+        EACH(i) x[i] = ok[i] ? x[i] : 0, y[i] = ok[i] ? y[i] : 0, z[i] = ok[i] ? z[i] : 1;
+    }
 }
 
 /* How many wait for an extent */
@@ -598,7 +659,15 @@ static void T(unproject_vjp)(const T(Camera) *c, const Rows *rows, int64_t camer
         gx[i] = is_known ? to_x[i] : 0, gy[i] = is_known ? to_y[i] : 0, gz[i] = is_known ? to_z[i] : 0;
     }
     for (int i = count; i < n; i++) gx[i] = gy[i] = gz[i] = 0;
-    T(rays_vjp)(c, n, a, b, gx, gy, gz, ga, gb, sums ? sums + 4 : NULL);
+    if (c->parts->map) {
+        ALIGNED R rx[BLOCK], ry[BLOCK], rz[BLOCK];
+        ALIGNED I all[BLOCK];
+        EACH(i) all[i] = 1;
+        T(rays)(c, n, a, b, all, rx, ry, rz);
+        if (sums) T(outer)(n, rx, ry, rz, gx, gy, gz, sums + 4);
+        T(product)(c->map, 1, 3, n, gx, gy, gz);
+    }
+    T(rays_vjp)(c, n, a, b, gx, gy, gz, ga, gb, sums ? sums + 4 + numbers_of_map(c->parts) : NULL);
     if (c->stages) {
         T(Jacobian) jacobian;
         T(lens)(c, 1, n, a, b, x, y, &jacobian, NULL), u = x, v = y;

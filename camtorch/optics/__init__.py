@@ -8,25 +8,31 @@ from camtorch.optics.charts import (
     EquidistantUpTo,
     Equisolid,
     Fov,
+    Linearity,
     OneDivision,
     Perspective,
     SphereChart,
     Transverse,
 )
-from camtorch.optics.lens import Lens, Planar, Stage, Tilt
+from camtorch.optics.lens import Homography, Lens, Planar, Shear, Stage, Tilt
 from camtorch.optics.radial import AnglePerRadius, Polynomial, RadialFactor, RadiusPolynomial, RadiusTable, Rational
+from camtorch.optics.ray_maps import Before, Bending, RayMap, Rotation
 from camtorch.optics.unified import Unified
 
 __all__ = [
     "AnglePerRadius",
+    "Before",
+    "Bending",
     "Chart",
     "CylinderChart",
     "Equidistant",
     "EquidistantUpTo",
     "Equisolid",
     "Fov",
+    "Homography",
     "Inverted",
     "Lens",
+    "Linearity",
     "OneDivision",
     "Perspective",
     "Planar",
@@ -35,6 +41,9 @@ __all__ = [
     "RadiusPolynomial",
     "RadiusTable",
     "Rational",
+    "RayMap",
+    "Rotation",
+    "Shear",
     "SphereChart",
     "Stage",
     "Tilt",

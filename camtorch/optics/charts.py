@@ -74,6 +74,10 @@ class Chart:
         """The unit ray of points on the plane; see `to_plane`."""
         raise NotImplementedError
 
+    def seen(self, a: Tensor, b: Tensor) -> Tensor | None:
+        """Positive for points where a lens begins that are the image of a ray; None where all up to `end` are."""
+        return None
+
     def end(self, dtype: torch.dtype) -> float | Tensor:
         """The radius on the plane at which the chart ends, one or (C, 1). Only charts that a lens follows need it."""
         raise NotImplementedError
@@ -366,3 +370,58 @@ class OneDivision(Chart):
     def to_ray(self, a: Tensor, b: Tensor, order: int = 2) -> Planes3:
         (coefficient,) = self.parameters
         return unit(a, b, torch.addcmul(torch.ones_like(a), coefficient, torch.addcmul(a * a, b, b)))
+
+
+class Linearity(Chart):
+    """r = tan(L theta) / L, theta or sin(L theta) / L, for L above, at and below 0: every ray with |L| theta < pi / 2.
+
+    L is the linearity of a CAHVORE camera. There is one continuous derivative by L at L = 0, and it is 0.
+    """
+
+    code: ClassVar[int | None] = 9
+
+    def __init__(self, linearity: Tensor):
+        self.parameters: tuple[Tensor, ...] = (linearity,)
+
+    def margin(self, x: Tensor, y: Tensor, z: Tensor) -> Tensor:
+        (linearity,) = self.parameters
+        theta = (torch.addcmul(x * x, y, y)).sqrt() * Equidistant().scale(x, y, z, 1)
+        before = math.pi / 2 - 1 / Perspective().end(z.dtype) - linearity.abs() * theta
+        return torch.minimum(Equidistant().margin(x, y, z), before)
+
+    def scale(self, x: Tensor, y: Tensor, z: Tensor, order: int = 2) -> Tensor:
+        (linearity,), angle = self.parameters, Equidistant().scale(x, y, z, order)
+        t = (linearity * angle) ** 2 * torch.addcmul(x * x, y, y)
+        return angle * torch.where(linearity > 0, tanc_root(t), sinc_root(t, order))
+
+    def _angle2(self, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
+        """L^2 r^2, and what of it is left up to where the sine turns."""
+        (linearity,) = self.parameters
+        square = linearity * linearity * torch.addcmul(a * a, b, b)
+        return square, torch.where(linearity > 0, 1.0, 1 - square)
+
+    def on_plane(self, a: Tensor, b: Tensor) -> Tensor:
+        square, left = self._angle2(a, b)
+        floor = 64 * torch.finfo(a.dtype).eps
+        theta = torch.addcmul(a * a, b, b).sqrt() * angle_per_radius(square, left.clamp(min=0).sqrt(), 1)
+        inside = torch.minimum(math.pi * (1 - floor) - theta, left - floor)
+        return torch.minimum(inside, Perspective().end(a.dtype) / 2 - torch.maximum(a.abs(), b.abs()))
+
+    def to_ray(self, a: Tensor, b: Tensor, order: int = 2) -> Planes3:
+        square, left = self._angle2(a, b)
+        factor = angle_per_radius(square, left.sqrt(), order)
+        return Equidistant().to_ray(a * factor, b * factor, order)
+
+    def end(self, dtype: torch.dtype) -> float | Tensor:
+        (linearity,), most = self.parameters, Perspective().end(dtype) / 2
+        size = linearity.detach().abs().double()
+        angle = (size * math.pi).clamp(max=math.pi / 2 - 1 / most)
+        ends = torch.where(linearity > 0, tanc_root(angle * angle), sinc_root(angle * angle, 1)) * angle
+        inside = 1 - 64 * torch.finfo(dtype).eps
+        return torch.where(size > 0, inside * ends / torch.where(size > 0, size, 1.0), inside * math.pi).clamp(max=most)
+
+    def usual_end(self, dtype: torch.dtype) -> float | Tensor:
+        return torch.as_tensor(self.end(dtype)).clamp(max=Perspective().usual_end(dtype))
+
+    def radii(self, count: int, like: Tensor) -> Tensor:
+        return Perspective().radii(count, like)

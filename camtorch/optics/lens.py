@@ -253,88 +253,127 @@ class PlanarAt(StageAt):
         return self.stage.radial.margin(self.t) if self.stage.radial else None
 
 
-class Tilt(Stage):
+class Homography(Stage):
+    """The projective map of a matrix, given row by row: (a, b, 1) becomes (x, y, w), and the point x / w, y / w."""
+
+    code: ClassVar[int | None] = 17
+
+    def __init__(self, *matrix: Tensor):
+        self.parameters: tuple[Tensor, ...] = matrix
+
+    def at(self, a: Tensor, b: Tensor, order: int = 1, t: Tensor | None = None) -> HomographyAt:
+        """The stage at points."""
+        return HomographyAt(self, a, b)
+
+    def lower_bound(self, radius: Tensor) -> Planes2:
+        """See `Planar.lower_bound`; here the bound is one of the orientation itself."""
+        h00, h01, h02, h10, h11, h12, h20, h21, h22 = self.parameters
+        slope = hypot(h20, h21)
+        nearest = h22 - slope * radius
+        size = torch.maximum(hypot(h00, h10), hypot(h01, h11)) * math.sqrt(2)
+        # past the horizon nothing is certain
+        seen = (size * radius + hypot(h02, h12)) / torch.where(nearest > 0, nearest, torch.nan)
+        minors = self._adjugate()
+        turned = h20 * minors[2] + h21 * minors[5] + h22 * minors[8]
+        return torch.minimum(torch.minimum(nearest, turned), h00 + h11 - slope * seen), seen
+
+    def start(self, u: Tensor, v: Tensor) -> Planes2:
+        """The point that is sent to (u, v)."""
+        r00, r01, r02, r10, r11, r12, r20, r21, r22 = self._adjugate()
+        reciprocal = 1 / (r20 * u + r21 * v + r22)
+        return (r00 * u + r01 * v + r02) * reciprocal, (r10 * u + r11 * v + r12) * reciprocal
+
+    def _adjugate(self) -> tuple[Tensor, ...]:
+        """The inverse matrix times the determinant."""
+        h00, h01, h02, h10, h11, h12, h20, h21, h22 = self.parameters
+        return (
+            *(h11 * h22 - h12 * h21, h02 * h21 - h01 * h22, h01 * h12 - h02 * h11),
+            *(h12 * h20 - h10 * h22, h00 * h22 - h02 * h20, h02 * h10 - h00 * h12),
+            *(h10 * h21 - h11 * h20, h01 * h20 - h00 * h21, h00 * h11 - h01 * h10),
+        )
+
+
+class HomographyAt(StageAt):
+    """A `Homography` at points."""
+
+    stage: Homography
+    depth: Tensor
+    reciprocal: Tensor
+    u: Tensor
+    v: Tensor
+
+    def __init__(self, stage: Homography, a: Tensor, b: Tensor):
+        super().__init__(stage, a, b)
+        h00, h01, h02, h10, h11, h12, h20, h21, h22 = stage.parameters
+        self.depth = h20 * a + h21 * b + h22
+        self.reciprocal = 1 / self.depth
+        self.u, self.v = self.reciprocal * (h00 * a + h01 * b + h02), self.reciprocal * (h10 * a + h11 * b + h12)
+
+    @property
+    def value(self) -> Planes2:
+        return self.u, self.v
+
+    @property
+    def jacobian(self) -> Jacobian:
+        h00, h01, _, h10, h11, _, h20, h21, _ = self.stage.parameters
+        u, v, one = self.u, self.v, self.reciprocal
+        return (h00 - u * h20) * one, (h01 - u * h21) * one, (h10 - v * h20) * one, (h11 - v * h21) * one
+
+    @property
+    def margin(self) -> Tensor:
+        # before the horizon
+        return self.depth
+
+
+class Tilt(Homography):
     """The homography of a sensor tilted by (tau_x, tau_y) radians.
 
-    Source: OpenCV `computeTiltProjectionMatrix`: the plane point is turned by R = R_y(tau_y) R_x(tau_x) and
-    projected back along the optical axis. It fixes the origin; OpenCV's R_x, R_y turn clockwise.
+    Source: OpenCV `computeTiltProjectionMatrix`: the plane point is turned by R = R_y(tau_y) R_x(tau_x) and projected
+    back along the optical axis, [[R22, 0, -R02], [0, R22, -R12], [0, 0, 1]] R. It fixes the origin; OpenCV's R_x, R_y
+    turn clockwise.
     """
 
     code: ClassVar[int | None] = 17
 
     def __init__(self, tau_x: Tensor, tau_y: Tensor):
         cx, sx, cy, sy = torch.cos(tau_x), torch.sin(tau_x), torch.cos(tau_y), torch.sin(tau_y)
-        self.parameters: tuple[Tensor, ...] = (
-            cy,
-            sy * sx,
-            -sy * cx,
-            torch.zeros_like(cx),
-            cx,
-            sx,
-            sy,
-            -cy * sx,
-            cy * cx,
-        )
+        zero = torch.zeros_like(cx)
+        super().__init__(cx, zero, zero, -sx * sy, cy, zero, sy, -cy * sx, cy * cx)
 
-    def at(self, a: Tensor, b: Tensor, order: int = 1, t: Tensor | None = None) -> TiltAt:
+
+class Shear(Stage):
+    """(x + e y, d x + y): a sensor out of line with the lens."""
+
+    code: ClassVar[int | None] = 18
+
+    def __init__(self, d: Tensor, e: Tensor):
+        self.parameters: tuple[Tensor, ...] = (d, e)
+
+    def __call__(self, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
+        d, e = self.parameters
+        return a + e * b, b + d * a
+
+    def at(self, a: Tensor, b: Tensor, order: int = 1, t: Tensor | None = None) -> ShearAt:
         """The stage at points."""
-        return TiltAt(self, a, b)
+        return ShearAt(self, a, b)
 
-    def lower_bound(self, radius: Tensor) -> Planes2:
-        """See `Planar.lower_bound`; here the bound is one of the orientation itself."""
-        r00, r01, r02, r10, r11, r12, r20, r21, r22 = self.parameters
-        slope = hypot(r20, r21)
-        nearest = r22 - slope * radius
-        size = torch.maximum(hypot(r00, r10), hypot(r01, r11)) * math.sqrt(2)
-        shift = hypot(r02, r12)
-        # past the horizon nothing is certain
-        seen = r22 * (size * radius + shift) / torch.where(nearest > 0, nearest, torch.nan)
-        return torch.minimum(nearest, r22 * (r00 + r11) - slope * seen), seen + shift
+    def lower_bound(self, radius: Tensor) -> tuple[Tensor, Tensor]:
+        d, e = self.parameters
+        # of the symmetric part the eigenvalues are 1 + (d + e) / 2 and 1 - (d + e) / 2
+        return (1 - (d + e).abs() / 2).expand_as(radius), radius * (1 + torch.maximum(d.abs(), e.abs()))
 
-    def start(self, u: Tensor, v: Tensor) -> Planes2:
-        """The point that is sent to (u, v)."""
-        r00, r01, r02, r10, r11, r12, r20, r21, r22 = self.parameters
-        x, y = (u + r02) / r22, (v + r12) / r22
-        # R's transpose is its inverse
-        reciprocal = 1 / (r02 * x + r12 * y + r22)
-        return (r00 * x + r10 * y + r20) * reciprocal, (r01 * x + r11 * y + r21) * reciprocal
+    def start(self, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
+        d, e = self.parameters
+        return (u - e * v) / (1 - d * e), (v - d * u) / (1 - d * e)
 
 
-class TiltAt(StageAt):
-    """A `Tilt` stage at points."""
-
-    stage: Tilt
-    a: Tensor
-    b: Tensor
-    depth: Tensor
-    reciprocal: Tensor
-    u: Tensor
-    v: Tensor
-
-    def __init__(self, stage: Tilt, a: Tensor, b: Tensor):
-        self.stage, self.a, self.b = stage, a, b
-        r00, r01, r02, r10, r11, r12, r20, r21, r22 = stage.parameters
-        self.depth = r20 * a + r21 * b + r22
-        self.reciprocal = 1 / self.depth
-        scale = r22 * self.reciprocal
-        self.u, self.v = scale * (r00 * a + r01 * b + r02), scale * (r10 * a + r11 * b + r12)
+class ShearAt(StageAt):
+    """A `Shear` at points."""
 
     @property
-    def value(self) -> Planes2:
-        _, _, r02, _, _, r12, _, _, _ = self.stage.parameters
-        return self.u - r02, self.v - r12
-
-    @property
-    def jacobian(self) -> Jacobian:
-        r00, r01, _, r10, r11, _, r20, r21, r22 = self.stage.parameters
-        ua, ub = r22 * r00 - self.u * r20, r22 * r01 - self.u * r21
-        va, vb = r22 * r10 - self.v * r20, r22 * r11 - self.v * r21
-        return ua * self.reciprocal, ub * self.reciprocal, va * self.reciprocal, vb * self.reciprocal
-
-    @property
-    def margin(self) -> Tensor:
-        # before the horizon
-        return self.depth
+    def jacobian(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        d, e = (w + torch.zeros_like(self.a) for w in self.stage.parameters)
+        return torch.ones_like(d), e, d, torch.ones_like(e)
 
 
 class Lens:

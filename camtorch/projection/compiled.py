@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from camtorch.optics.charts import Chart
     from camtorch.optics.lens import Lens, Stage
     from camtorch.optics.radial import RadialFactor
+    from camtorch.optics.ray_maps import RayMap
     from camtorch.projection.domain import Domain, Optics
 
 PROJECT, UNPROJECT, PROJECT_VJP, UNPROJECT_VJP = range(4)
@@ -49,6 +50,9 @@ class _Part(ctypes.Structure):
         ("factor", c_int32),
         ("n", c_int32),
         ("m", c_int32),
+        ("map", c_int32),
+        ("across", c_int32),
+        ("down", c_int32),
         ("constant", c_double),
     )
 
@@ -392,13 +396,19 @@ def codes(chart: Chart, lens: Lens) -> list[_Part] | None:
     return known if len(known) == len(parts) <= _MOST_PARTS else None
 
 
-def _code(part: Chart | Stage | RadialFactor | type[RadialFactor]) -> int | None:
+def _code(part: Chart | RayMap | Stage | RadialFactor | type[RadialFactor]) -> int | None:
     # a subclass may have another formula
     code: int | None = vars(part if isinstance(part, type) else type(part)).get("code")
     return code
 
 
 def _chart(chart: Chart) -> _Part | None:
+    if type(chart) is optics.Before:
+        part, code = _chart(chart.chart), _code(chart.change)
+        if part is None or part.map or code is None:
+            return None
+        part.map = code
+        return part
     flags = 0
     if type(chart) is optics.Transverse:
         chart, flags = chart.chart, _TRANSVERSE

@@ -180,6 +180,8 @@ class Unproject:
         else:
             solved = domain.chart.on_plane(p, q)
         solved = to_mask(solved)
+        seen = domain.chart.seen(replace(solved, a, 0.0), replace(solved, b, 0.0))
+        solved = solved if seen is None else solved * to_mask(seen)
         mask, a, b = mask * solved, replace(solved, a, 0.0), replace(solved, b, 0.0)
 
         def evaluate(u: Tensor, v: Tensor, intrinsics: Tensor, distortion: Tensor) -> Tensor:

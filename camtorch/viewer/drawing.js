@@ -699,7 +699,7 @@ const Viewer = (() => {
 
   function rangeOf(name, value) {
     const natural = { alpha: [0, 1], omega: [-2.5, 2.5], xi: [-0.9, 3], beta: [0.1, 3] }[name];
-    if (natural) return [Math.min(natural[0], value), Math.max(natural[1], value)];
+    if (natural && !state.model.startsWith("cahvor")) return [Math.min(natural[0], value), Math.max(natural[1], value)];
     const usual = /^(p|s)/.test(name) ? 0.02 : /^(d|e|tau)/.test(name) ? 0.2 : 0.3, reach = Math.max(usual, 1.5 * Math.abs(value));
     return [value - reach, value + reach];
   }

@@ -371,6 +371,40 @@ const Formulas = (() => {
     },
   });
 
+  const linearity = (l) => {
+    // r = tan(L theta) / L, theta or sin(L theta) / L, for L above, at and below 0
+    const size = Math.abs(l), plain = equidistant(), most = Math.PI / 2 - 1 / FAR;
+    const forward = (angle) => (l > 0 ? Math.tan(angle) : Math.sin(angle));
+    const angleEnd = Math.min(size * Math.PI, Math.PI / 2 - 2 / FAR);
+    const end = Math.min((1 - 64 * EPS) * (size > 0 ? forward(angleEnd) / size : Math.PI), FAR / 2);
+    return {
+      end,
+      radii: perspectiveRadii(FAR),
+      to: (x, y, z) => {
+        const point = plain.to(x, y, z), theta = point ? hypot(point[0], point[1]) : 0;
+        if (!point || !(size * theta < most)) return null;
+        const scale = size * theta > 0 ? forward(size * theta) / (size * theta) : 1;
+        return [point[0] * scale, point[1] * scale];
+      },
+      back: (a, b) => {
+        const r = hypot(a, b), s = size * r;
+        if (!(l > 0 || s * s < 1 - 64 * EPS) || !(Math.max(Math.abs(a), Math.abs(b)) < FAR / 2)) return null;
+        const theta = s > 0 ? (l > 0 ? Math.atan(s) : Math.asin(s)) / size : r;
+        if (!(theta < Math.PI * (1 - 64 * EPS))) return null;
+        return r > 0 ? plain.back((a * theta) / r, (b * theta) / r) : [0, 0, 1];
+      },
+    };
+  };
+
+  const rotated = (rows, chart) => ({
+    ...chart,
+    to: (x, y, z) => chart.to(...rows.map((row) => row[0] * x + row[1] * y + row[2] * z)),
+    back: (a, b) => {
+      const ray = chart.back(a, b);
+      return ray && [0, 1, 2].map((i) => rows[0][i] * ray[0] + rows[1][i] * ray[1] + rows[2][i] * ray[2]);
+    },
+  });
+
   // -- stages of a lens: `at(a, b)` is [u, v, du/da, du/db, dv/da, dv/db, margin]; `start` a point near what gives (u, v)
 
   function planar({ radial = null, tangential = [0, 0], prism = [0, 0, 0, 0] }) {
@@ -403,27 +437,28 @@ const Formulas = (() => {
     return { at, start, radial, isRadial: isRadial && radial !== null, isIdentity: isRadial && radial === null };
   }
 
-  function tilt(x, y) {
-    const cx = Math.cos(x), sx = Math.sin(x), cy = Math.cos(y), sy = Math.sin(y);
-    const [r00, r01, r02, r10, r11, r12, r20, r21, r22] = [cy, sy * sx, -sy * cx, 0, cx, sx, sy, -cy * sx, cy * cx];
+  function homography(matrix) {
+    // row by row: (a, b, 1) becomes (x, y, w), and the point x / w, y / w
+    const [h00, h01, h02, h10, h11, h12, h20, h21, h22] = matrix;
     const at = (a, b) => {
-      const depth = r20 * a + r21 * b + r22;
-      const u = (r22 * (r00 * a + r01 * b + r02)) / depth, v = (r22 * (r10 * a + r11 * b + r12)) / depth;
-      return [
-        u - r02,
-        v - r12,
-        (r22 * r00 - u * r20) / depth,
-        (r22 * r01 - u * r21) / depth,
-        (r22 * r10 - v * r20) / depth,
-        (r22 * r11 - v * r21) / depth,
-        depth,
-      ];
+      const depth = h20 * a + h21 * b + h22, u = (h00 * a + h01 * b + h02) / depth, v = (h10 * a + h11 * b + h12) / depth;
+      const [ua, ub, va, vb] = [h00 - u * h20, h01 - u * h21, h10 - v * h20, h11 - v * h21].map((w) => w / depth);
+      return [u, v, ua, ub, va, vb, depth];
     };
     const start = (u, v) => {
-      const p = (u + r02) / r22, q = (v + r12) / r22, below = r02 * p + r12 * q + r22;
-      return [(r00 * p + r10 * q + r20) / below, (r01 * p + r11 * q + r21) / below];
+      const below = (h10 * h21 - h11 * h20) * u + (h01 * h20 - h00 * h21) * v + h00 * h11 - h01 * h10;
+      return [
+        ((h11 * h22 - h12 * h21) * u + (h02 * h21 - h01 * h22) * v + h01 * h12 - h02 * h11) / below,
+        ((h12 * h20 - h10 * h22) * u + (h00 * h22 - h02 * h20) * v + h02 * h10 - h00 * h12) / below,
+      ];
     };
-    return { at, start, isIdentity: x === 0 && y === 0 };
+    return { at, start, isIdentity: matrix.every((w, i) => w === (i % 4 ? 0 : 1)) };
+  }
+
+  function tilt(x, y) {
+    // a sensor turned by R = R_y(y) R_x(x) and projected back along the axis
+    const cx = Math.cos(x), sx = Math.sin(x), cy = Math.cos(y), sy = Math.sin(y);
+    return homography([cx, 0, 0, -sx * sy, cy, 0, sy, -cy * sx, cy * cx]);
   }
 
   const shear = (d, e) => ({
@@ -547,6 +582,14 @@ const Formulas = (() => {
   ];
   const fTheta = (k) => [equidistant(), planar({ radial: radiusPolynomial(k) })];
 
+  const about = (chart, [alpha, beta, r0, r1, r2]) => {
+    // a chart about an axis of its own, of which r0, r1, r2 scale the points, and the way back
+    const [ca, sa, cb, sb] = [Math.cos(alpha), Math.sin(alpha), Math.cos(beta), Math.sin(beta)], scale = 1 + r0;
+    const rows = [[ca, 0, -sa], [-sa * sb, cb, -ca * sb], [sa * cb, sb, ca * cb]];
+    const back = [0, 1, 2].flatMap((i) => [rows[0][i] * scale, rows[1][i] * scale, rows[2][i]]);
+    return [rotated(rows, chart), planar({ radial: polynomial([r1 / scale, r2 / scale]) }), homography(back)];
+  };
+
   const MODELS = {
     pinhole: () => [perspective()],
     brown_conrady: ([k1, k2, p1, p2, ...more]) => {
@@ -567,8 +610,10 @@ const Formulas = (() => {
       planar({ radial: polynomial([k1, k2, k3, k4]), tangential: [p2, p1], prism: [sx1, 0, sy1, 0] }),
     ],
     f_theta: fTheta,
+    f_theta_sheared: ([d, e, ...k]) => [...fTheta(k), shear(d, e)],
     woodscape: fTheta,
     f_theta_backward: (k) => [inverted(radiusPolynomial(k))],
+    f_theta_backward_sheared: ([d, e, ...k]) => [inverted(radiusPolynomial(k)), shear(d, e)],
     ocamcalib: ([d, e, ...a]) => [inverted(angleOf(polynomialOf(a, 1))), shear(d, e)],
     division: (k) => [k.length === 1 ? oneDivision(k[0]) : inverted(angleOf(polynomialOf(k, 2)))],
     fov: ([omega]) => [fov(omega)],
@@ -583,6 +628,8 @@ const Formulas = (() => {
         planar({ radial: radiusTable(angles, k.slice(k.length / 2)) }),
       ];
     },
+    cahvor: (k) => about(perspective(), k),
+    cahvore: (k) => about(linearity(k[5]), k.slice(0, 5)),
     equirectangular: () => [sphere()],
     latlon: () => [transverse(sphere())],
     cylindrical: () => [cylinder()],
@@ -590,7 +637,12 @@ const Formulas = (() => {
   };
 
   // what formulas need beside numbers that are finite, and how to say it
+  const axisWithin = ([alpha, beta, r0]) =>
+    (Math.max(Math.abs(alpha), Math.abs(beta)) < Math.PI / 2 && r0 > -1) ||
+    "alpha and beta must lie within pi / 2, r0 above -1";
   const DEFINED = {
+    cahvor: axisWithin,
+    cahvore: axisWithin,
     eucm: (k) => k[1] > 0 || "beta must be above 0",
     double_sphere: (k) => k[0] > -1 || "xi must be above -1",
     mei: (k) => k[0] > -1 || "xi must be above -1",

@@ -90,7 +90,15 @@ def pixel_of(model, core, distortion):
         d2 = math.sqrt(r2 + (xi * d1 + 1) ** 2)
         scale = 1 / (alpha * d2 + (1 - alpha) * (xi * d1 + 1))
         x, y = x * scale, y * scale
-    elif model == "brown_conrady":
+    elif model == "woodscape":
+        theta = math.atan(math.sqrt(r2))
+        scale = (theta + sum(k * theta ** (i + 2) for i, k in enumerate(distortion))) / math.sqrt(r2)
+        x, y = x * scale, y * scale
+    elif model in ("brown_conrady", "mei"):
+        if model == "mei":  # cv2.omnidir: onto a plane above the unit sphere first
+            scale = 1 / (1 + d[0] * math.sqrt(r2 + 1))
+            x, y, d = x * scale, y * scale, d[1:]
+            r2 = x * x + y * y
         radial = 1 + d[0] * r2 + d[1] * r2**2 + d[4] * r2**3
         radial /= 1 + d[5] * r2 + d[6] * r2**2 + d[7] * r2**3
         tangential = 2 * d[2] * x * y + d[3] * (r2 + 2 * x * x), d[2] * (r2 + 2 * y * y) + 2 * d[3] * x * y

@@ -148,7 +148,11 @@ XML = "<opencv_storage>{}</opencv_storage>"
         ("a.yml", "".join(f"%TAG !{i:x}! b\n" for i in range(20_000)) + "---\na: 1\n", "too many YAML directives"),
         ("a.cameramodel", "{'lensmodel': __import__('os').system('true')}", "line 1"),
         ("a.cameramodel", "{'lensmodel': " + "[" * 30_000, "line 1: too many nested"),
-        ("a.cameramodel", "{'lensmodel': 'LENSMODEL_CAHVOR', 'imagersize': [4, 4]}", "'LENSMODEL_CAHVOR' is not known"),
+        (
+            "a.cameramodel",
+            "{'lensmodel': 'LENSMODEL_CAHVORE', 'imagersize': [4, 4]}",
+            "'LENSMODEL_CAHVORE' is not known",
+        ),
         ("a.cameramodel", "{'lensmodel': 1, 'lensmodel': 2}", "stands there twice"),
         ("a.cameramodel", "{'lensmodel': [1, 2,],\n'b': (1, 2,), }\n#\n}", "line 4: unmatched '}'"),
         ("a.cameramodel", "{'lensmodel': 1,\n'b': 'x'", "line 1: '{' was never closed"),

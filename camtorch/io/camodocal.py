@@ -1,0 +1,54 @@
+"""camodocal's camera files, also those of KITTI-360's fisheyes and of VINS: YAML of one camera."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from camtorch.io.protocol import Names
+from camtorch.io.record import Record, one_of
+from camtorch.io.writing import Lossy, number, quoted
+from camtorch.rig import Rig
+
+NAMES = Names("camodocal", "camodocal", (".yaml", ".yml"), ("image_0?.yaml", "*camodocal*.y*ml"))
+
+_GROUPS = ("mirror_parameters", "distortion_parameters", "projection_parameters")
+_RADTAN = ("k1", "k2", "p1", "p2")
+# model_type -> key, the names of the coefficients by their groups, the last one of which has the intrinsics
+_MODELS = {
+    "MEI": ("mei", (("xi",), _RADTAN, ("gamma1", "gamma2", "u0", "v0"))),
+    "PINHOLE": ("brown_conrady", ((), _RADTAN, ("fx", "fy", "cx", "cy"))),
+    "KANNALA_BRANDT": ("kannala_brandt", ((), (), ("k2", "k3", "k4", "k5", "mu", "mv", "u0", "v0"))),
+}
+
+
+def matches(keys: dict[str, Any]) -> bool:
+    """Whether these are the keys of such a file."""
+    return "model_type" in keys and "projection_parameters" in keys
+
+
+def parse(record: Record) -> Rig:
+    """The camera by its name; where that is empty, "camera"."""
+    key, names = _MODELS[one_of(record["model_type"], _MODELS)]
+    groups = [(record[group], there) for group, there in zip(_GROUPS, names, strict=True) if there]
+    values = [group[name].number() for group, there in groups for name in there]
+    size = record["image_height"].side(), record["image_width"].side()
+    name = record["camera_name"].text() if "camera_name" in record else ""
+    return Rig({name or "camera": record.camera(key, values[-4:], values[:-4], size)})
+
+
+def render(rig: Rig, path: str) -> str:
+    """The text of a file of one camera."""
+    lossy = Lossy(path, NAMES.title)
+    lossy.no_pose(rig)
+    name, camera = lossy.only_camera(rig)
+    height, width = lossy.size(name, camera)
+    key, intrinsics, distortion = lossy.model(name, camera, ("pinhole", *(key for key, _ in _MODELS.values())))
+    kind, (_, names) = next((k, m) for k, m in _MODELS.items() if m[0] == key or (key, k) == ("pinhole", "PINHOLE"))
+    if key != "mei":
+        distortion = [0.0] * 4 if key == "pinhole" else lossy.at_most(name, camera, distortion, (4,))
+    values = iter([*distortion, *intrinsics])
+    lines = ["%YAML:1.0", "---", f"model_type: {kind}", f"camera_name: {quoted(name)}"]
+    lines += [f"image_width: {width}", f"image_height: {height}"]
+    for group, there in zip(_GROUPS, names, strict=True):
+        lines += [f"{group}:", *(f"   {name}: {number(next(values))}" for name in there)] if there else []
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,196 @@
+"""Agisoft Metashape's XML: a calibration, or sensors and posed cameras; pixel centres at 0.5, p1 and p2 exchanged."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Iterable
+from typing import Any
+from xml.etree import ElementTree
+from xml.sax.saxutils import quoteattr
+
+import numpy as np
+
+from camtorch.camera import Camera
+from camtorch.io import poses
+from camtorch.io.parsing import decoded
+from camtorch.io.protocol import Names
+from camtorch.io.record import Record, one_of
+from camtorch.io.writing import Lossy
+from camtorch.rig import Rig
+
+NAMES = Names("metashape", "Metashape", (".xml",), ("*metashape*.xml", "cameras.xml"))
+
+_KIND = re.compile(rb"(?:<\?xml[^>]*>\s*)?<(?:calibration>|document\b.{,400}?<chunk\b)", re.S)
+_BYTES_PER_NODE = 16  # of the file, where there are more than a few elements and attributes
+_FEW_NODES = 1 << 14
+# type of a sensor, or projection of a calibration -> key, its coefficients by Metashape's names
+_MODELS = {
+    "frame": ("brown_conrady", ("k1", "k2", "p2", "p1", "k3")),
+    "fisheye": ("thin_prism_fisheye", ("k1", "k2", "p2", "p1", "k3", "k4")),
+}
+_MODELS["equidistant_fisheye"] = _MODELS["fisheye"]  # as it is called from version 2.3 on
+_UNKNOWN = ("b2", "k4", "p3", "p4")
+
+
+def matches(path: str, content: bytes) -> bool:
+    """Whether this is such a file."""
+    return _KIND.match(content.lstrip()) is not None
+
+
+def read(path: str, content: bytes) -> Rig:
+    """The camera of a calibration; or those of calibrated sensors by their labels, and the poses of their images.
+
+    Poses are of the world that the transform of the chunk, or of its component, says; without one, of the chunk.
+    """
+    root = _parse(path, content)
+    if root.tag == "calibration":
+        return Rig({"camera": _camera(Record(path, _values(root), "calibration"))})
+    chunks = root.findall("chunk")
+    if len(chunks) != 1:
+        Record(path, None, "document").fail(f"{len(chunks)} chunks; one is read, so export each to a file of its own")
+    sensors = [sensor for sensor in chunks[0].iterfind("sensors/sensor") if sensor.find("calibration") is not None]
+    Record(path, None, "sensors").few(len(sensors))
+    names = _names(path, sensors)
+    cameras = {}
+    for sensor, name in zip(sensors, names, strict=True):
+        added = sensor.find("corrections")
+        if added is not None and len(added):
+            Record(path, None, f"sensor {name:.60}").fail(
+                "corrections beside its calibration, which no model here has; optimise without additional corrections"
+            )
+        found = sensor.findall("calibration")
+        best = next((one for one in reversed(found) if one.get("class") == "adjusted"), found[-1])
+        cameras[name] = _camera(Record(path, {"type": sensor.get("type"), **_values(best)}, f"sensor {name:.60}"))
+    return _posed(path, chunks[0], cameras, dict(zip((sensor.get("id") for sensor in sensors), names, strict=True)))
+
+
+def _parse(path: str, content: bytes) -> ElementTree.Element:
+    text, whole = decoded(path, content), Record(path, None)
+    if declared := re.search(r"<!(?:DOCTYPE|ENTITY|ELEMENT|ATTLIST|NOTATION)", text, re.IGNORECASE):
+        line = text.count("\n", 0, declared.start()) + 1
+        Record(path, None, f"line {line}").fail("a document type, which could define entities: not read")
+    if text.count("=") + text.count("<") > max(_FEW_NODES, len(text) // _BYTES_PER_NODE):
+        whole.fail("too many elements")
+    try:
+        return ElementTree.fromstring(text.encode())
+    except ElementTree.ParseError as error:
+        return Record(path, None, f"line {error.position[0]}").fail(f"not XML: {str(error).split(':')[0]}")
+    except (ValueError, LookupError) as error:
+        return whole.fail(error)
+
+
+def _values(element: ElementTree.Element) -> Any:
+    """The text of an element, or its attributes and children by their names."""
+    text = (element.text or "").strip()
+    return text or {**element.attrib, **{child.tag: _values(child) for child in element}}
+
+
+def _names(path: str, elements: list[ElementTree.Element]) -> list[str]:
+    """Labels; with their ids where several have the same, or none."""
+    labels = Counter(element.get("label", "") for element in elements)
+    names = []
+    for element in elements:
+        label, identity = element.get("label", ""), element.get("id", "")
+        names.append(label if label and labels[label] == 1 else f"{label} {identity}".strip() or element.tag)
+    if len(set(names)) < len(names):
+        Record(path, None, elements[0].tag).fail("two have the same id")
+    return names
+
+
+def _camera(record: Record) -> Camera:
+    kind = record["type" if "type" in record else "projection"]
+    key, names = _MODELS[one_of(kind, _MODELS)]
+    resolution = record.get("resolution")
+    sides = record if resolution is None else resolution
+    height, width = sides["height"].side(), sides["width"].side()
+    value = {name: record[name].number() for name in record.keys() if re.fullmatch(r"c[xy]|[bkp]\d", name)}  # noqa: SIM118
+    for name in _UNKNOWN:
+        if value.get(name) and name not in names:
+            record[name].fail(f"{value[name]:g}, which no model here has; optimise the cameras without it")
+    f = record["f"].number()
+    cx, cy = ((side - 1) / 2 + value.get(c, 0.0) for c, side in (("cx", width), ("cy", height)))
+    distortion = [value.get(name, 0.0) for name in names] + [0.0] * (8 if len(names) > 5 else 5)
+    return record.camera(
+        key, [f + value.get("b1", 0.0), f, cx, cy], distortion[: 8 if len(names) > 5 else 5], (height, width)
+    )
+
+
+def _numbers(record: Record, count: int) -> list[float]:
+    return Record(record.path, record.text().split(), record.place).numbers(count)
+
+
+def _world(path: str, owner: ElementTree.Element) -> tuple[Any, float, Any]:
+    """Rotation, scale and translation to the world from a chunk or a component."""
+    transform = owner.find("transform")
+    record = Record(path, {} if transform is None else _values(transform), f"{owner.tag}.transform")
+    rotation, scale, translation = np.eye(3), 1.0, np.zeros(3)
+    if "rotation" in record:
+        rotation = np.array(_numbers(record["rotation"], 9)).reshape(3, 3)
+    if "scale" in record:
+        scale = record["scale"].number()
+    if "translation" in record:
+        translation = np.array(_numbers(record["translation"], 3))
+    poses.check_near(record, [*translation, scale])
+    return rotation, scale, translation
+
+
+def _posed(path: str, chunk: ElementTree.Element, cameras: dict[str, Camera], sensors: dict[str | None, str]) -> Rig:
+    """The rig of a chunk. Images that are not aligned, and those of sensors that are not calibrated, are left out."""
+    whole = _world(path, chunk)
+    parts = {part.get("id"): _world(path, part) for part in chunk.iterfind("components/component")}
+    elements = [one for one in chunk.iterfind("cameras//camera") if one.find("transform") is not None]
+    elements = [one for one in elements if one.get("sensor_id") in sensors]
+    names = _names(path, elements)
+    places = [Record(path, _values(one), f"camera {name:.60}") for one, name in zip(elements, names, strict=True)]
+    images, rows = {}, []
+    for name, place in zip(names, places, strict=True):
+        images[name] = sensors[place.value["sensor_id"]]
+        if name in cameras and name != images[name]:
+            place.fail("a sensor has this name")
+        row = np.array(_numbers(place["transform"], 16)).reshape(4, 4)
+        poses.check_near(place, row)
+        rotation, scale, translation = parts.get(place.value.get("component_id"), whole)
+        rows.append(np.c_[rotation @ row[:3, :3], scale * rotation @ row[:3, 3] + translation])
+    if not rows:
+        return Rig(cameras)
+    batch = poses.from_matrices(lambda i: places[i], np.array(rows), undo=True)
+    return Rig(cameras, (names, batch), images={name: own for name, own in images.items() if name != own})
+
+
+def files(rig: Rig, path: str) -> dict[str, bytes]:
+    """A calibration, of a single camera without a pose, which loses its name; else sensors and cameras of a chunk."""
+    lossy = Lossy(path, NAMES.title)
+    lines = ['<?xml version="1.0" encoding="UTF-8"?>']
+    written = {name: _entries(lossy, name, camera) for name, camera in rig.cameras.items()}
+    if len(written) == 1 and not rig.extrinsics:
+        ((kind, (height, width), values),) = written.values()
+        sides = f"<projection>{kind}</projection>", f"<width>{width}</width>", f"<height>{height}</height>"
+        return {path: _text([*lines, "<calibration>", *sides, *values, "</calibration>"])}
+    lines += ['<document version="1.2.0">', "<chunk>", "<sensors>"]
+    for i, (name, (kind, (height, width), values)) in enumerate(written.items()):
+        size = f'<resolution width="{width}" height="{height}"/>'
+        lines += [f'<sensor id="{i}" label={quoteattr(name)} type="{kind}">', size]
+        lines += [f'<calibration type="{kind}" class="adjusted">', size, *values, "</calibration>", "</sensor>"]
+    lines += ["</sensors>", "<cameras>"]
+    numbers = {name: i for i, name in enumerate(written)}
+    matrices = poses.matrices(poses.all_of(rig, lossy), undo=True).flatten(1).tolist()
+    for i, (name, row) in enumerate(zip(rig.extrinsics, matrices, strict=True)):
+        sensor = numbers[rig.images.get(name, name)]
+        lines += [f'<camera id="{i}" sensor_id="{sensor}" label={quoteattr(name)} enabled="true">']
+        lines += [f"<transform>{' '.join(map(repr, row))}</transform>", "</camera>"]
+    return {path: _text([*lines, "</cameras>", "</chunk>", "</document>"])}
+
+
+def _text(lines: Iterable[str]) -> bytes:
+    return ("\n".join(lines) + "\n").encode()
+
+
+def _entries(lossy: Lossy, name: str, camera: Camera) -> tuple[str, tuple[int, int], list[str]]:
+    """The type of a camera, its size, and the elements of its values."""
+    height, width = lossy.size(name, camera)
+    key, (fx, fy, cx, cy), distortion = lossy.model(name, camera, ("pinhole", *(key for key, _ in _MODELS.values())))
+    kind, names = next((kind, names) for kind, (k, names) in _MODELS.items() if k == key or key == "pinhole")
+    values = {"f": fy, "cx": cx - (width - 1) / 2, "cy": cy - (height - 1) / 2, "b1": fx - fy}
+    values |= zip(names, lossy.at_most(name, camera, distortion, (len(names),)), strict=True)
+    return kind, (height, width), [f"<{key}>{value!r}</{key}>" for key, value in values.items()]

@@ -1,0 +1,116 @@
+"""NVIDIA's ncore: JSON of one camera, as `encode_camera_model_parameters` of nvidia-ncore gives it."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import torch
+
+from camtorch.camera import Camera
+from camtorch.io.protocol import Names
+from camtorch.io.record import Record, one_of
+from camtorch.io.writing import Lossy, as_json
+from camtorch.models import FTheta, FThetaBackward
+from camtorch.rig import Rig
+from camtorch.windshield import Windshield
+
+NAMES = Names("ncore", "ncore", (".json",), ("*ncore*.json",))
+
+_POLYNOMIALS = {
+    "ANGLE_TO_PIXELDIST": ("angle_to_pixeldist_poly", FTheta),
+    "PIXELDIST_TO_ANGLE": ("pixeldist_to_angle_poly", FThetaBackward),
+}
+_PINHOLES = ("opencv-pinhole", "pinhole", "ideal-pinhole")
+
+
+def matches(keys: dict[str, Any]) -> bool:
+    """Whether these are the keys of such a file."""
+    return "camera_model_type" in keys and "camera_model_parameters" in keys
+
+
+def parse(record: Record) -> Rig:
+    """The camera, behind its windshield if it has one. Shutter and largest angle are not read.
+
+    Of the two polynomials of an f-theta, one of which is an approximate inverse of the other, the reference is read:
+    they are up to 0.25 px apart. Of a windshield it is those by which ncore projects, and the inverse is theirs.
+    """
+    kind = one_of(record["camera_model_type"], ("ftheta", *_PINHOLES, "opencv-fisheye"))
+    values = record["camera_model_parameters"]
+    camera = _f_theta(values) if kind == "ftheta" else _of_opencv(values, kind)
+    shield = values.get("external_distortion_parameters")
+    if shield is not None and shield.value is not None:
+        for place, key in ((record, "external_distortion_type"), (shield, "external_distortion_type")):
+            if key in place:
+                one_of(place[key], ("bivariate-windshield",))
+        try:
+            polynomials = (np.array(shield[f"{way}_poly"].numbers()) for way in ("horizontal", "vertical"))
+            # frozen, so that the coefficients of both are the camera's own
+            camera = camera.requires_grad_(False).behind(Windshield(*polynomials).requires_grad_(False))
+        except ValueError as error:
+            shield.fail(error)
+    return Rig({"camera": camera})
+
+
+def _f_theta(values: Record) -> Camera:
+    """Its principal point is in pixels whose centres are integers; those of the other models lie at 0.5."""
+    polynomial, kind = _POLYNOMIALS[one_of(values["reference_poly"], _POLYNOMIALS)]
+    coefficients = values[polynomial]
+    constant, *rest = coefficients.numbers() or [0.0]
+    if constant:
+        coefficients.fail(f"a constant of {constant:g}, which no model here has")
+    linear = values["linear_cde"].numbers(3) if "linear_cde" in values else [0.0]
+    while len(rest) > 2 and not rest[-1]:  # which files fill up
+        rest.pop()
+    try:
+        return kind.from_polynomial(
+            np.array(values["principal_point"].numbers(2)),
+            np.array(rest),
+            linear_cde=linear if any(linear) else (1.0, 0.0, 0.0),  # as ncore takes zeros
+            image_size=values["resolution"].size(),
+        )
+    except ValueError as error:
+        return coefficients.fail(error)
+
+
+def _of_opencv(values: Record, kind: str) -> Camera:
+    (fx, fy), (cx, cy) = values["focal_length"].numbers(2), values["principal_point"].numbers(2)
+    key, distortion = "pinhole", list[float]()
+    if kind == "opencv-fisheye":
+        key, distortion = "kannala_brandt", values["radial_coeffs"].numbers(4)
+    elif kind != "ideal-pinhole":
+        counts = (("radial_coeffs", 6), ("tangential_coeffs", 2), ("thin_prism_coeffs", 4))
+        radial, tangential, prism = (values[name].numbers(count) for name, count in counts)
+        key, distortion = "brown_conrady", [*radial[:2], *tangential, *radial[2:], *prism]
+    return values.camera(key, [fx, fy, cx - 0.5, cy - 0.5], distortion, values["resolution"].size())
+
+
+def render(rig: Rig, path: str) -> str:
+    """The text of a file of one camera, which loses its name, with a global shutter.
+
+    Cameras of OpenCV's models alone: an f-theta and a windshield would need approximate inverses beside them.
+    """
+    lossy = Lossy(path, NAMES.title)
+    lossy.no_pose(rig)
+    name, camera = lossy.only_camera(rig)
+    height, width = lossy.size(name, camera)
+    key, (fx, fy, cx, cy), k = lossy.model(name, camera, {"pinhole", "brown_conrady", "kannala_brandt"})
+    values: dict[str, Any] = {
+        "resolution": [width, height],
+        "shutter_type": "GLOBAL",
+        "external_distortion_parameters": None,
+        "principal_point": [cx + 0.5, cy + 0.5],
+        "focal_length": [fx, fy],
+    }
+    if key == "kannala_brandt":
+        values["radial_coeffs"] = lossy.at_most(name, camera, k, (4,))
+        rays, valid = camera.unproject([[-0.5, -0.5], [width - 0.5, -0.5], [-0.5, height - 0.5], [width, height]])
+        angles = torch.where(valid, torch.acos(rays[..., 2].clamp(-1, 1)), 0.0)
+        values["max_angle"] = float(angles.max()) or math.pi / 2
+        return as_json({"camera_model_type": "opencv-fisheye", "camera_model_parameters": values})
+    if key == "brown_conrady":
+        k1, k2, p1, p2, k3, k4, k5, k6, *prism = lossy.at_most(name, camera, k, (12,))
+        values |= {"radial_coeffs": [k1, k2, k3, k4, k5, k6], "tangential_coeffs": [p1, p2], "thin_prism_coeffs": prism}
+    kind = "ideal-pinhole" if key == "pinhole" else "opencv-pinhole"
+    return as_json({"camera_model_type": kind, "camera_model_parameters": values})

@@ -1,0 +1,73 @@
+"""nuScenes' and nuImages' `calibrated_sensor.json`: all cameras of all drives, with the channels of `sensor.json`."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections import Counter
+from typing import NoReturn
+
+from camtorch.camera import Camera
+from camtorch.io import poses
+from camtorch.io.parsing import decoded, parse_json, read_bytes
+from camtorch.io.protocol import Names
+from camtorch.io.record import Record
+from camtorch.io.writing import Lossy
+from camtorch.rig import Rig
+
+NAMES = Names("nuscenes", "nuScenes", (".json",), ("calibrated_sensor.json",))
+
+_START = 4096  # in which the first sensor shows
+
+
+def matches(path: str, content: bytes) -> bool:
+    """Whether this is such a file."""
+    return re.match(rb"\s*\[", content[:_START]) is not None and b'"sensor_token"' in content[:_START]
+
+
+def read(path: str, content: bytes) -> Rig:
+    """The cameras, without their image sizes, which stand in other tables; and their poses: camera from ego.
+
+    A camera is called by its channel, or where drives have calibrations of their own, by its token. What has no
+    intrinsics is a lidar or a radar, and left out.
+    """
+    sensors = [sensor for sensor in _table(path, content) if len(sensor["camera_intrinsic"])]
+    Record(path, None).few(len(sensors))
+    beside = os.path.join(os.path.dirname(path), "sensor.json")
+    channels = {}
+    if os.path.exists(beside):
+        channels = {sensor["token"].text(): sensor["channel"].text() for sensor in _table(beside, read_bytes(beside))}
+    names = [channels.get(sensor["sensor_token"].text(), "") for sensor in sensors]
+    often = Counter(names)
+    cameras: dict[str, Camera] = {}
+    for sensor, channel in zip(sensors, names, strict=True):
+        name = channel if channel and often[channel] == 1 else sensor["token"].text()
+        if name in cameras:
+            sensor["token"].fail(f"a second sensor is called {name!r:.60}")
+        cameras[name] = _camera(sensor)
+    if not cameras:
+        return Rig({})
+    values = [[*sensor["rotation"].numbers(4), *sensor["translation"].numbers(3)] for sensor in sensors]
+    return Rig(cameras, (list(cameras), poses.from_quaternions(lambda row: sensors[row], values, undo=True)))
+
+
+def _table(path: str, content: bytes) -> Record:
+    try:
+        return Record(path, parse_json(path, decoded(path, content)))
+    except (RecursionError, MemoryError):
+        Record(path, None).fail("nested too deeply")
+
+
+def _camera(sensor: Record) -> Camera:
+    matrix = sensor["camera_intrinsic"]
+    intrinsics = matrix.intrinsics([number for row in matrix.rows(3, 3) for number in row])
+    lens = sensor.get("camera_distortion")  # of nuImages
+    distortion = [] if lens is None else lens.numbers()
+    if lens is not None and len(distortion) == 6 and distortion.pop():
+        lens.fail("a sixth coefficient, of fisheyes, whose formula nuImages does not say")
+    return sensor.camera("brown_conrady" if distortion else "pinhole", intrinsics, distortion, None, lens=lens)
+
+
+def files(rig: Rig, path: str) -> NoReturn:
+    """Raise the CameraFileError that nothing is written: the tables of a data set belong together."""
+    Lossy(path, NAMES.title).fail("format", "read only: its tables refer to one another. Save as format='camtorch'")

@@ -1,0 +1,268 @@
+"""Files of data sets and of photogrammetry: poses and pixels by published formulas, and what is refused."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+import torch
+from rigs import FILES, float64, load
+
+import camtorch as ct
+
+POINT = np.array([0.3, -0.2, 1.5])
+
+
+def rotation_of(w, x, y, z):
+    """The matrix of a quaternion."""
+    w, x, y, z = np.array([w, x, y, z]) / np.linalg.norm([w, x, y, z])
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.eye(3) + 2 * w * cross + 2 * cross @ cross
+
+
+def seen(rig, name, point):
+    """A point of the rig's or the world's frame in the frame of a camera or an image."""
+    return rig.extrinsics[name](float64(point)).numpy()
+
+
+def changed(tmp_path, name, *changes):
+    """A sample with some of its text exchanged."""
+    text = (FILES / name).read_text()
+    for old, new in changes:
+        assert old in text
+        text = text.replace(old, new, 1)
+    path = tmp_path / name
+    path.write_text(text)
+    return path
+
+
+def test_woodscape_is_vehicle_from_camera():
+    rig, given = load("woodscape.json"), json.loads((FILES / "woodscape.json").read_text())["extrinsic"]
+    x, y, z, w = given["quaternion"]
+    vehicle = rotation_of(w, x, y, z) @ POINT + given["translation"]
+    assert np.allclose(seen(rig, "FV", vehicle), POINT, atol=1e-12)
+    angle = math.atan2(math.hypot(*POINT[:2]), POINT[2])
+    radius = 339.749 * angle - 31.988 * angle**2 + 48.275 * angle**3 - 7.201 * angle**4
+    centre = np.array([1280, 966]) / 2 + (3.942, -3.093) - 0.5
+    expected = centre + radius * POINT[:2] / math.hypot(*POINT[:2])
+    assert np.allclose(rig.camera.project(float64(POINT))[0].numpy(), expected, atol=1e-10)
+
+
+def test_a_woodscape_camera_without_a_pose_is_where_the_vehicle_is(tmp_path):
+    camera = load("woodscape.json").camera
+    ct.save(camera, tmp_path / "a.json", "woodscape")
+    found = ct.load(tmp_path / "a.json")
+    assert found.format == "woodscape"
+    assert torch.equal(found.camera.distortion, camera.distortion)
+    assert found.extrinsics["camera"].matrix().tolist() == torch.eye(4).tolist()
+
+
+def metashape_pixel(point, f, cx, cy, b1, k, p1, p2, size, fisheye):
+    """Of Metashape's manual, appendix C; the first pixel's centre is (0.5, 0.5)."""
+    x, y = point[:2] / point[2]
+    if fisheye:
+        r = math.hypot(x, y)
+        x, y = np.array([x, y]) * math.atan(r) / r
+    r2 = x * x + y * y
+    radial = 1 + sum(value * r2 ** (i + 1) for i, value in enumerate(k))
+    a = x * radial + p1 * (r2 + 2 * x * x) + 2 * p2 * x * y
+    b = y * radial + p2 * (r2 + 2 * y * y) + 2 * p1 * x * y
+    return np.array([size[0] * 0.5 + cx + a * f + a * b1, size[1] * 0.5 + cy + b * f])
+
+
+def test_pixels_of_metashape():
+    rig = load("metashape_cameras.xml")
+    frame = (3705.4728792737214, 11.6738523909, -27.7497969199, 0.5262024073)
+    lens = (-0.0919367147, -0.0762807468, 0.1162639394), -0.0003134847, 0.0001164035
+    expected = metashape_pixel(POINT, *frame, *lens, (5280, 3956), fisheye=False)
+    found = rig["000001-01_00001.JPG"].project(float64(POINT))[0].numpy() + 0.5
+    assert np.allclose(found, expected, atol=1e-9)
+    lens = (0.0499776, 0.00096095, -0.00013138), 8.29386e-05, -0.000224424
+    expected = metashape_pixel(POINT, 2300.09046, 48.6187, 52.6176, 0.0, *lens, (5312, 3553), fisheye=True)
+    assert np.allclose(rig["fisheye.jpg"].project(float64(POINT))[0].numpy() + 0.5, expected, atol=1e-9)
+
+
+@pytest.mark.parametrize("where", ["component", "chunk", "nowhere"])
+def test_poses_of_metashape_are_in_the_world_that_its_transform_says(where, tmp_path):
+    rotation = (
+        "0.8710699454 0.3070967021 -0.3833128821 -0.4909742007 0.5658364395 -0.6623997719 0.0134716110 0.7651932691"
+    )
+    text = (FILES / "metashape_cameras.xml").read_text()
+    assert rotation in text
+    start, end = text.index("    <components"), text.index("    <cameras")
+    transform = text[text.index("        <transform>") : text.index("</transform>") + len("</transform>")]
+    if where != "component":
+        text = text[:start] + (transform if where == "chunk" else "") + text[end:]
+    (tmp_path / "cameras.xml").write_text(text)
+    rig = ct.load(tmp_path / "cameras.xml")
+    assert list(rig.extrinsics) == ["000001-01_00001.JPG", "fisheye.jpg"]
+    assert set(rig.cameras) == {"M3M (12.29mm)", "ONE R"}
+    chunk = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]]) @ POINT + (0.5, -0.25, 2)
+    world, scale = chunk, 1.0
+    if where != "nowhere":
+        matrix, scale = np.array([*rotation.split(), "0.6436596744"], dtype=float).reshape(3, 3), 0.12354192447331316
+        world = scale * matrix @ chunk + (-0.249936, -0.425683, 0.402921)
+    # 1e-9: to so many digits the rotation of the file is one
+    assert np.allclose(seen(rig, "fisheye.jpg", world), POINT * scale, atol=1e-9)
+
+
+def test_sensors_and_images_of_metashape_that_are_called_the_same_get_their_ids(tmp_path):
+    same = ('label="ONE R"', 'label="M3M (12.29mm)"'), ('label="fisheye.jpg"', 'label="000001-01_00001.JPG"')
+    rig = ct.load(changed(tmp_path, "metashape_cameras.xml", *same))
+    assert rig.images == {"000001-01_00001.JPG 0": "M3M (12.29mm) 0", "000001-01_00001.JPG 1": "M3M (12.29mm) 1"}
+
+
+@pytest.mark.parametrize(
+    ("name", "old", "new", "reason"),
+    [
+        ("metashape_calibration.xml", "<k1>", "<b2>-0.3</b2><k1>", r"calibration\.b2: -0\.3, which no model here has"),
+        ("metashape_calibration.xml", "<k1>", "<k4>0.1</k4><k1>", r"calibration\.k4: 0\.1, which no model here has"),
+        ("metashape_calibration.xml", ">frame<", ">spherical<", "'spherical' is not known here; known are equidistant"),
+        ("metashape_calibration.xml", "<f>3239.2350850187408</f>", "", r"calibration\.f: missing"),
+        ("metashape_calibration.xml", "<f>3239", "<f>nan", r"calibration\.f: 'nan\.2350850187408' is no finite number"),
+        ("metashape_calibration.xml", "<width>5472", "<width>-1", r"calibration\.width: -1 is no number of pixels"),
+        ("metashape_calibration.xml", "</k1>", "", "line [0-9]+: not XML: mismatched tag"),
+        (
+            "metashape_calibration.xml",
+            "<calibration>",
+            "<!DOCTYPE x []><calibration>",
+            "a document type|<calibration> wh",
+        ),
+        ("metashape_cameras.xml", "0.5 0 0 -1 -0.25", "0.5 0 0 2 -0.25", r"camera fisheye\.jpg: no rotation"),
+        ("metashape_cameras.xml", "2 0 0 0 1<", "2 0 0 0<", r"camera fisheye\.jpg\.transform: 15 numbers where 16"),
+        ("metashape_cameras.xml", ">0.12354192447331316<", ">1e300<", r"component\.transform: a number beyond 1e\+100"),
+        ("metashape_cameras.xml", "<covariance>", "<corrections><a/></corrections><covariance>", "corrections beside"),
+        ("metashape_cameras.xml", "</document>", "<chunk/></document>", "2 chunks; one is read"),
+        ("woodscape.json", "radial_poly", "other", r"intrinsic\.model: 'other' is not known here"),
+        ("woodscape.json", "339.749", "0", r"intrinsic\.k1: 0, where the focal length belongs"),
+        ("woodscape.json", "0.5946", "5.946", "extrinsic: a quaternion of length"),
+        (
+            "gyroflow.json",
+            '"digital_lens": null',
+            '"digital_lens": "gopro_superview"',
+            "digital_lens: 'gopro_superview'",
+        ),
+        (
+            "gyroflow.json",
+            '"distortion_model": null',
+            '"distortion_model": "ptlens"',
+            "distortion_model: 'ptlens' is not",
+        ),
+        (
+            "gyroflow.json",
+            '"input_horizontal_stretch": 1.0',
+            '"input_horizontal_stretch": 1.33',
+            "1.33, which no model",
+        ),
+        (
+            "camodocal_kitti360.yaml",
+            "MEI",
+            "SCARAMUZZA",
+            "model_type: 'SCARAMUZZA' is not known here; known are KANNALA",
+        ),
+        ("camodocal_kitti360.yaml", "   xi: 2", "   xi: x2", r"mirror_parameters\.xi: .* is no finite number"),
+        (
+            "openmvg_sfm_data.json",
+            "pinhole_brown_t2",
+            "pinhole_new",
+            "polymorphic_name: 'pinhole_new' is not known here",
+        ),
+        ("openmvg_sfm_data.json", "[-0.0853, 0.1254, 0.0289]", "[0.1]", "disto_k3: 1 numbers where 3 belong"),
+        ("openmvg_sfm_data.json", "[1.0, 2.0, 3.0]", "[1.0, 2.0, 1e200]", r"center: a number beyond 1e\+100"),
+    ],
+)
+def test_what_is_refused(name, old, new, reason, tmp_path):
+    with pytest.raises(ct.CameraFileError, match=reason):
+        ct.load(changed(tmp_path, name, (old, new)))
+
+
+def test_kitti_360_is_the_mei_camera_of_camodocal():
+    xi, k1, k2, p1, p2 = load("camodocal_kitti360.yaml").camera.distortion.tolist()
+    a, b = POINT[:2] / (POINT[2] + xi * np.linalg.norm(POINT))
+    r2 = a * a + b * b
+    radial = k1 * r2 + k2 * r2 * r2
+    a, b = (
+        a + a * radial + 2 * p1 * a * b + p2 * (r2 + 2 * a * a),
+        b + b * radial + 2 * p2 * a * b + p1 * (r2 + 2 * b * b),
+    )
+    expected = [1336.3220825849971 * a + 716.94323510126321, 1335.7883350012958 * b + 705.76498308221585]
+    found, valid = load("camodocal_kitti360.yaml").camera.project(float64(POINT))
+    assert valid
+    assert np.allclose(found.numpy(), expected, atol=1e-9)
+
+
+@pytest.mark.parametrize("key", ["pinhole", "brown_conrady", "kannala_brandt", "mei"])
+def test_models_of_camodocal_come_back(key, tmp_path):
+    distortion = () if key == "pinhole" else (float64([0.1, 0.02, 0.003, -0.004, 0.01][: 5 if key == "mei" else 4]),)
+    camera = ct.MODELS[key](float64([500.1, 501.2, 320.3, 240.4]), *distortion, image_size=(480, 640))
+    ct.save(camera, tmp_path / "a.yaml", "camodocal")
+    found = ct.load(tmp_path / "a.yaml").camera
+    assert torch.equal(found.intrinsics, camera.intrinsics)
+    assert torch.equal(found.project(float64(POINT))[0], camera.project(float64(POINT))[0])
+
+
+def test_nuscenes_is_ego_from_sensor():
+    rig = ct.load(FILES / "nuscenes" / "calibrated_sensor.json")
+    assert rig.format == "nuscenes"
+    assert list(rig.cameras) == list(rig.extrinsics) == ["CAM_FRONT", "CAM_BACK"]  # and no lidar
+    assert rig["CAM_BACK"].intrinsics.tolist() == [809.2209905677063] * 2 + [829.2196003259838, 481.77842384512485]
+    rotation = rotation_of(0.4998015430569128, -0.5030316162024876, 0.4997798114386805, -0.49737083824542755)
+    ego = rotation @ POINT + (1.70079118954, 0.0159456324149, 1.51095763913)
+    assert np.allclose(seen(rig, "CAM_FRONT", ego), POINT, atol=1e-12)
+
+
+def test_tables_of_nuscenes_without_channels_or_with_several_drives(tmp_path):
+    table = json.loads((FILES / "nuscenes" / "calibrated_sensor.json").read_text())
+    (tmp_path / "calibrated_sensor.json").write_text(json.dumps(table))
+    tokens = ["1d31c729b073425e8e0202c5c6e66ee1", "6f3ea2e3f4bf4ae5b3ff2bc9d9b4b0a1"]
+    assert list(ct.load(tmp_path / "calibrated_sensor.json").cameras) == tokens
+    (tmp_path / "sensor.json").write_text((FILES / "nuscenes" / "sensor.json").read_text())
+    again = {**table[0], "token": "another drive", "camera_distortion": [-0.3, 0.1, 1e-3, 2e-3, 0.01, 0.0]}
+    (tmp_path / "calibrated_sensor.json").write_text(json.dumps([*table, again]))
+    rig = ct.load(tmp_path / "calibrated_sensor.json")
+    assert list(rig.cameras) == [tokens[0], "CAM_BACK", "another drive"]
+    assert rig["another drive"].distortion.tolist() == [-0.3, 0.1, 1e-3, 2e-3, 0.01]
+    for broken, reason in (
+        ({"rotation": [1, 1, 0, 0]}, r"\[2\]: a quaternion of length 1.41"),
+        ({"camera_distortion": [0, 0, 0, 0, 0, 0.1]}, r"\[2\].camera_distortion: a sixth coefficient"),
+        ({"token": tokens[0]}, r"\[2\].token: a second sensor is called"),
+        ({"camera_intrinsic": [[1, 2], [3, 4]]}, r"\[2\].camera_intrinsic: 2 rows where 3 belong"),
+    ):
+        (tmp_path / "calibrated_sensor.json").write_text(json.dumps([table[0], table[1], {**again, **broken}]))
+        with pytest.raises(ct.CameraFileError, match=reason):
+            ct.load(tmp_path / "calibrated_sensor.json")
+
+
+def test_views_of_openmvg():
+    rig = load("openmvg_sfm_data.json")
+    assert rig.images == {"100_7100.JPG": "0", "right/100_7100.JPG": "1"}  # and none without a pose
+    assert rig["2"].intrinsics.tolist() == [1431.5, 1431.5, 961.25, 540.0]  # whose kind stands before, by its number
+    there = np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1]]) @ (POINT - (1, 2, 3))
+    assert np.allclose(seen(rig, "right/100_7100.JPG", POINT), there, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "name", ["metashape_calibration.xml", "metashape_cameras.xml", "nuscenes/calibrated_sensor.json"]
+)
+def test_cut_off_anywhere(name, tmp_path):
+    whole = (FILES / name).read_bytes()
+    path = tmp_path / (FILES / name).name
+    for length in range(0, len(whole.rstrip()), 41):
+        path.write_bytes(whole[:length])
+        with pytest.raises(ct.CameraFileError, match=str(path.name)):
+            ct.load(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("a.xml", "<calibration>" + '<a b="1"/>' * 20_000 + "</calibration>"),
+        ("a.xml", "<calibration>" + "<a>" * 100_000),
+        ("a.json", '[{"sensor_token": ' + "[" * 100_000),
+        ("a.json", '[{"sensor_token": "a", "camera_intrinsic": 1}]'),
+    ],
+)
+def test_hostile(name, content, tmp_path):
+    (tmp_path / name).write_text(content)
+    with pytest.raises(ct.CameraFileError, match=name):
+        ct.load(tmp_path / name)
