@@ -81,11 +81,12 @@ const Viewer = (() => {
       tell(`The address gives ${key} another number of coefficients or no size; the page shows its own one.`, true);
       Object.assign(lens, { ...DATA.models[key], model: key });
     }
-    choose(lens, given.get("lens") ?? "");
+    choose(lens, (given.get("lens") ?? "").replace(/[\p{C}\p{Zl}\p{Zp}]/gu, " ").slice(0, 160)); // a comment of one line
     const projection = given.get("view");
-    if (projection in PROJECTIONS || Object.hasOwn(DATA.models, projection ?? "")) state.projection = projection;
+    if (Object.hasOwn(PROJECTIONS, projection ?? "") || Object.hasOwn(DATA.models, projection ?? "")) state.projection = projection;
     for (const name of ["fov", "yaw", "pitch"])
       if (Number.isFinite(parseFloat(given.get(name)))) state[name] = parseFloat(given.get(name));
+    state.pitch = Math.min(90, Math.max(-90, state.pitch));
     if (["board", "driver"].includes(given.get("picture"))) state.picture = given.get("picture");
     ask("view");
   }

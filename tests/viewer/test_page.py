@@ -230,6 +230,13 @@ def test_a_wrong_address_is_told(address, text, opened):
     assert tab.locator("#left").bounding_box()["height"] > 50
 
 
+def test_an_address_puts_nothing_into_the_lines_that_are_copied(opened):
+    tab = opened(address="#lens=GoPro%0Aimport os%E2%80%A8%0D<img src=x onerror=alert(1)>&view=constructor&pitch=1e9")
+    names = [line for line in tab.locator("#python").text_content().splitlines() if "import os" in line]
+    assert [line[0] for line in names] == ["#"]
+    assert tab.evaluate("[Viewer.state.projection, Viewer.state.pitch]") == ["perspective", 90]
+
+
 def test_keys_and_pointers_turn_and_widen(opened):
     tab = opened(fisheye())
     tab.focus("#right")
