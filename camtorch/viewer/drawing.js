@@ -494,8 +494,10 @@ const Viewer = (() => {
     }
   }
 
-  function glRenderer(canvas) {
-    const gl = canvas.getContext("webgl2", { antialias: false, alpha: false, preserveDrawingBuffer: true });
+  function glRenderer(canvas, evenSlow) {
+    // in software the canvas is faster
+    const options = { antialias: false, alpha: false, preserveDrawingBuffer: true };
+    const gl = canvas.getContext("webgl2", { ...options, failIfMajorPerformanceCaveat: !evenSlow });
     if (!gl) return null;
     const shader = (kind, text) => {
       const made = gl.createShader(kind);
@@ -580,20 +582,17 @@ const Viewer = (() => {
     };
   }
 
-  const drawing = document.createElement("canvas"); // over which labels are laid
   let renderer = null;
 
-  function makeRenderer(byCanvas) {
-    const canvas = byCanvas ? document.createElement("canvas") : drawing;
-    renderer = byCanvas ? null : glRenderer(canvas);
-    if (!renderer) {
+  function makeRenderer(way) {
+    // way: "webgl", "canvas", or null for the faster one
+    const canvas = document.createElement("canvas"), byGl = way === "canvas" ? null : glRenderer(canvas, way === "webgl");
+    if (byGl) renderer = { ...byGl, canvas, kind: "webgl" };
+    else {
       const plain = document.createElement("canvas");
-      renderer = canvasRenderer(plain);
-      renderer.canvas = plain;
-      renderer.kind = "canvas";
+      renderer = { ...canvasRenderer(plain), canvas: plain, kind: "canvas" };
       viewSize.splice(0, 2, 640, 480);
-    } else Object.assign(renderer, { canvas, kind: "webgl" });
-    target = null;
+    }
   }
 
   function footprint() {
@@ -932,7 +931,7 @@ const Viewer = (() => {
         offerFormats();
         ask("view");
         const reach = camera.reach(0), end = onCircle(reach * (1 - 1e-6), 0);
-        if (!end || end[0] - state.intrinsics[2] < 0.05 * state.size[1])
+        if (reach < 1 && !(end && end[0] - state.intrinsics[2] > 0.05 * state.size[1]))
           tell(`With these coefficients the lens folds ${(reach / RADIAN).toFixed(2)}° from its axis: nearly no pixel has a ray.`, true);
       } catch (error) {
         trouble = error.message;
@@ -1108,7 +1107,7 @@ const Viewer = (() => {
     const options = () => keys.map((key) => new Option(DATA.models[key].class, key));
     $("model").replaceChildren(...options());
     $("models").replaceChildren(...options());
-    makeRenderer(new URLSearchParams(location.hash.slice(1)).has("canvas"));
+    makeRenderer(new URLSearchParams(location.hash.slice(1)).get("draw"));
     listen();
     choose(DATA.camera ?? { model: "kannala_brandt", ...DATA.models.kannala_brandt });
     readAddress();
@@ -1120,5 +1119,5 @@ const Viewer = (() => {
   }
 
   begin().catch((error) => tell(`This page cannot begin: ${error.message}`, true));
-  return { state, frame, ask, cells, file, FORMATS, makeRenderer, takePhotograph, renderer: () => renderer, viewSize, labels: () => labels };
+  return { state, frame, ask, cells, file, FORMATS, takePhotograph, renderer: () => renderer, viewSize, labels: () => labels };
 })();

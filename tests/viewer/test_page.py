@@ -2,6 +2,7 @@
 
 import base64
 import contextlib
+import functools
 import io
 import re
 import shlex
@@ -26,35 +27,39 @@ pytestmark = [
 ]
 
 ARGUMENTS = [
-    *("--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-quic"),
-    *("--no-first-run", "--disable-background-networking", "--disable-component-update", "--disable-sync"),
+    *("--no-sandbox", "--disable-quic", "--no-first-run"),
+    *("--disable-background-networking", "--disable-component-update", "--disable-sync"),
 ]
+IN_SOFTWARE = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 SECOND = 1000
 
 
 @pytest.fixture(scope="module")
-def browser():
+def browsers():
     with sync_api.sync_playwright() as playwright:
-        launched = playwright.chromium.launch(executable_path=CHROMIUM, args=ARGUMENTS)
+        ways = {"webgl": IN_SOFTWARE, "canvas": ["--disable-gpu"]}
+        launch = functools.partial(playwright.chromium.launch, executable_path=CHROMIUM)
+        launched = {way: launch(args=ARGUMENTS + more) for way, more in ways.items()}
         yield launched
-        launched.close()
+        for each in launched.values():
+            each.close()
 
 
 @pytest.fixture
-def opened(browser, tmp_path):
+def opened(browsers, tmp_path):
     """Opens a page of a camera, or of presets; it fails for requests to elsewhere and for errors in the page."""
     trouble, contexts = [], []
 
-    def show(camera=None, image=None, address="", **options):
+    def show(camera=None, image=None, address="#", draw="canvas", **options):
         path = tmp_path / "viewer.html"
         path.write_text(page(camera, image), encoding="utf-8")
-        contexts.append(browser.new_context(**options))
+        contexts.append(browsers[draw].new_context(**options))
         tab = contexts[-1].new_page()
         tab.set_default_timeout(20 * SECOND)
         tab.on("request", lambda r: r.url.startswith(("file:", "data:", "blob:")) or trouble.append(r.url))
         tab.on("pageerror", lambda error: trouble.append(str(error)))
         tab.on("console", lambda message: message.type == "error" and trouble.append(message.text))
-        tab.goto(f"{path.as_uri()}{address}")
+        tab.goto(f"{path.as_uri()}{address}&draw={draw}")
         settled(tab)
         return tab
 
@@ -83,7 +88,7 @@ def photograph(path, height=240, width=320):
 
 
 @pytest.mark.parametrize("key", KEYS)
-def test_formulas_in_the_browser_are_those_of_python(key, browser, opened):
+def test_formulas_in_the_browser_are_those_of_python(key, opened):
     tab, cameras = opened(), lenses_of(key)
     answers = tab.evaluate(f"(asked) => ({ANSWERS})(asked)", [described(camera) for camera in cameras])
     for camera, answer in zip(cameras, answers, strict=True):
@@ -128,7 +133,7 @@ WAYS = [
 def test_the_lines_run_and_make_the_image_on_the_right(way, renderer, opened, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     photograph("photo.png")
-    tab = opened(fisheye(), address=way + "&canvas=1" * (renderer == "canvas"))
+    tab = opened(fisheye(), address=way, draw=renderer)
     assert tab.evaluate("Viewer.renderer().kind") == renderer
     tab.set_input_files("#file", "photo.png")
     tab.locator("#message").filter(has_text="photo.png: 320 x 240").wait_for()
@@ -151,7 +156,8 @@ def test_the_lines_run_and_make_the_image_on_the_right(way, renderer, opened, tm
             inner &= np.roll(seen, step, axis)
             edge &= np.roll(~seen, step, axis)
     assert np.abs(shown - made)[inner].max() < (12 if renderer == "webgl" else 25)  # the nearest pixel by canvas
-    assert ((np.abs(shown - [84, 92, 97]) < 1.5).all(-1))[edge].mean() > 0.9999
+    if edge.any():
+        assert (np.abs(shown - [84, 92, 97]) < 1.5).all(-1)[edge].mean() > 0.9999
 
 
 def test_the_command_runs(opened, tmp_path, monkeypatch):
@@ -166,7 +172,7 @@ def test_the_command_runs(opened, tmp_path, monkeypatch):
     with contextlib.redirect_stdout(io.StringIO()):
         assert not main(words)
     with Image.open("moved.png") as made:
-        assert made.size == (1280, 720)
+        assert made.size == (640, 480)
 
 
 def test_a_camera_with_its_photograph_is_what_it_opens_with(opened, tmp_path):
@@ -295,7 +301,12 @@ def test_a_phone_shows_it_without_scrolling_aside(opened):
     assert tab.evaluate("document.documentElement.scrollWidth") <= 360
 
 
-def test_without_webgl_the_canvas_draws(opened):
-    tab = opened(fisheye(), address="#canvas=1")
-    assert tab.evaluate("Viewer.renderer().kind") == "canvas"
-    assert tab.evaluate("Viewer.viewSize") == [640, 480]
+def test_where_webgl_is_slow_or_missing_the_canvas_draws(browsers, tmp_path):
+    (tmp_path / "viewer.html").write_text(page(fisheye()), encoding="utf-8")
+    for browser in browsers.values():  # one has it in software, the other one not at all
+        tab = browser.new_page()
+        tab.goto((tmp_path / "viewer.html").as_uri())
+        settled(tab)
+        assert tab.evaluate("Viewer.renderer().kind") == "canvas"
+        assert tab.evaluate("Viewer.viewSize") == [640, 480]
+        tab.close()
