@@ -499,6 +499,9 @@ const Viewer = (() => {
     const options = { antialias: false, alpha: false, preserveDrawingBuffer: true };
     const gl = canvas.getContext("webgl2", { ...options, failIfMajorPerformanceCaveat: !evenSlow });
     if (!gl) return null;
+    const named = gl.getExtension("WEBGL_debug_renderer_info");
+    const name = named ? gl.getParameter(named.UNMASKED_RENDERER_WEBGL) : "";
+    if (!evenSlow && /swiftshader|llvmpipe|software/i.test(name)) return null;
     const shader = (kind, text) => {
       const made = gl.createShader(kind);
       gl.shaderSource(made, text);
