@@ -4,6 +4,7 @@ from camtorch import augment, cabin, data, io, lenses, models, plot
 from camtorch.boards.finding import BoardObservations, find_board
 from camtorch.calibration.calibrate import Calibration, calibrate
 from camtorch.calibration.from_rays import fit
+from camtorch.calibration.hand_eye import HandEyeCalibration, calibrate_hand_eye
 from camtorch.calibration.pnp import solve_pnp
 from camtorch.calibration.rig import RigCalibration, calibrate_rig
 from camtorch.calibration.triangulate import triangulate
@@ -46,6 +47,7 @@ __all__ = [
     "Conversion",
     "Dewarp",
     "Extrinsics",
+    "HandEyeCalibration",
     "LookupMap",
     "MapReport",
     "Mixed",
@@ -63,6 +65,7 @@ __all__ = [
     "augment",
     "cabin",
     "calibrate",
+    "calibrate_hand_eye",
     "calibrate_rig",
     "cat",
     "data",

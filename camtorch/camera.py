@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import difflib
+import functools
 import inspect
 from collections.abc import Callable, Mapping, Sequence
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, cast
 
 import torch
@@ -23,6 +23,7 @@ from camtorch._arguments import (
     shown,
     values_of,
 )
+from camtorch._derived import variant
 from camtorch._editing import edited_by, quarter_turns
 from camtorch._evaluation import evaluated, mapped
 from camtorch._freezing import INTRINSICS, PREFIX, freeze, frozen_names, loaded, saved, with_frozen
@@ -48,7 +49,7 @@ from camtorch.projection.project import Project
 from camtorch.projection.rays import field_of_view
 from camtorch.projection.rows import Cameras
 from camtorch.projection.unproject import Unproject
-from camtorch.windshield import Windshield, behind, model_behind
+from camtorch.windshield import Windshield, behind
 
 if TYPE_CHECKING:
     from typing_extensions import Self, TypeVar
@@ -130,8 +131,6 @@ class Camera(BatchedModule):
 
     key: ClassVar[str] = ""
     """Under which `ct.MODELS` and files know the model; without one of its own a class cannot be saved."""
-    configuration: ClassVar[Mapping[str, Any]] = MappingProxyType({})
-    """What `configured` made the class with, of a model with the key: files hold it beside that."""
     default_count: ClassVar[int] = 0
     """How many coefficients, those of `ideal`, a camera has that is made without distortion."""
     defined_text: ClassVar[str] = ""
@@ -202,25 +201,6 @@ class Camera(BatchedModule):
         )
         self.hold("intrinsics", intrinsics, (*batch, 4))
         self.hold("distortion", distortion, (*batch, count))
-
-    @classmethod
-    def configured(cls, **configuration: Any) -> type[Self]:
-        """The class of this model's cameras in a configuration: `windshield=(n, m)` of those behind a `Windshield` of
-        so many coefficients. The same class for the same configuration.
-
-        Raises:
-            ValueError, TypeError: no configuration that the model has.
-        """
-        counts = configuration.pop("windshield", None)
-        if configuration or cls.configuration:
-            raise ValueError(f"{cls.__name__}: it has no configuration {shown(configuration)}")
-        return model_behind(cls, counts)
-
-    def __reduce_ex__(self, protocol: Any) -> Any:
-        made = super().__reduce_ex__(protocol)
-        if not self.configuration:
-            return made
-        return _of_configuration, (plain_model(type(self)), dict(self.configuration)), *made[2:]
 
     @classmethod
     def from_matrix(
@@ -372,6 +352,11 @@ class Camera(BatchedModule):
     def defined(k: Sequence[Tensor]) -> Tensor | None:
         """Positive where the formula exists for the coefficients, tensors of one shape; None where it always does."""
         return None
+
+    @classmethod
+    def variant(cls, text: str) -> type[Camera]:
+        """The class of the key `key:text`, of cameras behind a windshield for one; a ValueError if there is none."""
+        return variant(cls, text)
 
     def _model_name(self) -> str:
         # a class that adds methods alone is of the model that it is made from
@@ -733,17 +718,6 @@ class Camera(BatchedModule):
         return ", ".join(parts)
 
 
-def plain_model(model: type[Camera]) -> type[Camera]:
-    """The model that `configured` made this one of, or itself."""
-    return next(cls for cls in model.__mro__ if issubclass(cls, Camera) and not cls.configuration)
-
-
-def _of_configuration(model: type[Camera], configuration: dict[str, Any]) -> Camera:
-    """An empty camera, for a pickle to fill."""
-    kind = model.configured(**configuration)
-    return kind.__new__(kind)
-
-
 def _add_model(model: type[Camera]) -> None:
     """Check what a new model states, and let `MODELS` know it."""
     for name in ("optics", "defined"):
@@ -772,6 +746,9 @@ def as_model(model: type[Camera] | str, owner: str) -> type[Camera]:
         TypeError: no camera model. ValueError: an unknown key.
     """
     if isinstance(model, str):
+        key, *texts = model.split(":")
+        if texts and key in MODELS:
+            return functools.reduce(lambda kind, text: kind.variant(text), texts, MODELS[key])
         if model not in MODELS:
             keys = {name.lower(): key for key, cls in MODELS.items() for name in (key, cls.__name__)} | _ELSEWHERE
             close = difflib.get_close_matches(model.lower(), keys, 1)
@@ -783,6 +760,13 @@ def as_model(model: type[Camera] | str, owner: str) -> type[Camera]:
     if not (isinstance(model, type) and issubclass(model, Camera) and model.optics is not Camera.optics):
         raise TypeError(f"{owner}: model must be a camera model, or its key in ct.MODELS; got {shown(model)}")
     return model
+
+
+def __getattr__(name: str) -> type[Camera]:
+    """The class of a variant by its key, under which it is pickled."""
+    if ":" not in name:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return as_model(name, __name__)
 
 
 def fixed_camera(

@@ -157,7 +157,7 @@ class Mirroring:
         """
         table = self._named.get(name) if self._named is not None else self._one
         if table is None:
-            if self._named is self._one is None and kind in _HOLD[:2] and (meant := _FACES.get(count)):
+            if self._named is None and self._one is None and kind in _HOLD[:2] and (meant := _FACES.get(count)):
                 warnings.warn(
                     f"{self.owner}: {name} holds {count} points and mirrored faces keep their order: point 0 is then "
                     f"on the other side. landmarks={meant!r}, if that is their order, puts them right; "

@@ -31,19 +31,6 @@ _NOTHING = 1e-11  # px
 _LOST = 1e3  # px, that a point counts as which was seen and has no pixel
 
 
-class Sight(NamedTuple):
-    """What one camera sees, of B problems, V views and N points each; leading dims may be 1.
-
-    points: (B, V, N, 3) in the board's frame. pixels: (B, V, N, 2). weights: (B, V, N) of the squares, 0 for unseen,
-    where the others are any finite numbers. model: the class, or a camera of it.
-    """
-
-    model: type[Camera] | Camera
-    points: Tensor
-    pixels: Tensor
-    weights: Tensor
-
-
 class Poses(NamedTuple):
     """Rotations (B, P, 3, 3) and translations (B, P, 3)."""
 
@@ -78,11 +65,44 @@ class Poses(NamedTuple):
         return cls(eye.repeat(batch, count, 1, 1), like.new_zeros(batch, count, 3))
 
 
+class Prior(NamedTuple):
+    """What is known of a camera's parameters p before it sees anything: root @ (p - centre) is as if it were residuals.
+
+    centre: (P,). root: (R, P), in pixels.
+    """
+
+    centre: Tensor
+    root: Tensor
+
+
+class Sight(NamedTuple):
+    """What one camera sees, of B problems, V views and N points each; leading dims may be 1.
+
+    points: (B, V, N, 3) in the board's frame. pixels: (B, V, N, 2). weights: (B, V, N) of the squares, 0 for unseen,
+    where the others are any finite numbers. model: the class, or a camera of it. motions: (B, V), known ones of a
+    single board between the views, or None. prior: or None.
+    """
+
+    model: type[Camera] | Camera
+    points: Tensor
+    pixels: Tensor
+    weights: Tensor
+    motions: Poses | None = None
+    prior: Prior | None = None
+
+    def mapped(self, change: Callable[[Tensor], Tensor]) -> Sight:
+        """With a change to all tensors of problems."""
+        points, pixels, weights = map(change, self[1:4])
+        motions = self.motions and Poses(*map(change, self.motions))
+        return Sight(self.model, points, pixels, weights, motions, self.prior)
+
+
 class State(NamedTuple):
     """What is looked for. A point of a board is at `mount(board(point))` for a camera.
 
     parameters: of each camera (B, 4 + n), fx, fy, cx, cy and the coefficients. mounts: a pose for each camera, from the
-    frame of the first one, whose own it leaves as it is. boards: for each view. bend: (B, 2), how far the middle of a
+    frame of the first one, whose own it leaves as it is unless it learns. boards: for each view; a single one where the
+    views have known motions, and the point is at `mount(motion(board(point)))`. bend: (B, 2), how far the middle of a
     board's edges lies behind the plane, see `bent`.
     """
 
@@ -241,10 +261,7 @@ class Bundle:
         self.free, self.loss, self.loss_scale = free, loss, loss_scale
         self._last = None
         batch = state.boards.translations.shape[0]
-        self.sights = [
-            s._replace(**{name: getattr(s, name).expand(batch, *getattr(s, name).shape[1:]) for name in s._fields[1:]})
-            for s in sights
-        ]
+        self.sights = [s.mapped(lambda t: t.expand(batch, *t.shape[1:])) for s in sights]
         self.cameras = [_template(s.model, p) for s, p in zip(sights, state.parameters, strict=True)]
         self.rounding = torch.stack([rounding_of(s.pixels, s.weights) for s in self.sights]).sum(0)
         # a camera that does not learn, and is that of all problems, sees them in one row
@@ -264,7 +281,7 @@ class Bundle:
         self.width = 6 if free.boards == "poses" else 3
         """Of the unknowns of a view."""
         views = torch.stack([(s.weights > 0).any(-1).any(0) for s in self.sights]).any(0).sum()
-        self.unknowns = len(self.columns) + self.width * int(views)
+        self.unknowns = len(self.columns) + self.width * (1 if sights[0].motions else int(views))
         sides = zip(*(bounds(camera, p) for camera, p in zip(self.cameras, state.parameters, strict=True)), strict=True)
         self.low, self.high = (
             self._of_columns(side, end) for side, end in zip(sides, (-torch.inf, torch.inf), strict=True)
@@ -305,7 +322,9 @@ class Bundle:
             points = bent(points, state.bend)[0]
         turned = points @ state.boards.rotations.mT
         first = turned + state.boards.translations[:, :, None]
-        if c == 0:
+        if sight.motions:
+            first = sight.motions.moved(first)
+        if c == 0 and not self.free.mounts[0]:
             return turned, first, first
         mounts = state.mounts
         return turned, first, first @ mounts.rotations[:, c, None].mT + mounts.translations[:, c, None, None]
@@ -337,11 +356,14 @@ class Bundle:
         sight = self.sights[c]
         if rows is None or len(rows) == len(sight.points):
             return sight
-        return Sight(sight.model, *(t[rows] for t in sight[1:]))
+        return sight.mapped(lambda t: t[rows])
 
     def cost(self, flat: Sequence[Tensor], rows: Tensor) -> Tensor:
         """(R,)."""
         total = torch.stack([look.cost.sum((-1, -2)) for look in self.looks(flat, rows)]).sum(0)
+        for sight, parameters in zip(self.sights, flat[5:], strict=True):
+            if sight.prior:
+                total = total + ((parameters - sight.prior.centre) @ sight.prior.root.mT).square().sum(-1)
         return torch.where(torch.isfinite(total), total, torch.inf)
 
     # -- the linear problem
@@ -364,7 +386,7 @@ class Bundle:
         state, width, total = self.state(flat), self.width, len(self.columns)
         parts = []
         for c, look in enumerate(self.looks(flat, rows)):
-            block, at = self._rows_of(c, look, state, rows)
+            block, at = self.rows_of(c, look, state, rows)
             if total == 0:
                 parts.append(block)
                 continue
@@ -373,16 +395,30 @@ class Bundle:
                 whole = block.new_zeros(*block.shape[:-1], width + total + 1)
                 whole[..., [*range(width), *(width + g for g in at), width + total]] = block
                 block = whole
-            parts.append(block)
+            parts.append(block.flatten(1, 2)[:, None] if self.sights[0].motions else block)
         block = torch.cat(parts, -2)
         if total == 0:  # no more than six columns, which squares do no harm
             return Equations(triangle_of_few(block), block.new_zeros(len(block), 1, 1), ())
         triangle = torch.linalg.qr(padded(block), mode="r").R
-        left = triangle[..., width:, width:].flatten(1, 2)
+        left = torch.cat((triangle[..., width:, width:].flatten(1, 2), *self._rows_of_priors(state)), -2)
         shared = torch.linalg.qr(padded(left), mode="r").R
         return Equations(triangle[..., :width, :], shared, self.columns)
 
-    def _rows_of(self, c: int, look: _Look, state: State, rows: Tensor) -> tuple[Tensor, list[int]]:
+    def _rows_of_priors(self, state: State) -> list[Tensor]:
+        """(B, R, G + 1) of each."""
+        found = []
+        for c, (sight, parameters) in enumerate(zip(self.sights, state.parameters, strict=True)):
+            if sight.prior:
+                centre, root = sight.prior
+                rows = root.new_zeros(len(parameters), len(root), len(self.columns) + 1)
+                for g, (camera, i) in enumerate(self.columns):
+                    if camera == c and i < len(centre):
+                        rows[..., g] = root[:, i]
+                rows[..., -1] = (parameters - centre) @ root.mT
+                found.append(rows)
+        return found
+
+    def rows_of(self, c: int, look: _Look, state: State, rows: Tensor) -> tuple[Tensor, list[int]]:
         """The rows (B, V, 2 N, L + F + 1) of a camera, and which of the shared unknowns its F columns are."""
         sight = self.sight(c, rows)
         turned, first, points = look.frames
@@ -393,11 +429,13 @@ class Bundle:
         at = [g for g, _ in learnt]
         found = _pixel_jacobians(look.camera, points.reshape(*lead, 3), any(i >= 4 for _, i in learnt))
         by_point, by_k = (by.reshape(batch, views, count, 2, by.shape[-1]) for by in found)
-        by_first = by_point if c == 0 else by_point @ state.mounts.rotations[:, c, None, None]
+        is_mounted = c > 0 or self.free.mounts[0]
+        by_first = by_point @ state.mounts.rotations[:, c, None, None] if is_mounted else by_point
+        by_board = by_first @ sight.motions.rotations[:, :, None] if sight.motions else by_first
         columns = []
         if self.width == 6:
-            columns.append(torch.linalg.cross(turned[..., None, :].expand_as(by_first), by_first, dim=-1))
-        columns.append(by_first)
+            columns.append(torch.linalg.cross(turned[..., None, :].expand_as(by_board), by_board, dim=-1))
+        columns.append(by_board)
         if learnt:
             focal, centre = parameters[:, None, None, :2], parameters[:, None, None, 2:4]
             by_focal = torch.diag_embed((look.residuals + sight.pixels - centre) / focal)
@@ -410,7 +448,7 @@ class Bundle:
             columns += [torch.linalg.cross(turned[..., None, :].expand_as(by_point), by_point, dim=-1), by_point]
         if self.learns_bend:
             at += [g for g, (camera, _) in enumerate(self.columns) if camera == -1]
-            along = by_first @ state.boards.rotations[:, :, None, :, 2:]
+            along = by_board @ state.boards.rotations[:, :, None, :, 2:]
             columns.append(along * bent(sight.points, state.bend)[1][..., None, :])
         columns.append(look.residuals[..., None])
         weight = look.weights.sqrt()[..., None, None]

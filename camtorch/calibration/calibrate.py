@@ -16,20 +16,24 @@ from torch.nn.utils.parametrize import type_before_parametrizations
 from camtorch._arguments import as_flag, as_number, as_whole, shown
 from camtorch._freezing import INTRINSICS, frozen_names
 from camtorch._threads import on_one_thread
-from camtorch.calibration.bundle import LOSSES, Adjusted, Free, Poses, Sight, State, adjust
+from camtorch.calibration.bundle import LOSSES, Adjusted, Free, Poses, Prior, Sight, State, adjust
 from camtorch.calibration.observations import Layout, Observations, Points, as_observations, repeats
+from camtorch.calibration.priors import Known, as_known
 from camtorch.calibration.start import other_cameras, other_poses, poses_for, start_from_nothing
-from camtorch.calibration.uncertainty import Spread, noise_under, spread, uncertainty
+from camtorch.calibration.uncertainty import Spread, noise_under, shared_factor, spread, uncertainty
 from camtorch.calibration.verdict import check_determined, verdict, warnings
 from camtorch.camera import Camera
 from camtorch.camera import as_model as as_kind
 from camtorch.extrinsics import Extrinsics
+from camtorch.least_squares.equations import padded
+from camtorch.lenses import Lens
 from camtorch.rotations import rotation_vector
 
 STEPS = 300
 _MANY = 100  # coefficients
 _OUTLIER = 3.0  # standard deviations
 _ROUNDS = 20
+_SAME_WIDTH, _CONTRADICTED = 0.01, 3.0  # of a prior: a change that is none, and times its own that it has to be told
 _SECOND_LOOKS = 3  # at the poses
 _AS_GOOD = 9.0  # variances: the difference of two costs that three standard deviations explain
 _APART, _SAME = 5.0, 1e-3  # standard deviations, and part of the parameter, of two optima
@@ -238,6 +242,7 @@ def calibrate(
     loss_scale: float = 1.0,
     bend: bool = False,
     progress: Callable[[int, float], None] | None = None,
+    prior: Camera | Lens | Sequence[Camera | Lens] | None = None,
 ) -> Calibration:
     """The camera of a model under which known points are seen where they were seen, from nothing.
 
@@ -258,6 +263,11 @@ def calibrate(
         loss_scale: px, from where a robust loss grows slower.
         bend: whether the board may be bent: two numbers more, see `Calibration.bend`.
         progress: called after each step of the final search with its number and the cost.
+        prior: for few views: a camera that this one is like, of any model and any size of the same aspect ratio, an
+            entry of `ct.lenses`, or a list of such, as `ct.lenses.search` returns, whose own spread then counts. It is
+            where the search starts if there is no `start`, and counts as much as calibrations of one lens agree: in
+            `camtorch.calibration.priors` are the numbers. Where views tell more, they decide; where they contradict
+            it, it counts less, with a warning.
 
     Raises:
         ValueError: bad arguments, each with what to do; a problem that has no one solution, as a single view of a plane
@@ -265,10 +275,18 @@ def calibrate(
     """
     owner = "calibrate"
     seen, layout = as_observations(object_points, image_points, image_size, owner)
-    asked = as_model(model, count, start, fixed, owner)
     told = as_options(loss, loss_scale, bend, progress, owner)
-    search = Search(owner, asked, seen, middle_of([seen]), layout, loss, loss_scale)
-    found = results([search], search.alone(bend, told), search.free(bend), object_points, [image_points])
+    if prior is None:
+        asked = as_model(model, count, start, fixed, owner)
+        search = Search(owner, asked, seen, middle_of([seen]), layout, loss, loss_scale)
+        adjusted = search.alone(bend, told)
+    else:
+        asked = as_model(model, count, start, (), owner)
+        known = as_known(prior, asked.kind, asked.count, layout.image_size, owner, seen.pixels)
+        asked = as_model(asked.kind, None, asked.start or known.camera, fixed, owner)
+        search = Search(owner, asked, seen, middle_of([seen]), layout, loss, loss_scale)
+        adjusted = search.with_prior(known, bend, told)
+    found = results([search], adjusted, search.free(bend), object_points, [image_points])
     result = found.cameras[0]
     if not result.converged:
         python_warnings.warn(
@@ -299,6 +317,9 @@ class Search:
     layout: Layout
     loss: str | None
     loss_scale: float
+    prior: Prior | None = None
+    misfit: float = 1.0
+    """See `misfit`, beside a prior."""
 
     @cached_property
     def seen(self) -> Observations:
@@ -309,7 +330,8 @@ class Search:
     def sight(self) -> Sight:
         """It as one problem."""
         seen = self.seen
-        return Sight(self.asked.kind, seen.points[None], seen.pixels[None], seen.seen[None].to(seen.pixels))
+        weights = seen.seen[None].to(seen.pixels)
+        return Sight(self.asked.kind, seen.points[None], seen.pixels[None], weights, prior=self.prior)
 
     def free(self, bend: bool = False) -> Free:
         """What learns where there is no other camera."""
@@ -337,6 +359,43 @@ class Search:
             if not bool(again.cost < adjusted.cost):
                 break
             adjusted = again
+        return adjusted
+
+    def with_prior(
+        self, known: Known, bend: bool = False, progress: Callable[[int, Tensor], None] | None = None
+    ) -> Adjusted:
+        """The optimum by what this camera saw and what was known; `prior` becomes what that counts in px.
+
+        It counts by the noise that views show by themselves. A prior that the optimum is further from than its own
+        standard deviations is widened until it is not.
+        """
+        free, learns, wide = self.free(bend), max(int(self.asked.free.sum()), 1), 1.0
+        alone = self.alone(bend)
+        residuals, seen, valid = alone.residuals[0][0], self.seen.seen, alone.valid[0][0]
+        _, sigma, _ = noise_of(
+            residuals, seen, valid, self.loss, self.loss_scale, unknowns([self.sight], alone, len(seen))
+        )
+        self.misfit = misfit(alone, sigma)
+        sigma = sigma * self.misfit
+        self.prior = known.prior(sigma)
+        adjusted = min(
+            (self.alone(bend, progress), self.adjusted([self.sight], alone.state, free, steps=STEPS)),
+            key=lambda found: float(found.cost),
+        )
+        for _ in range(_ROUNDS):
+            before = wide
+            away = known.root @ (adjusted.state.parameters[0][0] - known.centre)
+            wide = max(1.0, float(away.square().sum() / learns) ** 0.5)
+            if abs(wide / before - 1) < _SAME_WIDTH:
+                break
+            self.prior = known.prior(sigma / wide)
+            adjusted = self.adjusted([self.sight], adjusted.state, free, steps=STEPS, progress=progress)
+        if wide > _CONTRADICTED:
+            python_warnings.warn(
+                f"{self.owner}: the views contradict prior, by {wide:.3g} standard deviations, and it counts so much "
+                "less: is it the lens, its focus and zoom, and the whole image, not a part of it?",
+                stacklevel=4,
+            )
         return adjusted
 
     def adjusted(self, sights: Sequence[Sight], state: State, free: Free, **options: Any) -> Adjusted:
@@ -424,12 +483,12 @@ def results(
     seen = torch.cat([one.seen for one in given])
     residuals, valid = (torch.cat([t[0] for t in of_all]) for of_all in (adjusted.residuals, adjusted.valid))
     views = torch.stack([one.seen.any(-1) for one in given]).any(0)
-    parameters = len(adjusted.equations.columns) + 6 * int(views.sum())
+    parameters = unknowns(sights, adjusted, int(views.sum()))
     loss, loss_scale = searches[0].loss, searches[0].loss_scale
-    inliers, sigma, noise = _noise_of(residuals, seen, valid, loss, loss_scale, parameters)
+    inliers, sigma, noise = noise_of(residuals, seen, valid, loss, loss_scale, parameters)
     # views that repeat others widen what is uncertain as if there were so many less
     again = repeats(given, [r[0] for r in adjusted.residuals])
-    noise = noise * math.sqrt(len(views) / (len(views) - len(again)))
+    noise = noise * math.sqrt(len(views) / (len(views) - len(again))) * searches[0].misfit
     cameras = []
     for c, (search, passed, own) in enumerate(zip(searches, image_points, inliers.split(len(views)), strict=True)):
         copies = search.layout.views[again[search.given.seen[again].any(-1)]].tolist()
@@ -437,17 +496,47 @@ def results(
         cameras.append(_result(adjusted, c, search, layout, own, sigma, noise, (object_points, passed)))
     for camera, ends in zip(cameras, optima, strict=True):
         camera.twins = () if ends is None else ends.twins(camera)
-    return Results(adjusted, cameras, _rms(residuals, seen), float(sigma), noise)
+    return Results(adjusted, cameras, rms_of(residuals, seen), float(sigma), noise)
 
 
-def _rms(residuals: Tensor, seen: Tensor) -> float:
+def unknowns(sights: Sequence[Sight], adjusted: Adjusted, views: int) -> float:
+    """How many numbers the residuals had to tell: those that learn, without what priors tell of them."""
+    equations = adjusted.equations
+    told = 0.0
+    for c, sight in enumerate(sights):
+        if sight.prior:
+            count = len(sight.prior.centre)
+            which = [(g, i) for g, (camera, i) in enumerate(equations.columns) if camera == c and i < count]
+            rows, own = [g for g, _ in which], [i for _, i in which]
+            told += float((sight.prior.root[:, own] @ shared_factor(equations)[0, rows]).square().sum())
+    return len(equations.columns) + 6 * views - told
+
+
+def misfit(adjusted: Adjusted, sigma: Tensor) -> float:
+    """How many times further the views disagree about the camera than noise of sigma explains, at least 1.
+
+    Where a model, a board or a detector errs, corners of a view are wrong together; on OV-plane this is 7, and so far
+    are calibrations by three views from that by all. A single view cannot tell.
+    """
+    problem, state = adjusted.problem, adjusted.problem.flat(adjusted.state)
+    one = torch.arange(1, device=sigma.device)
+    block, at = problem.rows_of(0, problem.looks(state, one)[0], adjusted.state, one)
+    views, width = block.shape[1], problem.width
+    if views == 1 or not at:
+        return 1.0
+    # what the poses leave of each view, along what the camera could do about it
+    left = torch.linalg.qr(padded(block), mode="r").R[0, :, width:-1, -1]
+    return max(1.0, float((left.square().sum() / ((views - 1) * len(at))).sqrt() / sigma))
+
+
+def rms_of(residuals: Tensor, seen: Tensor) -> float:
     """Px per point."""
     lengths = torch.where(seen, torch.linalg.vector_norm(residuals, dim=-1), 0.0)
     return float((lengths.square().sum() / seen.sum().clamp(min=1)).sqrt())
 
 
-def _noise_of(
-    residuals: Tensor, seen: Tensor, valid: Tensor, loss: str | None, loss_scale: float, free: int
+def noise_of(
+    residuals: Tensor, seen: Tensor, valid: Tensor, loss: str | None, loss_scale: float, free: float
 ) -> tuple[Tensor, Tensor, Tensor]:
     """The inliers, bool (V, N), sigma, and the noise that makes the covariance; without a loss both are one number.
 
@@ -493,7 +582,7 @@ def _result(
     return Calibration(
         camera=found,
         extrinsics=Extrinsics(rotation_vector(rotations).unsqueeze(-1), translations - rotations @ search.middle),
-        rms=_rms(residuals, seen.seen),
+        rms=rms_of(residuals, seen.seen),
         sigma=float(sigma),
         residuals=layout.restore(torch.where(valid[..., None], residuals, torch.nan)),
         inliers=layout.restore(inliers),

@@ -45,6 +45,8 @@ class RigCalibration:
     views: tuple[int, ...]
     """The numbers of the views that some camera saw, of those that were passed, without copies of others."""
     adjusted: Adjusted = field(repr=False)
+    factor: Tensor = field(repr=False)
+    """(G, G) F: F F^T is the covariance of what all views share, of `adjusted.equations.columns`."""
 
     @property
     def residuals(self) -> dict[str, Any]:
@@ -159,17 +161,19 @@ def calibrate_rig(
         name: Extrinsics(rotation_vector(r).unsqueeze(-1), t)
         for name, r, t in zip(observed, *(t[0] for t in state.mounts), strict=True)
     }
+    factor = shared_factor(found.adjusted.equations)[0] * found.noise
     result = RigCalibration(
         rig=Rig({name: c.camera for name, c in cameras.items()}, mounts),
         boards=Extrinsics(rotation_vector(rotations).unsqueeze(-1), translations - rotations @ middle),
         rms=found.rms,
         sigma=found.sigma,
         cameras=cameras,
-        mount_std=_mount_std(found.adjusted, list(observed), found.noise),
+        mount_std=_mount_std(found.adjusted, list(observed), factor),
         converged=all(c.converged for c in found.cameras),
         bend=found.cameras[0].bend,
         views=found.cameras[0].views,
         adjusted=found.adjusted,
+        factor=factor,
     )
     if not result.converged:
         python_warnings.warn(
@@ -244,9 +248,9 @@ def _between(a: _Alone, b: _Alone) -> tuple[Tensor, Tensor]:
     return rotations[middle], translations[middle]
 
 
-def _mount_std(adjusted: Adjusted, names: list[str], noise: Tensor) -> dict[str, Tensor]:
+def _mount_std(adjusted: Adjusted, names: list[str], factor: Tensor) -> dict[str, Tensor]:
     """(6,) by the name of a camera; zeros for the first one."""
-    std = torch.linalg.vector_norm(shared_factor(adjusted.equations)[0], dim=-1) * noise
+    std = torch.linalg.vector_norm(factor, dim=-1)
     result = {name: std.new_zeros(6) for name in names}
     for value, (camera, i) in zip(std, adjusted.equations.columns, strict=True):
         count = adjusted.state.parameters[camera].shape[-1]

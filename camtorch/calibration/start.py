@@ -342,7 +342,7 @@ def _turned(lens: _Lens, some: Observations) -> _Lens:
     # each is a problem of its own
     both = Poses(*(torch.cat((a[0, rows], b[0, rows]))[:, None] for a, b in zip(first, second, strict=True)))
     sight = _sight(lens.model, some)
-    sight = Sight(lens.model, *(t[0, rows].repeat(2, *[1] * (t.ndim - 2))[:, None] for t in sight[1:]))
+    sight = sight.mapped(lambda t: t[0, rows].repeat(2, *[1] * (t.ndim - 2))[:, None])
     free = Free((torch.zeros(lens.parameters.shape[-1], dtype=torch.bool, device="cpu"),), (False,))
     state = _state(lens.parameters, both)
     ended = adjust([sight], state, free, loss="cauchy", loss_scale=lens.scale, steps=_FEW_STEPS)

@@ -95,7 +95,7 @@ def spread(adjusted: Adjusted, model: type[Camera], camera: int, noise: Tensor) 
     return Spread(model, parameters.expand(len(factor), -1), factor)
 
 
-def noise_under(loss: str | None, loss_scale: float, residuals: Tensor, seen: Tensor, free: int) -> Tensor:
+def noise_under(loss: str | None, loss_scale: float, residuals: Tensor, seen: Tensor, free: float) -> Tensor:
     """(*B,) px per coordinate: the noise that makes the covariance of a weighted problem that of its optimum.
 
     Without a loss it is sqrt(sum of squares / (2 N - free)). A robust loss with weights w of squares pulls with the

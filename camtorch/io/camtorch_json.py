@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from camtorch._arguments import broadcast_shapes
 from camtorch._module import remade
-from camtorch.camera import Camera, plain_model
+from camtorch.camera import Camera
 from camtorch.extrinsics import Extrinsics
 from camtorch.io import poses
 from camtorch.io.protocol import Names
@@ -22,7 +22,6 @@ NAMES = Names("camtorch", "camtorch", (".json",), ("*.json",))
 
 _VERSION = 1
 _DEEPEST_BATCH = 8
-_MOST_COEFFICIENTS = 1000  # of a windshield across or down
 
 
 def matches(keys: dict[str, Any]) -> bool:
@@ -64,8 +63,6 @@ def _camera(record: Record) -> Camera:
     key = record["model"].text()
     names = [name.text() for name in record["distortion_names"]] if "distortion_names" in record else []
     kind = record.model(key)
-    if "configuration" in record:
-        kind = _configured(kind, record["configuration"])
     arguments = [_tensor(record["intrinsics"], 4)]
     if names:
         if list(kind.names_of(len(names)) or ()) != names:
@@ -79,14 +76,6 @@ def _camera(record: Record) -> Camera:
     _same_batch(record, *arguments)
     try:
         return kind(nn.Parameter(arguments[0]), *arguments[1:], image_size=size)  # what was cut out may be off centre
-    except (ValueError, TypeError) as error:
-        return record.fail(error)
-
-
-def _configured(kind: type[Camera], record: Record) -> type[Camera]:
-    try:
-        counts = [number.whole(1, _MOST_COEFFICIENTS, "number of coefficients") for number in record["windshield"]]
-        return kind.configured(windshield=tuple(counts))
     except (ValueError, TypeError) as error:
         return record.fail(error)
 
@@ -117,9 +106,7 @@ def render(rig: Rig, path: str) -> str:
     cameras, extrinsics = {}, {}
     for name, camera in rig.cameras.items():
         intrinsics, distortion = _rows(camera.intrinsics, camera.distortion)
-        entry: dict[str, Any] = {"model": plain_model(type(camera)).key, "intrinsics": _values(lossy, name, intrinsics)}
-        if camera.configuration:
-            entry["configuration"] = {name: list(value) for name, value in camera.configuration.items()}
+        entry: dict[str, Any] = {"model": camera.key, "intrinsics": _values(lossy, name, intrinsics)}
         if camera.distortion.shape[-1]:
             entry["distortion_names"] = list(camera.distortion_names)
             entry["distortion"] = _values(lossy, name, distortion)

@@ -12,7 +12,7 @@ from typing import Any, NoReturn
 import torch
 from torch import nn
 
-from camtorch.camera import Camera
+from camtorch.camera import Camera, as_model
 from camtorch.io._errors import CameraFileError
 from camtorch.models import MODELS
 
@@ -186,9 +186,12 @@ class Record:
 
     def model(self, key: str) -> type[Camera]:
         """The model of that key."""
-        if key not in MODELS:
+        if key.partition(":")[0] not in MODELS:
             self.fail(f"needs the camera model {key!r:.60}, which this camtorch does not have")
-        return MODELS[key]
+        try:
+            return as_model(key, "file")
+        except ValueError as error:
+            self.fail(error)
 
 
 def repeated(names: Iterable[str]) -> str | None:

@@ -156,9 +156,151 @@ static void T(shrunk)(int n, R *restrict x, R *restrict y, R *restrict z, R *res
     }
 }
 
+/* The step that a Jacobian sends to (du, dv), some finite one where it is singular; one over its determinant */
+INLINE R T(step)(R ua, R ub, R va, R vb, R du, R dv, R *da, R *db) {
+    const R determinant = ua * vb - ub * va, one = determinant / (determinant * determinant + FLOOR);
+    *da = (vb * du - ub * dv) * one, *db = (ua * dv - va * du) * one;
+    return one;
+}
+
+/* -- a windshield: polynomials of the angles phi = asin(x) and theta = asin(y) */
+
+#define NEAR_SIDE (8 * (IS_DOUBLE ? 1.4901161193847656e-08 : 3.4526698300124393e-04)) /* 8 sqrt(eps) */
+
+typedef struct {
+    ALIGNED R phi[BLOCK], theta[BLOCK], p[BLOCK], q[BLOCK], side[BLOCK];
+    T(Jacobian) by; /* of p and q by phi and theta */
+    ALIGNED I ok[BLOCK]; /* where that is regular, and ahead before and after */
+} T(Bent);
+
+/* A polynomial and its derivatives: coefficients of 1, phi, phi^2, ..., then theta (1, phi, ...) and so on */
+static void T(bivariate)(const R *c, int count, int n, const R *restrict phi, const R *restrict theta, R *restrict value,
+                         R *restrict by_phi, R *restrict by_theta) {
+    ALIGNED R inner[BLOCK], slope[BLOCK];
+    EACH(i) value[i] = by_phi[i] = by_theta[i] = 0;
+    const R *row = c + count;
+    for (int size = 1; row > c; size++) {
+        row -= size;
+        EACH(i) inner[i] = row[size - 1], slope[i] = 0;
+        for (int k = size - 2; k >= 0; k--) {
+            const R next = row[k];
+            EACH(i) slope[i] = slope[i] * phi[i] + inner[i], inner[i] = inner[i] * phi[i] + next;
+        }
+        EACH(i) {
+            by_theta[i] = by_theta[i] * theta[i] + value[i], by_phi[i] = by_phi[i] * theta[i] + slope[i];
+            value[i] = value[i] * theta[i] + inner[i];
+        }
+    }
+}
+
+/* Adds the sums of phi^i theta^j weight */
+static void T(bivariate_sums)(int count, int n, const R *restrict phi, const R *restrict theta, const R *restrict weight,
+                              double *sums) {
+    ALIGNED R row[BLOCK], term[BLOCK];
+    int size = 1;
+    while (size * (size + 1) / 2 < count) size++;
+    EACH(i) row[i] = weight[i];
+    for (; size > 0; size--) {
+        EACH(i) term[i] = row[i];
+        for (int k = 0; k < size; k++) {
+            *sums++ += T(total)(n, term);
+            EACH(i) term[i] *= phi[i];
+        }
+        EACH(i) row[i] *= theta[i];
+    }
+}
+
+/* z^2 of the ray of angles, and its x and y */
+INLINE R T(ray_of)(R phi, R theta, R *x, R *y) {
+    R sine, cosine, other, unused;
+    T(turn)(phi * phi, &sine, &cosine), T(turn)(theta * theta, &other, &unused);
+    *x = phi * sine, *y = theta * other;
+    return cosine * cosine - *y * *y;
+}
+
+static void T(bend_at)(const T(Camera) *c, int n, T(Bent) *b) {
+    const int across = c->parts->across, down = c->parts->down;
+    const R half = (R)(PI / 2), least = (R)NEAR_SIDE;
+    T(bivariate)(c->map, across, n, b->phi, b->theta, b->p, b->by.ua, b->by.ub);
+    T(bivariate)(c->map + across, down, n, b->phi, b->theta, b->q, b->by.va, b->by.vb);
+    EACH(i) {
+        R x, y;
+        const R p = b->p[i], q = b->q[i], area = b->by.ua[i] * b->by.vb[i] - b->by.ub[i] * b->by.va[i];
+        const I turned = (half - T(most)(T(absolute)(p), T(absolute)(q)) - least > 0) & (b->side[i] > 0);
+        const R before2 = T(ray_of)(b->phi[i], b->theta[i], &x, &y), after2 = T(ray_of)(turned ? p : 0, turned ? q : 0, &x, &y);
+        b->ok[i] = turned & (area - least > 0) & (after2 - least > 0) & (before2 - least * least > 0);
+    }
+}
+
+static void T(angles_of)(int n, const R *restrict x, const R *restrict y, const R *restrict z, T(Bent) *b) {
+    EACH(i) {
+        b->phi[i] = T(atan2)(x[i], T(root)(y[i] * y[i] + z[i] * z[i] + FLOOR));
+        b->theta[i] = T(atan2)(y[i], T(root)(x[i] * x[i] + z[i] * z[i] + FLOOR));
+        b->side[i] = z[i] < 0 ? -1 : 1;
+    }
+}
+
+/* The cotangents of angles of those of their rays, and of rays of those of their angles */
+static void T(ray_of_vjp)(int n, const R *restrict phi, const R *restrict theta, const R *restrict gx,
+                          const R *restrict gy, const R *restrict gz, R *restrict g_phi, R *restrict g_theta) {
+    EACH(i) {
+        R x, y, sine, cosine, other;
+        const R z2 = T(ray_of)(phi[i], theta[i], &x, &y), by_z = gz[i] / T(root)(z2 > FLOOR ? z2 : 1);
+        T(turn)(phi[i] * phi[i], &sine, &cosine), T(turn)(theta[i] * theta[i], &sine, &other);
+        g_phi[i] = cosine * (gx[i] - by_z * x), g_theta[i] = other * (gy[i] - by_z * y);
+    }
+}
+
+static void T(angles_vjp)(int n, const R *restrict x, const R *restrict y, const R *restrict z, const R *restrict g_phi,
+                          const R *restrict g_theta, R *restrict gx, R *restrict gy, R *restrict gz) {
+    EACH(i) {
+        const R xx = x[i] * x[i], yy = y[i] * y[i], zz = z[i] * z[i], one = 1 / (xx + yy + zz);
+        const R s = T(root)(yy + zz + FLOOR), t = T(root)(xx + zz + FLOOR);
+        const R a = g_phi[i] * one, b = g_theta[i] * one, in = a * x[i] / s + b * y[i] / t;
+        gx[i] = a * s - b * y[i] * x[i] / t, gy[i] = b * t - a * x[i] * y[i] / s, gz[i] = -in * z[i];
+    }
+}
+
+/* Unit rays behind the shield to those in front of it; `ok` where there is one */
+static void T(unbend)(const T(Camera) *c, int n, T(Bent) *b, R *restrict x, R *restrict y, R *restrict z, I *restrict ok) {
+    ALIGNED R p[BLOCK], q[BLOCK], off[BLOCK];
+    T(angles_of)(n, x, y, z, b);
+    EACH(i) p[i] = b->phi[i], q[i] = b->theta[i];
+    for (int count = 0;; count++) {
+        int all = 1;
+        T(bend_at)(c, n, b);
+        EACH(i) off[i] = T(absolute)(p[i] - b->p[i]) + T(absolute)(q[i] - b->q[i]);
+        for (int i = 0; i < n; i++) all &= !ok[i] | (off[i] < 4 * EPS);
+        if (all || count == 12) break;
+        EACH(i) {
+            R da, db;
+            const R half = (R)(PI / 2), most = (R)0.5;
+            T(step)(b->by.ua[i], b->by.ub[i], b->by.va[i], b->by.vb[i], p[i] - b->p[i], q[i] - b->q[i], &da, &db);
+            da = da > -most ? da < most ? da : most : -most, db = db > -most ? db < most ? db : most : -most;
+            da += b->phi[i], db += b->theta[i];
+            b->phi[i] = da > -half ? da < half ? da : half : -half, b->theta[i] = db > -half ? db < half ? db : half : -half;
+        }
+    }
+    EACH(i) {
+        const R z2 = T(ray_of)(b->phi[i], b->theta[i], x + i, y + i);
+        ok[i] &= b->ok[i] & (off[i] < 64 * EPS), z[i] = T(root)(z2 > 0 ? z2 : 0);
+    }
+}
+
 static void T(change)(const T(Camera) *c, int n, T(Seen) *s) {
     if (!c->parts->map) return;
     T(shrunk)(n, s->x, s->y, s->z, s->shrink);
+    if (c->parts->map == BEND) {
+        T(Bent) b;
+        T(angles_of)(n, s->x, s->y, s->z, &b);
+        T(bend_at)(c, n, &b);
+        EACH(i) {
+            const I ok = b.ok[i] & (s->shrink[i] > 0) & (T(absolute)(s->x[i] + s->y[i] + s->z[i]) < 8); /* nor what is not a number */
+            const R z2 = T(ray_of)(ok ? b.p[i] : 0, ok ? b.q[i] : 0, s->x + i, s->y + i);
+            s->z[i] = ok ? T(root)(z2) : NAN;
+        }
+        return;
+    }
     T(product)(c->map, 1, 3, n, s->x, s->y, s->z);
 }
 
@@ -177,8 +319,26 @@ static void T(change_vjp)(const T(Camera) *c, int n, T(Seen) *s, R *restrict gx,
         s->x[i] = ok ? s->x[i] : 0, s->y[i] = ok ? s->y[i] : 0, s->z[i] = ok ? s->z[i] : 1;
         s->shrink[i] = ok ? s->shrink[i] : 0;
     }
-    if (sums) T(outer)(n, gx, gy, gz, s->x, s->y, s->z, sums);
-    T(product)(c->map, 3, 1, n, gx, gy, gz);
+    if (c->parts->map == BEND) {
+        T(Bent) b;
+        ALIGNED R gp[BLOCK], gq[BLOCK];
+        T(angles_of)(n, s->x, s->y, s->z, &b);
+        T(bend_at)(c, n, &b);
+        EACH(i) b.p[i] = s->ok[i] ? b.p[i] : 0, b.q[i] = s->ok[i] ? b.q[i] : 0;
+        T(ray_of_vjp)(n, b.p, b.q, gx, gy, gz, gp, gq);
+        if (sums) {
+            T(bivariate_sums)(c->parts->across, n, b.phi, b.theta, gp, sums);
+            T(bivariate_sums)(c->parts->down, n, b.phi, b.theta, gq, sums + c->parts->across);
+        }
+        EACH(i) {
+            const R p = gp[i], q = gq[i];
+            gp[i] = p * b.by.ua[i] + q * b.by.va[i], gq[i] = p * b.by.ub[i] + q * b.by.vb[i];
+        }
+        T(angles_vjp)(n, s->x, s->y, s->z, gp, gq, gx, gy, gz);
+    } else {
+        if (sums) T(outer)(n, gx, gy, gz, s->x, s->y, s->z, sums);
+        T(product)(c->map, 3, 1, n, gx, gy, gz);
+    }
     EACH(i) gx[i] *= s->shrink[i], gy[i] *= s->shrink[i], gz[i] *= s->shrink[i];
 }
 
@@ -428,13 +588,6 @@ static void T(cover)(const T(Camera) *c, int n, R *a, R *b, const I *known, I *o
     }
 }
 
-/* The step that a Jacobian sends to (du, dv), some finite one where it is singular; one over its determinant */
-INLINE R T(step)(R ua, R ub, R va, R vb, R du, R dv, R *da, R *db) {
-    const R determinant = ua * vb - ub * va, one = determinant / (determinant * determinant + FLOOR);
-    *da = (vb * du - ub * dv) * one, *db = (ua * dv - va * du) * one;
-    return one;
-}
-
 /* Points near those that the stages from `first` on send to (u, v) */
 static void T(start)(const T(Camera) *c, int first, int n, const R *u, const R *v, R *restrict a, R *restrict b) {
     ALIGNED R x[BLOCK], y[BLOCK];
@@ -610,7 +763,10 @@ static void T(solutions)(const T(Camera) *c, int n, R *restrict u, R *restrict v
     } else T(cover)(c, n, u, v, known, ok);
     T(rays)(c, n, u, v, ok, x, y, z);
     if (c->parts->map) {
-        T(product)(c->map, 3, 1, n, x, y, z);
+        T(Bent) bent;
+        if (c->parts->map == BEND) T(unbend)(c, n, &bent, x, y, z, ok);
+        else T(product)(c->map, 3, 1, n, x, y, z);
+        EACH(i) u[i] = ok[i] ? u[i] : 0, v[i] = ok[i] ? v[i] : 0;
         EACH(i) x[i] = ok[i] ? x[i] : 0, y[i] = ok[i] ? y[i] : 0, z[i] = ok[i] ? z[i] : 1;
     }
 }
@@ -664,8 +820,26 @@ static void T(unproject_vjp)(const T(Camera) *c, const Rows *rows, int64_t camer
         ALIGNED I all[BLOCK];
         EACH(i) all[i] = 1;
         T(rays)(c, n, a, b, all, rx, ry, rz);
-        if (sums) T(outer)(n, rx, ry, rz, gx, gy, gz, sums + 4);
-        T(product)(c->map, 1, 3, n, gx, gy, gz);
+        if (c->parts->map == BEND) {
+            T(Bent) bent;
+            ALIGNED R gp[BLOCK], gq[BLOCK], p[BLOCK], q[BLOCK], s[BLOCK];
+            EACH(i) p[i] = rx[i], q[i] = ry[i], s[i] = rz[i];
+            T(unbend)(c, n, &bent, p, q, s, all);
+            T(ray_of_vjp)(n, bent.phi, bent.theta, gx, gy, gz, gp, gq);
+            EACH(i) {
+                R da, db;
+                T(step)(bent.by.ua[i], bent.by.va[i], bent.by.ub[i], bent.by.vb[i], gp[i], gq[i], &da, &db);
+                gp[i] = da, gq[i] = db, p[i] = -da, q[i] = -db;
+            }
+            if (sums) {
+                T(bivariate_sums)(c->parts->across, n, bent.phi, bent.theta, p, sums + 4);
+                T(bivariate_sums)(c->parts->down, n, bent.phi, bent.theta, q, sums + 4 + c->parts->across);
+            }
+            T(angles_vjp)(n, rx, ry, rz, gp, gq, gx, gy, gz);
+        } else {
+            if (sums) T(outer)(n, rx, ry, rz, gx, gy, gz, sums + 4);
+            T(product)(c->map, 1, 3, n, gx, gy, gz);
+        }
     }
     T(rays_vjp)(c, n, a, b, gx, gy, gz, ga, gb, sums ? sums + 4 + numbers_of_map(c->parts) : NULL);
     if (c->stages) {

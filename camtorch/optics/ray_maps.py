@@ -97,6 +97,8 @@ class Bending(RayMap):
     behind, to which the model does not apply, behind.
     """
 
+    code: ClassVar[int | None] = 2
+
     def __init__(self, horizontal: Sequence[Tensor], vertical: Sequence[Tensor]):
         self.parameters: tuple[Tensor, ...] = (*horizontal, *vertical)
         self.count = len(horizontal)

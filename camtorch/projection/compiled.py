@@ -147,7 +147,7 @@ class Plan:
         # which coefficients the parameters are; None where the model computes some
         self.places = torch.tensor(known, device="cpu") if len(known) == len(parameters) else None
         self.is_all = known == list(range(len(coefficients)))
-        self.is_chart = isinstance(chart, optics.Inverted)
+        self.is_chart = isinstance(_bare(chart), optics.Inverted)
         self.has_stages, self.is_radial = bool(lens.stages), lens.is_radial
         self.has_factor, self.has_rest = lens.radial is not None, lens.rest is not None
         self._ends: dict[torch.dtype, tuple[float, float]] = {}
@@ -241,7 +241,8 @@ class Lenses:
             chart, lens = self._optics()
             if constants := _constants(lens):
                 made.constants, made.constant_count = self._keep_columns(constants, k.dtype), len(constants)
-            factor = chart.factor(chart.parameters) if isinstance(chart, optics.Inverted) else lens.radial
+            bare = _bare(chart)
+            factor = bare.factor(bare.parameters) if isinstance(bare, optics.Inverted) else lens.radial
             if factor is not None:
                 many = len(factor.parameters) > _MOST_DEGREE
                 fold = factor.closed_fold() if many and factor.fold is None else factor.fold
@@ -402,12 +403,19 @@ def _code(part: Chart | RayMap | Stage | RadialFactor | type[RadialFactor]) -> i
     return code
 
 
+def _bare(chart: Chart) -> Chart:
+    """Without the map of rays before it."""
+    return chart.chart if isinstance(chart, optics.Before) else chart
+
+
 def _chart(chart: Chart) -> _Part | None:
     if type(chart) is optics.Before:
         part, code = _chart(chart.chart), _code(chart.change)
         if part is None or part.map or code is None:
             return None
         part.map = code
+        if isinstance(chart.change, optics.Bending):
+            part.across, part.down = chart.change.count, len(chart.change.parameters) - chart.change.count
         return part
     flags = 0
     if type(chart) is optics.Transverse:

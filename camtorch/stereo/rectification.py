@@ -26,6 +26,8 @@ from camtorch._arguments import (
     shown,
 )
 from camtorch._module import GeometryModule, Memo, typed_as
+from camtorch.calibration.rig import RigCalibration
+from camtorch.calibration.triangulate import moved_by_calibration
 from camtorch.camera import Camera
 from camtorch.extrinsics import Extrinsics
 from camtorch.io.filestorage import Value, write
@@ -59,6 +61,7 @@ _KINDS = {
 _LINE = 129  # points along the middle of an image
 _PARALLEL = 1e-6  # the part of the view direction across the baseline, below which there is none
 _STEP = 1e-4  # on the plane of a projection, over which its scale is measured
+_TOGETHER = 1 << 16  # points
 _LARGEST = 1 << 14  # px, a side that nobody asked for
 
 
@@ -204,6 +207,63 @@ class Rectification(GeometryModule):
         good = good.reshape((len(good), 1, *size) if batched else shape)
         points, good = points.reshape(*good.shape, 3), good & known
         return torch.where(good[..., None], points, 0.0), good
+
+    def range_sigma(
+        self,
+        disparity: Numbers,
+        sigma: Numbers,
+        *,
+        valid: Numbers | None = None,
+        calibration: RigCalibration | None = None,
+    ) -> tuple[Tensor, Tensor]:
+        """The standard deviations of the ranges of points, their distances from the left camera, to first order.
+
+        Args:
+            disparity: as in `disparity_to_points`.
+            sigma: px, the standard deviation of disparities: a number, or a map in their shape.
+            valid: as in `disparity_to_points`.
+            calibration: of `calibrate_rig`, that the cameras and the extrinsics of this one pair are of: what it does
+                not know of them is added.
+
+        Returns:
+            sigma of the range in the shape of the disparities, in the unit of the extrinsics, and valid as in
+            `disparity_to_points`; 0 where invalid. No graph.
+
+        Raises:
+            ValueError: another shape, a negative sigma, a calibration of other cameras, or beside a batch of pairs.
+        """
+        owner = "range_sigma"
+        with torch.inference_mode(False), torch.enable_grad():
+            leaf = as_values(disparity, "disparity", owner, self.camera_left.intrinsics.device).detach().clone()
+            dtype = leaf.dtype
+            if leaf.is_floating_point():  # others are refused below
+                leaf = leaf.double().requires_grad_()
+            points, good = self.disparity_to_points(leaf, valid)
+            distance = torch.linalg.vector_norm(torch.where(good[..., None], points, 1.0), dim=-1)
+            (slope,) = torch.autograd.grad(torch.where(good, distance, 0.0).sum(), leaf)
+        points, distance = points.detach(), distance.detach()
+        noise = as_values(sigma, "sigma", owner, leaf.device).detach().double()
+        if noise.ndim and noise.shape != leaf.shape:
+            raise ValueError(
+                f"{owner}: sigma must be a number, or of shape {tuple(leaf.shape)}; got {tuple(noise.shape)}"
+            )
+        if fails((noise >= 0) | ~good):
+            raise ValueError(f"{owner}: sigma must be px, not negative or NaN; got {shown(sigma)}")
+        variance = (slope * noise).square().expand(good.shape).clone()
+        if calibration is not None:
+            if self.extrinsics.batch_shape or self.camera_left.batch_shape:
+                raise ValueError(f"{owner}: calibration is of one pair; this is a batch")
+            pose = self.extrinsics.matrix().detach().double()
+            poses = torch.stack((torch.eye(4).to(pose), pose))
+            rig = (self.source_left, self.source_right), poses[:, :3, :3], poses[:, :3, 3]
+            parts = []
+            for some in (points[good] @ self.frame.left.detach()).split(_TOGETHER):  # in the left camera's frame
+                seen = torch.ones(2, len(some), dtype=torch.bool, device=some.device)
+                moved = moved_by_calibration(calibration, *rig, some, seen, owner)
+                along = some / torch.linalg.vector_norm(some, dim=-1, keepdim=True)
+                parts.append((along[:, None] @ moved).square().sum((-1, -2)))
+            variance[good] += torch.cat(parts) if parts else 0.0
+        return torch.where(good & torch.isfinite(variance), variance, 0.0).sqrt().to(dtype), good
 
     def _pixels(self) -> Tensor:
         """(*B, H, W, 2)."""

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from boards import opencv_left, stereo
+from boards import STEREO, opencv_left, seen_by, stereo
 from photographs import fisheye, photograph
 from PIL import Image
 from videos import write_video
@@ -69,6 +69,16 @@ def write_calibration_data():
     """Corners of a stereo pair, and photographs, as the pages on calibration speak of them."""
     pair, right, *_ = stereo(8)
     np.savez("stereo.npz", object_points=pair.object_points, left=pair.image_points, right=right)
+    pair, turns, shifts = seen_by(STEREO["left"], 8)
+    boards = np.tile(np.eye(4), (8, 1, 1))
+    boards[:, :3, :3], boards[:, :3, 3] = turns, shifts
+    # the hand is where the camera is, and the board where the base is
+    np.savez(
+        "robot.npz",
+        object_points=pair.object_points,
+        image_points=pair.image_points,
+        base_from_hand=np.linalg.inv(boards),
+    )
     Path("images").mkdir()
     for i, image in enumerate(photographs()):
         Image.fromarray(image).save(f"images/{i}.jpg", quality=95)

@@ -152,7 +152,7 @@ def test_it_is_a_camera_like_any_other(key, tmp_path):
     small = camera.resize(24, 32)
     warped = ct.Warp(small, ct.Pinhole([30.0, 30, 15.5, 11.5], image_size=(24, 32)).double())
     assert warped(torch.rand(1, 3, 24, 32, dtype=torch.float64)).isfinite().all()
-    with pytest.raises(ct.CameraFileError, match="behind a windshield"):
+    with pytest.raises(ct.CameraFileError, match=":windshield=6,10"):
         ct.save(camera, tmp_path / "camera.yml", "opencv")
 
 
