@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import numpy as np
@@ -81,6 +81,10 @@ def _edited_distortion(camera: Camera, across: Any, down: Any, on_side: Any) -> 
     k, names = camera.distortion, camera.distortion_names
     if on_side is not None:
         k = torch.where(torch.as_tensor(on_side, device=k.device).unsqueeze(-1), _on_side(camera), k)
+    for sign, mirrored in ((across, camera.mirror_x), (down, camera.mirror_y)):
+        if mirrored:
+            flipped = torch.as_tensor(sign < 0, device=k.device).unsqueeze(-1)
+            k = torch.where(flipped, _renamed(k, names, mirrored), k)
     for sign, odd in ((across, camera.odd_in_x), (down, camera.odd_in_y)):
         if not odd.isdisjoint(names):
             is_odd = torch.tensor([name in odd for name in names], device=k.device)
@@ -103,7 +107,12 @@ def _on_side(camera: Camera) -> Tensor:
                 f"{owner}: a sensor tilted about both axes, tau_x, tau_y = {tilts.tolist()}, has no "
                 "quarter turn: the model tilts about one after the other"
             )
+    return _renamed(camera.distortion, names, turned)
+
+
+def _renamed(k: Tensor, names: Sequence[str], turned: Mapping[str, str]) -> Tensor:
+    """Coefficients (*B, n) of these names, some of which others become, or these with a minus."""
+    places = {name: i for i, name in enumerate(names)}
     source = [turned.get(name, name) for name in names]
-    index = [names.index(name.removeprefix("-")) for name in source]
-    sign = camera.distortion.new_tensor([-1.0 if name.startswith("-") else 1.0 for name in source])
-    return camera.distortion[..., index] * sign
+    index = [places[name.removeprefix("-")] for name in source]
+    return k[..., index] * k.new_tensor([-1.0 if name.startswith("-") else 1.0 for name in source])

@@ -148,6 +148,10 @@ class Camera(BatchedModule):
     """The coefficients that change sign when the scene is mirrored left to right."""
     odd_in_y: ClassVar[frozenset[str]] = frozenset()
     """Likewise top to bottom."""
+    mirror_x: ClassVar[Mapping[str, str]] = {}
+    """Where more than signs change then: the coefficients that others become, {"a": "-b"} is a = -b."""
+    mirror_y: ClassVar[Mapping[str, str]] = {}
+    """Likewise top to bottom."""
     quarter_turn: ClassVar[Mapping[str, str] | None] = {}
     """The coefficients that others become when the image is turned clockwise by a quarter: {"p2": "-p1"} is p2 = -p1.
 
@@ -357,6 +361,15 @@ class Camera(BatchedModule):
     def variant(cls, text: str) -> type[Camera]:
         """The class of the key `key:text`, of cameras behind a windshield for one; a ValueError if there is none."""
         return variant(cls, text)
+
+    @classmethod
+    def smoothness(cls) -> Tensor | None:
+        """(R, n) rows whose products with the coefficients are small in a smooth lens, float64.
+
+        A model that states them has a lens that is linear in its coefficients, and coefficients enough to take the
+        place of the intrinsics, which fits then hold. None: the coefficients are few.
+        """
+        return None
 
     def _model_name(self) -> str:
         # a class that adds methods alone is of the model that it is made from

@@ -40,6 +40,7 @@ each_kind = pytest.mark.parametrize("key", sorted(DISTINCT))
 
 # Coefficients drawn, plausible and wild, by the first letters of their names: up to that size, or between two numbers
 RANGES = {
+    "splined": {"x": (0.01, 0.1), "y": (0.01, 0.1)},
     "fov": {"omega": ((0.2, 1.2), (-3.0, 3.0))},
     "division": {"lambda": ((-0.4, 0.2), (-3.0, 3.0))},
     "equisolid": {"k": (0.05, 0.5)},
@@ -252,6 +253,11 @@ def drawn(draw, key, wild):
     names = model.names_of(draw(st.sampled_from(counts))) if counts else ()
     focal, aspect, across, down = number(150, 600), number(0.9, 1.1), number(-20, 20), number(-20, 20)
     distortion = [number(*_limits(key, name, wild)) for name in names]
+    if RANGES.get(key) and not counts:  # too many to be drawn one by one
+        generator = torch.Generator().manual_seed(draw(st.integers(0, 1 << 20)))
+        limits = torch.tensor([_limits(key, name, wild) for name in model.distortion_names], dtype=torch.float64)
+        share = torch.rand(len(limits), generator=generator, dtype=torch.float64)
+        distortion = (limits[:, 0] + share * limits.diff()[:, 0]).tolist()
     distortion = _summed(key, torch.tensor(distortion, dtype=torch.float64)).tolist()
     focal /= axis_slope(key, distortion)
     intrinsics = [focal, focal * aspect, 320 + across, 240 + down]

@@ -22,6 +22,7 @@ _ROUNDS = 3
 _LAWSON_ROUNDS, _LAWSON_STEPS, _PATIENCE = 40, 2, 6
 _SETTLED = 1e-8  # the part of the cost that is left to gain when the search ends
 _NOTHING, _NEARLY_NOTHING = 1e-11, 1e-9  # px
+_SMOOTH = 1e-4  # of a pixel of error: one of a surface's second differences, which decides where no pixels do
 _LEAST_SLOPE = 1e-3  # of a lens at the axis, that a fit starts from
 _LOST = 0.1  # the error, in focal lengths, that a ray without a pixel counts as, where alternatives are compared
 
@@ -58,6 +59,9 @@ def fit(
         held: names of coefficients that stay as they start.
         fixed: (4 + n,) values that parameters keep, NaN for those that are looked for.
     """
+    smooth = camera.smoothness()
+    if smooth is not None:
+        return _fit_linear(camera, observations, slopes, smooth.to(slopes), fixed)
     results, scores = [], []
     tiny = _NEARLY_NOTHING**2 * observations.weights.sum(-1)
     found = torch.zeros_like(tiny, dtype=torch.bool)
@@ -84,12 +88,33 @@ def fit(
     return torch.stack(results)[best, torch.arange(len(best), device=best.device)]
 
 
+def _fit_linear(
+    camera: Camera, observations: Observations, slopes: Tensor, smooth: Tensor, fixed: Tensor | None
+) -> Tensor:
+    """`fit` of a lens that is linear in its coefficients: at these focal lengths and pixels of the axis, at once."""
+    parameters = torch.nn.functional.pad(slopes, (0, smooth.shape[-1]))
+    free = torch.ones_like(parameters[0], dtype=torch.bool) if fixed is None else fixed.isnan()
+    parameters = parameters if fixed is None else torch.where(free, parameters, fixed)
+    seen, _, by_k = sensor_jacobians(camera, parameters[:, 4:], observations.rays)
+    weights = (observations.weights * seen.covered)[:, None]
+    slope = (by_k[:, :, free[4:]] * (parameters[:, :2, None] * weights)[:, :, None]).movedim(2, -1).flatten(1, 2)
+    slight = _SMOOTH * parameters[:, :2].mean(-1)[:, None, None] * smooth
+    errors = _residuals(observations._replace(weights=weights[:, 0]), parameters, seen).flatten(1)
+    missing = -torch.cat((errors, (slight @ parameters[:, 4:, None])[..., 0]), -1)
+    rows = torch.cat((slope, slight[..., free[4:]]), 1)
+    found = torch.linalg.lstsq(rows, missing[..., None]).solution[..., 0]
+    parameters[:, 4:][:, free[4:]] += found
+    return parameters
+
+
 def refine_minimax(camera: Camera, observations: Observations, parameters: Tensor) -> Tensor:
     """Parameters (C, 4 + n) near those given at which the largest error is smaller; no row depends on another.
 
     Lawson's algorithm: weighted least squares over and over, the weight of a square multiplied by its error each time,
     approach what has the least largest error.
     """
+    if camera.smoothness() is not None:  # more coefficients than errors have peaks
+        return parameters
     low, high = bounds(camera, parameters)
     covered = observations.weights * to_sensor(camera, parameters[:, 4:], observations.rays).covered
     observations = observations._replace(weights=covered)

@@ -10,7 +10,7 @@ import torch
 
 from camtorch._arguments import no_camera
 from camtorch.augment.collate import collate_cameras
-from camtorch.camera import MODELS, Camera
+from camtorch.camera import MODELS, Camera, as_model
 
 PARTS = ("model", "intrinsics", "distortion", "image_size")
 
@@ -70,11 +70,11 @@ def from_columns(columns: Mapping[str, Any], name: str = "camera") -> Camera | l
 def camera_of(parts: Mapping[str, Any], owner: str) -> Camera:
     """The frozen camera of model, intrinsics, distortion and image_size."""
     model = str(parts["model"])
-    if model not in MODELS:
+    if model.partition(":")[0] not in MODELS:
         raise ValueError(f"{owner}: the model of a camera must be one of {', '.join(MODELS)}; got {model!r}")
     numbers = [_numbers(parts[part]) for part in ("intrinsics", "distortion") if parts.get(part) is not None]
     height, width = (int(side) for side in parts["image_size"])
-    camera: Camera = MODELS[model](*(n for n in numbers if n.size), image_size=(height, width))
+    camera: Camera = as_model(model, owner)(*(n for n in numbers if n.size), image_size=(height, width))
     return camera.requires_grad_(False)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 from camtorch.extrinsics import Extrinsics
@@ -9,6 +10,7 @@ from camtorch.io import poses
 from camtorch.io.protocol import Names
 from camtorch.io.record import Record, one_of
 from camtorch.io.writing import Lossy, number
+from camtorch.models import Splined
 from camtorch.rig import Rig
 
 NAMES = Names("mrcal", "mrcal", (".cameramodel",), ("*.cameramodel",))
@@ -24,6 +26,8 @@ _MODELS = {
 }
 # a CAHVORE says its linearity in the name, and ends with e0 e1 e2
 _CAHVORE = "LENSMODEL_CAHVORE_linearity="
+_SPLINED_NAME = "LENSMODEL_SPLINED_STEREOGRAPHIC_order={}_Nx={}_Ny={}_fov_x_deg={}"
+_SPLINED = re.compile(r"LENSMODEL_SPLINED_STEREOGRAPHIC_order=(\d+)_Nx=(\d+)_Ny=(\d+)_fov_x_deg=(\d+)")
 
 
 def matches(keys: dict[str, Any]) -> bool:
@@ -38,7 +42,8 @@ def parse(record: Record) -> Rig:
         linearity = Record(name.path, name.text().removeprefix(_CAHVORE), name.place)
         key, values = "cahvore", _central(record["intrinsics"], linearity)
     else:
-        key, count = _MODELS[one_of(name, [*_MODELS, f"{_CAHVORE}..."])]
+        known = [*_MODELS, f"{_CAHVORE}...", _SPLINED_NAME.format(3, 16, 11, 120)]
+        key, count = _splined(name) or _MODELS[one_of(name, known)]
         values = record["intrinsics"].numbers(4 + count)
     camera = record["intrinsics"].camera(key, values[:4], values[4:], record["imagersize"].size())
     extrinsics: dict[str, Extrinsics] = {}
@@ -57,18 +62,37 @@ def _central(record: Record, linearity: Record) -> list[float]:
     return [*values[:9], linearity.number()]
 
 
+def _splined(name: Record) -> tuple[str, int] | None:
+    """The key and number of coefficients of a splined lens; None of another one."""
+    found = _SPLINED.fullmatch(name.text())
+    if found is None:
+        return None
+    if max(map(len, found.groups())) > 4:
+        name.fail(f"{name.value!r:.100}: no grid of that size is read")
+    order, columns, rows, fov_x = map(int, found.groups())
+    try:
+        model = Splined.with_grid(order=order, columns=columns, rows=rows, fov_x=fov_x)
+    except ValueError as error:
+        name.fail(error)
+    return model.key, model.default_count
+
+
 def render(rig: Rig, path: str) -> str:
     """The text of a file."""
     lossy = Lossy(path, NAMES.title)
     name, camera = lossy.only_camera(rig)
     lossy.no_images(rig)
     height, width = lossy.size(name, camera)
-    key, intrinsics, distortion = lossy.model(name, camera, {"cahvore", *(key for key, _ in _MODELS.values())})
+    known = {"cahvore", *(key for key, _ in _MODELS.values())}
+    known.add(camera.key if isinstance(camera, Splined) else Splined.key)
+    key, intrinsics, distortion = lossy.model(name, camera, known)
     if key == "stereographic":  # without the polynomial
         distortion = lossy.at_most(name, camera, distortion, (0,))
     if key == "cahvore":
         *distortion, linearity = distortion
         model, distortion = f"{_CAHVORE}{number(linearity)}", [*distortion, 0.0, 0.0, 0.0]
+    elif isinstance(camera, Splined):
+        model = _SPLINED_NAME.format(camera.order, camera.columns, camera.rows, camera.fov_x)
     else:
         model = next(model for model, (k, count) in _MODELS.items() if k == key and count == len(distortion))
     rotation, translation = [0.0] * 3, [0.0] * 3

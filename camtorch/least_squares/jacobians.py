@@ -49,7 +49,9 @@ def _to_sensor(camera: Camera | type[Camera], k: Sequence[Tensor], rays: Sequenc
     a, b = chart.to_plane(x, y, z, order=1)
     covered = covered & (torch.maximum(a.abs(), b.abs()) <= FURTHEST)
     if lens.stages:
-        a, b = lens(a, b)
+        at = lens.at(a, b, 0)
+        covered = covered if at.edge is None else covered & (at.edge > 0)
+        a, b = at.value
     covered = covered & torch.isfinite(a) & torch.isfinite(b)
     return SensorPoints(torch.where(covered, a, 0.0), torch.where(covered, b, 0.0), covered)
 

@@ -26,6 +26,7 @@ from camtorch.models.mei import Mei
 from camtorch.models.ocamcalib import OCamCalib
 from camtorch.models.orthographic_fisheye import OrthographicFisheye
 from camtorch.models.pinhole import Pinhole
+from camtorch.models.splined import Splined
 from camtorch.models.stereographic import Stereographic
 from camtorch.models.tabulated import Tabulated
 from camtorch.models.thin_prism_fisheye import ThinPrismFisheye
@@ -59,6 +60,7 @@ __all__ = [
     "OCamCalib",
     "OrthographicFisheye",
     "Pinhole",
+    "Splined",
     "Stereographic",
     "Tabulated",
     "ThinPrismFisheye",

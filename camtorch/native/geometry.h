@@ -18,8 +18,8 @@ enum { HAS_XI = 1, HAS_ALPHA = 2, HAS_BETA = 4, TRANSVERSE = 8 };
 enum { NO_MAP, TURN, BEND };
 
 /* Stages of a lens on that plane */
-enum { PLANAR = 16, HOMOGRAPHY, SHEAR };
-/* Flags of the planar stage */
+enum { PLANAR = 16, HOMOGRAPHY, SHEAR, SURFACE };
+/* Flags of the planar stage; those of a surface of n x m control points, at least 4 x 4, are its order */
 enum { TANGENTIAL = 1, PRISM = 2 };
 
 /* Radial factors, of the planar stage and of the inverted chart; n numbers each, n + m the ratio, 4 n the table */

@@ -29,6 +29,7 @@ typedef struct {
     const Part *parts;
     int stages, way, swapped, is_radial, by_stages, usable;
     int follows, waits; /* whether the lens is to be followed along each azimuth, and yet has to be */
+    int ends;           /* whether it ends at the edge of a surface; not while it is followed */
     const R *map, *numbers[MOST_PARTS], *constants; /* those of the map before the chart; of the parts */
     T(Factor) factors[MOST_PARTS];
     T(Plane) planes[MOST_PARTS];

@@ -236,6 +236,53 @@ static void bound_homography(const double *k, int n, double *radius, double *lea
     }
 }
 
+/* The largest of what begins within each radius, none less than 0: `here` becomes that up to each */
+static void reach(int n, const double *radius, double begin, double value, double *here) {
+    int low = 0, high = n;
+    while (low < high) {
+        const int middle = (low + high) / 2;
+        if (radius[middle] < begin) low = middle + 1;
+        else high = middle;
+    }
+    if (low < n && value > here[low]) here[low] = value;
+}
+
+/* Slopes of a spline lie between those of the lines from control point to control point */
+static void bound_surface(const Part *part, const double *k, int n, double *radius, double *least) {
+    double steepest[MOST_RADII] = {0}, over[MOST_RADII] = {0}, down[MOST_RADII] = {0}, far[MOST_RADII] = {0};
+    double begin[2];
+    const int size[2] = {part->n, part->m};
+    for (int j = 0; j < size[1]; j++)
+        for (int i = 0; i < size[0]; i++) {
+            const double *at = k + 4 + 2 * (j * size[0] + i);
+            for (int more = 0; more < 3; more++) { /* the point, and the lines along a and along b */
+                if ((more == 1 && i + 1 == size[0]) || (more == 2 && j + 1 == size[1])) continue;
+                for (int axis = 0; axis < 2; axis++) {
+                    const double line = more == axis + 1, place = (axis ? j : i) - (size[axis] - 1 - line) / 2;
+                    const double away = fabs(place / k[axis] + k[2 + axis]) - ((part->flags + 1 - line) / 2) / k[axis];
+                    begin[axis] = away > 0 ? away : 0;
+                }
+                const double out = hypot(begin[0], begin[1]);
+                const double *next = at + (more == 2 ? 2 * size[0] : 2), scale = more ? k[more - 1] : 1;
+                if (!more) reach(n, radius, out, hypot(at[0], at[1]), far);
+                else {
+                    const double by_x = (next[0] - at[0]) * scale, by_y = (next[1] - at[1]) * scale;
+                    reach(n, radius, out, more == 1 ? -by_x : -by_y, steepest);
+                    reach(n, radius, out, fabs(more == 1 ? by_y : by_x), more == 1 ? over : down);
+                }
+            }
+        }
+    const double end_a = (size[0] - part->flags) / 2.0 / k[0] - fabs(k[2]);
+    const double end_b = (size[1] - part->flags) / 2.0 / k[1] - fabs(k[3]), end = end_a < end_b ? end_a : end_b;
+    for (int i = 0; i < n; i++) {
+        double *const all[4] = {steepest, over, down, far};
+        for (int j = 0; i && j < 4; j++) all[j][i] = all[j][i - 1] > all[j][i] ? all[j][i - 1] : all[j][i];
+        const double inside = end - radius[i], slope = 1 - steepest[i] - (over[i] + down[i]) / 2;
+        least[i] = inside > 0 ? slope : inside > -1e-3 ? -1e-3 : inside;
+        radius[i] += far[i];
+    }
+}
+
 /* The smallest bound of the stages from `first` on; radii become how far out their points go */
 static void bound_lens(const Lens *lens, int first, int n, double *radius, double *least) {
     double here[MOST_RADII];
@@ -248,7 +295,8 @@ static void bound_lens(const Lens *lens, int first, int n, double *radius, doubl
                 const double d = stage.numbers[0], e = stage.numbers[1];
                 const double wider = 1 + (fabs(d) > fabs(e) ? fabs(d) : fabs(e));
                 for (int i = 0; i < n; i++) here[i] = 1 - fabs(d + e) / 2, radius[i] *= wider;
-            } else bound_planar(&stage, n, radius, here);
+            } else if (stage.part->kind == SURFACE) bound_surface(stage.part, stage.numbers, n, radius, here);
+            else bound_planar(&stage, n, radius, here);
             /* the next stage sees what any smaller circle becomes as well; what is not a number stays none */
             for (int i = 1; i < n; i++) radius[i] = radius[i - 1] > radius[i] || radius[i - 1] != radius[i - 1] ? radius[i - 1] : radius[i];
             for (int i = 0; i < n; i++) least[i] = j == first || here[i] < least[i] || here[i] != here[i] ? here[i] : least[i];

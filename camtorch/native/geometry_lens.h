@@ -255,6 +255,139 @@ INLINE void T(adjugate)(const R *k, R *m) {
         }
 }
 
+/* Weights of four control points in a row, each twice, as polynomials of the place in a cell; and by how much they change
+   from control point to control point. Of order 2 the fourth, or at the end of a row the first, has no part */
+#define TWICE(a, b, c, d) {a, a, b, b, c, c, d, d}
+static const R T(cubic)[4][8] = {TWICE((R)(1 / 6.0), (R)(4 / 6.0), (R)(1 / 6.0), 0), TWICE((R)-0.5, 0, (R)0.5, 0),
+                                 TWICE((R)0.5, -1, (R)0.5, 0), TWICE((R)(-1 / 6.0), (R)0.5, (R)-0.5, (R)(1 / 6.0))};
+static const R T(quadratic)[2][4][8] = {
+    {TWICE((R)0.125, (R)0.75, (R)0.125, 0), TWICE((R)-0.5, 0, (R)0.5, 0), TWICE((R)0.5, -1, (R)0.5, 0), {0}},
+    {TWICE(0, (R)0.125, (R)0.75, (R)0.125), TWICE(0, (R)-0.5, 0, (R)0.5), TWICE(0, (R)0.5, -1, (R)0.5), {0}}};
+
+/* Points in their cells: where their 4 x 4 control points begin, how far into the cell they are, and its polynomials */
+typedef struct {
+    ALIGNED R x[BLOCK], y[BLOCK];
+    ALIGNED int32_t at[BLOCK], last_x[BLOCK], last_y[BLOCK];
+} T(Cells);
+
+static void T(cells)(const Part *part, const R *k, int n, const R *restrict a, const R *restrict b, T(Cells) *restrict to) {
+    const int order = part->flags;
+    const R columns = (R)part->n, rows = (R)part->m, sa = k[0], sb = k[1], ca = k[2], cb = k[3], half = order == 3 ? 0 : (R)0.5;
+    const R first_a = (columns - 1) / 2, first_b = (rows - 1) / 2, most_a = columns - (R)order, most_b = rows - (R)order;
+    const int32_t width = part->n, shift = order == 3 ? 0 : 2, last_a = width - shift, last_b = part->m - shift;
+    EACH(i) {
+        const R p = (a[i] - ca) * sa + first_a, q = (b[i] - cb) * sb + first_b;
+        R column = IS_DOUBLE ? (R)floor(p + half) : (R)floorf((float)(p + half));
+        R row = IS_DOUBLE ? (R)floor(q + half) : (R)floorf((float)(q + half));
+        column = column > 1 ? column : 1, column = column < most_a ? column : most_a;
+        row = row > 1 ? row : 1, row = row < most_b ? row : most_b;
+        to->x[i] = p - column, to->y[i] = q - row;
+        const int32_t at_x = (int32_t)column, at_y = (int32_t)row;
+        to->last_x[i] = at_x >= last_a, to->last_y[i] = at_y >= last_b;
+        to->at[i] = 2 * ((at_y - 1 - to->last_y[i]) * width + at_x - 1 - to->last_x[i]);
+    }
+}
+
+/* One of eight weights */
+INLINE R T(weight)(const R (*c)[8], int j, R x) { return c[0][j] + x * (c[1][j] + x * (c[2][j] + x * c[3][j])); }
+
+/* Two control points, or two weights twice: a vector, where the compiler has such */
+#if defined(__GNUC__)
+typedef R T(Pair) __attribute__((vector_size(4 * sizeof(R))));
+
+INLINE T(Pair) T(pair)(const R *from) {
+    T(Pair) to;
+    memcpy(&to, from, sizeof to);
+    return to;
+}
+
+INLINE T(Pair) T(weights)(const R (*c)[8], int half, R x) {
+    return T(pair)(c[0] + half) + x * (T(pair)(c[1] + half) + x * (T(pair)(c[2] + half) + x * T(pair)(c[3] + half)));
+}
+
+INLINE T(Pair) T(slopes)(const R (*c)[8], int half, R x) {
+    return T(pair)(c[1] + half) + x * (2 * T(pair)(c[2] + half) + x * (3 * T(pair)(c[3] + half)));
+}
+
+/* Of two columns, the sum over four rows by their weights */
+INLINE T(Pair) T(rows_of)(const R *from, int64_t width, T(Pair) low, T(Pair) high) {
+    return low[0] * T(pair)(from) + low[2] * T(pair)(from + width) + (high[0] * T(pair)(from + 2 * width) + high[2] * T(pair)(from + 3 * width));
+}
+
+#else
+INLINE R T(slope)(const R (*c)[8], int j, R x) { return c[1][j] + x * (2 * c[2][j] + x * 3 * c[3][j]); }
+#endif
+
+static void T(surface)(const Part *part, const R *k, int n, const R *restrict a, const R *restrict b, R *restrict u,
+                       R *restrict v, T(Jacobian) *restrict to) {
+    T(Cells) c;
+    const int64_t width = 2 * (int64_t)part->n;
+    const R sa = k[0], sb = k[1], (*first)[8] = part->flags == 3 ? T(cubic) : T(quadratic)[0];
+    T(cells)(part, k, n, a, b, &c);
+    for (int i = 0; i < n; i++) {
+        const R *from = k + 4 + c.at[i], (*by_x)[8] = first + 4 * c.last_x[i], (*by_y)[8] = first + 4 * c.last_y[i];
+#if defined(__GNUC__)
+        const T(Pair) x0 = T(weights)(by_x, 0, c.x[i]), x1 = T(weights)(by_x, 4, c.x[i]);
+        const T(Pair) y0 = T(weights)(by_y, 0, c.y[i]), y1 = T(weights)(by_y, 4, c.y[i]);
+        const T(Pair) s0 = T(rows_of)(from, width, y0, y1), s1 = T(rows_of)(from + 4, width, y0, y1);
+        const T(Pair) sum = s0 * x0 + s1 * x1;
+        u[i] = sum[0] + sum[2], v[i] = sum[1] + sum[3];
+        if (to) {
+            const T(Pair) across = s0 * T(slopes)(by_x, 0, c.x[i]) + s1 * T(slopes)(by_x, 4, c.x[i]);
+            const T(Pair) d0 = T(slopes)(by_y, 0, c.y[i]), d1 = T(slopes)(by_y, 4, c.y[i]);
+            const T(Pair) down = T(rows_of)(from, width, d0, d1) * x0 + T(rows_of)(from + 4, width, d0, d1) * x1;
+            to->ua[i] = across[0] + across[2], to->va[i] = across[1] + across[3];
+            to->ub[i] = down[0] + down[2], to->vb[i] = down[1] + down[3];
+        }
+#else
+        u[i] = v[i] = 0;
+        if (to) to->ua[i] = to->ub[i] = to->va[i] = to->vb[i] = 0;
+        for (int q = 0; q < 8; q += 2)
+            for (int p = 0; p < 8; p += 2) {
+                const R *at = from + q / 2 * width + p, w = T(weight)(by_x, p, c.x[i]), down = T(weight)(by_y, q, c.y[i]);
+                u[i] += w * down * at[0], v[i] += w * down * at[1];
+                if (!to) continue;
+                const R across = T(slope)(by_x, p, c.x[i]) * down, along = T(slope)(by_y, q, c.y[i]) * w;
+                to->ua[i] += across * at[0], to->va[i] += across * at[1];
+                to->ub[i] += along * at[0], to->vb[i] += along * at[1];
+            }
+#endif
+    }
+    EACH(i) u[i] += a[i], v[i] += b[i];
+    if (to) EACH(i) to->ua[i] = to->ua[i] * sa + 1, to->va[i] *= sa, to->ub[i] *= sb, to->vb[i] = to->vb[i] * sb + 1;
+}
+
+/* Cells and centre are constants: their sums stay 0 */
+static void T(surface_vjp)(const Part *part, const R *k, int n, const R *restrict a, const R *restrict b,
+                           R *restrict gu, R *restrict gv, double *sums) {
+    ALIGNED R u[BLOCK], v[BLOCK];
+    T(Jacobian) to;
+    T(surface)(part, k, n, a, b, u, v, &to);
+    if (sums) {
+        T(Cells) c;
+        const R(*first)[8] = part->flags == 3 ? T(cubic) : T(quadratic)[0];
+        T(cells)(part, k, n, a, b, &c);
+        for (int i = 0; i < n; i++) {
+            const R(*by_x)[8] = first + 4 * c.last_x[i], (*by_y)[8] = first + 4 * c.last_y[i];
+            for (int q = 0; q < 4; q++)
+                for (int j = 0; j < 8; j++)
+                    sums[4 + c.at[i] + 2 * (int64_t)part->n * q + j] +=
+                        T(weight)(by_y, 2 * q, c.y[i]) * T(weight)(by_x, j, c.x[i]) * (j % 2 ? gv[i] : gu[i]);
+        }
+    }
+    EACH(i) {
+        const R along = gu[i] * to.ua[i] + gv[i] * to.va[i];
+        gv[i] = gu[i] * to.ub[i] + gv[i] * to.vb[i], gu[i] = along;
+    }
+}
+
+/* In cells, positive up to the edge of a surface and a hair behind */
+INLINE R T(surface_edge)(const Part *part, const R *k, R a, R b) {
+    const R across = (R)(part->n - part->flags) / 2 + (R)1e-4 - T(absolute)((a - k[2]) * k[0]);
+    const R down = (R)(part->m - part->flags) / 2 + (R)1e-4 - T(absolute)((b - k[3]) * k[1]);
+    return across < down ? across : across == across ? down : -1;
+}
+
 static void T(stage)(const T(Camera) *c, int stage, int n, const R *a, const R *b, R *u, R *v, T(Jacobian) *to) {
     const Part *part = c->parts + stage;
     const R *k = c->numbers[stage];
@@ -262,7 +395,8 @@ static void T(stage)(const T(Camera) *c, int stage, int n, const R *a, const R *
     else if (part->kind == SHEAR) {
         EACH(i) u[i] = a[i] + k[1] * b[i], v[i] = b[i] + k[0] * a[i];
         if (to) EACH(i) to->ua[i] = to->vb[i] = 1, to->ub[i] = k[1], to->va[i] = k[0];
-    } else T(planar)(c, stage, n, a, b, u, v, to);
+    } else if (part->kind == SURFACE) T(surface)(part, k, n, a, b, u, v, to);
+    else T(planar)(c, stage, n, a, b, u, v, to);
 }
 
 /* Where the stages from `first` on send points, not in place; the Jacobian of all of them; if wanted, `least`: positive
@@ -285,6 +419,8 @@ static void T(lens)(const T(Camera) *c, int first, int n, const R *a, const R *b
             if (c->parts[j].kind == HOMOGRAPHY) EACH(i) margin[i] = k[6] * x[i] + k[7] * y[i] + k[8];
             else if (c->parts[j].factor == RATIONAL) {
                 EACH(i) margin[i] = T(horner)(k + c->parts[j].n, c->parts[j].m, x[i] * x[i] + y[i] * y[i], NULL);
+            } else if (c->parts[j].kind == SURFACE && c->ends) {
+                EACH(i) margin[i] = T(surface_edge)(c->parts + j, k, x[i], y[i]);
             } else EACH(i) margin[i] = INFINITY;
             EACH(i) {
                 /* a turn by half a circle has a positive determinant too: the trace tells it */
@@ -321,7 +457,8 @@ static void T(lens_vjp)(const T(Camera) *c, int n, const R *restrict a, const R 
                 const R w = gu[i] + k[0] * gv[i];
                 gv[i] += k[1] * gu[i], gu[i] = w;
             }
-        } else T(planar_vjp)(c, j, n, x[j - 1], y[j - 1], gu, gv, part);
+        } else if (c->parts[j].kind == SURFACE) T(surface_vjp)(c->parts + j, k, n, x[j - 1], y[j - 1], gu, gv, part);
+        else T(planar_vjp)(c, j, n, x[j - 1], y[j - 1], gu, gv, part);
     }
 }
 

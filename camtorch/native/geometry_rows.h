@@ -23,7 +23,7 @@ static void T(prepare)(const Cameras *all, int64_t camera, T(Camera) *c) {
     c->usable = !all->usable || all->usable[camera];
     c->inner2 = c->usable ? INFINITY : -1;
     c->swapped = c->parts->flags & TRANSVERSE && c->parts->kind >= CYLINDER;
-    for (int j = 0; j <= c->stages; j++) T(prepare_stage)(c, j);
+    for (int j = 0; j <= c->stages; j++) T(prepare_stage)(c, j), c->ends |= c->parts[j].kind == SURFACE;
     if (c->stages) {
         const Part *first = c->parts + 1;
         c->is_radial = c->stages == 1 && first->kind == PLANAR && !first->flags;
@@ -607,6 +607,19 @@ static void T(start)(const T(Camera) *c, int first, int n, const R *u, const R *
                 const R p = (a[i] - k[1] * b[i]) / area;
                 b[i] = (b[i] - k[0] * a[i]) / area, a[i] = p;
             }
+        } else if (c->parts[j].kind == SURFACE) {
+            const Part *part = c->parts + j;
+            const R across = (R)(part->n - part->flags) / 2 / k[0], down = (R)(part->m - part->flags) / 2 / k[1];
+            ALIGNED R p[BLOCK], q[BLOCK];
+            EACH(i) p[i] = a[i], q[i] = b[i];
+            for (int count = 0; count < 3; count++) { /* on the surface, behind which it may be anywhere */
+                EACH(i) {
+                    a[i] = a[i] > k[2] - across ? a[i] : k[2] - across, a[i] = a[i] < k[2] + across ? a[i] : k[2] + across;
+                    b[i] = b[i] > k[3] - down ? b[i] : k[3] - down, b[i] = b[i] < k[3] + down ? b[i] : k[3] + down;
+                }
+                T(stage)(c, j, n, a, b, x, y, NULL);
+                EACH(i) a[i] += p[i] - x[i], b[i] += q[i] - y[i];
+            }
         } else {
             T(stage)(c, j, n, a, b, x, y, NULL);
             EACH(i) a[i] = 2 * a[i] - x[i], b[i] = 2 * b[i] - y[i];
@@ -689,6 +702,12 @@ static void T(invert_radial)(const T(Camera) *c, int n, const R *restrict p, con
     }
 }
 
+/* See geometry_search.h */
+static void T(contained)(const T(Camera) *c, int n, const R *restrict a, const R *restrict b, const R *restrict least,
+                         I *restrict ok);
+static void T(search)(const T(Camera) *c, int n, const R *restrict u, const R *restrict v, R *restrict a, R *restrict b,
+                      I *restrict ok);
+
 /* `invert`, from a table and a few steps; what is not `ok`, and yet possible, is left */
 static void T(invert)(const T(Camera) *c, int n, const R *restrict u, const R *restrict v, R *restrict a, R *restrict b,
                       I *restrict ok, I *restrict possible) {
@@ -722,13 +741,24 @@ static void T(invert)(const T(Camera) *c, int n, const R *restrict u, const R *r
             EACH(i) a[i] *= scale[i], b[i] *= scale[i];
         }
         T(newton)(c, 1, n, u, v, a, b, ok, fewest);
-        EACH(i) ok[i] &= usual2 - (a[i] * a[i] + b[i] * b[i]) > 0, possible[i] = 1;
+        I outside = 0;
+        EACH(i) {
+            possible[i] = ok[i]; /* converged, somewhere */
+            ok[i] &= usual2 - (a[i] * a[i] + b[i] * b[i]) > 0;
+            outside |= possible[i] & !ok[i];
+        }
+        if (outside && c->ends && c->limits2) { /* no circle: much of an image lies beyond any within its edge */
+            ALIGNED R x[BLOCK], y[BLOCK], least[BLOCK];
+            ALIGNED I inside[BLOCK];
+            T(Jacobian) to;
+            EACH(i) p[i] = a[i] * (1 + 32 * EPS), q[i] = b[i] * (1 + 32 * EPS);
+            T(lens)(c, 1, n, p, q, x, y, &to, least);
+            T(contained)(c, n, p, q, least, inside);
+            EACH(i) ok[i] |= possible[i] & inside[i];
+        }
+        EACH(i) possible[i] = 1;
     }
 }
-
-/* See geometry_search.h */
-static void T(search)(const T(Camera) *c, int n, const R *restrict u, const R *restrict v, R *restrict a, R *restrict b,
-                      I *restrict ok);
 
 /* Pixels (u, v) to points (u, v) of the chart's plane and rays, the axis where there is none. `known` are numbers to
    calculate with; where one is not `ok`, a lens that `waits` for its extent leaves open whether it has a ray */

@@ -17,6 +17,7 @@ from camtorch.optics.charts import (
 from camtorch.optics.lens import Homography, Lens, Planar, Shear, Stage, Tilt
 from camtorch.optics.radial import AnglePerRadius, Polynomial, RadialFactor, RadiusPolynomial, RadiusTable, Rational
 from camtorch.optics.ray_maps import Before, Bending, RayMap, Rotation
+from camtorch.optics.surface import Surface
 from camtorch.optics.unified import Unified
 
 __all__ = [
@@ -46,6 +47,7 @@ __all__ = [
     "Shear",
     "SphereChart",
     "Stage",
+    "Surface",
     "Tilt",
     "Transverse",
     "Unified",

@@ -56,6 +56,8 @@ class Stage:
     """What of a first stage is tabulated, to start the inverse from."""
     is_radial = False
     """Whether that is the whole stage."""
+    is_affine = False
+    """Whether lines stay lines, and parallels parallel: then its inverse is never left open."""
 
     def __call__(self, a: Tensor, b: Tensor) -> Planes2:
         """Where points are sent."""
@@ -123,8 +125,13 @@ class StageAt:
         return None
 
     @property
+    def edge(self) -> Tensor | None:
+        """Positive up to where the map ends, although its formula goes on behind; None where it does not."""
+        return None
+
+    @property
     def orientation(self) -> Tensor:
-        """Positive where the map is defined, regular and not turned over."""
+        """Positive where the map is defined, regular and not turned over; `edge` has no part in it."""
         orientation, margin = _orientation(self.jacobian), self.margin
         return orientation if margin is None else torch.minimum(orientation, margin)
 
@@ -345,6 +352,7 @@ class Shear(Stage):
     """(x + e y, d x + y): a sensor out of line with the lens."""
 
     code: ClassVar[int | None] = 18
+    is_affine = True
 
     def __init__(self, d: Tensor, e: Tensor):
         self.parameters: tuple[Tensor, ...] = (d, e)
@@ -451,6 +459,12 @@ class LensAt:
         """The smallest of the stages: positive where the lens is defined; None where it is so everywhere."""
         margins = [margin for stage in self.stages if (margin := stage.margin) is not None]
         return functools.reduce(torch.minimum, margins) if margins else None
+
+    @property
+    def edge(self) -> Tensor | None:
+        """The smallest of the stages: positive up to where the lens ends; None where it does not."""
+        edges = [edge for stage in self.stages if (edge := stage.edge) is not None]
+        return functools.reduce(torch.minimum, edges) if edges else None
 
     @property
     def orientation(self) -> Tensor:

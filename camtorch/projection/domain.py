@@ -222,9 +222,14 @@ class Domain:
 
 
 def regular(lens: Lens, a: Tensor, b: Tensor) -> Tensor:
-    """Positive where the lens is regular at the point itself, and its inverse has a derivative."""
+    """Positive where the lens is regular at the point itself, which is no further out than it goes, and its inverse has
+    a derivative.
+    """
+    at = lens.at(a, b)
+    edge = at.edge
+    least = at.orientation if edge is None else torch.minimum(at.orientation, edge)
     # nearer to zero the reciprocal could leave the floating-point range
-    return plus(torch.nan_to_num(lens.at(a, b).orientation, nan=-1.0), -(torch.finfo(a.dtype).tiny ** 0.25))
+    return plus(torch.nan_to_num(least, nan=-1.0), -(torch.finfo(a.dtype).tiny ** 0.25))
 
 
 _domains = Memo(24)  # of a batch of eight models before, while and after it changes

@@ -218,7 +218,7 @@ class Unproject:
 
 def _search_recorded(domain: Domain, target: Planes2, found: Found) -> Found:
     """`search` for what is left open, as a part of an exported program."""
-    if domain.lens.radial is None:  # an affine map, of which nothing is
+    if all(stage.is_affine for stage in domain.lens.stages):  # of which nothing is
         return found
     camera, point = (~(found.solved > 0) & (found.possible > 0)).nonzero(as_tuple=True)
     a, b, there = search(domain, camera, *(w[camera, point] for w in target))

@@ -233,6 +233,7 @@ UNPUBLISHED = {
     "f_theta",
     "f_theta_backward",
     "orthographic_fisheye",
+    "splined",
     "stereographic",
     "tabulated",
 }

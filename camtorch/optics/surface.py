@@ -1,0 +1,173 @@
+"""The surface stage: a uniform B-spline surface that is added to a plane.
+
+`Surface(controls, columns, rows, order=3, cells=(sa, sb), centre=(ca, cb))` is a stage for any lens: the only one of
+the splined stereographic camera, or one more after those of another lens, `Lens(*lens.stages, Surface(...))`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cached_property
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from camtorch._portable import hypot
+from camtorch.optics.lens import Jacobian, Planes2, Stage, StageAt
+
+BEHIND = 1e-4  # cells past its edge that belong to a surface, so that what lies on the edge is on it in any rounding
+
+
+class Surface(Stage):
+    """(a, b) -> (a, b) + du(a, b), du a uniform B-spline surface of order 2 (quadratic) or 3 (cubic).
+
+    Control point (i, j) of the grid, i < columns, j < rows, stands at (a, b) = ((i - (columns - 1) / 2) / sa + ca,
+    (j - (rows - 1) / 2) / sb + cb). The surface ends where one more control point would have a part in it: 1 control
+    point (order 3) or 1/2 (order 2) from the outermost ones. Behind that edge, where nothing is valid, the outermost
+    pieces go on. Source: mrcal.c, `sample_bspline_surface_cubic` and `..._quadratic`.
+
+    Args:
+        controls: 2 columns rows coefficients, columns that broadcast against planes: du_a and du_b of point (0, 0), of
+            (1, 0), ...: those of (i, j) at 2 (j columns + i).
+        columns: control points along a, more than the order.
+        rows: along b.
+        order: 2 or 3.
+        cells: (sa, sb), how many lie on a unit of a and of b, positive: numbers, or columns as the controls, which
+            are constants.
+        centre: (ca, cb), the middle of the grid, likewise. The origin of the plane has to be on the surface.
+    """
+
+    code: ClassVar[int | None] = 19
+
+    columns: int
+    rows: int
+    order: int
+
+    def __init__(
+        self,
+        controls: Sequence[Tensor],
+        columns: int,
+        rows: int,
+        *,
+        order: int = 3,
+        cells: tuple[Tensor | float, Tensor | float],
+        centre: tuple[Tensor | float, Tensor | float] = (0.0, 0.0),
+    ):
+        self.columns, self.rows, self.order = columns, rows, order
+        place = [
+            w.detach() if isinstance(w, Tensor) else torch.full_like(controls[0], w, requires_grad=False)
+            for w in (*cells, *centre)
+        ]
+        self.parameters: tuple[Tensor, ...] = (*place, *controls)
+
+    def __call__(self, a: Tensor, b: Tensor) -> Planes2:
+        return self.at(a, b).value
+
+    def at(self, a: Tensor, b: Tensor, order: int = 1, t: Tensor | None = None) -> SurfaceAt:
+        """The stage at points."""
+        return SurfaceAt(self, a, b)
+
+    def lower_bound(self, radius: Tensor) -> Planes2:
+        """See `Stage.lower_bound`: slopes of a spline lie between those of the lines from control point to control
+        point, and it between these, of those that have a part in it within the circle.
+        """
+        sa, sb, ca, cb = (w.unsqueeze(-1) for w in self.parameters[:4])
+        grid = torch.stack(self.parameters[4:], -1).unflatten(-1, (self.rows, self.columns, 2))
+
+        def nearest(more_a: int, more_b: int) -> Tensor:
+            """(*C, 1, P): how far from the origin it begins what differences along a or b have a part in."""
+            reach = (self.order + 1) / 2
+            sides = []
+            for size, more, s, c in ((self.columns, more_a, sa, ca), (self.rows, more_b, sb, cb)):
+                middle = torch.arange(size - more, dtype=radius.dtype, device=radius.device) - (size - 1 - more) / 2
+                sides.append(((middle / s + c).abs() - (reach - more / 2) / s).clamp(min=0))
+            return hypot(sides[0].unsqueeze(-2), sides[1].unsqueeze(-1)).flatten(-2)
+
+        def most(values: Tensor, begin: Tensor) -> Tensor:
+            """(*C, S): the largest (*C, 1, P) of those that begin before each radius; 0 if all are less."""
+            values = torch.where(begin <= radius.unsqueeze(-1), values.flatten(-2), 0.0)
+            return values.amax(-1)
+
+        along, down = grid.diff(dim=-2) * sa[..., None, None], grid.diff(dim=-3) * sb[..., None, None]
+        here, there = nearest(1, 0), nearest(0, 1)
+        steepest = torch.maximum(most(-along[..., 0], here), most(-down[..., 1], there))
+        across = (most(along[..., 1].abs(), here) + most(down[..., 0].abs(), there)) / 2
+        edge = [(n - self.order) / 2 / s - c.abs() for n, s, c in ((self.columns, sa, ca), (self.rows, sb, cb))]
+        inside = torch.minimum(*edge).squeeze(-1) - radius
+        far = radius + most(hypot(*grid.unbind(-1)), nearest(0, 0))
+        return torch.where(inside > 0, 1 - steepest - across, inside.clamp(max=-1e-3)), far
+
+    def start(self, u: Tensor, v: Tensor) -> Planes2:
+        """A point near the one that is sent to (u, v)."""
+        sa, sb, ca, cb = self.parameters[:4]
+        half_a, half_b = (self.columns - self.order) / 2 / sa, (self.rows - self.order) / 2 / sb
+        a, b = u, v
+        for _ in range(3):  # on the surface, behind which it may be anywhere
+            a = torch.minimum(torch.maximum(a, ca - half_a), ca + half_a)
+            b = torch.minimum(torch.maximum(b, cb - half_b), cb + half_b)
+            x, y = self.at(a, b).value
+            a, b = a + u - x, b + v - y
+        return a, b
+
+
+class SurfaceAt(StageAt):
+    """A `Surface` at points."""
+
+    stage: Surface
+
+    def _place(self, axis: int) -> tuple[Tensor, Tensor, Tensor]:
+        """The first of the control points that have a part in it, weights (..., order + 1), and their slopes."""
+        stage, w = self.stage, (self.a, self.b)[axis]
+        size = (stage.columns, stage.rows)[axis]
+        position = (w - stage.parameters[2 + axis]) * stage.parameters[axis] + (size - 1) / 2
+        near = position.detach().nan_to_num(0.0)
+        cell = (near.floor() if stage.order == 3 else (near + 0.5).floor()).clamp(1, size - stage.order)
+        x = position - cell
+        if stage.order == 3:
+            y, xx = 1 - x, x * x
+            weights = y * y * y, (3 * x - 6) * xx + 4, ((3 - 3 * x) * x + 3) * x + 1, xx * x
+            slopes = -y * y / 2, (3 * x - 4) * x / 2, (1 + (2 - 3 * x) * x) / 2, xx / 2
+            return cell.long() - 1, torch.stack(weights, -1) / 6, torch.stack(slopes, -1)
+        few = (4 * x - 4) * x + 1, 6 - 8 * x * x, (4 * x + 4) * x + 1
+        return cell.long() - 1, torch.stack(few, -1) / 8, torch.stack((x - 0.5, -2 * x, x + 0.5), -1)
+
+    @cached_property
+    def _patch(self) -> tuple[Tensor, ...]:
+        """Control points (..., order + 1, order + 1, 2), rows first, and weights and slopes along a and b."""
+        stage = self.stage
+        controls = stage.parameters[4:]
+        points = torch.stack(controls, -1).reshape(-1, 2)
+        (i, wa, da), (j, wb, db) = self._place(0), self._place(1)
+        # of each camera, or point, its own
+        first = (torch.ones_like(controls[0], dtype=torch.int64).flatten().cumsum(0) - 1).view(controls[0].shape)
+        index = first * (stage.columns * stage.rows) + j * stage.columns + i
+        steps = torch.arange(stage.order + 1, device=index.device)
+        index = index[..., None, None] + steps[:, None] * stage.columns + steps
+        return points.index_select(0, index.flatten()).view(*index.shape, 2), wa, da, wb, db
+
+    @staticmethod
+    def _sum(patch: Tensor, along: Tensor, down: Tensor) -> Planes2:
+        x, y = ((patch * down[..., None, None]).sum(-3) * along[..., None]).sum(-2).unbind(-1)
+        return x, y
+
+    @property
+    def value(self) -> Planes2:
+        patch, wa, _, wb, _ = self._patch
+        x, y = self._sum(patch, wa, wb)
+        return self.a + x, self.b + y
+
+    @property
+    def jacobian(self) -> Jacobian:
+        patch, wa, da, wb, db = self._patch
+        sa, sb = self.stage.parameters[:2]
+        (ua, va), (ub, vb) = self._sum(patch, da, wb), self._sum(patch, wa, db)
+        return 1 + ua * sa, ub * sb, va * sa, 1 + vb * sb
+
+    @property
+    def edge(self) -> Tensor:
+        """In cells."""
+        stage = self.stage
+        sa, sb, ca, cb = stage.parameters[:4]
+        across = (stage.columns - stage.order) / 2 + BEHIND - ((self.a - ca) * sa).abs()
+        return torch.minimum(across, (stage.rows - stage.order) / 2 + BEHIND - ((self.b - cb) * sb).abs())
