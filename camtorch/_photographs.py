@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import io
+import os
 import warnings
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -126,3 +129,44 @@ def _pixels(path: Path, image: Image.Image) -> Tensor:
         image = image.convert(colours + "A" if clear else colours)
     pixels = torch.from_numpy(np.array(image))
     return pixels[None] if pixels.ndim == 2 else pixels.permute(2, 0, 1)
+
+
+def as_jpeg(image: Any, size: tuple[int, int], name: str, owner: str, side: int, quality: int) -> bytes:
+    """A JPEG file of an image of any kind that users pass, its longer side no more than `side` pixels.
+
+    Raises:
+        ValueError: its (height, width) is not `size`. OSError: it cannot be read.
+    """
+
+    def check(height: int, width: int) -> None:
+        if (height, width) != size:
+            raise ValueError(
+                f"{owner}: the image {name!r} has {width} x {height} pixels, and those of the camera have "
+                f"{size[1]} x {size[0]}"
+            )
+
+    if isinstance(image, (str, bytes, os.PathLike)):
+        with open_image(Path(os.fsdecode(image))) as opened:
+            check(*stored_size(opened))
+            opened.draft(None, (side, side))
+            image = load_stored(opened)
+    else:
+        image = image if isinstance(image, Image.Image) else _from_array(image)
+        check(image.height, image.width)
+    if image.mode.startswith(("I", "F")):  # deep grey
+        values = np.asarray(image, np.float64)
+        image = Image.fromarray((255 * values / max(values.max(), 1e-9)).clip(0, 255).astype(np.uint8))
+    image = image.convert("L" if image.mode in ("1", "L", "LA") else "RGB")
+    image.thumbnail((side, side), reducing_gap=2.0)
+    file = io.BytesIO()
+    image.save(file, "JPEG", quality=quality, optimize=True)
+    return file.getvalue()
+
+
+def _from_array(image: Any) -> Image.Image:
+    if isinstance(image, Tensor):
+        image = (image if image.ndim == 2 else image.movedim(0, -1)).numpy(force=True)
+    values = np.asarray(image)
+    if values.dtype.kind == "f":
+        values = (255 * values).clip(0, 255).astype(np.uint8)
+    return Image.fromarray(values[..., 0] if values.ndim == 3 and values.shape[-1] == 1 else values)

@@ -25,6 +25,7 @@ from camtorch.parametrize import PositiveFocal, TiedFocal
 from camtorch.report.report import write_report
 from camtorch.rig import Rig
 from camtorch.stereo.rectification import Rectification, rectify
+from camtorch.viewer.viewer import write_viewer
 from camtorch.warp import views
 from camtorch.warp.dewarp import Dewarp
 from camtorch.warp.plane import BirdsEye, PlaneWarp
@@ -87,5 +88,6 @@ __all__ = [
     "views",
     "vignetting",
     "write_report",
+    "write_viewer",
 ]
 __all__ += models.__all__

@@ -28,6 +28,7 @@ from camtorch._editing import edited_by, quarter_turns
 from camtorch._evaluation import evaluated, mapped
 from camtorch._freezing import INTRINSICS, PREFIX, freeze, frozen_names, loaded, saved, with_frozen
 from camtorch._module import BatchedModule, Memo, remade, typed_as
+from camtorch._notebook import as_html
 from camtorch._numbers import (
     camera_of_fov,
     checked_distortion,
@@ -114,8 +115,7 @@ class Camera(BatchedModule):
 
     Args:
         intrinsics: (*B, 4) fx, fy, cx, cy in pixels.
-        distortion: (*B, n) coefficients in the order of `distortion_names`; those of `ideal`, which are zeros unless
-            the model says otherwise, if left out.
+        distortion: (*B, n) coefficients in the order of `distortion_names`; `ideal` ones, mostly zeros, if left out.
         image_size: (height, width) in pixels, as `image.shape` and not OpenCV's (width, height); shared by the batch,
             needed only where an image is concerned.
 
@@ -138,6 +138,7 @@ class Camera(BatchedModule):
     """How many coefficients, those of `ideal`, a camera has that is made without distortion."""
     defined_text: ClassVar[str] = ""
     """In words, what `defined` asks for."""
+    _repr_html_ = as_html
     is_mixed: ClassVar[bool] = False
     """Whether it is a batch of several models, which have no coefficients in common; see `Mixed`."""
     tensor_names: ClassVar[tuple[str, ...]] = ("intrinsics", "distortion")

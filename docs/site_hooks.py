@@ -1,4 +1,6 @@
-"""What mkdocs does beside building pages: it takes pages from the repository's root, and lets images load lazily."""
+"""What mkdocs does beside building pages: it takes pages from the repository's root, and that of live lenses from the
+library, and lets images load lazily.
+"""
 
 import io
 import re
@@ -9,6 +11,8 @@ from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
 from PIL import Image
+
+from camtorch.viewer.viewer import page as viewer_page
 
 ROOT = Path(__file__).parent.parent
 WIDE = 700  # px: more than a phone shows
@@ -22,6 +26,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
         for other, page in PAGES.items():
             text = text.replace(f"]({other}", f"]({page}")
         files.append(File.generated(config, target, content=text.replace("](docs/", "](")))
+    files.append(File.generated(config, "viewer.html", content=viewer_page()))
     return files
 
 

@@ -214,6 +214,9 @@ def _show(commands: Commands) -> None:
     add("input", type=words.path, metavar="FILE", help="a calibration file")
     add("--against", type=words.path, metavar="OTHER", help="another calibration, to compare with")
     _calibration(add)
+    text = "a page that shows the lens live: one file that needs no other"
+    add("--html", type=words.path, metavar="PAGE", help=text)
+    add("--image", type=words.path, metavar="PHOTO", help="of the camera, for the page")
     _output(add, None, "an image: distortion, radius over angle")
 
 

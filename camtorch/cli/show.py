@@ -11,19 +11,25 @@ from PIL import Image
 from camtorch.analysis.difference import difference
 from camtorch.analysis.summary import summarise
 from camtorch.camera import Camera
-from camtorch.cli import images
+from camtorch.cli import images, targets
 from camtorch.cli.cameras import read_other, read_rig
 from camtorch.plot.axes import require_matplotlib
+from camtorch.viewer.viewer import write_viewer
 
 
 def run(arguments: argparse.Namespace) -> None:
     """Carry it out."""
     path, output, against = arguments.input, arguments.output, arguments.against
+    html, photograph = arguments.html, arguments.image
     if output is not None:
         images.check_target(output, force=arguments.force, inputs=(path, against))
         require_matplotlib()
+    if html is not None:
+        targets.check(html, force=arguments.force, inputs=(path, against, photograph))
+    elif photograph is not None:
+        raise ValueError("--image is for the page that --html writes")
     cameras = read_rig(path, arguments.name, arguments.from_model, arguments.size).cameras
-    single = output is not None or against is not None
+    single = any(file is not None for file in (output, against, html))
     if single and len(cameras) > 1:
         raise ValueError(f"{path}: --name says which camera is meant: {', '.join(cameras)}")
     ((name, camera), *_), other = cameras.items(), None
@@ -34,6 +40,8 @@ def run(arguments: argparse.Namespace) -> None:
         if other.image_size not in (None, camera.image_size):
             sizes = f"{other.width}x{other.height}, but {path} for {camera.width}x{camera.height}"
             raise ValueError(f"{against} is for {sizes}: cameras of one image are compared")
+    if html is not None:
+        write_viewer(camera, html, photograph)
     for name, camera in cameras.items():
         if camera.batch_shape:
             raise ValueError(f"{path}: {name} is a batch of {tuple(camera.batch_shape)} cameras; single ones are shown")
@@ -48,6 +56,8 @@ def run(arguments: argparse.Namespace) -> None:
         which = name if name != "camera" else camera.key
         _draw(output, camera, other, f"{path.name}: {which}, {camera.width} x {camera.height}")
         print(f"{output}: distortion, radius over angle{', difference' if other is not None else ''}")
+    if html is not None:
+        print(f"{html}: the lens, live, to be opened in a browser")
 
 
 def _draw(path: Path, camera: Camera, other: Camera | None, title: str) -> None:

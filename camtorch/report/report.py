@@ -17,11 +17,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
 import torch
-from torch import Tensor
 
 import camtorch.plot as plot
 from camtorch._arguments import check_path
-from camtorch._photographs import load_stored, stored_size
+from camtorch._photographs import as_jpeg
 from camtorch.calibration.calibrate import Calibration
 from camtorch.calibration.rig import RigCalibration
 from camtorch.calibration.verdict import ROUGH, Survey
@@ -31,8 +30,6 @@ from camtorch.plot.calibrations import sightings
 from camtorch.projection.rays import image_lattice
 
 if TYPE_CHECKING:
-    from PIL import Image
-
     Images: TypeAlias = Sequence[Any] | None
     Names: TypeAlias = Sequence[str] | None
 
@@ -253,7 +250,9 @@ def _photograph(shots: _Shots, number: int) -> dict[str, str]:
     image, name, note = "", shots.names[number], marks.title.split(", ", 1)[1]
     if shots.images[number] is not None:
         try:
-            image = _as_url("image/jpeg", _as_jpeg(shots.images[number], (height, width), name))
+            image = _as_url(
+                "image/jpeg", as_jpeg(shots.images[number], (height, width), name, "write_report", _SIDE, _QUALITY)
+            )
         except OSError as error:
             note += f"; no photograph: {error.strerror or error}"
     return {"id": f"{shots.prefix}view-{number}", "name": name, "note": note, "image": image, "marks": marks.url}
@@ -334,47 +333,3 @@ def _drawn(draw: Callable[[Any], object], ratio: float, *, bare: bool = False) -
 
 def _as_url(kind: str, data: bytes) -> str:
     return f"data:{kind};base64,{base64.b64encode(data).decode()}"
-
-
-def _as_jpeg(image: Any, size: tuple[int, int], name: str) -> bytes:
-    """A small JPEG file of an image of any kind that users pass.
-
-    Raises:
-        ValueError: its (height, width) is not `size`. OSError: it cannot be read.
-    """
-    from PIL import Image
-
-    def check(height: int, width: int) -> None:
-        if (height, width) != size:
-            raise ValueError(
-                f"write_report: the image {name!r} has {width} x {height} pixels, and those of the camera have "
-                f"{size[1]} x {size[0]}"
-            )
-
-    if _is_path(image):
-        with Image.open(os.fsdecode(image)) as opened:
-            check(*stored_size(opened))
-            opened.draft(None, (_SIDE, _SIDE))
-            image = load_stored(opened)
-    else:
-        image = image if isinstance(image, Image.Image) else _from_array(image)
-        check(image.height, image.width)
-    if image.mode.startswith(("I", "F")):  # deep grey
-        values = np.asarray(image, np.float64)
-        image = Image.fromarray((255 * values / max(values.max(), 1e-9)).clip(0, 255).astype(np.uint8))
-    image = image.convert("L" if image.mode in ("1", "L", "LA") else "RGB")
-    image.thumbnail((_SIDE, _SIDE), reducing_gap=2.0)
-    file = io.BytesIO()
-    image.save(file, "JPEG", quality=_QUALITY, optimize=True)
-    return file.getvalue()
-
-
-def _from_array(image: Any) -> Image.Image:
-    from PIL import Image
-
-    if isinstance(image, Tensor):
-        image = (image if image.ndim == 2 else image.movedim(0, -1)).numpy(force=True)
-    values = np.asarray(image)
-    if values.dtype.kind == "f":
-        values = (255 * values).clip(0, 255).astype(np.uint8)
-    return Image.fromarray(values[..., 0] if values.ndim == 3 and values.shape[-1] == 1 else values)

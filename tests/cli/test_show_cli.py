@@ -34,6 +34,21 @@ def test_show_prints_a_summary(folder, capsys):
         assert f"\n{label} " in text
 
 
+def test_show_writes_a_page(folder, capsys):
+    command("show", "camera.yml", "--html", "lens.html", "--image", "in.png")
+    assert capsys.readouterr().out.splitlines()[-1] == "lens.html: the lens, live, to be opened in a browser"
+    text = Path("lens.html").read_text()
+    assert '"distortion":[-0.02,0.004,-0.003,0.0006]' in text
+    assert "data:image/jpeg;base64," in text
+    refused_line = refused(capsys, "show", "camera.yml", "--html", "lens.html")
+    assert "--force" in refused_line
+    assert "--html" in refused(capsys, "show", "camera.yml", "--image", "in.png")
+    assert "in.png" in refused(capsys, "show", "camera.yml", "--html", "in.png", "--image", "in.png", "--force")
+    Path("broken.png").write_bytes(b"no image")
+    assert "broken.png" in refused(capsys, "show", "camera.yml", "--html", "b.html", "--image", "broken.png")
+    assert not Path("b.html").exists()
+
+
 @pytest.mark.slow
 def test_show_draws_an_image(folder, capsys):
     pytest.importorskip("matplotlib")

@@ -1,0 +1,1 @@
+"""A page that shows any lens live: `camtorch.write_viewer`."""

@@ -1,0 +1,181 @@
+"""A page that shows a lens live, in one HTML file that needs nothing else, `write_viewer`.
+
+The page is in the files beside this one: `formulas.js` has the camera models, `drawing.js` what is seen and moved,
+`presets.json` a real camera of every model. Here they become one text, with the camera, the photograph, and the
+collection of real lenses.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import os
+import zlib
+from functools import cache
+from importlib import resources
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+
+from camtorch._arguments import check_path
+from camtorch._photographs import as_jpeg
+from camtorch.camera import MODELS, Camera
+from camtorch.io.writing import replacing
+from camtorch.lenses.collection import columns
+from camtorch.projection.explanation import unusable
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+    from PIL import Image
+
+_SIDE, _QUALITY = 1920, 85  # px of the longer side of a photograph, and of its JPEG file
+_MOST_COUNT = 40  # coefficients that a model of any number of them is given in the page
+_FOCAL, _BEND = 0.25, 0.1  # px: what a focal length, a centre and a coefficient of a packed lens are rounded to
+
+
+@torch.no_grad()
+def write_viewer(
+    camera: Camera,
+    path: str | os.PathLike[str],
+    image: str | os.PathLike[str] | Path | Image.Image | NDArray[Any] | torch.Tensor | None = None,
+) -> None:
+    """Write a page that shows a lens live: one HTML file that needs no other and no network.
+
+    It shows the image with the limit of the lens's rays, the same image as another camera would have taken it, and the
+    radius over the angle; coefficients move, photographs can be dropped, other models and real lenses chosen, and the
+    lines of Python that do what is seen are there to be copied.
+
+    Args:
+        camera: a single camera with image_size. The page knows the models of the gallery of models.
+        path: the file; an existing one is replaced as a whole.
+        image: a photograph that the camera took: a path, a Pillow image, an array (H, W) or (H, W, C), a tensor
+            (C, H, W). The page keeps it at up to 1920 pixels. Without one it shows drawn scenes through the lens.
+
+    Raises:
+        ValueError: a batch of cameras, no image_size, a model that the page has no formulas of, a camera without
+            pixels, an image of another size than the camera's. TypeError: no camera, no path. OSError: the file cannot
+            be written, the image cannot be read.
+    """
+    check_path(path, "write_viewer")
+    text = page(camera, image)
+    with replacing(path) as (file,):
+        file.write(text.encode())
+
+
+def page(camera: Camera | None = None, image: Any = None) -> str:
+    """The text of the page; without a camera it begins with a preset, or with what its address says."""
+    data: dict[str, Any] = {"camera": None, "photograph": None, "models": models(), "lenses": _lenses()}
+    if camera is not None:
+        data["camera"] = _described(camera)
+        if image is not None:
+            name = os.fsdecode(image) if isinstance(image, (str, bytes, os.PathLike)) else "image"
+            jpeg = as_jpeg(image, camera._size_for("write_viewer"), name, "write_viewer", _SIDE, _QUALITY)
+            data["photograph"] = f"data:image/jpeg;base64,{base64.b64encode(jpeg).decode()}"
+    # no text of a file may end the element that it stands in
+    parts = {"data": json.dumps(data, allow_nan=False, separators=(",", ":")).replace("</", "<\\/")}
+    parts |= {name: _file(name) for name in ("page.css", "formulas.js", "drawing.js")}
+    text = _file("page.html")
+    for name, part in parts.items():
+        text = text.replace(f"@@{name}@@", part)
+    return text
+
+
+def _file(name: str) -> str:
+    return (resources.files(__package__) / name).read_text(encoding="utf-8")
+
+
+def _described(camera: Camera) -> dict[str, Any]:
+    """A camera as the page reads it."""
+    if not isinstance(camera, Camera) or camera.is_mixed:
+        has_one = isinstance(getattr(camera, "camera", None), Camera)
+        hint = ". Of a rig it takes rig.camera, or one of rig.cameras" if has_one else ""
+        raise TypeError(f"write_viewer: camera must be a camera of one model; got {type(camera).__name__}{hint}")
+    if camera.batch_shape:
+        shape = tuple(camera.batch_shape)
+        raise ValueError(f"write_viewer: camera must be a single one, as camera[0] is; got a batch {shape}")
+    if camera.key not in models():
+        raise ValueError(
+            f"write_viewer: the page has no formulas of {camera.key or type(camera).__name__}; it knows "
+            f"{', '.join(sorted(models()))}. camera.convert(...) makes one of these of it"
+        )
+    size = camera._size_for("write_viewer")
+    intrinsics, distortion = camera.intrinsics.detach().double(), camera.distortion.detach().double()
+    trouble = unusable(camera, intrinsics, distortion)
+    if trouble is not None:
+        raise ValueError(f"write_viewer: this camera has no pixels: {trouble[0]}: {trouble[1]}")
+    return {
+        "model": camera.key,
+        "intrinsics": _numbers(camera.intrinsics),
+        "distortion": _numbers(camera.distortion),
+        "names": list(camera.distortion_names)[: len(distortion)],
+        "image_size": list(size),
+    }
+
+
+def _numbers(values: torch.Tensor) -> list[float]:
+    """As they would be written: 0.1 of float32 is 0.1, not 0.10000000149."""
+    values = values.detach().cpu()
+    return [float(str(value)) for value in (values if values.dtype == torch.float64 else values.float()).numpy()]
+
+
+@cache
+def models() -> dict[str, dict[str, Any]]:
+    """Of each model that the page knows: a real camera, its class, names of coefficients, and how many there may be."""
+    known = {}
+    for key, preset in json.loads(_file("presets.json")).items():
+        kind = MODELS[key]
+        names = {n: kind.names_of(n) for n in range(1, _MOST_COUNT + 1)} if kind.distortion_names else {}
+        counts = [n for n, of_count in names.items() if of_count]
+        known[key] = {
+            "class": kind.__name__,
+            # the table's angles come before its radii, whatever their number: the page names those itself
+            "names": list(names[counts[-1]] or ()) if counts else [],
+            "counts": counts or [0],
+            "distortion": [],
+            **preset,
+        }
+    return known
+
+
+@cache
+def _lenses() -> dict[str, Any]:
+    """The collection of real lenses, packed: names and numbers by Deflate, numbers rounded to parts of a pixel.
+
+    A number is kept as an integer: focal lengths and centres in steps of `_FOCAL` pixels, fy and the centre relative to
+    fx and to the middle; k1 ... k4 by what they move a point at the corner of an image of an equidistant lens, in steps
+    of `_BEND`. Integers are laid out byte by byte, sign last, lowest bytes first.
+    """
+    texts, numbers = columns()
+    exists = np.minimum(numbers[0], numbers[1]) > 0  # a few have gone astray
+    fx, fy, cx, cy, *k = numbers[:8, exists]
+    width, height = (np.array(texts[side], float)[exists] for side in ("width", "height"))
+    focal = np.rint(fx / _FOCAL)
+    corner = np.hypot(width, height) / 2 / (focal * _FOCAL)
+    steps = [focal, np.rint(fy / _FOCAL) - focal]
+    steps += [np.rint((c - side / 2) / _FOCAL) for c, side in ((cx, width), (cy, height))]
+    steps += [np.rint(c * focal * _FOCAL * corner ** (2 * i + 3) / _BEND) for i, c in enumerate(k)]
+    widths, planes = [], []
+    for step in steps:
+        whole = step.astype(np.int64)
+        code = (whole << 1) ^ (whole >> 63)
+        widths.append((int(code.max()).bit_length() + 7) // 8)
+        planes += [((code >> 8 * i) & 255).astype(np.uint8) for i in range(widths[-1])]
+    names = "\0".join(
+        "\0".join(value for value, there in zip(texts[name], exists, strict=True) if there)
+        for name in ("brand", "camera", "lens", "setting", "width", "height")
+    )
+    return {
+        "count": int(exists.sum()),
+        "steps": [_FOCAL, _BEND],
+        "widths": widths,
+        "names": _deflated(names.encode()),
+        "numbers": _deflated(np.concatenate(planes).tobytes()),
+    }
+
+
+def _deflated(content: bytes) -> str:
+    """Raw Deflate, which browsers read by themselves, as Base64."""
+    return base64.b64encode(zlib.compress(content, 9)[2:-4]).decode()
