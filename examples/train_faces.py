@@ -1,7 +1,8 @@
 """Teaches networks by images of one camera to read faces behind others, with and without augmentation (some minutes).
 
-They start from the same weights and take as many steps on as many images. They find landmarks in the image of a
-driver's face, and which way the eyes look; those with rays are told beside each face where its corners look.
+They start from the same weights and take as many steps on as many images. They find landmarks in the image
+of a driver's face, and which way the eyes look; those with rays are told beside each face where its corners look. The
+last two learn from images of the other cameras themselves: what augmentation can come near to, and hardly pass.
 
     python examples/train_faces.py -o faces.png
 """
@@ -11,7 +12,6 @@ import copy
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from functools import partial
 from typing import NamedTuple
 
 import matplotlib.pyplot as plt
@@ -30,6 +30,8 @@ TRAINING_SETS = {
     "affine": "... with RandomAffine",
     "camtorch": "... with camtorch",
     "camtorch_rays": "... with camtorch and rays",
+    "own": "the other cameras' own images",
+    "own_rays": "... and rays",
 }
 TESTS = {
     "seen": "the same camera",
@@ -58,8 +60,18 @@ def by_camera(seen: Photographs, index: Tensor, generator: torch.Generator) -> S
     """
     augment = ct.augment.RandomCamera("real", fov=(60, 160), yaw=YAW, pitch=PITCH, roll=ROLL, crop=None, min_filled=0)
     change = augment.change(seen.camera, augment.draw(len(index), generator))
-    camera, turn = change.target, change.rotation
-    assert isinstance(camera, ct.Camera)
+    assert isinstance(change.target, ct.Camera)
+    return cut_out(seen, index, change.target, change.rotation, generator)
+
+
+def as_taken(seen: Photographs, index: Tensor, generator: torch.Generator) -> Samples:
+    """Faces of the images as they are, cut out, and a rolling shutter."""
+    turn = torch.eye(3, dtype=torch.float64).expand(len(index), 3, 3)
+    return cut_out(seen, index, seen.camera, turn, generator)
+
+
+def cut_out(seen: Photographs, index: Tensor, camera: ct.Camera, turn: Tensor, generator: torch.Generator) -> Samples:
+    """Faces as `camera`, one or one of each, sees them when it is turned and its shutter rolls, cut out at random."""
     jitter, rates = (2 * torch.rand(2, len(index), 3, generator=generator) - 1).unbind()
     near, whole = faces.cut(camera, *camera.project(seen.points[index].to(turn) @ turn.mT), jitter)
     readout = SIDE * faces.READOUT / faces.SIZE[0] * camera.fx / near.fx
@@ -88,7 +100,7 @@ def warped(seen: Photographs, index: Tensor, warp: ct.Warp, whole: Tensor) -> Sa
     return Samples(warp(seen.image[index]), keypoints, gaze, faces.corner_rays(warp.target), whole.float())
 
 
-AUGMENTATIONS: dict[str, Augment] = {"plain": plain, "affine": by_affine, "camtorch": by_camera}
+AUGMENTATIONS: dict[str, Augment] = {"plain": plain, "affine": by_affine, "camtorch": by_camera, "own": as_taken}
 
 
 # -- learning
@@ -146,16 +158,19 @@ class Result(NamedTuple):
     """By the test: a step, and what `medians` was after it."""
 
 
-def train(name: str, network: Network, seen: Photographs, tests: dict[str, Samples], steps: int, seed: int) -> Result:
-    """Train a network on batches of 32 photographs, augmented on the fly, and look how it does."""
+def train(
+    name: str, network: Network, seen: list[Photographs], tests: dict[str, Samples], steps: int, seed: int
+) -> Result:
+    """Train a network on batches of 32 photographs, of one camera after the other, and look how it does."""
     generator = torch.Generator().manual_seed(seed)
-    augment = partial(AUGMENTATIONS[name.removesuffix("_rays")], seen)
+    augment = AUGMENTATIONS[name.removesuffix("_rays")]
     network.with_rays = name.endswith("_rays")
     optimizer = torch.optim.AdamW(network.parameters(), weight_decay=1e-4)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, 5e-3, total_steps=steps, pct_start=0.2)
     curves: dict[str, list[tuple[int, float, float]]] = {test: [] for test in tests}
     for step in range(1, steps + 1):
-        samples = augment(torch.randint(len(seen.image), (32,), generator=generator), generator)
+        taken = seen[step % len(seen)]
+        samples = augment(taken, torch.randint(len(taken.image), (32,), generator=generator), generator)
         loss = loss_of(network(samples), samples)
         optimizer.zero_grad()
         loss.backward()
@@ -166,7 +181,7 @@ def train(name: str, network: Network, seen: Photographs, tests: dict[str, Sampl
                 curves[test].append((step, *medians(network, held_out)))
         if step % (6 * LOOKS) == 0 or step == steps:
             print(f"{TRAINING_SETS[name]:<26} step {step} of {steps}, loss {loss.item():.2f}", flush=True)
-    examples = augment(torch.arange(min(12, len(seen.image))), torch.Generator().manual_seed(seed))
+    examples = augment(seen[0], torch.arange(min(12, len(seen[0].image))), torch.Generator().manual_seed(seed))
     with torch.no_grad():
         found = network(tests["shutter"])
     return Result(Samples(*(values[examples.weight > 0][:2] for values in examples)), found, curves)
@@ -178,12 +193,17 @@ def run(images: int = 400, count: int = 150, steps: int = 1500, seed: int = 0) -
     Returns:
         a result for each of `TRAINING_SETS`, and the last test.
     """
-    print(f"rendering {images} images to learn from and {count} for each of {len(TESTS)} tests", flush=True)
+    print(f"rendering twice {images} images to learn from, {count} for each of {len(TESTS)} tests", flush=True)
     generator = torch.Generator().manual_seed(seed)
     drivers, others = (cabin.random_drivers(n, generator) for n in (images, count))
-    seen = faces.photograph(drivers)
+    seen = [faces.photograph(drivers)]
     mounts, shutter = (faces.by_others(others, generator, rolling=rolling) for rolling in (False, True))
     tests = {"seen": faces.by_teacher(others), "mounts": mounts, "shutter": shutter}
+    own = [
+        faces.photograph_mounted(drivers[rows], faces.lens(name), generator)
+        for name, rows in zip(faces.LENSES, torch.arange(images).tensor_split(len(faces.LENSES)), strict=True)
+    ]
+    learned = {name: own if name.startswith("own") else seen for name in TRAINING_SETS}
     torch.manual_seed(seed)
     first = Network()
     # A thread for each network keeps cores busier than many threads on one small image
@@ -191,7 +211,7 @@ def run(images: int = 400, count: int = 150, steps: int = 1500, seed: int = 0) -
     torch.set_num_threads(1)
     try:
         with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
-            jobs = [pool.submit(train, n, copy.deepcopy(first), seen, tests, steps, seed) for n in TRAINING_SETS]
+            jobs = [pool.submit(train, n, copy.deepcopy(first), learned[n], tests, steps, seed) for n in TRAINING_SETS]
             results = dict(zip(TRAINING_SETS, (job.result() for job in jobs), strict=True))
     finally:
         torch.set_num_threads(threads)

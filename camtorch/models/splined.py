@@ -11,8 +11,8 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from camtorch._arguments import as_whole
-from camtorch._freezing import frozen_names
+from camtorch._arguments import as_whole, values_of
+from camtorch._freezing import INTRINSICS, frozen_names
 from camtorch.camera import Camera
 from camtorch.optics import Chart, Lens, Surface, Unified
 from camtorch.optics.charts import even_steps_and_ratios
@@ -116,11 +116,15 @@ class Splined(Camera):
         return torch.cat([part.flatten(0, 2) for part in parts])
 
     def extra_repr(self) -> str:
-        """The grid in the place of all its numbers."""
-        size = f", image_size={self.image_size}" if self.image_size else ""
-        frozen = f", frozen=({', '.join(names)})" if (names := frozen_names(self)) else ""
-        batch = f"batch_shape={tuple(self.batch_shape)}, " if self.batch_shape else ""
-        return f"{batch}order={self.order}, columns={self.columns}, rows={self.rows}, fov_x={self.fov_x}{size}{frozen}"
+        """The grid in the place of its control points."""
+        parts = [f"batch_shape={tuple(self.batch_shape)}"] if self.batch_shape else []
+        numbers = None if self.batch_shape else values_of(self.intrinsics)
+        if numbers is not None:
+            parts += [f"{name}={value:.6g}" for name, value in zip(INTRINSICS, numbers.tolist(), strict=True)]
+        parts.append(f"order={self.order}, columns={self.columns}, rows={self.rows}, fov_x={self.fov_x}")
+        parts += [f"image_size={self.image_size}"] if self.image_size else []
+        parts += [f"frozen=({', '.join(names)})"] if (names := frozen_names(self)) else []
+        return ", ".join(parts)
 
 
 def _of_grid(order: int, columns: int, rows: int, fov_x: int) -> dict[str, Any]:

@@ -69,9 +69,19 @@ def teacher() -> Camera:
 
 def photograph(drivers: cabin.Drivers) -> Photographs:
     """Whole images of drivers by the `teacher`."""
-    parts = [drivers[slice(i, i + 25)] for i in range(0, len(drivers), 25)]
-    image = torch.cat([cabin.render(teacher(), part, samples=1) for part in parts])
-    return Photographs(image, points_of(drivers), drivers.gaze, teacher())
+    return _photograph(drivers, teacher(), torch.eye(3, dtype=torch.float64).expand(len(drivers), 3, 3))
+
+
+def photograph_mounted(drivers: cabin.Drivers, camera: Camera, generator: torch.Generator) -> Photographs:
+    """Whole images of drivers by a camera that is mounted at random for each of them, see `MOUNTS`."""
+    return _photograph(drivers, camera, mount_rotation(*_mounts(camera, drivers, generator).double().unbind(-1)))
+
+
+def _photograph(drivers: cabin.Drivers, camera: Camera, mounts: Tensor) -> Photographs:
+    parts = [slice(i, i + 25) for i in range(0, len(drivers), 25)]
+    image = torch.cat([cabin.render(camera, drivers[part], mounts[part], samples=1) for part in parts])
+    gaze = (mounts @ drivers.gaze[..., None])[..., 0]
+    return Photographs(image, points_of(drivers) @ mounts.mT, gaze, camera)
 
 
 def points_of(drivers: cabin.Drivers) -> Tensor:

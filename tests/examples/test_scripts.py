@@ -142,7 +142,7 @@ def looks_true(samples: Samples, drivers: cabin.Drivers) -> None:
     assert bool(((samples.keypoints > -1) & (samples.keypoints < SIDE))[whole].all())
 
 
-@pytest.mark.parametrize("name", ["plain", "camtorch"])
+@pytest.mark.parametrize("name", ["plain", "camtorch", "own"])
 def test_labels_learned_from_are_true(name, seen, drivers):
     samples = learned_from(name, seen)
     looks_true(samples, drivers)
@@ -179,7 +179,7 @@ def test_faces_before_a_rolling_shutter_are_those_that_a_warp_makes(drivers):
 
 @pytest.mark.slow
 def test_a_small_run_tries_all_networks_in_all_tests(tmp_path):
-    results, test = train_faces.run(images=2, count=5, steps=1, seed=2)
+    results, test = train_faces.run(images=5, count=5, steps=1, seed=2)
     assert list(results) == list(train_faces.TRAINING_SETS)
     assert all(list(result.curves) == list(train_faces.TESTS) for result in results.values())
     train_faces.draw(results, test, str(tmp_path / "faces.png"))

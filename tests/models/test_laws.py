@@ -464,6 +464,9 @@ def regular(lens, a, b, samples, azimuths):
     radial = getattr(lens.stages[0], "radial", None)
     if hasattr(radial, "denominator"):  # a pole with a zero right behind it is narrower than the samples
         before &= (radial.denominator(a * a + b * b) > 0).view(samples, azimuths).cummin(0).values
+    edge = lens.at(a, b).edge
+    if edge is not None:
+        before &= (edge > 0).view(samples, azimuths).cummin(0).values
     return before
 
 
