@@ -409,7 +409,7 @@ def test_jittered_lenses_stay_invertible_and_bounded():
             shift = (moved - edge).norm(dim=-1)[valid & seen].max() / math.hypot(SIZE[0] / 2, SIZE[1] / 2)
             assert amount / 50 < shift < 1.5 * amount, key
             moved = change.target.distortion.std(0) > 0
-            assert moved.any() if key == "tabulated" else moved.all()  # a table goes on beyond the image
+            assert moved.any() if key in ("tabulated", "splined") else moved.all()  # these go on beyond the image
 
 
 def test_a_family_has_the_field_of_view_that_is_asked_for():
