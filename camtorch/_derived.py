@@ -1,16 +1,16 @@
-"""Models made of others, whose coefficients stand before their own: of cameras behind a windshield, for one."""
+"""Models made of others, whose coefficients stand before their own: as behind a windshield."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import torch
 from torch import Tensor
 
-from camtorch.optics import Before, Bending, Chart, Lens
+from camtorch.optics import Before, Bending, Chart, Lens, Surface
 from camtorch.optics.ray_maps import order_of, powers
 
 if TYPE_CHECKING:
@@ -23,18 +23,57 @@ _models: dict[tuple[type[Camera], str], type[Camera]] = {}
 
 
 def variant(model: type[CameraT], text: str) -> type[CameraT]:
-    """The model of the key `key:text`, for that of the key: "windshield=6,3" is behind one of so many coefficients.
+    """The model of the key `key:text`, for that of the key: "windshield=6,3" is behind one of so many coefficients,
+    "elastic=10,8" has a surface of so many control points across and down after its lens.
 
     Raises:
         ValueError: there is none of that text.
     """
-    found = re.fullmatch(r"windshield=(\d{1,4}),(\d{1,4})", text)
-    counts = [int(count) for count in found.groups()] if found else []
-    if not counts or any(order_of(count) is None for count in counts):
-        raise ValueError(
-            f"{model.__name__}: there is no variant {text!r:.60}; windshield=N,M is one, N and M of 1, 3, 6, 10, ..."
-        )
-    return behind_windshield(model, *counts)
+    found = re.fullmatch(r"(windshield|elastic)=(\d{1,4}),(\d{1,4})", text)
+    if found is not None:
+        counts = int(found[2]), int(found[3])
+        if found[1] == "elastic" and min(counts) > 3:
+            return with_surface(model, *counts)
+        if found[1] == "windshield" and None not in map(order_of, counts):
+            return behind_windshield(model, *counts)
+    raise ValueError(
+        f"{model.__name__}: there is no variant {text!r:.60}; there are windshield=N,M of 1, 3, 6, 10, ... and "
+        "elastic=N,M from 4 on"
+    )
+
+
+def with_surface(model: type[CameraT], columns: int, rows: int) -> type[CameraT]:
+    """The model of cameras whose lens ends with a cubic `Surface`: its cells and centre, and its control points."""
+    place = "cells_a", "cells_b", "centre_a", "centre_b"
+    names = tuple(f"{w}{i}_{j}" for j in range(rows) for i in range(columns) for w in "ab")
+
+    def optics(optics: Optics, k: Sequence[Tensor]) -> Optics:
+        chart, lens = optics
+        surface = Surface(k[4:], columns, rows, cells=(k[0], k[1]), centre=(k[2], k[3]))
+        return chart, Lens(*lens.stages, surface)
+
+    def mirrored(across: bool) -> Mapping[str, str]:
+        turned, centre = ("a", "centre_a") if across else ("b", "centre_b")
+        found = {centre: f"-{centre}"}
+        for j in range(rows):
+            for i in range(columns):
+                there = f"{columns - 1 - i}_{j}" if across else f"{i}_{rows - 1 - j}"
+                found |= {f"{w}{i}_{j}": f"{'-' if w == turned else ''}{w}{there}" for w in "ab"}
+        return MappingProxyType(found)
+
+    return _derived(
+        model,
+        f"elastic={columns},{rows}",
+        "Elastic",
+        (*place, *names),
+        # so wide that it is everywhere
+        (1e-6, 1e-6, 0.0, 0.0, *[0.0] * len(names)),
+        optics,
+        mirror_x=MappingProxyType({**model.mirror_x, **mirrored(True)}),
+        mirror_y=MappingProxyType({**model.mirror_y, **mirrored(False)}),
+        quarter_turn=None,
+        fit_bounds=MappingProxyType({**model.fit_bounds, **dict.fromkeys(place)}),
+    )
 
 
 def behind_windshield(model: type[CameraT], across: int, down: int) -> type[CameraT]:

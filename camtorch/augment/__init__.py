@@ -19,6 +19,7 @@ from camtorch.augment.edits import (
     Rotate90,
     VerticalFlip,
 )
+from camtorch.augment.elastic import RandomElastic
 from camtorch.augment.face import FaceNormalizer
 from camtorch.augment.face_model import face_points
 from camtorch.augment.landmarks import LANDMARKS
@@ -43,6 +44,7 @@ __all__ = [
     "Preset",
     "RandomCamera",
     "RandomCrop",
+    "RandomElastic",
     "RandomLens",
     "RandomMount",
     "RandomResizedCrop",

@@ -56,9 +56,10 @@ class Surface(Stage):
     ):
         self.columns, self.rows, self.order = columns, rows, order
         place = [
-            w.detach() if isinstance(w, Tensor) else torch.full_like(controls[0], w, requires_grad=False)
+            w if isinstance(w, Tensor) else torch.full_like(controls[0], w, requires_grad=False)
             for w in (*cells, *centre)
         ]
+        place = [w.detach() if w.requires_grad else w for w in place]
         self.parameters: tuple[Tensor, ...] = (*place, *controls)
 
     def __call__(self, a: Tensor, b: Tensor) -> Planes2:
