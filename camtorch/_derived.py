@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import torch
 from torch import Tensor
@@ -44,7 +44,9 @@ def variant(model: type[CameraT], text: str) -> type[CameraT]:
 
 def with_surface(model: type[CameraT], columns: int, rows: int) -> type[CameraT]:
     """The model of cameras whose lens ends with a cubic `Surface`: its cells and centre, and its control points."""
-    place = "cells_a", "cells_b", "centre_a", "centre_b"
+    text, place = f"elastic={columns},{rows}", ("cells_a", "cells_b", "centre_a", "centre_b")
+    if (model, text) in _models:
+        return cast("type[CameraT]", _models[model, text])
     names = tuple(f"{w}{i}_{j}" for j in range(rows) for i in range(columns) for w in "ab")
 
     def optics(optics: Optics, k: Sequence[Tensor]) -> Optics:
@@ -63,7 +65,7 @@ def with_surface(model: type[CameraT], columns: int, rows: int) -> type[CameraT]
 
     return _derived(
         model,
-        f"elastic={columns},{rows}",
+        text,
         "Elastic",
         (*place, *names),
         # so wide that it is everywhere
