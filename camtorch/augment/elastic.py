@@ -41,6 +41,8 @@ class RandomElastic(Augmentation):
             camera that is elastic already.
     """
 
+    grid: tuple[int, int]
+    """Cells of the surface over the image, down and across."""
     other_words: ClassVar[Mapping[str, str]] = {"alpha": "amount", "sigma": "grid", "cells": "grid"}
 
     def __init__(

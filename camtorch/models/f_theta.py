@@ -53,7 +53,7 @@ class FThetaSheared(FTheta):
     """
 
     key = "f_theta_sheared"
-    shear_names = ("d", "e")
+    shear_names: ClassVar[tuple[str, ...]] = ("d", "e")
     distortion_names: tuple[str, ...] = (*shear_names, *FTheta.distortion_names)
     default_count = 5
     fit_counts: ClassVar[tuple[int, ...]] = (5, 7, 9)

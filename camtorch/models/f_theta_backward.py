@@ -46,7 +46,7 @@ class FThetaBackwardSheared(FThetaBackward):
     """
 
     key = "f_theta_backward_sheared"
-    shear_names = ("d", "e")
+    shear_names: ClassVar[tuple[str, ...]] = ("d", "e")
     distortion_names: tuple[str, ...] = (*shear_names, *FThetaBackward.distortion_names)
     default_count = 5
     fit_counts: ClassVar[tuple[int, ...]] = (5, 7, 9)

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 from camtorch._arguments import Numbers, as_image_size, as_real
+from camtorch.models._polynomial import FreePolynomial
 from camtorch.models.f_theta import FTheta
 
 if TYPE_CHECKING:
@@ -25,7 +26,7 @@ class WoodScape(FTheta):
     key = "woodscape"
     special_cases = ()
     fit_counts = ()
-    sheared = None
+    sheared: ClassVar[type[FreePolynomial] | None] = None
 
     @classmethod
     def names_of(cls, count: int) -> tuple[str, ...] | None:

@@ -103,7 +103,9 @@ def prior_of(
     for lens in _lenses(asked):
         plane = _plane(asked.kind, lens)
         if not asked.kind.optics(columns(lens))[0].has_scale:
-            raise ValueError(f"{owner}: {asked.kind.__name__} is a panorama, and has no lens to predict")
+            raise ValueError(
+                f"{owner}: {asked.kind.__name__} is a panorama, or has an axis of its own: no head predicts it"
+            )
         if given is not None and degrees is None:
             ranges = [(given * _LONGER, given, given / times) for times in _SHORTER]
         else:

@@ -463,7 +463,7 @@ class LensAt:
     @property
     def edge(self) -> Tensor | None:
         """The smallest of the stages: positive up to where the lens ends; None where it does not."""
-        edges = [edge for stage in self.stages if (edge := stage.edge) is not None]
+        edges = [edge for edge in [stage.edge for stage in self.stages] if edge is not None]
         return functools.reduce(torch.minimum, edges) if edges else None
 
     @property

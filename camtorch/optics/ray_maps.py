@@ -99,6 +99,8 @@ class Bending(RayMap):
 
     code: ClassVar[int | None] = 2
 
+    count: int
+
     def __init__(self, horizontal: Sequence[Tensor], vertical: Sequence[Tensor]):
         self.parameters: tuple[Tensor, ...] = (*horizontal, *vertical)
         self.count = len(horizontal)
@@ -172,6 +174,9 @@ class Before(Chart):
     """A chart of rays that a map has changed."""
 
     has_scale = False
+
+    change: RayMap
+    chart: Chart
 
     def __init__(self, change: RayMap, chart: Chart):
         self.change, self.chart = change, chart

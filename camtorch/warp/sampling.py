@@ -122,7 +122,7 @@ def _natively(images: Tensor, where: Sampling | Lattice, how: Sampler, out: Tens
     """
     mode, padding_mode, fill = how
     positions = where.nodes if isinstance(where, Lattice) else where.grid
-    if not (native_available() and sampler.takes(images.dtype, mode) and is_eager(images, positions)):
+    if not (is_eager(images, positions) and native_available() and sampler.takes(images.dtype, mode)):
         return None
     if (isinstance(where, Sampling) and where.scale is not None) or images.requires_grad or positions.requires_grad:
         return None

@@ -16,8 +16,11 @@ def seen_by(camera, step=37):
     return pixels, torch.where(valid[..., None], rays.detach(), torch.nan)
 
 
-# the angles of a table are its own
-@pytest.mark.parametrize("key", slow_unless(DISTINCT.__contains__, [key for key in KEYS if key != "tabulated"]))
+# the angles of a table are its own; fits of a lens about another axis start from the camera's, and may end beside it
+OWN = {"tabulated", "cahvor", "cahvore"}
+
+
+@pytest.mark.parametrize("key", slow_unless(DISTINCT.__contains__, [key for key in KEYS if key not in OWN]))
 def test_a_camera_is_found_by_its_rays(key):
     camera = one(key).requires_grad_(False)
     if camera.image_size is None:

@@ -310,9 +310,10 @@ def check_bad_rows(camera, method, good, bad):
     result, valid = getattr(camera, method)(alone)
     assert valid.all()
     expected = torch.autograd.grad((result * weights[: len(good)]).sum(), [alone, *parameters])
-    close = {"rtol": 100 * torch.finfo(result.dtype).eps, "atol": 0}
+    close = 100 * torch.finfo(result.dtype).eps
     for mine, reference in zip((by_value[: len(good)], *by_parameter), expected, strict=True):
-        torch.testing.assert_close(mine, reference, **close)
+        # sums over points, of which some cancel
+        torch.testing.assert_close(mine, reference, rtol=close, atol=close * float(reference.abs().max()))
 
 
 @every_model

@@ -150,7 +150,7 @@ static int fuzz(uint64_t job) {
     for (i = 1; i < cameras.part_count; i++) {
         Part *part = parts + i;
         part->kind = PLANAR + (int32_t)below(3);
-        if (part->kind == TILT) numbers += 9;
+        if (part->kind == HOMOGRAPHY) numbers += 9;
         if (part->kind == SHEAR) numbers += 2;
         if (part->kind != PLANAR) continue;
         part->flags = (int32_t)below(4);
