@@ -146,13 +146,8 @@ def test_poses_of_many_images_are_one_batch_in_every_format(tmp_path):
 @given(core=st.tuples(*[st.floats(1, 1e4)] * 4), distortion=st.lists(st.floats(-1, 1), min_size=4, max_size=4))
 def test_numbers_come_back_to_the_last_bit(tmp_path_factory, core, distortion):
     for format, suffix in SUFFIXES.items():
-        if format in (
-            "basalt",
-            "colmap",
-            "metashape",
-            "ncore",
-            "nerfstudio",
-        ):  # another number of coefficients; half a pixel
+        # another number of coefficients; half a pixel; parts of the image's side (docs/contributing/format.md adds it)
+        if format in ("basalt", "colmap", "metashape", "ncore", "nerfstudio", "opensfm"):
             continue
         path = tmp_path_factory.getbasetemp() / f"exact{suffix}"
         one = camera(distortion=distortion, core=core)
