@@ -16,7 +16,8 @@ from camtorch.projection.solve import search
 LENSES = [key for key in KEYS if one(key).distortion_names]
 STAGES = [key for key in LENSES if type(one(key)).optics(columns(one(key).distortion[None]))[1].stages]
 # What rounding keeps the search of single pixels from, at steep places of a chart that is solved for itself
-MISSED = {"ocamcalib": 0.02, "f_theta_backward_sheared": 2e-3}
+# of the sheared one 0.0007 were missed on a plausible lens, next to its rim: a weakness of the search, not of rounding
+MISSED = {"ocamcalib": 0.02, "f_theta_backward_sheared": 1e-3}
 
 
 class Leaning(ct.KannalaBrandt):
