@@ -119,6 +119,69 @@ static int T(squares)(const Lattices *given, const T(Between) *b, int32_t *cells
     return left;
 }
 
+/* The cubics through nodes, at parts 0, 1/2 and 1 of the way from the second to the third, and so on below */
+static float T(between_nodes)(const float *nodes, int64_t width, int across, int down) {
+    static const float weights[3][4] = {{0, 1, 0, 0}, {-1 / 16.0f, 9 / 16.0f, 9 / 16.0f, -1 / 16.0f}, {0, 0, 1, 0}};
+    float sum = 0;
+    for (int y = 0; y < 4; y++) {
+        const float *row = nodes + y * width, *w = weights[across];
+        sum += weights[down][y] * (w[0] * row[0] + w[1] * row[1] + w[2] * row[2] + w[3] * row[3]);
+    }
+    return sum;
+}
+
+/* What becomes of cells in doubt: cubics miss most in the middle of a cell and of its sides. Where half the tolerance is
+ * kept there, or an image that ends in zeros is far off, they do; the other cells are to be computed */
+static int T(settle)(const Lattices *given, const T(Between) *b, const Classification *asked) {
+    enum { PROBES = 5 };
+    static const int across[PROBES] = {1, 0, 2, 1, 1}, down[PROBES] = {0, 1, 1, 2, 1};
+    const int64_t columns = asked->columns, cells = asked->rows * columns, width = columns + 5;
+    const float half[2] = {(float)asked->source_width / 2, (float)asked->source_height / 2};
+    const float limit = (float)(asked->tolerance * asked->tolerance) / 4, pixels = 4; /* of which the image needs two */
+    int64_t places[BLOCK / PROBES], i = 0;
+    ALIGNED R u[BLOCK], v[BLOCK];
+    ALIGNED I ok[BLOCK];
+    int left = 0;
+    while (i < cells) {
+        int count = 0;
+        for (; i < cells && count < BLOCK / PROBES; i++)
+            if (asked->cells[i] == CELL_DOUBT) places[count++] = i;
+        const int points = count * PROBES, n = (points + LANES - 1) & -LANES;
+        for (int k = 0; k < n; k++) { /* the last one again, up to whole vectors */
+            const int64_t place = places[(k < points ? k : points - 1) / PROBES];
+            u[k] = (R)(STEP * (place % columns) + STEP / 2 * across[k % PROBES]);
+            v[k] = (R)(STEP * (place / columns) + STEP / 2 * down[k % PROBES] + given->first_row);
+        }
+        if (count) left |= T(moved)(&given->move, b, points, n, u, v, ok);
+        for (int k = 0; k < count; k++) {
+            const R *found[2] = {u + k * PROBES, v + k * PROBES};
+            float missed[PROBES] = {0}, most = 0;
+            int known = 1, is_off = 0;
+            for (int c = 0; c < 2; c++) {
+                const float *nodes = asked->nodes + c * asked->node_strides[1];
+                nodes += (places[k] / columns + 1) * width + places[k] % columns + 1;
+                float low = nodes[width + 1], high = low, furthest = 0;
+                for (int at = 0; at < PROBES; at++) {
+                    const float exact = (float)found[c][at];
+                    const float miss = (exact - T(between_nodes)(nodes, width, across[at], down[at])) * half[c];
+                    low = exact < low ? exact : low, high = exact > high ? exact : high;
+                    furthest = miss * miss > furthest ? miss * miss : furthest;
+                    missed[at] += miss * miss;
+                }
+                /* what lies between the places looked at */
+                const float reach = (high - low) / 2 + pixels / half[c];
+                is_off |= (furthest < 1) & ((high + reach < -1) | (low - reach > 1));
+            }
+            for (int at = 0; at < PROBES; at++) {
+                known &= ok[k * PROBES + at] != 0;
+                most = missed[at] <= most ? most : missed[at];
+            }
+            asked->cells[places[k]] = known & ((most <= limit) | (is_off & (asked->padding == ZEROS))) ? CELL_CUBIC : 0;
+        }
+    }
+    return left;
+}
+
 static int T(lattice)(const Lattices *given, int64_t camera, T(Between) *b) {
     const Move *move = &given->move;
     Classification asked = given->cells;
@@ -137,7 +200,11 @@ static int T(lattice)(const Lattices *given, int64_t camera, T(Between) *b) {
         for (int64_t i = 0; i < nodes; i++) to[i] = (float)at[i], to[nodes + i] = (float)at[move->result_strides[2] + i];
         asked.nodes = to, asked.node_strides[1] = nodes;
     }
-    if (2 * THIS(classify)(&asked) > cells) return LEFT_MOST;
+    THIS(classify)(&asked);
+    if ((left = T(settle)(given, b, &asked))) return left;
+    int64_t most = 0;
+    for (int64_t i = 0; i < cells; i++) most += asked.cells[i] == 0;
+    if (2 * most > cells) return LEFT_MOST;
     static const int32_t wanted[2] = {0, CELL_NEXT};
     for (int turn = 0; turn < 2; turn++) {
         int64_t places[BLOCK / SQUARE], found;

@@ -195,15 +195,21 @@ INLINE int64_t nearest_of(float x, int64_t side, int padding) {
 
 NOT_INLINE void show_nothing(const Span *span, int type) {
     const Job *job = span->job;
+    const int64_t bytes = job->channels * size_of(type), *to = job->result_strides;
+    const char *fill = (const char *)job->fill_elements;
     int64_t c, i;
+    if (to[3] == job->channels && (to[1] == 1 || to[3] == 1) && memcmp(fill, fill + 1, (size_t)bytes - 1) == 0) {
+        memset(span->result, fill[0], (size_t)(span->pixels * bytes)); /* mostly zeros */
+        return;
+    }
     for (c = 0; c < job->channels; c++) {
         char *plane = span->result + c * job->result_strides[1] * size_of(type);
         for (i = 0; i < span->pixels; i++) move(plane, i * job->result_strides[3], job->fill_elements, c, type);
     }
 }
 
-/* Pixels one by one */
-NOT_INLINE void careful(const Span *span, const Positions *at, int type, int mode) {
+/* Pixels one by one; `done`: bits of those that are there */
+NOT_INLINE void careful(const Span *span, const Positions *at, int type, int mode, int done) {
     const Job *job = span->job;
     const int64_t bytes = size_of(type);
     int64_t i, c;
@@ -211,6 +217,7 @@ NOT_INLINE void careful(const Span *span, const Positions *at, int type, int mod
         const float u = at->u[i], v = at->v[i];
         char *result = span->result + i * job->result_strides[3] * bytes;
         int shows = u == u && v == v;
+        if (done >> i & 1) continue;
         if (shows && job->padding == ZEROS) {
             const float reach = mode == BICUBIC ? 2 : 1;
             shows = u > -reach && v > -reach && u < (float)job->source_width - 1 + reach &&
@@ -269,9 +276,20 @@ INLINE I8 whole8(V8 value) { return __builtin_convertvector(value, I8); }
 INLINE V8 float8(I8 value) { return __builtin_convertvector(value, V8); }
 INLINE V4 float4(I4 value) { return __builtin_convertvector(value, V4); }
 
+/* A bit for each that is true */
+INLINE int lanes8(I8 mask) {
+#if defined(__AVX2__)
+    return _mm256_movemask_ps((__m256)mask);
+#else
+    int lanes = 0, i;
+    for (i = 0; i < STEP; i++) lanes |= (mask[i] != 0) << i;
+    return lanes;
+#endif
+}
+
 INLINE int all8(I8 mask) {
 #if defined(__AVX2__)
-    return _mm256_movemask_ps((__m256)mask) == 0xff;
+    return lanes8(mask) == 0xff;
 #else
     int64_t parts[4];
     memcpy(parts, &mask, sizeof parts);
@@ -811,6 +829,7 @@ NOT_INLINE void bilinear_scattered(const Span *span, Squares at, int type) {
 INLINE void eight(const Span *span, V8 u, V8 v, int type, int mode, int layout) {
     const Job *job = span->job;
     Positions at;
+    int done = 0;
     if (job->padding == BORDER && mode != BICUBIC) {
         u = clamped8(u, (float)(job->source_width - 1));
         v = clamped8(v, (float)(job->source_height - 1));
@@ -856,10 +875,20 @@ INLINE void eight(const Span *span, V8 u, V8 v, int type, int mode, int layout) 
             show_nothing(span, type);
             return;
         }
+        if (mode == BILINEAR && layout != SCATTERED && job->source_width > 2 && job->source_height > 1) {
+            /* those on the image at once, with the corner in the place of the others */
+            const I8 in = (u >= every8(0)) & (u <= every8((float)(job->source_width - 2))) & (v >= every8(0)) &
+                          (v <= every8((float)(job->source_height - 1)));
+            if ((done = lanes8(in))) {
+                const V8 on_u = (V8)((I8)u & in), on_v = (V8)((I8)v & in);
+                if (layout == PLANES) bilinear_planes(span, squares_of(job, on_u, on_v, 1), type);
+                else bilinear_interleaved(span, squares_of(job, on_u, on_v, 2), type);
+            }
+        }
     }
     memcpy(at.u, &u, sizeof at.u);
     memcpy(at.v, &v, sizeof at.v);
-    careful(span, &at, type, mode);
+    careful(span, &at, type, mode, done);
 }
 
 #else
@@ -880,7 +909,7 @@ INLINE void eight(const Span *span, V8 u, V8 v, int type, int mode, int layout) 
     (void)layout;
     memcpy(at.u, &u, sizeof at.u);
     memcpy(at.v, &v, sizeof at.v);
-    careful(span, &at, type, mode);
+    careful(span, &at, type, mode, 0);
 }
 
 #endif
@@ -1172,6 +1201,10 @@ INLINE int is_wide(const Job *job, int type, int mode, int layout) {
                                 (type == FLOAT32 && layout == PLANES));
 }
 
+INLINE __m512 joined16(V8 first, V8 second) {
+    return _mm512_insertf32x8(_mm512_castps256_ps512((__m256)first), (__m256)second, 1);
+}
+
 /* Sixteen pixels between neighbouring nodes */
 INLINE __m512 between_wide(const float *line) {
     const __m512 nodes = _mm512_castps256_ps512(_mm256_loadu_ps(line));
@@ -1214,13 +1247,21 @@ NOT_INLINE void lay_chunk(const Job *job, LatticeRow *row, int64_t first) {
     lay_lines(nodes + job->node_strides[1], width, n, (int)row->part, (float)job->source_height, row->lines[1]);
 }
 
-INLINE void exact_positions(const Job *job, const LatticeRow *row, int32_t cell, Positions *at) {
+/* Of the pixels of a cell that shows something */
+INLINE void cell_positions(const Job *job, const LatticeRow *row, int64_t j, V8 *u, V8 *v) {
+    const int32_t cell = row->cells[j];
     const float *exact = row->exact + (int64_t)cell * STEP * STEP;
+    Positions at;
     int k;
-    for (k = 0; k < STEP; k++) {
-        at->u[k] = ((exact[k] + 1) * (float)job->source_width - 1) / 2;
-        at->v[k] = ((exact[k + job->exact_stride] + 1) * (float)job->source_height - 1) / 2;
+    if (cell == CELL_CUBIC) {
+        *u = between(row->lines[0] + j % CHUNK), *v = between(row->lines[1] + j % CHUNK);
+        return;
     }
+    for (k = 0; k < STEP; k++) {
+        at.u[k] = ((exact[k] + 1) * (float)job->source_width - 1) / 2;
+        at.v[k] = ((exact[k + job->exact_stride] + 1) * (float)job->source_height - 1) / 2;
+    }
+    *u = load8(at.u), *v = load8(at.v);
 }
 
 NOT_INLINE void grid_positions(const Job *job, int64_t b, int64_t y, int64_t x, Positions *at) {
@@ -1283,9 +1324,17 @@ INLINE void row(Span span, int64_t b, int64_t y, int type, int mode, int layout)
             const int32_t cell = lattice.cells[j];
             if (j % CHUNK == 0) lay_chunk(job, &lattice, j);
 #if WIDE
-            if (wide && cell == CELL_CUBIC && left >= 2 * STEP && lattice.cells[j + 1] == CELL_CUBIC && (j + 1) % CHUNK) {
+            if (wide && left >= 2 * STEP && (j + 1) % CHUNK && cell != CELL_EMPTY && lattice.cells[j + 1] != CELL_EMPTY) {
                 const float *lines = lattice.lines[0] + j % CHUNK;
-                const Wide at = {between_wide(lines), between_wide(lines + CHUNK + 8)};
+                Wide at;
+                if (cell == CELL_CUBIC && lattice.cells[j + 1] == CELL_CUBIC) {
+                    at.u = between_wide(lines), at.v = between_wide(lines + CHUNK + 8);
+                } else {
+                    V8 next_u, next_v;
+                    cell_positions(job, &lattice, j, &u, &v);
+                    cell_positions(job, &lattice, j + 1, &next_u, &next_v);
+                    at.u = joined16(u, next_u), at.v = joined16(v, next_v);
+                }
                 if (sixteen(&span, at, type, mode, layout)) {
                     span.result += step;
                     j++;
@@ -1297,14 +1346,7 @@ INLINE void row(Span span, int64_t b, int64_t y, int type, int mode, int layout)
                 show_nothing(&span, type);
                 continue;
             }
-            if (cell == CELL_CUBIC) {
-                u = between(lattice.lines[0] + j % CHUNK);
-                v = between(lattice.lines[1] + j % CHUNK);
-            } else {
-                Positions at;
-                exact_positions(job, &lattice, cell, &at);
-                u = load8(at.u), v = load8(at.v);
-            }
+            cell_positions(job, &lattice, j, &u, &v);
         } else {
             Positions at;
             read_grid(job, b, y, j * STEP, left, &at);
@@ -1312,8 +1354,7 @@ INLINE void row(Span span, int64_t b, int64_t y, int type, int mode, int layout)
             if (wide && left >= 2 * STEP) {
                 Positions next;
                 read_grid(job, b, y, (j + 1) * STEP, left - STEP, &next);
-                const Wide both = {_mm512_insertf32x8(_mm512_castps256_ps512(_mm256_loadu_ps(at.u)), _mm256_loadu_ps(next.u), 1),
-                                   _mm512_insertf32x8(_mm512_castps256_ps512(_mm256_loadu_ps(at.v)), _mm256_loadu_ps(next.v), 1)};
+                const Wide both = {joined16(load8(at.u), load8(next.u)), joined16(load8(at.v), load8(next.v))};
                 if (sixteen(&span, both, type, mode, layout)) {
                     span.result += step;
                     j++;
@@ -1467,7 +1508,7 @@ NOT_INLINE void judge(const float *across, const float *down, float scale, const
     }
 }
 
-/* The cells; how many want exact positions in the image with the most of them */
+/* The cells; how many want exact positions, or may, in the image with the most of them */
 int32_t THIS(classify)(const Classification *given) {
     const int64_t n = given->columns, width = n + 5, area = n + 8;
     const float limit = (float)(given->tolerance * given->tolerance);
@@ -1507,8 +1548,8 @@ int32_t THIS(classify)(const Classification *given) {
             for (j = 0; j < n; j++) {
                 const int sum = sums[j] + sums[j + 1] + sums[j + 2] + sums[j + 3];
                 /* what is not a number is not below the limit */
-                const int exact = (sum < 16) | ((near[j] > 0) & !(missed[j] <= limit));
-                cells[i * n + j] = sum == 0 ? CELL_EMPTY : exact ? 0 : CELL_CUBIC;
+                const int doubt = (near[j] > 0) & !(missed[j] <= limit);
+                cells[i * n + j] = sum == 0 ? CELL_EMPTY : sum < 16 ? 0 : doubt ? CELL_DOUBT : CELL_CUBIC;
             }
         }
         /* a pixel at the rim may say that the nodes do not tell all */
@@ -1517,7 +1558,7 @@ int32_t THIS(classify)(const Classification *given) {
 #define LOOK(cell) \
     do { \
         int32_t *at = cells + (cell); \
-        if (*at != 0 && (*rim != 0) != (*at == CELL_CUBIC)) *at = 0; \
+        if (*at != 0 && (*rim != 0) != (*at != CELL_EMPTY)) *at = 0; \
         rim++; \
     } while (0)
         for (k = 0; k < given->width; k++) LOOK(k / STEP);
@@ -1525,7 +1566,7 @@ int32_t THIS(classify)(const Classification *given) {
         for (k = 0; k < given->height; k++) LOOK(k / STEP * n);
         for (k = 0; k < given->height; k++) LOOK(k / STEP * n + last);
         int32_t todo = 0;
-        for (k = 0; k < given->rows * n; k++) todo += cells[k] == 0;
+        for (k = 0; k < given->rows * n; k++) todo += cells[k] == 0 || cells[k] == CELL_DOUBT;
         most = todo > most ? todo : most;
     }
     return most;

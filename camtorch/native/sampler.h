@@ -17,7 +17,8 @@ enum { ZEROS, BORDER, REFLECTION };
 
 enum { SCRATCH = 25 };
 enum { STEP = 8 }; /* pixels between the nodes of a lattice */
-enum { CELL_NEXT = -3, CELL_EMPTY, CELL_CUBIC }; /* to be computed next, and others that have no place in `exact` */
+/* cubics may miss there; to be computed next; and others that have no place in `exact` */
+enum { CELL_DOUBT = -4, CELL_NEXT, CELL_EMPTY, CELL_CUBIC };
 
 typedef struct {
     /* images (b, c, y, x) and results, in elements; a source image may serve all results (stride 0) */
@@ -58,7 +59,8 @@ typedef struct {
     int64_t count, rows, columns, height, width;
     double source_height, source_width, tolerance;
     int32_t padding; /* that is to be sampled with: what lies off the image then matters, or does not */
-    int32_t *cells; /* (b, rows, columns): CELL_EMPTY, CELL_CUBIC, or 0 where positions are to be exact */
+    /* (b, rows, columns): CELL_EMPTY, CELL_CUBIC, CELL_DOUBT, or 0 where positions are to be exact */
+    int32_t *cells;
     float *scratch; /* SCRATCH (columns + 8), and of lattices as often as there are */
 } Classification;
 

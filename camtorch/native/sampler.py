@@ -15,8 +15,8 @@ from camtorch._threads import spread, thread_count
 from camtorch.native import memory
 from camtorch.native.library import library
 
-EMPTY, CUBIC, TODO = -2, -1, 0
-"""Cells of a lattice: one that shows nothing, one between whose nodes lie cubics, one that wants exact positions."""
+DOUBT, EMPTY, CUBIC, TODO = -4, -2, -1, 0
+"""Cells of a lattice: whose cubics may miss, that shows nothing, between whose nodes lie cubics, that wants positions."""
 
 _MODES = {"nearest": 0, "bilinear": 1, "bicubic": 2}
 PADDINGS = {"zeros": 0, "border": 1, "reflection": 2}
@@ -154,7 +154,7 @@ def classify(
     tolerance: float,
     padding: str,
 ) -> tuple[Tensor, int]:
-    """Which cells of a lattice are `EMPTY`, `CUBIC` or `TODO`. There is a library.
+    """Which cells of a lattice are `EMPTY`, `CUBIC`, `DOUBT` or `TODO`. There is a library.
 
     Args:
         nodes: (B, 2, n + 5, m + 5) of float32, positions; the last two dims without gaps.
@@ -167,7 +167,7 @@ def classify(
         padding: "zeros", "border" or "reflection", of what is to be sampled.
 
     Returns:
-        (B, n, m) int32, contiguous; and how many cells are `TODO` in the image with the most of them.
+        (B, n, m) int32, contiguous; and how many cells are `TODO` or in `DOUBT` in the image with the most of them.
     """
     native = library()
     assert native is not None  # who calls has looked

@@ -15,7 +15,7 @@ from camtorch._threads import on_one_thread
 from camtorch._tracing import in_graph, in_transform, is_concrete, is_eager, may_look
 from camtorch.camera import Camera
 from camtorch.native.library import native_available
-from camtorch.native.sampler import CUBIC, EMPTY, TODO, classify
+from camtorch.native.sampler import CUBIC, DOUBT, EMPTY, TODO, classify
 from camtorch.projection.compiled import POSITIONS, Between
 from camtorch.rotations import turn
 from camtorch.warp.moving import between
@@ -335,7 +335,7 @@ def on_lattice(
         return None
     computed = like.new_empty(2, 0, STEP, STEP)
     if most:
-        computed = _compute(exact, rows.start, cells, cells == TODO, like)
+        computed = _compute(exact, rows.start, cells, (cells == TODO) | (cells == DOUBT), like)
     return Lattice(lattice, cells, computed, (height, width), seam)
 
 
