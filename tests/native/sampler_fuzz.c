@@ -429,7 +429,8 @@ static void classify_any(const Variant *all, int n) {
         given.scratch = allocated(25 * (given.columns + 8) * 4);
         all[k].classify(&given);
         for (i = 0; i < given.count * given.rows * given.columns; i++)
-            if (given.cells[i] != CELL_EMPTY && given.cells[i] != CELL_CUBIC && given.cells[i] != 0) abort();
+            if (given.cells[i] != CELL_EMPTY && given.cells[i] != CELL_CUBIC && given.cells[i] != CELL_DOUBT && given.cells[i])
+                abort();
         free(given.cells), free(given.scratch);
     }
     free(nodes), free(mapped), free(rim);
