@@ -41,6 +41,7 @@ if TYPE_CHECKING:
 
 _FEW = 2 / 3  # of an image that shows something: with less than that, on average, a warning says so
 _TRIES = 8
+_CPU = torch.device("cpu")
 
 
 @dataclass(frozen=True)
@@ -115,21 +116,20 @@ def draw(
     if not (generator is None or isinstance(generator, torch.Generator)):
         raise TypeError(f"draw: generator must be a torch.Generator, or None; got {shown(generator)}")
     rows = min(count, 1) if same else count
-    device = generator.device if generator is not None else torch.device("cpu")
+    device = _CPU if generator is None else generator.device
     gate: Any = torch.rand(rows, generator=generator, device=device) < p if 0 < p < 1 else None
-    total = rows * sum(interval.size or 1 for interval in ranges.values())
+    sizes = [rows * (interval.size or 1) for interval in ranges.values()]
     # in float64, so that what is drawn is what every precision sees
-    shares: Any = torch.rand(total, generator=generator, dtype=torch.float64, device=device)
+    shares: Any = torch.rand(sum(sizes), generator=generator, dtype=torch.float64, device=device)
     if device.type == "cpu" and not torch.compiler.is_compiling():
-        gate, shares = np.array([p >= 1] * rows, dtype=bool) if gate is None else gate.numpy(), shares.numpy()
+        gate, shares = np.full(rows, p >= 1) if gate is None else gate.numpy(), shares.numpy()
     elif gate is None:
         gate = torch.full((rows,), p >= 1, device=device)
-    values, start = {"apply": gate}, 0
-    for name, interval in ranges.items():
-        shape = (rows,) if interval.size is None else (rows, interval.size)
-        end = start + math.prod(shape)
-        values[name] = interval.low + (interval.high - interval.low) * shares[start:end].reshape(shape)
-        start = end
+    values, end = {"apply": gate}, 0
+    for (name, interval), size in zip(ranges.items(), sizes, strict=True):
+        value = interval.low + (interval.high - interval.low) * shares[end : end + size]
+        values[name] = value if interval.size is None else value.reshape(rows, interval.size)
+        end += size
     return values if rows == count else {name: value[[0] * count] for name, value in values.items()}
 
 

@@ -16,7 +16,7 @@ from camtorch.native import memory
 from camtorch.native.library import library
 
 DOUBT, EMPTY, CUBIC, TODO = -4, -2, -1, 0
-"""Cells of a lattice: whose cubics may miss, that shows nothing, between whose nodes lie cubics, that wants positions."""
+"""Cells of a lattice: whose cubics may miss, showing nothing, between whose nodes lie cubics, wanting positions."""
 
 _MODES = {"nearest": 0, "bilinear": 1, "bicubic": 2}
 PADDINGS = {"zeros": 0, "border": 1, "reflection": 2}

@@ -541,10 +541,12 @@ class Between:
     """Of each as many, or one for all."""
     is_batch: bool
     """Whether pixels have a batch dim."""
+    dtype: torch.dtype
 
     def __init__(self, start: Native, end: Native, turns: Tensor | None, size: tuple[int, int], is_batch: bool):
         """turns: (3, 3) or (C, 3, 3), of their dtype. size: (height, width) of the others' image."""
         self._start, self._end, self._turns, self.is_batch = start, end, turns, is_batch
+        self.dtype = start.dtype
         count, strides = (1, (0, 0)) if turns is None else (turns.numel() // 9, turns.stride())
         self.cameras = max(start.cameras, end.cameras, count)
         if start.plan.has_factor and start.struct.table is None:
@@ -552,6 +554,11 @@ class Between:
         self._size = size
         by_camera = strides[0] if count > 1 else 0
         self._given = start.pointer, end.pointer, _address(turns), by_camera, *strides[-2:], self.cameras
+
+    def back(self, size: tuple[int, int]) -> Between:
+        """From the others to these, whose image is of that size."""
+        turns = None if self._turns is None else self._turns.mT
+        return Between(self._end, self._start, turns, size, self.is_batch)
 
     def rows(self, pixels: Tensor, form: int) -> tuple[Tensor, Tensor]:
         """Pixels (C or 1, N, 2) to (C, N, 2), and valid (C, N).

@@ -7,6 +7,7 @@ from torch import Tensor
 
 from camtorch._arguments import Numbers
 from camtorch._evaluation import compiled_of
+from camtorch._tracing import is_eager
 from camtorch.camera import Camera
 from camtorch.projection.compiled import ON_IMAGE, PIXELS, Between
 from camtorch.rotations import turn
@@ -34,13 +35,23 @@ def between(start: Camera, end: Camera, rotation: Tensor | None, like: Tensor) -
 
 
 def moved_pixels(
-    start: Camera, end: Camera, rotation: Tensor | None, pixels: Numbers, on_image: bool = False
+    start: Camera,
+    end: Camera,
+    rotation: Tensor | None,
+    pixels: Numbers,
+    on_image: bool = False,
+    known: Between | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Pixels (B, *N, 2), or (*N, 2), of one camera to another's, (-1, -1) without a place there, and whether they have;
     with `on_image`, whether that is on the image. Other arguments as of `between`.
+
+    known: the compiled geometry from `end` to `start`, of cameras that are not to change.
     """
     if isinstance(pixels, Tensor) and pixels.ndim > 0 and pixels.shape[-1] == 2:
-        ready = between(start, end, rotation, pixels)
+        if known is not None and pixels.dtype == known.dtype and is_eager(pixels) and not pixels.requires_grad:
+            ready: Between | None = known.back(end._size_for("Warp"))
+        else:
+            ready = between(start, end, rotation, pixels)
         if ready is not None and ((pixels.ndim > 1 and pixels.shape[0] == ready.cameras) or not ready.is_batch):
             moved, valid = ready.rows(pixels.reshape(ready.cameras, -1, 2), ON_IMAGE if on_image else PIXELS)
             return moved.view(pixels.shape), valid.view(pixels.shape[:-1])
