@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import ClassVar
 
 import torch
@@ -45,6 +45,8 @@ class CAHVOR(Camera):
     odd_in_y = frozenset({"beta"})
     quarter_turn = None
     special_cases: ClassVar[tuple[tuple[str, tuple[str, ...]], ...]] = (("pinhole", ()),)
+    # without distortion no axis is better than another, and a search does not begin
+    fit_starts: ClassVar[tuple[Mapping[str, float], ...]] = ({"r1": -0.1}, {"r1": 0.1})
     # beside the focal lengths it would be known by higher powers alone
     fit_bounds: ClassVar[dict[str, tuple[float, float] | None]] = {"r0": None}
     defined_text = "alpha, beta within pi / 2, r0 > -1"

@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from cameras import DISTINCT, KEYS, one, slow_unless
+from cameras import DISTINCT, KEYS, OFF_AXIS, one, slow_unless
 
 import camtorch as ct
 
@@ -16,8 +16,8 @@ def seen_by(camera, step=37):
     return pixels, torch.where(valid[..., None], rays.detach(), torch.nan)
 
 
-# the angles of a table are its own; fits of a lens about another axis start from the camera's, and may end beside it
-OWN = {"tabulated", "cahvor", "cahvore"}
+# the angles of a table are its own
+OWN = {"tabulated"}
 
 
 @pytest.mark.parametrize("key", slow_unless(DISTINCT.__contains__, [key for key in KEYS if key not in OWN]))
@@ -27,7 +27,8 @@ def test_a_camera_is_found_by_its_rays(key):
         camera = type(camera)(camera.intrinsics, camera.distortion, image_size=(480, 640)).double()
     pixels, rays = seen_by(camera)
     found = ct.fit(key, pixels, rays * 2, image_size=camera.image_size, count=camera.distortion.shape[-1])
-    assert float(found.rms) < 1e-3
+    # a CAHVOR's r0 stays 0, and the others make up for it
+    assert float(found.rms) < (0.05 if key in OFF_AXIS else 1e-3)
 
 
 def test_a_batch_of_rays_makes_a_batch_of_cameras():
