@@ -183,6 +183,8 @@ def no_camera(value: object) -> str:
         return f"{type(value).__name__}, {value._way_to_cameras()}"  # type: ignore[attr-defined]
     if isinstance(value, os.PathLike) or (isinstance(value, str) and os.path.splitext(value)[1]):
         return f"{type(value).__name__}; ct.load({os.fspath(value)!r:.60}).camera is that of a file"
+    if tuple(getattr(value, "shape", ()))[-2:] == (3, 3):
+        return f"{type(value).__name__} (3, 3); ct.BrownConrady.from_matrix(K, distortion) makes a camera of a matrix K"
     return type(value).__name__
 
 
@@ -421,7 +423,9 @@ def as_points(
         )
     takes = f"{name} must be (*B, *N, {size}) with batch dims *B = {tuple(batch)}"
     if values.ndim == 0 or values.shape[-1] != size:
-        raise ValueError(f"{owner}: {takes}; got shape {tuple(values.shape)}")
+        turned = values.ndim > 1 and values.shape[-2] == size
+        hint = f". One in each column, they go in as {name}.T" if turned else ""
+        raise ValueError(f"{owner}: {takes}; got shape {tuple(values.shape)}{hint}")
     lead, rest = values.shape[: len(batch)], values.shape[len(batch) : -1]
     try:
         if len(lead) < len(batch) or values.ndim <= len(batch):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -19,6 +20,7 @@ from camtorch._arguments import (
     check_devices,
     check_radians,
     fails,
+    is_predicted,
     values_of,
 )
 from camtorch._module import BatchedModule, learning_as, remade, typed_as
@@ -183,7 +185,7 @@ def head_angles(pose: Extrinsics | Numbers) -> Tensor:
         if matrix.shape[-2:] not in ((3, 3), (4, 4)):
             raise ValueError(
                 "head_angles: pose must be Extrinsics, a Pose, (..., 4, 4) or (..., 3, 3); "
-                f"got shape {tuple(matrix.shape)}"
+                f"got shape {tuple(matrix.shape)}. A rotation vector goes in as ct.rotation_matrix(rvec)"
             )
         matrix = matrix[..., :3, :3]
         check_rotation(matrix, "pose", "head_angles")
@@ -204,9 +206,14 @@ def head_rotation(angles: Numbers) -> Tensor:
     """Rotations (..., 3, 3), camera from head, of pitch, yaw and roll (..., 3) in radians: `head_angles` the other way.
 
     Raises:
-        TypeError: no numbers. ValueError: another shape.
+        TypeError: no numbers. ValueError: another shape, plain angles of more than a turn, which are degrees.
     """
     angles = as_coordinates(angles, "angles", 3, "head_rotation", means=", pitch, yaw and roll in radians")
+    if not is_predicted(angles) and fails(~(angles.abs() > 2 * math.pi * (1 + 1e-6))):
+        raise ValueError(
+            f"head_rotation: angles must be radians; {float(angles.abs().max()):.4g} seems to be degrees, which "
+            "torch.deg2rad() or math.radians() converts"
+        )
     angles = angles.to(torch.promote_types(angles.dtype, torch.float32))
     (cp, cy, cr), (sp, sy, sr) = angles.cos().unbind(-1), angles.sin().unbind(-1)
     rows = (

@@ -69,6 +69,14 @@ class Windshield(BatchedModule):
         for name, values in given.items():
             self.hold(name, values, (*batch, values.shape[-1]))
 
+    def extra_repr(self) -> str:
+        """The coefficients of one, and how many there are of a batch."""
+        if self.batch_shape:
+            return f"batch_shape={tuple(self.batch_shape)}"
+        return ", ".join(
+            f"{name}={[float(f'{x:.6g}') for x in getattr(self, name).tolist()]}" for name in self.tensor_names
+        )
+
     @property
     def batch_shape(self) -> torch.Size:
         """*B, the batch dims of the coefficients."""

@@ -73,6 +73,7 @@ def test_gradients():
         (torch.diag(torch.tensor([1.0, 1, -1])), ValueError, "must hold rotation matrices"),
         (torch.full((3, 3), torch.nan), ValueError, "pose"),
         ("left", TypeError, "pose must be numbers"),
+        (torch.zeros(3), ValueError, r"ct\.rotation_matrix\(rvec\)"),
     ],
 )
 def test_bad_poses(pose, error, says):
@@ -83,3 +84,5 @@ def test_bad_poses(pose, error, says):
 def test_bad_angles():
     with pytest.raises(ValueError, match=r"head_rotation: angles must be \(..., 3\), pitch, yaw"):
         ct.head_rotation([0.0, 1.0])
+    with pytest.raises(ValueError, match="must be radians; 30 seems to be degrees"):
+        ct.head_rotation([-30.0, 20.0, 5.0])

@@ -30,6 +30,8 @@ WRONG = [
     (lambda: CAMERA.project([LEAF] * 3), TypeError, r"points is a list of tensors that require grad; torch.stack"),
     (lambda: CAMERA.project(torch.ones(5, 3).to_sparse()), TypeError, r"points must be a dense tensor; got"),
     (lambda: CAMERA.project(META), ValueError, r"points must be on cpu, as KannalaBrandt; got meta"),
+    (lambda: CAMERA.project(np.ones((3, 7))), ValueError, r"shape \(3, 7\)\. One in each column, they .* points\.T"),
+    (lambda: ct.Warp(np.eye(3), CAMERA), TypeError, r"got ndarray \(3, 3\); ct\.BrownConrady\.from_matrix\(K, "),
     (lambda: CAMERA.contains(torch.ones(3)), ValueError, r"pixels must be \(..., 2\); got shape \(3,\)"),
     (lambda: MIXED.explain(7), ValueError, r"Mixed: points must be \(\*B, \*N, 3\).* got shape \(\)"),
     (lambda: WARP.transform_rays(torch.ones(2)), ValueError, r"Warp: rays must be \(B, \*N, 3\); got shape \(2,\)"),
