@@ -61,7 +61,7 @@ def read(path: str, content: bytes) -> Rig:
             )
         found = sensor.findall("calibration")
         best = next((one for one in reversed(found) if one.get("class") == "adjusted"), found[-1])
-        cameras[name] = _camera(Record(path, {"type": sensor.get("type"), **_values(best)}, f"sensor {name:.60}"))
+        cameras[name] = _camera(Record(path, {"type": sensor.get("type"), **_members(best)}, f"sensor {name:.60}"))
     return _posed(path, chunks[0], cameras, dict(zip((sensor.get("id") for sensor in sensors), names, strict=True)))
 
 
@@ -82,8 +82,11 @@ def _parse(path: str, content: bytes) -> ElementTree.Element:
 
 def _values(element: ElementTree.Element) -> Any:
     """The text of an element, or its attributes and children by their names."""
-    text = (element.text or "").strip()
-    return text or {**element.attrib, **{child.tag: _values(child) for child in element}}
+    return (element.text or "").strip() or _members(element)
+
+
+def _members(element: ElementTree.Element) -> dict[str, Any]:
+    return {**element.attrib, **{child.tag: _values(child) for child in element}}
 
 
 def _names(path: str, elements: list[ElementTree.Element]) -> list[str]:

@@ -112,6 +112,11 @@ def test_sensors_and_images_of_metashape_that_are_called_the_same_get_their_ids(
     assert rig.images == {"000001-01_00001.JPG 0": "M3M (12.29mm) 0", "000001-01_00001.JPG 1": "M3M (12.29mm) 1"}
 
 
+def test_text_between_the_elements_of_metashape_says_nothing(tmp_path):
+    rig = ct.load(changed(tmp_path, "metashape_cameras.xml", ('"adjusted">', '"adjusted">x')))
+    assert str(rig) == str(load("metashape_cameras.xml"))
+
+
 @pytest.mark.parametrize(
     ("name", "old", "new", "reason"),
     [
