@@ -132,7 +132,14 @@ def _pixels(path: Path, image: Image.Image) -> Tensor:
 
 
 def as_jpeg(image: Any, size: tuple[int, int], name: str, owner: str, side: int, quality: int) -> bytes:
-    """A JPEG file of an image of any kind that users pass, its longer side no more than `side` pixels.
+    """A JPEG file of what `as_photograph` makes of an image."""
+    file = io.BytesIO()
+    as_photograph(image, size, name, owner, side).save(file, "JPEG", quality=quality, optimize=True)
+    return file.getvalue()
+
+
+def as_photograph(image: Any, size: tuple[int, int], name: str, owner: str, side: int) -> Image.Image:
+    """Grey or RGB in 8 bits, of an image of any kind that users pass, its longer side no more than `side` pixels.
 
     Raises:
         ValueError: its (height, width) is not `size`. OSError: it cannot be read.
@@ -158,9 +165,8 @@ def as_jpeg(image: Any, size: tuple[int, int], name: str, owner: str, side: int,
         image = Image.fromarray((255 * values / max(values.max(), 1e-9)).clip(0, 255).astype(np.uint8))
     image = image.convert("L" if image.mode in ("1", "L", "LA") else "RGB")
     image.thumbnail((side, side), reducing_gap=2.0)
-    file = io.BytesIO()
-    image.save(file, "JPEG", quality=quality, optimize=True)
-    return file.getvalue()
+    found: Image.Image = image
+    return found
 
 
 def _from_array(image: Any) -> Image.Image:
