@@ -712,7 +712,8 @@ const Viewer = (() => {
     const rows = [
       ...["fx", "fy"].map((name, i) => [name, "intrinsics", i, state.intrinsics[i] * 0.3, state.intrinsics[i] * 2.5]),
       ...["cx", "cy"].map((name, i) => [name, "intrinsics", i + 2, state.intrinsics[i + 2] - side / 3, state.intrinsics[i + 2] + side / 3]),
-      ...names.map((name, i) => [name, "distortion", i, ...rangeOf(name, state.distortion[i])]),
+      // the control points of a surface are too many to be moved one by one
+      ...(names.length > 60 ? [] : names).map((name, i) => [name, "distortion", i, ...rangeOf(name, state.distortion[i])]),
     ];
     $("sliders").replaceChildren(
       ...rows.flatMap(([name, kind, index, low, high]) => {
@@ -1106,7 +1107,9 @@ const Viewer = (() => {
   }
 
   async function begin() {
-    const keys = Object.keys(DATA.models).filter((key) => Formulas.MODELS.includes(key));
+    const own = DATA.camera; // a splined one may have a grid that no preset has
+    if (own) DATA.models[own.model] ??= { ...own, counts: [own.distortion.length] };
+    const keys = Object.keys(DATA.models).filter((key) => Formulas.MODELS.includes(key.split(":")[0]));
     const options = () => keys.map((key) => new Option(DATA.models[key].class, key));
     $("model").replaceChildren(...options());
     $("models").replaceChildren(...options());

@@ -467,6 +467,58 @@ const Formulas = (() => {
     isIdentity: d === 0 && e === 0,
   });
 
+  function surface(controls, { columns, rows, order }, cells) {
+    // a uniform B-spline surface that is added to the plane; control point (i, j) at controls[2 (j columns + i)]
+    const sizes = [columns, rows], half = sizes.map((size) => (size - order) / 2);
+    const weights = (x) => {
+      if (order === 2)
+        return [[(4 * x - 4) * x + 1, 6 - 8 * x * x, (4 * x + 4) * x + 1].map((w) => w / 8), [x - 0.5, -2 * x, x + 0.5]];
+      const y = 1 - x;
+      return [
+        [y * y * y, (3 * x - 6) * x * x + 4, ((3 - 3 * x) * x + 3) * x + 1, x * x * x].map((w) => w / 6),
+        [-y * y / 2, (3 * x - 4) * x / 2, (1 + (2 - 3 * x) * x) / 2, x * x / 2],
+      ];
+    };
+    const place = (w, axis) => {
+      const position = w * cells + (sizes[axis] - 1) / 2;
+      const cell = Math.min(Math.max(Math.floor(position + (order === 2 ? 0.5 : 0)), 1), sizes[axis] - order);
+      return [cell - 1, ...weights(position - cell)];
+    };
+    const at = (a, b) => {
+      const [i, along, byA] = place(a, 0), [j, down, byB] = place(b, 1), sums = [0, 0, 0, 0, 0, 0];
+      for (let y = 0; y <= order; y++)
+        for (let x = 0; x <= order; x++) {
+          const from = 2 * ((j + y) * columns + i + x);
+          [along[x] * down[y], byA[x] * down[y] * cells, along[x] * byB[y] * cells].forEach((w, which) => {
+            sums[2 * which] += w * controls[from];
+            sums[2 * which + 1] += w * controls[from + 1];
+          });
+        }
+      const [u, v, ua, va, ub, vb] = sums;
+      // a little behind the edge, so that what lies on it is on it in any rounding
+      const margin = Math.min(half[0] + 1e-4 - Math.abs(a * cells), half[1] + 1e-4 - Math.abs(b * cells));
+      return [a + u, b + v, 1 + ua, ub, va, 1 + vb, margin];
+    };
+    const start = (u, v) => {
+      let [a, b] = [u, v];
+      for (let i = 0; i < 3; i++) {
+        [a, b] = [a, b].map((w, axis) => Math.min(Math.max(w, -half[axis] / cells), half[axis] / cells));
+        const [x, y] = at(a, b);
+        [a, b] = [a + u - x, b + v - y];
+      }
+      return [a, b];
+    };
+    return { at, start, isIdentity: false };
+  }
+
+  function splined(k, text = "order=3,columns=10,rows=8,fov_x=160") {
+    const grid = Object.fromEntries(text.split(",").map((part) => part.split("=")).map(([name, value]) => [name, Number(value)]));
+    const { columns, rows, order, fov_x: width } = grid, edge = 2 * Math.tan((width * Math.PI) / 720);
+    const cells = (columns - order) / (2 * edge), end = hypot(edge, (rows - order) / 2 / cells) * (1 + 1e-3);
+    if (k.length !== 2 * columns * rows) throw new Error(`A surface of ${columns} x ${rows} control points has two numbers of each.`);
+    return [{ ...unified({ alpha: 0.5 }), end, radii: (count) => radiiOf(count, end, end) }, surface(k, grid, cells)];
+  }
+
   function lensAt(stages, a, b) {
     // as a stage's, with the orientation, positive where all of it is regular, in place of the margin
     let u = a, v = b, ua = 1, ub = 0, va = 0, vb = 1, orientation = Infinity;
@@ -628,6 +680,7 @@ const Formulas = (() => {
         planar({ radial: radiusTable(angles, k.slice(k.length / 2)) }),
       ];
     },
+    splined,
     cahvor: (k) => about(perspective(), k),
     cahvore: (k) => about(linearity(k[5]), k.slice(0, 5)),
     equirectangular: () => [sphere()],
@@ -654,7 +707,8 @@ const Formulas = (() => {
   /** A camera: its model's key, [fx, fy, cx, cy] in pixels, coefficients. Throws an Error that says what is wrong. */
   class Camera {
     constructor(model, intrinsics, distortion = []) {
-      if (!Object.hasOwn(MODELS, model)) throw new Error(`This page has no formulas of the model ${model}.`);
+      const [family, variant] = model.split(":"); // of splined lenses, the grid
+      if (!Object.hasOwn(MODELS, family) || (variant && family !== "splined")) throw new Error(`This page has no formulas of the model ${model}.`);
       const [fx, fy] = intrinsics;
       if (intrinsics.length !== 4 || ![...intrinsics, ...distortion].every(Number.isFinite))
         throw new Error("All numbers of a camera must be finite.");
@@ -662,7 +716,7 @@ const Formulas = (() => {
       const defined = DEFINED[model]?.(distortion) ?? true;
       if (defined !== true) throw new Error(`No camera has such coefficients: ${defined}.`);
       Object.assign(this, { model, intrinsics, distortion });
-      const [chart, ...stages] = MODELS[model](distortion);
+      const [chart, ...stages] = MODELS[family](distortion, variant);
       this.chart = chart;
       const some = stages.filter((stage) => !stage.isIdentity);
       if (!some.length) this.lens = null;

@@ -19,10 +19,12 @@ import numpy as np
 import torch
 
 from camtorch._arguments import check_path
+from camtorch._module import model_of
 from camtorch._photographs import as_jpeg
 from camtorch.camera import MODELS, Camera
 from camtorch.io.writing import replacing
 from camtorch.lenses.collection import columns
+from camtorch.models import Splined
 from camtorch.projection.explanation import unusable
 
 if TYPE_CHECKING:
@@ -96,7 +98,7 @@ def _described(camera: Camera) -> dict[str, Any]:
     if camera.batch_shape:
         shape = tuple(camera.batch_shape)
         raise ValueError(f"write_viewer: camera must be a single one, as camera[0] is; got a batch {shape}")
-    if camera.key not in models():
+    if camera.key not in models() and not (isinstance(camera, Splined) and camera.key.startswith("splined:order")):
         raise ValueError(
             f"write_viewer: the page has no formulas of {camera.key or type(camera).__name__}; it knows "
             f"{', '.join(sorted(models()))}. camera.convert(...) makes one of these of it"
@@ -108,6 +110,7 @@ def _described(camera: Camera) -> dict[str, Any]:
         raise ValueError(f"write_viewer: this camera has no pixels: {trouble[0]}: {trouble[1]}")
     return {
         "model": camera.key,
+        "class": _constructor(model_of(camera)),
         "intrinsics": _numbers(camera.intrinsics),
         "distortion": _numbers(camera.distortion),
         "names": list(camera.distortion_names)[: len(distortion)],
@@ -127,17 +130,24 @@ def models() -> dict[str, dict[str, Any]]:
     known = {}
     for key, preset in json.loads(_file("presets.json")).items():
         kind = MODELS[key]
-        names = {n: kind.names_of(n) for n in range(1, _MOST_COUNT + 1)} if kind.distortion_names else {}
-        counts = [n for n, of_count in names.items() if of_count]
+        counts = (*range(1, _MOST_COUNT + 1), kind.default_count) if kind.distortion_names else ()
+        names = {n: of_count for n in counts if (of_count := kind.names_of(n))}
         known[key] = {
-            "class": kind.__name__,
+            "class": _constructor(kind),
             # the table's angles come before its radii, whatever their number: the page names those itself
-            "names": list(names[counts[-1]] or ()) if counts else [],
-            "counts": counts or [0],
+            "names": list(names[max(names)]) if names else [],
+            "counts": list(names) or [0],
             "distortion": [],
             **preset,
         }
     return known
+
+
+def _constructor(kind: type[Camera]) -> str:
+    """In `ct`; of splined lenses with their grid."""
+    if not issubclass(kind, Splined) or kind is Splined:
+        return kind.__name__
+    return f"Splined.with_grid(columns={kind.columns}, rows={kind.rows}, fov_x={kind.fov_x}, order={kind.order})"
 
 
 @cache

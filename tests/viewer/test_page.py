@@ -185,6 +185,18 @@ def test_a_camera_with_its_photograph_is_what_it_opens_with(opened, tmp_path):
     assert tab.inner_text("#message") == ""
 
 
+def test_a_surface_of_a_grid_of_its_own_is_what_it_opens_with(opened):
+    grid = ct.Splined.with_grid(columns=9, rows=7, fov_x=150)
+    camera = fisheye().convert(grid).camera
+    tab = opened(camera)
+    assert "ct.Splined.with_grid(columns=9, rows=7, fov_x=150, order=3)([130" in tab.inner_text("#python")
+    assert tab.input_value("#model") == camera.key
+    assert tab.locator("#sliders input[type=range]").count() == 4
+    loaded = read(*tab.evaluate("Viewer.file('camtorch (JSON)')"))
+    assert type(loaded) is grid
+    torch.testing.assert_close(loaded.distortion, camera.distortion, rtol=0, atol=0)
+
+
 def test_a_photograph_of_another_size_scales_the_lens(opened, tmp_path):
     photograph(tmp_path / "double.png", 480, 640)
     photograph(tmp_path / "square.png", 300, 300)
