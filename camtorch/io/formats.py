@@ -28,7 +28,6 @@ from camtorch.io import (
     nuscenes,
     ocamcalib,
     opencv,
-    openmvg,
     rays,
     ros,
     usda,
@@ -55,7 +54,6 @@ _BY_KEYS: tuple[KeyFormat, ...] = (
     woodscape,
     gyroflow,
     camodocal,
-    openmvg,
     opencv,
 )
 
@@ -75,7 +73,7 @@ def load(path: str | os.PathLike[str], format: str | None = None) -> Rig:
 
     Args:
         path: a file of OpenCV, ROS, Kalibr, COLMAP, Nerfstudio, Project Aria, Basalt, mrcal, ncore, OCamCalib,
-            WoodScape, Gyroflow, camodocal, Metashape, nuScenes, OpenMVG or camtorch; an archive of
+            WoodScape, Gyroflow, camodocal, Metashape, nuScenes or camtorch; an archive of
             `numpy.savez(path, K=K, D=D)`; or the folder of a COLMAP or Nerfstudio reconstruction. COLMAP's images
             beside the cameras are read with them.
         format: its format, one of the keys of `camtorch.save`; found from content and name if left out.

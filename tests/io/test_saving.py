@@ -56,7 +56,6 @@ LOST = [
     ("metashape", camera(distortion=[0.1] * 8), "Metashape has 5 for brown_conrady, so k4 k5 k6 would be lost"),
     ("metashape", camera("thin_prism_fisheye", [0.1] * 8), "Metashape has 6 for thin_prism_fisheye, so sx1 sy1 would"),
     ("nuscenes", camera("pinhole"), "cameras.json: format: read only"),
-    ("openmvg", camera("pinhole"), "cameras.json: format: read only"),
     ("kalibr", camera(core=[CORE] * 2, distortion=[[0.0] * 4] * 2), r"a batch of cameras \(2,\)"),
 ]
 
@@ -74,7 +73,7 @@ def test_values_that_are_not_finite_are_not_written(tmp_path):
     with torch.no_grad():
         broken.distortion[0] = torch.nan
     for format, suffix in SUFFIXES.items():
-        if format not in ("aria", "nuscenes", "openmvg"):  # the last two are read only
+        if format not in ("aria", "nuscenes"):  # the last one is read only
             with pytest.raises(ct.CameraFileError, match="not finite"):
                 ct.save(broken, tmp_path / f"x{suffix}", format)
 
