@@ -132,7 +132,7 @@ def save(rig: Rig | Camera, path: str | os.PathLike[str], format: str | None = N
         path: the file, which may be a link: then what it points to is replaced. With COLMAP it may be a folder, where
             poses go to an images file beside the cameras; with Nerfstudio one that exists.
         format: "opencv", "ros", "kalibr", "colmap", "nerfstudio", "aria", "basalt", "mrcal", "ncore",
-            "ocamcalib", "woodscape", "gyroflow", "camodocal", "metashape" or "camtorch"; written only, "usda", "carla",
+            "ocamcalib", "woodscape", "gyroflow", "camodocal" or "camtorch"; written only, "usda", "carla",
             "blender" or "rays". If left out: the format that the rig was loaded from if its files end like this one,
             else what the name says (`transforms.json`, `camchain.yaml`, `camera_info.yaml`, `.cameramodel`, `.xml`,
             `cameras.txt`, `.bin`, `.usda`, `.exr`), else camtorch's own for `.json`.
