@@ -173,6 +173,19 @@ def test_what_is_refused(name, old, new, reason, tmp_path):
         ct.load(changed(tmp_path, name, (old, new)))
 
 
+def test_a_windshield_of_ncore_stands_before_its_camera(tmp_path):
+    h, v = [0.001, 1.002, 0.003], [-0.002, 0.0, 0.998]
+    shield = json.dumps({"horizontal_poly": h, "vertical_poly": v})
+    path = changed(tmp_path, "ncore_ftheta.json", ('distortion_parameters": null', f'distortion_parameters": {shield}'))
+    found = ct.load(path).camera
+    expected = load("ncore_ftheta.json").camera.behind(ct.Windshield(np.array(h), np.array(v)))
+    assert torch.equal(found.project(float64(POINT))[0], expected.project(float64(POINT))[0])
+    assert not any(parameter.requires_grad for parameter in found.parameters())
+    path.write_text(path.read_text().replace("[0.001, 1.002, 0.003]", "[0.001, 1.002]"))
+    with pytest.raises(ct.CameraFileError, match=r"external_distortion_parameters: .*horizontal must be"):
+        ct.load(path)
+
+
 def test_kitti_360_is_the_mei_camera_of_camodocal():
     xi, k1, k2, p1, p2 = load("camodocal_kitti360.yaml").camera.distortion.tolist()
     a, b = POINT[:2] / (POINT[2] + xi * np.linalg.norm(POINT))
