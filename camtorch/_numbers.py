@@ -25,6 +25,7 @@ from camtorch._arguments import (
     shown,
     values_of,
 )
+from camtorch._freezing import INTRINSICS, frozen_names
 from camtorch._module import remade
 from camtorch.projection.rays import AXES, focal_for
 
@@ -37,6 +38,40 @@ _OF_CALIBRATE_CAMERA = 5, 8, 12, 14  # OpenCV's numbers of coefficients; 4 may b
 _LOOKED_AT = 64  # cameras of a batch: numbers in a wrong order are so in all of them
 _CENTRED, _NEAR = 0.1, 0.05
 """Of the image's sides: how far from its middle principal points usually lie, and how near one is certainly meant."""
+
+
+def checked_numbers(
+    model: type[Camera], intrinsics: Numbers, distortion: Numbers | None, image_size: Sequence[int] | None
+) -> tuple[Tensor, Tensor, torch.Size, tuple[int, int] | None]:
+    """Intrinsics, distortion, batch dims and image size of a camera of this model that is made of them."""
+    owner = model.__name__
+    intrinsics = checked_intrinsics(model, intrinsics)
+    if distortion is None:
+        ideal = model.ideal(model.default_count)
+        k = intrinsics.new_tensor(ideal) if ideal else intrinsics.new_empty(0)
+        distortion = k if intrinsics.ndim == 1 else k.expand(*intrinsics.shape[:-1], len(ideal))
+    else:
+        distortion = checked_distortion(model, distortion, intrinsics)
+    batch = as_batch(owner, intrinsics=intrinsics.shape, distortion=distortion.shape)
+    size = as_image_size(image_size, owner)
+    if size is not None:
+        warn_of_order(intrinsics, size, owner, stacklevel=4)
+    return intrinsics, distortion, batch, size
+
+
+def described(camera: Camera) -> str:
+    """Batch, size and, of a single camera, its numbers, for `repr`."""
+    parts = [f"batch_shape={tuple(camera.batch_shape)}"] if camera.batch_shape else []
+    numbers = None if camera.batch_shape else values_of(torch.cat(camera._tensors, -1))
+    if numbers is not None:
+        names = *INTRINSICS, *camera.distortion_names
+        parts += [f"{name}={value:.6g}" for name, value in zip(names, numbers.tolist(), strict=True)]
+    elif camera.distortion_names:
+        parts.append(f"distortion=({' '.join(camera.distortion_names)})")
+    if camera.image_size:
+        parts.append(f"image_size={camera.image_size}")
+    parts += [f"frozen=({', '.join(frozen)})"] if (frozen := frozen_names(camera)) else []
+    return ", ".join(parts)
 
 
 def checked_intrinsics(model: type[Camera], intrinsics: Numbers) -> Tensor:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import functools
 import inspect
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, cast
 
 import torch
@@ -14,28 +14,24 @@ from torch.nn.utils import parametrize
 
 from camtorch._arguments import (
     Numbers,
-    as_batch,
     as_image_size,
-    as_values,
     as_whole,
     broadcast_shapes,
     is_predicted,
     shown,
-    values_of,
 )
 from camtorch._derived import variant
 from camtorch._editing import edited_by, quarter_turns
 from camtorch._evaluation import evaluated, mapped
-from camtorch._freezing import INTRINSICS, PREFIX, freeze, frozen_names, loaded, saved, with_frozen
+from camtorch._freezing import PREFIX, freeze, loaded, saved, with_frozen
 from camtorch._module import BatchedModule, Memo, remade, typed_as
 from camtorch._notebook import as_html
 from camtorch._numbers import (
     camera_of_fov,
-    checked_distortion,
-    checked_intrinsics,
+    checked_numbers,
+    described,
     numbers_of_matrix,
     replaced,
-    warn_of_order,
 )
 from camtorch._registry import register
 from camtorch.convert.conversion import Conversion, convert
@@ -43,11 +39,10 @@ from camtorch.optics.charts import Chart
 from camtorch.optics.lens import Lens
 from camtorch.projection.depth import backproject
 from camtorch.projection.explanation import explain
-from camtorch.projection.fields import local_pinhole, over_image, patch_centres, perspective_field, plucker
+from camtorch.projection.fields import local_pinhole, on_image, over_image, patch_centres, perspective_field, plucker
 from camtorch.projection.polyline import project_polyline
 from camtorch.projection.project import Project
 from camtorch.projection.rays import field_of_view
-from camtorch.projection.rows import Cameras
 from camtorch.projection.unproject import Unproject
 from camtorch.windshield import Windshield, behind
 
@@ -187,19 +182,8 @@ class Camera(BatchedModule):
     def __init__(
         self, intrinsics: Numbers, distortion: Numbers | None = None, *, image_size: Sequence[int] | None = None
     ):
-        model = type(self)
-        owner = model.__name__
-        intrinsics = checked_intrinsics(model, intrinsics)
-        if distortion is None:
-            ideal = self.ideal(self.default_count)
-            k = intrinsics.new_tensor(ideal) if ideal else intrinsics.new_empty(0)
-            distortion = k if intrinsics.ndim == 1 else k.expand(*intrinsics.shape[:-1], len(ideal))
-        else:
-            distortion = checked_distortion(model, distortion, intrinsics)
-        batch = as_batch(owner, intrinsics=intrinsics.shape, distortion=distortion.shape)
-        count, size = distortion.shape[-1], as_image_size(image_size, owner)
-        if size is not None:
-            warn_of_order(intrinsics, size, owner)
+        intrinsics, distortion, batch, size = checked_numbers(type(self), intrinsics, distortion, image_size)
+        count = distortion.shape[-1]
         super().__init__(
             distortion_names=self.names_of(count) or (),
             image_size=size,
@@ -453,15 +437,7 @@ class Camera(BatchedModule):
         """
         return project_polyline(self, points, extrinsics)
 
-    def _evaluate(
-        self,
-        direction: type[Project] | type[Unproject],
-        rows: Tensor,
-        lead: torch.Size,
-        tensors: Sequence[Tensor],
-        cameras_of: Callable[[Tensor, Tensor], Cameras] | None = None,
-    ) -> tuple[Tensor, Tensor]:
-        return evaluated(self, direction, rows, lead, tensors, cameras_of)
+    _evaluate = evaluated
 
     @property
     def _tensors(self) -> tuple[Tensor, ...]:
@@ -477,12 +453,7 @@ class Camera(BatchedModule):
 
     def contains(self, pixels: Numbers) -> Tensor:
         """Bool (...): whether pixels (..., 2) lie on the image, its outer pixel edges included."""
-        height, width = self._size_for("contains")
-        pixels = as_values(pixels, "pixels", type(self).__name__)
-        if pixels.ndim == 0 or pixels.shape[-1] != 2:
-            raise ValueError(f"{type(self).__name__}: pixels must be (..., 2); got shape {tuple(pixels.shape)}")
-        u, v = pixels.unbind(-1)
-        return (u >= -0.5) & (u <= width - 0.5) & (v >= -0.5) & (v <= height - 0.5)
+        return on_image(pixels, self._size_for("contains"), type(self).__name__)
 
     def pixel_grid(self, stride: int = 1) -> Tensor:
         """(H, W, 2): the centre of every pixel; or (H / stride, W / stride, 2): that of every patch.
@@ -721,17 +692,7 @@ class Camera(BatchedModule):
 
     def extra_repr(self) -> str:
         """Batch, size and, for a single camera, its numbers."""
-        parts = [f"batch_shape={tuple(self.batch_shape)}"] if self.batch_shape else []
-        numbers = None if self.batch_shape else values_of(torch.cat(self._tensors, -1))
-        if numbers is not None:
-            names = *INTRINSICS, *self.distortion_names
-            parts += [f"{name}={value:.6g}" for name, value in zip(names, numbers.tolist(), strict=True)]
-        elif self.distortion_names:
-            parts.append(f"distortion=({' '.join(self.distortion_names)})")
-        if self.image_size:
-            parts.append(f"image_size={self.image_size}")
-        parts += [f"frozen=({', '.join(frozen)})"] if (frozen := frozen_names(self)) else []
-        return ", ".join(parts)
+        return described(self)
 
 
 def _add_model(model: type[Camera]) -> None:

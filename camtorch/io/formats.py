@@ -28,7 +28,6 @@ from camtorch.io import (
     nuscenes,
     ocamcalib,
     opencv,
-    openmvg,
     rays,
     ros,
     usda,
@@ -55,7 +54,6 @@ _BY_KEYS: tuple[KeyFormat, ...] = (
     woodscape,
     gyroflow,
     camodocal,
-    openmvg,
     opencv,
 )
 
@@ -75,7 +73,7 @@ def load(path: str | os.PathLike[str], format: str | None = None) -> Rig:
 
     Args:
         path: a file of OpenCV, ROS, Kalibr, COLMAP, Nerfstudio, Project Aria, Basalt, mrcal, ncore, OCamCalib,
-            WoodScape, Gyroflow, camodocal, Metashape, nuScenes, OpenMVG or camtorch; an archive of
+            WoodScape, Gyroflow, camodocal, Metashape, nuScenes or camtorch; an archive of
             `numpy.savez(path, K=K, D=D)`; or the folder of a COLMAP or Nerfstudio reconstruction. COLMAP's images
             beside the cameras are read with them.
         format: its format, one of the keys of `camtorch.save`; found from content and name if left out.
@@ -134,7 +132,7 @@ def save(rig: Rig | Camera, path: str | os.PathLike[str], format: str | None = N
         path: the file, which may be a link: then what it points to is replaced. With COLMAP it may be a folder, where
             poses go to an images file beside the cameras; with Nerfstudio one that exists.
         format: "opencv", "ros", "kalibr", "colmap", "nerfstudio", "aria", "basalt", "mrcal", "ncore",
-            "ocamcalib", "woodscape", "gyroflow", "camodocal", "metashape" or "camtorch"; written only, "usda", "carla",
+            "ocamcalib", "woodscape", "gyroflow", "camodocal" or "camtorch"; written only, "usda", "carla",
             "blender" or "rays". If left out: the format that the rig was loaded from if its files end like this one,
             else what the name says (`transforms.json`, `camchain.yaml`, `camera_info.yaml`, `.cameramodel`, `.xml`,
             `cameras.txt`, `.bin`, `.usda`, `.exr`), else camtorch's own for `.json`.

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Iterable
-from typing import Any
+from typing import Any, NoReturn
 from xml.etree import ElementTree
-from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
@@ -161,39 +159,6 @@ def _posed(path: str, chunk: ElementTree.Element, cameras: dict[str, Camera], se
     return Rig(cameras, (names, batch), images={name: own for name, own in images.items() if name != own})
 
 
-def files(rig: Rig, path: str) -> dict[str, bytes]:
-    """A calibration, of a single camera without a pose, which loses its name; else sensors and cameras of a chunk."""
-    lossy = Lossy(path, NAMES.title)
-    lines = ['<?xml version="1.0" encoding="UTF-8"?>']
-    written = {name: _entries(lossy, name, camera) for name, camera in rig.cameras.items()}
-    if len(written) == 1 and not rig.extrinsics:
-        ((kind, (height, width), values),) = written.values()
-        sides = f"<projection>{kind}</projection>", f"<width>{width}</width>", f"<height>{height}</height>"
-        return {path: _text([*lines, "<calibration>", *sides, *values, "</calibration>"])}
-    lines += ['<document version="1.2.0">', "<chunk>", "<sensors>"]
-    for i, (name, (kind, (height, width), values)) in enumerate(written.items()):
-        size = f'<resolution width="{width}" height="{height}"/>'
-        lines += [f'<sensor id="{i}" label={quoteattr(name)} type="{kind}">', size]
-        lines += [f'<calibration type="{kind}" class="adjusted">', size, *values, "</calibration>", "</sensor>"]
-    lines += ["</sensors>", "<cameras>"]
-    numbers = {name: i for i, name in enumerate(written)}
-    matrices = poses.matrices(poses.all_of(rig, lossy), undo=True).flatten(1).tolist()
-    for i, (name, row) in enumerate(zip(rig.extrinsics, matrices, strict=True)):
-        sensor = numbers[rig.images.get(name, name)]
-        lines += [f'<camera id="{i}" sensor_id="{sensor}" label={quoteattr(name)} enabled="true">']
-        lines += [f"<transform>{' '.join(map(repr, row))}</transform>", "</camera>"]
-    return {path: _text([*lines, "</cameras>", "</chunk>", "</document>"])}
-
-
-def _text(lines: Iterable[str]) -> bytes:
-    return ("\n".join(lines) + "\n").encode()
-
-
-def _entries(lossy: Lossy, name: str, camera: Camera) -> tuple[str, tuple[int, int], list[str]]:
-    """The type of a camera, its size, and the elements of its values."""
-    height, width = lossy.size(name, camera)
-    key, (fx, fy, cx, cy), distortion = lossy.model(name, camera, ("pinhole", *(key for key, _ in _MODELS.values())))
-    kind, names = next((kind, names) for kind, (k, names) in _MODELS.items() if k == key or key == "pinhole")
-    values = {"f": fy, "cx": cx - (width - 1) / 2, "cy": cy - (height - 1) / 2, "b1": fx - fy}
-    values |= zip(names, lossy.at_most(name, camera, distortion, (len(names),)), strict=True)
-    return kind, (height, width), [f"<{key}>{value!r}</{key}>" for key, value in values.items()]
+def files(rig: Rig, path: str) -> NoReturn:
+    """Raise the CameraFileError that nothing is written."""
+    Lossy(path, NAMES.title).fail("format", "read only. Save as format='opencv' or 'colmap'")

@@ -1,18 +1,12 @@
 """The collection as a file of the package: the numbers' own bits, columns side by side, a third smaller than as text.
 
 Text is compressed by LZMA, a seventh smaller than by Deflate; for the numbers, whose low bits are noise, it gains
-nothing and takes longer to read.
-
-`python camtorch/lenses/packing.py gyroflow.csv.gz camtorch/lenses/gyroflow.npz` made it.
+nothing and takes longer to read. fy is kept as its difference to fx, the principal point to the image's middle, each
+with its sign as the lowest bit, and the bytes of a column one plane after another.
 """
 
 from __future__ import annotations
 
-import csv
-import gzip
-import io
-import sys
-import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -22,29 +16,6 @@ TEXTS = "brand", "camera", "lens", "setting", "width", "height", "readout_ms", "
 """Columns that are kept as text, among them numbers that repeat or are missing."""
 NUMBERS = "fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4", "rms_px"
 """Columns of doubles, whose low bits are noise that nothing makes smaller."""
-
-
-def pack(table: Path, path: Path) -> None:
-    """Write a file of the package from a table (.csv.gz) that has the columns `TEXTS` and `NUMBERS`."""
-    with gzip.open(table, "rt", encoding="utf-8", newline="") as lines:
-        rows = list(csv.DictReader(lines))
-    text = "\0".join(row[name] for name in TEXTS for row in rows)
-    texts = {name: [row[name] for row in rows] for name in TEXTS}
-    bits = np.array([[float(row[name]) for row in rows] for name in NUMBERS]).view(np.int64)
-    steps = bits.copy()
-    steps[1] -= bits[0]  # fy is near fx
-    steps[2:4] -= _middles(texts)
-    # the sign as the lowest bit: numbers near zero then begin with zeros
-    codes = ((steps << 1) ^ (steps >> 63)).astype("<i8")
-    planes = codes[..., None].view(np.uint8).transpose(0, 2, 1)
-    with zipfile.ZipFile(path, "w") as file:
-        for name, array, kind in (
-            ("text", np.frombuffer(text.encode(), np.uint8), zipfile.ZIP_LZMA),
-            ("planes", planes, zipfile.ZIP_DEFLATED),
-        ):
-            content = io.BytesIO()
-            np.save(content, array)
-            file.writestr(zipfile.ZipInfo(f"{name}.npy"), content.getvalue(), kind, 9)
 
 
 def unpack(path: Path) -> tuple[dict[str, list[str]], NDArray[np.float64]]:
@@ -63,7 +34,3 @@ def unpack(path: Path) -> tuple[dict[str, list[str]], NDArray[np.float64]]:
 def _middles(texts: dict[str, list[str]]) -> NDArray[np.int64]:
     """The bits of the middles of the images, which principal points are near to."""
     return (np.array([texts[side] for side in ("width", "height")], float) / 2).view(np.int64)
-
-
-if __name__ == "__main__":
-    pack(Path(sys.argv[1]), Path(sys.argv[2]))

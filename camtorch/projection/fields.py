@@ -12,6 +12,7 @@ from torch import Tensor
 from camtorch._arguments import (
     Numbers,
     as_points,
+    as_values,
     as_vectors,
     as_whole,
     broadcast_shapes,
@@ -29,6 +30,15 @@ if TYPE_CHECKING:
 
 _MOST_KEPT = 1 << 19  # rays, of 6 MB in float32: what every camera of a large data set may keep
 _STRAIGHT = 1e-24  # the squared sine of the angle to the vertical up to which a ray goes straight up or down
+
+
+def on_image(pixels: Numbers, size: tuple[int, int], owner: str) -> Tensor:
+    """See `Camera.contains`."""
+    pixels = as_values(pixels, "pixels", owner)
+    if pixels.ndim == 0 or pixels.shape[-1] != 2:
+        raise ValueError(f"{owner}: pixels must be (..., 2); got shape {tuple(pixels.shape)}")
+    (u, v), (height, width) = pixels.unbind(-1), size
+    return (u >= -0.5) & (u <= width - 0.5) & (v >= -0.5) & (v <= height - 0.5)
 
 
 def patch_centres(size: tuple[int, int], stride: int, like: Tensor, owner: str) -> Tensor:

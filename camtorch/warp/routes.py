@@ -111,6 +111,12 @@ def positions(warp: Warp, route: Route, padding: PaddingMode = "zeros") -> Sampl
     return kept
 
 
+def by_pixel(warp: Warp) -> Sampling:
+    """The positions of all pixels, one by one."""
+    where = positions(warp, "graph" if route_of(warp) == "graph" else "kept")
+    return where.pixels if isinstance(where, Lattice) else where
+
+
 def _computed(warp: Warp, reach: PaddingMode) -> Sampling | Lattice:
     """The positions of all pixels, without a graph, which serve a padding."""
     if not (_is_operator(warp) and warp.tolerance and warp.target.intrinsics.is_cpu):

@@ -130,26 +130,9 @@ class Warp(GeometryModule):
         shutter: RollingShutter | None = None,
         target_shutter: RollingShutter | None = None,
     ):
-        source, target = as_sized(source, "source", "Warp"), as_sized(target, "target", "Warp")
         options = as_options("Warp", mode, padding_mode, fill, antialias, tolerance)
-        if target is not source:
-            check_devices("Warp", source=source.intrinsics, target=target.intrinsics)
         rotation = as_rotation(rotation, "Warp")
-        for name, each in (("shutter", shutter), ("target_shutter", target_shutter)):
-            if not (each is None or isinstance(each, RollingShutter)):
-                hint = "ct.RollingShutter(readout, rates) makes one, of seconds and radians per second"
-                raise TypeError(f"Warp: {name} must be a RollingShutter; got {type(each).__name__}. {hint}")
-        shapes = [tuple(part.batch_shape) for part in (source, target, shutter, target_shutter) if part is not None]
-        shapes += [] if rotation is None else [tuple(rotation.shape[:-2])]
-        try:
-            batch = broadcast_shapes(*shapes)
-        except ValueError:
-            batch = torch.Size((0, 0))  # none
-        if len(batch) > 1:
-            raise ValueError(
-                "Warp: source, target, rotation and shutters may each have one batch dim, of one size; "
-                f"got {', '.join(map(str, shapes))}"
-            )
+        _check_parts(source, target, rotation, shutter, target_shutter)
         self._set(source, target, options, shutter, target_shutter)
         self.turned_by(rotation)
 
@@ -273,7 +256,7 @@ class Warp(GeometryModule):
 
     def grid(self) -> Tensor:
         """(B or 1, H', W', 2): positions for `grid_sample(..., align_corners=False)`; -9 where there is none."""
-        return self._sampling().grid.clone(memory_format=torch.contiguous_format)
+        return routes.by_pixel(self).grid.clone(memory_format=torch.contiguous_format)
 
     def valid_mask(self) -> Tensor:
         """(B or 1, 1, H', W') bool: the pixel has a ray, and the source sees it on its image."""
@@ -299,19 +282,10 @@ class Warp(GeometryModule):
         """Those of some rows of the target, which serve a padding, within a tolerance."""
         return locate(*self._in_motion, self.rotation, tolerance, self.antialias, rows, padding)
 
-    def _sampling(self) -> Sampling:
-        """Those of all pixels, one by one."""
-        where = routes.positions(self, "graph" if routes.route_of(self) == "graph" else "kept")
-        return where.pixels if isinstance(where, Lattice) else where
-
     @property
     def _in_motion(self) -> tuple[Camera, Camera]:
         """Source and target, each behind its shutter."""
-        source, target = self.source, self.target
-        return (
-            source if self.shutter is None else cast("Camera", InMotion(source, self.shutter)),
-            target if self.target_shutter is None else cast("Camera", InMotion(target, self.target_shutter)),
-        )
+        return _moved_by(self.source, self.shutter), _moved_by(self.target, self.target_shutter)
 
     # -- labels
 
@@ -435,10 +409,41 @@ class Warp(GeometryModule):
 
     def extra_repr(self) -> str:
         """The options."""
-        options = ", ".join(
-            f"{name}={value!r}" for name, value in {**self.options, "tolerance": self.tolerance}.items()
+        said = {**self.options, "tolerance": self.tolerance, "rotation": self.rotation is not None}
+        return ", ".join(f"{name}={value!r}" for name, value in said.items())
+
+
+def _moved_by(camera: Camera, shutter: RollingShutter | None) -> Camera:
+    return camera if shutter is None else cast("Camera", InMotion(camera, shutter))
+
+
+def _check_parts(
+    source: Camera,
+    target: Camera,
+    rotation: Tensor | None,
+    shutter: RollingShutter | None,
+    target_shutter: RollingShutter | None,
+) -> None:
+    """Raise what is wrong with what a warp is between, and with how many of each there are."""
+    as_sized(source, "source", "Warp")
+    as_sized(target, "target", "Warp")
+    if target is not source:
+        check_devices("Warp", source=source.intrinsics, target=target.intrinsics)
+    for name, each in (("shutter", shutter), ("target_shutter", target_shutter)):
+        if not (each is None or isinstance(each, RollingShutter)):
+            hint = "ct.RollingShutter(readout, rates) makes one, of seconds and radians per second"
+            raise TypeError(f"Warp: {name} must be a RollingShutter; got {type(each).__name__}. {hint}")
+    shapes = [tuple(part.batch_shape) for part in (source, target, shutter, target_shutter) if part is not None]
+    shapes += [] if rotation is None else [tuple(rotation.shape[:-2])]
+    try:
+        batch = broadcast_shapes(*shapes)
+    except ValueError:
+        batch = torch.Size((0, 0))  # none
+    if len(batch) > 1:
+        raise ValueError(
+            "Warp: source, target, rotation and shutters may each have one batch dim, of one size; "
+            f"got {', '.join(map(str, shapes))}"
         )
-        return f"{options}, rotation={self.rotation is not None}"
 
 
 def checked(

@@ -4,7 +4,6 @@ import copy
 import math
 import pickle
 
-import kornia
 import pytest
 import torch
 from cameras import DISTINCT, KEYS, PAIRS, slow_unless, spread
@@ -100,41 +99,6 @@ def test_every_field_moves_together_between_any_two_models(key, which):
     torch.testing.assert_close(back["keypoints"][use], pixels[use], atol=2e-3, rtol=0)
     torch.testing.assert_close(back["gaze"], gaze, atol=1e-6, rtol=0)
     torch.testing.assert_close(back["points"], points, atol=1e-5, rtol=0)
-
-
-@pytest.mark.parametrize("preset", PRESETS)
-def test_boxes_enclose_warped_masks(preset):
-    camera = pinhole(focal=200.0)
-    boxes = torch.tensor([[40.0, 30, 120, 90], [150, 100, 280, 200], [60, 120, 140, 210]])
-    masks = torch.zeros(1, 3, *SIZE, dtype=torch.uint8)
-    for i, (x1, y1, x2, y2) in enumerate(boxes.int().tolist()):
-        masks[0, i, y1 : y2 + 1, x1 : x2 + 1] = 1
-    generator = torch.Generator().manual_seed(1)
-    augmentation = RandomCamera(preset, camera=camera, fov=(70, 85), tolerance=0)
-    out = augmentation(mask=masks, boxes=boxes[None], generator=generator, valid_mask=None)
-    assert out["boxes_valid"].all()
-    for mask, (x1, y1, x2, y2) in zip(out["mask"][0], out["boxes"][0].tolist(), strict=True):
-        rows, columns = mask.any(1).nonzero()[:, 0], mask.any(0).nonzero()[:, 0]
-        extent = [columns[0], rows[0], columns[-1], rows[-1]]
-        clipped = [max(x1, 0), max(y1, 0), min(x2, SIZE[1] - 1), min(y2, SIZE[0] - 1)]
-        assert all(abs(a - b) < 1 for a, b in zip(map(float, extent), clipped, strict=True))
-
-
-def test_a_mount_of_a_pinhole_is_a_homography():
-    """kornia's warp_perspective is the witness, on an image of the coordinates."""
-    camera = pinhole(torch.float64)
-    v, u = torch.meshgrid(*(torch.arange(side, dtype=torch.float64) for side in SIZE), indexing="ij")
-    image = torch.stack((u, v))[None].expand(4, -1, -1, -1)
-    augmentation = RandomMount(camera=camera, yaw=15, pitch=12, roll=40, zoom=(0.8, 1.3))
-    generator = torch.Generator().manual_seed(3)
-    out = augmentation(image=image, keypoints=lattice().double().expand(4, -1, -1), generator=generator)
-    homography = out["camera"].K @ out["rotation"] @ torch.linalg.inv(camera.K)
-    witness = kornia.geometry.warp_perspective(image, homography, SIZE, align_corners=True)
-    inside = kornia.geometry.warp_perspective(torch.ones_like(image), homography, SIZE, align_corners=True) == 1
-    assert inside.float().mean() > 0.4
-    torch.testing.assert_close(out["image"][inside], witness[inside], atol=1e-3, rtol=0)
-    moved = kornia.geometry.transform_points(homography, lattice().double().expand(4, -1, -1))
-    torch.testing.assert_close(out["keypoints"], moved, atol=1e-9, rtol=0)
 
 
 @pytest.mark.parametrize(
@@ -287,32 +251,6 @@ def test_skipped_samples_stay_bit_identical(name):
         assert [c.key for c in out["camera"]] == ["kannala_brandt" if a else "pinhole" for a in draw["apply"]]
     else:
         assert torch.equal(out["camera"].intrinsics[skipped][0], batch["camera"].intrinsics)
-
-
-def test_every_sample_may_have_its_own_camera():
-    models = [
-        pinhole(focal=60.0, size=(60, 80)),
-        source("fisheye624").resize(60, 80),
-        source("brown_conrady").resize(60, 80),
-    ]
-    augmentation, batch = RandomMount(roll=20), sample(3, models)
-    draw = augmentation.draw(3)
-    out = augmentation(batch, draw=draw)
-    assert [type(c) for c in out["camera"]] == [type(c) for c in models]
-    for i, camera in enumerate(models):
-        alone = augmentation(
-            image=batch["image"][i],
-            keypoints=batch["keypoints"][i],
-            camera=camera,
-            draw={k: v[i : i + 1] for k, v in draw.items()},
-        )
-        torch.testing.assert_close(alone["keypoints"], out["keypoints"][i], atol=1e-3, rtol=0)
-        torch.testing.assert_close(alone["image"], out["image"][i], atol=2e-3, rtol=0)
-    stacked = ct.Pinhole(
-        torch.tensor([[60.0, 60, 39.5, 29.5], [70, 70, 39.5, 29.5], [80, 80, 39.5, 29.5]]), image_size=(60, 80)
-    )
-    out = augmentation({**batch, "camera": stacked.requires_grad_(False)}, draw=draw)
-    torch.testing.assert_close(out["camera"].intrinsics[:, 0] / stacked.intrinsics[:, 0], draw["zoom"].float())
 
 
 def test_lists_hold_as_many_labels_as_each_sample_has():

@@ -39,7 +39,7 @@ def test_a_mount_looks_at_the_driver_upright(name, right_hand_drive):
 @pytest.mark.parametrize("name", MOUNTS)
 def test_regions_are_those_of_the_car_after_every_draw(name):
     regions, camera_from_car = Regions(), mount(name).extrinsics
-    count = 200
+    count = 60
     eyes, gaze = glances(5 * count)
     want = regions.region_of(gaze, eyes)
     assert len(want.unique()) > len(REGIONS) / 2

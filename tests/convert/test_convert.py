@@ -174,22 +174,6 @@ def test_special_cases_are_padded_and_come_back_bit_by_bit(names):
     assert same_numbers(camera.convert("fisheye62").camera.convert("kannala_brandt", count=4).camera, source)
 
 
-def test_every_number_of_opencv_coefficients():
-    camera = ct.Pinhole([500.0, 501, 320, 240], image_size=SIZE).double()
-    pinhole = camera
-    for count in (4, 5, 8, 12, 14, 12, 8, 5, 4):
-        result = camera.convert(ct.BrownConrady, count=count)
-        assert bool(result.exact)
-        assert float(result.max_error) == 0
-        camera = result.camera
-        assert camera.distortion.shape == (count,)
-    assert same_numbers(camera.convert("pinhole").camera, pinhole)
-    distorted = ct.BrownConrady([500.0, 501, 320, 240], [-0.1, 0.02, 1e-3, 0, 0, 0, 0, 0], image_size=SIZE)
-    assert distorted.convert(ct.BrownConrady).camera.distortion.shape == (8,)
-    assert bool(distorted.convert(ct.BrownConrady, count=4).exact)
-    assert not bool(distorted.convert("pinhole").exact)
-
-
 def test_what_would_be_lost_is_fitted_row_by_row():
     k = torch.zeros(3, 12, **F64)
     k[:, 0] = 0.02
@@ -211,46 +195,6 @@ def test_a_related_model_gets_as_many_coefficients_as_it_needs():
     assert bool(long.convert("fisheye62").exact)
     longer = ct.KannalaBrandt([300.0, 300, 320, 240], [0.01] * 6 + [0.001] * 4, image_size=SIZE)
     assert not bool(longer.convert("fisheye62").exact)
-
-
-def test_models_say_what_they_generalise(monkeypatch):
-    class Scaled(ct.KannalaBrandt):
-        distortion_names = ("stretch", "k1")
-        default_count = 2
-        special_cases = (("short", ("k1",)),)
-        fit_bounds = {"stretch": (0.5, 2.0)}  # noqa: RUF012
-
-        @classmethod
-        def names_of(cls, count):
-            return cls.distortion_names if count == 2 else None
-
-        @classmethod
-        def ideal(cls, count):
-            return 1.0, 0.0
-
-        @staticmethod
-        def optics(k):
-            return ct.KannalaBrandt.optics((k[1] * k[0],))
-
-    class Short(ct.KannalaBrandt):
-        @classmethod
-        def names_of(cls, count):
-            return ("k1",) if count == 1 else None
-
-        default_count = 1
-
-    monkeypatch.setitem(ct.MODELS, "short", Short)
-    monkeypatch.setitem(ct.MODELS, "scaled", Scaled)
-    short = Short([300.0, 300, 320, 240], [0.02], image_size=SIZE)
-    result = short.convert("scaled")
-    assert bool(result.exact)
-    assert result.camera.distortion.tolist() == pytest.approx([1.0, 0.02])
-    assert bool(result.camera.convert("short").exact)
-    stretched = Scaled([300.0, 300, 320, 240], [1.5, 0.02], image_size=SIZE)
-    back = stretched.convert("short")
-    assert not bool(back.exact)
-    assert float(back.max_error) < 1e-6
-    assert back.camera.distortion.item() == pytest.approx(0.03, abs=1e-6)
 
 
 # -- batches
@@ -405,26 +349,6 @@ def largest(source, result, rows=481, columns=641):
     (old, _), (new, mapped) = source.project(rays), result.camera.project(rays)
     # between the nodes there may be a hole that none of them fell into
     return float(torch.where(mapped, (new - old).norm(dim=-1), 0.0).max())
-
-
-@pytest.mark.parametrize(
-    ("key", "target", "intrinsics", "distortion"),
-    [
-        ("pinhole", "cylindrical", [300.0, 300, 320, 240], []),
-        *(pytest.param(*case, marks=pytest.mark.slow) for case in (
-        ("fisheye62", "cylindrical", [173, 173, 321, 234], [-0.489, -0.449, -0.077, 0.401, 0.047, 0.085, 0.015, 0.003]),
-        ("brown_conrady", "cylindrical", [281, 301, 302, 230], [0.137, -0.146, -1e-3, -2e-3, -0.1, 0.08, -0.11, 0.27]),
-        ("fisheye624", "f_theta", [219, 233, 303, 225],
-                     [-1e-3, 0.024, 0.013, 0.038, -0.031, -0.049, 0, -1e-3, 0, -1e-3, -1e-3, -2e-3]),
-        ("orthographic_fisheye", "brown_conrady", [150, 135, 320, 240], [0]))),
-    ],
-)  # fmt: skip
-@torch.no_grad()
-def test_nothing_between_the_nodes_is_worse(key, target, intrinsics, distortion):
-    source = make(key, torch.tensor(intrinsics, **F64), torch.tensor(distortion, **F64), image_size=SIZE)
-    for options in ({}, {"max_angle": 0.7}):
-        result = source.convert(target, **options)
-        assert largest(source, result) <= 1.002 * float(result.max_error)
 
 
 @pytest.mark.slow

@@ -166,19 +166,24 @@ def test_text_between_the_elements_of_metashape_says_nothing(tmp_path):
             "model_type: 'SCARAMUZZA' is not known here; known are KANNALA",
         ),
         ("camodocal_kitti360.yaml", "   xi: 2", "   xi: x2", r"mirror_parameters\.xi: .* is no finite number"),
-        (
-            "openmvg_sfm_data.json",
-            "pinhole_brown_t2",
-            "pinhole_new",
-            "polymorphic_name: 'pinhole_new' is not known here",
-        ),
-        ("openmvg_sfm_data.json", "[-0.0853, 0.1254, 0.0289]", "[0.1]", "disto_k3: 1 numbers where 3 belong"),
-        ("openmvg_sfm_data.json", "[1.0, 2.0, 3.0]", "[1.0, 2.0, 1e200]", r"center: a number beyond 1e\+100"),
     ],
 )
 def test_what_is_refused(name, old, new, reason, tmp_path):
     with pytest.raises(ct.CameraFileError, match=reason):
         ct.load(changed(tmp_path, name, (old, new)))
+
+
+def test_a_windshield_of_ncore_stands_before_its_camera(tmp_path):
+    h, v = [0.001, 1.002, 0.003], [-0.002, 0.0, 0.998]
+    shield = json.dumps({"horizontal_poly": h, "vertical_poly": v})
+    path = changed(tmp_path, "ncore_ftheta.json", ('distortion_parameters": null', f'distortion_parameters": {shield}'))
+    found = ct.load(path).camera
+    expected = load("ncore_ftheta.json").camera.behind(ct.Windshield(np.array(h), np.array(v)))
+    assert torch.equal(found.project(float64(POINT))[0], expected.project(float64(POINT))[0])
+    assert not any(parameter.requires_grad for parameter in found.parameters())
+    path.write_text(path.read_text().replace("[0.001, 1.002, 0.003]", "[0.001, 1.002]"))
+    with pytest.raises(ct.CameraFileError, match=r"external_distortion_parameters: .*horizontal must be"):
+        ct.load(path)
 
 
 def test_kitti_360_is_the_mei_camera_of_camodocal():
@@ -236,14 +241,6 @@ def test_tables_of_nuscenes_without_channels_or_with_several_drives(tmp_path):
         (tmp_path / "calibrated_sensor.json").write_text(json.dumps([table[0], table[1], {**again, **broken}]))
         with pytest.raises(ct.CameraFileError, match=reason):
             ct.load(tmp_path / "calibrated_sensor.json")
-
-
-def test_views_of_openmvg():
-    rig = load("openmvg_sfm_data.json")
-    assert rig.images == {"100_7100.JPG": "0", "right/100_7100.JPG": "1"}  # and none without a pose
-    assert rig["2"].intrinsics.tolist() == [1431.5, 1431.5, 961.25, 540.0]  # whose kind stands before, by its number
-    there = np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1]]) @ (POINT - (1, 2, 3))
-    assert np.allclose(seen(rig, "right/100_7100.JPG", POINT), there, atol=1e-12)
 
 
 @pytest.mark.parametrize(

@@ -183,7 +183,7 @@ def test_angles_of_nerfstudio(keys, focal, tmp_path):
     assert camera.intrinsics.tolist() == pytest.approx([*focal, 319.5, 239.5], rel=1e-12)
 
 
-HOLDING = {"camtorch", "kalibr", "colmap", "metashape", "nerfstudio", "aria", "basalt"}
+HOLDING = {"camtorch", "kalibr", "colmap", "nerfstudio", "aria", "basalt"}
 """Formats of several cameras at any places."""
 rotations = st.lists(st.floats(-3, 3), min_size=3, max_size=3) | st.permutations([0.0, 0.0, math.pi])
 vectors = st.tuples(rotations, st.lists(st.floats(-1e3, 1e3), min_size=3, max_size=3))

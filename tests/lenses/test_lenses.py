@@ -5,7 +5,6 @@ import hashlib
 import math
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 from PIL import Image
@@ -112,41 +111,6 @@ def test_a_lens_for_the_images_at_hand():
     assert ct.lenses.find("GoPro HERO9 Black Wide", image_size=(3984, 5312)).intrinsics[0] != whole.intrinsics[0]
     with pytest.raises(ValueError, match="not calibrated for images of the aspect ratio"):
         ct.lenses.find("GoPro HERO9 Black Wide", image_size=(1000, 3000))
-
-
-def folds(k):
-    """(N,) NumPy alone: the angle at which theta + k1 theta^3 + ... + k4 theta^9 turns back, pi if it never does."""
-    # the derivative as a polynomial in y = 1 / theta^2, whose first coefficient is 1
-    companion = np.zeros((len(k), 4, 4))
-    companion[:, [1, 2, 3], [0, 1, 2]] = 1
-    companion[:, 0] = -k * [3, 5, 7, 9]
-    roots = np.linalg.eigvals(companion)
-    real = (np.abs(roots.imag) < 1e-9 * np.abs(roots)) & (roots.real > 0)
-    return np.minimum(np.maximum(np.where(real, roots.real, 0.0).max(1), 1e-9) ** -0.5, np.pi)
-
-
-@pytest.mark.parametrize("step", [16, pytest.param(1, marks=pytest.mark.slow)])
-def test_corners_without_a_ray_are_those_beyond_the_fold(step):
-    lenses = [lens for lens in ct.lenses.search()[::step] if min(lens.intrinsics[:2]) > 0]
-    f, k = (np.array([getattr(lens, name) for lens in lenses]) for name in ("intrinsics", "distortion"))
-    size = np.array([lens.image_size for lens in lenses], dtype=float)
-    zero = np.zeros(len(lenses))
-    right, bottom = size[:, 1] - 1, size[:, 0] - 1
-    corners = np.stack([np.stack(c, -1) for c in ((zero, zero), (right, zero), (right, bottom), (zero, bottom))], 1)
-    radius = np.hypot(*((corners - f[:, None, 2:]) / f[:, None, :2]).transpose(2, 0, 1))
-    theta = folds(k)
-    x = theta**2
-    reach = (theta * (1 + x * (k[:, 0] + x * (k[:, 1] + x * (k[:, 2] + x * k[:, 3])))))[:, None]
-    clear = np.abs(radius / reach - 1) > 1e-9  # of rounding
-    parts = [slice(i, i + 256) for i in range(0, len(f), 256)]
-    valid = torch.cat([ct.KannalaBrandt(f[i], k[i]).unproject(torch.from_numpy(corners[i]))[1] for i in parts])
-    differ = (valid.numpy() != (radius < reach)) & clear
-    assert not differ.any(), [lenses[i].name for i in differ.any(1).nonzero()[0]]
-    share = 1 - float(valid.all(1).double().mean())
-    assert 0.01 < share < 0.08
-    if step == 1:
-        assert len(lenses) == 9810 - 31
-        assert int((~valid.all(1)).sum()) == int((radius > reach).any(1).sum())
 
 
 def source(size=(480, 640)):

@@ -74,22 +74,6 @@ def test_radius(model, coefficients, formula):
     torch.testing.assert_close(r, formula(theta), rtol=1e-13, atol=1e-14)
 
 
-def test_division_sees_along_its_polynomial():
-    pixels = pixel_lattice(spread("division"))
-    rays, valid = camera(ct.Division, -0.3).unproject(pixels)
-    assert valid.all()
-    a, b = ((pixels - INTRINSICS[2:]) / INTRINSICS[:2]).unbind(-1)
-    expected = torch.stack((a, b, 1 - 0.3 * (a * a + b * b)), -1)
-    torch.testing.assert_close(rays, expected / expected.norm(dim=-1, keepdim=True), rtol=0, atol=1e-15)
-
-    more = camera(ct.Division, -0.3, 0.05, -0.02)
-    r2 = a * a + b * b
-    expected = torch.stack((a, b, 1 - 0.3 * r2 + 0.05 * r2**2 - 0.02 * r2**3), -1)
-    rays, valid = more.unproject(pixels)
-    assert valid.all()
-    torch.testing.assert_close(rays, expected / expected.norm(dim=-1, keepdim=True), rtol=0, atol=1e-15)
-
-
 def test_f_theta_from_the_polynomial_of_angles():
     """Of pixels, as DriveWorks has it; and its inverse by bisection."""
     bw = torch.tensor([3.3e-3, 2.0e-8, -1.5e-10, 1.0e-13], dtype=torch.float64)

@@ -275,11 +275,9 @@ FUZZ = Path(__file__).parent / "geometry_fuzz.c"
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("variant", list(building.VARIANTS))
+@pytest.mark.parametrize("variant", ["baseline", "best"])
 def test_no_read_outside_and_nothing_undefined(variant, tmp_path):
-    here = list(building.VARIANTS).index(library().camtorch_variant().decode())
-    if list(building.VARIANTS).index(variant) > here:
-        pytest.skip(f"this CPU does not run {variant}")
+    variant = variant if variant in building.VARIANTS else library().camtorch_variant().decode()
     sanitizers = ["-fsanitize=address,undefined,float-cast-overflow", "-fno-sanitize-recover=all"]
     command = [*building._compiler(None), *building._FLAGS, "-O1", "-g", f"-I{building._HERE}", *sanitizers]
     (tmp_path / "empty.c").write_text("int main(void) { return 0; }\n")
@@ -288,5 +286,5 @@ def test_no_read_outside_and_nothing_undefined(variant, tmp_path):
     sources = ["-DVARIANT=fuzzed", *building.VARIANTS[variant], str(building._HERE / "geometry.c"), str(FUZZ)]
     subprocess.run([*command, *sources, "-lm", "-o", "fuzz"], cwd=tmp_path, check=True)
     environment = os.environ | {"ASAN_OPTIONS": "detect_leaks=0"}
-    done = subprocess.run([tmp_path / "fuzz", "1", "3000"], capture_output=True, text=True, env=environment)
+    done = subprocess.run([tmp_path / "fuzz", "1", "1500"], capture_output=True, text=True, env=environment)
     assert done.returncode == 0, done.stdout + done.stderr

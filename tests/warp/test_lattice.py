@@ -7,16 +7,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import camtorch as ct
+from camtorch.warp.routes import by_pixel
 
 TOLERANCES = (0.1, 0.01)
 
 
 def check(source, target, rotation):
     """Positions on the image, or of which one is, differ by no more than the tolerance; mapped are the same."""
-    exact = ct.Warp(source, target, rotation)._sampling()
+    exact = by_pixel(ct.Warp(source, target, rotation))
     half = torch.tensor(source.image_size[::-1]) / 2
     for tolerance in TOLERANCES:
-        close = ct.Warp(source, target, rotation, tolerance=tolerance)._sampling()
+        close = by_pixel(ct.Warp(source, target, rotation, tolerance=tolerance))
         assert torch.equal(exact.mapped, close.mapped)
         on_image = (exact.grid.abs() <= 1).all(-1) | (close.grid.abs() <= 1).all(-1)
         error = ((exact.grid - close.grid) * half).norm(dim=-1)[exact.mapped & on_image]

@@ -64,20 +64,6 @@ def test_the_image_agrees_with_the_points():
     torch.testing.assert_close(again, warp.target.pixel_grid()[inside].double(), atol=1e-9, rtol=0)
 
 
-def test_rays_turn_with_the_rotation():
-    rotation = turn(20, 10, -5, torch.float64)
-    source, target = fisheye(dtype=torch.float64), pinhole(dtype=torch.float64)
-    warp = ct.Warp(source, target, rotation)
-    rays = torch.nn.functional.normalize(torch.randn(20, 3, dtype=torch.float64, generator=torch.Generator()), dim=-1)
-    torch.testing.assert_close(warp.transform_rays(rays), rays @ rotation.T)
-    seen, _ = target.project(warp.transform_rays(rays))
-    pixels, in_source = source.project(rays)
-    moved, valid = warp.transform_points(pixels)
-    torch.testing.assert_close(moved[valid], seen[valid], atol=1e-9, rtol=0)
-    assert bool((valid <= in_source).all())
-    assert ct.Warp(source, target).transform_rays(rays) is rays
-
-
 def test_a_pinhole_turned_is_a_homography():
     camera, rotation = pinhole(dtype=torch.float64), turn(7, -4, 11, torch.float64)
     homography = camera.K.detach() @ rotation @ torch.linalg.inv(camera.K.detach())
