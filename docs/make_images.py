@@ -1,9 +1,12 @@
 """The images of the documentation, rendered: `python docs/make_images.py`, or those of one part, or some of these.
 
 `guides` makes those of the guides, `guides dewarp learn` two of them, `models kannala_brandt` that of one camera model;
-`case-study` takes a quarter of an hour and is made by its name only.
+`case-study` takes a quarter of an hour, `viewer` a browser (`pip install -e ".[viewer-test]"`, and Chromium): they are made by
+their names only.
 """
 
+import io
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -24,6 +27,7 @@ import train_faces
 from drawings import augmentations, concepts, guides, models, views
 from drawings.pages import EXAMPLES, IMAGES
 
+import camtorch as ct
 from camtorch.plot.axes import COLOURS
 
 SCRIPTS = {
@@ -68,6 +72,21 @@ def case_study(seeds: int = 3) -> None:
         print(f"{title:<28}{last.median(0).values.tolist()}")
 
 
+def viewer() -> None:
+    """The page that shows a lens live, with a photograph."""
+    from playwright.sync_api import sync_playwright
+
+    browser = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+    with tempfile.TemporaryDirectory() as folder, sync_playwright() as playwright:
+        page, photograph = Path(folder) / "lens.html", EXAMPLES / "photographs" / "fisheye"
+        ct.write_viewer(ct.load(f"{photograph}.yml").camera, page, f"{photograph}.jpg")
+        tab = playwright.chromium.launch(executable_path=browser).new_page(viewport={"width": 1440, "height": 900})
+        tab.goto(f"{page.as_uri()}#view=perspective&fov=100&draw=canvas")
+        tab.locator("#message:empty").wait_for(state="attached")
+        tab.wait_for_timeout(2000)  # until the photograph is drawn
+        save(Image.open(io.BytesIO(tab.screenshot())), "viewer")
+
+
 def examples(names: list[str]) -> None:
     """What the examples draw, or some of it."""
     for name in names or SCRIPTS:
@@ -95,10 +114,12 @@ def make(names: list[str]) -> None:
             part([])
     elif names == ["case-study"]:
         case_study()
+    elif names == ["viewer"]:
+        viewer()
     elif names[0] in PARTS:
         PARTS[names[0]](names[1:])
     else:
-        sys.exit(f"there is no part {names[0]!r}; there are {', '.join((*PARTS, 'case-study'))}")
+        sys.exit(f"there is no part {names[0]!r}; there are {', '.join((*PARTS, 'case-study', 'viewer'))}")
 
 
 if __name__ == "__main__":

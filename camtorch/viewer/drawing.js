@@ -378,7 +378,7 @@ const Viewer = (() => {
 
     context.lineWidth = 0.6 * line;
     context.font = `${8 * line}px system-ui, sans-serif`;
-    const most = furthestAngle() / RADIAN, step = [1, 2, 5, 10, 15, 30].find((s) => most / s < 8) ?? 30;
+    const most = furthestAngle() / RADIAN, step = [1, 2, 5, 10, 15, 30].find((s) => most / s < 7) ?? 30;
     for (let angle = step; angle < 180; angle += step) {
       const circle = Array.from({ length: 121 }, (_, i) => onCircle(angle * RADIAN, (i * Math.PI) / 60));
       if (!circle.some(Boolean)) break;
