@@ -581,7 +581,8 @@ class Camera(BatchedModule):
         Returns:
             A line for each point, in the order of `points.flatten(0, -2)`: "valid", or what keeps `project` from it:
             "the camera itself is unusable: ...", "not finite: ...", "no direction: ...", "the chart does not cover it:
-            ..." or "beyond the fold at ... degrees: ..."; angles from the optical axis, along the azimuth of the point.
+            ...", "beyond the fold at ... degrees: ..." or "beyond the edge of the surface at ..."; angles from the
+            optical axis, along the azimuth of the point.
         """
         return explain(self, points)
 

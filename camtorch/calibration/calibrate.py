@@ -300,8 +300,11 @@ def calibrate(
     found = results([search], adjusted, search.free(bend), object_points, [image_points])
     result = found.cameras[0]
     if not result.converged:
+        lost = int((result.observations.seen & ~result.adjusted.valid[0][0]).sum())
+        ends = f"; {lost} corners have no pixel in it: a surface has to reach further" if lost else ""
         python_warnings.warn(
-            f"{owner}: the search did not end at an optimum (rms {result.rms:.4g} px); do not use it. See its warnings",
+            f"{owner}: the search did not end at an optimum (rms {result.rms:.4g} px{ends}); do not use it. See its "
+            "warnings",
             stacklevel=2,
         )
     return result

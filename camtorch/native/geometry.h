@@ -31,6 +31,8 @@ enum { NODES = 1024 };   /* of the table of an inverse, see `radial_inverse.tabu
 enum { MOST_RADII = 512 }; /* on which a lens is followed outwards by bounds of its stages */
 enum { AZIMUTHS = 336 }; /* on which limits are given, see `fold.limits_and_extent` */
 enum { RADII = 80 };     /* on each of them: half over the whole chart, half around the fold of a radial factor */
+/* The inverse of a surface, nearly, as the numbers of a cubic one of GRID x GRID control points */
+enum { GRID = 48, START = 4 + 2 * GRID * GRID };
 /* Radii (RADII); how far out they are sent on each azimuth (AZIMUTHS, RADII), ascending; how far the image reaches in each
    direction (AZIMUTHS) */
 enum { EXTENT = RADII + AZIMUTHS * RADII + AZIMUTHS };
@@ -57,6 +59,11 @@ typedef struct {
     const void *inner2, *usual2, *limits2, *extent, *table;
     const uint8_t *stagewise;
     const void *circle2;
+    /* of a lens that is a surface, or a surface after a radial factor: where a point is in the domain for certain, of each
+       4 x 4 control points (c, n m) and up to the squared radius of the factor's fold (c); where to start the inverse of
+       the surface (c, START) */
+    const uint8_t *certain;
+    const void *certain2, *start;
     /* of an inverted chart: the squared radius and the squared angle of its fold, the table of its inverse */
     const void *chart_inner2, *chart_most2, *chart_table;
 } Cameras;
@@ -79,6 +86,8 @@ typedef struct {
     void *inner2, *usual2, *circle2, *table; /* (c), (c), (c), (c, 2 + 2 NODES); see `Cameras` */
     void *limits2, *extent;                  /* (c, AZIMUTHS), (c, EXTENT): both or none */
     uint8_t *stagewise;                      /* (c); with circle2 */
+    uint8_t *certain;                        /* (c, n m) */
+    void *certain2, *start;                  /* (c); (c, START), which reads `certain` */
 } Domain;
 
 enum { PROJECT, UNPROJECT, PROJECT_VJP, UNPROJECT_VJP };

@@ -34,7 +34,9 @@ typedef struct {
     T(Factor) factors[MOST_PARTS];
     T(Plane) planes[MOST_PARTS];
     R fx, fy, cx, cy, inner2, usual2, circle2;
-    const R *limits2, *extent, *table;
+    const R *limits2, *extent, *table, *start;
+    const uint8_t *certain;
+    R certain2;
     R chart_inner2, chart_most2;
     const R *chart_table;
     T(Chart) chart;

@@ -355,6 +355,89 @@ static void put(void *to, int64_t at, double value, int is_double) {
 
 #include "geometry_azimuths.h"
 
+/* -- surfaces */
+
+/* Whether a surface is regular wherever 4 x 4 control points have a part in it: its slopes lie between those of the lines
+   from control point to control point */
+static int is_regular(const Part *part, const double *k, const double *at) {
+    double ua = INFINITY, vb = INFINITY, ub = 0, va = 0, all = 0;
+    for (int j = 0; j < 4; j++)
+        for (int i = 0; i < 4; i++) {
+            const double *here = at + 2 * ((int64_t)j * part->n + i), *below = here + 2 * (int64_t)part->n;
+            if (i < 3) {
+                const double by_a = 1 + (here[2] - here[0]) * k[0], side = fabs(here[3] - here[1]) * k[0];
+                ua = by_a < ua ? by_a : ua, va = side > va ? side : va, all += by_a + side;
+            }
+            if (j < 3) {
+                const double by_b = 1 + (below[1] - here[1]) * k[1], side = fabs(below[0] - here[0]) * k[1];
+                vb = by_b < vb ? by_b : vb, ub = side > ub ? side : ub, all += by_b + side;
+            }
+        }
+    /* what is not a number is in all of them */
+    return all == all && ua > 0 && vb > 0 && ua * vb - ub * va > 0.01;
+}
+
+/* (n m): of the first of 4 x 4 control points, whether the surface is regular there and all the way from the centre */
+static void certain_of(const Part *part, const double *k, uint8_t *certain) {
+    const int n = part->n, m = part->m;
+    const double origin[LANES] = {0};
+    Cells_double at;
+    memset(certain, 0, (size_t)n * (size_t)m);
+    cells_double(part, k, 0, LANES, origin, origin, &at);
+    const int first_i = at.at[0] / 2 % n, first_j = at.at[0] / 2 / n;
+    for (int down = -1; down <= 1; down += 2)
+        for (int across = -1; across <= 1; across += 2)
+            for (int j = first_j; j >= 0 && j <= m - 4; j += down)
+                for (int i = first_i; i >= 0 && i <= n - 4; i += across) {
+                    const int here = j * n + i, before = i == first_i || certain[here - across];
+                    certain[here] = before && (j == first_j || certain[here - down * n]) && is_regular(part, k, k + 4 + 2 * here);
+                }
+}
+
+/* (START): the inverse of the last stage, a surface, on the box around what it sends certain points to */
+static void start_of(const Domain *d, int64_t camera, const uint8_t *certain, double *start) {
+    Camera_double c;
+    lens_of(d, camera, &c);
+    c.certain = certain;
+    const Part *part = c.parts + c.stages;
+    const double *k = c.numbers[c.stages], size[2] = {(part->n - part->flags) / k[0], (part->m - part->flags) / k[1]};
+    ALIGNED double a[BLOCK], b[BLOCK], u[BLOCK], v[BLOCK];
+    ALIGNED int64_t ok[BLOCK];
+    double low[2] = {INFINITY, INFINITY}, high[2] = {-INFINITY, -INFINITY}, found[2][GRID + 2][GRID + 2];
+    for (int j = 0; j < GRID; j++) {
+        for (int i = 0; i < GRID; i++)
+            a[i] = k[2] + size[0] * (i / (GRID - 1.0) - 0.5), b[i] = k[3] + size[1] * (j / (GRID - 1.0) - 0.5);
+        on_surface_double(&c, GRID, a, b, ok);
+        stage_double(&c, c.stages, GRID, a, b, u, v, NULL);
+        for (int i = 0; i < GRID; i++) {
+            if (!ok[i]) continue;
+            low[0] = u[i] < low[0] ? u[i] : low[0], high[0] = u[i] > high[0] ? u[i] : high[0];
+            low[1] = v[i] < low[1] ? v[i] : low[1], high[1] = v[i] > high[1] ? v[i] : high[1];
+        }
+    }
+    for (int axis = 0; axis < 2; axis++) {
+        const int is_box = low[axis] < high[axis];
+        start[axis] = (GRID - 3) / (is_box ? high[axis] - low[axis] : size[axis]);
+        start[2 + axis] = is_box ? (low[axis] + high[axis]) / 2 : k[2 + axis];
+    }
+    for (int j = 0; j < GRID + 2; j++) {
+        for (int i = 0; i < GRID + LANES; i++) {
+            u[i] = start[2] + ((i < GRID + 2 ? i : 0) - (GRID + 1) / 2.0) / start[0];
+            v[i] = start[3] + (j - (GRID + 1) / 2.0) / start[1];
+        }
+        start_double(&c, c.stages, GRID + LANES, u, v, a, b);
+        newton_double(&c, c.stages, GRID + LANES, u, v, a, b, ok, 1);
+        for (int i = 0; i < GRID + 2; i++) found[0][j][i] = ok[i] ? a[i] - u[i] : 0, found[1][j][i] = ok[i] ? b[i] - v[i] : 0;
+    }
+    for (int j = 1; j <= GRID; j++) /* so that it goes through them, to the fourth power of a cell */
+        for (int i = 1; i <= GRID; i++)
+            for (int axis = 0; axis < 2; axis++) {
+                double(*f)[GRID + 2] = found[axis];
+                const double beside = f[j][i - 1] + f[j][i + 1] + f[j - 1][i] + f[j + 1][i];
+                start[4 + 2 * ((j - 1) * GRID + i - 1) + axis] = f[j][i] - (beside - 4 * f[j][i]) / 6;
+            }
+}
+
 /* Fills in what of a `Domain` is wanted */
 void THIS(domain)(const Domain *d) {
     const int is_double = (int)d->is_double;
@@ -398,6 +481,17 @@ void THIS(domain)(const Domain *d) {
             Camera_double camera;
             lens_of(d, c, &camera);
             follow(d, c, &camera, has_factor ? fold : NAN, end);
+        }
+        const Part *last = d->parts + d->part_count - 1;
+        if (d->certain2) {
+            const double *controls = numbers + d->parameter_count - numbers_of(last);
+            certain_of(last, controls, d->certain + c * last->n * last->m);
+            put(d->certain2, c, has_factor ? within(fold, end, is_double) : INFINITY, is_double);
+        }
+        if (d->start) {
+            double start[START];
+            start_of(d, c, d->certain + c * last->n * last->m, start);
+            for (int i = 0; i < START; i++) put(d->start, c * START + i, start[i], is_double);
         }
         if (d->table && has_factor) {
             tabulate(&lens, fold, usual_end, table);

@@ -255,106 +255,89 @@ INLINE void T(adjugate)(const R *k, R *m) {
         }
 }
 
-/* Weights of four control points in a row, each twice, as polynomials of the place in a cell; and by how much they change
-   from control point to control point. Of order 2 the fourth, or at the end of a row the first, has no part */
-#define TWICE(a, b, c, d) {a, a, b, b, c, c, d, d}
-static const R T(cubic)[4][8] = {TWICE((R)(1 / 6.0), (R)(4 / 6.0), (R)(1 / 6.0), 0), TWICE((R)-0.5, 0, (R)0.5, 0),
-                                 TWICE((R)0.5, -1, (R)0.5, 0), TWICE((R)(-1 / 6.0), (R)0.5, (R)-0.5, (R)(1 / 6.0))};
-static const R T(quadratic)[2][4][8] = {
-    {TWICE((R)0.125, (R)0.75, (R)0.125, 0), TWICE((R)-0.5, 0, (R)0.5, 0), TWICE((R)0.5, -1, (R)0.5, 0), {0}},
-    {TWICE(0, (R)0.125, (R)0.75, (R)0.125), TWICE(0, (R)-0.5, 0, (R)0.5), TWICE(0, (R)0.5, -1, (R)0.5), {0}}};
-
-/* Points in their cells: where their 4 x 4 control points begin, how far into the cell they are, and its polynomials */
+/* Points in their cells: where their 4 x 4 control points begin, the weights of these along a and b and, if wanted, how
+   much these change from control point to control point. Of order 2 the fourth, or at the end of a row the first, has no part */
 typedef struct {
-    ALIGNED R x[BLOCK], y[BLOCK];
-    ALIGNED int32_t at[BLOCK], last_x[BLOCK], last_y[BLOCK];
+    ALIGNED R x[4][BLOCK], y[4][BLOCK], by_x[4][BLOCK], by_y[4][BLOCK];
+    ALIGNED int32_t at[BLOCK];
 } T(Cells);
 
-static void T(cells)(const Part *part, const R *k, int n, const R *restrict a, const R *restrict b, T(Cells) *restrict to) {
-    const int order = part->flags;
-    const R columns = (R)part->n, rows = (R)part->m, sa = k[0], sb = k[1], ca = k[2], cb = k[3], half = order == 3 ? 0 : (R)0.5;
-    const R first_a = (columns - 1) / 2, first_b = (rows - 1) / 2, most_a = columns - (R)order, most_b = rows - (R)order;
-    const int32_t width = part->n, shift = order == 3 ? 0 : 2, last_a = width - shift, last_b = part->m - shift;
-    EACH(i) {
-        const R p = (a[i] - ca) * sa + first_a, q = (b[i] - cb) * sb + first_b;
-        R column = IS_DOUBLE ? (R)floor(p + half) : (R)floorf((float)(p + half));
-        R row = IS_DOUBLE ? (R)floor(q + half) : (R)floorf((float)(q + half));
-        column = column > 1 ? column : 1, column = column < most_a ? column : most_a;
-        row = row > 1 ? row : 1, row = row < most_b ? row : most_b;
-        to->x[i] = p - column, to->y[i] = q - row;
-        const int32_t at_x = (int32_t)column, at_y = (int32_t)row;
-        to->last_x[i] = at_x >= last_a, to->last_y[i] = at_y >= last_b;
-        to->at[i] = 2 * ((at_y - 1 - to->last_y[i]) * width + at_x - 1 - to->last_x[i]);
+INLINE void T(weigh)(const int order, int n, R size, R (*restrict w)[BLOCK], R (*restrict by)[BLOCK], I *restrict first) {
+    const R half = order == 3 ? 0 : (R)0.5, most = size - (R)order;
+    EACH(i) { /* w[0]: the place in cells, from the first control point on */
+        R cell = IS_DOUBLE ? (R)floor(w[0][i] + half) : (R)floorf((float)(w[0][i] + half));
+        cell = cell > 1 ? cell : 1, cell = cell < most ? cell : most;
+        const R x = w[0][i] - cell, xx = x * x, y = 1 - x;
+        if (order == 3) {
+            w[0][i] = y * y * y * (R)(1 / 6.0), w[1][i] = (x / 2 - 1) * xx + (R)(2 / 3.0);
+            w[2][i] = ((1 - x) * x + 1) * x / 2 + (R)(1 / 6.0), w[3][i] = xx * x * (R)(1 / 6.0);
+            if (by) by[0][i] = -y * y / 2, by[1][i] = ((R)1.5 * x - 2) * x, by[2][i] = (R)0.5 + (1 - (R)1.5 * x) * x, by[3][i] = xx / 2;
+            first[i] = (I)cell - 1;
+        } else {
+            const int last = cell >= size - 2;
+            const R p = (xx - x) / 2 + (R)0.125, q = (R)0.75 - xx, r = (xx + x) / 2 + (R)0.125, s = x - (R)0.5, t = x + (R)0.5;
+            w[0][i] = last ? 0 : p, w[1][i] = last ? p : q, w[2][i] = last ? q : r, w[3][i] = last ? r : 0;
+            if (by) by[0][i] = last ? 0 : s, by[1][i] = last ? s : -2 * x, by[2][i] = last ? -2 * x : t, by[3][i] = last ? t : 0;
+            first[i] = (I)cell - 1 - last;
+        }
     }
 }
 
-/* One of eight weights */
-INLINE R T(weight)(const R (*c)[8], int j, R x) { return c[0][j] + x * (c[1][j] + x * (c[2][j] + x * c[3][j])); }
-
-/* Two control points, or two weights twice: a vector, where the compiler has such */
-#if defined(__GNUC__)
-typedef R T(Pair) __attribute__((vector_size(4 * sizeof(R))));
-
-INLINE T(Pair) T(pair)(const R *from) {
-    T(Pair) to;
-    memcpy(&to, from, sizeof to);
-    return to;
+INLINE void T(cells)(const Part *part, const R *k, const int slopes, int n, const R *restrict a, const R *restrict b,
+                     T(Cells) *restrict c) {
+    const R columns = (R)part->n, rows = (R)part->m, sa = k[0], sb = k[1], ca = k[2], cb = k[3];
+    ALIGNED I i_first[BLOCK], j_first[BLOCK];
+    EACH(i) c->x[0][i] = (a[i] - ca) * sa + (columns - 1) / 2, c->y[0][i] = (b[i] - cb) * sb + (rows - 1) / 2;
+    R(*by_x)[BLOCK] = slopes ? c->by_x : NULL, (*by_y)[BLOCK] = slopes ? c->by_y : NULL;
+    if (part->flags == 3) T(weigh)(3, n, columns, c->x, by_x, i_first), T(weigh)(3, n, rows, c->y, by_y, j_first);
+    else T(weigh)(2, n, columns, c->x, by_x, i_first), T(weigh)(2, n, rows, c->y, by_y, j_first);
+    EACH(i) c->at[i] = (int32_t)(2 * (j_first[i] * part->n + i_first[i]));
 }
 
-INLINE T(Pair) T(weights)(const R (*c)[8], int half, R x) {
-    return T(pair)(c[0] + half) + x * (T(pair)(c[1] + half) + x * (T(pair)(c[2] + half) + x * T(pair)(c[3] + half)));
+/* Of four columns, du and dv of each, the sums over four rows; and, if wanted, by other weights */
+INLINE void T(sum_rows)(const R *restrict controls, int64_t width, int n, const T(Cells) *restrict c, R *restrict sums,
+                        R *restrict others) {
+    for (int i = 0; i < n; i++) {
+        const R *restrict from = controls + c->at[i], p = c->y[0][i], q = c->y[1][i], r = c->y[2][i], s = c->y[3][i];
+        for (int j = 0; j < 8; j++)
+            sums[8 * i + j] = (p * from[j] + q * from[width + j]) + (r * from[2 * width + j] + s * from[3 * width + j]);
+        if (!others) continue;
+        const R dp = c->by_y[0][i], dq = c->by_y[1][i], dr = c->by_y[2][i], ds = c->by_y[3][i];
+        for (int j = 0; j < 8; j++)
+            others[8 * i + j] = (dp * from[j] + dq * from[width + j]) + (dr * from[2 * width + j] + ds * from[3 * width + j]);
+    }
 }
 
-INLINE T(Pair) T(slopes)(const R (*c)[8], int half, R x) {
-    return T(pair)(c[1] + half) + x * (2 * T(pair)(c[2] + half) + x * (3 * T(pair)(c[3] + half)));
+/* Of their sums, those over columns */
+INLINE void T(sum_columns)(const R *s, R p, R q, R r, R t, R *u, R *v) {
+    *u = (p * s[0] + q * s[2]) + (r * s[4] + t * s[6]), *v = (p * s[1] + q * s[3]) + (r * s[5] + t * s[7]);
 }
 
-/* Of two columns, the sum over four rows by their weights */
-INLINE T(Pair) T(rows_of)(const R *from, int64_t width, T(Pair) low, T(Pair) high) {
-    return low[0] * T(pair)(from) + low[2] * T(pair)(from + width) + (high[0] * T(pair)(from + 2 * width) + high[2] * T(pair)(from + 3 * width));
+INLINE void T(surface_of)(const Part *part, const R *k, int n, const R *restrict a, const R *restrict b, R *restrict u,
+                          R *restrict v, T(Jacobian) *restrict to) {
+    T(Cells) c;
+    ALIGNED R sums[8 * BLOCK], others[8 * BLOCK];
+    const int64_t width = 2 * (int64_t)part->n;
+    const R sa = k[0], sb = k[1];
+    T(cells)(part, k, to != NULL, n, a, b, &c);
+    T(sum_rows)(k + 4, width, n, &c, sums, to ? others : NULL);
+    EACH(i) {
+        T(sum_columns)(sums + 8 * i, c.x[0][i], c.x[1][i], c.x[2][i], c.x[3][i], u + i, v + i);
+        u[i] += a[i], v[i] += b[i];
+        if (!to) continue;
+        T(sum_columns)(sums + 8 * i, c.by_x[0][i], c.by_x[1][i], c.by_x[2][i], c.by_x[3][i], to->ua + i, to->va + i);
+        to->ua[i] = to->ua[i] * sa + 1, to->va[i] *= sa;
+    }
+    if (to) EACH(i) {
+        T(sum_columns)(others + 8 * i, c.x[0][i], c.x[1][i], c.x[2][i], c.x[3][i], to->ub + i, to->vb + i);
+        to->ub[i] *= sb, to->vb[i] = to->vb[i] * sb + 1;
+    }
 }
-
-#else
-INLINE R T(slope)(const R (*c)[8], int j, R x) { return c[1][j] + x * (2 * c[2][j] + x * 3 * c[3][j]); }
-#endif
 
 static void T(surface)(const Part *part, const R *k, int n, const R *restrict a, const R *restrict b, R *restrict u,
                        R *restrict v, T(Jacobian) *restrict to) {
-    T(Cells) c;
-    const int64_t width = 2 * (int64_t)part->n;
-    const R sa = k[0], sb = k[1], (*first)[8] = part->flags == 3 ? T(cubic) : T(quadratic)[0];
-    T(cells)(part, k, n, a, b, &c);
-    for (int i = 0; i < n; i++) {
-        const R *from = k + 4 + c.at[i], (*by_x)[8] = first + 4 * c.last_x[i], (*by_y)[8] = first + 4 * c.last_y[i];
-#if defined(__GNUC__)
-        const T(Pair) x0 = T(weights)(by_x, 0, c.x[i]), x1 = T(weights)(by_x, 4, c.x[i]);
-        const T(Pair) y0 = T(weights)(by_y, 0, c.y[i]), y1 = T(weights)(by_y, 4, c.y[i]);
-        const T(Pair) s0 = T(rows_of)(from, width, y0, y1), s1 = T(rows_of)(from + 4, width, y0, y1);
-        const T(Pair) sum = s0 * x0 + s1 * x1;
-        u[i] = sum[0] + sum[2], v[i] = sum[1] + sum[3];
-        if (to) {
-            const T(Pair) across = s0 * T(slopes)(by_x, 0, c.x[i]) + s1 * T(slopes)(by_x, 4, c.x[i]);
-            const T(Pair) d0 = T(slopes)(by_y, 0, c.y[i]), d1 = T(slopes)(by_y, 4, c.y[i]);
-            const T(Pair) down = T(rows_of)(from, width, d0, d1) * x0 + T(rows_of)(from + 4, width, d0, d1) * x1;
-            to->ua[i] = across[0] + across[2], to->va[i] = across[1] + across[3];
-            to->ub[i] = down[0] + down[2], to->vb[i] = down[1] + down[3];
-        }
-#else
-        u[i] = v[i] = 0;
-        if (to) to->ua[i] = to->ub[i] = to->va[i] = to->vb[i] = 0;
-        for (int q = 0; q < 8; q += 2)
-            for (int p = 0; p < 8; p += 2) {
-                const R *at = from + q / 2 * width + p, w = T(weight)(by_x, p, c.x[i]), down = T(weight)(by_y, q, c.y[i]);
-                u[i] += w * down * at[0], v[i] += w * down * at[1];
-                if (!to) continue;
-                const R across = T(slope)(by_x, p, c.x[i]) * down, along = T(slope)(by_y, q, c.y[i]) * w;
-                to->ua[i] += across * at[0], to->va[i] += across * at[1];
-                to->ub[i] += along * at[0], to->vb[i] += along * at[1];
-            }
-#endif
-    }
-    EACH(i) u[i] += a[i], v[i] += b[i];
-    if (to) EACH(i) to->ua[i] = to->ua[i] * sa + 1, to->va[i] *= sa, to->ub[i] *= sb, to->vb[i] = to->vb[i] * sb + 1;
+    if (to) T(surface_of)(part, k, n, a, b, u, v, to);
+    else T(surface_of)(part, k, n, a, b, u, v, NULL);
 }
 
 /* Cells and centre are constants: their sums stay 0 */
@@ -365,15 +348,14 @@ static void T(surface_vjp)(const Part *part, const R *k, int n, const R *restric
     T(surface)(part, k, n, a, b, u, v, &to);
     if (sums) {
         T(Cells) c;
-        const R(*first)[8] = part->flags == 3 ? T(cubic) : T(quadratic)[0];
-        T(cells)(part, k, n, a, b, &c);
-        for (int i = 0; i < n; i++) {
-            const R(*by_x)[8] = first + 4 * c.last_x[i], (*by_y)[8] = first + 4 * c.last_y[i];
+        T(cells)(part, k, 0, n, a, b, &c);
+        for (int i = 0; i < n; i++)
             for (int q = 0; q < 4; q++)
-                for (int j = 0; j < 8; j++)
-                    sums[4 + c.at[i] + 2 * (int64_t)part->n * q + j] +=
-                        T(weight)(by_y, 2 * q, c.y[i]) * T(weight)(by_x, j, c.x[i]) * (j % 2 ? gv[i] : gu[i]);
-        }
+                for (int p = 0; p < 4; p++) {
+                    double *here = sums + 4 + c.at[i] + 2 * ((int64_t)part->n * q + p);
+                    const R w = c.y[q][i] * c.x[p][i];
+                    here[0] += w * gu[i], here[1] += w * gv[i];
+                }
     }
     EACH(i) {
         const R along = gu[i] * to.ua[i] + gv[i] * to.va[i];
@@ -388,6 +370,16 @@ INLINE R T(surface_edge)(const Part *part, const R *k, R a, R b) {
     return across < down ? across : across == across ? down : -1;
 }
 
+/* Points of the plane of a surface, the last stage, where it is regular on the whole way from the centre for certain */
+static void T(on_surface)(const T(Camera) *c, int n, const R *restrict a, const R *restrict b, I *restrict ok) {
+    const Part *part = c->parts + c->stages;
+    const R *k = c->numbers[c->stages];
+    T(Cells) cells;
+    T(cells)(part, k, 0, n, a, b, &cells);
+    EACH(i) ok[i] = T(surface_edge)(part, k, a[i], b[i]) > 0;
+    for (int i = 0; i < n; i++) ok[i] &= c->certain[cells.at[i] / 2];
+}
+
 static void T(stage)(const T(Camera) *c, int stage, int n, const R *a, const R *b, R *u, R *v, T(Jacobian) *to) {
     const Part *part = c->parts + stage;
     const R *k = c->numbers[stage];
@@ -397,6 +389,15 @@ static void T(stage)(const T(Camera) *c, int stage, int n, const R *a, const R *
         if (to) EACH(i) to->ua[i] = to->vb[i] = 1, to->ub[i] = k[1], to->va[i] = k[0];
     } else if (part->kind == SURFACE) T(surface)(part, k, n, a, b, u, v, to);
     else T(planar)(c, stage, n, a, b, u, v, to);
+}
+
+/* Points that are in the domain for certain */
+static void T(certain)(const T(Camera) *c, int n, const R *restrict a, const R *restrict b, I *restrict ok) {
+    ALIGNED R x[BLOCK], y[BLOCK];
+    const R certain2 = c->certain2;
+    if (c->stages > 1) T(stage)(c, 1, n, a, b, x, y, NULL);
+    T(on_surface)(c, n, c->stages > 1 ? x : a, c->stages > 1 ? y : b, ok);
+    EACH(i) ok[i] &= certain2 - (a[i] * a[i] + b[i] * b[i]) > 0;
 }
 
 /* Where the stages from `first` on send points, not in place; the Jacobian of all of them; if wanted, `least`: positive

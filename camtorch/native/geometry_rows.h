@@ -35,6 +35,11 @@ static void T(prepare)(const Cameras *all, int64_t camera, T(Camera) *c) {
         c->limits2 = all->limits2 ? (const R *)all->limits2 + camera * AZIMUTHS : NULL;
         c->extent = all->extent ? (const R *)all->extent + camera * EXTENT : NULL;
         c->waits = c->follows && !c->extent;
+        if (all->certain && c->follows) {
+            const Part *last = c->parts + c->stages;
+            c->certain = all->certain + camera * last->n * last->m, c->certain2 = ((const R *)all->certain2)[camera];
+        }
+        c->start = all->start ? (const R *)all->start + camera * START : NULL;
         c->table = all->table ? (const R *)all->table + camera * (2 + 2 * NODES) : NULL;
     }
     if (c->parts->kind == INVERTED) {
@@ -218,11 +223,15 @@ INLINE R T(ray_of)(R phi, R theta, R *x, R *y) {
     return cosine * cosine - *y * *y;
 }
 
-static void T(bend_at)(const T(Camera) *c, int n, T(Bent) *b) {
+static void T(both)(const T(Camera) *c, int n, T(Bent) *b) {
     const int across = c->parts->across, down = c->parts->down;
-    const R half = (R)(PI / 2), least = (R)NEAR_SIDE;
     T(bivariate)(c->map, across, n, b->phi, b->theta, b->p, b->by.ua, b->by.ub);
     T(bivariate)(c->map + across, down, n, b->phi, b->theta, b->q, b->by.va, b->by.vb);
+}
+
+static void T(bend_at)(const T(Camera) *c, int n, T(Bent) *b) {
+    const R half = (R)(PI / 2), least = (R)NEAR_SIDE;
+    T(both)(c, n, b);
     EACH(i) {
         R x, y;
         const R p = b->p[i], q = b->q[i], area = b->by.ua[i] * b->by.vb[i] - b->by.ub[i] * b->by.va[i];
@@ -264,17 +273,25 @@ static void T(angles_vjp)(int n, const R *restrict x, const R *restrict y, const
 /* Unit rays behind the shield to those in front of it; `ok` where there is one */
 static void T(unbend)(const T(Camera) *c, int n, T(Bent) *b, R *restrict x, R *restrict y, R *restrict z, I *restrict ok) {
     ALIGNED R p[BLOCK], q[BLOCK], off[BLOCK];
+    const R half = (R)(PI / 2), least = (R)NEAR_SIDE;
     T(angles_of)(n, x, y, z, b);
-    EACH(i) p[i] = b->phi[i], q[i] = b->theta[i];
+    EACH(i) p[i] = b->phi[i], q[i] = b->theta[i], b->phi[i] = b->theta[i] = 0;
+    T(both)(c, LANES, b); /* from the inverse of the linear part, which is that of 0 */
+    const R p0 = b->p[0], q0 = b->q[0], ua = b->by.ua[0], ub = b->by.ub[0], va = b->by.va[0], vb = b->by.vb[0];
+    EACH(i) {
+        R da, db;
+        T(step)(ua, ub, va, vb, p[i] - p0, q[i] - q0, &da, &db);
+        b->phi[i] = da > -half ? da < half ? da : half : -half, b->theta[i] = db > -half ? db < half ? db : half : -half;
+    }
     for (int count = 0;; count++) {
-        int all = 1;
-        T(bend_at)(c, n, b);
+        I all = 1;
+        T(both)(c, n, b);
         EACH(i) off[i] = T(absolute)(p[i] - b->p[i]) + T(absolute)(q[i] - b->q[i]);
-        for (int i = 0; i < n; i++) all &= !ok[i] | (off[i] < 4 * EPS);
+        EACH(i) all &= !ok[i] | (off[i] < 4 * EPS);
         if (all || count == 12) break;
         EACH(i) {
             R da, db;
-            const R half = (R)(PI / 2), most = (R)0.5;
+            const R most = (R)0.5;
             T(step)(b->by.ua[i], b->by.ub[i], b->by.va[i], b->by.vb[i], p[i] - b->p[i], q[i] - b->q[i], &da, &db);
             da = da > -most ? da < most ? da : most : -most, db = db > -most ? db < most ? db : most : -most;
             da += b->phi[i], db += b->theta[i];
@@ -282,8 +299,11 @@ static void T(unbend)(const T(Camera) *c, int n, T(Bent) *b, R *restrict x, R *r
         }
     }
     EACH(i) {
-        const R z2 = T(ray_of)(b->phi[i], b->theta[i], x + i, y + i);
-        ok[i] &= b->ok[i] & (off[i] < 64 * EPS), z[i] = T(root)(z2 > 0 ? z2 : 0);
+        /* as of `bend_at`; what it would bend to is known */
+        const R area = b->by.ua[i] * b->by.vb[i] - b->by.ub[i] * b->by.va[i], after2 = z[i] * z[i];
+        const R z2 = T(ray_of)(b->phi[i], b->theta[i], x + i, y + i), last = T(most)(T(absolute)(p[i]), T(absolute)(q[i]));
+        ok[i] &= (off[i] < 64 * EPS) & (b->side[i] > 0) & (half - last - least > 0) & (area - least > 0);
+        ok[i] &= (after2 - least > 0) & (z2 - least * least > 0), z[i] = T(root)(z2 > 0 ? z2 : 0);
     }
 }
 
@@ -398,6 +418,12 @@ static int T(see)(const T(Camera) *c, int keeps, int count, int n, T(Seen) *s) {
     EACH(i) {
         s->ok[i] += s->ok[i] & !(inner2 - (s->a[i] * s->a[i] + s->b[i] * s->b[i]) > 0); /* 2: beyond */
         outside |= s->ok[i];
+    }
+    if (outside & 2 && c->certain) {
+        ALIGNED I certain[BLOCK];
+        T(certain)(c, n, s->a, s->b, certain);
+        outside = 0;
+        EACH(i) s->ok[i] = s->ok[i] == 2 && certain[i] ? 1 : s->ok[i], outside |= s->ok[i];
     }
     if (outside & 2 && c->follows) waiting = T(beyond)(c, count, n, s);
     EACH(i) {
@@ -607,6 +633,15 @@ static void T(start)(const T(Camera) *c, int first, int n, const R *u, const R *
                 const R p = (a[i] - k[1] * b[i]) / area;
                 b[i] = (b[i] - k[0] * a[i]) / area, a[i] = p;
             }
+        } else if (c->parts[j].kind == SURFACE && j == c->stages && c->start) {
+            const Part inverse = {.kind = SURFACE, .flags = 3, .n = GRID, .m = GRID};
+            const R *t = c->start, across = (R)(GRID - 3) / 2 / t[0], down = (R)(GRID - 3) / 2 / t[1];
+            ALIGNED R p[BLOCK], q[BLOCK];
+            EACH(i) {
+                p[i] = a[i] > t[2] - across ? a[i] : t[2] - across, p[i] = p[i] < t[2] + across ? p[i] : t[2] + across;
+                q[i] = b[i] > t[3] - down ? b[i] : t[3] - down, q[i] = q[i] < t[3] + down ? q[i] : t[3] + down;
+            }
+            T(surface)(&inverse, t, n, p, q, a, b, NULL);
         } else if (c->parts[j].kind == SURFACE) {
             const Part *part = c->parts + j;
             const R across = (R)(part->n - part->flags) / 2 / k[0], down = (R)(part->m - part->flags) / 2 / k[1];
@@ -711,7 +746,7 @@ static void T(search)(const T(Camera) *c, int n, const R *restrict u, const R *r
 /* `invert`, from a table and a few steps; what is not `ok`, and yet possible, is left */
 static void T(invert)(const T(Camera) *c, int n, const R *restrict u, const R *restrict v, R *restrict a, R *restrict b,
                       I *restrict ok, I *restrict possible) {
-    const int fewest = IS_DOUBLE ? 3 : 2;
+    const int fewest = (IS_DOUBLE ? 3 : 2) - !!c->start;
     ALIGNED R p[BLOCK], q[BLOCK];
     if (c->is_radial) {
         T(invert_radial)(c, n, u, v, a, b, ok, possible);
@@ -747,14 +782,24 @@ static void T(invert)(const T(Camera) *c, int n, const R *restrict u, const R *r
             ok[i] &= usual2 - (a[i] * a[i] + b[i] * b[i]) > 0;
             outside |= possible[i] & !ok[i];
         }
+        if (outside && c->certain) {
+            ALIGNED I certain[BLOCK];
+            outside = 0;
+            EACH(i) p[i] = a[i] * (1 + 32 * EPS), q[i] = b[i] * (1 + 32 * EPS);
+            T(certain)(c, n, p, q, certain);
+            EACH(i) ok[i] |= possible[i] & certain[i], outside |= possible[i] & !ok[i];
+        }
         if (outside && c->ends && c->limits2) { /* no circle: much of an image lies beyond any within its edge */
             ALIGNED R x[BLOCK], y[BLOCK], least[BLOCK];
             ALIGNED I inside[BLOCK];
             T(Jacobian) to;
-            EACH(i) p[i] = a[i] * (1 + 32 * EPS), q[i] = b[i] * (1 + 32 * EPS);
-            T(lens)(c, 1, n, p, q, x, y, &to, least);
-            T(contained)(c, n, p, q, least, inside);
-            EACH(i) ok[i] |= possible[i] & inside[i];
+            int places[BLOCK];
+            EACH(i) inside[i] = ok[i] | !possible[i];
+            const int some = T(chosen)(n, inside, places), filled = (some + LANES - 1) & -LANES;
+            for (int i = 0; i < filled; i++) p[i] = a[places[i]] * (1 + 32 * EPS), q[i] = b[places[i]] * (1 + 32 * EPS);
+            T(lens)(c, 1, filled, p, q, x, y, &to, least);
+            T(contained)(c, filled, p, q, least, inside);
+            for (int i = 0; i < some; i++) ok[places[i]] = inside[i];
         }
         EACH(i) possible[i] = 1;
     }
@@ -777,6 +822,11 @@ static void T(solutions)(const T(Camera) *c, int n, R *restrict u, R *restrict v
         T(invert)(c, n, u, v, a, b, ok, possible);
         int places[BLOCK], some;
         EACH(i) possible[i] = (possible[i] == 0) | ok[i] | (known[i] == 0); /* what is settled */
+        if (c->follows && c->extent) {
+            const R *furthest = c->extent + RADII + AZIMUTHS * RADII;
+            for (int i = 0; i < n; i++)
+                if (!possible[i]) possible[i] = T(root)(u[i] * u[i] + v[i] * v[i]) > furthest[T(azimuth)(u[i], v[i], 0)];
+        }
         if ((!c->follows || c->extent) && (some = T(chosen)(n, possible, places))) {
             ALIGNED R p[BLOCK], q[BLOCK], found_a[BLOCK], found_b[BLOCK];
             ALIGNED I found[BLOCK];

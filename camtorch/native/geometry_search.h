@@ -128,13 +128,9 @@ static void T(search)(const T(Camera) *c, int n, const R *restrict u, const R *r
     T(Seen) s;
     T(Jacobian) to;
     if (c->follows) {
-        const R *furthest = c->extent + RADII + AZIMUTHS * RADII;
-        for (int i = 0; i < n; i++) {
-            ok[i] = T(root)(u[i] * u[i] + v[i] * v[i]) <= furthest[T(azimuth)(u[i], v[i], 0)];
-            p[i] = ok[i] ? u[i] : 0, q[i] = ok[i] ? v[i] : 0;
-        }
-        T(begin)(c, n, p, q, a, b);
-        T(damped)(c, n, p, q, a, b);
+        EACH(i) ok[i] = 1;
+        T(begin)(c, n, u, v, a, b);
+        T(damped)(c, n, u, v, a, b);
     } else T(by_radius)(c, n, u, v, a, b, ok);
     T(lens)(c, 1, n, a, b, x, y, &to, least);
     T(contained)(c, n, a, b, least, inside);

@@ -37,6 +37,8 @@ _MOST_PARTS, _MOST_DEGREE = 5, 64
 _TABLE = 2 + 2 * 1024
 _RADII, _FOLLOWED, _AZIMUTHS = 512, 80, 336
 _EXTENT = _FOLLOWED + _AZIMUTHS * (_FOLLOWED + 1)
+_START = 4 + 2 * 48 * 48
+_FOR_START = 1 << 15  # points of a camera for which such a table pays
 
 _HAS_XI, _HAS_ALPHA, _HAS_BETA, _TRANSVERSE = 1, 2, 4, 8
 _TANGENTIAL, _PRISM = 1, 2
@@ -79,6 +81,9 @@ class _Cameras(ctypes.Structure):
         ("table", c_void_p),
         ("stagewise", c_void_p),
         ("circle2", c_void_p),
+        ("certain", c_void_p),
+        ("certain2", c_void_p),
+        ("start", c_void_p),
         ("chart_inner2", c_void_p),
         ("chart_most2", c_void_p),
         ("chart_table", c_void_p),
@@ -121,6 +126,9 @@ class _Domain(ctypes.Structure):
         ("limits2", c_void_p),
         ("extent", c_void_p),
         ("stagewise", c_void_p),
+        ("certain", c_void_p),
+        ("certain2", c_void_p),
+        ("start", c_void_p),
     )
 
 
@@ -137,6 +145,8 @@ class Plan:
     is_radial: bool
     has_factor: bool
     has_rest: bool
+    controls: int
+    """Of a surface, the last stage after nothing or a radial factor."""
 
     def __init__(self, chart: Chart, lens: Lens, parts: Sequence[_Part], coefficients: Sequence[Tensor]):
         """Of the optics of coefficients, columns, whatever their values."""
@@ -151,6 +161,9 @@ class Plan:
         self.is_chart = isinstance(_bare(chart), optics.Inverted)
         self.has_stages, self.is_radial = bool(lens.stages), lens.is_radial
         self.has_factor, self.has_rest = lens.radial is not None, lens.rest is not None
+        *before, last = lens.stages or (None,)
+        is_plain = isinstance(last, optics.Surface) and (not before or (len(before) == 1 and before[0].is_radial))
+        self.controls = parts[-1].n * parts[-1].m if is_plain else 0
         self._ends: dict[torch.dtype, tuple[float, float]] = {}
         self._radii: dict[tuple[torch.dtype, int], Tensor] = {}
 
@@ -284,6 +297,8 @@ class Lenses:
         wanted = {"inner2": self._new(1), "usual2": self._new(1)}
         if plan.has_rest:
             wanted |= {"circle2": self._new(1), "stagewise": self._new(1, torch.bool)}
+        if plan.controls:
+            wanted |= {"certain": self._new(plan.controls, torch.uint8), "certain2": self._new(1)}
         for name, place in wanted.items():
             setattr(self.struct, name, place)
         radii = {} if plan.is_radial else {"radii": self._keep(plan.radii(lambda: self._optics()[0], _RADII, self._k))}
@@ -296,6 +311,14 @@ class Lenses:
             self._ask({"table": table})
             self.struct.table = table  # when it is whole, for another thread may be looking
         return int(self.struct.table)
+
+    def surface_table(self) -> int:
+        """The same of the inverse of a surface."""
+        if self.struct.start is None:
+            table = self._new(_START)
+            self._ask({"start": table, "certain": self.struct.certain})
+            self.struct.start = table
+        return int(self.struct.start)
 
     def followed(self) -> tuple[int, int]:
         """The limits of each azimuth, and where the lens sends it: asked for only when a point lies far out."""
@@ -356,9 +379,12 @@ class Native:
         self.struct.intrinsics, self.struct.usable = map(_address, self._kept)
         self.pointer = addressof(self.struct)
 
-    def add_table(self) -> None:
-        """Have what the inverse starts from."""
-        self.struct.table = self._lenses.inverse_table()
+    def add_tables(self, count: int) -> None:
+        """Have what the inverse of so many pixels of each camera starts from."""
+        if self.plan.has_factor and self.struct.table is None:
+            self.struct.table = self._lenses.inverse_table()
+        if count >= _FOR_START and self.struct.certain is not None and self.struct.start is None:
+            self.struct.start = self._lenses.surface_table()
 
     def follow(self) -> None:
         """Have the limits of each azimuth, and where it is sent."""
@@ -482,8 +508,7 @@ def unproject(native: Native, pixels: Tensor, keeps: bool = False) -> Unprojecte
     rays = _empty((3, cameras, count), native.dtype)
     valid = torch.empty(cameras, count, dtype=torch.bool, device="cpu")
     solution = _empty((2, cameras, count), native.dtype) if keeps else None
-    if native.plan.has_factor and native.struct.table is None:
-        native.add_table()
+    native.add_tables(count)
     rows = pixels.data_ptr(), *pixels.stride(), *_planes(rays, cameras, count), valid.data_ptr()
     given = *rows, _address(solution), *_NO_ROWS, 0
     if _call(native, cameras, count, UNPROJECT, given):
@@ -549,8 +574,7 @@ class Between:
         self.dtype = start.dtype
         count, strides = (1, (0, 0)) if turns is None else (turns.numel() // 9, turns.stride())
         self.cameras = max(start.cameras, end.cameras, count)
-        if start.plan.has_factor and start.struct.table is None:
-            start.add_table()
+        start.add_tables(0)
         self._size = size
         by_camera = strides[0] if count > 1 else 0
         self._given = start.pointer, end.pointer, _address(turns), by_camera, *strides[-2:], self.cameras
@@ -567,6 +591,7 @@ class Between:
             the same, of which only those on the image are valid.
         """
         count = pixels.shape[1]
+        self._start.add_tables(count)
         result = torch.empty(self.cameras, count, 2, dtype=self._start.dtype, device="cpu")
         valid = torch.empty(self.cameras, count, dtype=torch.bool, device="cpu")
         rows = *_rows_of(pixels), result.data_ptr(), 2 * count, 2, 1, valid.data_ptr(), count, _TILE

@@ -92,4 +92,9 @@ def _reason(camera: Camera, row: dict[str, Tensor], point: Tensor) -> str:
         what = "the backward direction" if backward else angle
         return f"the chart does not cover it: {what}; on this side it ends at {math.degrees(end):.2f} degrees"
     fold = last(lambda rays: camera.project(rays)[1])
-    return f"beyond the fold at {math.degrees(fold):.2f} degrees: {angle}"
+    chart, lens = camera.optics(columns(camera.distortion[None].double()))
+    behind = min(theta, fold + 1e-3)
+    x, y = (torch.nn.functional.normalize(ray[:2].double(), dim=0) * math.sin(behind)).unsqueeze(-1)
+    edge = lens.at(*chart.to_plane(x, y, x.new_tensor([math.cos(behind)]))).edge
+    what = "fold" if edge is None or bool(edge > 0) else "edge of the surface"
+    return f"beyond the {what} at {math.degrees(fold):.2f} degrees: {angle}"

@@ -323,3 +323,29 @@ def test_contexts_of_torch(left):
     with torch.inference_mode():
         assert str(calibrate(LEFT)) == str(left)
     assert_close(values(found), values(left), **exactly)
+
+
+def test_a_surface_is_learnt_to_the_noise_and_one_that_ends_before_the_corners_says_so():
+    noise, draw = 0.1, torch.Generator().manual_seed(1)
+    model = ct.Splined.with_grid(columns=8, rows=7, fov_x=100)
+    bumps = 0.01 * torch.randn(model.default_count, generator=draw, dtype=torch.float64)
+    true = model(torch.tensor([300.0, 300.0, 319.5, 199.5], dtype=torch.float64), bumps, image_size=(400, 640))
+    y, x = torch.meshgrid(torch.arange(8.0) - 3.5, torch.arange(11.0) - 5, indexing="ij")
+    board = 0.03 * torch.stack((x, y, 0 * x), -1).reshape(-1, 3).double()
+    turns = torch.randn(14, 3, generator=draw, dtype=torch.float64) * torch.tensor([0.5, 0.5, 0.15])
+    places = torch.rand(14, 3, generator=draw, dtype=torch.float64) * torch.tensor([0.24, 0.18, 0.1])
+    views = ct.Extrinsics(turns, places + torch.tensor([-0.12, -0.09, 0.16]))
+    pixels, valid = true.project(views(board[None].expand(14, -1, -1)))
+    pixels = pixels.detach() + noise * torch.randn(pixels.shape, generator=draw, dtype=torch.float64)
+    seen = torch.where((valid & true.contains(pixels))[..., None], pixels, torch.nan)
+
+    def learnt(kind):
+        start = first.convert(kind).camera
+        return ct.calibrate(kind, board, seen, image_size=(400, 640), start=start)
+
+    first = ct.calibrate("kannala_brandt", board, seen, image_size=(400, 640)).camera
+    found = learnt(model)
+    assert found.converged
+    assert 0.9 * noise < found.sigma < 1.15 * noise
+    with pytest.warns(UserWarning, match="corners have no pixel in it: a surface has to reach further"):
+        assert not learnt(ct.Splined.with_grid(columns=8, rows=7, fov_x=60)).converged

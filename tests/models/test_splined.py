@@ -88,6 +88,33 @@ def test_past_the_edge_nothing_is_valid(grid, dtype):
     assert torch.equal(ideal.unproject(moved)[1], ~rim)
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("grid", GRIDS)
+def test_rays_of_many_pixels_are_those_of_few(grid, dtype):
+    camera = drawn(*grid, dtype=dtype)
+    shown = camera.project(on_surface(camera, 9).to(dtype))[0].detach()
+    low, high = shown.amin(0), shown.amax(0)
+    share = torch.rand(40_000, 2, generator=torch.Generator().manual_seed(5), dtype=dtype) * 1.2 - 0.1
+    pixels = low + (high - low) * share  # some beyond the edge
+    rays, valid = camera.unproject(pixels)
+    parts, found = zip(*(camera.unproject(some) for some in pixels.split(1000)), strict=True)
+    assert torch.equal(valid, torch.cat(found))
+    assert 0.5 < valid.double().mean() < 0.9
+    torch.testing.assert_close(rays, torch.cat(parts), rtol=0, atol=64 * torch.finfo(dtype).eps)
+    back = camera.project(rays[valid])[0]
+    assert (back - pixels[valid]).abs().max() < 64 * torch.finfo(dtype).eps * float(pixels.abs().max())
+
+
+def test_an_explanation_tells_the_edge_from_a_fold():
+    flat = ct.Splined([100, 100, 50, 50], [0.0] * ct.Splined.default_count)
+    (line,) = flat.explain([[10.0, 0.0, 1.0]])
+    assert line == "beyond the edge of the surface at 80.00 degrees: 84.29 degrees from the optical axis"
+    folded = flat.distortion.detach().reshape(8, 10, 2).clone()
+    folded[:, 7:] -= 1.0  # columns from the eighth on are drawn back
+    (line,) = ct.Splined(flat.intrinsics, folded.flatten()).explain([[10.0, 0.0, 1.0]])
+    assert line.startswith("beyond the fold at ")
+
+
 def test_grids_are_models_of_their_own_wherever_models_go(tmp_path):
     model = ct.Splined.with_grid(order=2, columns=9, rows=5, fov_x=120)
     assert model is ct.Splined.with_grid(columns=9, rows=5, fov_x=120, order=2)

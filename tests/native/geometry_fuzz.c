@@ -134,7 +134,7 @@ static int fuzz(uint64_t job) {
     Cameras cameras = {0};
     Rows rows = {0};
     int64_t numbers = 0, i;
-    void *kept[50];
+    void *kept[60];
     int used = 0, fine = 1;
     memset(parts, 0, sizeof parts);
     state = job * 0x2545f4914f6cdd1du;
@@ -149,9 +149,13 @@ static int fuzz(uint64_t job) {
     cameras.part_count = 1 + below(4);
     for (i = 1; i < cameras.part_count; i++) {
         Part *part = parts + i;
-        part->kind = PLANAR + (int32_t)below(3);
+        part->kind = PLANAR + (int32_t)below(4);
         if (part->kind == HOMOGRAPHY) numbers += 9;
         if (part->kind == SHEAR) numbers += 2;
+        if (part->kind == SURFACE) {
+            part->flags = 2 + (int32_t)below(2), part->n = 4 + (int32_t)below(5), part->m = 4 + (int32_t)below(5);
+            numbers += 4 + 2 * part->n * part->m;
+        }
         if (part->kind != PLANAR) continue;
         part->flags = (int32_t)below(4);
         numbers += factor_of(part, i == 1 ? POLYNOMIAL : NO_FACTOR, i == 1 ? RADIUS_TABLE : RADIUS_POLYNOMIAL);
@@ -176,6 +180,14 @@ static int fuzz(uint64_t job) {
         for (i = 0; i < c; i++) by_stages[i] = (uint8_t)below(2);
         cameras.stagewise = by_stages, cameras.circle2 = KEPT(filled(d, c, 2, 2));
     }
+    const Part *last = parts + cameras.part_count - 1;
+    const int64_t controls = last->kind == SURFACE ? last->n * last->m : 0;
+    if (controls && below(2)) {
+        uint8_t *certain = KEPT(malloc((size_t)(c * controls)));
+        for (i = 0; i < c * controls; i++) certain[i] = (uint8_t)below(2);
+        cameras.certain = certain, cameras.certain2 = KEPT(filled(d, c, 2, 2));
+        if (below(2)) cameras.start = KEPT(filled(d, c * START, 2, 0));
+    }
     if (parts[0].kind == INVERTED) {
         cameras.chart_inner2 = KEPT(filled(d, c, 2, 2)), cameras.chart_most2 = KEPT(filled(d, c, 2, 2));
         cameras.chart_table = KEPT(filled(d, c * (2 + 2 * NODES), 1, 1));
@@ -192,6 +204,10 @@ static int fuzz(uint64_t job) {
     domain.is_radial = has_factor && !many && !(parts[1].flags & (TANGENTIAL | PRISM));
     domain.inner2 = KEPT(filled(d, c, 0, 0)), domain.usual2 = KEPT(filled(d, c, 0, 0));
     domain.table = KEPT(filled(d, c * (2 + 2 * NODES), 0, 0));
+    if (controls && !domain.is_chart) {
+        domain.certain = KEPT(malloc((size_t)(c * controls))), domain.certain2 = KEPT(filled(d, c, 0, 0));
+        domain.start = KEPT(filled(d, c * START, 0, 0));
+    }
     if (has_factor && many && !domain.is_chart)
         domain.circle2 = KEPT(filled(d, c, 0, 0)), domain.stagewise = KEPT(malloc((size_t)c));
     if (cameras.part_count > 1 && !domain.is_chart && below(4) == 0) {
