@@ -1,8 +1,8 @@
 """The images of the documentation, rendered: `python docs/make_images.py`, or those of one part, or some of these.
 
 `guides` makes those of the guides, `guides dewarp learn` two of them, `models kannala_brandt` that of one camera model;
-`case-study` takes a quarter of an hour, `viewer` a browser (`pip install -e ".[viewer-test]"`, and Chromium): they are made by
-their names only.
+`case-study` takes a quarter of an hour, `viewer` a browser (`pip install -e ".[viewer-test]"`, and Chromium): these are
+made by their names only.
 """
 
 import io
