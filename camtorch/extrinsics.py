@@ -185,7 +185,7 @@ def head_angles(pose: Extrinsics | Numbers) -> Tensor:
         if matrix.shape[-2:] not in ((3, 3), (4, 4)):
             raise ValueError(
                 "head_angles: pose must be Extrinsics, a Pose, (..., 4, 4) or (..., 3, 3); "
-                f"got shape {tuple(matrix.shape)}. A rotation vector goes in as ct.rotation_matrix(rvec)"
+                f"got shape {tuple(matrix.shape)}. A rotation vector goes in as ct.Extrinsics(rvec, (0, 0, 0))"
             )
         matrix = matrix[..., :3, :3]
         check_rotation(matrix, "pose", "head_angles")

@@ -73,7 +73,7 @@ def test_gradients():
         (torch.diag(torch.tensor([1.0, 1, -1])), ValueError, "must hold rotation matrices"),
         (torch.full((3, 3), torch.nan), ValueError, "pose"),
         ("left", TypeError, "pose must be numbers"),
-        (torch.zeros(3), ValueError, r"ct\.rotation_matrix\(rvec\)"),
+        (torch.zeros(3), ValueError, r"ct\.Extrinsics\(rvec, \(0, 0, 0\)\)"),
     ],
 )
 def test_bad_poses(pose, error, says):
