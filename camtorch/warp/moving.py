@@ -7,7 +7,7 @@ from torch import Tensor
 
 from camtorch._arguments import Numbers
 from camtorch._evaluation import compiled_of
-from camtorch._tracing import is_eager
+from camtorch._tracing import is_eager, keeps_graph
 from camtorch.camera import Camera
 from camtorch.projection.compiled import ON_IMAGE, PIXELS, Between
 from camtorch.rotations import turn
@@ -48,10 +48,11 @@ def moved_pixels(
     known: the compiled geometry from `end` to `start`, of cameras that are not to change.
     """
     if isinstance(pixels, Tensor) and pixels.ndim > 0 and pixels.shape[-1] == 2:
-        if known is not None and pixels.dtype == known.dtype and is_eager(pixels) and not pixels.requires_grad:
-            ready: Between | None = known.back(end._size_for("Warp"))
-        else:
+        turns = () if rotation is None else (rotation,)
+        if known is None or pixels.dtype != known.dtype or keeps_graph(pixels, *start._tensors, *end._tensors, *turns):
             ready = between(start, end, rotation, pixels)
+        else:
+            ready = known.back(end._size_for("Warp")) if is_eager(pixels) else None
         if ready is not None and ((pixels.ndim > 1 and pixels.shape[0] == ready.cameras) or not ready.is_batch):
             moved, valid = ready.rows(pixels.reshape(ready.cameras, -1, 2), ON_IMAGE if on_image else PIXELS)
             return moved.view(pixels.shape), valid.view(pixels.shape[:-1])
