@@ -615,6 +615,7 @@ class Between:
             padding: that positions are for.
         """
         cameras, dtype, count = self.cameras, self._start.dtype, probes.shape[1]
+        self._start.add_tables(size[0] * size[1])  # of which some are computed one by one, or all
         n, m = (-(-side // 8) for side in size)
         nodes, most, is_double = (n + 5) * (m + 5), cameras * n * m, dtype == torch.float64
         result = torch.empty(cameras, 2, count, dtype=dtype, device="cpu")
