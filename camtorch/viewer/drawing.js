@@ -39,6 +39,8 @@ const Viewer = (() => {
     $("message").className = isTrouble ? "trouble" : "";
   }
 
+  const titleOf = (model) => `${DATA.models[model].class}${Formulas.partsOf(model).shield ? " behind a windshield" : ""}`;
+
   function coefficientNames(model, count) {
     const known = DATA.models[model];
     if (DATA.camera && DATA.camera.model === model && DATA.camera.names.length === count) return DATA.camera.names;
@@ -696,12 +698,13 @@ const Viewer = (() => {
       return rays.every(Boolean) ? `${Math.round(rays.reduce((sum, r) => sum + Math.acos(r[2]), 0) / RADIAN)}°` : "beyond its rays";
     });
     $("facts").textContent =
-      `${DATA.models[state.model].class}, ${state.size[1]} x ${state.size[0]} px: ${angles[0]} wide, ${angles[1]} high; ` +
+      `${titleOf(state.model)}, ${state.size[1]} x ${state.size[0]} px: ${angles[0]} wide, ${angles[1]} high; ` +
       `to the right its rays end at ${(reach / RADIAN).toFixed(1)}°.`;
   }
 
   function rangeOf(name, value) {
     const natural = { alpha: [0, 1], omega: [-2.5, 2.5], xi: [-0.9, 3], beta: [0.1, 3] }[name];
+    if (/^[hv]\d/.test(name)) return [value - 0.1, value + 0.1]; // of a windshield
     if (natural && !state.model.startsWith("cahvor")) return [Math.min(natural[0], value), Math.max(natural[1], value)];
     const usual = /^(p|s)/.test(name) ? 0.02 : /^(d|e|tau)/.test(name) ? 0.2 : 0.3, reach = Math.max(usual, 1.5 * Math.abs(value));
     return [value - reach, value + reach];
@@ -748,9 +751,12 @@ const Viewer = (() => {
     return /\./.test(text) ? text : `${text}.0`;
   };
 
-  const made = ({ model, intrinsics, distortion }, [height, width]) =>
-    `ct.${DATA.models[model].class}(${listed(intrinsics)}` +
-    `${distortion.length ? `, ${listed(distortion)}` : ""}, image_size=(${height}, ${width}))`;
+  function made({ model, intrinsics, distortion }, [height, width]) {
+    const [across, down] = Formulas.partsOf(model).shield ?? [0, 0], count = distortion.length - across - down;
+    const own = distortion.slice(0, count), bends = [distortion.slice(count, count + across), distortion.slice(count + across)];
+    const lens = `ct.${DATA.models[model].class}(${listed(intrinsics)}${count ? `, ${listed(own)}` : ""}, image_size=(${height}, ${width}))`;
+    return across ? `${lens}.behind(ct.Windshield(${bends.map(listed).join(", ")}))` : lens;
+  }
 
   function python() {
     if (trouble) return `# ${trouble}`;
@@ -790,6 +796,8 @@ const Viewer = (() => {
   }
 
   const matrix = ([fx, fy, cx, cy]) => [fx, 0, cx, 0, fy, cy, 0, 0, 1];
+  const json = (name, value) => [name, `${JSON.stringify(value, null, 2)}\n`];
+  const named = (names, values) => Object.fromEntries(names.map((name, i) => [name, values[i]]));
   const COLMAP = {
     pinhole: { 0: "PINHOLE" }, brown_conrady: { 4: "OPENCV", 8: "FULL_OPENCV" }, kannala_brandt: { 4: "OPENCV_FISHEYE" },
     fov: { 1: "FOV" }, thin_prism_fisheye: { 8: "THIN_PRISM_FISHEYE" }, fisheye624: { 12: "RAD_TAN_THIN_PRISM_FISHEYE" },
@@ -798,6 +806,30 @@ const Viewer = (() => {
   const KALIBR = {
     pinhole: ["pinhole", "none", 0, 0], brown_conrady: ["pinhole", "radtan", 0, 4], kannala_brandt: ["pinhole", "equidistant", 0, 4],
     fov: ["pinhole", "fov", 0, 1], mei: ["omni", "radtan", 1, 4], eucm: ["eucm", "none", 2, 0], double_sphere: ["ds", "none", 2, 0],
+  };
+
+  // [the format's name, how many focal lengths, and how many coefficients] of a model
+  const ARIA = {
+    fisheye624: ["FisheyeRadTanThinPrism", 1, 12], fisheye62: ["Fisheye62", 1, 8],
+    kannala_brandt: ["KannalaBrandtK3", 2, 4], pinhole: ["Linear", 2, 0],
+  };
+  const BASALT = {
+    pinhole: ["pinhole", []], double_sphere: ["ds", ["xi", "alpha"]], eucm: ["eucm", ["alpha", "beta"]], ucm: ["ucm", ["alpha"]],
+    kannala_brandt: ["kb4", ["k1", "k2", "k3", "k4"]], fov: ["fov", ["w"]],
+    brown_conrady: ["pinhole-radtan8", ["k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"]],
+  };
+  const MRCAL = {
+    pinhole: [0, "PINHOLE"], equirectangular: [0, "LONLAT"], latlon: [0, "LATLON"], stereographic: [0, "STEREOGRAPHIC"],
+    cahvor: [5, "CAHVOR"],
+  };
+  const NERFSTUDIO = {
+    pinhole: ["PINHOLE", [[]]], kannala_brandt: ["OPENCV_FISHEYE", [["k1", "k2", "k3", "k4"]]],
+    brown_conrady: ["OPENCV", [["k1", "k2", "p1", "p2"], ["k1", "k2", "p1", "p2", "k3"]]],
+  };
+  const CAMODOCAL = {
+    mei: ["MEI", [["mirror", ["xi"]], ["distortion", ["k1", "k2", "p1", "p2"]], ["projection", ["gamma1", "gamma2", "u0", "v0"]]]],
+    brown_conrady: ["PINHOLE", [["distortion", ["k1", "k2", "p1", "p2"]], ["projection", ["fx", "fy", "cx", "cy"]]]],
+    kannala_brandt: ["KANNALA_BRANDT", [["projection", ["k2", "k3", "k4", "k5", "mu", "mv", "u0", "v0"]]]],
   };
 
   // name of the file, and its text; null for a lens that the format cannot hold
@@ -846,6 +878,79 @@ const Viewer = (() => {
       if (!name) return null;
       const numbers = [fx, fy, cx + 0.5, cy + 0.5, ...distortion].map(numeral).join(" ");
       return ["cameras.txt", `# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n1 ${name} ${size[1]} ${size[0]} ${numbers}\n`];
+    },
+    "Nerfstudio (JSON)": ({ model, intrinsics: [fx, fy, cx, cy], distortion, size: [h, w] }) => {
+      const [kind, groups] = NERFSTUDIO[model] ?? ["FISHEYE624", []], names = groups.find((group) => group.length === distortion.length);
+      if (!names && model !== "fisheye624") return null;
+      const lens = names ? named(names, distortion) : { distortion_params: distortion };
+      const core = { camera_model: kind, fl_x: fx, fl_y: fy, cx: cx + 0.5, cy: cy + 0.5, w, h };
+      return json("transforms.json", { ...core, ...lens, frames: [] });
+    },
+    "Aria (JSON)": ({ model, intrinsics: [fx, fy, cx, cy], distortion, size }) => {
+      const [Name, focals, count] = ARIA[model] ?? [];
+      if (!Name || distortion.length !== count || (focals === 1 && fx !== fy)) return null;
+      return json("calibration.json", {
+        AlgorithmName: "camtorch", AlgorithmVersion: "1", CalibrationSource: "Unknown",
+        CameraCalibrations: [{
+          Calibrated: true, ConfigData: { ImageHeight: size[0], ImageWidth: size[1], MaxSolidAngle: Math.PI }, Label: "camera",
+          Projection: { Description: `see ${Name}.h`, Name, Params: [...[fx, fy].slice(0, focals), cx, cy, ...distortion] },
+          SerialNumber: "0", T_Device_Camera: { Translation: [0, 0, 0], UnitQuaternion: [1, [0, 0, 0]] },
+        }],
+        DeviceClassInfo: { BuildVersion: "DVT-S", DeviceClass: "Aria" },
+        FileFormat: { Tags: [], Timestamp: "", UnixTime: 0, Version: 3 },
+        OriginSpecification: { ChildLabel: "camera-slam-left", Type: "Custom" }, Serial: "",
+      });
+    },
+    "Basalt (JSON)": ({ model, intrinsics, distortion, size }) => {
+      const [camera_type, names] = BASALT[model] ?? [];
+      if (!camera_type || distortion.length !== names.length) return null;
+      const values = named(["fx", "fy", "cx", "cy", ...names], [...intrinsics, ...distortion]), zeros = (n) => Array(n).fill(0);
+      return json("calibration.json", { value0: {
+        T_imu_cam: [{ px: 0, py: 0, pz: 0, qx: 0, qy: 0, qz: 0, qw: 1 }],
+        intrinsics: [{ camera_type, intrinsics: model === "brown_conrady" ? { ...values, rpmax: 0 } : values }],
+        resolution: [[size[1], size[0]]], calib_accel_bias: zeros(9), calib_gyro_bias: zeros(12), imu_update_rate: 200,
+        accel_noise_std: Array(3).fill(0.016), gyro_noise_std: Array(3).fill(0.000282),
+        accel_bias_std: Array(3).fill(0.001), gyro_bias_std: Array(3).fill(0.0001), cam_time_offset_ns: 0, vignette: [],
+      } });
+    },
+    "mrcal (cameramodel)": ({ model, intrinsics, distortion, size }) => {
+      const n = distortion.length, grid = /^splined:order=(\d+),columns=(\d+),rows=(\d+),fov_x=(\d+)$/.exec(model);
+      let [count, name] = MRCAL[model] ?? [null], numbers = distortion;
+      if (model === "brown_conrady") [count, name] = [n, `OPENCV${n}`];
+      else if (model === "cahvore") [count, name, numbers] = [n, `CAHVORE_linearity=${numeral(distortion[5])}`, [...distortion.slice(0, 5), 0, 0, 0]];
+      else if (grid) [count, name] = [n, `SPLINED_STEREOGRAPHIC_order=${grid[1]}_Nx=${grid[2]}_Ny=${grid[3]}_fov_x_deg=${grid[4]}`];
+      if (count !== n) return null;
+      const pose = listed([0, 0, 0, 0, 0, 0]);
+      return ["camera.cameramodel", [
+        "{", `    'lensmodel':  'LENSMODEL_${name}',`, `    'intrinsics': ${listed([...intrinsics, ...numbers])},`,
+        `    'rt_cam_ref': ${pose},`, `    'extrinsics': ${pose},`, `    'imagersize': [ ${size[1]}, ${size[0]},],`, "}", "",
+      ].join("\n")];
+    },
+    "WoodScape (JSON)": ({ model, intrinsics: [fx, fy, cx, cy], distortion, size: [height, width] }) => {
+      if (model !== "woodscape" || distortion.length !== 3) return null;
+      const lens = {
+        model: "radial_poly", poly_order: 4, aspect_ratio: fy / fx, width, height,
+        cx_offset: cx - (width - 1) / 2, cy_offset: cy - (height - 1) / 2,
+        ...named(["k1", "k2", "k3", "k4"], [fx, ...distortion.map((k) => k * fx)]),
+      };
+      const extrinsic = { quaternion: [0, 0, 0, 1], translation: [0, 0, 0] };
+      return json("calibration.json", { name: "camera", extrinsic, intrinsic: lens });
+    },
+    "camodocal (YAML)": ({ model, intrinsics, distortion, size }) => {
+      const [kind, groups] = CAMODOCAL[model] ?? [], values = [...distortion, ...intrinsics];
+      if (!kind || values.length !== groups.reduce((sum, [, names]) => sum + names.length, 0)) return null;
+      const lines = groups.flatMap(([group, names]) => [`${group}_parameters:`, ...names.map((name) => `   ${name}: ${numeral(values.shift())}`)]);
+      const head = ["%YAML:1.0", "---", `model_type: ${kind}`, "camera_name: camera", `image_width: ${size[1]}`, `image_height: ${size[0]}`];
+      return ["camera.yaml", [...head, ...lines, ""].join("\n")];
+    },
+    "Gyroflow (JSON)": ({ model, intrinsics: [fx, fy, cx, cy], distortion, size: [h, w] }) => {
+      const kind = { kannala_brandt: "opencv_fisheye", brown_conrady: "opencv_standard" }[model], n = distortion.length;
+      if (!kind || !(n === 4 || (model === "brown_conrady" && [5, 8, 12].includes(n)))) return null;
+      const params = { RMS_error: 0, camera_matrix: [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], distortion_coeffs: distortion };
+      return json("lens.json", {
+        name: "camera", calibrator_version: "camtorch", calib_dimension: { w, h }, orig_dimension: { w, h }, asymmetrical: true,
+        input_horizontal_stretch: 1, input_vertical_stretch: 1, distortion_model: kind, fisheye_params: params,
+      });
     },
   };
 
@@ -1110,7 +1215,7 @@ const Viewer = (() => {
     const own = DATA.camera; // a splined one may have a grid that no preset has
     if (own) DATA.models[own.model] ??= { ...own, counts: [own.distortion.length] };
     const keys = Object.keys(DATA.models).filter((key) => Formulas.MODELS.includes(key.split(":")[0]));
-    const options = () => keys.map((key) => new Option(DATA.models[key].class, key));
+    const options = () => keys.map((key) => new Option(titleOf(key), key));
     $("model").replaceChildren(...options());
     $("models").replaceChildren(...options());
     makeRenderer(new URLSearchParams(location.hash.slice(1)).get("draw"));

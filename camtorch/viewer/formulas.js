@@ -405,6 +405,58 @@ const Formulas = (() => {
     },
   });
 
+  // -- a windshield before a chart: polynomials of the angles of rays, across and down
+
+  function bivariate(c) {
+    // the coefficients of 1, phi, phi^2, ..., then of theta (1, phi, ...), and so on; the value and both derivatives
+    const order = (Math.sqrt(8 * c.length + 1) - 3) / 2;
+    if (!Number.isInteger(order)) throw new Error("A windshield's polynomials have 1, 3, 6, 10, ... coefficients.");
+    return (phi, theta) => {
+      let [value, byPhi, byTheta, end] = [0, 0, 0, c.length];
+      for (let count = 1; count <= order + 1; end -= count++) {
+        let [inner, slope] = [0, 0];
+        for (let k = end - 1; k >= end - count; k--) [slope, inner] = [slope * phi + inner, inner * phi + c[k]];
+        [byTheta, byPhi, value] = [byTheta * theta + value, byPhi * theta + slope, value * theta + inner];
+      }
+      return [value, byPhi, byTheta];
+    };
+  }
+
+  function behindWindshield(across, down, chart) {
+    const P = bivariate(across), Q = bivariate(down), quarter = Math.PI / 2;
+    const anglesOf = (x, y, z) => [Math.atan2(x, hypot(y, z)), Math.atan2(y, hypot(x, z))];
+    const squareAhead = (phi, theta) => Math.cos(phi) ** 2 - Math.sin(theta) ** 2;
+    const rayOf = (phi, theta) => {
+      const square = squareAhead(phi, theta);
+      return square > 0 ? [Math.sin(phi), Math.sin(theta), Math.sqrt(square)] : null;
+    };
+    const at = (phi, theta) => {
+      // where angles go, the Jacobian, and whether the map is one to one and ahead around there
+      const [p, pa, pb] = P(phi, theta), [q, qa, qb] = Q(phi, theta), determinant = pa * qb - pb * qa;
+      const turned = quarter - Math.max(Math.abs(p), Math.abs(q));
+      return { p, q, pa, pb, qa, qb, determinant, margin: Math.min(squareAhead(p, q), determinant, turned) };
+    };
+    const to = (x, y, z) => {
+      const here = at(...anglesOf(x, y, z)), least = 8 * Math.sqrt(EPS);
+      if (!(Math.min(here.margin, z / Math.hypot(x, y, z)) > least)) return null;
+      return chart.to(...rayOf(here.p, here.q));
+    };
+    const back = (a, b) => {
+      const ray = chart.back(a, b);
+      if (!ray || !(ray[2] > 0)) return null;
+      const [u, v] = anglesOf(...ray), within = (step) => Math.min(Math.max(step, -0.5), 0.5);
+      let [phi, theta] = [u, v];
+      for (let i = 0; i < 12; i++) {
+        const { p, q, pa, pb, qa, qb, determinant } = at(phi, theta), [du, dv] = [u - p, v - q];
+        phi = Math.min(Math.max(phi + within((qb * du - pb * dv) / determinant), -quarter), quarter);
+        theta = Math.min(Math.max(theta + within((pa * dv - qa * du) / determinant), -quarter), quarter);
+      }
+      const here = at(phi, theta), found = rayOf(phi, theta);
+      return found && here.margin > 8 * Math.sqrt(EPS) && Math.hypot(here.p - u, here.q - v) < 1e-12 ? found : null;
+    };
+    return { ...chart, panorama: undefined, to, back };
+  }
+
   // -- stages of a lens: `at(a, b)` is [u, v, du/da, du/db, dv/da, dv/db, margin]; `start` a point near what gives (u, v)
 
   function planar({ radial = null, tangential = [0, 0], prism = [0, 0, 0, 0] }) {
@@ -704,20 +756,34 @@ const Formulas = (() => {
       k.slice(0, k.length / 2).every((angle, i) => angle > (i ? k[i - 1] : 0)) || "the angles must ascend from above 0",
   };
 
+  function partsOf(model) {
+    // "splined:order=3,..." has a grid, "pinhole:windshield=3,6" a windshield of so many coefficients
+    const [family, ...variants] = model.split(":"), known = { family, grid: undefined, shield: null };
+    for (const variant of variants) {
+      const counts = /^windshield=(\d+),(\d+)$/.exec(variant);
+      if (counts) known.shield = counts.slice(1).map(Number);
+      else if (family === "splined") known.grid = variant;
+      else known.family = "";
+    }
+    if (!Object.hasOwn(MODELS, known.family)) throw new Error(`This page has no formulas of the model ${model}.`);
+    return known;
+  }
+
   /** A camera: its model's key, [fx, fy, cx, cy] in pixels, coefficients. Throws an Error that says what is wrong. */
   class Camera {
     constructor(model, intrinsics, distortion = []) {
-      const [family, variant] = model.split(":"); // of splined lenses, the grid
-      if (!Object.hasOwn(MODELS, family) || (variant && family !== "splined")) throw new Error(`This page has no formulas of the model ${model}.`);
+      const { family, grid, shield } = partsOf(model);
       const [fx, fy] = intrinsics;
       if (intrinsics.length !== 4 || ![...intrinsics, ...distortion].every(Number.isFinite))
         throw new Error("All numbers of a camera must be finite.");
       if (!(fx > 0 && fy > 0)) throw new Error("Focal lengths must be above 0.");
-      const defined = DEFINED[model]?.(distortion) ?? true;
+      const own = shield ? distortion.slice(0, distortion.length - shield[0] - shield[1]) : distortion;
+      const defined = DEFINED[family]?.(own) ?? true;
       if (defined !== true) throw new Error(`No camera has such coefficients: ${defined}.`);
       Object.assign(this, { model, intrinsics, distortion });
-      const [chart, ...stages] = MODELS[family](distortion, variant);
-      this.chart = chart;
+      const [chart, ...stages] = MODELS[family](own, grid);
+      const bends = distortion.slice(own.length);
+      this.chart = shield ? behindWindshield(bends.slice(0, shield[0]), bends.slice(shield[0]), chart) : chart;
       const some = stages.filter((stage) => !stage.isIdentity);
       if (!some.length) this.lens = null;
       else if (some.length === 1 && some[0].isRadial) this.lens = radialLens(some[0], chart);
@@ -788,6 +854,6 @@ const Formulas = (() => {
     }
   }
 
-  return { Camera, MODELS: Object.keys(MODELS) };
+  return { Camera, MODELS: Object.keys(MODELS), partsOf };
 })();
 if (typeof module !== "undefined") module.exports = Formulas;

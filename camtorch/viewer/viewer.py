@@ -10,6 +10,7 @@ from __future__ import annotations
 import base64
 import json
 import os
+import re
 import zlib
 from functools import cache
 from importlib import resources
@@ -51,7 +52,8 @@ def write_viewer(
     lines of Python that do what is seen are there to be copied.
 
     Args:
-        camera: a single camera with image_size. The page knows the models of the gallery of models.
+        camera: a single camera with image_size. The page knows the models of the gallery of models,
+            also behind a windshield.
         path: the file; an existing one is replaced as a whole.
         image: a photograph that the camera took: a path, a Pillow image, an array (H, W) or (H, W, C), a tensor
             (C, H, W). The page keeps it at up to 1920 pixels. Without one it shows drawn scenes through the lens.
@@ -98,7 +100,8 @@ def _described(camera: Camera) -> dict[str, Any]:
     if camera.batch_shape:
         shape = tuple(camera.batch_shape)
         raise ValueError(f"write_viewer: camera must be a single one, as camera[0] is; got a batch {shape}")
-    if camera.key not in models() and not (isinstance(camera, Splined) and camera.key.startswith("splined:order")):
+    lens = next(kind for kind in model_of(camera).__mro__ if ":windshield=" not in kind.key)
+    if lens.key not in models() and not (issubclass(lens, Splined) and re.fullmatch("splined:order[^:]*", lens.key)):
         raise ValueError(
             f"write_viewer: the page has no formulas of {camera.key or type(camera).__name__}; it knows "
             f"{', '.join(sorted(models()))}. camera.convert(...) makes one of these of it"
@@ -110,7 +113,7 @@ def _described(camera: Camera) -> dict[str, Any]:
         raise ValueError(f"write_viewer: this camera has no pixels: {trouble[0]}: {trouble[1]}")
     return {
         "model": camera.key,
-        "class": _constructor(model_of(camera)),
+        "class": _constructor(lens),
         "intrinsics": _numbers(camera.intrinsics),
         "distortion": _numbers(camera.distortion),
         "names": list(camera.distortion_names)[: len(distortion)],
