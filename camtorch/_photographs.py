@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import os
+import re
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -64,15 +65,15 @@ def read_stored(path: Path, tell: Callable[[str], None]) -> tuple[Tensor, int | 
     """
     try:
         with open_image(path) as opened:
-            count, cut = getattr(opened, "n_frames", 1), _is_cut(opened)
+            count, tiles = getattr(opened, "n_frames", 1), getattr(opened, "tile", ())
+            # of deep colours its decoders are told so, which make eight bits of them
+            cut = opened.mode not in DEEP and any(re.search(r";16|65535", str(tile[3])) for tile in tiles)
             orientation = opened.getexif().get(ORIENTATION)
             image = load_stored(opened)
             if count > 1:
                 tell(f"{path} holds {count} images; only the first is taken")
             if cut:
                 tell(f"{path} has 16 bits a colour; only the upper 8 are read")
-            if image.mode in DEEP and "transparency" in image.info:
-                tell(f"{path} is grey of 16 bits with transparency, which is not read")
             return _pixels(path, image), orientation
     except FileNotFoundError:
         reason = "no such file"
@@ -101,17 +102,6 @@ def open_image(path: Path) -> Image.Image:
         # of a large photograph, which is what the user named
         warnings.simplefilter("ignore", Image.DecompressionBombWarning)
         return Image.open(path)
-
-
-def _is_cut(image: Image.Image) -> bool:
-    """Whether Pillow reads 16 bits as 8, before it does: its decoders' arguments tell."""
-    for tile in () if image.mode in DEEP else getattr(image, "tile", ()):
-        arguments = tile[3] if isinstance(tile[3], tuple) else (tile[3],)
-        if any(isinstance(argument, str) and ";16" in argument for argument in arguments):
-            return True
-        if tile[0] == "ppm" and isinstance(arguments[-1], int) and arguments[-1] > 255:
-            return True
-    return False
 
 
 def _pixels(path: Path, image: Image.Image) -> Tensor:

@@ -15,7 +15,7 @@ from camtorch.cli.terminal import note
 from camtorch.cli.words import GUESS, LENS
 from camtorch.data.columns import camera_of
 from camtorch.extrinsics import Extrinsics
-from camtorch.io import CameraFileError, load, opencv
+from camtorch.io import load, opencv
 from camtorch.models import MODELS
 from camtorch.rig import Rig
 
@@ -49,7 +49,7 @@ def read_rig(
         return _of_lens(str(path).removeprefix(LENS), size)
     if str(path).startswith(GUESS):
         return _guessed(str(path).removeprefix(GUESS), model, size)
-    rig = load(path) if model is None else _of_model(path, model)
+    rig = load(path) if model is None else opencv.read_rig(path, model)
     if stated and model is None and rig.format == "opencv" and _leaves_open(path):
         raise ValueError(
             f"{path}: 4 coefficients, and it does not say of which model: --from-model kannala_brandt if they come "
@@ -94,21 +94,6 @@ def _leaves_open(path: Path) -> bool:
         warnings.simplefilter("always")
         load(path)
     return any(issubclass(warning.category, opencv.AmbiguousModelWarning) for warning in caught)
-
-
-def _of_model(path: Path, model: str) -> Rig:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of what the file might mean: the model says it
-        try:
-            format = load(path).format
-        except CameraFileError:  # a model may be what it lacks
-            format = "opencv"
-    if format != "opencv":
-        raise ValueError(
-            f"{path}: a file of {format}, which says the models of its cameras; naming one is for files of OpenCV "
-            "that leave it open"
-        )
-    return opencv.read_rig(path, model)
 
 
 def _one(path: Path, rig: Rig, name: str | None = None) -> tuple[str, Camera]:
@@ -202,10 +187,8 @@ def settings_of(camera: Camera) -> dict[str, Any]:
     return {"model": camera.key, "image_size": camera.image_size, **values}
 
 
-def read_pair(
-    images: tuple[Path, Path], sizes: tuple[tuple[int, int], tuple[int, int]], arguments: argparse.Namespace
-) -> Rig:
-    """The two cameras, left and right, that took images of these (height, width), by the options of `add_pair`.
+def read_pair(images: Sequence[Path], sizes: Sequence[tuple[int, int]], arguments: argparse.Namespace) -> Rig:
+    """The two cameras, left and right, that took images of these (height, width).
 
     Raises:
         ValueError: as `read_posed`; it does not say which two cameras, or one has no pose.
@@ -214,25 +197,15 @@ def read_pair(
     if path is None:
         raise ValueError(f"{images[0]}: which cameras took the pair? --camera RIG, their calibration, says so")
     rig = read_rig(path, model=arguments.from_model)
-    left, right = arguments.left_camera, arguments.right_camera
-    for name in (left, right):
-        if name is not None and name not in rig:
-            raise ValueError(f"{path}: no camera is called {name!r}; there are {', '.join(rig)}")
-    if left is None or right is None:
-        if len(rig) != 2:
-            there = f"{len(rig)} camera{'s' * (len(rig) != 1)}, not two"
-            raise ValueError(f"{path}: {there}; --left-camera and --right-camera say which of {', '.join(rig)}")
-        first, second = rig
-        left = left or (second if right == first else first)
-        right = right or (second if left == first else first)
-    if left == right:
-        raise ValueError(f"{path}: --left-camera and --right-camera are both {left!r}")
+    names = arguments.names or list(rig)
+    if len(set(names)) != 2 or not set(names) <= set(rig):
+        raise ValueError(f"{path}: of which cameras? --names LEFT RIGHT says two of {', '.join(rig)}")
     cameras = {}
-    for name, image, size in zip((left, right), images, sizes, strict=True):
+    for name, image, size in zip(names, images, sizes, strict=True):
         cameras[name] = fitting(_one(path, rig, name)[1], path, image, size, arguments.rescale)
         if name not in rig.extrinsics:
             raise ValueError(f"{path}: {name} has no pose, so how the cameras stand to each other is not known")
-    return Rig(cameras, {name: rig.extrinsics[name] for name in cameras})
+    return Rig(cameras, {name: rig.extrinsics[name] for name in names})
 
 
 def fitting(camera: Camera, path: Path, image: Path, size: tuple[int, int], rescale: bool) -> Camera:
