@@ -1,4 +1,4 @@
-"""Sheets of images with captions and marks on them, in one palette, drawn by Pillow."""
+"""Marks on images, in one palette, drawn by Pillow."""
 
 from __future__ import annotations
 
@@ -16,9 +16,6 @@ INK, GREY, RIM, PAPER = (43, 42, 46), (122, 112, 100), (214, 202, 182), (250, 24
 POINT, BOX, GAZE = (226, 29, 72), (255, 190, 40), (30, 100, 240)
 """The colours of marks."""
 WHITE = (255, 255, 255, 235)
-LARGE, SMALL = 34, 16
-"""Sizes of texts."""
-MARGIN = 20
 _SHARP = 3  # marks are drawn that many times as large, and reduced
 
 
@@ -26,31 +23,6 @@ _SHARP = 3  # marks are drawn that many times as large, and reduced
 def font(size: int) -> Font:
     """Pillow's own font."""
     return ImageFont.load_default(size=size)
-
-
-class Sheet:
-    """A page with a title; places are its pixels (x, y), from the top left.
-
-    Args:
-        width: in pixels.
-        height: likewise.
-        title: the text in its top left corner.
-    """
-
-    def __init__(self, width: int, height: int, title: str):
-        self.image = Image.new("RGB", (width, height), PAPER)
-        self._draw = ImageDraw.Draw(self.image)
-        self.text((MARGIN, 14), title, size=LARGE)
-
-    def text(self, at: tuple[float, float], text: str, *, size: int = SMALL, colour: Colour = INK) -> None:
-        """One line of text whose top left corner is `at`."""
-        self._draw.text(at, text, colour, font(size))
-
-    def put(self, image: Image.Image, at: tuple[int, int]) -> None:
-        """An image with a rim, its top left corner at a place."""
-        self.image.paste(image, at)
-        left, top = at
-        self._draw.rectangle((left - 1, top - 1, left + image.width, top + image.height), outline=RIM)
 
 
 def shown(pixels: Tensor, height: int, width: int) -> Image.Image:

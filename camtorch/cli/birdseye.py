@@ -39,7 +39,7 @@ def run(arguments: argparse.Namespace) -> None:
             ranges = "--x, --y and --resolution"
             raise ValueError(f"{ranges} make {columns}x{rows} pixels; each side must be at most {LARGEST_SIDE}")
         images.write(arguments.output, images.from_tensor(warp(image[None])[0]))
-        filled = images.filled(warp)
+        filled = float(warp.valid_mask().double().mean())
     x, y = (f"{low:g} to {high:g}" for low, high in (arguments.x, arguments.y))
     print(
         f"{arguments.output}: the ground from above, x {x} and y {y} at {arguments.resolution:g} a pixel, "

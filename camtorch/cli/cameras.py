@@ -10,13 +10,12 @@ from pathlib import Path
 from typing import Any
 
 from camtorch import lenses
-from camtorch.camera import Camera
+from camtorch.camera import Camera, as_model
 from camtorch.cli.terminal import note
 from camtorch.cli.words import GUESS, LENS
 from camtorch.data.columns import camera_of
 from camtorch.extrinsics import Extrinsics
 from camtorch.io import load, opencv
-from camtorch.models import MODELS
 from camtorch.rig import Rig
 
 _ASPECT = 0.01  # the part by which the aspect ratios of a camera and an image may differ, as sizes are rounded
@@ -81,11 +80,9 @@ def _of_lens(words: str, size: tuple[int, int] | None) -> Rig:
 def _guessed(fov: str, model: str | None, size: tuple[int, int] | None) -> Rig:
     if size is None:
         raise ValueError(f"{GUESS}{fov}: a field of view is one of an image, and of what size is not known here")
-    key = model or ("pinhole" if float(fov) < _WIDE else "kannala_brandt")
-    if key not in MODELS:
-        raise ValueError(f"--model {key}: there is no such model; there are {', '.join(MODELS)}")
-    camera = MODELS[key].from_fov(float(fov), image_size=size).double().requires_grad_(False)
-    note(f"{fov} degrees wide is a guess: {key}, {_shown(size)}, focal length {float(camera.intrinsics[0]):.6g}")
+    kind = as_model(model or ("pinhole" if float(fov) < _WIDE else "kannala_brandt"), "--model")
+    camera = kind.from_fov(float(fov), image_size=size).double().requires_grad_(False)
+    note(f"{fov} degrees wide is a guess: {camera.key}, {_shown(size)}, focal length {float(camera.intrinsics[0]):.6g}")
     return Rig({"camera": camera})
 
 
@@ -125,7 +122,7 @@ def read_other(path: Path, name: str | None = None, model: str | None = None) ->
 
 
 def read_posed(image: Path, size: tuple[int, int], arguments: argparse.Namespace) -> tuple[Camera, Extrinsics | None]:
-    """The camera that took an image of that (height, width), by the options of `add_photograph`; and its pose.
+    """The camera that took an image of that (height, width), by the options of `_photograph`; and its pose.
 
     Raises:
         ValueError: as `read_camera`; no file is given, or it is for another size and is not to be scaled.
@@ -137,7 +134,7 @@ def read_posed(image: Path, size: tuple[int, int], arguments: argparse.Namespace
 def read_for_many(
     images: Sequence[Path], size_of: Callable[[Path], tuple[int, int] | None], arguments: argparse.Namespace
 ) -> Camera:
-    """The camera that took many images, by the options of `add_photograph`; see `fitting`.
+    """The camera that took many images, by the options of `_photograph`; see `fitting`.
 
     Where its file states no size, it is for the first image that has one, by which a lens is chosen, or guessed, too.
 

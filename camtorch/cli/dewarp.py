@@ -25,7 +25,6 @@ _SLASHES = ("/", os.sep)
 _TOLERANCE = 0.001  # pixels that nobody sees, for a lattice of positions also where a calibration is in float64
 _MOST_KEPT = 4  # warps of images of different sizes
 _MUCH = 0.6  # of a photograph: where a dewarped one shows less, it is said what shows more
-_LARGE = 32e6  # pixels, from where on their map is not kept, and one in 64 tells how much is filled
 
 
 @dataclass
@@ -81,19 +80,20 @@ class Dewarping:
 
 @torch.no_grad()
 def _facts(warp: Dewarp) -> dict[str, Any]:
-    """What is to be known of new images; `shown` is the part that they show of 64 x 64 pixels of the old one."""
+    """What is to be known of new images: of 64 x 64 places in them how many show something, `filled`; and how many of
+    as many in the old one they show, `shown`.
+    """
     source, target = warp.source, warp.target
     part = torch.tensor([source.width / 64, source.height / 64])
     lattice = (source.resize(64, 64).pixel_grid() + 0.5) * part - 0.5
-    large = target.height * target.width > _LARGE
-    seen = Warp(source, target.resize(target.height // 8, target.width // 8), warp.rotation) if large else warp
+    seen = Warp(source, target.resize(64, 64), warp.rotation).valid_mask()
     return {
         "model": source.key,
         "width": target.width,
         "height": target.height,
         "intrinsics": target.intrinsics.tolist(),
         "degrees": float(target.fov[0]),
-        "filled": images.filled(seen),
+        "filled": float(seen.double().mean()),
         "shown": float(warp.transform_points(lattice)[1].double().mean()),
     }
 

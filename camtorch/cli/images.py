@@ -15,7 +15,6 @@ from camtorch._photographs import size_of as size_of
 from camtorch.cli import targets
 from camtorch.cli.terminal import note
 from camtorch.io.writing import replacing
-from camtorch.warp.warp import Warp
 
 _KEEP_ORIENTATION = ("AVIF", "JPEG", "MPO", "PNG", "TIFF", "WEBP")
 _OTHER_SIZES = ("ICO", "ICNS")  # formats that hold an image in sizes of their own
@@ -38,12 +37,6 @@ def check_kind(path: Path) -> None:
     if kind not in Image.SAVE or kind in _OTHER_SIZES:
         why = "icons have sizes of their own" if kind in _OTHER_SIZES else "no image can be written as that"
         raise ImageFileError(f"{path}: {path.suffix or 'no suffix'}: {why}; try .png")
-
-
-def filled(warp: Warp) -> float:
-    """The part of new images that shows something."""
-    valid = warp.valid_mask()
-    return int(valid.sum()) / valid.numel()
 
 
 def in_colour(image: Tensor, paper: tuple[int, int, int] = (255, 255, 255)) -> Tensor:

@@ -5,15 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from PIL import Image
+from PIL import Image, ImageDraw
 from torch import Tensor
 
-from camtorch._drawing import GREY, INK, MARGIN, SMALL, Marks, Sheet, shown
+from camtorch._drawing import GREY, INK, PAPER, RIM, Marks, font, shown
 from camtorch.augment.sample import Sample
 
 TILE = (315, 420)
 """(height, width) within which images are shown."""
-_BAND, _LINE = 54, 21
+_TITLE, _BAND, _LINE, _MARGIN = 80, 54, 21, 20
 _NARROWEST = 340  # px that captions need
 _WIDER = 1.4  # columns for each row
 _REACH = 0.35  # length of gaze arrows, as a part of the distance to the eyes
@@ -23,15 +23,18 @@ def sheet(samples: Sequence[tuple[Sample, list[str]]], title: str) -> Image.Imag
     """One image of all samples, each with the lines of its caption."""
     height, width = fitted(samples[-1][0]["image"], *TILE)
     columns = min(len(samples), math.ceil(math.sqrt(_WIDER * len(samples))))
-    down, across = height + _BAND + MARGIN, max(width, _NARROWEST) + MARGIN
-    page = Sheet(columns * across + MARGIN, 80 - (-len(samples) // columns) * down, title)
+    down, across = height + _BAND + _MARGIN, max(width, _NARROWEST) + _MARGIN
+    page = Image.new("RGB", (columns * across + _MARGIN, _TITLE - (-len(samples) // columns) * down), PAPER)
+    draw = ImageDraw.Draw(page)
+    draw.text((_MARGIN, 14), title, INK, font(34))
     for number, (sample, caption) in enumerate(samples):
         row, column = divmod(number, columns)
-        tile, left, top = marked(sample, height, width), MARGIN + column * across, 80 + row * down
-        page.put(tile, (left, top))
+        tile, left, top = marked(sample, height, width), _MARGIN + column * across, _TITLE + row * down
+        page.paste(tile, (left, top))
+        draw.rectangle((left - 1, top - 1, left + tile.width, top + tile.height), outline=RIM)
         for i, line in enumerate(caption):
-            page.text((left, top + tile.height + 8 + _LINE * i), line, size=SMALL, colour=GREY if i else INK)
-    return page.image
+            draw.text((left, top + tile.height + 8 + _LINE * i), line, GREY if i else INK, font(16))
+    return page
 
 
 def marked(sample: Sample, height: int, width: int) -> Image.Image:

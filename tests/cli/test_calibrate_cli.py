@@ -172,19 +172,6 @@ def test_a_report_is_written_into_a_new_folder(capsys):
     assert "4.png" in Path("folder/report.html").read_text()
 
 
-def test_corners_are_read_as_they_were_written():
-    corners = corners_of(board=AprilGrid(4, 3, 0.05), hash="abc")
-    corners.images[2].pixels[:] = np.nan
-    corners.images[2].reason = "no board found"
-    write_corners(corners, "corners.json")
-    again = read_corners("corners.json")
-    assert again.board == corners.board
-    for one, other in zip(again.images, corners.images, strict=True):
-        assert np.array_equal(one.pixels, other.pixels, equal_nan=True)
-        assert (one.reason, one.hash, one.view, one.image_size) == (other.reason, other.hash, other.view, (480, 640))
-        assert one.path.resolve() == other.path.resolve()
-
-
 @pytest.mark.parametrize("package", ["matplotlib", "jinja2"])
 def test_what_a_report_needs_is_asked_before_the_work(package, capsys, monkeypatch):
     write_corners(corners_of(), "corners.json")
@@ -270,16 +257,6 @@ def test_cameras_agree_on_the_turns_of_a_board():
         assert len({(found[name][view] - truth[name][view]) % 4 for name in seen}) == 1
 
 
-def test_images_come_in_natural_order():
-    for name in ("a10.png", "a9.jpg", "a1.PNG", "notes.txt"):
-        Path(name).touch()
-    Path("folder").mkdir()
-    assert [str(path) for path in gather(["."])] == ["a1.PNG", "a9.jpg", "a10.png"]
-    assert [str(path) for path in gather(["a?.*", "a10.png", "a9.jpg"])] == ["a1.PNG", "a9.jpg", "a10.png"]
-    Path("[1].png").touch()
-    assert gather(["[1].png"]) == [Path("[1].png")]
-
-
 @pytest.mark.parametrize(
     ("left", "right", "views"),
     [
@@ -298,22 +275,6 @@ def test_images_taken_together(left, right, views):
     found = searching.together(cameras)
     assert list(found) == views
     assert sum(map(len, found.values())) == len(left) + len(right)
-
-
-@pytest.mark.slow
-def test_the_model_is_taken_that_predicts_best():
-    corners = corners_of()
-    pixels = np.stack([image.pixels for image in corners.images])
-    candidates = [("pinhole", 0), ("kannala_brandt", 4), ("kannala_brandt", 6)]
-    chosen = select(corners.points, pixels, image_size=(480, 640), candidates=candidates)
-    assert chosen.best.calibration.camera.distortion.shape == (4,)
-    assert chosen.best.calibration.rms < 0.15
-    lines = chosen.lines()
-    assert [line.split()[0] for line in lines[1:4]] == [key for key, _ in candidates]
-    assert [line.endswith("taken") for line in lines[1:4]] == [False, True, False]
-    least, fits, more = (trial.held_out for trial in chosen.trials)
-    assert least > 3 * fits
-    assert more >= 0.99 * fits
 
 
 @pytest.mark.slow
