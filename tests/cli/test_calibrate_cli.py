@@ -12,11 +12,9 @@ from photographs import fisheye, photograph
 from PIL import Image
 
 import camtorch as ct
-from camtorch.boards.boards import AprilGrid, Chessboard
+from camtorch.boards.boards import Chessboard
 from camtorch.boards.corners import Corners, ImageCorners, read_corners, write_corners
-from camtorch.boards.finding import gather
 from camtorch.boards.turns import agreeing, reordered, turns_of
-from camtorch.calibration.selection import select
 from camtorch.cli import searching
 from camtorch.cli.main import main
 from camtorch.rotations import rotation_matrix
