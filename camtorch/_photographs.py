@@ -6,7 +6,6 @@ import io
 import os
 import re
 import warnings
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -50,11 +49,11 @@ class ImageFileError(ValueError):
     """An image file that cannot be read or written. The text names the file and the reason."""
 
 
-def read_stored(path: Path, tell: Callable[[str], None]) -> tuple[Tensor, int | None]:
+def read_stored(path: Path) -> tuple[Tensor, int | None]:
     """An image as stored, and its Exif orientation: it is not turned, for calibrations know stored pixels.
 
-    Sentences that `tell` gets say what is left out: the lower bits of deep colours, which Pillow does not read, and all
-    but the first image of several.
+    Warnings say what is left out: the lower bits of deep colours, which Pillow does not read, and all but the first
+    image of several.
 
     Returns:
         (C, H, W) uint8 with C = 1 grey, 2 grey and alpha, 3 RGB or 4 RGBA; or (1, H, W) uint16 for deep grey images.
@@ -71,9 +70,9 @@ def read_stored(path: Path, tell: Callable[[str], None]) -> tuple[Tensor, int | 
             orientation = opened.getexif().get(ORIENTATION)
             image = load_stored(opened)
             if count > 1:
-                tell(f"{path} holds {count} images; only the first is taken")
+                warnings.warn(f"{path} holds {count} images; only the first is taken", stacklevel=2)
             if cut:
-                tell(f"{path} has 16 bits a colour; only the upper 8 are read")
+                warnings.warn(f"{path} has 16 bits a colour; only the upper 8 are read", stacklevel=2)
             return _pixels(path, image), orientation
     except FileNotFoundError:
         reason = "no such file"

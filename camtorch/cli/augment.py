@@ -33,7 +33,7 @@ def run(arguments: argparse.Namespace) -> int:
         print(f"{'real':<12} {'kannala_brandt':<15} {'any':<10} {_REAL}")
         return 0
     is_sheet = arguments.dataset is None
-    for name in ("jobs", "resume", "shard", "dry_run", "copies") if is_sheet else ("n", "labels"):
+    for name in ("jobs", "resume", "shard", "dry_run") if is_sheet else ("n", "labels"):
         if getattr(arguments, name):
             option = "-n" if name == "n" else f"--{name.replace('_', '-')}"
             raise ValueError(f"{option} is for {'--dataset' if is_sheet else 'a sheet, without --dataset'}")
@@ -75,7 +75,7 @@ def run(arguments: argparse.Namespace) -> int:
 @torch.no_grad()
 def _photograph(arguments: argparse.Namespace) -> Sample:
     """The image given, in colour, with its labels."""
-    image, orientation = images.read(arguments.image)
+    image, orientation = images.read_stored(arguments.image)
     size, path = (image.shape[-2], image.shape[-1]), arguments.labels
     entries = {} if path is None else read_json(path)
     if orientation not in (None, 1):

@@ -23,7 +23,7 @@ def run(arguments: argparse.Namespace) -> None:
     if pitch is not None and not -90 < pitch <= 90:
         raise ValueError(f"--pitch must be above -90 and at most 90 degrees, down from the horizon; got {pitch:g}")
     images.check_target(arguments.output, force=arguments.force, inputs=(arguments.image, arguments.camera))
-    image, _ = images.read(arguments.image)
+    image, _ = images.read_stored(arguments.image)
     camera, pose = cameras.read_posed(arguments.image, (image.shape[-2], image.shape[-1]), arguments)
     if height is not None:
         pose = _looking_down(height, math.radians(pitch or 0.0))

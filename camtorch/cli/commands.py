@@ -155,7 +155,6 @@ def _augment(commands: Commands) -> None:
     many = _many_files(command)
     text = "of all images of the folder IMAGE: a JSON file in COCO's format, or a folder of a JSON file for each"
     many("--dataset", type=words.path, metavar="LABELS", help=text)
-    many("--copies", type=words.count(10000), metavar="N", help="new images of each; 1 by default")
 
 
 def _map(commands: Commands) -> None:

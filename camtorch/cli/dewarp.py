@@ -14,9 +14,9 @@ from camtorch import __version__
 from camtorch.camera import Camera
 from camtorch.cli import cameras, images, many, targets, videos
 from camtorch.cli.commands import are_several
-from camtorch.cli.terminal import bar, note
+from camtorch.cli.terminal import bar
 from camtorch.jobs import inputs, items
-from camtorch.jobs.items import Item, Tell
+from camtorch.jobs.items import Item
 from camtorch.jobs.run import Account, Report
 from camtorch.warp.dewarp import Dewarp, Projection
 from camtorch.warp.warp import Warp
@@ -49,18 +49,18 @@ class Dewarping:
         settings = {"camtorch": __version__, "camera": cameras.settings_of(self.camera), **vars(self.encoder)}
         return settings | {name: getattr(self, name) for name in names}
 
-    def __call__(self, item: Item, tell: Tell, **options: Any) -> dict[str, Any]:
+    def __call__(self, item: Item, **options: Any) -> dict[str, Any]:
         """What the new camera is; options are those of `videos.remake`."""
         (source,), (target,) = item.inputs, item.outputs
         if videos.is_video(source):
             return videos.remake(source, target, lambda size: self._warp(source, size), self.encoder, **options)
-        image, orientation = images.read(source, tell)
+        image, orientation = images.read_stored(source)
         rows, columns = image.shape[-2:]
         warp, facts = self._warp(source, (rows, columns))
         with torch.no_grad():
             result = warp(image[None])[0]
         del image  # of hundreds of megabytes, perhaps
-        images.write(target, images.from_tensor(result), orientation=orientation, tell=tell, synced=False)
+        images.write(target, images.from_tensor(result), orientation=orientation, synced=False)
         return facts
 
     def warp_of(self, camera: Camera) -> Dewarp:
@@ -120,17 +120,13 @@ def _single(arguments: argparse.Namespace, source: Path) -> None:
     if arguments.dry_run:
         print(f"{source} -> {output}")
         return
-
-    def tell(text: str) -> None:
-        note(text if text.startswith(str(source)) else f"{source} {text}")
-
     item = Item((source,), (output,))
     if is_video:
         with bar("dewarping", videos.count_of(source), "frames") as shown:
-            facts = work(item, tell, done=shown.update)
+            facts = work(item, done=shown.update)
         end = f", {facts['frames']} frames"
     else:
-        facts = work(item, tell)
+        facts = work(item)
         end = f" and shows {100 * facts['shown']:.0f} % of the photograph"
         if facts["shown"] < _MUCH and arguments.projection == "perspective" and arguments.fov is None:
             end += "; --projection stereographic or cylindrical shows more, and --fov says how much"

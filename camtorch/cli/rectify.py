@@ -42,7 +42,7 @@ def run(arguments: argparse.Namespace) -> None:
             raise ValueError("--depth is for --disparity and --points")
     if arguments.disparity or arguments.points:
         opencv()
-    (left, turned_left), (right, turned_right) = map(images.read, taken)
+    (left, turned_left), (right, turned_right) = map(images.read_stored, taken)
     if len(left) != len(right) or left.dtype != right.dtype:
         raise ValueError(f"{taken[0]} and {taken[1]} are images of different kinds: convert one")
     if any(turned not in (None, 1) for turned in (turned_left, turned_right)):

@@ -155,7 +155,7 @@ def _searched(path: Path, board: Board, known: Mapping[Path, ImageCorners]) -> I
         digest = hash_of(path) if path.exists() or one is None else one.hash
         if one is not None and one.hash in ("", digest):
             return replace(one, path=path)
-        grey = read_grey(path, note)
+        grey = read_grey(path)
     except (ValueError, OSError) as error:
         why = reason(error).removeprefix(f"{path}: ")
         return ImageCorners(path, None, np.full((len(board.points()), 2), np.nan), why)

@@ -29,11 +29,9 @@ class Item:
         return str(self.inputs[0])
 
 
-Tell: TypeAlias = Callable[[str], None]
-"""Hears what the user should know of an item; where it begins with the item's name, that is left out."""
-Work: TypeAlias = Callable[[Item, Tell], Json]
+Work: TypeAlias = Callable[[Item], Json]
 """Makes all outputs of an item, each whole or not at all, and returns what the account is to keep of it. It is pickled,
-once for each process. Whatever it raises is why the item failed.
+once for each process. Whatever it raises is why the item failed, and its warnings are notes about the item.
 """
 
 

@@ -176,8 +176,8 @@ class _Attempt:
                 return _Outcome(known, is_new=False)
             with warnings.catch_warnings(record=True) as caught:
                 warnings.simplefilter("always", UserWarning)
-                result = self.work(item, outcome.notes.append)
-            outcome.notes += dict.fromkeys(str(warning.message) for warning in caught)
+                result = self.work(item)
+            outcome.notes = list(dict.fromkeys(str(warning.message) for warning in caught))
             outcome.record = {**self.account.record(item, inputs), "result": result}
         except Exception as error:
             outcome.failure = reason(error)

@@ -178,7 +178,7 @@ def test_the_exif_orientation_stays_or_its_loss_is_said(folder, capsys):
     kinds = {kind: suffix for suffix, kind in Image.registered_extensions().items()}
     for suffix in (kinds[kind] for kind in sorted({*kinds} & {*Image.SAVE} - {*_LEFT_OUT})):
         command("dewarp", "turned.jpg", "--camera", "camera.yml", "-o", f"out{suffix}", "--size", "9x6")
-        lost = f"turned.jpg is to be shown turned by its Exif orientation, which is lost: {suffix} files hold none\n"
+        lost = f"the Exif orientation, by which it is to be shown turned, is lost: {suffix} files hold none\n"
         assert (orientation_of(f"out{suffix}") == 3) != (lost in capsys.readouterr().err), suffix
 
 

@@ -85,7 +85,8 @@ def test_formats_of_files(folder, suffix, codec, sound):
     before, after = read_video(f"in{suffix}"), read_video(f"out/in{made}")
     assert after["codec"] == ("vp9" if suffix == ".webm" else "h264")
     assert len(after["frames"]) == 8
-    assert [data for *_, data in after["packets"]] == [data for *_, data in before["packets"]]
+    for (*_, old), (*_, new) in zip(before["packets"], after["packets"], strict=True):
+        assert old.endswith(new)  # whose headers .ts repeats in each
     assert np.allclose(np.diff(after["times"]), 1 / 30, atol=2e-3)
     assert Path(f"again/in{made}").read_bytes() == Path(f"out/in{made}").read_bytes()
 
