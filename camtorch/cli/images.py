@@ -15,9 +15,9 @@ from camtorch._photographs import read_stored as read_stored
 from camtorch._photographs import size_of as size_of
 from camtorch.cli import targets
 from camtorch.io.writing import replacing
+from camtorch.jobs.inputs import IMAGES
 
-_KEEP_ORIENTATION = ("AVIF", "JPEG", "MPO", "PNG", "TIFF", "WEBP")
-_OTHER_SIZES = ("ICO", "ICNS")  # formats that hold an image in sizes of their own
+_KEEP_ORIENTATION = ("JPEG", "PNG", "TIFF", "WEBP")
 
 
 def check_target(path: Path, *, force: bool, inputs: tuple[Path | None, ...] = ()) -> None:
@@ -27,11 +27,10 @@ def check_target(path: Path, *, force: bool, inputs: tuple[Path | None, ...] = (
 
 
 def check_kind(path: Path) -> None:
-    """Refuse, by an ImageFileError, a name of no file type that holds images of any size."""
-    kind = Image.registered_extensions().get(path.suffix.lower())
-    if kind not in Image.SAVE or kind in _OTHER_SIZES:
-        why = "icons have sizes of their own" if kind in _OTHER_SIZES else "no image can be written as that"
-        raise ImageFileError(f"{path}: {path.suffix or 'no suffix'}: {why}; try .png")
+    """Refuse, by an ImageFileError, a name of no file type that images are written as."""
+    if path.suffix.lower() not in IMAGES:
+        what = path.suffix or "no suffix"
+        raise ImageFileError(f"{path}: {what}: no image is written as that; try {', '.join(sorted(IMAGES))}")
 
 
 def in_colour(image: Tensor, paper: tuple[int, int, int] = (255, 255, 255)) -> Tensor:

@@ -11,7 +11,7 @@ from itertools import takewhile
 from pathlib import Path
 
 IMAGES = frozenset({".bmp", ".jpeg", ".jpg", ".pgm", ".png", ".ppm", ".tif", ".tiff", ".webp"})
-"""Suffixes, in lower case, of what is taken of a folder."""
+"""Suffixes, in lower case, of what is taken of a folder, and of what is written."""
 
 
 def natural(path: Path) -> list[tuple[int, int, str]]:
