@@ -134,12 +134,6 @@ def corners_of(board=BOARD, count=8, **more):
     return Corners(board, board.points(), images)
 
 
-def test_no_focal_length_is_held(capsys):
-    write_corners(corners_of(count=3), "corners.json")
-    calibrate("--corners", "corners.json", "--fixed", "fx,k3", expect=2)
-    assert "--fixed: no focal length is known to be held" in capsys.readouterr().err
-
-
 def test_corners_of_another_tool_need_no_image(capsys):
     """Two of the files are others saved again, which are named and count once."""
     corners = corners_of(count=6)
@@ -159,15 +153,6 @@ def test_corners_of_another_tool_need_no_image(capsys):
     words = "show another view again, as a copy of a file does: they count once"
     assert f"Views copy2.png, copy5.png {words}" in " ".join(captured.err.split())
     assert_near(found_camera(), fisheye(), 0.5)
-
-
-@pytest.mark.slow
-def test_a_report_is_written_into_a_new_folder(capsys):
-    write_corners(corners_of(count=5), "corners.json")
-    words = "--corners", "corners.json", "--model", "kannala_brandt", "--fixed", "k3,k4"
-    calibrate(*words, "-o", "camera.yml", "--report", "folder/report.html")
-    assert capsys.readouterr().out.endswith("camera.yml: kannala_brandt\nfolder/report.html: the report\n")
-    assert "4.png" in Path("folder/report.html").read_text()
 
 
 @pytest.mark.parametrize("package", ["matplotlib", "jinja2"])

@@ -181,6 +181,7 @@ CASES = {
         ("calibrate in.png --board 9x6 -o new.json --report new.json", "must be different files"),
         ("calibrate in.png --board 9x6 -o new.json --corners new.json", "must be different files"),
         ("calibrate in.png --board 9x6 --corners exists.json", "exists.json: no file of corners"),
+        ("calibrate --corners corners.json --fixed fx,k3", "--fixed: no focal length is known to be held"),
         ("calibrate in.png --board 8x6 --corners corners.json", "holds corners of chessboard, 9x6 inner corners"),
     ],
 }

@@ -162,20 +162,6 @@ def test_where_no_job_has_begun_nothing_is_gone_on_from():
 
 
 @pytest.mark.slow
-def test_what_a_crash_left_is_removed():
-    texts = {"a" * 30 + "1": "1", "a" * 30 + "2": "wait"}
-    process = started(texts)
-    process.kill()
-    process.communicate()
-    Path("out/waiting").unlink()
-    todo = jobs_of(texts | {"a" * 30 + "2": "2"})
-    assert len(left_over(todo)) == 1
-    assert left_over(todo[:1]) == []  # another name that begins alike
-    report = carried_out(todo, resume=True)
-    assert (report.made, report.kept, left_over(todo), len(contents())) == (1, 1, [], 4)
-
-
-@pytest.mark.slow
 def test_processes_make_what_one_makes_and_go_on_where_one_was_killed():
     texts = {f"{i:02}": "1" for i in range(20)} | {"04": "fail", "05": "note", "03": "die"}
     todo = jobs_of(texts)
