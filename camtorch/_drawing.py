@@ -1,4 +1,4 @@
-"""Sheets of images with captions and marks on them, in one palette, drawn by Pillow."""
+"""Marks on images, in one palette, drawn by Pillow."""
 
 from __future__ import annotations
 
@@ -16,9 +16,6 @@ INK, GREY, RIM, PAPER = (43, 42, 46), (122, 112, 100), (214, 202, 182), (250, 24
 POINT, BOX, GAZE = (226, 29, 72), (255, 190, 40), (30, 100, 240)
 """The colours of marks."""
 WHITE = (255, 255, 255, 235)
-LARGE, MIDDLE, SMALL = 34, 18, 16
-"""Sizes of texts."""
-MARGIN = 20
 _SHARP = 3  # marks are drawn that many times as large, and reduced
 
 
@@ -26,31 +23,6 @@ _SHARP = 3  # marks are drawn that many times as large, and reduced
 def font(size: int) -> Font:
     """Pillow's own font."""
     return ImageFont.load_default(size=size)
-
-
-class Sheet:
-    """A page with a title; places are its pixels (x, y), from the top left.
-
-    Args:
-        width: in pixels.
-        height: likewise.
-        title: the text in its top left corner.
-    """
-
-    def __init__(self, width: int, height: int, title: str):
-        self.image = Image.new("RGB", (width, height), PAPER)
-        self._draw = ImageDraw.Draw(self.image)
-        self.text((MARGIN, 14), title, size=LARGE)
-
-    def text(self, at: tuple[float, float], text: str, *, size: int = SMALL, colour: Colour = INK) -> None:
-        """One line of text whose top left corner is `at`."""
-        self._draw.text(at, text, colour, font(size))
-
-    def put(self, image: Image.Image, at: tuple[int, int]) -> None:
-        """An image with a rim, its top left corner at a place."""
-        self.image.paste(image, at)
-        left, top = at
-        self._draw.rectangle((left - 1, top - 1, left + image.width, top + image.height), outline=RIM)
 
 
 def shown(pixels: Tensor, height: int, width: int) -> Image.Image:
@@ -103,46 +75,20 @@ class Marks:
     def arrow(self, start: Sequence[float] | Tensor, end: Sequence[float] | Tensor, weight: float = 1.0) -> None:
         """An arrow, unless it would be a point."""
         (x, y), (to_x, to_y) = self._place(start), self._place(end)
-        length = math.dist((x, y), (to_x, to_y))
-        weight *= _SHARP
+        length, weight = math.dist((x, y), (to_x, to_y)), _SHARP * weight
         if length < weight:
             return
-        along_x, along_y = (to_x - x) / length, (to_y - y) / length
-        tip = min(9 * weight, 0.5 * length)
-        neck_x, neck_y = to_x - tip * along_x, to_y - tip * along_y
+        along_x, along_y, tip = (to_x - x) / length, (to_y - y) / length, min(9 * weight, 0.5 * length)
         for rim, colour in ((1.3 * weight, WHITE), (0.0, GAZE)):
-            self._draw.line((x, y, neck_x, neck_y), fill=colour, width=round(2.4 * weight + 2 * rim))
-            half = 0.5 * tip + 1.4 * rim
-            back_x, back_y = neck_x - rim * along_x, neck_y - rim * along_y
-            corners = [
-                (to_x + 1.6 * rim * along_x, to_y + 1.6 * rim * along_y),
-                (back_x + half * along_y, back_y - half * along_x),
-                (back_x - half * along_y, back_y + half * along_x),
-            ]
-            self._draw.polygon(corners, fill=colour)
-            r = 1.2 * weight + rim
-            self._draw.ellipse((x - r, y - r, x + r, y + r), fill=colour)
+            neck, half = tip + rim, 0.5 * tip + 1.4 * rim
+            back_x, back_y = to_x - neck * along_x, to_y - neck * along_y
+            self._draw.line((x, y, back_x, back_y), fill=colour, width=round(2.4 * weight + 2 * rim))
+            point = to_x + 1.6 * rim * along_x, to_y + 1.6 * rim * along_y
+            sides = [(back_x + s * half * along_y, back_y - s * half * along_x) for s in (1, -1)]
+            self._draw.polygon([point, *sides], fill=colour)
 
     def _place(self, pixel: Sequence[float] | Tensor) -> tuple[float, float]:
         # drawn in: what lies far off must not make Pillow draw for ever
         far = 9.0 * self.width
         x, y = (_SHARP * min(max((float(c) + 0.5) * self.scale, -far), far) for c in pixel)
         return x, y
-
-
-def shortened(text: str, size: int, width: float) -> str:
-    """As much of a text as fits into a width."""
-    while len(text) > 4 and font(size).getlength(text) > width:
-        text = text[:-4] + "..."
-    return text
-
-
-def wrapped(text: str, size: int, width: float) -> list[str]:
-    """A text in lines that fit into a width."""
-    lines: list[str] = []
-    for word in text.split():
-        if lines and font(size).getlength(f"{lines[-1]} {word}") <= width:
-            lines[-1] += f" {word}"
-        else:
-            lines.append(word)
-    return lines

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import io
 import os
+import re
 import warnings
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -49,11 +49,11 @@ class ImageFileError(ValueError):
     """An image file that cannot be read or written. The text names the file and the reason."""
 
 
-def read_stored(path: Path, tell: Callable[[str], None]) -> tuple[Tensor, int | None]:
+def read_stored(path: Path) -> tuple[Tensor, int | None]:
     """An image as stored, and its Exif orientation: it is not turned, for calibrations know stored pixels.
 
-    Sentences that `tell` gets say what is left out: the lower bits of deep colours, which Pillow does not read, and all
-    but the first image of several.
+    Warnings say what is left out: the lower bits of deep colours, which Pillow does not read, and all but the first
+    image of several.
 
     Returns:
         (C, H, W) uint8 with C = 1 grey, 2 grey and alpha, 3 RGB or 4 RGBA; or (1, H, W) uint16 for deep grey images.
@@ -64,15 +64,15 @@ def read_stored(path: Path, tell: Callable[[str], None]) -> tuple[Tensor, int | 
     """
     try:
         with open_image(path) as opened:
-            count, cut = getattr(opened, "n_frames", 1), _is_cut(opened)
+            count, tiles = getattr(opened, "n_frames", 1), getattr(opened, "tile", ())
+            # of deep colours its decoders are told so, which make eight bits of them
+            cut = opened.mode not in DEEP and any(re.search(r";16|65535", str(tile[3])) for tile in tiles)
             orientation = opened.getexif().get(ORIENTATION)
             image = load_stored(opened)
             if count > 1:
-                tell(f"{path} holds {count} images; only the first is taken")
+                warnings.warn(f"{path} holds {count} images; only the first is taken", stacklevel=2)
             if cut:
-                tell(f"{path} has 16 bits a colour; only the upper 8 are read")
-            if image.mode in DEEP and "transparency" in image.info:
-                tell(f"{path} is grey of 16 bits with transparency, which is not read")
+                warnings.warn(f"{path} has 16 bits a colour; only the upper 8 are read", stacklevel=2)
             return _pixels(path, image), orientation
     except FileNotFoundError:
         reason = "no such file"
@@ -101,17 +101,6 @@ def open_image(path: Path) -> Image.Image:
         # of a large photograph, which is what the user named
         warnings.simplefilter("ignore", Image.DecompressionBombWarning)
         return Image.open(path)
-
-
-def _is_cut(image: Image.Image) -> bool:
-    """Whether Pillow reads 16 bits as 8, before it does: its decoders' arguments tell."""
-    for tile in () if image.mode in DEEP else getattr(image, "tile", ()):
-        arguments = tile[3] if isinstance(tile[3], tuple) else (tile[3],)
-        if any(isinstance(argument, str) and ";16" in argument for argument in arguments):
-            return True
-        if tile[0] == "ppm" and isinstance(arguments[-1], int) and arguments[-1] > 255:
-            return True
-    return False
 
 
 def _pixels(path: Path, image: Image.Image) -> Tensor:

@@ -64,17 +64,6 @@ def detect(board: Board, image: NDArray[Any]) -> Detection:
     return Detection(pixels)
 
 
-def largest_chessboard(image: NDArray[Any]) -> Chessboard | None:
-    """The largest chessboard that an image shows, its longer side first, whatever its number of corners.
-
-    Of a board that is hard to see it may be a part: `detect` says whether it is found by that size.
-    """
-    cv2 = opencv("finding boards in images")
-    small, least = _shrunk(cv2, _as_grey8(image)), (Chessboard.least, Chessboard.least)
-    found, _, corners = cv2.findChessboardCornersSBWithMeta(small, least, _flags(cv2) | cv2.CALIB_CB_LARGER)
-    return Chessboard(max(corners.shape), min(corners.shape)) if found else None
-
-
 def _as_grey8(image: NDArray[Any]) -> NDArray[np.uint8]:
     """Of deep images the range that they use."""
     if image.dtype == np.uint8:

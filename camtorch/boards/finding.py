@@ -7,7 +7,7 @@ import os
 import re
 import warnings
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -172,7 +172,7 @@ def _searched(board: Board, image: Any) -> tuple[tuple[int, int] | None, Detecti
     """The size of an image, and what it shows."""
     if isinstance(image, Path):
         try:
-            image = read_grey(image, lambda note: None)
+            image = read_grey(image)
         except (ValueError, OSError) as error:
             return None, Detection(np.full((len(board.points()), 2), np.nan), str(error).removeprefix(f"{image}: "))
     height, width = image.shape
@@ -202,9 +202,9 @@ def gather(words: Iterable[str]) -> list[Path]:
     return sorted(found.values(), key=natural)
 
 
-def read_grey(path: Path, tell: Callable[[str], None]) -> NDArray[np.uint8] | NDArray[np.uint16]:
+def read_grey(path: Path) -> NDArray[np.uint8] | NDArray[np.uint16]:
     """(H, W) of an image file, as stored; see `read_stored`."""
-    pixels = read_stored(path, tell)[0].numpy()
+    pixels = read_stored(path)[0].numpy()
     if len(pixels) < 3:
         return np.ascontiguousarray(pixels[0])
     red, green, blue = pixels[:3].astype(np.float32)

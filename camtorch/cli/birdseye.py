@@ -23,7 +23,7 @@ def run(arguments: argparse.Namespace) -> None:
     if pitch is not None and not -90 < pitch <= 90:
         raise ValueError(f"--pitch must be above -90 and at most 90 degrees, down from the horizon; got {pitch:g}")
     images.check_target(arguments.output, force=arguments.force, inputs=(arguments.image, arguments.camera))
-    image, _ = images.read(arguments.image)
+    image, _ = images.read_stored(arguments.image)
     camera, pose = cameras.read_posed(arguments.image, (image.shape[-2], image.shape[-1]), arguments)
     if height is not None:
         pose = _looking_down(height, math.radians(pitch or 0.0))
@@ -39,7 +39,7 @@ def run(arguments: argparse.Namespace) -> None:
             ranges = "--x, --y and --resolution"
             raise ValueError(f"{ranges} make {columns}x{rows} pixels; each side must be at most {LARGEST_SIDE}")
         images.write(arguments.output, images.from_tensor(warp(image[None])[0]))
-        filled = images.filled(warp)
+        filled = float(warp.valid_mask().double().mean())
     x, y = (f"{low:g} to {high:g}" for low, high in (arguments.x, arguments.y))
     print(
         f"{arguments.output}: the ground from above, x {x} and y {y} at {arguments.resolution:g} a pixel, "

@@ -10,31 +10,21 @@ from camtorch.boards.boards import Board, board_of
 from camtorch.cli import targets
 from camtorch.io.writing import replacing
 
-_OWN = {"charuco": ("marker", "legacy", "dictionary"), "aprilgrid": ("spacing", "border", "dictionary")}
-"""Options of types of boards alone."""
-
 
 def read_board(arguments: argparse.Namespace, square: float) -> Board:
-    """The board that the options of `add_board` say, with squares of `square` if they do not say that.
+    """The board that the options of `board_options` say, with squares of `square` if they do not say that.
 
     Raises:
         ValueError: no --board, options of another type of board, numbers that no board has.
     """
     if arguments.board is None:
         raise ValueError("which board? --board COLUMNSxROWS says so, as in 9x6")
-    kind, length = arguments.type or "chessboard", arguments.square or square
-    columns, rows = arguments.board
-    options = {"type": kind, "columns": columns, "rows": rows, "square": length}
-    for name in ("marker", "legacy", "spacing", "border", "dictionary"):
-        value = getattr(arguments, name)
-        if value in (None, False):
-            continue
-        if name not in _OWN.get(kind, ()):
-            kinds = " or ".join(f"--type {other}" for other in _OWN if name in _OWN[other])
-            raise ValueError(f"--{name} is for {kinds}; this is a {kind}")
-        options[name] = value
-    if kind == "charuco":
-        options.setdefault("marker", 0.75 * length)
+    own = ("marker", "legacy", "spacing", "border", "dictionary")
+    options = {name: value for name in own if (value := getattr(arguments, name)) not in (None, False)}
+    options |= {"type": arguments.type or "chessboard", "square": arguments.square or square}
+    options["columns"], options["rows"] = arguments.board
+    if arguments.type == "charuco":
+        options.setdefault("marker", 0.75 * options["square"])
     return board_of(options)
 
 
@@ -53,23 +43,16 @@ def run(arguments: argparse.Namespace) -> None:
         if side <= 0:
             raise ValueError(f"on paper of {paper[0]:g} x {paper[1]:g} mm a square would be less than a millimetre")
         board = read_board(arguments, side)
-    page = printing.page(board, paper, (board.words("m"), "camtorch calibrate IMAGES -o camera.yml", _said(board)))
+    # what says to `camtorch calibrate` which board it is
+    options = board.options()
+    said = [f"--type {options.pop('type')} --board {options.pop('columns')}x{options.pop('rows')}"]
+    for name, value in options.items():
+        if value is not False:
+            said.append(
+                f"--{name}" + ("" if value is True else f" {value:.6g}" if isinstance(value, float) else f" {value}")
+            )
+    page = printing.page(board, paper, (board.words("m"), "camtorch calibrate IMAGES -o camera.yml", " ".join(said)))
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as (file,):
         file.write(printing.as_pdf(page) if path.suffix.lower() == ".pdf" else printing.as_svg(page).encode())
     print(f"{path}: {board.words('m')}, on {page.width:.4g} x {page.height:.4g} mm; print it at 100 %")
-
-
-def _said(board: Board) -> str:
-    """The options that say which board it is."""
-    options = board.options()
-    words = f"--board {options.pop('columns')}x{options.pop('rows')}"
-    kind = options.pop("type")
-    if kind != "chessboard":
-        words = f"--type {kind} {words}"
-    for name, value in options.items():
-        if isinstance(value, bool):
-            words += f" --{name}" if value else ""
-        else:
-            words += f" --{name} {value:.6g}" if isinstance(value, float) else f" --{name} {value}"
-    return words

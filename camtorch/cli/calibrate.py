@@ -20,9 +20,9 @@ from camtorch.calibration import selection
 from camtorch.calibration.calibrate import Calibration, calibrate
 from camtorch.calibration.rig import RigCalibration, calibrate_rig
 from camtorch.camera import MODELS, as_model
-from camtorch.cli import targets
+from camtorch.cli import searching, targets
 from camtorch.cli.board import read_board
-from camtorch.cli.searching import Views, found_corners, read_frames, usable_views
+from camtorch.cli.searching import Found, Views
 from camtorch.cli.terminal import note, progress
 from camtorch.io import CameraFileError, formats
 from camtorch.report.report import require_packages, write_report
@@ -38,42 +38,44 @@ def run(arguments: argparse.Namespace) -> None:
     files = [path for path in (arguments.output, arguments.report, arguments.corners) if path is not None]
     if len({path.absolute() for path in files}) < len(files):
         raise ValueError("-o, --report and --corners must be different files")
-    for path in (arguments.output, arguments.report):
-        if path is not None:
-            targets.check(path, force=arguments.force, inputs=given if path.exists() else ())
-    if arguments.corners is not None and not arguments.corners.exists():
-        targets.check(arguments.corners, force=False)
+    for path in files:
+        if path != arguments.corners or not path.exists():
+            targets.check(path, force=arguments.force, inputs=given)
     if arguments.report is not None:
         require_packages()
     if {"fx", "fy"} & set((arguments.fixed or "").split(",")):
         raise ValueError("--fixed: no focal length is known to be held; in Python ct.calibrate(start=camera) has one")
-    format, candidates = _writable(arguments.output, arguments.format, arguments.model, arguments.count)
-    corners = found_corners(
-        cameras,
-        read_board(arguments, 1.0) if arguments.board is not None else None,
-        arguments.corners,
-        arguments.match,
-        measured=arguments.square is not None,
-        force=arguments.force,
-    )
-    board = corners.board
+    candidates = _candidates(arguments)
+    kept: Path | None = arguments.corners
+    board = read_board(arguments, 1.0) if arguments.board is not None else None
+    known = None
+    if kept is not None and kept.exists():
+        known = searching.known_corners(kept, board, measured=arguments.square is not None)
+        board = known.board or board
+    if cameras:
+        found = searching.found_corners(cameras, board or read_board(arguments, 1.0), known)
+        if kept is not None:
+            searching.write_found(found.corners, known, kept)
+    else:
+        assert known is not None
+        found = Found(known, {})
+    board = found.corners.board
     unit = "" if board is None or board.square == 1 else "m"
     if board is not None and not unit and arguments.square is None:
         note("no --square is given: distances are in sides of a square")
-    views, size_of = usable_views(corners)
+    views, size_of = searching.usable_views(found.corners)
     words = "its points" if board is None else board.words(unit)
     for name, (height, width) in size_of.items():
         seen = [of_view[name] for of_view in views.values() if name in of_view]
-        total, count = sum(image.camera == name for image in corners.images), sum(image.seen for image in seen)
+        total, count = sum(image.camera == name for image in found.corners.images), sum(image.seen for image in seen)
         print(f"{_head(name)}{words}: in {len(seen)} of {total} images of {width}x{height}, {count} corners")
-    photographs = _photographs(views) if arguments.report is not None else {}
-    found = _calibrated(arguments, board, corners.points, views, size_of, candidates)
-    if isinstance(found, RigCalibration):
-        _tell_mounts(found, unit)
+    result = _calibrated(arguments, board, found.corners.points, views, size_of, candidates)
+    if isinstance(result, RigCalibration):
+        _tell_mounts(result, unit)
     if arguments.bend:
-        across, down = (f"{1000 * bend:.3g} mm" if unit == "m" else f"{bend:.3g}" for bend in found.bend)
+        across, down = (f"{1000 * bend:.3g} mm" if unit == "m" else f"{bend:.3g}" for bend in result.bend)
         print(f"board: its middle lies {across} off its left and right, {down} off its top and bottom")
-    _write(arguments, found, views, photographs, format)
+    _write(arguments, result, views, found)
 
 
 def _head(name: str) -> str:
@@ -89,8 +91,6 @@ def _cameras(arguments: argparse.Namespace) -> dict[str, list[Path]]:
         raise ValueError("images of one camera, --left and --right, or --rig: one of these says what to calibrate")
     if len(pair) == 1:
         raise ValueError(f"--{next(iter(pair))} is one of a pair: --left and --right are both needed")
-    if arguments.match and not (pair or arguments.rig):
-        raise ValueError("--match is for --left and --right, or --rig")
     if arguments.rig:
         named: dict[str, list[str]] = {}
         for word in arguments.rig:
@@ -110,48 +110,35 @@ def _cameras(arguments: argparse.Namespace) -> dict[str, list[Path]]:
     return {}
 
 
-def _writable(
-    path: Path, format: str | None, model: str | None, count: int | None
-) -> tuple[str | None, list[tuple[str, int]]]:
-    """The format of a file to be written, and the models to try that it can hold, before the work.
+def _candidates(arguments: argparse.Namespace) -> list[tuple[str, int]]:
+    """The models to try, with numbers of coefficients, that the file to be written can hold, seen before the work.
 
     Raises:
         ValueError: the name does not say the format; it holds no camera of the model.
     """
-
-    def failure(key: str, count: int) -> CameraFileError | None:
+    path, model, count = arguments.output, arguments.model, arguments.count
+    if arguments.format is None and path.suffix.lower() in (".yml", ".yaml"):  # which is written by several
+        arguments.format = "opencv"
+    if model is None and count is not None:
+        raise ValueError("--count is for a --model")
+    tried: Sequence[tuple[str, int]] = selection.CANDIDATES
+    if model is not None:
+        kind = as_model(model, "--model")
+        tried = [(model, kind.default_count if count is None else count)]
+        if kind.names_of(tried[0][1]) is None:
+            raise ValueError(f"--count: {model} takes {kind.counts_text()}; got {count}")
+    held = []
+    for key, number in tried:
         kind = MODELS[key]
-        camera = kind([500.0, 500.0, 320.0, 240.0], *([kind.ideal(count)] if count else []), image_size=(480, 640))
+        camera = kind([500.0, 500.0, 320.0, 240.0], *([kind.ideal(number)] if number else []), image_size=(480, 640))
         try:
-            formats.rendered(camera, path, format)
+            formats.rendered(camera, path, arguments.format)
+            held.append((key, number))
         except CameraFileError as error:
-            return error
-        return None
-
-    if format is None:
-        try:
-            failure("pinhole", 0)
-        except ValueError:  # as YAML is written by several
-            if path.suffix.lower() not in (".yml", ".yaml"):
-                raise
-            format = "opencv"
-    if model is None:
-        if count is not None:
-            raise ValueError("--count is for a --model")
-        held = [(key, count) for key, count in selection.CANDIDATES if failure(key, count) is None]
-        if not held:
-            raise ValueError(
-                f"{path}: {format or path.suffix} holds none of the models that are tried; --model says one"
-            )
-        return format, held
-    kind = as_model(model, "--model")
-    count = kind.default_count if count is None else count
-    if kind.names_of(count) is None:
-        raise ValueError(f"--count: {model} takes {kind.counts_text()}; got {count}")
-    error = failure(model, count)
-    if error is not None:
-        raise ValueError(f"{error}; -o camera.json holds every model")
-    return format, [(model, count)]
+            failure = error
+    if not held:
+        raise ValueError(f"{failure}; -o camera.json holds every model")
+    return held
 
 
 def _calibrated(
@@ -170,8 +157,11 @@ def _calibrated(
     for name, size in size_of.items():
         models[name], counts[name] = candidates[0]
         if len(candidates) > 1:
-            seen, show = pixels[name][[name in of_view for of_view in views.values()]], progress("trying models")
-            chosen = selection.select(points, seen, image_size=size, candidates=candidates, progress=show, **options)
+            seen = pixels[name][[name in of_view for of_view in views.values()]]
+            with progress("trying models") as show:
+                chosen = selection.select(
+                    points, seen, image_size=size, candidates=candidates, progress=show, **options
+                )
             models[name], counts[name] = chosen.best.model, chosen.best.count
             print(f"{_head(name)}models by cross-validation, px per point:", *chosen.lines(), sep="\n")
             left_out = [
@@ -200,7 +190,7 @@ def _calibrated(
             "Another --model, or --loss huber where some corners are wrong, may help"
         )
     for name, camera in _each(found).items():
-        _tell(camera, [str(of_view[name].path) if name in of_view else "" for of_view in views.values()], _head(name))
+        _tell(camera, [of_view[name].path.name if name in of_view else "" for of_view in views.values()], _head(name))
     return found
 
 
@@ -244,22 +234,14 @@ def _tell(found: Calibration, names: Sequence[str], head: str) -> None:
     if bad:
         print(f"{head}views that fit badly: {', '.join(bad)}")
     for warning in found.warnings:
-        note(f"{head}{_in_options(warning, names)}")
-    print(f"{head}{_in_options(found.verdict, names)}")
+        note(f"{head}{_named(warning, names)}")
+    print(f"{head}{_named(found.verdict, names)}")
 
 
-def _in_options(text: str, names: Sequence[str]) -> str:
-    """A text for Python as one for the command line: options for arguments, the names of views for their numbers."""
-
-    def fixed(match: re.Match[str]) -> str:
-        return "--fixed " + ",".join(re.findall(r"\w+", match[1]))
-
-    def named(match: re.Match[str]) -> str:
-        return match[1] + re.sub(r"\d+", lambda number: Path(names[int(number[0])]).name, match[2])
-
-    text = re.sub(r"\bfixed=\(([^)]*)\)", fixed, text)
-    text = re.sub(r"\b(count|loss)=\"?(\w+)\"?", r"--\1 \2", text.replace("bend=True", "--bend"))
-    return re.sub(r"\b([Vv]iews? )(\d+(?:, \d+)*)", named, text)
+def _named(text: str, names: Sequence[str]) -> str:
+    """A text in which the views that it numbers have their names."""
+    numbered = r"\b([Vv]iews? )(\d+(?:, \d+)*)"
+    return re.sub(numbered, lambda m: m[1] + re.sub(r"\d+", lambda n: names[int(n[0])], m[2]), text)
 
 
 def _with_spread(value: float, std: float, width: int = 11) -> str:
@@ -283,32 +265,21 @@ def _tell_mounts(found: RigCalibration, unit: str) -> None:
     print(f"rig: rms {found.rms:.4g} px per point, sigma {found.sigma:.4g} px per coordinate, {len(found.views)} views")
 
 
-def _photographs(views: Views) -> dict[Path, Path | NDArray[np.uint8]]:
-    """What a report shows of the views: by the path of each that is there, its file, or the frame of a video."""
-    paths = [image.path for of_view in views.values() for image in of_view.values()]
-    return {**{path: path for path in paths if path.exists()}, **read_frames(paths)}
-
-
-def _write(
-    arguments: argparse.Namespace,
-    found: Calibration | RigCalibration,
-    views: Views,
-    photographs: Mapping[Path, Path | NDArray[np.uint8]],
-    format: str | None,
-) -> None:
+def _write(arguments: argparse.Namespace, result: Calibration | RigCalibration, views: Views, found: Found) -> None:
     path, report = arguments.output, arguments.report
-    is_rig = isinstance(found, RigCalibration)
+    is_rig = isinstance(result, RigCalibration)
     path.parent.mkdir(parents=True, exist_ok=True)
-    formats.save(found.rig if isinstance(found, RigCalibration) else found.camera, path, format)
-    print(f"{path}: {f'{len(found.rig)} cameras' if isinstance(found, RigCalibration) else found.camera.key}")
+    formats.save(result.rig if isinstance(result, RigCalibration) else result.camera, path, arguments.format)
+    print(f"{path}: {f'{len(result.rig)} cameras' if isinstance(result, RigCalibration) else result.camera.key}")
     if report is None:
         return
     report.parent.mkdir(parents=True, exist_ok=True)
     images: dict[str, Any] = {}
     names: dict[str, Any] = {}
-    for name in _each(found):
+    for name in _each(result):
         seen = [(view, of_view.get(name)) for view, of_view in views.items()]
-        images[name] = [None if image is None else photographs.get(image.path) for _, image in seen]
+        paths = [None if image is None else image.path for _, image in seen]
+        images[name] = [found.frames.get(p, p if p.exists() else None) if p else None for p in paths]
         names[name] = [view if image is None else image.path.name for view, image in seen]
-    write_report(found, report, images=images if is_rig else images[""], names=names if is_rig else names[""])
+    write_report(result, report, images=images if is_rig else images[""], names=names if is_rig else names[""])
     print(f"{report}: the report")

@@ -10,13 +10,12 @@ from pathlib import Path
 from typing import Any
 
 from camtorch import lenses
-from camtorch.camera import Camera
+from camtorch.camera import Camera, as_model
 from camtorch.cli.terminal import note
 from camtorch.cli.words import GUESS, LENS
 from camtorch.data.columns import camera_of
 from camtorch.extrinsics import Extrinsics
-from camtorch.io import CameraFileError, load, opencv
-from camtorch.models import MODELS
+from camtorch.io import load, opencv
 from camtorch.rig import Rig
 
 _ASPECT = 0.01  # the part by which the aspect ratios of a camera and an image may differ, as sizes are rounded
@@ -49,7 +48,7 @@ def read_rig(
         return _of_lens(str(path).removeprefix(LENS), size)
     if str(path).startswith(GUESS):
         return _guessed(str(path).removeprefix(GUESS), model, size)
-    rig = load(path) if model is None else _of_model(path, model)
+    rig = load(path) if model is None else opencv.read_rig(path, model)
     if stated and model is None and rig.format == "opencv" and _leaves_open(path):
         raise ValueError(
             f"{path}: 4 coefficients, and it does not say of which model: --from-model kannala_brandt if they come "
@@ -81,11 +80,9 @@ def _of_lens(words: str, size: tuple[int, int] | None) -> Rig:
 def _guessed(fov: str, model: str | None, size: tuple[int, int] | None) -> Rig:
     if size is None:
         raise ValueError(f"{GUESS}{fov}: a field of view is one of an image, and of what size is not known here")
-    key = model or ("pinhole" if float(fov) < _WIDE else "kannala_brandt")
-    if key not in MODELS:
-        raise ValueError(f"--model {key}: there is no such model; there are {', '.join(MODELS)}")
-    camera = MODELS[key].from_fov(float(fov), image_size=size).double().requires_grad_(False)
-    note(f"{fov} degrees wide is a guess: {key}, {_shown(size)}, focal length {float(camera.intrinsics[0]):.6g}")
+    kind = as_model(model or ("pinhole" if float(fov) < _WIDE else "kannala_brandt"), "--model")
+    camera = kind.from_fov(float(fov), image_size=size).double().requires_grad_(False)
+    note(f"{fov} degrees wide is a guess: {camera.key}, {_shown(size)}, focal length {float(camera.intrinsics[0]):.6g}")
     return Rig({"camera": camera})
 
 
@@ -94,21 +91,6 @@ def _leaves_open(path: Path) -> bool:
         warnings.simplefilter("always")
         load(path)
     return any(issubclass(warning.category, opencv.AmbiguousModelWarning) for warning in caught)
-
-
-def _of_model(path: Path, model: str) -> Rig:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of what the file might mean: the model says it
-        try:
-            format = load(path).format
-        except CameraFileError:  # a model may be what it lacks
-            format = "opencv"
-    if format != "opencv":
-        raise ValueError(
-            f"{path}: a file of {format}, which says the models of its cameras; naming one is for files of OpenCV "
-            "that leave it open"
-        )
-    return opencv.read_rig(path, model)
 
 
 def _one(path: Path, rig: Rig, name: str | None = None) -> tuple[str, Camera]:
@@ -140,7 +122,7 @@ def read_other(path: Path, name: str | None = None, model: str | None = None) ->
 
 
 def read_posed(image: Path, size: tuple[int, int], arguments: argparse.Namespace) -> tuple[Camera, Extrinsics | None]:
-    """The camera that took an image of that (height, width), by the options of `add_photograph`; and its pose.
+    """The camera that took an image of that (height, width), by the options of `_photograph`; and its pose.
 
     Raises:
         ValueError: as `read_camera`; no file is given, or it is for another size and is not to be scaled.
@@ -152,7 +134,7 @@ def read_posed(image: Path, size: tuple[int, int], arguments: argparse.Namespace
 def read_for_many(
     images: Sequence[Path], size_of: Callable[[Path], tuple[int, int] | None], arguments: argparse.Namespace
 ) -> Camera:
-    """The camera that took many images, by the options of `add_photograph`; see `fitting`.
+    """The camera that took many images, by the options of `_photograph`; see `fitting`.
 
     Where its file states no size, it is for the first image that has one, by which a lens is chosen, or guessed, too.
 
@@ -202,10 +184,8 @@ def settings_of(camera: Camera) -> dict[str, Any]:
     return {"model": camera.key, "image_size": camera.image_size, **values}
 
 
-def read_pair(
-    images: tuple[Path, Path], sizes: tuple[tuple[int, int], tuple[int, int]], arguments: argparse.Namespace
-) -> Rig:
-    """The two cameras, left and right, that took images of these (height, width), by the options of `add_pair`.
+def read_pair(images: Sequence[Path], sizes: Sequence[tuple[int, int]], arguments: argparse.Namespace) -> Rig:
+    """The two cameras, left and right, that took images of these (height, width).
 
     Raises:
         ValueError: as `read_posed`; it does not say which two cameras, or one has no pose.
@@ -214,25 +194,15 @@ def read_pair(
     if path is None:
         raise ValueError(f"{images[0]}: which cameras took the pair? --camera RIG, their calibration, says so")
     rig = read_rig(path, model=arguments.from_model)
-    left, right = arguments.left_camera, arguments.right_camera
-    for name in (left, right):
-        if name is not None and name not in rig:
-            raise ValueError(f"{path}: no camera is called {name!r}; there are {', '.join(rig)}")
-    if left is None or right is None:
-        if len(rig) != 2:
-            there = f"{len(rig)} camera{'s' * (len(rig) != 1)}, not two"
-            raise ValueError(f"{path}: {there}; --left-camera and --right-camera say which of {', '.join(rig)}")
-        first, second = rig
-        left = left or (second if right == first else first)
-        right = right or (second if left == first else first)
-    if left == right:
-        raise ValueError(f"{path}: --left-camera and --right-camera are both {left!r}")
+    names = arguments.names or list(rig)
+    if len(set(names)) != 2 or not set(names) <= set(rig):
+        raise ValueError(f"{path}: of which cameras? --names LEFT RIGHT says two of {', '.join(rig)}")
     cameras = {}
-    for name, image, size in zip((left, right), images, sizes, strict=True):
+    for name, image, size in zip(names, images, sizes, strict=True):
         cameras[name] = fitting(_one(path, rig, name)[1], path, image, size, arguments.rescale)
         if name not in rig.extrinsics:
             raise ValueError(f"{path}: {name} has no pose, so how the cameras stand to each other is not known")
-    return Rig(cameras, {name: rig.extrinsics[name] for name in cameras})
+    return Rig(cameras, {name: rig.extrinsics[name] for name in names})
 
 
 def fitting(camera: Camera, path: Path, image: Path, size: tuple[int, int], rescale: bool) -> Camera:

@@ -1,4 +1,4 @@
-"""Annotations in COCO's format: read, and moved with their image, as labels of a sample, from one camera to another.
+"""Annotations in COCO's format, moved with their image, as labels of a sample, from one camera to another.
 
 Keypoints lie on a lattice whose whole numbers are the centres of pixels; boxes and polygons lie between the edges of
 pixels, half a pixel further.
@@ -6,158 +6,73 @@ pixels, half a pixel further.
 
 from __future__ import annotations
 
+import itertools
+import json
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
 
-from camtorch.augment.sample import KEEP, kind_of
-from camtorch.cli.labels import Json, LabelsError, read_json
+from camtorch.augment.sample import kind_of
+from camtorch.data.labelled import failing_at
 
+Json = dict[str, Any]
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
-Move = Callable[[Json], Json]
-"""Labels of an image -> labels of the new one."""
 _STEP = 8.0  # pixels: between points of a polygon's edge that are moved
-_SAG = 0.1  # pixels by which a straight edge may miss the curve that it stands for
-_COARSE = 8  # pixels between those of which it is asked whether the new image shows them
-_PARTS = 64  # of a way of some hundred pixels, three times in turn
 _LEAST = 0.01  # square pixels
 _FARTHEST = 1e6  # pixels
 _TURNED = ("gaze", "directions", "pitch_yaw", "points", "head_pose", "pose", "rvec", "tvec")
 _OWN = ("id", "image_id", "category_id", "iscrowd", "area", "bbox", "segmentation", "keypoints", "num_keypoints")
 
 
-@dataclass
-class DataSet:
-    """A file of annotations."""
+def read_json(path: Path) -> Json:
+    """The object in a file; a ValueError names the file and what is wrong with it."""
 
-    path: Path
-    rest: Json
-    """All but images and annotations."""
-    images: list[Json]
-    annotations: dict[Any, list[tuple[int, Json]]]
-    """Id of an image -> its annotations, and their places in the file."""
+    def refuse(constant: str) -> NoReturn:
+        raise ValueError(f"{constant} is none; null is, or leave it out")
+
+    with failing_at(path, "no JSON: ", ValueError, RecursionError):
+        content = json.loads(path.read_bytes(), parse_constant=refuse)
+    if not isinstance(content, dict):
+        raise ValueError(f"{path}: must be an object; got {content!r:.60}")
+    return content
 
 
-def read(path: Path) -> DataSet:
-    """A file of annotations.
+def read(path: Path) -> tuple[Json, list[Json], dict[Any, list[tuple[int, Json]]]]:
+    """What a file of annotations has beside images and annotations; images; and by the id of each its annotations and
+    their places in the file.
 
     Raises:
-        LabelsError: no JSON, or no images and annotations that belong together.
+        ValueError: no JSON, or no images and annotations that belong together.
     """
-    content = read_json(path, 'no file of COCO, which is an object with a list "images"')
+    content = read_json(path)
     images, annotations = content.pop("images", None), content.pop("annotations", [])
     if not isinstance(images, list) or not isinstance(annotations, list):
-        raise LabelsError(f'{path}: no file of COCO: "images" and "annotations" must be lists')
+        raise ValueError(f'{path}: no file of COCO: "images" and "annotations" must be lists')
     of: dict[Any, list[tuple[int, Json]]] = {}
     for i, image in enumerate(images):
-        if reason := _fault_of(image, of):
-            raise LabelsError(f"{path}: images[{i}]: {reason}")
+        if not isinstance(image, dict) or not isinstance(image.get("id"), (int, str)) or image["id"] in of:
+            raise ValueError(f"{path}: images[{i}]: must be an object with an id of its own")
+        name = image.get("file_name")
+        parts = PurePosixPath(name if isinstance(name, str) and "\0" not in name else "")
+        if not parts.name or parts.is_absolute() or ".." in parts.parts:
+            raise ValueError(f"{path}: images[{i}]: file_name must lie within the folder of images; got {name!r:.60}")
         of[image["id"]] = []
     for i, one in enumerate(annotations):
         if not isinstance(one, dict) or not isinstance(one.get("image_id"), (int, str)):
-            raise LabelsError(f"{path}: annotations[{i}]: must be an object with an image_id")
+            raise ValueError(f"{path}: annotations[{i}]: must be an object with an image_id")
         if one["image_id"] not in of:
-            raise LabelsError(f"{path}: annotations[{i}]: no image has the id {one['image_id']!r:.60}")
+            raise ValueError(f"{path}: annotations[{i}]: no image has the id {one['image_id']!r:.60}")
         of[one["image_id"]].append((i, one))
-    return DataSet(path, content, images, of)
-
-
-def labels_of(path: Path, image: Path, size: tuple[int, int]) -> Json:
-    """Keypoints that are labelled and boxes of one image, and its camera if stated, as a JSON of a sample has them.
-
-    Raises:
-        LabelsError: `read`'s; not one image of this name. ValueError: what is not as COCO has it.
-    """
-    data = read(path)
-    named = [one for one in data.images if PurePosixPath(one["file_name"]).name == image.name]
-    if len(named) != 1:
-        raise LabelsError(f"{path}: {len(named)} images have the name {image.name}")
-    keypoints: list[list[float]] = []
-    boxes: list[list[float]] = []
-    for i, one in data.annotations[named[0]["id"]]:
-        try:
-            parts = _Parts.of({**one, "segmentation": []}, size)
-        except (ValueError, TypeError) as error:
-            raise LabelsError(f"{path}: annotations[{i}]: {error}") from None
-        if parts.keypoints is not None:
-            keypoints += parts.keypoints[np.asarray(one["keypoints"][2::3]) > 0].tolist()
-        boxes += [] if parts.box is None else parts.box.tolist()
-    return {"keypoints": keypoints, "boxes": boxes, "camera": named[0].get("camera")}
-
-
-def _fault_of(image: Any, known: Mapping[Any, object]) -> str:
-    """What is wrong with an entry of an image."""
-    if not isinstance(image, dict) or not isinstance(image.get("id"), (int, str)):
-        return "must be an object with an id"
-    name = image.get("file_name")
-    if not isinstance(name, str) or not name or "\0" in name:
-        return f"file_name must be the name of a file; got {name!r:.60}"
-    if PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts:
-        return f"file_name must lie within the folder of images; got {name!r:.60}"
-    for side in ("width", "height"):
-        if type(image.get(side, 0)) not in (int, float):
-            return f"{side} must be a number; got {image[side]!r:.60}"
-    return f"another one has the id {image['id']!r:.60}" if image["id"] in known else ""
-
-
-# -- one image's annotations
-
-
-@dataclass
-class _Parts:
-    """What of an annotation moves; pixels, whose centres are whole numbers."""
-
-    entry: Json
-    keypoints: Array | None = None
-    """(N, 2)"""
-    box: Array | None = None
-    """(1, 4) x1, y1, x2, y2."""
-    mask: NDArray[np.uint8] | None = None
-    outlines: list[list[Array]] = field(default_factory=list)
-    """Points along each edge of each polygon; both of its corners are among them."""
-    turned: dict[str, str] = field(default_factory=dict)
-    """Name of an entry in the camera's frame -> that of its label."""
-
-    @classmethod
-    def of(cls, one: Json, size: tuple[int, int]) -> _Parts:
-        parts = cls(one)
-        if one.get("keypoints"):
-            parts.keypoints = _numbers(one["keypoints"], "keypoints", 3)[:, :2]
-        if one.get("bbox"):
-            numbers = _numbers(one["bbox"], "bbox", 4)
-            if len(numbers) != 1 or numbers[0, 2:].min() < 0:
-                raise ValueError(f"bbox must be [x, y, width, height]; got {one['bbox']!r:.80}")
-            parts.box = np.concatenate([numbers[:, :2], numbers[:, :2] + numbers[:, 2:]], 1) - 0.5
-        shape = one.get("segmentation") or []
-        if isinstance(shape, Mapping):
-            if shape.get("size") != list(size):
-                raise ValueError(
-                    f"segmentation has the size {shape.get('size')}, the image {list(size)}, height and width"
-                )
-            parts.mask = decoded(shape.get("counts"), size).astype(np.uint8)
-        elif isinstance(shape, list):
-            parts.outlines = [_outline(polygon) for polygon in shape]
-        else:
-            raise ValueError(f"segmentation must be a list of polygons, or an object of runs; got {shape!r:.80}")
-        return parts
-
-    def points(self) -> list[Array]:
-        return [*([] if self.keypoints is None else [self.keypoints]), *map(np.concatenate, self.outlines)]
+    return content, images, of
 
 
 class Annotations:
-    """The annotations of an image as labels of a sample, and what becomes of them.
-
-    Args:
-        entries: of one image.
-        size: its (height, width).
-        tell: hears of numbers that are not known and stay as they are.
+    """The annotations of an image of a (height, width) as labels of a sample, and what becomes of them.
 
     Raises:
         ValueError: what is not as COCO has it; the text names the annotation.
@@ -166,90 +81,87 @@ class Annotations:
     labels: Json
     """One field for all keypoints and corners of polygons, and one for all boxes: many fields take long to move."""
 
-    def __init__(self, entries: Sequence[Json], size: tuple[int, int], tell: Callable[[str], None]):
-        self._size, self._parts, self.labels = size, list[_Parts](), {}
+    def __init__(self, entries: Sequence[Json], size: tuple[int, int]):
+        self._entries, self.labels = entries, {}
+        self._points, self._boxes, self._turned = list[list[Array]](), list[Array](), list[dict[str, str]]()
         for i, one in enumerate(entries):
-            try:
-                parts = _Parts.of(one, size)
-            except (ValueError, TypeError) as error:
-                raise ValueError(f"annotation {one.get('id')!r:.40}: {error}") from None
-            for name, value in one.items():
-                try:
-                    kind = None if name in _OWN else kind_of(name, value, {}, "")
-                except ValueError:  # numbers
-                    kind = KEEP
-                if kind in _TURNED:
-                    parts.turned[name] = f"{name}_{i}_of_annotation_{one.get('id')}"
-                    self.labels[parts.turned[name]] = value
-                elif kind is not None:
-                    tell(f"{name!r} of annotations holds numbers that stay as they are")
-            if parts.mask is not None:
-                self.labels[f"mask_{i}"] = parts.mask
-            self._parts.append(parts)
-        points = [one for parts in self._parts for one in parts.points()]
-        boxes = [parts.box for parts in self._parts if parts.box is not None]
-        self._counts = {"keypoints": list(map(len, points)), "boxes": [1] * len(boxes)}
-        for name, arrays in (("keypoints", points), ("boxes", boxes)):
-            if arrays:
-                self.labels[name] = np.concatenate(arrays)
+            with failing_at(f"annotation {one.get('id')!r:.40}", "", ValueError, TypeError):
+                self._add(i, one, size)
+        nothing = np.zeros((0, 2))
+        self.labels |= {"keypoints": np.concatenate([nothing, *itertools.chain(*self._points)])}
+        self.labels |= {"boxes": np.concatenate([np.zeros((0, 4)), *self._boxes])}
 
-    def moved(self, new: Json, move: Move) -> list[Json | None]:
-        """The annotations after a change of the camera; None for those of which nothing is seen any more.
+    def _add(self, i: int, one: Json, size: tuple[int, int]) -> None:
+        keypoints = _numbers(one.get("keypoints") or [], "keypoints", 3)[:, :2]
+        box = _numbers(one.get("bbox") or [], "bbox", 4)
+        if len(box) > 1 or (box[:, 2:] < 0).any():
+            raise ValueError(f"bbox must be [x, y, width, height]; got {one['bbox']!r:.80}")
+        shape = one.get("segmentation") or []
+        if isinstance(shape, Mapping):
+            if shape.get("size") != list(size):
+                raise ValueError(
+                    f"segmentation has the size {shape.get('size')}, the image {list(size)}, height and width"
+                )
+            self.labels[f"mask_{i}"] = decoded(shape.get("counts"), size).astype(np.uint8)
+        elif not isinstance(shape, list):
+            raise ValueError(f"segmentation must be a list of polygons, or an object of runs; got {shape!r:.80}")
+        self._points.append([keypoints, *(() if isinstance(shape, Mapping) else map(_outline, shape))])
+        self._boxes.append(np.concatenate([box[:, :2], box[:, :2] + box[:, 2:]], 1) - 0.5)
+        turned = {}
+        for name, value in one.items():
+            if name not in _OWN and (name in _TURNED or name.startswith(tuple(f"{kind}_" for kind in _TURNED))):
+                kind_of(name, value, {}, "augment")
+                turned[name] = f"{name}_{i}_of_annotation_{one.get('id')}"
+                self.labels[turned[name]] = value
+        self._turned.append(turned)
 
-        Of keypoints those off the image get 0, 0, 0, and `num_keypoints` counts the others. Polygons are moved with
-        points between their corners where edges get curved, end at the rim of what can be mapped, and are clipped; runs
-        are moved as masks. The box is that of what is left of polygons or runs, else the one that encloses the moved
-        box, clipped. The area is that of what is left, or the old one's part of its box. `gaze`, `head_pose` and other
-        fields in the camera's frame turn with it.
+    def moved(self, new: Json) -> list[Json | None]:
+        """The annotations, of `labels` that were moved; None for those of which nothing is seen any more.
 
-        Args:
-            new: `labels`, moved.
-            move: moves others, as these were.
+        Of keypoints those off the image get 0, 0, 0, and `num_keypoints` counts the others. Polygons have points every
+        8 pixels, without those that have no place in the new image, and are clipped; runs are moved as masks. The box
+        is that of what is left of polygons or runs, else the one that encloses the moved box, clipped. The area is that
+        of what is left, or the old one's part of its box. `gaze`, `head_pose` and other fields in the camera's frame
+        turn with it.
         """
-        pieces = {name: self._split(new, name) for name in self._counts}
-        return [self._moved(parts, i, new, pieces, move) for i, parts in enumerate(self._parts)]
+        rows = (
+            zip(np.asarray(new[name]), np.asarray(new[f"{name}_valid"]), strict=True) for name in ("keypoints", "boxes")
+        )
+        points, boxes = rows
+        return [self._moved(i, one, new, points, boxes) for i, one in enumerate(self._entries)]
 
-    def _split(self, new: Json, name: str) -> Iterator[tuple[Array, Flags]]:
-        """Places and validity, annotation by annotation."""
-        counts = self._counts[name]
-        if not counts:
-            return iter(())
-        ends = np.cumsum(counts)[:-1]
-        return zip(*(np.split(np.asarray(new[name + mark]), ends) for mark in ("", "_valid")), strict=True)
-
-    def _moved(
-        self, parts: _Parts, i: int, new: Json, pieces: Mapping[str, Iterator[tuple[Array, Flags]]], move: Move
-    ) -> Json | None:
-        one, (height, width) = parts.entry, new["camera"]["image_size"]
-        result = one | {name: new[label] for name, label in parts.turned.items()}
+    def _moved(self, i: int, one: Json, new: Json, points: Iterator[Any], boxes: Iterator[Any]) -> Json | None:
+        height, width = new["camera"]["image_size"]
+        result = one | {name: new[label] for name, label in self._turned[i].items()}
+        keypoints, *outlines = ([*itertools.islice(points, len(part))] for part in self._points[i])
         is_seen, box, area = True, None, None
-        if parts.keypoints is not None:
-            places, valid = next(pieces["keypoints"])
-            inside = ((parts.keypoints >= -0.5) & (parts.keypoints <= np.array(self._size[::-1]) - 0.5)).all(1)
-            flags = np.asarray(one["keypoints"][2::3])
-            shown = valid & inside & (flags > 0)
-            rows = np.where(shown[:, None], np.column_stack([places, flags]), 0.0)
-            result["keypoints"] = [n for x, y, v in rows.tolist() for n in (_rounded(x), _rounded(y), int(v))]
-            result["num_keypoints"] = int(shown.sum())
-            is_seen = bool(shown.any())
-        if parts.box is not None:
-            places, valid = next(pieces["boxes"])
+        if keypoints:
+            rows = [
+                [_rounded(x), _rounded(y), int(flag)] if valid and flag > 0 else [0.0, 0.0, 0]
+                for ((x, y), valid), flag in zip(keypoints, one["keypoints"][2::3], strict=True)
+            ]
+            result["keypoints"] = [*itertools.chain(*rows)]
+            result["num_keypoints"] = sum(flag > 0 for *_, flag in rows)
+            is_seen = result["num_keypoints"] > 0
+        for places, valid in itertools.islice(boxes, len(self._boxes[i])):
             low, high = (places + 0.5).reshape(2, 2).clip(0, (width, height))
-            if valid[0] and (high > low).all():
-                box = [*low, *(high - low)]
-                old, part = math.prod(one["bbox"][2:]), math.prod(high - low)
-                area = one["area"] * part / old if old and type(one.get("area")) in (int, float) else None
-        if parts.outlines:
-            moved = [_polygon(edges, *next(pieces["keypoints"]), move, self._size) for edges in parts.outlines]
-            clipped = [_clipped(polygon, width, height) for polygon in moved]
+            if valid and (high > low).all():
+                box, old = [*low, *(high - low)], math.prod(one["bbox"][2:])
+                area = (
+                    one["area"] * math.prod(high - low) / old
+                    if old and isinstance(one.get("area"), (int, float))
+                    else None
+                )
+        if outlines:
+            there = (np.array([place for place, _ in outline if (place != -1).any()]) for outline in outlines)
+            clipped = (_clipped(polygon, width, height) for polygon in there)
             polygons = [polygon + 0.5 for polygon in clipped if _area(polygon) >= _LEAST]
             result["segmentation"] = [[_rounded(v) for v in polygon.ravel()] for polygon in polygons]
             area, corners = sum(map(_area, polygons)), np.concatenate([np.zeros((0, 2)), *polygons])
             box = [*corners.min(0), *np.ptp(corners, 0)] if len(corners) else None
-        elif parts.mask is not None:
+        elif f"mask_{i}" in new:
             mask = new[f"mask_{i}"] > 0
-            counts = encoded(mask, as_text=isinstance(one["segmentation"]["counts"], str))
-            result["segmentation"] = {**one["segmentation"], "counts": counts, "size": [height, width]}
+            result["segmentation"] = {**one["segmentation"], "counts": encoded(mask), "size": [height, width]}
             area, corners = int(mask.sum()), np.argwhere(mask)[:, ::-1]
             box = [*corners.min(0), *(np.ptp(corners, 0) + 1)] if len(corners) else None
         if one.get("bbox"):
@@ -276,78 +188,15 @@ def _rounded(value: float) -> float:
 # -- polygons
 
 
-def _outline(polygon: Any) -> list[Array]:
+def _outline(polygon: Any) -> Array:
+    """Points along a polygon, with its corners."""
     corners = _numbers(polygon, "segmentation", 2) - 0.5
     if len(corners) < 3:
         raise ValueError(f"segmentation: a polygon must have three corners; got {polygon}")
     ends = np.roll(corners, -1, 0)
     counts = np.maximum(np.ceil(np.linalg.norm(ends - corners, axis=1) / _STEP), 1).astype(int)
     edges = zip(corners, ends, counts.tolist(), strict=True)
-    return [np.linspace(a, b, n + 1) if n > 1 else np.stack([a, b]) for a, b, n in edges]
-
-
-def _polygon(edges: list[Array], places: Array, valid: Flags, move: Move, size: tuple[int, int]) -> Array:
-    """What became of a polygon (K, 2): its corners, and as many points between them as its edges are curved."""
-    there = valid | _has_place(places)
-    if not there.all():
-        places, there = _pulled_in(np.concatenate(edges), places, there, move, size)
-    ends = np.cumsum([len(edge) for edge in edges])[:-1]
-    pieces = zip(np.split(places, ends), np.split(there, ends), strict=True)
-    corners = np.concatenate([_simplified(edge[there]) for edge, there in pieces])
-    once: Array = corners[(corners != np.roll(corners, -1, 0)).any(1)]
-    return once
-
-
-def _has_place(places: Array) -> Flags:
-    has: Flags = (places != -1).any(-1)
-    return has
-
-
-def _simplified(line: Array) -> Array:
-    """As few of the points of a line (K, 2) as stand for it, by Ramer, Douglas and Peucker."""
-    if len(line) < 3:
-        return line
-    along, off = line[-1] - line[0], line - line[0]
-    distance = np.abs(off[:, 0] * along[1] - off[:, 1] * along[0]) / max(math.hypot(*along), 1e-9)
-    far = int(distance.argmax())
-    if distance[far] <= _SAG:
-        return np.stack([line[0], line[-1]])
-    return np.concatenate([_simplified(line[: far + 1]), _simplified(line[far:])[1:]])
-
-
-def _pulled_in(points: Array, places: Array, there: Flags, move: Move, size: tuple[int, int]) -> tuple[Array, Flags]:
-    """Places of the points along a polygon, and which there are.
-
-    What has no place takes that of the point where one last exists on the way to the middle of what the new image
-    shows: an outline around all that can be mapped so becomes its rim.
-    """
-    lattice = np.stack(np.meshgrid(*(np.arange(0.0, side, _COARSE) for side in size[::-1])), -1).reshape(-1, 2)
-    shown = lattice[np.asarray(move({"keypoints": lattice})["keypoints_valid"])]
-    if not len(shown):
-        return places, there
-    middle = shown[np.linalg.norm(shown - shown.mean(0), axis=1).argmin()]
-    # what lies beyond all that can be mapped, and not around it, stays away
-    if not there.any() and not _holds(points, middle):
-        return places, there
-    lost = points[~there]
-    rows, low, high = np.arange(len(lost)), np.zeros(len(lost)), np.ones(len(lost))
-    for _ in range(3):
-        shares = np.linspace(low, high, _PARTS + 1, axis=1)
-        on_way = lost[:, None] + shares[..., None] * (middle - lost)[:, None]
-        found = np.asarray(move({"keypoints": on_way.reshape(-1, 2)})["keypoints"]).reshape(on_way.shape)
-        first = _has_place(found).argmax(1)
-        low, high = shares[rows, np.maximum(first - 1, 0)], shares[rows, first]
-    places = places.copy()
-    places[~there] = found[rows, first]
-    return places, np.ones_like(there)
-
-
-def _holds(outline: Array, point: Array) -> bool:
-    """Whether a point is within an outline (K, 2): a ray from it to the right crosses that an odd number of times."""
-    (x1, y1), (x2, y2), (x, y) = outline.T, np.roll(outline, -1, 0).T, point
-    crosses = (y1 > y) != (y2 > y)
-    at = x1[crosses] + ((x2 - x1) * (y - y1))[crosses] / (y2 - y1)[crosses]
-    return bool((at > x).sum() % 2)
+    return np.concatenate([np.linspace(a, b, n, endpoint=False) for a, b, n in edges])
 
 
 def _clipped(polygon: Array, width: int, height: int) -> Array:
@@ -374,7 +223,7 @@ def _area(polygon: Array) -> float:
 #
 # Down the columns, one after another, beginning with zeros; "Data format" of cocodataset.org. As a text each number is
 # groups of five bits, the lowest first, with a sixth one where more follow, as characters from "0" on; from the fourth
-# number on it is the difference to the one before last. pycocotools reads past the end of texts that are cut off.
+# number on it is the difference to the one before last. pycocotools shows what is in memory where runs are too short.
 
 
 def decoded(counts: Any, size: tuple[int, int]) -> Flags:
@@ -392,20 +241,11 @@ def decoded(counts: Any, size: tuple[int, int]) -> Flags:
     return mask
 
 
-def encoded(mask: Flags, *, as_text: bool) -> list[int] | str:
+def encoded(mask: Flags) -> list[int]:
     """The runs of a mask (H, W)."""
     flat = np.concatenate([[False], mask.T.reshape(-1)])
     runs: list[int] = np.diff(np.flatnonzero(flat[1:] != flat[:-1]), prepend=0, append=mask.size).tolist()
-    if not as_text:
-        return runs
-    text = ""
-    for i, run in enumerate(runs):
-        rest, more = run - runs[i - 2] if i > 2 else run, True
-        while more:
-            low, rest = rest & 31, rest >> 5
-            more = rest != (-1 if low & 16 else 0)
-            text += chr(low + 32 * more + 48)
-    return text
+    return runs
 
 
 def _of_text(text: str) -> list[int]:

@@ -59,8 +59,9 @@ def _dewarp(commands: Commands) -> None:
     text = "of new images or videos; by default those of the old ones"
     _many_files(command)("--suffix", type=words.suffix, metavar=".EXT", help=text)
     video = command.add_argument_group("videos (pip install 'camtorch[video]')").add_argument
-    video("--codec", metavar="NAME", help="an encoder of ffmpeg's; libx264 by default, in .webm libvpx-vp9")
-    video("--crf", type=int, metavar="N", help="the encoder's quality, lower is better; 18 in libx264")
+    codecs = ("libx264", "libvpx-vp9", "ffv1")
+    video("--codec", choices=codecs, help="the encoder; libx264 by default, in .webm libvpx-vp9; ffv1 loses nothing")
+    video("--crf", type=int, metavar="N", help="its quality, lower is better; 18 in libx264")
 
 
 def _rectify(commands: Commands) -> None:
@@ -75,8 +76,7 @@ def _rectify(commands: Commands) -> None:
     add("left", type=words.path, metavar="LEFT", help="the left camera's image")
     add("right", type=words.path, metavar="RIGHT", help="the right camera's, of the same moment")
     add("--camera", type=words.path, metavar="RIG", help="its calibration with both poses, any format")
-    add("--left-camera", metavar="NAME", help="the camera of LEFT; by default the first of two")
-    add("--right-camera", metavar="NAME", help="that of RIGHT; by default the second of two")
+    add("--names", nargs=2, metavar=("LEFT", "RIGHT"), help="their cameras; by default the first and the second of two")
     _from_model(add)
     _rescale(add)
     image = command.add_argument_group("rectified images").add_argument
@@ -87,16 +87,10 @@ def _rectify(commands: Commands) -> None:
     image("--fov", type=words.span, metavar="DEGREES", help=text)
     image("--size", type=words.size, metavar="WxH", help="else what loses no detail")
     image("--vertical", action="store_true", help="LEFT is the upper of two: columns correspond")
-    text = "mean: look where both cameras look on average (the default); opencv: halve their rotation, as it does"
-    image("--align", choices=("mean", "opencv"), default="mean", help=text)
     depth = command.add_argument_group('depth, with OpenCV: pip install "camtorch[stereo]"').add_argument
-    text = (
-        "pixels of disparity: a .png of 16 bits, 256 times as many, 0 where unknown, or an .npy, NaN where "
-        "unknown; OUT/disparity.png by default. And OUT/disparity_colours.png to look at"
-    )
-    depth("--disparity", nargs="?", type=words.path, const=Path(), metavar="FILE", help=text)
-    text = "coloured points, in the left camera's frame and unit"
-    depth("--points", type=words.path, metavar="FILE.ply", help=text)
+    text = "OUT/disparity.npy, in pixels, NaN where unknown; and disparity.png to look at"
+    depth("--disparity", action="store_true", help=text)
+    depth("--points", action="store_true", help="OUT/points.ply, coloured, in the left camera's frame and unit")
     text = (
         f"the depths to look for, in the unit of RIG's poses; FAR may be inf; else {NEAR:g} to {FAR:g} times "
         "the distance of the cameras for points, and what is farther too for disparities"
@@ -138,7 +132,7 @@ def _augment(commands: Commands) -> None:
     add = command.add_argument
     text = "the image; the folder of images of a data set"
     add("image", type=words.path, nargs="?", metavar="IMAGE", help=text)
-    text = "of IMAGE: JSON of keypoints, boxes, gaze_from in pixels, gaze, and perhaps its camera; or as for --dataset"
+    text = "of IMAGE: JSON of keypoints, boxes, gaze_from in pixels, gaze, and perhaps its camera"
     add("--labels", type=words.path, metavar="FILE", help=text)
     add("--preset", default="none", metavar="NAME", help="whose lens the other cameras have")
     add("--list", action="store_true", help="print the presets, and nothing else")
@@ -161,7 +155,6 @@ def _augment(commands: Commands) -> None:
     many = _many_files(command)
     text = "of all images of the folder IMAGE: a JSON file in COCO's format, or a folder of a JSON file for each"
     many("--dataset", type=words.path, metavar="LABELS", help=text)
-    many("--copies", type=words.count(10000), metavar="N", help="new images of each; 1 by default")
 
 
 def _map(commands: Commands) -> None:
@@ -249,8 +242,6 @@ def _calibrate(commands: Commands) -> None:
     rig("--left", nargs="+", metavar="IMAGE", help="of the left camera of a pair")
     rig("--right", nargs="+", metavar="IMAGE", help="of the right one")
     rig("--rig", nargs="+", metavar="NAME=IMAGE", help="of any number of cameras: a folder or a pattern")
-    text = "what says which images were taken together; by default names where they agree, else the order"
-    rig("--match", choices=("name", "order"), help=text)
     _board_options(command, "if left out, distances are in squares")
     lens = command.add_argument_group("camera").add_argument
     lens("--model", metavar="KEY", help="kannala_brandt, brown_conrady ...; by default the one that fits")
@@ -259,7 +250,12 @@ def _calibrate(commands: Commands) -> None:
     lens("--loss", choices=("huber", "cauchy"), help="for corners of which some are wrong")
     lens("--loss-scale", type=float, default=1.0, metavar="PX", help="of that loss; 1 by default")
     lens("--bend", action="store_true", help="the board is not quite flat: find its bend as well")
-    add("--corners", type=words.path, metavar="FILE", help="a .json to keep corners in, and to take them from")
+    add(
+        "--corners",
+        type=words.path,
+        metavar="FILE",
+        help="a .json to keep corners in; without images, to take them from",
+    )
     add("--report", type=words.path, metavar="FILE", help="an .html to look at: how far the result can be trusted")
     add("--format", help=f"{_FORMAT}, OpenCV's for .yml")
     _output(add, "camera.json", "the calibration")

@@ -14,12 +14,10 @@ from camtorch import __version__
 from camtorch.camera import Camera
 from camtorch.cli import cameras, images, many, targets, videos
 from camtorch.cli.commands import are_several
-from camtorch.cli.terminal import bar, note
-from camtorch.io import CameraFileError, load
+from camtorch.cli.terminal import bar
 from camtorch.jobs import inputs, items
-from camtorch.jobs.items import Item, Listener, Shard
-from camtorch.jobs.manifest import Manifest
-from camtorch.jobs.run import Report
+from camtorch.jobs.items import Item
+from camtorch.jobs.run import Account, Report
 from camtorch.warp.dewarp import Dewarp, Projection
 from camtorch.warp.warp import Warp
 
@@ -27,7 +25,6 @@ _SLASHES = ("/", os.sep)
 _TOLERANCE = 0.001  # pixels that nobody sees, for a lattice of positions also where a calibration is in float64
 _MOST_KEPT = 4  # warps of images of different sizes
 _MUCH = 0.6  # of a photograph: where a dewarped one shows less, it is said what shows more
-_LARGE = 32e6  # pixels, from where on their map is not kept, and one in 64 tells how much is filled
 
 
 @dataclass
@@ -52,19 +49,18 @@ class Dewarping:
         settings = {"camtorch": __version__, "camera": cameras.settings_of(self.camera), **vars(self.encoder)}
         return settings | {name: getattr(self, name) for name in names}
 
-    def __call__(self, item: Item, listener: Listener) -> dict[str, Any]:
-        """What the new camera is."""
+    def __call__(self, item: Item, **options: Any) -> dict[str, Any]:
+        """What the new camera is; options are those of `videos.remake`."""
         (source,), (target,) = item.inputs, item.outputs
         if videos.is_video(source):
-            return videos.remake(source, target, lambda size: self._warp(source, size), self.encoder, listener)
-        image, orientation = images.read(source, tell=listener.note)
+            return videos.remake(source, target, lambda size: self._warp(source, size), self.encoder, **options)
+        image, orientation = images.read_stored(source)
         rows, columns = image.shape[-2:]
         warp, facts = self._warp(source, (rows, columns))
         with torch.no_grad():
             result = warp(image[None])[0]
         del image  # of hundreds of megabytes, perhaps
-        made = images.from_tensor(result)
-        images.write(target, made, orientation=orientation, tell=listener.note, synced=False)
+        images.write(target, images.from_tensor(result), orientation=orientation, synced=False)
         return facts
 
     def warp_of(self, camera: Camera) -> Dewarp:
@@ -84,19 +80,20 @@ class Dewarping:
 
 @torch.no_grad()
 def _facts(warp: Dewarp) -> dict[str, Any]:
-    """What is to be known of new images; `shown` is the part that they show of 64 x 64 pixels of the old one."""
+    """What is to be known of new images: of 64 x 64 places in them how many show something, `filled`; and how many of
+    as many in the old one they show, `shown`.
+    """
     source, target = warp.source, warp.target
     part = torch.tensor([source.width / 64, source.height / 64])
     lattice = (source.resize(64, 64).pixel_grid() + 0.5) * part - 0.5
-    large = target.height * target.width > _LARGE
-    seen = Warp(source, target.resize(target.height // 8, target.width // 8), warp.rotation) if large else warp
+    seen = Warp(source, target.resize(64, 64), warp.rotation).valid_mask()
     return {
         "model": source.key,
         "width": target.width,
         "height": target.height,
         "intrinsics": target.intrinsics.tolist(),
         "degrees": float(target.fov[0]),
-        "filled": images.filled(seen),
+        "filled": float(seen.double().mean()),
         "shown": float(warp.transform_points(lattice)[1].double().mean()),
     }
 
@@ -114,63 +111,53 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _single(arguments: argparse.Namespace, source: Path) -> None:
     is_video = videos.is_video(source)
-    output = Path(arguments.output or f"dewarped{source.suffix if is_video else '.png'}")
+    output = Path(arguments.output or f"dewarped{videos.written_suffix(source) if is_video else '.png'}")
     targets.check(output, force=arguments.force, inputs=(source, arguments.camera))
     (videos if is_video else images).check_kind(output)
-    if not (is_video or source.exists()):
+    if not source.exists():
         raise ValueError(f"{source}: no such file")
     work = _dewarping(arguments, [source])
-    item = videos.sized(Item((source,), (output,)))
     if arguments.dry_run:
         print(f"{source} -> {output}")
         return
-
-    def tell(text: str) -> None:
-        note(text if text.startswith(str(source)) else f"{source} {text}")
-
-    with bar("dewarping", item.size, "frames" if is_video else "images") as shown:
-        facts = work(item, Listener(tell, lambda done: shown.update(done - shown.n)))
-    end = f", {facts['frames']} frames" if is_video else f" and shows {100 * facts['shown']:.0f} % of the photograph"
-    if not is_video and facts["shown"] < _MUCH and arguments.projection == "perspective" and arguments.fov is None:
-        end += "; --projection stereographic or cylindrical shows more, and --fov says how much"
+    item = Item((source,), (output,))
+    if is_video:
+        with bar("dewarping", videos.count_of(source), "frames") as shown:
+            facts = work(item, done=shown.update)
+        end = f", {facts['frames']} frames"
+    else:
+        facts = work(item)
+        end = f" and shows {100 * facts['shown']:.0f} % of the photograph"
+        if facts["shown"] < _MUCH and arguments.projection == "perspective" and arguments.fov is None:
+            end += "; --projection stereographic or cylindrical shows more, and --fov says how much"
     print(f"{output}: {_told(arguments, facts)}{end}")
 
 
 def _many(arguments: argparse.Namespace) -> int:
-    known = inputs.IMAGES | set(videos.FORMATS)
-    for word in arguments.image:
-        if os.path.isfile(word) and Path(word).suffix.lower() not in known and _is_calibration(word):
-            raise ValueError(f"{word}: a calibration, not an image; --camera {word} names it")
-    output, shard = many.output_folder(arguments.output), arguments.shard or Shard.of_environment()
+    known = inputs.IMAGES | videos.FORMATS
+    output, shard = many.output_folder(arguments.output), many.shard_of(arguments)
     if not output.exists() and not arguments.output.endswith(_SLASHES) and output.suffix.lower() in known:
         raise ValueError(f"{output}: is the name of one file, but there may be several; -o OUT/ names a folder")
-    found, faults = inputs.find(arguments.image, known, output)
-    everything, suffix = list[Item](), arguments.suffix
-    for one in found:
-        target, is_video = output / one.place, videos.is_video(one.path)
+    found, suffix = inputs.find(arguments.image, known, output), arguments.suffix
+    everything = list[Item]()
+    for path, place in found:
+        target, is_video = output / place, videos.is_video(path)
+        if is_video:
+            target = target.with_suffix(videos.written_suffix(path))
         if suffix is not None and is_video == videos.is_video(Path("any" + suffix)):
             target = target.with_suffix(suffix)
         (videos if is_video else images).check_kind(target)
-        everything.append(Item((one.path,), (target,)))
+        everything.append(Item((path,), (target,)))
     items.check(everything, [arguments.camera] if arguments.camera else [])
-    work = _dewarping(arguments, [one.path for one in found])
+    work = _dewarping(arguments, [path for path, _ in found])
 
     def told(report: Report) -> str:
         facts = [{**result, "frames": 0} for result in report.results]
         return f", {_told(arguments, facts[0])}" if facts and all(one == facts[0] for one in facts) else ""
 
-    mine = list(map(videos.sized, shard.of(everything)))
-    manifest = Manifest(output, "dewarp", work.settings(), shard)
-    units = "frames" if any(item.size != 1 for item in mine) else "images"
-    return many.carry_out(mine, faults, work, manifest, arguments, doing="dewarping", units=units, told=told)
-
-
-def _is_calibration(word: str) -> bool:
-    try:
-        load(word)
-    except (CameraFileError, OSError):
-        return False
-    return True
+    return many.carry_out(
+        shard.of(everything), work, Account(output, "dewarp", work.settings(), shard), arguments, told
+    )
 
 
 def _dewarping(arguments: argparse.Namespace, sources: list[Path]) -> Dewarping:
@@ -178,9 +165,9 @@ def _dewarping(arguments: argparse.Namespace, sources: list[Path]) -> Dewarping:
     camera = cameras.read_for_many(
         sources, lambda one: (videos if videos.is_video(one) else images).size_of(one), arguments
     )
-    encoder = videos.Encoder(arguments.codec, arguments.crf)
     if any(map(videos.is_video, sources)):
-        encoder.check()
+        videos.require()
+    encoder = videos.Encoder(arguments.codec, arguments.crf)
     work = Dewarping(
         camera, arguments.camera, arguments.rescale, arguments.projection, arguments.fov, arguments.size, encoder
     )

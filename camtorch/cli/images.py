@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -10,20 +10,14 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from camtorch._photographs import ORIENTATION, ImageFileError, read_stored
+from camtorch._photographs import ORIENTATION, ImageFileError
+from camtorch._photographs import read_stored as read_stored
 from camtorch._photographs import size_of as size_of
 from camtorch.cli import targets
-from camtorch.cli.terminal import note
 from camtorch.io.writing import replacing
-from camtorch.warp.warp import Warp
+from camtorch.jobs.inputs import IMAGES
 
-_KEEP_ORIENTATION = ("AVIF", "JPEG", "MPO", "PNG", "TIFF", "WEBP")
-_OTHER_SIZES = ("ICO", "ICNS")  # formats that hold an image in sizes of their own
-
-
-def read(path: Path, tell: Callable[[str], None] = note) -> tuple[Tensor, int | None]:
-    """`read_stored`, which says in notes what is left out."""
-    return read_stored(path, tell)
+_KEEP_ORIENTATION = ("JPEG", "PNG", "TIFF", "WEBP")
 
 
 def check_target(path: Path, *, force: bool, inputs: tuple[Path | None, ...] = ()) -> None:
@@ -33,17 +27,10 @@ def check_target(path: Path, *, force: bool, inputs: tuple[Path | None, ...] = (
 
 
 def check_kind(path: Path) -> None:
-    """Refuse, by an ImageFileError, a name of no file type that holds images of any size."""
-    kind = Image.registered_extensions().get(path.suffix.lower())
-    if kind not in Image.SAVE or kind in _OTHER_SIZES:
-        why = "icons have sizes of their own" if kind in _OTHER_SIZES else "no image can be written as that"
-        raise ImageFileError(f"{path}: {path.suffix or 'no suffix'}: {why}; try .png")
-
-
-def filled(warp: Warp) -> float:
-    """The part of new images that shows something."""
-    valid = warp.valid_mask()
-    return int(valid.sum()) / valid.numel()
+    """Refuse, by an ImageFileError, a name of no file type that images are written as."""
+    if path.suffix.lower() not in IMAGES:
+        what = path.suffix or "no suffix"
+        raise ImageFileError(f"{path}: {what}: no image is written as that; try {', '.join(sorted(IMAGES))}")
 
 
 def in_colour(image: Tensor, paper: tuple[int, int, int] = (255, 255, 255)) -> Tensor:
@@ -63,17 +50,10 @@ def from_tensor(image: Tensor) -> Image.Image:
     return Image.fromarray(pixels[..., 0] if pixels.shape[-1] == 1 else pixels)
 
 
-def write(
-    path: Path,
-    image: Image.Image,
-    *,
-    orientation: int | None = None,
-    tell: Callable[[str], None] = note,
-    synced: bool = True,
-) -> None:
+def write(path: Path, image: Image.Image, *, orientation: int | None = None, synced: bool = True) -> None:
     """Write a Pillow image, whole or not at all; folders that lack are made; `synced` as of `replacing`.
 
-    Where the file type does not hold the Exif orientation of the image it was made of, `tell` gets that this is lost.
+    A warning says where the file type does not hold the Exif orientation of the image it was made of.
 
     Raises:
         ImageFileError: the file type does not take such pixels, or the disk does not take the file.
@@ -93,4 +73,5 @@ def write(
             reason = f"{path.suffix} files hold no image of mode {image.mode}; .png does"
         raise ImageFileError(f"{path}: {reason}") from None
     if orientation not in (None, 1) and kind not in _KEEP_ORIENTATION:
-        tell(f"is to be shown turned by its Exif orientation, which is lost: {path.suffix} files hold none")
+        turned = "the Exif orientation, by which it is to be shown turned, is lost"
+        warnings.warn(f"{turned}: {path.suffix} files hold none", stacklevel=2)

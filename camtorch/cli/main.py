@@ -6,21 +6,18 @@ What a command needs is imported when it runs: torch takes a second, which `--he
 from __future__ import annotations
 
 import argparse
-import contextlib
 import importlib
 import importlib.metadata
 import os
-import signal
 import sys
-import threading
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any, NoReturn
 
 from camtorch import __version__
 from camtorch.cli import commands
 from camtorch.cli.terminal import note, say, shown
-from camtorch.jobs import pool
+from camtorch.jobs import processes
 from camtorch.native import library
 
 _INTERRUPT, _PIPE = 128 + 2, 128 + 13  # as shells number signals
@@ -53,23 +50,19 @@ def main(argv: Sequence[str] | None = None) -> int:
         The exit status: 0; 1 where some of many files failed; 2 after an error, which is one line on stderr; 130 after
         an interrupt; 141 where nobody reads what is printed.
     """
-    if sys.stderr is None:  # closed by whoever called
-        with open(os.devnull, "w") as nobody, contextlib.redirect_stderr(nobody):
-            return main(argv)
     try:
         arguments = make_parser().parse_args(argv)
         module = f"camtorch.cli.{arguments.command}"
         if commands.uses_processes(arguments):
-            pool.prepare(module)  # they import what they need while this one does
-        with _interrupts_end_the_process(), shown("loading PyTorch"):
+            processes.prepare(module)  # they import what they need while this one does
+        with shown("loading PyTorch"):
             command = importlib.import_module(module)
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", UserWarning)
             status: int = command.run(arguments) or 0
         for warning in caught:
             note(warning.message)
-        if sys.stdout is not None:  # closed by whoever called
-            sys.stdout.flush()
+        sys.stdout.flush()
     except BrokenPipeError:  # whoever reads what is printed has enough, as `head` has
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return _PIPE
@@ -77,9 +70,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         say("interrupted")
         return _INTERRUPT
     except Exception as error:
-        if not (isinstance(error, (ValueError, ImportError, OSError)) or pool.lacks_memory(error)):
+        if not (isinstance(error, (ValueError, ImportError, OSError)) or processes.lacks_memory(error)):
             raise
-        say(f"error: {pool.reason(error)}")
+        say(f"error: {processes.reason(error)}")
         return 2
     return status
 
@@ -90,24 +83,6 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action=_Version, nargs=0, help="show what is installed and exit")
     commands.add_all(parser.add_subparsers(title="commands", dest="command", required=True, metavar="COMMAND"))
     return parser
-
-
-@contextlib.contextmanager
-def _interrupts_end_the_process() -> Iterator[None]:
-    """For the import of torch, which loses a KeyboardInterrupt, or aborts by it."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-
-    def end(number: int, frame: object) -> NoReturn:
-        say("interrupted")
-        os._exit(_INTERRUPT)
-
-    before = signal.signal(signal.SIGINT, end)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
 
 
 if __name__ == "__main__":

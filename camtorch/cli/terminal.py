@@ -32,23 +32,17 @@ def shown(what: str) -> Iterator[None]:
             print("\r\x1b[K", end="", file=sys.stderr, flush=True)  # the line is gone
 
 
-def bar(what: str, total: float, unit: str = "", **options: Any) -> Any:
+def bar(what: str, total: float | None, unit: str = "", **options: Any) -> Any:
     """A tqdm bar for work that takes more than a moment; a file or a pipe gets one twice a minute. Close it."""
     from tqdm import tqdm  # type: ignore[import-untyped]  # not before: `--help` does without
 
-    is_terminal = sys.stderr.isatty()
-    delay, interval = (0.5, 0.1) if is_terminal else (30.0, 30.0)  # seconds
-    common = {"leave": False, "smoothing": 0, "file": sys.stderr}
-    return tqdm(desc=what, total=total, unit=f" {unit}", delay=delay, mininterval=interval, **common | options)
+    delay, interval = (0.5, 0.1) if sys.stderr.isatty() else (30.0, 30.0)  # seconds
+    common = {"leave": False, "smoothing": 0, "file": sys.stderr, "delay": delay, "mininterval": interval}
+    return tqdm(desc=what, total=total, unit=f" {unit}", **common | options)
 
 
-def progress(what: str) -> Callable[[float], None]:
-    """A function that shows a done part, from 0 to 1, on a terminal; the bar is gone when the part is 1."""
-    shown = bar(what, 1.0, disable=None, bar_format="{desc}: {percentage:3.0f} %|{bar}| {remaining} left")
-
-    def show(part: float) -> None:
-        shown.update(part - shown.n)
-        if part >= 1:
-            shown.close()
-
-    return show
+@contextlib.contextmanager
+def progress(what: str) -> Iterator[Callable[[float], None]]:
+    """A function that shows a done part, from 0 to 1."""
+    with bar(what, 1.0, bar_format="{desc}: {percentage:3.0f} %|{bar}| {remaining} left") as shown:
+        yield lambda part: shown.update(part - shown.n)

@@ -1,16 +1,14 @@
-"""Video files through warps, by PyAV: time stamps, sound, subtitles and colours stay as they are."""
+"""Video files through warps, by PyAV: time stamps, sound and subtitles stay as they are."""
 
 from __future__ import annotations
 
 import contextlib
 import importlib
 import os
-import re
-import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -20,31 +18,22 @@ import torch
 
 from camtorch.camera import Camera
 from camtorch.io.writing import replacing
-from camtorch.jobs.items import Item, Listener
 from camtorch.warp.warp import Warp
 
-FORMATS = {
-    ".avi": "avi",
-    ".m4v": "mp4",
-    ".mkv": "matroska",
-    ".mov": "mov",
-    ".mp4": "mp4",
-    ".mts": "mpegts",
-    ".ts": "mpegts",
-    ".webm": "webm",
-}
+WRITTEN = {".mp4": "mp4", ".m4v": "mp4", ".mov": "mov", ".mkv": "matroska", ".webm": "webm"}
 """What ffmpeg calls the formats of files with these suffixes, in lower case."""
+FORMATS = frozenset({*WRITTEN, ".avi", ".mts", ".ts"})
+"""Suffixes of what is read."""
+CODECS = {
+    # how x264 weighs blocks by what refers to them is not the same each time
+    "libx264": {"crf": "18", "mbtree": "0"},
+    "libvpx-vp9": {"crf": "24", "b": "0"},
+    "ffv1": {},
+}
+"""Encoders with their options."""
 _READ = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpegts"  # no playlists, which would have other files read
-_QUALITIES = {"libx264": 18, "libx265": 20, "libvpx-vp9": 24, "libsvtav1": 24, "libaom-av1": 24}
-_QUANTISER = 3  # of encoders without a crf: near the best
-_LAMBDA = 118  # FF_QP2LAMBDA
 _THREADS = 4  # of an encoder: what it makes depends on their number, and shall not depend on the machine's
-_AHEAD = 8  # frames
-_OFTEN = 0.1  # seconds between two reports
-# how x264 weighs blocks by what refers to them is not the same each time; x265 says much
-_OPTIONS = {"libx264": {"mbtree": "0"}, "libx265": {"x265-params": "log-level=error"}}
-_EVEN = ("libx264", "libx265")
-_BY_QUANTISER = ("mpeg4", "mpeg2video", "mjpeg")
+_AHEAD = 8  # frames that wait to be encoded
 _CUT = 0.5  # seconds that may be missing at the end
 
 
@@ -57,62 +46,38 @@ def is_video(path: Path) -> bool:
     return path.suffix.lower() in FORMATS
 
 
+def written_suffix(path: Path) -> str:
+    """That of a video, or of the one that is made of it."""
+    return path.suffix if path.suffix.lower() in WRITTEN else ".mkv"
+
+
 def check_kind(path: Path) -> None:
     """Refuse, by a VideoFileError, a name that says of no format that videos can be written as."""
-    if not is_video(path):
+    if path.suffix.lower() not in WRITTEN:
         what = path.suffix or "no suffix"
-        raise VideoFileError(f"{path}: {what}: no video can be written as that; try {', '.join(FORMATS)}")
+        raise VideoFileError(f"{path}: {what}: no video is written as that; try {', '.join(WRITTEN)}")
 
 
-@dataclass(frozen=True)
-class Encoder:
-    """What videos are written with."""
-
-    codec: str | None = None
-    """An encoder of ffmpeg's; by default what suits the format."""
-    crf: int | None = None
-    """Its quality; by default one at which hardly anything is lost."""
-
-    def check(self) -> None:
-        """Refuse what no video can be written with, and a PyAV that is not installed."""
-        av = _av()
-        if self.codec is None:
-            return
-        try:
-            kind = av.Codec(self.codec, "w").type
-        except av.codec.codec.UnknownCodecError:
-            known = ", ".join(_QUALITIES)
-            raise ValueError(
-                f"--codec {self.codec}: there is no such encoder; there are {known}, ffv1 and others"
-            ) from None
-        if kind != "video":
-            raise ValueError(f"--codec {self.codec}: an encoder of {kind}, not of video")
-        if self.crf is not None and not _has_crf(self.codec):
-            raise ValueError(f"--crf: {self.codec} has no such option")
-
-
-def _av() -> Any:
+def require() -> Any:
+    """PyAV, or an ImportError that says how to install it."""
     try:
         return importlib.import_module("av")
     except ImportError:
         raise ImportError("videos take PyAV, which is not installed: pip install 'camtorch[video]'") from None
 
 
-def _has_crf(codec: str) -> bool:
-    return any(option.name == "crf" for option in _av().CodecContext.create(codec, "w").supported_options.private)
-
-
-# -- what a file says of itself
+# -- reading
 
 
 @contextlib.contextmanager
 def _opened(path: Path) -> Iterator[tuple[Any, Any]]:
     """A file and its first video stream; what goes wrong with it in the block is a VideoFileError."""
-    av = _av()
+    av = require()
     try:
         with av.open(os.fspath(path), options={"format_whitelist": _READ}) as container:
             if not container.streams.video:
                 raise VideoFileError(f"{path}: no video is in it")
+            container.streams.video[0].thread_type = "AUTO"
             yield container, container.streams.video[0]
     except av.error.FFmpegError as error:
         raise VideoFileError(f"{path}: {error.strerror}") from None
@@ -128,26 +93,44 @@ def size_of(path: Path) -> tuple[int, int] | None:
 
 
 def length_of(path: Path) -> float:
-    """Seconds; 0 where that is not said."""
-    with _opened(path) as (container, stream):
-        return float(_length(container, stream))
+    """Seconds, about; 0 where that is not said."""
+    with _opened(path) as (container, _):
+        return _span(container)[1]
 
 
-def frames(path: Path) -> Iterator[tuple[float, float, Any]]:
-    """Frames as they are stored: when each is shown, in seconds, the part of the video until then, and PyAV's frame."""
+def count_of(path: Path) -> int | None:
+    """How many frames, about; None where that is not said."""
     with _opened(path) as (container, stream):
-        stream.thread_type = "AUTO"
-        length, step = float(_length(container, stream)), float(1 / _rate(stream))
+        return stream.frames or round(_span(container)[1] * _rate(stream)) or None
+
+
+def frames(path: Path) -> Iterator[tuple[float, Any]]:
+    """Frames as they are stored: when each is shown, in seconds from the first one, and PyAV's frame."""
+    with _opened(path) as (container, stream):
         start = None
-        for number, (frame, _) in enumerate(_decoded(container, stream)):
-            seconds = number * step if frame.time is None else float(frame.time)
+        for frame, _ in _decoded(container, stream):
+            seconds = float(frame.pts * frame.time_base)
             start = seconds if start is None else start
-            yield seconds, min((seconds - start) / length, 1.0) if length else 0.0, frame
+            yield seconds - start, frame
+
+
+def _span(container: Any) -> tuple[float, float]:
+    """When a file begins, and how long it is, in seconds; 0 where that is not said."""
+    begin, length = ((value or 0) / 1e6 for value in (container.start_time, container.duration))
+    is_end = "matroska" in container.format.name  # which says when it ends instead
+    return begin, max(length - begin, 0.0) if is_end else length
+
+
+def _rate(stream: Any) -> Fraction:
+    return stream.guessed_rate or stream.average_rate or Fraction(25)
 
 
 def _decoded(container: Any, stream: Any, *others: Any) -> Iterator[tuple[Any, Any]]:
-    """(frame, None) of a stream, and (None, packet) of others, in the order in which they are stored."""
-    has_begun = False
+    """(frame, None) of a stream, and (None, packet) of others, in the order in which they are stored.
+
+    Frames have time stamps that grow.
+    """
+    last, count, step = None, 0, 1 / _rate(stream)
     for packet in container.demux(stream, *others):
         if packet.stream is not stream:
             if packet.dts is not None:
@@ -155,135 +138,82 @@ def _decoded(container: Any, stream: Any, *others: Any) -> Iterator[tuple[Any, A
             continue
         try:
             decoded = packet.decode()
-        except _av().error.InvalidDataError:
-            if has_begun:
+        except require().error.InvalidDataError:
+            if last is not None:
                 raise
             continue  # a recording that begins between whole frames
         for frame in decoded:
-            has_begun = True
+            frame.time_base = frame.time_base or step
+            if container.format.name == "avi":  # whose stamps are those of the order in which frames are stored
+                frame.pts = round(count * step / frame.time_base)
+            elif frame.pts is None:
+                frame.pts = 0 if last is None else last + round(step / frame.time_base)
+            last = frame.pts = frame.pts if last is None else max(frame.pts, last + 1)
+            count += 1
             yield frame, None
 
 
-def sized(item: Item) -> Item:
-    """The item with the number of its frames, about, if it is a video that says how long it is."""
-    if not is_video(item.inputs[0]):
-        return item
-    try:
-        with _opened(item.inputs[0]) as (container, stream):
-            return replace(item, size=max(int(stream.frames or _length(container, stream) * _rate(stream)), 1))
-    except VideoFileError:
-        return item
-
-
-def _rate(stream: Any) -> Fraction:
-    return stream.guessed_rate or stream.average_rate or Fraction(25)
-
-
-def _length(container: Any, stream: Any) -> Fraction:
-    """Seconds; 0 where that is not said."""
-    if stream.duration is not None and stream.time_base is not None:
-        duration: Fraction = stream.duration * stream.time_base
-        return duration
-    end, start = container.duration or 0, container.start_time or 0  # microseconds
-    if "matroska" in container.format.name and start < end:  # others say how long it is
-        end -= start
-    return Fraction(end, 1_000_000)
-
-
-# -- planes
+# -- warping
 #
-# A video is stored in planes of brightness and colour, the latter often of half the resolution. Each goes through a
-# warp of its own, so nothing is converted: it is half the work of RGB, and the colours that do not move stay exactly
-# as they are.
-
-_PLANAR = re.compile(r"(yuv[aj]?4\d\dp|gray|gbra?p)(9|10|12|14|16)?(le)?|nv12|nv16|nv24")
-
-
-def _plane(frame: Any, index: int) -> np.ndarray[Any, Any]:
-    """(H, W, C), the memory of a plane of a frame."""
-    own = [component for component in frame.format.components if component.plane == index]
-    plane, height, width = frame.planes[index], own[0].height, own[0].width
-    values = np.frombuffer(plane, np.uint8 if own[0].bits <= 8 else np.uint16)
-    row = plane.line_size // values.itemsize
-    return values[: height * row].reshape(height, row)[:, : width * len(own)].reshape(height, width, len(own))
-
-
-def _black(frame: Any, index: int) -> int:
-    """The value of what shows nothing."""
-    first = next(component for component in frame.format.components if component.plane == index)
-    is_yuv = frame.format.name.startswith(("yuv", "nv"))
-    # PyAV's is_chroma is False for chroma of the full resolution
-    if is_yuv and first.index in (1, 2):
-        return int(1 << (first.bits - 1))
-    return 0 if _is_full(frame) or first.is_alpha or not is_yuv else int(16 << (first.bits - 8))
-
-
-def _is_full(frame: Any) -> bool:
-    """Whether its values go from 0 to the greatest, as those of images do."""
-    return bool(frame.color_range == 2 or frame.format.name.startswith("yuvj"))
-
-
-def _camera_of_plane(camera: Camera, size: tuple[int, int], left: bool) -> Camera:
-    """The camera of a plane of a (height, width), that of its image's or half of it, rounded up.
-
-    `left` says whether planes of half the width have their pixels where the left ones of the image's pairs are, as in
-    MPEG-2 and what came after, rather than between.
-    """
-    height, width = size
-    down, across = -(-camera.height // height), -(-camera.width // width)
-    if (down, across) == (1, 1):
-        return camera
-    bottom, right = down * height - camera.height, across * width - camera.width
-    camera = camera.pad(0, right, 0, bottom).resize(height, width)
-    shift = camera.intrinsics.new_tensor([0.0, 0.0, 0.25 if left and across == 2 else 0.0, 0.0])
-    return camera.replace(intrinsics=camera.intrinsics.detach() + shift)
-
-
-class _Frames:
-    """Warps frames of one size.
-
-    Args:
-        warp: of images.
-        frame: as all are.
-    """
-
-    def __init__(self, warp: Warp, frame: Any):
-        self.size, self._format = (warp.target.height, warp.target.width), frame.format.name
-        left, new, self._warps = not self._format.startswith("yuvj"), self._new(), list[Warp]()
-        for index in range(len(frame.planes)):
-            sizes = (_plane(one, index).shape[:2] for one in (frame, new))
-            before, after = (
-                _camera_of_plane(camera, (height, width), left)
-                for camera, (height, width) in zip((warp.source, warp.target), sizes, strict=True)
-            )
-            fill = float(_black(frame, index))
-            of_plane = Warp(before, after, warp.rotation, fill=fill, tolerance=warp.tolerance)
-            self._warps.append(of_plane.requires_grad_(False))
-
-    def _new(self) -> Any:
-        return _av().VideoFrame(self.size[1], self.size[0], self._format)
-
-    def __call__(self, frame: Any) -> Any:
-        """The new frame, at the same time."""
-        new = self._new()
-        for index, warp in enumerate(self._warps):
-            values = torch.from_numpy(_plane(frame, index)).permute(2, 0, 1)[None]
-            with torch.no_grad():
-                _plane(new, index)[:] = warp(values)[0].permute(1, 2, 0).numpy()
-        _copy(frame, new, "pts", "time_base", "duration", *_COLOURS)
-        return new
-
+# Frames are warped in YUV 4:2:0 of eight bits, in which nearly all are stored: a plane of brightness, and two of
+# colours of half the resolution. Each goes through a warp of its own, which is half the work of RGB.
 
 _COLOURS = ("color_range", "colorspace", "color_primaries", "color_trc")
 """What the colours of a frame mean."""
 
 
-def _copy(one: Any, other: Any, *names: str) -> None:
-    for name in names:
-        setattr(other, name, getattr(one, name))
+def _planes(frame: Any) -> Iterator[np.ndarray[Any, Any]]:
+    """(H, W) of each, the memory of the frame."""
+    for plane in frame.planes:
+        yield np.frombuffer(plane, np.uint8).reshape(-1, plane.line_size)[: plane.height, : plane.width]
+
+
+def _halved(camera: Camera) -> Camera:
+    """The camera of the colours, whose pixels are where the left ones of the image's pairs are, as in MPEG-2."""
+    height, width = (camera.height + 1) // 2, (camera.width + 1) // 2
+    camera = camera.pad(0, 2 * width - camera.width, 0, 2 * height - camera.height).resize(height, width)
+    shift = camera.intrinsics.new_tensor([0.0, 0.0, 0.25, 0.0])
+    return camera.replace(intrinsics=camera.intrinsics.detach() + shift)
+
+
+class _Frames:
+    """Warps frames of one size; `first` is as all are."""
+
+    def __init__(self, warp: Warp, first: Any):
+        self.first, self.height, self.width = first.reformat(format="yuv420p"), warp.target.height, warp.target.width
+        cases = (
+            (warp.source, warp.target, 0 if self.first.color_range == 2 else 16),
+            (_halved(warp.source), _halved(warp.target), 128),
+        )
+        whole, half = (
+            Warp(source, target, warp.rotation, fill=float(black), tolerance=warp.tolerance).requires_grad_(False)
+            for source, target, black in cases
+        )
+        self._warps = whole, half, half
+
+    @torch.no_grad()
+    def __call__(self, frame: Any) -> Any:
+        """The new frame, at the same time."""
+        frame = frame.reformat(format="yuv420p")
+        new = require().VideoFrame(self.width, self.height, "yuv420p")
+        for warp, old, made in zip(self._warps, _planes(frame), _planes(new), strict=True):
+            made[:] = warp(torch.from_numpy(old)[None, None])[0, 0].numpy()
+        for name in ("pts", "time_base", "duration", *_COLOURS):
+            setattr(new, name, getattr(frame, name))
+        return new
 
 
 # -- from file to file
+
+
+@dataclass(frozen=True)
+class Encoder:
+    """What videos are written with."""
+
+    codec: str | None = None
+    """Of CODECS; by default what suits the format."""
+    crf: int | None = None
+    """Its quality; by default one at which hardly anything is lost."""
 
 
 def remake(
@@ -291,19 +221,19 @@ def remake(
     target: Path,
     warp_of: Callable[[tuple[int, int]], tuple[Warp, dict[str, Any]]],
     encoder: Encoder,
-    listener: Listener,
+    done: Callable[[], object] = lambda: None,
 ) -> dict[str, Any]:
     """Write a video whose frames are those of another one through a warp.
 
-    Time stamps, sound, subtitles, titles, the rotation with which it is shown, and what colours mean are
-    those of the source. Pixels are square then. What the format of the target cannot hold is an error.
+    Time stamps, sound, subtitles, the rotation with which it is shown, and what colours mean are those of the source.
+    Pixels are square then, and of eight bits in 4:2:0.
 
     Args:
         source: a video.
         target: a new one, whose suffix says the format. It is written whole or not at all; folders that lack are made.
         warp_of: the warp for frames of a (height, width), and what is to be known of it.
         encoder: of the new video.
-        listener: is told how many frames are done.
+        done: is called after each frame.
 
     Returns:
         What is to be known of the warp, and "frames", how many there are.
@@ -311,185 +241,80 @@ def remake(
     Raises:
         VideoFileError: what is not a video, ends too early, changes its size, or cannot be written so.
     """
-    av = _av()
     with _opened(source) as (container, stream):
         first, _ = next(_decoded(container, stream), (None, None))
-        if first is None:
-            raise VideoFileError(f"{source}: no frame of it can be read")
+    if first is None:
+        raise VideoFileError(f"{source}: no frame of it can be read")
     warp, facts = warp_of((first.height, first.width))
+    warped, format, count, end = _Frames(warp, first), WRITTEN[target.suffix.lower()], 0, 0.0
     target.parent.mkdir(parents=True, exist_ok=True)
-    with replacing(target) as (file,), _opened(source) as (container, stream):
+    with contextlib.ExitStack() as stack:
+        (file,) = stack.enter_context(replacing(target))
+        container, stream = stack.enter_context(_opened(source))
         # exact: no random identifiers
-        output = av.open(file, "w", format=FORMATS[target.suffix.lower()], options={"fflags": "+bitexact"})
-        try:
-            new = _Remake(source, target, container, stream, output, encoder, first, listener)
-            count = new.run(_Frames(warp, new.first))
-        except BaseException:
-            with contextlib.suppress(av.error.FFmpegError):
-                output.close()
-            raise
-        output.close()
+        output = stack.enter_context(require().open(file, "w", format=format, options={"fflags": "+bitexact"}))
+        new = _new_stream(output, warped, first, _rate(stream), encoder, target)
+        others = [other for other in container.streams if other.type in ("audio", "subtitle")]
+        copies = {other.index: _copied_stream(output, other, source, target) for other in others}
+        begin, length = _span(container)
+        # the encoder works in a thread of its own, the decoder in those of ffmpeg
+        writer, waiting = stack.enter_context(ThreadPoolExecutor(1)), deque[Future[None]]()
+
+        def write(frame: Any) -> None:
+            output.mux(new.encode(frame))
+
+        for frame, packet in _decoded(container, stream, *others):
+            if packet is not None:
+                end = max(end, float((packet.pts or packet.dts) * packet.time_base) - begin)
+                packet.stream = copies[packet.stream.index]
+                waiting.append(writer.submit(output.mux, packet))
+                continue
+            if (frame.height, frame.width) != (first.height, first.width):
+                was, now = f"{first.width}x{first.height}", f"{frame.width}x{frame.height}"
+                raise VideoFileError(f"{source}: its frames are {was}, then {now}")
+            end = max(end, float(frame.pts * frame.time_base + 1 / _rate(stream)) - begin)
+            waiting.append(writer.submit(write, warped(frame)))
+            while len(waiting) > _AHEAD:
+                waiting.popleft().result()
+            count += 1
+            done()
+        waiting.append(writer.submit(write, None))
+        for future in waiting:
+            future.result()
+        if length - end > max(_CUT, 0.02 * length):
+            raise VideoFileError(f"{source}: ends after {end:.1f} of {length:.1f} seconds; it is cut off or damaged")
     return facts | {"frames": count}
 
 
-@dataclass
-class _Remake:
-    """A video on its way from file to file."""
-
-    source: Path
-    target: Path
-    container: Any
-    stream: Any
-    output: Any
-    encoder: Encoder
-    first: Any
-    """Frame."""
-    listener: Listener
-    _first_stamp: int | None = None
-    _stamp: int | None = None
-    """Of the last frame."""
-
-    def __post_init__(self) -> None:
-        streams, first, format = self.container.streams, self.first, self.output.format.name
-        self.codec = self.encoder.codec or ("libvpx-vp9" if format == "webm" else "libx264")
-        self.others = [other for other in streams if other.type in ("audio", "subtitle")]
-        self.rate, self.size = _rate(self.stream), (first.height, first.width)
-        self.pixels = _pixels(first.format.name, self.codec)
-        if first.interlaced_frame:
-            self.listener.note(f"{self.source}: is interlaced; two moments get mixed within its frames")
-        if lost := sorted({one.type for one in streams if one not in (self.stream, *self.others)}):
-            self.listener.note(f"{self.source}: its other streams, {', '.join(lost)}, are left out")
-        # formats and encoders that know no time stamps but multiples of one step
-        whole = format == "avi" or self.codec == "mpeg4"
-        self.tick = 1 / self.rate if whole else first.time_base or 1 / self.rate
-        self.first = _converted(first, self.pixels)
-
-    def run(self, frames: _Frames) -> int:
-        """How many frames were written."""
-        stream, copies = self._new_stream(frames.size), self._copied_streams()
-        self.stream.thread_type = "AUTO"
-        begin = float((self.container.start_time or 0) / 1e6)
-        count, end, last, shown = 0, 0.0, 0.0, time.monotonic()
-        # the encoder works in a thread of its own, the decoder in those of ffmpeg
-        with ThreadPoolExecutor(1) as writer:
-            at_work: deque[Future[None]] = deque()
-            for frame, packet in _decoded(self.container, self.stream, *self.others):
-                if packet is not None:
-                    last = max(last, float((packet.pts or packet.dts) * packet.time_base) - begin)
-                    packet.stream = copies[packet.stream.index]
-                    at_work.append(writer.submit(self.output.mux, packet))
-                else:
-                    if self.size != (frame.height, frame.width):
-                        was, now = f"{self.size[1]}x{self.size[0]}", f"{frame.width}x{frame.height}"
-                        raise VideoFileError(f"{self.source}: its frames are {was}, then {now}")
-                    self._date(frame)
-                    end = float(frame.pts * frame.time_base + 1 / self.rate) - begin
-                    count += 1
-                    at_work.append(writer.submit(self._encode, stream, frames(_converted(frame, self.pixels))))
-                if len(at_work) > _AHEAD:
-                    at_work.popleft().result()
-                if time.monotonic() > shown + _OFTEN:
-                    shown = time.monotonic()
-                    self.listener.done(count)
-            at_work.append(writer.submit(self._encode, stream, None))
-            for future in at_work:
-                future.result()
-        length = float(_length(self.container, self.stream))
-        end = end if self.stream.duration is not None else max(end, last)
-        if length - end > max(_CUT, 0.02 * length):
-            raise VideoFileError(
-                f"{self.source}: ends after {end:.1f} of {length:.1f} seconds; it is cut off or damaged"
-            )
-        return count
-
-    def _date(self, frame: Any) -> None:
-        """Have a frame's time stamp, where there is none, or a wrong one, follow the last one's."""
-        frame.time_base = frame.time_base or 1 / self.rate
-        stamp = frame.pts
-        if self.container.format.name == "avi":  # whose stamps are those of the order in which frames are stored
-            self._first_stamp = frame.dts if self._first_stamp is None else self._first_stamp
-            stamp = None if frame.dts is None or self._first_stamp is None else frame.dts - self._first_stamp
-        if stamp is None:
-            stamp = 0 if self._stamp is None else self._stamp + round(1 / self.rate / frame.time_base)
-        frame.pts = self._stamp = stamp if self._stamp is None else max(stamp, self._stamp + 1)
-
-    def _encode(self, stream: Any, frame: Any) -> None:
-        """Write a frame; None in the end."""
-        if frame is not None and frame.time_base != self.tick:
-            frame.pts, frame.time_base = round(frame.pts * frame.time_base / self.tick), self.tick
-            frame.duration = 1
-        self.output.mux(stream.encode(frame))
-
-    def _new_stream(self, size: tuple[int, int]) -> Any:
-        """Of frames of a (height, width) that are as the first one, but for that."""
-        frame, format, (height, width) = self.first, self.output.format.name, size
-        try:
-            stream = self.output.add_stream(self.codec, rate=self.rate, time_base=self.tick)
-        except ValueError as error:
-            raise VideoFileError(f"{self.target}: {error}; --codec names another encoder") from None
-        halved = {(c.width < frame.width, c.height < frame.height) for c in frame.format.components if c.is_chroma}
-        if self.codec in _EVEN and any((across and width % 2) or (down and height % 2) for across, down in halved):
-            raise VideoFileError(
-                f"{self.target}: {width}x{height}, but {self.codec} wants even numbers; --size names them"
-            )
-        stream.width, stream.height, stream.pix_fmt = width, height, frame.format.name
-        context = stream.codec_context
-        _copy(frame, context, *_COLOURS)
-        context.thread_count = _THREADS
-        if _has_crf(self.codec):
-            crf = _QUALITIES.get(self.codec, 20) if self.encoder.crf is None else self.encoder.crf
-            stream.options = {"crf": str(crf), **_OPTIONS.get(self.codec, {})}
-        elif self.codec in _BY_QUANTISER:
-            context.qscale, context.global_quality = True, _QUANTISER * _LAMBDA
-        if format == "avi":
-            stream.options |= {"bf": "0"}  # its frames come in the order in which they are shown
-        matrix = frame.side_data.get("DISPLAYMATRIX")
-        if matrix is not None:
-            stream.set_display_matrix(np.frombuffer(matrix, np.int32).tolist())
-            if format not in ("mp4", "mov", "matroska"):
-                self.listener.note(f"{self.source}: is shown turned, which {self.target.suffix} files do not say")
-        stream.metadata.update(_kept(self.stream.metadata))
-        self.output.metadata.update(_kept(self.container.metadata))
-        return stream
-
-    def _copied_streams(self) -> dict[int, Any]:
-        """The new streams of sound and subtitles, by the indices of the old ones."""
-        copies = {}
-        for other in self.others:
-            try:
-                copies[other.index] = copy = self.output.add_stream_from_template(other)
-            except ValueError:
-                raise VideoFileError(
-                    f"{self.source}: its {other.type}, {other.codec_context.name}, cannot be kept in "
-                    f"{self.target.suffix}; .mkv takes nearly all"
-                ) from None
-            copy.metadata.update(_kept(other.metadata))
-            copy.disposition = other.disposition
-        return copies
+def _new_stream(output: Any, warped: _Frames, first: Any, rate: Fraction, encoder: Encoder, target: Path) -> Any:
+    codec = encoder.codec or ("libvpx-vp9" if output.format.name == "webm" else "libx264")
+    if codec == "libx264" and (warped.width % 2 or warped.height % 2):
+        size = f"{warped.width}x{warped.height}"
+        raise VideoFileError(f"{target}: {size}, but {codec} wants even numbers; --size names them")
+    try:
+        stream = output.add_stream(codec, rate=rate, time_base=first.time_base)
+    except ValueError as error:
+        raise VideoFileError(f"{target}: {error}; --codec names another encoder") from None
+    stream.width, stream.height, stream.pix_fmt = warped.width, warped.height, "yuv420p"
+    for name in _COLOURS:
+        setattr(stream.codec_context, name, getattr(warped.first, name))
+    stream.codec_context.thread_count = _THREADS
+    stream.options = CODECS[codec] | ({} if encoder.crf is None else {"crf": str(encoder.crf)})
+    matrix = first.side_data.get("DISPLAYMATRIX")
+    if matrix is not None:
+        stream.set_display_matrix(np.frombuffer(matrix, np.int32).tolist())
+    return stream
 
 
-def _pixels(format: str, codec: str) -> str:
-    """The format of pixels to work in: that of the video, if that can be done and written."""
-    known = [one.name for one in _av().Codec(codec, "w").video_formats or ()]
-    if _PLANAR.fullmatch(format) and (format in known or not known):
-        return format
-    return "yuv420p" if "yuv420p" in known or not known else next(filter(_PLANAR.fullmatch, known), known[0])
-
-
-def _converted(frame: Any, format: str) -> Any:
-    if frame.format.name.startswith("gray") and not frame.color_range:
-        frame.color_range = 2  # as ffmpeg takes it, but not what reads it as brightness without colours
-    if frame.format.name == format:
-        return frame
-    # of RGB nothing else is known, and this is what players take for granted; all else keeps its range
-    is_full = _is_full(frame) and not frame.format.is_rgb
-    options = {"dst_colorspace": "ITU709"} if frame.format.is_rgb else {}
-    new = frame.reformat(format=format, dst_color_range="JPEG" if is_full else "MPEG", **options)
-    new.colorspace, new.color_range = 1 if frame.format.is_rgb else frame.colorspace, 2 if is_full else 1
-    return new
-
-
-def _kept(metadata: dict[str, str]) -> dict[str, str]:
-    """What the new file does not say of itself."""
-    own = ("brand", "minor_version", "encoder", "DURATION", "BPS", "NUMBER_OF", "_STATISTICS")
-    return {name: text for name, text in metadata.items() if not any(word in name for word in own)}
+def _copied_stream(output: Any, other: Any, source: Path, target: Path) -> Any:
+    """That of sound or subtitles in the new file."""
+    try:
+        copy = output.add_stream_from_template(other)
+    except ValueError:
+        raise VideoFileError(
+            f"{source}: its {other.type}, {other.codec_context.name}, cannot be kept in {target.suffix}; .mkv takes "
+            "nearly all"
+        ) from None
+    if "language" in other.metadata:
+        copy.metadata["language"] = other.metadata["language"]
+    return copy

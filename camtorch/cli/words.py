@@ -48,10 +48,9 @@ def _counts(text: str, separator: str) -> tuple[int, ...]:
 
 def size(text: str) -> tuple[int, int]:
     """(height, width) of "WIDTHxHEIGHT"."""
-    if not (sides := _counts(text, "x")):
-        raise _WrongWord(f"{text!r} is not WIDTHxHEIGHT, as in 1280x720")
-    if not all(0 < side <= LARGEST_SIDE for side in sides):
-        raise _WrongWord(f"{text!r}: each side must be 1 to {LARGEST_SIDE} pixels")
+    sides = _counts(text, "x")
+    if not sides or not all(0 < side <= LARGEST_SIDE for side in sides):
+        raise _WrongWord(f"{text!r} is not WIDTHxHEIGHT, as in 1280x720, each of 1 to {LARGEST_SIDE} pixels")
     return sides[1], sides[0]
 
 
@@ -85,12 +84,10 @@ def count(most: int) -> Callable[[str], int]:
 def span(text: str) -> float | tuple[float, float]:
     """A number, or two."""
     try:
-        numbers = tuple(map(float, text.split(",")))
+        low, high = map(float, text.split(",")) if "," in text else (float(text), None)
     except ValueError:
-        numbers = ()
-    if len(numbers) not in (1, 2):
-        raise _WrongWord(f"{text!r} is neither a number nor LOW,HIGH, as in -5,20")
-    return (numbers[0], numbers[1]) if len(numbers) == 2 else numbers[0]
+        raise _WrongWord(f"{text!r} is neither a number nor LOW,HIGH, as in -5,20") from None
+    return low if high is None else (low, high)
 
 
 def fov(text: str) -> float | tuple[float, float] | str:
@@ -104,9 +101,7 @@ def guess(text: str) -> Path:
         degrees = float(text)
     except ValueError:
         degrees = math.nan
-    if 0 < degrees <= 2 * math.pi:
-        raise _WrongWord(f"{text} seems to be radians: {math.degrees(degrees):.4g} degrees; it takes degrees")
-    if not 0 < degrees <= 360:
+    if not 2 * math.pi < degrees <= 360:
         raise _WrongWord(f"{text!r} is no field of view in degrees, as 120")
     return Path(GUESS + text)
 
@@ -118,10 +113,8 @@ def length(text: str) -> float:
         metres = float(text.removesuffix(unit)) * _UNITS.get(unit, 1.0)
     except ValueError:
         metres = math.nan
-    if not 0 < metres < math.inf:
-        raise _WrongWord(f"{text!r} is no length above 0, as 30mm, 3cm, 1in or, in metres, 0.03")
-    if not unit and metres >= 1:
-        raise _WrongWord(f"{text!r} would be metres: {text}mm, or {text}m if it is that large")
+    if not 0 < metres < (math.inf if unit else 1.0):
+        raise _WrongWord(f"{text!r} is no length above 0, as 30mm, 3cm, 1in or, in metres and below 1, 0.03")
     return metres
 
 
@@ -130,9 +123,8 @@ def paper(text: str) -> str | tuple[float, float]:
     name = text.lower()
     if name in (*PAPERS, "board"):
         return name
-    unit = next((unit for unit in _UNITS if name.endswith(unit)), "mm")
-    sides = name.removesuffix(unit).split("x")
+    sides = name.removesuffix("mm").split("x")
     if len(sides) != 2:
         raise _WrongWord(f"{text!r} is no paper: {', '.join(PAPERS)}, board, or WIDTHxHEIGHT, as in 400x300mm")
-    width, height = (1000 * length(f"{side}{unit}") for side in sides)
+    width, height = (1000 * length(f"{side}mm") for side in sides)
     return width, height

@@ -1,5 +1,1 @@
-"""Many files at once: what to read, by which processes, what is done already, and what went wrong.
-
-`inputs.find` says which files are meant, `items` what is made of each; `run.run` has it made, and a `Manifest` keeps
-account.
-"""
+"""Many files at once: which are meant (`inputs`), what is made of each (`items`), and having it made (`run`)."""

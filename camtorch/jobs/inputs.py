@@ -6,22 +6,12 @@ import glob
 import hashlib
 import os
 import re
-from collections.abc import Callable, Collection, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Iterator, Sequence
 from itertools import takewhile
 from pathlib import Path
 
 IMAGES = frozenset({".bmp", ".jpeg", ".jpg", ".pgm", ".png", ".ppm", ".tif", ".tiff", ".webp"})
-"""Suffixes, in lower case, of what is taken of a folder."""
-
-
-@dataclass(frozen=True)
-class Found:
-    """A file to be read."""
-
-    path: Path
-    place: Path
-    """Relative to the folder of outputs."""
+"""Suffixes, in lower case, of what is taken of a folder, and of what is written."""
 
 
 def natural(path: Path) -> list[tuple[int, int, str]]:
@@ -30,67 +20,61 @@ def natural(path: Path) -> list[tuple[int, int, str]]:
     return [(0, int(part), "") if part.isdecimal() else (1, 0, part.lower()) for part in parts]
 
 
-def find(words: Sequence[str], suffixes: Collection[str], output: Path) -> tuple[list[Found], list[tuple[Path, str]]]:
-    """Files, each once, in natural order.
+def find(words: Sequence[str], suffixes: Collection[str], output: Path) -> list[tuple[Path, Path]]:
+    """Files, each once, in natural order, and their places relative to the folder of outputs.
 
-    Words are files, whatever their suffix; patterns, as a quoted 'in/**/*.jpg'; and folders, with all folders in them.
-    What begins with a dot is left out, and what is in the folder of outputs, where that lies within a folder that is
-    read. Links are followed.
-
-    Returns:
-        Files with their places: below a folder that is read, or the folder before the first wildcard of a pattern, the
-        tree is kept; of several words folders keep their names as well. And folders that could not be looked into, and
-        why.
+    Words are files, whatever their suffix; patterns, as a quoted 'in/**/*.jpg'; and folders, with all folders in them,
+    of which the tree is kept; of several words folders keep their names as well. What begins with a dot is left out,
+    and what is in the folder of outputs, where that lies within a folder that is read. Links are followed.
 
     Raises:
-        ValueError: a word that means no file.
+        ValueError: a word that means no file. OSError: a folder that cannot be looked into.
     """
-    files: list[Found] = []
-    faults: list[tuple[Path, str]] = []
+    files: dict[str, tuple[Path, Path]] = {}
+    out = os.path.realpath(output)
     for word in words:
         path, place = Path(word), Path()
+        if os.path.lexists(path) and not path.is_dir():
+            files[os.path.realpath(path)] = path, Path(path.name)
+            continue
         if path.is_dir():
             root, place = path, Path(path.resolve().name) if len(words) > 1 else place
-            paths = list(_below(path, output, lambda e: faults.append((Path(e.filename), e.strerror or ""))))
-        elif os.path.lexists(path):
-            files.append(Found(path, Path(path.name)))
-            continue
+            paths = _below(path)
         elif glob.has_magic(word):
             root = Path(*takewhile(lambda part: not glob.has_magic(part), path.parts))
-            paths = _matching(word, root, output)
+            # links in a circle make paths of any length to the same file
+            paths = iter(sorted(map(Path, glob.iglob(word, recursive=True)), key=lambda one: -len(one.parts)))
         else:
             raise ValueError(f"{path}: no such file or folder")
+        apart = _is_below(os.path.realpath(root), out)
         # a link to nothing is taken, so that it is told of; what is neither a file nor that, as a pipe, is not
-        found = [p for p in paths if p.suffix.lower() in suffixes and (p.is_file() or not os.path.exists(p))]
-        if not found and root is not path:
-            raise ValueError(f"{word}: no file of a known type has such a name")
-        files += [Found(path, place / path.relative_to(root)) for path in found]
-    once = {os.path.abspath(found.path): found for found in files}
-    files = sorted(once.values(), key=lambda found: natural(found.path))
-    if not files and not faults:
-        raise ValueError(f"{', '.join(words)}: nothing in there ends in {', '.join(sorted(suffixes))}")
-    return files, faults
+        found = {
+            os.path.realpath(one): (one, place / one.relative_to(root))
+            for one in paths
+            if one.suffix.lower() in suffixes
+            and (one.is_file() or not os.path.exists(one))
+            and (apart or not _is_below(os.path.realpath(one), out))
+        }
+        if not found:
+            raise ValueError(f"{word}: no file in there ends in {', '.join(sorted(suffixes))}")
+        files |= found
+    return sorted(files.values(), key=lambda found: natural(found[0]))
 
 
-def _below(root: Path, output: Path, failed: Callable[[OSError], object]) -> Iterator[Path]:
+def _below(root: Path) -> Iterator[Path]:
     """What is in a folder, and in those in it; a link to a folder that it lies in shows nothing new."""
-    out = os.path.realpath(output)
-    for name, folders, names in os.walk(root, followlinks=True, onerror=failed):
+
+    def refuse(error: OSError) -> None:
+        raise error
+
+    for name, folders, names in os.walk(root, followlinks=True, onerror=refuse):
         real = os.path.realpath(name)
-        targets = {one: os.path.realpath(os.path.join(name, one)) for one in folders if not one.startswith(".")}
-        folders[:] = [one for one, target in targets.items() if target != out and not _is_below(real, target)]
+        folders[:] = [
+            one
+            for one in folders
+            if not one.startswith(".") and not _is_below(real, os.path.realpath(os.path.join(name, one)))
+        ]
         yield from (Path(name, one) for one in names if not one.startswith("."))
-
-
-def _matching(pattern: str, root: Path, output: Path) -> list[Path]:
-    out = os.path.realpath(output)
-    inside = not _is_below(os.path.realpath(root), out)
-    shortest: dict[str, Path] = {}  # links in a circle make paths of any length
-    for path in sorted(map(Path, glob.glob(pattern, recursive=True)), key=lambda path: len(path.parts)):
-        real = os.path.realpath(path)
-        if not (inside and _is_below(real, out)):
-            shortest.setdefault(real, path)
-    return list(shortest.values())
 
 
 def _is_below(path: str, folder: str) -> bool:

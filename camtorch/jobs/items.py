@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import warnings
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,30 +22,16 @@ class Item:
     outputs: tuple[Path, ...]
     """All that is written, of no other item."""
     variant: str = ""
-    """What the outputs depend on beside what is in the inputs and the settings of the job: a seed, for example."""
-    size: int = 1
-    """How much work it is: the frames of a video."""
+    """What the outputs depend on beside what is in the inputs and the settings of the job: labels, for example."""
 
     @property
     def name(self) -> str:
         return str(self.inputs[0])
 
 
-@dataclass(frozen=True)
-class Listener:
-    """Who hears of the work on an item while it goes on."""
-
-    note: Callable[[str], None]
-    """Of what the user should know; where it begins with the item's name, that is left out."""
-    done: Callable[[int], object]
-    """Of how much of `Item.size` is done."""
-
-
-Work: TypeAlias = Callable[[Item, Listener], Json]
-"""Makes all outputs of an item, each whole or not at all, and returns what the manifest is to keep of it.
-
-It is pickled, once for each process. Whatever it raises is why the item failed; of a ValueError or OSError the text is
-shown as it is.
+Work: TypeAlias = Callable[[Item], Json]
+"""Makes all outputs of an item, each whole or not at all, and returns what the account is to keep of it. It is pickled,
+once for each process. Whatever it raises is why the item failed, and its warnings are notes about the item.
 """
 
 
@@ -77,32 +62,20 @@ class Shard:
     def of_environment(cls) -> Shard:
         """That of a process which torchrun or srun started, by what they set; else all items.
 
-        RANK and WORLD_SIZE may be left over in a shell: without torchrun's own mark they only give a warning.
+        RANK alone, which may be left over in a shell, means nothing; nor does a script that sbatch runs without srun.
 
         Raises:
             ValueError: what they set is missing, or no numbers that fit.
         """
-        known = os.environ
-        for mark, rank, count, local in (
+        for mark, *names in (
             ("TORCHELASTIC_RUN_ID", "RANK", "WORLD_SIZE", "LOCAL_WORLD_SIZE"),
-            # a script that sbatch runs has no step: SLURM_NTASKS is what was asked for, and nobody else works
             ("SLURM_STEP_ID", "SLURM_PROCID", "SLURM_NTASKS", "SLURM_NTASKS_PER_NODE"),
         ):
-            if known.get(mark, ""):
-                values = [known.get(name, "") for name in (rank, count)]
-                if not all(value.isascii() and value.isdigit() for value in values) or int(values[0]) >= int(values[1]):
-                    raise ValueError(
-                        f"{rank}={values[0]!r} and {count}={values[1]!r} do not say which shard of how many"
-                    )
-                here = known.get(local, "")
-                return cls(int(values[0]), int(values[1]), max(1, int(here)) if here.isdigit() else 1)
-        rank, count = known.get("RANK", ""), known.get("WORLD_SIZE", "")
-        if rank not in ("", "0") or count not in ("", "1"):
-            warnings.warn(
-                f"RANK={rank} WORLD_SIZE={count} is set, but not by torchrun or srun, and was not heeded: "
-                "all files were asked for; --shard 1/4 makes the first of four parts",
-                stacklevel=2,
-            )
+            if os.environ.get(mark, ""):
+                rank, count, local = (os.environ.get(name, "") for name in names)
+                if not (rank.isdecimal() and count.isdecimal() and int(rank) < int(count)):
+                    raise ValueError(f"{names[0]}={rank!r} and {names[1]}={count!r} do not say which shard of how many")
+                return cls(int(rank), int(count), max(1, int(local)) if local.isdecimal() else 1)
         return cls()
 
     def of(self, items: Sequence[T]) -> Sequence[T]:

@@ -11,8 +11,7 @@ from scenes import cabin, portrait
 
 import camtorch as ct
 from camtorch._drawing import INK, PAPER, Marks, font, shown
-from camtorch.cli.labels import Labels
-from camtorch.cli.sheet import LabelledImage, arrows
+from camtorch.cli.sheet import mark
 from drawings.pages import IMAGES, code, sections
 from drawings.sheets import GAP, TILE, WIDTH, pair, put
 
@@ -49,17 +48,7 @@ def marked(of: dict[str, Any], scale: float) -> Image.Image:
     rim = Image.composite(Image.new("L", mask.size), mask.filter(ImageFilter.MaxFilter(5)), mask)
     tile.paste(VIOLET, (0, 0), rim.filter(ImageFilter.SMOOTH))
     marks = Marks(width, height, scale)
-    yes = torch.ones(99, dtype=torch.bool)
-    boxes_valid = of.get("boxes_valid", yes[: len(of["boxes"])])
-    keypoints_valid = of.get("keypoints_valid", yes[: len(of["keypoints"])])
-    for box in of["boxes"][boxes_valid]:
-        marks.box(box, 1.1)
-    labels = Labels(of["keypoints"], of["boxes"], of["points"], of["gaze"])
-    image = LabelledImage(of["image"], of["camera"], labels, [], keypoints_valid, boxes_valid)
-    for start, end in arrows(image):
-        marks.arrow(start, end, 1.0)
-    for pixel in of["keypoints"][keypoints_valid]:
-        marks.point(pixel, 1.0)
+    mark(marks, of, 1.0)
     marks.over(tile)
     return tile
 

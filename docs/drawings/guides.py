@@ -17,10 +17,9 @@ from scenes.portrait import driver
 
 import camtorch as ct
 from camtorch._drawing import INK, PAPER, shown
+from camtorch.augment.sample import Sample
 from camtorch.boards.boards import Chessboard
 from camtorch.cli import sheet
-from camtorch.cli.labels import Labels
-from camtorch.cli.sheet import LabelledImage
 from camtorch.rotations import mount_rotation
 from drawings.pages import EXAMPLES, IMAGES
 from drawings.sheets import drawn, in_rows, tiles
@@ -29,32 +28,40 @@ SEED = 4
 PAGE = [value / 255 for value in PAPER]  # as matplotlib has colours
 
 
-def rendered(lens: ct.Camera | None = None) -> LabelledImage:
+def rendered(lens: ct.Camera | None = None) -> Sample:
     """A driver with labels, behind a lens."""
     found = driver(lens)
-    labels = Labels(found.keypoints, found.boxes, found.eyes, found.gaze)
-    return sheet.photograph(found.image, found.camera, labels, "a rendered driver")
+    labels = {"keypoints": found.keypoints, "boxes": found.boxes, "points": found.eyes, "gaze": found.gaze}
+    valid = {"keypoints_valid": found.camera.contains(found.keypoints)}
+    return {"image": found.image, "camera": found.camera, **labels, **valid}
 
 
-def moved(before: LabelledImage, warp: ct.Warp) -> LabelledImage:
+def moved(before: Sample, warp: ct.Warp) -> Sample:
     """An image with its labels, warped."""
-    labels = before.labels
-    keypoints, keypoints_valid = warp.transform_points(labels.keypoints)
-    boxes, boxes_valid = warp.transform_boxes(labels.boxes)
-    new = Labels(keypoints, boxes, warp.transform_rays(labels.eyes), warp.transform_rays(labels.gaze))
-    return LabelledImage(warp(before.image[None])[0], warp.target, new, [], keypoints_valid, boxes_valid)
+    keypoints, keypoints_valid = warp.transform_points(before["keypoints"])
+    boxes, boxes_valid = warp.transform_boxes(before["boxes"])
+    return {
+        "image": warp(before["image"][None])[0],
+        "camera": warp.target,
+        "keypoints": keypoints,
+        "keypoints_valid": keypoints_valid,
+        "boxes": boxes,
+        "boxes_valid": boxes_valid,
+        "points": warp.transform_rays(before["points"]),
+        "gaze": warp.transform_rays(before["gaze"]),
+    }
 
 
 def overview(columns: int = 4) -> Image.Image:
     """A fisheye image, dewarped, and as other cameras would have seen it."""
     lens = ct.KannalaBrandt.from_fov(170, image_size=(480, 640), distortion=[0.02, -0.01, 0.003, -0.001])
     fisheye = rendered(lens.double().requires_grad_(False))
-    straight = moved(fisheye, ct.Dewarp(fisheye.camera, fov=100, image_size=(480, 640)))
+    straight = moved(fisheye, ct.Dewarp(fisheye["camera"], fov=100, image_size=(480, 640)))
     mount = {"yaw": 12, "pitch": 8, "roll": 20}
     new = ct.augment.RandomCamera("dms90", **mount, fov="source", min_filled=0.98, image_size=(480, 640))
-    sample = {"keypoints": fisheye.labels.keypoints.expand(2, -1, -1), "camera": fisheye.camera}
+    sample = {"keypoints": fisheye["keypoints"].expand(2, -1, -1), "camera": fisheye["camera"]}
     sample = new(sample, draw=new.draw(2, torch.Generator().manual_seed(SEED)))
-    warps = [ct.Warp(fisheye.camera, c, r) for c, r in zip(sample["camera"], sample["rotation"], strict=True)]
+    warps = [ct.Warp(fisheye["camera"], c, r) for c, r in zip(sample["camera"], sample["rotation"], strict=True)]
     others = [moved(fisheye, warp) for warp in warps]
     panels = [
         (fisheye, "a fisheye of 170 degrees"),
@@ -64,7 +71,7 @@ def overview(columns: int = 4) -> Image.Image:
     return labelled(panels, columns)
 
 
-def labelled(panels: list[tuple[LabelledImage, str]], columns: int) -> Image.Image:
+def labelled(panels: list[tuple[Sample, str]], columns: int) -> Image.Image:
     """Images with their labels, small, and titles."""
     return in_rows([(sheet.marked(view, 300, 400), title) for view, title in panels], columns)
 
@@ -149,9 +156,12 @@ def fields() -> Image.Image:
 def augment() -> Image.Image:
     """What `camtorch augment` makes of a rendered driver."""
     before = rendered()
-    after = sheet.augmented(before, "dms130", 5, 0, min_filled=0.95, fov="source")
-    title, origin = "One image, five other cameras", sheet.origin("dms130", before)
-    page = sheet.drawing([before, *after], title, origin)
+    new = ct.augment.RandomCamera("dms130", image_size=(945, 1260), antialias=True, min_filled=0.95, fov="source")
+    generator, shown = torch.Generator().manual_seed(0), [(before, ["before"])]
+    for _ in range(5):
+        after = new(before, draw=new.draw(1, generator))
+        shown.append((after, [f"dms130, {float(after['camera'].fov[0]):.0f}° wide"]))
+    page = sheet.sheet(shown, "One image, five other cameras")
     page.thumbnail((960, 2000), Image.Resampling.LANCZOS)
     return page
 
@@ -175,12 +185,7 @@ def edits() -> Image.Image:
     panels = [(before, "an image with its labels")]
     for title, edit in named.items():
         torch.manual_seed(SEED)
-        labels = before.labels
-        given = {"keypoints": labels.keypoints, "boxes": labels.boxes, "points": labels.eyes, "gaze": labels.gaze}
-        out = edit(image=before.image, camera=before.camera, **given)
-        moved_labels = Labels(out["keypoints"], out["boxes"], out["points"], out["gaze"])
-        flags = out["keypoints_valid"], out["boxes_valid"]
-        panels.append((LabelledImage(out["image"], out["camera"], moved_labels, [], *flags), title))
+        panels.append((edit(before), title))
     return labelled(panels, 3)
 
 
@@ -188,8 +193,8 @@ def maps() -> Image.Image:
     """What meshes of a fisheye are off by: on the source, and over the target."""
     lens = ct.KannalaBrandt.from_fov(170, image_size=(480, 640), distortion=[0.02, -0.01, 0.003, -0.001])
     fisheye = rendered(lens.double().requires_grad_(False))
-    warp = ct.Dewarp(fisheye.camera, projection="cylindrical", fov=166, image_size=(480, 640))
-    images = [image[0].permute(1, 2, 0) for image in (fisheye.image[None], warp(fisheye.image[None]))]
+    warp = ct.Dewarp(fisheye["camera"], projection="cylindrical", fov=166, image_size=(480, 640))
+    images = [image[0].permute(1, 2, 0) for image in (fisheye["image"][None], warp(fisheye["image"][None]))]
     with tempfile.TemporaryDirectory() as folder:
         path = f"{folder}/map.bin"
         found = []

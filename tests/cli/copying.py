@@ -3,6 +3,7 @@
 import os
 import signal
 import time
+import warnings
 from dataclasses import dataclass
 
 from camtorch.io.writing import replacing
@@ -12,14 +13,14 @@ from camtorch.io.writing import replacing
 class Doubling:
     """What its inputs say, it does: "die", "fail", "wait", "note"."""
 
-    def __call__(self, item, listener):
+    def __call__(self, item):
         text = b"".join(path.read_bytes() for path in item.inputs)
         if text == b"die":
             os.kill(os.getpid(), signal.SIGKILL)
         if text == b"fail":
             raise ValueError(f"{item.inputs[0]}: it says so")
         if text == b"note":
-            listener.note(f"{item.inputs[0]} is a note")
+            warnings.warn(f"{item.inputs[0]} is a note", stacklevel=1)
         for path in item.outputs:
             path.parent.mkdir(parents=True, exist_ok=True)
             with replacing(path, synced=False) as (file,):
@@ -28,5 +29,4 @@ class Doubling:
                     (path.parent / "waiting").touch()
                     time.sleep(60)
                 file.write(text + item.variant.encode())
-        listener.done(item.size // 2)
         return {"size": 2 * len(text)}

@@ -1,13 +1,10 @@
 """Boards to print: to scale, and found where they are drawn."""
 
 import re
-import shutil
-import subprocess
 from itertools import product
 from pathlib import Path
 from xml.etree import ElementTree
 
-import cv2
 import numpy as np
 import pytest
 from cameras import slow_unless
@@ -80,16 +77,6 @@ def test_cross_references_of_a_pdf_are_right():
     length = int(re.search(rb"/Length (\d+)", content)[1])
     begin = content.index(b"stream\n") + 7
     assert content[begin + length :].startswith(b"\nendstream")
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(shutil.which("pdftoppm") is None, reason="poppler draws it")
-def test_poppler_draws_what_is_meant():
-    board("--type charuco --board 8x5 --square 30mm -o board.pdf")
-    subprocess.run(["pdftoppm", "-r", "127", "-gray", "-singlefile", "-png", "board.pdf", "board"], check=True)
-    found = detect(Charuco(8, 5, 0.03, 0.0225), cv2.imread("board.png", cv2.IMREAD_GRAYSCALE)).pixels / 5
-    truth = 1000 * Charuco(8, 5, 0.03, 0.0225).points()[:, :2]
-    assert np.abs((found - found.mean(0)) - (truth - truth.mean(0))).max() < 0.06
 
 
 def test_the_page_says_what_it_is(capsys):

@@ -1,7 +1,7 @@
 """From a video of a board to a camera's file, on the command line."""
 
-import sys
 from fractions import Fraction
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -44,7 +44,8 @@ def test_sharp_frames_that_differ_are_taken(filmed, tmp_path, capsys, monkeypatc
     path, truth = filmed
     monkeypatch.chdir(tmp_path)
     words = ["calibrate", str(path), *WORDS, "--corners", "corners.json"]
-    assert main([*words, "-o", "camera.yml"]) == 0
+    assert main([*words, "-o", "camera.yml", "--report", "report.html"]) == 0
+    assert Path("report.html").read_text().count("data:image/jpeg") >= 4  # frames are shown in it
     assert capsys.readouterr().out.startswith(
         f"{path}: of 5 sharp frames 5 show the board, and 4 of these differ\n"
         "chessboard, 9x6 inner corners, squares of 30 mm: in 4 of 4 images of 640x480, "
@@ -58,20 +59,6 @@ def test_sharp_frames_that_differ_are_taken(filmed, tmp_path, capsys, monkeypatc
     monkeypatch.setattr(searching, "detect", None)
     assert main([*words, "-o", "again.yml"]) == 0
     assert (ct.load("again.yml").camera.intrinsics == ct.load("camera.yml").camera.intrinsics).all()
-    # but the frames are shown in a report, for which they are read before the work
-    monkeypatch.setitem(sys.modules, "av", None)
-    assert main([*words, "--report", "report.html", "-o", "third.yml"]) == 2
-    assert "pip install 'camtorch[video]'" in capsys.readouterr().err
-    assert not (tmp_path / "third.yml").exists()
-
-
-@pytest.mark.slow
-def test_frames_are_read_for_the_report(filmed):
-    path, _ = filmed
-    there, gone = path.with_name("board.mp4#t=0.250"), path.with_name("other.mp4#t=0.250")
-    images = searching.read_frames([there, gone, path, None])
-    assert list(images) == [there]
-    assert images[there].shape == (480, 640)
 
 
 def test_time_stamps_may_begin_late(tmp_path):
@@ -86,10 +73,7 @@ def test_time_stamps_may_begin_late(tmp_path):
             file.mux(stream.encode(frame))
         file.mux(stream.encode(None))
     assert videos.length_of(path) == pytest.approx(3, abs=0.3)
-    times, parts = zip(*((seconds, part) for seconds, part, _ in videos.frames(path)), strict=True)
-    assert (times[0], times[-1]) == (hour, hour + 2.75)
-    assert parts[0] == 0
-    assert parts[-1] == pytest.approx(0.92, abs=0.09)
+    assert [seconds for seconds, _ in videos.frames(path)] == [i / RATE for i in range(3 * RATE)]
 
 
 def test_videos_are_for_one_camera(tmp_path, capsys, monkeypatch):

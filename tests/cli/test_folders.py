@@ -64,14 +64,6 @@ def test_a_folder_is_dewarped_as_its_images_one_by_one(folder, capsys):
     assert opened("out/deep/er/3.tif").mode == "I;16"
 
 
-def test_nobody_hears_of_it(folder, monkeypatch, capsys):
-    monkeypatch.setattr(sys, "stderr", None)
-    command(*WORDS, "--jobs", 1)
-    assert len(outputs()) == 5
-    assert sys.stderr is None
-    assert capsys.readouterr().out.startswith("out: 5 of 5 files made")
-
-
 def test_what_there_is_already(folder, capsys):
     assert refused(capsys, *WORDS[:-1], "new.png").endswith("-o OUT/ names a folder\n")
     command(*WORDS, "--dry-run")
@@ -167,22 +159,6 @@ def test_two_shards_are_one_run(folder, capsys, monkeypatch):
             monkeypatch.delenv(name)
         command(*WORDS[:-1], place, "--jobs", 1, "--resume")
         assert "0 of 9 files made" in capsys.readouterr().out
-
-
-def test_ranks_left_over_in_a_shell_ask_for_nothing(folder, capsys, monkeypatch):
-    monkeypatch.setenv("RANK", "0")
-    monkeypatch.setenv("WORLD_SIZE", "4")
-    Path("bare.yml").write_text(MATRIX)
-    command("dewarp", "in", "--camera", "bare.yml", "-o", "out", "--jobs", 1)  # which warns of its model as well
-    told = capsys.readouterr()
-    assert "out: 5 of 5 files made" in told.out
-    (note,) = [line for line in told.err.splitlines() if "RANK=0" in line]
-    assert note.startswith("camtorch: note: RANK=0 WORLD_SIZE=4 is set, but not by torchrun or srun")
-    assert note.endswith("--shard 1/4 makes the first of four parts")
-    command(*WORDS, "--jobs", 1, "--shard", "4/4", "--force")
-    told = capsys.readouterr()
-    assert "out, shard 4 of 4: 1 of 1 files made" in told.out
-    assert told.err == ""
 
 
 def test_a_camera_without_size_is_of_the_first_image(folder, capsys):

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from command_line import command, opened, pixels, refused
+from command_line import command, opened, pixels
 from PIL import Image
 
 import camtorch as ct
@@ -16,7 +16,6 @@ from camtorch.rotations import rotation_matrix
 cv2 = pytest.importorskip("cv2")
 
 SIZE, DISTANCE, BASELINE = (240, 320), 3.0, 0.25
-IMAGES = ["disparity_colours.png", "left.png", "pair.png", "right.png"]
 PLY = np.dtype([(name, "<f4") for name in "xyz"] + [("colour", "u1", 3)])
 
 
@@ -92,9 +91,9 @@ def test_a_pair_its_cameras_and_their_images(folder, capsys):
 
 @pytest.mark.parametrize("projection", ["perspective", "latlon", pytest.param("cylindrical", marks=pytest.mark.slow)])
 def test_disparities_and_points_of_a_wall(folder, capsys, projection):
-    words = ["--projection", projection, "--disparity", "--points", "out/cloud.ply", "-o", "out"]
+    words = ["--projection", projection, "--disparity", "--points", "-o", "out"]
     command("rectify", "left.png", "right.png", "--camera", "rig.json", *words)
-    points, colours = cloud("out/cloud.ply")
+    points, colours = cloud("out/points.ply")
     # in the left camera's frame
     assert len(points) > 20_000
     assert abs(np.median(points[:, 2]) / DISTANCE - 1) < 0.01
@@ -105,39 +104,35 @@ def test_disparities_and_points_of_a_wall(folder, capsys, projection):
     grid = (2 * at + 1) / torch.tensor([SIZE[1], SIZE[0]]) - 1
     there = torch.nn.functional.grid_sample(image, grid[None, None], align_corners=False)[0, :, 0].T
     assert np.median(np.abs(there.numpy() - colours)) < 2
-    disparity = pixels("out/disparity.png")
-    assert disparity.dtype == np.uint16
+    disparity = np.load("out/disparity.npy")
+    assert disparity.dtype == np.float32
     found = ct.rectify(given["left"], given["right"], given.between("left", "right"), projection=projection)
-    again, valid = found.disparity_to_points(torch.from_numpy(disparity / 256))
+    again, valid = found.disparity_to_points(torch.from_numpy(disparity).double())
     wall = again[valid] @ found.rotation_left
     assert abs(float(wall[:, 2].median()) / DISTANCE - 1) < 0.01
-    assert [path.name for path in sorted(Path("out").glob("*.png"))] == sorted([*IMAGES, "disparity.png"])
-    assert "% of left.png; out/disparity_colours.png: in colour" in capsys.readouterr().out
+    assert pixels("out/disparity.png").shape == (*disparity.shape, 3)
+    assert "% of left.png; disparity.png: in colour" in capsys.readouterr().out
 
 
 @pytest.mark.slow
 def test_depths_limit_points(folder, capsys):
     for near, far, some in ((2, 4, True), (5, "inf", False)):
-        words = ["--points", "cloud.ply", "--depth", near, far, "-o", "out", "--force"]
+        words = ["--points", "--depth", near, far, "-o", "out", "--force"]
         command("rectify", "left.png", "right.png", "--camera", "rig.json", *words)
-        points, _ = cloud("cloud.ply")
+        points, _ = cloud("out/points.ply")
         assert len(points) > 10_000 if some else len(points) < 1000
         # depth is along the rectified cameras' axis, which is turned
         assert not some or (points[:, 2].min() > 1.8 and points[:, 2].max() < 4.2)
-    assert not Path("out/disparity.png").exists()
+    assert not Path("out/disparity.npy").exists()
 
 
 def test_exchanged_cameras_have_negative_disparities(folder, capsys):
-    words = ["--left-camera", "right", "--camera", "rig.json"]
-    error = refused(capsys, "rectify", "right.png", "left.png", *words, "--disparity", "-o", "out")
-    assert "disparity.png: the right camera stands on the left, so disparities are negative; name an .npy" in error
-    assert not Path("out").exists()
-    command("rectify", "right.png", "left.png", *words, "--disparity", "d.npy", "--points", "cloud.ply", "-o", "out")
-    disparity = np.load("d.npy")
-    assert disparity.dtype == np.float32
+    words = ["--names", "right", "left", "--camera", "three.json", "--disparity", "--points", "-o", "out"]
+    command("rectify", "right.png", "left.png", *words)
+    disparity = np.load("out/disparity.npy")
     assert np.nanmax(disparity) < 0.1
     assert np.isfinite(disparity).mean() > 0.2
-    assert abs(np.median(cloud("cloud.ply")[0][:, 2]) / DISTANCE - 1) < 0.05
+    assert abs(np.median(cloud("out/points.ply")[0][:, 2]) / DISTANCE - 1) < 0.05
 
 
 def test_cameras_above_each_other(tmp_path, monkeypatch):
@@ -151,9 +146,9 @@ def test_cameras_above_each_other(tmp_path, monkeypatch):
     image = np.asarray(Image.fromarray(coarse).resize((120, 170), Image.Resampling.BICUBIC))
     Image.fromarray(image[:160]).save("upper.png")
     Image.fromarray(image[shift:][:160]).save("lower.png")
-    words = ["--camera", "rig.json", "--vertical", "--disparity", "d.npy", "--size", "120x160", "-o", "out"]
+    words = ["--camera", "rig.json", "--vertical", "--disparity", "--size", "120x160", "-o", "out"]
     command("rectify", "upper.png", "lower.png", *words)
-    disparity = np.load("d.npy")
+    disparity = np.load("out/disparity.npy")
     assert disparity.shape == pixels("out/left.png").shape == (160, 120)
     focal = float(ct.load("out/rectified.json")["upper"].intrinsics[1])
     assert np.nanmedian(disparity) == pytest.approx(shift * focal / 90, abs=0.1)
@@ -165,9 +160,9 @@ def test_deep_images_stay_deep(folder):
     for name in ("left", "right"):
         grey = pixels(f"{name}.png").mean(2)
         Image.fromarray((16 * grey).astype(np.uint16)).save(f"{name}16.png")
-    command("rectify", "left16.png", "right16.png", "--camera", "rig.json", "--points", "out/cloud.ply", "-o", "out")
+    command("rectify", "left16.png", "right16.png", "--camera", "rig.json", "--points", "-o", "out")
     assert pixels("out/left.png").dtype == np.uint16
-    assert abs(np.median(cloud("out/cloud.ply")[0][:, 2]) / DISTANCE - 1) < 0.02
+    assert abs(np.median(cloud("out/points.ply")[0][:, 2]) / DISTANCE - 1) < 0.02
 
 
 def test_images_of_another_resolution_and_no_opencv(folder, monkeypatch):

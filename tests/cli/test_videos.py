@@ -36,19 +36,18 @@ def test_all_but_the_image_stays(folder, capsys):
         "",
     )
     before, after = read_video("in.mkv"), read_video("out.mkv")
-    assert after["codec"] == "ffv1"
-    assert (before["pixels"], after["pixels"]) == ("yuvj420p", "yuv420p")  # two names for one, as the range is full
-    same = ("times", "packets", "title", "languages", "rate", "rotation", "matrix")
+    assert (after["codec"], after["pixels"]) == ("ffv1", "yuv420p")
+    same = ("times", "packets", "languages", "rate", "rotation", "matrix")
     assert {name: before[name] for name in same} == {name: after[name] for name in same}
     assert {kind for kind, *_ in after["packets"]} == {"audio", "subtitle"}
-    assert (after["rotation"], after["matrix"], after["title"], after["languages"]) == (90, (1, 2), "waves", ["fin"])
-    # brightness goes through the warp as an image does, to the bit
+    assert (after["rotation"], after["matrix"], after["languages"]) == (90, (1, 2), ["fin"])
+    # brightness goes through the warp as an image does, to the bit; colours are where they are in RGB, whose rounding
+    # to and fro is within a few levels
     warp = ct.Dewarp(camera(), tolerance=0.001)
     for old, new in zip(before["frames"], after["frames"], strict=True):
+        old = old.reformat(format="yuv420p")  # two names for one, as the range is full
         expected = warp(torch.from_numpy(planes(old)[0].astype(np.uint8).reshape(1, 1, 64, 96)))
         assert np.array_equal(expected.numpy().ravel(), planes(new)[0])
-    # colours are where they are in RGB, whose rounding to and fro is within a few levels
-    for old, new in zip(before["frames"], after["frames"], strict=True):
         rgb = torch.from_numpy(old.to_ndarray(format="rgb24")).permute(2, 0, 1)[None]
         expected = av.VideoFrame.from_ndarray(warp(rgb)[0].permute(1, 2, 0).numpy())
         expected = expected.reformat(format="yuv420p", dst_colorspace="ITU709", dst_color_range="JPEG")
@@ -56,25 +55,19 @@ def test_all_but_the_image_stays(folder, capsys):
             assert np.abs(got - wanted).mean() < 2, number
 
 
-# brightness alone, colours of half and of the full resolution, ten bits, transparency; the first pixel is black in each
-@pytest.mark.parametrize("pixels", ["yuv420p", "gray", "yuv444p", "yuv422p10le", "yuva420p"])
-@pytest.mark.parametrize("full", [1, 2])
-def test_what_shows_nothing_is_black_in_every_format(folder, pixels, full):
-    write_video("in.mkv", [0], codec="ffv1", pixels=pixels, matrix=1, full=full)
+@pytest.mark.parametrize("pixels", ["yuv420p", "gray", "yuv444p", "yuv422p10le", "bgr0"])
+def test_formats_of_pixels_become_one_in_which_nothing_is_black(folder, pixels):
+    Path("level.yml").write_text(LEVEL)  # the camera of an image without distortion
+    write_video("in.mkv", [0], codec="ffv1", pixels=pixels, matrix=1, full=1)
+    command("dewarp", "in.mkv", "--camera", "level.yml", "-o", "level.mkv", "--codec", "ffv1")
+    before, after = (read_video(name)["frames"][0] for name in ("in.mkv", "level.mkv"))
+    expected = before.reformat(format="yuv420p")
+    for old, new in zip(planes(expected), planes(after), strict=True):  # colours of half the resolution, too
+        assert np.abs(old - new).max() <= 1
     command(*WORDS, "--codec", "ffv1", "--projection", "equirectangular", "--fov", 360)
     made = read_video("out.mkv")
-    assert made["pixels"] == pixels
+    assert made["pixels"] == "yuv420p"
     assert made["frames"][0].reformat(format="rgb24").to_ndarray()[0, 0].tolist() == [0, 0, 0]
-
-
-def test_a_quarter_of_a_chroma_pixel(folder):
-    # the camera of an image without distortion: colours of half the resolution stay where they are, at either side
-    Path("level.yml").write_text(LEVEL)
-    write_video("in.mkv", [0], codec="ffv1")
-    command("dewarp", "in.mkv", "--camera", "level.yml", "-o", "out.mkv", "--codec", "ffv1")
-    before, after = (planes(read_video(name)["frames"][0]) for name in ("in.mkv", "out.mkv"))
-    for old, new in zip(before, after, strict=True):
-        assert np.abs(old - new).max() <= 1
 
 
 @pytest.mark.parametrize(
@@ -84,43 +77,24 @@ def test_a_quarter_of_a_chroma_pixel(folder):
         (".webm", "libvpx-vp9", "libopus"),
     ))],
 )  # fmt: skip
-def test_formats(folder, suffix, codec, sound):
+def test_formats_of_files(folder, suffix, codec, sound):
     write_video(f"in{suffix}", range(8), codec=codec, sound=sound)
-    command("dewarp", f"in{suffix}", "--camera", "camera.yml", "-o", f"out{suffix}")
-    before, after = read_video(f"in{suffix}"), read_video(f"out{suffix}")
+    made = suffix if suffix not in (".avi", ".ts") else ".mkv"
+    for place in ("out/", "again/"):
+        command("dewarp", f"in{suffix}", "--camera", "camera.yml", "-o", place)
+    before, after = read_video(f"in{suffix}"), read_video(f"out/in{made}")
     assert after["codec"] == ("vp9" if suffix == ".webm" else "h264")
     assert len(after["frames"]) == 8
-    assert [data for *_, data in after["packets"]] == [data for *_, data in before["packets"]]
-    assert np.allclose(np.diff(after["times"]), 1 / 30, atol=1e-3)
-    if suffix != ".avi":  # whose times are those in which decoders put them out
-        assert np.allclose(before["times"], after["times"], atol=1e-4)
-    command("dewarp", f"in{suffix}", "--camera", "camera.yml", "-o", f"again{suffix}")
-    assert Path(f"again{suffix}").read_bytes() == Path(f"out{suffix}").read_bytes()
+    for (*_, old), (*_, new) in zip(before["packets"], after["packets"], strict=True):
+        assert old.endswith(new)  # whose headers .ts repeats in each
+    assert np.allclose(np.diff(after["times"]), 1 / 30, atol=2e-3)
+    assert Path(f"again/in{made}").read_bytes() == Path(f"out/in{made}").read_bytes()
 
 
-def test_gray_keeps_its_range(folder):
-    Path("level.yml").write_text(LEVEL)
-    write_video("in.mkv", [0], codec="ffv1", pixels="gray")
-    command("dewarp", "in.mkv", "--camera", "level.yml", "-o", "out.mkv", "--crf", "1")
-    before, after = (read_video(name)["frames"][0].to_ndarray(format="gray") for name in ("in.mkv", "out.mkv"))
-    assert np.abs(before.astype(int) - after).max() <= 4  # to the ends of the range, where it was cut off
-
-
-@pytest.mark.parametrize(
-    "pixels",
-    ["bgr0", "yuv444p", *(pytest.param(p, marks=pytest.mark.slow) for p in ("gray", "yuv422p", "yuv420p10le"))],
-)
-def test_pixels(folder, pixels):
-    Path("level.yml").write_text(LEVEL)
-    write_video("in.mkv", [0, 1], codec="ffv1", pixels=pixels)
-    command("dewarp", "in.mkv", "--camera", "level.yml", "-o", "out.mkv", "--codec", "ffv1")
-    before, after = read_video("in.mkv"), read_video("out.mkv")
-    assert after["pixels"] == {"bgr0": "yuv420p"}.get(pixels, pixels)
-    expected = before["frames"][1]
-    if pixels == "bgr0":
-        expected = expected.reformat(format="yuv420p", dst_colorspace="ITU709", dst_color_range="MPEG")
-        assert after["matrix"] == (1, 1)
-    assert np.abs(expected.to_ndarray().astype(int) - after["frames"][1].to_ndarray()).max() <= 1
+def test_a_recording_may_begin_late(folder):
+    write_video("in.mkv", range(108000, 108010))
+    command(*WORDS)
+    assert np.allclose(read_video("in.mkv")["times"], read_video("out.mkv")["times"], atol=1e-3)
 
 
 def test_what_is_no_video(folder, capsys):
@@ -151,7 +125,7 @@ def test_what_is_no_video(folder, capsys):
 def test_a_folder_goes_on(folder, capsys):
     Path("in").mkdir()
     write_video("in/a.mp4", range(5), sound="aac")
-    write_video("in/b.mkv", range(5))
+    write_video("in/b.avi", range(5))
     Image.fromarray(np.zeros((64, 96), np.uint8)).save("in/c.png")
     words = ["dewarp", "in", "--camera", "camera.yml", "-o", "out/", "--jobs", 1]
     command(*words)
@@ -161,20 +135,18 @@ def test_a_folder_goes_on(folder, capsys):
     command(*words, "--resume")
     assert outputs() == before
     assert "1 of 3 files made" in capsys.readouterr().out
-    command(*words[:-3], "other", "--jobs", 1, "--suffix", ".avi")
-    assert outputs("other").keys() == {"a.avi", "b.avi", "c.png"}
+    command(*words[:-3], "other", "--jobs", 1, "--suffix", ".mov")
+    assert outputs("other").keys() == {"a.mov", "b.mov", "c.png"}
 
 
 REFUSED = [
-    ([*WORDS, "--codec", "nothing"], "--codec nothing: there is no such encoder; there are libx264"),
-    ([*WORDS, "--codec", "aac"], "--codec aac: an encoder of audio, not of video"),
-    ([*WORDS, "--codec", "ffv1", "--crf", "3"], "--crf: ffv1 has no such option"),
+    ([*WORDS, "--codec", "nothing"], "--codec: invalid choice: 'nothing'"),
     ([*WORDS, "--size", "95x64"], "out.mkv: 95x64, but libx264 wants even numbers"),
     ([*WORDS[:-1], "out.webm"], "in.mkv: its audio, mp3float, cannot be kept in .webm; .mkv takes nearly all"),
     ([*WORDS[:-1], "out.webm", "--codec", "libx264"], "does not support 'libx264' codec; --codec names another"),
-    ([*WORDS[:-1], "out.png"], "out.png: .png: no video can be written as that; try .avi, .m4v"),
+    ([*WORDS[:-1], "out.png"], "out.png: .png: no video is written as that; try .mp4, .m4v"),
     ([*WORDS[:-1], "in.mkv", "--force"], "in.mkv: would overwrite in.mkv, which is read"),
-    (["dewarp", "none.mkv", *WORDS[2:]], "none.mkv: No such file or directory"),
+    (["dewarp", "none.mkv", *WORDS[2:]], "none.mkv: no such file"),
 ]
 
 
@@ -189,8 +161,7 @@ def test_errors_are_one_line_and_leave_nothing(folder, capsys):
 def test_quality(folder):
     write_video("in.mp4", range(10))
     sizes = []
-    for words in ([], ["--crf", 40], ["--codec", "mpeg4"]):
+    for words in ([], ["--crf", 40]):
         command("dewarp", "in.mp4", "--camera", "camera.yml", "-o", "out.mp4", "--force", *words)
         sizes.append(Path("out.mp4").stat().st_size)
-        assert len(read_video("out.mp4")["frames"]) == 10
     assert sizes[1] < 0.6 * sizes[0]
