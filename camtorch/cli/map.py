@@ -11,7 +11,7 @@ from camtorch.maps.formats import check_map, files_of
 from camtorch.warp.dewarp import Dewarp
 from camtorch.warp.warp import Warp
 
-_READ = ("step", "v", "order")
+_READ = ("step", "v")
 _WRITTEN = (*_READ, "block", "dtype", "clip")
 
 

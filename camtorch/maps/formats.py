@@ -14,16 +14,15 @@ from camtorch._arguments import as_image_size, as_whole
 from camtorch.io._errors import CameraFileError
 from camtorch.io.parsing import path_of, read_bytes
 from camtorch.io.writing import as_json, replacing
-from camtorch.maps.depthai import DepthAI
 from camtorch.maps.dw100 import DW100
 from camtorch.maps.exact import Exact
 from camtorch.maps.lookup import LookupMap
+from camtorch.maps.obj import OBJ
 from camtorch.maps.onnx import ONNX
 from camtorch.maps.opencv import OpenCV
 from camtorch.maps.protocol import SIZES, MapFormat, Options, named_sizes
 from camtorch.maps.report import MapReport, measure
 from camtorch.maps.stmap import STMap
-from camtorch.maps.texture_mesh import GLTF, OBJ
 from camtorch.maps.ti_ldc import TILDC
 
 if TYPE_CHECKING:
@@ -38,9 +37,7 @@ _FORMATS: dict[str, MapFormat] = {
         STMap(),
         DW100(),
         TILDC(),
-        DepthAI(),
         OBJ(),
-        GLTF(),
         ONNX(),
     )
 }
@@ -88,9 +85,8 @@ def load_map(
     target_size: tuple[int, int] | None = None,
     step: int | None = None,
     v: str | None = None,
-    order: str | None = None,
 ) -> LookupMap:
-    """Read a map that `Warp.save` wrote, or another program: to see what it holds, and to compare it with a warp.
+    """Read a map that `Warp.save` wrote, or one as it writes them: to see what it holds, to compare it with a warp.
 
     Args:
         path: the file.
@@ -100,7 +96,6 @@ def load_map(
         target_size: (height, width) of those that it makes, where the file does not say.
         step: pixels of the target between the nodes of a bare table, where nothing beside it says.
         v: "up" or "down", which way v runs in an STMap that does not say; up if left out.
-        order: "yx" or "xy", of a DepthAI mesh without its description.
 
     Returns:
         A `LookupMap`: `.positions`, `.map_x`, `.map_y`, `.grid()`, `.error(warp)`; called with images it warps them.
@@ -113,7 +108,6 @@ def load_map(
     given = Options(
         step=None if step is None else as_whole(step, "step", "load_map"),
         v=v,
-        order=order,
         source_size=as_image_size(source_size, "load_map", "source_size"),
         target_size=as_image_size(target_size, "load_map", "target_size"),
     )
@@ -131,7 +125,7 @@ def load_map(
     if described.get("format", chosen.name) != chosen.name:
         raise CameraFileError(_description(name), "format", f"describes {described['format']!r:.60}, not {chosen.name}")
     facts = {key: tuple(value) if isinstance(value, list) else value for key, value in described.items()}
-    stated: dict[str, Any] = {key: facts[key] for key in ("step", "order") if key in facts}
+    stated: dict[str, Any] = {key: facts[key] for key in ("step",) if key in facts}
     if all(key in facts for key in SIZES):
         rows, columns, height, width = (facts[key] for key in SIZES)
         stated |= {"source_size": (rows, columns), "target_size": (height, width)}
@@ -163,7 +157,6 @@ def check_map(
     *,
     step: int | None = None,
     v: str | None = None,
-    order: str | None = None,
 ) -> MapReport:
     """How far a map that is there is from a warp; see `load_map`.
 
@@ -172,7 +165,7 @@ def check_map(
     """
     exact = Exact(warp, "check_map")
     sizes: dict[str, Any] = {"source_size": exact.source_size, "target_size": exact.target_size}
-    read = load_map(path, format, step=step, v=v, order=order, **sizes)
+    read = load_map(path, format, step=step, v=v, **sizes)
     return measure(path_of(path, "check_map"), read, exact, (), read.facts)
 
 

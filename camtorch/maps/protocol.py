@@ -22,7 +22,6 @@ class Options:
 
     step: int | None = None
     v: str | None = None
-    order: str | None = None
     block: tuple[int, int] | None = None
     dtype: str | None = None
     clip: bool | None = None
