@@ -14,7 +14,6 @@ from collections.abc import Iterable, Iterator
 from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
-import torch
 
 from camtorch.camera import Camera
 from camtorch.io import poses
@@ -22,9 +21,8 @@ from camtorch.io.nerfstudio import panorama
 from camtorch.io.parsing import check_ordinary, decoded
 from camtorch.io.protocol import Names
 from camtorch.io.record import Record, repeated
-from camtorch.io.writing import Lossy, all_left_over, number
+from camtorch.io.writing import Lossy, number
 from camtorch.rig import Rig
-from camtorch.rotations import quaternion_vector
 
 NAMES = Names("colmap", "COLMAP", (".txt", ".bin"), ("*.txt", "*.bin"), ("cameras.bin", "cameras.txt"))
 
@@ -62,7 +60,6 @@ _MOST_COMMENTS = 10_000  # and blank lines, before the first image or between tw
 _MOST_IMAGES = 1 << 18  # each takes some 400 bytes
 _LONGEST_NAME = 4096
 _LONGEST_LINE = 1 << 26
-_SAME = 1e-12  # of poses: what another format may have rounded
 _LARGEST_ID = (1 << 32) - 2  # of cameras; the one above means none
 
 
@@ -77,9 +74,6 @@ def read(path: str, content: bytes) -> Rig:
     cameras = _from_bytes(path, content) if path.endswith(".bin") else _from_text(path, content)
     beside = _images_beside(path)
     if beside is None or not os.path.exists(beside):
-        if beside is not None and (lost := all_left_over([beside])):
-            name = os.path.basename(lost[0])
-            Record(beside, None, "file").fail(f"missing; an interrupted save left {name}: rename it, or delete it")
         return Rig(cameras)
     images = _read_images(beside)
     if unknown := set(images.cameras) - cameras.keys():
@@ -232,7 +226,6 @@ _ImageEntry = tuple[int, Iterable[float], str, str, bool]
 
 def _images_from_text(path: str, file: BinaryIO) -> Iterator[_ImageEntry]:
     number = passed = 0
-    known: dict[bytes, str] = {}
     while line := file.readline(_LONGEST_LINE):
         number += 1
         record = Record(path, None, f"line {number}")
@@ -246,15 +239,12 @@ def _images_from_text(path: str, file: BinaryIO) -> Iterator[_ImageEntry]:
             _text(record, line)
             record.fail(f"less than IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME: {len(words)} words")
         try:
-            pose = list(map(float, words[1:8]))
+            pose, camera = list(map(float, words[1:8])), int(words[8])
         except ValueError:
-            pose = [Record(path, _text(record, word), record.place).number() for word in words[1:8]]
-        if words[8] not in known:
-            identity = Record(path, _text(record, words[8]), record.place).whole(0, _LARGEST_ID, "camera id")
-            known[words[8]] = str(identity)
+            record.fail(f"seven numbers and the id of a camera were expected; got {words[1:9]!r:.100}")
         name = _text(record, words[9].strip())
         points = file.readline(_LONGEST_LINE)  # of the image; the line may be empty
-        yield number, pose, known[words[8]], name, not (points.isspace() or not points)
+        yield number, pose, str(camera), name, not (points.isspace() or not points)
         number += 1
 
 
@@ -318,13 +308,11 @@ def files(rig: Rig, path: str) -> dict[str, bytes]:
         if beside is None:
             way = f"call the file cameras{suffix}, or name a folder"
             lossy.fail("extrinsics", f"no place: COLMAP has them in images{suffix} beside cameras, so {way}")
-        content = _images_content(lossy, rig, identities, beside, binary)
-        if content is not None:
-            contents[beside] = content
-            # COLMAP opens no folder without its points
-            points = os.path.join(os.path.dirname(path), f"points3D{suffix}")
-            if not os.path.exists(points):
-                contents[points] = struct.pack("<Q", 0) if binary else b"# Number of points: 0\n"
+        contents[beside] = _images_content(lossy, rig, identities, beside, binary)
+        # COLMAP opens no folder without its points
+        points = os.path.join(os.path.dirname(path), f"points3D{suffix}")
+        if not os.path.exists(points):
+            contents[points] = struct.pack("<Q", 0) if binary else b"# Number of points: 0\n"
     elif beside is not None and os.path.exists(beside):
         lossy.fail("extrinsics", f"none, while {beside} has poses of images, which these cameras would get")
     return contents
@@ -370,29 +358,21 @@ def _as_bytes(entries: list[tuple[Any, ...]]) -> bytes:
     return b"".join(parts)
 
 
-def _images_content(lossy: Lossy, rig: Rig, identities: dict[str, int], path: str, binary: bool) -> bytes | None:
-    """The file of a rig's poses, or None if the file that is there says the same.
+def _images_content(lossy: Lossy, rig: Rig, identities: dict[str, int], path: str, binary: bool) -> bytes:
+    """The file of a rig's poses.
 
     Raises:
         CameraFileError: the file that is there has points, which would be lost.
     """
     entries = []
-    posed = poses.all_of(rig, lossy)
-    for name, values in zip(rig.extrinsics, poses.quaternions(posed).tolist(), strict=True):
+    for name, values in zip(rig.extrinsics, poses.quaternions(poses.all_of(rig, lossy)).tolist(), strict=True):
         if not name or "\0" in name or (not binary and (name.split() != [name])):
             lossy.fail(
                 repr(name), "an image name that COLMAP does not read" + " from text; .bin takes it" * (not binary)
             )
         entries.append((name, identities[rig.images.get(name, name)], values))
-    if os.path.exists(path):
-        there = _read_images(path)
-        if [entry[:2] for entry in entries] == list(zip(there.names, map(int, there.cameras), strict=True)):
-            its = poses.as_float64(there.values)
-            theirs = torch.cat((quaternion_vector(its[:, :4]), its[:, 4:]), -1)
-            if torch.allclose(theirs, torch.cat((posed.rotation, posed.translation), -1), rtol=_SAME, atol=_SAME):
-                return None
-        if there.has_points:
-            Record(path, None).fail("holds the points of images, which would be lost; write to another folder")
+    if os.path.exists(path) and _read_images(path).has_points:
+        Record(path, None).fail("holds the points of images, which would be lost; write to another folder")
     folder, suffix = os.path.dirname(path), os.path.splitext(path)[1]
     for name in ("rigs", "frames"):
         if os.path.exists(os.path.join(folder, name + suffix)):

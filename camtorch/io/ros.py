@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import json
 from typing import Any
 
 from camtorch.io.protocol import Names
 from camtorch.io.record import Record, one_of
-from camtorch.io.writing import Lossy, listed, quoted
+from camtorch.io.writing import Lossy, listed
 from camtorch.rig import Rig
 
 NAMES = Names("ros", "ROS camera_info", (".yaml", ".yml"), ("*camera_info*", "*camerainfo*"))
@@ -72,7 +73,7 @@ def render(rig: Rig, path: str) -> str:
     lines = [
         f"image_width: {width}",
         f"image_height: {height}",
-        f"camera_name: {quoted(name)}",
+        f"camera_name: {json.dumps(name, ensure_ascii=False)}",
         *_matrix("camera_matrix", 3, 3, [fx, 0, cx, 0, fy, cy, 0, 0, 1]),
         f"distortion_model: {model}",
         *_matrix("distortion_coefficients", 1, len(distortion), distortion),

@@ -299,7 +299,7 @@ def test_what_is_written_only_is_not_read(tmp_path):
         ct.save(LENSES["pinhole"], tmp_path / name)
         with pytest.raises(ct.CameraFileError, match="a file for renderers, which is written only"):
             ct.load(tmp_path / name)
-    with pytest.raises(ValueError, match="format: 'carla' is written only; read are aria, "):
+    with pytest.raises(ValueError, match="format: 'carla' is not read; read are aria, "):
         ct.load(tmp_path / "a.usda", "carla")
     with pytest.raises(ValueError, match=r"a\.py: the name does not say the format; it may be blender"):
         ct.save(LENSES["pinhole"], tmp_path / "a.py")
