@@ -187,6 +187,7 @@ def test_numbers_are_numbers_to_pyyaml(tmp_path):
 def test_where_writing_fails_the_old_files_stay(function, at, tmp_path, monkeypatch):
     rig = ct.Rig({"1": camera("pinhole")}, {"a.jpg": ct.Extrinsics([0, 0, 0.1], [0, 0, 1])}, images={"a.jpg": "1"})
     ct.save(rig, tmp_path, "colmap")
+    rig.cameras["1"] = camera("pinhole", core=[600.0] * 4)
     files = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
     right, calls = getattr(os, function), iter(range(100))
 
@@ -198,11 +199,7 @@ def test_where_writing_fails_the_old_files_stay(function, at, tmp_path, monkeypa
     with monkeypatch.context() as patch:
         patch.setattr(os, function, failing)
         with pytest.raises(OSError, match="no space left"):
-            ct.save(
-                ct.Rig({"1": camera("pinhole", core=[600.0] * 4)}, rig.extrinsics, images=rig.images),
-                tmp_path,
-                "colmap",
-            )
+            ct.save(rig, tmp_path, "colmap")
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == files
 
 
