@@ -46,8 +46,8 @@ class AmbiguousModelWarning(UserWarning):
     """A file leaves open of which model its coefficients are."""
 
 
-def read(path: str | os.PathLike[str], model: str | None = None, *, name: str | None = None) -> Camera:
-    """The camera of an OpenCV YAML, JSON or XML file, in float64 and frozen.
+def read(path: str | os.PathLike[str], model: str | None = None) -> Camera:
+    """The only camera of an OpenCV YAML, JSON or XML file, in float64 and frozen; of several `read_rig(path)[name]`.
 
     Args:
         path: a file with a camera matrix (`camera_matrix`, `cameraMatrix`, `K`, `M`, `mtx`) and, where it has them,
@@ -55,26 +55,21 @@ def read(path: str | os.PathLike[str], model: str | None = None, *, name: str | 
         model: a key of `camtorch.MODELS`, for a file that leaves it open. If left out: without coefficients a pinhole,
             with a true `fisheye_model` a Kannala-Brandt, with `xi` a Mei, else a Brown-Conrady camera, with a warning
             where 4 coefficients could be of two models.
-        name: which camera of a file with several: the end of its keys, "1" for `M1` and `D1`.
 
     Raises:
-        CameraFileError: not one usable camera in the file, or one of another model than `model`.
-        OSError: no such file, or it cannot be opened. ValueError: an unknown model.
+        CameraFileError: no usable camera in the file, or one of another model than `model`.
+        OSError: no such file, or it cannot be opened. ValueError: an unknown model, or several cameras.
     """
     check_path(path, "io.opencv.read")
-    return _File(Record(path, parse_mapping(path, read_bytes(path)))).camera(_known(model), name).requires_grad_(False)
+    return read_rig(path, model).camera
 
 
 def read_rig(path: str | os.PathLike[str], model: str | None = None) -> Rig:
     """All cameras of such a file, and the pose of a pair, all frozen; see `read`, which says what it raises."""
     check_path(path, "io.opencv.read_rig")
-    return parse(Record(path, parse_mapping(path, read_bytes(path))), _known(model)).requires_grad_(False)
-
-
-def _known(model: str | None) -> str | None:
     if model is not None and (not isinstance(model, str) or model not in MODELS):
         raise ValueError(f"io.opencv: unknown model {shown(model)}; known are {', '.join(sorted(MODELS))}")
-    return model
+    return parse(Record(path, parse_mapping(path, read_bytes(path))), model).requires_grad_(False)
 
 
 def matches(keys: dict[str, Any]) -> bool:
@@ -88,7 +83,7 @@ def parse(record: Record, model: str | None = None) -> Rig:
     names = sorted(file.matrices, key=lambda name: (name.isdigit(), int(name) if name.isdigit() else 0, name))
     record.few(len(names))
     if not names:
-        file.camera(model, None)
+        file.fail("camera_matrix", "missing, also as cameraMatrix, K and M; is this a file of OpenCV's?")
     cameras = {name or "camera": file.camera(model, name) for name in names}
     extrinsics = {}
     keys = next((keys for keys in _POSES if all(key in record for key in keys)), None)
@@ -131,18 +126,8 @@ class _File:
                 named[match[1]] = key
         return named
 
-    def camera(self, model: str | None, name: str | None) -> Camera:
-        """The camera of a name, or the only one."""
-        keys = ", ".join(self.matrices.values())
-        if not keys:
-            self.fail("camera_matrix", "missing, also as cameraMatrix, K and M; is this a file of OpenCV's?")
-        if name is None and len(self.matrices) > 1:
-            one = min(self.matrices)
-            self.fail(keys, f"several cameras; choose one by its name, as in name={one!r} or --name {one}")
-        name = next(iter(self.matrices)) if name is None else name
-        if name not in self.matrices:
-            there = f"there are {sorted(self.matrices)}" if any(self.matrices) else "the only one has no name"
-            self.fail(keys, f"no camera is called {name!r:.60}; {there}")
+    def camera(self, model: str | None, name: str) -> Camera:
+        """The camera of a name."""
         key, lens, xi = self.matrices[name], self.lenses.get(name), self.xis.get(name)
         intrinsics = self.record[key].intrinsics(self.numbers(key))
         distortion = self.numbers(lens) if lens else []
