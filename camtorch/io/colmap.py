@@ -10,8 +10,8 @@ import os
 import re
 import struct
 from array import array
-from collections.abc import Iterable, Iterator
-from typing import Any, BinaryIO, NamedTuple
+from collections.abc import Callable, Iterable, Iterator
+from typing import Any, BinaryIO
 
 import numpy as np
 
@@ -20,7 +20,7 @@ from camtorch.io import poses
 from camtorch.io.nerfstudio import panorama
 from camtorch.io.parsing import check_ordinary, decoded
 from camtorch.io.protocol import Names
-from camtorch.io.record import Record, repeated
+from camtorch.io.record import Record
 from camtorch.io.writing import Lossy, number
 from camtorch.rig import Rig
 
@@ -75,14 +75,13 @@ def read(path: str, content: bytes) -> Rig:
     beside = _images_beside(path)
     if beside is None or not os.path.exists(beside):
         return Rig(cameras)
-    images = _read_images(beside)
-    if unknown := set(images.cameras) - cameras.keys():
-        row = next(row for row, camera in enumerate(images.cameras) if camera in unknown)
-        images.record(row).fail(f"its camera {images.cameras[row]} is not in {os.path.basename(path)}")
-    if not images.names:
+    images, values, _, record = _read_images(beside)
+    for row, camera in enumerate(images.values()):
+        if camera not in cameras:
+            record(row).fail(f"its camera {camera} is not in {os.path.basename(path)}")
+    if not images:
         return Rig(cameras)
-    batch = poses.from_quaternions(images.record, images.values)
-    return Rig(cameras, (images.names, batch), images=dict(zip(images.names, images.cameras, strict=True)))
+    return Rig(cameras, (list(images), poses.from_quaternions(record, values)), images=images)
 
 
 def _images_beside(path: str) -> str | None:
@@ -168,56 +167,35 @@ def _add(
 # -- images.txt and images.bin: the poses of images, whose points are passed over
 
 
-class _Images(NamedTuple):
-    """The images of a file.
-
-    names and cameras: of each image, the latter by their ids.
-    values: (N, 7), unit quaternions w, x, y, z and translations.
-    has_points: whether any of them has points.
-    unit, places: what numbers the place of an image in the file, and those numbers.
-    """
-
-    path: str
-    names: list[str]
-    cameras: list[str]
-    values: np.ndarray
-    has_points: bool
-    unit: str
-    places: array[int]
-
-    def record(self, row: int) -> Record:
-        """The place of an image."""
-        return Record(self.path, None, f"{self.unit} {self.places[row]}")
-
-
-def _read_images(path: str) -> _Images:
+def _read_images(path: str) -> tuple[dict[str, str], np.ndarray, bool, Callable[[int], Record]]:
     """The images of an images.txt or images.bin.
+
+    Returns:
+        Their names with the ids of their cameras; (N, 7) quaternions w, x, y, z and translations; whether any of them
+        has points; and of a row where it stands.
 
     Raises:
         CameraFileError: it is none, or two images have one name.
     """
     check_ordinary(path)
     unit, entries = ("byte", _images_from_bytes) if path.endswith(".bin") else ("line", _images_from_text)
-    names: list[str] = []
-    cameras: list[str] = []
+    images: dict[str, str] = {}
     values, places, has_points = array("d"), array("q"), False
+
+    def record(row: int) -> Record:
+        return Record(path, None, f"{unit} {places[row]}")
+
     with open(path, "rb", buffering=1 << 16) as file:
         for place, pose, camera, name, with_points in entries(path, file):
-            if len(names) >= _MOST_IMAGES:
-                Record(path, None, f"{unit} {place}").fail(f"more than {_MOST_IMAGES} images")
-            values.extend(pose)
-            cameras.append(camera)
-            names.append(name)
             places.append(place)
+            if len(images) >= _MOST_IMAGES:
+                record(-1).fail(f"more than {_MOST_IMAGES} images")
+            if name in images:
+                record(-1).fail(f"a second image is called {name!r:.60}")
+            images[name] = camera
+            values.extend(pose)
             has_points = has_points or with_points
-    images = _Images(path, names, cameras, np.array(values).reshape(-1, 7), has_points, unit, places)
-    if (twice := repeated(names)) is not None:
-        images.record(names.index(twice, names.index(twice) + 1)).fail(f"a second image is called {twice!r:.60}")
-    finite = np.isfinite(images.values).all(1)
-    if not finite.all():
-        row = int(finite.argmin())
-        images.record(row).fail(f"a pose that is no finite number: {images.values[row].tolist()}")
-    return images
+    return images, np.array(values).reshape(-1, 7), has_points, record
 
 
 _ImageEntry = tuple[int, Iterable[float], str, str, bool]
@@ -371,7 +349,7 @@ def _images_content(lossy: Lossy, rig: Rig, identities: dict[str, int], path: st
                 repr(name), "an image name that COLMAP does not read" + " from text; .bin takes it" * (not binary)
             )
         entries.append((name, identities[rig.images.get(name, name)], values))
-    if os.path.exists(path) and _read_images(path).has_points:
+    if os.path.exists(path) and _read_images(path)[2]:
         Record(path, None).fail("holds the points of images, which would be lost; write to another folder")
     folder, suffix = os.path.dirname(path), os.path.splitext(path)[1]
     for name in ("rigs", "frames"):

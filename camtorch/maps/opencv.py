@@ -72,6 +72,5 @@ class OpenCV(MapFormat):
         if positions.ndim != 3 or not positions.size or positions.shape[-1] != 2:
             raise ValueError(f"no maps of cv2.remap: {first.dtype} {first.shape} and {second.dtype} {second.shape}")
         positions[(positions <= _NOWHERE).any(-1) | ~np.isfinite(positions).all(-1)] = np.nan
-        says = all(key in arrays for key in SIZES[:2])
-        size = checked("source_size", [int(arrays[key]) for key in SIZES[:2]] if says else given.source_size)
+        size = checked("source_size", [int(arrays[key]) for key in SIZES[:2]])
         return LookupMap(torch.from_numpy(positions), size, "opencv_fixed" if is_fixed else "opencv", {})
