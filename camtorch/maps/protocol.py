@@ -18,7 +18,7 @@ _LONGEST = 1 << 16  # pixels along a side
 
 @dataclass(frozen=True)
 class Options:
-    """What a caller says of a map to write, see `Warp.save`, or a description of one to read; None: the format's own."""
+    """What is said of a map: by `Warp.save`, or by the description of one to read. None is the format's own."""
 
     step: int | None = None
     v: str | None = None
