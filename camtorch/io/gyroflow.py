@@ -29,6 +29,6 @@ def parse(record: Record) -> Rig:
     named = "distortion_model" in record and record["distortion_model"].value is not None
     key = _MODELS[one_of(record["distortion_model"], _MODELS) if named else "opencv_fisheye"]
     matrix, coefficients = (record["fisheye_params"][name] for name in ("camera_matrix", "distortion_coeffs"))
-    intrinsics = matrix.intrinsics([number for row in matrix.rows(3, 3) for number in row])
+    intrinsics = matrix.intrinsics()
     size = record["calib_dimension"]["h"].side(), record["calib_dimension"]["w"].side()
     return Rig({"camera": record.camera(key, intrinsics, coefficients.numbers(), size, lens=coefficients)})

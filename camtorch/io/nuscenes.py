@@ -57,8 +57,7 @@ def _table(path: str, content: bytes) -> Record:
 
 
 def _camera(sensor: Record) -> Camera:
-    matrix = sensor["camera_intrinsic"]
-    intrinsics = matrix.intrinsics([number for row in matrix.rows(3, 3) for number in row])
+    intrinsics = sensor["camera_intrinsic"].intrinsics()
     lens = sensor.get("camera_distortion")  # of nuImages
     distortion = [] if lens is None else lens.numbers()
     if lens is not None and len(distortion) == 6 and distortion.pop():

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 import re
 import warnings
@@ -129,11 +128,11 @@ class _File:
     def camera(self, model: str | None, name: str) -> Camera:
         """The camera of a name."""
         key, lens, xi = self.matrices[name], self.lenses.get(name), self.xis.get(name)
-        intrinsics = self.record[key].intrinsics(self.numbers(key))
-        distortion = self.numbers(lens) if lens else []
+        intrinsics = self.record[key].intrinsics()
+        distortion = self.record[lens].flat() if lens else []
         if xi:  # cv2.omnidir
             is_matrix = isinstance(self.record[xi].value, (dict, list))
-            distortion = [*(self.numbers(xi) if is_matrix else [self.record[xi].number()]), *distortion]
+            distortion = [*(self.record[xi].flat() if is_matrix else [self.record[xi].number()]), *distortion]
         stated, place = (("mei",), xi) if xi else self.stated()
         if place is not None and model is not None and model not in stated:
             self.fail(place, f"says that the model is {stated[0]}; do not name {model}, or correct the file")
@@ -170,7 +169,7 @@ class _File:
 
     def pose(self, rotation_key: str, translation_key: str) -> Extrinsics:
         """R or a rotation vector, and T."""
-        rotation, translation = self.numbers(rotation_key), self.numbers(translation_key)
+        rotation, translation = self.record[rotation_key].flat(), self.record[translation_key].flat()
         for key, values in ((rotation_key, rotation), (translation_key, translation)):
             count = 9 if key == "R" else 3
             if len(values) != count:
@@ -189,25 +188,6 @@ class _File:
         if height is None or width is None:
             self.fail("image_height" if height is None else "image_width", "missing, while the other side is given")
         return self.record[height].side(), self.record[width].side()
-
-    def numbers(self, key: str) -> list[float]:
-        """An OpenCV matrix, a list, or a list of rows as one list."""
-        record = self.record[key]
-        if isinstance(record.value, dict):
-            if "sizes" in record:  # of any other number of dimensions; of one, XML has no list
-                says, parts = "sizes say", record["sizes"]
-                sizes = parts.numbers() if isinstance(parts.value, list) else [parts.number()]
-            else:
-                says = "rows and cols say"
-                sizes = [Record(record.path, record.value.get(s), f"{key}.{s}").number() for s in ("rows", "cols")]
-            data = record.value.get("data")
-            if not isinstance(data, list) or len(data) != math.prod(sizes):
-                count = f"{len(data)} numbers" if isinstance(data, list) else "no list"
-                self.fail(f"{key}.data", f"{count}, where {says} {' x '.join(f'{s:g}' for s in sizes)}")
-            return record["data"].numbers()
-        if not isinstance(record.value, list):
-            self.fail(key, "is neither an OpenCV matrix nor a list of numbers")
-        return [item.number() for row in record for item in (row if isinstance(row.value, list) else [row])]
 
 
 # -- writing

@@ -31,11 +31,10 @@ def parse(record: Record) -> Rig:
     """The camera of a file: K and D. R and P, the rectification of a stereo pair, are not read."""
     name = record["camera_name"].text() if "camera_name" in record else "camera"
     width, height = (_either(record, f"image_{side}", side).side() for side in ("width", "height"))
-    matrix = _either(record, "camera_matrix", "K", "k")
-    intrinsics = matrix.intrinsics(_numbers(matrix))
+    intrinsics = _either(record, "camera_matrix", "K", "k").intrinsics()
     key, counts = _MODELS[one_of(record["distortion_model"], _MODELS)]
     coefficients = _either(record, "distortion_coefficients", "D", "d")
-    distortion = _numbers(coefficients)
+    distortion = coefficients.flat()
     while len(distortion) > max(counts, default=0) and not distortion[-1]:
         distortion.pop()  # zeros to fill a message of fixed length
     if not distortion:
@@ -49,15 +48,6 @@ def parse(record: Record) -> Rig:
 
 def _either(record: Record, *keys: str) -> Record:
     return record[next((key for key in keys if key in record), keys[0])]
-
-
-def _numbers(record: Record) -> list[float]:
-    if isinstance(record.value, dict):
-        rows, cols = (record[key].whole(0, 1000, "number of rows or columns") for key in ("rows", "cols"))
-        if len(record["data"]) != rows * cols:
-            record["data"].fail(f"{len(record['data'])} numbers, where rows and cols say {rows} x {cols}")
-        record = record["data"]
-    return record.numbers()
 
 
 def render(rig: Rig, path: str) -> str:

@@ -240,7 +240,7 @@ def test_tables_of_nuscenes_without_channels_or_with_several_drives(tmp_path):
         ({"rotation": [1, 1, 0, 0]}, r"\[2\]: a quaternion of length 1.41"),
         ({"camera_distortion": [0, 0, 0, 0, 0, 0.1]}, r"\[2\].camera_distortion: a sixth coefficient"),
         ({"token": tokens[0]}, r"\[2\].token: a second sensor is called"),
-        ({"camera_intrinsic": [[1, 2], [3, 4]]}, r"\[2\].camera_intrinsic: 2 rows where 3 belong"),
+        ({"camera_intrinsic": [[1, 2], [3, 4]]}, r"\[2\].camera_intrinsic: a camera matrix has 3 x 3 numbers"),
     ):
         (tmp_path / "calibrated_sensor.json").write_text(json.dumps([table[0], table[1], {**again, **broken}]))
         with pytest.raises(ct.CameraFileError, match=reason):

@@ -137,7 +137,7 @@ def test_several_cameras_are_a_rig():
         ("K: 5", "K", "neither"),
         ("K: [1, 2]", "K", "3 x 3"),
         ("K: {rows: 3, cols: 3, data: [1, 2]}", "K.data", "2 numbers, where rows and cols say 3 x 3"),
-        ("K: {cols: 3, data: [1, 2]}", "K.rows", "no number"),
+        ("K: {cols: 3, data: [1, 2]}", "K.rows", "missing"),
         ("K: [500, 0.5, 320, 0, 500, 240, 0, 0, 1]", r"K\[1\]", "skew of 0.5.*write 0"),
         ("K: [500, 0, 320, 0, 500, 240, 0, 0, 2]", "K", "is not"),
         ("K: [500, 0, 320, 0, .nan, 240, 0, 0, 1]", r"K\[4\]", "'.nan' is no finite number"),
