@@ -11,8 +11,7 @@ from camtorch.maps.formats import check_map, files_of
 from camtorch.warp.dewarp import Dewarp
 from camtorch.warp.warp import Warp
 
-_READ = ("step", "v", "order")
-_WRITTEN = (*_READ, "block", "dtype", "clip")
+_OPTIONS = ("step", "v", "block", "dtype", "clip")
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -25,11 +24,10 @@ def run(arguments: argparse.Namespace) -> None:
             targets.check(Path(name), force=arguments.force, inputs=(arguments.camera, arguments.target))
     warp = _warp(arguments)
     if output is None:
-        given = {name: getattr(arguments, name) for name in _READ}
-        print(check_map(warp, arguments.check, arguments.format, **given))
+        print(check_map(warp, arguments.check, arguments.format))
     else:
         output.parent.mkdir(parents=True, exist_ok=True)
-        print(warp.save(output, arguments.format, **{name: getattr(arguments, name) for name in _WRITTEN}))
+        print(warp.save(output, arguments.format, **{name: getattr(arguments, name) for name in _OPTIONS}))
 
 
 def _warp(arguments: argparse.Namespace) -> Warp:

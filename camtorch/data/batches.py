@@ -9,7 +9,6 @@ import numpy as np
 
 from camtorch._arguments import is_list, shown
 from camtorch.augment.sample import Sample
-from camtorch.camera import Camera
 from camtorch.data.columns import PARTS, to_columns
 from camtorch.data.moving import Mover, Moves
 from camtorch.data.seeded import Key
@@ -18,7 +17,6 @@ Array: TypeAlias = "np.ndarray[Any, Any]"
 Batch = dict[str, Any]
 """Column -> an array or a list, of as many rows as all others."""
 _OWNER = "MapBatches"
-_CHANNELS = 4
 
 
 class MapBatches(Mover):
@@ -91,62 +89,27 @@ class MapBatches(Mover):
         missing = [name for name in self._keys if name not in batch]
         if missing:
             raise ValueError(f"{_OWNER}: no column {missing[0]!r} to name the rows; there are {', '.join(batch)}")
-        rows = []
-        for i in range(len(next(iter(batch.values()), ()))):
-            row = {name: column[i] for name, column in batch.items()}
-            values = [row[name].item() if isinstance(row[name], np.generic) else row[name] for name in self._keys]
-            key: Key | None = tuple(values) if len(values) > 1 else values[0] if values else None
-            with self._naming(key):
-                rows.append(self._row(key, row))
+        count = max(counts.values(), default=0)
+        rows = [self._row({name: column[i] for name, column in batch.items()}) for i in range(count)]
         if not rows:
             return dict(batch)
         names = list(dict.fromkeys(name for row in rows for name in row))
         result = {**batch, **{name: _column([row.get(name) for row in rows]) for name in names}}
-        for name, column in batch.items():
+        for name, column in batch.items():  # of one type in all blocks
             if name in names and _is_objects(column) and not _is_objects(result[name]):
                 result[name] = _objects(list(result[name]))
         return result
 
-    def _row(self, key: Key | None, row: Mapping[str, Any]) -> Sample:
+    def _row(self, row: dict[str, Any]) -> Sample:
         """What has changed in a row."""
-        camera = {part: row[f"camera_{part}"] for part in PARTS if f"camera_{part}" in row}
-        sample: Sample = {}
-        column_of: dict[str, str] = {}
-        for name, value in row.items():
-            if name in self._keys or name.removeprefix("camera_") in PARTS or value is None:
-                continue
-            value = _dense(value)
-            field = _singular(name, value)
-            if self._kind(field, value) is not None or name.endswith("_valid"):
-                column_of[field], sample[field] = name, value
-        if camera:
-            sample["camera"] = self._camera({part: _dense(value) for part, value in camera.items()}, sample)
-        moved = self._move(key, sample)
-        result: Sample = {}
-        for name, value in moved.items():
-            if isinstance(value, Camera):
-                result.update(to_columns(value, name))
-            elif name in column_of:
-                result[column_of[name]] = value
-            else:
-                field = name.removesuffix("_valid")
-                result[f"{column_of[field]}_valid" if field in column_of and field != name else name] = value
-        return result
-
-
-def _singular(name: str, value: Any) -> str:
-    """The field of a column: a column `images` holds one image in each row, unless it holds several."""
-    single = np.ndim(value) == 2 or (np.ndim(value) == 3 and value.shape[-1] <= _CHANNELS)
-    return name.removesuffix("s") if name in ("images", "masks") and single else name
-
-
-def _dense(value: Any) -> Any:
-    """An array of numbers, where it came as arrays in an array of objects."""
-    if _is_objects(value) and len(value) and all(isinstance(v, (np.ndarray, list, tuple)) for v in value):
-        parts = [_dense(np.asarray(part)) for part in value]
-        if len({part.shape for part in parts}) == 1 and not any(map(_is_objects, parts)):
-            return np.stack(parts)
-    return value
+        values = [row.pop(name) for name in self._keys]
+        values = [value.item() if isinstance(value, np.generic) else value for value in values]
+        key: Key | None = tuple(values) if len(values) > 1 else values[0] if values else None
+        if numbers := {part: row.pop(f"camera_{part}") for part in PARTS if f"camera_{part}" in row}:
+            row["camera"] = numbers
+        moved = dict(self._moved(key, row))
+        camera = moved.pop("camera", None)
+        return moved if camera is None else {**moved, **to_columns(camera)}
 
 
 def _is_objects(column: Any) -> bool:

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -17,7 +16,7 @@ from camtorch.augment.augmentation import Augmentation
 from camtorch.augment.change import Part
 from camtorch.augment.face import FaceNormalizer
 from camtorch.augment.numpy import Transform
-from camtorch.augment.sample import IMAGES, Sample, kind_of
+from camtorch.augment.sample import IMAGES, KINDS, Sample, kind_of
 from camtorch.camera import Camera
 from camtorch.data.columns import camera_of
 from camtorch.data.seeded import Key, Seeded
@@ -89,40 +88,44 @@ class Mover:
         if self._seeded is not None:
             self._seeded.set_epoch(epoch)
 
-    def _kind(self, name: str, value: object) -> str | None:
-        """The kind of a field that moves, else None."""
-        return kind_of(name, value, self._fields, self._owner)
+    def _moved(self, key: Key | None, row: Mapping[str, Any]) -> Sample:
+        """What changes of a row: fields that move, what is valid of them, `rotation`, and `camera`, a Camera.
 
-    def _camera(self, parts: Mapping[str, Any], sample: Sample) -> Camera:
-        """The camera of a sample: its numbers, and the size of an image where they do not say it."""
-        if parts.get("image_size") is None:
-            sizes = (v.shape[:2] for n, v in sample.items() if self._kind(n, v) in IMAGES and np.ndim(v) in (2, 3))
-            parts = {**parts, "image_size": next(sizes, None)}
-        missing = [part for part in ("model", "intrinsics", "image_size") if parts.get(part) is None]
-        if missing:
-            has_none = ", ".join(missing)
-            raise ValueError(f"{self._owner}: the camera has no {has_none}; ct.data.to_columns tells all of it")
-        return camera_of(parts, self._owner)
-
-    @contextmanager
-    def _naming(self, key: object) -> Iterator[None]:
-        """Errors inside of it name the sample."""
+        A row has arrays, or lists of numbers; `camera` is one, or an object of its numbers.
+        """
         try:
-            yield
+            fields = {name: _dense(name, value) for name, value in row.items() if self._moves(name, value)}
+            camera = row.get("camera")
+            if camera is not None:
+                fields["camera"] = camera if isinstance(camera, Camera) else self._camera(camera, fields)
+            if self._seeded is not None:
+                return self._seeded(fields, key=key)  # type: ignore[arg-type]
+            return (self._fixed or self._by_camera(fields))(fields)
         except (ValueError, TypeError) as error:
             which = "" if key is None else f"sample {key!r:.200}: "
             kind = TypeError if isinstance(error, TypeError) else ValueError
             raise kind(f"{self._owner}: {which}{str(error).removeprefix(f'{self._owner}: ')}") from error
 
-    def _move(self, key: Key | None, sample: Sample) -> Sample:
-        """The sample moved, with the validity of its labels, `rotation`, and `camera`, a Camera."""
-        if self._seeded is not None:
-            return self._seeded(sample, key=key)  # type: ignore[arg-type]
-        if self._fixed is not None:
-            return self._fixed(sample)
-        camera, make = sample.get("camera"), self._make
+    def _moves(self, name: str, value: object) -> bool:
+        """Whether a value is a field that moves, or says what is valid of one."""
+        if name == "camera" or value is None:
+            return False
+        return name.endswith("_valid") or kind_of(name, value, self._fields, self._owner) is not None
+
+    def _camera(self, parts: Mapping[str, Any], fields: Sample) -> Camera:
+        """The camera of its numbers, and the size of an image where they do not say it."""
+        if parts.get("image_size") is None:
+            images = (v for n, v in fields.items() if kind_of(n, v, self._fields, self._owner) in IMAGES)
+            parts = {**parts, "image_size": next((v.shape[:2] for v in images if np.ndim(v) in (2, 3)), None)}
+        if missing := [part for part in ("model", "intrinsics", "image_size") if parts.get(part) is None]:
+            raise ValueError(f"the camera has no {', '.join(missing)}; ct.data.to_columns tells all of it")
+        return camera_of({part: _dense(part, value) for part, value in parts.items()}, self._owner)
+
+    def _by_camera(self, fields: Sample) -> Transform:
+        """What moves the samples of a camera."""
+        camera, make = fields.get("camera"), self._make
         if not isinstance(camera, Camera) or make is None:
-            there = ", ".join(sample) or "nothing"
+            there = ", ".join(fields) or "nothing"
             raise ValueError(f"no camera in the sample, of which a warp is made; it has {there}")
 
         def made() -> Transform:
@@ -132,4 +135,20 @@ class Mover:
             return Transform(Always(warp, self._owner, self._fields))
 
         found: Transform = self._made((camera.intrinsics, camera.distortion), (camera.key, camera.image_size), made)
-        return found(sample)
+        return found
+
+
+def _dense(name: str, value: Any) -> Any:
+    """An array of numbers, or of bool for validity, where it came as lists, or as arrays in an array of objects."""
+    if isinstance(value, list):
+        try:
+            array = np.asarray(value, bool if name.endswith("_valid") else np.float64)
+        except (ValueError, TypeError, OverflowError):
+            raise ValueError(f"{name} must be numbers in lists of one length; got {value!r:.80}") from None
+        kind = KINDS.get(name)
+        return array if array.size or kind is None else array.reshape(*[0] * (kind.dims - 1), *kind.last)
+    if isinstance(value, np.ndarray) and value.dtype == object:
+        parts = [_dense(name, part) for part in value]
+        if parts and all(isinstance(part, np.ndarray) and part.shape == parts[0].shape for part in parts):
+            return np.stack(parts)
+    return value

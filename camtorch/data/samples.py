@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from camtorch._arguments import shown
-from camtorch.augment.sample import IMAGES, KEEP, KINDS, Sample
+from camtorch.augment.sample import IMAGES, KEEP
 from camtorch.camera import Camera
 from camtorch.data.columns import PARTS, to_columns
 from camtorch.data.moving import Mover, Moves
@@ -59,9 +58,6 @@ class MapSamples(Mover):
         fields: Mapping[str, str] | None = None,
     ):
         super().__init__(transform, seed, epoch, fields)
-        for name, value in (("key", key), ("labels", labels)):
-            if not isinstance(value, str):
-                raise TypeError(f"{_OWNER}: {name} must name an entry of a sample; got {shown(value)}")
         self._key, self._labels = key, labels
 
     def __call__(self, sample: Mapping[str, Any]) -> dict[str, Any]:
@@ -76,83 +72,52 @@ class MapSamples(Mover):
             )
         if self._seeded is not None and self._key not in sample:
             raise ValueError(f"{_OWNER}: no {self._key!r} to name the sample; it has {', '.join(map(str, sample))}")
-        with self._naming(sample.get(self._key)):
-            return self._moved(sample)
-
-    def _moved(self, sample: Mapping[str, Any]) -> dict[str, Any]:
         labels = sample.get(self._labels, {})
         if not isinstance(labels, Mapping):
             raise TypeError(
                 f"{_OWNER}: {self._labels} must be an object of labels; got {type(labels).__name__}"
                 + (". Undecoded ones are decoded by .decode()" if isinstance(labels, bytes) else "")
             )
-        fields: Sample = {}
         entry_of: dict[str, str] = {}
-        for name, value in sample.items():
-            field = None if name in (self._key, self._labels) else self._field(name, value)
-            if field is not None:
-                if field in fields or field in labels:
-                    raise ValueError(f"{_OWNER}: {name} and {entry_of.get(field, self._labels)} both hold {field}")
-                fields[field], entry_of[field] = value, name
-        lists = set()
-        for name, value in labels.items():
-            if name == "camera" or value is None or not (name.endswith("_valid") or self._kind(name, value)):
-                continue
-            if isinstance(value, list):
-                lists.add(name)
-            fields[name] = _array(name, value, self._kind(name, value)) if isinstance(value, list) else value
-        camera = labels.get("camera")
-        if camera is not None:
-            fields["camera"] = camera if isinstance(camera, Camera) else self._camera(camera, fields)
+        for entry, value in sample.items():
+            if (field := self._field(entry, value)) is not None:
+                if field in entry_of or field in labels:
+                    raise ValueError(f"{_OWNER}: {entry} and {entry_of.get(field, self._labels)} both hold {field}")
+                entry_of[field] = entry
+        moved = self._moved(sample.get(self._key), {**labels, **{f: sample[entry] for f, entry in entry_of.items()}})
         result, told = dict(sample), dict(labels)
-        for name, value in self._move(sample.get(self._key), fields).items():
+        for name, value in moved.items():
             if name in entry_of:
                 result[entry_of[name]] = value
-            elif isinstance(value, Camera):
-                numbers = to_columns(value, "")
-                told[name] = {part: _plain(numbers[f"_{part}"]) for part in PARTS}
             elif name == "image_valid":
                 result[f"{name}.npy"] = value
+            elif isinstance(value, Camera):
+                told[name] = dict(zip(PARTS, map(_plain, to_columns(value).values()), strict=True))
             else:
-                told[name] = value if name in labels and name not in lists else _plain(value)
+                told[name] = value if isinstance(labels.get(name), np.ndarray) else _plain(value)
         result[self._labels] = told
         return result
 
     def _field(self, entry: str, value: Any) -> str | None:
         """The field that an entry holds, or None if it is passed on."""
-        if entry.startswith("__"):
-            return None
         stem, _, ending = entry.rpartition(".")
-        if entry in self._fields:
-            return entry
+        if entry in self._fields or entry.startswith("__") or entry in (self._key, self._labels):
+            return entry if entry in self._fields else None
         name = stem if ending in _ENDINGS else entry
         if not stem and ending in _ENDINGS and ending != "npy":
             name = "image"
         if ending in _ENDINGS and isinstance(value, (bytes, bytearray)):
             raise ValueError(f'{_OWNER}: {entry} is not decoded; .decode("rgb8") before .map makes arrays of images')
-        if self._kind(name or entry, value) is None:
-            if ending in _ENDINGS and np.ndim(value) >= 2:
-                raise ValueError(
-                    f"{_OWNER}: whether {entry} moves is not known; fields={{{entry!r}: KIND}} says so, where KIND is "
-                    f"{', '.join(IMAGES)} or {KEEP}, among others"
-                )
-            return None
-        if name in KINDS and not isinstance(value, np.ndarray):
-            raise TypeError(
-                f'{_OWNER}: {entry} must be a numpy array, as of .decode("rgb8"); got {type(value).__name__}'
+        if self._moves(name or entry, value):
+            if not isinstance(value, np.ndarray):
+                raise TypeError(f"{_OWNER}: {entry} must be a numpy array; got {type(value).__name__}")
+            return name
+        if ending in _ENDINGS and np.ndim(value) >= 2:
+            raise ValueError(
+                f"{_OWNER}: whether {entry} moves is not known; fields={{{entry!r}: KIND}} says so, where KIND is "
+                f"{', '.join(IMAGES)} or {KEEP}, among others"
             )
-        return name
-
-
-def _array(name: str, value: list[Any], kind: str | None) -> np.ndarray[Any, Any]:
-    """A label as an array: of float64, or of bool for validity."""
-    try:
-        array = np.asarray(value, bool if kind is None else np.float64)
-    except (ValueError, TypeError, OverflowError):
-        raise ValueError(f"{_OWNER}: {name} must be numbers in lists of one length; got {value!r:.80}") from None
-    if array.size or kind is None:
-        return array
-    return array.reshape(*[0] * (KINDS[kind].dims - 1), *KINDS[kind].last)
+        return None
 
 
 def _plain(value: Any) -> Any:

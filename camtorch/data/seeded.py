@@ -135,15 +135,6 @@ class Seeded:
             raise TypeError(f"Seeded: a Transform of arrays takes one sample, and one key; got {key!r:.60}")
         return self.augmentation(sample, draw=self.draw(key), **fields)  # type: ignore[arg-type]
 
-    def state_dict(self) -> dict[str, int]:
-        """What a checkpoint needs: the seed and the epoch."""
-        return {"seed": self.seed, "epoch": self.epoch}
-
-    def load_state_dict(self, state: Mapping[str, int]) -> None:
-        """Go on from a checkpoint, also in the workers of a DataLoader."""
-        numbers = _number(state["seed"], "seed"), _number(state["epoch"], "epoch")
-        self._numbers.copy_(torch.tensor(numbers))
-
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
         self._numbers.share_memory_()

@@ -20,7 +20,7 @@ _SENSOR = 36.0  # millimetres
 _LENSES = (1.0, 5000.0)  # millimetres, beyond which Blender takes the nearest
 
 
-def files(rig: Rig, path: str) -> dict[str, bytes]:
+def render(rig: Rig, path: str) -> str:
     """A script that adds one camera to the scene, and sets what the scene says of the image."""
     lossy = Lossy(path, NAMES.title)
     name, camera = lossy.only_camera(rig)
@@ -75,4 +75,4 @@ scene.render.resolution_x, scene.render.resolution_y, scene.render.resolution_pe
 scene.render.pixel_aspect_x, scene.render.pixel_aspect_y = {max(fy / fx, 1.0)!r}, {max(fx / fy, 1.0)!r}
 data.sensor_fit, data.sensor_width = "HORIZONTAL", {_SENSOR}
 '''
-    return {path: (text + "\n".join(lens) + "\n").encode()}
+    return text + "\n".join(lens) + "\n"

@@ -6,10 +6,9 @@ from typing import Any
 
 from camtorch.io.protocol import Names
 from camtorch.io.record import Record, one_of
-from camtorch.io.writing import Lossy, number, quoted
 from camtorch.rig import Rig
 
-NAMES = Names("camodocal", "camodocal", (".yaml", ".yml"), ("image_0?.yaml", "*camodocal*.y*ml"))
+NAMES = Names("camodocal", "camodocal")
 
 _GROUPS = ("mirror_parameters", "distortion_parameters", "projection_parameters")
 _RADTAN = ("k1", "k2", "p1", "p2")
@@ -34,21 +33,3 @@ def parse(record: Record) -> Rig:
     size = record["image_height"].side(), record["image_width"].side()
     name = record["camera_name"].text() if "camera_name" in record else ""
     return Rig({name or "camera": record.camera(key, values[-4:], values[:-4], size)})
-
-
-def render(rig: Rig, path: str) -> str:
-    """The text of a file of one camera."""
-    lossy = Lossy(path, NAMES.title)
-    lossy.no_pose(rig)
-    name, camera = lossy.only_camera(rig)
-    height, width = lossy.size(name, camera)
-    key, intrinsics, distortion = lossy.model(name, camera, ("pinhole", *(key for key, _ in _MODELS.values())))
-    kind, (_, names) = next((k, m) for k, m in _MODELS.items() if m[0] == key or (key, k) == ("pinhole", "PINHOLE"))
-    if key != "mei":
-        distortion = [0.0] * 4 if key == "pinhole" else lossy.at_most(name, camera, distortion, (4,))
-    values = iter([*distortion, *intrinsics])
-    lines = ["%YAML:1.0", "---", f"model_type: {kind}", f"camera_name: {quoted(name)}"]
-    lines += [f"image_width: {width}", f"image_height: {height}"]
-    for group, there in zip(_GROUPS, names, strict=True):
-        lines += [f"{group}:", *(f"   {name}: {number(next(values))}" for name in there)] if there else []
-    return "\n".join(lines) + "\n"

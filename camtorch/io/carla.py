@@ -27,7 +27,7 @@ _FITTED: dict[str, int | None] = {"kannala_brandt": 4, "brown_conrady": 5}
 _POWERS = 6  # of ftheta beyond the first
 
 
-def files(rig: Rig, path: str) -> dict[str, bytes]:
+def render(rig: Rig, path: str) -> str:
     """The text of a file of one camera, which loses its name."""
     lossy = Lossy(path, NAMES.title)
     lossy.no_pose(rig)
@@ -65,4 +65,4 @@ def files(rig: Rig, path: str) -> dict[str, bytes]:
         **{key: number(value) for key, value in numbers.items()},
         "distortion_coeffs": ",".join(map(number, values)),
     }
-    return {path: as_json({"blueprint": "sensor.camera.rt_lens", "lens": fit, "attributes": attributes}).encode()}
+    return as_json({"blueprint": "sensor.camera.rt_lens", "lens": fit, "attributes": attributes})

@@ -10,21 +10,19 @@ import os
 import re
 import struct
 from array import array
-from collections.abc import Iterable, Iterator
-from typing import Any, BinaryIO, NamedTuple
+from collections.abc import Callable, Iterable, Iterator
+from typing import Any, BinaryIO
 
 import numpy as np
-import torch
 
 from camtorch.camera import Camera
 from camtorch.io import poses
 from camtorch.io.nerfstudio import panorama
 from camtorch.io.parsing import check_ordinary, decoded
 from camtorch.io.protocol import Names
-from camtorch.io.record import Record, repeated
-from camtorch.io.writing import Lossy, all_left_over, number
+from camtorch.io.record import Record
+from camtorch.io.writing import Lossy, number
 from camtorch.rig import Rig
-from camtorch.rotations import quaternion_vector
 
 NAMES = Names("colmap", "COLMAP", (".txt", ".bin"), ("*.txt", "*.bin"), ("cameras.bin", "cameras.txt"))
 
@@ -62,7 +60,6 @@ _MOST_COMMENTS = 10_000  # and blank lines, before the first image or between tw
 _MOST_IMAGES = 1 << 18  # each takes some 400 bytes
 _LONGEST_NAME = 4096
 _LONGEST_LINE = 1 << 26
-_SAME = 1e-12  # of poses: what another format may have rounded
 _LARGEST_ID = (1 << 32) - 2  # of cameras; the one above means none
 
 
@@ -77,18 +74,14 @@ def read(path: str, content: bytes) -> Rig:
     cameras = _from_bytes(path, content) if path.endswith(".bin") else _from_text(path, content)
     beside = _images_beside(path)
     if beside is None or not os.path.exists(beside):
-        if beside is not None and (lost := all_left_over([beside])):
-            name = os.path.basename(lost[0])
-            Record(beside, None, "file").fail(f"missing; an interrupted save left {name}: rename it, or delete it")
         return Rig(cameras)
-    images = _read_images(beside)
-    if unknown := set(images.cameras) - cameras.keys():
-        row = next(row for row, camera in enumerate(images.cameras) if camera in unknown)
-        images.record(row).fail(f"its camera {images.cameras[row]} is not in {os.path.basename(path)}")
-    if not images.names:
+    images, values, _, record = _read_images(beside)
+    for row, camera in enumerate(images.values()):
+        if camera not in cameras:
+            record(row).fail(f"its camera {camera} is not in {os.path.basename(path)}")
+    if not images:
         return Rig(cameras)
-    batch = poses.from_quaternions(images.record, images.values)
-    return Rig(cameras, (images.names, batch), images=dict(zip(images.names, images.cameras, strict=True)))
+    return Rig(cameras, (list(images), poses.from_quaternions(record, values)), images=images)
 
 
 def _images_beside(path: str) -> str | None:
@@ -174,56 +167,35 @@ def _add(
 # -- images.txt and images.bin: the poses of images, whose points are passed over
 
 
-class _Images(NamedTuple):
-    """The images of a file.
-
-    names and cameras: of each image, the latter by their ids.
-    values: (N, 7), unit quaternions w, x, y, z and translations.
-    has_points: whether any of them has points.
-    unit, places: what numbers the place of an image in the file, and those numbers.
-    """
-
-    path: str
-    names: list[str]
-    cameras: list[str]
-    values: np.ndarray
-    has_points: bool
-    unit: str
-    places: array[int]
-
-    def record(self, row: int) -> Record:
-        """The place of an image."""
-        return Record(self.path, None, f"{self.unit} {self.places[row]}")
-
-
-def _read_images(path: str) -> _Images:
+def _read_images(path: str) -> tuple[dict[str, str], np.ndarray, bool, Callable[[int], Record]]:
     """The images of an images.txt or images.bin.
+
+    Returns:
+        Their names with the ids of their cameras; (N, 7) quaternions w, x, y, z and translations; whether any of them
+        has points; and of a row where it stands.
 
     Raises:
         CameraFileError: it is none, or two images have one name.
     """
     check_ordinary(path)
     unit, entries = ("byte", _images_from_bytes) if path.endswith(".bin") else ("line", _images_from_text)
-    names: list[str] = []
-    cameras: list[str] = []
+    images: dict[str, str] = {}
     values, places, has_points = array("d"), array("q"), False
+
+    def record(row: int) -> Record:
+        return Record(path, None, f"{unit} {places[row]}")
+
     with open(path, "rb", buffering=1 << 16) as file:
         for place, pose, camera, name, with_points in entries(path, file):
-            if len(names) >= _MOST_IMAGES:
-                Record(path, None, f"{unit} {place}").fail(f"more than {_MOST_IMAGES} images")
-            values.extend(pose)
-            cameras.append(camera)
-            names.append(name)
             places.append(place)
+            if len(images) >= _MOST_IMAGES:
+                record(-1).fail(f"more than {_MOST_IMAGES} images")
+            if name in images:
+                record(-1).fail(f"a second image is called {name!r:.60}")
+            images[name] = camera
+            values.extend(pose)
             has_points = has_points or with_points
-    images = _Images(path, names, cameras, np.array(values).reshape(-1, 7), has_points, unit, places)
-    if (twice := repeated(names)) is not None:
-        images.record(names.index(twice, names.index(twice) + 1)).fail(f"a second image is called {twice!r:.60}")
-    finite = np.isfinite(images.values).all(1)
-    if not finite.all():
-        row = int(finite.argmin())
-        images.record(row).fail(f"a pose that is no finite number: {images.values[row].tolist()}")
-    return images
+    return images, np.array(values).reshape(-1, 7), has_points, record
 
 
 _ImageEntry = tuple[int, Iterable[float], str, str, bool]
@@ -232,7 +204,6 @@ _ImageEntry = tuple[int, Iterable[float], str, str, bool]
 
 def _images_from_text(path: str, file: BinaryIO) -> Iterator[_ImageEntry]:
     number = passed = 0
-    known: dict[bytes, str] = {}
     while line := file.readline(_LONGEST_LINE):
         number += 1
         record = Record(path, None, f"line {number}")
@@ -246,15 +217,12 @@ def _images_from_text(path: str, file: BinaryIO) -> Iterator[_ImageEntry]:
             _text(record, line)
             record.fail(f"less than IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME: {len(words)} words")
         try:
-            pose = list(map(float, words[1:8]))
+            pose, camera = list(map(float, words[1:8])), int(words[8])
         except ValueError:
-            pose = [Record(path, _text(record, word), record.place).number() for word in words[1:8]]
-        if words[8] not in known:
-            identity = Record(path, _text(record, words[8]), record.place).whole(0, _LARGEST_ID, "camera id")
-            known[words[8]] = str(identity)
+            record.fail(f"seven numbers and the id of a camera were expected; got {words[1:9]!r:.100}")
         name = _text(record, words[9].strip())
         points = file.readline(_LONGEST_LINE)  # of the image; the line may be empty
-        yield number, pose, known[words[8]], name, not (points.isspace() or not points)
+        yield number, pose, str(camera), name, not (points.isspace() or not points)
         number += 1
 
 
@@ -318,13 +286,11 @@ def files(rig: Rig, path: str) -> dict[str, bytes]:
         if beside is None:
             way = f"call the file cameras{suffix}, or name a folder"
             lossy.fail("extrinsics", f"no place: COLMAP has them in images{suffix} beside cameras, so {way}")
-        content = _images_content(lossy, rig, identities, beside, binary)
-        if content is not None:
-            contents[beside] = content
-            # COLMAP opens no folder without its points
-            points = os.path.join(os.path.dirname(path), f"points3D{suffix}")
-            if not os.path.exists(points):
-                contents[points] = struct.pack("<Q", 0) if binary else b"# Number of points: 0\n"
+        contents[beside] = _images_content(lossy, rig, identities, beside, binary)
+        # COLMAP opens no folder without its points
+        points = os.path.join(os.path.dirname(path), f"points3D{suffix}")
+        if not os.path.exists(points):
+            contents[points] = struct.pack("<Q", 0) if binary else b"# Number of points: 0\n"
     elif beside is not None and os.path.exists(beside):
         lossy.fail("extrinsics", f"none, while {beside} has poses of images, which these cameras would get")
     return contents
@@ -370,29 +336,21 @@ def _as_bytes(entries: list[tuple[Any, ...]]) -> bytes:
     return b"".join(parts)
 
 
-def _images_content(lossy: Lossy, rig: Rig, identities: dict[str, int], path: str, binary: bool) -> bytes | None:
-    """The file of a rig's poses, or None if the file that is there says the same.
+def _images_content(lossy: Lossy, rig: Rig, identities: dict[str, int], path: str, binary: bool) -> bytes:
+    """The file of a rig's poses.
 
     Raises:
         CameraFileError: the file that is there has points, which would be lost.
     """
     entries = []
-    posed = poses.all_of(rig, lossy)
-    for name, values in zip(rig.extrinsics, poses.quaternions(posed).tolist(), strict=True):
+    for name, values in zip(rig.extrinsics, poses.quaternions(poses.all_of(rig, lossy)).tolist(), strict=True):
         if not name or "\0" in name or (not binary and (name.split() != [name])):
             lossy.fail(
                 repr(name), "an image name that COLMAP does not read" + " from text; .bin takes it" * (not binary)
             )
         entries.append((name, identities[rig.images.get(name, name)], values))
-    if os.path.exists(path):
-        there = _read_images(path)
-        if [entry[:2] for entry in entries] == list(zip(there.names, map(int, there.cameras), strict=True)):
-            its = poses.as_float64(there.values)
-            theirs = torch.cat((quaternion_vector(its[:, :4]), its[:, 4:]), -1)
-            if torch.allclose(theirs, torch.cat((posed.rotation, posed.translation), -1), rtol=_SAME, atol=_SAME):
-                return None
-        if there.has_points:
-            Record(path, None).fail("holds the points of images, which would be lost; write to another folder")
+    if os.path.exists(path) and _read_images(path)[2]:
+        Record(path, None).fail("holds the points of images, which would be lost; write to another folder")
     folder, suffix = os.path.dirname(path), os.path.splitext(path)[1]
     for name in ("rigs", "frames"):
         if os.path.exists(os.path.join(folder, name + suffix)):

@@ -1,15 +1,11 @@
-"""The files of a `cv2.FileStorage`: numbers and matrices as YAML, JSON and XML, and XML read."""
+"""The files of a `cv2.FileStorage`, as they are written: numbers and matrices as YAML, JSON and XML."""
 
 from __future__ import annotations
 
 import json
 import os
-import re
-from typing import Any, NoReturn
-from xml.parsers import expat
+from typing import Any
 
-from camtorch.io._errors import CameraFileError
-from camtorch.io.record import repeated
 from camtorch.io.writing import number, replacing
 
 Value = float | list[list[float]]
@@ -52,87 +48,3 @@ def write(path: str | os.PathLike[str], values: dict[str, Value]) -> None:
         raise ValueError(f"{os.fspath(path)}: files of OpenCV are called .yml, .json or .xml")
     with replacing(path) as (file,):
         file.write(text_for(path, values).encode())
-
-
-# -- reading XML: a mapping in <opencv_storage>, sequences as words or as elements called _
-
-_WORD = re.compile(r'"([^"]*)"|(\S+)')
-_DEEPEST = 100
-_MOST_VALUES = 1 << 17
-_MOST_ATTRIBUTES = 1 << 14
-
-
-def parse_storage(path: str | os.PathLike[str], content: bytes) -> dict[str, Any]:
-    """The keys of an XML file in UTF-8, as `camtorch.io.parsing.parse_mapping`.
-
-    Raises:
-        CameraFileError: no XML, a document type or an entity declared, a key twice, nested too deeply.
-    """
-    if declared := re.search(rb"<!(?:DOCTYPE|ENTITY|ELEMENT|ATTLIST|NOTATION)", content, re.IGNORECASE):
-        line = content.count(b"\n", 0, declared.start()) + 1
-        raise CameraFileError(path, f"line {line}", "a document type, which could define entities: not read")
-    if content.count(b"=") > _MOST_ATTRIBUTES:  # which make a mapping of each element before anyone can look
-        raise CameraFileError(path, "content", "too many attributes")
-    parser = expat.ParserCreate("utf-8")
-    parser.buffer_text, parser.buffer_size = True, 1 << 16
-    elements = _Elements(path, parser)
-    parser.StartElementHandler = elements.start
-    parser.EndElementHandler = elements.end
-    parser.CharacterDataHandler = elements.text
-    try:
-        parser.Parse(content, True)
-    except expat.ExpatError as error:
-        raise CameraFileError(path, f"line {error.lineno}", f"not XML: {expat.ErrorString(error.code)}") from None
-    root: dict[str, Any] = elements.root
-    return root
-
-
-class _Elements:
-    """The open elements: name, whether a matrix, text so far, children."""
-
-    def __init__(self, path: str | os.PathLike[str], parser: expat.XMLParserType):
-        self.path, self.parser = path, parser
-        self.root: Any = None
-        self.open: list[tuple[str, list[str], list[tuple[str, Any]]]] = []
-        self.count = 0
-
-    def fail(self, reason: str) -> NoReturn:
-        raise CameraFileError(self.path, f"line {self.parser.CurrentLineNumber}", reason)
-
-    def start(self, name: str, attributes: dict[str, str]) -> None:
-        if len(self.open) >= _DEEPEST:
-            self.fail("nested too deeply")
-        if not self.open and name != "opencv_storage":
-            self.fail(f"<{name:.60}> where <opencv_storage> belongs: XML is read where OpenCV wrote it")
-        self.counted(1)
-        self.open.append((name, [], []))
-
-    def counted(self, more: int) -> None:
-        self.count += more
-        if self.count > _MOST_VALUES:
-            self.fail(f"too many values: more than {_MOST_VALUES} are not read")
-
-    def text(self, text: str) -> None:
-        self.open[-1][1].append(text)
-
-    def end(self, name: str) -> None:
-        _, texts, children = self.open.pop()
-        words = []
-        for word in _WORD.finditer("".join(texts)):
-            self.counted(1)
-            words.append(word[1] or word[2] or "")
-        names = [key for key, _ in children]
-        if not self.open or (children and set(names) != {"_"}):
-            if words:
-                self.fail(f"text between the elements of <{name:.60}>")
-            if (twice := repeated(names)) is not None:
-                self.fail(f"the key {twice!r:.60} stands there twice")
-            value: Any = dict(children)
-        elif children or len(words) != 1 or name == "data":
-            value = words + [value for _, value in children]
-        else:
-            value = words[0]
-        if self.open:
-            self.open[-1][2].append((name, value))
-        else:
-            self.root = value

@@ -35,12 +35,12 @@ from camtorch.io import (
 )
 from camtorch.io._errors import CameraFileError
 from camtorch.io.parsing import parse_mapping, path_of, read_bytes
-from camtorch.io.protocol import ContentFormat, KeyFormat, WrittenFormat
+from camtorch.io.protocol import ContentFormat, FilesFormat, KeyFormat, Names, TextFormat
 from camtorch.io.record import Record
 from camtorch.io.writing import replacing
 from camtorch.rig import Rig
 
-# in the order in which they are asked
+# read, in the order in which they are asked
 _BY_CONTENT: tuple[ContentFormat, ...] = (colmap, metashape, nuscenes, ocamcalib)
 _BY_KEYS: tuple[KeyFormat, ...] = (
     camtorch_json,
@@ -57,13 +57,26 @@ _BY_KEYS: tuple[KeyFormat, ...] = (
     opencv,
 )
 
-# what renderers take, and nothing here reads
-_WRITTEN: tuple[WrittenFormat, ...] = (usda, carla, blender, rays)
+# written
+_AS_TEXT: tuple[TextFormat, ...] = (
+    aria,
+    basalt,
+    blender,
+    camtorch_json,
+    carla,
+    kalibr,
+    mrcal,
+    nerfstudio,
+    opencv,
+    ros,
+    usda,
+)
+_AS_FILES: tuple[FilesFormat, ...] = (colmap, rays)
 
-READ = {names.format: names for names in (*(m.NAMES for m in _BY_CONTENT), *(m.NAMES for m in _BY_KEYS))}
-NAMES_BY_FORMAT = READ | {m.NAMES.format: m.NAMES for m in _WRITTEN}
-FORMATS = tuple(NAMES_BY_FORMAT)
-_NOT_READ = {s for m in _WRITTEN for s in m.NAMES.suffixes} - {".npz"} - {s for n in READ.values() for s in n.suffixes}
+READ = {m.NAMES.format: m.NAMES for m in (*_BY_CONTENT, *_BY_KEYS)}
+WRITTEN = {m.NAMES.format: m.NAMES for m in (*_AS_TEXT, *_AS_FILES)}
+FORMATS = tuple(READ | WRITTEN)
+_OF_RENDERERS = (".usda", ".exr")  # whose content says nothing to a reader
 
 
 def load(path: str | os.PathLike[str], format: str | None = None) -> Rig:
@@ -76,7 +89,7 @@ def load(path: str | os.PathLike[str], format: str | None = None) -> Rig:
             WoodScape, Gyroflow, camodocal, Metashape, nuScenes or camtorch; an archive of
             `numpy.savez(path, K=K, D=D)`; or the folder of a COLMAP or Nerfstudio reconstruction. COLMAP's images
             beside the cameras are read with them.
-        format: its format, one of the keys of `camtorch.save`; found from content and name if left out.
+        format: its format, "opencv", "ros" and so on, in small letters; found from content and name if left out.
 
     Returns:
         A `Rig`: `rig.cameras`, `rig.extrinsics` (camera from rig, or from world for posed images), `rig.camera` if
@@ -87,9 +100,7 @@ def load(path: str | os.PathLike[str], format: str | None = None) -> Rig:
         CameraFileError: the file cannot be used; it says where and why. OSError: it cannot be opened.
         ValueError: an unknown format. TypeError: no path.
     """
-    path, format = path_of(path, "load", "calibration file"), _known(format)
-    if format is not None and format not in READ:
-        raise ValueError(f"format: {format!r} is written only; read are {', '.join(sorted(READ))}")
+    path, format = path_of(path, "load", "calibration file"), _known(format, READ, "read")
     if os.path.isdir(path):
         names = [name for names in READ.values() for name in names.in_folder]
         found = next((name for name in names if os.path.exists(os.path.join(path, name))), None)
@@ -111,7 +122,7 @@ def _read(path: str, content: bytes, format: str | None) -> tuple[Rig, str]:
     for by_content in _BY_CONTENT:
         if format == by_content.NAMES.format or (format is None and by_content.matches(path, content)):
             return by_content.read(path, content), by_content.NAMES.format
-    if format is None and path.lower().endswith(tuple(_NOT_READ)):
+    if format is None and path.lower().endswith(_OF_RENDERERS):
         raise CameraFileError(path, "content", "a file for renderers, which is written only: load what it was made of")
     keys = parse_mapping(path, content)
     for by_keys in _BY_KEYS:
@@ -124,6 +135,8 @@ def _read(path: str, content: bytes, format: str | None) -> tuple[Rig, str]:
 def save(rig: Rig | Camera, path: str | os.PathLike[str], format: str | None = None) -> None:
     """Write cameras to a calibration file; what stood there before is replaced as a whole, or stays.
 
+    Of the formats that `load` reads, those of data sets and of programs that make their own calibrations are read only.
+
     Of what renderers take ("usda", "carla", "blender"), a lens that the format has no model for is the closest one that
     it has: a warning says how far off that is, as the file does.
 
@@ -131,11 +144,10 @@ def save(rig: Rig | Camera, path: str | os.PathLike[str], format: str | None = N
         rig: a `Rig`, or one camera.
         path: the file, which may be a link: then what it points to is replaced. With COLMAP it may be a folder, where
             poses go to an images file beside the cameras; with Nerfstudio one that exists.
-        format: "opencv", "ros", "kalibr", "colmap", "nerfstudio", "aria", "basalt", "mrcal", "ncore",
-            "ocamcalib", "woodscape", "gyroflow", "camodocal" or "camtorch"; written only, "usda", "carla",
-            "blender" or "rays". If left out: the format that the rig was loaded from if its files end like this one,
-            else what the name says (`transforms.json`, `camchain.yaml`, `camera_info.yaml`, `.cameramodel`, `.xml`,
-            `cameras.txt`, `.bin`, `.usda`, `.exr`), else camtorch's own for `.json`.
+        format: "opencv", "ros", "kalibr", "colmap", "nerfstudio", "aria", "basalt", "mrcal" or "camtorch"; written
+            only, "usda", "carla", "blender" or "rays". If left out: the format that the rig was loaded from if its
+            files end like this one, else what the name says (`transforms.json`, `camchain.yaml`, `camera_info.yaml`,
+            `.cameramodel`, `.xml`, `cameras.txt`, `.bin`, `.usda`, `.exr`), else camtorch's own for `.json`.
 
     Raises:
         CameraFileError: something that the format cannot hold; it says what would be lost.
@@ -173,33 +185,34 @@ def rendered(rig: Rig | Camera, path: str | os.PathLike[str], format: str | None
             raise TypeError(f"{path}: {name} is a Mixed, and files hold cameras by name: save {by_name}")
         if not camera.key:
             raise TypeError(f"{path}: {name} is a {type(camera).__name__}, which has no key of its own to be loaded by")
-    format = _known(format) or _format_of(rig, path)
+    format = _known(format, WRITTEN, "written") or _format_of(rig, path)
     if os.path.isdir(path):
-        inside = [os.path.join(path, name) for name in NAMES_BY_FORMAT[format].in_folder]
+        inside = [os.path.join(path, name) for name in WRITTEN[format].in_folder]
         if not inside:
             raise ValueError(f"{path}: is a folder; {format} is one file, so name it")
         path = next(filter(os.path.exists, inside), inside[-1])
     try:
-        for by_content in (*_BY_CONTENT, *_WRITTEN):
-            if by_content.NAMES.format == format:
-                return by_content.files(rig, path)
-        by_keys = next(module for module in _BY_KEYS if module.NAMES.format == format)
-        return {path: by_keys.render(rig, path).encode()}
+        for writer in _AS_FILES:
+            if writer.NAMES.format == format:
+                return writer.files(rig, path)
+        text = next(module for module in _AS_TEXT if module.NAMES.format == format)
+        return {path: text.render(rig, path).encode()}
     except UnicodeEncodeError as error:
         raise CameraFileError(path, "names", f"{error.object!r:.60} is no text that a file can hold") from None
 
 
-def _known(format: str | None) -> str | None:
+def _known(format: str | None, there: dict[str, Names], done: str) -> str | None:
     name = None if format is None else str(format).lower()
-    if name is not None and name not in FORMATS:
-        raise ValueError(f"format: {format!r} is not known here; known are {', '.join(sorted(FORMATS))}")
-    return name
+    if name is None or name in there:
+        return name
+    reason = f"is not {done}" if name in FORMATS else "is not known here"
+    raise ValueError(f"format: {format!r} {reason}; {done} are {', '.join(sorted(there))}")
 
 
 def _format_of(rig: Rig, path: str) -> str:
     """The format to write: the rig's own if it may be, else the one that the name of the file means."""
     folder, file = os.path.isdir(path), os.path.basename(path).lower()
-    fitting = [n for n in NAMES_BY_FORMAT.values() if (n.in_folder if folder else file.endswith(n.suffixes))]
+    fitting = [n for n in WRITTEN.values() if (n.in_folder if folder else file.endswith(n.suffixes))]
     formats = sorted(names.format for names in fitting)
     if rig.format is not None and rig.format in formats:
         return rig.format
@@ -209,7 +222,7 @@ def _format_of(rig: Rig, path: str) -> str:
     meant = [pattern for pattern in patterns if fnmatch.fnmatchcase(file, pattern)]
     if meant:
         return patterns[max(meant, key=len)]
-    may = f"it may be {', '.join(formats)}" if formats else f"known are {', '.join(sorted(FORMATS))}"
+    may = f"it may be {', '.join(formats)}" if formats else f"written are {', '.join(sorted(WRITTEN))}"
     raise ValueError(
         f"{path}: the name does not say the format; {may}. Say which, as in format='kalibr' or --format kalibr"
     )

@@ -4,24 +4,21 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from typing import Any, NoReturn
+from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
 
 from camtorch.camera import Camera
 from camtorch.io import poses
-from camtorch.io.parsing import decoded
+from camtorch.io.parsing import decoded, parse_xml
 from camtorch.io.protocol import Names
 from camtorch.io.record import Record, one_of
-from camtorch.io.writing import Lossy
 from camtorch.rig import Rig
 
-NAMES = Names("metashape", "Metashape", (".xml",), ("*metashape*.xml", "cameras.xml"))
+NAMES = Names("metashape", "Metashape")
 
 _KIND = re.compile(rb"(?:<\?xml[^>]*>\s*)?<(?:calibration>|document\b.{,400}?<chunk\b)", re.S)
-_BYTES_PER_NODE = 16  # of the file, where there are more than a few elements and attributes
-_FEW_NODES = 1 << 14
 # type of a sensor, or projection of a calibration -> key, its coefficients by Metashape's names
 _MODELS = {
     "frame": ("brown_conrady", ("k1", "k2", "p2", "p1", "k3")),
@@ -41,7 +38,7 @@ def read(path: str, content: bytes) -> Rig:
 
     Poses are of the world that the transform of the chunk, or of its component, says; without one, of the chunk.
     """
-    root = _parse(path, content)
+    root = parse_xml(path, decoded(path, content))
     if root.tag == "calibration":
         return Rig({"camera": _camera(Record(path, _values(root), "calibration"))})
     chunks = root.findall("chunk")
@@ -61,21 +58,6 @@ def read(path: str, content: bytes) -> Rig:
         best = next((one for one in reversed(found) if one.get("class") == "adjusted"), found[-1])
         cameras[name] = _camera(Record(path, {"type": sensor.get("type"), **_members(best)}, f"sensor {name:.60}"))
     return _posed(path, chunks[0], cameras, dict(zip((sensor.get("id") for sensor in sensors), names, strict=True)))
-
-
-def _parse(path: str, content: bytes) -> ElementTree.Element:
-    text, whole = decoded(path, content), Record(path, None)
-    if declared := re.search(r"<!(?:DOCTYPE|ENTITY|ELEMENT|ATTLIST|NOTATION)", text, re.IGNORECASE):
-        line = text.count("\n", 0, declared.start()) + 1
-        Record(path, None, f"line {line}").fail("a document type, which could define entities: not read")
-    if text.count("=") + text.count("<") > max(_FEW_NODES, len(text) // _BYTES_PER_NODE):
-        whole.fail("too many elements")
-    try:
-        return ElementTree.fromstring(text.encode())
-    except ElementTree.ParseError as error:
-        return Record(path, None, f"line {error.position[0]}").fail(f"not XML: {str(error).split(':')[0]}")
-    except (ValueError, LookupError) as error:
-        return whole.fail(error)
 
 
 def _values(element: ElementTree.Element) -> Any:
@@ -157,8 +139,3 @@ def _posed(path: str, chunk: ElementTree.Element, cameras: dict[str, Camera], se
         return Rig(cameras)
     batch = poses.from_matrices(lambda i: places[i], np.array(rows), undo=True)
     return Rig(cameras, (names, batch), images={name: own for name, own in images.items() if name != own})
-
-
-def files(rig: Rig, path: str) -> NoReturn:
-    """Raise the CameraFileError that nothing is written."""
-    Lossy(path, NAMES.title).fail("format", "read only. Save as format='opencv' or 'colmap'")

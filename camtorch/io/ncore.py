@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
-import torch
 
 from camtorch.camera import Camera
 from camtorch.io.protocol import Names
 from camtorch.io.record import Record, one_of
-from camtorch.io.writing import Lossy, as_json
 from camtorch.models import FTheta, FThetaBackward
 from camtorch.rig import Rig
 from camtorch.windshield import Windshield
 
-NAMES = Names("ncore", "ncore", (".json",), ("*ncore*.json",))
+NAMES = Names("ncore", "ncore")
 
 _POLYNOMIALS = {
     "ANGLE_TO_PIXELDIST": ("angle_to_pixeldist_poly", FTheta),
@@ -84,33 +81,3 @@ def _of_opencv(values: Record, kind: str) -> Camera:
         radial, tangential, prism = (values[name].numbers(count) for name, count in counts)
         key, distortion = "brown_conrady", [*radial[:2], *tangential, *radial[2:], *prism]
     return values.camera(key, [fx, fy, cx - 0.5, cy - 0.5], distortion, values["resolution"].size())
-
-
-def render(rig: Rig, path: str) -> str:
-    """The text of a file of one camera, which loses its name, with a global shutter.
-
-    Cameras of OpenCV's models alone: an f-theta and a windshield would need approximate inverses beside them.
-    """
-    lossy = Lossy(path, NAMES.title)
-    lossy.no_pose(rig)
-    name, camera = lossy.only_camera(rig)
-    height, width = lossy.size(name, camera)
-    key, (fx, fy, cx, cy), k = lossy.model(name, camera, {"pinhole", "brown_conrady", "kannala_brandt"})
-    values: dict[str, Any] = {
-        "resolution": [width, height],
-        "shutter_type": "GLOBAL",
-        "external_distortion_parameters": None,
-        "principal_point": [cx + 0.5, cy + 0.5],
-        "focal_length": [fx, fy],
-    }
-    if key == "kannala_brandt":
-        values["radial_coeffs"] = lossy.at_most(name, camera, k, (4,))
-        rays, valid = camera.unproject([[-0.5, -0.5], [width - 0.5, -0.5], [-0.5, height - 0.5], [width, height]])
-        angles = torch.where(valid, torch.acos(rays[..., 2].clamp(-1, 1)), 0.0)
-        values["max_angle"] = float(angles.max()) or math.pi / 2
-        return as_json({"camera_model_type": "opencv-fisheye", "camera_model_parameters": values})
-    if key == "brown_conrady":
-        k1, k2, p1, p2, k3, k4, k5, k6, *prism = lossy.at_most(name, camera, k, (12,))
-        values |= {"radial_coeffs": [k1, k2, k3, k4, k5, k6], "tangential_coeffs": [p1, p2], "thin_prism_coeffs": prism}
-    kind = "ideal-pinhole" if key == "pinhole" else "opencv-pinhole"
-    return as_json({"camera_model_type": kind, "camera_model_parameters": values})

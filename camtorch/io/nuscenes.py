@@ -5,17 +5,15 @@ from __future__ import annotations
 import os
 import re
 from collections import Counter
-from typing import NoReturn
 
 from camtorch.camera import Camera
 from camtorch.io import poses
 from camtorch.io.parsing import decoded, parse_json, read_bytes
 from camtorch.io.protocol import Names
 from camtorch.io.record import Record
-from camtorch.io.writing import Lossy
 from camtorch.rig import Rig
 
-NAMES = Names("nuscenes", "nuScenes", (".json",), ("calibrated_sensor.json",))
+NAMES = Names("nuscenes", "nuScenes")
 
 _START = 4096  # in which the first sensor shows
 
@@ -59,15 +57,9 @@ def _table(path: str, content: bytes) -> Record:
 
 
 def _camera(sensor: Record) -> Camera:
-    matrix = sensor["camera_intrinsic"]
-    intrinsics = matrix.intrinsics([number for row in matrix.rows(3, 3) for number in row])
+    intrinsics = sensor["camera_intrinsic"].intrinsics()
     lens = sensor.get("camera_distortion")  # of nuImages
     distortion = [] if lens is None else lens.numbers()
     if lens is not None and len(distortion) == 6 and distortion.pop():
         lens.fail("a sixth coefficient, of fisheyes, whose formula nuImages does not say")
     return sensor.camera("brown_conrady" if distortion else "pinhole", intrinsics, distortion, None, lens=lens)
-
-
-def files(rig: Rig, path: str) -> NoReturn:
-    """Raise the CameraFileError that nothing is written: the tables of a data set belong together."""
-    Lossy(path, NAMES.title).fail("format", "read only: its tables refer to one another. Save as format='camtorch'")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 import re
 import warnings
@@ -46,8 +45,8 @@ class AmbiguousModelWarning(UserWarning):
     """A file leaves open of which model its coefficients are."""
 
 
-def read(path: str | os.PathLike[str], model: str | None = None, *, name: str | None = None) -> Camera:
-    """The camera of an OpenCV YAML, JSON or XML file, in float64 and frozen.
+def read(path: str | os.PathLike[str], model: str | None = None) -> Camera:
+    """The only camera of an OpenCV YAML, JSON or XML file, in float64 and frozen; of several `read_rig(path)[name]`.
 
     Args:
         path: a file with a camera matrix (`camera_matrix`, `cameraMatrix`, `K`, `M`, `mtx`) and, where it has them,
@@ -55,26 +54,21 @@ def read(path: str | os.PathLike[str], model: str | None = None, *, name: str | 
         model: a key of `camtorch.MODELS`, for a file that leaves it open. If left out: without coefficients a pinhole,
             with a true `fisheye_model` a Kannala-Brandt, with `xi` a Mei, else a Brown-Conrady camera, with a warning
             where 4 coefficients could be of two models.
-        name: which camera of a file with several: the end of its keys, "1" for `M1` and `D1`.
 
     Raises:
-        CameraFileError: not one usable camera in the file, or one of another model than `model`.
-        OSError: no such file, or it cannot be opened. ValueError: an unknown model.
+        CameraFileError: no usable camera in the file, or one of another model than `model`.
+        OSError: no such file, or it cannot be opened. ValueError: an unknown model, or several cameras.
     """
     check_path(path, "io.opencv.read")
-    return _File(Record(path, parse_mapping(path, read_bytes(path)))).camera(_known(model), name).requires_grad_(False)
+    return read_rig(path, model).camera
 
 
 def read_rig(path: str | os.PathLike[str], model: str | None = None) -> Rig:
     """All cameras of such a file, and the pose of a pair, all frozen; see `read`, which says what it raises."""
     check_path(path, "io.opencv.read_rig")
-    return parse(Record(path, parse_mapping(path, read_bytes(path))), _known(model)).requires_grad_(False)
-
-
-def _known(model: str | None) -> str | None:
     if model is not None and (not isinstance(model, str) or model not in MODELS):
         raise ValueError(f"io.opencv: unknown model {shown(model)}; known are {', '.join(sorted(MODELS))}")
-    return model
+    return parse(Record(path, parse_mapping(path, read_bytes(path))), model).requires_grad_(False)
 
 
 def matches(keys: dict[str, Any]) -> bool:
@@ -88,7 +82,7 @@ def parse(record: Record, model: str | None = None) -> Rig:
     names = sorted(file.matrices, key=lambda name: (name.isdigit(), int(name) if name.isdigit() else 0, name))
     record.few(len(names))
     if not names:
-        file.camera(model, None)
+        file.fail("camera_matrix", "missing, also as cameraMatrix, K and M; is this a file of OpenCV's?")
     cameras = {name or "camera": file.camera(model, name) for name in names}
     extrinsics = {}
     keys = next((keys for keys in _POSES if all(key in record for key in keys)), None)
@@ -131,24 +125,14 @@ class _File:
                 named[match[1]] = key
         return named
 
-    def camera(self, model: str | None, name: str | None) -> Camera:
-        """The camera of a name, or the only one."""
-        keys = ", ".join(self.matrices.values())
-        if not keys:
-            self.fail("camera_matrix", "missing, also as cameraMatrix, K and M; is this a file of OpenCV's?")
-        if name is None and len(self.matrices) > 1:
-            one = min(self.matrices)
-            self.fail(keys, f"several cameras; choose one by its name, as in name={one!r} or --name {one}")
-        name = next(iter(self.matrices)) if name is None else name
-        if name not in self.matrices:
-            there = f"there are {sorted(self.matrices)}" if any(self.matrices) else "the only one has no name"
-            self.fail(keys, f"no camera is called {name!r:.60}; {there}")
+    def camera(self, model: str | None, name: str) -> Camera:
+        """The camera of a name."""
         key, lens, xi = self.matrices[name], self.lenses.get(name), self.xis.get(name)
-        intrinsics = self.record[key].intrinsics(self.numbers(key))
-        distortion = self.numbers(lens) if lens else []
+        intrinsics = self.record[key].intrinsics()
+        distortion = self.record[lens].flat() if lens else []
         if xi:  # cv2.omnidir
             is_matrix = isinstance(self.record[xi].value, (dict, list))
-            distortion = [*(self.numbers(xi) if is_matrix else [self.record[xi].number()]), *distortion]
+            distortion = [*(self.record[xi].flat() if is_matrix else [self.record[xi].number()]), *distortion]
         stated, place = (("mei",), xi) if xi else self.stated()
         if place is not None and model is not None and model not in stated:
             self.fail(place, f"says that the model is {stated[0]}; do not name {model}, or correct the file")
@@ -185,7 +169,7 @@ class _File:
 
     def pose(self, rotation_key: str, translation_key: str) -> Extrinsics:
         """R or a rotation vector, and T."""
-        rotation, translation = self.numbers(rotation_key), self.numbers(translation_key)
+        rotation, translation = self.record[rotation_key].flat(), self.record[translation_key].flat()
         for key, values in ((rotation_key, rotation), (translation_key, translation)):
             count = 9 if key == "R" else 3
             if len(values) != count:
@@ -204,25 +188,6 @@ class _File:
         if height is None or width is None:
             self.fail("image_height" if height is None else "image_width", "missing, while the other side is given")
         return self.record[height].side(), self.record[width].side()
-
-    def numbers(self, key: str) -> list[float]:
-        """An OpenCV matrix, a list, or a list of rows as one list."""
-        record = self.record[key]
-        if isinstance(record.value, dict):
-            if "sizes" in record:  # of any other number of dimensions; of one, XML has no list
-                says, parts = "sizes say", record["sizes"]
-                sizes = parts.numbers() if isinstance(parts.value, list) else [parts.number()]
-            else:
-                says = "rows and cols say"
-                sizes = [Record(record.path, record.value.get(s), f"{key}.{s}").number() for s in ("rows", "cols")]
-            data = record.value.get("data")
-            if not isinstance(data, list) or len(data) != math.prod(sizes):
-                count = f"{len(data)} numbers" if isinstance(data, list) else "no list"
-                self.fail(f"{key}.data", f"{count}, where {says} {' x '.join(f'{s:g}' for s in sizes)}")
-            return record["data"].numbers()
-        if not isinstance(record.value, list):
-            self.fail(key, "is neither an OpenCV matrix nor a list of numbers")
-        return [item.number() for row in record for item in (row if isinstance(row.value, list) else [row])]
 
 
 # -- writing

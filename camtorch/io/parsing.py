@@ -10,23 +10,24 @@ import json
 import os
 import re
 from typing import Any, NoReturn
+from xml.etree import ElementTree
 
 from camtorch.io._errors import CameraFileError
-from camtorch.io.filestorage import parse_storage
 from camtorch.io.npz import parse_archive
 from camtorch.io.record import repeated
 
 LARGEST_FILE = 1 << 24
-_LARGEST_YAML = 1 << 22
-_LARGEST_SLOW_YAML = 1 << 19  # for PyYAML without libyaml
-_DEEPEST = 100
-_MOST_DIRECTIVES = 100  # libyaml compares each with all
-_MOST_VALUES = 1 << 17
+_LARGEST_STORAGE = 1 << 20  # of YAML and of OpenCV's XML
 _LARGEST_LITERAL = 1 << 15  # of which Python 3.10 can parse any: it crashes on deeper sums than that has room for
 _OPTIMIZATION_INPUTS = re.compile(r"('optimization_inputs'\s*:\s*)b'[^'\\\n]*'")  # megabytes, which are not read
+_DEEPEST = 100
+_MOST_VALUES = 1 << 17
 _MOST_JSON_UNITS = 1 << 20  # of 32 bytes, what a number takes in memory
 _BYTES_PER_UNIT = 4  # of the file, where there are more
+_FEW_NODES = 1 << 14  # elements and attributes of XML
+_BYTES_PER_NODE = 16  # of the file, where there are more
 _START = 1 << 16  # of a text, where its kind shows
+_WORD = re.compile(r'"([^"]*)"|(\S+)')
 
 # how files begin that people pass by mistake
 _OTHERS = (
@@ -115,8 +116,13 @@ def _from_text(path: str | os.PathLike[str], content: bytes) -> Any:
     if re.match(r"\s*\{", text):
         return parse_json(path, text)
     if re.match(r"\s*<", text):
-        return parse_storage(path, content)
+        return _from_storage(path, text)
     return _from_yaml(path, text)
+
+
+def _check_length(path: str | os.PathLike[str], text: str, most: int, kind: str) -> None:
+    if len(text) > most:
+        raise CameraFileError(path, "size", f"more than {most >> 10} KiB of {kind}")
 
 
 # -- JSON
@@ -159,34 +165,72 @@ def _is_literal(text: str) -> bool:
 
 
 def _from_literal(path: str | os.PathLike[str], text: str) -> Any:
-    """Texts, numbers, lists, tuples and mappings."""
     text = _OPTIMIZATION_INPUTS.sub(r"\1''", text)
-    if len(text) > _LARGEST_LITERAL:
-        raise CameraFileError(path, "size", f"more than {_LARGEST_LITERAL >> 10} KiB of a Python literal")
+    _check_length(path, text, _LARGEST_LITERAL, "a Python literal")
     try:
-        return _value_of(path, ast.parse(text, mode="eval").body)
+        return _with_floats(ast.literal_eval(ast.parse(text, mode="eval")))
     except SyntaxError as error:
         raise CameraFileError(path, f"line {error.lineno}", error.msg) from None
+    except (ValueError, TypeError):  # a list has no hash, as a key has
+        raise CameraFileError(path, "content", "something else than texts, numbers, lists and mappings") from None
 
 
-def _value_of(path: str | os.PathLike[str], node: ast.expr) -> Any:
-    """A node as JSON has it. `ast.literal_eval` alone passes over keys that stand there twice."""
-    if isinstance(node, (ast.List, ast.Tuple)):
-        return [_value_of(path, item) for item in node.elts]
-    if isinstance(node, ast.Dict):
-        keys: list[Any] = [key and _value_of(path, key) for key in node.keys]
-        if not all(isinstance(key, str) for key in keys):
-            raise CameraFileError(path, f"line {node.lineno}", "a key that is no text")
-        if (twice := repeated(keys)) is not None:
-            raise CameraFileError(path, f"line {node.lineno}", f"the key {twice!r:.60} stands there twice")
-        return dict(zip(keys, [_value_of(path, value) for value in node.values], strict=True))
-    try:
-        value = ast.literal_eval(node)
-    except ValueError:
-        raise CameraFileError(path, f"line {node.lineno}", "no text, number, list or mapping") from None
-    if isinstance(value, bytes):
-        return value.decode("latin-1")
+def _with_floats(value: Any) -> Any:
+    """A literal as JSON has it."""
+    if isinstance(value, dict):
+        return {str(key): _with_floats(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return list(map(_with_floats, value))
     return float(value) if type(value) is int else value
+
+
+# -- XML, in which OpenCV has keys in <opencv_storage>, and sequences as words or as elements called _
+
+
+def parse_xml(path: str | os.PathLike[str], text: str) -> ElementTree.Element:
+    """The root of a text of XML.
+
+    Raises:
+        CameraFileError: no XML, a document type or an entity declared, more elements than are worth their memory.
+    """
+    if declared := re.search(r"<!(?:DOCTYPE|ENTITY|ELEMENT|ATTLIST|NOTATION)", text, re.IGNORECASE):
+        line = text.count("\n", 0, declared.start()) + 1
+        raise CameraFileError(path, f"line {line}", "a document type, which could define entities: not read")
+    if text.count("=") + text.count("<") > max(_FEW_NODES, len(text) // _BYTES_PER_NODE):
+        raise CameraFileError(path, "content", "too many elements")
+    try:
+        return ElementTree.fromstring(text)
+    except ElementTree.ParseError as error:
+        reason = str(error).split(":")[0]
+        raise CameraFileError(path, f"line {error.position[0]}", f"not XML: {reason}") from None
+    except (ValueError, LookupError) as error:
+        raise CameraFileError(path, "content", error) from None
+
+
+def _from_storage(path: str | os.PathLike[str], text: str) -> Any:
+    _check_length(path, text, _LARGEST_STORAGE, "XML")
+    root = parse_xml(path, text)
+    if root.tag != "opencv_storage":
+        raise CameraFileError(
+            path, "content", f"<{root.tag:.60}> where <opencv_storage> belongs: XML is read where OpenCV wrote it"
+        )
+    return _keys_of(path, root)
+
+
+def _keys_of(path: str | os.PathLike[str], element: ElementTree.Element) -> dict[str, Any]:
+    names = [child.tag for child in element]
+    if (twice := repeated(names)) is not None:
+        raise CameraFileError(path, f"{element.tag:.60}", f"the key {twice!r:.60} stands there twice")
+    return {child.tag: _value_of(path, child) for child in element}
+
+
+def _value_of(path: str | os.PathLike[str], element: ElementTree.Element) -> Any:
+    if any(child.tag != "_" for child in element):
+        return _keys_of(path, element)
+    words = [word[1] or word[2] or "" for word in _WORD.finditer(element.text or "")]
+    if len(element) or len(words) != 1 or element.tag == "data":
+        return words + [_value_of(path, child) for child in element]
+    return words[0]
 
 
 # -- YAML
@@ -195,18 +239,14 @@ def _value_of(path: str | os.PathLike[str], node: ast.expr) -> Any:
 def _from_yaml(path: str | os.PathLike[str], text: str) -> Any:
     import yaml  # a fiftieth of a second: only when needed
 
-    loader = getattr(yaml, "CSafeLoader", None)
-    largest = _LARGEST_SLOW_YAML if loader is None else _LARGEST_YAML
-    if len(text) > largest:
-        raise CameraFileError(path, "size", f"more than {largest >> 10} KiB of YAML")
-    # "%YAML:1.0", as OpenCV writes it, is not YAML
-    text = re.sub(r"\A%YAML[^\n]*", "", text)
-    if text.count("\n%") > _MOST_DIRECTIVES:
-        raise CameraFileError(path, "content", "too many YAML directives")
+    _check_length(path, text, _LARGEST_STORAGE, "YAML")
+    text = re.sub(r"\A%YAML[^\n]*", "", text)  # "%YAML:1.0", as OpenCV writes it, is not YAML
+    if "\n%" in text:  # libyaml compares each with all
+        raise CameraFileError(path, "content", "YAML directives, which no calibration has")
     tree = _YamlTree(path)
     try:
         # events, not yaml.load: no recursion, no tags, and none of YAML 1.1's ideas of what is a number
-        for event in yaml.parse(text, loader or yaml.SafeLoader):
+        for event in yaml.parse(text, getattr(yaml, "CSafeLoader", yaml.SafeLoader)):
             tree.take(event, type(event).__name__)
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
@@ -224,11 +264,10 @@ class _YamlTree:
 
     def __init__(self, path: str | os.PathLike[str]):
         self.path = path
-        self.line = 0
+        self.line = self.documents = self.count = 0
         self.root: Any = None
-        self.open: list[list[Any]] = []  # container, key that waits for its value, anchor, how many values
-        self.anchors: dict[str, tuple[Any, int]] = {}
-        self.count = self.documents = 0
+        self.open: list[list[Any]] = []  # container, key that waits for its value, anchor, count before it
+        self.anchors: dict[str, tuple[Any, int]] = {}  # value, and how many values it is
 
     def fail(self, reason: object) -> NoReturn:
         raise CameraFileError(self.path, f"line {self.line}", reason) from None
@@ -242,26 +281,25 @@ class _YamlTree:
                 self.fail("a third document in the file")
         elif self.documents > 1:
             # rostopic ends a message with ---, which begins an empty document
-            text = getattr(event, "value", "")
-            if text or kind in ("SequenceStartEvent", "MappingStartEvent", "AliasEvent"):
+            if getattr(event, "value", "") or kind in ("SequenceStartEvent", "MappingStartEvent", "AliasEvent"):
                 self.fail("a second document in the file")
         elif kind == "ScalarEvent":
             self.check_tag(event.tag, "str")
-            self.put(event.value, 1, event.anchor)
+            self.put(event.value, event.anchor, 1)
         elif kind in ("SequenceStartEvent", "MappingStartEvent"):
             is_list = kind == "SequenceStartEvent"
             self.check_tag(event.tag, *(("seq",) if is_list else ("map", "opencv-matrix", "opencv-nd-matrix")))
-            self.begin([] if is_list else {}, event.anchor)
+            if len(self.open) >= _DEEPEST:
+                self.fail("nested too deeply")
+            if self.open and isinstance(self.open[-1][0], dict) and self.open[-1][1] is None:
+                self.fail("a key that is no text")
+            self.open.append([[] if is_list else {}, None, event.anchor, self.count])
         elif kind in ("SequenceEndEvent", "MappingEndEvent"):
-            container, key, anchor, count = self.open.pop()
-            if key is not None:
-                self.fail(f"the key {key!r:.60} has no value")
-            self.put(container, count, anchor)
+            container, _, anchor, before = self.open.pop()
+            self.put(container, anchor, self.count - before + 1, new=1)
         elif kind == "AliasEvent":
-            value, count = self.anchors.get(event.anchor) or self.fail(f"nothing is called {event.anchor!r:.60}")
-            if value is None:
-                self.fail("a recursive value")
-            self.put(value, count)
+            value, size = self.anchors.get(event.anchor) or self.fail(f"nothing is called {event.anchor!r:.60}")
+            self.put(value, None, size)
 
     def check_tag(self, tag: str | None, *names: str) -> None:
         if tag not in (None, "!", *(f"tag:yaml.org,2002:{name}" for name in names)):
@@ -269,28 +307,19 @@ class _YamlTree:
                 self.fail("expected keys and values after !!opencv-matrix")
             self.fail(f"could not determine a constructor for the tag {tag!r:.80}: nothing is constructed here")
 
-    def begin(self, container: list[Any] | dict[Any, Any], anchor: str | None) -> None:
-        if len(self.open) >= _DEEPEST:
-            raise CameraFileError(self.path, "content", "nested too deeply")
-        if self.open and isinstance(self.open[-1][0], dict) and self.open[-1][1] is None:
-            self.fail("a key that is no text")
-        if anchor:
-            self.anchors[anchor] = (None, 0)
-        self.open.append([container, None, anchor, 1])
-
-    def put(self, value: Any, count: int, anchor: str | None = None) -> None:
+    def put(self, value: Any, anchor: str | None, size: int, new: int | None = None) -> None:
         """A value of so many values, which in a mapping is a key or what belongs to it."""
-        self.count += 1
-        top: list[Any] = self.open[-1] if self.open else [None, None, None, 0]
-        top[3] += count
-        if max(self.count, top[3]) > _MOST_VALUES:  # an alias costs nothing here, but whoever walks through it pays
+        self.count += size if new is None else new  # an alias costs nothing here, but whoever walks through it pays
+        if self.count > _MOST_VALUES:
             self.fail(f"too many values: more than {_MOST_VALUES} are not read")
         if anchor:
-            self.anchors[anchor] = (value, count)
-        container, key = top[:2]
-        if container is None:
+            self.anchors[anchor] = (value, size)
+        if not self.open:
             self.root = value
-        elif isinstance(container, list):
+            return
+        top = self.open[-1]
+        container, key = top[:2]
+        if isinstance(container, list):
             container.append(value)
         elif key is not None:
             container[key], top[1] = value, None

@@ -39,7 +39,8 @@ def _check(place: Place, right: Tensor, reason: Callable[[int], str]) -> None:
 
 def check_near(place: Place, values: Any) -> None:
     """Refuse (*B, n) with numbers too large to compute with."""
-    _check(place, (as_float64(values).abs() <= _FARTHEST).all(-1), lambda row: f"a number beyond {_FARTHEST:g}")
+    right = (as_float64(values).abs() <= _FARTHEST).all(-1)
+    _check(place, right, lambda row: f"a number beyond {_FARTHEST:g}, or none")
 
 
 # -- reading: single poses, or a batch of them

@@ -16,7 +16,7 @@ class Names:
     Args:
         format: its key in `camtorch.load` and `camtorch.save`.
         title: what errors call it.
-        suffixes: those of its files, with the dot; for what is written, since content says what a file to read is.
+        suffixes: those of the files that are written, with the dot; content says what a file to read is.
         patterns: names of files, as fnmatch has them, that mean this format when one is written without another word;
             of several formats the one with the longest pattern that fits is taken.
         in_folder: files that stand for the folder they are in, the first that is there.
@@ -24,17 +24,21 @@ class Names:
 
     format: str
     title: str
-    suffixes: tuple[str, ...]
+    suffixes: tuple[str, ...] = ()
     patterns: tuple[str, ...] = ()
     in_folder: tuple[str, ...] = ()
 
 
-class KeyFormat(Protocol):
-    """A module that reads and writes keys and values: YAML, JSON, XML, Python literals, NumPy archives."""
+class Format(Protocol):
+    """Any module of a format."""
 
     @property
     def NAMES(self) -> Names:  # noqa: N802
         """What it and its files are called."""
+
+
+class KeyFormat(Format, Protocol):
+    """A module that reads keys and values: YAML, JSON, XML, Python literals, NumPy archives."""
 
     def matches(self, keys: dict[str, Any]) -> bool:
         """Whether these are the keys of such a file."""
@@ -42,26 +46,26 @@ class KeyFormat(Protocol):
     def parse(self, record: Record) -> Rig:
         """The cameras of the keys, in float64. Raises CameraFileError, as `record.fail` does."""
 
-    def render(self, rig: Rig, path: str) -> str:
-        """The text of a file. Raises CameraFileError for what the format cannot hold."""
 
-
-class WrittenFormat(Protocol):
-    """A module that writes files of any other kind, one or several of them."""
-
-    @property
-    def NAMES(self) -> Names:  # noqa: N802
-        """What it and its files are called."""
-
-    def files(self, rig: Rig, path: str) -> dict[str, bytes]:
-        """The contents of the files to write, by their paths. Raises CameraFileError for what they cannot hold."""
-
-
-class ContentFormat(WrittenFormat, Protocol):
-    """One that also reads them."""
+class ContentFormat(Format, Protocol):
+    """A module that reads files of any other kind."""
 
     def matches(self, path: str, content: bytes) -> bool:
         """Whether this is such a file."""
 
     def read(self, path: str, content: bytes) -> Rig:
         """The cameras of a file, in float64, with what lies beside it. Raises CameraFileError."""
+
+
+class TextFormat(Format, Protocol):
+    """A module that writes text."""
+
+    def render(self, rig: Rig, path: str) -> str:
+        """The text of a file. Raises CameraFileError for what the format cannot hold."""
+
+
+class FilesFormat(Format, Protocol):
+    """A module that writes files of any other kind, one or several of them."""
+
+    def files(self, rig: Rig, path: str) -> dict[str, bytes]:
+        """The contents of the files to write, by their paths. Raises CameraFileError for what they cannot hold."""

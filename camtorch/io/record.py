@@ -144,6 +144,20 @@ class Record:
             self.fail(f"{len(self)} rows where {rows} belong")
         return [row.numbers(columns) for row in self]
 
+    def flat(self) -> list[float]:
+        """The numbers of a list, of a list of rows, or of a matrix as OpenCV and ROS have it."""
+        if isinstance(self.value, dict):
+            name = "sizes" if "sizes" in self else "rows and cols"  # the former of any number of dimensions
+            parts = [self[key] for key in name.split(" and ")]
+            sizes = [n for part in parts for n in (part.numbers() if isinstance(part.value, list) else [part.number()])]
+            data = self["data"]
+            if len(data) != math.prod(sizes):
+                data.fail(f"{len(data)} numbers, where {name} say {' x '.join(f'{size:g}' for size in sizes)}")
+            return data.numbers()
+        if not isinstance(self.value, list):
+            self.fail("is neither an OpenCV matrix nor a list of numbers")
+        return [item.number() for row in self for item in (row if isinstance(row.value, list) else [row])]
+
     # -- cameras
 
     def few(self, count: int) -> None:
@@ -172,8 +186,9 @@ class Record:
         except (ValueError, TypeError) as error:
             self.fail(error)
 
-    def intrinsics(self, matrix: list[float]) -> list[float]:
-        """The focal lengths and principal point of a camera matrix of 3 x 3 numbers, which stands here."""
+    def intrinsics(self) -> list[float]:
+        """The focal lengths and principal point of the camera matrix, `flat`, that stands here."""
+        matrix = self.flat()
         if len(matrix) != 9:
             self.fail(f"a camera matrix has 3 x 3 numbers, this has {len(matrix)}")
         fx, skew, cx, below, fy, cy, *bottom = matrix

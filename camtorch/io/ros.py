@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import json
 from typing import Any
 
 from camtorch.io.protocol import Names
 from camtorch.io.record import Record, one_of
-from camtorch.io.writing import Lossy, listed, quoted
+from camtorch.io.writing import Lossy, listed
 from camtorch.rig import Rig
 
 NAMES = Names("ros", "ROS camera_info", (".yaml", ".yml"), ("*camera_info*", "*camerainfo*"))
@@ -30,11 +31,10 @@ def parse(record: Record) -> Rig:
     """The camera of a file: K and D. R and P, the rectification of a stereo pair, are not read."""
     name = record["camera_name"].text() if "camera_name" in record else "camera"
     width, height = (_either(record, f"image_{side}", side).side() for side in ("width", "height"))
-    matrix = _either(record, "camera_matrix", "K", "k")
-    intrinsics = matrix.intrinsics(_numbers(matrix))
+    intrinsics = _either(record, "camera_matrix", "K", "k").intrinsics()
     key, counts = _MODELS[one_of(record["distortion_model"], _MODELS)]
     coefficients = _either(record, "distortion_coefficients", "D", "d")
-    distortion = _numbers(coefficients)
+    distortion = coefficients.flat()
     while len(distortion) > max(counts, default=0) and not distortion[-1]:
         distortion.pop()  # zeros to fill a message of fixed length
     if not distortion:
@@ -50,15 +50,6 @@ def _either(record: Record, *keys: str) -> Record:
     return record[next((key for key in keys if key in record), keys[0])]
 
 
-def _numbers(record: Record) -> list[float]:
-    if isinstance(record.value, dict):
-        rows, cols = (record[key].whole(0, 1000, "number of rows or columns") for key in ("rows", "cols"))
-        if len(record["data"]) != rows * cols:
-            record["data"].fail(f"{len(record['data'])} numbers, where rows and cols say {rows} x {cols}")
-        record = record["data"]
-    return record.numbers()
-
-
 def render(rig: Rig, path: str) -> str:
     """The text of a file: R is the identity, and P is K."""
     lossy = Lossy(path, NAMES.title)
@@ -72,7 +63,7 @@ def render(rig: Rig, path: str) -> str:
     lines = [
         f"image_width: {width}",
         f"image_height: {height}",
-        f"camera_name: {quoted(name)}",
+        f"camera_name: {json.dumps(name, ensure_ascii=False)}",
         *_matrix("camera_matrix", 3, 3, [fx, 0, cx, 0, fy, cy, 0, 0, 1]),
         f"distortion_model: {model}",
         *_matrix("distortion_coefficients", 1, len(distortion), distortion),

@@ -46,7 +46,7 @@ def Xform "rig"
 """
 
 
-def files(rig: Rig, path: str) -> dict[str, bytes]:
+def render(rig: Rig, path: str) -> str:
     """The text of a scene: cameras below an Xform, which is the rig. Lengths are the rig's, said to be metres."""
     lossy = Lossy(path, NAMES.title)
     prims: dict[str, str] = {}
@@ -74,7 +74,7 @@ def files(rig: Rig, path: str) -> dict[str, bytes]:
             "}",
         ]
         prims[prim] = "".join(f"    {line}\n" for line in lines)
-    return {path: (_HEAD + "\n".join(prims.values()) + "}\n").encode()}
+    return _HEAD + "\n".join(prims.values()) + "}\n"
 
 
 def _lens(camera: Camera, size: tuple[int, int], fov: float) -> tuple[str, list[str]]:

@@ -7,12 +7,9 @@ from typing import Any
 from camtorch.io import poses
 from camtorch.io.protocol import Names
 from camtorch.io.record import Record, one_of
-from camtorch.io.writing import Lossy, as_json, multiple
 from camtorch.rig import Rig
 
-NAMES = Names(
-    "woodscape", "WoodScape", (".json",), ("*woodscape*.json", *(f"*_{c}.json" for c in ("fv", "rv", "mvl", "mvr")))
-)
+NAMES = Names("woodscape", "WoodScape")
 _POWERS = ("k1", "k2", "k3", "k4")
 
 
@@ -36,20 +33,3 @@ def parse(record: Record) -> Rig:
     x, y, z, w = pose["quaternion"].numbers(4)
     vehicle = [w, x, y, z, *pose["translation"].numbers(3)]
     return Rig({name: camera}, {name: poses.from_quaternions(pose, vehicle, undo=True)})
-
-
-def render(rig: Rig, path: str) -> str:
-    """The text of a file of one camera; one without a pose is where the vehicle is."""
-    lossy = Lossy(path, NAMES.title)
-    name, camera = lossy.only_camera(rig)
-    height, width = lossy.size(name, camera)
-    _, (fx, fy, cx, cy), distortion = lossy.model(name, camera, ("woodscape",))
-    w, x, y, z, *translation = poses.quaternions(lossy.all_posed(rig)[name], undo=True).tolist()
-    lens = {
-        **{"model": "radial_poly", "poly_order": 4, "aspect_ratio": fy / fx, "width": width, "height": height},
-        **{"cx_offset": cx - (width - 1) / 2, "cy_offset": cy - (height - 1) / 2},
-        **dict(zip(_POWERS, [fx, *(multiple(k, fx) for k in distortion)], strict=True)),
-    }
-    return as_json(
-        {"name": name, "extrinsic": {"quaternion": [x, y, z, w], "translation": translation}, "intrinsic": lens}
-    )

@@ -26,86 +26,59 @@ from camtorch.rig import Rig
 
 @contextlib.contextmanager
 def replacing(*paths: str | os.PathLike[str], synced: bool = True) -> Iterator[list[IO[bytes]]]:
-    """Open files to write that take the places of `paths` together at the end of the block; on any error none does.
+    """Open files to write that take the places of `paths` at the end of the block, one after the other.
 
-    All is on the disk before the first place changes, unless `synced` is false, for whoever finds out otherwise what a
-    loss of power took: that saves a hundredth of a second a file. Where a path is a link, what it points to is
-    replaced, and the link stays. Files keep their rights; new ones get those that the process gives to new files.
-
-    Of several files the old ones are moved aside first: a crash leaves some of them missing, and `all_left_over`
-    finds where they are, but never new ones beside old ones.
+    On any error in the block none does. All is on the disk before the first place changes, unless `synced` is false,
+    for whoever finds out otherwise what a loss of power took: that saves a hundredth of a second a file. Where a path
+    is a link, what it points to is replaced, and the link stays. Files keep their rights; new ones get those that the
+    process gives to new files.
 
     Raises:
         OSError: no such folder, a place that is taken by anything but an ordinary file, a full disk.
     """
     targets = [os.path.realpath(path) for path in paths]
     with contextlib.ExitStack() as stack:
-        files, new = [], {}  # new: target -> the file beside it
+        files, names = [], []
         for target in targets:
-            file, new[target] = _opened_beside(target)
-            stack.callback(_unlink, new[target])
+            file, name = _opened_beside(target)
+            stack.callback(_unlink, name)
             files.append(stack.enter_context(file))
+            names.append(name)
         yield files
         for file in files:
             file.flush()
             if synced:
                 os.fsync(file.fileno())
             file.close()
-        if len(targets) == 1:
-            os.replace(new[target], target)
-        else:
-            _replace_together(new)
-
-
-def _replace_together(new: dict[str, str]) -> None:
-    """Rename files to the targets that are their keys."""
-    old, placed = {}, []
-    try:
-        for target in filter(os.path.exists, new):
-            name = _beside(target)
-            os.replace(target, name)
-            old[target] = name
-        for target, name in new.items():
+        for name, target in zip(names, targets, strict=True):
             os.replace(name, target)
-            placed.append(target)
-    except BaseException:
-        for target in placed:
-            _unlink(target)
-        for target, name in old.items():
-            os.replace(name, target)
-        raise
-    for name in old.values():
-        _unlink(name)
 
 
 def all_left_over(paths: Iterable[str]) -> list[str]:
     """Files that crashes within `replacing` left beside any of `paths`; folders that are not there have none."""
-    marks = {os.path.join(os.path.dirname(path), f".{_marked(os.path.basename(path))}") for path in paths}
+    marks = {(os.path.dirname(path), _mark_of(path)) for path in paths}
     found = []
-    for folder in {os.path.dirname(mark) for mark in marks}:
+    for folder in {folder for folder, _ in marks}:
         with contextlib.suppress(FileNotFoundError, NotADirectoryError):
-            found += [os.path.join(folder, name) for name in os.listdir(folder or ".") if _PART.fullmatch(name)]
-    return sorted(path for path in found if path[: -_RANDOM - len(".part")] in marks)
+            for name in os.listdir(folder or "."):
+                part = _PART.fullmatch(name)
+                if part and (folder, part[1]) in marks:
+                    found.append(os.path.join(folder, name))
+    return sorted(found)
 
 
-_RANDOM = 8  # digits
-_PART = re.compile(rf"[.].*[.][0-9a-f]{{{8 + _RANDOM}}}[.]part", re.S)
+_PART = re.compile(r"[.]([0-9a-f]{16})[0-9a-f]{8}[.]part")
 
 
-def _marked(name: str) -> str:
-    """With what the names of files beside one of this name begin, after a dot, and no others."""
-    # a part and a hash: file systems allow 255 bytes, and many names begin alike
-    return f"{name[:20]}.{hashlib.blake2b(os.fsencode(name), digest_size=4).hexdigest()}"
-
-
-def _beside(path: str) -> str:
-    folder, name = os.path.split(path)
-    return os.path.join(folder, f".{_marked(name)}{secrets.token_hex(_RANDOM // 2)}.part")
+def _mark_of(path: str) -> str:
+    """What the names of files beside a path begin with: a hash, for a name may be as long as file systems allow."""
+    return hashlib.blake2b(os.fsencode(os.path.basename(path)), digest_size=8).hexdigest()
 
 
 def _opened_beside(path: str) -> tuple[IO[bytes], str]:
     """An empty file beside `path` with the rights of the file that it will replace, or of a new one; and its name."""
-    folder, name = os.path.dirname(path), _beside(path)
+    folder = os.path.dirname(path)
+    name = os.path.join(folder, f".{_mark_of(path)}{secrets.token_hex(4)}.part")
     if not os.path.isdir(folder):
         raise FileNotFoundError(errno.ENOENT, "no such folder", folder)
     try:
@@ -132,30 +105,12 @@ def _unlink(path: str) -> None:
 
 def number(value: float) -> str:
     """A number that every YAML reader takes for one, to the last bit: PyYAML reads 1e-05 as text, 1.0e-05 not."""
-    text = repr(float(value))
-    return re.sub(r"^(-?\d+)e", r"\1.0e", text)
-
-
-def multiple(quotient: float, divisor: float) -> float:
-    """What divided by the divisor gives the quotient, to the last bit if any number does."""
-    product = quotient * divisor
-    near = (product, math.nextafter(product, math.inf), math.nextafter(product, -math.inf))
-    return next((value for value in near if value / divisor == quotient), product)
+    return re.sub(r"^(-?\d+)e", r"\1.0e", repr(float(value)))
 
 
 def listed(values: Sequence[float]) -> str:
     """[1.0, 2.0]"""
     return f"[{', '.join(map(number, values))}]"
-
-
-def quoted(text: str) -> str:
-    """A text as YAML, in quotes unless it is a plain word."""
-    plain = re.fullmatch(r"[A-Za-z_/][\w./-]*", text) and text.lower() not in _YAML_WORDS
-    return text if plain else _SURROGATES.sub(lambda pair: json.loads(f'"{pair[0]}"'), json.dumps(text))
-
-
-_SURROGATES = re.compile(r"\\ud[89ab]..\\ud[c-f]..")  # which JSON writes, and YAML does not read
-_YAML_WORDS = {"y", "n", "yes", "no", "on", "off", "true", "false", "null"}
 
 
 def as_json(value: object) -> str:

@@ -7,23 +7,21 @@ from __future__ import annotations
 
 import json
 import os
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from camtorch._arguments import as_image_size, as_whole
 from camtorch.io._errors import CameraFileError
 from camtorch.io.parsing import path_of, read_bytes
 from camtorch.io.writing import as_json, replacing
-from camtorch.maps.depthai import DepthAI
 from camtorch.maps.dw100 import DW100
 from camtorch.maps.exact import Exact
 from camtorch.maps.lookup import LookupMap
+from camtorch.maps.obj import OBJ
 from camtorch.maps.onnx import ONNX
 from camtorch.maps.opencv import OpenCV
 from camtorch.maps.protocol import SIZES, MapFormat, Options, named_sizes
 from camtorch.maps.report import MapReport, measure
 from camtorch.maps.stmap import STMap
-from camtorch.maps.texture_mesh import GLTF, OBJ
 from camtorch.maps.ti_ldc import TILDC
 
 if TYPE_CHECKING:
@@ -38,9 +36,7 @@ _FORMATS: dict[str, MapFormat] = {
         STMap(),
         DW100(),
         TILDC(),
-        DepthAI(),
         OBJ(),
-        GLTF(),
         ONNX(),
     )
 }
@@ -80,27 +76,12 @@ def save_map(warp: Warp, path: str | os.PathLike[str], format: str | None, **sai
     return report
 
 
-def load_map(
-    path: str | os.PathLike[str],
-    format: str | None = None,
-    *,
-    source_size: tuple[int, int] | None = None,
-    target_size: tuple[int, int] | None = None,
-    step: int | None = None,
-    v: str | None = None,
-    order: str | None = None,
-) -> LookupMap:
-    """Read a map that `Warp.save` wrote, or another program: to see what it holds, and to compare it with a warp.
+def load_map(path: str | os.PathLike[str], format: str | None = None) -> LookupMap:
+    """Read a map that `Warp.save` wrote: to see what it holds, and to compare it with a warp.
 
     Args:
-        path: the file.
-        format: one of those of `Warp.save`; found from the content, the name and the description beside it if left
-            out.
-        source_size: (height, width) of the images that it takes, where the file does not say.
-        target_size: (height, width) of those that it makes, where the file does not say.
-        step: pixels of the target between the nodes of a bare table, where nothing beside it says.
-        v: "up" or "down", which way v runs in an STMap that does not say; up if left out.
-        order: "yx" or "xy", of a DepthAI mesh without its description.
+        path: the file, beside which bare tables have their description.
+        format: one of those of `Warp.save`; found from the content, the name and the description if left out.
 
     Returns:
         A `LookupMap`: `.positions`, `.map_x`, `.map_y`, `.grid()`, `.error(warp)`; called with images it warps them.
@@ -110,33 +91,22 @@ def load_map(
             format. ImportError: a library that the format needs is missing; the error names the extra.
     """
     name = path_of(path, "load_map")
-    given = Options(
-        step=None if step is None else as_whole(step, "step", "load_map"),
-        v=v,
-        order=order,
-        source_size=as_image_size(source_size, "load_map", "source_size"),
-        target_size=as_image_size(target_size, "load_map", "target_size"),
-    )
     content = read_bytes(name, _LARGEST_FILE)
-    chosen: MapFormat | None
-    if format is not None:
-        chosen = _named(format)
-    else:
-        chosen = next((known for known in _FORMATS.values() if known.matches(name, content)), None)
+    chosen = None if format is None else _named(format)
+    chosen = chosen or next((known for known in _FORMATS.values() if known.matches(name, content)), None)
     described = _read_description(name) if chosen is None or chosen.described else {}
     chosen = chosen or _FORMATS.get(str(described.get("format")))
     if chosen is None:
-        reason = f"no format that is known by its content; say format, one of {', '.join(FORMATS)}"
-        raise CameraFileError(name, "content", reason)
+        raise CameraFileError(name, "content", f"none that is known by it, or by {_description(name)}; say format")
     if described.get("format", chosen.name) != chosen.name:
         raise CameraFileError(_description(name), "format", f"describes {described['format']!r:.60}, not {chosen.name}")
     facts = {key: tuple(value) if isinstance(value, list) else value for key, value in described.items()}
-    stated: dict[str, Any] = {key: facts[key] for key in ("step", "order") if key in facts}
-    if all(key in facts for key in SIZES):
-        rows, columns, height, width = (facts[key] for key in SIZES)
-        stated |= {"source_size": (rows, columns), "target_size": (height, width)}
     try:
-        read = chosen.decode(content, replace(given, **stated))
+        sizes: dict[str, Any] = {}
+        if chosen.described:
+            rows, columns, height, width = (facts[key] for key in SIZES)
+            sizes = {"source_size": (rows, columns), "target_size": (height, width)}
+        read = chosen.decode(content, Options(step=facts.get("step"), **sizes))
     except ImportError:
         raise
     except Exception as error:  # whatever a damaged file makes of the library that reads it
@@ -156,24 +126,14 @@ def files_of(path: str | os.PathLike[str], format: str | None = None) -> tuple[s
     return (name, _description(name)) if _chosen(name, format).described else (name,)
 
 
-def check_map(
-    warp: Warp,
-    path: str | os.PathLike[str],
-    format: str | None = None,
-    *,
-    step: int | None = None,
-    v: str | None = None,
-    order: str | None = None,
-) -> MapReport:
+def check_map(warp: Warp, path: str | os.PathLike[str], format: str | None = None) -> MapReport:
     """How far a map that is there is from a warp; see `load_map`.
 
     Raises:
         ValueError: it is between images of other sizes, and as `load_map`.
     """
-    exact = Exact(warp, "check_map")
-    sizes: dict[str, Any] = {"source_size": exact.source_size, "target_size": exact.target_size}
-    read = load_map(path, format, step=step, v=v, order=order, **sizes)
-    return measure(path_of(path, "check_map"), read, exact, (), read.facts)
+    read = load_map(path, format)
+    return measure(path_of(path, "check_map"), read, Exact(warp, "check_map"), (), read.facts)
 
 
 _NO_FACTS = ("format", *SIZES, "max_error", "rms_error")

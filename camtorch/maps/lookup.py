@@ -9,7 +9,7 @@ import torch
 import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
 from torch import Tensor
 
-from camtorch._dtypes import SIGNED, narrow, widen
+from camtorch._dtypes import narrow, widen
 from camtorch.maps.exact import Exact
 
 if TYPE_CHECKING:
@@ -73,6 +73,8 @@ class LookupMap:
     def __call__(self, images: Tensor, mode: str = "bilinear", padding_mode: str = "zeros") -> Tensor:
         """Apply it to images (B, C, H, W) of the source's size, floating point, integer or bool; the dtype stays.
 
+        Integers are exact up to 2^53.
+
         Args:
             images: of the source.
             mode: "nearest", "bilinear" or "bicubic".
@@ -87,16 +89,9 @@ class LookupMap:
             raise ValueError(
                 f"LookupMap: images must be a dense tensor (B, C, {size[0]}, {size[1]}) of real numbers; got {what}"
             )
-        grid = self.grid().to(images.device, torch.float64)
-        if mode != "nearest" or images.is_floating_point():
-            values = widen(images)
-            grid = grid.to(values).expand(len(values), -1, -1, -1)
-            return narrow(F.grid_sample(values, grid, mode, padding_mode, align_corners=False), images.dtype)
-        # which pixel it is, counted from 1, as no float holds every id
-        place = torch.arange(1, math.prod(size) + 1, device=images.device).to(grid).view(1, 1, *size)
-        index = F.grid_sample(place, grid, mode, padding_mode, align_corners=False)[0, 0].long()
-        pixels = images.view(SIGNED.get(images.dtype, images.dtype)).flatten(2)
-        return F.pad(pixels, (1, 0))[..., index].view(images.dtype)
+        values = widen(images)
+        grid = self.grid().to(values).expand(len(values), -1, -1, -1)
+        return narrow(F.grid_sample(values, grid, mode, padding_mode, align_corners=False), images.dtype)
 
     def error(self, warp: Warp) -> Tensor:
         """(H', W') float64: how far it is from a warp, in pixels of the source; NaN where the warp shows nothing.

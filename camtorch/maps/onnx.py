@@ -16,7 +16,7 @@ import torch
 
 from camtorch.maps.exact import Exact
 from camtorch.maps.lookup import OUTSIDE, LookupMap
-from camtorch.maps.protocol import MOST_PIXELS, MapFormat, Options, checked
+from camtorch.maps.protocol import MapFormat, Options, checked
 
 _OPSET, _IR = 16, 8
 _DTYPES = ("float32", "uint8")
@@ -43,25 +43,13 @@ class ONNX(MapFormat):
         return _model(exact, dtype).SerializeToString(), {"dtype": dtype, "opset": _OPSET}
 
     def decode(self, content: bytes, given: Options) -> LookupMap:
-        """See `MapFormat`. It reads models of one GridSample with a constant grid."""
+        """See `MapFormat`. Models are read as they are written here."""
         onnx = _needed()
-        model = onnx.load_model_from_string(content)
-        samples = [node for node in model.graph.node if node.op_type == "GridSample"]
-        if len(samples) != 1:
-            raise ValueError(f"{len(samples)} GridSample nodes; one is read")
-        grids = [t for t in model.graph.initializer if t.name == samples[0].input[1]]
-        if not grids or grids[0].data_location == onnx.TensorProto.EXTERNAL:
-            raise ValueError("a grid that is no constant in this file")
-        attributes = {a.name: onnx.helper.get_attribute_value(a) for a in samples[0].attribute}
-        if attributes.get("align_corners", 0):
-            raise ValueError("align_corners=1")
-        grid = onnx.numpy_helper.to_array(grids[0]).astype(np.float64)
-        if grid.ndim != 4 or grid.shape[0] != 1 or grid.shape[3] != 2 or not 0 < grid.size <= 2 * MOST_PIXELS:
-            raise ValueError(f"a grid of shape {grid.shape}")
-        images = model.graph.input[0].type.tensor_type
-        sides = [int(dim.dim_value) for dim in images.shape.dim[2:4]]
+        graph = onnx.load_model_from_string(content).graph
+        (grid,) = (onnx.numpy_helper.to_array(t).astype(np.float64) for t in graph.initializer if t.name == "grid")
+        images = graph.input[0].type.tensor_type
         kind = onnx.helper.tensor_dtype_to_np_dtype(images.elem_type).name
-        size = checked("source_size", sides if all(sides) else given.source_size)
+        size = checked("source_size", [int(dim.dim_value) for dim in images.shape.dim[2:4]])
         positions = ((grid[0] + 1) * (size[1], size[0]) - 1) / 2
         positions[(grid[0] == OUTSIDE).all(-1) | ~np.isfinite(positions).all(-1)] = np.nan
         return LookupMap(torch.from_numpy(positions), size, self.name, {"dtype": kind})

@@ -1,4 +1,4 @@
-"""Maps of `cv2.remap`: float, or fixed-point as `cv2.convertMaps` makes them; FileStorage (.yml, .xml) and .npz.
+"""Maps of `cv2.remap`: float, or fixed-point as `cv2.convertMaps` makes them; FileStorage (.yml) and .npz.
 
 The keys are `map1` and `map2`, what `cv2.remap(image, map1, map2, ...)` takes, and `source_height`, `source_width`.
 Float maps are two CV_32FC1, x and y of the source. Fixed-point ones are CV_16SC2, the whole parts of x and y, and
@@ -9,27 +9,29 @@ Pixels without a position get -32768, which `cv2.remap` fills by BORDER_CONSTANT
 
 from __future__ import annotations
 
+import io
 from typing import Any
 
 import numpy as np
 import torch
 
 from camtorch.io._errors import CameraFileError
-from camtorch.maps.arrays import Arrays, as_archive, as_storage, from_archive, from_storage
-from camtorch.maps.exact import Exact, Floats
+from camtorch.io.npz import arrays_of
+from camtorch.maps.arrays import as_storage, from_storage
+from camtorch.maps.exact import Exact
 from camtorch.maps.lookup import LookupMap
 from camtorch.maps.protocol import MOST_PIXELS, SIZES, MapFormat, Options, checked
 
 _NOWHERE = -32768
 _LONGEST = 32766  # pixels: cv2.remap wants sides below SHRT_MAX
 _PARTS = 32  # of a pixel
-_PAIRS = (("map1", "map2"), ("map_x", "map_y"), ("mapx", "mapy"), ("mapX", "mapY"), ("map1x", "map1y"), ("x", "y"))
+_LARGEST_ARRAY = 8 * MOST_PIXELS
 
 
 class OpenCV(MapFormat):
     """The formats: see the module. "opencv_fixed" is in fixed point."""
 
-    suffixes: tuple[str, ...] = (".yml", ".yaml", ".xml", ".npz")
+    suffixes: tuple[str, ...] = (".yml", ".yaml", ".npz")
 
     def __init__(self, name: str):
         self.name = name
@@ -46,44 +48,29 @@ class OpenCV(MapFormat):
             maps = {"map1": whole.astype("<i2"), "map2": (rest[..., 1] * _PARTS + rest[..., 0]).astype("<u2")}
         else:
             maps = {name: positions[..., i].astype("<f4") for i, name in enumerate(("map1", "map2"))}
-        keys = {**maps, **dict(zip(SIZES[:2], exact.source_size, strict=True))}
-        if path.lower().endswith(".npz"):
-            return as_archive(keys), {}
-        return as_storage(keys, xml=path.lower().endswith(".xml")), {}
+        arrays = {**maps, **{name: np.array(side) for name, side in zip(SIZES[:2], exact.source_size, strict=True)}}
+        if not path.lower().endswith(".npz"):
+            return as_storage(arrays), {}
+        file = io.BytesIO()
+        np.savez(file, **arrays)
+        return file.getvalue(), {}
 
     def matches(self, path: str, content: bytes) -> bool:
         """See `MapFormat`. Which of the two it is the types of its matrices say."""
-        return content[:100].lstrip().startswith((b"PK\3\4", b"%YAML", b"<?xml", b"<opencv_storage"))
+        return content.startswith((b"PK\3\4", b"%YAML"))
 
     def decode(self, content: bytes, given: Options) -> LookupMap:
-        arrays = from_archive(content) if content.startswith(b"PK") else from_storage(content)
-        positions, fixed = _positions(arrays)
+        found = arrays_of(content, _LARGEST_ARRAY) if content.startswith(b"PK") else from_storage(content)
+        arrays = {name: array for name, array in found.items() if array is not None}
+        first, second = arrays["map1"], arrays["map2"]
+        is_fixed = first.dtype == np.int16
+        if is_fixed:
+            rest = second.astype(np.uint16).astype(np.int64)
+            positions = first + np.stack((rest % _PARTS, rest // _PARTS % _PARTS), -1) / _PARTS
+        else:
+            positions = np.stack((first, second), -1).astype(np.float64)
+        if positions.ndim != 3 or not positions.size or positions.shape[-1] != 2:
+            raise ValueError(f"no maps of cv2.remap: {first.dtype} {first.shape} and {second.dtype} {second.shape}")
         positions[(positions <= _NOWHERE).any(-1) | ~np.isfinite(positions).all(-1)] = np.nan
-        stated = [arrays[key].item() for key in SIZES[:2] if key in arrays and arrays[key].size == 1]
-        size = checked("source_size", stated if len(stated) == 2 else given.source_size)
-        return LookupMap(torch.from_numpy(positions), size, "opencv_fixed" if fixed else "opencv", {})
-
-
-def _positions(arrays: Arrays) -> tuple[Floats, bool]:
-    """(H', W', 2) of what `cv2.remap` takes, and whether that is fixed-point."""
-    names = next((names for names in _PAIRS if names[0] in arrays), None)
-    if names is None:
-        raise ValueError(f"no map of that name; it has {', '.join(arrays) or 'nothing'}")
-    first, second = arrays[names[0]], arrays.get(names[1])
-    if first.size > 2 * MOST_PIXELS:
-        raise ValueError(f"more than {MOST_PIXELS} pixels")
-    if second is not None and second.size and second.shape != first.shape[:2]:
-        raise ValueError(f"maps of shapes {first.shape} and {second.shape}")
-    second = second if second is not None and second.size else None
-    if first.size and first.dtype.kind == "f" and first.ndim == 2 and second is not None:
-        return np.stack((first, second), -1).astype(np.float64), False
-    if first.size and first.ndim == 3 and first.shape[2] == 2:
-        if first.dtype.kind == "f":
-            return first.astype(np.float64), False
-        if first.dtype == np.int16 and second is None:
-            return first.astype(np.float64), True
-        if first.dtype == np.int16 and second is not None and second.dtype in (np.uint16, np.int16):
-            rest = second.astype(np.int64)
-            return first + np.stack((rest & (_PARTS - 1), rest // _PARTS & (_PARTS - 1)), -1) / _PARTS, True
-    shapes = " and ".join(f"{a.dtype} {a.shape}" for a in (first, second) if a is not None)
-    raise ValueError(f"no maps of cv2.remap: {shapes}")
+        size = checked("source_size", [int(arrays[key]) for key in SIZES[:2]])
+        return LookupMap(torch.from_numpy(positions), size, "opencv_fixed" if is_fixed else "opencv", {})

@@ -18,11 +18,10 @@ _LONGEST = 1 << 16  # pixels along a side
 
 @dataclass(frozen=True)
 class Options:
-    """What a caller says of a map to write (see `Warp.save`) or to read (see `load_map`); None is the format's own."""
+    """What is said of a map: by `Warp.save`, or by the description of one to read. None is the format's own."""
 
     step: int | None = None
     v: str | None = None
-    order: str | None = None
     block: tuple[int, int] | None = None
     dtype: str | None = None
     clip: bool | None = None
@@ -68,13 +67,11 @@ def named_sizes(source: tuple[int, int], target: tuple[int, int]) -> dict[str, i
 
 
 def checked(name: str, size: Any) -> tuple[int, int]:
-    """The (height, width) that a map to read is for, which the caller or the file says.
+    """The (height, width) that a map to read is for, as the file or its description says.
 
     Raises:
-        ValueError: nobody says it, or it is none.
+        ValueError: it is none.
     """
-    if size is None:
-        raise ValueError(f"the file does not say the {name}; say {name}=(height, width)")
     sides = tuple(size) if isinstance(size, (tuple, list)) else ()
     whole = all(isinstance(side, int) and 0 < side <= _LONGEST for side in sides)
     if len(sides) != 2 or not whole or sides[0] * sides[1] > MOST_PIXELS:

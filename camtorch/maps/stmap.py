@@ -59,11 +59,8 @@ class STMap(MapFormat):
         pixels, stated = (_from_exr if content.startswith(_EXR) else _from_tiff)(content)
         if any(plane.ndim != 2 or plane.dtype.kind != "f" or not plane.size for plane in pixels):
             raise ValueError("red and green are not float")
-        way = stated.get("v", given.v or "up")
-        if way not in _WAYS or (given.v is not None and given.v != way):
-            raise ValueError(f"v runs {way!r}, and was said to run {given.v!r}")
-        says = all(key in stated for key in _KEYS[1:])
-        size = checked("source_size", [stated[key] for key in _KEYS[1:]] if says else given.source_size)
+        way, *sides = (stated[key] for key in _KEYS)
+        size = checked("source_size", sides)
         parts = np.stack(pixels, -1).astype(np.float64)
         nowhere = (parts == -1).all(-1) | ~np.isfinite(parts).all(-1)
         if way == "up":
@@ -112,10 +109,5 @@ def _from_tiff(content: bytes) -> tuple[list[np.ndarray], dict[str, Any]]:
     with tifffile.TiffFile(io.BytesIO(content)) as file:
         page = file.pages[0]
         _check_size(math.prod(page.shape))
-        pixels, text = page.asarray(), page.description
-        pixels = pixels if page.axes.startswith("S") else np.moveaxis(pixels, -1, 0)  # planes one after the other
-    try:
-        stated = json.loads(text)
-    except (ValueError, RecursionError):
-        stated = None
-    return [pixels[0], pixels[1]], stated if isinstance(stated, dict) else {}
+        pixels, stated = page.asarray(), json.loads(page.description)
+    return [pixels[..., 0], pixels[..., 1]], stated

@@ -372,7 +372,6 @@ class Warp(GeometryModule):
         *,
         step: int | None = None,
         v: Literal["up", "down"] | None = None,
-        order: Literal["yx", "xy"] | None = None,
         block: tuple[int, int] | None = None,
         dtype: Literal["float32", "uint8"] | None = None,
         clip: bool | None = None,
@@ -385,12 +384,11 @@ class Warp(GeometryModule):
 
         Args:
             path: of the file, replaced as a whole or not at all. Bare tables get a description beside them, PATH.json.
-            format: "opencv" (.yml, .xml, .npz), "opencv_fixed" (the same), "stmap" (.exr, .tif), "dw100", "ti_ldc",
-                "depthai", "obj", "gltf" (.glb, .gltf) or "onnx"; by default what the suffix says.
-            step: pixels of the target between the nodes of a mesh: 16 by default for "depthai", "obj" and "gltf", 8 for
-                "ti_ldc", where it is a power of two up to 128.
+            format: "opencv" (.yml, .npz), "opencv_fixed" (the same), "stmap" (.exr, .tif), "dw100", "ti_ldc", "obj" or
+                "onnx"; by default what the suffix says.
+            step: pixels of the target between the nodes of a mesh: 16 by default for "obj", 8 for "ti_ldc", where it is
+                a power of two up to 128.
             v: "stmap": "up", as Nuke has it and by default, or "down".
-            order: "depthai": "yx" for loadMeshFiles, the default, or "xy" for setWarpMesh.
             block: "ti_ldc": (height, width) of the blocks of the target; by default the largest that can be had.
             dtype: "onnx": of the images, "float32" by default.
             clip: "dw100", "ti_ldc": draw in positions that the format cannot hold, rather than refuse them.
@@ -402,7 +400,7 @@ class Warp(GeometryModule):
         """
         from camtorch.maps.formats import save_map  # all formats of maps: only when needed
 
-        return save_map(self, path, format, step=step, v=v, order=order, block=block, dtype=dtype, clip=clip)
+        return save_map(self, path, format, step=step, v=v, block=block, dtype=dtype, clip=clip)
 
     def __getstate__(self) -> dict[str, Any]:
         return {**super().__getstate__(), "_pinned": None}

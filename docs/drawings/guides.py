@@ -206,7 +206,6 @@ def maps() -> Image.Image:
                     ct.load_map(path).error(warp),
                 )
             )
-        warp.save(path, "depthai")
         mesh = ct.load_map(path).positions
     figure, axes = plt.subplots(1, 4, figsize=(16.4, 3.9), facecolor=PAGE, layout="constrained")
     for axis, image, title in zip(axes, images, ("a fisheye, and a mesh of every 16 px", "dewarped"), strict=False):

@@ -108,16 +108,12 @@ def test_a_batch_is_drawn_as_one_by_one():
         ct.data.Seeded(camtorch.augment.numpy.Transform(augmentation()))(image=images.numpy(), key=[1, 2, 3])
 
 
-def test_a_state_goes_on_in_another_process():
+def test_it_goes_on_in_another_process():
     augment = ct.data.Seeded(augmentation(), seed=3)
     augment.set_epoch(5)
-    other = ct.data.Seeded(augmentation())
-    other.load_state_dict(json.loads(json.dumps(augment.state_dict())))
-    for again in (other, pickle.loads(pickle.dumps(augment))):
-        assert (again.seed, again.epoch) == (3, 5)
-        assert torch.equal(again.draw([1])["yaw"], augment.draw([1])["yaw"])
-    augment.set_epoch(6)
-    assert other.epoch == 5
+    again = pickle.loads(pickle.dumps(augment))
+    assert (again.seed, again.epoch) == (3, 5)
+    assert torch.equal(again.draw([1])["yaw"], augment.draw([1])["yaw"])
 
 
 class Images(Dataset):
@@ -247,17 +243,15 @@ def test_columns_as_engines_hand_them_over():
         nested[i] = np.empty(3, object)
         for j, point in enumerate(row["keypoints"]):
             nested[i][j] = point
-    given = whole | {"keypoints": nested, "path": list(whole["path"]), "images": whole["image"], "none": [None] * 3}
-    del given["image"]
+    given = whole | {"keypoints": nested, "path": list(whole["path"]), "none": [None] * 3}
     given["nose"], given["score"] = whole["keypoints"], np.ones((3, 2))
     found = function(given)
-    assert np.array_equal(found["images"], expected["image"])
+    assert np.array_equal(found["image"], expected["image"])
     assert np.array_equal(found["score"], given["score"])
     for i in range(3):
         assert np.array_equal(found["keypoints"][i], expected["keypoints"][i])
         assert np.array_equal(found["nose"][i], expected["keypoints"][i])
         assert np.array_equal(found["nose_valid"][i], expected["keypoints_valid"][i])
-    assert "image" not in found
     empty = function({name: values[:0] for name, values in whole.items()})
     assert {name: len(values) for name, values in empty.items()} == dict.fromkeys(whole, 0)
 
@@ -360,7 +354,7 @@ def test_wrong_samples_are_told():
     sample = {"__key__": "a", "jpg": rows(1)[0]["image"], "json": {}}
     for change, message in (
         ({"jpg": b"JFIF"}, r'jpg is not decoded; .decode\("rgb8"\) before .map'),
-        ({"jpg": torch.zeros(3, *SIZE)}, r'jpg must be a numpy array, as of .decode\("rgb8"\); got Tensor'),
+        ({"jpg": torch.zeros(3, *SIZE)}, "jpg must be a numpy array; got Tensor"),
         ({"json": b"{}"}, "json must be an object of labels; got bytes. Undecoded ones"),
         ({"left.png": sample["jpg"]}, "whether left.png moves is not known; fields={'left.png': KIND}"),
         ({"png": sample["jpg"]}, "png and jpg both hold image"),

@@ -61,8 +61,7 @@ def test_an_omnidir_pair_as_opencv_writes_it(tmp_path):
         assert torch.equal(camera.distortion, rig.cameras[name].distortion)
 
 
-@pytest.mark.parametrize("key", ["dist_coeff", "distCoeff", "dist_coef", "distortion_coefficient", "d", "distCoeffsMat",
-                                 "distortion_params", "distortion_parameters", "dist"])  # fmt: skip
+@pytest.mark.parametrize("key", ["distCoeff", "dist_coef", "d", "distCoeffsMat", "distortion_parameters", "dist"])
 def test_distortion_by_many_names(path, key):
     assert ct.load(written(path, f"K: {K}\n{key}: [[0.3, 0.1, 0, 0, 0]]")).camera.distortion.shape == (5,)
 
@@ -120,32 +119,25 @@ def test_model_argument_decides(path):
         opencv.read(path, "fish")
 
 
-def test_stereo_file_asks_for_a_name():
-    with pytest.raises(CameraFileError, match=r"opencv_stereo.yml: M1, M2: several cameras; choose one by its name"):
+def test_several_cameras_are_a_rig():
+    with pytest.raises(ValueError, match=r"not one camera; rig.cameras has \['1', '2'\]"):
         opencv.read(FILES / "opencv_stereo.yml")
-    assert opencv.read(FILES / "opencv_stereo.yml", name="2").intrinsics.tolist() == [1064.3, 1065.1, 641.7, 396.4]
-    with pytest.raises(CameraFileError, match=r"no camera is called '3'; there are \['1', '2'\]"):
-        opencv.read(FILES / "opencv_stereo.yml", name="3")
+    assert opencv.read_rig(FILES / "opencv_stereo.yml")["2"].intrinsics.tolist() == [1064.3, 1065.1, 641.7, 396.4]
 
 
 @pytest.mark.parametrize(
     ("text", "place", "reason"),
     [
-        ("\n", "content", "not keys and values"),
         ("- 1", "content", "not keys and values"),
         ("a: [1", r"line \d", "expected"),
         ("{'K': 1}", "K", "neither"),
-        ("{'K': [1}", "line 1", "does not match"),
-        ("{K': 1}", "line 1", "double quotes"),
         ("x: 1", "camera_matrix", "missing"),
         ("K: !!opencv-matrix 3", "line 1", "keys and values"),
         (f"K: {K}\nM: {K}", "M", "one camera has this and K"),
         ("K: 5", "K", "neither"),
         ("K: [1, 2]", "K", "3 x 3"),
         ("K: {rows: 3, cols: 3, data: [1, 2]}", "K.data", "2 numbers, where rows and cols say 3 x 3"),
-        ("K: {rows: 1e99, cols: 1e99, data: [1, 2]}", "K.data", "1e[+]99"),
-        ("K: {cols: 3, data: [1, 2]}", "K.rows", "no number"),
-        ("K: {rows: 3, cols: 3}", "K.data", "no list"),
+        ("K: {cols: 3, data: [1, 2]}", "K.rows", "missing"),
         ("K: [500, 0.5, 320, 0, 500, 240, 0, 0, 1]", r"K\[1\]", "skew of 0.5.*write 0"),
         ("K: [500, 0, 320, 0, 500, 240, 0, 0, 2]", "K", "is not"),
         ("K: [500, 0, 320, 0, .nan, 240, 0, 0, 1]", r"K\[4\]", "'.nan' is no finite number"),
@@ -153,14 +145,11 @@ def test_stereo_file_asks_for_a_name():
         (f"K: {K}\nD: [0, 0, inf, 0]", r"D\[2\]", "no finite number"),
         (f"K: {K}\nD: [0, 0, 0]", "D", "3 coefficients; BrownConrady takes n = 4, 5"),
         (f"K: {K}\nimage_width: 640", "image_height", "missing"),
-        (f"K: {K}\nimage_width: 640\nimage_height: 1e30", "image_height", "no number of pixels"),
         (f"K: {K}\nimage_width: 640.5\nimage_height: 480", "image_width", "no number of pixels"),
         (f"K: {K}\nfisheye_model: [1]", "fisheye_model", "neither true nor false"),
         (f"K: {K}\nD: [0, 0, 0, 0]\ndistortion_model: equidistant", "distortion_model", "another model"),
         (f"K: {K}\nxi: 1.2", "xi", "1 coefficients; Mei takes n = 5"),
-        (f"K: {K}\nxi: soon", "xi", "'soon' is no finite number"),
         ("a\0b: 1", "content", "not allowed"),
-        ("K: " + "9" * 5000, "K", "neither"),
     ],
 )
 def test_every_fault_has_a_place_and_a_reason(path, text, place, reason):

@@ -5,6 +5,7 @@ import pickle
 
 import pytest
 import torch
+from rigs import float64
 
 import camtorch as ct
 
@@ -47,12 +48,9 @@ def test_it_is_a_mapping_of_names():
 @pytest.mark.parametrize("make", [lambda: rig_of(NAMES), posed_images], ids=["cameras", "images"])
 def test_it_is_a_module(make):
     rig, other = make(), make()
-    tensors = list(rig.parameters())
-    assert {id(p) for c in rig.values() for p in c.parameters()} <= {id(p) for p in tensors}
     assert not any(p.requires_grad for p in rig.requires_grad_(False).parameters())
     assert not any(p.requires_grad for name in rig.extrinsics for p in rig.extrinsics[name].parameters())
     assert all(p.dtype == torch.float64 for p in rig.double().parameters())
-    assert rig[next(iter(rig))].intrinsics.dtype == torch.float64
     with torch.no_grad():
         for p in other.parameters():
             p.mul_(1.25)
@@ -144,3 +142,59 @@ def test_who_takes_it_for_a_camera_is_told_where_those_are():
         ct.Dewarp("camera.yml")
     with pytest.raises(TypeError, match=r"got str$"):
         ct.augment.RandomMount(camera="pinhole")
+
+
+# -- what stands between two of its cameras
+
+LENS = ct.BrownConrady([500.0, 505, 320, 240], [-0.2, 0.05, 0.001, -0.001, 0.0], image_size=(480, 640))
+
+
+def pair(first=([0.0] * 3, [0.0] * 3)):
+    poses = {"left": ct.Extrinsics(*first), "right": ct.Extrinsics([0.02, -0.05, 0.01], [-0.12, 0.005, 0.004])}
+    return ct.Rig({"left": LENS, "right": LENS}, poses).double().requires_grad_(False)
+
+
+def test_a_file_with_two_cameras_gives_a_pair_to_rectify(tmp_path):
+    rig = pair(([0.3, 0.1, -0.2], [0.5, -0.4, 0.1]))
+    ct.save(rig, tmp_path / "rig.json")
+    again = ct.load(tmp_path / "rig.json")
+    left, right = again
+    found = again.between(left, right)
+    first, second = (rig.extrinsics[name].matrix() for name in rig)
+    torch.testing.assert_close(found.matrix(), second @ first.inverse(), rtol=0, atol=1e-14)
+    rectified = ct.rectify(again[left], again[right], found)
+    assert rectified.baseline.item() == pytest.approx(found.translation.norm().item(), rel=1e-14)
+
+
+@pytest.mark.parametrize("keys", [("R", "T"), ("om", "T"), ("rvec", "tvec")])
+def test_opencv_pairs_are_posed_by_matrices_and_by_vectors(keys, tmp_path):
+    turn, shift = float64([0.02, -0.05, 0.01]), [-0.12, 0.005, 0.004]
+    pose = ct.Extrinsics(turn, float64(shift))
+    rotation = pose.matrix()[:3, :3].flatten().tolist() if keys[0] == "R" else turn.tolist()
+    lens = "[500, 0, 320, 0, 500, 240, 0, 0, 1]"
+    (tmp_path / "pair.yml").write_text(f"M1: {lens}\nM2: {lens}\n{keys[0]}: {rotation}\n{keys[1]}: {shift}\n")
+    found = ct.load(tmp_path / "pair.yml").between("1", "2")
+    torch.testing.assert_close(found.matrix(), pose.matrix(), rtol=0, atol=1e-15)
+
+
+def test_gradients_reach_the_poses_of_the_rig():
+    rig = pair(([0.3, 0.1, -0.2], [0.5, -0.4, 0.1])).requires_grad_(True)
+    rectification = ct.rectify(rig["left"], rig["right"], rig.between("left", "right"))
+    rectification.baseline.backward()
+    for pose in rig.extrinsics.values():
+        assert pose.translation.grad.norm() > 0
+    assert rig.extrinsics["left"].rotation.grad.norm() > 0
+
+
+@pytest.mark.parametrize(
+    ("names", "text"),
+    [
+        (("left", "middle"), "no camera and no image is called 'middle'"),
+        (("left", "right"), "'right' has no pose in rig.extrinsics; there is 'left'"),
+    ],
+)
+def test_what_is_missing_is_said(names, text):
+    rig = pair()
+    del rig.extrinsics["right"]
+    with pytest.raises(ValueError, match=text):
+        rig.between(*names)

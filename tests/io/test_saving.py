@@ -3,8 +3,6 @@
 import json
 import os
 import stat
-import subprocess
-import sys
 
 import pytest
 import torch
@@ -46,15 +44,6 @@ LOST = [
     ("opencv", ct.Rig({"1": camera(), "2": camera("kannala_brandt")}), "a lens unlike that of the cameras before it"),
     ("opencv", ct.Rig({"1": camera(), "2": camera(image_size=(4, 4))}), "a size unlike that of the cameras before it"),
     ("nerfstudio", ct.Rig({"1": camera(), "2": camera("pinhole")}), "a file has one camera_model"),
-    ("gyroflow", camera("mei"), "Gyroflow has no name for mei"),
-    (
-        "camodocal",
-        camera("kannala_brandt", [1e-3] * 5),
-        "5 coefficients; camodocal has 4 for kannala_brandt, so k5 would",
-    ),
-    ("woodscape", camera(), "WoodScape has no name for brown_conrady"),
-    ("metashape", camera("pinhole"), "cameras.xml: format: read only"),
-    ("nuscenes", camera("pinhole"), "cameras.json: format: read only"),
     ("kalibr", camera(core=[CORE] * 2, distortion=[[0.0] * 4] * 2), r"a batch of cameras \(2,\)"),
 ]
 
@@ -72,7 +61,7 @@ def test_values_that_are_not_finite_are_not_written(tmp_path):
     with torch.no_grad():
         broken.distortion[0] = torch.nan
     for format, suffix in SUFFIXES.items():
-        if format not in ("aria", "metashape", "nuscenes"):  # the last two are read only
+        if format != "aria":
             with pytest.raises(ct.CameraFileError, match="not finite"):
                 ct.save(broken, tmp_path / f"x{suffix}", format)
 
@@ -142,20 +131,22 @@ def test_poses_of_many_images_are_one_batch_in_every_format(tmp_path):
 
 
 @given(core=st.tuples(*[st.floats(1, 1e4)] * 4), distortion=st.lists(st.floats(-1, 1), min_size=4, max_size=4))
-def test_numbers_come_back_to_the_last_bit(tmp_path_factory, core, distortion):
+def test_numbers_come_back(tmp_path_factory, core, distortion):
+    """To the last bit in the formats of OpenCV's own conventions; elsewhere up to the rounding of half a pixel."""
+    one = camera(distortion=distortion, core=core)
     for format, suffix in SUFFIXES.items():
-        # another number of coefficients; half a pixel; parts of the image's side (docs/contributing/format.md adds it)
-        if format in ("basalt", "colmap", "ncore", "nerfstudio", "opensfm"):
-            continue
         path = tmp_path_factory.getbasetemp() / f"exact{suffix}"
-        one = camera(distortion=distortion, core=core)
+        is_exact = format in ("opencv", "ros", "kalibr", "mrcal", "camtorch")
         try:
             ct.save(one, path, format)
         except ct.CameraFileError:
-            assert format not in ("opencv", "ros", "kalibr", "mrcal", "camtorch")
+            assert not is_exact
             continue
-        again = ct.load(path)
-        assert_same(ct.Rig(again.cameras), ct.Rig({"cam0" if format == "kalibr" else "camera": one}))
+        (again,) = ct.load(path).values()
+        limit = 0 if is_exact else 1e-12
+        torch.testing.assert_close(again.intrinsics, one.intrinsics, rtol=limit, atol=limit)
+        torch.testing.assert_close(again.distortion[:4], one.distortion, rtol=limit, atol=limit)
+        assert not again.distortion[4:].any()
 
 
 @pytest.mark.parametrize("name", ["\U0001f4f7 left", 'quote"', "line\nbreak"])
@@ -191,81 +182,25 @@ def test_numbers_are_numbers_to_pyyaml(tmp_path):
 # -- whole or not at all
 
 
-@pytest.fixture
-def reconstruction(tmp_path):
-    """COLMAP's files of a camera and a pose, and another rig of the same names."""
-    one, other = (
-        ct.Rig({"1": camera("pinhole", core=[focal, focal, 320, 240])}, {"a.jpg": pose}, images={"a.jpg": "1"})
-        for focal, pose in (
-            (500.0, ct.Extrinsics([0, 0, 0.1], [0, 0, 1])),
-            (600.0, ct.Extrinsics([0, 0, 0.2], [0, 0, 2])),
-        )
-    )
-    ct.save(one, tmp_path, "colmap")
-    return tmp_path, ct.load(tmp_path), other
+@pytest.mark.parametrize("function", ["fsync", "open"])
+@pytest.mark.parametrize("at", [0, 1])
+def test_where_writing_fails_the_old_files_stay(function, at, tmp_path, monkeypatch):
+    rig = ct.Rig({"1": camera("pinhole")}, {"a.jpg": ct.Extrinsics([0, 0, 0.1], [0, 0, 1])}, images={"a.jpg": "1"})
+    ct.save(rig, tmp_path, "colmap")
+    rig.cameras["1"] = camera("pinhole", core=[600.0] * 4)
+    files = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    right, calls = getattr(os, function), iter(range(100))
 
-
-def failing(function, at):
-    """A function that raises at its call of that number, counted from 0."""
-    calls = iter(range(100))
-
-    def call(*arguments):
+    def failing(*arguments):
         if next(calls) == at:
             raise OSError("no space left")
-        return function(*arguments)
+        return right(*arguments)
 
-    return call
-
-
-@pytest.mark.parametrize("function", ["replace", "fsync", "open"])
-@pytest.mark.parametrize("at", range(4))
-def test_files_that_belong_together_change_together(function, at, reconstruction, monkeypatch):
-    folder, before, other = reconstruction
-    files = {path.name: path.read_bytes() for path in folder.iterdir()}
     with monkeypatch.context() as patch:
-        patch.setattr(os, function, failing(getattr(os, function), at))
-        try:
-            ct.save(other, folder, "colmap")
-        except OSError:
-            assert {path.name: path.read_bytes() for path in folder.iterdir()} == files
-            assert_same(ct.load(folder), before)
-        else:
-            assert at >= 2  # two files, opened and flushed once each
-            assert len(list(folder.iterdir())) == len(files)
-            assert ct.load(folder).camera.intrinsics[0] == 600
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork")
-def test_a_crash_leaves_no_mixture(reconstruction):
-    """Where the process dies at one of the renames: the old or the new rig, or an error that says so."""
-    folder, _, other = reconstruction
-    ct.save(other, folder / "other.json")
-    code = f"""
-import os, pathlib, shutil, camtorch as ct
-folder = pathlib.Path({str(folder)!r})
-rig, rename = ct.load(folder / "other.json"), os.replace
-for at in range(4):
-    shutil.copytree(folder, folder.with_name(f"{{folder.name}}_{{at}}"))
-    child = os.fork()
-    if not child:
-        count = iter(range(100))
-        os.replace = lambda *names: os._exit(7) if next(count) == at else rename(*names)
-        ct.save(rig, folder.with_name(f"{{folder.name}}_{{at}}"), "colmap")
-        os._exit(0)
-    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 7
-"""
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
-    subprocess.run([sys.executable, "-W", "ignore", "-c", code], env=environment, check=True)
-    for at in range(4):
-        try:
-            found = ct.load(folder.with_name(f"{folder.name}_{at}") / "cameras.txt")
-        except (ct.CameraFileError, FileNotFoundError) as error:  # noqa: PERF203
-            reasons = ["No such file", "an interrupted save left .images.txt."]
-            assert at > 0 and any(reason in str(error) for reason in reasons)  # noqa: PT017, PT018
-        else:
-            pair = found.camera.intrinsics[0].item(), found.extrinsics["a.jpg"].translation[2].item()
-            assert pair in ((500, 1), (600, 2))
+        patch.setattr(os, function, failing)
+        with pytest.raises(OSError, match="no space left"):
+            ct.save(rig, tmp_path, "colmap")
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == files
 
 
 @pytest.mark.skipif(os.name == "nt", reason="POSIX modes")
@@ -322,13 +257,13 @@ def test_the_name_says_the_format(name, format, tmp_path):
 
 
 def test_what_the_name_does_not_say_is_asked_for(tmp_path):
-    with pytest.raises(
-        ValueError, match=r"a.yaml: the name does not say the format; it may be camodocal, kalibr, opencv, ros"
-    ):
+    with pytest.raises(ValueError, match=r"a.yaml: the name does not say the format; it may be kalibr, opencv, ros"):
         ct.save(camera(), tmp_path / "a.yaml")
-    with pytest.raises(ValueError, match="format: 'ply' is not known here; known are aria"):
+    with pytest.raises(ValueError, match="format: 'ply' is not known here; written are aria"):
         ct.save(camera(), tmp_path / "a.yaml", "ply")
-    with pytest.raises(ValueError, match="format: 'ply' is not known here"):
+    with pytest.raises(ValueError, match="format: 'woodscape' is not written; written are aria"):
+        ct.save(camera(), tmp_path / "a.json", "woodscape")
+    with pytest.raises(ValueError, match="format: 'ply' is not known here; read are aria"):
         ct.load(tmp_path / "a.yaml", "ply")
     with pytest.raises(TypeError, match="a Rig or a Camera can be saved; got list"):
         ct.save([camera()], tmp_path / "a.json")
