@@ -7,14 +7,15 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from camtorch._arguments import Numbers, as_batch, as_number, check_devices, holds
+from camtorch._arguments import Numbers, as_number, check_devices, holds
 from camtorch._module import GeometryModule, Memo, typed_as
 from camtorch.camera import Camera
 from camtorch.extrinsics import Extrinsics
 from camtorch.projection.depth import as_depth, depth_scale
-from camtorch.rotations import rotate_planes, rotation_matrix
+from camtorch.rotations import rotation_matrix
 from camtorch.warp.grid import Sampling, is_plain, to_positions
 from camtorch.warp.panorama import seam_of, seen_by
+from camtorch.warp.proxy import beside, check_pose, turned
 from camtorch.warp.sampling import MODES, PADDINGS, Fill, Mode, PaddingMode, as_fill, one_of, render
 from camtorch.warp.warp import as_sized
 
@@ -62,24 +63,11 @@ class Reproject(GeometryModule):
         super().__init__()
         owner = "Reproject"
         self.source, self.target = as_sized(source, "source", owner), as_sized(target, "target", owner)
-        if not isinstance(extrinsics, Extrinsics):
-            raise TypeError(
-                f"{owner}: extrinsics must be Extrinsics, source from target; got {type(extrinsics).__name__}"
-            )
-        check_devices(owner, source=source.intrinsics, target=target.intrinsics, extrinsics=extrinsics.rotation)
+        self.batch_shape = check_pose(owner, extrinsics, "source from target", source=source, target=target)
         self.extrinsics = extrinsics
         self.mode = one_of(mode, MODES, "mode", owner)
         self.padding_mode = one_of(padding_mode, PADDINGS, "padding_mode", owner)
         self.fill = as_fill(fill, owner)
-        batch = as_batch(
-            owner,
-            source=(*source.batch_shape, 1),
-            target=(*target.batch_shape, 1),
-            extrinsics=(*extrinsics.batch_shape, 1),
-        )
-        if len(batch) > 1:
-            raise ValueError(f"{owner}: cameras and extrinsics may have one batch dim; got {tuple(batch)}")
-        self.batch_shape = batch
         self._memo = Memo()
         seam_of(source)  # while its values may be looked at: traced code asks for it too
 
@@ -159,18 +147,11 @@ class Reproject(GeometryModule):
         if rays.ndim == 3:
             rays, has_ray = rays[None], has_ray[None]
         scale, good = depth_scale(depth, rays[:, None], has_ray[:, None], kind)
-        rotation, shift = rotation_matrix(self.extrinsics.rotation), self.extrinsics.translation
-        if rotation.ndim == 2:
-            rotation, shift = rotation[None], shift[None]
-        lead = rays.shape[1:-1]
-        rows = max(len(rays), len(rotation))
-        turned = rotate_planes(rotation.to(rays.dtype), rays.flatten(1, -2).expand(rows, -1, -1).unbind(-1))
-        shift = shift.to(rays.dtype)
-        planes = [
-            torch.addcmul(t[:, None, None, None], p.view(-1, 1, *lead), scale)
-            for p, t in zip(turned, shift.unbind(-1), strict=True)
-        ]
-        points = torch.stack(planes, -1)
+        directions = turned(rotation_matrix(self.extrinsics.rotation).to(rays.dtype), rays)[:, None]
+        shift = beside(self.extrinsics.translation, directions)
+        # plane by plane: several times as fast
+        parts = zip(shift.unbind(-1), directions.unbind(-1), strict=True)
+        points = torch.stack([torch.addcmul(start, along, scale) for start, along in parts], -1)
         if self.source.batch_shape and len(points) != len(self.source.intrinsics):
             points = points.expand(len(self.source.intrinsics), *points.shape[1:])
         pixels, mapped = seen_by(self.source, points)
