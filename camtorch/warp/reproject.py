@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
+from torch.nn.functional import max_pool2d, pad
 
 from camtorch._arguments import Numbers, as_number, check_devices, holds
 from camtorch._module import GeometryModule, Memo, typed_as
@@ -174,17 +175,14 @@ class Reproject(GeometryModule):
         given = as_depth(source_depth, kind, size, f"{owner}: source_depth", seen.device).detach()
         given = (given if given.ndim == 4 else given[None, None])[:, :1]
         known = torch.isfinite(given) & (given > 0)
-        # between two depths the farther one, so that the rim of a foreground hides nothing behind it that is seen
-        given = torch.where(known, given, torch.inf)
-        pixels = seen.detach().flatten(1, -2)
-        near = [
-            (pixels[..., i] + step).round().long().clamp(0, side - 1)
-            for i, side in ((0, size[1]), (1, size[0]))
-            for step in (-0.5, 0.5)
-        ]
-        rows = given.expand(len(pixels), -1, -1, -1).flatten(1)
-        corners = [rows.gather(1, v * size[1] + u) for u in near[:2] for v in near[2:]]
-        furthest = torch.stack(corners).amax(0).view(seen.shape[:-1])
+        # of the four pixels around the farthest, so that the rim of a foreground hides nothing behind it that is seen
+        around = max_pool2d(pad(torch.where(known, given, torch.inf), (1, 1, 1, 1), mode="replicate"), 2, 1)
+        u, v = (
+            (plane.floor() + 1).long().clamp(0, side)
+            for plane, side in zip(seen.detach().unbind(-1), size[::-1], strict=True)
+        )
+        rows = around.flatten(1).expand(len(seen), -1)
+        furthest = rows.gather(1, (v * (size[1] + 1) + u).flatten(1)).view(seen.shape[:-1])
         return far.detach() <= furthest * (1 + tolerance)
 
     def extra_repr(self) -> str:
