@@ -72,5 +72,3 @@ from camtorch.warp.surround import surround as surround
 from camtorch.warp.vignetting import vignetting as vignetting
 from camtorch.warp.warp import Warp as Warp
 from camtorch.windshield import Windshield as Windshield
-
-__all__ = [name for name in globals() if not name.startswith("_")]
