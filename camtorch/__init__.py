@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from camtorch._public import *  # noqa: F403 (the list is there)
-    from camtorch._public import __all__ as __all__
     from camtorch.models import *  # noqa: F403
 
 __version__ = "0.2.0"
@@ -15,8 +14,9 @@ __version__ = "0.2.0"
 
 
 def _load() -> None:
-    public = importlib.import_module("camtorch._public")
-    globals().update({name: getattr(public, name) for name in ("__all__", *public.__all__)})
+    public = vars(importlib.import_module("camtorch._public"))
+    names = {name: value for name, value in public.items() if not name.startswith("_")}
+    globals().update(names, __all__=sorted(names))
 
 
 if not TYPE_CHECKING:  # a checker knows the names, and no others

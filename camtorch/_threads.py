@@ -118,18 +118,9 @@ def _find_limits() -> tuple[Callable[[int], object], Callable[[int], int]] | Non
     """How OpenMP, and MKL where it is used, are told among how many threads to split the work of the calling one."""
     if sys.platform == "win32":
         return None
-    of_torch = ctypes.CDLL(torch._C.__file__)
-    threads = torch.get_num_threads()
-    for library in (ctypes.CDLL(None), of_torch):  # what was loaded before torch may take its place
-        openmp = getattr(library, "omp_set_num_threads", None)
-        if openmp is None:
-            continue
-        openmp(threads + 1)
-        is_it = torch.get_num_threads() == threads + 1
-        openmp(threads)
-        if is_it:
-            return openmp, getattr(of_torch, "MKL_Set_Num_Threads_Local", int)
-    return None
+    torch_library = ctypes.CDLL(torch._C.__file__)
+    openmp = getattr(torch_library, "omp_set_num_threads", None)
+    return None if openmp is None else (openmp, getattr(torch_library, "MKL_Set_Num_Threads_Local", int))
 
 
 _limits = _find_limits()

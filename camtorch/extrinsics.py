@@ -112,22 +112,20 @@ class Extrinsics(BatchedModule):
                     "Extrinsics: beside a translation the rotation must be (*B, 3, 3) matrices; got shape "
                     f"{tuple(rotation.shape)}. Rotation vectors go into Extrinsics(rotation, translation)"
                 )
-            check_rotation(rotation, "rotation", "Extrinsics")
-            translation = as_vectors(translation, "translation", "Extrinsics")
-            return cls(rotation_vector(rotation).unsqueeze(-1), translation)
-        matrix = as_real(given, "matrix", "Extrinsics")
-        if matrix.shape[-2:] not in ((4, 4), (3, 4)):
-            hint = ". A rotation goes with its translation: from_matrix(R, t)" if matrix.shape[-2:] == (3, 3) else ""
-            raise ValueError(
-                f"Extrinsics: matrix must be (*B, 4, 4) or (*B, 3, 4); got shape {tuple(matrix.shape)}{hint}"
-            )
-        if matrix.shape[-2] == 4:
-            bottom = matrix[..., 3, :].detach()
+        else:
+            matrix = as_real(given, "matrix", "Extrinsics")
+            if matrix.shape[-2:] not in ((4, 4), (3, 4)):
+                is_turn = matrix.shape[-2:] == (3, 3)
+                hint = ". A rotation goes with its translation: from_matrix(R, t)" if is_turn else ""
+                raise ValueError(
+                    f"Extrinsics: matrix must be (*B, 4, 4) or (*B, 3, 4); got shape {tuple(matrix.shape)}{hint}"
+                )
+            bottom = matrix[..., 3:, :].detach()
             if fails(bottom == bottom.new_tensor([0, 0, 0, 1])):
                 raise ValueError(f"Extrinsics: the last row of matrix must be 0 0 0 1; got {bottom.tolist()}")
-        rotation = matrix[..., :3, :3]
+            rotation, translation = matrix[..., :3, :3], matrix[..., :3, 3]
         check_rotation(rotation, "matrix", "Extrinsics")
-        return cls(rotation_vector(rotation).unsqueeze(-1), matrix[..., :3, 3])
+        return cls(rotation_vector(rotation).unsqueeze(-1), as_vectors(translation, "translation", "Extrinsics"))
 
     def inverse(self) -> Extrinsics:
         """World from camera."""

@@ -12,7 +12,6 @@ from torch import Tensor, nn
 
 from camtorch._arguments import (
     Numbers,
-    as_batch,
     as_coordinates,
     as_flag,
     as_fov,
@@ -20,7 +19,6 @@ from camtorch._arguments import (
     as_number,
     as_points,
     as_values,
-    check_devices,
     check_path,
     fails,
     shown,
@@ -34,6 +32,7 @@ from camtorch.io.filestorage import Value, write
 from camtorch.models import Cylindrical, Equirectangular, LatLon, Pinhole, TransverseCylindrical
 from camtorch.rotations import rotation_matrix
 from camtorch.warp.dewarp import middle_lines
+from camtorch.warp.proxy import check_pose
 from camtorch.warp.warp import Warp, as_sized
 
 Projection = Literal["perspective", "latlon", "cylindrical"]
@@ -271,27 +270,18 @@ class Rectification(GeometryModule):
         return camera.pixel_grid().expand(*camera.batch_shape, -1, -1, -1)
 
     def _points(self, pixels: Tensor, d: Tensor) -> tuple[Tensor, Tensor]:
-        """Of pixels (*B, H, W, 2) and disparities (B, H, W)."""
-        camera, baseline = self.camera_left, self.baseline.to(d.dtype)[..., None, None]
-        focal = camera.intrinsics.to(d.dtype)[..., self._axis, None, None]
-        rays, has_ray = camera.unproject(pixels.to(camera.intrinsics.dtype))
-        rays = rays.to(d.dtype)
-        along, z = rays[..., self._axis], rays[..., 2]
-        across = torch.hypot(rays[..., 1 - self._axis], z)
-        good = torch.isfinite(d) & has_ray & (d * baseline > 0)
-        d = torch.where(good, d, torch.where(baseline < 0, -1.0, 1.0).to(d.dtype))
-        unit = z if self.projection == "perspective" else across
-        if self.projection != "latlon":
-            distance = focal * baseline / d
-        else:
-            # by the angles from the plane across the baseline: tan a - tan b = sin(a - b) / (cos a cos b)
-            angle, turn = torch.atan2(along, across), d / focal
-            other = angle - turn
-            good = good & (turn.abs() < math.pi) & (other.abs() < math.pi / 2)
-            distance = baseline * torch.cos(angle) * torch.cos(other) / torch.sin(torch.where(good, turn, 1.0))
-        good = good & (distance > 0) & torch.isfinite(distance) & (unit > 0)
-        scale = torch.where(good, distance, 0.0) / torch.where(unit > 0, unit, 1.0)
-        return rays * scale[..., None], good
+        """Where the rays of both images meet, of pixels (*B, H, W, 2) and disparities (B, H, W)."""
+        camera, baseline = self.camera_left.each(Tensor.double), self.baseline[..., None, None]
+        good = torch.isfinite(d) & (d * baseline > 0)
+        step = torch.where(good, d, 1.0).double()[..., None] * _unit(self._axis, pixels.double())[:2]
+        (left, one), (right, other) = camera.unproject(pixels.double()), camera.unproject(pixels - step)
+        # in the plane of both, along the baseline and away from it
+        a, b = left[..., self._axis], self.distance(left)
+        c, e = right[..., self._axis], self.distance(right)
+        sine = a * e - b * c
+        good = good & one & other & (sine * baseline > 0)
+        scale = torch.where(good, baseline * e / torch.where(good, sine, 1.0), 0.0)
+        return (left * scale[..., None]).to(d.dtype), good & (scale > 0) & torch.isfinite(scale)
 
     def disparity(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """The disparity of points (*B, *N, 3) of the frame of the rectified left camera, and whether both see them."""
@@ -312,8 +302,8 @@ class Rectification(GeometryModule):
         near, far = (as_number(v, name, "disparity_range") for v, name in ((near, "near"), (far, "far")))
         if not 0 < near < far:
             raise ValueError(f"disparity_range: depths must be 0 < near < far; got near={near}, far={far}")
-        disparities = torch.cat([self._at(depth).flatten() for depth in (near, far)])
-        return float(disparities.min()), float(disparities.max())
+        found = torch.cat([self._at(near), self._at(far)])
+        return float(found.min()), float(found.max())
 
     def depth_range(self, least: float, most: float) -> tuple[float, float]:
         """The other way: the least and the greatest depth that disparities between two have; infinite for zero."""
@@ -325,7 +315,7 @@ class Rectification(GeometryModule):
             size = self.camera_left._size_for("depth_range")
             parts = [self._points(self._pixels(), end.expand(1, *size)) for end in ends]
             found = torch.cat([points[good] for points, good in parts])
-            found = found[..., 2] if self.projection == "perspective" else self.distance(found)
+            found = self._depth(found)
         if not len(found):
             return math.inf, math.inf
         return float(found.min()), math.inf if least <= 0 <= most else float(found.max())
@@ -338,14 +328,15 @@ class Rectification(GeometryModule):
     @torch.no_grad()
     def _at(self, depth: float) -> Tensor:
         """The disparities of all pixels at a depth."""
-        camera, baseline = self.camera_left, self.baseline[..., None, None]
-        focal = camera.intrinsics[..., self._axis, None, None]
-        if self.projection != "latlon":
-            return focal * baseline / depth
-        rays, has_ray = camera.unproject(self._pixels())
-        along, across = rays[..., self._axis], self.distance(rays)
-        angle = torch.atan2(along, across)
-        return (focal * (angle - torch.atan(torch.tan(angle) - baseline / depth)))[has_ray.expand(angle.shape)]
+        if math.isinf(depth):
+            return self.camera_left.intrinsics.new_zeros(1)
+        rays, _ = self.camera_left.unproject(self._pixels())
+        points = rays * (depth / self._depth(rays))[..., None]
+        disparity, seen = self.disparity(points.expand(*self.baseline.shape, *points.shape[-3:]))
+        return disparity[seen]
+
+    def _depth(self, points: Tensor) -> Tensor:
+        return points[..., 2] if self.projection == "perspective" else self.distance(points)
 
     def opencv(self) -> dict[str, Tensor]:
         """R1, R2, P1, P2 and Q, as `cv2.stereoRectify` returns them, for a perspective pair without batch.
@@ -423,20 +414,11 @@ def rectify(
     """
     owner = "rectify"
     left, right = as_sized(left, "left", owner), as_sized(right, "right", owner)
-    if not isinstance(extrinsics, Extrinsics):
-        raise TypeError(
-            f"{owner}: extrinsics must be Extrinsics, right from left; got {type(extrinsics).__name__}. "
-            "Of OpenCV's R and T ct.Extrinsics.from_matrix(R, T) is one"
-        )
     for value, name, known in ((projection, "projection", tuple(_KINDS)), (align, "align", ("mean", "opencv"))):
         if not isinstance(value, str) or value not in known:
             raise ValueError(f"{owner}: {name} must be one of {known}; got {shown(value)}")
     size, vertical = as_image_size(image_size, owner), as_flag(vertical, "vertical", owner)
-    check_devices(owner, left=left.intrinsics, right=right.intrinsics, extrinsics=extrinsics.rotation)
-    parts = {"left": left, "right": right, "extrinsics": extrinsics}
-    batch = as_batch(owner, **{name: (*part.batch_shape, 1) for name, part in parts.items()})
-    if len(batch) > 1:
-        raise ValueError(f"{owner}: cameras and extrinsics may have one batch dim; got {tuple(batch)}")
+    check_pose(owner, extrinsics, "right from left", left=left, right=right)
     with torch.no_grad():
         frame = frame_of(extrinsics, vertical, align)
         model = _KINDS[projection].columns if vertical else _KINDS[projection].rows

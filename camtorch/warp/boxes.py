@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from camtorch._arguments import Numbers, as_coordinates, as_values, as_whole, check_boxes, is_predicted
-from camtorch._tracing import may_look
+from camtorch._arguments import Numbers, as_coordinates, as_values, as_whole, check_boxes, holds, is_predicted
 from camtorch.warp.panorama import PANORAMAS
 
 if TYPE_CHECKING:
@@ -45,7 +44,7 @@ def enclosed(warp: Warp, corners: Tensor) -> tuple[Tensor, Tensor]:
     some, valid = mapped.any(-1), (mapped & warp.target.contains(moved)).any(-1)
     # a polygon about a direction that the target does not map is turned inside out
     plain = valid & mapped.all(-1) & (_area(corners) * _area(moved) > 0)
-    if not may_look(valid) or isinstance(warp.target, PANORAMAS) or not bool(plain.all()):
+    if isinstance(warp.target, PANORAMAS) or not holds(plain):
         lattice, inside = _inside(warp, corners, moved)
         inside = inside & finite
         some, valid = some | inside.any(-1), valid | inside.any(-1)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import torch
 from torch import Tensor, nn
@@ -14,9 +14,12 @@ from camtorch.camera import Camera
 from camtorch.models import UCM, Cylindrical, Equirectangular, Pinhole
 from camtorch.projection.rays import around_ends, image_lattice
 from camtorch.rotations import as_rotation
-from camtorch.warp.sampling import Fill, Mode, PaddingMode
+from camtorch.warp.sampling import WarpOptions
 from camtorch.warp.shutter import RollingShutter
 from camtorch.warp.warp import Warp, as_sized
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
 
 Projection = Literal["perspective", "stereographic", "cylindrical", "equirectangular"]
 
@@ -78,12 +81,9 @@ class Dewarp(Warp):
         fov: float | None = None,
         image_size: Sequence[int] | None = None,
         rotation: Tensor | None = None,
-        mode: Mode = "bilinear",
-        padding_mode: PaddingMode = "zeros",
-        fill: Fill = 0.0,
-        antialias: bool = False,
         tolerance: float | None = None,
         shutter: RollingShutter | None = None,
+        **options: Unpack[WarpOptions],
     ):
         if not isinstance(projection, str) or projection not in _PROJECTIONS:
             raise ValueError(f"Dewarp: projection must be one of {tuple(_PROJECTIONS)}; got {projection!r}")
@@ -102,17 +102,7 @@ class Dewarp(Warp):
             else:
                 intrinsics = _fitted(camera, projection, size, rotation)
         target = model(nn.Parameter(intrinsics, requires_grad=False), image_size=size)
-        super().__init__(
-            camera,
-            target,
-            rotation,
-            mode=mode,
-            padding_mode=padding_mode,
-            fill=fill,
-            antialias=antialias,
-            tolerance=tolerance,
-            shutter=shutter,
-        )
+        super().__init__(camera, target, rotation, tolerance=tolerance, shutter=shutter, **options)
 
 
 def _fitted(camera: Camera, projection: str, size: tuple[int, int], rotation: Tensor | None) -> Tensor:

@@ -3,30 +3,20 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import TYPE_CHECKING, cast
 
 import torch
 from torch import Tensor, nn
 
-from camtorch._arguments import (
-    Numbers,
-    as_batch,
-    as_coordinates,
-    as_number,
-    as_own,
-    as_real,
-    check_devices,
-    fails,
-    shown,
-    values_of,
-)
+from camtorch._arguments import Numbers, as_batch, as_coordinates, as_number, as_own, as_real, fails, shown, values_of
 from camtorch.camera import Camera
 from camtorch.extrinsics import Extrinsics
 from camtorch.models import Pinhole
-from camtorch.rotations import rotation_matrix
-from camtorch.warp.proxy import ProxyWarp, turned
-from camtorch.warp.sampling import Fill, Mode, PaddingMode
-from camtorch.warp.warp import Warp
+from camtorch.warp.proxy import ProxyWarp, beside
+from camtorch.warp.sampling import WarpOptions
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
 
 _GRAZING = 1e-9  # the cosine of a ray to the plane's normal from which on it does not meet the plane
 
@@ -54,7 +44,8 @@ class PlaneWarp(ProxyWarp):
             not fit, and as `Warp`. TypeError: no cameras, no extrinsics.
     """
 
-    batch_shape: torch.Size
+    normal: Tensor
+    distance: Tensor
 
     def __init__(
         self,
@@ -63,29 +54,18 @@ class PlaneWarp(ProxyWarp):
         extrinsics: Extrinsics,
         normal: Numbers,
         distance: Numbers,
-        *,
-        mode: Mode = "bilinear",
-        padding_mode: PaddingMode = "zeros",
-        fill: Fill = 0.0,
-        antialias: bool = False,
+        **options: Unpack[WarpOptions],
     ):
-        super().__init__(
-            source, target, mode=mode, padding_mode=padding_mode, fill=fill, antialias=antialias, tolerance=0.0
-        )
+        super().__init__(source, target, extrinsics, **options)
         owner = type(self).__name__
-        if not isinstance(extrinsics, Extrinsics):
-            raise TypeError(f"{owner}: extrinsics must be Extrinsics; got {type(extrinsics).__name__}")
-        self.extrinsics = extrinsics
         normal, distance = as_real(normal, "normal", owner), as_real(distance, "distance", owner)
         if normal.ndim not in (1, 2) or normal.shape[-1] != 3 or distance.ndim > 1:
             raise ValueError(
                 f"{owner}: normal must be (3,) or (B, 3) and distance a number or (B,); got {tuple(normal.shape)} and "
                 f"{tuple(distance.shape)}"
             )
-        check_devices(owner, source=source.intrinsics, target=target.intrinsics, extrinsics=extrinsics.rotation)
-        shapes = {"source": source.batch_shape, "target": target.batch_shape, "extrinsics": extrinsics.batch_shape}
-        shapes |= {"normal": normal.shape[:-1], "distance": distance.shape}
-        self.batch_shape = as_batch(owner, **{name: (*shape, 1) for name, shape in shapes.items()})
+        cameras = (*self.batch_shape, 1)
+        self.batch_shape = as_batch(owner, cameras=cameras, normal=normal.shape, distance=(*distance.shape, 1))
         for name, value in (("normal", normal), ("distance", distance)):
             if isinstance(value, nn.Parameter):
                 self.register_parameter(name, value)
@@ -93,12 +73,9 @@ class PlaneWarp(ProxyWarp):
                 self.register_buffer(name, as_own(value))
         self._check(owner)
 
-    normal: Tensor
-    distance: Tensor
-
     def _check(self, owner: str) -> None:
         """Raise a ValueError where the plane goes through a camera, or between them."""
-        known = [values for t in self.plane if (values := values_of(t)) is not None]
+        known = [values for t in (*self.pose, self.normal, self.distance) if (values := values_of(t)) is not None]
         if len(known) < 4:
             return
         rotation, shift, normal, distance = known
@@ -114,63 +91,27 @@ class PlaneWarp(ProxyWarp):
                 "the plane as the target; are the extrinsics source from target?"
             )
 
-    @property
-    def plane(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Source from target (*B, 3, 3) and (*B, 3), and the plane in the target's frame, (*B, 3) and (*B,)."""
-        return self._of_one_dtype(rotation_matrix(self.extrinsics.rotation), self.extrinsics.translation)
-
-    def _of_one_dtype(self, rotation: Tensor, shift: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    def _plane_of_source(self) -> tuple[Tensor, Tensor]:
+        """The normal (*B, 3) and the distance (*B,) in the source's frame."""
+        rotation, shift = self.pose
         dtype = torch.promote_types(rotation.dtype, self.normal.dtype)
-        return rotation.to(dtype), shift.to(dtype), self.normal.to(dtype), self.distance.to(dtype)
+        normal = (rotation.to(dtype) @ self.normal.to(dtype)[..., None])[..., 0]
+        return normal, self.distance + (normal * shift).sum(-1)
 
     def _inputs(self) -> list[Tensor]:
-        return [*super()._inputs(), self.extrinsics.rotation, self.extrinsics.translation, self.normal, self.distance]
+        return [*super()._inputs(), self.normal, self.distance]
 
-    # -- the plane
+    def _nearness(self, rays: Tensor, of_source: bool) -> tuple[Tensor, Tensor]:
+        normal, distance = self._plane_of_source() if of_source else (self.normal, self.distance)
+        normal = beside(normal / distance[..., None], rays)
+        near = (rays * normal).sum(-1)
+        return near, near.detach() > _GRAZING * torch.linalg.vector_norm(normal.detach(), dim=-1)
 
-    def _to_source(self, rays: Tensor) -> tuple[Tensor, Tensor]:
-        return _carried(rays, *self.plane), _ahead(rays, *self.plane[2:])
-
-    def _to_target(self, rays: Tensor) -> tuple[Tensor, Tensor]:
-        rotation, shift, normal, distance = self.plane
-        # the plane as the source has it
-        of_source = (rotation @ normal[..., None])[..., 0]
-        far = distance + (of_source * shift).sum(-1)
-        back = rotation.mT
-        return _carried(rays, back, -(back @ shift[..., None])[..., 0], of_source, far), _ahead(rays, of_source, far)
-
-    def transform_rays(self, rays: Numbers) -> Tensor:
-        """Turn directions (B, *N, 3), or (*N, 3), from the source's to the target's frame; lengths stay."""
-        rays = as_coordinates(rays, "rays", 3, type(self).__name__, self.source.intrinsics.device, "B, *N")
-        rotation = self.plane[0].mT.to(rays.dtype)
-        return turned(rotation, rays)
-
-    def inverse(self) -> Warp:
+    def inverse(self) -> PlaneWarp:
         """The warp from target to source, of the same plane. What lay outside the image stays lost."""
-        rotation, shift, normal, distance = self.plane
-        of_source = (rotation @ normal[..., None])[..., 0]
-        back = Extrinsics.from_matrix(rotation, shift).inverse()
-        options: dict[str, Any] = {name: value for name, value in self.options.items() if name != "tolerance"}
-        far = distance + (of_source * shift).sum(-1)
-        return PlaneWarp(self.target, self.source, back, of_source, far, **options)
-
-
-def _carried(rays: Tensor, rotation: Tensor, shift: Tensor, normal: Tensor, distance: Tensor) -> Tensor:
-    """Directions in which another camera sees the points where rays (B, *N, 3) meet a plane: (R + t n^T / d) ray."""
-    batch = torch.broadcast_shapes(rotation.shape[:-2], shift.shape[:-1], normal.shape[:-1], distance.shape)
-    matrix = rotation + (shift / distance[..., None])[..., :, None] * normal[..., None, :]
-    return turned(matrix.expand(*batch, 3, 3).to(rays.dtype), rays)
-
-
-def _ahead(rays: Tensor, normal: Tensor, distance: Tensor) -> Tensor:
-    """Whether rays (B, *N, 3) meet the plane."""
-    normal, distance = normal.detach(), distance.detach()
-    unit = normal / torch.linalg.vector_norm(normal, dim=-1, keepdim=True) * distance.sign()[..., None]
-    unit = unit.to(rays.dtype)
-    if unit.ndim == 2:
-        unit = unit.view(len(unit), *[1] * (rays.ndim - 2), 3)
-    meets: Tensor = (rays.detach() * unit).sum(-1) > _GRAZING
-    return meets
+        back = Extrinsics.from_matrix(self.pose).inverse()
+        options = {name: value for name, value in self.options.items() if name != "tolerance"}
+        return PlaneWarp(self.target, self.source, back, *self._plane_of_source(), **cast(WarpOptions, options))
 
 
 class BirdsEye(PlaneWarp):
@@ -204,10 +145,7 @@ class BirdsEye(PlaneWarp):
         x: tuple[float, float],
         y: tuple[float, float],
         resolution: float,
-        mode: Mode = "bilinear",
-        padding_mode: PaddingMode = "zeros",
-        fill: Fill = 0.0,
-        antialias: bool = False,
+        **options: Unpack[WarpOptions],
     ):
         x, y = _as_ends(x, "x"), _as_ends(y, "y")
         resolution = as_number(resolution, "resolution", "BirdsEye")
@@ -223,17 +161,7 @@ class BirdsEye(PlaneWarp):
             nn.Parameter(like.new_tensor([focal, focal, -x[0] * focal - 0.5, y[1] * focal - 0.5]), requires_grad=False),
             image_size=(size[0], size[1]),
         )
-        super().__init__(
-            camera,
-            down,
-            extrinsics,
-            (0.0, 0.0, 1.0),
-            1.0,
-            mode=mode,
-            padding_mode=padding_mode,
-            fill=fill,
-            antialias=antialias,
-        )
+        super().__init__(camera, down, extrinsics, (0.0, 0.0, 1.0), 1.0, **options)
         self.x, self.y, self.resolution = x, y, resolution
 
     def _check(self, owner: str) -> None:
@@ -246,12 +174,10 @@ class BirdsEye(PlaneWarp):
             )
 
     @property
-    def plane(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Camera from the one that looks down, and the ground in the frame of that."""
-        rotation, shift = rotation_matrix(self.extrinsics.rotation), self.extrinsics.translation
-        # ground from it: x right, y down is -y, z down is -z, from (0, 0, 1)
-        flip = rotation.new_tensor([1.0, -1.0, -1.0])
-        return self._of_one_dtype(rotation * flip, shift + rotation[..., 2])
+    def pose(self) -> tuple[Tensor, Tensor]:
+        """Camera from the one that looks down from (0, 0, 1): x right, y down is -y, z down is -z of the ground."""
+        rotation, shift = super().pose
+        return rotation * rotation.new_tensor([1.0, -1.0, -1.0]), shift + rotation[..., 2]
 
     @property
     def grid_points(self) -> Tensor:

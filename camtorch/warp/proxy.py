@@ -1,33 +1,61 @@
-"""Warps between cameras that stand at different places, by a proxy of the scene: a plane, a sphere, a depth map."""
+"""Warps between cameras that stand at different places, by a proxy of the scene: a plane, or a sphere."""
 
 from __future__ import annotations
+
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
-from camtorch._arguments import Numbers
-from camtorch.rotations import rotate_planes
+from camtorch._arguments import Numbers, as_batch, as_coordinates, check_devices
+from camtorch.camera import Camera
+from camtorch.extrinsics import Extrinsics
+from camtorch.rotations import rotate_planes, rotation_matrix
 from camtorch.warp.grid import Sampling, pixels_of_rows, scaled, to_positions
 from camtorch.warp.panorama import rays_of, seam_of, seen_by
-from camtorch.warp.sampling import PaddingMode
+from camtorch.warp.sampling import PaddingMode, WarpOptions
 from camtorch.warp.warp import Warp
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
 
 
 class ProxyWarp(Warp):
-    """A `Warp` whose cameras see the same points of a proxy, which says where rays of one meet those of the other.
+    """A `Warp` to a camera at another place: both see the same points of a proxy of the scene.
 
     Positions are exact, and full-size: no lattice.
     """
 
     is_an_operator = False
 
-    def _to_source(self, rays: Tensor) -> tuple[Tensor, Tensor]:
-        """Rays of the target (B, *N, 3) to directions in which the source sees their points, and whether there are."""
+    def __init__(self, source: Camera, target: Camera, extrinsics: Extrinsics, **options: Unpack[WarpOptions]):
+        super().__init__(source, target, tolerance=0.0, **options)
+        self.batch_shape = check_pose(
+            type(self).__name__, extrinsics, "source from target", source=source, target=target
+        )
+        self.extrinsics = extrinsics
+
+    @property
+    def pose(self) -> tuple[Tensor, Tensor]:
+        """Source from target: rotations (*B, 3, 3) and shifts (*B, 3)."""
+        return rotation_matrix(self.extrinsics.rotation), self.extrinsics.translation
+
+    def _nearness(self, rays: Tensor, of_source: bool) -> tuple[Tensor, Tensor]:
+        """One over the distance to the proxy along unit rays (B, *N, 3) of the source or of the target, and whether
+        they meet it.
+        """
         raise NotImplementedError
 
-    def _to_target(self, rays: Tensor) -> tuple[Tensor, Tensor]:
-        """The other way."""
-        raise NotImplementedError
+    def _inputs(self) -> list[Tensor]:
+        return [*super()._inputs(), self.extrinsics.rotation, self.extrinsics.translation]
+
+    def _carried(self, rays: Tensor, of_source: bool) -> tuple[Tensor, Tensor]:
+        """Directions in which the other camera sees what unit rays (B, *N, 3) of one meet, and whether they do."""
+        rotation, shift = (t.to(rays.dtype) for t in self.pose)
+        if of_source:
+            rotation, shift = rotation.mT, -(rotation.mT @ shift[..., None])[..., 0]
+        near, meets = self._nearness(rays, of_source)
+        return turned(rotation, rays) + beside(shift, rays) * near[..., None], meets
 
     def _locate(self, rows: range, padding: PaddingMode, tolerance: float) -> Sampling:
         if not self.antialias:
@@ -39,27 +67,43 @@ class ProxyWarp(Warp):
 
     def _of_rows(self, rows: range) -> tuple[Tensor, Tensor]:
         pixels = pixels_of_rows(self.target, rows)
-        rays, has_ray = rays_of(self.target, pixels.expand(*self.target.batch_shape, *pixels.shape))
-        if rays.ndim == 3:
-            rays, has_ray = rays[None], has_ray[None]
-        directions, met = self._to_source(rays)
-        count = self.source.batch_shape.numel()
-        if self.source.batch_shape and len(directions) == 1:
-            directions = directions.expand(count, *directions.shape[1:])
-        seen, mapped = seen_by(self.source, directions)
-        mapped = mapped & has_ray & met
+        batch = self.batch_shape or (1,)
+        seen, mapped = self._move(pixels.expand(*batch, *pixels.shape), back=True)
         return to_positions(seen, mapped, self.source._size_for("Warp")), mapped
 
     def _move(self, pixels: Numbers, back: bool = False, on_image: bool = False) -> tuple[Tensor, Tensor]:
-        source, target, carried = self.source, self.target, self._to_target
-        if back:
-            source, target, carried = target, source, self._to_source
+        source, target = (self.target, self.source) if back else (self.source, self.target)
         rays, has_ray = rays_of(source, pixels)
-        directions, met = carried(rays)
+        directions, meets = self._carried(rays, of_source=not back)
         seen, mapped = seen_by(target, directions)
-        valid = mapped & has_ray & met
+        valid = mapped & has_ray & meets
         seen = torch.where(valid.unsqueeze(-1), seen, -1.0)
         return seen, valid & target.contains(seen) if on_image else valid
+
+    def transform_rays(self, rays: Numbers) -> Tensor:
+        """Turn directions (B, *N, 3), or (*N, 3), from the source's to the target's frame; lengths stay."""
+        rays = as_coordinates(rays, "rays", 3, type(self).__name__, self.source.intrinsics.device, "B, *N")
+        return turned(self.pose[0].mT.to(rays.dtype), rays)
+
+
+def check_pose(owner: str, extrinsics: Extrinsics, between: str, **cameras: Camera) -> torch.Size:
+    """The batch dim, or none, of cameras and of the pose between them.
+
+    Raises:
+        ValueError: batch dims that do not fit, or more than one; several devices. TypeError: no extrinsics.
+    """
+    if not isinstance(extrinsics, Extrinsics):
+        raise TypeError(
+            f"{owner}: extrinsics must be Extrinsics, {between}; got {type(extrinsics).__name__}. "
+            "Of OpenCV's R and T ct.Extrinsics.from_matrix(R, T) is one"
+        )
+    intrinsics = {name: camera.intrinsics for name, camera in cameras.items()}
+    check_devices(owner, **intrinsics, extrinsics=extrinsics.rotation)
+    parts = {**cameras, "extrinsics": extrinsics}
+    batch = as_batch(owner, **{name: (*part.batch_shape, 1) for name, part in parts.items()})
+    if len(batch) > 1:
+        raise ValueError(f"{owner}: cameras and extrinsics may have one batch dim; got {tuple(batch)}")
+    return batch
 
 
 def turned(rotation: Tensor, rays: Tensor) -> Tensor:
@@ -69,3 +113,9 @@ def turned(rotation: Tensor, rays: Tensor) -> Tensor:
     rows = rays.expand(len(rotation), *rays.shape[1:]) if len(rays) == 1 else rays
     planes = rows.flatten(1, -2).unbind(-1)
     return rotate_planes(rotation, planes).movedim(0, -1).reshape(max(len(rows), len(rotation)), *rows.shape[1:])
+
+
+def beside(vectors: Tensor, rays: Tensor) -> Tensor:
+    """Vectors (3,) or (B, 3) in the dtype of rays (B, *N, 3), and in a shape that broadcasts against them."""
+    vectors = vectors.to(rays.dtype)
+    return vectors if vectors.ndim == 1 else vectors.view(len(vectors), *[1] * (rays.ndim - 2), 3)

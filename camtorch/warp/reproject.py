@@ -6,15 +6,17 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
+from torch.nn.functional import max_pool2d, pad
 
-from camtorch._arguments import Numbers, as_batch, as_number, check_devices, holds
+from camtorch._arguments import Numbers, as_number, check_devices, holds
 from camtorch._module import GeometryModule, Memo, typed_as
 from camtorch.camera import Camera
 from camtorch.extrinsics import Extrinsics
 from camtorch.projection.depth import as_depth, depth_scale
-from camtorch.rotations import rotate_planes, rotation_matrix
+from camtorch.rotations import rotation_matrix
 from camtorch.warp.grid import Sampling, is_plain, to_positions
 from camtorch.warp.panorama import seam_of, seen_by
+from camtorch.warp.proxy import beside, check_pose, turned
 from camtorch.warp.sampling import MODES, PADDINGS, Fill, Mode, PaddingMode, as_fill, one_of, render
 from camtorch.warp.warp import as_sized
 
@@ -62,24 +64,11 @@ class Reproject(GeometryModule):
         super().__init__()
         owner = "Reproject"
         self.source, self.target = as_sized(source, "source", owner), as_sized(target, "target", owner)
-        if not isinstance(extrinsics, Extrinsics):
-            raise TypeError(
-                f"{owner}: extrinsics must be Extrinsics, source from target; got {type(extrinsics).__name__}"
-            )
-        check_devices(owner, source=source.intrinsics, target=target.intrinsics, extrinsics=extrinsics.rotation)
+        self.batch_shape = check_pose(owner, extrinsics, "source from target", source=source, target=target)
         self.extrinsics = extrinsics
         self.mode = one_of(mode, MODES, "mode", owner)
         self.padding_mode = one_of(padding_mode, PADDINGS, "padding_mode", owner)
         self.fill = as_fill(fill, owner)
-        batch = as_batch(
-            owner,
-            source=(*source.batch_shape, 1),
-            target=(*target.batch_shape, 1),
-            extrinsics=(*extrinsics.batch_shape, 1),
-        )
-        if len(batch) > 1:
-            raise ValueError(f"{owner}: cameras and extrinsics may have one batch dim; got {tuple(batch)}")
-        self.batch_shape = batch
         self._memo = Memo()
         seam_of(source)  # while its values may be looked at: traced code asks for it too
 
@@ -159,18 +148,11 @@ class Reproject(GeometryModule):
         if rays.ndim == 3:
             rays, has_ray = rays[None], has_ray[None]
         scale, good = depth_scale(depth, rays[:, None], has_ray[:, None], kind)
-        rotation, shift = rotation_matrix(self.extrinsics.rotation), self.extrinsics.translation
-        if rotation.ndim == 2:
-            rotation, shift = rotation[None], shift[None]
-        lead = rays.shape[1:-1]
-        rows = max(len(rays), len(rotation))
-        turned = rotate_planes(rotation.to(rays.dtype), rays.flatten(1, -2).expand(rows, -1, -1).unbind(-1))
-        shift = shift.to(rays.dtype)
-        planes = [
-            torch.addcmul(t[:, None, None, None], p.view(-1, 1, *lead), scale)
-            for p, t in zip(turned, shift.unbind(-1), strict=True)
-        ]
-        points = torch.stack(planes, -1)
+        directions = turned(rotation_matrix(self.extrinsics.rotation).to(rays.dtype), rays)[:, None]
+        shift = beside(self.extrinsics.translation, directions)
+        # plane by plane: several times as fast
+        parts = zip(shift.unbind(-1), directions.unbind(-1), strict=True)
+        points = torch.stack([torch.addcmul(start, along, scale) for start, along in parts], -1)
         if self.source.batch_shape and len(points) != len(self.source.intrinsics):
             points = points.expand(len(self.source.intrinsics), *points.shape[1:])
         pixels, mapped = seen_by(self.source, points)
@@ -193,17 +175,14 @@ class Reproject(GeometryModule):
         given = as_depth(source_depth, kind, size, f"{owner}: source_depth", seen.device).detach()
         given = (given if given.ndim == 4 else given[None, None])[:, :1]
         known = torch.isfinite(given) & (given > 0)
-        # between two depths the farther one, so that the rim of a foreground hides nothing behind it that is seen
-        given = torch.where(known, given, torch.inf)
-        pixels = seen.detach().flatten(1, -2)
-        near = [
-            (pixels[..., i] + step).round().long().clamp(0, side - 1)
-            for i, side in ((0, size[1]), (1, size[0]))
-            for step in (-0.5, 0.5)
-        ]
-        rows = given.expand(len(pixels), -1, -1, -1).flatten(1)
-        corners = [rows.gather(1, v * size[1] + u) for u in near[:2] for v in near[2:]]
-        furthest = torch.stack(corners).amax(0).view(seen.shape[:-1])
+        # of the four pixels around the farthest, so that the rim of a foreground hides nothing behind it that is seen
+        around = max_pool2d(pad(torch.where(known, given, torch.inf), (1, 1, 1, 1), mode="replicate"), 2, 1)
+        u, v = (
+            (plane.floor() + 1).long().clamp(0, side)
+            for plane, side in zip(seen.detach().unbind(-1), size[::-1], strict=True)
+        )
+        rows = around.flatten(1).expand(len(seen), -1)
+        furthest = rows.gather(1, (v * (size[1] + 1) + u).flatten(1)).view(seen.shape[:-1])
         return far.detach() <= furthest * (1 + tolerance)
 
     def extra_repr(self) -> str:

@@ -73,7 +73,7 @@ def warped(warp: Warp, images: Tensor, sampler: Sampler) -> Tensor:
         parts = [
             warp.between(*given, **warp.options, shutter=warp.shutter, target_shutter=shutter) for shutter in shutters
         ]
-        return averaged(images, parts, warp.target_shutter.gamma, *sampler)
+        return averaged(images, parts, **sampler._asdict())
     if route == "operator":
         options = warp.tolerance, warp.antialias, _reach(warp, sampler.padding_mode), sampler
         return compiled.warped(images, warp.source, warp.target, warp.rotation, *options)

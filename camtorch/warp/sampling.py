@@ -461,6 +461,15 @@ class Options(TypedDict):
     tolerance: float | None
 
 
+class WarpOptions(TypedDict, total=False):
+    """Those of them that a user gives to every kind of warp; see `Warp`."""
+
+    mode: Mode
+    padding_mode: PaddingMode
+    fill: Fill
+    antialias: bool
+
+
 def as_options(
     owner: str, mode: str, padding_mode: str, fill: Fill, antialias: bool | None, tolerance: float | None
 ) -> Options:

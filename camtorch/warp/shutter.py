@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from functools import reduce
 from typing import Any, Literal, TypedDict, get_args
@@ -15,7 +14,6 @@ from camtorch._arguments import (
     as_batch,
     as_coordinates,
     as_image_size,
-    as_number,
     as_own,
     as_points,
     as_real,
@@ -23,11 +21,12 @@ from camtorch._arguments import (
     as_whole,
     broadcast_shapes,
     fails,
+    holds,
     shown,
+    values_of,
 )
 from camtorch._dtypes import narrow, widen
 from camtorch._module import GeometryModule
-from camtorch._tracing import in_transform, is_concrete, keeps_graph
 from camtorch.camera import Camera
 from camtorch.optics.special import cosc_root, sinc_root
 
@@ -37,7 +36,7 @@ DIRECTIONS: tuple[Direction, ...] = get_args(Direction)
 _LONGEST = 2.0  # seconds
 _FASTEST = 70.0  # radians per second: twice what gyroscopes measure
 _BEYOND = 1.0  # readouts from the middle of the image, half an image beyond its rim: further out time stands still
-_STEPS = 6  # of the secant method: three digits each in the end
+_STEPS = 4  # of the secant method, before one of Newton's
 _SETTLED = 0.01  # pixels by which the row of a point may be off when it is said to be found
 _STILL = 1e-3  # the part of a row that a row must advance by, as the scene passes
 
@@ -61,7 +60,6 @@ class RollingShutter(GeometryModule):
             by the turn meanwhile; a blur cannot be undone. Labels are of the middle of the exposure.
         samples: moments of the exposure that are averaged, at the cost of a warp each. Where the blur is many more
             pixels long, its steps show.
-        gamma: images are averaged as their power gamma: 2.2 is in linear light for those made for a screen.
 
     Plain values are kept as they are and do not learn; Parameters and tensors of a graph do.
 
@@ -74,9 +72,10 @@ class RollingShutter(GeometryModule):
     readout: Tensor
     rates: Tensor
     exposure: Tensor
+    offset: Tensor
+    """Seconds after which rows are seen: of a moment of an exposure."""
     batch_shape: torch.Size
     samples: int
-    gamma: float
 
     def __init__(
         self,
@@ -86,7 +85,6 @@ class RollingShutter(GeometryModule):
         direction: Direction = "down",
         exposure: Numbers = 0.0,
         samples: int = 8,
-        gamma: float = 1.0,
     ):
         super().__init__()
         owner = "RollingShutter"
@@ -107,9 +105,6 @@ class RollingShutter(GeometryModule):
             )
         if fails(times["exposure"].detach() >= 0):
             raise ValueError(f"{owner}: exposure must not be negative; got {times['exposure'].tolist()}")
-        samples, gamma = as_whole(samples, "samples", owner), as_number(gamma, "gamma", owner)
-        if samples < 1 or not (math.isfinite(gamma) and gamma > 0):
-            raise ValueError(f"{owner}: samples and gamma must be positive; got {samples!r} and {gamma!r}")
         shapes = {name: (*value.shape, 1) for name, value in times.items()}
         self.batch_shape = as_batch(owner, rates=rates.shape, **shapes)
         if len(self.batch_shape) > 1:
@@ -119,9 +114,9 @@ class RollingShutter(GeometryModule):
                 self.register_parameter(name, value)
             else:
                 self.register_buffer(name, as_own(value))
-        self.direction, self.samples, self.gamma = direction, samples, gamma
-        self._moment: float | None = None
-        self._blurs = not is_concrete(self.exposure) or bool((self.exposure.detach() > 0).any())
+        self.register_buffer("offset", torch.zeros_like(self.readout.detach()), persistent=False)
+        self.direction, self.samples = direction, as_whole(samples, "samples", owner, least=1)
+        self._blurred = not holds(self.exposure == 0)
 
     def times(self, pixels: Numbers, image_size: tuple[int, int]) -> Tensor:
         """(*B, *N): seconds from the middle of the readout at which pixels (*B, *N, 2) of an image are seen."""
@@ -135,45 +130,41 @@ class RollingShutter(GeometryModule):
 
     @property
     def tensors(self) -> list[Tensor]:
-        """All that positions depend on."""
-        return [self.readout, self.rates, self.exposure]
+        """All that positions depend on, beside the direction."""
+        return [self.readout, self.rates, self.offset]
 
     @property
     def form(self) -> tuple[object, ...]:
         """What they depend on beside tensors."""
-        return self.direction, self._moment
+        return (self.direction,)
 
     def rows_of(self, index: list[int]) -> RollingShutter:
         """The shutter of these rows of a batch."""
         if not self.batch_shape:
             return self
-
-        def of(value: Tensor, ndim: int) -> Tensor:
-            return value[index] if value.ndim > ndim else value
-
-        return self._with(of(self.readout, 0), of(self.rates, 1), of(self.exposure, 0))
+        rates = self.rates[index] if self.rates.ndim == 2 else self.rates
+        return self._with(rates, *(t[index] if t.ndim else t for t in (self.readout, self.exposure)))
 
     def detached(self) -> RollingShutter:
         """The shutter of the same numbers, which do not learn."""
-        return self._with(self.readout.detach(), self.rates.detach(), self.exposure.detach(), self._moment)
+        return self._with(self.rates.detach(), self.readout.detach(), self.exposure.detach())
 
-    def _with(self, readout: Tensor, rates: Tensor, exposure: Tensor, moment: float | None = None) -> RollingShutter:
-        options: dict[str, Any] = {"direction": self.direction, "samples": self.samples, "gamma": self.gamma}
-        made = RollingShutter(readout, rates, exposure=exposure, **options)
-        made._moment = moment
-        return made
+    def _with(self, rates: Tensor, readout: Tensor, exposure: Tensor) -> RollingShutter:
+        return RollingShutter(readout, rates, exposure=exposure, direction=self.direction, samples=self.samples)
 
     @property
     def blurs(self) -> bool:
-        """Whether the exposure takes time; a shutter at one moment of it does not blur."""
-        if self._moment is not None:
-            return False
-        return bool((self.exposure.detach() > 0).any()) if is_concrete(self.exposure) else self._blurs
+        """Whether the exposure takes time."""
+        exposure = values_of(self.exposure)
+        return self._blurred if exposure is None else bool((exposure > 0).any())
 
     def exposed(self) -> list[RollingShutter]:
         """The shutter at `samples` moments of its exposure, spread evenly."""
-        parts = ((i + 0.5) / self.samples - 0.5 for i in range(self.samples))
-        return [self._with(self.readout, self.rates, self.exposure, part) for part in parts]
+        moments = [self._with(self.rates, self.readout, torch.zeros_like(self.exposure)) for _ in range(self.samples)]
+        for i, moment in enumerate(moments):
+            moment.register_buffer("offset", ((i + 0.5) / self.samples - 0.5) * self.exposure, persistent=False)
+            moment._blurred = False
+        return moments
 
     def _share(self, pixels: Tensor, size: tuple[int, int]) -> Tensor:
         """When pixels (..., 2) are read, in readouts from the middle one."""
@@ -184,8 +175,8 @@ class RollingShutter(GeometryModule):
 
     def _times(self, share: Tensor, ndim: int) -> Tensor:
         """Seconds, of shares of the readout (..., ) of points with `ndim` dims."""
-        readout, exposure = (_lead(value.to(share.dtype), ndim - 1) for value in (self.readout, self.exposure))
-        return share * readout + self._moment * exposure if self._moment else share * readout
+        readout, offset = (_lead(value.to(share.dtype), ndim - 1) for value in (self.readout, self.offset))
+        return share * readout + offset
 
     def turned(self, rays: Tensor, share: Tensor, sign: float) -> Tensor:
         """Rays (*B, *N, 3) of shares (*B, *N) of the readout, turned to its middle (sign 1) or from it (sign -1).
@@ -207,10 +198,11 @@ class RollingShutter(GeometryModule):
 
     def extra_repr(self) -> str:
         """Times, rates and direction."""
-        if self.batch_shape or not all(map(is_concrete, self.tensors)):
+        readout, rates, exposure = map(values_of, (self.readout, self.rates, self.exposure))
+        if self.batch_shape or readout is None or rates is None or exposure is None:
             return f"batch_shape={tuple(self.batch_shape)}, direction={self.direction!r}"
-        parts = [f"readout={float(self.readout):g}", f"rates={self.rates.tolist()}", f"direction={self.direction!r}"]
-        return ", ".join([*parts, f"exposure={float(self.exposure):g}"])
+        parts = [f"readout={float(readout):g}", f"rates={rates.tolist()}", f"direction={self.direction!r}"]
+        return ", ".join([*parts, f"exposure={float(exposure):g}"])
 
 
 class Shutters(TypedDict):
@@ -262,57 +254,27 @@ class InMotion:
             return pixels, valid, self.shutter._share(pixels, self.size)
 
         with torch.no_grad():
-            share = torch.zeros_like(rays[..., 0].detach())
-            pixels, valid, found = seen(share)
-            before, missed_before = share, found
-            share = found
+            before = torch.zeros_like(rays[..., 0].detach())
+            share = missed_before = seen(before)[2]
             for _ in range(_STEPS):
-                pixels, valid, found = seen(share)
-                missed = found - share
+                missed = seen(share)[2] - share
                 change = missed - missed_before
                 flat = change == 0
                 step = torch.where(flat, missed, missed * (before - share) / torch.where(flat, 1.0, change))
                 before, missed_before = share, missed
                 share = (share + step.clamp(-0.5, 0.5)).clamp(-_BEYOND, _BEYOND)
-            pixels, valid, found = seen(share)
-            settled = ((found - share).abs() * side < _SETTLED) | (found.abs() >= _BEYOND)
-        tensors = (rays, *self.camera._tensors, *self.shutter.tensors)
-        if keeps_graph(*tensors) or in_transform():
-            with torch.no_grad():
-                h = 1e-4 if share.dtype == torch.float64 else 1e-2
-                slope = (seen(share + h)[2] - seen(share - h)[2]) / (2 * h)
-                settled = settled & ((1 - slope).abs() > _STILL)
-            ahead = seen(share)[2] - share
-            share = share + torch.where(settled, ahead / torch.where(settled, 1 - slope, 1.0), 0.0)
-            pixels, valid, _ = seen(share)
+            h = 1e-4 if share.dtype == torch.float64 else 1e-2
+            slope = (seen(share + h)[2] - seen(share - h)[2]) / (2 * h)
+        found = seen(share)[2]
+        off = found - share
+        settled = (off.detach().abs() * side < _SETTLED) | (found.detach().abs() >= _BEYOND)
+        settled = settled & ((1 - slope).abs() > _STILL)
+        pixels, valid, _ = seen(share + torch.where(settled, off / torch.where(settled, 1 - slope, 1.0), 0.0))
         valid = valid & settled
         return torch.where(valid.unsqueeze(-1), pixels, -1.0), valid
 
 
-def averaged(
-    images: Tensor,
-    warps: Sequence[Callable[..., Tensor]],
-    gamma: float,
-    mode: str,
-    padding_mode: str,
-    fill: tuple[float, ...],
-) -> Tensor:
-    """The mean of what warps make of images: of their power gamma, of which the root is taken again.
-
-    Args:
-        images: (B, C, H, W) of any dtype, which comes out.
-        warps: of the moments of an exposure.
-        gamma: see `RollingShutter`. Negative values count as 0 unless it is 1.
-        mode: of the warps.
-        padding_mode: likewise.
-        fill: likewise.
-    """
-    linear = widen(images)
-    if gamma != 1:
-        linear, fill = linear.clamp(min=0) ** gamma, tuple(max(value, 0.0) ** gamma for value in fill)
-    options = {"mode": mode, "padding_mode": padding_mode, "fill": fill}
-    mean = reduce(torch.add, (warp(linear, **options) for warp in warps)) / len(warps)
-    if gamma != 1:  # the root has no derivative at zero
-        some = mean > 0
-        mean = torch.where(some, torch.where(some, mean, 1.0) ** (1 / gamma), 0.0)
-    return narrow(mean, images.dtype)
+def averaged(images: Tensor, warps: Sequence[Callable[..., Tensor]], **options: Any) -> Tensor:
+    """The mean of what warps, of the moments of an exposure, make of images (B, C, H, W), in their dtype."""
+    wide = widen(images)
+    return narrow(reduce(torch.add, (warp(wide, **options) for warp in warps)) / len(warps), images.dtype)

@@ -18,7 +18,7 @@ from camtorch.extrinsics import Extrinsics
 from camtorch.rig import Rig
 from camtorch.rotations import rotation_matrix
 from camtorch.warp.plane import BirdsEye
-from camtorch.warp.proxy import ProxyWarp, turned
+from camtorch.warp.proxy import ProxyWarp, beside
 from camtorch.warp.sampling import Mode, blended
 from camtorch.warp.warp import Warp, as_sized
 
@@ -29,25 +29,17 @@ _LEAST = 1e-6  # the weight of a pixel that a camera only just sees, beside none
 class _SphereWarp(ProxyWarp):
     """What a target at a rig's origin sees of a sphere about it, by a camera of the rig within it."""
 
-    def __init__(self, source: Camera, target: Camera, extrinsics: Extrinsics, radius: float, mode: Mode):
-        super().__init__(source, target, mode=mode, padding_mode="border", tolerance=0.0)
-        self.extrinsics, self.radius = extrinsics, radius
+    def __init__(self, source: Camera, target: Camera, extrinsics: Extrinsics, radius: float, **options: Any):
+        super().__init__(source, target, extrinsics, **options)
+        self.radius = radius
 
-    def _inputs(self) -> list[Tensor]:
-        return [*super()._inputs(), self.extrinsics.rotation, self.extrinsics.translation]
-
-    def _to_source(self, rays: Tensor) -> tuple[Tensor, Tensor]:
-        rotation = rotation_matrix(self.extrinsics.rotation).to(rays.dtype)
-        points = turned(rotation, rays * self.radius) + self.extrinsics.translation.to(rays.dtype)
-        return points, torch.ones_like(rays[..., 0], dtype=torch.bool)
-
-    def _to_target(self, rays: Tensor) -> tuple[Tensor, Tensor]:
-        rotation = rotation_matrix(self.extrinsics.rotation).to(rays.dtype)
-        place = self.extrinsics.position.to(rays.dtype)
-        ahead = turned(rotation.mT, rays)
-        along = (ahead * place).sum(-1)
-        far = (along * along + self.radius**2 - place.square().sum()).sqrt() - along
-        return place + ahead * far[..., None], torch.ones_like(along, dtype=torch.bool)
+    def _nearness(self, rays: Tensor, of_source: bool) -> tuple[Tensor, Tensor]:
+        near = torch.full_like(rays[..., 0], 1 / self.radius)
+        if of_source:
+            shift = beside(self.extrinsics.translation, rays)  # of the origin, from the camera
+            along = (rays * shift).sum(-1)
+            near = 1 / ((along.square() + self.radius**2 - shift.square().sum(-1)).sqrt() + along)
+        return near, torch.ones_like(near, dtype=torch.bool)
 
 
 class Surround(GeometryModule):
@@ -229,5 +221,5 @@ def surround(
         far = float(torch.linalg.vector_norm(pose.position.detach(), dim=-1).max())
         if far >= distance:
             raise ValueError(f"{owner}: the camera {name!r} stands {far:.4g} from the origin; distance is {distance}")
-        warps[name] = _SphereWarp(camera, target, pose, distance, mode)
+        warps[name] = _SphereWarp(camera, target, pose, distance, **options)
     return Surround(warps, blend, fill)

@@ -24,8 +24,6 @@ __all__ = ["FACES", "Views", "cube", "look_at", "ring"]
 
 FACES = ("front", "right", "back", "left", "up", "down")
 """Of a cube, as the camera sees them from within; its own axis goes through the middle of the front."""
-_HALF = 0.5  # px, that a view reaches beyond the middle of its outermost pixels
-_EDGE = 1e-3  # px
 _ALONG = 65  # samples of an edge of a box, and of the steps to either side of the farthest of them
 _HALVES = 50  # of the step between two samples, between which the image of a lens ends
 _ROUNDS = 3  # of such samples: 2e-6 of an edge
@@ -95,19 +93,15 @@ class Views(GeometryModule):
 
         It falls linearly to the border of a view.
         """
-        rays, has_ray = rays_of(self.camera, self.camera.pixel_grid())
-        height, width = self.view._size_for("Views")
-        parts = []
-        for rotation in self.rotations:
-            pixels, valid = self.view.project((rays @ rotation.mT.to(rays.dtype)).to(self.view.intrinsics.dtype))
-            inner = torch.minimum(pixels.amin(-1), (pixels.new_tensor([width - 1.0, height - 1.0]) - pixels).amin(-1))
-            # a ray between two faces is on both
-            near = valid & has_ray & (inner > -_HALF - _EDGE)
-            parts.append(torch.where(near, (inner + _HALF).clamp(min=_EDGE), 0.0))
-        whole = torch.stack(parts)
+        pixels = self.view.pixel_grid()
+        ends = pixels.new_tensor([self.view.width, self.view.height])
+        ramp = torch.minimum(pixels + 1, ends - pixels).amin(-1)[None, None]
+        # to one pixel beyond the outermost ones: a ray between two faces is on both
+        parts = [warp(ramp, mode="bilinear", padding_mode="zeros") for warp in self.backs]
         if self.mode == "nearest":  # what a view fills in at its rim is no label
-            masks = self.valid_masks()
-            whole = whole * torch.cat([warp(masks[:, i]) for i, warp in enumerate(self.backs)])[:, 0]
+            masks = self.valid_masks().unbind(1)
+            parts = [part * warp(mask) for part, warp, mask in zip(parts, self.backs, masks, strict=True)]
+        whole = torch.cat(parts)[:, 0]
         total = whole.sum(0)
         return whole / torch.where(total > 0, total, 1.0)
 

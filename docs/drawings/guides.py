@@ -98,7 +98,7 @@ def shutters() -> Image.Image:
     rolled = expose(source, lambda rays: room.radiance((turns[:, None] @ rays[..., None])[..., 0]), samples=8)
     straight = ct.Pinhole.from_fov(95, image_size=(300, 400)).requires_grad_(False)
     shutter = ct.RollingShutter(0.03, rates)
-    blur = ct.RollingShutter(0.0, rates, exposure=0.01, gamma=2.2, samples=24)
+    blur = ct.RollingShutter(0.0, rates, exposure=0.01, samples=24)
     still = room.render(source, samples=8)
     panels = [
         (rolled, "rows rendered one by one, turning"),

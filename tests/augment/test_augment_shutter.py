@@ -127,7 +127,5 @@ def test_an_augmentation_darkens_the_rim():
 def test_what_is_no_number_is_told():
     with pytest.raises(TypeError, match="vignetting: power must be"):
         ct.vignetting(ct.Pinhole([40.0, 40.0, 31.5, 23.5], image_size=(48, 64)), "1")
-    with pytest.raises(TypeError, match="RollingShutter: gamma must be a number; got '2'"):
-        ct.RollingShutter(0.01, [0.0, 1.0, 0.0], gamma="2")
     with pytest.raises(TypeError, match="CanonicalCamera: focal must be a number; got '1000'"):
         ct.CanonicalCamera("1000")

@@ -83,7 +83,7 @@ WRONG = [
     (lambda: ct.BirdsEye(CAMERA, DOWN, x=(0, 1), y=(0, 1), resolution="1"), TypeError, r"resolution must be a number"),
     (lambda: ct.BirdsEye(CAMERA, DOWN, x=(0, 1), y=(0, 1), resolution=9), ValueError, r"at 9.0 units per pixel make"),
     (lambda: ct.Reproject(GRID, CAMERA, POSE), ValueError, r"Reproject: cameras and extrinsics may have one batch dim"),
-    (lambda: ct.RollingShutter(0.01, [0, 0, 0], samples=0), ValueError, r"samples and gamma must be positive; got 0"),
+    (lambda: ct.RollingShutter(0.01, [0, 0, 0], samples=0), ValueError, r"RollingShutter: samples must be at least 1; got 0"),
     (lambda: ct.RollingShutter(0.01, [0, 0, 0]).times([0, 0], None), TypeError, r"RollingShutter: image_size must be"),
     (lambda: ct.rectify(GRID, GRID, POSE), ValueError, r"rectify: cameras and extrinsics may have one batch dim"),
     (lambda: ct.rectify(CAMERA, CAMERA, POSE, fov=(60, 60, 60)), ValueError, r"fov must be horizontal, or .*\(60, 60,"),

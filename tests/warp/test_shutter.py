@@ -222,13 +222,11 @@ def test_an_exposure_blurs_by_the_turn_meanwhile():
     assert torch.equal(warp.transform_points(torch.tensor([[60.0, 40.0]]))[0].round(), torch.tensor([[60.0, 40.0]]))
     none = ct.RollingShutter(0.0, (0.0, 3.0, 0.0), exposure=0.0)
     assert torch.equal(ct.Warp(camera, camera, target_shutter=none)(image), ct.Warp(camera, camera)(image))
-    # a blur of an image that is one colour is that colour, in linear light as well; a light in the dark is brighter
     flat = torch.full((1, 3, 120, 160), 100, dtype=torch.uint8)
-    bright = ct.RollingShutter(0.01, (1.0, 3.0, 0.0), gamma=2.2, **options)
-    inner = ct.Warp(camera, camera, target_shutter=bright)(flat)[..., 20:-20, 20:-20]
+    turning = ct.RollingShutter(0.01, (1.0, 3.0, 0.0), **options)
+    inner = ct.Warp(camera, camera, target_shutter=turning)(flat)[..., 20:-20, 20:-20]
     assert inner.dtype == torch.uint8
     assert (inner.int() - 100).abs().max() <= 1
-    assert ct.Warp(camera, camera, target_shutter=bright)(image).sum() > 1.5 * blurred.sum()
 
 
 def test_the_mean_of_an_exposure_is_that_of_its_moments():
