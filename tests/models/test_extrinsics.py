@@ -105,24 +105,6 @@ def test_autocast_leaves_geometry_alone():
     assert torch.equal(inside, extrinsics(points))
 
 
-@pytest.mark.parametrize(
-    ("make", "says"),
-    [
-        (lambda: ct.Extrinsics([0.0, 0.0], [0.0, 0.0, 0.0]), r"rotation .*\(2,\)"),
-        (lambda: ct.Extrinsics([0.0, 0.0, 0.0], [0.0, math.nan, 0.0]), "translation .*finite"),
-        (lambda: ct.Extrinsics(torch.zeros(2, 3), torch.zeros(3, 3)), "do not fit"),
-        (lambda: ct.Extrinsics.from_matrix(torch.eye(3)), r"matrix .*\(3, 3\)"),
-        (lambda: ct.Extrinsics.from_matrix(2 * torch.eye(4)), "last row"),
-        (lambda: ct.Extrinsics.from_matrix(torch.diag(torch.tensor([1.0, 1.0, -1.0, 1.0]))), "rotation matrices"),
-        (lambda: ct.Extrinsics.from_matrix(torch.full((4, 4), math.nan)), "matri"),
-        (lambda: pose([0.0, 0.0, 0.0])(torch.zeros(4, 2)), r"points_world .*\(4, 2\)"),
-    ],
-)
-def test_bad_input_is_named(make, says):
-    with pytest.raises(ValueError, match=says):
-        make()
-
-
 def test_a_point_that_is_not_finite_leaves_the_gradient_of_the_pose_alone():
     layer = torch.nn.Sequential(pose(ROTATIONS["some"]), ct.Pinhole([300.0, 300.0, 320.0, 240.0]).double())
     points = torch.rand(4, 3, dtype=F64)
@@ -152,12 +134,7 @@ def test_what_comes_of_a_frozen_pose_is_frozen():
     assert pose(ROTATIONS["some"]).position.requires_grad
 
 
-def test_degrees_are_refused_and_what_learnt_is_not(tmp_path):
-    for degrees in ([0, 90, 0], torch.tensor([[0.1, 0.2, 0.3], [0.0, -30.0, 0.0]]), [[[0.0], [45.0], [0.0]]]):
-        with pytest.raises(
-            ValueError, match=r"Extrinsics: rotation holds.*radians; an angle of .* seems to be degrees"
-        ):
-            ct.Extrinsics(degrees, [0.0, 0.0, 0.0])
+def test_what_learnt_large_angles_is_not_refused(tmp_path):
     ct.Extrinsics([0.0, 2 * math.pi, 0.0], [0.0, 0.0, 0.0])
     pose = ct.Extrinsics([0.1, 0.2, 0.3], [1.0, 2.0, 3.0])
     with torch.no_grad():

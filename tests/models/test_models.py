@@ -16,15 +16,6 @@ def camera(model, *coefficients, scale=1.0):
     return model(intrinsics, *([torch.tensor(coefficients, dtype=torch.float64)] if coefficients else []))
 
 
-def radius(model, *coefficients):
-    """r of theta at half of the angles of `fan`, and theta."""
-    theta = torch.linspace(0.01, 1.5, 40, dtype=torch.float64)
-    rays = torch.stack((theta.sin(), 0 * theta, theta.cos()), -1)
-    pixels, valid = camera(model, *coefficients).project(rays)
-    assert valid.all()
-    return (pixels[:, 0] - INTRINSICS[2]) / INTRINSICS[0], theta
-
-
 @pytest.mark.parametrize(
     ("first", "second"),
     [
@@ -56,22 +47,6 @@ def test_the_same_camera(first, second):
     (rays, valid), (others, other_valid) = (c.unproject(pixels) for c in (first, second))
     assert torch.equal(valid, other_valid)
     torch.testing.assert_close(rays, others, rtol=0, atol=1e-12)
-
-
-@pytest.mark.parametrize(
-    ("model", "coefficients", "formula"),
-    [
-        (ct.Equisolid, [0.0], lambda t: 2 * (t / 2).sin()),
-        (ct.Equisolid, [0.03], lambda t: 2 * (t / 2).sin() * (1 + 0.03 * (2 * (t / 2).sin()) ** 2)),
-        (ct.Stereographic, [0.03], lambda t: 2 * (t / 2).tan() * (1 + 0.03 * (2 * (t / 2).tan()) ** 2)),
-        (ct.OrthographicFisheye, [0.03], lambda t: t.sin() * (1 + 0.03 * t.sin() ** 2)),
-        (ct.FOV, [0.9], lambda t: (2 * math.tan(0.45) * t.tan()).atan() / 0.9),
-        (ct.FTheta, [-0.09, 0.14, -0.02], lambda t: t - 0.09 * t**2 + 0.14 * t**3 - 0.02 * t**4),
-    ],
-)
-def test_radius(model, coefficients, formula):
-    r, theta = radius(model, *coefficients)
-    torch.testing.assert_close(r, formula(theta), rtol=1e-13, atol=1e-14)
 
 
 def test_f_theta_from_the_polynomial_of_angles():
@@ -122,15 +97,6 @@ def test_woodscape_from_its_numbers():
     assert valid.all()
     expected = sum(c * theta ** (i + 1) for i, c in enumerate(k))
     torch.testing.assert_close(pixels[:, 1], 479.407 + expected)
-
-
-@pytest.mark.parametrize(
-    ("centre", "coefficients", "text"),
-    [([1.0], [1.0, 2], "centre"), ([1.0, 2], [1.0], "n >= 2"), ([1.0, 2], [-1.0, 2], "must be positive")],
-)
-def test_bad_polynomials_are_refused(centre, coefficients, text):
-    with pytest.raises(ValueError, match=text):
-        ct.FTheta.from_polynomial(centre, coefficients)
 
 
 BREAKS = [
@@ -195,19 +161,6 @@ def test_the_angles_of_a_table_do_not_learn():
     angles, radii = made.distortion.grad.chunk(2)
     assert (angles == 0).all()
     assert (radii != 0).any()
-
-
-@pytest.mark.parametrize(
-    ("angles", "radii", "text"),
-    [([0.1], [1.0], "two nodes"), ([0, 0.1, 0.2], [0.1, 1, 2], "two nodes"), ([0.1, 0.2], [1.0], "shapes")],
-)
-def test_bad_tables_are_refused(angles, radii, text):
-    with pytest.raises(ValueError, match=text):
-        ct.Tabulated.from_table([1.0, 2.0], angles, radii)
-    with pytest.raises(ValueError, match=r"radians, up to pi; got up to 90.0. Degrees"):
-        ct.Tabulated.from_table([1.0, 2.0], [10.0, 90.0], [1.0, 2.0])
-    with pytest.raises(ValueError, match="ascend"):
-        camera(ct.Tabulated, 0.3, 0.2, 1.0, 2.0)
 
 
 # Models of which nobody published a calibration with its image size

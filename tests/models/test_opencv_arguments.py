@@ -1,6 +1,5 @@
 """What OpenCV's calibrations hand out is taken for what it is, whatever its shape, or refused with a hint."""
 
-import re
 import subprocess
 import sys
 
@@ -70,17 +69,6 @@ def test_a_batch_of_lenses_beside_one_matrix_remains():
     assert ct.KannalaBrandt.from_matrix(K[None], torch.zeros(1, 4)).batch_shape == (1,)
 
 
-def test_intrinsics_as_a_column_are_refused_with_a_hint():
-    with pytest.raises(ValueError, match=re.escape("intrinsics[..., 0]")):
-        ct.Pinhole(np.array([[300.0], [310.0], [319.5], [239.5]]))
-
-
-def test_a_model_without_distortion_says_which_has_it():
-    for model in (ct.Pinhole, ct.Equirectangular):
-        with pytest.raises(ValueError, match=rf"{model.__name__}: it has no distortion.*\(1, 5\).*BrownConrady"):
-            model.from_matrix(K, np.zeros((1, 5)))
-
-
 # -- poses
 
 R = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
@@ -145,38 +133,10 @@ def test_three_vectors_are_no_rotation_matrix():
     assert ct.Extrinsics(torch.tensor(R)[..., None], moves).batch_shape == (3,)
 
 
-@pytest.mark.parametrize(
-    ("make", "says"),
-    [
-        (lambda: ct.Extrinsics(R, np.zeros((3, 3))), r"from_matrix\(rotation, translation\).*rotation\[\.\.\., None\]"),
-        (lambda: ct.Extrinsics(np.ones((3, 3)), TVEC), r"rotation matrices.*rotation\[\.\.\., None\]"),
-        (lambda: ct.Extrinsics(2 * R, TVEC), "rotation matrices"),
-        (lambda: ct.Extrinsics(-R, TVEC), "rotation matrices.*det"),
-        (lambda: ct.Extrinsics.from_matrix((2 * R, TVEC)), "rotation matrices"),
-        (lambda: ct.Extrinsics.from_matrix(R), r"\(3, 3\).*from_matrix\(R, t\)"),
-        (lambda: ct.Extrinsics.from_matrix((RVEC, TVEC)), r"\(2, 3\)"),
-        (lambda: ct.Extrinsics.from_matrix(RVEC, TVEC), r"\(3,\).*Extrinsics\(rotation, translation\)"),
-        (lambda: ct.Extrinsics(np.zeros((3, 2)), TVEC), r"rotation .*\(3, 2\)"),
-        (lambda: ct.Extrinsics(RVEC, np.zeros((4, 1))), r"translation .*\(4, 1\)"),
-        (lambda: ct.Extrinsics(torch.nn.Parameter(torch.zeros(3, 1)), TVEC), r"Parameter rotation .*\(3, 1\)"),
-    ],
-)
-def test_poses_that_are_in_doubt_or_none(make, says):
-    with pytest.raises(ValueError, match=f"(?s)Extrinsics: .*{says}"):
-        make()
-
-
 def test_a_list_of_matrices_is_a_batch():
     transform = np.eye(4)
     assert ct.Extrinsics.from_matrix([transform, transform]).batch_shape == (2,)
     assert ct.Extrinsics.from_matrix(transform.tolist()).batch_shape == ()
-
-
-def test_a_warp_says_where_a_rotation_vector_goes():
-    camera = ct.Pinhole([300.0, 300.0, 319.5, 239.5], image_size=(480, 640))
-    for wrong in (RVEC, RVEC[:, None]):
-        with pytest.raises(ValueError, match=r"rotation must be .*Extrinsics\(vector"):
-            ct.Warp(camera, camera, wrong)
 
 
 # -- points
@@ -215,8 +175,6 @@ def test_stacked_results_of_opencv_are_a_batch():
     assert ct.KannalaBrandt.from_matrix(list(matrices), list(rows)).batch_shape == (2,)
     for shape in ((4, 1, 1), (1, 1, 4), (1, 4)):
         assert ct.KannalaBrandt.from_matrix(K, FISHEYE.reshape(shape)).batch_shape == ()
-    with pytest.raises(ValueError, match="coefficients of one lens"):
-        ct.KannalaBrandt([500.0, 500.0, 320.0, 240.0], FISHEYE.reshape(4, 1, 1))
     vectors = [np.full((1, 3), 0.1 * i) for i in range(4)]
     assert ct.Extrinsics(vectors, vectors).batch_shape == (4,)
     assert ct.Extrinsics(np.stack([np.eye(3)] * 2), np.zeros((2, 1, 3))).batch_shape == (2,)

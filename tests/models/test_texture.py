@@ -21,8 +21,6 @@ def test_numbers_by_name():
     assert not intrinsics.grad[..., :3].any()
     assert (camera.height, camera.width) == SIZE
     assert ct.UCM([1.0, 2.0, 3.0, 4.0], torch.zeros(5, 1)).fy.tolist() == [2.0] * 5
-    with pytest.raises(ValueError, match=r"Pinhole: width needs .*image_size"):
-        ct.Pinhole([1.0, 2.0, 3.0, 4.0]).width  # noqa: B018
 
 
 # -- parts of a batch
@@ -84,18 +82,6 @@ def test_parts_of_poses():
     torch.testing.assert_close(poses[2].matrix(), poses.matrix()[2])
     torch.testing.assert_close(poses[1:3].matrix(), poses.matrix()[1:3])
     assert [p.batch_shape for p in poses] == [()] * 4
-
-
-def test_a_single_camera_has_no_parts():
-    camera = ct.Pinhole([300.0, 300.0, 320.0, 240.0])
-    for wrong in (lambda: camera[0], lambda: len(camera), lambda: iter(camera), lambda: list(camera)):
-        with pytest.raises(TypeError, match="Pinhole: it has no batch dims"):
-            wrong()
-    assert camera
-    with pytest.raises(IndexError, match=r"Pinhole: 3 of a batch \(2,\)"):
-        ct.Pinhole(torch.tensor([[300.0, 300.0, 320.0, 240.0]] * 2))[3]
-    with pytest.raises(IndexError, match=r"Pinhole: \(0, 1\) of a batch \(2,\)"):
-        ct.Pinhole(torch.tensor([[300.0, 300.0, 320.0, 240.0]] * 2))[0, 1]
 
 
 # -- field of view
@@ -179,25 +165,6 @@ def test_wide_lenses():
         (ct.Pinhole, 60, SIZE, 320 / math.tan(math.pi / 6)),
     ):
         assert model.from_fov(fov, image_size=size).fx.item() == pytest.approx(focal, rel=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("fov", "options", "says"),
-    [
-        (math.pi / 2, {}, r"degrees; 1\.57.* radians.* 90 degrees"),
-        (0, {}, "above 0"),
-        (-60, {}, "above 0"),
-        (361, {}, "up to 360"),
-        (180, {}, "no horizontal field of view of 180.*179.9"),
-        (200, {"axis": "diagonal"}, "no diagonal field of view of 200"),
-        (60, {"axis": "x"}, "axis must be one of .*'x'"),
-        (60, {"image_size": None}, "image_size"),
-        (float("nan"), {}, "finite"),
-    ],
-)
-def test_fields_of_view_that_no_lens_has(fov, options, says):
-    with pytest.raises(ValueError, match=rf"Pinhole\.from_fov: .*{says}"):
-        ct.Pinhole.from_fov(fov, **({"image_size": SIZE} | options))
 
 
 # -- why a point has no pixel
