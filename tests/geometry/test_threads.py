@@ -220,20 +220,3 @@ def test_several_threads_use_one_camera():
         caller.join()
     assert len(found) == 4
     assert all(torch.equal(a, b) for results in found for a, b in zip(results, expected, strict=True))
-
-
-class Points(torch.utils.data.Dataset):
-    def __len__(self):
-        return 2
-
-    def __getitem__(self, index):
-        camera = one("kannala_brandt").float().requires_grad_(False)
-        points = torch.randn(150_000, 3, generator=torch.Generator().manual_seed(index))
-        return camera.project(points)[0], torch.get_num_threads()
-
-
-def test_workers_of_a_loader():
-    dataset = Points()
-    for index, (pixels, threads) in enumerate(torch.utils.data.DataLoader(dataset, None, num_workers=2)):
-        assert threads == 1
-        assert torch.equal(pixels, dataset[index][0])

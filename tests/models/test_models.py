@@ -49,6 +49,7 @@ def test_latlon_is_a_file_of_mrcal(tmp_path):
         (camera(ct.Division, -0.25), camera(ct.Stereographic, 0.0)),
         (camera(ct.FTheta, 0.0, 0.02, 0.0, -0.003), camera(ct.KannalaBrandt, 0.02, -0.003)),
         (camera(ct.FThetaBackward, 0.0, 0.0), camera(ct.KannalaBrandt, 0.0)),
+        (camera(ct.OCamCalib, 0.0, 0.0, 0.0, -0.2, 0.0, 0.01), camera(ct.Division, -0.2, 0.01)),
         (camera(ct.FTheta, 0.1, 0.02, -0.003), camera(ct.WoodScape, 0.1, 0.02, -0.003)),
         (camera(ct.ThinPrismFisheye, 0.02, 0.01, 0, 0, 0, 0, 0, 0), camera(ct.KannalaBrandt, 0.02, 0.01)),
     ],

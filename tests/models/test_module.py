@@ -1,6 +1,7 @@
 """A camera is a torch module like any other: compiled, transformed, exported, copied, saved, learned, predicted."""
 
 import copy
+import io
 import pickle
 import re
 
@@ -77,13 +78,31 @@ def test_compile_to_machine_code():
     assert_same(compiled(points), camera(points), rtol=1e-12, atol=0)
 
 
+def loaded(module, values, **options):
+    """A module that was exported, saved and loaded."""
+    file = io.BytesIO()
+    torch.export.save(torch.export.export(module, (values,), **options), file)
+    file.seek(0)
+    return torch.export.load(file).module()
+
+
 @pytest.mark.slow
-def test_export():
-    module, values = module_and_input("kannala_brandt", "project")
-    count = torch.export.Dim("count", min=2)
-    exported = torch.export.export(module, (values,), dynamic_shapes=({0: count},)).module()
+@pytest.mark.parametrize(
+    ("key", "method"), [("kannala_brandt", "project"), ("pinhole", "project"), ("equirectangular", "unproject")]
+)
+def test_export(key, method):
+    module, values = module_and_input(key, method)
+    module.requires_grad_(False)
+    exported = loaded(module, values, dynamic_shapes=({0: torch.export.Dim("count", min=2)},))
     for rows in (values, values[:9]):
         assert_same(exported(rows), module(rows))
+
+
+@pytest.mark.slow
+def test_export_of_a_dewarp():
+    dewarp = ct.Dewarp(one("pinhole").float().requires_grad_(False), image_size=(6, 8))
+    images = torch.rand(1, 3, *one("pinhole").image_size)
+    torch.testing.assert_close(loaded(dewarp, images)(images), dewarp(images))
 
 
 @each_kind

@@ -63,13 +63,6 @@ def test_a_camera_that_looks_along_z_is_the_same():
     assert torch.equal(forwards.intrinsics, backwards.intrinsics)
 
 
-def test_even_powers_are_a_division_camera():
-    camera = ct.OCamCalib(float64([300, 300, 320, 240]), float64([0, 0, 0, -0.2, 0, 0.01]), image_size=SIZE)
-    division = ct.Division(float64([300, 300, 320, 240]), float64([-0.2, 0.01]), image_size=SIZE)
-    torch.testing.assert_close(camera.rays()[0], division.rays()[0])
-    assert division.convert("ocamcalib").max_error < 1e-9
-
-
 # -- the file
 
 
