@@ -99,6 +99,11 @@ def test_a_pose_is_a_value():
     assert torch.equal(pose.expand(2, 3).matrix(), pose.matrix().expand(2, 3, 4, 4))
     assert not pose.detach().rotation.requires_grad
     assert pose.clone().rotation.requires_grad
+    poses = ct.Extrinsics(torch.rand(4, 3), torch.rand(3))
+    assert len(poses) == 4
+    for index in (2, slice(1, 3)):
+        torch.testing.assert_close(poses[index].matrix(), poses.matrix()[index])
+    assert [p.batch_shape for p in poses] == [()] * 4
 
 
 CAMERA = camera_of("kannala_brandt")
