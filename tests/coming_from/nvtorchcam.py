@@ -6,7 +6,7 @@ import torch
 
 import camtorch as ct
 
-from . import SIZE, close, equal, photograph, pixels, plane, points, row, trap
+from . import SIZE, close, elsewhere, equal, pixels, plane, points, trap
 
 HEIGHT, WIDTH = SIZE
 HALF = torch.tensor([WIDTH, HEIGHT]) / 2
@@ -15,11 +15,8 @@ INTRINSICS = torch.cat([AFFINE[:2] * HALF, (AFFINE[2:] + 1) * HALF - 0.5])  # as
 KS, PS = torch.tensor([-0.28, 0.1, -0.01, 0.02, 0.01, -0.003]), torch.tensor([1e-3, -5e-4])
 K4, PROJECTING, UNPROJECTING = ([0.02, -0.01, 0.003, -0.001], [0.0, 0.9, -0.02, 0.01], [0.0, 1.1, 0.02, -0.01])
 POINTS, PIXELS = torch.from_numpy(points()).float(), torch.from_numpy(pixels()).float()
-POSE, BESIDE = ct.Extrinsics([0.1, -0.2, 0.05], [0.1, 0.2, 0.3]), ct.Extrinsics([0.01, 0.05, -0.02], [-0.12, 0.01, 0.0])
-DEPTH = 2 + torch.rand(SIZE, generator=torch.Generator().manual_seed(0))
 PINHOLE = ct.Pinhole(INTRINSICS, image_size=SIZE).requires_grad_(False)
 FISHEYE = ct.KannalaBrandt(INTRINSICS, K4, image_size=SIZE).requires_grad_(False)
-IMAGE = torch.from_numpy(photograph()).permute(2, 0, 1)[None].float()
 RAYS = torch.nn.functional.normalize(POINTS, dim=-1)
 THETA, ACROSS = RAYS[:, 2:].acos(), torch.nn.functional.normalize(POINTS[:, :2], dim=-1)
 
@@ -70,35 +67,9 @@ def panorama():
     return normalised(ct.Equirectangular(intrinsics, image_size=SIZE).project(POINTS)[0]), documented, 1e-5
 
 
-def of_depth():
-    """The distance, and z, of what is seen at a depth along the ray and along the axis."""
-    world = {kind: POSE.inverse()(FISHEYE.backproject(DEPTH, kind=kind)[0]) for kind in ("z", "distance")}
-    yield POSE(world["distance"]).norm(dim=-1), DEPTH.expand_as(world["z"][..., 0]), 1e-4
-    yield POSE(world["z"])[..., 2].abs(), DEPTH.expand_as(world["z"][..., 0]), 1e-4
-
-
 def of_edges():
     intrinsics = PINHOLE.intrinsics + torch.tensor([0, 0, 0.5, 0.5])
     return torch.cat([intrinsics[:2] / HALF, intrinsics[2:] / HALF - 1]), AFFINE, 1e-6
-
-
-def rectified():
-    """By latitude, and flat: with one turn of the left camera."""
-    return [ct.rectify(PINHOLE, PINHOLE, BESIDE, projection=p).rotation_left for p in ("latlon", "perspective")]
-
-
-def resampled():
-    turn = POSE.matrix()[:3, :3]  # source from target
-    middle = torch.tensor([79.5, 59.5])
-    spot, _ = ct.Warp(FISHEYE, PINHOLE, turn.mT).transform_points(middle[None])
-    return spot[0], PINHOLE.project(turn.mT @ FISHEYE.unproject(middle)[0])[0], 1e-3
-
-
-def sampled():
-    warp = ct.Warp(FISHEYE, PINHOLE)
-    found = torch.nn.functional.grid_sample(IMAGE, warp.grid(), align_corners=False)
-    shown = warp.valid_mask().expand_as(found)
-    return found[shown], warp(IMAGE)[shown], 0.1
 
 
 equal("nvtorchcam.cameras", {
@@ -113,14 +84,6 @@ equal("nvtorchcam.cameras", {
         backwards(),
     ],
     "EquirectangularCamera": lambda: [panorama()],
-    "CameraBase.pixel_to_ray CameraBase.get_camera_rays": lambda: [
-        (FISHEYE.unproject(FISHEYE.pixel_grid())[0], FISHEYE.rays()[0], 1e-6),
-        (FISHEYE.rays()[0].norm(dim=-1), torch.ones(SIZE), 1e-5),
-    ],
-    "CameraBase.unproject_depth": of_depth,
-    "TensorDictionaryAffineCamera.crop": lambda: [(
-        FISHEYE.crop(20, 30, 60, 80).project(POINTS)[0], FISHEYE.project(POINTS)[0] - torch.tensor([30.0, 20.0]), 1e-4
-    )],
 })  # fmt: skip
 equal("nvtorchcam.utils", {
     "get_normalized_grid": lambda: [
@@ -128,26 +91,18 @@ equal("nvtorchcam.utils", {
         (normalised(FISHEYE.pixel_grid())[-1, -1], torch.tensor([1 - 1 / WIDTH, 1 - 1 / HEIGHT]), 1e-6),
     ],
     "normalized_intrinsics_from_pixel_intrinsics": lambda: [of_edges()],
-    "samples_from_image": lambda: [sampled()],
 })  # fmt: skip
-equal("nvtorchcam.warpings", {
-    "resample_by_intrinsics": lambda: [resampled()],
-    "stereo_rectify": lambda: [(*rectified(), 1e-5)],
+elsewhere("nvtorchcam.cameras", {
+    "CameraBase.pixel_to_ray CameraBase.get_camera_rays": "models/test_laws.py::test_pixel_grid_and_rays",
+    "CameraBase.unproject_depth": "warp/test_reproject.py::test_backprojected_points_are_seen_at_their_pixels",
+    "TensorDictionaryAffineCamera.crop": "models/test_laws.py::test_edits",
 })  # fmt: skip
-
-
-@row("nvtorchcam.warpings.backward_warp")
-def backward_warp():
-    _, seen = ct.Reproject(FISHEYE, PINHOLE, POSE)(IMAGE, DEPTH[None, None])
-    assert seen.float().mean() > 0.3
-
-
-@row("nvtorchcam.warpings.RandomResizedCropFlip")
-def crop_and_flip():
-    edits = [ct.augment.RandomResizedCrop((60, 80)), ct.augment.HorizontalFlip(p=1.0)]
-    keypoints = PINHOLE.project(POINTS)[0][None]
-    sample = ct.augment.Compose(edits, camera=PINHOLE)(image=IMAGE, points=POINTS[None], keypoints=keypoints)
-    close(sample["camera"].project(sample["points"])[0], sample["keypoints"], 1e-2)
+elsewhere("nvtorchcam.warpings", {
+    "resample_by_intrinsics": "warp/test_warp.py::test_a_pinhole_turned_is_a_homography",
+    "backward_warp": "warp/test_reproject.py::test_it_is_what_a_loop_makes",
+    "stereo_rectify": "stereo/test_rectify.py::test_rows_correspond_and_disparities_give_the_points",
+    "RandomResizedCropFlip": "augment/test_edits.py::test_the_camera_follows_every_edit",
+})  # fmt: skip
 
 
 @trap

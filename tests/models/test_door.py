@@ -21,7 +21,8 @@ GENERAL, WINDSHIELD, SHIELD = ct.KannalaBrandt.from_general, ct.Windshield, ct.W
 POSE, FROM, TABLE = ct.Extrinsics, ct.Extrinsics.from_matrix, ct.Tabulated.from_table
 R, RVEC, TVEC = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), np.array([0.1, -0.2, 0.3]), np.array([1.0, 2.0, 3.0])
 OCAM, SS, CENTRE = ct.OCamCalib.from_ocamcalib, (-206.517, 0.0, 2.207161e-03), (241.8, 394.6)
-NAN = math.nan
+NAN, A, REPROJECTION = math.nan, ct.augment, ct.losses.reprojection
+FLIP, IMAGE, UV = A.HorizontalFlip(1.0, landmarks="coco17"), torch.rand(3, *SIZE), torch.rand(17, 2)
 
 
 def leaf(*values):
@@ -216,6 +217,24 @@ WRONG = [
     (lambda: POSE([[[0.0], [45.0], [0.0]]], TVEC), ValueError, "seems to be degrees"),
     (lambda: ct.Warp(CAMERA, CAMERA, RVEC), ValueError, r"rotation must be .*Extrinsics\(vector"),
     (lambda: ct.Warp(CAMERA, CAMERA, RVEC[:, None]), ValueError, r"rotation must be .*Extrinsics\(vector"),
+    (lambda: ct.head_angles(EYE[:2, :2]), ValueError, r"^head_angles: .*\(\.\.\., 3, 3\); got shape \(2, 2\)"),
+    (lambda: ct.head_angles(np.diag([1.0, 1, -1])), ValueError, "^head_angles: .*must hold rotation matrices"),
+    (lambda: ct.head_angles(np.full((3, 3), NAN)), ValueError, "^head_angles: .*pose"),
+    (lambda: ct.head_angles("left"), TypeError, "^head_angles: pose must be numbers"),
+    (lambda: ct.head_angles(RVEC), ValueError, r"^head_angles: .*ct\.Extrinsics\(rvec, \(0, 0, 0\)\)"),
+    (lambda: ct.head_rotation([0.0, 1.0]), ValueError, r"head_rotation: angles must be \(..., 3\), pitch, yaw"),
+    (lambda: ct.head_rotation([-30.0, 20.0, 5.0]), ValueError, "must be radians; 30 seems to be degrees"),
+    # what people try first of edits, losses and shutters
+    (lambda: A.Resize([]), TypeError, "size must be whole numbers"),
+    (lambda: A.Rotate90(90), ValueError, "quarter turns; got 90, which would be degrees"),
+    (lambda: A.Rotate90((-90, 90)), ValueError, "degrees"),
+    (lambda: A.RandomResizedCrop(32, scale=0.5), TypeError, "scale must be a range"),
+    (lambda: ct.RollingShutter(0.01, [0, 1, 0], samples=2.5), TypeError, "samples must be a whole number"),
+    (lambda: ct.RollingShutter(0.01, [0, 1, 0], samples="8"), TypeError, "samples must be a whole number"),
+    (lambda: ct.vignetting(MIXED, torch.ones(3)), ValueError, "one for each of 2 cameras"),
+    (lambda: REPROJECTION(LENS, UV, torch.rand(9, 3)), ValueError, r"pixels \(17, 2\) of target and \(9, 2\)"),
+    (lambda: FLIP(image=IMAGE, keypoints=torch.rand(17, 3)), ValueError, r"\[..., 2\] goes in as keypoints_valid"),
+    (lambda: FLIP(image=IMAGE, keypoints=torch.rand(68, 2)), ValueError, r"landmarks=\{'keypoints': 'ibug68'\}"),
     # windshields
     (
         lambda: WINDSHIELD([0.0, 1, 0], [0.0, 0]),

@@ -6,6 +6,7 @@ import pickle
 import pytest
 import torch
 from cameras import DISTINCT, KEYS, make, real
+from test_laws import EDITS, FLIPS
 
 import camtorch as ct
 
@@ -113,17 +114,7 @@ def same(batch, cameras):
     )
 
 
-@pytest.mark.parametrize(
-    "edit",
-    [
-        lambda c: c.crop(3, 4, 20, 30),
-        lambda c: c.resize(24, 32),
-        lambda c: c.pad(1, 2, 3, 4),
-        lambda c: c.hflip(),
-        lambda c: c.vflip(),
-        lambda c: c.rot90(),
-    ],
-)
+@pytest.mark.parametrize("edit", [*(edit for edit, *_ in (EDITS | FLIPS).values()), lambda camera: camera.rot90()])
 def test_edits_are_those_of_each_camera_and_gradients_go_there(edit):
     cameras = models()
     edited = edit(ct.Mixed(cameras))
