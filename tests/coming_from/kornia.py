@@ -167,24 +167,22 @@ equal("kornia.geometry", {
         (ct.Pinhole.from_matrix(theirs().camera_matrix[0]).intrinsics, NUMBERS),
         (ct.Extrinsics.from_matrix(theirs().extrinsics).rotation, POSE.rotation[None]),
     ],
-    "camera.PinholeCamera.project": lambda: [(PINHOLE(POSE(POINTS))[0], theirs().project(POINTS[None])[0])],
-    "camera.PinholeCamera.unproject": lambda: [
-        (POSE.inverse()(lifted()), theirs().unproject(PIXELS[None], ONE[None])[0])
+    "camera.PinholeCamera.project camera.PinholeCamera.unproject": lambda: [
+        (PINHOLE(POSE(POINTS))[0], theirs().project(POINTS[None])[0]),
+        (POSE.inverse()(lifted()), theirs().unproject(PIXELS[None], ONE[None])[0]),
     ],
     "camera.PinholeCamera.scale": lambda: [(
         theirs().scale(torch.tensor([0.5]).double()).camera_matrix[0][[0, 1, 0, 1], [0, 1, 2, 2]],
         PINHOLE.resize(60, 80).intrinsics + torch.tensor([0, 0, 0.25, 0.25]),
     )],
-    "camera.project_points": lambda: [(PINHOLE.project(POINTS)[0], geometry.project_points(POINTS, MATRIX))],
-    "camera.unproject_points": lambda: [
+    "camera.project_points camera.unproject_points": lambda: [
+        (PINHOLE.project(POINTS)[0], geometry.project_points(POINTS, MATRIX)),
         (lifted(), geometry.unproject_points(PIXELS, ONE, MATRIX)),
         (PINHOLE.unproject(PIXELS)[0] * ONE, geometry.unproject_points(PIXELS, ONE, MATRIX, normalize=True)),
     ],
-    "camera.distort_points_kannala_brandt": lambda: [
-        (FISHEYE.project(POINTS)[0], camera.distort_points_kannala_brandt(plane(POINTS), NUMBERS_AND_D4))
-    ],
-    "camera.undistort_points_kannala_brandt": lambda: [
-        (plane(lifted(FISHEYE)), camera.undistort_points_kannala_brandt(PIXELS, NUMBERS_AND_D4), 1e-6)
+    "camera.distort_points_kannala_brandt camera.undistort_points_kannala_brandt": lambda: [
+        (FISHEYE.project(POINTS)[0], camera.distort_points_kannala_brandt(plane(POINTS), NUMBERS_AND_D4)),
+        (plane(lifted(FISHEYE)), camera.undistort_points_kannala_brandt(PIXELS, NUMBERS_AND_D4), 1e-6),
     ],
     "camera.StereoCamera depth.depth_from_disparity": by_disparity,
     "calibration.distort_points": lambda: [

@@ -1,6 +1,5 @@
 """Threads: who shares work, what comes of errors, forks and several callers, and that results do not depend on it."""
 
-import os
 import signal
 import threading
 import time
@@ -112,16 +111,6 @@ def test_an_interruption_waits_for_workers():
     assert ended == [1]
 
 
-def test_several_threads_call_at_once():
-    everything = [Pieces(30) for _ in range(6)]
-    callers = [threading.Thread(target=spread, args=(pieces, 3)) for pieces in everything]
-    for caller in callers:
-        caller.start()
-    for caller in callers:
-        caller.join()
-    assert all(sorted(pieces.done) == list(range(30)) for pieces in everything)
-
-
 def test_work_that_spreads_itself():
     inner = [Pieces(10, 0) for _ in range(4)]
     left = deque(inner)
@@ -136,18 +125,6 @@ def test_work_that_spreads_itself():
 
     spread(work, 2)
     assert all(sorted(pieces.done) == list(range(10)) for pieces in inner)
-
-
-@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork")
-@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")  # which may leave a child without its threads
-def test_a_child_has_workers_of_its_own():
-    spread(Pieces(10), 2)
-    child = os.fork()
-    if child == 0:
-        pieces = Pieces(20, threads=2)
-        spread(pieces, 2)
-        os._exit(0 if len(pieces.by) == 2 and sorted(pieces.done) == list(range(20)) else 1)
-    assert os.waitpid(child, 0)[1] == 0
 
 
 # -- the threads of torch
