@@ -27,21 +27,16 @@ def pose(rotation, translation=(0.3, -0.2, 1.5)):
 
 
 @pytest.mark.parametrize("rotation", ROTATIONS.values(), ids=ROTATIONS)
-def test_rotation_is_the_matrix_exponential(rotation):
+def test_rotation_is_the_matrix_exponential_and_back(rotation):
     x, y, z = rotation
     generator = torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]], dtype=F64)
     matrix = pose(rotation).matrix()
     torch.testing.assert_close(matrix[:3, :3], torch.linalg.matrix_exp(generator), atol=4e-15, rtol=0)
     assert matrix[3].tolist() == [0, 0, 0, 1]
     assert matrix[:3, 3].tolist() == [0.3, -0.2, 1.5]
-
-
-@pytest.mark.parametrize("rotation", ROTATIONS.values(), ids=ROTATIONS)
-def test_from_matrix_inverts_matrix(rotation):
-    original = pose(rotation)
-    again = ct.Extrinsics.from_matrix(original.matrix())
-    torch.testing.assert_close(again.matrix(), original.matrix(), atol=1e-12, rtol=0)
-    torch.testing.assert_close(ct.Extrinsics.from_matrix(original.matrix()[:3]).matrix(), again.matrix())
+    again = ct.Extrinsics.from_matrix(matrix)
+    torch.testing.assert_close(again.matrix(), matrix, atol=1e-12, rtol=0)
+    torch.testing.assert_close(ct.Extrinsics.from_matrix(matrix[:3]).matrix(), again.matrix())
 
 
 def test_inverse_compose_position_and_points():
