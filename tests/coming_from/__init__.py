@@ -1,6 +1,7 @@
 """What the checks of the rows of the pages "Coming from" have in common; beside this is one file a library."""
 
 import inspect
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -9,13 +10,14 @@ import torch
 
 CHECKS, TRAPS = {}, []
 SIZE = (120, 160)
+SLOW = [pytest.mark.slow]
 
 
 def row(*keys, slow=False):
     """Register the check of the rows that begin with these names, module and all."""
 
     def register(check):
-        param = pytest.param(check, id=keys[0], marks=[pytest.mark.slow] if slow else [])
+        param = pytest.param(check, id=keys[0], marks=SLOW if slow else [])
         assert not CHECKS.keys() & set(keys), keys
         CHECKS.update(dict.fromkeys(keys, param))
         return check
@@ -23,31 +25,48 @@ def row(*keys, slow=False):
     return register
 
 
-def equal(table):
-    """Register rows where the same numbers come out of both: names -> what gives pairs (ours, theirs), and an atol."""
-    for keys, pairs in table.items():
+def equal(module, table, slow=False):
+    """Register rows where the same comes out of both: names -> what gives pairs (ours, theirs[, atol])."""
+    for names, pairs in table.items():
 
         def check(pairs=pairs):
-            *found, atol = pairs()
-            for ours, theirs in found:
-                close(ours, theirs, atol)
+            for pair in pairs():
+                close(*pair)
 
         check.__signature__ = inspect.Signature()
-        row(*keys.split(" "))(check)
+        row(*(f"{module}.{name}" for name in names.split()), slow=slow)(check)
+
+
+def elsewhere(module, table):
+    """Register rows that tests of other rooms hold to: names -> "room/file.py::name" of the test."""
+    for names, test in table.items():
+
+        def check(test=test):
+            file, _, name = test.partition("::")
+            assert f"def {name}(" in (Path(__file__).parents[1] / file).read_text()
+
+        check.__signature__ = inspect.Signature()
+        row(*(f"{module}.{name}" for name in names.split()))(check)
 
 
 def trap(check, slow=False):
     """Register the check of what a page says under "Traps"."""
     name = f"{check.__module__.split('.')[-1]}: {check.__name__}"
-    TRAPS.append(pytest.param(check, id=name, marks=[pytest.mark.slow] if slow else []))
+    TRAPS.append(pytest.param(check, id=name, marks=SLOW if slow else []))
     return check
 
 
 def close(ours, theirs, atol=1e-9):
-    """The same shape, and the same numbers within atol."""
+    """The same shape, and the same numbers within atol; of images (H, W, C) but for two grey values, and the rim."""
     ours, theirs = (np.asarray(x.detach() if isinstance(x, torch.Tensor) else x) for x in (ours, theirs))
     assert ours.shape == theirs.shape
-    np.testing.assert_allclose(ours, theirs, rtol=0, atol=atol)
+    if ours.dtype != np.uint8:
+        np.testing.assert_allclose(ours, theirs, rtol=0, atol=atol)
+        return
+    shown = ((theirs > 0) & (ours > 0)).all(-1).astype(np.uint8)
+    inner = cv2.erode(shown, np.ones((5, 5)), borderValue=0).astype(bool)
+    assert inner.mean() > 0.2
+    assert np.abs(ours.astype(int) - theirs.astype(int))[inner].max() <= 2
 
 
 def points(count=50, low=(-1.5, -1.5, 1.5), high=(1.5, 1.5, 4.5), seed=0):
@@ -71,10 +90,11 @@ def as_images(array):
     return torch.from_numpy(np.ascontiguousarray(array)).permute(2, 0, 1)[None]
 
 
-def same_images(ours, theirs, within=2):
-    """Arrays (H, W, C) that differ by so many grey values, away from the borders of what is shown."""
-    assert ours.shape == theirs.shape
-    shown = ((theirs > 0) & (ours > 0)).all(-1).astype(np.uint8)
-    inner = cv2.erode(shown, np.ones((5, 5)), borderValue=0).astype(bool)
-    assert inner.mean() > 0.2
-    assert np.abs(ours.astype(int) - theirs.astype(int))[inner].max() <= within
+def warped(warp):
+    """What a warp makes of the photograph, as an array."""
+    return warp(as_images(photograph()))[0].permute(1, 2, 0).numpy()
+
+
+def plane(rays):
+    """Points (..., 2) of rays at a depth of one."""
+    return rays[..., :2] / rays[..., 2:]

@@ -1,7 +1,5 @@
 """The rows of the page on OpenCV."""
 
-import functools
-
 import cv2
 import numpy as np
 import pytest
@@ -11,7 +9,7 @@ from cameras import GOLDEN
 
 import camtorch as ct
 
-from . import SIZE, as_images, close, equal, photograph, pixels, points, row, same_images, trap
+from . import SIZE, as_images, close, elsewhere, equal, photograph, pixels, plane, points, row, trap, warped
 
 WH = SIZE[::-1]
 K = np.array([[75.0, 0, 79.5], [0, 77.5, 59.5], [0, 0, 1]])
@@ -20,395 +18,50 @@ D5 = np.array([-0.28, 0.1, 1e-3, -5e-4, -0.01])
 D4 = np.array([[0.02], [-0.01], [0.003], [-0.001]])
 XI = np.array([1.2])
 RVEC, TVEC = np.array([[0.1], [-0.2], [0.05]]), np.array([[0.1], [0.2], [1.0]])
-TURN = cv2.Rodrigues(np.array([0.1, -0.05, 0.2]))[0]
+SECOND = (np.array([[0.3], [0.1], [-0.2]]), np.array([[1.0], [2.0], [3.0]]))
+R = cv2.Rodrigues(np.array([0.1, -0.05, 0.2]))[0]
 FINE = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 200, 1e-14)
-
-
-def brown():
-    return ct.BrownConrady.from_matrix(K, D5, image_size=SIZE).requires_grad_(False)
-
-
-def fisheye():
-    return ct.KannalaBrandt.from_matrix(K, D4, image_size=SIZE).requires_grad_(False)
-
-
-def mei():
-    return ct.Mei.from_matrix(K, np.append(XI, D5[:4]), image_size=SIZE).requires_grad_(False)
-
-
-def target():
-    return ct.Pinhole.from_matrix(P, image_size=SIZE).requires_grad_(False)
-
-
-def pose():
-    return ct.Extrinsics(RVEC, TVEC).requires_grad_(False)
+X, UV, FLAT = points(), pixels(), points()[:, :2]
+POSE = ct.Extrinsics(RVEC, TVEC).requires_grad_(False)
+BROWN = ct.BrownConrady.from_matrix(K, D5, image_size=SIZE).requires_grad_(False)
+FISHEYE = ct.KannalaBrandt.from_matrix(K, D4, image_size=SIZE).requires_grad_(False)
+MEI = ct.Mei.from_matrix(K, np.append(XI, D5[:4]), image_size=SIZE).requires_grad_(False)
+TARGET = ct.Pinhole.from_matrix(P, image_size=SIZE).requires_grad_(False)
 
 
 def tensor(array):
     return torch.from_numpy(np.asarray(array))
 
 
-def warped(warp):
-    return warp(as_images(photograph()))[0].permute(1, 2, 0).numpy()
-
-
-def plane_points(rays):
-    return rays[..., :2] / rays[..., 2:]
-
-
 def seen(camera):
-    return camera(pose()(tensor(points())))[0]
+    return camera(POSE(tensor(X)))[0]
 
 
-FLAT, SECOND = points()[:, :2], (np.array([[0.3], [0.1], [-0.2]]), np.array([[1.0], [2.0], [3.0]]))
+def moved(target):
+    return ct.Warp(BROWN, target).transform_points(tensor(UV))[0]
+
+
+def remapped(map1, map2):
+    return cv2.remap(photograph(), map1, map2, cv2.INTER_LINEAR)
+
+
+def rectified(module, lens):
+    return module.initUndistortRectifyMap(K, lens, R, P, WH, cv2.CV_32FC1)
+
+
+def by_grid(maps):
+    """Maps of one's own, as on the page."""
+    grid = (2 * tensor(np.stack(maps, -1)) + 1) / torch.tensor(WH) - 1
+    return torch.nn.functional.grid_sample(as_images(photograph()).float(), grid[None], align_corners=False)
+
+
+def best_matrix():
+    new, _ = cv2.getOptimalNewCameraMatrix(K, D5, WH, 0.0)
+    return new, ct.Pinhole.from_matrix(new, image_size=SIZE).requires_grad_(False)
 
 
 def composed():
-    return ct.Extrinsics(*(column[:, 0] for column in SECOND)).compose(pose())
-
-
-equal({
-    "cv2.projectPoints": lambda: ((seen(brown()), cv2.projectPoints(points(), RVEC, TVEC, K, D5)[0][:, 0]), 1e-9),
-    "cv2.fisheye.projectPoints": lambda: (
-        (seen(fisheye()), cv2.fisheye.projectPoints(points()[None], RVEC, TVEC, K, D4)[0][0]), 1e-9
-    ),
-    "cv2.fisheye.distortPoints": lambda: (
-        (
-            fisheye().project(tensor(np.concatenate([FLAT, np.ones((50, 1))], 1)))[0],
-            cv2.fisheye.distortPoints(FLAT[None], K, D4)[0],
-        ),
-        1e-9,
-    ),
-    "cv2.Rodrigues": lambda: (
-        (pose().matrix()[:3, :3], cv2.Rodrigues(RVEC)[0]),
-        (ct.Extrinsics(cv2.Rodrigues(RVEC)[0], TVEC).rotation, RVEC[:, 0]),
-        1e-9,
-    ),
-    "cv2.composeRT": lambda: (
-        (composed().rotation, cv2.composeRT(RVEC, TVEC, *SECOND)[0][:, 0]),
-        (composed().translation, cv2.composeRT(RVEC, TVEC, *SECOND)[1][:, 0]),
-        1e-9,
-    ),
-    "cv2.omnidir.projectPoints": lambda: ((mei().project(tensor(points()))[0], spherical(points())), 1e-9),
-    "cv2.omnidir.undistortPoints cv2.omnidir.initUndistortRectifyMap": lambda: (
-        (plane_points(mei().unproject(tensor(spherical(points())))[0]), points()[:, :2] / points()[:, 2:]), 1e-9
-    ),
-})  # fmt: skip
-
-
-@row("cv2.undistortPoints")
-def undistort_points():
-    rays, valid = brown().unproject(tensor(pixels()[:, None]))  # shaped as OpenCV's
-    assert valid.all()
-    close(rays.norm(dim=-1), torch.ones(50, 1), 1e-12)
-    close(plane_points(rays), cv2.undistortPoints(pixels(), K, D5, criteria=FINE))
-    moved, _ = ct.Warp(brown(), target()).transform_points(tensor(pixels()))
-    close(moved, cv2.undistortPoints(pixels(), K, D5, P=P, criteria=FINE)[:, 0])
-
-    same = ct.Pinhole.from_matrix(K, image_size=SIZE)
-    moved, _ = ct.Warp(brown(), same).transform_points(tensor(pixels()))
-    close(moved, cv2.undistortImagePoints(pixels(), K, D5)[:, 0], 0.05)  # which takes 5 steps
-
-
-@row("cv2.undistort")
-def undistort():
-    same_images(warped(ct.Warp(brown(), target())), cv2.undistort(photograph(), K, D5, None, P))
-    np.testing.assert_array_equal(cv2.undistort(photograph(), K, D5), cv2.undistort(photograph(), K, D5, None, K))
-
-
-@row("cv2.initUndistortRectifyMap", "cv2.remap", "cv2.fisheye.initUndistortRectifyMap")
-def rectify_map():
-    for camera, lens, of in ((brown(), D5, cv2), (fisheye(), D4, cv2.fisheye)):
-        maps = of.initUndistortRectifyMap(K, lens, TURN, P, WH, cv2.CV_32FC1)
-        theirs = cv2.remap(photograph(), *maps, cv2.INTER_LINEAR)
-        warp = ct.Warp(camera, target(), tensor(TURN))
-        same_images(warped(warp), theirs)
-        seen = warp.valid_mask()[0, 0].numpy()
-        grid = warp.grid()[0].numpy()
-        for i, (found, size) in enumerate(zip(maps, WH, strict=True)):
-            np.testing.assert_allclose(((grid[..., i] + 1) * size - 1)[seen] / 2, found[seen], atol=2e-3)
-        grid = (2 * tensor(np.stack(maps, -1)) + 1) / torch.tensor(WH) - 1  # as on the page
-        ours = torch.nn.functional.grid_sample(as_images(photograph()).float(), grid[None], align_corners=False)
-        same_images(ours[0].permute(1, 2, 0).numpy(), theirs)
-    same_images(warped(ct.Warp(fisheye(), target())), cv2.fisheye.undistortImage(photograph(), K, D4, Knew=P))
-
-
-@row("cv2.initInverseRectificationMap")
-def inverse_map():
-    maps = cv2.initInverseRectificationMap(K, D5, TURN, P, WH, cv2.CV_32FC1)
-    ours = warped(ct.Warp(brown(), target(), tensor(TURN)).inverse())
-    same_images(ours, cv2.remap(photograph(), *maps, cv2.INTER_LINEAR))
-
-
-@row("cv2.convertMaps")
-def convert_maps(tmp_path):
-    warp = ct.Warp(brown(), target(), tensor(TURN))
-    warp.save(tmp_path / "fixed.npz", format="opencv_fixed")
-    with np.load(tmp_path / "fixed.npz") as read:
-        ours = cv2.remap(photograph(), *(read[name] for name in read.files if read[name].ndim > 1), cv2.INTER_LINEAR)
-    maps = cv2.initUndistortRectifyMap(K, D5, TURN, P, WH, cv2.CV_32FC1)
-    same_images(ours, cv2.remap(photograph(), *cv2.convertMaps(*maps, cv2.CV_16SC2), cv2.INTER_LINEAR))
-
-
-@row("cv2.getOptimalNewCameraMatrix", "cv2.fisheye.estimateNewCameraMatrixForUndistortRectify")
-def new_matrix():
-    new, _ = cv2.getOptimalNewCameraMatrix(K, D5, WH, 0.0)
-    warp = ct.Warp(brown(), ct.Pinhole.from_matrix(new, image_size=SIZE).requires_grad_(False))
-    same_images(warped(warp), cv2.undistort(photograph(), K, D5, None, new))
-    assert torch.isfinite(ct.Dewarp(fisheye()).target.intrinsics).all()
-
-
-@row("cv2.solvePnP", "cv2.solvePnPRansac", "cv2.fisheye.solvePnP")
-def solve_pnp():
-    board = points(12)
-    seen, around = (project(board[None], RVEC, TVEC, K, lens)[0].reshape(12, 1, 2)
-                    for project, lens in ((cv2.projectPoints, D5), (cv2.fisheye.projectPoints, D4)))  # fmt: skip
-    for camera, uv, (_, rvec, tvec) in (
-        (brown(), seen, cv2.solvePnP(board, seen, K, D5)),
-        (fisheye(), around, cv2.fisheye.solvePnP(board[None], around[:, 0][None], K, D4)),
-    ):
-        found, _, valid = ct.solve_pnp(camera, board, uv[:, 0])
-        assert valid
-        close(found.rotation, rvec[:, 0], 1e-5)
-        close(found.translation, tvec[:, 0], 1e-5)
-    seen[0] += 50.0
-    pose = ct.solve_pnp(brown(), board, seen[:, 0], threshold=2)
-    *_, inliers = cv2.solvePnPRansac(board, seen, K, D5, reprojectionError=2)
-    assert pose.inliers.nonzero()[:, 0].tolist() == inliers[:, 0].tolist() == list(range(1, 12))
-    close(pose.extrinsics.translation, TVEC[:, 0], 1e-5)
-
-
-@row("cv2.triangulatePoints", slow=True)
-def triangulate():
-    first = ct.Extrinsics([0.0, 0.0, 0.0], [0.0, 0.0, 0.0]).double().requires_grad_(False)
-    world = tensor(points(20))
-    seen = torch.stack([brown()(pose)[0] for pose in (first(world), pose()(world))])
-    found, _, valid = ct.triangulate([brown(), brown()], [first, pose()], seen)
-    assert valid.all()
-    close(found, world, 1e-6)
-    flat = [cv2.undistortPoints(uv.numpy(), K, D5, criteria=FINE)[:, 0].T for uv in seen]
-    theirs = cv2.triangulatePoints(np.eye(3, 4), pose().matrix().numpy()[:3], *flat)
-    close(found, (theirs[:3] / theirs[3]).T, 1e-6)
-
-
-def views():
-    """Thirteen of OpenCV's left camera: board, corners, (width, height)."""
-    left, _ = opencv_left()
-    board = left.object_points.numpy().astype(np.float32)
-    return board, [uv.numpy().astype(np.float32)[:, None] for uv in left.image_points], left.image_size[::-1]
-
-
-def same_calibrations(flags, options, guess):
-    board, corners, wh = views()
-    rms, matrix, distortion, *_ = cv2.calibrateCamera([board] * 13, corners, wh, *guess, flags=flags)
-    ours = ct.calibrate("brown_conrady", board, corners, image_size=wh[::-1], **options)
-    assert ours.rms == pytest.approx(rms, rel=1e-9)
-    close(ours.camera.K, matrix, 1e-4)
-    count = ours.camera.distortion.shape[-1]
-    # of the standard deviations: eight coefficients that trade with each other are known to far fewer digits than two
-    off = np.abs(ours.camera.distortion.detach().numpy() - distortion.ravel()[:count])
-    assert (off <= 1e-3 * ours.std[4:].numpy() + 1e-7).all()
-    assert not distortion.ravel()[count:].any()
-    return ours
-
-
-GUESS = np.array([[536.0, 0, 342], [0, 536.0, 235], [0, 0, 1]])
-
-
-@row("cv2.calibrateCamera", "cv2.calibrateCameraExtended", "cv2.findChessboardCornersSB", slow=True)
-def calibrate():
-    ours = same_calibrations(0, {"count": 5}, (None, None))
-    board, corners, wh = views()
-    *_, deviations, _, _ = cv2.calibrateCameraExtended([board] * 13, corners, wh, None, None)
-    std = ours.std.numpy()
-    np.testing.assert_allclose(std / deviations[:9, 0], np.full(9, std[0] / deviations[0, 0]), rtol=1e-3)
-    assert [tuple(residual.shape) for residual in ours.residuals] == [(54, 1, 2)] * 13
-    with pytest.warns(UserWarning, match="6"):  # in which no board was found
-        assert ct.calibrate("brown_conrady", board, [*corners[:6], None], image_size=wh[::-1], count=4).rms < 0.3
-
-
-FLAGS = {
-    "FIX_PRINCIPAL_POINT": {"count": 5, "fixed": ("cx", "cy")},
-    "ZERO_TANGENT_DIST": {"count": 5, "fixed": ("p1", "p2")},
-    "FIX_K3": {"count": 4},
-    "RATIONAL_MODEL": {"count": 8},
-}
-for _flag, _options in FLAGS.items():
-    row(f"cv2.CALIB_{_flag}", slow=True)(
-        functools.partial(same_calibrations, getattr(cv2, f"CALIB_{_flag}"), _options, (None, None))
-    )
-
-
-@row("cv2.CALIB_USE_INTRINSIC_GUESS", "cv2.CALIB_FIX_FOCAL_LENGTH", slow=True)
-def fixed_focal_length():
-    start = ct.BrownConrady.from_matrix(GUESS, np.zeros(5), image_size=(480, 640))
-    flags = cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_FIX_FOCAL_LENGTH
-    same_calibrations(flags, {"start": start, "fixed": ("fx", "fy")}, (GUESS.copy(), np.zeros(5)))
-
-
-def boards(cameras, count=12):
-    """A board (N, 3), and what cameras see of it in its poses: corners (V, N, 2) of each, float64, without noise.
-
-    Args:
-        cameras: (camera, from the first camera) of each.
-        count: V.
-    """
-    board = chessboard(8, 6, 0.025)
-    turns = torch.linspace(0, 6, count, dtype=torch.float64)
-    lean = torch.stack([0.5 * turns.cos(), 0.5 * turns.sin(), 0.3 * turns], -1)
-    place = torch.stack([0.05 * (2 * turns).sin() - 0.08, 0.04 * (2 * turns).cos() - 0.06, 0.25 + 0.02 * turns], -1)
-    placed = ct.Extrinsics(lean, place).requires_grad_(False)(board[None])
-    return board, [camera(pose(placed))[0] for camera, pose in cameras]
-
-
-HERE = ct.Extrinsics(np.zeros(3), np.zeros(3)).requires_grad_(False)
-RIGHT = ct.Extrinsics(np.array([0.01, 0.05, -0.02]), np.array([-0.12, 0.01, 0.005])).requires_grad_(False)
-
-
-def float32(array, shape):
-    return np.ascontiguousarray(array, np.float32).reshape(shape)
-
-
-@row("cv2.stereoCalibrate", "cv2.fisheye.stereoCalibrate", slow=True)
-def stereo_calibrate():
-    board, seen = boards([(brown(), HERE), (brown(), RIGHT)])
-    lists = [[float32(uv, (-1, 1, 2)) for uv in one] for one in seen]
-    fixed = cv2.CALIB_FIX_INTRINSIC
-    *_, turn, shift, _, _ = cv2.stereoCalibrate([float32(board, (-1, 3))] * 12, *lists, K, D5, K, D5, WH, flags=fixed)
-    ours = ct.calibrate_rig(
-        {"left": brown(), "right": brown()},
-        board,
-        dict(zip(("left", "right"), seen, strict=True)),
-        image_sizes={"left": SIZE, "right": SIZE},
-        fixed="all",
-    )
-    close(ours.rig.extrinsics["right"].matrix()[:3, :3], turn, 1e-4)
-    close(ours.rig.extrinsics["right"].translation, shift[:, 0], 1e-4)
-
-
-@row("cv2.stereoRectify", "cv2.fisheye.stereoRectify")
-def stereo_rectify():
-    turn, shift = cv2.Rodrigues(np.array([0.01, 0.05, -0.02]))[0], np.array([[-0.12], [0.01], [0.005]])
-    r1, r2, p1, p2, q, *_ = cv2.stereoRectify(K, D5, K, D5, WH, turn, shift, flags=cv2.CALIB_ZERO_DISPARITY)
-    extrinsics = ct.Extrinsics(turn, shift).requires_grad_(False)
-    ours = ct.rectify(brown(), brown(), extrinsics, align="opencv").opencv()
-    close(ours["R1"], r1, 1e-9)
-    close(ours["R2"], r2, 1e-9)
-    close(ours["P2"][0, 3] / ours["P2"][0, 0], p2[0, 3] / p2[0, 0], 1e-9)
-    assert (ours["P1"].shape, ours["Q"].shape) == (p1.shape, q.shape)
-    r1, *_ = cv2.fisheye.stereoRectify(K, D4, K, D4, WH, turn, shift[:, 0], cv2.CALIB_ZERO_DISPARITY)
-    close(ct.rectify(fisheye(), fisheye(), extrinsics, align="opencv").rotation_left, r1, 1e-6)
-    assert ct.rectify(fisheye(), fisheye(), extrinsics, projection="latlon").camera_left.key == "latlon"
-
-
-@row("cv2.reprojectImageTo3D")
-def disparities():
-    shift = ct.Extrinsics(np.zeros(3), np.array([-0.12, 0.0, 0.0])).requires_grad_(False)
-    pair = ct.rectify(brown(), brown(), shift)
-    disparity = np.random.default_rng(0).uniform(5, 50, pair.camera_left.image_size).astype(np.float32)
-    found, valid = pair.disparity_to_points(tensor(disparity).double())
-    assert valid.all()
-    close(found, cv2.reprojectImageTo3D(disparity, pair.opencv()["Q"].numpy()), 1e-4)
-
-
-@row("cv2.StereoSGBM_create")
-def matching():
-    shift = ct.Extrinsics(np.zeros(3), np.array([-0.12, 0.0, 0.0])).requires_grad_(False)
-    pair = ct.rectify(brown(), brown(), shift, image_size=(60, 80))
-    left, right = (image[0, 0].numpy() for image in pair(*[as_images(photograph())] * 2))
-    assert cv2.StereoSGBM_create(numDisparities=16, blockSize=5).compute(left, right).shape == (60, 80)
-
-
-@row("cv2.warpPerspective", slow=True)
-def homographies():
-    here = ct.Pinhole.from_matrix(K, image_size=SIZE).requires_grad_(False)
-    turn = P @ TURN @ np.linalg.inv(K)
-    same_images(warped(ct.Warp(here, target(), tensor(TURN))), cv2.warpPerspective(photograph(), turn, WH))
-    normal, distance = np.array([[0.1], [0.2], [1.0]]), 2.0
-    to_plane = K @ (cv2.Rodrigues(RVEC)[0] + TVEC / 10 @ normal.T / distance) @ np.linalg.inv(P)
-    plane = ct.PlaneWarp(here, target(), ct.Extrinsics(RVEC, TVEC / 10).requires_grad_(False), normal[:, 0], distance)
-    theirs = cv2.warpPerspective(photograph(), to_plane, WH, flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
-    same_images(warped(plane), theirs)
-
-
-@row("cv2.resize")
-def resize():
-    image = np.zeros(SIZE, np.float32)
-    image[:, 100:102] = 1.0  # a line whose middle is at column 100.5
-    shrunk = cv2.resize(image, (80, 60), interpolation=cv2.INTER_AREA)[0]
-    ray = brown().unproject(torch.tensor([100.5, 59.5], dtype=torch.float64))[0]
-    assert brown().resize(60, 80).project(ray)[0][0].item() == pytest.approx(
-        (shrunk * np.arange(80)).sum() / shrunk.sum()
-    )
-
-
-def moved_pixel(operation, pixel):
-    """Where an operation of OpenCV takes a pixel (x, y)."""
-    image = np.zeros(SIZE, np.uint8)
-    image[pixel[1], pixel[0]] = 1
-    row, column = np.argwhere(operation(image))[0]
-    return [column, row]
-
-
-@row("cv2.flip", "cv2.rotate")
-def flip_and_rotate():
-    x, y, z = brown().unproject(torch.tensor([100.0, 50.0], dtype=torch.float64))[0]
-    for camera, ray, operation in (
-        (brown().hflip(), (-x, y, z), lambda image: cv2.flip(image, 1)),
-        (brown().vflip(), (x, -y, z), lambda image: cv2.flip(image, 0)),
-        # the scene turns with the image: what was to the right is up, which is -y
-        (brown().rot90(), (y, -x, z), lambda image: cv2.rotate(image, cv2.ROTATE_90_COUNTERCLOCKWISE)),
-    ):
-        close(camera.project(torch.stack(ray))[0], moved_pixel(operation, (100, 50)), 1e-6)
-
-
-@row("cv2.calibrationMatrixValues")
-def field_of_view():
-    middle = K.copy()
-    middle[:2, 2] = 80.0, 60.0  # OpenCV takes the edges of the image to be at 0 and its width
-    found = cv2.calibrationMatrixValues(middle, WH, 1.0, 1.0)
-    camera = ct.Pinhole.from_matrix(K, image_size=SIZE)
-    np.testing.assert_allclose(camera.fov[:2].detach().numpy(), found[:2], atol=1e-9)
-
-
-@row("cv2.FileStorage")
-def file_storage(tmp_path):
-    path = str(tmp_path / "camera.yml")
-    storage = cv2.FileStorage(path, cv2.FILE_STORAGE_WRITE)
-    for name, value in (
-        ("image_width", 640),
-        ("image_height", 480),
-        ("camera_matrix", K),
-        ("distortion_coefficients", D5),
-    ):
-        storage.write(name, value)
-    storage.release()
-    camera = ct.load(path).camera
-    close(camera.K, K)
-    close(camera.distortion, D5)
-    ct.save(camera, tmp_path / "again.yml", format="opencv")
-    storage = cv2.FileStorage(str(tmp_path / "again.yml"), cv2.FILE_STORAGE_READ)
-    close(K, storage.getNode("camera_matrix").mat())
-
-
-@row("cv2.fisheye.undistortPoints")
-def fisheye_undistort():
-    rays, valid = fisheye().unproject(tensor(pixels()))
-    assert valid.all()
-    close(plane_points(rays), cv2.fisheye.undistortPoints(pixels()[None], K, D4, criteria=FINE)[0], 1e-6)
-    back, _ = fisheye().unproject(torch.tensor([[79.5 + 125, 59.5]], dtype=torch.float64))
-    assert back[0, 2] < 0
-
-
-@row("cv2.fisheye.calibrate", slow=True)
-def fisheye_calibrate():
-    board, (seen,) = boards([(fisheye(), HERE)])
-    flags = cv2.CALIB_FIX_SKEW | cv2.CALIB_RECOMPUTE_EXTRINSIC
-    objects, corners = [board.numpy()[None]] * 12, [uv.numpy()[None] for uv in seen]
-    _, matrix, distortion, *_ = cv2.fisheye.calibrate(objects, corners, WH, np.eye(3), np.zeros(4), flags=flags)
-    ours = ct.calibrate("kannala_brandt", board, seen, image_size=SIZE)
-    close(ours.camera.K, matrix, 1e-3)
-    close(ours.camera.distortion, distortion.ravel(), 1e-4)
+    return ct.Extrinsics(*(column[:, 0] for column in SECOND)).compose(POSE)
 
 
 def spherical(xyz):
@@ -422,51 +75,206 @@ def spherical(xyz):
     return np.stack([u, v], -1) @ K[:2, :2].T + K[:2, 2]
 
 
-@row("cv2.omnidir.RECTIFY_LONGLATI")
-def omnidir_panorama():
-    longlati = np.array([[40.0, 0, 10.0], [0, 35.0, 5.0], [0, 0, 1]])
-    quarter = np.array([40.0, 35.0, 10.0 + 20 * np.pi, 5.0 + 17.5 * np.pi])
-    panorama = ct.LatLon(quarter, image_size=SIZE).requires_grad_(False)
-    rays, valid = panorama.rays()
-    x, y = ((panorama.pixel_grid().numpy() - longlati[:2, 2]) / [40.0, 35.0]).transpose(2, 0, 1)
-    documented = np.stack([-np.cos(x), -np.sin(x) * np.cos(y), np.sin(x) * np.sin(y)], -1)
-    close(rays[valid], documented[valid.numpy()])
-
-
-@row("cv2.omnidir.calibrate", slow=True)
-def omnidir_calibrate():
-    board, (seen,) = boards([(mei(), HERE)])
-    ours = ct.calibrate("mei", board, seen, image_size=SIZE)
-    assert ours.rms < 1e-6
-    rays, _ = mei().unproject(tensor(pixels()))
-    close(ours.camera.project(rays)[0], pixels(), 0.1)
-
-
-@row("cv2.aruco.ArucoDetector.detectMarkers")
-def markers():
+def corners(pose):
+    """Of a marker, (1, 4, 2), seen by a fisheye."""
     square = np.array([[-0.5, 0.5, 0], [0.5, 0.5, 0], [0.5, -0.5, 0], [-0.5, -0.5, 0]])
-    corners = cv2.fisheye.projectPoints(square[None], RVEC, TVEC, K, D4)[0]  # (1, 4, 2), as of a marker
-    found, _, valid = ct.solve_pnp(fisheye(), square[None], corners)
+    return square, cv2.fisheye.projectPoints(square[None], *pose, K, D4)[0]
+
+
+def of_fisheye(board, uv):
+    """(ours, theirs): rotation and translation."""
+    found, _, valid = ct.solve_pnp(FISHEYE, board, uv)
     assert valid.all()
-    close(found.translation, TVEC.T, 1e-6)
+    _, rvec, tvec = cv2.fisheye.solvePnP(board[None], uv[None], K, D4)
+    return (found.rotation, rvec[:, 0], 1e-5), (found.translation, tvec[:, 0], 1e-5)
 
 
-@row("cv2.aruco.CharucoBoard.matchImagePoints", slow=True)
-def charuco():
-    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
-    board = cv2.aruco.CharucoBoard((9, 7), 0.025, 0.018, dictionary)
-    corners, (seen,) = boards([(fisheye(), HERE)])
-    close(corners + 0.025 * torch.tensor([1, 1, 0]), board.getChessboardCorners(), 1e-6)
-    rng = np.random.default_rng(0)
-    matched = [
-        board.matchImagePoints(
-            float32(uv[i:], (-1, 1, 2)) + rng.normal(0, 0.01, (len(uv) - i, 1, 2)).astype(np.float32),
-            np.arange(i, len(uv), dtype=np.int32)[:, None],
-        )
-        for i, uv in enumerate(seen)
-    ]
-    ours = ct.calibrate("kannala_brandt", *map(list, zip(*matched, strict=True)), image_size=SIZE)
-    close(ours.camera.K, K, 0.2)
+def middle():
+    """K with the principal point of OpenCV, which takes the edges of the image to be at 0 and its width."""
+    return np.array([[75.0, 0, 80.0], [0, 77.5, 60.0], [0, 0, 1]])
+
+
+def turned_plane():
+    """The homography of a plane, and what warps it."""
+    normal = np.array([[0.1], [0.2], [1.0]])
+    to_plane = K @ (cv2.Rodrigues(RVEC)[0] + TVEC / 10 @ normal.T / 2.0) @ np.linalg.inv(P)
+    pose = ct.Extrinsics(RVEC, TVEC / 10).requires_grad_(False)
+    here = ct.Pinhole.from_matrix(K, image_size=SIZE).requires_grad_(False)
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    return (
+        (warped(ct.PlaneWarp(here, TARGET, pose, normal[:, 0], 2.0)),
+         cv2.warpPerspective(photograph(), to_plane, WH, flags=flags)),
+        (warped(ct.Warp(here, TARGET, tensor(R))), cv2.warpPerspective(photograph(), P @ R @ np.linalg.inv(K), WH)),
+    )  # fmt: skip
+
+
+def panorama():
+    """LatLon, and the rays that the documentation of RECTIFY_LONGLATI gives its pixels."""
+    fx, fy, cx, cy = 40.0, 35.0, 10.0, 5.0
+    ours = ct.LatLon(np.array([fx, fy, cx + fx * np.pi / 2, cy + fy * np.pi / 2]), image_size=SIZE)
+    rays, valid = ours.rays()
+    x, y = ((ours.pixel_grid().numpy() - [cx, cy]) / [fx, fy]).transpose(2, 0, 1)
+    return rays[valid], np.stack([-np.cos(x), -np.sin(x) * np.cos(y), np.sin(x) * np.sin(y)], -1)[valid.numpy()]
+
+
+equal("cv2", {
+    "projectPoints": lambda: [(seen(BROWN), cv2.projectPoints(X, RVEC, TVEC, K, D5)[0][:, 0])],
+    "undistortPoints": lambda: [
+        # shaped as OpenCV's, whose undistortImagePoints takes 5 steps
+        (plane(BROWN.unproject(tensor(UV[:, None]))[0]), cv2.undistortPoints(UV, K, D5, criteria=FINE)),
+        (moved(TARGET), cv2.undistortPoints(UV, K, D5, P=P, criteria=FINE)[:, 0]),
+        (moved(ct.Pinhole.from_matrix(K, image_size=SIZE)), cv2.undistortImagePoints(UV, K, D5)[:, 0], 0.05),
+    ],
+    "undistort": lambda: [
+        (warped(ct.Warp(BROWN, TARGET)), cv2.undistort(photograph(), K, D5, None, P)),
+        (cv2.undistort(photograph(), K, D5), cv2.undistort(photograph(), K, D5, None, K)),
+    ],
+    "initUndistortRectifyMap remap fisheye.initUndistortRectifyMap": lambda: [
+        *((warped(ct.Warp(camera, TARGET, tensor(R))), remapped(*rectified(module, lens)))
+          for camera, module, lens in ((BROWN, cv2, D5), (FISHEYE, cv2.fisheye, D4))),
+        (by_grid(rectified(cv2, D5)).byte()[0].permute(1, 2, 0), remapped(*rectified(cv2, D5))),
+        (warped(ct.Warp(FISHEYE, TARGET)), cv2.fisheye.undistortImage(photograph(), K, D4, Knew=P)),
+    ],
+    "initInverseRectificationMap": lambda: [(
+        warped(ct.Warp(BROWN, TARGET, tensor(R)).inverse()),
+        remapped(*cv2.initInverseRectificationMap(K, D5, R, P, WH, cv2.CV_32FC1)),
+    )],
+    "getOptimalNewCameraMatrix": lambda: [
+        (warped(ct.Warp(BROWN, best_matrix()[1])), cv2.undistort(photograph(), K, D5, None, best_matrix()[0]))
+    ],
+    "Rodrigues": lambda: [
+        (POSE.matrix()[:3, :3], cv2.Rodrigues(RVEC)[0]),
+        (ct.Extrinsics(cv2.Rodrigues(RVEC)[0], TVEC).rotation, RVEC[:, 0]),
+    ],
+    "composeRT": lambda: [
+        (composed().rotation, cv2.composeRT(RVEC, TVEC, *SECOND)[0][:, 0]),
+        (composed().translation, cv2.composeRT(RVEC, TVEC, *SECOND)[1][:, 0]),
+    ],
+    "warpPerspective": turned_plane,
+    "calibrationMatrixValues": lambda: [
+        (ct.Pinhole.from_matrix(K, image_size=SIZE).fov[:2], cv2.calibrationMatrixValues(middle(), WH, 1, 1)[:2])
+    ],
+    "aruco.ArucoDetector.detectMarkers": lambda: [(
+        ct.solve_pnp(FISHEYE, corners((RVEC, TVEC))[0][None], corners((RVEC, TVEC))[1])[0].translation, TVEC.T, 1e-6
+    )],
+    "fisheye.projectPoints": lambda: [(seen(FISHEYE), cv2.fisheye.projectPoints(X[None], RVEC, TVEC, K, D4)[0][0])],
+    "fisheye.distortPoints": lambda: [(
+        FISHEYE.project(np.c_[FLAT, np.ones(50)])[0], cv2.fisheye.distortPoints(FLAT[None], K, D4)[0]
+    )],
+    "fisheye.undistortPoints": lambda: [(
+        plane(FISHEYE.unproject(UV)[0]), cv2.fisheye.undistortPoints(UV[None], K, D4, criteria=FINE)[0], 1e-6
+    )],
+    "fisheye.solvePnP": lambda: of_fisheye(
+        points(12), cv2.fisheye.projectPoints(points(12)[None], RVEC, TVEC, K, D4)[0][0]
+    ),
+    "omnidir.projectPoints": lambda: [(MEI.project(X)[0], spherical(X))],
+    "omnidir.undistortPoints omnidir.initUndistortRectifyMap": lambda: [
+        (plane(MEI.unproject(spherical(X))[0]), plane(X))
+    ],
+    "omnidir.RECTIFY_LONGLATI": lambda: [panorama()],
+})  # fmt: skip
+
+elsewhere("cv2", {
+    "convertMaps": "maps/test_maps.py::test_what_another_decoder_reads_is_as_far_off_as_the_report_says",
+    "solvePnP": "calibration/test_pnp.py::test_the_cost_is_opencvs_or_less",
+    "triangulatePoints": "calibration/test_triangulate.py::test_as_opencv_for_exact_pixels_of_pinholes",
+    "calibrateCamera calibrateCameraExtended CALIB_RATIONAL_MODEL":
+        "calibration/test_calibration.py::test_opencvs_optimum_from_nothing",
+    "omnidir.calibrate": "calibration/test_calibration.py::test_corners_without_noise_have_an_optimum",
+    "stereoCalibrate fisheye.stereoCalibrate":
+        "calibration/test_calibration_rig.py::test_cameras_and_poses_are_found_within_their_sigma",
+    "stereoRectify reprojectImageTo3D": "stereo/test_rectify.py::test_opencv_has_the_same_matrices",
+    "findChessboardCornersSB":
+        "boards/test_detection.py::test_noisy_and_blurred_chessboards_are_found_no_worse_than_by_their_sectors",
+    "FileStorage": "io/test_file_tools.py::test_opencv",
+})  # fmt: skip
+
+
+@row("cv2.solvePnPRansac")
+def ransac():
+    board = points(12)
+    uv = cv2.projectPoints(board, RVEC, TVEC, K, D5)[0]
+    uv[0] += 50.0
+    pose = ct.solve_pnp(BROWN, board, uv[:, 0], threshold=2)
+    *_, inliers = cv2.solvePnPRansac(board, uv, K, D5, reprojectionError=2)
+    assert pose.inliers.nonzero()[:, 0].tolist() == inliers[:, 0].tolist() == list(range(1, 12))
+    close(pose.extrinsics.translation, TVEC[:, 0], 1e-5)
+
+
+@row("cv2.fisheye.stereoRectify")
+def fisheye_stereo():
+    turn, shift = cv2.Rodrigues(np.array([0.01, 0.05, -0.02]))[0], np.array([-0.12, 0.01, 0.005])
+    theirs, *_ = cv2.fisheye.stereoRectify(K, D4, K, D4, WH, turn, shift, cv2.CALIB_ZERO_DISPARITY)
+    ours = ct.rectify(FISHEYE, FISHEYE, ct.Extrinsics(turn, shift), align="opencv")
+    close(ours.rotation_left, theirs, 1e-6)
+
+
+GUESS = np.array([[536.0, 0, 342], [0, 536.0, 235], [0, 0, 1]])
+START = ct.BrownConrady.from_matrix(GUESS, np.zeros(5), image_size=(480, 640))
+FLAGS = {
+    "FIX_PRINCIPAL_POINT": {"count": 5, "fixed": ("cx", "cy")},
+    "ZERO_TANGENT_DIST": {"count": 5, "fixed": ("p1", "p2")},
+    "FIX_K3": {"count": 4},
+    "USE_INTRINSIC_GUESS FIX_FOCAL_LENGTH": {"start": START, "fixed": ("fx", "fy")},
+}
+
+
+def same_calibrations(flags, options):
+    """Of thirteen views of OpenCV's left camera."""
+    left, _ = opencv_left()
+    board, wh = left.object_points.numpy().astype(np.float32), left.image_size[::-1]
+    views = [uv.numpy().astype(np.float32)[:, None] for uv in left.image_points]
+    guess = (GUESS.copy(), np.zeros(5)) if "start" in options else (None, None)
+    rms, matrix, distortion, *_ = cv2.calibrateCamera([board] * 13, views, wh, *guess, flags=flags)
+    ours = ct.calibrate("brown_conrady", board, views, image_size=wh[::-1], **options)
+    assert ours.rms == pytest.approx(rms, rel=1e-9)
+    close(ours.camera.K, matrix, 1e-4)
+    count = ours.camera.distortion.shape[-1]
+    # of the standard deviations, where coefficients trade with each other
+    off = np.abs(ours.camera.distortion.detach().numpy() - distortion.ravel()[:count])
+    assert (off <= 1e-3 * ours.std[4:].numpy() + 1e-7).all()
+    assert not distortion.ravel()[count:].any()
+    return ()
+
+
+for _names, _options in FLAGS.items():
+    _flags = sum(getattr(cv2, f"CALIB_{name}") for name in _names.split())
+    _keys = " ".join(f"CALIB_{name}" for name in _names.split())
+    equal("cv2", {_keys: lambda flags=_flags, options=_options: same_calibrations(flags, options)}, slow=True)
+
+
+@row("cv2.fisheye.calibrate", slow=True)
+def fisheye_calibrate():
+    board, turns = chessboard(8, 6, 0.025), torch.linspace(0, 6, 12, dtype=torch.float64)
+    lean = torch.stack([0.5 * turns.cos(), 0.5 * turns.sin(), 0.3 * turns], -1)
+    place = torch.stack([0.05 * (2 * turns).sin() - 0.08, 0.04 * (2 * turns).cos() - 0.06, 0.25 + 0.02 * turns], -1)
+    uv = FISHEYE(ct.Extrinsics(lean, place).requires_grad_(False)(board[None]))[0]
+    flags = cv2.CALIB_FIX_SKEW | cv2.CALIB_RECOMPUTE_EXTRINSIC
+    given = [board.numpy()[None]] * 12, [view.numpy()[None] for view in uv]
+    _, matrix, distortion, *_ = cv2.fisheye.calibrate(*given, WH, np.eye(3), np.zeros(4), flags=flags)
+    ours = ct.calibrate("kannala_brandt", board, uv, image_size=SIZE)
+    close(ours.camera.K, matrix, 1e-3)
+    close(ours.camera.distortion, distortion.ravel(), 1e-4)
+
+
+@row("cv2.resize", "cv2.flip", "cv2.rotate")
+def edits():
+    """Where a pixel goes with its image, the camera of the edited image sees its ray."""
+    uv = np.array([100.0, 50.0])
+    x, y, z = BROWN.unproject(uv)[0]
+    image = np.zeros(SIZE, np.float32)
+    image[50:52, 100:102] = 1.0  # its middle is half a pixel further
+    for camera, ray, operation, half in (
+        (BROWN.hflip(), (-x, y, z), lambda image: cv2.flip(image, 1), (-0.5, 0.5)),
+        (BROWN.vflip(), (x, -y, z), lambda image: cv2.flip(image, 0), (0.5, -0.5)),
+        # the scene turns with the image: what was to the right is up, which is -y
+        (BROWN.rot90(), (y, -x, z), lambda image: cv2.rotate(image, cv2.ROTATE_90_COUNTERCLOCKWISE), (0.5, -0.5)),
+        (BROWN.resize(60, 80), (x, y, z), lambda image: cv2.resize(image, (80, 60), interpolation=3), (0.25, 0.25)),
+    ):
+        made = operation(image)
+        rows, columns = np.mgrid[: made.shape[0], : made.shape[1]]
+        middle = np.array([(made * columns).sum(), (made * rows).sum()]) / made.sum()
+        close(camera.project(torch.stack(ray))[0], middle - half, 1e-5)
 
 
 @trap
@@ -476,8 +284,10 @@ def behind_the_camera():
     close(cv2.projectPoints(ahead, *nothing, D5)[0], cv2.projectPoints(behind, *nothing, D5)[0])
     seen, mirrored = (cv2.fisheye.projectPoints(one[None], *nothing, D4)[0] for one in (ahead, behind))
     close(seen, mirrored)
-    assert not brown().project(tensor(behind))[1]
-    assert np.abs(fisheye().project(tensor(behind))[0].numpy() - mirrored[0]).max() > 100
+    assert not BROWN.project(behind)[1]
+    assert np.abs(FISHEYE.project(behind)[0].numpy() - mirrored[0]).max() > 100
+    back, _ = FISHEYE.unproject(np.array([[79.5 + 125, 59.5]]))
+    assert back[0, 2] < 0
 
 
 @trap
@@ -494,14 +304,3 @@ def steps_of_undistort_points():
     assert 0.001 < off("cv2__projectpoints_d5_opencv_left_published") < 0.004
     assert 0.5 < off("cv2__projectpoints_d14_tilted") < 1.2
     assert off("cv2__projectpoints_d12_auto_front_120") > 100
-
-
-@trap
-def as_it_is_made():
-    assert ct.BrownConrady.from_matrix(K, D5).intrinsics.requires_grad
-    assert ct.KannalaBrandt.from_matrix(K.tolist(), D4.tolist()).intrinsics.dtype == torch.float32
-    skewed = K + np.array([[0, 1, 0], [0, 0, 0], [0, 0, 0]])
-    with pytest.raises(ValueError, match="skew"):
-        ct.BrownConrady.from_matrix(skewed, D5)
-    ct.BrownConrady.from_matrix(skewed, D5, ignore_skew=True)
-    assert brown()(tensor(points()[:, None]))[0].shape == (50, 1, 2)

@@ -90,16 +90,7 @@ def test_every_row_has_a_check():
     assert sorted(set(CHECKS) - {names[0] for names, _ in rows()}) == []
 
 
-@pytest.mark.parametrize("check", {id(param): param for param in CHECKS.values()}.values())
-def test_a_row_holds(check, tmp_path):
-    called(check, tmp_path)
-
-
-@pytest.mark.parametrize("check", TRAPS)
-def test_a_trap_is_one(check, tmp_path):
-    called(check, tmp_path)
-
-
-def called(check, folder):
+@pytest.mark.parametrize("check", [*{id(param): param for param in CHECKS.values()}.values(), *TRAPS])
+def test_a_row_or_a_trap_is_one(check, tmp_path):
     """Those that write files take a folder for them."""
-    check(*[folder] * len(inspect.signature(check).parameters))
+    check(*[tmp_path] * len(inspect.signature(check).parameters))

@@ -11,10 +11,7 @@ import venv
 from pathlib import Path
 
 import pytest
-import typed_uses
 from test_docs import blocks
-
-import camtorch as ct
 
 ROOT = Path(__file__).parents[2]
 
@@ -85,18 +82,6 @@ def is_of_others(line):
     """Whether an error has its cause in another library; the page that it is on may be called like one."""
     said = line.partition("error: ")[2]
     return any(re.search(pattern, said) for pattern in TOLERATED)
-
-
-def test_what_users_write_runs(tmp_path):
-    camera = typed_uses.cameras()
-    typed_uses.files(tmp_path)
-    typed_uses.warps(camera)
-    typed_uses.augmentations(camera)
-    typed_uses.calibrations(ct.Pinhole.from_fov(60, image_size=(480, 640)))
-    try:
-        typed_uses.own_model()
-    finally:
-        del ct.MODELS["typed_quintic"]
 
 
 @pytest.mark.slow

@@ -3,7 +3,6 @@
 import math
 
 import numpy as np
-import pytest
 import torch
 
 import camtorch as ct
@@ -64,25 +63,3 @@ def test_gradients():
         rotation = ct.head_rotation(rows).requires_grad_()
         ct.head_angles(rotation).sum().backward()
         assert torch.isfinite(rotation.grad).all()
-
-
-@pytest.mark.parametrize(
-    ("pose", "error", "says"),
-    [
-        (torch.eye(2), ValueError, r"\(\.\.\., 3, 3\); got shape \(2, 2\)"),
-        (torch.diag(torch.tensor([1.0, 1, -1])), ValueError, "must hold rotation matrices"),
-        (torch.full((3, 3), torch.nan), ValueError, "pose"),
-        ("left", TypeError, "pose must be numbers"),
-        (torch.zeros(3), ValueError, r"ct\.Extrinsics\(rvec, \(0, 0, 0\)\)"),
-    ],
-)
-def test_bad_poses(pose, error, says):
-    with pytest.raises(error, match=f"head_angles: .*{says}"):
-        ct.head_angles(pose)
-
-
-def test_bad_angles():
-    with pytest.raises(ValueError, match=r"head_rotation: angles must be \(..., 3\), pitch, yaw"):
-        ct.head_rotation([0.0, 1.0])
-    with pytest.raises(ValueError, match="must be radians; 30 seems to be degrees"):
-        ct.head_rotation([-30.0, 20.0, 5.0])

@@ -1,6 +1,5 @@
 """Threads: who shares work, what comes of errors, forks and several callers, and that results do not depend on it."""
 
-import os
 import signal
 import threading
 import time
@@ -112,16 +111,6 @@ def test_an_interruption_waits_for_workers():
     assert ended == [1]
 
 
-def test_several_threads_call_at_once():
-    everything = [Pieces(30) for _ in range(6)]
-    callers = [threading.Thread(target=spread, args=(pieces, 3)) for pieces in everything]
-    for caller in callers:
-        caller.start()
-    for caller in callers:
-        caller.join()
-    assert all(sorted(pieces.done) == list(range(30)) for pieces in everything)
-
-
 def test_work_that_spreads_itself():
     inner = [Pieces(10, 0) for _ in range(4)]
     left = deque(inner)
@@ -136,18 +125,6 @@ def test_work_that_spreads_itself():
 
     spread(work, 2)
     assert all(sorted(pieces.done) == list(range(10)) for pieces in inner)
-
-
-@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork")
-@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")  # which may leave a child without its threads
-def test_a_child_has_workers_of_its_own():
-    spread(Pieces(10), 2)
-    child = os.fork()
-    if child == 0:
-        pieces = Pieces(20, threads=2)
-        spread(pieces, 2)
-        os._exit(0 if len(pieces.by) == 2 and sorted(pieces.done) == list(range(20)) else 1)
-    assert os.waitpid(child, 0)[1] == 0
 
 
 # -- the threads of torch
@@ -220,20 +197,3 @@ def test_several_threads_use_one_camera():
         caller.join()
     assert len(found) == 4
     assert all(torch.equal(a, b) for results in found for a, b in zip(results, expected, strict=True))
-
-
-class Points(torch.utils.data.Dataset):
-    def __len__(self):
-        return 2
-
-    def __getitem__(self, index):
-        camera = one("kannala_brandt").float().requires_grad_(False)
-        points = torch.randn(150_000, 3, generator=torch.Generator().manual_seed(index))
-        return camera.project(points)[0], torch.get_num_threads()
-
-
-def test_workers_of_a_loader():
-    dataset = Points()
-    for index, (pixels, threads) in enumerate(torch.utils.data.DataLoader(dataset, None, num_workers=2)):
-        assert threads == 1
-        assert torch.equal(pixels, dataset[index][0])

@@ -27,21 +27,16 @@ def pose(rotation, translation=(0.3, -0.2, 1.5)):
 
 
 @pytest.mark.parametrize("rotation", ROTATIONS.values(), ids=ROTATIONS)
-def test_rotation_is_the_matrix_exponential(rotation):
+def test_rotation_is_the_matrix_exponential_and_back(rotation):
     x, y, z = rotation
     generator = torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]], dtype=F64)
     matrix = pose(rotation).matrix()
     torch.testing.assert_close(matrix[:3, :3], torch.linalg.matrix_exp(generator), atol=4e-15, rtol=0)
     assert matrix[3].tolist() == [0, 0, 0, 1]
     assert matrix[:3, 3].tolist() == [0.3, -0.2, 1.5]
-
-
-@pytest.mark.parametrize("rotation", ROTATIONS.values(), ids=ROTATIONS)
-def test_from_matrix_inverts_matrix(rotation):
-    original = pose(rotation)
-    again = ct.Extrinsics.from_matrix(original.matrix())
-    torch.testing.assert_close(again.matrix(), original.matrix(), atol=1e-12, rtol=0)
-    torch.testing.assert_close(ct.Extrinsics.from_matrix(original.matrix()[:3]).matrix(), again.matrix())
+    again = ct.Extrinsics.from_matrix(matrix)
+    torch.testing.assert_close(again.matrix(), matrix, atol=1e-12, rtol=0)
+    torch.testing.assert_close(ct.Extrinsics.from_matrix(matrix[:3]).matrix(), again.matrix())
 
 
 def test_inverse_compose_position_and_points():
@@ -105,24 +100,6 @@ def test_autocast_leaves_geometry_alone():
     assert torch.equal(inside, extrinsics(points))
 
 
-@pytest.mark.parametrize(
-    ("make", "says"),
-    [
-        (lambda: ct.Extrinsics([0.0, 0.0], [0.0, 0.0, 0.0]), r"rotation .*\(2,\)"),
-        (lambda: ct.Extrinsics([0.0, 0.0, 0.0], [0.0, math.nan, 0.0]), "translation .*finite"),
-        (lambda: ct.Extrinsics(torch.zeros(2, 3), torch.zeros(3, 3)), "do not fit"),
-        (lambda: ct.Extrinsics.from_matrix(torch.eye(3)), r"matrix .*\(3, 3\)"),
-        (lambda: ct.Extrinsics.from_matrix(2 * torch.eye(4)), "last row"),
-        (lambda: ct.Extrinsics.from_matrix(torch.diag(torch.tensor([1.0, 1.0, -1.0, 1.0]))), "rotation matrices"),
-        (lambda: ct.Extrinsics.from_matrix(torch.full((4, 4), math.nan)), "matri"),
-        (lambda: pose([0.0, 0.0, 0.0])(torch.zeros(4, 2)), r"points_world .*\(4, 2\)"),
-    ],
-)
-def test_bad_input_is_named(make, says):
-    with pytest.raises(ValueError, match=says):
-        make()
-
-
 def test_a_point_that_is_not_finite_leaves_the_gradient_of_the_pose_alone():
     layer = torch.nn.Sequential(pose(ROTATIONS["some"]), ct.Pinhole([300.0, 300.0, 320.0, 240.0]).double())
     points = torch.rand(4, 3, dtype=F64)
@@ -152,12 +129,7 @@ def test_what_comes_of_a_frozen_pose_is_frozen():
     assert pose(ROTATIONS["some"]).position.requires_grad
 
 
-def test_degrees_are_refused_and_what_learnt_is_not(tmp_path):
-    for degrees in ([0, 90, 0], torch.tensor([[0.1, 0.2, 0.3], [0.0, -30.0, 0.0]]), [[[0.0], [45.0], [0.0]]]):
-        with pytest.raises(
-            ValueError, match=r"Extrinsics: rotation holds.*radians; an angle of .* seems to be degrees"
-        ):
-            ct.Extrinsics(degrees, [0.0, 0.0, 0.0])
+def test_what_learnt_large_angles_is_not_refused(tmp_path):
     ct.Extrinsics([0.0, 2 * math.pi, 0.0], [0.0, 0.0, 0.0])
     pose = ct.Extrinsics([0.1, 0.2, 0.3], [1.0, 2.0, 3.0])
     with torch.no_grad():

@@ -35,16 +35,6 @@ def test_patches_are_the_pixels_of_the_image_made_smaller(stride):
     assert camera.pixel_grid(stride)[1, 2].tolist() == [2 * stride + (stride - 1) / 2, stride + (stride - 1) / 2]
 
 
-def test_sizes_that_patches_do_not_fill_are_told_what_to_do():
-    camera = fisheye().resize(480, 640)
-    with pytest.raises(ValueError, match=r"stride 14 .* \.crop\(0, 0, 476, 630\) .* \.pad\(0, 4, 0, 10\)"):
-        camera.rays(stride=14)
-    assert camera.crop(0, 0, 476, 630).rays(14)[0].shape == (34, 45, 3)
-    assert camera.pad(0, 4, 0, 10).rays(14)[0].shape == (35, 46, 3)
-    with pytest.raises(ValueError, match="at least 1"):
-        camera.rays(0)
-
-
 def test_what_is_kept_is_its_owners_and_follows_what_changes():
     camera = fisheye().requires_grad_(False)
     first, _ = camera.rays(16)
@@ -100,10 +90,6 @@ def test_lines_in_the_cameras_own_frame_and_in_batches():
     both = ct.Mixed([camera, pinhole])
     lines, _ = both.plucker(poses[:2], stride=32)
     assert torch.equal(lines[1], pinhole.plucker(poses[1], stride=32)[0])
-    with pytest.raises(ValueError, match="of extrinsics do not fit those of the camera"):
-        both.plucker(poses)
-    with pytest.raises(TypeError, match=r"Extrinsics.from_matrix\(T\)"):
-        camera.plucker(torch.eye(4))
 
 
 def test_lines_without_a_ray_are_zeros_without_a_gradient():
@@ -211,5 +197,3 @@ def test_fields_of_a_mixed_batch_are_those_of_each(keys):
     for i, camera in enumerate(cameras):
         for field, its in zip(fields, camera.perspective_field(down[i], stride=8), strict=True):
             assert torch.equal(field[i], its), camera
-    with pytest.raises(ValueError, match="gravity must have a direction"):
-        mixed.perspective_field((0, 0, 0))

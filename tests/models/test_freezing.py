@@ -126,23 +126,9 @@ def test_copies_pickles_and_states_keep_it():
     assert "frozen=(fx, k2)" in repr(camera)
 
 
-@pytest.mark.parametrize(
-    ("camera", "error", "message"),
-    [
-        (lambda: ct.Pinhole([9.0, 9, 4, 4]), ValueError, "'k1' is no parameter; there are fx, fy, cx, cy"),
-        (lambda: ct.Mixed([spread("pinhole"), spread("fov")]), TypeError, "Mixed"),
-    ],
-)
-def test_what_cannot_be_frozen_is_refused(camera, error, message):
-    with pytest.raises(error, match=message):
-        camera().freeze("k1")
-
-
-def test_a_parametrized_tensor_is_refused():
+def test_beside_a_parametrized_tensor():
     camera = spread("kannala_brandt")
     torch.nn.utils.parametrize.register_parametrization(camera, "intrinsics", ct.PositiveFocal())
-    with pytest.raises(TypeError, match="parametrized"):
-        camera.freeze("fx")
     assert "frozen=(k1)" in repr(camera.freeze("k1"))
 
 

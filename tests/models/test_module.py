@@ -1,6 +1,7 @@
 """A camera is a torch module like any other: compiled, transformed, exported, copied, saved, learned, predicted."""
 
 import copy
+import io
 import pickle
 import re
 
@@ -55,7 +56,9 @@ def parameters_of(module):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("key", "method"), [("kannala_brandt", "unproject"), ("fisheye624", "project")])
+@pytest.mark.parametrize(
+    ("key", "method"), [("kannala_brandt", "unproject"), ("fisheye624", "project"), ("brown_conrady", "project")]
+)
 def test_compile_without_graph_breaks(key, method):
     module, values = module_and_input(key, method)
     compiled = torch.compile(module, fullgraph=True, backend="aot_eager")
@@ -77,13 +80,31 @@ def test_compile_to_machine_code():
     assert_same(compiled(points), camera(points), rtol=1e-12, atol=0)
 
 
+def loaded(module, values, **options):
+    """A module that was exported, saved and loaded."""
+    file = io.BytesIO()
+    torch.export.save(torch.export.export(module, (values,), **options), file)
+    file.seek(0)
+    return torch.export.load(file).module()
+
+
 @pytest.mark.slow
-def test_export():
-    module, values = module_and_input("kannala_brandt", "project")
-    count = torch.export.Dim("count", min=2)
-    exported = torch.export.export(module, (values,), dynamic_shapes=({0: count},)).module()
+@pytest.mark.parametrize(
+    ("key", "method"), [("kannala_brandt", "project"), ("pinhole", "project"), ("equirectangular", "unproject")]
+)
+def test_export(key, method):
+    module, values = module_and_input(key, method)
+    module.requires_grad_(False)
+    exported = loaded(module, values, dynamic_shapes=({0: torch.export.Dim("count", min=2)},))
     for rows in (values, values[:9]):
         assert_same(exported(rows), module(rows))
+
+
+@pytest.mark.slow
+def test_export_of_a_dewarp():
+    dewarp = ct.Dewarp(one("pinhole").float().requires_grad_(False), image_size=(6, 8))
+    images = torch.rand(1, 3, *one("pinhole").image_size)
+    torch.testing.assert_close(loaded(dewarp, images)(images), dewarp(images))
 
 
 @each_kind
@@ -414,36 +435,6 @@ def test_the_models_that_must_be_there():
     for key, model in ct.MODELS.items():
         assert model.key == key
         assert issubclass(model, ct.Camera)
-
-
-def test_a_model_is_one_class():
-    """Defining a class with a key is all that a new model needs."""
-    from camtorch.optics import Equidistant, Lens
-
-    try:
-
-        class Spherical(ct.Camera):
-            key = "spherical_of_this_test"
-
-            @staticmethod
-            def optics(k):
-                return Equidistant(), Lens()
-
-        camera = ct.MODELS["spherical_of_this_test"]([100.0, 100.0, 50.0, 40.0])
-        rays = fan(170).float()
-        again, valid = camera.unproject(camera.project(rays)[0])
-        assert valid.all()
-        torch.testing.assert_close(again, rays, rtol=0, atol=1e-5)
-    finally:
-        ct.MODELS.pop("spherical_of_this_test", None)
-
-
-@pytest.mark.slow
-def test_compile_with_the_most_coefficients():
-    camera = ct.BrownConrady([300.0, 300.0, 32.0, 24.0], [-0.3, 0.1, 1e-3, -5e-4, *[1e-3] * 10])
-    points = torch.tensor([[0.1, -0.2, 1.0], [0.3, 0.2, -1.0]])
-    compiled = torch.compile(camera, fullgraph=True, backend="eager")
-    torch.testing.assert_close(compiled(points)[0], camera(points)[0])
 
 
 def test_an_edited_camera_learns_what_the_original_learns():

@@ -63,27 +63,6 @@ def test_a_camera_that_looks_along_z_is_the_same():
     assert torch.equal(forwards.intrinsics, backwards.intrinsics)
 
 
-def test_even_powers_are_a_division_camera():
-    camera = ct.OCamCalib(float64([300, 300, 320, 240]), float64([0, 0, 0, -0.2, 0, 0.01]), image_size=SIZE)
-    division = ct.Division(float64([300, 300, 320, 240]), float64([-0.2, 0.01]), image_size=SIZE)
-    torch.testing.assert_close(camera.rays()[0], division.rays()[0])
-    assert division.convert("ocamcalib").max_error < 1e-9
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (([0.0, 0, 1e-3], CENTRE), "must not be zero"),
-        (([-200.0], CENTRE), r"polynomial must be \(n,\), n >= 2"),
-        ((SS, (1.0, 2, 3)), r"centre \(2,\)"),
-        ((SS, CENTRE, (-1.0, 0, 0)), "c must be positive; got .* c = -1.0"),
-    ],
-)
-def test_numbers_that_are_no_camera_are_refused(arguments, message):
-    with pytest.raises(ValueError, match=message):
-        ct.OCamCalib.from_ocamcalib(*arguments)
-
-
 # -- the file
 
 

@@ -2,7 +2,6 @@
 
 import itertools
 
-import pytest
 import torch
 from cameras import every_model, one
 
@@ -77,18 +76,3 @@ def test_gradients_reach_points_and_camera():
     curve.sum().backward()
     assert torch.isfinite(points.grad).all()
     assert camera.intrinsics.grad[0] != 0
-
-
-@pytest.mark.parametrize(
-    ("points", "message"),
-    [
-        ([[0.0, 0, 1]], "two or more"),
-        ([[0.0, 1], [1, 1]], "3"),
-        ([[0.0, 0, 1], [float("nan"), 0, 1]], "finite"),
-    ],
-)
-def test_what_is_no_polyline_is_refused(points, message):
-    with pytest.raises(ValueError, match=message):
-        one("pinhole").project_polyline(points)
-    with pytest.raises(ValueError, match="single camera"):
-        ct.cat([one("pinhole"), one("pinhole")]).project_polyline([[0.0, 0, 1], [1, 0, 1]])

@@ -1,10 +1,8 @@
-"""What is handed out belongs to the caller; what is exported can be loaded."""
-
-import io
+"""What is handed out belongs to the caller."""
 
 import pytest
 import torch
-from cameras import each_kind, fan, one, pixel_lattice, real
+from cameras import each_kind, fan, one, pixel_lattice
 from torch import nn
 
 import camtorch as ct
@@ -60,35 +58,3 @@ def test_validity_may_be_edited_in_a_chain_of_layers(key):
     pixels[valid].sum().backward()
     assert layers[0].rotation.grad.isfinite().all()
     assert valid.any()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("key", "method"), [("pinhole", "project"), ("equirectangular", "unproject")])
-def test_an_exported_camera_without_coefficients_can_be_loaded(key, method):
-    camera = next(iter(real(key).values())).requires_grad_(False)
-    values = values_of(key, method)
-
-    class Method(nn.Module):
-        def __init__(self):
-            super().__init__()
-            self.camera = camera
-
-        def forward(self, values):
-            return getattr(self.camera, method)(values)
-
-    file = io.BytesIO()
-    torch.export.save(torch.export.export(Method(), (values,)), file)
-    file.seek(0)
-    loaded = torch.export.load(file).module()
-    for result, expected in zip(loaded(values), getattr(camera, method)(values), strict=True):
-        torch.testing.assert_close(result, expected)
-
-
-@pytest.mark.slow
-def test_an_exported_dewarp_of_a_pinhole_can_be_loaded():
-    dewarp = ct.Dewarp(one("pinhole").float().requires_grad_(False), image_size=(6, 8))
-    images = torch.rand(1, 3, *one("pinhole").image_size)
-    file = io.BytesIO()
-    torch.export.save(torch.export.export(dewarp, (images,)), file)
-    file.seek(0)
-    torch.testing.assert_close(torch.export.load(file).module()(images), dewarp(images))

@@ -135,20 +135,6 @@ def test_grids_are_models_of_their_own_wherever_models_go(tmp_path):
     assert type(camera.convert("splined:order=3,columns=12,rows=9,fov_x=120").camera).columns == 12
 
 
-@pytest.mark.parametrize(
-    ("grid", "complaint"),
-    [
-        ({"order": 4}, "order must be 2 or 3; got 4"),
-        ({"columns": 3}, "columns must be from 4"),
-        ({"rows": 1000}, "to 999"),
-        ({"fov_x": 360}, "from 1 to 359; got 360"),
-    ],
-)
-def test_grids_that_are_none_are_refused(grid, complaint):
-    with pytest.raises(ValueError, match=complaint):
-        ct.Splined.with_grid(**{"columns": 8, "rows": 6, "fov_x": 120, **grid})
-
-
 @pytest.mark.parametrize("name", ["order=4_Nx=9_Ny=5_fov_x_deg=120", "order=3_Nx=2_Ny=5_fov_x_deg=120"])
 def test_files_of_grids_that_are_none_are_refused(tmp_path, name):
     path = tmp_path / "camera.cameramodel"
@@ -156,11 +142,6 @@ def test_files_of_grids_that_are_none_are_refused(tmp_path, name):
     path.write_text(path.read_text().replace("order=2_Nx=9_Ny=5_fov_x_deg=120", name))
     with pytest.raises(ct.CameraFileError, match="lensmodel"):
         ct.load(path)
-
-
-def test_a_text_that_is_no_grid_is_refused():
-    with pytest.raises(ValueError, match="is how a grid is written"):
-        ct.Pinhole([300, 300, 319.5, 239.5], image_size=(480, 640)).convert("splined:16x11")
 
 
 def test_any_lens_becomes_one():

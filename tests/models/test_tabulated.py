@@ -131,14 +131,3 @@ def test_a_data_sheet_in_float32_has_the_rays_of_float64():
         counts.append(int(made.rays()[1].sum()))
     assert abs(counts[0] - counts[1]) <= 4  # pixels on the very circle
     assert counts[1] > 0.7 * 1024 * 1024
-
-
-def test_a_table_of_millimetres():
-    degrees = torch.arange(0, 100, 10, dtype=torch.float64)
-    heights = torch.tensor([0, 0.52, 1.03, 1.55, 2.08, 2.6, 3.1, 3.57, 3.97, 4.26], dtype=torch.float64)
-    made = ct.Tabulated.from_table(CENTRE, degrees.deg2rad(), heights, pixels_per_unit=1 / 0.003)
-    theta = torch.tensor([10.0, 40, 80, 3, 15, 47, 89, 90.5, 120], dtype=torch.float64).deg2rad()
-    pixels, valid = made.project(torch.stack((0 * theta, theta.sin(), theta.cos()), -1))
-    assert valid.tolist() == [True] * 7 + [False] * 2
-    expected = Reference(degrees[1:].deg2rad().numpy(), heights[1:].numpy()).radius(theta[:7].numpy())
-    np.testing.assert_allclose((pixels[:7, 1].detach() - CENTRE[1]) * 0.003, expected, rtol=1e-9)

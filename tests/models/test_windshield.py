@@ -167,29 +167,3 @@ def test_on_its_side():
     torch.testing.assert_close(turned, torch.stack((pixels[:, 1], 639 - pixels[:, 0]), -1), rtol=0, atol=1e-9)
     with pytest.raises(ValueError, match="quarter turn"):
         one("kannala_brandt").behind(shield()).rot90()
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (([0.0, 1, 0], [0.0, 0]), r"vertical must be .* 1, 3, 6, 10, 15, 21, ...; got shape \(2,\)"),
-        (([[0.0], [1], [0]], [0.0, 0, 1]), r"horizontal.*A column goes in as horizontal\[..., 0\]"),
-        (([0.0, math.nan, 0], [0.0, 0, 1]), "horizontal must be finite"),
-        (([0.0, 1, 0], "flat"), "vertical must be numbers"),
-        ((torch.zeros(2, 3), torch.zeros(3, 3)), "batch dims"),
-    ],
-)
-def test_bad_polynomials(arguments, message):
-    with pytest.raises((ValueError, TypeError), match=message):
-        ct.Windshield(*arguments)
-
-
-def test_bad_shields():
-    camera = one("kannala_brandt")
-    for wrong, message in (([0, 1, 0], "takes a ct.Windshield"), (None, "takes a ct.Windshield")):
-        with pytest.raises(TypeError, match=message):
-            camera.behind(wrong)
-    with pytest.raises(TypeError, match="behind one already"):
-        camera.behind(shield()).behind(shield())
-    with pytest.raises(TypeError, match="Mixed"):
-        ct.Mixed([camera]).behind(shield())

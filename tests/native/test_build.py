@@ -80,12 +80,14 @@ def test_every_variant_that_the_compiler_knows_is_in_it(tmp_path, monkeypatch):
 
 
 @compiles
-def test_more_words_reach_the_compiler_and_the_linker(tmp_path):
+def test_more_words_reach_the_compiler_and_the_linker(tmp_path, monkeypatch):
     write(tmp_path, kernel="#ifndef MORE\n#error no MORE\n#endif\n" + KERNEL)
     with pytest.raises(BuildError, match="no MORE"):
         build(tmp_path, sources=tmp_path)
     path = build(tmp_path, sources=tmp_path, extra=("-DMORE", "-g", "-fsanitize=undefined"))
     assert b"ubsan" in path.read_bytes()
+    monkeypatch.setenv("CC", f"{COMPILER} -DMORE")
+    assert build(tmp_path, sources=tmp_path).exists()
 
 
 @compiles
@@ -108,13 +110,6 @@ def test_a_library_in_use_is_replaced_beneath_nobody(tmp_path):
     build(tmp_path, sources=tmp_path)
     assert (tmp_path / LIBRARY).stat().st_ino != inode
     assert running.twice(21) == 42
-
-
-@compiles
-def test_the_compiler_may_have_options(tmp_path, monkeypatch):
-    write(tmp_path, kernel="#ifndef MORE\n#error no MORE\n#endif\n" + KERNEL)
-    monkeypatch.setenv("CC", f"{COMPILER} -DMORE")
-    assert build(tmp_path, sources=tmp_path).exists()
 
 
 def test_without_a_compiler_the_error_says_what_was_sought(tmp_path, no_compiler, monkeypatch):

@@ -235,22 +235,6 @@ def test_any_strides_and_threads(key):
     assert all(a.equal(b) for a, b in zip(found, cotangents, strict=True))
 
 
-def test_an_unusable_camera_has_invalid_rows_alone():
-    camera = one("kannala_brandt").float()
-    intrinsics = camera.intrinsics.detach().repeat(3, 1)
-    intrinsics[1, 0] = math.nan
-    distortion = camera.distortion.detach().repeat(3, 1)
-    distortion[2, 1] = math.inf
-    made = Cameras(type(camera), intrinsics, distortion).native
-    p = fan(60, 5, 4).float().expand(3, -1, -1)
-    out, valid = geometry.project(made, p)
-    assert valid.all(-1).tolist() == [True, False, False]
-    assert (out[:, 1:] == -1).all()
-    results, sums = geometry.project_vjp(made, p, torch.full_like(out, math.nan), True, True)
-    assert (results[1:] == 0).all()
-    assert (sums[1:] == 0).all()
-
-
 def test_what_users_make_has_no_code():
     class Wave(Stage):
         def __call__(self, a, b):
@@ -262,13 +246,6 @@ def test_what_users_make_has_no_code():
     assert geometry.codes(Equidistant(), Lens()) is not None
     assert geometry.codes(Equidistant(), Lens(Wave())) is None
     assert geometry.codes(Wide(), Lens()) is None
-
-
-def test_no_points():
-    made = native(one("kannala_brandt"))
-    out, valid = geometry.project(made, torch.empty(1, 0, 3, dtype=torch.float64))
-    assert out.shape == (2, 1, 0)
-    assert valid.shape == (1, 0)
 
 
 FUZZ = Path(__file__).parent / "geometry_fuzz.c"
