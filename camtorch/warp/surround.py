@@ -41,6 +41,9 @@ class _SphereWarp(ProxyWarp):
             near = 1 / ((along.square() + self.radius**2 - shift.square().sum(-1)).sqrt() + along)
         return near, torch.ones_like(near, dtype=torch.bool)
 
+    def inverse(self) -> Warp:
+        raise ValueError("Surround: the warp of a distance has no inverse; transform_points takes points to the target")
+
 
 class Surround(GeometryModule):
     """Images of several cameras blended into one: what `surround` makes.
