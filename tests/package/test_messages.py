@@ -141,7 +141,7 @@ WRONG = [
     (lambda: PAIR.disparity("points"), TypeError, r"Rectification.disparity: points must be a tensor; got str"),
     (lambda: PAIR.save(None), TypeError, r"Rectification.save: path must name a file; got None"),
     (lambda: ct.PlaneWarp(CAMERA, CAMERA, POSE, (0, 0, 1.0), 0.0), ValueError, r"the plane goes through the target"),
-    (lambda: ct.PlaneWarp(CAMERA, CAMERA, DOWN, (0, 0, 1.0), 1.0), ValueError, r"not stand on the same side"),
+    (lambda: ct.PlaneWarp(CAMERA, CAMERA, DOWN, (0, 0, 1.0), 1.0), ValueError, r"does not stand on the same side"),
     (lambda: ct.PlaneWarp(CAMERA, CAMERA, POSE, (0.0, 0, 0), 1.0), ValueError, r"normal must be finite and not zero"),
     (lambda: ct.PlaneWarp(CAMERA, CAMERA, POSE, (0.0, 1), 1.0), ValueError, r"normal must be \(3,\) or \(B, 3\)"),
     (
@@ -159,7 +159,7 @@ WRONG = [
     (
         lambda: ct.surround(ONE, CAMERA, distance=9).warp("a").inverse(),
         ValueError,
-        r"the warp of a distance has no inv",
+        r"distance has no inverse",
     ),
     (lambda: ct.surround([CAMERA], CAMERA), TypeError, r"surround: rig must be a Rig; got list"),
     (lambda: ct.surround(ONE, CAMERA)({"b": IMAGES}), ValueError, r"images must be of the cameras \['a'\]"),
