@@ -57,27 +57,6 @@ def test_of_pinholes_it_is_the_homography():
     torch.testing.assert_close(back, pixels[inside], rtol=0, atol=1e-6)
 
 
-@pytest.mark.parametrize("exchanged", [False, True])
-def test_points_of_the_plane_land_where_they_are(exchanged):
-    source, target = wide(), pinholes()[1]
-    extrinsics = pose()
-    warp = ct.PlaneWarp(source, target, extrinsics, NORMAL, DISTANCE)
-    generator = torch.Generator().manual_seed(0)
-    across = torch.randn(500, 2, generator=generator).double()
-    depth = (DISTANCE - across @ NORMAL[:2]) / NORMAL[2]
-    points = torch.cat((across, depth[:, None]), -1)
-    in_target, one = target.project(points)
-    in_source, other = source.project(extrinsics(points))
-    both = one & other & target.contains(in_target) & source.contains(in_source)
-    assert both.sum() > 100
-    warp = warp.inverse().inverse() if exchanged else warp
-    moved, valid = warp.transform_points(in_source[both])
-    assert valid.all()
-    torch.testing.assert_close(moved, in_target[both], rtol=0, atol=1e-7)
-    there, valid = warp.inverse().transform_points(in_target[both])
-    torch.testing.assert_close(there, in_source[both], rtol=0, atol=1e-7)
-
-
 def test_beyond_the_horizon_nothing_is_valid():
     source, target = wide(), wide((60, 80))
     floor = ct.PlaneWarp(source, target, pose(), (0.0, 1.0, 0.0), 1.5)
