@@ -43,8 +43,9 @@ def shutter(p):
 
 
 def above(p):
-    rotation = rotation_matrix(torch.tensor([0.6, 0, 0]).double()) @ LEVEL @ rotation_matrix(p["turn"])
-    place = p["shift"] + torch.tensor([0.0, 0, 2]).double()
+    down = rotation_matrix(torch.tensor([0.6, 0, 0]).double()) @ LEVEL
+    rotation = down.to(p["turn"]) @ rotation_matrix(p["turn"])
+    place = p["shift"] + torch.tensor([0.0, 0, 2]).to(p["shift"])
     return ct.Extrinsics.from_matrix(rotation, -(rotation @ place[..., None])[..., 0])
 
 
