@@ -24,7 +24,7 @@ from camtorch._arguments import (
     values_of,
 )
 from camtorch._module import BatchedModule, learning_as, remade, typed_as
-from camtorch.rotations import check_rotation, is_rotation, rotate_planes, rotation_matrix, rotation_vector
+from camtorch.rotations import are_rotations, check_rotation, rotate_planes, rotation_matrix, rotation_vector
 
 
 class Extrinsics(BatchedModule):
@@ -232,7 +232,7 @@ def _are_matrices(rotation: Tensor, translation: Tensor) -> bool:
     beside = translation.ndim == rotation.ndim - 1
     if values_of(rotation) is None:
         return beside
-    if is_rotation(rotation):
+    if bool(are_rotations(rotation).all()):
         if translation.shape[-2:] == (3, 3) and not beside:
             raise ValueError(
                 f"Extrinsics: rotation {tuple(rotation.shape)} beside translation {tuple(translation.shape)} may be "

@@ -106,13 +106,8 @@ def check_rotation(matrix: Tensor, name: str, owner: str, hint: str = "") -> Non
         )
 
 
-def is_rotation(matrix: Tensor) -> bool:
-    """Whether all of (*B, 3, 3) are rotations, to the precision that files store them with."""
-    return bool(are_rotations(matrix).all())
-
-
 def are_rotations(matrix: Tensor) -> Tensor:
-    """(*B) bool: which of (*B, 3, 3) are rotations; see `is_rotation`. Half precision stores them less precisely."""
+    """(*B) bool: which of (*B, 3, 3) are rotations, as precisely as files, or their own dtype, store them."""
     values, precision = matrix.detach().double(), 4 * torch.finfo(matrix.dtype).eps
     proper: Tensor = torch.linalg.det(values) > 0
     return (rotation_error(values) < max(1e-3, precision)) & proper

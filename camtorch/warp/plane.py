@@ -75,7 +75,7 @@ class PlaneWarp(ProxyWarp):
 
     def _check(self, owner: str) -> None:
         """Raise a ValueError where the plane goes through a camera, or between them."""
-        known = [values for t in (*self.pose, self.normal, self.distance) if (values := values_of(t)) is not None]
+        known = [values for t in (*self._pose(), self.normal, self.distance) if (values := values_of(t)) is not None]
         if len(known) < 4:
             return
         rotation, shift, normal, distance = known
@@ -93,7 +93,7 @@ class PlaneWarp(ProxyWarp):
 
     def _plane_of_source(self) -> tuple[Tensor, Tensor]:
         """The normal (*B, 3) and the distance (*B,) in the source's frame."""
-        rotation, shift = self.pose
+        rotation, shift = self._pose()
         dtype = torch.promote_types(rotation.dtype, self.normal.dtype)
         normal = (rotation.to(dtype) @ self.normal.to(dtype)[..., None])[..., 0]
         return normal, self.distance + (normal * shift).sum(-1)
@@ -109,7 +109,7 @@ class PlaneWarp(ProxyWarp):
 
     def inverse(self) -> PlaneWarp:
         """The warp from target to source, of the same plane. What lay outside the image stays lost."""
-        back = Extrinsics.from_matrix(self.pose).inverse()
+        back = Extrinsics.from_matrix(self._pose()).inverse()
         options = {name: value for name, value in self.options.items() if name != "tolerance"}
         return PlaneWarp(self.target, self.source, back, *self._plane_of_source(), **cast(WarpOptions, options))
 
@@ -173,10 +173,9 @@ class BirdsEye(PlaneWarp):
                 "Are the extrinsics camera from ground?"
             )
 
-    @property
-    def pose(self) -> tuple[Tensor, Tensor]:
+    def _pose(self) -> tuple[Tensor, Tensor]:
         """Camera from the one that looks down from (0, 0, 1): x right, y down is -y, z down is -z of the ground."""
-        rotation, shift = super().pose
+        rotation, shift = super()._pose()
         return rotation * rotation.new_tensor([1.0, -1.0, -1.0]), shift + rotation[..., 2]
 
     @property

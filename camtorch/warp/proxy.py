@@ -35,8 +35,7 @@ class ProxyWarp(Warp):
         )
         self.extrinsics = extrinsics
 
-    @property
-    def pose(self) -> tuple[Tensor, Tensor]:
+    def _pose(self) -> tuple[Tensor, Tensor]:
         """Source from target: rotations (*B, 3, 3) and shifts (*B, 3)."""
         return rotation_matrix(self.extrinsics.rotation), self.extrinsics.translation
 
@@ -51,7 +50,7 @@ class ProxyWarp(Warp):
 
     def _carried(self, rays: Tensor, of_source: bool) -> tuple[Tensor, Tensor]:
         """Directions in which the other camera sees what unit rays (B, *N, 3) of one meet, and whether they do."""
-        rotation, shift = (t.to(rays.dtype) for t in self.pose)
+        rotation, shift = (t.to(rays.dtype) for t in self._pose())
         if of_source:
             rotation, shift = rotation.mT, -(rotation.mT @ shift[..., None])[..., 0]
         near, meets = self._nearness(rays, of_source)
@@ -83,7 +82,7 @@ class ProxyWarp(Warp):
     def transform_rays(self, rays: Numbers) -> Tensor:
         """Turn directions (B, *N, 3), or (*N, 3), from the source's to the target's frame; lengths stay."""
         rays = as_coordinates(rays, "rays", 3, type(self).__name__, self.source.intrinsics.device, "B, *N")
-        return turned(self.pose[0].mT.to(rays.dtype), rays)
+        return turned(self._pose()[0].mT.to(rays.dtype), rays)
 
 
 def check_pose(owner: str, extrinsics: Extrinsics, between: str, **cameras: Camera) -> torch.Size:

@@ -41,6 +41,9 @@ class _SphereWarp(ProxyWarp):
             near = 1 / ((along.square() + self.radius**2 - shift.square().sum(-1)).sqrt() + along)
         return near, torch.ones_like(near, dtype=torch.bool)
 
+    def inverse(self) -> Warp:
+        raise ValueError("Surround: the warp of a distance has no inverse; transform_points takes points to the target")
+
 
 class Surround(GeometryModule):
     """Images of several cameras blended into one: what `surround` makes.
@@ -191,7 +194,7 @@ def surround(
     if missing or not len(rig):
         what = f"cameras without extrinsics: {', '.join(missing)}" if missing else "a rig without cameras"
         raise ValueError(f"{owner}: every camera needs its extrinsics, camera from rig; got {what}")
-    ground = {"x": x, "y": y, "resolution": resolution}
+    ground: dict[str, Any] = {"x": x, "y": y, "resolution": resolution}
     given = [name for name, value in ground.items() if value is not None]
     if (target is None and len(given) < 3) or (target is not None and given):
         raise ValueError(f"{owner}: give a target, or x, y and resolution of the ground; got target={target}, {ground}")
@@ -208,10 +211,7 @@ def surround(
     for name, camera in rig.items():
         pose = rig.extrinsics[name]
         if target is None:
-            assert x is not None
-            assert y is not None
-            assert resolution is not None
-            warps[name] = BirdsEye(camera, pose, x=x, y=y, resolution=resolution, **options)
+            warps[name] = BirdsEye(camera, pose, **ground, **options)
             continue
         as_sized(target, "target", owner)
         if math.isinf(distance):

@@ -22,7 +22,14 @@ PAIR = ct.rectify(BATCH[0], BATCH[0], POSE, fov=57.3, image_size=SIZE)
 PIXELS, RAYS = CAMERA.pixel_grid(), CAMERA.rays()[0]
 IMAGES, META = torch.zeros(2, 3, *SIZE), torch.zeros(5, 3, device="meta")
 LEAF = torch.ones((), requires_grad=True)
+DEEP, THREE = ct.Reproject(CAMERA, CAMERA, POSE), ct.RollingShutter(0.03, torch.zeros(3, 3))
+NORMAL = [0.1, 0.3, 1.0]
 augment = ct.augment
+
+
+def at(turn, shift):
+    return ct.Extrinsics([float(w) for w in turn], [float(w) for w in shift])
+
 
 WRONG = [
     # what is no tensor, or not such a one
@@ -68,6 +75,41 @@ WRONG = [
     (lambda: ct.Rig({"a": CAMERA}, images=["a"]), TypeError, r"Rig: images must be a dict"),
     (lambda: ONE.cameras["b"], KeyError, r"no Camera is called 'b'; there are 'a'"),
     (lambda: ONE.camera_of(["a"]), ValueError, r"no camera and no image is called \['a'\]"),
+    # warps
+    (lambda: ct.Warp(CAMERA, "target"), TypeError, r"Warp: target must be a Camera"),
+    (lambda: ct.Warp(ct.Pinhole([1.0, 1, 0, 0]), CAMERA), ValueError, r"Warp: the source needs an image_size"),
+    (lambda: ct.Warp(CAMERA, CAMERA, mode="linear"), ValueError, r"mode must be one of .*got 'linear'"),
+    (lambda: ct.Warp(CAMERA, CAMERA, padding_mode="wrap"), ValueError, r"padding_mode must be one of .*got 'wrap'"),
+    (lambda: ct.Warp(CAMERA, CAMERA, torch.eye(4)), ValueError, r"rotation must be \(3, 3\) .*got shape \(4, 4\)"),
+    (lambda: ct.Warp(CAMERA, CAMERA, 2 * torch.eye(3)), ValueError, r"rotation must hold rotation matrices"),
+    (lambda: ct.Warp(CAMERA, CAMERA, fill=math.nan), ValueError, r"fill must be finite"),
+    (lambda: ct.Warp(CAMERA, CAMERA, tolerance=-1), ValueError, r"tolerance must be a number of pixels, zero or more"),
+    (lambda: ct.Warp(CAMERA, CAMERA, shutter=0.03), TypeError, r"shutter must be a RollingShutter; got float"),
+    (lambda: ct.Warp(GRID[0], GRID[0], shutter=THREE), ValueError, r"shutters may each have one batch dim"),
+    (lambda: ct.Warp(CAMERA, CAMERA, fill=(1, 2))(IMAGES), ValueError, r"fill has 2 values, but the images have 3"),
+    (lambda: ct.Warp(CAMERA, BATCH)(IMAGES[:1].expand(3, -1, -1, -1)), ValueError, r"3 images do not fit 2 cameras"),
+    (lambda: WARP(IMAGES.mT), ValueError, r"\(32, 24\).*\(24, 32\)"),
+    (lambda: WARP(IMAGES[0]), ValueError, r"\(B, C, H, W\).*\(3, 24, 32\)"),
+    (lambda: WARP(IMAGES[:, 0]), ValueError, r"\(2, 24, 32\).*masks\[:, None\]"),
+    (lambda: WARP(IMAGES[0].movedim(0, -1)), ValueError, r"\(24, 32, 3\), with the channels last.*permute\(2, 0, 1\)"),
+    (lambda: WARP(IMAGES + 0j), TypeError, r"complex64"),
+    (lambda: WARP([[1.0]]), TypeError, r"images must be a tensor"),
+    (lambda: WARP.transform_boxes(torch.zeros(2, 3)), ValueError, r"boxes must be .*got shape \(2, 3\)"),
+    (lambda: WARP.transform_points(torch.zeros(2, 3)), ValueError, r"got shape \(2, 3\)"),
+    (lambda: ct.Dewarp(CAMERA, projection="fisheye"), ValueError, r"one of .*'perspective'.*got 'fisheye'"),
+    (lambda: ct.Dewarp(CAMERA, fov=180), ValueError, r"fov must be in degrees, above 0 and below 180 for perspective"),
+    (lambda: ct.Dewarp(CAMERA, fov=2.1), ValueError, r"seems to be radians.* 120.3 degrees"),
+    (lambda: ct.Dewarp(CAMERA, fov=math.nan), ValueError, r"fov"),
+    (lambda: ct.Dewarp(CAMERA, image_size=(480.0, 640)), TypeError, r"image_size must be"),
+    (lambda: ct.Dewarp(CAMERA, image_size=(0, 640)), ValueError, r"image_size must be"),
+    (lambda: ct.RollingShutter(33.0, [0, 0, 0]), ValueError, r"readout is in seconds; got 33.0"),
+    (lambda: ct.RollingShutter([[0.03]], [0, 0, 0]), ValueError, r"readout must be a number or \(B,\)"),
+    (lambda: ct.RollingShutter(0.03, [1.0, 2.0]), ValueError, r"rates must be \(\*B, 3\); got shape \(2,\)"),
+    (lambda: ct.RollingShutter(0.03, [1, math.nan, 2]), ValueError, r"rates must be finite"),
+    (lambda: ct.RollingShutter(0.03, [0, 90.0, 0]), ValueError, r"rates are in radians per second"),
+    (lambda: ct.RollingShutter([0.03, 0.02], [[0, 0, 0]] * 3), ValueError, r"do not fit together"),
+    (lambda: ct.RollingShutter(0.03, [0, 0, 0], direction="top"), ValueError, r"direction must be one of"),
+    (lambda: ct.RollingShutter(0.03, [0, 0, 0], exposure=-0.01), ValueError, r"exposure must not be negative"),
     # views, stereo, planes
     (lambda: ct.views.ring(CAMERA, 3, fov="60"), TypeError, r"ring: fov must be a number; got '60'"),
     (lambda: ct.views.ring(CAMERA, 3, fov=200), ValueError, r"ring: fov must be in degrees, above 0 and below 180;"),
@@ -83,7 +125,11 @@ WRONG = [
     (lambda: ct.BirdsEye(CAMERA, DOWN, x=(0, 1), y=(0, 1), resolution="1"), TypeError, r"resolution must be a number"),
     (lambda: ct.BirdsEye(CAMERA, DOWN, x=(0, 1), y=(0, 1), resolution=9), ValueError, r"at 9.0 units per pixel make"),
     (lambda: ct.Reproject(GRID, CAMERA, POSE), ValueError, r"Reproject: cameras and extrinsics may have one batch dim"),
-    (lambda: ct.RollingShutter(0.01, [0, 0, 0], samples=0), ValueError, r"RollingShutter: samples must be at least 1; got 0"),
+    (
+        lambda: ct.RollingShutter(0.01, [0, 0, 0], samples=0),
+        ValueError,
+        r"samples must be at least 1; got 0",
+    ),
     (lambda: ct.RollingShutter(0.01, [0, 0, 0]).times([0, 0], None), TypeError, r"RollingShutter: image_size must be"),
     (lambda: ct.rectify(GRID, GRID, POSE), ValueError, r"rectify: cameras and extrinsics may have one batch dim"),
     (lambda: ct.rectify(CAMERA, CAMERA, POSE, fov=(60, 60, 60)), ValueError, r"fov must be horizontal, or .*\(60, 60,"),
@@ -94,6 +140,48 @@ WRONG = [
     (lambda: PAIR.disparity_to_points(torch.ones(SIZE), [True]), ValueError, r"valid must have the shape of disparity"),
     (lambda: PAIR.disparity("points"), TypeError, r"Rectification.disparity: points must be a tensor; got str"),
     (lambda: PAIR.save(None), TypeError, r"Rectification.save: path must name a file; got None"),
+    (lambda: ct.PlaneWarp(CAMERA, CAMERA, POSE, (0, 0, 1.0), 0.0), ValueError, r"the plane goes through the target"),
+    (lambda: ct.PlaneWarp(CAMERA, CAMERA, DOWN, (0, 0, 1.0), 1.0), ValueError, r"does not stand on the same side"),
+    (lambda: ct.PlaneWarp(CAMERA, CAMERA, POSE, (0.0, 0, 0), 1.0), ValueError, r"normal must be finite and not zero"),
+    (lambda: ct.PlaneWarp(CAMERA, CAMERA, POSE, (0.0, 1), 1.0), ValueError, r"normal must be \(3,\) or \(B, 3\)"),
+    (
+        lambda: ct.PlaneWarp(CAMERA, CAMERA, np.eye(4), NORMAL, 1.0),
+        TypeError,
+        r"must be Extrinsics, source from target",
+    ),
+    (lambda: ct.BirdsEye(CAMERA, POSE, x=(0, 1), y=(0, 1), resolution=0.1), ValueError, r"it has to be above"),
+    (lambda: ct.BirdsEye(CAMERA, DOWN, x=(1, -1), y=(0, 1), resolution=0.1), ValueError, r"\(from, to\), ascending"),
+    (lambda: ct.BirdsEye(CAMERA, DOWN, x=(0, 1), y=(0, 1), resolution=0.0), ValueError, r"resolution must be positive"),
+    (lambda: ct.surround(ONE), ValueError, r"give a target, or x, y and resolution"),
+    (lambda: ct.surround(ONE, CAMERA, x=(-1, 1)), ValueError, r"give a target, or x, y and resolution"),
+    (lambda: ct.surround(ct.Rig({"a": CAMERA}), CAMERA), ValueError, r"cameras without extrinsics: a"),
+    (lambda: ct.surround(ONE, CAMERA, distance=0.05), ValueError, r"'a' stands 0.1 from the origin; distance is"),
+    (
+        lambda: ct.surround(ONE, CAMERA, distance=9).warp("a").inverse(),
+        ValueError,
+        r"distance has no inverse",
+    ),
+    (lambda: ct.surround([CAMERA], CAMERA), TypeError, r"surround: rig must be a Rig; got list"),
+    (lambda: ct.surround(ONE, CAMERA)({"b": IMAGES}), ValueError, r"images must be of the cameras \['a'\]"),
+    (lambda: ct.surround(ONE, CAMERA)([IMAGES, IMAGES]), ValueError, r"1 cameras, \['a'\]; got 2 images"),
+    (lambda: ct.views.ring(CAMERA, 0), ValueError, r"ring: count must be at least 1; got 0"),
+    (lambda: DEEP(IMAGES, torch.ones(1, 1, *SIZE), "depth"), ValueError, r"kind must be \"z\""),
+    (lambda: DEEP(IMAGES, torch.ones(1, 1, 3, 4)), ValueError, r"depth must be .*image_size \(24, 32\)"),
+    (lambda: DEEP(IMAGES[0], torch.ones(1, 1, *SIZE)), ValueError, r"images must be a tensor \(B, C, H, W\)"),
+    (lambda: DEEP(IMAGES, torch.ones(3, 1, *SIZE)), ValueError, r"batches do not fit: .*'depth': 3"),
+    (lambda: ct.Reproject(CAMERA, CAMERA, np.eye(4)), TypeError, r"must be Extrinsics, source from target"),
+    (lambda: CAMERA.backproject(np.zeros(SIZE, np.uint16)), ValueError, r"1000 in metres"),
+    (lambda: CAMERA.backproject(torch.ones(2, *SIZE)), ValueError, r"depth\[:, None\]"),
+    (lambda: ct.rectify(CAMERA, CAMERA, (np.eye(3), NORMAL)), TypeError, r"Extrinsics, right from left.*from_matrix"),
+    (lambda: ct.rectify(CAMERA, CAMERA, at([0, 0.1, 0], [0, 0, 0])), ValueError, r"stand at one place"),
+    (lambda: ct.rectify(CAMERA, CAMERA, at([0, 0, 0], [0, 0, 1])), ValueError, r"look along their baseline"),
+    (lambda: ct.rectify(CAMERA, CAMERA, at([0, math.pi, 0], [-1, 0, 0])), ValueError, r"away from each other"),
+    (lambda: ct.rectify(CAMERA, CAMERA, POSE, projection="fisheye"), ValueError, r"projection must be one of"),
+    (lambda: ct.rectify(CAMERA, CAMERA, POSE, fov=(90, 190)), ValueError, r"below 180 for perspective; got 190"),
+    (lambda: ct.rectify(ct.Pinhole([1.0, 1, 0, 0]), CAMERA, POSE), ValueError, r"the left needs an image_size"),
+    (lambda: ct.rectify(CAMERA, CAMERA, POSE, projection="latlon").opencv(), ValueError, r"of one perspective pair"),
+    (lambda: PAIR.disparity_to_points(np.zeros(SIZE, np.int16)), ValueError, r"floating point pixels; .* / 16"),
+    (lambda: PAIR.disparity_to_points(torch.zeros(64, 48)), ValueError, r"disparity must be"),
     (lambda: ct.Dewarp(CAMERA, fov="90"), TypeError, r"Dewarp: fov must be a number; got"),
     # augmentations
     (lambda: augment.RandomMount(zoom=1.0), ValueError, r"zoom must lie within .*got 1.0, which stands for \(0, 2\)"),

@@ -240,34 +240,6 @@ def test_field_of_view_and_size_are_as_asked(projection):
     assert both.camera_left.fov[:2].tolist() == pytest.approx([86, 57], rel=0.01)
 
 
-@pytest.mark.parametrize(
-    ("changes", "error", "words"),
-    [
-        ({"extrinsics": ct.Extrinsics([0, 0.1, 0], [0.0, 0, 0])}, ValueError, "one place"),
-        ({"extrinsics": ct.Extrinsics([0.0, 0, 0], [0, 0, 1.0])}, ValueError, "along their baseline"),
-        ({"extrinsics": ct.Extrinsics([0.0, math.pi, 0], [-1.0, 0, 0])}, ValueError, "away from each other"),
-        ({"extrinsics": (np.eye(3), np.ones(3))}, TypeError, "from_matrix"),
-        ({"projection": "fisheye"}, ValueError, "projection"),
-        ({"left": ct.Pinhole([500.0, 500, 320, 240])}, ValueError, "image_size"),
-        ({"fov": (90, 190)}, ValueError, "fov must be in degrees, above 0 and below 180 for perspective; got 190"),
-    ],
-)
-def test_bad_input_is_refused(changes, error, words):
-    given = dict(zip(("left", "right", "extrinsics"), pair(), strict=True)) | changes
-    with pytest.raises(error, match=words):
-        ct.rectify(**given)
-
-
-def test_bad_disparities_are_refused():
-    found = fisheyes(image_size=(48, 64))
-    with pytest.raises(ValueError, match="/ 16"):
-        found.disparity_to_points(np.zeros((48, 64), np.int16))
-    with pytest.raises(ValueError, match="disparity must be"):
-        found.disparity_to_points(torch.zeros(64, 48))
-    with pytest.raises(ValueError, match="perspective"):
-        fisheyes(projection="latlon").opencv()
-
-
 @pytest.mark.slow
 def test_it_is_a_graph_and_has_a_shape_on_meta():
     left, right, extrinsics = pair()

@@ -12,7 +12,6 @@ from torch.profiler import ProfilerActivity, profile
 
 import camtorch as ct
 import camtorch.augment.numpy
-from camtorch.augment.kornia import RandomCamera
 
 SIZE = (50, 70)
 needs_native = pytest.mark.skipif(not ct.native_available(), reason="there is no compiled sampler")
@@ -130,16 +129,6 @@ def test_nothing_as_large_as_an_image_is_made_but_the_result(read_only):
     assert out["image"].shape == array.shape
 
 
-@needs_native
-@pytest.mark.slow
-def test_batches_of_kornia_stay_as_they_lie():
-    images = torch.rand(4, 3, *LARGE).to(memory_format=torch.channels_last)
-    module = RandomCamera(camera(LARGE), min_filled=0)
-    out, large = allocated(lambda: module(images), images.nbytes // len(images))
-    assert large in ([], ["aten::empty"])  # memory that is used again is not of torch
-    assert out.is_contiguous(memory_format=torch.channels_last)
-
-
 # -- images at the door of warps
 
 
@@ -234,17 +223,3 @@ def test_the_error_for_an_array_says_lines_that_work(name):
     assert np.abs(made.astype(int)[..., :] - np.asarray(array).astype(int)).mean() < 80  # the same image, bent
     if isinstance(array, np.ndarray) and all(step > 0 for step in array.strides):
         assert images.data_ptr() == array.ctypes.data
-
-
-@pytest.mark.filterwarnings("ignore:.torch.jit:DeprecationWarning")  # inductor imports what still uses it
-@pytest.mark.slow
-def test_compiled_code_gives_them_back_as_they_lie():
-    batch = torch.from_numpy(np.stack([colours(), colours()])).permute(0, 3, 1, 2)
-    warp = ct.Warp(camera(), ct.Pinhole.from_fov(60, image_size=(40, 60))).requires_grad_(False)
-    torch.compiler.reset()
-    compiled = torch.compile(warp, fullgraph=True)
-    repeated = batch[:, :1].expand(-1, 3, -1, -1)
-    for images in (batch, batch.contiguous(), batch.float(), batch[:1], batch[:, :1], repeated):
-        expected, result = warp(images), compiled(images)
-        assert result.stride() == expected.stride()
-        assert (result.float() - expected.float()).abs().max() <= (1 if images.dtype == torch.uint8 else 2e-3)

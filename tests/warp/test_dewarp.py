@@ -143,30 +143,3 @@ def test_a_batch_gets_a_target_each():
         single = ct.Dewarp(ct.KannalaBrandt(intrinsics[i], [0.0], image_size=(480, 640)))
         torch.testing.assert_close(batch.target.intrinsics[i], single.target.intrinsics)
     assert batch(torch.ones(2, 1, 480, 640)).shape == (2, 1, 480, 640)
-
-
-def test_gradients_reach_the_camera():
-    camera = ct.KannalaBrandt([200.0, 200.0, 320.0, 240.0], image_size=(480, 640))
-    v, u = torch.meshgrid(torch.arange(480.0), torch.arange(640.0), indexing="ij")
-    ct.Dewarp(camera, image_size=(48, 64))((u * v * (u + v))[None, None] / 1e8).sum().backward()
-    assert (camera.intrinsics.grad != 0).all()
-    assert (camera.distortion.grad != 0).all()
-
-
-@pytest.mark.parametrize(
-    ("options", "error", "says"),
-    [
-        ({"projection": "fisheye"}, ValueError, "perspective.*fisheye"),
-        ({"fov": 0.0}, ValueError, "fov"),
-        ({"fov": 180}, ValueError, "fov"),
-        ({"fov": 2.1}, ValueError, "seems to be radians.* 120.3 degrees"),
-        ({"fov": math.nan}, ValueError, "fov"),
-        ({"image_size": (480.0, 640)}, TypeError, "image_size"),
-        ({"image_size": (0, 640)}, ValueError, "image_size"),
-        ({"rotation": torch.eye(2)}, ValueError, "rotation"),
-    ],
-)
-def test_bad_options_are_named(options, error, says):
-    camera = ct.KannalaBrandt([200.0, 200.0, 320.0, 240.0], image_size=(480, 640))
-    with pytest.raises(error, match=says):
-        ct.Dewarp(camera, **options)

@@ -69,17 +69,6 @@ def test_ids_of_a_batch_of_cameras_traced_and_in_transforms():
     assert torch.equal(torch.func.vmap(lambda image: alone(image[None])[0])(given), alone(given))
 
 
-@pytest.mark.parametrize("dtype", [torch.uint8, torch.float16, torch.bool, torch.int32])
-def test_narrow_dtypes_are_traced_as_they_are_run(dtype):
-    warp = ct.Warp(fisheye(), pinhole(), turn(20), fill=1)
-    given = torch.randint(200, (2, 3, *SIZE), generator=torch.Generator().manual_seed(0)).to(dtype)
-    compiled = torch.compile(warp, fullgraph=True, backend="eager")(given)
-    mapped = torch.func.vmap(lambda image: warp(image[None])[0])(given)
-    for result in (compiled, mapped):
-        assert result.dtype == dtype
-        assert (result.double() - warp(given).double()).abs().max() <= (0 if dtype == torch.bool else 1)
-
-
 @pytest.mark.parametrize(("mode", "padding_mode"), [*zip(MODES, PADDINGS, strict=True)])
 def test_wide_unsigned_integers_stay_in_range(mode, padding_mode):
     warp = ct.Warp(fisheye(), pinhole(), mode=mode, padding_mode=padding_mode)
@@ -120,22 +109,6 @@ def test_a_pixel_that_is_no_number_stays_in_its_neighbourhood(padding_mode, bad)
 
 
 @pytest.mark.parametrize(
-    ("images", "error", "says"),
-    [
-        (torch.zeros(*SIZE, 3, dtype=torch.uint8), ValueError, r"\(40, 50, 3\), with the channels last.*2, 0, 1\)\[No"),
-        (torch.zeros(2, *SIZE, 3), ValueError, r"channels last.*permute\(0, 3, 1, 2\)"),
-        (torch.zeros(*SIZE), ValueError, r"\(B, C, H, W\); got shape \(40, 50\)"),
-        (torch.zeros(2, *SIZE), ValueError, r"\(2, 40, 50\).*masks\[:, None\]"),
-        (np.zeros((*SIZE, 3), np.uint8), TypeError, r"ndarray.*torch.from_numpy\(array\).permute"),
-        (torch.zeros(1, 1, *SIZE, dtype=torch.complex64), TypeError, "complex64"),
-    ],
-)
-def test_layouts_that_are_not_taken_are_named(images, error, says):
-    with pytest.raises(error, match=says):
-        ct.Warp(fisheye(), pinhole())(images)
-
-
-@pytest.mark.parametrize(
     ("mode", "options"), [*zip(MODES, ({"antialias": True}, {"fill": 3.0}, {"padding_mode": "border"}), strict=True)]
 )
 def test_no_channels_and_no_images_make_none(mode, options):
@@ -147,41 +120,6 @@ def test_no_channels_and_no_images_make_none(mode, options):
 
 
 # -- no graph in vain
-
-
-@pytest.mark.parametrize(("dtype", "mode"), [*zip((torch.uint8, torch.int64, torch.bool), MODES, strict=True)])
-def test_integers_have_no_graph_while_cameras_learn(dtype, mode):
-    learning = ct.Warp(fisheye(learns=True), pinhole(), mode=mode, antialias=True)
-    frozen = ct.Warp(fisheye(), pinhole(), mode=mode, antialias=True)
-    given = torch.randint(2, (1, 3, *SIZE), generator=torch.Generator().manual_seed(0)).to(dtype)
-    result = learning(given)
-    assert result.grad_fn is None
-    assert not result.requires_grad
-    assert torch.equal(result, frozen(given))
-    assert learning.valid_mask().grad_fn is None
-    # and a step of the optimizer is seen
-    with torch.no_grad():
-        learning.source.intrinsics.add_(3.0)
-    assert not torch.equal(learning(given), result)
-    assert learning(given.float()).requires_grad
-
-
-@pytest.mark.parametrize("learns", [False, True])
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float16, torch.uint8, torch.float64])
-def test_float64_cameras_do_not_promote_images(dtype, learns):
-    wide = ct.Warp(fisheye(torch.float64, learns), pinhole(torch.float64))
-    images = (200 * torch.rand(2, 3, *SIZE, generator=torch.Generator().manual_seed(0))).to(dtype)
-    result = wide(images)
-    assert result.dtype == dtype
-    assert result.requires_grad == (learns and dtype.is_floating_point)
-    expected = ct.Warp(fisheye(), pinhole())(images.to(torch.float32))
-    # two roundings of a position in float32, and of a value
-    bound = 0.51 if dtype == torch.uint8 else 0.15 if dtype == torch.float16 else 0.02
-    assert (result.double() - expected.double()).abs().max() < bound
-    if learns and dtype.is_floating_point:
-        result.sum().backward()
-        assert wide.source.intrinsics.grad.dtype == torch.float64
-        assert wide.source.intrinsics.grad.abs().sum() > 0
 
 
 # -- what is handed out belongs to the caller

@@ -57,27 +57,6 @@ def test_of_pinholes_it_is_the_homography():
     torch.testing.assert_close(back, pixels[inside], rtol=0, atol=1e-6)
 
 
-@pytest.mark.parametrize("exchanged", [False, True])
-def test_points_of_the_plane_land_where_they_are(exchanged):
-    source, target = wide(), pinholes()[1]
-    extrinsics = pose()
-    warp = ct.PlaneWarp(source, target, extrinsics, NORMAL, DISTANCE)
-    generator = torch.Generator().manual_seed(0)
-    across = torch.randn(500, 2, generator=generator).double()
-    depth = (DISTANCE - across @ NORMAL[:2]) / NORMAL[2]
-    points = torch.cat((across, depth[:, None]), -1)
-    in_target, one = target.project(points)
-    in_source, other = source.project(extrinsics(points))
-    both = one & other & target.contains(in_target) & source.contains(in_source)
-    assert both.sum() > 100
-    warp = warp.inverse().inverse() if exchanged else warp
-    moved, valid = warp.transform_points(in_source[both])
-    assert valid.all()
-    torch.testing.assert_close(moved, in_target[both], rtol=0, atol=1e-7)
-    there, valid = warp.inverse().transform_points(in_target[both])
-    torch.testing.assert_close(there, in_source[both], rtol=0, atol=1e-7)
-
-
 def test_beyond_the_horizon_nothing_is_valid():
     source, target = wide(), wide((60, 80))
     floor = ct.PlaneWarp(source, target, pose(), (0.0, 1.0, 0.0), 1.5)
@@ -131,64 +110,3 @@ def test_the_image_from_above_is_what_lies_there():
     eye = ct.BirdsEye(camera, extrinsics, x=(-2, 3), y=(0, 4), resolution=0.02)
     assert eye.valid_mask().all()
     torch.testing.assert_close(eye(image)[0, 0], scene(eye.grid_points), rtol=0, atol=2e-3)
-
-
-def test_poses_cameras_and_planes_learn():
-    source, target = pinholes()
-    source, target = source.resize(8, 10).requires_grad_(True), target.resize(6, 7).requires_grad_(True)
-    images = torch.nn.functional.avg_pool2d(torch.rand(1, 1, 10, 12).double(), 3, 1)
-
-    def made(turn, shift, normal, distance, focal):
-        lens = ct.Pinhole(focal, image_size=(8, 10))
-        return ct.PlaneWarp(lens, target, ct.Extrinsics(turn, shift), normal, distance)(images)
-
-    inputs = (TURN, SHIFT, NORMAL, torch.tensor(DISTANCE).double(), source.intrinsics.detach())
-    assert torch.autograd.gradcheck(made, [t.clone().requires_grad_() for t in inputs], atol=1e-4)
-
-
-def test_a_batch_goes_one_by_one():
-    source, target = wide(), pinholes()[1]
-    turns, distances = torch.stack((TURN, 2 * TURN, -TURN)), torch.tensor([2.5, 3.0, 4.0]).double()
-    images = torch.rand(3, 2, 480, 640).double()
-    many = ct.PlaneWarp(source, target, ct.Extrinsics(turns[..., None], SHIFT).requires_grad_(False), NORMAL, distances)
-    result, mask = many(images), many.valid_mask()
-    pixels = torch.tensor([[300.0, 200], [320, 280]]).double().expand(3, 2, 2)
-    moved, _ = many.transform_points(pixels)
-    for i in range(3):
-        one = ct.PlaneWarp(source, target, ct.Extrinsics(turns[i], SHIFT).requires_grad_(False), NORMAL, distances[i])
-        torch.testing.assert_close(result[i : i + 1], one(images[i : i + 1]), rtol=0, atol=1e-9)
-        assert torch.equal(mask[i : i + 1], one.valid_mask())
-        torch.testing.assert_close(moved[i], one.transform_points(pixels[i])[0])
-
-
-@pytest.mark.slow
-def test_it_is_kept_until_something_changes_and_compiles():
-    source, target = pinholes()
-    extrinsics = pose()
-    warp = ct.PlaneWarp(source, target, extrinsics, NORMAL, DISTANCE)
-    images = torch.rand(1, 1, 100, 120).double()
-    before = warp(images)
-    torch.testing.assert_close(torch.compile(warp, backend="eager")(images), before, rtol=0, atol=1e-9)
-    with torch.no_grad():
-        extrinsics.translation += 0.2
-    assert (warp(images) - before).abs().max() > 1e-3
-
-
-def test_bad_planes_are_refused():
-    source, target = pinholes()
-    with pytest.raises(ValueError, match="through the target"):
-        ct.PlaneWarp(source, target, pose(), NORMAL, 0.0)
-    with pytest.raises(ValueError, match="same side"):
-        ct.PlaneWarp(source, target, ct.Extrinsics([0.0, 0, 0], [0, 0, -5.0]).double(), (0.0, 0, 1), 2.0)
-    with pytest.raises(ValueError, match="normal"):
-        ct.PlaneWarp(source, target, pose(), (0.0, 0, 0), 1.0)
-    with pytest.raises(ValueError, match="normal must be"):
-        ct.PlaneWarp(source, target, pose(), (0.0, 1.0), 1.0)
-    with pytest.raises(TypeError, match="Extrinsics"):
-        ct.PlaneWarp(source, target, torch.eye(4), NORMAL, 1.0)
-    with pytest.raises(ValueError, match="above"):
-        ct.BirdsEye(wide(), above_ground(height=-1.0), x=(-1, 1), y=(0, 1), resolution=0.1)
-    with pytest.raises(ValueError, match="ascending"):
-        ct.BirdsEye(wide(), above_ground(), x=(1, -1), y=(0, 1), resolution=0.1)
-    with pytest.raises(ValueError, match="resolution"):
-        ct.BirdsEye(wide(), above_ground(), x=(-1, 1), y=(0, 1), resolution=0.0)

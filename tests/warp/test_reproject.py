@@ -96,33 +96,6 @@ def test_a_sweep_is_its_planes_one_by_one():
         assert torch.equal(valid[:, :, i], here)
 
 
-@pytest.mark.slow
-def test_gradients():
-    source, target = pinhole((6, 7)), fisheye(size=(5, 6))
-    images, depth = smooth(1, 2, 6, 7), depths(1, 1, 5, 6)
-    turn, shift = torch.tensor([0.03, -0.1, 0.05]).double(), torch.tensor([0.1, -0.05, 0.08]).double()
-
-    def made(images, depth, turn, shift, k, intrinsics):
-        lens = type(source)(intrinsics, source.distortion, image_size=(6, 7))
-        sees = type(target)(target.intrinsics, k, image_size=(5, 6))
-        return ct.Reproject(lens, sees, ct.Extrinsics(turn, shift))(images, depth, "z")[0]
-
-    inputs = (images, depth, turn, shift, target.distortion.detach(), source.intrinsics.detach())
-    assert torch.autograd.gradcheck(made, [t.clone().requires_grad_() for t in inputs], atol=1e-4)
-
-
-def test_batches_of_poses_and_cameras():
-    turns, shifts = 0.1 * depths(3, 3, seed=2), 0.1 * depths(3, 3, seed=3)
-    images, depth = smooth(3, 2, 10, 14), depths(3, 1, *SIZE)
-    many = ct.Reproject(pinhole(), fisheye(), ct.Extrinsics(turns[:, :, None], shifts))(images, depth)
-    shared = ct.Reproject(pinhole(), fisheye(), ct.Extrinsics(turns[:, :, None], shifts))(images[:1], depth[:1])
-    for i in range(3):
-        one = ct.Reproject(pinhole(), fisheye(), ct.Extrinsics(turns[i], shifts[i]))
-        for whole, part in zip(many, one(images[i : i + 1], depth[i : i + 1]), strict=True):
-            torch.testing.assert_close(whole[i : i + 1], part)
-        torch.testing.assert_close(shared[0][i : i + 1], one(images[:1], depth[:1])[0])
-
-
 def test_what_stands_behind_something_is_not_seen():
     camera = ct.Pinhole([40.0, 40, 31.5, 23.5], image_size=(48, 64)).requires_grad_(False)
     beside = ct.Extrinsics([0.0, 0, 0], [-0.5, 0, 0]).requires_grad_(False)
@@ -158,31 +131,3 @@ def test_backprojected_points_are_seen_at_their_pixels(kind):
     assert not valid[2, 6, 6]
     one, _ = camera.backproject(depth[1, 0], kind)
     torch.testing.assert_close(one, points[1])
-
-
-def test_backprojection_has_gradients():
-    camera = fisheye(size=(4, 5))
-    depth = depths(1, 1, 4, 5).requires_grad_()
-    assert torch.autograd.gradcheck(lambda d: camera.backproject(d)[0], depth)
-
-
-def test_bad_input_is_refused():
-    camera = fisheye()
-    moved = ct.Reproject(camera, camera, pose())
-    images = smooth(1, 1, *SIZE)
-    with pytest.raises(ValueError, match="kind"):
-        moved(images, depths(1, 1, *SIZE), "depth")
-    with pytest.raises(ValueError, match="1000 in metres"):
-        camera.backproject(np.zeros(SIZE, np.uint16))
-    with pytest.raises(ValueError, match=r"depth\[:, None\]"):
-        camera.backproject(torch.ones(2, *SIZE))
-    with pytest.raises(ValueError, match="image_size"):
-        moved(images, depths(1, 1, 3, 4))
-    with pytest.raises(ValueError, match="images"):
-        moved(images[0], depths(1, 1, *SIZE))
-    with pytest.raises(ValueError, match="batches"):
-        moved(images.expand(2, -1, -1, -1), depths(3, 1, *SIZE))
-    with pytest.raises(TypeError, match="source from target"):
-        ct.Reproject(camera, camera, torch.eye(4))
-    with pytest.raises(ValueError, match="image_size"):
-        ct.Reproject(ct.Pinhole([1.0, 1, 0, 0]), camera, pose())

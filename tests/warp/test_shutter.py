@@ -1,8 +1,6 @@
 """Rolling shutters: undone and put on as rows are rendered one by one, there and back, with gradients."""
 
-import copy
 import math
-import pickle
 from functools import partial
 
 import numpy as np
@@ -117,63 +115,6 @@ def test_without_a_readout_it_is_the_plain_warp(name, dtype):
     close(plain.transform_points(pixels)[0], warp.transform_points(pixels)[0])
 
 
-@pytest.mark.parametrize("name", [pytest.param("shutter", marks=pytest.mark.slow), "target_shutter"])
-def test_gradients_go_to_rates_readout_and_camera(name):
-    camera, straight = fisheye(), ct.Pinhole.from_fov(80, image_size=(240, 320)).double()
-    pixels = torch.tensor([[100.0, 60.0], [160.0, 200.0], [220.0, 130.0]], dtype=torch.float64)
-
-    def moved(rates, readout, intrinsics, points):
-        lens = ct.KannalaBrandt(intrinsics, camera.distortion, image_size=camera.image_size)
-        options = {name: ct.RollingShutter(readout, rates)}
-        points, valid = ct.Warp(lens, straight.requires_grad_(False), **options).transform_points(points)
-        assert valid.all()
-        return points
-
-    rates = torch.tensor(RATES, dtype=torch.float64, requires_grad=True)
-    readout = torch.tensor(READOUT, dtype=torch.float64, requires_grad=True)
-    intrinsics = camera.intrinsics.clone().requires_grad_()
-    assert torch.autograd.gradcheck(moved, (rates, readout, intrinsics, pixels.requires_grad_()))
-
-
-@pytest.mark.slow
-def test_rates_are_learned_from_images():
-    camera = fisheye((60, 80), dtype=torch.float32)
-    v, u = torch.meshgrid(torch.arange(60.0), torch.arange(80.0), indexing="ij")
-    image = torch.stack([torch.sin(u / 7) + torch.cos(v / 5), torch.sin((u + v) / 9)])[None]
-    truth = torch.tensor([0.5, -2.0, 1.0])
-    rolled = ct.Warp(camera, camera, target_shutter=ct.RollingShutter(0.05, truth))(image)
-    rates = torch.zeros(3, requires_grad=True)
-    optimizer = torch.optim.LBFGS([rates], max_iter=12, line_search_fn="strong_wolfe")
-
-    def loss():
-        optimizer.zero_grad()
-        made = ct.Warp(camera, camera, target_shutter=ct.RollingShutter(0.05, rates))(image)
-        error = (made - rolled)[..., 6:-6, 6:-6].square().mean()
-        error.backward()
-        return error
-
-    optimizer.step(loss)
-    assert (rates - truth).abs().max() < 0.01
-
-
-def test_a_batch_of_shutters_is_each_of_them():
-    camera = fisheye((120, 160), dtype=torch.float32)
-    rates = torch.tensor([RATES, (0.0, 0.0, 0.0), (-2.0, 1.0, 3.0)])
-    readout = torch.tensor([0.03, 0.02, 0.01])
-    images = torch.rand(3, 2, 120, 160)
-    pixels = torch.rand(3, 7, 2) * 100
-    for name in ("shutter", "target_shutter"):
-        together = ct.Warp(camera, camera, **{name: ct.RollingShutter(readout, rates)})
-        result, (moved, valid) = together(images), together.transform_points(pixels)
-        assert together.valid_mask().shape == (3, 1, 120, 160)
-        for i in range(3):
-            alone = ct.Warp(camera, camera, **{name: ct.RollingShutter(readout[i], rates[i])})
-            assert torch.equal(result[i : i + 1], alone(images[i : i + 1]))
-            # without the compiled library torch rounds the last points of a batch otherwise
-            torch.testing.assert_close(moved[i], alone.transform_points(pixels[i])[0], rtol=0, atol=1e-4)
-            assert torch.equal(valid[i], alone.transform_points(pixels[i])[1])
-
-
 def test_both_shutters_one_lens_for_another():
     camera, other = fisheye(), ct.Pinhole.from_fov(80, image_size=(240, 320)).double().requires_grad_(False)
     down, up = shutter(), shutter(direction="up", rates=(1.0, -2.0, 0.5))
@@ -271,62 +212,3 @@ def test_transforms_of_functions_and_a_batch_of_several_models():
         assert torch.allclose(result[i], alone, atol=1e-12)
         assert torch.equal(valid[i], also)
     assert together(torch.rand(2, 1, 240, 320)).shape == (2, 1, 240, 320)
-
-
-def test_it_is_copied_pickled_and_moved():
-    camera = fisheye((60, 80), dtype=torch.float32)
-    warp = ct.Warp(camera, camera, shutter=ct.RollingShutter(0.03, torch.nn.Parameter(torch.tensor(RATES))))
-    assert "shutter.rates" in warp.state_dict()
-    image = torch.rand(1, 1, 60, 80)
-    for other in (copy.deepcopy(warp), pickle.loads(pickle.dumps(warp))):
-        assert torch.equal(other(image), warp(image))
-    assert warp.double().shutter.rates.dtype == torch.float64
-    assert "direction='down'" in repr(warp)
-    before = warp.grid()
-    with torch.no_grad():
-        warp.shutter.rates *= 2
-    assert not torch.equal(warp.grid(), before)
-    dewarp = ct.Dewarp(fisheye((60, 80)), shutter=shutter())
-    assert dewarp.shutter is not None
-
-
-@pytest.mark.slow
-def test_it_compiles_as_one_graph():
-    camera = ct.Pinhole.from_fov(60, image_size=(40, 60)).requires_grad_(False)
-    image = torch.rand(2, 3, 40, 60)
-
-    def rolled(image, rates):
-        return ct.Warp(camera, camera, target_shutter=ct.RollingShutter(0.03, rates))(image)
-
-    rates = torch.tensor(RATES)
-    assert torch.allclose(
-        torch.compile(rolled, fullgraph=True, backend="eager")(image, rates), rolled(image, rates), atol=2e-3
-    )
-
-
-@pytest.mark.parametrize(
-    ("arguments", "text"),
-    [
-        ((33.0, RATES), "readout is in seconds; got 33.0"),
-        ((0.03, (1.0, 2.0)), r"rates must be \(\*B, 3\); got shape \(2,\)"),
-        ((0.03, (1.0, math.nan, 2.0)), "rates must be finite"),
-        ((0.03, (0.0, 90.0, 0.0)), "rates are in radians per second"),
-        (([[0.03]], RATES), r"readout must be a number or \(B,\)"),
-        (([0.03, 0.02], [RATES] * 3), "do not fit together"),
-    ],
-)
-def test_what_is_no_shutter_is_refused(arguments, text):
-    with pytest.raises(ValueError, match=text):
-        ct.RollingShutter(*arguments)
-
-
-def test_options_of_a_shutter_are_checked():
-    with pytest.raises(ValueError, match="direction must be one of"):
-        ct.RollingShutter(0.03, RATES, direction="top")
-    with pytest.raises(ValueError, match="exposure must not be negative"):
-        ct.RollingShutter(0.03, RATES, exposure=-0.01)
-    with pytest.raises(TypeError, match="shutter must be a RollingShutter; got float"):
-        ct.Warp(fisheye(), fisheye(), shutter=0.03)
-    lens, two = ct.Pinhole(torch.ones(3, 4), image_size=(4, 4)), ct.RollingShutter(0.03, torch.zeros(2, 3))
-    with pytest.raises(ValueError, match="shutters may each have one batch dim"):
-        ct.Warp(lens, lens, shutter=two)

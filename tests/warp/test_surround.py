@@ -192,29 +192,6 @@ def test_a_view_without_weight_has_no_part(mode, bad):
         assert not result[weights.argmax(0) == 1].isfinite().any()
 
 
-def test_bad_rigs_and_targets_are_refused():
-    rig, camera = car(), wide()
-    with pytest.raises(ValueError, match="target"):
-        ct.surround(rig)
-    with pytest.raises(ValueError, match="target"):
-        ct.surround(rig, camera, x=(-1, 1))
-    with pytest.raises(ValueError, match="extrinsics"):
-        ct.surround(ct.Rig({"a": camera}), camera)
-    with pytest.raises(ValueError, match="distance"):
-        ct.surround(rig, camera, distance=1.0)
-    with pytest.raises(TypeError, match="Rig"):
-        ct.surround([camera], camera)
-    around = ct.surround(rig, camera)
-    with pytest.raises(ValueError, match="front"):
-        around({"front": torch.rand(1, 1, 360, 480)})
-    with pytest.raises(ValueError, match="4 cameras"):
-        around([torch.rand(1, 1, 360, 480)])
-    with pytest.raises(ValueError, match="count"):
-        ct.views.ring(camera, 0)
-    with pytest.raises(ValueError, match="views must be"):
-        ct.views.cube(camera).back(torch.rand(1, 5, 3, 4, 4))
-
-
 def test_views_give_no_label_that_is_in_no_image():
     camera = ct.KannalaBrandt.from_fov(190, image_size=(100, 160)).requires_grad_(False)
     views = ct.views.cube(camera, mode="nearest")

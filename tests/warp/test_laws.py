@@ -1,0 +1,206 @@
+"""Laws of every kind of warp: images and labels go together, a batch goes one by one, and its numbers learn."""
+
+import copy
+import pickle
+
+import pytest
+import torch
+from cameras import slow_unless
+
+import camtorch as ct
+from camtorch.rotations import rotation_matrix
+
+SIZE, SMALL = (24, 32), (10, 14)
+NUMBERS = {
+    "focal": [11.0, 11.2, 15.5, 11.5],
+    "lens": [0.02, -0.01, 0.004, -0.001],
+    "wide": [8.0, 8.2, 6.5, 4.5],
+    "turn": [0.03, -0.1, 0.05],
+    "shift": [0.1, -0.05, 0.08],
+    "normal": [0.1, 0.3, 1.0],
+    "distance": 2.5,
+    "readout": 0.02,
+    "rates": [0.5, 1.8, 0.5],
+}
+LEVEL = torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]).double()
+DEPTH = 1 + torch.rand(1, 1, *SMALL, generator=torch.Generator().manual_seed(1)).double()
+
+
+def source(p):
+    return ct.KannalaBrandt(p["focal"], p["lens"], image_size=SIZE)
+
+
+def target(p):
+    return ct.Pinhole(p["wide"], image_size=SMALL)
+
+
+def pose(p):
+    return ct.Extrinsics(p["turn"][..., None], p["shift"])
+
+
+def shutter(p):
+    return ct.RollingShutter(p["readout"], p["rates"])
+
+
+def above(p):
+    down = rotation_matrix(torch.tensor([0.6, 0, 0]).double()) @ LEVEL
+    rotation = down.to(p["turn"]) @ rotation_matrix(p["turn"])
+    place = p["shift"] + torch.tensor([0.0, 0, 2]).to(p["shift"])
+    return ct.Extrinsics.from_matrix(rotation, -(rotation @ place[..., None])[..., 0])
+
+
+CAMERAS = ("focal", "lens", "wide", "turn")
+# what makes a warp of numbers by name, and which of them it takes
+KINDS = {
+    "turned": (lambda p: ct.Warp(source(p), target(p), rotation_matrix(p["turn"])), CAMERAS),
+    "undone": (
+        lambda p: ct.Warp(source(p), target(p), rotation_matrix(p["turn"]), shutter=shutter(p)),
+        (*CAMERAS, "readout", "rates"),
+    ),
+    "rolling": (
+        lambda p: ct.Warp(source(p), target(p), rotation_matrix(p["turn"]), target_shutter=shutter(p)),
+        (*CAMERAS, "readout", "rates"),
+    ),
+    "plane": (
+        lambda p: ct.PlaneWarp(source(p), target(p), pose(p), p["normal"], p["distance"]),
+        (*CAMERAS, "shift", "normal", "distance"),
+    ),
+    "above": (
+        lambda p: ct.BirdsEye(source(p), above(p), x=(-1.0, 1), y=(0.5, 2), resolution=0.15),
+        ("focal", "lens", "turn", "shift"),
+    ),
+    "sphere": (
+        lambda p: ct.surround(ct.Rig({"a": source(p)}, {"a": pose(p)}), target(p), distance=5.0).warp("a"),
+        (*CAMERAS, "shift"),
+    ),
+    "depth": (lambda p: ct.Reproject(source(p), target(p), pose(p)), (*CAMERAS, "shift")),
+}
+WARPS = [kind for kind in KINDS if kind != "depth"]
+
+
+def numbers(kind, batched=(), dtype=torch.float64):
+    """What a kind takes; three of each that is batched."""
+    found = {name: torch.tensor(NUMBERS[name], dtype=torch.float64) for name in KINDS[kind][1]}
+    scales = torch.tensor([1.0, 1.1, 0.9]).double()
+    return {
+        name: (torch.stack([value * s for s in scales]) if name in batched else value).to(dtype)
+        for name, value in found.items()
+    }
+
+
+def still(kind, batched=(), dtype=torch.float64):
+    return KINDS[kind][0](numbers(kind, batched, dtype)).requires_grad_(False)
+
+
+def made(warp, images):
+    """The images that any kind of warp makes."""
+    return warp(images, DEPTH.to(images.dtype), "distance")[0] if isinstance(warp, ct.Reproject) else warp(images)
+
+
+def smooth(count=1, dtype=torch.float64):
+    v, u = torch.meshgrid(*(torch.arange(side, dtype=dtype) for side in SIZE), indexing="ij")
+    image = torch.stack((torch.sin(u / 5) * torch.cos(v / 4), u / 32, v / 24))
+    return torch.stack([image * (1 + 0.1 * i) for i in range(count)])
+
+
+def results(warp, images, points):
+    """Images and, of what moves labels, all of these."""
+    if isinstance(warp, ct.Reproject):
+        return [made(warp, images)]
+    boxes, rays = torch.cat((points, points + 5), -1), torch.nn.functional.pad(points / 9 - 1, (0, 1), value=1.0)
+    moved = [*warp.transform_points(points), *warp.transform_boxes(boxes), warp.transform_rays(rays)]
+    return [warp(images), warp.valid_mask(), warp.grid(), *moved]
+
+
+@pytest.mark.parametrize(
+    ("kind", "batched"), [(kind, names) for kind in KINDS for names in (*zip(KINDS[kind][1]), KINDS[kind][1])]
+)
+def test_a_batch_goes_one_by_one(kind, batched):
+    many, images = still(kind, batched), smooth(3)
+    points = torch.rand(3, 7, 2, generator=torch.Generator().manual_seed(0)).double() * 20
+    whole = results(many, images, points)
+    for i in range(3):
+        single = {name: value[i] if name in batched else value for name, value in numbers(kind, batched).items()}
+        alone = KINDS[kind][0](single).requires_grad_(False)
+        for batch, one in zip(whole, results(alone, images[i : i + 1], points[i]), strict=True):
+            row = batch[i] if len(batch) == 3 else batch[0]
+            torch.testing.assert_close(row, one[0] if one.ndim == batch.ndim else one, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_all_that_it_is_made_of_learns(kind):
+    names, values = zip(*numbers(kind).items(), strict=True)
+    leaves = [value.clone().requires_grad_() for value in values]
+
+    def image(images, *values):
+        return made(KINDS[kind][0](dict(zip(names, values, strict=True))), images)
+
+    # bilinear sampling is piecewise smooth: the step of the check must not cross a pixel boundary
+    images = smooth()[:, :1].requires_grad_()
+    assert torch.autograd.gradcheck(image, (images, *leaves), eps=1e-7, atol=1e-5, fast_mode=True)
+    image(images, *leaves).square().sum().backward()
+    assert all(leaf.grad.any() for leaf in leaves)
+
+
+@pytest.mark.parametrize("kind", WARPS)
+def test_the_image_agrees_with_the_points(kind):
+    """An image of the coordinates, warped, holds the source coordinates from which points get to each pixel."""
+    warp = still(kind)
+    v, u = torch.meshgrid(*(torch.arange(side, dtype=torch.float64) for side in SIZE), indexing="ij")
+    back = warp(torch.stack((u, v))[None])[0].movedim(0, -1)
+    seen, grid = warp.valid_mask()[0, 0], warp.target.pixel_grid().double()
+    inside = seen & (back > 1).all(-1) & (back < torch.tensor([SIZE[1] - 2, SIZE[0] - 2])).all(-1)
+    assert inside.sum() > 30
+    moved, valid = warp.transform_points(back[inside])
+    assert valid.all()
+    torch.testing.assert_close(moved, grid[inside], rtol=0, atol=1e-7)
+    if kind != "sphere":
+        again, valid = warp.inverse().transform_points(grid)
+        assert torch.equal(valid, seen)
+        torch.testing.assert_close(again[inside], back[inside], rtol=0, atol=1e-7)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_it_is_kept_until_something_changes(kind):
+    warp, images = still(kind), smooth()
+    before = made(warp, images)
+    assert torch.equal(made(warp, images), before)
+    tensors = dict((*warp.named_parameters(), *warp.named_buffers()))
+    for name, tensor in tensors.items():
+        if tensor.numel() == 0 or name.endswith(("exposure", "offset")) or (kind == "above" and name == "normal"):
+            continue
+        tensor.data.mul_(1.02)
+        changed = made(warp, images)
+        assert not torch.equal(changed, before), name
+        tensor.data.div_(1.02)
+        torch.testing.assert_close(made(warp, images), before, rtol=0, atol=1e-9)
+
+
+@pytest.mark.filterwarnings("ignore:.torch.jit:DeprecationWarning")
+@pytest.mark.parametrize("kind", slow_unless({"turned", "depth"}.__contains__, list(KINDS)))
+def test_it_is_copied_compiled_and_exported(kind):
+    warp, images = still(kind, dtype=torch.float32), smooth(2, torch.float32)
+    expected = made(warp, images)
+    for other in (copy.deepcopy(warp), pickle.loads(pickle.dumps(warp))):
+        assert torch.equal(made(other, images), expected)
+    compiled = torch.compile(lambda images: made(warp, images), fullgraph=True, backend="eager")
+    torch.testing.assert_close(compiled(images), expected, rtol=0, atol=2e-4)
+    if kind in WARPS:
+        exported = torch.export.export(warp, (images,)).module()
+        torch.testing.assert_close(exported(images), expected, rtol=0, atol=2e-4)
+        mapped = torch.func.vmap(lambda image: warp(image[None])[0])(images)
+        torch.testing.assert_close(mapped, expected, rtol=0, atol=2e-4)
+
+
+@pytest.mark.parametrize("dtype", [torch.uint8, torch.bool, torch.int32, torch.float16, torch.float32])
+@pytest.mark.parametrize("kind", KINDS)
+def test_images_keep_their_dtype_and_integers_have_no_graph(kind, dtype):
+    learning = KINDS[kind][0](numbers(kind)).requires_grad_(True)
+    images = (200 * smooth()).abs().to(dtype)
+    result, exact = made(learning, images) if kind != "depth" else learning(images, DEPTH)[0], None
+    assert result.dtype == dtype
+    assert result.requires_grad == dtype.is_floating_point
+    exact = made(still(kind), images.double()) if kind != "depth" else still(kind)(images.double(), DEPTH)[0]
+    exact = (exact >= 0.5).double() if dtype == torch.bool else exact
+    bound = {torch.bool: 0, torch.float16: 0.2, torch.float32: 0.02}.get(dtype, 0.51)
+    assert (result.double() - exact).abs().max() <= bound
