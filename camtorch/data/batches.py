@@ -105,8 +105,7 @@ class MapBatches(Mover):
         values = [row.pop(name) for name in self._keys]
         values = [value.item() if isinstance(value, np.generic) else value for value in values]
         key: Key | None = tuple(values) if len(values) > 1 else values[0] if values else None
-        if numbers := {part: row.pop(f"camera_{part}") for part in PARTS if f"camera_{part}" in row}:
-            row["camera"] = numbers
+        row["camera"] = {part: row.pop(f"camera_{part}") for part in PARTS if f"camera_{part}" in row} or None
         moved = dict(self._moved(key, row))
         camera = moved.pop("camera", None)
         return moved if camera is None else {**moved, **to_columns(camera)}

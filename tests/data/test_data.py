@@ -243,7 +243,7 @@ def test_columns_as_engines_hand_them_over():
         nested[i] = np.empty(3, object)
         for j, point in enumerate(row["keypoints"]):
             nested[i][j] = point
-    given = whole | {"keypoints": nested, "path": list(whole["path"]), "none": [None] * 3}
+    given = whole | {"keypoints": nested, "path": list(whole["path"]), "none": [None] * 3, "camera": ["left"] * 3}
     given["nose"], given["score"] = whole["keypoints"], np.ones((3, 2))
     found = function(given)
     assert np.array_equal(found["image"], expected["image"])
