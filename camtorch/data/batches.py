@@ -42,8 +42,7 @@ class MapBatches(Mover):
     or worker, and in a loop in one process.
 
     Args:
-        transform: an augmentation; a `Warp` or `Dewarp`; or what makes a warp of a camera, such as `ct.Dewarp` itself,
-            for rows that have cameras.
+        transform: an augmentation, or a `Warp` or `Dewarp`.
         key: the column that names a row for ever, of whole numbers or strings, or a list of such columns. Only what
             draws needs it. Paths should begin at the folder of the data set where they differ between machines.
         seed, epoch: of what is drawn.

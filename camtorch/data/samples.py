@@ -36,7 +36,7 @@ class MapSamples(Mover):
     A sample is drawn by its key: it comes out the same to the bit from whatever shard, node or worker.
 
     Args:
-        transform: an augmentation; a `Warp` or `Dewarp`; or what makes a warp of a camera, such as `ct.Dewarp`.
+        transform: an augmentation, or a `Warp` or `Dewarp`.
         key: the entry that names a sample for ever. Where several shards hold the same keys, something that tells
             them apart has to be put in.
         labels: the entry of labels.
