@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from camtorch._arguments import shown
 from camtorch.augment.sample import IMAGES, KEEP
 from camtorch.camera import Camera
 from camtorch.data.columns import PARTS, to_columns
@@ -58,6 +59,9 @@ class MapSamples(Mover):
         fields: Mapping[str, str] | None = None,
     ):
         super().__init__(transform, seed, epoch, fields)
+        for name, value in (("key", key), ("labels", labels)):
+            if not isinstance(value, str):
+                raise TypeError(f"{_OWNER}: {name} must name an entry of a sample; got {shown(value)}")
         self._key, self._labels = key, labels
 
     def __call__(self, sample: Mapping[str, Any]) -> dict[str, Any]:
