@@ -84,7 +84,8 @@ class Mover:
         A row has arrays, or lists of numbers; `camera` is one, or an object of its numbers.
         """
         try:
-            fields = {name: _dense(name, value) for name, value in row.items() if self._moves(name, value)}
+            moving = {name: value for name, value in row.items() if self._moves(name, value)}
+            fields = {name: _dense(name, value, self._fields.get(name, name)) for name, value in moving.items()}
             camera = row.get("camera")
             if camera is not None:
                 fields["camera"] = camera if isinstance(camera, Camera) else self._camera(camera, fields)
@@ -113,15 +114,16 @@ class Mover:
         return camera_of({part: _dense(part, value) for part, value in parts.items()}, self._owner)
 
 
-def _dense(name: str, value: Any) -> Any:
+def _dense(name: str, value: Any, kind: str = "") -> Any:
     """An array of numbers, or of bool for validity, where it came as lists, or as arrays in an array of objects."""
     if isinstance(value, list):
         try:
             array = np.asarray(value, bool if name.endswith("_valid") else np.float64)
         except (ValueError, TypeError, OverflowError):
             raise ValueError(f"{name} must be numbers in lists of one length; got {value!r:.80}") from None
-        kind = KINDS.get(name)
-        return array if array.size or kind is None else array.reshape(*[0] * (kind.dims - 1), *kind.last)
+        if array.size or kind not in KINDS:
+            return array
+        return array.reshape(*[0] * (KINDS[kind].dims - 1), *KINDS[kind].last)
     if isinstance(value, np.ndarray) and value.dtype == object:
         parts = [_dense(name, part) for part in value]
         if parts and all(isinstance(part, np.ndarray) and part.shape == parts[0].shape for part in parts):

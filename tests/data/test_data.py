@@ -361,5 +361,6 @@ def test_wrong_samples_are_told():
         function({"jpg": sample["jpg"]})
     with pytest.raises(TypeError, match=r"must be a dict of entries, before .to_tuple; got tuple"):
         function(("jpg",))
-    empty = function(sample | {"json": {"keypoints": [], "polygons": [], "boxes": None}})
+    function = ct.data.MapSamples(augmentation(), fields={"nose": "keypoints"})
+    empty = function(sample | {"json": {"keypoints": [], "polygons": [], "boxes": None, "nose": []}})
     assert (empty["json"]["keypoints"], empty["json"]["polygons"], empty["json"]["boxes"]) == ([], [], None)
