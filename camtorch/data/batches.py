@@ -42,8 +42,7 @@ class MapBatches(Mover):
     or worker, and in a loop in one process.
 
     Args:
-        transform: an augmentation; a `Warp` or `Dewarp`; or what makes a warp of a camera, such as `ct.Dewarp` itself,
-            for rows that have cameras.
+        transform: an augmentation, or a `Warp` or `Dewarp`.
         key: the column that names a row for ever, of whole numbers or strings, or a list of such columns. Only what
             draws needs it. Paths should begin at the folder of the data set where they differ between machines.
         seed, epoch: of what is drawn.
@@ -105,8 +104,7 @@ class MapBatches(Mover):
         values = [row.pop(name) for name in self._keys]
         values = [value.item() if isinstance(value, np.generic) else value for value in values]
         key: Key | None = tuple(values) if len(values) > 1 else values[0] if values else None
-        if numbers := {part: row.pop(f"camera_{part}") for part in PARTS if f"camera_{part}" in row}:
-            row["camera"] = numbers
+        row["camera"] = {part: row.pop(f"camera_{part}") for part in PARTS if f"camera_{part}" in row} or None
         moved = dict(self._moved(key, row))
         camera = moved.pop("camera", None)
         return moved if camera is None else {**moved, **to_columns(camera)}

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from camtorch._arguments import as_mapping
-from camtorch._module import Memo
 from camtorch.augment.augmentation import Augmentation
 from camtorch.augment.change import Part
 from camtorch.augment.face import FaceNormalizer
@@ -24,9 +22,8 @@ from camtorch.warp.proxy import ProxyWarp
 from camtorch.warp.shutter import Shutters
 from camtorch.warp.warp import Warp
 
-Moves = Augmentation | FaceNormalizer | Warp | Callable[[Camera], Warp]
-"""What moves samples: an augmentation, a warp, or what makes the warp of a sample's camera, such as `ct.Dewarp`."""
-_MOST_WARPS = 16  # whose maps are kept
+Moves = Augmentation | FaceNormalizer | Warp
+"""What moves samples."""
 
 
 class Always(Augmentation):
@@ -64,8 +61,6 @@ class Mover:
         self._fields = dict(as_mapping(fields, "fields", owner, "{'lidar': 'points'}"))
         self._seeded: Seeded | None = None
         self._fixed: Transform | None = None
-        self._make: Callable[[Camera], Warp] | None = None
-        self._made = Memo(_MOST_WARPS)
         if isinstance(transform, (Augmentation, FaceNormalizer)):
             transform = copy.copy(transform)
             transform.fields = self._fields = {**transform.fields, **self._fields}
@@ -75,13 +70,8 @@ class Mover:
                 self._seeded = Seeded(Transform(transform), seed=seed, epoch=epoch)
         elif isinstance(transform, Warp):
             self._fixed = Transform(Always(transform, owner, self._fields))
-        elif callable(transform) and not isinstance(transform, torch.nn.Module):
-            self._make = transform
         else:
-            raise TypeError(
-                f"{owner}: transform must be an augmentation, a Warp, or what makes a Warp of a camera, as ct.Dewarp "
-                f"does; got {type(transform).__name__}"
-            )
+            raise TypeError(f"{owner}: transform must be an augmentation or a Warp; got {type(transform).__name__}")
 
     def set_epoch(self, epoch: int) -> None:
         """Draw for this epoch from now on; workers and engines that were given a copy before do not hear of it."""
@@ -94,13 +84,15 @@ class Mover:
         A row has arrays, or lists of numbers; `camera` is one, or an object of its numbers.
         """
         try:
-            fields = {name: _dense(name, value) for name, value in row.items() if self._moves(name, value)}
+            moving = {name: value for name, value in row.items() if self._moves(name, value)}
+            fields = {name: _dense(name, value, self._fields.get(name, name)) for name, value in moving.items()}
             camera = row.get("camera")
             if camera is not None:
                 fields["camera"] = camera if isinstance(camera, Camera) else self._camera(camera, fields)
-            if self._seeded is not None:
-                return self._seeded(fields, key=key)  # type: ignore[arg-type]
-            return (self._fixed or self._by_camera(fields))(fields)
+            if self._fixed is not None:
+                return self._fixed(fields)
+            assert self._seeded is not None
+            return self._seeded(fields, key=key)  # type: ignore[arg-type]
         except (ValueError, TypeError) as error:
             which = "" if key is None else f"sample {key!r:.200}: "
             kind = TypeError if isinstance(error, TypeError) else ValueError
@@ -121,32 +113,17 @@ class Mover:
             raise ValueError(f"the camera has no {', '.join(missing)}; ct.data.to_columns tells all of it")
         return camera_of({part: _dense(part, value) for part, value in parts.items()}, self._owner)
 
-    def _by_camera(self, fields: Sample) -> Transform:
-        """What moves the samples of a camera."""
-        camera, make = fields.get("camera"), self._make
-        if not isinstance(camera, Camera) or make is None:
-            there = ", ".join(fields) or "nothing"
-            raise ValueError(f"no camera in the sample, of which a warp is made; it has {there}")
 
-        def made() -> Transform:
-            warp = make(camera)
-            if not isinstance(warp, Warp):
-                raise TypeError(f"what makes the warp of a camera must return a Warp; got {type(warp).__name__}")
-            return Transform(Always(warp, self._owner, self._fields))
-
-        found: Transform = self._made((camera.intrinsics, camera.distortion), (camera.key, camera.image_size), made)
-        return found
-
-
-def _dense(name: str, value: Any) -> Any:
+def _dense(name: str, value: Any, kind: str = "") -> Any:
     """An array of numbers, or of bool for validity, where it came as lists, or as arrays in an array of objects."""
     if isinstance(value, list):
         try:
             array = np.asarray(value, bool if name.endswith("_valid") else np.float64)
         except (ValueError, TypeError, OverflowError):
             raise ValueError(f"{name} must be numbers in lists of one length; got {value!r:.80}") from None
-        kind = KINDS.get(name)
-        return array if array.size or kind is None else array.reshape(*[0] * (kind.dims - 1), *kind.last)
+        if array.size or kind not in KINDS:
+            return array
+        return array.reshape(*[0] * (KINDS[kind].dims - 1), *KINDS[kind].last)
     if isinstance(value, np.ndarray) and value.dtype == object:
         parts = [_dense(name, part) for part in value]
         if parts and all(isinstance(part, np.ndarray) and part.shape == parts[0].shape for part in parts):

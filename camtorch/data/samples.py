@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from camtorch._arguments import shown
 from camtorch.augment.sample import IMAGES, KEEP
 from camtorch.camera import Camera
 from camtorch.data.columns import PARTS, to_columns
@@ -36,7 +37,7 @@ class MapSamples(Mover):
     A sample is drawn by its key: it comes out the same to the bit from whatever shard, node or worker.
 
     Args:
-        transform: an augmentation; a `Warp` or `Dewarp`; or what makes a warp of a camera, such as `ct.Dewarp`.
+        transform: an augmentation, or a `Warp` or `Dewarp`.
         key: the entry that names a sample for ever. Where several shards hold the same keys, something that tells
             them apart has to be put in.
         labels: the entry of labels.
@@ -58,6 +59,9 @@ class MapSamples(Mover):
         fields: Mapping[str, str] | None = None,
     ):
         super().__init__(transform, seed, epoch, fields)
+        for name, value in (("key", key), ("labels", labels)):
+            if not isinstance(value, str):
+                raise TypeError(f"{_OWNER}: {name} must name an entry of a sample; got {shown(value)}")
         self._key, self._labels = key, labels
 
     def __call__(self, sample: Mapping[str, Any]) -> dict[str, Any]:

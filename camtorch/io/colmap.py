@@ -262,7 +262,7 @@ def _images_from_bytes(path: str, file: BinaryIO) -> Iterator[_ImageEntry]:
 # -- writing
 
 
-def files(rig: Rig, path: str) -> dict[str, bytes]:
+def render(rig: Rig, path: str) -> dict[str, bytes]:
     """The files of a rig: cameras, and images beside them where there are poses.
 
     Each camera takes the smallest model that holds its values, and its id where its name is one.

@@ -35,7 +35,7 @@ from camtorch.io import (
 )
 from camtorch.io._errors import CameraFileError
 from camtorch.io.parsing import parse_mapping, path_of, read_bytes
-from camtorch.io.protocol import ContentFormat, FilesFormat, KeyFormat, Names, TextFormat
+from camtorch.io.protocol import ContentFormat, KeyFormat, Names, WrittenFormat
 from camtorch.io.record import Record
 from camtorch.io.writing import replacing
 from camtorch.rig import Rig
@@ -57,24 +57,24 @@ _BY_KEYS: tuple[KeyFormat, ...] = (
     opencv,
 )
 
-# written
-_AS_TEXT: tuple[TextFormat, ...] = (
+_WRITTEN: tuple[WrittenFormat, ...] = (
     aria,
     basalt,
     blender,
     camtorch_json,
     carla,
+    colmap,
     kalibr,
     mrcal,
     nerfstudio,
     opencv,
+    rays,
     ros,
     usda,
 )
-_AS_FILES: tuple[FilesFormat, ...] = (colmap, rays)
 
 READ = {m.NAMES.format: m.NAMES for m in (*_BY_CONTENT, *_BY_KEYS)}
-WRITTEN = {m.NAMES.format: m.NAMES for m in (*_AS_TEXT, *_AS_FILES)}
+WRITTEN = {m.NAMES.format: m.NAMES for m in _WRITTEN}
 FORMATS = tuple(READ | WRITTEN)
 _OF_RENDERERS = (".usda", ".exr")  # whose content says nothing to a reader
 
@@ -192,11 +192,8 @@ def rendered(rig: Rig | Camera, path: str | os.PathLike[str], format: str | None
             raise ValueError(f"{path}: is a folder; {format} is one file, so name it")
         path = next(filter(os.path.exists, inside), inside[-1])
     try:
-        for writer in _AS_FILES:
-            if writer.NAMES.format == format:
-                return writer.files(rig, path)
-        text = next(module for module in _AS_TEXT if module.NAMES.format == format)
-        return {path: text.render(rig, path).encode()}
+        found = next(module for module in _WRITTEN if module.NAMES.format == format).render(rig, path)
+        return {path: found.encode()} if isinstance(found, str) else found
     except UnicodeEncodeError as error:
         raise CameraFileError(path, "names", f"{error.object!r:.60} is no text that a file can hold") from None
 

@@ -57,15 +57,11 @@ class ContentFormat(Format, Protocol):
         """The cameras of a file, in float64, with what lies beside it. Raises CameraFileError."""
 
 
-class TextFormat(Format, Protocol):
-    """A module that writes text."""
+class WrittenFormat(Format, Protocol):
+    """A module that writes."""
 
-    def render(self, rig: Rig, path: str) -> str:
-        """The text of a file. Raises CameraFileError for what the format cannot hold."""
+    def render(self, rig: Rig, path: str) -> str | dict[str, bytes]:
+        """The text of a file; or the contents of files that are no text, or several, by their paths.
 
-
-class FilesFormat(Format, Protocol):
-    """A module that writes files of any other kind, one or several of them."""
-
-    def files(self, rig: Rig, path: str) -> dict[str, bytes]:
-        """The contents of the files to write, by their paths. Raises CameraFileError for what they cannot hold."""
+        Raises CameraFileError for what the format cannot hold.
+        """

@@ -20,7 +20,7 @@ NAMES = Names("rays", "a ray field", (".npz", ".exr"), ("*.exr",))
 
 
 @torch.no_grad()
-def files(rig: Rig, path: str) -> dict[str, bytes]:
+def render(rig: Rig, path: str) -> dict[str, bytes]:
     """The rays of one camera, which loses its name. Raises what `as_exr` raises."""
     lossy = Lossy(path, NAMES.title)
     if not path.lower().endswith(NAMES.suffixes):

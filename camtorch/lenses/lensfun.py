@@ -74,10 +74,8 @@ def from_lensfun(camera: Any, lens: Any, focal_length: float, *, image_size: Seq
         middle = (np.array(small) - 1) / 2
         seen = float(np.linalg.norm(moved[0, 0] - middle) / np.linalg.norm(middle))
         corners.sort(key=lambda r: abs(factor(r, *found.terms) - seen))
-    angle, long = (
-        _ANGLES[lens.type.name],
-        2 * focal * camera.crop_factor / _DIAGONAL,
-    )  # the focal length in half diagonals
+    angle = _ANGLES[lens.type.name]
+    long = 2 * focal * camera.crop_factor / _DIAGONAL  # the focal length in half diagonals
     reach = np.linspace(0, 2, 8 * _NODES)  # undistorted, in half diagonals
     with np.errstate(invalid="ignore"):
         angles = angle(reach / long)

@@ -106,7 +106,7 @@ def load_map(path: str | os.PathLike[str], format: str | None = None) -> LookupM
         if chosen.described:
             rows, columns, height, width = (facts[key] for key in SIZES)
             sizes = {"source_size": (rows, columns), "target_size": (height, width)}
-        read = chosen.decode(content, Options(step=facts.get("step"), **sizes))
+        read = chosen.decode(content, Options(step=described.get("step"), **sizes))
     except ImportError:
         raise
     except Exception as error:  # whatever a damaged file makes of the library that reads it

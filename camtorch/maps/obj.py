@@ -57,7 +57,8 @@ class OBJ(MapFormat):
         nodes = np.stack((parts[:, 0], 1 - parts[:, 1]), -1).reshape(len(y), len(x), 2) * source[::-1] - 0.5
         corners = np.array([[int(word.split("/")[0]) for word in words] for words in lines["f"]]).reshape(-1, 3) - 1
         drawn = np.zeros((len(y) - 1, len(x) - 1, 2), np.bool_)
-        drawn[(*divmod(corners[:, 0], len(x)), (corners[:, 1] == corners[:, 0] + len(x)).astype(np.intp))] = True
+        i, j = np.divmod(corners[:, 0], len(x))
+        drawn[i, j, (corners[:, 1] == corners[:, 0] + len(x)).astype(np.intp)] = True
         positions = Mesh(x - 0.5, y - 0.5, nodes, drawn=drawn).positions(target)
         facts = {"nodes": (len(y), len(x)), "triangles": len(corners)}
         return LookupMap(torch.from_numpy(positions), source, self.name, facts)

@@ -114,10 +114,9 @@ def test_two_workers_make_what_one_process_makes(cluster, tmp_path, blocks, size
 
 def test_actors_that_are_made_by_ray(cluster):
     rows = ray.data.from_items(samples(), override_num_blocks=4)
-    numbers = rows.map(lambda row: row | ct.data.to_columns(camera()))
-    dewarped = numbers.map_batches(
+    dewarped = rows.map_batches(
         ct.data.MapBatches,
-        fn_constructor_args=(ct.Dewarp,),
+        fn_constructor_args=(ct.Dewarp(camera()),),
         compute=ray.data.ActorPoolStrategy(size=2),
         batch_size=5,
     )

@@ -43,11 +43,12 @@ def loads_or_says_why(path):
     return True
 
 
-@pytest.mark.parametrize("name", SAMPLES)
+@pytest.mark.parametrize("name", [*SAMPLES, "nuscenes/calibrated_sensor.json"])
 def test_truncated_anywhere(name, tmp_path):
-    whole = (FILES / name).read_bytes()
+    given = FILES / name
+    whole = given.read_bytes()
     for length in {*range(0, len(whole), 37), *range(max(0, len(whole) - 5), len(whole))}:
-        loads_or_says_why(written(tmp_path / name, whole[:length]))
+        loads_or_says_why(written(tmp_path / given.name, whole[:length]))
 
 
 @pytest.mark.parametrize("suffix", ["txt", "bin"])
