@@ -172,9 +172,9 @@ def _map(commands: Commands) -> None:
     text = "a calibration: the new image is what that camera would see"
     target("--target", type=words.path, metavar="FILE", help=text)
     file = command.add_argument_group("the map").add_argument
-    text = "opencv, opencv_fixed, stmap, dw100, ti_ldc, obj or onnx; by default what OUT's name says"
+    text = "opencv, opencv_fixed, stmap, dw100, ti_ldc, depthai, obj or onnx; by default what OUT's name says"
     file("--format", help=text)
-    file("--step", type=int, metavar="PIXELS", help="between nodes: ti_ldc, obj")
+    file("--step", type=int, metavar="PIXELS", help="between nodes: ti_ldc, depthai, obj")
     file("--v", choices=("up", "down"), help="stmap: which way v runs; up by default, as in Nuke")
     file("--block", type=words.size, metavar="WxH", help="ti_ldc: of the new image; by default what fits")
     file("--dtype", choices=("float32", "uint8"), help="onnx: of images; float32 by default")

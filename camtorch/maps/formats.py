@@ -13,6 +13,7 @@ from camtorch._arguments import as_image_size, as_whole
 from camtorch.io._errors import CameraFileError
 from camtorch.io.parsing import path_of, read_bytes
 from camtorch.io.writing import as_json, replacing
+from camtorch.maps.depthai import DepthAI
 from camtorch.maps.dw100 import DW100
 from camtorch.maps.exact import Exact
 from camtorch.maps.lookup import LookupMap
@@ -36,6 +37,7 @@ _FORMATS: dict[str, MapFormat] = {
         STMap(),
         DW100(),
         TILDC(),
+        DepthAI(),
         OBJ(),
         ONNX(),
     )

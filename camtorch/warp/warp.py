@@ -384,10 +384,10 @@ class Warp(GeometryModule):
 
         Args:
             path: of the file, replaced as a whole or not at all. Bare tables get a description beside them, PATH.json.
-            format: "opencv" (.yml, .npz), "opencv_fixed" (the same), "stmap" (.exr, .tif), "dw100", "ti_ldc", "obj" or
-                "onnx"; by default what the suffix says.
-            step: pixels of the target between the nodes of a mesh: 16 by default for "obj", 8 for "ti_ldc", where it is
-                a power of two up to 128.
+            format: "opencv" (.yml, .npz), "opencv_fixed" (the same), "stmap" (.exr, .tif), "dw100", "ti_ldc",
+                "depthai", "obj" or "onnx"; by default what the suffix says.
+            step: pixels of the target between the nodes of a mesh: 16 by default for "depthai" and "obj", 8 for
+                "ti_ldc", where it is a power of two up to 128.
             v: "stmap": "up", as Nuke has it and by default, or "down".
             block: "ti_ldc": (height, width) of the blocks of the target; by default the largest that can be had.
             dtype: "onnx": of the images, "float32" by default.

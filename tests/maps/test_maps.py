@@ -117,6 +117,12 @@ def with_ti(path, warp, step=8, **_):
     return between(nodes, step, (height, width))
 
 
+def with_depthai(path, warp, step=16, **_):
+    height, width = warp.target.image_size
+    nodes = np.fromfile(path, "<f4").reshape(math.ceil(height / step) + 1, math.ceil(width / step) + 1, 2)
+    return between(nodes[..., ::-1], step, (height, width))
+
+
 def with_triangles(points, uv, triangles, warp):
     """Every triangle filled by its own affine map."""
     (height, width), (rows, columns) = warp.target.image_size, warp.source.image_size
@@ -154,6 +160,8 @@ CASES = [
     ("map.bin", "dw100", {}, with_dw100, 0.5),
     ("map.bin", "ti_ldc", {}, with_ti, 0.2),
     ("map.bin", "ti_ldc", {"step": 16}, with_ti, 0.5),
+    ("map.bin", "depthai", {}, with_depthai, 0.5),
+    ("map.bin", "depthai", {"step": 8}, with_depthai, 0.2),
     ("map.obj", "obj", {}, with_obj, 0.5),
 ]
 
@@ -241,7 +249,7 @@ def test_pixels_without_a_ray_are_marked(name, tmp_path):
     assert (read.grid()[0] == -9).all(-1).equal((warp.grid()[0] == -9).all(-1))
 
 
-@pytest.mark.parametrize("format", ["dw100", "ti_ldc"])
+@pytest.mark.parametrize("format", ["dw100", "ti_ldc", "depthai"])
 def test_meshes_go_on_where_rays_end(format, tmp_path):
     camera = partial().source
     warp = ct.Warp(camera, ct.KannalaBrandt([55.0, 55, 130, 80], image_size=(160, 256)).double(), tolerance=0)
