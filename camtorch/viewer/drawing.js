@@ -826,11 +826,6 @@ const Viewer = (() => {
     pinhole: ["PINHOLE", [[]]], kannala_brandt: ["OPENCV_FISHEYE", [["k1", "k2", "k3", "k4"]]],
     brown_conrady: ["OPENCV", [["k1", "k2", "p1", "p2"], ["k1", "k2", "p1", "p2", "k3"]]],
   };
-  const CAMODOCAL = {
-    mei: ["MEI", [["mirror", ["xi"]], ["distortion", ["k1", "k2", "p1", "p2"]], ["projection", ["gamma1", "gamma2", "u0", "v0"]]]],
-    brown_conrady: ["PINHOLE", [["distortion", ["k1", "k2", "p1", "p2"]], ["projection", ["fx", "fy", "cx", "cy"]]]],
-    kannala_brandt: ["KANNALA_BRANDT", [["projection", ["k2", "k3", "k4", "k5", "mu", "mv", "u0", "v0"]]]],
-  };
 
   // name of the file, and its text; null for a lens that the format cannot hold
   const FORMATS = {
@@ -925,32 +920,6 @@ const Viewer = (() => {
         "{", `    'lensmodel':  'LENSMODEL_${name}',`, `    'intrinsics': ${listed([...intrinsics, ...numbers])},`,
         `    'rt_cam_ref': ${pose},`, `    'extrinsics': ${pose},`, `    'imagersize': [ ${size[1]}, ${size[0]},],`, "}", "",
       ].join("\n")];
-    },
-    "WoodScape (JSON)": ({ model, intrinsics: [fx, fy, cx, cy], distortion, size: [height, width] }) => {
-      if (model !== "woodscape" || distortion.length !== 3) return null;
-      const lens = {
-        model: "radial_poly", poly_order: 4, aspect_ratio: fy / fx, width, height,
-        cx_offset: cx - (width - 1) / 2, cy_offset: cy - (height - 1) / 2,
-        ...named(["k1", "k2", "k3", "k4"], [fx, ...distortion.map((k) => k * fx)]),
-      };
-      const extrinsic = { quaternion: [0, 0, 0, 1], translation: [0, 0, 0] };
-      return json("calibration.json", { name: "camera", extrinsic, intrinsic: lens });
-    },
-    "camodocal (YAML)": ({ model, intrinsics, distortion, size }) => {
-      const [kind, groups] = CAMODOCAL[model] ?? [], values = [...distortion, ...intrinsics];
-      if (!kind || values.length !== groups.reduce((sum, [, names]) => sum + names.length, 0)) return null;
-      const lines = groups.flatMap(([group, names]) => [`${group}_parameters:`, ...names.map((name) => `   ${name}: ${numeral(values.shift())}`)]);
-      const head = ["%YAML:1.0", "---", `model_type: ${kind}`, "camera_name: camera", `image_width: ${size[1]}`, `image_height: ${size[0]}`];
-      return ["camera.yaml", [...head, ...lines, ""].join("\n")];
-    },
-    "Gyroflow (JSON)": ({ model, intrinsics: [fx, fy, cx, cy], distortion, size: [h, w] }) => {
-      const kind = { kannala_brandt: "opencv_fisheye", brown_conrady: "opencv_standard" }[model], n = distortion.length;
-      if (!kind || !(n === 4 || (model === "brown_conrady" && [5, 8, 12].includes(n)))) return null;
-      const params = { RMS_error: 0, camera_matrix: [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], distortion_coeffs: distortion };
-      return json("lens.json", {
-        name: "camera", calibrator_version: "camtorch", calib_dimension: { w, h }, orig_dimension: { w, h }, asymmetrical: true,
-        input_horizontal_stretch: 1, input_vertical_stretch: 1, distortion_model: kind, fisheye_params: params,
-      });
     },
   };
 

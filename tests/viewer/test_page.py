@@ -110,8 +110,7 @@ def test_every_model_is_shown_by_its_address(key, opened):
         assert type(loaded) is type(camera)
         assert loaded.image_size == camera.image_size
         torch.testing.assert_close(loaded.intrinsics.detach(), camera.intrinsics.detach(), rtol=0, atol=1e-11)
-        # WoodScape's file has the products of coefficients and focal length
-        torch.testing.assert_close(loaded.distortion.detach(), camera.distortion.detach(), rtol=1e-15, atol=0)
+        torch.testing.assert_close(loaded.distortion.detach(), camera.distortion.detach(), rtol=0, atol=0)
 
 
 def read(name, text):
