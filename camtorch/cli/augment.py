@@ -17,6 +17,7 @@ from camtorch.cli.coco import read_json
 from camtorch.cli.commands import SHEET, SHEET_COUNT
 from camtorch.cli.terminal import note
 from camtorch.data.labelled import failing_at
+from camtorch.data.seeded import generator
 
 _MUCH = 1 / 3  # of the new images
 _NOTHING = (233, 225, 209)  # the colour of what no camera saw
@@ -43,10 +44,6 @@ def run(arguments: argparse.Namespace) -> int:
     if like is not None and like != "real" and like not in PRESETS:
         known = "; ".join(f"{name}, {preset.origin}" for name, preset in PRESETS.items())
         raise ValueError(f"there is no preset {like!r}. There are none, the image's own lens; {known}; real, {_REAL}")
-    if not 0 <= arguments.seed < 1 << 63:
-        raise ValueError(f"--seed must be 0 or more, and below 2 to the 63rd; got {arguments.seed}")
-    if not 0 <= arguments.min_filled <= 1:
-        raise ValueError(f"--min-filled must be 0 to 1; got {arguments.min_filled:g}")
     given = {name: getattr(arguments, name) for name in ("yaw", "pitch", "roll", "zoom", "fov")}
     options = {name: value for name, value in given.items() if value is not None}
     options |= {"like": like, "image_size": arguments.size, "min_filled": arguments.min_filled or None}
@@ -115,9 +112,8 @@ def _augmented(
     size = max(1, round(height * scale)), max(1, round(width * scale))
     options = {**options, "image_size": size}
     augmentation = RandomCamera(antialias=True, fill=_NOTHING, valid_mask=True, **options)
-    generator = torch.Generator().manual_seed(seed)
-    for _ in range(count):
-        draw = augmentation.draw(1, generator)
+    for i in range(count):
+        draw = augmentation.draw(1, generator(i, seed=seed))
         new = augmentation(before, draw=draw)
         angles = [f"{name} {float(draw[name]) + 0.0:+.1f}°" for name in ("yaw", "pitch", "roll")]
         wide = f"{options['like'] or camera.key}, {float(new['camera'].fov[0]):.0f}° wide"

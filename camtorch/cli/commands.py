@@ -137,7 +137,7 @@ def _augment(commands: Commands) -> None:
     add("--preset", default="none", metavar="NAME", help="whose lens the other cameras have")
     add("--list", action="store_true", help="print the presets, and nothing else")
     add("-n", type=words.count(100), metavar="COUNT", help=f"how many other cameras; {SHEET_COUNT} by default")
-    add("--seed", type=int, default=0, help="of what is drawn; 0 by default")
+    add("--seed", type=words.count(2**63 - 1, 0), default=0, metavar="N", help="of what is drawn; 0 by default")
     add("--size", type=words.size, metavar="WxH", help="of the new images; by default the old one's")
     for name, text in (
         ("yaw", "degrees by which the camera turns to its right"),

@@ -5,9 +5,7 @@ from __future__ import annotations
 import contextlib
 import importlib
 import os
-from collections import deque
 from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -33,7 +31,6 @@ CODECS = {
 """Encoders with their options."""
 _READ = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpegts"  # no playlists, which would have other files read
 _THREADS = 4  # of an encoder: what it makes depends on their number, and shall not depend on the machine's
-_AHEAD = 8  # frames that wait to be encoded
 _CUT = 0.5  # seconds that may be missing at the end
 
 
@@ -257,30 +254,20 @@ def remake(
         others = [other for other in container.streams if other.type in ("audio", "subtitle")]
         copies = {other.index: _copied_stream(output, other, source, target) for other in others}
         begin, length = _span(container)
-        # the encoder works in a thread of its own, the decoder in those of ffmpeg
-        writer, waiting = stack.enter_context(ThreadPoolExecutor(1)), deque[Future[None]]()
-
-        def write(frame: Any) -> None:
-            output.mux(new.encode(frame))
-
         for frame, packet in _decoded(container, stream, *others):
             if packet is not None:
                 end = max(end, float((packet.pts or packet.dts) * packet.time_base) - begin)
                 packet.stream = copies[packet.stream.index]
-                waiting.append(writer.submit(output.mux, packet))
+                output.mux(packet)
                 continue
             if (frame.height, frame.width) != (first.height, first.width):
                 was, now = f"{first.width}x{first.height}", f"{frame.width}x{frame.height}"
                 raise VideoFileError(f"{source}: its frames are {was}, then {now}")
             end = max(end, float(frame.pts * frame.time_base + 1 / _rate(stream)) - begin)
-            waiting.append(writer.submit(write, warped(frame)))
-            while len(waiting) > _AHEAD:
-                waiting.popleft().result()
+            output.mux(new.encode(warped(frame)))
             count += 1
             done()
-        waiting.append(writer.submit(write, None))
-        for future in waiting:
-            future.result()
+        output.mux(new.encode(None))
         if length - end > max(_CUT, 0.02 * length):
             raise VideoFileError(f"{source}: ends after {end:.1f} of {length:.1f} seconds; it is cut off or damaged")
     return facts | {"frames": count}

@@ -70,12 +70,12 @@ def shard(text: str) -> Shard:
     return Shard(part[0] - 1, part[1])
 
 
-def count(most: int) -> Callable[[str], int]:
-    """What reads a whole number from 1 to `most`."""
+def count(most: int, least: int = 1) -> Callable[[str], int]:
+    """What reads a whole number of a range."""
 
     def parse(text: str) -> int:
-        if not (text.isascii() and text.isdigit() and 0 < int(text) <= most):
-            raise _WrongWord(f"{text!r} is not a whole number from 1 to {most}")
+        if not (text.isascii() and text.isdigit() and least <= int(text) <= most):
+            raise _WrongWord(f"{text!r} is not a whole number from {least} to {most}")
         return int(text)
 
     return parse

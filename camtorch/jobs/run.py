@@ -44,9 +44,10 @@ class Account:
         files = [path.read_bytes() for path in sorted(self.folder.glob(f".camtorch-{self._job}*.jsonl"))]
         size, self._size, self.has_begun = self._size, sum(map(len, files)), bool(files)
         for text in (text for content in files for text in content.splitlines()):
-            with contextlib.suppress(ValueError, TypeError, KeyError):  # cut off by a crash
+            with contextlib.suppress(ValueError, TypeError, AttributeError):  # cut off by a crash
                 record = json.loads(text)
-                self._records.setdefault(tuple(record["outputs"]), []).append(record)
+                if record.keys() >= {"outputs", "result"}:
+                    self._records.setdefault(tuple(record["outputs"]), []).append(record)
         return self._size > size
 
     def add(self, record: dict[str, Json] | None = None) -> None:

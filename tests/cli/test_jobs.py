@@ -159,6 +159,9 @@ def test_where_no_job_has_begun_nothing_is_gone_on_from():
         assert contents() == {"a": "mine"}
     assert carried_out(todo, force=True).made == 2
     assert Path("out/a").read_text() == "11"
+    (account,) = Path("out").glob(".camtorch*")  # lines of nobody's do no harm
+    account.write_bytes(account.read_bytes() + b'\n[1]\n{"outputs": [[1]], "result": 1}\n{"outputs": ["a"]}\n\xff\n"')
+    assert carried_out(todo, resume=True).kept == 2
 
 
 @pytest.mark.slow
