@@ -133,6 +133,8 @@ class Camera(BatchedModule):
     """How many coefficients, those of `ideal`, a camera has that is made without distortion."""
     defined_text: ClassVar[str] = ""
     """In words, what `defined` asks for."""
+    always_defined: ClassVar[bool] = False
+    """Whether the formula exists for all coefficients, as it does where a model states no `defined`."""
     _repr_html_ = as_html
     is_mixed: ClassVar[bool] = False
     """Whether it is a batch of several models, which have no coefficients in common; see `Mixed`."""
@@ -706,6 +708,7 @@ def _add_model(model: type[Camera]) -> None:
                 f"{type(stated).__name__}"
             )
     model._model = register(model)
+    model.always_defined = model.defined is Camera.defined
     if "key" not in model.__dict__:
         model.key = ""
         return

@@ -181,6 +181,13 @@ class Change:
         """The camera after, of a change of one sample."""
         return self.target[0] if self.gate is not None else alone(self.parts[0].target)
 
+    @property
+    def alone(self) -> Warp | None:
+        """The warp of a change of one sample, if that is all that happens to it."""
+        part = self.parts[0]
+        is_all = self.count == 1 and part.rows is None and self.gate is None and part.shades is None
+        return part.warp if is_all and part.light is None else None
+
     def leads_to(self, camera: Camera | Sequence[Camera]) -> bool:
         """Whether these may be the cameras after: of their number and intrinsics, where one may look."""
         ours, theirs = (one.intrinsics.detach().reshape(-1, 4) for one in (self.target, as_one(camera)))

@@ -13,21 +13,25 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.utils.parametrize import type_before_parametrizations
 
 from camtorch._arguments import are_numbers, as_image_size, broadcast_shapes, check_degrees, fails
+from camtorch._evaluation import rows_of
 from camtorch._module import Memo, remade
 from camtorch._numbers import joined, split, wide
 from camtorch._opaque import CameraNumbers, opaque
-from camtorch._tracing import in_graph
+from camtorch._tracing import in_graph, is_eager
 from camtorch.augment.augmentation import Augmentation, Range, as_range
 from camtorch.augment.change import Part
 from camtorch.augment.filling import enough, scaled
 from camtorch.augment.presets import PRESETS, PresetName
 from camtorch.augment.sample import Named
 from camtorch.camera import Camera
-from camtorch.lenses.drawing import covering, drawn
+from camtorch.lenses.drawing import FOLD, covering, drawn
 from camtorch.models import MODELS, KannalaBrandt
+from camtorch.projection.compiled import project, unproject
 from camtorch.projection.rays import field_of_view, image_lattice, polar_rays, reach
+from camtorch.projection.rows import Cameras
 from camtorch.rotations import mount_elements
 from camtorch.warp.boxes import along_edges
 from camtorch.warp.shifted import ShiftedWarp
@@ -206,8 +210,8 @@ class RandomCamera(Augmentation):
         lens = () if self.like is None else self.like._tensors
         if are_numbers(*source._tensors, *lens) and not any(isinstance(value, Tensor) for value in values.values()):
             # a hundred operations on some numbers, for each of which torch takes microseconds
-            of_one = all(isinstance(values.get(name, 0.0), float) for name in (*_TURNS, "fov"))
-            return self._made(source, values, math if of_one else np)
+            of_one = not any(isinstance(value, np.ndarray) for value in values.values())
+            return self._made(source, values, math if of_one and not source.batch_shape else np)
         like = wide(source.intrinsics.detach())
         return self._made(source, {name: torch.as_tensor(value).to(like) for name, value in values.items()}, torch)
 
@@ -292,7 +296,8 @@ class RandomCamera(Augmentation):
                 fx, fy = fx * values[name], fy * values[name]
         height, width = size
         if "centre" in values:
-            cx, cy = cx + values["centre"][..., 0] * width, cy + values["centre"][..., 1] * height
+            right, down = _pairs(values["centre"])
+            cx, cy = cx + right * width, cy + down * height
         if self._is_real:
             factor: Any = covering(joined((fx, fy, cx, cy), base.intrinsics, xp), reach, size)
             factor = factor if xp is torch else factor.numpy()
@@ -306,8 +311,8 @@ class RandomCamera(Augmentation):
             if in_graph(base.distortion):
                 distortion = base.distortion + (distortion - base.distortion.detach())
         if "crop" in values:  # a part of the image, enlarged to the full size
-            share, place = values["crop"], values["place"]
-            left, top = (1 - share) * place[..., 0] * width, (1 - share) * place[..., 1] * height
+            share, (right, down) = values["crop"], _pairs(values["place"])
+            left, top = (1 - share) * right * width, (1 - share) * down * height
             fx, fy, cx, cy = fx / share, fy / share, (cx + 0.5 - left) / share - 0.5, (cy + 0.5 - top) / share - 0.5
         return remade(base, intrinsics=joined((fx, fy, cx, cy), distortion, xp), distortion=distortion, image_size=size)
 
@@ -352,6 +357,8 @@ def _sized(base: Camera, size: tuple[int, int], fov: Any, xp: Any) -> Sequence[A
         return fx, fy, cx, cy
     half = fov * (math.pi / 360)
     sine, cosine = xp.sin(half), xp.cos(half)
+    if xp is math and (across := _seen_across(base, sine, cosine)) is not None:
+        return own[0] * size[1] / across, own[1] * size[1] / across, cx, cy
     ends = [joined((end, 0 * sine, cosine), base.intrinsics, xp) for end in (-sine, sine)]
     rays = torch.stack(ends, -2)
     if base.batch_shape:
@@ -362,6 +369,18 @@ def _sized(base: Camera, size: tuple[int, int], fov: Any, xp: Any) -> Sequence[A
     wide = pixels[..., 1, 0] - pixels[..., 0, 0]
     ratio = size[1] / (wide if xp is torch else wide.numpy())
     return own[0] * ratio, own[1] * ratio, cx, cy
+
+
+def _seen_across(base: Camera, sine: float, cosine: float) -> float | None:
+    """The pixels between two rays to either side of the axis; None where compiled code does not say."""
+    native = rows_of(base, base.intrinsics, base.distortion).native
+    if native is None:
+        return None
+    like = base.intrinsics
+    rays = joined((-sine, 0.0, cosine, sine, 0.0, cosine), like, math).view(1, 2, 3)
+    pixels, valid = project(native, rays)
+    (left, right), _ = pixels.view(2, 2).tolist()
+    return right - left if bool(valid.all()) else None
 
 
 class RandomMount(RandomCamera):
@@ -490,6 +509,11 @@ def _pair(value: RangeLike | str | None) -> RangeLike | str | None:
     return (value, value) if isinstance(value, (int, float)) else value
 
 
+def _pairs(values: Any) -> Any:
+    """Both of two numbers, or of (*B, 2) of them."""
+    return values if isinstance(values, list) else (values[..., 0], values[..., 1])
+
+
 def _light(camera: Camera, loss: Tensor) -> Tensor:
     """(B or 1, 1, H, W): one less `loss` (*B,) in the farthest corner, by the square of the distance."""
     height, width = camera.height, camera.width
@@ -534,11 +558,14 @@ def _jittered(camera: Camera, amounts: Tensor, nominal: Tensor) -> tuple[Tensor]
     rim, given = _rim(lens), lens.distortion.expand_as(steps)
     if len(rim) < len(steps):
         rim = rim.expand(len(steps), -1, -1)
-    result, done = given, torch.zeros(len(steps), dtype=torch.bool, device=steps.device)
+    result, done = given, None
     for part in _PARTS:
         candidate, defined = _defined(camera, given + part * steps, given)
-        fits = remade(lens, distortion=candidate).unproject(rim)[1].all(-1)
+        fits = _all_have_rays(lens, candidate, rim)
         fits = fits if defined is None else fits & defined
+        if done is None and bool(fits.all()):  # mostly the first step does
+            return (candidate.view(*amounts.shape[:-1], count),)
+        done = torch.zeros_like(fits) if done is None else done
         result = torch.where((fits & ~done).unsqueeze(-1), candidate, result)
         done |= fits
         if bool(done.all()):
@@ -546,12 +573,30 @@ def _jittered(camera: Camera, amounts: Tensor, nominal: Tensor) -> tuple[Tensor]
     return (result.view(*amounts.shape[:-1], count).clone(),)
 
 
-_measured = Memo(24)  # of a batch of eight models
+def _all_have_rays(lens: Camera, distortion: Tensor, pixels: Tensor) -> Tensor:
+    """(C,) bool: whether lenses with coefficients (C, n) in place of their own have rays for all pixels (C, N, 2)."""
+    intrinsics = lens.intrinsics.expand(len(distortion), 4)
+    made = Cameras(type_before_parametrizations(lens), intrinsics, distortion)
+    if made.native is None or not is_eager(pixels, intrinsics, distortion):
+        return remade(lens, intrinsics=intrinsics, distortion=distortion).unproject(pixels)[1].all(-1)
+    return unproject(made.native, pixels).valid.all(-1)
+
+
+_MOST_MEASURED = 64  # lenses
+_measured: dict[tuple[object, ...], Tensor] = {}
 
 
 def _kept(measure: Callable[..., Tensor], camera: Camera, *inputs: Tensor) -> Tensor:
     """`measure(camera, *inputs)`, of which these tensors are all that counts: mostly the lens is the same one."""
-    found: Tensor = _measured(inputs, (measure, type(camera), camera.image_size), lambda: measure(camera, *inputs))
+    values = [(t.dtype, t.shape, t.device, t.detach().cpu().numpy().tobytes()) for t in inputs]
+    key = measure, type(camera), camera.image_size, *values
+    found = _measured.pop(key, None)
+    if found is None:
+        with torch.inference_mode(False), torch.no_grad():  # what inference mode makes could not be used in a graph
+            found = measure(camera, *[t.detach().clone() for t in inputs])
+    _measured[key] = found  # the last one
+    while len(_measured) > _MOST_MEASURED:
+        _measured.pop(next(iter(_measured)), None)
     return found
 
 
@@ -599,11 +644,18 @@ def _rim(camera: Camera) -> Tensor:
     Of both: the image's edges, and where the lens ends on it; the principal point for what it does not show. What is
     mapped has no holes: a lens that is invertible on the outline is so inside.
     """
-    border = _border(camera._size_for("its rim")).to(camera.intrinsics)
+    size = camera._size_for("its rim")
+    border = _border(size, camera.intrinsics.dtype).to(camera.intrinsics.device)
     rim = border.expand(*camera.batch_shape, *border.shape)
     if len(camera.distortion) == 1:
-        least = _kept(_least_end, camera, camera.distortion.detach())
-        if bool((covering(camera.intrinsics, least, camera._size_for("its rim")) == 1).all()):
+        least = _kept(_least_end, camera, camera.distortion)
+        if len(camera.intrinsics) == 1:
+            (fx, fy, cx, cy), (height, width), end = camera.intrinsics[0].tolist(), size, least.item()
+            across, down = max(cx + 0.5, width - 0.5 - cx) / fx, max(cy + 0.5, height - 0.5 - cy) / fy
+            is_whole = math.hypot(across, down) <= FOLD * end
+        else:
+            is_whole = bool((covering(camera.intrinsics, least, size) == 1).all())
+        if is_whole:
             return rim
     if not bool(camera.unproject(rim)[1].all()):
         focal, centre = camera.intrinsics[:, None, :2], camera.intrinsics[:, None, 2:]
@@ -617,11 +669,12 @@ def _rim(camera: Camera) -> Tensor:
 
 
 @lru_cache(maxsize=16)
-def _border(size: tuple[int, int]) -> Tensor:
+def _border(size: tuple[int, int], dtype: torch.dtype) -> Tensor:
     """(N, 2): pixels along the outer edges of images of a size."""
     height, width = size
-    corners = torch.tensor([[0, 0], [width, 0], [width, height], [0, height]], dtype=torch.float64) - 0.5
-    return along_edges(corners, _EDGE_SAMPLES)
+    with torch.inference_mode(False):
+        corners = torch.tensor([[0, 0], [width, 0], [width, height], [0, height]], dtype=torch.float64) - 0.5
+        return along_edges(corners, _EDGE_SAMPLES).to(dtype)
 
 
 def _ends(camera: Camera, distortion: Tensor) -> Tensor:

@@ -91,10 +91,10 @@ class _Cameras(ctypes.Structure):
 
 
 _Rows = struct.Struct("20q").pack  # `Rows` of geometry.h
-_Move = struct.Struct("8q2d12q").pack  # `Move` of geometry.h
-_Lattices = struct.Struct(f"8q2d12q{CLASSIFICATION}4q").pack  # `Lattices`
+packed_move = struct.Struct("8q2d12q").pack  # `Move` of geometry.h
+packed_lattices = struct.Struct(f"8q2d12q{CLASSIFICATION}4q").pack  # `Lattices`
 POSITIONS, PIXELS, ON_IMAGE = range(3)
-_LEFT_FROM, _LEFT_TO, LEFT_MOST = 1, 2, 4
+LEFT_FROM, LEFT_TO, LEFT_MOST = 1, 2, 4
 _NO_ROWS = (0, 0, 0, 0)
 
 
@@ -594,8 +594,8 @@ class Between:
         self._start.add_tables(count)
         result = torch.empty(self.cameras, count, 2, dtype=self._start.dtype, device="cpu")
         valid = torch.empty(self.cameras, count, dtype=torch.bool, device="cpu")
-        rows = *_rows_of(pixels), result.data_ptr(), 2 * count, 2, 1, valid.data_ptr(), count, _TILE
-        call = _Move(*self._given, form, *self._size, *rows, addressof(_kept.counters))
+        rows = *rows_of(pixels), result.data_ptr(), 2 * count, 2, 1, valid.data_ptr(), count, _TILE
+        call = packed_move(*self._given, form, *self._size, *rows, addressof(_kept.counters))
         tiles = -(-count // _TILE) * self.cameras
         self._run("camtorch_moves", call, tiles if self.cameras * count >= _SHARED else 1)
         return result, valid
@@ -625,11 +625,11 @@ class Between:
         kept = _kept_memory(sum(sizes) + cameras * count)
         exact, narrow, scratch, valid = accumulate(sizes, initial=kept.data_ptr())
         at, used = result.data_ptr(), addressof(_kept.counters)
-        rows = *_rows_of(probes), at, 2 * count, 1, count, valid, count, count, used
+        rows = *rows_of(probes), at, 2 * count, 1, count, valid, count, count, used
         asked = at, 2 * count, count, valid, count, valid + nodes, count, cameras, n, m, *size
         how = *self._size, tolerance, PADDINGS[padding], cells.data_ptr(), scratch
         more = first_row, narrow if is_double else 0, exact, used + 8
-        call = _Lattices(*self._given, POSITIONS, *self._size, *rows, *asked, *how, *more)
+        call = packed_lattices(*self._given, POSITIONS, *self._size, *rows, *asked, *how, *more)
         if self._run("camtorch_lattices", call, cameras):
             return None
         if count := _kept.counters[1]:
@@ -646,9 +646,9 @@ class Between:
             counters[:] = [0, 0]
             spread(lambda: left.append(run(call)), threads)  # noqa: B023 (which is called at once)
             flags = functools.reduce(operator.or_, left)
-            if not flags & (_LEFT_FROM | _LEFT_TO):
+            if not flags & (LEFT_FROM | LEFT_TO):
                 return flags
-            for flag, native in ((_LEFT_FROM, self._start), (_LEFT_TO, self._end)):
+            for flag, native in ((LEFT_FROM, self._start), (LEFT_TO, self._end)):
                 if flags & flag:
                     native.follow()
 
@@ -673,7 +673,7 @@ def _kept_memory(count: int) -> Tensor:
     return _kept.memory
 
 
-def _rows_of(pixels: Tensor) -> tuple[int, int, int, int]:
+def rows_of(pixels: Tensor) -> tuple[int, int, int, int]:
     """Where pixels (C or 1, N, 2) lie, and their strides."""
     camera, point, component = pixels.stride()
     return pixels.data_ptr(), camera if pixels.shape[0] > 1 else 0, point, component

@@ -116,7 +116,7 @@ def _are_plain(model: type[Camera], intrinsics: Tensor, distortion: Tensor) -> b
     """Whether a short look says that all are usable."""
     if not intrinsics.is_cpu or not 0 < intrinsics.numel() + distortion.numel() <= _MOST_LOOKED_AT:
         return False
-    if distortion.numel() and model.defined(distortion.unbind(-1)) is not None:
+    if distortion.numel() and not model.always_defined and model.defined(distortion.unbind(-1)) is not None:
         return False
     rows = intrinsics.tolist()
     return math.isfinite(math.fsum(map(sum, (*rows, *distortion.tolist())))) and all(
