@@ -406,7 +406,9 @@ class Augmentation(SampleTransform):
         """
         values = {name: value for name, value in draw.items() if name != "apply"}
         if not source.batch_shape and (len(draw["apply"]) == 1 or all(map(_are_alike, values.values()))):
-            values = {n: value[0].tolist() if isinstance(value, np.ndarray) else value[0] for n, value in values.items()}
+            values = {
+                n: value[0].tolist() if isinstance(value, np.ndarray) else value[0] for n, value in values.items()
+            }
         return values
 
     def _new_camera(self, source: Camera, values: Mapping[str, Any]) -> tuple[Camera, Tensor | None]:

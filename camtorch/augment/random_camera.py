@@ -22,7 +22,7 @@ from camtorch._numbers import joined, split, wide
 from camtorch._opaque import CameraNumbers, opaque
 from camtorch._tracing import in_graph, is_eager
 from camtorch.augment.augmentation import Augmentation, Range, as_range
-from camtorch.augment.change import Part
+from camtorch.augment.change import Part, View
 from camtorch.augment.filling import enough, scaled
 from camtorch.augment.presets import PRESETS, PresetName
 from camtorch.augment.sample import Named
@@ -31,15 +31,17 @@ from camtorch.lenses.drawing import FOLD, covering, drawn
 from camtorch.models import MODELS, KannalaBrandt
 from camtorch.projection.compiled import project, unproject
 from camtorch.projection.rays import field_of_view, image_lattice, polar_rays, reach
-from camtorch.projection.rows import Cameras
+from camtorch.projection.rows import Cameras, single_native
 from camtorch.rotations import mount_elements
 from camtorch.warp.boxes import along_edges
+from camtorch.warp.panorama import PANORAMAS
 from camtorch.warp.shifted import ShiftedWarp
 from camtorch.warp.shutter import RollingShutter
 from camtorch.warp.vignetting import vignetting
 from camtorch.warp.warp import Warp
 
 RangeLike = float | Sequence[float]
+Array = np.ndarray[Any, Any]
 
 
 DRAWN = 16
@@ -207,24 +209,63 @@ class RandomCamera(Augmentation):
     def _new_camera(self, source: Camera, values: Mapping[str, Any]) -> tuple[Camera, Tensor | None]:
         if type(self).new_camera is not RandomCamera.new_camera:
             return super()._new_camera(source, values)
-        lens = () if self.like is None else self.like._tensors
-        if are_numbers(*source._tensors, *lens) and not any(isinstance(value, Tensor) for value in values.values()):
+        if self._are_plain(source, values):
             # a hundred operations on some numbers, for each of which torch takes microseconds
-            of_one = not any(isinstance(value, np.ndarray) for value in values.values())
-            return self._made(source, values, math if of_one and not source.batch_shape else np)
+            of_one = not source.batch_shape and not any(isinstance(value, np.ndarray) for value in values.values())
+            return self._made(source, values, math if of_one else np)
         like = wide(source.intrinsics.detach())
         return self._made(source, {name: torch.as_tensor(value).to(like) for name, value in values.items()}, torch)
 
+    def _are_plain(self, source: Camera, values: Mapping[str, Any]) -> bool:
+        """Whether plain numbers and arrays do, of which nothing is recorded."""
+        lens = () if self.like is None else self.like._tensors
+        return are_numbers(*source._tensors, *lens) and not any(isinstance(v, Tensor) for v in values.values())
+
     def _made(self, source: Camera, values: Mapping[str, Any], xp: Any) -> tuple[Camera, Tensor | None]:
         """The same by tensors, arrays in float64, or numbers: with the functions of torch, of numpy or of math."""
-        target = self._target(source, values, xp)
-        none = next((0 * values[name] for name in _TURNS if name in values), None)
-        if none is None:
+        base, numbers, distortion, size = self._target(source, values, xp)
+        intrinsics = joined(numbers, distortion if xp is torch else base.intrinsics, xp)
+        target = remade(base, intrinsics=intrinsics, distortion=distortion, image_size=size)
+        elements = self._turned(values, xp)
+        if elements is None:
             return target, None
-        angles = [values.get(name, none) * (math.pi / 180) for name in _TURNS]
-        elements = mount_elements([xp.cos(a) for a in angles], [xp.sin(a) for a in angles])
         rotation = joined(elements, source.intrinsics, xp)
         return target, rotation.view(*rotation.shape[:-1], 3, 3)
+
+    def _turned(self, values: Mapping[str, Any], xp: Any) -> Sequence[Any] | None:
+        """The elements of the rotation, row by row; None: the camera stays as it looks."""
+        none = next((0 * values[name] for name in _TURNS if name in values), None)
+        if none is None:
+            return None
+        angles = [values.get(name, none) * (math.pi / 180) for name in _TURNS]
+        return mount_elements([xp.cos(a) for a in angles], [xp.sin(a) for a in angles])
+
+    def _part(self, rows: list[int] | None, source: Camera, draw: Mapping[str, Any]) -> Part:
+        view = self._view(source, draw)
+        return super()._part(rows, source, draw) if view is None else Part.seen(rows, source, view, self.options)
+
+    def _view(self, source: Camera, draw: Mapping[str, Any]) -> View | None:
+        """What a draw makes of a single camera as plain numbers; None where it takes more than that."""
+        if self.min_filled or source.batch_shape or not self._is_usual or not isinstance(draw["apply"], np.ndarray):
+            return None
+        if isinstance(source, PANORAMAS) or isinstance(self.like, PANORAMAS):
+            return None
+        values = self._values(source, draw)
+        if any(isinstance(v, np.ndarray) for v in values.values()) or not self._are_plain(source, values):
+            return None
+        base, numbers, distortion, size = self._target(source, values, math)
+        total = math.fsum(numbers) + math.fsum(distortion.tolist())
+        if not math.isfinite(total) or min(numbers[:2]) <= 0:
+            return None
+        if not (base.always_defined or rows_of(base, *base._tensors).usable is None):
+            return None
+        return View(base, numbers, distortion, size, self._turned(values, math))
+
+    @property
+    def _is_usual(self) -> bool:
+        """Whether a camera is all that is drawn, and by this class."""
+        usual = type(self).new_camera is RandomCamera.new_camera and not self.options["antialias"]
+        return usual and bool(self.options["tolerance"]) and self.beside_the_camera.isdisjoint(self.ranges)
 
     def _warp(
         self, source: Camera, target: Camera, rotation: Tensor | None, shutter: RollingShutter | None = None
@@ -276,7 +317,10 @@ class RandomCamera(Augmentation):
             values.get("readout", 0.0), torch.deg2rad(values["rates"]), exposure=values.get("exposure", 0.0)
         )
 
-    def _target(self, source: Camera, values: Mapping[str, Any], xp: Any) -> Camera:
+    def _target(
+        self, source: Camera, values: Mapping[str, Any], xp: Any
+    ) -> tuple[Camera, Sequence[Any], Tensor, tuple[int, int]]:
+        """The new camera: of whose model, fx, fy, cx and cy, distortion, and (height, width)."""
         size = self.image_size or (source.height, source.width)
         base = source if self.like is None else self.like
         dtype, device = torch.promote_types(source.intrinsics.dtype, torch.float32), source.intrinsics.device
@@ -303,7 +347,10 @@ class RandomCamera(Augmentation):
             factor = factor if xp is torch else factor.numpy()
             fx, fy = fx * factor, fy * factor
         distortion = base.distortion
-        if "distortion" in values and distortion.shape[-1]:
+        if "distortion" in values and distortion.shape[-1] and xp is math:
+            usual = self._usual(base, size) if "fov" in values else joined(before, distortion, xp)
+            distortion = _jittered_alone(base, (fx, fy, cx, cy), values["distortion"], usual, size)
+        elif "distortion" in values and distortion.shape[-1]:
             drawn_to = remade(base, intrinsics=joined((fx, fy, cx, cy), distortion, xp), image_size=size).detach()
             usual = self._usual(base, size) if "fov" in values else joined(before, distortion, xp).detach()
             amounts = torch.as_tensor(values["distortion"], dtype=dtype, device=device)
@@ -314,7 +361,7 @@ class RandomCamera(Augmentation):
             share, (right, down) = values["crop"], _pairs(values["place"])
             left, top = (1 - share) * right * width, (1 - share) * down * height
             fx, fy, cx, cy = fx / share, fy / share, (cx + 0.5 - left) / share - 0.5, (cy + 0.5 - top) / share - 0.5
-        return remade(base, intrinsics=joined((fx, fy, cx, cy), distortion, xp), distortion=distortion, image_size=size)
+        return base, (fx, fy, cx, cy), distortion, size
 
     def _usual(self, base: Camera, size: tuple[int, int]) -> Tensor:
         """(*B, 4): intrinsics of the lens with the field of view in the middle of the range; graph-free."""
@@ -365,7 +412,7 @@ def _sized(base: Camera, size: tuple[int, int], fov: Any, xp: Any) -> Sequence[A
         rays = rays.expand(*broadcast_shapes(rays.shape, (*base.batch_shape, 2, 3)))
     pixels, valid = base.project(rays)
     if fails(valid):
-        raise ValueError(f"fov: a {base.key} lens of these coefficients does not reach {float(fov.max()):g} degrees")
+        raise ValueError(f"fov: a {base.key} lens of these coefficients does not reach {float(fov if xp is math else fov.max()):g} degrees")
     wide = pixels[..., 1, 0] - pixels[..., 0, 0]
     ratio = size[1] / (wide if xp is torch else wide.numpy())
     return own[0] * ratio, own[1] * ratio, cx, cy
@@ -450,7 +497,7 @@ class RandomMount(RandomCamera):
         kind = next(kind for kind, name in _DEPTHS.items() if name == key)
         kind = "z" if kind == "depth" else kind
         warp = ShiftedWarp(source, part.target, part.warp.rotation, values, kind, shift, **self.options)
-        return replace(part, warp=warp)
+        return replace(part, warp=warp, view=None)
 
 
 class RandomLens(RandomCamera):
@@ -549,6 +596,39 @@ def _shapes(camera: CameraNumbers, amounts: Tensor, nominal: Tensor) -> tuple[Te
     return (amounts.new_empty(*amounts.shape[:-1], camera.distortion.shape[-1]),)
 
 
+def _jittered_alone(
+    base: Camera, numbers: Sequence[float], amounts: Sequence[float], nominal: Tensor, size: tuple[int, int]
+) -> Tensor:
+    """`jittered` of one lens with plain numbers fx, fy, cx, cy before images of a size."""
+    model, k, intrinsics = type_before_parametrizations(base), base.distortion.detach(), joined(numbers, nominal, math)
+    fx, fy, cx, cy = intrinsics.tolist()
+    given = k.numpy()
+    known = (model, size, k.dtype, given.tobytes(), nominal.numpy().tobytes())
+    measured, end = _of_lens(known, base, nominal)
+    native = None
+    if model.always_defined and _is_within((fx, fy, cx, cy), end, size):
+        rim = _border(size, k.dtype)[None]
+        steps = np.resize(np.array(amounts[:DRAWN], given.dtype), len(given)) * measured
+        for part in _PARTS:
+            candidate = torch.from_numpy(given + given.dtype.type(part) * steps)
+            native = single_native(model, intrinsics, candidate)
+            if native is None:
+                break
+            if bool(unproject(native, rim).valid.all()):
+                return candidate
+    if native is not None:
+        return k
+    lens = remade(base, intrinsics=intrinsics, image_size=size).detach()
+    return jittered(lens, torch.as_tensor(amounts, dtype=k.dtype), nominal)
+
+
+def _is_within(numbers: Sequence[float], end: float, size: tuple[int, int]) -> bool:
+    """Whether all of an image is within a circle of a radius in focal lengths, with some room; see `covering`."""
+    (fx, fy, cx, cy), (height, width) = numbers, size
+    across, down = max(cx + 0.5, width - 0.5 - cx) / fx, max(cy + 0.5, height - 0.5 - cy) / fy
+    return math.hypot(across, down) <= FOLD * end
+
+
 @opaque(_shapes)
 def _jittered(camera: Camera, amounts: Tensor, nominal: Tensor) -> tuple[Tensor]:
     count = camera.distortion.shape[-1]
@@ -584,6 +664,7 @@ def _all_have_rays(lens: Camera, distortion: Tensor, pixels: Tensor) -> Tensor:
 
 _MOST_MEASURED = 64  # lenses
 _measured: dict[tuple[object, ...], Tensor] = {}
+_lenses: dict[tuple[object, ...], tuple[Array, float]] = {}
 
 
 def _kept(measure: Callable[..., Tensor], camera: Camera, *inputs: Tensor) -> Tensor:
@@ -597,6 +678,21 @@ def _kept(measure: Callable[..., Tensor], camera: Camera, *inputs: Tensor) -> Te
     _measured[key] = found  # the last one
     while len(_measured) > _MOST_MEASURED:
         _measured.pop(next(iter(_measured)), None)
+    return found
+
+
+def _of_lens(known: tuple[object, ...], base: Camera, nominal: Tensor) -> tuple[Array, float]:
+    """What changes of a lens by known numbers do (n,), and the least distance at which it ends."""
+    found = _lenses.pop(known, None)
+    if found is None:
+        with torch.inference_mode(False), torch.no_grad():
+            lens = remade(base.detach(), image_size=known[1])
+            k = lens.distortion.clone()
+            measured = _kept(_sensitivity, lens, k, nominal.clone()).to(k.dtype).numpy()
+            found = measured, float(_kept(_least_end, lens, k[None]))
+    _lenses[known] = found  # the last one
+    while len(_lenses) > _MOST_MEASURED:
+        _lenses.pop(next(iter(_lenses)), None)
     return found
 
 
@@ -649,13 +745,7 @@ def _rim(camera: Camera) -> Tensor:
     rim = border.expand(*camera.batch_shape, *border.shape)
     if len(camera.distortion) == 1:
         least = _kept(_least_end, camera, camera.distortion)
-        if len(camera.intrinsics) == 1:
-            (fx, fy, cx, cy), (height, width), end = camera.intrinsics[0].tolist(), size, least.item()
-            across, down = max(cx + 0.5, width - 0.5 - cx) / fx, max(cy + 0.5, height - 0.5 - cy) / fy
-            is_whole = math.hypot(across, down) <= FOLD * end
-        else:
-            is_whole = bool((covering(camera.intrinsics, least, size) == 1).all())
-        if is_whole:
+        if bool((covering(camera.intrinsics, least, size) == 1).all()):
             return rim
     if not bool(camera.unproject(rim)[1].all()):
         focal, centre = camera.intrinsics[:, None, :2], camera.intrinsics[:, None, 2:]

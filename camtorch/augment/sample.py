@@ -26,6 +26,7 @@ from camtorch._arguments import (
     fails,
     no_camera,
 )
+from camtorch._evaluation import rows_of
 from camtorch._threads import on_one_thread
 from camtorch.augment.change import Change, alone, as_one
 from camtorch.augment.landmarks import Mirroring, exchanged
@@ -33,8 +34,9 @@ from camtorch.camera import Camera
 from camtorch.mixed import Listed
 from camtorch.models import Pinhole
 from camtorch.rotations import are_rotations, check_rotation, rotation_matrix, rotation_vector
-from camtorch.warp.at_once import Work, sample_by
+from camtorch.warp.at_once import Work, at_once, between_of
 from camtorch.warp.sampling import Options, Sampler, as_options
+from camtorch.warp.warp import Warp
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -448,8 +450,10 @@ class SampleTransform(nn.Module):
         if form is None or (known := self._forms.get(form)) is None:
             result = self._checked_batch(sample, camera, predicted)
             named, batched, count, _ = result
-            if form is not None and result[3] is camera and all(
-                found in IMAGES or sample[name].dtype.is_floating_point for name, (found, _) in named.items()
+            if (
+                form is not None
+                and result[3] is camera
+                and all(found in IMAGES or sample[name].dtype.is_floating_point for name, (found, _) in named.items())
             ):
                 while len(self._forms) >= _MOST_FORMS:
                     self._forms.pop(next(iter(self._forms)), None)
@@ -553,11 +557,11 @@ class SampleTransform(nn.Module):
         def put(name: str, value: Tensor | list[Tensor]) -> None:
             moved[name] = value if batched or isinstance(value, list) else value.squeeze(0)
 
-        at_once = {} if self.valid_mask or sample.get("image_valid") is not None else self._at_once(named, change)
+        known = {} if self.valid_mask or sample.get("image_valid") is not None else self._at_once(named, change)
         for name, (found, value) in named.items():
             valid: Any
-            if name in at_once:
-                result, valid = at_once[name]
+            if name in known:
+                result, valid = known[name]
                 put(name, result)
             elif isinstance(value, list):
                 pairs = [self._one(change.row(i), found, v.unsqueeze(0), options) for i, v in enumerate(value)]
@@ -581,33 +585,43 @@ class SampleTransform(nn.Module):
             put("image_valid", before.contiguous())
         if "rotation" not in named:
             put("rotation", change.rotation.clone())
-        target = change.target if batched else change.single
         if self.mirroring is not None:
             self._mirror(moved, named, change.mirrored, batched)
-        if not isinstance(change.parts[0].target, Unknown):
+        if not isinstance(change.parts[0].camera, Unknown):
             # the change keeps cameras of its own, to go back by
-            target = target.clone()
+            target = change.target.clone() if batched else change.single
             moved["camera"] = list(target) if isinstance(target, Listed) else target
         return moved
 
     def _at_once(self, named: Named, change: Change) -> dict[str, tuple[Tensor, Tensor | None]]:
         """What moves of a single sample by one call of compiled code, and its validity."""
-        warp = change.alone
-        if warp is None:
+        part = change.alone
+        if part is None:
             return {}
+        if part.view is None:
+            options, between = cast("Warp", part.warp).options, between_of(cast("Warp", part.warp))
+            size = part.target._size_for("Warp")
+        else:
+            options, size = self.options, part.view.image_size
+            ends = rows_of(part.camera, *part.camera._tensors).native, part.view.native()
+            between = None if None in ends else (*ends, part.view.rotation())
+        if between is None or not options["tolerance"]:
+            return {}
+        fill = options["fill"]
         images: dict[str, tuple[Tensor, Sampler]] = {}
         pixels: dict[str, Tensor] = {}
         for name, (found, value) in named.items():
             if found in ("depth", "distance"):  # which ask for positions again
                 return {}
-            if found == "image" and len(warp.fill) in (1, value.shape[1]):
-                images[name] = value, Sampler(warp.mode, warp.padding_mode, warp.fill)
+            if found == "image" and len(fill) in (1, value.shape[1]):
+                images[name] = value, Sampler(options["mode"], options["padding_mode"], fill)
             elif found == "mask":
                 wide = value if value.ndim == 4 else value.unsqueeze(1)
                 images[name] = wide, Sampler("nearest", "zeros", (self.mask_fill,))
             elif moves(found, value) is _pixels:
                 pixels[name] = value.reshape(1, -1, 2)
-        made = sample_by(warp, Work(list(images.values()), list(pixels.values())))
+        sizes, work = (part.camera._size_for("Warp"), size), Work(list(images.values()), list(pixels.values()))
+        made = at_once(*between, sizes, options["tolerance"], work)
         if made is None:
             return {}
         results: dict[str, tuple[Tensor, Tensor | None]] = {}

@@ -107,6 +107,12 @@ class Cameras:
         return by_coefficients
 
 
+def single_native(model: type[Camera], intrinsics: Tensor, k: Tensor) -> compiled.Native | None:
+    """A camera of numbers (4,) and (n,) that are known to be usable, for the compiled geometry, if that knows it."""
+    k = k.detach()[None]
+    return compiled.native_of(model.optics, intrinsics[None], k, None, partial(_domain, model, k, False))
+
+
 def _domain(model: type[Camera], k: Tensor, learns: bool) -> Domain:
     # what learns will not be seen again
     return Domain(model.optics, k) if learns else domain_of(model._model, k, model.optics)

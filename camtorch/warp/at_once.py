@@ -32,30 +32,20 @@ _FEW = 2  # tiles of an image that one thread makes alone
 _ALIGNED = 64
 
 
-def sample_by(warp: Warp, work: Work) -> Made | None:
-    """The images and pixels of one sample that a warp moves; None where it has to go step by step.
+def between_of(warp: Warp) -> tuple[Native, Native, Tensor | None] | None:
+    """Source, target and rotation of a warp for compiled code; None where it has to go step by step.
 
     That is where its positions are kept, exact or antialiased, in a graph or traced, of a batch, of a seam or a shutter.
     """
     source, target, rotation = warp.source, warp.target, warp.rotation
-    tolerance = warp.tolerance
     if not warp.is_an_operator or warp._decides or warp._pinned is not None or warp.batch_shape:
         return None
-    if not tolerance or warp.antialias or warp.shutter is not None or warp.target_shutter is not None:
+    if not warp.tolerance or warp.antialias or warp.shutter is not None or warp.target_shutter is not None:
         return None
     if seam_of(source) is not None or seam_of(target) is not None:
         return None
-    like = target.intrinsics
-    tensors = [image for image, _ in work.images] + list(work.pixels)
-    made = compiled_of((target, source), like, *(() if rotation is None else (rotation,)))
-    if made is None or not is_eager(*tensors) or (torch.is_grad_enabled() and any(t.requires_grad for t in tensors)):
-        return None
-    dtype, sizes = like.dtype, (source._size_for("Warp"), target._size_for("Warp"))
-    if any(torch.promote_types(t.dtype, dtype) != dtype for t in work.pixels):
-        return None
-    work = work._replace(pixels=[t.to(dtype) for t in work.pixels])
-    turned = None if rotation is None else rotation.detach().to(dtype).contiguous()
-    return at_once(made[0][1], made[0][0], turned, sizes, tolerance, work)
+    made = compiled_of((source, target), target.intrinsics, *(() if rotation is None else (rotation,)))
+    return None if made is None else (*made[0], rotation)  # type: ignore[return-value]
 
 
 class Work(NamedTuple):
@@ -90,16 +80,25 @@ def at_once(
     tolerance: float,
     work: Work,
 ) -> Made | None:
-    """The images of a sample and its pixels; None where a lattice does not do, or images lie too oddly in memory.
+    """The images of a sample and its pixels.
+
+    None where a lattice does not do, images lie too oddly in memory, or something is in a graph or traced.
 
     Args:
         source: the camera of the images, single.
         target: that of the images to make.
-        rotation: (3, 3) contiguous, of their dtype, `ray_target = R ray_source`, or None.
+        rotation: (3, 3), `ray_target = R ray_source`, or None.
         sizes: (height, width) of the source's image, and of the target's.
         tolerance: positive; see `Warp`.
-        work: tensors without a graph, pixels of the cameras' dtype.
+        work: what is to be made.
     """
+    tensors = [image for image, _ in work.images] + list(work.pixels)
+    if not is_eager(*tensors) or (torch.is_grad_enabled() and any(t.requires_grad for t in tensors)):
+        return None
+    if any(torch.promote_types(t.dtype, source.dtype) != source.dtype for t in work.pixels):
+        return None
+    work = Work(work.images, [t.to(source.dtype) for t in work.pixels])
+    rotation = None if rotation is None else rotation.detach().to(source.dtype).contiguous()
     forms = [(image.shape[1], image.stride(), image.dtype, how) for image, how in work.images]
     key = (sizes, source.dtype, tolerance, *forms, *((t.shape[1], t.stride()) for t in work.pixels))
     call = _calls.kept.pop(key, None) or _Call.of(sizes, source.dtype, tolerance, work)
@@ -136,7 +135,15 @@ class _Call:
         probes = kept_probes(range(size[0]), size[1], dtype)
         count, nodes, wide = probes.shape[1], (n + 5) * (m + 5), dtype.itemsize
         is_double = dtype == torch.float64
-        parts = 2 * count * wide, 4 * n * m, count, 128 * n * m * wide, 8 * nodes * is_double, 4 * sampler.SCRATCH * (m + 8), 8
+        parts = (
+            2 * count * wide,
+            4 * n * m,
+            count,
+            128 * n * m * wide,
+            8 * nodes * is_double,
+            4 * sampler.SCRATCH * (m + 8),
+            8,
+        )
         places = [-(-part // _ALIGNED) * _ALIGNED for part in parts]
         with torch.inference_mode(False):
             memory = torch.empty(sum(places), dtype=torch.uint8, device="cpu")
@@ -152,7 +159,26 @@ class _Call:
             kept.append(holds)
         reach = max((sampler.PADDINGS[how.padding_mode] for _, how in images), default=0)
         rows = compiled.rows_of(probes)
-        move = 0, 0, 0, 0, 1, 3, 1, compiled.POSITIONS, *source_size, *rows, at, 2 * count, 1, count, valid, count, count, 0
+        move = (
+            0,
+            0,
+            0,
+            0,
+            1,
+            3,
+            1,
+            compiled.POSITIONS,
+            *source_size,
+            *rows,
+            at,
+            2 * count,
+            1,
+            count,
+            valid,
+            count,
+            count,
+            0,
+        )
         asked = at, 2 * count, count, valid, count, valid + nodes, count, 1, n, m, *size, *source_size, tolerance
         lattice = compiled.packed_lattices(
             *move, *asked, reach, cells, scratch, 0, narrow if is_double else 0, exact, used
@@ -203,7 +229,12 @@ class _Call:
         while flags := native.camtorch_together(words):
             if flags & LEFT_MOST:
                 return None
-            for bit, camera in ((LEFT_FROM, target), (LEFT_TO, source), (LEFT_FROM << 3, source), (LEFT_TO << 3, target)):
+            for bit, camera in (
+                (LEFT_FROM, target),
+                (LEFT_TO, source),
+                (LEFT_FROM << 3, source),
+                (LEFT_TO << 3, target),
+            ):
                 if flags & bit:
                     camera.follow()
             if flags >> 3:  # the images are made
