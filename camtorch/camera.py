@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, cast
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn.utils import parametrize
 
 from camtorch._arguments import (
@@ -27,6 +27,7 @@ from camtorch._freezing import PREFIX, freeze, loaded, saved, with_frozen
 from camtorch._module import BatchedModule, Memo, remade, typed_as
 from camtorch._notebook import as_html
 from camtorch._numbers import (
+    at_a_glance,
     camera_of_fov,
     checked_numbers,
     described,
@@ -184,6 +185,14 @@ class Camera(BatchedModule):
     def __init__(
         self, intrinsics: Numbers, distortion: Numbers | None = None, *, image_size: Sequence[int] | None = None
     ):
+        known = at_a_glance(type(self), intrinsics, distortion, image_size)
+        if known is not None:
+            intrinsics, distortion, names = known
+            memos = {name: Memo() for name in self.memo_names}
+            super().__init__(distortion_names=names, image_size=image_size, **memos, _warned=False)
+            self.put("intrinsics", nn.Parameter(intrinsics))
+            self.put("distortion", nn.Parameter(distortion) if names else distortion)
+            return
         intrinsics, distortion, batch, size = checked_numbers(type(self), intrinsics, distortion, image_size)
         count = distortion.shape[-1]
         super().__init__(

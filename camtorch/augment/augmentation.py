@@ -151,7 +151,7 @@ def draw(
     # in float64, so that what is drawn is what every precision sees
     shares: Any = torch.rand(spans.total, generator=generator, dtype=torch.float64, device=device)
     if device is _CPU and not torch.compiler.is_compiling():
-        gate, shares = np.full(rows, p >= 1) if gate is None else gate.numpy(), shares.numpy()
+        gate, shares = np.array([p >= 1] * rows, bool) if gate is None else gate.numpy(), shares.numpy()
     elif gate is None:
         gate = torch.full((rows,), p >= 1, device=device)
     values = {"apply": gate, **spans.of(shares)}

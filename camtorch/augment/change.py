@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, TypeVar
 
 import torch
@@ -55,6 +56,7 @@ class View:
             self.base, intrinsics=numbers, distortion=self.distortion.detach().clone(), image_size=self.image_size
         )
 
+    @cached_property
     def rotation(self) -> Tensor | None:
         """(3, 3), or None."""
         return None if self.turn is None else joined(self.turn, self.base.intrinsics, math).view(3, 3)
@@ -93,7 +95,7 @@ class Part:
     def __getattr__(self, name: str) -> Any:
         if name != "warp" or self.__dict__.get("view") is None:
             raise AttributeError(f"Part has no {name}")
-        self.warp = Warp.unchecked(self.camera, self.view.camera(), self._options).turned_by(self.view.rotation())
+        self.warp = Warp.unchecked(self.camera, self.view.camera(), self._options).turned_by(self.view.rotation)
         return self.warp
 
     @property
@@ -273,10 +275,8 @@ class Change:
         """(count, 3, 3): `ray_after = R ray_before`."""
 
         def turned(part: Part, n: int) -> Tensor:
-            if part.view is not None:
-                turned = part.view.rotation()
-            else:
-                turned = None if part.warp is None else part.warp.rotation
+            moves = part.view or part.warp
+            turned = None if moves is None else moves.rotation
             return (_eye(part.camera.intrinsics) if turned is None else turned).expand(n, 3, 3)
 
         parts = [turned(part, n) for part, n in zip(self.parts, self._counts, strict=True)]

@@ -147,7 +147,7 @@ class Transform:
             elif name in moved:
                 result[name] = moved.pop(name)
         for name, value in moved.items():
-            value = value.cpu().numpy() if isinstance(value, Tensor) else value
+            value = _plain(value) if isinstance(value, Tensor) else value
             result[name] = value[0] if name == _SEEN else value
         return result
 
@@ -201,11 +201,15 @@ class Transform:
 
 
 def _labels(name: str, array: Array) -> tuple[dict[str, Tensor], Restore]:
-    return {name: _tensor(array)}, lambda moved, size: moved[0].cpu().numpy().astype(array.dtype, copy=False)
+    return {name: _tensor(array)}, lambda moved, size: _plain(moved[0]).astype(array.dtype, copy=False)
 
 
 def _image(name: str, array: Array) -> tuple[dict[str, Tensor], Restore]:
     return {name: _planes(array)}, lambda moved, size: as_array(moved[0], array)
+
+
+def _plain(tensor: Tensor) -> Array:
+    return tensor.numpy() if tensor.is_cpu else tensor.cpu().numpy()
 
 
 def _planes(array: Array) -> Tensor:

@@ -209,17 +209,16 @@ class RandomCamera(Augmentation):
     def _new_camera(self, source: Camera, values: Mapping[str, Any]) -> tuple[Camera, Tensor | None]:
         if type(self).new_camera is not RandomCamera.new_camera:
             return super()._new_camera(source, values)
-        if self._are_plain(source, values):
+        if self._are_plain(source) and not any(isinstance(v, Tensor) for v in values.values()):
             # a hundred operations on some numbers, for each of which torch takes microseconds
             of_one = not source.batch_shape and not any(isinstance(value, np.ndarray) for value in values.values())
             return self._made(source, values, math if of_one else np)
         like = wide(source.intrinsics.detach())
         return self._made(source, {name: torch.as_tensor(value).to(like) for name, value in values.items()}, torch)
 
-    def _are_plain(self, source: Camera, values: Mapping[str, Any]) -> bool:
+    def _are_plain(self, source: Camera) -> bool:
         """Whether plain numbers and arrays do, of which nothing is recorded."""
-        lens = () if self.like is None else self.like._tensors
-        return are_numbers(*source._tensors, *lens) and not any(isinstance(v, Tensor) for v in values.values())
+        return are_numbers(*source._tensors, *(() if self.like is None else self.like._tensors))
 
     def _made(self, source: Camera, values: Mapping[str, Any], xp: Any) -> tuple[Camera, Tensor | None]:
         """The same by tensors, arrays in float64, or numbers: with the functions of torch, of numpy or of math."""
@@ -246,12 +245,12 @@ class RandomCamera(Augmentation):
 
     def _view(self, source: Camera, draw: Mapping[str, Any]) -> View | None:
         """What a draw makes of a single camera as plain numbers; None where it takes more than that."""
-        if self.min_filled or source.batch_shape or not self._is_usual or not isinstance(draw["apply"], np.ndarray):
+        if self.min_filled or not self._is_usual or not isinstance(draw["apply"], np.ndarray) or source.batch_shape:
             return None
         if isinstance(source, PANORAMAS) or isinstance(self.like, PANORAMAS):
             return None
         values = self._values(source, draw)
-        if any(isinstance(v, np.ndarray) for v in values.values()) or not self._are_plain(source, values):
+        if any(isinstance(v, (np.ndarray, Tensor)) for v in values.values()) or not self._are_plain(source):
             return None
         base, numbers, distortion, size = self._target(source, values, math)
         total = math.fsum(numbers) + math.fsum(distortion.tolist())
@@ -412,7 +411,8 @@ def _sized(base: Camera, size: tuple[int, int], fov: Any, xp: Any) -> Sequence[A
         rays = rays.expand(*broadcast_shapes(rays.shape, (*base.batch_shape, 2, 3)))
     pixels, valid = base.project(rays)
     if fails(valid):
-        raise ValueError(f"fov: a {base.key} lens of these coefficients does not reach {float(fov if xp is math else fov.max()):g} degrees")
+        widest = float(fov if xp is math else fov.max())
+        raise ValueError(f"fov: a {base.key} lens of these coefficients does not reach {widest:g} degrees")
     wide = pixels[..., 1, 0] - pixels[..., 0, 0]
     ratio = size[1] / (wide if xp is torch else wide.numpy())
     return own[0] * ratio, own[1] * ratio, cx, cy

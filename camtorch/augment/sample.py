@@ -604,7 +604,7 @@ class SampleTransform(nn.Module):
         else:
             options, size = self.options, part.view.image_size
             ends = rows_of(part.camera, *part.camera._tensors).native, part.view.native()
-            between = None if None in ends else (*ends, part.view.rotation())
+            between = None if None in ends else (*ends, part.view.rotation)
         if between is None or not options["tolerance"]:
             return {}
         fill = options["fill"]

@@ -222,7 +222,7 @@ class Lenses:
     """What it has of them; pointers that are not set are of what is not yet known."""
     _kept: list[object]
 
-    def __init__(self, plan: Plan, optics_of: Optics, k: Tensor, domain: Callable[[], Domain]):
+    def __init__(self, plan: Plan, optics_of: Optics, k: Tensor, domain: Callable[[], Domain], tables: bool = False):
         """See `native_of`."""
         self.plan, self._optics_of, self._k, self._kept = plan, optics_of, k, [k]
         self._slow_domain, self.cameras, self.dtype = domain, len(k), k.dtype
@@ -236,7 +236,7 @@ class Lenses:
         if plan.is_chart:
             self._add_chart()
         if plan.has_stages:
-            self._add_domain()
+            self._add_domain(tables)
 
     def _optics(self) -> tuple[Chart, Lens]:
         """In double precision."""
@@ -288,7 +288,7 @@ class Lenses:
         struct = self.struct
         struct.chart_inner2, struct.chart_table, struct.chart_most2 = inner2, place, self._keep(table[:, 1])
 
-    def _add_domain(self) -> None:
+    def _add_domain(self, tables: bool) -> None:
         plan = self.plan
         if plan.is_chart:  # whose end is that of a search
             domain = self._slow_domain()
@@ -301,6 +301,8 @@ class Lenses:
             wanted |= {"certain": self._new(plan.controls, torch.uint8), "certain2": self._new(1)}
         for name, place in wanted.items():
             setattr(self.struct, name, place)
+        if tables and plan.has_factor:  # at once, as there will be pixels
+            wanted["table"] = self.struct.table = self._new(_TABLE)
         radii = {} if plan.is_radial else {"radii": self._keep(plan.radii(lambda: self._optics()[0], _RADII, self._k))}
         self._ask(wanted | radii)
 
@@ -349,12 +351,12 @@ _MOST_LENSES, _LONGEST = 24, 512
 _lenses: dict[tuple[object, ...], Lenses] = {}
 
 
-def _lenses_of(plan: Plan, optics_of: Optics, k: Tensor, domain: Callable[[], Domain]) -> Lenses:
+def _lenses_of(plan: Plan, optics_of: Optics, k: Tensor, domain: Callable[[], Domain], tables: bool) -> Lenses:
     """Those of these values: of the last ones that were asked for, or new ones."""
     if k.numel() > _LONGEST:
-        return Lenses(plan, optics_of, k, domain)
+        return Lenses(plan, optics_of, k, domain, tables)
     key = plan, k.dtype, k.shape, k.numpy().tobytes()
-    found = _lenses.pop(key, None) or Lenses(plan, optics_of, k, domain)
+    found = _lenses.pop(key, None) or Lenses(plan, optics_of, k, domain, tables)
     _lenses[key] = found  # the last one
     while len(_lenses) > _MOST_LENSES:
         _lenses.pop(next(iter(_lenses)), None)
@@ -392,7 +394,12 @@ class Native:
 
 
 def native_of(
-    optics_of: Optics, intrinsics: Tensor, k: Tensor, usable: Tensor | None, domain: Callable[[], Domain]
+    optics_of: Optics,
+    intrinsics: Tensor,
+    k: Tensor,
+    usable: Tensor | None,
+    domain: Callable[[], Domain],
+    tables: bool = False,
 ) -> Native | None:
     """Cameras as the compiled geometry takes them.
 
@@ -404,11 +411,12 @@ def native_of(
         k: (C, n), coefficients.
         usable: the mask (C, 1) of the cameras that are usable, None if all are.
         domain: makes that of the lenses, for what the compiled geometry does not do.
+        tables: whether what the inverse starts from is sure to be wanted.
     """
     if library() is None or not intrinsics.is_cpu or not k.shape[0]:
         return None
     plan = _plan(optics_of, k)
-    return None if plan is None else Native(_lenses_of(plan, optics_of, k, domain), intrinsics, usable)
+    return None if plan is None else Native(_lenses_of(plan, optics_of, k, domain, tables), intrinsics, usable)
 
 
 def codes(chart: Chart, lens: Lens) -> list[_Part] | None:

@@ -110,7 +110,7 @@ class Cameras:
 def single_native(model: type[Camera], intrinsics: Tensor, k: Tensor) -> compiled.Native | None:
     """A camera of numbers (4,) and (n,) that are known to be usable, for the compiled geometry, if that knows it."""
     k = k.detach()[None]
-    return compiled.native_of(model.optics, intrinsics[None], k, None, partial(_domain, model, k, False))
+    return compiled.native_of(model.optics, intrinsics[None], k, None, partial(_domain, model, k, False), tables=True)
 
 
 def _domain(model: type[Camera], k: Tensor, learns: bool) -> Domain:

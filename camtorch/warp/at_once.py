@@ -35,7 +35,7 @@ _ALIGNED = 64
 def between_of(warp: Warp) -> tuple[Native, Native, Tensor | None] | None:
     """Source, target and rotation of a warp for compiled code; None where it has to go step by step.
 
-    That is where its positions are kept, exact or antialiased, in a graph or traced, of a batch, of a seam or a shutter.
+    That is where its positions are kept, exact, antialiased, in a graph, traced, of a batch, a seam or a shutter.
     """
     source, target, rotation = warp.source, warp.target, warp.rotation
     if not warp.is_an_operator or warp._decides or warp._pinned is not None or warp.batch_shape:
@@ -95,10 +95,12 @@ def at_once(
     tensors = [image for image, _ in work.images] + list(work.pixels)
     if not is_eager(*tensors) or (torch.is_grad_enabled() and any(t.requires_grad for t in tensors)):
         return None
-    if any(torch.promote_types(t.dtype, source.dtype) != source.dtype for t in work.pixels):
-        return None
-    work = Work(work.images, [t.to(source.dtype) for t in work.pixels])
-    rotation = None if rotation is None else rotation.detach().to(source.dtype).contiguous()
+    if any(t.dtype != source.dtype for t in work.pixels):
+        if any(torch.promote_types(t.dtype, source.dtype) != source.dtype for t in work.pixels):
+            return None
+        work = Work(work.images, [t.to(source.dtype) for t in work.pixels])
+    if rotation is not None and (rotation.dtype != source.dtype or not rotation.is_contiguous()):
+        rotation = rotation.detach().to(source.dtype).contiguous()
     forms = [(image.shape[1], image.stride(), image.dtype, how) for image, how in work.images]
     key = (sizes, source.dtype, tolerance, *forms, *((t.shape[1], t.stride()) for t in work.pixels))
     call = _calls.kept.pop(key, None) or _Call.of(sizes, source.dtype, tolerance, work)

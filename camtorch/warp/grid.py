@@ -378,6 +378,7 @@ def _probes(rows: range, width: int, like: Tensor) -> Tensor:
 
 @lru_cache(maxsize=8)
 def kept_probes(rows: range, width: int, dtype: torch.dtype) -> Tensor:
+    """(1, N, 2), on the CPU: the nodes of a lattice, and then the pixels at the rim of the target."""
     with torch.inference_mode(False):
         return _probes(rows, width, torch.empty(0, dtype=dtype, device="cpu"))
 
