@@ -608,7 +608,7 @@ def _jittered_alone(
     native = None
     if model.always_defined and _is_within((fx, fy, cx, cy), end, size):
         rim = _border(size, k.dtype)[None]
-        steps = np.resize(np.array(amounts[:DRAWN], given.dtype), len(given)) * measured
+        steps = np.array([amounts[i % DRAWN] for i in range(len(given))], given.dtype) * measured
         for part in _PARTS:
             candidate = torch.from_numpy(given + given.dtype.type(part) * steps)
             native = single_native(model, intrinsics, candidate)

@@ -124,7 +124,9 @@ class _Call:
             return None
         for image, how in work.images:
             result = sampler.empty(image, 1, sizes[1])
-            if not sampler.takes(image.dtype, how.mode) or not sampler.is_quick(image, result, how.mode):
+            if 0 in result.shape or not sampler.takes(image.dtype, how.mode):
+                return None
+            if not sampler.is_quick(image, result, how.mode):
                 return None
         return cls(sizes, dtype, tolerance, work)
 
