@@ -48,6 +48,10 @@ class View:
     image_size: tuple[int, int]
     turn: Sequence[float] | None
     """The elements of the rotation, row by row, or None."""
+    start: Native | None = None
+    """The camera before, for compiled code."""
+    lens: Native | None = None
+    """One of the same lens as the new camera, if there is one already."""
 
     def camera(self) -> Camera:
         """A new one."""
@@ -63,8 +67,10 @@ class View:
 
     def native(self) -> Native | None:
         """The camera for compiled code, if that knows the model."""
-        model, like = type_before_parametrizations(self.base), self.base.intrinsics
-        return single_native(model, joined(self.intrinsics, like, math), self.distortion)
+        intrinsics = joined(self.intrinsics, self.base.intrinsics, math)
+        if self.lens is not None:
+            return self.lens.before(intrinsics[None])
+        return single_native(type_before_parametrizations(self.base), intrinsics, self.distortion)
 
 
 @dataclass
@@ -273,13 +279,11 @@ class Change:
     @property
     def rotation(self) -> Tensor:
         """(count, 3, 3): `ray_after = R ray_before`."""
-
-        def turned(part: Part, n: int) -> Tensor:
+        parts = []
+        for part, n in zip(self.parts, self._counts, strict=True):
             moves = part.view or part.warp
             turned = None if moves is None else moves.rotation
-            return (_eye(part.camera.intrinsics) if turned is None else turned).expand(n, 3, 3)
-
-        parts = [turned(part, n) for part, n in zip(self.parts, self._counts, strict=True)]
+            parts.append((_eye(part.camera.intrinsics) if turned is None else turned).expand(n, 3, 3))
         rotation = parts[0] if self._order is None else torch.cat(parts)[self._order]
         if self.gate is not None:
             rotation = torch.where(self.gate.to(rotation.device)[:, None, None], rotation, _eye(rotation))

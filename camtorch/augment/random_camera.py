@@ -29,7 +29,7 @@ from camtorch.augment.sample import Named
 from camtorch.camera import Camera
 from camtorch.lenses.drawing import FOLD, covering, drawn
 from camtorch.models import MODELS, KannalaBrandt
-from camtorch.projection.compiled import project, unproject
+from camtorch.projection.compiled import Native, project, unproject
 from camtorch.projection.rays import field_of_view, image_lattice, polar_rays, reach
 from camtorch.projection.rows import Cameras, single_native
 from camtorch.rotations import mount_elements
@@ -222,7 +222,7 @@ class RandomCamera(Augmentation):
 
     def _made(self, source: Camera, values: Mapping[str, Any], xp: Any) -> tuple[Camera, Tensor | None]:
         """The same by tensors, arrays in float64, or numbers: with the functions of torch, of numpy or of math."""
-        base, numbers, distortion, size = self._target(source, values, xp)
+        base, numbers, distortion, size, _ = self._target(source, values, xp)
         intrinsics = joined(numbers, distortion if xp is torch else base.intrinsics, xp)
         target = remade(base, intrinsics=intrinsics, distortion=distortion, image_size=size)
         elements = self._turned(values, xp)
@@ -252,13 +252,18 @@ class RandomCamera(Augmentation):
         values = self._values(source, draw)
         if any(isinstance(v, (np.ndarray, Tensor)) for v in values.values()) or not self._are_plain(source):
             return None
-        base, numbers, distortion, size = self._target(source, values, math)
+        base, numbers, distortion, size, lens = self._target(source, values, math)
         total = math.fsum(numbers) + math.fsum(distortion.tolist())
         if not math.isfinite(total) or min(numbers[:2]) <= 0:
             return None
-        if not (base.always_defined or rows_of(base, *base._tensors).usable is None):
+        before = rows_of(source, *source._tensors)
+        if distortion is source.distortion:
+            lens = before.native
+        elif not base.always_defined and rows_of(base, *base._tensors).usable is not None:
             return None
-        return View(base, numbers, distortion, size, self._turned(values, math))
+        if before.usable is not None:
+            return None
+        return View(base, numbers, distortion, size, self._turned(values, math), before.native, lens)
 
     @property
     def _is_usual(self) -> bool:
@@ -318,8 +323,8 @@ class RandomCamera(Augmentation):
 
     def _target(
         self, source: Camera, values: Mapping[str, Any], xp: Any
-    ) -> tuple[Camera, Sequence[Any], Tensor, tuple[int, int]]:
-        """The new camera: of whose model, fx, fy, cx and cy, distortion, and (height, width)."""
+    ) -> tuple[Camera, Sequence[Any], Tensor, tuple[int, int], Native | None]:
+        """The new camera: of whose model, fx, fy, cx and cy, distortion, and (height, width); see `View.lens`."""
         size = self.image_size or (source.height, source.width)
         base = source if self.like is None else self.like
         dtype, device = torch.promote_types(source.intrinsics.dtype, torch.float32), source.intrinsics.device
@@ -345,10 +350,10 @@ class RandomCamera(Augmentation):
             factor: Any = covering(joined((fx, fy, cx, cy), base.intrinsics, xp), reach, size)
             factor = factor if xp is torch else factor.numpy()
             fx, fy = fx * factor, fy * factor
-        distortion = base.distortion
+        distortion, lens = base.distortion, None
         if "distortion" in values and distortion.shape[-1] and xp is math:
             usual = self._usual(base, size) if "fov" in values else joined(before, distortion, xp)
-            distortion = _jittered_alone(base, (fx, fy, cx, cy), values["distortion"], usual, size)
+            distortion, lens = _jittered_alone(base, (fx, fy, cx, cy), values["distortion"], usual, size)
         elif "distortion" in values and distortion.shape[-1]:
             drawn_to = remade(base, intrinsics=joined((fx, fy, cx, cy), distortion, xp), image_size=size).detach()
             usual = self._usual(base, size) if "fov" in values else joined(before, distortion, xp).detach()
@@ -360,7 +365,7 @@ class RandomCamera(Augmentation):
             share, (right, down) = values["crop"], _pairs(values["place"])
             left, top = (1 - share) * right * width, (1 - share) * down * height
             fx, fy, cx, cy = fx / share, fy / share, (cx + 0.5 - left) / share - 0.5, (cy + 0.5 - top) / share - 0.5
-        return base, (fx, fy, cx, cy), distortion, size
+        return base, (fx, fy, cx, cy), distortion, size, lens
 
     def _usual(self, base: Camera, size: tuple[int, int]) -> Tensor:
         """(*B, 4): intrinsics of the lens with the field of view in the middle of the range; graph-free."""
@@ -598,8 +603,8 @@ def _shapes(camera: CameraNumbers, amounts: Tensor, nominal: Tensor) -> tuple[Te
 
 def _jittered_alone(
     base: Camera, numbers: Sequence[float], amounts: Sequence[float], nominal: Tensor, size: tuple[int, int]
-) -> Tensor:
-    """`jittered` of one lens with plain numbers fx, fy, cx, cy before images of a size."""
+) -> tuple[Tensor, Native | None]:
+    """`jittered` of one lens with plain numbers fx, fy, cx, cy before images of a size; see `View.lens`."""
     model, k, intrinsics = type_before_parametrizations(base), base.distortion.detach(), joined(numbers, nominal, math)
     fx, fy, cx, cy = intrinsics.tolist()
     given = k.numpy()
@@ -615,11 +620,11 @@ def _jittered_alone(
             if native is None:
                 break
             if bool(unproject(native, rim).valid.all()):
-                return candidate
+                return candidate, native
     if native is not None:
-        return k
+        return k, None
     lens = remade(base, intrinsics=intrinsics, image_size=size).detach()
-    return jittered(lens, torch.as_tensor(amounts, dtype=k.dtype), nominal)
+    return jittered(lens, torch.as_tensor(amounts, dtype=k.dtype), nominal), None
 
 
 def _is_within(numbers: Sequence[float], end: float, size: tuple[int, int]) -> bool:

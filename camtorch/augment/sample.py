@@ -26,7 +26,6 @@ from camtorch._arguments import (
     fails,
     no_camera,
 )
-from camtorch._evaluation import rows_of
 from camtorch._threads import on_one_thread
 from camtorch.augment.change import Change, alone, as_one
 from camtorch.augment.landmarks import Mirroring, exchanged
@@ -603,8 +602,8 @@ class SampleTransform(nn.Module):
             size = part.target._size_for("Warp")
         else:
             options, size = self.options, part.view.image_size
-            ends = rows_of(part.camera, *part.camera._tensors).native, part.view.native()
-            between = None if None in ends else (*ends, part.view.rotation)
+            ends = part.view.start, part.view.native()
+            between = None if ends[0] is None or ends[1] is None else (ends[0], ends[1], part.view.rotation)
         if between is None or not options["tolerance"]:
             return {}
         fill = options["fill"]

@@ -381,6 +381,10 @@ class Native:
         self.struct.intrinsics, self.struct.usable = map(_address, self._kept)
         self.pointer = addressof(self.struct)
 
+    def before(self, intrinsics: Tensor) -> Native:
+        """The same lenses with other intrinsics (C, 4), all usable."""
+        return Native(self._lenses, intrinsics, None)
+
     def add_tables(self, count: int) -> None:
         """Have what the inverse of so many pixels of each camera starts from."""
         if self.plan.has_factor and self.struct.table is None:
