@@ -193,7 +193,7 @@ class Plan:
     def parameters_of(self, optics_of: Optics, k: Tensor) -> Tensor:
         """(C, parameters) of coefficients (C, n)."""
         if self.places is not None:
-            return k if self.is_all else k[:, self.places]
+            return k if self.is_all else k.index_select(1, self.places)
         chart, lens = optics_of(columns(k))
         return torch.cat([c.expand(len(k), 1) for c in (*chart.parameters, *lens.parameters)], -1)
 
