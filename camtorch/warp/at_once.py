@@ -30,6 +30,7 @@ _HEAD, _LATTICE, _MOVE, _JOB = 5, 44, 22, 38  # words of the structures of C
 _MOST = 4  # forms of samples that a thread keeps calls of
 _FEW = 2  # tiles of an image that one thread makes alone
 _ALIGNED = 64
+_PIXELS = 1 << 3  # flags of what is left of pixels are times this
 
 
 def between_of(warp: Warp) -> tuple[Native, Native, Tensor | None] | None:
@@ -139,15 +140,8 @@ class _Call:
         probes = kept_probes(range(size[0]), size[1], dtype)
         count, nodes, wide = probes.shape[1], (n + 5) * (m + 5), dtype.itemsize
         is_double = dtype == torch.float64
-        parts = (
-            2 * count * wide,
-            4 * n * m,
-            count,
-            128 * n * m * wide,
-            8 * nodes * is_double,
-            4 * sampler.SCRATCH * (m + 8),
-            8,
-        )
+        parts = [2 * count * wide, 4 * n * m, count, 128 * n * m * wide, 8 * nodes * is_double]
+        parts += [4 * sampler.SCRATCH * (m + 8), 8]
         places = [-(-part // _ALIGNED) * _ALIGNED for part in parts]
         with torch.inference_mode(False):
             memory = torch.empty(sum(places), dtype=torch.uint8, device="cpu")
@@ -163,26 +157,8 @@ class _Call:
             kept.append(holds)
         reach = max((sampler.PADDINGS[how.padding_mode] for _, how in images), default=0)
         rows = compiled.rows_of(probes)
-        move = (
-            0,
-            0,
-            0,
-            0,
-            1,
-            3,
-            1,
-            compiled.POSITIONS,
-            *source_size,
-            *rows,
-            at,
-            2 * count,
-            1,
-            count,
-            valid,
-            count,
-            count,
-            0,
-        )
+        move = [0, 0, 0, 0, 1, 3, 1, compiled.POSITIONS, *source_size, *rows]
+        move += [at, 2 * count, 1, count, valid, count, count, 0]
         asked = at, 2 * count, count, valid, count, valid + nodes, count, 1, n, m, *size, *source_size, tolerance
         lattice = compiled.packed_lattices(
             *move, *asked, reach, cells, scratch, 0, narrow if is_double else 0, exact, used
@@ -233,15 +209,13 @@ class _Call:
         while flags := native.camtorch_together(words):
             if flags & LEFT_MOST:
                 return None
-            for bit, camera in (
-                (LEFT_FROM, target),
-                (LEFT_TO, source),
-                (LEFT_FROM << 3, source),
-                (LEFT_TO << 3, target),
-            ):
-                if flags & bit:
-                    camera.follow()
-            if flags >> 3:  # the images are made
+            # of the lattice, else of the pixels, which go the other way
+            left, (start, end) = (flags, (target, source)) if flags < _PIXELS else (flags // _PIXELS, (source, target))
+            if left & LEFT_FROM:
+                start.follow()
+            if left & LEFT_TO:
+                end.follow()
+            if flags >= _PIXELS:  # the images are made
                 words[1] = 0
         if not is_whole:
             for i in range(len(work.images)):
