@@ -73,7 +73,8 @@ def at_a_glance(
         return None
     if not (model.always_defined and is_eager()):
         return None
-    made, rows = [], []
+    made: list[Tensor] = []
+    rows: list[list[float]] = []
     for value in (intrinsics, distortion):
         if value is None and not model.default_count and made:
             tensor, row = made[0].new_empty(0), []
@@ -92,7 +93,7 @@ def at_a_glance(
     names = model.names_of(len(rows[1]))
     if names is None or len(rows[0]) != 4 or not min(rows[0][:2]) > 0:
         return None
-    if size is not None and not _off_centre(*rows[0][2:], size) <= _CENTRED:
+    if size is not None and not _off_centre(rows[0][2], rows[0][3], size) <= _CENTRED:
         return None
     return made[0], made[1], tuple(names)
 

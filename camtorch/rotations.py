@@ -150,7 +150,7 @@ def _is_right(matrix: Tensor) -> bool:
     if not all(abs(u[0] * v[0] + u[1] * v[1] + u[2] * v[2] - right) < _NEARLY for u, v, right in pairs):
         return False
     across = (b[1] * c[2] - b[2] * c[1], b[2] * c[0] - b[0] * c[2], b[0] * c[1] - b[1] * c[0])
-    return a[0] * across[0] + a[1] * across[1] + a[2] * across[2] > 0
+    return bool(a[0] * across[0] + a[1] * across[1] + a[2] * across[2] > 0)
 
 
 def turn(rotation: Tensor | None, rays: Tensor, name: str) -> Tensor:

@@ -119,7 +119,8 @@ class Spans:
 
     def of(self, shares: Any) -> dict[str, Any]:
         """The values (rows,) or (rows, size) at shares (total,) of their ranges, arrays or tensors."""
-        low, wide = self.low, self.wide
+        low: Any = self.low
+        wide: Any = self.wide
         if isinstance(shares, Tensor):
             low, wide = (torch.as_tensor(ends, device=shares.device) for ends in (low, wide))
         values = low + wide * shares

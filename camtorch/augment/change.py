@@ -95,13 +95,14 @@ class Part:
         """That of a warp from a camera to a view of the same place."""
         part = cls(rows, None, camera, view=view)
         del part.warp
-        part._options = options
+        part.__dict__["options"] = options
         return part
 
     def __getattr__(self, name: str) -> Any:
-        if name != "warp" or self.__dict__.get("view") is None:
+        view: View | None = self.__dict__.get("view")
+        if name != "warp" or view is None:
             raise AttributeError(f"Part has no {name}")
-        self.warp = Warp.unchecked(self.camera, self.view.camera(), self._options).turned_by(self.view.rotation)
+        self.warp = Warp.unchecked(self.camera, view.camera(), self.__dict__["options"]).turned_by(view.rotation)
         return self.warp
 
     @property

@@ -408,8 +408,8 @@ def _sized(base: Camera, size: tuple[int, int], fov: Any, xp: Any) -> Sequence[A
         return fx, fy, cx, cy
     half = fov * (math.pi / 360)
     sine, cosine = xp.sin(half), xp.cos(half)
-    if xp is math and (across := _seen_across(base, sine, cosine)) is not None:
-        return own[0] * size[1] / across, own[1] * size[1] / across, cx, cy
+    if xp is math and (seen := _seen_across(base, sine, cosine)) is not None:
+        return own[0] * size[1] / seen, own[1] * size[1] / seen, cx, cy
     ends = [joined((end, 0 * sine, cosine), base.intrinsics, xp) for end in (-sine, sine)]
     rays = torch.stack(ends, -2)
     if base.batch_shape:
@@ -605,7 +605,8 @@ def _jittered_alone(
     base: Camera, numbers: Sequence[float], amounts: Sequence[float], nominal: Tensor, size: tuple[int, int]
 ) -> tuple[Tensor, Native | None]:
     """`jittered` of one lens with plain numbers fx, fy, cx, cy before images of a size; see `View.lens`."""
-    model, k, intrinsics = type_before_parametrizations(base), base.distortion.detach(), joined(numbers, nominal, math)
+    model: type[Camera] = type_before_parametrizations(base)
+    k, intrinsics = base.distortion.detach(), joined(numbers, nominal, math)
     fx, fy, cx, cy = intrinsics.tolist()
     given = k.numpy()
     known = (model, size, k.dtype, given.tobytes(), nominal.numpy().tobytes())
