@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from operator import methodcaller
 from typing import TYPE_CHECKING, Any, ClassVar, ParamSpec, TypeVar, cast
 
 import torch
@@ -37,12 +36,12 @@ def typed_as(forward: Callable[P, R]) -> Callable[[Callable[..., Any]], Callable
 
 _BARE = nn.Module().__dict__
 _CONTAINERS = {"_own": {}, **{name: value for name, value in _BARE.items() if isinstance(value, (dict, set))}}
-_copied = methodcaller("copy")
+_KINDS = [type(value) for value in _CONTAINERS.values()]
 
 
 def _containers() -> dict[str, Any]:
     """The empty dicts and sets of a module, each its own."""
-    return dict(zip(_CONTAINERS, map(_copied, _CONTAINERS.values()), strict=True))
+    return dict(zip(_CONTAINERS, [kind() for kind in _KINDS], strict=True))
 
 
 class GeometryModule(nn.Module):
@@ -382,13 +381,14 @@ class Memo:
     Nothing is kept while the values may not be looked at. Copies and pickles begin empty.
     """
 
-    capacity: int
+    capacity: int = 1
     result: Any = None
     """The one that was asked for last, of whatever inputs."""
     _kept: Sequence[tuple[tuple[Any, ...], list[Tensor], Any]] = ()  # the last one used is first
 
     def __init__(self, capacity: int = 1) -> None:
-        self.capacity = capacity
+        if capacity != 1:
+            self.capacity = capacity
 
     def __call__(self, inputs: Sequence[Tensor], options: tuple[Any, ...], compute: Callable[[], Any]) -> Any:
         """`compute()` without a graph, or its kept result; it depends on the tensors `inputs` and on `options`."""

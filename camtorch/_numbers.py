@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -27,6 +28,7 @@ from camtorch._arguments import (
 )
 from camtorch._freezing import INTRINSICS, frozen_names
 from camtorch._module import remade
+from camtorch._tracing import is_eager
 from camtorch.projection.rays import AXES, focal_for
 
 if TYPE_CHECKING:
@@ -35,6 +37,7 @@ if TYPE_CHECKING:
 CameraT = TypeVar("CameraT", bound="Camera")
 
 _OF_CALIBRATE_CAMERA = 5, 8, 12, 14  # OpenCV's numbers of coefficients; 4 may be of its fisheye, too
+_DTYPES, _NUMBERS = (torch.float32, torch.float64), {float, int}
 _LOOKED_AT = 64  # cameras of a batch: numbers in a wrong order are so in all of them
 _CENTRED, _NEAR = 0.1, 0.05
 """Of the image's sides: how far from its middle principal points usually lie, and how near one is certainly meant."""
@@ -57,6 +60,42 @@ def checked_numbers(
     if size is not None:
         warn_of_order(intrinsics, size, owner, stacklevel=4)
     return intrinsics, distortion, batch, size
+
+
+def at_a_glance(
+    model: type[Camera], intrinsics: Any, distortion: Any, size: Any
+) -> tuple[Tensor, Tensor, tuple[str, ...]] | None:
+    """Own tensors (4,) and (n,) of a single camera, and the names of its coefficients, if all is right at a glance.
+
+    That is of lists of numbers, and of plain tensors. None: it takes `checked_numbers` to say what is.
+    """
+    if size is not None and not (type(size) is tuple and [*map(type, size)] == [int, int] and min(size) > 0):
+        return None
+    if not (model.always_defined and is_eager()):
+        return None
+    made: list[Tensor] = []
+    rows: list[list[float]] = []
+    for value in (intrinsics, distortion):
+        if value is None and not model.default_count and made:
+            tensor, row = made[0].new_empty(0), []
+        elif type(value) is Tensor and value.ndim == 1 and value.dtype in _DTYPES and is_eager(value):
+            if value.requires_grad:
+                return None
+            tensor, row = value.detach().clone(), value.tolist()
+        elif type(value) is list and _NUMBERS.issuperset(map(type, value)):
+            tensor, row = torch.tensor(value, dtype=torch.get_default_dtype()), value
+        else:
+            return None
+        if not (is_eager(tensor) and tensor.dtype in _DTYPES and math.isfinite(sum(row))):
+            return None
+        made.append(tensor)
+        rows.append(row)
+    names = model.names_of(len(rows[1]))
+    if names is None or len(rows[0]) != 4 or not min(rows[0][:2]) > 0:
+        return None
+    if size is not None and not _off_centre(rows[0][2], rows[0][3], size) <= _CENTRED:
+        return None
+    return made[0], made[1], tuple(names)
 
 
 def described(camera: Camera) -> str:

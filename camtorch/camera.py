@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, cast
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn.utils import parametrize
 
 from camtorch._arguments import (
@@ -27,6 +27,7 @@ from camtorch._freezing import PREFIX, freeze, loaded, saved, with_frozen
 from camtorch._module import BatchedModule, Memo, remade, typed_as
 from camtorch._notebook import as_html
 from camtorch._numbers import (
+    at_a_glance,
     camera_of_fov,
     checked_numbers,
     described,
@@ -133,6 +134,8 @@ class Camera(BatchedModule):
     """How many coefficients, those of `ideal`, a camera has that is made without distortion."""
     defined_text: ClassVar[str] = ""
     """In words, what `defined` asks for."""
+    always_defined: ClassVar[bool] = False
+    """Whether the formula exists for all coefficients, as it does where a model states no `defined`."""
     _repr_html_ = as_html
     is_mixed: ClassVar[bool] = False
     """Whether it is a batch of several models, which have no coefficients in common; see `Mixed`."""
@@ -182,6 +185,14 @@ class Camera(BatchedModule):
     def __init__(
         self, intrinsics: Numbers, distortion: Numbers | None = None, *, image_size: Sequence[int] | None = None
     ):
+        known = at_a_glance(type(self), intrinsics, distortion, image_size)
+        if known is not None:
+            intrinsics, distortion, names = known
+            memos = {name: Memo() for name in self.memo_names}
+            super().__init__(distortion_names=names, image_size=image_size, **memos, _warned=False)
+            self.put("intrinsics", nn.Parameter(intrinsics))
+            self.put("distortion", nn.Parameter(distortion) if names else distortion)
+            return
         intrinsics, distortion, batch, size = checked_numbers(type(self), intrinsics, distortion, image_size)
         count = distortion.shape[-1]
         super().__init__(
@@ -706,6 +717,7 @@ def _add_model(model: type[Camera]) -> None:
                 f"{type(stated).__name__}"
             )
     model._model = register(model)
+    model.always_defined = model.defined is Camera.defined
     if "key" not in model.__dict__:
         model.key = ""
         return

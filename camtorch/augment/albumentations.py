@@ -124,7 +124,7 @@ class Transform(A.DualTransform):
         return np.concatenate((moved.numpy().astype(bboxes.dtype), bboxes[:, 4:]), 1)
 
     def apply_to_camera(self, camera: Camera | None, change: Change, **params: Any) -> Camera:
-        return change.single.clone()
+        return change.single
 
     def _mover(self, kind: str) -> Callable[..., np.ndarray]:
         def move(value: np.ndarray, change: Change, **params: Any) -> np.ndarray:

@@ -104,10 +104,39 @@ def as_range(
     return Range(low, high, size)
 
 
+class Spans:
+    """Ranges, ready to draw a value of each for some samples."""
+
+    def __init__(self, ranges: Mapping[str, Range], rows: int):
+        self.ranges, self.rows, self._places = dict(ranges), rows, []
+        counts = [rows * (interval.size or 1) for interval in ranges.values()]
+        self.low = np.repeat([interval.low for interval in ranges.values()] or [0.0], counts or [0])
+        self.wide = np.repeat([interval.high - interval.low for interval in ranges.values()] or [0.0], counts or [0])
+        self.total, end = sum(counts), 0
+        for (name, interval), count in zip(ranges.items(), counts, strict=True):
+            self._places.append((name, slice(end, end + count), interval.size and (rows, interval.size)))
+            end += count
+
+    def of(self, shares: Any) -> dict[str, Any]:
+        """The values (rows,) or (rows, size) at shares (total,) of their ranges, arrays or tensors."""
+        low: Any = self.low
+        wide: Any = self.wide
+        if isinstance(shares, Tensor):
+            low, wide = (torch.as_tensor(ends, device=shares.device) for ends in (low, wide))
+        values = low + wide * shares
+        return {n: values[at] if shape is None else values[at].reshape(shape) for n, at, shape in self._places}
+
+
 def draw(
-    ranges: Mapping[str, Range], count: int, p: float, same: bool, generator: torch.Generator | None
-) -> dict[str, Any]:
-    """`apply` (count,) bool, which is true with probability p, and a value (count,) or (count, size) for every range.
+    ranges: Mapping[str, Range],
+    count: int,
+    p: float,
+    same: bool,
+    generator: torch.Generator | None,
+    spans: Spans | None = None,
+) -> tuple[dict[str, Any], Spans]:
+    """`apply` (count,) bool, which is true with probability p, and a value (count,) or (count, size) for every range;
+    and what is to be given as `spans` for the next draw.
 
     The numbers come in the order in which kornia asks for them: first the gate, if there is a choice, then the ranges.
     They are arrays, which take less time than tensors, and tensors where the generator is on another device or what is
@@ -116,21 +145,18 @@ def draw(
     if not (generator is None or isinstance(generator, torch.Generator)):
         raise TypeError(f"draw: generator must be a torch.Generator, or None; got {shown(generator)}")
     rows = min(count, 1) if same else count
-    device = _CPU if generator is None else generator.device
+    if spans is None or spans.rows != rows or spans.ranges != ranges:
+        spans = Spans(ranges, rows)
+    device = _CPU if generator is None or generator.device.type == "cpu" else generator.device
     gate: Any = torch.rand(rows, generator=generator, device=device) < p if 0 < p < 1 else None
-    sizes = [rows * (interval.size or 1) for interval in ranges.values()]
     # in float64, so that what is drawn is what every precision sees
-    shares: Any = torch.rand(sum(sizes), generator=generator, dtype=torch.float64, device=device)
-    if device.type == "cpu" and not torch.compiler.is_compiling():
-        gate, shares = np.full(rows, p >= 1) if gate is None else gate.numpy(), shares.numpy()
+    shares: Any = torch.rand(spans.total, generator=generator, dtype=torch.float64, device=device)
+    if device is _CPU and not torch.compiler.is_compiling():
+        gate, shares = np.array([p >= 1] * rows, bool) if gate is None else gate.numpy(), shares.numpy()
     elif gate is None:
         gate = torch.full((rows,), p >= 1, device=device)
-    values, end = {"apply": gate}, 0
-    for (name, interval), size in zip(ranges.items(), sizes, strict=True):
-        value = interval.low + (interval.high - interval.low) * shares[end : end + size]
-        values[name] = value if interval.size is None else value.reshape(rows, interval.size)
-        end += size
-    return values if rows == count else {name: value[[0] * count] for name, value in values.items()}
+    values = {"apply": gate, **spans.of(shares)}
+    return (values if rows == count else {name: value[[0] * count] for name, value in values.items()}), spans
 
 
 class EditOptions(SampleOptions, total=False):
@@ -226,6 +252,7 @@ class Augmentation(SampleTransform):
         self.ranges = dict(ranges or {})
         self.min_filled = None if min_filled is None else as_part(min_filled, "min_filled", self._name)
         self._warned = False
+        self._spans: Spans | None = None
         self.last: Change | None = None
         """The change of the last call: its `source`, `target` and `rotation`."""
 
@@ -270,7 +297,8 @@ class Augmentation(SampleTransform):
 
     def _numbers(self, count: int, p: float, same_on_batch: bool, generator: torch.Generator | None) -> dict[str, Any]:
         """The draw as arrays or tensors; see the function `draw`."""
-        return draw(self.ranges, count, p, same_on_batch, generator)
+        values, self.__dict__["_spans"] = draw(self.ranges, count, p, same_on_batch, generator, self._spans)
+        return values
 
     def with_boxes(self, draw: Mapping[str, Any], boxes: Tensor | Sequence[Tensor] | None) -> Mapping[str, Any]:
         """A draw with the boxes of samples that it needs, where it has not got them.
@@ -279,7 +307,7 @@ class Augmentation(SampleTransform):
             draw: as of `draw`.
             boxes: of the samples (B, M, 4), or (M, 4) each; None if they have none.
         """
-        missing = {name: index for name, index in self.crops.items() if name not in draw}
+        missing = {name: index for name, index in self.crops.items() if name not in draw} if self.crops else {}
         if not missing:
             return draw
         if boxes is None:
@@ -309,6 +337,8 @@ class Augmentation(SampleTransform):
         groups: list[tuple[list[int] | None, Camera]] = [(None, camera)]
         if isinstance(camera, Mixed):
             groups = list(camera.groups)
+        elif count == 1 and applied[0] and self.p == 1 and isinstance(applied, np.ndarray):
+            return Change(1, [self._part(None, camera, draw)])
         before = {group.image_size for _, group in groups}
         if 0 < self.p < 1 and self.image_size is not None and before != {self.image_size}:
             raise ValueError(
@@ -375,11 +405,13 @@ class Augmentation(SampleTransform):
 
     def _values(self, source: Camera, draw: Mapping[str, Any]) -> dict[str, Any]:
         """What was drawn, (*B,) or (*B, size): of a single camera without batch dims where all samples draw the same,
-        as one map then serves them all.
+        as one map then serves them all; of arrays then plain numbers.
         """
         values = {name: value for name, value in draw.items() if name != "apply"}
         if not source.batch_shape and (len(draw["apply"]) == 1 or all(map(_are_alike, values.values()))):
-            values = {name: value[0] for name, value in values.items()}
+            values = {
+                n: value[0].tolist() if isinstance(value, np.ndarray) else value[0] for n, value in values.items()
+            }
         return values
 
     def _new_camera(self, source: Camera, values: Mapping[str, Any]) -> tuple[Camera, Tensor | None]:
@@ -390,7 +422,7 @@ class Augmentation(SampleTransform):
     def _like(source: Camera, values: Mapping[str, Any]) -> dict[str, Tensor]:
         """The values as tensors in the source's dtype and on its device."""
         dtype = torch.promote_types(source.intrinsics.dtype, torch.float32)
-        return {name: torch.as_tensor(value).to(source.intrinsics.device, dtype) for name, value in values.items()}
+        return {n: torch.as_tensor(value, dtype=dtype, device=source.intrinsics.device) for n, value in values.items()}
 
     def _warp(
         self, source: Camera, target: Camera, rotation: Tensor | None, shutter: RollingShutter | None = None
@@ -428,7 +460,7 @@ class Augmentation(SampleTransform):
         if not is_concrete(camera.intrinsics):
             return
         self._warned = True
-        values = draw(self.ranges, _TRIES, 1.0, False, torch.Generator().manual_seed(0))
+        values, _ = draw(self.ranges, _TRIES, 1.0, False, torch.Generator().manual_seed(0))
         with torch.no_grad():
             first = camera.detach()
             first = first[[0] * _TRIES] if first.batch_shape else first
@@ -516,6 +548,8 @@ class Augmentation(SampleTransform):
 
     def _of_sample(self, draw: Mapping[str, Any], named: Named) -> Mapping[str, Any]:
         """A draw with what it needs of a sample: boxes are those of that name, or the first of that kind."""
+        if not self.crops:
+            return draw
         found: dict[str, Any] = {name: value for name, (kind, value) in named.items() if kind == "boxes"}
         return self.with_boxes(draw, found.get("boxes", next(iter(found.values()), None)))
 

@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
+from torch.nn.utils.parametrize import type_before_parametrizations
 
 from camtorch._arguments import fails, holds
 from camtorch._dtypes import narrow, widen
 from camtorch._editing import edited
 from camtorch._module import remade
+from camtorch._numbers import joined
 from camtorch.camera import Camera
 from camtorch.mixed import Listed, Mixed
+from camtorch.projection.compiled import Native
+from camtorch.projection.rows import single_native
 from camtorch.warp.affine import AffineWarp, MirrorWarp, after
 from camtorch.warp.boxes import corners_of, in_order
 from camtorch.warp.sampling import Mode, Options
@@ -31,6 +37,43 @@ def _same(value: Tensor) -> Tensor:
 
 
 @dataclass
+class View:
+    """The new camera of a single sample as plain numbers, of which modules are made when somebody asks for them."""
+
+    base: Camera
+    """Of whose model and dtype it is."""
+    intrinsics: Sequence[float]
+    distortion: Tensor
+    """(n,)."""
+    image_size: tuple[int, int]
+    turn: Sequence[float] | None
+    """The elements of the rotation, row by row, or None."""
+    start: Native | None = None
+    """The camera before, for compiled code."""
+    lens: Native | None = None
+    """One of the same lens as the new camera, if there is one already."""
+
+    def camera(self) -> Camera:
+        """A new one."""
+        numbers = joined(self.intrinsics, self.base.intrinsics, math)
+        return remade(
+            self.base, intrinsics=numbers, distortion=self.distortion.detach().clone(), image_size=self.image_size
+        )
+
+    @cached_property
+    def rotation(self) -> Tensor | None:
+        """(3, 3), or None."""
+        return None if self.turn is None else joined(self.turn, self.base.intrinsics, math).view(3, 3)
+
+    def native(self) -> Native | None:
+        """The camera for compiled code, if that knows the model."""
+        intrinsics = joined(self.intrinsics, self.base.intrinsics, math)
+        if self.lens is not None:
+            return self.lens.before(intrinsics[None])
+        return single_native(type_before_parametrizations(self.base), intrinsics, self.distortion)
+
+
+@dataclass
 class Part:
     """Rows of a batch that move by one warp, or stay as they are."""
 
@@ -44,6 +87,23 @@ class Part:
     """How red and blue move, where they do not move as green."""
     light: Tensor | None = None
     """(n or 1, 1, H', W'): what the lens lets through."""
+    view: View | None = None
+    """What the warp is made by, if it is made only when it is asked for."""
+
+    @classmethod
+    def seen(cls, rows: list[int] | None, camera: Camera, view: View, options: Options) -> Part:
+        """That of a warp from a camera to a view of the same place."""
+        part = cls(rows, None, camera, view=view)
+        del part.warp
+        part.__dict__["options"] = options
+        return part
+
+    def __getattr__(self, name: str) -> Any:
+        view: View | None = self.__dict__.get("view")
+        if name != "warp" or view is None:
+            raise AttributeError(f"Part has no {name}")
+        self.warp = Warp.unchecked(self.camera, view.camera(), self.__dict__["options"]).turned_by(view.rotation)
+        return self.warp
 
     @property
     def target(self) -> Camera:
@@ -53,7 +113,7 @@ class Part:
     def by(self, change: Callable[[Warp], Warp]) -> Part:
         """The part with each of its warps changed."""
         shades = None if self.shades is None else (change(self.shades[0]), change(self.shades[1]))
-        return replace(self, warp=None if self.warp is None else change(self.warp), shades=shades)
+        return replace(self, warp=None if self.warp is None else change(self.warp), shades=shades, view=None)
 
     def take(self, index: list[int]) -> Part:
         """These rows of the part, as all there is."""
@@ -178,8 +238,20 @@ class Change:
 
     @property
     def single(self) -> Camera:
-        """The camera after, of a change of one sample."""
-        return self.target[0] if self.gate is not None else alone(self.parts[0].target)
+        """The camera after, of a change of one sample; its own, not that of the change."""
+        if (view := self.parts[0].view) is not None:
+            return view.camera()
+        return (self.target[0] if self.gate is not None else alone(self.parts[0].target)).clone()
+
+    @property
+    def alone(self) -> Part | None:
+        """The part of a change of one sample, if a warp is all that happens to it."""
+        part = self.parts[0]
+        if self.count != 1 or part.rows is not None or self.gate is not None:
+            return None
+        if part.view is not None:
+            return part
+        return part if part.warp is not None and part.shades is None and part.light is None else None
 
     def leads_to(self, camera: Camera | Sequence[Camera]) -> bool:
         """Whether these may be the cameras after: of their number and intrinsics, where one may look."""
@@ -208,12 +280,11 @@ class Change:
     @property
     def rotation(self) -> Tensor:
         """(count, 3, 3): `ray_after = R ray_before`."""
-
-        def turned(part: Part, n: int) -> Tensor:
-            turned = None if part.warp is None else part.warp.rotation
-            return (_eye(part.camera.intrinsics) if turned is None else turned).expand(n, 3, 3)
-
-        parts = [turned(part, n) for part, n in zip(self.parts, self._counts, strict=True)]
+        parts = []
+        for part, n in zip(self.parts, self._counts, strict=True):
+            moves = part.view or part.warp
+            turned = None if moves is None else moves.rotation
+            parts.append((_eye(part.camera.intrinsics) if turned is None else turned).expand(n, 3, 3))
         rotation = parts[0] if self._order is None else torch.cat(parts)[self._order]
         if self.gate is not None:
             rotation = torch.where(self.gate.to(rotation.device)[:, None, None], rotation, _eye(rotation))
@@ -222,7 +293,8 @@ class Change:
     @property
     def mirrored(self) -> Tensor | None:
         """(count,) bool: which samples are seen in a mirror; None if none is."""
-        turns = [part.warp.rotation if isinstance(part.warp, MirrorWarp) else None for part in self.parts]
+        mirrors = [None if part.view is not None else part.warp for part in self.parts]
+        turns = [warp.rotation if isinstance(warp, MirrorWarp) else None for warp in mirrors]
         if all(turn is None for turn in turns):
             return None
         device = self.parts[0].camera.intrinsics.device
@@ -275,10 +347,7 @@ class Change:
         if self._inverse is not None:  # with the maps that it has made
             return self._inverse
         parts = [
-            part
-            if part.warp is None
-            else replace(part, warp=part.warp.inverse(), camera=part.warp.target, shades=None, light=None)
-            for part in self.parts
+            part if part.warp is None else Part(part.rows, part.warp.inverse(), part.warp.target) for part in self.parts
         ]
         self._inverse = Change(self.count, parts, batch_type=self.batch_type, gate=self.gate)
         return self._inverse

@@ -137,7 +137,7 @@ class Compose(Augmentation):
     # -- drawing
 
     def _numbers(self, count: int, p: float, same_on_batch: bool, generator: torch.Generator | None) -> dict[str, Any]:
-        values = draw({}, count, p, same_on_batch, generator)
+        values, _ = draw({}, count, p, same_on_batch, generator)
         for i, part in enumerate(self.parts):
             own = part._numbers(count, part.p, same_on_batch or part.same_on_batch, generator)
             for key, value in own.items():

@@ -26,6 +26,7 @@ Restore = Callable[[list[Tensor], tuple[int, int]], Any]
 _OWNER = "numpy.Transform"
 _SEEN = "image_valid"
 _FEW = 4  # channels
+_MOST_FORMS = 64  # of fields whose way is remembered
 
 
 class Transform:
@@ -64,6 +65,7 @@ class Transform:
                 f"{_OWNER}: augmentation must be an augmentation of camtorch; got {type(augmentation).__name__}"
             )
         self.augmentation = augmentation
+        self._ways: dict[Any, Callable[[str, Array], tuple[dict[str, Tensor], Restore]]] = {}
 
     def __call__(
         self,
@@ -123,8 +125,15 @@ class Transform:
         sample = {**(sample or {}), **fields}
         inside = Single()
         entries: dict[str, tuple[dict[str, Tensor], Restore | None]] = {}
+        camera = sample.get("camera")
+        size = getattr(self.augmentation.camera if camera is None else camera, "image_size", None)
+        context = size, *self.augmentation.fields.items()
         for name, value in sample.items():
-            tensors, restore = entries[name] = self._entry(name, value, sample)
+            is_array = isinstance(value, np.ndarray)
+            form = (name, value.dtype, value.shape, *context) if is_array else None
+            way = self._ways.get(form)
+            entries[name] = way(name, value) if way else self._entry(name, value, sample, size, form)
+            tensors, restore = entries[name]
             inside.update({name: value} if restore is None else tensors)
         with torch.no_grad():
             moved = move(inside, **{key: value for key, value in options.items() if value is not None})
@@ -138,14 +147,17 @@ class Transform:
             elif name in moved:
                 result[name] = moved.pop(name)
         for name, value in moved.items():
-            value = value.cpu().numpy() if isinstance(value, Tensor) else value
+            value = _plain(value) if isinstance(value, Tensor) else value
             result[name] = value[0] if name == _SEEN else value
         return result
 
-    def _entry(self, name: str, value: Any, sample: Mapping[str, Any]) -> tuple[dict[str, Tensor], Restore | None]:
+    def _entry(
+        self, name: str, value: Any, sample: Mapping[str, Any], size: tuple[int, int] | None, form: Any
+    ) -> tuple[dict[str, Tensor], Restore | None]:
         """A field as the augmentation takes it, tensors, and how it gets its layout back.
 
         The latter is a function of what became of the tensors, and of the new image_size; None for what is passed on.
+        What is right of a `form`, the way of it is remembered.
         """
         if name in OWN or value is None:
             return {}, None
@@ -161,15 +173,16 @@ class Transform:
                 return {}, None
             return {name: _tensor(_checked(name, np.asarray(value)))}, lambda moved, size: moved[0].cpu().numpy()
         if kind not in IMAGES:
-            value = _checked(name, _numbers(value, kind))
-            tensor = _tensor(value)
-            check(kind, name, tensor, False, _OWNER)
-            return {name: tensor}, lambda moved, size: moved[0].cpu().numpy().astype(value.dtype, copy=False)
-        camera = sample.get("camera")
-        size = getattr(self.augmentation.camera if camera is None else camera, "image_size", None)
+            numbers = _checked(name, _numbers(value, kind))
+            check(kind, name, _tensor(numbers), False, _OWNER)
+            if numbers is value:
+                self._remember(form, _labels)
+            return _labels(name, numbers)
         many = isinstance(value, (list, tuple))
         if not many and name not in ("images", "masks"):
-            return {name: as_tensor(name, value, size)}, lambda moved, size: as_array(moved[0], value)
+            as_tensor(name, value, size)
+            self._remember(form, _image)
+            return _image(name, value)
         # names that begin with their kind are known to the augmentation
         tensors = {f"{kind}_{name}[{i}]": as_tensor(f"{name}[{i}]", one, size) for i, one in enumerate(value)}
 
@@ -180,6 +193,29 @@ class Transform:
             return np.stack(arrays) if arrays else np.zeros((0, *size, *value.shape[3:]), value.dtype)
 
         return tensors, restore
+
+    def _remember(self, form: Any, way: Callable[[str, Array], tuple[dict[str, Tensor], Restore]]) -> None:
+        if len(self._ways) >= _MOST_FORMS:
+            self._ways.clear()
+        self._ways[form] = way
+
+
+def _labels(name: str, array: Array) -> tuple[dict[str, Tensor], Restore]:
+    return {name: _tensor(array)}, lambda moved, size: _plain(moved[0]).astype(array.dtype, copy=False)
+
+
+def _image(name: str, array: Array) -> tuple[dict[str, Tensor], Restore]:
+    return {name: _planes(array)}, lambda moved, size: as_array(moved[0], array)
+
+
+def _plain(tensor: Tensor) -> Array:
+    return tensor.numpy() if tensor.is_cpu else tensor.cpu().numpy()
+
+
+def _planes(array: Array) -> Tensor:
+    """(C, H, W) of an array (H, W, C) or (H, W)."""
+    tensor = _tensor(array)
+    return tensor.permute(2, 0, 1) if array.ndim == 3 else tensor[None]
 
 
 def _numbers(value: Any, kind: str) -> Any:
@@ -205,15 +241,14 @@ def as_tensor(name: str, value: object, size: tuple[int, int] | None = None) -> 
             f"{_OWNER}: {name} must be (H, W, C) or (H, W); got shape {shape}, which has its channels first: "
             "np.moveaxis(image, 0, -1) puts them last"
         )
-    tensor = _tensor(array)
-    return tensor.permute(2, 0, 1) if len(shape) == 3 else tensor[None]
+    return _planes(array)
 
 
 def as_array(image: Tensor, like: Array) -> Array:
     """An image (C, H, W) in the layout and the dtype of an array: itself, if its channels come last in memory too."""
-    image = image.detach().cpu()
+    image = image.detach() if image.is_cpu else image.detach().cpu()
     array = (image.permute(1, 2, 0).contiguous() if like.ndim == 3 else image[0]).numpy()
-    return np.ascontiguousarray(array, like.dtype)
+    return array if array.dtype == like.dtype and array.flags.c_contiguous else np.ascontiguousarray(array, like.dtype)
 
 
 def _checked(name: str, value: object) -> Array:
@@ -234,6 +269,8 @@ class _Lent:
 
 def _tensor(array: Array) -> Tensor:
     """A tensor in the memory of an array, where torch can read it there; for reading alone."""
+    if array.flags.carray and array.dtype.isnative and array.itemsize <= 8:
+        return torch.from_numpy(array)
     # torch takes neither other byte orders nor long doubles, nor strides that are negative or end within a number
     dtype = array.dtype.newbyteorder("=") if array.dtype.itemsize <= 8 else np.dtype(np.float64)
     flags, steps = array.flags, array.strides

@@ -13,29 +13,35 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.utils.parametrize import type_before_parametrizations
 
 from camtorch._arguments import are_numbers, as_image_size, broadcast_shapes, check_degrees, fails
+from camtorch._evaluation import rows_of
 from camtorch._module import Memo, remade
 from camtorch._numbers import joined, split, wide
 from camtorch._opaque import CameraNumbers, opaque
-from camtorch._tracing import in_graph
+from camtorch._tracing import in_graph, is_eager
 from camtorch.augment.augmentation import Augmentation, Range, as_range
-from camtorch.augment.change import Part
+from camtorch.augment.change import Part, View
 from camtorch.augment.filling import enough, scaled
 from camtorch.augment.presets import PRESETS, PresetName
 from camtorch.augment.sample import Named
 from camtorch.camera import Camera
-from camtorch.lenses.drawing import covering, drawn
+from camtorch.lenses.drawing import FOLD, covering, drawn
 from camtorch.models import MODELS, KannalaBrandt
+from camtorch.projection.compiled import Native, project, unproject
 from camtorch.projection.rays import field_of_view, image_lattice, polar_rays, reach
+from camtorch.projection.rows import Cameras, single_native
 from camtorch.rotations import mount_elements
 from camtorch.warp.boxes import along_edges
+from camtorch.warp.panorama import PANORAMAS
 from camtorch.warp.shifted import ShiftedWarp
 from camtorch.warp.shutter import RollingShutter
 from camtorch.warp.vignetting import vignetting
 from camtorch.warp.warp import Warp
 
 RangeLike = float | Sequence[float]
+Array = np.ndarray[Any, Any]
 
 
 DRAWN = 16
@@ -203,24 +209,67 @@ class RandomCamera(Augmentation):
     def _new_camera(self, source: Camera, values: Mapping[str, Any]) -> tuple[Camera, Tensor | None]:
         if type(self).new_camera is not RandomCamera.new_camera:
             return super()._new_camera(source, values)
-        lens = () if self.like is None else self.like._tensors
-        if are_numbers(*source._tensors, *lens) and not any(isinstance(value, Tensor) for value in values.values()):
+        if self._are_plain(source) and not any(isinstance(v, Tensor) for v in values.values()):
             # a hundred operations on some numbers, for each of which torch takes microseconds
-            of_one = all(isinstance(values.get(name, 0.0), float) for name in (*_TURNS, "fov"))
+            of_one = not source.batch_shape and not any(isinstance(value, np.ndarray) for value in values.values())
             return self._made(source, values, math if of_one else np)
         like = wide(source.intrinsics.detach())
         return self._made(source, {name: torch.as_tensor(value).to(like) for name, value in values.items()}, torch)
 
+    def _are_plain(self, source: Camera) -> bool:
+        """Whether plain numbers and arrays do, of which nothing is recorded."""
+        return are_numbers(*source._tensors, *(() if self.like is None else self.like._tensors))
+
     def _made(self, source: Camera, values: Mapping[str, Any], xp: Any) -> tuple[Camera, Tensor | None]:
         """The same by tensors, arrays in float64, or numbers: with the functions of torch, of numpy or of math."""
-        target = self._target(source, values, xp)
-        none = next((0 * values[name] for name in _TURNS if name in values), None)
-        if none is None:
+        base, numbers, distortion, size, _ = self._target(source, values, xp)
+        intrinsics = joined(numbers, distortion if xp is torch else base.intrinsics, xp)
+        target = remade(base, intrinsics=intrinsics, distortion=distortion, image_size=size)
+        elements = self._turned(values, xp)
+        if elements is None:
             return target, None
-        angles = [values.get(name, none) * (math.pi / 180) for name in _TURNS]
-        elements = mount_elements([xp.cos(a) for a in angles], [xp.sin(a) for a in angles])
         rotation = joined(elements, source.intrinsics, xp)
         return target, rotation.view(*rotation.shape[:-1], 3, 3)
+
+    def _turned(self, values: Mapping[str, Any], xp: Any) -> Sequence[Any] | None:
+        """The elements of the rotation, row by row; None: the camera stays as it looks."""
+        none = next((0 * values[name] for name in _TURNS if name in values), None)
+        if none is None:
+            return None
+        angles = [values.get(name, none) * (math.pi / 180) for name in _TURNS]
+        return mount_elements([xp.cos(a) for a in angles], [xp.sin(a) for a in angles])
+
+    def _part(self, rows: list[int] | None, source: Camera, draw: Mapping[str, Any]) -> Part:
+        view = self._view(source, draw)
+        return super()._part(rows, source, draw) if view is None else Part.seen(rows, source, view, self.options)
+
+    def _view(self, source: Camera, draw: Mapping[str, Any]) -> View | None:
+        """What a draw makes of a single camera as plain numbers; None where it takes more than that."""
+        if self.min_filled or not self._is_usual or not isinstance(draw["apply"], np.ndarray) or source.batch_shape:
+            return None
+        if isinstance(source, PANORAMAS) or isinstance(self.like, PANORAMAS):
+            return None
+        values = self._values(source, draw)
+        if any(isinstance(v, (np.ndarray, Tensor)) for v in values.values()) or not self._are_plain(source):
+            return None
+        base, numbers, distortion, size, lens = self._target(source, values, math)
+        total = math.fsum(numbers) + math.fsum(distortion.tolist())
+        if not math.isfinite(total) or min(numbers[:2]) <= 0:
+            return None
+        before = rows_of(source, *source._tensors)
+        if distortion is source.distortion:
+            lens = before.native
+        elif not base.always_defined and rows_of(base, *base._tensors).usable is not None:
+            return None
+        if before.usable is not None:
+            return None
+        return View(base, numbers, distortion, size, self._turned(values, math), before.native, lens)
+
+    @property
+    def _is_usual(self) -> bool:
+        """Whether a camera is all that is drawn, and by this class."""
+        usual = type(self).new_camera is RandomCamera.new_camera and not self.options["antialias"]
+        return usual and bool(self.options["tolerance"]) and self.beside_the_camera.isdisjoint(self.ranges)
 
     def _warp(
         self, source: Camera, target: Camera, rotation: Tensor | None, shutter: RollingShutter | None = None
@@ -272,7 +321,10 @@ class RandomCamera(Augmentation):
             values.get("readout", 0.0), torch.deg2rad(values["rates"]), exposure=values.get("exposure", 0.0)
         )
 
-    def _target(self, source: Camera, values: Mapping[str, Any], xp: Any) -> Camera:
+    def _target(
+        self, source: Camera, values: Mapping[str, Any], xp: Any
+    ) -> tuple[Camera, Sequence[Any], Tensor, tuple[int, int], Native | None]:
+        """The new camera: of whose model, fx, fy, cx and cy, distortion, and (height, width); see `View.lens`."""
         size = self.image_size or (source.height, source.width)
         base = source if self.like is None else self.like
         dtype, device = torch.promote_types(source.intrinsics.dtype, torch.float32), source.intrinsics.device
@@ -292,13 +344,17 @@ class RandomCamera(Augmentation):
                 fx, fy = fx * values[name], fy * values[name]
         height, width = size
         if "centre" in values:
-            cx, cy = cx + values["centre"][..., 0] * width, cy + values["centre"][..., 1] * height
+            right, down = _pairs(values["centre"])
+            cx, cy = cx + right * width, cy + down * height
         if self._is_real:
             factor: Any = covering(joined((fx, fy, cx, cy), base.intrinsics, xp), reach, size)
             factor = factor if xp is torch else factor.numpy()
             fx, fy = fx * factor, fy * factor
-        distortion = base.distortion
-        if "distortion" in values and distortion.shape[-1]:
+        distortion, lens = base.distortion, None
+        if "distortion" in values and distortion.shape[-1] and xp is math:
+            usual = self._usual(base, size) if "fov" in values else joined(before, distortion, xp)
+            distortion, lens = _jittered_alone(base, (fx, fy, cx, cy), values["distortion"], usual, size)
+        elif "distortion" in values and distortion.shape[-1]:
             drawn_to = remade(base, intrinsics=joined((fx, fy, cx, cy), distortion, xp), image_size=size).detach()
             usual = self._usual(base, size) if "fov" in values else joined(before, distortion, xp).detach()
             amounts = torch.as_tensor(values["distortion"], dtype=dtype, device=device)
@@ -306,10 +362,10 @@ class RandomCamera(Augmentation):
             if in_graph(base.distortion):
                 distortion = base.distortion + (distortion - base.distortion.detach())
         if "crop" in values:  # a part of the image, enlarged to the full size
-            share, place = values["crop"], values["place"]
-            left, top = (1 - share) * place[..., 0] * width, (1 - share) * place[..., 1] * height
+            share, (right, down) = values["crop"], _pairs(values["place"])
+            left, top = (1 - share) * right * width, (1 - share) * down * height
             fx, fy, cx, cy = fx / share, fy / share, (cx + 0.5 - left) / share - 0.5, (cy + 0.5 - top) / share - 0.5
-        return remade(base, intrinsics=joined((fx, fy, cx, cy), distortion, xp), distortion=distortion, image_size=size)
+        return base, (fx, fy, cx, cy), distortion, size, lens
 
     def _usual(self, base: Camera, size: tuple[int, int]) -> Tensor:
         """(*B, 4): intrinsics of the lens with the field of view in the middle of the range; graph-free."""
@@ -352,16 +408,31 @@ def _sized(base: Camera, size: tuple[int, int], fov: Any, xp: Any) -> Sequence[A
         return fx, fy, cx, cy
     half = fov * (math.pi / 360)
     sine, cosine = xp.sin(half), xp.cos(half)
+    if xp is math and (seen := _seen_across(base, sine, cosine)) is not None:
+        return own[0] * size[1] / seen, own[1] * size[1] / seen, cx, cy
     ends = [joined((end, 0 * sine, cosine), base.intrinsics, xp) for end in (-sine, sine)]
     rays = torch.stack(ends, -2)
     if base.batch_shape:
         rays = rays.expand(*broadcast_shapes(rays.shape, (*base.batch_shape, 2, 3)))
     pixels, valid = base.project(rays)
     if fails(valid):
-        raise ValueError(f"fov: a {base.key} lens of these coefficients does not reach {float(fov.max()):g} degrees")
+        widest = float(fov if xp is math else fov.max())
+        raise ValueError(f"fov: a {base.key} lens of these coefficients does not reach {widest:g} degrees")
     wide = pixels[..., 1, 0] - pixels[..., 0, 0]
     ratio = size[1] / (wide if xp is torch else wide.numpy())
     return own[0] * ratio, own[1] * ratio, cx, cy
+
+
+def _seen_across(base: Camera, sine: float, cosine: float) -> float | None:
+    """The pixels between two rays to either side of the axis; None where compiled code does not say."""
+    native = rows_of(base, base.intrinsics, base.distortion).native
+    if native is None:
+        return None
+    like = base.intrinsics
+    rays = joined((-sine, 0.0, cosine, sine, 0.0, cosine), like, math).view(1, 2, 3)
+    pixels, valid = project(native, rays)
+    (left, right), _ = pixels.view(2, 2).tolist()
+    return right - left if bool(valid.all()) else None
 
 
 class RandomMount(RandomCamera):
@@ -431,7 +502,7 @@ class RandomMount(RandomCamera):
         kind = next(kind for kind, name in _DEPTHS.items() if name == key)
         kind = "z" if kind == "depth" else kind
         warp = ShiftedWarp(source, part.target, part.warp.rotation, values, kind, shift, **self.options)
-        return replace(part, warp=warp)
+        return replace(part, warp=warp, view=None)
 
 
 class RandomLens(RandomCamera):
@@ -490,6 +561,11 @@ def _pair(value: RangeLike | str | None) -> RangeLike | str | None:
     return (value, value) if isinstance(value, (int, float)) else value
 
 
+def _pairs(values: Any) -> Any:
+    """Both of two numbers, or of (*B, 2) of them."""
+    return values if isinstance(values, list) else (values[..., 0], values[..., 1])
+
+
 def _light(camera: Camera, loss: Tensor) -> Tensor:
     """(B or 1, 1, H, W): one less `loss` (*B,) in the farthest corner, by the square of the distance."""
     height, width = camera.height, camera.width
@@ -525,6 +601,40 @@ def _shapes(camera: CameraNumbers, amounts: Tensor, nominal: Tensor) -> tuple[Te
     return (amounts.new_empty(*amounts.shape[:-1], camera.distortion.shape[-1]),)
 
 
+def _jittered_alone(
+    base: Camera, numbers: Sequence[float], amounts: Sequence[float], nominal: Tensor, size: tuple[int, int]
+) -> tuple[Tensor, Native | None]:
+    """`jittered` of one lens with plain numbers fx, fy, cx, cy before images of a size; see `View.lens`."""
+    model: type[Camera] = type_before_parametrizations(base)
+    k, intrinsics = base.distortion.detach(), joined(numbers, nominal, math)
+    fx, fy, cx, cy = intrinsics.tolist()
+    given = k.numpy()
+    known = (model, size, k.dtype, given.tobytes(), nominal.numpy().tobytes())
+    measured, end = _of_lens(known, base, nominal)
+    native = None
+    if model.always_defined and _is_within((fx, fy, cx, cy), end, size):
+        rim = _border(size, k.dtype)[None]
+        steps = np.array([amounts[i % DRAWN] for i in range(len(given))], given.dtype) * measured
+        for part in _PARTS:
+            candidate = torch.from_numpy(given + given.dtype.type(part) * steps)
+            native = single_native(model, intrinsics, candidate)
+            if native is None:
+                break
+            if bool(unproject(native, rim).valid.all()):
+                return candidate, native
+    if native is not None:
+        return k, None
+    lens = remade(base, intrinsics=intrinsics, image_size=size).detach()
+    return jittered(lens, torch.as_tensor(amounts, dtype=k.dtype), nominal), None
+
+
+def _is_within(numbers: Sequence[float], end: float, size: tuple[int, int]) -> bool:
+    """Whether all of an image is within a circle of a radius in focal lengths, with some room; see `covering`."""
+    (fx, fy, cx, cy), (height, width) = numbers, size
+    across, down = max(cx + 0.5, width - 0.5 - cx) / fx, max(cy + 0.5, height - 0.5 - cy) / fy
+    return math.hypot(across, down) <= FOLD * end
+
+
 @opaque(_shapes)
 def _jittered(camera: Camera, amounts: Tensor, nominal: Tensor) -> tuple[Tensor]:
     count = camera.distortion.shape[-1]
@@ -534,11 +644,14 @@ def _jittered(camera: Camera, amounts: Tensor, nominal: Tensor) -> tuple[Tensor]
     rim, given = _rim(lens), lens.distortion.expand_as(steps)
     if len(rim) < len(steps):
         rim = rim.expand(len(steps), -1, -1)
-    result, done = given, torch.zeros(len(steps), dtype=torch.bool, device=steps.device)
+    result, done = given, None
     for part in _PARTS:
         candidate, defined = _defined(camera, given + part * steps, given)
-        fits = remade(lens, distortion=candidate).unproject(rim)[1].all(-1)
+        fits = _all_have_rays(lens, candidate, rim)
         fits = fits if defined is None else fits & defined
+        if done is None and bool(fits.all()):  # mostly the first step does
+            return (candidate.view(*amounts.shape[:-1], count),)
+        done = torch.zeros_like(fits) if done is None else done
         result = torch.where((fits & ~done).unsqueeze(-1), candidate, result)
         done |= fits
         if bool(done.all()):
@@ -546,12 +659,46 @@ def _jittered(camera: Camera, amounts: Tensor, nominal: Tensor) -> tuple[Tensor]
     return (result.view(*amounts.shape[:-1], count).clone(),)
 
 
-_measured = Memo(24)  # of a batch of eight models
+def _all_have_rays(lens: Camera, distortion: Tensor, pixels: Tensor) -> Tensor:
+    """(C,) bool: whether lenses with coefficients (C, n) in place of their own have rays for all pixels (C, N, 2)."""
+    intrinsics = lens.intrinsics.expand(len(distortion), 4)
+    made = Cameras(type_before_parametrizations(lens), intrinsics, distortion)
+    if made.native is None or not is_eager(pixels, intrinsics, distortion):
+        return remade(lens, intrinsics=intrinsics, distortion=distortion).unproject(pixels)[1].all(-1)
+    return unproject(made.native, pixels).valid.all(-1)
+
+
+_MOST_MEASURED = 64  # lenses
+_measured: dict[tuple[object, ...], Tensor] = {}
+_lenses: dict[tuple[object, ...], tuple[Array, float]] = {}
 
 
 def _kept(measure: Callable[..., Tensor], camera: Camera, *inputs: Tensor) -> Tensor:
     """`measure(camera, *inputs)`, of which these tensors are all that counts: mostly the lens is the same one."""
-    found: Tensor = _measured(inputs, (measure, type(camera), camera.image_size), lambda: measure(camera, *inputs))
+    values = [(t.dtype, t.shape, t.device, t.detach().cpu().numpy().tobytes()) for t in inputs]
+    key = measure, type(camera), camera.image_size, *values
+    found = _measured.pop(key, None)
+    if found is None:
+        with torch.inference_mode(False), torch.no_grad():  # what inference mode makes could not be used in a graph
+            found = measure(camera, *[t.detach().clone() for t in inputs])
+    _measured[key] = found  # the last one
+    while len(_measured) > _MOST_MEASURED:
+        _measured.pop(next(iter(_measured)), None)
+    return found
+
+
+def _of_lens(known: tuple[object, ...], base: Camera, nominal: Tensor) -> tuple[Array, float]:
+    """What changes of a lens by known numbers do (n,), and the least distance at which it ends."""
+    found = _lenses.pop(known, None)
+    if found is None:
+        with torch.inference_mode(False), torch.no_grad():
+            lens = remade(base.detach(), image_size=known[1])
+            k = lens.distortion.clone()
+            measured = _kept(_sensitivity, lens, k, nominal.clone()).to(k.dtype).numpy()
+            found = measured, float(_kept(_least_end, lens, k[None]))
+    _lenses[known] = found  # the last one
+    while len(_lenses) > _MOST_MEASURED:
+        _lenses.pop(next(iter(_lenses)), None)
     return found
 
 
@@ -599,11 +746,12 @@ def _rim(camera: Camera) -> Tensor:
     Of both: the image's edges, and where the lens ends on it; the principal point for what it does not show. What is
     mapped has no holes: a lens that is invertible on the outline is so inside.
     """
-    border = _border(camera._size_for("its rim")).to(camera.intrinsics)
+    size = camera._size_for("its rim")
+    border = _border(size, camera.intrinsics.dtype).to(camera.intrinsics.device)
     rim = border.expand(*camera.batch_shape, *border.shape)
     if len(camera.distortion) == 1:
-        least = _kept(_least_end, camera, camera.distortion.detach())
-        if bool((covering(camera.intrinsics, least, camera._size_for("its rim")) == 1).all()):
+        least = _kept(_least_end, camera, camera.distortion)
+        if bool((covering(camera.intrinsics, least, size) == 1).all()):
             return rim
     if not bool(camera.unproject(rim)[1].all()):
         focal, centre = camera.intrinsics[:, None, :2], camera.intrinsics[:, None, 2:]
@@ -617,11 +765,12 @@ def _rim(camera: Camera) -> Tensor:
 
 
 @lru_cache(maxsize=16)
-def _border(size: tuple[int, int]) -> Tensor:
+def _border(size: tuple[int, int], dtype: torch.dtype) -> Tensor:
     """(N, 2): pixels along the outer edges of images of a size."""
     height, width = size
-    corners = torch.tensor([[0, 0], [width, 0], [width, height], [0, height]], dtype=torch.float64) - 0.5
-    return along_edges(corners, _EDGE_SAMPLES)
+    with torch.inference_mode(False):
+        corners = torch.tensor([[0, 0], [width, 0], [width, height], [0, height]], dtype=torch.float64) - 0.5
+        return along_edges(corners, _EDGE_SAMPLES).to(dtype)
 
 
 def _ends(camera: Camera, distortion: Tensor) -> Tensor:

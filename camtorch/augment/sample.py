@@ -33,7 +33,9 @@ from camtorch.camera import Camera
 from camtorch.mixed import Listed
 from camtorch.models import Pinhole
 from camtorch.rotations import are_rotations, check_rotation, rotation_matrix, rotation_vector
-from camtorch.warp.sampling import Options, as_options
+from camtorch.warp.at_once import Work, at_once, between_of
+from camtorch.warp.sampling import Options, Sampler, as_options
+from camtorch.warp.warp import Warp
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -116,6 +118,7 @@ def _rotation_vector(change: Change, rvec: Tensor, options: Mapping[str, float])
 
 _MANY = 16
 _ROUNDING = 0.01
+_MOST_FORMS = 16  # of samples that a transform remembers
 
 
 def _rays(change: Change, rays: Tensor, options: Mapping[str, float]) -> Tensor:
@@ -154,6 +157,8 @@ KINDS = {
     "tvec": Field(1, 1, (3,), "(B, 3), a point of the camera frame", _positions),
     "rotation": Field(2, 2, (3,), "(B, 3, 3), turned so far", lambda c, turn, _: c.rays(turn, _columns, _columns)),
 }
+_CHECKED = ("boxes", "rvec", "head_pose", "pose", "pitch_yaw")
+"""Whose values are checked, not their shape alone."""
 _SINGLE_FILE = ("keypoints", "landmarks")  # which OpenCV has as (N, 1, 2)
 _ALIASES = {"images": "image", "masks": "mask", "bboxes": "boxes", "point": "points", "face_center": "points"}
 OWN = ("camera", "source_camera", "source_rotation", "scale")  # these come with a change and do not move
@@ -365,6 +370,7 @@ class SampleTransform(nn.Module):
         self.antialias = None if antialias is None else self.options["antialias"]
         self.mask_fill = as_number(mask_fill, "mask_fill", self._name)
         self.valid_mask = as_flag(valid_mask, "valid_mask", self._name)
+        self._forms: dict[tuple[Any, ...], tuple[list[tuple[str, str]], bool, int]] = {}
 
     @classmethod
     def _meant(cls, word: str) -> str:
@@ -433,10 +439,49 @@ class SampleTransform(nn.Module):
     def _batch(self, sample: Sample, predicted: bool = False) -> tuple[Named, bool, int, Camera]:
         """The fields that move, all with a batch dim; whether the sample had one; its size, and its cameras.
 
+        What samples of one form have in common is found and checked once.
+
         predicted: whether it may hold what networks made, whose values may be bad.
         """
         camera: Any = sample.get("camera")
         camera = self.camera if camera is None else camera
+        form = self._form_of(sample, camera)
+        if form is None or (known := self._forms.get(form)) is None:
+            result = self._checked_batch(sample, camera, predicted)
+            named, batched, count, _ = result
+            if (
+                form is not None
+                and result[3] is camera
+                and all(found in IMAGES or sample[name].dtype.is_floating_point for name, (found, _) in named.items())
+            ):
+                while len(self._forms) >= _MOST_FORMS:
+                    self._forms.pop(next(iter(self._forms)), None)
+                self._forms[form] = [(name, found) for name, (found, _) in named.items()], batched, count
+            return result
+        kinds, batched, count = known
+        if not predicted:
+            for name, found in kinds:
+                if found in _CHECKED:
+                    check_values(found, name, sample[name], self._name)
+        named = {name: (found, sample[name] if batched else sample[name].unsqueeze(0)) for name, found in kinds}
+        return named, batched, count, camera
+
+    def _form_of(self, sample: Sample, camera: object) -> tuple[Any, ...] | None:
+        """All that the fields of a sample are checked for but their values; None where that is more than tensors."""
+        if not isinstance(camera, Camera) or camera.is_mixed:
+            return None
+        intrinsics, distortion = camera._tensors
+        parts: list[Any] = [type(sample), camera.image_size, intrinsics.shape, distortion.shape, intrinsics.device]
+        for name, value in sample.items():
+            if isinstance(value, Tensor):
+                parts += name, value.shape, value.dtype, value.device
+            elif value is None or isinstance(value, (str, int, float, Camera)):
+                parts += name, type(value)
+            else:
+                return None
+        return *parts, *self.fields.items()
+
+    def _checked_batch(self, sample: Sample, camera: Any, predicted: bool) -> tuple[Named, bool, int, Camera]:
         named = self._sorted(sample)
         if not named:
             raise ValueError(f"{self._name}: the sample has no field that moves; known are {', '.join(KINDS)}")
@@ -511,9 +556,13 @@ class SampleTransform(nn.Module):
         def put(name: str, value: Tensor | list[Tensor]) -> None:
             moved[name] = value if batched or isinstance(value, list) else value.squeeze(0)
 
+        known = {} if self.valid_mask or sample.get("image_valid") is not None else self._at_once(named, change)
         for name, (found, value) in named.items():
             valid: Any
-            if isinstance(value, list):
+            if name in known:
+                result, valid = known[name]
+                put(name, result)
+            elif isinstance(value, list):
                 pairs = [self._one(change.row(i), found, v.unsqueeze(0), options) for i, v in enumerate(value)]
                 put(name, [result.squeeze(0) for result, _ in pairs])
                 valid = [v.squeeze(0) for _, v in pairs if v is not None] or None
@@ -535,14 +584,52 @@ class SampleTransform(nn.Module):
             put("image_valid", before.contiguous())
         if "rotation" not in named:
             put("rotation", change.rotation.clone())
-        target = change.target if batched else change.single
         if self.mirroring is not None:
             self._mirror(moved, named, change.mirrored, batched)
-        if not isinstance(change.parts[0].target, Unknown):
+        if not isinstance(change.parts[0].camera, Unknown):
             # the change keeps cameras of its own, to go back by
-            target = target.clone()
+            target = change.target.clone() if batched else change.single
             moved["camera"] = list(target) if isinstance(target, Listed) else target
         return moved
+
+    def _at_once(self, named: Named, change: Change) -> dict[str, tuple[Tensor, Tensor | None]]:
+        """What moves of a single sample by one call of compiled code, and its validity."""
+        part = change.alone
+        if part is None:
+            return {}
+        if part.view is None:
+            options, between = cast("Warp", part.warp).options, between_of(cast("Warp", part.warp))
+            size = part.target._size_for("Warp")
+        else:
+            options, size = self.options, part.view.image_size
+            ends = part.view.start, part.view.native()
+            between = None if ends[0] is None or ends[1] is None else (ends[0], ends[1], part.view.rotation)
+        if between is None or not options["tolerance"]:
+            return {}
+        fill = options["fill"]
+        images: dict[str, tuple[Tensor, Sampler]] = {}
+        pixels: dict[str, Tensor] = {}
+        for name, (found, value) in named.items():
+            if found in ("depth", "distance"):  # which ask for positions again
+                return {}
+            if found == "image" and len(fill) in (1, value.shape[1]):
+                images[name] = value, Sampler(options["mode"], options["padding_mode"], fill)
+            elif found == "mask":
+                wide = value if value.ndim == 4 else value.unsqueeze(1)
+                images[name] = wide, Sampler("nearest", "zeros", (self.mask_fill,))
+            elif moves(found, value) is _pixels:
+                pixels[name] = value.reshape(1, -1, 2)
+        sizes, work = (part.camera._size_for("Warp"), size), Work(list(images.values()), list(pixels.values()))
+        made = at_once(*between, sizes, options["tolerance"], work)
+        if made is None:
+            return {}
+        results: dict[str, tuple[Tensor, Tensor | None]] = {}
+        for name, image in zip(images, made.images, strict=True):
+            results[name] = image if named[name][1].ndim == 4 else image.squeeze(1), None
+        for name, (moved, valid) in zip(pixels, made.pixels, strict=True):
+            value = named[name][1]
+            results[name] = moved.view(value.shape).to(value.dtype), valid.view(value.shape[:-1])
+        return results
 
     def _mirror(self, moved: Sample, named: Named, mirrored: Tensor | None, batched: bool) -> None:
         """Let landmarks and fields of a moved sample change places where they are seen in a mirror."""

@@ -17,7 +17,7 @@ from camtorch.projection.domain import Domain
 _RMS = 1.0  # pixels
 _ASPECT = 0.05  # by which pixels may differ from squares
 _CENTRE = 0.1  # of the image's sides: how far from its middle the principal point may lie
-_FOLD = 0.98  # of the image's radius at the fold: closer to it a pixel is many degrees wide
+FOLD = 0.98  # of the image's radius at the fold: closer to it a pixel is many degrees wide
 _PART = 256  # lenses whose tables stay in the processor's cache: eight times as fast as all at once
 _EDGE = 1e-3  # degrees: what float32 may make of a field of view
 
@@ -75,7 +75,7 @@ def covering(intrinsics: Tensor, reach: Tensor, size: tuple[int, int]) -> Tensor
     height, width = size
     across = torch.maximum(cx + 0.5, width - 0.5 - cx) / fx
     down = torch.maximum(cy + 0.5, height - 0.5 - cy) / fy
-    return (torch.hypot(across, down) / (_FOLD * reach)).clamp(min=1.0)
+    return (torch.hypot(across, down) / (FOLD * reach)).clamp(min=1.0)
 
 
 @lru_cache(maxsize=16)

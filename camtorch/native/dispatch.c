@@ -3,6 +3,8 @@
 #include "geometry.h"
 #include "sampler.h"
 
+#include <string.h>
+
 #define DECLARED(variant)                                                                                              \
     int32_t sample_##variant(Job *);                                                                                      \
     int32_t classify_##variant(const Classification *);                                                                \
@@ -73,3 +75,30 @@ EXPORTED int64_t camtorch_lattices(const Lattices *given) { CALLED(lattices, giv
 EXPORTED void camtorch_domain(const Domain *domain) { CALLED(domain, domain) }
 
 EXPORTED void camtorch_consensus(const Agreement *given) { CALLED(consensus, given) }
+
+/* -- one sample */
+
+/* The positions of a lattice in float, for samplers: in place, plane by plane */
+static void narrowed(double *exact, int64_t count) {
+    for (int64_t i = 0; i < count; i++) {
+        const float value = (float)exact[i];
+        memcpy((char *)exact + i * (int64_t)sizeof value, &value, sizeof value);
+    }
+}
+
+/* A lattice, the images that are sampled on it, and other pixels of the same cameras, in one call on this thread: in between
+ * caches stay warm. Flags of what is left, as of lattices, and then nothing is made; or as of moves, LEFT_BITS higher */
+EXPORTED int64_t camtorch_together(const Together *given) {
+    const Lattices *lattices = &given->lattices;
+    int64_t left = 0;
+    *lattices->used = 0;
+    if (given->job_count) left = camtorch_lattices(lattices);
+    if (left) return left;
+    if (given->job_count && lattices->narrow)
+        for (int c = 0; c < 2; c++)
+            narrowed((double *)lattices->exact + c * SQUARES * lattices->cells.rows * lattices->cells.columns,
+                     SQUARES * *lattices->used);
+    for (int64_t i = 0; i < given->job_count && given->is_whole; i++) given->jobs[i].next = 0, camtorch_sample(given->jobs + i);
+    for (int64_t i = 0; i < given->move_count; i++) left |= camtorch_moves(given->moves + i);
+    return left << LEFT_BITS;
+}

@@ -149,4 +149,16 @@ typedef struct {
     int64_t *used; /* how many places there are */
 } Lattices;
 
+enum { SQUARES = STEP * STEP }; /* positions of a cell */
+enum { LEFT_BITS = 3 };
+
+/* One sample: a lattice of one camera, images that are sampled on it, in parts or whole, and pixels that move */
+typedef struct {
+    Job *jobs;
+    int64_t job_count, is_whole; /* 0: others sample the images */
+    const Move *moves;
+    int64_t move_count;
+    Lattices lattices;
+} Together;
+
 #endif

@@ -70,22 +70,18 @@ def sample(
     native = library()
     if native is None or 0 in result.shape:
         return
-    steps, made_steps = images.stride(), result.stride()
-    count, channels, height, width = result.shape
-    together = mode == "bilinear" and channels in (3, 4) and made_steps[1::2] == (1, channels)
-    # pixels that lie neither in planes nor side by side would be interpolated one by one
-    quick = mode == "nearest" or steps[3] == made_steps[3] == 1 or (together and steps[1::2] == (1, channels))
-    if not quick and math.prod(images.shape[2:]) <= _WORTH * math.prod(result.shape[2:]):
+    if not is_quick(images, result, mode) and math.prod(images.shape[2:]) <= _WORTH * math.prod(result.shape[2:]):
         where = {"grid": grid, "mapped": mapped, "nodes": nodes, "cells": cells, "exact": exact}
-        fits = together or made_steps[3] == 1
+        together = _are_together(result, mode)
+        fits = together or result.stride(3) == 1
         made = result if fits else torch.empty(result.shape, dtype=result.dtype, device="cpu")
-        source = images if steps[0] else images[:1]  # which all results show
+        source = images if images.stride(0) else images[:1]  # which all results show
         source = source.clone(memory_format=torch.channels_last if together else torch.contiguous_format)
         sample(source.expand(images.shape), made, mode, padding, fill, **where)
         if not fits:
             result.copy_(made)
         return
-    on_grid, on_lattice, masks, tile_rows = [0] * 6, [0] * 9, [0] * 2, max(_TILE // width // 8, 1) * 8
+    on_grid, on_lattice, masks = [0] * 6, [0] * 9, [0] * 2
     if grid is not None:
         on_grid = [grid.data_ptr(), _shared(grid), *grid.stride()[1:], grid.dtype == torch.float64]
         if mapped is not None:
@@ -95,17 +91,49 @@ def sample(
         (_, rows, columns), at = cells.shape, (exact.data_ptr(), exact.stride(0)) if exact.shape[1] else (0, 0)
         on_lattice = [nodes.data_ptr(), _shared(nodes), nodes.stride(1), cells.data_ptr(), _shared(cells)]
         on_lattice += [rows, columns, *at]
+    job, kept = packed(images, result, mode, padding, fill, (*on_grid, *masks, *on_lattice))
+    run, tiles = _Job.from_buffer_copy(job), tiles_of(result)
+    spread(lambda: native.camtorch_sample(run), min(thread_count(), tiles))
+    del kept
+
+
+def packed(
+    images: Tensor, result: Tensor, mode: str, padding: str, fill: Sequence[float], positions: Sequence[int]
+) -> tuple[bytes, object]:
+    """`Job` of sampler.h, and what has to live as long: arguments of `sample`, and the fields of the positions."""
     fills = _fills(tuple(fill), images.dtype)
     kind = _BYTES[images.dtype.itemsize] if mode == "nearest" else _TYPES[images.dtype]
-    job = _Job.from_buffer_copy(
-        _packed(
-            *(images.data_ptr(), result.data_ptr(), *steps, *made_steps, count, channels, *images.shape[-2:]),
-            *(height, width, *fills[:2], *on_grid, *masks, *on_lattice),
-            *(kind, _MODES[mode], PADDINGS[padding], tile_rows, 0),
-        )
+    count, channels, height, width = result.shape
+    sizes = count, channels, *images.shape[-2:], height, width
+    places = images.data_ptr(), result.data_ptr(), *images.stride(), *result.stride()
+    how = kind, _MODES[mode], PADDINGS[padding], _tile_rows(width), 0
+    return _packed(*places, *sizes, *fills[:2], *positions, *how), fills
+
+
+def _tile_rows(width: int) -> int:
+    return max(_TILE // width // 8, 1) * 8
+
+
+def tiles_of(result: Tensor) -> int:
+    """Among how many threads samples may be split."""
+    count, _, height, width = result.shape
+    return -(-height // _tile_rows(width)) * count
+
+
+def is_quick(images: Tensor, result: Tensor, mode: str) -> bool:
+    """Whether samples go by vectors: pixels that lie neither in planes nor side by side would go one by one."""
+    steps, made = images.stride(), result.stride()
+    return (
+        mode == "nearest"
+        or steps[3] == made[3] == 1
+        or (_are_together(result, mode) and steps[1::2] == (1, images.shape[1]))
     )
-    tiles = -(-height // tile_rows) * count
-    spread(lambda: native.camtorch_sample(job), min(thread_count(), tiles))
+
+
+def _are_together(result: Tensor, mode: str) -> bool:
+    """Whether channels are made side by side."""
+    channels = result.shape[1]
+    return mode == "bilinear" and channels in (3, 4) and result.stride()[1::2] == (1, channels)
 
 
 def _shared(tensor: Tensor) -> int:

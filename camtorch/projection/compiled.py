@@ -91,10 +91,10 @@ class _Cameras(ctypes.Structure):
 
 
 _Rows = struct.Struct("20q").pack  # `Rows` of geometry.h
-_Move = struct.Struct("8q2d12q").pack  # `Move` of geometry.h
-_Lattices = struct.Struct(f"8q2d12q{CLASSIFICATION}4q").pack  # `Lattices`
+packed_move = struct.Struct("8q2d12q").pack  # `Move` of geometry.h
+packed_lattices = struct.Struct(f"8q2d12q{CLASSIFICATION}4q").pack  # `Lattices`
 POSITIONS, PIXELS, ON_IMAGE = range(3)
-_LEFT_FROM, _LEFT_TO, LEFT_MOST = 1, 2, 4
+LEFT_FROM, LEFT_TO, LEFT_MOST = 1, 2, 4
 _NO_ROWS = (0, 0, 0, 0)
 
 
@@ -193,7 +193,7 @@ class Plan:
     def parameters_of(self, optics_of: Optics, k: Tensor) -> Tensor:
         """(C, parameters) of coefficients (C, n)."""
         if self.places is not None:
-            return k if self.is_all else k[:, self.places]
+            return k if self.is_all else k.index_select(1, self.places)
         chart, lens = optics_of(columns(k))
         return torch.cat([c.expand(len(k), 1) for c in (*chart.parameters, *lens.parameters)], -1)
 
@@ -222,7 +222,7 @@ class Lenses:
     """What it has of them; pointers that are not set are of what is not yet known."""
     _kept: list[object]
 
-    def __init__(self, plan: Plan, optics_of: Optics, k: Tensor, domain: Callable[[], Domain]):
+    def __init__(self, plan: Plan, optics_of: Optics, k: Tensor, domain: Callable[[], Domain], tables: bool = False):
         """See `native_of`."""
         self.plan, self._optics_of, self._k, self._kept = plan, optics_of, k, [k]
         self._slow_domain, self.cameras, self.dtype = domain, len(k), k.dtype
@@ -236,7 +236,7 @@ class Lenses:
         if plan.is_chart:
             self._add_chart()
         if plan.has_stages:
-            self._add_domain()
+            self._add_domain(tables)
 
     def _optics(self) -> tuple[Chart, Lens]:
         """In double precision."""
@@ -288,7 +288,7 @@ class Lenses:
         struct = self.struct
         struct.chart_inner2, struct.chart_table, struct.chart_most2 = inner2, place, self._keep(table[:, 1])
 
-    def _add_domain(self) -> None:
+    def _add_domain(self, tables: bool) -> None:
         plan = self.plan
         if plan.is_chart:  # whose end is that of a search
             domain = self._slow_domain()
@@ -301,6 +301,8 @@ class Lenses:
             wanted |= {"certain": self._new(plan.controls, torch.uint8), "certain2": self._new(1)}
         for name, place in wanted.items():
             setattr(self.struct, name, place)
+        if tables and plan.has_factor:  # at once, as there will be pixels
+            wanted["table"] = self.struct.table = self._new(_TABLE)
         radii = {} if plan.is_radial else {"radii": self._keep(plan.radii(lambda: self._optics()[0], _RADII, self._k))}
         self._ask(wanted | radii)
 
@@ -349,12 +351,12 @@ _MOST_LENSES, _LONGEST = 24, 512
 _lenses: dict[tuple[object, ...], Lenses] = {}
 
 
-def _lenses_of(plan: Plan, optics_of: Optics, k: Tensor, domain: Callable[[], Domain]) -> Lenses:
+def _lenses_of(plan: Plan, optics_of: Optics, k: Tensor, domain: Callable[[], Domain], tables: bool) -> Lenses:
     """Those of these values: of the last ones that were asked for, or new ones."""
     if k.numel() > _LONGEST:
-        return Lenses(plan, optics_of, k, domain)
+        return Lenses(plan, optics_of, k, domain, tables)
     key = plan, k.dtype, k.shape, k.numpy().tobytes()
-    found = _lenses.pop(key, None) or Lenses(plan, optics_of, k, domain)
+    found = _lenses.pop(key, None) or Lenses(plan, optics_of, k, domain, tables)
     _lenses[key] = found  # the last one
     while len(_lenses) > _MOST_LENSES:
         _lenses.pop(next(iter(_lenses)), None)
@@ -379,6 +381,10 @@ class Native:
         self.struct.intrinsics, self.struct.usable = map(_address, self._kept)
         self.pointer = addressof(self.struct)
 
+    def before(self, intrinsics: Tensor) -> Native:
+        """The same lenses with other intrinsics (C, 4), all usable."""
+        return Native(self._lenses, intrinsics, None)
+
     def add_tables(self, count: int) -> None:
         """Have what the inverse of so many pixels of each camera starts from."""
         if self.plan.has_factor and self.struct.table is None:
@@ -392,7 +398,12 @@ class Native:
 
 
 def native_of(
-    optics_of: Optics, intrinsics: Tensor, k: Tensor, usable: Tensor | None, domain: Callable[[], Domain]
+    optics_of: Optics,
+    intrinsics: Tensor,
+    k: Tensor,
+    usable: Tensor | None,
+    domain: Callable[[], Domain],
+    tables: bool = False,
 ) -> Native | None:
     """Cameras as the compiled geometry takes them.
 
@@ -404,11 +415,12 @@ def native_of(
         k: (C, n), coefficients.
         usable: the mask (C, 1) of the cameras that are usable, None if all are.
         domain: makes that of the lenses, for what the compiled geometry does not do.
+        tables: whether what the inverse starts from is sure to be wanted.
     """
     if library() is None or not intrinsics.is_cpu or not k.shape[0]:
         return None
     plan = _plan(optics_of, k)
-    return None if plan is None else Native(_lenses_of(plan, optics_of, k, domain), intrinsics, usable)
+    return None if plan is None else Native(_lenses_of(plan, optics_of, k, domain, tables), intrinsics, usable)
 
 
 def codes(chart: Chart, lens: Lens) -> list[_Part] | None:
@@ -594,8 +606,8 @@ class Between:
         self._start.add_tables(count)
         result = torch.empty(self.cameras, count, 2, dtype=self._start.dtype, device="cpu")
         valid = torch.empty(self.cameras, count, dtype=torch.bool, device="cpu")
-        rows = *_rows_of(pixels), result.data_ptr(), 2 * count, 2, 1, valid.data_ptr(), count, _TILE
-        call = _Move(*self._given, form, *self._size, *rows, addressof(_kept.counters))
+        rows = *rows_of(pixels), result.data_ptr(), 2 * count, 2, 1, valid.data_ptr(), count, _TILE
+        call = packed_move(*self._given, form, *self._size, *rows, addressof(_kept.counters))
         tiles = -(-count // _TILE) * self.cameras
         self._run("camtorch_moves", call, tiles if self.cameras * count >= _SHARED else 1)
         return result, valid
@@ -625,11 +637,11 @@ class Between:
         kept = _kept_memory(sum(sizes) + cameras * count)
         exact, narrow, scratch, valid = accumulate(sizes, initial=kept.data_ptr())
         at, used = result.data_ptr(), addressof(_kept.counters)
-        rows = *_rows_of(probes), at, 2 * count, 1, count, valid, count, count, used
+        rows = *rows_of(probes), at, 2 * count, 1, count, valid, count, count, used
         asked = at, 2 * count, count, valid, count, valid + nodes, count, cameras, n, m, *size
         how = *self._size, tolerance, PADDINGS[padding], cells.data_ptr(), scratch
         more = first_row, narrow if is_double else 0, exact, used + 8
-        call = _Lattices(*self._given, POSITIONS, *self._size, *rows, *asked, *how, *more)
+        call = packed_lattices(*self._given, POSITIONS, *self._size, *rows, *asked, *how, *more)
         if self._run("camtorch_lattices", call, cameras):
             return None
         if count := _kept.counters[1]:
@@ -646,9 +658,9 @@ class Between:
             counters[:] = [0, 0]
             spread(lambda: left.append(run(call)), threads)  # noqa: B023 (which is called at once)
             flags = functools.reduce(operator.or_, left)
-            if not flags & (_LEFT_FROM | _LEFT_TO):
+            if not flags & (LEFT_FROM | LEFT_TO):
                 return flags
-            for flag, native in ((_LEFT_FROM, self._start), (_LEFT_TO, self._end)):
+            for flag, native in ((LEFT_FROM, self._start), (LEFT_TO, self._end)):
                 if flags & flag:
                     native.follow()
 
@@ -673,7 +685,7 @@ def _kept_memory(count: int) -> Tensor:
     return _kept.memory
 
 
-def _rows_of(pixels: Tensor) -> tuple[int, int, int, int]:
+def rows_of(pixels: Tensor) -> tuple[int, int, int, int]:
     """Where pixels (C or 1, N, 2) lie, and their strides."""
     camera, point, component = pixels.stride()
     return pixels.data_ptr(), camera if pixels.shape[0] > 1 else 0, point, component

@@ -107,6 +107,12 @@ class Cameras:
         return by_coefficients
 
 
+def single_native(model: type[Camera], intrinsics: Tensor, k: Tensor) -> compiled.Native | None:
+    """A camera of numbers (4,) and (n,) that are known to be usable, for the compiled geometry, if that knows it."""
+    k = k.detach()[None]
+    return compiled.native_of(model.optics, intrinsics[None], k, None, partial(_domain, model, k, False), tables=True)
+
+
 def _domain(model: type[Camera], k: Tensor, learns: bool) -> Domain:
     # what learns will not be seen again
     return Domain(model.optics, k) if learns else domain_of(model._model, k, model.optics)
@@ -116,7 +122,7 @@ def _are_plain(model: type[Camera], intrinsics: Tensor, distortion: Tensor) -> b
     """Whether a short look says that all are usable."""
     if not intrinsics.is_cpu or not 0 < intrinsics.numel() + distortion.numel() <= _MOST_LOOKED_AT:
         return False
-    if distortion.numel() and model.defined(distortion.unbind(-1)) is not None:
+    if distortion.numel() and not model.always_defined and model.defined(distortion.unbind(-1)) is not None:
         return False
     rows = intrinsics.tolist()
     return math.isfinite(math.fsum(map(sum, (*rows, *distortion.tolist())))) and all(

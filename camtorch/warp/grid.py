@@ -24,10 +24,10 @@ from camtorch.warp.panorama import Seam, rays_of, seam_of, seen_by
 OUTSIDE = -9.0  # a sampling position that no image reaches, not even with its interpolation margin
 _FAR = 100.0  # positions beyond are drawn in: grid_sample casts them to integers
 _STRIP = 1 << 19  # pixels
-_FEWEST = 8  # cells along a side from which on a lattice pays
+FEWEST = 8  # cells along a side from which on a lattice pays
 STEP = 8  # pixels between the nodes of a lattice
 _BLOCK = 128  # pixels that one product interpolates: wider ones multiply with more zeros
-_MOST_KEPT = 1 << 16  # nodes of a lattice whose pixels are kept for the next one
+MOST_KEPT = 1 << 16  # nodes of a lattice whose pixels are kept for the next one
 
 Exact = Callable[[Tensor], tuple[Tensor, Tensor]]
 """Pixels (h, w, 2) for every camera, or (B, h, w, 2) for each its own, to positions (B or 1, h, w, 2) as of
@@ -325,13 +325,13 @@ def on_lattice(
     """
     like, (height, width) = _like(target), (len(rows), target._size_for("Warp")[1])
     n, m = math.ceil(height / STEP), math.ceil(width / STEP)  # cells
-    if min(n, m) < _FEWEST or not native_available():
+    if min(n, m) < FEWEST or not native_available():
         return None
     native = _native(source, target, rotation, like)
     if native is None and not is_eager(like):
         return None
     nodes, seam, size = (n + 5) * (m + 5), seam_of(source), source._size_for("Warp")
-    pixels = _kept_probes(rows, width, like.dtype) if nodes <= _MOST_KEPT else _probes(rows, width, like)
+    pixels = kept_probes(rows, width, like.dtype) if nodes <= MOST_KEPT else _probes(rows, width, like)
     if native is not None:
         made = native.lattices(pixels, (height, width), rows.start, tolerance, padding)
         return None if made is None else Lattice(*made, (height, width), seam, native)
@@ -377,7 +377,8 @@ def _probes(rows: range, width: int, like: Tensor) -> Tensor:
 
 
 @lru_cache(maxsize=8)
-def _kept_probes(rows: range, width: int, dtype: torch.dtype) -> Tensor:
+def kept_probes(rows: range, width: int, dtype: torch.dtype) -> Tensor:
+    """(1, N, 2), on the CPU: the nodes of a lattice, and then the pixels at the rim of the target."""
     with torch.inference_mode(False):
         return _probes(rows, width, torch.empty(0, dtype=dtype, device="cpu"))
 
