@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from collections.abc import Sequence
 from ctypes import addressof, c_int64
 from typing import NamedTuple
 
@@ -17,6 +18,7 @@ _FROM_RAYS, _REFINED, _SOLVED, _AGREED = range(4)
 _LOSSES = (None, "huber", "cauchy")
 _SHARED = 1 << 9  # points of poses that a thread is woken for
 _Poses = struct.Struct("11q5d10q").pack  # `Poses` of native/poses.h
+_Views = struct.Struct("16q").pack  # `Views`
 
 
 class Search(NamedTuple):
@@ -102,6 +104,40 @@ def solved(
         if not _run(native, points, None, pixels, weights, task, search, threshold, results):
             return Solved(vectors, translations, rms, valid, inliers, covariance)
         native.follow()
+
+
+def triangles(
+    native: Native,
+    points: Tensor,
+    poses: tuple[Tensor, Tensor],
+    residuals: Tensor,
+    weights: Tensor,
+    learnt: Sequence[int],
+) -> tuple[Tensor, Tensor]:
+    """Of cameras (B,), or of one, that see points (B, V, N, 3): `Equations.view` and `Equations.shared`.
+
+    poses: (B, V, 3, 3), (B, V, 3). residuals: (B, V, N, 2). weights: (B, V, N) of their squares. learnt: numbers of
+    intrinsics, and of coefficients from 4 on, which columns are by.
+    """
+    compiled, plan = library(), native.plan
+    assert compiled is not None  # or nobody has a `Native`
+    if plan.places is not None and not plan.is_all:  # the place of each coefficient among the parameters
+        at = {4 + place: 4 + i for i, place in enumerate(plan.places.tolist())}
+        learnt = [at.get(number, number) for number in learnt]
+    points = points if points.stride()[2:] == (3, 1) else points.contiguous()
+    batch, views, count, _ = points.shape
+    size = len(learnt) + 1
+    given = [t.contiguous() for t in (*poses, residuals, weights)]
+    view, shared = points.new_empty(batch, views, 6, 6 + size), points.new_empty(batch, size, size)
+    numbers, left = (c_int64 * size)(*learnt), c_int64(0)
+    call = _Views(
+        *(native.pointer, points.data_ptr(), *points.stride()[:2], *(t.data_ptr() for t in given)),
+        *(batch, views, count, addressof(numbers), len(learnt), view.data_ptr(), shared.data_ptr(), addressof(left)),
+    )
+    compiled.camtorch_views(call)
+    if left.value:
+        raise MemoryError(f"no memory for {views} views of {count} points")
+    return view, shared
 
 
 def _run(

@@ -223,7 +223,7 @@ def _compiled(given: _Given, threshold: float | None) -> Solved | None:
     start = None
     if threshold is not None:
         task = _Task.of(given)
-        start = consensus(task.points, task.rays, _slopes(task), task.weights > 0, threshold)[:2]
+        start = _consensus(task, threshold)
     return solved(made[0][0], points, pixels, weights, _SEARCH, start, threshold or 0.0)
 
 
@@ -273,13 +273,14 @@ def _with_graph(given: _Given, found: Solved) -> tuple[Tensor, Tensor, Tensor]:
     return vectors, translations, root_of(means, found.valid)
 
 
-def _slopes(task: _Task) -> Tensor:
-    """(B, N, 2, 3): the derivatives of pixels by rays, nearly: where poses are only looked for differences do."""
+def _consensus(task: _Task, threshold: float) -> tuple[Tensor, Tensor]:
+    """The poses on which most points agree: rotations (B, 3, 3), translations (B, 3)."""
+    # where poses are only looked for, differences are derivatives
     moves = _MOVE * torch.eye(4, 3, dtype=task.rays.dtype, device=task.rays.device)  # the last one: none
     pixels, seen = task.camera.project((task.rays[:, :, None] + moves).flatten(1, 2))
     pixels, seen = pixels.unflatten(1, (-1, 4)), seen.unflatten(1, (-1, 4)).all(-1)
-    slopes: Tensor = ((pixels[:, :, :3] - pixels[:, :, 3:]) / _MOVE).mT
-    return torch.where(seen[..., None, None], slopes, torch.nan)
+    slopes = ((pixels[:, :, :3] - pixels[:, :, 3:]) / _MOVE).mT
+    return consensus(task.points, task.rays, slopes, seen & (task.weights > 0), threshold)[:2]
 
 
 # -- by torch
@@ -299,11 +300,11 @@ def _searched(given: _Given, threshold: float | None) -> Solved:
         if bool(flat.any()):
             found = _least([found, _minimum(task, *mirrored, flat)])
     else:
-        rotations, translations, _ = consensus(task.points, task.rays, _slopes(task), weights > 0, threshold)
+        rotations, translations = _consensus(task, threshold)
         near, found = _near(task, rotations, translations, threshold), None
-        for number in range(_ROUNDS):
+        for _ in range(_ROUNDS):
             task = task._replace(weights=torch.where(near, weights, 0.0))
-            found = _minimum(task, rotations, translations, _spread(task.points, near), 40 if number else 1)
+            found = _minimum(task, rotations, translations, _spread(task.points, near))
             rotations, translations, before = found.rotations, found.translations, near
             near = _near(task._replace(weights=weights), rotations, translations, threshold)
             if torch.equal(near, before):
@@ -323,13 +324,7 @@ class _Found(NamedTuple):
     triangles: Tensor
 
 
-def _minimum(
-    task: _Task,
-    rotations: Tensor,
-    translations: Tensor,
-    valid: Tensor | None = None,
-    steps: int = 40,
-) -> _Found:
+def _minimum(task: _Task, rotations: Tensor, translations: Tensor, valid: Tensor | None = None) -> _Found:
     """The minima that poses (B, ...) lead to; valid: bool (B,), those that are meant."""
     camera = task.camera
     parameters = torch.cat([t.detach().view(-1, t.shape[-1]) for t in camera._tensors], -1)
@@ -338,7 +333,7 @@ def _minimum(
     none = Poses.none(len(rotations), 1, rotations)
     free = Free((torch.zeros(parameters.shape[-1], dtype=torch.bool, device="cpu"),), (False,))
     found = adjust(
-        [sight], State((parameters,), none, start, rotations.new_zeros(len(rotations), 2)), free, steps=steps
+        [sight], State((parameters,), none, start, rotations.new_zeros(len(rotations), 2)), free, steps=_SEARCH.steps
     )
     fine = (
         found.converged & (found.valid[0][:, 0] | (task.weights == 0)).all(-1) & ((task.weights > 0).sum(-1) >= _LEAST)

@@ -12,7 +12,8 @@
     int64_t lattices_##variant(const Lattices *);                                                                      \
     void domain_##variant(const Domain *);                                                                             \
     void consensus_##variant(const Agreement *);                                                                       \
-    void poses_##variant(const Poses *);
+    void poses_##variant(const Poses *);                                                                               \
+    void views_##variant(const Views *);
 DECLARED(baseline)
 #ifdef HAS_AVX2
 DECLARED(avx2)
@@ -77,3 +78,5 @@ EXPORTED void camtorch_domain(const Domain *domain) { CALLED(domain, domain) }
 EXPORTED void camtorch_consensus(const Agreement *given) { CALLED(consensus, given) }
 
 EXPORTED void camtorch_poses(const Poses *given) { CALLED(poses, given) }
+
+EXPORTED void camtorch_views(const Views *given) { CALLED(views, given) }

@@ -23,7 +23,6 @@ int64_t THIS(geometry)(const Rows *);
 #define THIN 0.1
 #define LINE 1e-6
 #define WORSE 4.0
-#define MUCH_WORSE 100.0
 enum { BEGUN = 12, FEW_BEGUN = 4, STEPS = 8, FEW = 5, FEW_STEPS = 8, TURNS = 24, ROUNDS = 8 };
 
 static double dot(const double *a, const double *b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
@@ -688,7 +687,7 @@ static double solve(const Poses *given, Row *row, double *rotation, double *tran
     memcpy(rotation, rotations[best], sizeof *rotations), memcpy(translation, translations[best], sizeof *translations);
     if (!valid[best]) return INFINITY;
     double cost = or_better(given, row, rotation, translation, INFINITY, rotation, translation, given->steps);
-    if (costs[!best] < INFINITY && costs[!best] <= (few ? MUCH_WORSE : WORSE) * costs[best])
+    if (costs[!best] < INFINITY && (few || costs[!best] <= WORSE * costs[best]))
         cost = or_better(given, row, rotation, translation, cost, rotations[!best], translations[!best], few ? given->steps : FEW_STEPS);
     /* of so few points on a plane the other minimum may be one of pixels, and none of rays */
     if (few && valid[0] && !valid[1] && mirrored(row, rotation, translation, mirror, shift))
@@ -716,7 +715,7 @@ static double agree(const Poses *given, Row *row, double *rotation, double *tran
             same &= near == row->inliers[i], row->inliers[i] = (uint8_t)near;
             row->own_weights[i] = near ? row->shares[i] : 0;
         }
-        if (!same) cost = refine(given, row, rotation, translation, round ? given->steps : 1, &converged, &complete);
+        if (!same) cost = refine(given, row, rotation, translation, given->steps, &converged, &complete);
     }
     const int64_t seen = moments_of(row, moments, middle);
     const double trace = moments[0] + moments[4] + moments[8];
@@ -776,32 +775,6 @@ static void assess(const Poses *given, Row *row, int64_t at, double cost) {
     given->rms[at] = is_valid ? sqrt(residual / (sum > DBL_MIN ? sum : DBL_MIN)) : INFINITY, given->valid[at] = (uint8_t)is_valid;
 }
 
-/* One of several cameras */
-static Cameras only(const Cameras *all, int64_t at) {
-    Cameras one = *all;
-    const Part *last = all->parts + all->part_count - 1;
-    one.cameras = 1;
-#define MOVED(field, size) if (one.field) one.field = (const void *)((const double *)one.field + at * (size))
-    MOVED(intrinsics, 4);
-    MOVED(parameters, all->parameter_count);
-    MOVED(constants, all->constant_count);
-    MOVED(inner2, 1);
-    MOVED(usual2, 1);
-    MOVED(limits2, AZIMUTHS);
-    MOVED(extent, EXTENT);
-    MOVED(table, 2 + 2 * NODES);
-    MOVED(circle2, 1);
-    MOVED(certain2, 1);
-    MOVED(start, START);
-    MOVED(chart_inner2, 1);
-    MOVED(chart_most2, 1);
-    MOVED(chart_table, 2 + 2 * NODES);
-    if (one.usable) one.usable += at;
-    if (one.stagewise) one.stagewise += at;
-    if (one.certain) one.certain += at * last->n * last->m;
-    return one;
-}
-
 /* Takes rows until none is left that nobody has taken */
 void THIS(poses)(const Poses *given) {
     const int64_t n = given->count;
@@ -822,7 +795,7 @@ void THIS(poses)(const Poses *given) {
             from_rays(&row, (double(*)[9])(given->rotations + 18 * at), (double(*)[3])(given->translations + 6 * at), given->valid + 2 * at);
             continue;
         }
-        row.camera = given->cameras->cameras > 1 ? only(given->cameras, at) : *given->cameras;
+        row.camera = only(given->cameras, at);
         if (given->task == REFINED) {
             double largest = 0, sum = 0;
             int complete;
