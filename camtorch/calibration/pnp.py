@@ -327,7 +327,8 @@ class _Found(NamedTuple):
 def _minimum(task: _Task, rotations: Tensor, translations: Tensor, valid: Tensor | None = None) -> _Found:
     """The minima that poses (B, ...) lead to; valid: bool (B,), those that are meant."""
     camera = task.camera
-    parameters = torch.cat([t.detach().view(-1, t.shape[-1]) for t in camera._tensors], -1)
+    parameters = torch.cat(camera._tensors, -1).detach()
+    parameters = parameters.view(-1, parameters.shape[-1])
     sight = Sight(camera, task.points[:, None], task.pixels[:, None], task.weights[:, None])
     start = Poses(rotations[:, None], translations[:, None])
     none = Poses.none(len(rotations), 1, rotations)

@@ -19,7 +19,8 @@ LEAST = 4  # points that make a pose
 _TOLD = 6  # points that agree by chance too rarely to be looked for in vain
 _FIRST, _NEXT = 512, 1024  # samples of the rounds
 _SURE = 10.0  # samples without an outlier, to be expected, that end the search
-_MOST = 1 << 17  # samples at most: of many points of which hardly any agree there would be no end
+# samples at most: of many points of which hardly any agree there would be no end; and without compiled code
+_MOST, _MOST_OF_FOUR = 1 << 17, 1 << 14
 _TRIED, _STEPS = 8, 3  # the best poses of a round, and how often each is fitted to the points near it
 _AT_ONCE = 1 << 19  # numbers of a tensor
 _SHARED = 1 << 16  # points of samples that threads are woken for
@@ -121,7 +122,8 @@ def consensus(points: Tensor, rays: Tensor, slopes: Tensor, seen: Tensor, thresh
         drawn += samples
         share, few = agree[rows].clamp(min=_TOLD).to(costs), counts[rows].clamp(min=_TOLD).to(costs)
         share = torch.stack([(share - i) / (few - i) for i in range(size)]).prod(0)
-        rows = rows[drawn * share < _SURE] if drawn < _MOST else rows[:0]
+        most = _MOST_OF_FOUR if compiled is None else _MOST
+        rows = rows[drawn * share < _SURE] if drawn < most else rows[:0]
     return Consensus(best[..., :3], best[..., 3], costs)
 
 
