@@ -27,7 +27,7 @@ _TRIED = {
     0.65: (14.0, 28.0, 46.0, 66.0, 88.0),
 }
 _VIEWS, _POINTS = 24, 100  # that the search looks at
-_KEPT = 3  # of the lenses tried
+_KEPT, _UNLIKE = 3, 2.0  # of the lenses tried, and up to how many times the error of the best
 _ROUNDS = 4  # of poses
 _BAD = 2.0  # times the usual error: a view whose pose may be spoilt
 _IN_DOUBT = 4.0  # times the usual error of the better pose: the other one may be it
@@ -262,10 +262,10 @@ def _unified(few: Observations, image_size: tuple[int, int], fixed: Collection[s
     by_view = errors.nanmedian(-1).values.sort(-1).values
     score = by_view[:, : math.ceil(_TRIMMED * by_view.shape[1])].mean(-1)
     score, rows = score.topk(_KEPT, largest=False)
+    rows = rows[score <= _UNLIKE * score[0]]
     lens = lens._replace(boards=boards, scale=max(_LEAST_SCALE, 2 * float(score[0]))).of(rows)
-    lens = lens.adjusted(few, _free(UCM, 1, ("cx", "cy")), _FEW_STEPS, _WORSE).of(slice(1))
     free = _free(UCM, 1, [name for name in fixed if name in ("cx", "cy")])
-    return _turned(lens.adjusted(few, free, _FEW_STEPS, _WORSE), few)
+    return _turned(lens.adjusted(few, free, _STEPS, _WORSE).of(slice(1)), few)
 
 
 def _posed(camera: Camera, some: Observations) -> tuple[Poses, Tensor]:
