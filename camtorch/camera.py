@@ -766,6 +766,12 @@ def fixed_camera(
 
     Bad numbers give results that are invalid, and no error.
     """
-    usual = [torch.ones(4)] + [torch.tensor(model.ideal(n)) for n in distortion.shape[-1:] if n]
     size = None if image_size is None else (image_size[0], image_size[1])
-    return remade(model(*usual), intrinsics=intrinsics.detach(), distortion=distortion.detach(), image_size=size)
+    template = _ideal_camera(model, distortion.shape[-1])
+    return remade(template, intrinsics=intrinsics.detach(), distortion=distortion.detach(), image_size=size)
+
+
+@functools.lru_cache(maxsize=32)
+def _ideal_camera(model: type[Camera], count: int) -> Camera:
+    with torch.inference_mode(False):
+        return model(torch.ones(4), *[torch.tensor(model.ideal(n)) for n in (count,) if n])

@@ -44,6 +44,8 @@ def as_vectors(values: Numbers, name: str, size: int, owner: str, device: torch.
 
 def rows_of(camera: Camera, batch: torch.Size) -> Camera:
     """The camera in float64, with its graph: of `math.prod(batch)` rows, or of none if it is one for all of them."""
+    if not camera.batch_shape and all(t.dtype == torch.float64 for t in camera._tensors):
+        return camera
     tensors = {}
     shared = math.prod(camera.batch_shape) == 1
     for name in camera.tensor_names:

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from torch import Tensor
@@ -17,6 +17,7 @@ from torch.nn.utils.parametrize import type_before_parametrizations
 
 from camtorch._evaluation import compiled_of
 from camtorch._module import remade
+from camtorch.calibration import compiled as compiled_poses
 from camtorch.camera import Camera, fixed_camera
 from camtorch.convert.fitting import bounds
 from camtorch.least_squares.equations import Equations, System, padded, triangle_of_few
@@ -25,8 +26,11 @@ from camtorch.least_squares.levenberg_marquardt import FIRST_DAMPING, minimise, 
 from camtorch.projection import compiled
 from camtorch.rotations import small_turn
 
+if TYPE_CHECKING:
+    from camtorch.calibration.observations import Observations
+
 LOSSES = ("huber", "cauchy")
-_SETTLED = 1e-10  # of the variance: the squared distance to the optimum, in standard deviations, that ends a search
+SETTLED = 1e-10  # of the variance: the squared distance to the optimum, in standard deviations, that ends a search
 _NOTHING = 1e-11  # px
 _LOST = 1e3  # px, that a point counts as which was seen and has no pixel
 
@@ -164,6 +168,7 @@ def adjust(
     loss_scale: float = 1.0,
     steps: int = 60,
     damping: float = FIRST_DAMPING,
+    settled: float = SETTLED,
     progress: Callable[[int, Tensor], None] | None = None,
 ) -> Adjusted:
     """The state of least squares near a given one, for each of B problems, whose cameras see the same views.
@@ -178,7 +183,7 @@ def adjust(
     found = minimise(
         problem,
         problem.flat(state),
-        tolerance=_SETTLED / spare,
+        tolerance=settled / spare,
         tiny=_NOTHING**2 * counts,
         steps=steps,
         damping=damping,
@@ -194,6 +199,33 @@ def adjust(
         tuple(look.weights for look in looks),
         problem,
     )
+
+
+def minima(
+    model: type[Camera] | Camera,
+    parameters: Tensor,
+    poses: Poses,
+    seen: Observations,
+    loss: tuple[str | None, float],
+    steps: int,
+) -> tuple[Poses, Tensor]:
+    """The poses (K, 1) of least cost near given ones, each a problem of its own, and these costs (K,).
+
+    parameters: (1 or K, 4 + n). seen: of K views.
+    """
+    points, pixels, weights = seen.points, seen.pixels, seen.seen.to(seen.pixels)
+    camera = remade(_template(model, parameters), intrinsics=parameters[:, :4], distortion=parameters[:, 4:])
+    if (made := compiled_of([camera], pixels)) is not None:
+        search = compiled_poses.Search(steps, SETTLED, _NOTHING, FIRST_DAMPING, *loss)
+        rotations, translations, cost = compiled_poses.refined(
+            made[0][0], points, pixels, weights, (poses.rotations[:, 0], poses.translations[:, 0]), search
+        )
+        return Poses(rotations[:, None], translations[:, None]), cost
+    sight = Sight(model, points[:, None], pixels[:, None], weights[:, None])
+    free = Free((torch.zeros(parameters.shape[-1], dtype=torch.bool, device="cpu"),), (False,))
+    state = State((parameters,), Poses.none(len(pixels), 1, pixels), poses, pixels.new_zeros(len(pixels), 2))
+    found = adjust([sight], state, free, loss=loss[0], loss_scale=loss[1], steps=steps)
+    return found.state.boards, found.cost
 
 
 def robust(loss: str | None, scale: float, squares: Tensor) -> tuple[Tensor, Tensor]:
@@ -384,6 +416,8 @@ class Bundle:
         """The triangles of a state."""
         rows = torch.arange(len(flat[0]), device=flat[0].device) if rows is None else rows
         state, width, total = self.state(flat), self.width, len(self.columns)
+        if (found := self._compiled(state, rows)) is not None:
+            return found
         parts = []
         for c, look in enumerate(self.looks(flat, rows)):
             block, at = self.rows_of(c, look, state, rows)
@@ -403,6 +437,25 @@ class Bundle:
         left = torch.cat((triangle[..., width:, width:].flatten(1, 2), *self._rows_of_priors(state)), -2)
         shared = torch.linalg.qr(padded(left), mode="r").R
         return Equations(triangle[..., :width, :], shared, self.columns)
+
+    def _compiled(self, state: State, rows: Tensor) -> Equations | None:
+        """The same by compiled code, where there is any, of one camera and flat boards that may be anywhere."""
+        if len(self.sights) > 1 or self.free.mounts[0] or self.sights[0].motions or self.width < 6:
+            return None
+        if self.learns_bend or bool((state.bend != 0).any()):
+            return None
+        look, sight = self.looks(self.flat(state), rows)[0], self.sight(0, rows)
+        learnt = [i for _, i in self.columns]
+        made = compiled_of([look.camera], look.residuals)
+        if made is None or (made[0][0].plan.places is None and any(i >= 4 for i in learnt)):
+            return None
+        view, shared = compiled_poses.triangles(
+            made[0][0], sight.points, state.boards, look.residuals, look.weights, learnt
+        )
+        if sight.prior:
+            whole = torch.cat((shared, *self._rows_of_priors(state)), -2)
+            shared = torch.linalg.qr(padded(whole), mode="r").R
+        return Equations(view, shared, self.columns)
 
     def _rows_of_priors(self, state: State) -> list[Tensor]:
         """(B, R, G + 1) of each."""

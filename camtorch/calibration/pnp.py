@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import cache
 from typing import Any, NamedTuple
 
 import torch
@@ -10,31 +11,29 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from camtorch._arguments import Numbers, as_number, broadcast_shapes, no_camera, working_dtype
+from camtorch._evaluation import compiled_of
 from camtorch._module import remade
 from camtorch._threads import on_one_thread
 from camtorch.calibration.batches import as_tensor, as_vectors, learns, root_of, rows_of
+from camtorch.calibration.bundle import Free, Poses, Sight, State, adjust
+from camtorch.calibration.compiled import Search, Solved, solved
 from camtorch.calibration.ransac import consensus
 from camtorch.calibration.rays import poses_from_rays
 from camtorch.camera import Camera
 from camtorch.extrinsics import Extrinsics
-from camtorch.least_squares.equations import Equations, System, triangle_of_few
 from camtorch.least_squares.implicit import attached
-from camtorch.least_squares.levenberg_marquardt import minimise, rounding_of
 from camtorch.mixed import Mixed
-from camtorch.rotations import rotation_matrix, rotation_vector, skew_matrix, small_turn
+from camtorch.rotations import rotation_matrix, rotation_vector, skew_matrix
 
 _LEAST = 4  # points
 _FEW = 5  # points, that may have minima far from where they start
-_WORSE, _MUCH_WORSE = 4.0, 100.0  # times the cost of the best start, beyond which none became the best; of few points
 _MOVE = 1e-6  # of rays, whose pixels' difference is a derivative
 _THIN = 0.1  # of the extent of points: what is thinner may have the minima of a plane
-_STEPS, _FEW_STEPS = 40, 8  # at most; towards a minimum that is rarely the better one
-_DAMPING = 1e-8  # at first: a start is nearly the optimum
-_SETTLED = 1e-7  # of the variance: the squared distance to the optimum, in standard deviations, that ends a search
-_NOTHING = 1e-9  # px, that rounding may leave
 _LINE = 1e-6  # of the extent of points: less across is none
-_TURNS, _CHOICES = 12, 6  # steps by inliers, at most, and before how many of them they are chosen again
-_LOST = 1e3  # px, that a point without a pixel counts as where starts are compared
+_ROUNDS = 8  # of points that are near, and of the minimum that these have
+# A start is nearly the optimum. The squared distance to the optimum that ends a search is of the variance, in standard
+# deviations; rounding may leave so many px
+_SEARCH = Search(steps=40, settled=1e-7, nothing=1e-9, damping=1e-8)
 
 
 class _Pose(NamedTuple):
@@ -116,25 +115,17 @@ def solve_pnp(
             raise ValueError(f"solve_pnp: threshold must be positive, in px; got {threshold:g}")
     if isinstance(camera, Mixed):
         return _of_each_model(camera, object_points, pixels, weights, threshold)
-    task = _Task.of(camera, object_points, pixels, weights)
+    given = _Given.of(camera, object_points, pixels, weights)
     with torch.no_grad():
-        found = _solved(task) if threshold is None else _agreed(task, threshold)
-        inliers = found.inliers & found.valid[:, None]
-        rotation, translation, mean = rotation_vector(found.rotations), found.translations, found.normal[:, 6, 6]
-        moved = (found.rotations @ task.middles[..., None])[..., 0]
-        covariance = _covariance(found, moved)
-    task = task._replace(weights=torch.where(inliers, task.weights, 0.0))
-    if learns([camera], task.points, task.pixels, task.weights):
-        unknowns = attached(task.cost, torch.cat((rotation, translation), -1), found.valid)
-        mean = 2 * task.cost(unknowns)
-        rotation, translation = unknowns.split(3, -1)
-        moved = (rotation_matrix(rotation) @ task.middles[..., None])[..., 0]
-    mean = mean / task.weights.sum(-1).clamp(min=torch.finfo(torch.float64).tiny)
-    rotation, translation = (t.to(task.dtype).view(*task.batch, 3) for t in (rotation, translation - moved))
-    rms, valid = root_of(mean, found.valid).to(task.dtype).view(task.batch), found.valid.view(task.batch)
-    inliers = inliers.view(*task.batch, inliers.shape[-1])
-    covariance = covariance.to(task.dtype).view(*task.batch, 6, 6)
-    return Pose(_fixed(rotation, translation), rms, valid, inliers, covariance)
+        found = _compiled(given, threshold) or _searched(given, threshold)
+    vectors, translations, rms = found.vectors, found.translations, found.rms
+    if learns([given.camera], *given.tensors()):
+        vectors, translations, rms = _with_graph(given, found)
+    vectors, translations = (t.to(given.dtype).view(*given.batch, 3) for t in (vectors, translations))
+    rms = rms.to(given.dtype).view(given.batch)
+    inliers = found.inliers.view(*given.batch, found.inliers.shape[-1])
+    covariance = found.covariance.to(given.dtype).view(*given.batch, 6, 6)
+    return Pose(_fixed(vectors, translations), rms, found.valid.view(given.batch), inliers, covariance)
 
 
 def _of_each_model(
@@ -160,25 +151,32 @@ def _of_each_model(
 
 def _fixed(rotation: Tensor, translation: Tensor) -> Extrinsics:
     """A pose that does not learn by itself; gradients go to what it was found from."""
-    made = Extrinsics(rotation[..., None], translation)
-    return made if rotation.requires_grad else made.requires_grad_(False)
+    return remade(_identity(), rotation=rotation, translation=translation)
 
 
-class _Task(NamedTuple):
-    """B rows, float64, with graphs where there are: what is unseen has weight 0 and is finite."""
+@cache
+def _identity() -> Extrinsics:
+    with torch.inference_mode(False):
+        return Extrinsics([0.0, 0.0, 0.0], [0.0, 0.0, 0.0])
+
+
+class _Given(NamedTuple):
+    """What users pass, checked, in float64, with graphs where there are."""
 
     camera: Camera  # of B rows, or of none for all
-    points: Tensor  # (B, N, 3) about their middles
+    points: Tensor  # (B or 1, N, 3)
     pixels: Tensor  # (B, N, 2)
-    weights: Tensor  # (B, N)
-    rays: Tensor  # (B, N, 3)
-    middles: Tensor  # (B, 3) of the points as they were passed, which may lie far from the origin
+    weights: Tensor | None  # (B, N)
     batch: torch.Size
     dtype: torch.dtype
 
+    def tensors(self) -> list[Tensor]:
+        """Those of points."""
+        return [t for t in self[1:4] if t is not None]
+
     @classmethod
-    def of(cls, camera: Camera, object_points: Numbers, pixels: Numbers, weights: Numbers | None) -> _Task:
-        """What users pass, checked."""
+    def of(cls, camera: Camera, object_points: Numbers, pixels: Numbers, weights: Numbers | None) -> _Given:
+        """What `solve_pnp` takes."""
         owner = "solve_pnp"
         if not isinstance(camera, Camera):
             raise TypeError(f"{owner}: camera must be a camera, as ct.KannalaBrandt(...); got {no_camera(camera)}")
@@ -194,35 +192,65 @@ class _Task(NamedTuple):
             )
         if count < _LEAST:
             raise ValueError(f"{owner}: it takes {_LEAST} points at least; got {shapes}")
-        given = seen_at.new_ones(count)
-        if weights is not None:
-            given = as_tensor(weights, "weights", owner, device)
+        if given is not None:
             if given.shape[-1:] != (count,):
                 raise ValueError(f"{owner}: weights must be (*B, N) with N = {count}; got shape {tuple(given.shape)}")
             if not bool((given >= 0).all()):
                 raise ValueError(f"{owner}: weights must not be negative; got {given.detach().min().item():.4g}")
+        leads = points.shape[:-2], seen_at.shape[:-2], () if given is None else given.shape[:-1]
         try:
-            batch = broadcast_shapes(camera.batch_shape, points.shape[:-2], seen_at.shape[:-2], given.shape[:-1])
+            batch = broadcast_shapes(camera.batch_shape, *leads)
         except ValueError:
             raise ValueError(
-                f"{owner}: the batch dims of {shapes}, weights {tuple(given.shape)} and the camera's "
+                f"{owner}: the batch dims of {shapes}, weights {leads[2]} and the camera's "
                 f"{tuple(camera.batch_shape)} do not fit"
             ) from None
         dtype = working_dtype(points, seen_at, *camera._tensors)
-        points, seen_at, given = (
-            t.double().expand(*batch, count, *size).reshape(-1, count, *size)
-            for t, size in ((points, (3,)), (seen_at, (2,)), (given, ()))
-        )
-        rows = rows_of(camera, batch)
+
+        def rows(values: Tensor, *size: int) -> Tensor:
+            return values.double().expand(*batch, *size).reshape(-1, *size)
+
+        points = points.double().view(1, count, 3) if points.ndim == 2 else rows(points, count, 3)
+        given = None if given is None else rows(given, count)
+        return cls(rows_of(camera, batch), points, rows(seen_at, count, 2), given, batch, dtype)
+
+
+def _compiled(given: _Given, threshold: float | None) -> Solved | None:
+    """By compiled code, where there is any for the camera."""
+    points, pixels, weights = (None if t is None else t.detach() for t in given[1:4])
+    if points is None or pixels is None or not len(pixels) or (made := compiled_of([given.camera], pixels)) is None:
+        return None
+    start = None
+    if threshold is not None:
+        task = _Task.of(given)
+        start = _consensus(task, threshold)
+    return solved(made[0][0], points, pixels, weights, _SEARCH, start, threshold or 0.0)
+
+
+class _Task(NamedTuple):
+    """B rows: what is unseen has weight 0 and is finite."""
+
+    camera: Camera  # of B rows, or of none for all
+    points: Tensor  # (B, N, 3) about their middles
+    pixels: Tensor  # (B, N, 2)
+    weights: Tensor  # (B, N)
+    rays: Tensor  # (B, N, 3)
+    middles: Tensor  # (B, 3) of the points as they were passed, which may lie far from the origin
+
+    @classmethod
+    def of(cls, given: _Given) -> _Task:
+        """With graphs where there are."""
+        points, pixels = given.points.expand(len(given.pixels), -1, -1), given.pixels
+        weights = torch.ones_like(pixels[..., 0]) if given.weights is None else given.weights
         with torch.no_grad():
-            rays, seen = rows.unproject(seen_at)
+            rays, seen = given.camera.unproject(pixels)
             # a sum shows what is not finite, and these powers what would not be
-            seen = seen & torch.isfinite(points.square().sum(-1).square() + given)
-            counts = (seen & (given > 0))[..., None]
+            seen = seen & torch.isfinite(points.square().sum(-1).square() + weights)
+            counts = (seen & (weights > 0))[..., None]
             middles = torch.where(counts, points, 0.0).sum(-2) / counts.sum(-2).clamp(min=1)
         points = torch.where(seen[..., None], points - middles[:, None], 0.0)
-        seen_at, given = torch.where(seen[..., None], seen_at, 0.0), torch.where(seen, given, 0.0)
-        return cls(rows, points, seen_at, given, rays, middles, batch, dtype)
+        pixels, weights = torch.where(seen[..., None], pixels, 0.0), torch.where(seen, weights, 0.0)
+        return cls(given.camera, points, pixels, weights, rays, middles)
 
     def cost(self, unknowns: Tensor) -> Tensor:
         """(B,) half the sum of squares at rotation vectors and translations (B, 6)."""
@@ -232,98 +260,119 @@ class _Task(NamedTuple):
         return 0.5 * (torch.where(valid, squares, 0.0) * self.weights).sum(-1)
 
 
-class _Optimum(NamedTuple):
-    """Rotations (B, 3, 3), translations (B, 3), whether they are one, and which points (B, N) they are of.
-
-    normal: (B, 7, 7), the weighted products of the residuals' derivatives by turn and shift, and of the residuals;
-    inverse: (B, 6, 6), of the former.
-    """
-
-    rotations: Tensor
-    translations: Tensor
-    valid: Tensor
-    inliers: Tensor
-    normal: Tensor
-    inverse: Tensor
+def _with_graph(given: _Given, found: Solved) -> tuple[Tensor, Tensor, Tensor]:
+    """The poses and the root mean squares with their derivatives."""
+    task = _Task.of(given)
+    task = task._replace(weights=torch.where(found.inliers, task.weights, 0.0))
+    middles = task.middles[..., None]
+    centred = found.translations + (rotation_matrix(found.vectors) @ middles)[..., 0]
+    unknowns = attached(task.cost, torch.cat((found.vectors, centred), -1), found.valid)
+    vectors, centred = unknowns.split(3, -1)
+    translations = centred - (rotation_matrix(vectors) @ middles)[..., 0]
+    means = 2 * task.cost(unknowns) / task.weights.sum(-1).clamp(min=torch.finfo(torch.float64).tiny)
+    return vectors, translations, root_of(means, found.valid)
 
 
-def _solved(task: _Task) -> _Optimum:
-    """The poses of least cost of all that is seen."""
-    points, pixels, weights = (t.detach() for t in task[1:4])
-    starts = poses_from_rays(points, task.rays, weights)
-    seen_at, mapped = task.camera.project(starts.moved(points).flatten(1, 2))
-    shape = *starts.valid.shape, points.shape[1]
-    squares = (seen_at.view(*shape, 2) - pixels[:, None]).square().sum(-1)
-    costs = (torch.where(mapped.view(shape), squares, _LOST**2) * weights[:, None]).sum(-1)
-    costs = torch.where(starts.valid, costs, torch.inf)
-    best, every = costs.argmin(-1), torch.arange(len(costs), device=costs.device)
-    found = _refined(task, every, starts.rotations[every, best], starts.translations[every, best])
-    found = found._replace(costs=torch.where(starts.valid[every, best], found.costs, torch.inf))
-    few = (weights > 0).sum(-1) <= _FEW
-    others = costs.scatter(1, best[:, None], torch.inf).amin(-1)
-    for those, factor, steps in ((few, _MUCH_WORSE, _STEPS), (~few, _WORSE, _FEW_STEPS)):
-        (rows,) = (those & (others <= factor * costs.amin(-1)) & (others < torch.inf)).nonzero(as_tuple=True)
-        other = starts.rotations[rows, 1 - best[rows]], starts.translations[rows, 1 - best[rows]]
-        found = found.or_better(rows, _refined(task, rows, *other, steps))
-    # of so few points on a plane the other minimum may be one of pixels, and none of rays
-    (rows,) = (few & starts.valid[:, 0] & ~starts.valid[:, 1]).nonzero(as_tuple=True)
-    flat, turned, moved = _mirrored(points[rows], weights[rows], found.rotations[rows], found.translations[rows])
-    found = found.or_better(rows[flat], _refined(task, rows[flat], turned[flat], moved[flat]))
-    problem = _Reprojection(task, every)
-    normal = _normal(*problem.linear((found.rotations, found.translations), every), weights)
-    valid = torch.isfinite(found.costs)
-    return _Optimum(found.rotations, found.translations, valid, weights > 0, normal, _inverse(normal))
+def _consensus(task: _Task, threshold: float) -> tuple[Tensor, Tensor]:
+    """The poses on which most points agree: rotations (B, 3, 3), translations (B, 3)."""
+    # where poses are only looked for, differences are derivatives
+    moves = _MOVE * torch.eye(4, 3, dtype=task.rays.dtype, device=task.rays.device)  # the last one: none
+    pixels, seen = task.camera.project((task.rays[:, :, None] + moves).flatten(1, 2))
+    pixels, seen = pixels.unflatten(1, (-1, 4)), seen.unflatten(1, (-1, 4)).all(-1)
+    slopes = ((pixels[:, :, :3] - pixels[:, :, 3:]) / _MOVE).mT
+    return consensus(task.points, task.rays, slopes, seen & (task.weights > 0), threshold)[:2]
+
+
+# -- by torch
+
+
+def _searched(given: _Given, threshold: float | None) -> Solved:
+    """The same on any device, for any camera."""
+    given = given._replace(points=given.points.detach(), pixels=given.pixels.detach())
+    task = _Task.of(given if given.weights is None else given._replace(weights=given.weights.detach()))
+    weights = task.weights
+    if threshold is None:
+        starts = poses_from_rays(task.points, task.rays, weights)
+        found = _least([_minimum(task, *(t[:, i] for t in starts)) for i in range(2)])
+        # of so few points on a plane the other minimum may be one of pixels, and none of rays
+        flat, *mirrored = _mirrored(task, found.rotations, found.translations)
+        flat = flat & starts.valid[:, 0] & ~starts.valid[:, 1] & ((weights > 0).sum(-1) <= _FEW)
+        if bool(flat.any()):
+            found = _least([found, _minimum(task, *mirrored, flat)])
+    else:
+        rotations, translations = _consensus(task, threshold)
+        near, found = _near(task, rotations, translations, threshold), None
+        for _ in range(_ROUNDS):
+            task = task._replace(weights=torch.where(near, weights, 0.0))
+            found = _minimum(task, rotations, translations, _spread(task.points, near))
+            rotations, translations, before = found.rotations, found.translations, near
+            near = _near(task._replace(weights=weights), rotations, translations, threshold)
+            if torch.equal(near, before):
+                break
+        found = found._replace(costs=torch.where((near == before).all(-1), found.costs, torch.inf))
+    return _assessed(task, found)
 
 
 class _Found(NamedTuple):
-    """Minima: costs (R,), infinite where there is none, rotations (R, 3, 3) and translations (R, 3)."""
+    """Minima: costs (B,), infinite where there is none, rotations (B, 3, 3), translations (B, 3); and triangles
+    (B, 6, 7) of the derivatives by turn and shift, and of the residuals.
+    """
 
     costs: Tensor
     rotations: Tensor
     translations: Tensor
-
-    def or_better(self, rows: Tensor, other: _Found) -> _Found:
-        """With the minima of some rows, where they are lower, in the place of those here."""
-        better = other.costs < self.costs[rows]
-        whole = _Found(*(t.clone() for t in self))
-        for mine, its in zip(whole, other, strict=True):
-            mine[rows[better]] = its[better]
-        return whole
+    triangles: Tensor
 
 
-def _agreed(task: _Task, threshold: float) -> _Optimum:
-    """The poses of least cost of the points on which most agree: steps of Gauss and Newton by what is near before."""
-    given = task.weights > 0
-    every = torch.arange(len(given), device=given.device)
-    problem = _Reprojection(task, every)
-    # differences do where poses are only looked for
-    moves = _MOVE * torch.eye(4, 3, dtype=task.rays.dtype, device=task.rays.device)  # the last one: none
-    pixels, seen = problem.camera.project((task.rays[:, :, None] + moves).flatten(1, 2))
-    pixels, seen = pixels.unflatten(1, (given.shape[1], 4)), seen.unflatten(1, (given.shape[1], 4)).all(-1)
-    slopes = ((pixels[:, :, :3] - pixels[:, :, 3:]) / _MOVE).mT
-    rotations, translations, _ = consensus(problem.points, task.rays, slopes, given & seen, threshold)
-    inliers = torch.zeros_like(given)
-    for number in range(_TURNS):
-        state, before = (rotations, translations), inliers
-        if number % 2 == 0:  # a step hardly changes the derivatives
-            residuals, mapped, columns = problem.linear(state, every)
-        else:
-            residuals, mapped = problem.residuals(state)
-        if number < _CHOICES:
-            inliers = given & mapped & (residuals.square().sum(-1) < threshold**2)
-        normal = _normal(residuals, mapped, columns, torch.where(inliers, problem.weights, 0.0))
-        inverse = _inverse(normal)
-        step = -(inverse @ normal[:, :6, 6:])[..., 0]
-        gain, cost = -(step * normal[:, :6, 6]).sum(-1), normal[:, 6, 6]
-        rounding = 2 * (cost * problem.rounding).sqrt() + problem.rounding
-        tolerance = _SETTLED / (2 * inliers.sum(-1) - 6).clamp(min=1)
-        settled = (gain <= torch.maximum(tolerance * cost, rounding)) & (inliers == before).all(-1)
-        step = torch.where(torch.isfinite(step).all(-1, keepdim=True), step, 0.0)
-        rotations, translations = small_turn(step[:, :3]) @ rotations, translations + step[:, 3:]
-        if bool(settled.all()):
-            break
-    settled &= _spread(problem.points, inliers)
-    return _Optimum(rotations, translations, settled, inliers, normal, inverse)
+def _minimum(task: _Task, rotations: Tensor, translations: Tensor, valid: Tensor | None = None) -> _Found:
+    """The minima that poses (B, ...) lead to; valid: bool (B,), those that are meant."""
+    camera = task.camera
+    parameters = torch.cat(camera._tensors, -1).detach()
+    parameters = parameters.view(-1, parameters.shape[-1])
+    sight = Sight(camera, task.points[:, None], task.pixels[:, None], task.weights[:, None])
+    start = Poses(rotations[:, None], translations[:, None])
+    none = Poses.none(len(rotations), 1, rotations)
+    free = Free((torch.zeros(parameters.shape[-1], dtype=torch.bool, device="cpu"),), (False,))
+    found = adjust(
+        [sight], State((parameters,), none, start, rotations.new_zeros(len(rotations), 2)), free, steps=_SEARCH.steps
+    )
+    fine = (
+        found.converged & (found.valid[0][:, 0] | (task.weights == 0)).all(-1) & ((task.weights > 0).sum(-1) >= _LEAST)
+    )
+    fine = fine if valid is None else fine & valid
+    (turned,), (moved,) = (t.unbind(1) for t in found.state.boards)
+    return _Found(torch.where(fine, found.cost, torch.inf), turned, moved, found.equations.view[:, 0])
+
+
+def _least(candidates: list[_Found]) -> _Found:
+    """Of each row the lowest one."""
+    best = torch.stack([found.costs for found in candidates]).argmin(0)
+    rows = torch.arange(len(best), device=best.device)
+    return _Found(*(torch.stack(parts)[best, rows] for parts in zip(*candidates, strict=True)))
+
+
+def _near(task: _Task, rotations: Tensor, translations: Tensor, threshold: float) -> Tensor:
+    """Bool (B, N): the points that are seen near their pixels."""
+    pixels, valid = task.camera.project(task.points @ rotations.mT + translations[:, None])
+    return valid & (task.weights > 0) & ((pixels - task.pixels).square().sum(-1) < threshold**2)
+
+
+def _assessed(task: _Task, found: _Found) -> Solved:
+    """With what the noise does to them, of turns and of shifts of the origin."""
+    valid = torch.isfinite(found.costs)
+    inliers = (task.weights > 0) & valid[:, None]
+    eye = torch.eye(6, dtype=found.costs.dtype, device=found.costs.device)
+    by = found.triangles[..., :6].square().sum(-2).sqrt()
+    inverse, failed = torch.linalg.inv_ex(found.triangles[..., :6] / torch.where(by > 0, by, 1.0)[:, None])
+    inverse = inverse / by[..., None]
+    variance = found.costs / (2 * inliers.sum(-1) - 6).clamp(min=1)
+    away, carried = (found.rotations @ task.middles[..., None])[..., 0], eye.repeat(len(valid), 1, 1)
+    carried[:, 3:, :3] = skew_matrix(away)
+    carried = carried @ inverse
+    covariance = carried @ carried.mT * variance[:, None, None]
+    covariance = torch.where((valid & (failed == 0))[:, None, None], covariance, torch.nan)
+    rms = (found.costs / task.weights.sum(-1).clamp(min=torch.finfo(torch.float64).tiny)).sqrt()
+    return Solved(rotation_vector(found.rotations), found.translations - away, rms, valid, inliers, covariance)
 
 
 def _spread(points: Tensor, inliers: Tensor) -> Tensor:
@@ -338,125 +387,12 @@ def _spread(points: Tensor, inliers: Tensor) -> Tensor:
     return enough
 
 
-def _derivatives(camera: Camera, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Pixels, whether there is one, and derivatives (B, N, 2, 3) by points (B, N, 3) of a frozen camera."""
-    with torch.inference_mode(False), torch.enable_grad():
-        # each point twice: all derivatives by one pass backward
-        leaf = torch.cat((points.detach(), points.detach()), -2).requires_grad_()
-        pixels, valid = camera.project(leaf)
-        by = torch.zeros_like(pixels)
-        count = points.shape[-2]
-        by[:, :count, 0] = by[:, count:, 1] = 1.0
-        (slopes,) = torch.autograd.grad(pixels, leaf, by)
-    return pixels[:, :count].detach(), valid[:, :count], slopes.unflatten(1, (2, count)).transpose(1, 2)
-
-
-def _normal(residuals: Tensor, valid: Tensor, columns: Tensor, weights: Tensor) -> Tensor:
-    """(B, 7, 7), see `_Optimum`."""
-    root = torch.where(valid, weights, 0.0).sqrt()[..., None, None]
-    rows = (torch.cat((columns, residuals[..., None]), -1) * root).flatten(1, 2)
-    normal: Tensor = rows.mT @ rows
-    return normal
-
-
-def _inverse(normal: Tensor) -> Tensor:
-    """(B, 6, 6) of what is for the unknowns, whose units differ; not finite where there is none."""
-    normal = normal[:, :6, :6]
-    scale = normal.diagonal(dim1=-2, dim2=-1)
-    scale = torch.where(scale > 0, scale, 1.0).rsqrt()
-    scale = scale[:, :, None] * scale[:, None]
-    inverse, failed = torch.linalg.inv_ex(normal * scale)
-    return torch.where((failed == 0)[:, None, None], inverse * scale, torch.nan)
-
-
-class _Reprojection:
-    """Poses of some rows of a task, for `minimise`: states are rotations (R, 3, 3) and translations (R, 3)."""
-
-    def __init__(self, task: _Task, rows: Tensor):
-        self.points, self.pixels, self.weights = (t.detach()[rows] for t in task[1:4])
-        with torch.inference_mode(False):
-            tensors = {name: getattr(task.camera, name).detach().clone() for name in task.camera.tensor_names}
-        self.camera = remade(task.camera, **{name: t[rows] if t.ndim > 1 else t for name, t in tensors.items()})
-        self.rounding = rounding_of(self.pixels, self.weights)
-
-    def _of(self, rows: Tensor) -> tuple[Camera, Tensor, Tensor, Tensor]:
-        whole = len(rows) == len(self.points)
-        camera = self.camera if whole or not self.camera.batch_shape else self.camera[rows]
-        points, pixels, weights = (t if whole else t[rows] for t in (self.points, self.pixels, self.weights))
-        return camera, points, pixels, weights
-
-    def cost(self, state: tuple[Tensor, ...], rows: Tensor) -> Tensor:
-        """(R,)."""
-        camera, points, seen_at, weights = self._of(rows)
-        pixels, valid = camera.project(points @ state[0].mT + state[1][:, None])
-        squares = torch.where(valid, (pixels - seen_at).square().sum(-1), _LOST**2)
-        total = (squares * weights).sum(-1)
-        return torch.where(torch.isfinite(total), total, torch.inf)
-
-    def linear(self, state: tuple[Tensor, ...], rows: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Residuals (R, N, 2), whether there is a pixel, and derivatives (R, N, 2, 6) by turn and shift."""
-        camera, points, seen_at, _ = self._of(rows)
-        turned = points @ state[0].mT
-        pixels, valid, slopes = _derivatives(camera, turned + state[1][:, None])
-        turns = torch.linalg.cross(turned[:, :, None].expand_as(slopes), slopes)
-        return torch.where(valid[..., None], pixels - seen_at, 0.0), valid, torch.cat((turns, slopes), -1)
-
-    def linearised(self, state: tuple[Tensor, ...], rows: Tensor) -> System:
-        """At a state."""
-        residuals, valid, columns = self.linear(state, rows)
-        root = torch.where(valid, self._of(rows)[3], 0.0).sqrt()[..., None, None]
-        block = (torch.cat((columns, residuals[..., None]), -1) * root).flatten(1, 2)
-        equations = Equations(triangle_of_few(block)[:, None], block.new_zeros(len(block), 1, 1))
-        return System(equations, 6, torch.zeros(len(block), 0, dtype=torch.bool, device=block.device))
-
-    def residuals(self, state: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
-        """(B, N, 2) of all rows, and whether there is a pixel."""
-        pixels, valid = self.camera.project(self.points @ state[0].mT + state[1][:, None])
-        return torch.where(valid[..., None], pixels - self.pixels, 0.0), valid
-
-    def moved(self, state: tuple[Tensor, ...], step: tuple[Tensor, ...], rows: Tensor) -> tuple[Tensor, ...]:
-        """The state a step further."""
-        turn, shift = step[0][:, 0].split(3, -1)
-        return small_turn(turn) @ state[0], state[1] + shift
-
-
-def _refined(task: _Task, rows: Tensor, rotations: Tensor, translations: Tensor, steps: int = _STEPS) -> _Found:
-    """The minima that starts (R, ...) for some rows of the task lead to."""
-    if len(rows) == 0:
-        return _Found(translations[:, 0], rotations, translations)
-    problem = _Reprojection(task, rows)
-    counts = (problem.weights > 0).sum(-1)
-    found = minimise(
-        problem,
-        (rotations, translations),
-        tolerance=_SETTLED / (2 * counts - 6).clamp(min=1),
-        tiny=_NOTHING**2 * counts,
-        going=counts >= _LEAST,
-        steps=steps,
-        damping=_DAMPING,
-    )
-    rotations, translations = found.state
-    complete = (problem.residuals(found.state)[1] | (problem.weights == 0)).all(-1)
-    return _Found(torch.where(found.converged & complete, found.cost, torch.inf), rotations, translations)
-
-
-def _covariance(found: _Optimum, middles: Tensor) -> Tensor:
-    """(B, 6, 6) of turns, and shifts of the origin, from which the points' middles (B, 3) lie in the camera's axes."""
-    variance = found.normal[:, 6, 6] / (2 * found.inliers.sum(-1) - 6).clamp(min=1)
-    carried = torch.eye(6, dtype=middles.dtype, device=middles.device).repeat(len(middles), 1, 1)
-    carried[:, 3:, :3] = skew_matrix(middles)
-    covariance = carried @ (found.inverse * variance[:, None, None]) @ carried.mT
-    return torch.where(found.valid[:, None, None], covariance, torch.nan)
-
-
-def _mirrored(
-    points: Tensor, weights: Tensor, rotations: Tensor, translations: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
+def _mirrored(task: _Task, rotations: Tensor, translations: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Whether points are nearly on a plane, and poses whose normals of it are mirrored at the line of sight."""
-    share = weights / weights.sum(-1, keepdim=True)
-    centre = (share[..., None] * points).sum(-2)
-    centred = points - centre[:, None]
-    variances, axes = torch.linalg.eigh((share[..., None] * centred).mT @ centred)
+    share = task.weights / task.weights.sum(-1, keepdim=True)
+    centre = (share[..., None] * task.points).sum(-2)
+    centred = task.points - centre[:, None]
+    variances, axes = torch.linalg.eigh(((share[..., None] * centred).mT @ centred).nan_to_num(0.0))
     flat, normal = variances[:, 0] <= _THIN**2 * variances[:, 2], axes[..., 0]
     middle = (rotations @ centre[..., None])[..., 0] + translations
     across_sight, in_plane = (

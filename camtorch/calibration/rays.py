@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from camtorch.calibration.compiled import can_search, from_rays
 from camtorch.rotations import small_turn
 
 _PAIRS = ((0, 1, 2), (1, 3, 4), (2, 4, 5))  # of symmetric matrices, the place among six entries
@@ -47,6 +48,8 @@ def poses_from_rays(points: Tensor, rays: Tensor, weights: Tensor) -> RayPoses:
     a row, S = 2. A pose is valid if four points or more are seen that are not on a line, everything is finite, and most
     of what is seen lies ahead on its rays; the second one if it is another minimum. Others are finite and mean nothing.
     """
+    if can_search(points, rays, weights):
+        return RayPoses(*from_rays(points, rays, weights))
     # what is not finite, which a sum shows, has weight 0; what has no weight is zero
     seen = torch.isfinite(points.sum(-1) + rays.sum(-1) + weights) & (weights > 0)
     points, rays = torch.where(seen[..., None], points, 0.0), torch.where(seen[..., None], rays, 0.0)

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
-from camtorch.calibration.bundle import Free, Poses, Sight, State, adjust
+from camtorch.calibration.bundle import SETTLED, Free, Poses, Sight, State, adjust, minima
 from camtorch.calibration.rays import poses_from_rays
 from camtorch.camera import Camera, fixed_camera
 from camtorch.convert import fitting, views
 from camtorch.models import UCM, KannalaBrandt
-from camtorch.projection.rays import angles_from_axis
+from camtorch.projection.rays import angles_from_axis, slopes_at_axis
 
 if TYPE_CHECKING:
     from camtorch.calibration.observations import Observations
@@ -22,12 +22,12 @@ if TYPE_CHECKING:
 # Lenses that are tried. The unified camera is a perspective one for 0, a stereographic one for 1/2, and nearly an
 # equidistant or equisolid one for 0.65; degrees from the axis, at the seen pixel that is furthest from the middle
 _TRIED = {
-    0.0: (3.0, 5.0, 8.0, 12.0, 18.0, 25.0, 33.0, 42.0, 52.0, 62.0, 72.0),
-    0.5: (8.0, 14.0, 22.0, 32.0, 44.0, 56.0, 68.0, 80.0, 92.0, 104.0, 116.0),
-    0.65: (8.0, 14.0, 22.0, 32.0, 44.0, 56.0, 68.0, 80.0, 92.0, 104.0),
+    0.0: (4.0, 7.0, 12.0, 18.0, 27.0, 38.0, 51.0, 66.0),
+    0.5: (12.0, 26.0, 44.0, 64.0, 84.0, 106.0),
+    0.65: (14.0, 28.0, 46.0, 66.0, 88.0),
 }
 _VIEWS, _POINTS = 24, 100  # that the search looks at
-_KEPT = 5  # of the lenses tried
+_KEPT, _UNLIKE = 3, 2.0  # of the lenses tried, and up to how many times the error of the best
 _ROUNDS = 4  # of poses
 _BAD = 2.0  # times the usual error: a view whose pose may be spoilt
 _IN_DOUBT = 4.0  # times the usual error of the better pose: the other one may be it
@@ -37,10 +37,12 @@ _TRIMMED = 0.8  # of the views decide: others may be spoilt
 _LEAST_SCALE = 0.5  # px, of robust weights
 _NO_PIXEL = 1e3  # px, the error of a corner without a pixel
 _OUTLIER = 3.0  # times the scale
+_LEAST_SLOPE = 1e-3  # of a lens at the axis, that a search starts from
 _WORSE, _LITTLE_WORSE = 2.0, 1.01  # than the best: costs of what is kept
 _ALIKE = 1e-3  # the relative difference of two starts, of one
 _SAME = 1e-7  # the difference of two costs, of one optimum
 _FEW_STEPS, _STEPS, _MANY_STEPS = 6, 12, 40
+_NEARLY = 1e-2  # as `SETTLED`, of a lens that another one follows
 # Coefficients with which the others make a valley that has several deepest places, and where along it to start
 _ALONG = {
     "double_sphere": ("xi", (-0.3, 0.0, 0.3, 0.7)),
@@ -86,7 +88,9 @@ def start_from_nothing(
         lens = _refined(lens, few, KannalaBrandt, 4, fixed, ("cauchy", lens.scale)).of(slice(1))
     lens = _refined(lens, few, model, count, fixed, (loss, loss_scale))
     _check_reach(lens.of(slice(1)), few, first)
-    state = poses_for(lens.parameters[:1], observations, model, image_size, lens.scale)
+    state = lens.of(slice(1)).state
+    if few is not observations:
+        state = poses_for(state.parameters[0], observations, model, image_size, lens.scale)
     if len(lens.parameters) == 1:
         return state
     lens = lens._replace(boards=state.boards.expand(len(lens.parameters)))
@@ -193,7 +197,9 @@ class _Lens(NamedTuple):
         loss: name and scale; Cauchy's of the scale here if left out.
         """
         name, scale = loss or ("cauchy", self.scale)
-        found = adjust([_sight(self.model, few)], self.state, free, loss=name, loss_scale=scale, steps=steps)
+        settled = _NEARLY if loss is None else SETTLED
+        sight = _sight(self.model, few)
+        found = adjust([sight], self.state, free, loss=name, loss_scale=scale, steps=steps, settled=settled)
         cost, rows = found.cost.sort()
         near = cost <= worst * cost[0]
         near[1:] &= cost.diff() > _SAME * cost[:-1]
@@ -256,10 +262,10 @@ def _unified(few: Observations, image_size: tuple[int, int], fixed: Collection[s
     by_view = errors.nanmedian(-1).values.sort(-1).values
     score = by_view[:, : math.ceil(_TRIMMED * by_view.shape[1])].mean(-1)
     score, rows = score.topk(_KEPT, largest=False)
+    rows = rows[score <= _UNLIKE * score[0]]
     lens = lens._replace(boards=boards, scale=max(_LEAST_SCALE, 2 * float(score[0]))).of(rows)
-    lens = lens.adjusted(few, _free(UCM, 1, ("cx", "cy")), _FEW_STEPS, _WORSE).of(slice(1))
     free = _free(UCM, 1, [name for name in fixed if name in ("cx", "cy")])
-    return _turned(lens.adjusted(few, free, _FEW_STEPS, _WORSE), few)
+    return _turned(lens.adjusted(few, free, _STEPS, _WORSE).of(slice(1)), few)
 
 
 def _posed(camera: Camera, some: Observations) -> tuple[Poses, Tensor]:
@@ -339,16 +345,11 @@ def _turned(lens: _Lens, some: Observations) -> _Lens:
     (rows,) = (others <= _IN_DOUBT * torch.minimum(usual, other)).nonzero(as_tuple=True)
     if len(rows) == 0:
         return lens._replace(boards=first)
-    # each is a problem of its own
     both = Poses(*(torch.cat((a[0, rows], b[0, rows]))[:, None] for a, b in zip(first, second, strict=True)))
-    sight = _sight(lens.model, some)
-    sight = sight.mapped(lambda t: t[0, rows].repeat(2, *[1] * (t.ndim - 2))[:, None])
-    free = Free((torch.zeros(lens.parameters.shape[-1], dtype=torch.bool, device="cpu"),), (False,))
-    state = _state(lens.parameters, both)
-    ended = adjust([sight], state, free, loss="cauchy", loss_scale=lens.scale, steps=_FEW_STEPS)
+    poses, cost = minima(lens.model, lens.parameters, both, some.of(rows.repeat(2)), ("cauchy", lens.scale), _FEW_STEPS)
     halves = slice(len(rows)), slice(len(rows), None)
-    a, b = (Poses(*(t[half].transpose(0, 1) for t in ended.state.boards)) for half in halves)
-    better = Poses.where(ended.cost[halves[0]] <= ended.cost[halves[1]], a, b)
+    a, b = (Poses(*(t[half].transpose(0, 1) for t in poses)) for half in halves)
+    better = Poses.where(cost[halves[0]] <= cost[halves[1]], a, b)
     return lens._replace(boards=first.with_views(rows, better))
 
 
@@ -375,24 +376,31 @@ def _fitted(lens: _Lens, few: Observations, model: type[Camera], count: int, fix
     reach = torch.where(inliers, angles_from_axis(rays), 0.0).amax((-1, -2))
     names = model.names_of(count) or ()
     ideal = slopes.new_tensor(model.ideal(count))
-    held = [name for name in names if name in fixed]
     starts = model.fit_start(names, *views.radii(camera, slopes, (_REACH * reach).clamp(max=math.pi)))[:, 0]
-    sets = [(starts, held)]
+    is_fixed = torch.tensor([name in fixed for name in names], dtype=torch.bool, device=slopes.device)
+    starts = torch.where(is_fixed, ideal, starts)
+    sets = [(starts, is_fixed)]  # and which of the coefficients stay as they start
     along, values = _ALONG.get(model.key, ("", ()))
+    order = torch.arange(len(names), device=slopes.device)
     if values and along not in fixed:
+        at = names.index(along)
         more = starts[:1].repeat(len(values), 1)
-        more[:, names.index(along)] = more.new_tensor(values)
-        sets.append((more, [*held, along]))
-    sets += [(starts[:1], [*held, *names[order:]]) for order in _LOW_ORDERS if len(names) > order and not values]
-    seen = fitting.Observations(rays.flatten(1, 2), few.pixels.flatten(0, 1)[None], inliers.flatten(1).double())
+        more[:, at] = more.new_tensor(values)
+        sets.append((more, is_fixed | (order == at)))
+    if not values:
+        sets += [(starts[:1], is_fixed | (order >= low)) for low in _LOW_ORDERS if len(names) > low]
+    begun = torch.cat([some for some, _ in sets])
+    held = torch.cat([torch.where(stays, some, torch.nan) for some, stays in sets])
+    held = torch.nn.functional.pad(held, (4, 0), value=torch.nan)
     template = fixed_camera(model, slopes[:1], ideal[None], lens.image_size)
-    is_held = torch.tensor([name in held for name in names], dtype=torch.bool, device=slopes.device)
-    fitted = []
-    for some, stay in sets:
-        some = torch.where(is_held, ideal, some)
-        rows = fitting.Observations(*(t.expand(len(some), *t.shape[1:]) for t in seen))
-        fitted.append(fitting.fit(template, rows, some[None], slopes.expand(len(some), -1), stay))
-    parameters = torch.cat(fitted)
+    seen = fitting.Observations(rays.flatten(1, 2), few.pixels.flatten(0, 1)[None], inliers.flatten(1).double())
+    seen = fitting.Observations(*(t.expand(len(begun), *t.shape[1:]) for t in seen))
+    slopes = slopes.expand(len(begun), -1)
+    focal = slopes[:, :2] / slopes_at_axis(template.optics, begun).clamp(min=_LEAST_SLOPE)
+    parameters = torch.cat((focal, slopes[:, 2:], begun), -1)
+    _, valid = fixed_camera(model, parameters[:, :4], begun).project(seen.rays)
+    if values or not bool((valid | (seen.weights == 0)).all()):
+        parameters = fitting.fit(template, seen, begun[None], slopes, fixed=held)
     # those that are not as good as the same as an earlier one
     apart = (parameters[:, None] - parameters).abs() > _ALIKE * (parameters.abs() + _ALIKE)
     parameters = parameters[~(~apart.any(-1)).tril(-1).any(-1)]

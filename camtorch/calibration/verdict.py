@@ -43,10 +43,6 @@ _MOST_OF_A_VIEW = 0.8  # of its corners
 
 _TILTED = "Tilt the board by 30 to 45 degrees to all sides"
 _ROWS, _COLUMNS = ("top", "", "bottom"), ("left", "", "right")
-_OTHERS = {"pinhole": "brown_conrady", "brown_conrady": "", "kannala_brandt": "fisheye624", "fisheye62": "fisheye624"}
-_OTHERS |= dict.fromkeys(("fisheye624", "thin_prism_fisheye"), "")
-_WIDER = {"pinhole": "kannala_brandt", "brown_conrady": "kannala_brandt or fisheye624"}
-"""Models to try where another one does not fit, and where corners reach far from the axis."""
 
 
 class Zone(NamedTuple):
@@ -341,16 +337,16 @@ def _outliers(survey: Survey) -> Iterator[str]:
     # of the lengths of normal errors so many are beyond three standard deviations, and none beyond six
     if count > 3 + 2 * math.exp(-4.5) * int(seen.sum()) or bool((lengths[bad] > 6 * usual).any()):
         most = int(per_view.argmax())
-        everywhere = int((per_view > 0).sum()) >= int(seen.any(-1).sum())
-        concentrated = "" if everywhere else f", {int(per_view[most])} of them in view {calibration.views[most]}"
         robust = "" if calibration.loss else ': loss="huber" keeps them from pulling'
-        what = "corners are outliers" if count > 1 else "corners is an outlier"
-        yield f"{count} of {int(seen.sum())} {what}{concentrated}{robust}. Look at the views"
+        yield (
+            f"{count} of {int(seen.sum())} corners are outliers, {int(per_view[most])} of them in view "
+            f"{calibration.views[most]}{robust}. Look at the views"
+        )
     (lost,) = (per_view > _MOST_OF_A_VIEW * seen.sum(-1)).nonzero(as_tuple=True)
     if len(lost) and calibration.loss:
         yield (
             f"Nearly all corners of {_numbered(survey, lost)} are outliers, as where they are numbered in another "
-            f"order. Leave {'them' if len(lost) > 1 else 'it'} out: such views make all parameters look less certain"
+            "order. Leave such views out: they make all parameters look less certain"
         )
 
 
@@ -360,8 +356,8 @@ def _bad_views(survey: Survey) -> Iterator[str]:
     (bad,) = (rms > max(_WORSE_VIEW * usual, survey.rounding)).nonzero(as_tuple=True)
     if len(bad) and len(rms) >= _FEW_VIEWS:
         yield (
-            f"{_numbered(survey, bad).capitalize()} fit{'s' * (len(bad) == 1)} worse than the others, up to "
-            f"{_px(float(rms[bad].amax()))} where {_px(usual)} is usual: look at their corners, or leave them out"
+            f"Worse than the others fit {_numbered(survey, bad)}, up to {_px(float(rms[bad].amax()))} where "
+            f"{_px(usual)} is usual: look at their corners, or leave them out"
         )
 
 
@@ -369,30 +365,28 @@ def _views(survey: Survey) -> Iterator[str]:
     calibration = survey.calibration
     if calibration.copies:
         yield (
-            f"{named(calibration.copies).capitalize()} show{'s' * (len(calibration.copies) == 1)} another view again, "
-            "as a copy of a file does: they count once. Take new photographs instead"
+            f"Another view is shown again by {named(calibration.copies)}, as a copy of a file does: they count once. "
+            "Take new photographs instead"
         )
     copies = [calibration.views.index(view) for view in calibration.copies if view in calibration.views]
     count = int(survey.seen.any(-1).sum()) - int(survey.seen[copies].any(-1).sum())
     if count < _FEW_VIEWS:
-        plural = "s" * (count != 1)
-        yield f"Only {count} view{plural}: a bad one has nothing to be told by. Take 10 to 20. {_TILTED}"
+        yield f"Few views ({count}): a bad one has nothing to be told by. Take 10 to 20. {_TILTED}"
 
 
 def _loose(survey: Survey) -> Iterator[str]:
     loose = survey.loose_focal
-    known = f"known to {_percent(loose)} only" if loose < 1 else "as good as unknown"
-    if loose > _LOOSE_FOCAL and len(survey.seen) > 1 and survey.tilt < _ALIKE:
+    if loose > _LOOSE_FOCAL:
+        why = "Take views in which the board is near and tilted, and fills the image"
+        if len(survey.seen) > 1 and survey.tilt < _ALIKE:
+            why = f"All boards are parallel to within {_degrees(survey.tilt)}. {_TILTED}"
+        yield f"The focal length is known to {_percent(loose)} only. {why}"
+    std = max(survey.calibration.std[2:4].tolist())
+    if std > _LOOSE_CENTRE * max(survey.calibration.image_size):
         yield (
-            f"All boards are parallel to within {_degrees(survey.tilt)}, so that a longer focal length looks like a "
-            f"greater distance: it is {known}. {_TILTED}"
+            f"The principal point is known to {_px(std)} only. {_TILTED}, or hold it in the middle with "
+            'fixed=("cx", "cy")'
         )
-    elif loose > _LOOSE_FOCAL:
-        yield f"The focal length is {known}. Take views in which the board is near and tilted, and fills the image"
-    std, longer = max(survey.calibration.std[2:4].tolist()), max(survey.calibration.image_size)
-    if std > _LOOSE_CENTRE * longer:
-        known = f"known to {_px(std)} only" if std < longer else "as good as unknown"
-        yield f'The principal point is {known}. {_TILTED}, or hold it in the middle with fixed=("cx", "cy")'
 
 
 def _twins(survey: Survey) -> Iterator[str]:
@@ -404,17 +398,14 @@ def _twins(survey: Survey) -> Iterator[str]:
             for values in (survey.parameters.tolist(), *calibration.twins)
         )
         yield (
-            f"The parameters are not known, though projections are where corners were seen: {'; '.join(others)} "
-            f"fit{'s' * (len(others) == 1)} as well as {found}. Compare no parameters, or take eucm or kannala_brandt"
+            "The parameters are not known, though projections are where corners were seen. As well as "
+            f"{found} fit {'; '.join(others)}. Compare no parameters, or take eucm or kannala_brandt"
         )
 
 
 def _coverage(survey: Survey) -> Iterator[str]:
-    missing = survey.missing
-    if missing:
-        known = max((zone.uncertainty for zone in missing if zone.rays >= 0.5), default=math.nan)
-        where = f", where projections are uncertain by up to {_px(known)}" if math.isfinite(known) else ""
-        yield f"Few corners or none in {_places(missing)} of the image{where}. Hold the board there, near to the edges"
+    if missing := survey.missing:
+        yield f"Few corners or none in {_places(missing)} of the image. Hold the board there, near to the edges"
 
 
 def _angles(survey: Survey) -> Iterator[str]:
@@ -440,8 +431,7 @@ def _pattern(survey: Survey) -> Iterator[str]:
     bend, more = survey.gains
     share = survey.pattern_share
     least = max(_GAIN, (_CERTAIN * calibration.sigma) ** 2 / max(float(calibration.adjusted.cost[0]), 1e-300))
-    is_bent = bend[2] > least and share < 2 * _PATTERN_SHARE and len(survey.seen) >= _FEW_VIEWS
-    if is_bent:
+    if bend[2] > least and share < 2 * _PATTERN_SHARE and len(survey.seen) >= _FEW_VIEWS:
         points = calibration.observations.points[survey.seen]
         sides = (points.amax(0) - points.amin(0))[:2].tolist()
         x, y = (_percent(abs(value) / side) for value, side in zip(bend[:2], sides, strict=True))
@@ -455,12 +445,9 @@ def _pattern(survey: Survey) -> Iterator[str]:
             f"by {_percent(more[1])}"
         )
     elif share > _PATTERN_SHARE:
-        key, wide = calibration.spread.model.key, survey.reach > math.radians(40)
-        other = (_WIDER if wide else _OTHERS).get(key, _OTHERS.get(key, "kannala_brandt or fisheye624"))
-        tries = " or ".join(filter(None, (other, "" if any(calibration.bend) or is_bent else "bend=True")))
         yield (
             f"The residuals have a pattern over the image, of {_px(share * calibration.rms)}: the model is not that of "
-            f"the lens, or the board is not as described. {f'Try {tries}' if tries else 'See whether it is flat'}"
+            "the lens, or the board is not as described. Try brown_conrady, kannala_brandt or fisheye624, or bend=True"
         )
 
 
@@ -491,8 +478,8 @@ def _needless(survey: Survey) -> Iterator[str]:
     if taken:
         found = [names[i] for i in sorted(taken)]
         yield (
-            f"{_listed(found)} cannot be told from zero: the data do not need {'them' if len(found) > 1 else 'it'}. "
-            f"{_fixed(found)} makes the rest more certain"
+            f"{_listed(found)} cannot be told from zero, and the data do not need that: {_fixed(found)} makes the rest "
+            "more certain"
         )
 
 
@@ -502,34 +489,21 @@ def verdict(calibration: Calibration) -> str:
     survey = Survey(calibration)
     if not calibration.converged:
         return next(_search(survey)) + "."
-    middle, rays = survey.zones[4].uncertainty, float(survey.rays[1].double().mean())
+    middle = survey.zones[4].uncertainty
     # what the model makes of rays that no corner was near is not told by the noise
     fine, fine_share = survey.good_within(FINE, survey.reach + _BEYOND)
     rough, rough_share = survey.good_within(ROUGH)
-    usual = "one standard deviation in the worst direction, far away"
-    if fine_share > 0.99 * rays:
-        whole = "the whole image" if rays > 0.99 else f"all of the image that has rays, {_percent(rays)}"
-        largest = float(survey.uncertainty.nan_to_num(0.0).amax())
-        good = (
-            f"Good for measuring in {whole}, up to {_degrees(fine)} from the optical axis: projections are "
-            f"known to {_px(middle)} in the middle and to {_px(largest)} at worst ({usual})."
-        )
-    elif fine_share > 0:
+    noise = "one standard deviation in the worst direction"
+    if fine_share > 0:
         there = float(survey.uncertainty[survey.angles <= fine].amax())
-        rest = f"Up to {_degrees(rough)}, {_percent(rough_share)}, it is good for looking at, and the rest a guess."
-        if rough_share > 0.99 * rays:
-            rest = "The rest of its rays is good for looking at."
         good = (
             f"Good for measuring up to {_degrees(fine)} from the optical axis, {_percent(fine_share)} of the image: "
-            f"projections are known to {_px(middle)} in the middle and to {_px(there)} at that angle ({usual}). {rest}"
-        )
-    elif rough_share > 0:
-        good = (
-            f"Not for measuring: projections are known to {_px(middle)} in the middle ({usual}). Good for looking at "
-            f"up to {_degrees(rough)} from the optical axis, {_percent(rough_share)} of the image."
+            f"projections are known to {_px(middle)} in the middle and to {_px(there)} at worst ({noise})."
         )
     else:
-        good = f"Of no use yet: projections are uncertain by {_px(middle)} even in the middle ({usual})."
+        good = f"Not for measuring: projections are known to {_px(middle)} in the middle ({noise})."
+    if rough_share > fine_share:
+        good += f" Good for looking at up to {_degrees(rough)}, {_percent(rough_share)} of the image."
     reach = f"Corners were seen up to {_degrees(survey.reach)}; the image goes to {_degrees(survey.image_reach)}."
     return f"{good} {reach} {_next(survey)}"
 

@@ -1,5 +1,5 @@
-/* Poses on which many points agree: a round of samples for each row. The formulas are those of camtorch/calibration/ransac.py,
- * named alike there, and their sources stand there. */
+/* Poses on which many points agree: a round of samples for each row. What the search is, and its sources, stand in
+ * camtorch/calibration/ransac.py. */
 #include <math.h>
 #include <string.h>
 
@@ -118,7 +118,8 @@ static void adjugate(const double *a, double *found) {
     for (int i = 0; i < 3; i++) cross(a + 3 * ((i + 1) % 3), a + 3 * ((i + 2) % 3), found + 3 * i);
 }
 
-/* The two vectors whose product a symmetric matrix of rank two is, or none */
+/* The two vectors whose product a symmetric matrix of rank two is, or none: J. Richter-Gebert, Perspectives on Projective
+   Geometry, 2011, section 11.1 */
 static int split(const double *conic, double *first, double *second) {
     double square[9], product[9];
     int most = 0, place = 0;
@@ -137,6 +138,7 @@ static int split(const double *conic, double *first, double *second) {
     return 1;
 }
 
+/* A real root of a + b x + c x^2 + d x^3, the one furthest from the others where there are three */
 static double root_of(double a, double b, double c, double d) {
     a /= d, b /= d, c /= 3 * d;
     double q = c * c - b / 3, r = c * (c * c - b / 2) + a / 2, excess = r * r - q * q * q, x;
@@ -164,7 +166,14 @@ static void frame(double corners[3][3], double *found) {
         for (int j = 0; j < 3; j++) found[3 * k + j] = axes[j][k];
 }
 
-/* How many poses (3, 4) there are, at most four, in which a triangle's corners are on rays */
+/* How many poses (3, 4) there are, at most four, in which a triangle's corners are on rays.
+
+   The ratios of the corners' distances are where two conics meet: on the two lines that one of their pencil falls into,
+   whose place there is a root of a cubic (M. Persson and K. Nordberg, Lambda Twist, ECCV 2018; Y. Ding et al., Revisiting
+   the P3P Problem, CVPR 2023). In differences of the distances instead of the distances, nothing cancels where the view
+   is narrow: the squared sides (0, 1), (1, 2) and (2, 0) of a triangle with corners s_i along rays r_i are, with
+   e = |r_i - r_j|^2, (s_i - s_j)^2 + e s_i s_j, which are quadratic forms of p = s_0 - s_2, q = s_1 - s_2 and w = s_2:
+   `constant` of the first term, `one` of the second what there is of p w and q w, beside w^2. */
 static int poses_of_three(double points[3][3], double rays[3][3], double poses[4][12]) {
     static const double one[3][9] = {
         {0, 0, .5, 0, 0, .5, .5, .5, 0}, {0, 0, 0, 0, 0, .5, 0, .5, 0}, {0, 0, .5, 0, 0, 0, .5, 0, 0}};

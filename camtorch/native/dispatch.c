@@ -1,6 +1,7 @@
 /* The entry points: each is that of the best variant that this CPU can run. */
 #include "consensus.h"
 #include "geometry.h"
+#include "poses.h"
 #include "sampler.h"
 
 #include <string.h>
@@ -12,7 +13,9 @@
     int64_t moves_##variant(const Move *);                                                                             \
     int64_t lattices_##variant(const Lattices *);                                                                      \
     void domain_##variant(const Domain *);                                                                             \
-    void consensus_##variant(const Agreement *);
+    void consensus_##variant(const Agreement *);                                                                       \
+    void poses_##variant(const Poses *);                                                                               \
+    void views_##variant(const Views *);
 DECLARED(baseline)
 #ifdef HAS_AVX2
 DECLARED(avx2)
@@ -75,6 +78,10 @@ EXPORTED int64_t camtorch_lattices(const Lattices *given) { CALLED(lattices, giv
 EXPORTED void camtorch_domain(const Domain *domain) { CALLED(domain, domain) }
 
 EXPORTED void camtorch_consensus(const Agreement *given) { CALLED(consensus, given) }
+
+EXPORTED void camtorch_poses(const Poses *given) { CALLED(poses, given) }
+
+EXPORTED void camtorch_views(const Views *given) { CALLED(views, given) }
 
 /* -- one sample */
 

@@ -150,8 +150,8 @@ def test_corners_of_another_tool_need_no_image(capsys):
     calibrate(*words, "-o", "camera.yml")
     captured = capsys.readouterr()
     assert "in 8 of 8 images of 640x480" in captured.out
-    words = "show another view again, as a copy of a file does: they count once"
-    assert f"Views copy2.png, copy5.png {words}" in " ".join(captured.err.split())
+    words = "as a copy of a file does: they count once"
+    assert f"shown again by views copy2.png, copy5.png, {words}" in " ".join(captured.err.split())
     assert_near(found_camera(), fisheye(), 0.5)
 
 

@@ -1,0 +1,175 @@
+"""Poses by compiled code: rows to pointers, and rows to threads. The formulas are in `rays.py` and `pnp.py` as well."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+from ctypes import addressof, c_int64
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from camtorch._threads import spread, thread_count
+from camtorch.native.library import library
+from camtorch.projection.compiled import Native
+
+_FROM_RAYS, _REFINED, _SOLVED, _AGREED = range(4)
+_LOSSES = (None, "huber", "cauchy")
+_SHARED = 1 << 9  # points of poses that a thread is woken for
+_Poses = struct.Struct("11q5d10q").pack  # `Poses` of native/poses.h
+_Views = struct.Struct("16q").pack  # `Views`
+
+
+class Search(NamedTuple):
+    """How a pose is looked for: at most so many steps of Levenberg and Marquardt, until so little is left to gain."""
+
+    steps: int
+    settled: float
+    nothing: float
+    damping: float
+    loss: str | None = None
+    loss_scale: float = 1.0
+
+
+_NONE = Search(0, 0.0, 0.0, 0.0)
+
+
+class Solved(NamedTuple):
+    """Poses (B,); see `pnp.Pose`. Rms is infinite where they are not valid."""
+
+    vectors: Tensor
+    translations: Tensor
+    rms: Tensor
+    valid: Tensor
+    inliers: Tensor
+    covariance: Tensor
+
+
+def can_search(*tensors: Tensor) -> bool:
+    """Whether compiled code takes them."""
+    return library() is not None and all(t.is_cpu for t in tensors)
+
+
+def from_rays(points: Tensor, rays: Tensor, weights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Rotations (B, 2, 3, 3), translations (B, 2, 3) and valid (B, 2), of what `poses_from_rays` takes.
+
+    points: (P, N, 3), the same for each P rows.
+    """
+    count = len(rays)
+    rotations, translations = rays.new_empty(count, 2, 3, 3), rays.new_empty(count, 2, 3)
+    valid = torch.empty(count, 2, dtype=torch.bool, device="cpu")
+    _run(None, points, rays, None, weights, _FROM_RAYS, _NONE, 0.0, (rotations, translations, valid))
+    return rotations, translations, valid
+
+
+def refined(
+    native: Native, points: Tensor, pixels: Tensor, weights: Tensor, start: tuple[Tensor, Tensor], search: Search
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Rotations (B, 3, 3), translations (B, 3) and costs (B,) of the minima that poses lead to.
+
+    points: (P, N, 3). pixels: (B, N, 2). weights: (B, N) of the squares.
+    """
+    while True:
+        results = *(t.clone(memory_format=torch.contiguous_format) for t in start), None, pixels.new_empty(len(pixels))
+        results = results[0], results[1], torch.empty(len(pixels), dtype=torch.bool, device="cpu"), results[3]
+        if not _run(native, points, None, pixels, weights, _REFINED, search, 0.0, results):
+            return results[0], results[1], results[3]
+        native.follow()
+
+
+def solved(
+    native: Native,
+    points: Tensor,
+    pixels: Tensor,
+    weights: Tensor | None,
+    search: Search,
+    start: tuple[Tensor, Tensor] | None = None,
+    threshold: float = 0.0,
+) -> Solved:
+    """The poses of what `solve_pnp` takes, (P, N, 3), (B, N, 2) and (B, N).
+
+    start: poses about the middle of the points that are seen, on which most agree; of all that is seen without.
+    """
+    batch, count, _ = pixels.shape
+    native.add_tables(count)
+    while True:
+        rotations, translations = pixels.new_empty(batch, 3, 3), pixels.new_empty(batch, 3)
+        if start is not None:
+            rotations, translations = start[0].clone(), start[1].clone()
+        vectors, rms, covariance = (pixels.new_empty(batch, *size) for size in ((3,), (), (6, 6)))
+        valid, inliers = (torch.empty(size, dtype=torch.bool, device="cpu") for size in (batch, (batch, count)))
+        results = rotations, translations, valid, None, vectors, rms, inliers, covariance
+        task = _SOLVED if start is None else _AGREED
+        if not _run(native, points, None, pixels, weights, task, search, threshold, results):
+            return Solved(vectors, translations, rms, valid, inliers, covariance)
+        native.follow()
+
+
+def triangles(
+    native: Native,
+    points: Tensor,
+    poses: tuple[Tensor, Tensor],
+    residuals: Tensor,
+    weights: Tensor,
+    learnt: Sequence[int],
+) -> tuple[Tensor, Tensor]:
+    """Of cameras (B,), or of one, that see points (B, V, N, 3): `Equations.view` and `Equations.shared`.
+
+    poses: (B, V, 3, 3), (B, V, 3). residuals: (B, V, N, 2). weights: (B, V, N) of their squares. learnt: numbers of
+    intrinsics, and of coefficients from 4 on, which columns are by.
+    """
+    compiled, plan = library(), native.plan
+    assert compiled is not None  # or nobody has a `Native`
+    if plan.places is not None and not plan.is_all:  # the place of each coefficient among the parameters
+        at = {4 + place: 4 + i for i, place in enumerate(plan.places.tolist())}
+        learnt = [at.get(number, number) for number in learnt]
+    points = points if points.stride()[2:] == (3, 1) else points.contiguous()
+    batch, views, count, _ = points.shape
+    size = len(learnt) + 1
+    given = [t.contiguous() for t in (*poses, residuals, weights)]
+    view, shared = points.new_empty(batch, views, 6, 6 + size), points.new_empty(batch, size, size)
+    numbers, left = (c_int64 * size)(*learnt), c_int64(0)
+    call = _Views(
+        *(native.pointer, points.data_ptr(), *points.stride()[:2], *(t.data_ptr() for t in given)),
+        *(batch, views, count, addressof(numbers), len(learnt), view.data_ptr(), shared.data_ptr(), addressof(left)),
+    )
+    compiled.camtorch_views(call)
+    if left.value:
+        raise MemoryError(f"no memory for {views} views of {count} points")
+    return view, shared
+
+
+def _run(
+    native: Native | None,
+    points: Tensor,
+    rays: Tensor | None,
+    pixels: Tensor | None,
+    weights: Tensor | None,
+    task: int,
+    search: Search,
+    threshold: float,
+    results: tuple[Tensor | None, ...],
+) -> int:
+    """How many points wait for what is known of a lens."""
+    compiled = library()
+    assert compiled is not None  # see `can_search`
+    given = [None if t is None else t.contiguous() for t in (points, rays, pixels, weights)]
+    rows = next(t for t in (rays, pixels) if t is not None)
+    batch, count = rows.shape[:2]
+    counters = (c_int64 * 2)()
+    call = _Poses(
+        0 if native is None else native.pointer,
+        *(0 if t is None else t.data_ptr() for t in given),
+        *(len(points), batch, count, task, _LOSSES.index(search.loss), search.steps),
+        *(search.loss_scale, search.settled, search.nothing, search.damping, threshold),
+        *(0 if t is None else t.data_ptr() for t in results),
+        *[0] * (8 - len(results)),
+        addressof(counters),
+        addressof(counters) + 8,
+    )
+    threads = min(thread_count(), batch, 1 + batch * count // _SHARED) if batch > 1 else 1
+    spread(lambda: compiled.camtorch_poses(call), threads)
+    if counters[1] < 0:
+        raise MemoryError(f"no memory for poses of {count} points")
+    return counters[1]

@@ -1,0 +1,75 @@
+/* What Python hands to the search for poses. calibration/compiled.py has the same fields. */
+#ifndef CAMTORCH_POSES_H
+#define CAMTORCH_POSES_H
+
+#include "geometry.h"
+
+/* One of several cameras, in double precision; or the one for all */
+static inline Cameras only(const Cameras *all, int64_t at) {
+    Cameras one = *all;
+    if (all->cameras == 1) return one;
+    const Part *last = all->parts + all->part_count - 1;
+    one.cameras = 1;
+#define MOVED(field, size) if (one.field) one.field = (const void *)((const double *)one.field + at * (size))
+    MOVED(intrinsics, 4);
+    MOVED(parameters, all->parameter_count);
+    MOVED(constants, all->constant_count);
+    MOVED(inner2, 1);
+    MOVED(usual2, 1);
+    MOVED(limits2, AZIMUTHS);
+    MOVED(extent, EXTENT);
+    MOVED(table, 2 + 2 * NODES);
+    MOVED(circle2, 1);
+    MOVED(certain2, 1);
+    MOVED(start, START);
+    MOVED(chart_inner2, 1);
+    MOVED(chart_most2, 1);
+    MOVED(chart_table, 2 + 2 * NODES);
+#undef MOVED
+    if (one.usable) one.usable += at;
+    if (one.stagewise) one.stagewise += at;
+    if (one.certain) one.certain += at * last->n * last->m;
+    return one;
+}
+
+/* From the rays alone, two poses a row; nearest to the pixels, from a pose; that, with all that comes before and after it:
+   from nothing; from a pose, by the points near it */
+enum { FROM_RAYS, REFINED, SOLVED, AGREED };
+enum { LEAST_SQUARES, HUBER, CAUCHY };
+
+/* Rows (b) of n points; what a task has no use for is NULL */
+typedef struct {
+    const Cameras *cameras; /* (b), or one for all; in double precision */
+    const double *points;   /* (point_rows, n, 3), over and over again */
+    const double *rays, *pixels, *weights; /* (b, n, 3), (b, n, 2), (b, n): weights of squares, 0 for unseen */
+    int64_t point_rows, row_count, count;
+    int64_t task, loss, steps;
+    double loss_scale, settled, nothing, damping;
+    double threshold;                 /* px, of AGREED */
+    double *rotations, *translations; /* (b, 9) and (b, 3); of FROM_RAYS (b, 2, 9) and (b, 2, 3) */
+    uint8_t *valid;                   /* (b), or (b, 2): whether it is a pose, or a minimum */
+    double *costs;                    /* (b) */
+    /* of SOLVED and AGREED: rotation vectors (b, 3), root mean squares (b), which points the pose
+       is of (b, n), and the covariance (b, 6, 6) of turn and shift */
+    double *vectors, *rms;
+    uint8_t *inliers;
+    double *covariance;
+    int64_t *next, *left; /* the row that whoever is free takes; how many points wait for what is known of lenses */
+} Poses;
+
+/* The linearised problem of cameras (b) that see v views of n points each, whose columns are by turn and shift of the view,
+   by numbers that learn, and the residuals; see least_squares/equations.py */
+typedef struct {
+    const Cameras *cameras; /* (b), or one for all; in double precision */
+    const double *points;   /* (b, v, n, 3), strides by problem and view */
+    int64_t point_strides[2];
+    const double *rotations, *translations; /* (b, v, 9), (b, v, 3) */
+    const double *residuals, *weights; /* (b, v, n, 2), (b, v, n): of the squares */
+    int64_t problems, views, count;
+    const int64_t *learnt; /* (columns): of intrinsics and parameters */
+    int64_t columns;
+    double *view, *shared; /* triangles (b, v, 6, 6 + columns + 1), (b, columns + 1, columns + 1) */
+    int64_t *left;         /* -1: no memory */
+} Views;
+
+#endif
