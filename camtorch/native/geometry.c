@@ -31,7 +31,7 @@
 enum { LANES = 16 };      /* that a block is filled up to a multiple of */
 enum { MOST_STEPS = 5 };  /* of Newton's method; what then still moves is left to brackets and searches */
 enum { START_ROUNDS = 6, DAMPED_STEPS = 60 }; /* of a search */
-enum { SQUARE = 64 };     /* pixels of a cell of a lattice */
+enum { SQUARE = 64, PROBES = 5 }; /* pixels of a cell of a lattice; of these, where one in doubt is looked at */
 enum { PADDED = 8 };      /* numbers of a factor that loops are made for */
 #define PI 3.14159265358979323846
 

@@ -113,31 +113,73 @@ static int T(squares)(const Lattices *given, const T(Between) *b, int32_t *cells
         for (int64_t y = i > 0 ? i - 1 : 0; y <= i + 1 && y < rows; y++)
             for (int64_t x = j > 0 ? j - 1 : 0; x <= j + 1 && x < columns; x++) {
                 int32_t *at = cells + y * columns + x;
-                if (*at == CELL_EMPTY || *at == CELL_CUBIC) *at = CELL_NEXT;
+                if (*at == CELL_EMPTY || *at == CELL_CUBIC || *at == CELL_QUINTIC) *at = CELL_NEXT;
             }
     }
     return left;
 }
 
-/* The cubics through nodes, at parts 0, 1/2 and 1 of the way from the second to the third, and so on below */
-static float T(between_nodes)(const float *nodes, int64_t width, int across, int down) {
-    static const float weights[3][4] = {{0, 1, 0, 0}, {-1 / 16.0f, 9 / 16.0f, 9 / 16.0f, -1 / 16.0f}, {0, 0, 1, 0}};
-    float sum = 0;
-    for (int y = 0; y < 4; y++) {
-        const float *row = nodes + y * width, *w = weights[across];
-        sum += weights[down][y] * (w[0] * row[0] + w[1] * row[1] + w[2] * row[2] + w[3] * row[3]);
-    }
-    return sum;
+/* In the middle of four nodes, or of six, from the first one on */
+INLINE float T(middle)(const float *p, int64_t step, int count) {
+    if (count == 4) return (9 * (p[step] + p[2 * step]) - (p[0] + p[3 * step])) / 16;
+    return (150 * (p[2 * step] + p[3 * step]) - 25 * (p[step] + p[4 * step]) + 3 * (p[0] + p[5 * step])) / 256;
 }
 
-/* What becomes of cells in doubt: cubics miss most in the middle of a cell and of its sides. Where half the tolerance is
- * kept there, or an image that ends in zeros is far off, they do; the other cells are to be computed */
-static int T(settle)(const Lattices *given, const T(Between) *b, const Classification *asked) {
-    enum { PROBES = 5 };
-    static const int across[PROBES] = {1, 0, 2, 1, 1}, down[PROBES] = {0, 1, 1, 2, 1};
-    const int64_t columns = asked->columns, cells = asked->rows * columns, width = columns + 5;
+/* What `count` x `count` nodes say of a cell's middle, the middles of its sides before that; node: its first corner */
+INLINE void T(middles)(const float *node, int64_t width, const int count, float *at) {
+    const int64_t before = count / 2 - 1;
+    float line[6];
+    for (int k = 0; k < count; k++) line[k] = T(middle)(node + (k - before) * width - before, 1, count);
+    at[0] = line[before], at[3] = line[before + 1], at[4] = T(middle)(line, 1, count);
+    at[1] = T(middle)(node - before * width, width, count), at[2] = T(middle)(node - before * width + 1, width, count);
+}
+
+/* By how much, squared, what `count` x `count` nodes say misses what was found; at most of each coordinate, and of both */
+static float T(most_missed)(const Classification *asked, int64_t first, const int count, const R *u, const R *v,
+                            float *of_each) {
     const float half[2] = {(float)asked->source_width / 2, (float)asked->source_height / 2};
-    const float limit = (float)(asked->tolerance * asked->tolerance) / 4, pixels = 4; /* of which the image needs two */
+    const int64_t width = asked->columns + 5;
+    float missed[PROBES] = {0}, said[PROBES], most = 0;
+    for (int c = 0; c < 2; c++) {
+        const R *found = c ? v : u;
+        T(middles)(asked->nodes + c * asked->node_strides[1] + first + 2 * width + 2, width, count, said);
+        of_each[c] = 0;
+        for (int at = 0; at < PROBES; at++) {
+            const float miss = ((float)found[at] - said[at]) * half[c];
+            of_each[c] = miss * miss > of_each[c] ? miss * miss : of_each[c];
+            missed[at] += miss * miss;
+        }
+    }
+    for (int at = 0; at < PROBES; at++) most = missed[at] <= most ? most : missed[at]; /* or what is not a number */
+    return most;
+}
+
+/* Whether a cell lies far off the image; missed: by how much cubics miss each coordinate, squared */
+static int T(is_off)(const Classification *asked, int64_t first, const R *u, const R *v, const float *missed) {
+    const float half[2] = {(float)asked->source_width / 2, (float)asked->source_height / 2}, pixels = 4; /* two would do */
+    int is_off = 0;
+    for (int c = 0; c < 2; c++) {
+        const R *found = c ? v : u;
+        float low = asked->nodes[c * asked->node_strides[1] + first + 2 * (asked->columns + 5) + 2], high = low;
+        for (int at = 0; at < PROBES; at++) {
+            const float exact = (float)found[at];
+            low = exact < low ? exact : low, high = exact > high ? exact : high;
+        }
+        /* what lies between the places looked at */
+        const float reach = (high - low) / 2 + pixels / half[c];
+        is_off |= (missed[c] < 1) & ((high + reach < -1) | (low - reach > 1));
+    }
+    return is_off;
+}
+
+/* What becomes of cells in doubt: polynomials miss most in the middle of a cell and of its sides. Where half the tolerance
+ * is kept there, or an image that ends in zeros is far off, cubics do; or quintics, through six nodes; the other cells are
+ * to be computed */
+static int T(settle)(const Lattices *given, const T(Between) *b, const Classification *asked) {
+    static const int across[PROBES] = {1, 0, 2, 1, 1}, down[PROBES] = {0, 1, 1, 2, 1};
+    static const uint8_t all[6] = {1, 1, 1, 1, 1, 1};
+    const int64_t columns = asked->columns, cells = asked->rows * columns, width = columns + 5;
+    const float limit = (float)(asked->tolerance * asked->tolerance) / 4;
     int64_t places[BLOCK / PROBES], i = 0;
     ALIGNED R u[BLOCK], v[BLOCK];
     ALIGNED I ok[BLOCK];
@@ -154,32 +196,57 @@ static int T(settle)(const Lattices *given, const T(Between) *b, const Classific
         }
         if (count) left |= T(moved)(&given->move, b, points, n, u, v, ok);
         for (int k = 0; k < count; k++) {
-            const R *found[2] = {u + k * PROBES, v + k * PROBES};
-            float missed[PROBES] = {0}, most = 0;
-            int known = 1, is_off = 0;
-            for (int c = 0; c < 2; c++) {
-                const float *nodes = asked->nodes + c * asked->node_strides[1];
-                nodes += (places[k] / columns + 1) * width + places[k] % columns + 1;
-                float low = nodes[width + 1], high = low, furthest = 0;
-                for (int at = 0; at < PROBES; at++) {
-                    const float exact = (float)found[c][at];
-                    const float miss = (exact - T(between_nodes)(nodes, width, across[at], down[at])) * half[c];
-                    low = exact < low ? exact : low, high = exact > high ? exact : high;
-                    furthest = miss * miss > furthest ? miss * miss : furthest;
-                    missed[at] += miss * miss;
-                }
-                /* what lies between the places looked at */
-                const float reach = (high - low) / 2 + pixels / half[c];
-                is_off |= (furthest < 1) & ((high + reach < -1) | (low - reach > 1));
+            const R *found_u = u + k * PROBES, *found_v = v + k * PROBES;
+            const int64_t first = places[k] / columns * width + places[k] % columns; /* of its 6 x 6 nodes */
+            float missed[2];
+            int known = 1, cell = 0;
+            for (int at = 0; at < PROBES; at++) known &= ok[k * PROBES + at] != 0;
+            if (known && (T(most_missed)(asked, first, 4, found_u, found_v, missed) <= limit ||
+                          (asked->padding == ZEROS && T(is_off)(asked, first, found_u, found_v, missed)))) {
+                cell = CELL_CUBIC;
+            } else if (known) {
+                for (int y = 0; y < 6; y++) known &= !memcmp(asked->mapped + first + y * width, all, sizeof all);
+                /* a quarter of that, and of what cubics miss: where the curvature steps, quintics gain nothing, and swing */
+                if (known && T(most_missed)(asked, first, 6, found_u, found_v, missed) <= limit / 16) cell = CELL_QUINTIC;
             }
-            for (int at = 0; at < PROBES; at++) {
-                known &= ok[k * PROBES + at] != 0;
-                most = missed[at] <= most ? most : missed[at];
-            }
-            asked->cells[places[k]] = known & ((most <= limit) | (is_off & (asked->padding == ZEROS))) ? CELL_CUBIC : 0;
+            asked->cells[places[k]] = cell;
         }
     }
     return left;
+}
+
+/* All pixels of the cells that quintics are laid in, each from its 6 x 6 nodes */
+static void T(lay_quintics)(const Lattices *given, const Classification *asked) {
+    const int64_t columns = asked->columns, cells = asked->rows * columns, width = columns + 5;
+    R *exact[2] = {(R *)given->exact, (R *)given->exact + given->move.cameras * cells * SQUARE};
+    float weights[6][STEP];
+    for (int j = 0; j < 6; j++)
+        for (int k = 0; k < STEP; k++) {
+            weights[j][k] = 1;
+            for (int m = 0; m < 6; m++)
+                if (m != j) weights[j][k] *= ((float)k / STEP + 2 - m) / (j - m);
+        }
+    for (int64_t i = 0; i < cells; i++) {
+        if (asked->cells[i] != CELL_QUINTIC) continue;
+        const int64_t number = added(given->used, 1);
+        asked->cells[i] = (int32_t)number;
+        for (int c = 0; c < 2; c++) {
+            const float *nodes = asked->nodes + c * asked->node_strides[1] + i / columns * width + i % columns;
+            /* down the six columns of nodes, then across */
+            for (int y = 0; y < STEP; y++) {
+                float line[6], made[STEP];
+                for (int j = 0; j < 6; j++) {
+                    float sum = 0;
+                    for (int m = 0; m < 6; m++) sum += weights[m][y] * nodes[m * width + j];
+                    line[j] = sum;
+                }
+                for (int k = 0; k < STEP; k++) made[k] = weights[0][k] * line[0];
+                for (int j = 1; j < 6; j++)
+                    for (int k = 0; k < STEP; k++) made[k] += weights[j][k] * line[j];
+                for (int k = 0; k < STEP; k++) exact[c][number * SQUARE + y * STEP + k] = (R)made[k];
+            }
+        }
+    }
 }
 
 static int T(lattice)(const Lattices *given, int64_t camera, T(Between) *b) {
@@ -219,6 +286,7 @@ static int T(lattice)(const Lattices *given, int64_t camera, T(Between) *b) {
             }
         } while (found && turn);
     }
+    T(lay_quintics)(given, &asked);
     return left;
 }
 

@@ -8,6 +8,7 @@
 
 #include <math.h>
 #include <stddef.h>
+#include <stdlib.h>
 #include <string.h>
 
 #if defined(__AVX2__)
@@ -31,7 +32,7 @@
 #define NOT_INLINE static
 #endif
 
-enum { CHUNK = 256 };         /* cells whose lines of nodes are made at a time */
+enum { CHUNK = 256 };          /* pixels of a row whose positions are made at a time */
 enum { MOST_INTERLEAVED = 4 }; /* channels */
 enum { ROWS_AHEAD = 8 };       /* of the source */
 
@@ -867,23 +868,24 @@ INLINE void eight(const Span *span, V8 u, V8 v, int type, int mode, int layout) 
         bilinear_scattered(span, squares_of(job, u, v, 1), type);
         return;
     }
-    if (job->padding == ZEROS) {
-        const float reach = mode == BICUBIC ? 2 : 1;
-        const V8 low = every8(-reach);
-        const V8 right = every8((float)(job->source_width - 1) + reach), below = every8((float)(job->source_height - 1) + reach);
-        if (all8(~((u > low) & (u < right) & (v > low) & (v < below)))) {
-            show_nothing(span, type);
-            return;
-        }
-        if (mode == BILINEAR && layout != SCATTERED && job->source_width > 2 && job->source_height > 1) {
-            /* those on the image at once, with the corner in the place of the others */
-            const I8 in = (u >= every8(0)) & (u <= every8((float)(job->source_width - 2))) & (v >= every8(0)) &
-                          (v <= every8((float)(job->source_height - 1)));
-            if ((done = lanes8(in))) {
-                const V8 on_u = (V8)((I8)u & in), on_v = (V8)((I8)v & in);
-                if (layout == PLANES) bilinear_planes(span, squares_of(job, on_u, on_v, 1), type);
-                else bilinear_interleaved(span, squares_of(job, on_u, on_v, 2), type);
-            }
+    /* beyond `reach` of zeros nothing is shown, nor what has no position */
+    const float reach = job->padding != ZEROS ? INFINITY : mode == BICUBIC ? 2 : 1;
+    const V8 low = every8(-reach);
+    const V8 right = every8((float)(job->source_width - 1) + reach);
+    const V8 below = every8((float)(job->source_height - 1) + reach);
+    if (all8(~((u >= low) & (u <= right) & (v >= low) & (v <= below)))) {
+        show_nothing(span, type);
+        return;
+    }
+    const int several = job->source_width > 2 && job->source_height > 1;
+    if (job->padding == ZEROS && mode == BILINEAR && layout != SCATTERED && several) {
+        /* those on the image at once, with the corner in the place of the others */
+        const I8 in = (u >= every8(0)) & (u <= every8((float)(job->source_width - 2))) & (v >= every8(0)) &
+                      (v <= every8((float)(job->source_height - 1)));
+        if ((done = lanes8(in))) {
+            const V8 on_u = (V8)((I8)u & in), on_v = (V8)((I8)v & in);
+            if (layout == PLANES) bilinear_planes(span, squares_of(job, on_u, on_v, 1), type);
+            else bilinear_interleaved(span, squares_of(job, on_u, on_v, 2), type);
         }
     }
     memcpy(at.u, &u, sizeof at.u);
@@ -925,8 +927,13 @@ INLINE void eight(const Span *span, V8 u, V8 v, int type, int mode, int layout) 
 #define EIGHT(f) {f(0), f(1), f(2), f(3), f(4), f(5), f(6), f(7)}
 static const float WEIGHTS[4][STEP] = {EIGHT(ROW0), EIGHT(ROW1), EIGHT(ROW2), EIGHT(ROW3)};
 
+/* Of pixels of a row, in pixels of the source; NaN where there is none */
+typedef struct {
+    float u[CHUNK], v[CHUNK];
+} Chunk;
+
 /* The cubics through columns of nodes, at part k / 8 between two rows of them, in pixels of the source */
-INLINE void lay_lines(const float *nodes, int64_t stride, int64_t n, int part, float side, float *line) {
+INLINE void lay_line(const float *nodes, int64_t stride, int64_t n, int part, float side, float *line) {
     const float w0 = WEIGHTS[0][part], w1 = WEIGHTS[1][part], w2 = WEIGHTS[2][part], w3 = WEIGHTS[3][part];
     const float half = side / 2, middle = (side - 1) / 2;
     const float *a = nodes, *b = a + stride, *c = b + stride, *d = c + stride;
@@ -934,437 +941,347 @@ INLINE void lay_lines(const float *nodes, int64_t stride, int64_t n, int part, f
     for (j = 0; j < n; j++) line[j] = (a[j] * w0 + b[j] * w1 + c[j] * w2 + d[j] * w3) * half + middle;
 }
 
-INLINE V8 between(const float *line) {
+/* Eight pixels between neighbouring nodes */
+INLINE void lay_cubic(const float *line, float *to) {
 #if VECTORS
-    return load8(WEIGHTS[0]) * line[0] + load8(WEIGHTS[1]) * line[1] + load8(WEIGHTS[2]) * line[2] +
-           load8(WEIGHTS[3]) * line[3];
+    const V8 made = load8(WEIGHTS[0]) * line[0] + load8(WEIGHTS[1]) * line[1] + load8(WEIGHTS[2]) * line[2] +
+                    load8(WEIGHTS[3]) * line[3];
+    memcpy(to, &made, sizeof made);
 #else
-    V8 value;
-    int i;
-    for (i = 0; i < STEP; i++)
-        value.lane[i] = WEIGHTS[0][i] * line[0] + WEIGHTS[1][i] * line[1] + WEIGHTS[2][i] * line[2] + WEIGHTS[3][i] * line[3];
-    return value;
+    int k;
+    for (k = 0; k < STEP; k++)
+        to[k] = WEIGHTS[0][k] * line[0] + WEIGHTS[1][k] * line[1] + WEIGHTS[2][k] * line[2] + WEIGHTS[3][k] * line[3];
 #endif
+}
+
+#if WIDE
+/* Sixteen */
+INLINE void lay_cubics(const float *line, float *to) {
+    const __m512 nodes = _mm512_castps256_ps512(_mm256_loadu_ps(line));
+    const __m512i first = _mm512_setr_epi32(0, 0, 0, 0, 0, 0, 0, 0, 1, 1, 1, 1, 1, 1, 1, 1);
+    __m512 sum = _mm512_setzero_ps();
+    int k;
+    for (k = 0; k < 4; k++)
+        sum = _mm512_fmadd_ps(_mm512_broadcast_f32x8(_mm256_loadu_ps(WEIGHTS[k])),
+                              _mm512_permutexvar_ps(_mm512_add_epi32(first, _mm512_set1_epi32(k)), nodes), sum);
+    _mm512_storeu_ps(to, sum);
+}
+#endif
+
+/* From a lattice, of whole cells */
+static void lattice_positions(const Job *job, int64_t b, int64_t y, int64_t x, int64_t n, Chunk *at) {
+    const int64_t i = y / STEP, first = x / STEP, width = job->columns + 5, count = (n + STEP - 1) / STEP;
+    const int part = (int)(y % STEP);
+    const float *nodes = job->nodes + b * job->node_strides[0] + (i + 1) * width + first + 1;
+    const int32_t *cells = job->cells + b * job->cell_stride + i * job->columns + first;
+    float across[CHUNK / STEP + 8], down[CHUNK / STEP + 8]; /* of which registers read some beyond */
+    int64_t j;
+    int k;
+    lay_line(nodes, width, count + 3, part, (float)job->source_width, across);
+    lay_line(nodes + job->node_strides[1], width, count + 3, part, (float)job->source_height, down);
+    for (j = 0; j < count; j++) {
+        float *u = at->u + j * STEP, *v = at->v + j * STEP;
+#if WIDE
+        if (j + 1 < count && cells[j] == CELL_CUBIC && cells[j + 1] == CELL_CUBIC) {
+            lay_cubics(across + j, u), lay_cubics(down + j, v);
+            j++;
+            continue;
+        }
+#endif
+        if (cells[j] == CELL_CUBIC) {
+            lay_cubic(across + j, u), lay_cubic(down + j, v);
+        } else if (cells[j] == CELL_EMPTY) {
+            for (k = 0; k < STEP; k++) u[k] = v[k] = NAN;
+        } else {
+            const float *exact = job->exact + ((int64_t)cells[j] * STEP + part) * STEP;
+            for (k = 0; k < STEP; k++) {
+                u[k] = ((exact[k] + 1) * (float)job->source_width - 1) / 2;
+                v[k] = ((exact[k + job->exact_stride] + 1) * (float)job->source_height - 1) / 2;
+            }
+        }
+    }
+}
+
+/* From a grid; those behind the last pixel of a row are that of the last one */
+static void grid_positions(const Job *job, int64_t b, int64_t y, int64_t x, int64_t n, Chunk *at) {
+    const int64_t across = job->grid_strides[2], to_v = job->grid_strides[3], filled = (n + STEP - 1) / STEP * STEP;
+    const int64_t start = b * job->grid_strides[0] + y * job->grid_strides[1] + x * across;
+    const float half_u = (float)job->source_width / 2, half_v = (float)job->source_height / 2;
+    const float *grid = (const float *)job->grid + start;
+    const double *wide = (const double *)job->grid + start;
+    int64_t k;
+    if (job->grid_is_double)
+        for (k = 0; k < n; k++) at->u[k] = (float)wide[k * across], at->v[k] = (float)wide[k * across + to_v];
+    else if (across == 1)
+        for (k = 0; k < n; k++) at->u[k] = grid[k], at->v[k] = grid[k + to_v];
+    else if (across == 2 && to_v == 1)
+        for (k = 0; k < n; k++) at->u[k] = grid[2 * k], at->v[k] = grid[2 * k + 1];
+    else
+        for (k = 0; k < n; k++) at->u[k] = grid[k * across], at->v[k] = grid[k * across + to_v];
+    for (k = n; k < filled; k++) at->u[k] = at->u[n - 1], at->v[k] = at->v[n - 1];
+    /* as torch's grid_sample does: on noise every rounding shows */
+    for (k = 0; k < filled; k++) {
+        at->u[k] = (at->u[k] + 1) * half_u - 0.5f;
+        at->v[k] = (at->v[k] + 1) * half_v - 0.5f;
+    }
+    if (job->mapped) {
+        const uint8_t *mapped = job->mapped + b * job->mapped_stride + y * job->width + x;
+        for (k = 0; k < n; k++)
+            if (!mapped[k]) at->u[k] = NAN;
+    }
+}
+
+NOT_INLINE void positions(const Job *job, int64_t b, int64_t y, int64_t x, int64_t n, Chunk *at) {
+    if (job->nodes) lattice_positions(job, b, y, x, n, at);
+    else grid_positions(job, b, y, x, n, at);
 }
 
 /* -- sixteen pixels at a time, whose neighbours are picked out of whole registers */
 
 #if WIDE
 
+/* Where images lie, of the kinds that are known here, strides in elements */
 typedef struct {
-    __m512 u, v;
+    const char *source;
+    int64_t channels, from_plane, below, to_plane, width, height;
 } Wide;
 
-/* Squares that begin within a few rows and columns */
+/* Squares that begin within four rows, and lie within a part of these that registers hold */
 typedef struct {
-    __m512i x, y; /* columns and rows from the first one on */
-    int64_t column, row;
-    int rows;           /* that they take, two at least */
-    __mmask16 from[5];  /* which begin in a row or below it */
+    __m512i x, y;  /* elements from the begin of that part, rows from the first one on */
+    int64_t begin; /* of the part, from the image's first element on */
 } WideWindow;
 
-INLINE int32_t first_of(__m512i x) { return _mm_cvtsi128_si32(_mm512_castsi512_si128(x)); }
-INLINE int32_t last_of(__m512i x) { return _mm_extract_epi32(_mm512_extracti32x4_epi32(x, 3), 3); }
+INLINE int32_t whole(float x) { return _mm_cvttss_si32(_mm_set_ss(x)); }
 
-INLINE int window_of_sixteen(__m512i x, __m512i y, int32_t columns, int32_t rows, WideWindow *window) {
-    const int32_t x0 = first_of(x), x15 = last_of(x), y0 = first_of(y), y15 = last_of(y);
-    int k;
-    window->column = x0 < x15 ? x0 : x15;
-    window->row = y0 < y15 ? y0 : y15;
-    window->x = _mm512_sub_epi32(x, _mm512_set1_epi32((int32_t)window->column));
-    window->y = _mm512_sub_epi32(y, _mm512_set1_epi32((int32_t)window->row));
-    window->rows = 2;
-    for (k = 1; k < 5; k++) {
-        window->from[k] = _mm512_cmpge_epi32_mask(window->y, _mm512_set1_epi32(k));
-        window->rows += window->from[k] != 0;
-    }
+/* Whether squares of positions at (x, y), of pixels of so many elements, are all `good` and lie in so many rows and
+ * elements of each */
+INLINE int in_window(const Wide *image, const float *u, const float *v, __m512i x, __m512i y, __mmask16 good,
+                     const int pixel, const int rows, const int part, WideWindow *window) {
+    const int64_t x0 = whole(u[0]), x15 = whole(u[15]), y0 = whole(v[0]), y15 = whole(v[15]);
+    const int64_t column = pixel * (x0 < x15 ? x0 : x15), row = y0 < y15 ? y0 : y15;
+    const int64_t last_begin = pixel * image->width - part, last_row = image->height - rows;
+    const int64_t begin = column < last_begin ? column : last_begin, first = row < last_row ? row : last_row;
+    if (pixel == 3) x = _mm512_add_epi32(x, _mm512_slli_epi32(x, 1));
+    window->x = _mm512_sub_epi32(x, _mm512_set1_epi32((int32_t)begin));
+    window->y = _mm512_sub_epi32(y, _mm512_set1_epi32((int32_t)first));
+    window->begin = first * image->below + begin;
     /* as unsigned numbers, so not negative either */
-    return (_mm512_cmplt_epu32_mask(window->x, _mm512_set1_epi32(columns)) &
-            _mm512_cmplt_epu32_mask(window->y, _mm512_set1_epi32(rows))) == 0xffff;
+    good = _mm512_mask_cmple_epu32_mask(good, window->x, _mm512_set1_epi32(part - 2 * pixel));
+    return _mm512_mask_cmple_epu32_mask(good, window->y, _mm512_set1_epi32(rows - 2)) == 0xffff;
 }
 
-/* Bytes of a row, of which `left` are the row's */
-INLINE __m512i row64(const char *from, int64_t left) {
-    if (left >= 64) return _mm512_loadu_si512(from);
-    return _mm512_maskz_loadu_epi8(((__mmask64)1 << left) - 1, from);
-}
-
-INLINE __m256i row32(const char *from, int64_t left) {
-    if (left >= 32) return _mm256_loadu_si256((const __m256i *)from);
-    return _mm256_maskz_loadu_epi8(((__mmask32)1 << left) - 1, from);
-}
-
-/* Four rows of 32 bytes, the last one of the image again where there are fewer */
-typedef struct {
-    __m512i upper, lower;
-} Rows;
-
-INLINE Rows rows_of(const Job *job, const char *plane, const WideWindow *window) {
-    const int64_t below = job->source_strides[2], left = job->source_width - window->column;
-    const int64_t more = job->source_height - 1 - window->row;
-    const char *from = plane + window->row * below + window->column;
-    Rows rows;
-    rows.upper = _mm512_inserti64x4(_mm512_castsi256_si512(row32(from, left)), row32(from + (more > 0 ? 1 : more) * below, left), 1);
-    rows.lower = _mm512_inserti64x4(_mm512_castsi256_si512(row32(from + (more > 1 ? 2 : more) * below, left)),
-                                    row32(from + (more > 2 ? 3 : more) * below, left), 1);
-    return rows;
+/* How many rows hold squares whose positions go on evenly: two, three or five, or more */
+INLINE int rows_of_sixteen(const float *v) {
+    const int32_t first = whole(v[0]), last = whole(v[15]);
+    return first == last ? 2 : (first < last ? first + 1 == last : last + 1 == first) ? 3 : 5;
 }
 
 #define NEIGHBOURS 0x5555555555555555u /* of 16 bits the lower byte each */
 
-/* Parts of the right neighbour, and of the left one below it, in 2^-14 */
-INLINE __m512i byte_weights(__m512 u) {
-    const __m512i right = _mm512_cvtps_epi32(_mm512_mul_ps(u, _mm512_set1_ps(16384)));
-    return _mm512_or_si512(_mm512_sub_epi32(_mm512_set1_epi32(16384), right), _mm512_slli_epi32(right, 16));
+/* The two weights of a part of a square's side, in 2^-14 */
+INLINE __m512i weights16(__m512i part) {
+    return _mm512_add_epi32(_mm512_sub_epi32(_mm512_slli_epi32(part, 16), part), _mm512_set1_epi32(1 << 14));
 }
 
-INLINE __m512i blended_bytes(__m512i upper, __m512i lower, __m512i weights, __m512 v) {
-    const __m512 above = _mm512_cvtepi32_ps(_mm512_madd_epi16(upper, weights));
-    const __m512 under = _mm512_cvtepi32_ps(_mm512_madd_epi16(lower, weights));
-    const __m512 down = _mm512_mul_ps(v, _mm512_set1_ps(1.0f / 16384)), up = _mm512_sub_ps(_mm512_set1_ps(1.0f / 16384), down);
-    return _mm512_cvtps_epi32(_mm512_fmadd_ps(above, up, _mm512_mul_ps(under, down)));
+/* Pairs of bytes above and below, blended; halves of what is cut off on the way are added */
+INLINE __m512i blended_bytes(__m512i upper, __m512i lower, __m512i across, __m512i down) {
+    const __m512i above = _mm512_srli_epi32(_mm512_madd_epi16(upper, across), 7);
+    const __m512i under = _mm512_slli_epi32(_mm512_madd_epi16(lower, across), 9);
+    const __m512i value = _mm512_madd_epi16(_mm512_mask_blend_epi16(0xaaaaaaaau, above, under), down);
+    return _mm512_srli_epi32(_mm512_add_epi32(value, _mm512_set1_epi32((1 << 20) + (1 << 13))), 21);
 }
 
-INLINE void bytes_of_sixteen(const Span *span, const WideWindow *window, __m512 u, __m512 v, int rows) {
-    const Job *job = span->job;
-    const int64_t below = job->source_strides[2], left = job->source_width - window->column;
-    const char *from = span->source + window->row * below + window->column;
-    const __m512i weights = byte_weights(u);
-    const __m512i pick = _mm512_add_epi32(_mm512_or_si512(window->x, _mm512_slli_epi32(window->x, 16)), _mm512_set1_epi32(1 << 16));
+/* A byte of each square and that `right` of it */
+INLINE __m512i byte_pairs16(__m512i at, int32_t right) {
+    return _mm512_add_epi32(_mm512_or_si512(at, _mm512_slli_epi32(at, 16)), _mm512_set1_epi32(right << 16));
+}
+
+INLINE __m512i rows_of_32(const char *first, const char *second) {
+    return _mm512_inserti64x4(_mm512_castsi256_si512(_mm256_loadu_si256((const __m256i *)first)),
+                              _mm256_loadu_si256((const __m256i *)second), 1);
+}
+
+INLINE void bytes_of_sixteen(const Wide *image, char *result, const WideWindow *window, __m512i across, __m512i down,
+                             const int rows) {
+    const char *from = image->source + window->begin;
+    const int64_t below = image->below;
+    const __m512i pick = byte_pairs16(_mm512_or_si512(window->x, _mm512_slli_epi32(window->y, 5)), 1);
     int64_t c;
-    int k;
-#define ROW(k) _mm512_maskz_permutexvar_epi8(NEIGHBOURS, pick, _mm512_castsi256_si512(row32(from + (k) * below, left)))
-    for (c = 0; c < job->channels; c++, from += job->source_strides[1]) {
-        __m512i upper = ROW(0), last = ROW(1), lower = last;
+    for (c = 0; c < image->channels; c++, from += image->from_plane, result += image->to_plane) {
+        __m512i upper = rows_of_32(from, from + below), lower = rows_of_32(from + below, from + 2 * below);
         ask_below(from, below);
-        for (k = 2; k < rows; k++) {
-            const __m512i next = ROW(k);
-            upper = _mm512_mask_mov_epi32(upper, window->from[k - 1], last);
-            lower = _mm512_mask_mov_epi32(lower, window->from[k - 1], next);
-            last = next;
+        if (rows == 3) {
+            upper = _mm512_maskz_permutexvar_epi8(NEIGHBOURS, pick, upper);
+            lower = _mm512_maskz_permutexvar_epi8(NEIGHBOURS, pick, lower);
+        } else {
+            const __m512i third = rows_of_32(from + 2 * below, from + 3 * below);
+            upper = _mm512_maskz_permutex2var_epi8(NEIGHBOURS, upper, pick, third);
+            const __m512i fourth = rows_of_32(from + 3 * below, from + 4 * below);
+            lower = _mm512_maskz_permutex2var_epi8(NEIGHBOURS, lower, pick, fourth);
         }
-        _mm_storeu_si128((__m128i *)(span->result + c * job->result_strides[1]),
-                         _mm512_cvtepi32_epi8(blended_bytes(upper, lower, weights, v)));
+        _mm_storeu_si128((__m128i *)result, _mm512_cvtepi32_epi8(blended_bytes(upper, lower, across, down)));
     }
-#undef ROW
 }
 
-/* Sixteen pixels of three channels, of 32 bits each, next to each other */
-INLINE void store_colours(char *to, __m512i packed) {
-    const __m512i dense = _mm512_setr_epi32(0x04020100, 0x09080605, 0x0e0d0c0a, 0x14121110, 0x19181615, 0x1e1d1c1a,
-                                            0x24222120, 0x29282625, 0x2e2d2c2a, 0x34323130, 0x39383635, 0x3e3d3c3a, 0, 0, 0, 0);
-    _mm512_mask_storeu_epi32(to, 0x0fff, _mm512_permutexvar_epi8(dense, packed));
-}
-
-/* Three channels next to each other, of squares within three rows and 20 columns */
-INLINE void colours_of_sixteen(const Span *span, const WideWindow *window, __m512 u, __m512 v) {
-    const Job *job = span->job;
-    const int64_t below = job->source_strides[2], left = 3 * (job->source_width - window->column);
-    const char *from = span->source + window->row * below + 3 * window->column;
-    const __m512i weights = byte_weights(u), two = _mm512_add_epi32(window->x, window->x);
-    const __m512i at = _mm512_or_si512(_mm512_add_epi32(window->x, two), _mm512_slli_epi32(window->y, 6));
-    __m512i pick = _mm512_add_epi32(_mm512_or_si512(at, _mm512_slli_epi32(at, 16)), _mm512_set1_epi32(3 << 16));
-    const __m512i first = row64(from, left), second = row64(from + below, left);
-    ask_below(from, below);
-    const __m512i third = window->row + 2 < job->source_height ? row64(from + 2 * below, left) : second;
-    __m512i packed = _mm512_setzero_si512();
-    int c;
-    for (c = 0; c < 3; c++) {
-        const __m512i value = blended_bytes(_mm512_maskz_permutex2var_epi8(NEIGHBOURS, first, pick, second),
-                                            _mm512_maskz_permutex2var_epi8(NEIGHBOURS, second, pick, third), weights, v);
-        packed = _mm512_or_si512(packed, _mm512_sll_epi32(value, _mm_cvtsi32_si128(8 * c)));
-        pick = _mm512_add_epi32(pick, _mm512_set1_epi32(0x00010001));
-    }
-    store_colours(span->result, packed);
-}
-
-/* The same within six rows and 41 columns */
-INLINE void far_colours_of_sixteen(const Span *span, const WideWindow *window, __m512 u, __m512 v) {
-    const Job *job = span->job;
-    const int64_t below = job->source_strides[2], left = 3 * (job->source_width - window->column);
-    const char *from = span->source + window->row * below + 3 * window->column;
-    const __m512i weights = byte_weights(u), at = _mm512_add_epi32(window->x, _mm512_add_epi32(window->x, window->x));
-    __m512i pick = _mm512_add_epi32(_mm512_or_si512(at, _mm512_slli_epi32(at, 16)), _mm512_set1_epi32(3 << 16));
-    __m512i low[6], high[6], packed = _mm512_setzero_si512();
+/* Three channels next to each other */
+INLINE void colours_of_sixteen(const Wide *image, char *result, const WideWindow *window, __m512i across, __m512i down,
+                               const int rows) {
+    const char *from = image->source + window->begin;
+    /* two rows are picked from at once */
+    const __m512i second = _mm512_slli_epi32(_mm512_and_si512(window->y, _mm512_set1_epi32(1)), 6);
+    const __mmask16 far = _mm512_test_epi32_mask(window->y, _mm512_set1_epi32(2));
+    __m512i pick = byte_pairs16(_mm512_or_si512(window->x, second), 3), row[5], packed = _mm512_setzero_si512();
     int c, k;
-    ask_below(from, below);
-    for (k = 0; k < window->rows; k++, from += below) {
-        low[k] = row64(from, left);
-        high[k] = left > 64 ? row64(from + 64, left - 64) : _mm512_setzero_si512();
-    }
+    ask_below(from, image->below);
+    for (k = 0; k < rows; k++) row[k] = _mm512_loadu_si512(from + k * image->below);
+#define PICKED(k) _mm512_maskz_permutex2var_epi8(NEIGHBOURS, row[k], pick, row[(k) + 1])
     for (c = 0; c < 3; c++) {
-#define ROW(k) _mm512_maskz_permutex2var_epi8(NEIGHBOURS, low[k], pick, high[k])
-        __m512i upper = ROW(0), last = ROW(1), lower = last;
-        ask_below(from, below);
-        for (k = 2; k < window->rows; k++) {
-            const __m512i next = ROW(k);
-            upper = _mm512_mask_mov_epi32(upper, window->from[k - 1], last);
-            lower = _mm512_mask_mov_epi32(lower, window->from[k - 1], next);
-            last = next;
+        __m512i upper = PICKED(0), lower = PICKED(1);
+        if (rows == 5) {
+            upper = _mm512_mask_mov_epi32(upper, far, PICKED(2));
+            lower = _mm512_mask_mov_epi32(lower, far, PICKED(3));
         }
-#undef ROW
-        const __m512i value = blended_bytes(upper, lower, weights, v);
-        packed = _mm512_or_si512(packed, _mm512_sll_epi32(value, _mm_cvtsi32_si128(8 * c)));
+        packed = _mm512_or_si512(packed, _mm512_slli_epi32(blended_bytes(upper, lower, across, down), 8 * c));
         pick = _mm512_add_epi32(pick, _mm512_set1_epi32(0x00010001));
     }
-    store_colours(span->result, packed);
+#undef PICKED
+    const __m512i dense = _mm512_permutexvar_epi8(
+        _mm512_setr_epi32(0x04020100, 0x09080605, 0x0e0d0c0a, 0x14121110, 0x19181615, 0x1e1d1c1a, 0x24222120, 0x29282625,
+                          0x2e2d2c2a, 0x34323130, 0x39383635, 0x3e3d3c3a, 0, 0, 0, 0), packed);
+    _mm256_storeu_si256((__m256i *)result, _mm512_castsi512_si256(dense));
+    _mm_storeu_si128((__m128i *)(result + 32), _mm512_extracti32x4_epi32(dense, 2));
 }
 
-/* Between neighbours of a row */
-INLINE __m512 across_sixteen(const float *from, __m512i left, __m512i right, __m512 other_u, __m512 u) {
-    const __m512 low = _mm512_loadu_ps(from), high = _mm512_loadu_ps(from + 16);
-    return _mm512_fmadd_ps(_mm512_permutex2var_ps(low, left, high), other_u,
-                           _mm512_mul_ps(_mm512_permutex2var_ps(low, right, high), u));
-}
-
-INLINE void floats_of_sixteen(const Span *span, const WideWindow *window, __m512 u, __m512 v, int rows) {
-    const Job *job = span->job;
-    const int64_t below = job->source_strides[2];
-    const float *from = (const float *)span->source + window->row * below + window->column;
-    const __m512 other_u = _mm512_sub_ps(_mm512_set1_ps(1), u), other_v = _mm512_sub_ps(_mm512_set1_ps(1), v);
+INLINE void floats_of_sixteen(const Wide *image, char *result, const WideWindow *window, __m512 u, __m512 v,
+                              const int rows) {
+    const float *from = (const float *)image->source + window->begin;
+    const __m512 one = _mm512_set1_ps(1);
     const __m512i left = window->x, right = _mm512_add_epi32(left, _mm512_set1_epi32(1));
     int64_t c;
     int k;
-    for (c = 0; c < job->channels; c++, from += job->source_strides[1]) {
-        __m512 above = across_sixteen(from, left, right, other_u, u), last = across_sixteen(from + below, left, right, other_u, u);
-        __m512 under = last;
-        ask_below(from, below * (int64_t)sizeof(float));
-        for (k = 2; k < rows; k++) {
-            const __m512 next = across_sixteen(from + k * below, left, right, other_u, u);
-            above = _mm512_mask_mov_ps(above, window->from[k - 1], last);
-            under = _mm512_mask_mov_ps(under, window->from[k - 1], next);
-            last = next;
+    for (c = 0; c < image->channels; c++, from += image->from_plane, result += image->to_plane * 4) {
+        const float *row = from;
+        __m512 above, under, made;
+        ask_below(from, image->below * (int64_t)sizeof(float));
+        for (k = 0; k < rows; k++, row += image->below) {
+            const __m512 low = _mm512_loadu_ps(row), high = _mm512_loadu_ps(row + 16);
+            const __mmask16 here = _mm512_cmpge_epi32_mask(window->y, _mm512_set1_epi32(k));
+            const __mmask16 before = _mm512_cmpge_epi32_mask(window->y, _mm512_set1_epi32(k - 1));
+            made = _mm512_fmadd_ps(_mm512_permutex2var_ps(low, left, high), _mm512_sub_ps(one, u),
+                                   _mm512_mul_ps(_mm512_permutex2var_ps(low, right, high), u));
+            if (k < rows - 1) above = k ? _mm512_mask_mov_ps(above, here, made) : made;
+            if (k) under = k > 1 ? _mm512_mask_mov_ps(under, before, made) : made;
         }
-        _mm512_storeu_ps((float *)span->result + c * job->result_strides[1],
-                         _mm512_fmadd_ps(above, other_v, _mm512_mul_ps(under, v)));
+        _mm512_storeu_ps((float *)result, _mm512_fmadd_ps(above, _mm512_sub_ps(one, v), _mm512_mul_ps(under, v)));
     }
 }
 
-INLINE void nearest_of_sixteen(const Span *span, const WideWindow *window) {
-    const Job *job = span->job;
+INLINE void nearest_of_sixteen(const Wide *image, char *result, const WideWindow *window) {
     const __m512i at = _mm512_or_si512(window->x, _mm512_slli_epi32(window->y, 5));
+    const char *from = image->source + window->begin;
+    const int64_t below = image->below;
     int64_t c;
-    for (c = 0; c < job->channels; c++) {
-        const char *plane = span->source + c * job->source_strides[1];
-        const Rows rows = rows_of(job, plane, window);
-        ask_below(plane + window->row * job->source_strides[2] + window->column, job->source_strides[2]);
-        _mm_storeu_si128((__m128i *)(span->result + c * job->result_strides[1]),
-                         _mm512_cvtepi32_epi8(_mm512_permutex2var_epi8(rows.upper, at, rows.lower)));
+    for (c = 0; c < image->channels; c++, from += image->from_plane, result += image->to_plane) {
+        ask_below(from, below);
+        const __m512i upper = rows_of_32(from, from + below), lower = rows_of_32(from + 2 * below, from + 3 * below);
+        _mm_storeu_si128((__m128i *)result, _mm512_cvtepi32_epi8(_mm512_permutex2var_epi8(upper, at, lower)));
     }
 }
 
-#define BY_ROWS(make)                                                                                                  \
-    if (window.rows == 2) make(span, &window, u, v, 2);                                                                \
-    else if (window.rows == 3) make(span, &window, u, v, 3);                                                           \
-    else make(span, &window, u, v, window.rows)
-
-/* Whether there is such a way, and the pixels are made */
-INLINE int sixteen(const Span *span, Wide at, int type, int mode, int layout) {
-    const Job *job = span->job;
-    const __m512 zero = _mm512_setzero_ps();
-    const __m512 last_u = _mm512_set1_ps((float)(job->source_width - 1)), last_v = _mm512_set1_ps((float)(job->source_height - 1));
+/* Whether there is such a way, and the pixels are made. Of bytes, positions are rounded to 2^-14 */
+INLINE int sixteen(const Wide *image, char *result, const float *at_u, const float *at_v, int type, int mode,
+                   int layout) {
+    const int32_t right = (int32_t)image->width - 1, bottom = (int32_t)image->height - 1;
+    const __m512 u = _mm512_loadu_ps(at_u), v = _mm512_loadu_ps(at_v);
+    const int rows = rows_of_sixteen(at_v);
+    /* where images shrink: soon */
+    if (layout == INTERLEAVED && llabs((int64_t)whole(at_u[15]) - whole(at_u[0])) > 19) return 0;
     WideWindow window;
-    if ((_mm512_cmp_ps_mask(at.u, zero, _CMP_GE_OQ) & _mm512_cmp_ps_mask(at.u, last_u, _CMP_LE_OQ) &
-         _mm512_cmp_ps_mask(at.v, zero, _CMP_GE_OQ) & _mm512_cmp_ps_mask(at.v, last_v, _CMP_LE_OQ)) != 0xffff)
-        return 0;
+    __m512i x, y;
+    __mmask16 good;
+#define WITHIN(pixel, rows, part) in_window(image, at_u, at_v, x, y, good, pixel, rows, part, &window)
     if (mode == NEAREST) {
-        if (!window_of_sixteen(_mm512_cvtps_epi32(at.u), _mm512_cvtps_epi32(at.v), 32, 4, &window)) return 0;
-        nearest_of_sixteen(span, &window);
+        x = _mm512_cvtps_epi32(u), y = _mm512_cvtps_epi32(v);
+        good = _mm512_cmple_epu32_mask(x, _mm512_set1_epi32(right));
+        good = _mm512_mask_cmple_epu32_mask(good, y, _mm512_set1_epi32(bottom));
+        if (!WITHIN(1, 5, 32)) return 0;
+        nearest_of_sixteen(image, result, &window);
         return 1;
     }
-    const __m512i x = _mm512_min_epi32(_mm512_cvttps_epi32(at.u), _mm512_set1_epi32((int32_t)job->source_width - 2));
-    const __m512i y = _mm512_min_epi32(_mm512_cvttps_epi32(at.v), _mm512_set1_epi32((int32_t)job->source_height - 2));
-    const __m512 u = _mm512_sub_ps(at.u, _mm512_cvtepi32_ps(x)), v = _mm512_sub_ps(at.v, _mm512_cvtepi32_ps(y));
     if (type == FLOAT32) {
-        if (!window_of_sixteen(x, y, 31, 5, &window) || window.column + 32 > job->source_width) return 0;
-        BY_ROWS(floats_of_sixteen);
+        x = _mm512_min_epi32(_mm512_cvttps_epi32(u), _mm512_set1_epi32(right - 1));
+        y = _mm512_min_epi32(_mm512_cvttps_epi32(v), _mm512_set1_epi32(bottom - 1));
+        const __m512 across = _mm512_sub_ps(u, _mm512_cvtepi32_ps(x)), down = _mm512_sub_ps(v, _mm512_cvtepi32_ps(y));
+        good = _mm512_cmp_ps_mask(u, _mm512_setzero_ps(), _CMP_GE_OQ);
+        good = _mm512_mask_cmp_ps_mask(good, v, _mm512_setzero_ps(), _CMP_GE_OQ);
+        good = _mm512_mask_cmp_ps_mask(good, u, _mm512_set1_ps((float)right), _CMP_LE_OQ);
+        good = _mm512_mask_cmp_ps_mask(good, v, _mm512_set1_ps((float)bottom), _CMP_LE_OQ);
+        if (rows == 2 && WITHIN(1, 2, 32)) floats_of_sixteen(image, result, &window, across, down, 2);
+        else if (rows <= 3 && WITHIN(1, 3, 32)) floats_of_sixteen(image, result, &window, across, down, 3);
+        else if (WITHIN(1, 5, 32)) floats_of_sixteen(image, result, &window, across, down, 5);
+        else return 0;
         return 1;
     }
-    if (layout == INTERLEAVED) {
-        if (!window_of_sixteen(x, y, 41, 5, &window)) return 0;
-        if (window.rows <= 3 && _mm512_cmplt_epi32_mask(window.x, _mm512_set1_epi32(20)) == 0xffff)
-            colours_of_sixteen(span, &window, u, v);
-        else
-            far_colours_of_sixteen(span, &window, u, v);
-        return 1;
+    const __m512 scale = _mm512_set1_ps(1 << 14);
+    const __m512i last_u = _mm512_set1_epi32(right << 14), last_v = _mm512_set1_epi32(bottom << 14);
+    const __m512i one = _mm512_set1_epi32(1), parts = _mm512_set1_epi32((1 << 14) - 1);
+    x = _mm512_cvtps_epi32(_mm512_mul_ps(u, scale)), y = _mm512_cvtps_epi32(_mm512_mul_ps(v, scale));
+    good = _mm512_mask_cmple_epu32_mask(_mm512_cmple_epu32_mask(x, last_u), y, last_v);
+    /* the last column and row belong to the squares before them, of which they are all but 2^-14 */
+    x = _mm512_min_epi32(x, _mm512_sub_epi32(last_u, one)), y = _mm512_min_epi32(y, _mm512_sub_epi32(last_v, one));
+    const __m512i across = weights16(_mm512_and_si512(x, parts)), down = weights16(_mm512_and_si512(y, parts));
+    x = _mm512_srli_epi32(x, 14), y = _mm512_srli_epi32(y, 14);
+    if (layout == PLANES) {
+        if (rows <= 3 && WITHIN(1, 3, 32)) bytes_of_sixteen(image, result, &window, across, down, 3);
+        else if (WITHIN(1, 5, 32)) bytes_of_sixteen(image, result, &window, across, down, 5);
+        else return 0;
+    } else {
+        if (rows <= 3 && WITHIN(3, 3, 64)) colours_of_sixteen(image, result, &window, across, down, 3);
+        else if (WITHIN(3, 5, 64)) colours_of_sixteen(image, result, &window, across, down, 5);
+        else return 0;
     }
-    if (!window_of_sixteen(x, y, 31, 5, &window)) return 0;
-    BY_ROWS(bytes_of_sixteen);
+#undef WITHIN
     return 1;
 }
 
 /* Whether `sixteen` knows a way for images of this kind */
 INLINE int is_wide(const Job *job, int type, int mode, int layout) {
-    if (job->source_width < 2 || job->source_height < 2) return 0;
+    /* registers hold a part of an image; fractions of positions in 2^-14 */
+    if (job->source_width < 32 || job->source_height < 5) return 0;
+    if (job->source_width > 1 << 16 || job->source_height > 1 << 16) return 0;
     if (mode == NEAREST) return type == BYTES1 && job->source_strides[3] == 1 && job->result_strides[3] == 1;
     return mode == BILINEAR && ((type == UINT8 && (layout == PLANES || (layout == INTERLEAVED && job->channels == 3))) ||
                                 (type == FLOAT32 && layout == PLANES));
 }
 
-INLINE __m512 joined16(V8 first, V8 second) {
-    return _mm512_insertf32x8(_mm512_castps256_ps512((__m256)first), (__m256)second, 1);
-}
-
-/* Sixteen pixels between neighbouring nodes */
-INLINE __m512 between_wide(const float *line) {
-    const __m512 nodes = _mm512_castps256_ps512(_mm256_loadu_ps(line));
-    __m512 sum = _mm512_setzero_ps();
-#define ADDED(k)                                                                                                       \
-    sum = _mm512_fmadd_ps(_mm512_broadcast_f32x8(_mm256_loadu_ps(WEIGHTS[k])),                                         \
-                          _mm512_permutexvar_ps(_mm512_setr_epi32(k, k, k, k, k, k, k, k, k + 1, k + 1, k + 1, k + 1,  \
-                                                                  k + 1, k + 1, k + 1, k + 1), nodes), sum)
-    ADDED(0);
-    ADDED(1);
-    ADDED(2);
-    ADDED(3);
-#undef ADDED
-    return sum;
-}
-
 #endif
-
-/* A row of the target on the lattice: the lines through its columns of nodes, and its cells */
-typedef struct {
-    const float *nodes;
-    const int32_t *cells;
-    const float *exact;
-    int64_t part;
-    float lines[2][CHUNK + 8];
-} LatticeRow;
-
-INLINE void begin_row(const Job *job, int64_t b, int64_t y, LatticeRow *row) {
-    const int64_t i = y / STEP;
-    row->part = y % STEP;
-    row->nodes = job->nodes + b * job->node_strides[0] + (i + 1) * (job->columns + 5) + 1;
-    row->cells = job->cells + b * job->cell_stride + i * job->columns;
-    row->exact = job->exact + row->part * STEP;
-}
-
-NOT_INLINE void lay_chunk(const Job *job, LatticeRow *row, int64_t first) {
-    const int64_t left = job->columns - first, n = (left < CHUNK ? left : CHUNK) + 3, width = job->columns + 5;
-    const float *nodes = row->nodes + first;
-    lay_lines(nodes, width, n, (int)row->part, (float)job->source_width, row->lines[0]);
-    lay_lines(nodes + job->node_strides[1], width, n, (int)row->part, (float)job->source_height, row->lines[1]);
-}
-
-/* Of the pixels of a cell that shows something */
-INLINE void cell_positions(const Job *job, const LatticeRow *row, int64_t j, V8 *u, V8 *v) {
-    const int32_t cell = row->cells[j];
-    const float *exact = row->exact + (int64_t)cell * STEP * STEP;
-    Positions at;
-    int k;
-    if (cell == CELL_CUBIC) {
-        *u = between(row->lines[0] + j % CHUNK), *v = between(row->lines[1] + j % CHUNK);
-        return;
-    }
-    for (k = 0; k < STEP; k++) {
-        at.u[k] = ((exact[k] + 1) * (float)job->source_width - 1) / 2;
-        at.v[k] = ((exact[k + job->exact_stride] + 1) * (float)job->source_height - 1) / 2;
-    }
-    *u = load8(at.u), *v = load8(at.v);
-}
-
-NOT_INLINE void grid_positions(const Job *job, int64_t b, int64_t y, int64_t x, Positions *at) {
-    const int64_t across = job->grid_strides[2], to_v = job->grid_strides[3];
-    const int64_t start = b * job->grid_strides[0] + y * job->grid_strides[1];
-    const int64_t n = job->width - x < STEP ? job->width - x : STEP;
-    const float *grid = (const float *)job->grid + start;
-    const double *wide = (const double *)job->grid + start;
-    int64_t k;
-    for (k = 0; k < STEP; k++) {
-        const int64_t i = (x + (k < n ? k : n - 1)) * across;
-        at->u[k] = job->grid_is_double ? (float)wide[i] : grid[i];
-        at->v[k] = job->grid_is_double ? (float)wide[i + to_v] : grid[i + to_v];
-    }
-}
-
-/* Eight positions of a grid of single precision, in a row of `left` */
-INLINE void read_grid(const Job *job, int64_t b, int64_t y, int64_t x, int64_t left, Positions *at) {
-    const int64_t across = job->grid_strides[2], to_v = job->grid_strides[3];
-    const float half_u = (float)job->source_width / 2, half_v = (float)job->source_height / 2;
-    const float *grid = (const float *)job->grid + b * job->grid_strides[0] + y * job->grid_strides[1] + x * across;
-    int64_t k;
-    if (left < STEP || job->grid_is_double || !(across == 1 || (across == 2 && to_v == 1))) {
-        grid_positions(job, b, y, x, at);
-    } else if (across == 1) {
-        memcpy(at->u, grid, sizeof at->u);
-        memcpy(at->v, grid + to_v, sizeof at->v);
-    } else {
-        for (k = 0; k < STEP; k++) {
-            at->u[k] = grid[2 * k];
-            at->v[k] = grid[2 * k + 1];
-        }
-    }
-    /* as torch's grid_sample does: on noise every rounding shows */
-    for (k = 0; k < STEP; k++) {
-        at->u[k] = (at->u[k] + 1) * half_u - 0.5f;
-        at->v[k] = (at->v[k] + 1) * half_v - 0.5f;
-    }
-    if (job->mapped) {
-        const uint8_t *mapped = job->mapped + b * job->mapped_stride + y * job->width + x;
-        for (k = 0; k < STEP && k < left; k++)
-            if (!mapped[k]) at->u[k] = NAN;
-    }
-}
 
 INLINE void row(Span span, int64_t b, int64_t y, int type, int mode, int layout) {
     const Job *job = span.job;
-    const int64_t step = STEP * job->result_strides[3] * size_of(type), columns = (job->width + STEP - 1) / STEP;
-    LatticeRow lattice;
-    int64_t j;
+    const int64_t step = job->result_strides[3] * size_of(type);
+    char *const first = span.result;
+    Chunk at;
+    int64_t x, i, k;
 #if WIDE
+    const int64_t *from = job->source_strides;
+    const Wide image = {span.source, job->channels, from[1], from[2], job->result_strides[1], job->source_width,
+                        job->source_height};
     const int wide = is_wide(job, type, mode, layout);
 #endif
-    if (job->nodes) begin_row(job, b, y, &lattice);
-    for (j = 0; j < columns; j++, span.result += step) {
-        const int64_t left = job->width - j * STEP;
-        V8 u, v;
-        span.pixels = left < STEP ? left : STEP;
-        if (job->nodes) {
-            const int32_t cell = lattice.cells[j];
-            if (j % CHUNK == 0) lay_chunk(job, &lattice, j);
+    for (x = 0; x < job->width; x += CHUNK) {
+        const int64_t n = job->width - x < CHUNK ? job->width - x : CHUNK;
+        positions(job, b, y, x, n, &at);
+        for (i = 0; i < n;) {
 #if WIDE
-            if (wide && left >= 2 * STEP && (j + 1) % CHUNK && cell != CELL_EMPTY && lattice.cells[j + 1] != CELL_EMPTY) {
-                const float *lines = lattice.lines[0] + j % CHUNK;
-                Wide at;
-                if (cell == CELL_CUBIC && lattice.cells[j + 1] == CELL_CUBIC) {
-                    at.u = between_wide(lines), at.v = between_wide(lines + CHUNK + 8);
-                } else {
-                    V8 next_u, next_v;
-                    cell_positions(job, &lattice, j, &u, &v);
-                    cell_positions(job, &lattice, j + 1, &next_u, &next_v);
-                    at.u = joined16(u, next_u), at.v = joined16(v, next_v);
-                }
-                if (sixteen(&span, at, type, mode, layout)) {
-                    span.result += step;
-                    j++;
-                    continue;
-                }
-            }
+            for (; wide && n - i >= 2 * STEP; i += 2 * STEP)
+                if (!sixteen(&image, first + (x + i) * step, at.u + i, at.v + i, type, mode, layout)) break;
 #endif
-            if (cell == CELL_EMPTY) {
-                show_nothing(&span, type);
-                continue;
+            for (k = 0; k < 2 && i < n; k++, i += STEP) {
+                span.result = first + (x + i) * step, span.pixels = n - i < STEP ? n - i : STEP;
+                eight(&span, load8(at.u + i), load8(at.v + i), type, mode, layout);
             }
-            cell_positions(job, &lattice, j, &u, &v);
-        } else {
-            Positions at;
-            read_grid(job, b, y, j * STEP, left, &at);
-#if WIDE
-            if (wide && left >= 2 * STEP) {
-                Positions next;
-                read_grid(job, b, y, (j + 1) * STEP, left - STEP, &next);
-                const Wide both = {joined16(load8(at.u), load8(next.u)), joined16(load8(at.v), load8(next.v))};
-                if (sixteen(&span, both, type, mode, layout)) {
-                    span.result += step;
-                    j++;
-                    continue;
-                }
-            }
-#endif
-            u = load8(at.u), v = load8(at.v);
         }
-        eight(&span, u, v, type, mode, layout);
     }
 }
 

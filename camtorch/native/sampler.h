@@ -17,8 +17,8 @@ enum { ZEROS, BORDER, REFLECTION };
 
 enum { SCRATCH = 25 };
 enum { STEP = 8 }; /* pixels between the nodes of a lattice */
-/* cubics may miss there; to be computed next; and others that have no place in `exact` */
-enum { CELL_DOUBT = -4, CELL_NEXT, CELL_EMPTY, CELL_CUBIC };
+/* quintics do there, which are to be laid; cubics may miss; to be computed next; and others that have no place in `exact` */
+enum { CELL_QUINTIC = -5, CELL_DOUBT, CELL_NEXT, CELL_EMPTY, CELL_CUBIC };
 
 typedef struct {
     /* images (b, c, y, x) and results, in elements; a source image may serve all results (stride 0) */

@@ -310,9 +310,10 @@ def on_lattice(
 ) -> Lattice | None:
     """Positions within `tolerance` pixels of the exact ones, from a lattice of every eighth pixel.
 
-    Where fourth differences say that cubics miss by more than the tolerance, and at the limit of what is mapped and
-    beside it, the cameras give a cell's pixels one by one. None if that would be most of the image. What is mapped, or
-    is not, between four nodes alone and away from that limit is not seen.
+    Where fourth differences say that cubics may miss by more than the tolerance, positions in the middle of a cell and
+    of its sides decide: where cubics do miss, a cell's pixels come one by one, from quintics if these do not, else from
+    the cameras, as at the limit of what is mapped and beside it. None if the cameras gave most of the image. What is
+    mapped, or is not, between four nodes alone and away from that limit is not seen.
 
     Args:
         source: the camera of the images.
