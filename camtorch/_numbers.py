@@ -71,22 +71,21 @@ def at_a_glance(
     """
     if size is not None and not (type(size) is tuple and [*map(type, size)] == [int, int] and min(size) > 0):
         return None
-    if not (model.always_defined and is_eager()):
+    given = [value for value in (intrinsics, distortion) if type(value) is Tensor]
+    if not (model.always_defined and is_eager(*given)):
         return None
     made: list[Tensor] = []
     rows: list[list[float]] = []
     for value in (intrinsics, distortion):
         if value is None and not model.default_count and made:
             tensor, row = made[0].new_empty(0), []
-        elif type(value) is Tensor and value.ndim == 1 and value.dtype in _DTYPES and is_eager(value):
-            if value.requires_grad:
-                return None
-            tensor, row = value.detach().clone(), value.tolist()
+        elif type(value) is Tensor and value.ndim == 1 and value.dtype in _DTYPES and not value.requires_grad:
+            tensor, row = value.clone(), value.tolist()
         elif type(value) is list and _NUMBERS.issuperset(map(type, value)):
             tensor, row = torch.tensor(value, dtype=torch.get_default_dtype()), value
         else:
             return None
-        if not (is_eager(tensor) and tensor.dtype in _DTYPES and math.isfinite(sum(row))):
+        if not (tensor.is_cpu and tensor.dtype in _DTYPES and math.isfinite(sum(row))):
             return None
         made.append(tensor)
         rows.append(row)

@@ -9,7 +9,7 @@ from functools import cached_property
 from typing import Any, TypeVar
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn.utils.parametrize import type_before_parametrizations
 
 from camtorch._arguments import fails, holds
@@ -55,10 +55,13 @@ class View:
 
     def camera(self) -> Camera:
         """A new one."""
-        numbers = joined(self.intrinsics, self.base.intrinsics, math)
-        return remade(
-            self.base, intrinsics=numbers, distortion=self.distortion.detach().clone(), image_size=self.image_size
-        )
+        if torch.is_inference_mode_enabled():  # what that makes could not be used in a graph later
+            with torch.inference_mode(False), torch.no_grad():
+                return self.camera()
+        numbers = nn.Parameter(joined(self.intrinsics, self.base.intrinsics, math), requires_grad=False)
+        k = self.distortion.detach().clone()
+        k = nn.Parameter(k, requires_grad=False) if k.shape[0] else k
+        return remade(self.base, intrinsics=numbers, distortion=k, image_size=self.image_size)
 
     @cached_property
     def rotation(self) -> Tensor | None:

@@ -80,6 +80,9 @@ def test_what_comes_out_is_not_what_the_change_keeps():
     back = augment.inverse(image=torch.zeros(3, *SIZE))
     assert back["image"].shape == (3, *SIZE)
     assert not torch.equal(augment.last.rotation[0], torch.ones(3, 3))
+    with torch.inference_mode():
+        made = augment(sample)["camera"]
+    assert not made.intrinsics.is_inference()
 
 
 def test_samples_of_any_layout_and_form_follow_each_other():
