@@ -22,6 +22,7 @@ from camtorch.data.seeded import generator
 _MUCH = 1 / 3  # of the new images
 _NOTHING = (233, 225, 209)  # the colour of what no camera saw
 _FINE = 3  # times what a sheet shows are the new images, so that its edges are smooth
+_LABELS = ("keypoints", "boxes", "gaze", "camera")
 _REAL = "another of 7,000 calibrated lenses for each image, of the field of view that --fov says"
 
 
@@ -75,6 +76,11 @@ def _photograph(arguments: argparse.Namespace) -> Sample:
     image, orientation = images.read_stored(arguments.image)
     size, path = (image.shape[-2], image.shape[-1]), arguments.labels
     entries = {} if path is None else read_json(path)
+    if entries and not any(name in entries for name in _LABELS):
+        hint = ". The labels of a data set go in with --dataset" if "annotations" in entries else ""
+        raise ValueError(
+            f"{path}: one of {', '.join(_LABELS)} was expected; got {', '.join(map(str, entries))!s:.80}{hint}"
+        )
     if orientation not in (None, 1):
         note(f"{arguments.image} is shown as stored, not turned by its Exif orientation: so labels know it")
     if entries.get("camera") is None:
