@@ -296,10 +296,10 @@ def _searched(given: _Given, threshold: float | None) -> Solved:
         turns, shifts, valid = starts
         found = _least([_minimum(task, turns[:, i], shifts[:, i], valid[:, i]) for i in range(2)])
         # of so few points on a plane the other minimum may be one of pixels, and none of rays
-        flat, *mirrored = _mirrored(task, found.rotations, found.translations)
+        flat, turns, shifts = _mirrored(task, found.rotations, found.translations)
         flat = flat & starts.valid[:, 0] & ~starts.valid[:, 1] & ((weights > 0).sum(-1) <= _FEW)
         if bool(flat.any()):
-            found = _least([found, _minimum(task, *mirrored, flat)])
+            found = _least([found, _minimum(task, turns, shifts, flat)])
     else:
         rotations, translations = _consensus(task, threshold)
         near, before = _near(task, rotations, translations, threshold), torch.zeros_like(weights, dtype=torch.bool)
