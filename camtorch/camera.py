@@ -767,7 +767,7 @@ def fixed_camera(
     Bad numbers give results that are invalid, and no error.
     """
     size = None if image_size is None else (image_size[0], image_size[1])
-    template = _ideal_camera(model, distortion.shape[-1])
+    template = _ideal_camera(model, distortion.shape[-1])  # type: ignore[arg-type]  # a class can be hashed
     return remade(template, intrinsics=intrinsics.detach(), distortion=distortion.detach(), image_size=size)
 
 

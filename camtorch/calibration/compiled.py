@@ -71,10 +71,11 @@ def refined(
     points: (P, N, 3). pixels: (B, N, 2). weights: (B, N) of the squares.
     """
     while True:
-        results = *(t.clone(memory_format=torch.contiguous_format) for t in start), None, pixels.new_empty(len(pixels))
-        results = results[0], results[1], torch.empty(len(pixels), dtype=torch.bool, device="cpu"), results[3]
+        rotations, translations = (t.clone(memory_format=torch.contiguous_format) for t in start)
+        converged, costs = torch.empty(len(pixels), dtype=torch.bool, device="cpu"), pixels.new_empty(len(pixels))
+        results = rotations, translations, converged, costs
         if not _run(native, points, None, pixels, weights, _REFINED, search, 0.0, results):
-            return results[0], results[1], results[3]
+            return rotations, translations, costs
         native.follow()
 
 

@@ -293,22 +293,24 @@ def _searched(given: _Given, threshold: float | None) -> Solved:
     weights = task.weights
     if threshold is None:
         starts = poses_from_rays(task.points, task.rays, weights)
-        found = _least([_minimum(task, *(t[:, i] for t in starts)) for i in range(2)])
+        turns, shifts, valid = starts
+        found = _least([_minimum(task, turns[:, i], shifts[:, i], valid[:, i]) for i in range(2)])
         # of so few points on a plane the other minimum may be one of pixels, and none of rays
-        flat, *mirrored = _mirrored(task, found.rotations, found.translations)
+        flat, turns, shifts = _mirrored(task, found.rotations, found.translations)
         flat = flat & starts.valid[:, 0] & ~starts.valid[:, 1] & ((weights > 0).sum(-1) <= _FEW)
         if bool(flat.any()):
-            found = _least([found, _minimum(task, *mirrored, flat)])
+            found = _least([found, _minimum(task, turns, shifts, flat)])
     else:
         rotations, translations = _consensus(task, threshold)
-        near, found = _near(task, rotations, translations, threshold), None
+        near, before = _near(task, rotations, translations, threshold), torch.zeros_like(weights, dtype=torch.bool)
+        lost, none = torch.full_like(weights[:, 0], torch.inf), weights.new_zeros(len(weights), 6, 7)
+        found = _Found(lost, rotations, translations, none)
         for _ in range(_ROUNDS):
-            task = task._replace(weights=torch.where(near, weights, 0.0))
-            found = _minimum(task, rotations, translations, _spread(task.points, near))
-            rotations, translations, before = found.rotations, found.translations, near
-            near = _near(task._replace(weights=weights), rotations, translations, threshold)
             if torch.equal(near, before):
                 break
+            task = task._replace(weights=torch.where(near, weights, 0.0))
+            found = _minimum(task, found.rotations, found.translations, _spread(task.points, near))
+            before, near = near, _near(task._replace(weights=weights), found.rotations, found.translations, threshold)
         found = found._replace(costs=torch.where((near == before).all(-1), found.costs, torch.inf))
     return _assessed(task, found)
 

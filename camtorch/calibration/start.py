@@ -42,7 +42,7 @@ _WORSE, _LITTLE_WORSE = 2.0, 1.01  # than the best: costs of what is kept
 _ALIKE = 1e-3  # the relative difference of two starts, of one
 _SAME = 1e-7  # the difference of two costs, of one optimum
 _FEW_STEPS, _STEPS, _MANY_STEPS = 6, 12, 40
-_NEARLY = 1e-2  # as `SETTLED`, of a lens that another one follows
+_NEARLY = 0.1  # as `SETTLED`, of a lens that another one follows
 # Coefficients with which the others make a valley that has several deepest places, and where along it to start
 _ALONG = {
     "double_sphere": ("xi", (-0.3, 0.0, 0.3, 0.7)),
