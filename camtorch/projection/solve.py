@@ -140,7 +140,7 @@ class _Search:
         miss = torch.maximum((x - u).abs(), (y - v).abs())
         # away from it, where another processor's rounding would carry the ray across
         further = 1 + 32 * torch.finfo(u.dtype).eps
-        beyond = [times(w, further) for w in seen]
+        beyond = times(seen[0], further), times(seen[1], further)
         valid = valid & covered & self.contains(*beyond) & (miss <= rounding(u, v, stretch))
         return torch.where(valid, a, 0.0), torch.where(valid, b, 0.0), valid
 
