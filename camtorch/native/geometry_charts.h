@@ -4,6 +4,8 @@
  * function of x^2 + y^2 and z; and rays are (a S, b S, C), S and C functions of a^2 + b^2.
  */
 
+#define NEAR_SIDE (8 * (IS_DOUBLE ? 1.4901161193847656e-08 : 3.4526698300124393e-04)) /* 8 sqrt(eps) */
+
 /* What a chart is made of, by value: loops keep it in registers */
 typedef struct {
     R xi, alpha, beta; /* of a unified chart */
@@ -317,7 +319,7 @@ INLINE I T(on_plane)(const T(Chart) k, const int way, R a, R b) {
         return inside & (before - 64 * EPS * (r2 + ahead * ahead) > 0) & (reach - 64 * EPS * T(absolute)(ahead) > 0);
     }
     case FOV: return ((R)(PI * PI) - k.omega * k.omega * r2 > 0) & (FARTHEST / 2 - far > 0);
-    case ONE_DIVISION: return (1 - 64 * EPS - k.k * r2 > 0) & (FARTHEST / 2 - far > 0);
+    case ONE_DIVISION: return (1 - 2 * (R)NEAR_SIDE - k.k * r2 > 0) & (FARTHEST / 2 - far > 0);
     case CYLINDER: return (half_turn - T(absolute)(a) > 0) & (FARTHEST - T(absolute)(b) > 0);
     case SPHERE: return (half_turn - T(absolute)(a) > 0) & ((R)(PI / 2) - T(absolute)(b) > 0);
     case LINEARITY: {

@@ -170,8 +170,6 @@ INLINE R T(step)(R ua, R ub, R va, R vb, R du, R dv, R *da, R *db) {
 
 /* -- a windshield: polynomials of the angles phi = asin(x) and theta = asin(y) */
 
-#define NEAR_SIDE (8 * (IS_DOUBLE ? 1.4901161193847656e-08 : 3.4526698300124393e-04)) /* 8 sqrt(eps) */
-
 typedef struct {
     ALIGNED R phi[BLOCK], theta[BLOCK], p[BLOCK], q[BLOCK], side[BLOCK];
     T(Jacobian) by; /* of p and q by phi and theta */
@@ -299,11 +297,12 @@ static void T(unbend)(const T(Camera) *c, int n, T(Bent) *b, R *restrict x, R *r
         }
     }
     EACH(i) {
-        /* as of `bend_at`; what it would bend to is known */
+        /* as of `bend_at`, and so far within that rounding carries none across; what it would bend to is known */
+        const R inner = least + 256 * EPS;
         const R area = b->by.ua[i] * b->by.vb[i] - b->by.ub[i] * b->by.va[i], after2 = z[i] * z[i];
         const R z2 = T(ray_of)(b->phi[i], b->theta[i], x + i, y + i), last = T(most)(T(absolute)(p[i]), T(absolute)(q[i]));
-        ok[i] &= (off[i] < 64 * EPS) & (b->side[i] > 0) & (half - last - least > 0) & (area - least > 0);
-        ok[i] &= (after2 - least > 0) & (z2 - least * least > 0), z[i] = T(root)(z2 > 0 ? z2 : 0);
+        ok[i] &= (off[i] < 64 * EPS) & (b->side[i] > 0) & (half - last - inner > 0) & (area - inner > 0);
+        ok[i] &= (after2 - inner > 0) & (z2 - (least * least + 256 * EPS) > 0), z[i] = T(root)(z2 > 0 ? z2 : 0);
     }
 }
 
@@ -596,10 +595,8 @@ static NOT_INLINE void T(cover_of)(const T(Camera) *c, int n, R *restrict a, R *
     })
 }
 
-/* Of points of the plane, `ok` where they are known to be the image of a ray; the centre elsewhere */
-static void T(cover)(const T(Camera) *c, int n, R *a, R *b, const I *known, I *ok) {
-    T(cover_of)(c, n, c->swapped ? b : a, c->swapped ? a : b, known, ok);
-    if (c->way != INVERTED) return;
+/* Of points of the plane of an inverted chart that are `ok`, those whose ray it covers for certain; the centre elsewhere */
+static void T(cover_inverted)(const T(Camera) *c, int n, R *restrict a, R *restrict b, I *restrict ok) {
     const R inner2 = c->chart_inner2 * (1 - 64 * EPS), limit = c->chart_most2 * (1 - 128 * EPS);
     const R before = limit < (R)(PI * PI) ? limit : (R)(PI * PI);
     ALIGNED R p[BLOCK], q[BLOCK], factor[BLOCK];
@@ -612,6 +609,12 @@ static void T(cover)(const T(Camera) *c, int n, R *a, R *b, const I *known, I *o
         ok[i] &= before - (p[i] * p[i] + q[i] * q[i]) > 0;
         a[i] = ok[i] ? a[i] : 0, b[i] = ok[i] ? b[i] : 0;
     }
+}
+
+/* Of points of the plane, `ok` where they are known to be the image of a ray; the centre elsewhere */
+static void T(cover)(const T(Camera) *c, int n, R *a, R *b, const I *known, I *ok) {
+    T(cover_of)(c, n, c->swapped ? b : a, c->swapped ? a : b, known, ok);
+    if (c->way == INVERTED) T(cover_inverted)(c, n, a, b, ok);
 }
 
 /* Points near those that the stages from `first` on send to (u, v) */
@@ -840,6 +843,7 @@ static void T(solutions)(const T(Camera) *c, int n, R *restrict u, R *restrict v
             ok[i] &= known[i];
             u[i] = ok[i] ? a[i] : 0, v[i] = ok[i] ? b[i] : 0;
         }
+        if (c->way == INVERTED) T(cover_inverted)(c, n, u, v, ok);
     } else T(cover)(c, n, u, v, known, ok);
     T(rays)(c, n, u, v, ok, x, y, z);
     if (c->parts->map) {

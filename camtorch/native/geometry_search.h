@@ -129,8 +129,10 @@ static void T(search)(const T(Camera) *c, int n, const R *restrict u, const R *r
     T(Jacobian) to;
     if (c->follows) {
         EACH(i) ok[i] = 1;
+        T(Camera) endless = *c; /* on the way a point may be behind the edge, where the formula goes on */
+        endless.ends = 0;
         T(begin)(c, n, u, v, a, b);
-        T(damped)(c, n, u, v, a, b);
+        T(damped)(&endless, n, u, v, a, b);
     } else T(by_radius)(c, n, u, v, a, b, ok);
     T(lens)(c, 1, n, a, b, x, y, &to, least);
     T(contained)(c, n, a, b, least, inside);

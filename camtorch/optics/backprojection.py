@@ -80,6 +80,9 @@ class Inverted(Chart):
         before = times(self._inverse.most2, 1 - 128 * torch.finfo(a.dtype).eps)
         return torch.minimum(inside, before.clamp(max=math.pi**2) - theta2)
 
+    def seen(self, a: Tensor, b: Tensor) -> Tensor:
+        return self.on_plane(a, b)
+
     def to_ray(self, a: Tensor, b: Tensor, order: int = 2) -> Planes3:
         factor = self._radial(torch.addcmul(a * a, b, b))
         return Equidistant().to_ray(a * factor, b * factor, order)

@@ -363,8 +363,8 @@ class OneDivision(Chart):
 
     def on_plane(self, a: Tensor, b: Tensor) -> Tensor:
         (coefficient,) = self.parameters
-        # away from the fold, where the ray's own rounding would carry it across
-        before = 1 - 64 * torch.finfo(a.dtype).eps - coefficient * torch.addcmul(a * a, b, b)
+        # away from the fold, where the ray's own rounding would carry it across; what `margin` has is its square
+        before = 1 - 16 * torch.finfo(a.dtype).eps ** 0.5 - coefficient * torch.addcmul(a * a, b, b)
         return torch.minimum(before, Perspective().end(a.dtype) / 2 - torch.maximum(a.abs(), b.abs()))
 
     def to_ray(self, a: Tensor, b: Tensor, order: int = 2) -> Planes3:
@@ -418,7 +418,8 @@ class Linearity(Chart):
         angle = (size * math.pi).clamp(max=math.pi / 2 - 1 / most)
         ends = torch.where(linearity > 0, tanc_root(angle * angle), sinc_root(angle * angle, 1)) * angle
         inside = 1 - 64 * torch.finfo(dtype).eps
-        return torch.where(size > 0, inside * ends / torch.where(size > 0, size, 1.0), inside * math.pi).clamp(max=most)
+        end = torch.where(size > 0, inside * ends / torch.where(size > 0, size, 1.0), inside * math.pi)
+        return end.clamp(max=most).to(dtype)
 
     def usual_end(self, dtype: torch.dtype) -> float | Tensor:
         return torch.as_tensor(self.end(dtype)).clamp(max=Perspective().usual_end(dtype))

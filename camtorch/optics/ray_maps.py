@@ -193,14 +193,15 @@ class Before(Chart):
         return self.chart.on_plane(a, b)
 
     def seen(self, a: Tensor, b: Tensor) -> Tensor | None:
-        goal = self.chart.to_ray(a, b, 0)
+        covered, goal = self.chart.seen(a, b), self.chart.to_ray(a, b, 0)
         ray = self.change.inverse(*goal, 0)
         own = self.change.margin(*ray)
         if own is None:
-            return None
+            return covered
         x, y, z = ((p - q).abs() for p, q in zip(self.change(*ray), goal, strict=True))
         enough = 256 * torch.finfo(a.dtype).eps
-        return torch.minimum(enough - (x + y + z), own - enough)
+        own = torch.minimum(enough - (x + y + z), own - enough)
+        return own if covered is None else torch.minimum(covered, own)
 
     def to_ray(self, a: Tensor, b: Tensor, order: int = 2) -> Planes3:
         return self.change.inverse(*self.chart.to_ray(a, b, order), order)

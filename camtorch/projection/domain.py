@@ -221,12 +221,12 @@ class Domain:
         return torch.maximum(inside, torch.minimum(limits2 - t, regular(self.lens, a, b)))
 
 
-def regular(lens: Lens, a: Tensor, b: Tensor) -> Tensor:
+def regular(lens: Lens, a: Tensor, b: Tensor, to_edge: bool = True) -> Tensor:
     """Positive where the lens is regular at the point itself, which is no further out than it goes, and its inverse has
-    a derivative.
+    a derivative. to_edge: not beyond where it ends, either.
     """
     at = lens.at(a, b)
-    edge = at.edge
+    edge = at.edge if to_edge else None
     least = at.orientation if edge is None else torch.minimum(at.orientation, edge)
     # nearer to zero the reciprocal could leave the floating-point range
     return plus(torch.nan_to_num(least, nan=-1.0), -(torch.finfo(a.dtype).tiny ** 0.25))

@@ -140,18 +140,18 @@ class _Search:
         miss = torch.maximum((x - u).abs(), (y - v).abs())
         # away from it, where another processor's rounding would carry the ray across
         further = 1 + 32 * torch.finfo(u.dtype).eps
-        beyond = [times(w, further) for w in seen]
+        beyond = times(seen[0], further), times(seen[1], further)
         valid = valid & covered & self.contains(*beyond) & (miss <= rounding(u, v, stretch))
         return torch.where(valid, a, 0.0), torch.where(valid, b, 0.0), valid
 
-    def contains(self, a: Tensor, b: Tensor) -> Tensor:
-        """Bool: what `Domain.margin` says of single points."""
+    def contains(self, a: Tensor, b: Tensor, to_edge: bool = True) -> Tensor:
+        """Bool: what `Domain.margin` says of single points; see `regular`."""
         t = torch.addcmul(a * a, b, b)
         inside = t < self.domain.inner2[self.camera, 0]
         if self.is_circle:
             return inside
         before = t < self.domain.limits2[self.camera, azimuth(a, b)]
-        regular_there: Tensor = inside | (before & (regular(self.lens, a, b) > 0))
+        regular_there: Tensor = inside | (before & (regular(self.lens, a, b, to_edge) > 0))
         return regular_there
 
     def radial(self, u: Tensor, v: Tensor) -> Planes2:
@@ -195,7 +195,8 @@ class _Search:
             at = self.lens.at(*trial)
             ahead = newton_step(jacobian, u - at.value[0], v - at.value[1])
             nearer = ahead[0] * ahead[0] + ahead[1] * ahead[1] < da * da + db * db
-            good = active & nearer & self.contains(*trial)
+            # on the way it may be behind the edge, where the formula goes on
+            good = active & nearer & self.contains(*trial, to_edge=False)
             new = *trial, *at.value, *at.jacobian
             state = tuple(torch.where(good, n, o) for n, o in zip(new, state, strict=True))
             length = torch.where(good, (length * 4).clamp(max=1), length / 4)

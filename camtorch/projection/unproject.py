@@ -130,7 +130,8 @@ def attach(lens: Lens, solution: Planes2, target: Planes2, steps: int) -> Planes
     for _ in range(steps):
         x, y = lens(a, b)
         da, db, _ = newton_step((xa, xb, ya, yb), target[0] - x, target[1] - y)
-        a, b = a + da, b + db
+        # the value stays: next to a fold a step of what rounding left would lead across
+        a, b = a + (da - da.detach()), b + (db - db.detach())
     return a, b
 
 

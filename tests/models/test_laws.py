@@ -590,6 +590,44 @@ def test_pixels_around_the_image_of_the_fold(key, name, dtype):
     assert right[valid].all(), (around[valid & ~right][:3].tolist(), again[valid & ~right][:3].tolist())
 
 
+def rim_of(camera, azimuths):
+    """(M, 2): pixels of the last valid rays on some azimuths, by bisection, those that are no more than images away."""
+    phi = torch.linspace(0.1, 2 * math.pi + 0.1, azimuths + 1, dtype=torch.float64)[:-1]
+
+    def project(theta):
+        sine = theta.sin()
+        return camera.project(torch.stack((sine * phi.cos(), sine * phi.sin(), theta.cos() + 0 * phi), -1))
+
+    theta = torch.linspace(0, math.radians(179.9), 400, dtype=torch.float64)[:, None]
+    invalid = ~project(theta)[1]
+    first = invalid.int().argmax(0)
+    low, high = theta[(first - 1).clamp(min=0), 0], theta[first, 0]
+    for _ in range(60):
+        valid = project((low + high) / 2)[1]
+        low, high = torch.where(valid, (low + high) / 2, low), torch.where(valid, high, (low + high) / 2)
+    pixels = project(low)[0].detach()
+    near = (pixels - camera.intrinsics[2:].detach()).norm(dim=-1) < 5 * max(camera.image_size)
+    return pixels[invalid.any(0) & near]
+
+
+@every_model
+@both_precisions
+@settings(max_examples=2)
+@given(data=st.data())
+def test_what_a_pixel_sees_is_seen(key, dtype, data):
+    """Wherever a pixel has a ray, however near to a fold or to the end of a chart, that ray has a pixel."""
+    camera = data.draw(drawn(key, data.draw(st.booleans())))
+    centre = camera.intrinsics[2:].detach()
+    rim = torch.cat((rim_of(camera, 8), centre[None]))  # if only that
+    hair = torch.logspace(math.log10(torch.finfo(dtype).eps), -2, 48, dtype=torch.float64)[:, None, None]
+    pixels = (centre + (rim - centre) * (1 - hair)).view(-1, 2).to(dtype)
+    camera = camera.to(dtype)
+    # native, and the formula
+    for unproject, project in ((camera.unproject, camera.project), (vmap(camera.unproject), vmap(camera.project))):
+        rays, valid = unproject(pixels)
+        assert project(rays)[1][valid].all()
+
+
 # -- batches
 
 

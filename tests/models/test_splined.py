@@ -64,10 +64,11 @@ def test_pixels_are_those_of_the_formula_up_to_the_edge_and_behind_the_camera(gr
     torch.testing.assert_close(
         pixels.detach(), torch.tensor(np.array([reference(camera, p) for p in rays.numpy()])), rtol=0, atol=1e-9
     )
-    back, found = camera.unproject(pixels)
-    assert found.all()
     expected = torch.nn.functional.normalize(rays, dim=-1)
-    assert torch.linalg.cross(back, expected).norm(dim=-1).max() < 1e-12
+    for unproject in (camera.unproject, torch.func.vmap(camera.unproject)):  # native, and the formula
+        back, found = unproject(pixels)
+        assert found.all()
+        assert torch.linalg.cross(back, expected).norm(dim=-1).max() < 1e-12
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
