@@ -482,4 +482,5 @@ def test_padding_and_fill():
     assert (black["mask"][:, None].expand_as(seen)[~seen] == 9).all()
     border = RandomMount(**mount, padding_mode="border")(batch)["image"]
     assert (border[outside] > 0).any()
-    torch.testing.assert_close(border[inside], black["image"][inside])
+    # a border asks for positions in other cells of the lattice; both keep to 0.001 px, and values move by 0.1 a pixel
+    torch.testing.assert_close(border[inside], black["image"][inside], rtol=0, atol=2e-4)

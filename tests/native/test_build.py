@@ -122,7 +122,7 @@ def test_without_a_compiler_the_error_says_what_was_sought(tmp_path, no_compiler
 
 def copy(folder):
     """A package of camtorch's with no library in it, and the path of its `native`."""
-    ignore = shutil.ignore_patterns("_sampler.*", "__pycache__", "geometry*.[ch]")
+    ignore = shutil.ignore_patterns("_sampler.*", "__pycache__", "*.[ch]")
     return shutil.copytree(ROOT / "camtorch", folder / "camtorch", ignore=ignore) / "native"
 
 
