@@ -6,7 +6,6 @@ import math
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -231,7 +230,7 @@ class Augmentation(SampleTransform):
     """The ranges of what the new images have beside a camera."""
     image_size: tuple[int, int] | None = None
     """Of what comes out; None: that of what comes in."""
-    crops: Mapping[str, int] = MappingProxyType({})
+    crops: Mapping[str, int]
     """Boxes that a draw needs, by their names in it: which of each sample's."""
     p: float
     same_on_batch: bool
@@ -250,6 +249,7 @@ class Augmentation(SampleTransform):
         self.p = as_part(p, "p", self._name, "probability")
         self.same_on_batch = as_flag(same_on_batch, "same_on_batch", self._name)
         self.ranges = dict(ranges or {})
+        self.crops = {}
         self.min_filled = None if min_filled is None else as_part(min_filled, "min_filled", self._name)
         self._warned = False
         self._spans: Spans | None = None
@@ -307,7 +307,7 @@ class Augmentation(SampleTransform):
             draw: as of `draw`.
             boxes: of the samples (B, M, 4), or (M, 4) each; None if they have none.
         """
-        missing = {name: index for name, index in self.crops.items() if name not in draw} if self.crops else {}
+        missing = {name: index for name, index in self.crops.items() if name not in draw}
         if not missing:
             return draw
         if boxes is None:

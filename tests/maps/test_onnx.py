@@ -75,10 +75,11 @@ def test_a_dewarp_takes_any_batch_and_bytes():
     many = images.expand(3, -1, -1, -1).contiguous()
     (result,), expected = run(many), warp(many)
     assert result.dtype == expected.dtype == torch.uint8
-    # what lies within rounding of one half may become the next integer
+    # what lies within rounding of one half may become the next integer: positions of the warp are good to its
+    # tolerance of 0.001 px, and values move by some a pixel
     off = (result.double() - expected).abs()
     assert off.max() <= 1
-    assert (off > 0).double().mean() < 1e-3
+    assert (off > 0).double().mean() < 3e-3
 
 
 OPTIONS = [
