@@ -100,7 +100,8 @@ def _described(camera: Camera) -> dict[str, Any]:
     if camera.batch_shape:
         shape = tuple(camera.batch_shape)
         raise ValueError(f"write_viewer: camera must be a single one, as camera[0] is; got a batch {shape}")
-    lens = next(kind for kind in model_of(camera).__mro__ if ":windshield=" not in kind.key)
+    kinds: list[Any] = list(model_of(camera).__mro__)
+    lens = next(kind for kind in kinds if ":windshield=" not in kind.key)
     if lens.key not in models() and not (issubclass(lens, Splined) and re.fullmatch("splined:order[^:]*", lens.key)):
         raise ValueError(
             f"write_viewer: the page has no formulas of {camera.key or type(camera).__name__}; it knows "
