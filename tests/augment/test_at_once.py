@@ -103,6 +103,10 @@ def test_samples_of_any_layout_and_form_follow_each_other():
                 # planes and channels side by side may be rounded otherwise
                 np.testing.assert_allclose(out["image"].astype(float), again["image"].astype(float), rtol=1e-5, atol=1)
                 assert (out["keypoints"].shape, again["keypoints"].shape) == ((0, 2), (1, 2))
+    for size, axis in (((1, 48), 0), ((48, 1), 1)):  # numpy calls them contiguous
+        row = np.flip(random.integers(0, 200, (*size, 3)).astype(np.uint8), axis)
+        one = transform(image=row, camera=example("pinhole", size).requires_grad_(False))
+        assert one["image"].shape == row.shape
     with pytest.raises(ValueError, match=r"image is .* but the image_size of camera"):
         transform(image=image[:-1])
     with pytest.raises(ValueError, match=r"keypoints must be \(N, 2\)"):
