@@ -117,3 +117,16 @@ def test_samples_of_any_layout_and_form_follow_each_other():
         transform(image=image, bboxes=boxes[:, ::-1].copy())
     with pytest.raises(ValueError, match="holds real numbers"):
         transform(image=image, lidar=np.zeros((4, 3)))
+
+
+@pytest.mark.parametrize("lead", [(), (2,)])
+def test_pixels_of_half_precision_stay_finite(lead):
+    """The image of a ray nearly across the axis is farther away than half precision has numbers."""
+    focal = 40 / (math.pi / 2 - 5e-4)
+    camera = ct.KannalaBrandt([focal, focal, 48.0, 32.0], [0.0] * 4, image_size=(64, 96)).requires_grad_(False)
+    flat = dict.fromkeys(("yaw", "pitch", "roll", "focal", "centre", "distortion", "crop"))
+    pixels = torch.tensor([[88.0, 32.0], [50.0, 30.0]]).half().expand(*lead, 2, 2)
+    out = RandomCamera("pinhole", fov=(60, 60), camera=camera, **flat)(keypoints=pixels)
+    assert out["keypoints"].dtype == torch.float16
+    assert torch.isfinite(out["keypoints"]).all()
+    assert out["keypoints_valid"].tolist() == torch.tensor([False, True]).expand(*lead, 2).tolist()
