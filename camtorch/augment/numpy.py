@@ -269,12 +269,13 @@ class _Lent:
 
 def _tensor(array: Array) -> Tensor:
     """A tensor in the memory of an array, where torch can read it there; for reading alone."""
-    if array.flags.carray and array.dtype.isnative and array.itemsize <= 8:
+    if array.flags.carray and array.dtype.isnative and array.itemsize <= 8 and min(array.strides, default=0) >= 0:
         return torch.from_numpy(array)
     # torch takes neither other byte orders nor long doubles, nor strides that are negative or end within a number
     dtype = array.dtype.newbyteorder("=") if array.dtype.itemsize <= 8 else np.dtype(np.float64)
     flags, steps = array.flags, array.strides
-    whole = flags.aligned and (flags.c_contiguous or all(step >= 0 and step % array.itemsize == 0 for step in steps))
+    # a dim of one, which may run backwards, leaves an array contiguous
+    whole = flags.aligned and all(step >= 0 and step % array.itemsize == 0 for step in steps)
     if array.dtype != dtype or not whole:
         return torch.from_numpy(_dense(array, dtype))
     return torch.from_numpy(array if flags.writeable else np.asarray(_Lent(array)))

@@ -628,7 +628,7 @@ class SampleTransform(nn.Module):
             results[name] = image if named[name][1].ndim == 4 else image.squeeze(1), None
         for name, (moved, valid) in zip(pixels, made.pixels, strict=True):
             value = named[name][1]
-            results[name] = moved.view(value.shape).to(value.dtype), valid.view(value.shape[:-1])
+            results[name] = _in_range(moved.view(value.shape), value.dtype), valid.view(value.shape[:-1])
         return results
 
     def _mirror(self, moved: Sample, named: Named, mirrored: Tensor | None, batched: bool) -> None:
@@ -670,7 +670,7 @@ class SampleTransform(nn.Module):
         result = moves(found, value)(change, value, options)
         result, valid = result if isinstance(result, tuple) else (result, None)
         # geometry is computed in float32 at least; what came in half precision goes out in it
-        return result.to(value.dtype) if value.dtype.is_floating_point else result, valid
+        return _in_range(result, value.dtype) if value.dtype.is_floating_point else result, valid
 
     def _still(self, name: str, valid: Any, given: Any, batched: bool) -> Any:
         """Flags of a batch, invalid where those given were; any number but zero is valid, as in COCO."""
@@ -684,6 +684,14 @@ class SampleTransform(nn.Module):
             raise ValueError(f"{self._name}: {name} must be {shapes}; got {[tuple(b.shape) for b in before]}")
         now = [v & b.to(v.device) for v, b in zip(now, before, strict=True)]
         return now if many else now[0].unsqueeze(0) if single else now[0]
+
+
+def _in_range(values: Tensor, dtype: torch.dtype) -> Tensor:
+    """In a dtype that may be narrower: finite values stay finite."""
+    if dtype == torch.float16 != values.dtype:
+        most = torch.finfo(dtype).max
+        values = values.clamp(-most, most)
+    return values.to(dtype)
 
 
 def from_pitch_yaw(angles: Tensor) -> Tensor:

@@ -27,6 +27,7 @@ from camtorch.rotations import rotation_matrix, rotation_vector, skew_matrix
 
 _LEAST = 4  # points
 _FEW = 5  # points, that may have minima far from where they start
+_WORSE = 4.0  # times the least cost: what begins below that may end below it
 _MOVE = 1e-6  # of rays, whose pixels' difference is a derivative
 _THIN = 0.1  # of the extent of points: what is thinner may have the minima of a plane
 _LINE = 1e-6  # of the extent of points: less across is none
@@ -295,9 +296,11 @@ def _searched(given: _Given, threshold: float | None) -> Solved:
         starts = poses_from_rays(task.points, task.rays, weights)
         turns, shifts, valid = starts
         found = _least([_minimum(task, turns[:, i], shifts[:, i], valid[:, i]) for i in range(2)])
-        # of so few points on a plane the other minimum may be one of pixels, and none of rays
+        # of points on a plane the other minimum may be one of pixels, and none of rays: of few, and of much noise
         flat, turns, shifts = _mirrored(task, found.rotations, found.translations)
-        flat = flat & starts.valid[:, 0] & ~starts.valid[:, 1] & ((weights > 0).sum(-1) <= _FEW)
+        few = ~starts.valid[:, 1] & ((weights > 0).sum(-1) <= _FEW)
+        near = 2 * task.cost(torch.cat((rotation_vector(turns), shifts), -1)) <= _WORSE * found.costs
+        flat = flat & torch.isfinite(found.costs) & (few | near)
         if bool(flat.any()):
             found = _least([found, _minimum(task, turns, shifts, flat)])
     else:

@@ -662,14 +662,16 @@ static int mirrored(const Row *row, const double *rotation, const double *transl
     return 1;
 }
 
-/* Takes the minimum that a pose leads to if it is lower; its cost */
+/* Takes the minimum that a pose leads to if it is lower; its cost. What is far from that after some steps goes no further */
 static double or_better(const Poses *given, Row *row, double *rotation, double *translation, double cost,
-                        const double *other, const double *shift, int64_t steps) {
+                        const double *other, const double *shift) {
+    const int64_t first = isfinite(cost) && given->steps > FEW_STEPS ? FEW_STEPS : given->steps;
     double turned[9], shifted[3];
     uint8_t converged;
     int complete;
     memcpy(turned, other, sizeof turned), memcpy(shifted, shift, sizeof shifted);
-    const double found = refine(given, row, turned, shifted, steps, &converged, &complete);
+    double found = refine(given, row, turned, shifted, first, &converged, &complete);
+    if (!converged && found <= WORSE * cost) found = refine(given, row, turned, shifted, given->steps - first, &converged, &complete);
     if (!(converged && complete && found < cost)) return cost;
     memcpy(rotation, turned, sizeof turned), memcpy(translation, shifted, sizeof shifted);
     return found;
@@ -686,12 +688,13 @@ static double solve(const Poses *given, Row *row, double *rotation, double *tran
     const int best = costs[1] < costs[0];
     memcpy(rotation, rotations[best], sizeof *rotations), memcpy(translation, translations[best], sizeof *translations);
     if (!valid[best]) return INFINITY;
-    double cost = or_better(given, row, rotation, translation, INFINITY, rotation, translation, given->steps);
-    if (costs[!best] < INFINITY && (few || costs[!best] <= WORSE * costs[best]))
-        cost = or_better(given, row, rotation, translation, cost, rotations[!best], translations[!best], few ? given->steps : FEW_STEPS);
-    /* of so few points on a plane the other minimum may be one of pixels, and none of rays */
-    if (few && valid[0] && !valid[1] && mirrored(row, rotation, translation, mirror, shift))
-        cost = or_better(given, row, rotation, translation, cost, mirror, shift, given->steps);
+    double cost = or_better(given, row, rotation, translation, INFINITY, rotation, translation);
+    if (valid[!best] && (few || !isfinite(cost) || costs[!best] <= WORSE * costs[best]))
+        cost = or_better(given, row, rotation, translation, cost, rotations[!best], translations[!best]);
+    /* of points on a plane the other minimum may be one of pixels, and none of rays: of few, and of much noise */
+    if (isfinite(cost) && mirrored(row, rotation, translation, mirror, shift) &&
+        ((few && !valid[!best]) || cost_of(given, row, mirror, shift, &complete) <= WORSE * cost))
+        cost = or_better(given, row, rotation, translation, cost, mirror, shift);
     return cost;
 }
 

@@ -106,6 +106,10 @@ def test_samples_of_any_layout_and_form_follow_each_other():
                 # planes and channels side by side may be rounded otherwise
                 np.testing.assert_allclose(out["image"].astype(float), again["image"].astype(float), rtol=1e-5, atol=1)
                 assert (out["keypoints"].shape, again["keypoints"].shape) == ((0, 2), (1, 2))
+    for size, axis in (((1, 48), 0), ((48, 1), 1)):  # numpy calls them contiguous
+        row = np.flip(random.integers(0, 200, (*size, 3)).astype(np.uint8), axis)
+        one = transform(image=row, camera=example("pinhole", size).requires_grad_(False))
+        assert one["image"].shape == row.shape
     with pytest.raises(ValueError, match=r"image is .* but the image_size of camera"):
         transform(image=image[:-1])
     with pytest.raises(ValueError, match=r"keypoints must be \(N, 2\)"):
@@ -116,3 +120,16 @@ def test_samples_of_any_layout_and_form_follow_each_other():
         transform(image=image, bboxes=boxes[:, ::-1].copy())
     with pytest.raises(ValueError, match="holds real numbers"):
         transform(image=image, lidar=np.zeros((4, 3)))
+
+
+@pytest.mark.parametrize("lead", [(), (2,)])
+def test_pixels_of_half_precision_stay_finite(lead):
+    """The image of a ray nearly across the axis is farther away than half precision has numbers."""
+    focal = 40 / (math.pi / 2 - 5e-4)
+    camera = ct.KannalaBrandt([focal, focal, 48.0, 32.0], [0.0] * 4, image_size=(64, 96)).requires_grad_(False)
+    flat = dict.fromkeys(("yaw", "pitch", "roll", "focal", "centre", "distortion", "crop"))
+    pixels = torch.tensor([[88.0, 32.0], [50.0, 30.0]]).half().expand(*lead, 2, 2)
+    out = RandomCamera("pinhole", fov=(60, 60), camera=camera, **flat)(keypoints=pixels)
+    assert out["keypoints"].dtype == torch.float16
+    assert torch.isfinite(out["keypoints"]).all()
+    assert out["keypoints_valid"].tolist() == torch.tensor([False, True]).expand(*lead, 2).tolist()

@@ -482,5 +482,5 @@ def test_padding_and_fill():
     assert (black["mask"][:, None].expand_as(seen)[~seen] == 9).all()
     border = RandomMount(**mount, padding_mode="border")(batch)["image"]
     assert (border[outside] > 0).any()
-    # a border asks for positions in other cells of the lattice; both keep to 0.001 px, and values move by 0.1 a pixel
-    torch.testing.assert_close(border[inside], black["image"][inside], rtol=0, atol=2e-4)
+    # which cells are interpolated depends on the padding: 0.001 px of an image whose pixels differ by 1 at the most
+    torch.testing.assert_close(border[inside], black["image"][inside], atol=1e-3, rtol=0)

@@ -153,6 +153,27 @@ def test_both_minima_of_a_plane_are_compared():
     assert better > 60
 
 
+@pytest.mark.parametrize("points", [4, 6, 9, 70])
+def test_of_much_noise_the_better_minimum_of_a_plane_is_returned(points):
+    """Twelve pixels wide, and two of noise: both minima may begin alike, end slowly, or be none of rays."""
+    camera, g = lens(60), torch.Generator().manual_seed(0)
+    target = torch.zeros(200, points, 3).double()
+    target[..., :2] = 0.05 * (2 * torch.rand(200, points, 2, generator=g) - 1)
+    turn = rotation_matrix(0.6 * torch.randn(200, 3, generator=g).double())
+    pixels = camera.project(target @ turn.mT + torch.tensor([0.5, 0.2, 9.0]))[0]
+    pixels = pixels + 2 * torch.randn(pixels.shape, generator=g).double()
+    found, rms, valid = ct.solve_pnp(camera, target, pixels)
+    assert valid.all()
+    sight = torch.nn.functional.normalize(found.translation, dim=-1)
+    flip = torch.eye(3) - 2 * sight[:, :, None] * sight[:, None]
+    other = flip @ found.matrix()[:, :3, :3] @ torch.diag(torch.tensor([1.0, 1, -1])).double()
+    for row, start in product(range(len(pixels)), (turn, other)):
+        vector = cv2.Rodrigues(start[row].numpy())[0]
+        given = target[row].numpy(), pixels[row].numpy(), camera.K.numpy(), camera.distortion.numpy()
+        theirs = opencvs_rms(*given, vector, found.translation[row].numpy()[:, None].copy())
+        assert rms[row] <= theirs * (1 + 1e-5)
+
+
 def test_gradients_are_those_of_the_optimum():
     camera = lens(130)
     target, _, _, pixels = scenes(camera, 130, 1, 5, "planar")
