@@ -40,6 +40,8 @@ def run(arguments: argparse.Namespace) -> int:
             raise ValueError(f"{option} is for {'--dataset' if is_sheet else 'a sheet, without --dataset'}")
     if is_sheet and arguments.image is None:
         raise ValueError("which image? camtorch augment IMAGE --camera FILE")
+    if is_sheet and arguments.image.is_dir():
+        raise ValueError(f"{arguments.image}: a folder; a sheet is of one image, and --dataset LABELS is for a folder")
     like = None if arguments.preset == "none" else arguments.preset
     if like is not None and like != "real" and like not in PRESETS:
         known = "; ".join(f"{name}, {preset.origin}" for name, preset in PRESETS.items())
@@ -75,6 +77,12 @@ def _photograph(arguments: argparse.Namespace) -> Sample:
     image, orientation = images.read_stored(arguments.image)
     size, path = (image.shape[-2], image.shape[-1]), arguments.labels
     entries = {} if path is None else read_json(path)
+    if "annotations" in entries:
+        raise ValueError(
+            f"{path}: labels of a data set in COCO's form, which --dataset takes; --labels is of one image"
+        )
+    if path is not None and not entries.keys() & {"keypoints", "boxes", "gaze"}:
+        note(f"{path}: has no keypoints, boxes or gaze, so no labels are shown")
     if orientation not in (None, 1):
         note(f"{arguments.image} is shown as stored, not turned by its Exif orientation: so labels know it")
     if entries.get("camera") is None:
