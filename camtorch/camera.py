@@ -125,7 +125,8 @@ class Camera(BatchedModule):
 
     Raises:
         ValueError: a wrong shape or number of coefficients, bad values, an image size that is not positive.
-        TypeError: parameters that are not numbers, an image size that is not two integers.
+        TypeError: parameters that are not numbers, an image size that is not two integers; `Camera` itself, which
+            states no model.
     """
 
     key: ClassVar[str] = ""
@@ -185,6 +186,11 @@ class Camera(BatchedModule):
     def __init__(
         self, intrinsics: Numbers, distortion: Numbers | None = None, *, image_size: Sequence[int] | None = None
     ):
+        if type(self).optics is Camera.optics:
+            raise TypeError(
+                f"{type(self).__name__}: a camera is made by its model, as ct.KannalaBrandt(intrinsics, distortion), "
+                "or ct.KannalaBrandt.from_matrix(K, distortion) of a matrix K; ct.MODELS has all models"
+            )
         known = at_a_glance(type(self), intrinsics, distortion, image_size)
         if known is not None:
             intrinsics, distortion, names = known

@@ -11,6 +11,7 @@ labels along. What they find is compared in the camera's frame, by how far from 
 import argparse
 import time
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import matplotlib.pyplot as plt
@@ -82,7 +83,7 @@ def look_at(batch: Sample, jitter: float = 1.0) -> Sample:
 
 
 def plain(batch: Sample, jitter: float = 1.0) -> Sample:
-    """The square around each box, scaled; directions stay those of the camera, which nobody told of the crop."""
+    """The square around each box, scaled; directions stay those of the camera before the crop."""
     camera, boxes = batch["camera"], batch["boxes"][:, 0]
     low, high = boxes.split(2, -1)
     chance = jitter * (2 * torch.rand(len(boxes), 3) - 1)
@@ -146,7 +147,7 @@ def train(way: str, data: Sample, camera: ct.Camera, steps: int) -> Network:
         loss.backward()
         optimizer.step()
         schedule.step()
-        if step % 300 == 0 or step == steps:
+        if step % 100 == 0 or step == steps:
             print(f"{CROPS[way]:<28} step {step} of {steps}, loss {loss.item():.2f}", flush=True)
     return network
 
@@ -225,9 +226,11 @@ def draw(found: dict[str, dict[str, list[float]]], output: str) -> None:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("-o", "--output", default="driver_monitoring.png")
-    parser.add_argument("--labels", help="a file that ct.data.read reads: landmarks are learned from it instead")
+    parser.add_argument("--labels", help="a file that ct.data.read reads: learn landmarks from it instead, into a .pt")
     arguments = parser.parse_args()
     if arguments.labels:
-        learn_landmarks(arguments.labels)
+        weights = Path(arguments.output).with_suffix(".pt")
+        torch.save(learn_landmarks(arguments.labels).state_dict(), weights)
+        print(f"{weights}: the network's state_dict")
     else:
         draw(run(), arguments.output)

@@ -184,8 +184,10 @@ def kind_of(name: str, value: object, own: Mapping[str, str], owner: str) -> str
         if base is not None and not isinstance(value, (Tensor, np.ndarray, list, tuple)):
             return None  # image_path, mask_id
     if base is None and _holds_reals(value):
+        close = difflib.get_close_matches(name, KINDS, 1)
+        meant = f"Did you mean {close[0]!r}? " if close else ""
         raise ValueError(
-            f"{owner}: {name!r} holds real numbers, and whether they move with the camera is not known. "
+            f"{owner}: {name!r} holds real numbers, and whether they move with the camera is not known. {meant}"
             f"fields={{{name!r}: KIND}} says so, where KIND is {', '.join(KINDS)} or {KEEP}"
         )
     return base
@@ -217,8 +219,11 @@ def as_tensor(value: object, name: str, kind: str, owner: str) -> Tensor:
         value = torch.from_numpy(value)
     if not isinstance(value, Tensor) or value.dtype.is_complex:
         what = f"dtype {value.dtype}" if isinstance(value, (Tensor, np.ndarray)) else type(value).__name__
+        plain = isinstance(value, (list, tuple, int, float))
+        hint = ". Plain numbers go in as torch.tensor(numbers); a list has a tensor for each sample"
         raise TypeError(
-            f"{owner}: {name} must be a tensor of real numbers, {KINDS[kind].shape}; got {what}{_hint(name)}"
+            f"{owner}: {name} must be a tensor of real numbers, {KINDS[kind].shape}; got {what}"
+            f"{hint if plain else _hint(name)}"
         )
     if kind not in IMAGES and not value.dtype.is_floating_point:
         value = value.to(torch.get_default_dtype())  # whole pixels do not stay whole

@@ -22,7 +22,6 @@ from camtorch.data.seeded import generator
 _MUCH = 1 / 3  # of the new images
 _NOTHING = (233, 225, 209)  # the colour of what no camera saw
 _FINE = 3  # times what a sheet shows are the new images, so that its edges are smooth
-_LABELS = ("keypoints", "boxes", "gaze", "camera")
 _REAL = "another of 7,000 calibrated lenses for each image, of the field of view that --fov says"
 
 
@@ -41,6 +40,8 @@ def run(arguments: argparse.Namespace) -> int:
             raise ValueError(f"{option} is for {'--dataset' if is_sheet else 'a sheet, without --dataset'}")
     if is_sheet and arguments.image is None:
         raise ValueError("which image? camtorch augment IMAGE --camera FILE")
+    if is_sheet and arguments.image.is_dir():
+        raise ValueError(f"{arguments.image}: a folder; a sheet is of one image, and --dataset LABELS is for a folder")
     like = None if arguments.preset == "none" else arguments.preset
     if like is not None and like != "real" and like not in PRESETS:
         known = "; ".join(f"{name}, {preset.origin}" for name, preset in PRESETS.items())
@@ -76,11 +77,12 @@ def _photograph(arguments: argparse.Namespace) -> Sample:
     image, orientation = images.read_stored(arguments.image)
     size, path = (image.shape[-2], image.shape[-1]), arguments.labels
     entries = {} if path is None else read_json(path)
-    if entries and not any(name in entries for name in _LABELS):
-        hint = ". The labels of a data set go in with --dataset" if "annotations" in entries else ""
+    if "annotations" in entries:
         raise ValueError(
-            f"{path}: one of {', '.join(_LABELS)} was expected; got {', '.join(map(str, entries))!s:.80}{hint}"
+            f"{path}: labels of a data set in COCO's form, which --dataset takes; --labels is of one image"
         )
+    if path is not None and not entries.keys() & {"keypoints", "boxes", "gaze"}:
+        note(f"{path}: has no keypoints, boxes or gaze, so no labels are shown")
     if orientation not in (None, 1):
         note(f"{arguments.image} is shown as stored, not turned by its Exif orientation: so labels know it")
     if entries.get("camera") is None:

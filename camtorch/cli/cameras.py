@@ -194,6 +194,11 @@ def read_pair(images: Sequence[Path], sizes: Sequence[tuple[int, int]], argument
     if path is None:
         raise ValueError(f"{images[0]}: which cameras took the pair? --camera RIG, their calibration, says so")
     rig = read_rig(path, model=arguments.from_model)
+    if len(rig) == 1:
+        raise ValueError(
+            f"{path}: has one camera; a pair takes a file of two with their poses, as camtorch calibrate "
+            "--left LEFT --right RIGHT makes one"
+        )
     names = arguments.names or list(rig)
     if len(set(names)) != 2 or not set(names) <= set(rig):
         raise ValueError(f"{path}: of which cameras? --names LEFT RIGHT says two of {', '.join(rig)}")

@@ -22,6 +22,7 @@ from camtorch.warp.dewarp import Dewarp, Projection
 from camtorch.warp.warp import Warp
 
 _SLASHES = ("/", os.sep)
+_CALIBRATIONS = (".yml", ".yaml", ".json", ".xml")
 _TOLERANCE = 0.001  # pixels that nobody sees, for a lattice of positions also where a calibration is in float64
 _MOST_KEPT = 4  # warps of images of different sizes
 _MUCH = 0.6  # of a photograph: where a dewarped one shows less, it is said what shows more
@@ -135,6 +136,11 @@ def _single(arguments: argparse.Namespace, source: Path) -> None:
 
 def _many(arguments: argparse.Namespace) -> int:
     known = inputs.IMAGES | videos.FORMATS
+    if any(Path(name).suffix.lower() in _CALIBRATIONS for name in arguments.image):
+        raise ValueError(
+            f"{' '.join(arguments.image)}: all of them are taken for images; --camera names the calibration, and -o "
+            "the new image: camtorch dewarp photo.jpg --camera camera.yml -o straight.png"
+        )
     output, shard = many.output_folder(arguments.output), many.shard_of(arguments)
     if not output.exists() and not arguments.output.endswith(_SLASHES) and output.suffix.lower() in known:
         raise ValueError(f"{output}: is the name of one file, but there may be several; -o OUT/ names a folder")

@@ -114,7 +114,9 @@ def length(text: str) -> float:
     except ValueError:
         metres = math.nan
     if not 0 < metres < (math.inf if unit else 1.0):
-        raise _WrongWord(f"{text!r} is no length above 0, as 30mm, 3cm, 1in or, in metres and below 1, 0.03")
+        raise _WrongWord(
+            f"{text!r} is no length above 0 with its unit, as 30mm, 3cm, 1in; without one it is in metres, below 1"
+        )
     return metres
 
 

@@ -34,7 +34,7 @@ _OTHERS = (
     (rb"\x80[\x02-\x05]", "a pickle, which could run any code: not read. Save numpy.savez(path, K=K, D=D) instead"),
     (rb"\x93NUMPY", "a single array; save both by numpy.savez(path, K=K, D=D)"),
     (rb"\x89HDF", "a file of HDF5 or MATLAB, which is not read; export K and D from there"),
-    (rb"\x89PNG|\xff\xd8\xff|II\*\0|MM\0\*", "an image; a calibration is read here"),
+    (rb"\x89PNG|\xff\xd8\xff|II\*\0|MM\0\*", "an image, where a file of a calibration is wanted"),
 )
 
 

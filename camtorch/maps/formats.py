@@ -99,7 +99,9 @@ def load_map(path: str | os.PathLike[str], format: str | None = None) -> LookupM
     described = _read_description(name) if chosen is None or chosen.described else {}
     chosen = chosen or _FORMATS.get(str(described.get("format")))
     if chosen is None:
-        raise CameraFileError(name, "content", f"none that is known by it, or by {_description(name)}; say format")
+        raise CameraFileError(
+            name, "content", f"not that of a known map, and no {_description(name)} says it; say format"
+        )
     if described.get("format", chosen.name) != chosen.name:
         raise CameraFileError(_description(name), "format", f"describes {described['format']!r:.60}, not {chosen.name}")
     facts = {key: tuple(value) if isinstance(value, list) else value for key, value in described.items()}
@@ -170,7 +172,7 @@ def _chosen(path: str, format: str | None) -> MapFormat:
     suffixes = {suffix: known for known in reversed(_FORMATS.values()) for suffix in known.suffixes}
     if suffix not in suffixes:
         raise ValueError(
-            f"{path}: the name does not say the format; names on {', '.join(suffixes)} do, for the others say which, "
+            f"{path}: the name does not say the format; names that end in {', '.join(suffixes)} do. Say which, "
             f"as in format='dw100' or --format dw100; known are {', '.join(FORMATS)}"
         )
     return suffixes[suffix]

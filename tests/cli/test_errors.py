@@ -29,7 +29,7 @@ CASES = {
         ("dewarp camera.yml --camera camera.yml", "camera.yml: not an image"),
         ("dewarp cut.png --camera camera.yml", "cut.png: "),
         ("dewarp in.png --camera none.yml", "none.yml: No such file"),
-        ("dewarp in.png --camera in.png", "in.png: byte 0: an image; a calibration is read here"),
+        ("dewarp in.png --camera in.png", "in.png: byte 0: an image, where a file of a calibration is wanted"),
         ("dewarp in.png --camera bad.yml", "bad.yml: K: a camera matrix has 3 x 3"),
         ("dewarp in.png", "in.png: which camera took it? --camera FILE"),
         (f"dewarp {PHOTO} -o in.png/o.png", "in.png is no folder"),
@@ -58,6 +58,7 @@ CASES = {
     ],
     "many": [
         ("dewarp images --camera camera.yml", "into which folder? -o OUT/"),
+        ("dewarp in.png camera.yml o.png", "--camera names the calibration, and -o the new image: camtorch dewarp"),
         ("dewarp images none --camera camera.yml -o out", "none: no such file or folder"),
         ("dewarp images --camera camera.yml -o camera.yml", "camera.yml: is no folder"),
         ("dewarp images --camera camera.yml -o o.png", "o.png: is the name of one file"),
@@ -117,11 +118,17 @@ CASES = {
         (f"augment {PHOTO} --yaw 200", "yaw must lie within [-180, 180]"),
         (f"augment {PHOTO} --pitch=5,-5", "pitch must be (low, high)"),
         (f"augment {PHOTO} --preset webcam --fov 200", "does not reach 200 degrees"),
+        ("augment images --camera camera.yml", "images: a folder; a sheet is of one image, and --dataset LABELS"),
+        (
+            f"augment {PHOTO} --labels coco.json",
+            "coco.json: labels of a data set in COCO's form, which --dataset takes",
+        ),
         (f"augment {PHOTO} --labels labels.json -o labels.json --force", "would overwrite labels.json"),
         ("augment half.png --camera camera.yml", "--rescale scales the camera"),
     ],
     "rectify": [
         (PAIR, "in.png: which cameras took the pair? --camera RIG"),
+        (f"{PAIR} --camera camera.yml", "camera.yml: has one camera; a pair takes a file of two"),
         (f"{PAIR} --camera three.json", "of which cameras? --names LEFT RIGHT says two of left, right, third"),
         (f"{PAIR} --camera three.json --names x left", "says two of left, right, third"),
         (f"{PAIR} --camera rig.json --names left left", "says two of left, right"),
@@ -139,9 +146,12 @@ CASES = {
         ("board --board 9 -o b.pdf", "'9' is not COLUMNSxROWS"),
         ("board --board 9x6 -o b.png", "b.png: a board is drawn as .pdf or .svg"),
         ("board --board 9x6 --square 50mm -o b.pdf", "500 x 350 mm does not fit on paper of 297 x 210 mm"),
-        ("board --board 9x6 --square 3ft -o b.pdf", "'3ft' is no length above 0"),
+        ("board --board 9x6 --square 3ft -o b.pdf", "'3ft' is no length above 0 with its unit"),
         ("board --board 9x6 --square=-3 -o b.pdf", "'-3' is no length above 0"),
-        ("board --board 9x6 --square 24 -o b.pdf", "'24' is no length above 0, as 30mm, 3cm, 1in or, in metres"),
+        (
+            "board --board 9x6 --square 24 -o b.pdf",
+            "'24' is no length above 0 with its unit, as 30mm, 3cm, 1in; without one",
+        ),
         ("board --board 9x6 --paper a9 -o b.pdf", "'a9' is no paper: a4, a3"),
         ("board --board 9x6 --paper 20x20mm -o b.pdf", "a square would be less than a millimetre"),
         ("board --board 9x6 --spacing 0.3 -o b.pdf", "a chessboard has columns, rows, square; got columns, rows, spa"),
@@ -194,6 +204,7 @@ def files(tmp_path_factory):
     (folder / "bad.yml").write_text("K: [1, 2]")
     (folder / "bare.yml").write_text(LEVEL)
     (folder / "labels.json").write_text(json.dumps({"keypoints": [[20, 30]]}))
+    (folder / "coco.json").write_text(json.dumps({"images": [], "annotations": []}))
     (folder / "cut.png").write_bytes((folder / "in.png").read_bytes()[:3000])
     (folder / "images").mkdir()
     (folder / "empty").mkdir()

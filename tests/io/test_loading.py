@@ -51,7 +51,7 @@ def test_no_path(tmp_path):
         (b"", "content: the file is empty"),
         (pickle.dumps({"K": K, "D": D}), "byte 0: a pickle, which could run any code: not read. .*numpy.savez"),
         (b"\x93NUMPY\x01\0", "byte 0: a single array; save both by numpy.savez"),
-        (b"\x89PNG\r\n\x1a\n", "byte 0: an image; a calibration is read here"),
+        (b"\x89PNG\r\n\x1a\n", "byte 0: an image, where a file of a calibration is wanted"),
         (b"\xff\xd8\xff\xe0", "byte 0: an image"),
         (b"\x89HDF\r\n\x1a\n", "byte 0: a file of HDF5 or MATLAB"),
         (b"\xfe\xfd\xfc", "byte 0: not text"),

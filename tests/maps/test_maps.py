@@ -454,7 +454,7 @@ def test_bare_tables_have_a_description(tmp_path):
         ct.load_map(tmp_path / "map.bin")
     (tmp_path / "map.bin.json").unlink()
     for format in (None, "ti_ldc"):
-        with pytest.raises(ct.CameraFileError, match=r"known by it, or by .*map\.bin\.json|no map of ti_ldc"):
+        with pytest.raises(ct.CameraFileError, match=r"a known map, and no .*map\.bin\.json|no map of ti_ldc"):
             ct.load_map(tmp_path / "map.bin", format)
 
 

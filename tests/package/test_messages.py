@@ -33,6 +33,19 @@ def at(turn, shift):
 
 WRONG = [
     # what is no tensor, or not such a one
+    (lambda: ct.Camera(np.eye(3), np.zeros(4)), TypeError, r"Camera: a camera is made by its model, .*from_matrix\(K"),
+    (lambda: ct.Camera([20.0, 20.0, 15.5, 11.5]), TypeError, r"as ct.KannalaBrandt\(intrinsics, distortion\)"),
+    (lambda: ct.Camera.from_fov(90, image_size=SIZE), TypeError, r"ct.MODELS has all models"),
+    (
+        lambda: augment.BoxCrop((8, 8), camera=CAMERA)(image=IMAGES[0], boxes=[[3.0, 4.0, 9.0, 9.0]]),
+        TypeError,
+        r"Plain numbers go in as torch.tensor\(numbers\); a list has a tensor for each sample",
+    ),
+    (
+        lambda: augment.RandomMount(camera=CAMERA)(image=IMAGES[0], keypoint=torch.ones(3, 2)),
+        ValueError,
+        r"'keypoint' holds real numbers.* Did you mean 'keypoints'\? fields",
+    ),
     (lambda: ct.Pinhole([LEAF] * 4), TypeError, r"Pinhole: intrinsics is a list of tensors that require grad"),
     (lambda: CAMERA.project([LEAF] * 3), TypeError, r"points is a list of tensors that require grad; torch.stack"),
     (lambda: CAMERA.project(torch.ones(5, 3).to_sparse()), TypeError, r"points must be a dense tensor; got"),
