@@ -608,9 +608,9 @@ class SampleTransform(nn.Module):
             options, size = self.options, part.view.image_size
             ends = part.view.start, part.view.native()
             between = None if ends[0] is None or ends[1] is None else (ends[0], ends[1], part.view.rotation)
-        if is_single and (between is None or not options["tolerance"]):
+        fill, tolerance = options["fill"], options["tolerance"]
+        if is_single and (between is None or not tolerance):
             return {}
-        fill = options["fill"]
         images: dict[str, tuple[Tensor, Sampler]] = {}
         pixels: dict[str, Tensor] = {}
         for name, (found, value) in named.items():
@@ -624,8 +624,8 @@ class SampleTransform(nn.Module):
             elif is_single and moves(found, value) is _pixels:
                 pixels[name] = value.reshape(1, -1, 2)
         sizes, work = (part.camera._size_for("Warp"), size), Work(list(images.values()), list(pixels.values()))
-        if between is not None:
-            made = at_once(*between, sizes, options["tolerance"], work)
+        if between is not None and tolerance:
+            made = at_once(*between, sizes, tolerance, work)
         else:
             made = batch_at_once(cast("Warp", part.warp), work.images)
         if made is None:

@@ -113,8 +113,9 @@ typedef struct {
 /* What is made of pixels that are moved: positions as of grid_sample, OUTSIDE where there is none; or pixels, -1 there, of
    which ON_IMAGE leaves those on the image of `to` valid alone */
 enum { POSITIONS, PIXELS, ON_IMAGE };
-/* What is left to do: pixels wait for the extent of `from`, points for the limits of `to` */
-enum { LEFT_FROM = 1, LEFT_TO = 2 };
+/* What is left to do: pixels wait for the extent of `from`, points for the limits of `to`; most cells of a lattice want
+   exact positions */
+enum { LEFT_FROM = 1, LEFT_TO = 2, LEFT_MOST = 4 };
 #define OUTSIDE (-9)
 #define FAR 100 /* beyond, positions are drawn in */
 

@@ -94,7 +94,7 @@ _Rows = struct.Struct("20q").pack  # `Rows` of geometry.h
 packed_move = struct.Struct("8q2d12q").pack  # `Move` of geometry.h
 packed_lattices = struct.Struct(f"8q2d12q{CLASSIFICATION}6q").pack  # `Lattices`
 POSITIONS, PIXELS, ON_IMAGE = range(3)
-LEFT_FROM, LEFT_TO = 1, 2
+LEFT_FROM, LEFT_TO, LEFT_MOST = 1, 2, 4
 _NO_ROWS = (0, 0, 0, 0)
 
 
@@ -620,8 +620,10 @@ class Between:
         tolerance: float,
         padding: str,
         jobs: Callable[[tuple[int, ...]], list[bytes]] = lambda on_lattice: [],
-    ) -> Lattices:
+    ) -> Lattices | None:
         """Positions from nodes and from pixels at the rim: see `warp.grid.on_lattice`.
+
+        None where most cells would have positions of their own.
 
         Args:
             probes: (1, N, 2): of the nodes, then of the rim.
@@ -650,23 +652,24 @@ class Between:
         images = create_string_buffer(b"".join(made))
         more = first_row, narrow if is_double else 0, exact, used + 8, addressof(images), len(made)
         call = packed_lattices(*self._given, POSITIONS, *self._size, *rows, *asked, *how, *more)
-        self._run("camtorch_lattices", call, cameras)
+        if self._run("camtorch_lattices", call, cameras):
+            return None
         if count := _kept.counters[1]:
             found = kept[: sizes[0]].view(dtype).view(2, most, 8, 8)[:, :count].clone()
         else:
             found = torch.empty(2, 0, 8, 8, dtype=dtype, device="cpu")
         return Lattices(result.as_strided((cameras, 2, n + 5, m + 5), (*result.stride()[:2], m + 5, 1)), cells, found)
 
-    def _run(self, name: str, call: bytes, tiles: int) -> None:
-        """call: whose next tile, and number of places, are this thread's counters."""
+    def _run(self, name: str, call: bytes, tiles: int) -> int:
+        """Flags of what is not made. call: whose next tile, and number of places, are this thread's counters."""
         run, threads, counters = _entry(name, c_int64), min(thread_count(), tiles) if tiles > 1 else 1, _kept.counters
         while True:
             left: list[int] = []
             counters[:] = [0, 0]
             spread(lambda: left.append(run(call)), threads)  # noqa: B023 (which is called at once)
             flags = functools.reduce(operator.or_, left)
-            if not flags:
-                return
+            if not flags & (LEFT_FROM | LEFT_TO):
+                return flags
             for flag, native in ((LEFT_FROM, self._start), (LEFT_TO, self._end)):
                 if flags & flag:
                     native.follow()

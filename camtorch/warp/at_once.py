@@ -18,7 +18,7 @@ from camtorch._tracing import is_eager
 from camtorch.native import sampler
 from camtorch.native.library import library
 from camtorch.projection import compiled
-from camtorch.projection.compiled import LEFT_FROM, LEFT_TO, Native
+from camtorch.projection.compiled import LEFT_FROM, LEFT_MOST, LEFT_TO, Native
 from camtorch.warp.grid import FEWEST, MOST_KEPT, STEP, kept_probes
 from camtorch.warp.panorama import seam_of
 from camtorch.warp.sampling import Sampler
@@ -207,6 +207,8 @@ class _Call:
         words[2] = is_whole = threads == 1 or self._tiles <= _FEW
         words[1] = len(work.images)
         while flags := native.camtorch_together(words):
+            if flags & LEFT_MOST:
+                return None
             # of the lattice, else of the pixels, which go the other way
             left, (start, end) = (flags, (target, source)) if flags < _PIXELS else (flags // _PIXELS, (source, target))
             if left & LEFT_FROM:

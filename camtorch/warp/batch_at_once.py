@@ -71,5 +71,6 @@ def batch_at_once(warp: Warp, images: Sequence[tuple[Tensor, Sampler]]) -> Made 
 
     padding = PADDINGS[max(PADDINGS.index(how.padding_mode) for _, how in images)]
     probes = kept_probes(range(size[0]), size[1], torch.float32)
-    back.lattices(probes, size, 0, warp.tolerance, padding, jobs)
+    if back.lattices(probes, size, 0, warp.tolerance, padding, jobs) is None:
+        return None
     return Made(results, [])

@@ -312,9 +312,8 @@ def on_lattice(
 
     Where fourth differences say that cubics may miss by more than the tolerance, positions in the middle of a cell and
     of its sides decide: where cubics do miss, a cell's pixels come one by one, from quintics if these do not, else from
-    the cameras, as at the limit of what is mapped and beside it. What is mapped, or is not, between four nodes alone
-    and away from that limit is not seen. None of small images, without the compiled library, and where cameras that it
-    does not know would give most of the image.
+    the cameras, as at the limit of what is mapped and beside it. None if the cameras gave most of the image. What is
+    mapped, or is not, between four nodes alone and away from that limit is not seen.
 
     Args:
         source: the camera of the images.
@@ -336,7 +335,7 @@ def on_lattice(
     pixels = kept_probes(rows, width, like.dtype) if nodes <= MOST_KEPT else _probes(rows, width, like)
     if native is not None:
         made = native.lattices(pixels, (height, width), rows.start, tolerance, padding)
-        return Lattice(*made, (height, width), seam, native)
+        return None if made is None else Lattice(*made, (height, width), seam, native)
     exact = partial(_positions, source, target, rotation, None)
     positions, mapped = exact(pixels)  # (B, 1, N, 2)
     lattice = positions[:, 0, :nodes].movedim(-1, 1).contiguous().unflatten(2, (n + 5, m + 5))
