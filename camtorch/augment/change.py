@@ -247,13 +247,13 @@ class Change:
         return (self.target[0] if self.gate is not None else alone(self.parts[0].target)).clone()
 
     @property
-    def alone(self) -> Part | None:
-        """The part of a change of one sample, if a warp is all that happens to it."""
+    def whole(self) -> Part | None:
+        """The only part, if a warp is all that happens to it."""
         part = self.parts[0]
-        if self.count != 1 or part.rows is not None or self.gate is not None:
+        if part.rows is not None or self.gate is not None:
             return None
         if part.view is not None:
-            return part
+            return part if self.count == 1 else None
         return part if part.warp is not None and part.shades is None and part.light is None else None
 
     def leads_to(self, camera: Camera | Sequence[Camera]) -> bool:

@@ -34,6 +34,7 @@ from camtorch.mixed import Listed
 from camtorch.models import Pinhole
 from camtorch.rotations import are_rotations, check_rotation, rotation_matrix, rotation_vector
 from camtorch.warp.at_once import Work, at_once, between_of
+from camtorch.warp.batch_at_once import batch_at_once
 from camtorch.warp.sampling import Options, Sampler, as_options
 from camtorch.warp.warp import Warp
 
@@ -598,34 +599,40 @@ class SampleTransform(nn.Module):
         return moved
 
     def _at_once(self, named: Named, change: Change) -> dict[str, tuple[Tensor, Tensor | None]]:
-        """What moves of a single sample by one call of compiled code, and its validity."""
-        part = change.alone
+        """What moves by one call of compiled code, of batches images alone, and its validity."""
+        part, is_single = change.whole, change.count == 1
         if part is None:
             return {}
-        if part.view is None:
+        between = None
+        if not is_single:
+            options, size = cast("Warp", part.warp).options, part.target._size_for("Warp")
+        elif part.view is None:
             options, between = cast("Warp", part.warp).options, between_of(cast("Warp", part.warp))
             size = part.target._size_for("Warp")
         else:
             options, size = self.options, part.view.image_size
             ends = part.view.start, part.view.native()
             between = None if ends[0] is None or ends[1] is None else (ends[0], ends[1], part.view.rotation)
-        if between is None or not options["tolerance"]:
+        fill, tolerance = options["fill"], options["tolerance"]
+        if is_single and (between is None or not tolerance):
             return {}
-        fill = options["fill"]
         images: dict[str, tuple[Tensor, Sampler]] = {}
         pixels: dict[str, Tensor] = {}
         for name, (found, value) in named.items():
-            if found in ("depth", "distance"):  # which ask for positions again
+            if found in ("depth", "distance") or isinstance(value, list):  # which ask for positions again
                 return {}
             if found == "image" and len(fill) in (1, value.shape[1]):
                 images[name] = value, Sampler(options["mode"], options["padding_mode"], fill)
             elif found == "mask":
                 wide = value if value.ndim == 4 else value.unsqueeze(1)
                 images[name] = wide, Sampler("nearest", "zeros", (self.mask_fill,))
-            elif moves(found, value) is _pixels:
+            elif is_single and moves(found, value) is _pixels:
                 pixels[name] = value.reshape(1, -1, 2)
         sizes, work = (part.camera._size_for("Warp"), size), Work(list(images.values()), list(pixels.values()))
-        made = at_once(*between, sizes, options["tolerance"], work)
+        if between is not None and tolerance:
+            made = at_once(*between, sizes, tolerance, work)
+        else:
+            made = batch_at_once(cast("Warp", part.warp), work.images)
         if made is None:
             return {}
         results: dict[str, tuple[Tensor, Tensor | None]] = {}

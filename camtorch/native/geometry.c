@@ -63,6 +63,7 @@ enum { FEW, SOME, RATIO, ROOTS, ANGLES, ALL, ANY };
     }
 
 int32_t THIS(classify)(const Classification *);
+void THIS(sample_image)(const Job *, int64_t);
 
 /* How many numbers the map before a chart has */
 static int numbers_of_map(const Part *part) { return part->map == TURN ? 9 : part->map == BEND ? part->across + part->down : 0; }

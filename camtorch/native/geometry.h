@@ -147,6 +147,8 @@ typedef struct {
        and of those around a cell in which what is mapped ends. Each cell gets the number of its place there */
     void *exact;
     int64_t *used; /* how many places there are */
+    const Job *jobs; /* images (c) that are sampled, each as soon as its lattice is there; none where `exact` is double */
+    int64_t job_count;
 } Lattices;
 
 enum { SQUARES = STEP * STEP }; /* positions of a cell */

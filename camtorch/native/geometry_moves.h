@@ -295,6 +295,9 @@ static int64_t T(lattices)(const Lattices *given) {
     int left = 0;
     T(Between) b;
     b.index = -1;
-    while ((at = taken(given->move.next, &own)) < given->move.cameras && !left) left |= T(lattice)(given, at, &b);
+    while ((at = taken(given->move.next, &own)) < given->move.cameras && !left) {
+        left = T(lattice)(given, at, &b);
+        for (int64_t i = 0; i < given->job_count && !left; i++) THIS(sample_image)(given->jobs + i, at);
+    }
     return left;
 }

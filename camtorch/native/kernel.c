@@ -1124,6 +1124,15 @@ INLINE void bytes_of_sixteen(const Wide *image, char *result, const WideWindow *
     }
 }
 
+/* The three lower bytes of sixteen numbers */
+INLINE void store_colours(char *result, __m512i packed) {
+    const __m512i dense = _mm512_permutexvar_epi8(
+        _mm512_setr_epi32(0x04020100, 0x09080605, 0x0e0d0c0a, 0x14121110, 0x19181615, 0x1e1d1c1a, 0x24222120, 0x29282625,
+                          0x2e2d2c2a, 0x34323130, 0x39383635, 0x3e3d3c3a, 0, 0, 0, 0), packed);
+    _mm256_storeu_si256((__m256i *)result, _mm512_castsi512_si256(dense));
+    _mm_storeu_si128((__m128i *)(result + 32), _mm512_extracti32x4_epi32(dense, 2));
+}
+
 /* Three channels next to each other */
 INLINE void colours_of_sixteen(const Wide *image, char *result, const WideWindow *window, __m512i across, __m512i down,
                                const int rows) {
@@ -1146,11 +1155,34 @@ INLINE void colours_of_sixteen(const Wide *image, char *result, const WideWindow
         pick = _mm512_add_epi32(pick, _mm512_set1_epi32(0x00010001));
     }
 #undef PICKED
-    const __m512i dense = _mm512_permutexvar_epi8(
-        _mm512_setr_epi32(0x04020100, 0x09080605, 0x0e0d0c0a, 0x14121110, 0x19181615, 0x1e1d1c1a, 0x24222120, 0x29282625,
-                          0x2e2d2c2a, 0x34323130, 0x39383635, 0x3e3d3c3a, 0, 0, 0, 0), packed);
-    _mm256_storeu_si256((__m256i *)result, _mm512_castsi512_si256(dense));
-    _mm_storeu_si128((__m128i *)(result + 32), _mm512_extracti32x4_epi32(dense, 2));
+    store_colours(result, packed);
+}
+
+/* The same where images shrink, and a row of the window takes two registers */
+INLINE void far_colours_of_sixteen(const Wide *image, char *result, const WideWindow *window, __m512i across,
+                                   __m512i down, const int rows) {
+    const char *from = image->source + window->begin;
+    __m512i pick = byte_pairs16(window->x, 3), low[5], high[5], packed = _mm512_setzero_si512();
+    __mmask16 below[5]; /* which squares begin in a row or below it */
+    int c, k;
+    for (k = 0; k < rows; k++, from += image->below) {
+        ask_below(from, image->below);
+        low[k] = _mm512_loadu_si512(from), high[k] = _mm512_loadu_si512(from + 64);
+        below[k] = _mm512_cmpge_epi32_mask(window->y, _mm512_set1_epi32(k));
+    }
+#define PICKED(k) _mm512_maskz_permutex2var_epi8(NEIGHBOURS, low[k], pick, high[k])
+    for (c = 0; c < 3; c++) {
+        __m512i upper = PICKED(0), last = PICKED(1), lower = last;
+        for (k = 2; k < rows; k++) {
+            upper = _mm512_mask_mov_epi32(upper, below[k - 1], last);
+            last = PICKED(k);
+            lower = _mm512_mask_mov_epi32(lower, below[k - 1], last);
+        }
+        packed = _mm512_or_si512(packed, _mm512_slli_epi32(blended_bytes(upper, lower, across, down), 8 * c));
+        pick = _mm512_add_epi32(pick, _mm512_set1_epi32(0x00010001));
+    }
+#undef PICKED
+    store_colours(result, packed);
 }
 
 INLINE void floats_of_sixteen(const Wide *image, char *result, const WideWindow *window, __m512 u, __m512 v,
@@ -1195,8 +1227,9 @@ INLINE int sixteen(const Wide *image, char *result, const float *at_u, const flo
     const int32_t right = (int32_t)image->width - 1, bottom = (int32_t)image->height - 1;
     const __m512 u = _mm512_loadu_ps(at_u), v = _mm512_loadu_ps(at_v);
     const int rows = rows_of_sixteen(at_v);
-    /* where images shrink: soon */
-    if (layout == INTERLEAVED && llabs((int64_t)whole(at_u[15]) - whole(at_u[0])) > 19) return 0;
+    /* where images shrink, a row's pixels take one register, or two, of these: known at once */
+    const int64_t reach = layout == INTERLEAVED ? llabs((int64_t)whole(at_u[15]) - whole(at_u[0])) : 0;
+    if (reach > (image->width < 43 ? 19 : 40)) return 0;
     WideWindow window;
     __m512i x, y;
     __mmask16 good;
@@ -1237,8 +1270,11 @@ INLINE int sixteen(const Wide *image, char *result, const float *at_u, const flo
         else if (WITHIN(1, 5, 32)) bytes_of_sixteen(image, result, &window, across, down, 5);
         else return 0;
     } else {
-        if (rows <= 3 && WITHIN(3, 3, 64)) colours_of_sixteen(image, result, &window, across, down, 3);
-        else if (WITHIN(3, 5, 64)) colours_of_sixteen(image, result, &window, across, down, 5);
+        if (reach <= 19 && rows <= 3 && WITHIN(3, 3, 64)) colours_of_sixteen(image, result, &window, across, down, 3);
+        else if (reach <= 19 && WITHIN(3, 5, 64)) colours_of_sixteen(image, result, &window, across, down, 5);
+        else if (reach <= 19) return 0;
+        else if (rows <= 3 && WITHIN(3, 3, 128)) far_colours_of_sixteen(image, result, &window, across, down, 3);
+        else if (WITHIN(3, 5, 128)) far_colours_of_sixteen(image, result, &window, across, down, 5);
         else return 0;
     }
 #undef WITHIN
@@ -1339,11 +1375,18 @@ static const Tile interpolated[][2][3] = {WAYS(UINT8), WAYS(BOOL), WAYS(UINT16),
 static const Tile moved[] = {NAME(BYTES1, NEAREST, SCATTERED), NAME(BYTES2, NEAREST, SCATTERED),
                              NAME(BYTES4, NEAREST, SCATTERED), NAME(BYTES8, NEAREST, SCATTERED)};
 
+static Tile way_of(const Job *job) {
+    if (job->mode == NEAREST) return moved[job->type - BYTES1];
+    return interpolated[job->type][job->mode - BILINEAR][layout_of(job)];
+}
+
+/* One image as a whole */
+void THIS(sample_image)(const Job *job, int64_t b) { way_of(job)(job, b, 0, job->height); }
+
 /* Makes tiles until none is left that nobody has taken; how many it made */
 int32_t THIS(sample)(Job *job) {
     const int64_t tiles = (job->height + job->tile_rows - 1) / job->tile_rows;
-    const Tile make = job->mode == NEAREST ? moved[job->type - BYTES1]
-                                           : interpolated[job->type][job->mode - BILINEAR][layout_of(job)];
+    const Tile make = way_of(job);
     int32_t made;
     for (made = 0;; made++) {
 #if defined(_MSC_VER)

@@ -8,7 +8,7 @@ import operator
 import struct
 import threading
 from collections.abc import Callable, Sequence
-from ctypes import addressof, byref, c_double, c_int32, c_int64, c_void_p
+from ctypes import addressof, byref, c_double, c_int32, c_int64, c_void_p, create_string_buffer
 from itertools import accumulate
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -92,7 +92,7 @@ class _Cameras(ctypes.Structure):
 
 _Rows = struct.Struct("20q").pack  # `Rows` of geometry.h
 packed_move = struct.Struct("8q2d12q").pack  # `Move` of geometry.h
-packed_lattices = struct.Struct(f"8q2d12q{CLASSIFICATION}4q").pack  # `Lattices`
+packed_lattices = struct.Struct(f"8q2d12q{CLASSIFICATION}6q").pack  # `Lattices`
 POSITIONS, PIXELS, ON_IMAGE = range(3)
 LEFT_FROM, LEFT_TO, LEFT_MOST = 1, 2, 4
 _NO_ROWS = (0, 0, 0, 0)
@@ -613,7 +613,13 @@ class Between:
         return result, valid
 
     def lattices(
-        self, probes: Tensor, size: tuple[int, int], first_row: int, tolerance: float, padding: str
+        self,
+        probes: Tensor,
+        size: tuple[int, int],
+        first_row: int,
+        tolerance: float,
+        padding: str,
+        jobs: Callable[[tuple[int, ...]], list[bytes]] = lambda on_lattice: [],
     ) -> Lattices | None:
         """Positions from nodes and from pixels at the rim: see `warp.grid.on_lattice`.
 
@@ -625,6 +631,8 @@ class Between:
             first_row: of the target.
             tolerance: in pixels of the source.
             padding: that positions are for.
+            jobs: `Job` of sampler.h, of images (C, ...) that are sampled in the same call, by where the lattices lie;
+                of float32 alone.
         """
         cameras, dtype, count = self.cameras, self._start.dtype, probes.shape[1]
         self._start.add_tables(size[0] * size[1])  # of which some are computed one by one, or all
@@ -640,7 +648,9 @@ class Between:
         rows = *rows_of(probes), at, 2 * count, 1, count, valid, count, count, used
         asked = at, 2 * count, count, valid, count, valid + nodes, count, cameras, n, m, *size
         how = *self._size, tolerance, PADDINGS[padding], cells.data_ptr(), scratch
-        more = first_row, narrow if is_double else 0, exact, used + 8
+        made = jobs((at, 2 * count, count, cells.data_ptr(), n * m, n, m, exact, 64 * most))
+        images = create_string_buffer(b"".join(made))
+        more = first_row, narrow if is_double else 0, exact, used + 8, addressof(images), len(made)
         call = packed_lattices(*self._given, POSITIONS, *self._size, *rows, *asked, *how, *more)
         if self._run("camtorch_lattices", call, cameras):
             return None

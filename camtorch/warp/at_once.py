@@ -26,7 +26,7 @@ from camtorch.warp.sampling import Sampler
 if TYPE_CHECKING:
     from camtorch.warp.warp import Warp
 
-_HEAD, _LATTICE, _MOVE, _JOB = 5, 44, 22, 38  # words of the structures of C
+_HEAD, _LATTICE, _MOVE, _JOB = 5, 46, 22, 38  # words of the structures of C
 _MOST = 4  # forms of samples that a thread keeps calls of
 _FEW = 2  # tiles of an image that one thread makes alone
 _ALIGNED = 64
@@ -161,7 +161,7 @@ class _Call:
         move += [at, 2 * count, 1, count, valid, count, count, 0]
         asked = at, 2 * count, count, valid, count, valid + nodes, count, 1, n, m, *size, *source_size, tolerance
         lattice = compiled.packed_lattices(
-            *move, *asked, reach, cells, scratch, 0, narrow if is_double else 0, exact, used
+            *move, *asked, reach, cells, scratch, 0, narrow if is_double else 0, exact, used, 0, 0
         )
         moves = [
             compiled.packed_move(

@@ -67,6 +67,26 @@ def test_as_step_by_step(key, name, dtype):
         assert torch.equal(out["camera"].distortion, change.target.distortion[0])
 
 
+@pytest.mark.parametrize("threads", [1, 2, 3])
+@pytest.mark.parametrize("name", AUGMENTATIONS)
+@pytest.mark.parametrize("key", LENSES)
+def test_batches_as_step_by_step(key, name, threads):
+    """Each sample of a batch goes to a thread: the numbers do not depend on that."""
+    camera, before = example(key, SIZE).requires_grad_(False), torch.get_num_threads()
+    sample = {field: torch.stack([value, value.flip(-1)] * 2) for field, value in sample_for(torch.float32).items()}
+    torch.manual_seed(0)
+    augment = AUGMENTATIONS[name]()
+    torch.set_num_threads(threads)
+    try:
+        out = augment(sample, camera=camera)
+    finally:
+        torch.set_num_threads(before)
+    change = augment.last
+    assert torch.equal(out["image"], change.images(sample["image"]))
+    assert torch.equal(out["mask"], change.labels(sample["mask"][:, None], augment.mask_fill)[:, 0])
+    assert torch.equal(out["keypoints"], change.points(sample["keypoints"])[0])
+
+
 def test_what_comes_out_is_not_what_the_change_keeps():
     camera = example("brown_conrady", SIZE).requires_grad_(False)
     augment, sample = RandomMount(camera=camera), sample_for(torch.float32)

@@ -64,6 +64,10 @@ static int32_t factor_of(Part *part, int first, int last) {
     return part->n * (part->factor == RADIUS_TABLE ? 4 : 1) + part->m;
 }
 
+static int64_t sampled; /* how many images lattices were handed on for */
+
+void sample_image_fuzzed(const Job *job, int64_t b) { sampled += b >= 0 && b < job->count; }
+
 /* In the place of the one that kernel.c has, which has a fuzz of its own: cells of any kind */
 int32_t classify_fuzzed(const Classification *given) {
     int32_t todo = 0;
@@ -112,8 +116,11 @@ static int moved(const Cameras *cameras, int64_t tile) {
         asked.count = c, asked.rows = rows, asked.columns = columns, asked.height = height, asked.width = width;
         asked.source_height = move.height, asked.source_width = move.width, asked.tolerance = share() * 0.1;
         asked.padding = (int32_t)below(3), asked.cells = cells, asked.scratch = scratch;
-        Lattices lattices = {move, asked, below(50), narrow, exact, &used};
+        Job jobs[2] = {{0}};
+        jobs[0].count = jobs[1].count = c, sampled = 0;
+        Lattices lattices = {move, asked, below(50), narrow, exact, &used, jobs, below(3)};
         const int64_t left = lattices_fuzzed(&lattices);
+        fine &= left || sampled == c * lattices.job_count;
         fine &= used >= 0 && used <= c * rows * columns;
         for (int64_t i = 0; !left && i < c * rows * columns; i++) fine &= cells[i] >= CELL_EMPTY && cells[i] < used;
         free(cells), free(scratch), free(exact);
