@@ -626,13 +626,16 @@ def camera_of_sample(
     return camera
 
 
-def move_points(augmentation: Augmentation, change: Change, pixels: Tensor) -> tuple[Tensor, Tensor]:
+def move_points(
+    augmentation: Augmentation, change: Change, pixels: Tensor, made: tuple[Tensor, Tensor] | None = None
+) -> tuple[Tensor, Tensor]:
     """Keypoints (B, *N, 2) moved, and valid (B, *N); landmarks in their order in a mirror.
 
-    (-1, -1), by which front ends say that a point has no place, stays that, and is not valid.
+    (-1, -1), by which front ends say that a point has no place, stays that, and is not valid. What `together` has made
+    of them is not made again.
     """
     lost = (pixels == -1).all(-1)
-    moved, valid = change.points(pixels)
+    moved, valid = change.points(pixels) if made is None else made
     moved, valid = torch.where(lost.unsqueeze(-1), -1.0, moved), valid & ~lost
     mirrored, mirroring = change.mirrored, augmentation.mirroring
     order = None if mirroring is None else mirroring.order("keypoints", "keypoints", pixels.shape[-2])

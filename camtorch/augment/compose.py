@@ -183,7 +183,7 @@ class Compose(Augmentation):
             (first, *others) = step.parts  # one camera for all where it is one
             camera = step.target if others or first.rows is not None else first.target
         assert total is not None
-        sizes = {part.target.image_size for part in total.parts}
+        sizes = {part.image_size for part in total.parts}
         if len(sizes) > 1 and total.batch_type is not Listed:
             raise ValueError(
                 f"{self._name}: samples of one batch would come out in the sizes {sorted(map(str, sizes))}"

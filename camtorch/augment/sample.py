@@ -33,9 +33,8 @@ from camtorch.camera import Camera
 from camtorch.mixed import Listed
 from camtorch.models import Pinhole
 from camtorch.rotations import are_rotations, check_rotation, rotation_matrix, rotation_vector
-from camtorch.warp.at_once import Work, at_once, between_of
+from camtorch.warp.at_once import Work, at_once
 from camtorch.warp.sampling import Options, Sampler, as_options
-from camtorch.warp.warp import Warp
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -556,7 +555,7 @@ class SampleTransform(nn.Module):
         def put(name: str, value: Tensor | list[Tensor]) -> None:
             moved[name] = value if batched or isinstance(value, list) else value.squeeze(0)
 
-        known = {} if self.valid_mask or sample.get("image_valid") is not None else self._at_once(named, change)
+        known = {} if self.valid_mask or sample.get("image_valid") is not None else together(change, named, **options)
         for name, (found, value) in named.items():
             valid: Any
             if name in known:
@@ -591,45 +590,6 @@ class SampleTransform(nn.Module):
             target = change.target.clone() if batched else change.single
             moved["camera"] = list(target) if isinstance(target, Listed) else target
         return moved
-
-    def _at_once(self, named: Named, change: Change) -> dict[str, tuple[Tensor, Tensor | None]]:
-        """What moves of a single sample by one call of compiled code, and its validity."""
-        part = change.alone
-        if part is None:
-            return {}
-        if part.view is None:
-            options, between = cast("Warp", part.warp).options, between_of(cast("Warp", part.warp))
-            size = part.target._size_for("Warp")
-        else:
-            options, size = self.options, part.view.image_size
-            ends = part.view.start, part.view.native()
-            between = None if ends[0] is None or ends[1] is None else (ends[0], ends[1], part.view.rotation)
-        if between is None or not options["tolerance"]:
-            return {}
-        fill = options["fill"]
-        images: dict[str, tuple[Tensor, Sampler]] = {}
-        pixels: dict[str, Tensor] = {}
-        for name, (found, value) in named.items():
-            if found in ("depth", "distance"):  # which ask for positions again
-                return {}
-            if found == "image" and len(fill) in (1, value.shape[1]):
-                images[name] = value, Sampler(options["mode"], options["padding_mode"], fill)
-            elif found == "mask":
-                wide = value if value.ndim == 4 else value.unsqueeze(1)
-                images[name] = wide, Sampler("nearest", "zeros", (self.mask_fill,))
-            elif moves(found, value) is _pixels:
-                pixels[name] = value.reshape(1, -1, 2)
-        sizes, work = (part.camera._size_for("Warp"), size), Work(list(images.values()), list(pixels.values()))
-        made = at_once(*between, sizes, options["tolerance"], work)
-        if made is None:
-            return {}
-        results: dict[str, tuple[Tensor, Tensor | None]] = {}
-        for name, image in zip(images, made.images, strict=True):
-            results[name] = image if named[name][1].ndim == 4 else image.squeeze(1), None
-        for name, (moved, valid) in zip(pixels, made.pixels, strict=True):
-            value = named[name][1]
-            results[name] = moved.view(value.shape).to(value.dtype), valid.view(value.shape[:-1])
-        return results
 
     def _mirror(self, moved: Sample, named: Named, mirrored: Tensor | None, batched: bool) -> None:
         """Let landmarks and fields of a moved sample change places where they are seen in a mirror."""
@@ -684,6 +644,42 @@ class SampleTransform(nn.Module):
             raise ValueError(f"{self._name}: {name} must be {shapes}; got {[tuple(b.shape) for b in before]}")
         now = [v & b.to(v.device) for v, b in zip(now, before, strict=True)]
         return now if many else now[0].unsqueeze(0) if single else now[0]
+
+
+def together(
+    change: Change, named: Named, mask_fill: float = 0.0, lateral: float = 0
+) -> dict[str, tuple[Tensor, Tensor | None]]:
+    """What of a single sample moves by one call of compiled code, and its validity; `named` holds batches of one."""
+    part = change.parts[0]
+    if change.count != 1 or part.moves is None or part.rows is not None or change.gate is not None:
+        return {}
+    options, between = part.moves.options, part.between()
+    if between is None:
+        return {}
+    fill = options["fill"]
+    images: dict[str, tuple[Tensor, Sampler]] = {}
+    pixels: dict[str, Tensor] = {}
+    for name, (found, value) in named.items():
+        if found in ("depth", "distance"):  # which ask for positions again
+            return {}
+        if found == "image" and len(fill) in (1, value.shape[1]):
+            images[name] = value, Sampler(options["mode"], options["padding_mode"], fill)
+        elif found == "mask":
+            wide = value if value.ndim == 4 else value.unsqueeze(1)
+            images[name] = wide, Sampler("nearest", "zeros", (mask_fill,))
+        elif moves(found, value) is _pixels:
+            pixels[name] = value.reshape(1, -1, 2)
+    sizes = part.camera._size_for("Warp"), part.image_size
+    made = at_once(*between, sizes, options, Work(list(images.values()), list(pixels.values())))
+    if made is None:
+        return {}
+    results: dict[str, tuple[Tensor, Tensor | None]] = {}
+    for name, image in zip(images, made.images, strict=True):
+        results[name] = image if named[name][1].ndim == 4 else image.squeeze(1), None
+    for name, (moved, valid) in zip(pixels, made.pixels, strict=True):
+        value = named[name][1]
+        results[name] = moved.view(value.shape).to(value.dtype), valid.view(value.shape[:-1])
+    return results
 
 
 def from_pitch_yaw(angles: Tensor) -> Tensor:

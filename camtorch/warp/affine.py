@@ -16,11 +16,9 @@ from camtorch.camera import Camera
 from camtorch.native import sampler
 from camtorch.warp.grid import Lattice, Sampling, straight_lattice
 from camtorch.warp.routes import positions, route_of
-from camtorch.warp.sampling import Fill, Mode, PaddingMode, Sampler, joined, render
+from camtorch.warp.sampling import SHRINKS, Fill, Mode, PaddingMode, Sampler, joined, render
 from camtorch.warp.warp import Warp, checked
 
-SHRINKS = 1.5
-"""From this many pixels of the image to one of the result on, edits antialias by themselves."""
 _MOST = 8  # times that an image is halved
 _PLAIN = (torch.uint8, torch.float32, torch.float64)  # that torch interpolates as they are
 _WHOLE = 1e-9  # pixels by which the numbers of a map may miss whole ones
