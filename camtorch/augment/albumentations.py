@@ -99,11 +99,7 @@ class Transform(A.DualTransform):
             made = together(change, named, self.augmentation.mask_fill)
             rest = {name: value for name, value in data.items() if name not in made}
             moved: dict[str, Any] = super().apply_with_params({**params, "change": change}, *args, **rest)
-            for name, value in made.items():
-                of_points = named[name][0] == "keypoints"
-                moved[name] = (
-                    self._points(data[name], change, value) if of_points else as_array(value[0][0], data[name])
-                )
+            moved |= {name: self._key2func[name](data[name], change=change, made=value) for name, value in made.items()}
             result = {name: moved[name] for name in data}
             return result if isinstance(camera, Unknown) else {**result, "camera": self.apply_to_camera(camera, change)}
 
@@ -113,7 +109,7 @@ class Transform(A.DualTransform):
         kind = kinds.get(getattr(self._key2func.get(name), "__name__", "")) if isinstance(value, np.ndarray) else None
         if kind is None:
             return None
-        return kind, (_pixels(value) if kind == "keypoints" else as_tensor(name, value)[None])
+        return kind, (torch.as_tensor(value[:, :2]) if kind == "keypoints" else as_tensor(name, value))[None]
 
     def _source(self, data: Mapping[str, Any]) -> Camera:
         sizes = [(name, np.shape(data[name])[:2]) for name in ("image", "mask") if data.get(name) is not None]
@@ -121,18 +117,18 @@ class Transform(A.DualTransform):
 
     # -- what moves
 
-    def apply(self, img: np.ndarray, change: Change, **params: Any) -> np.ndarray:
-        return as_array(change.images(as_tensor("image", img)[None])[0], img)
+    def apply(self, img: np.ndarray, change: Change, made: Any = None, **params: Any) -> np.ndarray:
+        images = change.images(as_tensor("image", img)[None]) if made is None else made[0]
+        return as_array(images[0], img)
 
-    def apply_to_mask(self, mask: np.ndarray, change: Change, **params: Any) -> np.ndarray:
-        return as_array(change.labels(as_tensor("mask", mask)[None], self.augmentation.mask_fill)[0], mask)
+    def apply_to_mask(self, mask: np.ndarray, change: Change, made: Any = None, **params: Any) -> np.ndarray:
+        fill = self.augmentation.mask_fill
+        masks = change.labels(as_tensor("mask", mask)[None], fill) if made is None else made[0]
+        return as_array(masks[0], mask)
 
-    def apply_to_keypoints(self, keypoints: np.ndarray, change: Change, **params: Any) -> np.ndarray:
+    def apply_to_keypoints(self, keypoints: np.ndarray, change: Change, made: Any = None, **params: Any) -> np.ndarray:
         """Keypoints (N, 2 and more), x and y first, in pixels whose centres are whole numbers."""
-        return self._points(keypoints, change)
-
-    def _points(self, keypoints: np.ndarray, change: Change, made: Any = None) -> np.ndarray:
-        moved = move_points(self.augmentation, change, _pixels(keypoints), made)[0][0]
+        moved = move_points(self.augmentation, change, torch.as_tensor(keypoints[:, :2])[None], made)[0][0]
         return np.concatenate((moved.numpy(), keypoints[:, 2:]), 1)
 
     def apply_to_bboxes(self, bboxes: np.ndarray, change: Change, **params: Any) -> np.ndarray:
@@ -155,10 +151,6 @@ class Transform(A.DualTransform):
             return moved[0].numpy()
 
         return move
-
-
-def _pixels(keypoints: np.ndarray) -> Tensor:
-    return torch.as_tensor(keypoints[:, :2])[None]
 
 
 def _corners(bboxes: Any, camera: Camera) -> Tensor:

@@ -337,8 +337,6 @@ class Augmentation(SampleTransform):
         groups: list[tuple[list[int] | None, Camera]] = [(None, camera)]
         if isinstance(camera, Mixed):
             groups = list(camera.groups)
-        elif count == 1 and applied[0] and self.p == 1 and isinstance(applied, np.ndarray):
-            return Change(1, [self._part(None, camera, draw)])
         before = {group.image_size for _, group in groups}
         if 0 < self.p < 1 and self.image_size is not None and before != {self.image_size}:
             raise ValueError(

@@ -100,7 +100,7 @@ class Transform(v2.Transform):
         """Draw once for all inputs of a sample.
 
         Returns:
-            `change`, and `camera`, the new one.
+            `change`, `camera`, the new one, and `made`, the inputs that are moved already, and what became of them.
         """
         cameras = [one for one in flat_inputs if isinstance(one, Camera)]
         if len(cameras) > 1:
@@ -115,14 +115,10 @@ class Transform(v2.Transform):
                 boxes = torch.cat(_ends(plain.reshape(-1, 4), boxes.format.value), -1)[None] - 0.5
             change = self.augmentation.change(camera, self.augmentation.with_boxes(self.augmentation.draw(1), boxes))
             self.augmentation.last, self._flags = change, []
-            return {"change": change, "camera": change.single, "made": self._together(change, flat_inputs)}
-
-    def _together(self, change: Change, inputs: list[Any]) -> list[tuple[Any, Any]]:
-        """Those of the inputs that one call of compiled code moves, and what it makes of them."""
-        fields = [_field(one) for one in inputs]
-        named = {str(i): (field[0], field[1][None]) for i, field in enumerate(fields) if field is not None}
-        made = together(change, named, self.augmentation.mask_fill)
-        return [(inputs[int(i)], result) for i, result in made.items()]
+            fields = {str(i): field for i, one in enumerate(flat_inputs) if (field := _field(one)) is not None}
+            made = together(change, fields, self.augmentation.mask_fill)
+            left = [(flat_inputs[int(i)], result) for i, result in made.items()]
+            return {"change": change, "camera": change.single, "made": left}
 
     def transform(self, inpt: Any, params: dict[str, Any]) -> Any:
         """Move one input of a sample by the `params` of `make_params`."""
@@ -193,17 +189,16 @@ def _size(inpt: Any) -> tuple[int, int] | None:
 
 
 def _field(inpt: Any) -> tuple[str, Tensor] | None:
-    """An input as the field of a single sample; None for what moves by itself."""
+    """An input as the field of a batch of one; None for what moves by itself."""
     if isinstance(inpt, PIL.Image.Image):
-        return None if inpt.mode in _NO_COLOURS else ("image", as_tensor("image", np.asarray(inpt)))
-    if isinstance(inpt, (Camera, tv_tensors.BoundingBoxes)) or inpt.requires_grad:
+        return None if inpt.mode in _NO_COLOURS else ("image", as_tensor("image", np.asarray(inpt))[None])
+    kinds = {"image": tv_tensors.Image, "mask": tv_tensors.Mask, "keypoints": _PLACES[1:]}
+    plain = None if isinstance(inpt, (Camera, tv_tensors.TVTensor)) else "image"
+    kind = next((kind for kind, types in kinds.items() if isinstance(inpt, types)), plain)
+    if kind is None or inpt.ndim != KINDS[kind].dims or inpt.requires_grad:
         return None
-    kind = "mask" if isinstance(inpt, tv_tensors.Mask) else "keypoints" if isinstance(inpt, _PLACES) else "image"
-    known = not isinstance(inpt, tv_tensors.TVTensor) or kind != "image" or isinstance(inpt, tv_tensors.Image)
-    if not known or inpt.ndim != KINDS[kind].dims:
-        return None
-    plain = inpt.as_subclass(torch.Tensor)
-    return kind, _wide(plain) if kind == "keypoints" else plain
+    value = inpt.as_subclass(torch.Tensor)[None]
+    return kind, _wide(value) if kind == "keypoints" else value
 
 
 def _images(change: Change, images: Tensor) -> Tensor:

@@ -22,7 +22,7 @@ from camtorch.projection import compiled
 from camtorch.projection.compiled import LEFT_FROM, LEFT_MOST, LEFT_TO, Native
 from camtorch.warp.grid import FEWEST, MOST_KEPT, STEP, kept_probes
 from camtorch.warp.panorama import seam_of
-from camtorch.warp.sampling import SHRINKS, Options, Sampler
+from camtorch.warp.sampling import SHRINKS, SURELY, Options, Sampler
 
 if TYPE_CHECKING:
     from camtorch.warp.warp import Warp
@@ -31,7 +31,6 @@ _HEAD, _LATTICE, _MOVE, _JOB = 5, 44, 22, 38  # words of the structures of C
 _MOST = 4  # forms of samples that a thread keeps calls of
 _FEW = 2  # tiles of an image that one thread makes alone
 _ALIGNED = 64
-_SURELY = 0.999
 _PIXELS = 1 << 3  # flags of what is left of pixels are times this
 
 
@@ -230,7 +229,7 @@ class _Call:
                 end.follow()
             if flags >= _PIXELS:  # the images are made
                 words[1] = 0
-        if looks and not self._is_large():
+        if looks and not self._keeps_size():
             return None
         if not is_whole:
             for i in range(len(work.images)):
@@ -240,12 +239,12 @@ class _Call:
                 spread(lambda: native.camtorch_sample(run), threads)  # noqa: B023 (which is called at once)
         return made
 
-    def _is_large(self) -> bool:
+    def _keeps_size(self) -> bool:
         """Whether images surely shrink by less than a `MirrorWarp` halves them for, of steps that rounding adds up."""
-        seen = (abs(self._seen) <= 1).all(0)
+        seen = np.all(abs(self._seen) <= 1, 0)
         positions = self._seen * self._half
         down, right = positions[:, 1:] - positions[:, :-1], positions[:, :, 1:] - positions[:, :, :-1]
         both = seen[1:] & seen[:-1], seen[:, 1:] & seen[:, :-1]
         steps = [np.hypot(*step)[pair] for step, pair in zip((down, right), both, strict=True)]
         total, count = (sum(numbers) for numbers in zip(*((step.sum(), step.size) for step in steps), strict=True))
-        return bool(total < _SURELY * SHRINKS * 4 * STEP * max(count, 1))
+        return bool(total < SURELY * SHRINKS * 4 * STEP * max(count, 1))
