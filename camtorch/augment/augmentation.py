@@ -635,9 +635,10 @@ def move_points(
     lost = (pixels == -1).all(-1)
     moved, valid = change.points(pixels) if made is None else made
     moved, valid = torch.where(lost.unsqueeze(-1), -1.0, moved), valid & ~lost
-    mirrored, mirroring = change.mirrored, augmentation.mirroring
+    mirroring = augmentation.mirroring
     order = None if mirroring is None else mirroring.order("keypoints", "keypoints", pixels.shape[-2])
-    if mirrored is None or order is None:
+    mirrored = None if order is None else change.mirrored
+    if mirrored is None:
         return moved, valid
     rows, index = mirrored.reshape(-1, *[1] * (valid.ndim - 1)), torch.tensor(order, device=pixels.device)
     moved = torch.where(rows.unsqueeze(-1), moved.index_select(-2, index), moved)

@@ -82,9 +82,7 @@ class View:
 
     def warp(self, source: Camera) -> Warp:
         """From the camera before."""
-        if self.options["antialias"] is None:
-            return MirrorWarp(source, self.target, self.rotation, **self.options)
-        return Warp.unchecked(source, self.target, self.options).turned_by(self.rotation)
+        return MirrorWarp(source, self.target, self.rotation, **self.options)
 
 
 @dataclass

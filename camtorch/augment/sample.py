@@ -558,15 +558,12 @@ class SampleTransform(nn.Module):
         known = {} if self.valid_mask or sample.get("image_valid") is not None else together(change, named, **options)
         for name, (found, value) in named.items():
             valid: Any
-            if name in known:
-                result, valid = known[name]
-                put(name, result)
-            elif isinstance(value, list):
+            if isinstance(value, list):
                 pairs = [self._one(change.row(i), found, v.unsqueeze(0), options) for i, v in enumerate(value)]
                 put(name, [result.squeeze(0) for result, _ in pairs])
                 valid = [v.squeeze(0) for _, v in pairs if v is not None] or None
             else:
-                result, valid = self._one(change, found, value, options)
+                result, valid = known[name] if name in known else self._one(change, found, value, options)
                 put(name, result)
             if valid is not None:
                 put(f"{name}_valid", self._still(f"{name}_valid", valid, sample.get(f"{name}_valid"), batched))
