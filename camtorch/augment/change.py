@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, TypeVar
 
@@ -57,6 +57,8 @@ class View:
     """The camera before, for compiled code."""
     lens: Native | None = None
     """One of the same lens as the new camera, if there is one already."""
+    made: Warp | None = field(default=None, init=False)
+    """The warp, once somebody has asked for it."""
 
     @cached_property
     def target(self) -> Camera:
@@ -82,7 +84,9 @@ class View:
 
     def warp(self, source: Camera) -> Warp:
         """From the camera before."""
-        return MirrorWarp(source, self.target, self.rotation, **self.options)
+        if self.made is None:
+            self.made = MirrorWarp(source, self.target, self.rotation, **self.options)
+        return self.made
 
 
 @dataclass
@@ -100,9 +104,9 @@ class Part:
     light: Tensor | None = None
     """(n or 1, 1, H', W'): what the lens lets through."""
 
-    @cached_property
+    @property
     def warp(self) -> Warp | None:
-        """By which these rows move, made where it is asked for."""
+        """By which these rows move."""
         return self.moves.warp(self.camera) if isinstance(self.moves, View) else self.moves
 
     @property
