@@ -21,7 +21,7 @@ from torch import Tensor
 from camtorch.augment.augmentation import Augmentation, camera_of_sample, check_front_end, move_points
 from camtorch.augment.change import Change
 from camtorch.augment.numpy import as_array, as_tensor
-from camtorch.augment.sample import KINDS, Unknown, moves
+from camtorch.augment.sample import KINDS, Unknown, moves, together
 from camtorch.camera import Camera
 
 _OWNER = "albumentations.Transform"
@@ -95,8 +95,21 @@ class Transform(A.DualTransform):
         with torch.no_grad():
             self.augmentation.tell_of_empty_images(camera)
             change = self.augmentation.last = self.augmentation.change(camera, drawn)
-            moved: dict[str, Any] = super().apply_with_params({**params, "change": change}, *args, **data)
-            return moved if isinstance(camera, Unknown) else {**moved, "camera": self.apply_to_camera(camera, change)}
+            named = {name: field for name, value in data.items() if (field := self._field(name, value)) is not None}
+            made = together(change, named, self.augmentation.mask_fill)
+            rest = {name: value for name, value in data.items() if name not in made}
+            moved: dict[str, Any] = super().apply_with_params({**params, "change": change}, *args, **rest)
+            moved |= {name: self._key2func[name](data[name], change=change, made=value) for name, value in made.items()}
+            result = {name: moved[name] for name in data}
+            return result if isinstance(camera, Unknown) else {**result, "camera": self.apply_to_camera(camera, change)}
+
+    def _field(self, name: str, value: Any) -> tuple[str, Tensor] | None:
+        """What a sample holds as the field of a batch of one; None for what moves by itself."""
+        kinds = {"apply": "image", "apply_to_mask": "mask", "apply_to_keypoints": "keypoints"}
+        kind = kinds.get(getattr(self._key2func.get(name), "__name__", "")) if isinstance(value, np.ndarray) else None
+        if kind is None:
+            return None
+        return kind, (torch.as_tensor(value[:, :2]) if kind == "keypoints" else as_tensor(name, value))[None]
 
     def _source(self, data: Mapping[str, Any]) -> Camera:
         sizes = [(name, np.shape(data[name])[:2]) for name in ("image", "mask") if data.get(name) is not None]
@@ -104,15 +117,18 @@ class Transform(A.DualTransform):
 
     # -- what moves
 
-    def apply(self, img: np.ndarray, change: Change, **params: Any) -> np.ndarray:
-        return as_array(change.images(as_tensor("image", img)[None])[0], img)
+    def apply(self, img: np.ndarray, change: Change, made: Any = None, **params: Any) -> np.ndarray:
+        images = change.images(as_tensor("image", img)[None]) if made is None else made[0]
+        return as_array(images[0], img)
 
-    def apply_to_mask(self, mask: np.ndarray, change: Change, **params: Any) -> np.ndarray:
-        return as_array(change.labels(as_tensor("mask", mask)[None], self.augmentation.mask_fill)[0], mask)
+    def apply_to_mask(self, mask: np.ndarray, change: Change, made: Any = None, **params: Any) -> np.ndarray:
+        fill = self.augmentation.mask_fill
+        masks = change.labels(as_tensor("mask", mask)[None], fill) if made is None else made[0]
+        return as_array(masks[0], mask)
 
-    def apply_to_keypoints(self, keypoints: np.ndarray, change: Change, **params: Any) -> np.ndarray:
+    def apply_to_keypoints(self, keypoints: np.ndarray, change: Change, made: Any = None, **params: Any) -> np.ndarray:
         """Keypoints (N, 2 and more), x and y first, in pixels whose centres are whole numbers."""
-        moved = move_points(self.augmentation, change, torch.as_tensor(keypoints[:, :2])[None])[0][0]
+        moved = move_points(self.augmentation, change, torch.as_tensor(keypoints[:, :2])[None], made)[0][0]
         return np.concatenate((moved.numpy(), keypoints[:, 2:]), 1)
 
     def apply_to_bboxes(self, bboxes: np.ndarray, change: Change, **params: Any) -> np.ndarray:

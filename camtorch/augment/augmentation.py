@@ -337,8 +337,6 @@ class Augmentation(SampleTransform):
         groups: list[tuple[list[int] | None, Camera]] = [(None, camera)]
         if isinstance(camera, Mixed):
             groups = list(camera.groups)
-        elif count == 1 and applied[0] and self.p == 1 and isinstance(applied, np.ndarray):
-            return Change(1, [self._part(None, camera, draw)])
         before = {group.image_size for _, group in groups}
         if 0 < self.p < 1 and self.image_size is not None and before != {self.image_size}:
             raise ValueError(
@@ -626,17 +624,21 @@ def camera_of_sample(
     return camera
 
 
-def move_points(augmentation: Augmentation, change: Change, pixels: Tensor) -> tuple[Tensor, Tensor]:
+def move_points(
+    augmentation: Augmentation, change: Change, pixels: Tensor, made: tuple[Tensor, Tensor] | None = None
+) -> tuple[Tensor, Tensor]:
     """Keypoints (B, *N, 2) moved, and valid (B, *N); landmarks in their order in a mirror.
 
-    (-1, -1), by which front ends say that a point has no place, stays that, and is not valid.
+    (-1, -1), by which front ends say that a point has no place, stays that, and is not valid. What `together` has made
+    of them is not made again.
     """
     lost = (pixels == -1).all(-1)
-    moved, valid = change.points(pixels)
+    moved, valid = change.points(pixels) if made is None else made
     moved, valid = torch.where(lost.unsqueeze(-1), -1.0, moved), valid & ~lost
-    mirrored, mirroring = change.mirrored, augmentation.mirroring
+    mirroring = augmentation.mirroring
     order = None if mirroring is None else mirroring.order("keypoints", "keypoints", pixels.shape[-2])
-    if mirrored is None or order is None:
+    mirrored = None if order is None else change.mirrored
+    if mirrored is None:
         return moved, valid
     rows, index = mirrored.reshape(-1, *[1] * (valid.ndim - 1)), torch.tensor(order, device=pixels.device)
     moved = torch.where(rows.unsqueeze(-1), moved.index_select(-2, index), moved)

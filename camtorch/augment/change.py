@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, TypeVar
 
@@ -12,9 +12,10 @@ import torch
 from torch import Tensor, nn
 from torch.nn.utils.parametrize import type_before_parametrizations
 
-from camtorch._arguments import fails, holds
+from camtorch._arguments import are_numbers, fails, holds
 from camtorch._dtypes import narrow, widen
 from camtorch._editing import edited
+from camtorch._evaluation import rows_of
 from camtorch._module import remade
 from camtorch._numbers import joined
 from camtorch.camera import Camera
@@ -22,7 +23,9 @@ from camtorch.mixed import Listed, Mixed
 from camtorch.projection.compiled import Native
 from camtorch.projection.rows import single_native
 from camtorch.warp.affine import AffineWarp, MirrorWarp, after
+from camtorch.warp.at_once import between_of
 from camtorch.warp.boxes import corners_of, in_order
+from camtorch.warp.panorama import seam_of
 from camtorch.warp.sampling import Mode, Options
 from camtorch.warp.shifted import ShiftedWarp
 from camtorch.warp.shutter import Shutters
@@ -46,12 +49,21 @@ class View:
     distortion: Tensor
     """(n,)."""
     image_size: tuple[int, int]
-    turn: Sequence[float] | None
-    """The elements of the rotation, row by row, or None."""
+    rotation: Tensor | None
+    """(3, 3), or None."""
+    options: Options
+    """Of the warp that leads to it."""
     start: Native | None = None
     """The camera before, for compiled code."""
     lens: Native | None = None
     """One of the same lens as the new camera, if there is one already."""
+    made: Warp | None = field(default=None, init=False)
+    """The warp, once somebody has asked for it."""
+
+    @cached_property
+    def target(self) -> Camera:
+        """The one of the change, which nobody else gets."""
+        return self.camera()
 
     def camera(self) -> Camera:
         """A new one."""
@@ -63,17 +75,18 @@ class View:
         k = nn.Parameter(k, requires_grad=False) if k.shape[0] else k
         return remade(self.base, intrinsics=numbers, distortion=k, image_size=self.image_size)
 
-    @cached_property
-    def rotation(self) -> Tensor | None:
-        """(3, 3), or None."""
-        return None if self.turn is None else joined(self.turn, self.base.intrinsics, math).view(3, 3)
-
     def native(self) -> Native | None:
         """The camera for compiled code, if that knows the model."""
         intrinsics = joined(self.intrinsics, self.base.intrinsics, math)
         if self.lens is not None:
             return self.lens.before(intrinsics[None])
         return single_native(type_before_parametrizations(self.base), intrinsics, self.distortion)
+
+    def warp(self, source: Camera) -> Warp:
+        """From the camera before."""
+        if self.made is None:
+            self.made = MirrorWarp(source, self.target, self.rotation, **self.options)
+        return self.made
 
 
 @dataclass
@@ -82,41 +95,41 @@ class Part:
 
     rows: list[int] | None
     """Which samples of the batch, or None for all."""
-    warp: Warp | None
-    """None: nothing happens to these rows."""
+    moves: Warp | View | None
+    """By what; None: nothing happens to these rows."""
     camera: Camera
     """Before the change; the warp's source."""
     shades: tuple[Warp, Warp] | None = None
     """How red and blue move, where they do not move as green."""
     light: Tensor | None = None
     """(n or 1, 1, H', W'): what the lens lets through."""
-    view: View | None = None
-    """What the warp is made by, if it is made only when it is asked for."""
 
-    @classmethod
-    def seen(cls, rows: list[int] | None, camera: Camera, view: View, options: Options) -> Part:
-        """That of a warp from a camera to a view of the same place."""
-        part = cls(rows, None, camera, view=view)
-        del part.warp
-        part.__dict__["options"] = options
-        return part
-
-    def __getattr__(self, name: str) -> Any:
-        view: View | None = self.__dict__.get("view")
-        if name != "warp" or view is None:
-            raise AttributeError(f"Part has no {name}")
-        self.warp = Warp.unchecked(self.camera, view.camera(), self.__dict__["options"]).turned_by(view.rotation)
-        return self.warp
+    @property
+    def warp(self) -> Warp | None:
+        """By which these rows move."""
+        return self.moves.warp(self.camera) if isinstance(self.moves, View) else self.moves
 
     @property
     def target(self) -> Camera:
         """After the change."""
-        return self.camera if self.warp is None else self.warp.target
+        return self.camera if self.moves is None else self.moves.target
+
+    @property
+    def image_size(self) -> tuple[int, int]:
+        """(height, width) after the change."""
+        return self.moves.image_size if isinstance(self.moves, View) else self.target._size_for("Warp")
+
+    def between(self) -> tuple[Native, Native, Tensor | None] | None:
+        """Both cameras and the rotation for compiled code; None where it takes more than that."""
+        if not isinstance(self.moves, View):
+            return None if self.moves is None or self.shades or self.light is not None else between_of(self.moves)
+        start, end = self.moves.start, self.moves.native()
+        return None if start is None or end is None else (start, end, self.moves.rotation)
 
     def by(self, change: Callable[[Warp], Warp]) -> Part:
         """The part with each of its warps changed."""
         shades = None if self.shades is None else (change(self.shades[0]), change(self.shades[1]))
-        return replace(self, warp=None if self.warp is None else change(self.warp), shades=shades, view=None)
+        return replace(self, moves=None if self.warp is None else change(self.warp), shades=shades)
 
     def take(self, index: list[int]) -> Part:
         """These rows of the part, as all there is."""
@@ -151,32 +164,41 @@ def _joined(a: Part, b: Part) -> Part:
     Raises:
         ValueError: the colours or the light of a lens seen through another one, or a shutter before the last warp.
     """
-    if b.warp is None:
+    if b.moves is None:
         return a
-    first = a.warp
-    if first is None:
+    if a.moves is None:
         return replace(b, rows=a.rows, camera=a.camera)
-    if first.target_shutter is not None:
+    if not isinstance(a.moves, View) and a.moves.target_shutter is not None:
         raise ValueError(
             "Compose: what comes after a rolling shutter or an exposure would move its rows; rates go last"
         )
-    rotation = _both_turns(first.rotation, b.warp.rotation)
-    if not isinstance(b.warp, AffineWarp):
+    rotation = _both_turns(a.moves.rotation, b.moves.rotation)
+    if not isinstance(b.moves, AffineWarp):
         if a.shades is not None or a.light is not None:
             raise ValueError(
                 "Compose: the colours or the light of one lens would be seen through another; chromatic and vignetting "
                 "go to the last lens of a chain"
             )
-
+        if isinstance(b.moves, View) and not a.camera.batch_shape:
+            start = a.moves.start if isinstance(a.moves, View) else _single(a.camera)
+            return replace(b, rows=a.rows, camera=a.camera, moves=replace(b.moves, rotation=rotation, start=start))
         moved = b.by(lambda warp: MirrorWarp(a.camera, warp.target, rotation, **warp.shutters))
         return replace(moved, rows=a.rows, camera=a.camera)
-    edit, size = b.warp.matrix, b.warp.target.image_size
-    if isinstance(first, AffineWarp):
-        matrix = after(edit, first.matrix)
-        return replace(a, warp=AffineWarp(a.camera, edited(a.camera, matrix, size), matrix, rotation))
-    light = None if a.light is None else b.warp(a.light, padding_mode="border")
+    edit, size = b.moves.matrix, b.moves.target.image_size
+    if isinstance(a.moves, AffineWarp):
+        matrix = after(edit, a.moves.matrix)
+        return replace(a, moves=AffineWarp(a.camera, edited(a.camera, matrix, size), matrix, rotation))
+    light = None if a.light is None else b.moves(a.light, padding_mode="border")
     moved = a.by(lambda warp: MirrorWarp(a.camera, edited(warp.target, edit, size), rotation))
     return replace(moved, light=light)
+
+
+def _single(camera: Camera) -> Native | None:
+    """A single camera for compiled code; None where that does not do."""
+    if seam_of(camera) is not None or not are_numbers(*camera._tensors):
+        return None
+    rows = rows_of(camera, *camera._tensors)
+    return rows.native if rows.usable is None else None
 
 
 def _optioned(warp: Warp, options: Options) -> Warp:
@@ -242,19 +264,9 @@ class Change:
     @property
     def single(self) -> Camera:
         """The camera after, of a change of one sample; its own, not that of the change."""
-        if (view := self.parts[0].view) is not None:
+        if isinstance(view := self.parts[0].moves, View):
             return view.camera()
         return (self.target[0] if self.gate is not None else alone(self.parts[0].target)).clone()
-
-    @property
-    def whole(self) -> Part | None:
-        """The only part, if a warp is all that happens to it."""
-        part = self.parts[0]
-        if part.rows is not None or self.gate is not None:
-            return None
-        if part.view is not None:
-            return part if self.count == 1 else None
-        return part if part.warp is not None and part.shades is None and part.light is None else None
 
     def leads_to(self, camera: Camera | Sequence[Camera]) -> bool:
         """Whether these may be the cameras after: of their number and intrinsics, where one may look."""
@@ -285,8 +297,7 @@ class Change:
         """(count, 3, 3): `ray_after = R ray_before`."""
         parts = []
         for part, n in zip(self.parts, self._counts, strict=True):
-            moves = part.view or part.warp
-            turned = None if moves is None else moves.rotation
+            turned = None if part.moves is None else part.moves.rotation
             parts.append((_eye(part.camera.intrinsics) if turned is None else turned).expand(n, 3, 3))
         rotation = parts[0] if self._order is None else torch.cat(parts)[self._order]
         if self.gate is not None:
@@ -296,8 +307,8 @@ class Change:
     @property
     def mirrored(self) -> Tensor | None:
         """(count,) bool: which samples are seen in a mirror; None if none is."""
-        mirrors = [None if part.view is not None else part.warp for part in self.parts]
-        turns = [warp.rotation if isinstance(warp, MirrorWarp) else None for warp in mirrors]
+        moves = [part.moves for part in self.parts]
+        turns = [each.rotation if isinstance(each, (View, MirrorWarp)) else None for each in moves]
         if all(turn is None for turn in turns):
             return None
         device = self.parts[0].camera.intrinsics.device
@@ -335,7 +346,12 @@ class Change:
 
     def with_options(self, options: Options) -> Change:
         """The change with its warps made anew by other options."""
-        parts = [part.by(lambda warp: _optioned(warp, options)) for part in self.parts]
+        parts = [
+            replace(part, moves=replace(part.moves, options=options))
+            if isinstance(part.moves, View)
+            else part.by(lambda warp: _optioned(warp, options))
+            for part in self.parts
+        ]
         return Change(self.count, parts, batch_type=self.batch_type, gate=self.gate)
 
     def row(self, i: int) -> Change:

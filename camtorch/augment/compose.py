@@ -151,16 +151,6 @@ class Compose(Augmentation):
 
     # -- applying
 
-    def new_camera(self, source: Camera, values: Mapping[str, Tensor]) -> tuple[Camera, Tensor | None]:
-        count = max((len(value) for value in values.values() if value.ndim), default=1)
-        draw = {key: value.expand(count, *value.shape) if not value.ndim else value for key, value in values.items()}
-        change = self._change(source, {"apply": torch.ones(count, dtype=torch.bool), **draw})
-        target = change.target
-        if target.is_mixed:
-            kinds = sorted({type(one).__name__ for one in target})
-            raise ValueError(f"{self._name}: samples would come out with cameras of several models; got {kinds}")
-        return target, change.rotation
-
     def tell_of_empty_images(self, camera: Camera) -> None:
         for part in self.parts:
             part.tell_of_empty_images(camera)
@@ -183,7 +173,7 @@ class Compose(Augmentation):
             (first, *others) = step.parts  # one camera for all where it is one
             camera = step.target if others or first.rows is not None else first.target
         assert total is not None
-        sizes = {part.target.image_size for part in total.parts}
+        sizes = {part.image_size for part in total.parts}
         if len(sizes) > 1 and total.batch_type is not Listed:
             raise ValueError(
                 f"{self._name}: samples of one batch would come out in the sizes {sorted(map(str, sizes))}"

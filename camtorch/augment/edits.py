@@ -70,12 +70,6 @@ class Edit(Augmentation):
 
     # -- what follows from it
 
-    def new_camera(self, source: Camera, values: Mapping[str, Tensor]) -> tuple[Camera, Tensor | None]:
-        matrix, size = self.edit(
-            (source.height, source.width), {name: value.double() for name, value in values.items()}
-        )
-        return edited(source, matrix, size), _turn(matrix, source)
-
     def tell_of_empty_images(self, camera: Camera) -> None:
         """Nothing is empty that is not asked for."""
 

@@ -225,23 +225,21 @@ class RandomCamera(Augmentation):
         base, numbers, distortion, size, _ = self._target(source, values, xp)
         intrinsics = joined(numbers, distortion if xp is torch else base.intrinsics, xp)
         target = remade(base, intrinsics=intrinsics, distortion=distortion, image_size=size)
-        elements = self._turned(values, xp)
-        if elements is None:
-            return target, None
-        rotation = joined(elements, source.intrinsics, xp)
-        return target, rotation.view(*rotation.shape[:-1], 3, 3)
+        return target, self._rotation(values, source.intrinsics, xp)
 
-    def _turned(self, values: Mapping[str, Any], xp: Any) -> Sequence[Any] | None:
-        """The elements of the rotation, row by row; None: the camera stays as it looks."""
+    def _rotation(self, values: Mapping[str, Any], like: Tensor, xp: Any) -> Tensor | None:
+        """(*B, 3, 3); None: the camera stays as it looks."""
         none = next((0 * values[name] for name in _TURNS if name in values), None)
         if none is None:
             return None
         angles = [values.get(name, none) * (math.pi / 180) for name in _TURNS]
-        return mount_elements([xp.cos(a) for a in angles], [xp.sin(a) for a in angles])
+        elements = mount_elements([xp.cos(a) for a in angles], [xp.sin(a) for a in angles])
+        rotation = joined(elements, like, xp)
+        return rotation.view(*rotation.shape[:-1], 3, 3)
 
     def _part(self, rows: list[int] | None, source: Camera, draw: Mapping[str, Any]) -> Part:
         view = self._view(source, draw)
-        return super()._part(rows, source, draw) if view is None else Part.seen(rows, source, view, self.options)
+        return super()._part(rows, source, draw) if view is None else Part(rows, view, source)
 
     def _view(self, source: Camera, draw: Mapping[str, Any]) -> View | None:
         """What a draw makes of a single camera as plain numbers; None where it takes more than that."""
@@ -263,7 +261,8 @@ class RandomCamera(Augmentation):
             return None
         if before.usable is not None:
             return None
-        return View(base, numbers, distortion, size, self._turned(values, math), before.native, lens)
+        turn = self._rotation(values, source.intrinsics, math)
+        return View(base, numbers, distortion, size, turn, self.options, before.native, lens)
 
     @property
     def _is_usual(self) -> bool:
@@ -502,7 +501,7 @@ class RandomMount(RandomCamera):
         kind = next(kind for kind, name in _DEPTHS.items() if name == key)
         kind = "z" if kind == "depth" else kind
         warp = ShiftedWarp(source, part.target, part.warp.rotation, values, kind, shift, **self.options)
-        return replace(part, warp=warp, view=None)
+        return replace(part, moves=warp)
 
 
 class RandomLens(RandomCamera):

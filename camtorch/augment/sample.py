@@ -33,10 +33,9 @@ from camtorch.camera import Camera
 from camtorch.mixed import Listed
 from camtorch.models import Pinhole
 from camtorch.rotations import are_rotations, check_rotation, rotation_matrix, rotation_vector
-from camtorch.warp.at_once import Work, at_once, between_of
+from camtorch.warp.at_once import Work, at_once
 from camtorch.warp.batch_at_once import batch_at_once
 from camtorch.warp.sampling import Options, Sampler, as_options
-from camtorch.warp.warp import Warp
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -562,18 +561,15 @@ class SampleTransform(nn.Module):
         def put(name: str, value: Tensor | list[Tensor]) -> None:
             moved[name] = value if batched or isinstance(value, list) else value.squeeze(0)
 
-        known = {} if self.valid_mask or sample.get("image_valid") is not None else self._at_once(named, change)
+        known = {} if self.valid_mask or sample.get("image_valid") is not None else together(change, named, **options)
         for name, (found, value) in named.items():
             valid: Any
-            if name in known:
-                result, valid = known[name]
-                put(name, result)
-            elif isinstance(value, list):
+            if isinstance(value, list):
                 pairs = [self._one(change.row(i), found, v.unsqueeze(0), options) for i, v in enumerate(value)]
                 put(name, [result.squeeze(0) for result, _ in pairs])
                 valid = [v.squeeze(0) for _, v in pairs if v is not None] or None
             else:
-                result, valid = self._one(change, found, value, options)
+                result, valid = known[name] if name in known else self._one(change, found, value, options)
                 put(name, result)
             if valid is not None:
                 put(f"{name}_valid", self._still(f"{name}_valid", valid, sample.get(f"{name}_valid"), batched))
@@ -597,51 +593,6 @@ class SampleTransform(nn.Module):
             target = change.target.clone() if batched else change.single
             moved["camera"] = list(target) if isinstance(target, Listed) else target
         return moved
-
-    def _at_once(self, named: Named, change: Change) -> dict[str, tuple[Tensor, Tensor | None]]:
-        """What moves by one call of compiled code, of batches images alone, and its validity."""
-        part, is_single = change.whole, change.count == 1
-        if part is None:
-            return {}
-        between = None
-        if not is_single:
-            options, size = cast("Warp", part.warp).options, part.target._size_for("Warp")
-        elif part.view is None:
-            options, between = cast("Warp", part.warp).options, between_of(cast("Warp", part.warp))
-            size = part.target._size_for("Warp")
-        else:
-            options, size = self.options, part.view.image_size
-            ends = part.view.start, part.view.native()
-            between = None if ends[0] is None or ends[1] is None else (ends[0], ends[1], part.view.rotation)
-        fill, tolerance = options["fill"], options["tolerance"]
-        if is_single and (between is None or not tolerance):
-            return {}
-        images: dict[str, tuple[Tensor, Sampler]] = {}
-        pixels: dict[str, Tensor] = {}
-        for name, (found, value) in named.items():
-            if found in ("depth", "distance") or isinstance(value, list):  # which ask for positions again
-                return {}
-            if found == "image" and len(fill) in (1, value.shape[1]):
-                images[name] = value, Sampler(options["mode"], options["padding_mode"], fill)
-            elif found == "mask":
-                wide = value if value.ndim == 4 else value.unsqueeze(1)
-                images[name] = wide, Sampler("nearest", "zeros", (self.mask_fill,))
-            elif is_single and moves(found, value) is _pixels:
-                pixels[name] = value.reshape(1, -1, 2)
-        sizes, work = (part.camera._size_for("Warp"), size), Work(list(images.values()), list(pixels.values()))
-        if between is not None and tolerance:
-            made = at_once(*between, sizes, tolerance, work)
-        else:
-            made = batch_at_once(cast("Warp", part.warp), work.images)
-        if made is None:
-            return {}
-        results: dict[str, tuple[Tensor, Tensor | None]] = {}
-        for name, image in zip(images, made.images, strict=True):
-            results[name] = image if named[name][1].ndim == 4 else image.squeeze(1), None
-        for name, (moved, valid) in zip(pixels, made.pixels, strict=True):
-            value = named[name][1]
-            results[name] = _in_range(moved.view(value.shape), value.dtype), valid.view(value.shape[:-1])
-        return results
 
     def _mirror(self, moved: Sample, named: Named, mirrored: Tensor | None, batched: bool) -> None:
         """Let landmarks and fields of a moved sample change places where they are seen in a mirror."""
@@ -704,6 +655,48 @@ def _in_range(values: Tensor, dtype: torch.dtype) -> Tensor:
         most = torch.finfo(dtype).max
         values = values.clamp(-most, most)
     return values.to(dtype)
+
+
+def together(
+    change: Change, named: Named, mask_fill: float = 0.0, lateral: float = 0
+) -> dict[str, tuple[Tensor, Tensor | None]]:
+    """What moves by one call of compiled code, and its validity: images and pixels of a batch of one, images of others."""
+    part, is_single = change.parts[0], change.count == 1
+    if part.moves is None or part.rows is not None or change.gate is not None:
+        return {}
+    if not is_single and (part.shades is not None or part.light is not None):
+        return {}
+    options, between = part.moves.options, part.between() if is_single else None
+    if is_single and between is None:
+        return {}
+    fill = options["fill"]
+    images: dict[str, tuple[Tensor, Sampler]] = {}
+    pixels: dict[str, Tensor] = {}
+    for name, (found, value) in named.items():
+        if found in ("depth", "distance") or isinstance(value, list):  # which ask for positions again
+            return {}
+        if found == "image" and len(fill) in (1, value.shape[1]):
+            images[name] = value, Sampler(options["mode"], options["padding_mode"], fill)
+        elif found == "mask":
+            wide = value if value.ndim == 4 else value.unsqueeze(1)
+            images[name] = wide, Sampler("nearest", "zeros", (mask_fill,))
+        elif is_single and moves(found, value) is _pixels:
+            pixels[name] = value.reshape(1, -1, 2)
+    work = Work(list(images.values()), list(pixels.values()))
+    made = None
+    if between is not None:
+        made = at_once(*between, (part.camera._size_for("Warp"), part.image_size), options, work)
+    elif part.warp is not None:
+        made = batch_at_once(part.warp, work.images)
+    if made is None:
+        return {}
+    results: dict[str, tuple[Tensor, Tensor | None]] = {}
+    for name, image in zip(images, made.images, strict=True):
+        results[name] = image if named[name][1].ndim == 4 else image.squeeze(1), None
+    for name, (moved, valid) in zip(pixels, made.pixels, strict=True):
+        value = named[name][1]
+        results[name] = _in_range(moved.view(value.shape), value.dtype), valid.view(value.shape[:-1])
+    return results
 
 
 def from_pitch_yaw(angles: Tensor) -> Tensor:

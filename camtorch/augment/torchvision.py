@@ -19,6 +19,7 @@ from torch import Tensor
 from camtorch.augment.augmentation import Augmentation, camera_of_sample, check_front_end, move_points
 from camtorch.augment.change import Change
 from camtorch.augment.numpy import as_array, as_tensor
+from camtorch.augment.sample import KINDS, together
 from camtorch.camera import Camera
 
 try:
@@ -32,6 +33,7 @@ except Exception as error:  # a binary that does not match fails with a RuntimeE
     ) from error
 
 _OWNER = "torchvision.Transform"
+_NO_COLOURS = "1", "P", "PA"  # modes of PIL
 # since torchvision 0.23
 _PLACES: Any = (tv_tensors.BoundingBoxes, *([tv_tensors.KeyPoints] if hasattr(tv_tensors, "KeyPoints") else []))
 
@@ -98,7 +100,7 @@ class Transform(v2.Transform):
         """Draw once for all inputs of a sample.
 
         Returns:
-            `change`, and `camera`, the new one.
+            `change`, `camera`, the new one, and `made`, the inputs that are moved already, and what became of them.
         """
         cameras = [one for one in flat_inputs if isinstance(one, Camera)]
         if len(cameras) > 1:
@@ -113,41 +115,49 @@ class Transform(v2.Transform):
                 boxes = torch.cat(_ends(plain.reshape(-1, 4), boxes.format.value), -1)[None] - 0.5
             change = self.augmentation.change(camera, self.augmentation.with_boxes(self.augmentation.draw(1), boxes))
             self.augmentation.last, self._flags = change, []
-            return {"change": change, "camera": change.single}
+            fields = {str(i): field for i, one in enumerate(flat_inputs) if (field := _field(one)) is not None}
+            made = together(change, fields, self.augmentation.mask_fill)
+            left = [(flat_inputs[int(i)], result) for i, result in made.items()]
+            return {"change": change, "camera": change.single, "made": left}
 
     def transform(self, inpt: Any, params: dict[str, Any]) -> Any:
         """Move one input of a sample by the `params` of `make_params`."""
         # a graph of the camera would make the warp slower, and could not leave a DataLoader's worker
         with torch.set_grad_enabled(torch.is_grad_enabled() and getattr(inpt, "requires_grad", False)):
-            return self._moved(inpt, params["change"], params["camera"])
+            left = params.get("made", [])
+            place = next((i for i, (one, _) in enumerate(left) if one is inpt), None)
+            made = None if place is None else left.pop(place)[1]
+            return self._moved(inpt, params["change"], params["camera"], made)
 
-    def _moved(self, inpt: Any, change: Change, camera: Camera) -> Any:
+    def _moved(self, inpt: Any, change: Change, camera: Camera, made: Any = None) -> Any:
         if isinstance(inpt, Camera):
             return camera
         plain = inpt.as_subclass(torch.Tensor) if isinstance(inpt, tv_tensors.TVTensor) else inpt
         if isinstance(inpt, _PLACES):
             of_boxes = isinstance(inpt, tv_tensors.BoundingBoxes)
-            moved, valid = _boxes(change, plain, inpt.format.value) if of_boxes else self._points(change, plain)
-            if change.parts[0].warp is None:
+            moved, valid = _boxes(change, plain, inpt.format.value) if of_boxes else self._points(change, plain, made)
+            if change.parts[0].moves is None:
                 moved = plain
             result = tv_tensors.wrap(moved, like=inpt, canvas_size=camera.image_size)
             self._flags.append((result, valid))
             return result
-        if change.parts[0].warp is None:
+        if change.parts[0].moves is None:
             return inpt
         if isinstance(inpt, PIL.Image.Image):
-            return _pil(change, inpt)
+            return _pil(change, inpt, made)
         if isinstance(inpt, tv_tensors.Mask):
-            return tv_tensors.wrap(_labels(change, plain, self.augmentation.mask_fill), like=inpt)
-        if isinstance(inpt, (tv_tensors.Image, tv_tensors.Video)):
-            return tv_tensors.wrap(_images(change, plain), like=inpt)
-        return inpt if isinstance(inpt, tv_tensors.TVTensor) else _images(change, plain)
+            masks = _labels(change, plain, self.augmentation.mask_fill) if made is None else made[0][0]
+            return tv_tensors.wrap(masks, like=inpt)
+        if isinstance(inpt, tv_tensors.TVTensor) and not isinstance(inpt, (tv_tensors.Image, tv_tensors.Video)):
+            return inpt
+        images = _images(change, plain) if made is None else made[0][0]
+        return tv_tensors.wrap(images, like=inpt) if isinstance(inpt, tv_tensors.TVTensor) else images
 
-    def _points(self, change: Change, points: Tensor) -> tuple[Tensor, Tensor]:
+    def _points(self, change: Change, points: Tensor, made: Any) -> tuple[Tensor, Tensor]:
         """Pixels (..., 2), and valid (...)."""
         number = points.shape[-2] if points.ndim > 1 else 1
         rows = _wide(points).reshape(1, math.prod(points.shape[:-2]), number, 2)
-        moved, valid = move_points(self.augmentation, change, rows)
+        moved, valid = move_points(self.augmentation, change, rows, made)
         moved = moved if points.is_floating_point() else moved.round()
         return moved.reshape(points.shape).to(points.dtype), valid.reshape(points.shape[:-1])
 
@@ -178,6 +188,19 @@ def _size(inpt: Any) -> tuple[int, int] | None:
     return None if isinstance(inpt, (Camera, tv_tensors.TVTensor)) else tuple(inpt.shape[-2:])
 
 
+def _field(inpt: Any) -> tuple[str, Tensor] | None:
+    """An input as the field of a batch of one; None for what moves by itself."""
+    if isinstance(inpt, PIL.Image.Image):
+        return None if inpt.mode in _NO_COLOURS else ("image", as_tensor("image", np.asarray(inpt))[None])
+    kinds = {"image": tv_tensors.Image, "mask": tv_tensors.Mask, "keypoints": _PLACES[1:]}
+    plain = None if isinstance(inpt, (Camera, tv_tensors.TVTensor)) else "image"
+    kind = next((kind for kind, types in kinds.items() if isinstance(inpt, types)), plain)
+    if kind is None or inpt.ndim != KINDS[kind].dims or inpt.requires_grad:
+        return None
+    value = inpt.as_subclass(torch.Tensor)[None]
+    return kind, _wide(value) if kind == "keypoints" else value
+
+
 def _images(change: Change, images: Tensor) -> Tensor:
     """Images (..., C, H, W), or (H, W), all of one sample."""
     frames = images.reshape(-1, *images.shape[-3:]) if images.ndim > 2 else images[None, None]
@@ -186,14 +209,15 @@ def _images(change: Change, images: Tensor) -> Tensor:
     return moved.reshape(*images.shape[:-2], *moved.shape[-2:])
 
 
-def _pil(change: Change, image: PIL.Image.Image) -> PIL.Image.Image:
-    if image.mode in ("1", "P", "PA"):
+def _pil(change: Change, image: PIL.Image.Image, made: Any) -> PIL.Image.Image:
+    if image.mode in _NO_COLOURS:
         raise ValueError(
             f"{_OWNER}: values between those of a PIL image of mode {image.mode!r} mean nothing; "
             "image.convert('RGB') makes it an image, tv_tensors.Mask(image) labels"
         )
     array = np.asarray(image)
-    moved = as_array(change.images(as_tensor("image", array)[None])[0], array)
+    images = change.images(as_tensor("image", array)[None]) if made is None else made[0]
+    moved = as_array(images[0], array)
     return PIL.Image.frombuffer(image.mode, moved.shape[1::-1], moved, "raw", image.mode, 0, 1)
 
 

@@ -16,11 +16,9 @@ from camtorch.camera import Camera
 from camtorch.native import sampler
 from camtorch.warp.grid import Lattice, Sampling, straight_lattice
 from camtorch.warp.routes import positions, route_of
-from camtorch.warp.sampling import Fill, Mode, PaddingMode, Sampler, joined, render
+from camtorch.warp.sampling import SHRINKS, SURELY, Fill, Mode, PaddingMode, Sampler, joined, render
 from camtorch.warp.warp import Warp, checked
 
-SHRINKS = 1.5
-"""From this many pixels of the image to one of the result on, edits antialias by themselves."""
 _MOST = 8  # times that an image is halved
 _PLAIN = (torch.uint8, torch.float32, torch.float64)  # that torch interpolates as they are
 _WHOLE = 1e-9  # pixels by which the numbers of a map may miss whole ones
@@ -64,7 +62,7 @@ class MirrorWarp(Warp):
     ) -> Tensor:
         """Warped images, as of `Warp.forward`; smaller ones of them where they shrink."""
         plain = not (torch.compiler.is_compiling() or in_transform()) and is_concrete(self.target.intrinsics)
-        if self._decides and plain:
+        if self._decides and plain and (self._halvings is None or any(self._halvings)):
             sampler = checked(self, images, mode, padding_mode, fill)
             smooth = sampler.mode != "nearest" and images.dtype != torch.bool
             if smooth and route_of(self, images, sampler.mode) == "kept":
@@ -138,6 +136,10 @@ class AffineWarp(MirrorWarp):
         rotation = None if self.rotation is None else self.rotation.mT
         return AffineWarp(self.target, self.source, inverted(self.matrix), rotation, **self.options)
 
+    def pin(self) -> Warp:
+        """Nothing: copied and shrunk images ask for no positions, and the others' are kept as they are asked for."""
+        return self
+
     # -- images
 
     def forward(
@@ -155,6 +157,8 @@ class AffineWarp(MirrorWarp):
             made = self._shrunk(images, mode) if made is None else made
             if made is not None:
                 return made
+            if self._halvings is None and bool((self._scale < SURELY * SHRINKS).all()):
+                self._halvings = [0] * len(self._maps)
             if padding_mode == "zeros" and self._is_inside:
                 padding_mode = "border"  # up to the outer edges of its pixels an image ends nowhere
         return super().forward(images, mode=mode, padding_mode=padding_mode, fill=values)
@@ -167,10 +171,20 @@ class AffineWarp(MirrorWarp):
         return bool((low > -_NEARLY).all() & (high < size + _NEARLY).all())
 
     @cached_property
+    def _back(self) -> Tensor:
+        """(B or 1, 2, 3): the maps back, without a graph."""
+        return inverted(self._maps.detach())
+
+    @cached_property
+    def _scale(self) -> Tensor:
+        """(B or 1, 2): the pixels of the image, across and down, that come to one of the result."""
+        return self._back[:, :, :2].abs().sum(-1)
+
+    @cached_property
     def _edges(self) -> Tensor:
         """(B or 1, 2, 2): where two opposite corners of the edited image lie, from the corner of the image's pixels."""
         height, width = self.target._size_for("Warp")
-        back = inverted(self._maps.detach())
+        back = self._back
         ends = back.new_tensor([[-0.5, -0.5], [width - 0.5, height - 0.5]])
         return (back[:, None, :, :2] * ends[None, :, None]).sum(-1) + back[:, None, :, 2] + 0.5
 
@@ -210,9 +224,8 @@ class AffineWarp(MirrorWarp):
         if not (self.antialias or self._decides) or mode == "nearest" or images.dtype == torch.bool:
             return None
         height, width = self.target._size_for("Warp")
-        back = inverted(self._maps)
-        scale = back[:, :, :2].abs().sum(-1)
-        if not bool((back[:, 0, 1] == 0).all() & (scale > (1 if self.antialias else SHRINKS)).any()):
+        back, least = self._back, 1 if self.antialias else SHRINKS
+        if not bool((back[:, 0, 1] == 0).all() & (self._scale > least).any()):
             return None
         edges = self._edges
         if not (self._is_inside and bool((edges - edges.round()).abs().max() < _NEARLY)):

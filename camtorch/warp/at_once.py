@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from itertools import accumulate
 from typing import TYPE_CHECKING, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -21,7 +22,7 @@ from camtorch.projection import compiled
 from camtorch.projection.compiled import LEFT_FROM, LEFT_MOST, LEFT_TO, Native
 from camtorch.warp.grid import FEWEST, MOST_KEPT, STEP, kept_probes
 from camtorch.warp.panorama import seam_of
-from camtorch.warp.sampling import Sampler
+from camtorch.warp.sampling import SHRINKS, SURELY, Options, Sampler
 
 if TYPE_CHECKING:
     from camtorch.warp.warp import Warp
@@ -36,10 +37,11 @@ _PIXELS = 1 << 3  # flags of what is left of pixels are times this
 def between_of(warp: Warp) -> tuple[Native, Native, Tensor | None] | None:
     """Source, target and rotation of a warp for compiled code; None where it has to go step by step.
 
-    That is where its positions are kept, exact, antialiased, in a graph, traced, of a batch, a seam or a shutter.
+    That is where its positions are kept, exact, antialiased throughout, in a graph, traced, of a batch, a seam or a
+    shutter.
     """
     source, target, rotation = warp.source, warp.target, warp.rotation
-    if not warp.is_an_operator or warp._decides or warp._pinned is not None or warp.batch_shape:
+    if not warp.is_an_operator or warp._pinned is not None or warp.batch_shape:
         return None
     if not warp.tolerance or warp.antialias or warp.shutter is not None or warp.target_shutter is not None:
         return None
@@ -78,21 +80,24 @@ def at_once(
     target: Native,
     rotation: Tensor | None,
     sizes: tuple[tuple[int, int], tuple[int, int]],
-    tolerance: float,
+    options: Options,
     work: Work,
 ) -> Made | None:
     """The images of a sample and its pixels.
 
-    None where a lattice does not do, images lie too oddly in memory, or something is in a graph or traced.
+    None where a lattice does not do, images shrink, lie too oddly in memory, or something is in a graph or traced.
 
     Args:
         source: the camera of the images, single.
         target: that of the images to make.
         rotation: (3, 3), `ray_target = R ray_source`, or None.
         sizes: (height, width) of the source's image, and of the target's.
-        tolerance: positive; see `Warp`.
+        options: of a `Warp` whose tolerance is positive, or of a `MirrorWarp` that decides where to antialias.
         work: what is to be made.
     """
+    tolerance = options["tolerance"]
+    if not tolerance or options["antialias"]:
+        return None
     tensors = [image for image, _ in work.images] + list(work.pixels)
     if not is_eager(*tensors) or (torch.is_grad_enabled() and any(t.requires_grad for t in tensors)):
         return None
@@ -110,7 +115,7 @@ def at_once(
     _calls.kept[key] = call  # the last one
     while len(_calls.kept) > _MOST:
         del _calls.kept[next(iter(_calls.kept))]
-    return call(source, target, rotation, work)
+    return call(source, target, rotation, work, options["antialias"] is None)
 
 
 class _Call:
@@ -181,8 +186,14 @@ class _Call:
         self._tiles = max((sampler.tiles_of(sampler.empty(image, 1, size)) for image, _ in images), default=1)
         self._size, self._pixels, self._dtype = size, size[0] * size[1], dtype
         self._kept = memory, probes, kept  # what the words point to
+        positions = memory[: parts[0]].view(dtype).view(2, count)[:, :nodes].view(2, n + 5, m + 5)
+        self._seen = positions[:, ::4, ::4].numpy()
+        self._half = np.array([source_size[1] / 2, source_size[0] / 2])[:, None, None]
+        self._may_shrink = any(how.mode != "nearest" and image.dtype != torch.bool for image, how in images)
 
-    def __call__(self, source: Native, target: Native, rotation: Tensor | None, work: Work) -> Made | None:
+    def __call__(
+        self, source: Native, target: Native, rotation: Tensor | None, work: Work, decides: bool
+    ) -> Made | None:
         words, turns = self._words, 0 if rotation is None else rotation.data_ptr()
         target.add_tables(self._pixels if work.images else 0)
         if work.pixels:
@@ -204,7 +215,8 @@ class _Call:
             at += _JOB
         native, threads = library(), min(thread_count(), self._tiles)
         assert native is not None  # or nobody has a `Native`
-        words[2] = is_whole = threads == 1 or self._tiles <= _FEW
+        looks = decides and self._may_shrink
+        words[2] = is_whole = not looks and (threads == 1 or self._tiles <= _FEW)
         words[1] = len(work.images)
         while flags := native.camtorch_together(words):
             if flags & LEFT_MOST:
@@ -217,6 +229,8 @@ class _Call:
                 end.follow()
             if flags >= _PIXELS:  # the images are made
                 words[1] = 0
+        if looks and not self._keeps_size():
+            return None
         if not is_whole:
             for i in range(len(work.images)):
                 job = words[self._first_job + i * _JOB : self._first_job + (i + 1) * _JOB]
@@ -224,3 +238,13 @@ class _Call:
                 run[_JOB - 1] = 0
                 spread(lambda: native.camtorch_sample(run), threads)  # noqa: B023 (which is called at once)
         return made
+
+    def _keeps_size(self) -> bool:
+        """Whether images surely shrink by less than a `MirrorWarp` halves them for, of steps that rounding adds up."""
+        seen = np.all(abs(self._seen) <= 1, 0)
+        positions = self._seen * self._half
+        down, right = positions[:, 1:] - positions[:, :-1], positions[:, :, 1:] - positions[:, :, :-1]
+        both = seen[1:] & seen[:-1], seen[:, 1:] & seen[:, :-1]
+        steps = [np.hypot(*step)[pair] for step, pair in zip((down, right), both, strict=True)]
+        total, count = (sum(numbers) for numbers in zip(*((step.sum(), step.size) for step in steps), strict=True))
+        return bool(total < SURELY * SHRINKS * 4 * STEP * max(count, 1))

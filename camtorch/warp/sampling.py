@@ -26,6 +26,9 @@ Name = TypeVar("Name", bound=str)
 MODES: tuple[Mode, ...] = get_args(Mode)
 PADDINGS: tuple[PaddingMode, ...] = get_args(PaddingMode)
 
+SHRINKS = 1.5
+"""From this many pixels of the image to one of the result on, edits antialias by themselves."""
+SURELY = 0.999  # of that: whatever rounding does, less does not
 _REACH = {"nearest": 1, "bilinear": 1, "bicubic": 2}  # pixels to either side of a position that have a part in it
 _LARGE = 1 << 23  # numbers in an image whose copy in float32 leaves every cache
 _TILE = 512  # pixels along the sides of what is then sampled at a time

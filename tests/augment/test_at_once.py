@@ -1,14 +1,26 @@
 """A single sample is made by one call of compiled code, to the very numbers that its change makes step by step."""
 
+import importlib
 import math
 
 import numpy as np
+import PIL.Image
 import pytest
 import torch
+from torchvision_stand_in import torchvision_of
 
 import camtorch as ct
 import camtorch.augment.numpy
-from camtorch.augment import Compose, RandomCamera, RandomLens, RandomMount
+import camtorch.augment.sample
+from camtorch.augment import (
+    Compose,
+    HorizontalFlip,
+    RandomCamera,
+    RandomLens,
+    RandomMount,
+    RandomResizedCrop,
+    Resize,
+)
 
 SIZE = (96, 130)
 DTYPES = torch.float32, torch.float64
@@ -35,6 +47,11 @@ AUGMENTATIONS = {
     "another lens": lambda: RandomCamera("dms60", image_size=(90, 120), min_filled=0),
     "filled": lambda: RandomMount(min_filled=0.9, p=0.7),
     "chain": lambda: Compose([RandomMount(), RandomLens()], antialias=False),
+    "chain that decides": lambda: Compose([RandomMount(), RandomLens()]),
+    "flipped chain": lambda: Compose([RandomResizedCrop(SIZE, scale=(0.5, 1)), HorizontalFlip(), RandomLens()]),
+    "chain that shrinks": lambda: Compose([RandomMount(), RandomLens(), Resize((40, 54))], mask_fill=3),
+    "a lens that shrinks": lambda: Compose([RandomCamera("dms60", image_size=(64, 70), min_filled=0)]),
+    "edits": lambda: Compose([RandomResizedCrop((64, 80), scale=(0.3, 0.6)), HorizontalFlip()], fill=9),
 }
 
 
@@ -153,3 +170,73 @@ def test_pixels_of_half_precision_stay_finite(lead):
     assert out["keypoints"].dtype == torch.float16
     assert torch.isfinite(out["keypoints"]).all()
     assert out["keypoints_valid"].tolist() == torch.tensor([False, True]).expand(*lead, 2).tolist()
+
+
+@pytest.fixture(params=["torchvision", "albumentations"])
+def transform(request, monkeypatch):
+    """A function of an augmentation, an image (H, W, 3), a mask and pixels, of arrays, by another library's classes."""
+    if request.param == "albumentations":
+        A = pytest.importorskip("albumentations", reason="albumentations is not installed")  # noqa: N806
+        front_end = importlib.import_module("camtorch.augment.albumentations")
+
+        def transform(augment, image, mask, pixels):
+            both = A.KeypointParams("xy", remove_invisible=False)
+            pipeline = A.Compose([front_end.Transform(augment)], keypoint_params=both, seed=3)
+            out = pipeline(image=image, mask=mask, keypoints=pixels)
+            return out["image"], out["mask"], out["keypoints"]
+
+        yield transform
+        return
+    with torchvision_of("stand-in", monkeypatch) as tv_tensors:
+        front_end = importlib.import_module("camtorch.augment.torchvision")
+
+        def transform(augment, image, mask, pixels):
+            torch.manual_seed(3)
+            planes = tv_tensors.Image(torch.from_numpy(image).permute(2, 0, 1))
+            points = tv_tensors.KeyPoints(torch.from_numpy(pixels), canvas_size=SIZE)
+            sample = {"again": planes, "image": planes, "mask": tv_tensors.Mask(torch.from_numpy(mask)), "at": points}
+            sample["shown"] = PIL.Image.fromarray(image)
+            out = front_end.Transform(augment)(sample)
+            assert out["again"].data_ptr() != out["image"].data_ptr()
+            assert torch.equal(out["again"], out["image"])
+            np.testing.assert_array_equal(np.asarray(out["shown"]), out["image"].permute(1, 2, 0).numpy())
+            return out["image"].permute(1, 2, 0).numpy(), out["mask"].numpy(), out["at"].numpy()
+
+        yield transform
+
+
+@pytest.mark.parametrize("name", AUGMENTATIONS)
+def test_front_ends_as_step_by_step(transform, name, monkeypatch):
+    augment, random = AUGMENTATIONS[name](), np.random.default_rng(0)
+    augment.camera = example("brown_conrady", SIZE).requires_grad_(False)
+    image = random.integers(256, size=(*SIZE, 3), dtype=np.uint8)
+    mask = random.integers(9, size=SIZE, dtype=np.uint8)
+    pixels = random.uniform(-10, 140, (9, 2)).astype(np.float32)
+    pixels[3] = -1
+    got = transform(augment, image, mask, pixels)
+    monkeypatch.setattr(camtorch.augment.sample, "at_once", lambda *given: None)
+    for made, expected in zip(got, transform(augment, image, mask, pixels), strict=True):
+        assert made.dtype == expected.dtype
+        np.testing.assert_array_equal(made, expected)
+    assert (got[2][3] == -1).all()
+
+
+@pytest.mark.parametrize("name", ["mount", "chain that decides", "flipped chain"])
+def test_what_goes_at_once_makes_no_warp(name):
+    camera, sample = example("brown_conrady", SIZE).requires_grad_(False), sample_for(torch.float32)
+    augment = AUGMENTATIONS[name]()
+    augment(sample, camera=camera)
+    assert augment.last.parts[0].moves.made is None
+
+
+@pytest.mark.parametrize("antialias", [None, False])
+def test_a_mirrored_chain_goes_back(antialias):
+    camera = example("brown_conrady", SIZE).requires_grad_(False)
+    augment = Compose([HorizontalFlip(p=1, landmarks=[(0, 1)]), RandomLens()], camera=camera, antialias=antialias)
+    sample = {**sample_for(torch.float32), "gaze": torch.tensor([0.1, 0.2, -0.9])}
+    out = augment(sample)
+    assert torch.linalg.det(out["rotation"]) < 0
+    back = augment.inverse(keypoints=out["keypoints"], gaze=out["gaze"])
+    torch.testing.assert_close(back["gaze"], sample["gaze"])
+    seen = out["keypoints_valid"]
+    torch.testing.assert_close(back["keypoints"][seen], sample["keypoints"][seen], rtol=0, atol=1e-2)

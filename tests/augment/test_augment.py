@@ -471,7 +471,7 @@ def test_compiled_in_one_graph():
 
 def test_padding_and_fill():
     batch = sample()
-    mount = {"yaw": (40, 40), "pitch": (0, 0), "roll": (0, 0)}
+    mount = {"yaw": (40, 40), "pitch": (0, 0), "roll": (0, 0), "tolerance": 0}  # a lattice may differ by padding
     black, grey = (RandomMount(**mount, fill=fill, mask_fill=9, valid_mask=True)(batch) for fill in (0.0, 0.5))
     seen = black["image_valid"].expand_as(black["image"])
     assert 0.1 < seen.float().mean() < 0.9
