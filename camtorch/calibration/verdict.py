@@ -312,8 +312,10 @@ def warnings(calibration: Calibration) -> list[str]:
 
 def _search(survey: Survey) -> Iterator[str]:
     if not survey.calibration.converged:
+        held = survey.calibration.adjusted.held_by
+        by = f", held by {held} corners at the end of what the camera shows, which another step would lose" * bool(held)
         yield (
-            "The search did not end at an optimum: do not use this camera. See whether the board's size, the image "
+            f"The search did not end at an optimum{by}: do not use this camera. See whether the board's size, the image "
             "size and the model are right, try another model first, or give start=a camera"
         )
 
