@@ -118,7 +118,7 @@ class Splined(Camera):
 
     @classmethod
     def searched(cls) -> type[Camera]:
-        return _searched(cls)
+        return _searched(cls)  # type: ignore[arg-type]  # a class can be hashed
 
     def extra_repr(self) -> str:
         """The grid in the place of its control points."""

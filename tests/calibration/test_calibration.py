@@ -353,16 +353,17 @@ def test_a_surface_is_learnt_to_the_noise_and_one_that_ends_before_the_corners_s
         assert not short.converged
         _, valid = short.camera.project(short.extrinsics(board[None].expand(14, -1, -1)))
         lost = seen.isfinite().all(-1) & ~valid
-        assert lost.any()
+        assert short.lost == int(lost.sum()) > 0
+        assert any("A surface has to reach further" in text for text in short.warnings)
+        assert short.adjusted.converged or fov_x == 60
         assert short.residuals[lost].isnan().all()
 
 
 @slow
-@pytest.mark.parametrize("rows", [10, 11])
-def test_a_surface_is_learnt_from_corners_on_its_edge(rows):
-    """OV-plane; of 10 rows the edge goes through a corner, those of 11 were chosen by the training views alone."""
+def test_a_surface_beats_kannala_brandt_on_images_that_it_never_saw():
+    """OV-plane; the grid was chosen by two-fold cross-validation over the training views."""
     train, test = ov_plane("train"), ov_plane("test")
-    model = ct.Splined.with_grid(columns=12, rows=rows, fov_x=200)
+    model = ct.Splined.with_grid(columns=12, rows=11, fov_x=200)
     found = calibrate(train, model=model, start=calibrate(train, model="kannala_brandt").camera.convert(model).camera)
     assert found.converged
     assert found.rms < 0.427
