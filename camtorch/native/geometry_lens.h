@@ -374,9 +374,10 @@ INLINE R T(surface_edge)(const Part *part, const R *k, R behind, R a, R b) {
 static void T(on_surface)(const T(Camera) *c, int n, const R *restrict a, const R *restrict b, I *restrict ok) {
     const Part *part = c->parts + c->stages;
     const R *k = c->numbers[c->stages];
+    EACH(i) ok[i] = T(surface_edge)(part, k, (R)1e-4, a[i], b[i]) > 0; /* up to its edge and a hair behind, no further */
+    if (c->all_certain) return;
     T(Cells) cells;
     T(cells)(part, k, 0, n, a, b, &cells);
-    EACH(i) ok[i] = T(surface_edge)(part, k, (R)1e-4, a[i], b[i]) > 0; /* up to its edge and a hair behind, no further */
     for (int i = 0; i < n; i++) ok[i] &= c->certain[cells.at[i] / 2];
 }
 
