@@ -375,6 +375,11 @@ class Camera(BatchedModule):
         """
         return None
 
+    @classmethod
+    def searched(cls) -> type[Camera]:
+        """The model while its cameras are looked for: pixels may go on a little behind where its own end."""
+        return cls
+
     def _model_name(self) -> str:
         # a class that adds methods alone is of the model that it is made from
         return next(cls.__name__ for cls in type(self).__mro__ if "optics" in cls.__dict__)

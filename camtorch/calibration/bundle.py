@@ -157,6 +157,17 @@ class Adjusted:
         """There, linearised."""
         return self.problem.equations(self.problem.flat(self.state))
 
+    @cached_property
+    @torch.no_grad()
+    def held_by(self) -> int:
+        """How many points would be lost by another step: these hold a search that did not converge."""
+        problem, flat = self.problem, self.problem.flat(self.state)
+        rows = torch.arange(len(self.cost), device=self.cost.device)
+        before = problem.looks(flat, rows)
+        step, _ = problem.linearised(flat, rows).step(torch.full_like(self.cost, FIRST_DAMPING))
+        after = problem.looks(problem.moved(flat, step, rows), rows)
+        return sum(int((a.valid & ~b.valid & (a.weights > 0)).sum()) for a, b in zip(before, after, strict=True))
+
 
 @torch.no_grad()
 def adjust(
@@ -174,7 +185,8 @@ def adjust(
     """The state of least squares near a given one, for each of B problems, whose cameras see the same views.
 
     A point that was seen and has no pixel, because the camera's field of view ends before it, counts as far away: no
-    step is taken that loses points. The loss is one of `LOSSES` or None, of the length of each residual in px, see
+    step is taken that loses points. On the way a lens may go on behind its end, see `Camera.searched`; what lies there
+    in the end is not valid. The loss is one of `LOSSES` or None, of the length of each residual in px, see
     `robust`. progress: called after each step with its number and the costs (B,).
     """
     problem = Bundle(sights, state, free, loss, loss_scale)
@@ -195,7 +207,7 @@ def adjust(
         found.cost,
         found.converged,
         tuple(look.residuals for look in looks),
-        tuple(look.valid for look in looks),
+        tuple(problem.shown(c, look) for c, look in enumerate(looks)),
         tuple(look.weights for look in looks),
         problem,
     )
@@ -383,6 +395,15 @@ class Bundle:
             self._last = given, [self.look(c, flat, rows) for c in range(len(self.sights))]
         return self._last[1]
 
+    def shown(self, c: int, look: _Look) -> Tensor:
+        """(B, V, N): the points that a camera shows, and not only while it is searched."""
+        kind = _kind(self.sights[c].model)
+        if kind.searched() is kind:
+            return look.valid
+        camera = fixed_camera(kind, look.camera.intrinsics, look.camera.distortion)
+        camera._warned = True
+        return look.valid & camera.project(look.frames[-1])[1]
+
     def sight(self, c: int, rows: Tensor | None) -> Sight:
         """Of some problems."""
         sight = self.sights[c]
@@ -533,10 +554,13 @@ class Bundle:
         return self.flat(State(tuple(parameters), mounts, boards, bend))
 
 
+def _kind(model: type[Camera] | Camera) -> type[Camera]:
+    return model if isinstance(model, type) else type_before_parametrizations(model)
+
+
 def _template(model: type[Camera] | Camera, parameters: Tensor) -> Camera:
     """A frozen camera of the model, for others that have its number of coefficients."""
-    kind = model if isinstance(model, type) else type_before_parametrizations(model)
-    made = fixed_camera(kind, parameters[0, :4], parameters[0, 4:])
+    made = fixed_camera(_kind(model).searched(), parameters[0, :4], parameters[0, 4:])
     made._warned = True  # a step that is refused may have gone anywhere
     return made
 

@@ -158,7 +158,7 @@ class Calibration:
     spread: Spread = field(repr=False)
     """What the noise of the corners does to the parameters and the poses."""
     converged: bool
-    """Whether nothing was left to gain when the search ended."""
+    """Whether nothing was left to gain when the search ended, and every corner that was seen has a pixel."""
     bend: tuple[float, float]
     """How far the middle of the board lies off the plane of its edges, along x and y; zeros unless it was asked for."""
     image_size: tuple[int, int]
@@ -199,6 +199,11 @@ class Calibration:
     def point_residuals(self) -> Tensor:
         """(V, N, 2) the residuals of `observations`."""
         return self.adjusted.residuals[self.index][0]
+
+    @property
+    def lost(self) -> int:
+        """How many corners were seen that have no pixel in the camera, because it ends before them."""
+        return int((self.observations.seen & ~self.adjusted.valid[self.index][0]).sum())
 
     def uncertainty(self, pixels: Any, distance: float = math.inf) -> Tensor:
         """How far the camera may be wrong about pixels, were it calibrated again from other images of such quality.
@@ -300,11 +305,10 @@ def calibrate(
     found = results([search], adjusted, search.free(bend), object_points, [image_points])
     result = found.cameras[0]
     if not result.converged:
-        lost = int((result.observations.seen & ~result.adjusted.valid[0][0]).sum())
-        ends = f"; {lost} corners have no pixel in it: a surface has to reach further" if lost else ""
+        ends = [] if bool(result.adjusted.converged[0]) else ["the search did not end at an optimum"]
+        ends += [f"{lost} corners have no pixel in it: a surface has to reach further"] if (lost := result.lost) else []
         python_warnings.warn(
-            f"{owner}: the search did not end at an optimum (rms {result.rms:.4g} px{ends}); do not use it. See its "
-            "warnings",
+            f"{owner}: {', and '.join(ends)} (rms {result.rms:.4g} px); do not use it. See its warnings",
             stacklevel=2,
         )
     return result

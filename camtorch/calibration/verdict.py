@@ -311,10 +311,18 @@ def warnings(calibration: Calibration) -> list[str]:
 
 
 def _search(survey: Survey) -> Iterator[str]:
-    if not survey.calibration.converged:
+    found = survey.calibration
+    if lost := found.lost:
         yield (
-            "The search did not end at an optimum: do not use this camera. See whether the board's size, the image "
-            "size and the model are right, try another model first, or give start=a camera"
+            f"{lost} corners have no pixel in this camera, which ends before them: do not use it. "
+            "A surface has to reach further: give a wider grid"
+        )
+    if not bool(found.adjusted.converged[0]):
+        held = found.adjusted.held_by
+        by = f", held by {held} corners at the end of what the camera shows, lost by another step" if held else ""
+        yield (
+            f"The search did not end at an optimum{by}: do not use this camera. See whether the board's size, the "
+            "image size and the model are right, try another model first, or give start=a camera"
         )
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from typing import Any, ClassVar
 
@@ -16,6 +16,7 @@ from camtorch._freezing import INTRINSICS, frozen_names
 from camtorch.camera import Camera
 from camtorch.optics import Chart, Lens, Surface, Unified
 from camtorch.optics.charts import even_steps_and_ratios
+from camtorch.optics.surface import BEHIND
 
 _VARIANT = re.compile(r"order=(\d),columns=(\d{1,3}),rows=(\d{1,3}),fov_x=(\d{1,3})")
 
@@ -115,6 +116,10 @@ class Splined(Camera):
         parts = across.diff(dim=1), down.diff(dim=0), math.sqrt(2) * across.diff(dim=0)
         return torch.cat([part.flatten(0, 2) for part in parts])
 
+    @classmethod
+    def searched(cls) -> type[Camera]:
+        return _searched(cls)  # type: ignore[arg-type]  # a class can be hashed
+
     def extra_repr(self) -> str:
         """The grid in the place of its control points."""
         parts = [f"batch_shape={tuple(self.batch_shape)}"] if self.batch_shape else []
@@ -127,14 +132,30 @@ class Splined(Camera):
         return ", ".join(parts)
 
 
-def _of_grid(order: int, columns: int, rows: int, fov_x: int) -> dict[str, Any]:
-    """What depends on the grid."""
-    edge = 2 * math.tan(math.radians(fov_x) / 4)
-    cells = (columns - order) / (2 * edge)
-    last = math.hypot(edge, (rows - order) / 2 / cells) * (1 + 1e-3)
+def _optics_of(
+    order: int, columns: int, rows: int, fov_x: int, behind: float
+) -> Callable[[Sequence[Tensor]], tuple[Chart, Lens]]:
+    """Those of a surface that ends so many cells behind its edge."""
+    cells = (columns - order) / (4 * math.tan(math.radians(fov_x) / 4))
+    last = math.hypot((columns - order) / 2 + behind, (rows - order) / 2 + behind) / cells * (1 + 1e-3)
 
     def optics(k: Sequence[Tensor]) -> tuple[Chart, Lens]:
-        return StereographicUpTo(last), Lens(Surface(k, columns, rows, order=order, cells=(cells, cells)))
+        surface = Surface(k, columns, rows, order=order, cells=(cells, cells), behind=behind)
+        return StereographicUpTo(last), Lens(surface)
+
+    return optics
+
+
+@cache
+def _searched(kind: type[Splined]) -> type[Splined]:
+    """Corners on the edge would hold a search that may not lose them: there the outermost pieces go on."""
+    optics = _optics_of(kind.order, kind.columns, kind.rows, kind.fov_x, behind=1.0)
+    named = {"__module__": Camera.__module__, "__qualname__": f"{kind.key}:searched", "__doc__": kind.__doc__}
+    return type("Splined", (kind,), {**named, "optics": staticmethod(optics)})
+
+
+def _of_grid(order: int, columns: int, rows: int, fov_x: int) -> dict[str, Any]:
+    """What depends on the grid."""
 
     def mirror(turn: str, place: Any) -> Mapping[str, str]:
         signs = {axis: "-" if axis == turn else "" for axis in "xy"}
@@ -142,7 +163,7 @@ def _of_grid(order: int, columns: int, rows: int, fov_x: int) -> dict[str, Any]:
         return {f"{w}{i}_{j}": f"{signs[w]}{w}{place(i, j)}" for i, j in pairs for w in "xy"}
 
     return {
-        "optics": staticmethod(optics),
+        "optics": staticmethod(_optics_of(order, columns, rows, fov_x, BEHIND)),
         "default_count": 2 * columns * rows,
         "distortion_names": tuple(f"{w}{i}_{j}" for j in range(rows) for i in range(columns) for w in "xy"),
         "mirror_x": mirror("x", lambda i, j: f"{columns - 1 - i}_{j}"),

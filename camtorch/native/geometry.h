@@ -40,7 +40,7 @@ enum { EXTENT = RADII + AZIMUTHS * RADII + AZIMUTHS };
 /* A chart or a stage */
 typedef struct {
     int32_t kind, flags, factor, n, m, map, across, down; /* the last two of a windshield */
-    double constant; /* alpha of a unified chart that does not learn it */
+    double constant; /* alpha of a unified chart that does not learn it; cells past its edge that belong to a surface */
 } Part;
 
 /* Cameras (c) of one model. Pointers are to numbers of one type, float or double, without gaps */

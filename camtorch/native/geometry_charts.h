@@ -38,6 +38,7 @@ typedef struct {
     R fx, fy, cx, cy, inner2, usual2, circle2;
     const R *limits2, *extent, *table, *start;
     const uint8_t *certain;
+    int all_certain; /* of all pieces of the surface */
     R certain2;
     R chart_inner2, chart_most2;
     const R *chart_table;

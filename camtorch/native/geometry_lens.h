@@ -363,10 +363,10 @@ static void T(surface_vjp)(const Part *part, const R *k, int n, const R *restric
     }
 }
 
-/* In cells, positive up to the edge of a surface and a hair behind */
-INLINE R T(surface_edge)(const Part *part, const R *k, R a, R b) {
-    const R across = (R)(part->n - part->flags) / 2 + (R)1e-4 - T(absolute)((a - k[2]) * k[0]);
-    const R down = (R)(part->m - part->flags) / 2 + (R)1e-4 - T(absolute)((b - k[3]) * k[1]);
+/* In cells, positive up to the edge of a surface and so many behind */
+INLINE R T(surface_edge)(const Part *part, const R *k, R behind, R a, R b) {
+    const R across = (R)(part->n - part->flags) / 2 + behind - T(absolute)((a - k[2]) * k[0]);
+    const R down = (R)(part->m - part->flags) / 2 + behind - T(absolute)((b - k[3]) * k[1]);
     return across < down ? across : across == across ? down : -1;
 }
 
@@ -374,9 +374,10 @@ INLINE R T(surface_edge)(const Part *part, const R *k, R a, R b) {
 static void T(on_surface)(const T(Camera) *c, int n, const R *restrict a, const R *restrict b, I *restrict ok) {
     const Part *part = c->parts + c->stages;
     const R *k = c->numbers[c->stages];
+    EACH(i) ok[i] = T(surface_edge)(part, k, (R)1e-4, a[i], b[i]) > 0; /* up to its edge and a hair behind, no further */
+    if (c->all_certain) return;
     T(Cells) cells;
     T(cells)(part, k, 0, n, a, b, &cells);
-    EACH(i) ok[i] = T(surface_edge)(part, k, a[i], b[i]) > 0;
     for (int i = 0; i < n; i++) ok[i] &= c->certain[cells.at[i] / 2];
 }
 
@@ -421,7 +422,7 @@ static void T(lens)(const T(Camera) *c, int first, int n, const R *a, const R *b
             else if (c->parts[j].factor == RATIONAL) {
                 EACH(i) margin[i] = T(horner)(k + c->parts[j].n, c->parts[j].m, x[i] * x[i] + y[i] * y[i], NULL);
             } else if (c->parts[j].kind == SURFACE && c->ends) {
-                EACH(i) margin[i] = T(surface_edge)(c->parts + j, k, x[i], y[i]);
+                EACH(i) margin[i] = T(surface_edge)(c->parts + j, k, (R)c->parts[j].constant, x[i], y[i]);
             } else EACH(i) margin[i] = INFINITY;
             EACH(i) {
                 /* a turn by half a circle has a positive determinant too: the trace tells it */

@@ -38,6 +38,9 @@ static void T(prepare)(const Cameras *all, int64_t camera, T(Camera) *c) {
         if (all->certain && c->follows) {
             const Part *last = c->parts + c->stages;
             c->certain = all->certain + camera * last->n * last->m, c->certain2 = ((const R *)all->certain2)[camera];
+            c->all_certain = 1;
+            for (int j = 0; j <= last->m - 4; j++)
+                for (int i = 0; i <= last->n - 4; i++) c->all_certain &= c->certain[j * last->n + i];
         }
         c->start = all->start ? (const R *)all->start + camera * START : NULL;
         c->table = all->table ? (const R *)all->table + camera * (2 + 2 * NODES) : NULL;

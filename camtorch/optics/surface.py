@@ -36,6 +36,7 @@ class Surface(Stage):
         cells: (sa, sb), how many lie on a unit of a and of b, positive: numbers, or columns as the controls, which
             are constants.
         centre: (ca, cb), the middle of the grid, likewise. The origin of the plane has to be on the surface.
+        behind: cells past its edge that belong to it.
     """
 
     code: ClassVar[int | None] = 19
@@ -43,6 +44,7 @@ class Surface(Stage):
     columns: int
     rows: int
     order: int
+    behind: float
 
     def __init__(
         self,
@@ -53,8 +55,9 @@ class Surface(Stage):
         order: int = 3,
         cells: tuple[Tensor | float, Tensor | float],
         centre: tuple[Tensor | float, Tensor | float] = (0.0, 0.0),
+        behind: float = BEHIND,
     ):
-        self.columns, self.rows, self.order = columns, rows, order
+        self.columns, self.rows, self.order, self.behind = columns, rows, order, behind
         place = [
             w if isinstance(w, Tensor) else torch.full_like(controls[0], w, requires_grad=False)
             for w in (*cells, *centre)
@@ -170,5 +173,5 @@ class SurfaceAt(StageAt):
         """In cells."""
         stage = self.stage
         sa, sb, ca, cb = stage.parameters[:4]
-        across = (stage.columns - stage.order) / 2 + BEHIND - ((self.a - ca) * sa).abs()
-        return torch.minimum(across, (stage.rows - stage.order) / 2 + BEHIND - ((self.b - cb) * sb).abs())
+        across = (stage.columns - stage.order) / 2 + stage.behind - ((self.a - ca) * sa).abs()
+        return torch.minimum(across, (stage.rows - stage.order) / 2 + stage.behind - ((self.b - cb) * sb).abs())

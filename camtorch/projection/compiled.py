@@ -470,7 +470,9 @@ def _chart(chart: Chart) -> _Part | None:
 def _stage(stage: Stage) -> _Part | None:
     kind = _code(stage)
     if kind is not None and isinstance(stage, optics.Surface):
-        return _Part(kind, stage.order, 0, stage.columns, stage.rows) if min(stage.columns, stage.rows) > 3 else None
+        if min(stage.columns, stage.rows) < 4:
+            return None
+        return _Part(kind, stage.order, 0, stage.columns, stage.rows, constant=stage.behind)
     if kind is None or not isinstance(stage, optics.Planar):
         return None if kind is None else _Part(kind)
     part, radial = _Part(kind, _TANGENTIAL * bool(stage.tangential) | _PRISM * bool(stage.prism)), stage.radial

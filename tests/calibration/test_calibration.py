@@ -347,5 +347,24 @@ def test_a_surface_is_learnt_to_the_noise_and_one_that_ends_before_the_corners_s
     found = learnt(model)
     assert found.converged
     assert 0.9 * noise < found.sigma < 1.15 * noise
-    with pytest.warns(UserWarning, match="corners have no pixel in it: a surface has to reach further"):
-        assert not learnt(ct.Splined.with_grid(columns=8, rows=7, fov_x=60)).converged
+    for fov_x in (60, 92):  # far before them, and less than a cell
+        with pytest.warns(UserWarning, match="corners have no pixel in it: a surface has to reach further"):
+            short = learnt(ct.Splined.with_grid(columns=8, rows=7, fov_x=fov_x))
+        assert not short.converged
+        _, valid = short.camera.project(short.extrinsics(board[None].expand(14, -1, -1)))
+        lost = seen.isfinite().all(-1) & ~valid
+        assert short.lost == int(lost.sum()) > 0
+        assert any("A surface has to reach further" in text for text in short.warnings)
+        assert short.adjusted.converged or fov_x == 60
+        assert short.residuals[lost].isnan().all()
+
+
+@slow
+def test_a_surface_beats_kannala_brandt_on_images_that_it_never_saw():
+    """OV-plane; the grid was chosen by two-fold cross-validation over the training views."""
+    train, test = ov_plane("train"), ov_plane("test")
+    model = ct.Splined.with_grid(columns=12, rows=11, fov_x=200)
+    found = calibrate(train, model=model, start=calibrate(train, model="kannala_brandt").camera.convert(model).camera)
+    assert found.converged
+    assert found.rms < 0.427
+    assert calibrate(test, model=found.camera, fixed="all").rms < 0.43
