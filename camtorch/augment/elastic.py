@@ -10,10 +10,11 @@ import torch
 from torch import Tensor
 from torch.nn.utils.parametrize import type_before_parametrizations
 
-from camtorch._arguments import as_whole
+from camtorch._arguments import as_whole, columns
 from camtorch._derived import with_surface
 from camtorch.augment.augmentation import Augmentation, EditOptions, Range, as_range
 from camtorch.camera import Camera
+from camtorch.optics.charts import Chart
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
@@ -38,7 +39,7 @@ class RandomElastic(Augmentation):
 
     Raises:
         ValueError: an amount that is negative, or with which so fine a grid might fold: 4 amount cells is 1 or more; a
-            camera that is elastic already.
+            camera that is elastic already; a panorama, `FOV` or `Division`, which no lens follows.
     """
 
     grid: tuple[int, int]
@@ -76,6 +77,13 @@ class RandomElastic(Augmentation):
         """The camera with the surface; see `Augmentation.new_camera`."""
         if ":elastic=" in source.key:
             raise ValueError(f"{self._name}: the camera is elastic already, {source.key}")
+        try:
+            _chart_of(source).end(torch.float32)
+        except NotImplementedError:
+            raise ValueError(
+                f"{self._name}: no surface can follow {type(source).__name__}, whose formula has no lens after it; "
+                "camera.convert(ct.KannalaBrandt).camera is one that has"
+            ) from None
         height, width = source._size_for(self._name)
         down, across = self.grid
         focal, centre = source.intrinsics.detach().split(2, -1)
@@ -94,3 +102,9 @@ class RandomElastic(Augmentation):
         distortion = torch.cat([part.expand(*batch, part.shape[-1]).to(moved.dtype) for part in parts], -1)
         intrinsics = source.intrinsics.expand(*batch, 4).to(moved.dtype)
         return model(intrinsics, distortion, image_size=source.image_size).freeze_like(source), None
+
+
+def _chart_of(camera: Camera) -> Chart:
+    """The chart of a camera of that model."""
+    ideal = camera.ideal(camera.distortion.shape[-1])
+    return camera.optics(columns(camera.distortion.new_tensor([ideal])))[0]

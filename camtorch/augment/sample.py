@@ -660,7 +660,7 @@ def _in_range(values: Tensor, dtype: torch.dtype) -> Tensor:
 def together(
     change: Change, named: Named, mask_fill: float = 0.0, lateral: float = 0
 ) -> dict[str, tuple[Tensor, Tensor | None]]:
-    """What moves by one compiled call, and its validity: images and pixels of a batch of one, images of other batches."""
+    """What moves by one compiled call, and its validity: images and pixels of a batch of one, images of another."""
     part, is_single = change.parts[0], change.count == 1
     if part.moves is None or part.rows is not None or change.gate is not None:
         return {}

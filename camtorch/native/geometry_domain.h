@@ -486,7 +486,7 @@ void THIS(domain)(const Domain *d) {
         if (d->certain2) {
             const double *controls = numbers + d->parameter_count - numbers_of(last);
             certain_of(last, controls, d->certain + c * last->n * last->m);
-            put(d->certain2, c, has_factor ? within(fold, end, is_double) : INFINITY, is_double);
+            put(d->certain2, c, within(has_factor ? fold : end, end, is_double), is_double);
         }
         if (d->start) {
             double start[START];

@@ -127,16 +127,20 @@ class Unified(Chart):
         return Perspective().end(dtype)
 
     def end(self, dtype: torch.dtype) -> float | Tensor:
-        xi, alpha, _ = self._parts()
+        xi, alpha, beta = self._parts()
         most, inside = self._most(dtype) / 2, 1 - 64 * torch.finfo(dtype).eps
-        if xi is None:
+        if xi is None and not isinstance(alpha, Tensor):
             return min(most, inside / (2 * alpha - 1) ** 0.5) if alpha > 0.5 else most
-        beyond = (xi - 1) * (xi + 1)
-        return torch.where(beyond > 0, inside * torch.where(beyond > 0, beyond, 1.0).rsqrt(), most).clamp(max=most)
+        fold = (2 * alpha - 1) * (torch.ones_like(self.parameters[0]) if beta is None else beta)
+        end = torch.where(fold > 0, inside * torch.where(fold > 0, fold, 1.0).rsqrt(), most)
+        if xi is not None:  # from outside of the sphere lines touch it where ahead = r sqrt(xi^2 - 1)
+            beyond = (xi - 1) * (xi + 1)
+            below = alpha * xi + (1 - alpha) * torch.where(beyond > 0, beyond, 1.0).sqrt()
+            end = torch.minimum(end, torch.where(beyond > 0, inside / below, most))
+        return end.clamp(max=most)
 
     def usual_end(self, dtype: torch.dtype) -> float | Tensor:
-        xi, alpha, _ = self._parts()
-        usual = math.tan(math.radians(87)) * (1 if xi is not None or alpha == 0 else 1 / alpha)
+        usual = math.tan(math.radians(87)) / (1.0 if self.has_xi else self.fixed_alpha or 1.0)
         end = self.end(dtype)
         return end.clamp(max=usual) if isinstance(end, Tensor) else min(end, usual)
 

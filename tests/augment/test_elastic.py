@@ -126,3 +126,41 @@ def test_files_hold_it(tmp_path):
 def test_what_is_refused(options, message):
     with pytest.raises((ValueError, TypeError), match=message):
         ct.augment.RandomElastic(**options)
+
+
+ALONE = {"fov", "division", "cylindrical", "equirectangular", "latlon", "transverse_cylindrical"}
+
+
+@pytest.mark.parametrize("way", ["native", "formula"])
+@pytest.mark.parametrize("key", sorted(set(ct.MODELS) - ALONE))
+def test_an_elastic_camera_of_any_model_ends_where_its_own_does(key, way):
+    plain = one(key).double().requires_grad_(False)
+    camera = ct.augment.RandomElastic()(camera=plain, keypoints=torch.rand(2, 2))["camera"]
+    pixels = torch.rand(500, 2, generator=torch.Generator().manual_seed(3)).double()
+    pixels = pixels * torch.tensor([plain.width, plain.height]) - 0.5
+    rays, valid = camera.unproject(pixels) if way == "native" else torch.func.vmap(camera.unproject)(pixels)
+    seen, back = camera.project(rays[valid])
+    assert back.all()
+    assert valid.any()
+    torch.testing.assert_close(seen, pixels[valid], rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("xi", [-0.27, 0.3, 1.3])
+@pytest.mark.parametrize("alpha", [0.0, 0.55, 0.8])
+def test_an_elastic_double_sphere_ends_at_both_of_its_folds(xi, alpha):
+    plain = ct.DoubleSphere([150.0, 150, 319.5, 239.5], [xi, alpha], image_size=(480, 640)).double()
+    plain.requires_grad_(False)
+    camera = ct.augment.RandomElastic(amount=1e-9)(camera=plain, keypoints=torch.rand(2, 2))["camera"]
+    pixels = torch.cartesian_prod(torch.linspace(0, 639, 33), torch.linspace(0, 479, 25)).double()
+    for unproject in (camera.unproject, torch.func.vmap(camera.unproject)):
+        rays, valid = unproject(pixels)
+        assert (valid == plain.unproject(pixels)[1]).double().mean() > 0.99  # but for pixels at the fold
+        seen, back = camera.project(rays[valid])
+        assert back.all()
+        torch.testing.assert_close(seen, pixels[valid], rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("key", sorted(ALONE))
+def test_a_model_that_no_lens_follows_is_refused(key):
+    with pytest.raises(ValueError, match=f"no surface can follow {ct.MODELS[key].__name__}"):
+        ct.augment.RandomElastic()(camera=one(key).requires_grad_(False), keypoints=torch.rand(2, 2))
