@@ -81,8 +81,6 @@ def _photograph(arguments: argparse.Namespace) -> Sample:
         raise ValueError(
             f"{path}: labels of a data set in COCO's form, which --dataset takes; --labels is of one image"
         )
-    if path is not None and not entries.keys() & {"keypoints", "boxes", "gaze"}:
-        note(f"{path}: has no keypoints, boxes or gaze, so no labels are shown")
     if orientation not in (None, 1):
         note(f"{arguments.image} is shown as stored, not turned by its Exif orientation: so labels know it")
     if entries.get("camera") is None:
@@ -106,6 +104,8 @@ def _photograph(arguments: argparse.Namespace) -> Sample:
                 raise ValueError(f"gaze_from: the camera has no ray at {entries['gaze_from']}")
             sample["points"] = eyes.double().expand_as(sample["gaze"])
         RandomCamera(min_filled=0)(**sample)  # which says what is wrong with them
+    if path is not None and not entries.keys() & {"keypoints", "boxes", "gaze"}:
+        note(f"{path}: has no keypoints, boxes or gaze, so no labels are shown")
     return sample
 
 
