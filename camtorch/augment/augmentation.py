@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from camtorch._arguments import (
@@ -106,14 +107,23 @@ def as_range(
 class Spans:
     """Ranges, ready to draw a value of each for some samples."""
 
+    ranges: dict[str, Range]
+    rows: int
+    low: NDArray[np.float64]
+    wide: NDArray[np.float64]
+    total: int
+    _places: list[tuple[str, slice, tuple[int, int] | None]]
+
     def __init__(self, ranges: Mapping[str, Range], rows: int):
         self.ranges, self.rows, self._places = dict(ranges), rows, []
         counts = [rows * (interval.size or 1) for interval in ranges.values()]
         self.low = np.repeat([interval.low for interval in ranges.values()] or [0.0], counts or [0])
         self.wide = np.repeat([interval.high - interval.low for interval in ranges.values()] or [0.0], counts or [0])
-        self.total, end = sum(counts), 0
+        self.total = sum(counts)
+        end = 0
         for (name, interval), count in zip(ranges.items(), counts, strict=True):
-            self._places.append((name, slice(end, end + count), interval.size and (rows, interval.size)))
+            shape = (rows, interval.size) if interval.size else None
+            self._places.append((name, slice(end, end + count), shape))
             end += count
 
     def of(self, shares: Any) -> dict[str, Any]:

@@ -22,7 +22,7 @@ WRITTEN = {".mp4": "mp4", ".m4v": "mp4", ".mov": "mov", ".mkv": "matroska", ".we
 """What ffmpeg calls the formats of files with these suffixes, in lower case."""
 FORMATS = frozenset({*WRITTEN, ".avi", ".mts", ".ts"})
 """Suffixes of what is read."""
-CODECS = {
+CODECS: dict[str, dict[str, str]] = {
     # how x264 weighs blocks by what refers to them is not the same each time
     "libx264": {"crf": "18", "mbtree": "0"},
     "libvpx-vp9": {"crf": "24", "b": "0"},

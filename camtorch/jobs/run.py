@@ -30,6 +30,7 @@ class Account:
 
     folder: Path
     shard: Shard
+    has_begun: bool
 
     def __init__(self, folder: Path, job: str, settings: Json, shard: Shard):
         self.folder, self.shard, self._job = folder, shard, job

@@ -91,8 +91,8 @@ class _Cameras(ctypes.Structure):
 
 
 _Rows = struct.Struct("20q").pack  # `Rows` of geometry.h
-packed_move = struct.Struct("8q2d12q").pack  # `Move` of geometry.h
-packed_lattices = struct.Struct(f"8q2d12q{CLASSIFICATION}6q").pack  # `Lattices`
+packed_move: Callable[..., bytes] = struct.Struct("8q2d12q").pack  # `Move` of geometry.h
+packed_lattices: Callable[..., bytes] = struct.Struct(f"8q2d12q{CLASSIFICATION}6q").pack  # `Lattices`
 POSITIONS, PIXELS, ON_IMAGE = range(3)
 LEFT_FROM, LEFT_TO, LEFT_MOST = 1, 2, 4
 _NO_ROWS = (0, 0, 0, 0)

@@ -44,6 +44,7 @@ class PlaneWarp(ProxyWarp):
             not fit, and as `Warp`. TypeError: no cameras, no extrinsics.
     """
 
+    batch_shape: torch.Size
     normal: Tensor
     distance: Tensor
 

@@ -27,6 +27,7 @@ class ProxyWarp(Warp):
     """
 
     is_an_operator = False
+    batch_shape: torch.Size
 
     def __init__(self, source: Camera, target: Camera, extrinsics: Extrinsics, **options: Unpack[WarpOptions]):
         super().__init__(source, target, tolerance=0.0, **options)

@@ -47,6 +47,7 @@ class Reproject(GeometryModule):
 
     source: Camera
     target: Camera
+    batch_shape: torch.Size
     mode: Mode
     padding_mode: PaddingMode
     fill: tuple[float, ...]
