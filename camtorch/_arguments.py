@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import functools
 import math
 import operator
 import os
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, TypeAlias, TypeGuard
+from typing import Any, ParamSpec, TypeAlias, TypeGuard, TypeVar
 
 import numpy as np
 import torch
@@ -16,6 +17,28 @@ from camtorch._tracing import in_graph, is_concrete, is_eager, keeps_graph, may_
 
 Numbers: TypeAlias = "Tensor | np.ndarray[Any, Any] | np.number[Any] | float | list[Any] | tuple[Any, ...]"
 """What users pass as numbers: a tensor, an array, a number, or lists of them."""
+
+Taken = ParamSpec("Taken")
+Result = TypeVar("Result")
+
+
+def hinting(hint: str) -> Callable[[Callable[Taken, Result]], Callable[Taken, Result]]:
+    """A function whose error on arguments that it does not have says what to type, as another library's order."""
+
+    def hinted(function: Callable[Taken, Result]) -> Callable[Taken, Result]:
+        @functools.wraps(function)
+        def call(*args: Taken.args, **kwargs: Taken.kwargs) -> Result:
+            try:
+                return function(*args, **kwargs)
+            except TypeError as error:
+                is_inner = error.__traceback__ is None or error.__traceback__.tb_next is not None
+                if is_inner and not any(f"unexpected keyword argument {name!r}" in str(error) for name in kwargs):
+                    raise
+                raise TypeError(f"{error}. {hint}") from None
+
+        return call
+
+    return hinted
 
 
 def as_real(value: Numbers, name: str, owner: str) -> Tensor:
@@ -319,6 +342,15 @@ def check_radians(vectors: Tensor, name: str, owner: str) -> None:
         raise ValueError(
             f"{owner}: {name} holds rotation vectors, axis times angle in radians; an angle of {longest:.4g} seems to "
             "be degrees, which torch.deg2rad() or math.radians() converts"
+        )
+
+
+def check_angles(angles: Tensor, owner: str) -> None:
+    """Raise a ValueError for plain angles of more than a turn, which are degrees."""
+    if not is_predicted(angles) and fails(~(angles.abs() > 2 * math.pi * (1 + 1e-6))):
+        raise ValueError(
+            f"{owner}: angles must be radians; {float(angles.abs().max()):.4g} seems to be degrees, which "
+            "torch.deg2rad() or math.radians() converts"
         )
 
 

@@ -32,6 +32,18 @@ def quarter_turns(image_size: tuple[int, int]) -> tuple[tuple[tuple[int, int, in
     )
 
 
+def check_crop(camera: Camera, corner: tuple[int, int], size: tuple[int, int]) -> None:
+    """Raise a ValueError if a part, its corner (top, left) and its size, holds no pixel of the camera's image."""
+    known = camera.image_size
+    if known is None:
+        return
+    if any(at >= end or at + side <= 0 for at, side, end in zip(corner, size, known, strict=True)):
+        raise ValueError(
+            f"{type(camera).__name__}.crop: (top, left, height, width) = {(*corner, *size)} holds no pixel of the "
+            f"image (height, width) = {known}"
+        )
+
+
 def edited_by(camera: CameraT, matrix: Sequence[Sequence[float]], size: Sequence[int]) -> CameraT:
     """The camera of an image whose pixels all move by one map (2, 3); it learns where the camera does.
 

@@ -337,6 +337,17 @@ def warn_of_order(intrinsics: Tensor, size: tuple[int, int], owner: str, stackle
         )
 
 
+def warn_of_exchange(old: tuple[int, int], new: tuple[int, int], owner: str) -> None:
+    """Warn of a new size that has the shape of the old one on its side, as (width, height) would."""
+    turned = new[0] * old[0] / (new[1] * old[1])
+    if old[0] != old[1] and abs(turned - 1) < _CENTRED / 10:
+        warnings.warn(
+            f"{owner}: {new} is (height, width); an image of {old} is stretched to that, and keeps its shape as "
+            f"{new[::-1]}. The camera of the image on its side comes from camera.rot90",
+            stacklevel=3,
+        )
+
+
 def _off_centre(cx: float, cy: float, size: tuple[int, int]) -> float:
     """How far a point is from the middle of an image, the larger one of the parts of its height and width."""
     height, width = size

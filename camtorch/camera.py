@@ -21,7 +21,7 @@ from camtorch._arguments import (
     shown,
 )
 from camtorch._derived import variant
-from camtorch._editing import edited_by, quarter_turns
+from camtorch._editing import check_crop, edited_by, quarter_turns
 from camtorch._evaluation import evaluated, mapped
 from camtorch._freezing import PREFIX, freeze, loaded, saved, with_frozen
 from camtorch._module import BatchedModule, Memo, remade, typed_as
@@ -33,6 +33,7 @@ from camtorch._numbers import (
     described,
     numbers_of_matrix,
     replaced,
+    warn_of_exchange,
 )
 from camtorch._registry import register
 from camtorch.convert.conversion import Conversion, convert
@@ -612,8 +613,14 @@ class Camera(BatchedModule):
     # made from the original's, and that is where gradients go. From a frozen camera, or under no_grad, it is a copy.
 
     def crop(self, top: int, left: int, height: int, width: int) -> Self:
-        """The camera of the part of the image whose top-left pixel is (left, top); it may reach outside."""
+        """The camera of the part of the image whose top-left pixel is (left, top); it may reach outside.
+
+        Raises:
+            ValueError: a part without any pixel of the image.
+        """
         top, left = (as_whole(v, name, "crop") for v, name in ((top, "top"), (left, "left")))
+        as_image_size((height, width), f"{type(self).__name__}.crop")
+        check_crop(self, (top, left), (height, width))
         return edited_by(self, ((1, 0, -left), (0, 1, -top)), (height, width))
 
     def pad(self, left: int, right: int, top: int, bottom: int) -> Self:
@@ -624,9 +631,13 @@ class Camera(BatchedModule):
         return edited_by(self, ((1, 0, left), (0, 1, top)), (height + top + bottom, width + left + right))
 
     def resize(self, height: int, width: int) -> Self:
-        """The camera of the image scaled to that size; pixel edges scale, as with align_corners=False."""
+        """The camera of the image scaled to that size; pixel edges scale, as with align_corners=False.
+
+        It warns where the new size is like the old one with height and width exchanged.
+        """
         old_height, old_width = self._size_for("resize")
         as_image_size((height, width), f"{type(self).__name__}.resize")
+        warn_of_exchange((old_height, old_width), (height, width), f"{type(self).__name__}.resize")
         across, down = width / old_width, height / old_height
         return edited_by(self, ((across, 0, (across - 1) / 2), (0, down, (down - 1) / 2)), (height, width))
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -17,10 +16,11 @@ from camtorch._arguments import (
     as_rows,
     as_vectors,
     broadcast_shapes,
+    check_angles,
     check_devices,
     check_radians,
     fails,
-    is_predicted,
+    shown,
     values_of,
 )
 from camtorch._module import BatchedModule, learning_as, remade, typed_as
@@ -53,8 +53,13 @@ class Extrinsics(BatchedModule):
     rotation: Tensor
     translation: Tensor
 
-    def __init__(self, rotation: Numbers, translation: Numbers):
+    def __init__(self, rotation: Numbers, translation: Numbers | None = None):
         super().__init__()
+        if translation is None:
+            raise TypeError(
+                f"Extrinsics: translation is missing beside rotation, a {shown(rotation)}; "
+                "ct.Extrinsics.from_matrix(T) takes a matrix (4, 4), and translation=[0.0, 0.0, 0.0] is none"
+            )
         translation = as_vectors(translation, "translation", "Extrinsics")
         # columns (3, 3, 1) are vectors without a doubt
         undecided = as_real(rotation, "rotation", "Extrinsics").shape[-2:] == (3, 3)
@@ -207,11 +212,7 @@ def head_rotation(angles: Numbers) -> Tensor:
         TypeError: no numbers. ValueError: another shape, plain angles of more than a turn, which are degrees.
     """
     angles = as_coordinates(angles, "angles", 3, "head_rotation", means=", pitch, yaw and roll in radians")
-    if not is_predicted(angles) and fails(~(angles.abs() > 2 * math.pi * (1 + 1e-6))):
-        raise ValueError(
-            f"head_rotation: angles must be radians; {float(angles.abs().max()):.4g} seems to be degrees, which "
-            "torch.deg2rad() or math.radians() converts"
-        )
+    check_angles(angles, "head_rotation")
     angles = angles.to(torch.promote_types(angles.dtype, torch.float32))
     (cp, cy, cr), (sp, sy, sr) = angles.cos().unbind(-1), angles.sin().unbind(-1)
     rows = (

@@ -21,6 +21,7 @@ from camtorch._arguments import (
     as_flag,
     as_mapping,
     as_number,
+    check_angles,
     check_boxes,
     check_radians,
     fails,
@@ -703,8 +704,13 @@ def from_pitch_yaw(angles: Tensor) -> Tensor:
     """Unit gaze vectors (..., 3) of pitch and yaw (..., 2) in radians, as in MPIIGaze and ETH-XGaze.
 
     Zero looks into the camera, along -z. Source: Zhang et al., ETH-XGaze, 2020, and its code.
+
+    Raises:
+        ValueError: another shape, plain angles of more than a turn, which are degrees.
     """
-    pitch, yaw = as_coordinates(angles, "angles", 2, "from_pitch_yaw").unbind(-1)
+    angles = as_coordinates(angles, "angles", 2, "from_pitch_yaw")
+    check_angles(angles, "from_pitch_yaw")
+    pitch, yaw = angles.unbind(-1)
     return torch.stack((-pitch.cos() * yaw.sin(), -pitch.sin(), -pitch.cos() * yaw.cos()), -1)
 
 

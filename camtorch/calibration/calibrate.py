@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from torch.nn.utils.parametrize import type_before_parametrizations
 
-from camtorch._arguments import as_flag, as_number, as_whole, shown
+from camtorch._arguments import as_flag, as_number, as_whole, hinting, shown
 from camtorch._freezing import INTRINSICS, frozen_names
 from camtorch._threads import on_one_thread
 from camtorch.calibration.bundle import LOSSES, Adjusted, Free, Poses, Prior, Sight, State, adjust
@@ -243,6 +243,7 @@ class Calibration:
 
 
 @on_one_thread
+@hinting('A model comes first: ct.calibrate("brown_conrady", object_points, image_points, image_size=(height, width))')
 def calibrate(
     model: type[Camera] | str | Camera,
     object_points: Points,

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from camtorch._arguments import Numbers, as_number, broadcast_shapes, no_camera, working_dtype
+from camtorch._arguments import Numbers, as_number, broadcast_shapes, hinting, no_camera, working_dtype
 from camtorch._evaluation import compiled_of
 from camtorch._module import remade
 from camtorch._threads import on_one_thread
@@ -69,6 +69,7 @@ class Pose(_Pose):
 
 
 @on_one_thread
+@hinting("A camera comes first: ct.solve_pnp(ct.BrownConrady.from_matrix(K, distortion), object_points, pixels)")
 def solve_pnp(
     camera: Camera,
     object_points: Numbers,

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from camtorch._arguments import Numbers, as_number, working_dtype
+from camtorch._arguments import Numbers, as_number, hinting, working_dtype
 from camtorch._module import BatchedModule
 from camtorch._threads import on_one_thread
 from camtorch.calibration.batches import as_tensor, learns, root_of, rows_of
@@ -64,6 +64,7 @@ class Triangulation(_Triangulation):
 
 
 @on_one_thread
+@hinting("It takes lists: ct.triangulate([camera, ...], [extrinsics, ...], pixels), pixels (C, N, 2)")
 def triangulate(
     cameras: Sequence[Camera] | Camera,
     extrinsics: Sequence[Extrinsics] | Extrinsics,

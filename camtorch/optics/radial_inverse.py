@@ -307,7 +307,7 @@ class RadialInverse:
         """The factor by which it scales points of squared radius r2, (C, ...) or (M,), up to `most2`."""
         if self.of_points:
             return bracketed(self.radial, r2, self.inner2)
-        rows = r2.reshape(self.k.shape[0], -1)
+        rows = r2.unsqueeze(-1).flatten(1)
         if is_portable_export():
             inner2 = self.inner2.reshape(-1, 1)
             return _scale(self.factor.name, self.k, inner2, self._table, rows).view_as(r2)
@@ -370,7 +370,8 @@ def _(info: Any, in_dims: tuple[Any, ...], name: str, k: Tensor, end: float, r2:
     _, of_k, _, of_r2 = in_dims
     r2 = r2.expand(info.batch_size, *r2.shape) if of_r2 is None else r2.movedim(of_r2, 0)
     if of_k is None:  # what is mapped joins the points
-        found, inner2, most2 = _radial_inverse(name, k, end, r2.movedim(0, 1).flatten(1))
-        return (found.unflatten(1, (info.batch_size, -1)), inner2, most2), (1, None, None)
+        r2 = r2.movedim(0, 1)
+        found, inner2, most2 = _radial_inverse(name, k, end, r2.flatten(1))
+        return (found.unflatten(1, r2.shape[1:]), inner2, most2), (1, None, None)
     results = _radial_inverse(name, k.movedim(of_k, 0).flatten(0, 1), end, r2.flatten(0, 1))
-    return tuple(r.unflatten(0, (info.batch_size, -1)) for r in results), (0, 0, 0)
+    return tuple(r.unflatten(0, r2.shape[:2]) for r in results), (0, 0, 0)

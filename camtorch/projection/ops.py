@@ -83,8 +83,8 @@ def _(model: str, *planes: Tensor) -> tuple[Tensor, ...]:
 
 @tables.register_vmap
 def _(info: Any, in_dims: tuple[Any, ...], model: str, k: Tensor) -> Any:
-    results = tables(model, k.movedim(in_dims[1], 0).flatten(0, 1))
-    return tuple(r.unflatten(0, (info.batch_size, -1)) for r in results), (0, 0, 0)
+    k = k.movedim(in_dims[1], 0)
+    return tuple(r.unflatten(0, k.shape[:2]) for r in tables(model, k.flatten(0, 1))), (0, 0, 0)
 
 
 @search_open.register_vmap
@@ -106,11 +106,12 @@ def _mapped(
     rows = []
     for plane, dim in zip(planes, in_dims[2:], strict=True):
         plane = plane.expand(info.batch_size, *plane.shape) if dim is None else plane.movedim(dim, 0)
-        rows.append((plane if cameras else plane.movedim(0, 1)).flatten(*((0, 1) if cameras else (1, 2))))
-    results = operator(model, k.movedim(in_dims[1], 0).flatten(0, 1) if cameras else k, *rows)
-    if cameras:
-        return tuple(r.unflatten(0, (info.batch_size, -1)) for r in results), (0, 0, 0)
-    return tuple(r.unflatten(1, (info.batch_size, -1)) for r in results), (1, 1, 1)
+        rows.append(plane if cameras else plane.movedim(0, 1))
+    joined = 0 if cameras else 1
+    shape = rows[0].shape[joined : joined + 2]
+    k = k.movedim(in_dims[1], 0).flatten(0, 1) if cameras else k
+    results = operator(model, k, *(plane.flatten(joined, joined + 1) for plane in rows))
+    return tuple(r.unflatten(joined, shape) for r in results), (joined,) * 3
 
 
 @torch.library.custom_op("camtorch::transposed", mutates_args=())

@@ -21,6 +21,7 @@ from camtorch._arguments import (
     as_values,
     check_path,
     fails,
+    hinting,
     shown,
 )
 from camtorch._module import GeometryModule, Memo, typed_as
@@ -379,6 +380,7 @@ class Rectification(GeometryModule):
         return f"{self.projection}, {'columns' if self.vertical else 'rows'} correspond, baseline {far}"
 
 
+@hinting("OpenCV's K1, D1, K2, D2, R, T are ct.rectify(left, right, ct.Extrinsics(R, T)), of cameras from_matrix(K, D)")
 def rectify(
     left: Camera,
     right: Camera,

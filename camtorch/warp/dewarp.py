@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Literal
 import torch
 from torch import Tensor, nn
 
-from camtorch._arguments import as_fov, as_image_size, broadcast_shapes
+from camtorch._arguments import as_fov, as_image_size, broadcast_shapes, hinting
 from camtorch.camera import Camera
 from camtorch.models import UCM, Cylindrical, Equirectangular, Pinhole
 from camtorch.projection.rays import around_ends, image_lattice
@@ -73,6 +73,7 @@ class Dewarp(Warp):
             or up to 360, one up to 2 pi, which seems to be in radians, and as `Warp`.
     """
 
+    @hinting("It takes a camera, as ct.KannalaBrandt.from_matrix(K, D, image_size=size); fov says how much it shows")
     def __init__(
         self,
         camera: Camera,

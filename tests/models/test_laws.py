@@ -678,6 +678,9 @@ def test_no_points_give_no_pixels(key):
     pixels, valid = one(key).project(torch.zeros(0, 3))
     assert pixels.shape == (0, 2)
     assert valid.shape == (0,)
+    if key != "tabulated":  # torch's gather under vmap takes no mapped dim of 0
+        assert vmap(one(key).project)(torch.zeros(0, 4, 3))[0].shape == (0, 4, 2)
+        assert vmap(one(key).unproject)(torch.zeros(0, 4, 2))[0].shape == (0, 4, 3)
     rays, valid = one(key).unproject(torch.zeros(4, 0, 2))
     assert rays.shape == (4, 0, 3)
     assert valid.shape == (4, 0)

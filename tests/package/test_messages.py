@@ -240,6 +240,29 @@ WRONG = [
     (lambda: ct.WoodScape.from_woodscape([20, 0, 0, 0], 3, image_size=SIZE), ValueError, r"offset must be \(2,\) ="),
     (lambda: ct.io.opencv.read(None), TypeError, r"io.opencv.read: path must name a file; got None"),
     (lambda: ct.load_map("\0"), ct.CameraFileError, r"path: a NUL character, which no path has"),
+    # the order of OpenCV's arguments
+    (
+        lambda: ct.solve_pnp(np.ones((6, 3)), np.ones((6, 2)), np.eye(3), np.zeros(4)),
+        TypeError,
+        r"were given\. A camera comes first: ct.solve_pnp\(ct.BrownConrady.from_matrix\(K, distortion\)",
+    ),
+    (
+        lambda: ct.calibrate([np.ones((6, 3))], [np.ones((6, 2))], (32, 24), None, None),
+        TypeError,
+        r"were given\. A model comes first: .*image_size=\(height, width\)",
+    ),
+    (lambda: ct.triangulate(np.eye(3), np.eye(3), 1, 2), TypeError, r"were given\. It takes lists: ct.triangulate\("),
+    (
+        lambda: ct.rectify(np.eye(3), np.zeros(4), np.eye(3), np.zeros(4), (32, 24), np.eye(3), np.zeros(3)),
+        TypeError,
+        r"were given\. OpenCV's .* ct.rectify\(left, right, ct.Extrinsics\(R, T\)\)",
+    ),
+    (lambda: ct.Dewarp(np.eye(3), np.zeros(4)), TypeError, r"were given\. It takes a camera, as .*from_matrix\(K, D"),
+    (lambda: ct.Dewarp(CAMERA, balance=0.5), TypeError, r"argument 'balance'\. It takes .* fov says how much it"),
+    (lambda: ct.Extrinsics(np.eye(4)), TypeError, r"translation is missing .*\(4, 4\); ct.Extrinsics.from_matrix\(T"),
+    (lambda: augment.from_pitch_yaw(torch.tensor([10.0, 20.0])), ValueError, r"radians; 20 seems to be degrees"),
+    (lambda: CAMERA.crop(24, 0, 8, 8), ValueError, r"crop: .* = \(24, 0, 8, 8\) holds no pixel of the image .*24, 32"),
+    (lambda: CAMERA.crop(0, -8, 8, 8), ValueError, r"crop: .* holds no pixel"),
 ]
 
 
@@ -247,3 +270,9 @@ WRONG = [
 def test_wrong_calls_are_told_in_words(call, error, says):
     with pytest.raises(error, match=says):
         call()
+
+
+def test_a_size_with_height_and_width_exchanged_is_warned_of():
+    with pytest.warns(UserWarning, match=r"resize: \(64, 48\) is \(height, width\).* as \(48, 64\)\. .*rot90"):
+        CAMERA.resize(64, 48)
+    CAMERA.resize(32, 32)  # of another shape, as networks want it
