@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import os
 import re
 import warnings
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -62,29 +64,37 @@ def read_stored(path: Path) -> tuple[Tensor, int | None]:
     Raises:
         ImageFileError: no such file, no image, a damaged one, floating-point pixels, or more than 16 bits deep.
     """
+    with _refused(path, ImageFileError), open_image(path) as opened:
+        count, tiles = getattr(opened, "n_frames", 1), getattr(opened, "tile", ())
+        # of deep colours its decoders are told so, which make eight bits of them
+        cut = opened.mode not in DEEP and any(re.search(r";16|65535", str(tile[3])) for tile in tiles)
+        orientation = opened.getexif().get(ORIENTATION)
+        image = load_stored(opened)
+        if count > 1:
+            warnings.warn(f"{path} holds {count} images; only the first is taken", stacklevel=2)
+        if cut:
+            warnings.warn(f"{path} has 16 bits a colour; only the upper 8 are read", stacklevel=2)
+        return _pixels(path, image), orientation
+
+
+@contextlib.contextmanager
+def _refused(name: object, kind: type[Exception]) -> Iterator[None]:
+    """What Pillow raises where it cannot read a file, as an error of that kind, which names file and reason."""
     try:
-        with open_image(path) as opened:
-            count, tiles = getattr(opened, "n_frames", 1), getattr(opened, "tile", ())
-            # of deep colours its decoders are told so, which make eight bits of them
-            cut = opened.mode not in DEEP and any(re.search(r";16|65535", str(tile[3])) for tile in tiles)
-            orientation = opened.getexif().get(ORIENTATION)
-            image = load_stored(opened)
-            if count > 1:
-                warnings.warn(f"{path} holds {count} images; only the first is taken", stacklevel=2)
-            if cut:
-                warnings.warn(f"{path} has 16 bits a colour; only the upper 8 are read", stacklevel=2)
-            return _pixels(path, image), orientation
-    except FileNotFoundError:
-        reason = "no such file"
-    except UnidentifiedImageError:
-        reason = "not an image that Pillow can read"
-    except Image.DecompressionBombError:
-        reason = f"more than {2 * (Image.MAX_IMAGE_PIXELS or 0) / 1e6:.0f} million pixels, which are not read"
+        yield
     except ImageFileError:
         raise
+    except Image.DecompressionBombError:
+        reason = f"more than {2 * (Image.MAX_IMAGE_PIXELS or 0) / 1e6:.0f} million pixels, which are not read"
+        raise kind(f"{name}: {reason}") from None
+    except UnidentifiedImageError:
+        raise kind(f"{name}: not an image that Pillow can read") from None
+    except FileNotFoundError:
+        if kind is OSError:
+            raise
+        raise kind(f"{name}: no such file") from None
     except (OSError, SyntaxError, ValueError, EOFError) as error:
-        reason = getattr(error, "strerror", None) or str(error)
-    raise ImageFileError(f"{path}: {reason}")
+        raise kind(f"{name}: {getattr(error, 'strerror', None) or error}") from None
 
 
 def size_of(path: Path) -> tuple[int, int] | None:
@@ -142,10 +152,13 @@ def as_photograph(image: Any, size: tuple[int, int], name: str, owner: str, side
             )
 
     if isinstance(image, (str, bytes, os.PathLike)):
-        with open_image(Path(os.fsdecode(image))) as opened:
+        with _refused(name, OSError):
+            opened = open_image(Path(os.fsdecode(image)))
+        with opened:
             check(*stored_size(opened))
-            opened.draft(None, (side, side))
-            image = load_stored(opened)
+            with _refused(name, OSError):
+                opened.draft(None, (side, side))
+                image = load_stored(opened)
     else:
         image = image if isinstance(image, Image.Image) else _from_array(image)
         check(image.height, image.width)

@@ -93,7 +93,8 @@ def _photograph(arguments: argparse.Namespace) -> Sample:
     with failing_at(path, "", ValueError, TypeError, RuntimeError, OverflowError):
         for name in ("keypoints", "boxes"):
             if entries.get(name):
-                sample[name] = torch.from_numpy(np.asarray(entries[name], np.float64))
+                with failing_at(name, "", ValueError, TypeError):
+                    sample[name] = torch.from_numpy(np.asarray(entries[name], np.float64))
                 count, valid = len(sample[name]), entries.get(f"{name}_valid", True)
                 seen = camera.contains(sample[name].reshape(count, -1)[:, :2])  # what begins off the image is not shown
                 sample[f"{name}_valid"] = seen & torch.as_tensor(valid, dtype=torch.bool)

@@ -192,7 +192,8 @@ def _convert(commands: Commands) -> None:
     )
     add = command.add_argument
     add("input", type=words.path, metavar="IN", help="a calibration file")
-    add("output", type=words.path, metavar="OUT", help="the new one")
+    add("new", type=words.path, nargs="?", metavar="OUT", help="the new one")
+    add("-o", "--output", type=words.path, metavar="OUT", help="the same, as of other commands")
     add("--model", metavar="KEY", help="the model of OUT; by default that of IN")
     add("--count", type=int, metavar="N", help="of coefficients, where the model leaves a choice")
     add("--max-angle", type=float, metavar="DEGREES", help="from the axis, up to which rays matter")

@@ -15,7 +15,9 @@ from camtorch.rig import Rig
 
 def run(arguments: argparse.Namespace) -> None:
     """Carry it out."""
-    path = arguments.output
+    if (arguments.new is None) == (arguments.output is None):
+        raise ValueError("which file is the new one? camtorch convert IN -o OUT")
+    path = arguments.new or arguments.output
     if not path.is_dir():  # some formats are folders
         targets.check(path, force=arguments.force, inputs=_read(arguments.input))
     angle = arguments.max_angle

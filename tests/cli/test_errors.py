@@ -22,7 +22,7 @@ CASES = {
         ("undistort", "invalid choice: 'undistort'"),
         ("dewarp", "required: IMAGE"),
         ("show", "required: FILE"),
-        ("convert camera.yml", "required: OUT"),
+        ("convert camera.yml", "which file is the new one"),
     ],
     "files": [
         ("dewarp none.png --camera camera.yml", "none.png: no such file"),

@@ -148,6 +148,7 @@ BAD = [
     ('{"camera": {"model": "none"}}', "labels.json: states the camera, and so does --camera"),
     ('{"gaze": [0, 1], "gaze_from": [3, 4]}', ""),
     ('{"gaze": [0, 0, 1], "gaze_from": [9000, 4]}', "gaze_from: the camera has no ray at [9000, 4]"),
+    ('{"keypoints": "abc"}', "labels.json: keypoints: could not convert"),
     ('{"images": [], "annotations": []}', "labels of a data set in COCO's form, which --dataset takes"),
 ]
 

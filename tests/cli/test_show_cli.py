@@ -2,6 +2,7 @@
 
 import math
 import re
+import zlib
 from pathlib import Path
 
 import pytest
@@ -44,8 +45,18 @@ def test_show_writes_a_page(folder, capsys):
     assert "--force" in refused_line
     assert "--html" in refused(capsys, "show", "camera.yml", "--image", "in.png")
     assert "in.png" in refused(capsys, "show", "camera.yml", "--html", "in.png", "--image", "in.png", "--force")
-    Path("broken.png").write_bytes(b"no image")
-    assert "broken.png" in refused(capsys, "show", "camera.yml", "--html", "b.html", "--image", "broken.png")
+    whole = Path("in.png").read_bytes()
+    huge = whole[:16] + 2 * (60_000).to_bytes(4, "big") + whole[24:29]  # of a bomb; what comes next is not read
+    huge += zlib.crc32(huge[12:]).to_bytes(4, "big") + whole[33:]
+    for content, reason in (
+        (b"no image", "not an image"),
+        (whole[:-40], "truncated"),
+        (huge, "million pixels, which are not read"),
+    ):
+        Path("broken.png").write_bytes(content)
+        error = refused(capsys, "show", "camera.yml", "--html", "b.html", "--image", "broken.png")
+        assert "broken.png: " in error
+        assert reason in error
     assert not Path("b.html").exists()
 
 
@@ -74,6 +85,10 @@ def test_convert_writes_the_new_camera(folder, capsys):
     camera = ct.load("out.json").camera
     assert (type(camera), camera.image_size) == (ct.Fisheye624, (64, 96))
     assert camera.distortion[:4].tolist() == [-0.02, 0.004, -0.003, 0.0006]
+    command("convert", "camera.yml", "-o", "same.json", "--model", "fisheye624")
+    assert Path("same.json").read_bytes() == Path("out.json").read_bytes()
+    for names in ((), ("a.json", "-o", "b.json")):
+        assert "camtorch convert IN -o OUT" in refused(capsys, "convert", "camera.yml", *names)
 
 
 def test_convert_says_how_good_it_is(folder, capsys):
