@@ -149,7 +149,8 @@ class XGaze(FileSamples):
         height, width = patch.shape[:2]
         sample: Sample = {"image": torch.from_numpy(np.ascontiguousarray(patch[..., ::-1].transpose(2, 0, 1)))}
         if "face_gaze" in told:
-            sample["gaze"] = from_pitch_yaw(told["face_gaze"])
+            with failing_at(place, "face_gaze: ", ValueError):
+                sample["gaze"] = from_pitch_yaw(told["face_gaze"])
         sample |= {new: told[name] for name, new in _FIELDS.items() if name in told}
         camera = Pinhole([_FOCAL, _FOCAL, width / 2, height / 2], image_size=(height, width))
         return {**sample, "camera": camera.requires_grad_(False), "path": str(path), "row": row}
@@ -166,5 +167,6 @@ def _hdf(path: Path) -> Iterator[Any]:
         open_file = importlib.import_module("h5py").File
     except ImportError:
         raise ImportError(f'{path}: to read it needs h5py: pip install "camtorch[datasets]"') from None
-    with failing_at(path, "not a whole file of HDF5: ", OSError, KeyError, RuntimeError), open_file(path, "r") as file:
+    errors = OSError, KeyError, RuntimeError, ValueError, AttributeError  # the last of what is no array
+    with failing_at(path, "not a whole file of HDF5: ", *errors), open_file(path, "r") as file:
         yield file

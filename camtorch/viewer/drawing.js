@@ -381,6 +381,7 @@ const Viewer = (() => {
     context.lineWidth = 0.6 * line;
     context.font = `${8 * line}px system-ui, sans-serif`;
     const most = furthestAngle() / RADIAN, step = [1, 2, 5, 10, 15, 30].find((s) => most / s < 7) ?? 30;
+    let labelled = null; // at the rim of a fisheye circles lie closer than their numbers are wide
     for (let angle = step; angle < 180; angle += step) {
       const circle = Array.from({ length: 121 }, (_, i) => onCircle(angle * RADIAN, (i * Math.PI) / 60));
       if (!circle.some(Boolean)) break;
@@ -393,7 +394,8 @@ const Viewer = (() => {
       context.lineDashOffset = 0;
       context.setLineDash([]);
       const place = circle[0] && circle[0][0] < width - 14 * line ? circle[0] : circle[60];
-      if (!place) continue;
+      if (!place || (labelled && Math.hypot(place[0] - labelled[0], place[1] - labelled[1]) < 18 * line)) continue;
+      labelled = place;
       context.strokeStyle = "#000000";
       context.fillStyle = "#ffffff";
       context.strokeText(`${angle}°`, place[0] + line, place[1] - line);
@@ -695,10 +697,11 @@ const Viewer = (() => {
       const middle = axis ? [state.intrinsics[2], 0] : [0, state.intrinsics[3]];
       const other = axis ? [state.intrinsics[2], side - 1] : [side - 1, state.intrinsics[3]];
       const rays = [camera.unproject(...middle), camera.unproject(...other)];
-      return rays.every(Boolean) ? `${Math.round(rays.reduce((sum, r) => sum + Math.acos(r[2]), 0) / RADIAN)}°` : "beyond its rays";
+      if (!rays.every(Boolean)) return `without rays at its ${axis ? "upper or lower" : "left or right"} edge`;
+      return `${Math.round(rays.reduce((sum, r) => sum + Math.acos(r[2]), 0) / RADIAN)}° ${axis ? "high" : "wide"}`;
     });
     $("facts").textContent =
-      `${titleOf(state.model)}, ${state.size[1]} x ${state.size[0]} px: ${angles[0]} wide, ${angles[1]} high; ` +
+      `${titleOf(state.model)}, ${state.size[1]} x ${state.size[0]} px: ${angles[0]}, ${angles[1]}; ` +
       `to the right its rays end at ${(reach / RADIAN).toFixed(1)}°.`;
   }
 
@@ -1192,9 +1195,10 @@ const Viewer = (() => {
     choose(DATA.camera ?? { model: "kannala_brandt", ...DATA.models.kannala_brandt });
     readAddress();
     if (DATA.photograph) {
+      const told = [$("message").textContent, $("message").className !== ""]; // of the address
       const bytes = Uint8Array.from(atob(DATA.photograph.split(",")[1]), (c) => c.charCodeAt(0));
       await takePhotograph(new Blob([bytes], { type: "image/jpeg" }), "the photograph", DATA.camera.image_size);
-      tell("");
+      tell(...told);
     }
   }
 

@@ -468,6 +468,12 @@ def test_faults_in_hdf5_name_the_file(tmp_path):
     with h5py.File(path, "w") as file:
         file["face_patch"], file["face_gaze"] = np.zeros((2, 8, 8, 3), np.uint8), np.zeros((3, 2))
     assert "face_gaze (N, 2)" in message(path)
+    with h5py.File(path, "w") as file:
+        file["face_patch"], file["face_gaze"] = np.zeros((2, 8, 8, 3), np.uint8), np.full((2, 2), 40.0)
+    assert "row 0: face_gaze: from_pitch_yaw: angles must be radians" in message(path)
+    with h5py.File(path, "w") as file:
+        file["face_patch"] = np.dtype(np.uint8)  # a type, and no array
+    assert "not a whole file of HDF5" in message(path)
 
 
 def test_a_format_that_is_not_seen_is_an_error_that_lists_them(tmp_path):

@@ -262,9 +262,10 @@ def test_trouble_is_a_sentence(opened, tmp_path):
     ],
 )
 def test_a_wrong_address_is_told(address, text, opened):
-    tab = opened(address=address)
-    assert text in tab.inner_text("#message")
-    assert tab.locator("#left").bounding_box()["height"] > 50
+    for camera, image in ((None, None), (fisheye(), np.zeros((240, 320, 3), np.uint8))):
+        tab = opened(camera, image, address)
+        assert text in tab.inner_text("#message")
+        assert tab.locator("#left").bounding_box()["height"] > 50
 
 
 def test_an_address_puts_nothing_into_the_lines_that_are_copied(opened):
