@@ -1195,7 +1195,8 @@ const Viewer = (() => {
     choose(DATA.camera ?? { model: "kannala_brandt", ...DATA.models.kannala_brandt });
     readAddress();
     if (DATA.photograph) {
-      const told = [$("message").textContent, $("message").className !== ""]; // of the address
+      frame();
+      const told = [$("message").textContent, $("message").className !== ""]; // of what the address asks for
       const bytes = Uint8Array.from(atob(DATA.photograph.split(",")[1]), (c) => c.charCodeAt(0));
       await takePhotograph(new Blob([bytes], { type: "image/jpeg" }), "the photograph", DATA.camera.image_size);
       tell(...told);
