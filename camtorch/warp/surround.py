@@ -82,7 +82,7 @@ class Surround(GeometryModule):
 
     def weights(self) -> dict[str, Tensor]:
         """(1, 1, H, W) by the name of a camera; they add up to one where any camera sees something, else to zero."""
-        return dict(zip(self.names, self._weights(), strict=True))
+        return {name: kept.clone() for name, kept in zip(self.names, self._weights(), strict=True)}
 
     @torch.no_grad()
     def _weights(self) -> tuple[Tensor, ...]:

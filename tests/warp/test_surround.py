@@ -73,6 +73,8 @@ def test_four_cameras_from_above_have_no_seams(dtype):
     error = (result.double() / scale - floor(points)).abs()[valid]
     # a grey level, where a floor far away is enlarged too
     assert float(error.quantile(0.99)) < 1 / 255
+    for handed in around.weights().values():  # belongs to the caller
+        handed.zero_()
     weights = torch.stack(list(around.weights().values()))
     torch.testing.assert_close(weights.sum(0)[valid], torch.ones_like(weights.sum(0)[valid]))
     assert (weights.sum(0)[~valid] == 0).all()
