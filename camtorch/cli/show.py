@@ -41,6 +41,7 @@ def run(arguments: argparse.Namespace) -> None:
             sizes = f"{other.width}x{other.height}, but {path} for {camera.width}x{camera.height}"
             raise ValueError(f"{against} is for {sizes}: cameras of one image are compared")
     if html is not None:
+        html.parent.mkdir(parents=True, exist_ok=True)
         write_viewer(camera, html, photograph)
     for name, camera in cameras.items():
         if camera.batch_shape:

@@ -41,6 +41,8 @@ def test_show_writes_a_page(folder, capsys):
     text = Path("lens.html").read_text()
     assert '"distortion":[-0.02,0.004,-0.003,0.0006]' in text
     assert "data:image/jpeg;base64," in text
+    command("show", "camera.yml", "--html", "new/lens.html", "--image", "in.png")  # its folder is made, as elsewhere
+    assert Path("new/lens.html").read_text() == text
     refused_line = refused(capsys, "show", "camera.yml", "--html", "lens.html")
     assert "--force" in refused_line
     assert "--html" in refused(capsys, "show", "camera.yml", "--image", "in.png")
