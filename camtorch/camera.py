@@ -17,6 +17,7 @@ from camtorch._arguments import (
     as_image_size,
     as_whole,
     broadcast_shapes,
+    hinting,
     is_predicted,
     shown,
 )
@@ -212,6 +213,7 @@ class Camera(BatchedModule):
         self.hold("distortion", distortion, (*batch, count))
 
     @classmethod
+    @hinting("It takes from_matrix(K, distortion, image_size=(height, width))")
     def from_matrix(
         cls,
         K: Numbers,  # noqa: N803
@@ -236,6 +238,7 @@ class Camera(BatchedModule):
         return cls(*numbers_of_matrix(cls, K, distortion, ignore_skew), image_size=image_size)
 
     @classmethod
+    @hinting("It takes from_fov(degrees, image_size=(height, width)), and perhaps axis and distortion")
     def from_fov(
         cls,
         fov: Numbers,

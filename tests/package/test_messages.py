@@ -259,6 +259,12 @@ WRONG = [
     ),
     (lambda: ct.Dewarp(np.eye(3), np.zeros(4)), TypeError, r"were given\. It takes a camera, as .*from_matrix\(K, D"),
     (lambda: ct.Dewarp(CAMERA, balance=0.5), TypeError, r"argument 'balance'\. It takes .* fov says how much it"),
+    (
+        lambda: ct.Pinhole.from_matrix(np.eye(3), None, SIZE),
+        TypeError,
+        r"given\. It takes from_matrix\(K, dist",
+    ),
+    (lambda: ct.Pinhole.from_fov(90), TypeError, r"'image_size'\. It takes from_fov\(degrees, image_size="),
     (lambda: ct.Extrinsics(np.eye(4)), TypeError, r"translation is missing .*\(4, 4\); ct.Extrinsics.from_matrix\(T"),
     (lambda: augment.from_pitch_yaw(torch.tensor([10.0, 20.0])), ValueError, r"radians; 20 seems to be degrees"),
     (lambda: CAMERA.crop(24, 0, 8, 8), ValueError, r"crop: .* = \(24, 0, 8, 8\) holds no pixel of the image .*24, 32"),
