@@ -294,7 +294,10 @@ class Bundle:
     are_shared: list[bool]
     fixed: list[Camera | None]
     learns_bend: bool
+    lost: Tensor
     columns: tuple[tuple[int, int], ...]
+    learnt: list[tuple[Tensor, Tensor]]
+    """Of each camera the numbers of its columns, and of its parameters in them."""
     unknowns: int
     low: Tensor
     high: Tensor
@@ -308,6 +311,7 @@ class Bundle:
         self.sights = [s.mapped(lambda t: t.expand(batch, *t.shape[1:])) for s in sights]
         self.cameras = [_template(s.model, p) for s, p in zip(sights, state.parameters, strict=True)]
         self.rounding = torch.stack([rounding_of(s.pixels, s.weights) for s in self.sights]).sum(0)
+        self.lost = robust(loss, loss_scale, self.sights[0].weights.new_tensor(_LOST**2))[0]
         # a camera that does not learn, and is that of all problems, sees them in one row
         self.are_shared = [
             len(p) == 1 and not bool(f.any()) for p, f in zip(state.parameters, free.parameters, strict=True)
@@ -322,6 +326,11 @@ class Bundle:
             + [(c, len(free.parameters[c]) + i) for c, learns in enumerate(free.mounts) if learns for i in range(6)]
             + [(-1, i) for i in range(2) if free.bend]
         )
+        self.learnt = []
+        for c, p in enumerate(state.parameters):
+            of = [(g, i) for g, (camera, i) in enumerate(self.columns) if camera == c and i < p.shape[-1]]
+            at, own = torch.tensor(of, dtype=torch.long, device=p.device).view(-1, 2).unbind(-1)
+            self.learnt.append((at, own))
         self.width = 6 if free.boards == "poses" else 3
         """Of the unknowns of a view."""
         views = torch.stack([(s.weights > 0).any(-1).any(0) for s in self.sights]).any(0).sum()
@@ -383,17 +392,17 @@ class Bundle:
         pixels, valid = camera.project(frames[-1])
         seen = sight.weights > 0
         residuals = torch.where((valid & seen)[..., None], pixels - sight.pixels, 0.0)
-        cost, slope = robust(self.loss, self.loss_scale, residuals.square().sum(-1))
-        lost = robust(self.loss, self.loss_scale, torch.full_like(cost, _LOST**2))[0]
-        cost = torch.where(valid, cost, lost) * sight.weights
+        u, v = residuals.unbind(-1)
+        cost, slope = robust(self.loss, self.loss_scale, u * u + v * v)
+        cost = torch.where(valid, cost, self.lost) * sight.weights
         return _Look(residuals, valid, torch.where(valid, slope * sight.weights, 0.0), cost, frames, camera)
 
     def looks(self, flat: Sequence[Tensor], rows: Tensor) -> list[_Look]:
         """Of all cameras: those of the last state again if it is that."""
-        given = rows, *flat
-        if self._last is None or not all(map(torch.equal, given, self._last[0])):
-            self._last = given, [self.look(c, flat, rows) for c in range(len(self.sights))]
-        return self._last[1]
+        given, last = (rows, *flat), self._last
+        if last is None or not all(a is b or torch.equal(a, b) for a, b in zip(given, last[0], strict=True)):
+            self._last = last = given, [self.look(c, flat, rows) for c in range(len(self.sights))]
+        return last[1]
 
     def shown(self, c: int, look: _Look) -> Tensor:
         """(B, V, N): the points that a camera shows, and not only while it is searched."""
@@ -437,7 +446,7 @@ class Bundle:
         """The triangles of a state."""
         rows = torch.arange(len(flat[0]), device=flat[0].device) if rows is None else rows
         state, width, total = self.state(flat), self.width, len(self.columns)
-        if (found := self._compiled(state, rows)) is not None:
+        if (found := self._compiled(flat, rows)) is not None:
             return found
         parts = []
         for c, look in enumerate(self.looks(flat, rows)):
@@ -459,14 +468,15 @@ class Bundle:
         shared = torch.linalg.qr(padded(left), mode="r").R
         return Equations(triangle[..., :width, :], shared, self.columns)
 
-    def _compiled(self, state: State, rows: Tensor) -> Equations | None:
+    def _compiled(self, flat: Sequence[Tensor], rows: Tensor) -> Equations | None:
         """The same by compiled code, where there is any, of one camera and flat boards that may be anywhere."""
         if len(self.sights) > 1 or self.free.mounts[0] or self.sights[0].motions or self.width < 6:
             return None
+        state = self.state(flat)
         if self.learns_bend or bool((state.bend != 0).any()):
             return None
-        look, sight = self.looks(self.flat(state), rows)[0], self.sight(0, rows)
-        learnt = [i for _, i in self.columns]
+        look, sight = self.looks(flat, rows)[0], self.sight(0, rows)
+        learnt = self.learnt[0][1].tolist()
         made = compiled_of([look.camera], look.residuals)
         if made is None or (made[0][0].plan.places is None and any(i >= 4 for i in learnt)):
             return None
@@ -499,9 +509,8 @@ class Bundle:
         batch, views, count = points.shape[:3]
         parameters = state.parameters[c]
         lead = (1, batch * views * count) if self.are_shared[c] else (batch, views * count)
-        learnt = [(g, i) for g, (camera, i) in enumerate(self.columns) if camera == c and i < parameters.shape[-1]]
-        at = [g for g, _ in learnt]
-        found = _pixel_jacobians(look.camera, points.reshape(*lead, 3), any(i >= 4 for _, i in learnt))
+        at, own = (t.tolist() for t in self.learnt[c])
+        found = _pixel_jacobians(look.camera, points.reshape(*lead, 3), any(i >= 4 for i in own))
         by_point, by_k = (by.reshape(batch, views, count, 2, by.shape[-1]) for by in found)
         is_mounted = c > 0 or self.free.mounts[0]
         by_first = by_point @ state.mounts.rotations[:, c, None, None] if is_mounted else by_point
@@ -510,11 +519,11 @@ class Bundle:
         if self.width == 6:
             columns.append(torch.linalg.cross(turned[..., None, :].expand_as(by_board), by_board, dim=-1))
         columns.append(by_board)
-        if learnt:
+        if own:
             focal, centre = parameters[:, None, None, :2], parameters[:, None, None, 2:4]
             by_focal = torch.diag_embed((look.residuals + sight.pixels - centre) / focal)
             by_centre = torch.eye(2, dtype=focal.dtype, device=focal.device).expand_as(by_focal)
-            columns.append(torch.cat((by_focal, by_centre, by_k), -1)[..., [i for _, i in learnt]])
+            columns.append(torch.cat((by_focal, by_centre, by_k), -1)[..., own])
         mine = [g for g, (camera, i) in enumerate(self.columns) if camera == c and i >= parameters.shape[-1]]
         if mine:
             at += mine
@@ -538,18 +547,20 @@ class Bundle:
             boards = Poses(turned, boards.translations + of_views[..., 3:])
         else:
             boards = boards._replace(translations=boards.translations + of_views)
-        parameters = [p.clone() for p in state.parameters]
-        turn, shift = torch.zeros_like(mounts.translations), torch.zeros_like(mounts.translations)
-        for g, (c, i) in enumerate(self.columns):
-            if c < 0:
-                bend = bend.clone()
-                bend[:, i] += shared[:, g]
-            elif i < parameters[c].shape[-1]:
-                parameters[c][:, i] = (parameters[c][:, i] + shared[:, g]).clamp(self.low[rows, g], self.high[rows, g])
-            else:
-                i -= parameters[c].shape[-1]
-                (turn if i < 3 else shift)[:, c, i % 3] += shared[:, g]
+        parameters = []
+        for p, (at, own) in zip(state.parameters, self.learnt, strict=True):
+            if len(at):
+                low, high = (ends[rows][:, at] for ends in (self.low, self.high))
+                p = p.index_copy(1, own, (p[:, own] + shared[:, at]).clamp(low, high))
+            parameters.append(p)
+        if self.learns_bend:
+            bend = bend + shared[:, -2:]
         if any(self.free.mounts):
+            turn, shift = torch.zeros_like(mounts.translations), torch.zeros_like(mounts.translations)
+            for g, (c, i) in enumerate(self.columns):
+                i -= parameters[c].shape[-1]
+                if c >= 0 and i >= 0:
+                    (turn if i < 3 else shift)[:, c, i % 3] += shared[:, g]
             mounts = Poses(small_turn(turn) @ mounts.rotations, mounts.translations + shift)
         return self.flat(State(tuple(parameters), mounts, boards, bend))
 

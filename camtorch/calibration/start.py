@@ -328,7 +328,8 @@ def _errors(camera: Camera, boards: Poses, some: Observations) -> Tensor:
     """(B, V, N) px, NaN for what is not seen."""
     pixels, valid = camera.project(boards.moved(some.points).flatten(1, 2))
     shape = len(pixels), *some.seen.shape
-    errors = torch.linalg.vector_norm(pixels.view(*shape, 2) - some.pixels, dim=-1)
+    # components lie in planes, along which a norm would be slow
+    errors = torch.hypot(*(pixels.view(*shape, 2) - some.pixels).unbind(-1))
     return torch.where(some.seen, torch.where(valid.view(shape), errors, _NO_PIXEL), torch.nan)
 
 

@@ -72,4 +72,13 @@ typedef struct {
     int64_t *left;         /* -1: no memory */
 } Views;
 
+/* Damped steps of such problems, of views with so many unknowns; `System.step` there */
+typedef struct {
+    const double *view, *shared; /* (b, v, width, width + columns + 1), (b, columns + 1, columns + 1) */
+    const double *damping;       /* (b) */
+    int64_t problems, views, width, columns;
+    double *of_views, *of_shared, *rest; /* (b, v, width), (b, columns), (b): what a step leaves of the decrement */
+    int64_t *left;                       /* -1: no memory */
+} Steps;
+
 #endif
