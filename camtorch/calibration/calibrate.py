@@ -507,8 +507,9 @@ def results(
     for c, search in enumerate(searches):
         adjusted, found = search.other_optima(c, sights, adjusted, free)
         optima.append(found)
+    spreads = [spread(adjusted, search.asked.kind, c) for c, search in enumerate(searches)]
     for c, search in enumerate(searches):
-        check_determined(adjusted, c, search.asked.kind, search.asked.names, sights[c], search.owner)
+        check_determined(adjusted, c, spreads[c], search.asked.names, sights[c], search.owner)
     given = [search.given for search in searches]
     seen = torch.cat([one.seen for one in given])
     residuals, valid = (torch.cat([t[0] for t in of_all]) for of_all in (adjusted.residuals, adjusted.valid))
@@ -520,10 +521,11 @@ def results(
     again = repeats(given, [r[0] for r in adjusted.residuals])
     noise = noise * math.sqrt(len(views) / (len(views) - len(again))) * searches[0].misfit
     cameras = []
-    for c, (search, passed, own) in enumerate(zip(searches, image_points, inliers.split(len(views)), strict=True)):
+    for c, (search, pixels, own) in enumerate(zip(searches, image_points, inliers.split(len(views)), strict=True)):
         copies = search.layout.views[again[search.given.seen[again].any(-1)]].tolist()
         layout = search.layout._replace(copies=tuple(sorted({*search.layout.copies, *copies})))
-        cameras.append(_result(adjusted, c, search, layout, own, sigma, noise, (object_points, passed)))
+        passed = object_points, pixels
+        cameras.append(_result(adjusted, c, search, layout, own, sigma, spreads[c].scaled(noise.reshape(1)), passed))
     for camera, ends in zip(cameras, optima, strict=True):
         camera.twins = () if ends is None else ends.twins(camera)
     return Results(adjusted, cameras, rms_of(residuals, seen), float(sigma), noise)
@@ -597,7 +599,7 @@ def _result(
     layout: Layout,
     inliers: Tensor,
     sigma: Tensor,
-    noise: Tensor,
+    spread: Spread,
     passed: tuple[Any, Any],
 ) -> Calibration:
     """The result for one of the cameras."""
@@ -617,7 +619,7 @@ def _result(
         residuals=layout.restore(torch.where(valid[..., None], residuals, torch.nan)),
         inliers=layout.restore(inliers),
         parameter_names=asked.names,
-        spread=spread(adjusted, asked.kind, camera, noise.reshape(1)),
+        spread=spread,
         converged=bool(adjusted.converged[0]) and bool((valid | ~seen.seen).all()),
         bend=(float(state.bend[0, 0]), float(state.bend[0, 1])),
         image_size=layout.image_size,

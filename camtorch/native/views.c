@@ -52,19 +52,48 @@ static void solved(const double *columns, int64_t width, int64_t rows, const dou
     }
 }
 
+/* The points of a view in the frame of its camera */
+static void moved_to(const Views *given, int64_t problem, int64_t view, double *moved) {
+    const double *points = given->points + problem * given->point_strides[0] + view * given->point_strides[1];
+    const int64_t at = problem * given->views + view;
+    const double *rotation = given->rotations + 9 * at, *shift = given->translations + 3 * at;
+    for (int64_t i = 0; i < given->count; i++)
+        for (int k = 0; k < 3; k++) {
+            const double *r = rotation + 3 * k, *p = points + 3 * i;
+            moved[3 * i + k] = r[0] * p[0] + r[1] * p[1] + r[2] * p[2] + shift[k];
+        }
+}
+
+/* Residuals, weights, and the cost of a view; `Bundle.look`. How many points wait */
+static int64_t look(const Views *given, const Cameras *camera, int64_t problem, int64_t view, double *moved) {
+    const int64_t n = given->count, at = problem * given->views + view;
+    double *residuals = given->residuals + at * n * 2, *weights = given->weights + at * n, *cost = given->costs + at;
+    const double *pixels = given->pixels + at * n * 2, *of_points = given->given + at * n;
+    uint8_t *valid = given->valid + at * n;
+    moved_to(given, problem, view, moved);
+    const Rows of = {.cameras = camera, .rows = moved, .row_strides = {3 * n, 3, 1}, .results = residuals,
+                     .result_strides = {2 * n, 2, 1}, .valid = valid, .count = n, .tile = n, .direction = PROJECT};
+    const int64_t left = THIS(geometry)(&of);
+    *cost = 0;
+    for (int64_t i = 0; i < n; i++) {
+        double *residual = residuals + 2 * i, weight;
+        const int counts = valid[i] && of_points[i] > 0;
+        for (int k = 0; k < 2; k++) residual[k] = counts ? residual[k] - pixels[2 * i + k] : 0;
+        const double square = valid[i] ? residual[0] * residual[0] + residual[1] * residual[1] : LOST * LOST;
+        *cost += of_points[i] * robust(given->loss, given->loss_scale, square, &weight);
+        weights[i] = valid[i] ? weight * of_points[i] : 0;
+    }
+    return left;
+}
+
 /* The columns (6 + columns + 1, rows) of a view, whose rows are u and v of each point */
 static void columns_of(const Views *given, const Cameras *camera, int64_t problem, int64_t view, double *columns,
                        int64_t rows, double *moved, double *slopes, double *sums, int by_numbers) {
     static const double ones[3] = {0, 1, 0};
     const int64_t n = given->count, width = 4 + camera->parameter_count, at = problem * given->views + view;
-    const double *points = given->points + problem * given->point_strides[0] + view * given->point_strides[1];
-    const double *rotation = given->rotations + 9 * at, *shift = given->translations + 3 * at;
+    const double *shift = given->translations + 3 * at;
     const double *residuals = given->residuals + at * n * 2, *weights = given->weights + at * n;
-    for (int64_t i = 0; i < n; i++)
-        for (int k = 0; k < 3; k++) {
-            const double *r = rotation + 3 * k, *p = points + 3 * i;
-            moved[3 * i + k] = r[0] * p[0] + r[1] * p[1] + r[2] * p[2] + shift[k];
-        }
+    moved_to(given, problem, view, moved);
     for (int by = 0; by < 2; by++) {
         if (by_numbers) memset(sums, 0, (size_t)(n * width) * sizeof *sums);
         const Rows of = {.cameras = camera, .rows = moved, .row_strides = {3 * n, 3, 1}, .results = slopes,
@@ -105,6 +134,10 @@ void THIS(views)(const Views *given) {
     for (int64_t problem = 0; problem < given->problems; problem++) {
         const Cameras camera = only(given->cameras, problem);
         for (int64_t view = 0; view < given->views; view++) {
+            if (!given->view) {
+                *given->left += look(given, &camera, problem, view, moved);
+                continue;
+            }
             for (int64_t j = 0; j < width; j++)
                 for (int64_t i = 2 * n; i < rows; i++) columns[j * rows + i] = 0;
             columns_of(given, &camera, problem, view, columns, rows, moved, slopes, sums, learnt > 0);
@@ -115,6 +148,7 @@ void THIS(views)(const Views *given) {
             for (int64_t j = 0; j < own; j++)
                 for (int64_t i = 0; i < own; i++) stacked[j * all + view * own + i] = i > j ? 0 : columns[(6 + j) * rows + 6 + i];
         }
+        if (!given->view) continue;
         reduce(stacked, own, all, own);
         double *to = given->shared + problem * own * own;
         for (int64_t i = 0; i < own; i++)
