@@ -24,6 +24,7 @@ from camtorch.least_squares.equations import Equations, System, padded, triangle
 from camtorch.least_squares.jacobians import sensor_jacobians
 from camtorch.least_squares.levenberg_marquardt import FIRST_DAMPING, minimise, rounding_of
 from camtorch.projection import compiled
+from camtorch.projection.rows import Cameras
 from camtorch.rotations import small_turn
 
 if TYPE_CHECKING:
@@ -271,15 +272,14 @@ def bent(points: Tensor, bend: Tensor) -> tuple[Tensor, Tensor]:
 class _Look(NamedTuple):
     """What a camera makes of a state.
 
-    residuals: (B, V, N, 2). valid, weights: (B, V, N), the weights of the squares. cost: (B, V). camera: as it is then.
-    native: it, where compiled code made this.
+    residuals: (B, V, N, 2). valid, weights: (B, V, N), the weights of the squares. cost: (B, V). native: the camera,
+    where compiled code made this.
     """
 
     residuals: Tensor
     valid: Tensor
     weights: Tensor
     cost: Tensor
-    camera: Camera
     native: compiled.Native | None = None
 
 
@@ -336,8 +336,10 @@ class Bundle:
             at, own = torch.tensor(of, dtype=torch.long, device=p.device).view(-1, 2).unbind(-1)
             self.learnt.append((at, own))
         self.is_bent = free.bend or bool((state.bend != 0).any())
-        plain = free.boards == "poses" and not (free.mounts[0] or sights[0].motions or self.is_bent)
-        self.is_plain = len(sights) == 1 and plain
+        plain = (
+            len(sights) == 1 and free.boards == "poses" and not (free.mounts[0] or sights[0].motions or self.is_bent)
+        )
+        self.is_plain = plain and compiled_of([self.camera(0, state)], self.sights[0].pixels) is not None
         self.width = 6 if free.boards == "poses" else 3
         """Of the unknowns of a view."""
         views = torch.stack([(s.weights > 0).any(-1).any(0) for s in self.sights]).any(0).sum()
@@ -389,23 +391,27 @@ class Bundle:
         mounts = state.mounts
         return turned, first, first @ mounts.rotations[:, c, None].mT + mounts.translations[:, c, None, None]
 
+    def camera(self, c: int, state: State) -> Camera:
+        """As it is in a state."""
+        parameters = state.parameters[c]
+        return self.fixed[c] or remade(self.cameras[c], intrinsics=parameters[:, :4], distortion=parameters[:, 4:])
+
     def look(self, c: int, flat: Sequence[Tensor], rows: Tensor | None = None) -> _Look:
         """What a camera makes of a state."""
         state, sight = self.state(flat), self.sight(c, rows)
-        camera, parameters = self.fixed[c], state.parameters[c]
-        if camera is None:
-            camera = remade(self.cameras[c], intrinsics=parameters[:, :4], distortion=parameters[:, 4:])
-        if self.is_plain and (made := compiled_of([camera], sight.pixels)) is not None:
-            native = made[0][0]
+        if self.is_plain and len(state.bend):
+            parameters = state.parameters[0][: 1 if self.are_shared[0] else None]
+            native = Cameras(type(self.cameras[0]), parameters[:, :4], parameters[:, 4:]).native
+            assert native is not None  # it was there for the first ones
             loss = self.loss, self.loss_scale
             found = compiled_poses.seen(native, sight.points, state.boards, sight.pixels, sight.weights, *loss)
-            return _Look(*found, camera, native)
-        pixels, valid = camera.project(self.points(c, state, sight)[-1])
+            return _Look(*found, native)
+        pixels, valid = self.camera(c, state).project(self.points(c, state, sight)[-1])
         residuals = torch.where((valid & (sight.weights > 0))[..., None], pixels - sight.pixels, 0.0)
         u, v = residuals.unbind(-1)
         cost, slope = robust(self.loss, self.loss_scale, u * u + v * v)
         cost = (torch.where(valid, cost, self.lost) * sight.weights).sum(-1)
-        return _Look(residuals, valid, torch.where(valid, slope * sight.weights, 0.0), cost, camera)
+        return _Look(residuals, valid, torch.where(valid, slope * sight.weights, 0.0), cost)
 
     def looks(self, flat: Sequence[Tensor], rows: Tensor) -> list[_Look]:
         """Of all cameras: those of the last state again if it is that."""
@@ -419,9 +425,11 @@ class Bundle:
         kind = _kind(self.sights[c].model)
         if kind.searched() is kind:
             return look.valid
-        camera = fixed_camera(kind, look.camera.intrinsics, look.camera.distortion)
+        state = self.state(flat)
+        searched = self.camera(c, state)
+        camera = fixed_camera(kind, searched.intrinsics, searched.distortion)
         camera._warned = True
-        return look.valid & camera.project(self.points(c, self.state(flat), self.sights[c])[-1])[1]
+        return look.valid & camera.project(self.points(c, state, self.sights[c])[-1])[1]
 
     def sight(self, c: int, rows: Tensor | None) -> Sight:
         """Of some problems."""
@@ -512,7 +520,7 @@ class Bundle:
         batch, views, count = points.shape[:3]
         lead = (1, batch * views * count) if self.are_shared[c] else (batch, views * count)
         at, own = (t.tolist() for t in self.learnt[c])
-        found = pixel_jacobians(look.camera, points.reshape(*lead, 3), bool(own))
+        found = pixel_jacobians(self.camera(c, state), points.reshape(*lead, 3), bool(own))
         by_point, by_parameters = (by.reshape(batch, views, count, 2, by.shape[-1]) for by in found)
         is_mounted = c > 0 or self.free.mounts[0]
         by_first = by_point @ state.mounts.rotations[:, c, None, None] if is_mounted else by_point
