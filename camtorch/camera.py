@@ -371,7 +371,8 @@ class Camera(BatchedModule):
         """(R, n) rows whose products with the coefficients are small in a smooth lens, float64.
 
         A model that states them has a lens that is linear in its coefficients, and coefficients enough to take the
-        place of the intrinsics, which fits then hold. None: the coefficients are few.
+        place of the intrinsics, which fits then hold, and of coefficients that are in no row, as those of a windshield.
+        None: the coefficients are few.
         """
         return None
 

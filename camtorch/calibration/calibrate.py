@@ -101,8 +101,9 @@ def as_model(
     if not isinstance(fixed, Collection) or isinstance(fixed, Mapping):
         raise TypeError(f'{owner}: fixed must be names of parameters, as ("cx", "cy"), or "all"; got {fixed!r}')
     fixed = (names if fixed == "all" else (fixed,)) if isinstance(fixed, str) else tuple(fixed)
-    if start is not None and model.smoothness() is not None:
-        fixed = (*fixed, *INTRINSICS)
+    if start is not None and (smooth := model.smoothness()) is not None:
+        # what these do, of a windshield before it too, a surface does as well
+        fixed = (*fixed, *(name for name, is_it in zip(names[4:], smooth.any(0), strict=True) if not is_it), *INTRINSICS)
     unknown = [name for name in fixed if not isinstance(name, str) or name not in names]
     if unknown:
         raise ValueError(
