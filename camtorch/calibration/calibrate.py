@@ -102,8 +102,9 @@ def as_model(
         raise TypeError(f'{owner}: fixed must be names of parameters, as ("cx", "cy"), or "all"; got {fixed!r}')
     fixed = (names if fixed == "all" else (fixed,)) if isinstance(fixed, str) else tuple(fixed)
     if start is not None and (smooth := model.smoothness()) is not None:
-        # what these do, of a windshield before it too, a surface does as well
-        fixed = (*fixed, *(name for name, is_it in zip(names[4:], smooth.any(0), strict=True) if not is_it), *INTRINSICS)
+        # what these do, and a windshield, a surface does as well
+        own = zip(names[4:], smooth.any(0).tolist(), strict=True)
+        fixed = (*fixed, *INTRINSICS, *(name for name, is_in in own if not is_in))
     unknown = [name for name in fixed if not isinstance(name, str) or name not in names]
     if unknown:
         raise ValueError(
