@@ -51,7 +51,7 @@ class GeometryModule(nn.Module):
     _own: dict[str, Tensor | None]
     """The tensors that were registered, also while others stand in their place."""
 
-    def __init__(self, modules: Mapping[str, nn.Module | None] = MappingProxyType({}), **attributes: Any):
+    def __init__(self, modules: Mapping[str, nn.Module | None] = MappingProxyType({}), /, **attributes: Any):
         """With these attributes, which are no modules, and parts."""
         if torch.compiler.is_compiling():  # which follows torch's own way, that takes 1 us an attribute
             super().__init__()
@@ -310,13 +310,13 @@ def remade(module: Made, **changes: Any) -> Made:
     A Parameter and a tensor of a graph are kept as they are. Any other tensor is held as it is, without a copy, by a
     Parameter that does not learn.
     """
-    model = model_of(module)
+    model: Any = model_of(module)
     tensors = {name: changes.pop(name) if name in changes else getattr(module, name) for name in module.tensor_names}
     if torch.compiler.is_compiling() and "image_size" in module.__dict__:
         # the compiler follows a constructor, and nothing that does without
         numbers = [fixed(tensor) for tensor in tensors.values() if tensor.shape[-1]]
-        return model(*numbers, image_size=changes.get("image_size", module.image_size))
-    made = model.__new__(model)
+        return cast("Made", model(*numbers, image_size=changes.get("image_size", module.image_size)))
+    made: Made = model.__new__(model)
     state = made.__dict__
     state.update(module.__dict__, _is_full_backward_hook=None, **changes)
     state.update(_containers())

@@ -144,7 +144,7 @@ def _is_right(matrix: Tensor) -> bool:
     squares = a * a + b * b + c * c, d * d + e * e + f * f, g * g + h * h + i * i
     products = a * d + b * e + c * f, d * g + e * h + f * i, g * a + h * b + i * c
     misses = max(max(squares) - 1, 1 - min(squares), max(products), -min(products))
-    return misses < _NEARLY and a * (e * i - f * h) + b * (f * g - d * i) + c * (d * h - e * g) > 0
+    return bool(misses < _NEARLY and a * (e * i - f * h) + b * (f * g - d * i) + c * (d * h - e * g) > 0)
 
 
 def turn(rotation: Tensor | None, rays: Tensor, name: str) -> Tensor:

@@ -87,8 +87,10 @@ def minimise(
     every = torch.arange(len(state[0]), device=device)
     # of each problem a number or two: NumPy takes a fraction of the time that torch does
     cost, own_rounding = (t.numpy(force=True).copy() for t in (problem.cost(state, every), problem.rounding))
-    tolerance, tiny = (np.broadcast_to(torch.as_tensor(t).numpy(force=True), cost.shape) for t in (tolerance, tiny))
-    weights, growth, converged = np.full_like(cost, damping), np.full_like(cost, 4.0), cost <= tiny
+    parts, least = (
+        np.broadcast_to(t.numpy(force=True) if isinstance(t, Tensor) else t, cost.shape) for t in (tolerance, tiny)
+    )
+    weights, growth, converged = np.full_like(cost, damping), np.full_like(cost, 4.0), cost <= least
     is_going = np.isfinite(cost) & ~converged & (True if going is None else going.numpy(force=True))
     system = None
     for number in range(steps):
@@ -103,7 +105,7 @@ def minimise(
             before = cost[rows]
             # sum((r + d)^2) - sum(r^2) is at most this, for residuals r and their rounding d
             rounding = 2 * np.sqrt(before * own_rounding[rows]) + own_rounding[rows]
-            enough = np.maximum(tolerance[rows] * before, rounding)
+            enough = np.maximum(parts[rows] * before, rounding)
             last = system.decrement.numpy(force=True) <= enough
         weight = weights[rows]
         step, promised = system.step(torch.from_numpy(weight).to(device))
@@ -121,7 +123,7 @@ def minimise(
         factor = np.where(kept > _GOOD, 0.03, np.where(kept > _FAIR, 1.0, 2.0))
         weights[rows] = (weight * np.where(better, factor, growth[rows])).clip(LEAST_DAMPING, MOST_DAMPING)
         growth[rows] = np.where(better, 4.0, growth[rows] * 2).clip(max=64.0)
-        settled = last | (cost[rows] <= tiny[rows])
+        settled = last | (cost[rows] <= least[rows])
         if stuck.any():
             settled = settled | stuck & (system.firm_decrement.numpy(force=True) <= enough)
         converged[rows] = settled
