@@ -155,6 +155,15 @@ def _derived(
             return make(model.optics(k[:-added]), k[-added:])
 
         @classmethod
+        def smoothness(cls) -> Tensor | None:
+            own = model.smoothness()
+            return None if own is None else torch.nn.functional.pad(own, (0, added))
+
+        @classmethod
+        def searched(cls) -> type[Camera]:
+            return cls if model.searched() is model else variant(model.searched(), text)
+
+        @classmethod
         def fit_start(cls, names: tuple[str, ...], angles: Tensor, radii: Tensor) -> Tensor:
             own = model.fit_start(names[:-added], angles, radii)
             return torch.cat((own, own.new_tensor(ideals).expand(*own.shape[:-1], added)), -1)

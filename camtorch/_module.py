@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, ClassVar, ParamSpec, TypeVar, cast
 
 import torch
@@ -39,9 +40,9 @@ _CONTAINERS = {"_own": {}, **{name: value for name, value in _BARE.items() if is
 _KINDS = [type(value) for value in _CONTAINERS.values()]
 
 
-def _containers() -> dict[str, Any]:
+def _containers() -> Iterator[tuple[str, Any]]:
     """The empty dicts and sets of a module, each its own."""
-    return dict(zip(_CONTAINERS, [kind() for kind in _KINDS], strict=True))
+    return zip(_CONTAINERS, [kind() for kind in _KINDS], strict=True)
 
 
 class GeometryModule(nn.Module):
@@ -50,18 +51,19 @@ class GeometryModule(nn.Module):
     _own: dict[str, Tensor | None]
     """The tensors that were registered, also while others stand in their place."""
 
-    def __init__(self, **attributes: Any):
+    def __init__(self, modules: Mapping[str, nn.Module | None] = MappingProxyType({}), /, **attributes: Any):
+        """With these attributes, which are no modules, and parts."""
         if torch.compiler.is_compiling():  # which follows torch's own way, that takes 1 us an attribute
             super().__init__()
-            for name, value in attributes.items():
+            for name, value in (*modules.items(), *attributes.items()):
                 setattr(self, name, value)
         else:
             state = self.__dict__
-            state.update(_BARE)
+            state.update(_BARE, **attributes)
             state.update(_containers())
-            modules = state["_modules"]
-            for name, value in attributes.items():
-                (modules if isinstance(value, nn.Module) else state)[name] = value
+            parts = state["_modules"]
+            for name, module in modules.items():
+                (state if module is None else parts)[name] = module
 
     def register_parameter(self, name: str, param: nn.Parameter | None) -> None:
         """As of `nn.Module`."""
@@ -308,13 +310,13 @@ def remade(module: Made, **changes: Any) -> Made:
     A Parameter and a tensor of a graph are kept as they are. Any other tensor is held as it is, without a copy, by a
     Parameter that does not learn.
     """
-    model = model_of(module)
+    model: Any = model_of(module)
     tensors = {name: changes.pop(name) if name in changes else getattr(module, name) for name in module.tensor_names}
     if torch.compiler.is_compiling() and "image_size" in module.__dict__:
         # the compiler follows a constructor, and nothing that does without
         numbers = [fixed(tensor) for tensor in tensors.values() if tensor.shape[-1]]
-        return model(*numbers, image_size=changes.get("image_size", module.image_size))
-    made = model.__new__(model)
+        return cast("Made", model(*numbers, image_size=changes.get("image_size", module.image_size)))
+    made: Made = model.__new__(model)
     state = made.__dict__
     state.update(module.__dict__, _is_full_backward_hook=None, **changes)
     state.update(_containers())

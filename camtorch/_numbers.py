@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import math
+import functools
 import warnings
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -35,9 +35,12 @@ if TYPE_CHECKING:
     from camtorch.camera import Camera
 
 CameraT = TypeVar("CameraT", bound="Camera")
+_Checked = tuple[Tensor, Tensor, tuple[str, ...], torch.Size, tuple[int, int] | None]
 
 _OF_CALIBRATE_CAMERA = 5, 8, 12, 14  # OpenCV's numbers of coefficients; 4 may be of its fisheye, too
 _DTYPES, _NUMBERS = (torch.float32, torch.float64), {float, int}
+_NO_BATCH = torch.Size()
+_LARGE = 1e30  # which float32 has, and NaN is not below
 _LOOKED_AT = 64  # cameras of a batch: numbers in a wrong order are so in all of them
 _CENTRED, _NEAR = 0.1, 0.05
 """Of the image's sides: how far from its middle principal points usually lie, and how near one is certainly meant."""
@@ -45,8 +48,8 @@ _CENTRED, _NEAR = 0.1, 0.05
 
 def checked_numbers(
     model: type[Camera], intrinsics: Numbers, distortion: Numbers | None, image_size: Sequence[int] | None
-) -> tuple[Tensor, Tensor, torch.Size, tuple[int, int] | None]:
-    """Intrinsics, distortion, batch dims and image size of a camera of this model that is made of them."""
+) -> _Checked:
+    """Intrinsics, distortion, its names, batch dims and image size of a camera of this model that is made of them."""
     owner = model.__name__
     intrinsics = checked_intrinsics(model, intrinsics)
     if distortion is None:
@@ -59,42 +62,47 @@ def checked_numbers(
     size = as_image_size(image_size, owner)
     if size is not None:
         warn_of_order(intrinsics, size, owner, stacklevel=4)
-    return intrinsics, distortion, batch, size
+    return intrinsics, distortion, model.names_of(distortion.shape[-1]) or (), batch, size
 
 
-def at_a_glance(
-    model: type[Camera], intrinsics: Any, distortion: Any, size: Any
-) -> tuple[Tensor, Tensor, tuple[str, ...]] | None:
-    """Own tensors (4,) and (n,) of a single camera, and the names of its coefficients, if all is right at a glance.
+def at_a_glance(model: type[Camera], intrinsics: Any, distortion: Any, size: Any) -> _Checked | None:
+    """As `checked_numbers`, Parameters of a single camera, if all is right at a glance; None where that is not enough.
 
-    That is of lists of numbers, and of plain tensors. None: it takes `checked_numbers` to say what is.
+    It is of lists of numbers, and of plain tensors.
     """
-    if size is not None and not (type(size) is tuple and [*map(type, size)] == [int, int] and min(size) > 0):
-        return None
-    given = [value for value in (intrinsics, distortion) if type(value) is Tensor]
-    if not (model.always_defined and is_eager(*given)):
+    if not (model.always_defined and is_eager(*[value for value in (intrinsics, distortion) if type(value) is Tensor])):
         return None
     made: list[Tensor] = []
     rows: list[list[float]] = []
     for value in (intrinsics, distortion):
-        if value is None and not model.default_count and made:
-            tensor, row = made[0].new_empty(0), []
-        elif type(value) is Tensor and value.ndim == 1 and value.dtype in _DTYPES and not value.requires_grad:
+        if type(value) is list and _NUMBERS.issuperset(map(type, value)):
+            tensor, row = torch.empty(len(value)), value
+        elif type(value) is Tensor and value.ndim == 1 and not value.requires_grad:
             tensor, row = value.clone(), value.tolist()
-        elif type(value) is list and _NUMBERS.issuperset(map(type, value)):
-            tensor, row = torch.tensor(value, dtype=torch.get_default_dtype()), value
+        elif value is None and not model.default_count and made:
+            tensor, row = made[0].new_empty(0), []
         else:
             return None
-        if not (tensor.is_cpu and tensor.dtype in _DTYPES and math.isfinite(sum(row))):
+        if not (tensor.dtype in _DTYPES and tensor.is_cpu and sum(map(abs, row)) < _LARGE):
             return None
-        made.append(tensor)
+        if row is value:
+            tensor.numpy()[:] = row  # in half the time of torch.tensor
+        made.append(nn.Parameter(tensor) if row else tensor)
         rows.append(row)
-    names = model.names_of(len(rows[1]))
-    if names is None or len(rows[0]) != 4 or not min(rows[0][:2]) > 0:
+    names = _names_of(model, len(rows[1]))  # type: ignore[arg-type]  # a class can be hashed
+    if len(rows[0]) != 4 or not min(rows[0][:2]) > 0 or names is None:
         return None
-    if size is not None and not _off_centre(rows[0][2], rows[0][3], size) <= _CENTRED:
-        return None
-    return made[0], made[1], tuple(names)
+    if size is not None:
+        if not (type(size) is tuple and len(size) == 2 and type(size[0]) is type(size[1]) is int and min(size) > 0):
+            return None
+        if not _off_centre(rows[0][2], rows[0][3], size) <= _CENTRED:
+            return None
+    return made[0], made[1], names, _NO_BATCH, size
+
+
+@functools.lru_cache(maxsize=256)
+def _names_of(model: type[Camera], count: int) -> tuple[str, ...] | None:
+    return model.names_of(count)
 
 
 def described(camera: Camera) -> str:

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, cast
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn.utils import parametrize
 
 from camtorch._arguments import (
@@ -193,24 +193,16 @@ class Camera(BatchedModule):
                 f"{type(self).__name__}: a camera is made by its model, as ct.KannalaBrandt(intrinsics, distortion), "
                 "or ct.KannalaBrandt.from_matrix(K, distortion) of a matrix K; ct.MODELS has all models"
             )
-        known = at_a_glance(type(self), intrinsics, distortion, image_size)
-        if known is not None:
-            intrinsics, distortion, names = known
-            memos = {name: Memo() for name in self.memo_names}
-            super().__init__(distortion_names=names, image_size=image_size, **memos, _warned=False)
-            self.put("intrinsics", nn.Parameter(intrinsics))
-            self.put("distortion", nn.Parameter(distortion) if names else distortion)
-            return
-        intrinsics, distortion, batch, size = checked_numbers(type(self), intrinsics, distortion, image_size)
-        count = distortion.shape[-1]
+        given = type(self), intrinsics, distortion, image_size
+        intrinsics, distortion, names, batch, size = at_a_glance(*given) or checked_numbers(*given)
         super().__init__(
-            distortion_names=self.names_of(count) or (),
+            distortion_names=names,
             image_size=size,
             **{name: Memo() for name in self.memo_names},
             _warned=is_predicted(intrinsics) or is_predicted(distortion),
         )
         self.hold("intrinsics", intrinsics, (*batch, 4))
-        self.hold("distortion", distortion, (*batch, count))
+        self.hold("distortion", distortion, (*batch, distortion.shape[-1]))
 
     @classmethod
     @hinting("It takes from_matrix(K, distortion, image_size=(height, width))")
@@ -375,7 +367,8 @@ class Camera(BatchedModule):
         """(R, n) rows whose products with the coefficients are small in a smooth lens, float64.
 
         A model that states them has a lens that is linear in its coefficients, and coefficients enough to take the
-        place of the intrinsics, which fits then hold. None: the coefficients are few.
+        place of the intrinsics, which fits then hold, and of coefficients that are in no row, as those of a windshield.
+        None: the coefficients are few.
         """
         return None
 

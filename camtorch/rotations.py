@@ -126,7 +126,7 @@ def as_rotation(rotation: Numbers | None, owner: str) -> Tensor | None:
     if rotation is None:
         return None
     if type(rotation) is Tensor and rotation.shape == (3, 3) and _is_right(rotation):
-        return as_own(rotation)
+        return rotation if rotation.requires_grad else rotation.clone()
     rotation = as_real(rotation, "rotation", owner)
     if rotation.shape[-2:] != (3, 3) or rotation.ndim > 3:
         hint = ". ct.Extrinsics(vector, (0, 0, 0)).matrix()[..., :3, :3] is the matrix of a rotation vector"
@@ -140,12 +140,11 @@ def _is_right(matrix: Tensor) -> bool:
     """Whether (3, 3) is a rotation at a glance, by plain numbers, which take less time than one operator of torch."""
     if not (matrix.dtype in (torch.float32, torch.float64) and is_eager(matrix)):
         return False
-    a, b, c = matrix.tolist()
-    pairs = ((a, a, 1), (b, b, 1), (c, c, 1), (a, b, 0), (b, c, 0), (c, a, 0))
-    if not all(abs(u[0] * v[0] + u[1] * v[1] + u[2] * v[2] - right) < _NEARLY for u, v, right in pairs):
-        return False
-    across = (b[1] * c[2] - b[2] * c[1], b[2] * c[0] - b[0] * c[2], b[0] * c[1] - b[1] * c[0])
-    return bool(a[0] * across[0] + a[1] * across[1] + a[2] * across[2] > 0)
+    (a, b, c), (d, e, f), (g, h, i) = matrix.tolist()
+    squares = a * a + b * b + c * c, d * d + e * e + f * f, g * g + h * h + i * i
+    products = a * d + b * e + c * f, d * g + e * h + f * i, g * a + h * b + i * c
+    misses = max(max(squares) - 1, 1 - min(squares), max(products), -min(products))
+    return bool(misses < _NEARLY and a * (e * i - f * h) + b * (f * g - d * i) + c * (d * h - e * g) > 0)
 
 
 def turn(rotation: Tensor | None, rays: Tensor, name: str) -> Tensor:

@@ -24,6 +24,7 @@ from camtorch.least_squares.equations import Equations, System, padded, triangle
 from camtorch.least_squares.jacobians import sensor_jacobians
 from camtorch.least_squares.levenberg_marquardt import FIRST_DAMPING, minimise, rounding_of
 from camtorch.projection import compiled
+from camtorch.projection.rows import Cameras
 from camtorch.rotations import small_turn
 
 if TYPE_CHECKING:
@@ -207,7 +208,7 @@ def adjust(
         found.cost,
         found.converged,
         tuple(look.residuals for look in looks),
-        tuple(problem.shown(c, look) for c, look in enumerate(looks)),
+        tuple(problem.shown(c, found.state, look) for c, look in enumerate(looks)),
         tuple(look.weights for look in looks),
         problem,
     )
@@ -269,17 +270,17 @@ def bent(points: Tensor, bend: Tensor) -> tuple[Tensor, Tensor]:
 
 
 class _Look(NamedTuple):
-    """What a camera makes of a state: residuals (B, V, N, 2), valid, weights of the squares and cost (B, V, N).
+    """What a camera makes of a state.
 
-    frames: the points in it, see `Bundle.points`. camera: as it is in that state.
+    residuals: (B, V, N, 2). valid, weights: (B, V, N), the weights of the squares. cost: (B, V). native: the camera,
+    where compiled code made this.
     """
 
     residuals: Tensor
     valid: Tensor
     weights: Tensor
     cost: Tensor
-    frames: tuple[Tensor, Tensor, Tensor]
-    camera: Camera
+    native: compiled.Native | None = None
 
 
 class Bundle:
@@ -294,7 +295,13 @@ class Bundle:
     are_shared: list[bool]
     fixed: list[Camera | None]
     learns_bend: bool
+    is_bent: bool
+    is_plain: bool
+    """Whether one camera sees flat boards that may be anywhere: what compiled code knows."""
+    lost: Tensor
     columns: tuple[tuple[int, int], ...]
+    learnt: list[tuple[Tensor, Tensor]]
+    """Of each camera the numbers of its columns, and of its parameters in them."""
     unknowns: int
     low: Tensor
     high: Tensor
@@ -308,6 +315,7 @@ class Bundle:
         self.sights = [s.mapped(lambda t: t.expand(batch, *t.shape[1:])) for s in sights]
         self.cameras = [_template(s.model, p) for s, p in zip(sights, state.parameters, strict=True)]
         self.rounding = torch.stack([rounding_of(s.pixels, s.weights) for s in self.sights]).sum(0)
+        self.lost = robust(loss, loss_scale, self.sights[0].weights.new_tensor(_LOST**2))[0]
         # a camera that does not learn, and is that of all problems, sees them in one row
         self.are_shared = [
             len(p) == 1 and not bool(f.any()) for p, f in zip(state.parameters, free.parameters, strict=True)
@@ -322,6 +330,16 @@ class Bundle:
             + [(c, len(free.parameters[c]) + i) for c, learns in enumerate(free.mounts) if learns for i in range(6)]
             + [(-1, i) for i in range(2) if free.bend]
         )
+        self.learnt = []
+        for c, p in enumerate(state.parameters):
+            of = [(g, i) for g, (camera, i) in enumerate(self.columns) if camera == c and i < p.shape[-1]]
+            at, own = torch.tensor(of, dtype=torch.long, device=p.device).view(-1, 2).unbind(-1)
+            self.learnt.append((at, own))
+        self.is_bent = free.bend or bool((state.bend != 0).any())
+        plain = (
+            len(sights) == 1 and free.boards == "poses" and not (free.mounts[0] or sights[0].motions or self.is_bent)
+        )
+        self.is_plain = plain and compiled_of([self.camera(0, state)], self.sights[0].pixels) is not None
         self.width = 6 if free.boards == "poses" else 3
         """Of the unknowns of a view."""
         views = torch.stack([(s.weights > 0).any(-1).any(0) for s in self.sights]).any(0).sum()
@@ -362,7 +380,7 @@ class Bundle:
     def points(self, c: int, state: State, sight: Sight) -> tuple[Tensor, Tensor, Tensor]:
         """(B, V, N, 3): those of the board as it lies, in the frame of the first camera, in that of this one."""
         points = sight.points
-        if self.learns_bend or bool((state.bend != 0).any()):
+        if self.is_bent:
             points = bent(points, state.bend)[0]
         turned = points @ state.boards.rotations.mT
         first = turned + state.boards.translations[:, :, None]
@@ -373,36 +391,45 @@ class Bundle:
         mounts = state.mounts
         return turned, first, first @ mounts.rotations[:, c, None].mT + mounts.translations[:, c, None, None]
 
+    def camera(self, c: int, state: State) -> Camera:
+        """As it is in a state."""
+        parameters = state.parameters[c]
+        return self.fixed[c] or remade(self.cameras[c], intrinsics=parameters[:, :4], distortion=parameters[:, 4:])
+
     def look(self, c: int, flat: Sequence[Tensor], rows: Tensor | None = None) -> _Look:
         """What a camera makes of a state."""
         state, sight = self.state(flat), self.sight(c, rows)
-        frames = self.points(c, state, sight)
-        camera, parameters = self.fixed[c], state.parameters[c]
-        if camera is None:
-            camera = remade(self.cameras[c], intrinsics=parameters[:, :4], distortion=parameters[:, 4:])
-        pixels, valid = camera.project(frames[-1])
-        seen = sight.weights > 0
-        residuals = torch.where((valid & seen)[..., None], pixels - sight.pixels, 0.0)
-        cost, slope = robust(self.loss, self.loss_scale, residuals.square().sum(-1))
-        lost = robust(self.loss, self.loss_scale, torch.full_like(cost, _LOST**2))[0]
-        cost = torch.where(valid, cost, lost) * sight.weights
-        return _Look(residuals, valid, torch.where(valid, slope * sight.weights, 0.0), cost, frames, camera)
+        if self.is_plain and len(state.bend):
+            parameters = state.parameters[0][: 1 if self.are_shared[0] else None]
+            native = Cameras(type(self.cameras[0]), parameters[:, :4], parameters[:, 4:]).native
+            assert native is not None  # it was there for the first ones
+            loss = self.loss, self.loss_scale
+            found = compiled_poses.seen(native, sight.points, state.boards, sight.pixels, sight.weights, *loss)
+            return _Look(*found, native)
+        pixels, valid = self.camera(c, state).project(self.points(c, state, sight)[-1])
+        residuals = torch.where((valid & (sight.weights > 0))[..., None], pixels - sight.pixels, 0.0)
+        u, v = residuals.unbind(-1)
+        cost, slope = robust(self.loss, self.loss_scale, u * u + v * v)
+        cost = (torch.where(valid, cost, self.lost) * sight.weights).sum(-1)
+        return _Look(residuals, valid, torch.where(valid, slope * sight.weights, 0.0), cost)
 
     def looks(self, flat: Sequence[Tensor], rows: Tensor) -> list[_Look]:
         """Of all cameras: those of the last state again if it is that."""
-        given = rows, *flat
-        if self._last is None or not all(map(torch.equal, given, self._last[0])):
-            self._last = given, [self.look(c, flat, rows) for c in range(len(self.sights))]
-        return self._last[1]
+        given, last = (rows, *flat), self._last
+        if last is None or not all(a is b or torch.equal(a, b) for a, b in zip(given, last[0], strict=True)):
+            self._last = last = given, [self.look(c, flat, rows) for c in range(len(self.sights))]
+        return last[1]
 
-    def shown(self, c: int, look: _Look) -> Tensor:
+    def shown(self, c: int, flat: Sequence[Tensor], look: _Look) -> Tensor:
         """(B, V, N): the points that a camera shows, and not only while it is searched."""
         kind = _kind(self.sights[c].model)
         if kind.searched() is kind:
             return look.valid
-        camera = fixed_camera(kind, look.camera.intrinsics, look.camera.distortion)
+        state = self.state(flat)
+        searched = self.camera(c, state)
+        camera = fixed_camera(kind, searched.intrinsics, searched.distortion)
         camera._warned = True
-        return look.valid & camera.project(look.frames[-1])[1]
+        return look.valid & camera.project(self.points(c, state, self.sights[c])[-1])[1]
 
     def sight(self, c: int, rows: Tensor | None) -> Sight:
         """Of some problems."""
@@ -413,7 +440,7 @@ class Bundle:
 
     def cost(self, flat: Sequence[Tensor], rows: Tensor) -> Tensor:
         """(R,)."""
-        total = torch.stack([look.cost.sum((-1, -2)) for look in self.looks(flat, rows)]).sum(0)
+        total = torch.stack([look.cost.sum(-1) for look in self.looks(flat, rows)]).sum(0)
         for sight, parameters in zip(self.sights, flat[5:], strict=True):
             if sight.prior:
                 total = total + ((parameters - sight.prior.centre) @ sight.prior.root.mT).square().sum(-1)
@@ -437,7 +464,7 @@ class Bundle:
         """The triangles of a state."""
         rows = torch.arange(len(flat[0]), device=flat[0].device) if rows is None else rows
         state, width, total = self.state(flat), self.width, len(self.columns)
-        if (found := self._compiled(state, rows)) is not None:
+        if (found := self._compiled(flat, rows)) is not None:
             return found
         parts = []
         for c, look in enumerate(self.looks(flat, rows)):
@@ -459,20 +486,14 @@ class Bundle:
         shared = torch.linalg.qr(padded(left), mode="r").R
         return Equations(triangle[..., :width, :], shared, self.columns)
 
-    def _compiled(self, state: State, rows: Tensor) -> Equations | None:
+    def _compiled(self, flat: Sequence[Tensor], rows: Tensor) -> Equations | None:
         """The same by compiled code, where there is any, of one camera and flat boards that may be anywhere."""
-        if len(self.sights) > 1 or self.free.mounts[0] or self.sights[0].motions or self.width < 6:
+        (_, own), *_ = self.learnt
+        look, state, sight = self.looks(flat, rows)[0], self.state(flat), self.sight(0, rows)
+        if look.native is None or (look.native.plan.places is None and bool((own >= 4).any())):
             return None
-        if self.learns_bend or bool((state.bend != 0).any()):
-            return None
-        look, sight = self.looks(self.flat(state), rows)[0], self.sight(0, rows)
-        learnt = [i for _, i in self.columns]
-        made = compiled_of([look.camera], look.residuals)
-        if made is None or (made[0][0].plan.places is None and any(i >= 4 for i in learnt)):
-            return None
-        view, shared = compiled_poses.triangles(
-            made[0][0], sight.points, state.boards, look.residuals, look.weights, learnt
-        )
+        seen = compiled_poses.Seen(*look[:4])
+        view, shared = compiled_poses.triangles(look.native, sight.points, state.boards, seen, own.tolist())
         if sight.prior:
             whole = torch.cat((shared, *self._rows_of_priors(state)), -2)
             shared = torch.linalg.qr(padded(whole), mode="r").R
@@ -495,14 +516,12 @@ class Bundle:
     def rows_of(self, c: int, look: _Look, state: State, rows: Tensor) -> tuple[Tensor, list[int]]:
         """The rows (B, V, 2 N, L + F + 1) of a camera, and which of the shared unknowns its F columns are."""
         sight = self.sight(c, rows)
-        turned, first, points = look.frames
+        turned, first, points = self.points(c, state, sight)
         batch, views, count = points.shape[:3]
-        parameters = state.parameters[c]
         lead = (1, batch * views * count) if self.are_shared[c] else (batch, views * count)
-        learnt = [(g, i) for g, (camera, i) in enumerate(self.columns) if camera == c and i < parameters.shape[-1]]
-        at = [g for g, _ in learnt]
-        found = _pixel_jacobians(look.camera, points.reshape(*lead, 3), any(i >= 4 for _, i in learnt))
-        by_point, by_k = (by.reshape(batch, views, count, 2, by.shape[-1]) for by in found)
+        at, own = (t.tolist() for t in self.learnt[c])
+        found = pixel_jacobians(self.camera(c, state), points.reshape(*lead, 3), bool(own))
+        by_point, by_parameters = (by.reshape(batch, views, count, 2, by.shape[-1]) for by in found)
         is_mounted = c > 0 or self.free.mounts[0]
         by_first = by_point @ state.mounts.rotations[:, c, None, None] if is_mounted else by_point
         by_board = by_first @ sight.motions.rotations[:, :, None] if sight.motions else by_first
@@ -510,12 +529,10 @@ class Bundle:
         if self.width == 6:
             columns.append(torch.linalg.cross(turned[..., None, :].expand_as(by_board), by_board, dim=-1))
         columns.append(by_board)
-        if learnt:
-            focal, centre = parameters[:, None, None, :2], parameters[:, None, None, 2:4]
-            by_focal = torch.diag_embed((look.residuals + sight.pixels - centre) / focal)
-            by_centre = torch.eye(2, dtype=focal.dtype, device=focal.device).expand_as(by_focal)
-            columns.append(torch.cat((by_focal, by_centre, by_k), -1)[..., [i for _, i in learnt]])
-        mine = [g for g, (camera, i) in enumerate(self.columns) if camera == c and i >= parameters.shape[-1]]
+        if own:
+            columns.append(by_parameters[..., own])
+        count = state.parameters[c].shape[-1]
+        mine = [g for g, (camera, i) in enumerate(self.columns) if camera == c and i >= count]
         if mine:
             at += mine
             turned = first @ state.mounts.rotations[:, c, None].mT
@@ -538,18 +555,20 @@ class Bundle:
             boards = Poses(turned, boards.translations + of_views[..., 3:])
         else:
             boards = boards._replace(translations=boards.translations + of_views)
-        parameters = [p.clone() for p in state.parameters]
-        turn, shift = torch.zeros_like(mounts.translations), torch.zeros_like(mounts.translations)
-        for g, (c, i) in enumerate(self.columns):
-            if c < 0:
-                bend = bend.clone()
-                bend[:, i] += shared[:, g]
-            elif i < parameters[c].shape[-1]:
-                parameters[c][:, i] = (parameters[c][:, i] + shared[:, g]).clamp(self.low[rows, g], self.high[rows, g])
-            else:
-                i -= parameters[c].shape[-1]
-                (turn if i < 3 else shift)[:, c, i % 3] += shared[:, g]
+        parameters = []
+        for p, (at, own) in zip(state.parameters, self.learnt, strict=True):
+            if len(at):
+                low, high = (ends[rows][:, at] for ends in (self.low, self.high))
+                p = p.index_copy(1, own, (p[:, own] + shared[:, at]).clamp(low, high))
+            parameters.append(p)
+        if self.learns_bend:
+            bend = bend + shared[:, -2:]
         if any(self.free.mounts):
+            turn, shift = torch.zeros_like(mounts.translations), torch.zeros_like(mounts.translations)
+            for g, (c, i) in enumerate(self.columns):
+                i -= parameters[c].shape[-1]
+                if c >= 0 and i >= 0:
+                    (turn if i < 3 else shift)[:, c, i % 3] += shared[:, g]
             mounts = Poses(small_turn(turn) @ mounts.rotations, mounts.translations + shift)
         return self.flat(State(tuple(parameters), mounts, boards, bend))
 
@@ -565,17 +584,24 @@ def _template(model: type[Camera] | Camera, parameters: Tensor) -> Camera:
     return made
 
 
-def _pixel_jacobians(camera: Camera, points: Tensor, learns: bool) -> tuple[Tensor, Tensor]:
-    """The exact derivatives of pixels by points (C, N, 3), and by the coefficients of cameras (C,) if one learns.
+def pixel_jacobians(camera: Camera, points: Tensor, learns: bool = True) -> tuple[Tensor, Tensor]:
+    """The exact derivatives of pixels by points (C, N, 3), and by the parameters of cameras (C,) if one learns.
 
-    (C, N, 2, 3) and (C, N, 2, n), which mean nothing where a point is not valid.
+    (C, N, 2, 3) and (C, N, 2, 4 + n): zero where there is no pixel, and of no meaning where a point is not valid.
     """
-    if not learns and (made := compiled_of([camera], points)) is not None:
-        ones = torch.eye(2, dtype=points.dtype, device="cpu")[:, :, None, None].expand(2, 2, *points.shape[:2])
-        rows = [compiled.project_vjp(made[0][0], points, one, True, False)[0] for one in ones]
-        by_point = torch.stack([row for row in rows if row is not None], -2)
-        return by_point.nan_to_num(0.0, 0.0, 0.0), points.new_zeros(*by_point.shape[:-1], 0)
+    made = compiled_of([camera], points)
+    plan = None if made is None else made[0][0].plan
+    if made is not None and plan is not None and (not learns or plan.places is not None):
+        by_point, by_own = (t.nan_to_num(0.0, 0.0, 0.0) for t in compiled.project_jacobians(made[0][0], points, learns))
+        if learns and plan.places is not None and not plan.is_all:
+            by_parameters = by_own.new_zeros(*by_own.shape[:-1], 4 + camera.distortion.shape[-1])
+            by_parameters[..., :4], by_parameters[..., 4 + plan.places] = by_own[..., :4], by_own[..., 4:]
+            return by_point, by_parameters
+        return by_point, by_own
     intrinsics = camera.intrinsics.view(-1, 4)
     found = sensor_jacobians(camera, camera.distortion.view(len(intrinsics), -1), points)
     focal = intrinsics[:, None, :2, None]
-    return found.by_ray.permute(0, 3, 1, 2) * focal, found.by_k.permute(0, 3, 1, 2) * focal
+    by_focal = torch.diag_embed(torch.stack(found.points[:2], -1))
+    by_centre = torch.diag_embed(found.points.covered[..., None].expand(*points.shape[:2], 2).to(points))
+    by_parameters = torch.cat((by_focal, by_centre, found.by_k.permute(0, 3, 1, 2) * focal), -1)
+    return found.by_ray.permute(0, 3, 1, 2) * focal, by_parameters

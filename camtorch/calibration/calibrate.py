@@ -101,8 +101,10 @@ def as_model(
     if not isinstance(fixed, Collection) or isinstance(fixed, Mapping):
         raise TypeError(f'{owner}: fixed must be names of parameters, as ("cx", "cy"), or "all"; got {fixed!r}')
     fixed = (names if fixed == "all" else (fixed,)) if isinstance(fixed, str) else tuple(fixed)
-    if start is not None and model.smoothness() is not None:
-        fixed = (*fixed, *INTRINSICS)
+    if start is not None and (smooth := model.smoothness()) is not None:
+        # what these do, and a windshield, a surface does as well
+        own = zip(names[4:], smooth.any(0).tolist(), strict=True)
+        fixed = (*fixed, *INTRINSICS, *(name for name, is_in in own if not is_in))
     unknown = [name for name in fixed if not isinstance(name, str) or name not in names]
     if unknown:
         raise ValueError(
@@ -508,8 +510,9 @@ def results(
     for c, search in enumerate(searches):
         adjusted, found = search.other_optima(c, sights, adjusted, free)
         optima.append(found)
+    spreads = [spread(adjusted, search.asked.kind, c) for c, search in enumerate(searches)]
     for c, search in enumerate(searches):
-        check_determined(adjusted, c, search.asked.kind, search.asked.names, sights[c], search.owner)
+        check_determined(adjusted, c, spreads[c], search.asked.names, sights[c], search.owner)
     given = [search.given for search in searches]
     seen = torch.cat([one.seen for one in given])
     residuals, valid = (torch.cat([t[0] for t in of_all]) for of_all in (adjusted.residuals, adjusted.valid))
@@ -521,10 +524,11 @@ def results(
     again = repeats(given, [r[0] for r in adjusted.residuals])
     noise = noise * math.sqrt(len(views) / (len(views) - len(again))) * searches[0].misfit
     cameras = []
-    for c, (search, passed, own) in enumerate(zip(searches, image_points, inliers.split(len(views)), strict=True)):
+    for c, (search, pixels, own) in enumerate(zip(searches, image_points, inliers.split(len(views)), strict=True)):
         copies = search.layout.views[again[search.given.seen[again].any(-1)]].tolist()
         layout = search.layout._replace(copies=tuple(sorted({*search.layout.copies, *copies})))
-        cameras.append(_result(adjusted, c, search, layout, own, sigma, noise, (object_points, passed)))
+        passed = object_points, pixels
+        cameras.append(_result(adjusted, c, search, layout, own, sigma, spreads[c].scaled(noise.reshape(1)), passed))
     for camera, ends in zip(cameras, optima, strict=True):
         camera.twins = () if ends is None else ends.twins(camera)
     return Results(adjusted, cameras, rms_of(residuals, seen), float(sigma), noise)
@@ -598,7 +602,7 @@ def _result(
     layout: Layout,
     inliers: Tensor,
     sigma: Tensor,
-    noise: Tensor,
+    spread: Spread,
     passed: tuple[Any, Any],
 ) -> Calibration:
     """The result for one of the cameras."""
@@ -618,7 +622,7 @@ def _result(
         residuals=layout.restore(torch.where(valid[..., None], residuals, torch.nan)),
         inliers=layout.restore(inliers),
         parameter_names=asked.names,
-        spread=spread(adjusted, asked.kind, camera, noise.reshape(1)),
+        spread=spread,
         converged=bool(adjusted.converged[0]) and bool((valid | ~seen.seen).all()),
         bend=(float(state.bend[0, 0]), float(state.bend[0, 1])),
         image_size=layout.image_size,

@@ -18,7 +18,7 @@ _FROM_RAYS, _REFINED, _SOLVED, _AGREED = range(4)
 _LOSSES = (None, "huber", "cauchy")
 _SHARED = 1 << 9  # points of poses that a thread is woken for
 _Poses = struct.Struct("11q5d10q").pack  # `Poses` of native/poses.h
-_Views = struct.Struct("16q").pack  # `Views`
+_Views = struct.Struct("16qd5q").pack  # `Views`
 
 
 class Search(NamedTuple):
@@ -107,38 +107,75 @@ def solved(
         native.follow()
 
 
-def triangles(
+class Seen(NamedTuple):
+    """See `Bundle.look`: residuals (B, V, N, 2), valid and weights (B, V, N), cost (B, V)."""
+
+    residuals: Tensor
+    valid: Tensor
+    weights: Tensor
+    cost: Tensor
+
+
+def seen(
     native: Native,
     points: Tensor,
     poses: tuple[Tensor, Tensor],
-    residuals: Tensor,
+    pixels: Tensor,
     weights: Tensor,
-    learnt: Sequence[int],
+    loss: str | None,
+    loss_scale: float,
+) -> Seen:
+    """What cameras (B,), or one, make of points (B, V, N, 3) whose pixels (B, V, N, 2) are known.
+
+    poses: (B, V, 3, 3), (B, V, 3). weights: (B, V, N) of the squares.
+    """
+    valid = torch.empty(weights.shape, dtype=torch.bool, device="cpu")
+    made = Seen(
+        pixels.new_empty(pixels.shape), valid, weights.new_empty(weights.shape), weights.new_empty(weights.shape[:2])
+    )
+    given = [t.contiguous() for t in (*poses, pixels, weights)]
+    places = [t.data_ptr() for t in (*given, made.residuals, made.weights, made.valid, made.cost)]
+    while _views(native, points, places, (_LOSSES.index(loss), loss_scale), (0, 0, 0, 0)):
+        native.follow()
+    return made
+
+
+def triangles(
+    native: Native, points: Tensor, poses: tuple[Tensor, Tensor], seen: Seen, learnt: Sequence[int]
 ) -> tuple[Tensor, Tensor]:
     """Of cameras (B,), or of one, that see points (B, V, N, 3): `Equations.view` and `Equations.shared`.
 
-    poses: (B, V, 3, 3), (B, V, 3). residuals: (B, V, N, 2). weights: (B, V, N) of their squares. learnt: numbers of
-    intrinsics, and of coefficients from 4 on, which columns are by.
+    poses: (B, V, 3, 3), (B, V, 3). seen: at these. learnt: numbers of intrinsics, and of coefficients from 4 on, which
+    columns are by.
     """
-    compiled, plan = library(), native.plan
-    assert compiled is not None  # or nobody has a `Native`
+    plan = native.plan
     if plan.places is not None and not plan.is_all:  # the place of each coefficient among the parameters
         at = {4 + place: 4 + i for i, place in enumerate(plan.places.tolist())}
         learnt = [at.get(number, number) for number in learnt]
-    points = points if points.stride()[2:] == (3, 1) else points.contiguous()
-    batch, views, count, _ = points.shape
     size = len(learnt) + 1
-    given = [t.contiguous() for t in (*poses, residuals, weights)]
-    view, shared = points.new_empty(batch, views, 6, 6 + size), points.new_empty(batch, size, size)
-    numbers, left = (c_int64 * size)(*learnt), c_int64(0)
-    call = _Views(
-        *(native.pointer, points.data_ptr(), *points.stride()[:2], *(t.data_ptr() for t in given)),
-        *(batch, views, count, addressof(numbers), len(learnt), view.data_ptr(), shared.data_ptr(), addressof(left)),
-    )
-    compiled.camtorch_views(call)
-    if left.value:
-        raise MemoryError(f"no memory for {views} views of {count} points")
+    view = points.new_empty(*points.shape[:2], 6, 6 + size)
+    shared, numbers = points.new_empty(len(points), size, size), (c_int64 * size)(*learnt)
+    given = [t.contiguous() for t in (*poses, seen.residuals, seen.weights)]
+    places = [t.data_ptr() for t in given]
+    wanted = addressof(numbers), len(learnt), view.data_ptr(), shared.data_ptr()
+    _views(native, points, [*places[:2], 0, 0, *places[2:], 0, 0], (0, 0.0), wanted)
     return view, shared
+
+
+def _views(
+    native: Native, points: Tensor, places: Sequence[int], loss: tuple[int, float], wanted: tuple[int, int, int, int]
+) -> int:
+    """How many points wait for what is known of a lens. Arguments are parts of `Views`."""
+    compiled, left = library(), c_int64(0)
+    assert compiled is not None  # or nobody has a `Native`
+    points = points if points.stride()[2:] == (3, 1) else points.contiguous()
+    sizes, strides = points.shape[:3], points.stride()[:2]
+    compiled.camtorch_views(
+        _Views(native.pointer, points.data_ptr(), *strides, *places, *sizes, *loss, *wanted, addressof(left))
+    )
+    if left.value < 0:
+        raise MemoryError(f"no memory for {sizes[1]} views of {sizes[2]} points")
+    return left.value
 
 
 def _run(

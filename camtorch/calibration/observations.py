@@ -273,6 +273,9 @@ def _as_float64(value: Any, size: int, name: str, owner: str) -> Tensor:
 
 def _padded(views: Sequence[Tensor | None], count: int, size: int, device: torch.device) -> Tensor:
     """(V, count, size), NaN where there is nothing."""
+    given = [points for points in views if points is not None and len(points) == count]
+    if len(given) == len(views):
+        return torch.stack(given).to(device, torch.float64)
     padded = torch.full((len(views), count, size), torch.nan, dtype=torch.float64, device=device)
     for row, points in zip(padded, views, strict=True):
         if points is not None:

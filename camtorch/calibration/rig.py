@@ -228,7 +228,7 @@ def _joined(sights: list[Sight], alone: list[_Alone], free: Free) -> State:
         state = State(parameters, mounts, own, own.translations.new_zeros(1, 2))
         bundle = Bundle(sights, state, free, "cauchy", 1.0)
         flat = bundle.flat(state)
-        cost = torch.stack([bundle.look(k, flat).cost[0].sum(-1) for k in range(len(sights))]).sum(0)
+        cost = torch.stack([bundle.look(k, flat).cost[0] for k in range(len(sights))]).sum(0)
         better = one.has_pose & (cost < least)
         least = torch.where(better, cost, least)
         boards = Poses.where(better, own, boards)

@@ -28,6 +28,7 @@ _TRIED = {
 }
 _VIEWS, _POINTS = 24, 100  # that the search looks at
 _KEPT, _UNLIKE = 3, 2.0  # of the lenses tried, and up to how many times the error of the best
+_FAR = 4.0  # times that error after the first round: no lens to go on with
 _ROUNDS = 4  # of poses
 _BAD = 2.0  # times the usual error: a view whose pose may be spoilt
 _IN_DOUBT = 4.0  # times the usual error of the better pose: the other one may be it
@@ -42,7 +43,7 @@ _WORSE, _LITTLE_WORSE = 2.0, 1.01  # than the best: costs of what is kept
 _ALIKE = 1e-3  # the relative difference of two starts, of one
 _SAME = 1e-7  # the difference of two costs, of one optimum
 _FEW_STEPS, _STEPS, _MANY_STEPS = 6, 12, 40
-_NEARLY = 0.1  # as `SETTLED`, of a lens that another one follows
+_NEARLY = 1.0  # as `SETTLED`, of a lens that another one follows
 # Coefficients with which the others make a valley that has several deepest places, and where along it to start
 _ALONG = {
     "double_sphere": ("xi", (-0.3, 0.0, 0.3, 0.7)),
@@ -85,8 +86,11 @@ def start_from_nothing(
     bounds = [model.fit_bounds.get(name, ()) for name in model.names_of(count) or ()]
     if bounds and all(ends is None for ends in bounds):
         # what keeps the shape that it starts with takes that of a good lens
-        lens = _refined(lens, few, KannalaBrandt, 4, fixed, ("cauchy", lens.scale)).of(slice(1))
-    lens = _refined(lens, few, model, count, fixed, (loss, loss_scale))
+        free = _free(KannalaBrandt, 4, fixed)
+        lens = _refined(_fitted(lens, few, KannalaBrandt, 4, fixed), few, free, ("cauchy", lens.scale)).of(slice(1))
+    lens = _fitted(lens, few, model, count, fixed)
+    if few is not observations or len(lens.parameters) > 1:
+        lens = _refined(lens, few, _free(model, count, fixed), (loss, loss_scale))
     _check_reach(lens.of(slice(1)), few, first)
     state = lens.of(slice(1)).state
     if few is not observations:
@@ -114,8 +118,8 @@ def poses_for(
 ) -> State:
     """A known camera, parameters (1, 4 + n), and the poses of all views; scale: px, from which corners count less."""
     lens = _Lens(model, parameters, Poses.none(1, 1, parameters), scale, image_size)
-    boards, _ = _posed(lens.camera, observations)
-    return _turned(lens._replace(boards=boards), observations).state
+    boards, errors = _posed(lens.camera, observations)
+    return _turned(lens._replace(boards=boards), observations, errors).state
 
 
 def other_poses(state: State, observations: Observations, model: type[Camera], image_size: tuple[int, int]) -> State:
@@ -130,7 +134,7 @@ def other_poses(state: State, observations: Observations, model: type[Camera], i
     rows = errors.nanmedian(-1).values.argsort(descending=True)[:_DOUBTED]
     boards = state.boards.of(rows, 1)
     lens = lens._replace(boards=boards, scale=max(_LEAST_SCALE, 2 * float(errors.nanmedian())))
-    others = _turned(lens, observations.of(rows)).boards
+    others = _turned(lens, observations.of(rows), errors[None, rows]).boards
     cosine = ((boards.rotations * others.rotations).sum((-1, -2)) - 1) / 2
     shift = torch.linalg.vector_norm(others.translations - boards.translations, dim=-1)
     is_other = (cosine < math.cos(_OTHER)) | (shift > _OTHER * torch.linalg.vector_norm(boards.translations, dim=-1))
@@ -181,9 +185,9 @@ class _Lens(NamedTuple):
     def camera(self) -> Camera:
         return fixed_camera(self.model, self.parameters[:, :4], self.parameters[:, 4:], self.image_size)
 
-    def errors(self, some: Observations, boards: Poses | None = None) -> Tensor:
+    def errors(self, some: Observations) -> Tensor:
         """(B, V, N) px, NaN for what is not seen."""
-        return _errors(self.camera, boards or self.boards, some)
+        return _errors(self.camera, self.boards, some)
 
     def of(self, rows: Tensor | slice) -> _Lens:
         """Some of them."""
@@ -258,17 +262,19 @@ def _unified(few: Observations, image_size: tuple[int, int], fixed: Collection[s
     alpha = centre.new_tensor([alpha for alpha, _ in tried])[:, None]
     parameters = torch.cat((focal, focal, centre.expand(len(tried), 2), alpha), -1)
     lens = _Lens(UCM, parameters, Poses.none(1, 1, parameters), _LEAST_SCALE, image_size)
-    boards, errors = _posed(lens.camera, few)
-    by_view = errors.nanmedian(-1).values.sort(-1).values
-    score = by_view[:, : math.ceil(_TRIMMED * by_view.shape[1])].mean(-1)
-    score, rows = score.topk(_KEPT, largest=False)
-    rows = rows[score <= _UNLIKE * score[0]]
-    lens = lens._replace(boards=boards, scale=max(_LEAST_SCALE, 2 * float(score[0]))).of(rows)
+    for rounds, kept, unlike in ((1, len(tried), _FAR), (_ROUNDS, _KEPT, _UNLIKE)):
+        boards, errors = _posed(lens.camera, few, rounds)
+        by_view = errors.nanmedian(-1).values.sort(-1).values
+        score = by_view[:, : math.ceil(_TRIMMED * by_view.shape[1])].mean(-1)
+        score, rows = score.topk(min(kept, len(score)), largest=False)
+        rows = rows[score <= unlike * score[0]]
+        lens = lens._replace(boards=boards, scale=max(_LEAST_SCALE, 2 * float(score[0]))).of(rows)
     free = _free(UCM, 1, [name for name in fixed if name in ("cx", "cy")])
-    return _turned(lens.adjusted(few, free, _STEPS, _WORSE).of(slice(1)), few)
+    lens = lens.adjusted(few, free, _STEPS, _WORSE).of(slice(1))
+    return _turned(lens, few, lens.errors(few))
 
 
-def _posed(camera: Camera, some: Observations) -> tuple[Poses, Tensor]:
+def _posed(camera: Camera, some: Observations, rounds: int = _ROUNDS) -> tuple[Poses, Tensor]:
     """Poses (B, V) in closed form for cameras (B,), and the errors in px, (B, V, N); NaN for what is not seen.
 
     Each round goes without the outliers of the one before, for views to which that made a difference.
@@ -280,7 +286,7 @@ def _posed(camera: Camera, some: Observations) -> tuple[Poses, Tensor]:
     weights, rows = has_ray.to(rays.dtype), torch.arange(len(rays), device=rays.device)
     boards = Poses.none(shape[0], shape[1], rays)
     before = rays.new_full(shape[:2], torch.inf)
-    for i in range(_ROUNDS):
+    for i in range(rounds):
         found = poses_from_rays(points[rows], rays[rows], weights[rows])
         for poses, new in zip(boards, found[:2], strict=True):
             poses.flatten(0, 1)[rows] = new[:, 0]
@@ -296,13 +302,12 @@ def _posed(camera: Camera, some: Observations) -> tuple[Poses, Tensor]:
     return boards, errors
 
 
-def _resampled(lens: _Lens, some: Observations) -> Poses:
-    """Poses (1, V) of which those that outliers spoilt are the best by handfuls of corners."""
-    camera, boards = lens.camera, lens.boards
-    usual = lens.errors(some)[0].nanmedian(-1).values
+def _resampled(camera: Camera, boards: Poses, some: Observations, errors: Tensor) -> tuple[Poses, Tensor]:
+    """Poses (1, V) of errors (1, V, N), of which those that outliers spoilt are the best by handfuls of corners."""
+    usual = errors[0].nanmedian(-1).values
     (bad,) = (usual > _BAD * usual.median().clamp(min=_LEAST_SCALE)).nonzero(as_tuple=True)
     if len(bad) == 0:
-        return boards
+        return boards, errors
     generator = torch.Generator("cpu").manual_seed(0)
     many = some.of(bad.repeat_interleave(_HANDFULS))
     rays, has_ray = (t[0] for t in _rays(camera, many))
@@ -314,7 +319,8 @@ def _resampled(lens: _Lens, some: Observations) -> Poses:
     best = usual.argmin(-1)
     changed = best < _HANDFULS
     rows = (torch.arange(len(bad), device=bad.device) * _HANDFULS + best)[changed]
-    return boards.with_views(bad[changed], tried.of(rows, 1))
+    boards = boards.with_views(bad[changed], tried.of(rows, 1))
+    return boards, _errors(camera, boards, some)
 
 
 def _rays(camera: Camera, some: Observations) -> tuple[Tensor, Tensor]:
@@ -325,22 +331,27 @@ def _rays(camera: Camera, some: Observations) -> tuple[Tensor, Tensor]:
 
 
 def _errors(camera: Camera, boards: Poses, some: Observations) -> Tensor:
-    """(B, V, N) px, NaN for what is not seen."""
-    pixels, valid = camera.project(boards.moved(some.points).flatten(1, 2))
-    shape = len(pixels), *some.seen.shape
-    errors = torch.linalg.vector_norm(pixels.view(*shape, 2) - some.pixels, dim=-1)
-    return torch.where(some.seen, torch.where(valid.view(shape), errors, _NO_PIXEL), torch.nan)
+    """(B, V, N) px of as many cameras, or of one for all, NaN for what is not seen."""
+    points = boards.moved(some.points)
+    pixels, valid = camera.project(points.reshape(len(camera.intrinsics), -1, 3))
+    # components lie in planes, along which a norm would be slow
+    errors = torch.hypot(*(pixels.view(*points.shape[:-1], 2) - some.pixels).unbind(-1))
+    return torch.where(some.seen, torch.where(valid.view(points.shape[:-1]), errors, _NO_PIXEL), torch.nan)
 
 
-def _turned(lens: _Lens, some: Observations) -> _Lens:
-    """With the best of the poses that each view may have under a single camera: a plane has two that look alike."""
-    old = _resampled(lens, some)
-    rays, has_ray = (t[0] for t in _rays(lens.camera, some))
-    errors = lens.errors(some, old)
+def _turned(lens: _Lens, some: Observations, errors: Tensor) -> _Lens:
+    """With the best of the poses that each view may have under a single camera: a plane has two that look alike.
+
+    errors: (1, V, N) of the poses that the lens has.
+    """
+    camera = lens.camera
+    old, errors = _resampled(camera, lens.boards, some, errors)
+    rays, has_ray = (t[0] for t in _rays(camera, some))
     weights = torch.where(has_ray, 1 / (1 + (errors[0] / lens.scale).square()), 0.0)
     found = poses_from_rays(some.points, rays, weights)
-    first, second = (Poses(*(t[None, :, i] for t in found[:2])) for i in range(2))
-    usual, other, others = (lens.errors(some, poses)[0].nanmedian(-1).values for poses in (old, first, second))
+    both = Poses(*(t.transpose(0, 1) for t in found[:2]))
+    first, second = (both.of(slice(i, i + 1)) for i in range(2))
+    usual, other, others = torch.cat((errors, _errors(camera, both, some))).nanmedian(-1).values
     first = Poses.where(usual <= other, old, first)
     (rows,) = (others <= _IN_DOUBT * torch.minimum(usual, other)).nonzero(as_tuple=True)
     if len(rows) == 0:
@@ -353,17 +364,9 @@ def _turned(lens: _Lens, some: Observations) -> _Lens:
     return lens._replace(boards=first.with_views(rows, better))
 
 
-def _refined(
-    lens: _Lens,
-    few: Observations,
-    model: type[Camera],
-    count: int,
-    fixed: Collection[str],
-    loss: tuple[str | None, float],
-) -> _Lens:
-    """Cameras of another model that explain best what was seen, the best first; those that are nearly as good."""
-    free = _free(model, count, fixed)
-    lens = _fitted(lens, few, model, count, fixed).adjusted(few, free, _STEPS, _WORSE, loss)
+def _refined(lens: _Lens, few: Observations, free: Free, loss: tuple[str | None, float]) -> _Lens:
+    """Cameras that explain best what was seen, the best first; those that are nearly as good."""
+    lens = lens.adjusted(few, free, _STEPS, _WORSE, loss)
     return lens if len(lens.parameters) == 1 else lens.adjusted(few, free, _MANY_STEPS, _LITTLE_WORSE, loss)
 
 

@@ -9,10 +9,9 @@ import torch
 from torch import Tensor
 
 from camtorch._arguments import Numbers, as_values
-from camtorch.calibration.bundle import Adjusted, robust
+from camtorch.calibration.bundle import Adjusted, pixel_jacobians, robust
 from camtorch.camera import Camera, fixed_camera
 from camtorch.least_squares.equations import Equations
-from camtorch.least_squares.jacobians import sensor_jacobians
 
 _PIXELS = 1 << 15  # that are looked at together
 # Relative to the greatest singular value. Parameters of which a camera has one too many, as the turn of a panorama and
@@ -56,24 +55,22 @@ class Spread(NamedTuple):
         return torch.cat([self._of_pixels(*part) for part in parts], 1)
 
     def _of_pixels(self, pixels: Tensor, distance: Tensor) -> Tensor:
-        intrinsics, k = self.parameters[:, :4], self.parameters[:, 4:]
-        rays, valid = fixed_camera(self.model, intrinsics, k).unproject(pixels)
-        found = sensor_jacobians(self.model, k, rays)
-        points, zero, one = found.points, torch.zeros_like(rays[..., 0]), torch.ones_like(rays[..., 0])
-        focal = intrinsics[:, None, :2, None]
-        by_intrinsics = torch.stack(
-            [torch.stack(pair, -1) for pair in ((points.a, zero), (zero, points.b), (one, zero), (zero, one))], -1
-        )
-        by_k, by_ray = found.by_k.permute(0, 3, 1, 2) * focal, found.by_ray.permute(0, 3, 1, 2) * focal
+        camera = fixed_camera(self.model, self.parameters[:, :4], self.parameters[:, 4:])
+        rays, valid = camera.unproject(pixels)
+        by_ray, by_parameters = pixel_jacobians(camera, rays)
         by_turn = torch.linalg.cross(rays[:, :, None].expand_as(by_ray), by_ray, dim=-1)
-        slopes = torch.cat((by_intrinsics, by_k, by_turn, by_ray / distance[..., None, None]), -1)
+        slopes = torch.cat((by_parameters, by_turn, by_ray / distance[..., None, None]), -1)
         moved = slopes @ self.factor[:, None]
-        known = valid & points.covered
+        known = valid & (by_parameters[..., 0, 2] > 0)  # by cx: whether there is a pixel
         return torch.where(known[..., None, None], moved @ moved.mT, torch.nan)
 
+    def scaled(self, noise: Tensor) -> Spread:
+        """That of a noise of the corners (B,), px per coordinate, of what is that of 1."""
+        return self._replace(factor=self.factor * noise[:, None, None])
 
-def spread(adjusted: Adjusted, model: type[Camera], camera: int, noise: Tensor) -> Spread:
-    """That of one camera, by its number, at an optimum; noise: (B,) of the corners, px per coordinate."""
+
+def spread(adjusted: Adjusted, model: type[Camera], camera: int) -> Spread:
+    """That of one camera, by its number, at an optimum, where the corners' noise is 1 px per coordinate."""
     equations, state = adjusted.equations, adjusted.state
     parameters, mounts = state.parameters[camera], state.mounts
     shared = shared_factor(equations)
@@ -91,7 +88,7 @@ def spread(adjusted: Adjusted, model: type[Camera], camera: int, noise: Tensor) 
     shift = torch.cat((shift, none), -1) + rotation @ frame[:, 3:]
     shift = shift + _cross_matrix(mounts.translations[:, camera]) @ turn
     own = torch.cat((own[:, :count], none[:, :1].expand(-1, count, -1)), -1)
-    factor = torch.cat((own, turn, shift), 1) * noise[:, None, None]
+    factor = torch.cat((own, turn, shift), 1)
     return Spread(model, parameters.expand(len(factor), -1), factor)
 
 

@@ -14,12 +14,11 @@ from torch import Tensor
 from camtorch._arguments import columns
 from camtorch.calibration.bundle import Adjusted, Bundle, Free, Sight, State
 from camtorch.calibration.observations import named
-from camtorch.calibration.uncertainty import spread, worst
+from camtorch.calibration.uncertainty import Spread, worst
 from camtorch.projection.rays import angles_from_axis, image_edges, image_lattice
 
 if TYPE_CHECKING:
     from camtorch.calibration.calibrate import Calibration
-    from camtorch.camera import Camera
 
 FINE, ROUGH = 0.5, 3.0
 """Px, the standard deviations of projections that are good enough to measure by, and to look at images."""
@@ -535,18 +534,18 @@ def _next(survey: Survey) -> str:
 
 @torch.no_grad()
 def check_determined(
-    adjusted: Adjusted, camera: int, model: type[Camera], names: Sequence[str], sight: Sight, owner: str
+    adjusted: Adjusted, camera: int, found: Spread, names: Sequence[str], sight: Sight, owner: str
 ) -> None:
     """Refuse a problem in which the views of a camera leave it open, as those of boards that are all parallel do.
 
     It is open where corners that are wrong by a tenth of a pixel leave the projections of what was seen uncertain by a
     fiftieth of the extent of the corners: a matter of where the boards were, which corners without noise cannot hide.
-    Several views that no camera fits are wrong, not open, and what warnings are for.
+    Several views that no camera fits are wrong, not open, and what warnings are for. found: of noise of 1 px.
 
     Raises:
         ValueError: it is open, with what to do.
     """
-    found = spread(adjusted, model, camera, adjusted.cost.new_full((1,), _USUAL_NOISE))
+    found = found.scaled(adjusted.cost.new_full((1,), _USUAL_NOISE))
     seen = sight.weights[0] > 0
     views = int(seen.any(-1).sum())
     misfit = torch.linalg.vector_norm(adjusted.residuals[camera][0], dim=-1)[seen].median()

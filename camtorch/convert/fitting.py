@@ -92,9 +92,10 @@ def _fit_linear(
     camera: Camera, observations: Observations, slopes: Tensor, smooth: Tensor, fixed: Tensor | None
 ) -> Tensor:
     """`fit` of a lens that is linear in its coefficients: at these focal lengths and pixels of the axis, at once."""
-    parameters = torch.nn.functional.pad(slopes, (0, smooth.shape[-1]))
-    free = torch.ones_like(parameters[0], dtype=torch.bool) if fixed is None else fixed.isnan()
-    parameters = parameters if fixed is None else torch.where(free, parameters, fixed)
+    parameters = torch.cat((slopes, slopes.new_tensor(camera.ideal(smooth.shape[-1])).expand(len(slopes), -1)), -1)
+    free = torch.nn.functional.pad(smooth.any(0), (4, 0), value=True)  # a windshield before it stays as it is
+    free = free if fixed is None else free & fixed.isnan()
+    parameters = parameters if fixed is None else torch.where(fixed.isnan(), parameters, fixed)
     seen, _, by_k = sensor_jacobians(camera, parameters[:, 4:], observations.rays)
     weights = (observations.weights * seen.covered)[:, None]
     slope = (by_k[:, :, free[4:]] * (parameters[:, :2, None] * weights)[:, :, None]).movedim(2, -1).flatten(1, 2)

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import struct
+from ctypes import addressof, c_int64
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
+
+from camtorch.native.library import library
 
 
 class Equations(NamedTuple):
@@ -27,6 +31,8 @@ class Equations(NamedTuple):
 
 
 _NOTHING = 1e-20  # of the squares of a column: what rounding leaves of one that is a sum of others
+_FEW = 64  # shared unknowns, for which compiled code is quicker than LAPACK
+_Steps = struct.Struct("11q").pack  # `Steps` of native/poses.h
 _FIRM = 1e-4  # of the largest singular value: what is less belongs to unknowns that the data hardly determine
 
 
@@ -69,6 +75,8 @@ class System:
     def step(self, damping: Tensor) -> tuple[tuple[Tensor, Tensor], Tensor]:
         """Of the views (R, V, L), and of what they share (R, G); and by how much the linear problem's cost falls."""
         view, shared, width = self.equations.view, self.equations.shared, self.width
+        if library() is not None and shared.is_cpu and shared.dtype == torch.float64 and shared.shape[-1] <= _FEW:
+            return self._compiled_step(damping)
         squares = view[..., :-1].square().sum(-2)
         root = damping.sqrt()
         rest = shared.shape[-1] - 1
@@ -103,6 +111,19 @@ class System:
         fine = torch.isfinite(whole).all(-1) & torch.isfinite(of_views).all(-1).all(-1)
         of_views, whole = torch.where(fine[:, None, None], of_views, 0.0), torch.where(fine[:, None], whole, 0.0)
         return (of_views, whole), self.decrement - self._left(of_views, whole)
+
+    def _compiled_step(self, damping: Tensor) -> tuple[tuple[Tensor, Tensor], Tensor]:
+        given = [t.contiguous() for t in (self.equations.view, self.equations.shared, damping)]
+        (count, views), columns = given[0].shape[:2], given[1].shape[-1] - 1
+        of_views, whole = damping.new_empty(count, views, self.width), damping.new_empty(count, columns)
+        left, made = c_int64(0), (of_views, whole, rest := torch.empty_like(damping))
+        sizes, places = (count, views, self.width, columns), [t.data_ptr() for t in (*given, *made)]
+        compiled = library()
+        assert compiled is not None  # who calls has looked
+        compiled.camtorch_steps(_Steps(*places[:3], *sizes, *places[3:], addressof(left)))
+        if left.value:
+            raise MemoryError(f"no memory for {views} views")
+        return (of_views, whole), self.decrement - rest
 
     def _left(self, of_views: Tensor, whole: Tensor) -> Tensor:
         """(R,) what of the decrement a step leaves."""

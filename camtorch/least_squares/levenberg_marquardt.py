@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import NamedTuple, Protocol
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -53,6 +54,7 @@ def rounding_of(pixels: Tensor, weights: Tensor) -> Tensor:
     return (torch.finfo(pixels.dtype).eps * largest).square() * weights.flatten(1).sum(-1)
 
 
+@np.errstate(all="ignore")  # of costs that are infinite
 def minimise(
     problem: Problem,
     state: State,
@@ -81,47 +83,53 @@ def minimise(
         damping: the first one.
         progress: called after each step with its number and the costs.
     """
-    rows = torch.arange(len(state[0]), device=state[0].device)
-    cost = problem.cost(state, rows)
-    state = tuple([t.clone() for t in state])
-    tolerance, tiny = (torch.as_tensor(t, device=cost.device).to(cost).expand_as(cost) for t in (tolerance, tiny))
-    weights = torch.full_like(cost, damping)
-    growth = torch.full_like(cost, 4.0)
-    converged = cost <= tiny
-    going = torch.isfinite(cost) & ~converged & (torch.ones_like(converged) if going is None else going)
+    device = state[0].device
+    every = torch.arange(len(state[0]), device=device)
+    # of each problem a number or two: NumPy takes a fraction of the time that torch does
+    cost, own_rounding = (t.numpy(force=True).copy() for t in (problem.cost(state, every), problem.rounding))
+    parts, least = (
+        np.broadcast_to(t.numpy(force=True) if isinstance(t, Tensor) else t, cost.shape) for t in (tolerance, tiny)
+    )
+    weights, growth, converged = np.full_like(cost, damping), np.full_like(cost, 4.0), cost <= least
+    is_going = np.isfinite(cost) & ~converged & (True if going is None else going.numpy(force=True))
     system = None
     for number in range(steps):
         if system is None:
-            (rows,) = going.nonzero(as_tuple=True)
+            (rows,) = is_going.nonzero()
             if len(rows) == 0:
                 break
-            old = tuple([t[rows] for t in state])
-            system = problem.linearised(old, rows)
+            whole = len(rows) == len(cost)
+            at = every if whole else torch.from_numpy(rows).to(device)
+            old = state if whole else tuple([t[at] for t in state])
+            system = problem.linearised(old, at)
             before = cost[rows]
+            # sum((r + d)^2) - sum(r^2) is at most this, for residuals r and their rounding d
+            rounding = 2 * np.sqrt(before * own_rounding[rows]) + own_rounding[rows]
+            enough = np.maximum(parts[rows] * before, rounding)
+            last = system.decrement.numpy(force=True) <= enough
         weight = weights[rows]
-        step, promised = system.step(weight)
-        new = problem.moved(old, step, rows)
-        after = problem.cost(new, rows)
-        kept = (before - after) / promised.clamp(min=torch.finfo(cost.dtype).tiny)
-        # sum((r + d)^2) - sum(r^2) is at most this, for residuals r and their rounding d
-        rounding = 2 * (before * problem.rounding[rows]).sqrt() + problem.rounding[rows]
-        enough = torch.maximum(tolerance[rows] * before, rounding)
-        last = system.decrement <= enough
-        better = (after < before) | (last & (after <= before + torch.maximum(rounding, 1e-12 * before)))
+        step, promised = system.step(torch.from_numpy(weight).to(device))
+        new = problem.moved(old, step, at)
+        after = problem.cost(new, at).numpy(force=True)
+        kept = (before - after) / np.maximum(promised.numpy(force=True), np.finfo(cost.dtype).tiny)
+        better = (after < before) | (last & (after <= before + np.maximum(rounding, 1e-12 * before)))
         stuck = ~better & ((weight >= MOST_DAMPING) | last)
-        for whole, part in zip(state, new, strict=True):
-            whole[rows[better]] = part[better]
-        cost[rows] = torch.where(better, after, before)
-        factor = torch.where(kept > _GOOD, 0.1, torch.where(kept > _FAIR, 1.0, 2.0))
-        weights[rows] = (weight * torch.where(better, factor, growth[rows])).clamp(LEAST_DAMPING, MOST_DAMPING)
-        growth[rows] = torch.where(better, 4.0, growth[rows] * 2).clamp(max=64.0)
-        settled = last | (cost[rows] <= tiny[rows])
-        if bool(stuck.any()):
-            settled = settled | stuck & (system.firm_decrement <= enough)
+        if whole and better.all():
+            state = new
+        elif better.any():
+            where = torch.from_numpy(better).to(device)
+            state = tuple([t.index_copy(0, at[where], part[where]) for t, part in zip(state, new, strict=True)])
+        cost[rows] = np.where(better, after, before)
+        factor = np.where(kept > _GOOD, 0.03, np.where(kept > _FAIR, 1.0, 2.0))
+        weights[rows] = (weight * np.where(better, factor, growth[rows])).clip(LEAST_DAMPING, MOST_DAMPING)
+        growth[rows] = np.where(better, 4.0, growth[rows] * 2).clip(max=64.0)
+        settled = last | (cost[rows] <= least[rows])
+        if stuck.any():
+            settled = settled | stuck & (system.firm_decrement.numpy(force=True) <= enough)
         converged[rows] = settled
-        going[rows] = ~(settled | stuck)
+        is_going[rows] = ~(settled | stuck)
         if progress is not None:
-            progress(number + 1, cost)
-        if bool(better.any()) or bool(stuck.any()):
+            progress(number + 1, torch.from_numpy(cost.copy()))
+        if better.any() or stuck.any():
             system = None
-    return Minimum(state, cost, converged)
+    return Minimum(state, *(torch.from_numpy(t).to(device) for t in (cost, converged)))

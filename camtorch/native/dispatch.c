@@ -15,7 +15,8 @@
     void domain_##variant(const Domain *);                                                                             \
     void consensus_##variant(const Agreement *);                                                                       \
     void poses_##variant(const Poses *);                                                                               \
-    void views_##variant(const Views *);
+    void views_##variant(const Views *);                                                                               \
+    void steps_##variant(const Steps *);
 DECLARED(baseline)
 #ifdef HAS_AVX2
 DECLARED(avx2)
@@ -82,6 +83,8 @@ EXPORTED void camtorch_consensus(const Agreement *given) { CALLED(consensus, giv
 EXPORTED void camtorch_poses(const Poses *given) { CALLED(poses, given) }
 
 EXPORTED void camtorch_views(const Views *given) { CALLED(views, given) }
+
+EXPORTED void camtorch_steps(const Steps *given) { CALLED(steps, given) }
 
 /* -- one sample */
 

@@ -19,7 +19,6 @@ int64_t THIS(geometry)(const Rows *);
 #define TINY 1e-300
 #define MOST_DAMPING 1e8
 #define LEAST_DAMPING 1e-15
-#define LOST 1e3
 #define THIN 0.1
 #define LINE 1e-6
 #define WORSE 4.0
@@ -475,18 +474,6 @@ static void from_rays(const Row *row, double rotations[2][9], double translation
     valid[1] &= !(trace_of_turn(rotations[0], rotations[1]) > SAME_TRACE);
 }
 
-/* Costs and weights of residuals of squared lengths; `robust` */
-static double robust(const Poses *given, double square, double *weight) {
-    const double c2 = given->loss_scale * given->loss_scale;
-    if (given->loss == HUBER && square > c2) {
-        const double length = sqrt(square);
-        *weight = given->loss_scale / length;
-        return 2 * given->loss_scale * length - c2;
-    }
-    *weight = given->loss == CAUCHY ? 1 / (1 + square / c2) : 1;
-    return given->loss == CAUCHY ? c2 * log1p(square / c2) : square;
-}
-
 static void moved(Row *row, const double *rotation, const double *translation) {
     for (int64_t i = 0; i < row->count; i++) {
         applied(rotation, row->points + 3 * i, row->moved + 3 * i);
@@ -506,7 +493,7 @@ static double cost_of(const Poses *given, Row *row, const double *rotation, cons
     for (int64_t i = 0; i < n; i++) {
         if (!(row->weights[i] > 0)) continue;
         const double x = row->seen[2 * i] - row->pixels[2 * i], y = row->seen[2 * i + 1] - row->pixels[2 * i + 1];
-        cost += row->weights[i] * robust(given, row->mapped[i] ? x * x + y * y : LOST * LOST, &weight);
+        cost += row->weights[i] * robust(given->loss, given->loss_scale, row->mapped[i] ? x * x + y * y : LOST * LOST, &weight);
         *complete &= row->mapped[i];
     }
     return isfinite(cost) ? cost : INFINITY;
@@ -529,7 +516,7 @@ static void linearised(const Poses *given, Row *row, const double *translation, 
         double weight, residuals[2], turned[3];
         for (int by = 0; by < 2; by++) residuals[by] = row->seen[2 * i + by] - row->pixels[2 * i + by];
         for (int k = 0; k < 3; k++) turned[k] = row->moved[3 * i + k] - translation[k];
-        robust(given, residuals[0] * residuals[0] + residuals[1] * residuals[1], &weight);
+        robust(given->loss, given->loss_scale, residuals[0] * residuals[0] + residuals[1] * residuals[1], &weight);
         weight *= row->weights[i];
         for (int by = 0; by < 2; by++) {
             const double *slope = row->slopes + (by * n + i) * 3;
@@ -586,7 +573,7 @@ static double refine(const Poses *given, Row *row, double *rotation, double *tra
         const double kept = (cost - after) / (promised > DBL_MIN ? promised : DBL_MIN);
         const int stuck = last || damping >= MOST_DAMPING;
         is_new = after < cost || (last && after <= cost + (rounding > 1e-12 * cost ? rounding : 1e-12 * cost));
-        damping *= is_new ? kept > 0.75 ? 0.1 : kept > 0.25 ? 1 : 2 : growth;
+        damping *= is_new ? kept > 0.75 ? 0.03 : kept > 0.25 ? 1 : 2 : growth;
         damping = damping < LEAST_DAMPING ? LEAST_DAMPING : damping > MOST_DAMPING ? MOST_DAMPING : damping;
         growth = is_new ? 4 : 2 * growth < 64 ? 2 * growth : 64;
         if (is_new) {

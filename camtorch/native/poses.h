@@ -2,6 +2,8 @@
 #ifndef CAMTORCH_POSES_H
 #define CAMTORCH_POSES_H
 
+#include <math.h>
+
 #include "geometry.h"
 
 /* One of several cameras, in double precision; or the one for all */
@@ -36,6 +38,19 @@ static inline Cameras only(const Cameras *all, int64_t at) {
    from nothing; from a pose, by the points near it */
 enum { FROM_RAYS, REFINED, SOLVED, AGREED };
 enum { LEAST_SQUARES, HUBER, CAUCHY };
+#define LOST 1e3 /* px, that a point counts as which was seen and has no pixel */
+
+/* Costs and weights of residuals of squared lengths; `robust` of calibration/bundle.py */
+static inline double robust(int64_t loss, double scale, double square, double *weight) {
+    const double c2 = scale * scale;
+    if (loss == HUBER && square > c2) {
+        const double length = sqrt(square);
+        *weight = scale / length;
+        return 2 * scale * length - c2;
+    }
+    *weight = loss == CAUCHY ? 1 / (1 + square / c2) : 1;
+    return loss == CAUCHY ? c2 * log1p(square / c2) : square;
+}
 
 /* Rows (b) of n points; what a task has no use for is NULL */
 typedef struct {
@@ -57,19 +72,32 @@ typedef struct {
     int64_t *next, *left; /* the row that whoever is free takes; how many points wait for what is known of lenses */
 } Poses;
 
-/* The linearised problem of cameras (b) that see v views of n points each, whose columns are by turn and shift of the view,
+/* Cameras (b) that see v views of n points each, or the linearised problem, whose columns are by turn and shift of the view,
    by numbers that learn, and the residuals; see least_squares/equations.py */
 typedef struct {
     const Cameras *cameras; /* (b), or one for all; in double precision */
     const double *points;   /* (b, v, n, 3), strides by problem and view */
     int64_t point_strides[2];
     const double *rotations, *translations; /* (b, v, 9), (b, v, 3) */
-    const double *residuals, *weights; /* (b, v, n, 2), (b, v, n): of the squares */
-    int64_t problems, views, count;
+    const double *pixels, *given; /* (b, v, n, 2), (b, v, n): the weights of squares, 0 for unseen; of looks alone */
+    double *residuals, *weights;  /* (b, v, n, 2), (b, v, n): what looks make of them, and the linearised problem reads */
+    uint8_t *valid;               /* (b, v, n) */
+    double *costs;                /* (b, v) */
+    int64_t problems, views, count, loss;
+    double loss_scale;
     const int64_t *learnt; /* (columns): of intrinsics and parameters */
     int64_t columns;
-    double *view, *shared; /* triangles (b, v, 6, 6 + columns + 1), (b, columns + 1, columns + 1) */
-    int64_t *left;         /* -1: no memory */
+    double *view, *shared; /* triangles (b, v, 6, 6 + columns + 1), (b, columns + 1, columns + 1), or NULL: a look */
+    int64_t *left;         /* how many points wait for what is known of lenses; -1: no memory */
 } Views;
+
+/* Damped steps of such problems, of views with so many unknowns; `System.step` there */
+typedef struct {
+    const double *view, *shared; /* (b, v, width, width + columns + 1), (b, columns + 1, columns + 1) */
+    const double *damping;       /* (b) */
+    int64_t problems, views, width, columns;
+    double *of_views, *of_shared, *rest; /* (b, v, width), (b, columns), (b): what a step leaves of the decrement */
+    int64_t *left;                       /* -1: no memory */
+} Steps;
 
 #endif

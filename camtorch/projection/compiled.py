@@ -547,6 +547,21 @@ def project_vjp(
     return results, None if sums is None else sums.sum(1).to(native.dtype)
 
 
+def project_jacobians(native: Native, points: Tensor, by_camera: bool) -> tuple[Tensor, Tensor]:
+    """The derivatives of pixels by points (C, N, 3), and by the numbers of the cameras if asked for: see `project_vjp`.
+
+    (C, N, 2, 3) and (C, N, 2, 4 + n or 0), zero where there is no pixel.
+    """
+    cameras, count, _ = points.shape
+    by_points = torch.empty(2, cameras, count, 3, dtype=native.dtype, device="cpu")
+    sums = torch.zeros(2, cameras, count, (4 + native.parameters) * by_camera, dtype=torch.float64, device="cpu")
+    tile = 1 if by_camera else _TILE
+    for one, by, to in zip(torch.eye(2, dtype=native.dtype, device="cpu"), by_points, sums, strict=True):
+        given = points.data_ptr(), *points.stride(), *_points(by), 0, 0, one.data_ptr(), 0, 0, 1
+        _call(native, cameras, count, PROJECT_VJP, (*given, to.data_ptr() if by_camera else 0), tile)
+    return by_points.movedim(0, 2), sums.movedim(0, 2)
+
+
 def unproject_vjp(
     native: Native, valid: Tensor, solution: Tensor, cotangents: Tensor, want_pixels: bool, want_parameters: bool
 ) -> tuple[Tensor | None, Tensor | None]:
@@ -736,14 +751,14 @@ def _address(tensor: Tensor | None) -> int:
     return 0 if tensor is None else tensor.data_ptr()
 
 
-def _call(native: Native, cameras: int, count: int, direction: int, rows: tuple[int, ...]) -> int:
+def _call(native: Native, cameras: int, count: int, direction: int, rows: tuple[int, ...], tile: int = _TILE) -> int:
     """rows: what of `Rows` is between its cameras and its count."""
     assert cameras == native.cameras
     run, points = _entry("camtorch_geometry", c_int64), cameras * count
     if points < _SHARED:
-        return run(_Rows(native.pointer, *rows, count, _TILE, direction, 0)) if points else 0
+        return run(_Rows(native.pointer, *rows, count, tile, direction, 0)) if points else 0
     following = c_int64(0)
-    call = _Rows(native.pointer, *rows, count, _TILE, direction, addressof(following))
+    call = _Rows(native.pointer, *rows, count, tile, direction, addressof(following))
     left: list[int] = []
     spread(lambda: left.append(run(call)), min(thread_count(), -(-count // _TILE) * cameras))
     return sum(left)

@@ -132,8 +132,8 @@ class Warp(GeometryModule):
     ):
         options = as_options("Warp", mode, padding_mode, fill, antialias, tolerance)
         rotation = as_rotation(rotation, "Warp")
-        _check_parts(source, target, rotation, shutter, target_shutter)
-        self._set(source, target, options, shutter, target_shutter)
+        batch = _check_parts(source, target, rotation, shutter, target_shutter)
+        self._set(source, target, options, shutter, target_shutter, batch)
         self.turned_by(rotation)
 
     def _set(
@@ -143,19 +143,19 @@ class Warp(GeometryModule):
         options: Options,
         shutter: RollingShutter | None = None,
         target_shutter: RollingShutter | None = None,
+        batch: torch.Size | None = None,
     ) -> None:
-        parts = (source, target, shutter, target_shutter)
+        parts = {"source": source, "target": target, "shutter": shutter, "target_shutter": target_shutter}
+        if batch is None:
+            batch = broadcast_shapes(*[part.batch_shape for part in parts.values() if part is not None])
         super().__init__(
-            source=source,
-            target=target,
+            parts,
+            batch_shape=batch,
             mode=options["mode"],
             padding_mode=options["padding_mode"],
             fill=options["fill"],
             antialias=options["antialias"],
             _tolerance=options["tolerance"],
-            shutter=shutter,
-            target_shutter=target_shutter,
-            batch_shape=broadcast_shapes(*[part.batch_shape for part in parts if part is not None]),
             _memos={},
             _pinned=None,
             _constants=Memo(),
@@ -421,11 +421,11 @@ def _check_parts(
     rotation: Tensor | None,
     shutter: RollingShutter | None,
     target_shutter: RollingShutter | None,
-) -> None:
-    """Raise what is wrong with what a warp is between, and with how many of each there are."""
+) -> torch.Size:
+    """How many of each a warp is between; raises what is wrong with that, and with them."""
     as_sized(source, "source", "Warp")
     as_sized(target, "target", "Warp")
-    if target is not source:
+    if source.intrinsics.device != target.intrinsics.device:
         check_devices("Warp", source=source.intrinsics, target=target.intrinsics)
     for name, each in (("shutter", shutter), ("target_shutter", target_shutter)):
         if not (each is None or isinstance(each, RollingShutter)):
@@ -442,6 +442,7 @@ def _check_parts(
             "Warp: source, target, rotation and shutters may each have one batch dim, of one size; "
             f"got {', '.join(map(str, shapes))}"
         )
+    return batch
 
 
 def checked(

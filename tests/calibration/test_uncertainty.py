@@ -124,7 +124,7 @@ def test_of_a_rig_is_that_of_mrcal_by_brute_force():
     slopes = torch.autograd.functional.jacobian(predicted, zero)[:, use]
     inverse = torch.linalg.pinv(slopes, rtol=1e-14)
     covariance = NOISE**2 * inverse @ inverse.mT
-    values = spread(adjusted, ct.KannalaBrandt, 1, torch.tensor([NOISE], **F64))
+    values = spread(adjusted, ct.KannalaBrandt, 1).scaled(torch.tensor([NOISE], **F64))
     own = [use.index(8 + i) for i in range(7)]
     assert torch.allclose(values.covariance[0, :7, :7], covariance[own][:, own], rtol=1e-6, atol=1e-14)
     assert not values.covariance[0, 7].any()
@@ -156,7 +156,7 @@ def test_refits_of_lenses_scatter_as_predicted(key, fixed):
     free, (camera,) = problem.free(*fixed), problem.cameras
     adjusted = adjust(problem.sights(300), problem.state(300), free)
     assert bool(adjusted.converged.all())
-    values = spread(adjusted, type(camera), 0, problem.sigma(adjusted, free))
+    values = spread(adjusted, type(camera), 0).scaled(problem.sigma(adjusted, free))
     parameters, learns = adjusted.state.parameters[0], free.parameters[0]
     assert not (parameters - problem.parameters[0])[:, ~learns].any()
     assert not values.std[:, ~learns].any()
@@ -183,7 +183,7 @@ def robustly(loss, scale, share, batch):
     sight = sight._replace(pixels=sight.pixels + bad[..., None] * push)
     adjusted = adjust([sight], problem.state(batch), free, loss=loss, loss_scale=scale, steps=200)
     noise = noise_under(loss, scale, adjusted.residuals[0], problem.seen[0][None], problem.unknowns(free))
-    values = spread(adjusted, ct.KannalaBrandt, 0, noise)
+    values = spread(adjusted, ct.KannalaBrandt, 0).scaled(noise)
     return adjusted.state.parameters[0] - problem.parameters[0], values.std, noise
 
 
@@ -200,10 +200,9 @@ def test_projections_are_known_where_parameters_are_not():
     camera = ct.Cylindrical(torch.tensor([120.0, 120, 320, 240], **F64), image_size=(480, 640))
     problem = Problem(camera)
     noise = torch.tensor([NOISE], **F64)
-    loose, held = (
-        spread(adjust(problem.sights(noise=0.0), problem.state(), problem.free(*f), steps=0), type(camera), 0, noise)
-        for f in ((), ("cx",))
-    )
+    sights, state = problem.sights(noise=0.0), problem.state()
+    ends = (adjust(sights, state, problem.free(*names), steps=0) for names in ((), ("cx",)))
+    loose, held = (spread(end, type(camera), 0).scaled(noise) for end in ends)
     assert loose.std[0, 2] > 1e6 * loose.std[0, 0]
     for distance in (0.4, math.inf):
         assert torch.allclose(uncertainty(loose, PIXELS, distance), uncertainty(held, PIXELS, distance), rtol=1e-5)

@@ -1,31 +1,17 @@
 /* Random cameras and rows for every variant of the geometry: built with sanitizers, it shows that none reads or writes
  * outside, and that results are finite. Memory is as large as what is addressed, to the byte.
- *
- * Called as: geometry_fuzz FIRST COUNT, the numbers of the jobs. Ends with 1, and the job's number, where one is not.
+ * See `all_jobs`.
  */
 #include <math.h>
-#include <stdio.h>
-#include <stdlib.h>
 #include <string.h>
 
+#include "chance.h"
 #include "geometry.h"
 
 int64_t geometry_fuzzed(const Rows *);
 int64_t moves_fuzzed(const Move *);
 int64_t lattices_fuzzed(const Lattices *);
 void domain_fuzzed(const Domain *);
-
-static uint64_t state; /* of chance: splitmix64 */
-
-static uint64_t bits(void) {
-    uint64_t z = (state += 0x9e3779b97f4a7c15u);
-    z = (z ^ (z >> 30)) * 0xbf58476d1ce4e5b9u;
-    z = (z ^ (z >> 27)) * 0x94d049bb133111ebu;
-    return z ^ (z >> 31);
-}
-
-static int64_t below(int64_t n) { return (int64_t)(bits() % (uint64_t)n); }
-static double share(void) { return (double)(bits() >> 11) / 9007199254740992.0; }
 
 /* Numbers of that size, some of them wild */
 static double number(double size) {
@@ -136,7 +122,7 @@ static int moved(const Cameras *cameras, int64_t tile) {
     return fine;
 }
 
-static int fuzz(uint64_t job) {
+static int fuzz(void) {
     Part parts[MOST_PARTS];
     Cameras cameras = {0};
     Rows rows = {0};
@@ -144,7 +130,6 @@ static int fuzz(uint64_t job) {
     void *kept[60];
     int used = 0, fine = 1;
     memset(parts, 0, sizeof parts);
-    state = job * 0x2545f4914f6cdd1du;
     const int d = (int)below(2), direction = (int)below(4), is_vjp = direction >= PROJECT_VJP;
     parts[0].kind = (int32_t)below(SPHERE + 1);
     if (parts[0].kind >= CYLINDER) parts[0].flags = below(2) ? TRANSVERSE : 0;
@@ -249,13 +234,4 @@ static int fuzz(uint64_t job) {
     return fine;
 }
 
-int main(int count, char **words) {
-    (void)count;
-    const uint64_t first = strtoull(words[1], NULL, 10), jobs = strtoull(words[2], NULL, 10);
-    for (uint64_t job = first; job < first + jobs; job++)
-        if (!fuzz(job)) {
-            printf("job %llu\n", (unsigned long long)job);
-            return 1;
-        }
-    return 0;
-}
+int main(int count, char **words) { return count == 3 ? all_jobs(words, fuzz) : 2; }

@@ -1,28 +1,15 @@
 /* Random rows for the search for poses and for linearised views, seen by a pinhole of its own instead of the geometry: built
  * with sanitizers, it shows that none reads or writes outside, and that what is valid is finite.
- *
- * Called as: poses_fuzz FIRST COUNT, the numbers of the jobs. Ends with 1, and the job's number, where one is not.
+ * See `all_jobs`.
  */
 #include <math.h>
-#include <stdio.h>
-#include <stdlib.h>
 
+#include "chance.h"
 #include "poses.h"
 
 void poses_fuzzed(const Poses *);
 void views_fuzzed(const Views *);
-
-static uint64_t state; /* of chance: splitmix64 */
-
-static uint64_t bits(void) {
-    uint64_t z = (state += 0x9e3779b97f4a7c15u);
-    z = (z ^ (z >> 30)) * 0xbf58476d1ce4e5b9u;
-    z = (z ^ (z >> 27)) * 0x94d049bb133111ebu;
-    return z ^ (z >> 31);
-}
-
-static int64_t below(int64_t n) { return (int64_t)(bits() % (uint64_t)n); }
-static double share(void) { return (double)(bits() >> 11) / 9007199254740992.0; }
+void steps_fuzzed(const Steps *);
 
 /* Of 500 px, and two parameters that do nothing */
 int64_t geometry_fuzzed(const Rows *rows) {
@@ -94,24 +81,27 @@ static int job(void) {
     double *shifts = filled(rows * views * 3, 1), *residuals = filled(rows * views * points * 2, 1);
     double *squares = filled(rows * views * points, 1), *view = filled(rows * views * 6 * width, 1);
     double *shared = filled(rows * (numbers + 1) * (numbers + 1), 1);
+    double *at = filled(rows * views * points * 2, 400), *used = filled(rows * views * points, 1);
+    double *costs_of = filled(rows * views, 1);
+    uint8_t *mapped = malloc((size_t)(rows * views * points));
     for (int64_t i = 0; i < rows * views * points; i++) squares[i] = squares[i] > 0 ? squares[i] : 0;
-    const Views seen = {&cameras, boards, {views * points * 3, points * 3}, turns, shifts, residuals, squares,
-                        rows, views, points, learnt, numbers, view, shared, &left};
+    Views seen = {&cameras, boards, {views * points * 3, points * 3}, turns, shifts, at, squares, residuals, used, mapped,
+                  costs_of, rows, views, points, below(3), 1.5, learnt, numbers, NULL, shared, &left};
     views_fuzzed(&seen);
-    void *all[] = {object, pixels, weights, rays, rotations, translations, vectors, rms, covariance, costs, valid,
-                   inliers, boards, turns, shifts, residuals, squares, view, shared};
+    seen.view = view;
+    views_fuzzed(&seen);
+    const int64_t unknowns = below(2) ? 6 : 0, many = unknowns ? views : 0;
+    double *damping = filled(rows, 1), *of_views = filled(rows * many * unknowns, 1), *of_shared = filled(rows * numbers, 1);
+    double *rest = filled(rows, 1);
+    for (int64_t i = 0; i < rows; i++) damping[i] = fabs(damping[i]);
+    const Steps steps = {view, shared, damping, rows, many, unknowns, numbers, of_views, of_shared, rest, &left};
+    steps_fuzzed(&steps);
+    for (int64_t i = 0; i < rows * numbers; i++) is_fine &= isfinite(of_shared[i]);
+    void *all[] = {object, pixels, weights, rays, rotations, translations, vectors, rms, covariance, costs, valid, inliers,
+                   boards, turns, shifts, residuals, squares, view, shared, at, used, costs_of, mapped, damping, of_views,
+                   of_shared, rest};
     for (size_t i = 0; i < sizeof all / sizeof *all; i++) free(all[i]);
     return is_fine && left == 0;
 }
 
-int main(int count, char **words) {
-    const int64_t first = count > 1 ? atoll(words[1]) : 1, jobs = count > 2 ? atoll(words[2]) : 1000;
-    for (int64_t i = first; i < first + jobs; i++) {
-        state = (uint64_t)i;
-        if (!job()) {
-            printf("job %lld\n", (long long)i);
-            return 1;
-        }
-    }
-    return 0;
-}
+int main(int count, char **words) { return count == 3 ? all_jobs(words, job) : 2; }

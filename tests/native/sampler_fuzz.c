@@ -4,10 +4,9 @@
  * Called as: sampler_fuzz FIRST COUNT, the numbers of the jobs. Ends with 1, and the job's number, where two disagree.
  */
 #include <math.h>
-#include <stdio.h>
-#include <stdlib.h>
 #include <string.h>
 
+#include "chance.h"
 #include "sampler.h"
 
 typedef struct {
@@ -49,20 +48,8 @@ static int variants(Variant *all) {
     return n;
 }
 
-/* -- chance: splitmix64 */
-
-static uint64_t state;
-
-static uint64_t bits(void) {
-    uint64_t z = (state += 0x9e3779b97f4a7c15u);
-    z = (z ^ (z >> 30)) * 0xbf58476d1ce4e5b9u;
-    z = (z ^ (z >> 27)) * 0x94d049bb133111ebu;
-    return z ^ (z >> 31);
-}
-
-static int64_t below(int64_t n) { return (int64_t)(bits() % (uint64_t)n); }
 static int one_in(int64_t n) { return below(n) == 0; }
-static double uniform(double low, double high) { return low + (high - low) * (double)(bits() >> 11) * 0x1p-53; }
+static double uniform(double low, double high) { return low + (high - low) * share(); }
 
 static int64_t side(void) {
     switch (below(8)) {

@@ -1,9 +1,6 @@
 """Laws of the compiled geometry: what Python's formulas say of a ray or a pixel, it says too, and their derivatives."""
 
 import math
-import os
-import subprocess
-from pathlib import Path
 from unittest.mock import patch
 
 import pytest
@@ -12,8 +9,6 @@ from cameras import KEYS, every_model, fan, make, one, pixel_lattice, real, spre
 
 import camtorch as ct
 from camtorch._arguments import columns
-from camtorch.native import build as building
-from camtorch.native.library import library
 from camtorch.optics import Equidistant, Lens, Stage
 from camtorch.projection import compiled as geometry
 from camtorch.projection.project import Project
@@ -248,20 +243,6 @@ def test_what_users_make_has_no_code():
     assert geometry.codes(Wide(), Lens()) is None
 
 
-FUZZ = Path(__file__).parent / "geometry_fuzz.c"
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("variant", ["baseline", "best"])
-def test_no_read_outside_and_nothing_undefined(variant, tmp_path):
-    variant = variant if variant in building.VARIANTS else library().camtorch_variant().decode()
-    sanitizers = ["-fsanitize=address,undefined,float-cast-overflow", "-fno-sanitize-recover=all"]
-    command = [*building._compiler(None), *building._FLAGS, "-O1", "-g", f"-I{building._HERE}", *sanitizers]
-    (tmp_path / "empty.c").write_text("int main(void) { return 0; }\n")
-    if subprocess.run([*command, "empty.c", "-o", "empty"], cwd=tmp_path, capture_output=True).returncode:
-        pytest.skip(f"{command[0]} has no sanitizers")
-    sources = ["-DVARIANT=fuzzed", *building.VARIANTS[variant], str(building._HERE / "geometry.c"), str(FUZZ)]
-    subprocess.run([*command, *sources, "-lm", "-o", "fuzz"], cwd=tmp_path, check=True)
-    environment = os.environ | {"ASAN_OPTIONS": "detect_leaks=0"}
-    done = subprocess.run([tmp_path / "fuzz", "1", "1500"], capture_output=True, text=True, env=environment)
-    assert done.returncode == 0, done.stdout + done.stderr
+def test_no_read_outside_and_nothing_undefined(fuzzed):
+    fuzzed("geometry_fuzz.c", ["geometry.c"], 1500)
