@@ -587,57 +587,6 @@ INLINE V4 channels4(const char *at, int type) {
 
 #if defined(__AVX512VBMI__) && defined(__AVX512VL__) && defined(__AVX512BW__) && defined(__AVX512DQ__)
 #define WIDE 1
-
-/* Eight pixels of three floats, if their squares begin within nine columns and two rows, and two more columns follow */
-INLINE int colours_of_eight(const Span *span, const Squares *at) {
-    const Job *job = span->job;
-    const int64_t below = job->source_strides[2];
-    const int32_t x0 = at->x[0], x7 = at->x[7], y0 = at->y[0], y7 = at->y[7];
-    const int32_t column = x0 < x7 ? x0 : x7, first = y0 < y7 ? y0 : y7;
-    const __m256i dx = _mm256_sub_epi32((__m256i)at->x, _mm256_set1_epi32(column));
-    const __m256i dy = _mm256_sub_epi32((__m256i)at->y, _mm256_set1_epi32(first));
-    if ((_mm256_cmplt_epu32_mask(dx, _mm256_set1_epi32(9)) & _mm256_cmplt_epu32_mask(dy, _mm256_set1_epi32(2))) != 0xff ||
-        column + 11 > job->source_width || span->pixels < STEP)
-        return 0;
-    /* sixteen and eight elements of the result: of which pixel each is, and which of its channels */
-    const __m512i pixel[2] = {_mm512_setr_epi32(0, 0, 0, 1, 1, 1, 2, 2, 2, 3, 3, 3, 4, 4, 4, 5),
-                              _mm512_setr_epi32(5, 5, 6, 6, 6, 7, 7, 7, 7, 7, 7, 7, 7, 7, 7, 7)};
-    const __m512i channel[2] = {_mm512_setr_epi32(0, 1, 2, 0, 1, 2, 0, 1, 2, 0, 1, 2, 0, 1, 2, 0),
-                                _mm512_setr_epi32(1, 2, 0, 1, 2, 0, 1, 2, 2, 2, 2, 2, 2, 2, 2, 2)};
-    const __m512i three = _mm512_castsi256_si512(_mm256_add_epi32(dx, _mm256_add_epi32(dx, dx)));
-    const __m512i rows = _mm512_castsi256_si512(dy);
-    const __m512 parts_u = _mm512_castps256_ps512((__m256)at->u), parts_v = _mm512_castps256_ps512((__m256)at->v);
-    const float *from = (const float *)span->source + first * below + 3 * column;
-    ask_below(from, below * (int64_t)sizeof(float));
-    ask_below(from + 16, below * (int64_t)sizeof(float));
-    __m512 made[2];
-    int k;
-    for (k = 0; k < 2; k++) {
-        const __m512i left = _mm512_add_epi32(_mm512_permutexvar_epi32(pixel[k], three), channel[k]);
-        const __m512i right = _mm512_add_epi32(left, _mm512_set1_epi32(3));
-        const __m512 u = _mm512_permutexvar_ps(pixel[k], parts_u), v = _mm512_permutexvar_ps(pixel[k], parts_v);
-        const __m512 other_u = _mm512_sub_ps(_mm512_set1_ps(1), u), other_v = _mm512_sub_ps(_mm512_set1_ps(1), v);
-        const __mmask16 second = _mm512_test_epi32_mask(_mm512_permutexvar_epi32(pixel[k], rows), _mm512_set1_epi32(1));
-#define ROW(i)                                                                                                         \
-    const __m512 low##i = _mm512_loadu_ps(from + i * below), high##i = _mm512_loadu_ps(from + i * below + 16);         \
-    const __m512 row##i = _mm512_fmadd_ps(_mm512_permutex2var_ps(low##i, left, high##i), other_u,                      \
-                                          _mm512_mul_ps(_mm512_permutex2var_ps(low##i, right, high##i), u))
-        ROW(0);
-        ROW(1);
-        __m512 above = row0, under = row1;
-        if (second) {
-            ROW(2);
-            above = _mm512_mask_mov_ps(row0, second, row1);
-            under = _mm512_mask_mov_ps(row1, second, row2);
-        }
-#undef ROW
-        made[k] = _mm512_fmadd_ps(above, other_v, _mm512_mul_ps(under, v));
-    }
-    _mm512_storeu_ps((float *)span->result, made[0]);
-    _mm256_storeu_ps((float *)span->result + 16, _mm512_castps512_ps256(made[1]));
-    return 1;
-}
-
 #else
 #define WIDE 0
 #endif
@@ -648,9 +597,6 @@ INLINE void bilinear_interleaved(const Span *span, Squares at, int type) {
     const int64_t right = channels * bytes, below = job->source_strides[2] * bytes;
     float values[STEP * MOST_INTERLEAVED + 4];
     int64_t offsets[STEP], i, n = span->pixels * channels;
-#if WIDE
-    if (type == FLOAT32 && channels == 3 && colours_of_eight(span, &at)) return;
-#endif
     offsets_of(job, at.x, at.y, offsets);
     ask_below(span->source + offsets[0] * bytes, below);
     ask_below(span->source + offsets[STEP - 1] * bytes, below);
@@ -1046,20 +992,18 @@ typedef struct {
 
 INLINE int32_t whole(float x) { return _mm_cvttss_si32(_mm_set_ss(x)); }
 
-/* Whether squares of positions at (x, y), of pixels of so many elements, are all `good` and lie in so many rows and
- * elements of each */
+/* Whether squares of positions at (x, y) are all `good` and lie in so many rows and 32 elements of each */
 INLINE int in_window(const Wide *image, const float *u, const float *v, __m512i x, __m512i y, __mmask16 good,
-                     const int pixel, const int rows, const int part, WideWindow *window) {
+                     const int rows, WideWindow *window) {
     const int64_t x0 = whole(u[0]), x15 = whole(u[15]), y0 = whole(v[0]), y15 = whole(v[15]);
-    const int64_t column = pixel * (x0 < x15 ? x0 : x15), row = y0 < y15 ? y0 : y15;
-    const int64_t last_begin = pixel * image->width - part, last_row = image->height - rows;
+    const int64_t column = x0 < x15 ? x0 : x15, row = y0 < y15 ? y0 : y15;
+    const int64_t last_begin = image->width - 32, last_row = image->height - rows;
     const int64_t begin = column < last_begin ? column : last_begin, first = row < last_row ? row : last_row;
-    if (pixel == 3) x = _mm512_add_epi32(x, _mm512_slli_epi32(x, 1));
     window->x = _mm512_sub_epi32(x, _mm512_set1_epi32((int32_t)begin));
     window->y = _mm512_sub_epi32(y, _mm512_set1_epi32((int32_t)first));
     window->begin = first * image->below + begin;
     /* as unsigned numbers, so not negative either */
-    good = _mm512_mask_cmple_epu32_mask(good, window->x, _mm512_set1_epi32(part - 2 * pixel));
+    good = _mm512_mask_cmple_epu32_mask(good, window->x, _mm512_set1_epi32(30));
     return _mm512_mask_cmple_epu32_mask(good, window->y, _mm512_set1_epi32(rows - 2)) == 0xffff;
 }
 
@@ -1067,11 +1011,6 @@ INLINE int in_window(const Wide *image, const float *u, const float *v, __m512i 
 INLINE int rows_of_sixteen(const float *v) {
     const int32_t first = whole(v[0]), last = whole(v[15]);
     return first == last ? 2 : (first < last ? first + 1 == last : last + 1 == first) ? 3 : 5;
-}
-
-INLINE __m512i rows_of_32(const char *first, const char *second) {
-    return _mm512_inserti64x4(_mm512_castsi256_si512(_mm256_loadu_si256((const __m256i *)first)),
-                              _mm256_loadu_si256((const __m256i *)second), 1);
 }
 
 INLINE void floats_of_sixteen(const Wide *image, char *result, const WideWindow *window, __m512 u, __m512 v,
@@ -1098,45 +1037,23 @@ INLINE void floats_of_sixteen(const Wide *image, char *result, const WideWindow 
     }
 }
 
-INLINE void nearest_of_sixteen(const Wide *image, char *result, const WideWindow *window) {
-    const __m512i at = _mm512_or_si512(window->x, _mm512_slli_epi32(window->y, 5));
-    const char *from = image->source + window->begin;
-    const int64_t below = image->below;
-    int64_t c;
-    for (c = 0; c < image->channels; c++, from += image->from_plane, result += image->to_plane) {
-        ask_below(from, below);
-        const __m512i upper = rows_of_32(from, from + below), lower = rows_of_32(from + 2 * below, from + 3 * below);
-        _mm_storeu_si128((__m128i *)result, _mm512_cvtepi32_epi8(_mm512_permutex2var_epi8(upper, at, lower)));
-    }
-}
-
-/* Whether there is such a way, and the pixels are made */
-INLINE int sixteen(const Wide *image, char *result, const float *at_u, const float *at_v, int mode) {
+/* Whether there is such a way, and the pixels of floats are made */
+INLINE int sixteen(const Wide *image, char *result, const float *at_u, const float *at_v) {
     const int32_t right = (int32_t)image->width - 1, bottom = (int32_t)image->height - 1;
     const __m512 u = _mm512_loadu_ps(at_u), v = _mm512_loadu_ps(at_v);
     const int rows = rows_of_sixteen(at_v);
-    WideWindow window;
-    __m512i x, y;
-    __mmask16 good;
-#define WITHIN(pixel, rows, part) in_window(image, at_u, at_v, x, y, good, pixel, rows, part, &window)
-    if (mode == NEAREST) {
-        x = _mm512_cvtps_epi32(u), y = _mm512_cvtps_epi32(v);
-        good = _mm512_cmple_epu32_mask(x, _mm512_set1_epi32(right));
-        good = _mm512_mask_cmple_epu32_mask(good, y, _mm512_set1_epi32(bottom));
-        if (!WITHIN(1, 5, 32)) return 0;
-        nearest_of_sixteen(image, result, &window);
-        return 1;
-    }
-    x = _mm512_min_epi32(_mm512_cvttps_epi32(u), _mm512_set1_epi32(right - 1));
-    y = _mm512_min_epi32(_mm512_cvttps_epi32(v), _mm512_set1_epi32(bottom - 1));
+    const __m512i x = _mm512_min_epi32(_mm512_cvttps_epi32(u), _mm512_set1_epi32(right - 1));
+    const __m512i y = _mm512_min_epi32(_mm512_cvttps_epi32(v), _mm512_set1_epi32(bottom - 1));
     const __m512 across = _mm512_sub_ps(u, _mm512_cvtepi32_ps(x)), down = _mm512_sub_ps(v, _mm512_cvtepi32_ps(y));
-    good = _mm512_cmp_ps_mask(u, _mm512_setzero_ps(), _CMP_GE_OQ);
+    WideWindow window;
+    __mmask16 good = _mm512_cmp_ps_mask(u, _mm512_setzero_ps(), _CMP_GE_OQ);
     good = _mm512_mask_cmp_ps_mask(good, v, _mm512_setzero_ps(), _CMP_GE_OQ);
     good = _mm512_mask_cmp_ps_mask(good, u, _mm512_set1_ps((float)right), _CMP_LE_OQ);
     good = _mm512_mask_cmp_ps_mask(good, v, _mm512_set1_ps((float)bottom), _CMP_LE_OQ);
-    if (rows == 2 && WITHIN(1, 2, 32)) floats_of_sixteen(image, result, &window, across, down, 2);
-    else if (rows <= 3 && WITHIN(1, 3, 32)) floats_of_sixteen(image, result, &window, across, down, 3);
-    else if (WITHIN(1, 5, 32)) floats_of_sixteen(image, result, &window, across, down, 5);
+#define WITHIN(rows) in_window(image, at_u, at_v, x, y, good, rows, &window)
+    if (rows == 2 && WITHIN(2)) floats_of_sixteen(image, result, &window, across, down, 2);
+    else if (rows <= 3 && WITHIN(3)) floats_of_sixteen(image, result, &window, across, down, 3);
+    else if (WITHIN(5)) floats_of_sixteen(image, result, &window, across, down, 5);
     else return 0;
 #undef WITHIN
     return 1;
@@ -1204,21 +1121,24 @@ INLINE __m512i between_bytes(__m512i pairs, __m512i t) {
 /* Whether all lie there, and those that are `wanted` are made: pixels of one byte or of three, in rows of so many
  * registers. Positions are rounded to 2^-16. */
 INLINE int bytes_at(const Wide *image, const Place *place, char *result, const float *u, const float *v, const int pixel,
-                    const int registers, __mmask32 wanted) {
+                    const int registers, const int mode, __mmask32 wanted) {
     const int64_t rows = place->rows;
     int64_t c;
     int j, k;
     if (!rows) return 0;
     /* as numbers from 128 on, whose upper halves say the pixel in the window, and the lower ones the part of its side */
     const __m512 from_u = _mm512_set1_ps(128 - place->x), from_v = _mm512_set1_ps(128 - place->y);
-    const __m512i u0 = _mm512_castps_si512(_mm512_add_ps(_mm512_loadu_ps(u), from_u));
-    const __m512i u1 = _mm512_castps_si512(_mm512_add_ps(_mm512_loadu_ps(u + 16), from_u));
-    const __m512i v0 = _mm512_castps_si512(_mm512_add_ps(_mm512_loadu_ps(v), from_v));
-    const __m512i v1 = _mm512_castps_si512(_mm512_add_ps(_mm512_loadu_ps(v + 16), from_v));
+#define NUMBERS(x, from)                                                                                               \
+    _mm512_castps_si512(_mm512_add_ps(                                                                                 \
+        mode == NEAREST ? _mm512_roundscale_ps(_mm512_loadu_ps(x), 0) : _mm512_loadu_ps(x), from))
+    const __m512i u0 = NUMBERS(u, from_u), u1 = NUMBERS(u + 16, from_u);
+    const __m512i v0 = NUMBERS(v, from_v), v1 = NUMBERS(v + 16, from_v);
+#undef NUMBERS
+    const int beyond = mode == NEAREST ? 1 : 2;
     const __m512i begin = _mm512_set1_epi16(0x4300), middle = _mm512_set1_epi16((short)0x8000);
     const __m512i column = _mm512_sub_epi16(halves(u0, u1, 1), begin), row = _mm512_sub_epi16(halves(v0, v1, 1), begin);
-    const __mmask32 good = _mm512_cmple_epu16_mask(column, _mm512_set1_epi16(64 * registers / pixel - 2));
-    if (_mm512_mask_cmple_epu16_mask(good, row, _mm512_set1_epi16((short)(rows - 2))) != 0xffffffffu) return 0;
+    const __mmask32 good = _mm512_cmple_epu16_mask(column, _mm512_set1_epi16((short)(64 * registers / pixel - beyond)));
+    if (_mm512_mask_cmple_epu16_mask(good, row, _mm512_set1_epi16((short)(rows - beyond))) != 0xffffffffu) return 0;
     const __m512i part_u = _mm512_xor_si512(halves(u0, u1, 0), middle), part_v = _mm512_xor_si512(halves(v0, v1, 0), middle);
     const __m512i at = _mm512_mullo_epi16(column, _mm512_set1_epi16((short)(0x0101 * pixel)));
     /* of a register of the result each: which pixels and channels its elements are */
@@ -1263,6 +1183,11 @@ INLINE int bytes_at(const Wide *image, const Place *place, char *result, const f
                 last[k] = found;
             }
         }
+        if (mode == NEAREST) {
+            const __mmask32 below = _mm512_cmpge_epi16_mask(row, _mm512_set1_epi16((short)(rows - 1)));
+            _mm256_storeu_si256((__m256i *)result, _mm512_cvtepi16_epi8(_mm512_mask_mov_epi16(upper[0], below, lower[0])));
+            continue;
+        }
         for (k = 0; k < pixel; k++) {
             const __m512i value = between16(between_bytes(upper[k], t_u[k]), between_bytes(lower[k], t_u[k]), t_v[k]);
             const __m512i rounded = _mm512_add_epi16(value, _mm512_set1_epi16(128));
@@ -1299,16 +1224,9 @@ NOT_INLINE int bytes_at_rim(const Span *span, const Wide *image, const float *u,
     }
     places_of(image, on_u, on_v, 32, pixel, registers, &place);
     if (~inside) show_nothing(span, UINT8);
-    if (inside && !bytes_at(image, &place, span->result, on_u, on_v, pixel, registers, inside)) return 0;
+    if (inside && !bytes_at(image, &place, span->result, on_u, on_v, pixel, registers, BILINEAR, inside)) return 0;
     if (near & ~inside) careful(span, u, v, UINT8, BILINEAR, inside | ~near);
     return 1;
-}
-
-/* Whether there is such a way for images of this kind; registers hold a part of an image */
-INLINE int is_wide(const Job *job, int type, int mode, int layout) {
-    if (job->source_width < 32 || job->source_height < 5) return 0;
-    if (mode == NEAREST) return type == BYTES1 && job->source_strides[3] == 1 && job->result_strides[3] == 1;
-    return mode == BILINEAR && type == FLOAT32 && layout == PLANES;
 }
 
 #endif
@@ -1325,42 +1243,55 @@ INLINE void eights(Span *span, char *first, const Chunk *at, int64_t i, int64_t 
 #if WIDE
 
 INLINE void wide_bytes(Span *span, const Wide *image, char *first, const Chunk *at, int64_t n, const int pixel,
-                       const int registers, int layout) {
+                       const int registers, int mode) {
     Place places[CHUNK / 32], *place = places;
     int64_t i;
     places_of(image, at->u, at->v, n, pixel, registers, places);
     for (i = 0; i < n; i += 32, place++) {
+        const float *u = at->u + i, *v = at->v + i;
         span->result = first + i * pixel, span->pixels = 32;
-        if (bytes_at(image, place, span->result, at->u + i, at->v + i, pixel, registers, ~0u)) continue;
-        if (!bytes_at_rim(span, image, at->u + i, at->v + i, pixel))
-            eights(span, first, at, i, i + 32, UINT8, BILINEAR, layout);
+        if (bytes_at(image, place, span->result, u, v, pixel, registers, mode, ~0u)) continue;
+        if (mode == NEAREST) eights(span, first, at, i, i + 32, BYTES1, NEAREST, SCATTERED);
+        else if (!bytes_at_rim(span, image, u, v, pixel))
+            eights(span, first, at, i, i + 32, UINT8, BILINEAR, pixel == 1 ? PLANES : INTERLEAVED);
     }
+}
+
+/* How many of n pixels of a row are made so, the first of them */
+INLINE int64_t wide(Span *span, char *first, const Chunk *at, int64_t n, int type, int mode, int layout) {
+    const Job *job = span->job;
+    const int64_t *from = job->source_strides, *to = job->result_strides;
+    const Wide image = {span->source, job->channels, from[1], from[2], to[1], job->source_width, job->source_height};
+    const int in_planes = layout == PLANES || (mode == NEAREST && from[3] == 1 && to[3] == 1);
+    int64_t i;
+    if (mode == BILINEAR && type == FLOAT32 && in_planes && image.width >= 32 && image.height >= 5) {
+        for (i = 0; n - i >= 16; i += 16)
+            if (!sixteen(&image, first + 4 * i, at->u + i, at->v + i))
+                eights(span, first, at, i, i + 16, FLOAT32, BILINEAR, PLANES);
+        return i;
+    }
+    if (!(mode == BILINEAR ? type == UINT8 : mode == NEAREST && type == BYTES1) || n < 32) return 0;
+    if (!in_planes && !(layout == INTERLEAVED && job->channels == 3)) return 0;
+    /* how far 32 pixels go */
+    const int64_t across = llabs((int64_t)whole(at->u[n - 1]) - whole(at->u[0])) * 32 / n + 5;
+    const int64_t down = llabs((int64_t)whole(at->v[n - 1]) - whole(at->v[0])) * 32 / n;
+    if (down > MOST_ROWS || across > (in_planes ? 128 : 85)) return 0;
+    n = n / 32 * 32;
+    if (in_planes && across <= 64) wide_bytes(span, &image, first, at, n, 1, 1, mode);
+    else if (in_planes) wide_bytes(span, &image, first, at, n, 1, 2, mode);
+    else if (across <= 42) wide_bytes(span, &image, first, at, n, 3, 2, BILINEAR);
+    else wide_bytes(span, &image, first, at, n, 3, 4, BILINEAR);
+    return n;
 }
 
 #endif
 
 INLINE void chunk(Span *span, char *first, const Chunk *at, int64_t n, int type, int mode, int layout) {
-    const Job *job = span->job;
-    int64_t i = 0;
+    int64_t made = 0;
 #if WIDE
-    const int64_t *from = job->source_strides, step = job->result_strides[3] * size_of(type);
-    const Wide image = {span->source, job->channels, from[1], from[2], job->result_strides[1], job->source_width,
-                        job->source_height};
-    if (type == UINT8 && mode == BILINEAR && n >= 32 && (layout == PLANES || (layout == INTERLEAVED && job->channels == 3))) {
-        /* how far 32 pixels go */
-        const int64_t across = llabs((int64_t)whole(at->u[n - 1]) - whole(at->u[0])) * 32 / n + 5;
-        const int64_t down = llabs((int64_t)whole(at->v[n - 1]) - whole(at->v[0])) * 32 / n;
-        const int64_t made = down > MOST_ROWS ? 0 : n / 32 * 32;
-        if (layout == PLANES && across <= 64) wide_bytes(span, &image, first, at, i = made, 1, 1, PLANES);
-        else if (layout == PLANES && across <= 128) wide_bytes(span, &image, first, at, i = made, 1, 2, PLANES);
-        else if (layout == INTERLEAVED && across <= 42) wide_bytes(span, &image, first, at, i = made, 3, 2, INTERLEAVED);
-        else if (layout == INTERLEAVED && across <= 85) wide_bytes(span, &image, first, at, i = made, 3, 4, INTERLEAVED);
-    } else if (is_wide(job, type, mode, layout)) {
-        for (; n - i >= 16; i += 16)
-            if (!sixteen(&image, first + i * step, at->u + i, at->v + i, mode)) eights(span, first, at, i, i + 16, type, mode, layout);
-    }
+    made = wide(span, first, at, n, type, mode, layout);
 #endif
-    eights(span, first, at, i, n, type, mode, layout);
+    eights(span, first, at, made, n, type, mode, layout);
 }
 
 /* -- tiles */
