@@ -1,6 +1,6 @@
 /* Samples images where a warp says, in tiles of rows: one variant, for the instructions that it is compiled for.
  *
- * A tile goes row by row, eight pixels at a time. Their positions come from a grid or from a lattice, between whose
+ * A tile goes by columns of chunks, a chunk row by row, eight pixels at a time, or 16 or 32 (see `wide`). Their positions come from a grid or from a lattice, between whose
  * nodes lie cubics. Eight pixels that read inside of the image alone take a way without branches; all others, and all
  * pixels where the compiler has no vectors, go one by one through `sample_at`.
  */
@@ -893,14 +893,18 @@ typedef struct {
 /* The cubics along a row of nodes, the first of which lies before that of the first pixel */
 NOT_INLINE void lay_line(const float *nodes, int64_t cells, float side, float *__restrict line) {
     const float half = side / 2, middle = (side - 1) / 2;
-    float weights[4][STEP];
     int64_t j;
-    int k;
-    for (k = 0; k < 4 * STEP; k++) weights[k / STEP][k % STEP] = half * WEIGHTS[k / STEP][k % STEP];
     for (j = 0; j < cells; j++, nodes++, line += STEP) {
-        const float a = nodes[0], b = nodes[1], c = nodes[2], d = nodes[3];
+        const float a = nodes[0] * half, b = nodes[1] * half, c = nodes[2] * half, d = nodes[3] * half;
+#if VECTORS
+        const V8 made = load8(WEIGHTS[0]) * a + load8(WEIGHTS[1]) * b + load8(WEIGHTS[2]) * c + load8(WEIGHTS[3]) * d +
+                        middle;
+        memcpy(line, &made, sizeof made);
+#else
+        int k;
         for (k = 0; k < STEP; k++)
-            line[k] = a * weights[0][k] + b * weights[1][k] + c * weights[2][k] + d * weights[3][k] + middle;
+            line[k] = WEIGHTS[0][k] * a + WEIGHTS[1][k] * b + WEIGHTS[2][k] * c + WEIGHTS[3][k] * d + middle;
+#endif
     }
 }
 
@@ -1064,8 +1068,9 @@ INLINE int sixteen(const Wide *image, char *result, const float *at_u, const flo
 enum { MOST_ROWS = 24 };
 
 /* Of the bytes of 32 pixels with three channels: the pixel, and the channel with that of the next pixel */
-#define REPEATED(f) f(0), f(1), f(2), f(3), f(4), f(5), f(6), f(7), f(8), f(9), f(10), f(11), f(12), f(13), f(14), f(15), \
-    f(16), f(17), f(18), f(19), f(20), f(21), f(22), f(23), f(24), f(25), f(26), f(27), f(28), f(29), f(30), f(31)
+#define REPEATED(f)                                                                                                    \
+    f(0), f(1), f(2), f(3), f(4), f(5), f(6), f(7), f(8), f(9), f(10), f(11), f(12), f(13), f(14), f(15), f(16), f(17), \
+        f(18), f(19), f(20), f(21), f(22), f(23), f(24), f(25), f(26), f(27), f(28), f(29), f(30), f(31)
 #define THREE_TIMES(i) i, i, i
 #define THREE(i) 0x0300, 0x0401, 0x0502
 static const int16_t PIXELS[96] = {REPEATED(THREE_TIMES)}, CHANNELS[96] = {REPEATED(THREE)};
@@ -1118,6 +1123,17 @@ INLINE __m512i between_bytes(__m512i pairs, __m512i t) {
     return _mm512_add_epi16(sum, _mm512_mulhrs_epi16(difference, t));
 }
 
+/* Bytes of a window of so many registers */
+INLINE __m512i found(const char *from, __m512i pick, const int registers) {
+    const __m512i low = _mm512_loadu_si512(from);
+    if (registers == 1) return _mm512_permutexvar_epi8(pick, low);
+    const __m512i first = _mm512_permutex2var_epi8(low, pick, _mm512_loadu_si512(from + 64));
+    if (registers == 2) return first;
+    const __m512i second =
+        _mm512_permutex2var_epi8(_mm512_loadu_si512(from + 128), pick, _mm512_loadu_si512(from + 192));
+    return _mm512_mask_mov_epi8(first, _mm512_movepi8_mask(pick), second);
+}
+
 /* Whether all lie there, and those that are `wanted` are made: pixels of one byte or of three, in rows of so many
  * registers. Positions are rounded to 2^-16. */
 INLINE int bytes_at(const Wide *image, const Place *place, char *result, const float *u, const float *v, const int pixel,
@@ -1136,10 +1152,12 @@ INLINE int bytes_at(const Wide *image, const Place *place, char *result, const f
 #undef NUMBERS
     const int beyond = mode == NEAREST ? 1 : 2;
     const __m512i begin = _mm512_set1_epi16(0x4300), middle = _mm512_set1_epi16((short)0x8000);
-    const __m512i column = _mm512_sub_epi16(halves(u0, u1, 1), begin), row = _mm512_sub_epi16(halves(v0, v1, 1), begin);
+    const __m512i column = _mm512_sub_epi16(halves(u0, u1, 1), begin);
+    const __m512i row = _mm512_sub_epi16(halves(v0, v1, 1), begin);
     const __mmask32 good = _mm512_cmple_epu16_mask(column, _mm512_set1_epi16((short)(64 * registers / pixel - beyond)));
     if (_mm512_mask_cmple_epu16_mask(good, row, _mm512_set1_epi16((short)(rows - beyond))) != 0xffffffffu) return 0;
-    const __m512i part_u = _mm512_xor_si512(halves(u0, u1, 0), middle), part_v = _mm512_xor_si512(halves(v0, v1, 0), middle);
+    const __m512i part_u = _mm512_xor_si512(halves(u0, u1, 0), middle);
+    const __m512i part_v = _mm512_xor_si512(halves(v0, v1, 0), middle);
     const __m512i at = _mm512_mullo_epi16(column, _mm512_set1_epi16((short)(0x0101 * pixel)));
     /* of a register of the result each: which pixels and channels its elements are */
     __m512i pick[3], t_u[3], t_v[3], begins[3], last[3], upper[3], lower[3];
@@ -1149,7 +1167,8 @@ INLINE int bytes_at(const Wide *image, const Place *place, char *result, const f
         stored[0] = wanted;
     } else {
         for (k = 0; k < 3; k++) {
-            const __m512i which = _mm512_loadu_si512(PIXELS + 32 * k), channel = _mm512_loadu_si512(CHANNELS + 32 * k);
+            const __m512i which = _mm512_loadu_si512(PIXELS + 32 * k);
+            const __m512i channel = _mm512_loadu_si512(CHANNELS + 32 * k);
             pick[k] = _mm512_add_epi16(_mm512_permutexvar_epi16(which, at), channel);
             t_u[k] = _mm512_permutexvar_epi16(which, part_u), t_v[k] = _mm512_permutexvar_epi16(which, part_v);
             begins[k] = _mm512_permutexvar_epi16(which, row);
@@ -1157,39 +1176,31 @@ INLINE int bytes_at(const Wide *image, const Place *place, char *result, const f
         }
     }
     const char *plane = image->source + place->begin;
-#define FOUND(k, from)                                                                                                 \
-    (registers == 1 ? _mm512_permutexvar_epi8(pick[k], _mm512_loadu_si512(from))                                       \
-     : registers == 2                                                                                                  \
-         ? _mm512_permutex2var_epi8(_mm512_loadu_si512(from), pick[k], _mm512_loadu_si512((from) + 64))                \
-         : _mm512_mask_permutex2var_epi8_(_mm512_permutex2var_epi8(_mm512_loadu_si512(from), pick[k],                  \
-                                                                   _mm512_loadu_si512((from) + 64)),                   \
-                                          _mm512_movepi8_mask(pick[k]),                                                \
-                                          _mm512_permutex2var_epi8(_mm512_loadu_si512((from) + 128), pick[k],          \
-                                                                   _mm512_loadu_si512((from) + 192))))
-#define _mm512_mask_permutex2var_epi8_(a, m, b) _mm512_mask_mov_epi8(a, m, b)
     for (c = 0; c < (pixel == 1 ? image->channels : 1); c++, plane += image->from_plane, result += image->to_plane) {
         const char *from = plane + image->below;
         ask_below(from, image->below);
         if (pixel > 1) ask_below(from + 64, image->below);
-        for (k = 0; k < pixel; k++) upper[k] = FOUND(k, plane), last[k] = lower[k] = FOUND(k, from);
+        for (k = 0; k < pixel; k++) upper[k] = found(plane, pick[k], registers), last[k] = lower[k] = found(from, pick[k], registers);
         for (j = 2; j < rows; j++) {
             const __m512i before = _mm512_set1_epi16((short)(j - 2));
             from += image->below;
             for (k = 0; k < pixel; k++) {
                 const __mmask32 below = _mm512_cmpgt_epi16_mask(begins[k], before);
-                const __m512i found = FOUND(k, from);
+                const __m512i next = found(from, pick[k], registers);
                 upper[k] = _mm512_mask_mov_epi16(upper[k], below, last[k]);
-                lower[k] = _mm512_mask_mov_epi16(lower[k], below, found);
-                last[k] = found;
+                lower[k] = _mm512_mask_mov_epi16(lower[k], below, next);
+                last[k] = next;
             }
         }
         if (mode == NEAREST) {
             const __mmask32 below = _mm512_cmpge_epi16_mask(row, _mm512_set1_epi16((short)(rows - 1)));
-            _mm256_storeu_si256((__m256i *)result, _mm512_cvtepi16_epi8(_mm512_mask_mov_epi16(upper[0], below, lower[0])));
+            const __m512i value = _mm512_mask_mov_epi16(upper[0], below, lower[0]);
+            _mm256_storeu_si256((__m256i *)result, _mm512_cvtepi16_epi8(value));
             continue;
         }
         for (k = 0; k < pixel; k++) {
-            const __m512i value = between16(between_bytes(upper[k], t_u[k]), between_bytes(lower[k], t_u[k]), t_v[k]);
+            const __m512i above = between_bytes(upper[k], t_u[k]), under = between_bytes(lower[k], t_u[k]);
+            const __m512i value = between16(above, under, t_v[k]);
             const __m512i rounded = _mm512_add_epi16(value, _mm512_set1_epi16(128));
             const __m512i dense = _mm512_permutexvar_epi8(_mm512_loadu_si512(UPPER), rounded);
             _mm256_mask_storeu_epi8(result + 32 * k, stored[k], _mm512_castsi512_si256(dense));
@@ -1213,8 +1224,10 @@ NOT_INLINE int bytes_at_rim(const Span *span, const Wide *image, const float *u,
     if (span->job->padding == REFLECTION || right < 1 || bottom < 1) return 0;
     for (k = 0; k < 32; k += 16) {
         const __m512 x = _mm512_loadu_ps(u + k), y = _mm512_loadu_ps(v + k);
-        const __m512 on_x = _mm512_max_ps(_mm512_min_ps(x, last_u), zero), on_y = _mm512_max_ps(_mm512_min_ps(y, last_v), zero);
-        const __m512 off = _mm512_max_ps(_mm512_abs_ps(_mm512_sub_ps(x, on_x)), _mm512_abs_ps(_mm512_sub_ps(y, on_y)));
+        const __m512 on_x = _mm512_max_ps(_mm512_min_ps(x, last_u), zero);
+        const __m512 on_y = _mm512_max_ps(_mm512_min_ps(y, last_v), zero);
+        const __m512 off_x = _mm512_abs_ps(_mm512_sub_ps(x, on_x)), off_y = _mm512_abs_ps(_mm512_sub_ps(y, on_y));
+        const __m512 off = _mm512_max_ps(off_x, off_y);
         const __mmask16 is = _mm512_cmp_ps_mask(x, y, _CMP_ORD_Q); /* NaN has none */
         inside |= (uint32_t)_mm512_mask_cmp_ps_mask(is, off, zero, _CMP_EQ_OQ) << k;
         near |= (uint32_t)_mm512_mask_cmp_ps_mask(is, off, _mm512_set1_ps(1), _CMP_LT_OQ) << k;
