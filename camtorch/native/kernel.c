@@ -1,6 +1,6 @@
 /* Samples images where a warp says, in tiles of rows: one variant, for the instructions that it is compiled for.
  *
- * A tile goes row by row, eight pixels at a time. Their positions come from a grid or from a lattice, between whose
+ * A tile goes by columns of chunks, a chunk row by row, eight pixels at a time, or 16 or 32 (see `wide`). Their positions come from a grid or from a lattice, between whose
  * nodes lie cubics. Eight pixels that read inside of the image alone take a way without branches; all others, and all
  * pixels where the compiler has no vectors, go one by one through `sample_at`.
  */
@@ -85,6 +85,9 @@ INLINE void move(char *to, int64_t i, const char *from, int64_t j, int type) {
     default: ((uint64_t *)to)[i] = ((const uint64_t *)from)[j];
     }
 }
+
+INLINE float greater(float a, float b) { return a > b ? a : b; }
+INLINE float lesser(float a, float b) { return a < b ? a : b; }
 
 /* What is not a number, as the reflection of infinity, is the first */
 static float clamped(float x, float last) { return x > 0 ? x > last ? last : x : 0; }
@@ -210,12 +213,12 @@ NOT_INLINE void show_nothing(const Span *span, int type) {
 }
 
 /* Pixels one by one; `done`: bits of those that are there */
-NOT_INLINE void careful(const Span *span, const Positions *at, int type, int mode, int done) {
+NOT_INLINE void careful(const Span *span, const float *at_u, const float *at_v, int type, int mode, uint32_t done) {
     const Job *job = span->job;
     const int64_t bytes = size_of(type);
     int64_t i, c;
     for (i = 0; i < span->pixels; i++) {
-        const float u = at->u[i], v = at->v[i];
+        const float u = at_u[i], v = at_v[i];
         char *result = span->result + i * job->result_strides[3] * bytes;
         int shows = u == u && v == v;
         if (done >> i & 1) continue;
@@ -584,57 +587,6 @@ INLINE V4 channels4(const char *at, int type) {
 
 #if defined(__AVX512VBMI__) && defined(__AVX512VL__) && defined(__AVX512BW__) && defined(__AVX512DQ__)
 #define WIDE 1
-
-/* Eight pixels of three floats, if their squares begin within nine columns and two rows, and two more columns follow */
-INLINE int colours_of_eight(const Span *span, const Squares *at) {
-    const Job *job = span->job;
-    const int64_t below = job->source_strides[2];
-    const int32_t x0 = at->x[0], x7 = at->x[7], y0 = at->y[0], y7 = at->y[7];
-    const int32_t column = x0 < x7 ? x0 : x7, first = y0 < y7 ? y0 : y7;
-    const __m256i dx = _mm256_sub_epi32((__m256i)at->x, _mm256_set1_epi32(column));
-    const __m256i dy = _mm256_sub_epi32((__m256i)at->y, _mm256_set1_epi32(first));
-    if ((_mm256_cmplt_epu32_mask(dx, _mm256_set1_epi32(9)) & _mm256_cmplt_epu32_mask(dy, _mm256_set1_epi32(2))) != 0xff ||
-        column + 11 > job->source_width || span->pixels < STEP)
-        return 0;
-    /* sixteen and eight elements of the result: of which pixel each is, and which of its channels */
-    const __m512i pixel[2] = {_mm512_setr_epi32(0, 0, 0, 1, 1, 1, 2, 2, 2, 3, 3, 3, 4, 4, 4, 5),
-                              _mm512_setr_epi32(5, 5, 6, 6, 6, 7, 7, 7, 7, 7, 7, 7, 7, 7, 7, 7)};
-    const __m512i channel[2] = {_mm512_setr_epi32(0, 1, 2, 0, 1, 2, 0, 1, 2, 0, 1, 2, 0, 1, 2, 0),
-                                _mm512_setr_epi32(1, 2, 0, 1, 2, 0, 1, 2, 2, 2, 2, 2, 2, 2, 2, 2)};
-    const __m512i three = _mm512_castsi256_si512(_mm256_add_epi32(dx, _mm256_add_epi32(dx, dx)));
-    const __m512i rows = _mm512_castsi256_si512(dy);
-    const __m512 parts_u = _mm512_castps256_ps512((__m256)at->u), parts_v = _mm512_castps256_ps512((__m256)at->v);
-    const float *from = (const float *)span->source + first * below + 3 * column;
-    ask_below(from, below * (int64_t)sizeof(float));
-    ask_below(from + 16, below * (int64_t)sizeof(float));
-    __m512 made[2];
-    int k;
-    for (k = 0; k < 2; k++) {
-        const __m512i left = _mm512_add_epi32(_mm512_permutexvar_epi32(pixel[k], three), channel[k]);
-        const __m512i right = _mm512_add_epi32(left, _mm512_set1_epi32(3));
-        const __m512 u = _mm512_permutexvar_ps(pixel[k], parts_u), v = _mm512_permutexvar_ps(pixel[k], parts_v);
-        const __m512 other_u = _mm512_sub_ps(_mm512_set1_ps(1), u), other_v = _mm512_sub_ps(_mm512_set1_ps(1), v);
-        const __mmask16 second = _mm512_test_epi32_mask(_mm512_permutexvar_epi32(pixel[k], rows), _mm512_set1_epi32(1));
-#define ROW(i)                                                                                                         \
-    const __m512 low##i = _mm512_loadu_ps(from + i * below), high##i = _mm512_loadu_ps(from + i * below + 16);         \
-    const __m512 row##i = _mm512_fmadd_ps(_mm512_permutex2var_ps(low##i, left, high##i), other_u,                      \
-                                          _mm512_mul_ps(_mm512_permutex2var_ps(low##i, right, high##i), u))
-        ROW(0);
-        ROW(1);
-        __m512 above = row0, under = row1;
-        if (second) {
-            ROW(2);
-            above = _mm512_mask_mov_ps(row0, second, row1);
-            under = _mm512_mask_mov_ps(row1, second, row2);
-        }
-#undef ROW
-        made[k] = _mm512_fmadd_ps(above, other_v, _mm512_mul_ps(under, v));
-    }
-    _mm512_storeu_ps((float *)span->result, made[0]);
-    _mm256_storeu_ps((float *)span->result + 16, _mm512_castps512_ps256(made[1]));
-    return 1;
-}
-
 #else
 #define WIDE 0
 #endif
@@ -645,9 +597,6 @@ INLINE void bilinear_interleaved(const Span *span, Squares at, int type) {
     const int64_t right = channels * bytes, below = job->source_strides[2] * bytes;
     float values[STEP * MOST_INTERLEAVED + 4];
     int64_t offsets[STEP], i, n = span->pixels * channels;
-#if WIDE
-    if (type == FLOAT32 && channels == 3 && colours_of_eight(span, &at)) return;
-#endif
     offsets_of(job, at.x, at.y, offsets);
     ask_below(span->source + offsets[0] * bytes, below);
     ask_below(span->source + offsets[STEP - 1] * bytes, below);
@@ -890,7 +839,7 @@ INLINE void eight(const Span *span, V8 u, V8 v, int type, int mode, int layout) 
     }
     memcpy(at.u, &u, sizeof at.u);
     memcpy(at.v, &v, sizeof at.v);
-    careful(span, &at, type, mode, done);
+    careful(span, at.u, at.v, type, mode, (uint32_t)done);
 }
 
 #else
@@ -911,7 +860,7 @@ INLINE void eight(const Span *span, V8 u, V8 v, int type, int mode, int layout) 
     (void)layout;
     memcpy(at.u, &u, sizeof at.u);
     memcpy(at.v, &v, sizeof at.v);
-    careful(span, &at, type, mode, 0);
+    careful(span, at.u, at.v, type, mode, 0);
 }
 
 #endif
@@ -929,70 +878,68 @@ static const float WEIGHTS[4][STEP] = {EIGHT(ROW0), EIGHT(ROW1), EIGHT(ROW2), EI
 
 /* Of pixels of a row, in pixels of the source; NaN where there is none */
 typedef struct {
-    float u[CHUNK], v[CHUNK];
+    _Alignas(64) float u[CHUNK];
+    float v[CHUNK];
 } Chunk;
 
-/* The cubics through columns of nodes, at part k / 8 between two rows of them, in pixels of the source */
-INLINE void lay_line(const float *nodes, int64_t stride, int64_t n, int part, float side, float *line) {
-    const float w0 = WEIGHTS[0][part], w1 = WEIGHTS[1][part], w2 = WEIGHTS[2][part], w3 = WEIGHTS[3][part];
+/* Lines of pixels between the nodes of a row each, the four that the rows of a cell lie between: that of the i-th row of
+ * nodes at i % 4. In pixels of the source. */
+typedef struct {
+    _Alignas(64) float u[4][CHUNK];
+    float v[4][CHUNK];
+    int cubic; /* whether all cells are */
+} Lines;
+
+/* The cubics along a row of nodes, the first of which lies before that of the first pixel */
+NOT_INLINE void lay_line(const float *nodes, int64_t cells, float side, float *__restrict line) {
     const float half = side / 2, middle = (side - 1) / 2;
-    const float *a = nodes, *b = a + stride, *c = b + stride, *d = c + stride;
     int64_t j;
-    for (j = 0; j < n; j++) line[j] = (a[j] * w0 + b[j] * w1 + c[j] * w2 + d[j] * w3) * half + middle;
-}
-
-/* Eight pixels between neighbouring nodes */
-INLINE void lay_cubic(const float *line, float *to) {
+    for (j = 0; j < cells; j++, nodes++, line += STEP) {
+        const float a = nodes[0] * half, b = nodes[1] * half, c = nodes[2] * half, d = nodes[3] * half;
 #if VECTORS
-    const V8 made = load8(WEIGHTS[0]) * line[0] + load8(WEIGHTS[1]) * line[1] + load8(WEIGHTS[2]) * line[2] +
-                    load8(WEIGHTS[3]) * line[3];
-    memcpy(to, &made, sizeof made);
+        const V8 made = load8(WEIGHTS[0]) * a + load8(WEIGHTS[1]) * b + load8(WEIGHTS[2]) * c + load8(WEIGHTS[3]) * d +
+                        middle;
+        memcpy(line, &made, sizeof made);
 #else
-    int k;
-    for (k = 0; k < STEP; k++)
-        to[k] = WEIGHTS[0][k] * line[0] + WEIGHTS[1][k] * line[1] + WEIGHTS[2][k] * line[2] + WEIGHTS[3][k] * line[3];
+        int k;
+        for (k = 0; k < STEP; k++)
+            line[k] = WEIGHTS[0][k] * a + WEIGHTS[1][k] * b + WEIGHTS[2][k] * c + WEIGHTS[3][k] * d + middle;
 #endif
+    }
 }
 
-#if WIDE
-/* Sixteen */
-INLINE void lay_cubics(const float *line, float *to) {
-    const __m512 nodes = _mm512_castps256_ps512(_mm256_loadu_ps(line));
-    const __m512i first = _mm512_setr_epi32(0, 0, 0, 0, 0, 0, 0, 0, 1, 1, 1, 1, 1, 1, 1, 1);
-    __m512 sum = _mm512_setzero_ps();
-    int k;
-    for (k = 0; k < 4; k++)
-        sum = _mm512_fmadd_ps(_mm512_broadcast_f32x8(_mm256_loadu_ps(WEIGHTS[k])),
-                              _mm512_permutexvar_ps(_mm512_add_epi32(first, _mm512_set1_epi32(k)), nodes), sum);
-    _mm512_storeu_ps(to, sum);
+/* Those between four lines, at `part` / 8 from the second to the third one */
+NOT_INLINE void between_lines(const float (*lines)[CHUNK], int64_t row, int part, int64_t n, float *__restrict to) {
+    const float w0 = WEIGHTS[0][part], w1 = WEIGHTS[1][part], w2 = WEIGHTS[2][part], w3 = WEIGHTS[3][part];
+    const float *a = lines[row % 4], *b = lines[(row + 1) % 4], *c = lines[(row + 2) % 4], *d = lines[(row + 3) % 4];
+    int64_t k;
+    for (k = 0; k < n; k++) to[k] = a[k] * w0 + b[k] * w1 + c[k] * w2 + d[k] * w3;
 }
-#endif
 
-/* From a lattice, of whole cells */
-static void lattice_positions(const Job *job, int64_t b, int64_t y, int64_t x, int64_t n, Chunk *at) {
-    const int64_t i = y / STEP, first = x / STEP, width = job->columns + 5, count = (n + STEP - 1) / STEP;
+/* From a lattice, of whole cells; a row of a tile after the other, from its `first` one on */
+static void lattice_positions(const Job *job, int64_t b, int64_t y, int64_t x, int64_t n, int64_t first, Lines *lines,
+                              Chunk *at) {
+    const int64_t i = y / STEP, column = x / STEP, width = job->columns + 5, count = (n + STEP - 1) / STEP;
     const int part = (int)(y % STEP);
-    const float *nodes = job->nodes + b * job->node_strides[0] + (i + 1) * width + first + 1;
-    const int32_t *cells = job->cells + b * job->cell_stride + i * job->columns + first;
-    float across[CHUNK / STEP + 8], down[CHUNK / STEP + 8]; /* of which registers read some beyond */
+    const float *nodes = job->nodes + b * job->node_strides[0] + column + 1;
+    const int32_t *cells = job->cells + b * job->cell_stride + i * job->columns + column;
     int64_t j;
     int k;
-    lay_line(nodes, width, count + 3, part, (float)job->source_width, across);
-    lay_line(nodes + job->node_strides[1], width, count + 3, part, (float)job->source_height, down);
-    for (j = 0; j < count; j++) {
-        float *u = at->u + j * STEP, *v = at->v + j * STEP;
-#if WIDE
-        if (j + 1 < count && cells[j] == CELL_CUBIC && cells[j + 1] == CELL_CUBIC) {
-            lay_cubics(across + j, u), lay_cubics(down + j, v);
-            j++;
-            continue;
+    if (y == first || part == 0) {
+        for (j = y == first ? i + 1 : i + 4; j < i + 5; j++) {
+            lay_line(nodes + j * width, count, (float)job->source_width, lines->u[j % 4]);
+            lay_line(nodes + job->node_strides[1] + j * width, count, (float)job->source_height, lines->v[j % 4]);
         }
-#endif
-        if (cells[j] == CELL_CUBIC) {
-            lay_cubic(across + j, u), lay_cubic(down + j, v);
-        } else if (cells[j] == CELL_EMPTY) {
+        lines->cubic = 1;
+        for (j = 0; j < count; j++) lines->cubic &= cells[j] == CELL_CUBIC;
+    }
+    between_lines(lines->u, i + 1, part, count * STEP, at->u);
+    between_lines(lines->v, i + 1, part, count * STEP, at->v);
+    for (j = 0; j < count && !lines->cubic; j++) {
+        float *u = at->u + j * STEP, *v = at->v + j * STEP;
+        if (cells[j] == CELL_EMPTY) {
             for (k = 0; k < STEP; k++) u[k] = v[k] = NAN;
-        } else {
+        } else if (cells[j] != CELL_CUBIC) {
             const float *exact = job->exact + ((int64_t)cells[j] * STEP + part) * STEP;
             for (k = 0; k < STEP; k++) {
                 u[k] = ((exact[k] + 1) * (float)job->source_width - 1) / 2;
@@ -1031,11 +978,6 @@ static void grid_positions(const Job *job, int64_t b, int64_t y, int64_t x, int6
     }
 }
 
-NOT_INLINE void positions(const Job *job, int64_t b, int64_t y, int64_t x, int64_t n, Chunk *at) {
-    if (job->nodes) lattice_positions(job, b, y, x, n, at);
-    else grid_positions(job, b, y, x, n, at);
-}
-
 /* -- sixteen pixels at a time, whose neighbours are picked out of whole registers */
 
 #if WIDE
@@ -1054,20 +996,18 @@ typedef struct {
 
 INLINE int32_t whole(float x) { return _mm_cvttss_si32(_mm_set_ss(x)); }
 
-/* Whether squares of positions at (x, y), of pixels of so many elements, are all `good` and lie in so many rows and
- * elements of each */
+/* Whether squares of positions at (x, y) are all `good` and lie in so many rows and 32 elements of each */
 INLINE int in_window(const Wide *image, const float *u, const float *v, __m512i x, __m512i y, __mmask16 good,
-                     const int pixel, const int rows, const int part, WideWindow *window) {
+                     const int rows, WideWindow *window) {
     const int64_t x0 = whole(u[0]), x15 = whole(u[15]), y0 = whole(v[0]), y15 = whole(v[15]);
-    const int64_t column = pixel * (x0 < x15 ? x0 : x15), row = y0 < y15 ? y0 : y15;
-    const int64_t last_begin = pixel * image->width - part, last_row = image->height - rows;
+    const int64_t column = x0 < x15 ? x0 : x15, row = y0 < y15 ? y0 : y15;
+    const int64_t last_begin = image->width - 32, last_row = image->height - rows;
     const int64_t begin = column < last_begin ? column : last_begin, first = row < last_row ? row : last_row;
-    if (pixel == 3) x = _mm512_add_epi32(x, _mm512_slli_epi32(x, 1));
     window->x = _mm512_sub_epi32(x, _mm512_set1_epi32((int32_t)begin));
     window->y = _mm512_sub_epi32(y, _mm512_set1_epi32((int32_t)first));
     window->begin = first * image->below + begin;
     /* as unsigned numbers, so not negative either */
-    good = _mm512_mask_cmple_epu32_mask(good, window->x, _mm512_set1_epi32(part - 2 * pixel));
+    good = _mm512_mask_cmple_epu32_mask(good, window->x, _mm512_set1_epi32(30));
     return _mm512_mask_cmple_epu32_mask(good, window->y, _mm512_set1_epi32(rows - 2)) == 0xffff;
 }
 
@@ -1075,114 +1015,6 @@ INLINE int in_window(const Wide *image, const float *u, const float *v, __m512i 
 INLINE int rows_of_sixteen(const float *v) {
     const int32_t first = whole(v[0]), last = whole(v[15]);
     return first == last ? 2 : (first < last ? first + 1 == last : last + 1 == first) ? 3 : 5;
-}
-
-#define NEIGHBOURS 0x5555555555555555u /* of 16 bits the lower byte each */
-
-/* The two weights of a part of a square's side, in 2^-14 */
-INLINE __m512i weights16(__m512i part) {
-    return _mm512_add_epi32(_mm512_sub_epi32(_mm512_slli_epi32(part, 16), part), _mm512_set1_epi32(1 << 14));
-}
-
-/* Pairs of bytes above and below, blended; halves of what is cut off on the way are added */
-INLINE __m512i blended_bytes(__m512i upper, __m512i lower, __m512i across, __m512i down) {
-    const __m512i above = _mm512_srli_epi32(_mm512_madd_epi16(upper, across), 7);
-    const __m512i under = _mm512_slli_epi32(_mm512_madd_epi16(lower, across), 9);
-    const __m512i value = _mm512_madd_epi16(_mm512_mask_blend_epi16(0xaaaaaaaau, above, under), down);
-    return _mm512_srli_epi32(_mm512_add_epi32(value, _mm512_set1_epi32((1 << 20) + (1 << 13))), 21);
-}
-
-/* A byte of each square and that `right` of it */
-INLINE __m512i byte_pairs16(__m512i at, int32_t right) {
-    return _mm512_add_epi32(_mm512_or_si512(at, _mm512_slli_epi32(at, 16)), _mm512_set1_epi32(right << 16));
-}
-
-INLINE __m512i rows_of_32(const char *first, const char *second) {
-    return _mm512_inserti64x4(_mm512_castsi256_si512(_mm256_loadu_si256((const __m256i *)first)),
-                              _mm256_loadu_si256((const __m256i *)second), 1);
-}
-
-INLINE void bytes_of_sixteen(const Wide *image, char *result, const WideWindow *window, __m512i across, __m512i down,
-                             const int rows) {
-    const char *from = image->source + window->begin;
-    const int64_t below = image->below;
-    const __m512i pick = byte_pairs16(_mm512_or_si512(window->x, _mm512_slli_epi32(window->y, 5)), 1);
-    int64_t c;
-    for (c = 0; c < image->channels; c++, from += image->from_plane, result += image->to_plane) {
-        __m512i upper = rows_of_32(from, from + below), lower = rows_of_32(from + below, from + 2 * below);
-        ask_below(from, below);
-        if (rows == 3) {
-            upper = _mm512_maskz_permutexvar_epi8(NEIGHBOURS, pick, upper);
-            lower = _mm512_maskz_permutexvar_epi8(NEIGHBOURS, pick, lower);
-        } else {
-            const __m512i third = rows_of_32(from + 2 * below, from + 3 * below);
-            upper = _mm512_maskz_permutex2var_epi8(NEIGHBOURS, upper, pick, third);
-            const __m512i fourth = rows_of_32(from + 3 * below, from + 4 * below);
-            lower = _mm512_maskz_permutex2var_epi8(NEIGHBOURS, lower, pick, fourth);
-        }
-        _mm_storeu_si128((__m128i *)result, _mm512_cvtepi32_epi8(blended_bytes(upper, lower, across, down)));
-    }
-}
-
-/* The three lower bytes of sixteen numbers */
-INLINE void store_colours(char *result, __m512i packed) {
-    const __m512i dense = _mm512_permutexvar_epi8(
-        _mm512_setr_epi32(0x04020100, 0x09080605, 0x0e0d0c0a, 0x14121110, 0x19181615, 0x1e1d1c1a, 0x24222120, 0x29282625,
-                          0x2e2d2c2a, 0x34323130, 0x39383635, 0x3e3d3c3a, 0, 0, 0, 0), packed);
-    _mm256_storeu_si256((__m256i *)result, _mm512_castsi512_si256(dense));
-    _mm_storeu_si128((__m128i *)(result + 32), _mm512_extracti32x4_epi32(dense, 2));
-}
-
-/* Three channels next to each other */
-INLINE void colours_of_sixteen(const Wide *image, char *result, const WideWindow *window, __m512i across, __m512i down,
-                               const int rows) {
-    const char *from = image->source + window->begin;
-    /* two rows are picked from at once */
-    const __m512i second = _mm512_slli_epi32(_mm512_and_si512(window->y, _mm512_set1_epi32(1)), 6);
-    const __mmask16 far = _mm512_test_epi32_mask(window->y, _mm512_set1_epi32(2));
-    __m512i pick = byte_pairs16(_mm512_or_si512(window->x, second), 3), row[5], packed = _mm512_setzero_si512();
-    int c, k;
-    ask_below(from, image->below);
-    for (k = 0; k < rows; k++) row[k] = _mm512_loadu_si512(from + k * image->below);
-#define PICKED(k) _mm512_maskz_permutex2var_epi8(NEIGHBOURS, row[k], pick, row[(k) + 1])
-    for (c = 0; c < 3; c++) {
-        __m512i upper = PICKED(0), lower = PICKED(1);
-        if (rows == 5) {
-            upper = _mm512_mask_mov_epi32(upper, far, PICKED(2));
-            lower = _mm512_mask_mov_epi32(lower, far, PICKED(3));
-        }
-        packed = _mm512_or_si512(packed, _mm512_slli_epi32(blended_bytes(upper, lower, across, down), 8 * c));
-        pick = _mm512_add_epi32(pick, _mm512_set1_epi32(0x00010001));
-    }
-#undef PICKED
-    store_colours(result, packed);
-}
-
-/* The same where images shrink, and a row of the window takes two registers */
-INLINE void far_colours_of_sixteen(const Wide *image, char *result, const WideWindow *window, __m512i across,
-                                   __m512i down, const int rows) {
-    const char *from = image->source + window->begin;
-    __m512i pick = byte_pairs16(window->x, 3), low[5], high[5], packed = _mm512_setzero_si512();
-    __mmask16 below[5]; /* which squares begin in a row or below it */
-    int c, k;
-    for (k = 0; k < rows; k++, from += image->below) {
-        ask_below(from, image->below);
-        low[k] = _mm512_loadu_si512(from), high[k] = _mm512_loadu_si512(from + 64);
-        below[k] = _mm512_cmpge_epi32_mask(window->y, _mm512_set1_epi32(k));
-    }
-#define PICKED(k) _mm512_maskz_permutex2var_epi8(NEIGHBOURS, low[k], pick, high[k])
-    for (c = 0; c < 3; c++) {
-        __m512i upper = PICKED(0), last = PICKED(1), lower = last;
-        for (k = 2; k < rows; k++) {
-            upper = _mm512_mask_mov_epi32(upper, below[k - 1], last);
-            last = PICKED(k);
-            lower = _mm512_mask_mov_epi32(lower, below[k - 1], last);
-        }
-        packed = _mm512_or_si512(packed, _mm512_slli_epi32(blended_bytes(upper, lower, across, down), 8 * c));
-        pick = _mm512_add_epi32(pick, _mm512_set1_epi32(0x00010001));
-    }
-#undef PICKED
-    store_colours(result, packed);
 }
 
 INLINE void floats_of_sixteen(const Wide *image, char *result, const WideWindow *window, __m512 u, __m512 v,
@@ -1209,128 +1041,290 @@ INLINE void floats_of_sixteen(const Wide *image, char *result, const WideWindow 
     }
 }
 
-INLINE void nearest_of_sixteen(const Wide *image, char *result, const WideWindow *window) {
-    const __m512i at = _mm512_or_si512(window->x, _mm512_slli_epi32(window->y, 5));
-    const char *from = image->source + window->begin;
-    const int64_t below = image->below;
-    int64_t c;
-    for (c = 0; c < image->channels; c++, from += image->from_plane, result += image->to_plane) {
-        ask_below(from, below);
-        const __m512i upper = rows_of_32(from, from + below), lower = rows_of_32(from + 2 * below, from + 3 * below);
-        _mm_storeu_si128((__m128i *)result, _mm512_cvtepi32_epi8(_mm512_permutex2var_epi8(upper, at, lower)));
-    }
-}
-
-/* Whether there is such a way, and the pixels are made. Of bytes, positions are rounded to 2^-14 */
-INLINE int sixteen(const Wide *image, char *result, const float *at_u, const float *at_v, int type, int mode,
-                   int layout) {
+/* Whether there is such a way, and the pixels of floats are made */
+INLINE int sixteen(const Wide *image, char *result, const float *at_u, const float *at_v) {
     const int32_t right = (int32_t)image->width - 1, bottom = (int32_t)image->height - 1;
     const __m512 u = _mm512_loadu_ps(at_u), v = _mm512_loadu_ps(at_v);
     const int rows = rows_of_sixteen(at_v);
-    /* where images shrink, a row's pixels take one register, or two, of these: known at once */
-    const int64_t reach = layout == INTERLEAVED ? llabs((int64_t)whole(at_u[15]) - whole(at_u[0])) : 0;
-    if (reach > (image->width < 43 ? 19 : 40)) return 0;
+    const __m512i x = _mm512_min_epi32(_mm512_cvttps_epi32(u), _mm512_set1_epi32(right - 1));
+    const __m512i y = _mm512_min_epi32(_mm512_cvttps_epi32(v), _mm512_set1_epi32(bottom - 1));
+    const __m512 across = _mm512_sub_ps(u, _mm512_cvtepi32_ps(x)), down = _mm512_sub_ps(v, _mm512_cvtepi32_ps(y));
     WideWindow window;
-    __m512i x, y;
-    __mmask16 good;
-#define WITHIN(pixel, rows, part) in_window(image, at_u, at_v, x, y, good, pixel, rows, part, &window)
-    if (mode == NEAREST) {
-        x = _mm512_cvtps_epi32(u), y = _mm512_cvtps_epi32(v);
-        good = _mm512_cmple_epu32_mask(x, _mm512_set1_epi32(right));
-        good = _mm512_mask_cmple_epu32_mask(good, y, _mm512_set1_epi32(bottom));
-        if (!WITHIN(1, 5, 32)) return 0;
-        nearest_of_sixteen(image, result, &window);
-        return 1;
-    }
-    if (type == FLOAT32) {
-        x = _mm512_min_epi32(_mm512_cvttps_epi32(u), _mm512_set1_epi32(right - 1));
-        y = _mm512_min_epi32(_mm512_cvttps_epi32(v), _mm512_set1_epi32(bottom - 1));
-        const __m512 across = _mm512_sub_ps(u, _mm512_cvtepi32_ps(x)), down = _mm512_sub_ps(v, _mm512_cvtepi32_ps(y));
-        good = _mm512_cmp_ps_mask(u, _mm512_setzero_ps(), _CMP_GE_OQ);
-        good = _mm512_mask_cmp_ps_mask(good, v, _mm512_setzero_ps(), _CMP_GE_OQ);
-        good = _mm512_mask_cmp_ps_mask(good, u, _mm512_set1_ps((float)right), _CMP_LE_OQ);
-        good = _mm512_mask_cmp_ps_mask(good, v, _mm512_set1_ps((float)bottom), _CMP_LE_OQ);
-        if (rows == 2 && WITHIN(1, 2, 32)) floats_of_sixteen(image, result, &window, across, down, 2);
-        else if (rows <= 3 && WITHIN(1, 3, 32)) floats_of_sixteen(image, result, &window, across, down, 3);
-        else if (WITHIN(1, 5, 32)) floats_of_sixteen(image, result, &window, across, down, 5);
-        else return 0;
-        return 1;
-    }
-    const __m512 scale = _mm512_set1_ps(1 << 14);
-    const __m512i last_u = _mm512_set1_epi32(right << 14), last_v = _mm512_set1_epi32(bottom << 14);
-    const __m512i one = _mm512_set1_epi32(1), parts = _mm512_set1_epi32((1 << 14) - 1);
-    x = _mm512_cvtps_epi32(_mm512_mul_ps(u, scale)), y = _mm512_cvtps_epi32(_mm512_mul_ps(v, scale));
-    good = _mm512_mask_cmple_epu32_mask(_mm512_cmple_epu32_mask(x, last_u), y, last_v);
-    /* the last column and row belong to the squares before them, of which they are all but 2^-14 */
-    x = _mm512_min_epi32(x, _mm512_sub_epi32(last_u, one)), y = _mm512_min_epi32(y, _mm512_sub_epi32(last_v, one));
-    const __m512i across = weights16(_mm512_and_si512(x, parts)), down = weights16(_mm512_and_si512(y, parts));
-    x = _mm512_srli_epi32(x, 14), y = _mm512_srli_epi32(y, 14);
-    if (layout == PLANES) {
-        if (rows <= 3 && WITHIN(1, 3, 32)) bytes_of_sixteen(image, result, &window, across, down, 3);
-        else if (WITHIN(1, 5, 32)) bytes_of_sixteen(image, result, &window, across, down, 5);
-        else return 0;
-    } else {
-        if (reach <= 19 && rows <= 3 && WITHIN(3, 3, 64)) colours_of_sixteen(image, result, &window, across, down, 3);
-        else if (reach <= 19 && WITHIN(3, 5, 64)) colours_of_sixteen(image, result, &window, across, down, 5);
-        else if (reach <= 19) return 0;
-        else if (rows <= 3 && WITHIN(3, 3, 128)) far_colours_of_sixteen(image, result, &window, across, down, 3);
-        else if (WITHIN(3, 5, 128)) far_colours_of_sixteen(image, result, &window, across, down, 5);
-        else return 0;
-    }
+    __mmask16 good = _mm512_cmp_ps_mask(u, _mm512_setzero_ps(), _CMP_GE_OQ);
+    good = _mm512_mask_cmp_ps_mask(good, v, _mm512_setzero_ps(), _CMP_GE_OQ);
+    good = _mm512_mask_cmp_ps_mask(good, u, _mm512_set1_ps((float)right), _CMP_LE_OQ);
+    good = _mm512_mask_cmp_ps_mask(good, v, _mm512_set1_ps((float)bottom), _CMP_LE_OQ);
+#define WITHIN(rows) in_window(image, at_u, at_v, x, y, good, rows, &window)
+    if (rows == 2 && WITHIN(2)) floats_of_sixteen(image, result, &window, across, down, 2);
+    else if (rows <= 3 && WITHIN(3)) floats_of_sixteen(image, result, &window, across, down, 3);
+    else if (WITHIN(5)) floats_of_sixteen(image, result, &window, across, down, 5);
+    else return 0;
 #undef WITHIN
     return 1;
 }
 
-/* Whether `sixteen` knows a way for images of this kind */
-INLINE int is_wide(const Job *job, int type, int mode, int layout) {
-    /* registers hold a part of an image; fractions of positions in 2^-14 */
-    if (job->source_width < 32 || job->source_height < 5) return 0;
-    if (job->source_width > 1 << 16 || job->source_height > 1 << 16) return 0;
-    if (mode == NEAREST) return type == BYTES1 && job->source_strides[3] == 1 && job->result_strides[3] == 1;
-    return mode == BILINEAR && ((type == UINT8 && (layout == PLANES || (layout == INTERLEAVED && job->channels == 3))) ||
-                                (type == FLOAT32 && layout == PLANES));
+/* -- thirty-two pixels of bytes at a time, whose neighbours are picked out of a window of some rows */
+
+enum { MOST_ROWS = 24 };
+
+/* Of the bytes of 32 pixels with three channels: the pixel, and the channel with that of the next pixel */
+#define REPEATED(f)                                                                                                    \
+    f(0), f(1), f(2), f(3), f(4), f(5), f(6), f(7), f(8), f(9), f(10), f(11), f(12), f(13), f(14), f(15), f(16), f(17), \
+        f(18), f(19), f(20), f(21), f(22), f(23), f(24), f(25), f(26), f(27), f(28), f(29), f(30), f(31)
+#define THREE_TIMES(i) i, i, i
+#define THREE(i) 0x0300, 0x0401, 0x0502
+static const int16_t PIXELS[96] = {REPEATED(THREE_TIMES)}, CHANNELS[96] = {REPEATED(THREE)};
+#define ODD(i) 2 * (i) + 1
+static const uint8_t UPPER[64] = {REPEATED(ODD)}; /* bytes of words */
+
+/* Where 32 pixels are read: of some rows from y on, windows that begin at pixel x */
+typedef struct {
+    float x, y;
+    int64_t begin; /* of the first window, in elements */
+    int64_t rows;  /* none if there are no such windows */
+} Place;
+
+/* How many pixels so many registers have a part of */
+#define READ(registers, pixel) ((64 * (registers) + (pixel) - 1) / (pixel))
+
+/* Positions hardly go any further between three of 32. Pixels of one element or of three. */
+INLINE void places_of(const Wide *image, const float *u, const float *v, int64_t n, const int pixel, const int registers,
+                      Place *places) {
+    const float last = (float)(image->width - READ(registers, pixel));
+    for (; n >= 32; n -= 32, u += 32, v += 32, places++) {
+        const float left = lesser(u[0], u[31]) - 1;
+        const float top = lesser(lesser(v[0], v[31]), v[16]) - 0.0625f;
+        const int64_t end = whole(greater(greater(v[0], v[31]), v[16]) + 0.0625f) + 2;
+        const int64_t x = whole(greater(lesser(left, last), 0)), y = whole(greater(top, 0));
+        const int64_t rows = (end < image->height ? end : image->height) - y;
+        places->x = (float)x, places->y = (float)y;
+        places->begin = y * image->below + pixel * x;
+        places->rows = last >= 0 && rows >= 2 && rows <= MOST_ROWS ? rows : 0;
+    }
+}
+
+/* The lower or upper halves of 32 numbers */
+INLINE __m512i halves(__m512i first, __m512i second, int upper) {
+    const __m512i even = _mm512_setr_epi32(0x00020000, 0x00060004, 0x000a0008, 0x000e000c, 0x00120010, 0x00160014,
+                                           0x001a0018, 0x001e001c, 0x00220020, 0x00260024, 0x002a0028, 0x002e002c,
+                                           0x00320030, 0x00360034, 0x003a0038, 0x003e003c);
+    return _mm512_permutex2var_epi16(first, _mm512_add_epi16(even, _mm512_set1_epi16((short)upper)), second);
+}
+
+/* Between two numbers in 2^-7 of bytes, at 2 t - 1 in 2^-15; the result in 2^-8 */
+INLINE __m512i between16(__m512i a, __m512i b, __m512i t) {
+    return _mm512_add_epi16(_mm512_add_epi16(a, b), _mm512_mulhrs_epi16(_mm512_sub_epi16(b, a), t));
+}
+
+/* Between the two bytes of each of 32 words; the result in 2^-7 */
+INLINE __m512i between_bytes(__m512i pairs, __m512i t) {
+    const __m512i sum = _mm512_maddubs_epi16(pairs, _mm512_set1_epi16(0x4040));
+    const __m512i difference = _mm512_maddubs_epi16(pairs, _mm512_set1_epi16(0x40c0));
+    return _mm512_add_epi16(sum, _mm512_mulhrs_epi16(difference, t));
+}
+
+/* Bytes of a window of so many registers */
+INLINE __m512i found(const char *from, __m512i pick, const int registers) {
+    const __m512i low = _mm512_loadu_si512(from);
+    if (registers == 1) return _mm512_permutexvar_epi8(pick, low);
+    const __m512i first = _mm512_permutex2var_epi8(low, pick, _mm512_loadu_si512(from + 64));
+    if (registers == 2) return first;
+    const __m512i second =
+        _mm512_permutex2var_epi8(_mm512_loadu_si512(from + 128), pick, _mm512_loadu_si512(from + 192));
+    return _mm512_mask_mov_epi8(first, _mm512_movepi8_mask(pick), second);
+}
+
+/* Whether all lie there, and those that are `wanted` are made: pixels of one byte or of three, in rows of so many
+ * registers. Positions are rounded to 2^-16. */
+INLINE int bytes_at(const Wide *image, const Place *place, char *result, const float *u, const float *v, const int pixel,
+                    const int registers, const int mode, __mmask32 wanted) {
+    const int64_t rows = place->rows;
+    int64_t c;
+    int j, k;
+    if (!rows) return 0;
+    /* as numbers from 128 on, whose upper halves say the pixel in the window, and the lower ones the part of its side */
+    const __m512 from_u = _mm512_set1_ps(128 - place->x), from_v = _mm512_set1_ps(128 - place->y);
+#define NUMBERS(x, from)                                                                                               \
+    _mm512_castps_si512(_mm512_add_ps(                                                                                 \
+        mode == NEAREST ? _mm512_roundscale_ps(_mm512_loadu_ps(x), 0) : _mm512_loadu_ps(x), from))
+    const __m512i u0 = NUMBERS(u, from_u), u1 = NUMBERS(u + 16, from_u);
+    const __m512i v0 = NUMBERS(v, from_v), v1 = NUMBERS(v + 16, from_v);
+#undef NUMBERS
+    const int beyond = mode == NEAREST ? 1 : 2;
+    const __m512i begin = _mm512_set1_epi16(0x4300), middle = _mm512_set1_epi16((short)0x8000);
+    const __m512i column = _mm512_sub_epi16(halves(u0, u1, 1), begin);
+    const __m512i row = _mm512_sub_epi16(halves(v0, v1, 1), begin);
+    const __mmask32 good = _mm512_cmple_epu16_mask(column, _mm512_set1_epi16((short)(64 * registers / pixel - beyond)));
+    if (_mm512_mask_cmple_epu16_mask(good, row, _mm512_set1_epi16((short)(rows - beyond))) != 0xffffffffu) return 0;
+    const __m512i part_u = _mm512_xor_si512(halves(u0, u1, 0), middle);
+    const __m512i part_v = _mm512_xor_si512(halves(v0, v1, 0), middle);
+    const __m512i at = _mm512_mullo_epi16(column, _mm512_set1_epi16((short)(0x0101 * pixel)));
+    /* of a register of the result each: which pixels and channels its elements are */
+    __m512i pick[3], t_u[3], t_v[3], begins[3], last[3], upper[3], lower[3];
+    __mmask32 stored[3];
+    if (pixel == 1) {
+        pick[0] = _mm512_add_epi16(at, _mm512_set1_epi16(0x0100)), t_u[0] = part_u, t_v[0] = part_v, begins[0] = row;
+        stored[0] = wanted;
+    } else {
+        for (k = 0; k < 3; k++) {
+            const __m512i which = _mm512_loadu_si512(PIXELS + 32 * k);
+            const __m512i channel = _mm512_loadu_si512(CHANNELS + 32 * k);
+            pick[k] = _mm512_add_epi16(_mm512_permutexvar_epi16(which, at), channel);
+            t_u[k] = _mm512_permutexvar_epi16(which, part_u), t_v[k] = _mm512_permutexvar_epi16(which, part_v);
+            begins[k] = _mm512_permutexvar_epi16(which, row);
+            stored[k] = _mm512_movepi16_mask(_mm512_permutexvar_epi16(which, _mm512_movm_epi16(wanted)));
+        }
+    }
+    const char *plane = image->source + place->begin;
+    for (c = 0; c < (pixel == 1 ? image->channels : 1); c++, plane += image->from_plane, result += image->to_plane) {
+        const char *from = plane + image->below;
+        ask_below(from, image->below);
+        if (pixel > 1) ask_below(from + 64, image->below);
+        for (k = 0; k < pixel; k++) upper[k] = found(plane, pick[k], registers), last[k] = lower[k] = found(from, pick[k], registers);
+        for (j = 2; j < rows; j++) {
+            const __m512i before = _mm512_set1_epi16((short)(j - 2));
+            from += image->below;
+            for (k = 0; k < pixel; k++) {
+                const __mmask32 below = _mm512_cmpgt_epi16_mask(begins[k], before);
+                const __m512i next = found(from, pick[k], registers);
+                upper[k] = _mm512_mask_mov_epi16(upper[k], below, last[k]);
+                lower[k] = _mm512_mask_mov_epi16(lower[k], below, next);
+                last[k] = next;
+            }
+        }
+        if (mode == NEAREST) {
+            const __mmask32 below = _mm512_cmpge_epi16_mask(row, _mm512_set1_epi16((short)(rows - 1)));
+            const __m512i value = _mm512_mask_mov_epi16(upper[0], below, lower[0]);
+            _mm256_storeu_si256((__m256i *)result, _mm512_cvtepi16_epi8(value));
+            continue;
+        }
+        for (k = 0; k < pixel; k++) {
+            const __m512i above = between_bytes(upper[k], t_u[k]), under = between_bytes(lower[k], t_u[k]);
+            const __m512i value = between16(above, under, t_v[k]);
+            const __m512i rounded = _mm512_add_epi16(value, _mm512_set1_epi16(128));
+            const __m512i dense = _mm512_permutexvar_epi8(_mm512_loadu_si512(UPPER), rounded);
+            _mm256_mask_storeu_epi8(result + 32 * k, stored[k], _mm512_castsi512_si256(dense));
+        }
+    }
+    return 1;
+}
+
+/* Pixels of which some lie off the image, or at its very last ones: whether they are made */
+NOT_INLINE int bytes_at_rim(const Span *span, const Wide *image, const float *u, const float *v, const int pixel) {
+    const int registers = pixel == 1 ? 2 : 4;
+    const float right = (float)(image->width - 1), bottom = (float)(image->height - 1);
+    const __m512 zero = _mm512_setzero_ps(), last_u = _mm512_set1_ps(right), last_v = _mm512_set1_ps(bottom);
+    /* the last column and row belong to the squares before them */
+    const __m512 most_u = _mm512_set1_ps(right - greater(right, 128) * 1.2e-7f);
+    const __m512 most_v = _mm512_set1_ps(bottom - greater(bottom, 128) * 1.2e-7f);
+    float on_u[32], on_v[32];
+    uint32_t inside = 0, near = 0; /* near: of the pixels that show something */
+    Place place;
+    int k;
+    if (span->job->padding == REFLECTION || right < 1 || bottom < 1) return 0;
+    for (k = 0; k < 32; k += 16) {
+        const __m512 x = _mm512_loadu_ps(u + k), y = _mm512_loadu_ps(v + k);
+        const __m512 on_x = _mm512_max_ps(_mm512_min_ps(x, last_u), zero);
+        const __m512 on_y = _mm512_max_ps(_mm512_min_ps(y, last_v), zero);
+        const __m512 off_x = _mm512_abs_ps(_mm512_sub_ps(x, on_x)), off_y = _mm512_abs_ps(_mm512_sub_ps(y, on_y));
+        const __m512 off = _mm512_max_ps(off_x, off_y);
+        const __mmask16 is = _mm512_cmp_ps_mask(x, y, _CMP_ORD_Q); /* NaN has none */
+        inside |= (uint32_t)_mm512_mask_cmp_ps_mask(is, off, zero, _CMP_EQ_OQ) << k;
+        near |= (uint32_t)_mm512_mask_cmp_ps_mask(is, off, _mm512_set1_ps(1), _CMP_LT_OQ) << k;
+        _mm512_storeu_ps(on_u + k, _mm512_min_ps(on_x, most_u));
+        _mm512_storeu_ps(on_v + k, _mm512_min_ps(on_y, most_v));
+        if (span->job->padding == BORDER) inside |= (uint32_t)is << k;
+    }
+    places_of(image, on_u, on_v, 32, pixel, registers, &place);
+    if (~inside) show_nothing(span, UINT8);
+    if (inside && !bytes_at(image, &place, span->result, on_u, on_v, pixel, registers, BILINEAR, inside)) return 0;
+    if (near & ~inside) careful(span, u, v, UINT8, BILINEAR, inside | ~near);
+    return 1;
 }
 
 #endif
 
-INLINE void row(Span span, int64_t b, int64_t y, int type, int mode, int layout) {
-    const Job *job = span.job;
-    const int64_t step = job->result_strides[3] * size_of(type);
-    char *const first = span.result;
-    Chunk at;
-    int64_t x, i, k;
-#if WIDE
-    const int64_t *from = job->source_strides;
-    const Wide image = {span.source, job->channels, from[1], from[2], job->result_strides[1], job->source_width,
-                        job->source_height};
-    const int wide = is_wide(job, type, mode, layout);
-#endif
-    for (x = 0; x < job->width; x += CHUNK) {
-        const int64_t n = job->width - x < CHUNK ? job->width - x : CHUNK;
-        positions(job, b, y, x, n, &at);
-        for (i = 0; i < n;) {
-#if WIDE
-            for (; wide && n - i >= 2 * STEP; i += 2 * STEP)
-                if (!sixteen(&image, first + (x + i) * step, at.u + i, at.v + i, type, mode, layout)) break;
-#endif
-            for (k = 0; k < 2 && i < n; k++, i += STEP) {
-                span.result = first + (x + i) * step, span.pixels = n - i < STEP ? n - i : STEP;
-                eight(&span, load8(at.u + i), load8(at.v + i), type, mode, layout);
-            }
-        }
+/* Pixels i ... n - 1 of a row; `first`: where that at 0 is written */
+INLINE void eights(Span *span, char *first, const Chunk *at, int64_t i, int64_t n, int type, int mode, int layout) {
+    const int64_t step = span->job->result_strides[3] * size_of(type);
+    for (; i < n; i += STEP) {
+        span->result = first + i * step, span->pixels = n - i < STEP ? n - i : STEP;
+        eight(span, load8(at->u + i), load8(at->v + i), type, mode, layout);
     }
+}
+
+#if WIDE
+
+INLINE void wide_bytes(Span *span, const Wide *image, char *first, const Chunk *at, int64_t n, const int pixel,
+                       const int registers, int mode) {
+    Place places[CHUNK / 32], *place = places;
+    int64_t i;
+    places_of(image, at->u, at->v, n, pixel, registers, places);
+    for (i = 0; i < n; i += 32, place++) {
+        const float *u = at->u + i, *v = at->v + i;
+        span->result = first + i * pixel, span->pixels = 32;
+        if (bytes_at(image, place, span->result, u, v, pixel, registers, mode, ~0u)) continue;
+        if (mode == NEAREST) eights(span, first, at, i, i + 32, BYTES1, NEAREST, SCATTERED);
+        else if (!bytes_at_rim(span, image, u, v, pixel))
+            eights(span, first, at, i, i + 32, UINT8, BILINEAR, pixel == 1 ? PLANES : INTERLEAVED);
+    }
+}
+
+/* How many of n pixels of a row are made so, the first of them */
+INLINE int64_t wide(Span *span, char *first, const Chunk *at, int64_t n, int type, int mode, int layout) {
+    const Job *job = span->job;
+    const int64_t *from = job->source_strides, *to = job->result_strides;
+    const Wide image = {span->source, job->channels, from[1], from[2], to[1], job->source_width, job->source_height};
+    const int in_planes = layout == PLANES || (mode == NEAREST && from[3] == 1 && to[3] == 1);
+    int64_t i;
+    if (mode == BILINEAR && type == FLOAT32 && in_planes && image.width >= 32 && image.height >= 5) {
+        for (i = 0; n - i >= 16; i += 16)
+            if (!sixteen(&image, first + 4 * i, at->u + i, at->v + i))
+                eights(span, first, at, i, i + 16, FLOAT32, BILINEAR, PLANES);
+        return i;
+    }
+    if (!(mode == BILINEAR ? type == UINT8 : mode == NEAREST && type == BYTES1) || n < 32) return 0;
+    if (!in_planes && !(layout == INTERLEAVED && job->channels == 3)) return 0;
+    /* how far 32 pixels go */
+    const int64_t across = llabs((int64_t)whole(at->u[n - 1]) - whole(at->u[0])) * 32 / n + 5;
+    const int64_t down = llabs((int64_t)whole(at->v[n - 1]) - whole(at->v[0])) * 32 / n;
+    if (down > MOST_ROWS || across > (in_planes ? 128 : 85)) return 0;
+    n = n / 32 * 32;
+    if (in_planes && across <= 64) wide_bytes(span, &image, first, at, n, 1, 1, mode);
+    else if (in_planes) wide_bytes(span, &image, first, at, n, 1, 2, mode);
+    else if (across <= 42) wide_bytes(span, &image, first, at, n, 3, 2, BILINEAR);
+    else wide_bytes(span, &image, first, at, n, 3, 4, BILINEAR);
+    return n;
+}
+
+#endif
+
+INLINE void chunk(Span *span, char *first, const Chunk *at, int64_t n, int type, int mode, int layout) {
+    int64_t made = 0;
+#if WIDE
+    made = wide(span, first, at, n, type, mode, layout);
+#endif
+    eights(span, first, at, made, n, type, mode, layout);
 }
 
 /* -- tiles */
 
 INLINE void tile(const Job *job, int64_t b, int64_t from, int64_t to, int type, int mode, int layout) {
+    const int64_t *strides = job->result_strides;
     Span span;
-    int64_t y;
+    Lines lines;
+    Chunk at;
+    int64_t x, y;
     span.job = job;
     span.source = (const char *)job->source + b * job->source_strides[0] * size_of(type);
-    for (y = from; y < to; y++) {
-        span.result = (char *)job->result + (b * job->result_strides[0] + y * job->result_strides[2]) * size_of(type);
-        row(span, b, y, type, mode, layout);
+    for (x = 0; x < job->width; x += CHUNK) {
+        const int64_t n = job->width - x < CHUNK ? job->width - x : CHUNK;
+        for (y = from; y < to; y++) {
+            if (job->nodes) lattice_positions(job, b, y, x, n, from, &lines, &at);
+            else grid_positions(job, b, y, x, n, &at);
+            chunk(&span, (char *)job->result + (b * strides[0] + y * strides[2] + x * strides[3]) * size_of(type), &at, n,
+                  type, mode, layout);
+        }
     }
 }
 
@@ -1410,8 +1404,6 @@ static const float SAFETY = 3;          /* times that is assumed: at a step of t
 static const float MARGIN = 0.05f;      /* of half an image: what lies beyond is not sampled */
 static const float OVERSHOOT = 0.5f;    /* of the range of its nodes by which a cubic may leave it: 0.27 along each axis */
 
-INLINE float greater(float a, float b) { return a > b ? a : b; }
-INLINE float lesser(float a, float b) { return a < b ? a : b; }
 /* By differences of differences, which numbers that lie close together have without roundings */
 INLINE float fourth(float a, float b, float c, float d, float e) {
     const float ab = b - a, bc = c - b, cd = d - c, de = e - d;

@@ -58,7 +58,7 @@ static int64_t side(void) {
     case 2: return 1 + below(4);
     case 3: return 8 * (1 + below(6));
     case 4: return one_in(40) ? 2000 + below(18001) : 1 + below(400);
-    default: return 1 + below(70);
+    default: return 1 + below(150);
     }
 }
 
