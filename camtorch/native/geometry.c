@@ -38,8 +38,8 @@ enum { PADDED = 8 };      /* numbers of a factor that loops are made for */
 /* Over the points of a block; `n` is a multiple of LANES */
 #define EACH(i) for (int i = 0; i < (n & -LANES); i++)
 
-/* Charts that have loops of their own: unified ones of alpha 0, of alpha 1 and no xi, and of no xi */
-enum { SHIFTED = LINEARITY + 1, SPHERICAL, ENHANCED };
+/* Charts that have loops of their own: unified ones of alpha 0, and of no xi those of alpha 1, of alpha 1/2, and others */
+enum { SHIFTED = LINEARITY + 1, SPHERICAL, HALFWAY, ENHANCED };
 /* Factors that have: polynomials of few numbers and of some, and so on; any other one */
 enum { FEW, SOME, RATIO, ROOTS, ANGLES, ALL, ANY };
 
@@ -51,7 +51,7 @@ enum { FEW, SOME, RATIO, ROOTS, ANGLES, ALL, ANY };
         WAY(PERSPECTIVE, __VA_ARGS__) WAY(EQUIDISTANT, __VA_ARGS__) WAY(EQUISOLID, __VA_ARGS__)                        \
         WAY(UNIFIED, __VA_ARGS__) WAY(FOV, __VA_ARGS__) WAY(ONE_DIVISION, __VA_ARGS__) WAY(INVERTED, __VA_ARGS__)      \
         WAY(CYLINDER, __VA_ARGS__) WAY(SPHERE, __VA_ARGS__) WAY(SHIFTED, __VA_ARGS__) WAY(SPHERICAL, __VA_ARGS__)      \
-        WAY(ENHANCED, __VA_ARGS__) WAY(LINEARITY, __VA_ARGS__)                                                                                  \
+        WAY(HALFWAY, __VA_ARGS__) WAY(ENHANCED, __VA_ARGS__) WAY(LINEARITY, __VA_ARGS__)                               \
     }
 #define FORM(name, made, n, m, ...) CASE(name, enum { kind = made, count = n, below = m }; __VA_ARGS__)
 #define EACH_FORM(given, ...)                                                                                          \

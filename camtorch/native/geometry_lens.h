@@ -416,11 +416,27 @@ INLINE R T(surface_edge)(const Part *part, const R *k, R behind, R a, R b) {
     return across < down ? across : across == across ? down : -1;
 }
 
+/* What is certain of a surface that is the last stage: up to its edge and a hair behind, no further */
+typedef struct {
+    R sa, sb, ca, cb, across, down;
+} T(Edge);
+
+INLINE T(Edge) T(edge_of)(const T(Camera) *c) {
+    const Part *part = c->parts + c->stages;
+    const R *k = c->numbers[c->stages], behind = (R)1e-4;
+    return (T(Edge)){k[0], k[1], k[2], k[3], (R)(part->n - part->flags) / 2 + behind, (R)(part->m - part->flags) / 2 + behind};
+}
+
+INLINE I T(on_edge)(const T(Edge) e, R a, R b) {
+    return (e.across - T(absolute)((a - e.ca) * e.sa) > 0) & (e.down - T(absolute)((b - e.cb) * e.sb) > 0);
+}
+
 /* Points of the plane of a surface, the last stage, where it is regular on the whole way from the centre for certain */
 static void T(on_surface)(const T(Camera) *c, int n, const R *restrict a, const R *restrict b, I *restrict ok) {
     const Part *part = c->parts + c->stages;
     const R *k = c->numbers[c->stages];
-    EACH(i) ok[i] = T(surface_edge)(part, k, (R)1e-4, a[i], b[i]) > 0; /* up to its edge and a hair behind, no further */
+    const T(Edge) edge = T(edge_of)(c);
+    EACH(i) ok[i] = T(on_edge)(edge, a[i], b[i]);
     if (c->all_certain) return;
     T(Cells) cells;
     T(cells)(part, k, n, a, b, &cells);

@@ -41,6 +41,7 @@ static void T(prepare)(const Cameras *all, int64_t camera, T(Camera) *c) {
             c->all_certain = 1;
             for (int j = 0; j <= last->m - 4; j++)
                 for (int i = 0; i <= last->n - 4; i++) c->all_certain &= c->certain[j * last->n + i];
+            c->to_edge = c->all_certain && c->stages == 1;
         }
         c->start = all->start ? (const R *)all->start + camera * START : NULL;
         c->table = all->table ? (const R *)all->table + camera * (2 + 2 * NODES) : NULL;
@@ -417,16 +418,24 @@ static int T(see)(const T(Camera) *c, int keeps, int count, int n, T(Seen) *s) {
                s->z, s->shrink, s->scale, swapped ? s->b : s->a, swapped ? s->a : s->b, s->ok);
     if (!later) return 0;
     if (c->way == INVERTED) T(see_inverted)(c, keeps, n, s);
-    EACH(i) {
+    if (c->to_edge) {
+        const T(Edge) edge = T(edge_of)(c);
+        const R certain2 = c->certain2;
+        EACH(i) {
+            const I is_on = T(on_edge)(edge, s->a[i], s->b[i]) & (certain2 - (s->a[i] * s->a[i] + s->b[i] * s->b[i]) > 0);
+            s->ok[i] += s->ok[i] & !is_on, outside |= s->ok[i];
+        }
+    } else EACH(i) {
         s->ok[i] += s->ok[i] & !(inner2 - (s->a[i] * s->a[i] + s->b[i] * s->b[i]) > 0); /* 2: beyond */
         outside |= s->ok[i];
     }
-    if (outside & 2 && c->certain) {
+    if (outside & 2 && c->certain && !c->to_edge) {
         ALIGNED I certain[BLOCK];
         T(certain)(c, n, s->a, s->b, certain);
         outside = 0;
         EACH(i) s->ok[i] = s->ok[i] == 2 && certain[i] ? 1 : s->ok[i], outside |= s->ok[i];
     }
+    if (!(outside & 2) && c->way != INVERTED) return 0;
     if (outside & 2 && c->follows) waiting = T(beyond)(c, count, n, s);
     EACH(i) {
         s->ok[i] = s->ok[i] == 1;
@@ -772,7 +781,7 @@ static void T(invert)(const T(Camera) *c, int n, const R *restrict u, const R *r
             possible[i] = within[i] & (possible[i] | !known[i]);
         }
     } else {
-        const int has_table = c->table != NULL;
+        const int has_table = c->table != NULL, to_edge = c->to_edge;
         const R usual2 = c->usual2 * (1 - 32 * EPS);
         T(start)(c, has_table ? 2 : 1, n, u, v, a, b);
         if (has_table) {
@@ -788,7 +797,16 @@ static void T(invert)(const T(Camera) *c, int n, const R *restrict u, const R *r
             ok[i] &= usual2 - (a[i] * a[i] + b[i] * b[i]) > 0;
             outside |= possible[i] & !ok[i];
         }
-        if (outside && c->certain) {
+        if (outside && to_edge) {
+            const T(Edge) edge = T(edge_of)(c);
+            const R certain2 = c->certain2 * (1 - 64 * EPS), further = 1 + 32 * EPS;
+            outside = 0;
+            EACH(i) {
+                ok[i] |= possible[i] & T(on_edge)(edge, a[i] * further, b[i] * further) & (certain2 - (a[i] * a[i] + b[i] * b[i]) > 0);
+                outside |= possible[i] & !ok[i];
+            }
+        }
+        if (outside && c->certain && !to_edge) {
             ALIGNED I certain[BLOCK];
             outside = 0;
             EACH(i) p[i] = a[i] * (1 + 32 * EPS), q[i] = b[i] * (1 + 32 * EPS);
