@@ -33,6 +33,10 @@ typedef struct {
     int follows, waits; /* whether the lens is to be followed along each azimuth, and yet has to be */
     int ends;           /* whether it ends at the edge of a surface; not while it is followed */
     const R *map, *numbers[MOST_PARTS], *constants; /* those of the map before the chart; of the parts */
+    /* a windshield's polynomials, padded with zeros to an order that loops are made for, or 0; their own orders; by how much
+       both bend at the most */
+    R bent[2][BENT], bend;
+    int order, orders[2];
     T(Factor) factors[MOST_PARTS];
     T(Plane) planes[MOST_PARTS];
     R fx, fy, cx, cy, inner2, usual2, circle2;

@@ -323,14 +323,6 @@ INLINE R T(weight)(const R (*restrict k)[8], const int order, const int column, 
     return value * x + k[0][column];
 }
 
-/* Control points of a row of eight, weighed by rows and columns, and their halves added up; if wanted, by their slopes too.
-   A loop that stays one is eight numbers at a time */
-#if defined(__GNUC__)
-#define KEPT_LOOP _Pragma("GCC unroll 1")
-#else
-#define KEPT_LOOP
-#endif
-
 INLINE void T(halves)(const R *restrict eight, R *restrict four) {
     KEPT_LOOP for (int j = 0; j < 4; j++) four[j] = eight[j] + eight[j + 4];
 }
