@@ -64,7 +64,8 @@ def test_cameras_are_behind_polynomials_of_any_order(orders, dtype):
     if 0 in orders:  # of one number nothing depends on the ray
         assert not valid.any()
         return
-    assert valid.all() and known.all()
+    assert valid.all()
+    assert known.all()
     torch.testing.assert_close(pixels, expected.detach(), rtol=0, atol=4e3 * eps)
     back, found = seen.unproject(pixels)
     assert found.all()
