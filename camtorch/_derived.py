@@ -168,7 +168,7 @@ def _derived(
             own = model.fit_start(names[:-added], angles, radii)
             return torch.cat((own, own.new_tensor(ideals).expand(*own.shape[:-1], added)), -1)
 
-    for name, value in stated.items():
+    for name, value in {"always_defined": model.always_defined, **stated}.items():
         setattr(Derived, name, value)
     Derived.__name__ = f"{model.__name__}{suffix}"
     Derived.key = f"{model.key or model.__qualname__}:{text}"  # which stands for it, without an entry in MODELS

@@ -157,7 +157,8 @@ def checked_distortion(model: type[Camera], distortion: Numbers, intrinsics: Ten
         raise ValueError(
             f"{owner}: distortion must be (*B, n) with {model.counts_text()}; got shape {tuple(distortion.shape)}{hint}"
         )
-    defined = None if is_predicted(distortion) else model.defined(distortion.unbind(-1))
+    is_known = model.always_defined or is_predicted(distortion)
+    defined = None if is_known else model.defined(distortion.unbind(-1))
     if defined is not None and fails(defined > 0):
         raise ValueError(f"{owner}: the formula needs {model.defined_text}; got {distortion.tolist()}")
     return distortion

@@ -33,13 +33,23 @@ enum { MOST_STEPS = 5 };  /* of Newton's method; what then still moves is left t
 enum { START_ROUNDS = 6, DAMPED_STEPS = 60 }; /* of a search */
 enum { SQUARE = 64, PROBES = 5 }; /* pixels of a cell of a lattice; of these, where one in doubt is looked at */
 enum { PADDED = 8 };      /* numbers of a factor that loops are made for */
+enum { BENT = 21 };       /* of each polynomial of a windshield: those of order 5 */
 #define PI 3.14159265358979323846
 
 /* Over the points of a block; `n` is a multiple of LANES */
 #define EACH(i) for (int i = 0; i < (n & -LANES); i++)
 
-/* Charts that have loops of their own: unified ones of alpha 0, of alpha 1 and no xi, and of no xi */
-enum { SHIFTED = LINEARITY + 1, SPHERICAL, ENHANCED };
+/* Loops that compilers would unroll, but make vectors of; and that they shall unroll */
+#if defined(__GNUC__)
+#define KEPT_LOOP _Pragma("GCC unroll 1")
+#define UNROLLED_LOOP _Pragma("GCC unroll 8")
+#else
+#define KEPT_LOOP
+#define UNROLLED_LOOP
+#endif
+
+/* Charts that have loops of their own: unified ones of alpha 0, and of no xi those of alpha 1, of alpha 1/2, and others */
+enum { SHIFTED = LINEARITY + 1, SPHERICAL, HALFWAY, ENHANCED };
 /* Factors that have: polynomials of few numbers and of some, and so on; any other one */
 enum { FEW, SOME, RATIO, ROOTS, ANGLES, ALL, ANY };
 
@@ -51,7 +61,7 @@ enum { FEW, SOME, RATIO, ROOTS, ANGLES, ALL, ANY };
         WAY(PERSPECTIVE, __VA_ARGS__) WAY(EQUIDISTANT, __VA_ARGS__) WAY(EQUISOLID, __VA_ARGS__)                        \
         WAY(UNIFIED, __VA_ARGS__) WAY(FOV, __VA_ARGS__) WAY(ONE_DIVISION, __VA_ARGS__) WAY(INVERTED, __VA_ARGS__)      \
         WAY(CYLINDER, __VA_ARGS__) WAY(SPHERE, __VA_ARGS__) WAY(SHIFTED, __VA_ARGS__) WAY(SPHERICAL, __VA_ARGS__)      \
-        WAY(ENHANCED, __VA_ARGS__) WAY(LINEARITY, __VA_ARGS__)                                                                                  \
+        WAY(HALFWAY, __VA_ARGS__) WAY(ENHANCED, __VA_ARGS__) WAY(LINEARITY, __VA_ARGS__)                               \
     }
 #define FORM(name, made, n, m, ...) CASE(name, enum { kind = made, count = n, below = m }; __VA_ARGS__)
 #define EACH_FORM(given, ...)                                                                                          \
@@ -60,6 +70,17 @@ enum { FEW, SOME, RATIO, ROOTS, ANGLES, ALL, ANY };
         FORM(RATIO, RATIONAL, PADDED / 2, PADDED / 2, __VA_ARGS__)                                                     \
         FORM(ROOTS, RADIUS_POLYNOMIAL, PADDED, 0, __VA_ARGS__) FORM(ANGLES, ANGLE_PER_RADIUS, PADDED, 0, __VA_ARGS__)  \
         FORM(ALL, ANGLE_OF_ALL_POWERS, PADDED, 0, __VA_ARGS__)                                                         \
+    }
+
+/* The same for the orders of a windshield's polynomials, or those up to which both are padded */
+#define ORDERS(name, ...) CASE(name, enum { across = name, down = name }; __VA_ARGS__)
+#define EACH_ORDER(given, own, ...)                                                                                    \
+    switch (given) {                                                                                                   \
+        ORDERS(2, __VA_ARGS__) ORDERS(3, __VA_ARGS__) ORDERS(5, __VA_ARGS__)                                           \
+    default: {                                                                                                         \
+        const int across = own[0], down = own[1];                                                                      \
+        __VA_ARGS__                                                                                                    \
+    }                                                                                                                  \
     }
 
 int32_t THIS(classify)(const Classification *);

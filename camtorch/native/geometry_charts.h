@@ -33,12 +33,16 @@ typedef struct {
     int follows, waits; /* whether the lens is to be followed along each azimuth, and yet has to be */
     int ends;           /* whether it ends at the edge of a surface; not while it is followed */
     const R *map, *numbers[MOST_PARTS], *constants; /* those of the map before the chart; of the parts */
+    /* a windshield's polynomials, padded with zeros to an order that loops are made for, or 0; their own orders; by how much
+       both bend at the most */
+    R bent[2][BENT], bend;
+    int order, orders[2];
     T(Factor) factors[MOST_PARTS];
     T(Plane) planes[MOST_PARTS];
     R fx, fy, cx, cy, inner2, usual2, circle2;
     const R *limits2, *extent, *table, *start;
     const uint8_t *certain;
-    int all_certain; /* of all pieces of the surface */
+    int all_certain, to_edge; /* of all pieces of the surface; and it is the only stage */
     R certain2;
     R chart_inner2, chart_most2;
     const R *chart_table;
@@ -61,6 +65,7 @@ static void T(prepare_chart)(T(Camera) *c) {
         chart->beta = part->flags & HAS_BETA ? *k : 1;
         const int fixed = !(part->flags & HAS_ALPHA);
         if (part->flags & HAS_XI) c->way = fixed && chart->alpha == 0 ? SHIFTED : UNIFIED;
+        else if (fixed && chart->alpha == (R)0.5 && chart->beta == 1) c->way = HALFWAY;
         else c->way = fixed && chart->alpha == 1 ? SPHERICAL : ENHANCED;
     } else if (part->kind == ONE_DIVISION) {
         chart->k = k[0];
@@ -108,19 +113,22 @@ INLINE R T(scale)(const T(Chart) k, const int way, R x, R y, R z, I *ok) {
     case UNIFIED:
     case SHIFTED:
     case SPHERICAL:
+    case HALFWAY:
     case ENHANCED: {
         const int has_xi = way == UNIFIED || way == SHIFTED;
         const R distance = has_xi ? T(root)(rho2 + z * z) : 0, w = has_xi ? z + k.xi * distance : z;
-        const R sphere = way == SHIFTED ? 0 : T(root)(k.beta * rho2 + w * w);
-        R below = way == SHIFTED ? w : way == SPHERICAL ? sphere : w + k.alpha * (sphere - w), before = 1;
-        if (way == UNIFIED || way == ENHANCED) { /* behind, without cancellation */
-            const R sum = k.alpha * sphere - (1 - k.alpha) * w;
-            const R behind = (k.alpha * k.alpha * k.beta * rho2 + (2 * k.alpha - 1) * (w * w)) / (w > 0 ? 1 : sum);
-            below = w > 0 ? below : behind, before = k.alpha * w + (1 - k.alpha) * sphere;
+        const R alpha = way == HALFWAY ? (R)0.5 : k.alpha, beta = way == HALFWAY ? 1 : k.beta;
+        const R sphere = way == SHIFTED ? 0 : T(root)(beta * rho2 + w * w);
+        R above = 1, below = way == SHIFTED ? w : way == SPHERICAL ? sphere : w + alpha * (sphere - w), before = 1;
+        if (way == UNIFIED || way == ENHANCED || way == HALFWAY) { /* behind, without cancellation */
+            const R behind = alpha * alpha * beta * rho2 + (2 * alpha - 1) * (w * w);
+            const R sum = alpha * sphere - (1 - alpha) * w;
+            above = w > 0 ? 1 : sum, below = w > 0 ? below : behind;
+            before = T(least)(alpha * w + (1 - alpha) * sphere, T(most)(w, sum));
         }
         if (way == SPHERICAL) before = w;
-        *ok = (FARTHEST * below - far > 0) & (before > 0) & (has_xi ? distance + k.xi * z > 0 : 1);
-        return 1 / below;
+        *ok = (FARTHEST * below - far * above > 0) & (before > 0) & (has_xi ? distance + k.xi * z > 0 : 1);
+        return above / below;
     }
     case FOV: {
         const R w2 = k.tan2 * rho2, beyond = k.omega * k.omega * FARTHEST * FARTHEST - (R)(PI * PI);
@@ -182,6 +190,7 @@ INLINE void T(scale_slopes)(const T(Chart) k, const int way, R x, R y, R z, R s,
     case UNIFIED:
     case SHIFTED:
     case SPHERICAL:
+    case HALFWAY:
     case ENHANCED: {
         const int has_xi = way == UNIFIED || way == SHIFTED;
         const R distance = has_xi ? T(root)(rho2 + z * z) : 1, w = has_xi ? z + k.xi * distance : z;
@@ -311,10 +320,11 @@ INLINE I T(on_plane)(const T(Chart) k, const int way, R a, R b) {
     case UNIFIED:
     case SHIFTED:
     case SPHERICAL:
+    case HALFWAY:
     case ENHANCED: {
         const R around = k.beta * r2, margin = 1 - 64 * EPS - (2 * k.alpha - 1) * around;
         const I inside = (FARTHEST / 2 - far > 0) & (margin > 0);
-        if (way == SPHERICAL || way == ENHANCED) return inside;
+        if (way == SPHERICAL || way == HALFWAY || way == ENHANCED) return inside;
         const R ahead = T(ahead)(around, k.alpha), before = ahead * ahead + (1 - k.xi) * (1 + k.xi) * r2;
         const R reach = T(root)(before > 0 ? before : 0) + k.xi * ahead;
         return inside & (before - 64 * EPS * (r2 + ahead * ahead) > 0) & (reach - 64 * EPS * T(absolute)(ahead) > 0);
@@ -350,11 +360,12 @@ INLINE void T(turned)(const T(Chart) k, const int way, R r2, R *s, R *z, R *ds, 
     case UNIFIED:
     case SHIFTED:
     case SPHERICAL:
+    case HALFWAY:
     case ENHANCED: {
         const int has_xi = way == UNIFIED || way == SHIFTED;
-        const R h = way == SHIFTED ? 1 : T(ahead)(k.beta * r2, k.alpha), below = r2 + h * h;
+        const R h = way == SHIFTED ? 1 : way == HALFWAY ? 1 - r2 / 4 : T(ahead)(k.beta * r2, k.alpha), below = r2 + h * h;
         /* where the line from the shifted centre meets the unit sphere, on the side of the axis */
-        const R short_of = (1 - k.xi) * (1 + k.xi), root = T(root)(has_xi ? h * h + short_of * r2 : below);
+        const R short_of = (1 - k.xi) * (1 + k.xi), root = way == HALFWAY ? 1 + r2 / 4 : T(root)(has_xi ? h * h + short_of * r2 : below);
         *s = has_xi ? (k.xi * h + root) / below : 1 / root, *z = h * *s - k.xi;
         if (ds) {
             const R by_r2 = -k.alpha * k.beta / (2 * T(root)(1 - (2 * k.alpha - 1) * k.beta * r2)); /* of h */

@@ -383,7 +383,7 @@ static void certain_of(const Part *part, const double *k, uint8_t *certain) {
     const double origin[LANES] = {0};
     Cells_double at;
     memset(certain, 0, (size_t)n * (size_t)m);
-    cells_double(part, k, 0, LANES, origin, origin, &at);
+    cells_double(part, k, LANES, origin, origin, &at);
     const int first_i = at.at[0] / 2 % n, first_j = at.at[0] / 2 / n;
     for (int down = -1; down <= 1; down += 2)
         for (int across = -1; across <= 1; across += 2)

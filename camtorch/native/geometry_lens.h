@@ -255,89 +255,123 @@ INLINE void T(adjugate)(const R *k, R *m) {
         }
 }
 
-/* Points in their cells: where their 4 x 4 control points begin, the weights of these along a and b and, if wanted, how
-   much these change from control point to control point. Of order 2 the fourth, or at the end of a row the first, has no part */
+/* Points in their cells: where their 4 x 4 control points begin, the place along a, whether of order 2 these are the last
+   of a row, the weights of rows and, if wanted, how much these change from row to row. Of order 2 the fourth row, or at the
+   end the first, has no part */
 typedef struct {
-    ALIGNED R x[4][BLOCK], y[4][BLOCK], by_x[4][BLOCK], by_y[4][BLOCK];
+    ALIGNED R x[BLOCK], y[4][BLOCK], by_y[4][BLOCK];
+    ALIGNED I is_last[BLOCK];
     ALIGNED int32_t at[BLOCK];
 } T(Cells);
 
-INLINE void T(weigh)(const int order, int n, R size, R (*restrict w)[BLOCK], R (*restrict by)[BLOCK], I *restrict first) {
+/* The place in a cell of a place in cells, the first of four control points, and whether of order 2 they are the last ones */
+INLINE void T(place)(const int order, int n, R size, R *restrict w, I *restrict first, I *restrict is_last) {
     const R half = order == 3 ? 0 : (R)0.5, most = size - (R)order;
-    EACH(i) { /* w[0]: the place in cells, from the first control point on */
-        R cell = IS_DOUBLE ? (R)floor(w[0][i] + half) : (R)floorf((float)(w[0][i] + half));
+    EACH(i) {
+        R cell = IS_DOUBLE ? (R)floor(w[i] + half) : (R)floorf((float)(w[i] + half));
         cell = cell > 1 ? cell : 1, cell = cell < most ? cell : most;
-        const R x = w[0][i] - cell, xx = x * x, y = 1 - x;
+        is_last[i] = (order == 2) & (cell >= size - 2);
+        w[i] -= cell, first[i] = (I)cell - 1 - is_last[i];
+    }
+}
+
+INLINE void T(weigh)(const int order, int n, const I *restrict is_last, R (*restrict w)[BLOCK], R (*restrict by)[BLOCK]) {
+    EACH(i) { /* w[0]: the place in a cell */
+        const R x = w[0][i], xx = x * x, y = 1 - x;
         if (order == 3) {
             w[0][i] = y * y * y * (R)(1 / 6.0), w[1][i] = (x / 2 - 1) * xx + (R)(2 / 3.0);
             w[2][i] = ((1 - x) * x + 1) * x / 2 + (R)(1 / 6.0), w[3][i] = xx * x * (R)(1 / 6.0);
             if (by) by[0][i] = -y * y / 2, by[1][i] = ((R)1.5 * x - 2) * x, by[2][i] = (R)0.5 + (1 - (R)1.5 * x) * x, by[3][i] = xx / 2;
-            first[i] = (I)cell - 1;
         } else {
-            const int last = cell >= size - 2;
+            const I last = is_last[i];
             const R p = (xx - x) / 2 + (R)0.125, q = (R)0.75 - xx, r = (xx + x) / 2 + (R)0.125, s = x - (R)0.5, t = x + (R)0.5;
             w[0][i] = last ? 0 : p, w[1][i] = last ? p : q, w[2][i] = last ? q : r, w[3][i] = last ? r : 0;
             if (by) by[0][i] = last ? 0 : s, by[1][i] = last ? s : -2 * x, by[2][i] = last ? -2 * x : t, by[3][i] = last ? t : 0;
-            first[i] = (I)cell - 1 - last;
         }
     }
 }
 
-INLINE void T(cells)(const Part *part, const R *k, const int slopes, int n, const R *restrict a, const R *restrict b,
-                     T(Cells) *restrict c) {
+INLINE void T(cells_of)(const Part *part, const R *k, const int order, const int slopes, int n, const R *restrict a,
+                        const R *restrict b, T(Cells) *restrict c) {
     const R columns = (R)part->n, rows = (R)part->m, sa = k[0], sb = k[1], ca = k[2], cb = k[3];
-    ALIGNED I i_first[BLOCK], j_first[BLOCK];
-    EACH(i) c->x[0][i] = (a[i] - ca) * sa + (columns - 1) / 2, c->y[0][i] = (b[i] - cb) * sb + (rows - 1) / 2;
-    R(*by_x)[BLOCK] = slopes ? c->by_x : NULL, (*by_y)[BLOCK] = slopes ? c->by_y : NULL;
-    if (part->flags == 3) T(weigh)(3, n, columns, c->x, by_x, i_first), T(weigh)(3, n, rows, c->y, by_y, j_first);
-    else T(weigh)(2, n, columns, c->x, by_x, i_first), T(weigh)(2, n, rows, c->y, by_y, j_first);
+    ALIGNED I i_first[BLOCK], j_first[BLOCK], is_last[BLOCK];
+    EACH(i) c->x[i] = (a[i] - ca) * sa + (columns - 1) / 2, c->y[0][i] = (b[i] - cb) * sb + (rows - 1) / 2;
+    T(place)(order, n, columns, c->x, i_first, c->is_last), T(place)(order, n, rows, c->y[0], j_first, is_last);
+    T(weigh)(order, n, is_last, c->y, slopes ? c->by_y : NULL);
     EACH(i) c->at[i] = (int32_t)(2 * (j_first[i] * part->n + i_first[i]));
 }
 
-/* Of four columns, du and dv of each, the sums over four rows; and, if wanted, by other weights */
-INLINE void T(sum_rows)(const R *restrict controls, int64_t width, int n, const T(Cells) *restrict c, R *restrict sums,
-                        R *restrict others) {
-    for (int i = 0; i < n; i++) {
-        const R *restrict from = controls + c->at[i], p = c->y[0][i], q = c->y[1][i], r = c->y[2][i], s = c->y[3][i];
-        for (int j = 0; j < 8; j++)
-            sums[8 * i + j] = (p * from[j] + q * from[width + j]) + (r * from[2 * width + j] + s * from[3 * width + j]);
-        if (!others) continue;
-        const R dp = c->by_y[0][i], dq = c->by_y[1][i], dr = c->by_y[2][i], ds = c->by_y[3][i];
-        for (int j = 0; j < 8; j++)
-            others[8 * i + j] = (dp * from[j] + dq * from[width + j]) + (dr * from[2 * width + j] + ds * from[3 * width + j]);
-    }
+static void T(cells)(const Part *part, const R *k, int n, const R *restrict a, const R *restrict b, T(Cells) *restrict c) {
+    if (part->flags == 3) T(cells_of)(part, k, 3, 0, n, a, b, c);
+    else T(cells_of)(part, k, 2, 0, n, a, b, c);
 }
 
-/* Of their sums, those over columns */
-INLINE void T(sum_columns)(const R *s, R p, R q, R r, R t, R *u, R *v) {
-    *u = (p * s[0] + q * s[2]) + (r * s[4] + t * s[6]), *v = (p * s[1] + q * s[3]) + (r * s[5] + t * s[7]);
+/* Weights of four columns, of du and dv each, by powers of the place in a cell: of order 3, of order 2, and of that at the
+   end of a row */
+static const ALIGNED R T(powers_of)[3][4][8] = {
+    {{1 / 6.0, 1 / 6.0, 2 / 3.0, 2 / 3.0, 1 / 6.0, 1 / 6.0, 0, 0}, {-0.5, -0.5, 0, 0, 0.5, 0.5, 0, 0},
+     {0.5, 0.5, -1, -1, 0.5, 0.5, 0, 0}, {-1 / 6.0, -1 / 6.0, 0.5, 0.5, -0.5, -0.5, 1 / 6.0, 1 / 6.0}},
+    {{0.125, 0.125, 0.75, 0.75, 0.125, 0.125, 0, 0}, {-0.5, -0.5, 0, 0, 0.5, 0.5, 0, 0}, {0.5, 0.5, -1, -1, 0.5, 0.5, 0, 0}},
+    {{0, 0, 0.125, 0.125, 0.75, 0.75, 0.125, 0.125}, {0, 0, -0.5, -0.5, 0, 0, 0.5, 0.5}, {0, 0, 0.5, 0.5, -1, -1, 0.5, 0.5}},
+};
+
+INLINE R T(weight)(const R (*restrict k)[8], const int order, const int column, R x, R *slope) {
+    R value = k[2][column], by_x = value;
+    if (order == 3) value += k[3][column] * x, by_x = value + k[3][column] * x;
+    value = value * x + k[1][column];
+    if (slope) *slope = by_x * x + value;
+    return value * x + k[0][column];
 }
 
-INLINE void T(surface_of)(const Part *part, const R *k, int n, const R *restrict a, const R *restrict b, R *restrict u,
-                          R *restrict v, T(Jacobian) *restrict to) {
+INLINE void T(halves)(const R *restrict eight, R *restrict four) {
+    KEPT_LOOP for (int j = 0; j < 4; j++) four[j] = eight[j] + eight[j + 4];
+}
+
+INLINE void T(surface_of)(const Part *part, const R *k, const int order, int n, const R *restrict a, const R *restrict b,
+                          R *restrict u, R *restrict v, T(Jacobian) *restrict to) {
     T(Cells) c;
-    ALIGNED R sums[8 * BLOCK], others[8 * BLOCK];
+    ALIGNED R sums[4 * BLOCK], by_a[4 * BLOCK], by_b[4 * BLOCK];
+    ALIGNED R made[8], across[8], down[8];
     const int64_t width = 2 * (int64_t)part->n;
-    const R sa = k[0], sb = k[1];
-    T(cells)(part, k, to != NULL, n, a, b, &c);
-    T(sum_rows)(k + 4, width, n, &c, sums, to ? others : NULL);
-    EACH(i) {
-        T(sum_columns)(sums + 8 * i, c.x[0][i], c.x[1][i], c.x[2][i], c.x[3][i], u + i, v + i);
-        u[i] += a[i], v[i] += b[i];
-        if (!to) continue;
-        T(sum_columns)(sums + 8 * i, c.by_x[0][i], c.by_x[1][i], c.by_x[2][i], c.by_x[3][i], to->ua + i, to->va + i);
-        to->ua[i] = to->ua[i] * sa + 1, to->va[i] *= sa;
+    const R sa = k[0], sb = k[1], *restrict controls = k + 4;
+    T(cells_of)(part, k, order, to != NULL, n, a, b, &c);
+    for (int i = 0; i < n; i++) {
+        const R *restrict row = controls + c.at[i], x = c.x[i];
+        const R p = c.y[0][i], q = c.y[1][i], r = c.y[2][i], s = c.y[3][i];
+        const R(*restrict powers)[8] = T(powers_of)[order == 3 ? 0 : 1 + c.is_last[i]];
+        if (!to) {
+            KEPT_LOOP for (int j = 0; j < 8; j++)
+                made[j] = ((p * row[j] + q * row[width + j]) + (r * row[2 * width + j] + s * row[3 * width + j])) *
+                          T(weight)(powers, order, j, x, NULL);
+            T(halves)(made, sums + 4 * i);
+            continue;
+        }
+        const R dp = c.by_y[0][i], dq = c.by_y[1][i], dr = c.by_y[2][i], ds = c.by_y[3][i];
+        KEPT_LOOP for (int j = 0; j < 8; j++) {
+            const R first = row[j], second = row[width + j], third = row[2 * width + j], fourth = row[3 * width + j];
+            const R sum = (p * first + q * second) + (r * third + s * fourth);
+            R slope;
+            const R weight = T(weight)(powers, order, j, x, &slope);
+            made[j] = sum * weight, across[j] = sum * slope;
+            down[j] = ((dp * first + dq * second) + (dr * third + ds * fourth)) * weight;
+        }
+        T(halves)(made, sums + 4 * i), T(halves)(across, by_a + 4 * i), T(halves)(down, by_b + 4 * i);
     }
-    if (to) EACH(i) {
-        T(sum_columns)(others + 8 * i, c.x[0][i], c.x[1][i], c.x[2][i], c.x[3][i], to->ub + i, to->vb + i);
-        to->ub[i] *= sb, to->vb[i] = to->vb[i] * sb + 1;
+    EACH(i) u[i] = a[i] + (sums[4 * i] + sums[4 * i + 2]), v[i] = b[i] + (sums[4 * i + 1] + sums[4 * i + 3]);
+    if (!to) return;
+    EACH(i) {
+        to->ua[i] = (by_a[4 * i] + by_a[4 * i + 2]) * sa + 1, to->va[i] = (by_a[4 * i + 1] + by_a[4 * i + 3]) * sa;
+        to->ub[i] = (by_b[4 * i] + by_b[4 * i + 2]) * sb, to->vb[i] = (by_b[4 * i + 1] + by_b[4 * i + 3]) * sb + 1;
     }
 }
 
 static void T(surface)(const Part *part, const R *k, int n, const R *restrict a, const R *restrict b, R *restrict u,
                        R *restrict v, T(Jacobian) *restrict to) {
-    if (to) T(surface_of)(part, k, n, a, b, u, v, to);
-    else T(surface_of)(part, k, n, a, b, u, v, NULL);
+    if (part->flags == 3) {
+        if (to) T(surface_of)(part, k, 3, n, a, b, u, v, to);
+        else T(surface_of)(part, k, 3, n, a, b, u, v, NULL);
+    } else if (to) T(surface_of)(part, k, 2, n, a, b, u, v, to);
+    else T(surface_of)(part, k, 2, n, a, b, u, v, NULL);
 }
 
 /* Cells and centre are constants: their sums stay 0 */
@@ -348,14 +382,18 @@ static void T(surface_vjp)(const Part *part, const R *k, int n, const R *restric
     T(surface)(part, k, n, a, b, u, v, &to);
     if (sums) {
         T(Cells) c;
-        T(cells)(part, k, 0, n, a, b, &c);
-        for (int i = 0; i < n; i++)
-            for (int q = 0; q < 4; q++)
-                for (int p = 0; p < 4; p++) {
+        T(cells)(part, k, n, a, b, &c);
+        for (int i = 0; i < n; i++) {
+            const R(*powers)[8] = T(powers_of)[part->flags == 3 ? 0 : 1 + c.is_last[i]];
+            for (int p = 0; p < 4; p++) {
+                const R across = T(weight)(powers, part->flags, 2 * p, c.x[i], NULL);
+                for (int q = 0; q < 4; q++) {
                     double *here = sums + 4 + c.at[i] + 2 * ((int64_t)part->n * q + p);
-                    const R w = c.y[q][i] * c.x[p][i];
+                    const R w = c.y[q][i] * across;
                     here[0] += w * gu[i], here[1] += w * gv[i];
                 }
+            }
+        }
     }
     EACH(i) {
         const R along = gu[i] * to.ua[i] + gv[i] * to.va[i];
@@ -370,14 +408,30 @@ INLINE R T(surface_edge)(const Part *part, const R *k, R behind, R a, R b) {
     return across < down ? across : across == across ? down : -1;
 }
 
+/* What is certain of a surface that is the last stage: up to its edge and a hair behind, no further */
+typedef struct {
+    R sa, sb, ca, cb, across, down;
+} T(Edge);
+
+INLINE T(Edge) T(edge_of)(const T(Camera) *c) {
+    const Part *part = c->parts + c->stages;
+    const R *k = c->numbers[c->stages], behind = (R)1e-4;
+    return (T(Edge)){k[0], k[1], k[2], k[3], (R)(part->n - part->flags) / 2 + behind, (R)(part->m - part->flags) / 2 + behind};
+}
+
+INLINE I T(on_edge)(const T(Edge) e, R a, R b) {
+    return (e.across - T(absolute)((a - e.ca) * e.sa) > 0) & (e.down - T(absolute)((b - e.cb) * e.sb) > 0);
+}
+
 /* Points of the plane of a surface, the last stage, where it is regular on the whole way from the centre for certain */
 static void T(on_surface)(const T(Camera) *c, int n, const R *restrict a, const R *restrict b, I *restrict ok) {
     const Part *part = c->parts + c->stages;
     const R *k = c->numbers[c->stages];
-    EACH(i) ok[i] = T(surface_edge)(part, k, (R)1e-4, a[i], b[i]) > 0; /* up to its edge and a hair behind, no further */
+    const T(Edge) edge = T(edge_of)(c);
+    EACH(i) ok[i] = T(on_edge)(edge, a[i], b[i]);
     if (c->all_certain) return;
     T(Cells) cells;
-    T(cells)(part, k, 0, n, a, b, &cells);
+    T(cells)(part, k, n, a, b, &cells);
     for (int i = 0; i < n; i++) ok[i] &= c->certain[cells.at[i] / 2];
 }
 

@@ -271,7 +271,7 @@ static int T(lattice)(const Lattices *given, int64_t camera, T(Between) *b) {
     if ((left = T(settle)(given, b, &asked))) return left;
     int64_t most = 0;
     for (int64_t i = 0; i < cells; i++) most += asked.cells[i] == 0;
-    if (2 * most > cells) return LEFT_MOST;
+    if (8 * most > 7 * cells) return LEFT_MOST;
     static const int32_t wanted[2] = {0, CELL_NEXT};
     for (int turn = 0; turn < 2; turn++) {
         int64_t places[BLOCK / SQUARE], found;

@@ -10,6 +10,26 @@ static void T(prepare_stage)(T(Camera) *c, int j) {
     if (part->flags & PRISM) plane->s0 = k[0], plane->s1 = k[1], plane->s2 = k[2], plane->s3 = k[3];
 }
 
+/* See `bivariate` */
+static void T(prepare_bent)(T(Camera) *c) {
+    const int counts[2] = {c->parts->across, c->parts->down};
+    const R *numbers = c->map;
+    for (int j = 0; j < 2; numbers += counts[j++])
+        while ((c->orders[j] + 1) * (c->orders[j] + 2) / 2 < counts[j]) c->orders[j]++;
+    const int most = c->orders[0] > c->orders[1] ? c->orders[0] : c->orders[1];
+    c->order = most <= 2 ? 2 : most <= 3 ? 3 : most <= 5 ? 5 : 0, c->bend = 0, numbers = c->map;
+    for (int j = 0; j < 2; j++)
+        for (int q = 0, place = 0; q <= c->orders[j]; q++)
+            for (int p = 0; p <= c->orders[j] - q; p++, numbers++) {
+                const int degree = p + q;
+                R size = T(absolute)(*numbers) * (R)(degree * (degree - 1));
+                for (int k = 2; k < degree; k++) size *= (R)(PI / 2);
+                c->bend += size;
+                if (c->order) c->bent[j][place + p] = *numbers;
+                if (p == c->orders[j] - q) place += c->order + 1 - q;
+            }
+}
+
 static void T(prepare)(const Cameras *all, int64_t camera, T(Camera) *c) {
     const R *numbers = (const R *)all->parameters + camera * all->parameter_count;
     const R *intrinsics = (const R *)all->intrinsics + 4 * camera;
@@ -41,6 +61,7 @@ static void T(prepare)(const Cameras *all, int64_t camera, T(Camera) *c) {
             c->all_certain = 1;
             for (int j = 0; j <= last->m - 4; j++)
                 for (int i = 0; i <= last->n - 4; i++) c->all_certain &= c->certain[j * last->n + i];
+            c->to_edge = c->all_certain && c->stages == 1;
         }
         c->start = all->start ? (const R *)all->start + camera * START : NULL;
         c->table = all->table ? (const R *)all->table + camera * (2 + 2 * NODES) : NULL;
@@ -50,6 +71,7 @@ static void T(prepare)(const Cameras *all, int64_t camera, T(Camera) *c) {
         c->chart_most2 = ((const R *)all->chart_most2)[camera];
         c->chart_table = (const R *)all->chart_table + camera * (2 + 2 * NODES);
     }
+    if (c->parts->map == BEND) T(prepare_bent)(c);
     T(prepare_chart)(c);
 }
 
@@ -176,27 +198,31 @@ INLINE R T(step)(R ua, R ub, R va, R vb, R du, R dv, R *da, R *db) {
 typedef struct {
     ALIGNED R phi[BLOCK], theta[BLOCK], p[BLOCK], q[BLOCK], side[BLOCK];
     T(Jacobian) by; /* of p and q by phi and theta */
-    ALIGNED I ok[BLOCK]; /* where that is regular, and ahead before and after */
 } T(Bent);
 
 /* A polynomial and its derivatives: coefficients of 1, phi, phi^2, ..., then theta (1, phi, ...) and so on */
-static void T(bivariate)(const R *c, int count, int n, const R *restrict phi, const R *restrict theta, R *restrict value,
-                         R *restrict by_phi, R *restrict by_theta) {
-    ALIGNED R inner[BLOCK], slope[BLOCK];
-    EACH(i) value[i] = by_phi[i] = by_theta[i] = 0;
-    const R *row = c + count;
-    for (int size = 1; row > c; size++) {
+INLINE R T(bivariate)(const R *c, const int order, R phi, R theta, R *by_phi, R *by_theta) {
+    const R *row = c + (order + 1) * (order + 2) / 2;
+    R value = 0, along = 0, down = 0;
+    UNROLLED_LOOP for (int size = 1; size <= order + 1; size++) {
         row -= size;
-        EACH(i) inner[i] = row[size - 1], slope[i] = 0;
-        for (int k = size - 2; k >= 0; k--) {
-            const R next = row[k];
-            EACH(i) slope[i] = slope[i] * phi[i] + inner[i], inner[i] = inner[i] * phi[i] + next;
-        }
-        EACH(i) {
-            by_theta[i] = by_theta[i] * theta[i] + value[i], by_phi[i] = by_phi[i] * theta[i] + slope[i];
-            value[i] = value[i] * theta[i] + inner[i];
-        }
+        R inner = row[size - 1], slope = 0;
+        UNROLLED_LOOP for (int k = size - 2; k >= 0; k--) slope = slope * phi + inner, inner = inner * phi + row[k];
+        down = down * theta + value, along = along * theta + slope, value = value * theta + inner;
     }
+    *by_phi = along, *by_theta = down;
+    return value;
+}
+
+/* The polynomials of a windshield where loops of `order` find them */
+typedef struct {
+    R padded[2][BENT];
+    const R *p, *q;
+} T(Shield);
+
+INLINE void T(shield_of)(const T(Camera) *c, T(Shield) *made) {
+    memcpy(made->padded, c->bent, sizeof made->padded);
+    made->p = c->order ? made->padded[0] : c->map, made->q = c->order ? made->padded[1] : c->map + c->parts->across;
 }
 
 /* Adds the sums of phi^i theta^j weight */
@@ -225,21 +251,12 @@ INLINE R T(ray_of)(R phi, R theta, R *x, R *y) {
 }
 
 static void T(both)(const T(Camera) *c, int n, T(Bent) *b) {
-    const int across = c->parts->across, down = c->parts->down;
-    T(bivariate)(c->map, across, n, b->phi, b->theta, b->p, b->by.ua, b->by.ub);
-    T(bivariate)(c->map + across, down, n, b->phi, b->theta, b->q, b->by.va, b->by.vb);
-}
-
-static void T(bend_at)(const T(Camera) *c, int n, T(Bent) *b) {
-    const R half = (R)(PI / 2), least = (R)NEAR_SIDE;
-    T(both)(c, n, b);
-    EACH(i) {
-        R x, y;
-        const R p = b->p[i], q = b->q[i], area = b->by.ua[i] * b->by.vb[i] - b->by.ub[i] * b->by.va[i];
-        const I turned = (half - T(most)(T(absolute)(p), T(absolute)(q)) - least > 0) & (b->side[i] > 0);
-        const R before2 = T(ray_of)(b->phi[i], b->theta[i], &x, &y), after2 = T(ray_of)(turned ? p : 0, turned ? q : 0, &x, &y);
-        b->ok[i] = turned & (area - least > 0) & (after2 - least > 0) & (before2 - least * least > 0);
-    }
+    T(Shield) shield;
+    T(shield_of)(c, &shield);
+    EACH_ORDER(c->order, c->orders, EACH(i) {
+        b->p[i] = T(bivariate)(shield.p, across, b->phi[i], b->theta[i], b->by.ua + i, b->by.ub + i);
+        b->q[i] = T(bivariate)(shield.q, down, b->phi[i], b->theta[i], b->by.va + i, b->by.vb + i);
+    })
 }
 
 static void T(angles_of)(int n, const R *restrict x, const R *restrict y, const R *restrict z, T(Bent) *b) {
@@ -271,40 +288,52 @@ static void T(angles_vjp)(int n, const R *restrict x, const R *restrict y, const
     }
 }
 
+INLINE R T(inside)(R low, R x, R high) { return x > low ? x < high ? x : high : low; }
+
 /* Unit rays behind the shield to those in front of it; `ok` where there is one */
 static void T(unbend)(const T(Camera) *c, int n, T(Bent) *b, R *restrict x, R *restrict y, R *restrict z, I *restrict ok) {
-    ALIGNED R p[BLOCK], q[BLOCK], off[BLOCK];
-    const R half = (R)(PI / 2), least = (R)NEAR_SIDE;
+    ALIGNED R p[BLOCK], q[BLOCK], area[BLOCK];
+    ALIGNED I done[BLOCK];
+    /* as of `change`, and so far within that rounding carries none across */
+    const R half = (R)(PI / 2), longest = (R)0.5, least = (R)NEAR_SIDE, inner = least + 256 * EPS, bend = c->bend;
+    T(Shield) shield;
+    T(shield_of)(c, &shield);
     T(angles_of)(n, x, y, z, b);
-    EACH(i) p[i] = b->phi[i], q[i] = b->theta[i], b->phi[i] = b->theta[i] = 0;
-    T(both)(c, LANES, b); /* from the inverse of the linear part, which is that of 0 */
-    const R p0 = b->p[0], q0 = b->q[0], ua = b->by.ua[0], ub = b->by.ub[0], va = b->by.va[0], vb = b->by.vb[0];
+    /* from the inverse of the linear part */
+    const R *of_p = c->map, *of_q = c->map + c->parts->across, p0 = of_p[0], q0 = of_q[0];
+    const R ua = c->orders[0] ? of_p[1] : 0, ub = c->orders[0] ? of_p[c->orders[0] + 1] : 0;
+    const R va = c->orders[1] ? of_q[1] : 0, vb = c->orders[1] ? of_q[c->orders[1] + 1] : 0;
     EACH(i) {
         R da, db;
+        p[i] = b->phi[i], q[i] = b->theta[i], done[i] = !ok[i];
         T(step)(ua, ub, va, vb, p[i] - p0, q[i] - q0, &da, &db);
-        b->phi[i] = da > -half ? da < half ? da : half : -half, b->theta[i] = db > -half ? db < half ? db : half : -half;
+        b->phi[i] = T(inside)(-half, da, half), b->theta[i] = T(inside)(-half, db, half);
     }
-    for (int count = 0;; count++) {
+    for (int count = 0; count < 13; count++) {
         I all = 1;
-        T(both)(c, n, b);
-        EACH(i) off[i] = T(absolute)(p[i] - b->p[i]) + T(absolute)(q[i] - b->q[i]);
-        EACH(i) all &= !ok[i] | (off[i] < 4 * EPS);
-        if (all || count == 12) break;
-        EACH(i) {
-            R da, db;
-            const R most = (R)0.5;
-            T(step)(b->by.ua[i], b->by.ub[i], b->by.va[i], b->by.vb[i], p[i] - b->p[i], q[i] - b->q[i], &da, &db);
-            da = da > -most ? da < most ? da : most : -most, db = db > -most ? db < most ? db : most : -most;
-            da += b->phi[i], db += b->theta[i];
-            b->phi[i] = da > -half ? da < half ? da : half : -half, b->theta[i] = db > -half ? db < half ? db : half : -half;
-        }
+        EACH_ORDER(c->order, c->orders, EACH(i) {
+            R ua, ub, va, vb, da, db;
+            const R phi = b->phi[i], theta = b->theta[i];
+            const R du = p[i] - T(bivariate)(shield.p, across, phi, theta, &ua, &ub);
+            const R dv = q[i] - T(bivariate)(shield.q, down, phi, theta, &va, &vb), off = T(absolute)(du) + T(absolute)(dv);
+            T(step)(ua, ub, va, vb, du, dv, &da, &db);
+            da = T(inside)(-longest, da, longest), db = T(inside)(-longest, db, longest);
+            const R here = ua * vb - ub * va, size = T(absolute)(da) + T(absolute)(db);
+            const R change = 2 * bend * size * (T(absolute)(ua) + T(absolute)(ub) + T(absolute)(va) + T(absolute)(vb) + bend * size);
+            /* found; or so near that the next step leaves nothing, and changes nothing either */
+            const I was = done[i] != 0, found = off < (count < 12 ? 4 : 64) * EPS;
+            const I next = (4 * EPS - bend * (size * size) > 0) & (here - change - inner > 0);
+            b->phi[i] = was | found ? phi : T(inside)(-half, phi + da, half);
+            b->theta[i] = was | found ? theta : T(inside)(-half, theta + db, half);
+            area[i] = was ? area[i] : here;
+            done[i] = was | found | next, all &= done[i];
+        })
+        if (all) break;
     }
     EACH(i) {
-        /* as of `bend_at`, and so far within that rounding carries none across; what it would bend to is known */
-        const R inner = least + 256 * EPS;
-        const R area = b->by.ua[i] * b->by.vb[i] - b->by.ub[i] * b->by.va[i], after2 = z[i] * z[i];
-        const R z2 = T(ray_of)(b->phi[i], b->theta[i], x + i, y + i), last = T(most)(T(absolute)(p[i]), T(absolute)(q[i]));
-        ok[i] &= (off[i] < 64 * EPS) & (b->side[i] > 0) & (half - last - inner > 0) & (area - inner > 0);
+        const R after2 = z[i] * z[i], last = T(most)(T(absolute)(p[i]), T(absolute)(q[i]));
+        const R z2 = T(ray_of)(b->phi[i], b->theta[i], x + i, y + i);
+        ok[i] &= done[i] & (b->side[i] > 0) & (half - last - inner > 0) & (area[i] - inner > 0);
         ok[i] &= (after2 - inner > 0) & (z2 - (least * least + 256 * EPS) > 0), z[i] = T(root)(z2 > 0 ? z2 : 0);
     }
 }
@@ -314,12 +343,15 @@ static void T(change)(const T(Camera) *c, int n, T(Seen) *s) {
     T(shrunk)(n, s->x, s->y, s->z, s->shrink);
     if (c->parts->map == BEND) {
         T(Bent) b;
+        const R half = (R)(PI / 2), least = (R)NEAR_SIDE;
         T(angles_of)(n, s->x, s->y, s->z, &b);
-        T(bend_at)(c, n, &b);
-        EACH(i) {
-            const I ok = b.ok[i] & (s->shrink[i] > 0) & (T(absolute)(s->x[i] + s->y[i] + s->z[i]) < 8); /* nor what is not a number */
-            const R z2 = T(ray_of)(ok ? b.p[i] : 0, ok ? b.q[i] : 0, s->x + i, s->y + i);
-            s->z[i] = ok ? T(root)(z2) : NAN;
+        T(both)(c, n, &b);
+        EACH(i) { /* where the polynomials are regular, and rays ahead before and after */
+            const R x = s->x[i], y = s->y[i], z = s->z[i], p = b.p[i], q = b.q[i], area = b.by.ua[i] * b.by.vb[i] - b.by.ub[i] * b.by.va[i];
+            const R z2 = T(ray_of)(p, q, s->x + i, s->y + i);
+            I ok = (half - T(most)(T(absolute)(p), T(absolute)(q)) - least > 0) & (area - least > 0) & (z2 - least > 0);
+            ok &= (z > 0) & (z * z - least * least * (x * x + y * y + z * z) > 0) & (s->shrink[i] > 0);
+            s->z[i] = ok & (T(absolute)(x + y + z) < 8) ? T(root)(z2) : NAN; /* nor what is not a number */
         }
         return;
     }
@@ -345,7 +377,7 @@ static void T(change_vjp)(const T(Camera) *c, int n, T(Seen) *s, R *restrict gx,
         T(Bent) b;
         ALIGNED R gp[BLOCK], gq[BLOCK];
         T(angles_of)(n, s->x, s->y, s->z, &b);
-        T(bend_at)(c, n, &b);
+        T(both)(c, n, &b);
         EACH(i) b.p[i] = s->ok[i] ? b.p[i] : 0, b.q[i] = s->ok[i] ? b.q[i] : 0;
         T(ray_of_vjp)(n, b.p, b.q, gx, gy, gz, gp, gq);
         if (sums) {
@@ -417,16 +449,24 @@ static int T(see)(const T(Camera) *c, int keeps, int count, int n, T(Seen) *s) {
                s->z, s->shrink, s->scale, swapped ? s->b : s->a, swapped ? s->a : s->b, s->ok);
     if (!later) return 0;
     if (c->way == INVERTED) T(see_inverted)(c, keeps, n, s);
-    EACH(i) {
+    if (c->to_edge) {
+        const T(Edge) edge = T(edge_of)(c);
+        const R certain2 = c->certain2;
+        EACH(i) {
+            const I is_on = T(on_edge)(edge, s->a[i], s->b[i]) & (certain2 - (s->a[i] * s->a[i] + s->b[i] * s->b[i]) > 0);
+            s->ok[i] += s->ok[i] & !is_on, outside |= s->ok[i];
+        }
+    } else EACH(i) {
         s->ok[i] += s->ok[i] & !(inner2 - (s->a[i] * s->a[i] + s->b[i] * s->b[i]) > 0); /* 2: beyond */
         outside |= s->ok[i];
     }
-    if (outside & 2 && c->certain) {
+    if (outside & 2 && c->certain && !c->to_edge) {
         ALIGNED I certain[BLOCK];
         T(certain)(c, n, s->a, s->b, certain);
         outside = 0;
         EACH(i) s->ok[i] = s->ok[i] == 2 && certain[i] ? 1 : s->ok[i], outside |= s->ok[i];
     }
+    if (!(outside & 2) && c->way != INVERTED) return 0;
     if (outside & 2 && c->follows) waiting = T(beyond)(c, count, n, s);
     EACH(i) {
         s->ok[i] = s->ok[i] == 1;
@@ -772,7 +812,7 @@ static void T(invert)(const T(Camera) *c, int n, const R *restrict u, const R *r
             possible[i] = within[i] & (possible[i] | !known[i]);
         }
     } else {
-        const int has_table = c->table != NULL;
+        const int has_table = c->table != NULL, to_edge = c->to_edge;
         const R usual2 = c->usual2 * (1 - 32 * EPS);
         T(start)(c, has_table ? 2 : 1, n, u, v, a, b);
         if (has_table) {
@@ -788,7 +828,16 @@ static void T(invert)(const T(Camera) *c, int n, const R *restrict u, const R *r
             ok[i] &= usual2 - (a[i] * a[i] + b[i] * b[i]) > 0;
             outside |= possible[i] & !ok[i];
         }
-        if (outside && c->certain) {
+        if (outside && to_edge) {
+            const T(Edge) edge = T(edge_of)(c);
+            const R certain2 = c->certain2 * (1 - 64 * EPS), further = 1 + 32 * EPS;
+            outside = 0;
+            EACH(i) {
+                ok[i] |= possible[i] & T(on_edge)(edge, a[i] * further, b[i] * further) & (certain2 - (a[i] * a[i] + b[i] * b[i]) > 0);
+                outside |= possible[i] & !ok[i];
+            }
+        }
+        if (outside && c->certain && !to_edge) {
             ALIGNED I certain[BLOCK];
             outside = 0;
             EACH(i) p[i] = a[i] * (1 + 32 * EPS), q[i] = b[i] * (1 + 32 * EPS);
@@ -911,7 +960,7 @@ static void T(unproject_vjp)(const T(Camera) *c, const Rows *rows, int64_t camer
             T(Bent) bent;
             ALIGNED R gp[BLOCK], gq[BLOCK], p[BLOCK], q[BLOCK], s[BLOCK];
             EACH(i) p[i] = rx[i], q[i] = ry[i], s[i] = rz[i];
-            T(unbend)(c, n, &bent, p, q, s, all);
+            T(unbend)(c, n, &bent, p, q, s, all), T(both)(c, n, &bent);
             T(ray_of_vjp)(n, bent.phi, bent.theta, gx, gy, gz, gp, gq);
             EACH(i) {
                 R da, db;

@@ -145,6 +145,8 @@ class Plan:
     is_radial: bool
     has_factor: bool
     has_rest: bool
+    is_long: bool
+    """Whether a radial factor has so many numbers that its fold is not found by a root."""
     controls: int
     """Of a surface, the last stage after nothing or a radial factor."""
 
@@ -161,6 +163,7 @@ class Plan:
         self.is_chart = isinstance(_bare(chart), optics.Inverted)
         self.has_stages, self.is_radial = bool(lens.stages), lens.is_radial
         self.has_factor, self.has_rest = lens.radial is not None, lens.rest is not None
+        self.is_long = any(part.factor and part.n + part.m > _MOST_DEGREE for part in parts)
         *before, last = lens.stages or (None,)
         is_plain = isinstance(last, optics.Surface) and (not before or (len(before) == 1 and before[0].is_radial))
         self.controls = parts[-1].n * parts[-1].m if is_plain else 0
@@ -251,7 +254,7 @@ class Lenses:
         made.parameters, made.parameter_count = self._keep(plan.parameters_of(self._optics_of, k)), plan.parameters
         made.most = torch.finfo(self.dtype).max ** 0.25
         made.ends, made.usual_ends = map(self._keep_ends, plan.ends(lambda: self._optics()[0], self.dtype))
-        if plan.places is None or plan.parameters > _MOST_DEGREE:
+        if plan.places is None or plan.is_long:
             chart, lens = self._optics()
             if constants := _constants(lens):
                 made.constants, made.constant_count = self._keep_columns(constants, k.dtype), len(constants)
@@ -652,7 +655,7 @@ class Between:
                 of float32 alone.
         """
         cameras, dtype, count = self.cameras, self._start.dtype, probes.shape[1]
-        self._start.add_tables(size[0] * size[1])  # of which some are computed one by one, or all
+        self._start.add_tables(size[0] * size[1])  # of which one in 64 is a node, and some are computed one by one
         n, m = (-(-side // 8) for side in size)
         nodes, most, is_double = (n + 5) * (m + 5), cameras * n * m, dtype == torch.float64
         result = torch.empty(cameras, 2, count, dtype=dtype, device="cpu")

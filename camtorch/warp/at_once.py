@@ -195,7 +195,7 @@ class _Call:
         self, source: Native, target: Native, rotation: Tensor | None, work: Work, decides: bool
     ) -> Made | None:
         words, turns = self._words, 0 if rotation is None else rotation.data_ptr()
-        target.add_tables(self._pixels if work.images else 0)
+        target.add_tables(self._pixels if work.images else 0)  # as `Between.lattices` does it
         if work.pixels:
             source.add_tables(0)
         words[_HEAD], words[_HEAD + 1], words[_HEAD + 2] = target.pointer, source.pointer, turns

@@ -46,6 +46,32 @@ def test_it_is_the_formula_and_back():
     torch.testing.assert_close(shield().inverse(there).detach(), rays, rtol=0, atol=1e-13)
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("orders", [(0, 1), (1, 0), (2, 1), (4, 3), (3, 5), (6, 2), (7, 8)], ids=str)
+def test_cameras_are_behind_polynomials_of_any_order(orders, dtype):
+    """Natively those of few orders have loops of their own."""
+    generator = torch.Generator().manual_seed(0)
+    parts = []
+    for order, linear in zip(orders, (1, orders[1] + 1), strict=True):
+        c = 1e-3 * torch.randn((order + 1) * (order + 2) // 2, generator=generator, dtype=torch.float64)
+        if order:
+            c[linear] += 1
+        parts.append(c.to(dtype))
+    camera, glass = one("kannala_brandt").detach().clone().to(dtype), ct.Windshield(*parts)
+    seen, rays, eps = camera.behind(glass).detach(), fan(60).to(dtype), torch.finfo(dtype).eps
+    pixels, valid = seen.project(rays)
+    expected, known = camera.project(glass(rays))
+    if 0 in orders:  # of one number nothing depends on the ray
+        assert not valid.any()
+        return
+    assert valid.all()
+    assert known.all()
+    torch.testing.assert_close(pixels, expected.detach(), rtol=0, atol=4e3 * eps)
+    back, found = seen.unproject(pixels)
+    assert found.all()
+    assert (back - rays).norm(dim=-1).max() < 64 * eps
+
+
 def test_derivatives_of_both_directions():
     inputs = tuple(t.detach().requires_grad_() for t in (fan(50)[::97].clone(), *shield().parameters()))
     for way in (ct.Windshield.forward, ct.Windshield.inverse):

@@ -131,13 +131,20 @@ static int fuzz(void) {
     int used = 0, fine = 1;
     memset(parts, 0, sizeof parts);
     const int d = (int)below(2), direction = (int)below(4), is_vjp = direction >= PROJECT_VJP;
-    parts[0].kind = (int32_t)below(SPHERE + 1);
-    if (parts[0].kind >= CYLINDER) parts[0].flags = below(2) ? TRANSVERSE : 0;
+    parts[0].kind = (int32_t)below(LINEARITY + 1);
+    if (parts[0].kind == CYLINDER || parts[0].kind == SPHERE) parts[0].flags = below(2) ? TRANSVERSE : 0;
     if (parts[0].kind == UNIFIED) parts[0].flags = (int32_t)below(8), parts[0].constant = (double)below(3) / 2;
     if (parts[0].kind == UNIFIED)
         for (i = 1; i < 8; i *= 2) numbers += !!(parts[0].flags & i);
-    if (parts[0].kind == FOV || parts[0].kind == ONE_DIVISION) numbers = 1;
+    if (parts[0].kind == FOV || parts[0].kind == ONE_DIVISION || parts[0].kind == LINEARITY) numbers = 1;
     if (parts[0].kind == INVERTED) numbers = factor_of(parts, POLYNOMIAL, ANGLE_OF_ALL_POWERS);
+    parts[0].map = (int32_t)below(3);
+    if (parts[0].map == TURN) numbers += 9;
+    if (parts[0].map == BEND) {
+        const int32_t across = (int32_t)below(8), down = (int32_t)below(8); /* orders */
+        parts[0].across = (across + 1) * (across + 2) / 2, parts[0].down = (down + 1) * (down + 2) / 2;
+        numbers += parts[0].across + parts[0].down;
+    }
     cameras.part_count = 1 + below(4);
     for (i = 1; i < cameras.part_count; i++) {
         Part *part = parts + i;
