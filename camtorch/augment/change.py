@@ -268,6 +268,14 @@ class Change:
             return view.camera()
         return (self.target[0] if self.gate is not None else alone(self.parts[0].target)).clone()
 
+    @property
+    def single_rotation(self) -> Tensor:
+        """(3, 3): the rotation of a change of one sample, of its own memory."""
+        view = self.parts[0].moves
+        if isinstance(view, View) and view.rotation is not None:
+            return view.rotation.clone()
+        return self.rotation[0].clone()
+
     def leads_to(self, camera: Camera | Sequence[Camera]) -> bool:
         """Whether these may be the cameras after: of their number and intrinsics, where one may look."""
         ours, theirs = (one.intrinsics.detach().reshape(-1, 4) for one in (self.target, as_one(camera)))
