@@ -272,9 +272,9 @@ class Change:
     def single_rotation(self) -> Tensor:
         """(3, 3): the rotation of a change of one sample, of its own memory."""
         view = self.parts[0].moves
-        if isinstance(view, View) and view.rotation is not None:
-            return view.rotation.clone()
-        return self.rotation[0].clone()
+        if not isinstance(view, View):
+            return self.rotation[0].clone()
+        return _eye(self.parts[0].camera.intrinsics) if view.rotation is None else view.rotation.clone()
 
     def leads_to(self, camera: Camera | Sequence[Camera]) -> bool:
         """Whether these may be the cameras after: of their number and intrinsics, where one may look."""

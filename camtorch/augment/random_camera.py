@@ -243,7 +243,7 @@ class RandomCamera(Augmentation):
 
     def _view(self, source: Camera, draw: Mapping[str, Any]) -> View | None:
         """What a draw makes of a single camera as plain numbers; None where it takes more than that."""
-        if self.min_filled or not self._is_usual or not isinstance(draw["apply"], np.ndarray) or source.batch_shape:
+        if self.min_filled or not self._is_usual or isinstance(draw["apply"], Tensor) or source.batch_shape:
             return None
         if isinstance(source, PANORAMAS) or isinstance(self.like, PANORAMAS):
             return None
@@ -497,7 +497,8 @@ class RandomMount(RandomCamera):
         (key, values), count = depth.popitem(), len(draw["apply"])
         part = super()._part(rows, source, {name: v for name, v in draw.items() if name not in (*_SHIFTS, key)})
         assert part.warp is not None
-        shift = torch.stack([torch.as_tensor(draw[name]) for name in _SHIFTS], -1).expand(count, 3)
+        shifts = [torch.as_tensor(draw[name], dtype=torch.float64) for name in _SHIFTS]
+        shift = torch.stack(shifts, -1).expand(count, 3)
         kind = next(kind for kind, name in _DEPTHS.items() if name == key)
         kind = "z" if kind == "depth" else kind
         warp = ShiftedWarp(source, part.target, part.warp.rotation, values, kind, shift, **self.options)
