@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any, TypeVar
 
 import torch
@@ -274,7 +274,7 @@ class Change:
         view = self.parts[0].moves
         if not isinstance(view, View):
             return self.rotation[0].clone()
-        return _eye(self.parts[0].camera.intrinsics) if view.rotation is None else view.rotation.clone()
+        return (_no_turn(view.distortion.dtype) if view.rotation is None else view.rotation).clone()
 
     def leads_to(self, camera: Camera | Sequence[Camera]) -> bool:
         """Whether these may be the cameras after: of their number and intrinsics, where one may look."""
@@ -559,6 +559,12 @@ def alone(camera: Camera) -> Camera:
 
 def _eye(like: Tensor) -> Tensor:
     return torch.eye(3, dtype=like.dtype, device=like.device)
+
+
+@lru_cache(maxsize=4)
+def _no_turn(dtype: torch.dtype) -> Tensor:
+    with torch.inference_mode(False):
+        return torch.eye(3, dtype=dtype, device="cpu")
 
 
 def _gated(gate: Tensor, moved: Tensor, kept: Tensor) -> Tensor:

@@ -29,7 +29,7 @@ from camtorch.augment.sample import Named
 from camtorch.camera import Camera
 from camtorch.lenses.drawing import FOLD, covering, drawn
 from camtorch.models import MODELS, KannalaBrandt
-from camtorch.projection.compiled import Native, project, unproject
+from camtorch.projection.compiled import Native, project_numbers, unproject
 from camtorch.projection.rays import field_of_view, image_lattice, polar_rays, reach
 from camtorch.projection.rows import Cameras, single_native
 from camtorch.rotations import mount_elements
@@ -218,7 +218,8 @@ class RandomCamera(Augmentation):
 
     def _are_plain(self, source: Camera) -> bool:
         """Whether plain numbers and arrays do, of which nothing is recorded."""
-        return are_numbers(*source._tensors, *(() if self.like is None else self.like._tensors))
+        like = self._modules.get("like")
+        return are_numbers(*source._tensors, *(() if like is None else like._tensors))
 
     def _made(self, source: Camera, values: Mapping[str, Any], xp: Any) -> tuple[Camera, Tensor | None]:
         """The same by tensors, arrays in float64, or numbers: with the functions of torch, of numpy or of math."""
@@ -235,7 +236,7 @@ class RandomCamera(Augmentation):
         angles = [values.get(name, none) * (math.pi / 180) for name in _TURNS]
         elements = mount_elements([xp.cos(a) for a in angles], [xp.sin(a) for a in angles])
         rotation = joined(elements, like, xp)
-        return rotation.view(*rotation.shape[:-1], 3, 3)
+        return rotation.view(3, 3) if xp is math else rotation.view(*rotation.shape[:-1], 3, 3)
 
     def _part(self, rows: list[int] | None, source: Camera, draw: Mapping[str, Any]) -> Part:
         view = self._view(source, draw)
@@ -245,7 +246,7 @@ class RandomCamera(Augmentation):
         """What a draw makes of a single camera as plain numbers; None where it takes more than that."""
         if self.min_filled or not self._is_usual or isinstance(draw["apply"], Tensor) or source.batch_shape:
             return None
-        if isinstance(source, PANORAMAS) or isinstance(self.like, PANORAMAS):
+        if isinstance(source, PANORAMAS) or isinstance(self._modules.get("like"), PANORAMAS):
             return None
         values = self._values(source, draw)
         if any(isinstance(v, (np.ndarray, Tensor)) for v in values.values()) or not self._are_plain(source):
@@ -325,7 +326,8 @@ class RandomCamera(Augmentation):
     ) -> tuple[Camera, Sequence[Any], Tensor, tuple[int, int], Native | None]:
         """The new camera: of whose model, fx, fy, cx and cy, distortion, and (height, width); see `View.lens`."""
         size = self.image_size or (source.height, source.width)
-        base = source if self.like is None else self.like
+        like = self._modules.get("like")
+        base = source if like is None else like
         dtype, device = torch.promote_types(source.intrinsics.dtype, torch.float32), source.intrinsics.device
         if self._is_real:
             share = torch.as_tensor(values["lens"], dtype=dtype, device=device)
@@ -427,11 +429,8 @@ def _seen_across(base: Camera, sine: float, cosine: float) -> float | None:
     native = rows_of(base, base.intrinsics, base.distortion).native
     if native is None:
         return None
-    like = base.intrinsics
-    rays = joined((-sine, 0.0, cosine, sine, 0.0, cosine), like, math).view(1, 2, 3)
-    pixels, valid = project(native, rays)
-    (left, right), _ = pixels.view(2, 2).tolist()
-    return right - left if bool(valid.all()) else None
+    pixels = project_numbers(native, (-sine, 0.0, cosine, sine, 0.0, cosine))
+    return None if pixels is None else pixels[2] - pixels[0]
 
 
 class RandomMount(RandomCamera):
@@ -620,7 +619,7 @@ def _jittered_alone(
             native = single_native(model, intrinsics, candidate)
             if native is None:
                 break
-            if bool(unproject(native, rim).valid.all()):
+            if unproject(native, rim).valid.numpy().all():
                 return candidate, native
     if native is not None:
         return k, None

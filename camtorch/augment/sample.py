@@ -448,7 +448,7 @@ class SampleTransform(nn.Module):
         predicted: whether it may hold what networks made, whose values may be bad.
         """
         camera: Any = sample.get("camera")
-        camera = self.camera if camera is None else camera
+        camera = self._modules.get("camera") if camera is None else camera
         form = self._form_of(sample, camera)
         if form is None or (known := self._forms.get(form)) is None:
             result = self._checked_batch(sample, camera, predicted)
