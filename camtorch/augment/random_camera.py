@@ -30,7 +30,7 @@ from camtorch.camera import Camera
 from camtorch.lenses.drawing import FOLD, covering, drawn
 from camtorch.models import MODELS, KannalaBrandt
 from camtorch.projection.compiled import Native, project_numbers, unproject
-from camtorch.projection.rays import field_of_view, image_lattice, polar_rays, reach
+from camtorch.projection.rays import field_of_view, pixel_lattice, polar_rays, reach
 from camtorch.projection.rows import Cameras, single_native
 from camtorch.rotations import mount_elements
 from camtorch.warp.boxes import along_edges
@@ -707,26 +707,33 @@ def _sensitivity(camera: Camera, distortion: Tensor, nominal: Tensor) -> Tensor:
     That moves the rim by its share of the distance from the centre to the corner.
     """
     camera = remade(camera, intrinsics=nominal.detach().double(), distortion=distortion.detach().double())
-    pixels = image_lattice(camera, _SIDE, _SIDE).flatten(0, 1)
+    pixels = _over(camera._size_for("its sensitivity")).to(distortion.device)
     batch, count = camera.batch_shape, camera.distortion.shape[-1]
     odd = camera.odd_in_x | camera.odd_in_y
     lopsided = torch.tensor([name in odd for name in camera.distortion_names], device=pixels.device)
     share = torch.where(lopsided, _SMALL, 1.0) / max(int((~lopsided).sum()), 1)
     rays, seen = camera.unproject(pixels.expand(*batch, *pixels.shape))
-    rays = rays.unsqueeze(-3).expand(*batch, count, *pixels.shape[:-1], 3)
-    ends = []
-    for sign in (-1, 1):
-        change = sign * _STEP * torch.eye(count, dtype=torch.float64, device=rays.device)
-        given = camera.distortion.expand(*batch, count).unsqueeze(-2)
-        distortion, _ = _defined(camera, given + change, given)
-        intrinsics = camera.intrinsics.expand(*batch, 4).unsqueeze(-2).expand(*batch, count, 4)
-        ends.append(remade(camera, intrinsics=intrinsics, distortion=distortion).project(rays))
-    (before, valid), (after, also) = ends
+    # each coefficient less, then each more; the same lenses stand before any part of an image
+    change = _STEP * torch.eye(count, dtype=torch.float64, device=rays.device)
+    given = camera.distortion.expand(*batch, count).unsqueeze(-2)
+    distortion, _ = _defined(camera, given + torch.cat((-change, change)), given)
+    intrinsics = camera.intrinsics.expand(*batch, 4).unsqueeze(-2).expand(*batch, 2 * count, 4)
+    rays = rays.unsqueeze(-3).expand(*batch, 2 * count, *rays.shape[-2:])
+    ends, valid = remade(camera, intrinsics=intrinsics, distortion=distortion).project(rays)
+    (before, after), both = ends.split(count, -3), valid.unflatten(-2, (2, count)).all(-3)
     moved = (after - before).norm(dim=-1) / (2 * _STEP)
-    most = torch.where(valid & also & seen.unsqueeze(-2), moved, 0.0).amax(-1)
+    most = torch.where(both & seen.unsqueeze(-2), moved, 0.0).amax(-1)
     height, width = camera.height, camera.width
     corner = ((width / 2) ** 2 + (height / 2) ** 2) ** 0.5
     return share * torch.where(most > 0, corner / most.clamp(min=1e-30), 0.0)
+
+
+@lru_cache(maxsize=16)
+def _over(size: tuple[int, int]) -> Tensor:
+    """(N, 2) in float64: pixels in even steps over images of a size, to their outer edges."""
+    with torch.inference_mode(False):
+        edges = torch.tensor([[-0.5, -0.5], [size[1] - 0.5, size[0] - 0.5]], dtype=torch.float64)
+        return pixel_lattice(edges[0], edges[1], _SIDE, _SIDE).flatten(0, 1)
 
 
 def _defined(camera: Camera, distortion: Tensor, otherwise: Tensor) -> tuple[Tensor, Tensor | None]:

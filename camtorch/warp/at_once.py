@@ -1,4 +1,4 @@
-"""One sample, or a batch of them, by one call of compiled code: the lattice of a warp, images sampled on it, and pixels."""
+"""One sample, or a batch, by one call of compiled code: the lattice of a warp, images sampled on it, and pixels."""
 
 from __future__ import annotations
 
@@ -200,7 +200,7 @@ def at_once(
 
 
 def _maker(ndim: int, image: Tensor, size: tuple[int, int], batched: bool) -> Callable[[], Tensor]:
-    """What makes the place for the samples of an image (1, C, H, W), or of a mask (1, H, W) that is one as it is here."""
+    """What makes the place for the samples of an image (1, C, H, W), which as a mask may come as (1, H, W)."""
     like = torch.empty_strided(image.shape, image.stride(), dtype=image.dtype, device="meta")
 
     def made() -> Tensor:
@@ -312,7 +312,7 @@ class _Call:
             turns = None if rotation is None else rotation.mT
             if not _surely_keeps_size(Between(target, source, turns, self._sizes[0], False), self._sizes):
                 return None
-        words, turn, size = self._words, 0 if rotation is None else rotation.data_ptr(), self._sizes[1]
+        words, turn = self._words, 0 if rotation is None else rotation.data_ptr()
         target.add_tables(self._pixels if self._jobs else 0)
         if self._moves:
             source.add_tables(0)

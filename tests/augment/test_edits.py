@@ -15,9 +15,9 @@ import torch.nn.functional as F  # noqa: N812
 from torchvision_stand_in import torchvision_of
 
 import camtorch as ct
-import camtorch.augment.sample
 import camtorch.augment.kornia as fronts
 import camtorch.augment.numpy
+import camtorch.augment.sample
 from camtorch.warp import sampling
 
 A = ct.augment
