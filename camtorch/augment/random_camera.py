@@ -29,7 +29,7 @@ from camtorch.augment.sample import Named
 from camtorch.camera import Camera
 from camtorch.lenses.drawing import FOLD, covering, drawn
 from camtorch.models import MODELS, KannalaBrandt
-from camtorch.projection.compiled import Native, project_numbers, unproject
+from camtorch.projection.compiled import Native, project, project_numbers, unproject
 from camtorch.projection.rays import field_of_view, pixel_lattice, polar_rays, reach
 from camtorch.projection.rows import Cameras, single_native
 from camtorch.rotations import mount_elements
@@ -646,7 +646,7 @@ def _jittered(camera: Camera, amounts: Tensor, nominal: Tensor) -> tuple[Tensor]
     result, done = given, None
     for part in _PARTS:
         candidate, defined = _defined(camera, given + part * steps, given)
-        fits = _all_have_rays(lens, candidate, rim)
+        fits = _seen_through(lens, lens.intrinsics.expand(len(candidate), 4), candidate, rim, unproject)[1].all(-1)
         fits = fits if defined is None else fits & defined
         if done is None and bool(fits.all()):  # mostly the first step does
             return (candidate.view(*amounts.shape[:-1], count),)
@@ -658,13 +658,16 @@ def _jittered(camera: Camera, amounts: Tensor, nominal: Tensor) -> tuple[Tensor]
     return (result.view(*amounts.shape[:-1], count).clone(),)
 
 
-def _all_have_rays(lens: Camera, distortion: Tensor, pixels: Tensor) -> Tensor:
-    """(C,) bool: whether lenses with coefficients (C, n) in place of their own have rays for all pixels (C, N, 2)."""
-    intrinsics = lens.intrinsics.expand(len(distortion), 4)
+def _seen_through(
+    lens: Camera, intrinsics: Tensor, distortion: Tensor, values: Tensor, way: Callable[[Native, Tensor], Any]
+) -> tuple[Tensor, Tensor]:
+    """What lenses of other numbers, (C, 4) and (C, n), make of pixels or rays (C, N, size); way: which of both."""
     made = Cameras(type_before_parametrizations(lens), intrinsics, distortion)
-    if made.native is None or not is_eager(pixels, intrinsics, distortion):
-        return remade(lens, intrinsics=intrinsics, distortion=distortion).unproject(pixels)[1].all(-1)
-    return unproject(made.native, pixels).valid.all(-1)
+    if made.native is None or not is_eager(values, intrinsics, distortion):
+        camera = remade(lens, intrinsics=intrinsics, distortion=distortion)
+        return camera.project(values) if way is project else camera.unproject(values)
+    planes, valid, *_ = way(made.native, values)
+    return planes.movedim(0, -1), valid
 
 
 _MOST_MEASURED = 64  # lenses
@@ -706,26 +709,28 @@ def _sensitivity(camera: Camera, distortion: Tensor, nominal: Tensor) -> Tensor:
 
     That moves the rim by its share of the distance from the centre to the corner.
     """
-    camera = remade(camera, intrinsics=nominal.detach().double(), distortion=distortion.detach().double())
-    pixels = _over(camera._size_for("its sensitivity")).to(distortion.device)
-    batch, count = camera.batch_shape, camera.distortion.shape[-1]
-    odd = camera.odd_in_x | camera.odd_in_y
-    lopsided = torch.tensor([name in odd for name in camera.distortion_names], device=pixels.device)
-    share = torch.where(lopsided, _SMALL, 1.0) / max(int((~lopsided).sum()), 1)
-    rays, seen = camera.unproject(pixels.expand(*batch, *pixels.shape))
+    count, size = distortion.shape[-1], camera._size_for("its sensitivity")
+    batch = broadcast_shapes(nominal.shape[:-1], distortion.shape[:-1])
+    intrinsics, k = (
+        t.detach().double().expand(*batch, t.shape[-1]).reshape(-1, t.shape[-1]) for t in (nominal, distortion)
+    )
+    pixels = _over(size).to(k.device).expand(len(k), -1, -1)
+    rays, seen = _seen_through(camera, intrinsics, k, pixels, unproject)
     # each coefficient less, then each more; the same lenses stand before any part of an image
-    change = _STEP * torch.eye(count, dtype=torch.float64, device=rays.device)
-    given = camera.distortion.expand(*batch, count).unsqueeze(-2)
-    distortion, _ = _defined(camera, given + torch.cat((-change, change)), given)
-    intrinsics = camera.intrinsics.expand(*batch, 4).unsqueeze(-2).expand(*batch, 2 * count, 4)
-    rays = rays.unsqueeze(-3).expand(*batch, 2 * count, *rays.shape[-2:])
-    ends, valid = remade(camera, intrinsics=intrinsics, distortion=distortion).project(rays)
-    (before, after), both = ends.split(count, -3), valid.unflatten(-2, (2, count)).all(-3)
-    moved = (after - before).norm(dim=-1) / (2 * _STEP)
-    most = torch.where(both & seen.unsqueeze(-2), moved, 0.0).amax(-1)
-    height, width = camera.height, camera.width
-    corner = ((width / 2) ** 2 + (height / 2) ** 2) ** 0.5
-    return share * torch.where(most > 0, corner / most.clamp(min=1e-30), 0.0)
+    change = _STEP * torch.eye(count, dtype=torch.float64, device=k.device)
+    lenses, _ = _defined(camera, k[:, None] + torch.cat((-change, change)), k[:, None])
+    many = [t.repeat_interleave(2 * count, 0) for t in (intrinsics, rays)]
+    ends, valid = _seen_through(camera, many[0], lenses.flatten(0, 1), many[1], project)
+    # (B, less and more, n, N, 2), and plain arithmetic on a few numbers
+    places, known = (t.unflatten(0, (-1, 2, count)).cpu().numpy() for t in (ends, valid))
+    moved = np.linalg.norm(places[:, 1] - places[:, 0], axis=-1) / (2 * _STEP)
+    most = np.where(known.all(1) & seen.cpu().numpy()[:, None], moved, 0.0).max(-1)
+    odd = camera.odd_in_x | camera.odd_in_y
+    lopsided = np.array([name in odd for name in camera.distortion_names], bool)
+    share = np.where(lopsided, np.float32(_SMALL), np.float32(1)) / np.float32(max((~lopsided).sum(), 1))
+    corner = math.hypot(size[1] / 2, size[0] / 2)
+    measured = share * np.where(most > 0, corner / most.clip(min=1e-30), 0.0)
+    return torch.from_numpy(measured.reshape(*batch, count)).to(k.device)
 
 
 @lru_cache(maxsize=16)

@@ -15,7 +15,6 @@ from camtorch._tracing import in_transform, is_concrete, may_look
 from camtorch.camera import Camera
 from camtorch.native import sampler
 from camtorch.warp.grid import Lattice, Sampling, straight_lattice
-from camtorch.warp.panorama import Seam
 from camtorch.warp.routes import positions, route_of
 from camtorch.warp.sampling import SHRINKS, SURELY, Fill, Mode, PaddingMode, Sampler, joined, render
 from camtorch.warp.warp import Warp, checked
@@ -302,28 +301,21 @@ def _halvings(where: Sampling | Lattice, size: tuple[int, int]) -> list[int]:
     """For every camera, how often to halve its image so that at most one and a half pixels of it come to one."""
     apart, every = (8, 4) if isinstance(where, Lattice) else (1, 32)
     planes = where.nodes if isinstance(where, Lattice) else where.grid.detach().movedim(-1, 1)
-    scale = shrinking(planes[:, :, ::every, ::every], apart * every, size, where.seam)
-    return (scale / SHRINKS).clamp(min=0.5).log2().ceil().long().clamp(min=0, max=_MOST).tolist()
-
-
-def shrinking(positions: Tensor, apart: int, size: tuple[int, int], seam: Seam | None = None) -> Tensor:
-    """(B,): how many pixels of images of a size come to one of the target, in the mean.
-
-    positions: (B, 2, n, m), as of `grid_sample`, of every so many pixels of the target.
-    """
-    seen = (positions.abs() <= 1).all(1)
-    planes = positions * positions.new_tensor([size[1] / 2, size[0] / 2])[:, None, None]
+    planes = planes[:, :, ::every, ::every]
+    seen = (planes.abs() <= 1).all(1)
+    grid, planes = planes, planes * planes.new_tensor([size[1] / 2, size[0] / 2])[:, None, None]
     total, count = planes.new_zeros(len(planes)), planes.new_zeros(len(planes))
     for dim in (-1, -2):
         n = planes.shape[dim] - 1
         steps = planes.diff(dim=dim)
-        if seam is None:
+        if where.seam is None:
             steps = torch.hypot(*steps.unbind(1))
         else:
-            steps = seam.distance(steps.movedim(1, -1), positions.narrow(dim, 0, n).movedim(1, -1), size)
+            steps = where.seam.distance(steps.movedim(1, -1), grid.narrow(dim, 0, n).movedim(1, -1), size)
         both = seen.narrow(dim, 0, n) & seen.narrow(dim, 1, n)
         total, count = total + (steps * both).sum((1, 2)), count + both.sum((1, 2))
-    return total / (count.clamp(min=1) * apart)
+    scale = total / (count.clamp(min=1) * apart * every)
+    return (scale / SHRINKS).clamp(min=0.5).log2().ceil().long().clamp(min=0, max=_MOST).tolist()
 
 
 def inverted(matrix: Tensor) -> Tensor:

@@ -10,6 +10,7 @@ import threading
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -20,7 +21,6 @@ from camtorch.native import memory, sampler
 from camtorch.native.library import library
 from camtorch.projection import compiled
 from camtorch.projection.compiled import LEFT_FROM, LEFT_MOST, LEFT_TO, POSITIONS, Between, Native
-from camtorch.warp.affine import shrinking
 from camtorch.warp.grid import FEWEST, MOST_KEPT, STEP, kept_probes
 from camtorch.warp.moving import between
 from camtorch.warp.panorama import seam_of
@@ -100,9 +100,15 @@ def _coarse(size: tuple[int, int], dtype: torch.dtype) -> tuple[Tensor, tuple[in
 def _surely_keeps_size(back: Between, sizes: Sizes) -> bool:
     """Whether no image shrinks so far that a `MirrorWarp` would halve it; back: from the target to the source."""
     nodes, shape = _coarse(sizes[1], back.dtype)
-    places, _ = back.rows(nodes, POSITIONS)
-    scale = shrinking(places.view(-1, *shape, 2).movedim(-1, 1), _APART, sizes[0])
-    return bool((scale < SURELY * SHRINKS).all())
+    places = back.rows(nodes, POSITIONS)[0].numpy().reshape(-1, *shape, 2)
+    seen = (abs(places) <= 1).all(-1)
+    places = places * np.array([sizes[0][1] / 2, sizes[0][0] / 2], places.dtype)
+    down, across = places[:, 1:] - places[:, :-1], places[:, :, 1:] - places[:, :, :-1]
+    total, count = 0.0, 0
+    for steps, both in ((down, seen[:, 1:] & seen[:, :-1]), (across, seen[:, :, 1:] & seen[:, :, :-1])):
+        total = total + (np.hypot(steps[..., 0], steps[..., 1]) * both).sum((1, 2))
+        count = count + both.sum((1, 2))
+    return bool((total < SURELY * SHRINKS * _APART * np.maximum(count, 1)).all())
 
 
 def batch_at_once(warp: Warp, images: Sequence[tuple[Tensor, Sampler]]) -> list[Tensor] | None:
