@@ -183,8 +183,9 @@ def _between(distance: Tensor, pixels: Tensor) -> Tensor:
     on = (u >= -0.5) & (u <= width - 0.5) & (v >= -0.5) & (v <= height - 0.5)
     u, v = torch.where(on, u, 0.0).clamp(0, width - 1), torch.where(on, v, 0.0).clamp(0, height - 1)
     left, top = u.floor().clamp(max=max(width - 2, 0)), v.floor().clamp(max=max(height - 2, 0))
-    right, down = u - left, v - top
-    rows, at = distance.flatten(1), (top * width + left).long()
+    dtype = torch.promote_types(distance.dtype, pixels.dtype)
+    right, down = (u - left).to(dtype), (v - top).to(dtype)
+    rows, at = distance.flatten(1).to(dtype), (top * width + left).long()
     across, below = int(width > 1), width * int(height > 1)
     a, b, c, d = (rows.gather(1, at + step) for step in (0, across, below, below + across))
     low, high = a.minimum(b).minimum(c.minimum(d)), a.maximum(b).maximum(c.maximum(d))
