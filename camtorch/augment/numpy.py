@@ -126,7 +126,7 @@ class Transform:
         inside = Single()
         entries: dict[str, tuple[dict[str, Tensor], Restore | None]] = {}
         camera = sample.get("camera")
-        size = getattr(self.augmentation._modules.get("camera") if camera is None else camera, "image_size", None)
+        size = getattr(self.augmentation._held("camera") if camera is None else camera, "image_size", None)
         context = size, *self.augmentation.fields.items()
         for name, value in sample.items():
             is_array = isinstance(value, np.ndarray)

@@ -218,7 +218,7 @@ class RandomCamera(Augmentation):
 
     def _are_plain(self, source: Camera) -> bool:
         """Whether plain numbers and arrays do, of which nothing is recorded."""
-        like = self._modules.get("like")
+        like = self._held("like")
         return are_numbers(*source._tensors, *(() if like is None else like._tensors))
 
     def _made(self, source: Camera, values: Mapping[str, Any], xp: Any) -> tuple[Camera, Tensor | None]:
@@ -246,7 +246,7 @@ class RandomCamera(Augmentation):
         """What a draw makes of a single camera as plain numbers; None where it takes more than that."""
         if self.min_filled or not self._is_usual or isinstance(draw["apply"], Tensor) or source.batch_shape:
             return None
-        if isinstance(source, PANORAMAS) or isinstance(self._modules.get("like"), PANORAMAS):
+        if isinstance(source, PANORAMAS) or isinstance(self._held("like"), PANORAMAS):
             return None
         values = self._values(source, draw)
         if any(isinstance(v, (np.ndarray, Tensor)) for v in values.values()) or not self._are_plain(source):
@@ -326,7 +326,7 @@ class RandomCamera(Augmentation):
     ) -> tuple[Camera, Sequence[Any], Tensor, tuple[int, int], Native | None]:
         """The new camera: of whose model, fx, fy, cx and cy, distortion, and (height, width); see `View.lens`."""
         size = self.image_size or (source.height, source.width)
-        like = self._modules.get("like")
+        like = self._held("like")
         base = source if like is None else like
         dtype, device = torch.promote_types(source.intrinsics.dtype, torch.float32), source.intrinsics.device
         if self._is_real:

@@ -418,6 +418,10 @@ class SampleTransform(nn.Module):
             f"labels go; {how}"
         )
 
+    def _held(self, name: str) -> Camera | None:
+        """A camera of its own, from the dict where it lies: `nn.Module` looks into all."""
+        return cast("Camera | None", self._modules.get(name))
+
     # -- moving
 
     def _given(self, sample: Mapping[str, object] | None, fields: Mapping[str, object]) -> Sample:
@@ -448,7 +452,7 @@ class SampleTransform(nn.Module):
         predicted: whether it may hold what networks made, whose values may be bad.
         """
         camera: Any = sample.get("camera")
-        camera = self._modules.get("camera") if camera is None else camera
+        camera = self._held("camera") if camera is None else camera
         form = self._form_of(sample, camera)
         if form is None or (known := self._forms.get(form)) is None:
             result = self._checked_batch(sample, camera, predicted)

@@ -8,7 +8,7 @@ import itertools
 import math
 import threading
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -101,7 +101,7 @@ def _surely_keeps_size(back: Between, sizes: Sizes) -> bool:
     """Whether no image shrinks so far that a `MirrorWarp` would halve it; back: from the target to the source."""
     nodes, shape = _coarse(sizes[1], back.dtype)
     places = back.rows(nodes, POSITIONS)[0].numpy().reshape(-1, *shape, 2)
-    seen = (abs(places) <= 1).all(-1)
+    seen: np.ndarray[Any, Any] = np.all(abs(places) <= 1, axis=-1)
     places = places * np.array([sizes[0][1] / 2, sizes[0][0] / 2], places.dtype)
     down, across = places[:, 1:] - places[:, :-1], places[:, :, 1:] - places[:, :, :-1]
     total, count = 0.0, 0
@@ -141,7 +141,7 @@ def batch_at_once(warp: Warp, images: Sequence[tuple[Tensor, Sampler]]) -> list[
         return None
     if warp._decides and _smooth(images) and not _surely_keeps_size(back, sizes):
         return None
-    kept = []  # what jobs point to
+    kept: list[object] = []  # what jobs point to
 
     def jobs(on_lattice: tuple[int, ...]) -> list[bytes]:
         pairs = zip(images, results, strict=True)
