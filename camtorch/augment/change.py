@@ -321,7 +321,7 @@ class Change:
             return None
         device = self.parts[0].camera.intrinsics.device
         flags = [
-            torch.zeros(n, dtype=torch.bool, device=device) if t is None else (torch.linalg.det(t) < 0).expand(n)
+            torch.zeros(n, dtype=torch.bool, device=device) if t is None else _is_mirror(t).expand(n)
             for t, n in zip(turns, self._counts, strict=True)
         ]
         rows = flags[0] if self._order is None else torch.cat(flags)[self._order]
@@ -555,6 +555,12 @@ def as_one(camera: Camera | Sequence[Camera]) -> Camera:
 def alone(camera: Camera) -> Camera:
     """A batch of one as the camera that it holds, which serves any number of samples."""
     return camera[0] if camera.batch_shape == (1,) else camera
+
+
+def _is_mirror(rotation: Tensor) -> Tensor:
+    """(*B,) bool: whether (*B, 3, 3) has a negative determinant, without the many steps of torch's own."""
+    x, y, z = rotation.unbind(-2)
+    return (torch.linalg.cross(x, y) * z).sum(-1) < 0
 
 
 def _eye(like: Tensor) -> Tensor:
