@@ -530,7 +530,7 @@ class Augmentation(SampleTransform):
             raise ValueError(f"{self._name}: the draw is for {change.count} samples, here are {count}")
         if not torch.compiler.is_compiling():
             self.__dict__["last"] = change  # as nn.Module would, after some questions
-            if count and not self._warned and any(found == "image" for found, _ in named.values()):
+            if count and not self._warned and "image" in [found for found, _ in named.values()]:
                 self.tell_of_empty_images(camera)
         return self._moved(sample, named, batched, change)
 
