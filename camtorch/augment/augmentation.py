@@ -120,7 +120,8 @@ class Spans:
         self.low = np.repeat([interval.low for interval in ranges.values()] or [0.0], counts or [0])
         self.wide = np.repeat([interval.high - interval.low for interval in ranges.values()] or [0.0], counts or [0])
         self.total = sum(counts)
-        self._ends = self.low[: self.total].tolist(), self.wide[: self.total].tolist()
+        every = [interval for interval, n in zip(ranges.values(), counts, strict=True) for _ in range(n)]
+        self._ends = [(interval.low, interval.high - interval.low) for interval in every]
         end = 0
         for (name, interval), count in zip(ranges.items(), counts, strict=True):
             shape = (rows, interval.size) if interval.size else None
@@ -129,7 +130,7 @@ class Spans:
 
     def alone(self, shares: Sequence[float]) -> dict[str, list[Any]]:
         """The values of one row as plain numbers, (1,) or (1, size)."""
-        values = [low + wide * share for low, wide, share in zip(*self._ends, shares, strict=True)]
+        values = [low + wide * share for (low, wide), share in zip(self._ends, shares, strict=True)]
         return {n: values[at] if shape is None else [values[at]] for n, at, shape in self._places}
 
     def of(self, shares: Any) -> dict[str, Any]:

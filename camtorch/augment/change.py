@@ -560,7 +560,8 @@ def alone(camera: Camera) -> Camera:
 def _is_mirror(rotation: Tensor) -> Tensor:
     """(*B,) bool: whether (*B, 3, 3) has a negative determinant, without the many steps of torch's own."""
     x, y, z = rotation.unbind(-2)
-    return (torch.linalg.cross(x, y) * z).sum(-1) < 0
+    negative: Tensor = (torch.linalg.cross(x, y) * z).sum(-1) < 0
+    return negative
 
 
 def _eye(like: Tensor) -> Tensor:
