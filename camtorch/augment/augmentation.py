@@ -120,11 +120,18 @@ class Spans:
         self.low = np.repeat([interval.low for interval in ranges.values()] or [0.0], counts or [0])
         self.wide = np.repeat([interval.high - interval.low for interval in ranges.values()] or [0.0], counts or [0])
         self.total = sum(counts)
+        every = [interval for interval, n in zip(ranges.values(), counts, strict=True) for _ in range(n)]
+        self._ends = [(interval.low, interval.high - interval.low) for interval in every]
         end = 0
         for (name, interval), count in zip(ranges.items(), counts, strict=True):
             shape = (rows, interval.size) if interval.size else None
             self._places.append((name, slice(end, end + count), shape))
             end += count
+
+    def alone(self, shares: Sequence[float]) -> dict[str, list[Any]]:
+        """The values of one row as plain numbers, (1,) or (1, size)."""
+        values = [low + wide * share for (low, wide), share in zip(self._ends, shares, strict=True)]
+        return {n: values[at] if shape is None else [values[at]] for n, at, shape in self._places}
 
     def of(self, shares: Any) -> dict[str, Any]:
         """The values (rows,) or (rows, size) at shares (total,) of their ranges, arrays or tensors."""
@@ -148,8 +155,8 @@ def draw(
     and what is to be given as `spans` for the next draw.
 
     The numbers come in the order in which kornia asks for them: first the gate, if there is a choice, then the ranges.
-    They are arrays, which take less time than tensors, and tensors where the generator is on another device or what is
-    done with them is compiled.
+    They are lists of one sample and arrays of several, which take less time than tensors, and tensors where the
+    generator is on another device or what is done with them is compiled.
     """
     if not (generator is None or isinstance(generator, torch.Generator)):
         raise TypeError(f"draw: generator must be a torch.Generator, or None; got {shown(generator)}")
@@ -161,6 +168,8 @@ def draw(
     # in float64, so that what is drawn is what every precision sees
     shares: Any = torch.rand(spans.total, generator=generator, dtype=torch.float64, device=device)
     if device is _CPU and not torch.compiler.is_compiling():
+        if rows == count == 1:
+            return {"apply": [p >= 1] if gate is None else gate.tolist(), **spans.alone(shares.tolist())}, spans
         gate, shares = np.array([p >= 1] * rows, bool) if gate is None else gate.numpy(), shares.numpy()
     elif gate is None:
         gate = torch.full((rows,), p >= 1, device=device)
@@ -303,10 +312,13 @@ class Augmentation(SampleTransform):
     ) -> dict[str, Tensor]:
         """`draw` with another p and same_on_batch."""
         numbers = self._numbers(count, p, same_on_batch, generator)
-        return {name: torch.as_tensor(value) for name, value in numbers.items()}
+        return {
+            name: torch.as_tensor(value, dtype=torch.bool if name == "apply" else torch.float64)
+            for name, value in numbers.items()
+        }
 
     def _numbers(self, count: int, p: float, same_on_batch: bool, generator: torch.Generator | None) -> dict[str, Any]:
-        """The draw as arrays or tensors; see the function `draw`."""
+        """The draw as lists, arrays or tensors; see the function `draw`."""
         values, self.__dict__["_spans"] = draw(self.ranges, count, p, same_on_batch, generator, self._spans)
         return values
 
@@ -347,20 +359,20 @@ class Augmentation(SampleTransform):
         groups: list[tuple[list[int] | None, Camera]] = [(None, camera)]
         if isinstance(camera, Mixed):
             groups = list(camera.groups)
-        before = {group.image_size for _, group in groups}
-        if 0 < self.p < 1 and self.image_size is not None and before != {self.image_size}:
+        if 0 < self.p < 1 and self.image_size is not None and _sizes(groups) != {self.image_size}:
             raise ValueError(
                 f"{self._name}: with p < 1 the image_size must be that of the images, so that all come out alike; "
-                f"got image_size={self.image_size} for images of {', '.join(map(str, before))}"
+                f"got image_size={self.image_size} for images of {', '.join(map(str, _sizes(groups)))}"
             )
 
         def part(rows: list[int] | None, source: Camera) -> Part:
             return self._part(rows, source, draw if rows is None else {n: value[rows] for n, value in draw.items()})
 
-        looks = isinstance(applied, np.ndarray) or may_look(applied) or count == 0
-        if not looks or all(applied.tolist()):  # traced, all rows move, and a gate chooses
+        looks = not isinstance(applied, Tensor) or may_look(applied) or count == 0
+        chosen = applied if isinstance(applied, list) else applied.tolist() if looks else []
+        if all(chosen):  # traced, all rows move, and a gate chooses
             return by_kinds(count, camera, part, None if looks or self.p == 1 else applied)
-        parts, chosen = [], applied.tolist()
+        parts = []
         for rows, group in groups:
             rows = list(range(count)) if rows is None else rows
             for moves in (True, False):
@@ -370,7 +382,7 @@ class Augmentation(SampleTransform):
                     own = [rows[n] for n in here]
                     parts.append(part(own, source) if moves else Part(own, None, source))
         sizes = {part.target.image_size for part in parts}
-        if len(sizes) > 1 and len(before) == 1:
+        if len(sizes) > 1 and len(_sizes(groups)) == 1:
             found = sorted(map(str, sizes))
             raise ValueError(
                 f"{self._name}: samples of one batch would come out in the sizes {found}; with p < 1 the size must stay"
@@ -519,7 +531,7 @@ class Augmentation(SampleTransform):
             raise ValueError(f"{self._name}: the draw is for {change.count} samples, here are {count}")
         if not torch.compiler.is_compiling():
             self.__dict__["last"] = change  # as nn.Module would, after some questions
-            if count and any(found == "image" for found, _ in named.values()):
+            if count and not self._warned and "image" in [found for found, _ in named.values()]:
                 self.tell_of_empty_images(camera)
         return self._moved(sample, named, batched, change)
 
@@ -574,6 +586,11 @@ class Augmentation(SampleTransform):
         parts = [f"{name}={interval}" for name, interval in self.ranges.items()]
         options = {"p": self.p, "same_on_batch": self.same_on_batch, **self.options, "min_filled": self.min_filled}
         return ", ".join(parts + [f"{name}={value!r}" for name, value in options.items()])
+
+
+def _sizes(groups: Sequence[tuple[list[int] | None, Camera]]) -> set[tuple[int, int] | None]:
+    """Of the images of groups of cameras."""
+    return {camera.image_size for _, camera in groups}
 
 
 def _are_alike(value: Any) -> bool:

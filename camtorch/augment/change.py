@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any, TypeVar
 
 import torch
@@ -268,6 +268,14 @@ class Change:
             return view.camera()
         return (self.target[0] if self.gate is not None else alone(self.parts[0].target)).clone()
 
+    @property
+    def single_rotation(self) -> Tensor:
+        """(3, 3): the rotation of a change of one sample, of its own memory."""
+        view = self.parts[0].moves
+        if not isinstance(view, View):
+            return self.rotation[0].clone()
+        return (_no_turn(view.distortion.dtype) if view.rotation is None else view.rotation).clone()
+
     def leads_to(self, camera: Camera | Sequence[Camera]) -> bool:
         """Whether these may be the cameras after: of their number and intrinsics, where one may look."""
         ours, theirs = (one.intrinsics.detach().reshape(-1, 4) for one in (self.target, as_one(camera)))
@@ -313,7 +321,7 @@ class Change:
             return None
         device = self.parts[0].camera.intrinsics.device
         flags = [
-            torch.zeros(n, dtype=torch.bool, device=device) if t is None else (torch.linalg.det(t) < 0).expand(n)
+            torch.zeros(n, dtype=torch.bool, device=device) if t is None else _is_mirror(t).expand(n)
             for t, n in zip(turns, self._counts, strict=True)
         ]
         rows = flags[0] if self._order is None else torch.cat(flags)[self._order]
@@ -549,8 +557,21 @@ def alone(camera: Camera) -> Camera:
     return camera[0] if camera.batch_shape == (1,) else camera
 
 
+def _is_mirror(rotation: Tensor) -> Tensor:
+    """(*B,) bool: whether (*B, 3, 3) has a negative determinant, without the many steps of torch's own."""
+    x, y, z = rotation.unbind(-2)
+    negative: Tensor = (torch.linalg.cross(x, y) * z).sum(-1) < 0
+    return negative
+
+
 def _eye(like: Tensor) -> Tensor:
     return torch.eye(3, dtype=like.dtype, device=like.device)
+
+
+@lru_cache(maxsize=4)
+def _no_turn(dtype: torch.dtype) -> Tensor:
+    with torch.inference_mode(False):
+        return torch.eye(3, dtype=dtype, device="cpu")
 
 
 def _gated(gate: Tensor, moved: Tensor, kept: Tensor) -> Tensor:

@@ -137,11 +137,12 @@ class Compose(Augmentation):
     # -- drawing
 
     def _numbers(self, count: int, p: float, same_on_batch: bool, generator: torch.Generator | None) -> dict[str, Any]:
-        values, _ = draw({}, count, p, same_on_batch, generator)
+        values: dict[str, Any] = draw({}, count, p, same_on_batch, generator)[0]
+        values["apply"] = values["apply"] if isinstance(values["apply"], Tensor) else np.asarray(values["apply"])
         for i, part in enumerate(self.parts):
             own = part._numbers(count, part.p, same_on_batch or part.same_on_batch, generator)
             for key, value in own.items():
-                values[f"{i}.{key}"] = value.double() if isinstance(value, Tensor) else value.astype(np.float64)
+                values[f"{i}.{key}"] = value.double() if isinstance(value, Tensor) else np.asarray(value, np.float64)
         return values
 
     def size_after(self, size: tuple[int, int]) -> tuple[int, int]:

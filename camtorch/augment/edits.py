@@ -79,7 +79,8 @@ class Edit(Augmentation):
     def map_of(self, draw: Mapping[str, Any], size: tuple[int, int]) -> tuple[Tensor | None, tuple[int, int]]:
         """What a draw does to images of a size: `edit`, where it applies; None where it never does."""
         applied = torch.as_tensor(draw["apply"])
-        values = {name: torch.as_tensor(value).double() for name, value in draw.items() if name != "apply"}
+        given = {name: value for name, value in draw.items() if name != "apply"}
+        values = {name: torch.as_tensor(value, dtype=torch.float64) for name, value in given.items()}
         matrix, new = self.edit(size, values)
         all_are = holds(applied) or (self.p == 1 and not fails(applied))
         if new != size and (not all_are or 0 < self.p < 1):

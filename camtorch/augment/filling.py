@@ -12,8 +12,9 @@ from camtorch._arguments import broadcast_shapes
 from camtorch._module import remade
 from camtorch._opaque import CameraNumbers, opaque
 from camtorch.camera import Camera
-from camtorch.rotations import rotation_matrix, rotation_vector, turn
+from camtorch.rotations import rotation_matrix, rotation_vector
 from camtorch.warp.boxes import along_edges
+from camtorch.warp.moving import moved_pixels
 
 _POINTS, _RIM = 1000, 16  # over the image, and along each of its edges
 _ROOT = 1.324717957244746
@@ -56,9 +57,8 @@ def _part_shown(
         shapes.append(zoom.shape)
         centre = target.intrinsics[..., None, 2:]
         pixels = centre + (pixels - centre) / zoom[..., None, None]
-    rays, has_ray = target.unproject(pixels.expand(*broadcast_shapes(*shapes), *pixels.shape[-2:]))
-    seen, mapped = source.project(turn(None if rotation is None else rotation.mT, rays, "rays"))
-    shown = has_ray & mapped & source.contains(seen)
+    pixels = pixels.expand(*broadcast_shapes(*shapes), *pixels.shape[-2:])
+    _, shown = moved_pixels(target, source, None if rotation is None else rotation.mT, pixels, on_image=True)
     part = shown[..., :_POINTS].to(pixels.dtype).mean(-1)
     return torch.where(shown[..., _POINTS:].all(-1), part, part.clamp(max=_NEARLY))
 

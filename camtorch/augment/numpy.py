@@ -126,7 +126,7 @@ class Transform:
         inside = Single()
         entries: dict[str, tuple[dict[str, Tensor], Restore | None]] = {}
         camera = sample.get("camera")
-        size = getattr(self.augmentation.camera if camera is None else camera, "image_size", None)
+        size = getattr(self.augmentation._held("camera") if camera is None else camera, "image_size", None)
         context = size, *self.augmentation.fields.items()
         for name, value in sample.items():
             is_array = isinstance(value, np.ndarray)
@@ -246,9 +246,8 @@ def as_tensor(name: str, value: object, size: tuple[int, int] | None = None) -> 
 
 def as_array(image: Tensor, like: Array) -> Array:
     """An image (C, H, W) in the layout and the dtype of an array: itself, if its channels come last in memory too."""
-    image = image.detach() if image.is_cpu else image.detach().cpu()
-    array = (image.permute(1, 2, 0).contiguous() if like.ndim == 3 else image[0]).numpy()
-    return array if array.dtype == like.dtype and array.flags.c_contiguous else np.ascontiguousarray(array, like.dtype)
+    planes = _plain(image.detach() if image.requires_grad else image)
+    return np.ascontiguousarray(planes.transpose(1, 2, 0) if like.ndim == 3 else planes[0], like.dtype)
 
 
 def _checked(name: str, value: object) -> Array:

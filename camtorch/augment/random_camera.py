@@ -29,8 +29,8 @@ from camtorch.augment.sample import Named
 from camtorch.camera import Camera
 from camtorch.lenses.drawing import FOLD, covering, drawn
 from camtorch.models import MODELS, KannalaBrandt
-from camtorch.projection.compiled import Native, project, unproject
-from camtorch.projection.rays import field_of_view, image_lattice, polar_rays, reach
+from camtorch.projection.compiled import Native, project, project_numbers, unproject
+from camtorch.projection.rays import field_of_view, pixel_lattice, polar_rays, reach
 from camtorch.projection.rows import Cameras, single_native
 from camtorch.rotations import mount_elements
 from camtorch.warp.boxes import along_edges
@@ -218,7 +218,8 @@ class RandomCamera(Augmentation):
 
     def _are_plain(self, source: Camera) -> bool:
         """Whether plain numbers and arrays do, of which nothing is recorded."""
-        return are_numbers(*source._tensors, *(() if self.like is None else self.like._tensors))
+        like = self._held("like")
+        return are_numbers(*source._tensors, *(() if like is None else like._tensors))
 
     def _made(self, source: Camera, values: Mapping[str, Any], xp: Any) -> tuple[Camera, Tensor | None]:
         """The same by tensors, arrays in float64, or numbers: with the functions of torch, of numpy or of math."""
@@ -235,7 +236,7 @@ class RandomCamera(Augmentation):
         angles = [values.get(name, none) * (math.pi / 180) for name in _TURNS]
         elements = mount_elements([xp.cos(a) for a in angles], [xp.sin(a) for a in angles])
         rotation = joined(elements, like, xp)
-        return rotation.view(*rotation.shape[:-1], 3, 3)
+        return rotation.view(3, 3) if xp is math else rotation.view(*rotation.shape[:-1], 3, 3)
 
     def _part(self, rows: list[int] | None, source: Camera, draw: Mapping[str, Any]) -> Part:
         view = self._view(source, draw)
@@ -243,9 +244,9 @@ class RandomCamera(Augmentation):
 
     def _view(self, source: Camera, draw: Mapping[str, Any]) -> View | None:
         """What a draw makes of a single camera as plain numbers; None where it takes more than that."""
-        if self.min_filled or not self._is_usual or not isinstance(draw["apply"], np.ndarray) or source.batch_shape:
+        if self.min_filled or not self._is_usual or isinstance(draw["apply"], Tensor) or source.batch_shape:
             return None
-        if isinstance(source, PANORAMAS) or isinstance(self.like, PANORAMAS):
+        if isinstance(source, PANORAMAS) or isinstance(self._held("like"), PANORAMAS):
             return None
         values = self._values(source, draw)
         if any(isinstance(v, (np.ndarray, Tensor)) for v in values.values()) or not self._are_plain(source):
@@ -325,7 +326,8 @@ class RandomCamera(Augmentation):
     ) -> tuple[Camera, Sequence[Any], Tensor, tuple[int, int], Native | None]:
         """The new camera: of whose model, fx, fy, cx and cy, distortion, and (height, width); see `View.lens`."""
         size = self.image_size or (source.height, source.width)
-        base = source if self.like is None else self.like
+        like = self._held("like")
+        base = source if like is None else like
         dtype, device = torch.promote_types(source.intrinsics.dtype, torch.float32), source.intrinsics.device
         if self._is_real:
             share = torch.as_tensor(values["lens"], dtype=dtype, device=device)
@@ -427,11 +429,8 @@ def _seen_across(base: Camera, sine: float, cosine: float) -> float | None:
     native = rows_of(base, base.intrinsics, base.distortion).native
     if native is None:
         return None
-    like = base.intrinsics
-    rays = joined((-sine, 0.0, cosine, sine, 0.0, cosine), like, math).view(1, 2, 3)
-    pixels, valid = project(native, rays)
-    (left, right), _ = pixels.view(2, 2).tolist()
-    return right - left if bool(valid.all()) else None
+    pixels = project_numbers(native, (-sine, 0.0, cosine, sine, 0.0, cosine))
+    return None if pixels is None else pixels[2] - pixels[0]
 
 
 class RandomMount(RandomCamera):
@@ -497,7 +496,8 @@ class RandomMount(RandomCamera):
         (key, values), count = depth.popitem(), len(draw["apply"])
         part = super()._part(rows, source, {name: v for name, v in draw.items() if name not in (*_SHIFTS, key)})
         assert part.warp is not None
-        shift = torch.stack([torch.as_tensor(draw[name]) for name in _SHIFTS], -1).expand(count, 3)
+        shifts = [torch.as_tensor(draw[name], dtype=torch.float64) for name in _SHIFTS]
+        shift = torch.stack(shifts, -1).expand(count, 3)
         kind = next(kind for kind, name in _DEPTHS.items() if name == key)
         kind = "z" if kind == "depth" else kind
         warp = ShiftedWarp(source, part.target, part.warp.rotation, values, kind, shift, **self.options)
@@ -619,7 +619,7 @@ def _jittered_alone(
             native = single_native(model, intrinsics, candidate)
             if native is None:
                 break
-            if bool(unproject(native, rim).valid.all()):
+            if unproject(native, rim).valid.numpy().all():
                 return candidate, native
     if native is not None:
         return k, None
@@ -646,7 +646,7 @@ def _jittered(camera: Camera, amounts: Tensor, nominal: Tensor) -> tuple[Tensor]
     result, done = given, None
     for part in _PARTS:
         candidate, defined = _defined(camera, given + part * steps, given)
-        fits = _all_have_rays(lens, candidate, rim)
+        fits = _seen_through(lens, lens.intrinsics.expand(len(candidate), 4), candidate, rim, unproject)[1].all(-1)
         fits = fits if defined is None else fits & defined
         if done is None and bool(fits.all()):  # mostly the first step does
             return (candidate.view(*amounts.shape[:-1], count),)
@@ -658,13 +658,16 @@ def _jittered(camera: Camera, amounts: Tensor, nominal: Tensor) -> tuple[Tensor]
     return (result.view(*amounts.shape[:-1], count).clone(),)
 
 
-def _all_have_rays(lens: Camera, distortion: Tensor, pixels: Tensor) -> Tensor:
-    """(C,) bool: whether lenses with coefficients (C, n) in place of their own have rays for all pixels (C, N, 2)."""
-    intrinsics = lens.intrinsics.expand(len(distortion), 4)
+def _seen_through(
+    lens: Camera, intrinsics: Tensor, distortion: Tensor, values: Tensor, way: Callable[[Native, Tensor], Any]
+) -> tuple[Tensor, Tensor]:
+    """What lenses of other numbers, (C, 4) and (C, n), make of pixels or rays (C, N, size); way: which of both."""
     made = Cameras(type_before_parametrizations(lens), intrinsics, distortion)
-    if made.native is None or not is_eager(pixels, intrinsics, distortion):
-        return remade(lens, intrinsics=intrinsics, distortion=distortion).unproject(pixels)[1].all(-1)
-    return unproject(made.native, pixels).valid.all(-1)
+    if made.native is None or not is_eager(values, intrinsics, distortion):
+        camera = remade(lens, intrinsics=intrinsics, distortion=distortion)
+        return camera.project(values) if way is project else camera.unproject(values)
+    planes, valid, *_ = way(made.native, values)
+    return planes.movedim(0, -1), valid
 
 
 _MOST_MEASURED = 64  # lenses
@@ -706,27 +709,36 @@ def _sensitivity(camera: Camera, distortion: Tensor, nominal: Tensor) -> Tensor:
 
     That moves the rim by its share of the distance from the centre to the corner.
     """
-    camera = remade(camera, intrinsics=nominal.detach().double(), distortion=distortion.detach().double())
-    pixels = image_lattice(camera, _SIDE, _SIDE).flatten(0, 1)
-    batch, count = camera.batch_shape, camera.distortion.shape[-1]
+    count, size = distortion.shape[-1], camera._size_for("its sensitivity")
+    batch = broadcast_shapes(nominal.shape[:-1], distortion.shape[:-1])
+    intrinsics, k = (
+        t.detach().double().expand(*batch, t.shape[-1]).reshape(-1, t.shape[-1]) for t in (nominal, distortion)
+    )
+    pixels = _over(size).to(k.device).expand(len(k), -1, -1)
+    rays, seen = _seen_through(camera, intrinsics, k, pixels, unproject)
+    # each coefficient less, then each more; the same lenses stand before any part of an image
+    change = _STEP * torch.eye(count, dtype=torch.float64, device=k.device)
+    lenses, _ = _defined(camera, k[:, None] + torch.cat((-change, change)), k[:, None])
+    many = [t.repeat_interleave(2 * count, 0) for t in (intrinsics, rays)]
+    ends, valid = _seen_through(camera, many[0], lenses.flatten(0, 1), many[1], project)
+    # (B, less and more, n, N, 2), and plain arithmetic on a few numbers
+    places, known = (t.unflatten(0, (-1, 2, count)).cpu().numpy() for t in (ends, valid))
+    moved = np.linalg.norm(places[:, 1] - places[:, 0], axis=-1) / (2 * _STEP)
+    most = np.where(known.all(1) & seen.cpu().numpy()[:, None], moved, 0.0).max(-1)
     odd = camera.odd_in_x | camera.odd_in_y
-    lopsided = torch.tensor([name in odd for name in camera.distortion_names], device=pixels.device)
-    share = torch.where(lopsided, _SMALL, 1.0) / max(int((~lopsided).sum()), 1)
-    rays, seen = camera.unproject(pixels.expand(*batch, *pixels.shape))
-    rays = rays.unsqueeze(-3).expand(*batch, count, *pixels.shape[:-1], 3)
-    ends = []
-    for sign in (-1, 1):
-        change = sign * _STEP * torch.eye(count, dtype=torch.float64, device=rays.device)
-        given = camera.distortion.expand(*batch, count).unsqueeze(-2)
-        distortion, _ = _defined(camera, given + change, given)
-        intrinsics = camera.intrinsics.expand(*batch, 4).unsqueeze(-2).expand(*batch, count, 4)
-        ends.append(remade(camera, intrinsics=intrinsics, distortion=distortion).project(rays))
-    (before, valid), (after, also) = ends
-    moved = (after - before).norm(dim=-1) / (2 * _STEP)
-    most = torch.where(valid & also & seen.unsqueeze(-2), moved, 0.0).amax(-1)
-    height, width = camera.height, camera.width
-    corner = ((width / 2) ** 2 + (height / 2) ** 2) ** 0.5
-    return share * torch.where(most > 0, corner / most.clamp(min=1e-30), 0.0)
+    lopsided = np.array([name in odd for name in camera.distortion_names], bool)
+    share = np.where(lopsided, np.float32(_SMALL), np.float32(1)) / np.float32(max((~lopsided).sum(), 1))
+    corner = math.hypot(size[1] / 2, size[0] / 2)
+    measured = share * np.where(most > 0, corner / most.clip(min=1e-30), 0.0)
+    return torch.from_numpy(measured.reshape(*batch, count)).to(k.device)
+
+
+@lru_cache(maxsize=16)
+def _over(size: tuple[int, int]) -> Tensor:
+    """(N, 2) in float64: pixels in even steps over images of a size, to their outer edges."""
+    with torch.inference_mode(False):
+        edges = torch.tensor([[-0.5, -0.5], [size[1] - 0.5, size[0] - 0.5]], dtype=torch.float64)
+        return pixel_lattice(edges[0], edges[1], _SIDE, _SIDE).flatten(0, 1)
 
 
 def _defined(camera: Camera, distortion: Tensor, otherwise: Tensor) -> tuple[Tensor, Tensor | None]:

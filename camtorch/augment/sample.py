@@ -34,8 +34,7 @@ from camtorch.camera import Camera
 from camtorch.mixed import Listed
 from camtorch.models import Pinhole
 from camtorch.rotations import are_rotations, check_rotation, rotation_matrix, rotation_vector
-from camtorch.warp.at_once import Work, at_once
-from camtorch.warp.batch_at_once import batch_at_once
+from camtorch.warp.at_once import at_once, batch_at_once
 from camtorch.warp.sampling import Options, Sampler, as_options
 
 P = ParamSpec("P")
@@ -420,6 +419,10 @@ class SampleTransform(nn.Module):
             f"labels go; {how}"
         )
 
+    def _held(self, name: str) -> Camera | None:
+        """A camera of its own, from the dict where it lies: `nn.Module` looks into all."""
+        return cast("Camera | None", self._modules.get(name))
+
     # -- moving
 
     def _given(self, sample: Mapping[str, object] | None, fields: Mapping[str, object]) -> Sample:
@@ -450,7 +453,7 @@ class SampleTransform(nn.Module):
         predicted: whether it may hold what networks made, whose values may be bad.
         """
         camera: Any = sample.get("camera")
-        camera = self.camera if camera is None else camera
+        camera = self._held("camera") if camera is None else camera
         form = self._form_of(sample, camera)
         if form is None or (known := self._forms.get(form)) is None:
             result = self._checked_batch(sample, camera, predicted)
@@ -559,21 +562,23 @@ class SampleTransform(nn.Module):
         if self.mirroring is not None:
             options["lateral"] = self.mirroring.lateral
 
-        def put(name: str, value: Tensor | list[Tensor]) -> None:
-            moved[name] = value if batched or isinstance(value, list) else value.squeeze(0)
-
-        known = {} if self.valid_mask or sample.get("image_valid") is not None else together(change, named, **options)
+        known = {}
+        if not self.valid_mask and sample.get("image_valid") is None:
+            known = together(change, named, **options, batched=batched)
         for name, (found, value) in named.items():
             valid: Any
-            if isinstance(value, list):
+            if name in known:
+                moved[name], valid = known[name]
+            elif isinstance(value, list):
                 pairs = [self._one(change.row(i), found, v.unsqueeze(0), options) for i, v in enumerate(value)]
-                put(name, [result.squeeze(0) for result, _ in pairs])
+                moved[name] = [result.squeeze(0) for result, _ in pairs]
                 valid = [v.squeeze(0) for _, v in pairs if v is not None] or None
             else:
-                result, valid = known[name] if name in known else self._one(change, found, value, options)
-                put(name, result)
+                result, valid = self._one(change, found, value, options)
+                moved[name] = result if batched else result.squeeze(0)
+                valid = valid if batched or valid is None else valid.squeeze(0)
             if valid is not None:
-                put(f"{name}_valid", self._still(f"{name}_valid", valid, sample.get(f"{name}_valid"), batched))
+                moved[f"{name}_valid"] = self._still(f"{name}_valid", valid, sample.get(f"{name}_valid"))
         before = sample.get("image_valid")
         if before is not None:
             before = torch.as_tensor(before) != 0
@@ -584,9 +589,10 @@ class SampleTransform(nn.Module):
         if self.valid_mask and any(found == "image" for found, _ in named.values()):
             before = change.valid_mask() if before is None else before & change.valid_mask()
         if before is not None:
-            put("image_valid", before.contiguous())
+            before = before.contiguous()
+            moved["image_valid"] = before if batched else before.squeeze(0)
         if "rotation" not in named:
-            put("rotation", change.rotation.clone())
+            moved["rotation"] = change.rotation.clone() if batched else change.single_rotation
         if self.mirroring is not None:
             self._mirror(moved, named, change.mirrored, batched)
         if not isinstance(change.parts[0].camera, Unknown):
@@ -636,18 +642,17 @@ class SampleTransform(nn.Module):
         # geometry is computed in float32 at least; what came in half precision goes out in it
         return _in_range(result, value.dtype) if value.dtype.is_floating_point else result, valid
 
-    def _still(self, name: str, valid: Any, given: Any, batched: bool) -> Any:
-        """Flags of a batch, invalid where those given were; any number but zero is valid, as in COCO."""
+    def _still(self, name: str, valid: Any, given: Any) -> Any:
+        """Flags that come out, invalid where those given were; any number but zero is valid, as in COCO."""
         if given is None:
             return valid
-        many, single = isinstance(valid, list), not batched
-        now = valid if many else [valid.squeeze(0) if single else valid]
-        before = [torch.as_tensor(b) != 0 for b in (given if many else [given])]
+        many = isinstance(valid, list)
+        now, before = valid if many else [valid], [torch.as_tensor(b) != 0 for b in (given if many else [given])]
         if [b.shape for b in before] != [v.shape for v in now]:
             shapes = ", ".join(str(tuple(v.shape)) for v in now)
             raise ValueError(f"{self._name}: {name} must be {shapes}; got {[tuple(b.shape) for b in before]}")
         now = [v & b.to(v.device) for v, b in zip(now, before, strict=True)]
-        return now if many else now[0].unsqueeze(0) if single else now[0]
+        return now if many else now[0]
 
 
 def _in_range(values: Tensor, dtype: torch.dtype) -> Tensor:
@@ -659,45 +664,47 @@ def _in_range(values: Tensor, dtype: torch.dtype) -> Tensor:
 
 
 def together(
-    change: Change, named: Named, mask_fill: float = 0.0, lateral: float = 0
+    change: Change, named: Named, mask_fill: float = 0.0, lateral: float = 0, batched: bool = True
 ) -> dict[str, tuple[Tensor, Tensor | None]]:
-    """What moves by one compiled call, and its validity: images and pixels of a batch of one, images of another."""
+    """What moves by one compiled call, and its validity: images and pixels of a batch of one, images of another.
+
+    batched: whether the results have a batch dim, as `named` has; those of a batch of one may do without.
+    """
     part, is_single = change.parts[0], change.count == 1
     if part.moves is None or part.rows is not None or change.gate is not None:
         return {}
     if not is_single and (part.shades is not None or part.light is not None):
         return {}
-    options, between = part.moves.options, part.between() if is_single else None
-    if is_single and between is None:
-        return {}
-    fill = options["fill"]
-    images: dict[str, tuple[Tensor, Sampler]] = {}
-    pixels: dict[str, Tensor] = {}
+    options = part.moves.options
+    mode, padding_mode, fill = options["mode"], options["padding_mode"], options["fill"]
+    hows: dict[str, Sampler | None] = {}
     for name, (found, value) in named.items():
         if found in ("depth", "distance") or isinstance(value, list):  # which ask for positions again
             return {}
         if found == "image" and len(fill) in (1, value.shape[1]):
-            images[name] = value, Sampler(options["mode"], options["padding_mode"], fill)
+            hows[name] = Sampler(mode, padding_mode, fill)
         elif found == "mask":
-            wide = value if value.ndim == 4 else value.unsqueeze(1)
-            images[name] = wide, Sampler("nearest", "zeros", (mask_fill,))
+            hows[name] = Sampler("nearest", "zeros", (mask_fill,))
         elif is_single and moves(found, value) is _pixels:
-            pixels[name] = value.reshape(1, -1, 2)
-    work = Work(list(images.values()), list(pixels.values()))
-    made = None
-    if between is not None:
-        made = at_once(*between, (part.camera._size_for("Warp"), part.image_size), options, work)
-    elif part.warp is not None:
-        made = batch_at_once(part.warp, work.images)
+            hows[name] = None
+    values = [named[name][1] for name in hows]
+    if not is_single:
+        wide = [value if value.ndim == 4 else value.unsqueeze(1) for value in values]
+        pairs = [(value, how) for value, how in zip(wide, hows.values(), strict=True) if how is not None]
+        images = None if part.warp is None else batch_at_once(part.warp, pairs)
+        found_images = zip(hows, values, images or (), strict=False)
+        return {n: (image if value.ndim == 4 else image.squeeze(1), None) for n, value, image in found_images}
+    between = part.between() if values else None
+    if between is None:
+        return {}
+    sizes = part.camera._size_for("Warp"), part.image_size
+    made = at_once(*between, sizes, options, values, list(hows.values()), batched)
     if made is None:
         return {}
-    results: dict[str, tuple[Tensor, Tensor | None]] = {}
-    for name, image in zip(images, made.images, strict=True):
-        results[name] = image if named[name][1].ndim == 4 else image.squeeze(1), None
-    for name, (moved, valid) in zip(pixels, made.pixels, strict=True):
-        value = named[name][1]
-        results[name] = _in_range(moved.view(value.shape), value.dtype), valid.view(value.shape[:-1])
-    return results
+    return {
+        name: (result if result.dtype == value.dtype else _in_range(result, value.dtype), valid)
+        for name, value, (result, valid) in zip(hows, values, made, strict=True)
+    }
 
 
 def from_pitch_yaw(angles: Tensor) -> Tensor:

@@ -8,7 +8,7 @@ import operator
 import struct
 import threading
 from collections.abc import Callable, Sequence
-from ctypes import addressof, byref, c_double, c_int32, c_int64, c_void_p, create_string_buffer
+from ctypes import addressof, byref, c_bool, c_double, c_float, c_int32, c_int64, c_void_p, create_string_buffer
 from itertools import accumulate
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -232,8 +232,9 @@ class Lenses:
         self.struct = struct = _Cameras()
         struct.parts, struct.part_count, struct.parameter_count = addressof(plan.parts), plan.count, plan.parameters
         struct.is_double, struct.cameras = self.dtype == torch.float64, self.cameras
+        self._parameters = plan.parameters_of(optics_of, k) if plan.parameters else k
         if plan.parameters:
-            struct.parameters = self._keep(plan.parameters_of(optics_of, k))
+            struct.parameters = self._keep(self._parameters)
         if plan.places is None and (constants := _constants(optics_of(columns(k))[1])):
             struct.constants, struct.constant_count = self._keep_columns(constants), len(constants)
         if plan.is_chart:
@@ -248,16 +249,18 @@ class Lenses:
     @functools.cached_property
     def _domain(self) -> _Domain:
         """What it is asked with; its optics are of double precision."""
-        made, plan, k = _Domain(), self.plan, self._k.double()
+        made, plan = _Domain(), self.plan
+        known = plan.places is not None or not plan.parameters
+        parameters = self._parameters if known else plan.parameters_of(self._optics_of, self._k.double())
         made.parts, made.part_count = addressof(plan.parts), plan.count
         made.is_double, made.cameras, made.is_radial = self.dtype == torch.float64, self.cameras, plan.is_radial
-        made.parameters, made.parameter_count = self._keep(plan.parameters_of(self._optics_of, k)), plan.parameters
+        made.parameters, made.parameter_count = self._keep(parameters.double()), plan.parameters
         made.most = torch.finfo(self.dtype).max ** 0.25
         made.ends, made.usual_ends = map(self._keep_ends, plan.ends(lambda: self._optics()[0], self.dtype))
         if plan.places is None or plan.is_long:
             chart, lens = self._optics()
             if constants := _constants(lens):
-                made.constants, made.constant_count = self._keep_columns(constants, k.dtype), len(constants)
+                made.constants, made.constant_count = self._keep_columns(constants, torch.float64), len(constants)
             bare = _bare(chart)
             factor = bare.factor(bare.parameters) if isinstance(bare, optics.Inverted) else lens.radial
             if factor is not None:
@@ -268,8 +271,7 @@ class Lenses:
 
     def _keep_ends(self, end: float | Tensor) -> int:
         if isinstance(end, float):
-            ends = (c_double * self.cameras)(*[end] * self.cameras)
-            self._kept.append(ends)
+            self._kept.append(ends := _same_ends(end, self.cameras))
             return addressof(ends)
         return self._keep(end.expand(self.cameras, 1).double())
 
@@ -297,15 +299,16 @@ class Lenses:
             domain = self._slow_domain()
             self.struct.inner2, self.struct.usual2 = self._keep(domain.inner2), self._keep(domain.usual2)
             return
-        wanted = {"inner2": self._new(1), "usual2": self._new(1)}
-        if plan.has_rest:
-            wanted |= {"circle2": self._new(1), "stagewise": self._new(1, torch.bool)}
+        names = ["inner2", "usual2", *["circle2", "stagewise"] * plan.has_rest, *["certain2"] * bool(plan.controls)]
+        counts = [1] * len(names)
+        if tables and plan.has_factor:  # at once, as there will be pixels
+            names, counts = [*names, "table"], [*counts, _TABLE]
+        start, step = self._new(sum(counts)), self.cameras * self.dtype.itemsize
+        wanted = {name: start + step * i for i, name in enumerate(names)}
         if plan.controls:
-            wanted |= {"certain": self._new(plan.controls, torch.uint8), "certain2": self._new(1)}
+            wanted["certain"] = self._new(plan.controls, torch.uint8)
         for name, place in wanted.items():
             setattr(self.struct, name, place)
-        if tables and plan.has_factor:  # at once, as there will be pixels
-            wanted["table"] = self.struct.table = self._new(_TABLE)
         radii = {} if plan.is_radial else {"radii": self._keep(plan.radii(lambda: self._optics()[0], _RADII, self._k))}
         self._ask(wanted | radii)
 
@@ -348,6 +351,11 @@ class Lenses:
 
     def _keep_columns(self, columns: Sequence[Tensor], dtype: torch.dtype | None = None) -> int:
         return self._keep(torch.cat([c.expand(self.cameras, 1) for c in columns], -1).to(dtype or self.dtype))
+
+
+@functools.lru_cache(maxsize=16)
+def _same_ends(end: float, cameras: int) -> ctypes.Array[c_double]:
+    return (c_double * cameras)(*[end] * cameras)
 
 
 _MOST_LENSES, _LONGEST = 24, 512
@@ -497,6 +505,17 @@ def _constants(lens: Lens) -> Sequence[Tensor]:
 
 
 # -- calls
+
+
+def project_numbers(native: Native, points: Sequence[float]) -> list[float] | None:
+    """x, y, z of some points to u, v of their pixels, by one camera; None where one is not valid."""
+    kind, count = (c_double if native.dtype == torch.float64 else c_float), len(points) // 3
+    given, pixels, valid = (kind * len(points))(*points), (kind * (2 * count))(), (c_bool * count)()
+    rows = addressof(given), 0, 3, 1, addressof(pixels), 0, 2, 1, addressof(valid), 0, *_NO_ROWS, 0
+    if _call(native, 1, count, PROJECT, rows):
+        native.follow()
+        _call(native, 1, count, PROJECT, rows)
+    return list(pixels) if all(valid) else None
 
 
 def project(native: Native, points: Tensor) -> tuple[Tensor, Tensor]:

@@ -1,13 +1,14 @@
-"""One sample by one call of compiled code: the lattice of a warp, images sampled on it, and pixels that move along."""
+"""One sample, or a batch, by one call of compiled code: the lattice of a warp, images sampled on it, and pixels."""
 
 from __future__ import annotations
 
 import ctypes
+import functools
+import itertools
 import math
 import threading
-from collections.abc import Sequence
-from itertools import accumulate
-from typing import TYPE_CHECKING, NamedTuple
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -16,13 +17,14 @@ from torch import Tensor
 from camtorch._evaluation import compiled_of
 from camtorch._threads import spread, thread_count
 from camtorch._tracing import is_eager
-from camtorch.native import sampler
+from camtorch.native import memory, sampler
 from camtorch.native.library import library
 from camtorch.projection import compiled
-from camtorch.projection.compiled import LEFT_FROM, LEFT_MOST, LEFT_TO, Native
+from camtorch.projection.compiled import LEFT_FROM, LEFT_MOST, LEFT_TO, POSITIONS, Between, Native
 from camtorch.warp.grid import FEWEST, MOST_KEPT, STEP, kept_probes
+from camtorch.warp.moving import between
 from camtorch.warp.panorama import seam_of
-from camtorch.warp.sampling import SHRINKS, SURELY, Options, Sampler
+from camtorch.warp.sampling import PADDINGS, SHRINKS, SURELY, Options, Sampler
 
 if TYPE_CHECKING:
     from camtorch.warp.warp import Warp
@@ -30,41 +32,127 @@ if TYPE_CHECKING:
 _HEAD, _LATTICE, _MOVE, _JOB = 5, 46, 22, 38  # words of the structures of C
 _MOST = 4  # forms of samples that a thread keeps calls of
 _FEW = 2  # tiles of an image that one thread makes alone
+_EVEN = 4  # samples a thread from which on it matters little that the last ones leave some threads idle
 _ALIGNED = 64
 _PIXELS = 1 << 3  # flags of what is left of pixels are times this
+_APART = 4 * STEP  # pixels between those that tell how far an image shrinks
+
+Sizes = tuple[tuple[int, int], tuple[int, int]]
+"""(height, width) of the source's image, and of the target's."""
+
+
+def _is_used_once(warp: Warp) -> bool:
+    """Whether its positions come from a lattice that nobody keeps, of cameras that stand still."""
+    return (
+        warp.is_an_operator
+        and warp._pinned is None
+        and bool(warp.tolerance)
+        and not warp.antialias
+        and warp.shutter is None
+        and warp.target_shutter is None
+    )
 
 
 def between_of(warp: Warp) -> tuple[Native, Native, Tensor | None] | None:
-    """Source, target and rotation of a warp for compiled code; None where it has to go step by step.
+    """Source, target and rotation of a single warp for compiled code; None where it has to go step by step.
 
-    That is where its positions are kept, exact, antialiased throughout, in a graph, traced, of a batch, a seam or a
-    shutter.
+    That is where its positions are kept, exact, antialiased throughout, in a graph, traced, or have a seam.
     """
     source, target, rotation = warp.source, warp.target, warp.rotation
-    if not warp.is_an_operator or warp._pinned is not None or warp.batch_shape:
-        return None
-    if not warp.tolerance or warp.antialias or warp.shutter is not None or warp.target_shutter is not None:
-        return None
-    if seam_of(source) is not None or seam_of(target) is not None:
+    if warp.batch_shape or not _is_used_once(warp) or seam_of(source) is not None or seam_of(target) is not None:
         return None
     made = compiled_of((source, target), target.intrinsics, *(() if rotation is None else (rotation,)))
     return None if made is None else (*made[0], rotation)  # type: ignore[return-value]
 
 
-class Work(NamedTuple):
-    """What a warp is to do for one sample."""
-
-    images: Sequence[tuple[Tensor, Sampler]]
-    """(1, C, H, W) each, and how they are sampled."""
-    pixels: Sequence[Tensor]
-    """(1, N, 2) each, of the source's image, to be moved to the target's."""
+def _has_lattice(size: tuple[int, int]) -> bool:
+    """Whether images of a size are large enough for one, and it is not too large to be kept."""
+    n, m = (math.ceil(side / STEP) for side in size)
+    return min(n, m) >= FEWEST and (n + 5) * (m + 5) <= MOST_KEPT
 
 
-class Made(NamedTuple):
-    """What comes of it: (1, C, h, w) each; and pixels (1, N, 2), valid (1, N), as of `Warp.transform_points`."""
+def _result(image: Tensor, how: Sampler, count: int, size: tuple[int, int]) -> Tensor | None:
+    """What (count, C, h, w) samples of an image go to; None where they lie too oddly in memory, or are none."""
+    result = sampler.empty(image, count, size)
+    takes = 0 not in result.shape and sampler.takes(image.dtype, how.mode)
+    return result if takes and sampler.is_quick(image, result, how.mode) else None
 
-    images: list[Tensor]
-    pixels: list[tuple[Tensor, Tensor]]
+
+def _job(image: Tensor, result: Tensor, how: Sampler, on_lattice: tuple[int, ...]) -> tuple[bytes, object]:
+    fill = how.fill * image.shape[1] if len(how.fill) == 1 else how.fill
+    return sampler.packed(image, result, how.mode, how.padding_mode, fill, (0,) * 8 + on_lattice)
+
+
+def _smooth(images: Sequence[tuple[Tensor, Sampler]]) -> bool:
+    """Whether a warp that decides for itself might halve one of them."""
+    return any(how.mode != "nearest" and image.dtype != torch.bool for image, how in images)
+
+
+@functools.lru_cache(maxsize=16)
+def _coarse(size: tuple[int, int], dtype: torch.dtype) -> tuple[Tensor, tuple[int, int]]:
+    """(1, N, 2): every fourth node of a lattice, and how many down and across."""
+    n, m = (math.ceil(side / STEP) + 5 for side in size)
+    with torch.inference_mode(False):
+        nodes = kept_probes(range(size[0]), size[1], dtype)[:, : n * m].view(n, m, 2)[::4, ::4]
+        return nodes.reshape(1, -1, 2), (nodes.shape[0], nodes.shape[1])
+
+
+def _surely_keeps_size(back: Between, sizes: Sizes) -> bool:
+    """Whether no image shrinks so far that a `MirrorWarp` would halve it; back: from the target to the source."""
+    nodes, shape = _coarse(sizes[1], back.dtype)
+    places = back.rows(nodes, POSITIONS)[0].numpy().reshape(-1, *shape, 2)
+    seen: np.ndarray[Any, Any] = np.all(abs(places) <= 1, axis=-1)
+    places = places * np.array([sizes[0][1] / 2, sizes[0][0] / 2], places.dtype)
+    down, across = places[:, 1:] - places[:, :-1], places[:, :, 1:] - places[:, :, :-1]
+    total, count = 0.0, 0
+    for steps, both in ((down, seen[:, 1:] & seen[:, :-1]), (across, seen[:, :, 1:] & seen[:, :, :-1])):
+        total = total + (np.hypot(steps[..., 0], steps[..., 1]) * both).sum((1, 2))
+        count = count + both.sum((1, 2))
+    return bool((total < SURELY * SHRINKS * _APART * np.maximum(count, 1)).all())
+
+
+def batch_at_once(warp: Warp, images: Sequence[tuple[Tensor, Sampler]]) -> list[Tensor] | None:
+    """Images (B, C, H, W) of a warp of B cameras that is used once: each thread takes a sample, to its last pixel.
+
+    None where lattices do not do, images lie too oddly in memory or shrink, there are too few samples for the threads,
+    or something is in a graph or traced.
+
+    Args:
+        warp: from each sample's camera to another one.
+        images: and how they are sampled.
+    """
+    tensors = [image for image, _ in images]
+    if not images or not is_eager(*tensors):
+        return None
+    cameras, threads = math.prod(warp.batch_shape), thread_count()
+    if cameras < 2 or (cameras % threads and cameras < _EVEN * threads):
+        return None
+    if not _is_used_once(warp) or warp.target.intrinsics.dtype != torch.float32:
+        return None
+    if torch.is_grad_enabled() and any(t.requires_grad for t in (*tensors, *warp._inputs())):
+        return None
+    sizes, rotation = (warp.source._size_for("Warp"), warp.target._size_for("Warp")), warp.rotation
+    found = [_result(image, how, cameras, sizes[1]) for image, how in images]
+    results = [result for result in found if result is not None]
+    if len(results) < len(images) or not _has_lattice(sizes[1]):
+        return None
+    back = between(warp.target, warp.source, None if rotation is None else rotation.mT, warp.target.intrinsics)
+    if back is None or back.cameras != cameras:
+        return None
+    if warp._decides and _smooth(images) and not _surely_keeps_size(back, sizes):
+        return None
+    kept: list[object] = []  # what jobs point to
+
+    def jobs(on_lattice: tuple[int, ...]) -> list[bytes]:
+        pairs = zip(images, results, strict=True)
+        packed = [_job(image, result, how, on_lattice) for (image, how), result in pairs]
+        kept.extend(holds for _, holds in packed)
+        return [job for job, _ in packed]
+
+    padding = PADDINGS[max(PADDINGS.index(how.padding_mode) for _, how in images)]
+    probes = kept_probes(range(sizes[1][0]), sizes[1][1], torch.float32)
+    made = back.lattices(probes, sizes[1], 0, warp.tolerance, padding, jobs)
+    return None if made is None else results
 
 
 class _Calls(threading.local):
@@ -79,11 +167,13 @@ def at_once(
     source: Native,
     target: Native,
     rotation: Tensor | None,
-    sizes: tuple[tuple[int, int], tuple[int, int]],
+    sizes: Sizes,
     options: Options,
-    work: Work,
-) -> Made | None:
-    """The images of a sample and its pixels.
+    values: Sequence[Tensor],
+    hows: Sequence[Sampler | None],
+    batched: bool = True,
+) -> list[tuple[Tensor, Tensor | None]] | None:
+    """The images of a sample and its pixels, with a batch dim of one or without; and which pixels are valid.
 
     None where a lattice does not do, images shrink, lie too oddly in memory, or something is in a graph or traced.
 
@@ -91,31 +181,43 @@ def at_once(
         source: the camera of the images, single.
         target: that of the images to make.
         rotation: (3, 3), `ray_target = R ray_source`, or None.
-        sizes: (height, width) of the source's image, and of the target's.
+        sizes: of the images.
         options: of a `Warp` whose tolerance is positive, or of a `MirrorWarp` that decides where to antialias.
-        work: what is to be made.
+        values: images (1, C, H, W), masks (1, H, W) as well; and pixels (1, *N, 2) of the source's image.
+        hows: how images are sampled; None for pixels, which move as by `Warp.transform_points`.
+        batched: whether results have the batch dim.
     """
-    tolerance = options["tolerance"]
-    if not tolerance or options["antialias"]:
+    tolerance, antialias = options["tolerance"], options["antialias"]
+    if not tolerance or antialias or not is_eager(*values):
         return None
-    tensors = [image for image, _ in work.images] + list(work.pixels)
-    if not is_eager(*tensors) or (torch.is_grad_enabled() and any(t.requires_grad for t in tensors)):
+    if torch.is_grad_enabled() and any(t.requires_grad for t in values):
         return None
-    if any(t.dtype != source.dtype for t in work.pixels):
-        if any(torch.promote_types(t.dtype, source.dtype) != source.dtype for t in work.pixels):
-            return None
-        work = Work(work.images, [t.to(source.dtype) for t in work.pixels])
     if rotation is not None and (rotation.dtype != source.dtype or not rotation.is_contiguous()):
         rotation = rotation.detach().to(source.dtype).contiguous()
-    forms = [(image.shape[1], image.stride(), image.dtype, how) for image, how in work.images]
-    key = (sizes, source.dtype, tolerance, *forms, *((t.shape[1], t.stride()) for t in work.pixels))
-    call = _calls.kept.pop(key, None) or _Call.of(sizes, source.dtype, tolerance, work)
+    forms = [(t.shape, t.stride(), t.dtype, how) for t, how in zip(values, hows, strict=True)]
+    key = (sizes, source.dtype, tolerance, batched, *forms)
+    call = _calls.kept.pop(key, None) or _Call.of(sizes, source.dtype, tolerance, values, hows, batched)
     if call is None:
         return None
     _calls.kept[key] = call  # the last one
     while len(_calls.kept) > _MOST:
         del _calls.kept[next(iter(_calls.kept))]
-    return call(source, target, rotation, work, options["antialias"] is None)
+    return call(source, target, rotation, values, antialias is None)
+
+
+def _maker(ndim: int, image: Tensor, size: tuple[int, int], batched: bool) -> Callable[[], Tensor]:
+    """What makes the place for the samples of an image (1, C, H, W), which as a mask may come as (1, H, W)."""
+    like = torch.empty_strided(image.shape, image.stride(), dtype=image.dtype, device="meta")
+
+    def made() -> Tensor:
+        result = sampler.empty(like, 1, size)
+        result = result if ndim == 4 else result.squeeze(1)
+        return result if batched else result.squeeze(0)
+
+    shape = made()
+    if shape.nbytes >= memory.LEAST:
+        return made
+    return functools.partial(torch.empty_strided, shape.shape, shape.stride(), dtype=shape.dtype, device="cpu")
 
 
 class _Call:
@@ -123,24 +225,43 @@ class _Call:
 
     @classmethod
     def of(
-        cls, sizes: tuple[tuple[int, int], tuple[int, int]], dtype: torch.dtype, tolerance: float, work: Work
+        cls,
+        sizes: Sizes,
+        dtype: torch.dtype,
+        tolerance: float,
+        values: Sequence[Tensor],
+        hows: Sequence[Sampler | None],
+        batched: bool,
     ) -> _Call | None:
-        n, m = (math.ceil(side / STEP) for side in sizes[1])
-        if min(n, m) < FEWEST or (n + 5) * (m + 5) > MOST_KEPT:
+        if not _has_lattice(sizes[1]):
             return None
-        for image, how in work.images:
-            result = sampler.empty(image, 1, sizes[1])
-            if 0 in result.shape or not sampler.takes(image.dtype, how.mode):
+        images, pixels = [], []
+        makers: list[Callable[[], Tensor] | None] = []
+        for value, how in zip(values, hows, strict=True):
+            if how is None:
+                if torch.promote_types(value.dtype, dtype) != dtype:
+                    return None
+                pixels.append(value.to(dtype).reshape(1, -1, 2))
+                makers.append(None)
+                continue
+            image = value if value.ndim == 4 else value.unsqueeze(1)
+            if _result(image, how, 1, sizes[1]) is None:
                 return None
-            if not sampler.is_quick(image, result, how.mode):
-                return None
-        return cls(sizes, dtype, tolerance, work)
+            images.append((image, how))
+            makers.append(_maker(value.ndim, image, sizes[1], batched))
+        return cls(sizes, dtype, tolerance, images, pixels, makers, batched)
 
     def __init__(
-        self, sizes: tuple[tuple[int, int], tuple[int, int]], dtype: torch.dtype, tolerance: float, work: Work
+        self,
+        sizes: Sizes,
+        dtype: torch.dtype,
+        tolerance: float,
+        images: Sequence[tuple[Tensor, Sampler]],
+        pixels: Sequence[Tensor],
+        makers: Sequence[Callable[[], Tensor] | None],
+        batched: bool,
     ):
         source_size, size = sizes
-        images, pixels = work
         n, m = (math.ceil(side / STEP) for side in size)
         probes = kept_probes(range(size[0]), size[1], dtype)
         count, nodes, wide = probes.shape[1], (n + 5) * (m + 5), dtype.itemsize
@@ -149,15 +270,13 @@ class _Call:
         parts += [4 * sampler.SCRATCH * (m + 8), 8]
         places = [-(-part // _ALIGNED) * _ALIGNED for part in parts]
         with torch.inference_mode(False):
-            memory = torch.empty(sum(places), dtype=torch.uint8, device="cpu")
-        at, cells, valid, exact, narrow, scratch, used = accumulate(places[:-1], initial=memory.data_ptr())
+            room = torch.empty(sum(places), dtype=torch.uint8, device="cpu")
+        at, cells, valid, exact, narrow, scratch, used = itertools.accumulate(places[:-1], initial=room.data_ptr())
         jobs, kept = [], []
         plane = 64 * n * m * (2 if is_double else 1)
         on_lattice = narrow if is_double else at, 0, nodes if is_double else count, cells, 0, n, m, exact, plane
         for image, how in images:
-            fill = how.fill * image.shape[1] if len(how.fill) == 1 else how.fill
-            result = sampler.empty(image, 1, size)
-            job, holds = sampler.packed(image, result, how.mode, how.padding_mode, fill, (0,) * 8 + on_lattice)
+            job, holds = _job(image, sampler.empty(image, 1, size), how, on_lattice)
             jobs.append(job)
             kept.append(holds)
         reach = max((sampler.PADDINGS[how.padding_mode] for _, how in images), default=0)
@@ -180,44 +299,51 @@ class _Call:
         text = bytes(8 * _HEAD) + lattice + b"".join(moves) + b"".join(jobs)
         assert len(text) == start + 8 * (_MOVE * len(moves) + _JOB * len(jobs))
         self._words = (ctypes.c_int64 * (len(text) // 8)).from_buffer_copy(text)
-        self._first_move, self._first_job = _HEAD + _LATTICE, _HEAD + _LATTICE + _MOVE * len(moves)
+        first_move, self._first_job = _HEAD + _LATTICE, _HEAD + _LATTICE + _MOVE * len(moves)
         here = ctypes.addressof(self._words)
         self._words[:_HEAD] = [here + 8 * self._first_job, len(jobs), 1, here + start, len(moves)]
+        self._moves, self._jobs = bool(moves), len(jobs)
+        # where the pointers to each value go, and what makes the results of images
+        to_moves, to_jobs = itertools.count(first_move, _MOVE), itertools.count(self._first_job, _JOB)
+        self._slots = [(next(to_moves if make is None else to_jobs), make) for make in makers]
         self._tiles = max((sampler.tiles_of(sampler.empty(image, 1, size)) for image, _ in images), default=1)
-        self._size, self._pixels, self._dtype = size, size[0] * size[1], dtype
-        self._kept = memory, probes, kept  # what the words point to
-        positions = memory[: parts[0]].view(dtype).view(2, count)[:, :nodes].view(2, n + 5, m + 5)
-        self._seen = positions[:, ::4, ::4].numpy()
-        self._half = np.array([source_size[1] / 2, source_size[0] / 2])[:, None, None]
-        self._may_shrink = any(how.mode != "nearest" and image.dtype != torch.bool for image, how in images)
+        self._sizes, self._pixels, self._dtype, self._lead = sizes, size[0] * size[1], dtype, 0 if batched else 1
+        self._kept = room, probes, kept  # what the words point to
+        self._may_shrink = _smooth(images)
 
     def __call__(
-        self, source: Native, target: Native, rotation: Tensor | None, work: Work, decides: bool
-    ) -> Made | None:
-        words, turns = self._words, 0 if rotation is None else rotation.data_ptr()
-        target.add_tables(self._pixels if work.images else 0)  # as `Between.lattices` does it
-        if work.pixels:
+        self, source: Native, target: Native, rotation: Tensor | None, values: Sequence[Tensor], decides: bool
+    ) -> list[tuple[Tensor, Tensor | None]] | None:
+        if decides and self._may_shrink:
+            turns = None if rotation is None else rotation.mT
+            if not _surely_keeps_size(Between(target, source, turns, self._sizes[0], False), self._sizes):
+                return None
+        words, turn = self._words, 0 if rotation is None else rotation.data_ptr()
+        target.add_tables(self._pixels if self._jobs else 0)
+        if self._moves:
             source.add_tables(0)
-        words[_HEAD], words[_HEAD + 1], words[_HEAD + 2] = target.pointer, source.pointer, turns
-        made = Made([], [])
-        at = self._first_move
-        for given in work.pixels:
-            moved = torch.empty(1, given.shape[1], 2, dtype=self._dtype, device="cpu")
-            valid = torch.empty(1, given.shape[1], dtype=torch.bool, device="cpu")
-            words[at], words[at + 1], words[at + 2] = source.pointer, target.pointer, turns
-            words[at + 10], words[at + 14], words[at + 18] = given.data_ptr(), moved.data_ptr(), valid.data_ptr()
-            made.pixels.append((moved, valid))
-            at += _MOVE
-        for image, _ in work.images:
-            result = sampler.empty(image, 1, self._size)
-            words[at], words[at + 1] = image.data_ptr(), result.data_ptr()
-            made.images.append(result)
-            at += _JOB
+        words[_HEAD], words[_HEAD + 1], words[_HEAD + 2] = target.pointer, source.pointer, turn
+        results: list[tuple[Tensor, Tensor | None]] = []
+        given = []  # pixels in the dtype of the cameras, for as long as the call
+        for value, (at, make) in zip(values, self._slots, strict=True):
+            if make is None:
+                shape = value.shape[self._lead :]
+                if value.dtype != self._dtype or value.ndim != 3:
+                    value = value.to(self._dtype).reshape(1, -1, 2)
+                    given.append(value)
+                result = torch.empty(shape, dtype=self._dtype, device="cpu")
+                valid = torch.empty(shape[:-1], dtype=torch.bool, device="cpu")
+                words[at], words[at + 1], words[at + 2] = source.pointer, target.pointer, turn
+                words[at + 10], words[at + 14], words[at + 18] = value.data_ptr(), result.data_ptr(), valid.data_ptr()
+                results.append((result, valid))
+            else:
+                result = make()
+                words[at], words[at + 1] = value.data_ptr(), result.data_ptr()
+                results.append((result, None))
         native, threads = library(), min(thread_count(), self._tiles)
         assert native is not None  # or nobody has a `Native`
-        looks = decides and self._may_shrink
-        words[2] = is_whole = not looks and (threads == 1 or self._tiles <= _FEW)
-        words[1] = len(work.images)
+        words[2] = is_whole = threads == 1 or self._tiles <= _FEW
+        words[1] = self._jobs
         while flags := native.camtorch_together(words):
             if flags & LEFT_MOST:
                 return None
@@ -229,22 +355,10 @@ class _Call:
                 end.follow()
             if flags >= _PIXELS:  # the images are made
                 words[1] = 0
-        if looks and not self._keeps_size():
-            return None
         if not is_whole:
-            for i in range(len(work.images)):
+            for i in range(self._jobs):
                 job = words[self._first_job + i * _JOB : self._first_job + (i + 1) * _JOB]
                 run = (ctypes.c_int64 * _JOB)(*job)
                 run[_JOB - 1] = 0
                 spread(lambda: native.camtorch_sample(run), threads)  # noqa: B023 (which is called at once)
-        return made
-
-    def _keeps_size(self) -> bool:
-        """Whether images surely shrink by less than a `MirrorWarp` halves them for, of steps that rounding adds up."""
-        seen = np.all(abs(self._seen) <= 1, 0)
-        positions = self._seen * self._half
-        down, right = positions[:, 1:] - positions[:, :-1], positions[:, :, 1:] - positions[:, :, :-1]
-        both = seen[1:] & seen[:-1], seen[:, 1:] & seen[:, :-1]
-        steps = [np.hypot(*step)[pair] for step, pair in zip((down, right), both, strict=True)]
-        total, count = (sum(numbers) for numbers in zip(*((step.sum(), step.size) for step in steps), strict=True))
-        return bool(total < SURELY * SHRINKS * 4 * STEP * max(count, 1))
+        return results

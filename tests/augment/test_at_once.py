@@ -172,6 +172,37 @@ def test_pixels_of_half_precision_stay_finite(lead):
     assert out["keypoints_valid"].tolist() == torch.tensor([False, True]).expand(*lead, 2).tolist()
 
 
+def odd_samples():
+    sample, nan = sample_for(torch.float32), float("nan")
+    image, pixels = sample["image"], sample["keypoints"]
+    return {
+        "no pixels": {"image": image, "keypoints": pixels[:0]},
+        "lost pixels": {"image": image, "keypoints": torch.cat((pixels, torch.tensor([[nan, 1.0], [math.inf, 2.0]])))},
+        "other precision": {"image": image.half(), "keypoints": pixels.half(), "landmarks": pixels.double()},
+        "gaps": {"image": torch.cat((image, image), 2)[:, :, ::2], "keypoints": torch.cat((pixels, pixels), 1)[:, ::2]},
+        "turned in memory": {"image": image.mT.contiguous().mT, "keypoints": pixels.T.contiguous().T},
+        "expanded": {"image": image[:1].expand(3, -1, -1), "keypoints": pixels[:1].expand(5, -1)},
+        "masks": {"image": image[:1], "mask": image[:1] > 99, "mask_b": image[:2].int(), "mask_c": image[0].double()},
+        "a batch of one": {"image": image[None], "mask": image[None, 0], "keypoints": pixels[None]},
+        "given flags": {"image": image, "keypoints": pixels[:, None], "keypoints_valid": torch.arange(9)[:, None] % 2},
+    }
+
+
+@pytest.mark.parametrize("name", ["mount", "lens", "chain that decides"])
+@pytest.mark.parametrize("form", odd_samples())
+def test_odd_samples_as_step_by_step(form, name, monkeypatch):
+    sample, camera = odd_samples()[form], example("brown_conrady", SIZE).requires_grad_(False)
+    augment = RandomMount() if name == "mount" else RandomLens() if name == "lens" else AUGMENTATIONS[name]()
+    torch.manual_seed(0)
+    out = augment(sample, camera=camera)
+    monkeypatch.setattr(camtorch.augment.sample, "at_once", lambda *given: None)
+    torch.manual_seed(0)
+    expected = augment(sample, camera=camera)
+    assert out.keys() == expected.keys()
+    for field in expected.keys() - {"camera"}:
+        torch.testing.assert_close(out[field], expected[field], rtol=0, atol=0, equal_nan=True)
+
+
 @pytest.fixture(params=["torchvision", "albumentations"])
 def transform(request, monkeypatch):
     """A function of an augmentation, an image (H, W, 3), a mask and pixels, of arrays, by another library's classes."""

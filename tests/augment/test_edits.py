@@ -17,6 +17,7 @@ from torchvision_stand_in import torchvision_of
 import camtorch as ct
 import camtorch.augment.kornia as fronts
 import camtorch.augment.numpy
+import camtorch.augment.sample
 from camtorch.warp import sampling
 
 A = ct.augment
@@ -292,6 +293,10 @@ def test_a_chain_is_one_resampling(monkeypatch):
     for name in ("_natively", "_by_torch"):
         real = getattr(sampling, name)
         monkeypatch.setattr(sampling, name, lambda *a, real=real, **k: calls.append(r := real(*a, **k)) or r)
+    real_batch = camtorch.augment.sample.batch_at_once
+    monkeypatch.setattr(
+        camtorch.augment.sample, "batch_at_once", lambda *a: calls.append(r := real_batch(*a) or None) or r
+    )
     image = torch.randint(0, 256, (4, 3, 96, 128), dtype=torch.uint8)
     mixture()(image=image, camera=lens)
     assert sum(call is not None for call in calls) == 1

@@ -126,7 +126,7 @@ def test_nothing_as_large_as_an_image_is_made_but_the_result(read_only):
     array.flags.writeable = not read_only
     move = ct.augment.numpy.Transform(ct.augment.RandomMount(camera=camera(LARGE)))
     out, large = allocated(lambda: move(image=array), array.nbytes)
-    assert large == ["aten::empty"]
+    assert large in ([], ["aten::empty"])  # none where the memory of results is kept
     assert out["image"].shape == array.shape
 
 
