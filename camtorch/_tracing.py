@@ -94,12 +94,15 @@ def keeps_graph(*tensors: Tensor) -> bool:
 def set_aside() -> Iterator[None]:
     """Nothing is traced in here: what is made of values becomes a constant of the graph that is being recorded."""
     flags = {name: getattr(torch.compiler, name, False) for name in ("_is_compiling_flag", "_is_exporting_flag")}
+    recording = torch._C._get_tracing_state()  # of torch.jit.trace
     with torch._C.DisableTorchFunction(), _disable_current_modes(), torch.no_grad():
         try:
+            torch._C._set_tracing_state(None)
             for name in flags:
                 setattr(torch.compiler, name, False)
             yield
         finally:
+            torch._C._set_tracing_state(recording)
             for name, flag in flags.items():
                 setattr(torch.compiler, name, flag)
 

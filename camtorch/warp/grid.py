@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from contextlib import nullcontext
 from functools import cached_property, lru_cache, partial, reduce
 from typing import NamedTuple
 
@@ -12,7 +13,7 @@ import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
 from torch import Tensor
 
 from camtorch._threads import on_one_thread
-from camtorch._tracing import in_graph, in_transform, is_concrete, is_eager, may_look
+from camtorch._tracing import in_graph, in_jit_trace, in_transform, is_concrete, is_eager, may_look, set_aside
 from camtorch.camera import Camera
 from camtorch.native.library import native_available
 from camtorch.native.sampler import CUBIC, DOUBT, EMPTY, TODO, classify
@@ -115,7 +116,11 @@ class Lattice:
 
     @cached_property
     def pixels(self) -> Sampling:
-        """Pixel by pixel."""
+        """Pixel by pixel: a constant of what torch.jit.trace records, also where nobody has asked for it before."""
+        with set_aside() if in_jit_trace() else nullcontext():
+            return self._by_pixel()
+
+    def _by_pixel(self) -> Sampling:
         height, width = self.size
         _, n, m = self.cells.shape
         planes = interpolated(self.nodes[:, :, 1:-1, 1:-1], n, m)  # (B, 2, 8 n, 8 m)
