@@ -387,7 +387,7 @@ class Search:
             first = poses_for(torch.cat(given, -1), seen, asked.kind, size)
         adjusted = optimum(first)
         for _ in range(_SECOND_LOOKS):
-            other = other_poses(adjusted.state, seen, asked.kind, size)
+            other = other_poses(adjusted, seen, asked.kind, size)
             again = adjusted if other is adjusted.state else optimum(other)
             if not bool(again.cost < adjusted.cost):
                 break

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
-from camtorch.calibration.bundle import SETTLED, Free, Poses, Sight, State, adjust, minima
+from camtorch.calibration.bundle import SETTLED, Adjusted, Free, Poses, Sight, State, adjust, minima, pixel_jacobians
 from camtorch.calibration.rays import poses_from_rays
 from camtorch.camera import Camera, fixed_camera
 from camtorch.convert import fitting, views
 from camtorch.models import UCM, KannalaBrandt
-from camtorch.projection.rays import angles_from_axis, slopes_at_axis
+from camtorch.projection.rays import angles_from_axis
 
 if TYPE_CHECKING:
     from camtorch.calibration.observations import Observations
@@ -89,9 +89,9 @@ def start_from_nothing(
         free = _free(KannalaBrandt, 4, fixed)
         lens = _refined(_fitted(lens, few, KannalaBrandt, 4, fixed), few, free, ("cauchy", lens.scale)).of(slice(1))
     lens = _fitted(lens, few, model, count, fixed)
-    if few is not observations or len(lens.parameters) > 1:
+    if few is not observations or len(lens.parameters) > 1 or bool(lens.lost(few).any()):
         lens = _refined(lens, few, _free(model, count, fixed), (loss, loss_scale))
-    _check_reach(lens.of(slice(1)), few, first)
+        _check_reach(lens.of(slice(1)), few, first)
     state = lens.of(slice(1)).state
     if few is not observations:
         state = poses_for(state.parameters[0], observations, model, image_size, lens.scale)
@@ -122,14 +122,15 @@ def poses_for(
     return _turned(lens._replace(boards=boards), observations, errors).state
 
 
-def other_poses(state: State, observations: Observations, model: type[Camera], image_size: tuple[int, int]) -> State:
-    """An optimum, B = 1, with other poses of the views that another one fits better; itself where there is none.
+def other_poses(found: Adjusted, observations: Observations, model: type[Camera], image_size: tuple[int, int]) -> State:
+    """The state of an optimum, B = 1, with better poses of the views that have them; itself where none has.
 
     While the camera was not known, a view may have taken the wrong one of the two poses that a plane seems to have, or
     have been led astray by outliers.
     """
+    state = found.state
     lens = _Lens(model, state.parameters[0], state.boards, _LEAST_SCALE, image_size)
-    errors = lens.errors(observations)[0]
+    errors = _lengths(found.residuals[0], found.valid[0], observations.seen)[0]
     # views whose errors are greater than those of many others
     rows = errors.nanmedian(-1).values.argsort(descending=True)[:_DOUBTED]
     boards = state.boards.of(rows, 1)
@@ -188,6 +189,11 @@ class _Lens(NamedTuple):
     def errors(self, some: Observations) -> Tensor:
         """(B, V, N) px, NaN for what is not seen."""
         return _errors(self.camera, self.boards, some)
+
+    def lost(self, some: Observations) -> Tensor:
+        """(B, V, N) bool, the corners that were seen and have no pixel."""
+        _, valid = self.camera.project(self.boards.moved(some.points).flatten(1, 2))
+        return some.seen & ~valid.view(-1, *some.seen.shape)
 
     def of(self, rows: Tensor | slice) -> _Lens:
         """Some of them."""
@@ -334,9 +340,13 @@ def _errors(camera: Camera, boards: Poses, some: Observations) -> Tensor:
     """(B, V, N) px of as many cameras, or of one for all, NaN for what is not seen."""
     points = boards.moved(some.points)
     pixels, valid = camera.project(points.reshape(len(camera.intrinsics), -1, 3))
+    return _lengths(pixels.view(*points.shape[:-1], 2) - some.pixels, valid.view(points.shape[:-1]), some.seen)
+
+
+def _lengths(residuals: Tensor, valid: Tensor, seen: Tensor) -> Tensor:
+    """(B, V, N) px, NaN for what is not seen."""
     # components lie in planes, along which a norm would be slow
-    errors = torch.hypot(*(pixels.view(*points.shape[:-1], 2) - some.pixels).unbind(-1))
-    return torch.where(some.seen, torch.where(valid.view(points.shape[:-1]), errors, _NO_PIXEL), torch.nan)
+    return torch.where(seen, torch.where(valid, torch.hypot(*residuals.unbind(-1)), _NO_PIXEL), torch.nan)
 
 
 def _turned(lens: _Lens, some: Observations, errors: Tensor) -> _Lens:
@@ -373,7 +383,7 @@ def _refined(lens: _Lens, few: Observations, free: Free, loss: tuple[str | None,
 def _fitted(lens: _Lens, few: Observations, model: type[Camera], count: int, fixed: Collection[str]) -> _Lens:
     """Cameras (S,) of another model that see the corners, as the boards lie, where they were seen."""
     camera = lens.camera
-    slopes = views.focal_at_axis(camera)
+    slopes = torch.cat((_focal_at_axis(camera), camera.intrinsics[:, 2:]), -1)
     rays = torch.nn.functional.normalize(lens.boards.moved(few.points), dim=-1)
     inliers = few.seen & (lens.errors(few) < _OUTLIER * lens.scale)
     reach = torch.where(inliers, angles_from_axis(rays), 0.0).amax((-1, -2))
@@ -399,7 +409,8 @@ def _fitted(lens: _Lens, few: Observations, model: type[Camera], count: int, fix
     seen = fitting.Observations(rays.flatten(1, 2), few.pixels.flatten(0, 1)[None], inliers.flatten(1).double())
     seen = fitting.Observations(*(t.expand(len(begun), *t.shape[1:]) for t in seen))
     slopes = slopes.expand(len(begun), -1)
-    focal = slopes[:, :2] / slopes_at_axis(template.optics, begun).clamp(min=_LEAST_SLOPE)
+    ones = slopes.new_tensor([1.0, 1.0, 0.0, 0.0]).expand_as(slopes)
+    focal = slopes[:, :2] / _focal_at_axis(fixed_camera(model, ones, begun)).clamp(min=_LEAST_SLOPE)
     parameters = torch.cat((focal, slopes[:, 2:], begun), -1)
     _, valid = fixed_camera(model, parameters[:, :4], begun).project(seen.rays)
     if values or not bool((valid | (seen.weights == 0)).all()):
@@ -413,18 +424,24 @@ def _fitted(lens: _Lens, few: Observations, model: type[Camera], count: int, fix
     return _Lens(model, parameters, lens.boards.expand(len(parameters)), lens.scale, lens.image_size)
 
 
+def _focal_at_axis(camera: Camera) -> Tensor:
+    """(C, 2) px per radian at the axis of cameras (C,); the stated ones where the coefficients make no lens."""
+    stated = camera.intrinsics[:, :2]
+    axis = stated.new_tensor([0.0, 0.0, 1.0]).expand(len(stated), 1, 3)
+    slopes = pixel_jacobians(camera, axis, False)[0][:, 0, :, :2].diagonal(dim1=-2, dim2=-1)
+    return torch.where(torch.isfinite(slopes) & (slopes > 0), slopes, stated)
+
+
 def _check_reach(lens: _Lens, few: Observations, other: _Lens) -> None:
     """Raise a ValueError where the model has no pixel for many of the corners, or for some and errs with the others.
 
     other: a lens that reaches them.
     """
-    _, valid = lens.camera.project(lens.boards.moved(few.points).flatten(1, 2))
-    lost = few.seen & ~valid.view(few.seen.shape)
-    most = _LOST * int(few.seen.sum()) if lens.scale <= _ERRS * other.scale else 0
-    if int(lost.sum()) > most:
+    lost = int(lens.lost(few).sum())
+    if lost > (_LOST * int(few.seen.sum()) if lens.scale <= _ERRS * other.scale else 0):
         inliers = few.seen & (other.errors(few)[0] < _OUTLIER * other.scale)
         furthest = math.degrees(float(angles_from_axis(other.boards.moved(few.points))[0][inliers].amax()))
         raise ValueError(
-            f"calibrate: {lens.model.__name__} has no pixels for {int(lost.sum())} of {int(few.seen.sum())} corners, "
+            f"calibrate: {lens.model.__name__} has no pixels for {lost} of {int(few.seen.sum())} corners, "
             f"seen up to about {furthest:.0f} degrees from the axis; kannala_brandt and other fisheye models do"
         )

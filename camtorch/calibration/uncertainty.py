@@ -77,9 +77,8 @@ def spread(adjusted: Adjusted, model: type[Camera], camera: int) -> Spread:
     frame = _frame_factor(equations, state.boards.translations, shared)
     count = parameters.shape[-1]
     own = shared.new_zeros(len(shared), count + 6, shared.shape[-1])
-    for g, (c, i) in enumerate(equations.columns):
-        if c == camera:
-            own[:, i] = shared[:, g]
+    of_own = [(g, i) for g, (c, i) in enumerate(equations.columns) if c == camera]
+    own[:, [i for _, i in of_own]] = shared[:, [g for g, _ in of_own]]
     turn, shift = own[:, count : count + 3], own[:, count + 3 :]
     # of the frame of the first camera, in that of this one
     rotation = mounts.rotations[:, camera]

@@ -77,6 +77,17 @@ def test_a_model_that_does_not_reach_says_so():
         ct.calibrate("brown_conrady", *seen[:2], image_size=seen.image_size)
 
 
+def test_a_model_that_errs_and_loses_a_few_corners_says_so():
+    camera = a_camera("kannala_brandt", 190).requires_grad_(False)
+    seen, _, _ = seen_by(camera, 190, 14, 0.2, 1)
+    is_far = camera.unproject(seen.image_points.nan_to_num())[0][..., 2] < math.cos(math.radians(88))
+    too_many = is_far & (is_far.flatten().cumsum(0).view(is_far.shape) > 4)
+    pixels = seen.image_points.masked_fill(too_many[..., None], torch.nan)
+    pixels = pixels[(~pixels.isnan().any(-1)).sum(-1) >= 20]
+    with pytest.raises(ValueError, match=r"Pinhole has no pixels for \d+ of \d+ corners.*degrees"):
+        ct.calibrate("pinhole", seen.object_points, pixels, image_size=SIZE)
+
+
 def test_the_better_of_two_poses_that_look_alike():
     camera = a_camera("pinhole", 12).requires_grad_(False)
     seen, rotations, _ = seen_by(camera, 12, 30, 0.05, 3)
