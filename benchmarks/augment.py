@@ -41,6 +41,7 @@ CHAIN, CHAIN_EDITS = "crop, flip, lens", "camtorch crop, flip"
 VISION, VISION_BATCH = "torchvision crop, flip", "torchvision, one draw"
 ANGLES = {"yaw": 10, "pitch": 10, "roll": 10, "min_filled": 0}
 _DEGREES = np.radians(10)
+_ROUNDS = 0.1  # seconds of a chain's round: of single calls the fastest is the luckiest draw, of one crop or of eight
 _COMPILED = 1  # cases whose compiled contestants are timed: to compile takes longer than everything else
 
 
@@ -72,7 +73,7 @@ def run(options: Options) -> tuple[list[Record], list[str]]:
         for operation in OPERATIONS:
             runs = contestants(case, size, data_of(operation, size, options), options, compiled=i < _COMPILED)
             records += measure(case.name, operation, runs, options)
-    chain = measure(CHAIN, BYTE, chains(size, options), options)
+    chain = measure(CHAIN, BYTE, chains(size, options), options, shortest=_ROUNDS)
     shape = f"{BATCH}x1x{size[0]}x{size[1]}"
     tables = [
         table(
@@ -98,7 +99,8 @@ def requirements(records: Sequence[Record]) -> list[Requirement]:
     chain = {row: times for row, times in rows.items() if row[0] == CHAIN}
     rows = {row: times for row, times in rows.items() if row[0] != CHAIN}
     found = [
-        Requirement(f"{CHAIN}: faster than torchvision's without the lens", 1.0, times_faster(chain, OURS, [VISION]))
+        Requirement(f"{CHAIN}: faster than torchvision's without the lens", 1.0, times_faster(chain, OURS, [VISION])),
+        Requirement(f"{CHAIN}: 1.5 times {VISION_BATCH}", 1.5, times_faster(chain, OURS, [VISION_BATCH])),
     ]
     for case, bound in zip(CASES[:2], (1.5, 5.0), strict=True):
         ratios = times_faster({row: times for row, times in rows.items() if row[0] == case.name}, OURS, [OPENCV])

@@ -221,7 +221,10 @@ def joined(numbers: Sequence[Any], like: Tensor, xp: Any) -> Tensor:
     kind = np.float64 if like.dtype == torch.float64 else np.float32
     if _FLOATS.issuperset(map(type, numbers)):
         return torch.from_numpy(np.array(numbers, kind))
-    return torch.from_numpy(np.stack(np.broadcast_arrays(*numbers), -1).astype(kind))
+    made = np.empty((*np.broadcast(*numbers).shape, len(numbers)), kind)
+    for i, number in enumerate(numbers):
+        made[..., i] = number
+    return torch.from_numpy(made)
 
 
 def _is_column(model: type[Camera], distortion: Tensor) -> bool:

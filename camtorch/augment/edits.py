@@ -128,20 +128,19 @@ def _turn(matrix: Tensor, source: Camera) -> Tensor | None:
     return on_rays(matrix).to(torch.promote_types(source.intrinsics.dtype, torch.float32))
 
 
-def _map(across: Tensor | float, left: Tensor | float, down: Tensor | float, top: Tensor | float) -> Tensor:
-    """(*B, 2, 3): (across u + left, down v + top)."""
-    given = across, 0.0, left, 0.0, down, top
-    if not any(isinstance(n, Tensor) for n in given):
-        return torch.tensor(given, dtype=torch.float64).view(2, 3)
-    numbers = [torch.as_tensor(n, dtype=torch.float64) for n in given]
-    matrix: Tensor = torch.stack(torch.broadcast_tensors(*numbers), -1).unflatten(-1, (2, 3))
-    return matrix
+def _map(across: float, left: float, down: float, top: float) -> Tensor:
+    """(2, 3): (across u + left, down v + top)."""
+    return torch.tensor([[across, 0.0, left], [0.0, down, top]], dtype=torch.float64)
 
 
-def _box_to(size: tuple[int, int], left: Any, top: Any, width: Any, height: Any) -> Tensor:
-    """The map that brings a box, from its outer edges on, to an image of a size."""
-    across, down = size[1] / width, size[0] / height
-    return _map(across, (0.5 - left) * across - 0.5, down, (0.5 - top) * down - 0.5)
+def _box_to(size: tuple[int, int], corner: Tensor, sides: Tensor) -> Tensor:
+    """(*B, 2, 3): the map that brings a box, from its outer edges on, to an image of a size.
+
+    Its corner (left, top), and its sides (width, height), are (*B, 2).
+    """
+    scale = sides.new_tensor(size[::-1]) / sides
+    shift = (0.5 - corner) * scale - 0.5
+    return torch.cat((torch.diag_embed(scale), shift.unsqueeze(-1)), -1)
 
 
 class _Sized(Edit):
@@ -187,10 +186,9 @@ class RandomResizedCrop(_Sized):
         ratio = values["ratio"].exp()
         width = (values["scale"] * rows * cols * ratio).sqrt()
         width = torch.minimum(width.clamp(max=cols), rows * ratio)
-        height = (width / ratio).round().clamp(1, rows)
-        width = width.round().clamp(1, cols)
-        left, top = ((values["place"] * torch.stack((cols - width, rows - height), -1)).round()).unbind(-1)
-        return _box_to(self.image_size, left, top, width, height), self.image_size
+        whole = width.new_tensor([cols, rows])
+        sides = torch.minimum(torch.stack((width, width / ratio), -1).round().clamp(min=1), whole)
+        return _box_to(self.image_size, (values["place"] * (whole - sides)).round(), sides), self.image_size
 
 
 class RandomCrop(_Sized):
@@ -208,9 +206,8 @@ class RandomCrop(_Sized):
         (height, width), new = size, self.image_size
         if new[0] > height or new[1] > width:
             raise ValueError(f"{self._name}: the box {new} must lie within the image, which is {size}; Pad enlarges it")
-        room = values["place"].new_tensor([width - new[1], height - new[0]])
-        left, top = (values["place"] * room).round().unbind(-1)
-        return _map(1.0, -left, 1.0, -top), new
+        corner = (values["place"] * values["place"].new_tensor([width - new[1], height - new[0]])).round()
+        return _box_to(new, corner, corner.new_tensor(new[::-1]).expand_as(corner)), new
 
 
 class CenterCrop(_Sized):
@@ -252,7 +249,8 @@ class Resize(Edit):
         if self.image_size is None and self.shorter is not None:
             height, width = (max(int(self.shorter * side / min(size)), 1) for side in size)
         new = self.image_size or (height, width)
-        return _box_to(new, 0, 0, size[1], size[0]), new
+        across, down = new[1] / size[1], new[0] / size[0]
+        return _map(across, 0.5 * across - 0.5, down, 0.5 * down - 0.5), new
 
 
 class Pad(Edit):

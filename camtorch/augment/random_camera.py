@@ -409,7 +409,7 @@ def _sized(base: Camera, size: tuple[int, int], fov: Any, xp: Any) -> Sequence[A
         return fx, fy, cx, cy
     half = fov * (math.pi / 360)
     sine, cosine = xp.sin(half), xp.cos(half)
-    if xp is math and (seen := _seen_across(base, sine, cosine)) is not None:
+    if xp is not torch and (seen := _seen_across(base, sine, cosine)) is not None:
         return own[0] * size[1] / seen, own[1] * size[1] / seen, cx, cy
     ends = [joined((end, 0 * sine, cosine), base.intrinsics, xp) for end in (-sine, sine)]
     rays = torch.stack(ends, -2)
@@ -424,13 +424,19 @@ def _sized(base: Camera, size: tuple[int, int], fov: Any, xp: Any) -> Sequence[A
     return own[0] * ratio, own[1] * ratio, cx, cy
 
 
-def _seen_across(base: Camera, sine: float, cosine: float) -> float | None:
-    """The pixels between two rays to either side of the axis; None where compiled code does not say."""
-    native = rows_of(base, base.intrinsics, base.distortion).native
+def _seen_across(base: Camera, sine: Any, cosine: Any) -> Any:
+    """The pixels between two rays to either side of the axis, or of each of arrays of them (B,).
+
+    None where compiled code does not say.
+    """
+    native = None if base.batch_shape else rows_of(base, base.intrinsics, base.distortion).native
     if native is None:
         return None
-    pixels = project_numbers(native, (-sine, 0.0, cosine, sine, 0.0, cosine))
-    return None if pixels is None else pixels[2] - pixels[0]
+    ends, is_one = (-sine, 0 * sine, cosine, sine, 0 * sine, cosine), isinstance(sine, float)
+    pixels = project_numbers(native, ends if is_one else np.transpose(ends).ravel().tolist())
+    if pixels is None:
+        return None
+    return pixels[2] - pixels[0] if is_one else np.subtract(pixels[2::4], pixels[::4])
 
 
 class RandomMount(RandomCamera):

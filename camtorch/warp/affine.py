@@ -330,14 +330,10 @@ def inverted(matrix: Tensor) -> Tensor:
 
 def after(second: Tensor, first: Tensor) -> Tensor:
     """(*B, 2, 3): the first map, then the second."""
-    linear = (second[..., :2].unsqueeze(-1) * first[..., :2].unsqueeze(-3)).sum(-2)
-    shift = (second[..., :2] * first[..., 2].unsqueeze(-2)).sum(-1) + second[..., 2]
-    return torch.cat((linear, shift.unsqueeze(-1)), -1)
+    return second[..., :2] @ first + F.pad(second[..., 2:], (2, 0))
 
 
 def on_rays(matrix: Tensor) -> Tensor:
     """(*B, 3, 3): what maps of pixels do to rays, a mirror or a turn about the axis: their signs."""
     signs = matrix[..., :2].sign()
-    zero = torch.zeros_like(signs[..., 0])
-    ahead = torch.stack((zero[..., 0], zero[..., 0], zero[..., 0] + 1), -1)
-    return torch.cat((torch.cat((signs, zero.unsqueeze(-1)), -1), ahead.unsqueeze(-2)), -2)
+    return F.pad(signs, (0, 1, 0, 1)) + signs.new_tensor([0.0, 0.0, 1.0]).diag()

@@ -20,6 +20,7 @@ from camtorch.augment import (
     RandomMount,
     RandomResizedCrop,
     Resize,
+    Rotate90,
 )
 
 SIZE = (96, 130)
@@ -102,6 +103,34 @@ def test_batches_as_step_by_step(key, name, threads):
     assert torch.equal(out["image"], change.images(sample["image"]))
     assert torch.equal(out["mask"], change.labels(sample["mask"][:, None], augment.mask_fill)[:, 0])
     assert torch.equal(out["keypoints"], change.points(sample["keypoints"])[0])
+
+
+LAST = {
+    "lens": lambda: RandomLens("pinhole", fov=(65, 80), min_filled=0),
+    "fisheye": lambda: RandomLens("kannala_brandt", fov=(65, 80), min_filled=0),
+    "its like": lambda: RandomLens(min_filled=0),
+    "mount": lambda: RandomMount(min_filled=0),
+    "quarters": lambda: Rotate90((0, 2), step=2),
+    "camera": lambda: RandomCamera(min_filled=0.9),
+}
+
+
+@pytest.mark.skipif(not ct.native_available(), reason="formulas of torch round numbers of a batch differently")
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("name", LAST)
+def test_a_sample_of_a_batch_is_what_it_is_alone(name, dtype):
+    augment = Compose([RandomResizedCrop(SIZE), HorizontalFlip(landmarks={}), LAST[name]()])
+    camera, alone = example("brown_conrady", SIZE).to(dtype).requires_grad_(False), sample_for(dtype)
+    alone |= {"boxes": torch.tensor([[20, 20, 60, 50]], dtype=dtype), "gaze": torch.tensor([0.6, 0, -0.8], dtype=dtype)}
+    torch.manual_seed(0)
+    draw = augment.draw(4)
+    batch = augment({field: torch.stack([value] * 4) for field, value in alone.items()}, camera=camera, draw=draw)
+    cameras = batch.pop("camera")
+    for i in range(4):
+        one = augment(alone, camera=camera, draw={key: value[i : i + 1] for key, value in draw.items()})
+        assert torch.equal(cameras[i].intrinsics, one["camera"].intrinsics)
+        assert torch.equal(cameras[i].distortion, one["camera"].distortion)
+        assert all(torch.equal(value[i], one[field]) for field, value in batch.items())
 
 
 def test_what_comes_out_is_not_what_the_change_keeps():
