@@ -17,6 +17,7 @@ from camtorch._tracing import (
     in_graph,
     in_transform,
     is_concrete,
+    is_eager,
     is_exporting,
     is_fake,
     keeps_graph,
@@ -394,7 +395,7 @@ class Memo:
 
     def __call__(self, inputs: Sequence[Tensor], options: tuple[Any, ...], compute: Callable[[], Any]) -> Any:
         """`compute()` without a graph, or its kept result; it depends on the tensors `inputs` and on `options`."""
-        if not all(is_concrete(t) and not has_tangent(t) for t in inputs):
+        if not is_eager(*inputs) and not all(is_concrete(t) and not has_tangent(t) for t in inputs):
             return compute()
         known = self._kept
         for i, entry in enumerate(known):

@@ -7,9 +7,9 @@ import os
 import sys
 import threading
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import suppress
 from functools import wraps
+from queue import SimpleQueue
 from typing import ParamSpec, TypeVar
 
 import torch
@@ -17,12 +17,9 @@ import torch
 P = ParamSpec("P")
 R = TypeVar("R")
 
-_MOST_THREADS = 256
-_pool: ThreadPoolExecutor
-
 
 def spread(work: Callable[[], object], threads: int) -> None:
-    """Run the same function on several threads at once: on this one, and on workers of the pool.
+    """Run the same function on several threads at once: on this one, and on workers that wait for such.
 
     The function takes what there is to do from somewhere, piece by piece, until nothing is left. Most of its time it
     must not hold the GIL, and in a worker it finds the state of torch that a new thread has.
@@ -37,38 +34,80 @@ def spread(work: Callable[[], object], threads: int) -> None:
     Raises:
         BaseException: the first one that any run raised, after all have ended.
     """
-    if threads <= 1:
+    if threads <= 1 or sys.is_finalizing():  # a new thread would never begin
         work()
         return
-    futures: list[Future[object]] = []
-    with suppress(RuntimeError):  # no more threads for this process, or the interpreter is about to end
-        futures += (_pool.submit(work) for _ in range(threads - 1))
+    runs: list[_Run] = []
+    with suppress(RuntimeError):  # no more threads for this process, or, from Python 3.12 on, at its end
+        runs.extend(_begin(work) for _ in range(threads - 1))
     try:
         work()
     finally:
         # workers still write into memory that the caller's frame keeps alive, also where this one is interrupted
-        begun, interruption = [future for future in futures if not future.cancel()], None
+        begun, interruption = [run for run in runs if not run.take_back()], None
         while begun:
             try:
-                wait(begun)
+                for run in begun:
+                    with run.ending:
+                        pass
                 break
             except BaseException as error:
                 interruption = interruption or error
         if interruption is not None:
             raise interruption
-    for future in begun:
-        future.result()
+    for run in begun:
+        if run.error is not None:
+            raise run.error
 
 
-def _new_pool() -> None:
-    """Also in the child of a fork, which has none of the threads."""
-    global _pool
-    _pool = ThreadPoolExecutor(_MOST_THREADS, "camtorch")
+_idle: list[SimpleQueue[_Run]] = []  # of workers: where each takes what it is to do
 
 
-_new_pool()
-if hasattr(os, "register_at_fork"):  # not on Windows
-    os.register_at_fork(after_in_child=_new_pool)
+class _Run:
+    """Of some work on a worker, unless the thread that asks for it takes it back before that begins."""
+
+    def __init__(self, work: Callable[[], object], worker: SimpleQueue[_Run]):
+        self.work, self.worker, self.ticket, self.ending = work, worker, threading.Lock(), threading.Lock()
+        self.error: BaseException | None = None
+        self.ending.acquire()
+
+    def take_back(self) -> bool:
+        """Whether the worker has not begun, and will not; it is idle then, if it has not seen so yet."""
+        taken = self.ticket.acquire(blocking=False)
+        if taken:
+            _idle.append(self.worker)
+        return taken
+
+    def __call__(self) -> None:
+        if self.ticket.acquire(blocking=False):
+            try:
+                self.work()
+            except BaseException as error:
+                self.error = error
+            _idle.append(self.worker)  # before anybody hears of the end, who may have more to do
+            self.ending.release()
+
+
+def _begin(work: Callable[[], object]) -> _Run:
+    """On the worker that became idle last, or on a new one."""
+    try:
+        worker = _idle.pop()
+    except IndexError:
+        worker = SimpleQueue()
+        # the interpreter need not end it: all it does then is wait
+        threading.Thread(target=_serve, args=(worker,), name="camtorch", daemon=True).start()
+    run = _Run(work, worker)
+    worker.put(run)
+    return run
+
+
+def _serve(worker: SimpleQueue[_Run]) -> None:
+    while True:
+        worker.get()()
+
+
+if hasattr(os, "register_at_fork"):  # not on Windows; the child of a fork has none of the threads
+    os.register_at_fork(after_in_child=_idle.clear)
 
 
 # -- the threads of torch

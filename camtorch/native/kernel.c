@@ -1080,17 +1080,16 @@ static const uint8_t UPPER[64] = {REPEATED(ODD)}; /* bytes of words */
 /* Where 32 pixels are read: of some rows from y on, windows that begin at pixel x */
 typedef struct {
     float x, y;
-    int64_t begin; /* of the first window, in elements */
-    int64_t rows;  /* none if there are no such windows */
+    int64_t begin;   /* of the first window, in elements */
+    int64_t columns; /* that lie in the window and on the image */
+    int64_t rows;    /* none if there are no such windows */
 } Place;
-
-/* How many pixels so many registers have a part of */
-#define READ(registers, pixel) ((64 * (registers) + (pixel) - 1) / (pixel))
 
 /* Positions hardly go any further between three of 32. Pixels of one element or of three. */
 INLINE void places_of(const Wide *image, const float *u, const float *v, int64_t n, const int pixel, const int registers,
                       Place *places) {
-    const float last = (float)(image->width - READ(registers, pixel));
+    const int64_t most = 64 * registers / pixel;
+    const float last = (float)(image->width - most);
     for (; n >= 32; n -= 32, u += 32, v += 32, places++) {
         const float left = lesser(u[0], u[31]) - 1;
         const float top = lesser(lesser(v[0], v[31]), v[16]) - 0.0625f;
@@ -1099,7 +1098,8 @@ INLINE void places_of(const Wide *image, const float *u, const float *v, int64_t
         const int64_t rows = (end < image->height ? end : image->height) - y;
         places->x = (float)x, places->y = (float)y;
         places->begin = y * image->below + pixel * x;
-        places->rows = last >= 0 && rows >= 2 && rows <= MOST_ROWS ? rows : 0;
+        places->columns = image->width - x < most ? image->width - x : most;
+        places->rows = image->width >= 2 && rows >= 2 && rows <= MOST_ROWS ? rows : 0;
     }
 }
 
@@ -1123,14 +1123,15 @@ INLINE __m512i between_bytes(__m512i pairs, __m512i t) {
     return _mm512_add_epi16(sum, _mm512_mulhrs_epi16(difference, t));
 }
 
-/* Bytes of a window of so many registers */
-INLINE __m512i found(const char *from, __m512i pick, const int registers) {
-    const __m512i low = _mm512_loadu_si512(from);
+/* Bytes of a window of so many registers, of which those are read that are `held` */
+INLINE __m512i found(const char *from, const __mmask64 *held, __m512i pick, const int registers) {
+#define LOADED(k) _mm512_maskz_loadu_epi8(held[k], from + 64 * (k))
+    const __m512i low = LOADED(0);
     if (registers == 1) return _mm512_permutexvar_epi8(pick, low);
-    const __m512i first = _mm512_permutex2var_epi8(low, pick, _mm512_loadu_si512(from + 64));
+    const __m512i first = _mm512_permutex2var_epi8(low, pick, LOADED(1));
     if (registers == 2) return first;
-    const __m512i second =
-        _mm512_permutex2var_epi8(_mm512_loadu_si512(from + 128), pick, _mm512_loadu_si512(from + 192));
+    const __m512i second = _mm512_permutex2var_epi8(LOADED(2), pick, LOADED(3));
+#undef LOADED
     return _mm512_mask_mov_epi8(first, _mm512_movepi8_mask(pick), second);
 }
 
@@ -1154,7 +1155,7 @@ INLINE int bytes_at(const Wide *image, const Place *place, char *result, const f
     const __m512i begin = _mm512_set1_epi16(0x4300), middle = _mm512_set1_epi16((short)0x8000);
     const __m512i column = _mm512_sub_epi16(halves(u0, u1, 1), begin);
     const __m512i row = _mm512_sub_epi16(halves(v0, v1, 1), begin);
-    const __mmask32 good = _mm512_cmple_epu16_mask(column, _mm512_set1_epi16((short)(64 * registers / pixel - beyond)));
+    const __mmask32 good = _mm512_cmple_epu16_mask(column, _mm512_set1_epi16((short)(place->columns - beyond)));
     if (_mm512_mask_cmple_epu16_mask(good, row, _mm512_set1_epi16((short)(rows - beyond))) != 0xffffffffu) return 0;
     const __m512i part_u = _mm512_xor_si512(halves(u0, u1, 0), middle);
     const __m512i part_v = _mm512_xor_si512(halves(v0, v1, 0), middle);
@@ -1175,18 +1176,26 @@ INLINE int bytes_at(const Wide *image, const Place *place, char *result, const f
             stored[k] = _mm512_movepi16_mask(_mm512_permutexvar_epi16(which, _mm512_movm_epi16(wanted)));
         }
     }
+    __mmask64 held[4];
+    for (k = 0; k < registers; k++) {
+        const int64_t bytes = place->columns * pixel - 64 * k;
+        held[k] = bytes >= 64 ? ~0ull : bytes > 0 ? ~0ull >> (64 - bytes) : 0;
+    }
     const char *plane = image->source + place->begin;
     for (c = 0; c < (pixel == 1 ? image->channels : 1); c++, plane += image->from_plane, result += image->to_plane) {
         const char *from = plane + image->below;
         ask_below(from, image->below);
         if (pixel > 1) ask_below(from + 64, image->below);
-        for (k = 0; k < pixel; k++) upper[k] = found(plane, pick[k], registers), last[k] = lower[k] = found(from, pick[k], registers);
+        for (k = 0; k < pixel; k++) {
+            upper[k] = found(plane, held, pick[k], registers);
+            last[k] = lower[k] = found(from, held, pick[k], registers);
+        }
         for (j = 2; j < rows; j++) {
             const __m512i before = _mm512_set1_epi16((short)(j - 2));
             from += image->below;
             for (k = 0; k < pixel; k++) {
                 const __mmask32 below = _mm512_cmpgt_epi16_mask(begins[k], before);
-                const __m512i next = found(from, pick[k], registers);
+                const __m512i next = found(from, held, pick[k], registers);
                 upper[k] = _mm512_mask_mov_epi16(upper[k], below, last[k]);
                 lower[k] = _mm512_mask_mov_epi16(lower[k], below, next);
                 last[k] = next;

@@ -29,6 +29,8 @@ CLASSIFICATION = "12q3di2q"
 """`Classification` of sampler.h."""
 _Classification = struct.Struct(CLASSIFICATION).pack
 SCRATCH = 25  # numbers of float32 for each column of a lattice and eight more
+Later = list[tuple["ctypes.Array[ctypes.c_char]", int, object]]
+"""Images that `finish` makes: how, in how many tiles, and what has to live until then."""
 _WORTH = 8  # pixels that may be copied for one that is made: interpolated one by one they would take longer
 
 
@@ -49,6 +51,7 @@ def sample(
     nodes: Tensor | None = None,
     cells: Tensor | None = None,
     exact: Tensor | None = None,
+    later: Later | None = None,
 ) -> None:
     """Write the samples of images into `result`, at the positions of a grid or of a lattice.
 
@@ -66,9 +69,9 @@ def sample(
             from the one at (-16, -16) on.
         cells: (B or 1, n, m) int32, contiguous: `EMPTY`, `CUBIC`, or the cell's place in `exact`.
         exact: (2, K, 8, 8) of float32, contiguous: positions, NaN where there is none.
+        later: gets what is to be done, if this is to be done by `finish`, together with other images.
     """
-    native = library()
-    if native is None or 0 in result.shape:
+    if library() is None or 0 in result.shape:
         return
     if not is_quick(images, result, mode) and math.prod(images.shape[2:]) <= _WORTH * math.prod(result.shape[2:]):
         where = {"grid": grid, "mapped": mapped, "nodes": nodes, "cells": cells, "exact": exact}
@@ -77,7 +80,7 @@ def sample(
         made = result if fits else torch.empty(result.shape, dtype=result.dtype, device="cpu")
         source = images if images.stride(0) else images[:1]  # which all results show
         source = source.clone(memory_format=torch.channels_last if together else torch.contiguous_format)
-        sample(source.expand(images.shape), made, mode, padding, fill, **where)
+        sample(source.expand(images.shape), made, mode, padding, fill, **where, later=None)
         if not fits:
             result.copy_(made)
         return
@@ -92,9 +95,24 @@ def sample(
         on_lattice = [nodes.data_ptr(), _shared(nodes), nodes.stride(1), cells.data_ptr(), _shared(cells)]
         on_lattice += [rows, columns, *at]
     job, kept = packed(images, result, mode, padding, fill, (*on_grid, *masks, *on_lattice))
-    run, tiles = _Job.from_buffer_copy(job), tiles_of(result)
-    spread(lambda: native.camtorch_sample(run), min(thread_count(), tiles))
-    del kept
+    jobs = [] if later is None else later
+    holds = images, result, grid, mapped, nodes, cells, exact, kept
+    jobs.append((_Job.from_buffer_copy(job), tiles_of(result), holds))
+    if later is None:
+        finish(jobs)
+
+
+def finish(jobs: Later) -> None:
+    """Write the samples that `sample` has left for later."""
+    native = library() if jobs else None
+    if native is None:
+        return
+
+    def work() -> None:
+        for job, _, _ in jobs:
+            native.camtorch_sample(job)
+
+    spread(work, min(thread_count(), sum(tiles for _, tiles, _ in jobs)))
 
 
 def packed(

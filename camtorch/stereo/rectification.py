@@ -31,10 +31,12 @@ from camtorch.camera import Camera
 from camtorch.extrinsics import Extrinsics
 from camtorch.io.filestorage import Value, write
 from camtorch.models import Cylindrical, Equirectangular, LatLon, Pinhole, TransverseCylindrical
+from camtorch.native.sampler import Later, finish
 from camtorch.rotations import rotation_matrix
+from camtorch.warp import routes
 from camtorch.warp.dewarp import middle_lines
 from camtorch.warp.proxy import check_pose
-from camtorch.warp.warp import Warp, as_sized
+from camtorch.warp.warp import Warp, as_sized, checked
 
 Projection = Literal["perspective", "latlon", "cylindrical"]
 Align = Literal["mean", "opencv"]
@@ -153,8 +155,13 @@ class Rectification(GeometryModule):
 
     def forward(self, left: Tensor, right: Tensor) -> tuple[Tensor, Tensor]:
         """Both images, (B, C, H, W) each, rectified."""
-        of_left, of_right = self._warps()
-        return of_left(left), of_right(right)
+        later: Later = []  # threads share both: they are waited for once
+        of_left, of_right = (
+            routes.warped(warp, images, checked(warp, images, None, None, None), later)
+            for warp, images in zip(self._warps(), (left, right), strict=True)
+        )
+        finish(later)
+        return of_left, of_right
 
     if TYPE_CHECKING:
 

@@ -20,7 +20,7 @@ from camtorch._tracing import (
     keeps_graph,
     set_aside,
 )
-from camtorch.native.sampler import empty
+from camtorch.native.sampler import Later, empty
 from camtorch.warp import compiled
 from camtorch.warp.grid import Lattice, Sampling, scaled
 from camtorch.warp.panorama import seam_of
@@ -63,8 +63,8 @@ def route_of(warp: Warp, images: Tensor | None = None, mode: Mode = "nearest") -
     return "graph" if learns else "kept"
 
 
-def warped(warp: Warp, images: Tensor, sampler: Sampler) -> Tensor:
-    """The images of a warp; those given are checked."""
+def warped(warp: Warp, images: Tensor, sampler: Sampler, later: Later | None = None) -> Tensor:
+    """The images of a warp; those given are checked. With `later`, `finish` may have to make them."""
     route = route_of(warp, images, sampler.mode)
     if route == "exposure":
         assert warp.target_shutter is not None
@@ -85,7 +85,7 @@ def warped(warp: Warp, images: Tensor, sampler: Sampler) -> Tensor:
             with torch.no_grad():
                 render(images, where, *sampler, kept, result[:, :, rows])
         return result
-    return render(images, positions(warp, route, sampler.padding_mode), *sampler)
+    return render(images, positions(warp, route, sampler.padding_mode), *sampler, later=later)
 
 
 def positions(warp: Warp, route: Route, padding: PaddingMode = "zeros") -> Sampling | Lattice:

@@ -51,6 +51,7 @@ def render(
     fill: tuple[float, ...],
     kept: dict[int, Pyramid] | None = None,
     out: Tensor | None = None,
+    later: sampler.Later | None = None,
 ) -> Tensor:
     """The images that a warp makes.
 
@@ -64,6 +65,7 @@ def render(
         fill: the value of pixels that show nothing, one or C.
         kept: holds the halves of the images from one call to the next.
         out: where to write the result, if it has no graph.
+        later: what compiled code is to do is left to `sampler.finish`, and goes in here.
 
     Returns:
         (B, C, h, W') of the dtype of the images. Half precision is sampled in float32; integers are rounded and stay
@@ -80,7 +82,7 @@ def render(
     if isinstance(where, Sampling) and not dtype.is_floating_point:
         where = where._replace(grid=where.grid.detach())
     how = Sampler(mode, padding_mode, fill)
-    result = _natively(images, where, how, out)
+    result = _natively(images, where, how, out, later)
     if result is None:
         result = _by_torch(images, where, how, kept)
         result = _laid_as(images, result) if out is None else out.copy_(result)
@@ -117,7 +119,13 @@ def _laid_as(images: Tensor, result: Tensor) -> Tensor:
     return result.contiguous(memory_format=torch.channels_last)
 
 
-def _natively(images: Tensor, where: Sampling | Lattice, how: Sampler, out: Tensor | None = None) -> Tensor | None:
+def _natively(
+    images: Tensor,
+    where: Sampling | Lattice,
+    how: Sampler,
+    out: Tensor | None = None,
+    later: sampler.Later | None = None,
+) -> Tensor | None:
     """What compiled code makes, or None: here is decided whether it does.
 
     It wants the library, memory of the CPU, no graph and no transform, nobody who records what torch does, a dtype that
@@ -133,14 +141,15 @@ def _natively(images: Tensor, where: Sampling | Lattice, how: Sampler, out: Tens
     if isinstance(where, Lattice):
         result = sampler.empty(images, images.shape[0], where.size) if out is None else out
         at = where.single
-        sampler.sample(images, result, mode, padding_mode, values, nodes=at.nodes, cells=at.cells, exact=at.exact)
+        on = {"nodes": at.nodes, "cells": at.cells, "exact": at.exact}
+        sampler.sample(images, result, mode, padding_mode, values, **on, later=later)
         return result
     if positions.dtype not in (torch.float32, torch.float64):
         return None
     result = sampler.empty(images, images.shape[0], (positions.shape[1], positions.shape[2])) if out is None else out
     # in "zeros" positions far outside say that there is none
     mapped = None if padding_mode == "zeros" else where.mapped
-    sampler.sample(images, result, mode, padding_mode, values, grid=positions, mapped=mapped)
+    sampler.sample(images, result, mode, padding_mode, values, grid=positions, mapped=mapped, later=later)
     return result
 
 

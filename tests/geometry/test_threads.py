@@ -49,6 +49,7 @@ def test_workers_are_kept():
     before = threading.active_count()
     for _ in range(5):
         spread(Pieces(10), 3)
+        spread(int, 3)  # which ends before most workers begin
     assert threading.active_count() == before
 
 
