@@ -120,7 +120,7 @@ def minimise(
             where = torch.from_numpy(better).to(device)
             state = tuple([t.index_copy(0, at[where], part[where]) for t, part in zip(state, new, strict=True)])
         cost[rows] = np.where(better, after, before)
-        factor = np.where(kept > _GOOD, 0.03, np.where(kept > _FAIR, 1.0, 2.0))
+        factor = np.where(kept > _GOOD, 0.1, np.where(kept > _FAIR, 1.0, 2.0))
         weights[rows] = (weight * np.where(better, factor, growth[rows])).clip(LEAST_DAMPING, MOST_DAMPING)
         growth[rows] = np.where(better, 4.0, growth[rows] * 2).clip(max=64.0)
         settled = last | (cost[rows] <= least[rows])

@@ -573,7 +573,7 @@ static double refine(const Poses *given, Row *row, double *rotation, double *tra
         const double kept = (cost - after) / (promised > DBL_MIN ? promised : DBL_MIN);
         const int stuck = last || damping >= MOST_DAMPING;
         is_new = after < cost || (last && after <= cost + (rounding > 1e-12 * cost ? rounding : 1e-12 * cost));
-        damping *= is_new ? kept > 0.75 ? 0.03 : kept > 0.25 ? 1 : 2 : growth;
+        damping *= is_new ? kept > 0.75 ? 0.1 : kept > 0.25 ? 1 : 2 : growth;
         damping = damping < LEAST_DAMPING ? LEAST_DAMPING : damping > MOST_DAMPING ? MOST_DAMPING : damping;
         growth = is_new ? 4 : 2 * growth < 64 ? 2 * growth : 64;
         if (is_new) {
