@@ -97,12 +97,12 @@ def set_aside() -> Iterator[None]:
     recording = torch._C._get_tracing_state()  # of torch.jit.trace
     with torch._C.DisableTorchFunction(), _disable_current_modes(), torch.no_grad():
         try:
-            torch._C._set_tracing_state(None)
+            torch._C._set_tracing_state(None)  # type: ignore[attr-defined]
             for name in flags:
                 setattr(torch.compiler, name, False)
             yield
         finally:
-            torch._C._set_tracing_state(recording)
+            torch._C._set_tracing_state(recording)  # type: ignore[attr-defined]
             for name, flag in flags.items():
                 setattr(torch.compiler, name, flag)
 
