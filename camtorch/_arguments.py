@@ -6,6 +6,7 @@ import functools
 import math
 import operator
 import os
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ParamSpec, TypeAlias, TypeGuard, TypeVar
 
@@ -39,6 +40,14 @@ def hinting(hint: str) -> Callable[[Callable[Taken, Result]], Callable[Taken, Re
         return call
 
     return hinted
+
+
+def users_line() -> int:
+    """The `stacklevel` at which a warning of the caller shows the line that called this package."""
+    level, frame, package = 1, sys._getframe(1), os.path.dirname(__file__) + os.sep
+    while frame.f_back is not None and frame.f_code.co_filename.startswith(package):
+        level, frame = level + 1, frame.f_back
+    return level
 
 
 def as_real(value: Numbers, name: str, owner: str) -> Tensor:

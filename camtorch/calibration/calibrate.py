@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from torch.nn.utils.parametrize import type_before_parametrizations
 
-from camtorch._arguments import as_flag, as_number, as_whole, hinting, shown
+from camtorch._arguments import as_flag, as_number, as_whole, hinting, shown, users_line
 from camtorch._freezing import INTRINSICS, frozen_names
 from camtorch._threads import on_one_thread
 from camtorch.calibration.bundle import LOSSES, Adjusted, Free, Poses, Prior, Sight, State, adjust
@@ -312,7 +312,7 @@ def calibrate(
         ends += [f"{lost} corners have no pixel in it: a surface has to reach further"] if (lost := result.lost) else []
         python_warnings.warn(
             f"{owner}: {', and '.join(ends)} (rms {result.rms:.4g} px); do not use it. See its warnings",
-            stacklevel=2,
+            stacklevel=users_line(),
         )
     return result
 
@@ -427,7 +427,7 @@ class Search:
             python_warnings.warn(
                 f"{self.owner}: the views contradict prior, by {wide:.3g} standard deviations, and it counts so much "
                 "less: is it the lens, its focus and zoom, and the whole image, not a part of it?",
-                stacklevel=4,
+                stacklevel=users_line(),
             )
         return adjusted
 

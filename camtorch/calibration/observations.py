@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from camtorch._arguments import Numbers, as_image_size, as_values, shown
+from camtorch._arguments import Numbers, as_image_size, as_values, shown, users_line
 
 Points: TypeAlias = "Numbers | Sequence[Numbers | None]"
 """Points of all views: a tensor, an array, or a list with one of them, or None, for each view."""
@@ -206,7 +206,7 @@ def _observed(
     copy = has & torch.tensor([first.setdefault(row.tobytes(), i) != i for i, row in enumerate(ordered)], device=device)
     for left_out, why in ((~has, "nothing was seen"), (copy, "the corners are those of another view")):
         if bool(left_out.any()):
-            warnings.warn(f"{owner}: left out, as {why} in {_views_of(left_out)}", UserWarning, stacklevel=5)
+            warnings.warn(f"{owner}: left out, as {why} in {_views_of(left_out)}", UserWarning, stacklevel=users_line())
     kept = (has & ~copy).nonzero()[:, 0]
     found = {}
     for name, given in views.items():

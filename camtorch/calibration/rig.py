@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from camtorch._arguments import users_line
 from camtorch._threads import on_one_thread
 from camtorch.calibration.bundle import Adjusted, Bundle, Free, Poses, Sight, State
 from camtorch.calibration.calibrate import STEPS, Calibration, Search, as_model, as_options, middle_of, results
@@ -179,7 +180,7 @@ def calibrate_rig(
         python_warnings.warn(
             f"{owner}: the search did not end at an optimum (rms {result.rms:.4g} px); do not use it. See its "
             "warnings, and whether each view was taken by all cameras at the same moment",
-            stacklevel=2,
+            stacklevel=users_line(),
         )
     return result
 
