@@ -204,8 +204,8 @@ class AffineWarp(MirrorWarp):
                 view = view.mT
             dims = [dim for dim, sign in ((-1, a + b), (-2, c + d)) if sign < 0]
             if dims:  # torch flips none of those without a sign
-                signed = SIGNED.get(view.dtype, view.dtype)
-                view = view.view(signed).flip(dims).view(view.dtype)
+                signed = SIGNED.get(view.dtype)  # a view by a dtype, be it the same, has no gradient
+                view = view.flip(dims) if signed is None else view.view(signed).flip(dims).view(view.dtype)
             # of the first pixel of the view
             left -= (view.shape[-1] - 1) * (a + b < 0)
             top -= (view.shape[-2] - 1) * (c + d < 0)
