@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import torch
 from torch import Tensor
 
-from camtorch._module import is_parameter
+from camtorch._module import BatchedModule, is_parameter
 from camtorch._tracing import in_transform, is_concrete, is_recorded
 
 if TYPE_CHECKING:
+    from typing_extensions import Self
+
     from camtorch.camera import Camera
 
 INTRINSICS = "fx", "fy", "cx", "cy"
@@ -64,7 +66,7 @@ def frozen_names(camera: Camera) -> tuple[str, ...]:
     return tuple(found)
 
 
-def freeze(camera: Camera, names: Sequence[str], frozen: bool) -> None:
+def _freeze(camera: Camera, names: Sequence[str], frozen: bool) -> None:
     """Freeze, or let learn again, the parameters of these names; all of them for none."""
     owner = f"{type(camera).__name__}.{'freeze' if frozen else 'unfreeze'}"
     if camera.is_mixed:
@@ -94,23 +96,47 @@ def freeze(camera: Camera, names: Sequence[str], frozen: bool) -> None:
             camera.put(PREFIX + tensor, now)
 
 
-def saved(camera: Camera, destination: Any, prefix: str) -> None:
-    """After a state was saved, which shares the memory of the Parameters: its metadata say what is frozen."""
-    for tensor, _ in _tensors_of(camera):
-        getattr(camera, tensor)  # by which it is as it was frozen
-    if (names := frozen_names(camera)) and hasattr(destination, "_metadata"):
-        destination._metadata[prefix[:-1]]["frozen"] = names
-
-
-def loaded(camera: Camera, metadata: dict[str, Any]) -> None:
-    """After a state was loaded: what is frozen has the values of the state, and what the state says is frozen too."""
-    names = {*frozen_names(camera), *metadata.get("frozen", ())}
-    for tensor, _ in _tensors_of(camera):
-        camera._buffers.pop(PREFIX + tensor, None)
-    if names:
-        freeze(camera, sorted(names), True)
-
-
 def _tensors_of(camera: Camera) -> tuple[tuple[str, tuple[str, ...]], ...]:
     """What holds them, and the names of its columns; a Mixed has none of its own."""
     return () if camera.is_mixed else (("intrinsics", INTRINSICS), ("distortion", tuple(camera.distortion_names)))
+
+
+class Freezable(BatchedModule):
+    """What a camera is beside its optics: a module whose parameters can be frozen by name."""
+
+    def freeze(self, *names: str) -> Self:
+        """Let parameters stay as they are while the others learn: `camera.freeze("fx", "fy", "k3")`.
+
+        They have no gradient, and neither weight decay nor the momentum of an optimizer moves them; `ct.fit` and
+        `ct.calibrate` hold them where they start from the camera. States, pickles and `copy.deepcopy` keep them frozen;
+        what is made from the camera, as by `resize` or `clone`, sends its gradients to what learns here.
+
+        Args:
+            names: "fx", "fy", "cx", "cy", and of `distortion_names`; all parameters if there are none.
+        """
+        _freeze(cast("Camera", self), names, True)
+        return self
+
+    def unfreeze(self, *names: str) -> Self:
+        """Let parameters that were frozen learn again, from the values that they have; all of them for no name."""
+        _freeze(cast("Camera", self), names, False)
+        return self
+
+    def _save_to_state_dict(self, destination: Any, prefix: str, keep_vars: bool) -> None:
+        super()._save_to_state_dict(destination, prefix, keep_vars)
+        # it shares the memory of the Parameters, which are as they were frozen once they were looked at
+        camera = cast("Camera", self)
+        for tensor, _ in _tensors_of(camera):
+            getattr(camera, tensor)
+        if (names := frozen_names(camera)) and hasattr(destination, "_metadata"):
+            destination._metadata[prefix[:-1]]["frozen"] = names
+
+    def _load_from_state_dict(self, *arguments: Any) -> None:
+        super()._load_from_state_dict(*arguments)
+        # what is frozen has the values of the state, and what the state says is frozen too
+        camera = cast("Camera", self)
+        names = {*frozen_names(camera), *arguments[2].get("frozen", ())}
+        for tensor, _ in _tensors_of(camera):
+            camera._buffers.pop(PREFIX + tensor, None)
+        if names:
+            _freeze(camera, sorted(names), True)

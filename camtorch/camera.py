@@ -24,8 +24,8 @@ from camtorch._arguments import (
 from camtorch._derived import variant
 from camtorch._editing import check_crop, edited_by, quarter_turns
 from camtorch._evaluation import evaluated, mapped
-from camtorch._freezing import PREFIX, freeze, loaded, saved, with_frozen
-from camtorch._module import BatchedModule, Memo, remade, typed_as
+from camtorch._freezing import PREFIX, Freezable, with_frozen
+from camtorch._module import Memo, remade, typed_as
 from camtorch._notebook import as_html
 from camtorch._numbers import (
     at_a_glance,
@@ -100,7 +100,7 @@ def _held(name: str, doc: str) -> Any:
     return property(tensor, doc=doc)
 
 
-class Camera(BatchedModule):
+class Camera(Freezable):
     """A learnable camera: `pixel = focal * lens(chart(ray)) + principal_point`.
 
     A model states its `key`, its `distortion_names` and its `optics`; all else is done here.
@@ -277,32 +277,6 @@ class Camera(BatchedModule):
             ValueError, TypeError: as of the constructor.
         """
         return replaced(self, intrinsics, distortion, image_size)
-
-    def freeze(self, *names: str) -> Self:
-        """Let parameters stay as they are while the others learn: `camera.freeze("fx", "fy", "k3")`.
-
-        They have no gradient, and neither weight decay nor the momentum of an optimizer moves them; `ct.fit` and
-        `ct.calibrate` hold them where they start from the camera. States, pickles and `copy.deepcopy` keep them frozen;
-        what is made from the camera, as by `resize` or `clone`, sends its gradients to what learns here.
-
-        Args:
-            names: "fx", "fy", "cx", "cy", and of `distortion_names`; all parameters if there are none.
-        """
-        freeze(self, names, True)
-        return self
-
-    def unfreeze(self, *names: str) -> Self:
-        """Let parameters that were frozen learn again, from the values that they have; all of them for no name."""
-        freeze(self, names, False)
-        return self
-
-    def _save_to_state_dict(self, destination: Any, prefix: str, keep_vars: bool) -> None:
-        super()._save_to_state_dict(destination, prefix, keep_vars)
-        saved(self, destination, prefix)
-
-    def _load_from_state_dict(self, *arguments: Any) -> None:
-        super()._load_from_state_dict(*arguments)
-        loaded(self, arguments[2])
 
     @property
     def batch_shape(self) -> torch.Size:
