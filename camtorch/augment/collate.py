@@ -12,6 +12,7 @@ from torch.utils.data._utils.collate import collate as collate_by
 from torch.utils.data._utils.collate import default_collate_fn_map
 
 from camtorch._arguments import is_list
+from camtorch.augment.sending import stacked
 from camtorch.camera import Camera
 from camtorch.mixed import cat
 
@@ -23,6 +24,10 @@ def collate(samples: Sequence[object]) -> object:
     differ, such as the keypoints of several faces, come as the list of tensors that the augmentations take. Cameras
     become a batch, a `ct.Mixed` where they are of several models, or a list where their images are of several sizes; so
     they do by `default_collate`.
+
+    In a worker on Linux, batches go into shared memory that is used again when the main process has let go of them, of
+    at most as many bytes as it had at once: to get new memory takes torch's own way as long as images take to be
+    augmented. Small ones go within the message. With torch's sharing strategy "file_system" all is torch's own.
 
     Raises:
         TypeError: no list of samples; what cannot be collated, as by `default_collate`. ValueError: an empty list.
@@ -37,8 +42,8 @@ def collate(samples: Sequence[object]) -> object:
 def _tensors(batch: Sequence[Tensor], *, collate_fn_map: Any = None) -> Tensor | list[Tensor]:
     if len({tensor.shape for tensor in batch}) > 1:
         return list(batch)
-    stacked: Tensor = default_collate_fn_map[Tensor](batch, collate_fn_map=collate_fn_map)
-    return stacked
+    sent = stacked(batch)
+    return default_collate_fn_map[Tensor](batch, collate_fn_map=collate_fn_map) if sent is None else sent
 
 
 def _arrays(batch: Sequence[np.ndarray], *, collate_fn_map: Any = None) -> Tensor | list[Tensor]:
