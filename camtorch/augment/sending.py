@@ -9,9 +9,9 @@ from __future__ import annotations
 import functools
 import mmap
 import os
+import threading
 import weakref
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from multiprocessing.reduction import ForkingPickler
 from typing import Any
 
@@ -33,7 +33,7 @@ _HOME, _AWAY, _LOST = 0, 1, 2
 class Sent(Tensor):
     """A batch in a worker, which comes out of the DataLoader as a plain tensor; so does what is computed from it."""
 
-    __torch_function__ = torch._C._disabled_torch_function_impl
+    __torch_function__ = torch._C._disabled_torch_function_impl  # type: ignore[assignment]
 
     def __reduce_ex__(self, protocol: Any) -> Any:
         return self.as_subclass(Tensor).__reduce_ex__(protocol)  # to files and the like
@@ -57,17 +57,13 @@ class _Block:
         del _held[place]
         _away.append(self)
 
-    @property
-    def may_be_used(self) -> bool:
-        """Whether nobody will read again what is in it."""
-        return self.memory[-1] == _HOME and self.forks == _forks
 
-
-# No lock: a tensor may die wherever Python collects garbage. What is done to these is done at once.
 _held: dict[int, _Block] = {}
 """By where they lie, the blocks on which this process has a tensor."""
 _away: list[_Block] = []
+"""Those on which another one may have one."""
 _idle: list[_Block] = []
+_lock = threading.Lock()  # of the lists, but for what comes back: a tensor may die wherever Python collects garbage
 _forks = 0
 
 
@@ -95,21 +91,15 @@ def _block(size: int) -> _Block | None:
     """One of so many bytes that nobody has; None where the system, or the user, wants torch's own."""
     if get_sharing_strategy() == "file_system" or not _is_open(os.getppid()):
         return None
-    for block in tuple(_away):
-        if block.memory[-1] != _AWAY:
-            with suppress(ValueError):  # another thread has it
-                _away.remove(block)
-                _idle.append(block)
-    for block in reversed(tuple(_idle)):
-        if block.size == size or not block.may_be_used:
-            try:
-                _idle.remove(block)
-            except ValueError:
-                continue
-            if block.may_be_used:
-                return block
-    while sum(block.size for block in tuple(_idle)) > LIMIT:
-        with suppress(IndexError):
+    with _lock:
+        for block in [block for block in _away if block.memory[-1] != _AWAY]:
+            _away.remove(block)
+            _idle.append(block)
+        _idle[:] = [block for block in _idle if block.memory[-1] == _HOME and block.forks == _forks]
+        for i in reversed(range(len(_idle))):
+            if _idle[i].size == size:
+                return _idle.pop(i)
+        while sum(block.size for block in _idle) > LIMIT:
             del _idle[0]
     try:
         return _Block(size) if len(_away) < _MOST else None
