@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import functools
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ from torch.utils.data._utils.collate import collate as collate_by
 from torch.utils.data._utils.collate import default_collate_fn_map
 
 from camtorch._arguments import is_list
-from camtorch.augment.sending import stacked
+from camtorch.augment.sending import stacked, within_message
 from camtorch.camera import Camera
 from camtorch.mixed import cat
 
@@ -36,7 +37,8 @@ def collate(samples: Sequence[object]) -> object:
         raise TypeError(f"collate: samples must be a list of samples; got {type(samples).__name__}")
     if not samples:
         raise ValueError("collate: samples must not be empty; got an empty list")
-    return collate_by(samples, collate_fn_map={**default_collate_fn_map, Tensor: _tensors, np.ndarray: _arrays})
+    others = {kind: functools.partial(_others, function) for kind, function in default_collate_fn_map.items()}
+    return collate_by(samples, collate_fn_map={**others, Tensor: _tensors, np.ndarray: _arrays})
 
 
 def _tensors(batch: Sequence[Tensor], *, collate_fn_map: Any = None) -> Tensor | list[Tensor]:
@@ -48,6 +50,10 @@ def _tensors(batch: Sequence[Tensor], *, collate_fn_map: Any = None) -> Tensor |
 
 def _arrays(batch: Sequence[np.ndarray], *, collate_fn_map: Any = None) -> Tensor | list[Tensor]:
     return _tensors([torch.as_tensor(array) for array in batch], collate_fn_map=collate_fn_map)
+
+
+def _others(function: Callable[..., Any], batch: Sequence[Any], *, collate_fn_map: Any = None) -> Any:
+    return within_message(function(batch, collate_fn_map=collate_fn_map))
 
 
 def collate_cameras(batch: Sequence[Camera], *, collate_fn_map: Any = None) -> Camera | list[Camera]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import functools
 import mmap
 import os
+import pickle
 import threading
 import weakref
 from collections.abc import Callable, Sequence
@@ -16,7 +17,7 @@ from multiprocessing.reduction import ForkingPickler
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.multiprocessing import get_sharing_strategy
 from torch.multiprocessing.reductions import reduce_tensor
 from torch.utils.data import get_worker_info
@@ -65,6 +66,21 @@ _away: list[_Block] = []
 _idle: list[_Block] = []
 _lock = threading.Lock()  # of the lists, but for what comes back: a tensor may die wherever Python collects garbage
 _forks = 0
+
+
+def within_message(value: Any) -> Any:
+    """What a worker sends, as it is elsewhere; if it is a small tensor, or something else that has some, by value."""
+    if get_worker_info() is None:
+        return value
+    if type(value) is Tensor:
+        return value.as_subclass(Sent)
+    if isinstance(value, nn.Module):
+        ForkingPickler.register(type(value), _by_value)
+    return value
+
+
+def _by_value(module: nn.Module) -> tuple[Callable[[bytes], Any], tuple[bytes]]:
+    return pickle.loads, (pickle.dumps(module),)
 
 
 def stacked(batch: Sequence[Tensor]) -> Tensor | None:
