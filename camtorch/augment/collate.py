@@ -26,9 +26,10 @@ def collate(samples: Sequence[object]) -> object:
     become a batch, a `ct.Mixed` where they are of several models, or a list where their images are of several sizes; so
     they do by `default_collate`.
 
-    In a worker on Linux, batches go into shared memory that is used again when the main process has let go of them, of
-    at most as many bytes as it had at once: to get new memory takes torch's own way as long as images take to be
-    augmented. Small ones go within the message. With torch's sharing strategy "file_system" all is torch's own.
+    In a worker on Linux, batches go into shared memory that is used again when the main process has let go of them,
+    as new memory takes as long to get as images take to be augmented; of no more bytes than were in use at once. What
+    is small goes within the message. So the storage of what arrives cannot be resized. With torch's sharing strategy
+    "file_system" all goes torch's own way.
 
     Raises:
         TypeError: no list of samples; what cannot be collated, as by `default_collate`. ValueError: an empty list.

@@ -26,8 +26,8 @@ from camtorch.native.memory import LIMIT, tensor_on
 
 _SMALL = 1 << 16
 """Bytes below which a tensor goes within the message."""
-_MOST = 64
-"""Blocks that others have, at most: for those who keep more batches than that, memory is torch's own."""
+_MOST = 32
+"""Blocks that wait, and blocks that others have: for those who keep more batches than that, memory is torch's own."""
 _HOME, _AWAY, _LOST = 0, 1, 2
 
 
@@ -115,7 +115,7 @@ def _block(size: int) -> _Block | None:
         for i in reversed(range(len(_idle))):
             if _idle[i].size == size:
                 return _idle.pop(i)
-        while sum(block.size for block in _idle) > LIMIT:
+        while len(_idle) >= _MOST or sum(block.size for block in _idle) > LIMIT:
             del _idle[0]
     try:
         return _Block(size) if len(_away) < _MOST else None
