@@ -1,7 +1,8 @@
 """A DataLoader: samples per second of its workers, of arrays that are in memory already.
 
 Each sample is an image of (480, 640, 3) uint8, a mask and 68 landmarks; batches of 8 come out. "nothing done" hands
-samples on as they are: what the DataLoader itself takes. The loaders take turns, an epoch each.
+samples on as they are: what the DataLoader itself takes. The loaders take turns, an epoch each: all collate as torch
+does, then all of them by `ct.augment.collate`.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from functools import partial
 from importlib.util import find_spec
+from itertools import product
 
 import numpy as np
 import torch
@@ -21,13 +23,14 @@ from benchmarks.point_peers import OPENCV, OURS
 from benchmarks.tables import Record, only, table
 from benchmarks.timing import Run, measure, threads
 from benchmarks.verdict import Requirement, figures, verdict
-from camtorch.augment import RandomCamera
+from camtorch.augment import RandomCamera, collate
 
 NOTHING, ALBUMENTATIONS = "nothing done", "albumentations Affine"
 WORKERS = (1, 2)
 _CHANNELS = 3
 _BATCHES, _QUICK_BATCHES = 12, 2  # of an epoch
-_OPERATION = "{} worker{}"
+_OPERATION = "{} worker{}{}"
+_COLLATES = {"": None, ", ct.augment.collate": collate}
 
 Sample = dict[str, np.ndarray]
 Move = Callable[[Sample], Sample]
@@ -68,9 +71,9 @@ def measured(options: Options) -> list[Record]:
     count = augment.BATCH * (_QUICK_BATCHES if options.quick else _BATCHES)
     records = []
     for case in augment.CASES[:2]:
-        for workers in WORKERS:
-            operation = _OPERATION.format(workers, "s" * (workers > 1))
-            runs = {who: epochs(Samples(move, size, count), workers) for who, move in moves(case, size).items()}
+        for (how, by), workers in product(_COLLATES.items(), WORKERS):
+            operation = _OPERATION.format(workers, "s" * (workers > 1), how)
+            runs = {who: epochs(Samples(move, size, count), workers, by) for who, move in moves(case, size).items()}
             # OpenCV as torch does by itself: one in a worker. Its threads do not come along with a fork, so before that
             with threads(1):
                 taken = measure(f"DataLoader, {case.name}", operation, runs, options)
@@ -96,13 +99,14 @@ def requirements(records: Sequence[Record]) -> list[Requirement]:
     return found
 
 
-def epochs(samples: Samples, workers: int) -> Run:
+def epochs(samples: Samples, workers: int, collate_fn: Callable | None) -> Run:
     """An epoch of a loader whose workers stay."""
     loader = DataLoader(
         samples,
         batch_size=augment.BATCH,
         num_workers=workers,
         persistent_workers=True,
+        collate_fn=collate_fn,
     )
 
     def run() -> None:

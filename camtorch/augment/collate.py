@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import functools
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from torch.utils.data._utils.collate import collate as collate_by
 from torch.utils.data._utils.collate import default_collate_fn_map
 
 from camtorch._arguments import is_list
+from camtorch.augment.sending import stacked, within_message
 from camtorch.camera import Camera
 from camtorch.mixed import cat
 
@@ -24,6 +26,11 @@ def collate(samples: Sequence[object]) -> object:
     become a batch, a `ct.Mixed` where they are of several models, or a list where their images are of several sizes; so
     they do by `default_collate`.
 
+    In a worker on Linux, batches go into shared memory that is used again when the main process has let go of them,
+    as new memory takes as long to get as images take to be augmented; of no more bytes than were in use at once. What
+    is small goes within the message. So the storage of what arrives cannot be resized. With torch's sharing strategy
+    "file_system" all goes torch's own way.
+
     Raises:
         TypeError: no list of samples; what cannot be collated, as by `default_collate`. ValueError: an empty list.
     """
@@ -31,18 +38,23 @@ def collate(samples: Sequence[object]) -> object:
         raise TypeError(f"collate: samples must be a list of samples; got {type(samples).__name__}")
     if not samples:
         raise ValueError("collate: samples must not be empty; got an empty list")
-    return collate_by(samples, collate_fn_map={**default_collate_fn_map, Tensor: _tensors, np.ndarray: _arrays})
+    others = {kind: functools.partial(_others, function) for kind, function in default_collate_fn_map.items()}
+    return collate_by(samples, collate_fn_map={**others, Tensor: _tensors, np.ndarray: _arrays})
 
 
 def _tensors(batch: Sequence[Tensor], *, collate_fn_map: Any = None) -> Tensor | list[Tensor]:
     if len({tensor.shape for tensor in batch}) > 1:
         return list(batch)
-    stacked: Tensor = default_collate_fn_map[Tensor](batch, collate_fn_map=collate_fn_map)
-    return stacked
+    sent = stacked(batch)
+    return default_collate_fn_map[Tensor](batch, collate_fn_map=collate_fn_map) if sent is None else sent
 
 
 def _arrays(batch: Sequence[np.ndarray], *, collate_fn_map: Any = None) -> Tensor | list[Tensor]:
     return _tensors([torch.as_tensor(array) for array in batch], collate_fn_map=collate_fn_map)
+
+
+def _others(function: Callable[..., Any], batch: Sequence[Any], *, collate_fn_map: Any = None) -> Any:
+    return within_message(function(batch, collate_fn_map=collate_fn_map))
 
 
 def collate_cameras(batch: Sequence[Camera], *, collate_fn_map: Any = None) -> Camera | list[Camera]:

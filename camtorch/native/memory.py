@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import mmap
 import weakref
+from collections.abc import Callable
 from contextlib import suppress
 
 import torch
@@ -27,11 +28,16 @@ def empty(shape: tuple[int, ...], dtype: torch.dtype, layout: torch.memory_forma
     block = _block(size)
     if block is None:
         return torch.empty(shape, dtype=dtype, device="cpu", memory_format=layout)
+    return tensor_on(block, like, lambda: _keep(block))
+
+
+def tensor_on(block: mmap.mmap, like: Tensor, died: Callable[[], None]) -> Tensor:
+    """A tensor of the shape, strides and dtype of another, on the memory of a block; what is called when it is gone."""
     memory = (ctypes.c_char * len(block)).from_buffer(block)  # which the storage holds, and nothing else
-    weakref.finalize(memory, _keep, block).atexit = False
+    weakref.finalize(memory, died).atexit = False
     storage = torch.frombuffer(memory, dtype=torch.uint8).untyped_storage()
     # not a view, of which there are things that cannot be done
-    return torch.empty(0, dtype=dtype, device="cpu").set_(storage, 0, like.shape, like.stride())
+    return torch.empty(0, dtype=like.dtype, device="cpu").set_(storage, 0, like.shape, like.stride())
 
 
 def release() -> None:

@@ -1,0 +1,176 @@
+"""Batches that workers of a DataLoader send: in shared memory that is used again or, if small, within the message.
+
+Memory that is new to a process takes as long to get as images take to be augmented; and every tensor that torch sends
+has a file of its own, for which the other process has to ask.
+"""
+
+from __future__ import annotations
+
+import functools
+import mmap
+import os
+import pickle
+import threading
+import weakref
+from collections.abc import Callable, Sequence
+from multiprocessing.reduction import ForkingPickler
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.multiprocessing import get_sharing_strategy
+from torch.multiprocessing.reductions import reduce_tensor
+from torch.utils.data import get_worker_info
+
+from camtorch.native.memory import LIMIT, tensor_on
+
+_SMALL = 1 << 16
+"""Bytes below which a tensor goes within the message."""
+_MOST = 32
+"""Blocks that wait, and blocks that others have: for those who keep more batches than that, memory is torch's own."""
+_HOME, _AWAY, _LOST = 0, 1, 2
+
+
+class Sent(Tensor):
+    """A batch in a worker, which comes out of the DataLoader as a plain tensor; so does what is computed from it."""
+
+    __torch_function__ = torch._C._disabled_torch_function_impl  # type: ignore[assignment]
+
+    def __reduce_ex__(self, protocol: Any) -> Any:
+        return self.as_subclass(Tensor).__reduce_ex__(protocol)  # to files and the like
+
+    def __deepcopy__(self, memo: Any) -> Tensor:
+        return self.as_subclass(Tensor).__deepcopy__(memo)  # type: ignore[no-any-return]
+
+
+class _Block:
+    """Shared memory, whose last byte says whether another process has it, or has had it before a fork."""
+
+    def __init__(self, size: int):
+        self.size, self.forks = size, _forks
+        self.file = os.memfd_create("camtorch")
+        weakref.finalize(self, os.close, self.file).atexit = False
+        os.ftruncate(self.file, size + 1)
+        self.memory = _mapped(os.getpid(), self.file, size)
+
+    def back(self, place: int) -> None:
+        """No tensor of this process is on it any more."""
+        del _held[place]
+        _away.append(self)
+
+
+_held: dict[int, _Block] = {}
+"""By where they lie, the blocks on which this process has a tensor."""
+_away: list[_Block] = []
+"""Those on which another one may have one."""
+_idle: list[_Block] = []
+_lock = threading.Lock()  # of the lists, but for what comes back: a tensor may die wherever Python collects garbage
+_forks = 0
+
+
+def within_message(value: Any) -> Any:
+    """What a worker sends, as it is elsewhere; if it is a small tensor, or something else that has some, by value."""
+    if get_worker_info() is None:
+        return value
+    if type(value) is Tensor:
+        return value.as_subclass(Sent)
+    if isinstance(value, nn.Module):
+        ForkingPickler.register(type(value), _by_value)
+    return value
+
+
+def _by_value(module: nn.Module) -> tuple[Callable[[bytes], Any], tuple[bytes]]:
+    return pickle.loads, (pickle.dumps(module),)
+
+
+def stacked(batch: Sequence[Tensor]) -> Tensor | None:
+    """A batch of tensors of one shape, ready to be sent; None where no worker asks, and where torch's own way does."""
+    first = batch[0]
+    if get_worker_info() is None or any(
+        type(t) is not Tensor or t.dtype != first.dtype or t.layout != torch.strided or not t.is_cpu or t.requires_grad
+        for t in batch
+    ):
+        return None
+    like = torch.empty(len(batch), *first.shape, dtype=first.dtype, device="meta")
+    if like.nbytes < _SMALL:
+        return torch.stack(list(batch)).as_subclass(Sent)
+    block = _block(like.nbytes)
+    if block is None:
+        return None
+    place = torch.frombuffer(block.memory, dtype=torch.uint8).data_ptr()
+    _held[place] = block
+    result = tensor_on(block.memory, like, functools.partial(block.back, place))
+    return torch.stack(list(batch), out=result).as_subclass(Sent)
+
+
+def _block(size: int) -> _Block | None:
+    """One of so many bytes that nobody has; None where the system, or the user, wants torch's own."""
+    if get_sharing_strategy() == "file_system" or not _is_open(os.getppid()):
+        return None
+    with _lock:
+        for block in [block for block in _away if block.memory[-1] != _AWAY]:
+            _away.remove(block)
+            _idle.append(block)
+        _idle[:] = [block for block in _idle if block.memory[-1] == _HOME and block.forks == _forks]
+        for i in reversed(range(len(_idle))):
+            if _idle[i].size == size:
+                return _idle.pop(i)
+        while len(_idle) >= _MOST or sum(block.size for block in _idle) > LIMIT:
+            del _idle[0]
+    try:
+        return _Block(size) if len(_away) < _MOST else None
+    except OSError:
+        return None
+
+
+@functools.cache
+def _is_open(process: int) -> bool:
+    """Whether files of such a process can be opened by others of the same user, as Linux has it."""
+    try:
+        return hasattr(os, "memfd_create") and bool(os.listdir(f"/proc/{process}/fd"))
+    except OSError:
+        return False
+
+
+def _mapped(process: int, file: int, size: int) -> mmap.mmap:
+    with open(f"/proc/{process}/fd/{file}", "r+b", buffering=0) as opened:
+        return mmap.mmap(opened.fileno(), size + 1)
+
+
+def _reduced(sent: Sent) -> tuple[Callable[..., Tensor], tuple[Any, ...]]:
+    """What another process makes the tensor of."""
+    block, what = _held.get(sent.data_ptr()), (sent.dtype, tuple(sent.shape))
+    if sent.is_contiguous() and not sent.requires_grad:
+        if block is not None and block.memory[-1] == _HOME:
+            block.memory[-1] = _AWAY
+            return _arrived, (os.getpid(), block.file, block.size, *what)
+        if sent.nbytes < _SMALL:
+            return _unpacked, (sent.reshape(-1).view(torch.uint8).numpy().tobytes(), *what)
+    reduced: tuple[Callable[..., Tensor], tuple[Any, ...]] = reduce_tensor(
+        sent.detach().as_subclass(Tensor).clone().requires_grad_(sent.requires_grad)
+    )
+    return reduced
+
+
+def _arrived(process: int, file: int, size: int, dtype: torch.dtype, shape: tuple[int, ...]) -> Tensor:
+    memory, forks = _mapped(process, file, size), _forks
+
+    def died() -> None:
+        memory[-1] = _HOME if forks == _forks else _LOST
+
+    return tensor_on(memory, torch.empty(shape, dtype=dtype, device="meta"), died)
+
+
+def _unpacked(data: bytes, dtype: torch.dtype, shape: tuple[int, ...]) -> Tensor:
+    return torch.frombuffer(bytearray(data), dtype=dtype).view(shape) if data else torch.empty(shape, dtype=dtype)
+
+
+def _forked() -> None:
+    """What two processes have on it from now on is not written to again."""
+    global _forks
+    _forks += 1
+
+
+ForkingPickler.register(Sent, _reduced)
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(before=_forked)
