@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import functools
 import mmap
 import weakref
 from contextlib import suppress
@@ -22,8 +23,7 @@ def empty(shape: tuple[int, ...], dtype: torch.dtype, layout: torch.memory_forma
 
     As long as it, a view of it, or an array on its memory lives, nobody else gets that. Its storage cannot be resized.
     """
-    like = torch.empty(shape, dtype=dtype, device="meta", memory_format=layout)
-    size = -(-like.nbytes // mmap.PAGESIZE) * mmap.PAGESIZE  # large pages within it, not beyond
+    size, strides = _place(shape, dtype, layout)
     block = _block(size)
     if block is None:
         return torch.empty(shape, dtype=dtype, device="cpu", memory_format=layout)
@@ -31,7 +31,14 @@ def empty(shape: tuple[int, ...], dtype: torch.dtype, layout: torch.memory_forma
     weakref.finalize(memory, _keep, block).atexit = False
     storage = torch.frombuffer(memory, dtype=torch.uint8).untyped_storage()
     # not a view, of which there are things that cannot be done
-    return torch.empty(0, dtype=dtype, device="cpu").set_(storage, 0, like.shape, like.stride())
+    return torch.empty(0, dtype=dtype, device="cpu").set_(storage, 0, shape, strides)
+
+
+@functools.lru_cache(maxsize=64)
+def _place(shape: tuple[int, ...], dtype: torch.dtype, layout: torch.memory_format) -> tuple[int, tuple[int, ...]]:
+    """Bytes of whole pages, with large ones within them and not beyond, and strides."""
+    like = torch.empty(shape, dtype=dtype, device="meta", memory_format=layout)
+    return -(-like.nbytes // mmap.PAGESIZE) * mmap.PAGESIZE, like.stride()
 
 
 def release() -> None:
