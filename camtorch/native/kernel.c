@@ -1312,7 +1312,7 @@ INLINE int64_t wide(Span *span, char *first, const Chunk *at, int64_t n, int typ
                 eights(span, first, at, i, i + 16, FLOAT32, BILINEAR, PLANES);
         return i;
     }
-    if (mode == NEAREST && type == BYTES4 && in_planes && llabs(image.below) * image.height < INT32_MAX) {
+    if (mode == NEAREST && type == BYTES4 && in_planes && llabs(image.below) * image.height + image.width < INT32_MAX) {
         for (i = 0; n - i >= 16; i += 16)
             if (!nearest_of_sixteen(&image, first + 4 * i, at->u + i, at->v + i))
                 eights(span, first, at, i, i + 16, BYTES4, NEAREST, SCATTERED);
