@@ -99,7 +99,7 @@ def stacked(batch: Sequence[Tensor]) -> Tensor | None:
         return None
     place = torch.frombuffer(block.memory, dtype=torch.uint8).data_ptr()
     _held[place] = block
-    result = tensor_on(block.memory, like, functools.partial(block.back, place))
+    result = tensor_on(block.memory, like.dtype, like.shape, like.stride(), functools.partial(block.back, place))
     return torch.stack(list(batch), out=result).as_subclass(Sent)
 
 
@@ -158,7 +158,7 @@ def _arrived(process: int, file: int, size: int, dtype: torch.dtype, shape: tupl
     def died() -> None:
         memory[-1] = _HOME if forks == _forks else _LOST
 
-    return tensor_on(memory, torch.empty(shape, dtype=dtype, device="meta"), died)
+    return tensor_on(memory, dtype, shape, torch.empty(shape, device="meta").stride(), died)
 
 
 def _unpacked(data: bytes, dtype: torch.dtype, shape: tuple[int, ...]) -> Tensor:

@@ -199,16 +199,18 @@ INLINE int64_t nearest_of(float x, int64_t side, int padding) {
 
 NOT_INLINE void show_nothing(const Span *span, int type) {
     const Job *job = span->job;
-    const int64_t bytes = job->channels * size_of(type), *to = job->result_strides;
+    const int64_t size = size_of(type), all = job->channels * size, *to = job->result_strides;
     const char *fill = (const char *)job->fill_elements;
     int64_t c, i;
-    if (to[3] == job->channels && (to[1] == 1 || to[3] == 1) && memcmp(fill, fill + 1, (size_t)bytes - 1) == 0) {
-        memset(span->result, fill[0], (size_t)(span->pixels * bytes)); /* mostly zeros */
+    if (to[1] == 1 && to[3] == job->channels && memcmp(fill, fill + 1, (size_t)all - 1) == 0) {
+        memset(span->result, fill[0], (size_t)(span->pixels * all)); /* mostly zeros */
         return;
     }
-    for (c = 0; c < job->channels; c++) {
-        char *plane = span->result + c * job->result_strides[1] * size_of(type);
-        for (i = 0; i < span->pixels; i++) move(plane, i * job->result_strides[3], job->fill_elements, c, type);
+    for (c = 0; c < job->channels; c++, fill += size) {
+        char *plane = span->result + c * to[1] * size;
+        if (to[3] == 1 && memcmp(fill, fill + 1, (size_t)size - 1) == 0) memset(plane, fill[0], (size_t)(span->pixels * size));
+        else
+            for (i = 0; i < span->pixels; i++) move(plane, i * to[3], fill, 0, type);
     }
 }
 
@@ -1063,6 +1065,24 @@ INLINE int sixteen(const Wide *image, char *result, const float *at_u, const flo
     return 1;
 }
 
+/* Of four bytes each that are moved: whether all lie on the image, and are made */
+INLINE int nearest_of_sixteen(const Wide *image, char *result, const float *at_u, const float *at_v) {
+    const __m512 u = _mm512_loadu_ps(at_u), v = _mm512_loadu_ps(at_v), zero = _mm512_setzero_ps();
+    const char *from = image->source;
+    __mmask16 good = _mm512_cmp_ps_mask(u, zero, _CMP_GE_OQ);
+    good = _mm512_mask_cmp_ps_mask(good, v, zero, _CMP_GE_OQ);
+    good = _mm512_mask_cmp_ps_mask(good, u, _mm512_set1_ps((float)(image->width - 1)), _CMP_LE_OQ);
+    good = _mm512_mask_cmp_ps_mask(good, v, _mm512_set1_ps((float)(image->height - 1)), _CMP_LE_OQ);
+    if (good != 0xffff) return 0;
+    const __m512i down = _mm512_mullo_epi32(_mm512_cvtps_epi32(v), _mm512_set1_epi32((int32_t)image->below));
+    const __m512i at = _mm512_add_epi32(down, _mm512_cvtps_epi32(u));
+    for (int64_t c = 0; c < image->channels; c++, from += image->from_plane * 4, result += image->to_plane * 4) {
+        ask_below(from + (whole(at_v[0]) * image->below + whole(at_u[0])) * 4, image->below * 4);
+        _mm512_storeu_si512(result, _mm512_i32gather_epi32(at, from, 4));
+    }
+    return 1;
+}
+
 /* -- thirty-two pixels of bytes at a time, whose neighbours are picked out of a window of some rows */
 
 enum { MOST_ROWS = 24 };
@@ -1290,6 +1310,12 @@ INLINE int64_t wide(Span *span, char *first, const Chunk *at, int64_t n, int typ
         for (i = 0; n - i >= 16; i += 16)
             if (!sixteen(&image, first + 4 * i, at->u + i, at->v + i))
                 eights(span, first, at, i, i + 16, FLOAT32, BILINEAR, PLANES);
+        return i;
+    }
+    if (mode == NEAREST && type == BYTES4 && in_planes && llabs(image.below) * image.height + image.width < INT32_MAX) {
+        for (i = 0; n - i >= 16; i += 16)
+            if (!nearest_of_sixteen(&image, first + 4 * i, at->u + i, at->v + i))
+                eights(span, first, at, i, i + 16, BYTES4, NEAREST, SCATTERED);
         return i;
     }
     if (!(mode == BILINEAR ? type == UINT8 : mode == NEAREST && type == BYTES1) || n < 32) return 0;

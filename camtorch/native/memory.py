@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import functools
 import mmap
 import weakref
 from collections.abc import Callable
@@ -23,21 +24,29 @@ def empty(shape: tuple[int, ...], dtype: torch.dtype, layout: torch.memory_forma
 
     As long as it, a view of it, or an array on its memory lives, nobody else gets that. Its storage cannot be resized.
     """
-    like = torch.empty(shape, dtype=dtype, device="meta", memory_format=layout)
-    size = -(-like.nbytes // mmap.PAGESIZE) * mmap.PAGESIZE  # large pages within it, not beyond
+    size, strides = _place(shape, dtype, layout)
     block = _block(size)
     if block is None:
         return torch.empty(shape, dtype=dtype, device="cpu", memory_format=layout)
-    return tensor_on(block, like, lambda: _keep(block))
+    return tensor_on(block, dtype, shape, strides, lambda: _keep(block))
 
 
-def tensor_on(block: mmap.mmap, like: Tensor, died: Callable[[], None]) -> Tensor:
-    """A tensor of the shape, strides and dtype of another, on the memory of a block; what is called when it is gone."""
+def tensor_on(
+    block: mmap.mmap, dtype: torch.dtype, shape: tuple[int, ...], strides: tuple[int, ...], died: Callable[[], None]
+) -> Tensor:
+    """A tensor on the memory of a block; and what is called when it is gone."""
     memory = (ctypes.c_char * len(block)).from_buffer(block)  # which the storage holds, and nothing else
     weakref.finalize(memory, died).atexit = False
     storage = torch.frombuffer(memory, dtype=torch.uint8).untyped_storage()
     # not a view, of which there are things that cannot be done
-    return torch.empty(0, dtype=like.dtype, device="cpu").set_(storage, 0, like.shape, like.stride())
+    return torch.empty(0, dtype=dtype, device="cpu").set_(storage, 0, shape, strides)
+
+
+@functools.lru_cache(maxsize=64)
+def _place(shape: tuple[int, ...], dtype: torch.dtype, layout: torch.memory_format) -> tuple[int, tuple[int, ...]]:
+    """Bytes of whole pages, with large ones within them and not beyond, and strides."""
+    like = torch.empty(shape, dtype=dtype, device="meta", memory_format=layout)
+    return -(-like.nbytes // mmap.PAGESIZE) * mmap.PAGESIZE, like.stride()
 
 
 def release() -> None:

@@ -105,8 +105,9 @@ def positions(warp: Warp, route: Route, padding: PaddingMode = "zeros") -> Sampl
         return warp._pinned
 
     forms = [None if shutter is None else shutter.form for shutter in (warp.shutter, warp.target_shutter)]
-    options = warp.source._form, warp.target._form, *forms, warp.rotation is None, warp.antialias, warp.tolerance
-    memo = warp._memos.setdefault(reach if warp.tolerance else "zeros", Memo())  # what is exact serves all
+    tolerance = warp.tolerance
+    options = warp.source._form, warp.target._form, *forms, warp.rotation is None, warp.antialias, tolerance
+    memo = warp._memos.setdefault(reach if tolerance else "zeros", Memo())  # what is exact serves all
     kept: Sampling | Lattice = memo(warp._inputs(), options, lambda: _computed(warp, reach))
     return kept
 
