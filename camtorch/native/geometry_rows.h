@@ -1001,15 +1001,11 @@ static void T(unproject_vjp)(const T(Camera) *c, const Rows *rows, int64_t camer
 /* Asks for the memory of rows that come next, while others are computed */
 static void T(fetch)(const void *memory, const int64_t *strides, int components, int64_t camera, int64_t first,
                      int64_t count) {
-#if defined(__GNUC__)
     const int64_t bytes = count * strides[1] * (int64_t)sizeof(R);
     if (!memory || strides[1] < 1 || strides[1] > 16) return;
     const char *from = (const char *)((const R *)memory + camera * strides[0] + first * strides[1]);
     for (int j = 0; j < (strides[2] == 1 ? 1 : components); j++)
         for (int64_t i = 0; i < bytes; i += 64) __builtin_prefetch(from + j * strides[2] * (int64_t)sizeof(R) + i);
-#else
-    (void)memory, (void)strides, (void)components, (void)camera, (void)first, (void)count;
-#endif
 }
 
 static int64_t T(rows)(const Rows *rows) {

@@ -1,8 +1,8 @@
 /* Samples images where a warp says, in tiles of rows: one variant, for the instructions that it is compiled for.
  *
  * A tile goes by columns of chunks, a chunk row by row, eight pixels at a time, or 16 or 32 (see `wide`). Their positions come from a grid or from a lattice, between whose
- * nodes lie cubics. Eight pixels that read inside of the image alone take a way without branches; all others, and all
- * pixels where the compiler has no vectors, go one by one through `sample_at`.
+ * nodes lie cubics. Eight pixels that read inside of the image alone take a way without branches; all others go one
+ * by one through `sample_at`, and all where tests ask for that.
  */
 #include "sampler.h"
 
@@ -14,23 +14,18 @@
 #if defined(__AVX2__)
 #include <immintrin.h>
 #endif
-#if defined(_MSC_VER)
-#include <intrin.h>
-#endif
 
 #define JOINED_(a, b) a##_##b
 #define JOINED(a, b) JOINED_(a, b)
 #define THIS(name) JOINED(name, VARIANT)
 
-#if defined(__GNUC__) && !defined(CAMTORCH_PLAIN)
+#if defined(CAMTORCH_PLAIN)
+#define VECTORS 0
+#else
 #define VECTORS 1
+#endif
 #define INLINE static inline __attribute__((always_inline))
 #define NOT_INLINE static __attribute__((noinline))
-#else
-#define VECTORS 0
-#define INLINE static inline
-#define NOT_INLINE static
-#endif
 
 enum { CHUNK = 256 };          /* pixels of a row whose positions are made at a time */
 enum { MOST_INTERLEAVED = 4 }; /* channels */
@@ -1392,11 +1387,7 @@ int32_t THIS(sample)(Job *job) {
     const Tile make = way_of(job);
     int32_t made;
     for (made = 0;; made++) {
-#if defined(_MSC_VER)
-        const int64_t i = _InterlockedExchangeAdd64(&job->next, 1);
-#else
         const int64_t i = __atomic_fetch_add(&job->next, 1, __ATOMIC_RELAXED);
-#endif
         int64_t b, from;
         if (i >= tiles * job->count) return made;
         /* one image after the other of the same rows: positions that they share are in the cache then */
