@@ -381,68 +381,21 @@ INLINE void store_words(char *to, I8 value, int64_t n) {
     memcpy(to, &words, (size_t)n * 2);
 }
 
-/* Two neighbours of each of eight rows, one to the left and one to the right */
-typedef struct {
-    V8 left, right;
-} Pairs;
-
-INLINE Pairs float_pairs(const float *plane, const int64_t *at) {
-    typedef uint64_t U4 __attribute__((vector_size(32)));
-    uint64_t p[STEP];
-    Pairs pairs;
+/* Eight pixels of an image, of any rows */
+INLINE V8 gathered(const char *from, const int64_t *at, int type) {
+    V8 floats;
+    I8 whole;
     int i;
-    for (i = 0; i < STEP; i++) memcpy(p + i, plane + at[i], 8);
-    const V8 a = (V8)(U4){p[0], p[1], p[4], p[5]}, b = (V8)(U4){p[2], p[3], p[6], p[7]};
-#if defined(__AVX2__)
-    pairs.left = (V8)_mm256_shuffle_ps((__m256)a, (__m256)b, 0x88);
-    pairs.right = (V8)_mm256_shuffle_ps((__m256)a, (__m256)b, 0xdd);
-#else
-    pairs.left = (V8){a[0], a[2], b[0], b[2], a[4], a[6], b[4], b[6]};
-    pairs.right = (V8){a[1], a[3], b[1], b[3], a[5], a[7], b[5], b[7]};
-#endif
-    return pairs;
-}
-
-INLINE Pairs word_pairs(const uint16_t *plane, const int64_t *at) {
-    uint32_t p[STEP];
-    Pairs pairs;
-    int i;
-    for (i = 0; i < STEP; i++) memcpy(p + i, plane + at[i], 4);
-    const I8 both = {(int32_t)p[0], (int32_t)p[1], (int32_t)p[2], (int32_t)p[3],
-                     (int32_t)p[4], (int32_t)p[5], (int32_t)p[6], (int32_t)p[7]};
-#if defined(__BYTE_ORDER__) && __BYTE_ORDER__ == __ORDER_BIG_ENDIAN__
-    pairs.right = float8(both & 0xffff);
-    pairs.left = float8((both >> 16) & 0xffff);
-#else
-    pairs.left = float8(both & 0xffff);
-    pairs.right = float8((both >> 16) & 0xffff);
-#endif
-    return pairs;
+    for (i = 0; i < STEP; i++) {
+        if (type == FLOAT32) floats[i] = ((const float *)from)[at[i]];
+        else if (type == UINT16) whole[i] = ((const uint16_t *)from)[at[i]];
+        else whole[i] = ((const uint8_t *)from)[at[i]];
+    }
+    return type == FLOAT32 ? floats : float8(whole);
 }
 
 /* True from one half on, as bytes */
 INLINE I8 truth8(V8 value) { return -(value >= every8(0.5f)); }
-
-INLINE I8 byte_pairs(const uint8_t *plane, const int64_t *at) {
-    uint16_t p[STEP];
-    int i;
-    for (i = 0; i < STEP; i++) memcpy(p + i, plane + at[i], 2);
-    return (I8){p[0], p[1], p[2], p[3], p[4], p[5], p[6], p[7]};
-}
-
-INLINE Pairs split_bytes(I8 both) {
-    Pairs pairs;
-#if defined(__BYTE_ORDER__) && __BYTE_ORDER__ == __ORDER_BIG_ENDIAN__
-    pairs.right = float8(both & 0xff);
-    pairs.left = float8(both >> 8);
-#else
-    pairs.left = float8(both & 0xff);
-    pairs.right = float8(both >> 8);
-#endif
-    return pairs;
-}
-
-INLINE V8 across8(Pairs p, V8 u) { return p.left * (1 - u) + p.right * u; }
 
 #if defined(__AVX2__)
 
@@ -538,20 +491,11 @@ INLINE void bilinear_planes(const Span *span, Squares at, int type) {
 #endif
     offsets_of(job, at.x, at.y, offsets);
     for (c = 0; c < job->channels; c++, plane += from, result += to) {
-        Pairs upper, lower;
-        V8 value;
+        const char *lower = plane + below * bytes;
+        const V8 above = gathered(plane, offsets, type) * (1 - at.u) + gathered(plane + bytes, offsets, type) * at.u;
+        const V8 under = gathered(lower, offsets, type) * (1 - at.u) + gathered(lower + bytes, offsets, type) * at.u;
+        const V8 value = above * (1 - at.v) + under * at.v;
         ask_below(plane + offsets[0] * bytes, below * bytes);
-        if (type == FLOAT32) {
-            upper = float_pairs((const float *)plane, offsets);
-            lower = float_pairs((const float *)plane + below, offsets);
-        } else if (type == UINT16) {
-            upper = word_pairs((const uint16_t *)plane, offsets);
-            lower = word_pairs((const uint16_t *)plane + below, offsets);
-        } else {
-            upper = split_bytes(byte_pairs((const uint8_t *)plane, offsets));
-            lower = split_bytes(byte_pairs((const uint8_t *)plane + below, offsets));
-        }
-        value = across8(upper, at.u) * (1 - at.v) + across8(lower, at.u) * at.v;
         if (type == FLOAT32) store_floats(result, value, span->pixels);
         else if (type == UINT16) store_words(result, rounded8(value), span->pixels);
         else store_bytes(result, type == BOOL ? truth8(value) : rounded8(value), span->pixels);
