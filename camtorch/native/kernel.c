@@ -318,13 +318,9 @@ INLINE V8 reflected8(V8 x, float side) {
 
 /* To the nearest whole number, of numbers whose size is below 2^22 */
 INLINE I8 rounded8(V8 value) {
-#if defined(__AVX2__)
-    return (I8)_mm256_cvtps_epi32((__m256)value);
-#else
     const V8 large = every8(12582912.0f);
     V8 sum = value + large;
     return (I8)sum - (I8)large;
-#endif
 }
 
 /* Where eight pixels are read: from the corner (x, y) of a square of four pixels, at a part of its sides */
@@ -359,18 +355,9 @@ INLINE void store_floats(char *to, V8 value, int64_t n) {
 }
 
 INLINE void store_bytes(char *to, I8 value, int64_t n) {
-    uint64_t bytes;
-#if defined(__AVX2__)
-    const __m256i words = _mm256_packs_epi32((__m256i)value, (__m256i)value);
-    const __m256i packed = _mm256_packus_epi16(words, words);
-    const uint32_t low = (uint32_t)_mm256_cvtsi256_si32(packed);
-    const uint32_t high = (uint32_t)_mm_cvtsi128_si32(_mm256_extracti128_si256(packed, 1));
-    bytes = (uint64_t)high << 32 | low;
-#else
+    typedef int16_t W8 __attribute__((vector_size(16)));
     typedef uint8_t B8 __attribute__((vector_size(8)));
-    B8 packed = __builtin_convertvector(value, B8);
-    memcpy(&bytes, &packed, sizeof bytes);
-#endif
+    const B8 bytes = __builtin_convertvector(__builtin_convertvector(value, W8), B8); /* in steps compilers know */
     if (n == STEP) memcpy(to, &bytes, sizeof bytes);
     else memcpy(to, &bytes, (size_t)n);
 }
