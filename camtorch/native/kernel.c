@@ -608,21 +608,9 @@ INLINE void cubic_weights8(V8 t, V8 *w) {
 
 /* Columns of a table of eight rows */
 INLINE void transpose(const V4 *rows, V8 *columns) {
-#if defined(__AVX2__)
-#define TWO_ROWS(i) _mm256_insertf128_ps(_mm256_castps128_ps256((__m128)rows[i]), (__m128)rows[(i) + 4], 1)
-    const __m256 a = TWO_ROWS(0), b = TWO_ROWS(1), c = TWO_ROWS(2), d = TWO_ROWS(3);
-#undef TWO_ROWS
-    const __m256 low_ab = _mm256_unpacklo_ps(a, b), high_ab = _mm256_unpackhi_ps(a, b);
-    const __m256 low_cd = _mm256_unpacklo_ps(c, d), high_cd = _mm256_unpackhi_ps(c, d);
-    columns[0] = (V8)_mm256_shuffle_ps(low_ab, low_cd, 0x44);
-    columns[1] = (V8)_mm256_shuffle_ps(low_ab, low_cd, 0xee);
-    columns[2] = (V8)_mm256_shuffle_ps(high_ab, high_cd, 0x44);
-    columns[3] = (V8)_mm256_shuffle_ps(high_ab, high_cd, 0xee);
-#else
     int i, k;
     for (k = 0; k < 4; k++)
         for (i = 0; i < STEP; i++) columns[k][i] = rows[i][k];
-#endif
 }
 
 INLINE void bicubic_planes(const Span *span, V8 u, V8 v, int type) {
