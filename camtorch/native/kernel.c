@@ -673,23 +673,6 @@ INLINE void nearest8(const Span *span, V8 u, V8 v, int type) {
 /* How pixels lie in memory, in source and result */
 enum { PLANES, INTERLEAVED, SCATTERED };
 
-/* Of channels that lie anywhere, and so of the last columns and rows of those that lie together */
-NOT_INLINE void bilinear_scattered(const Span *span, Squares at, int type) {
-    const Job *job = span->job;
-    const int64_t *strides = job->source_strides;
-    int64_t i, c;
-    for (i = 0; i < span->pixels; i++) {
-        const float u = at.u[i], v = at.v[i];
-        const int64_t corner = at.y[i] * strides[2] + at.x[i] * strides[3];
-        for (c = 0; c < job->channels; c++) {
-            const int64_t upper = corner + c * strides[1], lower = upper + strides[2];
-            const float above = load(span->source, upper, type) * (1 - u) + load(span->source, upper + strides[3], type) * u;
-            const float below = load(span->source, lower, type) * (1 - u) + load(span->source, lower + strides[3], type) * u;
-            store(span->result, i * job->result_strides[3] + c * job->result_strides[1], above * (1 - v) + below * v, type);
-        }
-    }
-}
-
 INLINE void eight(const Span *span, V8 u, V8 v, int type, int mode, int layout) {
     const Job *job = span->job;
     Positions at;
@@ -726,10 +709,6 @@ INLINE void eight(const Span *span, V8 u, V8 v, int type, int mode, int layout) 
             bicubic_planes(span, u, v, type);
             return;
         }
-    }
-    if (mode == BILINEAR && layout != PLANES && job->source_width > 1 && job->source_height > 1 && inside(job, u, v, 0, 0)) {
-        bilinear_scattered(span, squares_of(job, u, v, 1), type);
-        return;
     }
     /* beyond `reach` of zeros nothing is shown, nor what has no position */
     const float reach = job->padding != ZEROS ? INFINITY : mode == BICUBIC ? 2 : 1;
