@@ -148,42 +148,30 @@ NOT_INLINE Taps taps_at(const Job *job, float u, float v, int mode) {
     return taps;
 }
 
-/* One channel of one pixel; `plane` is that of the channel */
-INLINE float sample_at(const Job *job, const char *plane, const Taps *taps, float fill, int type, int mode) {
+/* One channel of one pixel, by the taps of weights above `lost`; `plane` is that of the channel */
+INLINE float sum_of(const Job *job, const char *plane, const Taps *taps, float fill, int type, int mode, float lost_u,
+                    float lost_v) {
     const int64_t *strides = job->source_strides, *columns = taps->columns, *rows = taps->rows;
     const float *across = taps->across, *down = taps->down;
     const int n = mode == BILINEAR ? 2 : 4;
     float sum = 0;
     int i, j;
-    if (job->padding != ZEROS) {
-        for (j = 0; j < n; j++) {
-            const int64_t row = rows[j] * strides[2];
-            float line = 0;
-            for (i = 0; i < n; i++) line += across[i] * load(plane, row + columns[i] * strides[3], type);
-            sum += down[j] * line;
-        }
-    } else {
-        for (j = 0; j < n; j++)
-            for (i = 0; i < n; i++)
+    for (j = 0; j < n; j++)
+        for (i = 0; i < n; i++)
+            if (fabsf(down[j]) > lost_v && fabsf(across[i]) > lost_u)
                 sum += down[j] * across[i] *
                        (rows[j] < 0 || columns[i] < 0
                             ? fill
                             : load(plane, rows[j] * strides[2] + columns[i] * strides[3], type));
-    }
-    if (mode == BICUBIC && type == FLOAT32 && !(fabsf(sum) <= 3.4028235e38f)) {
-        /* a pixel that is not finite has no part where its weight is but a rounding error */
-        const float lost_u = 4 * (float)job->source_width * 1.1920929e-7f;
-        const float lost_v = 4 * (float)job->source_height * 1.1920929e-7f;
-        sum = 0;
-        for (j = 0; j < n; j++)
-            for (i = 0; i < n; i++)
-                if (fabsf(down[j]) > lost_v && fabsf(across[i]) > lost_u)
-                    sum += down[j] * across[i] *
-                           (rows[j] < 0 || columns[i] < 0
-                                ? fill
-                                : load(plane, rows[j] * strides[2] + columns[i] * strides[3], type));
-    }
     return sum;
+}
+
+INLINE float sample_at(const Job *job, const char *plane, const Taps *taps, float fill, int type, int mode) {
+    const float sum = sum_of(job, plane, taps, fill, type, mode, -1, -1), rounding = 4 * 1.1920929e-7f;
+    if (mode != BICUBIC || type != FLOAT32 || fabsf(sum) <= 3.4028235e38f) return sum;
+    /* a pixel that is not finite has no part where its weight is but a rounding error */
+    return sum_of(job, plane, taps, fill, type, mode, rounding * (float)job->source_width,
+                  rounding * (float)job->source_height);
 }
 
 /* The pixel nearest to a position, or -1 */
