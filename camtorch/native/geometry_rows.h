@@ -998,16 +998,6 @@ static void T(unproject_vjp)(const T(Camera) *c, const Rows *rows, int64_t camer
     if (rows->results) T(store)((R *)rows->results + camera * to[0] + first * to[1], to, 2, count, ga, gb, NULL);
 }
 
-/* Asks for the memory of rows that come next, while others are computed */
-static void T(fetch)(const void *memory, const int64_t *strides, int components, int64_t camera, int64_t first,
-                     int64_t count) {
-    const int64_t bytes = count * strides[1] * (int64_t)sizeof(R);
-    if (!memory || strides[1] < 1 || strides[1] > 16) return;
-    const char *from = (const char *)((const R *)memory + camera * strides[0] + first * strides[1]);
-    for (int j = 0; j < (strides[2] == 1 ? 1 : components); j++)
-        for (int64_t i = 0; i < bytes; i += 64) __builtin_prefetch(from + j * strides[2] * (int64_t)sizeof(R) + i);
-}
-
 static int64_t T(rows)(const Rows *rows) {
     const int64_t tiles = (rows->count + rows->tile - 1) / rows->tile, width = 4 + rows->cameras->parameter_count;
     int64_t left = 0, last = -1, own = 0, at;
@@ -1019,11 +1009,6 @@ static int64_t T(rows)(const Rows *rows) {
         if (index != last) T(prepare)(rows->cameras, last = index, &camera);
         for (int64_t i = first; i < end; i += BLOCK) {
             const int count = (int)(end - i < BLOCK ? end - i : BLOCK);
-            const int64_t next = i + BLOCK, after = end - next < BLOCK ? end - next : BLOCK;
-            if (after > 0) {
-                T(fetch)(rows->rows, rows->row_strides, 3 - rows->direction % 2, index, next, after);
-                T(fetch)(rows->cotangents, rows->cotangent_strides, 2 + rows->direction % 2, index, next, after);
-            }
             switch (rows->direction) {
             case PROJECT: left += T(project)(&camera, rows, index, i, count); break;
             case UNPROJECT: left += T(unproject)(&camera, rows, index, i, count); break;
