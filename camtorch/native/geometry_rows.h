@@ -742,25 +742,13 @@ static void T(newton_step)(const T(Camera) *c, int first, int n, const R *restri
 /* Newton's method for the stages from `first` on, wherever that leads; `ok` where the next step would be nothing */
 static void T(newton)(const T(Camera) *c, int first, int n, const R *restrict u, const R *restrict v, R *restrict a,
                       R *restrict b, I *restrict ok, int fewest) {
-    int places[BLOCK], some = n, count = 0;
-    while (count < MOST_STEPS && some > n / 4) { /* few are left to a block of their own */
-        if (count < fewest) EACH(i) ok[i] = 0;
+    I all = 0;
+    for (int count = 1; count <= MOST_STEPS && !all; count++) {
+        if (count <= fewest) EACH(i) ok[i] = 0;
         T(newton_step)(c, first, n, u, v, a, b, ok);
-        if (++count >= fewest) some = T(chosen)(n, ok, places);
+        all = count >= fewest;
+        EACH(i) all &= ok[i] != 0;
     }
-    if (!some || count == MOST_STEPS) return;
-    ALIGNED R p[BLOCK], q[BLOCK], x[BLOCK], y[BLOCK];
-    ALIGNED I done[BLOCK];
-    const int filled = (some + LANES - 1) & -LANES;
-    for (int i = 0; i < filled; i++)
-        p[i] = u[places[i]], q[i] = v[places[i]], x[i] = a[places[i]], y[i] = b[places[i]], done[i] = 0;
-    while (count++ < MOST_STEPS) {
-        I all = 1;
-        T(newton_step)(c, first, filled, p, q, x, y, done);
-        for (int i = 0; i < filled; i++) all &= done[i];
-        if (all) break;
-    }
-    for (int i = 0; i < some; i++) a[places[i]] = x[i], b[places[i]] = y[i], ok[places[i]] = done[i];
 }
 
 /* By the radial factor of the first stage alone: where it sends points to (p, q); `possible` within the fold's image */
