@@ -31,10 +31,6 @@ enum { CHUNK = 256 };          /* pixels of a row whose positions are made at a 
 enum { MOST_INTERLEAVED = 4 }; /* channels */
 enum { ROWS_AHEAD = 8 };       /* of the source */
 
-typedef struct {
-    float u[STEP], v[STEP];
-} Positions;
-
 /* What eight pixels are written to and read from */
 typedef struct {
     const Job *job;
@@ -230,6 +226,9 @@ NOT_INLINE void careful(const Span *span, const float *at_u, const float *at_v, 
             for (c = 0; c < job->channels; c++) move(result, c * job->result_strides[1], job->fill_elements, c, type);
     }
 }
+
+/* How pixels lie in memory, in source and result */
+enum { PLANES, INTERLEAVED, SCATTERED };
 
 #if VECTORS
 
@@ -658,12 +657,9 @@ INLINE void nearest8(const Span *span, V8 u, V8 v, int type) {
     }
 }
 
-/* How pixels lie in memory, in source and result */
-enum { PLANES, INTERLEAVED, SCATTERED };
-
-INLINE void eight(const Span *span, V8 u, V8 v, int type, int mode, int layout) {
+INLINE void eight(const Span *span, const float *at_u, const float *at_v, int type, int mode, int layout) {
     const Job *job = span->job;
-    Positions at;
+    V8 u = load8(at_u), v = load8(at_v);
     int done = 0;
     if (job->padding == BORDER && mode != BICUBIC) {
         u = clamped8(u, (float)(job->source_width - 1));
@@ -718,30 +714,15 @@ INLINE void eight(const Span *span, V8 u, V8 v, int type, int mode, int layout) 
             else bilinear_interleaved(span, squares_of(job, on_u, on_v, 2), type);
         }
     }
-    memcpy(at.u, &u, sizeof at.u);
-    memcpy(at.v, &v, sizeof at.v);
-    careful(span, at.u, at.v, type, mode, (uint32_t)done);
+    careful(span, at_u, at_v, type, mode, (uint32_t)done);
 }
 
 #else
 #define WIDE 0
 
-typedef struct { float lane[STEP]; } V8;
-
-enum { PLANES, INTERLEAVED, SCATTERED };
-
-INLINE V8 load8(const float *from) {
-    V8 value;
-    memcpy(&value, from, sizeof value);
-    return value;
-}
-
-INLINE void eight(const Span *span, V8 u, V8 v, int type, int mode, int layout) {
-    Positions at;
+INLINE void eight(const Span *span, const float *at_u, const float *at_v, int type, int mode, int layout) {
     (void)layout;
-    memcpy(at.u, &u, sizeof at.u);
-    memcpy(at.v, &v, sizeof at.v);
-    careful(span, at.u, at.v, type, mode, 0);
+    careful(span, at_u, at_v, type, mode, 0);
 }
 
 #endif
@@ -1139,7 +1120,7 @@ INLINE void eights(Span *span, char *first, const Chunk *at, int64_t i, int64_t 
     const int64_t step = span->job->result_strides[3] * size_of(type);
     for (; i < n; i += STEP) {
         span->result = first + i * step, span->pixels = n - i < STEP ? n - i : STEP;
-        eight(span, load8(at->u + i), load8(at->v + i), type, mode, layout);
+        eight(span, at->u + i, at->v + i, type, mode, layout);
     }
 }
 
