@@ -150,20 +150,17 @@ typedef struct {
 /* Of points beyond `inner2`, `ok` where the lens is regular all the way from the centre. How many of those that count
    wait for limits */
 static int T(beyond)(const T(Camera) *c, int count, int n, T(Seen) *s) {
-    ALIGNED R x[BLOCK], y[BLOCK], u[BLOCK], v[BLOCK], least[BLOCK];
+    ALIGNED R u[BLOCK], v[BLOCK], least[BLOCK];
     T(Jacobian) jacobian;
-    int places[BLOCK], some = 0;
-    for (int i = 0; i < n; i++)
-        if (s->ok[i] == 2) places[some++] = i;
-    for (int i = some; i % LANES; i++) places[i] = places[some - 1];
-    const int filled = (some + LANES - 1) & -LANES;
-    for (int i = 0; i < filled; i++) x[i] = s->a[places[i]], y[i] = s->b[places[i]];
-    if (c->limits2) T(lens)(c, 1, filled, x, y, u, v, &jacobian, least);
-    for (int i = 0; i < some; i++) {
-        const R limit2 = c->limits2 ? c->limits2[T(azimuth)(x[i], y[i], 0)] : 0;
-        s->ok[places[i]] = (limit2 - (x[i] * x[i] + y[i] * y[i]) > 0) && least[i] > TINY;
+    int waiting = 0;
+    if (c->limits2) T(lens)(c, 1, n, s->a, s->b, u, v, &jacobian, least);
+    for (int i = 0; i < n; i++) {
+        const R a = s->a[i], b = s->b[i];
+        if (s->ok[i] != 2) continue;
+        s->ok[i] = c->limits2 && c->limits2[T(azimuth)(a, b, 0)] - (a * a + b * b) > 0 && least[i] > TINY;
+        waiting += !c->limits2 && i < count;
     }
-    return c->limits2 ? 0 : some && places[0] < count ? some : 0;
+    return waiting;
 }
 
 /* -- the map of rays before a chart, in place; optics/ray_maps.py */
