@@ -6,24 +6,35 @@
 
 #include <string.h>
 
-#define DECLARED(variant)                                                                                              \
-    int32_t sample_##variant(Job *);                                                                                      \
-    int32_t classify_##variant(const Classification *);                                                                \
-    int64_t geometry_##variant(const Rows *);                                                                          \
-    int64_t moves_##variant(const Move *);                                                                             \
-    int64_t lattices_##variant(const Lattices *);                                                                      \
-    void domain_##variant(const Domain *);                                                                             \
-    void consensus_##variant(const Agreement *);                                                                       \
-    void poses_##variant(const Poses *);                                                                               \
-    void views_##variant(const Views *);                                                                               \
-    void steps_##variant(const Steps *);
-DECLARED(baseline)
-#ifdef HAS_AVX2
-DECLARED(avx2)
-#endif
 #ifdef HAS_AVX512
-DECLARED(avx512)
+#define IF_AVX512(code) code
+#else
+#define IF_AVX512(code)
 #endif
+#ifdef HAS_AVX2
+#define IF_AVX2(code) code
+#else
+#define IF_AVX2(code)
+#endif
+
+/* What it is, its name, and what it is given */
+#define EACH_ENTRY(ENTRY)                                                                                              \
+    ENTRY(int32_t, sample, Job *)                                                                                      \
+    ENTRY(int32_t, classify, const Classification *)                                                                   \
+    ENTRY(int64_t, geometry, const Rows *)                                                                             \
+    ENTRY(int64_t, moves, const Move *)                                                                                \
+    ENTRY(int64_t, lattices, const Lattices *)                                                                         \
+    ENTRY(void, domain, const Domain *)                                                                                \
+    ENTRY(void, consensus, const Agreement *)                                                                          \
+    ENTRY(void, poses, const Poses *)                                                                                  \
+    ENTRY(void, views, const Views *)                                                                                  \
+    ENTRY(void, steps, const Steps *)
+
+#define DECLARED(result, name, type)                                                                                   \
+    result name##_baseline(type);                                                                                      \
+    IF_AVX2(result name##_avx2(type);)                                                                                 \
+    IF_AVX512(result name##_avx512(type);)
+EACH_ENTRY(DECLARED)
 
 enum { BASELINE, AVX2, AVX512 };
 
@@ -49,42 +60,15 @@ EXPORTED const char *camtorch_variant(void) {
     return names[variant()];
 }
 
-#define CALLED(name, ...)                                                                                              \
-    switch (variant()) {                                                                                               \
-        IF_AVX512(case AVX512: return name##_avx512(__VA_ARGS__);)                                                     \
-        IF_AVX2(case AVX2: return name##_avx2(__VA_ARGS__);)                                                           \
-    default: return name##_baseline(__VA_ARGS__);                                                                      \
+#define CALLED(result, name, type)                                                                                     \
+    EXPORTED result camtorch_##name(type given) {                                                                      \
+        switch (variant()) {                                                                                           \
+            IF_AVX512(case AVX512: return name##_avx512(given);)                                                       \
+            IF_AVX2(case AVX2: return name##_avx2(given);)                                                             \
+        default: return name##_baseline(given);                                                                        \
+        }                                                                                                              \
     }
-#ifdef HAS_AVX512
-#define IF_AVX512(code) code
-#else
-#define IF_AVX512(code)
-#endif
-#ifdef HAS_AVX2
-#define IF_AVX2(code) code
-#else
-#define IF_AVX2(code)
-#endif
-
-EXPORTED int32_t camtorch_sample(Job *job) { CALLED(sample, job) }
-
-EXPORTED int32_t camtorch_classify(const Classification *given) { CALLED(classify, given) }
-
-EXPORTED int64_t camtorch_geometry(const Rows *rows) { CALLED(geometry, rows) }
-
-EXPORTED int64_t camtorch_moves(const Move *move) { CALLED(moves, move) }
-
-EXPORTED int64_t camtorch_lattices(const Lattices *given) { CALLED(lattices, given) }
-
-EXPORTED void camtorch_domain(const Domain *domain) { CALLED(domain, domain) }
-
-EXPORTED void camtorch_consensus(const Agreement *given) { CALLED(consensus, given) }
-
-EXPORTED void camtorch_poses(const Poses *given) { CALLED(poses, given) }
-
-EXPORTED void camtorch_views(const Views *given) { CALLED(views, given) }
-
-EXPORTED void camtorch_steps(const Steps *given) { CALLED(steps, given) }
+EACH_ENTRY(CALLED)
 
 /* -- one sample */
 

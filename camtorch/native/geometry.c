@@ -12,17 +12,9 @@
 #include <stdlib.h>
 #include <string.h>
 
-#if defined(_MSC_VER)
-#include <intrin.h>
-#define ALIGNED __declspec(align(64))
-#define INLINE static inline
-#define NOT_INLINE
-#define restrict __restrict
-#else
 #define ALIGNED __attribute__((aligned(64)))
 #define INLINE static inline __attribute__((always_inline))
 #define NOT_INLINE __attribute__((noinline))
-#endif
 
 #define JOINED_(a, b) a##_##b
 #define JOINED(a, b) JOINED_(a, b)
@@ -40,13 +32,8 @@ enum { BENT = 21 };       /* of each polynomial of a windshield: those of order 
 #define EACH(i) for (int i = 0; i < (n & -LANES); i++)
 
 /* Loops that compilers would unroll, but make vectors of; and that they shall unroll */
-#if defined(__GNUC__)
 #define KEPT_LOOP _Pragma("GCC unroll 1")
 #define UNROLLED_LOOP _Pragma("GCC unroll 8")
-#else
-#define KEPT_LOOP
-#define UNROLLED_LOOP
-#endif
 
 /* Charts that have loops of their own: unified ones of alpha 0, and of no xi those of alpha 1, of alpha 1/2, and others */
 enum { SHIFTED = LINEARITY + 1, SPHERICAL, HALFWAY, ENHANCED };
@@ -104,13 +91,7 @@ static int numbers_of(const Part *part) {
 }
 
 /* What a number was that several callers add to */
-static int64_t added(int64_t *number, int64_t count) {
-#if defined(_MSC_VER)
-    return _InterlockedExchangeAdd64(number, count);
-#else
-    return __atomic_fetch_add(number, count, __ATOMIC_RELAXED);
-#endif
-}
+static int64_t added(int64_t *number, int64_t count) { return __atomic_fetch_add(number, count, __ATOMIC_RELAXED); }
 
 /* The tile that whoever is free takes */
 static int64_t taken(int64_t *next, int64_t *own) { return next ? added(next, 1) : (*own)++; }

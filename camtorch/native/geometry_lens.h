@@ -554,7 +554,6 @@ static int T(chosen)(int n, const I *restrict open, int *restrict places) {
 /* The factor by which the inverse of a factor scales points, from the table; `ok` where that is found by a few steps */
 static void T(solve)(const T(Factor) *of, const R *table, int n, const R *restrict r2, R *restrict scale,
                      I *restrict ok) {
-    int places[BLOCK], some;
     T(tabulated)(table, n, r2, scale);
     EACH(i) ok[i] = 0;
     R k[PADDED];
@@ -568,24 +567,19 @@ static void T(solve)(const T(Factor) *of, const R *table, int n, const R *restri
         }
         scale[i] = s, ok[i] = found;
     })
-    if (!(some = T(chosen)(n, ok, places))) return;
-    ALIGNED R square[BLOCK], found[BLOCK], t[BLOCK], factor[BLOCK], slope[BLOCK];
-    ALIGNED I done[BLOCK];
-    n = (some + LANES - 1) & -LANES;
-    for (int i = 0; i < n; i++) square[i] = r2[places[i]], found[i] = scale[places[i]], done[i] = 0;
+    ALIGNED R t[BLOCK], factor[BLOCK], slope[BLOCK];
     for (int count = 0; count < MOST_STEPS; count++) {
-        EACH(i) t[i] = square[i] * found[i] * found[i];
+        I all = 1;
+        EACH(i) all &= ok[i] != 0;
+        if (all) return;
+        EACH(i) t[i] = r2[i] * scale[i] * scale[i];
         T(radial)(of, n, t, factor, slope);
         EACH(i) {
             I is_short;
-            const R ahead = T(nearer)(found[i], t[i], factor[i], slope[i], &is_short);
-            found[i] = done[i] ? found[i] : ahead, done[i] |= is_short;
+            const R ahead = T(nearer)(scale[i], t[i], factor[i], slope[i], &is_short);
+            scale[i] = ok[i] ? scale[i] : ahead, ok[i] |= is_short;
         }
-        I all = 1;
-        EACH(i) all &= done[i];
-        if (all) break;
     }
-    for (int i = 0; i < some; i++) scale[places[i]] = found[i], ok[places[i]] = done[i];
 }
 
 /* The same of few points in a bracket up to the fold: Newton's steps, and every other one halves the bracket */

@@ -27,15 +27,7 @@ static int T(moved)(const Move *move, const T(Between) *b, int count, int n, R *
     T(solutions)(&b->from, n, u, v, known, ok, s.x, s.y, s.z);
     if (b->from.waits)
         for (int i = 0; i < count; i++) left |= !ok[i] & (known[i] != 0) ? LEFT_FROM : 0;
-    if (move->turns) {
-        const R *t = b->turn;
-        EACH(i) {
-            const R x = s.x[i], y = s.y[i], z = s.z[i];
-            s.x[i] = t[0] * x + t[1] * y + t[2] * z;
-            s.y[i] = t[3] * x + t[4] * y + t[5] * z;
-            s.z[i] = t[6] * x + t[7] * y + t[8] * z;
-        }
-    }
+    if (move->turns) T(product)(b->turn, 1, 3, n, s.x, s.y, s.z);
     left |= T(pixels_of)(&b->to, count, n, &s, u, v) ? LEFT_TO : 0;
     EACH(i) ok[i] &= s.ok[i];
     if (move->form == POSITIONS) {

@@ -150,20 +150,17 @@ typedef struct {
 /* Of points beyond `inner2`, `ok` where the lens is regular all the way from the centre. How many of those that count
    wait for limits */
 static int T(beyond)(const T(Camera) *c, int count, int n, T(Seen) *s) {
-    ALIGNED R x[BLOCK], y[BLOCK], u[BLOCK], v[BLOCK], least[BLOCK];
+    ALIGNED R u[BLOCK], v[BLOCK], least[BLOCK];
     T(Jacobian) jacobian;
-    int places[BLOCK], some = 0;
-    for (int i = 0; i < n; i++)
-        if (s->ok[i] == 2) places[some++] = i;
-    for (int i = some; i % LANES; i++) places[i] = places[some - 1];
-    const int filled = (some + LANES - 1) & -LANES;
-    for (int i = 0; i < filled; i++) x[i] = s->a[places[i]], y[i] = s->b[places[i]];
-    if (c->limits2) T(lens)(c, 1, filled, x, y, u, v, &jacobian, least);
-    for (int i = 0; i < some; i++) {
-        const R limit2 = c->limits2 ? c->limits2[T(azimuth)(x[i], y[i], 0)] : 0;
-        s->ok[places[i]] = (limit2 - (x[i] * x[i] + y[i] * y[i]) > 0) && least[i] > TINY;
+    int waiting = 0;
+    if (c->limits2) T(lens)(c, 1, n, s->a, s->b, u, v, &jacobian, least);
+    for (int i = 0; i < n; i++) {
+        const R a = s->a[i], b = s->b[i];
+        if (s->ok[i] != 2) continue;
+        s->ok[i] = c->limits2 && c->limits2[T(azimuth)(a, b, 0)] - (a * a + b * b) > 0 && least[i] > TINY;
+        waiting += !c->limits2 && i < count;
     }
-    return c->limits2 ? 0 : some && places[0] < count ? some : 0;
+    return waiting;
 }
 
 /* -- the map of rays before a chart, in place; optics/ray_maps.py */
@@ -742,25 +739,13 @@ static void T(newton_step)(const T(Camera) *c, int first, int n, const R *restri
 /* Newton's method for the stages from `first` on, wherever that leads; `ok` where the next step would be nothing */
 static void T(newton)(const T(Camera) *c, int first, int n, const R *restrict u, const R *restrict v, R *restrict a,
                       R *restrict b, I *restrict ok, int fewest) {
-    int places[BLOCK], some = n, count = 0;
-    while (count < MOST_STEPS && some > n / 4) { /* few are left to a block of their own */
-        if (count < fewest) EACH(i) ok[i] = 0;
+    I all = 0;
+    for (int count = 1; count <= MOST_STEPS && !all; count++) {
+        if (count <= fewest) EACH(i) ok[i] = 0;
         T(newton_step)(c, first, n, u, v, a, b, ok);
-        if (++count >= fewest) some = T(chosen)(n, ok, places);
+        all = count >= fewest;
+        EACH(i) all &= ok[i] != 0;
     }
-    if (!some || count == MOST_STEPS) return;
-    ALIGNED R p[BLOCK], q[BLOCK], x[BLOCK], y[BLOCK];
-    ALIGNED I done[BLOCK];
-    const int filled = (some + LANES - 1) & -LANES;
-    for (int i = 0; i < filled; i++)
-        p[i] = u[places[i]], q[i] = v[places[i]], x[i] = a[places[i]], y[i] = b[places[i]], done[i] = 0;
-    while (count++ < MOST_STEPS) {
-        I all = 1;
-        T(newton_step)(c, first, filled, p, q, x, y, done);
-        for (int i = 0; i < filled; i++) all &= done[i];
-        if (all) break;
-    }
-    for (int i = 0; i < some; i++) a[places[i]] = x[i], b[places[i]] = y[i], ok[places[i]] = done[i];
 }
 
 /* By the radial factor of the first stage alone: where it sends points to (p, q); `possible` within the fold's image */
@@ -998,20 +983,6 @@ static void T(unproject_vjp)(const T(Camera) *c, const Rows *rows, int64_t camer
     if (rows->results) T(store)((R *)rows->results + camera * to[0] + first * to[1], to, 2, count, ga, gb, NULL);
 }
 
-/* Asks for the memory of rows that come next, while others are computed */
-static void T(fetch)(const void *memory, const int64_t *strides, int components, int64_t camera, int64_t first,
-                     int64_t count) {
-#if defined(__GNUC__)
-    const int64_t bytes = count * strides[1] * (int64_t)sizeof(R);
-    if (!memory || strides[1] < 1 || strides[1] > 16) return;
-    const char *from = (const char *)((const R *)memory + camera * strides[0] + first * strides[1]);
-    for (int j = 0; j < (strides[2] == 1 ? 1 : components); j++)
-        for (int64_t i = 0; i < bytes; i += 64) __builtin_prefetch(from + j * strides[2] * (int64_t)sizeof(R) + i);
-#else
-    (void)memory, (void)strides, (void)components, (void)camera, (void)first, (void)count;
-#endif
-}
-
 static int64_t T(rows)(const Rows *rows) {
     const int64_t tiles = (rows->count + rows->tile - 1) / rows->tile, width = 4 + rows->cameras->parameter_count;
     int64_t left = 0, last = -1, own = 0, at;
@@ -1023,11 +994,6 @@ static int64_t T(rows)(const Rows *rows) {
         if (index != last) T(prepare)(rows->cameras, last = index, &camera);
         for (int64_t i = first; i < end; i += BLOCK) {
             const int count = (int)(end - i < BLOCK ? end - i : BLOCK);
-            const int64_t next = i + BLOCK, after = end - next < BLOCK ? end - next : BLOCK;
-            if (after > 0) {
-                T(fetch)(rows->rows, rows->row_strides, 3 - rows->direction % 2, index, next, after);
-                T(fetch)(rows->cotangents, rows->cotangent_strides, 2 + rows->direction % 2, index, next, after);
-            }
             switch (rows->direction) {
             case PROJECT: left += T(project)(&camera, rows, index, i, count); break;
             case UNPROJECT: left += T(unproject)(&camera, rows, index, i, count); break;

@@ -1,8 +1,8 @@
 /* Samples images where a warp says, in tiles of rows: one variant, for the instructions that it is compiled for.
  *
  * A tile goes by columns of chunks, a chunk row by row, eight pixels at a time, or 16 or 32 (see `wide`). Their positions come from a grid or from a lattice, between whose
- * nodes lie cubics. Eight pixels that read inside of the image alone take a way without branches; all others, and all
- * pixels where the compiler has no vectors, go one by one through `sample_at`.
+ * nodes lie cubics. Eight pixels that read inside of the image alone take a way without branches; all others go one
+ * by one through `sample_at`, and all where tests ask for that.
  */
 #include "sampler.h"
 
@@ -14,31 +14,22 @@
 #if defined(__AVX2__)
 #include <immintrin.h>
 #endif
-#if defined(_MSC_VER)
-#include <intrin.h>
-#endif
 
 #define JOINED_(a, b) a##_##b
 #define JOINED(a, b) JOINED_(a, b)
 #define THIS(name) JOINED(name, VARIANT)
 
-#if defined(__GNUC__) && !defined(CAMTORCH_PLAIN)
+#if defined(CAMTORCH_PLAIN)
+#define VECTORS 0
+#else
 #define VECTORS 1
+#endif
 #define INLINE static inline __attribute__((always_inline))
 #define NOT_INLINE static __attribute__((noinline))
-#else
-#define VECTORS 0
-#define INLINE static inline
-#define NOT_INLINE static
-#endif
 
 enum { CHUNK = 256 };          /* pixels of a row whose positions are made at a time */
 enum { MOST_INTERLEAVED = 4 }; /* channels */
 enum { ROWS_AHEAD = 8 };       /* of the source */
-
-typedef struct {
-    float u[STEP], v[STEP];
-} Positions;
 
 /* What eight pixels are written to and read from */
 typedef struct {
@@ -153,42 +144,30 @@ NOT_INLINE Taps taps_at(const Job *job, float u, float v, int mode) {
     return taps;
 }
 
-/* One channel of one pixel; `plane` is that of the channel */
-INLINE float sample_at(const Job *job, const char *plane, const Taps *taps, float fill, int type, int mode) {
+/* One channel of one pixel, by the taps of weights above `lost`; `plane` is that of the channel */
+INLINE float sum_of(const Job *job, const char *plane, const Taps *taps, float fill, int type, int mode, float lost_u,
+                    float lost_v) {
     const int64_t *strides = job->source_strides, *columns = taps->columns, *rows = taps->rows;
     const float *across = taps->across, *down = taps->down;
     const int n = mode == BILINEAR ? 2 : 4;
     float sum = 0;
     int i, j;
-    if (job->padding != ZEROS) {
-        for (j = 0; j < n; j++) {
-            const int64_t row = rows[j] * strides[2];
-            float line = 0;
-            for (i = 0; i < n; i++) line += across[i] * load(plane, row + columns[i] * strides[3], type);
-            sum += down[j] * line;
-        }
-    } else {
-        for (j = 0; j < n; j++)
-            for (i = 0; i < n; i++)
+    for (j = 0; j < n; j++)
+        for (i = 0; i < n; i++)
+            if (fabsf(down[j]) > lost_v && fabsf(across[i]) > lost_u)
                 sum += down[j] * across[i] *
                        (rows[j] < 0 || columns[i] < 0
                             ? fill
                             : load(plane, rows[j] * strides[2] + columns[i] * strides[3], type));
-    }
-    if (mode == BICUBIC && type == FLOAT32 && !(fabsf(sum) <= 3.4028235e38f)) {
-        /* a pixel that is not finite has no part where its weight is but a rounding error */
-        const float lost_u = 4 * (float)job->source_width * 1.1920929e-7f;
-        const float lost_v = 4 * (float)job->source_height * 1.1920929e-7f;
-        sum = 0;
-        for (j = 0; j < n; j++)
-            for (i = 0; i < n; i++)
-                if (fabsf(down[j]) > lost_v && fabsf(across[i]) > lost_u)
-                    sum += down[j] * across[i] *
-                           (rows[j] < 0 || columns[i] < 0
-                                ? fill
-                                : load(plane, rows[j] * strides[2] + columns[i] * strides[3], type));
-    }
     return sum;
+}
+
+INLINE float sample_at(const Job *job, const char *plane, const Taps *taps, float fill, int type, int mode) {
+    const float sum = sum_of(job, plane, taps, fill, type, mode, -1, -1), rounding = 4 * 1.1920929e-7f;
+    if (mode != BICUBIC || type != FLOAT32 || fabsf(sum) <= 3.4028235e38f) return sum;
+    /* a pixel that is not finite has no part where its weight is but a rounding error */
+    return sum_of(job, plane, taps, fill, type, mode, rounding * (float)job->source_width,
+                  rounding * (float)job->source_height);
 }
 
 /* The pixel nearest to a position, or -1 */
@@ -249,6 +228,9 @@ NOT_INLINE void careful(const Span *span, const float *at_u, const float *at_v, 
             for (c = 0; c < job->channels; c++) move(result, c * job->result_strides[1], job->fill_elements, c, type);
     }
 }
+
+/* How pixels lie in memory, in source and result */
+enum { PLANES, INTERLEAVED, SCATTERED };
 
 #if VECTORS
 
@@ -325,13 +307,9 @@ INLINE V8 reflected8(V8 x, float side) {
 
 /* To the nearest whole number, of numbers whose size is below 2^22 */
 INLINE I8 rounded8(V8 value) {
-#if defined(__AVX2__)
-    return (I8)_mm256_cvtps_epi32((__m256)value);
-#else
     const V8 large = every8(12582912.0f);
     V8 sum = value + large;
     return (I8)sum - (I8)large;
-#endif
 }
 
 /* Where eight pixels are read: from the corner (x, y) of a square of four pixels, at a part of its sides */
@@ -366,18 +344,9 @@ INLINE void store_floats(char *to, V8 value, int64_t n) {
 }
 
 INLINE void store_bytes(char *to, I8 value, int64_t n) {
-    uint64_t bytes;
-#if defined(__AVX2__)
-    const __m256i words = _mm256_packs_epi32((__m256i)value, (__m256i)value);
-    const __m256i packed = _mm256_packus_epi16(words, words);
-    const uint32_t low = (uint32_t)_mm256_cvtsi256_si32(packed);
-    const uint32_t high = (uint32_t)_mm_cvtsi128_si32(_mm256_extracti128_si256(packed, 1));
-    bytes = (uint64_t)high << 32 | low;
-#else
+    typedef int16_t W8 __attribute__((vector_size(16)));
     typedef uint8_t B8 __attribute__((vector_size(8)));
-    B8 packed = __builtin_convertvector(value, B8);
-    memcpy(&bytes, &packed, sizeof bytes);
-#endif
+    const B8 bytes = __builtin_convertvector(__builtin_convertvector(value, W8), B8); /* in steps compilers know */
     if (n == STEP) memcpy(to, &bytes, sizeof bytes);
     else memcpy(to, &bytes, (size_t)n);
 }
@@ -388,68 +357,21 @@ INLINE void store_words(char *to, I8 value, int64_t n) {
     memcpy(to, &words, (size_t)n * 2);
 }
 
-/* Two neighbours of each of eight rows, one to the left and one to the right */
-typedef struct {
-    V8 left, right;
-} Pairs;
-
-INLINE Pairs float_pairs(const float *plane, const int64_t *at) {
-    typedef uint64_t U4 __attribute__((vector_size(32)));
-    uint64_t p[STEP];
-    Pairs pairs;
+/* Eight pixels of an image, of any rows */
+INLINE V8 gathered(const char *from, const int64_t *at, int type) {
+    V8 floats;
+    I8 whole;
     int i;
-    for (i = 0; i < STEP; i++) memcpy(p + i, plane + at[i], 8);
-    const V8 a = (V8)(U4){p[0], p[1], p[4], p[5]}, b = (V8)(U4){p[2], p[3], p[6], p[7]};
-#if defined(__AVX2__)
-    pairs.left = (V8)_mm256_shuffle_ps((__m256)a, (__m256)b, 0x88);
-    pairs.right = (V8)_mm256_shuffle_ps((__m256)a, (__m256)b, 0xdd);
-#else
-    pairs.left = (V8){a[0], a[2], b[0], b[2], a[4], a[6], b[4], b[6]};
-    pairs.right = (V8){a[1], a[3], b[1], b[3], a[5], a[7], b[5], b[7]};
-#endif
-    return pairs;
-}
-
-INLINE Pairs word_pairs(const uint16_t *plane, const int64_t *at) {
-    uint32_t p[STEP];
-    Pairs pairs;
-    int i;
-    for (i = 0; i < STEP; i++) memcpy(p + i, plane + at[i], 4);
-    const I8 both = {(int32_t)p[0], (int32_t)p[1], (int32_t)p[2], (int32_t)p[3],
-                     (int32_t)p[4], (int32_t)p[5], (int32_t)p[6], (int32_t)p[7]};
-#if defined(__BYTE_ORDER__) && __BYTE_ORDER__ == __ORDER_BIG_ENDIAN__
-    pairs.right = float8(both & 0xffff);
-    pairs.left = float8((both >> 16) & 0xffff);
-#else
-    pairs.left = float8(both & 0xffff);
-    pairs.right = float8((both >> 16) & 0xffff);
-#endif
-    return pairs;
+    for (i = 0; i < STEP; i++) {
+        if (type == FLOAT32) floats[i] = ((const float *)from)[at[i]];
+        else if (type == UINT16) whole[i] = ((const uint16_t *)from)[at[i]];
+        else whole[i] = ((const uint8_t *)from)[at[i]];
+    }
+    return type == FLOAT32 ? floats : float8(whole);
 }
 
 /* True from one half on, as bytes */
 INLINE I8 truth8(V8 value) { return -(value >= every8(0.5f)); }
-
-INLINE I8 byte_pairs(const uint8_t *plane, const int64_t *at) {
-    uint16_t p[STEP];
-    int i;
-    for (i = 0; i < STEP; i++) memcpy(p + i, plane + at[i], 2);
-    return (I8){p[0], p[1], p[2], p[3], p[4], p[5], p[6], p[7]};
-}
-
-INLINE Pairs split_bytes(I8 both) {
-    Pairs pairs;
-#if defined(__BYTE_ORDER__) && __BYTE_ORDER__ == __ORDER_BIG_ENDIAN__
-    pairs.right = float8(both & 0xff);
-    pairs.left = float8(both >> 8);
-#else
-    pairs.left = float8(both & 0xff);
-    pairs.right = float8(both >> 8);
-#endif
-    return pairs;
-}
-
-INLINE V8 across8(Pairs p, V8 u) { return p.left * (1 - u) + p.right * u; }
 
 #if defined(__AVX2__)
 
@@ -545,20 +467,11 @@ INLINE void bilinear_planes(const Span *span, Squares at, int type) {
 #endif
     offsets_of(job, at.x, at.y, offsets);
     for (c = 0; c < job->channels; c++, plane += from, result += to) {
-        Pairs upper, lower;
-        V8 value;
+        const char *lower = plane + below * bytes;
+        const V8 above = gathered(plane, offsets, type) * (1 - at.u) + gathered(plane + bytes, offsets, type) * at.u;
+        const V8 under = gathered(lower, offsets, type) * (1 - at.u) + gathered(lower + bytes, offsets, type) * at.u;
+        const V8 value = above * (1 - at.v) + under * at.v;
         ask_below(plane + offsets[0] * bytes, below * bytes);
-        if (type == FLOAT32) {
-            upper = float_pairs((const float *)plane, offsets);
-            lower = float_pairs((const float *)plane + below, offsets);
-        } else if (type == UINT16) {
-            upper = word_pairs((const uint16_t *)plane, offsets);
-            lower = word_pairs((const uint16_t *)plane + below, offsets);
-        } else {
-            upper = split_bytes(byte_pairs((const uint8_t *)plane, offsets));
-            lower = split_bytes(byte_pairs((const uint8_t *)plane + below, offsets));
-        }
-        value = across8(upper, at.u) * (1 - at.v) + across8(lower, at.u) * at.v;
         if (type == FLOAT32) store_floats(result, value, span->pixels);
         else if (type == UINT16) store_words(result, rounded8(value), span->pixels);
         else store_bytes(result, type == BOOL ? truth8(value) : rounded8(value), span->pixels);
@@ -684,21 +597,9 @@ INLINE void cubic_weights8(V8 t, V8 *w) {
 
 /* Columns of a table of eight rows */
 INLINE void transpose(const V4 *rows, V8 *columns) {
-#if defined(__AVX2__)
-#define TWO_ROWS(i) _mm256_insertf128_ps(_mm256_castps128_ps256((__m128)rows[i]), (__m128)rows[(i) + 4], 1)
-    const __m256 a = TWO_ROWS(0), b = TWO_ROWS(1), c = TWO_ROWS(2), d = TWO_ROWS(3);
-#undef TWO_ROWS
-    const __m256 low_ab = _mm256_unpacklo_ps(a, b), high_ab = _mm256_unpackhi_ps(a, b);
-    const __m256 low_cd = _mm256_unpacklo_ps(c, d), high_cd = _mm256_unpackhi_ps(c, d);
-    columns[0] = (V8)_mm256_shuffle_ps(low_ab, low_cd, 0x44);
-    columns[1] = (V8)_mm256_shuffle_ps(low_ab, low_cd, 0xee);
-    columns[2] = (V8)_mm256_shuffle_ps(high_ab, high_cd, 0x44);
-    columns[3] = (V8)_mm256_shuffle_ps(high_ab, high_cd, 0xee);
-#else
     int i, k;
     for (k = 0; k < 4; k++)
         for (i = 0; i < STEP; i++) columns[k][i] = rows[i][k];
-#endif
 }
 
 INLINE void bicubic_planes(const Span *span, V8 u, V8 v, int type) {
@@ -758,29 +659,9 @@ INLINE void nearest8(const Span *span, V8 u, V8 v, int type) {
     }
 }
 
-/* How pixels lie in memory, in source and result */
-enum { PLANES, INTERLEAVED, SCATTERED };
-
-/* Of channels that lie anywhere, and so of the last columns and rows of those that lie together */
-NOT_INLINE void bilinear_scattered(const Span *span, Squares at, int type) {
+INLINE void eight(const Span *span, const float *at_u, const float *at_v, int type, int mode, int layout) {
     const Job *job = span->job;
-    const int64_t *strides = job->source_strides;
-    int64_t i, c;
-    for (i = 0; i < span->pixels; i++) {
-        const float u = at.u[i], v = at.v[i];
-        const int64_t corner = at.y[i] * strides[2] + at.x[i] * strides[3];
-        for (c = 0; c < job->channels; c++) {
-            const int64_t upper = corner + c * strides[1], lower = upper + strides[2];
-            const float above = load(span->source, upper, type) * (1 - u) + load(span->source, upper + strides[3], type) * u;
-            const float below = load(span->source, lower, type) * (1 - u) + load(span->source, lower + strides[3], type) * u;
-            store(span->result, i * job->result_strides[3] + c * job->result_strides[1], above * (1 - v) + below * v, type);
-        }
-    }
-}
-
-INLINE void eight(const Span *span, V8 u, V8 v, int type, int mode, int layout) {
-    const Job *job = span->job;
-    Positions at;
+    V8 u = load8(at_u), v = load8(at_v);
     int done = 0;
     if (job->padding == BORDER && mode != BICUBIC) {
         u = clamped8(u, (float)(job->source_width - 1));
@@ -815,10 +696,6 @@ INLINE void eight(const Span *span, V8 u, V8 v, int type, int mode, int layout) 
             return;
         }
     }
-    if (mode == BILINEAR && layout != PLANES && job->source_width > 1 && job->source_height > 1 && inside(job, u, v, 0, 0)) {
-        bilinear_scattered(span, squares_of(job, u, v, 1), type);
-        return;
-    }
     /* beyond `reach` of zeros nothing is shown, nor what has no position */
     const float reach = job->padding != ZEROS ? INFINITY : mode == BICUBIC ? 2 : 1;
     const V8 low = every8(-reach);
@@ -839,30 +716,15 @@ INLINE void eight(const Span *span, V8 u, V8 v, int type, int mode, int layout) 
             else bilinear_interleaved(span, squares_of(job, on_u, on_v, 2), type);
         }
     }
-    memcpy(at.u, &u, sizeof at.u);
-    memcpy(at.v, &v, sizeof at.v);
-    careful(span, at.u, at.v, type, mode, (uint32_t)done);
+    careful(span, at_u, at_v, type, mode, (uint32_t)done);
 }
 
 #else
 #define WIDE 0
 
-typedef struct { float lane[STEP]; } V8;
-
-enum { PLANES, INTERLEAVED, SCATTERED };
-
-INLINE V8 load8(const float *from) {
-    V8 value;
-    memcpy(&value, from, sizeof value);
-    return value;
-}
-
-INLINE void eight(const Span *span, V8 u, V8 v, int type, int mode, int layout) {
-    Positions at;
+INLINE void eight(const Span *span, const float *at_u, const float *at_v, int type, int mode, int layout) {
     (void)layout;
-    memcpy(at.u, &u, sizeof at.u);
-    memcpy(at.v, &v, sizeof at.v);
-    careful(span, at.u, at.v, type, mode, 0);
+    careful(span, at_u, at_v, type, mode, 0);
 }
 
 #endif
@@ -1278,7 +1140,7 @@ INLINE void eights(Span *span, char *first, const Chunk *at, int64_t i, int64_t 
     const int64_t step = span->job->result_strides[3] * size_of(type);
     for (; i < n; i += STEP) {
         span->result = first + i * step, span->pixels = n - i < STEP ? n - i : STEP;
-        eight(span, load8(at->u + i), load8(at->v + i), type, mode, layout);
+        eight(span, at->u + i, at->v + i, type, mode, layout);
     }
 }
 
@@ -1418,11 +1280,7 @@ int32_t THIS(sample)(Job *job) {
     const Tile make = way_of(job);
     int32_t made;
     for (made = 0;; made++) {
-#if defined(_MSC_VER)
-        const int64_t i = _InterlockedExchangeAdd64(&job->next, 1);
-#else
         const int64_t i = __atomic_fetch_add(&job->next, 1, __ATOMIC_RELAXED);
-#endif
         int64_t b, from;
         if (i >= tiles * job->count) return made;
         /* one image after the other of the same rows: positions that they share are in the cache then */
