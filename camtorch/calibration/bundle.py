@@ -403,9 +403,7 @@ class Bundle:
             parameters = state.parameters[0][: 1 if self.are_shared[0] else None]
             native = Cameras(type(self.cameras[0]), parameters[:, :4], parameters[:, 4:]).native
             assert native is not None  # it was there for the first ones
-            loss = self.loss, self.loss_scale
-            found = compiled_poses.seen(native, sight.points, state.boards, sight.pixels, sight.weights, *loss)
-            return _Look(*found, native)
+            return _Look(*compiled_poses.seen(native, *self._of_sight(state, sight))[0], native)
         pixels, valid = self.camera(c, state).project(self.points(c, state, sight)[-1])
         residuals = torch.where((valid & (sight.weights > 0))[..., None], pixels - sight.pixels, 0.0)
         u, v = residuals.unbind(-1)
@@ -492,12 +490,15 @@ class Bundle:
         look, state, sight = self.looks(flat, rows)[0], self.state(flat), self.sight(0, rows)
         if look.native is None or (look.native.plan.places is None and bool((own >= 4).any())):
             return None
-        seen = compiled_poses.Seen(*look[:4])
-        view, shared = compiled_poses.triangles(look.native, sight.points, state.boards, seen, own.tolist())
+        _, view, shared = compiled_poses.seen(look.native, *self._of_sight(state, sight), own.tolist())
         if sight.prior:
             whole = torch.cat((shared, *self._rows_of_priors(state)), -2)
             shared = torch.linalg.qr(padded(whole), mode="r").R
         return Equations(view, shared, self.columns)
+
+    def _of_sight(self, state: State, sight: Sight) -> tuple[Tensor, Poses, Tensor, Tensor, tuple[str | None, float]]:
+        """What compiled code takes."""
+        return sight.points, state.boards, sight.pixels, sight.weights, (self.loss, self.loss_scale)
 
     def _rows_of_priors(self, state: State) -> list[Tensor]:
         """(B, R, G + 1) of each."""
@@ -551,7 +552,7 @@ class Bundle:
         of_views, shared = step
         boards, mounts, bend = state.boards, state.mounts, state.bend
         if self.width == 6:
-            turned = small_turn(of_views[..., :3]) @ boards.rotations
+            turned = compiled_poses.turned(boards.rotations, of_views)
             boards = Poses(turned, boards.translations + of_views[..., 3:])
         else:
             boards = boards._replace(translations=boards.translations + of_views)

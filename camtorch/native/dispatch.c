@@ -3,8 +3,7 @@
 #include "geometry.h"
 #include "poses.h"
 #include "sampler.h"
-
-#include <string.h>
+#include "small.h"
 
 #define DECLARED(variant)                                                                                              \
     int32_t sample_##variant(Job *);                                                                                      \
@@ -85,6 +84,11 @@ EXPORTED void camtorch_poses(const Poses *given) { CALLED(poses, given) }
 EXPORTED void camtorch_views(const Views *given) { CALLED(views, given) }
 
 EXPORTED void camtorch_steps(const Steps *given) { CALLED(steps, given) }
+
+/* Rotations (n, 3, 3) after turns of n steps, `width` apart */
+EXPORTED void camtorch_turns(const double *steps, int64_t width, double *rotations, int64_t count) {
+    for (int64_t i = 0; i < count; i++) turn(steps + i * width, rotations + 9 * i, 3);
+}
 
 /* -- one sample */
 
