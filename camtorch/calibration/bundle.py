@@ -298,7 +298,6 @@ class Bundle:
     is_bent: bool
     is_plain: bool
     """Whether one camera sees flat boards that may be anywhere: what compiled code knows."""
-    lost: Tensor
     columns: tuple[tuple[int, int], ...]
     learnt: list[tuple[Tensor, Tensor]]
     """Of each camera the numbers of its columns, and of its parameters in them."""
@@ -315,7 +314,6 @@ class Bundle:
         self.sights = [s.mapped(lambda t: t.expand(batch, *t.shape[1:])) for s in sights]
         self.cameras = [_template(s.model, p) for s, p in zip(sights, state.parameters, strict=True)]
         self.rounding = torch.stack([rounding_of(s.pixels, s.weights) for s in self.sights]).sum(0)
-        self.lost = robust(loss, loss_scale, self.sights[0].weights.new_tensor(_LOST**2))[0]
         # a camera that does not learn, and is that of all problems, sees them in one row
         self.are_shared = [
             len(p) == 1 and not bool(f.any()) for p, f in zip(state.parameters, free.parameters, strict=True)
@@ -339,7 +337,7 @@ class Bundle:
         plain = (
             len(sights) == 1 and free.boards == "poses" and not (free.mounts[0] or sights[0].motions or self.is_bent)
         )
-        self.is_plain = plain and compiled_of([self.camera(0, state)], self.sights[0].pixels) is not None
+        self.is_plain = plain and compiled_of(self.cameras, self.sights[0].pixels) is not None
         self.width = 6 if free.boards == "poses" else 3
         """Of the unknowns of a view."""
         views = torch.stack([(s.weights > 0).any(-1).any(0) for s in self.sights]).any(0).sum()
@@ -408,7 +406,8 @@ class Bundle:
         residuals = torch.where((valid & (sight.weights > 0))[..., None], pixels - sight.pixels, 0.0)
         u, v = residuals.unbind(-1)
         cost, slope = robust(self.loss, self.loss_scale, u * u + v * v)
-        cost = (torch.where(valid, cost, self.lost) * sight.weights).sum(-1)
+        lost, _ = robust(self.loss, self.loss_scale, cost.new_tensor(_LOST**2))
+        cost = (torch.where(valid, cost, lost) * sight.weights).sum(-1)
         return _Look(residuals, valid, torch.where(valid, slope * sight.weights, 0.0), cost)
 
     def looks(self, flat: Sequence[Tensor], rows: Tensor) -> list[_Look]:
@@ -432,9 +431,7 @@ class Bundle:
     def sight(self, c: int, rows: Tensor | None) -> Sight:
         """Of some problems."""
         sight = self.sights[c]
-        if rows is None or len(rows) == len(sight.points):
-            return sight
-        return sight.mapped(lambda t: t[rows])
+        return sight if rows is None else sight.mapped(lambda t: _of_rows(t, rows))
 
     def cost(self, flat: Sequence[Tensor], rows: Tensor) -> Tensor:
         """(R,)."""
@@ -454,7 +451,7 @@ class Bundle:
             # what would leave its bounds stays there, so that the others can move on
             view, shared = equations.view[..., self.width :], equations.shared
             slope = (view[..., :-1] * view[..., -1:]).sum((1, 2)) + (shared[..., :-1] * shared[..., -1:]).sum(1)
-            values, low, high = self._of_columns(flat[5:], 0.0), self.low[rows], self.high[rows]
+            values, low, high = self._of_columns(flat[5:], 0.0), _of_rows(self.low, rows), _of_rows(self.high, rows)
             held = (values <= low) & (slope > 0) | (values >= high) & (slope < 0)
         return System(equations, self.width, held)
 
@@ -559,7 +556,7 @@ class Bundle:
         parameters = []
         for p, (at, own) in zip(state.parameters, self.learnt, strict=True):
             if len(at):
-                low, high = (ends[rows][:, at] for ends in (self.low, self.high))
+                low, high = (_of_rows(ends, rows)[:, at] for ends in (self.low, self.high))
                 p = p.index_copy(1, own, (p[:, own] + shared[:, at]).clamp(low, high))
             parameters.append(p)
         if self.learns_bend:
@@ -572,6 +569,11 @@ class Bundle:
                     (turn if i < 3 else shift)[:, c, i % 3] += shared[:, g]
             mounts = Poses(small_turn(turn) @ mounts.rotations, mounts.translations + shift)
         return self.flat(State(tuple(parameters), mounts, boards, bend))
+
+
+def _of_rows(values: Tensor, rows: Tensor) -> Tensor:
+    """Those of some problems."""
+    return values if len(rows) == len(values) else values[rows]
 
 
 def _kind(model: type[Camera] | Camera) -> type[Camera]:
