@@ -6,6 +6,7 @@ complement, without the squares of a normal equation. Time and memory grow with 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -602,7 +603,7 @@ def pixel_jacobians(camera: Camera, points: Tensor, learns: bool = True) -> tupl
             return by_point, by_parameters
         return by_point, by_own
     intrinsics = camera.intrinsics.view(-1, 4)
-    found = sensor_jacobians(camera, camera.distortion.view(len(intrinsics), -1), points)
+    found = sensor_jacobians(camera, camera.distortion.view(len(intrinsics), -1), points, math.inf)
     focal = intrinsics[:, None, :2, None]
     by_focal = torch.diag_embed(torch.stack(found.points[:2], -1))
     by_centre = torch.diag_embed(found.points.covered[..., None].expand(*points.shape[:2], 2).to(points))
