@@ -60,7 +60,7 @@ class Spread(NamedTuple):
         by_ray, by_parameters = pixel_jacobians(camera, rays)
         by_turn = torch.linalg.cross(rays[:, :, None].expand_as(by_ray), by_ray, dim=-1)
         slopes = torch.cat((by_parameters, by_turn, by_ray / distance[..., None, None]), -1)
-        moved = (slopes.flatten(1, 2) @ self.factor).unflatten(1, (-1, 2))
+        moved = slopes @ self.factor[:, None]
         known = valid & (by_parameters[..., 0, 2] > 0)  # by cx: whether there is a pixel
         return torch.where(known[..., None, None], moved @ moved.mT, torch.nan)
 
