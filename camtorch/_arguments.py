@@ -7,6 +7,7 @@ import math
 import operator
 import os
 import sys
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ParamSpec, TypeAlias, TypeGuard, TypeVar
 
@@ -42,12 +43,16 @@ def hinting(hint: str) -> Callable[[Callable[Taken, Result]], Callable[Taken, Re
     return hinted
 
 
-def users_line() -> int:
-    """The `stacklevel` at which a warning of the caller shows the line that called this package."""
-    level, frame, package = 1, sys._getframe(1), os.path.dirname(__file__) + os.sep
-    while frame.f_back is not None and frame.f_code.co_filename.startswith(package):
+def warn(text: str, category: type[Warning] = UserWarning) -> None:
+    """Warn, and show the line that called this package."""
+    level, frame = 2, sys._getframe(1)
+    while frame.f_back is not None and frame.f_code.co_filename.startswith(_INSIDE):
         level, frame = level + 1, frame.f_back
-    return level
+    warnings.warn(text, category, stacklevel=level)
+
+
+# torch stands between a module's caller and its forward
+_INSIDE = tuple(os.path.dirname(file) + os.sep for file in (__file__, torch.__file__))
 
 
 def as_real(value: Numbers, name: str, owner: str) -> Tensor:

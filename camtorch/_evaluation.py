@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from functools import partial
@@ -14,7 +13,7 @@ from torch import Tensor, nn
 from torch.autograd import Function, forward_ad
 from torch.nn.utils import parametrize
 
-from camtorch._arguments import Numbers, as_points
+from camtorch._arguments import Numbers, as_points, warn
 from camtorch._module import Memo, is_constant, with_values
 from camtorch._portable import is_portable_export
 from camtorch._tracing import (
@@ -217,10 +216,9 @@ def _warn_of_unusable(camera: Camera, cameras: Cameras, usable: Tensor) -> None:
             '"intrinsics", camtorch.PositiveFocal())'
         )
         keeps = keeps if found[0] == "intrinsics" else ""
-        warnings.warn(
+        warn(
             f"{name}: {found[0]}{where} became unusable: {found[1]}. All its results are invalid "
             f"and its gradients zero from here on. A smaller learning rate keeps it from there{keeps}",
-            stacklevel=2,
         )
 
 

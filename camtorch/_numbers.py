@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import warnings
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -25,6 +24,7 @@ from camtorch._arguments import (
     row_of,
     shown,
     values_of,
+    warn,
 )
 from camtorch._freezing import INTRINSICS, frozen_names
 from camtorch._module import remade
@@ -61,7 +61,7 @@ def checked_numbers(
     batch = as_batch(owner, intrinsics=intrinsics.shape, distortion=distortion.shape)
     size = as_image_size(image_size, owner)
     if size is not None:
-        warn_of_order(intrinsics, size, owner, stacklevel=4)
+        warn_of_order(intrinsics, size, owner)
     return intrinsics, distortion, model.names_of(distortion.shape[-1]) or (), batch, size
 
 
@@ -181,7 +181,7 @@ def replaced(
     batch = as_batch(model.__name__, intrinsics=now.shape, distortion=k.shape)
     size = changes.get("image_size", camera.image_size)
     if intrinsics is not None and size is not None:
-        warn_of_order(now, size, model.__name__, stacklevel=4)
+        warn_of_order(now, size, model.__name__)
     for name in changes.keys() & {"intrinsics", "distortion"}:
         value = changes[name]
         if not is_kept(value):
@@ -321,7 +321,7 @@ def camera_of_fov(
     return made
 
 
-def warn_of_order(intrinsics: Tensor, size: tuple[int, int], owner: str, stacklevel: int = 3) -> None:
+def warn_of_order(intrinsics: Tensor, size: tuple[int, int], owner: str) -> None:
     """Warn of plain numbers (*B, 4) that fit in another order only: of (width, height), or as fx, cx, fy, cy."""
     if is_kept(intrinsics) or is_predicted(intrinsics):
         return
@@ -333,19 +333,17 @@ def warn_of_order(intrinsics: Tensor, size: tuple[int, int], owner: str, stackle
     given = f"fx, fy, cx, cy = {rows[0]}"
     cut_out = "The camera of a part of an image comes from camera.crop"
     if all(_off_centre(cx, cy, size[::-1]) <= _NEAR for _, _, cx, cy in rows):
-        warnings.warn(
+        warn(
             f"{owner}: image_size={size} is (height, width), as image.shape, and the principal point of {given} is the "
             f"middle of {size[::-1]}. OpenCV's (width, height) goes in turned round. {cut_out}",
-            stacklevel=stacklevel,
         )
     elif all(
         _off_centre(fy, cy, size) <= _NEAR and abs(cx - fx) <= _NEAR * fx and abs(fy - fx) > _CENTRED * fx
         for fx, fy, cx, cy in rows
     ):
-        warnings.warn(
+        warn(
             f"{owner}: {given} have their principal point far from the middle of images of {size}, and seem to be "
             f"fx, cx, fy, cy; both focal lengths come first. {cut_out}",
-            stacklevel=stacklevel,
         )
 
 
@@ -353,10 +351,9 @@ def warn_of_exchange(old: tuple[int, int], new: tuple[int, int], owner: str) -> 
     """Warn of a new size that has the shape of the old one on its side, as (width, height) would."""
     turned = new[0] * old[0] / (new[1] * old[1])
     if old[0] != old[1] and abs(turned - 1) < _CENTRED / 10:
-        warnings.warn(
+        warn(
             f"{owner}: {new} is (height, width); an image of {old} is stretched to that, and keeps its shape as "
             f"{new[::-1]}. The camera of the image on its side comes from camera.rot90",
-            stacklevel=3,
         )
 
 

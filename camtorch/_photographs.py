@@ -16,6 +16,8 @@ import torch
 from PIL import Image, UnidentifiedImageError
 from torch import Tensor
 
+from camtorch._arguments import warn
+
 ORIENTATION = 0x0112  # the Exif tag, likewise of TIFF
 _WIDTH, _HEIGHT = 256, 257  # tags of TIFF
 DEEP = ("I;16", "I;16B", "I;16L", "I;16N", "I")
@@ -71,9 +73,9 @@ def read_stored(path: Path) -> tuple[Tensor, int | None]:
         orientation = opened.getexif().get(ORIENTATION)
         image = load_stored(opened)
         if count > 1:
-            warnings.warn(f"{path} holds {count} images; only the first is taken", stacklevel=2)
+            warn(f"{path} holds {count} images; only the first is taken")
         if cut:
-            warnings.warn(f"{path} has 16 bits a colour; only the upper 8 are read", stacklevel=2)
+            warn(f"{path} has 16 bits a colour; only the upper 8 are read")
         return _pixels(path, image), orientation
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -25,6 +24,7 @@ from camtorch._arguments import (
     holds,
     no_camera,
     shown,
+    warn,
 )
 from camtorch._module import typed_as
 from camtorch._tracing import is_concrete, may_look
@@ -462,11 +462,10 @@ class Augmentation(SampleTransform):
         if self._warned or not fails(found >= share):
             return
         self._warned, few = True, int((found < share).sum())
-        warnings.warn(
+        warn(
             f"{self._name}: min_filled={share:g} is out of reach for {few} of {found.numel()} new images, of "
             f"which down to {float(found.min()):.0%} shows something: the camera of the images does not see along the "
             "axis of the new one",
-            stacklevel=2,
         )
 
     def _tell_of_zoom(self, source: Camera, target: Camera, factor: Tensor, found: Tensor) -> None:
@@ -486,12 +485,11 @@ class Augmentation(SampleTransform):
             first = first[[0] * _TRIES] if first.batch_shape else first
             shares = filled(first, *self._new_camera(first, self._values(first, values)))
         if shares.mean() < _FEW:
-            warnings.warn(
+            warn(
                 f"{self._name}: of the new images {1 - float(shares.mean()):.0%} will show nothing, and of some "
                 f"{1 - float(shares.min()):.0%}, as the camera of the images does not see so far. min_filled=0.9 zooms "
                 "until that much of every image shows something; fov='source', in lenses, takes one as wide as the "
                 "images are; min_filled=0 says that it is meant so",
-                stacklevel=2,
             )
 
     # -- applying

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -10,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from camtorch._arguments import as_flag, as_whole, shown
+from camtorch._arguments import as_flag, as_whole, shown, warn
 
 
 def _order(count: int, *runs: tuple[int, int, int]) -> tuple[int, ...]:
@@ -158,11 +157,10 @@ class Mirroring:
         table = self._named.get(name) if self._named is not None else self._one
         if table is None:
             if self._named is None and self._one is None and kind in _HOLD[:2] and (meant := _FACES.get(count)):
-                warnings.warn(
+                warn(
                     f"{self.owner}: {name} holds {count} points and mirrored faces keep their order: point 0 is then "
                     f"on the other side. landmarks={meant!r}, if that is their order, puts them right; "
                     "landmarks={} says that they shall keep it",
-                    stacklevel=2,
                 )
             return None
         order = table.of(count)

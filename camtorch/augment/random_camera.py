@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from difflib import get_close_matches
@@ -15,7 +14,7 @@ import torch
 from torch import Tensor
 from torch.nn.utils.parametrize import type_before_parametrizations
 
-from camtorch._arguments import are_numbers, as_image_size, broadcast_shapes, check_degrees, fails
+from camtorch._arguments import are_numbers, as_image_size, broadcast_shapes, check_degrees, fails, warn
 from camtorch._evaluation import rows_of
 from camtorch._module import Memo, remade
 from camtorch._numbers import joined, split, wide
@@ -306,12 +305,11 @@ class RandomCamera(Augmentation):
         if not bool(less.any()):
             return
         _told.add(key)
-        warnings.warn(
+        warn(
             f"{self._name}: asked for fov={asked:g} degrees at least, an image is {float(made[less].min()):.0f} wide: "
             f"min_filled={share:g} zooms until so much of it is filled, and the camera of the images, "
             f"{float(source.fov[..., 0].max()):.0f} degrees wide, shows no more where the new one looks. fov='source' "
             "asks for what it has; with min_filled=0 the rest stays empty",
-            stacklevel=2,
         )
 
     def _shutter(self, values: Mapping[str, Tensor]) -> RollingShutter | None:

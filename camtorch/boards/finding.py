@@ -5,7 +5,6 @@ from __future__ import annotations
 import glob
 import os
 import re
-import warnings
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -16,7 +15,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from camtorch._arguments import as_number, shown
+from camtorch._arguments import as_number, shown, warn
 from camtorch._photographs import read_stored
 from camtorch.boards.boards import Board, board_of, opencv
 from camtorch.boards.detection import Detection, detect
@@ -94,9 +93,8 @@ def find_board(images: Any, board: Any, *, square: float = 1.0, **options: Any) 
             pixels.append(detection.pixels)
     if left_out:
         more = f" and {len(left_out) - _NAMED} more" if len(left_out) > _NAMED else ""
-        warnings.warn(
+        warn(
             f"{_OWNER}: {len(left_out)} of {len(given)} images are left out: {', '.join(left_out[:_NAMED])}{more}",
-            stacklevel=2,
         )
     return BoardObservations([wanted.points()] * len(names), pixels, names, usual)
 

@@ -6,6 +6,7 @@ complement, without the squares of a normal equation. Time and memory grow with 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -298,7 +299,6 @@ class Bundle:
     is_bent: bool
     is_plain: bool
     """Whether one camera sees flat boards that may be anywhere: what compiled code knows."""
-    lost: Tensor
     columns: tuple[tuple[int, int], ...]
     learnt: list[tuple[Tensor, Tensor]]
     """Of each camera the numbers of its columns, and of its parameters in them."""
@@ -315,7 +315,6 @@ class Bundle:
         self.sights = [s.mapped(lambda t: t.expand(batch, *t.shape[1:])) for s in sights]
         self.cameras = [_template(s.model, p) for s, p in zip(sights, state.parameters, strict=True)]
         self.rounding = torch.stack([rounding_of(s.pixels, s.weights) for s in self.sights]).sum(0)
-        self.lost = robust(loss, loss_scale, self.sights[0].weights.new_tensor(_LOST**2))[0]
         # a camera that does not learn, and is that of all problems, sees them in one row
         self.are_shared = [
             len(p) == 1 and not bool(f.any()) for p, f in zip(state.parameters, free.parameters, strict=True)
@@ -339,7 +338,7 @@ class Bundle:
         plain = (
             len(sights) == 1 and free.boards == "poses" and not (free.mounts[0] or sights[0].motions or self.is_bent)
         )
-        self.is_plain = plain and compiled_of([self.camera(0, state)], self.sights[0].pixels) is not None
+        self.is_plain = plain and compiled_of(self.cameras, self.sights[0].pixels) is not None
         self.width = 6 if free.boards == "poses" else 3
         """Of the unknowns of a view."""
         views = torch.stack([(s.weights > 0).any(-1).any(0) for s in self.sights]).any(0).sum()
@@ -403,14 +402,13 @@ class Bundle:
             parameters = state.parameters[0][: 1 if self.are_shared[0] else None]
             native = Cameras(type(self.cameras[0]), parameters[:, :4], parameters[:, 4:]).native
             assert native is not None  # it was there for the first ones
-            loss = self.loss, self.loss_scale
-            found = compiled_poses.seen(native, sight.points, state.boards, sight.pixels, sight.weights, *loss)
-            return _Look(*found, native)
+            return _Look(*compiled_poses.seen(native, *self._of_sight(state, sight))[0], native)
         pixels, valid = self.camera(c, state).project(self.points(c, state, sight)[-1])
         residuals = torch.where((valid & (sight.weights > 0))[..., None], pixels - sight.pixels, 0.0)
         u, v = residuals.unbind(-1)
         cost, slope = robust(self.loss, self.loss_scale, u * u + v * v)
-        cost = (torch.where(valid, cost, self.lost) * sight.weights).sum(-1)
+        lost, _ = robust(self.loss, self.loss_scale, cost.new_tensor(_LOST**2))
+        cost = (torch.where(valid, cost, lost) * sight.weights).sum(-1)
         return _Look(residuals, valid, torch.where(valid, slope * sight.weights, 0.0), cost)
 
     def looks(self, flat: Sequence[Tensor], rows: Tensor) -> list[_Look]:
@@ -434,9 +432,7 @@ class Bundle:
     def sight(self, c: int, rows: Tensor | None) -> Sight:
         """Of some problems."""
         sight = self.sights[c]
-        if rows is None or len(rows) == len(sight.points):
-            return sight
-        return sight.mapped(lambda t: t[rows])
+        return sight if rows is None else sight.mapped(lambda t: _of_rows(t, rows))
 
     def cost(self, flat: Sequence[Tensor], rows: Tensor) -> Tensor:
         """(R,)."""
@@ -456,7 +452,7 @@ class Bundle:
             # what would leave its bounds stays there, so that the others can move on
             view, shared = equations.view[..., self.width :], equations.shared
             slope = (view[..., :-1] * view[..., -1:]).sum((1, 2)) + (shared[..., :-1] * shared[..., -1:]).sum(1)
-            values, low, high = self._of_columns(flat[5:], 0.0), self.low[rows], self.high[rows]
+            values, low, high = self._of_columns(flat[5:], 0.0), _of_rows(self.low, rows), _of_rows(self.high, rows)
             held = (values <= low) & (slope > 0) | (values >= high) & (slope < 0)
         return System(equations, self.width, held)
 
@@ -492,12 +488,15 @@ class Bundle:
         look, state, sight = self.looks(flat, rows)[0], self.state(flat), self.sight(0, rows)
         if look.native is None or (look.native.plan.places is None and bool((own >= 4).any())):
             return None
-        seen = compiled_poses.Seen(*look[:4])
-        view, shared = compiled_poses.triangles(look.native, sight.points, state.boards, seen, own.tolist())
+        _, view, shared = compiled_poses.seen(look.native, *self._of_sight(state, sight), own.tolist())
         if sight.prior:
             whole = torch.cat((shared, *self._rows_of_priors(state)), -2)
             shared = torch.linalg.qr(padded(whole), mode="r").R
         return Equations(view, shared, self.columns)
+
+    def _of_sight(self, state: State, sight: Sight) -> tuple[Tensor, Poses, Tensor, Tensor, tuple[str | None, float]]:
+        """What compiled code takes."""
+        return sight.points, state.boards, sight.pixels, sight.weights, (self.loss, self.loss_scale)
 
     def _rows_of_priors(self, state: State) -> list[Tensor]:
         """(B, R, G + 1) of each."""
@@ -551,14 +550,14 @@ class Bundle:
         of_views, shared = step
         boards, mounts, bend = state.boards, state.mounts, state.bend
         if self.width == 6:
-            turned = small_turn(of_views[..., :3]) @ boards.rotations
+            turned = compiled_poses.turned(boards.rotations, of_views)
             boards = Poses(turned, boards.translations + of_views[..., 3:])
         else:
             boards = boards._replace(translations=boards.translations + of_views)
         parameters = []
         for p, (at, own) in zip(state.parameters, self.learnt, strict=True):
             if len(at):
-                low, high = (ends[rows][:, at] for ends in (self.low, self.high))
+                low, high = (_of_rows(ends, rows)[:, at] for ends in (self.low, self.high))
                 p = p.index_copy(1, own, (p[:, own] + shared[:, at]).clamp(low, high))
             parameters.append(p)
         if self.learns_bend:
@@ -571,6 +570,11 @@ class Bundle:
                     (turn if i < 3 else shift)[:, c, i % 3] += shared[:, g]
             mounts = Poses(small_turn(turn) @ mounts.rotations, mounts.translations + shift)
         return self.flat(State(tuple(parameters), mounts, boards, bend))
+
+
+def _of_rows(values: Tensor, rows: Tensor) -> Tensor:
+    """Those of some problems."""
+    return values if len(rows) == len(values) else values[rows]
 
 
 def _kind(model: type[Camera] | Camera) -> type[Camera]:
@@ -599,7 +603,7 @@ def pixel_jacobians(camera: Camera, points: Tensor, learns: bool = True) -> tupl
             return by_point, by_parameters
         return by_point, by_own
     intrinsics = camera.intrinsics.view(-1, 4)
-    found = sensor_jacobians(camera, camera.distortion.view(len(intrinsics), -1), points)
+    found = sensor_jacobians(camera, camera.distortion.view(len(intrinsics), -1), points, math.inf)
     focal = intrinsics[:, None, :2, None]
     by_focal = torch.diag_embed(torch.stack(found.points[:2], -1))
     by_centre = torch.diag_embed(found.points.covered[..., None].expand(*points.shape[:2], 2).to(points))

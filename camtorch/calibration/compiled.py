@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Sequence
-from ctypes import addressof, c_int64
+from ctypes import addressof, c_int64, c_void_p
 from typing import NamedTuple
 
 import torch
@@ -13,6 +13,7 @@ from torch import Tensor
 from camtorch._threads import spread, thread_count
 from camtorch.native.library import library
 from camtorch.projection.compiled import Native
+from camtorch.rotations import small_turn
 
 _FROM_RAYS, _REFINED, _SOLVED, _AGREED = range(4)
 _LOSSES = (None, "huber", "cauchy")
@@ -122,60 +123,56 @@ def seen(
     poses: tuple[Tensor, Tensor],
     pixels: Tensor,
     weights: Tensor,
-    loss: str | None,
-    loss_scale: float,
-) -> Seen:
+    loss: tuple[str | None, float],
+    learnt: Sequence[int] | None = None,
+) -> tuple[Seen, Tensor, Tensor]:
     """What cameras (B,), or one, make of points (B, V, N, 3) whose pixels (B, V, N, 2) are known.
 
-    poses: (B, V, 3, 3), (B, V, 3). weights: (B, V, N) of the squares.
+    Also `Equations.view` and `Equations.shared`, if it is said what columns are by.
+
+    poses: (B, V, 3, 3), (B, V, 3). weights: (B, V, N) of the squares. loss: name and scale. learnt: numbers of
+    intrinsics, and of coefficients from 4 on.
     """
+    compiled, plan, left = library(), native.plan, c_int64(0)
+    assert compiled is not None  # or nobody has a `Native`
     valid = torch.empty(weights.shape, dtype=torch.bool, device="cpu")
     made = Seen(
         pixels.new_empty(pixels.shape), valid, weights.new_empty(weights.shape), weights.new_empty(weights.shape[:2])
     )
-    given = [t.contiguous() for t in (*poses, pixels, weights)]
-    places = [t.data_ptr() for t in (*given, made.residuals, made.weights, made.valid, made.cost)]
-    while _views(native, points, places, (_LOSSES.index(loss), loss_scale), (0, 0, 0, 0)):
-        native.follow()
-    return made
-
-
-def triangles(
-    native: Native, points: Tensor, poses: tuple[Tensor, Tensor], seen: Seen, learnt: Sequence[int]
-) -> tuple[Tensor, Tensor]:
-    """Of cameras (B,), or of one, that see points (B, V, N, 3): `Equations.view` and `Equations.shared`.
-
-    poses: (B, V, 3, 3), (B, V, 3). seen: at these. learnt: numbers of intrinsics, and of coefficients from 4 on, which
-    columns are by.
-    """
-    plan = native.plan
+    wanted = learnt or ()
     if plan.places is not None and not plan.is_all:  # the place of each coefficient among the parameters
         at = {4 + place: 4 + i for i, place in enumerate(plan.places.tolist())}
-        learnt = [at.get(number, number) for number in learnt]
-    size = len(learnt) + 1
-    view = points.new_empty(*points.shape[:2], 6, 6 + size)
-    shared, numbers = points.new_empty(len(points), size, size), (c_int64 * size)(*learnt)
-    given = [t.contiguous() for t in (*poses, seen.residuals, seen.weights)]
-    places = [t.data_ptr() for t in given]
-    wanted = addressof(numbers), len(learnt), view.data_ptr(), shared.data_ptr()
-    _views(native, points, [*places[:2], 0, 0, *places[2:], 0, 0], (0, 0.0), wanted)
-    return view, shared
-
-
-def _views(
-    native: Native, points: Tensor, places: Sequence[int], loss: tuple[int, float], wanted: tuple[int, int, int, int]
-) -> int:
-    """How many points wait for what is known of a lens. Arguments are parts of `Views`."""
-    compiled, left = library(), c_int64(0)
-    assert compiled is not None  # or nobody has a `Native`
+        wanted = [at.get(number, number) for number in wanted]
+    count = 0 if learnt is None else len(points)
+    size, numbers = len(wanted) + 1, (c_int64 * (len(wanted) + 1))(*wanted)
+    view, shared = points.new_empty(count, points.shape[1], 6, 6 + size), points.new_empty(count, size, size)
     points = points if points.stride()[2:] == (3, 1) else points.contiguous()
-    sizes, strides = points.shape[:3], points.stride()[:2]
-    compiled.camtorch_views(
-        _Views(native.pointer, points.data_ptr(), *strides, *places, *sizes, *loss, *wanted, addressof(left))
+    given = [t.contiguous() for t in (*poses, pixels, weights)]
+    call = _Views(
+        *(native.pointer, points.data_ptr(), *points.stride()[:2]),
+        *(t.data_ptr() for t in (*given, made.residuals, made.weights, made.valid, made.cost)),
+        *(*points.shape[:3], _LOSSES.index(loss[0]), loss[1]),
+        *(addressof(numbers), size - 1, view.data_ptr(), shared.data_ptr(), addressof(left)),
     )
-    if left.value < 0:
-        raise MemoryError(f"no memory for {sizes[1]} views of {sizes[2]} points")
-    return left.value
+    compiled.camtorch_views(call)
+    while left.value:
+        if left.value < 0:
+            raise MemoryError(f"no memory for {points.shape[1]} views of {points.shape[2]} points")
+        left.value = 0
+        native.follow()
+        compiled.camtorch_views(call)
+    return made, view, shared
+
+
+def turned(rotations: Tensor, steps: Tensor) -> Tensor:
+    """Rotations (..., 3, 3) after the small turns of the first three numbers of steps (..., n)."""
+    compiled = library() if rotations.is_cpu and rotations.dtype == torch.float64 else None
+    if compiled is None:
+        return small_turn(steps[..., :3]) @ rotations
+    made, steps = rotations.clone(memory_format=torch.contiguous_format), steps.contiguous()
+    places = c_void_p(steps.data_ptr()), c_int64(steps.shape[-1]), c_void_p(made.data_ptr())
+    compiled.camtorch_turns(*places, c_int64(made.numel() // 9))
+    return made
 
 
 def _run(

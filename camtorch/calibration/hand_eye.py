@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import warnings as python_warnings
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
@@ -11,7 +10,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from camtorch._arguments import shown, users_line
+from camtorch._arguments import shown, warn
 from camtorch._freezing import frozen_names
 from camtorch._threads import on_one_thread
 from camtorch.calibration.bundle import Adjusted, Free, Poses, Sight, State
@@ -314,9 +313,7 @@ def _result(
     converged = converged & (valid | ~whole.seen).flatten(1).all(-1)
     if not bool(converged.all()):
         sets = f" in {int((~converged).sum())} of {len(converged)} sets" if batch else f" (rms {rms[0]:.4g} px)"
-        python_warnings.warn(
-            f"{search.owner}: the search did not end at an optimum{sets}; do not use it", stacklevel=users_line()
-        )
+        warn(f"{search.owner}: the search did not end at an optimum{sets}; do not use it")
 
     def one(values: Tensor) -> Tensor:
         return values if batch else values[0]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple, TypeAlias
 
@@ -11,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from camtorch._arguments import Numbers, as_image_size, as_values, shown, users_line
+from camtorch._arguments import Numbers, as_image_size, as_values, shown, warn
 
 Points: TypeAlias = "Numbers | Sequence[Numbers | None]"
 """Points of all views: a tensor, an array, or a list with one of them, or None, for each view."""
@@ -206,7 +205,7 @@ def _observed(
     copy = has & torch.tensor([first.setdefault(row.tobytes(), i) != i for i, row in enumerate(ordered)], device=device)
     for left_out, why in ((~has, "nothing was seen"), (copy, "the corners are those of another view")):
         if bool(left_out.any()):
-            warnings.warn(f"{owner}: left out, as {why} in {_views_of(left_out)}", UserWarning, stacklevel=users_line())
+            warn(f"{owner}: left out, as {why} in {_views_of(left_out)}")
     kept = (has & ~copy).nonzero()[:, 0]
     found = {}
     for name, given in views.items():

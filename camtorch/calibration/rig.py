@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import warnings as python_warnings
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
@@ -11,7 +10,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from camtorch._arguments import users_line
+from camtorch._arguments import warn
 from camtorch._threads import on_one_thread
 from camtorch.calibration.bundle import Adjusted, Bundle, Free, Poses, Sight, State
 from camtorch.calibration.calibrate import STEPS, Calibration, Search, as_model, as_options, middle_of, results
@@ -177,10 +176,9 @@ def calibrate_rig(
         factor=factor,
     )
     if not result.converged:
-        python_warnings.warn(
+        warn(
             f"{owner}: the search did not end at an optimum (rms {result.rms:.4g} px); do not use it. See its "
             "warnings, and whether each view was taken by all cameras at the same moment",
-            stacklevel=users_line(),
         )
     return result
 

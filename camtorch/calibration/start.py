@@ -135,7 +135,8 @@ def other_poses(found: Adjusted, observations: Observations, model: type[Camera]
     rows = errors.nanmedian(-1).values.argsort(descending=True)[:_DOUBTED]
     boards = state.boards.of(rows, 1)
     lens = lens._replace(boards=boards, scale=max(_LEAST_SCALE, 2 * float(errors.nanmedian())))
-    others = _turned(lens, observations.of(rows), errors[None, rows]).boards
+    with torch.inference_mode():
+        others = _turned(lens, observations.of(rows), errors[None, rows]).boards
     cosine = ((boards.rotations * others.rotations).sum((-1, -2)) - 1) / 2
     shift = torch.linalg.vector_norm(others.translations - boards.translations, dim=-1)
     is_other = (cosine < math.cos(_OTHER)) | (shift > _OTHER * torch.linalg.vector_norm(boards.translations, dim=-1))
@@ -268,43 +269,50 @@ def _unified(few: Observations, image_size: tuple[int, int], fixed: Collection[s
     alpha = centre.new_tensor([alpha for alpha, _ in tried])[:, None]
     parameters = torch.cat((focal, focal, centre.expand(len(tried), 2), alpha), -1)
     lens = _Lens(UCM, parameters, Poses.none(1, 1, parameters), _LEAST_SCALE, image_size)
+    begun = None
     for rounds, kept, unlike in ((1, len(tried), _FAR), (_ROUNDS, _KEPT, _UNLIKE)):
-        boards, errors = _posed(lens.camera, few, rounds)
+        boards, errors = _posed(lens.camera, few, rounds, begun)
         by_view = errors.nanmedian(-1).values.sort(-1).values
         score = by_view[:, : math.ceil(_TRIMMED * by_view.shape[1])].mean(-1)
         score, rows = score.topk(min(kept, len(score)), largest=False)
         rows = rows[score <= unlike * score[0]]
         lens = lens._replace(boards=boards, scale=max(_LEAST_SCALE, 2 * float(score[0]))).of(rows)
+        begun = lens.boards, errors[rows]
     free = _free(UCM, 1, [name for name in fixed if name in ("cx", "cy")])
     lens = lens.adjusted(few, free, _STEPS, _WORSE).of(slice(1))
     return _turned(lens, few, lens.errors(few))
 
 
-def _posed(camera: Camera, some: Observations, rounds: int = _ROUNDS) -> tuple[Poses, Tensor]:
+def _posed(
+    camera: Camera, some: Observations, rounds: int = _ROUNDS, begun: tuple[Poses, Tensor] | None = None
+) -> tuple[Poses, Tensor]:
     """Poses (B, V) in closed form for cameras (B,), and the errors in px, (B, V, N); NaN for what is not seen.
 
-    Each round goes without the outliers of the one before, for views to which that made a difference.
+    Each round goes without the outliers of the one before, for views to which that made a difference. begun: what the
+    first round finds, where it is known.
     """
     rays, has_ray = _rays(camera, some)
     shape = has_ray.shape
     points = some.points.expand(*shape, 3).flatten(0, 1)
     rays, has_ray = rays.flatten(0, 1), has_ray.flatten(0, 1)
     weights, rows = has_ray.to(rays.dtype), torch.arange(len(rays), device=rays.device)
-    boards = Poses.none(shape[0], shape[1], rays)
+    boards, errors = begun or (Poses.none(shape[0], shape[1], rays), rays.new_empty(0))
     before = rays.new_full(shape[:2], torch.inf)
     for i in range(rounds):
+        if i > 0:
+            usual = errors.nanmedian(-1).values.clamp(min=_LEAST_SCALE / 2)
+            if i > 1:
+                (rows,) = (usual < _CHANGED * before).flatten().nonzero(as_tuple=True)
+            if len(rows) == 0:
+                break
+            weights = 1 / (1 + (errors / (2 * usual[..., None])).square())
+            weights, before = torch.where(has_ray, weights.flatten(0, 1), 0.0), usual
+        elif begun:
+            continue
         found = poses_from_rays(points[rows], rays[rows], weights[rows])
         for poses, new in zip(boards, found[:2], strict=True):
             poses.flatten(0, 1)[rows] = new[:, 0]
         errors = _errors(camera, boards, some)
-        usual = errors.nanmedian(-1).values.clamp(min=_LEAST_SCALE / 2)
-        weights = 1 / (1 + (errors / (2 * usual[..., None])).square())
-        weights = torch.where(has_ray, weights.flatten(0, 1), 0.0)
-        if i > 0:
-            (rows,) = (usual < _CHANGED * before).flatten().nonzero(as_tuple=True)
-        if len(rows) == 0:
-            break
-        before = usual
     return boards, errors
 
 
@@ -389,7 +397,9 @@ def _fitted(lens: _Lens, few: Observations, model: type[Camera], count: int, fix
     reach = torch.where(inliers, angles_from_axis(rays), 0.0).amax((-1, -2))
     names = model.names_of(count) or ()
     ideal = slopes.new_tensor(model.ideal(count))
-    starts = model.fit_start(names, *views.radii(camera, slopes, (_REACH * reach).clamp(max=math.pi)))[:, 0]
+    starts = ideal[None]
+    if names:
+        starts = model.fit_start(names, *views.radii(camera, slopes, (_REACH * reach).clamp(max=math.pi)))[:, 0]
     is_fixed = torch.tensor([name in fixed for name in names], dtype=torch.bool, device=slopes.device)
     starts = torch.where(is_fixed, ideal, starts)
     sets = [(starts, is_fixed)]  # and which of the coefficients stay as they start

@@ -532,7 +532,7 @@ def _next(survey: Survey) -> str:
     return "It needs no more views; four times as many would halve the uncertainty."
 
 
-@torch.no_grad()
+@torch.inference_mode()
 def check_determined(
     adjusted: Adjusted, camera: int, found: Spread, names: Sequence[str], sight: Sight, owner: str
 ) -> None:

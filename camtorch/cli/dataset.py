@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import hashlib
 import json
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,6 +12,7 @@ from typing import Any
 
 import torch
 
+from camtorch._arguments import warn
 from camtorch.augment import RandomCamera
 from camtorch.camera import Camera
 from camtorch.cli import cameras, coco, images, many
@@ -66,7 +66,7 @@ class Augmenting:
             raise ValueError(f"it is {columns}x{rows}, and its labels are for {stated}")
         if orientation not in (None, 1):
             text = f"{item.name} is taken as stored, not turned by its Exif orientation, and so are its labels"
-            warnings.warn(text, stacklevel=1)
+            warn(text)
         camera = self._camera(item.inputs[0], size, entry.get("camera"))
         known = json.dumps(cameras.settings_of(camera))
         if known not in self._samples:  # mostly it is that of the image before

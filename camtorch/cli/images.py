@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +9,7 @@ import torch
 from PIL import Image
 from torch import Tensor
 
+from camtorch._arguments import warn
 from camtorch._photographs import ORIENTATION, ImageFileError
 from camtorch._photographs import read_stored as read_stored
 from camtorch._photographs import size_of as size_of
@@ -74,4 +74,4 @@ def write(path: Path, image: Image.Image, *, orientation: int | None = None, syn
         raise ImageFileError(f"{path}: {reason}") from None
     if orientation not in (None, 1) and kind not in _KEEP_ORIENTATION:
         turned = "the Exif orientation, by which it is to be shown turned, is lost"
-        warnings.warn(f"{turned}: {path.suffix} files hold none", stacklevel=2)
+        warn(f"{turned}: {path.suffix} files hold none")

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import os
 import re
-import warnings
 from typing import Any, NoReturn
 
-from camtorch._arguments import check_path, shown
+from camtorch._arguments import check_path, shown, warn
 from camtorch.camera import Camera
 from camtorch.extrinsics import Extrinsics
 from camtorch.io import poses
@@ -158,12 +157,11 @@ class _File:
         if "kannala_brandt" in stated:
             return "kannala_brandt"
         if len(distortion) == _FISHEYE_COUNT and not stated:
-            warnings.warn(
+            warn(
                 f"{self.record.path}: {_FISHEYE_COUNT} coefficients and no fisheye_model: taken for brown_conrady. "
                 "If they come from cv2.fisheye, load them by camtorch.io.opencv.read(path, 'kannala_brandt'); "
                 "on the command line, --from-model says which",
                 AmbiguousModelWarning,
-                stacklevel=4,
             )
         return "brown_conrady" if distortion else "pinhole"
 

@@ -11,12 +11,12 @@ import os
 import re
 import secrets
 import stat
-import warnings
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from typing import IO, NoReturn
 
 from torch import Tensor
 
+from camtorch._arguments import warn
 from camtorch.camera import Camera
 from camtorch.convert.conversion import Conversion
 from camtorch.extrinsics import Extrinsics
@@ -176,7 +176,7 @@ class Lossy:
             f"(rms {float(best.rms):.3g}) up to {math.degrees(float(best.max_angle)):.1f} degrees from the axis, "
             f"{100 * float(best.valid_fraction):.4g} % of the image"
         )
-        warnings.warn(f"{self.path}: {name}: {self.format} has no such lens: {fit}", stacklevel=5)
+        warn(f"{self.path}: {name}: {self.format} has no such lens: {fit}")
         return best, fit
 
     def _single(self, name: str, owner: Camera | Extrinsics, what: str, *tensors: Tensor) -> list[list[float]]:

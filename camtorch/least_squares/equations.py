@@ -44,10 +44,10 @@ class System:
 
     def __init__(self, equations: Equations, width: int, held: Tensor):
         self.width = width
-        if equations.shared.shape[-1] > 1:
-            # what the unknowns of the views do as well, as a turn about the axis of a panorama does, is left to them
-            own = equations.shared[:, :-1, :-1].square().sum(-2)
-            held = held | (own < _NOTHING * (own + equations.view[..., width:-1].square().sum((1, 2))))
+        of_views, own = equations.view.square().sum((1, 2)), equations.shared[:, :-1].square().sum(-2)
+        # what the unknowns of the views do as well, as a turn about the axis of a panorama does, is left to them
+        held = held | (own < _NOTHING * (own + of_views[:, width:]))[:, :-1]
+        self.equations, self.decrement = equations, of_views[:, -1] + own[:, -1]
         if bool(held.any()):
             keep = torch.nn.functional.pad(~held, (width, 1), value=True)
             equations = Equations(
@@ -56,8 +56,8 @@ class System:
                 equations.columns,
             )
             # without a column the rest is no triangle any more
-            equations = equations._replace(shared=torch.linalg.qr(equations.shared, mode="r").R)
-        self.equations, self.decrement = equations, equations.decrement
+            self.equations = equations._replace(shared=torch.linalg.qr(equations.shared, mode="r").R)
+            self.decrement = self.equations.decrement
 
     @property
     def firm_decrement(self) -> Tensor:

@@ -38,16 +38,18 @@ class SensorJacobians(NamedTuple):
 
 def to_sensor(camera: Camera | type[Camera], k: Tensor, rays: Tensor) -> SensorPoints:
     """Rays (C, N, 3) through the chart and the lens of coefficients (C, n), whether or not they lie before a fold."""
-    return _to_sensor(camera, columns(k), rays.unbind(-1))
+    return _to_sensor(camera, columns(k), rays.unbind(-1), FURTHEST)
 
 
-def _to_sensor(camera: Camera | type[Camera], k: Sequence[Tensor], rays: Sequence[Tensor]) -> SensorPoints:
+def _to_sensor(
+    camera: Camera | type[Camera], k: Sequence[Tensor], rays: Sequence[Tensor], furthest: float
+) -> SensorPoints:
     chart, lens = camera.optics(k)
     x, y, z = rays
     covered = (chart.margin(x, y, z) > 0).expand_as(x)
     x, y, z = torch.where(covered, x, 0.0), torch.where(covered, y, 0.0), torch.where(covered, z, 1.0)
     a, b = chart.to_plane(x, y, z, order=1)
-    covered = covered & (torch.maximum(a.abs(), b.abs()) <= FURTHEST)
+    covered = covered & (torch.maximum(a.abs(), b.abs()) <= furthest)
     if lens.stages:
         at = lens.at(a, b, 0)
         covered = covered if at.edge is None else covered & (at.edge > 0)
@@ -56,25 +58,27 @@ def _to_sensor(camera: Camera | type[Camera], k: Sequence[Tensor], rays: Sequenc
     return SensorPoints(torch.where(covered, a, 0.0), torch.where(covered, b, 0.0), covered)
 
 
-def sensor_jacobians(camera: Camera | type[Camera], k: Tensor, rays: Tensor) -> SensorJacobians:
+def sensor_jacobians(
+    camera: Camera | type[Camera], k: Tensor, rays: Tensor, furthest: float = FURTHEST
+) -> SensorJacobians:
     """`to_sensor` with its exact derivatives by the rays (C, N, 3), at their length, and the coefficients (C, n)."""
     chart, _ = camera.optics(columns(k))
     # a table for each point would be dear: where the other direction is searched, derivatives go forward
-    jacobians = _forward(camera, k, rays) if isinstance(chart, Inverted) else _backward(camera, k, rays)
+    jacobians = (_forward if isinstance(chart, Inverted) else _backward)(camera, k, rays, furthest)
     # where a derivative is no number, as at the end of a chart, a step goes without it
     return jacobians._replace(
         by_ray=jacobians.by_ray.nan_to_num(0.0, 0.0, 0.0), by_k=jacobians.by_k.nan_to_num(0.0, 0.0, 0.0)
     )
 
 
-def _backward(camera: Camera | type[Camera], k: Tensor, rays: Tensor) -> SensorJacobians:
+def _backward(camera: Camera | type[Camera], k: Tensor, rays: Tensor, furthest: float) -> SensorJacobians:
     """Twice backward, whatever the number of coefficients, of which each point has its own."""
     with torch.inference_mode(False), torch.enable_grad():
         shape = rays.shape[:-1]
         # contiguous planes, or torch's operations take several times as long; copies, or they stay those of inference
         planes = [_copied(w).requires_grad_() for w in rays.detach().unbind(-1)]
         own = [_copied(c.expand(shape)).requires_grad_() for c in columns(k.detach())]
-        points = _to_sensor(camera, own, planes)
+        points = _to_sensor(camera, own, planes, furthest)
         one, leaves = torch.ones(shape, dtype=rays.dtype, device=rays.device), [*planes, *own]
         slopes = [
             torch.autograd.grad(plane, leaves, one, retain_graph=True, allow_unused=True, materialize_grads=True)
@@ -89,7 +93,7 @@ def _copied(plane: Tensor) -> Tensor:
     return plane.clone(memory_format=torch.contiguous_format)
 
 
-def _forward(camera: Camera | type[Camera], k: Tensor, rays: Tensor) -> SensorJacobians:
+def _forward(camera: Camera | type[Camera], k: Tensor, rays: Tensor, furthest: float) -> SensorJacobians:
     """Once forward, on a row more for each direction: vmap would take Python's word for many operations."""
     count = k.shape[-1] + 3
     directions = torch.eye(count, dtype=k.dtype, device=k.device)
@@ -100,7 +104,7 @@ def _forward(camera: Camera | type[Camera], k: Tensor, rays: Tensor) -> SensorJa
         along = directions[:, None, :3].expand(-1, rays.shape[1], -1).repeat(len(rays), 1, 1)
         dual_rays = forward_ad.make_dual(rays.repeat_interleave(count, 0), along)
         dual_k = forward_ad.make_dual(k.repeat_interleave(count, 0), directions[:, 3:].repeat(len(k), 1))
-        seen = to_sensor(camera, dual_k, dual_rays)
+        seen = _to_sensor(camera, columns(dual_k), dual_rays.unbind(-1), furthest)
         parts = [forward_ad.unpack_dual(plane) for plane in seen[:2]]
     values = [part.primal[::count] for part in parts]
     tangents = [torch.zeros_like(part.primal) if part.tangent is None else part.tangent for part in parts]

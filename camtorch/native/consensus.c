@@ -1,13 +1,7 @@
 /* Poses on which many points agree: a round of samples for each row. What the search is, and its sources, stand in
  * camtorch/calibration/ransac.py. */
-#include <math.h>
-#include <string.h>
-
 #include "consensus.h"
-
-#define NAMED(name, variant) name##_##variant
-#define EXPANDED(name, variant) NAMED(name, variant)
-#define THIS(name) EXPANDED(name, VARIANT)
+#include "small.h"
 
 enum { BLOCK = 64, TRIED = 8, STEPS = 3 };
 
@@ -16,19 +10,6 @@ typedef struct {
     int64_t count;
     double most;
 } Lines;
-
-static void cross(const double *a, const double *b, double *c) {
-    c[0] = a[1] * b[2] - a[2] * b[1];
-    c[1] = a[2] * b[0] - a[0] * b[2];
-    c[2] = a[0] * b[1] - a[1] * b[0];
-}
-
-static double dot(const double *a, const double *b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
-
-static void multiplied(const double *a, const double *b, double *c) {
-    for (int i = 0; i < 3; i++)
-        for (int j = 0; j < 3; j++) c[3 * i + j] = a[3 * i] * b[j] + a[3 * i + 1] * b[3 + j] + a[3 * i + 2] * b[6 + j];
-}
 
 /* The squares of points from `first` on, at most BLOCK, at a pose (3, 4) */
 static void squares_of(const Lines *lines, const double *pose, int64_t first, int64_t count, double *restrict squares) {
@@ -86,31 +67,11 @@ static void fit(const Lines *lines, double *pose) {
                 for (int b = a; b < 7; b++) normal[a][b] += row[a] * row[b];
         }
     }
-    /* by Cholesky's triangle, in place */
     double step[6];
-    for (int a = 0; a < 6; a++) {
-        double square = normal[a][a] * (1 + 1e-9) + 1e-300;
-        for (int k = 0; k < a; k++) square -= normal[k][a] * normal[k][a];
-        if (!(square > 0)) return;
-        normal[a][a] = sqrt(square);
-        for (int b = a + 1; b < 7; b++) {
-            double sum = normal[a][b];
-            for (int k = 0; k < a; k++) sum -= normal[k][a] * normal[k][b];
-            normal[a][b] = sum / normal[a][a];
-        }
-    }
-    for (int a = 5; a >= 0; a--) {
-        double sum = -normal[a][6];
-        for (int b = a + 1; b < 6; b++) sum -= normal[a][b] * step[b];
-        step[a] = sum / normal[a][a];
-    }
-    double half[3] = {step[0] / 2, step[1] / 2, step[2] / 2}, scale = 2 / (1 + dot(half, half));
-    for (int j = 0; j < 3; j++) {
-        double column[3] = {pose[j], pose[4 + j], pose[8 + j]}, once[3], twice[3];
-        cross(half, column, once);
-        cross(half, once, twice);
-        for (int k = 0; k < 3; k++) pose[4 * k + j] += scale * (once[k] + twice[k]);
-    }
+    for (int a = 0; a < 6; a++) normal[a][a] = normal[a][a] * (1 + 1e-9) + 1e-300, step[a] = -normal[a][6];
+    if (!triangle(6, 7, normal[0])) return;
+    solved(6, 7, normal[0], step);
+    turn(step, pose, 4);
     for (int k = 0; k < 3; k++) pose[4 * k + 3] += step[3 + k];
 }
 

@@ -3,8 +3,7 @@
 #include "geometry.h"
 #include "poses.h"
 #include "sampler.h"
-
-#include <string.h>
+#include "small.h"
 
 #ifdef HAS_AVX512
 #define IF_AVX512(code) code
@@ -69,6 +68,11 @@ EXPORTED const char *camtorch_variant(void) {
         }                                                                                                              \
     }
 EACH_ENTRY(CALLED)
+
+/* Rotations (n, 3, 3) after turns of n steps, `width` apart */
+EXPORTED void camtorch_turns(const double *steps, int64_t width, double *rotations, int64_t count) {
+    for (int64_t i = 0; i < count; i++) turn(steps + i * width, rotations + 9 * i, 3);
+}
 
 /* -- one sample */
 

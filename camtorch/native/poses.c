@@ -1,17 +1,9 @@
 /* Poses of known points: from the rays that see them, and nearest to their pixels. The formulas are those of
  * camtorch/calibration/rays.py and pnp.py, named alike there, and their sources stand there. */
-#include "poses.h"
-
 #include <float.h>
-#include <math.h>
 #include <stdlib.h>
-#include <string.h>
 
-#define NAMED(name, variant) name##_##variant
-#define EXPANDED(name, variant) NAMED(name, variant)
-#define THIS(name) EXPANDED(name, VARIANT)
-
-int64_t THIS(geometry)(const Rows *);
+#include "views.h"
 
 #define FLAT 1e-6
 #define SAME_TRACE 2.9996000133332 /* 1 + 2 cos(0.02) */
@@ -22,49 +14,15 @@ int64_t THIS(geometry)(const Rows *);
 #define THIN 0.1
 #define LINE 1e-6
 #define WORSE 4.0
+enum { ONE_STEP = 97 }; /* `numbers_of_step` of one view */
 enum { BEGUN = 12, FEW_BEGUN = 4, STEPS = 8, FEW = 5, FEW_STEPS = 8, TURNS = 24, ROUNDS = 8 };
-
-static double dot(const double *a, const double *b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
-
-static void cross(const double *a, const double *b, double *c) {
-    const double x = a[1] * b[2] - a[2] * b[1], y = a[2] * b[0] - a[0] * b[2];
-    c[2] = a[0] * b[1] - a[1] * b[0], c[0] = x, c[1] = y;
-}
-
-/* c = a b, 3 x 3 */
-static void multiplied(const double *a, const double *b, double *c) {
-    double made[9];
-    for (int i = 0; i < 3; i++)
-        for (int j = 0; j < 3; j++) made[3 * i + j] = a[3 * i] * b[j] + a[3 * i + 1] * b[3 + j] + a[3 * i + 2] * b[6 + j];
-    memcpy(c, made, sizeof made);
-}
-
-static void applied(const double *m, const double *v, double *found) {
-    for (int i = 0; i < 3; i++) found[i] = dot(m + 3 * i, v);
-}
 
 static void normalized(double *v) {
     const double length = sqrt(dot(v, v)), by = 1 / (length > 1e-12 ? length : 1e-12);
     for (int k = 0; k < 3; k++) v[k] *= by;
 }
 
-static void column(const double *m, int j, double *v) {
-    for (int k = 0; k < 3; k++) v[k] = m[3 * k + j];
-}
-
 static double trace_of_turn(const double *a, const double *b) { return dot(a, b) + dot(a + 3, b + 3) + dot(a + 6, b + 6); }
-
-/* Turns a matrix, by Cayley's formula; `small_turn` */
-static void turn(const double *by, double *rotation) {
-    const double half[3] = {by[0] / 2, by[1] / 2, by[2] / 2}, scale = 2 / (1 + dot(half, half));
-    for (int j = 0; j < 3; j++) {
-        double old[3], once[3], twice[3];
-        column(rotation, j, old);
-        cross(half, old, once);
-        cross(half, once, twice);
-        for (int k = 0; k < 3; k++) rotation[3 * k + j] += scale * (once[k] + twice[k]);
-    }
-}
 
 /* Eigenvalues, ascending, and vectors (in rows) of a symmetric matrix of n <= 4, which is lost: by Jacobi's rotations */
 static void eigen(int n, double *a, double *values, double *vectors) {
@@ -99,36 +57,6 @@ static void eigen(int n, double *a, double *values, double *vectors) {
         used |= 1 << least, values[i] = a[n * least + least];
         memcpy(vectors + n * i, axes + n * least, (size_t)n * sizeof(double));
     }
-}
-
-/* The triangle of Cholesky, in place, of the upper half of a matrix of n rows of `width`; whether there is one */
-static int triangle(int n, int width, double *a) {
-    for (int i = 0; i < n; i++) {
-        double square = a[width * i + i];
-        for (int k = 0; k < i; k++) square -= a[width * k + i] * a[width * k + i];
-        if (!(square > 0)) return 0;
-        a[width * i + i] = sqrt(square);
-        for (int j = i + 1; j < n; j++) {
-            double sum = a[width * i + j];
-            for (int k = 0; k < i; k++) sum -= a[width * k + i] * a[width * k + j];
-            a[width * i + j] = sum / a[width * i + i];
-        }
-    }
-    return 1;
-}
-
-/* Solves with that triangle: v becomes what the matrix sends to it. The square of what is half way */
-static double solved(int n, int width, const double *a, double *v) {
-    double square = 0;
-    for (int i = 0; i < n; i++) {
-        for (int k = 0; k < i; k++) v[i] -= a[width * k + i] * v[k];
-        v[i] /= a[width * i + i], square += v[i] * v[i];
-    }
-    for (int i = n - 1; i >= 0; i--) {
-        for (int k = i + 1; k < n; k++) v[i] -= a[width * i + k] * v[k];
-        v[i] /= a[width * i + i];
-    }
-    return square;
 }
 
 /* The eigenvector of the least eigenvalue of a matrix without negative ones, n <= 9, which is lost: by steps of the inverse */
@@ -257,7 +185,7 @@ static void descend(const Distances *d, double *rotation, int steps) {
         if (triangle(3, 3, damped)) {
             solved(3, 3, damped, by);
             memcpy(turned, rotation, sizeof turned);
-            turn(by, turned);
+            turn(by, turned, 3);
             const double after = of_rotation(d, turned);
             if (after < cost) memcpy(rotation, turned, sizeof turned), cost = after, is_new = 1;
             if (dot(by, by) < 1e-18) return;
@@ -388,10 +316,11 @@ static void rotations_in_space(const Distances *d, const double *local, const do
 
 typedef struct {
     const double *points, *rays, *pixels, *weights; /* of what is given, or the following copies */
-    int64_t count, waiting;
-    double *own_points, *own_rays, *own_pixels, *own_weights, *local, *shares, *moved, *seen, *slopes;
-    uint8_t *mapped, *inliers;
+    int64_t count;
+    double *own_points, *own_rays, *own_pixels, *own_weights, *local, *shares, *columns;
+    uint8_t *inliers;
     Cameras camera;
+    View view; /* as it was seen last */
     double middle[3], rounding; /* see `rounding_of` */
 } Row;
 
@@ -474,97 +403,52 @@ static void from_rays(const Row *row, double rotations[2][9], double translation
     valid[1] &= !(trace_of_turn(rotations[0], rotations[1]) > SAME_TRACE);
 }
 
-static void moved(Row *row, const double *rotation, const double *translation) {
-    for (int64_t i = 0; i < row->count; i++) {
-        applied(rotation, row->points + 3 * i, row->moved + 3 * i);
-        for (int k = 0; k < 3; k++) row->moved[3 * i + k] += translation[k];
-    }
-}
-
-/* The cost of a pose, whose pixels it leaves in `seen`; complete: whether all that counts has a pixel */
+/* The cost of a pose, which `view` keeps; infinite where it is no number. Complete: whether all that counts has a pixel */
 static double cost_of(const Poses *given, Row *row, const double *rotation, const double *translation, int *complete) {
-    const int64_t n = row->count;
-    moved(row, rotation, translation);
-    const Rows rows = {.cameras = &row->camera, .rows = row->moved, .row_strides = {3 * n, 3, 1}, .results = row->seen,
-                       .result_strides = {2 * n, 2, 1}, .valid = row->mapped, .count = n, .tile = n, .direction = PROJECT};
-    row->waiting += THIS(geometry)(&rows);
-    double cost = 0, weight;
+    View *view = &row->view;
+    view->camera = &row->camera, view->points = row->points, view->pixels = row->pixels, view->given = row->weights;
+    view->rotation = rotation, view->shift = translation, view->loss = given->loss, view->loss_scale = given->loss_scale;
+    const double cost = look(view);
     *complete = 1;
-    for (int64_t i = 0; i < n; i++) {
-        if (!(row->weights[i] > 0)) continue;
-        const double x = row->seen[2 * i] - row->pixels[2 * i], y = row->seen[2 * i + 1] - row->pixels[2 * i + 1];
-        cost += row->weights[i] * robust(given->loss, given->loss_scale, row->mapped[i] ? x * x + y * y : LOST * LOST, &weight);
-        *complete &= row->mapped[i];
-    }
+    for (int64_t i = 0; i < row->count; i++) *complete &= view->valid[i] || !(row->weights[i] > 0);
     return isfinite(cost) ? cost : INFINITY;
 }
 
-/* The weighted products (7, 7) of derivatives by turn and shift, and of residuals, at the pose of the last `cost_of` */
-static void linearised(const Poses *given, Row *row, const double *translation, double normal[7][7]) {
-    const int64_t n = row->count;
-    static const double ones[3] = {0, 1, 0};
-    for (int by = 0; by < 2; by++) {
-        const Rows rows = {.cameras = &row->camera, .rows = row->moved, .row_strides = {3 * n, 3, 1},
-                           .results = row->slopes + by * 3 * n, .result_strides = {3 * n, 3, 1},
-                           .cotangents = ones + 1 - by, .cotangent_strides = {0, 0, 1},
-                           .count = n, .tile = n, .direction = PROJECT_VJP};
-        THIS(geometry)(&rows);
-    }
-    memset(normal, 0, 49 * sizeof(double));
-    for (int64_t i = 0; i < n; i++) {
-        if (!(row->weights[i] > 0 && row->mapped[i])) continue;
-        double weight, residuals[2], turned[3];
-        for (int by = 0; by < 2; by++) residuals[by] = row->seen[2 * i + by] - row->pixels[2 * i + by];
-        for (int k = 0; k < 3; k++) turned[k] = row->moved[3 * i + k] - translation[k];
-        robust(given->loss, given->loss_scale, residuals[0] * residuals[0] + residuals[1] * residuals[1], &weight);
-        weight *= row->weights[i];
-        for (int by = 0; by < 2; by++) {
-            const double *slope = row->slopes + (by * n + i) * 3;
-            double line[7] = {0, 0, 0, slope[0], slope[1], slope[2], residuals[by]};
-            cross(turned, slope, line);
-            for (int a = 0; a < 7; a++) {
-                const double scaled = weight * line[a];
-                for (int b = a; b < 7; b++) normal[a][b] += scaled * line[b];
-            }
-        }
-    }
-    for (int a = 0; a < 7; a++)
-        for (int b = 0; b < a; b++) normal[a][b] = normal[b][a];
+/* The triangle (6, 7) of derivatives by turn and shift, and of residuals, at the pose of the last `cost_of`; the sum of the
+   squares of residuals */
+static double linearised(Row *row, const double *translation, double found[6][7]) {
+    const int64_t rows = 2 * row->count > 7 ? 2 * row->count : 7;
+    double *columns = row->columns, *residuals = columns + 6 * rows;
+    row->view.shift = translation;
+    columns_of(&row->view, NULL, 0, columns, rows);
+    const double square = product(residuals, residuals, rows);
+    reduce(columns, 7, rows, 6);
+    for (int i = 0; i < 6; i++)
+        for (int j = 0; j < 7; j++) found[i][j] = j < i ? 0 : columns[j * rows + i];
+    return square;
 }
 
 /* Goes from a pose to the minimum that it leads to, as `minimise` does; its cost. complete: whether all has a pixel there */
 static double refine(const Poses *given, Row *row, double *rotation, double *translation, int64_t steps, uint8_t *converged,
                      int *complete) {
+    static const double none[1] = {0};
     int seen = 0, tried;
     for (int64_t i = 0; i < row->count; i++) seen += row->weights[i] > 0;
     const double settled = given->settled / (2 * seen - 6 > 1 ? 2 * seen - 6 : 1), tiny = given->nothing * given->nothing * seen;
-    double cost = cost_of(given, row, rotation, translation, complete), normal[7][7], scale[6] = {0};
+    double cost = cost_of(given, row, rotation, translation, complete), linear[6][7], memory[ONE_STEP];
     double damping = given->damping, growth = 4, decrement = 0;
     int is_new = 1, going = isfinite(cost) && cost > tiny;
     *converged = cost <= tiny;
-    for (int64_t step = 0; going && step < steps; step++) {
-        double damped[7][7], by[6], turned[9], shifted[3], promised = 0;
+    for (int64_t number = 0; going && number < steps; number++) {
+        double by[6], turned[9], shifted[3];
         if (is_new) {
-            linearised(given, row, translation, normal);
-            for (int a = 0; a < 6; a++) scale[a] = normal[a][a] > 0 ? 1 / sqrt(normal[a][a]) : 1;
+            linearised(row, translation, linear);
+            decrement = 0;
+            for (int a = 0; a < 6; a++) decrement += linear[a][6] * linear[a][6];
         }
-        for (int way = !is_new; way < 2; way++) { /* without damping, for the decrement; with it */
-            for (int a = 0; a < 6; a++) {
-                for (int b = 0; b < 6; b++) damped[a][b] = normal[a][b] * scale[a] * scale[b];
-                damped[a][a] += 1e-14 + way * damping, by[a] = -normal[a][6] * scale[a];
-            }
-            const int fine = triangle(6, 7, damped[0]);
-            const double square = fine ? solved(6, 7, damped[0], by) : 0;
-            if (!fine) memset(by, 0, sizeof by);
-            if (!way) decrement = square;
-        }
-        for (int a = 0; a < 6; a++) by[a] *= scale[a];
-        for (int a = 0; a < 6; a++) {
-            promised -= 2 * normal[a][6] * by[a];
-            for (int b = 0; b < 6; b++) promised -= by[a] * normal[a][b] * by[b];
-        }
+        const double promised = decrement - step(linear[0], none, damping, 1, 6, 0, by, by, memory);
         memcpy(turned, rotation, sizeof turned);
-        turn(by, turned);
+        turn(by, turned, 3);
         for (int k = 0; k < 3; k++) shifted[k] = translation[k] + by[3 + k];
         const double after = cost_of(given, row, turned, shifted, &tried);
         const double rounding = 2 * sqrt(cost * row->rounding) + row->rounding;
@@ -591,13 +475,13 @@ static int64_t prepare(const Poses *given, Row *row) {
     const int64_t n = row->count;
     int64_t seen = 0;
     const Rows rows = {.cameras = &row->camera, .rows = row->pixels, .row_strides = {2 * n, 2, 1}, .results = row->own_rays,
-                       .result_strides = {3 * n, 3, 1}, .valid = row->mapped, .count = n, .tile = n, .direction = UNPROJECT};
-    row->waiting += THIS(geometry)(&rows);
+                       .result_strides = {3 * n, 3, 1}, .valid = row->view.valid, .count = n, .tile = n, .direction = UNPROJECT};
+    row->view.left += THIS(geometry)(&rows);
     double sum = 0, largest = 0;
     memset(row->middle, 0, sizeof row->middle);
     for (int64_t i = 0; i < n; i++) {
         const double *p = row->points + 3 * i, square = dot(p, p), w = given->weights ? row->weights[i] : 1;
-        const int has = row->mapped[i] && isfinite(square * square + w) && w > 0;
+        const int has = row->view.valid[i] && isfinite(square * square + w) && w > 0;
         row->own_weights[i] = has ? w : 0;
         for (int k = 0; k < 2; k++) {
             const double pixel = row->own_pixels[2 * i + k] = has ? row->pixels[2 * i + k] : 0;
@@ -700,8 +584,8 @@ static double agree(const Poses *given, Row *row, double *rotation, double *tran
         cost_of(given, row, rotation, translation, &complete);
         same = round > 0;
         for (int64_t i = 0; i < row->count; i++) {
-            const double x = row->seen[2 * i] - row->pixels[2 * i], y = row->seen[2 * i + 1] - row->pixels[2 * i + 1];
-            const int near = row->mapped[i] && x * x + y * y < most && row->shares[i] > 0;
+            const double *away = row->view.residuals + 2 * i;
+            const int near = row->view.valid[i] && away[0] * away[0] + away[1] * away[1] < most && row->shares[i] > 0;
             same &= near == row->inliers[i], row->inliers[i] = (uint8_t)near;
             row->own_weights[i] = near ? row->shares[i] : 0;
         }
@@ -732,25 +616,28 @@ static void vector_of(const double *m, double *vector) {
    from which the points' middle lies in the camera's axes */
 static void assess(const Poses *given, Row *row, int64_t at, double cost) {
     double *rotation = given->rotations + 9 * at, *translation = given->translations + 3 * at, *covariance = given->covariance + 36 * at;
-    double normal[7][7], scale[6], inverse[6][6], carried[6][6] = {{0}}, away[3], sum = 0;
-    int complete, inliers = 0;
-    const int is_valid = isfinite(cost);
+    double linear[6][7], scale[6], inverse[6][6], carried[6][6] = {{0}}, away[3], sum = 0;
+    int complete, inliers = 0, fine = isfinite(cost);
+    const int is_valid = fine;
     cost_of(given, row, rotation, translation, &complete);
-    linearised(given, row, translation, normal);
+    const double residual = linearised(row, translation, linear);
     for (int64_t i = 0; i < row->count; i++) {
         const int has = row->weights[i] > 0;
         given->inliers[at * row->count + i] = (uint8_t)(is_valid && has), inliers += has, sum += row->weights[i];
     }
-    for (int a = 0; a < 6; a++) scale[a] = normal[a][a] > 0 ? 1 / sqrt(normal[a][a]) : 1;
-    const double residual = normal[6][6], variance = residual / (2 * inliers - 6 > 1 ? 2 * inliers - 6 : 1);
-    for (int a = 0; a < 6; a++)
-        for (int b = 0; b < 6; b++) normal[a][b] *= scale[a] * scale[b];
-    const int fine = is_valid && triangle(6, 7, normal[0]);
+    const double variance = residual / (2 * inliers - 6 > 1 ? 2 * inliers - 6 : 1);
+    for (int b = 0; b < 6; b++) {
+        double square = 0;
+        for (int a = 0; a <= b; a++) square += linear[a][b] * linear[a][b];
+        scale[b] = square > 0 ? 1 / sqrt(square) : 1;
+        for (int a = 0; a <= b; a++) linear[a][b] *= scale[b];
+        fine &= linear[b][b] != 0;
+    }
     applied(rotation, row->middle, away);
     for (int a = 0; a < 6; a++) {
         double unit[6] = {0};
         unit[a] = 1;
-        if (fine) solved(6, 7, normal[0], unit);
+        if (fine) solved(6, 7, linear[0], unit);
         for (int b = 0; b < 6; b++) inverse[b][a] = fine ? unit[b] * scale[a] * scale[b] * variance : NAN;
         carried[a][a] = 1;
     }
@@ -768,19 +655,21 @@ static void assess(const Poses *given, Row *row, int64_t at, double cost) {
 /* Takes rows until none is left that nobody has taken */
 void THIS(poses)(const Poses *given) {
     const int64_t n = given->count;
-    Row row = {.count = n};
-    double *memory = malloc((size_t)n * (24 * sizeof(double) + 2));
+    const int64_t rows = 2 * n > 7 ? 2 * n : 7;
+    Row row = {.count = n, .view.count = n};
+    double *memory = malloc((size_t)(22 * n + 7 * rows) * sizeof *memory + (size_t)n * 2);
     if (!memory) {
         __atomic_store_n(given->left, -1, __ATOMIC_RELAXED);
         return;
     }
     row.own_points = memory, row.own_rays = memory + 3 * n, row.own_pixels = memory + 6 * n, row.own_weights = memory + 8 * n;
-    row.local = memory + 9 * n, row.shares = memory + 12 * n, row.moved = memory + 13 * n, row.seen = memory + 16 * n;
-    row.slopes = memory + 18 * n, row.mapped = (uint8_t *)(memory + 24 * n), row.inliers = row.mapped + n;
+    row.local = memory + 9 * n, row.shares = memory + 12 * n, row.columns = memory + 22 * n;
+    row.view.residuals = memory + 13 * n, row.view.weights = memory + 15 * n, row.view.moved = memory + 16 * n;
+    row.view.slopes = memory + 19 * n, row.view.valid = (uint8_t *)(row.columns + 7 * rows), row.inliers = row.view.valid + n;
     for (int64_t at; (at = __atomic_fetch_add(given->next, 1, __ATOMIC_RELAXED)) < given->row_count;) {
         double *rotation = given->rotations + 9 * at, *translation = given->translations + 3 * at, cost;
         row.points = given->points + at % given->point_rows * 3 * n, row.rays = given->rays + at * 3 * n;
-        row.pixels = given->pixels + at * 2 * n, row.weights = given->weights + at * n, row.waiting = 0;
+        row.pixels = given->pixels + at * 2 * n, row.weights = given->weights + at * n, row.view.left = 0;
         if (given->task == FROM_RAYS) {
             from_rays(&row, (double(*)[9])(given->rotations + 18 * at), (double(*)[3])(given->translations + 6 * at), given->valid + 2 * at);
             continue;
@@ -799,7 +688,7 @@ void THIS(poses)(const Poses *given) {
             cost = given->task == SOLVED ? solve(given, &row, rotation, translation) : agree(given, &row, rotation, translation);
             assess(given, &row, at, cost);
         }
-        __atomic_fetch_add(given->left, row.waiting, __ATOMIC_RELAXED);
+        __atomic_fetch_add(given->left, row.view.left, __ATOMIC_RELAXED);
     }
     free(memory);
 }

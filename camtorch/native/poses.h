@@ -72,22 +72,22 @@ typedef struct {
     int64_t *next, *left; /* the row that whoever is free takes; how many points wait for what is known of lenses */
 } Poses;
 
-/* Cameras (b) that see v views of n points each, or the linearised problem, whose columns are by turn and shift of the view,
-   by numbers that learn, and the residuals; see least_squares/equations.py */
+/* Cameras (b) that see v views of n points each: residuals, and the linearised problem if it is asked for, whose columns are by
+   turn and shift of the view, by numbers that learn, and the residuals; see least_squares/equations.py */
 typedef struct {
     const Cameras *cameras; /* (b), or one for all; in double precision */
     const double *points;   /* (b, v, n, 3), strides by problem and view */
     int64_t point_strides[2];
     const double *rotations, *translations; /* (b, v, 9), (b, v, 3) */
-    const double *pixels, *given; /* (b, v, n, 2), (b, v, n): the weights of squares, 0 for unseen; of looks alone */
-    double *residuals, *weights;  /* (b, v, n, 2), (b, v, n): what looks make of them, and the linearised problem reads */
+    const double *pixels, *given; /* (b, v, n, 2), (b, v, n): the weights of squares, 0 for unseen */
+    double *residuals, *weights;  /* (b, v, n, 2), (b, v, n) */
     uint8_t *valid;               /* (b, v, n) */
     double *costs;                /* (b, v) */
     int64_t problems, views, count, loss;
     double loss_scale;
     const int64_t *learnt; /* (columns): of intrinsics and parameters */
     int64_t columns;
-    double *view, *shared; /* triangles (b, v, 6, 6 + columns + 1), (b, columns + 1, columns + 1), or NULL: a look */
+    double *view, *shared; /* triangles (b, v, 6, 6 + columns + 1), (b, columns + 1, columns + 1), or NULL */
     int64_t *left;         /* how many points wait for what is known of lenses; -1: no memory */
 } Views;
 

@@ -7,7 +7,7 @@ import torch
 from boards import seen_by
 
 import camtorch as ct
-from camtorch.calibration.bundle import Free, Poses, Sight, State, adjust
+from camtorch.calibration.bundle import Free, Poses, Sight, State, adjust, pixel_jacobians
 from camtorch.calibration.uncertainty import noise_under, spread, uncertainty
 from camtorch.rotations import rotation_matrix
 
@@ -206,3 +206,17 @@ def test_projections_are_known_where_parameters_are_not():
     assert loose.std[0, 2] > 1e6 * loose.std[0, 0]
     for distance in (0.4, math.inf):
         assert torch.allclose(uncertainty(loose, PIXELS, distance), uncertainty(held, PIXELS, distance), rtol=1e-5)
+
+
+@pytest.mark.parametrize("learns", [True, False])
+def test_derivatives_go_on_to_the_end_of_the_chart(learns):
+    camera = ct.Pinhole(torch.tensor([[10.0, 11, 320, 240]], **F64))
+    angles = torch.tensor([60.0, 86.9, 87.5, 89.5], **F64).deg2rad()
+    rays = torch.stack((0.6 * angles.sin(), 0.8 * angles.sin(), angles.cos()), -1)[None]
+    with torch.set_grad_enabled(learns):  # by the formula, by compiled code
+        by_point, by_own = pixel_jacobians(camera, rays)
+    expected = torch.func.vmap(torch.func.jacrev(lambda ray: camera[0].detach().project(ray)[0]))(rays[0])
+    torch.testing.assert_close(by_point[0], expected, rtol=1e-12, atol=0)
+    plane = rays[0, :, :2] / rays[0, :, 2:]
+    torch.testing.assert_close(by_own[0, :, 0, 0], plane[:, 0], rtol=1e-12, atol=0)
+    assert bool((by_own[0, :, 1, 3] == 1).all())

@@ -58,7 +58,9 @@ static int job(void) {
     uint8_t *valid = malloc((size_t)poses), *inliers = malloc((size_t)(rows * points));
     int64_t next = 0, left = 0;
     const Part part = {.kind = PERSPECTIVE};
-    const Cameras cameras = {.parts = &part, .part_count = 1, .is_double = 1, .cameras = 1, .parameter_count = 2};
+    const double intrinsics[4] = {500, 500, 0, 0};
+    const Cameras cameras = {.parts = &part, .part_count = 1, .is_double = 1, .cameras = 1, .intrinsics = intrinsics,
+                             .parameter_count = 2};
     const int is_flat = !below(3);
     for (int64_t i = 0; i < of_points * points * 3; i++) object[i] = is_flat && i % 3 == 2 ? 0 : object[i];
     for (int64_t i = 0; i < rows * points; i++) weights[i] = weights[i] > -0.8 ? fabs(weights[i]) : 0;
