@@ -394,6 +394,31 @@ static void certain_of(const Part *part, const double *k, uint8_t *certain) {
                 }
 }
 
+/* (PIECE of each piece): a surface as polynomials of the place in a piece: of each power of that down, those of that across
+   in the order 0, 2, 1, 3 */
+static void pieces_of(const Part *part, const double *k, void *pieces, int64_t at, int is_double) {
+    static const int place[4] = {0, 2, 1, 3};
+    const double(*powers)[8] = powers_of_double[part->flags == 3 ? 0 : 1];
+    for (int j = 0; j < part->m - part->flags; j++)
+        for (int i = 0; i < part->n - part->flags; i++, at += PIECE) {
+            double made[4][8] = {{0}};
+            for (int row = 0; row <= part->flags; row++) {
+                const double *from = k + 4 + 2 * ((int64_t)(j + row) * part->n + i);
+                double across[8];
+                for (int p = 0; p < 4; p++)
+                    for (int axis = 0; axis < 2; axis++) {
+                        double sum = 0;
+                        for (int column = 0; column <= part->flags; column++)
+                            sum += powers[place[p]][2 * column] * from[2 * column + axis];
+                        across[2 * p + axis] = sum;
+                    }
+                for (int q = 0; q < 4; q++)
+                    for (int p = 0; p < 8; p++) made[q][p] += powers[q][2 * row] * across[p];
+            }
+            for (int p = 0; p < PIECE; p++) put(pieces, at + p, made[p / 8][p % 8], is_double);
+        }
+}
+
 /* (START): the inverse of the last stage, a surface, on the box around what it sends certain points to */
 static void start_of(const Domain *d, int64_t camera, const uint8_t *certain, double *start) {
     Camera_double c;
@@ -487,6 +512,7 @@ void THIS(domain)(const Domain *d) {
             const double *controls = numbers + d->parameter_count - numbers_of(last);
             certain_of(last, controls, d->certain + c * last->n * last->m);
             put(d->certain2, c, within(has_factor ? fold : end, end, is_double), is_double);
+            if (d->pieces) pieces_of(last, controls, d->pieces, c * PIECE * (last->n - last->flags) * (last->m - last->flags), is_double);
         }
         if (d->start) {
             double start[START];
