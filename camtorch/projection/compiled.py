@@ -37,7 +37,7 @@ _MOST_PARTS, _MOST_DEGREE = 5, 64
 _TABLE = 2 + 2 * 1024
 _RADII, _FOLLOWED, _AZIMUTHS = 512, 80, 336
 _EXTENT = _FOLLOWED + _AZIMUTHS * (_FOLLOWED + 1)
-_START, _PIECE = 4 + 2 * 48 * 48, 32
+_START, _PIECE = 4 + 2 * 46 * 46, 32
 _FOR_START = 1 << 15  # points of a camera for which such a table pays
 
 _HAS_XI, _HAS_ALPHA, _HAS_BETA, _TRANSVERSE = 1, 2, 4, 8
