@@ -88,7 +88,7 @@ class RandomElastic(Augmentation):
         if ":elastic=" in source.key:
             raise ValueError(f"{self._name}: the camera is elastic already, {source.key}")
         kind: type[Camera] = type_before_parametrizations(source)
-        if not _takes_surface(kind, source.distortion.shape[-1]):
+        if not _takes_surface(kind, source.distortion.shape[-1]):  # type: ignore[arg-type]  # a class can be hashed
             raise ValueError(
                 f"{self._name}: no surface can follow {type(source).__name__}, whose formula has no lens after it; "
                 "camera.convert(ct.KannalaBrandt).camera is one that has"
@@ -134,7 +134,7 @@ class RandomElastic(Augmentation):
         model, distortion = self._with_surface(source, self._like(source, values))
         if not math.isfinite(distortion.sum()):
             return None
-        base = _prototype(model, distortion.shape[-1], distortion.dtype)
+        base = _prototype(model, distortion.shape[-1], distortion.dtype)  # type: ignore[arg-type]  # likewise
         numbers = source.intrinsics.tolist()
         return View(base, numbers, distortion, source._size_for(self._name), None, self.options, before.native)
 
