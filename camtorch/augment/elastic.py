@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.utils.parametrize import type_before_parametrizations
 
-from camtorch._arguments import as_whole, columns
+from camtorch._arguments import are_numbers, as_whole, columns
 from camtorch._derived import with_surface
+from camtorch._evaluation import rows_of
+from camtorch._module import Memo
 from camtorch.augment.augmentation import Augmentation, EditOptions, Range, as_range
+from camtorch.augment.change import Part, View
 from camtorch.camera import Camera
-from camtorch.optics.charts import Chart
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
@@ -67,7 +71,7 @@ class RandomElastic(Augmentation):
                 f"{self._name}: amount must be below {most:.3g} for {max(down, across)} cells, else the surface might "
                 f"fold; got {amount!r}"
             )
-        self.grid = down, across
+        self.grid, self._memo = (down, across), Memo()
         self.ranges: dict[str, Range] = {
             "amount": drawn,
             "bends": Range(-1, 1, 2 * (across + _BESIDE) * (down + _BESIDE)),
@@ -75,36 +79,79 @@ class RandomElastic(Augmentation):
 
     def new_camera(self, source: Camera, values: Mapping[str, Tensor]) -> tuple[Camera, None]:
         """The camera with the surface; see `Augmentation.new_camera`."""
+        model, distortion = self._with_surface(source, values)
+        intrinsics = source.intrinsics.expand(*distortion.shape[:-1], 4).to(distortion.dtype)
+        return model(intrinsics, distortion, image_size=source.image_size).freeze_like(source), None
+
+    def _with_surface(self, source: Camera, values: Mapping[str, Tensor]) -> tuple[type[Camera], Tensor]:
+        """The model of the new camera, and its distortion."""
         if ":elastic=" in source.key:
             raise ValueError(f"{self._name}: the camera is elastic already, {source.key}")
-        try:
-            _chart_of(source).end(torch.float32)
-        except NotImplementedError:
+        kind: type[Camera] = type_before_parametrizations(source)
+        if not _takes_surface(kind, source.distortion.shape[-1]):  # type: ignore[arg-type]  # a class can be hashed
             raise ValueError(
                 f"{self._name}: no surface can follow {type(source).__name__}, whose formula has no lens after it; "
                 "camera.convert(ct.KannalaBrandt).camera is one that has"
-            ) from None
-        height, width = source._size_for(self._name)
-        down, across = self.grid
+            )
+        size = source._size_for(self._name)
+        (down, across), least = self.grid, min(size)
+        focal, place, more = self._memo((source.intrinsics,), (size,), lambda: self._placed(source, size))
+        bends = values["bends"].unflatten(-1, (down + _BESIDE, across + _BESIDE, 2))
+        if any(more):
+            bends = torch.nn.functional.pad(bends, (0, 0, more[0], more[0], more[1], more[1]))
+        moved = values["amount"][..., None, None, None] * least * bends / focal[..., None, None, :]
+        batch = torch.broadcast_shapes(moved.shape[:-3], source.batch_shape)
+        parts = source.distortion, place, moved.flatten(-3)
+        distortion = torch.cat([part.expand(*batch, part.shape[-1]).to(moved.dtype) for part in parts], -1)
+        return with_surface(kind, *bends.shape[-2:-4:-1]), distortion
+
+    def _placed(self, source: Camera, size: tuple[int, int]) -> tuple[Tensor, Tensor, list[int]]:
+        """The focal lengths; cells and centre of a surface over the image; and how many control points more it takes to
+        either side, as the principal point of what was cut out may lie outside of the image, and shall lie on it.
+        """
+        (height, width), (down, across) = size, self.grid
         focal, centre = source.intrinsics.detach().split(2, -1)
         middle = (centre.new_tensor([width - 1, height - 1]) / 2 - centre) / focal
         cells = centre.new_tensor([across / width, down / height]) * focal
-        # the principal point of what was cut out may lie outside of the image, and shall lie on the surface
-        away = ((middle * cells).abs().reshape(-1, 2).amax(0) - centre.new_tensor([across, down]) / 2).tolist()
-        more = [max(0, math.ceil(w)) for w in away]
-        bends = values["bends"].unflatten(-1, (down + _BESIDE, across + _BESIDE, 2))
-        bends = torch.nn.functional.pad(bends, (0, 0, more[0], more[0], more[1], more[1]))
-        moved = values["amount"][..., None, None, None] * min(height, width) * bends
-        model: type[Camera] = with_surface(type_before_parametrizations(source), *bends.shape[-2:-4:-1])
-        batch = torch.broadcast_shapes(moved.shape[:-3], source.batch_shape)
-        moved = moved.expand(*batch, *moved.shape[-3:]) / focal[..., None, None, :]
-        parts = source.distortion, cells, middle, moved.flatten(-3)
-        distortion = torch.cat([part.expand(*batch, part.shape[-1]).to(moved.dtype) for part in parts], -1)
-        intrinsics = source.intrinsics.expand(*batch, 4).to(moved.dtype)
-        return model(intrinsics, distortion, image_size=source.image_size).freeze_like(source), None
+        away = (middle * cells).abs().reshape(-1, 2).amax(0) - centre.new_tensor([across, down]) / 2
+        return focal, torch.cat((cells, middle), -1), [max(0, math.ceil(w)) for w in away.tolist()]
+
+    def _part(self, rows: list[int] | None, source: Camera, draw: Mapping[str, Any]) -> Part:
+        view = self._view(source, draw)
+        return super()._part(rows, source, draw) if view is None else Part(rows, view, source)
+
+    def _view(self, source: Camera, draw: Mapping[str, Any]) -> View | None:
+        """What a draw makes of a single camera as plain numbers; None where it takes more than that."""
+        is_usual = type(self).new_camera is RandomElastic.new_camera and self.options["tolerance"]
+        if not is_usual or self.min_filled or self.options["antialias"] or isinstance(draw["apply"], Tensor):
+            return None
+        if source.batch_shape or not are_numbers(*source._tensors):
+            return None
+        before = rows_of(source, *source._tensors)
+        values = self._values(source, draw)
+        if before.usable is not None or any(isinstance(value, (np.ndarray, Tensor)) for value in values.values()):
+            return None
+        model, distortion = self._with_surface(source, self._like(source, values))
+        if not math.isfinite(distortion.sum()):
+            return None
+        base = _prototype(model, distortion.shape[-1], distortion.dtype)  # type: ignore[arg-type]  # likewise
+        numbers = source.intrinsics.tolist()
+        return View(base, numbers, distortion, source._size_for(self._name), None, self.options, before.native)
 
 
-def _chart_of(camera: Camera) -> Chart:
-    """The chart of a camera of that model."""
-    ideal = camera.ideal(camera.distortion.shape[-1])
-    return camera.optics(columns(camera.distortion.new_tensor([ideal])))[0]
+@functools.lru_cache(maxsize=64)
+def _takes_surface(model: type[Camera], count: int) -> bool:
+    """Whether a lens follows the chart of a model of so many coefficients."""
+    try:
+        model.optics(columns(torch.tensor([model.ideal(count)])))[0].end(torch.float32)
+    except NotImplementedError:
+        return False
+    return True
+
+
+@functools.lru_cache(maxsize=64)
+def _prototype(model: type[Camera], count: int, dtype: torch.dtype) -> Camera:
+    """Some camera of a model."""
+    with torch.inference_mode(False):
+        ones = torch.ones(4, dtype=dtype)
+        return model(ones, ones.new_tensor(model.ideal(count))).detach()

@@ -32,7 +32,9 @@ enum { MOST_RADII = 512 }; /* on which a lens is followed outwards by bounds of 
 enum { AZIMUTHS = 336 }; /* on which limits are given, see `fold.limits_and_extent` */
 enum { RADII = 80 };     /* on each of them: half over the whole chart, half around the fold of a radial factor */
 /* The inverse of a surface, nearly, as the numbers of a cubic one of GRID x GRID control points */
-enum { GRID = 48, START = 4 + 2 * GRID * GRID };
+enum { GRID = 46, START = 4 + 2 * GRID * GRID };
+/* Numbers of a piece of a surface: 4 x 4 coefficients, of du and dv each */
+enum { PIECE = 32 };
 /* Radii (RADII); how far out they are sent on each azimuth (AZIMUTHS, RADII), ascending; how far the image reaches in each
    direction (AZIMUTHS) */
 enum { EXTENT = RADII + AZIMUTHS * RADII + AZIMUTHS };
@@ -61,9 +63,9 @@ typedef struct {
     const void *circle2;
     /* of a lens that is a surface, or a surface after a radial factor: where a point is in the domain for certain, of each
        4 x 4 control points (c, n m) and up to the squared radius of the factor's fold (c); where to start the inverse of
-       the surface (c, START) */
+       the surface (c, START); the surface as polynomials (c, PIECE of each piece), or NULL, see `pieces_of` */
     const uint8_t *certain;
-    const void *certain2, *start;
+    const void *certain2, *start, *pieces;
     /* of an inverted chart: the squared radius and the squared angle of its fold, the table of its inverse */
     const void *chart_inner2, *chart_most2, *chart_table;
 } Cameras;
@@ -87,7 +89,7 @@ typedef struct {
     void *limits2, *extent;                  /* (c, AZIMUTHS), (c, EXTENT): both or none */
     uint8_t *stagewise;                      /* (c); with circle2 */
     uint8_t *certain;                        /* (c, n m) */
-    void *certain2, *start;                  /* (c); (c, START), which reads `certain` */
+    void *certain2, *start, *pieces; /* (c); (c, START), which reads `certain`; (c, PIECE of each piece) */
 } Domain;
 
 enum { PROJECT, UNPROJECT, PROJECT_VJP, UNPROJECT_VJP };

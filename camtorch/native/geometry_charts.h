@@ -40,7 +40,7 @@ typedef struct {
     T(Factor) factors[MOST_PARTS];
     T(Plane) planes[MOST_PARTS];
     R fx, fy, cx, cy, inner2, usual2, circle2;
-    const R *limits2, *extent, *table, *start;
+    const R *limits2, *extent, *table, *start, *pieces;
     const uint8_t *certain;
     int all_certain, to_edge; /* of all pieces of the surface; and it is the only stage */
     R certain2;

@@ -394,8 +394,34 @@ static void certain_of(const Part *part, const double *k, uint8_t *certain) {
                 }
 }
 
+/* (PIECE of each piece): a surface as polynomials of the place in a piece: of each power of that down, those of that across
+   in the order 0, 2, 1, 3 */
+static void pieces_of(const Part *part, const double *k, void *pieces, int64_t at, int is_double) {
+    static const int place[4] = {0, 2, 1, 3};
+    const double(*powers)[8] = powers_of_double[part->flags == 3 ? 0 : 1];
+    for (int j = 0; j < part->m - part->flags; j++)
+        for (int i = 0; i < part->n - part->flags; i++, at += PIECE) {
+            double made[4][8] = {{0}};
+            for (int row = 0; row <= part->flags; row++) {
+                const double *from = k + 4 + 2 * ((int64_t)(j + row) * part->n + i);
+                double across[8];
+                for (int p = 0; p < 4; p++)
+                    for (int axis = 0; axis < 2; axis++) {
+                        double sum = 0;
+                        for (int column = 0; column <= part->flags; column++)
+                            sum += powers[place[p]][2 * column] * from[2 * column + axis];
+                        across[2 * p + axis] = sum;
+                    }
+                for (int q = 0; q < 4; q++)
+                    for (int p = 0; p < 8; p++) made[q][p] += powers[q][2 * row] * across[p];
+            }
+            for (int p = 0; p < PIECE; p++) put(pieces, at + p, made[p / 8][p % 8], is_double);
+        }
+}
+
 /* (START): the inverse of the last stage, a surface, on the box around what it sends certain points to */
-static void start_of(const Domain *d, int64_t camera, const uint8_t *certain, double *start) {
+static void start_of(const Domain *d, int64_t camera, const uint8_t *certain) {
+    enum { SIDE = GRID + 2 }; /* whole vectors */
     Camera_double c;
     lens_of(d, camera, &c);
     c.certain = certain;
@@ -403,13 +429,13 @@ static void start_of(const Domain *d, int64_t camera, const uint8_t *certain, do
     const double *k = c.numbers[c.stages], size[2] = {(part->n - part->flags) / k[0], (part->m - part->flags) / k[1]};
     ALIGNED double a[BLOCK], b[BLOCK], u[BLOCK], v[BLOCK];
     ALIGNED int64_t ok[BLOCK];
-    double low[2] = {INFINITY, INFINITY}, high[2] = {-INFINITY, -INFINITY}, found[2][GRID + 2][GRID + 2];
-    for (int j = 0; j < GRID; j++) {
-        for (int i = 0; i < GRID; i++)
-            a[i] = k[2] + size[0] * (i / (GRID - 1.0) - 0.5), b[i] = k[3] + size[1] * (j / (GRID - 1.0) - 0.5);
-        on_surface_double(&c, GRID, a, b, ok);
-        stage_double(&c, c.stages, GRID, a, b, u, v, NULL);
-        for (int i = 0; i < GRID; i++) {
+    double low[2] = {INFINITY, INFINITY}, high[2] = {-INFINITY, -INFINITY}, found[2][SIDE][SIDE], start[START];
+    for (int j = 0; j < SIDE; j++) {
+        for (int i = 0; i < SIDE; i++)
+            a[i] = k[2] + size[0] * (i / (SIDE - 1.0) - 0.5), b[i] = k[3] + size[1] * (j / (SIDE - 1.0) - 0.5);
+        on_surface_double(&c, SIDE, a, b, ok);
+        stage_double(&c, c.stages, SIDE, a, b, u, v, NULL);
+        for (int i = 0; i < SIDE; i++) {
             if (!ok[i]) continue;
             low[0] = u[i] < low[0] ? u[i] : low[0], high[0] = u[i] > high[0] ? u[i] : high[0];
             low[1] = v[i] < low[1] ? v[i] : low[1], high[1] = v[i] > high[1] ? v[i] : high[1];
@@ -420,22 +446,23 @@ static void start_of(const Domain *d, int64_t camera, const uint8_t *certain, do
         start[axis] = (GRID - 3) / (is_box ? high[axis] - low[axis] : size[axis]);
         start[2 + axis] = is_box ? (low[axis] + high[axis]) / 2 : k[2 + axis];
     }
-    for (int j = 0; j < GRID + 2; j++) {
-        for (int i = 0; i < GRID + LANES; i++) {
-            u[i] = start[2] + ((i < GRID + 2 ? i : 0) - (GRID + 1) / 2.0) / start[0];
-            v[i] = start[3] + (j - (GRID + 1) / 2.0) / start[1];
+    for (int j = 0; j < SIDE; j++) {
+        for (int i = 0; i < SIDE; i++) {
+            u[i] = start[2] + (i - (GRID + 1) / 2.0) / start[0], v[i] = start[3] + (j - (GRID + 1) / 2.0) / start[1];
+            if (j) a[i] = u[i] + found[0][j - 1][i], b[i] = v[i] + found[1][j - 1][i]; /* as in the row before */
         }
-        start_double(&c, c.stages, GRID + LANES, u, v, a, b);
-        newton_double(&c, c.stages, GRID + LANES, u, v, a, b, ok, 1);
-        for (int i = 0; i < GRID + 2; i++) found[0][j][i] = ok[i] ? a[i] - u[i] : 0, found[1][j][i] = ok[i] ? b[i] - v[i] : 0;
+        if (!j) start_double(&c, c.stages, SIDE, u, v, a, b);
+        newton_double(&c, c.stages, SIDE, u, v, a, b, ok, 1);
+        for (int i = 0; i < SIDE; i++) found[0][j][i] = ok[i] ? a[i] - u[i] : 0, found[1][j][i] = ok[i] ? b[i] - v[i] : 0;
     }
     for (int j = 1; j <= GRID; j++) /* so that it goes through them, to the fourth power of a cell */
         for (int i = 1; i <= GRID; i++)
             for (int axis = 0; axis < 2; axis++) {
-                double(*f)[GRID + 2] = found[axis];
+                double(*f)[SIDE] = found[axis];
                 const double beside = f[j][i - 1] + f[j][i + 1] + f[j - 1][i] + f[j + 1][i];
                 start[4 + 2 * ((j - 1) * GRID + i - 1) + axis] = f[j][i] - (beside - 4 * f[j][i]) / 6;
             }
+    for (int i = 0; i < START; i++) put(d->start, camera * START + i, start[i], (int)d->is_double);
 }
 
 /* Fills in what of a `Domain` is wanted */
@@ -487,12 +514,9 @@ void THIS(domain)(const Domain *d) {
             const double *controls = numbers + d->parameter_count - numbers_of(last);
             certain_of(last, controls, d->certain + c * last->n * last->m);
             put(d->certain2, c, within(has_factor ? fold : end, end, is_double), is_double);
+            if (d->pieces) pieces_of(last, controls, d->pieces, c * PIECE * (last->n - last->flags) * (last->m - last->flags), is_double);
         }
-        if (d->start) {
-            double start[START];
-            start_of(d, c, d->certain + c * last->n * last->m, start);
-            for (int i = 0; i < START; i++) put(d->start, c * START + i, start[i], is_double);
-        }
+        if (d->start) start_of(d, c, d->certain + c * last->n * last->m);
         if (d->table && has_factor) {
             tabulate(&lens, fold, usual_end, table);
             for (int i = 0; i < 2 + 2 * NODES; i++) put(d->table, c * (2 + 2 * NODES) + i, table[i], is_double);

@@ -374,6 +374,54 @@ static void T(surface)(const Part *part, const R *k, int n, const R *restrict a,
     else T(surface_of)(part, k, 2, n, a, b, u, v, NULL);
 }
 
+/* The same of a surface, the last stage, of whose pieces the polynomials are known: see `pieces_of` */
+INLINE void T(patches_at)(const T(Camera) *c, int n, const R *restrict a, const R *restrict b, R *restrict u,
+                         R *restrict v, T(Jacobian) *restrict to) {
+    const Part *part = c->parts + c->stages;
+    const int order = part->flags, across = part->n - order;
+    const R *k = c->numbers[c->stages], sa = k[0], sb = k[1], ca = k[2], cb = k[3], half = order == 3 ? 0 : (R)0.5;
+    const R middle_a = (R)(part->n - 1) / 2, middle_b = (R)(part->m - 1) / 2, most_i = (R)across, most_j = (R)(part->m - order);
+    ALIGNED R x[BLOCK], y[BLOCK], low[4 * BLOCK], high[4 * BLOCK], down[4 * BLOCK];
+    ALIGNED int32_t at[BLOCK];
+    EACH(i) {
+        const R p = (a[i] - ca) * sa + middle_a, q = (b[i] - cb) * sb + middle_b;
+        R cell_i = IS_DOUBLE ? (R)floor(p + half) : (R)floorf((float)(p + half));
+        R cell_j = IS_DOUBLE ? (R)floor(q + half) : (R)floorf((float)(q + half));
+        cell_i = cell_i > 1 ? cell_i : 1, cell_i = cell_i < most_i ? cell_i : most_i;
+        cell_j = cell_j > 1 ? cell_j : 1, cell_j = cell_j < most_j ? cell_j : most_j;
+        x[i] = p - cell_i, y[i] = q - cell_j, at[i] = ((int32_t)cell_j - 1) * across + (int32_t)cell_i - 1;
+    }
+    for (int i = 0; i < n; i++) {
+        const R *restrict piece = c->pieces + (int64_t)PIECE * at[i], p = x[i], q = y[i];
+        ALIGNED R sum[8], slope[8];
+        KEPT_LOOP for (int j = 0; j < 8; j++) {
+            R by = piece[24 + j], w = by * q + piece[16 + j];
+            by = by * q + w, w = w * q + piece[8 + j];
+            slope[j] = by * q + w, sum[j] = w * q + piece[j];
+        }
+        KEPT_LOOP for (int j = 0; j < 4; j++) low[4 * i + j] = sum[4 + j] * p + sum[j];
+        if (!to) continue;
+        KEPT_LOOP for (int j = 0; j < 4; j++) high[4 * i + j] = sum[4 + j], down[4 * i + j] = slope[4 + j] * p + slope[j];
+    }
+    EACH(i) {
+        const R xx = x[i] * x[i];
+        u[i] = a[i] + (low[4 * i + 2] * xx + low[4 * i]), v[i] = b[i] + (low[4 * i + 3] * xx + low[4 * i + 1]);
+    }
+    if (!to) return;
+    EACH(i) {
+        const R w = x[i], xx = w * w;
+        to->ua[i] = (high[4 * i + 2] * xx + (2 * w * low[4 * i + 2] + high[4 * i])) * sa + 1;
+        to->va[i] = (high[4 * i + 3] * xx + (2 * w * low[4 * i + 3] + high[4 * i + 1])) * sa;
+        to->ub[i] = (down[4 * i + 2] * xx + down[4 * i]) * sb, to->vb[i] = (down[4 * i + 3] * xx + down[4 * i + 1]) * sb + 1;
+    }
+}
+
+static void T(patches)(const T(Camera) *c, int n, const R *restrict a, const R *restrict b, R *restrict u, R *restrict v,
+                      T(Jacobian) *restrict to) {
+    if (to) T(patches_at)(c, n, a, b, u, v, to);
+    else T(patches_at)(c, n, a, b, u, v, NULL);
+}
+
 /* Cells and centre are constants: their sums stay 0 */
 static void T(surface_vjp)(const Part *part, const R *k, int n, const R *restrict a, const R *restrict b,
                            R *restrict gu, R *restrict gv, double *sums) {
@@ -442,7 +490,8 @@ static void T(stage)(const T(Camera) *c, int stage, int n, const R *a, const R *
     else if (part->kind == SHEAR) {
         EACH(i) u[i] = a[i] + k[1] * b[i], v[i] = b[i] + k[0] * a[i];
         if (to) EACH(i) to->ua[i] = to->vb[i] = 1, to->ub[i] = k[1], to->va[i] = k[0];
-    } else if (part->kind == SURFACE) T(surface)(part, k, n, a, b, u, v, to);
+    } else if (part->kind == SURFACE && c->pieces && stage == c->stages) T(patches)(c, n, a, b, u, v, to);
+    else if (part->kind == SURFACE) T(surface)(part, k, n, a, b, u, v, to);
     else T(planar)(c, stage, n, a, b, u, v, to);
 }
 

@@ -4,7 +4,25 @@ typedef struct {
     int64_t index; /* of the cameras that these are; -1: none yet */
     T(Camera) from, to;
     R turn[9];
+    R within2; /* see `compare` */
 } T(Between);
+
+/* Whether `from` is `to` with a surface after its lens: then pixels move by that surface alone, within a circle of its
+   plane in which all is certain; else there is no such circle */
+static void T(compare)(const Move *move, T(Between) *b) {
+    const T(Camera) *from = &b->from, *to = &b->to;
+    const int last = to->stages + 1;
+    b->within2 = -1;
+    if (move->turns || from->stages != last || !from->all_certain || !from->start || !(from->usable & to->usable)) return;
+    if (from->parts->map || from->way == INVERTED || (last > 1 && from->parts[1].factor == RADIUS_TABLE)) return;
+    if (from->fx != to->fx || from->fy != to->fy || from->cx != to->cx || from->cy != to->cy) return;
+    if (memcmp(from->parts, to->parts, (size_t)last * sizeof(Part))) return;
+    if (memcmp(from->map, to->map, (size_t)(from->numbers[last] - from->map) * sizeof(R))) return;
+    R inner2[LANES], factor[LANES];
+    for (int i = 0; i < LANES; i++) inner2[i] = (R)0.98 * T(least)(from->certain2, to->inner2), factor[i] = 1;
+    if (to->stages) T(radial)(to->factors + 1, LANES, inner2, factor, NULL);
+    b->within2 = factor[0] > 0 ? inner2[0] * factor[0] * factor[0] : -1;
+}
 
 static void T(between)(const Move *move, int64_t index, T(Between) *b) {
     const int is_first = b->index < 0;
@@ -15,12 +33,31 @@ static void T(between)(const Move *move, int64_t index, T(Between) *b) {
     if (move->turns && (is_first || strides[0]))
         for (int i = 0; i < 9; i++)
             b->turn[i] = ((const R *)move->turns)[index * strides[0] + i / 3 * strides[1] + i % 3 * strides[2]];
+    T(compare)(move, b);
     b->index = index;
 }
 
-/* Pixels (u, v) to what `form` says, `ok` where there is any; flags of what is left to do */
-static int T(moved)(const Move *move, const T(Between) *b, int count, int n, R *restrict u, R *restrict v,
-                    I *restrict ok) {
+/* Pixels (u, v) to pixels (p, q) by the surface alone, `ok` where that does */
+static void T(by_surface)(const T(Between) *b, int n, const R *restrict u, const R *restrict v, R *restrict p,
+                          R *restrict q, I *restrict ok) {
+    const T(Camera) *c = &b->from;
+    const R fx = c->fx, fy = c->fy, cx = c->cx, cy = c->cy, by_fx = 1 / fx, by_fy = 1 / fy, within2 = b->within2;
+    const T(Edge) edge = T(edge_of)(c);
+    ALIGNED R x[BLOCK], y[BLOCK];
+    EACH(i) x[i] = (u[i] - cx) * by_fx, y[i] = (v[i] - cy) * by_fy;
+    T(start)(c, c->stages, n, x, y, p, q);
+    T(newton)(c, c->stages, n, x, y, p, q, ok, IS_DOUBLE ? 2 : 1);
+    EACH(i) {
+        const R further = 1 + 32 * EPS;
+        ok[i] &= T(on_edge)(edge, p[i] * further, q[i] * further) & (within2 - (p[i] * p[i] + q[i] * q[i]) > 0);
+        x[i] = fx * p[i], y[i] = fy * q[i];
+    }
+    EACH(i) p[i] = x[i] + cx, q[i] = y[i] + cy; /* not at once, see `pixels_of` */
+}
+
+/* Pixels (u, v) to those by their rays, `ok` where there is one; flags of what is left to do */
+static int T(by_rays)(const Move *move, const T(Between) *b, int count, int n, R *restrict u, R *restrict v,
+                      I *restrict ok) {
     ALIGNED I known[BLOCK];
     T(Seen) s;
     int left = 0;
@@ -30,14 +67,34 @@ static int T(moved)(const Move *move, const T(Between) *b, int count, int n, R *
     if (move->turns) T(product)(b->turn, 1, 3, n, s.x, s.y, s.z);
     left |= T(pixels_of)(&b->to, count, n, &s, u, v) ? LEFT_TO : 0;
     EACH(i) ok[i] &= s.ok[i];
+    return left;
+}
+
+/* Pixels (u, v) to what `form` says, `ok` where there is any; flags of what is left to do */
+static int T(moved)(const Move *move, const T(Between) *b, int count, int n, R *restrict u, R *restrict v,
+                    I *restrict ok) {
+    ALIGNED R x[BLOCK], y[BLOCK], p[BLOCK], q[BLOCK];
+    int places[BLOCK], left = 0;
+    if (!(b->within2 > 0)) left = T(by_rays)(move, b, count, n, u, v, ok);
+    else {
+        T(by_surface)(b, n, u, v, p, q, ok);
+        const int some = T(chosen)(n, ok, places), filled = (some + LANES - 1) & -LANES;
+        if (some) {
+            ALIGNED I found[BLOCK];
+            for (int i = 0; i < filled; i++) x[i] = u[places[i]], y[i] = v[places[i]];
+            left = T(by_rays)(move, b, some, filled, x, y, found);
+            for (int i = 0; i < some; i++) p[places[i]] = x[i], q[places[i]] = y[i], ok[places[i]] = found[i];
+        }
+        EACH(i) u[i] = p[i], v[i] = q[i];
+    }
     if (move->form == POSITIONS) {
         const R across = (R)(2 / move->width), down = (R)(2 / move->height), far = FAR;
         const R right = (R)(1 / move->width - 1), below = (R)(1 / move->height - 1);
-        EACH(i) s.x[i] = u[i] * across, s.y[i] = v[i] * down; /* not at once, see `pixels_of` */
+        EACH(i) x[i] = u[i] * across, y[i] = v[i] * down; /* not at once, see `pixels_of` */
         EACH(i) {
-            const R p = s.x[i] + right, q = s.y[i] + below;
-            u[i] = !ok[i] ? OUTSIDE : p < -far ? -far : p > far ? far : p;
-            v[i] = !ok[i] ? OUTSIDE : q < -far ? -far : q > far ? far : q;
+            const R s = x[i] + right, t = y[i] + below;
+            u[i] = !ok[i] ? OUTSIDE : s < -far ? -far : s > far ? far : s;
+            v[i] = !ok[i] ? OUTSIDE : t < -far ? -far : t > far ? far : t;
         }
         return left;
     }

@@ -63,6 +63,10 @@ static void T(prepare)(const Cameras *all, int64_t camera, T(Camera) *c) {
                 for (int i = 0; i <= last->n - 4; i++) c->all_certain &= c->certain[j * last->n + i];
             c->to_edge = c->all_certain && c->stages == 1;
         }
+        if (all->pieces) {
+            const Part *last = c->parts + c->stages;
+            c->pieces = (const R *)all->pieces + camera * PIECE * (last->n - last->flags) * (last->m - last->flags);
+        }
         c->start = all->start ? (const R *)all->start + camera * START : NULL;
         c->table = all->table ? (const R *)all->table + camera * (2 + 2 * NODES) : NULL;
     }

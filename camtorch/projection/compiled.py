@@ -37,7 +37,7 @@ _MOST_PARTS, _MOST_DEGREE = 5, 64
 _TABLE = 2 + 2 * 1024
 _RADII, _FOLLOWED, _AZIMUTHS = 512, 80, 336
 _EXTENT = _FOLLOWED + _AZIMUTHS * (_FOLLOWED + 1)
-_START = 4 + 2 * 48 * 48
+_START, _PIECE = 4 + 2 * 46 * 46, 32
 _FOR_START = 1 << 15  # points of a camera for which such a table pays
 
 _HAS_XI, _HAS_ALPHA, _HAS_BETA, _TRANSVERSE = 1, 2, 4, 8
@@ -84,6 +84,7 @@ class _Cameras(ctypes.Structure):
         ("certain", c_void_p),
         ("certain2", c_void_p),
         ("start", c_void_p),
+        ("pieces", c_void_p),
         ("chart_inner2", c_void_p),
         ("chart_most2", c_void_p),
         ("chart_table", c_void_p),
@@ -129,6 +130,7 @@ class _Domain(ctypes.Structure):
         ("certain", c_void_p),
         ("certain2", c_void_p),
         ("start", c_void_p),
+        ("pieces", c_void_p),
     )
 
 
@@ -149,6 +151,8 @@ class Plan:
     """Whether a radial factor has so many numbers that its fold is not found by a root."""
     controls: int
     """Of a surface, the last stage after nothing or a radial factor."""
+    pieces: int
+    """How many numbers say what its pieces are."""
 
     def __init__(self, chart: Chart, lens: Lens, parts: Sequence[_Part], coefficients: Sequence[Tensor]):
         """Of the optics of coefficients, columns, whatever their values."""
@@ -166,7 +170,9 @@ class Plan:
         self.is_long = any(part.factor and part.n + part.m > _MOST_DEGREE for part in parts)
         *before, last = lens.stages or (None,)
         is_plain = isinstance(last, optics.Surface) and (not before or (len(before) == 1 and before[0].is_radial))
-        self.controls = parts[-1].n * parts[-1].m if is_plain else 0
+        end = parts[-1]
+        self.controls = end.n * end.m if is_plain else 0
+        self.pieces = _PIECE * (end.n - end.flags) * (end.m - end.flags) if is_plain else 0
         self._ends: dict[torch.dtype, tuple[float, float]] = {}
         self._radii: dict[tuple[torch.dtype, int], Tensor] = {}
 
@@ -306,7 +312,7 @@ class Lenses:
         start, step = self._new(sum(counts)), self.cameras * self.dtype.itemsize
         wanted = {name: start + step * i for i, name in enumerate(names)}
         if plan.controls:
-            wanted["certain"] = self._new(plan.controls, torch.uint8)
+            wanted["certain"], wanted["pieces"] = self._new(plan.controls, torch.uint8), self._new(plan.pieces)
         for name, place in wanted.items():
             setattr(self.struct, name, place)
         radii = {} if plan.is_radial else {"radii": self._keep(plan.radii(lambda: self._optics()[0], _RADII, self._k))}

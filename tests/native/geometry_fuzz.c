@@ -181,10 +181,12 @@ static int fuzz(void) {
     }
     const Part *last = parts + cameras.part_count - 1;
     const int64_t controls = last->kind == SURFACE ? last->n * last->m : 0;
+    const int64_t pieces = controls ? PIECE * (last->n - last->flags) * (last->m - last->flags) : 0;
     if (controls && below(2)) {
         uint8_t *certain = KEPT(malloc((size_t)(c * controls)));
         for (i = 0; i < c * controls; i++) certain[i] = (uint8_t)below(2);
         cameras.certain = certain, cameras.certain2 = KEPT(filled(d, c, 2, 2));
+        if (below(2)) cameras.pieces = KEPT(filled(d, c * pieces, 2, 0));
         if (below(2)) cameras.start = KEPT(filled(d, c * START, 2, 0));
     }
     if (parts[0].kind == INVERTED) {
@@ -205,7 +207,7 @@ static int fuzz(void) {
     domain.table = KEPT(filled(d, c * (2 + 2 * NODES), 0, 0));
     if (controls && !domain.is_chart) {
         domain.certain = KEPT(malloc((size_t)(c * controls))), domain.certain2 = KEPT(filled(d, c, 0, 0));
-        domain.start = KEPT(filled(d, c * START, 0, 0));
+        domain.start = KEPT(filled(d, c * START, 0, 0)), domain.pieces = KEPT(filled(d, c * pieces, 0, 0));
     }
     if (has_factor && many && !domain.is_chart)
         domain.circle2 = KEPT(filled(d, c, 0, 0)), domain.stagewise = KEPT(malloc((size_t)c));
