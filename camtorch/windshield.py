@@ -25,9 +25,6 @@ from camtorch.optics import Bending
 from camtorch.optics.charts import Planes3
 from camtorch.optics.ray_maps import order_of
 
-if TYPE_CHECKING:
-    pass
-
 
 class Windshield(BatchedModule):
     """What a windshield does to the rays of a camera behind it: `camera.behind(shield)` is the camera of both.

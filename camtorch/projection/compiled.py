@@ -38,6 +38,7 @@ _TABLE = 2 + 2 * 1024
 _RADII, _FOLLOWED, _AZIMUTHS = 512, 80, 336
 _EXTENT = _FOLLOWED + _AZIMUTHS * (_FOLLOWED + 1)
 _START, _PIECE = 4 + 2 * 46 * 46, 32
+_MOST_CONTROLS = 64 * 64  # of a surface whose pieces, of 16 times the memory, pay
 _FOR_START = 1 << 15  # points of a camera for which such a table pays
 
 _HAS_XI, _HAS_ALPHA, _HAS_BETA, _TRANSVERSE = 1, 2, 4, 8
@@ -172,7 +173,7 @@ class Plan:
         is_plain = isinstance(last, optics.Surface) and (not before or (len(before) == 1 and before[0].is_radial))
         end = parts[-1]
         self.controls = end.n * end.m if is_plain else 0
-        self.pieces = _PIECE * (end.n - end.flags) * (end.m - end.flags) if is_plain else 0
+        self.pieces = _PIECE * (end.n - end.flags) * (end.m - end.flags) if 0 < self.controls <= _MOST_CONTROLS else 0
         self._ends: dict[torch.dtype, tuple[float, float]] = {}
         self._radii: dict[tuple[torch.dtype, int], Tensor] = {}
 
@@ -312,7 +313,8 @@ class Lenses:
         start, step = self._new(sum(counts)), self.cameras * self.dtype.itemsize
         wanted = {name: start + step * i for i, name in enumerate(names)}
         if plan.controls:
-            wanted["certain"], wanted["pieces"] = self._new(plan.controls, torch.uint8), self._new(plan.pieces)
+            wanted["certain"] = self._new(plan.controls, torch.uint8)
+            wanted |= {"pieces": self._new(plan.pieces)} if plan.pieces else {}
         for name, place in wanted.items():
             setattr(self.struct, name, place)
         radii = {} if plan.is_radial else {"radii": self._keep(plan.radii(lambda: self._optics()[0], _RADII, self._k))}

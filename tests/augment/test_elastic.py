@@ -101,6 +101,22 @@ def test_batches_front_ends_and_cut_images():
     torch.testing.assert_close(63 - pixels[:, 0], torch.tensor([20.0, 40.0]), rtol=0, atol=1e-3)
 
 
+def test_surfaces_of_many_and_of_few_control_points_are_the_formula():
+    """Up to a number of them they become polynomials, piece by piece."""
+    camera = ct.KannalaBrandt([600.0, 600, 320, 240], [0.01, 0, 0, 0], image_size=(480, 1400)).requires_grad_(False)
+    counts = []
+    for left in (200, 1100):
+        elastic = ct.augment.RandomElastic(amount=0.005, grid=24, camera=camera.double().crop(120, left, 240, 240))
+        bent = elastic({"keypoints": torch.rand(5, 2).double()})["camera"]
+        counts.append(bent.distortion.numel() // 2)
+        pixels = bent.pixel_grid()[::9, ::9].reshape(-1, 2).double()
+        rays, valid = bent.unproject(pixels)
+        assert valid.double().mean() > 0.9
+        torch.testing.assert_close(rays, torch.func.vmap(bent.unproject)(pixels)[0], rtol=0, atol=1e-9)
+        torch.testing.assert_close(bent.project(rays)[0][valid], pixels[valid], rtol=0, atol=1e-9)
+    assert counts[0] < 64 * 64 < counts[1] - 4
+
+
 def test_files_hold_it(tmp_path):
     camera = ct.Pinhole.from_fov(60, image_size=(48, 64)).double().requires_grad_(False)
     bent = ct.augment.RandomElastic(amount=0.03)({"image": torch.rand(1, 48, 64), "camera": camera})["camera"]

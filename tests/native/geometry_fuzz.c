@@ -65,9 +65,19 @@ int32_t classify_fuzzed(const Classification *given) {
     return todo;
 }
 
-/* Pixels, and a lattice, of cameras to themselves, turned */
+/* Pixels, and a lattice, of cameras to themselves, turned, or to these without the surface at the end of their lens */
 static int moved(const Cameras *cameras, int64_t tile) {
     const int d = (int)cameras->is_double, fits = below(2);
+    const Part *last = cameras->parts + cameras->part_count - 1;
+    Cameras bare = *cameras;
+    void *fewer = NULL;
+    if (last->kind == SURFACE && below(4)) {
+        const int64_t item = d ? 8 : 4, all = cameras->parameter_count, kept = all - 4 - 2 * last->n * last->m;
+        bare.part_count--, bare.parameter_count = kept, bare.parameters = fewer = malloc((size_t)(kept * cameras->cameras * item) + !kept);
+        for (int64_t i = 0; i < cameras->cameras; i++)
+            memcpy((char *)fewer + i * kept * item, (const char *)cameras->parameters + i * all * item, (size_t)(kept * item));
+        bare.stagewise = bare.certain = NULL, bare.circle2 = bare.certain2 = bare.start = bare.pieces = NULL;
+    }
     const int64_t c = cameras->cameras, height = 1 + below(70), width = 1 + below(90);
     const int64_t rows = (height + 7) / 8, columns = (width + 7) / 8, nodes = (rows + 5) * (columns + 5);
     const int64_t n = fits ? nodes + 2 * (height + width) : 1 + below(700), size = d ? 8 : 4;
@@ -75,8 +85,8 @@ static int moved(const Cameras *cameras, int64_t tile) {
     Move move = {0};
     void *turns = filled(d, 9 * c, 1, 0), *narrow = NULL, *valid = malloc((size_t)(c * n));
     int64_t following = 0, used = 0;
-    move.from = move.to = cameras, move.cameras = c, move.form = fits ? POSITIONS : below(3);
-    if (below(2)) {
+    move.from = cameras, move.to = fewer ? &bare : cameras, move.cameras = c, move.form = fits ? POSITIONS : below(3);
+    if (below(fewer ? 4 : 2) == 0) {
         const int64_t back = below(2);
         move.turns = turns, move.turn_strides[0] = 9 * below(2);
         move.turn_strides[1] = back ? 1 : 3, move.turn_strides[2] = back ? 3 : 1;
@@ -118,7 +128,7 @@ static int moved(const Cameras *cameras, int64_t tile) {
         /* what is moved off the image has its place, which may be too far for a number */
         fine &= fits || move.form == ON_IMAGE || ((uint8_t *)valid)[camera * n + point] == 1 || isfinite(value);
     }
-    free(turns), free(narrow), free(valid), free(pixels), free(results);
+    free(turns), free(narrow), free(valid), free(pixels), free(results), free(fewer);
     return fine;
 }
 
@@ -182,12 +192,13 @@ static int fuzz(void) {
     const Part *last = parts + cameras.part_count - 1;
     const int64_t controls = last->kind == SURFACE ? last->n * last->m : 0;
     const int64_t pieces = controls ? PIECE * (last->n - last->flags) * (last->m - last->flags) : 0;
-    if (controls && below(2)) {
+    if (controls && below(4)) {
         uint8_t *certain = KEPT(malloc((size_t)(c * controls)));
-        for (i = 0; i < c * controls; i++) certain[i] = (uint8_t)below(2);
+        const int all = below(4) > 0;
+        for (i = 0; i < c * controls; i++) certain[i] = (uint8_t)(all || below(2));
         cameras.certain = certain, cameras.certain2 = KEPT(filled(d, c, 2, 2));
         if (below(2)) cameras.pieces = KEPT(filled(d, c * pieces, 2, 0));
-        if (below(2)) cameras.start = KEPT(filled(d, c * START, 2, 0));
+        if (below(4)) cameras.start = KEPT(filled(d, c * START, 2, 0));
     }
     if (parts[0].kind == INVERTED) {
         cameras.chart_inner2 = KEPT(filled(d, c, 2, 2)), cameras.chart_most2 = KEPT(filled(d, c, 2, 2));
