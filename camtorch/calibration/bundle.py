@@ -441,11 +441,11 @@ class Bundle:
 
     def cost(self, flat: Sequence[Tensor], rows: Tensor) -> Tensor:
         """(R,)."""
-        total = torch.stack([look.cost.sum(-1) for look in self.looks(flat, rows)]).sum(0)
+        total = torch.cat([look.cost for look in self.looks(flat, rows)], -1).sum(-1)
         for sight, parameters in zip(self.sights, flat[5:], strict=True):
             if sight.prior:
                 total = total + ((parameters - sight.prior.centre) @ sight.prior.root.mT).square().sum(-1)
-        return torch.where(torch.isfinite(total), total, torch.inf)
+        return total.nan_to_num(torch.inf, torch.inf)
 
     # -- the linear problem
 
