@@ -273,15 +273,15 @@ def bent(points: Tensor, bend: Tensor) -> tuple[Tensor, Tensor]:
 class _Look(NamedTuple):
     """What a camera makes of a state.
 
-    residuals: (B, V, N, 2). valid, weights: (B, V, N), the weights of the squares. cost: (B, V). native: the camera,
-    where compiled code made this.
+    residuals: (B, V, N, 2). valid, weights: (B, V, N), the weights of the squares. cost: (B, V). triangles: those of
+    `Equations`, without priors, where compiled code made them in passing.
     """
 
     residuals: Tensor
     valid: Tensor
     weights: Tensor
     cost: Tensor
-    native: compiled.Native | None = None
+    triangles: tuple[Tensor, Tensor] | None = None
 
 
 class Bundle:
@@ -402,7 +402,12 @@ class Bundle:
             parameters = state.parameters[0][: 1 if self.are_shared[0] else None]
             native = Cameras(type(self.cameras[0]), parameters[:, :4], parameters[:, 4:]).native
             assert native is not None  # it was there for the first ones
-            return _Look(*compiled_poses.seen(native, *self._of_sight(state, sight))[0], native)
+            own = self.learnt[0][1].tolist()
+            has_triangles = native.plan.places is not None or all(i < 4 for i in own)
+            given = sight.points, state.boards, sight.pixels, sight.weights, (self.loss, self.loss_scale)
+            # the next step begins here, unless this one was in vain
+            made, *triangles = compiled_poses.seen(native, *given, own if has_triangles else None)
+            return _Look(*made, (triangles[0], triangles[1]) if has_triangles else None)
         pixels, valid = self.camera(c, state).project(self.points(c, state, sight)[-1])
         residuals = torch.where((valid & (sight.weights > 0))[..., None], pixels - sight.pixels, 0.0)
         u, v = residuals.unbind(-1)
@@ -432,15 +437,15 @@ class Bundle:
     def sight(self, c: int, rows: Tensor | None) -> Sight:
         """Of some problems."""
         sight = self.sights[c]
-        return sight if rows is None else sight.mapped(lambda t: _of_rows(t, rows))
+        return sight if rows is None or len(rows) == len(sight.weights) else sight.mapped(lambda t: t[rows])
 
     def cost(self, flat: Sequence[Tensor], rows: Tensor) -> Tensor:
         """(R,)."""
-        total = torch.stack([look.cost.sum(-1) for look in self.looks(flat, rows)]).sum(0)
+        total = torch.cat([look.cost for look in self.looks(flat, rows)], -1).sum(-1)
         for sight, parameters in zip(self.sights, flat[5:], strict=True):
             if sight.prior:
                 total = total + ((parameters - sight.prior.centre) @ sight.prior.root.mT).square().sum(-1)
-        return torch.where(torch.isfinite(total), total, torch.inf)
+        return total.nan_to_num(torch.inf, torch.inf)
 
     # -- the linear problem
 
@@ -460,10 +465,14 @@ class Bundle:
         """The triangles of a state."""
         rows = torch.arange(len(flat[0]), device=flat[0].device) if rows is None else rows
         state, width, total = self.state(flat), self.width, len(self.columns)
-        if (found := self._compiled(flat, rows)) is not None:
-            return found
-        parts = []
-        for c, look in enumerate(self.looks(flat, rows)):
+        looks, parts = self.looks(flat, rows), []
+        if (made := looks[0].triangles) is not None:
+            view, shared = made
+            if self.sights[0].prior:
+                whole = torch.cat((shared, *self._rows_of_priors(state)), -2)
+                shared = torch.linalg.qr(padded(whole), mode="r").R
+            return Equations(view, shared, self.columns)
+        for c, look in enumerate(looks):
             block, at = self.rows_of(c, look, state, rows)
             if total == 0:
                 parts.append(block)
@@ -481,22 +490,6 @@ class Bundle:
         left = torch.cat((triangle[..., width:, width:].flatten(1, 2), *self._rows_of_priors(state)), -2)
         shared = torch.linalg.qr(padded(left), mode="r").R
         return Equations(triangle[..., :width, :], shared, self.columns)
-
-    def _compiled(self, flat: Sequence[Tensor], rows: Tensor) -> Equations | None:
-        """The same by compiled code, where there is any, of one camera and flat boards that may be anywhere."""
-        (_, own), *_ = self.learnt
-        look, state, sight = self.looks(flat, rows)[0], self.state(flat), self.sight(0, rows)
-        if look.native is None or (look.native.plan.places is None and bool((own >= 4).any())):
-            return None
-        _, view, shared = compiled_poses.seen(look.native, *self._of_sight(state, sight), own.tolist())
-        if sight.prior:
-            whole = torch.cat((shared, *self._rows_of_priors(state)), -2)
-            shared = torch.linalg.qr(padded(whole), mode="r").R
-        return Equations(view, shared, self.columns)
-
-    def _of_sight(self, state: State, sight: Sight) -> tuple[Tensor, Poses, Tensor, Tensor, tuple[str | None, float]]:
-        """What compiled code takes."""
-        return sight.points, state.boards, sight.pixels, sight.weights, (self.loss, self.loss_scale)
 
     def _rows_of_priors(self, state: State) -> list[Tensor]:
         """(B, R, G + 1) of each."""
