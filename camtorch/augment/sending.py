@@ -72,11 +72,18 @@ def within_message(value: Any) -> Any:
     """What a worker sends, as it is elsewhere; if it is a small tensor, or something else that has some, by value."""
     if get_worker_info() is None:
         return value
-    if type(value) is Tensor:
+    if _is_plain(value):
         return value.as_subclass(Sent)
     if isinstance(value, nn.Module):
         ForkingPickler.register(type(value), _by_value)
     return value
+
+
+def _is_plain(value: Any) -> bool:
+    """Whether it is a tensor that its bytes, dtype and shape say all of."""
+    if type(value) is not Tensor or value.layout != torch.strided or not value.is_cpu:
+        return False
+    return not (value.requires_grad or value.is_quantized or value.is_conj() or value.is_neg())
 
 
 def _by_value(module: nn.Module) -> tuple[Callable[[bytes], Any], tuple[bytes]]:
@@ -86,10 +93,7 @@ def _by_value(module: nn.Module) -> tuple[Callable[[bytes], Any], tuple[bytes]]:
 def stacked(batch: Sequence[Tensor]) -> Tensor | None:
     """A batch of tensors of one shape, ready to be sent; None where no worker asks, and where torch's own way does."""
     first = batch[0]
-    if get_worker_info() is None or any(
-        type(t) is not Tensor or t.dtype != first.dtype or t.layout != torch.strided or not t.is_cpu or t.requires_grad
-        for t in batch
-    ):
+    if get_worker_info() is None or any(t.dtype != first.dtype or not _is_plain(t) for t in batch):
         return None
     like = torch.empty(len(batch), *first.shape, dtype=first.dtype, device="meta")
     if like.nbytes < _SMALL:
@@ -162,7 +166,9 @@ def _arrived(process: int, file: int, size: int, dtype: torch.dtype, shape: tupl
 
 
 def _unpacked(data: bytes, dtype: torch.dtype, shape: tuple[int, ...]) -> Tensor:
-    return torch.frombuffer(bytearray(data), dtype=dtype).view(shape) if data else torch.empty(shape, dtype=dtype)
+    if not data:
+        return torch.empty(shape, dtype=dtype, device="cpu")
+    return torch.frombuffer(bytearray(data), dtype=dtype).view(shape)
 
 
 def _forked() -> None:
@@ -173,4 +179,4 @@ def _forked() -> None:
 
 ForkingPickler.register(Sent, _reduced)
 if hasattr(os, "register_at_fork"):
-    os.register_at_fork(before=_forked)
+    os.register_at_fork(before=_forked, after_in_parent=_forked, after_in_child=_forked)  # threads go on in between

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import functools
+import math
 import mmap
 import weakref
 from collections.abc import Callable
@@ -37,7 +38,8 @@ def tensor_on(
     """A tensor on the memory of a block; and what is called when it is gone."""
     memory = (ctypes.c_char * len(block)).from_buffer(block)  # which the storage holds, and nothing else
     weakref.finalize(memory, died).atexit = False
-    storage = torch.frombuffer(memory, dtype=torch.uint8).untyped_storage()
+    count = math.prod(shape) * dtype.itemsize  # a storage is saved as a whole, so of the tensor's bytes alone
+    storage = torch.frombuffer(memory, dtype=torch.uint8, count=count).untyped_storage()
     # not a view, of which there are things that cannot be done
     return torch.empty(0, dtype=dtype, device="cpu").set_(storage, 0, shape, strides)
 

@@ -1,6 +1,7 @@
 """Batches that workers send in memory which is used again: what comes out stays what it is."""
 
 import copy
+import io
 import os
 import pickle
 from pathlib import Path
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from torch.utils.data import DataLoader, Dataset
+from torch.utils.data._utils.collate import default_collate_fn_map
 
 from camtorch.augment import collate
 
@@ -170,3 +172,34 @@ def test_another_strategy_of_torchs_is_kept(monkeypatch):
     for _, batch in numbered(loader()):
         assert batch["image"].is_shared()
         assert not batch["number"].is_shared()
+
+
+def test_what_arrives_can_be_saved_and_loaded():
+    batch = next(iter(loader()))
+    for value in batch["image"], batch["depth"]:
+        assert value.untyped_storage().nbytes() == value.nbytes
+        file = io.BytesIO()
+        torch.save(value, file)
+        file.seek(0)
+        assert torch.equal(torch.load(file), value)
+
+
+UNLIKE = {
+    "sparse": lambda: torch.eye(3).to_sparse(),
+    "compressed": lambda: torch.eye(3).to_sparse_csr(),
+    "conjugate": lambda: torch.ones(3, dtype=torch.complex64).conj(),
+    "quantized": lambda: torch.quantize_per_tensor(torch.ones(3), 0.1, 0, torch.quint8),
+    "learns": lambda: torch.ones(3, requires_grad=True),
+}
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")  # torch's, of what is beta
+@pytest.mark.parametrize("name", UNLIKE)
+def test_what_is_more_than_its_bytes_goes_torchs_way(monkeypatch, name):
+    class Odd:
+        """Whose batches are made by a function of somebody's own."""
+
+    monkeypatch.setitem(default_collate_fn_map, Odd, lambda batch, *, collate_fn_map=None: UNLIKE[name]())
+    value = next(iter(DataLoader([Odd()] * 2, 2, num_workers=1, collate_fn=collate, timeout=30)))
+    assert value.layout == UNLIKE[name]().layout
+    assert value.requires_grad == (name == "learns")
