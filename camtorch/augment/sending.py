@@ -31,7 +31,7 @@ _MOST = 32
 _HOME, _AWAY, _LOST = 0, 1, 2
 
 
-class Sent(Tensor):
+class _Sent(Tensor):
     """A batch in a worker, which comes out of the DataLoader as a plain tensor; so does what is computed from it."""
 
     __torch_function__ = torch._C._disabled_torch_function_impl  # type: ignore[assignment]
@@ -73,7 +73,7 @@ def within_message(value: Any) -> Any:
     if get_worker_info() is None:
         return value
     if _is_plain(value):
-        return value.as_subclass(Sent)
+        return value.as_subclass(_Sent)
     if isinstance(value, nn.Module):
         ForkingPickler.register(type(value), _by_value)
     return value
@@ -97,14 +97,14 @@ def stacked(batch: Sequence[Tensor]) -> Tensor | None:
         return None
     like = torch.empty(len(batch), *first.shape, dtype=first.dtype, device="meta")
     if like.nbytes < _SMALL:
-        return torch.stack(list(batch)).as_subclass(Sent)
+        return torch.stack(list(batch)).as_subclass(_Sent)
     block = _block(like.nbytes)
     if block is None:
         return None
     place = torch.frombuffer(block.memory, dtype=torch.uint8).data_ptr()
     _held[place] = block
     result = tensor_on(block.memory, like.dtype, like.shape, like.stride(), functools.partial(block.back, place))
-    return torch.stack(list(batch), out=result).as_subclass(Sent)
+    return torch.stack(list(batch), out=result).as_subclass(_Sent)
 
 
 def _block(size: int) -> _Block | None:
@@ -141,7 +141,7 @@ def _mapped(process: int, file: int, size: int) -> mmap.mmap:
         return mmap.mmap(opened.fileno(), size + 1)
 
 
-def _reduced(sent: Sent) -> tuple[Callable[..., Tensor], tuple[Any, ...]]:
+def _reduced(sent: _Sent) -> tuple[Callable[..., Tensor], tuple[Any, ...]]:
     """What another process makes the tensor of."""
     block, what = _held.get(sent.data_ptr()), (sent.dtype, tuple(sent.shape))
     if sent.is_contiguous() and not sent.requires_grad:
@@ -177,6 +177,6 @@ def _forked() -> None:
     _forks += 1
 
 
-ForkingPickler.register(Sent, _reduced)
+ForkingPickler.register(_Sent, _reduced)
 if hasattr(os, "register_at_fork"):
     os.register_at_fork(before=_forked, after_in_parent=_forked, after_in_child=_forked)  # threads go on in between
