@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import ctypes
 import os
 import sys
@@ -60,13 +61,13 @@ def spread(work: Callable[[], object], threads: int) -> None:
             raise run.error
 
 
-_idle: list[SimpleQueue[_Run]] = []  # of workers: where each takes what it is to do
+_idle: list[SimpleQueue[_Run | None]] = []  # of workers: where each takes what it is to do
 
 
 class _Run:
     """Of some work on a worker, unless the thread that asks for it takes it back before that begins."""
 
-    def __init__(self, work: Callable[[], object], worker: SimpleQueue[_Run]):
+    def __init__(self, work: Callable[[], object], worker: SimpleQueue[_Run | None]):
         self.work, self.worker, self.ticket, self.ending = work, worker, threading.Lock(), threading.Lock()
         self.error: BaseException | None = None
         self.ending.acquire()
@@ -94,20 +95,40 @@ def _begin(work: Callable[[], object]) -> _Run:
         worker = _idle.pop()
     except IndexError:
         worker = SimpleQueue()
-        # the interpreter need not end it: all it does then is wait
-        threading.Thread(target=_serve, args=(worker,), name="camtorch", daemon=True).start()
+        thread = threading.Thread(target=_serve, args=(worker,), name="camtorch", daemon=True)
+        thread.start()
+        _started.append((thread, worker))
     run = _Run(work, worker)
     worker.put(run)
     return run
 
 
-def _serve(worker: SimpleQueue[_Run]) -> None:
-    while True:
-        worker.get()()
+_started: list[tuple[threading.Thread, SimpleQueue[_Run | None]]] = []
 
 
-if hasattr(os, "register_at_fork"):  # not on Windows; the child of a fork has none of the threads
-    os.register_at_fork(after_in_child=_idle.clear)
+def _serve(worker: SimpleQueue[_Run | None]) -> None:
+    for run in iter(worker.get, None):
+        run()
+        del run  # and what it worked on
+
+
+@atexit.register
+def _end() -> None:
+    """A thread that wants the GIL while the interpreter ends is unwound, through torch's frames too, which aborts."""
+    for _, worker in _started:
+        worker.put(None)
+    for thread, _ in _started:
+        thread.join(1)
+
+
+def _forked() -> None:
+    """The child of a fork has none of the threads."""
+    _idle.clear()
+    _started.clear()
+
+
+if hasattr(os, "register_at_fork"):  # not on Windows
+    os.register_at_fork(after_in_child=_forked)
 
 
 # -- the threads of torch

@@ -1,6 +1,8 @@
 """Threads: who shares work, what comes of errors, forks and several callers, and that results do not depend on it."""
 
 import signal
+import subprocess
+import sys
 import threading
 import time
 from collections import deque
@@ -198,3 +200,20 @@ def test_several_threads_use_one_camera():
         caller.join()
     assert len(found) == 4
     assert all(torch.equal(a, b) for results in found for a, b in zip(results, expected, strict=True))
+
+
+def test_threads_end_before_the_interpreter():
+    code = """
+import atexit, threading
+
+@atexit.register  # so that it is called after camtorch's
+def check():
+    names = [thread.name for thread in threading.enumerate()]
+    print("worked" if worked else "alone", names)
+
+from camtorch._threads import spread
+worked, both = [], threading.Barrier(2)
+spread(lambda: worked.append(both.wait(20)), 2)
+"""
+    done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
+    assert done.stdout == "worked ['MainThread']\n"
