@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import json
 import os
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -24,6 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camtorch.boards.boards import Board, board_of
+from camtorch.boards.detection import NOT_FOUND
 from camtorch.io.writing import as_json, replacing
 
 _FORMAT = "camtorch_corners"
@@ -53,6 +55,24 @@ class ImageCorners:
     def seen(self) -> int:
         """How many points."""
         return int(np.isfinite(self.pixels[:, 0]).sum())
+
+    def unusable(self, usual: tuple[int, int] | None) -> str:
+        """Why it says nothing of a camera whose images have a size, (height, width), as a rule; empty where it does."""
+        if self.reason or not self.seen:
+            return self.reason or NOT_FOUND
+        if self.image_size == usual:
+            return ""
+        own, most = (f"{size[1]}x{size[0]}" for size in (self.image_size, usual) if size)
+        return f"{own}, but most images are {most}"
+
+
+def usual_sizes(images: Sequence[ImageCorners]) -> dict[str, tuple[int, int]]:
+    """(height, width) of most images that show the board, by the name of their camera."""
+    sizes: dict[str, Counter[tuple[int, int]]] = {}
+    for image in images:
+        if image.seen and image.image_size:
+            sizes.setdefault(image.camera, Counter())[image.image_size] += 1
+    return {camera: counted.most_common(1)[0][0] for camera, counted in sizes.items()}
 
 
 @dataclass(eq=False)

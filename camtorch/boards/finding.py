@@ -5,7 +5,6 @@ from __future__ import annotations
 import glob
 import os
 import re
-from collections import Counter
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -18,8 +17,10 @@ from numpy.typing import NDArray
 from camtorch._arguments import as_number, shown, warn
 from camtorch._photographs import read_stored
 from camtorch.boards.boards import Board, board_of, opencv
-from camtorch.boards.detection import Detection, detect
+from camtorch.boards.corners import ImageCorners, usual_sizes
+from camtorch.boards.detection import detect
 from camtorch.jobs.inputs import IMAGES, natural
+from camtorch.jobs.processes import reason
 
 _OWNER = "find_board"
 _NAMED = 6  # images left out, in the warning
@@ -73,30 +74,20 @@ def find_board(images: Any, board: Any, *, square: float = 1.0, **options: Any) 
     wanted = as_board(board, as_number(square, "square", _OWNER), options)
     given = _given(images)
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        found = list(pool.map(lambda one: _searched(wanted, one[1]), given))
-    sizes = Counter(size for size, detection in found if size is not None and not detection.reason)
-    if not sizes:
-        reasons = "; ".join(
-            f"{name}: {detection.reason}" for (name, _), (_, detection) in zip(given, found, strict=True)
-        )
+        found = list(pool.map(lambda one: corners_in(wanted, *one), given))
+    usual = usual_sizes(found).get("")
+    if usual is None:
+        reasons = "; ".join(f"{one.path}: {one.reason}" for one in found)
         raise ValueError(f"{_OWNER}: {wanted.words()} is in none of {len(given)} images: {reasons:.500}")
-    usual = sizes.most_common(1)[0][0]
-    left_out, names, pixels = [], [], []
-    for (name, _), (size, detection) in zip(given, found, strict=True):
-        reason = detection.reason
-        if not reason and size != usual:
-            reason = f"{size} (height, width), but most images are {usual}"
-        if reason:
-            left_out.append(f"{name} ({reason})")
-        else:
-            names.append(name)
-            pixels.append(detection.pixels)
+    left_out = [f"{one.path} ({why})" for one in found if (why := one.unusable(usual))]
+    used = [one for one in found if not one.unusable(usual)]
     if left_out:
         more = f" and {len(left_out) - _NAMED} more" if len(left_out) > _NAMED else ""
         warn(
             f"{_OWNER}: {len(left_out)} of {len(given)} images are left out: {', '.join(left_out[:_NAMED])}{more}",
         )
-    return BoardObservations([wanted.points()] * len(names), pixels, names, usual)
+    points, pixels = [wanted.points()] * len(used), [one.pixels for one in used]
+    return BoardObservations(points, pixels, [str(one.path) for one in used], usual)
 
 
 def as_board(board: Any, square: float, options: dict[str, Any]) -> Board:
@@ -118,8 +109,8 @@ def as_board(board: Any, square: float, options: dict[str, Any]) -> Board:
     return board_of(own)
 
 
-def _given(images: Any) -> list[tuple[str, Any]]:
-    """(name, path or array) of all images."""
+def _given(images: Any) -> list[tuple[Path, NDArray[Any] | None]]:
+    """The path of each image, or a name and the array of one that is in memory."""
     if isinstance(images, (str, os.PathLike)):
         images = [images]
     if isinstance(images, (np.ndarray, torch.Tensor)):
@@ -128,12 +119,12 @@ def _given(images: Any) -> list[tuple[str, Any]]:
         raise TypeError(f"{_OWNER}: images must be paths or arrays; got {shown(images)}")
     if not images:
         raise ValueError(f"{_OWNER}: no images")
-    given: list[tuple[str, Any]] = []
+    given: list[tuple[Path, NDArray[Any] | None]] = []
     for i, one in enumerate(images):
         if isinstance(one, (str, os.PathLike)):
-            given += [(str(path), path) for path in gather([os.fspath(one)])]
+            given += [(path, None) for path in gather([os.fspath(one)])]
         elif isinstance(one, (np.ndarray, torch.Tensor)):
-            given.append((f"image {i}", _grey_of(one, f"images[{i}]")))
+            given.append((Path(f"image {i}"), _grey_of(one, f"images[{i}]")))
         else:
             raise TypeError(f"{_OWNER}: images[{i}] must be a path or an array; got {shown(one)}")
     return given
@@ -166,15 +157,15 @@ def _grey_of(image: Any, name: str) -> NDArray[Any]:
     return np.rint(array[..., :3].astype(np.float32) @ np.array(weights, np.float32)).astype(array.dtype)
 
 
-def _searched(board: Board, image: Any) -> tuple[tuple[int, int] | None, Detection]:
-    """The size of an image, and what it shows."""
-    if isinstance(image, Path):
-        try:
-            image = read_grey(image)
-        except (ValueError, OSError) as error:
-            return None, Detection(np.full((len(board.points()), 2), np.nan), str(error).removeprefix(f"{image}: "))
-    height, width = image.shape
-    return (height, width), detect(board, image)
+def corners_in(board: Board, path: Path, grey: NDArray[Any] | None = None) -> ImageCorners:
+    """What an image shows, which is read unless its grey values (H, W) are given."""
+    try:
+        grey = read_grey(path) if grey is None else grey
+    except (ValueError, OSError) as error:
+        nothing = np.full((len(board.points()), 2), np.nan)
+        return ImageCorners(path, None, nothing, reason(error).removeprefix(f"{path}: "))
+    found = detect(board, grey)
+    return ImageCorners(path, (grey.shape[0], grey.shape[1]), found.pixels, found.reason)
 
 
 def gather(words: Iterable[str]) -> list[Path]:

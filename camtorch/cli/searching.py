@@ -21,13 +21,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camtorch.boards.boards import Board, opencv
-from camtorch.boards.corners import Corners, ImageCorners, read_corners, write_corners
-from camtorch.boards.detection import NOT_FOUND, detect
-from camtorch.boards.finding import read_grey
+from camtorch.boards.corners import Corners, ImageCorners, read_corners, usual_sizes, write_corners
+from camtorch.boards.detection import detect
+from camtorch.boards.finding import corners_in
 from camtorch.cli import videos
 from camtorch.cli.terminal import bar, note
 from camtorch.jobs.inputs import hash_of, natural
-from camtorch.jobs.processes import reason
 
 _LEAST_VIEWS = 3
 _MOMENT = 0.5  # seconds, at least, of which the sharpest frame is taken
@@ -151,16 +150,10 @@ def _each(work: Callable[[T], R], tasks: Sequence[T], what: str) -> list[R]:
 def _searched(path: Path, board: Board, known: Mapping[Path, ImageCorners]) -> ImageCorners:
     """What an image shows; what is known of one that is gone, or that another tool has searched, is believed."""
     one = known.get(path.resolve())
-    try:
-        digest = hash_of(path) if path.exists() or one is None else one.hash
-        if one is not None and one.hash in ("", digest):
-            return replace(one, path=path)
-        grey = read_grey(path)
-    except (ValueError, OSError) as error:
-        why = reason(error).removeprefix(f"{path}: ")
-        return ImageCorners(path, None, np.full((len(board.points()), 2), np.nan), why)
-    found = detect(board, grey)
-    return ImageCorners(path, grey.shape, found.pixels, found.reason, digest)
+    digest = hash_of(path) if path.is_file() and os.access(path, os.R_OK) else ""
+    if one is not None and (one.hash in ("", digest) or not path.exists()):
+        return replace(one, path=path)
+    return replace(corners_in(board, path), hash=digest)
 
 
 def usable_views(corners: Corners) -> tuple[Views, dict[str, tuple[int, int]]]:
@@ -172,21 +165,15 @@ def usable_views(corners: Corners) -> tuple[Views, dict[str, tuple[int, int]]]:
     Raises:
         ValueError: too few.
     """
-    cameras = list(dict.fromkeys(image.camera for image in corners.images))
-    sizes = {name: Counter(i.image_size for i in corners.images if i.camera == name and i.seen) for name in cameras}
-    size_of = {name: count.most_common(1)[0][0] for name, count in sizes.items() if count}
+    size_of = usual_sizes(corners.images)
     views: Views = {}
     for number, image in enumerate(corners.images):
-        why = image.reason or ("" if image.seen else NOT_FOUND)
-        usual = size_of.get(image.camera)
-        if not why and image.image_size != usual:
-            why = f"{_shown(image.image_size)}, but most images are {_shown(usual)}"
-        if why:
+        if why := image.unusable(size_of.get(image.camera)):
             note(f"{image.path} is left out: {why}")
         else:
             # of a single camera every image is a view
             views.setdefault(image.view if image.camera else str(number), {})[image.camera] = image
-    for name in cameras:
+    for name in dict.fromkeys(image.camera for image in corners.images):
         seen = sum(name in of_view for of_view in views.values())
         if seen < _LEAST_VIEWS:
             of, total = f" of {name}" if name else "", sum(image.camera == name for image in corners.images)
@@ -194,11 +181,7 @@ def usable_views(corners: Corners) -> tuple[Views, dict[str, tuple[int, int]]]:
                 f"a board was found in {seen} of {total} images{of}, and {_LEAST_VIEWS} are needed, better 20; is it "
                 f"{'this one' if corners.board is None else corners.board.words()}?"
             )
-    return views, {name: size for name, size in size_of.items() if size is not None}
-
-
-def _shown(size: tuple[int, int] | None) -> str:
-    return "of no size" if size is None else f"{size[1]}x{size[0]}"
+    return views, size_of
 
 
 # -- corners in videos
