@@ -47,6 +47,14 @@ def skew_matrix(vectors: Tensor) -> Tensor:
     return matrix
 
 
+def nearest_rotation(matrices: Tensor) -> Tensor:
+    """(*B, 3, 3) rotations R of the greatest trace of R^T M, by Kabsch's method: the nearest to M by least squares."""
+    u, _, v = torch.linalg.svd(matrices)
+    last = u[..., 2:] * torch.linalg.det(u @ v)[..., None, None]
+    rotations: Tensor = torch.cat((u[..., :2], last), -1) @ v
+    return rotations
+
+
 def rotation_vector(matrix: Tensor) -> Tensor:
     """(*B, 3, 3) rotation matrices to (*B, 3) rotation vectors with an angle up to pi.
 

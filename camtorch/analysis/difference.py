@@ -10,6 +10,7 @@ from torch import Tensor
 
 from camtorch.camera import Camera
 from camtorch.projection.rays import image_lattice
+from camtorch.rotations import nearest_rotation
 
 _LONG = 400  # pixels of the lattice along the longer side
 _ROUNDING = 1e-9  # px, far above that of two equal cameras
@@ -86,19 +87,11 @@ def difference(a: Camera, b: Camera, *, remove_rotation: bool = False) -> Differ
     rays, seen = a.unproject(pixels)
     turn = torch.eye(3, dtype=torch.float64, device=rays.device)
     if remove_rotation:
-        turn = _rotation(rays, b.unproject(pixels), seen)
+        aim, found = b.unproject(pixels)
+        both = seen & found
+        turn = nearest_rotation(aim[both].double().mT @ rays[both].double())
     others, shown = b.project(rays.double() @ turn.mT)
     return Difference(torch.linalg.vector_norm(others.double() - pixels, dim=-1), seen & shown, turn)
-
-
-def _rotation(rays: Tensor, others: tuple[Tensor, Tensor], seen: Tensor) -> Tensor:
-    """The rotation R of least squares of `R ray - other`, by Kabsch's method."""
-    use = seen & others[1]
-    u, _, vh = torch.linalg.svd(others[0][use].double().mT @ rays[use].double())
-    sign = torch.ones(3, dtype=torch.float64, device=u.device)
-    sign[2] = torch.linalg.det(u @ vh)
-    rotation: Tensor = u @ torch.diag(sign) @ vh
-    return rotation
 
 
 def angle(rotation: Tensor) -> float:

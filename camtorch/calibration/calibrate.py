@@ -54,6 +54,14 @@ class Model:
         """Of all parameters."""
         return (*INTRINSICS, *(self.kind.names_of(self.count) or ()))
 
+    def camera(self, parameters: Tensor, image_size: tuple[int, int] | None) -> Camera:
+        """That of parameters (*B, 4 + n), in which what is frozen in the camera to start from is frozen."""
+        parts = parameters.split((4, self.count) if self.count else 4, -1)
+        found = self.kind(*parts, image_size=image_size)
+        if self.start is not None and (frozen := frozen_names(self.start)):
+            found.freeze(*frozen)
+        return found
+
 
 def as_model(
     model: type[Camera] | str | Camera,
@@ -607,14 +615,9 @@ def _result(
     """The result for one of the cameras."""
     asked, seen = search.asked, search.given
     state, residuals, valid = adjusted.state, adjusted.residuals[camera][0], adjusted.valid[camera][0]
-    parameters = state.parameters[camera][0]
-    arguments = (parameters[:4], parameters[4:]) if asked.count else (parameters[:4],)
     rotations, translations = (t[0] for t in _seen_from(state, camera))
-    found = asked.kind(*arguments, image_size=layout.image_size)
-    if asked.start is not None and (frozen := frozen_names(asked.start)):
-        found.freeze(*frozen)
     return Calibration(
-        camera=found,
+        camera=asked.camera(state.parameters[camera][0], layout.image_size),
         extrinsics=Extrinsics(rotation_vector(rotations).unsqueeze(-1), translations - rotations @ search.middle),
         rms=rms_of(residuals, seen.seen),
         sigma=float(sigma),

@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 
 from camtorch._arguments import Numbers, as_image_size, as_values
-from camtorch._freezing import frozen_names
 from camtorch._threads import on_one_thread
 from camtorch.calibration.calibrate import Model, as_model
 from camtorch.camera import Camera, fixed_camera
@@ -95,10 +94,7 @@ def fit(
         kept = kept.to(starts)
         starts = torch.where(kept[4:].isnan(), starts, kept[4:])
     parameters = fitting.fit(template, seen, starts, slopes, fixed=kept)
-    parts = parameters[:, :4].reshape(*batch, 4), parameters[:, 4:].reshape(*batch, asked.count)
-    camera = asked.kind(*parts[: 1 + (asked.count > 0)], image_size=size)
-    if start is not None and (frozen := frozen_names(start)):
-        camera.freeze(*frozen)
+    camera = asked.camera(parameters.reshape(*batch, -1), size)
     found, valid = fixed_camera(asked.kind, parameters[:, :4], parameters[:, 4:]).project(seen.rays)
     shown = valid & counts
     errors = torch.where(shown, torch.linalg.vector_norm(found - seen.pixels, dim=-1), 0.0)

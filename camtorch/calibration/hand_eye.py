@@ -11,7 +11,6 @@ import torch
 from torch import Tensor
 
 from camtorch._arguments import shown, warn
-from camtorch._freezing import frozen_names
 from camtorch._threads import on_one_thread
 from camtorch.calibration.bundle import Adjusted, Free, Poses, Sight, State
 from camtorch.calibration.calibrate import STEPS, Search, as_model, as_options, middle_of, noise_of, rms_of
@@ -19,7 +18,7 @@ from camtorch.calibration.observations import Observations, Points, _as_float64,
 from camtorch.calibration.uncertainty import shared_factor
 from camtorch.camera import Camera
 from camtorch.extrinsics import Extrinsics
-from camtorch.rotations import rotation_vector, skew_matrix
+from camtorch.rotations import nearest_rotation, rotation_vector, skew_matrix
 
 _POSE = ("wx", "wy", "wz", "tx", "ty", "tz")
 _LEAST_VIEWS = 3
@@ -247,7 +246,8 @@ def _closed_form(boards: Poses, motions: Poses, has: Tensor) -> tuple[Poses, Pos
     for _ in range(_ROUNDS):
         products = torch.einsum("bv,bvki,bvlj->bijkl", weights, boards.rotations, motions.rotations)
         left, _, right = torch.linalg.svd(products.flatten(3, 4).flatten(1, 2))
-        x, y = (_nearest_rotation(v.unflatten(-1, (3, 3))) for v in (right[:, 0], left[..., 0]))
+        vectors = torch.stack((right[:, 0], left[..., 0])).unflatten(-1, (3, 3))  # up to scale and sign
+        x, y = nearest_rotation(vectors * torch.linalg.det(vectors).sign()[..., None, None])
         turned = x[:, None] @ motions.rotations
         gap = boards.rotations @ y[:, None] @ turned.mT
         angle = torch.linalg.vector_norm(rotation_vector(gap), dim=-1).masked_fill(~has, torch.nan)
@@ -260,13 +260,6 @@ def _closed_form(boards: Poses, motions: Poses, has: Tensor) -> tuple[Poses, Pos
         shifts = (torch.linalg.pinv(rows) @ (rest * root).flatten(1, 2)[..., None])[..., 0]
         weights = torch.where(has, 1 / (1 + (angle.nan_to_num() / scale).square()), 0.0)
     return Poses(x[:, None], shifts[:, None, 3:]), Poses(y.mT[:, None], shifts[:, None, :3]), middle
-
-
-def _nearest_rotation(matrix: Tensor) -> Tensor:
-    """(B, 3, 3): of a matrix up to its scale and sign."""
-    left, _, right = torch.linalg.svd(matrix * torch.linalg.det(matrix).sign()[:, None, None])
-    nearest: Tensor = left @ right
-    return nearest
 
 
 def _result(
@@ -322,12 +315,8 @@ def _result(
         rows = layout.restore(values.flatten(0, 1)[layout.views])
         return rows.unflatten(0, (*batch, -1)) if batch else rows
 
-    numbers = one(parameters)
-    camera = asked.kind(numbers[..., :4], numbers[..., 4:], image_size=layout.image_size)
-    if asked.start is not None and (frozen := frozen_names(asked.start)):
-        camera.freeze(*frozen)
     return HandEyeCalibration(
-        camera=camera,
+        camera=asked.camera(one(parameters), layout.image_size),
         hand_eye=Extrinsics.from_matrix(one(mounts)),
         world=Extrinsics.from_matrix(one(worlds)),
         rms=parameters.new_tensor(rms) if batch else rms[0],

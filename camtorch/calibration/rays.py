@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from camtorch.calibration.compiled import can_search, from_rays
-from camtorch.rotations import small_turn
+from camtorch.rotations import nearest_rotation, small_turn
 
 _PAIRS = ((0, 1, 2), (1, 3, 4), (2, 4, 5))  # of symmetric matrices, the place among six entries
 _FLAT = 1e-6  # of the points' extent: less counts as none
@@ -240,7 +240,7 @@ def _rotations_in_space(local: Tensor, rays: Tensor, weights: Tensor, distances:
     rows = (weights[..., None] * (rays @ frame[..., :2])).mT @ local
     rows = normalize(rows / (weights[..., None] * local.square()).sum(-2).clamp(min=_TINY)[:, None], dim=-1)
     from_afar = frame @ torch.cat((rows, torch.linalg.cross(rows[:, :1], rows[:, 1:])), 1)
-    nearest = _nearest_rotation(torch.cat((linear, from_afar[:, None]), 1))
+    nearest = nearest_rotation(torch.cat((linear, from_afar[:, None]), 1))
     planar = _planar_starts(rays, weights, distances)
     rotations = torch.cat((nearest, planar, frame[:, None] @ _right_turns(frame)), 1)
 
@@ -267,11 +267,3 @@ def _right_turns(like: Tensor) -> Tensor:
     signs = torch.cartesian_prod(*[like.new_tensor([1.0, -1.0])] * 3)
     matrices = (matrices[:, None] * signs[:, None]).flatten(0, 1)
     return matrices[torch.linalg.det(matrices) > 0]
-
-
-def _nearest_rotation(matrices: Tensor) -> Tensor:
-    """(..., 3, 3) rotations."""
-    u, _, v = torch.linalg.svd(matrices)
-    last = u[..., 2:] * torch.linalg.det(u @ v)[..., None, None]
-    rotation: Tensor = torch.cat((u[..., :2], last), -1) @ v
-    return rotation

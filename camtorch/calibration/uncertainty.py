@@ -12,6 +12,7 @@ from camtorch._arguments import Numbers, as_values
 from camtorch.calibration.bundle import Adjusted, pixel_jacobians, robust
 from camtorch.camera import Camera, fixed_camera
 from camtorch.least_squares.equations import Equations
+from camtorch.rotations import skew_matrix
 
 _PIXELS = 1 << 15  # that are looked at together
 # Relative to the greatest singular value. Parameters of which a camera has one too many, as the turn of a panorama and
@@ -85,7 +86,7 @@ def spread(adjusted: Adjusted, model: type[Camera], camera: int) -> Spread:
     none = frame.new_zeros(len(frame), 3, frame.shape[-1] - shared.shape[-1])
     turn = torch.cat((turn, none), -1) + rotation @ frame[:, :3]
     shift = torch.cat((shift, none), -1) + rotation @ frame[:, 3:]
-    shift = shift + _cross_matrix(mounts.translations[:, camera]) @ turn
+    shift = shift + skew_matrix(mounts.translations[:, camera]) @ turn
     own = torch.cat((own[:, :count], none[:, :1].expand(-1, count, -1)), -1)
     factor = torch.cat((own, turn, shift), 1)
     return Spread(model, parameters.expand(len(factor), -1), factor)
@@ -148,18 +149,10 @@ def _frame_factor(equations: Equations, translations: Tensor, shared: Tensor) ->
     inverse = inverse * share[..., None, None]
     turn = inverse[..., :3, :]
     # about the origin, not the board
-    carried = torch.cat((turn, inverse[..., 3:, :] + _cross_matrix(translations) @ turn), -2)
+    carried = torch.cat((turn, inverse[..., 3:, :] + skew_matrix(translations) @ turn), -2)
     by_shared = -(carried @ right).sum(1)
     by_noise = carried.movedim(1, -2).flatten(-2)  # (B, 6, 6 V)
     return torch.cat((by_shared @ shared, torch.linalg.qr(by_noise.mT, mode="r").R.mT), -1)
-
-
-def _cross_matrix(vectors: Tensor) -> Tensor:
-    """(..., 3, 3): that of the product v x."""
-    x, y, z = vectors.unbind(-1)
-    zero = torch.zeros_like(x)
-    matrix: Tensor = torch.stack((zero, -z, y, z, zero, -x, -y, x, zero), -1).unflatten(-1, (3, 3))
-    return matrix
 
 
 def worst(covariances: Tensor) -> Tensor:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
 from typing import TYPE_CHECKING, NamedTuple
 
 import torch
@@ -44,7 +43,6 @@ def fit(
     observations: Observations,
     starts: Tensor,
     slopes: Tensor,
-    held: Collection[str] = (),
     fixed: Tensor | None = None,
 ) -> Tensor:
     """The parameters (C, 4 + n) at which a camera sees the pixels of the rays as nearly as it can.
@@ -56,7 +54,6 @@ def fit(
         observations: what it shall see.
         starts: (S, C, n) coefficients to start from; of what becomes of them the best is kept.
         slopes: (C, 4) the focal lengths at the axis in x and y, and the pixel of the axis.
-        held: names of coefficients that stay as they start.
         fixed: (4 + n,) values that parameters keep, NaN for those that are looked for.
     """
     smooth = camera.smoothness()
@@ -68,7 +65,7 @@ def fit(
     for start in starts:
         focal = slopes[:, :2] / slopes_at_axis(camera.optics, start).clamp(min=_LEAST_SLOPE)
         parameters = torch.cat((focal, slopes[:, 2:], start), -1)
-        low, high = bounds(camera, parameters, held)
+        low, high = bounds(camera, parameters)
         if fixed is not None:
             low, high = (torch.where(fixed.isnan(), ends, fixed) for ends in (low, high))
         parameters = parameters.clamp(low, high)
@@ -146,12 +143,12 @@ def _distances(observations: Observations, camera: Camera, parameters: Tensor) -
     return distances
 
 
-def bounds(camera: Camera, parameters: Tensor, held: Collection[str] = ()) -> tuple[Tensor, Tensor]:
+def bounds(camera: Camera, parameters: Tensor) -> tuple[Tensor, Tensor]:
     """The least and the greatest parameters (C, 4 + n); a focal length stays within a factor of 1000."""
     low, high = torch.full_like(parameters, -torch.inf), torch.full_like(parameters, torch.inf)
     low[:, :2], high[:, :2] = parameters[:, :2] * 1e-3, parameters[:, :2] * 1e3
     for i, name in enumerate(camera.distortion_names, 4):
-        ends = None if name in held else camera.fit_bounds.get(name, (-torch.inf, torch.inf))
+        ends = camera.fit_bounds.get(name, (-torch.inf, torch.inf))
         low[:, i], high[:, i] = ends or (parameters[:, i], parameters[:, i])
     return low, high
 

@@ -32,7 +32,7 @@ from camtorch.extrinsics import Extrinsics
 from camtorch.io.filestorage import Value, write
 from camtorch.models import Cylindrical, Equirectangular, LatLon, Pinhole, TransverseCylindrical
 from camtorch.native.sampler import Later, finish
-from camtorch.rotations import rotation_matrix
+from camtorch.rotations import rotation_matrix, skew_matrix
 from camtorch.warp import routes
 from camtorch.warp.dewarp import middle_lines
 from camtorch.warp.proxy import check_pose
@@ -456,16 +456,12 @@ def frame_of(extrinsics: Extrinsics, vertical: bool, align: Align) -> Frame:
     axis = int(vertical)
     if align == "opencv":
         half = rotation_matrix(-extrinsics.rotation.double() / 2)
-        across = (half @ translation[..., None])[..., 0]
+        across = (half @ translation[..., None])[..., 0] / length[..., None]
         # the shortest turn that brings the baseline to its axis
         sign = torch.where(across[..., axis] > 0, 1.0, -1.0).to(across)
         aim = sign[..., None] * _unit(axis, across)
-        normal = torch.linalg.cross(across, aim, dim=-1)
-        sine = torch.linalg.vector_norm(normal, dim=-1)
-        angle = torch.atan2(sine, (across * aim).sum(-1))
-        small = sine <= 1e-12 * length
-        factor = torch.where(small, 0.0, angle / torch.where(small, 1.0, sine))
-        turn = rotation_matrix(normal * factor[..., None])
+        skew, cosine = skew_matrix(torch.linalg.cross(across, aim, dim=-1)), (across * aim).sum(-1)
+        turn = torch.eye(3).to(skew) + skew + skew @ skew / (1 + cosine)[..., None, None]
         return Frame(turn @ half.mT, turn @ half, -sign * length)
     toward = -(rotation.mT @ translation[..., None])[..., 0] / length[..., None]  # of the right camera, from the left
     view, upright = rotation[..., 2, :] + _unit(2, rotation), rotation[..., axis, :] + _unit(axis, rotation)

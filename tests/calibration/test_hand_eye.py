@@ -53,6 +53,13 @@ def test_exact_corners_give_the_exact_poses(eye, held):
     torch.testing.assert_close(seen[known], corners.image_points[0][known], rtol=0, atol=1e-7)
 
 
+def test_a_model_may_have_no_coefficients():
+    corners, _, _, poses = made("in_hand")
+    found = calibrated(corners, poses, "in_hand", "pinhole")
+    assert found.camera.key == "pinhole"
+    assert found.covariance.shape == (16, 16)
+
+
 @pytest.mark.parametrize(
     ("eye", "held"), [("in_hand", False), ("to_hand", True), pytest.param("to_hand", False, marks=pytest.mark.slow)]
 )
