@@ -179,13 +179,9 @@ def test_boards_are_made_again_of_their_options(board):
         (lambda: Chessboard(2, 6), "at least 3x3 inner corners are needed; got 2x6"),
         (lambda: Chessboard(9, 6, 0.0), "must be positive"),
         (lambda: Chessboard(9, 6, float("nan")), "must be positive"),
-        (lambda: Charuco(5, 5, 0.03, 0.03), "must be smaller than its square; got 0.03 in 0.03"),
         (lambda: AprilGrid(6, 6, 0.03, spacing=0), "above 0 and at most 2; got 0"),
         (lambda: AprilGrid(6, 6, 0.03, border=0), "1, 2 or 3 cells; got 0"),
         (lambda: board_of({"type": "circles"}), "one of chessboard, charuco, aprilgrid; got 'circles'"),
-        (lambda: board_of({"type": "chessboard", "columns": 9}), "a chessboard has columns, rows, square; got columns"),
-        (lambda: list(Charuco(30, 30, 1.0, 0.5, "4X4_50").cells()), "has 50 markers"),
-        (lambda: detect(Charuco(5, 5, 1.0, 0.5, "99"), np.zeros((9, 9), np.uint8)), "no dictionary of markers"),
     ],
 )
 def test_bad_boards(make, text):

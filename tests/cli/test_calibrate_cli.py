@@ -1,7 +1,6 @@
 """From photographs on the command line to a camera's file."""
 
 import json
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -153,18 +152,6 @@ def test_corners_of_another_tool_need_no_image(capsys):
     words = "as a copy of a file does: they count once"
     assert f"shown again by views copy2.png, copy5.png, {words}" in " ".join(captured.err.split())
     assert_near(found_camera(), fisheye(), 0.5)
-
-
-@pytest.mark.parametrize("package", ["matplotlib", "jinja2"])
-def test_what_a_report_needs_is_asked_before_the_work(package, capsys, monkeypatch):
-    write_corners(corners_of(), "corners.json")
-    monkeypatch.setitem(sys.modules, package, None)
-    words = "--corners", "corners.json", "--report", "report.html", "-o", "camera.yml"
-    calibrate(*words, expect=2)
-    captured = capsys.readouterr()
-    assert "pip install 'camtorch[plot]'" in captured.err
-    assert captured.out == ""
-    assert sorted(path.name for path in Path().iterdir()) == ["corners.json"]
 
 
 def two_cameras(board):

@@ -119,12 +119,20 @@ CASES = {
         (f"augment {PHOTO} --pitch=5,-5", "pitch must be (low, high)"),
         (f"augment {PHOTO} --preset webcam --fov 200", "does not reach 200 degrees"),
         ("augment images --camera camera.yml", "images: a folder; a sheet is of one image, and --dataset LABELS"),
-        (
-            f"augment {PHOTO} --labels coco.json",
-            "coco.json: labels of a data set in COCO's form, which --dataset takes",
-        ),
         (f"augment {PHOTO} --labels labels.json -o labels.json --force", "would overwrite labels.json"),
         ("augment half.png --camera camera.yml", "--rescale scales the camera"),
+    ],
+    "map": [
+        ("map camera.yml", "-o OUT writes one, --check MAP measures one"),
+        ("map camera.yml -o a.bin", "does not say the format"),
+        ("map camera.yml -o camera.yml --format obj", "would overwrite camera.yml"),
+        ("map rig.json --name left -o rig --format dw100 --force", "rig.json: would overwrite"),
+        ("map camera.yml -o a.npz --fov 2.1", "2.1 seems to be radians"),
+        ("map camera.yml -o a.npz --fov 200", "below 180 for perspective; got 200"),
+        ("map camera.yml -o a.npz --target camera.yml --size 10x10", "--size is for a dewarping"),
+        ("map bare.yml -o a.npz", "bare.yml states no image size; --camera-size WxH says it"),
+        ("map camera.yml -o a.npz --step 8", "opencv has no step"),
+        ("map camera.yml --check rig.json", "say format"),
     ],
     "rectify": [
         (PAIR, "in.png: which cameras took the pair? --camera RIG"),
@@ -204,7 +212,6 @@ def files(tmp_path_factory):
     (folder / "bad.yml").write_text("K: [1, 2]")
     (folder / "bare.yml").write_text(LEVEL)
     (folder / "labels.json").write_text(json.dumps({"keypoints": [[20, 30]]}))
-    (folder / "coco.json").write_text(json.dumps({"images": [], "annotations": []}))
     (folder / "cut.png").write_bytes((folder / "in.png").read_bytes()[:3000])
     (folder / "images").mkdir()
     (folder / "empty").mkdir()
@@ -239,6 +246,8 @@ def test_errors_are_one_line_and_leave_nothing(files, monkeypatch, capsys, group
     ("module", "words", "text"),
     [
         ("matplotlib", "show camera.yml -o out.png", "pip install 'camtorch[plot]'"),
+        ("matplotlib", "calibrate --corners corners.json --report report.html", "pip install 'camtorch[plot]'"),
+        ("jinja2", "calibrate --corners corners.json --report report.html", "pip install 'camtorch[plot]'"),
         ("cv2", f"{PAIR} --camera rig.json --disparity", 'pip install "camtorch[stereo]"'),
         ("av", "dewarp in.png film.mkv --camera camera.yml -o out/", "pip install 'camtorch[video]'"),
     ],
@@ -246,4 +255,6 @@ def test_errors_are_one_line_and_leave_nothing(files, monkeypatch, capsys, group
 def test_a_package_that_lacks_is_named(files, monkeypatch, capsys, module, words, text):
     monkeypatch.chdir(files)
     monkeypatch.setitem(sys.modules, module, None)
+    before = sorted(files.iterdir())
     assert text in refused(capsys, *words.split())
+    assert sorted(files.iterdir()) == before

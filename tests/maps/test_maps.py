@@ -520,26 +520,6 @@ def test_the_command_writes_a_map_and_measures_one(folder, capsys):
     assert "80x60 from 320x200" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize(
-    ("words", "match"),
-    [
-        ("", "-o OUT writes one, --check MAP measures one"),
-        ("-o a.bin", "does not say the format"),
-        ("-o camera.json --format obj", "would overwrite camera.json"),
-        ("-o a.npz --fov 2.1", "2.1 seems to be radians"),
-        ("-o a.npz --fov 200", "below 180 for perspective; got 200"),
-        ("-o a.npz --target camera.json --size 10x10", "--size is for a dewarping"),
-        ("-o camera --format dw100 --force", "camera.json: would overwrite"),
-        ("-o a.npz --step 8", "opencv has no step"),
-        ("--check camera.json", "say format"),
-    ],
-)
-def test_the_command_says_what_it_cannot_do(words, match, folder, capsys):
-    assert main(["map", "camera.json", *words.split()]) == 2
-    assert match in capsys.readouterr().err
-    assert os.listdir(folder) == ["camera.json"]
-
-
 def test_masks_stay_bool_and_integers_whole(tmp_path):
     camera = ct.Pinhole([10.0, 10.0, 3.5, 3.5], image_size=(8, 8)).requires_grad_(False)
     ct.Warp(camera, camera).save(tmp_path / "map.npz")
