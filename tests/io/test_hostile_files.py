@@ -1,12 +1,17 @@
 """Broken and hostile files: one error with file, place and reason, quickly, and nothing else."""
 
+import io
 import json
 import math
 import os
+import pickle
+import re
 import struct
 import subprocess
 import sys
+import zipfile
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
@@ -18,6 +23,8 @@ import camtorch as ct
 pytestmark = pytest.mark.filterwarnings("ignore:.*4 coefficients and no fisheye_model")
 CAMERA = "1 PINHOLE 640 480 500 500 320 240\n"
 IMAGE = "1 1 0 0 0 0 0 0 1 a.jpg\n\n"
+BINARY = struct.pack("<QIiQQ4d", 1, 1, 1, 4, 4, 1, 1, 1, 1)
+GIGANTIC = struct.pack("<Q", 1 << 60)
 
 
 def written(path, content):
@@ -112,6 +119,22 @@ K = "[500, 0, 320, 0, 500, 240, 0, 0, 1]"
 CAM = "{camera_model: pinhole, distortion_model: none, intrinsics: [1, 1, 0, 0], resolution: [4, 4]}"
 LAUGHS = "".join(f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]\n" for i in range(1, 12))
 XML = "<opencv_storage>{}</opencv_storage>"
+OWN = """{"camtorch": 1, "extrinsics": {}, "cameras": {"a":
+    {"model": "kannala_brandt", "intrinsics": %s, "distortion": %s, "distortion_names": ["k1"]}}}"""
+
+
+def archive(**files):
+    content = io.BytesIO()
+    with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as file:
+        for name, data in files.items():
+            file.writestr(name.replace("__", "."), data)
+    return content.getvalue()
+
+
+def array(shape, data=b"", descr="<f8"):
+    content = io.BytesIO()
+    np.lib.format.write_array_header_1_0(content, {"descr": descr, "fortran_order": False, "shape": shape})
+    return content.getvalue() + data
 
 
 @pytest.mark.parametrize(
@@ -140,6 +163,10 @@ XML = "<opencv_storage>{}</opencv_storage>"
         ("a.json", '{"camtorch": 1, "cameras": {"a": {"model": "x", "intrinsics": [1]}}}', "needs the camera model"),
         ("a.json", '{"camtorch": 1, "cameras": {"a": 1, "a": 2}}', "the key 'a' stands there twice"),
         ("a.json", '{"camera_angle_x": 5e-324, "w": 4, "h": 4}', "camera_angle_x: 5e-324 is no angle"),
+        ("a.json", '[{"sensor_token": ' + "[" * 100_000, "nested too deeply"),
+        ("a.json", '[{"sensor_token": "a", "camera_intrinsic": 1}]', r"camera_intrinsic: no list, but 1\.0"),
+        ("a.json", OWN % ([[[1, 1, 1, 1]]] * 3000, [[[0.0]] * 3000]), "batch dims that differ"),
+        ("a.json", OWN % ([[1, 1, 1, 1]] * 3, [[0.0]] * 2), "batch dims that differ"),
         ("a.json", '{"hello": 1}', "no format that is known here has the keys 'hello'"),
         ("a.json", '{"\\n\\u0000": {"K": 1}}', "no format that is known here"),
         ("a.xml", '<!DOCTYPE x [<!ENTITY a "b">]>' + XML.format("&a;"), "line 1: a document type"),
@@ -147,6 +174,8 @@ XML = "<opencv_storage>{}</opencv_storage>"
         ("a.xml", XML.format("<a>" * 100_000), "too many elements"),
         ("a.xml", XML.format(f"<K>{K[1:-1]}</K><K>1</K>"), "opencv_storage: the key 'K' stands there twice"),
         ("a.xml", "<html></html>", "<html> where <opencv_storage> belongs"),
+        ("a.xml", "<calibration>" + '<a b="1"/>' * 20_000 + "</calibration>", "too many elements"),
+        ("a.xml", "<calibration>" + "<a>" * 100_000, "too many elements"),
         ("a.yml", "\n%TAG !a! b\n---\na: 1\n", "YAML directives"),
         ("a.cameramodel", "{'lensmodel': __import__('os').system('true')}", "something else than texts"),
         ("a.cameramodel", "{'lensmodel': " + "[" * 30_000, "line 1: too many nested"),
@@ -162,52 +191,50 @@ XML = "<opencv_storage>{}</opencv_storage>"
         ("a.cameramodel", "{'lensmodel': " + "-" * 30_000 + "1}", "deep"),
         ("a.cameramodel", "{'lensmodel': 'x', 'more': '" + "x" * 40_000 + "'}", "size: more than 32 KiB"),
         ("a.cameramodel", "{'lensmodel': 1, []: 3}", "something else than texts"),
+        ("a.npz", archive(data__pkl=b"x"), "content: no format that is known here has the keys 'data.pkl'"),
+        ("a.npz", archive(K__npy=b"x"), "K: is neither an OpenCV matrix nor a list of numbers"),
+        ("a.npz", archive(K__npy=array((1 << 40,))), "K: is neither"),
+        ("a.npz", archive(K__npy=array((3, 3), bytes(8))), "K: is neither"),
+        ("a.npz", archive(K__npy=array((9,), b"." * 72, "|O")), "K: is neither"),
+        ("a.npz", archive(K__npy=array((1 << 20,), bytes(8 << 20))), "K: is neither"),
+        ("a.npz", archive(K__npy=array((3, 3), bytes(72)))[:-30], "content: no archive of NumPy's"),
+        ("a.npz", archive(**{f"a{i}__npy": array((1,), bytes(8)) for i in range(1001)}), "more than 1000 arrays"),
+        ("a.p", b"", "content: the file is empty"),
+        ("a.p", pickle.dumps({"K": [1]}), "byte 0: a pickle, which could run any code: not read. .*numpy.savez"),
+        ("a.p", b"\x93NUMPY\x01\0", "byte 0: a single array; save both by numpy.savez"),
+        ("a.p", b"\x89PNG\r\n\x1a\n", "byte 0: an image, where a file of a calibration is wanted"),
+        ("a.p", b"\xff\xd8\xff\xe0", "byte 0: an image"),
+        ("a.p", b"\x89HDF\r\n\x1a\n", "byte 0: a file of HDF5 or MATLAB"),
+        ("a.p", b"\xfe\xfd\xfc", "byte 0: not text"),
+        ("a.p", "{'K': [500, 0, 320, 0, 500, 240, 0, 0]}", "K: a camera matrix has 3 x 3 numbers"),
         ("cameras.txt", CAMERA * 2, "line 2: a second camera has the id 1"),
         ("cameras.txt", CAMERA.replace("PINHOLE", "FISH"), "the model 'FISH' is not known here; known are"),
         ("cameras.txt", CAMERA.replace("240", ""), "line 1: 3 parameters; PINHOLE has 4"),
         ("cameras.txt", CAMERA.replace("240", "1e400"), "line 1.*'1e400' is no finite number"),
-        ("cameras.bin", struct.pack("<Q", 1 << 60), "byte 0: 1152921504606846976 cameras, for which the file is too"),
+        ("cameras.bin", GIGANTIC, "byte 0: 1152921504606846976 cameras, for which the file is too"),
         ("cameras.bin", struct.pack("<QIiQQ", 1, 1, 99, 4, 4), "byte 8: the model 99 is not known here"),
         ("cameras.bin", struct.pack("<QIiQQ4d", 1, 1, 1, 4, 4, 1, 1, math.nan, 1), "not finite"),
         ("cameras.bin", struct.pack("<QIiQQ4d", 1, 1, 1, 1 << 60, 4, 1, 1, 1, 1), "no number of pixels"),
-        ("cameras.bin", struct.pack("<QIiQQ4d", 1, 1, 1, 4, 4, 1, 1, 1, 1) + b"x", "1 bytes after the last camera"),
+        ("cameras.bin", BINARY + b"x", "1 bytes after the last camera"),
+        ("images.txt", IMAGE * 2, "line 3: a second image is called 'a.jpg'"),
+        ("images.txt", IMAGE.replace(" 1 a", " 7 a"), "line 1: its camera 7 is not in cameras.txt"),
+        ("images.txt", IMAGE.replace("1 1 0", "1 2 0"), "line 1: a quaternion of length 2, which is no rotation"),
+        ("images.txt", IMAGE.replace("0 1 a", "1e300 1 a"), "line 1: a number beyond 1e[+]100"),
+        ("images.txt", "1 1 0 0\n", "line 1: less than IMAGE_ID"),
+        ("images.txt", IMAGE.replace("1 1 0", "1 x 0"), "line 1: seven numbers and the id of a camera were expected"),
+        ("images.txt", b"\xff\xfe\n", "line 1: not text"),
+        ("images.bin", GIGANTIC, "for which the file is too small"),
+        ("images.bin", struct.pack("<QI7dI", 1, 1, 1, *[0] * 6, 1) + b"a\0" + GIGANTIC, "for which the file is too"),
     ],
 )
 def test_faults(name, content, reason, tmp_path):
+    """Of images beside a camera that is right."""
     path = written(tmp_path / name, content)
-    with pytest.raises(ct.CameraFileError, match=reason):
+    if path.stem == "images":
+        path = written(path.with_stem("cameras"), CAMERA if path.suffix == ".txt" else BINARY)
+    with pytest.raises(ct.CameraFileError, match=rf"{re.escape(name)}: .*{reason}"):
         ct.load(path)
     assert not loads_or_says_why(path)
-
-
-@pytest.mark.parametrize(
-    ("images", "reason"),
-    [
-        (IMAGE * 2, "line 3: a second image is called 'a.jpg'"),
-        (IMAGE.replace(" 1 a", " 7 a"), "line 1: its camera 7 is not in cameras.txt"),
-        (IMAGE.replace("1 1 0", "1 2 0"), "line 1: a quaternion of length 2, which is no rotation"),
-        (IMAGE.replace("0 1 a", "1e300 1 a"), "line 1: a number beyond 1e[+]100"),
-        ("1 1 0 0\n", "line 1: less than IMAGE_ID"),
-        (IMAGE.replace("1 1 0", "1 x 0"), "line 1: seven numbers and the id of a camera were expected"),
-        (b"\xff\xfe\n", "line 1: not text"),
-    ],
-)
-def test_faults_of_images(images, reason, tmp_path):
-    written(tmp_path / "cameras.txt", CAMERA)
-    written(tmp_path / "images.txt", images)
-    with pytest.raises(ct.CameraFileError, match=reason):
-        ct.load(tmp_path)
-
-
-@pytest.mark.parametrize(
-    "content",
-    [struct.pack("<Q", 1 << 60), struct.pack("<QI7dI", 1, 1, 1, *[0] * 6, 1) + b"a\0" + struct.pack("<Q", 1 << 60)],
-)
-def test_gigantic_counts_of_images(content, tmp_path):
-    written(tmp_path / "cameras.bin", struct.pack("<QIiQQ4d", 1, 1, 1, 4, 4, 1, 1, 1, 1))
-    written(tmp_path / "images.bin", content)
-    with pytest.raises(ct.CameraFileError, match="for which the file is too small"):
-        ct.load(tmp_path)
 
 
 MB = 1 << 20
@@ -310,17 +337,6 @@ def test_poses_of_many_images_cost_little(tmp_path):
     ]
     assert len(ct.load(folders[0]).extrinsics) == len(ct.load(folders[1]).extrinsics) == 20_000
     assert [*costing_little(folders)][:2] == [True, True]
-
-
-@pytest.mark.parametrize("content", [
-    {"intrinsics": [[[1, 1, 1, 1]]] * 3000, "distortion": [[[0.0]] * 3000], "distortion_names": ["k1"]},
-    {"intrinsics": [[1, 1, 1, 1]] * 3, "distortion": [[0.0]] * 2, "distortion_names": ["k1"]},
-])  # fmt: skip
-def test_small_files_make_no_large_batches(content, tmp_path):
-    cameras = {"a": {"model": "kannala_brandt", **content}}
-    path = written(tmp_path / "own.json", json.dumps({"camtorch": 1, "cameras": cameras, "extrinsics": {}}))
-    with pytest.raises(ct.CameraFileError, match="batch dims that differ"):
-        ct.load(path)
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no named pipes")

@@ -1,9 +1,6 @@
 """What people pass to `ct.load` first: paths of every kind, other people's files, NumPy archives."""
 
-import io
 import os
-import pickle
-import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -42,28 +39,6 @@ def test_no_path(tmp_path):
         ct.load(tmp_path)
 
 
-# -- other people's files
-
-
-@pytest.mark.parametrize(
-    ("content", "reason"),
-    [
-        (b"", "content: the file is empty"),
-        (pickle.dumps({"K": K, "D": D}), "byte 0: a pickle, which could run any code: not read. .*numpy.savez"),
-        (b"\x93NUMPY\x01\0", "byte 0: a single array; save both by numpy.savez"),
-        (b"\x89PNG\r\n\x1a\n", "byte 0: an image, where a file of a calibration is wanted"),
-        (b"\xff\xd8\xff\xe0", "byte 0: an image"),
-        (b"\x89HDF\r\n\x1a\n", "byte 0: a file of HDF5 or MATLAB"),
-        (b"\xfe\xfd\xfc", "byte 0: not text"),
-        (b"{'K': [500, 0, 320, 0, 500, 240, 0, 0]}", "K: a camera matrix has 3 x 3 numbers"),
-    ],
-)
-def test_what_is_no_calibration_is_said(content, reason, tmp_path):
-    (tmp_path / "calibration.p").write_bytes(content)
-    with pytest.raises(ct.CameraFileError, match=rf"calibration\.p: {reason}"):
-        ct.load(tmp_path / "calibration.p")
-
-
 # -- NumPy archives
 
 
@@ -98,36 +73,3 @@ def test_sizes_without_an_order_are_refused(tmp_path):
         ct.CameraFileError, match=r"image_size: 480 640 may be \(width, height\) or .* save image_width"
     ):
         ct.load(tmp_path / "calibration.npz")
-
-
-def archive(**files):
-    content = io.BytesIO()
-    with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as file:
-        for name, data in files.items():
-            file.writestr(name.replace("__", "."), data)
-    return content.getvalue()
-
-
-def array(shape, data=b"", descr="<f8"):
-    content = io.BytesIO()
-    np.lib.format.write_array_header_1_0(content, {"descr": descr, "fortran_order": False, "shape": shape})
-    return content.getvalue() + data
-
-
-@pytest.mark.parametrize(
-    ("content", "reason"),
-    [
-        (archive(data__pkl=b"x"), "content: no format that is known here has the keys 'data.pkl'"),
-        (archive(K__npy=b"x"), "K: is neither an OpenCV matrix nor a list of numbers"),
-        (archive(K__npy=array((1 << 40,))), "K: is neither"),
-        (archive(K__npy=array((3, 3), bytes(8))), "K: is neither"),
-        (archive(K__npy=array((9,), b"." * 72, "|O")), "K: is neither"),
-        (archive(K__npy=array((1 << 20,), bytes(8 << 20))), "K: is neither"),
-        (archive(K__npy=array((3, 3), bytes(72)))[:-30], "content: no archive of NumPy's"),
-        (archive(**{f"a{i}__npy": array((1,), bytes(8)) for i in range(1001)}), "content: .* more than 1000 arrays"),
-    ],
-)
-def test_archives_of_something_else(content, reason, tmp_path):
-    (tmp_path / "a.npz").write_bytes(content)
-    with pytest.raises(ct.CameraFileError, match=rf"a\.npz: {reason}"):
-        ct.load(tmp_path / "a.npz")
