@@ -123,6 +123,17 @@ def test_what_fits_nothing_is_refused(extrinsics, error, says):
         ct.Rig({"a": camera()}, extrinsics)
 
 
+def test_which_camera_is_meant():
+    rig = rig_of(["left", "right"])
+    assert "left: KannalaBrandt 640x480 (300, 300," in repr(rig)
+    with pytest.raises(ValueError, match="not one camera"):
+        _ = rig.camera
+    with pytest.raises(ValueError, match="no camera and no image is called 'x'"):
+        rig.camera_of("x")
+    with pytest.raises(ValueError, match="is of a camera 'b'"):
+        ct.Rig({"a": camera()}, images={"i": "b"})
+
+
 def test_who_takes_it_for_a_camera_is_told_where_those_are():
     camera = ct.Pinhole.from_fov(70, image_size=(480, 640))
     one, two = ct.Rig({"left": camera}), ct.Rig({"left": camera, "right": camera})

@@ -266,3 +266,29 @@ def test_a_thousand_rigs_have_positive_focal_lengths(projection):
     assert (camera.intrinsics[:, :2] > 0).all()
     assert frame.left.isfinite().all()
     assert frame.right.isfinite().all()
+
+
+# -- files of OpenCV
+
+
+@pytest.mark.parametrize("suffix", [".yml", ".json", ".xml"])
+def test_opencv_reads_the_matrices_of_a_rectified_pair(suffix, tmp_path):
+    cv2 = pytest.importorskip("cv2")
+    found = ct.rectify(*pair(), image_size=(400, 600)).requires_grad_(False)
+    path = tmp_path / f"pair{suffix}"
+    found.save(path)
+    storage = cv2.FileStorage(str(path), cv2.FileStorage_READ)
+    pose = found.extrinsics.matrix()
+    for name, value in {**found.opencv(), "R": pose[:3, :3], "T": pose[:3, 3:]}.items():
+        np.testing.assert_allclose(storage.getNode(name).mat(), value, rtol=1e-14, atol=1e-15, err_msg=name)
+    assert (storage.getNode("image_width").real(), storage.getNode("image_height").real()) == (600, 400)
+    storage.release()
+    assert [p.name for p in tmp_path.iterdir()] == [path.name]
+
+
+def test_matrices_of_opencv_are_of_perspective_pairs(tmp_path):
+    with pytest.raises(ValueError, match=r"Rectification.opencv: .* this is latlon"):
+        ct.rectify(*pair(), projection="latlon").save(tmp_path / "pair.yml")
+    with pytest.raises(ValueError, match=r"pair.txt: .*\.yml, \.json or \.xml"):
+        ct.rectify(*pair()).save(tmp_path / "pair.txt")
+    assert not list(tmp_path.iterdir())
