@@ -10,7 +10,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -236,10 +236,16 @@ def minima(
         )
         return Poses(rotations[:, None], translations[:, None]), cost
     sight = Sight(model, points[:, None], pixels[:, None], weights[:, None])
-    free = Free((torch.zeros(parameters.shape[-1], dtype=torch.bool, device="cpu"),), (False,))
-    state = State((parameters,), Poses.none(len(pixels), 1, pixels), poses, pixels.new_zeros(len(pixels), 2))
-    found = adjust([sight], state, free, loss=loss[0], loss_scale=loss[1], steps=steps)
+    found = posed(sight, parameters, poses, loss=loss[0], loss_scale=loss[1], steps=steps)
     return found.state.boards, found.cost
+
+
+def posed(sight: Sight, parameters: Tensor, poses: Poses, **options: Any) -> Adjusted:
+    """The poses (K, 1) of least cost near given ones, each a problem of its own, of a camera that is held."""
+    free = Free((torch.zeros(parameters.shape[-1], dtype=torch.bool, device="cpu"),), (False,))
+    none = Poses.none(len(poses.translations), 1, poses.translations)
+    state = State((parameters,), none, poses, torch.zeros_like(poses.translations[:, 0, :2]))
+    return adjust([sight], state, free, **options)
 
 
 def robust(loss: str | None, scale: float, squares: Tensor) -> tuple[Tensor, Tensor]:

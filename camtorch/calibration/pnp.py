@@ -15,7 +15,7 @@ from camtorch._evaluation import compiled_of
 from camtorch._module import remade
 from camtorch._threads import on_one_thread
 from camtorch.calibration.batches import as_tensor, as_vectors, learns, root_of, rows_of
-from camtorch.calibration.bundle import Free, Poses, Sight, State, adjust
+from camtorch.calibration.bundle import Poses, Sight, posed
 from camtorch.calibration.compiled import Search, Solved, solved
 from camtorch.calibration.ransac import consensus
 from camtorch.calibration.rays import poses_from_rays
@@ -330,22 +330,15 @@ class _Found(NamedTuple):
     triangles: Tensor
 
 
-def _minimum(task: _Task, rotations: Tensor, translations: Tensor, valid: Tensor | None = None) -> _Found:
+def _minimum(task: _Task, rotations: Tensor, translations: Tensor, valid: Tensor) -> _Found:
     """The minima that poses (B, ...) lead to; valid: bool (B,), those that are meant."""
     camera = task.camera
     parameters = torch.cat(camera._tensors, -1).detach()
     parameters = parameters.view(-1, parameters.shape[-1])
     sight = Sight(camera, task.points[:, None], task.pixels[:, None], task.weights[:, None])
-    start = Poses(rotations[:, None], translations[:, None])
-    none = Poses.none(len(rotations), 1, rotations)
-    free = Free((torch.zeros(parameters.shape[-1], dtype=torch.bool, device="cpu"),), (False,))
-    found = adjust(
-        [sight], State((parameters,), none, start, rotations.new_zeros(len(rotations), 2)), free, steps=_SEARCH.steps
-    )
-    fine = (
-        found.converged & (found.valid[0][:, 0] | (task.weights == 0)).all(-1) & ((task.weights > 0).sum(-1) >= _LEAST)
-    )
-    fine = fine if valid is None else fine & valid
+    found = posed(sight, parameters, Poses(rotations[:, None], translations[:, None]), steps=_SEARCH.steps)
+    fine = found.converged & valid & ((task.weights > 0).sum(-1) >= _LEAST)
+    fine = fine & (found.valid[0][:, 0] | (task.weights == 0)).all(-1)
     (turned,), (moved,) = (t.unbind(1) for t in found.state.boards)
     return _Found(torch.where(fine, found.cost, torch.inf), turned, moved, found.equations.view[:, 0])
 
