@@ -117,6 +117,12 @@ class State(NamedTuple):
     boards: Poses
     bend: Tensor
 
+    @classmethod
+    def of_one(cls, parameters: Tensor, boards: Poses) -> State:
+        """Of a single camera, parameters (1 or B, 4 + n), and flat boards in its frame."""
+        batch = len(boards.translations)
+        return cls((parameters,), Poses.none(batch, 1, parameters), boards, parameters.new_zeros(batch, 2))
+
     def of(self, rows: Tensor) -> State:
         """Those of some problems, given by numbers."""
         return State(
@@ -243,9 +249,7 @@ def minima(
 def posed(sight: Sight, parameters: Tensor, poses: Poses, **options: Any) -> Adjusted:
     """The poses (K, 1) of least cost near given ones, each a problem of its own, of a camera that is held."""
     free = Free((torch.zeros(parameters.shape[-1], dtype=torch.bool, device="cpu"),), (False,))
-    none = Poses.none(len(poses.translations), 1, poses.translations)
-    state = State((parameters,), none, poses, torch.zeros_like(poses.translations[:, 0, :2]))
-    return adjust([sight], state, free, **options)
+    return adjust([sight], State.of_one(parameters, poses), free, **options)
 
 
 def robust(loss: str | None, scale: float, squares: Tensor) -> tuple[Tensor, Tensor]:

@@ -181,7 +181,7 @@ class _Lens(NamedTuple):
     @property
     def state(self) -> State:
         """Where an adjustment starts."""
-        return _state(self.parameters, self.boards)
+        return State.of_one(self.parameters, self.boards)
 
     @property
     def camera(self) -> Camera:
@@ -219,11 +219,6 @@ class _Lens(NamedTuple):
         errors = torch.where(found.valid[0][rows[0]], errors, _NO_PIXEL)[few.seen]
         scale = max(_LEAST_SCALE, 2 * float(errors.median()))
         return self._replace(parameters=found.state.parameters[0], boards=found.state.boards, scale=scale).of(rows)
-
-
-def _state(parameters: Tensor, boards: Poses) -> State:
-    batch = len(boards.translations)
-    return State((parameters,), Poses.none(batch, 1, parameters), boards, parameters.new_zeros(batch, 2))
 
 
 def _sight(model: type[Camera], observations: Observations) -> Sight:
