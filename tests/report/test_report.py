@@ -4,6 +4,7 @@ import base64
 import io
 import os
 import re
+import sys
 import xml.etree.ElementTree as ElementTree
 from html.parser import HTMLParser
 
@@ -176,6 +177,13 @@ def test_bad_arguments(given, error, words, tmp_path):
     with pytest.raises(error, match=f"^write_report: {words}"):
         ct.write_report(opencv_calibration(), tmp_path / "report.html", **given)
     assert not os.listdir(tmp_path)
+
+
+@pytest.mark.parametrize("package", ["matplotlib", "jinja2"])
+def test_packages_that_are_not_there(package, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, package, None)
+    with pytest.raises(ImportError, match=r"pip install 'camtorch\[plot\]'"):
+        ct.write_report(opencv_calibration(), tmp_path / "report.html")
 
 
 @pytest.fixture(scope="module")
