@@ -194,6 +194,13 @@ def test_a_coefficient_held_at_its_best_value_changes_no_other(left):
     assert bool((held.std <= left.std * (1 + 1e-6)).all())
 
 
+def test_what_is_frozen_at_the_start_is_frozen_in_the_result(left):
+    start = copy.deepcopy(left.camera).freeze("cx", "k1")
+    found = calibrate(LEFT, model=start)
+    assert "frozen=(cx, k1)" in repr(found.camera)
+    assert found.std[[2, 4]].tolist() == [0, 0]
+
+
 def test_a_camera_that_is_held_leaves_the_poses_to_be_found(left):
     poses = calibrate(LEFT, model=left.camera, fixed="all")
     assert_close(values(poses), values(left), **exactly)
