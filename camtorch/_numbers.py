@@ -137,7 +137,12 @@ def checked_intrinsics(model: type[Camera], intrinsics: Numbers) -> Tensor:
         )
     row = row_of(intrinsics)
     if not is_predicted(intrinsics) and (fails(intrinsics[..., :2] > 0) if row is None else min(row[:2]) <= 0):
-        raise ValueError(f"{owner}: focal lengths must be positive; got fx, fy = {intrinsics[..., :2].tolist()}")
+        hint = (
+            f". Of matrices (4, 4) use {owner}.from_matrix(K[..., :3, :3])" if intrinsics.shape[-2:] == (4, 4) else ""
+        )
+        raise ValueError(
+            f"{owner}: focal lengths must be positive; got fx, fy = {str(intrinsics[..., :2].tolist()):.200}{hint}"
+        )
     return intrinsics
 
 
@@ -260,7 +265,8 @@ def numbers_of_matrix(
     owner = model.__name__
     K = as_real(K, "K", owner)  # noqa: N806
     if K.shape[-2:] != (3, 3):
-        raise ValueError(f"{owner}: K must be (*B, 3, 3); got shape {tuple(K.shape)}")
+        hint = ". Of larger ones it is K[..., :3, :3]" if min(K.shape[-2:], default=0) >= 3 else ""
+        raise ValueError(f"{owner}: K must be (*B, 3, 3); got shape {tuple(K.shape)}{hint}")
     bottom, skew = K[..., 2, :].detach(), K[..., 0, 1].detach()
     if fails(bottom == bottom.new_tensor([0, 0, 1])) or fails(K[..., 1, 0] == 0):
         raise ValueError(f"{owner}: K must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]; got {K.tolist()}")

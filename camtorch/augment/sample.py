@@ -183,14 +183,23 @@ def kind_of(name: str, value: object, own: Mapping[str, str], owner: str) -> str
         base = begins[-1] if begins else None
         if base is not None and not isinstance(value, (Tensor, np.ndarray, list, tuple)):
             return None  # image_path, mask_id
-    if base is None and _holds_reals(value):
-        close = difflib.get_close_matches(name, KINDS, 1)
+    if base is None and (_holds_reals(value) or _holds_planes(name, value)):
+        close = _close_to(name)
         meant = f"Did you mean {close[0]!r}? " if close else ""
         raise ValueError(
             f"{owner}: {name!r} holds real numbers, and whether they move with the camera is not known. {meant}"
             f"fields={{{name!r}: KIND}} says so, where KIND is {', '.join(KINDS)} or {KEEP}"
         )
     return base
+
+
+def _close_to(name: str) -> list[str]:
+    return ["mask"] if name.startswith("seg") else difflib.get_close_matches(name, KINDS, 1)
+
+
+def _holds_planes(name: str, value: object) -> bool:
+    """Whether whole numbers may be masks, boxes or points: more than a row a sample, or named like such."""
+    return isinstance(value, (Tensor, np.ndarray)) and (value.ndim > 2 or (value.ndim == 2 and bool(_close_to(name))))
 
 
 def _holds_reals(value: object) -> bool:

@@ -19,6 +19,7 @@ POSE = ct.Extrinsics([0.0, 0.0, 0.0], [-0.1, 0.0, 0.0]).requires_grad_(False)
 DOWN = ct.Extrinsics.from_matrix(np.diag([1.0, -1.0, -1.0]), [0.0, 0.0, 2.0])
 ONE = ct.Rig({"a": CAMERA}, {"a": POSE})
 WARP = ct.Warp(CAMERA, BATCH[0])
+MOUNT = ct.augment.RandomMount(camera=CAMERA)
 PAIR = ct.rectify(BATCH[0], BATCH[0], POSE, fov=57.3, image_size=SIZE)
 PIXELS, RAYS = CAMERA.pixel_grid(), CAMERA.rays()[0]
 IMAGES, META = torch.zeros(2, 3, *SIZE), torch.zeros(5, 3, device="meta")
@@ -51,6 +52,8 @@ WRONG = [
         r"an image size; image_size=\(height",
     ),
     (lambda: ct.Pinhole([20.0, 20, 15, 11], [0.1, 0, 0, 0]), ValueError, r"Pinhole: it has no distortion, .*\(4,\)"),
+    (lambda: ct.Pinhole(torch.eye(4)), ValueError, r"focal lengths .* Of matrices \(4, 4\) use Pinhole.from_matrix\(K"),
+    (lambda: ct.Pinhole.from_matrix(torch.eye(4)), ValueError, r"got shape \(4, 4\)\. Of larger ones it is K\[..., :3"),
     (lambda: ct.Extrinsics(0, 0, 1), TypeError, r"It takes ct.Extrinsics\(\[rx, ry, rz\], \[tx, ty, tz\]\)"),
     (lambda: ct.Camera.from_fov(90, image_size=SIZE), TypeError, r"ct.MODELS has all models"),
     (
@@ -62,6 +65,13 @@ WRONG = [
         lambda: augment.RandomMount(camera=CAMERA)(image=IMAGES[0], keypoint=torch.ones(3, 2)),
         ValueError,
         r"'keypoint' holds real numbers.* Did you mean 'keypoints'\? fields",
+    ),
+    (lambda: MOUNT(image=IMAGES[0], bbox=torch.tensor([[3, 4, 9, 9]])), ValueError, r"'bbox' .* Did you mean 'boxes'"),
+    (lambda: MOUNT(image=IMAGES[0], seg=torch.ones(SIZE, dtype=torch.uint8)), ValueError, r"Did you mean 'mask'\?"),
+    (
+        lambda: MOUNT(image=IMAGES, parts=torch.ones(2, 5, 2).int()),
+        ValueError,
+        r"'parts' .*move with the camera is not",
     ),
     (lambda: ct.Pinhole([LEAF] * 4), TypeError, r"Pinhole: intrinsics is a list of tensors that require grad"),
     (lambda: CAMERA.project([LEAF] * 3), TypeError, r"points is a list of tensors that require grad; torch.stack"),
