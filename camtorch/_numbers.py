@@ -141,7 +141,7 @@ def checked_intrinsics(model: type[Camera], intrinsics: Numbers) -> Tensor:
             f". Of matrices (4, 4) use {owner}.from_matrix(K[..., :3, :3])" if intrinsics.shape[-2:] == (4, 4) else ""
         )
         raise ValueError(
-            f"{owner}: focal lengths must be positive; got fx, fy = {str(intrinsics[..., :2].tolist()):.200}{hint}"
+            f"{owner}: focal lengths must be positive; got fx, fy = {intrinsics[..., :2].tolist()!s:.200}{hint}"
         )
     return intrinsics
 
