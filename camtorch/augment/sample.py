@@ -263,6 +263,12 @@ def check(kind: str, name: str, value: Tensor, batched: bool, owner: str) -> Non
 def check_values(kind: str, name: str, value: Tensor, owner: str) -> None:
     """Raise a ValueError for plain labels in another form than that of their kind; what is NaN is in none."""
     if kind == "boxes":
+        form = getattr(getattr(value, "format", None), "value", "XYXY")  # of torchvision's BoundingBoxes
+        if form != "XYXY":
+            raise ValueError(
+                f"{owner}: {name} must be x1, y1, x2, y2; got BoundingBoxes of the format {form}, which "
+                "camtorch.augment.torchvision.Transform takes"
+            )
         check_boxes(value, name, owner)
     elif kind == "rvec":
         check_radians(value, name, owner)
