@@ -253,6 +253,8 @@ def check(kind: str, name: str, value: Tensor, batched: bool, owner: str) -> Non
     if not least <= dims <= most or (field.last and value.shape[-1] not in field.last):
         what = field.shape if batched else field.shape.replace("(B, ", "(")
         hint = _hint(name)
+        if kind in ("rvec", "tvec") and value.shape[-2:] == (3, 1):
+            hint = f". OpenCV's column goes in as {name}[..., 0]"
         if kind == "keypoints" and value.ndim and value.shape[-1] == 3:
             hint = f". Of x, y and visibility, [..., 2] goes in as {name}_valid=..., a flag for each"
         raise ValueError(f"{owner}: {name} must be {what}; got shape {tuple(value.shape)}{hint}")

@@ -66,6 +66,7 @@ WRONG = [
         ValueError,
         r"'keypoint' holds real numbers.* Did you mean 'keypoints'\? fields",
     ),
+    (lambda: MOUNT(image=IMAGES[0], rvec=torch.ones(3, 1)), ValueError, r"OpenCV's column goes in as rvec\[..., 0\]"),
     (lambda: MOUNT(image=IMAGES[0], bbox=torch.tensor([[3, 4, 9, 9]])), ValueError, r"'bbox' .* Did you mean 'boxes'"),
     (lambda: MOUNT(image=IMAGES[0], seg=torch.ones(SIZE, dtype=torch.uint8)), ValueError, r"Did you mean 'mask'\?"),
     (
