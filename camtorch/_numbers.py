@@ -41,6 +41,7 @@ _OF_CALIBRATE_CAMERA = 5, 8, 12, 14  # OpenCV's numbers of coefficients; 4 may b
 _DTYPES, _NUMBERS = (torch.float32, torch.float64), {float, int}
 _NO_BATCH = torch.Size()
 _LARGE = 1e30  # which float32 has, and NaN is not below
+_SIZE_LIKE = 32  # px; two whole coefficients of it and above are an image size
 _LOOKED_AT = 64  # cameras of a batch: numbers in a wrong order are so in all of them
 _CENTRED, _NEAR = 0.1, 0.05
 """Of the image's sides: how far from its middle principal points usually lie, and how near one is certainly meant."""
@@ -83,7 +84,7 @@ def at_a_glance(model: type[Camera], intrinsics: Any, distortion: Any, size: Any
             tensor, row = made[0].new_empty(0), []
         else:
             return None
-        if not (tensor.dtype in _DTYPES and tensor.is_cpu and sum(map(abs, row)) < _LARGE):
+        if not (tensor.dtype in _DTYPES and tensor.is_cpu and sum(map(abs, row)) < (_SIZE_LIKE if made else _LARGE)):
             return None
         if row is value:
             tensor.numpy()[:] = row  # in half the time of torch.tensor
@@ -136,7 +137,12 @@ def checked_intrinsics(model: type[Camera], intrinsics: Numbers) -> Tensor:
         )
     row = row_of(intrinsics)
     if not is_predicted(intrinsics) and (fails(intrinsics[..., :2] > 0) if row is None else min(row[:2]) <= 0):
-        raise ValueError(f"{owner}: focal lengths must be positive; got fx, fy = {intrinsics[..., :2].tolist()}")
+        hint = (
+            f". Of matrices (4, 4) use {owner}.from_matrix(K[..., :3, :3])" if intrinsics.shape[-2:] == (4, 4) else ""
+        )
+        raise ValueError(
+            f"{owner}: focal lengths must be positive; got fx, fy = {intrinsics[..., :2].tolist()!s:.200}{hint}"
+        )
     return intrinsics
 
 
@@ -148,6 +154,14 @@ def checked_distortion(model: type[Camera], distortion: Numbers, intrinsics: Ten
     """
     owner = model.__name__
     distortion = as_real(distortion, "distortion", owner)
+    if not model.distortion_names and distortion.numel():
+        raise ValueError(
+            f"{owner}: it has no distortion, and got coefficients of shape {tuple(distortion.shape)}; of "
+            "OpenCV's, BrownConrady takes those of calibrateCamera, KannalaBrandt those of fisheye, Mei omnidir's"
+        )
+    row = row_of(distortion)
+    if row is not None and len(row) == 2 and min(row) >= _SIZE_LIKE and all(map(float.is_integer, row)):
+        raise ValueError(f"{owner}: distortion {row} seems to be an image size; image_size=(height, width) is one")
     known = distortion.ndim > 0 and model.names_of(distortion.shape[-1]) is not None
     in_doubt = _is_column(model, distortion) and intrinsics.shape[:-1] != distortion.shape[:-1]
     if known:
@@ -251,7 +265,8 @@ def numbers_of_matrix(
     owner = model.__name__
     K = as_real(K, "K", owner)  # noqa: N806
     if K.shape[-2:] != (3, 3):
-        raise ValueError(f"{owner}: K must be (*B, 3, 3); got shape {tuple(K.shape)}")
+        hint = ". Of larger ones it is K[..., :3, :3]" if min(K.shape[-2:], default=0) >= 3 else ""
+        raise ValueError(f"{owner}: K must be (*B, 3, 3); got shape {tuple(K.shape)}{hint}")
     bottom, skew = K[..., 2, :].detach(), K[..., 0, 1].detach()
     if fails(bottom == bottom.new_tensor([0, 0, 1])) or fails(K[..., 1, 0] == 0):
         raise ValueError(f"{owner}: K must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]; got {K.tolist()}")
@@ -265,10 +280,7 @@ def numbers_of_matrix(
         return (intrinsics,)
     distortion = as_real(distortion, "distortion", owner)
     if not model.distortion_names:
-        raise ValueError(
-            f"{owner}: it has no distortion, and got coefficients of shape {tuple(distortion.shape)}; of "
-            "OpenCV's, BrownConrady takes those of calibrateCamera, KannalaBrandt those of fisheye, Mei omnidir's"
-        )
+        return intrinsics, distortion  # which the constructor refuses
     if K.ndim == 2 and distortion.numel() == max(distortion.shape, default=0):
         distortion = distortion.flatten()
     elif 2 < K.ndim == distortion.ndim and distortion.shape[-2] == 1:  # OpenCV's rows (1, n), stacked

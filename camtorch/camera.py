@@ -185,6 +185,10 @@ class Camera(Freezable):
     _fields: Memo
     _warned: bool
 
+    @hinting(
+        "Numbers go in as lists, the size by name: ct.Pinhole([fx, fy, cx, cy], image_size=(height, width)), "
+        "ct.KannalaBrandt([fx, fy, cx, cy], [k1, k2, k3, k4]); a matrix as ct.BrownConrady.from_matrix(K, distortion)"
+    )
     def __init__(
         self, intrinsics: Numbers, distortion: Numbers | None = None, *, image_size: Sequence[int] | None = None
     ):

@@ -20,6 +20,7 @@ from camtorch._arguments import (
     check_devices,
     check_radians,
     fails,
+    hinting,
     shown,
     values_of,
 )
@@ -53,6 +54,9 @@ class Extrinsics(BatchedModule):
     rotation: Tensor
     translation: Tensor
 
+    @hinting(
+        "It takes ct.Extrinsics([rx, ry, rz], [tx, ty, tz]), a rotation vector in radians; from_matrix(T) a matrix"
+    )
     def __init__(self, rotation: Numbers, translation: Numbers | None = None):
         super().__init__()
         if translation is None:

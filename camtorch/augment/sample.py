@@ -183,14 +183,23 @@ def kind_of(name: str, value: object, own: Mapping[str, str], owner: str) -> str
         base = begins[-1] if begins else None
         if base is not None and not isinstance(value, (Tensor, np.ndarray, list, tuple)):
             return None  # image_path, mask_id
-    if base is None and _holds_reals(value):
-        close = difflib.get_close_matches(name, KINDS, 1)
+    if base is None and (_holds_reals(value) or _holds_planes(name, value)):
+        close = _close_to(name)
         meant = f"Did you mean {close[0]!r}? " if close else ""
         raise ValueError(
             f"{owner}: {name!r} holds real numbers, and whether they move with the camera is not known. {meant}"
             f"fields={{{name!r}: KIND}} says so, where KIND is {', '.join(KINDS)} or {KEEP}"
         )
     return base
+
+
+def _close_to(name: str) -> list[str]:
+    return ["mask"] if name.startswith("seg") else difflib.get_close_matches(name, KINDS, 1)
+
+
+def _holds_planes(name: str, value: object) -> bool:
+    """Whether whole numbers may be masks, boxes or points: more than a row a sample, or named like such."""
+    return isinstance(value, (Tensor, np.ndarray)) and (value.ndim > 2 or (value.ndim == 2 and bool(_close_to(name))))
 
 
 def _holds_reals(value: object) -> bool:
@@ -244,6 +253,8 @@ def check(kind: str, name: str, value: Tensor, batched: bool, owner: str) -> Non
     if not least <= dims <= most or (field.last and value.shape[-1] not in field.last):
         what = field.shape if batched else field.shape.replace("(B, ", "(")
         hint = _hint(name)
+        if kind in ("rvec", "tvec") and value.shape[-2:] == (3, 1):
+            hint = f". OpenCV's column goes in as {name}[..., 0]"
         if kind == "keypoints" and value.ndim and value.shape[-1] == 3:
             hint = f". Of x, y and visibility, [..., 2] goes in as {name}_valid=..., a flag for each"
         raise ValueError(f"{owner}: {name} must be {what}; got shape {tuple(value.shape)}{hint}")
@@ -254,6 +265,12 @@ def check(kind: str, name: str, value: Tensor, batched: bool, owner: str) -> Non
 def check_values(kind: str, name: str, value: Tensor, owner: str) -> None:
     """Raise a ValueError for plain labels in another form than that of their kind; what is NaN is in none."""
     if kind == "boxes":
+        form = getattr(getattr(value, "format", None), "value", "XYXY")  # of torchvision's BoundingBoxes
+        if form != "XYXY":
+            raise ValueError(
+                f"{owner}: {name} must be x1, y1, x2, y2; got BoundingBoxes of the format {form}, which "
+                "camtorch.augment.torchvision.Transform takes"
+            )
         check_boxes(value, name, owner)
     elif kind == "rvec":
         check_radians(value, name, owner)

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
+from torch.utils._pytree import tree_leaves
 
 from camtorch.augment.augmentation import Augmentation, camera_of_sample, check_front_end, move_points
 from camtorch.augment.change import Change
@@ -68,7 +69,7 @@ class Transform(v2.Transform):
         valid: whether points and boxes in dicts get flags.
 
     Raises:
-        TypeError: it is no augmentation; a camera that is none.
+        TypeError: it is no augmentation; a camera that is none; an image of a sample as a NumPy array.
         ValueError: no camera, or one with batch dims; images, boxes or points that are not of the camera's
             image_size; rotated boxes; PIL images of palettes or single bits.
     """
@@ -85,6 +86,8 @@ class Transform(v2.Transform):
         self._flags: list[tuple[Tensor, Tensor]] = []
 
     def forward(self, *inputs: Any) -> Any:
+        if any(isinstance(one, np.ndarray) and one.ndim > 1 and one.dtype == np.uint8 for one in tree_leaves(inputs)):
+            raise TypeError(f"{_OWNER}: an array would stay as it is; v2.ToImage() before makes an Image of it")
         outputs = super().forward(*inputs)
         if self.valid:
             _put(outputs, self._flags)

@@ -234,7 +234,7 @@ def _tell(found: Calibration, names: Sequence[str], head: str) -> None:
     if bad:
         print(f"{head}views that fit badly: {', '.join(bad)}")
     for warning in found.warnings:
-        note(f"{head}{_named(warning, names)}")
+        note(f"{head}{_with_options(_named(warning, names))}")
     print(f"{head}{_named(found.verdict, names)}")
 
 
@@ -242,6 +242,12 @@ def _named(text: str, names: Sequence[str]) -> str:
     """A text in which the views that it numbers have their names."""
     numbered = r"\b([Vv]iews? )(\d+(?:, \d+)*)"
     return re.sub(numbered, lambda m: m[1] + re.sub(r"\d+", lambda n: names[int(n[0])], m[2]), text)
+
+
+def _with_options(text: str) -> str:
+    """A text in which arguments of `ct.calibrate` are the options of the command."""
+    text = re.sub(r'fixed=\("(.*?)",?\)', lambda m: f"--fixed {m[1].replace(chr(34), '').replace(' ', '')}", text)
+    return re.sub(r"count=(\d+)", r"--count \1", text.replace("bend=True", "--bend"))
 
 
 def _with_spread(value: float, std: float, width: int = 11) -> str:

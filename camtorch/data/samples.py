@@ -116,7 +116,7 @@ class MapSamples(Mover):
             if not isinstance(value, np.ndarray):
                 raise TypeError(f"{_OWNER}: {entry} must be a numpy array; got {type(value).__name__}")
             return name
-        if ending in _ENDINGS and np.ndim(value) >= 2:
+        if ending in _ENDINGS and np.ndim(value) >= 2 and name not in self._fields:
             raise ValueError(
                 f"{_OWNER}: whether {entry} moves is not known; fields={{{entry!r}: KIND}} says so, where KIND is "
                 f"{', '.join(IMAGES)} or {KEEP}, among others"

@@ -250,8 +250,9 @@ def _from_yaml(path: str | os.PathLike[str], text: str) -> Any:
             tree.take(event, type(event).__name__)
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
-        reason = getattr(error, "problem", None) or getattr(error, "reason", None) or "not YAML"
-        raise CameraFileError(path, f"line {mark.line + 1}" if mark else "content", reason) from None
+        reason = getattr(error, "problem", None) or getattr(error, "reason", None) or "no reason given"
+        where = f"line {mark.line + 1}" if mark else "content"
+        raise CameraFileError(path, where, f"not readable as YAML: {reason}") from None
     except (ValueError, OverflowError) as error:
         if isinstance(error, CameraFileError):
             raise

@@ -4,7 +4,6 @@ from collections.abc import Sequence
 
 from torch import Tensor
 
-from camtorch._arguments import Numbers
 from camtorch.camera import Camera
 from camtorch.optics import Chart, CylinderChart, Lens, Transverse
 
@@ -21,9 +20,6 @@ class TransverseCylindrical(Camera):
 
     key = "transverse_cylindrical"
     quarter_turn = None
-
-    def __init__(self, intrinsics: Numbers, *, image_size: Sequence[int] | None = None) -> None:
-        super().__init__(intrinsics, image_size=image_size)
 
     @staticmethod
     def optics(k: Sequence[Tensor]) -> tuple[Chart, Lens]:

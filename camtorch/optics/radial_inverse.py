@@ -290,7 +290,7 @@ class RadialInverse:
         parameters = [w.detach() for w in parameters]
         self.factor, self.radial, self.end = factor, factor(parameters), end
         self.of_points = parameters[0].ndim < 2
-        self.k = torch.stack(parameters, -1).reshape(-1, len(parameters))
+        self.k = torch.stack(parameters, -1).reshape(parameters[0].numel(), len(parameters))
         k, rows = self.k, None
         if is_portable_export():
             inner2, table = _made_tables(factor.name, k, end)

@@ -141,7 +141,7 @@ class SurfaceAt(StageAt):
         """Control points (..., order + 1, order + 1, 2), rows first, and weights and slopes along a and b."""
         stage = self.stage
         controls = stage.parameters[4:]
-        points = torch.stack(controls, -1).reshape(-1, 2)
+        points = torch.stack(controls, -1).unflatten(-1, (len(controls) // 2, 2)).flatten(0, -2)
         (i, wa, da), (j, wb, db) = self._place(0), self._place(1)
         # of each camera, or point, its own
         first = (torch.ones_like(controls[0], dtype=torch.int64).flatten().cumsum(0) - 1).view(controls[0].shape)

@@ -64,7 +64,7 @@ _LINE = 129  # points along the middle of an image
 _PARALLEL = 1e-6  # the part of the view direction across the baseline, below which there is none
 _STEP = 1e-4  # on the plane of a projection, over which its scale is measured
 _TOGETHER = 1 << 16  # points
-_LARGEST = 1 << 14  # px, a side that nobody asked for
+_LARGEST = 8  # times the longest side of a camera, a side that nobody asked for
 
 
 class Frame(NamedTuple):
@@ -417,8 +417,9 @@ def rectify(
             between the cameras, as `cv2.stereoRectify` does.
 
     Raises:
-        ValueError: cameras at one place, or that look along the baseline or away from each other; a projection or
-            alignment that does not exist, a fov out of range or up to 2 pi, as in radians, cameras without image_size.
+        ValueError: cameras at one place, or that look along the baseline or away from each other; images of more than
+            eight times the longest side of a camera, where no image_size is given; a projection or alignment that
+            does not exist, a fov out of range or up to 2 pi, as in radians, cameras without image_size.
         TypeError: no cameras.
     """
     owner = "rectify"
@@ -436,7 +437,9 @@ def rectify(
         if fov is not None:
             high = _half(fov, projection, vertical, (high - low) / 2, owner)
             low = -high
-        camera = _target(model, low, high, focal, size, fov)
+        if size is None:
+            size = _sides(high - low, focal, _LARGEST * max(left.height, left.width, right.height, right.width))
+        camera = _target(model, low, high, size, fov)
     dtype = torch.promote_types(left.intrinsics.dtype, right.intrinsics.dtype)
     return Rectification(left, right, extrinsics, camera.to(dtype), projection, vertical, align)
 
@@ -545,16 +548,25 @@ def _half(fov: float | tuple[float, float], projection: str, vertical: bool, usu
     return half
 
 
-def _target(
-    model: type[Camera], low: Tensor, high: Tensor, focal: Tensor, size: tuple[int, int] | None, fov: Any
-) -> Camera:
+def _sides(extent: Tensor, focal: Tensor, most: int) -> tuple[int, int]:
+    """Height and width of images of that extent that lose nothing.
+
+    Raises:
+        ValueError: a side is longer than `most`.
+    """
+    width, height = (int(side) for side in (extent * focal[..., None]).reshape(-1, 2).amax(0).round().clamp(min=2))
+    if max(height, width) > most:
+        raise ValueError(
+            f"rectify: as fine as the sharper camera the images would be {(height, width)}; give image_size=(height, "
+            "width), and perhaps fov. Such sizes come of cameras that look along their baseline, or of extrinsics that "
+            "are not right from left"
+        )
+    return height, width
+
+
+def _target(model: type[Camera], low: Tensor, high: Tensor, size: tuple[int, int], fov: Any) -> Camera:
     """The camera of both images: square pixels, unless two angles and a size say otherwise."""
-    extent = high - low
-    if size is None:
-        wanted = (extent * focal[..., None]).reshape(-1, 2).amax(0).round().clamp(2, _LARGEST)
-        width, height = (int(side) for side in wanted)
-    else:
-        height, width = size
+    extent, (height, width) = high - low, size
     shape = extent.new_tensor([width, height])
     both = shape / extent
     if fov is None:

@@ -90,7 +90,8 @@ class Warp(GeometryModule):
     `Cylindrical` source as wide as 2 pi, or a `LatLon` or `TransverseCylindrical` one as tall, to 0.05 pixels, all of a
     batch. That takes a slightly larger copy of it. Behind a `shutter`, or in a `Mixed`, it ends at its edges.
 
-    The sampling grid is kept while nothing that it depends on can learn or has changed.
+    The sampling grid is kept while nothing that it depends on can learn or has changed. In a network the cameras are
+    part of it: `warp.requires_grad_(False)` keeps an optimizer from moving them, `warp.source.freeze("fx")` one number.
 
     Raises:
         ValueError: a mode that does not exist, cameras without image_size, a rotation of another shape or that is

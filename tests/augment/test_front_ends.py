@@ -280,6 +280,15 @@ def test_what_has_no_place_keeps_its_row(vision):
     assert (none.shape, masks.shape) == ((0, 4), (0, *SIZE))
 
 
+def test_what_would_not_move_or_be_misread_is_refused(vision):
+    front_end, tv = vision
+    boxes = tv.BoundingBoxes(torch.tensor([[2.0, 3, 9, 8]]), format=tv.BoundingBoxFormat.XYWH, canvas_size=SIZE)
+    with pytest.raises(TypeError, match=r"array would stay as it is; v2.ToImage\(\)"):
+        front_end.Transform(augmentation(), camera())({"image": images()[0], "boxes": boxes})
+    with pytest.raises(ValueError, match="boxes must be x1, y1, x2, y2; got BoundingBoxes of the format XYWH"):
+        augmentation()(image=torch.zeros(3, *SIZE), boxes=boxes, camera=camera())
+
+
 def test_plain_tensors_and_pil_images(vision):
     front_end, _ = vision
     image = images()[0]

@@ -133,6 +133,14 @@ def corners_of(board=BOARD, count=8, **more):
     return Corners(board, board.points(), images)
 
 
+def test_advice_names_options_of_the_command(capsys):
+    write_corners(corners_of(count=4), "corners.json")
+    calibrate("--corners", "corners.json", "--model", "fisheye624", "-o", "camera.json")
+    notes = capsys.readouterr().err
+    assert "cannot be told from zero, and the data do not need that: --fixed s3 makes" in notes
+    assert "fixed=" not in notes
+
+
 def test_corners_of_another_tool_need_no_image(capsys):
     """Two of the files are others saved again, which are named and count once."""
     corners = corners_of(count=6)

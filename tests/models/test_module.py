@@ -126,6 +126,16 @@ def test_vmap_over_cameras(key, method):
         assert_same([r[i] for r in results], functional_call(module, {n: p[i] for n, p in stacked.items()}, (values,)))
 
 
+@both_directions
+@pytest.mark.parametrize("key", ["pinhole", "kannala_brandt", "f_theta_backward", "ocamcalib", "splined"])
+def test_vmap_over_no_camera(key, method):
+    module, values = module_and_input(key, method)
+    none = {name: p[None][:0] for name, p in parameters_of(module).items()}
+    found, valid = vmap(lambda parameters: functional_call(module, parameters, (values,)))(none)
+    assert found.shape == (0, *module(values)[0].shape)
+    assert valid.shape == found.shape[:-1]
+
+
 @every_model
 @both_directions
 def test_forward_and_reverse_mode_agree(key, method):

@@ -14,10 +14,12 @@ CAMERA = ct.KannalaBrandt([20.0, 20.0, 15.5, 11.5], [0.02, -0.01, 0.0, 0.0], ima
 BATCH = ct.Pinhole(torch.tensor([[20.0, 20.0, 15.5, 11.5]] * 2), image_size=SIZE).requires_grad_(False)
 GRID = ct.Pinhole(torch.tensor([[[20.0, 20.0, 15.5, 11.5]] * 2] * 2), image_size=SIZE).requires_grad_(False)
 MIXED = ct.Mixed([CAMERA, BATCH[0]])
+WIDE = [model([200.0, 200, 319.5, 239.5], image_size=(480, 640)) for model in (ct.Pinhole, ct.KannalaBrandt)]
 POSE = ct.Extrinsics([0.0, 0.0, 0.0], [-0.1, 0.0, 0.0]).requires_grad_(False)
 DOWN = ct.Extrinsics.from_matrix(np.diag([1.0, -1.0, -1.0]), [0.0, 0.0, 2.0])
 ONE = ct.Rig({"a": CAMERA}, {"a": POSE})
 WARP = ct.Warp(CAMERA, BATCH[0])
+MOUNT = ct.augment.RandomMount(camera=CAMERA)
 PAIR = ct.rectify(BATCH[0], BATCH[0], POSE, fov=57.3, image_size=SIZE)
 PIXELS, RAYS = CAMERA.pixel_grid(), CAMERA.rays()[0]
 IMAGES, META = torch.zeros(2, 3, *SIZE), torch.zeros(5, 3, device="meta")
@@ -35,6 +37,24 @@ WRONG = [
     # what is no tensor, or not such a one
     (lambda: ct.Camera(np.eye(3), np.zeros(4)), TypeError, r"Camera: a camera is made by its model, .*from_matrix\(K"),
     (lambda: ct.Camera([20.0, 20.0, 15.5, 11.5]), TypeError, r"as ct.KannalaBrandt\(intrinsics, distortion\)"),
+    (lambda: ct.Pinhole(300, 300, 320, 240), TypeError, r"as lists.*: ct.Pinhole\(\[fx, fy, cx, cy\], image_size="),
+    (lambda: ct.Pinhole(fx=300, fy=300, cx=320, cy=240), TypeError, r"argument 'fx'. Numbers go in as lists"),
+    (lambda: ct.KannalaBrandt(300, 300, 320, 240, [0.1]), TypeError, r"Numbers go in as lists.* matrix as .*from_ma"),
+    (lambda: ct.KannalaBrandt([3.0, 3, 1, 1], SIZE[:1], SIZE), TypeError, r"the size by name: .*image_size=\(height"),
+    (
+        lambda: ct.KannalaBrandt([300, 300, 320, 240], (480, 640)),
+        ValueError,
+        r"\[480.0, 640.0\] seems to be an",
+    ),
+    (
+        lambda: ct.KannalaBrandt([300, 300, 320, 240], [480, 640]),
+        ValueError,
+        r"an image size; image_size=\(height",
+    ),
+    (lambda: ct.Pinhole([20.0, 20, 15, 11], [0.1, 0, 0, 0]), ValueError, r"Pinhole: it has no distortion, .*\(4,\)"),
+    (lambda: ct.Pinhole(torch.eye(4)), ValueError, r"focal lengths .* Of matrices \(4, 4\) use Pinhole.from_matrix\(K"),
+    (lambda: ct.Pinhole.from_matrix(torch.eye(4)), ValueError, r"got shape \(4, 4\)\. Of larger ones it is K\[..., :3"),
+    (lambda: ct.Extrinsics(0, 0, 1), TypeError, r"It takes ct.Extrinsics\(\[rx, ry, rz\], \[tx, ty, tz\]\)"),
     (lambda: ct.Camera.from_fov(90, image_size=SIZE), TypeError, r"ct.MODELS has all models"),
     (
         lambda: augment.BoxCrop((8, 8), camera=CAMERA)(image=IMAGES[0], boxes=[[3.0, 4.0, 9.0, 9.0]]),
@@ -45,6 +65,14 @@ WRONG = [
         lambda: augment.RandomMount(camera=CAMERA)(image=IMAGES[0], keypoint=torch.ones(3, 2)),
         ValueError,
         r"'keypoint' holds real numbers.* Did you mean 'keypoints'\? fields",
+    ),
+    (lambda: MOUNT(image=IMAGES[0], rvec=torch.ones(3, 1)), ValueError, r"OpenCV's column goes in as rvec\[..., 0\]"),
+    (lambda: MOUNT(image=IMAGES[0], bbox=torch.tensor([[3, 4, 9, 9]])), ValueError, r"'bbox' .* Did you mean 'boxes'"),
+    (lambda: MOUNT(image=IMAGES[0], seg=torch.ones(SIZE, dtype=torch.uint8)), ValueError, r"Did you mean 'mask'\?"),
+    (
+        lambda: MOUNT(image=IMAGES, parts=torch.ones(2, 5, 2).int()),
+        ValueError,
+        r"'parts' .*move with the camera is not",
     ),
     (lambda: ct.Pinhole([LEAF] * 4), TypeError, r"Pinhole: intrinsics is a list of tensors that require grad"),
     (lambda: CAMERA.project([LEAF] * 3), TypeError, r"points is a list of tensors that require grad; torch.stack"),
@@ -188,6 +216,11 @@ WRONG = [
     (lambda: ct.rectify(CAMERA, CAMERA, (np.eye(3), NORMAL)), TypeError, r"Extrinsics, right from left.*from_matrix"),
     (lambda: ct.rectify(CAMERA, CAMERA, at([0, 0.1, 0], [0, 0, 0])), ValueError, r"stand at one place"),
     (lambda: ct.rectify(CAMERA, CAMERA, at([0, 0, 0], [0, 0, 1])), ValueError, r"look along their baseline"),
+    (
+        lambda: ct.rectify(*WIDE, at([-0.011, -0.008, 0.01], [3e-5, -2.5e-5, 1]), vertical=True, align="opencv"),
+        ValueError,
+        r"images would be \(\d+, \d+\); give image_size=\(height, width\)",
+    ),
     (lambda: ct.rectify(CAMERA, CAMERA, at([0, math.pi, 0], [-1, 0, 0])), ValueError, r"away from each other"),
     (lambda: ct.rectify(CAMERA, CAMERA, POSE, projection="fisheye"), ValueError, r"projection must be one of"),
     (lambda: ct.rectify(CAMERA, CAMERA, POSE, fov=(90, 190)), ValueError, r"below 180 for perspective; got 190"),
