@@ -33,6 +33,7 @@ _MANY = 100  # coefficients
 _OUTLIER = 3.0  # standard deviations
 _ROUNDS = 20
 _SMOOTH = 0.02  # of a pixel of error: one of a surface's second differences, see `Camera.smoothness`
+_BESIDE = 1e-3  # radians from the axis, where a surface shows which way is right
 _SAME_WIDTH, _CONTRADICTED = 0.01, 3.0  # of a prior: a change that is none, and times its own that it has to be told
 _SECOND_LOOKS = 3  # at the poses
 _AS_GOOD = 9.0  # variances: the difference of two costs that three standard deviations explain
@@ -349,11 +350,22 @@ class Search:
     """See `misfit`, beside a prior."""
 
     def __post_init__(self) -> None:
-        smooth = self.asked.kind.smoothness()
-        if smooth is not None and self.asked.start is not None:  # where nothing is seen a surface goes on as it came
-            focal = float(self.asked.start.intrinsics.detach()[..., :2].mean())
-            root = torch.nn.functional.pad(_SMOOTH * focal * smooth.to(self.given.pixels), (4, 0))
-            self.prior = Prior(root.new_zeros(root.shape[-1]), root)
+        kind, start = self.asked.kind, self.asked.start
+        smooth = kind.smoothness()
+        if smooth is None or start is None:
+            return
+        # where nothing is seen a surface goes on as the start does
+        like = self.given.pixels
+        core, coefficients = (t.detach().to(like).reshape(-1) for t in (start.intrinsics, start.distortion))
+        axis = like.new_tensor([[0.0, 0.0, 1.0], [_BESIDE, 0.0, 1.0]])
+
+        def frame(coefficients: Tensor) -> Tensor:
+            (x, y), (_, right) = kind(core, coefficients).project(axis)[0]
+            return torch.stack((x, y, (right - y) / _BESIDE / 10))
+
+        # a surface could do what turns of the camera do, and boards turn with it: the frame is that of the start
+        rows = _SMOOTH * float(core[:2].mean()) * smooth.to(like), torch.func.jacrev(frame)(coefficients)
+        self.prior = Prior(torch.cat((core, coefficients)), torch.nn.functional.pad(torch.cat(rows), (4, 0)))
 
     @cached_property
     def seen(self) -> Observations:

@@ -181,7 +181,7 @@ def calibrate_hand_eye(
         first = state._replace(parameters=()).of(part)
         first = first._replace(parameters=(parameters[part] if len(parameters) == sets else parameters,))
         given = (whole.points[part], whole.pixels[part], whole.seen[part].to(like))
-        sight = Sight(asked.kind, *given, motions.of(part))
+        sight = Sight(asked.kind, *given, motions.of(part), search.prior)
         found.append(search.adjusted([sight], first, free, steps=STEPS, progress=told))
     return _result(search, found, whole, has, eye, batch)
 

@@ -7,6 +7,7 @@ has rotations; `writing.Lossy` says what would be lost.
 
 from __future__ import annotations
 
+import codecs
 import fnmatch
 import os
 
@@ -107,7 +108,7 @@ def load(path: str | os.PathLike[str], format: str | None = None) -> Rig:
         if found is None:
             raise CameraFileError(path, "folder", f"has none of {', '.join(names)}")
         path = os.path.join(path, found)
-    content = read_bytes(path)
+    content = read_bytes(path).removeprefix(codecs.BOM_UTF8)  # which some editors put there
     try:
         rig, format = _read(path, content, format)
     except (ArithmeticError, RecursionError, MemoryError) as error:

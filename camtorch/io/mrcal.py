@@ -84,7 +84,9 @@ def render(rig: Rig, path: str) -> str:
     lossy.no_images(rig)
     height, width = lossy.size(name, camera)
     known = {"cahvore", *(key for key, _ in _MODELS.values())}
-    known.add(camera.key if isinstance(camera, Splined) else Splined.key)
+    if isinstance(camera, Splined):  # but none behind a windshield, say, whose key is another
+        grid = {"order": camera.order, "columns": camera.columns, "rows": camera.rows, "fov_x": camera.fov_x}
+        known.add(Splined.with_grid(**grid).key)
     key, intrinsics, distortion = lossy.model(name, camera, known)
     if key == "stereographic":  # without the polynomial
         distortion = lossy.at_most(name, camera, distortion, (0,))

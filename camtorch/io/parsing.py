@@ -170,7 +170,7 @@ def _from_literal(path: str | os.PathLike[str], text: str) -> Any:
     try:
         return _with_floats(ast.literal_eval(ast.parse(text, mode="eval")))
     except SyntaxError as error:
-        raise CameraFileError(path, f"line {error.lineno}", error.msg) from None
+        raise CameraFileError(path, f"line {error.lineno}" if error.lineno else "content", error.msg) from None
     except (ValueError, TypeError):  # a list has no hash, as a key has
         raise CameraFileError(path, "content", "something else than texts, numbers, lists and mappings") from None
 
@@ -240,7 +240,7 @@ def _from_yaml(path: str | os.PathLike[str], text: str) -> Any:
     import yaml  # a fiftieth of a second: only when needed
 
     _check_length(path, text, _LARGEST_STORAGE, "YAML")
-    text = re.sub(r"\A%YAML[^\n]*", "", text)  # "%YAML:1.0", as OpenCV writes it, is not YAML
+    text = re.sub(r"\A(\s*)%YAML[^\r\n]*", r"\1", text)  # "%YAML:1.0", as OpenCV writes it, is not YAML
     if "\n%" in text:  # libyaml compares each with all
         raise CameraFileError(path, "content", "YAML directives, which no calibration has")
     tree = _YamlTree(path)

@@ -91,9 +91,9 @@ class Splined(Camera):
 
     @classmethod
     def variant(cls, text: str) -> type[Camera]:
-        found = _VARIANT.fullmatch(text)
-        if found is None and text.startswith("windshield"):
+        if cls is not Splined or text.startswith(("windshield", "elastic")):  # a grid has no other grid
             return super().variant(text)
+        found = _VARIANT.fullmatch(text)
         if found is None:
             raise ValueError(
                 f"'splined:order=3,columns=16,rows=11,fov_x=120' is how a grid is written; got {text!r:.60}"

@@ -7,7 +7,6 @@ the splined stereographic camera, or one more after those of another lens, `Lens
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import cached_property
 from typing import ClassVar
 
 import torch
@@ -120,6 +119,11 @@ class SurfaceAt(StageAt):
 
     stage: Surface
 
+    def __init__(self, stage: Surface, a: Tensor, b: Tensor):
+        super().__init__(stage, a, b)
+        # at once: torch.compile does not enter the lock that cached_property has before Python 3.12
+        self._patch = self._at_points()
+
     def _place(self, axis: int) -> tuple[Tensor, Tensor, Tensor]:
         """The first of the control points that have a part in it, weights (..., order + 1), and their slopes."""
         stage, w = self.stage, (self.a, self.b)[axis]
@@ -136,8 +140,7 @@ class SurfaceAt(StageAt):
         few = (4 * x - 4) * x + 1, 6 - 8 * x * x, (4 * x + 4) * x + 1
         return cell.long() - 1, torch.stack(few, -1) / 8, torch.stack((x - 0.5, -2 * x, x + 0.5), -1)
 
-    @cached_property
-    def _patch(self) -> tuple[Tensor, ...]:
+    def _at_points(self) -> tuple[Tensor, ...]:
         """Control points (..., order + 1, order + 1, 2), rows first, and weights and slopes along a and b."""
         stage = self.stage
         controls = stage.parameters[4:]

@@ -117,6 +117,19 @@ def test_surfaces_of_many_and_of_few_control_points_are_the_formula():
     assert counts[0] < 64 * 64 < counts[1] - 4
 
 
+@pytest.mark.parametrize("key", ["splined", "splined:order=2,columns=9,rows=5,fov_x=120", "kannala_brandt"])
+@pytest.mark.parametrize("windshield", [False, True])
+def test_it_goes_through_pickles_and_files_whatever_it_was_before(key, windshield, tmp_path):
+    plain = one("kannala_brandt").convert(key).camera if ":" in key else one(key)
+    if windshield:
+        plain = plain.behind(ct.Windshield([0.0, 0.99, 0.01], [0.0, 0.0, 1.0]))
+    bent = ct.augment.RandomElastic()(camera=plain.double(), keypoints=torch.rand(2, 2))["camera"]
+    ct.save(bent, tmp_path / "bent.json")
+    for other in (pickle.loads(pickle.dumps(bent)), ct.load(tmp_path / "bent.json").camera):
+        assert type(other) is type(bent)
+        assert torch.equal(other.distortion, bent.distortion.double())
+
+
 def test_files_hold_it(tmp_path):
     camera = ct.Pinhole.from_fov(60, image_size=(48, 64)).double().requires_grad_(False)
     bent = ct.augment.RandomElastic(amount=0.03)({"image": torch.rand(1, 48, 64), "camera": camera})["camera"]

@@ -60,6 +60,16 @@ def test_a_model_may_have_no_coefficients():
     assert found.covariance.shape == (16, 16)
 
 
+def test_a_surface_is_learnt_on_the_hand_in_the_frame_of_its_start():
+    """Where nothing is seen its control points went beyond 1e8, and the hand turned with it by three degrees."""
+    corners, hand_eye, _, poses = made("in_hand", views=12, noise=0.1)
+    model = ct.Splined.with_grid(columns=8, rows=7, fov_x=75)
+    found = calibrated(corners, poses, "in_hand", model, start=CAMERA)
+    assert found.converged
+    assert found.camera.distortion.abs().max() < 1
+    torch.testing.assert_close(found.hand_eye.matrix().detach(), hand_eye.matrix(), rtol=0, atol=3e-3)
+
+
 @pytest.mark.parametrize(
     ("eye", "held"), [("in_hand", False), ("to_hand", True), pytest.param("to_hand", False, marks=pytest.mark.slow)]
 )

@@ -1,12 +1,13 @@
 """What people pass to `ct.load` first: paths of every kind, other people's files, NumPy archives."""
 
 import os
+import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from rigs import FILES
+from rigs import FILES, SAMPLES, assert_same
 
 import camtorch as ct
 
@@ -20,6 +21,22 @@ D = np.array([[0.3, 0.1, 0.001, -0.002, 0.05]])
 @pytest.mark.parametrize("kind", [str, Path, os.fsencode])
 def test_paths_of_every_kind(kind):
     assert ct.load(kind(str(FILES / "opencv_camera.yml"))).camera.image_size == (800, 1280)
+
+
+@pytest.mark.parametrize("end", [b"\n", b"\r\n"])
+@pytest.mark.parametrize("start", [b"", b"\xef\xbb\xbf", b"\xef\xbb\xbf\n"])
+@pytest.mark.parametrize(
+    "name", [*(name for name in SAMPLES if name[-4:] != ".bin"), "nuscenes/calibrated_sensor.json"]
+)
+def test_what_editors_do_to_a_file_is_no_fault_of_it(name, start, end, tmp_path):
+    whole = (FILES / name).read_bytes().replace(b"\r\n", b"\n")
+    if whole.startswith(b"<?xml"):
+        start = start.rstrip()  # XML has no empty line there
+    path = tmp_path / name
+    path.parent.mkdir(exist_ok=True)
+    path.write_bytes((start + whole).replace(b"\n", end))
+    shutil.copy(FILES / "nuscenes/sensor.json", path.parent)
+    assert_same(ct.load(path), ct.load(FILES / name))
 
 
 def test_no_path(tmp_path):

@@ -8,6 +8,7 @@ import re
 import pytest
 import torch
 from cameras import (
+    KEYS,
     constants,
     each_kind,
     every_model,
@@ -15,6 +16,7 @@ from cameras import (
     make,
     one,
     pixel_lattice,
+    slow_unless,
     spread,
 )
 from torch import nn
@@ -68,6 +70,15 @@ def test_compile_without_graph_breaks(key, method):
         result, valid = function(leaf)
         gradients.append((result, valid, *torch.autograd.grad(result.sum(), [leaf, *module.parameters()])))
     assert_same(*gradients)
+
+
+@pytest.mark.parametrize("key", slow_unless("splined".__eq__, KEYS))
+@both_directions
+def test_compile_takes_every_model(key, method):
+    module, values = module_and_input(key, method)
+    torch._dynamo.reset()  # of which each model would count as one more change of the same function
+    compiled = torch.compile(module, fullgraph=True, backend="eager")
+    assert_same(compiled(values), module(values), rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.slow

@@ -145,6 +145,13 @@ def test_files_of_grids_that_are_none_are_refused(tmp_path, name):
         ct.load(path)
 
 
+def test_a_grid_has_no_other_grid():
+    grid = "order=3,columns=16,rows=11,fov_x=120"
+    for key in (f"splined:{grid}:{grid}", f"splined:windshield=3,3:{grid}"):
+        with pytest.raises(ValueError, match="there is no variant 'order=3"):
+            ct.Pinhole([500, 500, 320, 240]).convert(key)
+
+
 def test_any_lens_becomes_one():
     lens = ct.KannalaBrandt([300, 300, 310, 230], [0.03, -0.01, 0.002, -0.0005], image_size=(480, 640)).double()
     found = lens.convert("splined")
