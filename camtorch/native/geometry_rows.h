@@ -153,15 +153,20 @@ typedef struct {
 /* Of points beyond `inner2`, `ok` where the lens is regular all the way from the centre. How many of those that count
    wait for limits */
 static int T(beyond)(const T(Camera) *c, int count, int n, T(Seen) *s) {
-    ALIGNED R u[BLOCK], v[BLOCK], least[BLOCK];
+    ALIGNED R a[BLOCK], b[BLOCK], u[BLOCK], v[BLOCK], least[BLOCK];
+    ALIGNED I settled[BLOCK];
     T(Jacobian) jacobian;
-    int waiting = 0;
-    if (c->limits2) T(lens)(c, 1, n, s->a, s->b, u, v, &jacobian, least);
-    for (int i = 0; i < n; i++) {
-        const R a = s->a[i], b = s->b[i];
-        if (s->ok[i] != 2) continue;
-        s->ok[i] = c->limits2 && c->limits2[T(azimuth)(a, b, 0)] - (a * a + b * b) > 0 && least[i] > TINY;
-        waiting += !c->limits2 && i < count;
+    int places[BLOCK], waiting = 0;
+    EACH(i) settled[i] = s->ok[i] != 2;
+    const int some = T(chosen)(n, settled, places), filled = (some + LANES - 1) & -LANES;
+    if (c->limits2) {
+        for (int i = 0; i < filled; i++) a[i] = s->a[places[i]], b[i] = s->b[places[i]];
+        T(lens)(c, 1, filled, a, b, u, v, &jacobian, least);
+    }
+    for (int i = 0; i < some; i++) {
+        const int at = places[i];
+        s->ok[at] = c->limits2 && c->limits2[T(azimuth)(a[i], b[i], 0)] - (a[i] * a[i] + b[i] * b[i]) > 0 && least[i] > TINY;
+        waiting += !c->limits2 && at < count;
     }
     return waiting;
 }
