@@ -31,8 +31,8 @@ enum { NODES = 1024 };   /* of the table of an inverse, see `radial_inverse.tabu
 enum { MOST_RADII = 512 }; /* on which a lens is followed outwards by bounds of its stages */
 enum { AZIMUTHS = 336 }; /* on which limits are given, see `fold.limits_and_extent` */
 enum { RADII = 80 };     /* on each of them: half over the whole chart, half around the fold of a radial factor */
-/* The inverse of a surface, nearly, as the numbers of a cubic one of GRID x GRID control points */
-enum { GRID = 46, START = 4 + 2 * GRID * GRID };
+/* The inverse of a surface, nearly: a polynomial of CELL numbers on each of GRID x GRID cells, after where these are */
+enum { GRID = 44, CELL = 16, START = CELL * (1 + GRID * GRID) };
 /* Numbers of a piece of a surface: 4 x 4 coefficients, of du and dv each */
 enum { PIECE = 32 };
 /* Radii (RADII); how far out they are sent on each azimuth (AZIMUTHS, RADII), ascending; how far the image reaches in each
@@ -62,7 +62,7 @@ typedef struct {
     const uint8_t *stagewise;
     const void *circle2;
     /* of a lens that is a surface, or a surface after a radial factor: where a point is in the domain for certain, of each
-       4 x 4 control points (c, n m) and up to the squared radius of the factor's fold (c); where to start the inverse of
+       piece of it (c, n m, of which as many are used) and up to the squared radius of the factor's fold (c); where to start the inverse of
        the surface (c, START); the surface as polynomials (c, PIECE of each piece), or NULL, see `pieces_of` */
     const uint8_t *certain;
     const void *certain2, *start, *pieces;

@@ -357,18 +357,18 @@ static void put(void *to, int64_t at, double value, int is_double) {
 
 /* -- surfaces */
 
-/* Whether a surface is regular wherever 4 x 4 control points have a part in it: its slopes lie between those of the lines
-   from control point to control point */
+/* Whether a piece of a surface is regular, whose control points begin there: its slopes lie between those of the lines from
+   control point to control point */
 static int is_regular(const Part *part, const double *k, const double *at) {
     double ua = INFINITY, vb = INFINITY, ub = 0, va = 0, all = 0;
-    for (int j = 0; j < 4; j++)
-        for (int i = 0; i < 4; i++) {
+    for (int j = 0; j <= part->flags; j++)
+        for (int i = 0; i <= part->flags; i++) {
             const double *here = at + 2 * ((int64_t)j * part->n + i), *below = here + 2 * (int64_t)part->n;
-            if (i < 3) {
+            if (i < part->flags) {
                 const double by_a = 1 + (here[2] - here[0]) * k[0], side = fabs(here[3] - here[1]) * k[0];
                 ua = by_a < ua ? by_a : ua, va = side > va ? side : va, all += by_a + side;
             }
-            if (j < 3) {
+            if (j < part->flags) {
                 const double by_b = 1 + (below[1] - here[1]) * k[1], side = fabs(below[0] - here[0]) * k[1];
                 vb = by_b < vb ? by_b : vb, ub = side > ub ? side : ub, all += by_b + side;
             }
@@ -377,20 +377,20 @@ static int is_regular(const Part *part, const double *k, const double *at) {
     return all == all && ua > 0 && vb > 0 && ua * vb - ub * va > 0.01;
 }
 
-/* (n m): of the first of 4 x 4 control points, whether the surface is regular there and all the way from the centre */
-static void certain_of(const Part *part, const double *k, uint8_t *certain) {
-    const int n = part->n, m = part->m;
-    const double origin[LANES] = {0};
-    Cells_double at;
-    memset(certain, 0, (size_t)n * (size_t)m);
-    cells_double(part, k, LANES, origin, origin, &at);
-    const int first_i = at.at[0] / 2 % n, first_j = at.at[0] / 2 / n;
-    for (int down = -1; down <= 1; down += 2)
-        for (int across = -1; across <= 1; across += 2)
-            for (int j = first_j; j >= 0 && j <= m - 4; j += down)
-                for (int i = first_i; i >= 0 && i <= n - 4; i += across) {
-                    const int here = j * n + i, before = i == first_i || certain[here - across];
-                    certain[here] = before && (j == first_j || certain[here - down * n]) && is_regular(part, k, k + 4 + 2 * here);
+/* Of each piece, whether the surface is regular there and all the way from the centre */
+static void certain_of(const Camera_double *c, uint8_t *certain) {
+    const Part *part = c->parts + c->stages;
+    const double *k = c->numbers[c->stages];
+    const int across = part->n - part->flags, down = part->m - part->flags;
+    double unused;
+    const int first = piece_double(pieces_on_double(c), 0, 0, &unused, &unused), first_i = first % across, first_j = first / across;
+    for (int by_j = -1; by_j <= 1; by_j += 2)
+        for (int by_i = -1; by_i <= 1; by_i += 2)
+            for (int j = first_j; j >= 0 && j < down; j += by_j)
+                for (int i = first_i; i >= 0 && i < across; i += by_i) {
+                    const int here = j * across + i, before = i == first_i || certain[here - by_i];
+                    certain[here] = before && (j == first_j || certain[here - by_j * across]) &&
+                                    is_regular(part, k, k + 4 + 2 * (j * part->n + i));
                 }
 }
 
@@ -419,9 +419,31 @@ static void pieces_of(const Part *part, const double *k, void *pieces, int64_t a
         }
 }
 
-/* (START): the inverse of the last stage, a surface, on the box around what it sends certain points to */
+/* By how much the slopes of a surface change at the most on a unit: second derivatives of a spline lie between the second
+   differences of its control points */
+static double bend_of(const Part *part, const double *k) {
+    const int64_t row = 2 * (int64_t)part->n;
+    double most = 0;
+    for (int axis = 0; axis < 2; axis++) {
+        double along = 0, mixed = 0;
+        for (int j = 0; j < part->m; j++)
+            for (int i = 0; i < part->n; i++) {
+                const double *at = k + 4 + row * j + 2 * i + axis;
+                if (i > 1) along = fmax(along, fabs(at[0] - 2 * at[-2] + at[-4]));
+                if (j > 1) along = fmax(along, fabs(at[0] - 2 * at[-row] + at[-2 * row]));
+                if (i && j) mixed = fmax(mixed, fabs(at[0] - at[-2] - at[-row] + at[-row - 2]));
+            }
+        most += along + mixed;
+    }
+    return most * fmax(k[0] * k[0], k[1] * k[1]);
+}
+
+/* (START): the inverse of the last stage, a surface, on the box around what it sends certain points to. First where
+   the cells are, as of a surface, and what Newton's method leaves of a step: it times the step's square times the size of
+   the Jacobian and over its determinant, to be less than 1. Of each cell its middle; slopes across and down; by how much
+   these change across; and down */
 static void start_of(const Domain *d, int64_t camera, const uint8_t *certain) {
-    enum { SIDE = GRID + 2 }; /* whole vectors */
+    enum { SIDE = GRID + 4 }; /* the middles of cells, and two around: whole vectors */
     Camera_double c;
     lens_of(d, camera, &c);
     c.certain = certain;
@@ -429,7 +451,7 @@ static void start_of(const Domain *d, int64_t camera, const uint8_t *certain) {
     const double *k = c.numbers[c.stages], size[2] = {(part->n - part->flags) / k[0], (part->m - part->flags) / k[1]};
     ALIGNED double a[BLOCK], b[BLOCK], u[BLOCK], v[BLOCK];
     ALIGNED int64_t ok[BLOCK];
-    double low[2] = {INFINITY, INFINITY}, high[2] = {-INFINITY, -INFINITY}, found[2][SIDE][SIDE], start[START];
+    double low[2] = {INFINITY, INFINITY}, high[2] = {-INFINITY, -INFINITY}, found[2][SIDE][SIDE], start[CELL] = {0};
     for (int j = 0; j < SIDE; j++) {
         for (int i = 0; i < SIDE; i++)
             a[i] = k[2] + size[0] * (i / (SIDE - 1.0) - 0.5), b[i] = k[3] + size[1] * (j / (SIDE - 1.0) - 0.5);
@@ -443,26 +465,43 @@ static void start_of(const Domain *d, int64_t camera, const uint8_t *certain) {
     }
     for (int axis = 0; axis < 2; axis++) {
         const int is_box = low[axis] < high[axis];
-        start[axis] = (GRID - 3) / (is_box ? high[axis] - low[axis] : size[axis]);
+        start[axis] = GRID / (is_box ? high[axis] - low[axis] : size[axis]);
         start[2 + axis] = is_box ? (low[axis] + high[axis]) / 2 : k[2 + axis];
     }
+    const double least = (d->is_double ? DBL_EPSILON : FLT_EPSILON) / 4 * hypot(GRID / 2 / start[0], GRID / 2 / start[1]);
+    start[4] = bend_of(part, k) / 2 / least;
+    for (int i = 0; i < CELL; i++) put(d->start, camera * START + i, start[i], (int)d->is_double);
     for (int j = 0; j < SIDE; j++) {
         for (int i = 0; i < SIDE; i++) {
-            u[i] = start[2] + (i - (GRID + 1) / 2.0) / start[0], v[i] = start[3] + (j - (GRID + 1) / 2.0) / start[1];
-            if (j) a[i] = u[i] + found[0][j - 1][i], b[i] = v[i] + found[1][j - 1][i]; /* as in the row before */
+            u[i] = start[2] + (i - (SIDE - 1) / 2.0) / start[0], v[i] = start[3] + (j - (SIDE - 1) / 2.0) / start[1];
+            if (j) a[i] = found[0][j - 1][i], b[i] = found[1][j - 1][i] + 1 / start[1]; /* as in the row before */
         }
         if (!j) start_double(&c, c.stages, SIDE, u, v, a, b);
         newton_double(&c, c.stages, SIDE, u, v, a, b, ok, 1);
-        for (int i = 0; i < SIDE; i++) found[0][j][i] = ok[i] ? a[i] - u[i] : 0, found[1][j][i] = ok[i] ? b[i] - v[i] : 0;
+        for (int i = 0; i < SIDE; i++) {
+            found[0][j][i] = ok[i] ? a[i] : u[i], found[1][j][i] = ok[i] ? b[i] : v[i];
+        }
     }
-    for (int j = 1; j <= GRID; j++) /* so that it goes through them, to the fourth power of a cell */
-        for (int i = 1; i <= GRID; i++)
+    for (int j = 2; j < SIDE - 2; j++)
+        for (int i = 2; i < SIDE - 2; i++) {
+            double made[CELL] = {0};
             for (int axis = 0; axis < 2; axis++) {
-                double(*f)[SIDE] = found[axis];
-                const double beside = f[j][i - 1] + f[j][i + 1] + f[j - 1][i] + f[j + 1][i];
-                start[4 + 2 * ((j - 1) * GRID + i - 1) + axis] = f[j][i] - (beside - 4 * f[j][i]) / 6;
+                const double *f = &found[axis][j][i], *over = f - SIDE, *under = f + SIDE;
+                const double right = f[1] - f[-1], below = under[0] - over[0];
+                /* of thirds, which are left out, what is least without them */
+                const double third = (f[2] - f[-2]) / 2 - right, down = (f[2 * SIDE] - f[-2 * SIDE]) / 2 - below;
+                const double mixed = (under[1] - under[-1]) / 2 - right + (over[1] - over[-1]) / 2;
+                const double other = (under[1] - over[1]) / 2 - below + (under[-1] - over[-1]) / 2;
+                const double turn = (under[1] - under[-1] - over[1] + over[-1]) / 8;
+                made[axis] = f[0];
+                made[4 + axis] = right / 2 - third * (1 / 6.0 - 1 / 32.0) + mixed / 16;
+                made[6 + axis] = below / 2 - down * (1 / 6.0 - 1 / 32.0) + other / 16;
+                made[8 + axis] = (f[1] - 2 * f[0] + f[-1]) / 2, made[14 + axis] = (under[0] - 2 * f[0] + over[0]) / 2;
+                made[10 + axis] = made[12 + axis] = turn;
             }
-    for (int i = 0; i < START; i++) put(d->start, camera * START + i, start[i], (int)d->is_double);
+            for (int p = 0; p < CELL; p++)
+                put(d->start, camera * START + CELL * (1 + (j - 2) * GRID + i - 2) + p, made[p], (int)d->is_double);
+        }
 }
 
 /* Fills in what of a `Domain` is wanted */
@@ -512,7 +551,9 @@ void THIS(domain)(const Domain *d) {
         const Part *last = d->parts + d->part_count - 1;
         if (d->certain2) {
             const double *controls = numbers + d->parameter_count - numbers_of(last);
-            certain_of(last, controls, d->certain + c * last->n * last->m);
+            Camera_double camera;
+            lens_of(d, c, &camera);
+            certain_of(&camera, d->certain + c * last->n * last->m);
             put(d->certain2, c, within(has_factor ? fold : end, end, is_double), is_double);
             if (d->pieces) pieces_of(last, controls, d->pieces, c * PIECE * (last->n - last->flags) * (last->m - last->flags), is_double);
         }

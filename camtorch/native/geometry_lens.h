@@ -268,7 +268,7 @@ typedef struct {
 INLINE void T(place)(const int order, int n, R size, R *restrict w, I *restrict first, I *restrict is_last) {
     const R half = order == 3 ? 0 : (R)0.5, most = size - (R)order;
     EACH(i) {
-        R cell = IS_DOUBLE ? (R)floor(w[i] + half) : (R)floorf((float)(w[i] + half));
+        R cell = T(whole)(w[i] + half);
         cell = cell > 1 ? cell : 1, cell = cell < most ? cell : most;
         is_last[i] = (order == 2) & (cell >= size - 2);
         w[i] -= cell, first[i] = (I)cell - 1 - is_last[i];
@@ -374,23 +374,40 @@ static void T(surface)(const Part *part, const R *k, int n, const R *restrict a,
     else T(surface_of)(part, k, 2, n, a, b, u, v, NULL);
 }
 
-/* The same of a surface, the last stage, of whose pieces the polynomials are known: see `pieces_of` */
-INLINE void T(patches_at)(const T(Camera) *c, int n, const R *restrict a, const R *restrict b, R *restrict u,
-                         R *restrict v, T(Jacobian) *restrict to) {
+/* The pieces of a surface, the last stage, by value */
+typedef struct {
+    R sa, sb, ca, cb, middle_a, middle_b, half, last_i, last_j;
+    int32_t across;
+} T(Pieces);
+
+INLINE T(Pieces) T(pieces_on)(const T(Camera) *c) {
     const Part *part = c->parts + c->stages;
-    const int order = part->flags, across = part->n - order;
-    const R *k = c->numbers[c->stages], sa = k[0], sb = k[1], ca = k[2], cb = k[3], half = order == 3 ? 0 : (R)0.5;
-    const R middle_a = (R)(part->n - 1) / 2, middle_b = (R)(part->m - 1) / 2, most_i = (R)across, most_j = (R)(part->m - order);
-    ALIGNED R x[BLOCK], y[BLOCK], low[4 * BLOCK], high[4 * BLOCK], down[4 * BLOCK];
+    const R *k = c->numbers[c->stages];
+    const int across = part->n - part->flags, down = part->m - part->flags;
+    return (T(Pieces)){k[0], k[1], k[2], k[3], (R)(part->n - 1) / 2, (R)(part->m - 1) / 2, part->flags == 3 ? 0 : (R)0.5,
+                       (R)across, (R)down, across};
+}
+
+/* The piece that a point lies on, or that goes on there, and the place on it */
+INLINE int32_t T(piece)(const T(Pieces) of, R a, R b, R *x, R *y) {
+    const R p = (a - of.ca) * of.sa + of.middle_a, q = (b - of.cb) * of.sb + of.middle_b;
+    R i = T(whole)(p + of.half);
+    R j = T(whole)(q + of.half);
+    i = i > 1 ? i : 1, i = i < of.last_i ? i : of.last_i;
+    j = j > 1 ? j : 1, j = j < of.last_j ? j : of.last_j;
+    *x = p - i, *y = q - j;
+    return ((int32_t)j - 1) * of.across + (int32_t)i - 1;
+}
+
+/* A surface, the last stage, of whose pieces the polynomials are known, see `pieces_of`: of each point the place across and,
+   of the powers 0 and 2 of that, the numbers of the part that is even there; if wanted, of that which is odd, and of the
+   slope down */
+INLINE void T(patches_of)(const T(Camera) *c, const int slopes, int n, const R *restrict a, const R *restrict b, R *restrict x,
+                          R *restrict low, R *restrict high, R *restrict down) {
+    const T(Pieces) pieces = T(pieces_on)(c);
+    ALIGNED R y[BLOCK];
     ALIGNED int32_t at[BLOCK];
-    EACH(i) {
-        const R p = (a[i] - ca) * sa + middle_a, q = (b[i] - cb) * sb + middle_b;
-        R cell_i = IS_DOUBLE ? (R)floor(p + half) : (R)floorf((float)(p + half));
-        R cell_j = IS_DOUBLE ? (R)floor(q + half) : (R)floorf((float)(q + half));
-        cell_i = cell_i > 1 ? cell_i : 1, cell_i = cell_i < most_i ? cell_i : most_i;
-        cell_j = cell_j > 1 ? cell_j : 1, cell_j = cell_j < most_j ? cell_j : most_j;
-        x[i] = p - cell_i, y[i] = q - cell_j, at[i] = ((int32_t)cell_j - 1) * across + (int32_t)cell_i - 1;
-    }
+    EACH(i) at[i] = T(piece)(pieces, a[i], b[i], x + i, y + i);
     for (int i = 0; i < n; i++) {
         const R *restrict piece = c->pieces + (int64_t)PIECE * at[i], p = x[i], q = y[i];
         ALIGNED R sum[8], slope[8];
@@ -400,26 +417,31 @@ INLINE void T(patches_at)(const T(Camera) *c, int n, const R *restrict a, const 
             slope[j] = by * q + w, sum[j] = w * q + piece[j];
         }
         KEPT_LOOP for (int j = 0; j < 4; j++) low[4 * i + j] = sum[4 + j] * p + sum[j];
-        if (!to) continue;
+        if (!slopes) continue;
         KEPT_LOOP for (int j = 0; j < 4; j++) high[4 * i + j] = sum[4 + j], down[4 * i + j] = slope[4 + j] * p + slope[j];
     }
-    EACH(i) {
-        const R xx = x[i] * x[i];
-        u[i] = a[i] + (low[4 * i + 2] * xx + low[4 * i]), v[i] = b[i] + (low[4 * i + 3] * xx + low[4 * i + 1]);
-    }
-    if (!to) return;
-    EACH(i) {
-        const R w = x[i], xx = w * w;
-        to->ua[i] = (high[4 * i + 2] * xx + (2 * w * low[4 * i + 2] + high[4 * i])) * sa + 1;
-        to->va[i] = (high[4 * i + 3] * xx + (2 * w * low[4 * i + 3] + high[4 * i + 1])) * sa;
-        to->ub[i] = (down[4 * i + 2] * xx + down[4 * i]) * sb, to->vb[i] = (down[4 * i + 3] * xx + down[4 * i + 1]) * sb + 1;
-    }
+}
+
+INLINE void T(patch)(const R *low, R x, R a, R b, R *u, R *v) {
+    *u = a + (low[2] * x * x + low[0]), *v = b + (low[3] * x * x + low[1]);
+}
+
+INLINE void T(patch_slopes)(const R *low, const R *high, const R *down, R x, R sa, R sb, R *ua, R *ub, R *va, R *vb) {
+    const R xx = x * x;
+    *ua = (high[2] * xx + (2 * x * low[2] + high[0])) * sa + 1, *va = (high[3] * xx + (2 * x * low[3] + high[1])) * sa;
+    *ub = (down[2] * xx + down[0]) * sb, *vb = (down[3] * xx + down[1]) * sb + 1;
 }
 
 static void T(patches)(const T(Camera) *c, int n, const R *restrict a, const R *restrict b, R *restrict u, R *restrict v,
                       T(Jacobian) *restrict to) {
-    if (to) T(patches_at)(c, n, a, b, u, v, to);
-    else T(patches_at)(c, n, a, b, u, v, NULL);
+    const R *k = c->numbers[c->stages], sa = k[0], sb = k[1];
+    ALIGNED R x[BLOCK], low[4 * BLOCK], high[4 * BLOCK], down[4 * BLOCK];
+    if (to) T(patches_of)(c, 1, n, a, b, x, low, high, down);
+    else T(patches_of)(c, 0, n, a, b, x, low, high, down);
+    EACH(i) T(patch)(low + 4 * i, x[i], a[i], b[i], u + i, v + i);
+    if (!to) return;
+    EACH(i)
+        T(patch_slopes)(low + 4 * i, high + 4 * i, down + 4 * i, x[i], sa, sb, to->ua + i, to->ub + i, to->va + i, to->vb + i);
 }
 
 /* Cells and centre are constants: their sums stay 0 */
@@ -473,14 +495,16 @@ INLINE I T(on_edge)(const T(Edge) e, R a, R b) {
 
 /* Points of the plane of a surface, the last stage, where it is regular on the whole way from the centre for certain */
 static void T(on_surface)(const T(Camera) *c, int n, const R *restrict a, const R *restrict b, I *restrict ok) {
-    const Part *part = c->parts + c->stages;
-    const R *k = c->numbers[c->stages];
     const T(Edge) edge = T(edge_of)(c);
     EACH(i) ok[i] = T(on_edge)(edge, a[i], b[i]);
     if (c->all_certain) return;
-    T(Cells) cells;
-    T(cells)(part, k, n, a, b, &cells);
-    for (int i = 0; i < n; i++) ok[i] &= c->certain[cells.at[i] / 2];
+    const T(Pieces) pieces = T(pieces_on)(c);
+    ALIGNED int32_t at[BLOCK];
+    EACH(i) {
+        R x, y;
+        at[i] = T(piece)(pieces, a[i], b[i], &x, &y);
+    }
+    for (int i = 0; i < n; i++) ok[i] &= c->certain[at[i]];
 }
 
 static void T(stage)(const T(Camera) *c, int stage, int n, const R *a, const R *b, R *u, R *v, T(Jacobian) *to) {

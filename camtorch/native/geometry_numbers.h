@@ -22,8 +22,15 @@
 
 INLINE R T(absolute)(R x) { return IS_DOUBLE ? (R)fabs(x) : (R)fabsf((float)x); }
 INLINE R T(root)(R x) { return IS_DOUBLE ? (R)sqrt(x) : (R)sqrtf((float)x); }
+INLINE R T(whole)(R x) { return IS_DOUBLE ? (R)floor(x) : (R)floorf((float)x); }
 INLINE R T(most)(R x, R y) { return x > y ? x : y; }
 INLINE R T(least)(R x, R y) { return x < y ? x : y; }
+
+/* The end `low` too for what is not a number */
+INLINE R T(inside)(R low, R x, R high) {
+    const R up = x > low ? x : low;
+    return up < high ? up : high;
+}
 
 INLINE I T(bits)(R x) {
     I bits;

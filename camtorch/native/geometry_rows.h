@@ -59,8 +59,7 @@ static void T(prepare)(const Cameras *all, int64_t camera, T(Camera) *c) {
             const Part *last = c->parts + c->stages;
             c->certain = all->certain + camera * last->n * last->m, c->certain2 = ((const R *)all->certain2)[camera];
             c->all_certain = 1;
-            for (int j = 0; j <= last->m - 4; j++)
-                for (int i = 0; i <= last->n - 4; i++) c->all_certain &= c->certain[j * last->n + i];
+            for (int i = 0; i < (last->n - last->flags) * (last->m - last->flags); i++) c->all_certain &= c->certain[i];
             c->to_edge = c->all_certain && c->stages == 1;
         }
         if (all->pieces) {
@@ -154,15 +153,20 @@ typedef struct {
 /* Of points beyond `inner2`, `ok` where the lens is regular all the way from the centre. How many of those that count
    wait for limits */
 static int T(beyond)(const T(Camera) *c, int count, int n, T(Seen) *s) {
-    ALIGNED R u[BLOCK], v[BLOCK], least[BLOCK];
+    ALIGNED R a[BLOCK], b[BLOCK], u[BLOCK], v[BLOCK], least[BLOCK];
+    ALIGNED I settled[BLOCK];
     T(Jacobian) jacobian;
-    int waiting = 0;
-    if (c->limits2) T(lens)(c, 1, n, s->a, s->b, u, v, &jacobian, least);
-    for (int i = 0; i < n; i++) {
-        const R a = s->a[i], b = s->b[i];
-        if (s->ok[i] != 2) continue;
-        s->ok[i] = c->limits2 && c->limits2[T(azimuth)(a, b, 0)] - (a * a + b * b) > 0 && least[i] > TINY;
-        waiting += !c->limits2 && i < count;
+    int places[BLOCK], waiting = 0;
+    EACH(i) settled[i] = s->ok[i] != 2;
+    const int some = T(chosen)(n, settled, places), filled = (some + LANES - 1) & -LANES;
+    if (c->limits2) {
+        for (int i = 0; i < filled; i++) a[i] = s->a[places[i]], b[i] = s->b[places[i]];
+        T(lens)(c, 1, filled, a, b, u, v, &jacobian, least);
+    }
+    for (int i = 0; i < some; i++) {
+        const int at = places[i];
+        s->ok[at] = c->limits2 && c->limits2[T(azimuth)(a[i], b[i], 0)] - (a[i] * a[i] + b[i] * b[i]) > 0 && least[i] > TINY;
+        waiting += !c->limits2 && at < count;
     }
     return waiting;
 }
@@ -288,8 +292,6 @@ static void T(angles_vjp)(int n, const R *restrict x, const R *restrict y, const
         gx[i] = a * s - b * y[i] * x[i] / t, gy[i] = b * t - a * x[i] * y[i] / s, gz[i] = -in * z[i];
     }
 }
-
-INLINE R T(inside)(R low, R x, R high) { return x > low ? x < high ? x : high : low; }
 
 /* Unit rays behind the shield to those in front of it; `ok` where there is one */
 static void T(unbend)(const T(Camera) *c, int n, T(Bent) *b, R *restrict x, R *restrict y, R *restrict z, I *restrict ok) {
@@ -661,11 +663,33 @@ static void T(cover)(const T(Camera) *c, int n, R *a, R *b, const I *known, I *o
     if (c->way == INVERTED) T(cover_inverted)(c, n, a, b, ok);
 }
 
+/* Points near those that a surface sends to (u, v), from a table of that, see `start_of` */
+static NOT_INLINE void T(begin_surface)(const R *restrict table, int n, const R *restrict u, const R *restrict v, R *restrict a,
+                             R *restrict b) {
+    const R across = table[0], down = table[1], half_u = GRID / 2 / across, half_v = GRID / 2 / down;
+    const R left = table[2] - half_u, right = table[2] + half_u, top = table[3] - half_v, bottom = table[3] + half_v;
+    ALIGNED R x[BLOCK], y[BLOCK], sums[4 * BLOCK];
+    ALIGNED int32_t at[BLOCK];
+    EACH(i) {
+        const R p = (T(inside)(left, u[i], right) - left) * across, q = (T(inside)(top, v[i], bottom) - top) * down;
+        /* rounding may carry the end of the last cell past that */
+        const R column = T(whole)(p * (1 - 8 * EPS)), row = T(whole)(q * (1 - 8 * EPS)), place = row * GRID + column;
+        x[i] = p - column - (R)0.5, y[i] = q - row - (R)0.5, at[i] = (int32_t)T(inside)(0, place, GRID * GRID - 1);
+    }
+    for (int i = 0; i < n; i++) {
+        const R *restrict cell = table + (int64_t)CELL * (1 + at[i]), p = x[i], q = y[i], place[4] = {p, p, q, q};
+        KEPT_LOOP for (int j = 0; j < 4; j++)
+            sums[4 * i + j] = ((cell[8 + j] * p + cell[4 + j]) + cell[12 + j] * q) * place[j] + cell[j];
+    }
+    EACH(i) a[i] = sums[4 * i] + sums[4 * i + 2], b[i] = sums[4 * i + 1] + sums[4 * i + 3];
+}
+
 /* Points near those that the stages from `first` on send to (u, v) */
 static void T(start)(const T(Camera) *c, int first, int n, const R *u, const R *v, R *restrict a, R *restrict b) {
     ALIGNED R x[BLOCK], y[BLOCK];
-    EACH(i) a[i] = u[i], b[i] = v[i];
-    for (int j = c->stages; j >= first; j--) {
+    if (c->start) T(begin_surface)(c->start, n, u, v, a, b);
+    else EACH(i) a[i] = u[i], b[i] = v[i];
+    for (int j = c->stages - !!c->start; j >= first; j--) {
         const R *k = c->numbers[j];
         if (c->parts[j].kind == HOMOGRAPHY) {
             R m[9];
@@ -680,15 +704,6 @@ static void T(start)(const T(Camera) *c, int first, int n, const R *u, const R *
                 const R p = (a[i] - k[1] * b[i]) / area;
                 b[i] = (b[i] - k[0] * a[i]) / area, a[i] = p;
             }
-        } else if (c->parts[j].kind == SURFACE && j == c->stages && c->start) {
-            const Part inverse = {.kind = SURFACE, .flags = 3, .n = GRID, .m = GRID};
-            const R *t = c->start, across = (R)(GRID - 3) / 2 / t[0], down = (R)(GRID - 3) / 2 / t[1];
-            ALIGNED R p[BLOCK], q[BLOCK];
-            EACH(i) {
-                p[i] = a[i] > t[2] - across ? a[i] : t[2] - across, p[i] = p[i] < t[2] + across ? p[i] : t[2] + across;
-                q[i] = b[i] > t[3] - down ? b[i] : t[3] - down, q[i] = q[i] < t[3] + down ? q[i] : t[3] + down;
-            }
-            T(surface)(&inverse, t, n, p, q, a, b, NULL);
         } else if (c->parts[j].kind == SURFACE) {
             const Part *part = c->parts + j;
             const R across = (R)(part->n - part->flags) / 2 / k[0], down = (R)(part->m - part->flags) / 2 / k[1];
@@ -709,19 +724,20 @@ static void T(start)(const T(Camera) *c, int first, int n, const R *u, const R *
     }
 }
 
-INLINE I T(step_of)(R *a, R *b, R du, R dv, R ua, R ub, R va, R vb, I ok) {
+/* `bend`: see `start_of`, or none where nothing is known of it */
+INLINE I T(step_of)(R *a, R *b, R du, R dv, R ua, R ub, R va, R vb, const R *bend, I ok) {
     R da, db;
-    const R one = T(step)(ua, ub, va, vb, du, dv, &da, &db), p = *a + da, q = *b + db;
-    const I is_short = (EPS / 64 * (p * p + q * q + (R)0.01) - (da * da + db * db) > 0) & (T(absolute)(one) > 0);
+    const R one = T(absolute)(T(step)(ua, ub, va, vb, du, dv, &da, &db)), p = *a + da, q = *b + db, step2 = da * da + db * db;
+    const R size = T(absolute)(ua) + T(absolute)(ub) + T(absolute)(va) + T(absolute)(vb);
+    const R left = bend ? 1 - *bend * step2 * (size * one) : EPS / 64 * (p * p + q * q + (R)0.01) - step2;
     *a = ok ? *a : p, *b = ok ? *b : q;
-    return ok | is_short;
+    return ok | ((left > 0) & (one > 0));
 }
 
 /* A step of Newton's method for the stages from `first` on, of points that are not `ok`: are they now? */
 static void T(newton_step)(const T(Camera) *c, int first, int n, const R *restrict u, const R *restrict v,
                            R *restrict a, R *restrict b, I *restrict ok) {
     ALIGNED R x[BLOCK], y[BLOCK];
-    T(Jacobian) to;
     if (first == c->stages && c->parts[first].kind == PLANAR) { /* most often */
         ALIGNED R t[BLOCK];
         const T(Plane) k = c->planes[first];
@@ -731,25 +747,49 @@ static void T(newton_step)(const T(Camera) *c, int first, int n, const R *restri
             R p, q, ua, ub, va, vb;
             T(planar_at)(k, a[i], b[i], x[i], &p, &q);
             T(planar_slopes)(k, a[i], b[i], x[i], y[i], &ua, &ub, &va, &vb);
-            ok[i] = T(step_of)(a + i, b + i, u[i] - p, v[i] - q, ua, ub, va, vb, ok[i]);
+            ok[i] = T(step_of)(a + i, b + i, u[i] - p, v[i] - q, ua, ub, va, vb, NULL, ok[i]);
         }
-        return;
+    } else if (first == c->stages && c->pieces && c->start) {
+        const R *k = c->numbers[first], sa = k[0], sb = k[1], bend = c->start[4];
+        ALIGNED R low[4 * BLOCK], high[4 * BLOCK], down[4 * BLOCK];
+        T(patches_of)(c, 1, n, a, b, x, low, high, down);
+        EACH(i) {
+            R p, q, ua, ub, va, vb;
+            T(patch)(low + 4 * i, x[i], a[i], b[i], &p, &q);
+            T(patch_slopes)(low + 4 * i, high + 4 * i, down + 4 * i, x[i], sa, sb, &ua, &ub, &va, &vb);
+            ok[i] = T(step_of)(a + i, b + i, u[i] - p, v[i] - q, ua, ub, va, vb, &bend, ok[i]);
+        }
+    } else {
+        T(Jacobian) to;
+        T(lens)(c, first, n, a, b, x, y, &to, NULL);
+        EACH(i)
+            ok[i] = T(step_of)(a + i, b + i, u[i] - x[i], v[i] - y[i], to.ua[i], to.ub[i], to.va[i], to.vb[i], NULL, ok[i]);
     }
-    T(lens)(c, first, n, a, b, x, y, &to, NULL);
-    EACH(i)
-        ok[i] = T(step_of)(a + i, b + i, u[i] - x[i], v[i] - y[i], to.ua[i], to.ub[i], to.va[i], to.vb[i], ok[i]);
 }
 
-/* Newton's method for the stages from `first` on, wherever that leads; `ok` where the next step would be nothing */
+/* Newton's method for the stages from `first` on, wherever that leads; `ok` where the next step would be nothing: `fewest`
+   steps of all points, more of those alone that need them */
 static void T(newton)(const T(Camera) *c, int first, int n, const R *restrict u, const R *restrict v, R *restrict a,
                       R *restrict b, I *restrict ok, int fewest) {
-    I all = 0;
-    for (int count = 1; count <= MOST_STEPS && !all; count++) {
-        if (count <= fewest) EACH(i) ok[i] = 0;
+    for (int count = 0; count < fewest; count++) {
+        EACH(i) ok[i] = 0;
         T(newton_step)(c, first, n, u, v, a, b, ok);
-        all = count >= fewest;
-        EACH(i) all &= ok[i] != 0;
     }
+    int places[BLOCK];
+    const int some = T(chosen)(n, ok, places), filled = (some + LANES - 1) & -LANES;
+    if (!some) return;
+    ALIGNED R p[BLOCK], q[BLOCK], x[BLOCK], y[BLOCK];
+    ALIGNED I found[BLOCK], any = 1;
+    for (int i = 0; i < filled; i++) {
+        const int at = places[i];
+        p[i] = u[at], q[i] = v[at], x[i] = a[at], y[i] = b[at], found[i] = 0;
+    }
+    for (int count = fewest; count < MOST_STEPS && any; count++) {
+        T(newton_step)(c, first, filled, p, q, x, y, found);
+        any = 0;
+        for (int i = 0; i < filled; i++) any |= !found[i];
+    }
+    for (int i = 0; i < some; i++) a[places[i]] = x[i], b[places[i]] = y[i], ok[places[i]] = found[i];
 }
 
 /* By the radial factor of the first stage alone: where it sends points to (p, q); `possible` within the fold's image */
