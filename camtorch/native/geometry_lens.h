@@ -374,15 +374,13 @@ static void T(surface)(const Part *part, const R *k, int n, const R *restrict a,
     else T(surface_of)(part, k, 2, n, a, b, u, v, NULL);
 }
 
-/* The same of a surface, the last stage, of whose pieces the polynomials are known: see `pieces_of` */
-INLINE void T(patches_at)(const T(Camera) *c, int n, const R *restrict a, const R *restrict b, R *restrict u,
-                         R *restrict v, T(Jacobian) *restrict to) {
+/* Where points lie in the pieces of a surface, the last stage, and in which of those */
+INLINE void T(in_pieces)(const T(Camera) *c, int n, const R *restrict a, const R *restrict b, R *restrict x, R *restrict y,
+                         int32_t *restrict at) {
     const Part *part = c->parts + c->stages;
     const int order = part->flags, across = part->n - order;
     const R *k = c->numbers[c->stages], sa = k[0], sb = k[1], ca = k[2], cb = k[3], half = order == 3 ? 0 : (R)0.5;
     const R middle_a = (R)(part->n - 1) / 2, middle_b = (R)(part->m - 1) / 2, most_i = (R)across, most_j = (R)(part->m - order);
-    ALIGNED R x[BLOCK], y[BLOCK], low[4 * BLOCK], high[4 * BLOCK], down[4 * BLOCK];
-    ALIGNED int32_t at[BLOCK];
     EACH(i) {
         const R p = (a[i] - ca) * sa + middle_a, q = (b[i] - cb) * sb + middle_b;
         R cell_i = IS_DOUBLE ? (R)floor(p + half) : (R)floorf((float)(p + half));
@@ -391,6 +389,15 @@ INLINE void T(patches_at)(const T(Camera) *c, int n, const R *restrict a, const 
         cell_j = cell_j > 1 ? cell_j : 1, cell_j = cell_j < most_j ? cell_j : most_j;
         x[i] = p - cell_i, y[i] = q - cell_j, at[i] = ((int32_t)cell_j - 1) * across + (int32_t)cell_i - 1;
     }
+}
+
+/* The same of a surface, the last stage, of whose pieces the polynomials are known: see `pieces_of` */
+INLINE void T(patches_at)(const T(Camera) *c, int n, const R *restrict a, const R *restrict b, R *restrict u,
+                         R *restrict v, T(Jacobian) *restrict to) {
+    const R *k = c->numbers[c->stages], sa = k[0], sb = k[1];
+    ALIGNED R x[BLOCK], y[BLOCK], low[4 * BLOCK], high[4 * BLOCK], down[4 * BLOCK];
+    ALIGNED int32_t at[BLOCK];
+    T(in_pieces)(c, n, a, b, x, y, at);
     for (int i = 0; i < n; i++) {
         const R *restrict piece = c->pieces + (int64_t)PIECE * at[i], p = x[i], q = y[i];
         ALIGNED R sum[8], slope[8];
