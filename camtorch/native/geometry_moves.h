@@ -267,16 +267,17 @@ static void T(weights_of)(const int count, float (*weights)[STEP]) {
 
 /* All pixels of a cell from `count` x `count` nodes, of which the first is given: down the columns, then across */
 INLINE void T(laid)(const float *nodes, int64_t width, const int count, const float (*weights)[STEP], R *restrict to) {
+    float line[6][STEP];
+    for (int j = 0; j < count; j++) {
+        for (int y = 0; y < STEP; y++) line[j][y] = weights[0][y] * nodes[j];
+        for (int m = 1; m < count; m++)
+            for (int y = 0; y < STEP; y++) line[j][y] += weights[m][y] * nodes[m * width + j];
+    }
     for (int y = 0; y < STEP; y++) {
-        float line[6], made[STEP];
-        for (int j = 0; j < count; j++) {
-            float sum = 0;
-            for (int m = 0; m < count; m++) sum += weights[m][y] * nodes[m * width + j];
-            line[j] = sum;
-        }
-        for (int k = 0; k < STEP; k++) made[k] = weights[0][k] * line[0];
+        float made[STEP];
+        for (int k = 0; k < STEP; k++) made[k] = weights[0][k] * line[0][y];
         for (int j = 1; j < count; j++)
-            for (int k = 0; k < STEP; k++) made[k] += weights[j][k] * line[j];
+            for (int k = 0; k < STEP; k++) made[k] += weights[j][k] * line[j][y];
         for (int k = 0; k < STEP; k++) to[y * STEP + k] = (R)made[k];
     }
 }
@@ -348,24 +349,30 @@ INLINE void T(middles)(const float *node, int64_t width, const int count, float 
     at[1] = T(middle)(node - before * width, width, count), at[2] = T(middle)(node - before * width + 1, width, count);
 }
 
-/* By how much, squared, what `count` x `count` nodes say misses what was found; at most of each coordinate, and of both */
+/* The largest of misses in pixels, squared: of each coordinate, and of both */
+static float T(largest)(const R *across, const R *down, float *of_each) {
+    float most = 0;
+    of_each[0] = of_each[1] = 0;
+    for (int at = 0; at < PROBES; at++) {
+        const float u2 = (float)(across[at] * across[at]), v2 = (float)(down[at] * down[at]);
+        of_each[0] = u2 > of_each[0] ? u2 : of_each[0], of_each[1] = v2 > of_each[1] ? v2 : of_each[1];
+        most = u2 + v2 <= most ? most : u2 + v2; /* or what is not a number */
+    }
+    return most;
+}
+
+/* By how much what `count` x `count` nodes say misses what was found */
 static float T(most_missed)(const Classification *asked, int64_t first, const int count, const R *u, const R *v,
                             float *of_each) {
     const float half[2] = {(float)asked->source_width / 2, (float)asked->source_height / 2};
     const int64_t width = asked->columns + 5;
-    float missed[PROBES] = {0}, said[PROBES], most = 0;
+    float said[PROBES];
+    R missed[2][PROBES];
     for (int c = 0; c < 2; c++) {
-        const R *found = c ? v : u;
         T(middles)(asked->nodes + c * asked->node_strides[1] + first + 2 * width + 2, width, count, said);
-        of_each[c] = 0;
-        for (int at = 0; at < PROBES; at++) {
-            const float miss = ((float)found[at] - said[at]) * half[c];
-            of_each[c] = miss * miss > of_each[c] ? miss * miss : of_each[c];
-            missed[at] += miss * miss;
-        }
+        for (int at = 0; at < PROBES; at++) missed[c][at] = (R)(((float)(c ? v : u)[at] - said[at]) * half[c]);
     }
-    for (int at = 0; at < PROBES; at++) most = missed[at] <= most ? most : missed[at]; /* or what is not a number */
-    return most;
+    return T(largest)(missed[0], missed[1], of_each);
 }
 
 /* Whether a cell lies far off the image; missed: by how much cubics miss each coordinate, squared */
@@ -408,6 +415,7 @@ static int T(settle)(const Lattices *given, const T(Between) *b, const Classific
             u[k] = (R)(STEP * (place % columns) + STEP / 2 * across[k % PROBES]);
             v[k] = (R)(STEP * (place / columns) + STEP / 2 * down[k % PROBES] + given->first_row);
         }
+        int is_refined = 0;
         for (int k = 0; b->close2 > 0 && k < points; k += PROBES) {
             const int64_t place = places[k / PROBES], first = (place / columns + 2) * width + place % columns + 2;
             for (int c = 0; c < 2; c++) {
@@ -418,22 +426,23 @@ static int T(settle)(const Lattices *given, const T(Between) *b, const Classific
         }
         for (int k = points; k < n; k++) near[0][k] = near[0][points - 1], near[1][k] = near[1][points - 1];
         if (count && b->close2 > 0 && T(refined_positions)(&given->move, b, n, u, v, near, missed)) {
-            memcpy(u, near[0], sizeof u), memcpy(v, near[1], sizeof v);
-            EACH(i) ok[i] = 1;
+            EACH(i) u[i] = near[0][i], v[i] = near[1][i], ok[i] = 1;
+            is_refined = 1;
         } else if (count) left |= T(moved)(&given->move, b, points, n, u, v, ok);
         for (int k = 0; k < count; k++) {
             const R *found_u = u + k * PROBES, *found_v = v + k * PROBES;
             const int64_t first = places[k] / columns * width + places[k] % columns; /* of its 6 x 6 nodes */
-            float missed[2];
+            float of_each[2];
             int known = 1, cell = 0;
             for (int at = 0; at < PROBES; at++) known &= ok[k * PROBES + at] != 0;
-            if (known && (T(most_missed)(asked, first, 4, found_u, found_v, missed) <= limit ||
-                          (asked->padding == ZEROS && T(is_off)(asked, first, found_u, found_v, missed)))) {
+            const float by_cubics = is_refined ? T(largest)(missed[0] + k * PROBES, missed[1] + k * PROBES, of_each)
+                                               : T(most_missed)(asked, first, 4, found_u, found_v, of_each);
+            if (known && (by_cubics <= limit || (asked->padding == ZEROS && T(is_off)(asked, first, found_u, found_v, of_each)))) {
                 cell = CELL_CUBIC;
             } else if (known) {
                 for (int y = 0; y < 6; y++) known &= !memcmp(asked->mapped + first + y * width, all, sizeof all);
                 /* a quarter of that, and of what cubics miss: where the curvature steps, quintics gain nothing, and swing */
-                if (known && T(most_missed)(asked, first, 6, found_u, found_v, missed) <= limit / 16) cell = CELL_QUINTIC;
+                if (known && T(most_missed)(asked, first, 6, found_u, found_v, of_each) <= limit / 16) cell = CELL_QUINTIC;
             }
             asked->cells[places[k]] = cell;
         }

@@ -727,7 +727,7 @@ class Between:
                 of float32 alone.
         """
         cameras, dtype, count = self.cameras, self._start.dtype, probes.shape[1]
-        self._start.add_tables(size[0] * size[1], moving=True)  # of which one in 64 is a node, and some are computed one by one
+        self._start.add_tables(size[0] * size[1], moving=True)  # one in 64 is a node; some are exact
         n, m = (-(-side // 8) for side in size)
         nodes, most, is_double = (n + 5) * (m + 5), cameras * n * m, dtype == torch.float64
         result = torch.empty(cameras, 2, count, dtype=dtype, device="cpu")
