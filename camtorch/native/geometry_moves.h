@@ -267,17 +267,16 @@ static void T(weights_of)(const int count, float (*weights)[STEP]) {
 
 /* All pixels of a cell from `count` x `count` nodes, of which the first is given: down the columns, then across */
 INLINE void T(laid)(const float *nodes, int64_t width, const int count, const float (*weights)[STEP], R *restrict to) {
-    float line[6][STEP];
-    for (int j = 0; j < count; j++) {
-        for (int y = 0; y < STEP; y++) line[j][y] = weights[0][y] * nodes[j];
-        for (int m = 1; m < count; m++)
-            for (int y = 0; y < STEP; y++) line[j][y] += weights[m][y] * nodes[m * width + j];
-    }
     for (int y = 0; y < STEP; y++) {
-        float made[STEP];
-        for (int k = 0; k < STEP; k++) made[k] = weights[0][k] * line[0][y];
+        float line[6], made[STEP];
+        for (int j = 0; j < count; j++) {
+            float sum = 0;
+            for (int m = 0; m < count; m++) sum += weights[m][y] * nodes[m * width + j];
+            line[j] = sum;
+        }
+        for (int k = 0; k < STEP; k++) made[k] = weights[0][k] * line[0];
         for (int j = 1; j < count; j++)
-            for (int k = 0; k < STEP; k++) made[k] += weights[j][k] * line[j][y];
+            for (int k = 0; k < STEP; k++) made[k] += weights[j][k] * line[j];
         for (int k = 0; k < STEP; k++) to[y * STEP + k] = (R)made[k];
     }
 }
