@@ -85,6 +85,31 @@ class RandomElastic(Augmentation):
 
     def _with_surface(self, source: Camera, values: Mapping[str, Tensor]) -> tuple[type[Camera], Tensor]:
         """The model of the new camera, and its distortion."""
+        kind, least, focal, place, more = self._surface(source)
+        down, across = self.grid
+        bends = values["bends"].unflatten(-1, (down + _BESIDE, across + _BESIDE, 2))
+        if any(more):
+            bends = torch.nn.functional.pad(bends, (0, 0, more[0], more[0], more[1], more[1]))
+        moved = values["amount"][..., None, None, None] * least * bends / focal[..., None, None, :]
+        batch = torch.broadcast_shapes(moved.shape[:-3], source.batch_shape)
+        parts = source.distortion, place, moved.flatten(-3)
+        distortion = torch.cat([part.expand(*batch, part.shape[-1]).to(moved.dtype) for part in parts], -1)
+        return with_surface(kind, *bends.shape[-2:-4:-1]), distortion
+
+    def _with_numbers(self, source: Camera, values: Mapping[str, Any]) -> tuple[type[Camera], Tensor]:
+        """The same of a single camera and plain numbers, without the many steps of torch."""
+        kind, least, focal, place, more = self._surface(source)
+        down, across = self.grid
+        k, dtype = source.distortion.detach().numpy(), np.dtype("f8" if focal.dtype == torch.float64 else "f4")
+        bends = np.array(values["bends"], dtype).reshape(down + _BESIDE, across + _BESIDE, 2)
+        if any(more):
+            bends = np.pad(bends, ((more[1], more[1]), (more[0], more[0]), (0, 0)))
+        moved = dtype.type(values["amount"]) * dtype.type(least) * bends / focal.numpy()
+        distortion = np.concatenate((k, place.numpy(), moved.ravel()), dtype=dtype)
+        return with_surface(kind, *bends.shape[1::-1]), torch.from_numpy(distortion)
+
+    def _surface(self, source: Camera) -> tuple[type[Camera], int, Tensor, Tensor, list[int]]:
+        """The model of a camera, the shorter side of its image, and what `_placed` says."""
         if ":elastic=" in source.key:
             raise ValueError(f"{self._name}: the camera is elastic already, {source.key}")
         kind: type[Camera] = type_before_parametrizations(source)
@@ -94,16 +119,7 @@ class RandomElastic(Augmentation):
                 "camera.convert(ct.KannalaBrandt).camera is one that has"
             )
         size = source._size_for(self._name)
-        (down, across), least = self.grid, min(size)
-        focal, place, more = self._memo((source.intrinsics,), (size,), lambda: self._placed(source, size))
-        bends = values["bends"].unflatten(-1, (down + _BESIDE, across + _BESIDE, 2))
-        if any(more):
-            bends = torch.nn.functional.pad(bends, (0, 0, more[0], more[0], more[1], more[1]))
-        moved = values["amount"][..., None, None, None] * least * bends / focal[..., None, None, :]
-        batch = torch.broadcast_shapes(moved.shape[:-3], source.batch_shape)
-        parts = source.distortion, place, moved.flatten(-3)
-        distortion = torch.cat([part.expand(*batch, part.shape[-1]).to(moved.dtype) for part in parts], -1)
-        return with_surface(kind, *bends.shape[-2:-4:-1]), distortion
+        return kind, min(size), *self._memo((source.intrinsics,), (size,), lambda: self._placed(source, size))
 
     def _placed(self, source: Camera, size: tuple[int, int]) -> tuple[Tensor, Tensor, list[int]]:
         """The focal lengths; cells and centre of a surface over the image; and how many control points more it takes to
@@ -131,7 +147,7 @@ class RandomElastic(Augmentation):
         values = self._values(source, draw)
         if before.usable is not None or any(isinstance(value, (np.ndarray, Tensor)) for value in values.values()):
             return None
-        model, distortion = self._with_surface(source, self._like(source, values))
+        model, distortion = self._with_numbers(source, values)
         if not math.isfinite(distortion.sum()):
             return None
         base = _prototype(model, distortion.shape[-1], distortion.dtype)  # type: ignore[arg-type]  # likewise

@@ -31,6 +31,7 @@ typedef struct {
     const Part *parts;
     int stages, way, swapped, is_radial, by_stages, usable;
     int follows, waits; /* whether the lens is to be followed along each azimuth, and yet has to be */
+    int is_partial;     /* whether nothing of its domain is known, but for the surface that it ends with */
     int ends;           /* whether it ends at the edge of a surface; not while it is followed */
     const R *map, *numbers[MOST_PARTS], *constants; /* those of the map before the chart; of the parts */
     /* a windshield's polynomials, padded with zeros to an order that loops are made for, or 0; their own orders; by how much

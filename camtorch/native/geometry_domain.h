@@ -519,7 +519,7 @@ void THIS(domain)(const Domain *d) {
         double fold = 0, table[2 + 2 * NODES];
         const int has_factor = lens.part->factor != NO_FACTOR;
         int goes_by_stages = 0;
-        if (has_factor) fold = fold_of(&lens, d->folds ? d->folds[c] : NAN, end, d->most);
+        if (has_factor && (d->inner2 || d->limits2 || d->table)) fold = fold_of(&lens, d->folds ? d->folds[c] : NAN, end, d->most);
         if (d->circle2) {
             double value, square = fold * fold;
             factors(&lens, 1, &square, &value, NULL);
@@ -549,14 +549,14 @@ void THIS(domain)(const Domain *d) {
             follow(d, c, &camera, has_factor ? fold : NAN, end);
         }
         const Part *last = d->parts + d->part_count - 1;
-        if (d->certain2) {
-            const double *controls = numbers + d->parameter_count - numbers_of(last);
+        if (d->certain2) put(d->certain2, c, within(has_factor ? fold : end, end, is_double), is_double);
+        if (d->certain) {
             Camera_double camera;
             lens_of(d, c, &camera);
             certain_of(&camera, d->certain + c * last->n * last->m);
-            put(d->certain2, c, within(has_factor ? fold : end, end, is_double), is_double);
-            if (d->pieces) pieces_of(last, controls, d->pieces, c * PIECE * (last->n - last->flags) * (last->m - last->flags), is_double);
         }
+        const double *controls = numbers + d->parameter_count - numbers_of(last);
+        if (d->pieces) pieces_of(last, controls, d->pieces, c * PIECE * (last->n - last->flags) * (last->m - last->flags), is_double);
         if (d->start) start_of(d, c, d->certain + c * last->n * last->m);
         if (d->table && has_factor) {
             tabulate(&lens, fold, usual_end, table);

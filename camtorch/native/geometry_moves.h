@@ -4,24 +4,44 @@ typedef struct {
     int64_t index; /* of the cameras that these are; -1: none yet */
     T(Camera) from, to;
     R turn[9];
-    R within2; /* see `compare` */
+    const T(Camera) *bent, *plain; /* which of both is the other one with a surface after its lens, NULL where none is */
+    R within2;                     /* see `surely2` */
+    R close2;                      /* the squared length of a step in pixels after which the next one is less than the tolerance of a lattice */
+    float cubics[4][STEP]; /* weights of nodes */
 } T(Between);
 
-/* Whether `from` is `to` with a surface after its lens: then pixels move by that surface alone, within a circle of its
-   plane in which all is certain; else there is no such circle */
+/* The squared radius of a circle of a camera's plane in which each point has a ray for certain */
+static R T(surely2)(const T(Camera) *c) {
+    const int is_bare = !c->parts->map && c->way != INVERTED;
+    if (is_bare && !c->stages && c->way == PERSPECTIVE) return SQUARABLE;
+    if (!is_bare || c->stages != 1 || c->parts[1].kind != PLANAR || c->parts[1].factor == NO_FACTOR) return 0;
+    /* the lens is regular within a circle, and sends that one out of all of a smaller one */
+    const T(Plane) k = c->planes[1];
+    ALIGNED R t[LANES], factor[LANES];
+    R furthest = 0;
+    for (int i = 0; i < LANES; i++) t[i] = (R)0.98 * T(least)(c->inner2, c->usual2) / (R)(1 << i);
+    T(radial)(c->factors + 1, LANES, t, factor, NULL);
+    for (int i = 0; i < LANES; i++) {
+        const R across = T(absolute)(k.s0) + T(absolute)(k.s1) * t[i], down = T(absolute)(k.s2) + T(absolute)(k.s3) * t[i];
+        const R aside = t[i] * (3 * (T(absolute)(k.px) + T(absolute)(k.py)) + across + down);
+        furthest = T(most)(furthest, T(root)(t[i]) * factor[i] - aside);
+    }
+    return furthest * furthest;
+}
+
+/* Whether one camera is the other one with a surface after its lens, regular in all places: then pixels move by that alone,
+   wherever the other one has a ray */
 static void T(compare)(const Move *move, T(Between) *b) {
-    const T(Camera) *from = &b->from, *to = &b->to;
-    const int last = to->stages + 1;
-    b->within2 = -1;
-    if (move->turns || from->stages != last || !from->all_certain || !from->start || !(from->usable & to->usable)) return;
-    if (from->parts->map || from->way == INVERTED || (last > 1 && from->parts[1].factor == RADIUS_TABLE)) return;
+    const T(Camera) *from = &b->from, *to = &b->to, *bent = from->stages > to->stages ? from : to, *plain = bent == from ? to : from;
+    const int last = plain->stages + 1;
+    const int64_t constants = move->from->constant_count;
+    b->bent = b->plain = NULL, b->within2 = b->close2 = 0;
+    if (move->turns || bent->stages != last || !bent->all_certain || !(from->usable & to->usable)) return;
     if (from->fx != to->fx || from->fy != to->fy || from->cx != to->cx || from->cy != to->cy) return;
-    if (memcmp(from->parts, to->parts, (size_t)last * sizeof(Part))) return;
-    if (memcmp(from->map, to->map, (size_t)(from->numbers[last] - from->map) * sizeof(R))) return;
-    R inner2[LANES], factor[LANES];
-    for (int i = 0; i < LANES; i++) inner2[i] = (R)0.98 * T(least)(from->certain2, to->inner2), factor[i] = 1;
-    if (to->stages) T(radial)(to->factors + 1, LANES, inner2, factor, NULL);
-    b->within2 = factor[0] > 0 ? inner2[0] * factor[0] * factor[0] : -1;
+    if (memcmp(from->parts, to->parts, (size_t)last * sizeof(Part)) || move->to->constant_count != constants) return;
+    if (memcmp(from->map, to->map, (size_t)(bent->numbers[last] - bent->map) * sizeof(R))) return;
+    if (constants && memcmp(from->constants, to->constants, (size_t)constants * sizeof(R))) return;
+    b->bent = bent, b->plain = plain, b->within2 = T(surely2)(plain);
 }
 
 static void T(between)(const Move *move, int64_t index, T(Between) *b) {
@@ -37,30 +57,19 @@ static void T(between)(const Move *move, int64_t index, T(Between) *b) {
     b->index = index;
 }
 
-/* Pixels (u, v) to pixels (p, q) by the surface alone, `ok` where that does */
-static void T(by_surface)(const T(Between) *b, int n, const R *restrict u, const R *restrict v, R *restrict p,
-                          R *restrict q, I *restrict ok) {
-    const T(Camera) *c = &b->from;
-    const R fx = c->fx, fy = c->fy, cx = c->cx, cy = c->cy, by_fx = 1 / fx, by_fy = 1 / fy, within2 = b->within2;
-    const T(Edge) edge = T(edge_of)(c);
-    ALIGNED R x[BLOCK], y[BLOCK];
-    EACH(i) x[i] = (u[i] - cx) * by_fx, y[i] = (v[i] - cy) * by_fy;
-    T(start)(c, c->stages, n, x, y, p, q);
-    T(newton)(c, c->stages, n, x, y, p, q, ok, IS_DOUBLE ? 2 : 1);
-    EACH(i) {
-        const R further = 1 + 32 * EPS;
-        ok[i] &= T(on_edge)(edge, p[i] * further, q[i] * further) & (within2 - (p[i] * p[i] + q[i] * q[i]) > 0);
-        x[i] = fx * p[i], y[i] = fy * q[i];
-    }
-    EACH(i) p[i] = x[i] + cx, q[i] = y[i] + cy; /* not at once, see `pixels_of` */
-}
+/* Whether it takes more than is known of a camera to find rays */
+static int T(lacks)(const T(Camera) *c) { return c->is_partial || ((c->is_radial || c->by_stages) && !c->table); }
 
 /* Pixels (u, v) to those by their rays, `ok` where there is one; flags of what is left to do */
 static int T(by_rays)(const Move *move, const T(Between) *b, int count, int n, R *restrict u, R *restrict v,
                       I *restrict ok) {
     ALIGNED I known[BLOCK];
     T(Seen) s;
-    int left = 0;
+    int left = (T(lacks)(&b->from) ? LEFT_FROM : 0) | (b->to.is_partial ? LEFT_TO : 0);
+    if (left) {
+        EACH(i) ok[i] = 0;
+        return left;
+    }
     T(solutions)(&b->from, n, u, v, known, ok, s.x, s.y, s.z);
     if (b->from.waits)
         for (int i = 0; i < count; i++) left |= !ok[i] & (known[i] != 0) ? LEFT_FROM : 0;
@@ -70,23 +79,132 @@ static int T(by_rays)(const Move *move, const T(Between) *b, int count, int n, R
     return left;
 }
 
+/* A component of a piece of a surface at a place, and its derivatives by that */
+INLINE R T(piece_at)(const R *piece, R x, R y, R *by_x, R *by_y) {
+    R value = 0, across = 0, down = 0;
+    UNROLLED_LOOP for (int q = 3; q >= 0; q--) { /* powers of x stand in the order 0, 2, 1, 3 */
+        const R *k = piece + 8 * q, square = k[6] * x + k[2], line = square * x + k[4];
+        down = down * y + value, value = value * y + (line * x + k[0]);
+        across = across * y + ((k[6] * x + square) * x + line);
+    }
+    *by_x = across, *by_y = down;
+    return value;
+}
+
+/* Where a surface alone sends points that lie together, each vector piece by piece */
+static void T(sent_together)(const T(Camera) *c, int n, const R *restrict a, const R *restrict b, R *restrict u, R *restrict v,
+                             T(Jacobian) *restrict to) {
+    ALIGNED R x[BLOCK], y[BLOCK];
+    ALIGNED int32_t at[BLOCK];
+    const R *k = c->numbers[c->stages], sa = k[0], sb = k[1];
+    const T(Pieces) pieces = T(pieces_on)(c);
+    EACH(i) at[i] = T(piece)(pieces, a[i], b[i], x + i, y + i);
+    for (int i = 0; i < n; i += LANES) {
+        R value[2][LANES] = {{0}}, by_x[2][LANES] = {{0}}, by_y[2][LANES] = {{0}}, s[LANES], t[LANES];
+        int32_t piece_at[LANES];
+        memcpy(s, x + i, sizeof s), memcpy(t, y + i, sizeof t), memcpy(piece_at, at + i, sizeof piece_at);
+        int32_t here = INT32_MAX, next;
+        for (int j = 0; j < LANES; j++) here = piece_at[j] < here ? piece_at[j] : here;
+        for (; here < INT32_MAX; here = next) {
+            R piece[PIECE];
+            memcpy(piece, c->pieces + (int64_t)PIECE * here, sizeof piece);
+            for (int axis = 0; axis < 2; axis++)
+                for (int j = 0; j < LANES; j++) {
+                    R across, down;
+                    const R found = T(piece_at)(piece + axis, s[j], t[j], &across, &down);
+                    const int is_in = piece_at[j] == here;
+                    value[axis][j] = is_in ? found : value[axis][j];
+                    by_x[axis][j] = is_in ? across : by_x[axis][j], by_y[axis][j] = is_in ? down : by_y[axis][j];
+                }
+            next = INT32_MAX;
+            for (int j = 0; j < LANES; j++) next = piece_at[j] > here && piece_at[j] < next ? piece_at[j] : next;
+        }
+        for (int j = 0; j < LANES; j++) {
+            u[i + j] = a[i + j] + value[0][j], v[i + j] = b[i + j] + value[1][j];
+            to->ua[i + j] = by_x[0][j] * sa + 1, to->ub[i + j] = by_y[0][j] * sb;
+            to->va[i + j] = by_x[1][j] * sa, to->vb[i + j] = by_y[1][j] * sb + 1;
+        }
+    }
+}
+
+/* From pixels (u, v), and those near to which the surface moves them, to the latter as near as a lattice wants them, in
+   place, and by how much they moved first; 0 where that does not lead there */
+static int T(refined)(const T(Between) *b, int n, const R *restrict u, const R *restrict v, R (*restrict near)[BLOCK],
+                      R (*restrict missed)[BLOCK]) {
+    const T(Camera) *c = b->bent;
+    const R fx = c->fx, fy = c->fy, cx = c->cx, cy = c->cy, by_fx = 1 / fx, by_fy = 1 / fy, close2 = b->close2;
+    ALIGNED R a[BLOCK], e[BLOCK], p[BLOCK], q[BLOCK];
+    T(Jacobian) to;
+    for (int count = 0; count < MOST_STEPS; count++) {
+        I all = 1;
+        EACH(i) a[i] = (near[0][i] - cx) * by_fx, e[i] = (near[1][i] - cy) * by_fy;
+        T(sent_together)(c, n, a, e, p, q, &to);
+        EACH(i) {
+            R da, db;
+            T(step)(to.ua[i], to.ub[i], to.va[i], to.vb[i], (u[i] - cx) * by_fx - p[i], (v[i] - cy) * by_fy - q[i], &da, &db);
+            const R across = fx * da, down = fy * db;
+            near[0][i] += across, near[1][i] += down;
+            missed[0][i] = count ? missed[0][i] : across, missed[1][i] = count ? missed[1][i] : down;
+            all &= close2 - (across * across + down * down) > 0;
+        }
+        if (all) return 1;
+    }
+    return 0;
+}
+
+/* The same of cameras that differ by a surface: by that alone, where the other one has a ray */
+static int T(by_surface)(const Move *move, const T(Between) *b, int count, int n, R *restrict u, R *restrict v,
+                         I *restrict ok) {
+    const T(Camera) *c = b->bent, *plain = b->plain;
+    const int is_inverse = c == &b->from, of_plain = is_inverse ? LEFT_TO : LEFT_FROM;
+    const R fx = c->fx, fy = c->fy, cx = c->cx, cy = c->cy, by_fx = 1 / fx, by_fy = 1 / fy, within2 = b->within2;
+    const R further = is_inverse ? 1 + 32 * EPS : 1, behind = (R)c->parts[c->stages].constant;
+    const T(Edge) edge = T(edge_of)(c);
+    ALIGNED R x[BLOCK], y[BLOCK], p[BLOCK], q[BLOCK], some_u[BLOCK], some_v[BLOCK];
+    ALIGNED I settled[BLOCK], on[BLOCK], known[BLOCK], found[BLOCK];
+    int places[BLOCK], left = 0, some;
+    EACH(i) x[i] = (u[i] - cx) * by_fx, y[i] = (v[i] - cy) * by_fy;
+    if (is_inverse) {
+        T(start)(c, c->stages, n, x, y, p, q);
+        T(newton)(c, c->stages, n, x, y, p, q, settled, (IS_DOUBLE ? 3 : 2) - !!c->start);
+    } else T(stage)(c, c->stages, n, x, y, p, q, NULL);
+    const R *a = is_inverse ? p : x, *e = is_inverse ? q : y; /* on the surface's plane, where pixels of `plain` are */
+    EACH(i) {
+        on[i] = T(on_edge)(edge, a[i] * further, e[i] * further);
+        /* behind the edge there is nothing; but a solution there need not be the only one */
+        const I off = !(T(surface_edge)(c->parts + c->stages, c->numbers[c->stages], behind, a[i], e[i]) > 0);
+        settled[i] = is_inverse ? settled[i] & on[i] : on[i] | off;
+        ok[i] = settled[i] & on[i] & (within2 - (a[i] * a[i] + e[i] * e[i]) > 0);
+    }
+    EACH(i) found[i] = ok[i] | !(settled[i] & on[i]);
+    if ((some = T(chosen)(n, found, places))) {
+        T(Seen) s;
+        const int filled = (some + LANES - 1) & -LANES;
+        if (T(lacks)(plain)) left = of_plain;
+        for (int i = 0; i < filled; i++) some_u[i] = a[places[i]] * fx + cx, some_v[i] = e[places[i]] * fy + cy;
+        if (!left) T(solutions)(plain, filled, some_u, some_v, known, found, s.x, s.y, s.z);
+        for (int i = 0; i < some && !left; i++) {
+            ok[places[i]] = found[i];
+            left |= plain->waits && !found[i] && known[i] ? of_plain : 0;
+        }
+    }
+    EACH(i) x[i] = fx * p[i], y[i] = fy * q[i];
+    EACH(i) p[i] = x[i] + cx, q[i] = y[i] + cy; /* not at once, see `pixels_of` */
+    if ((some = T(chosen)(n, settled, places))) {
+        const int filled = (some + LANES - 1) & -LANES;
+        for (int i = 0; i < filled; i++) some_u[i] = u[places[i]], some_v[i] = v[places[i]];
+        left |= T(by_rays)(move, b, some, filled, some_u, some_v, found);
+        for (int i = 0; i < some; i++) p[places[i]] = some_u[i], q[places[i]] = some_v[i], ok[places[i]] = found[i];
+    }
+    EACH(i) u[i] = p[i], v[i] = q[i];
+    return left;
+}
+
 /* Pixels (u, v) to what `form` says, `ok` where there is any; flags of what is left to do */
 static int T(moved)(const Move *move, const T(Between) *b, int count, int n, R *restrict u, R *restrict v,
                     I *restrict ok) {
-    ALIGNED R x[BLOCK], y[BLOCK], p[BLOCK], q[BLOCK];
-    int places[BLOCK], left = 0;
-    if (!(b->within2 > 0)) left = T(by_rays)(move, b, count, n, u, v, ok);
-    else {
-        T(by_surface)(b, n, u, v, p, q, ok);
-        const int some = T(chosen)(n, ok, places), filled = (some + LANES - 1) & -LANES;
-        if (some) {
-            ALIGNED I found[BLOCK];
-            for (int i = 0; i < filled; i++) x[i] = u[places[i]], y[i] = v[places[i]];
-            left = T(by_rays)(move, b, some, filled, x, y, found);
-            for (int i = 0; i < some; i++) p[places[i]] = x[i], q[places[i]] = y[i], ok[places[i]] = found[i];
-        }
-        EACH(i) u[i] = p[i], v[i] = q[i];
-    }
+    ALIGNED R x[BLOCK], y[BLOCK];
+    const int left = b->bent ? T(by_surface)(move, b, count, n, u, v, ok) : T(by_rays)(move, b, count, n, u, v, ok);
     if (move->form == POSITIONS) {
         const R across = (R)(2 / move->width), down = (R)(2 / move->height), far = FAR;
         const R right = (R)(1 / move->width - 1), below = (R)(1 / move->height - 1);
@@ -138,20 +256,68 @@ static int64_t T(moves)(const Move *move) {
 
 /* -- lattices */
 
+/* Of polynomials through `count` nodes, the weights of each on the way from a cell's first one to the next */
+static void T(weights_of)(const int count, float (*weights)[STEP]) {
+    for (int j = 0; j < count; j++)
+        for (int k = 0; k < STEP; k++) {
+            weights[j][k] = 1;
+            for (int m = 0; m < count; m++)
+                if (m != j) weights[j][k] *= ((float)k / STEP + count / 2 - 1 - m) / (j - m);
+        }
+}
+
+/* All pixels of a cell from `count` x `count` nodes, of which the first is given: down the columns, then across */
+INLINE void T(laid)(const float *nodes, int64_t width, const int count, const float (*weights)[STEP], R *restrict to) {
+    for (int y = 0; y < STEP; y++) {
+        float line[6], made[STEP];
+        for (int j = 0; j < count; j++) {
+            float sum = 0;
+            for (int m = 0; m < count; m++) sum += weights[m][y] * nodes[m * width + j];
+            line[j] = sum;
+        }
+        for (int k = 0; k < STEP; k++) made[k] = weights[0][k] * line[0];
+        for (int j = 1; j < count; j++)
+            for (int k = 0; k < STEP; k++) made[k] += weights[j][k] * line[j];
+        for (int k = 0; k < STEP; k++) to[y * STEP + k] = (R)made[k];
+    }
+}
+
+/* Positions that lie near those of pixels (u, v), to these; 0 where that does not lead there */
+static int T(refined_positions)(const Move *move, const T(Between) *b, int n, const R *u, const R *v, R (*near)[BLOCK],
+                                R (*missed)[BLOCK]) {
+    const R across = (R)(move->width / 2), down = (R)(move->height / 2), by_across = 1 / across, by_down = 1 / down;
+    EACH(i) near[0][i] = (near[0][i] + 1) * across - (R)0.5, near[1][i] = (near[1][i] + 1) * down - (R)0.5;
+    const int is_there = T(refined)(b, n, u, v, near, missed);
+    EACH(i) near[0][i] = (near[0][i] + (R)0.5) * by_across - 1, near[1][i] = (near[1][i] + (R)0.5) * by_down - 1;
+    return is_there;
+}
+
 /* All pixels of some cells, `number` of the first one; where what is mapped ends in one, those around it are next */
-static int T(squares)(const Lattices *given, const T(Between) *b, int32_t *cells, const int64_t *places, int count,
-                      int64_t number) {
-    const int64_t rows = given->cells.rows, columns = given->cells.columns;
+static int T(squares)(const Lattices *given, const T(Between) *b, const Classification *asked, const int64_t *places,
+                      int count, int64_t number) {
+    const int64_t rows = asked->rows, columns = asked->columns, width = columns + 5;
+    int32_t *cells = asked->cells;
     const int n = count * SQUARE;
-    ALIGNED R u[BLOCK], v[BLOCK];
+    ALIGNED R u[BLOCK], v[BLOCK], near[2][BLOCK], missed[2][BLOCK];
     ALIGNED I ok[BLOCK];
-    for (int k = 0; k < count; k++)
+    int is_near = b->close2 > 0, left = 0;
+    for (int k = 0; k < count; k++) {
+        const int64_t first = (places[k] / columns + 1) * width + places[k] % columns + 1; /* of 4 x 4 nodes */
         for (int i = 0; i < SQUARE; i++) {
             u[k * SQUARE + i] = (R)(STEP * (places[k] % columns) + i % STEP);
             v[k * SQUARE + i] = (R)(STEP * (places[k] / columns) + i / STEP + given->first_row);
         }
-    const int left = T(moved)(&given->move, b, n, n, u, v, ok);
+        for (int i = 0; i < 16; i++) is_near &= asked->mapped[first + i / 4 * width + i % 4];
+        for (int c = 0; c < 2 && is_near; c++)
+            T(laid)(asked->nodes + c * asked->node_strides[1] + first, width, 4, b->cubics, near[c] + k * SQUARE);
+    }
     R *across = (R *)given->exact + number * SQUARE, *down = across + given->move.cameras * rows * columns * SQUARE;
+    if (is_near && T(refined_positions)(&given->move, b, n, u, v, near, missed)) {
+        memcpy(across, near[0], (size_t)n * sizeof(R)), memcpy(down, near[1], (size_t)n * sizeof(R));
+        for (int k = 0; k < count; k++) cells[places[k]] = (int32_t)(number + k);
+        return 0;
+    }
+    left = T(moved)(&given->move, b, n, n, u, v, ok);
     for (int i = 0; i < n; i++) across[i] = ok[i] ? u[i] : NAN, down[i] = ok[i] ? v[i] : NAN;
     for (int k = 0; k < count; k++) {
         const int64_t i = places[k] / columns, j = places[k] % columns;
@@ -183,24 +349,30 @@ INLINE void T(middles)(const float *node, int64_t width, const int count, float 
     at[1] = T(middle)(node - before * width, width, count), at[2] = T(middle)(node - before * width + 1, width, count);
 }
 
-/* By how much, squared, what `count` x `count` nodes say misses what was found; at most of each coordinate, and of both */
+/* The largest of misses in pixels, squared: of each coordinate, and of both */
+static float T(largest)(const R *across, const R *down, float *of_each) {
+    float most = 0;
+    of_each[0] = of_each[1] = 0;
+    for (int at = 0; at < PROBES; at++) {
+        const float u2 = (float)(across[at] * across[at]), v2 = (float)(down[at] * down[at]);
+        of_each[0] = u2 > of_each[0] ? u2 : of_each[0], of_each[1] = v2 > of_each[1] ? v2 : of_each[1];
+        most = u2 + v2 <= most ? most : u2 + v2; /* or what is not a number */
+    }
+    return most;
+}
+
+/* By how much what `count` x `count` nodes say misses what was found */
 static float T(most_missed)(const Classification *asked, int64_t first, const int count, const R *u, const R *v,
                             float *of_each) {
     const float half[2] = {(float)asked->source_width / 2, (float)asked->source_height / 2};
     const int64_t width = asked->columns + 5;
-    float missed[PROBES] = {0}, said[PROBES], most = 0;
+    float said[PROBES];
+    R missed[2][PROBES];
     for (int c = 0; c < 2; c++) {
-        const R *found = c ? v : u;
         T(middles)(asked->nodes + c * asked->node_strides[1] + first + 2 * width + 2, width, count, said);
-        of_each[c] = 0;
-        for (int at = 0; at < PROBES; at++) {
-            const float miss = ((float)found[at] - said[at]) * half[c];
-            of_each[c] = miss * miss > of_each[c] ? miss * miss : of_each[c];
-            missed[at] += miss * miss;
-        }
+        for (int at = 0; at < PROBES; at++) missed[c][at] = (R)(((float)(c ? v : u)[at] - said[at]) * half[c]);
     }
-    for (int at = 0; at < PROBES; at++) most = missed[at] <= most ? most : missed[at]; /* or what is not a number */
-    return most;
+    return T(largest)(missed[0], missed[1], of_each);
 }
 
 /* Whether a cell lies far off the image; missed: by how much cubics miss each coordinate, squared */
@@ -230,7 +402,7 @@ static int T(settle)(const Lattices *given, const T(Between) *b, const Classific
     const int64_t columns = asked->columns, cells = asked->rows * columns, width = columns + 5;
     const float limit = (float)(asked->tolerance * asked->tolerance) / 4;
     int64_t places[BLOCK / PROBES], i = 0;
-    ALIGNED R u[BLOCK], v[BLOCK];
+    ALIGNED R u[BLOCK], v[BLOCK], near[2][BLOCK], missed[2][BLOCK];
     ALIGNED I ok[BLOCK];
     int left = 0;
     while (i < cells) {
@@ -243,20 +415,34 @@ static int T(settle)(const Lattices *given, const T(Between) *b, const Classific
             u[k] = (R)(STEP * (place % columns) + STEP / 2 * across[k % PROBES]);
             v[k] = (R)(STEP * (place / columns) + STEP / 2 * down[k % PROBES] + given->first_row);
         }
-        if (count) left |= T(moved)(&given->move, b, points, n, u, v, ok);
+        int is_refined = 0;
+        for (int k = 0; b->close2 > 0 && k < points; k += PROBES) {
+            const int64_t place = places[k / PROBES], first = (place / columns + 2) * width + place % columns + 2;
+            for (int c = 0; c < 2; c++) {
+                float said[PROBES];
+                T(middles)(asked->nodes + c * asked->node_strides[1] + first, width, 4, said);
+                for (int at = 0; at < PROBES; at++) near[c][k + at] = (R)said[at];
+            }
+        }
+        for (int k = points; k < n; k++) near[0][k] = near[0][points - 1], near[1][k] = near[1][points - 1];
+        if (count && b->close2 > 0 && T(refined_positions)(&given->move, b, n, u, v, near, missed)) {
+            EACH(i) u[i] = near[0][i], v[i] = near[1][i], ok[i] = 1;
+            is_refined = 1;
+        } else if (count) left |= T(moved)(&given->move, b, points, n, u, v, ok);
         for (int k = 0; k < count; k++) {
             const R *found_u = u + k * PROBES, *found_v = v + k * PROBES;
             const int64_t first = places[k] / columns * width + places[k] % columns; /* of its 6 x 6 nodes */
-            float missed[2];
+            float of_each[2];
             int known = 1, cell = 0;
             for (int at = 0; at < PROBES; at++) known &= ok[k * PROBES + at] != 0;
-            if (known && (T(most_missed)(asked, first, 4, found_u, found_v, missed) <= limit ||
-                          (asked->padding == ZEROS && T(is_off)(asked, first, found_u, found_v, missed)))) {
+            const float by_cubics = is_refined ? T(largest)(missed[0] + k * PROBES, missed[1] + k * PROBES, of_each)
+                                               : T(most_missed)(asked, first, 4, found_u, found_v, of_each);
+            if (known && (by_cubics <= limit || (asked->padding == ZEROS && T(is_off)(asked, first, found_u, found_v, of_each)))) {
                 cell = CELL_CUBIC;
             } else if (known) {
                 for (int y = 0; y < 6; y++) known &= !memcmp(asked->mapped + first + y * width, all, sizeof all);
                 /* a quarter of that, and of what cubics miss: where the curvature steps, quintics gain nothing, and swing */
-                if (known && T(most_missed)(asked, first, 6, found_u, found_v, missed) <= limit / 16) cell = CELL_QUINTIC;
+                if (known && T(most_missed)(asked, first, 6, found_u, found_v, of_each) <= limit / 16) cell = CELL_QUINTIC;
             }
             asked->cells[places[k]] = cell;
         }
@@ -269,31 +455,14 @@ static void T(lay_quintics)(const Lattices *given, const Classification *asked) 
     const int64_t columns = asked->columns, cells = asked->rows * columns, width = columns + 5;
     R *exact[2] = {(R *)given->exact, (R *)given->exact + given->move.cameras * cells * SQUARE};
     float weights[6][STEP];
-    for (int j = 0; j < 6; j++)
-        for (int k = 0; k < STEP; k++) {
-            weights[j][k] = 1;
-            for (int m = 0; m < 6; m++)
-                if (m != j) weights[j][k] *= ((float)k / STEP + 2 - m) / (j - m);
-        }
+    T(weights_of)(6, weights);
     for (int64_t i = 0; i < cells; i++) {
         if (asked->cells[i] != CELL_QUINTIC) continue;
         const int64_t number = added(given->used, 1);
         asked->cells[i] = (int32_t)number;
         for (int c = 0; c < 2; c++) {
             const float *nodes = asked->nodes + c * asked->node_strides[1] + i / columns * width + i % columns;
-            /* down the six columns of nodes, then across */
-            for (int y = 0; y < STEP; y++) {
-                float line[6], made[STEP];
-                for (int j = 0; j < 6; j++) {
-                    float sum = 0;
-                    for (int m = 0; m < 6; m++) sum += weights[m][y] * nodes[m * width + j];
-                    line[j] = sum;
-                }
-                for (int k = 0; k < STEP; k++) made[k] = weights[0][k] * line[0];
-                for (int j = 1; j < 6; j++)
-                    for (int k = 0; k < STEP; k++) made[k] += weights[j][k] * line[j];
-                for (int k = 0; k < STEP; k++) exact[c][number * SQUARE + y * STEP + k] = (R)made[k];
-            }
+            T(laid)(nodes, width, 6, weights, exact[c] + number * SQUARE);
         }
     }
 }
@@ -305,6 +474,11 @@ static int T(lattice)(const Lattices *given, int64_t camera, T(Between) *b) {
     const R *at = (const R *)move->results + camera * move->result_strides[0];
     int left = 0;
     T(between)(move, camera, b);
+    if (b->bent == &b->from && b->bent->pieces) { /* whose slopes change by no more than 4 from cell to cell */
+        const R *k = b->bent->numbers[b->bent->stages];
+        b->close2 = (R)asked.tolerance / (8 * (k[0] / b->bent->fx + k[1] / b->bent->fy));
+        T(weights_of)(4, b->cubics);
+    }
     for (int64_t i = 0; i < move->count; i += BLOCK)
         left |= T(move_row)(move, b, i, (int)(move->count - i < BLOCK ? move->count - i : BLOCK));
     if (left) return left;
@@ -330,7 +504,7 @@ static int T(lattice)(const Lattices *given, int64_t camera, T(Between) *b) {
             for (int64_t i = 0; i < cells || count; i++) {
                 if (i < cells && asked.cells[i] == wanted[turn]) places[count++] = i;
                 if (count < BLOCK / SQUARE && (i < cells || !count)) continue;
-                left |= T(squares)(given, b, asked.cells, places, count, added(given->used, count));
+                left |= T(squares)(given, b, &asked, places, count, added(given->used, count));
                 found += count, count = 0;
             }
         } while (found && turn);

@@ -49,18 +49,20 @@ static void T(prepare)(const Cameras *all, int64_t camera, T(Camera) *c) {
         c->is_radial = c->stages == 1 && first->kind == PLANAR && !first->flags;
         c->by_stages = all->stagewise && all->stagewise[camera];
         c->follows = !c->is_radial && !c->by_stages;
-        c->inner2 = c->usable ? ((const R *)all->inner2)[camera] : -1;
+        c->is_partial = !all->inner2;
+        c->inner2 = c->usable && all->inner2 ? ((const R *)all->inner2)[camera] : -1;
         c->usual2 = all->usual2 ? ((const R *)all->usual2)[camera] : c->inner2;
         c->circle2 = all->circle2 ? ((const R *)all->circle2)[camera] : 0;
         c->limits2 = all->limits2 ? (const R *)all->limits2 + camera * AZIMUTHS : NULL;
         c->extent = all->extent ? (const R *)all->extent + camera * EXTENT : NULL;
         c->waits = c->follows && !c->extent;
-        if (all->certain && c->follows) {
+        if (all->certain) {
             const Part *last = c->parts + c->stages;
-            c->certain = all->certain + camera * last->n * last->m, c->certain2 = ((const R *)all->certain2)[camera];
+            const uint8_t *certain = all->certain + camera * last->n * last->m;
             c->all_certain = 1;
-            for (int i = 0; i < (last->n - last->flags) * (last->m - last->flags); i++) c->all_certain &= c->certain[i];
-            c->to_edge = c->all_certain && c->stages == 1;
+            for (int i = 0; i < (last->n - last->flags) * (last->m - last->flags); i++) c->all_certain &= certain[i];
+            if (all->certain2 && c->follows) c->certain = certain, c->certain2 = ((const R *)all->certain2)[camera];
+            c->to_edge = c->certain && c->all_certain && c->stages == 1;
         }
         if (all->pieces) {
             const Part *last = c->parts + c->stages;

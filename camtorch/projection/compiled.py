@@ -151,7 +151,9 @@ class Plan:
     is_long: bool
     """Whether a radial factor has so many numbers that its fold is not found by a root."""
     controls: int
-    """Of a surface, the last stage after nothing or a radial factor."""
+    """Of a surface, the last stage."""
+    is_plain: bool
+    """Whether that comes after nothing or a radial factor."""
     pieces: int
     """How many numbers say what its pieces are."""
 
@@ -170,9 +172,9 @@ class Plan:
         self.has_factor, self.has_rest = lens.radial is not None, lens.rest is not None
         self.is_long = any(part.factor and part.n + part.m > _MOST_DEGREE for part in parts)
         *before, last = lens.stages or (None,)
-        is_plain = isinstance(last, optics.Surface) and (not before or (len(before) == 1 and before[0].is_radial))
+        self.is_plain = isinstance(last, optics.Surface) and (not before or (len(before) == 1 and before[0].is_radial))
         end = parts[-1]
-        self.controls = end.n * end.m if is_plain else 0
+        self.controls = end.n * end.m if isinstance(last, optics.Surface) else 0
         self.pieces = _PIECE * (end.n - end.flags) * (end.m - end.flags) if 0 < self.controls <= _MOST_CONTROLS else 0
         self._ends: dict[torch.dtype, tuple[float, float]] = {}
         self._radii: dict[tuple[torch.dtype, int], Tensor] = {}
@@ -246,7 +248,9 @@ class Lenses:
             struct.constants, struct.constant_count = self._keep_columns(constants), len(constants)
         if plan.is_chart:
             self._add_chart()
-        if plan.has_stages:
+        if plan.controls:  # that pixels move by: most often nobody asks for more
+            self._add_surface()
+        elif plan.has_stages:
             self._add_domain(tables)
 
     def _optics(self) -> tuple[Chart, Lens]:
@@ -300,25 +304,36 @@ class Lenses:
         struct = self.struct
         struct.chart_inner2, struct.chart_table, struct.chart_most2 = inner2, place, self._keep(table[:, 1])
 
+    def _add_surface(self) -> None:
+        plan, wanted = self.plan, {"certain": self._new(self.plan.controls, torch.uint8)}
+        wanted |= {"pieces": self._new(plan.pieces)} if plan.pieces else {}
+        self._ask(wanted)
+        for name, place in wanted.items():
+            setattr(self.struct, name, place)
+
+    def whole(self) -> _Cameras:
+        """What it has, and all of the domain."""
+        if self.plan.has_stages and self.struct.inner2 is None:
+            self._add_domain(tables=False)
+        return self.struct
+
     def _add_domain(self, tables: bool) -> None:
         plan = self.plan
         if plan.is_chart:  # whose end is that of a search
             domain = self._slow_domain()
-            self.struct.inner2, self.struct.usual2 = self._keep(domain.inner2), self._keep(domain.usual2)
+            self.struct.usual2, self.struct.inner2 = self._keep(domain.usual2), self._keep(domain.inner2)
             return
-        names = ["inner2", "usual2", *["circle2", "stagewise"] * plan.has_rest, *["certain2"] * bool(plan.controls)]
+        has_certain = plan.is_plain and self.struct.certain is not None
+        names = ["inner2", "usual2", *["circle2", "stagewise"] * plan.has_rest, *["certain2"] * has_certain]
         counts = [1] * len(names)
         if tables and plan.has_factor:  # at once, as there will be pixels
             names, counts = [*names, "table"], [*counts, _TABLE]
         start, step = self._new(sum(counts)), self.cameras * self.dtype.itemsize
         wanted = {name: start + step * i for i, name in enumerate(names)}
-        if plan.controls:
-            wanted["certain"] = self._new(plan.controls, torch.uint8)
-            wanted |= {"pieces": self._new(plan.pieces)} if plan.pieces else {}
-        for name, place in wanted.items():
-            setattr(self.struct, name, place)
         radii = {} if plan.is_radial else {"radii": self._keep(plan.radii(lambda: self._optics()[0], _RADII, self._k))}
         self._ask(wanted | radii)
+        for name, place in reversed(wanted.items()):  # inner2 last, by which another thread sees that all is there
+            setattr(self.struct, name, place)
 
     def inverse_table(self) -> int:
         """What the inverse of the radial factor starts from; it is made when it is first asked for."""
@@ -390,7 +405,8 @@ class Native:
     cameras: int
     dtype: torch.dtype
     parameters: int
-    pointer: int
+    bare: int
+    """The pointer where pixels move, which takes no more of the domain than there is, and says if it wants more."""
 
     def __init__(self, lenses: Lenses, intrinsics: Tensor, usable: Tensor | None):
         """See `native_of`."""
@@ -398,22 +414,51 @@ class Native:
         self._kept = intrinsics.contiguous(), None if usable is None else (usable > 0).contiguous()
         self.cameras, self.dtype, self.parameters = intrinsics.shape[0], intrinsics.dtype, lenses.plan.parameters
         self.struct.intrinsics, self.struct.usable = map(_address, self._kept)
-        self.pointer = addressof(self.struct)
+        self.bare = addressof(self.struct)
+
+    @property
+    def pointer(self) -> int:
+        """With all of the domain."""
+        if self._is_partial:
+            self._complete()
+        return self.bare
+
+    @property
+    def _is_partial(self) -> bool:
+        return self.plan.controls > 0 and self.struct.inner2 is None
+
+    def _complete(self) -> None:
+        whole = self._lenses.whole()
+        for name in ("usual2", "circle2", "stagewise", "certain2", "inner2"):
+            setattr(self.struct, name, getattr(whole, name))
 
     def before(self, intrinsics: Tensor) -> Native:
         """The same lenses with other intrinsics (C, 4), all usable."""
         return Native(self._lenses, intrinsics, None)
 
-    def add_tables(self, count: int) -> None:
-        """Have what the inverse of so many pixels of each camera starts from."""
+    def add_tables(self, count: int, moving: bool = False) -> None:
+        """Have what the inverse of so many pixels of each camera starts from; where pixels move, unless that is by a
+        surface alone, as C says.
+        """
+        if self._is_partial:
+            if moving:
+                return
+            self._complete()
         if self.plan.has_factor and self.struct.table is None:
             self.struct.table = self._lenses.inverse_table()
-        if count >= _FOR_START and self.struct.certain is not None and self.struct.start is None:
+        if count >= _FOR_START and self.plan.is_plain and self.plan.controls and self.struct.start is None:
             self.struct.start = self._lenses.surface_table()
 
     def follow(self) -> None:
         """Have the limits of each azimuth, and where it is sent."""
         self.struct.limits2, self.struct.extent = self._lenses.followed()
+
+    def add_what_is_left(self) -> None:
+        """What C wants to move pixels: the domain and its tables, or else what `follow` has."""
+        if self._is_partial or (self.plan.has_factor and self.struct.table is None):
+            self.add_tables(0)
+        else:
+            self.follow()
 
 
 def native_of(
@@ -633,10 +678,10 @@ class Between:
         self.dtype = start.dtype
         count, strides = (1, (0, 0)) if turns is None else (turns.numel() // 9, turns.stride())
         self.cameras = max(start.cameras, end.cameras, count)
-        start.add_tables(0)
+        start.add_tables(0, moving=True)
         self._size = size
         by_camera = strides[0] if count > 1 else 0
-        self._given = start.pointer, end.pointer, _address(turns), by_camera, *strides[-2:], self.cameras
+        self._given = start.bare, end.bare, _address(turns), by_camera, *strides[-2:], self.cameras
 
     def back(self, size: tuple[int, int]) -> Between:
         """From the others to these, whose image is of that size."""
@@ -650,7 +695,7 @@ class Between:
             the same, of which only those on the image are valid.
         """
         count = pixels.shape[1]
-        self._start.add_tables(count)
+        self._start.add_tables(count, moving=True)
         result = torch.empty(self.cameras, count, 2, dtype=self._start.dtype, device="cpu")
         valid = torch.empty(self.cameras, count, dtype=torch.bool, device="cpu")
         rows = *rows_of(pixels), result.data_ptr(), 2 * count, 2, 1, valid.data_ptr(), count, _TILE
@@ -682,7 +727,7 @@ class Between:
                 of float32 alone.
         """
         cameras, dtype, count = self.cameras, self._start.dtype, probes.shape[1]
-        self._start.add_tables(size[0] * size[1])  # of which one in 64 is a node, and some are computed one by one
+        self._start.add_tables(size[0] * size[1], moving=True)  # one in 64 is a node; some are exact
         n, m = (-(-side // 8) for side in size)
         nodes, most, is_double = (n + 5) * (m + 5), cameras * n * m, dtype == torch.float64
         result = torch.empty(cameras, 2, count, dtype=dtype, device="cpu")
@@ -719,7 +764,7 @@ class Between:
                 return flags
             for flag, native in ((LEFT_FROM, self._start), (LEFT_TO, self._end)):
                 if flags & flag:
-                    native.follow()
+                    native.add_what_is_left()
 
 
 class _Kept(threading.local):

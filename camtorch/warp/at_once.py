@@ -319,10 +319,10 @@ class _Call:
             if not _surely_keeps_size(Between(target, source, turns, self._sizes[0], False), self._sizes):
                 return None
         words, turn = self._words, 0 if rotation is None else rotation.data_ptr()
-        target.add_tables(self._pixels if self._jobs else 0)
+        target.add_tables(self._pixels if self._jobs else 0, moving=True)
         if self._moves:
-            source.add_tables(0)
-        words[_HEAD], words[_HEAD + 1], words[_HEAD + 2] = target.pointer, source.pointer, turn
+            source.add_tables(0, moving=True)
+        words[_HEAD], words[_HEAD + 1], words[_HEAD + 2] = target.bare, source.bare, turn
         results: list[tuple[Tensor, Tensor | None]] = []
         given = []  # pixels in the dtype of the cameras, for as long as the call
         for value, (at, make) in zip(values, self._slots, strict=True):
@@ -333,7 +333,7 @@ class _Call:
                     given.append(value)
                 result = torch.empty(shape, dtype=self._dtype, device="cpu")
                 valid = torch.empty(shape[:-1], dtype=torch.bool, device="cpu")
-                words[at], words[at + 1], words[at + 2] = source.pointer, target.pointer, turn
+                words[at], words[at + 1], words[at + 2] = source.bare, target.bare, turn
                 words[at + 10], words[at + 14], words[at + 18] = value.data_ptr(), result.data_ptr(), valid.data_ptr()
                 results.append((result, valid))
             else:
@@ -350,9 +350,9 @@ class _Call:
             # of the lattice, else of the pixels, which go the other way
             left, (start, end) = (flags, (target, source)) if flags < _PIXELS else (flags // _PIXELS, (source, target))
             if left & LEFT_FROM:
-                start.follow()
+                start.add_what_is_left()
             if left & LEFT_TO:
-                end.follow()
+                end.add_what_is_left()
             if flags >= _PIXELS:  # the images are made
                 words[1] = 0
         if not is_whole:

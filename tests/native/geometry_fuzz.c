@@ -69,7 +69,7 @@ int32_t classify_fuzzed(const Classification *given) {
 static int moved(const Cameras *cameras, int64_t tile) {
     const int d = (int)cameras->is_double, fits = below(2);
     const Part *last = cameras->parts + cameras->part_count - 1;
-    Cameras bare = *cameras;
+    Cameras bent = *cameras, bare = *cameras;
     void *fewer = NULL;
     if (last->kind == SURFACE && below(4)) {
         const int64_t item = d ? 8 : 4, all = cameras->parameter_count, kept = all - 4 - 2 * last->n * last->m;
@@ -77,6 +77,7 @@ static int moved(const Cameras *cameras, int64_t tile) {
         for (int64_t i = 0; i < cameras->cameras; i++)
             memcpy((char *)fewer + i * kept * item, (const char *)cameras->parameters + i * all * item, (size_t)(kept * item));
         bare.stagewise = bare.certain = NULL, bare.circle2 = bare.certain2 = bare.start = bare.pieces = NULL;
+        if (below(2)) bare.table = NULL;
     }
     const int64_t c = cameras->cameras, height = 1 + below(70), width = 1 + below(90);
     const int64_t rows = (height + 7) / 8, columns = (width + 7) / 8, nodes = (rows + 5) * (columns + 5);
@@ -85,7 +86,10 @@ static int moved(const Cameras *cameras, int64_t tile) {
     Move move = {0};
     void *turns = filled(d, 9 * c, 1, 0), *narrow = NULL, *valid = malloc((size_t)(c * n));
     int64_t following = 0, used = 0;
-    move.from = cameras, move.to = fewer ? &bare : cameras, move.cameras = c, move.form = fits ? POSITIONS : below(3);
+    if (bent.certain && below(2)) /* nothing more is known of its domain */
+        bent.stagewise = NULL, bent.inner2 = bent.usual2 = bent.circle2 = bent.certain2 = bent.table = bent.limits2 = bent.extent = NULL;
+    move.from = &bent, move.to = fewer ? &bare : &bent, move.cameras = c, move.form = fits ? POSITIONS : below(3);
+    if (fewer && below(2)) move.from = &bare, move.to = &bent;
     if (below(fewer ? 4 : 2) == 0) {
         const int64_t back = below(2);
         move.turns = turns, move.turn_strides[0] = 9 * below(2);
