@@ -154,14 +154,14 @@ def checked_distortion(model: type[Camera], distortion: Numbers, intrinsics: Ten
     """
     owner = model.__name__
     distortion = as_real(distortion, "distortion", owner)
+    row = row_of(distortion)
+    if row is not None and len(row) == 2 and min(row) >= _SIZE_LIKE and all(map(float.is_integer, row)):
+        raise ValueError(f"{owner}: distortion {row} seems to be an image size; image_size=(height, width) is one")
     if not model.distortion_names and distortion.numel():
         raise ValueError(
             f"{owner}: it has no distortion, and got coefficients of shape {tuple(distortion.shape)}; of "
             "OpenCV's, BrownConrady takes those of calibrateCamera, KannalaBrandt those of fisheye, Mei omnidir's"
         )
-    row = row_of(distortion)
-    if row is not None and len(row) == 2 and min(row) >= _SIZE_LIKE and all(map(float.is_integer, row)):
-        raise ValueError(f"{owner}: distortion {row} seems to be an image size; image_size=(height, width) is one")
     known = distortion.ndim > 0 and model.names_of(distortion.shape[-1]) is not None
     in_doubt = _is_column(model, distortion) and intrinsics.shape[:-1] != distortion.shape[:-1]
     if known:

@@ -10,7 +10,6 @@ images = torch.rand(1, 3, 480, 640)
 
 ct.Pinhole([300.0, 300, 320, 240], image_size=480)  # type: ignore[arg-type]  # pyright: ignore[reportArgumentType]
 ct.Pinhole("300 300 320 240")  # type: ignore[arg-type]  # pyright: ignore[reportArgumentType]
-ct.Pinhole([300.0, 300, 320, 240], (480, 640))  # type: ignore[call-arg]  # pyright: ignore[reportCallIssue]
 ct.Fisheye([300.0, 300, 320, 240])  # type: ignore[attr-defined]  # pyright: ignore
 camera.distort(images)  # type: ignore[operator]  # pyright: ignore[reportCallIssue]
 camera.crop(0, 0, "100", 100)  # type: ignore[arg-type]  # pyright: ignore[reportArgumentType]
