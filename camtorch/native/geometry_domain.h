@@ -419,25 +419,6 @@ static void pieces_of(const Part *part, const double *k, void *pieces, int64_t a
         }
 }
 
-/* By how much the slopes of a surface change at the most on a unit: second derivatives of a spline lie between the second
-   differences of its control points */
-static double bend_of(const Part *part, const double *k) {
-    const int64_t row = 2 * (int64_t)part->n;
-    double most = 0;
-    for (int axis = 0; axis < 2; axis++) {
-        double along = 0, mixed = 0;
-        for (int j = 0; j < part->m; j++)
-            for (int i = 0; i < part->n; i++) {
-                const double *at = k + 4 + row * j + 2 * i + axis;
-                if (i > 1) along = fmax(along, fabs(at[0] - 2 * at[-2] + at[-4]));
-                if (j > 1) along = fmax(along, fabs(at[0] - 2 * at[-row] + at[-2 * row]));
-                if (i && j) mixed = fmax(mixed, fabs(at[0] - at[-2] - at[-row] + at[-row - 2]));
-            }
-        most += along + mixed;
-    }
-    return most * fmax(k[0] * k[0], k[1] * k[1]);
-}
-
 /* (START): the inverse of the last stage, a surface, on the box around what it sends certain points to. First where
    the cells are, as of a surface, and what Newton's method leaves of a step: it times the step's square times the size of
    the Jacobian and over its determinant, to be less than 1. Of each cell its middle; slopes across and down; by how much
@@ -469,7 +450,7 @@ static void start_of(const Domain *d, int64_t camera, const uint8_t *certain) {
         start[2 + axis] = is_box ? (low[axis] + high[axis]) / 2 : k[2 + axis];
     }
     const double least = (d->is_double ? DBL_EPSILON : FLT_EPSILON) / 4 * hypot(GRID / 2 / start[0], GRID / 2 / start[1]);
-    start[4] = bend_of(part, k) / 2 / least;
+    start[4] = bend_of_double(part, k) / 2 / least;
     for (int i = 0; i < CELL; i++) put(d->start, camera * START + i, start[i], (int)d->is_double);
     for (int j = 0; j < SIDE; j++) {
         for (int i = 0; i < SIDE; i++) {

@@ -374,6 +374,25 @@ static void T(surface)(const Part *part, const R *k, int n, const R *restrict a,
     else T(surface_of)(part, k, 2, n, a, b, u, v, NULL);
 }
 
+/* By how much the slopes of a surface change at the most on a unit: second derivatives of a spline lie between the second
+   differences of its control points */
+static R T(bend_of)(const Part *part, const R *k) {
+    const int64_t row = 2 * (int64_t)part->n;
+    R sum = 0;
+    for (int axis = 0; axis < 2; axis++) {
+        R along = 0, mixed = 0;
+        for (int j = 0; j < part->m; j++)
+            for (int i = 0; i < part->n; i++) {
+                const R *at = k + 4 + row * j + 2 * i + axis;
+                if (i > 1) along = T(most)(along, T(absolute)(at[0] - 2 * at[-2] + at[-4]));
+                if (j > 1) along = T(most)(along, T(absolute)(at[0] - 2 * at[-row] + at[-2 * row]));
+                if (i && j) mixed = T(most)(mixed, T(absolute)(at[0] - at[-2] - at[-row] + at[-row - 2]));
+            }
+        sum += along + mixed;
+    }
+    return sum * T(most)(k[0] * k[0], k[1] * k[1]);
+}
+
 /* The pieces of a surface, the last stage, by value */
 typedef struct {
     R sa, sb, ca, cb, middle_a, middle_b, half, last_i, last_j;

@@ -6,8 +6,8 @@ typedef struct {
     R turn[9];
     const T(Camera) *bent, *plain; /* which of both is the other one with a surface after its lens, NULL where none is */
     R within2;                     /* see `surely2` */
-    R close2;                      /* the squared length of a step in pixels after which the next one is less than the tolerance of a lattice */
-    float cubics[4][STEP]; /* weights of nodes */
+    R bend;                        /* of lattices, what a step leaves beside their tolerance: see `start_of`; -1: none */
+    float cubics[4][STEP];         /* weights of nodes */
 } T(Between);
 
 /* The squared radius of a circle of a camera's plane in which each point has a ray for certain */
@@ -35,7 +35,7 @@ static void T(compare)(const Move *move, T(Between) *b) {
     const T(Camera) *from = &b->from, *to = &b->to, *bent = from->stages > to->stages ? from : to, *plain = bent == from ? to : from;
     const int last = plain->stages + 1;
     const int64_t constants = move->from->constant_count;
-    b->bent = b->plain = NULL, b->within2 = b->close2 = 0;
+    b->bent = b->plain = NULL, b->within2 = 0, b->bend = -1;
     if (move->turns || bent->stages != last || !bent->all_certain || !(from->usable & to->usable)) return;
     if (from->fx != to->fx || from->fy != to->fy || from->cx != to->cx || from->cy != to->cy) return;
     if (memcmp(from->parts, to->parts, (size_t)last * sizeof(Part)) || move->to->constant_count != constants) return;
@@ -132,7 +132,7 @@ static void T(sent_together)(const T(Camera) *c, int n, const R *restrict a, con
 static int T(refined)(const T(Between) *b, int n, const R *restrict u, const R *restrict v, R (*restrict near)[BLOCK],
                       R (*restrict missed)[BLOCK]) {
     const T(Camera) *c = b->bent;
-    const R fx = c->fx, fy = c->fy, cx = c->cx, cy = c->cy, by_fx = 1 / fx, by_fy = 1 / fy, close2 = b->close2;
+    const R fx = c->fx, fy = c->fy, cx = c->cx, cy = c->cy, by_fx = 1 / fx, by_fy = 1 / fy, bend = b->bend;
     ALIGNED R a[BLOCK], e[BLOCK], p[BLOCK], q[BLOCK];
     T(Jacobian) to;
     for (int count = 0; count < MOST_STEPS; count++) {
@@ -141,11 +141,13 @@ static int T(refined)(const T(Between) *b, int n, const R *restrict u, const R *
         T(sent_together)(c, n, a, e, p, q, &to);
         EACH(i) {
             R da, db;
-            T(step)(to.ua[i], to.ub[i], to.va[i], to.vb[i], (u[i] - cx) * by_fx - p[i], (v[i] - cy) * by_fy - q[i], &da, &db);
+            const R ua = to.ua[i], ub = to.ub[i], va = to.va[i], vb = to.vb[i];
+            const R one = T(absolute)(T(step)(ua, ub, va, vb, (u[i] - cx) * by_fx - p[i], (v[i] - cy) * by_fy - q[i], &da, &db));
+            const R size = T(absolute)(ua) + T(absolute)(ub) + T(absolute)(va) + T(absolute)(vb);
             const R across = fx * da, down = fy * db;
             near[0][i] += across, near[1][i] += down;
             missed[0][i] = count ? missed[0][i] : across, missed[1][i] = count ? missed[1][i] : down;
-            all &= close2 - (across * across + down * down) > 0;
+            all &= (1 - bend * (da * da + db * db) * (size * one) > 0) & (one > 0);
         }
         if (all) return 1;
     }
@@ -300,7 +302,7 @@ static int T(squares)(const Lattices *given, const T(Between) *b, const Classifi
     const int n = count * SQUARE;
     ALIGNED R u[BLOCK], v[BLOCK], near[2][BLOCK], missed[2][BLOCK];
     ALIGNED I ok[BLOCK];
-    int is_near = b->close2 > 0, left = 0;
+    int is_near = b->bend >= 0, left = 0;
     for (int k = 0; k < count; k++) {
         const int64_t first = (places[k] / columns + 1) * width + places[k] % columns + 1; /* of 4 x 4 nodes */
         for (int i = 0; i < SQUARE; i++) {
@@ -416,7 +418,7 @@ static int T(settle)(const Lattices *given, const T(Between) *b, const Classific
             v[k] = (R)(STEP * (place / columns) + STEP / 2 * down[k % PROBES] + given->first_row);
         }
         int is_refined = 0;
-        for (int k = 0; b->close2 > 0 && k < points; k += PROBES) {
+        for (int k = 0; b->bend >= 0 && k < points; k += PROBES) {
             const int64_t place = places[k / PROBES], first = (place / columns + 2) * width + place % columns + 2;
             for (int c = 0; c < 2; c++) {
                 float said[PROBES];
@@ -425,7 +427,7 @@ static int T(settle)(const Lattices *given, const T(Between) *b, const Classific
             }
         }
         for (int k = points; k < n; k++) near[0][k] = near[0][points - 1], near[1][k] = near[1][points - 1];
-        if (count && b->close2 > 0 && T(refined_positions)(&given->move, b, n, u, v, near, missed)) {
+        if (count && b->bend >= 0 && T(refined_positions)(&given->move, b, n, u, v, near, missed)) {
             EACH(i) u[i] = near[0][i], v[i] = near[1][i], ok[i] = 1;
             is_refined = 1;
         } else if (count) left |= T(moved)(&given->move, b, points, n, u, v, ok);
@@ -474,9 +476,10 @@ static int T(lattice)(const Lattices *given, int64_t camera, T(Between) *b) {
     const R *at = (const R *)move->results + camera * move->result_strides[0];
     int left = 0;
     T(between)(move, camera, b);
-    if (b->bent == &b->from && b->bent->pieces) { /* whose slopes change by no more than 4 from cell to cell */
-        const R *k = b->bent->numbers[b->bent->stages];
-        b->close2 = (R)asked.tolerance / (8 * (k[0] / b->bent->fx + k[1] / b->bent->fy));
+    if (b->bent == &b->from && b->bent->pieces) { /* to a quarter of the tolerance, as cells are held to half of it */
+        const int last = b->bent->stages;
+        const R focal = T(most)(T(absolute)(b->bent->fx), T(absolute)(b->bent->fy));
+        b->bend = 2 * focal / (R)asked.tolerance * T(bend_of)(b->bent->parts + last, b->bent->numbers[last]);
         T(weights_of)(4, b->cubics);
     }
     for (int64_t i = 0; i < move->count; i += BLOCK)
