@@ -9,7 +9,6 @@ from collections.abc import Sequence
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
-Colour = tuple[int, ...]
 Font = ImageFont.FreeTypeFont | ImageFont.ImageFont
 
 INK, GREY, RIM, PAPER = (43, 42, 46), (122, 112, 100), (214, 202, 182), (250, 245, 235)
@@ -50,10 +49,10 @@ class Marks:
         self._image = Image.new("RGBA", (_SHARP * width, _SHARP * height))
         self._draw = ImageDraw.Draw(self._image)
 
-    def over(self, image: Image.Image, at: tuple[int, int] = (0, 0)) -> None:
-        """Lay the marks over an image, their top left corner at one of its pixels."""
+    def over(self, image: Image.Image) -> None:
+        """Lay the marks over an image."""
         marks = self._image.reduce(_SHARP)
-        image.paste(marks, at, marks)
+        image.paste(marks, (0, 0), marks)
 
     def point(self, at: Sequence[float] | Tensor, weight: float = 1.0) -> None:
         """A keypoint, on any ground; likewise boxes and arrows: the weight is that of lines."""

@@ -16,16 +16,17 @@ import albumentations as A  # noqa: N812 (everybody's name for it)
 import numpy as np
 import torch
 from albumentations.core.type_definitions import Targets
-from torch import Tensor
 
-from camtorch.augment.augmentation import Augmentation, camera_of_sample, check_front_end, move_points
+from camtorch.augment import numpy as arrays
+from camtorch.augment.augmentation import Augmentation, camera_of_sample, check_front_end
 from camtorch.augment.change import Change
-from camtorch.augment.numpy import as_array, as_tensor
-from camtorch.augment.sample import KINDS, Unknown, moves, together
+from camtorch.augment.sample import KINDS, Unknown
 from camtorch.camera import Camera
 
 _OWNER = "albumentations.Transform"
-_KINDS = [k for k in KINDS if k not in ("image", "mask", "keypoints", "polygons", "boxes", "landmarks")]
+_KINDS = {kind: kind for kind in KINDS if kind not in ("polygons", "boxes", "landmarks")}
+_KINDS |= {"images": "image", "masks": "mask", "bboxes": "boxes"}
+"""Targets of pipelines, and the kinds of fields that they are."""
 
 
 class Transform(A.DualTransform):
@@ -62,12 +63,11 @@ class Transform(A.DualTransform):
         check_front_end(_OWNER, augmentation, camera)
         super().__init__(p=augmentation.p if p is None else p)
         self.augmentation, self.camera = augmentation, camera
+        self._arrays = arrays.Transform(augmentation)
 
     @property
     def targets(self) -> dict[str, Callable[..., Any]]:
-        moved = {name: getattr(self, f"apply_to_{name}") for name in ("images", "mask", "masks", "bboxes", "keypoints")}
-        others = {name: self._mover(name) for name in _KINDS}
-        return {"image": self.apply, **moved, **others, "camera": self.apply_to_camera}
+        return dict.fromkeys((*_KINDS, "camera"), self.apply)
 
     @property
     def last(self) -> Change | None:
@@ -88,72 +88,52 @@ class Transform(A.DualTransform):
 
     def apply_with_params(self, params: dict[str, Any], *args: Any, **data: Any) -> dict[str, Any]:
         camera = self._source(data)
-        drawn: Any = {name: torch.tensor(value, dtype=torch.float64) for name, value in params["draw"].items()}
-        if self.augmentation.crops:
-            given = data.get("bboxes")
-            drawn = self.augmentation.with_boxes(drawn, None if given is None else _corners(given, camera)[None])
-        with torch.no_grad():
-            self.augmentation.tell_of_empty_images(camera)
-            change = self.augmentation.last = self.augmentation.change(camera, drawn)
-            named = {name: field for name, value in data.items() if (field := self._field(name, value)) is not None}
-            made = together(change, named, self.augmentation.mask_fill)
-            rest = {name: value for name, value in data.items() if name not in made}
-            moved: dict[str, Any] = super().apply_with_params({**params, "change": change}, *args, **rest)
-            moved |= {name: self._key2func[name](data[name], change=change, made=value) for name, value in made.items()}
-            result = {name: moved[name] for name in data}
-            return result if isinstance(camera, Unknown) else {**result, "camera": self.apply_to_camera(camera, change)}
-
-    def _field(self, name: str, value: Any) -> tuple[str, Tensor] | None:
-        """What a sample holds as the field of a batch of one; None for what moves by itself."""
-        kinds = {"apply": "image", "apply_to_mask": "mask", "apply_to_keypoints": "keypoints"}
-        kind = kinds.get(getattr(self._key2func.get(name), "__name__", "")) if isinstance(value, np.ndarray) else None
-        if kind is None:
-            return None
-        return kind, (torch.as_tensor(value[:, :2]) if kind == "keypoints" else as_tensor(name, value))[None]
+        fields: dict[str, Any] = {} if isinstance(camera, Unknown) else {"camera": camera}
+        names = {}
+        for i, (name, value) in enumerate(data.items()):
+            target = self._additional_targets.get(name, name)
+            if target in _KINDS and value is not None:
+                names[name] = field = name if name == target else f"{_KINDS[target]}_{i}"
+                fields[field] = _given(target, value, camera)
+        drawn = {name: torch.tensor(value, dtype=torch.float64) for name, value in params["draw"].items()}
+        moved = self._arrays(fields, draw=drawn)
+        change = self.augmentation.last
+        assert change is not None  # of this call
+        result = dict(data)
+        for name, field in names.items():
+            target = self._additional_targets.get(name, name)
+            seen = moved.get(f"{field}_valid")
+            result[name] = _taken(target, data[name], moved[field], seen, change.parts[0].image_size)
+        return {**result, "camera": moved["camera"]} if "camera" in moved else result
 
     def _source(self, data: Mapping[str, Any]) -> Camera:
         sizes = [(name, np.shape(data[name])[:2]) for name in ("image", "mask") if data.get(name) is not None]
         return camera_of_sample(_OWNER, self.augmentation, data.get("camera", self.camera), sizes)
 
-    # -- what moves
 
-    def apply(self, img: np.ndarray, change: Change, made: Any = None, **params: Any) -> np.ndarray:
-        images = change.images(as_tensor("image", img)[None]) if made is None else made[0]
-        return as_array(images[0], img)
-
-    def apply_to_mask(self, mask: np.ndarray, change: Change, made: Any = None, **params: Any) -> np.ndarray:
-        fill = self.augmentation.mask_fill
-        masks = change.labels(as_tensor("mask", mask)[None], fill) if made is None else made[0]
-        return as_array(masks[0], mask)
-
-    def apply_to_keypoints(self, keypoints: np.ndarray, change: Change, made: Any = None, **params: Any) -> np.ndarray:
-        """Keypoints (N, 2 and more), x and y first, in pixels whose centres are whole numbers."""
-        moved = move_points(self.augmentation, change, torch.as_tensor(keypoints[:, :2])[None], made)[0][0]
-        return np.concatenate((moved.numpy(), keypoints[:, 2:]), 1)
-
-    def apply_to_bboxes(self, bboxes: np.ndarray, change: Change, **params: Any) -> np.ndarray:
-        """Boxes (M, 4 and more) between pixel edges, as parts of width and height."""
-        target = change.parts[0].target
-        moved, seen = change.boxes(_corners(bboxes, change.parts[0].camera)[None])
-        after = torch.tensor([target.width, target.height] * 2, dtype=torch.float64)
-        moved = torch.where(seen[0, :, None], (moved[0] + 0.5) / after, 0.0)
-        return np.concatenate((moved.numpy().astype(bboxes.dtype), bboxes[:, 4:]), 1)
-
-    def apply_to_camera(self, camera: Camera | None, change: Change, **params: Any) -> Camera:
-        return change.single
-
-    def _mover(self, kind: str) -> Callable[..., np.ndarray]:
-        def move(value: np.ndarray, change: Change, **params: Any) -> np.ndarray:
-            tensor = torch.as_tensor(np.asarray(value))[None]
-            mirroring = self.augmentation.mirroring
-            options = {} if mirroring is None else {"lateral": mirroring.lateral}
-            moved: Tensor = moves(kind, tensor)(change, tensor, options)
-            return moved[0].numpy()
-
-        return move
+def _given(target: str, value: Any, camera: Camera) -> Any:
+    """What pipelines hand on, as `numpy.Transform` takes it: in pixels, and NaN for a keypoint without a place."""
+    if target in ("images", "masks"):
+        return list(value)
+    if target == "bboxes":
+        return value[:, :4].astype(np.float64) * _sides((camera.height, camera.width)) - 0.5
+    if target == "keypoints":
+        return np.where((value[:, :2] == -1).all(1, keepdims=True), np.nan, value[:, :2])
+    return value
 
 
-def _corners(bboxes: Any, camera: Camera) -> Tensor:
-    """(M, 4) pixels x1, y1, x2, y2 of boxes (M, 4 and more) that are parts of an image's width and height."""
-    sides = torch.tensor([camera.width, camera.height] * 2, dtype=torch.float64)
-    return torch.as_tensor(np.asarray(bboxes)[:, :4], dtype=torch.float64) * sides - 0.5
+def _taken(target: str, given: Any, moved: Any, seen: Any, size: tuple[int, int]) -> Any:
+    """What came of it, as they go on with it."""
+    if target in ("images", "masks"):
+        return np.stack(moved) if isinstance(given, np.ndarray) and len(given) else moved
+    if target == "keypoints":
+        return np.concatenate((np.nan_to_num(moved, nan=-1.0), given[:, 2:]), 1)
+    if target == "bboxes":  # a lost one has no area
+        parts = np.where(seen[:, None], (moved + 0.5) / _sides(size), 0.0)
+        return np.concatenate((parts.astype(given.dtype), given[:, 4:]), 1)
+    return moved
+
+
+def _sides(size: tuple[int, int]) -> np.ndarray:
+    """Width and height, of both corners of a box."""
+    return np.array([size[1], size[0]] * 2, np.float64)

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from difflib import get_close_matches
 from functools import lru_cache
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, TypeVar
 
 import numpy as np
 import torch
@@ -41,6 +41,7 @@ from camtorch.warp.warp import Warp
 
 RangeLike = float | Sequence[float]
 Array = np.ndarray[Any, Any]
+T = TypeVar("T")
 
 
 DRAWN = 16
@@ -612,8 +613,7 @@ def _jittered_alone(
     k, intrinsics = base.distortion.detach(), joined(numbers, nominal, math)
     fx, fy, cx, cy = intrinsics.tolist()
     given = k.numpy()
-    known = (model, size, k.dtype, given.tobytes(), nominal.numpy().tobytes())
-    measured, end = _of_lens(known, base, nominal)
+    measured, end = _kept(_of_lens, base, k, nominal, size=size)
     native = None
     if model.always_defined and _is_within((fx, fy, cx, cy), end, size):
         rim = _border(size, k.dtype)[None]
@@ -675,37 +675,31 @@ def _seen_through(
 
 
 _MOST_MEASURED = 64  # lenses
-_measured: dict[tuple[object, ...], Tensor] = {}
-_lenses: dict[tuple[object, ...], tuple[Array, float]] = {}
+_measured: dict[tuple[object, ...], Any] = {}
 
 
-def _kept(measure: Callable[..., Tensor], camera: Camera, *inputs: Tensor) -> Tensor:
-    """`measure(camera, *inputs)`, of which these tensors are all that counts: mostly the lens is the same one."""
+def _kept(measure: Callable[..., T], camera: Camera, *inputs: Tensor, size: tuple[int, int] | None = None) -> T:
+    """`measure(camera, *inputs)`, of which these tensors are all that counts: mostly the lens is the same one.
+
+    size: of its images, (height, width), by default its own.
+    """
     values = [(t.dtype, t.shape, t.device, t.detach().cpu().numpy().tobytes()) for t in inputs]
-    key = measure, type(camera), camera.image_size, *values
-    found = _measured.pop(key, None)
+    key = measure, type(camera), size or camera.image_size, *values
+    found: T | None = _measured.pop(key, None)
     if found is None:
         with torch.inference_mode(False), torch.no_grad():  # what inference mode makes could not be used in a graph
-            found = measure(camera, *[t.detach().clone() for t in inputs])
+            lens = camera if size is None else remade(camera.detach(), image_size=size)
+            found = measure(lens, *[t.detach().clone() for t in inputs])
     _measured[key] = found  # the last one
     while len(_measured) > _MOST_MEASURED:
         _measured.pop(next(iter(_measured)), None)
     return found
 
 
-def _of_lens(known: tuple[object, ...], base: Camera, nominal: Tensor) -> tuple[Array, float]:
-    """What changes of a lens by known numbers do (n,), and the least distance at which it ends."""
-    found = _lenses.pop(known, None)
-    if found is None:
-        with torch.inference_mode(False), torch.no_grad():
-            lens = remade(base.detach(), image_size=known[1])
-            k = lens.distortion.clone()
-            measured = _kept(_sensitivity, lens, k, nominal.clone()).to(k.dtype).numpy()
-            found = measured, float(_kept(_least_end, lens, k[None]))
-    _lenses[known] = found  # the last one
-    while len(_lenses) > _MOST_MEASURED:
-        _lenses.pop(next(iter(_lenses)), None)
-    return found
+def _of_lens(camera: Camera, distortion: Tensor, nominal: Tensor) -> tuple[Array, float]:
+    """What changes of a single lens do (n,), and the least distance at which it ends; see `_sensitivity`."""
+    measured = _sensitivity(camera, distortion, nominal).to(distortion.dtype).numpy()
+    return measured, float(_least_end(camera, distortion[None]))
 
 
 def _sensitivity(camera: Camera, distortion: Tensor, nominal: Tensor) -> Tensor:

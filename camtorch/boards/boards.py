@@ -71,9 +71,9 @@ class Board:
         return self.rows, self.columns
 
     @property
-    def symmetries(self) -> int:
-        """How many turns of the board look the same: 1, 2 (half turns) or 4."""
-        return 1
+    def is_symmetric(self) -> bool:
+        """Whether it looks the same after a turn, so that nothing tells which of its points is the first."""
+        return False
 
     def points(self) -> NDArray[np.float64]:
         """(N, 3), row by row from the top left."""
@@ -129,11 +129,8 @@ class Chessboard(Board):
     least = 3  # of which OpenCV finds no fewer
 
     @property
-    def symmetries(self) -> int:
-        if (self.columns + self.rows) % 2:
-            return 1  # a half turn exchanges black and white
-        # a quarter turn exchanges them where the squares of a side are an even number
-        return 4 if self.columns == self.rows and self.columns % 2 == 0 else 2
+    def is_symmetric(self) -> bool:
+        return (self.columns + self.rows) % 2 == 0  # else a half turn exchanges black and white
 
     def points(self) -> NDArray[np.float64]:
         return _grid_points(self.square * np.arange(self.columns), self.square * np.arange(self.rows))

@@ -43,7 +43,7 @@ def detect(board: Board, image: NDArray[Any]) -> Detection:
     """Find a board in an image.
 
     The points of a chessboard are told apart as its colours allow: where black is at the top left of the first one. If
-    they allow several orders (`board.symmetries`), the first point is the one nearest to the image's top left corner.
+    they allow several orders (`board.is_symmetric`), the first point is the one nearest to the image's top left corner.
     image: (H, W) of grey values, uint8 or uint16.
 
     Raises:

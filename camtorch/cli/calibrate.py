@@ -12,10 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from camtorch.boards.boards import Board
 from camtorch.boards.corners import image_points
 from camtorch.boards.finding import gather
-from camtorch.boards.turns import agreeing, reordered
 from camtorch.calibration import selection
 from camtorch.calibration.calibrate import Calibration, calibrate
 from camtorch.calibration.rig import RigCalibration, calibrate_rig
@@ -52,6 +50,12 @@ def run(arguments: argparse.Namespace) -> None:
     if kept is not None and kept.exists():
         known = searching.known_corners(kept, board, measured=arguments.square is not None)
         board = known.board or board
+    names = set(cameras) or {image.camera for image in (known.images if known else ())}
+    if board is not None and board.is_symmetric and len(names) > 1:
+        raise ValueError(
+            f"{board.words()}: looks the same after a turn, so that nothing tells whether several cameras begin at the "
+            "same corner. A board with an even and an odd number of corners, as 9x6, leaves no doubt"
+        )
     if cameras:
         found = searching.found_corners(cameras, board or read_board(arguments, 1.0), known)
         if kept is not None:
@@ -69,7 +73,7 @@ def run(arguments: argparse.Namespace) -> None:
         seen = [of_view[name] for of_view in views.values() if name in of_view]
         total, count = sum(image.camera == name for image in found.corners.images), sum(image.seen for image in seen)
         print(f"{_head(name)}{words}: in {len(seen)} of {total} images of {width}x{height}, {count} corners")
-    result = _calibrated(arguments, board, found.corners.points, views, size_of, candidates)
+    result = _calibrated(arguments, found.corners.points, views, size_of, candidates)
     if isinstance(result, RigCalibration):
         _tell_mounts(result, unit)
     if arguments.bend:
@@ -143,7 +147,6 @@ def _candidates(arguments: argparse.Namespace) -> list[tuple[str, int]]:
 
 def _calibrated(
     arguments: argparse.Namespace,
-    board: Board | None,
     points: NDArray[Any],
     views: Views,
     size_of: Mapping[str, tuple[int, int]],
@@ -174,15 +177,6 @@ def _calibrated(
         size, count = size_of[""], counts[""]
         found = calibrate(models[""], points, pixels[""], image_size=size, count=count, bend=arguments.bend, **options)
     else:
-        if board is not None and board.symmetries > 1:
-            poses = {}
-            for name, seen in pixels.items():
-                rows = np.flatnonzero(np.isfinite(seen[..., 0]).any(1))
-                alone = calibrate(
-                    models[name], points, seen[rows], image_size=size_of[name], count=counts[name], **options
-                )
-                poses[name] = dict(zip(rows.tolist(), alone.extrinsics.matrix().detach().cpu().numpy(), strict=True))
-            pixels = _agreeing(board, pixels, poses)
         found = calibrate_rig(models, points, pixels, image_sizes=size_of, count=counts, bend=arguments.bend, **options)
     if not found.converged:
         raise ValueError(
@@ -196,22 +190,6 @@ def _calibrated(
 
 def _each(found: Calibration | RigCalibration) -> Mapping[str, Calibration]:
     return found.cameras if isinstance(found, RigCalibration) else {"": found}
-
-
-def _agreeing(
-    board: Board, pixels: dict[str, NDArray[Any]], poses: Mapping[str, dict[int, NDArray[Any]]]
-) -> dict[str, NDArray[Any]]:
-    """The points of a board that looks the same after a turn, numbered alike in all cameras."""
-    result, changed = {}, 0
-    for name, turns in agreeing(board, poses).items():
-        result[name] = reordered(board, pixels[name], [turns.get(view, 0) for view in range(len(pixels[name]))])
-        changed += sum(turn > 0 for turn in turns.values())
-    if changed:
-        note(
-            f"this board looks the same after a turn: {changed} views were turned for the cameras to agree. A board "
-            "with an even and an odd number of corners, as 9x6, leaves no doubt"
-        )
-    return result
 
 
 def _tell(found: Calibration, names: Sequence[str], head: str) -> None:

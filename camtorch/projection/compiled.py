@@ -683,11 +683,6 @@ class Between:
         by_camera = strides[0] if count > 1 else 0
         self._given = start.bare, end.bare, _address(turns), by_camera, *strides[-2:], self.cameras
 
-    def back(self, size: tuple[int, int]) -> Between:
-        """From the others to these, whose image is of that size."""
-        turns = None if self._turns is None else self._turns.mT
-        return Between(self._end, self._start, turns, size, self.is_batch)
-
     def rows(self, pixels: Tensor, form: int) -> tuple[Tensor, Tensor]:
         """Pixels (C or 1, N, 2) to (C, N, 2), and valid (C, N).
 

@@ -89,19 +89,7 @@ def _(info: Any, in_dims: tuple[Any, ...], model: str, k: Tensor) -> Any:
 
 @search_open.register_vmap
 def _(info: Any, in_dims: tuple[Any, ...], model: str, k: Tensor, *planes: Tensor) -> Any:
-    return _mapped(search_open, info, in_dims, model, k, *planes)
-
-
-def _mapped(
-    operator: Callable[..., tuple[Tensor, ...]],
-    info: Any,
-    in_dims: tuple[Any, ...],
-    model: str,
-    k: Tensor,
-    *planes: Tensor,
-) -> Any:
-    """An operator of planes (C, N) of cameras (C, n), with a mapped dim."""
-    # it joins the cameras, or the points where the cameras are not mapped
+    # what is mapped joins the cameras, or the points where the cameras are not mapped
     cameras = in_dims[1] is not None
     rows = []
     for plane, dim in zip(planes, in_dims[2:], strict=True):
@@ -110,7 +98,7 @@ def _mapped(
     joined = 0 if cameras else 1
     shape = rows[0].shape[joined : joined + 2]
     k = k.movedim(in_dims[1], 0).flatten(0, 1) if cameras else k
-    results = operator(model, k, *(plane.flatten(joined, joined + 1) for plane in rows))
+    results = search_open(model, k, *(plane.flatten(joined, joined + 1) for plane in rows))
     return tuple(r.unflatten(joined, shape) for r in results), (joined,) * 3
 
 

@@ -74,7 +74,6 @@ class Lattice:
         exact: (2, K, 8, 8), positions, NaN where none is mapped.
         size: (h, w) of the target.
         seam: which edges of the source's image meet.
-        back: the compiled geometry from the target to the source, where they come from there.
     """
 
     nodes: Tensor
@@ -82,18 +81,9 @@ class Lattice:
     exact: Tensor
     size: tuple[int, int]
     seam: Seam | None
-    back: Between | None
 
-    def __init__(
-        self,
-        nodes: Tensor,
-        cells: Tensor,
-        exact: Tensor,
-        size: tuple[int, int],
-        seam: Seam | None = None,
-        back: Between | None = None,
-    ):
-        self.nodes, self.cells, self.exact, self.size, self.seam, self.back = nodes, cells, exact, size, seam, back
+    def __init__(self, nodes: Tensor, cells: Tensor, exact: Tensor, size: tuple[int, int], seam: Seam | None = None):
+        self.nodes, self.cells, self.exact, self.size, self.seam = nodes, cells, exact, size, seam
 
     def cameras(self, rows: slice | Tensor) -> Lattice:
         """Of these cameras of the batch."""
@@ -340,7 +330,7 @@ def on_lattice(
     pixels = kept_probes(rows, width, like.dtype) if nodes <= MOST_KEPT else _probes(rows, width, like)
     if native is not None:
         made = native.lattices(pixels, (height, width), rows.start, tolerance, padding)
-        return None if made is None else Lattice(*made, (height, width), seam, native)
+        return None if made is None else Lattice(*made, (height, width), seam)
     exact = partial(_positions, source, target, rotation, None)
     positions, mapped = exact(pixels)  # (B, 1, N, 2)
     lattice = positions[:, 0, :nodes].movedim(-1, 1).contiguous().unflatten(2, (n + 5, m + 5))

@@ -7,7 +7,6 @@ from torch import Tensor
 
 from camtorch._arguments import Numbers
 from camtorch._evaluation import compiled_of
-from camtorch._tracing import is_eager, keeps_graph
 from camtorch.camera import Camera
 from camtorch.projection.compiled import ON_IMAGE, PIXELS, Between
 from camtorch.rotations import turn
@@ -35,24 +34,13 @@ def between(start: Camera, end: Camera, rotation: Tensor | None, like: Tensor) -
 
 
 def moved_pixels(
-    start: Camera,
-    end: Camera,
-    rotation: Tensor | None,
-    pixels: Numbers,
-    on_image: bool = False,
-    known: Between | None = None,
+    start: Camera, end: Camera, rotation: Tensor | None, pixels: Numbers, on_image: bool = False
 ) -> tuple[Tensor, Tensor]:
     """Pixels (B, *N, 2), or (*N, 2), of one camera to another's, (-1, -1) without a place there, and whether they have;
     with `on_image`, whether that is on the image. Other arguments as of `between`.
-
-    known: the compiled geometry from `end` to `start`, of cameras that are not to change.
     """
     if isinstance(pixels, Tensor) and pixels.ndim > 0 and pixels.shape[-1] == 2:
-        turns = () if rotation is None else (rotation,)
-        if known is None or pixels.dtype != known.dtype or keeps_graph(pixels, *start._tensors, *end._tensors, *turns):
-            ready = between(start, end, rotation, pixels)
-        else:
-            ready = known.back(end._size_for("Warp")) if is_eager(pixels) else None
+        ready = between(start, end, rotation, pixels)
         if ready is not None and ((pixels.ndim > 1 and pixels.shape[0] == ready.cameras) or not ready.is_batch):
             moved, valid = ready.rows(pixels.reshape(ready.cameras, -1, 2), ON_IMAGE if on_image else PIXELS)
             return moved.view(pixels.shape), valid.view(pixels.shape[:-1])

@@ -303,12 +303,10 @@ class Warp(GeometryModule):
         """Pixels of the source to the target's image, or back, and whether they have a place there, on it or not; see
         `moved_pixels`.
         """
-        (source, target), rotation, known = self._in_motion, self.rotation, None
+        (source, target), rotation = self._in_motion, self.rotation
         if back:
             source, target, rotation = target, source, None if rotation is None else rotation.mT
-        elif isinstance(self._pinned, Lattice):
-            known = self._pinned.back
-        return moved_pixels(source, target, rotation, pixels, on_image, known)
+        return moved_pixels(source, target, rotation, pixels, on_image)
 
     def transform_boxes(self, boxes: Numbers) -> tuple[Tensor, Tensor]:
         """Move boxes (B, *N, 4), or (*N, 4): x1, y1, x2, y2 in pixel-centre coordinates.

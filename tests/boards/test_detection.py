@@ -48,7 +48,7 @@ def test_a_part_of_a_board_with_markers_is_enough(board):
 
 def test_chessboards_keep_their_order_however_they_are_turned():
     board = BOARDS[0]
-    assert board.symmetries == 1
+    assert not board.is_symmetric
     for roll in (0.3, 0.3 + np.pi):
         middle = 0.12 * np.array([np.cos(roll), np.sin(roll)]) - 0.075 * np.array([-np.sin(roll), np.cos(roll)])
         image, truth = photograph(board, fisheye(), (0.0, 0, roll), (*-middle, 0.3))
@@ -56,12 +56,11 @@ def test_chessboards_keep_their_order_however_they_are_turned():
 
 
 @pytest.mark.parametrize(
-    ("columns", "rows", "symmetries"),
-    [(6, 6, 4), *(pytest.param(*case, marks=pytest.mark.slow) for case in ((7, 5, 2), (5, 5, 2)))],
+    ("columns", "rows"), [(6, 6), *(pytest.param(*case, marks=pytest.mark.slow) for case in ((7, 5), (5, 5)))]
 )
-def test_ambiguous_chessboards_begin_near_the_top_left(columns, rows, symmetries):
+def test_ambiguous_chessboards_begin_near_the_top_left(columns, rows):
     board = Chessboard(columns, rows, 0.03)
-    assert board.symmetries == symmetries
+    assert board.is_symmetric
     for roll in (0.2, -0.3):
         image, truth = photograph(board, fisheye(), (0.1, 0.1, roll), (-0.09, -0.06, 0.3))
         assert np.abs(detect(board, image).pixels - truth).max() < 0.6
