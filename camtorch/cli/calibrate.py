@@ -52,9 +52,9 @@ def run(arguments: argparse.Namespace) -> None:
         board = known.board or board
     names = set(cameras) or {image.camera for image in (known.images if known else ())}
     if board is not None and board.is_symmetric and len(names) > 1:
-        raise ValueError(
-            f"{board.words()}: looks the same after a turn, so that nothing tells whether several cameras begin at the "
-            "same corner. A board with an even and an odd number of corners, as 9x6, leaves no doubt"
+        note(
+            "this board looks the same after a turn: the corner nearest to the top left of an image is taken for its "
+            "first one, so hold the cameras alike. An even and an odd number of corners, as 9x6, leave no doubt"
         )
     if cameras:
         found = searching.found_corners(cameras, board or read_board(arguments, 1.0), known)
