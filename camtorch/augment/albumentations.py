@@ -67,7 +67,8 @@ class Transform(A.DualTransform):
 
     @property
     def targets(self) -> dict[str, Callable[..., Any]]:
-        return dict.fromkeys((*_KINDS, "camera"), self.apply)
+        nothing: Callable[..., Any] = self.apply  # they move together, see `apply_with_params`
+        return dict.fromkeys((*_KINDS, "camera"), nothing)
 
     @property
     def last(self) -> Change | None:

@@ -79,6 +79,8 @@ def test_what_has_no_place_is_where_its_params_look():
     out = compose(one)(**sample())
     assert out["keypoints"].tolist() == [[-1, -1]] * 3
     assert (len(out["bboxes"]), out["names"]) == (0, [])
+    flip = ct.augment.albumentations.Transform(ct.augment.HorizontalFlip(p=1))
+    assert compose(one, flip)(**sample())["keypoints"].tolist() == [[-1, -1]] * 3
     away = A.Compose([one], keypoint_params=A.KeypointParams(format="xy", remove_invisible=True))
     assert len(away(image=sample()["image"], keypoints=sample()["keypoints"][:2])["keypoints"]) == 0
 
