@@ -6,8 +6,8 @@ typedef struct {
     R turn[9];
     const T(Camera) *bent, *plain; /* which of both is the other one with a surface after its lens, NULL where none is */
     R within2;                     /* see `surely2` */
-    R bend;                        /* of lattices, what a step leaves beside their tolerance: see `start_of`; -1: none */
-    float cubics[4][STEP];         /* weights of nodes */
+    R bend;                        /* of lattices, what a Newton step leaves beside their tolerance; -1: none */
+    float cubics[4][STEP], slopes[4][STEP]; /* weights of nodes; of values at both ends, and of slopes there */
 } T(Between);
 
 /* The squared radius of a circle of a camera's plane in which each point has a ray for certain */
@@ -128,9 +128,8 @@ static void T(sent_together)(const T(Camera) *c, int n, const R *restrict a, con
 }
 
 /* From pixels (u, v), and those near to which the surface moves them, to the latter as near as a lattice wants them, in
-   place, and by how much they moved first; 0 where that does not lead there */
-static int T(refined)(const T(Between) *b, int n, const R *restrict u, const R *restrict v, R (*restrict near)[BLOCK],
-                      R (*restrict missed)[BLOCK]) {
+   place; 0 where that does not lead there */
+static int T(refined)(const T(Between) *b, int n, const R *restrict u, const R *restrict v, R (*restrict near)[BLOCK]) {
     const T(Camera) *c = b->bent;
     const R fx = c->fx, fy = c->fy, cx = c->cx, cy = c->cy, by_fx = 1 / fx, by_fy = 1 / fy, bend = b->bend;
     ALIGNED R a[BLOCK], e[BLOCK], p[BLOCK], q[BLOCK];
@@ -144,9 +143,7 @@ static int T(refined)(const T(Between) *b, int n, const R *restrict u, const R *
             const R ua = to.ua[i], ub = to.ub[i], va = to.va[i], vb = to.vb[i];
             const R one = T(absolute)(T(step)(ua, ub, va, vb, (u[i] - cx) * by_fx - p[i], (v[i] - cy) * by_fy - q[i], &da, &db));
             const R size = T(absolute)(ua) + T(absolute)(ub) + T(absolute)(va) + T(absolute)(vb);
-            const R across = fx * da, down = fy * db;
-            near[0][i] += across, near[1][i] += down;
-            missed[0][i] = count ? missed[0][i] : across, missed[1][i] = count ? missed[1][i] : down;
+            near[0][i] += fx * da, near[1][i] += fy * db;
             all &= (1 - bend * (da * da + db * db) * (size * one) > 0) & (one > 0);
         }
         if (all) return 1;
@@ -285,11 +282,10 @@ INLINE void T(laid)(const float *nodes, int64_t width, const int count, const fl
 }
 
 /* Positions that lie near those of pixels (u, v), to these; 0 where that does not lead there */
-static int T(refined_positions)(const Move *move, const T(Between) *b, int n, const R *u, const R *v, R (*near)[BLOCK],
-                                R (*missed)[BLOCK]) {
+static int T(refined_positions)(const Move *move, const T(Between) *b, int n, const R *u, const R *v, R (*near)[BLOCK]) {
     const R across = (R)(move->width / 2), down = (R)(move->height / 2), by_across = 1 / across, by_down = 1 / down;
     EACH(i) near[0][i] = (near[0][i] + 1) * across - (R)0.5, near[1][i] = (near[1][i] + 1) * down - (R)0.5;
-    const int is_there = T(refined)(b, n, u, v, near, missed);
+    const int is_there = T(refined)(b, n, u, v, near);
     EACH(i) near[0][i] = (near[0][i] + (R)0.5) * by_across - 1, near[1][i] = (near[1][i] + (R)0.5) * by_down - 1;
     return is_there;
 }
@@ -300,7 +296,7 @@ static int T(squares)(const Lattices *given, const T(Between) *b, const Classifi
     const int64_t rows = asked->rows, columns = asked->columns, width = columns + 5;
     int32_t *cells = asked->cells;
     const int n = count * SQUARE;
-    ALIGNED R u[BLOCK], v[BLOCK], near[2][BLOCK], missed[2][BLOCK];
+    ALIGNED R u[BLOCK], v[BLOCK], near[2][BLOCK];
     ALIGNED I ok[BLOCK];
     int is_near = b->bend >= 0, left = 0;
     for (int k = 0; k < count; k++) {
@@ -314,7 +310,7 @@ static int T(squares)(const Lattices *given, const T(Between) *b, const Classifi
             T(laid)(asked->nodes + c * asked->node_strides[1] + first, width, 4, b->cubics, near[c] + k * SQUARE);
     }
     R *across = (R *)given->exact + number * SQUARE, *down = across + given->move.cameras * rows * columns * SQUARE;
-    if (is_near && T(refined_positions)(&given->move, b, n, u, v, near, missed)) {
+    if (is_near && T(refined_positions)(&given->move, b, n, u, v, near)) {
         memcpy(across, near[0], (size_t)n * sizeof(R)), memcpy(down, near[1], (size_t)n * sizeof(R));
         for (int k = 0; k < count; k++) cells[places[k]] = (int32_t)(number + k);
         return 0;
@@ -351,30 +347,23 @@ INLINE void T(middles)(const float *node, int64_t width, const int count, float 
     at[1] = T(middle)(node - before * width, width, count), at[2] = T(middle)(node - before * width + 1, width, count);
 }
 
-/* The largest of misses in pixels, squared: of each coordinate, and of both */
-static float T(largest)(const R *across, const R *down, float *of_each) {
-    float most = 0;
-    of_each[0] = of_each[1] = 0;
-    for (int at = 0; at < PROBES; at++) {
-        const float u2 = (float)(across[at] * across[at]), v2 = (float)(down[at] * down[at]);
-        of_each[0] = u2 > of_each[0] ? u2 : of_each[0], of_each[1] = v2 > of_each[1] ? v2 : of_each[1];
-        most = u2 + v2 <= most ? most : u2 + v2; /* or what is not a number */
-    }
-    return most;
-}
-
-/* By how much what `count` x `count` nodes say misses what was found */
+/* By how much, in pixels and squared, what `count` x `count` nodes say misses what was found: of each coordinate, and of
+   both */
 static float T(most_missed)(const Classification *asked, int64_t first, const int count, const R *u, const R *v,
                             float *of_each) {
     const float half[2] = {(float)asked->source_width / 2, (float)asked->source_height / 2};
     const int64_t width = asked->columns + 5;
-    float said[PROBES];
-    R missed[2][PROBES];
-    for (int c = 0; c < 2; c++) {
-        T(middles)(asked->nodes + c * asked->node_strides[1] + first + 2 * width + 2, width, count, said);
-        for (int at = 0; at < PROBES; at++) missed[c][at] = (R)(((float)(c ? v : u)[at] - said[at]) * half[c]);
+    float said[2][PROBES], most = 0;
+    for (int c = 0; c < 2; c++)
+        T(middles)(asked->nodes + c * asked->node_strides[1] + first + 2 * width + 2, width, count, said[c]);
+    of_each[0] = of_each[1] = 0;
+    for (int at = 0; at < PROBES; at++) {
+        const float across = ((float)u[at] - said[0][at]) * half[0], down = ((float)v[at] - said[1][at]) * half[1];
+        const float u2 = across * across, v2 = down * down;
+        of_each[0] = u2 > of_each[0] ? u2 : of_each[0], of_each[1] = v2 > of_each[1] ? v2 : of_each[1];
+        most = u2 + v2 <= most ? most : u2 + v2; /* or what is not a number */
     }
-    return T(largest)(missed[0], missed[1], of_each);
+    return most;
 }
 
 /* Whether a cell lies far off the image; missed: by how much cubics miss each coordinate, squared */
@@ -395,16 +384,23 @@ static int T(is_off)(const Classification *asked, int64_t first, const R *u, con
     return is_off;
 }
 
+/* Whether all 6 x 6 nodes around a cell are mapped, of which the first is given */
+static int T(is_inside)(const Classification *asked, int64_t first) {
+    static const uint8_t all[6] = {1, 1, 1, 1, 1, 1};
+    for (int y = 0; y < 6; y++)
+        if (memcmp(asked->mapped + first + y * (asked->columns + 5), all, sizeof all)) return 0;
+    return 1;
+}
+
 /* What becomes of cells in doubt: polynomials miss most in the middle of a cell and of its sides. Where half the tolerance
  * is kept there, or an image that ends in zeros is far off, cubics do; or quintics, through six nodes; the other cells are
  * to be computed */
 static int T(settle)(const Lattices *given, const T(Between) *b, const Classification *asked) {
     static const int across[PROBES] = {1, 0, 2, 1, 1}, down[PROBES] = {0, 1, 1, 2, 1};
-    static const uint8_t all[6] = {1, 1, 1, 1, 1, 1};
     const int64_t columns = asked->columns, cells = asked->rows * columns, width = columns + 5;
     const float limit = (float)(asked->tolerance * asked->tolerance) / 4;
     int64_t places[BLOCK / PROBES], i = 0;
-    ALIGNED R u[BLOCK], v[BLOCK], near[2][BLOCK], missed[2][BLOCK];
+    ALIGNED R u[BLOCK], v[BLOCK];
     ALIGNED I ok[BLOCK];
     int left = 0;
     while (i < cells) {
@@ -417,39 +413,134 @@ static int T(settle)(const Lattices *given, const T(Between) *b, const Classific
             u[k] = (R)(STEP * (place % columns) + STEP / 2 * across[k % PROBES]);
             v[k] = (R)(STEP * (place / columns) + STEP / 2 * down[k % PROBES] + given->first_row);
         }
-        int is_refined = 0;
-        for (int k = 0; b->bend >= 0 && k < points; k += PROBES) {
-            const int64_t place = places[k / PROBES], first = (place / columns + 2) * width + place % columns + 2;
-            for (int c = 0; c < 2; c++) {
-                float said[PROBES];
-                T(middles)(asked->nodes + c * asked->node_strides[1] + first, width, 4, said);
-                for (int at = 0; at < PROBES; at++) near[c][k + at] = (R)said[at];
-            }
-        }
-        for (int k = points; k < n; k++) near[0][k] = near[0][points - 1], near[1][k] = near[1][points - 1];
-        if (count && b->bend >= 0 && T(refined_positions)(&given->move, b, n, u, v, near, missed)) {
-            EACH(i) u[i] = near[0][i], v[i] = near[1][i], ok[i] = 1;
-            is_refined = 1;
-        } else if (count) left |= T(moved)(&given->move, b, points, n, u, v, ok);
+        if (count) left |= T(moved)(&given->move, b, points, n, u, v, ok);
         for (int k = 0; k < count; k++) {
             const R *found_u = u + k * PROBES, *found_v = v + k * PROBES;
             const int64_t first = places[k] / columns * width + places[k] % columns; /* of its 6 x 6 nodes */
             float of_each[2];
-            int known = 1, cell = 0;
+            int known = 1, cell = CELL_NEXT;
             for (int at = 0; at < PROBES; at++) known &= ok[k * PROBES + at] != 0;
-            const float by_cubics = is_refined ? T(largest)(missed[0] + k * PROBES, missed[1] + k * PROBES, of_each)
-                                               : T(most_missed)(asked, first, 4, found_u, found_v, of_each);
+            const float by_cubics = T(most_missed)(asked, first, 4, found_u, found_v, of_each);
             if (known && (by_cubics <= limit || (asked->padding == ZEROS && T(is_off)(asked, first, found_u, found_v, of_each)))) {
                 cell = CELL_CUBIC;
             } else if (known) {
-                for (int y = 0; y < 6; y++) known &= !memcmp(asked->mapped + first + y * width, all, sizeof all);
                 /* a quarter of that, and of what cubics miss: where the curvature steps, quintics gain nothing, and swing */
-                if (known && T(most_missed)(asked, first, 6, found_u, found_v, of_each) <= limit / 16) cell = CELL_QUINTIC;
+                if (T(is_inside)(asked, first) && T(most_missed)(asked, first, 6, found_u, found_v, of_each) <= limit / 16) cell = CELL_QUINTIC;
             }
             asked->cells[places[k]] = cell;
         }
     }
     return left;
+}
+
+/* Of nodes in a row, by how much their positions change on the way to the next ones, as the slopes of the surface say:
+   each coordinate across, then down */
+static void T(slopes_of)(const Move *move, const T(Between) *b, const float *u, const float *v, int64_t count,
+                         float *const to[4]) {
+    const T(Camera) *c = b->bent;
+    const R half_u = (R)(move->width / 2), half_v = (R)(move->height / 2), fx = c->fx, fy = c->fy;
+    const R by_u = STEP / half_u, by_v = STEP / half_v;
+    ALIGNED R x[BLOCK], y[BLOCK], p[BLOCK], q[BLOCK];
+    T(Jacobian) by;
+    for (int64_t first = 0; first < count; first += BLOCK) {
+        const int some = (int)(count - first < BLOCK ? count - first : BLOCK), n = (some + LANES - 1) & -LANES;
+        for (int i = 0; i < n; i++) {
+            const int64_t at = first + (i < some ? i : some - 1);
+            x[i] = (((R)u[at] + 1) * half_u - (R)0.5 - c->cx) / fx, y[i] = (((R)v[at] + 1) * half_v - (R)0.5 - c->cy) / fy;
+        }
+        T(sent_together)(c, n, x, y, p, q, &by);
+        for (int i = 0; i < some; i++) {
+            const R one = 1 / (by.ua[i] * by.vb[i] - by.ub[i] * by.va[i]);
+            to[0][first + i] = (float)(by.vb[i] * one * by_u), to[1][first + i] = (float)(-by.va[i] * one * by_v * fy / fx);
+            to[2][first + i] = (float)(-by.ub[i] * one * by_u * fx / fy), to[3][first + i] = (float)(by.ua[i] * one * by_v);
+        }
+    }
+}
+
+/* Between two values, by their slopes */
+INLINE float T(halfway)(float first, float second, float slope, float next_slope) {
+    return (first + second) / 2 + (slope - next_slope) / 8;
+}
+
+/* At the corner k of 4 x 4 nodes in row r, by how much the slopes across change on the way down, and the other way round */
+INLINE float T(twist)(const float *const *across, const float *const *down, int r, int64_t k) {
+    return ((across[r + 1][k] - across[r - 1][k]) + (down[r][k + 1] - down[r][k - 1])) / 4;
+}
+
+/* Adds, of a coordinate and of the cell at the k-th one of its nodes, by how much what cubics say in its middle and in
+   those of its sides misses what slopes at its corners say, in pixels and squared */
+INLINE void T(add_missed)(const float *const *at, const float *const *across, const float *const *down, int64_t k, float half,
+                          float *missed) {
+    float line[4], said[2], slope[2];
+    UNROLLED_LOOP for (int r = 0; r < 4; r++) line[r] = T(middle)(at[r] + k - 1, 1, 4);
+    UNROLLED_LOOP for (int i = 0; i < 2; i++) {
+        const int r = 1 + i;
+        const int64_t j = k + i;
+        said[i] = T(halfway)(at[r][k], at[r][k + 1], across[r][k], across[r][k + 1]);
+        slope[i] = T(halfway)(down[r][k], down[r][k + 1], T(twist)(across, down, r, k), T(twist)(across, down, r, k + 1));
+        const float side[4] = {at[0][j], at[1][j], at[2][j], at[3][j]};
+        const float beside = (T(halfway)(side[1], side[2], down[1][j], down[2][j]) - T(middle)(side, 1, 4)) * half;
+        const float above = (said[i] - line[r]) * half;
+        missed[i] += above * above, missed[2 + i] += beside * beside;
+    }
+    const float within = (T(halfway)(said[0], said[1], slope[0], slope[1]) - T(middle)(line, 1, 4)) * half;
+    missed[4] += within * within;
+}
+
+/* Of the cells of a row, the largest of that */
+static NOT_INLINE void T(missed_by_slopes)(int64_t columns, const float *const (*at)[4], const float *const (*across)[4],
+                                           const float *const (*down)[4], const float *half, float *restrict missed) {
+    for (int64_t j = 0; j < columns; j++) {
+        float of[PROBES] = {0}, most = 0;
+        UNROLLED_LOOP for (int c = 0; c < 2; c++) T(add_missed)(at[c], across[c], down[c], j + 2, half[c], of);
+        UNROLLED_LOOP for (int k = 0; k < PROBES; k++) most = of[k] <= most ? most : of[k]; /* or what is not a number */
+        missed[j] = most;
+    }
+}
+
+/* Of cells in doubt that pixels reach by a surface, within: there slopes at the corners miss a quarter of what cubics
+   through the nodes miss, and less where no curvature steps. So the difference of both says which of them does */
+static void T(settle_by_slopes)(const Lattices *given, const T(Between) *b, const Classification *asked) {
+    const int64_t columns = asked->columns, width = columns + 5;
+    const float half[2] = {(float)asked->source_width / 2, (float)asked->source_height / 2};
+    const float limit = (float)(asked->tolerance * asked->tolerance), near = limit * 9 / 64, far = limit * 25 / 16;
+    R *exact[2] = {(R *)given->exact, (R *)given->exact + given->move.cameras * asked->rows * columns * SQUARE};
+    float *missed = asked->scratch + 16 * width;
+    int64_t made = 0;
+    for (int64_t i = 0; i < asked->rows; i++) {
+        int32_t *cells = asked->cells + i * columns;
+        const float *at[2][4], *across[2][4], *down[2][4];
+        int64_t j = 0;
+        while (j < columns && cells[j] != CELL_DOUBT) j++;
+        if (j == columns) continue;
+        for (int r = 0; r < 4; r++) {
+            const int64_t row = i + 1 + r;
+            float *lines = asked->scratch + row % 4 * 4 * width, *const to[4] = {lines, lines + width, lines + 2 * width, lines + 3 * width};
+            for (int c = 0; c < 2; c++) {
+                at[c][r] = asked->nodes + c * asked->node_strides[1] + row * width;
+                across[c][r] = to[c], down[c][r] = to[2 + c];
+            }
+            if (row >= made) T(slopes_of)(&given->move, b, at[0][r], at[1][r], width, to), made = row + 1;
+        }
+        T(missed_by_slopes)(columns, at, across, down, half, missed);
+        for (j = 0; j < columns; j++) {
+            if (cells[j] != CELL_DOUBT || !T(is_inside)(asked, i * width + j)) continue;
+            cells[j] = missed[j] <= near ? CELL_CUBIC : CELL_NEXT;
+            if (missed[j] <= near || !(missed[j] <= far)) continue;
+            cells[j] = (int32_t)added(given->used, 1);
+            for (int c = 0; c < 2; c++) {
+                float corners[4][4];
+                for (int k = 0; k < 4; k++) {
+                    const int r = 1 + k % 2;
+                    const int64_t to = j + 2 + k / 2;
+                    corners[k % 2][k / 2] = at[c][r][to], corners[k % 2][2 + k / 2] = across[c][r][to];
+                    corners[2 + k % 2][k / 2] = down[c][r][to];
+                    corners[2 + k % 2][2 + k / 2] = T(twist)(across[c], down[c], r, to);
+                }
+                T(laid)(corners[0], 4, 4, b->slopes, exact[c] + (int64_t)cells[j] * SQUARE);
+            }
+        }
+    }
 }
 
 /* All pixels of the cells that quintics are laid in, each from its 6 x 6 nodes */
@@ -469,11 +560,29 @@ static void T(lay_quintics)(const Lattices *given, const Classification *asked) 
     }
 }
 
+/* Whether all pixels of the image lie so far inside of what a surface and the camera before it show that none is moved
+   out of that: no further than its furthest control point is */
+static int T(reaches_all)(const Classification *asked, const T(Between) *b) {
+    const T(Camera) *c = b->bent;
+    const Part *last = c->parts + c->stages;
+    const T(Edge) edge = T(edge_of)(c);
+    const R *k = c->numbers[c->stages] + 4;
+    R most[2] = {0, 0};
+    for (int i = 0; i < 2 * last->n * last->m; i++) most[i % 2] = T(most)(most[i % 2], T(absolute)(k[i]));
+    for (int i = 0; i < 4; i++) {
+        const R u = i % 2 ? (R)(asked->width - 1) : 0, v = i / 2 ? (R)(asked->height - 1) : 0;
+        const R a = (u - c->cx) / c->fx + (i % 2 ? most[0] : -most[0]), e = (v - c->cy) / c->fy + (i / 2 ? most[1] : -most[1]);
+        if (!T(on_edge)(edge, a, e) || !(b->within2 - (a * a + e * e) > 0)) return 0;
+    }
+    return 1;
+}
+
 static int T(lattice)(const Lattices *given, int64_t camera, T(Between) *b) {
     const Move *move = &given->move;
     Classification asked = given->cells;
     const int64_t cells = asked.rows * asked.columns, nodes = (asked.rows + 5) * (asked.columns + 5);
     const R *at = (const R *)move->results + camera * move->result_strides[0];
+    int64_t wanted = move->count;
     int left = 0;
     T(between)(move, camera, b);
     if (b->bent == &b->from && b->bent->pieces) { /* to a quarter of the tolerance, as cells are held to half of it */
@@ -481,9 +590,15 @@ static int T(lattice)(const Lattices *given, int64_t camera, T(Between) *b) {
         const R focal = T(most)(T(absolute)(b->bent->fx), T(absolute)(b->bent->fy));
         b->bend = 2 * focal / (R)asked.tolerance * T(bend_of)(b->bent->parts + last, b->bent->numbers[last]);
         T(weights_of)(4, b->cubics);
+        for (int k = 0; k < STEP; k++) {
+            const float t = (float)k / STEP, s = 1 - t;
+            b->slopes[0][k] = (1 + 2 * t) * s * s, b->slopes[1][k] = (1 + 2 * s) * t * t;
+            b->slopes[2][k] = t * s * s, b->slopes[3][k] = -s * t * t;
+        }
+        if (T(reaches_all)(&asked, b)) wanted = nodes, memset(move->valid + camera * move->count + nodes, 1, (size_t)(move->count - nodes));
     }
-    for (int64_t i = 0; i < move->count; i += BLOCK)
-        left |= T(move_row)(move, b, i, (int)(move->count - i < BLOCK ? move->count - i : BLOCK));
+    for (int64_t i = 0; i < wanted; i += BLOCK)
+        left |= T(move_row)(move, b, i, (int)(wanted - i < BLOCK ? wanted - i : BLOCK));
     if (left) return left;
     asked.count = 1, asked.cells += camera * cells, asked.mapped = move->valid + camera * move->count;
     asked.rim = asked.mapped + nodes, asked.nodes = (const float *)at;
@@ -494,24 +609,23 @@ static int T(lattice)(const Lattices *given, int64_t camera, T(Between) *b) {
         asked.nodes = to, asked.node_strides[1] = nodes;
     }
     THIS(classify)(&asked);
+    for (int64_t i = 0; i < cells; i++) asked.cells[i] = asked.cells[i] ? asked.cells[i] : CELL_NEXT;
+    if (b->bend >= 0) T(settle_by_slopes)(given, b, &asked);
     if ((left = T(settle)(given, b, &asked))) return left;
-    int64_t most = 0;
-    for (int64_t i = 0; i < cells; i++) most += asked.cells[i] == 0;
+    int64_t most = 0, found;
+    for (int64_t i = 0; i < cells; i++) most += asked.cells[i] == CELL_NEXT;
     if (8 * most > 7 * cells) return LEFT_MOST;
-    static const int32_t wanted[2] = {0, CELL_NEXT};
-    for (int turn = 0; turn < 2; turn++) {
-        int64_t places[BLOCK / SQUARE], found;
-        do { /* those that are next turn up ahead, and behind */
-            int count = 0;
-            found = 0;
-            for (int64_t i = 0; i < cells || count; i++) {
-                if (i < cells && asked.cells[i] == wanted[turn]) places[count++] = i;
-                if (count < BLOCK / SQUARE && (i < cells || !count)) continue;
-                left |= T(squares)(given, b, &asked, places, count, added(given->used, count));
-                found += count, count = 0;
-            }
-        } while (found && turn);
-    }
+    do { /* those that are next turn up ahead, and behind */
+        int64_t places[BLOCK / SQUARE];
+        int count = 0;
+        found = 0;
+        for (int64_t i = 0; i < cells || count; i++) {
+            if (i < cells && asked.cells[i] == CELL_NEXT) places[count++] = i;
+            if (count < BLOCK / SQUARE && (i < cells || !count)) continue;
+            left |= T(squares)(given, b, &asked, places, count, added(given->used, count));
+            found += count, count = 0;
+        }
+    } while (found);
     T(lay_quintics)(given, &asked);
     return left;
 }
