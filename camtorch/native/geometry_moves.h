@@ -6,8 +6,9 @@ typedef struct {
     R turn[9];
     const T(Camera) *bent, *plain; /* which of both is the other one with a surface after its lens, NULL where none is */
     R within2;                     /* see `surely2` */
+    int is_sure;                   /* while nodes of a lattice are sought whose pixels are all mapped, see `reaches_all` */
     R bend;                        /* of lattices, what a Newton step leaves beside their tolerance; -1: none */
-    float cubics[4][STEP], slopes[4][STEP]; /* weights of nodes; of values at both ends, and of slopes there */
+    float cubics[4][STEP], changes[4][STEP]; /* weights of nodes; of both ends, and of changes there */
 } T(Between);
 
 /* The squared radius of a circle of a camera's plane in which each point has a ray for certain */
@@ -35,7 +36,7 @@ static void T(compare)(const Move *move, T(Between) *b) {
     const T(Camera) *from = &b->from, *to = &b->to, *bent = from->stages > to->stages ? from : to, *plain = bent == from ? to : from;
     const int last = plain->stages + 1;
     const int64_t constants = move->from->constant_count;
-    b->bent = b->plain = NULL, b->within2 = 0, b->bend = -1;
+    b->bent = b->plain = NULL, b->within2 = 0, b->is_sure = 0, b->bend = -1;
     if (move->turns || bent->stages != last || !bent->all_certain || !(from->usable & to->usable)) return;
     if (from->fx != to->fx || from->fy != to->fy || from->cx != to->cx || from->cy != to->cy) return;
     if (memcmp(from->parts, to->parts, (size_t)last * sizeof(Part)) || move->to->constant_count != constants) return;
@@ -165,8 +166,13 @@ static int T(by_surface)(const Move *move, const T(Between) *b, int count, int n
     EACH(i) x[i] = (u[i] - cx) * by_fx, y[i] = (v[i] - cy) * by_fy;
     if (is_inverse) {
         T(start)(c, c->stages, n, x, y, p, q);
-        T(newton)(c, c->stages, n, x, y, p, q, settled, (IS_DOUBLE ? 3 : 2) - !!c->start);
+        T(newton)(c, c->stages, n, x, y, p, q, settled, (IS_DOUBLE ? 3 : 2) - !!c->pieces);
     } else T(stage)(c, c->stages, n, x, y, p, q, NULL);
+    if (b->is_sure) { /* behind its edge the surface goes on */
+        EACH(i) x[i] = fx * p[i], y[i] = fy * q[i];
+        EACH(i) u[i] = x[i] + cx, v[i] = y[i] + cy, ok[i] = settled[i];
+        return 0;
+    }
     const R *a = is_inverse ? p : x, *e = is_inverse ? q : y; /* on the surface's plane, where pixels of `plain` are */
     EACH(i) {
         on[i] = T(on_edge)(edge, a[i] * further, e[i] * further);
@@ -433,112 +439,138 @@ static int T(settle)(const Lattices *given, const T(Between) *b, const Classific
     return left;
 }
 
-/* Of nodes in a row, by how much their positions change on the way to the next ones, as the slopes of the surface say:
-   each coordinate across, then down */
-static void T(slopes_of)(const Move *move, const T(Between) *b, const float *u, const float *v, int64_t count,
-                         float *const to[4]) {
+/* Four rows of nodes, of each coordinate: positions, and by how much they change on the way to the next nodes */
+typedef struct {
+    const float *at[2][4], *across[2][4], *down[2][4];
+} T(Nodes);
+
+/* Those from a row on; of each eight rows in turn the changes have their place */
+static T(Nodes) T(nodes_from)(const Classification *asked, int64_t first) {
+    const int64_t width = asked->columns + 5;
+    T(Nodes) found;
+    for (int i = 0; i < 8; i++) {
+        const int64_t c = i / 4, row = first + i % 4;
+        found.at[c][i % 4] = asked->nodes + c * asked->node_strides[1] + row * width;
+        found.across[c][i % 4] = asked->scratch + (row % 8 * 4 + c) * width;
+        found.down[c][i % 4] = found.across[c][i % 4] + 2 * width;
+    }
+    return found;
+}
+
+/* The changes of a row of nodes, as the slopes of the surface say */
+static void T(add_changes)(const Move *move, const T(Between) *b, const Classification *asked, int64_t row) {
     const T(Camera) *c = b->bent;
+    const T(Nodes) here = T(nodes_from)(asked, row);
     const R half_u = (R)(move->width / 2), half_v = (R)(move->height / 2), fx = c->fx, fy = c->fy;
     const R by_u = STEP / half_u, by_v = STEP / half_v;
+    const int64_t width = asked->columns + 5;
+    float *to = asked->scratch + row % 8 * 4 * width;
     ALIGNED R x[BLOCK], y[BLOCK], p[BLOCK], q[BLOCK];
     T(Jacobian) by;
-    for (int64_t first = 0; first < count; first += BLOCK) {
-        const int some = (int)(count - first < BLOCK ? count - first : BLOCK), n = (some + LANES - 1) & -LANES;
+    for (int64_t first = 0; first < width; first += BLOCK, to += BLOCK) {
+        const int some = (int)(width - first < BLOCK ? width - first : BLOCK), n = (some + LANES - 1) & -LANES;
         for (int i = 0; i < n; i++) {
-            const int64_t at = first + (i < some ? i : some - 1);
-            x[i] = (((R)u[at] + 1) * half_u - (R)0.5 - c->cx) / fx, y[i] = (((R)v[at] + 1) * half_v - (R)0.5 - c->cy) / fy;
+            const int64_t k = first + (i < some ? i : some - 1);
+            x[i] = (((R)here.at[0][0][k] + 1) * half_u - (R)0.5 - c->cx) / fx;
+            y[i] = (((R)here.at[1][0][k] + 1) * half_v - (R)0.5 - c->cy) / fy;
         }
         T(sent_together)(c, n, x, y, p, q, &by);
         for (int i = 0; i < some; i++) {
             const R one = 1 / (by.ua[i] * by.vb[i] - by.ub[i] * by.va[i]);
-            to[0][first + i] = (float)(by.vb[i] * one * by_u), to[1][first + i] = (float)(-by.va[i] * one * by_v * fy / fx);
-            to[2][first + i] = (float)(-by.ub[i] * one * by_u * fx / fy), to[3][first + i] = (float)(by.ua[i] * one * by_v);
+            to[i] = (float)(by.vb[i] * one * by_u), to[width + i] = (float)(-by.va[i] * one * by_v * fy / fx);
+            to[2 * width + i] = (float)(-by.ub[i] * one * by_u * fx / fy), to[3 * width + i] = (float)(by.ua[i] * one * by_v);
         }
     }
 }
 
-/* Between two values, by their slopes */
-INLINE float T(halfway)(float first, float second, float slope, float next_slope) {
-    return (first + second) / 2 + (slope - next_slope) / 8;
+/* Between two values, by how much they change */
+INLINE float T(halfway)(float first, float second, float change, float next_change) {
+    return (first + second) / 2 + (change - next_change) / 8;
 }
 
-/* At the corner k of 4 x 4 nodes in row r, by how much the slopes across change on the way down, and the other way round */
+/* At node k of row r, by how much changes across change on the way down, and the other way round */
 INLINE float T(twist)(const float *const *across, const float *const *down, int r, int64_t k) {
     return ((across[r + 1][k] - across[r - 1][k]) + (down[r][k + 1] - down[r][k - 1])) / 4;
 }
 
-/* Adds, of a coordinate and of the cell at the k-th one of its nodes, by how much what cubics say in its middle and in
-   those of its sides misses what slopes at its corners say, in pixels and squared */
+/* Adds, of a coordinate and of the cell at the k-th of its nodes, by how much what cubics say in its middle and in those of
+   its sides misses what changes at its corners say, in pixels and squared */
 INLINE void T(add_missed)(const float *const *at, const float *const *across, const float *const *down, int64_t k, float half,
                           float *missed) {
-    float line[4], said[2], slope[2];
+    float line[4], said[2], change[2];
     UNROLLED_LOOP for (int r = 0; r < 4; r++) line[r] = T(middle)(at[r] + k - 1, 1, 4);
     UNROLLED_LOOP for (int i = 0; i < 2; i++) {
         const int r = 1 + i;
         const int64_t j = k + i;
         said[i] = T(halfway)(at[r][k], at[r][k + 1], across[r][k], across[r][k + 1]);
-        slope[i] = T(halfway)(down[r][k], down[r][k + 1], T(twist)(across, down, r, k), T(twist)(across, down, r, k + 1));
+        change[i] = T(halfway)(down[r][k], down[r][k + 1], T(twist)(across, down, r, k), T(twist)(across, down, r, k + 1));
         const float side[4] = {at[0][j], at[1][j], at[2][j], at[3][j]};
         const float beside = (T(halfway)(side[1], side[2], down[1][j], down[2][j]) - T(middle)(side, 1, 4)) * half;
         const float above = (said[i] - line[r]) * half;
         missed[i] += above * above, missed[2 + i] += beside * beside;
     }
-    const float within = (T(halfway)(said[0], said[1], slope[0], slope[1]) - T(middle)(line, 1, 4)) * half;
+    const float within = (T(halfway)(said[0], said[1], change[0], change[1]) - T(middle)(line, 1, 4)) * half;
     missed[4] += within * within;
 }
 
 /* Of the cells of a row, the largest of that */
-static NOT_INLINE void T(missed_by_slopes)(int64_t columns, const float *const (*at)[4], const float *const (*across)[4],
-                                           const float *const (*down)[4], const float *half, float *restrict missed) {
+static NOT_INLINE void T(judge)(T(Nodes) from, int64_t columns, const float *half, float *restrict missed) {
     for (int64_t j = 0; j < columns; j++) {
         float of[PROBES] = {0}, most = 0;
-        UNROLLED_LOOP for (int c = 0; c < 2; c++) T(add_missed)(at[c], across[c], down[c], j + 2, half[c], of);
+        UNROLLED_LOOP for (int c = 0; c < 2; c++)
+            T(add_missed)(from.at[c], from.across[c], from.down[c], j + 2, half[c], of);
         UNROLLED_LOOP for (int k = 0; k < PROBES; k++) most = of[k] <= most ? most : of[k]; /* or what is not a number */
         missed[j] = most;
     }
 }
 
-/* Of cells in doubt that pixels reach by a surface, within: there slopes at the corners miss a quarter of what cubics
-   through the nodes miss, and less where no curvature steps. So the difference of both says which of them does */
-static void T(settle_by_slopes)(const Lattices *given, const T(Between) *b, const Classification *asked) {
-    const int64_t columns = asked->columns, width = columns + 5;
+/* All pixels of a cell from its corners and the changes there */
+static void T(lay_changes)(const T(Nodes) *from, int64_t cell, const float (*weights)[STEP], R *const *to) {
+    for (int c = 0; c < 2; c++) {
+        float corners[16];
+        for (int k = 0; k < 4; k++) {
+            const int r = 1 + k / 2, at = k / 2 * 4 + k % 2;
+            const int64_t node = cell + 2 + k % 2;
+            corners[at] = from->at[c][r][node], corners[at + 2] = from->across[c][r][node];
+            corners[at + 8] = from->down[c][r][node];
+            corners[at + 10] = T(twist)(from->across[c], from->down[c], r, node);
+        }
+        T(laid)(corners, 4, 4, weights, to[c]);
+    }
+}
+
+/* Of cells in doubt that pixels reach by a surface, within. What changes at the corners say misses a quarter of what cubics
+   through the nodes miss, and less where no curvature steps, so that the difference of both tells of either; but where it
+   changes its sign, that of the cells around */
+static void T(settle_by_changes)(const Lattices *given, const T(Between) *b, const Classification *asked, int is_sure) {
+    const int64_t rows = asked->rows, columns = asked->columns, width = columns + 5;
     const float half[2] = {(float)asked->source_width / 2, (float)asked->source_height / 2};
-    const float limit = (float)(asked->tolerance * asked->tolerance), near = limit * 9 / 64, far = limit * 25 / 16;
-    R *exact[2] = {(R *)given->exact, (R *)given->exact + given->move.cameras * asked->rows * columns * SQUARE};
-    float *missed = asked->scratch + 16 * width;
-    int64_t made = 0;
-    for (int64_t i = 0; i < asked->rows; i++) {
+    const float limit = (float)(asked->tolerance * asked->tolerance), near = limit * 9 / 64, far = limit * 9 / 4;
+    R *exact[2] = {(R *)given->exact, (R *)given->exact + given->move.cameras * rows * columns * SQUARE};
+    float *missed = asked->scratch + 32 * width, *around = missed + 4 * width;
+    int64_t made = 0, judged = 0;
+    for (int64_t i = 0; i < rows; i++) {
         int32_t *cells = asked->cells + i * columns;
-        const float *at[2][4], *across[2][4], *down[2][4];
+        const int64_t before = i > 0 ? i - 1 : 0, behind = i + 1 < rows ? i + 1 : i;
         int64_t j = 0;
         while (j < columns && cells[j] != CELL_DOUBT) j++;
         if (j == columns) continue;
-        for (int r = 0; r < 4; r++) {
-            const int64_t row = i + 1 + r;
-            float *lines = asked->scratch + row % 4 * 4 * width, *const to[4] = {lines, lines + width, lines + 2 * width, lines + 3 * width};
-            for (int c = 0; c < 2; c++) {
-                at[c][r] = asked->nodes + c * asked->node_strides[1] + row * width;
-                across[c][r] = to[c], down[c][r] = to[2 + c];
-            }
-            if (row >= made) T(slopes_of)(&given->move, b, at[0][r], at[1][r], width, to), made = row + 1;
+        for (judged = judged > before ? judged : before; judged <= behind; judged++) {
+            for (made = made > judged + 1 ? made : judged + 1; made < judged + 5; made++) T(add_changes)(&given->move, b, asked, made);
+            T(judge)(T(nodes_from)(asked, judged + 1), columns, half, missed + judged % 4 * width);
         }
-        T(missed_by_slopes)(columns, at, across, down, half, missed);
+        const float *here = missed + i % 4 * width, *above = missed + before % 4 * width, *below = missed + behind % 4 * width;
+        for (j = 0; j < columns; j++) around[j + 1] = fmaxf(here[j], fmaxf(above[j], below[j]));
+        around[0] = around[columns + 1] = 0;
+        const T(Nodes) from = T(nodes_from)(asked, i + 1);
         for (j = 0; j < columns; j++) {
-            if (cells[j] != CELL_DOUBT || !T(is_inside)(asked, i * width + j)) continue;
-            cells[j] = missed[j] <= near ? CELL_CUBIC : CELL_NEXT;
-            if (missed[j] <= near || !(missed[j] <= far)) continue;
-            cells[j] = (int32_t)added(given->used, 1);
-            for (int c = 0; c < 2; c++) {
-                float corners[4][4];
-                for (int k = 0; k < 4; k++) {
-                    const int r = 1 + k % 2;
-                    const int64_t to = j + 2 + k / 2;
-                    corners[k % 2][k / 2] = at[c][r][to], corners[k % 2][2 + k / 2] = across[c][r][to];
-                    corners[2 + k % 2][k / 2] = down[c][r][to];
-                    corners[2 + k % 2][2 + k / 2] = T(twist)(across[c], down[c], r, to);
-                }
-                T(laid)(corners[0], 4, 4, b->slopes, exact[c] + (int64_t)cells[j] * SQUARE);
-            }
+            if (cells[j] != CELL_DOUBT || !(is_sure || T(is_inside)(asked, i * width + j))) continue;
+            const float most = fmaxf(fmaxf(around[j], around[j + 1]), around[j + 2]) / 12;
+            const float miss = most > here[j] ? most : here[j]; /* or what is not a number */
+            cells[j] = miss <= near ? CELL_CUBIC : miss <= far ? (int32_t)added(given->used, 1) : CELL_NEXT;
+            if (cells[j] < 0) continue;
+            R *const to[2] = {exact[0] + (int64_t)cells[j] * SQUARE, exact[1] + (int64_t)cells[j] * SQUARE};
+            T(lay_changes)(&from, j, b->changes, to);
         }
     }
 }
@@ -583,22 +615,25 @@ static int T(lattice)(const Lattices *given, int64_t camera, T(Between) *b) {
     const int64_t cells = asked.rows * asked.columns, nodes = (asked.rows + 5) * (asked.columns + 5);
     const R *at = (const R *)move->results + camera * move->result_strides[0];
     int64_t wanted = move->count;
-    int left = 0;
+    int left = 0, is_sure = 0;
     T(between)(move, camera, b);
     if (b->bent == &b->from && b->bent->pieces) { /* to a quarter of the tolerance, as cells are held to half of it */
-        const int last = b->bent->stages;
         const R focal = T(most)(T(absolute)(b->bent->fx), T(absolute)(b->bent->fy));
-        b->bend = 2 * focal / (R)asked.tolerance * T(bend_of)(b->bent->parts + last, b->bent->numbers[last]);
+        b->bend = 2 * focal / (R)asked.tolerance * b->bent->curve;
         T(weights_of)(4, b->cubics);
         for (int k = 0; k < STEP; k++) {
             const float t = (float)k / STEP, s = 1 - t;
-            b->slopes[0][k] = (1 + 2 * t) * s * s, b->slopes[1][k] = (1 + 2 * s) * t * t;
-            b->slopes[2][k] = t * s * s, b->slopes[3][k] = -s * t * t;
+            b->changes[0][k] = (1 + 2 * t) * s * s, b->changes[1][k] = (1 + 2 * s) * t * t;
+            b->changes[2][k] = t * s * s, b->changes[3][k] = -s * t * t;
         }
-        if (T(reaches_all)(&asked, b)) wanted = nodes, memset(move->valid + camera * move->count + nodes, 1, (size_t)(move->count - nodes));
+        if ((b->is_sure = is_sure = T(reaches_all)(&asked, b))) {
+            wanted = nodes; /* not those at the rim */
+            memset(move->valid + camera * move->count + nodes, 1, (size_t)(move->count - nodes));
+        }
     }
     for (int64_t i = 0; i < wanted; i += BLOCK)
         left |= T(move_row)(move, b, i, (int)(wanted - i < BLOCK ? wanted - i : BLOCK));
+    b->is_sure = 0;
     if (left) return left;
     asked.count = 1, asked.cells += camera * cells, asked.mapped = move->valid + camera * move->count;
     asked.rim = asked.mapped + nodes, asked.nodes = (const float *)at;
@@ -609,12 +644,13 @@ static int T(lattice)(const Lattices *given, int64_t camera, T(Between) *b) {
         asked.nodes = to, asked.node_strides[1] = nodes;
     }
     THIS(classify)(&asked);
-    for (int64_t i = 0; i < cells; i++) asked.cells[i] = asked.cells[i] ? asked.cells[i] : CELL_NEXT;
-    if (b->bend >= 0) T(settle_by_slopes)(given, b, &asked);
+    for (int64_t i = 0; i < cells; i++)
+        if (!asked.cells[i] || (is_sure && asked.cells[i] == CELL_EMPTY)) asked.cells[i] = CELL_NEXT;
+    if (b->bend >= 0) T(settle_by_changes)(given, b, &asked, is_sure);
     if ((left = T(settle)(given, b, &asked))) return left;
     int64_t most = 0, found;
     for (int64_t i = 0; i < cells; i++) most += asked.cells[i] == CELL_NEXT;
-    if (8 * most > 7 * cells) return LEFT_MOST;
+    if (b->bend < 0 && 8 * most > 7 * cells) return LEFT_MOST;
     do { /* those that are next turn up ahead, and behind */
         int64_t places[BLOCK / SQUARE];
         int count = 0;
