@@ -545,7 +545,7 @@ static void T(lay_changes)(const T(Nodes) *from, int64_t cell, const float (*wei
 static void T(settle_by_changes)(const Lattices *given, const T(Between) *b, const Classification *asked, int is_sure) {
     const int64_t rows = asked->rows, columns = asked->columns, width = columns + 5;
     const float half[2] = {(float)asked->source_width / 2, (float)asked->source_height / 2};
-    const float limit = (float)(asked->tolerance * asked->tolerance), near = limit * 9 / 64, far = limit * 9 / 4;
+    const float limit = (float)(asked->tolerance * asked->tolerance), near = limit * 9 / 64, far = limit * 4;
     R *exact[2] = {(R *)given->exact, (R *)given->exact + given->move.cameras * rows * columns * SQUARE};
     float *missed = asked->scratch + 32 * width, *around = missed + 4 * width;
     int64_t made = 0, judged = 0;
@@ -565,7 +565,7 @@ static void T(settle_by_changes)(const Lattices *given, const T(Between) *b, con
         const T(Nodes) from = T(nodes_from)(asked, i + 1);
         for (j = 0; j < columns; j++) {
             if (cells[j] != CELL_DOUBT || !(is_sure || T(is_inside)(asked, i * width + j))) continue;
-            const float most = fmaxf(fmaxf(around[j], around[j + 1]), around[j + 2]) / 12;
+            const float most = fmaxf(fmaxf(around[j], around[j + 1]), around[j + 2]) / 16;
             const float miss = most > here[j] ? most : here[j]; /* or what is not a number */
             cells[j] = miss <= near ? CELL_CUBIC : miss <= far ? (int32_t)added(given->used, 1) : CELL_NEXT;
             if (cells[j] < 0) continue;
