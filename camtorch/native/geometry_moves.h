@@ -128,31 +128,7 @@ static void T(sent_together)(const T(Camera) *c, int n, const R *restrict a, con
     }
 }
 
-/* From pixels (u, v), and those near to which the surface moves them, to the latter as near as a lattice wants them, in
-   place; 0 where that does not lead there */
-static int T(refined)(const T(Between) *b, int n, const R *restrict u, const R *restrict v, R (*restrict near)[BLOCK]) {
-    const T(Camera) *c = b->bent;
-    const R fx = c->fx, fy = c->fy, cx = c->cx, cy = c->cy, by_fx = 1 / fx, by_fy = 1 / fy, bend = b->bend;
-    ALIGNED R a[BLOCK], e[BLOCK], p[BLOCK], q[BLOCK];
-    T(Jacobian) to;
-    for (int count = 0; count < MOST_STEPS; count++) {
-        I all = 1;
-        EACH(i) a[i] = (near[0][i] - cx) * by_fx, e[i] = (near[1][i] - cy) * by_fy;
-        T(sent_together)(c, n, a, e, p, q, &to);
-        EACH(i) {
-            R da, db;
-            const R ua = to.ua[i], ub = to.ub[i], va = to.va[i], vb = to.vb[i];
-            const R one = T(absolute)(T(step)(ua, ub, va, vb, (u[i] - cx) * by_fx - p[i], (v[i] - cy) * by_fy - q[i], &da, &db));
-            const R size = T(absolute)(ua) + T(absolute)(ub) + T(absolute)(va) + T(absolute)(vb);
-            near[0][i] += fx * da, near[1][i] += fy * db;
-            all &= (1 - bend * (da * da + db * db) * (size * one) > 0) & (one > 0);
-        }
-        if (all) return 1;
-    }
-    return 0;
-}
-
-/* The same of cameras that differ by a surface: by that alone, where the other one has a ray */
+/* `by_rays` of cameras that differ by a surface: by that alone, where the other one has a ray */
 static int T(by_surface)(const Move *move, const T(Between) *b, int count, int n, R *restrict u, R *restrict v,
                          I *restrict ok) {
     const T(Camera) *c = b->bent, *plain = b->plain;
@@ -287,13 +263,37 @@ INLINE void T(laid)(const float *nodes, int64_t width, const int count, const fl
     }
 }
 
-/* Positions that lie near those of pixels (u, v), to these; 0 where that does not lead there */
-static int T(refined_positions)(const Move *move, const T(Between) *b, int n, const R *u, const R *v, R (*near)[BLOCK]) {
-    const R across = (R)(move->width / 2), down = (R)(move->height / 2), by_across = 1 / across, by_down = 1 / down;
-    EACH(i) near[0][i] = (near[0][i] + 1) * across - (R)0.5, near[1][i] = (near[1][i] + 1) * down - (R)0.5;
-    const int is_there = T(refined)(b, n, u, v, near);
-    EACH(i) near[0][i] = (near[0][i] + (R)0.5) * by_across - 1, near[1][i] = (near[1][i] + (R)0.5) * by_down - 1;
-    return is_there;
+/* Positions on an image of that size to points of a camera's plane: times, and plus */
+INLINE void T(plane_of)(const Move *move, const T(Camera) *c, R *times, R *plus) {
+    times[0] = (R)(move->width / 2) / c->fx, times[1] = (R)(move->height / 2) / c->fy;
+    plus[0] = times[0] - ((R)0.5 + c->cx) / c->fx, plus[1] = times[1] - ((R)0.5 + c->cy) / c->fy;
+}
+
+/* From pixels (u, v), and positions near those to which the surface moves them, to the latter as near as a lattice wants
+   them, in place; 0 where that does not lead there */
+static int T(refined)(const Move *move, const T(Between) *b, int n, const R *restrict u, const R *restrict v,
+                      R (*restrict near)[BLOCK]) {
+    const T(Camera) *c = b->bent;
+    const R by_fx = 1 / c->fx, by_fy = 1 / c->fy, cx = c->cx, cy = c->cy, bend = b->bend;
+    R k[2], l[2];
+    ALIGNED R a[BLOCK], e[BLOCK], p[BLOCK], q[BLOCK];
+    T(Jacobian) to;
+    T(plane_of)(move, c, k, l);
+    for (int count = 0; count < MOST_STEPS; count++) {
+        I all = 1;
+        EACH(i) a[i] = near[0][i] * k[0] + l[0], e[i] = near[1][i] * k[1] + l[1];
+        T(sent_together)(c, n, a, e, p, q, &to);
+        EACH(i) {
+            R da, db;
+            const R ua = to.ua[i], ub = to.ub[i], va = to.va[i], vb = to.vb[i];
+            const R one = T(absolute)(T(step)(ua, ub, va, vb, (u[i] - cx) * by_fx - p[i], (v[i] - cy) * by_fy - q[i], &da, &db));
+            const R size = T(absolute)(ua) + T(absolute)(ub) + T(absolute)(va) + T(absolute)(vb);
+            near[0][i] += da / k[0], near[1][i] += db / k[1];
+            all &= (1 - bend * (da * da + db * db) * (size * one) > 0) & (one > 0);
+        }
+        if (all) return 1;
+    }
+    return 0;
 }
 
 /* All pixels of some cells, `number` of the first one; where what is mapped ends in one, those around it are next */
@@ -316,7 +316,7 @@ static int T(squares)(const Lattices *given, const T(Between) *b, const Classifi
             T(laid)(asked->nodes + c * asked->node_strides[1] + first, width, 4, b->cubics, near[c] + k * SQUARE);
     }
     R *across = (R *)given->exact + number * SQUARE, *down = across + given->move.cameras * rows * columns * SQUARE;
-    if (is_near && T(refined_positions)(&given->move, b, n, u, v, near)) {
+    if (is_near && T(refined)(&given->move, b, n, u, v, near)) {
         memcpy(across, near[0], (size_t)n * sizeof(R)), memcpy(down, near[1], (size_t)n * sizeof(R));
         for (int k = 0; k < count; k++) cells[places[k]] = (int32_t)(number + k);
         return 0;
@@ -459,26 +459,24 @@ static T(Nodes) T(nodes_from)(const Classification *asked, int64_t first) {
 
 /* The changes of a row of nodes, as the slopes of the surface say */
 static void T(add_changes)(const Move *move, const T(Between) *b, const Classification *asked, int64_t row) {
-    const T(Camera) *c = b->bent;
     const T(Nodes) here = T(nodes_from)(asked, row);
-    const R half_u = (R)(move->width / 2), half_v = (R)(move->height / 2), fx = c->fx, fy = c->fy;
-    const R by_u = STEP / half_u, by_v = STEP / half_v;
     const int64_t width = asked->columns + 5;
     float *to = asked->scratch + row % 8 * 4 * width;
+    R k[2], l[2];
     ALIGNED R x[BLOCK], y[BLOCK], p[BLOCK], q[BLOCK];
     T(Jacobian) by;
+    T(plane_of)(move, b->bent, k, l);
     for (int64_t first = 0; first < width; first += BLOCK, to += BLOCK) {
         const int some = (int)(width - first < BLOCK ? width - first : BLOCK), n = (some + LANES - 1) & -LANES;
         for (int i = 0; i < n; i++) {
-            const int64_t k = first + (i < some ? i : some - 1);
-            x[i] = (((R)here.at[0][0][k] + 1) * half_u - (R)0.5 - c->cx) / fx;
-            y[i] = (((R)here.at[1][0][k] + 1) * half_v - (R)0.5 - c->cy) / fy;
+            const int64_t at = first + (i < some ? i : some - 1);
+            x[i] = (R)here.at[0][0][at] * k[0] + l[0], y[i] = (R)here.at[1][0][at] * k[1] + l[1];
         }
-        T(sent_together)(c, n, x, y, p, q, &by);
-        for (int i = 0; i < some; i++) {
-            const R one = 1 / (by.ua[i] * by.vb[i] - by.ub[i] * by.va[i]);
-            to[i] = (float)(by.vb[i] * one * by_u), to[width + i] = (float)(-by.va[i] * one * by_v * fy / fx);
-            to[2 * width + i] = (float)(-by.ub[i] * one * by_u * fx / fy), to[3 * width + i] = (float)(by.ua[i] * one * by_v);
+        T(sent_together)(b->bent, n, x, y, p, q, &by);
+        for (int i = 0; i < some; i++) { /* positions by pixels, the inverse */
+            const R one = STEP / (by.ua[i] * by.vb[i] - by.ub[i] * by.va[i]), across = one / b->bent->fx, down = one / b->bent->fy;
+            to[i] = (float)(by.vb[i] * across / k[0]), to[width + i] = (float)(-by.va[i] * across / k[1]);
+            to[2 * width + i] = (float)(-by.ub[i] * down / k[0]), to[3 * width + i] = (float)(by.ua[i] * down / k[1]);
         }
     }
 }
