@@ -592,7 +592,7 @@ static void T(lay_quintics)(const Lattices *given, const Classification *asked) 
 
 /* Whether all pixels of the image lie so far inside of what a surface and the camera before it show that none is moved
    out of that: no further than its furthest control point is */
-static int T(reaches_all)(const Classification *asked, const T(Between) *b) {
+static int T(reaches_all)(const Lattices *given, const T(Between) *b) {
     const T(Camera) *c = b->bent;
     const Part *last = c->parts + c->stages;
     const T(Edge) edge = T(edge_of)(c);
@@ -600,7 +600,8 @@ static int T(reaches_all)(const Classification *asked, const T(Between) *b) {
     R most[2] = {0, 0};
     for (int i = 0; i < 2 * last->n * last->m; i++) most[i % 2] = T(most)(most[i % 2], T(absolute)(k[i]));
     for (int i = 0; i < 4; i++) {
-        const R u = i % 2 ? (R)(asked->width - 1) : 0, v = i / 2 ? (R)(asked->height - 1) : 0;
+        const R u = i % 2 ? (R)(given->cells.width - 1) : 0;
+        const R v = (R)given->first_row + (i / 2 ? (R)(given->cells.height - 1) : 0);
         const R a = (u - c->cx) / c->fx + (i % 2 ? most[0] : -most[0]), e = (v - c->cy) / c->fy + (i / 2 ? most[1] : -most[1]);
         if (!T(on_edge)(edge, a, e) || !(b->within2 - (a * a + e * e) > 0)) return 0;
     }
@@ -624,7 +625,7 @@ static int T(lattice)(const Lattices *given, int64_t camera, T(Between) *b) {
             b->changes[0][k] = (1 + 2 * t) * s * s, b->changes[1][k] = (1 + 2 * s) * t * t;
             b->changes[2][k] = t * s * s, b->changes[3][k] = -s * t * t;
         }
-        if ((b->is_sure = is_sure = T(reaches_all)(&asked, b))) {
+        if ((b->is_sure = is_sure = T(reaches_all)(given, b))) {
             wanted = nodes; /* not those at the rim */
             memset(move->valid + camera * move->count + nodes, 1, (size_t)(move->count - nodes));
         }
