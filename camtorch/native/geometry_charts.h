@@ -44,7 +44,7 @@ typedef struct {
     const R *limits2, *extent, *table, *start, *pieces;
     const uint8_t *certain;
     int all_certain, to_edge; /* of all pieces of the surface; and it is the only stage */
-    R certain2;
+    R certain2, curve; /* see `bend_of` */
     R chart_inner2, chart_most2;
     const R *chart_table;
     T(Chart) chart;

@@ -6,8 +6,9 @@ typedef struct {
     R turn[9];
     const T(Camera) *bent, *plain; /* which of both is the other one with a surface after its lens, NULL where none is */
     R within2;                     /* see `surely2` */
-    R bend;                        /* of lattices, what a step leaves beside their tolerance: see `start_of`; -1: none */
-    float cubics[4][STEP];         /* weights of nodes */
+    int is_sure;                   /* while nodes of a lattice are sought whose pixels are all mapped, see `reaches_all` */
+    R bend;                        /* of lattices, what a Newton step leaves beside their tolerance; -1: none */
+    float cubics[4][STEP], changes[4][STEP]; /* weights of nodes; of both ends, and of changes there */
 } T(Between);
 
 /* The squared radius of a circle of a camera's plane in which each point has a ray for certain */
@@ -35,7 +36,7 @@ static void T(compare)(const Move *move, T(Between) *b) {
     const T(Camera) *from = &b->from, *to = &b->to, *bent = from->stages > to->stages ? from : to, *plain = bent == from ? to : from;
     const int last = plain->stages + 1;
     const int64_t constants = move->from->constant_count;
-    b->bent = b->plain = NULL, b->within2 = 0, b->bend = -1;
+    b->bent = b->plain = NULL, b->within2 = 0, b->is_sure = 0, b->bend = -1;
     if (move->turns || bent->stages != last || !bent->all_certain || !(from->usable & to->usable)) return;
     if (from->fx != to->fx || from->fy != to->fy || from->cx != to->cx || from->cy != to->cy) return;
     if (memcmp(from->parts, to->parts, (size_t)last * sizeof(Part)) || move->to->constant_count != constants) return;
@@ -127,34 +128,7 @@ static void T(sent_together)(const T(Camera) *c, int n, const R *restrict a, con
     }
 }
 
-/* From pixels (u, v), and those near to which the surface moves them, to the latter as near as a lattice wants them, in
-   place, and by how much they moved first; 0 where that does not lead there */
-static int T(refined)(const T(Between) *b, int n, const R *restrict u, const R *restrict v, R (*restrict near)[BLOCK],
-                      R (*restrict missed)[BLOCK]) {
-    const T(Camera) *c = b->bent;
-    const R fx = c->fx, fy = c->fy, cx = c->cx, cy = c->cy, by_fx = 1 / fx, by_fy = 1 / fy, bend = b->bend;
-    ALIGNED R a[BLOCK], e[BLOCK], p[BLOCK], q[BLOCK];
-    T(Jacobian) to;
-    for (int count = 0; count < MOST_STEPS; count++) {
-        I all = 1;
-        EACH(i) a[i] = (near[0][i] - cx) * by_fx, e[i] = (near[1][i] - cy) * by_fy;
-        T(sent_together)(c, n, a, e, p, q, &to);
-        EACH(i) {
-            R da, db;
-            const R ua = to.ua[i], ub = to.ub[i], va = to.va[i], vb = to.vb[i];
-            const R one = T(absolute)(T(step)(ua, ub, va, vb, (u[i] - cx) * by_fx - p[i], (v[i] - cy) * by_fy - q[i], &da, &db));
-            const R size = T(absolute)(ua) + T(absolute)(ub) + T(absolute)(va) + T(absolute)(vb);
-            const R across = fx * da, down = fy * db;
-            near[0][i] += across, near[1][i] += down;
-            missed[0][i] = count ? missed[0][i] : across, missed[1][i] = count ? missed[1][i] : down;
-            all &= (1 - bend * (da * da + db * db) * (size * one) > 0) & (one > 0);
-        }
-        if (all) return 1;
-    }
-    return 0;
-}
-
-/* The same of cameras that differ by a surface: by that alone, where the other one has a ray */
+/* `by_rays` of cameras that differ by a surface: by that alone, where the other one has a ray */
 static int T(by_surface)(const Move *move, const T(Between) *b, int count, int n, R *restrict u, R *restrict v,
                          I *restrict ok) {
     const T(Camera) *c = b->bent, *plain = b->plain;
@@ -168,8 +142,13 @@ static int T(by_surface)(const Move *move, const T(Between) *b, int count, int n
     EACH(i) x[i] = (u[i] - cx) * by_fx, y[i] = (v[i] - cy) * by_fy;
     if (is_inverse) {
         T(start)(c, c->stages, n, x, y, p, q);
-        T(newton)(c, c->stages, n, x, y, p, q, settled, (IS_DOUBLE ? 3 : 2) - !!c->start);
+        T(newton)(c, c->stages, n, x, y, p, q, settled, (IS_DOUBLE ? 3 : 2) - !!c->pieces);
     } else T(stage)(c, c->stages, n, x, y, p, q, NULL);
+    if (b->is_sure) { /* behind its edge the surface goes on */
+        EACH(i) x[i] = fx * p[i], y[i] = fy * q[i];
+        EACH(i) u[i] = x[i] + cx, v[i] = y[i] + cy, ok[i] = settled[i];
+        return 0;
+    }
     const R *a = is_inverse ? p : x, *e = is_inverse ? q : y; /* on the surface's plane, where pixels of `plain` are */
     EACH(i) {
         on[i] = T(on_edge)(edge, a[i] * further, e[i] * further);
@@ -284,14 +263,37 @@ INLINE void T(laid)(const float *nodes, int64_t width, const int count, const fl
     }
 }
 
-/* Positions that lie near those of pixels (u, v), to these; 0 where that does not lead there */
-static int T(refined_positions)(const Move *move, const T(Between) *b, int n, const R *u, const R *v, R (*near)[BLOCK],
-                                R (*missed)[BLOCK]) {
-    const R across = (R)(move->width / 2), down = (R)(move->height / 2), by_across = 1 / across, by_down = 1 / down;
-    EACH(i) near[0][i] = (near[0][i] + 1) * across - (R)0.5, near[1][i] = (near[1][i] + 1) * down - (R)0.5;
-    const int is_there = T(refined)(b, n, u, v, near, missed);
-    EACH(i) near[0][i] = (near[0][i] + (R)0.5) * by_across - 1, near[1][i] = (near[1][i] + (R)0.5) * by_down - 1;
-    return is_there;
+/* Positions on an image of that size to points of a camera's plane: times, and plus */
+INLINE void T(plane_of)(const Move *move, const T(Camera) *c, R *times, R *plus) {
+    times[0] = (R)(move->width / 2) / c->fx, times[1] = (R)(move->height / 2) / c->fy;
+    plus[0] = times[0] - ((R)0.5 + c->cx) / c->fx, plus[1] = times[1] - ((R)0.5 + c->cy) / c->fy;
+}
+
+/* From pixels (u, v), and positions near those to which the surface moves them, to the latter as near as a lattice wants
+   them, in place; 0 where that does not lead there */
+static int T(refined)(const Move *move, const T(Between) *b, int n, const R *restrict u, const R *restrict v,
+                      R (*restrict near)[BLOCK]) {
+    const T(Camera) *c = b->bent;
+    const R by_fx = 1 / c->fx, by_fy = 1 / c->fy, cx = c->cx, cy = c->cy, bend = b->bend;
+    R k[2], l[2];
+    ALIGNED R a[BLOCK], e[BLOCK], p[BLOCK], q[BLOCK];
+    T(Jacobian) to;
+    T(plane_of)(move, c, k, l);
+    for (int count = 0; count < MOST_STEPS; count++) {
+        I all = 1;
+        EACH(i) a[i] = near[0][i] * k[0] + l[0], e[i] = near[1][i] * k[1] + l[1];
+        T(sent_together)(c, n, a, e, p, q, &to);
+        EACH(i) {
+            R da, db;
+            const R ua = to.ua[i], ub = to.ub[i], va = to.va[i], vb = to.vb[i];
+            const R one = T(absolute)(T(step)(ua, ub, va, vb, (u[i] - cx) * by_fx - p[i], (v[i] - cy) * by_fy - q[i], &da, &db));
+            const R size = T(absolute)(ua) + T(absolute)(ub) + T(absolute)(va) + T(absolute)(vb);
+            near[0][i] += da / k[0], near[1][i] += db / k[1];
+            all &= (1 - bend * (da * da + db * db) * (size * one) > 0) & (one > 0);
+        }
+        if (all) return 1;
+    }
+    return 0;
 }
 
 /* All pixels of some cells, `number` of the first one; where what is mapped ends in one, those around it are next */
@@ -300,7 +302,7 @@ static int T(squares)(const Lattices *given, const T(Between) *b, const Classifi
     const int64_t rows = asked->rows, columns = asked->columns, width = columns + 5;
     int32_t *cells = asked->cells;
     const int n = count * SQUARE;
-    ALIGNED R u[BLOCK], v[BLOCK], near[2][BLOCK], missed[2][BLOCK];
+    ALIGNED R u[BLOCK], v[BLOCK], near[2][BLOCK];
     ALIGNED I ok[BLOCK];
     int is_near = b->bend >= 0, left = 0;
     for (int k = 0; k < count; k++) {
@@ -314,7 +316,7 @@ static int T(squares)(const Lattices *given, const T(Between) *b, const Classifi
             T(laid)(asked->nodes + c * asked->node_strides[1] + first, width, 4, b->cubics, near[c] + k * SQUARE);
     }
     R *across = (R *)given->exact + number * SQUARE, *down = across + given->move.cameras * rows * columns * SQUARE;
-    if (is_near && T(refined_positions)(&given->move, b, n, u, v, near, missed)) {
+    if (is_near && T(refined)(&given->move, b, n, u, v, near)) {
         memcpy(across, near[0], (size_t)n * sizeof(R)), memcpy(down, near[1], (size_t)n * sizeof(R));
         for (int k = 0; k < count; k++) cells[places[k]] = (int32_t)(number + k);
         return 0;
@@ -351,30 +353,23 @@ INLINE void T(middles)(const float *node, int64_t width, const int count, float 
     at[1] = T(middle)(node - before * width, width, count), at[2] = T(middle)(node - before * width + 1, width, count);
 }
 
-/* The largest of misses in pixels, squared: of each coordinate, and of both */
-static float T(largest)(const R *across, const R *down, float *of_each) {
-    float most = 0;
-    of_each[0] = of_each[1] = 0;
-    for (int at = 0; at < PROBES; at++) {
-        const float u2 = (float)(across[at] * across[at]), v2 = (float)(down[at] * down[at]);
-        of_each[0] = u2 > of_each[0] ? u2 : of_each[0], of_each[1] = v2 > of_each[1] ? v2 : of_each[1];
-        most = u2 + v2 <= most ? most : u2 + v2; /* or what is not a number */
-    }
-    return most;
-}
-
-/* By how much what `count` x `count` nodes say misses what was found */
+/* By how much, in pixels and squared, what `count` x `count` nodes say misses what was found: of each coordinate, and of
+   both */
 static float T(most_missed)(const Classification *asked, int64_t first, const int count, const R *u, const R *v,
                             float *of_each) {
     const float half[2] = {(float)asked->source_width / 2, (float)asked->source_height / 2};
     const int64_t width = asked->columns + 5;
-    float said[PROBES];
-    R missed[2][PROBES];
-    for (int c = 0; c < 2; c++) {
-        T(middles)(asked->nodes + c * asked->node_strides[1] + first + 2 * width + 2, width, count, said);
-        for (int at = 0; at < PROBES; at++) missed[c][at] = (R)(((float)(c ? v : u)[at] - said[at]) * half[c]);
+    float said[2][PROBES], most = 0;
+    for (int c = 0; c < 2; c++)
+        T(middles)(asked->nodes + c * asked->node_strides[1] + first + 2 * width + 2, width, count, said[c]);
+    of_each[0] = of_each[1] = 0;
+    for (int at = 0; at < PROBES; at++) {
+        const float across = ((float)u[at] - said[0][at]) * half[0], down = ((float)v[at] - said[1][at]) * half[1];
+        const float u2 = across * across, v2 = down * down;
+        of_each[0] = u2 > of_each[0] ? u2 : of_each[0], of_each[1] = v2 > of_each[1] ? v2 : of_each[1];
+        most = u2 + v2 <= most ? most : u2 + v2; /* or what is not a number */
     }
-    return T(largest)(missed[0], missed[1], of_each);
+    return most;
 }
 
 /* Whether a cell lies far off the image; missed: by how much cubics miss each coordinate, squared */
@@ -395,16 +390,23 @@ static int T(is_off)(const Classification *asked, int64_t first, const R *u, con
     return is_off;
 }
 
+/* Whether all 6 x 6 nodes around a cell are mapped, of which the first is given */
+static int T(is_inside)(const Classification *asked, int64_t first) {
+    static const uint8_t all[6] = {1, 1, 1, 1, 1, 1};
+    for (int y = 0; y < 6; y++)
+        if (memcmp(asked->mapped + first + y * (asked->columns + 5), all, sizeof all)) return 0;
+    return 1;
+}
+
 /* What becomes of cells in doubt: polynomials miss most in the middle of a cell and of its sides. Where half the tolerance
  * is kept there, or an image that ends in zeros is far off, cubics do; or quintics, through six nodes; the other cells are
  * to be computed */
 static int T(settle)(const Lattices *given, const T(Between) *b, const Classification *asked) {
     static const int across[PROBES] = {1, 0, 2, 1, 1}, down[PROBES] = {0, 1, 1, 2, 1};
-    static const uint8_t all[6] = {1, 1, 1, 1, 1, 1};
     const int64_t columns = asked->columns, cells = asked->rows * columns, width = columns + 5;
     const float limit = (float)(asked->tolerance * asked->tolerance) / 4;
     int64_t places[BLOCK / PROBES], i = 0;
-    ALIGNED R u[BLOCK], v[BLOCK], near[2][BLOCK], missed[2][BLOCK];
+    ALIGNED R u[BLOCK], v[BLOCK];
     ALIGNED I ok[BLOCK];
     int left = 0;
     while (i < cells) {
@@ -417,39 +419,158 @@ static int T(settle)(const Lattices *given, const T(Between) *b, const Classific
             u[k] = (R)(STEP * (place % columns) + STEP / 2 * across[k % PROBES]);
             v[k] = (R)(STEP * (place / columns) + STEP / 2 * down[k % PROBES] + given->first_row);
         }
-        int is_refined = 0;
-        for (int k = 0; b->bend >= 0 && k < points; k += PROBES) {
-            const int64_t place = places[k / PROBES], first = (place / columns + 2) * width + place % columns + 2;
-            for (int c = 0; c < 2; c++) {
-                float said[PROBES];
-                T(middles)(asked->nodes + c * asked->node_strides[1] + first, width, 4, said);
-                for (int at = 0; at < PROBES; at++) near[c][k + at] = (R)said[at];
-            }
-        }
-        for (int k = points; k < n; k++) near[0][k] = near[0][points - 1], near[1][k] = near[1][points - 1];
-        if (count && b->bend >= 0 && T(refined_positions)(&given->move, b, n, u, v, near, missed)) {
-            EACH(i) u[i] = near[0][i], v[i] = near[1][i], ok[i] = 1;
-            is_refined = 1;
-        } else if (count) left |= T(moved)(&given->move, b, points, n, u, v, ok);
+        if (count) left |= T(moved)(&given->move, b, points, n, u, v, ok);
         for (int k = 0; k < count; k++) {
             const R *found_u = u + k * PROBES, *found_v = v + k * PROBES;
             const int64_t first = places[k] / columns * width + places[k] % columns; /* of its 6 x 6 nodes */
             float of_each[2];
-            int known = 1, cell = 0;
+            int known = 1, cell = CELL_NEXT;
             for (int at = 0; at < PROBES; at++) known &= ok[k * PROBES + at] != 0;
-            const float by_cubics = is_refined ? T(largest)(missed[0] + k * PROBES, missed[1] + k * PROBES, of_each)
-                                               : T(most_missed)(asked, first, 4, found_u, found_v, of_each);
+            const float by_cubics = T(most_missed)(asked, first, 4, found_u, found_v, of_each);
             if (known && (by_cubics <= limit || (asked->padding == ZEROS && T(is_off)(asked, first, found_u, found_v, of_each)))) {
                 cell = CELL_CUBIC;
             } else if (known) {
-                for (int y = 0; y < 6; y++) known &= !memcmp(asked->mapped + first + y * width, all, sizeof all);
                 /* a quarter of that, and of what cubics miss: where the curvature steps, quintics gain nothing, and swing */
-                if (known && T(most_missed)(asked, first, 6, found_u, found_v, of_each) <= limit / 16) cell = CELL_QUINTIC;
+                if (T(is_inside)(asked, first) && T(most_missed)(asked, first, 6, found_u, found_v, of_each) <= limit / 16) cell = CELL_QUINTIC;
             }
             asked->cells[places[k]] = cell;
         }
     }
     return left;
+}
+
+/* Four rows of nodes, of each coordinate: positions, and by how much they change on the way to the next nodes */
+typedef struct {
+    const float *at[2][4], *across[2][4], *down[2][4];
+} T(Nodes);
+
+/* Those from a row on; of each eight rows in turn the changes have their place */
+static T(Nodes) T(nodes_from)(const Classification *asked, int64_t first) {
+    const int64_t width = asked->columns + 5;
+    T(Nodes) found;
+    for (int i = 0; i < 8; i++) {
+        const int64_t c = i / 4, row = first + i % 4;
+        found.at[c][i % 4] = asked->nodes + c * asked->node_strides[1] + row * width;
+        found.across[c][i % 4] = asked->scratch + (row % 8 * 4 + c) * width;
+        found.down[c][i % 4] = found.across[c][i % 4] + 2 * width;
+    }
+    return found;
+}
+
+/* The changes of a row of nodes, as the slopes of the surface say */
+static void T(add_changes)(const Move *move, const T(Between) *b, const Classification *asked, int64_t row) {
+    const T(Nodes) here = T(nodes_from)(asked, row);
+    const int64_t width = asked->columns + 5;
+    float *to = asked->scratch + row % 8 * 4 * width;
+    R k[2], l[2];
+    ALIGNED R x[BLOCK], y[BLOCK], p[BLOCK], q[BLOCK];
+    T(Jacobian) by;
+    T(plane_of)(move, b->bent, k, l);
+    for (int64_t first = 0; first < width; first += BLOCK, to += BLOCK) {
+        const int some = (int)(width - first < BLOCK ? width - first : BLOCK), n = (some + LANES - 1) & -LANES;
+        for (int i = 0; i < n; i++) {
+            const int64_t at = first + (i < some ? i : some - 1);
+            x[i] = (R)here.at[0][0][at] * k[0] + l[0], y[i] = (R)here.at[1][0][at] * k[1] + l[1];
+        }
+        T(sent_together)(b->bent, n, x, y, p, q, &by);
+        for (int i = 0; i < some; i++) { /* positions by pixels, the inverse */
+            const R one = STEP / (by.ua[i] * by.vb[i] - by.ub[i] * by.va[i]), across = one / b->bent->fx, down = one / b->bent->fy;
+            to[i] = (float)(by.vb[i] * across / k[0]), to[width + i] = (float)(-by.va[i] * across / k[1]);
+            to[2 * width + i] = (float)(-by.ub[i] * down / k[0]), to[3 * width + i] = (float)(by.ua[i] * down / k[1]);
+        }
+    }
+}
+
+/* Between two values, by how much they change */
+INLINE float T(halfway)(float first, float second, float change, float next_change) {
+    return (first + second) / 2 + (change - next_change) / 8;
+}
+
+/* At node k of row r, by how much changes across change on the way down, and the other way round */
+INLINE float T(twist)(const float *const *across, const float *const *down, int r, int64_t k) {
+    return ((across[r + 1][k] - across[r - 1][k]) + (down[r][k + 1] - down[r][k - 1])) / 4;
+}
+
+/* Adds, of a coordinate and of the cell at the k-th of its nodes, by how much what cubics say in its middle and in those of
+   its sides misses what changes at its corners say, in pixels and squared */
+INLINE void T(add_missed)(const float *const *at, const float *const *across, const float *const *down, int64_t k, float half,
+                          float *missed) {
+    float line[4], said[2], change[2];
+    UNROLLED_LOOP for (int r = 0; r < 4; r++) line[r] = T(middle)(at[r] + k - 1, 1, 4);
+    UNROLLED_LOOP for (int i = 0; i < 2; i++) {
+        const int r = 1 + i;
+        const int64_t j = k + i;
+        said[i] = T(halfway)(at[r][k], at[r][k + 1], across[r][k], across[r][k + 1]);
+        change[i] = T(halfway)(down[r][k], down[r][k + 1], T(twist)(across, down, r, k), T(twist)(across, down, r, k + 1));
+        const float side[4] = {at[0][j], at[1][j], at[2][j], at[3][j]};
+        const float beside = (T(halfway)(side[1], side[2], down[1][j], down[2][j]) - T(middle)(side, 1, 4)) * half;
+        const float above = (said[i] - line[r]) * half;
+        missed[i] += above * above, missed[2 + i] += beside * beside;
+    }
+    const float within = (T(halfway)(said[0], said[1], change[0], change[1]) - T(middle)(line, 1, 4)) * half;
+    missed[4] += within * within;
+}
+
+/* Of the cells of a row, the largest of that */
+static NOT_INLINE void T(judge)(T(Nodes) from, int64_t columns, const float *half, float *restrict missed) {
+    for (int64_t j = 0; j < columns; j++) {
+        float of[PROBES] = {0}, most = 0;
+        UNROLLED_LOOP for (int c = 0; c < 2; c++)
+            T(add_missed)(from.at[c], from.across[c], from.down[c], j + 2, half[c], of);
+        UNROLLED_LOOP for (int k = 0; k < PROBES; k++) most = of[k] <= most ? most : of[k]; /* or what is not a number */
+        missed[j] = most;
+    }
+}
+
+/* All pixels of a cell from its corners and the changes there */
+static void T(lay_changes)(const T(Nodes) *from, int64_t cell, const float (*weights)[STEP], R *const *to) {
+    for (int c = 0; c < 2; c++) {
+        float corners[16];
+        for (int k = 0; k < 4; k++) {
+            const int r = 1 + k / 2, at = k / 2 * 4 + k % 2;
+            const int64_t node = cell + 2 + k % 2;
+            corners[at] = from->at[c][r][node], corners[at + 2] = from->across[c][r][node];
+            corners[at + 8] = from->down[c][r][node];
+            corners[at + 10] = T(twist)(from->across[c], from->down[c], r, node);
+        }
+        T(laid)(corners, 4, 4, weights, to[c]);
+    }
+}
+
+/* Of cells in doubt that pixels reach by a surface, within. What changes at the corners say misses a quarter of what cubics
+   through the nodes miss, and less where no curvature steps, so that the difference of both tells of either; but where it
+   changes its sign, that of the cells around */
+static void T(settle_by_changes)(const Lattices *given, const T(Between) *b, const Classification *asked, int is_sure) {
+    const int64_t rows = asked->rows, columns = asked->columns, width = columns + 5;
+    const float half[2] = {(float)asked->source_width / 2, (float)asked->source_height / 2};
+    const float limit = (float)(asked->tolerance * asked->tolerance), near = limit * 9 / 64, far = limit * 4;
+    R *exact[2] = {(R *)given->exact, (R *)given->exact + given->move.cameras * rows * columns * SQUARE};
+    float *missed = asked->scratch + 32 * width, *around = missed + 4 * width;
+    int64_t made = 0, judged = 0;
+    for (int64_t i = 0; i < rows; i++) {
+        int32_t *cells = asked->cells + i * columns;
+        const int64_t before = i > 0 ? i - 1 : 0, behind = i + 1 < rows ? i + 1 : i;
+        int64_t j = 0;
+        while (j < columns && cells[j] != CELL_DOUBT) j++;
+        if (j == columns) continue;
+        for (judged = judged > before ? judged : before; judged <= behind; judged++) {
+            for (made = made > judged + 1 ? made : judged + 1; made < judged + 5; made++) T(add_changes)(&given->move, b, asked, made);
+            T(judge)(T(nodes_from)(asked, judged + 1), columns, half, missed + judged % 4 * width);
+        }
+        const float *here = missed + i % 4 * width, *above = missed + before % 4 * width, *below = missed + behind % 4 * width;
+        for (j = 0; j < columns; j++) around[j + 1] = fmaxf(here[j], fmaxf(above[j], below[j]));
+        around[0] = around[columns + 1] = 0;
+        const T(Nodes) from = T(nodes_from)(asked, i + 1);
+        for (j = 0; j < columns; j++) {
+            if (cells[j] != CELL_DOUBT || !(is_sure || T(is_inside)(asked, i * width + j))) continue;
+            const float most = fmaxf(fmaxf(around[j], around[j + 1]), around[j + 2]) / 16;
+            const float miss = most > here[j] ? most : here[j]; /* or what is not a number */
+            cells[j] = miss <= near ? CELL_CUBIC : miss <= far ? (int32_t)added(given->used, 1) : CELL_NEXT;
+            if (cells[j] < 0) continue;
+            R *const to[2] = {exact[0] + (int64_t)cells[j] * SQUARE, exact[1] + (int64_t)cells[j] * SQUARE};
+            T(lay_changes)(&from, j, b->changes, to);
+        }
+    }
 }
 
 /* All pixels of the cells that quintics are laid in, each from its 6 x 6 nodes */
@@ -469,21 +590,49 @@ static void T(lay_quintics)(const Lattices *given, const Classification *asked) 
     }
 }
 
+/* Whether all pixels of the image lie so far inside of what a surface and the camera before it show that none is moved
+   out of that: no further than its furthest control point is */
+static int T(reaches_all)(const Lattices *given, const T(Between) *b) {
+    const T(Camera) *c = b->bent;
+    const Part *last = c->parts + c->stages;
+    const T(Edge) edge = T(edge_of)(c);
+    const R *k = c->numbers[c->stages] + 4;
+    R most[2] = {0, 0};
+    for (int i = 0; i < 2 * last->n * last->m; i++) most[i % 2] = T(most)(most[i % 2], T(absolute)(k[i]));
+    for (int i = 0; i < 4; i++) {
+        const R u = i % 2 ? (R)(given->cells.width - 1) : 0;
+        const R v = (R)given->first_row + (i / 2 ? (R)(given->cells.height - 1) : 0);
+        const R a = (u - c->cx) / c->fx + (i % 2 ? most[0] : -most[0]), e = (v - c->cy) / c->fy + (i / 2 ? most[1] : -most[1]);
+        if (!T(on_edge)(edge, a, e) || !(b->within2 - (a * a + e * e) > 0)) return 0;
+    }
+    return 1;
+}
+
 static int T(lattice)(const Lattices *given, int64_t camera, T(Between) *b) {
     const Move *move = &given->move;
     Classification asked = given->cells;
     const int64_t cells = asked.rows * asked.columns, nodes = (asked.rows + 5) * (asked.columns + 5);
     const R *at = (const R *)move->results + camera * move->result_strides[0];
-    int left = 0;
+    int64_t wanted = move->count;
+    int left = 0, is_sure = 0;
     T(between)(move, camera, b);
     if (b->bent == &b->from && b->bent->pieces) { /* to a quarter of the tolerance, as cells are held to half of it */
-        const int last = b->bent->stages;
         const R focal = T(most)(T(absolute)(b->bent->fx), T(absolute)(b->bent->fy));
-        b->bend = 2 * focal / (R)asked.tolerance * T(bend_of)(b->bent->parts + last, b->bent->numbers[last]);
+        b->bend = 2 * focal / (R)asked.tolerance * b->bent->curve;
         T(weights_of)(4, b->cubics);
+        for (int k = 0; k < STEP; k++) {
+            const float t = (float)k / STEP, s = 1 - t;
+            b->changes[0][k] = (1 + 2 * t) * s * s, b->changes[1][k] = (1 + 2 * s) * t * t;
+            b->changes[2][k] = t * s * s, b->changes[3][k] = -s * t * t;
+        }
+        if ((b->is_sure = is_sure = T(reaches_all)(given, b))) {
+            wanted = nodes; /* not those at the rim */
+            memset(move->valid + camera * move->count + nodes, 1, (size_t)(move->count - nodes));
+        }
     }
-    for (int64_t i = 0; i < move->count; i += BLOCK)
-        left |= T(move_row)(move, b, i, (int)(move->count - i < BLOCK ? move->count - i : BLOCK));
+    for (int64_t i = 0; i < wanted; i += BLOCK)
+        left |= T(move_row)(move, b, i, (int)(wanted - i < BLOCK ? wanted - i : BLOCK));
+    b->is_sure = 0;
     if (left) return left;
     asked.count = 1, asked.cells += camera * cells, asked.mapped = move->valid + camera * move->count;
     asked.rim = asked.mapped + nodes, asked.nodes = (const float *)at;
@@ -494,24 +643,24 @@ static int T(lattice)(const Lattices *given, int64_t camera, T(Between) *b) {
         asked.nodes = to, asked.node_strides[1] = nodes;
     }
     THIS(classify)(&asked);
+    for (int64_t i = 0; i < cells; i++)
+        if (!asked.cells[i] || (is_sure && asked.cells[i] == CELL_EMPTY)) asked.cells[i] = CELL_NEXT;
+    if (b->bend >= 0) T(settle_by_changes)(given, b, &asked, is_sure);
     if ((left = T(settle)(given, b, &asked))) return left;
-    int64_t most = 0;
-    for (int64_t i = 0; i < cells; i++) most += asked.cells[i] == 0;
-    if (8 * most > 7 * cells) return LEFT_MOST;
-    static const int32_t wanted[2] = {0, CELL_NEXT};
-    for (int turn = 0; turn < 2; turn++) {
-        int64_t places[BLOCK / SQUARE], found;
-        do { /* those that are next turn up ahead, and behind */
-            int count = 0;
-            found = 0;
-            for (int64_t i = 0; i < cells || count; i++) {
-                if (i < cells && asked.cells[i] == wanted[turn]) places[count++] = i;
-                if (count < BLOCK / SQUARE && (i < cells || !count)) continue;
-                left |= T(squares)(given, b, &asked, places, count, added(given->used, count));
-                found += count, count = 0;
-            }
-        } while (found && turn);
-    }
+    int64_t most = 0, found;
+    for (int64_t i = 0; i < cells; i++) most += asked.cells[i] == CELL_NEXT;
+    if (b->bend < 0 && 8 * most > 7 * cells) return LEFT_MOST;
+    do { /* those that are next turn up ahead, and behind */
+        int64_t places[BLOCK / SQUARE];
+        int count = 0;
+        found = 0;
+        for (int64_t i = 0; i < cells || count; i++) {
+            if (i < cells && asked.cells[i] == CELL_NEXT) places[count++] = i;
+            if (count < BLOCK / SQUARE && (i < cells || !count)) continue;
+            left |= T(squares)(given, b, &asked, places, count, added(given->used, count));
+            found += count, count = 0;
+        }
+    } while (found);
     T(lay_quintics)(given, &asked);
     return left;
 }

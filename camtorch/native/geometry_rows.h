@@ -67,6 +67,7 @@ static void T(prepare)(const Cameras *all, int64_t camera, T(Camera) *c) {
         if (all->pieces) {
             const Part *last = c->parts + c->stages;
             c->pieces = (const R *)all->pieces + camera * PIECE * (last->n - last->flags) * (last->m - last->flags);
+            c->curve = T(bend_of)(last, c->numbers[c->stages]);
         }
         c->start = all->start ? (const R *)all->start + camera * START : NULL;
         c->table = all->table ? (const R *)all->table + camera * (2 + 2 * NODES) : NULL;
@@ -726,7 +727,8 @@ static void T(start)(const T(Camera) *c, int first, int n, const R *u, const R *
     }
 }
 
-/* `bend`: see `start_of`, or none where nothing is known of it */
+/* bend: what Newton's method leaves of a step: it times the step's square times the size of the Jacobian and over its
+   determinant, to be less than 1; or none where nothing is known of it */
 INLINE I T(step_of)(R *a, R *b, R du, R dv, R ua, R ub, R va, R vb, const R *bend, I ok) {
     R da, db;
     const R one = T(absolute)(T(step)(ua, ub, va, vb, du, dv, &da, &db)), p = *a + da, q = *b + db, step2 = da * da + db * db;
@@ -751,8 +753,11 @@ static void T(newton_step)(const T(Camera) *c, int first, int n, const R *restri
             T(planar_slopes)(k, a[i], b[i], x[i], y[i], &ua, &ub, &va, &vb);
             ok[i] = T(step_of)(a + i, b + i, u[i] - p, v[i] - q, ua, ub, va, vb, NULL, ok[i]);
         }
-    } else if (first == c->stages && c->pieces && c->start) {
-        const R *k = c->numbers[first], sa = k[0], sb = k[1], bend = c->start[4];
+    } else if (first == c->stages && c->pieces) {
+        const Part *part = c->parts + first;
+        const R *k = c->numbers[first], sa = k[0], sb = k[1];
+        const R half_a = (R)(part->n - part->flags) / 2 / sa, half_b = (R)(part->m - part->flags) / 2 / sb;
+        const R bend = c->curve * 2 / EPS / T(root)(half_a * half_a + half_b * half_b);
         ALIGNED R low[4 * BLOCK], high[4 * BLOCK], down[4 * BLOCK];
         T(patches_of)(c, 1, n, a, b, x, low, high, down);
         EACH(i) {
@@ -823,7 +828,7 @@ static void T(search)(const T(Camera) *c, int n, const R *restrict u, const R *r
 /* `invert`, from a table and a few steps; what is not `ok`, and yet possible, is left */
 static void T(invert)(const T(Camera) *c, int n, const R *restrict u, const R *restrict v, R *restrict a, R *restrict b,
                       I *restrict ok, I *restrict possible) {
-    const int fewest = (IS_DOUBLE ? 3 : 2) - !!c->start;
+    const int fewest = (IS_DOUBLE ? 3 : 2) - !!c->pieces;
     ALIGNED R p[BLOCK], q[BLOCK];
     if (c->is_radial) {
         T(invert_radial)(c, n, u, v, a, b, ok, possible);

@@ -80,6 +80,24 @@ def test_the_image_moves_as_the_keypoints_do(key):
     torch.testing.assert_close(seen[valid & inside], out["keypoints"][valid & inside], rtol=0, atol=2e-3)
 
 
+@pytest.mark.parametrize("side", [64, 128, 256])
+@pytest.mark.parametrize("grid", [3, 4, 6, 12])
+def test_images_keep_the_tolerance_and_do_not_hang_on_the_batch(side, grid):
+    """Cells of a lattice that cubics, the surface's slopes or Newton's steps lay, on small images too."""
+    camera = ct.BrownConrady([1.1 * side] * 2 + [side / 2] * 2, [0.1, -0.05, 0.001, -0.001, 0], image_size=(side, side))
+    elastic = ct.augment.RandomElastic(amount=0.02, grid=grid, camera=camera.requires_grad_(False))
+    image = torch.rand(1, side, side, generator=torch.Generator().manual_seed(0))
+    for seed in range(3):
+        draw = elastic.draw(1, torch.Generator().manual_seed(seed))
+        alone = elastic({"image": image}, draw=draw)
+        batch = elastic({"image": image[None]}, draw=draw)
+        assert torch.equal(alone["image"], batch["image"][0])
+        assert torch.equal(alone["camera"].distortion, batch["camera"].distortion.view(-1))
+        exact = ct.Warp(copy.deepcopy(camera).double(), copy.deepcopy(alone["camera"]).double(), tolerance=0.0)
+        off = (exact.grid() - ct.Warp(camera, alone["camera"]).grid())[exact.valid_mask()[:, 0]].norm(dim=-1)
+        assert off.max() * side / 2 < 0.001
+
+
 def test_batches_front_ends_and_cut_images():
     camera = ct.KannalaBrandt([250.0, 250, 320, 240], [0.05, -0.01, 0, 0], image_size=(480, 640)).requires_grad_(False)
     face = camera.crop(40, 420, 64, 64)  # whose principal point lies far outside
@@ -132,7 +150,8 @@ def test_it_goes_through_pickles_and_files_whatever_it_was_before(key, windshiel
 
 def test_files_hold_it(tmp_path):
     camera = ct.Pinhole.from_fov(60, image_size=(48, 64)).double().requires_grad_(False)
-    bent = ct.augment.RandomElastic(amount=0.03)({"image": torch.rand(1, 48, 64), "camera": camera})["camera"]
+    elastic = ct.augment.RandomElastic(amount=0.03, grid=6)
+    bent = elastic({"image": torch.rand(1, 48, 64), "camera": camera})["camera"]
     ct.save(bent, tmp_path / "bent.json")
     found = ct.load(tmp_path / "bent.json").camera
     assert found.key == bent.key == "pinhole:elastic=10,10"
@@ -145,7 +164,8 @@ def test_files_hold_it(tmp_path):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"amount": 0.1}, "amount must be below 0.0417 for 6 cells"),
+        ({"amount": 0.1, "grid": 6}, "amount must be below 0.0417 for 6 cells"),
+        ({"amount": 0.1}, "amount must be below 0.0625 for 4 cells"),
         ({"amount": (-0.01, 0.01)}, "amount must lie within"),
         ({"grid": 0}, "grid must be from 1 to 32 cells"),
         ({"grid": (3, 4, 5)}, "grid must be"),

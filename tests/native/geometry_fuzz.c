@@ -58,7 +58,8 @@ void sample_image_fuzzed(const Job *job, int64_t b) { sampled += b >= 0 && b < j
 int32_t classify_fuzzed(const Classification *given) {
     int32_t todo = 0;
     for (int64_t i = 0; i < given->rows * given->columns; i++) {
-        given->cells[i] = CELL_EMPTY + (int32_t)below(3);
+        const int32_t kinds[4] = {CELL_DOUBT, CELL_EMPTY, CELL_CUBIC, 0};
+        given->cells[i] = kinds[below(4)];
         todo += given->cells[i] == 0;
     }
     given->scratch[SCRATCH * (given->columns + 8) - 1] = given->nodes[given->node_strides[1]];
