@@ -86,7 +86,10 @@ def as_real(value: Numbers, name: str, owner: str) -> Tensor:
     else:
         finite = not is_concrete(value) or is_predicted(value) or bool(torch.isfinite(value).all())
     if not finite:
-        raise ValueError(f"{owner}: {name} must be finite; got {value.detach().tolist()}")
+        wrong = (~value.detach().isfinite()).nonzero()
+        first = wrong[0].tolist()
+        place = f", first {name}{first} = {value[tuple(first)].item()}" if first else ""
+        raise ValueError(f"{owner}: {name} must be finite; {len(wrong)} of {value.numel()} numbers are not{place}")
     return value
 
 

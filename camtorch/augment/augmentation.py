@@ -600,9 +600,9 @@ def _are_alike(value: Any) -> bool:
 # -- for front ends, which hold an augmentation and the camera of their images
 
 
-def check_front_end(owner: str, augmentation: object, camera: object) -> None:
-    """Raise a TypeError unless this is an augmentation, and that a camera or None."""
-    if not isinstance(augmentation, Augmentation):
+def check_front_end(owner: str, augmentation: object, camera: object, *kinds: type[SampleTransform]) -> None:
+    """Raise a TypeError unless this is an augmentation, or one of other kinds, and that a camera or None."""
+    if not isinstance(augmentation, kinds or Augmentation):
         raise TypeError(f"{owner}: augmentation must be an Augmentation; got {type(augmentation).__name__}")
     if camera is not None and not isinstance(camera, Camera):
         raise TypeError(f"{owner}: camera must be a Camera; got {no_camera(camera)}")

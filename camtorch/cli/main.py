@@ -28,7 +28,9 @@ class _Parser(argparse.ArgumentParser):
         super().__init__(allow_abbrev=False, **options)
 
     def error(self, message: str) -> NoReturn:
-        raise ValueError(f"{message} (see {self.prog} --help)")
+        rest = message.removeprefix("unrecognized arguments: ")
+        hint = "" if rest == message or rest.startswith("-") else f"; -o {rest.split()[0]} names what is written"
+        raise ValueError(f"{message}{hint} (see {self.prog} --help)")
 
 
 class _Version(argparse.Action):
