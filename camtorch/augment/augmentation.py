@@ -39,7 +39,7 @@ from camtorch.warp.warp import Warp
 if TYPE_CHECKING:
     from typing_extensions import Unpack
 
-_FEW = 2 / 3  # of an image that shows something: with less than that, on average, a warning says so
+_FEW = 2 / 3  # of what an image shows of its own camera: with less than that, on average, a warning says so
 _TRIES = 8
 _CPU = torch.device("cpu")
 
@@ -236,8 +236,8 @@ class Augmentation(SampleTransform):
         min_filled: the part of every new image, from 0 to 1, that has to show something of the old one. As far as it
             takes, the new camera zooms, and where four times are not enough it turns less far. This follows from the
             camera and the draw, and so does a replay. A warning tells once if a source cannot fill so much. None
-            leaves images as they are drawn, and warns once where more than a third of them is going to be empty; so
-            does 0, without a word.
+            leaves images as they are drawn, and warns once where more than a third of what the old ones show is going
+            to be empty; so does 0, without a word.
 
     Raises:
         ValueError: a p or a min_filled outside of [0, 1], an unknown kind of field or way to sample.
@@ -484,7 +484,8 @@ class Augmentation(SampleTransform):
             first = camera.detach()
             first = first[[0] * _TRIES] if first.batch_shape else first
             shares = filled(first, *self._new_camera(first, self._values(first, values)))
-        if shares.mean() < _FEW:
+            own = filled(first, first, None)  # of a fisheye's circle less than all
+        if shares.mean() < _FEW * own.mean():
             warn(
                 f"{self._name}: of the new images {1 - float(shares.mean()):.0%} will show nothing, and of some "
                 f"{1 - float(shares.min()):.0%}, as the camera of the images does not see so far. min_filled=0.9 zooms "

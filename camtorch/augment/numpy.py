@@ -258,7 +258,8 @@ def as_array(image: Tensor, like: Array) -> Array:
 def _checked(name: str, value: object) -> Array:
     if not isinstance(value, np.ndarray) or value.dtype.kind not in "biuf":
         what = f"dtype {value.dtype}" if isinstance(value, np.ndarray) else type(value).__name__
-        raise TypeError(f"{_OWNER}: {name} must be a numpy array of real numbers; got {what}")
+        hint = f"; np.array({name}) makes one of it" if hasattr(value, "__array_interface__") else ""
+        raise TypeError(f"{_OWNER}: {name} must be a numpy array of real numbers; got {what}{hint}")
     return value
 
 

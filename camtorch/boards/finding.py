@@ -123,8 +123,9 @@ def _given(images: Any) -> list[tuple[Path, NDArray[Any] | None]]:
     for i, one in enumerate(images):
         if isinstance(one, (str, os.PathLike)):
             given += [(path, None) for path in gather([os.fspath(one)])]
-        elif isinstance(one, (np.ndarray, torch.Tensor)):
-            given.append((Path(f"image {i}"), _grey_of(one, f"images[{i}]")))
+        elif isinstance(one, torch.Tensor) or hasattr(one, "__array_interface__"):  # as images of PIL have it
+            array = one if isinstance(one, torch.Tensor) else np.asarray(one)
+            given.append((Path(f"image {i}"), _grey_of(array, f"images[{i}]")))
         else:
             raise TypeError(f"{_OWNER}: images[{i}] must be a path or an array; got {shown(one)}")
     return given

@@ -29,7 +29,8 @@ class _Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         rest = message.removeprefix("unrecognized arguments: ")
-        hint = "" if rest == message or rest.startswith("-") else f"; -o {rest.split()[0]} names what is written"
+        is_file = rest != message and not rest.startswith("-") and os.path.splitext(rest)[1]
+        hint = f"; -o {rest.split()[0]} names what is written" if is_file else ""
         raise ValueError(f"{message}{hint} (see {self.prog} --help)")
 
 

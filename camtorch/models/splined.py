@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from camtorch._arguments import as_whole, values_of
+from camtorch._arguments import as_whole, hinting, values_of
 from camtorch._freezing import INTRINSICS, frozen_names
 from camtorch.camera import Camera
 from camtorch.optics import Chart, Lens, Surface, Unified
@@ -63,6 +63,7 @@ class Splined(Camera):
     quarter_turn = None
 
     @classmethod
+    @hinting("By name: ct.Splined.with_grid(columns=16, rows=11, fov_x=120), mrcal's Nx, Ny and fov_x_deg")
     def with_grid(cls, *, columns: int, rows: int, fov_x: float, order: int = 3) -> type[Splined]:
         """The class of cameras of another grid: a model for `convert`, `calibrate` and files as any other.
 
