@@ -179,7 +179,10 @@ def as_vectors(value: Numbers, name: str, owner: str) -> Tensor:
     elif vectors.ndim and vectors.shape[-1] == 3:
         return vectors
     else:
-        raise ValueError(f"{owner}: {name} must be (*B, 3); got shape {tuple(vectors.shape)}")
+        hint = (
+            ". Of a quaternion it is scipy's Rotation.from_quat(xyzw).as_rotvec()" if vectors.shape[-1:] == (4,) else ""
+        )
+        raise ValueError(f"{owner}: {name} must be (*B, 3); got shape {tuple(vectors.shape)}{hint}")
     if isinstance(value, nn.Parameter):  # the module could not own it
         raise ValueError(f"{owner}: the Parameter {name} must be (*B, 3); got shape {tuple(vectors.shape)}")
     return flat
@@ -200,7 +203,7 @@ def as_image_size(value: Any, owner: str, name: str = "image_size") -> tuple[int
             raise TypeError
         height, width = (operator.index(side) for side in value)
     except (TypeError, ValueError):
-        raise TypeError(f"{owner}: {name} must be two integers (height, width); got {value!r}") from None
+        raise TypeError(f"{owner}: {name} must be two integers (height, width); got {shown(value)}") from None
     if height <= 0 or width <= 0:
         raise ValueError(f"{owner}: {name} must be positive (height, width); got {(height, width)}")
     return height, width

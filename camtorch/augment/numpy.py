@@ -114,12 +114,7 @@ class Transform:
         return f"Transform({self.augmentation!r})"
 
     def _moved(
-        self,
-        move: Callable[..., Sample],
-        sample: Mapping[str, Any] | None,
-        fields: Sample,
-        options: Mapping[str, Any],
-        otherwise: Camera | None = None,
+        self, move: Callable[..., Sample], sample: Any, fields: Sample, options: Sample, otherwise: Camera | None = None
     ) -> Sample:
         if sample is not None and not isinstance(sample, Mapping):
             raise TypeError(

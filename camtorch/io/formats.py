@@ -130,15 +130,11 @@ def _read(path: str, content: bytes, format: str | None) -> tuple[Rig, str]:
         if format == by_keys.NAMES.format or (format is None and by_keys.matches(keys)):
             return by_keys.parse(Record(path, keys)), by_keys.NAMES.format
     shown = ", ".join(f"{key!r:.30}" for key in list(keys)[:5]) or "none"
-    hint = (
-        ""
-        if "fx" not in keys
-        else (
-            "; a camera of these numbers is ct.BrownConrady([fx, fy, cx, cy], [k1, k2, p1, p2], image_size=(height, "
-            "width)), or a ct.KannalaBrandt, a ct.Pinhole and so on; where (0, 0) lies, whoever wrote the file knows"
+    if "fx" in keys:
+        shown += (
+            "; a camera of numbers is ct.BrownConrady([fx, fy, cx, cy], [k1, k2, p1, p2], image_size=(height, width))"
         )
-    )
-    raise CameraFileError(path, "content", f"no format that is known here has the keys {shown}{hint}")
+    raise CameraFileError(path, "content", f"no format that is known here has the keys {shown}")
 
 
 def save(rig: Rig | Camera, path: str | os.PathLike[str], format: str | None = None) -> None:

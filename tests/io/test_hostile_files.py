@@ -171,7 +171,7 @@ def array(shape, data=b"", descr="<f8"):
         (
             "a.json",
             '{"fx": 9, "fy": 9, "cx": 4, "cy": 4}',
-            r"'cy'; a camera of these numbers is ct.BrownConrady\(\[fx,",
+            r"'cy'; a camera of numbers is ct.BrownConrady\(\[fx,",
         ),
         ("a.json", '{"\\n\\u0000": {"K": 1}}', "no format that is known here"),
         ("a.xml", '<!DOCTYPE x [<!ENTITY a "b">]>' + XML.format("&a;"), "line 1: a document type"),

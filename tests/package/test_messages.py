@@ -55,6 +55,12 @@ WRONG = [
     (lambda: ct.Pinhole([20.0, 20, 15, 11], [0.1, 0, 0, 0]), ValueError, r"Pinhole: it has no distortion, .*\(4,\)"),
     (lambda: ct.Pinhole(torch.eye(4)), ValueError, r"focal lengths .* Of matrices \(4, 4\) use Pinhole.from_matrix\(K"),
     (lambda: ct.Pinhole.from_matrix(torch.eye(4)), ValueError, r"got shape \(4, 4\)\. Of larger ones it is K\[..., :3"),
+    (lambda: ct.Extrinsics([0.0, 0, 0, 1], [0.0, 0, 0]), ValueError, r"got shape \(4,\)\. Of a quaternion .*from_quat"),
+    (
+        lambda: ct.Pinhole([9.0] * 4, image_size=np.eye(3)),
+        TypeError,
+        r"\(height, width\); got ndarray of shape \(3, 3\)",
+    ),
     (lambda: ct.Extrinsics(0, 0, 1), TypeError, r"It takes ct.Extrinsics\(\[rx, ry, rz\], \[tx, ty, tz\]\)"),
     (lambda: CAMERA.resize((12, 16)), TypeError, r"It takes camera.resize\(height, width\), two numbers"),
     (
