@@ -28,9 +28,9 @@ class _Parser(argparse.ArgumentParser):
         super().__init__(allow_abbrev=False, **options)
 
     def error(self, message: str) -> NoReturn:
-        rest = message.removeprefix("unrecognized arguments: ")
-        is_file = rest != message and not rest.startswith("-") and os.path.splitext(rest)[1]
-        hint = f"; -o {rest.split()[0]} names what is written" if is_file else ""
+        name = message.partition("unrecognized arguments: ")[2].split(" ")[0]
+        is_new = os.path.splitext(name)[1] and not name.startswith("-") and not os.path.exists(name)
+        hint = f"; -o {name} names what is written" if is_new else ""
         raise ValueError(f"{message}{hint} (see {self.prog} --help)")
 
 

@@ -128,6 +128,7 @@ CASES = {
             "map camera.yml a.npz --size 9x9",
             "unrecognized arguments: a.npz; -o a.npz names what is written (see camtorch",
         ),
+        ("show camera.yml bad.yml", "unrecognized arguments: bad.yml (see camtorch --help)"),
         ("map camera.yml --sise 9x9", "unrecognized arguments: --sise 9x9 (see camtorch --help)"),
         ("map camera.yml -o a.bin", "does not say the format"),
         ("map camera.yml -o camera.yml --format obj", "would overwrite camera.yml"),
