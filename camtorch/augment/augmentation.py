@@ -86,10 +86,11 @@ def as_range(
         TypeError: neither a number nor two. ValueError: NaN, the wrong order, or outside of [least, most].
     """
     try:
-        if isinstance(value, Iterable):
+        if isinstance(value, Iterable) and not isinstance(value, str):
             low, high = map(float, value)
         else:
-            low, high = around - float(value), around + float(value)  # type: ignore[arg-type]
+            number = as_number(value, name, owner)
+            low, high = around - number, around + number
     except (TypeError, ValueError, RuntimeError, OverflowError):
         raise TypeError(f"{owner}: {name} must be a range (low, high) or a number; got {shown(value)}") from None
     if not (math.isfinite(low) and math.isfinite(high)):

@@ -294,10 +294,8 @@ def check_values(kind: str, name: str, value: Tensor, owner: str) -> None:
 
 
 def _tell_of_parts(name: str, boxes: Tensor, owner: str) -> None:
-    """Warn of plain boxes that all lie between the centres of the first pixels, as parts of an image's sides do."""
-    if not may_look(boxes) or boxes.requires_grad:
-        return
-    if bool(((boxes >= 0) & (boxes <= 1)).all()) and bool((boxes % 1 != 0).any()):
+    """Warn of boxes that all lie between the centres of the first pixels, as parts of an image's sides do."""
+    if may_look(boxes) and bool((boxes == boxes.clamp(0, 1)).all() & (boxes % 1 != 0).any()):
         warn(
             f"{owner}: {name} must be pixels x1, y1, x2, y2, and all of these lie within [0, 1], as parts of an "
             "image's width and height do: times width and height, less 0.5, those are pixels"

@@ -244,6 +244,7 @@ WRONG = [
     (lambda: ct.Dewarp(CAMERA, fov="90"), TypeError, r"Dewarp: fov must be a number; got"),
     # augmentations
     (lambda: augment.RandomMount(zoom=1.0), ValueError, r"zoom must lie within .*got 1.0, which stands for \(0, 2\)"),
+    (lambda: augment.RandomMount(yaw="12"), TypeError, r"yaw must be a range \(low, high\) or a number; got '12'"),
     (lambda: augment.RandomMount(10), TypeError, r"were given\. By name: RandomMount\(yaw=..., pitch=..., roll"),
     (lambda: augment.Resize(12, 16), TypeError, r"were given\. By name: Resize\(size=...\)"),
     (lambda: arrays.Transform(MOUNT, np.eye(3)), TypeError, r"numpy.Transform: camera must be a Camera; got ndarray"),
