@@ -59,7 +59,8 @@ def find_board(images: Any, board: Any, *, square: float = 1.0, **options: Any) 
 
     Args:
         images: a path, a folder, a pattern as "photos/*.jpg", or a list of these; or arrays (H, W), (H, W, C), tensors
-            (C, H, W), one, a list, or a stack of them, uint8 or uint16 (floating point is taken as 0 to 1).
+            (C, H, W), one, a list, or a stack of them, uint8 or uint16 (floating point is taken as 0 to 1); or a list
+            of PIL's images.
         board: "9x6", the inner corners of a chessboard across and down, or (9, 6); "charuco 5x7", squares; "aprilgrid
             6x6", tags.
         square: the side of a square, or of a tag, in the unit that poses shall have.
