@@ -86,7 +86,10 @@ def as_real(value: Numbers, name: str, owner: str) -> Tensor:
     else:
         finite = not is_concrete(value) or is_predicted(value) or bool(torch.isfinite(value).all())
     if not finite:
-        raise ValueError(f"{owner}: {name} must be finite; got {value.detach().tolist()}")
+        wrong = (~value.detach().isfinite()).nonzero()
+        first = wrong[0].tolist()
+        place = f", first {name}{first} = {value[tuple(first)].item()}" if first else ""
+        raise ValueError(f"{owner}: {name} must be finite; {len(wrong)} of {value.numel()} numbers are not{place}")
     return value
 
 
@@ -176,7 +179,10 @@ def as_vectors(value: Numbers, name: str, owner: str) -> Tensor:
     elif vectors.ndim and vectors.shape[-1] == 3:
         return vectors
     else:
-        raise ValueError(f"{owner}: {name} must be (*B, 3); got shape {tuple(vectors.shape)}")
+        hint = (
+            ". Of a quaternion it is scipy's Rotation.from_quat(xyzw).as_rotvec()" if vectors.shape[-1:] == (4,) else ""
+        )
+        raise ValueError(f"{owner}: {name} must be (*B, 3); got shape {tuple(vectors.shape)}{hint}")
     if isinstance(value, nn.Parameter):  # the module could not own it
         raise ValueError(f"{owner}: the Parameter {name} must be (*B, 3); got shape {tuple(vectors.shape)}")
     return flat
@@ -197,7 +203,7 @@ def as_image_size(value: Any, owner: str, name: str = "image_size") -> tuple[int
             raise TypeError
         height, width = (operator.index(side) for side in value)
     except (TypeError, ValueError):
-        raise TypeError(f"{owner}: {name} must be two integers (height, width); got {value!r}") from None
+        raise TypeError(f"{owner}: {name} must be two integers (height, width); got {shown(value)}") from None
     if height <= 0 or width <= 0:
         raise ValueError(f"{owner}: {name} must be positive (height, width); got {(height, width)}")
     return height, width

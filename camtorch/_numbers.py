@@ -357,6 +357,11 @@ def warn_of_order(intrinsics: Tensor, size: tuple[int, int], owner: str) -> None
             f"{owner}: {given} have their principal point far from the middle of images of {size}, and seem to be "
             f"fx, cx, fy, cy; both focal lengths come first. {cut_out}",
         )
+    elif all(20 * max(fx, fy) < min(size) and max(abs(cx - 0.5), abs(cy - 0.5)) < 0.2 for fx, fy, cx, cy in rows):
+        warn(
+            f"{owner}: {given} seem to be parts of the image's width and height; in pixels fx and cx are times width, "
+            "fy and cy times height, and the principal point is less 0.5"
+        )
 
 
 def warn_of_exchange(old: tuple[int, int], new: tuple[int, int], owner: str) -> None:

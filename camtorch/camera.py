@@ -604,6 +604,7 @@ class Camera(Freezable):
         left, right, top, bottom = (as_whole(value, name, "pad") for value, name in sides)
         return edited_by(self, ((1, 0, left), (0, 1, top)), (height + top + bottom, width + left + right))
 
+    @hinting("It takes camera.resize(height, width), two numbers")
     def resize(self, height: int, width: int) -> Self:
         """The camera of the image scaled to that size; pixel edges scale, as with align_corners=False.
 

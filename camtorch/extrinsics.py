@@ -62,7 +62,7 @@ class Extrinsics(BatchedModule):
         if translation is None:
             raise TypeError(
                 f"Extrinsics: translation is missing beside rotation, a {shown(rotation)}; "
-                "ct.Extrinsics.from_matrix(T) takes a matrix (4, 4), and translation=[0.0, 0.0, 0.0] is none"
+                "ct.Extrinsics.from_matrix(T) takes a matrix (4, 4), mrcal's rt is rt[:3], rt[3:], [0.0, 0, 0] is none"
             )
         translation = as_vectors(translation, "translation", "Extrinsics")
         # columns (3, 3, 1) are vectors without a doubt

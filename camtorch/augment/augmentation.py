@@ -39,7 +39,7 @@ from camtorch.warp.warp import Warp
 if TYPE_CHECKING:
     from typing_extensions import Unpack
 
-_FEW = 2 / 3  # of an image that shows something: with less than that, on average, a warning says so
+_FEW = 2 / 3  # of what an image shows of its own camera: with less than that, on average, a warning says so
 _TRIES = 8
 _CPU = torch.device("cpu")
 
@@ -86,10 +86,11 @@ def as_range(
         TypeError: neither a number nor two. ValueError: NaN, the wrong order, or outside of [least, most].
     """
     try:
-        if isinstance(value, Iterable):
+        if isinstance(value, Iterable) and not isinstance(value, str):
             low, high = map(float, value)
         else:
-            low, high = around - float(value), around + float(value)  # type: ignore[arg-type]
+            number = as_number(value, name, owner)
+            low, high = around - number, around + number
     except (TypeError, ValueError, RuntimeError, OverflowError):
         raise TypeError(f"{owner}: {name} must be a range (low, high) or a number; got {shown(value)}") from None
     if not (math.isfinite(low) and math.isfinite(high)):
@@ -236,8 +237,8 @@ class Augmentation(SampleTransform):
         min_filled: the part of every new image, from 0 to 1, that has to show something of the old one. As far as it
             takes, the new camera zooms, and where four times are not enough it turns less far. This follows from the
             camera and the draw, and so does a replay. A warning tells once if a source cannot fill so much. None
-            leaves images as they are drawn, and warns once where more than a third of them is going to be empty; so
-            does 0, without a word.
+            leaves images as they are drawn, and warns once where more than a third of what the old ones show is going
+            to be empty; so does 0, without a word.
 
     Raises:
         ValueError: a p or a min_filled outside of [0, 1], an unknown kind of field or way to sample.
@@ -484,7 +485,8 @@ class Augmentation(SampleTransform):
             first = camera.detach()
             first = first[[0] * _TRIES] if first.batch_shape else first
             shares = filled(first, *self._new_camera(first, self._values(first, values)))
-        if shares.mean() < _FEW:
+            own = filled(first, first, None)  # of a fisheye's circle less than all
+        if shares.mean() < _FEW * own.mean():
             warn(
                 f"{self._name}: of the new images {1 - float(shares.mean()):.0%} will show nothing, and of some "
                 f"{1 - float(shares.min()):.0%}, as the camera of the images does not see so far. min_filled=0.9 zooms "
@@ -600,9 +602,9 @@ def _are_alike(value: Any) -> bool:
 # -- for front ends, which hold an augmentation and the camera of their images
 
 
-def check_front_end(owner: str, augmentation: object, camera: object) -> None:
-    """Raise a TypeError unless this is an augmentation, and that a camera or None."""
-    if not isinstance(augmentation, Augmentation):
+def check_front_end(owner: str, augmentation: object, camera: object, *kinds: type[SampleTransform]) -> None:
+    """Raise a TypeError unless this is an augmentation, or one of other kinds, and that a camera or None."""
+    if not isinstance(augmentation, kinds or Augmentation):
         raise TypeError(f"{owner}: augmentation must be an Augmentation; got {type(augmentation).__name__}")
     if camera is not None and not isinstance(camera, Camera):
         raise TypeError(f"{owner}: camera must be a Camera; got {no_camera(camera)}")

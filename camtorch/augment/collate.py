@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
+from torch.utils.data import get_worker_info
 from torch.utils.data._utils.collate import collate as collate_by
 from torch.utils.data._utils.collate import default_collate_fn_map
 
@@ -43,6 +44,8 @@ def collate(samples: Sequence[object]) -> object:
 
 
 def _tensors(batch: Sequence[Tensor], *, collate_fn_map: Any = None) -> Tensor | list[Tensor]:
+    if get_worker_info() is not None:  # which no graph can leave
+        batch = [tensor.detach() for tensor in batch]
     if len({tensor.shape for tensor in batch}) > 1:
         return list(batch)
     sent = stacked(batch)

@@ -28,6 +28,7 @@ from camtorch.augment.augmentation import Augmentation, check_front_end, check_s
 from camtorch.augment.change import Change
 from camtorch.augment.collate import collate_cameras
 from camtorch.augment.presets import PresetName
+from camtorch.augment.sample import on_samples
 from camtorch.camera import Camera
 from camtorch.warp.sampling import Mode
 
@@ -189,6 +190,7 @@ class CameraAugmentation(GeometricAugmentationBase2D):
 
     # -- moving
 
+    @on_samples
     def _move(self, params: Params, value: Tensor, move: Callable[[Change, Tensor], Any], back: bool = False) -> Any:
         """`move(change, value)`, in the dtype of the value; positions in half precision would be off by pixels."""
         with torch.autocast(value.device.type, enabled=False):

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from camtorch.augment.augmentation import Augmentation
+from camtorch.augment.augmentation import Augmentation, check_front_end
 from camtorch.augment.change import Change
 from camtorch.augment.face import FaceNormalizer
 from camtorch.augment.sample import IMAGES, KINDS, OWN, Sample, Single, check, kind_of
@@ -41,7 +41,7 @@ class Transform:
       the centre of the top-left one at (0, 0). Boxes between pixel edges, albumentations' "pascal_voc", are these
       plus 0.5.
     * `gaze` (3,), `head_pose` (4, 4), `rvec` (3,), `tvec` (3,), `points` (N, 3), and all other fields.
-    * `camera`: the camera of the images, unless the augmentation has one. Edits, and `Compose` of them, need none.
+    * `camera`: the camera of the images, unless this or the augmentation has one. Edits need none.
 
     Whatever is no field is passed on as it is. All arrays come out with the layout and the dtype that they came in
     with, but coordinates of whole numbers come out in float32. Beside them come `keypoints_valid` (N,), `bboxes_valid`
@@ -54,17 +54,15 @@ class Transform:
 
     Args:
         augmentation: what to do.
+        camera: of samples that hold none; by default the augmentation's.
 
     Raises:
-        TypeError: it is no augmentation.
+        TypeError: it is no augmentation; a camera that is none.
     """
 
-    def __init__(self, augmentation: Augmentation | FaceNormalizer):
-        if not isinstance(augmentation, (Augmentation, FaceNormalizer)):
-            raise TypeError(
-                f"{_OWNER}: augmentation must be an augmentation of camtorch; got {type(augmentation).__name__}"
-            )
-        self.augmentation = augmentation
+    def __init__(self, augmentation: Augmentation | FaceNormalizer, camera: Camera | None = None):
+        check_front_end(_OWNER, augmentation, camera, Augmentation, FaceNormalizer)
+        self.augmentation, self.camera = augmentation, camera
         self._ways: dict[Any, Callable[[str, Array], tuple[dict[str, Tensor], Restore]]] = {}
 
     def __call__(
@@ -91,7 +89,7 @@ class Transform:
                 real numbers.
         """
         options = {"draw": draw, "generator": generator}
-        return self._moved(self.augmentation.forward, sample, fields, options)
+        return self._moved(self.augmentation.forward, sample, fields, options, self.camera)
 
     def inverse(
         self,
@@ -102,7 +100,7 @@ class Transform:
         **fields: Any,
     ) -> Sample:
         """Move a sample back, see `Augmentation.inverse`: by the last call's change, or by `draw` and its `camera`."""
-        options = {} if draw is None else {"draw": draw, "camera": camera}
+        options = {} if draw is None else {"draw": draw, "camera": self.camera if camera is None else camera}
         if draw is None and camera is not None:
             fields["camera"] = camera
         return self._moved(self.augmentation.inverse, sample, fields, options)
@@ -116,13 +114,15 @@ class Transform:
         return f"Transform({self.augmentation!r})"
 
     def _moved(
-        self, move: Callable[..., Sample], sample: Mapping[str, Any] | None, fields: Sample, options: Mapping[str, Any]
+        self, move: Callable[..., Sample], sample: Any, fields: Sample, options: Sample, otherwise: Camera | None = None
     ) -> Sample:
         if sample is not None and not isinstance(sample, Mapping):
             raise TypeError(
                 f"{_OWNER}: the fields go in by name, as in transform(image=...); got {type(sample).__name__}"
             )
         sample = {**(sample or {}), **fields}
+        if otherwise is not None and sample.get("camera") is None:
+            sample["camera"] = otherwise
         inside = Single()
         entries: dict[str, tuple[dict[str, Tensor], Restore | None]] = {}
         camera = sample.get("camera")
@@ -253,7 +253,8 @@ def as_array(image: Tensor, like: Array) -> Array:
 def _checked(name: str, value: object) -> Array:
     if not isinstance(value, np.ndarray) or value.dtype.kind not in "biuf":
         what = f"dtype {value.dtype}" if isinstance(value, np.ndarray) else type(value).__name__
-        raise TypeError(f"{_OWNER}: {name} must be a numpy array of real numbers; got {what}")
+        hint = f"; np.array({name}) makes one of it" if hasattr(value, "__array_interface__") else ""
+        raise TypeError(f"{_OWNER}: {name} must be a numpy array of real numbers; got {what}{hint}")
     return value
 
 

@@ -25,9 +25,12 @@ from camtorch._arguments import (
     check_boxes,
     check_radians,
     fails,
+    hinting,
     no_camera,
+    warn,
 )
 from camtorch._threads import on_one_thread
+from camtorch._tracing import may_look
 from camtorch.augment.change import Change, alone, as_one
 from camtorch.augment.landmarks import Mirroring, exchanged
 from camtorch.camera import Camera
@@ -290,6 +293,15 @@ def check_values(kind: str, name: str, value: Tensor, owner: str) -> None:
             )
 
 
+def _tell_of_parts(name: str, boxes: Tensor, owner: str) -> None:
+    """Warn of boxes that all lie between the centres of the first pixels, as parts of an image's sides do."""
+    if may_look(boxes) and bool((boxes == boxes.clamp(0, 1)).all() & (boxes % 1 != 0).any()):
+        warn(
+            f"{owner}: {name} must be pixels x1, y1, x2, y2, and all of these lie within [0, 1], as parts of an "
+            "image's width and height do: times width and height, less 0.5, those are pixels"
+        )
+
+
 def is_batch(named: Named, camera: object) -> bool:
     """Whether a sample of name -> (kind, value) is a batch of samples.
 
@@ -393,6 +405,14 @@ class SampleTransform(nn.Module):
         self.mask_fill = as_number(mask_fill, "mask_fill", self._name)
         self.valid_mask = as_flag(valid_mask, "valid_mask", self._name)
         self._forms: dict[tuple[Any, ...], tuple[list[tuple[str, str]], bool, int]] = {}
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        super().__init_subclass__(**options)
+        own: Any = vars(cls).get("__init__")
+        if (code := getattr(own, "__code__", None)) is not None:
+            names = code.co_varnames[1 : code.co_argcount + code.co_kwonlyargcount]
+            by_name = ", ".join(f"{name}=..." for name in names)
+            cls.__init__ = hinting(f"By name: {cls.__name__}({by_name})")(own)  # type: ignore[method-assign]
 
     @classmethod
     def _meant(cls, word: str) -> str:
@@ -524,6 +544,8 @@ class SampleTransform(nn.Module):
                 check(found, which, item, batched and not several, self._name)
                 if not predicted:
                     check_values(found, which, item, self._name)
+                    if found == "boxes" and "image" in named:
+                        _tell_of_parts(which, item, self._name)
             value = items if several else value if batched else value.unsqueeze(0)
             own = len(items) if several else items[0].shape[0] if batched else 1
             named[name], count = (found, value), own if count < 0 else count

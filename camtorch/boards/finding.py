@@ -59,7 +59,8 @@ def find_board(images: Any, board: Any, *, square: float = 1.0, **options: Any) 
 
     Args:
         images: a path, a folder, a pattern as "photos/*.jpg", or a list of these; or arrays (H, W), (H, W, C), tensors
-            (C, H, W), one, a list, or a stack of them, uint8 or uint16 (floating point is taken as 0 to 1).
+            (C, H, W), one, a list, or a stack of them, uint8 or uint16 (floating point is taken as 0 to 1); or a list
+            of PIL's images.
         board: "9x6", the inner corners of a chessboard across and down, or (9, 6); "charuco 5x7", squares; "aprilgrid
             6x6", tags.
         square: the side of a square, or of a tag, in the unit that poses shall have.
@@ -123,8 +124,9 @@ def _given(images: Any) -> list[tuple[Path, NDArray[Any] | None]]:
     for i, one in enumerate(images):
         if isinstance(one, (str, os.PathLike)):
             given += [(path, None) for path in gather([os.fspath(one)])]
-        elif isinstance(one, (np.ndarray, torch.Tensor)):
-            given.append((Path(f"image {i}"), _grey_of(one, f"images[{i}]")))
+        elif isinstance(one, torch.Tensor) or hasattr(one, "__array_interface__"):  # as images of PIL have it
+            array = one if isinstance(one, torch.Tensor) else np.asarray(one)
+            given.append((Path(f"image {i}"), _grey_of(array, f"images[{i}]")))
         else:
             raise TypeError(f"{_OWNER}: images[{i}] must be a path or an array; got {shown(one)}")
     return given

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 from torch.nn.utils.parametrize import type_before_parametrizations
 
-from camtorch._arguments import as_flag, as_number, as_whole, hinting, shown, warn
+from camtorch._arguments import as_flag, as_number, as_whole, hinting, no_camera, shown, warn
 from camtorch._freezing import INTRINSICS, frozen_names
 from camtorch._threads import on_one_thread
 from camtorch.calibration.bundle import LOSSES, Adjusted, Free, Poses, Prior, Sight, State, adjust
@@ -85,7 +85,7 @@ def as_model(
     model = as_kind(model, owner)
     if start is not None:
         if not isinstance(start, Camera):
-            raise TypeError(f"{owner}: start must be a camera; got {type(start).__name__}")
+            raise TypeError(f"{owner}: start must be a camera; got {no_camera(start)}")
         if (
             model.smoothness() is not None
             and not start.batch_shape

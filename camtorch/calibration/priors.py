@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from camtorch._arguments import shown
+from camtorch._arguments import no_camera, shown
 from camtorch.calibration.bundle import Prior
 from camtorch.camera import Camera, fixed_camera
 from camtorch.least_squares.equations import padded
@@ -58,7 +58,8 @@ def as_known(
     cameras = []
     for member in members:
         if not isinstance(member, (Camera, Lens)) or (isinstance(member, Camera) and member.batch_shape.numel() != 1):
-            raise TypeError(f"{owner}: prior must be a camera, a lens of ct.lenses, or a list; got {shown(member)}")
+            got = shown(member) if isinstance(member, Camera) else no_camera(member)
+            raise TypeError(f"{owner}: prior must be a camera, a lens of ct.lenses, or a list; got {got}")
         if isinstance(member, Lens) and not member.is_optical:
             continue
         camera = member.camera() if isinstance(member, Lens) else member[0] if member.batch_shape else member

@@ -28,7 +28,10 @@ class _Parser(argparse.ArgumentParser):
         super().__init__(allow_abbrev=False, **options)
 
     def error(self, message: str) -> NoReturn:
-        raise ValueError(f"{message} (see {self.prog} --help)")
+        name = message.partition("unrecognized arguments: ")[2].split(" ")[0]
+        is_new = os.path.splitext(name)[1] and not name.startswith("-") and not os.path.exists(name)
+        hint = f"; -o {name} names what is written" if is_new else ""
+        raise ValueError(f"{message}{hint} (see {self.prog} --help)")
 
 
 class _Version(argparse.Action):

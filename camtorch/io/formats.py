@@ -130,6 +130,10 @@ def _read(path: str, content: bytes, format: str | None) -> tuple[Rig, str]:
         if format == by_keys.NAMES.format or (format is None and by_keys.matches(keys)):
             return by_keys.parse(Record(path, keys)), by_keys.NAMES.format
     shown = ", ".join(f"{key!r:.30}" for key in list(keys)[:5]) or "none"
+    if "fx" in keys:
+        shown += (
+            "; a camera of numbers is ct.BrownConrady([fx, fy, cx, cy], [k1, k2, p1, p2], image_size=(height, width))"
+        )
     raise CameraFileError(path, "content", f"no format that is known here has the keys {shown}")
 
 

@@ -83,7 +83,7 @@ def render(rig: Rig, path: str) -> str:
     name, camera = lossy.only_camera(rig)
     lossy.no_images(rig)
     height, width = lossy.size(name, camera)
-    known = {"cahvore", *(key for key, _ in _MODELS.values())}
+    known = {"cahvore", "splined", *(key for key, _ in _MODELS.values())}
     if isinstance(camera, Splined):  # but none behind a windshield, say, whose key is another
         grid = {"order": camera.order, "columns": camera.columns, "rows": camera.rows, "fov_x": camera.fov_x}
         known.add(Splined.with_grid(**grid).key)

@@ -6,7 +6,10 @@ import os
 import re
 from typing import Any, NoReturn
 
+import torch
+
 from camtorch._arguments import check_path, shown, warn
+from camtorch._numbers import warn_of_order
 from camtorch.camera import Camera
 from camtorch.extrinsics import Extrinsics
 from camtorch.io import poses
@@ -135,8 +138,10 @@ class _File:
         stated, place = (("mei",), xi) if xi else self.stated()
         if place is not None and model is not None and model not in stated:
             self.fail(place, f"says that the model is {stated[0]}; do not name {model}, or correct the file")
-        kind = model or ("mei" if xi else self.model(distortion, stated))
-        return self.record[key].camera(kind, intrinsics, distortion, self.image_size(), self.record[lens or xi or key])
+        kind, size = model or ("mei" if xi else self.model(distortion, stated)), self.image_size()
+        if size is not None and self.find(_SIZE):  # a pair, whose order no key says
+            warn_of_order(torch.tensor(intrinsics), size, str(self.record.path))
+        return self.record[key].camera(kind, intrinsics, distortion, size, self.record[lens or xi or key])
 
     def stated(self) -> tuple[tuple[str, ...], str | None]:
         """The models that the flag of fisheyes leaves open, and its key; none where there is no flag."""

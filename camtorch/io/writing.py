@@ -152,7 +152,8 @@ class Lossy:
         """The key of a single camera's model, which must be a known one, its intrinsics and its distortion."""
         (fx, fy, cx, cy), distortion = self._single(name, camera, "cameras", camera.intrinsics, camera.distortion)
         if camera.key not in known:
-            self.fail(name, f"{self.format} has no name for {camera.key}; it has for {', '.join(sorted(known))}")
+            others = f"it has for {', '.join(sorted(known))}, which camera.convert(key).camera makes of it"
+            self.fail(name, f"{self.format} has no name for {camera.key}; {others}")
         return camera.key, (fx, fy, cx, cy), distortion
 
     def closest(self, name: str, camera: Camera, models: Mapping[str, int | None]) -> tuple[Conversion[Camera], str]:

@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from camtorch._arguments import as_whole, values_of
+from camtorch._arguments import as_whole, hinting, values_of
 from camtorch._freezing import INTRINSICS, frozen_names
 from camtorch.camera import Camera
 from camtorch.optics import Chart, Lens, Surface, Unified
@@ -63,19 +63,21 @@ class Splined(Camera):
     quarter_turn = None
 
     @classmethod
-    def with_grid(cls, *, columns: int, rows: int, fov_x: int, order: int = 3) -> type[Splined]:
+    @hinting("By name: ct.Splined.with_grid(columns=16, rows=11, fov_x=120), mrcal's Nx, Ny and fov_x_deg")
+    def with_grid(cls, *, columns: int, rows: int, fov_x: float, order: int = 3) -> type[Splined]:
         """The class of cameras of another grid: a model for `convert`, `calibrate` and files as any other.
 
         Args:
             columns: control points across, more than the order, up to 999.
             rows: control points down.
-            fov_x: horizontal field of view of the surface in whole DEGREES, as mrcal has it, from 1 to 359.
+            fov_x: horizontal field of view of the surface in whole DEGREES, as mrcal's files have it, from 1 to 359.
             order: of the spline, 2 or 3.
 
         Raises:
             ValueError: an order, a size of the grid or a field of view out of these ranges.
         """
         owner = "Splined.with_grid"
+        fov_x = int(fov_x) if isinstance(fov_x, float) and fov_x.is_integer() else fov_x
         order, columns, rows, fov_x = (
             as_whole(value, name, owner)
             for value, name in ((order, "order"), (columns, "columns"), (rows, "rows"), (fov_x, "fov_x"))

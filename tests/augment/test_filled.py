@@ -52,6 +52,7 @@ def test_mostly_empty_images_are_told_once_with_the_number():
         RandomMount(camera=pinhole()),
         RandomCamera("dms130", camera=pinhole(), min_filled=0.5),
         RandomCamera("dms130", camera=pinhole(), p=0),
+        RandomMount(yaw=2, pitch=2, camera=ct.OrthographicFisheye([50.0, 50, 79.5, 59.5], image_size=SIZE)),  # a circle
     ],
 )
 def test_what_is_full_or_meant_so_is_not_told(augmentation):

@@ -107,7 +107,7 @@ def test_layouts_lists_and_what_was_valid_before():
 
 def test_there_and_back():
     image, _, points, _ = images()
-    transform = ct.augment.numpy.Transform(ct.augment.RandomMount(camera=camera()))
+    transform = ct.augment.numpy.Transform(ct.augment.RandomMount(), camera())
     out = transform(image=image, keypoints=points[:2], gaze=[0.0, 0.6, -0.8])
     back = transform.inverse(**out)
     np.testing.assert_allclose(back["keypoints"], points[:2], atol=1e-3)
@@ -117,7 +117,7 @@ def test_there_and_back():
     draw = transform.augmentation.draw(1, torch.Generator().manual_seed(5))
     moved = transform(keypoints=points, generator=generator)["keypoints"]
     np.testing.assert_array_equal(moved, transform(keypoints=points, draw=draw)["keypoints"])
-    again = transform.inverse(keypoints=moved[:2], draw=draw, camera=camera())
+    again = transform.inverse(keypoints=moved[:2], draw=draw)
     np.testing.assert_allclose(again["keypoints"], points[:2], atol=1e-3)
 
 

@@ -9,6 +9,7 @@ from torch.utils.data import DataLoader, Dataset
 
 import camtorch as ct
 import camtorch.augment.numpy
+from camtorch.augment import kornia as adapter
 
 SIZE = (12, 16)
 COUNT = 8
@@ -74,6 +75,32 @@ def test_workers_differ_and_runs_repeat(arrays):
     # the first two batches are of different workers
     assert len(moved) >= COUNT - 3
     assert len(moved.flatten(1).unique(dim=0)) == len(moved)
+
+
+class Seen(Dataset):
+    """What a camera that learns makes of images and points, without an augmentation and by kornia's."""
+
+    def __init__(self):
+        self.dewarp, self.augmentation = ct.Dewarp(camera()), adapter.RandomLens(camera())
+
+    def __len__(self):
+        return 2
+
+    def __getitem__(self, index):
+        image, points = torch.rand(1, 1, *SIZE), torch.tensor([[7.0, 5.0]])
+        moved = self.augmentation(image)[0]
+        assert not moved.requires_grad
+        return {"image": self.dewarp(image)[0], "pixels": self.dewarp.transform_points(points)[0], "moved": moved}
+
+
+@pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
+@pytest.mark.parametrize("context", ["fork", pytest.param("spawn", marks=pytest.mark.slow)])
+def test_what_a_worker_sends_has_no_graph(context):
+    if context not in torch.multiprocessing.get_all_start_methods():
+        pytest.skip("this system cannot fork")
+    options = {"num_workers": 1, "multiprocessing_context": context, "collate_fn": ct.augment.collate}
+    (batch,) = DataLoader(Seen(), batch_size=2, **options)
+    assert not any(value.requires_grad for value in batch.values())
 
 
 def test_collated_samples_move_on_in_the_main_process():

@@ -47,6 +47,7 @@ def test_paths_and_arrays_give_the_same_and_calibrate(views, tmp_path):
         lambda image: image,
         lambda image: np.stack([image] * 3, -1),
         lambda image: [torch.from_numpy(image)[None]],
+        lambda image: [Image.fromarray(image).convert("RGB")],
         lambda image: torch.from_numpy(image)[None, None].float() / 255,
         lambda image: image.astype(np.uint16) * 257,
     ],

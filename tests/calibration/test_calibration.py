@@ -309,7 +309,7 @@ def test_corners_without_noise_have_an_optimum(key, form):
         ({"bend": "no"}, TypeError, "bend must be True or False"),
         ({"progress": "bar"}, TypeError, "progress must be a function"),
         ({"start": ct.KannalaBrandt([500.0, 500.0, 320.0, 240.0])}, ValueError, "start must be one BrownConrady.*Kan"),
-        ({"start": "camera.yml"}, TypeError, "start must be a camera; got str"),
+        ({"start": "camera.yml"}, TypeError, "start must be a camera; got str; ct.load"),
         ({"model": ct.Pinhole(torch.ones(2, 4))}, ValueError, r"start must be one Pinhole.*batch_shape=\(2,\)"),
         ({"object_points": LEFT.object_points[:48]}, ValueError, "48"),
     ],

@@ -139,6 +139,7 @@ def test_three_real_views():
     ("prior", "error", "says"),
     [
         (7, TypeError, "prior must be a camera"),
+        ("camera.yml", TypeError, r"prior must be a camera, .* got str; ct.load\('camera.yml'\).camera is that of a"),
         ([TRUTH, None], TypeError, "prior must be a camera"),
         (ct.Pinhole(torch.ones(2, 4)), TypeError, "prior must be a camera"),
         ([], ValueError, "prior has no lens"),

@@ -124,6 +124,12 @@ CASES = {
     ],
     "map": [
         ("map camera.yml", "-o OUT writes one, --check MAP measures one"),
+        (
+            "map camera.yml a.npz --size 9x9",
+            "unrecognized arguments: a.npz; -o a.npz names what is written (see camtorch",
+        ),
+        ("show camera.yml bad.yml", "unrecognized arguments: bad.yml (see camtorch --help)"),
+        ("map camera.yml --sise 9x9", "unrecognized arguments: --sise 9x9 (see camtorch --help)"),
         ("map camera.yml -o a.bin", "does not say the format"),
         ("map camera.yml -o camera.yml --format obj", "would overwrite camera.yml"),
         ("map rig.json --name left -o rig --format dw100 --force", "rig.json: would overwrite"),

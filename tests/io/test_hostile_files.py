@@ -168,6 +168,11 @@ def array(shape, data=b"", descr="<f8"):
         ("a.json", OWN % ([[[1, 1, 1, 1]]] * 3000, [[[0.0]] * 3000]), "batch dims that differ"),
         ("a.json", OWN % ([[1, 1, 1, 1]] * 3, [[0.0]] * 2), "batch dims that differ"),
         ("a.json", '{"hello": 1}', "no format that is known here has the keys 'hello'"),
+        (
+            "a.json",
+            '{"fx": 9, "fy": 9, "cx": 4, "cy": 4}',
+            r"'cy'; a camera of numbers is ct.BrownConrady\(\[fx,",
+        ),
         ("a.json", '{"\\n\\u0000": {"K": 1}}', "no format that is known here"),
         ("a.xml", '<!DOCTYPE x [<!ENTITY a "b">]>' + XML.format("&a;"), "line 1: a document type"),
         ("a.xml", XML.format("&a;"), "line 1: not XML"),

@@ -30,6 +30,12 @@ def test_old_header_other_names_and_what_is_not_asked_for_may_be_nan():
     assert camera.image_size == (480, 640)
 
 
+def test_a_pair_that_is_height_and_width_is_warned_of(path):
+    assert ct.load(written(path, f"K: {K}\nimage_size: [640, 480]\n")).camera.image_size == (480, 640)
+    with pytest.warns(UserWarning, match=r"camera.yml: image_size=\(640, 480\) is .* the middle of \(480, 640\)"):
+        ct.load(written(path, f"K: {K}\nimage_size: [480, 640]\n"))
+
+
 @pytest.mark.parametrize("suffix", [".yml", ".json", ".xml"])
 @pytest.mark.parametrize("xi", ["1.25", "[1.25]", "!!opencv-matrix {rows: 1, cols: 1, dt: d, data: [1.25]}"])
 def test_omnidir(tmp_path, suffix, xi):

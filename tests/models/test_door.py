@@ -128,6 +128,8 @@ WRONG = [
     (lambda: grid(columns=3), ValueError, "columns must be from 4"),
     (lambda: grid(rows=1000), ValueError, "to 999"),
     (lambda: grid(fov_x=360), ValueError, "from 1 to 359; got 360"),
+    (lambda: ct.Splined.with_grid(16, 11, 120), TypeError, r"given\. By name: .*columns=16, rows=11, fov_x=120"),
+    (lambda: grid(fov_x=170.5), TypeError, "fov_x must be a whole number; got 170.5"),
     (lambda: CAMERA.convert("splined:16x11"), ValueError, "is how a grid is written"),
     # fields of view
     (lambda: from_fov(0), ValueError, r"^Pinhole\.from_fov: .*above 0"),
@@ -392,6 +394,9 @@ def test_a_size_and_numbers_in_another_order_are_told(as_passed):
         ct.Pinhole(as_passed(good), image_size=SWAPPED)
     with pytest.warns(UserWarning, match=r"fx, cx, fy, cy; both focal lengths come first"):
         ct.KannalaBrandt(as_passed([500.0, 315.0, 501.0, 243.0]), image_size=WIDE)
+    with pytest.warns(UserWarning, match=r"seem to be parts of the image's width and height; in pixels fx and cx are"):
+        ct.Pinhole(as_passed([0.78, 1.04, 0.5, 0.52]), image_size=WIDE)
+    ct.Pinhole(as_passed([1.0, 1.0, 0.5, 0.5]), image_size=(4, 4))
 
 
 def test_what_is_off_centre_for_a_reason_is_not_warned_of(tmp_path):

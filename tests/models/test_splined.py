@@ -118,7 +118,7 @@ def test_an_explanation_tells_the_edge_from_a_fold():
 
 def test_grids_are_models_of_their_own_wherever_models_go(tmp_path):
     model = ct.Splined.with_grid(order=2, columns=9, rows=5, fov_x=120)
-    assert model is ct.Splined.with_grid(columns=9, rows=5, fov_x=120, order=2)
+    assert model is ct.Splined.with_grid(columns=9, rows=5, fov_x=120.0, order=2)
     assert ct.Splined.with_grid(columns=10, rows=8, fov_x=160) is ct.Splined is ct.MODELS["splined"]
     camera = drawn(2, 9, 5, 120)
     for other in (pickle.loads(pickle.dumps(camera)), copy.deepcopy(camera), camera.resize(240, 320)):

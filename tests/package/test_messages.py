@@ -8,6 +8,7 @@ import torch
 
 import camtorch as ct
 from camtorch.augment import kornia as adapter
+from camtorch.augment import numpy as arrays
 
 SIZE = (24, 32)
 CAMERA = ct.KannalaBrandt([20.0, 20.0, 15.5, 11.5], [0.02, -0.01, 0.0, 0.0], image_size=SIZE).requires_grad_(False)
@@ -54,7 +55,19 @@ WRONG = [
     (lambda: ct.Pinhole([20.0, 20, 15, 11], [0.1, 0, 0, 0]), ValueError, r"Pinhole: it has no distortion, .*\(4,\)"),
     (lambda: ct.Pinhole(torch.eye(4)), ValueError, r"focal lengths .* Of matrices \(4, 4\) use Pinhole.from_matrix\(K"),
     (lambda: ct.Pinhole.from_matrix(torch.eye(4)), ValueError, r"got shape \(4, 4\)\. Of larger ones it is K\[..., :3"),
+    (lambda: ct.Extrinsics([0.0, 0, 0, 1], [0.0, 0, 0]), ValueError, r"got shape \(4,\)\. Of a quaternion .*from_quat"),
+    (
+        lambda: ct.Pinhole([9.0] * 4, image_size=np.eye(3)),
+        TypeError,
+        r"\(height, width\); got ndarray of shape \(3, 3\)",
+    ),
     (lambda: ct.Extrinsics(0, 0, 1), TypeError, r"It takes ct.Extrinsics\(\[rx, ry, rz\], \[tx, ty, tz\]\)"),
+    (lambda: CAMERA.resize((12, 16)), TypeError, r"It takes camera.resize\(height, width\), two numbers"),
+    (
+        lambda: ct.Splined(np.ones(4), np.where(np.arange(160) == 7, math.nan, 0.0)),
+        ValueError,
+        r"distortion must be finite; 1 of 160 numbers are not, first distortion\[7\] = nan$",
+    ),
     (lambda: ct.Camera.from_fov(90, image_size=SIZE), TypeError, r"ct.MODELS has all models"),
     (
         lambda: augment.BoxCrop((8, 8), camera=CAMERA)(image=IMAGES[0], boxes=[[3.0, 4.0, 9.0, 9.0]]),
@@ -231,6 +244,10 @@ WRONG = [
     (lambda: ct.Dewarp(CAMERA, fov="90"), TypeError, r"Dewarp: fov must be a number; got"),
     # augmentations
     (lambda: augment.RandomMount(zoom=1.0), ValueError, r"zoom must lie within .*got 1.0, which stands for \(0, 2\)"),
+    (lambda: augment.RandomMount(yaw="12"), TypeError, r"yaw must be a range \(low, high\) or a number; got '12'"),
+    (lambda: augment.RandomMount(10), TypeError, r"were given\. By name: RandomMount\(yaw=..., pitch=..., roll"),
+    (lambda: augment.Resize(12, 16), TypeError, r"were given\. By name: Resize\(size=...\)"),
+    (lambda: arrays.Transform(MOUNT, np.eye(3)), TypeError, r"numpy.Transform: camera must be a Camera; got ndarray"),
     (lambda: augment.RandomMount(p="half"), TypeError, r"RandomMount: p must be a number; got 'half'"),
     (lambda: augment.RandomMount(same_on_batch="no"), TypeError, r"same_on_batch must be True or False; got 'no'"),
     (lambda: augment.RandomMount(fields=["image"]), TypeError, r"RandomMount: fields must be a dict, as"),
@@ -309,6 +326,16 @@ WRONG = [
 def test_wrong_calls_are_told_in_words(call, error, says):
     with pytest.raises(error, match=says):
         call()
+
+
+def test_boxes_that_are_parts_of_an_image_are_warned_of():
+    parts = torch.tensor([[0.1, 0.2, 0.5, 0.6], [0.0, 0.5, 1.0, 1.0]])
+    with pytest.warns(
+        UserWarning, match=r"RandomMount: boxes must be pixels .* within \[0, 1\], as parts of an image's"
+    ):
+        MOUNT(image=IMAGES[0], boxes=parts)
+    for boxes in (20 * parts, parts.round(), torch.zeros(2, 4), torch.full((2, 4), math.nan)):
+        MOUNT(image=IMAGES[0], boxes=boxes)
 
 
 def test_a_size_with_height_and_width_exchanged_is_warned_of():
