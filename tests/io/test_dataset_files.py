@@ -156,6 +156,14 @@ def test_text_between_the_elements_of_metashape_says_nothing(tmp_path):
             "SCARAMUZZA",
             "model_type: 'SCARAMUZZA' is not known here; known are KANNALA",
         ),
+        ("ncore_ftheta.json", "principal_point", "middle", r"^[^:]*: camera_model_parameters\.principal_point: mis"),
+        ("ncore_ftheta.json", "3848", "0", r"^[^:]*: camera_model_parameters\.resolution\[0\]: 0 is no number"),
+        (
+            "ncore_ftheta.json",
+            'distortion_parameters": null',
+            'distortion_parameters": {"horizontal_poly": [0, 1, 0]}',
+            r"^[^:]*: camera_model_parameters\.external_distortion_parameters\.vertical_poly: missing",
+        ),
         ("camodocal_kitti360.yaml", "   xi: 2", "   xi: x2", r"mirror_parameters\.xi: .* is no finite number"),
     ],
 )
