@@ -253,3 +253,9 @@ def test_tables_of_nuscenes_without_channels_or_with_several_drives(tmp_path):
         (tmp_path / "calibrated_sensor.json").write_text(json.dumps([table[0], table[1], {**again, **broken}]))
         with pytest.raises(ct.CameraFileError, match=reason):
             ct.load(tmp_path / "calibrated_sensor.json")
+
+
+def test_a_database_of_lensfun_names_its_reader(tmp_path):
+    (tmp_path / "lenses.xml").write_text('<lensdatabase version="2"><lens/></lensdatabase>')
+    with pytest.raises(ct.CameraFileError, match=r"lenses\.xml: content: .* ct\.lenses\.from_lensfun"):
+        ct.load(tmp_path / "lenses.xml")
