@@ -78,6 +78,7 @@ READ = {m.NAMES.format: m.NAMES for m in (*_BY_CONTENT, *_BY_KEYS)}
 WRITTEN = {m.NAMES.format: m.NAMES for m in _WRITTEN}
 FORMATS = tuple(READ | WRITTEN)
 _OF_RENDERERS = (".usda", ".exr")  # whose content says nothing to a reader
+_KEYS_OF_RENDERERS = {"blueprint", "directions"}  # of CARLA's JSON and of ray fields
 
 
 def load(path: str | os.PathLike[str], format: str | None = None) -> Rig:
@@ -123,12 +124,13 @@ def _read(path: str, content: bytes, format: str | None) -> tuple[Rig, str]:
     for by_content in _BY_CONTENT:
         if format == by_content.NAMES.format or (format is None and by_content.matches(path, content)):
             return by_content.read(path, content), by_content.NAMES.format
-    if format is None and path.lower().endswith(_OF_RENDERERS):
-        raise CameraFileError(path, "content", "a file for renderers, which is written only: load what it was made of")
-    keys = parse_mapping(path, content)
+    of_renderers = format is None and path.lower().endswith(_OF_RENDERERS)
+    keys = {} if of_renderers else parse_mapping(path, content)
     for by_keys in _BY_KEYS:
         if format == by_keys.NAMES.format or (format is None and by_keys.matches(keys)):
             return by_keys.parse(Record(path, keys)), by_keys.NAMES.format
+    if of_renderers or not _KEYS_OF_RENDERERS.isdisjoint(keys):
+        raise CameraFileError(path, "content", "a file for renderers, which is written only: load what it was made of")
     shown = ", ".join(f"{key!r:.30}" for key in list(keys)[:5]) or "none"
     if "fx" in keys:
         shown += (

@@ -41,8 +41,8 @@ def parse(record: Record) -> Rig:
         for place, key in ((record, "external_distortion_type"), (shield, "external_distortion_type")):
             if key in place:
                 one_of(place[key], ("bivariate-windshield",))
+        polynomials = [np.array(shield[f"{way}_poly"].numbers()) for way in ("horizontal", "vertical")]
         try:
-            polynomials = (np.array(shield[f"{way}_poly"].numbers()) for way in ("horizontal", "vertical"))
             # frozen, so that the coefficients of both are the camera's own
             camera = camera.requires_grad_(False).behind(Windshield(*polynomials).requires_grad_(False))
         except ValueError as error:
@@ -60,13 +60,10 @@ def _f_theta(values: Record) -> Camera:
     linear = values["linear_cde"].numbers(3) if "linear_cde" in values else [0.0]
     while len(rest) > 2 and not rest[-1]:  # which files fill up
         rest.pop()
+    centre, size = np.array(values["principal_point"].numbers(2)), values["resolution"].size()
+    linear = linear if any(linear) else [1.0, 0.0, 0.0]  # as ncore takes zeros
     try:
-        return kind.from_polynomial(
-            np.array(values["principal_point"].numbers(2)),
-            np.array(rest),
-            linear_cde=linear if any(linear) else (1.0, 0.0, 0.0),  # as ncore takes zeros
-            image_size=values["resolution"].size(),
-        )
+        return kind.from_polynomial(centre, np.array(rest), linear_cde=linear, image_size=size)
     except ValueError as error:
         return coefficients.fail(error)
 

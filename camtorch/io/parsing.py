@@ -210,6 +210,8 @@ def parse_xml(path: str | os.PathLike[str], text: str) -> ElementTree.Element:
 def _from_storage(path: str | os.PathLike[str], text: str) -> Any:
     _check_length(path, text, _LARGEST_STORAGE, "XML")
     root = parse_xml(path, text)
+    if root.tag == "lensdatabase":
+        raise CameraFileError(path, "content", "lensfun's lenses, which lensfunpy reads, for ct.lenses.from_lensfun")
     if root.tag != "opencv_storage":
         raise CameraFileError(
             path, "content", f"<{root.tag:.60}> where <opencv_storage> belongs: XML is read where OpenCV wrote it"

@@ -156,6 +156,14 @@ def test_text_between_the_elements_of_metashape_says_nothing(tmp_path):
             "SCARAMUZZA",
             "model_type: 'SCARAMUZZA' is not known here; known are KANNALA",
         ),
+        ("ncore_ftheta.json", "principal_point", "middle", r"^[^:]*: camera_model_parameters\.principal_point: mis"),
+        ("ncore_ftheta.json", "3848", "0", r"^[^:]*: camera_model_parameters\.resolution\[0\]: 0 is no number"),
+        (
+            "ncore_ftheta.json",
+            'distortion_parameters": null',
+            'distortion_parameters": {"horizontal_poly": [0, 1, 0]}',
+            r"^[^:]*: camera_model_parameters\.external_distortion_parameters\.vertical_poly: missing",
+        ),
         ("camodocal_kitti360.yaml", "   xi: 2", "   xi: x2", r"mirror_parameters\.xi: .* is no finite number"),
     ],
 )
@@ -245,3 +253,9 @@ def test_tables_of_nuscenes_without_channels_or_with_several_drives(tmp_path):
         (tmp_path / "calibrated_sensor.json").write_text(json.dumps([table[0], table[1], {**again, **broken}]))
         with pytest.raises(ct.CameraFileError, match=reason):
             ct.load(tmp_path / "calibrated_sensor.json")
+
+
+def test_a_database_of_lensfun_names_its_reader(tmp_path):
+    (tmp_path / "lenses.xml").write_text('<lensdatabase version="2"><lens/></lensdatabase>')
+    with pytest.raises(ct.CameraFileError, match=r"lenses\.xml: content: .* ct\.lenses\.from_lensfun"):
+        ct.load(tmp_path / "lenses.xml")
