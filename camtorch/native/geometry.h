@@ -32,7 +32,7 @@ enum { MOST_RADII = 512 }; /* on which a lens is followed outwards by bounds of 
 enum { AZIMUTHS = 336 }; /* on which limits are given, see `fold.limits_and_extent` */
 enum { RADII = 80 };     /* on each of them: half over the whole chart, half around the fold of a radial factor */
 /* The inverse of a surface, nearly: a polynomial of CELL numbers on each of GRID x GRID cells, after where these are */
-enum { GRID = 44, CELL = 16, START = CELL * (1 + GRID * GRID) };
+enum { GRID = 60, CELL = 16, START = CELL * (1 + GRID * GRID) };
 /* Numbers of a piece of a surface: 4 x 4 coefficients, of du and dv each */
 enum { PIECE = 32 };
 /* Radii (RADII); how far out they are sent on each azimuth (AZIMUTHS, RADII), ascending; how far the image reaches in each

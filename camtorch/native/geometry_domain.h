@@ -420,8 +420,8 @@ static void pieces_of(const Part *part, const double *k, void *pieces, int64_t a
 }
 
 /* (START): the inverse of the last stage, a surface, on the box around what it sends certain points to. First where
-   the cells are, as of a surface, and what Newton's method leaves of a step: it times the step's square times the size of
-   the Jacobian and over its determinant, to be less than 1. Of each cell its middle; slopes across and down; by how much
+   the cells are, as of a surface, and what Newton's method leaves of a step: it times the step's square times the norm of
+   the Jacobian's inverse, to be less than 1. Of each cell its middle; slopes across and down; by how much
    these change across; and down */
 static void start_of(const Domain *d, int64_t camera, const uint8_t *certain) {
     enum { SIDE = GRID + 4 }; /* the middles of cells, and two around: whole vectors */
@@ -449,7 +449,7 @@ static void start_of(const Domain *d, int64_t camera, const uint8_t *certain) {
         start[axis] = GRID / (is_box ? high[axis] - low[axis] : size[axis]);
         start[2 + axis] = is_box ? (low[axis] + high[axis]) / 2 : k[2 + axis];
     }
-    const double least = (d->is_double ? DBL_EPSILON : FLT_EPSILON) / 4 * hypot(GRID / 2 / start[0], GRID / 2 / start[1]);
+    const double least = (d->is_double ? DBL_EPSILON : FLT_EPSILON) / 2 * hypot(GRID / 2 / start[0], GRID / 2 / start[1]);
     start[4] = bend_of_double(part, k) / 2 / least;
     for (int i = 0; i < CELL; i++) put(d->start, camera * START + i, start[i], (int)d->is_double);
     for (int j = 0; j < SIDE; j++) {

@@ -374,7 +374,7 @@ static void T(surface)(const Part *part, const R *k, int n, const R *restrict a,
     else T(surface_of)(part, k, 2, n, a, b, u, v, NULL);
 }
 
-/* By how much the slopes of a surface change at the most on a unit: second derivatives of a spline lie between the second
+/* By how much the slopes of a surface, along a line, change at the most on a unit: second derivatives of a spline lie between the second
    differences of its control points */
 static R T(bend_of)(const Part *part, const R *k) {
     const int64_t row = 2 * (int64_t)part->n;
@@ -388,9 +388,9 @@ static R T(bend_of)(const Part *part, const R *k) {
                 if (j > 1) along = T(most)(along, T(absolute)(at[0] - 2 * at[-row] + at[-2 * row]));
                 if (i && j) mixed = T(most)(mixed, T(absolute)(at[0] - at[-2] - at[-row] + at[-row - 2]));
             }
-        sum += along + mixed;
+        sum += (along + mixed) * (along + mixed);
     }
-    return sum * T(most)(k[0] * k[0], k[1] * k[1]);
+    return T(root)(sum) * T(most)(k[0] * k[0], k[1] * k[1]);
 }
 
 /* The pieces of a surface, the last stage, by value */
@@ -498,10 +498,6 @@ INLINE R T(surface_edge)(const Part *part, const R *k, R behind, R a, R b) {
 }
 
 /* What is certain of a surface that is the last stage: up to its edge and a hair behind, no further */
-typedef struct {
-    R sa, sb, ca, cb, across, down;
-} T(Edge);
-
 INLINE T(Edge) T(edge_of)(const T(Camera) *c) {
     const Part *part = c->parts + c->stages;
     const R *k = c->numbers[c->stages], behind = (R)1e-4;
@@ -510,6 +506,11 @@ INLINE T(Edge) T(edge_of)(const T(Camera) *c) {
 
 INLINE I T(on_edge)(const T(Edge) e, R a, R b) {
     return (e.across - T(absolute)((a - e.ca) * e.sa) > 0) & (e.down - T(absolute)((b - e.cb) * e.sb) > 0);
+}
+
+INLINE I T(in_box)(const T(Edge) box, R certain2, R beside2, R a, R b) {
+    const R square = a * a + b * b;
+    return (T(on_edge)(box, a, b) & (certain2 - square > 0)) | (beside2 - square > 0);
 }
 
 /* Points of the plane of a surface, the last stage, where it is regular on the whole way from the centre for certain */

@@ -30,6 +30,27 @@ static void T(prepare_bent)(T(Camera) *c) {
             }
 }
 
+/* The box of pieces that are certain: of all pieces, less at each turn the row or column at its rim that has most others */
+static int T(prepare_box)(T(Camera) *c, const uint8_t *certain) {
+    const Part *part = c->parts + c->stages;
+    const int across = part->n - part->flags, down = part->m - part->flags;
+    int ends[4] = {0, across - 1, 0, down - 1}, counts[4], worst = 0; /* left, right, top, bottom */
+    do {
+        memset(counts, 0, sizeof counts);
+        for (int j = ends[2]; j <= ends[3]; j++) counts[0] += !certain[j * across + ends[0]], counts[1] += !certain[j * across + ends[1]];
+        for (int i = ends[0]; i <= ends[1]; i++) counts[2] += !certain[ends[2] * across + i], counts[3] += !certain[ends[3] * across + i];
+        for (int side = 0; side < 4; side++) worst = counts[side] > counts[worst] ? side : worst;
+        if (counts[worst]) ends[worst] += worst & 1 ? -1 : 1;
+    } while (counts[worst] && ends[0] <= ends[1] && ends[2] <= ends[3]);
+    c->box = T(edge_of)(c);
+    c->all_certain = ends[1] - ends[0] == across - 1 && ends[3] - ends[2] == down - 1;
+    if (c->all_certain) return 1;
+    const R within = (R)1e-4;
+    c->box.ca += (R)(ends[0] + ends[1] + 1 - across) / 2 / c->box.sa, c->box.across = (R)(ends[1] + 1 - ends[0]) / 2 - within;
+    c->box.cb += (R)(ends[2] + ends[3] + 1 - down) / 2 / c->box.sb, c->box.down = (R)(ends[3] + 1 - ends[2]) / 2 - within;
+    return !counts[worst];
+}
+
 static void T(prepare)(const Cameras *all, int64_t camera, T(Camera) *c) {
     const R *numbers = (const R *)all->parameters + camera * all->parameter_count;
     const R *intrinsics = (const R *)all->intrinsics + 4 * camera;
@@ -59,10 +80,9 @@ static void T(prepare)(const Cameras *all, int64_t camera, T(Camera) *c) {
         if (all->certain) {
             const Part *last = c->parts + c->stages;
             const uint8_t *certain = all->certain + camera * last->n * last->m;
-            c->all_certain = 1;
-            for (int i = 0; i < (last->n - last->flags) * (last->m - last->flags); i++) c->all_certain &= certain[i];
+            const int has_box = T(prepare_box)(c, certain);
             if (all->certain2 && c->follows) c->certain = certain, c->certain2 = ((const R *)all->certain2)[camera];
-            c->to_edge = c->certain && c->all_certain && c->stages == 1;
+            c->has_box = has_box && c->certain && c->stages == 1, c->beside2 = c->all_certain ? -1 : c->usual2;
         }
         if (all->pieces) {
             const Part *last = c->parts + c->stages;
@@ -454,18 +474,15 @@ static int T(see)(const T(Camera) *c, int keeps, int count, int n, T(Seen) *s) {
                s->z, s->shrink, s->scale, swapped ? s->b : s->a, swapped ? s->a : s->b, s->ok);
     if (!later) return 0;
     if (c->way == INVERTED) T(see_inverted)(c, keeps, n, s);
-    if (c->to_edge) {
-        const T(Edge) edge = T(edge_of)(c);
-        const R certain2 = c->certain2;
-        EACH(i) {
-            const I is_on = T(on_edge)(edge, s->a[i], s->b[i]) & (certain2 - (s->a[i] * s->a[i] + s->b[i] * s->b[i]) > 0);
-            s->ok[i] += s->ok[i] & !is_on, outside |= s->ok[i];
-        }
+    if (c->has_box) {
+        const T(Edge) box = c->box;
+        const R certain2 = c->certain2, beside2 = c->beside2;
+        EACH(i) s->ok[i] += s->ok[i] & !T(in_box)(box, certain2, beside2, s->a[i], s->b[i]), outside |= s->ok[i];
     } else EACH(i) {
         s->ok[i] += s->ok[i] & !(inner2 - (s->a[i] * s->a[i] + s->b[i] * s->b[i]) > 0); /* 2: beyond */
         outside |= s->ok[i];
     }
-    if (outside & 2 && c->certain && !c->to_edge) {
+    if (outside & 2 && c->certain && !(c->has_box && c->all_certain)) {
         ALIGNED I certain[BLOCK];
         T(certain)(c, n, s->a, s->b, certain);
         outside = 0;
@@ -730,8 +747,8 @@ static void T(start)(const T(Camera) *c, int first, int n, const R *u, const R *
 INLINE I T(step_of)(R *a, R *b, R du, R dv, R ua, R ub, R va, R vb, const R *bend, I ok) {
     R da, db;
     const R one = T(absolute)(T(step)(ua, ub, va, vb, du, dv, &da, &db)), p = *a + da, q = *b + db, step2 = da * da + db * db;
-    const R size = T(absolute)(ua) + T(absolute)(ub) + T(absolute)(va) + T(absolute)(vb);
-    const R left = bend ? 1 - *bend * step2 * (size * one) : EPS / 64 * (p * p + q * q + (R)0.01) - step2;
+    const R off = bend ? *bend * step2 * one : 0;
+    const R left = bend ? 1 - off * off * (ua * ua + ub * ub + va * va + vb * vb) : EPS / 64 * (p * p + q * q + (R)0.01) - step2;
     *a = ok ? *a : p, *b = ok ? *b : q;
     return ok | ((left > 0) & (one > 0));
 }
@@ -843,8 +860,9 @@ static void T(invert)(const T(Camera) *c, int n, const R *restrict u, const R *r
             possible[i] = within[i] & (possible[i] | !known[i]);
         }
     } else {
-        const int has_table = c->table != NULL, to_edge = c->to_edge;
-        const R usual2 = c->usual2 * (1 - 32 * EPS);
+        const int has_table = c->table != NULL;
+        const R usual2 = c->usual2 * (1 - 32 * EPS), certain2 = c->certain2, beside2 = c->beside2, further = 1 + 32 * EPS;
+        const T(Edge) box = c->box;
         T(start)(c, has_table ? 2 : 1, n, u, v, a, b);
         if (has_table) {
             ALIGNED R r2[BLOCK], scale[BLOCK];
@@ -854,24 +872,14 @@ static void T(invert)(const T(Camera) *c, int n, const R *restrict u, const R *r
         }
         T(newton)(c, 1, n, u, v, a, b, ok, fewest);
         I outside = 0;
-        EACH(i) {
-            possible[i] = ok[i]; /* converged, somewhere */
-            ok[i] &= usual2 - (a[i] * a[i] + b[i] * b[i]) > 0;
-            outside |= possible[i] & !ok[i];
-        }
-        if (outside && to_edge) {
-            const T(Edge) edge = T(edge_of)(c);
-            const R certain2 = c->certain2 * (1 - 64 * EPS), further = 1 + 32 * EPS;
-            outside = 0;
-            EACH(i) {
-                ok[i] |= possible[i] & T(on_edge)(edge, a[i] * further, b[i] * further) & (certain2 - (a[i] * a[i] + b[i] * b[i]) > 0);
-                outside |= possible[i] & !ok[i];
-            }
-        }
-        if (outside && c->certain && !to_edge) {
+        EACH(i) possible[i] = ok[i]; /* converged, somewhere */
+        if (c->has_box) EACH(i) ok[i] &= T(in_box)(box, certain2, beside2, a[i] * further, b[i] * further);
+        else EACH(i) ok[i] &= usual2 - (a[i] * a[i] + b[i] * b[i]) > 0;
+        EACH(i) outside |= possible[i] & !ok[i];
+        if (outside && c->certain && !(c->has_box && c->all_certain)) {
             ALIGNED I certain[BLOCK];
             outside = 0;
-            EACH(i) p[i] = a[i] * (1 + 32 * EPS), q[i] = b[i] * (1 + 32 * EPS);
+            EACH(i) p[i] = a[i] * further, q[i] = b[i] * further;
             T(certain)(c, n, p, q, certain);
             EACH(i) ok[i] |= possible[i] & certain[i], outside |= possible[i] & !ok[i];
         }
@@ -882,7 +890,7 @@ static void T(invert)(const T(Camera) *c, int n, const R *restrict u, const R *r
             int places[BLOCK];
             EACH(i) inside[i] = ok[i] | !possible[i];
             const int some = T(chosen)(n, inside, places), filled = (some + LANES - 1) & -LANES;
-            for (int i = 0; i < filled; i++) p[i] = a[places[i]] * (1 + 32 * EPS), q[i] = b[places[i]] * (1 + 32 * EPS);
+            for (int i = 0; i < filled; i++) p[i] = a[places[i]] * further, q[i] = b[places[i]] * further;
             T(lens)(c, 1, filled, p, q, x, y, &to, least);
             T(contained)(c, filled, p, q, least, inside);
             for (int i = 0; i < some; i++) ok[places[i]] = inside[i];

@@ -37,7 +37,7 @@ _MOST_PARTS, _MOST_DEGREE = 5, 64
 _TABLE = 2 + 2 * 1024
 _RADII, _FOLLOWED, _AZIMUTHS = 512, 80, 336
 _EXTENT = _FOLLOWED + _AZIMUTHS * (_FOLLOWED + 1)
-_START, _PIECE = 16 * (1 + 44 * 44), 32
+_START, _PIECE = 16 * (1 + 60 * 60), 32
 _MOST_CONTROLS = 64 * 64  # of a surface whose pieces, of 16 times the memory, pay
 _FOR_START = 1 << 15  # points of a camera for which such a table pays
 
