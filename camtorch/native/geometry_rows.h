@@ -30,27 +30,6 @@ static void T(prepare_bent)(T(Camera) *c) {
             }
 }
 
-/* The box of pieces that are certain: of all pieces, less at each turn the row or column at its rim that has most others */
-static int T(prepare_box)(T(Camera) *c, const uint8_t *certain) {
-    const Part *part = c->parts + c->stages;
-    const int across = part->n - part->flags, down = part->m - part->flags;
-    int ends[4] = {0, across - 1, 0, down - 1}, counts[4], worst = 0; /* left, right, top, bottom */
-    do {
-        memset(counts, 0, sizeof counts);
-        for (int j = ends[2]; j <= ends[3]; j++) counts[0] += !certain[j * across + ends[0]], counts[1] += !certain[j * across + ends[1]];
-        for (int i = ends[0]; i <= ends[1]; i++) counts[2] += !certain[ends[2] * across + i], counts[3] += !certain[ends[3] * across + i];
-        for (int side = 0; side < 4; side++) worst = counts[side] > counts[worst] ? side : worst;
-        if (counts[worst]) ends[worst] += worst & 1 ? -1 : 1;
-    } while (counts[worst] && ends[0] <= ends[1] && ends[2] <= ends[3]);
-    c->box = T(edge_of)(c);
-    c->all_certain = ends[1] - ends[0] == across - 1 && ends[3] - ends[2] == down - 1;
-    if (c->all_certain) return 1;
-    const R within = (R)1e-4;
-    c->box.ca += (R)(ends[0] + ends[1] + 1 - across) / 2 / c->box.sa, c->box.across = (R)(ends[1] + 1 - ends[0]) / 2 - within;
-    c->box.cb += (R)(ends[2] + ends[3] + 1 - down) / 2 / c->box.sb, c->box.down = (R)(ends[3] + 1 - ends[2]) / 2 - within;
-    return !counts[worst];
-}
-
 static void T(prepare)(const Cameras *all, int64_t camera, T(Camera) *c) {
     const R *numbers = (const R *)all->parameters + camera * all->parameter_count;
     const R *intrinsics = (const R *)all->intrinsics + 4 * camera;
@@ -80,9 +59,14 @@ static void T(prepare)(const Cameras *all, int64_t camera, T(Camera) *c) {
         if (all->certain) {
             const Part *last = c->parts + c->stages;
             const uint8_t *certain = all->certain + camera * last->n * last->m;
-            const int has_box = T(prepare_box)(c, certain);
-            if (all->certain2 && c->follows) c->certain = certain, c->certain2 = ((const R *)all->certain2)[camera];
-            c->has_box = has_box && c->certain && c->stages == 1, c->beside2 = c->all_certain ? -1 : c->usual2;
+            c->all_certain = 1, c->box = T(edge_of)(c);
+            for (int i = 0; i < (last->n - last->flags) * (last->m - last->flags); i++) c->all_certain &= certain[i];
+            if (all->certain2 && c->follows) {
+                const R *box = (const R *)all->certain2 + BOX * camera;
+                c->certain = certain, c->certain2 = box[0], c->beside2 = c->all_certain ? -1 : c->usual2;
+                if (!c->all_certain) c->box.ca = box[1], c->box.cb = box[2], c->box.across = box[3], c->box.down = box[4];
+                c->has_box = c->stages == 1 && c->box.across > 0 && c->box.down > 0;
+            }
         }
         if (all->pieces) {
             const Part *last = c->parts + c->stages;
