@@ -421,7 +421,7 @@ INLINE int32_t T(piece)(const T(Pieces) of, R a, R b, R *x, R *y) {
 /* A surface, the last stage, of whose pieces the polynomials are known, see `pieces_of`: of each point the place across and,
    of the powers 0 and 2 of that, the numbers of the part that is even there; if wanted, of that which is odd, and of the
    slope down */
-INLINE void T(patches_of)(const T(Camera) *c, const int slopes, int n, const R *restrict a, const R *restrict b, R *restrict x,
+INLINE void T(patches_of)(const T(Camera) *c, const int order, const int slopes, int n, const R *restrict a, const R *restrict b, R *restrict x,
                           R *restrict low, R *restrict high, R *restrict down) {
     const T(Pieces) pieces = T(pieces_on)(c);
     ALIGNED R y[BLOCK];
@@ -431,8 +431,9 @@ INLINE void T(patches_of)(const T(Camera) *c, const int slopes, int n, const R *
         const R *restrict piece = c->pieces + (int64_t)PIECE * at[i], p = x[i], q = y[i];
         ALIGNED R sum[8], slope[8];
         KEPT_LOOP for (int j = 0; j < 8; j++) {
-            R by = piece[24 + j], w = by * q + piece[16 + j];
-            by = by * q + w, w = w * q + piece[8 + j];
+            R by = piece[16 + j], w = by;
+            if (order == 3) w += piece[24 + j] * q, by = piece[24 + j] * q + w;
+            w = w * q + piece[8 + j];
             slope[j] = by * q + w, sum[j] = w * q + piece[j];
         }
         KEPT_LOOP for (int j = 0; j < 4; j++) low[4 * i + j] = sum[4 + j] * p + sum[j];
@@ -445,22 +446,32 @@ INLINE void T(patch)(const R *low, R x, R a, R b, R *u, R *v) {
     *u = a + (low[2] * x * x + low[0]), *v = b + (low[3] * x * x + low[1]);
 }
 
-INLINE void T(patch_slopes)(const R *low, const R *high, const R *down, R x, R sa, R sb, R *ua, R *ub, R *va, R *vb) {
-    const R xx = x * x;
-    *ua = (high[2] * xx + (2 * x * low[2] + high[0])) * sa + 1, *va = (high[3] * xx + (2 * x * low[3] + high[1])) * sa;
+INLINE void T(patch_slopes)(const int order, const R *low, const R *high, const R *down, R x, R sa, R sb, R *ua, R *ub, R *va,
+                            R *vb) {
+    const R xx = x * x, p = order == 3 ? high[2] * xx : 0, q = order == 3 ? high[3] * xx : 0;
+    *ua = (p + (2 * x * low[2] + high[0])) * sa + 1, *va = (q + (2 * x * low[3] + high[1])) * sa;
     *ub = (down[2] * xx + down[0]) * sb, *vb = (down[3] * xx + down[1]) * sb + 1;
 }
 
-static void T(patches)(const T(Camera) *c, int n, const R *restrict a, const R *restrict b, R *restrict u, R *restrict v,
-                      T(Jacobian) *restrict to) {
+INLINE void T(patches_by)(const T(Camera) *c, const int order, int n, const R *restrict a, const R *restrict b, R *restrict u,
+                          R *restrict v, T(Jacobian) *restrict to) {
     const R *k = c->numbers[c->stages], sa = k[0], sb = k[1];
     ALIGNED R x[BLOCK], low[4 * BLOCK], high[4 * BLOCK], down[4 * BLOCK];
-    if (to) T(patches_of)(c, 1, n, a, b, x, low, high, down);
-    else T(patches_of)(c, 0, n, a, b, x, low, high, down);
+    T(patches_of)(c, order, to != NULL, n, a, b, x, low, high, down);
     EACH(i) T(patch)(low + 4 * i, x[i], a[i], b[i], u + i, v + i);
     if (!to) return;
     EACH(i)
-        T(patch_slopes)(low + 4 * i, high + 4 * i, down + 4 * i, x[i], sa, sb, to->ua + i, to->ub + i, to->va + i, to->vb + i);
+        T(patch_slopes)(order, low + 4 * i, high + 4 * i, down + 4 * i, x[i], sa, sb, to->ua + i, to->ub + i, to->va + i,
+                        to->vb + i);
+}
+
+static WIDE void T(patches)(const T(Camera) *c, int n, const R *restrict a, const R *restrict b, R *restrict u, R *restrict v,
+                            T(Jacobian) *restrict to) {
+    if (c->parts[c->stages].flags == 3) {
+        if (to) T(patches_by)(c, 3, n, a, b, u, v, to);
+        else T(patches_by)(c, 3, n, a, b, u, v, NULL);
+    } else if (to) T(patches_by)(c, 2, n, a, b, u, v, to);
+    else T(patches_by)(c, 2, n, a, b, u, v, NULL);
 }
 
 /* Cells and centre are constants: their sums stay 0 */
@@ -639,7 +650,11 @@ static int T(chosen)(int n, const I *restrict open, int *restrict places) {
     I all = 1;
     EACH(i) all &= open[i] != 0;
     if (all) return 0;
-    for (int i = 0; i < n; i++) places[count] = i, count += !open[i]; /* no branch, that nobody could foretell */
+    for (int first = 0; first < n; first += LANES) {
+        all = 1;
+        for (int j = 0; j < LANES; j++) all &= open[first + j] != 0;
+        for (int i = first; i < first + LANES && !all; i++) places[count] = i, count += !open[i]; /* no branch, that nobody could foretell */
+    }
     for (int i = count; count && i % LANES; i++) places[i] = places[count - 1];
     return count;
 }

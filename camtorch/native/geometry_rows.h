@@ -667,7 +667,7 @@ static void T(cover)(const T(Camera) *c, int n, R *a, R *b, const I *known, I *o
 }
 
 /* Points near those that a surface sends to (u, v), from a table of that, see `start_of` */
-static NOT_INLINE void T(begin_surface)(const R *restrict table, int n, const R *restrict u, const R *restrict v, R *restrict a,
+static WIDE void T(begin_surface)(const R *restrict table, int n, const R *restrict u, const R *restrict v, R *restrict a,
                              R *restrict b) {
     const R across = table[0], down = table[1], half_u = GRID / 2 / across, half_v = GRID / 2 / down;
     const R left = table[2] - half_u, right = table[2] + half_u, top = table[3] - half_v, bottom = table[3] + half_v;
@@ -737,6 +737,26 @@ INLINE I T(step_of)(R *a, R *b, R du, R dv, R ua, R ub, R va, R vb, const R *ben
     return ok | ((left > 0) & (one > 0));
 }
 
+/* The same of a surface of that order whose pieces are known */
+INLINE void T(step_on_pieces)(const T(Camera) *c, const int order, int n, const R *restrict u, const R *restrict v,
+                              R *restrict a, R *restrict b, I *restrict ok) {
+    const R *k = c->numbers[c->stages], sa = k[0], sb = k[1], bend = c->start[4];
+    ALIGNED R x[BLOCK], low[4 * BLOCK], high[4 * BLOCK], down[4 * BLOCK];
+    T(patches_of)(c, order, 1, n, a, b, x, low, high, down);
+    EACH(i) {
+        R p, q, ua, ub, va, vb;
+        T(patch)(low + 4 * i, x[i], a[i], b[i], &p, &q);
+        T(patch_slopes)(order, low + 4 * i, high + 4 * i, down + 4 * i, x[i], sa, sb, &ua, &ub, &va, &vb);
+        ok[i] = T(step_of)(a + i, b + i, u[i] - p, v[i] - q, ua, ub, va, vb, &bend, ok[i]);
+    }
+}
+
+static WIDE void T(steps_on_pieces)(const T(Camera) *c, int n, const R *restrict u, const R *restrict v, R *restrict a,
+                                    R *restrict b, I *restrict ok) {
+    if (c->parts[c->stages].flags == 3) T(step_on_pieces)(c, 3, n, u, v, a, b, ok);
+    else T(step_on_pieces)(c, 2, n, u, v, a, b, ok);
+}
+
 /* A step of Newton's method for the stages from `first` on, of points that are not `ok`: are they now? */
 static void T(newton_step)(const T(Camera) *c, int first, int n, const R *restrict u, const R *restrict v,
                            R *restrict a, R *restrict b, I *restrict ok) {
@@ -753,15 +773,7 @@ static void T(newton_step)(const T(Camera) *c, int first, int n, const R *restri
             ok[i] = T(step_of)(a + i, b + i, u[i] - p, v[i] - q, ua, ub, va, vb, NULL, ok[i]);
         }
     } else if (first == c->stages && c->pieces && c->start) {
-        const R *k = c->numbers[first], sa = k[0], sb = k[1], bend = c->start[4];
-        ALIGNED R low[4 * BLOCK], high[4 * BLOCK], down[4 * BLOCK];
-        T(patches_of)(c, 1, n, a, b, x, low, high, down);
-        EACH(i) {
-            R p, q, ua, ub, va, vb;
-            T(patch)(low + 4 * i, x[i], a[i], b[i], &p, &q);
-            T(patch_slopes)(low + 4 * i, high + 4 * i, down + 4 * i, x[i], sa, sb, &ua, &ub, &va, &vb);
-            ok[i] = T(step_of)(a + i, b + i, u[i] - p, v[i] - q, ua, ub, va, vb, &bend, ok[i]);
-        }
+        T(steps_on_pieces)(c, n, u, v, a, b, ok);
     } else {
         T(Jacobian) to;
         T(lens)(c, first, n, a, b, x, y, &to, NULL);
