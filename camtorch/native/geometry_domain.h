@@ -488,10 +488,16 @@ static void start_of(const Domain *d, int64_t camera, const uint8_t *certain) {
     ALIGNED double a[BLOCK], b[BLOCK], u[BLOCK], v[BLOCK];
     ALIGNED int64_t ok[BLOCK];
     double low[2] = {INFINITY, INFINITY}, high[2] = {-INFINITY, -INFINITY}, found[2][SIDE][SIDE], start[CELL] = {0};
-    for (int j = 0; j < SIDE; j++) {
-        for (int i = 0; i < SIDE; i++)
-            a[i] = k[2] + size[0] * (i / (SIDE - 1.0) - 0.5), b[i] = k[3] + size[1] * (j / (SIDE - 1.0) - 0.5);
-        on_surface_double(&c, SIDE, a, b, ok);
+    double box[4];
+    box_of(&c, certain, box);
+    for (int j = 0; j < 2 * SIDE; j++) {
+        const double share = j % SIDE / (SIDE - 1.0) - 0.5; /* of the surface, then of its box */
+        for (int i = 0; i < SIDE; i++) {
+            a[i] = (i / (SIDE - 1.0) - 0.5) * (j < SIDE ? size[0] : 2 * box[2] / k[0]) + (j < SIDE ? k[2] : box[0]);
+            b[i] = share * (j < SIDE ? size[1] : 2 * box[3] / k[1]) + (j < SIDE ? k[3] : box[1]);
+            ok[i] = box[2] > 0 && box[3] > 0;
+        }
+        if (j < SIDE) on_surface_double(&c, SIDE, a, b, ok);
         stage_double(&c, c.stages, SIDE, a, b, u, v, NULL);
         for (int i = 0; i < SIDE; i++) {
             if (!ok[i]) continue;
