@@ -47,8 +47,7 @@ typedef struct {
     T(Plane) planes[MOST_PARTS];
     R fx, fy, cx, cy, inner2, usual2, circle2;
     const R *limits2, *extent, *table, *start, *pieces;
-    const uint8_t *certain;
-    int all_certain, has_box; /* of all pieces of the surface; of those of a box, and it is the only stage */
+    int all_certain, has_box, is_boxed; /* all pieces of the surface; a box of it; and it is the only stage */
     T(Edge) box;
     R certain2, beside2; /* of a circle beside that box, in which points are certain as well; -1: none */
     R chart_inner2, chart_most2;

@@ -474,7 +474,7 @@ static void pieces_of(const Part *part, const double *k, void *pieces, int64_t a
         }
 }
 
-/* (START): the inverse of the last stage, a surface, on the box around what it sends certain points to. First where
+/* (START): the inverse of the last stage, a surface, on the box around what it sends its regular box to. First where
    the cells are, as of a surface, and what Newton's method leaves of a step: it times the step's square times the norm of
    the Jacobian's inverse, to be less than 1. Of each cell its middle; slopes across and down; by how much
    these change across; and down */
@@ -482,32 +482,25 @@ static void start_of(const Domain *d, int64_t camera, const uint8_t *certain) {
     enum { SIDE = GRID + 4 }; /* the middles of cells, and two around: whole vectors */
     Camera_double c;
     lens_of(d, camera, &c);
-    c.certain = certain;
     const Part *part = c.parts + c.stages;
-    const double *k = c.numbers[c.stages], size[2] = {(part->n - part->flags) / k[0], (part->m - part->flags) / k[1]};
-    ALIGNED double a[BLOCK], b[BLOCK], u[BLOCK], v[BLOCK];
+    const double *k = c.numbers[c.stages];
+    ALIGNED double a[BLOCK], b[BLOCK], u[BLOCK], v[BLOCK], box[4];
     ALIGNED int64_t ok[BLOCK];
     double low[2] = {INFINITY, INFINITY}, high[2] = {-INFINITY, -INFINITY}, found[2][SIDE][SIDE], start[CELL] = {0};
-    double box[4];
     box_of(&c, certain, box);
-    for (int j = 0; j < 2 * SIDE; j++) {
-        const double share = j % SIDE / (SIDE - 1.0) - 0.5; /* of the surface, then of its box */
-        for (int i = 0; i < SIDE; i++) {
-            a[i] = (i / (SIDE - 1.0) - 0.5) * (j < SIDE ? size[0] : 2 * box[2] / k[0]) + (j < SIDE ? k[2] : box[0]);
-            b[i] = share * (j < SIDE ? size[1] : 2 * box[3] / k[1]) + (j < SIDE ? k[3] : box[1]);
-            ok[i] = box[2] > 0 && box[3] > 0;
-        }
-        if (j < SIDE) on_surface_double(&c, SIDE, a, b, ok);
+    if (!(box[2] > 0 && box[3] > 0)) box[0] = k[2], box[1] = k[3], box[2] = part->n / 2.0, box[3] = part->m / 2.0;
+    for (int j = 0; j < SIDE; j++) {
+        for (int i = 0; i < SIDE; i++)
+            a[i] = box[0] + (2 * i / (SIDE - 1.0) - 1) * box[2] / k[0], b[i] = box[1] + (2 * j / (SIDE - 1.0) - 1) * box[3] / k[1];
         stage_double(&c, c.stages, SIDE, a, b, u, v, NULL);
         for (int i = 0; i < SIDE; i++) {
-            if (!ok[i]) continue;
             low[0] = u[i] < low[0] ? u[i] : low[0], high[0] = u[i] > high[0] ? u[i] : high[0];
             low[1] = v[i] < low[1] ? v[i] : low[1], high[1] = v[i] > high[1] ? v[i] : high[1];
         }
     }
     for (int axis = 0; axis < 2; axis++) {
         const int is_box = low[axis] < high[axis];
-        start[axis] = GRID / (is_box ? high[axis] - low[axis] : size[axis]);
+        start[axis] = GRID / (is_box ? high[axis] - low[axis] : 2 * box[2 + axis] / k[axis]);
         start[2 + axis] = is_box ? (low[axis] + high[axis]) / 2 : k[2 + axis];
     }
     const double least = (d->is_double ? DBL_EPSILON : FLT_EPSILON) / 2 * hypot(GRID / 2 / start[0], GRID / 2 / start[1]);

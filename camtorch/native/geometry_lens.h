@@ -524,20 +524,6 @@ INLINE I T(in_box)(const T(Edge) box, R certain2, R beside2, R a, R b) {
     return (T(on_edge)(box, a, b) & (certain2 - square > 0)) | (beside2 - square > 0);
 }
 
-/* Points of the plane of a surface, the last stage, where it is regular on the whole way from the centre for certain */
-static void T(on_surface)(const T(Camera) *c, int n, const R *restrict a, const R *restrict b, I *restrict ok) {
-    const T(Edge) edge = T(edge_of)(c);
-    EACH(i) ok[i] = T(on_edge)(edge, a[i], b[i]);
-    if (c->all_certain) return;
-    const T(Pieces) pieces = T(pieces_on)(c);
-    ALIGNED int32_t at[BLOCK];
-    EACH(i) {
-        R x, y;
-        at[i] = T(piece)(pieces, a[i], b[i], &x, &y);
-    }
-    for (int i = 0; i < n; i++) ok[i] &= c->certain[at[i]];
-}
-
 static void T(stage)(const T(Camera) *c, int stage, int n, const R *a, const R *b, R *u, R *v, T(Jacobian) *to) {
     const Part *part = c->parts + stage;
     const R *k = c->numbers[stage];
@@ -550,13 +536,13 @@ static void T(stage)(const T(Camera) *c, int stage, int n, const R *a, const R *
     else T(planar)(c, stage, n, a, b, u, v, to);
 }
 
-/* Points that are in the domain for certain */
+/* Points that are in the domain for certain, of a surface after a radial factor */
 static void T(certain)(const T(Camera) *c, int n, const R *restrict a, const R *restrict b, I *restrict ok) {
     ALIGNED R x[BLOCK], y[BLOCK];
     const R certain2 = c->certain2;
-    if (c->stages > 1) T(stage)(c, 1, n, a, b, x, y, NULL);
-    T(on_surface)(c, n, c->stages > 1 ? x : a, c->stages > 1 ? y : b, ok);
-    EACH(i) ok[i] &= certain2 - (a[i] * a[i] + b[i] * b[i]) > 0;
+    const T(Edge) box = c->box;
+    T(stage)(c, 1, n, a, b, x, y, NULL);
+    EACH(i) ok[i] = T(on_edge)(box, x[i], y[i]) & (certain2 - (a[i] * a[i] + b[i] * b[i]) > 0);
 }
 
 /* Where the stages from `first` on send points, not in place; the Jacobian of all of them; if wanted, `least`: positive

@@ -63,9 +63,8 @@ static void T(prepare)(const Cameras *all, int64_t camera, T(Camera) *c) {
             for (int i = 0; i < (last->n - last->flags) * (last->m - last->flags); i++) c->all_certain &= certain[i];
             if (all->certain2 && c->follows) {
                 const R *box = (const R *)all->certain2 + BOX * camera;
-                c->certain = certain, c->certain2 = box[0], c->beside2 = c->all_certain ? -1 : c->usual2;
+                c->has_box = 1, c->is_boxed = c->stages == 1, c->certain2 = box[0], c->beside2 = c->all_certain ? -1 : c->usual2;
                 if (!c->all_certain) c->box.ca = box[1], c->box.cb = box[2], c->box.across = box[3], c->box.down = box[4];
-                c->has_box = c->stages == 1 && c->box.across > 0 && c->box.down > 0;
             }
         }
         if (all->pieces) {
@@ -458,7 +457,7 @@ static int T(see)(const T(Camera) *c, int keeps, int count, int n, T(Seen) *s) {
                s->z, s->shrink, s->scale, swapped ? s->b : s->a, swapped ? s->a : s->b, s->ok);
     if (!later) return 0;
     if (c->way == INVERTED) T(see_inverted)(c, keeps, n, s);
-    if (c->has_box) {
+    if (c->is_boxed) {
         const T(Edge) box = c->box;
         const R certain2 = c->certain2, beside2 = c->beside2;
         EACH(i) s->ok[i] += s->ok[i] & !T(in_box)(box, certain2, beside2, s->a[i], s->b[i]), outside |= s->ok[i];
@@ -466,7 +465,7 @@ static int T(see)(const T(Camera) *c, int keeps, int count, int n, T(Seen) *s) {
         s->ok[i] += s->ok[i] & !(inner2 - (s->a[i] * s->a[i] + s->b[i] * s->b[i]) > 0); /* 2: beyond */
         outside |= s->ok[i];
     }
-    if (outside & 2 && c->certain && !(c->has_box && c->all_certain)) {
+    if (outside & 2 && c->has_box && !c->is_boxed) {
         ALIGNED I certain[BLOCK];
         T(certain)(c, n, s->a, s->b, certain);
         outside = 0;
@@ -869,10 +868,10 @@ static void T(invert)(const T(Camera) *c, int n, const R *restrict u, const R *r
         T(newton)(c, 1, n, u, v, a, b, ok, fewest);
         I outside = 0;
         EACH(i) possible[i] = ok[i]; /* converged, somewhere */
-        if (c->has_box) EACH(i) ok[i] &= T(in_box)(box, certain2, beside2, a[i] * further, b[i] * further);
+        if (c->is_boxed) EACH(i) ok[i] &= T(in_box)(box, certain2, beside2, a[i] * further, b[i] * further);
         else EACH(i) ok[i] &= usual2 - (a[i] * a[i] + b[i] * b[i]) > 0;
         EACH(i) outside |= possible[i] & !ok[i];
-        if (outside && c->certain && !(c->has_box && c->all_certain)) {
+        if (outside && c->has_box && !c->is_boxed) {
             ALIGNED I certain[BLOCK];
             outside = 0;
             EACH(i) p[i] = a[i] * further, q[i] = b[i] * further;
