@@ -636,11 +636,7 @@ static int T(chosen)(int n, const I *restrict open, int *restrict places) {
     I all = 1;
     EACH(i) all &= open[i] != 0;
     if (all) return 0;
-    for (int first = 0; first < n; first += LANES) {
-        all = 1;
-        for (int j = 0; j < LANES; j++) all &= open[first + j] != 0;
-        for (int i = first; i < first + LANES && !all; i++) places[count] = i, count += !open[i]; /* no branch, that nobody could foretell */
-    }
+    for (int i = 0; i < n; i++) places[count] = i, count += !open[i]; /* no branch, that nobody could foretell */
     for (int i = count; count && i % LANES; i++) places[i] = places[count - 1];
     return count;
 }
