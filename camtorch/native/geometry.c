@@ -15,6 +15,12 @@
 #define ALIGNED __attribute__((aligned(64)))
 #define INLINE static inline __attribute__((always_inline))
 #define NOT_INLINE __attribute__((noinline))
+/* Where surfaces are evaluated, vectors of 512 bits gain a tenth; compilers before do not know the attribute for certain */
+#if defined __AVX512F__ && !defined __clang__ && __GNUC__ >= 12
+#define WIDE NOT_INLINE __attribute__((target("prefer-vector-width=512")))
+#else
+#define WIDE NOT_INLINE
+#endif
 
 #define JOINED_(a, b) a##_##b
 #define JOINED(a, b) JOINED_(a, b)

@@ -32,7 +32,9 @@ enum { MOST_RADII = 512 }; /* on which a lens is followed outwards by bounds of 
 enum { AZIMUTHS = 336 }; /* on which limits are given, see `fold.limits_and_extent` */
 enum { RADII = 80 };     /* on each of them: half over the whole chart, half around the fold of a radial factor */
 /* The inverse of a surface, nearly: a polynomial of CELL numbers on each of GRID x GRID cells, after where these are */
-enum { GRID = 44, CELL = 16, START = CELL * (1 + GRID * GRID) };
+enum { GRID = 60, CELL = 16, START = CELL * (1 + GRID * GRID) };
+/* A squared radius, the middle of a box and its size, see `box_of` */
+enum { BOX = 5 };
 /* Numbers of a piece of a surface: 4 x 4 coefficients, of du and dv each */
 enum { PIECE = 32 };
 /* Radii (RADII); how far out they are sent on each azimuth (AZIMUTHS, RADII), ascending; how far the image reaches in each
@@ -62,8 +64,8 @@ typedef struct {
     const uint8_t *stagewise;
     const void *circle2;
     /* of a lens that is a surface, or a surface after a radial factor: where a point is in the domain for certain, of each
-       piece of it (c, n m, of which as many are used) and up to the squared radius of the factor's fold (c); where to start the inverse of
-       the surface (c, START); the surface as polynomials (c, PIECE of each piece), or NULL, see `pieces_of` */
+       piece of it (c, n m, of which as many are used), and up to the squared radius of the factor's fold in a box of the
+       surface (c, BOX); where to start the inverse of the surface (c, START); the surface as polynomials (c, PIECE of each piece), or NULL, see `pieces_of` */
     const uint8_t *certain;
     const void *certain2, *start, *pieces;
     /* of an inverted chart: the squared radius and the squared angle of its fold, the table of its inverse */
@@ -89,7 +91,7 @@ typedef struct {
     void *limits2, *extent;                  /* (c, AZIMUTHS), (c, EXTENT): both or none */
     uint8_t *stagewise;                      /* (c); with circle2 */
     uint8_t *certain;                        /* (c, n m) */
-    void *certain2, *start, *pieces; /* (c); (c, START), which reads `certain`; (c, PIECE of each piece) */
+    void *certain2, *start, *pieces; /* (c, BOX) and (c, START), which read `certain`; (c, PIECE of each piece) */
 } Domain;
 
 enum { PROJECT, UNPROJECT, PROJECT_VJP, UNPROJECT_VJP };

@@ -26,6 +26,11 @@ typedef struct {
     R px, py, s0, s1, s2, s3;
 } T(Plane);
 
+/* A box of the plane of a surface: in cells, how far it goes to each side of its middle */
+typedef struct {
+    R sa, sb, ca, cb, across, down;
+} T(Edge);
+
 /* A camera: its numbers, by parts, and what follows from them alone */
 typedef struct {
     const Part *parts;
@@ -42,9 +47,10 @@ typedef struct {
     T(Plane) planes[MOST_PARTS];
     R fx, fy, cx, cy, inner2, usual2, circle2;
     const R *limits2, *extent, *table, *start, *pieces;
-    const uint8_t *certain;
-    int all_certain, to_edge; /* of all pieces of the surface; and it is the only stage */
-    R certain2, curve; /* see `bend_of` */
+    int all_certain, has_box, is_boxed; /* all pieces of the surface; a box of it; and it is the only stage */
+    T(Edge) box;
+    R certain2, beside2; /* of a circle beside that box, in which points are certain as well; -1: none */
+    R curve; /* see `bend_of` */
     R chart_inner2, chart_most2;
     const R *chart_table;
     T(Chart) chart;

@@ -394,6 +394,61 @@ static void certain_of(const Camera_double *c, uint8_t *certain) {
                 }
 }
 
+/* Whether a surface is regular on squares of an eighth of a cell in a row, the first of which has its middle there: by how
+   much slopes change at the most */
+static int is_regular_along(const Camera_double *c, double bend, int axis, int count, double a, double b) {
+    const double *k = c->numbers[c->stages], step = 0.125 / k[axis], change = bend * hypot(0.0625 / k[0], 0.0625 / k[1]);
+    ALIGNED double x[BLOCK], y[BLOCK], u[BLOCK], v[BLOCK];
+    Jacobian_double to;
+    int ok = 1;
+    for (int first = 0; first < count; first += BLOCK) {
+        for (int i = 0; i < BLOCK; i++) {
+            const double far = step * (first + i < count ? first + i : count - 1);
+            x[i] = axis ? a : a + far, y[i] = axis ? b + far : b;
+        }
+        stage_double(c, c->stages, BLOCK, x, y, u, v, &to);
+        for (int i = 0; i < BLOCK; i++) {
+            const double ua = to.ua[i], ub = to.ub[i], va = to.va[i], vb = to.vb[i];
+            ok &= ua - change > 0 && vb - change > 0 && ua * vb - ub * va - change * sqrt(ua * ua + ub * ub + va * va + vb * vb) > 0;
+        }
+    }
+    return ok;
+}
+
+/* (4) of a box in which a surface is regular: its middle, and in cells how far it goes across and down. Of all pieces, less
+   at each turn the row or column at its rim that has most others, and then with a part of these */
+static void box_of(const Camera_double *c, const uint8_t *certain, double *box) {
+    const Part *part = c->parts + c->stages;
+    const double *k = c->numbers[c->stages], bend = bend_of_double(part, k);
+    const int size[2] = {part->n - part->flags, part->m - part->flags};
+    int ends[2][2] = {{0, size[0]}, {0, size[1]}}, counts[4], worst = 0; /* left and right, top and bottom */
+    do {
+        memset(counts, 0, sizeof counts);
+        for (int side = 0; side < 4; side++) {
+            const int axis = side / 2, line = ends[axis][side % 2] - side % 2;
+            for (int i = ends[!axis][0]; i < ends[!axis][1]; i++) counts[side] += !certain[axis ? line * size[0] + i : i * size[0] + line];
+            worst = counts[side] > counts[worst] ? side : worst;
+        }
+        if (counts[worst]) ends[worst / 2][worst % 2] += worst % 2 ? -1 : 1;
+    } while (counts[worst] && ends[worst / 2][0] < ends[worst / 2][1]);
+    double found[2][2];
+    for (int side = 0; side < 4; side++) found[side / 2][side % 2] = ends[side / 2][side % 2] - size[side / 2] / 2.0;
+    for (int side = 0; side < 4 && !counts[worst]; side++) {
+        const int axis = side / 2, other = !axis, is_last = side % 2;
+        const double outwards = is_last ? 0.125 : -0.125;
+        double *end = found[axis] + is_last, place[2];
+        for (; fabs(*end) < size[axis] / 2.0; *end += outwards) {
+            place[axis] = *end + outwards / 2, place[other] = found[other][0] + 0.0625;
+            const int count = (int)(8 * (found[other][1] - found[other][0]));
+            if (!is_regular_along(c, bend, other, count, k[2] + place[0] / k[0], k[3] + place[1] / k[1])) break;
+        }
+    }
+    for (int axis = 0; axis < 2; axis++) {
+        box[axis] = k[2 + axis] + (found[axis][0] + found[axis][1]) / 2 / k[axis];
+        box[2 + axis] = (found[axis][1] - found[axis][0]) / 2 - 1e-4; /* that rounding carries nothing out of */
+    }
+}
+
 /* (PIECE of each piece): a surface as polynomials of the place in a piece: of each power of that down, those of that across
    in the order 0, 2, 1, 3 */
 static void pieces_of(const Part *part, const double *k, void *pieces, int64_t at, int is_double) {
@@ -419,33 +474,32 @@ static void pieces_of(const Part *part, const double *k, void *pieces, int64_t a
         }
 }
 
-/* (START): the inverse of the last stage, a surface, on the box around what it sends certain points to. First where
+/* (START): the inverse of the last stage, a surface, on the box around what it sends its regular box to. First where
    the cells are, as of a surface. Of each cell its middle; slopes across and down; by how much these change across; and
    down */
 static void start_of(const Domain *d, int64_t camera, const uint8_t *certain) {
     enum { SIDE = GRID + 4 }; /* the middles of cells, and two around: whole vectors */
     Camera_double c;
     lens_of(d, camera, &c);
-    c.certain = certain;
     const Part *part = c.parts + c.stages;
-    const double *k = c.numbers[c.stages], size[2] = {(part->n - part->flags) / k[0], (part->m - part->flags) / k[1]};
-    ALIGNED double a[BLOCK], b[BLOCK], u[BLOCK], v[BLOCK];
+    const double *k = c.numbers[c.stages];
+    ALIGNED double a[BLOCK], b[BLOCK], u[BLOCK], v[BLOCK], box[4];
     ALIGNED int64_t ok[BLOCK];
     double low[2] = {INFINITY, INFINITY}, high[2] = {-INFINITY, -INFINITY}, found[2][SIDE][SIDE], start[CELL] = {0};
+    box_of(&c, certain, box);
+    if (!(box[2] > 0 && box[3] > 0)) box[0] = k[2], box[1] = k[3], box[2] = part->n / 2.0, box[3] = part->m / 2.0;
     for (int j = 0; j < SIDE; j++) {
         for (int i = 0; i < SIDE; i++)
-            a[i] = k[2] + size[0] * (i / (SIDE - 1.0) - 0.5), b[i] = k[3] + size[1] * (j / (SIDE - 1.0) - 0.5);
-        on_surface_double(&c, SIDE, a, b, ok);
+            a[i] = box[0] + (2 * i / (SIDE - 1.0) - 1) * box[2] / k[0], b[i] = box[1] + (2 * j / (SIDE - 1.0) - 1) * box[3] / k[1];
         stage_double(&c, c.stages, SIDE, a, b, u, v, NULL);
         for (int i = 0; i < SIDE; i++) {
-            if (!ok[i]) continue;
             low[0] = u[i] < low[0] ? u[i] : low[0], high[0] = u[i] > high[0] ? u[i] : high[0];
             low[1] = v[i] < low[1] ? v[i] : low[1], high[1] = v[i] > high[1] ? v[i] : high[1];
         }
     }
     for (int axis = 0; axis < 2; axis++) {
         const int is_box = low[axis] < high[axis];
-        start[axis] = GRID / (is_box ? high[axis] - low[axis] : size[axis]);
+        start[axis] = GRID / (is_box ? high[axis] - low[axis] : 2 * box[2 + axis] / k[axis]);
         start[2 + axis] = is_box ? (low[axis] + high[axis]) / 2 : k[2 + axis];
     }
     for (int i = 0; i < CELL; i++) put(d->start, camera * START + i, start[i], (int)d->is_double);
@@ -527,11 +581,14 @@ void THIS(domain)(const Domain *d) {
             follow(d, c, &camera, has_factor ? fold : NAN, end);
         }
         const Part *last = d->parts + d->part_count - 1;
-        if (d->certain2) put(d->certain2, c, within(has_factor ? fold : end, end, is_double), is_double);
         if (d->certain) {
             Camera_double camera;
+            uint8_t *certain = d->certain + c * last->n * last->m;
             lens_of(d, c, &camera);
-            certain_of(&camera, d->certain + c * last->n * last->m);
+            certain_of(&camera, certain);
+            double box[BOX] = {within(has_factor ? fold : end, end, is_double)};
+            if (d->certain2) box_of(&camera, certain, box + 1);
+            for (int i = 0; d->certain2 && i < BOX; i++) put(d->certain2, BOX * c + i, box[i], is_double);
         }
         const double *controls = numbers + d->parameter_count - numbers_of(last);
         if (d->pieces) pieces_of(last, controls, d->pieces, c * PIECE * (last->n - last->flags) * (last->m - last->flags), is_double);

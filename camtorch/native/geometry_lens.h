@@ -374,7 +374,7 @@ static void T(surface)(const Part *part, const R *k, int n, const R *restrict a,
     else T(surface_of)(part, k, 2, n, a, b, u, v, NULL);
 }
 
-/* By how much the slopes of a surface change at the most on a unit: second derivatives of a spline lie between the second
+/* By how much the slopes of a surface, along a line, change at the most on a unit: second derivatives of a spline lie between the second
    differences of its control points */
 static R T(bend_of)(const Part *part, const R *k) {
     const int64_t row = 2 * (int64_t)part->n;
@@ -388,9 +388,9 @@ static R T(bend_of)(const Part *part, const R *k) {
                 if (j > 1) along = T(most)(along, T(absolute)(at[0] - 2 * at[-row] + at[-2 * row]));
                 if (i && j) mixed = T(most)(mixed, T(absolute)(at[0] - at[-2] - at[-row] + at[-row - 2]));
             }
-        sum += along + mixed;
+        sum += (along + mixed) * (along + mixed);
     }
-    return sum * T(most)(k[0] * k[0], k[1] * k[1]);
+    return T(root)(sum) * T(most)(k[0] * k[0], k[1] * k[1]);
 }
 
 /* The pieces of a surface, the last stage, by value */
@@ -421,7 +421,7 @@ INLINE int32_t T(piece)(const T(Pieces) of, R a, R b, R *x, R *y) {
 /* A surface, the last stage, of whose pieces the polynomials are known, see `pieces_of`: of each point the place across and,
    of the powers 0 and 2 of that, the numbers of the part that is even there; if wanted, of that which is odd, and of the
    slope down */
-INLINE void T(patches_of)(const T(Camera) *c, const int slopes, int n, const R *restrict a, const R *restrict b, R *restrict x,
+INLINE void T(patches_of)(const T(Camera) *c, const int order, const int slopes, int n, const R *restrict a, const R *restrict b, R *restrict x,
                           R *restrict low, R *restrict high, R *restrict down) {
     const T(Pieces) pieces = T(pieces_on)(c);
     ALIGNED R y[BLOCK];
@@ -431,8 +431,9 @@ INLINE void T(patches_of)(const T(Camera) *c, const int slopes, int n, const R *
         const R *restrict piece = c->pieces + (int64_t)PIECE * at[i], p = x[i], q = y[i];
         ALIGNED R sum[8], slope[8];
         KEPT_LOOP for (int j = 0; j < 8; j++) {
-            R by = piece[24 + j], w = by * q + piece[16 + j];
-            by = by * q + w, w = w * q + piece[8 + j];
+            R by = piece[16 + j], w = by;
+            if (order == 3) w += piece[24 + j] * q, by = piece[24 + j] * q + w;
+            w = w * q + piece[8 + j];
             slope[j] = by * q + w, sum[j] = w * q + piece[j];
         }
         KEPT_LOOP for (int j = 0; j < 4; j++) low[4 * i + j] = sum[4 + j] * p + sum[j];
@@ -445,22 +446,32 @@ INLINE void T(patch)(const R *low, R x, R a, R b, R *u, R *v) {
     *u = a + (low[2] * x * x + low[0]), *v = b + (low[3] * x * x + low[1]);
 }
 
-INLINE void T(patch_slopes)(const R *low, const R *high, const R *down, R x, R sa, R sb, R *ua, R *ub, R *va, R *vb) {
-    const R xx = x * x;
-    *ua = (high[2] * xx + (2 * x * low[2] + high[0])) * sa + 1, *va = (high[3] * xx + (2 * x * low[3] + high[1])) * sa;
+INLINE void T(patch_slopes)(const int order, const R *low, const R *high, const R *down, R x, R sa, R sb, R *ua, R *ub, R *va,
+                            R *vb) {
+    const R xx = x * x, p = order == 3 ? high[2] * xx : 0, q = order == 3 ? high[3] * xx : 0;
+    *ua = (p + (2 * x * low[2] + high[0])) * sa + 1, *va = (q + (2 * x * low[3] + high[1])) * sa;
     *ub = (down[2] * xx + down[0]) * sb, *vb = (down[3] * xx + down[1]) * sb + 1;
 }
 
-static void T(patches)(const T(Camera) *c, int n, const R *restrict a, const R *restrict b, R *restrict u, R *restrict v,
-                      T(Jacobian) *restrict to) {
+INLINE void T(patches_by)(const T(Camera) *c, const int order, int n, const R *restrict a, const R *restrict b, R *restrict u,
+                          R *restrict v, T(Jacobian) *restrict to) {
     const R *k = c->numbers[c->stages], sa = k[0], sb = k[1];
     ALIGNED R x[BLOCK], low[4 * BLOCK], high[4 * BLOCK], down[4 * BLOCK];
-    if (to) T(patches_of)(c, 1, n, a, b, x, low, high, down);
-    else T(patches_of)(c, 0, n, a, b, x, low, high, down);
+    T(patches_of)(c, order, to != NULL, n, a, b, x, low, high, down);
     EACH(i) T(patch)(low + 4 * i, x[i], a[i], b[i], u + i, v + i);
     if (!to) return;
     EACH(i)
-        T(patch_slopes)(low + 4 * i, high + 4 * i, down + 4 * i, x[i], sa, sb, to->ua + i, to->ub + i, to->va + i, to->vb + i);
+        T(patch_slopes)(order, low + 4 * i, high + 4 * i, down + 4 * i, x[i], sa, sb, to->ua + i, to->ub + i, to->va + i,
+                        to->vb + i);
+}
+
+static WIDE void T(patches)(const T(Camera) *c, int n, const R *restrict a, const R *restrict b, R *restrict u, R *restrict v,
+                            T(Jacobian) *restrict to) {
+    if (c->parts[c->stages].flags == 3) {
+        if (to) T(patches_by)(c, 3, n, a, b, u, v, to);
+        else T(patches_by)(c, 3, n, a, b, u, v, NULL);
+    } else if (to) T(patches_by)(c, 2, n, a, b, u, v, to);
+    else T(patches_by)(c, 2, n, a, b, u, v, NULL);
 }
 
 /* Cells and centre are constants: their sums stay 0 */
@@ -498,10 +509,6 @@ INLINE R T(surface_edge)(const Part *part, const R *k, R behind, R a, R b) {
 }
 
 /* What is certain of a surface that is the last stage: up to its edge and a hair behind, no further */
-typedef struct {
-    R sa, sb, ca, cb, across, down;
-} T(Edge);
-
 INLINE T(Edge) T(edge_of)(const T(Camera) *c) {
     const Part *part = c->parts + c->stages;
     const R *k = c->numbers[c->stages], behind = (R)1e-4;
@@ -512,18 +519,9 @@ INLINE I T(on_edge)(const T(Edge) e, R a, R b) {
     return (e.across - T(absolute)((a - e.ca) * e.sa) > 0) & (e.down - T(absolute)((b - e.cb) * e.sb) > 0);
 }
 
-/* Points of the plane of a surface, the last stage, where it is regular on the whole way from the centre for certain */
-static void T(on_surface)(const T(Camera) *c, int n, const R *restrict a, const R *restrict b, I *restrict ok) {
-    const T(Edge) edge = T(edge_of)(c);
-    EACH(i) ok[i] = T(on_edge)(edge, a[i], b[i]);
-    if (c->all_certain) return;
-    const T(Pieces) pieces = T(pieces_on)(c);
-    ALIGNED int32_t at[BLOCK];
-    EACH(i) {
-        R x, y;
-        at[i] = T(piece)(pieces, a[i], b[i], &x, &y);
-    }
-    for (int i = 0; i < n; i++) ok[i] &= c->certain[at[i]];
+INLINE I T(in_box)(const T(Edge) box, R certain2, R beside2, R a, R b) {
+    const R square = a * a + b * b;
+    return (T(on_edge)(box, a, b) & (certain2 - square > 0)) | (beside2 - square > 0);
 }
 
 static void T(stage)(const T(Camera) *c, int stage, int n, const R *a, const R *b, R *u, R *v, T(Jacobian) *to) {
@@ -538,13 +536,13 @@ static void T(stage)(const T(Camera) *c, int stage, int n, const R *a, const R *
     else T(planar)(c, stage, n, a, b, u, v, to);
 }
 
-/* Points that are in the domain for certain */
+/* Points that are in the domain for certain, of a surface after a radial factor */
 static void T(certain)(const T(Camera) *c, int n, const R *restrict a, const R *restrict b, I *restrict ok) {
     ALIGNED R x[BLOCK], y[BLOCK];
     const R certain2 = c->certain2;
-    if (c->stages > 1) T(stage)(c, 1, n, a, b, x, y, NULL);
-    T(on_surface)(c, n, c->stages > 1 ? x : a, c->stages > 1 ? y : b, ok);
-    EACH(i) ok[i] &= certain2 - (a[i] * a[i] + b[i] * b[i]) > 0;
+    const T(Edge) box = c->box;
+    T(stage)(c, 1, n, a, b, x, y, NULL);
+    EACH(i) ok[i] = T(on_edge)(box, x[i], y[i]) & (certain2 - (a[i] * a[i] + b[i] * b[i]) > 0);
 }
 
 /* Where the stages from `first` on send points, not in place; the Jacobian of all of them; if wanted, `least`: positive

@@ -135,7 +135,7 @@ static int T(by_surface)(const Move *move, const T(Between) *b, int count, int n
     const int is_inverse = c == &b->from, of_plain = is_inverse ? LEFT_TO : LEFT_FROM;
     const R fx = c->fx, fy = c->fy, cx = c->cx, cy = c->cy, by_fx = 1 / fx, by_fy = 1 / fy, within2 = b->within2;
     const R further = is_inverse ? 1 + 32 * EPS : 1, behind = (R)c->parts[c->stages].constant;
-    const T(Edge) edge = T(edge_of)(c);
+    const T(Edge) edge = c->box;
     ALIGNED R x[BLOCK], y[BLOCK], p[BLOCK], q[BLOCK], some_u[BLOCK], some_v[BLOCK];
     ALIGNED I settled[BLOCK], on[BLOCK], known[BLOCK], found[BLOCK];
     int places[BLOCK], left = 0, some;
@@ -287,9 +287,9 @@ static int T(refined)(const Move *move, const T(Between) *b, int n, const R *res
             R da, db;
             const R ua = to.ua[i], ub = to.ub[i], va = to.va[i], vb = to.vb[i];
             const R one = T(absolute)(T(step)(ua, ub, va, vb, (u[i] - cx) * by_fx - p[i], (v[i] - cy) * by_fy - q[i], &da, &db));
-            const R size = T(absolute)(ua) + T(absolute)(ub) + T(absolute)(va) + T(absolute)(vb);
+            const R off = bend * (da * da + db * db) * one;
             near[0][i] += da / k[0], near[1][i] += db / k[1];
-            all &= (1 - bend * (da * da + db * db) * (size * one) > 0) & (one > 0);
+            all &= (1 - off * off * (ua * ua + ub * ub + va * va + vb * vb) > 0) & (one > 0);
         }
         if (all) return 1;
     }
@@ -595,7 +595,7 @@ static void T(lay_quintics)(const Lattices *given, const Classification *asked) 
 static int T(reaches_all)(const Lattices *given, const T(Between) *b) {
     const T(Camera) *c = b->bent;
     const Part *last = c->parts + c->stages;
-    const T(Edge) edge = T(edge_of)(c);
+    const T(Edge) edge = c->box;
     const R *k = c->numbers[c->stages] + 4;
     R most[2] = {0, 0};
     for (int i = 0; i < 2 * last->n * last->m; i++) most[i % 2] = T(most)(most[i % 2], T(absolute)(k[i]));

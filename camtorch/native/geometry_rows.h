@@ -59,10 +59,13 @@ static void T(prepare)(const Cameras *all, int64_t camera, T(Camera) *c) {
         if (all->certain) {
             const Part *last = c->parts + c->stages;
             const uint8_t *certain = all->certain + camera * last->n * last->m;
-            c->all_certain = 1;
+            c->all_certain = 1, c->box = T(edge_of)(c);
             for (int i = 0; i < (last->n - last->flags) * (last->m - last->flags); i++) c->all_certain &= certain[i];
-            if (all->certain2 && c->follows) c->certain = certain, c->certain2 = ((const R *)all->certain2)[camera];
-            c->to_edge = c->certain && c->all_certain && c->stages == 1;
+            if (all->certain2 && c->follows) {
+                const R *box = (const R *)all->certain2 + BOX * camera;
+                c->has_box = 1, c->is_boxed = c->stages == 1, c->certain2 = box[0], c->beside2 = c->all_certain ? -1 : c->usual2;
+                if (!c->all_certain) c->box.ca = box[1], c->box.cb = box[2], c->box.across = box[3], c->box.down = box[4];
+            }
         }
         if (all->pieces) {
             const Part *last = c->parts + c->stages;
@@ -455,18 +458,15 @@ static int T(see)(const T(Camera) *c, int keeps, int count, int n, T(Seen) *s) {
                s->z, s->shrink, s->scale, swapped ? s->b : s->a, swapped ? s->a : s->b, s->ok);
     if (!later) return 0;
     if (c->way == INVERTED) T(see_inverted)(c, keeps, n, s);
-    if (c->to_edge) {
-        const T(Edge) edge = T(edge_of)(c);
-        const R certain2 = c->certain2;
-        EACH(i) {
-            const I is_on = T(on_edge)(edge, s->a[i], s->b[i]) & (certain2 - (s->a[i] * s->a[i] + s->b[i] * s->b[i]) > 0);
-            s->ok[i] += s->ok[i] & !is_on, outside |= s->ok[i];
-        }
+    if (c->is_boxed) {
+        const T(Edge) box = c->box;
+        const R certain2 = c->certain2, beside2 = c->beside2;
+        EACH(i) s->ok[i] += s->ok[i] & !T(in_box)(box, certain2, beside2, s->a[i], s->b[i]), outside |= s->ok[i];
     } else EACH(i) {
         s->ok[i] += s->ok[i] & !(inner2 - (s->a[i] * s->a[i] + s->b[i] * s->b[i]) > 0); /* 2: beyond */
         outside |= s->ok[i];
     }
-    if (outside & 2 && c->certain && !c->to_edge) {
+    if (outside & 2 && c->has_box && !c->is_boxed) {
         ALIGNED I certain[BLOCK];
         T(certain)(c, n, s->a, s->b, certain);
         outside = 0;
@@ -667,7 +667,7 @@ static void T(cover)(const T(Camera) *c, int n, R *a, R *b, const I *known, I *o
 }
 
 /* Points near those that a surface sends to (u, v), from a table of that, see `start_of` */
-static NOT_INLINE void T(begin_surface)(const R *restrict table, int n, const R *restrict u, const R *restrict v, R *restrict a,
+static WIDE void T(begin_surface)(const R *restrict table, int n, const R *restrict u, const R *restrict v, R *restrict a,
                              R *restrict b) {
     const R across = table[0], down = table[1], half_u = GRID / 2 / across, half_v = GRID / 2 / down;
     const R left = table[2] - half_u, right = table[2] + half_u, top = table[3] - half_v, bottom = table[3] + half_v;
@@ -732,10 +732,33 @@ static void T(start)(const T(Camera) *c, int first, int n, const R *u, const R *
 INLINE I T(step_of)(R *a, R *b, R du, R dv, R ua, R ub, R va, R vb, const R *bend, I ok) {
     R da, db;
     const R one = T(absolute)(T(step)(ua, ub, va, vb, du, dv, &da, &db)), p = *a + da, q = *b + db, step2 = da * da + db * db;
-    const R size = T(absolute)(ua) + T(absolute)(ub) + T(absolute)(va) + T(absolute)(vb);
-    const R left = bend ? 1 - *bend * step2 * (size * one) : EPS / 64 * (p * p + q * q + (R)0.01) - step2;
+    const R off = bend ? *bend * step2 * one : 0;
+    const R left = bend ? 1 - off * off * (ua * ua + ub * ub + va * va + vb * vb) : EPS / 64 * (p * p + q * q + (R)0.01) - step2;
     *a = ok ? *a : p, *b = ok ? *b : q;
     return ok | ((left > 0) & (one > 0));
+}
+
+/* The same of a surface of that order whose pieces are known */
+INLINE void T(step_on_pieces)(const T(Camera) *c, const int order, int n, const R *restrict u, const R *restrict v,
+                              R *restrict a, R *restrict b, I *restrict ok) {
+    const Part *part = c->parts + c->stages;
+    const R *k = c->numbers[c->stages], sa = k[0], sb = k[1];
+    const R half_a = (R)(part->n - part->flags) / 2 / sa, half_b = (R)(part->m - part->flags) / 2 / sb;
+    const R bend = c->curve / EPS / T(root)(half_a * half_a + half_b * half_b);
+    ALIGNED R x[BLOCK], low[4 * BLOCK], high[4 * BLOCK], down[4 * BLOCK];
+    T(patches_of)(c, order, 1, n, a, b, x, low, high, down);
+    EACH(i) {
+        R p, q, ua, ub, va, vb;
+        T(patch)(low + 4 * i, x[i], a[i], b[i], &p, &q);
+        T(patch_slopes)(order, low + 4 * i, high + 4 * i, down + 4 * i, x[i], sa, sb, &ua, &ub, &va, &vb);
+        ok[i] = T(step_of)(a + i, b + i, u[i] - p, v[i] - q, ua, ub, va, vb, &bend, ok[i]);
+    }
+}
+
+static WIDE void T(steps_on_pieces)(const T(Camera) *c, int n, const R *restrict u, const R *restrict v, R *restrict a,
+                                    R *restrict b, I *restrict ok) {
+    if (c->parts[c->stages].flags == 3) T(step_on_pieces)(c, 3, n, u, v, a, b, ok);
+    else T(step_on_pieces)(c, 2, n, u, v, a, b, ok);
 }
 
 /* A step of Newton's method for the stages from `first` on, of points that are not `ok`: are they now? */
@@ -754,18 +777,7 @@ static void T(newton_step)(const T(Camera) *c, int first, int n, const R *restri
             ok[i] = T(step_of)(a + i, b + i, u[i] - p, v[i] - q, ua, ub, va, vb, NULL, ok[i]);
         }
     } else if (first == c->stages && c->pieces) {
-        const Part *part = c->parts + first;
-        const R *k = c->numbers[first], sa = k[0], sb = k[1];
-        const R half_a = (R)(part->n - part->flags) / 2 / sa, half_b = (R)(part->m - part->flags) / 2 / sb;
-        const R bend = c->curve * 2 / EPS / T(root)(half_a * half_a + half_b * half_b);
-        ALIGNED R low[4 * BLOCK], high[4 * BLOCK], down[4 * BLOCK];
-        T(patches_of)(c, 1, n, a, b, x, low, high, down);
-        EACH(i) {
-            R p, q, ua, ub, va, vb;
-            T(patch)(low + 4 * i, x[i], a[i], b[i], &p, &q);
-            T(patch_slopes)(low + 4 * i, high + 4 * i, down + 4 * i, x[i], sa, sb, &ua, &ub, &va, &vb);
-            ok[i] = T(step_of)(a + i, b + i, u[i] - p, v[i] - q, ua, ub, va, vb, &bend, ok[i]);
-        }
+        T(steps_on_pieces)(c, n, u, v, a, b, ok);
     } else {
         T(Jacobian) to;
         T(lens)(c, first, n, a, b, x, y, &to, NULL);
@@ -848,8 +860,9 @@ static void T(invert)(const T(Camera) *c, int n, const R *restrict u, const R *r
             possible[i] = within[i] & (possible[i] | !known[i]);
         }
     } else {
-        const int has_table = c->table != NULL, to_edge = c->to_edge;
-        const R usual2 = c->usual2 * (1 - 32 * EPS);
+        const int has_table = c->table != NULL;
+        const R usual2 = c->usual2 * (1 - 32 * EPS), certain2 = c->certain2, beside2 = c->beside2, further = 1 + 32 * EPS;
+        const T(Edge) box = c->box;
         T(start)(c, has_table ? 2 : 1, n, u, v, a, b);
         if (has_table) {
             ALIGNED R r2[BLOCK], scale[BLOCK];
@@ -859,24 +872,14 @@ static void T(invert)(const T(Camera) *c, int n, const R *restrict u, const R *r
         }
         T(newton)(c, 1, n, u, v, a, b, ok, fewest);
         I outside = 0;
-        EACH(i) {
-            possible[i] = ok[i]; /* converged, somewhere */
-            ok[i] &= usual2 - (a[i] * a[i] + b[i] * b[i]) > 0;
-            outside |= possible[i] & !ok[i];
-        }
-        if (outside && to_edge) {
-            const T(Edge) edge = T(edge_of)(c);
-            const R certain2 = c->certain2 * (1 - 64 * EPS), further = 1 + 32 * EPS;
-            outside = 0;
-            EACH(i) {
-                ok[i] |= possible[i] & T(on_edge)(edge, a[i] * further, b[i] * further) & (certain2 - (a[i] * a[i] + b[i] * b[i]) > 0);
-                outside |= possible[i] & !ok[i];
-            }
-        }
-        if (outside && c->certain && !to_edge) {
+        EACH(i) possible[i] = ok[i]; /* converged, somewhere */
+        if (c->is_boxed) EACH(i) ok[i] &= T(in_box)(box, certain2, beside2, a[i] * further, b[i] * further);
+        else EACH(i) ok[i] &= usual2 - (a[i] * a[i] + b[i] * b[i]) > 0;
+        EACH(i) outside |= possible[i] & !ok[i];
+        if (outside && c->has_box && !c->is_boxed) {
             ALIGNED I certain[BLOCK];
             outside = 0;
-            EACH(i) p[i] = a[i] * (1 + 32 * EPS), q[i] = b[i] * (1 + 32 * EPS);
+            EACH(i) p[i] = a[i] * further, q[i] = b[i] * further;
             T(certain)(c, n, p, q, certain);
             EACH(i) ok[i] |= possible[i] & certain[i], outside |= possible[i] & !ok[i];
         }
@@ -887,7 +890,7 @@ static void T(invert)(const T(Camera) *c, int n, const R *restrict u, const R *r
             int places[BLOCK];
             EACH(i) inside[i] = ok[i] | !possible[i];
             const int some = T(chosen)(n, inside, places), filled = (some + LANES - 1) & -LANES;
-            for (int i = 0; i < filled; i++) p[i] = a[places[i]] * (1 + 32 * EPS), q[i] = b[places[i]] * (1 + 32 * EPS);
+            for (int i = 0; i < filled; i++) p[i] = a[places[i]] * further, q[i] = b[places[i]] * further;
             T(lens)(c, 1, filled, p, q, x, y, &to, least);
             T(contained)(c, filled, p, q, least, inside);
             for (int i = 0; i < some; i++) ok[places[i]] = inside[i];

@@ -22,7 +22,8 @@ static inline Cameras only(const Cameras *all, int64_t at) {
     MOVED(extent, EXTENT);
     MOVED(table, 2 + 2 * NODES);
     MOVED(circle2, 1);
-    MOVED(certain2, 1);
+    MOVED(certain2, BOX);
+    MOVED(pieces, PIECE * (last->n - last->flags) * (last->m - last->flags));
     MOVED(start, START);
     MOVED(chart_inner2, 1);
     MOVED(chart_most2, 1);

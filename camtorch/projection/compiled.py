@@ -37,7 +37,7 @@ _MOST_PARTS, _MOST_DEGREE = 5, 64
 _TABLE = 2 + 2 * 1024
 _RADII, _FOLLOWED, _AZIMUTHS = 512, 80, 336
 _EXTENT = _FOLLOWED + _AZIMUTHS * (_FOLLOWED + 1)
-_START, _PIECE = 16 * (1 + 44 * 44), 32
+_START, _PIECE, _BOX = 16 * (1 + 60 * 60), 32, 5
 _MOST_CONTROLS = 64 * 64  # of a surface whose pieces, of 16 times the memory, pay
 _FOR_START = 1 << 15  # points of a camera for which such a table pays
 
@@ -325,13 +325,13 @@ class Lenses:
             return
         has_certain = plan.is_plain and self.struct.certain is not None
         names = ["inner2", "usual2", *["circle2", "stagewise"] * plan.has_rest, *["certain2"] * has_certain]
-        counts = [1] * len(names)
+        counts = [_BOX if name == "certain2" else 1 for name in names]
         if tables and plan.has_factor:  # at once, as there will be pixels
             names, counts = [*names, "table"], [*counts, _TABLE]
         start, step = self._new(sum(counts)), self.cameras * self.dtype.itemsize
-        wanted = {name: start + step * i for i, name in enumerate(names)}
+        wanted = {name: start + step * i for name, i in zip(names, accumulate(counts, initial=0), strict=False)}
         radii = {} if plan.is_radial else {"radii": self._keep(plan.radii(lambda: self._optics()[0], _RADII, self._k))}
-        self._ask(wanted | radii)
+        self._ask(wanted | radii | ({"certain": self.struct.certain} if has_certain else {}))
         for name, place in reversed(wanted.items()):  # inner2 last, by which another thread sees that all is there
             setattr(self.struct, name, place)
 

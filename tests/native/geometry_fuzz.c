@@ -201,7 +201,7 @@ static int fuzz(void) {
         uint8_t *certain = KEPT(malloc((size_t)(c * controls)));
         const int all = below(4) > 0;
         for (i = 0; i < c * controls; i++) certain[i] = (uint8_t)(all || below(2));
-        cameras.certain = certain, cameras.certain2 = KEPT(filled(d, c, 2, 2));
+        cameras.certain = certain, cameras.certain2 = KEPT(filled(d, c * BOX, 2, 2));
         if (below(2)) cameras.pieces = KEPT(filled(d, c * pieces, 2, 0));
         if (below(4)) cameras.start = KEPT(filled(d, c * START, 2, 0));
     }
@@ -222,7 +222,7 @@ static int fuzz(void) {
     domain.inner2 = KEPT(filled(d, c, 0, 0)), domain.usual2 = KEPT(filled(d, c, 0, 0));
     domain.table = KEPT(filled(d, c * (2 + 2 * NODES), 0, 0));
     if (controls && !domain.is_chart) {
-        domain.certain = KEPT(malloc((size_t)(c * controls))), domain.certain2 = KEPT(filled(d, c, 0, 0));
+        domain.certain = KEPT(malloc((size_t)(c * controls))), domain.certain2 = KEPT(filled(d, c * BOX, 0, 0));
         domain.start = KEPT(filled(d, c * START, 0, 0)), domain.pieces = KEPT(filled(d, c * pieces, 0, 0));
     }
     if (has_factor && many && !domain.is_chart)
