@@ -22,6 +22,7 @@ from camtorch.camera import Camera
 from camtorch.mixed import Listed, Mixed
 from camtorch.projection.compiled import Native
 from camtorch.projection.rows import single_native
+from camtorch.rotations import turn
 from camtorch.warp.affine import AffineWarp, MirrorWarp, after
 from camtorch.warp.at_once import between_of
 from camtorch.warp.boxes import corners_of, in_order
@@ -105,8 +106,9 @@ class Part:
     """(n or 1, 1, H', W'): what the lens lets through."""
 
     @property
-    def warp(self) -> Warp | None:
-        """By which these rows move."""
+    def warp(self) -> Warp:
+        """By which these rows move, if they do."""
+        assert self.moves is not None
         return self.moves.warp(self.camera) if isinstance(self.moves, View) else self.moves
 
     @property
@@ -129,7 +131,7 @@ class Part:
     def by(self, change: Callable[[Warp], Warp]) -> Part:
         """The part with each of its warps changed."""
         shades = None if self.shades is None else (change(self.shades[0]), change(self.shades[1]))
-        return replace(self, moves=None if self.warp is None else change(self.warp), shades=shades)
+        return replace(self, moves=None if self.moves is None else change(self.warp), shades=shades)
 
     def take(self, index: list[int]) -> Part:
         """These rows of the part, as all there is."""
@@ -374,23 +376,24 @@ class Change:
         if self._inverse is not None:  # with the maps that it has made
             return self._inverse
         parts = [
-            part if part.warp is None else Part(part.rows, part.warp.inverse(), part.warp.target) for part in self.parts
+            part if part.moves is None else Part(part.rows, part.warp.inverse(), part.warp.target)
+            for part in self.parts
         ]
         self._inverse = Change(self.count, parts, batch_type=self.batch_type, gate=self.gate)
         return self._inverse
 
     def each(
-        self, value: Tensor, move: Callable[[Part, Warp, Tensor], Moved], stay: Callable[[Camera, Tensor], Moved]
+        self, value: Tensor, move: Callable[[Part, Tensor], Moved], stay: Callable[[Camera, Tensor], Moved]
     ) -> Moved:
-        """`move(part, warp, rows)` of every part's rows of `value`, and `stay(camera, rows)` where nothing moves.
+        """`move(part, rows)` of every part's rows of `value`, and `stay(camera, rows)` where nothing moves.
 
         Both give a tensor, or a pair of tensors.
         """
 
         def of(part: Part) -> Moved:
             # what comes out is never what went in, but a copy
-            rows = value[part.rows] if part.rows is not None else value.clone() if part.warp is None else value
-            return stay(part.camera, rows) if part.warp is None else move(part, part.warp, rows)
+            rows = value[part.rows] if part.rows is not None else value.clone() if part.moves is None else value
+            return stay(part.camera, rows) if part.moves is None else move(part, rows)
 
         results = [of(part) for part in self.parts]
         gate, order = self.gate, self._order
@@ -406,7 +409,8 @@ class Change:
     def images(self, images: Tensor, **options: Any) -> Tensor:
         """Images (count, C, H, W), with the colours and the light of the lens; options as of `Warp.forward`."""
 
-        def move(part: Part, warp: Warp, rows: Tensor) -> Tensor:
+        def move(part: Part, rows: Tensor) -> Tensor:
+            warp = part.warp
             if part.shades is not None and rows.shape[1] == 3:
                 red, blue = part.shades
                 fills = warp.fill if len(warp.fill) == 3 else [None] * 3
@@ -421,8 +425,8 @@ class Change:
     def labels(self, masks: Tensor, fill: float = 0.0, mode: Mode = "nearest") -> Tensor:
         """Masks (count, C, H, W) of any dtype, the nearest value of each; `fill` where nothing is seen."""
 
-        def move(part: Part, warp: Warp, rows: Tensor) -> Tensor:
-            return warp.pin().forward(rows, mode=mode, padding_mode="zeros", fill=fill)
+        def move(part: Part, rows: Tensor) -> Tensor:
+            return part.warp.pin().forward(rows, mode=mode, padding_mode="zeros", fill=fill)
 
         return self.each(masks, move, lambda camera, rows: rows)
 
@@ -434,7 +438,7 @@ class Change:
         )
         return self.each(
             everywhere,
-            lambda part, warp, rows: warp.pin().valid_mask().expand(len(rows), -1, -1, -1),
+            lambda part, rows: part.warp.pin().valid_mask().expand(len(rows), -1, -1, -1),
             lambda camera, rows: rows,
         )
 
@@ -442,7 +446,7 @@ class Change:
         """Pixels (count, *N, 2), and valid (count, *N): on the image."""
         return self.each(
             pixels,
-            lambda part, warp, rows: warp.transform_points(rows),
+            lambda part, rows: part.warp.transform_points(rows),
             lambda camera, rows: (rows, camera.contains(rows)),
         )
 
@@ -454,13 +458,13 @@ class Change:
             on_image = (rows[..., :2] <= limits).all(-1) & (rows[..., 2:] >= -0.5).all(-1)
             return rows, on_image & in_order(rows) & torch.isfinite(rows).all(-1)
 
-        return self.each(boxes, lambda part, warp, rows: warp.transform_boxes(rows), stay)
+        return self.each(boxes, lambda part, rows: part.warp.transform_boxes(rows), stay)
 
     def quadrilaterals(self, corners: Tensor) -> tuple[Tensor, Tensor]:
         """Quadrilaterals (count, *N, 4, 2): the corners of the boxes that enclose them, and valid (count, *N)."""
 
-        def move(part: Part, warp: Warp, rows: Tensor) -> tuple[Tensor, Tensor]:
-            enclosing, valid = warp.enclose(rows)
+        def move(part: Part, rows: Tensor) -> tuple[Tensor, Tensor]:
+            enclosing, valid = part.warp.enclose(rows)
             return corners_of(enclosing), valid
 
         def stay(camera: Camera, rows: Tensor) -> tuple[Tensor, Tensor]:
@@ -476,14 +480,15 @@ class Change:
         What has another form is read as rays, and written in its form again.
         """
 
-        def move(part: Part, warp: Warp, rows: Tensor) -> Tensor:
-            if warp.rotation is None:
+        def move(part: Part, rows: Tensor) -> Tensor:
+            rotation = None if part.moves is None else part.moves.rotation
+            if rotation is None:
                 return rows.clone()
-            moved = write(warp.transform_rays(read(rows)))
-            if read is _same or warp.rotation.ndim == 2:
+            moved = write(turn(rotation, read(rows), "rays"))
+            if read is _same or rotation.ndim == 2:
                 return moved
             # reading and writing rounds
-            still = (warp.rotation == _eye(warp.rotation)).all(-1).all(-1)
+            still = (rotation == _eye(rotation)).all(-1).all(-1)
             return torch.where(still.reshape(-1, *[1] * (rows.ndim - 1)), rows.to(moved), moved)
 
         return self.each(rays, move, lambda camera, rows: rows)
@@ -491,17 +496,19 @@ class Change:
     def positions(self, points: Tensor) -> Tensor:
         """Points (count, *N, 3) of the camera frame: as `rays`, and those of a camera that moves shift."""
 
-        def move(part: Part, warp: Warp, rows: Tensor) -> Tensor:
-            if isinstance(warp, ShiftedWarp):
-                return warp.transform_positions(rows)
-            return rows.clone() if warp.rotation is None else warp.transform_rays(rows)
+        def move(part: Part, rows: Tensor) -> Tensor:
+            if isinstance(part.moves, ShiftedWarp):
+                return part.moves.transform_positions(rows)
+            rotation = None if part.moves is None else part.moves.rotation
+            return rows.clone() if rotation is None else turn(rotation, rows, "points")
 
         return self.each(points, move, lambda camera, rows: rows)
 
     def distance(self, distance: Tensor) -> Tensor:
         """Distance from the camera (count, C, H, W); 0 where nothing is known."""
 
-        def move(part: Part, warp: Warp, rows: Tensor) -> Tensor:
+        def move(part: Part, rows: Tensor) -> Tensor:
+            warp = part.warp
             if isinstance(warp, ShiftedWarp):
                 return narrow(warp.moved_distance(widen(rows)), rows.dtype)
             return warp.pin()(rows, mode="nearest", padding_mode="zeros", fill=0.0)
@@ -520,7 +527,8 @@ class Change:
             z = (rays[..., 2] * valid).to(like)
             return z.reshape(-1, 1, *z.shape[-2:])
 
-        def move(part: Part, warp: Warp, rows: Tensor) -> Tensor:
+        def move(part: Part, rows: Tensor) -> Tensor:
+            warp = part.warp
             if isinstance(warp, AffineWarp):
                 return warp.pin()(rows, mode="nearest", padding_mode="zeros", fill=0.0)
             wide = widen(rows)

@@ -500,7 +500,6 @@ class RandomMount(RandomCamera):
             raise ValueError(f"{self._name}: shift needs the sample's depth; call the augmentation with the sample")
         (key, values), count = depth.popitem(), len(draw["apply"])
         part = super()._part(rows, source, {name: v for name, v in draw.items() if name not in (*_SHIFTS, key)})
-        assert part.warp is not None
         shifts = [torch.as_tensor(draw[name], dtype=torch.float64) for name in _SHIFTS]
         shift = torch.stack(shifts, -1).expand(count, 3)
         kind = next(kind for kind, name in _DEPTHS.items() if name == key)

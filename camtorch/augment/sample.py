@@ -17,6 +17,7 @@ from torch.utils.data import get_worker_info
 
 from camtorch._arguments import (
     GUESS_CAMERA,
+    are_numbers,
     as_coordinates,
     as_flag,
     as_mapping,
@@ -31,13 +32,14 @@ from camtorch._arguments import (
 )
 from camtorch._threads import on_one_thread
 from camtorch._tracing import may_look
-from camtorch.augment.change import Change, alone, as_one
+from camtorch.augment.change import Change, Part, View, alone, as_one
 from camtorch.augment.landmarks import Mirroring, exchanged
 from camtorch.camera import Camera
 from camtorch.mixed import Listed
 from camtorch.models import Pinhole
 from camtorch.rotations import are_rotations, check_rotation, rotation_matrix, rotation_vector
 from camtorch.warp.at_once import at_once, batch_at_once
+from camtorch.warp.boxes import edges_of, enclosing
 from camtorch.warp.sampling import Options, Sampler, as_options
 
 P = ParamSpec("P")
@@ -724,13 +726,14 @@ def together(
             hows[name] = Sampler(mode, padding_mode, fill)
         elif found == "mask":
             hows[name] = Sampler("nearest", "zeros", (mask_fill,))
-        elif is_single and moves(found, value) is _pixels:
+        elif is_single and (_are_quick(value, part) if found == "boxes" else moves(found, value) is _pixels):
             hows[name] = None
-    values = [named[name][1] for name in hows]
+    fields = (named[name] for name in hows)
+    values = [edges_of(value) if found == "boxes" else value for found, value in fields]
     if not is_single:
         wide = [value if value.ndim == 4 else value.unsqueeze(1) for value in values]
         pairs = [(value, how) for value, how in zip(wide, hows.values(), strict=True) if how is not None]
-        images = None if part.warp is None else batch_at_once(part.warp, pairs)
+        images = batch_at_once(part.warp, pairs)
         found_images = zip(hows, values, images or (), strict=False)
         return {n: (image if value.ndim == 4 else image.squeeze(1), None) for n, value, image in found_images}
     between = part.between() if values else None
@@ -740,10 +743,20 @@ def together(
     made = at_once(*between, sizes, options, values, list(hows.values()), batched)
     if made is None:
         return {}
-    return {
-        name: (result if result.dtype == value.dtype else _in_range(result, value.dtype), valid)
-        for name, value, (result, valid) in zip(hows, values, made, strict=True)
-    }
+    results: dict[str, tuple[Tensor, Tensor | None]] = {}
+    for name, value, (result, valid) in zip(hows, values, made, strict=True):
+        found, given = named[name]
+        if found == "boxes":
+            boxes = enclosing(given if batched else given[0], result, cast("Tensor", valid))
+            results |= {} if boxes is None else {name: boxes}
+        else:
+            results[name] = result if result.dtype == value.dtype else _in_range(result, value.dtype), valid
+    return results
+
+
+def _are_quick(boxes: Tensor, part: Part) -> bool:
+    """Whether boxes may move by the compiled call of a single sample."""
+    return isinstance(part.moves, View) and boxes.dtype == part.moves.distortion.dtype and are_numbers(boxes)
 
 
 def from_pitch_yaw(angles: Tensor) -> Tensor:

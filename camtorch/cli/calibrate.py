@@ -131,6 +131,11 @@ def _candidates(arguments: argparse.Namespace) -> list[tuple[str, int]]:
         tried = [(model, kind.default_count if count is None else count)]
         if kind.names_of(tried[0][1]) is None:
             raise ValueError(f"--count: {model} takes {kind.counts_text()}; got {count}")
+        if kind.smoothness() is not None:
+            raise ValueError(
+                f"--model: {model} learns a surface over a lens that is known. In Python, fitted = ct.calibrate(...) of "
+                "another model, and then ct.calibrate('splined', ..., start=fitted.camera)"
+            )
     held = []
     for key, number in tried:
         kind = MODELS[key]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -52,6 +53,34 @@ def enclosed(warp: Warp, corners: Tensor) -> tuple[Tensor, Tensor]:
         low = torch.minimum(low, torch.where(inside, lattice, torch.inf).amin(-2))
         high = torch.maximum(high, torch.where(inside, lattice, -torch.inf).amax(-2))
     return torch.where(some.unsqueeze(-1), torch.cat((low, high), -1), -1.0), valid
+
+
+def edges_of(boxes: Tensor) -> Tensor:
+    """(..., N, 2): the points along the edges of plain boxes (..., 4) that are moved to enclose them."""
+    given = boxes.numpy()
+    start, end = given[..., None, [[0, 1], [2, 1], [2, 3], [0, 3]]], given[..., None, [[2, 1], [2, 3], [0, 3], [0, 1]]]
+    share = np.arange(_EDGE_SAMPLES, dtype=given.dtype)[:, None, None] / _EDGE_SAMPLES
+    points = (start + (end - start) * share).swapaxes(-3, -2)
+    return torch.from_numpy(points.reshape(*boxes.shape[:-1], 4 * _EDGE_SAMPLES, 2))
+
+
+def enclosing(boxes: Tensor, moved: Tensor, on_image: Tensor) -> tuple[Tensor, Tensor] | None:
+    """`moved_boxes` of plain boxes (..., 4) whose edges are moved already, to no panorama; None where that takes more,
+    as one of them is moved in part, off the image, or turned inside out.
+
+    moved: (..., N, 2), where their `edges_of` went, (-1, -1) for points without a place.
+    on_image: (..., N), whether that is on the image.
+    """
+    places, seen, given = moved.numpy(), on_image.numpy(), boxes.numpy()
+    if not seen.all() and not (seen.any(-1).all() and (seen | (places != -1).any(-1)).all()):
+        return None
+    x, y = places[..., 0], places[..., 1]
+    area = (
+        (x[..., :-1] * y[..., 1:] - x[..., 1:] * y[..., :-1]).sum(-1) + x[..., -1] * y[..., 0] - x[..., 0] * y[..., -1]
+    )
+    if not ((area > 0).all() and (given[..., 2:] > given[..., :2]).all()):
+        return None
+    return torch.from_numpy(np.concatenate((places.min(-2), places.max(-2)), -1)), on_image.any(-1)
 
 
 def _inside(warp: Warp, corners: Tensor, like: Tensor) -> tuple[Tensor, Tensor]:

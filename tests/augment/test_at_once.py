@@ -133,6 +133,18 @@ def test_a_sample_of_a_batch_is_what_it_is_alone(name, dtype):
         assert all(torch.equal(value[i], one[field]) for field, value in batch.items())
 
 
+@pytest.mark.parametrize("name", LAST)
+def test_boxes_of_a_sample_move_as_by_its_warp(name):
+    camera, first = example("brown_conrady", SIZE).requires_grad_(False), torch.tensor([20.0, 20, 60, 50])
+    rows = [first, first - 30, first + 1000, first * math.nan, first[[0, 1, 0, 1]]]
+    for boxes in (torch.stack(rows[:1]), torch.stack(rows[:2]), torch.stack(rows), torch.zeros(0, 4)):
+        augment = LAST[name]()
+        out = augment({**sample_for(torch.float32), "boxes": boxes}, camera=camera)
+        want, valid = augment.last.boxes(boxes[None])
+        assert torch.equal(out["boxes"], want[0])
+        assert torch.equal(out["boxes_valid"], valid[0])
+
+
 def test_what_comes_out_is_not_what_the_change_keeps():
     camera = example("brown_conrady", SIZE).requires_grad_(False)
     augment, sample = RandomMount(camera=camera), sample_for(torch.float32)

@@ -253,6 +253,7 @@ def test_models_that_the_file_cannot_hold_are_not_tried(capsys, monkeypatch):
     ("words", "text"),
     [
         ("a.png --board 9x6", "a board was found in 0 of 1 images, and 3 are needed"),
+        ("--corners corners.json --model splined", "splined learns a surface over a lens that is known"),
         ("--corners corners.json --model kannala_brandt --fixed q", "fixed names 'q'; KannalaBrandt has fx, fy"),
     ],
 )
