@@ -133,8 +133,8 @@ def _candidates(arguments: argparse.Namespace) -> list[tuple[str, int]]:
             raise ValueError(f"--count: {model} takes {kind.counts_text()}; got {count}")
         if kind.smoothness() is not None:
             raise ValueError(
-                f"--model: {model} learns a surface over a lens that is known. In Python: fitted = ct.calibrate(...) of "
-                f"another model, then ct.calibrate({model!r}, ..., start=fitted.camera)"
+                f"--model: {model} learns a surface over a lens that is known. In Python: fitted = ct.calibrate(...) "
+                f"of another model, then ct.calibrate({model!r}, ..., start=fitted.camera)"
             )
     held = []
     for key, number in tried:
