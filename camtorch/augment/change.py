@@ -399,7 +399,7 @@ class Change:
         gate, order = self.gate, self._order
         moved = results[0]
         if order is not None:
-            moved = _both(lambda pieces: torch.cat(pieces)[order], *results)
+            moved = _both(lambda pieces: _rows_together(pieces)[order], *results)
         if gate is not None:
             moved = _both(lambda pair: _gated(gate, *pair), moved, stay(self.parts[0].camera, value))
         return moved
@@ -580,6 +580,16 @@ def _eye(like: Tensor) -> Tensor:
 def _no_turn(dtype: torch.dtype) -> Tensor:
     with torch.inference_mode(False):
         return torch.eye(3, dtype=dtype, device="cpu")
+
+
+def _rows_together(pieces: Sequence[Tensor]) -> Tensor:
+    sizes = {tuple(piece.shape[-2:]) for piece in pieces}
+    if pieces[0].ndim > 2 and len(sizes) > 1:  # of images: the rest keeps its shape
+        raise ValueError(
+            f"samples of one batch would come out in the sizes {sorted(sizes)}; as lists of images they may, "
+            "and same_on_batch=True moves all alike"
+        )
+    return torch.cat(tuple(pieces))
 
 
 def _gated(gate: Tensor, moved: Tensor, kept: Tensor) -> Tensor:

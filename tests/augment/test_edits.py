@@ -718,3 +718,20 @@ def test_boxes_stay_where_any_of_their_mask_does(name):
     camera = ct.Pinhole([300.0, 300.0, 159.5, 119.5], image_size=(240, 320)).requires_grad_(False)
     boxes = torch.stack((boxes[0] + 400, 100 * boxes[0] - 9000))
     assert ct.augment.RandomMount(p=0.0, camera=camera)(boxes=boxes)["boxes_valid"].tolist() == [False, True]
+
+
+def test_quarter_turns_of_several_models_are_told_of_where_images_are_one_tensor():
+    cameras = [
+        model.from_fov(60, image_size=(16, 24)).requires_grad_(False) for model in (ct.Pinhole, ct.KannalaBrandt)
+    ]
+    rotate, images = ct.augment.Rotate90(), torch.rand(2, 3, 16, 24)
+    draw = next(
+        seed
+        for seed in range(50)
+        if (rotate.draw(2, torch.Generator().manual_seed(seed))["times"] * 4).long().tolist() == [0, 1]
+    )
+    torch.manual_seed(draw)
+    change = rotate.change(cameras, rotate.draw(2, torch.Generator().manual_seed(draw)))
+    with pytest.raises(ValueError, match=r"in the sizes \[\(16, 24\), \(24, 16\)\]; as lists"):
+        change.images(images)
+    assert change.points(torch.zeros(2, 5, 2))[0].shape == (2, 5, 2)
