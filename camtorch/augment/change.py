@@ -117,6 +117,11 @@ class Part:
         return self.camera if self.moves is None else self.moves.target
 
     @property
+    def rotation(self) -> Tensor | None:
+        """`ray_after = R ray_before`, (3, 3) or (n, 3, 3); None where nothing turns."""
+        return None if self.moves is None else self.moves.rotation
+
+    @property
     def image_size(self) -> tuple[int, int]:
         """(height, width) after the change."""
         return self.moves.image_size if isinstance(self.moves, View) else self.target._size_for("Warp")
@@ -307,8 +312,7 @@ class Change:
         """(count, 3, 3): `ray_after = R ray_before`."""
         parts = []
         for part, n in zip(self.parts, self._counts, strict=True):
-            turned = None if part.moves is None else part.moves.rotation
-            parts.append((_eye(part.camera.intrinsics) if turned is None else turned).expand(n, 3, 3))
+            parts.append((_eye(part.camera.intrinsics) if part.rotation is None else part.rotation).expand(n, 3, 3))
         rotation = parts[0] if self._order is None else torch.cat(parts)[self._order]
         if self.gate is not None:
             rotation = torch.where(self.gate.to(rotation.device)[:, None, None], rotation, _eye(rotation))
@@ -481,7 +485,7 @@ class Change:
         """
 
         def move(part: Part, rows: Tensor) -> Tensor:
-            rotation = None if part.moves is None else part.moves.rotation
+            rotation = part.rotation
             if rotation is None:
                 return rows.clone()
             moved = write(turn(rotation, read(rows), "rays"))
@@ -499,8 +503,7 @@ class Change:
         def move(part: Part, rows: Tensor) -> Tensor:
             if isinstance(part.moves, ShiftedWarp):
                 return part.moves.transform_positions(rows)
-            rotation = None if part.moves is None else part.moves.rotation
-            return rows.clone() if rotation is None else turn(rotation, rows, "points")
+            return rows.clone() if part.rotation is None else turn(part.rotation, rows, "points")
 
         return self.each(points, move, lambda camera, rows: rows)
 

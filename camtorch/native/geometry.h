@@ -65,7 +65,8 @@ typedef struct {
     const void *circle2;
     /* of a lens that is a surface, or a surface after a radial factor: where a point is in the domain for certain, of each
        piece of it (c, n m, of which as many are used), and up to the squared radius of the factor's fold in a box of the
-       surface (c, BOX); where to start the inverse of the surface (c, START); the surface as polynomials (c, PIECE of each piece), or NULL, see `pieces_of` */
+       surface (c, BOX); where to start the inverse of the surface (c, START); the surface as polynomials (c, PIECE of each
+       piece), or NULL, see `pieces_of` */
     const uint8_t *certain;
     const void *certain2, *start, *pieces;
     /* of an inverted chart: the squared radius and the squared angle of its fold, the table of its inverse */

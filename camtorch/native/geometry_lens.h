@@ -374,8 +374,8 @@ static void T(surface)(const Part *part, const R *k, int n, const R *restrict a,
     else T(surface_of)(part, k, 2, n, a, b, u, v, NULL);
 }
 
-/* By how much the slopes of a surface, along a line, change at the most on a unit: second derivatives of a spline lie between the second
-   differences of its control points */
+/* By how much the slopes of a surface, along a line, change at the most on a unit: second derivatives of a spline lie
+   between the second differences of its control points */
 static R T(bend_of)(const Part *part, const R *k) {
     const int64_t row = 2 * (int64_t)part->n;
     R sum = 0;
@@ -421,8 +421,8 @@ INLINE int32_t T(piece)(const T(Pieces) of, R a, R b, R *x, R *y) {
 /* A surface, the last stage, of whose pieces the polynomials are known, see `pieces_of`: of each point the place across and,
    of the powers 0 and 2 of that, the numbers of the part that is even there; if wanted, of that which is odd, and of the
    slope down */
-INLINE void T(patches_of)(const T(Camera) *c, const int order, const int slopes, int n, const R *restrict a, const R *restrict b, R *restrict x,
-                          R *restrict low, R *restrict high, R *restrict down) {
+INLINE void T(patches_of)(const T(Camera) *c, const int order, const int slopes, int n, const R *restrict a,
+                          const R *restrict b, R *restrict x, R *restrict low, R *restrict high, R *restrict down) {
     const T(Pieces) pieces = T(pieces_on)(c);
     ALIGNED R y[BLOCK];
     ALIGNED int32_t at[BLOCK];

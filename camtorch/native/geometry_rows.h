@@ -727,8 +727,8 @@ static void T(start)(const T(Camera) *c, int first, int n, const R *u, const R *
     }
 }
 
-/* bend: what Newton's method leaves of a step: it times the step's square times the size of the Jacobian and over its
-   determinant, to be less than 1; or none where nothing is known of it */
+/* bend: what Newton's method leaves of a step: it times the step's square times the norm of the Jacobian's inverse, to be
+   less than 1; or none where nothing is known of it */
 INLINE I T(step_of)(R *a, R *b, R du, R dv, R ua, R ub, R va, R vb, const R *bend, I ok) {
     R da, db;
     const R one = T(absolute)(T(step)(ua, ub, va, vb, du, dv, &da, &db)), p = *a + da, q = *b + db, step2 = da * da + db * db;
