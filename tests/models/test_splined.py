@@ -190,3 +190,24 @@ def test_a_surface_goes_behind_any_lens_at_any_place():
         lambda p, w: Bent(w[:4], w[4:]).project(p)[0],
         (rays[valid][::9].detach().requires_grad_(), torch.cat((camera.intrinsics, k)).detach().requires_grad_()),
     )
+
+
+@pytest.mark.parametrize("order", [2, 3])
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_a_fold_at_the_rim_is_the_same_for_many_pixels_and_for_few(order, dtype):
+    """Many are begun from a table of the part of the surface that does not fold."""
+    model = ct.Splined.with_grid(order=order, columns=12, rows=9, fov_x=150)
+    k = 0.01 * torch.randn(9, 12, 2, generator=torch.Generator().manual_seed(order), dtype=torch.float64)
+    k[-1, :, 1] -= 1.0  # the last row falls back
+    camera = model([280.0, 285, 319.5, 239.5], k.flatten(), image_size=(480, 640)).to(dtype).requires_grad_(False)
+    corner = torch.tensor([700.0, 560.0], dtype=dtype)
+    pixels = torch.rand(1 << 16, 2, generator=torch.Generator().manual_seed(0), dtype=dtype) * corner - 30
+    few, alone = camera.unproject(pixels[:4000])
+    rays, valid = camera.unproject(pixels)
+    again, seen = camera.project(rays)
+    loss = 16 * torch.finfo(dtype).eps * 700
+    assert seen[valid].all()
+    assert (again - pixels)[valid].abs().max() < loss
+    assert torch.equal(alone, valid[:4000])
+    assert (few - rays[:4000])[alone].abs().max() < loss
+    assert 0.5 < valid.double().mean() < 0.95  # the fold lies within the image
