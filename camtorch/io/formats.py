@@ -78,7 +78,12 @@ READ = {m.NAMES.format: m.NAMES for m in (*_BY_CONTENT, *_BY_KEYS)}
 WRITTEN = {m.NAMES.format: m.NAMES for m in _WRITTEN}
 FORMATS = tuple(READ | WRITTEN)
 _OF_RENDERERS = (".usda", ".exr")  # whose content says nothing to a reader
-_KEYS_OF_RENDERERS = {"blueprint", "directions"}  # of CARLA's JSON and of ray fields
+_FOR_RENDERERS = "a file for renderers, which is written only: load what it was made of"
+_NOT_READ = {  # keys of files that have a format which is not read, and why
+    "blueprint": _FOR_RENDERERS,  # CARLA's JSON
+    "directions": _FOR_RENDERERS,  # ray fields
+    "sfm_data_version": "OpenMVG's scene, which is not read: openMVG_main_openMVG2Colmap writes it in COLMAP's format",
+}
 
 
 def load(path: str | os.PathLike[str], format: str | None = None) -> Rig:
@@ -124,13 +129,14 @@ def _read(path: str, content: bytes, format: str | None) -> tuple[Rig, str]:
     for by_content in _BY_CONTENT:
         if format == by_content.NAMES.format or (format is None and by_content.matches(path, content)):
             return by_content.read(path, content), by_content.NAMES.format
-    of_renderers = format is None and path.lower().endswith(_OF_RENDERERS)
-    keys = {} if of_renderers else parse_mapping(path, content)
+    if format is None and path.lower().endswith(_OF_RENDERERS):
+        raise CameraFileError(path, "content", _FOR_RENDERERS)
+    keys = parse_mapping(path, content)
     for by_keys in _BY_KEYS:
         if format == by_keys.NAMES.format or (format is None and by_keys.matches(keys)):
             return by_keys.parse(Record(path, keys)), by_keys.NAMES.format
-    if of_renderers or not _KEYS_OF_RENDERERS.isdisjoint(keys):
-        raise CameraFileError(path, "content", "a file for renderers, which is written only: load what it was made of")
+    for key in _NOT_READ.keys() & keys:
+        raise CameraFileError(path, "content", _NOT_READ[key])
     shown = ", ".join(f"{key!r:.30}" for key in list(keys)[:5]) or "none"
     if "fx" in keys:
         shown += (

@@ -259,3 +259,9 @@ def test_a_database_of_lensfun_names_its_reader(tmp_path):
     (tmp_path / "lenses.xml").write_text('<lensdatabase version="2"><lens/></lensdatabase>')
     with pytest.raises(ct.CameraFileError, match=r"lenses\.xml: content: .* ct\.lenses\.from_lensfun"):
         ct.load(tmp_path / "lenses.xml")
+
+
+def test_a_scene_of_openmvg_names_what_exports_it(tmp_path):
+    (tmp_path / "sfm_data.json").write_text('{"sfm_data_version": "0.3", "views": [], "intrinsics": []}')
+    with pytest.raises(ct.CameraFileError, match=r"sfm_data\.json: content: OpenMVG's scene.* COLMAP's format"):
+        ct.load(tmp_path / "sfm_data.json")
