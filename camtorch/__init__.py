@@ -8,7 +8,7 @@ if TYPE_CHECKING:
     from camtorch._public import *  # noqa: F403 (the list is there)
     from camtorch.models import *  # noqa: F403
 
-__version__ = "0.3.0"
+__version__ = "0.4.0.dev0"
 
 # What is public needs torch, which takes a second to import; `camtorch --help` does not. So names come at first use.
 
