@@ -19,10 +19,10 @@ from camtorch._photographs import read_stored
 from camtorch.boards.boards import Board, board_of, opencv
 from camtorch.boards.corners import ImageCorners, usual_sizes
 from camtorch.boards.detection import detect
-from camtorch.jobs.inputs import IMAGES, natural
-from camtorch.jobs.processes import reason
 
 _OWNER = "find_board"
+_IMAGES = frozenset({".bmp", ".jpeg", ".jpg", ".pgm", ".png", ".ppm", ".tif", ".tiff", ".webp"})
+"""Suffixes, in lower case, of the files that are taken from a folder."""
 _NAMED = 6  # images left out, in the warning
 _RED, _GREEN, _BLUE = 0.299, 0.587, 0.114
 
@@ -165,7 +165,8 @@ def corners_in(board: Board, path: Path, grey: NDArray[Any] | None = None) -> Im
         grey = read_grey(path) if grey is None else grey
     except (ValueError, OSError) as error:
         nothing = np.full((len(board.points()), 2), np.nan)
-        return ImageCorners(path, None, nothing, reason(error).removeprefix(f"{path}: "))
+        why = getattr(error, "strerror", None) or str(error)
+        return ImageCorners(path, None, nothing, " ".join(why.removeprefix(f"{path}: ").split()))
     found = detect(board, grey)
     return ImageCorners(path, (grey.shape[0], grey.shape[1]), found.pixels, found.reason)
 
@@ -180,7 +181,7 @@ def gather(words: Iterable[str]) -> list[Path]:
     for word in words:
         path = Path(word)
         if path.is_dir():
-            paths = [p for p in path.iterdir() if p.suffix.lower() in IMAGES and p.is_file()]
+            paths = [p for p in path.iterdir() if p.suffix.lower() in _IMAGES and p.is_file()]
             if not paths:
                 raise ValueError(f"{word}: a folder without images")
         elif os.path.lexists(word) or not glob.has_magic(word):
@@ -191,6 +192,12 @@ def gather(words: Iterable[str]) -> list[Path]:
                 raise ValueError(f"{word}: no file has such a name")
         found |= {os.path.abspath(p): p for p in paths}
     return sorted(found.values(), key=natural)
+
+
+def natural(path: Path) -> list[tuple[int, int, str]]:
+    """Return a key that sorts 2 before 10."""
+    parts = re.split(r"(\d+)", str(path))
+    return [(0, int(part), "") if part.isdecimal() else (1, 0, part.lower()) for part in parts]
 
 
 def read_grey(path: Path) -> NDArray[np.uint8] | NDArray[np.uint16]:

@@ -6,26 +6,9 @@ import argparse
 import math
 
 from camtorch.boards import printing
-from camtorch.boards.boards import Board, board_of
 from camtorch.cli import targets
+from camtorch.cli.calibrate import _read_board as read_board
 from camtorch.io.writing import replacing
-
-
-def read_board(arguments: argparse.Namespace, square: float) -> Board:
-    """The board that the options of `board_options` say, with squares of `square` if they do not say that.
-
-    Raises:
-        ValueError: no --board, options of another type of board, numbers that no board has.
-    """
-    if arguments.board is None:
-        raise ValueError("which board? --board COLUMNSxROWS says so, as in 9x6")
-    own = ("marker", "legacy", "spacing", "border", "dictionary")
-    options = {name: value for name in own if (value := getattr(arguments, name)) not in (None, False)}
-    options |= {"type": arguments.type or "chessboard", "square": arguments.square or square}
-    options["columns"], options["rows"] = arguments.board
-    if arguments.type == "charuco":
-        options.setdefault("marker", 0.75 * options["square"])
-    return board_of(options)
 
 
 def run(arguments: argparse.Namespace) -> None:

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from camtorch.boards.boards import Board, board_of
 from camtorch.boards.corners import image_points
 from camtorch.boards.finding import gather
 from camtorch.calibration import selection
@@ -19,7 +20,6 @@ from camtorch.calibration.calibrate import Calibration, calibrate
 from camtorch.calibration.rig import RigCalibration, calibrate_rig
 from camtorch.camera import MODELS, as_model
 from camtorch.cli import searching, targets
-from camtorch.cli.board import read_board
 from camtorch.cli.searching import Found, Views
 from camtorch.cli.terminal import note, progress
 from camtorch.io import CameraFileError, formats
@@ -45,7 +45,7 @@ def run(arguments: argparse.Namespace) -> None:
         raise ValueError("--fixed: no focal length is known to be held; in Python ct.calibrate(start=camera) has one")
     candidates = _candidates(arguments)
     kept: Path | None = arguments.corners
-    board = read_board(arguments, 1.0) if arguments.board is not None else None
+    board = _read_board(arguments, 1.0) if arguments.board is not None else None
     known = None
     if kept is not None and kept.exists():
         known = searching.known_corners(kept, board, measured=arguments.square is not None)
@@ -57,7 +57,7 @@ def run(arguments: argparse.Namespace) -> None:
             "first one, so hold the cameras alike. An even and an odd number of corners, as 9x6, leave no doubt"
         )
     if cameras:
-        found = searching.found_corners(cameras, board or read_board(arguments, 1.0), known)
+        found = searching.found_corners(cameras, board or _read_board(arguments, 1.0), known)
         if kept is not None:
             searching.write_found(found.corners, known, kept)
     else:
@@ -80,6 +80,23 @@ def run(arguments: argparse.Namespace) -> None:
         across, down = (f"{1000 * bend:.3g} mm" if unit == "m" else f"{bend:.3g}" for bend in result.bend)
         print(f"board: its middle lies {across} off its left and right, {down} off its top and bottom")
     _write(arguments, result, views, found)
+
+
+def _read_board(arguments: argparse.Namespace, square: float) -> Board:
+    """The board that the options of `_board_options` say, with squares of `square` if they do not say that.
+
+    Raises:
+        ValueError: no --board, options of another type of board, numbers that no board has.
+    """
+    if arguments.board is None:
+        raise ValueError("which board? --board COLUMNSxROWS says so, as in 9x6")
+    own = ("marker", "legacy", "spacing", "border", "dictionary")
+    options = {name: value for name in own if (value := getattr(arguments, name)) not in (None, False)}
+    options |= {"type": arguments.type or "chessboard", "square": arguments.square or square}
+    options["columns"], options["rows"] = arguments.board
+    if arguments.type == "charuco":
+        options.setdefault("marker", 0.75 * options["square"])
+    return board_of(options)
 
 
 def _head(name: str) -> str:

@@ -23,10 +23,10 @@ from numpy.typing import NDArray
 from camtorch.boards.boards import Board, opencv
 from camtorch.boards.corners import Corners, ImageCorners, read_corners, usual_sizes, write_corners
 from camtorch.boards.detection import detect
-from camtorch.boards.finding import corners_in
+from camtorch.boards.finding import corners_in, natural
 from camtorch.cli import videos
 from camtorch.cli.terminal import bar, note
-from camtorch.jobs.inputs import hash_of, natural
+from camtorch.jobs.inputs import hash_of
 
 _LEAST_VIEWS = 3
 _MOMENT = 0.5  # seconds, at least, of which the sharpest frame is taken
