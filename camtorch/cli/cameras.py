@@ -13,7 +13,6 @@ from camtorch import lenses
 from camtorch.camera import Camera, as_model
 from camtorch.cli.terminal import note
 from camtorch.cli.words import GUESS, LENS
-from camtorch.data.columns import camera_of
 from camtorch.extrinsics import Extrinsics
 from camtorch.io import load, opencv
 from camtorch.rig import Rig
@@ -163,51 +162,10 @@ def _unfitted(image: Path, size: tuple[int, int] | None, arguments: argparse.Nam
     return rig, *_one(path, rig)
 
 
-def stated(parts: Any, size: tuple[int, int]) -> Camera:
-    """The camera that the labels of an image of that (height, width) state.
-
-    Raises:
-        ValueError: it is none, or for another size.
-    """
-    try:
-        camera = camera_of({"image_size": size, **parts}, "camera")
-    except (ValueError, TypeError, KeyError) as error:
-        raise ValueError(f"the camera of its labels: {error}") from None
-    if camera.image_size != size:
-        raise ValueError(f"it is {size}, height and width, and the camera of its labels {camera.image_size}")
-    return camera
-
-
 def settings_of(camera: Camera) -> dict[str, Any]:
     """A camera as JSON, for the account of a job."""
     values = {name: getattr(camera, name).detach().tolist() for name in ("intrinsics", "distortion")}
     return {"model": camera.key, "image_size": camera.image_size, **values}
-
-
-def read_pair(images: Sequence[Path], sizes: Sequence[tuple[int, int]], arguments: argparse.Namespace) -> Rig:
-    """The two cameras, left and right, that took images of these (height, width).
-
-    Raises:
-        ValueError: as `read_posed`; it does not say which two cameras, or one has no pose.
-    """
-    path: Path | None = arguments.camera
-    if path is None:
-        raise ValueError(f"{images[0]}: which cameras took the pair? --camera RIG, their calibration, says so")
-    rig = read_rig(path, model=arguments.from_model)
-    if len(rig) == 1:
-        raise ValueError(
-            f"{path}: has one camera; a pair takes a file of two with their poses, as camtorch calibrate "
-            "--left LEFT --right RIGHT makes one"
-        )
-    names = arguments.names or list(rig)
-    if len(set(names)) != 2 or not set(names) <= set(rig):
-        raise ValueError(f"{path}: of which cameras? --names LEFT RIGHT says two of {', '.join(rig)}")
-    cameras = {}
-    for name, image, size in zip(names, images, sizes, strict=True):
-        cameras[name] = fitting(_one(path, rig, name)[1], path, image, size, arguments.rescale)
-        if name not in rig.extrinsics:
-            raise ValueError(f"{path}: {name} has no pose, so how the cameras stand to each other is not known")
-    return Rig(cameras, {name: rig.extrinsics[name] for name in names})
 
 
 def fitting(camera: Camera, path: Path, image: Path, size: tuple[int, int], rescale: bool) -> Camera:

@@ -14,17 +14,13 @@ from camtorch.cli import words
 Commands: TypeAlias = "argparse._SubParsersAction[Any]"
 Add: TypeAlias = Callable[..., Any]
 """The method `add_argument` of a command, or of a group of its options."""
-NEAR, FAR = 3.0, 100.0
-"""Depths in baselines, of which disparities and points are by default."""
-SHEET, SHEET_COUNT = "augment.png", 8
-"""Of `camtorch augment`: the image that it writes, and how many cameras that shows."""
 _FORMAT = "of OUT; by default what its name says"
 _BOARDS = ("chessboard", "charuco", "aprilgrid")  # as `camtorch.boards` has them, which takes numpy to import
 
 
 def add_all(commands: Commands) -> None:
     """Add the commands to a command line; each is carried out by the function `run` of the module of its name."""
-    for add in (_dewarp, _rectify, _birdseye, _augment, _map, _convert, _show, _lenses, _calibrate, _board):
+    for add in (_dewarp, _map, _convert, _show, _lenses, _calibrate):
         add(commands)
 
 
@@ -62,99 +58,6 @@ def _dewarp(commands: Commands) -> None:
     codecs = ("libx264", "libvpx-vp9", "ffv1")
     video("--codec", choices=codecs, help="the encoder; libx264 by default, in .webm libvpx-vp9; ffv1 loses nothing")
     video("--crf", type=int, metavar="N", help="its quality, lower is better; 18 in libx264")
-
-
-def _rectify(commands: Commands) -> None:
-    command = commands.add_parser(
-        "rectify",
-        help="rectify a stereo pair; disparities and points of it",
-        description="Rectify a stereo pair: camtorch rectify left.jpg right.jpg --camera rig.json -o out. The folder "
-        "OUT gets left.png and right.png, whose rows correspond, pair.png, both beside each other with lines along "
-        "rows, rectified.json, their cameras, and in perspective opencv.yml: R1, R2, P1, P2, Q.",
-    )
-    add = command.add_argument
-    add("left", type=words.path, metavar="LEFT", help="the left camera's image")
-    add("right", type=words.path, metavar="RIGHT", help="the right camera's, of the same moment")
-    add("--camera", type=words.path, metavar="RIG", help="its calibration with both poses, any format")
-    add("--names", nargs=2, metavar=("LEFT", "RIGHT"), help="their cameras; by default the first and the second of two")
-    _from_model(add)
-    _rescale(add)
-    image = command.add_argument_group("rectified images").add_argument
-    ways = ("perspective", "latlon", "cylindrical")
-    text = "perspective (the default) goes to some 120 degrees; latlon and cylindrical, about the baseline, further"
-    image("--projection", choices=ways, default="perspective", help=text)
-    text = "of view, horizontal, or horizontal,vertical; else what fits"
-    image("--fov", type=words.span, metavar="DEGREES", help=text)
-    image("--size", type=words.size, metavar="WxH", help="else what loses no detail")
-    image("--vertical", action="store_true", help="LEFT is the upper of two: columns correspond")
-    depth = command.add_argument_group('depth, with OpenCV: pip install "camtorch[stereo]"').add_argument
-    text = "OUT/disparity.npy, in pixels, NaN where unknown; and disparity.png to look at"
-    depth("--disparity", action="store_true", help=text)
-    depth("--points", action="store_true", help="OUT/points.ply, coloured, in the left camera's frame and unit")
-    text = (
-        f"the depths to look for, in the unit of RIG's poses; FAR may be inf; else {NEAR:g} to {FAR:g} times "
-        "the distance of the cameras for points, and what is farther too for disparities"
-    )
-    depth("--depth", nargs=2, type=float, metavar=("NEAR", "FAR"), help=text)
-    _output(add, "rectified", "the folder of the new images")
-
-
-def _birdseye(commands: Commands) -> None:
-    command = commands.add_parser(
-        "birdseye",
-        help="see the ground from above",
-        description="See the ground from above: camtorch birdseye photo.jpg --camera camera.json --x -3 3 --y 1 9 "
-        "--resolution 0.01 -o above.png. The pose in FILE is camera from ground, z up; without one, --height and "
-        "--pitch say how the camera looks, and the ground's y axis lies ahead of it, x to its right, the origin "
-        "below it.",
-    )
-    command.add_argument("image", type=words.path, metavar="IMAGE", help="the image")
-    ground = command.add_argument_group("ground, in the unit of the pose, or of --height").add_argument
-    for name, text in (("--x", "what is seen, left to right"), ("--y", "what is seen, bottom to top")):
-        ground(name, type=float, nargs=2, required=True, metavar=("FROM", "TO"), help=text)
-    ground("--resolution", type=float, required=True, metavar="UNITS", help="of a pixel: 0.01 for 1 cm")
-    pose = command.add_argument_group("pose, instead of that in FILE").add_argument
-    pose("--height", type=float, help="of the camera above the ground")
-    text = "down from the horizon, 90 for straight down; 0 by default"
-    pose("--pitch", type=float, metavar="DEGREES", help=text)
-    _photograph(command)
-    _output(command.add_argument, "birdseye.png")
-
-
-def _augment(commands: Commands) -> None:
-    command = commands.add_parser(
-        "augment",
-        help="a sheet of an image with its labels, or a data set, as other cameras see them",
-        description="A sheet of an image with its labels as other cameras see them. With --dataset a new data set: "
-        "camtorch augment images/ --dataset annotations.json --camera camera.yml -o new/. A RANGE is LOW,HIGH, as in "
-        "--yaw=-5,20, or a number: so far to either side of doing nothing, or just that --fov.",
-    )
-    add = command.add_argument
-    text = "the image; the folder of images of a data set"
-    add("image", type=words.path, nargs="?", metavar="IMAGE", help=text)
-    text = "of IMAGE: JSON of keypoints, boxes, gaze_from in pixels, gaze, and perhaps its camera"
-    add("--labels", type=words.path, metavar="FILE", help=text)
-    add("--preset", default="none", metavar="NAME", help="whose lens the other cameras have")
-    add("--list", action="store_true", help="print the presets, and nothing else")
-    add("-n", type=words.count(100), metavar="COUNT", help=f"how many other cameras; {SHEET_COUNT} by default")
-    add("--seed", type=words.count(2**63 - 1, 0), default=0, metavar="N", help="of what is drawn; 0 by default")
-    add("--size", type=words.size, metavar="WxH", help="of the new images; by default the old one's")
-    for name, text in (
-        ("yaw", "degrees by which the camera turns to its right"),
-        ("pitch", "degrees by which it then looks up"),
-        ("roll", "degrees by which it then leans to its right"),
-        ("zoom", "factor on the focal lengths"),
-    ):
-        add(f"--{name}", type=words.span, metavar="RANGE", help=text)
-    text = "horizontal field of view in degrees; or source: as much of the lens's as the image fills"
-    add("--fov", type=words.fov, metavar="RANGE", help=text)
-    text = "of each new image that has to show something, 0 to 1: it zooms until it does; 0 by default"
-    add("--min-filled", type=float, default=0.0, metavar="PART", help=text)
-    _photograph(command)
-    _output(add, None, f"the sheet, {SHEET} by default; of a data set, a folder")
-    many = _many_files(command)
-    text = "of all images of the folder IMAGE: a JSON file in COCO's format, or a folder of a JSON file for each"
-    many("--dataset", type=words.path, metavar="LABELS", help=text)
 
 
 def _map(commands: Commands) -> None:
@@ -259,20 +162,6 @@ def _calibrate(commands: Commands) -> None:
     add("--report", type=words.path, metavar="FILE", help="an .html to look at: how far the result can be trusted")
     add("--format", help=f"{_FORMAT}, OpenCV's for .yml")
     _output(add, "camera.json", "the calibration")
-
-
-def _board(commands: Commands) -> None:
-    command = commands.add_parser(
-        "board",
-        help="draw a board to print, for camtorch calibrate",
-        description="Draw a board to print, to scale: camtorch board --board 9x6 --square 25mm -o board.pdf. "
-        "Print it at 100 % (no fit to page), on something flat.",
-    )
-    _board_options(command, "by default as many whole millimetres as fit on the paper")
-    papers = ", ".join(words.PAPERS)
-    text = f"{papers}, WIDTHxHEIGHT as in 400x300mm, or board: as large as needed; a4 by default"
-    command.add_argument("--paper", type=words.paper, default="a4", metavar="NAME", help=text)
-    _output(command.add_argument, "board.pdf", "the drawing, a .pdf or .svg")
 
 
 # -- options of several commands

@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import torch
 from PIL import Image
 from torch import Tensor
 
@@ -31,17 +30,6 @@ def check_kind(path: Path) -> None:
     if path.suffix.lower() not in IMAGES:
         what = path.suffix or "no suffix"
         raise ImageFileError(f"{path}: {what}: no image is written as that; try {', '.join(sorted(IMAGES))}")
-
-
-def in_colour(image: Tensor, paper: tuple[int, int, int] = (255, 255, 255)) -> Tensor:
-    """(3, H, W) uint8 of any image; deep ones from their darkest to their brightest, what is clear on paper."""
-    if image.dtype != torch.uint8:
-        deep = image.float()
-        image = (255 * (deep - deep.min()) / (deep.max() - deep.min()).clamp(min=1)).round().byte()
-    if len(image) in (2, 4):
-        alpha = image[-1:] / 255
-        image = (image[:-1] * alpha + torch.tensor(paper)[:, None, None] * (1 - alpha)).round().byte()
-    return image.expand(3, -1, -1)
 
 
 def from_tensor(image: Tensor) -> Image.Image:

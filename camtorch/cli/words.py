@@ -15,7 +15,6 @@ LENS = "lens:"
 """What the name of a real lens begins with, in the place of a calibration file."""
 GUESS = "guess:"
 """What a guessed horizontal field of view in degrees begins with, in the place of a calibration file."""
-PAPERS = ("a4", "a3", "a2", "a1", "a0", "letter", "legal", "tabloid")
 _UNITS = {"mm": 1e-3, "cm": 1e-2, "in": 0.0254, "m": 1.0}
 _WrongWord = argparse.ArgumentTypeError
 
@@ -81,20 +80,6 @@ def count(most: int, least: int = 1) -> Callable[[str], int]:
     return parse
 
 
-def span(text: str) -> float | tuple[float, float]:
-    """A number, or two."""
-    try:
-        low, high = map(float, text.split(",")) if "," in text else (float(text), None)
-    except ValueError:
-        raise _WrongWord(f"{text!r} is neither a number nor LOW,HIGH, as in -5,20") from None
-    return low if high is None else (low, high)
-
-
-def fov(text: str) -> float | tuple[float, float] | str:
-    """A range, or the word "source"."""
-    return text if text == "source" else span(text)
-
-
 def guess(text: str) -> Path:
     """A guessed field of view in degrees, in the place of a calibration file."""
     try:
@@ -118,15 +103,3 @@ def length(text: str) -> float:
             f"{text!r} is no length above 0 with its unit, as 30mm, 3cm, 1in; without one it is in metres, below 1"
         )
     return metres
-
-
-def paper(text: str) -> str | tuple[float, float]:
-    """The name of a paper, or (width, height) in mm of "WIDTHxHEIGHT", as in 400x300mm."""
-    name = text.lower()
-    if name in (*PAPERS, "board"):
-        return name
-    sides = name.removesuffix("mm").split("x")
-    if len(sides) != 2:
-        raise _WrongWord(f"{text!r} is no paper: {', '.join(PAPERS)}, board, or WIDTHxHEIGHT, as in 400x300mm")
-    width, height = (1000 * length(f"{side}mm") for side in sides)
-    return width, height

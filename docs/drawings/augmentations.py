@@ -10,8 +10,7 @@ from PIL import Image, ImageDraw, ImageFilter
 from scenes import cabin, portrait
 
 import camtorch as ct
-from camtorch._drawing import INK, PAPER, Marks, font, shown
-from camtorch.cli.sheet import mark
+from drawings.marks import INK, PAPER, Marks, font, mark, shown
 from drawings.pages import IMAGES, code, sections
 from drawings.sheets import GAP, TILE, WIDTH, pair, put
 

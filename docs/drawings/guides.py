@@ -16,11 +16,10 @@ from scenes.exposure import expose
 from scenes.portrait import driver
 
 import camtorch as ct
-from camtorch._drawing import INK, PAPER, shown
 from camtorch.augment.sample import Sample
 from camtorch.boards.boards import Chessboard
-from camtorch.cli import sheet
 from camtorch.rotations import mount_rotation
+from drawings.marks import INK, PAPER, marked, shown
 from drawings.pages import EXAMPLES, IMAGES
 from drawings.sheets import drawn, in_rows, tiles
 
@@ -73,7 +72,7 @@ def overview(columns: int = 4) -> Image.Image:
 
 def labelled(panels: list[tuple[Sample, str]], columns: int) -> Image.Image:
     """Images with their labels, small, and titles."""
-    return in_rows([(sheet.marked(view, 300, 400), title) for view, title in panels], columns)
+    return in_rows([(marked(view, 300, 400), title) for view, title in panels], columns)
 
 
 def lenses() -> Image.Image:
@@ -154,16 +153,14 @@ def fields() -> Image.Image:
 
 
 def augment() -> Image.Image:
-    """What `camtorch augment` makes of a rendered driver."""
+    """A rendered driver, and what `ct.augment.RandomCamera` makes of it."""
     before = rendered()
     new = ct.augment.RandomCamera("dms130", image_size=(945, 1260), antialias=True, min_filled=0.95, fov="source")
-    generator, shown = torch.Generator().manual_seed(0), [(before, ["before"])]
+    generator, panels = torch.Generator().manual_seed(0), [(before, "before")]
     for _ in range(5):
         after = new(before, draw=new.draw(1, generator))
-        shown.append((after, [f"dms130, {float(after['camera'].fov[0]):.0f}° wide"]))
-    page = sheet.sheet(shown, "One image, five other cameras")
-    page.thumbnail((960, 2000), Image.Resampling.LANCZOS)
-    return page
+        panels.append((after, f"dms130, {float(after['camera'].fov[0]):.0f}° wide"))
+    return labelled(panels, 3)
 
 
 def edits() -> Image.Image:

@@ -10,7 +10,7 @@ import matplotlib.pyplot as plt
 from PIL import Image, ImageDraw
 from torch import Tensor
 
-from camtorch._drawing import INK, PAPER, RIM, font, shown
+from drawings.marks import INK, PAPER, RIM, font, shown
 
 WIDTH, TILE, GAP = 960, (345, 460), 13
 """Pixels: of an image in the galleries, of a part of it at its most (height, width), between them."""

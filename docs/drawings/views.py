@@ -16,7 +16,7 @@ from boards import opencv_left
 from PIL import Image
 
 import camtorch as ct
-from camtorch._drawing import shown
+from drawings.marks import shown
 from drawings.models import rendered
 from drawings.pages import DOCS, IMAGES, code, sections
 from drawings.sheets import TILE, drawn, pair

@@ -2,7 +2,6 @@
 
 import functools
 import importlib.util
-import json
 import re
 import runpy
 import shlex
@@ -105,12 +104,6 @@ def folder(tmp_path, monkeypatch, request):
     if "clip.mp4" in text:
         pytest.importorskip("av")
         write_video("drive/clip.mp4", range(3), size=(height, width))
-    if "--dataset faces.json" in text:
-        Path("faces").mkdir()
-        shutil.copy("photo.jpg", "faces/0.jpg")
-        labels = {"id": 1, "image_id": 1, "category_id": 1, "bbox": [300, 200, 90, 99], "keypoints": [330, 250, 2]}
-        content = {"images": [{"id": 1, "file_name": "0.jpg"}], "annotations": [labels], "categories": [{"id": 1}]}
-        Path("faces.json").write_text(json.dumps(content))
     if '"sparse/0"' in text:
         Path("sparse/0").mkdir(parents=True)
         pose = ct.Extrinsics([0.0, 0.1, 0.0], [0.0, 0.0, 0.1]).double()
@@ -205,5 +198,5 @@ def test_links_of_the_root_lead_somewhere():
 def test_the_page_of_commands_is_what_the_parser_knows():
     made = runpy.run_path(str(ROOT / "docs" / "make_commands.py"))
     assert made["PAGE"].read_text(encoding="utf-8") == made["text"](), "python docs/make_commands.py makes it anew"
-    for name in ("dewarp", "rectify", "birdseye", "lenses", "calibrate"):
+    for name in ("dewarp", "convert", "show", "map", "lenses", "calibrate"):
         assert f"## camtorch {name}\n" in made["text"]()

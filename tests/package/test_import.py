@@ -94,7 +94,7 @@ def test_exported_programs_load(tmp_path):
 
 @pytest.mark.slow
 def test_output_that_nobody_reads_is_no_error():
-    code = "from camtorch.cli.main import main; import sys; sys.exit(main(['augment', '--list']))"
+    code = "from camtorch.cli.main import main; import sys; sys.exit(main(['lenses', 'GoPro']))"
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
     with subprocess.Popen([sys.executable, "-c", code], env=ENVIRONMENT, **pipes) as process:
         process.stdout.close()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Sequence
+from typing import Any
 
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
@@ -15,6 +16,7 @@ INK, GREY, RIM, PAPER = (43, 42, 46), (122, 112, 100), (214, 202, 182), (250, 24
 POINT, BOX, GAZE = (226, 29, 72), (255, 190, 40), (30, 100, 240)
 """The colours of marks."""
 WHITE = (255, 255, 255, 235)
+_REACH = 0.35  # length of gaze arrows, as a part of the distance to the eyes
 _SHARP = 3  # marks are drawn that many times as large, and reduced
 
 
@@ -91,3 +93,33 @@ class Marks:
         far = 9.0 * self.width
         x, y = (_SHARP * min(max((float(c) + 0.5) * self.scale, -far), far) for c in pixel)
         return x, y
+
+
+def mark(marks: Marks, sample: dict[str, Any], weight: float) -> None:
+    """Mark the valid `boxes` and `keypoints` of a sample, and its `gaze` from `points`."""
+    for box in _valid(sample, "boxes"):
+        marks.box(box, weight)
+    if "gaze" in sample:
+        eyes, camera = sample["points"], sample["camera"]
+        ends = eyes + _REACH * eyes.norm(dim=-1, keepdim=True) * sample["gaze"]
+        (start, seen), (end, ahead) = camera.project(eyes), camera.project(ends)
+        for i in (seen & ahead & camera.contains(start)).nonzero()[:, 0].tolist():
+            marks.arrow(start[i], end[i], weight)
+    for pixel in _valid(sample, "keypoints"):
+        marks.point(pixel, weight)
+
+
+def _valid(sample: dict[str, Any], name: str) -> Sequence[Tensor]:
+    valid = sample.get(f"{name}_valid", slice(None))
+    return sample[name][valid] if name in sample else ()
+
+
+def marked(sample: dict[str, Any], height: int, width: int) -> Image.Image:
+    """The image of a sample, (3, H, W), as large as fits, with its valid labels."""
+    rows, columns = sample["image"].shape[-2:]
+    scale = min(height / rows, width / columns)
+    height, width = max(1, round(rows * scale)), max(1, round(columns * scale))
+    tile, marks = shown(sample["image"], height, width), Marks(width, height, width / columns)
+    mark(marks, sample, max(1.0, width / 640))
+    marks.over(tile)
+    return tile
