@@ -4,9 +4,6 @@ from camtorch import (
     augment as augment,
 )
 from camtorch import (
-    cabin as cabin,
-)
-from camtorch import (
     data as data,
 )
 from camtorch import (
@@ -67,8 +64,6 @@ from camtorch.warp.plane import BirdsEye as BirdsEye
 from camtorch.warp.plane import PlaneWarp as PlaneWarp
 from camtorch.warp.reproject import Reproject as Reproject
 from camtorch.warp.shutter import RollingShutter as RollingShutter
-from camtorch.warp.surround import Surround as Surround
-from camtorch.warp.surround import surround as surround
 from camtorch.warp.vignetting import vignetting as vignetting
 from camtorch.warp.warp import Warp as Warp
 from camtorch.windshield import Windshield as Windshield

@@ -33,7 +33,7 @@ from camtorch.plot.axes import COLOURS
 SCRIPTS = {
     "room": "dewarp_room",
     "stereo": "stereo_room",
-    "surround": "birds_eye",
+    "surround": "surround_view",
     "camera": "predict_camera",
     "drivers": "driver_monitoring",
 }

@@ -9,7 +9,9 @@ labels along. What they find is compared in the camera's frame, by how far from 
 """
 
 import argparse
+import math
 import time
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -98,6 +100,89 @@ def plain(batch: Sample, jitter: float = 1.0) -> Sample:
 
 
 WAYS = {"plain": plain, "look_at": look_at}
+
+
+# -- the car: its frame is ISO 8855's in metres, x ahead, y to the left, z up, from midway between the driver's eyes
+
+Point = tuple[float, float, float]
+MOUNTS: dict[str, tuple[Point, float]] = {
+    "steering_column": ((0.55, 0.0, -0.33), 60.0),
+    "cluster": ((0.78, 0.0, -0.22), 50.0),
+    "centre_stack": ((0.72, -0.38, -0.22), 130.0),
+    "mirror": ((0.5, -0.38, 0.14), 140.0),
+    "a_pillar": ((0.6, 0.5, 0.02), 60.0),
+}
+"""Position and degrees across of a usual lens: estimates for a car of middle size, with the wheel on the left."""
+REGIONS: dict[str, tuple[Point, ...]] = {
+    "windscreen": ((0.9, 0.55, -0.12), (0.9, -1.1, -0.12), (0.6, -1.05, 0.25), (0.6, 0.5, 0.25)),
+    "cluster": ((0.72, 0.18, -0.28), (0.72, -0.18, -0.28), (0.72, -0.18, -0.15), (0.72, 0.18, -0.15)),
+    "centre_stack": ((0.72, -0.25, -0.45), (0.72, -0.52, -0.45), (0.72, -0.52, -0.15), (0.72, -0.25, -0.15)),
+    "mirror": ((0.5, -0.28, 0.1), (0.5, -0.52, 0.1), (0.5, -0.52, 0.18), (0.5, -0.28, 0.18)),
+    "left_mirror": ((0.75, 0.85, -0.15), (0.75, 0.6, -0.15), (0.75, 0.6, 0.02), (0.75, 0.85, 0.02)),
+    "right_mirror": ((0.85, -1.42, -0.15), (0.85, -1.7, -0.15), (0.85, -1.7, 0.02), (0.85, -1.42, 0.02)),
+    "left_window": ((0.6, 0.65, -0.15), (-0.4, 0.65, -0.15), (-0.4, 0.65, 0.3), (0.6, 0.65, 0.3)),
+    "passenger": ((-0.2, -0.6, -0.7), (0.4, -0.6, -0.7), (0.4, -0.6, -0.1), (-0.2, -0.6, -0.1)),
+    "lap": ((0.05, 0.25, -0.6), (0.45, 0.25, -0.6), (0.45, -0.25, -0.6), (0.05, -0.25, -0.6)),
+}
+"""The corners of what drivers look at."""
+
+
+def camera_from_car(position: Sequence[float]) -> ct.Extrinsics:
+    """Return the pose of an upright camera that looks at the driver's eyes."""
+    at = torch.tensor(position, dtype=torch.float64)
+    ahead = F.normalize(-at, dim=0)
+    right = F.normalize(torch.linalg.cross(ahead, at.new_tensor([0, 0, 1])), dim=0)
+    rotation = torch.stack((right, torch.linalg.cross(ahead, right), ahead))
+    return ct.Extrinsics.from_matrix(rotation, -rotation @ at).requires_grad_(False)
+
+
+def in_car(rays: Tensor, pose: Tensor | None) -> Tensor:
+    """Turn rays (..., 3) of the camera's frame into the car's; pose (..., 4, 4) is camera from car."""
+    return rays.double() if pose is None else (pose[..., :3, :3].double().mT @ rays.double()[..., None])[..., 0]
+
+
+class Regions:
+    """Convex plane polygons in the car's frame, by name; the last of `names` is "elsewhere"."""
+
+    def __init__(self, polygons: Mapping[str, Sequence[Sequence[float]]] = REGIONS) -> None:
+        self.names = (*polygons, "elsewhere")
+        self.corners = [torch.tensor(corners, dtype=torch.float64) for corners in polygons.values()]
+
+    def region_of(self, gaze: Tensor, eye: Tensor, pose: Tensor | None = None) -> Tensor:
+        """Return the number (...) in `names` of the nearest region that rays (..., 3) from eyes (..., 3) meet, or -1.
+
+        Both are in the frame of a camera with pose (..., 4, 4), camera from car, or in the car's without one.
+        """
+        start = in_car(eye if pose is None else eye - pose[..., :3, 3], pose)
+        ray, start = torch.broadcast_tensors(in_car(gaze, pose), start)
+        nearest = torch.full(ray.shape[:-1], math.inf, dtype=torch.float64)
+        found = torch.full(ray.shape[:-1], -1)
+        for number, corners in enumerate(self.corners):
+            edges = corners.roll(-1, 0) - corners
+            normal = torch.linalg.cross(edges[0], edges[1])
+            distance = (corners[0] - start) @ normal / (ray @ normal)
+            hit = start + distance[..., None] * ray
+            sides = torch.linalg.cross(edges.expand(*hit.shape[:-1], -1, -1), hit[..., None, :] - corners) @ normal
+            here = (sides > 0).all(-1) & (distance > 0) & (distance < nearest)
+            nearest, found = torch.where(here, distance, nearest), torch.where(here, number, found)
+        return found
+
+
+def head_share(gaze: Tensor, head: Tensor, pose: Tensor | None = None) -> Tensor:
+    """Return which part (...) of a glance away from straight ahead the head makes: an "owl" 1, a "lizard" 0.
+
+    The words are Euro NCAP's. Gaze (..., 3) and head (..., 3, 3) or (..., 4, 4), whose nose points along -z, are in the
+    frame of a camera with pose (..., 4, 4), camera from car, or in the car's without one.
+    """
+
+    def from_ahead(rays: Tensor) -> Tensor:  # angles to the left and up
+        x, side = rays[..., :1], rays[..., 1:]
+        size = side.norm(dim=-1, keepdim=True)
+        return side * (torch.atan2(size, x) / size.clamp(min=1e-30))
+
+    eyes, nose = (from_ahead(in_car(rays, pose)) for rays in (gaze, -head[..., :3, 2]))
+    square = eyes.square().sum(-1)
+    return torch.where(square > 1e-12, (eyes * nose).sum(-1) / square.clamp(min=1e-12), 0.0)
 
 
 # -- learning

@@ -431,16 +431,3 @@ def test_sequences_and_mappings_need_not_be_python_s():
     moves = ct.data.MapBatches(ct.augment.RandomCamera("webcam", camera=left), key=Options(["path"]))
     image = np.zeros((1, *left.image_size, 3), np.uint8)
     assert moves({"image": image, "path": np.array(["a"])})["image"].shape == image.shape
-
-
-def test_images_of_a_surround_may_be_stacked():
-    camera = ct.Pinhole.from_fov(90, image_size=(12, 16)).requires_grad_(False)
-    poses = [ct.Extrinsics.from_matrix(torch.eye(4)) for _ in range(2)]
-    rig = ct.Rig({"a": camera, "b": camera}, dict(zip("ab", poses, strict=True)))
-    surround = ct.surround(rig, ct.Pinhole.from_fov(60, image_size=(8, 8)))
-    images = torch.rand(2, 1, 3, 12, 16)
-    (stacked, _), (listed, _) = surround(images), surround(list(images))
-    assert stacked.equal(listed)
-    assert surround(Options(images))[0].equal(listed)
-    with refuses(TypeError, "Surround: images must be tensors"):
-        surround(images[:, 0])
