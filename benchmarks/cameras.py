@@ -24,8 +24,6 @@ COEFFICIENTS: dict[str, tuple[float, ...]] = {
     "f_theta_backward": (0.02, -0.03, 0.004),
     "f_theta_sheared": (1e-3, -1e-3, -0.09, 0.14, -0.02),
     "f_theta_backward_sheared": (1e-3, -1e-3, 0.02, -0.03, 0.004),
-    "cahvor": (0.02, -0.03, -0.002, 0.04, -0.01),
-    "cahvore": (0.02, -0.03, -0.002, 0.03, -0.01, 0.34),
     "woodscape": (-0.09, 0.14, -0.02),
     # theta (1 + 0.02 theta^2 - 0.01 theta^4 + ...) every 15 degrees
     "tabulated": (

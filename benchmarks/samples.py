@@ -1,8 +1,8 @@
 """One sample at a time, as a worker of a DataLoader has it: a uint8 image of three channels and 68 landmarks.
 
-Affine, ElasticTransform and OpticalDistortion are albumentations', of about the same extent; the last moves no
-landmarks here, which would make it many times slower. "RandomCamera" moves a mask as well, and stands beside the same
-by OpenCV: new maps, the image, the mask and the landmarks. One thread.
+Affine and OpticalDistortion are albumentations', of about the same extent; the latter moves no landmarks here, which
+would make it many times slower. "RandomCamera" moves a mask as well, and stands beside the same by OpenCV: new maps,
+the image, the mask and the landmarks. One thread.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from benchmarks.point_peers import OPENCV, OURS
 from benchmarks.tables import Record, only, table
 from benchmarks.timing import Run, measure, threads
 from benchmarks.verdict import Requirement, figures, times_faster, verdict
-from camtorch.augment import RandomCamera, RandomElastic, RandomLens, RandomMount
+from camtorch.augment import RandomCamera, RandomLens, RandomMount
 
-AFFINE, ELASTIC, DISTORTION = "albumentations Affine", "ElasticTransform", "OpticalDistortion, no landmarks"
+AFFINE, DISTORTION = "albumentations Affine", "OpticalDistortion, no landmarks"
 SIZES = (256, 256), (480, 640)
 _ANGLES = {"yaw": 10, "pitch": 10, "roll": 10}
 _ROUNDS = 0.02  # seconds that one round of a contestant takes
@@ -87,7 +87,6 @@ def contestants(size: tuple[int, int]) -> dict[str, dict[str, Run]]:
         "RandomMount": {OURS: ours(RandomMount(camera=brown, min_filled=0, **_ANGLES))},
         "RandomLens": {OURS: ours(RandomLens(camera=brown))},
         "RandomLens to a fisheye": {OURS: ours(RandomLens("kannala_brandt", camera=brown, fov=(60, 70), min_filled=0))},
-        "RandomElastic": {OURS: ours(RandomElastic(camera=brown))},
     }
     for case, camera in zip(augment.CASES[:2], (brown, fisheye), strict=True):
         move = augment.OpenCVCamera(case, camera)
@@ -102,10 +101,8 @@ def contestants(size: tuple[int, int]) -> dict[str, dict[str, Run]]:
         affine = A.Compose(
             [A.Affine(rotate=(-10, 10), translate_percent=0.02, scale=(0.95, 1.05), p=1)], keypoint_params=points
         )
-        elastic = A.Compose([A.ElasticTransform(p=1)], keypoint_params=points)
         distortion = A.Compose([A.OpticalDistortion(distort_limit=0.3, p=1)])
         found["RandomMount"][AFFINE] = lambda: affine(image=image, keypoints=keypoints)
-        found["RandomElastic"][ELASTIC] = lambda: elastic(image=image, keypoints=keypoints)
         for case in ("RandomLens", "RandomLens to a fisheye"):
             found[case][DISTORTION] = lambda: distortion(image=image)
     return found

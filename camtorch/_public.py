@@ -66,4 +66,3 @@ from camtorch.warp.reproject import Reproject as Reproject
 from camtorch.warp.shutter import RollingShutter as RollingShutter
 from camtorch.warp.vignetting import vignetting as vignetting
 from camtorch.warp.warp import Warp as Warp
-from camtorch.windshield import Windshield as Windshield

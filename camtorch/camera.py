@@ -21,7 +21,6 @@ from camtorch._arguments import (
     is_predicted,
     shown,
 )
-from camtorch._derived import variant
 from camtorch._editing import check_crop, edited_by, quarter_turns
 from camtorch._evaluation import evaluated, mapped
 from camtorch._freezing import PREFIX, Freezable, with_frozen
@@ -47,7 +46,6 @@ from camtorch.projection.polyline import project_polyline
 from camtorch.projection.project import Project
 from camtorch.projection.rays import field_of_view
 from camtorch.projection.unproject import Unproject
-from camtorch.windshield import Windshield, behind
 
 if TYPE_CHECKING:
     from typing_extensions import Self, TypeVar
@@ -337,15 +335,15 @@ class Camera(Freezable):
 
     @classmethod
     def variant(cls, text: str) -> type[Camera]:
-        """The class of the key `key:text`, of cameras behind a windshield for one; a ValueError if there is none."""
-        return variant(cls, text)
+        """Return the class of the key `key:text`, such as another grid of `Splined`; a ValueError if there is none."""
+        raise ValueError(f"{cls.__name__}: there is no variant {text!r:.60}")
 
     @classmethod
     def smoothness(cls) -> Tensor | None:
         """(R, n) rows whose products with the coefficients are small in a smooth lens, float64.
 
         A model that states them has a lens that is linear in its coefficients, and coefficients enough to take the
-        place of the intrinsics, which fits then hold, and of coefficients that are in no row, as those of a windshield.
+        place of the intrinsics, which fits then hold, and of coefficients that are in no row.
         None: the coefficients are few.
         """
         return None
@@ -638,18 +636,6 @@ class Camera(Freezable):
         return edited_by(self, quarter_turns(size)[turns], size[::-1] if turns % 2 else size)
 
     # -- another model
-
-    def behind(self, shield: Windshield) -> Self:
-        """The camera that looks through a windshield: what it projects goes through the shield first.
-
-        Its coefficients are this camera's, then the shield's, h0 h1 ... of `horizontal` and v0 v1 ... of `vertical`. As
-        of an edited image its gradients go to both where they learn. A ray is valid if it is ahead of the camera, as
-        the one that it becomes, if the shield does not fold there, and if this camera sees what it becomes.
-
-        Raises:
-            TypeError: no `Windshield`; a `Mixed`; a camera that is behind one. ValueError: batch dims that do not fit.
-        """
-        return behind(self, shield)
 
     def convert(
         self,

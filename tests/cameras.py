@@ -55,8 +55,6 @@ RANGES = {
     "woodscape": {"k": (0.1, 0.5)},
     "f_theta_sheared": {"d": (0.01, 0.3), "e": (0.01, 0.3), "k": (0.1, 0.5)},
     "f_theta_backward_sheared": {"d": (0.01, 0.3), "e": (0.01, 0.3), "k": (0.1, 0.5)},
-    "cahvor": {"alpha": (0.02, 0.3), "beta": (0.02, 0.3), "r": (0.05, 0.5)},
-    "cahvore": {"alpha": (0.02, 0.3), "beta": (0.02, 0.3), "r": (0.05, 0.5), "linearity": ((0.3, 1.0), (-1.5, 1.5))},
     "ucm": {"alpha": ((0.0, 1.0), (-1.0, 1.5))},
     "eucm": {"alpha": ((0.0, 1.0), (-1.0, 1.5)), "beta": ((0.5, 1.5), (0.01, 20.0))},
     "double_sphere": {"alpha": ((0.0, 1.0), (-0.5, 1.5)), "xi": ((-0.3, 0.6), (-0.9, 3.0))},
@@ -113,9 +111,6 @@ CALIBRATIONS = {
         ),
         (2168, 3848),
     ),
-    # of the size of those in mrcal's tests
-    "cahvor": ((1761.18, 1761.25, 1965.71, 1087.52), (0.02, -0.03, -0.002, 0.04, -0.01), (2200, 4000)),
-    "cahvore": ((842.3, 850.1, 1965.71, 1087.52), (0.02, -0.03, -0.002, 0.03, -0.01, 0.34), (2200, 4000)),
     # KITTI-360, calibration/image_02.yaml
     "mei": (
         (1336.3220825849971, 1335.7883350012958, 716.94323510126321, 705.76498308221585),
@@ -129,8 +124,6 @@ CALIBRATIONS = {
 NOT_ANALYTIC = {
     *("f_theta", "f_theta_backward", "f_theta_backward_sheared", "f_theta_sheared", "ocamcalib", "woodscape"),
 }
-# Cameras whose lens has an axis of its own
-OFF_AXIS = {"cahvor", "cahvore"}
 
 
 def constants(camera):

@@ -19,7 +19,6 @@ from camtorch.augment.edits import (
     Rotate90,
     VerticalFlip,
 )
-from camtorch.augment.elastic import RandomElastic
 from camtorch.augment.face import FaceNormalizer
 from camtorch.augment.face_model import face_points
 from camtorch.augment.landmarks import LANDMARKS
@@ -44,7 +43,6 @@ __all__ = [
     "Preset",
     "RandomCamera",
     "RandomCrop",
-    "RandomElastic",
     "RandomLens",
     "RandomMount",
     "RandomResizedCrop",

@@ -23,7 +23,7 @@ from torch.nn.utils.parametrize import type_before_parametrizations
 from camtorch._arguments import as_part, as_values, check_boxes, fails, shown
 from camtorch._dtypes import narrow, widen
 from camtorch._module import Memo, remade
-from camtorch.augment import box_crop, compose, edits, elastic, random_camera
+from camtorch.augment import box_crop, compose, edits, random_camera
 from camtorch.augment.augmentation import Augmentation, check_front_end, check_single, move_points
 from camtorch.augment.change import Change
 from camtorch.augment.collate import collate_cameras
@@ -47,7 +47,6 @@ __all__ = [
     "Pad",
     "RandomCamera",
     "RandomCrop",
-    "RandomElastic",
     "RandomLens",
     "RandomMount",
     "RandomResizedCrop",
@@ -332,10 +331,6 @@ class RandomLens(_Random, wraps=random_camera.RandomLens):
 
 class RandomCamera(_Random, wraps=random_camera.RandomCamera):
     """Another camera in the same place, turned and with another lens."""
-
-
-class RandomElastic(_Random, wraps=elastic.RandomElastic):
-    """The image bent smoothly, as rubber is."""
 
 
 class RandomResizedCrop(_Random, wraps=edits.RandomResizedCrop):

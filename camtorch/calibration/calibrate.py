@@ -110,7 +110,7 @@ def as_model(
         raise TypeError(f'{owner}: fixed must be names of parameters, as ("cx", "cy"), or "all"; got {fixed!r}')
     fixed = (names if fixed == "all" else (fixed,)) if isinstance(fixed, str) else tuple(fixed)
     if start is not None and (smooth := model.smoothness()) is not None:
-        # what these do, and a windshield, a surface does as well
+        # a surface does what these do as well
         own = zip(names[4:], smooth.any(0).tolist(), strict=True)
         fixed = (*fixed, *INTRINSICS, *(name for name, is_in in own if not is_in))
     unknown = [name for name in fixed if not isinstance(name, str) or name not in names]

@@ -21,11 +21,8 @@ _MODELS = {
     "LENSMODEL_LONLAT": ("equirectangular", 0),
     "LENSMODEL_LATLON": ("latlon", 0),
     "LENSMODEL_STEREOGRAPHIC": ("stereographic", 0),
-    "LENSMODEL_CAHVOR": ("cahvor", 5),
     **{f"LENSMODEL_OPENCV{count}": ("brown_conrady", count) for count in (4, 5, 8, 12, 14)},
 }
-# a CAHVORE says its linearity in the name, and ends with e0 e1 e2
-_CAHVORE = "LENSMODEL_CAHVORE_linearity="
 _SPLINED_NAME = "LENSMODEL_SPLINED_STEREOGRAPHIC_order={}_Nx={}_Ny={}_fov_x_deg={}"
 _SPLINED = re.compile(r"LENSMODEL_SPLINED_STEREOGRAPHIC_order=(\d+)_Nx=(\d+)_Ny=(\d+)_fov_x_deg=(\d+)")
 
@@ -38,13 +35,8 @@ def matches(keys: dict[str, Any]) -> bool:
 def parse(record: Record) -> Rig:
     """The camera; the rig is mrcal's reference. The valid region and the optimization inputs are not read."""
     name = record["lens_model" if "lens_model" in record else "lensmodel"]
-    if name.text().startswith(_CAHVORE):
-        linearity = Record(name.path, name.text().removeprefix(_CAHVORE), name.place)
-        key, values = "cahvore", _central(record["intrinsics"], linearity)
-    else:
-        known = [*_MODELS, f"{_CAHVORE}...", _SPLINED_NAME.format(3, 16, 11, 120)]
-        key, count = _splined(name) or _MODELS[one_of(name, known)]
-        values = record["intrinsics"].numbers(4 + count)
+    key, count = _splined(name) or _MODELS[one_of(name, [*_MODELS, _SPLINED_NAME.format(3, 16, 11, 120)])]
+    values = record["intrinsics"].numbers(4 + count)
     camera = record["intrinsics"].camera(key, values[:4], values[4:], record["imagersize"].size())
     extrinsics: dict[str, Extrinsics] = {}
     for place in ("rt_cam_ref", "extrinsics"):
@@ -52,14 +44,6 @@ def parse(record: Record) -> Rig:
             rt = record[place].numbers(6)
             extrinsics["camera"] = poses.pose(record[place], rt[:3], rt[3:])
     return Rig({"camera": camera}, extrinsics)
-
-
-def _central(record: Record, linearity: Record) -> list[float]:
-    """The numbers of a CAHVORE, with its linearity in the place of e0 e1 e2, which are zeros."""
-    values = record.numbers(12)
-    if any(values[9:]):
-        record.fail(f"e0, e1, e2 = {values[9:]}: its rays do not pass one point, as those of each camera here do")
-    return [*values[:9], linearity.number()]
 
 
 def _splined(name: Record) -> tuple[str, int] | None:
@@ -83,17 +67,14 @@ def render(rig: Rig, path: str) -> str:
     name, camera = lossy.only_camera(rig)
     lossy.no_images(rig)
     height, width = lossy.size(name, camera)
-    known = {"cahvore", "splined", *(key for key, _ in _MODELS.values())}
-    if isinstance(camera, Splined):  # but none behind a windshield, say, whose key is another
+    known = {"splined", *(key for key, _ in _MODELS.values())}
+    if isinstance(camera, Splined):
         grid = {"order": camera.order, "columns": camera.columns, "rows": camera.rows, "fov_x": camera.fov_x}
         known.add(Splined.with_grid(**grid).key)
     key, intrinsics, distortion = lossy.model(name, camera, known)
     if key == "stereographic":  # without the polynomial
         distortion = lossy.at_most(name, camera, distortion, (0,))
-    if key == "cahvore":
-        *distortion, linearity = distortion
-        model, distortion = f"{_CAHVORE}{number(linearity)}", [*distortion, 0.0, 0.0, 0.0]
-    elif isinstance(camera, Splined):
+    if isinstance(camera, Splined):
         model = _SPLINED_NAME.format(camera.order, camera.columns, camera.rows, camera.fov_x)
     else:
         model = next(model for model, (k, count) in _MODELS.items() if k == key and count == len(distortion))

@@ -11,7 +11,6 @@ from camtorch.io.protocol import Names
 from camtorch.io.record import Record, one_of
 from camtorch.models import FTheta, FThetaBackward
 from camtorch.rig import Rig
-from camtorch.windshield import Windshield
 
 NAMES = Names("ncore", "ncore")
 
@@ -28,25 +27,17 @@ def matches(keys: dict[str, Any]) -> bool:
 
 
 def parse(record: Record) -> Rig:
-    """The camera, behind its windshield if it has one. Shutter and largest angle are not read.
+    """The camera. Shutter and largest angle are not read; a camera behind a windshield is refused.
 
     Of the two polynomials of an f-theta, one of which is an approximate inverse of the other, the reference is read:
-    they are up to 0.25 px apart. Of a windshield it is those by which ncore projects, and the inverse is theirs.
+    they are up to 0.25 px apart.
     """
     kind = one_of(record["camera_model_type"], ("ftheta", *_PINHOLES, "opencv-fisheye"))
     values = record["camera_model_parameters"]
     camera = _f_theta(values) if kind == "ftheta" else _of_opencv(values, kind)
     shield = values.get("external_distortion_parameters")
     if shield is not None and shield.value is not None:
-        for place, key in ((record, "external_distortion_type"), (shield, "external_distortion_type")):
-            if key in place:
-                one_of(place[key], ("bivariate-windshield",))
-        polynomials = [np.array(shield[f"{way}_poly"].numbers()) for way in ("horizontal", "vertical")]
-        try:
-            # frozen, so that the coefficients of both are the camera's own
-            camera = camera.requires_grad_(False).behind(Windshield(*polynomials).requires_grad_(False))
-        except ValueError as error:
-            shield.fail(error)
+        shield.fail("this camera looks through a windshield, which no model here has")
     return Rig({"camera": camera})
 
 

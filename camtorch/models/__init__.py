@@ -7,8 +7,6 @@ another thing.
 
 from camtorch.camera import MODELS
 from camtorch.models.brown_conrady import BrownConrady
-from camtorch.models.cahvor import CAHVOR
-from camtorch.models.cahvore import CAHVORE
 from camtorch.models.cylindrical import Cylindrical
 from camtorch.models.division import Division
 from camtorch.models.double_sphere import DoubleSphere
@@ -35,8 +33,6 @@ from camtorch.models.ucm import UCM
 from camtorch.models.woodscape import WoodScape
 
 __all__ = [
-    "CAHVOR",
-    "CAHVORE",
     "EUCM",
     "FOV",
     "MODELS",

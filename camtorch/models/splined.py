@@ -93,7 +93,7 @@ class Splined(Camera):
 
     @classmethod
     def variant(cls, text: str) -> type[Camera]:
-        if cls is not Splined or text.startswith(("windshield", "elastic")):  # a grid has no other grid
+        if cls is not Splined:  # a grid has no other grid
             return super().variant(text)
         found = _VARIANT.fullmatch(text)
         if found is None:

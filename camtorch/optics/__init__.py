@@ -8,7 +8,6 @@ from camtorch.optics.charts import (
     EquidistantUpTo,
     Equisolid,
     Fov,
-    Linearity,
     OneDivision,
     Perspective,
     SphereChart,
@@ -16,14 +15,11 @@ from camtorch.optics.charts import (
 )
 from camtorch.optics.lens import Homography, Lens, Planar, Shear, Stage, Tilt
 from camtorch.optics.radial import AnglePerRadius, Polynomial, RadialFactor, RadiusPolynomial, RadiusTable, Rational
-from camtorch.optics.ray_maps import Before, Bending, RayMap, Rotation
 from camtorch.optics.surface import Surface
 from camtorch.optics.unified import Unified
 
 __all__ = [
     "AnglePerRadius",
-    "Before",
-    "Bending",
     "Chart",
     "CylinderChart",
     "Equidistant",
@@ -33,7 +29,6 @@ __all__ = [
     "Homography",
     "Inverted",
     "Lens",
-    "Linearity",
     "OneDivision",
     "Perspective",
     "Planar",
@@ -42,8 +37,6 @@ __all__ = [
     "RadiusPolynomial",
     "RadiusTable",
     "Rational",
-    "RayMap",
-    "Rotation",
     "Shear",
     "SphereChart",
     "Stage",

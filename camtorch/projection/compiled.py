@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from camtorch.optics.charts import Chart
     from camtorch.optics.lens import Lens, Stage
     from camtorch.optics.radial import RadialFactor
-    from camtorch.optics.ray_maps import RayMap
     from camtorch.projection.domain import Domain, Optics
 
 PROJECT, UNPROJECT, PROJECT_VJP, UNPROJECT_VJP = range(4)
@@ -167,7 +166,7 @@ class Plan:
         # which coefficients the parameters are; None where the model computes some
         self.places = torch.tensor(known, device="cpu") if len(known) == len(parameters) else None
         self.is_all = known == list(range(len(coefficients)))
-        self.is_chart = isinstance(_bare(chart), optics.Inverted)
+        self.is_chart = isinstance(chart, optics.Inverted)
         self.has_stages, self.is_radial = bool(lens.stages), lens.is_radial
         self.has_factor, self.has_rest = lens.radial is not None, lens.rest is not None
         self.is_long = any(part.factor and part.n + part.m > _MOST_DEGREE for part in parts)
@@ -272,8 +271,7 @@ class Lenses:
             chart, lens = self._optics()
             if constants := _constants(lens):
                 made.constants, made.constant_count = self._keep_columns(constants, torch.float64), len(constants)
-            bare = _bare(chart)
-            factor = bare.factor(bare.parameters) if isinstance(bare, optics.Inverted) else lens.radial
+            factor = chart.factor(chart.parameters) if isinstance(chart, optics.Inverted) else lens.radial
             if factor is not None:
                 many = len(factor.parameters) > _MOST_DEGREE
                 fold = factor.closed_fold() if many and factor.fold is None else factor.fold
@@ -494,26 +492,13 @@ def codes(chart: Chart, lens: Lens) -> list[_Part] | None:
     return known if len(known) == len(parts) <= _MOST_PARTS else None
 
 
-def _code(part: Chart | RayMap | Stage | RadialFactor | type[RadialFactor]) -> int | None:
+def _code(part: Chart | Stage | RadialFactor | type[RadialFactor]) -> int | None:
     # a subclass may have another formula
     code: int | None = vars(part if isinstance(part, type) else type(part)).get("code")
     return code
 
 
-def _bare(chart: Chart) -> Chart:
-    """Without the map of rays before it."""
-    return chart.chart if isinstance(chart, optics.Before) else chart
-
-
 def _chart(chart: Chart) -> _Part | None:
-    if type(chart) is optics.Before:
-        part, code = _chart(chart.chart), _code(chart.change)
-        if part is None or part.map or code is None:
-            return None
-        part.map = code
-        if isinstance(chart.change, optics.Bending):
-            part.across, part.down = chart.change.count, len(chart.change.parameters) - chart.change.count
-        return part
     flags = 0
     if type(chart) is optics.Transverse:
         chart, flags = chart.chart, _TRANSVERSE

@@ -39,8 +39,6 @@ const Viewer = (() => {
     $("message").className = isTrouble ? "trouble" : "";
   }
 
-  const titleOf = (model) => `${DATA.models[model].class}${Formulas.partsOf(model).shield ? " behind a windshield" : ""}`;
-
   function coefficientNames(model, count) {
     const known = DATA.models[model];
     if (DATA.camera && DATA.camera.model === model && DATA.camera.names.length === count) return DATA.camera.names;
@@ -701,14 +699,13 @@ const Viewer = (() => {
       return `${Math.round(rays.reduce((sum, r) => sum + Math.acos(r[2]), 0) / RADIAN)}° ${axis ? "high" : "wide"}`;
     });
     $("facts").textContent =
-      `${titleOf(state.model)}, ${state.size[1]} x ${state.size[0]} px: ${angles[0]}, ${angles[1]}; ` +
+      `${DATA.models[state.model].class}, ${state.size[1]} x ${state.size[0]} px: ${angles[0]}, ${angles[1]}; ` +
       `to the right its rays end at ${(reach / RADIAN).toFixed(1)}°.`;
   }
 
   function rangeOf(name, value) {
     const natural = { alpha: [0, 1], omega: [-2.5, 2.5], xi: [-0.9, 3], beta: [0.1, 3] }[name];
-    if (/^[hv]\d/.test(name)) return [value - 0.1, value + 0.1]; // of a windshield
-    if (natural && !state.model.startsWith("cahvor")) return [Math.min(natural[0], value), Math.max(natural[1], value)];
+    if (natural) return [Math.min(natural[0], value), Math.max(natural[1], value)];
     const usual = /^(p|s)/.test(name) ? 0.02 : /^(d|e|tau)/.test(name) ? 0.2 : 0.3, reach = Math.max(usual, 1.5 * Math.abs(value));
     return [value - reach, value + reach];
   }
@@ -755,10 +752,8 @@ const Viewer = (() => {
   };
 
   function made({ model, intrinsics, distortion }, [height, width]) {
-    const [across, down] = Formulas.partsOf(model).shield ?? [0, 0], count = distortion.length - across - down;
-    const own = distortion.slice(0, count), bends = [distortion.slice(count, count + across), distortion.slice(count + across)];
-    const lens = `ct.${DATA.models[model].class}(${listed(intrinsics)}${count ? `, ${listed(own)}` : ""}, image_size=(${height}, ${width}))`;
-    return across ? `${lens}.behind(ct.Windshield(${bends.map(listed).join(", ")}))` : lens;
+    const own = distortion.length ? `, ${listed(distortion)}` : "";
+    return `ct.${DATA.models[model].class}(${listed(intrinsics)}${own}, image_size=(${height}, ${width}))`;
   }
 
   function python() {
@@ -823,7 +818,6 @@ const Viewer = (() => {
   };
   const MRCAL = {
     pinhole: [0, "PINHOLE"], equirectangular: [0, "LONLAT"], latlon: [0, "LATLON"], stereographic: [0, "STEREOGRAPHIC"],
-    cahvor: [5, "CAHVOR"],
   };
   const NERFSTUDIO = {
     pinhole: ["PINHOLE", [[]]], kannala_brandt: ["OPENCV_FISHEYE", [["k1", "k2", "k3", "k4"]]],
@@ -913,14 +907,13 @@ const Viewer = (() => {
     },
     "mrcal (cameramodel)": ({ model, intrinsics, distortion, size }) => {
       const n = distortion.length, grid = /^splined:order=(\d+),columns=(\d+),rows=(\d+),fov_x=(\d+)$/.exec(model);
-      let [count, name] = MRCAL[model] ?? [null], numbers = distortion;
+      let [count, name] = MRCAL[model] ?? [null];
       if (model === "brown_conrady") [count, name] = [n, `OPENCV${n}`];
-      else if (model === "cahvore") [count, name, numbers] = [n, `CAHVORE_linearity=${numeral(distortion[5])}`, [...distortion.slice(0, 5), 0, 0, 0]];
       else if (grid) [count, name] = [n, `SPLINED_STEREOGRAPHIC_order=${grid[1]}_Nx=${grid[2]}_Ny=${grid[3]}_fov_x_deg=${grid[4]}`];
       if (count !== n) return null;
       const pose = listed([0, 0, 0, 0, 0, 0]);
       return ["camera.cameramodel", [
-        "{", `    'lensmodel':  'LENSMODEL_${name}',`, `    'intrinsics': ${listed([...intrinsics, ...numbers])},`,
+        "{", `    'lensmodel':  'LENSMODEL_${name}',`, `    'intrinsics': ${listed([...intrinsics, ...distortion])},`,
         `    'rt_cam_ref': ${pose},`, `    'extrinsics': ${pose},`, `    'imagersize': [ ${size[1]}, ${size[0]},],`, "}", "",
       ].join("\n")];
     },

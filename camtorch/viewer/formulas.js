@@ -371,92 +371,6 @@ const Formulas = (() => {
     },
   });
 
-  const linearity = (l) => {
-    // r = tan(L theta) / L, theta or sin(L theta) / L, for L above, at and below 0
-    const size = Math.abs(l), plain = equidistant(), most = Math.PI / 2 - 1 / FAR;
-    const forward = (angle) => (l > 0 ? Math.tan(angle) : Math.sin(angle));
-    const angleEnd = Math.min(size * Math.PI, Math.PI / 2 - 2 / FAR);
-    const end = Math.min((1 - 64 * EPS) * (size > 0 ? forward(angleEnd) / size : Math.PI), FAR / 2);
-    return {
-      end,
-      radii: perspectiveRadii(FAR),
-      to: (x, y, z) => {
-        const point = plain.to(x, y, z), theta = point ? hypot(point[0], point[1]) : 0;
-        if (!point || !(size * theta < most)) return null;
-        const scale = size * theta > 0 ? forward(size * theta) / (size * theta) : 1;
-        return [point[0] * scale, point[1] * scale];
-      },
-      back: (a, b) => {
-        const r = hypot(a, b), s = size * r;
-        if (!(l > 0 || s * s < 1 - 64 * EPS) || !(Math.max(Math.abs(a), Math.abs(b)) < FAR / 2)) return null;
-        const theta = s > 0 ? (l > 0 ? Math.atan(s) : Math.asin(s)) / size : r;
-        if (!(theta < Math.PI * (1 - 64 * EPS))) return null;
-        return r > 0 ? plain.back((a * theta) / r, (b * theta) / r) : [0, 0, 1];
-      },
-    };
-  };
-
-  const rotated = (rows, chart) => ({
-    ...chart,
-    to: (x, y, z) => chart.to(...rows.map((row) => row[0] * x + row[1] * y + row[2] * z)),
-    back: (a, b) => {
-      const ray = chart.back(a, b);
-      return ray && [0, 1, 2].map((i) => rows[0][i] * ray[0] + rows[1][i] * ray[1] + rows[2][i] * ray[2]);
-    },
-  });
-
-  // -- a windshield before a chart: polynomials of the angles of rays, across and down
-
-  function bivariate(c) {
-    // the coefficients of 1, phi, phi^2, ..., then of theta (1, phi, ...), and so on; the value and both derivatives
-    const order = (Math.sqrt(8 * c.length + 1) - 3) / 2;
-    if (!Number.isInteger(order)) throw new Error("A windshield's polynomials have 1, 3, 6, 10, ... coefficients.");
-    return (phi, theta) => {
-      let [value, byPhi, byTheta, end] = [0, 0, 0, c.length];
-      for (let count = 1; count <= order + 1; end -= count++) {
-        let [inner, slope] = [0, 0];
-        for (let k = end - 1; k >= end - count; k--) [slope, inner] = [slope * phi + inner, inner * phi + c[k]];
-        [byTheta, byPhi, value] = [byTheta * theta + value, byPhi * theta + slope, value * theta + inner];
-      }
-      return [value, byPhi, byTheta];
-    };
-  }
-
-  function behindWindshield(across, down, chart) {
-    const P = bivariate(across), Q = bivariate(down), quarter = Math.PI / 2;
-    const anglesOf = (x, y, z) => [Math.atan2(x, hypot(y, z)), Math.atan2(y, hypot(x, z))];
-    const squareAhead = (phi, theta) => Math.cos(phi) ** 2 - Math.sin(theta) ** 2;
-    const rayOf = (phi, theta) => {
-      const square = squareAhead(phi, theta);
-      return square > 0 ? [Math.sin(phi), Math.sin(theta), Math.sqrt(square)] : null;
-    };
-    const at = (phi, theta) => {
-      // where angles go, the Jacobian, and whether the map is one to one and ahead around there
-      const [p, pa, pb] = P(phi, theta), [q, qa, qb] = Q(phi, theta), determinant = pa * qb - pb * qa;
-      const turned = quarter - Math.max(Math.abs(p), Math.abs(q));
-      return { p, q, pa, pb, qa, qb, determinant, margin: Math.min(squareAhead(p, q), determinant, turned) };
-    };
-    const to = (x, y, z) => {
-      const here = at(...anglesOf(x, y, z)), least = 8 * Math.sqrt(EPS);
-      if (!(Math.min(here.margin, z / Math.hypot(x, y, z)) > least)) return null;
-      return chart.to(...rayOf(here.p, here.q));
-    };
-    const back = (a, b) => {
-      const ray = chart.back(a, b);
-      if (!ray || !(ray[2] > 0)) return null;
-      const [u, v] = anglesOf(...ray), within = (step) => Math.min(Math.max(step, -0.5), 0.5);
-      let [phi, theta] = [u, v];
-      for (let i = 0; i < 12; i++) {
-        const { p, q, pa, pb, qa, qb, determinant } = at(phi, theta), [du, dv] = [u - p, v - q];
-        phi = Math.min(Math.max(phi + within((qb * du - pb * dv) / determinant), -quarter), quarter);
-        theta = Math.min(Math.max(theta + within((pa * dv - qa * du) / determinant), -quarter), quarter);
-      }
-      const here = at(phi, theta), found = rayOf(phi, theta);
-      return found && here.margin > 8 * Math.sqrt(EPS) && Math.hypot(here.p - u, here.q - v) < 1e-12 ? found : null;
-    };
-    return { ...chart, panorama: undefined, to, back };
-  }
-
   // -- stages of a lens: `at(a, b)` is [u, v, du/da, du/db, dv/da, dv/db, margin]; `start` a point near what gives (u, v)
 
   function planar({ radial = null, tangential = [0, 0], prism = [0, 0, 0, 0] }) {
@@ -686,14 +600,6 @@ const Formulas = (() => {
   ];
   const fTheta = (k) => [equidistant(), planar({ radial: radiusPolynomial(k) })];
 
-  const about = (chart, [alpha, beta, r0, r1, r2]) => {
-    // a chart about an axis of its own, of which r0, r1, r2 scale the points, and the way back
-    const [ca, sa, cb, sb] = [Math.cos(alpha), Math.sin(alpha), Math.cos(beta), Math.sin(beta)], scale = 1 + r0;
-    const rows = [[ca, 0, -sa], [-sa * sb, cb, -ca * sb], [sa * cb, sb, ca * cb]];
-    const back = [0, 1, 2].flatMap((i) => [rows[0][i] * scale, rows[1][i] * scale, rows[2][i]]);
-    return [rotated(rows, chart), planar({ radial: polynomial([r1 / scale, r2 / scale]) }), homography(back)];
-  };
-
   const MODELS = {
     pinhole: () => [perspective()],
     brown_conrady: ([k1, k2, p1, p2, ...more]) => {
@@ -733,8 +639,6 @@ const Formulas = (() => {
       ];
     },
     splined,
-    cahvor: (k) => about(perspective(), k),
-    cahvore: (k) => about(linearity(k[5]), k.slice(0, 5)),
     equirectangular: () => [sphere()],
     latlon: () => [transverse(sphere())],
     cylindrical: () => [cylinder()],
@@ -742,12 +646,7 @@ const Formulas = (() => {
   };
 
   // what formulas need beside numbers that are finite, and how to say it
-  const axisWithin = ([alpha, beta, r0]) =>
-    (Math.max(Math.abs(alpha), Math.abs(beta)) < Math.PI / 2 && r0 > -1) ||
-    "alpha and beta must lie within pi / 2, r0 above -1";
   const DEFINED = {
-    cahvor: axisWithin,
-    cahvore: axisWithin,
     eucm: (k) => k[1] > 0 || "beta must be above 0",
     double_sphere: (k) => k[0] > -1 || "xi must be above -1",
     mei: (k) => k[0] > -1 || "xi must be above -1",
@@ -757,33 +656,25 @@ const Formulas = (() => {
   };
 
   function partsOf(model) {
-    // "splined:order=3,..." has a grid, "pinhole:windshield=3,6" a windshield of so many coefficients
-    const [family, ...variants] = model.split(":"), known = { family, grid: undefined, shield: null };
-    for (const variant of variants) {
-      const counts = /^windshield=(\d+),(\d+)$/.exec(variant);
-      if (counts) known.shield = counts.slice(1).map(Number);
-      else if (family === "splined") known.grid = variant;
-      else known.family = "";
-    }
-    if (!Object.hasOwn(MODELS, known.family)) throw new Error(`This page has no formulas of the model ${model}.`);
-    return known;
+    // "splined:order=3,..." has a grid
+    const [family, ...variants] = model.split(":"), most = family === "splined" ? 1 : 0;
+    if (!Object.hasOwn(MODELS, family) || variants.length > most) throw new Error(`This page has no formulas of the model ${model}.`);
+    return { family, grid: variants[0] };
   }
 
   /** A camera: its model's key, [fx, fy, cx, cy] in pixels, coefficients. Throws an Error that says what is wrong. */
   class Camera {
     constructor(model, intrinsics, distortion = []) {
-      const { family, grid, shield } = partsOf(model);
+      const { family, grid } = partsOf(model);
       const [fx, fy] = intrinsics;
       if (intrinsics.length !== 4 || ![...intrinsics, ...distortion].every(Number.isFinite))
         throw new Error("All numbers of a camera must be finite.");
       if (!(fx > 0 && fy > 0)) throw new Error("Focal lengths must be above 0.");
-      const own = shield ? distortion.slice(0, distortion.length - shield[0] - shield[1]) : distortion;
-      const defined = DEFINED[family]?.(own) ?? true;
+      const defined = DEFINED[family]?.(distortion) ?? true;
       if (defined !== true) throw new Error(`No camera has such coefficients: ${defined}.`);
       Object.assign(this, { model, intrinsics, distortion });
-      const [chart, ...stages] = MODELS[family](own, grid);
-      const bends = distortion.slice(own.length);
-      this.chart = shield ? behindWindshield(bends.slice(0, shield[0]), bends.slice(shield[0]), chart) : chart;
+      const [chart, ...stages] = MODELS[family](distortion, grid);
+      this.chart = chart;
       const some = stages.filter((stage) => !stage.isIdentity);
       if (!some.length) this.lens = null;
       else if (some.length === 1 && some[0].isRadial) this.lens = radialLens(some[0], chart);

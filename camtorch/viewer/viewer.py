@@ -52,8 +52,7 @@ def write_viewer(
     lines of Python that do what is seen are there to be copied.
 
     Args:
-        camera: a single camera with image_size. The page knows the models of the gallery of models,
-            also behind a windshield.
+        camera: a single camera with image_size. The page knows the models of the gallery of models.
         path: the file; an existing one is replaced as a whole.
         image: a photograph that the camera took: a path, a Pillow image, an array (H, W) or (H, W, C), a tensor
             (C, H, W). The page keeps it at up to 1920 pixels. Without one it shows drawn scenes through the lens.
@@ -100,8 +99,7 @@ def _described(camera: Camera) -> dict[str, Any]:
     if camera.batch_shape:
         shape = tuple(camera.batch_shape)
         raise ValueError(f"write_viewer: camera must be a single one, as camera[0] is; got a batch {shape}")
-    kinds: list[Any] = list(model_of(camera).__mro__)
-    lens = next(kind for kind in kinds if ":windshield=" not in kind.key)
+    lens = model_of(camera)
     if lens.key not in models() and not (issubclass(lens, Splined) and re.fullmatch("splined:order[^:]*", lens.key)):
         raise ValueError(
             f"write_viewer: the page has no formulas of {camera.key or type(camera).__name__}; it knows "

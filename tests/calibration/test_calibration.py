@@ -379,23 +379,6 @@ def test_a_surface_is_learnt_in_the_frame_of_its_start(order):
     assert_close(turned, torch.eye(3).double(), rtol=0, atol=2e-3)
 
 
-@pytest.mark.parametrize("way", ["a camera", "another model"])
-def test_a_surface_is_learnt_behind_a_windshield(way):
-    """Which stays as it came: what it does the surface does as well."""
-    shield = ct.Windshield([0.002, 1.01, 0.003], [-0.001, 0.002, 0.98])
-    model = ct.Splined.with_grid(columns=8, rows=7, fov_x=125)
-    lens = ct.KannalaBrandt([300.0, 302, 319.5, 199.5], [0.02, -0.01, 0, 0], image_size=(400, 640)).double()
-    corners, *_ = seen_by(lens.behind(shield), 12, noise=0.1)
-    plain = calibrate(corners, model="kannala_brandt").camera
-    known = plain.convert(model).camera.behind(shield)
-    found = calibrate(corners, model=type(known), start=known if way == "a camera" else plain)
-    assert found.converged
-    assert found.sigma < 0.12
-    given = [0.0, 1, 0, 0, 0, 1] if way == "another model" else [0.002, 1.01, 0.003, -0.001, 0.002, 0.98]
-    assert_close(found.camera.distortion[-6:].detach(), torch.tensor(given).double(), rtol=0, atol=1e-7)
-    assert bool((found.std[-6:] == 0).all())
-
-
 @slow
 def test_a_surface_beats_kannala_brandt_on_images_that_it_never_saw():
     """OV-plane; the grid was chosen by two-fold cross-validation over the training views."""

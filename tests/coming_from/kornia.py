@@ -282,18 +282,6 @@ def random_fisheye():
     assert (sample["keypoints"] - SPOT).abs().max() > 0.1
 
 
-@row("kornia.augmentation.RandomElasticTransform")
-def random_elastic():
-    """kornia's keypoints stay where they were; ours lie where the surface took what they lay on."""
-    pipeline = K.AugmentationSequential(K.RandomElasticTransform(p=1.0), data_keys=["input", "keypoints"])
-    assert torch.equal(pipeline(IMAGE.float(), SPOT)[1], SPOT)
-    v, u = torch.meshgrid(*(torch.arange(float(n)) for n in SIZE), indexing="ij")
-    blob = torch.exp(-((u - SPOT[0, 0, 0]) ** 2 + (v - SPOT[0, 0, 1]) ** 2) / 8)[None, None]
-    sample = ct.augment.RandomElastic(amount=0.03, camera=PINHOLE.float())(image=blob, keypoints=SPOT)
-    seen = sample["image"][0, 0] / sample["image"].sum()
-    close(sample["keypoints"][0, 0], torch.stack([(seen * u).sum(), (seen * v).sum()]), 0.2)
-
-
 @trap
 def behind_and_past():
     behind = torch.tensor([[0.1, 0.2, -1.0]], dtype=torch.float64)

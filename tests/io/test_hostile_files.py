@@ -186,8 +186,8 @@ def array(shape, data=b"", descr="<f8"):
         ("a.cameramodel", "{'lensmodel': " + "[" * 30_000, "line 1: too many nested"),
         (
             "a.cameramodel",
-            "{'lensmodel': 'LENSMODEL_CAHVORE', 'imagersize': [4, 4]}",
-            "'LENSMODEL_CAHVORE' is not known",
+            "{'lensmodel': 'LENSMODEL_NONE', 'imagersize': [4, 4]}",
+            "'LENSMODEL_NONE' is not known",
         ),
         ("a.cameramodel", "{'lensmodel': [1, 2,],\n'b': (1, 2,), }\n#\n}", "line 4: unmatched '}'"),
         ("a.cameramodel", "{'lensmodel': 1,\n'b': 'x'", "line 1: '{' was never closed"),

@@ -21,8 +21,6 @@ def camera(key="brown_conrady", distortion=None, core=CORE, **options):
     return ct.MODELS[key](float64(core), *arguments, **{"image_size": (480, 640)} | options)
 
 
-BEHIND = camera("splined", [0.01] * 160).behind(ct.Windshield([0.0, 1, 0.1], [0.0, 0, 1]))
-
 # -- what a format cannot hold
 
 LOST = [
@@ -40,7 +38,6 @@ LOST = [
     ("aria", camera(), "Aria has no name for brown_conrady"),
     ("basalt", camera("fisheye624"), "Basalt has no name for fisheye624"),
     ("mrcal", camera("kannala_brandt"), r"for brown.* splined, .*, which camera.convert\(key\).camera m"),
-    ("mrcal", BEHIND, "mrcal has no name for splined:windshield=3,3"),
     ("mrcal", ct.Rig({"a": camera(), "b": camera()}), "2 cameras; mrcal holds one"),
     ("ros", ct.Rig({"a": camera()}, {"a": ct.Extrinsics([0, 0, 0.1], [0, 0, 0])}), "its extrinsics would be lost"),
     ("basalt", ct.Rig({"a": camera(), "b": camera()}), "a: no extrinsics, which Basalt needs of each camera"),

@@ -17,7 +17,7 @@ SIZE, K, EYE = (480, 640), np.array([[300.0, 0.0, 320.0], [0.0, 310.0, 240.0], [
 CAMERA = ct.Pinhole(INTRINSICS, image_size=SIZE).requires_grad_(False)
 LENS = ct.KannalaBrandt(INTRINSICS, [0.02, -0.01, 0.003, -0.001], image_size=SIZE).requires_grad_(False)
 BARE, PAIR, MIXED = ct.Pinhole(INTRINSICS), CAMERA.expand(2), ct.Mixed([CAMERA, LENS])
-GENERAL, WINDSHIELD, SHIELD = ct.KannalaBrandt.from_general, ct.Windshield, ct.Windshield([0.0, 1, 0], [0.0, 0, 1])
+GENERAL = ct.KannalaBrandt.from_general
 POSE, FROM, TABLE = ct.Extrinsics, ct.Extrinsics.from_matrix, ct.Tabulated.from_table
 R, RVEC, TVEC = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), np.array([0.1, -0.2, 0.3]), np.array([1.0, 2.0, 3.0])
 OCAM, SS, CENTRE = ct.OCamCalib.from_ocamcalib, (-206.517, 0.0, 2.207161e-03), (241.8, 394.6)
@@ -237,20 +237,6 @@ WRONG = [
     (lambda: REPROJECTION(LENS, UV, torch.rand(9, 3)), ValueError, r"pixels \(17, 2\) of target and \(9, 2\)"),
     (lambda: FLIP(image=IMAGE, keypoints=torch.rand(17, 3)), ValueError, r"\[..., 2\] goes in as keypoints_valid"),
     (lambda: FLIP(image=IMAGE, keypoints=torch.rand(68, 2)), ValueError, r"landmarks=\{'keypoints': 'ibug68'\}"),
-    # windshields
-    (
-        lambda: WINDSHIELD([0.0, 1, 0], [0.0, 0]),
-        ValueError,
-        r"vertical must be .* 1, 3, 6, 10, 15, 21, ...; got .*\(2,\)",
-    ),
-    (lambda: WINDSHIELD([[0.0], [1], [0]], [0.0, 0, 1]), ValueError, r"horizontal.*as horizontal\[..., 0\]"),
-    (lambda: WINDSHIELD([0.0, NAN, 0], [0.0, 0, 1]), ValueError, "horizontal must be finite"),
-    (lambda: WINDSHIELD([0.0, 1, 0], "flat"), TypeError, "vertical must be numbers"),
-    (lambda: WINDSHIELD(torch.zeros(2, 3), torch.zeros(3, 3)), ValueError, "batch dims"),
-    (lambda: LENS.behind([0, 1, 0]), TypeError, "takes a ct.Windshield"),
-    (lambda: LENS.behind(None), TypeError, "takes a ct.Windshield"),
-    (lambda: LENS.behind(SHIELD).behind(SHIELD), TypeError, "behind one already"),
-    (lambda: MIXED.behind(SHIELD), TypeError, "Mixed"),
 ]
 
 

@@ -9,7 +9,6 @@ from cameras import (
     FEW_REAL,
     KEYS,
     NOT_ANALYTIC,
-    OFF_AXIS,
     RANGES,
     RARE_ARE_SLOW,
     REAL,
@@ -35,7 +34,6 @@ import camtorch as ct
 from camtorch.optics.backprojection import Inverted
 from camtorch.optics.charts import CylinderChart, Perspective, SphereChart, Transverse
 from camtorch.optics.lens import Lens
-from camtorch.optics.ray_maps import Before
 
 EPS = torch.finfo(torch.float64).eps
 distinct_models = pytest.mark.parametrize("key", RARE_ARE_SLOW)
@@ -250,8 +248,6 @@ def test_derivatives_of_unproject(key, camera_of):
 @pytest.mark.parametrize("offset", [0.0, 1e-300, 1e-12, 1e-7])
 def test_derivatives_at_the_axis(key, offset):
     """On the axis a camera without even terms is a pinhole camera, first derivatives included."""
-    if key in OFF_AXIS:
-        pytest.skip("its lens is about another axis")
     camera = spread(key)
     # a table has its slope in the lens
     slope = 1 if key == "tabulated" else axis_slope(key, camera.distortion.tolist())
@@ -432,9 +428,6 @@ def before_fold(camera, rays, samples, azimuths):
     The determinant by autograd and sampled densely.
     """
     chart, lens = optics(camera)
-    if isinstance(chart, Before):  # whose radius is about another axis
-        before = (chart.margin(*rays.unbind(-1)) > 0).view(samples, azimuths).cummin(0).values
-        return before & regular(lens, *chart.to_plane(*rays.unbind(-1)), samples, azimuths)
     if not chart.has_scale:
         return (chart.margin(*rays.unbind(-1)) > 0).view(samples, azimuths)
     if isinstance(chart, Inverted):  # its formula leads from the radius to the angle
@@ -478,7 +471,7 @@ def within_reach(camera, rays, samples, azimuths):
     own: k5 = 0.5, s1 = s3 = 0.03125, from 100,000 focal lengths on.
     """
     chart, lens = optics(camera)
-    if (not chart.has_scale and not isinstance(chart, Before)) or isinstance(chart, Inverted):
+    if not chart.has_scale or isinstance(chart, Inverted):
         return torch.ones(samples, azimuths, dtype=torch.bool)
     return (torch.hypot(*lens(*chart.to_plane(*rays.unbind(-1)))) < 1e4).view(samples, azimuths).cummin(0).values
 
@@ -489,7 +482,7 @@ def turned_little(camera, rays, samples, azimuths):
     From there on it may count as turned over, which has a positive determinant too.
     """
     chart, lens = optics(camera)
-    if (not chart.has_scale and not isinstance(chart, Before)) or not lens.stages:
+    if not chart.has_scale or not lens.stages:
         return torch.ones(samples, azimuths, dtype=torch.bool)
     a, b = chart.to_plane(*rays.unbind(-1))
     one, zero = torch.ones_like(a), torch.zeros_like(a)

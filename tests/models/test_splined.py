@@ -147,7 +147,7 @@ def test_files_of_grids_that_are_none_are_refused(tmp_path, name):
 
 def test_a_grid_has_no_other_grid():
     grid = "order=3,columns=16,rows=11,fov_x=120"
-    for key in (f"splined:{grid}:{grid}", f"splined:windshield=3,3:{grid}"):
+    for key in (f"splined:{grid}:{grid}", f"pinhole:{grid}"):
         with pytest.raises(ValueError, match="there is no variant 'order=3"):
             ct.Pinhole([500, 500, 320, 240]).convert(key)
 

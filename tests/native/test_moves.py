@@ -53,24 +53,6 @@ def test_points_move_as_by_a_ray(key, dtype):
             check((moved, valid), (there, mapped & target.contains(there)), target.image_size)
 
 
-@pytest.mark.parametrize("key", ["pinhole", "kannala_brandt", "double_sphere", "woodscape", "brown_conrady"])
-@each_dtype
-def test_points_leave_a_surface_as_by_a_ray(key, dtype):
-    """Between cameras that differ by a surface alone no ray is made."""
-    plain = sized(one(key), dtype).resize(240, 320)
-    torch.manual_seed(2)
-    bent = ct.augment.RandomElastic(amount=0.03, camera=plain)({"image": torch.zeros(3, 1, 240, 320)})["camera"]
-    pixels = torch.rand(3, 40000, 2).to(dtype) * torch.tensor([360, 280]) - 20  # enough for a table of the inverse
-    moved, valid = ct.Warp(bent, plain).transform_points(pixels)
-    there, mapped = one_by_one(bent, plain, None, pixels)
-    on_image = mapped & plain.contains(there)
-    assert (valid != on_image).sum() <= 2
-    assert on_image.sum() > 30000
-    both = valid & on_image
-    assert (there - pixels)[both].abs().max() > 3
-    assert (moved - there)[both].abs().max() <= 16 * torch.finfo(dtype).eps * 320
-
-
 @each_key
 def test_a_batch_moves_as_each_alone_and_in_any_memory(key):
     camera = sized(one(key), torch.float64)

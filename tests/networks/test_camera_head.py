@@ -15,7 +15,7 @@ from camtorch.projection.rays import image_lattice
 SIZE = (480, 640)
 PANORAMAS = {"cylindrical", "equirectangular", "latlon", "transverse_cylindrical"}
 FOV = {"orthographic_fisheye": (40, 80)}  # degrees; further out is nothing
-OTHERS = {"cahvor", "cahvore", "splined"}  # which are not on their side what they are upright; heads refuse them
+OTHERS = {"splined"}  # which is not on its side what it is upright; heads refuse it
 KEYS = sorted(set(ct.MODELS) - PANORAMAS - OTHERS)
 QUICK = [key if key in DISTINCT else pytest.param(key, marks=pytest.mark.slow) for key in KEYS]
 

@@ -47,7 +47,7 @@ def drawn(key, which, seed):
 
 
 def lenses_of(key):
-    """A preset, real calibrations, drawn ones, and the preset behind a windshield."""
+    """A preset, real calibrations, and drawn ones."""
     found = [preset(key)]
     if key in CALIBRATIONS:
         *numbers, size = CALIBRATIONS[key]
@@ -58,9 +58,6 @@ def lenses_of(key):
     if key == "splined":
         other = ct.Splined.with_grid(columns=9, rows=11, fov_x=200, order=2)
         found += [preset("kannala_brandt").convert(other).camera]
-    # of the size of a real one
-    shield = ct.Windshield([1.2e-3, 1.0021, -8e-4, 6e-4, 3e-3, -9e-4], [-4e-3, 1e-3, 0.9962])
-    found += [camera.double().behind(shield.double()) for camera in found[:1]]
     return [camera for camera in found if camera.key.split(":")[0] == key]
 
 

@@ -197,25 +197,6 @@ def test_a_surface_of_a_grid_of_its_own_is_what_it_opens_with(opened):
     torch.testing.assert_close(loaded.distortion, camera.distortion, rtol=0, atol=0)
 
 
-def test_a_camera_behind_a_windshield_is_what_it_opens_with(opened):
-    shield = ct.Windshield([0.002, 1.001, -8e-4], [-0.004, 1e-3, 0.996])
-    camera = fisheye().behind(shield.double())
-    tab = opened(camera)
-    assert tab.input_value("#model") == "kannala_brandt:windshield=3,3"
-    assert "KannalaBrandt behind a windshield, 320 x 240 px" in tab.inner_text("#facts")
-    line = next(line for line in tab.inner_text("#python").splitlines() if line.startswith("camera = "))
-    for made in (
-        eval(line.removeprefix("camera = "), {"ct": ct}),
-        read(*tab.evaluate("Viewer.file('camtorch (JSON)')")),
-    ):
-        assert made.key == camera.key
-        torch.testing.assert_close(made.distortion.detach().float(), camera.distortion.detach().float())
-    assert tab.evaluate("Object.keys(Viewer.FORMATS).filter(Viewer.file)") == ["camtorch (JSON)"]
-    tab.get_by_label("h0, as a number").fill("0.01")
-    settled(tab)
-    assert "ct.Windshield([0.01, 1.001" in tab.inner_text("#python")
-
-
 def test_a_photograph_of_another_size_scales_the_lens(opened, tmp_path):
     photograph(tmp_path / "double.png", 480, 640)
     photograph(tmp_path / "square.png", 300, 300)
