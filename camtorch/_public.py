@@ -23,12 +23,6 @@ from camtorch.boards.finding import find_board as find_board
 from camtorch.calibration.calibrate import Calibration as Calibration
 from camtorch.calibration.calibrate import calibrate as calibrate
 from camtorch.calibration.from_rays import fit as fit
-from camtorch.calibration.hand_eye import (
-    HandEyeCalibration as HandEyeCalibration,
-)
-from camtorch.calibration.hand_eye import (
-    calibrate_hand_eye as calibrate_hand_eye,
-)
 from camtorch.calibration.pnp import solve_pnp as solve_pnp
 from camtorch.calibration.rig import RigCalibration as RigCalibration
 from camtorch.calibration.rig import calibrate_rig as calibrate_rig

@@ -85,31 +85,27 @@ class Sight(NamedTuple):
     """What one camera sees, of B problems, V views and N points each; leading dims may be 1.
 
     points: (B, V, N, 3) in the board's frame. pixels: (B, V, N, 2). weights: (B, V, N) of the squares, 0 for unseen,
-    where the others are any finite numbers. model: the class, or a camera of it. motions: (B, V), known ones of a
-    single board between the views, or None. prior: or None.
+    where the others are any finite numbers. model: the class, or a camera of it. prior: or None.
     """
 
     model: type[Camera] | Camera
     points: Tensor
     pixels: Tensor
     weights: Tensor
-    motions: Poses | None = None
     prior: Prior | None = None
 
     def mapped(self, change: Callable[[Tensor], Tensor]) -> Sight:
         """With a change to all tensors of problems."""
         points, pixels, weights = map(change, self[1:4])
-        motions = self.motions and Poses(*map(change, self.motions))
-        return Sight(self.model, points, pixels, weights, motions, self.prior)
+        return Sight(self.model, points, pixels, weights, self.prior)
 
 
 class State(NamedTuple):
     """What is looked for. A point of a board is at `mount(board(point))` for a camera.
 
     parameters: of each camera (B, 4 + n), fx, fy, cx, cy and the coefficients. mounts: a pose for each camera, from the
-    frame of the first one, whose own it leaves as it is unless it learns. boards: for each view; a single one where the
-    views have known motions, and the point is at `mount(motion(board(point)))`. bend: (B, 2), how far the middle of a
-    board's edges lies behind the plane, see `bent`.
+    frame of the first one, whose own it leaves as it is unless it learns. boards: for each view. bend: (B, 2), how far
+    the middle of a board's edges lies behind the plane, see `bent`.
     """
 
     parameters: tuple[Tensor, ...]
@@ -345,14 +341,12 @@ class Bundle:
             at, own = torch.tensor(of, dtype=torch.long, device=p.device).view(-1, 2).unbind(-1)
             self.learnt.append((at, own))
         self.is_bent = free.bend or bool((state.bend != 0).any())
-        plain = (
-            len(sights) == 1 and free.boards == "poses" and not (free.mounts[0] or sights[0].motions or self.is_bent)
-        )
+        plain = len(sights) == 1 and free.boards == "poses" and not (free.mounts[0] or self.is_bent)
         self.is_plain = plain and compiled_of(self.cameras, self.sights[0].pixels) is not None
         self.width = 6 if free.boards == "poses" else 3
         """Of the unknowns of a view."""
         views = torch.stack([(s.weights > 0).any(-1).any(0) for s in self.sights]).any(0).sum()
-        self.unknowns = len(self.columns) + self.width * (1 if sights[0].motions else int(views))
+        self.unknowns = len(self.columns) + self.width * int(views)
         sides = zip(*(bounds(camera, p) for camera, p in zip(self.cameras, state.parameters, strict=True)), strict=True)
         self.low, self.high = (
             self._of_columns(side, end) for side, end in zip(sides, (-torch.inf, torch.inf), strict=True)
@@ -393,8 +387,6 @@ class Bundle:
             points = bent(points, state.bend)[0]
         turned = points @ state.boards.rotations.mT
         first = turned + state.boards.translations[:, :, None]
-        if sight.motions:
-            first = sight.motions.moved(first)
         if c == 0 and not self.free.mounts[0]:
             return turned, first, first
         mounts = state.mounts
@@ -492,7 +484,7 @@ class Bundle:
                 whole = block.new_zeros(*block.shape[:-1], width + total + 1)
                 whole[..., [*range(width), *(width + g for g in at), width + total]] = block
                 block = whole
-            parts.append(block.flatten(1, 2)[:, None] if self.sights[0].motions else block)
+            parts.append(block)
         block = torch.cat(parts, -2)
         if total == 0:  # no more than six columns, which squares do no harm
             return Equations(triangle_of_few(block), block.new_zeros(len(block), 1, 1), ())
@@ -526,11 +518,10 @@ class Bundle:
         by_point, by_parameters = (by.reshape(batch, views, count, 2, by.shape[-1]) for by in found)
         is_mounted = c > 0 or self.free.mounts[0]
         by_first = by_point @ state.mounts.rotations[:, c, None, None] if is_mounted else by_point
-        by_board = by_first @ sight.motions.rotations[:, :, None] if sight.motions else by_first
         columns = []
         if self.width == 6:
-            columns.append(torch.linalg.cross(turned[..., None, :].expand_as(by_board), by_board, dim=-1))
-        columns.append(by_board)
+            columns.append(torch.linalg.cross(turned[..., None, :].expand_as(by_first), by_first, dim=-1))
+        columns.append(by_first)
         if own:
             columns.append(by_parameters[..., own])
         count = state.parameters[c].shape[-1]
@@ -541,7 +532,7 @@ class Bundle:
             columns += [torch.linalg.cross(turned[..., None, :].expand_as(by_point), by_point, dim=-1), by_point]
         if self.learns_bend:
             at += [g for g, (camera, _) in enumerate(self.columns) if camera == -1]
-            along = by_board @ state.boards.rotations[:, :, None, :, 2:]
+            along = by_first @ state.boards.rotations[:, :, None, :, 2:]
             columns.append(along * bent(sight.points, state.bend)[1][..., None, :])
         columns.append(look.residuals[..., None])
         weight = look.weights.sqrt()[..., None, None]

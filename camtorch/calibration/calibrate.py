@@ -17,15 +17,12 @@ from camtorch._freezing import INTRINSICS, frozen_names
 from camtorch._threads import on_one_thread
 from camtorch.calibration.bundle import LOSSES, Adjusted, Free, Poses, Prior, Sight, State, adjust
 from camtorch.calibration.observations import Layout, Observations, Points, as_observations, repeats
-from camtorch.calibration.priors import Known, as_known
 from camtorch.calibration.start import other_cameras, other_poses, poses_for, start_from_nothing
 from camtorch.calibration.uncertainty import Spread, noise_under, shared_factor, spread, uncertainty
 from camtorch.calibration.verdict import check_determined, verdict, warnings
 from camtorch.camera import Camera
 from camtorch.camera import as_model as as_kind
 from camtorch.extrinsics import Extrinsics
-from camtorch.least_squares.equations import padded
-from camtorch.lenses import Lens
 from camtorch.rotations import rotation_vector
 
 STEPS = 300
@@ -34,7 +31,6 @@ _OUTLIER = 3.0  # standard deviations
 _ROUNDS = 20
 _SMOOTH = 0.02  # of a pixel of error: one of a surface's second differences, see `Camera.smoothness`
 _BESIDE = 1e-3  # radians from the axis, where a surface shows which way is right
-_SAME_WIDTH, _CONTRADICTED = 0.01, 3.0  # of a prior: a change that is none, and times its own that it has to be told
 _SECOND_LOOKS = 3  # at the poses
 _AS_GOOD = 9.0  # variances: the difference of two costs that three standard deviations explain
 _APART, _SAME = 5.0, 1e-3  # standard deviations, and part of the parameter, of two optima
@@ -267,7 +263,6 @@ def calibrate(
     loss_scale: float = 1.0,
     bend: bool = False,
     progress: Callable[[int, float], None] | None = None,
-    prior: Camera | Lens | Sequence[Camera | Lens] | None = None,
 ) -> Calibration:
     """The camera of a model under which known points are seen where they were seen, from nothing.
 
@@ -288,11 +283,6 @@ def calibrate(
         loss_scale: px, from where a robust loss grows slower.
         bend: whether the board may be bent: two numbers more, see `Calibration.bend`.
         progress: called after each step of the final search with its number and the cost.
-        prior: for few views: a camera that this one is like, of any model and any size of the same aspect ratio, an
-            entry of `ct.lenses`, or a list of such, as `ct.lenses.search` returns, whose own spread then counts. It is
-            where the search starts if there is no `start`, and counts as much as calibrations of one lens agree: in
-            `camtorch.calibration.priors` are the numbers. Where views tell more, they decide; where they contradict
-            it, it counts less, with a warning.
 
     Raises:
         ValueError: bad arguments, each with what to do; a problem that has no one solution, as a single view of a plane
@@ -301,19 +291,9 @@ def calibrate(
     owner = "calibrate"
     seen, layout = as_observations(object_points, image_points, image_size, owner)
     told = as_options(loss, loss_scale, bend, progress, owner)
-    if prior is None:
-        asked = as_model(model, count, start, fixed, owner)
-        search = Search(owner, asked, seen, middle_of([seen]), layout, loss, loss_scale)
-        adjusted = search.alone(bend, told)
-    else:
-        asked = as_model(model, count, start, (), owner)
-        if asked.kind.smoothness() is not None:
-            raise ValueError(f"{owner}: {asked.kind.__name__} takes no prior; start=camera is what it begins with")
-        known = as_known(prior, asked.kind, asked.count, layout.image_size, owner, seen.pixels)
-        asked = as_model(asked.kind, None, asked.start or known.camera, fixed, owner)
-        search = Search(owner, asked, seen, middle_of([seen]), layout, loss, loss_scale)
-        adjusted = search.with_prior(known, bend, told)
-    found = results([search], adjusted, search.free(bend), object_points, [image_points])
+    asked = as_model(model, count, start, fixed, owner)
+    search = Search(owner, asked, seen, middle_of([seen]), layout, loss, loss_scale)
+    found = results([search], search.alone(bend, told), search.free(bend), object_points, [image_points])
     result = found.cameras[0]
     if not result.converged:
         ends = [] if bool(result.adjusted.converged[0]) else ["the search did not end at an optimum"]
@@ -346,8 +326,7 @@ class Search:
     loss: str | None
     loss_scale: float
     prior: Prior | None = None
-    misfit: float = 1.0
-    """See `misfit`, beside a prior."""
+    """Of a surface: what its start says of it."""
 
     def __post_init__(self) -> None:
         kind, start = self.asked.kind, self.asked.start
@@ -412,42 +391,6 @@ class Search:
             if not bool(again.cost < adjusted.cost):
                 break
             adjusted = again
-        return adjusted
-
-    def with_prior(
-        self, known: Known, bend: bool = False, progress: Callable[[int, Tensor], None] | None = None
-    ) -> Adjusted:
-        """The optimum by what this camera saw and what was known; `prior` becomes what that counts in px.
-
-        It counts by the noise that views show by themselves. A prior that the optimum is further from than its own
-        standard deviations is widened until it is not.
-        """
-        free, learns, wide = self.free(bend), max(int(self.asked.free.sum()), 1), 1.0
-        alone = self.alone(bend)
-        residuals, seen, valid = alone.residuals[0][0], self.seen.seen, alone.valid[0][0]
-        _, sigma, _ = noise_of(
-            residuals, seen, valid, self.loss, self.loss_scale, unknowns([self.sight], alone, len(seen))
-        )
-        self.misfit = misfit(alone, sigma)
-        sigma = sigma * self.misfit
-        self.prior = known.prior(sigma)
-        adjusted = min(
-            (self.alone(bend, progress), self.adjusted([self.sight], alone.state, free, steps=STEPS)),
-            key=lambda found: float(found.cost),
-        )
-        for _ in range(_ROUNDS):
-            before = wide
-            away = known.root @ (adjusted.state.parameters[0][0] - known.centre)
-            wide = max(1.0, float(away.square().sum() / learns) ** 0.5)
-            if abs(wide / before - 1) < _SAME_WIDTH:
-                break
-            self.prior = known.prior(sigma / wide)
-            adjusted = self.adjusted([self.sight], adjusted.state, free, steps=STEPS, progress=progress)
-        if wide > _CONTRADICTED:
-            warn(
-                f"{self.owner}: the views contradict prior, by {wide:.3g} standard deviations, and it counts so much "
-                "less: is it the lens, its focus and zoom, and the whole image, not a part of it?",
-            )
         return adjusted
 
     def adjusted(self, sights: Sequence[Sight], state: State, free: Free, **options: Any) -> Adjusted:
@@ -541,7 +484,7 @@ def results(
     inliers, sigma, noise = noise_of(residuals, seen, valid, loss, loss_scale, parameters)
     # views that repeat others widen what is uncertain as if there were so many less
     again = repeats(given, [r[0] for r in adjusted.residuals])
-    noise = noise * math.sqrt(len(views) / (len(views) - len(again))) * searches[0].misfit
+    noise = noise * math.sqrt(len(views) / (len(views) - len(again)))
     cameras = []
     for c, (search, pixels, own) in enumerate(zip(searches, image_points, inliers.split(len(views)), strict=True)):
         copies = search.layout.views[again[search.given.seen[again].any(-1)]].tolist()
@@ -564,23 +507,6 @@ def unknowns(sights: Sequence[Sight], adjusted: Adjusted, views: int) -> float:
             rows, own = [g for g, _ in which], [i for _, i in which]
             told += float((sight.prior.root[:, own] @ shared_factor(equations)[0, rows]).square().sum())
     return len(equations.columns) + 6 * views - told
-
-
-def misfit(adjusted: Adjusted, sigma: Tensor) -> float:
-    """How many times further the views disagree about the camera than noise of sigma explains, at least 1.
-
-    Where a model, a board or a detector errs, corners of a view are wrong together; on OV-plane this is 7, and so far
-    are calibrations by three views from that by all. A single view cannot tell.
-    """
-    problem, state = adjusted.problem, adjusted.problem.flat(adjusted.state)
-    one = torch.arange(1, device=sigma.device)
-    block, at = problem.rows_of(0, problem.looks(state, one)[0], adjusted.state, one)
-    views, width = block.shape[1], problem.width
-    if views == 1 or not at:
-        return 1.0
-    # what the poses leave of each view, along what the camera could do about it
-    left = torch.linalg.qr(padded(block), mode="r").R[0, :, width:-1, -1]
-    return max(1.0, float((left.square().sum() / ((views - 1) * len(at))).sqrt() / sigma))
 
 
 def rms_of(residuals: Tensor, seen: Tensor) -> float:

@@ -1,6 +1,5 @@
 """Plots of cameras and calibrations, by matplotlib (`pip install camtorch[plot]`): each function draws on Axes, `ax`,
-by default new ones, and returns them. Without matplotlib an ImportError says how to install it. `to_rerun` and
-`to_viser` show images in viewers of scenes.
+by default new ones, and returns them. Without matplotlib an ImportError says how to install it.
 """
 
 from camtorch.plot.calibrations import (
@@ -14,7 +13,6 @@ from camtorch.plot.calibrations import (
     views,
 )
 from camtorch.plot.cameras import difference, distortion_field, portrait, radius_curve, rig
-from camtorch.plot.spheres import to_rerun, to_viser
 
 __all__ = [
     "boards",
@@ -27,8 +25,6 @@ __all__ = [
     "residual_histogram",
     "residuals",
     "rig",
-    "to_rerun",
-    "to_viser",
     "uncertainty",
     "view",
     "views",
