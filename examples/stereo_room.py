@@ -1,19 +1,21 @@
 """Measures a room by two fisheyes: rectifies them, matches by OpenCV, and compares with the true distances.
 
-python examples/stereo_room.py -o stereo.png    # pip install -e ".[plot,stereo]"
+python examples/stereo_room.py -o stereo.png    # pip install -e ".[calibrate]"
 """
 
 import argparse
+import math
 from typing import NamedTuple
 
+import cv2
 import matplotlib.pyplot as plt
+import numpy as np
 import torch
 from scenes import room
 from torch import Tensor
 
 import camtorch as ct
 from camtorch.rotations import rotation_matrix
-from camtorch.stereo.matching import match  # OpenCV's semi-global matching, as `camtorch rectify` calls it
 
 BASELINE = 0.25  # metres
 LEFT, RIGHT = (rotation_matrix(torch.tensor(r).double()) for r in ([-0.04, 0.05, 0.02], [0.03, -0.06, -0.03]))
@@ -49,6 +51,18 @@ def photographs(size: int = 960, samples: int = 5) -> tuple[ct.Camera, Tensor, T
     return lens, left, right
 
 
+def match(left: Tensor, right: Tensor, least: float, most: float) -> Tensor:
+    """Disparities (H, W) in pixels from least to most by OpenCV's semi-global matching, NaN where it finds none."""
+    start = math.floor(least)
+    count = 16 * math.ceil((most + 1 - start) / 16)  # of disparities: OpenCV takes multiples of 16
+    sides = 0, 0, max(start + count, 0), max(-start, 0)  # OpenCV leaves out columns that it would compare with none
+    images = [image.permute(1, 2, 0).contiguous().numpy() for image in (left, right)]
+    padded = [cv2.copyMakeBorder(image, *sides, cv2.BORDER_REPLICATE) for image in images]
+    matcher = cv2.StereoSGBM_create(start, count, 5, 600, 2400, 1, 0, 10, 100, 2)
+    found = matcher.compute(*padded)[:, sides[2] : sides[2] + left.shape[-1]]
+    return torch.from_numpy(np.where(found < 16 * start, np.nan, found / 16))  # OpenCV's are sixteenths
+
+
 @torch.no_grad()
 def study(
     lens: ct.Camera, left: Tensor, right: Tensor, projection: str, fov: tuple[float, float], pose: ct.Extrinsics = POSE
@@ -56,8 +70,8 @@ def study(
     """Rectify to a projection of (horizontal, vertical) degrees, match, and compare."""
     pair = ct.rectify(lens, lens, pose, projection=projection, fov=fov)  # type: ignore[arg-type]
     first, second = (image[0] for image in pair(left, right))
-    disparity, known = match(pair, first, second, *pair.disparity_range(near=0.45))
-    points, good = pair.disparity_to_points(disparity.double(), known)
+    disparity = match(first, second, *pair.disparity_range(near=0.45))
+    points, good = pair.disparity_to_points(disparity, pair.valid_masks()[0][0, 0])
 
     room_from_rectified = LEFT.T @ pair.rotation_left.T
     rays, has_ray = pair.camera_left.rays()
