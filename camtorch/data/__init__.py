@@ -5,8 +5,7 @@ What a sample becomes follows from the sample, its key, a seed and the epoch, wh
 
 from camtorch.data.batches import MapBatches
 from camtorch.data.columns import from_columns, to_columns
-from camtorch.data.files import read
-from camtorch.data.labelled import Samples
+from camtorch.data.labels import Samples, read
 from camtorch.data.samples import MapSamples
 from camtorch.data.seeded import Key, Seeded, generator
 

@@ -15,10 +15,8 @@ from camtorch.camera import Camera
 from camtorch.io import (
     aria,
     basalt,
-    blender,
     camodocal,
     camtorch_json,
-    carla,
     colmap,
     gyroflow,
     kalibr,
@@ -29,15 +27,13 @@ from camtorch.io import (
     nuscenes,
     ocamcalib,
     opencv,
-    rays,
     ros,
-    usda,
     woodscape,
 )
 from camtorch.io._errors import CameraFileError
 from camtorch.io.parsing import parse_mapping, path_of, read_bytes
 from camtorch.io.protocol import ContentFormat, KeyFormat, Names, WrittenFormat
-from camtorch.io.record import Record
+from camtorch.io.record import LEFT, Record
 from camtorch.io.writing import replacing
 from camtorch.rig import Rig
 
@@ -61,29 +57,19 @@ _BY_KEYS: tuple[KeyFormat, ...] = (
 _WRITTEN: tuple[WrittenFormat, ...] = (
     aria,
     basalt,
-    blender,
     camtorch_json,
-    carla,
     colmap,
     kalibr,
     mrcal,
     nerfstudio,
     opencv,
-    rays,
     ros,
-    usda,
 )
 
 READ = {m.NAMES.format: m.NAMES for m in (*_BY_CONTENT, *_BY_KEYS)}
 WRITTEN = {m.NAMES.format: m.NAMES for m in _WRITTEN}
 FORMATS = tuple(READ | WRITTEN)
-_OF_RENDERERS = (".usda", ".exr")  # whose content says nothing to a reader
-_FOR_RENDERERS = "a file for renderers, which is written only: load what it was made of"
-_NOT_READ = {  # keys of files that have a format which is not read, and why
-    "blueprint": _FOR_RENDERERS,  # CARLA's JSON
-    "directions": _FOR_RENDERERS,  # ray fields
-    "sfm_data_version": "OpenMVG's scene, which is not read: openMVG_main_openMVG2Colmap writes it in COLMAP's format",
-}
+_OPENMVG = "OpenMVG's scene, which is not read: openMVG_main_openMVG2Colmap writes it in COLMAP's format"
 
 
 def load(path: str | os.PathLike[str], format: str | None = None) -> Rig:
@@ -129,14 +115,12 @@ def _read(path: str, content: bytes, format: str | None) -> tuple[Rig, str]:
     for by_content in _BY_CONTENT:
         if format == by_content.NAMES.format or (format is None and by_content.matches(path, content)):
             return by_content.read(path, content), by_content.NAMES.format
-    if format is None and path.lower().endswith(_OF_RENDERERS):
-        raise CameraFileError(path, "content", _FOR_RENDERERS)
     keys = parse_mapping(path, content)
     for by_keys in _BY_KEYS:
         if format == by_keys.NAMES.format or (format is None and by_keys.matches(keys)):
             return by_keys.parse(Record(path, keys)), by_keys.NAMES.format
-    for key in _NOT_READ.keys() & keys:
-        raise CameraFileError(path, "content", _NOT_READ[key])
+    if "sfm_data_version" in keys:
+        raise CameraFileError(path, "content", _OPENMVG)
     shown = ", ".join(f"{key!r:.30}" for key in list(keys)[:5]) or "none"
     if "fx" in keys:
         shown += (
@@ -150,22 +134,18 @@ def save(rig: Rig | Camera, path: str | os.PathLike[str], format: str | None = N
 
     Of the formats that `load` reads, those of data sets and of programs that make their own calibrations are read only.
 
-    Of what renderers take ("usda", "carla", "blender"), a lens that the format has no model for is the closest one that
-    it has: a warning says how far off that is, as the file does.
-
     Args:
         rig: a `Rig`, or one camera.
         path: the file, which may be a link: then what it points to is replaced. With COLMAP it may be a folder, where
             poses go to an images file beside the cameras; with Nerfstudio one that exists.
-        format: "opencv", "ros", "kalibr", "colmap", "nerfstudio", "aria", "basalt", "mrcal" or "camtorch"; written
-            only, "usda", "carla", "blender" or "rays". If left out: the format that the rig was loaded from if its
-            files end like this one, else what the name says (`transforms.json`, `camchain.yaml`, `camera_info.yaml`,
-            `.cameramodel`, `.xml`, `cameras.txt`, `.bin`, `.usda`, `.exr`), else camtorch's own for `.json`.
+        format: "opencv", "ros", "kalibr", "colmap", "nerfstudio", "aria", "basalt", "mrcal" or "camtorch". If left
+            out: the format that the rig was loaded from if its files end like this one, else what the name says
+            (`transforms.json`, `camchain.yaml`, `camera_info.yaml`, `.cameramodel`, `.xml`, `cameras.txt`, `.bin`),
+            else camtorch's own for `.json`.
 
     Raises:
         CameraFileError: something that the format cannot hold; it says what would be lost.
-        ValueError: an unknown format, or a suffix that does not say which. OSError: it cannot be written. ImportError:
-            OpenEXR is missing, which writes `.exr`.
+        ValueError: an unknown format, or a suffix that does not say which. OSError: it cannot be written.
     """
     write(rendered(rig, path, format), path)
 
@@ -216,7 +196,8 @@ def _known(format: str | None, there: dict[str, Names], done: str) -> str | None
     if name is None or name in there:
         return name
     reason = f"is not {done}" if name in FORMATS else "is not known here"
-    raise ValueError(f"format: {format!r} {reason}; {done} are {', '.join(sorted(there))}")
+    left = "" if name in FORMATS else f". {LEFT}"
+    raise ValueError(f"format: {format!r} {reason}; {done} are {', '.join(sorted(there))}{left}")
 
 
 def _format_of(rig: Rig, path: str) -> str:

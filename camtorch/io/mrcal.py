@@ -8,7 +8,7 @@ from typing import Any
 from camtorch.extrinsics import Extrinsics
 from camtorch.io import poses
 from camtorch.io.protocol import Names
-from camtorch.io.record import Record, one_of
+from camtorch.io.record import LEFT, Record
 from camtorch.io.writing import Lossy, number
 from camtorch.models import Splined
 from camtorch.rig import Rig
@@ -35,7 +35,11 @@ def matches(keys: dict[str, Any]) -> bool:
 def parse(record: Record) -> Rig:
     """The camera; the rig is mrcal's reference. The valid region and the optimization inputs are not read."""
     name = record["lens_model" if "lens_model" in record else "lensmodel"]
-    key, count = _splined(name) or _MODELS[one_of(name, [*_MODELS, _SPLINED_NAME.format(3, 16, 11, 120)])]
+    found = _splined(name) or _MODELS.get(name.text())
+    if found is None:
+        known = ", ".join(sorted([*_MODELS, _SPLINED_NAME.format(3, 16, 11, 120)]))
+        name.fail(f"{name.text()!r:.60} is not known here; known are {known}. {LEFT}")
+    key, count = found
     values = record["intrinsics"].numbers(4 + count)
     camera = record["intrinsics"].camera(key, values[:4], values[4:], record["imagersize"].size())
     extrinsics: dict[str, Extrinsics] = {}

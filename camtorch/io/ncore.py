@@ -8,7 +8,7 @@ import numpy as np
 
 from camtorch.camera import Camera
 from camtorch.io.protocol import Names
-from camtorch.io.record import Record, one_of
+from camtorch.io.record import LEFT, Record, one_of
 from camtorch.models import FTheta, FThetaBackward
 from camtorch.rig import Rig
 
@@ -37,7 +37,7 @@ def parse(record: Record) -> Rig:
     camera = _f_theta(values) if kind == "ftheta" else _of_opencv(values, kind)
     shield = values.get("external_distortion_parameters")
     if shield is not None and shield.value is not None:
-        shield.fail("this camera looks through a windshield, which no model here has")
+        shield.fail(f"this camera looks through a windshield, which no model here has. {LEFT}")
     return Rig({"camera": camera})
 
 

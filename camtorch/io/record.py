@@ -16,6 +16,7 @@ from camtorch.camera import Camera, as_model
 from camtorch.io._errors import CameraFileError
 from camtorch.models import MODELS
 
+LEFT = "What left camtorch stands in docs/leaving-0.3.md"
 LARGEST_SIDE = 1 << 20
 _MOST_CAMERAS = 20_000
 _SHOWN = 8
@@ -202,11 +203,11 @@ class Record:
     def model(self, key: str) -> type[Camera]:
         """The model of that key."""
         if key.partition(":")[0] not in MODELS:
-            self.fail(f"needs the camera model {key!r:.60}, which this camtorch does not have")
+            self.fail(f"needs the camera model {key!r:.60}, which this camtorch does not have. {LEFT}")
         try:
             return as_model(key, "file")
         except ValueError as error:
-            self.fail(error)
+            self.fail(f"{error}. {LEFT}")
 
 
 def repeated(names: Iterable[str]) -> str | None:

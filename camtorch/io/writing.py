@@ -11,14 +11,12 @@ import os
 import re
 import secrets
 import stat
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from typing import IO, NoReturn
 
 from torch import Tensor
 
-from camtorch._arguments import warn
 from camtorch.camera import Camera
-from camtorch.convert.conversion import Conversion
 from camtorch.extrinsics import Extrinsics
 from camtorch.io._errors import CameraFileError
 from camtorch.rig import Rig
@@ -155,30 +153,6 @@ class Lossy:
             others = f"it has for {', '.join(sorted(known))}, which camera.convert(key).camera makes of it"
             self.fail(name, f"{self.format} has no name for {camera.key}; {others}")
         return camera.key, (fx, fy, cx, cy), distortion
-
-    def closest(self, name: str, camera: Camera, models: Mapping[str, int | None]) -> tuple[Conversion[Camera], str]:
-        """A single camera as one of these models, key to number of coefficients, and how good that is, in words.
-
-        One that holds it exactly, its own asked first, else the one that comes closest, of which a warning says the
-        error.
-        """
-        self._single(name, camera, "cameras", camera.intrinsics, camera.distortion)
-        found = []
-        for key in sorted(models, key=lambda key: key != camera.key):
-            result = camera.convert(key, count=models[key])
-            if bool(result.exact):
-                return result, f"{camera.key}, exact"
-            found.append(result)
-        best = min(found, key=lambda result: (-round(float(result.valid_fraction), 2), float(result.max_error)))
-        if not (float(best.valid_fraction) > 0 and math.isfinite(float(best.max_error))):
-            self.fail(name, f"{self.format} has no {camera.key}, and none of {', '.join(models)} comes near it")
-        fit = (
-            f"{camera.key} as the closest {best.camera.key}, off by at most {float(best.max_error):.3g} px "
-            f"(rms {float(best.rms):.3g}) up to {math.degrees(float(best.max_angle)):.1f} degrees from the axis, "
-            f"{100 * float(best.valid_fraction):.4g} % of the image"
-        )
-        warn(f"{self.path}: {name}: {self.format} has no such lens: {fit}")
-        return best, fit
 
     def _single(self, name: str, owner: Camera | Extrinsics, what: str, *tensors: Tensor) -> list[list[float]]:
         """The finite numbers of what is no batch."""
