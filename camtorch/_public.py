@@ -36,6 +36,7 @@ from camtorch.io import CameraFileError as CameraFileError
 from camtorch.io import load as load
 from camtorch.io import save as save
 from camtorch.maps.formats import load_map as load_map
+from camtorch.maps.formats import save_map as save_map
 from camtorch.maps.lookup import LookupMap as LookupMap
 from camtorch.maps.report import MapReport as MapReport
 from camtorch.mixed import Mixed as Mixed

@@ -63,9 +63,9 @@ def _dewarp(commands: Commands) -> None:
 def _map(commands: Commands) -> None:
     command = commands.add_parser(
         "map",
-        help="write a dewarping as a lookup table for OpenCV, ONNX, STMap, camera chips",
+        help="write a dewarping as a lookup table for OpenCV, ONNX, camera chips",
         description="Write where each pixel of a dewarped image is taken from, for another runtime, and say how far "
-        "that is from exact: camtorch map camera.yml -o map.exr",
+        "that is from exact: camtorch map camera.yml -o map.npz",
     )
     add = command.add_argument
     add("camera", type=words.path, metavar="CAMERA", help="the calibration of the images, any format")
@@ -75,10 +75,9 @@ def _map(commands: Commands) -> None:
     text = "a calibration: the new image is what that camera would see"
     target("--target", type=words.path, metavar="FILE", help=text)
     file = command.add_argument_group("the map").add_argument
-    text = "opencv, opencv_fixed, stmap, dw100, ti_ldc, depthai, obj or onnx; by default what OUT's name says"
+    text = "opencv, opencv_fixed, dw100, ti_ldc or onnx; by default what OUT's name says"
     file("--format", help=text)
-    file("--step", type=int, metavar="PIXELS", help="between nodes: ti_ldc, depthai, obj")
-    file("--v", choices=("up", "down"), help="stmap: which way v runs; up by default, as in Nuke")
+    file("--step", type=int, metavar="PIXELS", help="ti_ldc: between nodes; 8 by default")
     file("--block", type=words.size, metavar="WxH", help="ti_ldc: of the new image; by default what fits")
     file("--dtype", choices=("float32", "uint8"), help="onnx: of images; float32 by default")
     file("--clip", action="store_true", default=None, help="dw100, ti_ldc: draw in what they cannot hold")

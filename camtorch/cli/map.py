@@ -7,11 +7,11 @@ from pathlib import Path
 
 from camtorch.cli import targets
 from camtorch.cli.cameras import read_camera
-from camtorch.maps.formats import check_map, files_of
+from camtorch.maps.formats import check_map, files_of, save_map
 from camtorch.warp.dewarp import Dewarp
 from camtorch.warp.warp import Warp
 
-_OPTIONS = ("step", "v", "block", "dtype", "clip")
+_OPTIONS = ("step", "block", "dtype", "clip")
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -27,7 +27,7 @@ def run(arguments: argparse.Namespace) -> None:
         print(check_map(warp, arguments.check, arguments.format))
     else:
         output.parent.mkdir(parents=True, exist_ok=True)
-        print(warp.save(output, arguments.format, **{name: getattr(arguments, name) for name in _OPTIONS}))
+        print(save_map(warp, output, arguments.format, **{name: getattr(arguments, name) for name in _OPTIONS}))
 
 
 def _warp(arguments: argparse.Namespace) -> Warp:

@@ -10,16 +10,14 @@ https://docs.kernel.org/userspace-api/media/drivers/dw100.html
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
 from camtorch.io._errors import CameraFileError
 from camtorch.maps.exact import Exact, Floats
-from camtorch.maps.mesh import Mesh, held, rounded
-from camtorch.maps.protocol import Options
-from camtorch.maps.tables import Table, table
+from camtorch.maps.mesh import Mesh, Table, held, rounded, table
 
 _PARTS = 16
 _MOST = (1 << 16) - 1
@@ -31,19 +29,20 @@ class DW100(Table):
 
     name = "dw100"
     options: tuple[str, ...] = ("clip",)
-    steps: Sequence[int] = (16,)
+    step, steps = 16, (16,)
 
-    def pack(self, path: str, mesh: Mesh, exact: Exact, options: Options) -> tuple[bytes, dict[str, Any]]:
-        """Raises CameraFileError: sizes that the hardware does not take, positions off 0 to 4095.9375."""
+    def pack(self, path: str, mesh: Mesh, exact: Exact, options: Mapping[str, Any]) -> tuple[bytes, dict[str, Any]]:
+        """See `Table`; raise a CameraFileError for sizes and positions that the hardware does not take."""
         for what, size in (("source", exact.source_size), ("target", exact.target_size)):
             if any(not low <= side <= high for low, side, high in zip(_SMALLEST, size, _LARGEST, strict=True)):
                 raise CameraFileError(
                     path, f"{what} size", f"{size[1]}x{size[0]}; the DW100 takes 176x144 to 4096x3072 pixels"
                 )
         low, high = np.zeros(2), np.full(2, _MOST / _PARTS)
-        parts = rounded(held(path, self.name, mesh, low, high, clip=bool(options.clip)), exact, _PARTS, low, high)
+        mesh = held(path, self.name, mesh, low, high, clip=bool(options.get("clip")))
+        parts = rounded(mesh, exact, _PARTS, low, high)
         return (parts[..., 1] << 16 | parts[..., 0]).astype("<u4").tobytes(), {}
 
-    def unpack(self, content: bytes, columns: Floats, rows: Floats, given: Options) -> tuple[Floats, dict[str, Any]]:
-        words = table(content, "<u4", (len(rows), len(columns)))
-        return np.stack((words & _MOST, words >> 16), -1) / _PARTS, {}
+    def unpack(self, content: bytes, blank: Mesh) -> Floats:
+        words = table(content, "<u4", blank.nodes.shape[:2])
+        return np.stack((words & _MOST, words >> 16), -1) / _PARTS

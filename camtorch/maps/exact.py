@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 import torch
 
-if TYPE_CHECKING:
-    from camtorch.warp.warp import Warp
+from camtorch.warp.warp import Warp
 
 Floats = npt.NDArray[np.float64]
 Bools = npt.NDArray[np.bool_]
@@ -30,7 +28,7 @@ class Exact:
     """
 
     def __init__(self, warp: Warp, owner: str):
-        if not hasattr(warp, "transform_points"):
+        if not isinstance(warp, Warp):
             raise TypeError(f"{owner}: warp must be a Warp; got {type(warp).__name__}")
         count = warp.batch_shape.numel()
         if count != 1:

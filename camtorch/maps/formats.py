@@ -1,4 +1,4 @@
-"""`Warp.save` and `load_map`: the formats of maps, none of which is known here but by its object.
+"""`save_map` and `load_map`: the formats of maps, none of which is known here but by its object.
 
 To add a format, write one file beside this one, as `protocol.py` says, and name its object below.
 """
@@ -7,90 +7,109 @@ from __future__ import annotations
 
 import json
 import os
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal, TypedDict
 
-from camtorch._arguments import as_image_size, as_whole
 from camtorch.io._errors import CameraFileError
 from camtorch.io.parsing import path_of, read_bytes
 from camtorch.io.writing import as_json, replacing
-from camtorch.maps.depthai import DepthAI
 from camtorch.maps.dw100 import DW100
 from camtorch.maps.exact import Exact
 from camtorch.maps.lookup import LookupMap
-from camtorch.maps.obj import OBJ
 from camtorch.maps.onnx import ONNX
 from camtorch.maps.opencv import OpenCV
-from camtorch.maps.protocol import SIZES, MapFormat, Options, named_sizes
+from camtorch.maps.protocol import SIZES, MapFormat
 from camtorch.maps.report import MapReport, measure
-from camtorch.maps.stmap import STMap
 from camtorch.maps.ti_ldc import TILDC
+from camtorch.warp.warp import Warp
 
 if TYPE_CHECKING:
-    from camtorch.warp.warp import Warp
+    from typing_extensions import Unpack
 
 # in the order in which they are asked
 _FORMATS: dict[str, MapFormat] = {
-    format.name: format
-    for format in (
-        OpenCV("opencv"),
-        OpenCV("opencv_fixed"),
-        STMap(),
-        DW100(),
-        TILDC(),
-        DepthAI(),
-        OBJ(),
-        ONNX(),
-    )
+    format.name: format for format in (OpenCV("opencv"), OpenCV("opencv_fixed"), DW100(), TILDC(), ONNX())
 }
 FORMATS = tuple(_FORMATS)
 
 _LARGEST_FILE = 1 << 31
 _LARGEST_DESCRIPTION = 1 << 16
+_KNOWN = f"known are {', '.join(FORMATS)}; docs/leaving-0.3.md says what to use for formats that left"
 
 
-def save_map(warp: Warp, path: str | os.PathLike[str], format: str | None, **said: Any) -> MapReport:
-    """See `Warp.save`; `said` are fields of `Options`."""
-    name = path_of(path, "Warp.save")
+class MapOptions(TypedDict, total=False):
+    """What `save_map` takes besides, each for some formats."""
+
+    step: int | None
+    block: tuple[int, int] | None
+    dtype: Literal["float32", "uint8"] | None
+    clip: bool | None
+
+
+def save_map(
+    warp: Warp, path: str | os.PathLike[str], format: str | None = None, **options: Unpack[MapOptions]
+) -> MapReport:
+    """Write where each pixel of the target is taken from, for another runtime, and measure what was written.
+
+    The file is read back, interpolated as its runtime does, and compared with the exact positions, at every pixel that
+    shows the source's image. A map holds positions alone: mode, padding, fill and antialias are the runtime's, except
+    for "onnx", which holds all but the last.
+
+    Args:
+        warp: a single one.
+        path: of the file, replaced as a whole or not at all. Bare tables get a description beside them, PATH.json.
+        format: "opencv" (.yml, .npz), "opencv_fixed" (the same), "dw100", "ti_ldc" or "onnx"; by default what the
+            suffix says.
+        step: "ti_ldc": pixels of the target between the nodes of the mesh, a power of two up to 128; 8 by default.
+        block: "ti_ldc": (height, width) of the blocks of the target; by default the largest that can be had.
+        dtype: "onnx": of the images, "float32" by default, or "uint8".
+        clip: "dw100", "ti_ldc": draw in positions that the format cannot hold, rather than refuse them.
+
+    Raises:
+        CameraFileError: If the format cannot hold this warp; the error says why. ValueError: If the warp is a batch,
+            the format unknown, or an option not one of the format. ImportError: If a library that the format needs is
+            missing; the error names the extra. OSError: If the file cannot be written.
+
+    Example:
+        >>> report = ct.save_map(ct.Dewarp(camera), "map.npz")
+        >>> report.max_error  # pixels of the source
+    """
+    name = path_of(path, "save_map")
     chosen = _chosen(name, format)
-    if said["step"] is not None:
-        said["step"] = as_whole(said["step"], "step", "Warp.save")
-    if said["block"] is not None:
-        said["block"] = as_image_size(said["block"], "Warp.save", "block")
-    for option, value in said.items():
-        if value is not None and option not in chosen.options:
+    given = {option: value for option, value in options.items() if value is not None}
+    for option in given:
+        if option not in chosen.options:
             takes = f"; it takes {', '.join(chosen.options)}" if chosen.options else ""
-            raise ValueError(f"Warp.save: {chosen.name} has no {option}{takes}")
+            raise ValueError(f"save_map: {chosen.name} has no {option}{takes}")
     if chosen.suffixes and not name.lower().endswith(chosen.suffixes):
         raise ValueError(f"{name}: files of {chosen.name} are called {', '.join(chosen.suffixes)}")
-    exact = Exact(warp, "Warp.save")
+    exact = Exact(warp, "save_map")
     if not exact.shown.any():
-        raise ValueError(f"Warp.save: {name}: no pixel of the target shows anything of the source's image")
-    options = Options(**said, source_size=exact.source_size, target_size=exact.target_size)
-    content, facts = chosen.encode(name, exact, options)
-    files = (name, _description(name)) if chosen.described else (name,)
-    report = measure(name, chosen.decode(content, options), exact, files, facts)
+        raise ValueError(f"save_map: {name}: no pixel of the target shows anything of the source's image")
+    content, facts = chosen.encode(name, exact, given)
+    described = {"format": chosen.name, **dict(zip(SIZES, exact.source_size + exact.target_size, strict=True)), **facts}
+    files = files_of(name, chosen.name)
+    report = measure(name, chosen.decode(content, described), exact, files, facts)
     with replacing(*files) as opened:
         opened[0].write(content)
         if chosen.described:
             errors = {"max_error": round(report.max_error, 6), "rms_error": round(report.rms_error, 6)}
-            sizes = named_sizes(report.source_size, report.target_size)
-            opened[1].write(as_json({"format": chosen.name, **sizes, **facts, **errors}).encode())
+            opened[1].write(as_json({**described, **errors}).encode())
     return report
 
 
 def load_map(path: str | os.PathLike[str], format: str | None = None) -> LookupMap:
-    """Read a map that `Warp.save` wrote: to see what it holds, and to compare it with a warp.
+    """Read a map that `save_map` wrote: to see what it holds, and to compare it with a warp.
 
     Args:
         path: the file, beside which bare tables have their description.
-        format: one of those of `Warp.save`; found from the content, the name and the description if left out.
+        format: one of those of `save_map`; found from the content, the name and the description if left out.
 
     Returns:
         A `LookupMap`: `.positions`, `.map_x`, `.map_y`, `.grid()`, `.error(warp)`; called with images it warps them.
 
     Raises:
-        CameraFileError: the file cannot be used; it says why. OSError: it cannot be opened. ValueError: an unknown
-            format. ImportError: a library that the format needs is missing; the error names the extra.
+        CameraFileError: If the file cannot be used; the error says why. OSError: If it cannot be opened. ValueError: If
+            the format is unknown. ImportError: If a library that it needs is missing; the error names the extra.
     """
     name = path_of(path, "load_map")
     content = read_bytes(name, _LARGEST_FILE)
@@ -99,42 +118,33 @@ def load_map(path: str | os.PathLike[str], format: str | None = None) -> LookupM
     described = _read_description(name) if chosen is None or chosen.described else {}
     chosen = chosen or _FORMATS.get(str(described.get("format")))
     if chosen is None:
-        raise CameraFileError(
-            name, "content", f"not that of a known map, and no {_description(name)} says it; say format"
-        )
+        what = f"not that of a known map, and no {_description(name)} says it; say format: {_KNOWN}"
+        raise CameraFileError(name, "content", what)
     if described.get("format", chosen.name) != chosen.name:
         raise CameraFileError(_description(name), "format", f"describes {described['format']!r:.60}, not {chosen.name}")
-    facts = {key: tuple(value) if isinstance(value, list) else value for key, value in described.items()}
     try:
-        sizes: dict[str, Any] = {}
-        if chosen.described:
-            rows, columns, height, width = (facts[key] for key in SIZES)
-            sizes = {"source_size": (rows, columns), "target_size": (height, width)}
-        read = chosen.decode(content, Options(step=described.get("step"), **sizes))
+        read = chosen.decode(content, described)
     except ImportError:
         raise
     except Exception as error:  # whatever a damaged file makes of the library that reads it
         reason = f"no map of {chosen.name}: {str(error) or type(error).__name__}"
         raise CameraFileError(name, "content", reason) from None
+    facts = {key: tuple(value) if isinstance(value, list) else value for key, value in described.items()}
     read.facts = {**{key: facts[key] for key in facts if key not in _NO_FACTS}, **read.facts}
     return read
 
 
 def files_of(path: str | os.PathLike[str], format: str | None = None) -> tuple[str, ...]:
-    """The files that `Warp.save` writes: that of the path, and beside a bare table its description.
-
-    Raises:
-        ValueError: as `Warp.save`, of the path and the format.
-    """
-    name = path_of(path, "Warp.save")
+    """Return the files that `save_map` writes: that of the path, and beside a bare table its description."""
+    name = path_of(path, "save_map")
     return (name, _description(name)) if _chosen(name, format).described else (name,)
 
 
 def check_map(warp: Warp, path: str | os.PathLike[str], format: str | None = None) -> MapReport:
-    """How far a map that is there is from a warp; see `load_map`.
+    """Return how far a map that is there is from a warp; see `load_map`.
 
     Raises:
-        ValueError: it is between images of other sizes, and as `load_map`.
+        ValueError: If it is between images of other sizes, and as `load_map`.
     """
     read = load_map(path, format)
     return measure(path_of(path, "check_map"), read, Exact(warp, "check_map"), (), read.facts)
@@ -144,12 +154,12 @@ _NO_FACTS = ("format", *SIZES, "max_error", "rms_error")
 
 
 def _description(path: str) -> str:
-    """The file that says what a bare table does not."""
+    """Return the file that says what a bare table does not."""
     return path + ".json"
 
 
 def _read_description(path: str) -> dict[str, Any]:
-    """What stands beside a bare table, or nothing."""
+    """Return what stands beside a bare table, or nothing."""
     beside = _description(path)
     if not os.path.isfile(beside):
         return {}
@@ -165,7 +175,7 @@ def _read_description(path: str) -> dict[str, Any]:
 
 
 def _chosen(path: str, format: str | None) -> MapFormat:
-    """The format to write."""
+    """Return the format to write."""
     if format is not None:
         return _named(format)
     suffix = os.path.splitext(path)[1].lower()
@@ -173,7 +183,7 @@ def _chosen(path: str, format: str | None) -> MapFormat:
     if suffix not in suffixes:
         raise ValueError(
             f"{path}: the name does not say the format; names that end in {', '.join(suffixes)} do. Say which, "
-            f"as in format='dw100' or --format dw100; known are {', '.join(FORMATS)}"
+            f"as in format='dw100' or --format dw100; {_KNOWN}"
         )
     return suffixes[suffix]
 
@@ -181,5 +191,5 @@ def _chosen(path: str, format: str | None) -> MapFormat:
 def _named(format: str) -> MapFormat:
     found = _FORMATS.get(str(format).lower())
     if found is None:
-        raise ValueError(f"format: {format!r} is no format of a map that is known here; known are {', '.join(FORMATS)}")
+        raise ValueError(f"format: {format!r} is no format of a map that is known here; {_KNOWN}")
     return found

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
@@ -11,9 +11,7 @@ from torch import Tensor
 
 from camtorch._dtypes import narrow, widen
 from camtorch.maps.exact import Exact
-
-if TYPE_CHECKING:
-    from camtorch.warp.warp import Warp
+from camtorch.warp.warp import Warp
 
 OUTSIDE = -9.0
 """A position of `grid_sample` that no image reaches."""

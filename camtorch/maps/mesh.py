@@ -1,147 +1,141 @@
-"""Meshes: positions at the nodes of a lattice over the target, and what a runtime makes of them between the nodes."""
+"""Meshes: positions at the corners of blocks of the target, and tables of them as camera chips take them."""
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from abc import abstractmethod
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
+import torch
 
 from camtorch.io._errors import CameraFileError
 from camtorch.maps.exact import Bools, Exact, Floats
+from camtorch.maps.lookup import LookupMap
+from camtorch.maps.protocol import SIZES, MapFormat, checked
 
-STEP, STEPS = 16, range(1, 257)
-"""Pixels of the target between nodes: usually, and those that formats without other limits take."""
 _SLACK = 0.5  # pixels: as far as a pixel that shows the image may lie beyond the outermost pixel centres
 _OUTWARDS = 1 / 32  # of the second differences by which nodes round outwards
 _MOST_STEPS = 200
 _GAIN = 1e-9  # pixels
-_NEIGHBOURS = ((-1, -1), (-1, 0), (-1, 1), (0, -1), (0, 1), (1, -1), (1, 0), (1, 1))
+_NEIGHBOURS = [(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if i or j]
 _REACH = 1  # sizes of the source by which nodes that no shown pixel needs may lie off it
 
 
 @dataclass(frozen=True)
 class Mesh:
-    """Positions at the nodes of a lattice over the target.
+    """Positions at every `step` pixels of the target from the first to beyond the last, bilinear between them."""
 
-    Args:
-        columns: (m,) of the nodes in pixels of the target, ascending.
-        rows: (n,) likewise.
-        nodes: (n, m, 2), x and y in pixels of the source.
-        needed: (n, m) bool, nodes of cells with a pixel that the warp shows; None of a mesh that was read.
-        drawn: (n - 1, m - 1, 2) bool: each cell is two triangles, above and below its diagonal from the node with the
-            lowest coordinates, and which of them are there. None where cells are bilinear, and all there.
-    """
-
-    columns: Floats
-    rows: Floats
+    step: int
     nodes: Floats
+    """(n, m, 2), x and y in pixels of the source."""
     needed: Bools | None = None
-    drawn: Bools | None = None
+    """(n, m): nodes of blocks with a pixel that the warp shows; None for a mesh that was read."""
+
+    @property
+    def places(self) -> Floats:
+        """(n, m, 2): x and y of the nodes in pixels of the target."""
+        n, m = self.nodes.shape[:2]
+        return self.step * np.stack(np.meshgrid(np.arange(m), np.arange(n)), -1).astype(np.float64)
 
     def positions(self, size: tuple[int, int]) -> Floats:
-        """(H', W', 2): of each pixel of a target of that size, NaN where no triangle is."""
-        height, width = size
-        i, s = _cells(self.rows, height)
-        j, t = _cells(self.columns, width)
-        s, t = s[:, None, None], t[:, None]
-        if self.drawn is None:
-            lines = self.nodes[i] * (1 - s) + self.nodes[i + 1] * s
-            between: Floats = lines[:, j] * (1 - t) + lines[:, j + 1] * t
-            return between
-        upper, lower = self.nodes[i], self.nodes[i + 1]
-        start, end = upper[:, j], lower[:, j + 1]
-        above = t >= s
-        corner = np.where(above, upper[:, j + 1], lower[:, j])
-        along, rest = np.where(above, t, s), np.where(above, s, t)
-        result: Floats = start + along * (corner - start) + rest * (end - corner)
-        there = np.where(above[..., 0], self.drawn[i][:, j, 0], self.drawn[i][:, j, 1])
-        result[~there] = np.nan
-        return result
+        """Return the position (H', W', 2) of each pixel of a target of that size."""
+        (i, s), (j, t) = (divmod(np.arange(side), self.step) for side in size)
+        s, t = (s / self.step)[:, None, None], (t / self.step)[:, None]
+        lines = self.nodes[i] * (1 - s) + self.nodes[i + 1] * s
+        between: Floats = lines[:, j] * (1 - t) + lines[:, j + 1] * t
+        return between
 
 
-def _cells(nodes: Floats, count: int) -> tuple[np.ndarray, Floats]:
-    """For each of `count` pixels the cell that it lies in, and where in it, from 0 to 1."""
-    pixels = np.arange(count, dtype=np.float64)
-    cell = np.clip(np.searchsorted(nodes, pixels, "right") - 1, 0, len(nodes) - 2)
-    return cell, (pixels - nodes[cell]) / (nodes[cell + 1] - nodes[cell])
+class Table(MapFormat):
+    """A format whose file is a bare table of a mesh: sizes and step come from the description next to it."""
+
+    described = True
+    step: int
+    """Pixels of the target between nodes, by default."""
+    steps: Sequence[int]
+
+    @abstractmethod
+    def pack(self, path: str, mesh: Mesh, exact: Exact, options: Mapping[str, Any]) -> tuple[bytes, dict[str, Any]]:
+        """Return the file of a mesh, and the facts that its user needs besides its step and its number of nodes."""
+
+    @abstractmethod
+    def unpack(self, content: bytes, blank: Mesh) -> Floats:
+        """Return the nodes (n, m, 2) of a file; `blank` has their step and their places."""
+
+    def encode(self, path: str, exact: Exact, options: Mapping[str, Any]) -> tuple[bytes, dict[str, Any]]:
+        mesh = mesh_of(path, exact, self._checked(options.get("step", self.step), "save_map"))
+        content, facts = self.pack(path, mesh, exact, options)
+        return content, {"step": mesh.step, "nodes": mesh.nodes.shape[:2], **facts}
+
+    def decode(self, content: bytes, described: Mapping[str, Any]) -> LookupMap:
+        sides = [described[key] for key in SIZES]
+        source, target = checked("source_size", sides[:2]), checked("target_size", sides[2:])
+        step = self._checked(described.get("step", self.step), "load_map")
+        nodes = self.unpack(content, Mesh(step, np.empty((*_counts(step, target), 2))))
+        positions = torch.from_numpy(Mesh(step, nodes).positions(target))
+        return LookupMap(positions, source, self.name, {"step": step, "nodes": nodes.shape[:2]})
+
+    def _checked(self, step: Any, owner: str) -> int:
+        if step not in self.steps:
+            raise ValueError(f"{owner}: step must be one of {', '.join(map(str, self.steps))} pixels; got {step!r:.60}")
+        return int(step)
 
 
-def as_step(step: int | None, owner: str, steps: Sequence[int] = STEPS, usual: int = STEP) -> int:
-    """Pixels of the target between nodes; `usual` if nobody says.
+def table(content: bytes, dtype: str, shape: tuple[int, ...]) -> np.ndarray:
+    """Return the numbers of a table of that shape; raise a ValueError if the content has another length."""
+    expected = int(np.prod(shape, dtype=object)) * np.dtype(dtype).itemsize
+    if len(content) != expected:
+        raise ValueError(f"{len(content)} bytes; {'x'.join(map(str, shape))} of {np.dtype(dtype)} are {expected}")
+    return np.frombuffer(content, dtype).reshape(shape)
+
+
+def _counts(step: int, size: tuple[int, int]) -> tuple[int, int]:
+    """Return how many nodes there are down and across: the last ones are not below the size."""
+    return -(-size[0] // step) + 1, -(-size[1] // step) + 1
+
+
+def mesh_of(path: str, exact: Exact, step: int) -> Mesh:
+    """Return the mesh of a warp, exact at its nodes, and smoothly continued to those that have no position.
 
     Raises:
-        ValueError: none of `steps`.
+        CameraFileError: If positions leap across the source from one pixel to the next; `path` is that of the map.
     """
-    if step is None:
-        return usual
-    if step not in steps:
-        which = f"{steps[0]} to {steps[-1]}" if isinstance(steps, range) else f"one of {', '.join(map(str, steps))}"
-        raise ValueError(f"{owner}: step must be {which} pixels; got {step}")
-    return step
-
-
-def nodes_every(step: int, size: int) -> Floats:
-    """Pixels 0, step, ... to the first that is not below the size."""
-    return np.arange(-(-size // step) + 1, dtype=np.float64) * step
-
-
-def mesh_of(path: str, exact: Exact, columns: Floats, rows: Floats, *, triangles: bool = False) -> Mesh:
-    """The mesh of a warp: exact at its nodes, and smoothly continued to those that have no position.
-
-    Args:
-        path: of the map, for errors.
-        exact: of the warp.
-        columns: (m,) of the nodes in pixels of the target.
-        rows: (n,) likewise.
-        triangles: whether cells are two triangles, of which those that show nothing are left out.
-
-    Raises:
-        CameraFileError: positions leap across the source from one pixel to the next.
-    """
-    shown = exact.shown
     if leaps := _leaps(exact):
         raise CameraFileError(
             path,
             "mesh",
             f"positions leap across the source beside {leaps} pixels, as at the seam of a panorama, and no mesh does. "
-            "A target that does not show the seam has one; opencv, stmap and onnx hold positions pixel by pixel",
+            "A target that does not show the seam has one; opencv and onnx hold positions pixel by pixel",
         )
-    (i, s), (j, t) = _cells(rows, shown.shape[0]), _cells(columns, shown.shape[1])
-    down, across = np.nonzero(shown)
-    below = (t[across] < s[down]).astype(np.intp)
-    drawn = np.zeros((len(rows) - 1, len(columns) - 1, 2), np.bool_)
-    drawn[i[down], j[across], below] = True
-    cells = drawn.any(-1)
-    needed = np.zeros((len(rows), len(columns)), np.bool_)
-    for a in (slice(None, -1), slice(1, None)):
-        for b in (slice(None, -1), slice(1, None)):
-            needed[a, b] |= cells
-    nodes, mapped = exact.at(columns, rows)
+    n, m = _counts(step, exact.target_size)
+    down, across = np.nonzero(exact.shown)
+    blocks = np.zeros((n + 1, m + 1), np.bool_)  # each node between its four blocks
+    blocks[down // step + 1, across // step + 1] = True
+    needed = blocks[1:, 1:] | blocks[:-1, 1:] | blocks[1:, :-1] | blocks[:-1, :-1]
+    nodes, mapped = exact.at(step * np.arange(m, dtype=np.float64), step * np.arange(n, dtype=np.float64))
     sides = np.array(exact.source_size[::-1], np.float64)
     low, high = -_REACH * sides, (1 + _REACH) * sides
-    # what is far off says nothing of where to go on
+    # nodes far off do not tell where to go on
     nodes = _continued(np.where(needed[..., None], nodes, nodes.clip(low, high)), mapped, low, high)
-    return Mesh(columns, rows, nodes, needed, drawn if triangles else None)
+    return Mesh(step, nodes, needed)
 
 
 def _leaps(exact: Exact) -> int:
-    """How many shown pixels are half the source away from a shown neighbour."""
-    half = np.array(exact.source_size[::-1], np.float64) / 2
-    p, shown = exact.positions, exact.shown
-    count = 0
-    for one, two in (
-        ((slice(1, None),), (slice(None, -1),)),
-        ((slice(None), slice(1, None)), (slice(None), slice(None, -1))),
+    """Count the shown pixels that are half the source away from a shown neighbour."""
+    half, count = np.array(exact.source_size[::-1], np.float64) / 2, 0
+    for p, shown in (
+        (exact.positions, exact.shown),
+        (exact.positions.swapaxes(0, 1), exact.shown.T),
     ):
-        far = (np.abs(p[one] - p[two]) > half).any(-1)
-        count += int((far & shown[one] & shown[two]).sum())
+        count += int(((np.abs(np.diff(p, axis=0)) > half).any(-1) & shown[1:] & shown[:-1]).sum())
     return count
 
 
 def _continued(nodes: Floats, known: Bools, low: Floats, high: Floats) -> Floats:
-    """Nodes (n, m, 2) with those that are not known laid out from their neighbours, ring by ring.
+    """Return nodes (n, m, 2) with those that are not known laid out from their neighbours, ring by ring.
 
     The first ring is where parabolas through three nodes go on, as it has a part in what is shown. Those behind it go
     on along lines, each by half the step before, so that hardware is not sent across the image.
@@ -173,18 +167,10 @@ def _continued(nodes: Floats, known: Bools, low: Floats, high: Floats) -> Floats
 
 
 def held(path: str, format: str, mesh: Mesh, low: Floats, high: Floats, *, clip: bool) -> Mesh:
-    """The mesh with its nodes drawn in to what a format holds.
-
-    Args:
-        path: of the map, for the error.
-        format: likewise.
-        mesh: of the warp.
-        low: least x and y that the format holds at each node, (..., 2).
-        high: the largest.
-        clip: whether nodes of shown pixels may be drawn in; others always are, and those by half a pixel.
+    """Return the mesh with its nodes drawn in to the least and largest x and y (..., 2) that a format holds.
 
     Raises:
-        CameraFileError: nodes of shown pixels that it does not hold.
+        CameraFileError: If nodes of shown pixels lie more than half a pixel beyond, unless `clip` is set.
     """
     beyond = ((mesh.nodes < low - _SLACK) | (mesh.nodes > high + _SLACK)).any(-1)
     if mesh.needed is not None and not clip and (lost := beyond & mesh.needed).any():
@@ -201,59 +187,53 @@ def held(path: str, format: str, mesh: Mesh, low: Floats, high: Floats, *, clip:
 
 
 def rounded(mesh: Mesh, exact: Exact, parts: int, low: Floats, high: Floats) -> np.ndarray:
-    """The nodes in whole parts of a pixel, (n, m, 2) int64, so that the largest error at shown pixels is small.
+    """Return the nodes in whole parts of a pixel, (n, m, 2) int64, so that the largest error at shown pixels is small.
 
-    Each is one of the two next to the exact value, along each axis. Between nodes a bend is cut off, by an eighth of
-    its second difference, so nodes round towards its outside; then those about the largest error round as is best
-    there, until that helps no more.
-
-    Args:
-        mesh: of the warp, of bilinear cells.
-        exact: what it is measured against.
-        parts: of a pixel.
-        low: least x and y that may be had at each node, in pixels, whole parts.
-        high: the largest.
+    Each is one of the two next to the exact value, along each axis, within low and high in pixels. Between nodes a bend
+    is cut off, by an eighth of its second difference, so nodes round towards its outside; then those about the largest
+    error round as is best there, until that helps no more.
     """
-    least, most = (np.broadcast_to(limit * parts, mesh.nodes.shape) for limit in (low, high))
     values = mesh.nodes * parts
+    least, most = low * parts, high * parts
     outside = (_OUTWARDS * _bend(mesh.nodes) * parts).clip(-0.5, 0.5)
     nodes = np.rint(values - outside).clip(least, most)
     either = np.floor(values).clip(least, most), np.ceil(values).clip(least, most)
-    limit = np.array(exact.source_size[::-1], np.float64) - 1
-    wanted, shown = exact.positions.clip(0, limit), exact.shown
+    edge = np.array(exact.source_size[::-1], np.float64) - 1
+    wanted, shown = exact.positions.clip(0, edge), exact.shown
 
-    def errors(mesh: Mesh, pixels: tuple[slice, slice]) -> Floats:
-        size = shown[pixels].shape
-        off = mesh.positions((size[0], size[1])).clip(0, limit) - wanted[pixels]
+    def errors(nodes: Floats, pixels: tuple[slice, ...]) -> Floats:
+        height, width = shown[pixels].shape
+        off = Mesh(mesh.step, nodes / parts).positions((height, width)).clip(0, edge) - wanted[pixels]
         distance: Floats = np.hypot(off[..., 0], off[..., 1]) * shown[pixels]
         return distance
 
-    error = errors(replace(mesh, nodes=nodes / parts), (slice(None), slice(None)))
+    error = errors(nodes, (slice(None), slice(None)))
     for _ in range(_MOST_STEPS):
         worst = divmod(int(error.argmax()), error.shape[1])
-        i, j = (int(_cells(line, at + 1)[0][-1]) for line, at in zip((mesh.rows, mesh.columns), worst, strict=True))
-        least_error, step = float(error[worst]) - _GAIN, None
-        for node in ((i, j), (i, j + 1), (i + 1, j), (i + 1, j + 1)):
-            down, across = (slice(max(k - 1, 0), k + 2) for k in node)
-            rows, columns = mesh.rows[down], mesh.columns[across]
-            pixels = slice(int(rows[0]), int(rows[-1])), slice(int(columns[0]), int(columns[-1]))
-            around = Mesh(columns - columns[0], rows - rows[0], nodes[down, across] / parts)
-            for x, y in itertools.product((0, 1), (0, 1)):
-                value = np.array([either[x][node][0], either[y][node][1]])
-                around.nodes[node[0] - down.start, node[1] - across.start] = value / parts
-                off = errors(around, pixels)
+        least_error, best = float(error[worst]) - _GAIN, None
+        for node in itertools.product(*((at // mesh.step, at // mesh.step + 1) for at in worst)):
+            near = tuple(slice(max(k - 1, 0), k + 2) for k in node)
+            patch = nodes[near].copy()
+            pixels = tuple(
+                slice(mesh.step * part.start, mesh.step * (part.start + count - 1))
+                for part, count in zip(near, patch.shape, strict=False)
+            )
+            for x, y in itertools.product(either, either):
+                value = np.array([x[node][0], y[node][1]])
+                patch[node[0] - near[0].start, node[1] - near[1].start] = value
+                off = errors(patch, pixels)
                 if off.max() < least_error:
-                    least_error, step = float(off.max()), (node, value, pixels, off)
-        if step is None:
+                    least_error, best = float(off.max()), (node, value, pixels, off)
+        if best is None:
             break
-        node, value, pixels, off = step
+        node, value, pixels, off = best
         nodes[node], error[pixels] = value, off
     whole: np.ndarray = nodes.astype(np.int64)
     return whole
 
 
 def _bend(nodes: Floats) -> Floats:
-    """The second differences along both axes, of (n, m, 2); at the ends those next to them."""
+    """Return the sum of the second differences along both axes, of (n, m, 2); at the ends those next to them."""
     total = np.zeros_like(nodes)
     for axis in (0, 1):
         if nodes.shape[axis] > 2:

@@ -8,6 +8,7 @@ too, but for a panorama of a whole turn, which GridSample ends at its edges; ali
 from __future__ import annotations
 
 import itertools
+from collections.abc import Mapping
 from types import ModuleType
 from typing import Any
 
@@ -16,7 +17,7 @@ import torch
 
 from camtorch.maps.exact import Exact
 from camtorch.maps.lookup import OUTSIDE, LookupMap
-from camtorch.maps.protocol import MapFormat, Options, checked
+from camtorch.maps.protocol import MapFormat, checked
 
 _OPSET, _IR = 16, 8
 _DTYPES = ("float32", "uint8")
@@ -29,20 +30,20 @@ class ONNX(MapFormat):
     suffixes: tuple[str, ...] = (".onnx",)
     options: tuple[str, ...] = ("dtype",)
 
-    def encode(self, path: str, exact: Exact, options: Options) -> tuple[bytes, dict[str, Any]]:
-        warp, dtype = exact.warp, options.dtype or "float32"
+    def encode(self, path: str, exact: Exact, options: Mapping[str, Any]) -> tuple[bytes, dict[str, Any]]:
+        warp, dtype = exact.warp, options.get("dtype", "float32")
         if dtype not in _DTYPES:
-            raise ValueError(f"Warp.save: dtype must be one of {_DTYPES}; got {dtype!r}")
+            raise ValueError(f"save_map: dtype must be one of {_DTYPES}; got {dtype!r}")
         if warp.antialias:
-            raise ValueError("Warp.save: GridSample has no antialiasing; save a warp with antialias=False")
+            raise ValueError("save_map: GridSample has no antialiasing; save a warp with antialias=False")
         if warp.mode == "bicubic" and warp.padding_mode != "zeros":
             raise ValueError(
-                f"Warp.save: mode='bicubic' with padding_mode={warp.padding_mode!r} is not the same in every ONNX "
+                f"save_map: mode='bicubic' with padding_mode={warp.padding_mode!r} is not the same in every ONNX "
                 "runtime; 'bilinear' is, or padding_mode='zeros'"
             )
         return _model(exact, dtype).SerializeToString(), {"dtype": dtype, "opset": _OPSET}
 
-    def decode(self, content: bytes, given: Options) -> LookupMap:
+    def decode(self, content: bytes, described: Mapping[str, Any]) -> LookupMap:
         """See `MapFormat`. Models are read as they are written here."""
         onnx = _needed()
         graph = onnx.load_model_from_string(content).graph

@@ -10,6 +10,7 @@ Pixels without a position get -32768, which `cv2.remap` fills by BORDER_CONSTANT
 from __future__ import annotations
 
 import io
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -20,7 +21,7 @@ from camtorch.io.npz import arrays_of
 from camtorch.maps.arrays import as_storage, from_storage
 from camtorch.maps.exact import Exact
 from camtorch.maps.lookup import LookupMap
-from camtorch.maps.protocol import MOST_PIXELS, SIZES, MapFormat, Options, checked
+from camtorch.maps.protocol import MOST_PIXELS, SIZES, MapFormat, checked
 
 _NOWHERE = -32768
 _LONGEST = 32766  # pixels: cv2.remap wants sides below SHRT_MAX
@@ -36,7 +37,7 @@ class OpenCV(MapFormat):
     def __init__(self, name: str):
         self.name = name
 
-    def encode(self, path: str, exact: Exact, options: Options) -> tuple[bytes, dict[str, Any]]:
+    def encode(self, path: str, exact: Exact, options: Mapping[str, Any]) -> tuple[bytes, dict[str, Any]]:
         sides = (*exact.source_size, *exact.target_size)
         if max(sides) > _LONGEST:
             raise CameraFileError(path, "size", f"a side of {max(sides)} px; cv2.remap takes at most {_LONGEST}")
@@ -59,7 +60,7 @@ class OpenCV(MapFormat):
         """See `MapFormat`. Which of the two it is the types of its matrices say."""
         return content.startswith((b"PK\3\4", b"%YAML"))
 
-    def decode(self, content: bytes, given: Options) -> LookupMap:
+    def decode(self, content: bytes, described: Mapping[str, Any]) -> LookupMap:
         found = arrays_of(content, _LARGEST_ARRAY) if content.startswith(b"PK") else from_storage(content)
         arrays = {name: array for name, array in found.items() if array is not None}
         first, second = arrays["map1"], arrays["map2"]

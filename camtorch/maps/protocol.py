@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from collections.abc import Mapping
 from typing import Any
 
 from camtorch.maps.exact import Exact
@@ -16,26 +16,13 @@ SIZES = "source_height", "source_width", "target_height", "target_width"
 _LONGEST = 1 << 16  # pixels along a side
 
 
-@dataclass(frozen=True)
-class Options:
-    """What is said of a map: by `Warp.save`, or by the description of one to read. None is the format's own."""
-
-    step: int | None = None
-    v: str | None = None
-    block: tuple[int, int] | None = None
-    dtype: str | None = None
-    clip: bool | None = None
-    source_size: tuple[int, int] | None = None
-    target_size: tuple[int, int] | None = None
-
-
 class MapFormat(ABC):
     """A format: one object a format, in `camtorch.maps.formats`.
 
     Attributes:
-        name: its key in `Warp.save`.
+        name: its key in `save_map`.
         suffixes: of its files; the first format that has a suffix is meant by it. None of a bare table.
-        options: of `Options`, those that `Warp.save` takes for it.
+        options: the names of those that `save_map` takes for it.
         described: whether its files say nothing of themselves, so that a description is written beside them.
     """
 
@@ -45,11 +32,11 @@ class MapFormat(ABC):
     described = False
 
     @abstractmethod
-    def encode(self, path: str, exact: Exact, options: Options) -> tuple[bytes, dict[str, Any]]:
-        """The file of a warp, and the facts that its user needs beside it.
+    def encode(self, path: str, exact: Exact, options: Mapping[str, Any]) -> tuple[bytes, dict[str, Any]]:
+        """Return the file of a warp, and the facts that its user needs beside it.
 
         Raises:
-            CameraFileError: what the format cannot hold. ValueError: a bad option.
+            CameraFileError: If the format cannot hold the warp. ValueError, TypeError: If an option is bad.
         """
 
     def matches(self, path: str, content: bytes) -> bool:
@@ -57,22 +44,13 @@ class MapFormat(ABC):
         return bool(self.suffixes) and path.lower().endswith(self.suffixes)
 
     @abstractmethod
-    def decode(self, content: bytes, given: Options) -> LookupMap:
-        """Read a file. Any exception but an ImportError says that it is damaged."""
-
-
-def named_sizes(source: tuple[int, int], target: tuple[int, int]) -> dict[str, int]:
-    """`SIZES` of images (height, width)."""
-    return dict(zip(SIZES, (*source, *target), strict=True))
+    def decode(self, content: bytes, described: Mapping[str, Any]) -> LookupMap:
+        """Read a file, with its description. Any exception except an ImportError means that it is damaged."""
 
 
 def checked(name: str, size: Any) -> tuple[int, int]:
-    """The (height, width) that a map to read is for, as the file or its description says.
-
-    Raises:
-        ValueError: it is none.
-    """
-    sides = tuple(size) if isinstance(size, (tuple, list)) else ()
+    """Return the (height, width) that a file or its description says; raise a ValueError if it is none."""
+    sides = tuple(size)
     whole = all(isinstance(side, int) and 0 < side <= _LONGEST for side in sides)
     if len(sides) != 2 or not whole or sides[0] * sides[1] > MOST_PIXELS:
         raise ValueError(f"{name} {size!r:.60} is no (height, width) of a map; at most {MOST_PIXELS} pixels")

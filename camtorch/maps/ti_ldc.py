@@ -14,17 +14,16 @@ Technical reference manuals, e.g. SPRUJ28, "LDC Lens Distortion Back-Mapping" an
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
+from camtorch._arguments import as_image_size, as_whole
 from camtorch.io._errors import CameraFileError
 from camtorch.maps.exact import Exact, Floats
-from camtorch.maps.mesh import Mesh, held, rounded
-from camtorch.maps.protocol import Options
-from camtorch.maps.tables import Table, table
+from camtorch.maps.mesh import Mesh, Table, held, rounded, table
 
 _PARTS = 8
 _LOW, _HIGH = -(1 << 15), (1 << 15) - 1
@@ -41,35 +40,38 @@ class TILDC(Table):
 
     name = "ti_ldc"
     options: tuple[str, ...] = ("step", "block", "clip")
-    step = 8
-    steps: Sequence[int] = tuple(1 << m for m in range(8))
+    step, steps = 8, tuple(1 << m for m in range(8))
 
-    def pack(self, path: str, mesh: Mesh, exact: Exact, options: Options) -> tuple[bytes, dict[str, Any]]:
-        """Raises CameraFileError: sizes, offsets or padding that the LDC does not take. ValueError: a bad block."""
-        block = options.block
+    def encode(self, path: str, exact: Exact, options: Mapping[str, Any]) -> tuple[bytes, dict[str, Any]]:
+        if "step" in options:
+            as_whole(options["step"], "step", "save_map")
+        return super().encode(path, exact, options)
+
+    def pack(self, path: str, mesh: Mesh, exact: Exact, options: Mapping[str, Any]) -> tuple[bytes, dict[str, Any]]:
+        """See `Table`; raise a CameraFileError for sizes, offsets or padding that the LDC does not take."""
+        block = as_image_size(options.get("block"), "save_map", "block")
         if block is not None and (block[1] % 8 or block[0] % 2 or not all(0 < s <= _LONGEST_BLOCK for s in block)):
             raise ValueError(
-                "Warp.save: block=(height, width) must be of an even height and a width that is a multiple of 8, each "
+                "save_map: block=(height, width) must be of an even height and a width that is a multiple of 8, each "
                 f"at most {_LONGEST_BLOCK}; got {block}"
             )
         if max(*exact.source_size, *exact.target_size) > _LARGEST:
             raise CameraFileError(path, "size", f"a side above {_LARGEST} px, which the LDC does not take")
-        places = np.stack(np.meshgrid(mesh.columns, mesh.rows), -1)
+        (n, m), places = mesh.nodes.shape[:2], mesh.places
         limits = places + _LOW / _PARTS, places + _HIGH / _PARTS
-        mesh = held(path, self.name, mesh, *limits, clip=bool(options.clip))
+        mesh = held(path, self.name, mesh, *limits, clip=bool(options.get("clip")))
         parts = rounded(mesh, exact, _PARTS, *limits)
-        pitch = _pitch(len(mesh.columns))
-        lines = np.zeros((len(mesh.rows), pitch // 2), "<i2")
-        lines[:, : 2 * len(mesh.columns)] = (parts - places * _PARTS).reshape(len(mesh.rows), -1)
+        lines = np.zeros((n, _pitch(m) // 2), "<i2")
+        lines[:, : 2 * m] = (parts - places * _PARTS).reshape(n, -1)
         positions = replace(mesh, nodes=parts / _PARTS).positions(exact.target_size)
         size, padding, largest = _fetched(path, positions, exact.source_size, block)
-        facts = {"line_offset": pitch, "block_size": size, "pixel_padding": padding, "source_block": largest}
+        facts = {"line_offset": _pitch(m), "block_size": size, "pixel_padding": padding, "source_block": largest}
         return lines.tobytes(), facts
 
-    def unpack(self, content: bytes, columns: Floats, rows: Floats, given: Options) -> tuple[Floats, dict[str, Any]]:
-        lines = table(content, "<i2", (len(rows), _pitch(len(columns)) // 2))
-        offsets = lines[:, : 2 * len(columns)].reshape(len(rows), len(columns), 2) / _PARTS
-        return np.stack(np.meshgrid(columns, rows), -1) + offsets, {}
+    def unpack(self, content: bytes, blank: Mesh) -> Floats:
+        n, m = blank.nodes.shape[:2]
+        lines = table(content, "<i2", (n, _pitch(m) // 2))
+        return blank.places + lines[:, : 2 * m].reshape(n, m, 2) / _PARTS
 
 
 def _pitch(columns: int) -> int:

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, cast
+from typing import TYPE_CHECKING, Any, ClassVar, cast
 
 import numpy as np
 import torch
@@ -37,7 +36,6 @@ from camtorch.warp.shutter import InMotion, RollingShutter, Shutters
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-    from camtorch.maps.report import MapReport
 
 _SINGLE = 1e-3  # pixels: some ulps of a position in an image a thousand pixels wide, computed in float32
 
@@ -361,45 +359,6 @@ class Warp(GeometryModule):
             "antialias": None if self._decides else self.antialias,  # type: ignore[typeddict-item]
             "tolerance": self._tolerance,
         }
-
-    # -- for other runtimes
-
-    def save(
-        self,
-        path: str | os.PathLike[str],
-        format: str | None = None,
-        *,
-        step: int | None = None,
-        v: Literal["up", "down"] | None = None,
-        block: tuple[int, int] | None = None,
-        dtype: Literal["float32", "uint8"] | None = None,
-        clip: bool | None = None,
-    ) -> MapReport:
-        """Write where each pixel of the target is taken from, for another runtime, and measure what was written.
-
-        What the file holds is read back, interpolated as its runtime does, and compared with the exact positions, at
-        every pixel that shows the source's image. A map holds positions alone: mode, padding, fill and antialias are
-        the runtime's, but for "onnx", which holds all but the last.
-
-        Args:
-            path: of the file, replaced as a whole or not at all. Bare tables get a description beside them, PATH.json.
-            format: "opencv" (.yml, .npz), "opencv_fixed" (the same), "stmap" (.exr, .tif), "dw100", "ti_ldc",
-                "depthai", "obj" or "onnx"; by default what the suffix says.
-            step: pixels of the target between the nodes of a mesh: 16 by default for "depthai" and "obj", 8 for
-                "ti_ldc", where it is a power of two up to 128.
-            v: "stmap": "up", as Nuke has it and by default, or "down".
-            block: "ti_ldc": (height, width) of the blocks of the target; by default the largest that can be had.
-            dtype: "onnx": of the images, "float32" by default.
-            clip: "dw100", "ti_ldc": draw in positions that the format cannot hold, rather than refuse them.
-
-        Raises:
-            CameraFileError: a format that cannot hold this warp; it says why. ValueError: a batch of warps, an unknown
-                format, an option that it does not have. ImportError: a library that it needs is missing; the error
-                names the extra. OSError: the file cannot be written.
-        """
-        from camtorch.maps.formats import save_map  # all formats of maps: only when needed
-
-        return save_map(self, path, format, step=step, v=v, block=block, dtype=dtype, clip=clip)
 
     def __getstate__(self) -> dict[str, Any]:
         return {**super().__getstate__(), "_pinned": None}

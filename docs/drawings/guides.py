@@ -196,7 +196,7 @@ def maps() -> Image.Image:
         path = f"{folder}/map.bin"
         found = []
         for format, title in (("dw100", "DW100: every 16 px, in 1/16 px"), ("ti_ldc", "TI LDC: every 8 px, in 1/8 px")):
-            report = warp.save(path, format)
+            report = ct.save_map(warp, path, format)
             found.append(
                 (
                     f"{title}\n{report.max_error:.2f} px at most, rms {report.rms_error:.2f}",

@@ -79,24 +79,6 @@ def with_opencv(path, **_):
     return np.stack(maps[:2], -1)
 
 
-def with_ffmpeg(path, warp, v="up", **_):
-    av = pytest.importorskip("av")
-    with av.open(path) as file:
-        frame = next(file.decode(video=0))
-    assert frame.format.name.startswith("gbrpf32")
-    return from_uv(frame.to_ndarray()[..., :2], warp, v)
-
-
-def with_opencv_tiff(path, warp, v="up", **_):
-    return from_uv(cv2.imread(path, cv2.IMREAD_UNCHANGED)[..., :0:-1], warp, v)
-
-
-def from_uv(uv, warp, v):
-    height, width = warp.source.image_size
-    u, w = uv[..., 0].astype(float), uv[..., 1].astype(float)
-    return np.stack((u * width - 0.5, (1 - w if v == "up" else w) * height - 0.5), -1)
-
-
 def with_dw100(path, warp, **_):
     height, width = warp.target.image_size
     words = np.fromfile(path, "<u4").reshape(math.ceil(height / 16) + 1, math.ceil(width / 16) + 1)
@@ -117,59 +99,21 @@ def with_ti(path, warp, step=8, **_):
     return between(nodes, step, (height, width))
 
 
-def with_depthai(path, warp, step=16, **_):
-    height, width = warp.target.image_size
-    nodes = np.fromfile(path, "<f4").reshape(math.ceil(height / step) + 1, math.ceil(width / step) + 1, 2)
-    return between(nodes[..., ::-1], step, (height, width))
-
-
-def with_triangles(points, uv, triangles, warp):
-    """Every triangle filled by its own affine map."""
-    (height, width), (rows, columns) = warp.target.image_size, warp.source.image_size
-    found = np.full((height, width, 2), np.nan)
-    source = uv * (columns, rows) - 0.5
-    for corners in triangles:
-        a, b, c = points[corners]
-        low, high = points[corners].min(0), points[corners].max(0)
-        x, y = np.meshgrid(np.arange(int(low[0]), math.ceil(high[0])), np.arange(int(low[1]), math.ceil(high[1])))
-        weights = np.linalg.solve(np.stack((b - a, c - a), -1), np.stack((x.ravel(), y.ravel())) + 0.5 - a[:, None])
-        inside = (weights >= -1e-9).all(0) & (weights.sum(0) <= 1 + 1e-9)
-        value = np.stack((1 - weights.sum(0), *weights), -1) @ source[corners]
-        found[y.ravel()[inside], x.ravel()[inside]] = value[inside]
-    return found
-
-
-def with_obj(path, warp, **_):
-    lines = [line.split() for line in Path(path).read_text().splitlines()]
-    height = warp.target.image_size[0]
-    points = np.array([[float(x), height - float(y)] for kind, x, y, *_ in lines if kind == "v"])
-    uv = np.array([[float(u), 1 - float(v)] for kind, u, v, *_ in lines if kind == "vt"])
-    triangles = [[int(word.split("/")[0]) - 1 for word in line[1:]] for line in lines if line[0] == "f"]
-    assert all(word.split("/")[0] == word.split("/")[1] for line in lines if line[0] == "f" for word in line[1:])
-    return with_triangles(points, uv, np.array(triangles), warp)
-
-
 CASES = [
     ("map.yml", "opencv", {}, with_opencv, 2e-5),
     ("map.npz", "opencv", {}, with_opencv, 2e-5),
     ("map.yml", "opencv_fixed", {}, with_opencv, 0.0222),
     ("map.npz", "opencv_fixed", {}, with_opencv, 0.0222),
-    ("map.exr", "stmap", {}, with_ffmpeg, 2e-5),
-    ("map.exr", "stmap", {"v": "down"}, with_ffmpeg, 2e-5),
-    ("map.tif", "stmap", {}, with_opencv_tiff, 2e-5),
     ("map.bin", "dw100", {}, with_dw100, 0.5),
     ("map.bin", "ti_ldc", {}, with_ti, 0.2),
     ("map.bin", "ti_ldc", {"step": 16}, with_ti, 0.5),
-    ("map.bin", "depthai", {}, with_depthai, 0.5),
-    ("map.bin", "depthai", {"step": 8}, with_depthai, 0.2),
-    ("map.obj", "obj", {}, with_obj, 0.5),
 ]
 
 
 @pytest.mark.parametrize(("name", "format", "options", "decode", "most"), CASES)
 def test_what_another_decoder_reads_is_as_far_off_as_the_report_says(name, format, options, decode, most, tmp_path):
     warp, path = small(), str(tmp_path / name)
-    report = warp.save(path, format, **options)
+    report = ct.save_map(warp, path, format, **options)
     found = off(decode(path, warp=warp, **options), warp)
     assert float(found.max()) == pytest.approx(report.max_error, abs=1e-6)
     assert float(found.square().mean().sqrt()) == pytest.approx(report.rms_error, abs=1e-6)
@@ -186,7 +130,7 @@ def test_meshes_of_a_fisheye_are_as_near_as_their_fractions_allow(step, tmp_path
     """The panorama of 170 degrees, the hardest: an eighth of a pixel alone is off by 0.0884."""
     warp = ct.Dewarp(fisheye(), projection="cylindrical", fov=170)
     format, most = ("ti_ldc", 0.09) if step == 8 else ("dw100", 0.15)
-    assert warp.save(tmp_path / "map.bin", format).max_error <= most
+    assert ct.save_map(warp, tmp_path / "map.bin", format).max_error <= most
 
 
 # -- onnx
@@ -205,7 +149,7 @@ def test_meshes_of_a_fisheye_are_as_near_as_their_fractions_allow(step, tmp_path
 def test_onnx_runtime_makes_the_same_images(mode, padding, fill, dtype, tmp_path):
     lens = partial().source.float()
     warp = ct.Dewarp(lens, fov=149, image_size=(90, 160), mode=mode, padding_mode=padding, fill=fill, tolerance=0)
-    report = warp.save(tmp_path / "warp.onnx", dtype=None if dtype == "float32" else dtype)
+    report = ct.save_map(warp, tmp_path / "warp.onnx", dtype=None if dtype == "float32" else dtype)
     session = onnxruntime.InferenceSession(tmp_path / "warp.onnx", providers=["CPUExecutionProvider"])
     for batch in (1, 3):
         images = torch.rand(batch, 3, 176, 256, generator=torch.Generator().manual_seed(batch))
@@ -225,20 +169,20 @@ def test_onnx_runtime_makes_the_same_images(mode, padding, fill, dtype, tmp_path
 def test_onnx_refuses_what_runtimes_do_in_their_own_ways(tmp_path):
     camera = fisheye(0.25)
     with pytest.raises(ValueError, match="bicubic"):
-        ct.Dewarp(camera, mode="bicubic", padding_mode="border").save(tmp_path / "a.onnx")
+        ct.save_map(ct.Dewarp(camera, mode="bicubic", padding_mode="border"), tmp_path / "a.onnx")
     with pytest.raises(ValueError, match="antialias"):
-        ct.Dewarp(camera, antialias=True).save(tmp_path / "a.onnx")
+        ct.save_map(ct.Dewarp(camera, antialias=True), tmp_path / "a.onnx")
     with pytest.raises(ValueError, match="float16"):
-        ct.Dewarp(camera).save(tmp_path / "a.onnx", dtype="float16")
+        ct.save_map(ct.Dewarp(camera), tmp_path / "a.onnx", dtype="float16")
 
 
 # -- where rays end
 
 
-@pytest.mark.parametrize("name", ["map.npz", "map.exr", "map.onnx"])
+@pytest.mark.parametrize("name", ["map.npz", "map.onnx"])
 def test_pixels_without_a_ray_are_marked(name, tmp_path):
     warp = partial()
-    report = warp.save(tmp_path / name)
+    report = ct.save_map(warp, tmp_path / name)
     read = ct.load_map(tmp_path / name)
     assert 0.1 < report.shown / warp.valid_mask().numel() < 0.6
     assert report.shown == int(warp.valid_mask().sum())
@@ -249,11 +193,11 @@ def test_pixels_without_a_ray_are_marked(name, tmp_path):
     assert (read.grid()[0] == -9).all(-1).equal((warp.grid()[0] == -9).all(-1))
 
 
-@pytest.mark.parametrize("format", ["dw100", "ti_ldc", "depthai"])
+@pytest.mark.parametrize("format", ["dw100", "ti_ldc"])
 def test_meshes_go_on_where_rays_end(format, tmp_path):
     camera = partial().source
     warp = ct.Warp(camera, ct.KannalaBrandt([55.0, 55, 130, 80], image_size=(160, 256)).double(), tolerance=0)
-    report = warp.save(tmp_path / "map.bin", format)
+    report = ct.save_map(warp, tmp_path / "map.bin", format)
     assert report.stray > 0
     assert report.rms_error < (0.25 if format == "ti_ldc" else 1.0)  # lens and steps are of the same size
     assert report.max_error < 7
@@ -262,26 +206,14 @@ def test_meshes_go_on_where_rays_end(format, tmp_path):
     assert max(float(moved.diff(dim=dim).abs().max()) for dim in (0, 1)) < 20
 
 
-def test_triangles_that_show_nothing_are_left_out(tmp_path):
-    warp = partial()
-    report = warp.save(tmp_path / "map.obj", step=4)
-    read = ct.load_map(tmp_path / "map.obj")
-    drawn = ~read.positions[..., 0].isnan()
-    shown = warp.valid_mask()[0, 0]
-    assert (drawn | ~shown).all()
-    assert (drawn & ~shown).sum() < 0.1 * shown.sum()
-    assert report.triangles < 2 * (report.nodes[0] - 1) * (report.nodes[1] - 1)
-
-
 def test_a_seam_is_no_mesh(tmp_path):
     panorama = ct.Equirectangular([256 / math.tau, 256 / math.tau, 127.5, 63.5], image_size=(128, 256)).double()
     back = torch.tensor([[-1.0, 0, 0], [0, 1, 0], [0, 0, -1]]).double()
     view = ct.Pinhole.from_fov(60, image_size=(160, 200)).double()
     warp = ct.Warp(panorama, view, back)
-    for format in ("dw100", "obj"):
-        with pytest.raises(ct.CameraFileError, match="leap across"):
-            warp.save(tmp_path / "map.obj", format)
-    assert warp.save(tmp_path / "map.npz").max_error < 1e-4
+    with pytest.raises(ct.CameraFileError, match="leap across"):
+        ct.save_map(warp, tmp_path / "map.bin", "dw100")
+    assert ct.save_map(warp, tmp_path / "map.npz").max_error < 1e-4
 
 
 # -- what a format cannot hold
@@ -295,15 +227,17 @@ def upside_down():
 def test_positions_beyond_the_format_are_an_error_and_clipping_is_told(tmp_path):
     path = tmp_path / "map.bin"
     with pytest.raises(ct.CameraFileError, match=r"vertices: lie at x -1.0 .* dw100 does not hold.*clip=True"):
-        upside_down().save(path, "dw100")
+        ct.save_map(upside_down(), path, "dw100")
     assert not os.listdir(tmp_path)
-    report = upside_down().save(path, "dw100", clip=True)
+    report = ct.save_map(upside_down(), path, "dw100", clip=True)
     assert 0.5 < report.max_error < 2
     assert float(off(with_dw100(path, upside_down()), upside_down()).max()) == pytest.approx(report.max_error, abs=1e-6)
-    assert upside_down().save(path, "ti_ldc").max_error < 1e-9
+    assert ct.save_map(upside_down(), path, "ti_ldc").max_error < 1e-9
     wide = ct.Pinhole([2000.0, 2000, 6000, 119.5], image_size=(240, 8000)).double()
     with pytest.raises(ct.CameraFileError, match="ti_ldc does not hold"):
-        ct.Warp(wide, ct.Pinhole([2000.0, 2000, 160, 119.5], image_size=(240, 320)).double()).save(path, "ti_ldc")
+        ct.save_map(
+            ct.Warp(wide, ct.Pinhole([2000.0, 2000, 160, 119.5], image_size=(240, 320)).double()), path, "ti_ldc"
+        )
 
 
 def test_sizes_beyond_the_hardware_are_errors(tmp_path):
@@ -318,13 +252,13 @@ def test_sizes_beyond_the_hardware_are_errors(tmp_path):
         ((9, 32767), (17, 17), "opencv", "32767 px"),
     ):
         with pytest.raises(ct.CameraFileError, match=match):
-            warp(source, target).save(tmp_path / "map.npz", format)
+            ct.save_map(warp(source, target), tmp_path / "map.npz", format)
 
 
 @pytest.mark.parametrize("block", [None, (8, 32)])
 def test_blocks_with_their_padding_hold_what_they_need(block, tmp_path):
     warp = ct.Dewarp(fisheye(0.25), projection="equirectangular", image_size=(90, 160))
-    report = warp.save(tmp_path / "map.bin", "ti_ldc", block=block)
+    report = ct.save_map(warp, tmp_path / "map.bin", "ti_ldc", block=block)
     (height, width), padding = report.block_size, report.pixel_padding
     assert block in (None, (height, width))
     assert width % 8 == 0
@@ -348,8 +282,8 @@ def test_blocks_that_need_more_padding_than_there_is_are_refused(tmp_path):
     lens = ct.KannalaBrandt([60.0, 60, 319.5, 239.5], [0.0] * 4, image_size=(480, 640)).double()
     wide = ct.Warp(lens, ct.Pinhole([10.0, 10, 63.5, 63.5], image_size=(128, 128)).double(), tolerance=0)
     with pytest.raises(ct.CameraFileError, match=r"blocks of 128x128 need \d+ pixels .* smaller blocks"):
-        wide.save(tmp_path / "map.bin", "ti_ldc", block=(128, 128))
-    report = wide.save(tmp_path / "map.bin", "ti_ldc")
+        ct.save_map(wide, tmp_path / "map.bin", "ti_ldc", block=(128, 128))
+    report = ct.save_map(wide, tmp_path / "map.bin", "ti_ldc")
     assert report.block_size[0] <= 64
     assert report.pixel_padding <= 15
 
@@ -359,33 +293,35 @@ def test_blocks_that_need_more_padding_than_there_is_are_refused(tmp_path):
 
 def test_the_name_says_the_format_or_the_error_lists_them(tmp_path):
     warp = small()
-    for name, format in (("a.yaml", "opencv"), ("a.TIF", "stmap"), ("a.obj", "obj")):
-        assert warp.save(tmp_path / name).format == format
-    with pytest.raises(ValueError, match="does not say the format") as raised:
-        warp.save(tmp_path / "map.bin")
-    assert all(format in str(raised.value) for format in FORMATS)
-    with pytest.raises(ValueError, match="format: 'nvidia' is no format of a map"):
-        warp.save(tmp_path / "map.yml", "nvidia")
+    for name, format in (("a.yaml", "opencv"), ("a.NPZ", "opencv"), ("a.onnx", "onnx")):
+        assert ct.save_map(warp, tmp_path / name).format == format
+    for name, format, match in (
+        ("map.bin", None, "does not say the format"),
+        ("map.exr", None, "does not say the format"),
+        ("map.yml", "stmap", "format: 'stmap' is no format of a map"),
+    ):
+        with pytest.raises(ValueError, match=match) as raised:
+            ct.save_map(warp, tmp_path / name, format)
+        assert all(word in str(raised.value) for word in (*FORMATS, "docs/leaving-0.3.md"))
     with pytest.raises(ValueError, match=r"files of opencv are called \.yml"):
-        warp.save(tmp_path / "map.png", "opencv")
+        ct.save_map(warp, tmp_path / "map.png", "opencv")
 
 
 @pytest.mark.parametrize(
     ("format", "options", "match"),
     [
         ("opencv", {"step": 8}, "opencv has no step"),
-        ("ti_ldc", {"block": 32}, r"Warp.save: block must be two integers \(height, width\); got 32"),
+        ("ti_ldc", {"block": 32}, r"save_map: block must be two integers \(height, width\); got 32"),
         ("ti_ldc", {"step": 8.0}, r"step must be a whole number; got 8.0"),
         ("dw100", {"step": 8}, "dw100 has no step; it takes clip"),
         ("ti_ldc", {"step": 12}, "step must be one of"),
         ("ti_ldc", {"block": (8, 12)}, "multiple of 8"),
-        ("obj", {"step": 0}, "step must be 1"),
-        ("stmap", {"v": "left"}, "v must be 'up'"),
+        ("opencv", {"v": "up"}, "opencv has no v"),
     ],
 )
 def test_options_that_are_none_are_errors(format, options, match, tmp_path):
     with pytest.raises((ValueError, TypeError), match=match):
-        small().save(tmp_path / {"stmap": "map.exr", "obj": "map.obj"}.get(format, "map.npz"), format, **options)
+        ct.save_map(small(), tmp_path / "map.npz", format, **options)
 
 
 def test_one_warp_is_saved_whether_it_learns_or_not(tmp_path):
@@ -395,41 +331,41 @@ def test_one_warp_is_saved_whether_it_learns_or_not(tmp_path):
     pose = ct.Extrinsics([math.radians(125), 0.0, 0.0], [0.0, 1.0, 0.5]).double().requires_grad_(False)
     above = ct.BirdsEye(camera, pose, x=(-1, 1), y=(1, 2.5), resolution=0.02)
     for warp in (learning, above, ct.Dewarp(fisheye(0.25).float())):  # measured in float64
-        assert warp.save(tmp_path / "map.npz").max_error < 2e-5
+        assert ct.save_map(warp, tmp_path / "map.npz").max_error < 2e-5
     batch = ct.KannalaBrandt(camera.intrinsics.expand(2, 4), camera.distortion.expand(2, 4), image_size=(200, 320))
     with pytest.raises(ValueError, match="a batch of 2"):
-        ct.Dewarp(batch).save(tmp_path / "map.npz")
+        ct.save_map(ct.Dewarp(batch), tmp_path / "map.npz")
     single = ct.KannalaBrandt(camera.intrinsics[None], camera.distortion[None], image_size=(200, 320))
-    assert ct.Dewarp(single).save(tmp_path / "map.npz").max_error < 1e-4
+    assert ct.save_map(ct.Dewarp(single), tmp_path / "map.npz").max_error < 1e-4
 
 
 def test_a_warp_that_shows_nothing_is_an_error(tmp_path):
     camera = ct.Pinhole.from_fov(60, image_size=(160, 200)).double()
     back = torch.diag(torch.tensor([-1.0, 1, -1])).double()
     with pytest.raises(ValueError, match="no pixel of the target shows"):
-        ct.Warp(camera, camera, back).save(tmp_path / "map.npz")
+        ct.save_map(ct.Warp(camera, camera, back), tmp_path / "map.npz")
 
 
 def test_shutters_are_saved_but_for_their_blur(tmp_path):
     warp = ct.Warp(small().source, small().target, shutter=ct.RollingShutter(0.03, [1.0, -5.0, 4.0]))
-    assert warp.save(tmp_path / "map.npz").max_error < 1e-4
+    assert ct.save_map(warp, tmp_path / "map.npz").max_error < 1e-4
     assert off(ct.load_map(tmp_path / "map.npz").positions, warp).max() < 1e-4
     assert off(positions(small())[0], warp).max() > 1
     blurred = ct.Warp(warp.source, warp.target, target_shutter=ct.RollingShutter(0.0, [0.0, 5.0, 0.0], exposure=0.03))
     with pytest.raises(ValueError, match="blur of an exposure"):
-        blurred.save(tmp_path / "map.npz")
+        ct.save_map(blurred, tmp_path / "map.npz")
 
 
 def test_what_stood_there_stays_where_saving_fails(tmp_path):
     path = tmp_path / "map.bin"
-    small().save(path, "dw100")
+    ct.save_map(small(), path, "dw100")
     before = {name: (tmp_path / name).read_bytes() for name in sorted(os.listdir(tmp_path))}
     assert list(before) == ["map.bin", "map.bin.json"]
     with pytest.raises(ct.CameraFileError):
-        upside_down().save(path, "dw100")
+        ct.save_map(upside_down(), path, "dw100")
     (tmp_path / "other.bin.json").mkdir()  # the map has a place, its description none
     with pytest.raises(OSError, match="no ordinary file"):
-        small().save(tmp_path / "other.bin", "ti_ldc")
+        ct.save_map(small(), tmp_path / "other.bin", "ti_ldc")
     (tmp_path / "other.bin.json").rmdir()
     assert {name: (tmp_path / name).read_bytes() for name in sorted(os.listdir(tmp_path))} == before
 
@@ -438,7 +374,7 @@ def test_what_stood_there_stays_where_saving_fails(tmp_path):
 
 
 def test_bare_tables_have_a_description(tmp_path):
-    report = small().save(tmp_path / "map.bin", "ti_ldc", step=16)
+    report = ct.save_map(small(), tmp_path / "map.bin", "ti_ldc", step=16)
     described = json.loads((tmp_path / "map.bin.json").read_text())
     assert described["format"] == "ti_ldc"
     assert described["block_size"] == list(report.block_size)
@@ -472,12 +408,12 @@ def spoiled(content, random):
     return content + b"9" * 40
 
 
-@pytest.mark.parametrize("suffix", ["yml", "npz", "exr", "tif", "bin", "obj", "onnx"])
+@pytest.mark.parametrize("suffix", ["yml", "npz", "bin", "onnx"])
 @pytest.mark.filterwarnings("ignore")
 def test_spoiled_maps_are_one_kind_of_error(suffix, tmp_path):
     view = ct.Pinhole.from_fov(60, image_size=(40, 50)).double().requires_grad_(False)
     path = tmp_path / f"map.{suffix}"
-    ct.Warp(view, view).save(path, "ti_ldc" if suffix == "bin" else None)
+    ct.save_map(ct.Warp(view, view), path, "ti_ldc" if suffix == "bin" else None)
     content, random = path.read_bytes(), np.random.default_rng(0)
     for _ in range(10):
         path.write_bytes(spoiled(content, random))
@@ -490,7 +426,7 @@ def test_spoiled_maps_are_one_kind_of_error(suffix, tmp_path):
 
 @pytest.mark.parametrize("content", ["", "[]", '{"format": 3}', '{"format": "dw100", "source_height": -1}', "{" * 9999])
 def test_spoiled_descriptions_are_one_kind_of_error(content, tmp_path):
-    small().save(tmp_path / "map.bin", "dw100")
+    ct.save_map(small(), tmp_path / "map.bin", "dw100")
     (tmp_path / "map.bin.json").write_text(content)
     with pytest.raises(ct.CameraFileError):
         ct.load_map(tmp_path / "map.bin")
@@ -516,13 +452,13 @@ def test_the_command_writes_a_map_and_measures_one(folder, capsys):
     assert main(["map", "camera.json", "--fov", "60", "--check", "maps/ti.bin"]) == 0
     assert "off by at most 0." not in capsys.readouterr().out
     ct.save(ct.Pinhole.from_fov(50, image_size=(60, 80)), "view.json")
-    assert main(["map", "camera.json", "--target", "view.json", "-o", "a.exr", "--v", "down"]) == 0
+    assert main(["map", "camera.json", "--target", "view.json", "-o", "a.npz"]) == 0
     assert "80x60 from 320x200" in capsys.readouterr().out
 
 
 def test_masks_stay_bool_and_integers_whole(tmp_path):
     camera = ct.Pinhole([10.0, 10.0, 3.5, 3.5], image_size=(8, 8)).requires_grad_(False)
-    ct.Warp(camera, camera).save(tmp_path / "map.npz")
+    ct.save_map(ct.Warp(camera, camera), tmp_path / "map.npz")
     found = ct.load_map(tmp_path / "map.npz")
     mask = torch.arange(64).reshape(1, 1, 8, 8) % 3 == 0
     assert found(mask).equal(mask)
