@@ -178,11 +178,13 @@ def head_share(gaze: Tensor, head: Tensor, pose: Tensor | None = None) -> Tensor
     def from_ahead(rays: Tensor) -> Tensor:  # angles to the left and up
         x, side = rays[..., :1], rays[..., 1:]
         size = side.norm(dim=-1, keepdim=True)
-        return side * (torch.atan2(size, x) / size.clamp(min=1e-30))
+        angles: Tensor = side * (torch.atan2(size, x) / size.clamp(min=1e-30))
+        return angles
 
     eyes, nose = (from_ahead(in_car(rays, pose)) for rays in (gaze, -head[..., :3, 2]))
     square = eyes.square().sum(-1)
-    return torch.where(square > 1e-12, (eyes * nose).sum(-1) / square.clamp(min=1e-12), 0.0)
+    share: Tensor = torch.where(square > 1e-12, (eyes * nose).sum(-1) / square.clamp(min=1e-12), 0.0)
+    return share
 
 
 # -- learning

@@ -4,7 +4,8 @@ python examples/surround_view.py -o above.png
 """
 
 import argparse
-from typing import NamedTuple
+from functools import partial
+from typing import Any, NamedTuple
 
 import matplotlib.pyplot as plt
 import torch
@@ -17,14 +18,13 @@ import camtorch as ct
 
 X, Y = (-7.8, 7.8), (-10.2, 10.2)
 """Metres to the right of the car's middle, and ahead."""
-FADE = 1.0
-"""Metres over which a camera fades out before its view ends."""
+FADE = 1.0  # metres over which a camera fades out before its view ends
 
 
 def surround(rig: ct.Rig, resolution: float) -> tuple[list[ct.BirdsEye], Tensor]:
     """Return a warp per camera and weights (N, 1, H, W), which add up to 1 in each pixel that a camera sees."""
-    options = {"x": X, "y": Y, "resolution": resolution, "padding_mode": "border"}
-    eyes = [ct.BirdsEye(camera, rig.extrinsics[name], **options) for name, camera in rig.items()]
+    make = partial(ct.BirdsEye, x=X, y=Y, resolution=resolution, padding_mode="border")
+    eyes = [make(camera, rig.extrinsics[name]) for name, camera in rig.items()]
     weights, reach = torch.cat([eye.valid_mask() for eye in eyes]).float(), round(FADE / resolution)
     for _ in range(2):  # the mean around a pixel is one half at a straight edge: 0 there, 1 far inside
         mean = avg_pool2d(weights, 2 * reach + 1, stride=1, padding=reach, count_include_pad=False)
@@ -60,7 +60,7 @@ def study(size: tuple[int, int] = (800, 1280), resolution: float = 0.02, samples
 
 def draw(s: Study, output: str) -> None:
     """Draw what the four cameras see, and the ground with the car on it."""
-    layout = [["front", "right", "above"], ["rear", "left", "above"]]
+    layout: Any = [["front", "right", "above"], ["rear", "left", "above"]]
     figure, axes = plt.subplot_mosaic(layout, width_ratios=[1.6, 1.6, 1.53], figsize=(14.2, 6.1), layout="constrained")
     for name, image in {**s.images, "above": s.above}.items():
         axes[name].imshow(image.permute(1, 2, 0).clamp(0, 1).numpy(), extent=(*X, *Y) if name == "above" else None)

@@ -16,7 +16,7 @@ _LINE = 76  # characters of base64 in a line
 
 
 def as_storage(arrays: Arrays) -> bytes:
-    """What `cv2.FileStorage` reads: matrices as it writes them with WRITE_BASE64, and whole numbers."""
+    """Return what `cv2.FileStorage` reads: matrices as it writes them with WRITE_BASE64, and whole numbers."""
     parts = [b"%YAML:1.0\n---\n"]
     for key, value in arrays.items():
         if value.ndim == 0:
@@ -42,11 +42,7 @@ _END = re.compile(rb"^\S|\Z", re.MULTILINE)
 
 
 def from_storage(content: bytes) -> Arrays:
-    """The matrices of such a file, (rows, columns[, channels]), and the whole numbers.
-
-    Raises:
-        ValueError, KeyError: a matrix that is damaged, or of another type.
-    """
+    """Return the matrices of such a file, (rows, columns[, channels]), and the whole numbers; raise if damaged."""
     arrays = {found[1].decode(): np.array(int(found[2])) for found in _NUMBER.finditer(content)}
     for found in _MATRIX.finditer(content):
         end = _END.search(content, found.end())

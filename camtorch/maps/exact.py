@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from functools import cached_property
-
 import numpy as np
 import numpy.typing as npt
 import torch
@@ -20,12 +18,19 @@ class Exact:
     """Positions on the source's image by pixels of the target, as the cameras say: no lattice, nothing rounded.
 
     Args:
-        warp: a single one; what of it learns is taken as it is.
+        warp: a single one; the present values of parameters are used.
         owner: the function that needs it, for errors.
 
     Raises:
-        ValueError: a batch of warps, or one that blurs.
+        ValueError: If the warp is a batch, or blurs.
     """
+
+    positions: Floats
+    """(H', W', 2): x and y in pixels of the source for every pixel of the target; finite, on its image or off."""
+    mapped: Bools
+    """(H', W'): the pixel has a ray, and the source maps it, on its image or off."""
+    shown: Bools
+    """(H', W'): the pixel shows something of the source's image, as `Warp.valid_mask`."""
 
     def __init__(self, warp: Warp, owner: str):
         if not isinstance(warp, Warp):
@@ -45,46 +50,23 @@ class Exact:
         self.warp = warp
         self.source_size: tuple[int, int] = warp.source._size_for(owner)
         self.target_size: tuple[int, int] = warp.target._size_for(owner)
-        self._batch, self._device = warp.batch_shape, warp.target.intrinsics.device
         with torch.no_grad():
             self._back = warp.inverse()
+        height, width = self.target_size
+        self.positions, self.mapped = self.at(np.arange(float(width)), np.arange(float(height)))
+        outer = np.array(self.source_size[::-1]) - 0.5
+        self.shown = self.mapped & ((self.positions >= -0.5) & (self.positions <= outer)).all(-1)
 
     def at(self, columns: Floats, rows: Floats) -> tuple[Floats, Bools]:
-        """Positions of the pixels where columns (m,) and rows (n,) of the target cross; they may lie off its image.
-
-        Returns:
-            (n, m, 2), x and y in pixels of the source, finite; and (n, m): there is a ray, and the source maps it.
-        """
+        """Return positions (n, m, 2) and `mapped` (n, m) where columns (m,) and rows (n,) of the target cross."""
         positions, mapped = np.empty((len(rows), len(columns), 2)), np.empty((len(rows), len(columns)), np.bool_)
         step = max(_STRIP // max(len(columns), 1), 1)
         for top in range(0, len(rows), step):
             here = slice(top, top + step)
             grid = np.stack(np.meshgrid(columns, rows[here]), -1)
-            pixels = torch.from_numpy(grid).to(self._device).expand(*self._batch, *grid.shape)
+            pixels = torch.from_numpy(grid).to(self.warp.target.intrinsics.device)
             with torch.no_grad():
-                moved, valid = self._back._move(pixels)
+                moved, valid = self._back._move(pixels.expand(*self.warp.batch_shape, *grid.shape))
             positions[here] = moved.double().cpu().numpy().reshape(grid.shape)
             mapped[here] = valid.cpu().numpy().reshape(grid.shape[:-1])
         return positions, mapped
-
-    @cached_property
-    def _pixels(self) -> tuple[Floats, Bools]:
-        height, width = self.target_size
-        return self.at(np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64))
-
-    @property
-    def positions(self) -> Floats:
-        """(H', W', 2), of every pixel of the target."""
-        return self._pixels[0]
-
-    @property
-    def mapped(self) -> Bools:
-        """(H', W'): the pixel has a ray, and the source maps it, on its image or off."""
-        return self._pixels[1]
-
-    @cached_property
-    def shown(self) -> Bools:
-        """(H', W'): the pixel shows something of the source's image, as `Warp.valid_mask`."""
-        height, width = self.source_size
-        x, y = self.positions[..., 0], self.positions[..., 1]
-        return self.mapped & (x >= -0.5) & (x <= width - 0.5) & (y >= -0.5) & (y <= height - 0.5)

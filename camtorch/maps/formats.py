@@ -141,11 +141,7 @@ def files_of(path: str | os.PathLike[str], format: str | None = None) -> tuple[s
 
 
 def check_map(warp: Warp, path: str | os.PathLike[str], format: str | None = None) -> MapReport:
-    """Return how far a map that is there is from a warp; see `load_map`.
-
-    Raises:
-        ValueError: If it is between images of other sizes, and as `load_map`.
-    """
+    """Return how far a map that is there is from a warp; raise as `load_map`, and if it is between other sizes."""
     read = load_map(path, format)
     return measure(path_of(path, "check_map"), read, Exact(warp, "check_map"), (), read.facts)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -18,26 +19,21 @@ OUTSIDE = -9.0
 _FAR = 100.0  # positions beyond are drawn in, as by `Warp`: float32 does not hold all of them, nor do integers
 
 
+@dataclass(eq=False, repr=False)
 class LookupMap:
     """A map that was read from a file: where every pixel of the target is taken from.
 
     Meshes are interpolated as the hardware does. It is there to check a file, and to see what a runtime will make of
     an image; `Warp` is faster and more exact.
-
-    Args:
-        positions: (H', W', 2) float64, x and y in pixels of the source; NaN where the map draws nothing.
-        source_size: (height, width) of the images that it takes.
-        format: what it was read as.
-        facts: what the file or its description says beside, such as `step`, `nodes` or `block_size`.
     """
 
     positions: Tensor
+    """(H', W', 2) float64, x and y in pixels of the source; NaN where the map draws nothing."""
     source_size: tuple[int, int]
+    """(height, width) of the images that it takes."""
     format: str
     facts: dict[str, Any]
-
-    def __init__(self, positions: Tensor, source_size: tuple[int, int], format: str, facts: dict[str, Any]):
-        self.positions, self.source_size, self.format, self.facts = positions, source_size, format, facts
+    """What else the file or its description says, such as `step`, `nodes` or `block_size`."""
 
     @property
     def target_size(self) -> tuple[int, int]:
@@ -57,29 +53,23 @@ class LookupMap:
 
     def grid(self) -> Tensor:
         """(1, H', W', 2) float32, as of `Warp.grid`: for `grid_sample(..., align_corners=False)`, -9 for nothing."""
-        height, width = self.source_size
-        size = self.positions.new_tensor([width, height])
+        size = self.positions.new_tensor(self.source_size[::-1])
         grid = ((2 * self.positions + 1) / size - 1).nan_to_num(OUTSIDE, OUTSIDE, OUTSIDE)
         return grid.clamp(-_FAR, _FAR).float()[None]
 
     def valid_mask(self) -> Tensor:
         """(1, 1, H', W') bool: the pixel shows something of the source's image."""
-        height, width = self.source_size
-        x, y = self.positions.unbind(-1)  # NaN is nowhere
-        return ((x >= -0.5) & (x <= width - 0.5) & (y >= -0.5) & (y <= height - 0.5))[None, None]
+        outer = self.positions.new_tensor(self.source_size[::-1]) - 0.5
+        return ((self.positions >= -0.5) & (self.positions <= outer)).all(-1)[None, None]  # NaN is nowhere
 
     def __call__(self, images: Tensor, mode: str = "bilinear", padding_mode: str = "zeros") -> Tensor:
         """Apply it to images (B, C, H, W) of the source's size, floating point, integer or bool; the dtype stays.
 
         Integers are exact up to 2^53.
-
-        Args:
-            images: of the source.
-            mode: "nearest", "bilinear" or "bicubic".
-            padding_mode: "zeros", "border" or "reflection".
+        `mode` is "nearest", "bilinear" or "bicubic", `padding_mode` "zeros", "border" or "reflection".
 
         Raises:
-            ValueError: another shape or size.
+            ValueError: If the images have another shape or size.
         """
         size = self.source_size
         if not isinstance(images, Tensor) or images.is_complex() or images.is_sparse or images.shape[2:] != size:
@@ -98,7 +88,7 @@ class LookupMap:
         nothing and the warp does, it is infinite.
 
         Raises:
-            ValueError: the warp is between images of other sizes.
+            ValueError: If the warp is between images of other sizes.
         """
         return self._off(Exact(warp, "LookupMap.error"))
 
@@ -109,8 +99,7 @@ class LookupMap:
                 f"LookupMap.error: the map is from images of (height, width) {mine[0]} to {mine[1]}, the warp from "
                 f"{wanted[0]} to {wanted[1]}"
             )
-        height, width = self.source_size
-        limits = self.positions.new_zeros(2), self.positions.new_tensor([width - 1.0, height - 1.0])
+        limits = self.positions.new_zeros(2), self.positions.new_tensor(self.source_size[::-1]) - 1
         off = self.positions.clamp(*limits) - torch.from_numpy(exact.positions).clamp(*limits)
         distance = torch.hypot(*off.unbind(-1)).nan_to_num(math.inf)
         return torch.where(torch.from_numpy(exact.shown), distance, math.nan)

@@ -42,8 +42,8 @@ class Mesh:
 
     def positions(self, size: tuple[int, int]) -> Floats:
         """Return the position (H', W', 2) of each pixel of a target of that size."""
-        (i, s), (j, t) = (divmod(np.arange(side), self.step) for side in size)
-        s, t = (s / self.step)[:, None, None], (t / self.step)[:, None]
+        (i, down), (j, across) = (divmod(np.arange(side), self.step) for side in size)
+        s, t = (down / self.step)[:, None, None], (across / self.step)[:, None]
         lines = self.nodes[i] * (1 - s) + self.nodes[i + 1] * s
         between: Floats = lines[:, j] * (1 - t) + lines[:, j + 1] * t
         return between
@@ -126,10 +126,7 @@ def mesh_of(path: str, exact: Exact, step: int) -> Mesh:
 def _leaps(exact: Exact) -> int:
     """Count the shown pixels that are half the source away from a shown neighbour."""
     half, count = np.array(exact.source_size[::-1], np.float64) / 2, 0
-    for p, shown in (
-        (exact.positions, exact.shown),
-        (exact.positions.swapaxes(0, 1), exact.shown.T),
-    ):
+    for p, shown in ((exact.positions, exact.shown), (exact.positions.swapaxes(0, 1), exact.shown.T)):
         count += int(((np.abs(np.diff(p, axis=0)) > half).any(-1) & shown[1:] & shown[:-1]).sum())
     return count
 

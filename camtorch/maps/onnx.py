@@ -7,7 +7,6 @@ too, but for a panorama of a whole turn, which GridSample ends at its edges; ali
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Mapping
 from types import ModuleType
 from typing import Any
@@ -74,21 +73,14 @@ def _model(exact: Exact, dtype: str) -> Any:
         grid = warp.grid().float().cpu().numpy()  # what the warp itself samples by
     mapped = ~(grid == OUTSIDE).all(-1)
     fill = np.array(warp.fill, np.float32).reshape(1, -1, 1, 1)
-    constants = {
-        "grid": grid,
-        "planes": np.array([1, -1, height, width], np.int64),
-        "target_size": np.array(exact.target_size, np.int64),
-        "first": np.array([0], np.int64),
-        "third": np.array([2], np.int64),
-    }
+    shapes = {"planes": [1, -1, height, width], "target_size": exact.target_size, "first": [0], "third": [2]}
+    constants = {"grid": grid, **{name: np.array(shape, np.int64) for name, shape in shapes.items()}}
     nodes: list[Any] = []
-    names = (f"step{i}" for i in itertools.count())
 
     def add(kind: str, *inputs: str, **attributes: Any) -> str:
-        """A node, and the name of what it makes."""
-        output = next(names)
-        nodes.append(helper.make_node(kind, list(inputs), [output], **attributes))
-        return output
+        """Add a node, and return the name of its output."""
+        nodes.append(helper.make_node(kind, list(inputs), [f"step{len(nodes)}"], **attributes))
+        return f"step{len(nodes) - 1}"
 
     images = add("Cast", "images", to=kinds.FLOAT) if dtype == "uint8" else "images"
     blended = warp.padding_mode == "zeros" and bool(fill.any())  # the rim fades to the fill, not to zero

@@ -34,7 +34,7 @@ class MapReport:
     files: tuple[str, ...]
     """What was written: the map, and beside a bare table its description."""
     facts: dict[str, Any]
-    """What whoever uses the map has to know beside, such as `step`, `nodes`, `block_size` or `v`."""
+    """What whoever uses the map has to know beside, such as `step`, `nodes` or `block_size`."""
 
     def __getattr__(self, name: str) -> Any:
         # a fact is an attribute
@@ -58,10 +58,9 @@ class MapReport:
 
 
 def measure(path: str, read: LookupMap, exact: Exact, files: tuple[str, ...], facts: dict[str, Any]) -> MapReport:
-    """The report on a map that was read back."""
-    off = read._off(exact)
-    error = off[~off.isnan()]
-    shown = torch.from_numpy(exact.shown)
+    """Return the report on a map that was read back."""
+    off, shown = read._off(exact), torch.from_numpy(exact.shown)
+    error = off[shown]
     return MapReport(
         path=path,
         format=read.format,

@@ -82,18 +82,14 @@ def _pitch(columns: int) -> int:
 def _fetched(
     path: str, positions: Floats, source: tuple[int, int], block: tuple[int, int] | None
 ) -> tuple[tuple[int, int], int, tuple[int, int]]:
-    """The size of a block of the target, the padding that it needs, and the largest part of the source fetched.
-
-    Raises:
-        CameraFileError: more padding than the hardware has.
+    """Return the size of a block of the target, the padding that it needs, and the largest part of the source fetched;
+    raise a CameraFileError if that is more padding than the hardware has.
     """
     drawn = positions.clip(0, np.array(source[::-1], np.float64) - 1)
-    padding = -1
     for size in _BLOCKS if block is None else (block,):
         padding, largest = _padding(drawn, size)
         if padding <= _MOST_PADDING:
             return size, padding, largest
-    size = _BLOCKS[-1] if block is None else block
     raise CameraFileError(
         path,
         "pixel padding",
