@@ -25,10 +25,8 @@ def add_all(commands: Commands) -> None:
 
 
 def uses_processes(arguments: argparse.Namespace) -> bool:
-    """Whether a command may be one on many files, for which processes are to be started early."""
-    if getattr(arguments, "jobs", 1) == 1 or arguments.dry_run:
-        return False
-    return are_several(arguments.image) if arguments.command == "dewarp" else arguments.dataset is not None
+    """Whether a command may be one on many files, for which processes are started early."""
+    return arguments.command == "dewarp" and arguments.jobs != 1 and are_several(arguments.image)
 
 
 def are_several(names: list[str]) -> bool:
@@ -51,9 +49,13 @@ def _dewarp(commands: Commands) -> None:
     _photograph(command)
     text = "the new image, dewarped.png by default; OUT/, a folder, where there are several"
     add("-o", "--output", type=words.raw_path, metavar="OUT", help=text)
-    _force(add)
+    if_there = command.add_mutually_exclusive_group().add_argument
+    _force(if_there)
+    if_there("--resume", action="store_true", help="make only what OUT/ does not hold yet, as after a broken run")
+    many = command.add_argument_group("many files").add_argument
+    many("--jobs", type=words.count(1024), metavar="N", help="processes; by default as many as there are cores")
     text = "of new images or videos; by default those of the old ones"
-    _many_files(command)("--suffix", type=words.suffix, metavar=".EXT", help=text)
+    many("--suffix", type=words.suffix, metavar=".EXT", help=text)
     video = command.add_argument_group("videos (pip install 'camtorch[video]')").add_argument
     codecs = ("libx264", "libvpx-vp9", "ffv1")
     video("--codec", choices=codecs, help="the encoder; libx264 by default, in .webm libvpx-vp9; ffv1 loses nothing")
@@ -234,15 +236,3 @@ def _output(add: Add, default: str | None, text: str = "the new image") -> None:
 
 def _force(add: Add) -> None:
     add("--force", action="store_true", help="overwrite OUT if it exists")
-
-
-def _many_files(command: argparse.ArgumentParser) -> Add:
-    """How many files are worked on; what is returned adds more of this."""
-    add = command.add_argument_group("many files").add_argument
-    add("--jobs", type=words.count(1024), metavar="N", help="processes; by default as many as there are cores")
-    text = "go on where a run was broken off; what is done and unchanged is kept"
-    add("--resume", action="store_true", help=text)
-    text = "only the I-th of N parts, as 1/4; processes of torchrun and srun know theirs"
-    add("--shard", type=words.shard, metavar="I/N", help=text)
-    add("--dry-run", action="store_true", help="print what would be done")
-    return add

@@ -1,23 +1,26 @@
-"""The command `camtorch dewarp`: photographs and videos without their lens's distortion."""
+"""The command `camtorch dewarp`: photographs and videos without their lens's distortion, one or many."""
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import torch
 
-from camtorch import __version__
+from camtorch import _photographs
 from camtorch.camera import Camera
-from camtorch.cli import cameras, images, many, targets, videos
+from camtorch.cli import cameras, images, processes, targets, videos
 from camtorch.cli.commands import are_several
-from camtorch.cli.terminal import bar
-from camtorch.jobs import inputs, items
-from camtorch.jobs.items import Item
-from camtorch.jobs.run import Account, Report
+from camtorch.cli.processes import Outcome, Pair
+from camtorch.cli.targets import IMAGES
+from camtorch.cli.terminal import bar, note, say
+from camtorch.io.writing import all_left_over
 from camtorch.warp.dewarp import Dewarp, Projection
 from camtorch.warp.warp import Warp
 
@@ -25,12 +28,12 @@ _SLASHES = ("/", os.sep)
 _CALIBRATIONS = (".yml", ".yaml", ".json", ".xml")
 _TOLERANCE = 0.001  # pixels that nobody sees, for a lattice of positions also where a calibration is in float64
 _MOST_KEPT = 4  # warps of images of different sizes
-_MUCH = 0.6  # of a photograph: where a dewarped one shows less, it is said what shows more
+_MUCH = 0.6  # of a photograph: where a dewarped one shows less, a hint names what shows more
 
 
 @dataclass
 class Dewarping:
-    """Makes one item; a `camtorch.jobs.items.Work`. The map is computed once for each size of image."""
+    """Makes one file of another. The map is computed once for each size of image."""
 
     camera: Camera
     """Of a known size."""
@@ -44,18 +47,11 @@ class Dewarping:
     encoder: videos.Encoder
     _warps: dict[tuple[int, int], tuple[Dewarp, dict[str, Any]]] = field(default_factory=dict)
 
-    def settings(self) -> dict[str, Any]:
-        """All that outputs depend on; JSON."""
-        names = ("rescale", "projection", "fov", "image_size")
-        settings = {"camtorch": __version__, "camera": cameras.settings_of(self.camera), **vars(self.encoder)}
-        return settings | {name: getattr(self, name) for name in names}
-
-    def __call__(self, item: Item, **options: Any) -> dict[str, Any]:
-        """What the new camera is; options are those of `videos.remake`."""
-        (source,), (target,) = item.inputs, item.outputs
+    def __call__(self, source: Path, target: Path, **options: Any) -> dict[str, Any]:
+        """Return facts about the new camera; options are those of `videos.remake`."""
         if videos.is_video(source):
             return videos.remake(source, target, lambda size: self._warp(source, size), self.encoder, **options)
-        image, orientation = images.read_stored(source)
+        image, orientation = _photographs.read_stored(source)
         rows, columns = image.shape[-2:]
         warp, facts = self._warp(source, (rows, columns))
         with torch.no_grad():
@@ -65,7 +61,7 @@ class Dewarping:
         return facts
 
     def warp_of(self, camera: Camera) -> Dewarp:
-        """That of images of a camera."""
+        """Return the warp of images of a camera."""
         return Dewarp(
             camera, projection=self.projection, fov=self.fov, image_size=self.image_size, tolerance=_TOLERANCE
         )
@@ -81,8 +77,8 @@ class Dewarping:
 
 @torch.no_grad()
 def _facts(warp: Dewarp) -> dict[str, Any]:
-    """What is to be known of new images: of 64 x 64 places in them how many show something, `filled`; and how many of
-    as many in the old one they show, `shown`.
+    """Return facts about new images: which part of 64 x 64 places in them shows something, `filled`; and which part of
+    as many in the old image they show, `shown`.
     """
     source, target = warp.source, warp.target
     part = torch.tensor([source.width / 64, source.height / 64])
@@ -103,7 +99,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Carry it out."""
     if are_several(arguments.image) or (arguments.output or "").endswith(_SLASHES):
         return _many(arguments)
-    for name in ("resume", "shard", "suffix"):
+    for name in ("resume", "suffix"):
         if getattr(arguments, name):
             raise ValueError(f"--{name} is for folders: -o OUT/, with a slash, puts the new one into one")
     _single(arguments, Path(arguments.image[0]))
@@ -114,63 +110,123 @@ def _single(arguments: argparse.Namespace, source: Path) -> None:
     is_video = videos.is_video(source)
     output = Path(arguments.output or f"dewarped{videos.written_suffix(source) if is_video else '.png'}")
     targets.check(output, force=arguments.force, inputs=(source, arguments.camera))
-    (videos if is_video else images).check_kind(output)
+    _writer(source).check_kind(output)
     if not source.exists():
         raise ValueError(f"{source}: no such file")
     work = _dewarping(arguments, [source])
-    if arguments.dry_run:
-        print(f"{source} -> {output}")
-        return
-    item = Item((source,), (output,))
     if is_video:
         with bar("dewarping", videos.count_of(source), "frames") as shown:
-            facts = work(item, done=shown.update)
+            facts = work(source, output, done=shown.update)
         end = f", {facts['frames']} frames"
     else:
-        facts = work(item)
+        facts = work(source, output)
         end = f" and shows {100 * facts['shown']:.0f} % of the photograph"
         if facts["shown"] < _MUCH and arguments.projection == "perspective" and arguments.fov is None:
             end += "; --projection stereographic or cylindrical shows more, and --fov says how much"
-    print(f"{output}: {_told(arguments, facts)}{end}")
+    print(f"{output}: {_described(arguments, facts)}{end}")
 
 
 def _many(arguments: argparse.Namespace) -> int:
-    known = inputs.IMAGES | videos.FORMATS
+    """Make all files, and print what became of them; return the exit status, 1 if any failed."""
+    output = _folder(arguments)
+    pairs = [(path, _target(path, output / place, arguments.suffix)) for path, place in _found(arguments, output)]
+    others = [arguments.camera] if arguments.camera else []
+    todo = targets.to_make(pairs, others, resume=arguments.resume, force=arguments.force)
+    work = _dewarping(arguments, [source for source, _ in pairs])
+    outcomes = _outcomes(work, todo, arguments)
+    for line, names in _notes(outcomes).items():
+        note(f"{names[0]}: {line}" if len(names) == 1 else f"{names[0]} and {len(names) - 1} more: {line}")
+    failed = [source for source, _ in todo if outcomes[source].failure]
+    for source in failed:
+        say(f"error: {source}: {_without(source, outcomes[source].failure)}")
+    facts = [{**one.facts, "frames": 0} for one in outcomes.values() if not one.failure]
+    alike = facts and all(one == facts[0] for one in facts)
+    parts = [f"{len(facts)} of {len(pairs)} files made" + (f", {_described(arguments, facts[0])}" if alike else "")]
+    parts += [f"{len(pairs) - len(todo)} were there already"] if len(pairs) > len(todo) else []
+    parts += [f"{len(failed)} failed"] if failed else []
+    print(f"{output}: {'; '.join(parts)}")
+    return 1 if failed else 0
+
+
+def _folder(arguments: argparse.Namespace) -> Path:
+    """Return the folder of outputs."""
     if any(Path(name).suffix.lower() in _CALIBRATIONS for name in arguments.image):
         raise ValueError(
             f"{' '.join(arguments.image)}: all of them are taken for images; --camera names the calibration, and -o "
             "the new image: camtorch dewarp photo.jpg --camera camera.yml -o straight.png"
         )
-    output, shard = many.output_folder(arguments.output), many.shard_of(arguments)
-    if not output.exists() and not arguments.output.endswith(_SLASHES) and output.suffix.lower() in known:
-        raise ValueError(f"{output}: is the name of one file, but there may be several; -o OUT/ names a folder")
-    found, suffix = inputs.find(arguments.image, known, output), arguments.suffix
-    everything = list[Item]()
-    for path, place in found:
-        target, is_video = output / place, videos.is_video(path)
-        if is_video:
-            target = target.with_suffix(videos.written_suffix(path))
-        if suffix is not None and is_video == videos.is_video(Path("any" + suffix)):
-            target = target.with_suffix(suffix)
-        (videos if is_video else images).check_kind(target)
-        everything.append(Item((path,), (target,)))
-    items.check(everything, [arguments.camera] if arguments.camera else [])
-    work = _dewarping(arguments, [path for path, _ in found])
-
-    def told(report: Report) -> str:
-        facts = [{**result, "frames": 0} for result in report.results]
-        return f", {_told(arguments, facts[0])}" if facts and all(one == facts[0] for one in facts) else ""
-
-    return many.carry_out(
-        shard.of(everything), work, Account(output, "dewarp", work.settings(), shard), arguments, told
-    )
+    if arguments.output is None:
+        raise ValueError("into which folder? -o OUT/ names it, for several images or a folder of them")
+    path = Path(arguments.output)
+    if os.path.lexists(path) and not path.is_dir():
+        raise ValueError(f"{path}: is no folder, which -o names for several images or a folder of them")
+    is_file = path.suffix.lower() in IMAGES | videos.FORMATS and not arguments.output.endswith(_SLASHES)
+    if is_file and not path.exists():
+        raise ValueError(f"{path}: is the name of one file, but there may be several; -o OUT/ names a folder")
+    return path
 
 
-def _dewarping(arguments: argparse.Namespace, sources: list[Path]) -> Dewarping:
-    """What is done to each; the camera is of the size of the first image where its file states none."""
-    camera = cameras.read_for_many(
-        sources, lambda one: (videos if videos.is_video(one) else images).size_of(one), arguments
-    )
+def _found(arguments: argparse.Namespace, output: Path) -> list[tuple[Path, Path]]:
+    return targets.find(arguments.image, IMAGES | videos.FORMATS, output)
+
+
+def _writer(source: Path) -> ModuleType:
+    """Return the module that writes what is made of a file."""
+    return videos if videos.is_video(source) else images
+
+
+def _target(source: Path, target: Path, suffix: str | None) -> Path:
+    """Return `target` with the suffix of what is made of a file."""
+    is_video = videos.is_video(source)
+    if is_video:
+        target = target.with_suffix(videos.written_suffix(source))
+    if suffix is not None and is_video == videos.is_video(Path("any" + suffix)):
+        target = target.with_suffix(suffix)
+    _writer(source).check_kind(target)
+    return target
+
+
+def _outcomes(work: Dewarping, todo: Sequence[Pair], arguments: argparse.Namespace) -> dict[Path, Outcome]:
+    """Make files, and return what became of them by their sources."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    count = max(min(arguments.jobs or cores, len(todo)), 1)
+    outcomes: dict[Path, Outcome] = {}
+    _remove_left_over(todo)
+    try:
+        with bar("dewarp", len(todo), "files") as shown:
+            for (source, _), outcome in processes.each(work, todo, count):
+                outcomes[source] = outcome
+                shown.update()
+    except ChildProcessError as error:
+        raise ValueError(f"{error}; --resume goes on where it was broken off, --jobs 1 needs the least") from None
+    finally:
+        _remove_left_over(todo)
+    return {source: outcomes[source] for source, _ in todo}
+
+
+def _remove_left_over(todo: Sequence[Pair]) -> None:
+    """Remove the halves of files that a process which was killed left beside outputs."""
+    for path in all_left_over(os.path.realpath(target) for _, target in todo):
+        with contextlib.suppress(OSError):
+            os.unlink(path)
+
+
+def _notes(outcomes: dict[Path, Outcome]) -> dict[str, list[Path]]:
+    """Return notes without the names of files, with the files that they are about."""
+    notes: dict[str, list[Path]] = {}
+    for source, outcome in outcomes.items():
+        for text in outcome.notes:
+            notes.setdefault(_without(source, text), []).append(source)
+    return notes
+
+
+def _without(source: Path, text: str) -> str:
+    return text.removeprefix(str(source)).lstrip(": ")
+
+
+def _dewarping(arguments: argparse.Namespace, sources: Sequence[Path]) -> Dewarping:
+    """Return what is done to each; the camera gets the size of the first image if its file states none."""
+    camera = cameras.read_for_many(sources, _size_of, arguments)
     if any(map(videos.is_video, sources)):
         videos.require()
     encoder = videos.Encoder(arguments.codec, arguments.crf)
@@ -178,11 +234,15 @@ def _dewarping(arguments: argparse.Namespace, sources: list[Path]) -> Dewarping:
         camera, arguments.camera, arguments.rescale, arguments.projection, arguments.fov, arguments.size, encoder
     )
     if camera.image_size is not None:
-        work.warp_of(camera)  # what is wrong with it is so for all
+        work.warp_of(camera)  # an error of the options is one of all files
     return work
 
 
-def _told(arguments: argparse.Namespace, facts: dict[str, Any]) -> str:
+def _size_of(source: Path) -> tuple[int, int] | None:
+    return videos.size_of(source) if videos.is_video(source) else _photographs.size_of(source)
+
+
+def _described(arguments: argparse.Namespace, facts: dict[str, Any]) -> str:
     fx, fy, cx, cy = facts["intrinsics"]
     return (
         f"{facts['model']} dewarped to {arguments.projection}, {facts['degrees']:.1f} degrees wide, "

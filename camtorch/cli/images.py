@@ -1,4 +1,4 @@
-"""Image files as tensors and back, by Pillow, without surprises."""
+"""Image files written from tensors, by Pillow."""
 
 from __future__ import annotations
 
@@ -10,41 +10,32 @@ from torch import Tensor
 
 from camtorch._arguments import warn
 from camtorch._photographs import ORIENTATION, ImageFileError
-from camtorch._photographs import read_stored as read_stored
-from camtorch._photographs import size_of as size_of
-from camtorch.cli import targets
+from camtorch.cli.targets import IMAGES
 from camtorch.io.writing import replacing
-from camtorch.jobs.inputs import IMAGES
 
 _KEEP_ORIENTATION = ("JPEG", "PNG", "TIFF", "WEBP")
 
 
-def check_target(path: Path, *, force: bool, inputs: tuple[Path | None, ...] = ()) -> None:
-    """Refuse before the work what could not be written after it: see `targets.check` and `check_kind`."""
-    targets.check(path, force=force, inputs=inputs)
-    check_kind(path)
-
-
 def check_kind(path: Path) -> None:
-    """Refuse, by an ImageFileError, a name of no file type that images are written as."""
+    """Raise an ImageFileError if the name is of no file type that images are written as."""
     if path.suffix.lower() not in IMAGES:
         what = path.suffix or "no suffix"
         raise ImageFileError(f"{path}: {what}: no image is written as that; try {', '.join(sorted(IMAGES))}")
 
 
 def from_tensor(image: Tensor) -> Image.Image:
-    """A Pillow image of (C, H, W) uint8 or (1, H, W) uint16."""
+    """Return a Pillow image of (C, H, W) uint8 or (1, H, W) uint16."""
     pixels = image.permute(1, 2, 0).contiguous().numpy()
     return Image.fromarray(pixels[..., 0] if pixels.shape[-1] == 1 else pixels)
 
 
 def write(path: Path, image: Image.Image, *, orientation: int | None = None, synced: bool = True) -> None:
-    """Write a Pillow image, whole or not at all; folders that lack are made; `synced` as of `replacing`.
+    """Write a Pillow image, whole or not at all, and the folders that lack; `synced` as of `replacing`.
 
-    A warning says where the file type does not hold the Exif orientation of the image it was made of.
+    It warns if the file type does not hold the Exif orientation of the original.
 
     Raises:
-        ImageFileError: the file type does not take such pixels, or the disk does not take the file.
+        ImageFileError: If the file type does not take such pixels, or the disk does not take the file.
     """
     kind = Image.registered_extensions()[path.suffix.lower()]
     options: dict[str, Any] = {"quality": 95}

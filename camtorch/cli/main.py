@@ -1,6 +1,6 @@
-"""The command line `camtorch`: how a command is carried out, and how errors are told.
+"""The command line `camtorch`: how a command is carried out, and how errors are shown.
 
-What a command needs is imported when it runs: torch takes a second, which `--help` and a wrong option do without.
+The modules of a command are imported when it runs: torch takes a second, which `--help` and a wrong option save.
 """
 
 from __future__ import annotations
@@ -15,9 +15,8 @@ from collections.abc import Sequence
 from typing import Any, NoReturn
 
 from camtorch import __version__
-from camtorch.cli import commands
-from camtorch.cli.terminal import note, say, shown
-from camtorch.jobs import processes
+from camtorch.cli import commands, processes
+from camtorch.cli.terminal import lacks_memory, note, reason, say, shown
 from camtorch.native import library
 
 _INTERRUPT, _PIPE = 128 + 2, 128 + 13  # as shells number signals
@@ -28,14 +27,16 @@ class _Parser(argparse.ArgumentParser):
         super().__init__(allow_abbrev=False, **options)
 
     def error(self, message: str) -> NoReturn:
-        name = message.partition("unrecognized arguments: ")[2].split(" ")[0]
-        is_new = os.path.splitext(name)[1] and not name.startswith("-") and not os.path.exists(name)
-        hint = f"; -o {name} names what is written" if is_new else ""
-        raise ValueError(f"{message}{hint} (see {self.prog} --help)")
+        name, hint = message.partition("unrecognized arguments: ")[2].split(" ")[0], f"see {self.prog} --help"
+        if os.path.splitext(name)[1] and not name.startswith("-") and not os.path.exists(name):
+            message += f"; -o {name} names what is written"
+        elif name.startswith("-") or message.startswith("argument COMMAND: invalid choice"):
+            hint += "; commands and options of 0.3 that are gone: docs/leaving-0.3.md"
+        raise ValueError(f"{message} ({hint})")
 
 
 class _Version(argparse.Action):
-    """Of what a result depends on, read where it is installed: nothing of it is imported for that."""
+    """Prints the versions on which results depend, without importing what has them."""
 
     def __call__(self, *_: object) -> NoReturn:
         try:
@@ -50,8 +51,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line `argv`, by default the process's own.
 
     Returns:
-        The exit status: 0; 1 where some of many files failed; 2 after an error, which is one line on stderr; 130 after
-        an interrupt; 141 where nobody reads what is printed.
+        The exit status: 0; 1 if some of many files failed; 2 after an error, which is one line on stderr; 130 after an
+        interrupt; 141 if nobody reads what is printed.
     """
     try:
         arguments = make_parser().parse_args(argv)
@@ -73,15 +74,15 @@ def main(argv: Sequence[str] | None = None) -> int:
         say("interrupted")
         return _INTERRUPT
     except Exception as error:
-        if not (isinstance(error, (ValueError, ImportError, OSError)) or processes.lacks_memory(error)):
+        if not (isinstance(error, (ValueError, ImportError, OSError)) or lacks_memory(error)):
             raise
-        say(f"error: {processes.reason(error)}")
+        say(f"error: {reason(error)}")
         return 2
     return status
 
 
 def make_parser() -> argparse.ArgumentParser:
-    """The command's options, from which the page of commands is made too."""
+    """Return the parser of all options, from which the page of commands is made too."""
     parser = _Parser(prog="camtorch", description="Cameras as layers for PyTorch.")
     parser.add_argument("--version", action=_Version, nargs=0, help="show what is installed and exit")
     commands.add_all(parser.add_subparsers(title="commands", dest="command", required=True, metavar="COMMAND"))

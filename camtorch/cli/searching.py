@@ -8,6 +8,7 @@ time, as `board.mp4#t=12.345`, in seconds.
 
 from __future__ import annotations
 
+import hashlib
 import os
 import re
 from collections import Counter
@@ -26,7 +27,6 @@ from camtorch.boards.detection import detect
 from camtorch.boards.finding import corners_in, natural
 from camtorch.cli import videos
 from camtorch.cli.terminal import bar, note
-from camtorch.jobs.inputs import hash_of
 
 _LEAST_VIEWS = 3
 _MOMENT = 0.5  # seconds, at least, of which the sharpest frame is taken
@@ -71,6 +71,11 @@ def together(cameras: Mapping[str, Sequence[Path]]) -> dict[str, dict[str, Path]
         )
     rows = zip(*cameras.values(), strict=True)
     return {str(i): dict(zip(cameras, row, strict=True)) for i, row in enumerate(rows)}
+
+
+def hash_of(path: Path) -> str:
+    """BLAKE2b of what is in a file, 16 bytes, hexadecimal."""
+    return hashlib.blake2b(path.read_bytes(), digest_size=16).hexdigest()
 
 
 def _last_number(path: Path) -> str | None:

@@ -22,7 +22,8 @@ def run(arguments: argparse.Namespace) -> None:
     path, output, against = arguments.input, arguments.output, arguments.against
     html, photograph = arguments.html, arguments.image
     if output is not None:
-        images.check_target(output, force=arguments.force, inputs=(path, against))
+        targets.check(output, force=arguments.force, inputs=(path, against))
+        images.check_kind(output)
         require_matplotlib()
     if html is not None:
         targets.check(html, force=arguments.force, inputs=(path, against, photograph))

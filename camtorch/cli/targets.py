@@ -1,14 +1,26 @@
-"""Where results go: what could not be written after the work is refused before it."""
+"""Which files a command reads and writes: what could not be written after the work is refused before it."""
 
 from __future__ import annotations
 
+import glob
 import os
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from itertools import takewhile
 from pathlib import Path
+
+from camtorch.boards.finding import natural
+from camtorch.cli.processes import Pair
+
+IMAGES = frozenset({".bmp", ".jpeg", ".jpg", ".pgm", ".png", ".ppm", ".tif", ".tiff", ".webp"})
+"""Suffixes, in lower case, of the images that are taken from a folder, and of those that are written."""
 
 
 def check(path: Path, *, force: bool, inputs: tuple[Path | None, ...] = ()) -> None:
-    """Refuse, by a ValueError, a path that no file can be written to: one of the inputs, also by a link; one that
-    exists, unless `force` is given; one without a folder to write to, or to make it in.
+    """Check that a file can be written.
+
+    Raises:
+        ValueError: If the path is a folder, or one of the inputs, also by a link; if it exists and `force` is false; if
+            no folder is there to write to, or to make it in.
     """
     if path.is_dir():
         raise ValueError(f"{path}: is a folder; name a file in it")
@@ -22,3 +34,95 @@ def check(path: Path, *, force: bool, inputs: tuple[Path | None, ...] = ()) -> N
         raise ValueError(f"{path}: {folder} is no folder")
     if not os.access(folder, os.W_OK):
         raise ValueError(f"{path}: the folder {folder} cannot be written to")
+
+
+# -- many files
+
+
+def find(words: Sequence[str], suffixes: Collection[str], output: Path) -> list[tuple[Path, Path]]:
+    """Return the files that words mean, each once, in natural order, and their places below the folder of outputs.
+
+    Words are files of any suffix; patterns, as a quoted 'in/**/*.jpg'; and folders with all folders in them, whose tree
+    is kept; if there are several words, folders keep their names as well. Names that begin with a dot are left out, as
+    is the folder of outputs where it lies within a folder that is read. Links are followed.
+
+    Raises:
+        ValueError: If a word means no file. OSError: If a folder cannot be read.
+    """
+    files: dict[str, tuple[Path, Path]] = {}
+    out = os.path.realpath(output)
+    for word in words:
+        root, place = Path(word), Path()
+        if root.is_dir():
+            place, paths = Path(root.resolve().name) if len(words) > 1 else place, _below(root)
+        elif os.path.lexists(root):
+            files[os.path.realpath(root)] = root, Path(root.name)
+            continue
+        elif glob.has_magic(word):
+            # links in a circle make paths of any length to the same file: the shortest is taken last
+            paths = iter(sorted(map(Path, glob.iglob(word, recursive=True)), key=lambda one: -len(one.parts)))
+            root = Path(*takewhile(lambda part: not glob.has_magic(part), root.parts))
+        else:
+            raise ValueError(f"{word}: no such file or folder")
+        apart = _is_below(os.path.realpath(root), out)
+        # a link to nothing is taken, so that an error names it; a pipe is not
+        found = {
+            os.path.realpath(one): (one, place / one.relative_to(root))
+            for one in paths
+            if one.suffix.lower() in suffixes
+            and (one.is_file() or not os.path.exists(one))
+            and (apart or not _is_below(os.path.realpath(one), out))
+        }
+        if not found:
+            raise ValueError(f"{word}: no file in there ends in {', '.join(sorted(suffixes))}")
+        files |= found
+    return sorted(files.values(), key=lambda found: natural(found[0]))
+
+
+def _below(root: Path) -> Iterator[Path]:
+    """Yield the files in a folder and in those below it; a link to a folder that it lies in shows nothing new."""
+
+    def refuse(error: OSError) -> None:
+        raise error
+
+    for name, folders, names in os.walk(root, followlinks=True, onerror=refuse):
+        real = os.path.realpath(name)
+        folders[:] = [
+            one
+            for one in folders
+            if not one.startswith(".") and not _is_below(real, os.path.realpath(os.path.join(name, one)))
+        ]
+        yield from (Path(name, one) for one in names if not one.startswith("."))
+
+
+def _is_below(path: str, folder: str) -> bool:
+    return path == folder or path.startswith(os.path.join(folder, ""))
+
+
+def to_make(pairs: Sequence[Pair], others: Iterable[Path], *, resume: bool, force: bool) -> list[Pair]:
+    """Return the pairs whose files are to be made; with `resume` those that are there are left out.
+
+    An empty file is what a loss of power leaves of one that was there, and is made again.
+
+    Raises:
+        ValueError: If files would be written over each other, or over one that is read, also one of `others`; if a file
+            exists, unless `resume` or `force` is given.
+    """
+    read = {os.path.realpath(path): path for path in (*(source for source, _ in pairs), *others)}
+    written: dict[str, Path] = {}
+    for source, target in pairs:
+        place = os.path.realpath(target)
+        if place in written:
+            raise ValueError(f"{written[place]} and {source} would both be written to {target}")
+        if place in read:
+            raise ValueError(f"{target}: would overwrite {read[place]}, which is read; name another folder")
+        written[place] = source
+    if resume:
+        return [pair for pair in pairs if not (pair[1].is_file() and pair[1].stat().st_size)]
+    there = [target for _, target in pairs if os.path.lexists(target)]
+    if there and not force:
+        more = f", and {len(there) - 1} more of {len(pairs)}" if len(there) > 1 else ""
+        raise ValueError(
+            f"{there[0]}: exists already{more}; --resume goes on where a run was broken off, --force overwrites"
+        )
+    return list(pairs)

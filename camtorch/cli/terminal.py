@@ -1,4 +1,4 @@
-"""What the command says on stderr: notes, errors, and by tqdm how far a long work is."""
+"""Lines on stderr: notes, errors with their reasons, and progress by tqdm."""
 
 from __future__ import annotations
 
@@ -9,19 +9,37 @@ from typing import Any
 
 
 def say(text: str) -> None:
-    """One line, whatever the text: what would steer a terminal, as names of files may, is spelt out."""
+    """Print one line, whatever the text; characters that would steer a terminal, as names of files may, are escaped."""
     line = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in " ".join(text.split()))
     print("camtorch:", line, file=sys.stderr, flush=True)
 
 
 def note(text: object) -> None:
-    """What the user should know though the work goes on."""
+    """Print what the user should know though the work goes on."""
     say(f"note: {text}")
+
+
+def reason(error: Exception) -> str:
+    """Return why something failed, in a line."""
+    if lacks_memory(error):
+        text = f"out of memory: {error}"
+    elif isinstance(error, OSError) and error.strerror:
+        text = f"{error.filename}: {error.strerror}" if error.filename else error.strerror
+    elif isinstance(error, (ValueError, OSError, ImportError)) and str(error):
+        text = str(error)
+    else:
+        text = f"{type(error).__name__}: {error}"
+    return " ".join(text.split())
+
+
+def lacks_memory(error: Exception) -> bool:
+    """Whether memory ran out, for which torch has no type of its own."""
+    return isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and "allocate memory" in str(error))
 
 
 @contextlib.contextmanager
 def shown(what: str) -> Iterator[None]:
-    """Say on a terminal what goes on, while it does."""
+    """Show a line on a terminal during the block."""
     is_terminal = sys.stderr.isatty()
     if is_terminal:
         print(f"camtorch: {what}", end="", file=sys.stderr, flush=True)
@@ -29,11 +47,11 @@ def shown(what: str) -> Iterator[None]:
         yield
     finally:
         if is_terminal:
-            print("\r\x1b[K", end="", file=sys.stderr, flush=True)  # the line is gone
+            print("\r\x1b[K", end="", file=sys.stderr, flush=True)  # erases the line
 
 
 def bar(what: str, total: float | None, unit: str = "", **options: Any) -> Any:
-    """A tqdm bar for work that takes more than a moment; a file or a pipe gets one twice a minute. Close it."""
+    """Return a tqdm bar for work that takes more than a moment; a file or a pipe gets one twice a minute. Close it."""
     from tqdm import tqdm  # type: ignore[import-untyped]  # not before: `--help` does without
 
     delay, interval = (0.5, 0.1) if sys.stderr.isatty() else (30.0, 30.0)  # seconds
@@ -43,6 +61,6 @@ def bar(what: str, total: float | None, unit: str = "", **options: Any) -> Any:
 
 @contextlib.contextmanager
 def progress(what: str) -> Iterator[Callable[[float], None]]:
-    """A function that shows a done part, from 0 to 1."""
+    """Yield a function that shows the part that is done, from 0 to 1."""
     with bar(what, 1.0, bar_format="{desc}: {percentage:3.0f} %|{bar}| {remaining} left") as shown:
         yield lambda part: shown.update(part - shown.n)

@@ -1,4 +1,4 @@
-"""Video files through warps, by PyAV: time stamps, sound and subtitles stay as they are."""
+"""Videos through warps, by PyAV: time stamps, sound and subtitles stay as they are."""
 
 from __future__ import annotations
 
@@ -30,12 +30,24 @@ CODECS: dict[str, dict[str, str]] = {
 }
 """Encoders with their options."""
 _READ = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpegts"  # no playlists, which would have other files read
-_THREADS = 4  # of an encoder: what it makes depends on their number, and shall not depend on the machine's
+_THREADS = 4  # of an encoder: what it makes depends on their number, and must not depend on the machine's
 _CUT = 0.5  # seconds that may be missing at the end
+_COLOURS = ("color_range", "colorspace", "color_primaries", "color_trc")
+"""What the colours of a frame mean."""
 
 
 class VideoFileError(ValueError):
     """A video that cannot be read or written. The text names the file and the reason."""
+
+
+@dataclass(frozen=True)
+class Encoder:
+    """How videos are written."""
+
+    codec: str | None = None
+    """Of CODECS; by default what suits the format."""
+    crf: int | None = None
+    """Its quality; by default one at which hardly anything is lost."""
 
 
 def is_video(path: Path) -> bool:
@@ -44,19 +56,19 @@ def is_video(path: Path) -> bool:
 
 
 def written_suffix(path: Path) -> str:
-    """That of a video, or of the one that is made of it."""
+    """Return the suffix of a video that is made of another one."""
     return path.suffix if path.suffix.lower() in WRITTEN else ".mkv"
 
 
 def check_kind(path: Path) -> None:
-    """Refuse, by a VideoFileError, a name that says of no format that videos can be written as."""
+    """Raise a VideoFileError if the name is of no format that videos are written as."""
     if path.suffix.lower() not in WRITTEN:
         what = path.suffix or "no suffix"
         raise VideoFileError(f"{path}: {what}: no video is written as that; try {', '.join(WRITTEN)}")
 
 
 def require() -> Any:
-    """PyAV, or an ImportError that says how to install it."""
+    """Return PyAV, or raise an ImportError that says how to install it."""
     try:
         return importlib.import_module("av")
     except ImportError:
@@ -68,7 +80,7 @@ def require() -> Any:
 
 @contextlib.contextmanager
 def _opened(path: Path) -> Iterator[tuple[Any, Any]]:
-    """A file and its first video stream; what goes wrong with it in the block is a VideoFileError."""
+    """Open a file, and yield it and its first video stream; errors of ffmpeg in the block are VideoFileErrors."""
     av = require()
     try:
         with av.open(os.fspath(path), options={"format_whitelist": _READ}) as container:
@@ -81,28 +93,26 @@ def _opened(path: Path) -> Iterator[tuple[Any, Any]]:
 
 
 def size_of(path: Path) -> tuple[int, int] | None:
-    """(height, width) of a video; None of anything else."""
-    try:
-        with _opened(path) as (_, stream):
-            return stream.codec_context.height, stream.codec_context.width
-    except VideoFileError:
-        return None
+    """Return (height, width) of a video; None of anything else."""
+    with contextlib.suppress(VideoFileError), _opened(path) as (_, stream):
+        return stream.codec_context.height, stream.codec_context.width
+    return None
 
 
 def length_of(path: Path) -> float:
-    """Seconds, about; 0 where that is not said."""
+    """Return about how many seconds it takes; 0 if the file does not say it."""
     with _opened(path) as (container, _):
         return _span(container)[1]
 
 
 def count_of(path: Path) -> int | None:
-    """How many frames, about; None where that is not said."""
+    """Return about how many frames it has; None if the file does not say it."""
     with _opened(path) as (container, stream):
         return stream.frames or round(_span(container)[1] * _rate(stream)) or None
 
 
 def frames(path: Path) -> Iterator[tuple[float, Any]]:
-    """Frames as they are stored: when each is shown, in seconds from the first one, and PyAV's frame."""
+    """Yield PyAV's frames as they are stored, each with its time in seconds from the first one."""
     with _opened(path) as (container, stream):
         start = None
         for frame, _ in _decoded(container, stream):
@@ -112,9 +122,9 @@ def frames(path: Path) -> Iterator[tuple[float, Any]]:
 
 
 def _span(container: Any) -> tuple[float, float]:
-    """When a file begins, and how long it is, in seconds; 0 where that is not said."""
+    """Return when a file begins, and how long it is, in seconds; 0 if it does not say it."""
     begin, length = ((value or 0) / 1e6 for value in (container.start_time, container.duration))
-    is_end = "matroska" in container.format.name  # which says when it ends instead
+    is_end = "matroska" in container.format.name  # which states its end instead
     return begin, max(length - begin, 0.0) if is_end else length
 
 
@@ -123,7 +133,7 @@ def _rate(stream: Any) -> Fraction:
 
 
 def _decoded(container: Any, stream: Any, *others: Any) -> Iterator[tuple[Any, Any]]:
-    """(frame, None) of a stream, and (None, packet) of others, in the order in which they are stored.
+    """Yield (frame, None) of a stream and (None, packet) of others in the order in which they are stored.
 
     Frames have time stamps that grow.
     """
@@ -150,67 +160,7 @@ def _decoded(container: Any, stream: Any, *others: Any) -> Iterator[tuple[Any, A
             yield frame, None
 
 
-# -- warping
-#
-# Frames are warped in YUV 4:2:0 of eight bits, in which nearly all are stored: a plane of brightness, and two of
-# colours of half the resolution. Each goes through a warp of its own, which is half the work of RGB.
-
-_COLOURS = ("color_range", "colorspace", "color_primaries", "color_trc")
-"""What the colours of a frame mean."""
-
-
-def _planes(frame: Any) -> Iterator[np.ndarray[Any, Any]]:
-    """(H, W) of each, the memory of the frame."""
-    for plane in frame.planes:
-        yield np.frombuffer(plane, np.uint8).reshape(-1, plane.line_size)[: plane.height, : plane.width]
-
-
-def _halved(camera: Camera) -> Camera:
-    """The camera of the colours, whose pixels are where the left ones of the image's pairs are, as in MPEG-2."""
-    height, width = (camera.height + 1) // 2, (camera.width + 1) // 2
-    camera = camera.pad(0, 2 * width - camera.width, 0, 2 * height - camera.height).resize(height, width)
-    shift = camera.intrinsics.new_tensor([0.0, 0.0, 0.25, 0.0])
-    return camera.replace(intrinsics=camera.intrinsics.detach() + shift)
-
-
-class _Frames:
-    """Warps frames of one size; `first` is as all are."""
-
-    def __init__(self, warp: Warp, first: Any):
-        self.first, self.height, self.width = first.reformat(format="yuv420p"), warp.target.height, warp.target.width
-        cases = (
-            (warp.source, warp.target, 0 if self.first.color_range == 2 else 16),
-            (_halved(warp.source), _halved(warp.target), 128),
-        )
-        whole, half = (
-            Warp(source, target, warp.rotation, fill=float(black), tolerance=warp.tolerance).requires_grad_(False)
-            for source, target, black in cases
-        )
-        self._warps = whole, half, half
-
-    @torch.no_grad()
-    def __call__(self, frame: Any) -> Any:
-        """The new frame, at the same time."""
-        frame = frame.reformat(format="yuv420p")
-        new = require().VideoFrame(self.width, self.height, "yuv420p")
-        for warp, old, made in zip(self._warps, _planes(frame), _planes(new), strict=True):
-            made[:] = warp(torch.from_numpy(old)[None, None])[0, 0].numpy()
-        for name in ("pts", "time_base", "duration", *_COLOURS):
-            setattr(new, name, getattr(frame, name))
-        return new
-
-
-# -- from file to file
-
-
-@dataclass(frozen=True)
-class Encoder:
-    """What videos are written with."""
-
-    codec: str | None = None
-    """Of CODECS; by default what suits the format."""
-    crf: int | None = None
-    """Its quality; by default one at which hardly anything is lost."""
+# -- writing
 
 
 def remake(
@@ -220,37 +170,39 @@ def remake(
     encoder: Encoder,
     done: Callable[[], object] = lambda: None,
 ) -> dict[str, Any]:
-    """Write a video whose frames are those of another one through a warp.
+    """Write a video of the warped frames of another one, whole or not at all, with the folders that lack.
 
-    Time stamps, sound, subtitles, the rotation with which it is shown, and what colours mean are those of the source.
-    Pixels are square then, and of eight bits in 4:2:0.
+    Time stamps, sound, subtitles, the rotation with which it is shown, and the meaning of colours are those of the
+    source. Pixels are square then, and of eight bits in 4:2:0.
 
     Args:
-        source: a video.
-        target: a new one, whose suffix says the format. It is written whole or not at all; folders that lack are made.
-        warp_of: the warp for frames of a (height, width), and what is to be known of it.
-        encoder: of the new video.
-        done: is called after each frame.
+        source: A video.
+        target: A new one, whose suffix says the format.
+        warp_of: Returns the warp for frames of a (height, width), and facts about it.
+        encoder: How it is written.
+        done: Is called after each frame.
 
     Returns:
-        What is to be known of the warp, and "frames", how many there are.
+        The facts about the warp, and "frames", how many there are.
 
     Raises:
-        VideoFileError: what is not a video, ends too early, changes its size, or cannot be written so.
+        VideoFileError: If the source is no video, ends too early or changes its size; if it cannot be written so.
     """
     with _opened(source) as (container, stream):
         first, _ = next(_decoded(container, stream), (None, None))
     if first is None:
         raise VideoFileError(f"{source}: no frame of it can be read")
     warp, facts = warp_of((first.height, first.width))
-    warped, format, count, end = _Frames(warp, first), WRITTEN[target.suffix.lower()], 0, 0.0
+    warps, count, end = _plane_warps(warp, first), 0, 0.0
     target.parent.mkdir(parents=True, exist_ok=True)
-    with contextlib.ExitStack() as stack:
-        (file,) = stack.enter_context(replacing(target))
-        container, stream = stack.enter_context(_opened(source))
-        # exact: no random identifiers
-        output = stack.enter_context(require().open(file, "w", format=format, options={"fflags": "+bitexact"}))
-        new = _new_stream(output, warped, first, _rate(stream), encoder, target)
+    # bitexact: no random identifiers
+    options = {"format": WRITTEN[target.suffix.lower()], "options": {"fflags": "+bitexact"}}
+    with (
+        replacing(target) as (file,),
+        _opened(source) as (container, stream),
+        require().open(file, "w", **options) as output,
+    ):
+        new = _new_stream(output, warp.target, first, _rate(stream), encoder, target)
         others = [other for other in container.streams if other.type in ("audio", "subtitle")]
         copies = {other.index: _copied_stream(output, other, source, target) for other in others}
         begin, length = _span(container)
@@ -264,7 +216,7 @@ def remake(
                 was, now = f"{first.width}x{first.height}", f"{frame.width}x{frame.height}"
                 raise VideoFileError(f"{source}: its frames are {was}, then {now}")
             end = max(end, float(frame.pts * frame.time_base + 1 / _rate(stream)) - begin)
-            output.mux(new.encode(warped(frame)))
+            output.mux(new.encode(_warped(warps, frame)))
             count += 1
             done()
         output.mux(new.encode(None))
@@ -273,18 +225,59 @@ def remake(
     return facts | {"frames": count}
 
 
-def _new_stream(output: Any, warped: _Frames, first: Any, rate: Fraction, encoder: Encoder, target: Path) -> Any:
+def _plane_warps(warp: Warp, first: Any) -> tuple[Warp, Warp, Warp]:
+    """Return the warps of the planes of YUV 4:2:0, of brightness and of two colours of half the resolution.
+
+    Nearly all videos are stored so, and warping that is half the work of RGB.
+    """
+    black = 0 if first.reformat(format="yuv420p").color_range == 2 else 16
+    pairs = ((warp.source, warp.target, black), (_halved(warp.source), _halved(warp.target), 128))
+    whole, half = (
+        Warp(source, target, warp.rotation, fill=float(fill), tolerance=warp.tolerance).requires_grad_(False)
+        for source, target, fill in pairs
+    )
+    return whole, half, half
+
+
+def _halved(camera: Camera) -> Camera:
+    """Return the camera of the colours, whose pixels are where the left ones of the image's pairs are, as in MPEG-2."""
+    height, width = (camera.height + 1) // 2, (camera.width + 1) // 2
+    camera = camera.pad(0, 2 * width - camera.width, 0, 2 * height - camera.height).resize(height, width)
+    shift = camera.intrinsics.new_tensor([0.0, 0.0, 0.25, 0.0])
+    return camera.replace(intrinsics=camera.intrinsics.detach() + shift)
+
+
+@torch.no_grad()
+def _warped(warps: tuple[Warp, Warp, Warp], frame: Any) -> Any:
+    """Return the warped frame, of the same time."""
+    frame = frame.reformat(format="yuv420p")
+    new = require().VideoFrame(warps[0].target.width, warps[0].target.height, "yuv420p")
+    for warp, old, made in zip(warps, _planes(frame), _planes(new), strict=True):
+        made[:] = warp(torch.from_numpy(old)[None, None])[0, 0].numpy()
+    for name in ("pts", "time_base", "duration", *_COLOURS):
+        setattr(new, name, getattr(frame, name))
+    return new
+
+
+def _planes(frame: Any) -> Iterator[np.ndarray[Any, Any]]:
+    """Yield the planes (H, W) of a frame, which share its memory."""
+    for plane in frame.planes:
+        yield np.frombuffer(plane, np.uint8).reshape(-1, plane.line_size)[: plane.height, : plane.width]
+
+
+def _new_stream(output: Any, camera: Camera, first: Any, rate: Fraction, encoder: Encoder, target: Path) -> Any:
     codec = encoder.codec or ("libvpx-vp9" if output.format.name == "webm" else "libx264")
-    if codec == "libx264" and (warped.width % 2 or warped.height % 2):
-        size = f"{warped.width}x{warped.height}"
+    if codec == "libx264" and (camera.width % 2 or camera.height % 2):
+        size = f"{camera.width}x{camera.height}"
         raise VideoFileError(f"{target}: {size}, but {codec} wants even numbers; --size names them")
     try:
         stream = output.add_stream(codec, rate=rate, time_base=first.time_base)
     except ValueError as error:
         raise VideoFileError(f"{target}: {error}; --codec names another encoder") from None
-    stream.width, stream.height, stream.pix_fmt = warped.width, warped.height, "yuv420p"
+    stream.width, stream.height, stream.pix_fmt = camera.width, camera.height, "yuv420p"
+    like = first.reformat(format="yuv420p")
     for name in _COLOURS:
-        setattr(stream.codec_context, name, getattr(warped.first, name))
+        setattr(stream.codec_context, name, getattr(like, name))
     stream.codec_context.thread_count = _THREADS
     stream.options = CODECS[codec] | ({} if encoder.crf is None else {"crf": str(encoder.crf)})
     matrix = first.side_data.get("DISPLAYMATRIX")
@@ -294,7 +287,7 @@ def _new_stream(output: Any, warped: _Frames, first: Any, rate: Fraction, encode
 
 
 def _copied_stream(output: Any, other: Any, source: Path, target: Path) -> Any:
-    """That of sound or subtitles in the new file."""
+    """Return the stream of sound or subtitles in the new file."""
     try:
         copy = output.add_stream_from_template(other)
     except ValueError:

@@ -7,8 +7,6 @@ import math
 from collections.abc import Callable
 from pathlib import Path
 
-from camtorch.jobs.items import Shard
-
 LARGEST_SIDE = 32768
 """Pixels."""
 LENS = "lens:"
@@ -59,14 +57,6 @@ def board(text: str) -> tuple[int, int]:
     if not counts or max(counts) > 9999:
         raise _WrongWord(f"{text!r} is not COLUMNSxROWS, as in 9x6")
     return counts[0], counts[1]
-
-
-def shard(text: str) -> Shard:
-    """The I-th of N parts, of "I/N"."""
-    part = _counts(text, "/")
-    if not part or not 0 < part[0] <= part[1]:
-        raise _WrongWord(f"{text!r} is not I/N, the I-th of N parts, from 1/N to N/N")
-    return Shard(part[0] - 1, part[1])
 
 
 def count(most: int, least: int = 1) -> Callable[[str], int]:

@@ -13,8 +13,8 @@ from command_line import FILES, LEVEL, MATRIX, camera, command, opened, pixels, 
 from PIL import Image
 
 import camtorch as ct
-from camtorch.cli import images
-from camtorch.jobs.inputs import IMAGES
+from camtorch._photographs import size_of
+from camtorch.cli.targets import IMAGES
 
 
 def test_dewarp_writes_what_dewarp_makes(folder, capsys):
@@ -167,7 +167,7 @@ def test_images_are_taken_as_they_are_stored(folder, suffix, options):
     command("dewarp", f"turned{suffix}", "--camera", "camera.yml", "-o", "out.png")
     assert np.array_equal(pixels("out.png"), pixels("expected.png"))
     assert orientation_of("out.png") == 6
-    assert images.size_of(Path(f"turned{suffix}")) == (64, 96)
+    assert size_of(Path(f"turned{suffix}")) == (64, 96)
 
 
 def test_the_exif_orientation_stays_or_its_loss_is_said(folder, capsys):

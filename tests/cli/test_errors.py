@@ -16,6 +16,7 @@ CASES = {
     "words": [
         ("", "the following arguments are required: COMMAND"),
         ("undistort", "invalid choice: 'undistort'"),
+        ("rectify left.png right.png", "commands and options of 0.3 that are gone: docs/leaving-0.3.md"),
         ("dewarp", "required: IMAGE"),
         ("show", "required: FILE"),
         ("convert camera.yml", "which file is the new one"),
@@ -65,7 +66,7 @@ CASES = {
         ("dewarp images --camera camera.yml -o out --suffix .ico", ".ico: no image is written as that"),
         ("dewarp images --camera camera.yml -o out --suffix png", "'png' is no suffix, as .png is"),
         ("dewarp images --camera camera.yml -o out --jobs 0", "'0' is not a whole number from 1 to 1024"),
-        ("dewarp images --camera camera.yml -o out --shard 0/4", "'0/4' is not I/N, the I-th of N parts"),
+        ("dewarp images --camera camera.yml -o out --resume --force", "--force: not allowed with argument --resume"),
         (f"dewarp {PHOTO} -o o.png --resume", "--resume is for folders"),
     ],
     "show": [
@@ -94,9 +95,9 @@ CASES = {
             "unrecognized arguments: a.npz; -o a.npz names what is written (see camtorch",
         ),
         ("show camera.yml bad.yml", "unrecognized arguments: bad.yml (see camtorch --help)"),
-        ("map camera.yml --sise 9x9", "unrecognized arguments: --sise 9x9 (see camtorch --help)"),
+        ("map camera.yml --sise 9x9", "unrecognized arguments: --sise 9x9 (see camtorch --help; commands and options"),
         ("map camera.yml -o a.bin", "does not say the format"),
-        ("map camera.yml -o camera.yml --format obj", "would overwrite camera.yml"),
+        ("map camera.yml -o camera.yml --format opencv", "would overwrite camera.yml"),
         ("map rig.json --name left -o rig --format dw100 --force", "rig.json: would overwrite"),
         ("map camera.yml -o a.npz --fov 2.1", "2.1 seems to be radians"),
         ("map camera.yml -o a.npz --fov 200", "below 180 for perspective; got 200"),

@@ -15,6 +15,9 @@ import pytest
 from command_line import MATRIX, command, opened, refused
 from PIL import Image
 
+from camtorch.cli import targets
+from camtorch.io.writing import all_left_over
+
 TRIALS = int(os.environ.get("CAMTORCH_TRIALS", "1"))
 WORDS = ["dewarp", "in", "--camera", "camera.yml", "-o", "out/"]
 
@@ -42,16 +45,69 @@ def write_images(modes, seed=0):
 
 
 def outputs(place="out"):
-    """What is in all files but the accounts."""
-    files = [path for path in Path(place).rglob("*") if path.is_file() and not path.name.startswith(".camtorch")]
-    return {str(path.relative_to(place)): path.read_bytes() for path in files}
+    """The contents of all files."""
+    return {str(path.relative_to(place)): path.read_bytes() for path in Path(place).rglob("*") if path.is_file()}
+
+
+# -- which files are meant
+
+
+@pytest.fixture
+def tree(tmp_path, monkeypatch):
+    """Files in folders, and a function that returns which of them are found, and their places."""
+    monkeypatch.chdir(tmp_path)
+    for name in ("in/10.jpg", "in/2.JPG", "in/deep/1.png", "in/deep/notes.txt", "in/.hidden.jpg", "in/.git/3.jpg"):
+        Path(name).parent.mkdir(parents=True, exist_ok=True)
+        Path(name).write_text(name)
+
+    def found(*words, output="out"):
+        return {str(path): str(place) for path, place in targets.find(words, targets.IMAGES, Path(output))}
+
+    return found
+
+
+def test_files_are_found_with_their_places(tree):
+    everything = {"in/2.JPG": "2.JPG", "in/10.jpg": "10.jpg", "in/deep/1.png": "deep/1.png"}  # 2 before 10
+    for words, expected in (
+        (["in"], everything),
+        (["in/deep", "in/2.JPG", "in/2.JPG"], {"in/2.JPG": "2.JPG", "in/deep/1.png": "deep/1.png"}),
+        (["in/**/*"], everything),
+        (["in/d*/*"], {"in/deep/1.png": "deep/1.png"}),
+    ):
+        assert list(tree(*words).items()) == list(expected.items())
+    Path("in/[1].jpg").write_text("the name of a file, not a pattern")
+    assert tree("in/[1].jpg") == {"in/[1].jpg": "[1].jpg"}
+    Path("in/empty").mkdir()
+    for word in ("in/*gif", "in/empty"):
+        with pytest.raises(ValueError, match=r"no file in there ends in .bmp"):
+            tree(word)
+    Path("in/out").mkdir()
+    Path("in/out/2.JPG").write_text("made")
+    for word in ("in", "in/**/*", "."):
+        assert not any("out" in name for name in tree(word, output="in/out"))
+    assert tree("in/out", output="in/out") == {"in/out/2.JPG": "2.JPG"}  # and is refused, as it would be overwritten
+
+
+def test_links(tree):
+    Path("elsewhere").mkdir()
+    Path("elsewhere/5.jpg").touch()
+    for name, target in (("there", "../elsewhere"), ("deep/up", ".."), ("me.jpg", "me.jpg"), ("gone.jpg", "no.jpg")):
+        Path("in", name).symlink_to(target)
+    os.mkfifo("in/pipe.jpg")
+    # a link to nothing is taken, so that an error names it; a circle shows nothing new
+    lost = {"in/gone.jpg", "in/me.jpg"}
+    assert tree("in").keys() == {"in/2.JPG", "in/10.jpg", "in/deep/1.png", "in/there/5.jpg", *lost}
+    assert tree("in/**/*.jpg").keys() == {"in/10.jpg", "in/there/5.jpg", *lost}
+
+
+# -- what is made of them
 
 
 def test_a_folder_is_dewarped_as_its_images_one_by_one(folder, capsys):
     command(*WORDS, "--jobs", 1, "--fov", 90)
-    told = capsys.readouterr()
-    assert told.err == ""
-    assert told.out == (
+    printed = capsys.readouterr()
+    assert printed.err == ""
+    assert printed.out == (
         "out: 5 of 5 files made, kannala_brandt dewarped to perspective, 90.0 degrees wide, 96x64, fx 48 fy 48 cx 47.5 "
         "cy 31.5; 100.0 % of it is filled\n"
     )
@@ -62,39 +118,29 @@ def test_a_folder_is_dewarped_as_its_images_one_by_one(folder, capsys):
     assert outputs("single") == made
     assert opened("out/2.jpg").getexif()[0x0112] == 6
     assert opened("out/deep/er/3.tif").mode == "I;16"
+    command("dewarp", "in/1.png", "--camera", "camera.yml", "--fov", 90, "-o", "one/")
+    assert outputs("one") == {"1.png": made["1.png"]}
 
 
 def test_what_there_is_already(folder, capsys):
-    assert refused(capsys, *WORDS[:-1], "new.png").endswith("-o OUT/ names a folder\n")
-    command(*WORDS, "--dry-run")
-    assert "in/1.png -> out/1.png\n" in (told := capsys.readouterr().out)
-    assert told.endswith("5 to be made, 0 there already\n")
-    assert not Path("out").exists()
     command(*WORDS, "--jobs", 1)
     before = outputs()
-    assert "out/1.png: exists already, and 4 more of 5; --resume goes on" in refused(capsys, *WORDS)
+    Path("in/cut.png").write_text("no image")  # is not looked at before what exists is refused
+    assert "out/1.png: exists already, and 4 more of 6; --resume goes on" in refused(capsys, *WORDS)
+    Path("in/cut.png").unlink()
     Path("in/1.png").rename("in/9.png")
-    Path("out/2.jpg").write_bytes(b"")
+    Path("out/2.jpg").write_bytes(b"")  # after a loss of power
     Path("out/deep/1.png").unlink()
-    Path("in/deep/4.webp").write_bytes(Path("in/2.jpg").read_bytes())
-    command(*WORDS, "--dry-run", "--resume")
-    changed = [("2.jpg", "2.jpg"), ("9.png", "9.png"), ("deep/1.png", "deep/1.png"), ("deep/4.webp", "deep/4.webp")]
-    lines = "".join(f"in/{old} -> out/{new}\n" for old, new in changed)
-    assert capsys.readouterr().out == f"{lines}4 to be made, 1 there already\n"
+    Path("out/deep/4.webp").write_bytes(b"mine")
     command(*WORDS, "--jobs", 1, "--resume")
-    assert "out: 4 of 5 files made, kannala" in (told := capsys.readouterr().out)
-    assert told.endswith("; 1 were there already\n")
-    after = outputs()
-    assert after == before | {"9.png": before["1.png"], "deep/4.webp": after["deep/4.webp"]}
-    assert after["deep/4.webp"] != before["deep/4.webp"]
-    (account,) = Path("out").glob(".camtorch*")
-    account.write_bytes(account.read_bytes()[:-40])  # cut off in the middle of the last line, as by a crash
+    printed = capsys.readouterr().out
+    assert "out: 3 of 5 files made, kannala" in printed
+    assert printed.endswith("; 2 were there already\n")
+    assert outputs() == before | {"9.png": before["1.png"], "deep/4.webp": b"mine"}
     command(*WORDS, "--jobs", 1, "--resume")
-    assert "out: 1 of 5 files made" in capsys.readouterr().out
-    command(*WORDS, "--jobs", 1, "--resume", "--projection", "cylindrical")
-    assert "out: 5 of 5 files made, kannala_brandt dewarped to cylindrical" in capsys.readouterr().out
+    assert capsys.readouterr().out == "out: 0 of 5 files made; 5 were there already\n"
     command(*WORDS, "--jobs", 1, "--force")
-    assert outputs() == after
+    assert outputs() == before | {"9.png": before["1.png"]}
 
 
 def test_hostile_files_are_a_line_each(folder, capsys, monkeypatch):
@@ -116,7 +162,7 @@ def test_hostile_files_are_a_line_each(folder, capsys, monkeypatch):
     locked = not os.access("in/locked.png", os.R_OK)  # not from root
     capsys.readouterr()
     command(*WORDS, "--jobs", 1, "--force", expect=1)
-    told = capsys.readouterr()
+    printed = capsys.readouterr()
     expected = [
         "in/me.png: Too many levels of symbolic links",
         "in/bomb.png: more than 179 million pixels, which are not read",
@@ -127,38 +173,14 @@ def test_hostile_files_are_a_line_each(folder, capsys, monkeypatch):
         "in/small.png: is 1x1, but the camera in camera.yml is for 96x64; ",
         "in/words.jpg: not an image that Pillow can read",
     ]
-    lines = told.err.splitlines()
+    lines = printed.err.splitlines()
     assert len(lines) == len(expected)
     for line, text in zip(sorted(lines), sorted(expected), strict=True):
         assert line.startswith(f"camtorch: error: {text}")
-    assert f"; {len(expected)} failed\n" in told.out
+    assert f"; {len(expected)} failed\n" in printed.out
     made = outputs()
     assert {name: made[name] for name in before} == before
     assert made.keys() - before.keys() == (set() if locked else {"locked.png"})
-    command(*WORDS, "--dry-run", "--resume")
-    assert capsys.readouterr().out.endswith(f"{len(expected)} to be made, {len(made)} there already\n")
-
-
-def test_two_shards_are_one_run(folder, capsys, monkeypatch):
-    write_images({f"more/{i}.png": "RGB" for i in range(4)})
-    command(*WORDS, "--jobs", 1)
-    whole = outputs()
-    capsys.readouterr()
-    for names in (("RANK", "WORLD_SIZE", "TORCHELASTIC_RUN_ID"), ()):
-        place = names[0].lower() if names else "option"
-        for rank in (0, 1):
-            for name, value in zip(names, (rank, 2, 0), strict=False):
-                monkeypatch.setenv(name, str(value))
-            shard = [] if names else ["--shard", f"{rank + 1}/2"]
-            command(*WORDS[:-1], place, "--jobs", 1, *shard)
-        assert outputs(place) == whole
-        told = capsys.readouterr()
-        assert f"{place}, shard 2 of 2: 4 of 4 files made" in told.out
-        assert told.err == ""
-        for name in names:
-            monkeypatch.delenv(name)
-        command(*WORDS[:-1], place, "--jobs", 1, "--resume")
-        assert "0 of 9 files made" in capsys.readouterr().out
 
 
 def test_a_camera_without_size_is_of_the_first_image(folder, capsys):
@@ -167,15 +189,15 @@ def test_a_camera_without_size_is_of_the_first_image(folder, capsys):
     Path("in/0.png").write_text("no image")
     words = ["dewarp", "in", "--camera", "bare.yml", "--model", "kannala_brandt", "-o", "out", "--jobs", 1]
     command(*words, expect=1)
-    told = capsys.readouterr().err
-    assert "note: bare.yml states no image size; taken to be for 96x64, as in/1.png is\n" in told
-    assert "in/half.png: is 48x32, but the camera in bare.yml is for 96x64; --rescale" in told
-    command(*words, "--rescale", "--resume", expect=1)
+    printed = capsys.readouterr().err
+    assert "note: bare.yml states no image size; taken to be for 96x64, as in/1.png is\n" in printed
+    assert "in/half.png: is 48x32, but the camera in bare.yml is for 96x64; --rescale" in printed
+    command(*words, "--rescale", "--force", expect=1)
     assert opened("out/half.png").size == (48, 32)
-    assert "; 1 failed\n" in capsys.readouterr().out  # images of two sizes are not all alike
+    assert capsys.readouterr().out == "out: 6 of 7 files made; 1 failed\n"  # images of two sizes are not all alike
 
 
-def test_notes_are_said_once(folder, capsys):
+def test_notes_are_printed_once(folder, capsys):
     for name in "ab":
         frames = [Image.new("RGB", (96, 64), colour) for colour in ("red", "blue")]
         frames[0].save(f"in/{name}.tif", save_all=True, append_images=frames[1:])
@@ -191,47 +213,83 @@ def test_other_suffixes(folder, capsys):
     assert "in/1.jpg and in/1.png would both be written to out/1.png" in text
 
 
-def test_one_image_into_a_folder(folder, capsys):
-    command("dewarp", "in/1.png", "--camera", "camera.yml", "-o", "out/")
-    assert outputs().keys() == {"1.png"}
-    command("dewarp", "in/1.png", "--camera", "camera.yml", "-o", "new.png", "--dry-run")
-    assert capsys.readouterr().out.endswith("in/1.png -> new.png\n")
-    assert not Path("new.png").exists()
+# -- processes
 
 
-@pytest.mark.slow
-def test_processes_make_the_same(folder):
-    command(*WORDS, "--jobs", 1)
-    command(*WORDS[:-1], "other", "--jobs", 2)
-    assert outputs("other") == outputs()
-
-
-@pytest.mark.slow
-def test_killed_at_any_moment_and_gone_on(folder):
-    write_images({f"{i}.png": "RGB" for i in range(10, 26)})
-    words = [sys.executable, "-m", "camtorch", *WORDS[:-1]]
+def started(*words, **options):
+    """A command in a process group of its own."""
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+    words = [sys.executable, "-m", "camtorch", *map(str, words)]
+    return subprocess.Popen(words, env=environment, start_new_session=True, **options)
+
+
+def group_has_ended(number):
+    for _ in range(300):
+        try:
+            os.killpg(number, 0)
+        except ProcessLookupError:
+            return True
+        time.sleep(0.05)
+    os.killpg(number, signal.SIGKILL)
+    return False
+
+
+@pytest.mark.slow
+def test_processes_make_the_same(folder, capsys):
+    Path("in/words.jpg").write_text("no image")
+    for place, jobs in (("one", 1), ("two", 2)):
+        command(*WORDS[:-1], place, "--jobs", jobs, expect=1)
+        assert capsys.readouterr().err == "camtorch: error: in/words.jpg: not an image that Pillow can read\n"
+    assert outputs("one") == outputs("two")
+
+
+@pytest.mark.slow
+def test_killed_at_any_moment_and_resumed(folder):
+    write_images({f"{i}.png": "RGB" for i in range(10, 26)})
     begin = time.monotonic()
-    subprocess.run([*words, "whole", "--jobs", "2"], check=True, capture_output=True, env=environment)
+    assert started(*WORDS[:-1], "whole", "--jobs", 2, stdout=subprocess.DEVNULL).wait() == 0
     took, whole = time.monotonic() - begin, outputs("whole")
     assert len(whole) == 21
     generator = random.Random(7)
     for trial in range(TRIALS):
-        place = f"{trial}"
-        for everyone in (False, True) if TRIALS > 1 else (True,):  # it is broken off as it goes on as well
-            going_on = ["--resume"] if Path(place).exists() else []
-            process = subprocess.Popen(
-                [*words, place, "--jobs", "2", *going_on],
-                stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=environment, start_new_session=True,
-            )  # fmt: skip
+        place = str(trial)
+        for everyone in (False, True):  # the second time as it is resumed; without the others, these end as well
+            process = started(*WORDS[:-1], place, "--jobs", 2, "--resume", stdout=subprocess.DEVNULL)
             time.sleep(generator.uniform(0.5, 1.05) * took)
-            if everyone:
-                os.killpg(process.pid, signal.SIGKILL)
-            else:
-                process.kill()
+            os.killpg(process.pid, signal.SIGKILL) if everyone else process.kill()
             process.wait()
-        done = subprocess.run(
-            [*words, place, "--jobs", "2", "--resume"], capture_output=True, env=environment, text=True
-        )
-        assert (done.returncode, done.stderr) == (0, "")
+            assert group_has_ended(process.pid)
+        process = started(*WORDS[:-1], place, "--jobs", 2, "--resume", stderr=subprocess.PIPE, text=True)
+        assert (process.communicate()[1], process.returncode) == ("", 0)
         assert outputs(place) == whole
+
+
+@pytest.mark.slow
+def test_an_interrupt_is_one_line(folder):
+    write_images({f"{i}.png": "RGB" for i in range(10, 400)})
+    process = started(*WORDS, "--jobs", 2, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    while len(list(Path("out").glob("*"))) < 9:
+        assert process.poll() is None
+        time.sleep(0.01)
+    process.send_signal(signal.SIGINT)
+    assert process.communicate(timeout=30) == ("", "camtorch: interrupted\n")
+    assert process.returncode == 130
+    assert group_has_ended(process.pid)
+    assert len(outputs()) < 390
+    assert all_left_over(os.path.realpath(path).replace("/in/", "/out/") for path in Path("in").rglob("*")) == []
+
+
+@pytest.mark.slow
+def test_a_process_that_is_killed_ends_the_run_with_an_error(folder):
+    write_images({f"{i}.png": "RGB" for i in range(10, 400)})
+    process = started(*WORDS, "--jobs", 2, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    while len(list(Path("out").glob("*"))) < 9:
+        assert process.poll() is None
+        time.sleep(0.01)
+    for found in Path("/proc").glob("[0-9]*"):  # those of the group that have its pool's lines to read
+        if os.getpgid(int(found.name)) == process.pid != int(found.name):
+            victim = int(found.name)
+    os.kill(victim, signal.SIGKILL)
+    _, error = process.communicate(timeout=30)
+    assert error.startswith("camtorch: error: a process was killed, perhaps for lack of memory; --resume goes on")
+    assert process.returncode == 2

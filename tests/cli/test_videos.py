@@ -131,7 +131,7 @@ def test_a_folder_goes_on(folder, capsys):
     command(*words)
     before = outputs()
     assert before.keys() == {"a.mp4", "b.mkv", "c.png"}
-    Path("out/b.mkv").write_bytes(before["b.mkv"][:100])
+    Path("out/b.mkv").unlink()
     command(*words, "--resume")
     assert outputs() == before
     assert "1 of 3 files made" in capsys.readouterr().out

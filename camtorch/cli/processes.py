@@ -1,0 +1,108 @@
+"""Processes that make files, one thread each, and what becomes of each file."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import pickle
+import signal
+import sys
+import threading
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, TypeAlias
+
+from camtorch.cli.terminal import reason
+
+Pair: TypeAlias = tuple[Path, Path]
+"""A file that is read, and the file that is made of it."""
+Work: TypeAlias = Callable[[Path, Path], Any]
+"""Makes a file, whole or not at all, and returns facts about it."""
+_HOW = "spawn" if sys.platform == "win32" else "forkserver"
+_work: Work
+
+
+@dataclass
+class Outcome:
+    """What became of a pair."""
+
+    facts: Any = None
+    failure: str = ""
+    """Why no file was made; empty if one was."""
+    notes: list[str] = field(default_factory=list)
+
+
+def prepare(module: str) -> None:
+    """Import a module once for all processes to come, while this process does something else."""
+    if _HOW == "forkserver":
+        from multiprocessing import forkserver
+
+        multiprocessing.set_forkserver_preload([__name__, module])
+        forkserver.ensure_running()
+
+
+def each(work: Work, pairs: Sequence[Pair], count: int) -> Iterator[tuple[Pair, Outcome]]:
+    """Yield pairs with their outcomes as they are done, by `count` processes; a single one is this process.
+
+    Processes end at once after an error or an interrupt.
+
+    Raises:
+        ChildProcessError: If a process was killed.
+    """
+    if count == 1:
+        yield from ((pair, _attempt(work, pair)) for pair in pairs)
+        return
+    others = multiprocessing.active_children()
+    # pickled here, because multiprocessing would share the memory of tensors
+    begin = (pickle.dumps(work),)
+    executor = ProcessPoolExecutor(count, multiprocessing.get_context(_HOW), _begin, begin)
+    try:
+        futures = {executor.submit(_attempt_here, pair): pair for pair in pairs}
+        yield from ((futures[future], future.result()) for future in as_completed(futures))
+    except BrokenProcessPool:
+        raise ChildProcessError("a process was killed, perhaps for lack of memory") from None
+    except BaseException:
+        for process in set(multiprocessing.active_children()).difference(others):
+            process.terminate()
+        raise
+    finally:
+        executor.shutdown(cancel_futures=True)
+
+
+def _begin(pickled: bytes) -> None:
+    """Prepare a new process."""
+    global _work
+    import torch
+
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the process that started this one handles interrupts
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    torch.set_num_threads(1)
+    _work = pickle.loads(pickled)
+
+
+def _end_with_parent() -> None:
+    """End this process when its parent was killed, which could not end it."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)
+
+
+def _attempt_here(pair: Pair) -> Outcome:
+    return _attempt(_work, pair)
+
+
+def _attempt(work: Work, pair: Pair) -> Outcome:
+    outcome = Outcome()
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", UserWarning)
+        try:
+            outcome.facts = work(*pair)
+        except Exception as error:
+            return Outcome(failure=reason(error))
+    outcome.notes = list(dict.fromkeys(str(warning.message) for warning in caught))
+    return outcome
