@@ -59,5 +59,6 @@ from camtorch.warp.plane import BirdsEye as BirdsEye
 from camtorch.warp.plane import PlaneWarp as PlaneWarp
 from camtorch.warp.reproject import Reproject as Reproject
 from camtorch.warp.shutter import RollingShutter as RollingShutter
+from camtorch.warp.shutter import ShutterWarp as ShutterWarp
 from camtorch.warp.vignetting import vignetting as vignetting
 from camtorch.warp.warp import Warp as Warp

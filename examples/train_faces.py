@@ -76,7 +76,7 @@ def cut_out(seen: Photographs, index: Tensor, camera: ct.Camera, turn: Tensor, g
     near, whole = faces.cut(camera, *camera.project(seen.points[index].to(turn) @ turn.mT), jitter)
     readout = SIDE * faces.READOUT / faces.SIZE[0] * camera.fx / near.fx
     shutter = ct.RollingShutter(readout, faces.RATE * rates)
-    warp = ct.Warp(seen.camera, near, turn, target_shutter=shutter, padding_mode="border")
+    warp = ct.ShutterWarp(seen.camera, near, turn, target_shutter=shutter, padding_mode="border")
     return warped(seen, index, warp, whole)
 
 

@@ -25,6 +25,7 @@ from camtorch.augment.landmarks import LANDMARKS
 from camtorch.augment.presets import PRESETS, Preset
 from camtorch.augment.random_camera import RandomCamera, RandomLens, RandomMount
 from camtorch.augment.sample import from_pitch_yaw, to_pitch_yaw
+from camtorch.augment.shutter import RandomShutter
 from camtorch.rotations import mount_rotation
 from camtorch.warp.boxes import outlines
 
@@ -46,6 +47,7 @@ __all__ = [
     "RandomLens",
     "RandomMount",
     "RandomResizedCrop",
+    "RandomShutter",
     "Range",
     "Resize",
     "Rotate90",

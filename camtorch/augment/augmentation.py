@@ -33,7 +33,6 @@ from camtorch.augment.filling import enough, filled, scaled
 from camtorch.augment.sample import Named, Sample, SampleOptions, SampleTransform, Unknown, on_samples
 from camtorch.camera import Camera
 from camtorch.mixed import Mixed
-from camtorch.warp.shutter import RollingShutter
 from camtorch.warp.warp import Warp
 
 if TYPE_CHECKING:
@@ -248,6 +247,8 @@ class Augmentation(SampleTransform):
     ranges: dict[str, Range]
     beside_the_camera: ClassVar[frozenset[str]] = frozenset()
     """The ranges of what the new images have beside a camera."""
+    keeps_lens: ClassVar[bool] = False
+    """Whether it may follow the colours and the light of a lens, though it needs the camera."""
     image_size: tuple[int, int] | None = None
     """Of what comes out; None: that of what comes in."""
     crops: Mapping[str, int]
@@ -421,7 +422,7 @@ class Augmentation(SampleTransform):
             self._tell_of_zoom(source, target, factor, found)
         beside = self.beside_the_camera.intersection(values)
         more = self._like(source, {name: values[name] for name in values if name in beside}) if beside else {}
-        warp = self._warp(source, target, rotation, self._shutter(more))
+        warp = self._warp(source, target, rotation)
         return Part(rows, warp, source, *self._seen_through(warp, more))
 
     def _values(self, source: Camera, draw: Mapping[str, Any]) -> dict[str, Any]:
@@ -445,14 +446,8 @@ class Augmentation(SampleTransform):
         dtype = torch.promote_types(source.intrinsics.dtype, torch.float32)
         return {n: torch.as_tensor(value, dtype=dtype, device=source.intrinsics.device) for n, value in values.items()}
 
-    def _warp(
-        self, source: Camera, target: Camera, rotation: Tensor | None, shutter: RollingShutter | None = None
-    ) -> Warp:
-        return Warp(source, target, rotation, **self.options, target_shutter=shutter)
-
-    def _shutter(self, values: Mapping[str, Tensor]) -> RollingShutter | None:
-        """By which the new images are taken."""
-        return None
+    def _warp(self, source: Camera, target: Camera, rotation: Tensor | None) -> Warp:
+        return Warp(source, target, rotation, **self.options)
 
     def _seen_through(self, warp: Warp, values: Mapping[str, Tensor]) -> tuple[tuple[Warp, Warp] | None, Tensor | None]:
         """What the lens does to colours and light: `shades` and `light` of the part of a batch."""

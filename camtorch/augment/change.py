@@ -29,7 +29,6 @@ from camtorch.warp.boxes import corners_of, in_order
 from camtorch.warp.panorama import seam_of
 from camtorch.warp.sampling import Mode, Options
 from camtorch.warp.shifted import ShiftedWarp
-from camtorch.warp.shutter import Shutters
 from camtorch.warp.warp import Warp
 
 _ROUNDED = 1e-5  # relative: cameras that were float32 on the way are the same ones
@@ -155,30 +154,21 @@ def _rows_of_warp(warp: Warp, camera: Camera, index: list[int]) -> Warp:
     rotation, target = warp.rotation, _rows_of(warp.target, index)
     if rotation is not None and rotation.ndim == 3:
         rotation = rotation[index]
-    if isinstance(warp, ShiftedWarp):
-        return warp.rows_of(camera, target, rotation, index)
-    if isinstance(warp, AffineWarp):
-        matrix = warp.matrix if warp.matrix.ndim == 2 else warp.matrix[index]
-        return AffineWarp(camera, target, matrix, rotation, **warp.options)
-    first, last = warp.shutter, warp.target_shutter
-    shutters: Shutters = {"shutter": first and first.rows_of(index), "target_shutter": last and last.rows_of(index)}
-    return warp.between(camera, target, rotation, **warp.options, **shutters)
+    return warp.rows_of(camera, target, rotation, index)
 
 
 def _joined(a: Part, b: Part) -> Part:
     """One part that does with one warp what two do one after the other.
 
     Raises:
-        ValueError: the colours or the light of a lens seen through another one, or a shutter before the last warp.
+        ValueError: the colours or the light of a lens seen through another one.
     """
     if b.moves is None:
         return a
     if a.moves is None:
         return replace(b, rows=a.rows, camera=a.camera)
-    if not isinstance(a.moves, View) and a.moves.target_shutter is not None:
-        raise ValueError(
-            "Compose: what comes after a rolling shutter or an exposure would move its rows; rates go last"
-        )
+    if not isinstance(b.moves, View) and b.moves.keeps_lens:
+        return a.by(b.moves.follow)
     rotation = _both_turns(a.moves.rotation, b.moves.rotation)
     if not isinstance(b.moves, AffineWarp):
         if a.shades is not None or a.light is not None:
@@ -189,7 +179,7 @@ def _joined(a: Part, b: Part) -> Part:
         if isinstance(b.moves, View) and not a.camera.batch_shape:
             start = a.moves.start if isinstance(a.moves, View) else _single(a.camera)
             return replace(b, rows=a.rows, camera=a.camera, moves=replace(b.moves, rotation=rotation, start=start))
-        moved = b.by(lambda warp: MirrorWarp(a.camera, warp.target, rotation, **warp.shutters))
+        moved = b.by(lambda warp: MirrorWarp(a.camera, warp.target, rotation))
         return replace(moved, rows=a.rows, camera=a.camera)
     edit, size = b.moves.matrix, b.moves.target.image_size
     if isinstance(a.moves, AffineWarp):
@@ -211,9 +201,8 @@ def _single(camera: Camera) -> Native | None:
 def _optioned(warp: Warp, options: Options) -> Warp:
     if isinstance(warp, MirrorWarp) and warp.options == options:
         return warp
-    if isinstance(warp, AffineWarp):
-        return AffineWarp(warp.source, warp.target, warp.matrix, warp.rotation, **options)
-    return MirrorWarp(warp.source, warp.target, warp.rotation, **options, **warp.shutters)
+    make = warp.between if isinstance(warp, MirrorWarp) else MirrorWarp
+    return make(warp.source, warp.target, warp.rotation, **options)
 
 
 def _both_turns(first: Tensor | None, second: Tensor | None) -> Tensor | None:

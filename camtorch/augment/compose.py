@@ -46,8 +46,8 @@ class Compose(Augmentation):
 
     Raises:
         TypeError: something that is no augmentation. ValueError: none; two tables of landmarks that differ; a part that
-            wants other images than the whole; chromatic aberration or vignetting before another lens; rates before the
-            last part.
+            wants other images than the whole; chromatic aberration or vignetting before another lens; a
+            `RandomShutter` before the last part.
     """
 
     augmentations: nn.ModuleList
@@ -119,11 +119,11 @@ class Compose(Augmentation):
                 )
             if "rates" in drawn and parts[i + 1 :]:
                 raise ValueError(
-                    f"{self._name}: what comes after the rolling shutter of {type(part).__name__} would move its "
-                    "rows; rates go to the last augmentation"
+                    f"{self._name}: what comes after a rolling shutter would move its rows; {type(part).__name__} goes "
+                    "last"
                 )
             coloured = {"chromatic", "vignetting", "cos4"} & drawn
-            if coloured and any(later.needs_camera for later in parts[i + 1 :]):
+            if coloured and any(later.needs_camera and not later.keeps_lens for later in parts[i + 1 :]):
                 raise ValueError(
                     f"{self._name}: the {' and '.join(sorted(coloured))} of {type(part).__name__} would be seen "
                     "through another lens; only edits may follow it"

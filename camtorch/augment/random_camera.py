@@ -35,7 +35,6 @@ from camtorch.rotations import mount_elements
 from camtorch.warp.boxes import along_edges
 from camtorch.warp.panorama import PANORAMAS
 from camtorch.warp.shifted import ShiftedWarp
-from camtorch.warp.shutter import RollingShutter
 from camtorch.warp.vignetting import vignetting
 from camtorch.warp.warp import Warp
 
@@ -99,11 +98,6 @@ class RandomCamera(Augmentation):
             the distance from the principal point.
         cos4: natural vignetting: the light falls by this power of cos^4 of a pixel's angle to the axis; 1 is the law,
             fisheyes have less, below 0 it is undone. See `ct.vignetting`.
-        rates: degrees per second by which the new camera turns while it takes its image: about x (up), y (right) and
-            z (clockwise), each drawn for itself. What comes of it say readout and exposure, of which one is needed. See
-            `RollingShutter`; points in space, gaze and poses are of the middle of the readout.
-        readout: seconds from the first row of a rolling shutter to the last; below 0 it reads from the bottom up.
-        exposure: seconds for which a row gathers light, which blurs images. Labels are of its middle.
         image_size: (height, width) to come out; the sample's by default. Fields of view are those in width.
         options: p, same_on_batch, camera, fields, mode, padding_mode, fill, antialias, tolerance, mask_fill, valid_mask
             and min_filled; see `Augmentation`.
@@ -117,9 +111,7 @@ class RandomCamera(Augmentation):
         **dict.fromkeys(("preset", "model", "lens"), "like"),
         **{"center": "centre", "size": "image_size"},
     }
-    beside_the_camera: ClassVar[frozenset[str]] = frozenset(
-        {"chromatic", "vignetting", "cos4", "rates", "readout", "exposure"}
-    )
+    beside_the_camera: ClassVar[frozenset[str]] = frozenset({"chromatic", "vignetting", "cos4"})
     like: Camera | None
 
     def __init__(
@@ -138,9 +130,6 @@ class RandomCamera(Augmentation):
         chromatic: RangeLike | None = None,
         vignetting: RangeLike | None = None,
         cos4: RangeLike | None = None,
-        rates: RangeLike | None = None,
-        readout: RangeLike | None = None,
-        exposure: RangeLike | None = None,
         image_size: Sequence[int] | None = None,
         **options: Any,
     ):
@@ -174,20 +163,12 @@ class RandomCamera(Augmentation):
             "chromatic": (chromatic, {"least": -0.5, "most": 0.5, "size": 2}),
             "vignetting": (_pair(vignetting), {"least": 0, "most": 1}),
             "cos4": (_pair(cos4), {"least": -2, "most": 2}),
-            "rates": (rates, {"least": -3600, "most": 3600, "size": 3}),
-            "readout": (_pair(readout), {"least": -1, "most": 1}),
-            "exposure": (_pair(exposure), {"least": 0, "most": 1}),
         }
         self.ranges: dict[str, Range] = {
             n: as_range(v, n, self._name, **limit) for n, (v, limit) in limits.items() if v is not None
         }
         if "fov" in self.ranges:
             check_degrees(self.ranges["fov"].low, fov, self._name)
-        if ("rates" in self.ranges) != bool({"readout", "exposure"} & set(self.ranges)):
-            raise ValueError(
-                f"{self._name}: rates, in degrees per second, show by a readout or an exposure, in seconds, and those "
-                f"by rates; got rates={rates!r}, readout={readout!r}, exposure={exposure!r}"
-            )
         among = self.ranges.pop("fov", None) if self._is_real else None
         self._among = None if among is None else (among.low, among.high)
 
@@ -271,17 +252,14 @@ class RandomCamera(Augmentation):
         usual = type(self).new_camera is RandomCamera.new_camera and not self.options["antialias"]
         return usual and bool(self.options["tolerance"]) and self.beside_the_camera.isdisjoint(self.ranges)
 
-    def _warp(
-        self, source: Camera, target: Camera, rotation: Tensor | None, shutter: RollingShutter | None = None
-    ) -> Warp:
-        return Warp.unchecked(source, target, self.options, None, shutter).turned_by(rotation)
+    def _warp(self, source: Camera, target: Camera, rotation: Tensor | None) -> Warp:
+        return Warp.unchecked(source, target, self.options).turned_by(rotation)
 
     def _seen_through(self, warp: Warp, values: Mapping[str, Tensor]) -> tuple[tuple[Warp, Warp] | None, Tensor | None]:
         shades = light = None
         if "chromatic" in values:
             red, blue = (scaled(warp.target, 1 + values["chromatic"][..., i]) for i in (0, 1))
-            how = warp.rotation, warp.target_shutter
-            shades = self._warp(warp.source, red, *how), self._warp(warp.source, blue, *how)
+            shades = self._warp(warp.source, red, warp.rotation), self._warp(warp.source, blue, warp.rotation)
         if "vignetting" in values:
             light = _light(warp.target, values["vignetting"])
         if "cos4" in values:
@@ -311,13 +289,6 @@ class RandomCamera(Augmentation):
             f"min_filled={share:g} zooms until so much of it is filled, and the camera of the images, "
             f"{float(source.fov[..., 0].max()):.0f} degrees wide, shows no more where the new one looks. fov='source' "
             "asks for what it has; with min_filled=0 the rest stays empty",
-        )
-
-    def _shutter(self, values: Mapping[str, Tensor]) -> RollingShutter | None:
-        if "rates" not in values:
-            return None
-        return RollingShutter(
-            values.get("readout", 0.0), torch.deg2rad(values["rates"]), exposure=values.get("exposure", 0.0)
         )
 
     def _target(
@@ -470,9 +441,8 @@ class RandomMount(RandomCamera):
             return
         if isinstance(shift, (str, int, float)) or len(shift) != len(_SHIFTS):
             raise TypeError(f"{self._name}: shift must be three lengths or ranges (dx, dy, dz); got {shift!r}")
-        for name in ("chromatic", "rates"):
-            if name in self.ranges:
-                raise ValueError(f"{self._name}: with shift there is no {name}")
+        if "chromatic" in self.ranges:
+            raise ValueError(f"{self._name}: with shift there is no chromatic")
         for name, each in zip(_SHIFTS, shift, strict=True):
             self.ranges[name] = as_range(each, "shift", self._name)
 

@@ -19,7 +19,6 @@ from camtorch.camera import Camera
 from camtorch.data.columns import camera_of
 from camtorch.data.seeded import Key, Seeded
 from camtorch.warp.proxy import ProxyWarp
-from camtorch.warp.shutter import Shutters
 from camtorch.warp.warp import Warp
 
 Moves = Augmentation | FaceNormalizer | Warp
@@ -36,12 +35,9 @@ class Always(Augmentation):
             raise TypeError(f"{owner}: {type(warp).__name__} moves images alone; call it on them, without their labels")
         if warp.batch_shape:
             raise ValueError(f"{owner}: the warp must be a single one; got batch dims {tuple(warp.batch_shape)}")
-        source, target = warp.source.detach(), warp.target.detach()
-        super().__init__(camera=source, fields=fields, min_filled=0)
-        rotation = None if warp.rotation is None else warp.rotation.detach()
-        first, last = warp.shutter, warp.target_shutter
-        shutters: Shutters = {"shutter": first and first.detached(), "target_shutter": last and last.detached()}
-        self.warp = Warp(source, target, rotation, **warp.options, **shutters)
+        warp = warp.detach()
+        super().__init__(camera=warp.source, fields=fields, min_filled=0)
+        self.warp = warp
 
     def _part(self, rows: list[int] | None, source: Camera, draw: Mapping[str, Tensor]) -> Part:
         return Part(rows, self.warp, self.warp.source)

@@ -22,7 +22,7 @@ class Exact:
         owner: the function that needs it, for errors.
 
     Raises:
-        ValueError: If the warp is a batch, or blurs.
+        ValueError: If the warp is a batch.
     """
 
     positions: Floats
@@ -40,12 +40,6 @@ class Exact:
             raise ValueError(
                 f"{owner}: a map is of one warp, and this is a batch of {count}; camera[i] is one of a batch of "
                 "cameras, so take each ct.Warp(source[i], target[i], rotation[i])"
-            )
-        shutter = warp.target_shutter
-        if shutter is not None and shutter.blurs:
-            raise ValueError(
-                f"{owner}: the blur of an exposure takes each pixel from {shutter.samples} positions, and a map holds "
-                "one; a target_shutter with exposure=0 has one"
             )
         self.warp = warp
         self.source_size: tuple[int, int] = warp.source._size_for(owner)

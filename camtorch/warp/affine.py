@@ -65,7 +65,7 @@ class MirrorWarp(Warp):
         if self._decides and plain and (self._halvings is None or any(self._halvings)):
             sampler = checked(self, images, mode, padding_mode, fill)
             smooth = sampler.mode != "nearest" and images.dtype != torch.bool
-            if smooth and route_of(self, images, sampler.mode) == "kept":
+            if smooth and route_of(self, images) == "kept":
                 where = positions(self, "kept", sampler.padding_mode)
                 if self._halvings is None:
                     self._halvings = _halvings(where, self.source._size_for("Warp"))
@@ -130,6 +130,15 @@ class AffineWarp(MirrorWarp):
         super().__init__(source, target, rotation, **options)
         self.register_buffer("matrix", matrix, persistent=False)
         self.batch_shape = broadcast_shapes(self.batch_shape, matrix.shape[:-2])
+
+    def between(self, source: Camera, target: Camera, rotation: Tensor | None, **options: Any) -> Warp:
+        """See `Warp.between`; the map of pixels stays."""
+        return AffineWarp(source, target, self.matrix, rotation, **options)
+
+    def rows_of(self, source: Camera, target: Camera, rotation: Tensor | None, index: list[int]) -> Warp:
+        """See `Warp.rows_of`."""
+        matrix = self.matrix if self.matrix.ndim == 2 else self.matrix[index]
+        return AffineWarp(source, target, matrix, rotation, **self.options)
 
     def inverse(self) -> Warp:
         """The edit back. What it cut off stays lost."""

@@ -43,14 +43,7 @@ Sizes = tuple[tuple[int, int], tuple[int, int]]
 
 def _is_used_once(warp: Warp) -> bool:
     """Whether its positions come from a lattice that nobody keeps, of cameras that stand still."""
-    return (
-        warp.is_an_operator
-        and warp._pinned is None
-        and bool(warp.tolerance)
-        and not warp.antialias
-        and warp.shutter is None
-        and warp.target_shutter is None
-    )
+    return warp.is_an_operator and warp._pinned is None and bool(warp.tolerance) and not warp.antialias
 
 
 def between_of(warp: Warp) -> tuple[Native, Native, Tensor | None] | None:

@@ -14,8 +14,7 @@ from camtorch.camera import Camera
 from camtorch.models import UCM, Cylindrical, Equirectangular, Pinhole
 from camtorch.projection.rays import around_ends, image_lattice
 from camtorch.rotations import as_rotation
-from camtorch.warp.sampling import WarpOptions
-from camtorch.warp.shutter import RollingShutter
+from camtorch.warp.sampling import TolerantOptions
 from camtorch.warp.warp import Warp, as_sized
 
 if TYPE_CHECKING:
@@ -63,7 +62,7 @@ class Dewarp(Warp):
             where that is one; for how far it shows up and down its image_size has the say.
         image_size: (height, width) of the target; the source's by default.
         rotation: (3, 3) or (B, 3, 3), `ray_target = R ray_source`: where the target looks.
-        mode, padding_mode, fill, antialias, tolerance, shutter: as `Warp` takes them.
+        mode, padding_mode, fill, antialias, tolerance: as `Warp` takes them.
 
     The target has square pixels, is chosen once, and does not learn. It is finite for every camera, also where the
     lens folds inside the image or sees past 90 degrees.
@@ -82,9 +81,7 @@ class Dewarp(Warp):
         fov: float | None = None,
         image_size: Sequence[int] | None = None,
         rotation: Tensor | None = None,
-        tolerance: float | None = None,
-        shutter: RollingShutter | None = None,
-        **options: Unpack[WarpOptions],
+        **options: Unpack[TolerantOptions],
     ):
         if not isinstance(projection, str) or projection not in _PROJECTIONS:
             raise ValueError(f"Dewarp: projection must be one of {tuple(_PROJECTIONS)}; got {projection!r}")
@@ -103,7 +100,7 @@ class Dewarp(Warp):
             else:
                 intrinsics = _fitted(camera, projection, size, rotation)
         target = model(nn.Parameter(intrinsics, requires_grad=False), image_size=size)
-        super().__init__(camera, target, rotation, tolerance=tolerance, shutter=shutter, **options)
+        super().__init__(camera, target, rotation, **options)
 
 
 def _fitted(camera: Camera, projection: str, size: tuple[int, int], rotation: Tensor | None) -> Tensor:

@@ -24,22 +24,20 @@ from camtorch.native.sampler import Later, empty
 from camtorch.warp import compiled
 from camtorch.warp.grid import Lattice, Sampling, scaled
 from camtorch.warp.panorama import seam_of
-from camtorch.warp.sampling import PADDINGS, Mode, PaddingMode, Pyramid, Sampler, render
-from camtorch.warp.shutter import averaged
+from camtorch.warp.sampling import PADDINGS, PaddingMode, Pyramid, Sampler, render
 
 if TYPE_CHECKING:
     from camtorch.warp.warp import Warp
 
-Route = Literal["exposure", "operator", "strips", "graph", "kept"]
+Route = Literal["operator", "strips", "graph", "kept"]
 
 _MOST_KEPT = 1 << 25  # pixels of a grid; longer ones, of 256 MB in float32, are made by strips and not kept
 _STRIP = 1 << 21  # pixels of such a strip
 
 
-def route_of(warp: Warp, images: Tensor | None = None, mode: Mode = "nearest") -> Route:
+def route_of(warp: Warp, images: Tensor | None = None) -> Route:
     """The route of a call; the lattice and the native sampler are chosen below, by `locate` and `render`.
 
-    * "exposure": the target's shutter blurs, so that the images are the mean of warps at several moments;
     * "operator": compiled code calls one operator, and traces nothing of it;
     * "strips": the grid would be too long for memory, and is made part by part;
     * "graph": something learns, so that positions are computed anew with their graph;
@@ -48,13 +46,9 @@ def route_of(warp: Warp, images: Tensor | None = None, mode: Mode = "nearest") -
     Args:
         warp: the warp that is called.
         images: to be warped; None where positions alone are asked for.
-        mode: in which they are sampled.
     """
     learns = warp._pinned is None and torch.is_grad_enabled() and keeps_graph(*warp._inputs())
     if images is not None:
-        shutter = warp.target_shutter
-        if mode != "nearest" and shutter is not None and shutter.blurs:
-            return "exposure"
         learns = learns and images.dtype.is_floating_point
         if not learns and _is_operator(warp) and compiled.takes(images, warp._inputs()):
             return "operator"
@@ -65,15 +59,7 @@ def route_of(warp: Warp, images: Tensor | None = None, mode: Mode = "nearest") -
 
 def warped(warp: Warp, images: Tensor, sampler: Sampler, later: Later | None = None) -> Tensor:
     """The images of a warp; those given are checked. With `later`, `finish` may have to make them."""
-    route = route_of(warp, images, sampler.mode)
-    if route == "exposure":
-        assert warp.target_shutter is not None
-        shutters = warp.target_shutter.exposed()
-        given = warp.source, warp.target, warp.rotation
-        parts = [
-            warp.between(*given, **warp.options, shutter=warp.shutter, target_shutter=shutter) for shutter in shutters
-        ]
-        return averaged(images, parts, **sampler._asdict())
+    route = route_of(warp, images)
     if route == "operator":
         options = warp.tolerance, warp.antialias, _reach(warp, sampler.padding_mode), sampler
         return compiled.warped(images, warp.source, warp.target, warp.rotation, *options)
@@ -104,9 +90,8 @@ def positions(warp: Warp, route: Route, padding: PaddingMode = "zeros") -> Sampl
     if warp._pinned is not None and (reach == warp.padding_mode or isinstance(warp._pinned, Sampling)):
         return warp._pinned
 
-    forms = [None if shutter is None else shutter.form for shutter in (warp.shutter, warp.target_shutter)]
-    tolerance = warp.tolerance
-    options = warp.source._form, warp.target._form, *forms, warp.rotation is None, warp.antialias, tolerance
+    (source, target), tolerance = warp._ends, warp.tolerance
+    options = source._form, target._form, warp.rotation is None, warp.antialias, tolerance
     memo = warp._memos.setdefault(reach if tolerance else "zeros", Memo())  # what is exact serves all
     kept: Sampling | Lattice = memo(warp._inputs(), options, lambda: _computed(warp, reach))
     return kept
@@ -189,11 +174,8 @@ def _reach(warp: Warp, padding: PaddingMode) -> PaddingMode:
 
 
 def _is_operator(warp: Warp) -> bool:
-    """Whether code is compiled that calls this warp as one; it knows cameras of one model, and no shutters."""
-    if not (is_for_here() and warp.is_an_operator):
-        return False
-    plain = warp.shutter is None and warp.target_shutter is None
-    return plain and not (warp.source.is_mixed or warp.target.is_mixed)
+    """Whether code is compiled that calls this warp as one; it knows cameras of one model."""
+    return is_for_here() and warp.is_an_operator and not (warp.source.is_mixed or warp.target.is_mixed)
 
 
 def _is_long(warp: Warp) -> bool:

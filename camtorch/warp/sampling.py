@@ -482,6 +482,12 @@ class WarpOptions(TypedDict, total=False):
     antialias: bool
 
 
+class TolerantOptions(WarpOptions, total=False):
+    """And how exact positions are."""
+
+    tolerance: float | None
+
+
 def as_options(
     owner: str, mode: str, padding_mode: str, fill: Fill, antialias: bool | None, tolerance: float | None
 ) -> Options:

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from functools import reduce
-from typing import Any, Literal, TypedDict, get_args
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, Literal, cast, get_args
 
 import torch
 from torch import Tensor, nn
@@ -18,17 +17,21 @@ from camtorch._arguments import (
     as_points,
     as_real,
     as_vectors,
-    as_whole,
     broadcast_shapes,
     fails,
-    holds,
     shown,
     values_of,
 )
-from camtorch._dtypes import narrow, widen
 from camtorch._module import GeometryModule
 from camtorch.camera import Camera
 from camtorch.optics.special import cosc_root, sinc_root
+from camtorch.rotations import as_rotation
+from camtorch.warp.affine import MirrorWarp
+from camtorch.warp.sampling import TolerantOptions
+from camtorch.warp.warp import Warp
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
 
 Direction = Literal["down", "up", "right", "left"]
 DIRECTIONS: tuple[Direction, ...] = get_args(Direction)
@@ -42,9 +45,9 @@ _STILL = 1e-3  # the part of a row that a row must advance by, as the scene pass
 
 
 class RollingShutter(GeometryModule):
-    """Rows read one after the other, down the image, by a camera that turns at a constant rate: for `Warp`.
+    """Rows read one after the other, down the image, by a camera that turns at a constant rate: for `ShutterWarp`.
 
-    Convention: `rates` are what a gyroscope in the camera tells, in its frame (x right, y down, z forward): about +x
+    Convention: `rates` are what a gyroscope in the camera measures, in its frame (x right, y down, z forward): about +x
     the camera looks up, about +y it turns right, about +z it leans right, clockwise. With t = 0 in the middle of the
     readout, when the middle of the image is read, `ray_at_0 = exp(t [rates]) ray_at_t`. All else that has no row, as
     points in space, gaze and poses, is of that moment.
@@ -56,67 +59,44 @@ class RollingShutter(GeometryModule):
             other way. 0 is a global shutter.
         rates: (3,) or (B, 3) radians per second.
         direction: in which the sensor is read: "down", "up", "right" or "left", as seen in the image.
-        exposure: seconds for which each row gathers light, or (B,). A warp that puts the shutter on blurs its images
-            by the turn meanwhile; a blur cannot be undone. Labels are of the middle of the exposure.
-        samples: moments of the exposure that are averaged, at the cost of a warp each. Where the blur is many more
-            pixels long, its steps show.
 
     Plain values are kept as they are and do not learn; Parameters and tensors of a graph do.
 
     Raises:
-        ValueError: numbers that are not finite, shapes that do not fit, times of more than two seconds (they may be
-            milliseconds), rates of more than 70 radians per second (degrees), an unknown direction. TypeError: no
-            numbers.
+        ValueError: If numbers are not finite, shapes do not fit, the readout is more than two seconds (it may be
+            milliseconds), a rate is more than 70 radians per second (degrees), or the direction is unknown.
+        TypeError: If a value is not numeric.
     """
 
     readout: Tensor
     rates: Tensor
-    exposure: Tensor
-    offset: Tensor
-    """Seconds after which rows are seen: of a moment of an exposure."""
     batch_shape: torch.Size
-    samples: int
 
-    def __init__(
-        self,
-        readout: Numbers,
-        rates: Numbers,
-        *,
-        direction: Direction = "down",
-        exposure: Numbers = 0.0,
-        samples: int = 8,
-    ):
+    def __init__(self, readout: Numbers, rates: Numbers, *, direction: Direction = "down"):
         super().__init__()
         owner = "RollingShutter"
-        rates = as_vectors(rates, "rates", owner)
-        times = {name: as_real(value, name, owner) for name, value in (("readout", readout), ("exposure", exposure))}
+        rates, readout = as_vectors(rates, "rates", owner), as_real(readout, "readout", owner)
         if not isinstance(direction, str) or direction not in DIRECTIONS:
             raise ValueError(f"{owner}: direction must be one of {DIRECTIONS}; got {shown(direction)}")
-        for name, value in times.items():
-            if value.ndim > 1:
-                raise ValueError(f"{owner}: {name} must be a number or (B,); got shape {tuple(value.shape)}")
-            if fails(value.detach().abs() < _LONGEST):
-                raise ValueError(
-                    f"{owner}: {name} is in seconds; got {value.tolist()}, which would be milliseconds: {name} / 1000"
-                )
+        if readout.ndim > 1:
+            raise ValueError(f"{owner}: readout must be a number or (B,); got shape {tuple(readout.shape)}")
+        if fails(readout.detach().abs() < _LONGEST):
+            raise ValueError(
+                f"{owner}: readout is in seconds; got {readout.tolist()}, which would be milliseconds: readout / 1000"
+            )
         if fails(rates.detach().abs() < _FASTEST):
             raise ValueError(
                 f"{owner}: rates are in radians per second; got {rates.tolist()}, which would be degrees: numpy.deg2rad"
             )
-        if fails(times["exposure"].detach() >= 0):
-            raise ValueError(f"{owner}: exposure must not be negative; got {times['exposure'].tolist()}")
-        shapes = {name: (*value.shape, 1) for name, value in times.items()}
-        self.batch_shape = as_batch(owner, rates=rates.shape, **shapes)
+        self.batch_shape = as_batch(owner, rates=rates.shape, readout=(*readout.shape, 1))
         if len(self.batch_shape) > 1:
             raise ValueError(f"{owner}: rates must be (3,) or (B, 3); got shape {tuple(rates.shape)}")
-        for name, value in (*times.items(), ("rates", rates)):
+        for name, value in (("readout", readout), ("rates", rates)):
             if isinstance(value, nn.Parameter):
                 self.register_parameter(name, value)
             else:
                 self.register_buffer(name, as_own(value))
-        self.register_buffer("offset", torch.zeros_like(self.readout.detach()), persistent=False)
-        self.direction, self.samples = direction, as_whole(samples, "samples", owner, least=1)
-        self._blurred = not holds(self.exposure == 0)
+        self.direction = direction
 
     def times(self, pixels: Numbers, image_size: tuple[int, int]) -> Tensor:
         """(*B, *N): seconds from the middle of the readout at which pixels (*B, *N, 2) of an image are seen."""
@@ -126,45 +106,17 @@ class RollingShutter(GeometryModule):
             raise TypeError("RollingShutter: image_size must be two integers (height, width); got None")
         return self._times(self._share(values, image_size), values.ndim)
 
-    # -- what a warp asks for
-
-    @property
-    def tensors(self) -> list[Tensor]:
-        """All that positions depend on, beside the direction."""
-        return [self.readout, self.rates, self.offset]
-
-    @property
-    def form(self) -> tuple[object, ...]:
-        """What they depend on beside tensors."""
-        return (self.direction,)
+    # -- for a warp
 
     def rows_of(self, index: list[int]) -> RollingShutter:
-        """The shutter of these rows of a batch."""
-        if not self.batch_shape:
-            return self
+        """Return the shutter of these rows of a batch."""
         rates = self.rates[index] if self.rates.ndim == 2 else self.rates
-        return self._with(rates, *(t[index] if t.ndim else t for t in (self.readout, self.exposure)))
+        readout = self.readout[index] if self.readout.ndim else self.readout
+        return RollingShutter(readout, rates, direction=self.direction)
 
-    def detached(self) -> RollingShutter:
-        """The shutter of the same numbers, which do not learn."""
-        return self._with(self.rates.detach(), self.readout.detach(), self.exposure.detach())
-
-    def _with(self, rates: Tensor, readout: Tensor, exposure: Tensor) -> RollingShutter:
-        return RollingShutter(readout, rates, exposure=exposure, direction=self.direction, samples=self.samples)
-
-    @property
-    def blurs(self) -> bool:
-        """Whether the exposure takes time."""
-        exposure = values_of(self.exposure)
-        return self._blurred if exposure is None else bool((exposure > 0).any())
-
-    def exposed(self) -> list[RollingShutter]:
-        """The shutter at `samples` moments of its exposure, spread evenly."""
-        moments = [self._with(self.rates, self.readout, torch.zeros_like(self.exposure)) for _ in range(self.samples)]
-        for i, moment in enumerate(moments):
-            moment.register_buffer("offset", ((i + 0.5) / self.samples - 0.5) * self.exposure, persistent=False)
-            moment._blurred = False
-        return moments
+    def detach(self) -> RollingShutter:
+        """Return the shutter of the same numbers, which do not learn."""
+        return RollingShutter(self.readout.detach(), self.rates.detach(), direction=self.direction)
 
     def _share(self, pixels: Tensor, size: tuple[int, int]) -> Tensor:
         """When pixels (..., 2) are read, in readouts from the middle one."""
@@ -175,8 +127,7 @@ class RollingShutter(GeometryModule):
 
     def _times(self, share: Tensor, ndim: int) -> Tensor:
         """Seconds, of shares of the readout (..., ) of points with `ndim` dims."""
-        readout, offset = (_lead(value.to(share.dtype), ndim - 1) for value in (self.readout, self.offset))
-        return share * readout + offset
+        return share * _lead(self.readout.to(share.dtype), ndim - 1)
 
     def turned(self, rays: Tensor, share: Tensor, sign: float) -> Tensor:
         """Rays (*B, *N, 3) of shares (*B, *N) of the readout, turned to its middle (sign 1) or from it (sign -1).
@@ -196,25 +147,113 @@ class RollingShutter(GeometryModule):
         )
         return torch.stack(planes, -1)
 
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *given: Any) -> None:
+        exposure = state_dict.pop(f"{prefix}exposure", None)  # of 0.3
+        if exposure is not None and fails(exposure == 0):
+            raise ValueError('RollingShutter: the state has an exposure, which is gone: see "Leaving 0.3" in the docs')
+        super()._load_from_state_dict(state_dict, prefix, *given)
+
     def extra_repr(self) -> str:
-        """Times, rates and direction."""
-        readout, rates, exposure = map(values_of, (self.readout, self.rates, self.exposure))
-        if self.batch_shape or readout is None or rates is None or exposure is None:
+        """The readout, the rates and the direction."""
+        readout, rates = map(values_of, (self.readout, self.rates))
+        if self.batch_shape or readout is None or rates is None:
             return f"batch_shape={tuple(self.batch_shape)}, direction={self.direction!r}"
-        parts = [f"readout={float(readout):g}", f"rates={rates.tolist()}", f"direction={self.direction!r}"]
-        return ", ".join([*parts, f"exposure={float(exposure):g}"])
-
-
-class Shutters(TypedDict):
-    """What a `Warp` takes of shutters by name."""
-
-    shutter: RollingShutter | None
-    target_shutter: RollingShutter | None
+        return f"readout={float(readout):g}, rates={rates.tolist()}, direction={self.direction!r}"
 
 
 def _lead(value: Tensor, ndim: int, inner: int = 0) -> Tensor:
     """(B, ...) before points with `ndim` leading dims; what has no batch dim serves all."""
     return value if value.ndim == inner else value.reshape(len(value), *[1] * (ndim - 1), *value.shape[1:])
+
+
+class ShutterWarp(MirrorWarp):
+    """A `Warp` between cameras with rolling shutters: it undoes that of the source, and puts on that of the target.
+
+    Cameras and rotation are those of the middle of the readout. Images, points and boxes move by the row that sees
+    them; rays turn by the rotation alone.
+
+        straight = ct.ShutterWarp(camera, ct.Dewarp(camera).target, shutter=ct.RollingShutter(0.015, [0.3, -1.2, 0.5]))
+        images = straight(images)
+
+    Args:
+        source: the camera of the given images.
+        target: the camera of the images to make.
+        rotation: (3, 3) or (B, 3, 3), `ray_target = R ray_source`; None is no rotation.
+        shutter: by which the given images were taken.
+        target_shutter: by which the images to make are taken.
+        as_warp: mode, padding_mode, fill, antialias, tolerance, as `Warp` takes them.
+
+    Raises:
+        ValueError: If batch dims do not fit, and as `Warp`. TypeError: If a shutter is no `RollingShutter`.
+    """
+
+    is_an_operator = False
+    keeps_lens = True
+    batch_shape: torch.Size
+    shutter: RollingShutter | None
+    target_shutter: RollingShutter | None
+
+    def __init__(
+        self,
+        source: Camera,
+        target: Camera,
+        rotation: Tensor | None = None,
+        *,
+        shutter: RollingShutter | None = None,
+        target_shutter: RollingShutter | None = None,
+        **as_warp: Unpack[TolerantOptions],
+    ):
+        rotation = as_rotation(rotation, "ShutterWarp")
+        super().__init__(source, target, None, **as_warp)
+        shutters = {"shutter": shutter, "target_shutter": target_shutter}
+        shapes = {"cameras": (*self.batch_shape, 1)}
+        shapes |= {} if rotation is None else {"rotation": rotation.shape[:-1]}
+        for name, each in shutters.items():
+            if not (each is None or isinstance(each, RollingShutter)):
+                hint = "ct.RollingShutter(readout, rates) makes one, of seconds and radians per second"
+                raise TypeError(f"ShutterWarp: {name} must be a RollingShutter; got {type(each).__name__}. {hint}")
+            shapes |= {} if each is None else {name: (*each.batch_shape, 1)}
+            setattr(self, name, each)
+        self.batch_shape = as_batch("ShutterWarp", **shapes)
+        self.turned_by(rotation)
+
+    @property
+    def _ends(self) -> tuple[Camera, Camera]:
+        return _behind(self.shutter, self.source), _behind(self.target_shutter, self.target)
+
+    def inverse(self) -> Warp:
+        """Return the warp from target to source. It puts on the shutter that this one undoes, and the other way."""
+        rotation = None if self.rotation is None else self.rotation.mT
+        shutters = {"shutter": self.target_shutter, "target_shutter": self.shutter}
+        return self.between(self.target, self.source, rotation, **self.options, **shutters)
+
+    def between(self, source: Camera, target: Camera, rotation: Tensor | None, **options: Any) -> Warp:
+        """See `Warp.between`; the shutters stay unless the options have others."""
+        options = {"shutter": self.shutter, "target_shutter": self.target_shutter, **options}
+        return ShutterWarp(source, target, **options).turned_by(rotation)
+
+    def detach(self) -> Warp:
+        """See `Warp.detach`."""
+        rotation = None if self.rotation is None else self.rotation.detach()
+        options = {**self.options, **self._shutters(RollingShutter.detach)}
+        return self.between(self.source.detach(), self.target.detach(), rotation, **options)
+
+    def rows_of(self, source: Camera, target: Camera, rotation: Tensor | None, index: list[int]) -> Warp:
+        """See `Warp.rows_of`."""
+        shutters = self._shutters(lambda shutter: shutter.rows_of(index) if shutter.batch_shape else shutter)
+        return self.between(source, target, rotation, **self.options, **shutters)
+
+    def follow(self, first: Warp) -> Warp:
+        """See `Warp.follow`."""
+        return self.between(first.source, first.target, first.rotation, **self.options)
+
+    def _shutters(self, change: Callable[[RollingShutter], RollingShutter]) -> dict[str, RollingShutter | None]:
+        both = {"shutter": self.shutter, "target_shutter": self.target_shutter}
+        return {name: None if each is None else change(each) for name, each in both.items()}
+
+
+def _behind(shutter: RollingShutter | None, camera: Camera) -> Camera:
+    return camera if shutter is None else cast("Camera", InMotion(camera, shutter))
 
 
 class InMotion:
@@ -232,6 +271,14 @@ class InMotion:
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self.camera, name)
+
+    @property
+    def _tensors(self) -> tuple[Tensor, ...]:
+        return *self.camera._tensors, self.shutter.readout, self.shutter.rates
+
+    @property
+    def _form(self) -> tuple[object, ...]:
+        return self.camera._form, self.shutter.direction
 
     def unproject(self, pixels: Numbers) -> tuple[Tensor, Tensor]:
         """As of a camera; in closed form, for a pixel says when it is seen."""
@@ -272,9 +319,3 @@ class InMotion:
         pixels, valid, _ = seen(share + torch.where(settled, off / torch.where(settled, 1 - slope, 1.0), 0.0))
         valid = valid & settled
         return torch.where(valid.unsqueeze(-1), pixels, -1.0), valid
-
-
-def averaged(images: Tensor, warps: Sequence[Callable[..., Tensor]], **options: Any) -> Tensor:
-    """The mean of what warps, of the moments of an exposure, make of images (B, C, H, W), in their dtype."""
-    wide = widen(images)
-    return narrow(reduce(torch.add, (warp(wide, **options) for warp in warps)) / len(warps), images.dtype)

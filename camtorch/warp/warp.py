@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any, ClassVar, cast
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import torch
@@ -31,7 +31,6 @@ from camtorch.warp.sampling import (
     as_options,
     one_of,
 )
-from camtorch.warp.shutter import InMotion, RollingShutter, Shutters
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -80,9 +79,6 @@ class Warp(GeometryModule):
             lattice of every eighth pixel, several times as fast where cameras are new, and what it does not reach is
             computed. By default 0.001 between cameras in float32, whose rounding costs as much, and zero in
             float64. Zero is exact; so are points, boxes and rays always, warps with a graph, and those on a GPU.
-        shutter: the `RollingShutter` by which the given images were taken: undone along with the lens. Both cameras and
-            the rotation are then those of the middle of the readout.
-        target_shutter: the one by which the images to make are taken: put on.
 
     The image of a panorama of a whole turn goes on beyond its seam and its poles: of an `Equirectangular` or
     `Cylindrical` source as wide as 2 pi, or a `LatLon` or `TransverseCylindrical` one as tall, to 0.05 pixels, all of a
@@ -100,6 +96,8 @@ class Warp(GeometryModule):
     _decides = False  # for itself where to antialias
     is_an_operator: ClassVar[bool] = True
     """Whether compiled code calls it as one: the cameras and the rotation are all there is to it."""
+    keeps_lens: ClassVar[bool] = False
+    """Whether it may follow another warp, and is then what `follow` makes of that."""
     batch_shape: torch.Size
     mode: Mode
     padding_mode: PaddingMode
@@ -112,8 +110,6 @@ class Warp(GeometryModule):
     rotation: Tensor | None = _part("_buffers", "rotation")
     fill: tuple[float, ...]
     antialias: bool
-    shutter: RollingShutter | None
-    target_shutter: RollingShutter | None
 
     def __init__(
         self,
@@ -126,13 +122,10 @@ class Warp(GeometryModule):
         fill: Fill = 0.0,
         antialias: bool = False,
         tolerance: float | None = None,
-        shutter: RollingShutter | None = None,
-        target_shutter: RollingShutter | None = None,
     ):
         options = as_options("Warp", mode, padding_mode, fill, antialias, tolerance)
         rotation = as_rotation(rotation, "Warp")
-        batch = _check_parts(source, target, rotation, shutter, target_shutter)
-        self._set(source, target, options, shutter, target_shutter, batch)
+        self._set(source, target, options, _check_parts(source, target, rotation))
         self.turned_by(rotation)
 
     def _set(
@@ -140,15 +133,12 @@ class Warp(GeometryModule):
         source: Camera,
         target: Camera,
         options: Options,
-        shutter: RollingShutter | None = None,
-        target_shutter: RollingShutter | None = None,
         batch: torch.Size | None = None,
     ) -> None:
-        parts = {"source": source, "target": target, "shutter": shutter, "target_shutter": target_shutter}
         if batch is None:
-            batch = broadcast_shapes(*[part.batch_shape for part in parts.values() if part is not None])
+            batch = broadcast_shapes(source.batch_shape, target.batch_shape)
         super().__init__(
-            parts,
+            {"source": source, "target": target},
             batch_shape=batch,
             mode=options["mode"],
             padding_mode=options["padding_mode"],
@@ -271,20 +261,18 @@ class Warp(GeometryModule):
 
     def _inputs(self) -> list[Tensor]:
         """All tensors that they depend on."""
-        rotation, found = self.rotation, [*self.source._tensors, *self.target._tensors]
-        found += [] if rotation is None else [rotation]
-        for shutter in (self.shutter, self.target_shutter):
-            found += [] if shutter is None else shutter.tensors
-        return found
+        (source, target), rotation = self._ends, self.rotation
+        found = [*source._tensors, *target._tensors]
+        return found if rotation is None else [*found, rotation]
 
     def _locate(self, rows: range, padding: PaddingMode, tolerance: float) -> Sampling | Lattice:
         """Those of some rows of the target, which serve a padding, within a tolerance."""
-        return locate(*self._in_motion, self.rotation, tolerance, self.antialias, rows, padding)
+        return locate(*self._ends, self.rotation, tolerance, self.antialias, rows, padding)
 
     @property
-    def _in_motion(self) -> tuple[Camera, Camera]:
-        """Source and target, each behind its shutter."""
-        return _moved_by(self.source, self.shutter), _moved_by(self.target, self.target_shutter)
+    def _ends(self) -> tuple[Camera, Camera]:
+        """Source and target, by which positions are found."""
+        return self.source, self.target
 
     # -- labels
 
@@ -301,7 +289,7 @@ class Warp(GeometryModule):
         """Pixels of the source to the target's image, or back, and whether they have a place there, on it or not; see
         `moved_pixels`.
         """
-        (source, target), rotation = self._in_motion, self.rotation
+        (source, target), rotation = self._ends, self.rotation
         if back:
             source, target, rotation = target, source, None if rotation is None else rotation.mT
         return moved_pixels(source, target, rotation, pixels, on_image)
@@ -327,27 +315,31 @@ class Warp(GeometryModule):
         return enclosed(self, corners)
 
     def transform_rays(self, rays: Numbers) -> Tensor:
-        """Turn directions (B, *N, 3), or (*N, 3), from the source's to the target's frame; lengths stay.
-
-        With shutters both frames are those of the middle of the readout.
-        """
+        """Turn directions (B, *N, 3), or (*N, 3), from the source's to the target's frame; lengths stay."""
         rays = as_coordinates(rays, "rays", 3, "Warp", self.source.intrinsics.device, "B, *N")
         return turn(self.rotation, rays, "rays")
 
     def inverse(self) -> Warp:
         """The warp from target to source. What lay outside the image, or between its pixels, stays lost."""
         rotation = None if self.rotation is None else self.rotation.mT
-        shutters: Shutters = {"shutter": self.target_shutter, "target_shutter": self.shutter}
-        return self.between(self.target, self.source, rotation, **self.options, **shutters)
+        return self.between(self.target, self.source, rotation, **self.options)
 
     def between(self, source: Camera, target: Camera, rotation: Tensor | None, **options: Any) -> Warp:
         """A warp as this one is, mirrored or not, between other cameras."""
         return Warp(source, target, rotation, **options)
 
-    @property
-    def shutters(self) -> Shutters:
-        """Of source and target, as another Warp takes them."""
-        return {"shutter": self.shutter, "target_shutter": self.target_shutter}
+    def detach(self) -> Warp:
+        """Return the same warp, which does not learn."""
+        rotation = None if self.rotation is None else self.rotation.detach()
+        return self.between(self.source.detach(), self.target.detach(), rotation, **self.options)
+
+    def rows_of(self, source: Camera, target: Camera, rotation: Tensor | None, index: list[int]) -> Warp:
+        """Return the warp of these rows of a batch, whose cameras and rotations are given."""
+        return self.between(source, target, rotation, **self.options)
+
+    def follow(self, first: Warp) -> Warp:
+        """Return this warp after `first`, as one, if it keeps the lens of that."""
+        raise NotImplementedError
 
     @property
     def options(self) -> Options:
@@ -369,37 +361,21 @@ class Warp(GeometryModule):
         return ", ".join(f"{name}={value!r}" for name, value in said.items())
 
 
-def _moved_by(camera: Camera, shutter: RollingShutter | None) -> Camera:
-    return camera if shutter is None else cast("Camera", InMotion(camera, shutter))
-
-
-def _check_parts(
-    source: Camera,
-    target: Camera,
-    rotation: Tensor | None,
-    shutter: RollingShutter | None,
-    target_shutter: RollingShutter | None,
-) -> torch.Size:
+def _check_parts(source: Camera, target: Camera, rotation: Tensor | None) -> torch.Size:
     """How many of each a warp is between; raises what is wrong with that, and with them."""
     as_sized(source, "source", "Warp")
     as_sized(target, "target", "Warp")
     if source.intrinsics.device != target.intrinsics.device:
         check_devices("Warp", source=source.intrinsics, target=target.intrinsics)
-    for name, each in (("shutter", shutter), ("target_shutter", target_shutter)):
-        if not (each is None or isinstance(each, RollingShutter)):
-            hint = "ct.RollingShutter(readout, rates) makes one, of seconds and radians per second"
-            raise TypeError(f"Warp: {name} must be a RollingShutter; got {type(each).__name__}. {hint}")
-    shapes = [tuple(part.batch_shape) for part in (source, target, shutter, target_shutter) if part is not None]
+    shapes = [tuple(source.batch_shape), tuple(target.batch_shape)]
     shapes += [] if rotation is None else [tuple(rotation.shape[:-2])]
     try:
         batch = broadcast_shapes(*shapes)
     except ValueError:
         batch = torch.Size((0, 0))  # none
     if len(batch) > 1:
-        raise ValueError(
-            "Warp: source, target, rotation and shutters may each have one batch dim, of one size; "
-            f"got {', '.join(map(str, shapes))}"
-        )
+        got = ", ".join(map(str, shapes))
+        raise ValueError(f"Warp: source, target and rotation may each have one batch dim, of one size; got {got}")
     return batch
 
 

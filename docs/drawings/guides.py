@@ -88,7 +88,7 @@ def lenses() -> Image.Image:
 
 
 def shutters() -> Image.Image:
-    """An image as a rolling shutter takes it while the camera turns, that undone, and the blur of an exposure."""
+    """An image as a rolling shutter takes it while the camera turns, and that undone."""
     source = ct.KannalaBrandt.from_fov(130, image_size=(300, 400)).requires_grad_(False)
     rates = torch.tensor([1.0, -5.0, 4.0])
     times = 0.03 * ((torch.arange(300) + 0.5) / 300 - 0.5)
@@ -97,15 +97,12 @@ def shutters() -> Image.Image:
     rolled = expose(source, lambda rays: room.radiance((turns[:, None] @ rays[..., None])[..., 0]), samples=8)
     straight = ct.Pinhole.from_fov(95, image_size=(300, 400)).requires_grad_(False)
     shutter = ct.RollingShutter(0.03, rates)
-    blur = ct.RollingShutter(0.0, rates, exposure=0.01, samples=24)
-    still = room.render(source, samples=8)
     panels = [
         (rolled, "rows rendered one by one, turning"),
         (ct.Warp(source, straight)(rolled[None])[0], "lens undone"),
-        (ct.Warp(source, straight, shutter=shutter)(rolled[None])[0], "lens and shutter undone"),
-        (ct.Warp(source, straight, target_shutter=blur)(still[None])[0], "an exposure put on"),
+        (ct.ShutterWarp(source, straight, shutter=shutter)(rolled[None])[0], "lens and shutter undone"),
     ]
-    return tiles(panels, 4)
+    return tiles(panels, 3)
 
 
 def mounted(pitch: float, roll: float) -> torch.Tensor:

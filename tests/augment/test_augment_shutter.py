@@ -1,4 +1,4 @@
-"""Augmentations whose new camera turns while it takes its image, and whose lens darkens the rim."""
+"""Augmentations whose camera turns while it takes its image, and whose lens darkens the rim."""
 
 import copy
 
@@ -6,7 +6,7 @@ import pytest
 import torch
 
 import camtorch as ct
-from camtorch.augment import RandomCamera, RandomLens, RandomMount
+from camtorch.augment import RandomMount, RandomShutter
 
 
 def camera(size=(120, 160)):
@@ -16,9 +16,10 @@ def camera(size=(120, 160)):
 STILL = {"yaw": None, "pitch": None, "roll": None, "zoom": None}
 
 
-def test_a_sample_moves_by_the_warp_of_its_shutter():
+@pytest.mark.parametrize("direction", ["down", "left"])
+def test_a_sample_moves_by_the_warp_of_its_shutter(direction):
     source = camera()
-    augment = RandomMount(**STILL, rates=120, readout=(0.02, 0.03), camera=source)
+    augment = RandomShutter((0.02, 0.03), 120, direction=direction, camera=source)
     draw = augment.draw(3, torch.Generator().manual_seed(0))
     assert draw["rates"].shape == (3, 3)
     assert (draw["rates"].abs() <= 120).all()
@@ -26,8 +27,8 @@ def test_a_sample_moves_by_the_warp_of_its_shutter():
     gaze, mask = torch.randn(3, 3), torch.randint(0, 5, (3, 1, 120, 160))
     sample = augment(image=image, keypoints=keypoints, gaze=gaze, mask=mask, draw=draw)
     rates = torch.deg2rad(draw["rates"].float())
-    shutter = ct.RollingShutter(draw["readout"].float(), rates)
-    warp = ct.Warp(source, source, target_shutter=shutter, tolerance=0.001)
+    shutter = ct.RollingShutter(draw["readout"].float(), rates, direction=direction)
+    warp = ct.ShutterWarp(source, source, target_shutter=shutter, tolerance=0.001)
     assert torch.equal(sample["image"], warp(image))
     assert torch.equal(sample["mask"], warp(mask, mode="nearest"))
     assert torch.equal(sample["keypoints"], warp.transform_points(keypoints)[0])
@@ -40,7 +41,7 @@ def test_a_sample_moves_by_the_warp_of_its_shutter():
 
 def test_some_of_a_batch_and_cameras_of_several_models():
     cameras = [camera(), ct.KannalaBrandt.from_fov(90, image_size=(120, 160)).requires_grad_(False), camera()]
-    augment = RandomCamera(rates=200, readout=0.03, exposure=0.005, p=0.6)
+    augment = RandomShutter(0.03, 200, p=0.6)
     draw = augment.draw(3, torch.Generator().manual_seed(2))
     draw["apply"] = torch.tensor([True, True, False])
     images = torch.rand(3, 3, 120, 160)
@@ -54,38 +55,33 @@ def test_some_of_a_batch_and_cameras_of_several_models():
     assert torch.equal(change.row(1).points(points[:1])[0], change.points(points)[0][1:2])
 
 
-def test_chromatic_aberration_goes_through_the_shutter_too():
+def test_a_chain_moves_images_once_and_ends_with_its_shutter():
+    """Edits, the colours and the light of a lens go before it."""
     source, image = camera(), torch.rand(2, 1, 120, 160).expand(-1, 3, -1, -1)
-    augment = RandomMount(**STILL, rates=120, readout=0.03, chromatic=(0.0, 0.0), camera=source)
-    draw = augment.draw(2, torch.Generator().manual_seed(0))
-    result = augment(image=image, draw=draw)["image"]
-    assert torch.equal(result[:, 0], result[:, 1])
-    assert torch.equal(result[:, 2], result[:, 1])
-
-
-def test_a_chain_ends_with_its_shutter():
-    source, image = camera(), torch.rand(2, 3, 120, 160)
-    flip = ct.augment.HorizontalFlip(p=1.0)
-    moves = RandomMount(**STILL, rates=200, readout=0.03, exposure=0.01)
-    chain = ct.augment.Compose([flip, moves], camera=source)
+    first = [ct.augment.HorizontalFlip(p=1.0), RandomMount(**STILL, chromatic=(0.0, 0.0), vignetting=0.4)]
+    rolls = RandomShutter(0.03, 200)
+    chain = ct.augment.Compose([*first, rolls], camera=source)
     draw = chain.draw(2, torch.Generator().manual_seed(0))
     points = torch.rand(2, 5, 2) * 80 + 30
     once = chain(image=image, keypoints=points, draw=draw)
-    first = flip(image=image, keypoints=points, camera=source)
-    own = {key[2:]: value for key, value in draw.items() if key.startswith("1.")}
-    second = moves({name: first[name] for name in ("image", "keypoints", "camera")}, draw=own)
+    plain = ct.augment.Compose(first, camera=source)(
+        image=torch.ones_like(image), keypoints=points, draw={k: v for k, v in draw.items() if k[0] != "2"}
+    )
+    own = {key[2:]: value for key, value in draw.items() if key.startswith("2.")}
+    second = rolls(keypoints=plain["keypoints"], image=image.flip(-1), camera=plain["camera"], draw=own)
     assert (once["keypoints"] - second["keypoints"]).abs().max() < 1e-3
-    assert (once["image"] - second["image"]).abs().max() < 2e-3
-    with pytest.raises(ValueError, match="rates go to the last augmentation"):
-        ct.augment.Compose([moves, flip], camera=source)
+    assert (once["image"] - second["image"] * plain["image"]).abs().max() < 2e-3
+    with pytest.raises(ValueError, match="RandomShutter goes last"):
+        ct.augment.Compose([rolls, first[0]], camera=source)
 
 
-def test_rates_want_a_readout_or_an_exposure():
-    for options in ({"rates": 30}, {"readout": 0.03}, {"exposure": (0, 0.01)}):
-        with pytest.raises(ValueError, match="rates, in degrees per second, show by a readout or an exposure"):
-            RandomLens(**options)
+def test_times_and_rates_are_seconds_and_degrees():
     with pytest.raises(ValueError, match=r"readout must lie within \[-1, 1\]"):
-        RandomLens(rates=30, readout=33)
+        RandomShutter(33, 30)
+    with pytest.raises(ValueError, match=r"direction must be one of"):
+        RandomShutter(0.03, 30, direction="top")
+    with pytest.raises(TypeError, match="there is no min_filled here"):
+        RandomShutter(0.03, 30, min_filled=0.5)
 
 
 @pytest.mark.parametrize("fov", [60, 120, 170])

@@ -213,7 +213,7 @@ def test_a_warp_of_one_camera_for_all_rows():
 
     shutter = ct.RollingShutter(0.03, torch.tensor([0.5, 6.0, 1.0], requires_grad=True) * 1)
     target = ct.Pinhole([18.0, 18.0, 15.5, 11.5], image_size=SIZE)
-    warp = ct.Warp(camera(), target, shutter=shutter)
+    warp = ct.ShutterWarp(camera(), target, shutter=shutter)
     some = batch(rows())
     moved = pickle.loads(pickle.dumps(ct.data.MapBatches(warp)))(some)
     expected, _ = warp.transform_points(torch.from_numpy(some["keypoints"]))

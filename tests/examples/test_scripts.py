@@ -168,7 +168,7 @@ def test_faces_before_a_rolling_shutter_are_those_that_a_warp_makes(drivers):
     readout = SIDE * faces.READOUT / SIZE[0] * camera.fx / near.fx
     # a camera that turns sees the scene turn the other way
     shutter = ct.RollingShutter(readout, -rates.double()).requires_grad_(False)
-    warp = ct.Warp(near, near, target_shutter=shutter, padding_mode="border")
+    warp = ct.ShutterWarp(near, near, target_shutter=shutter, padding_mode="border")
     moved, _ = warp.transform_points(still.keypoints.double())
     assert (still.keypoints - rolling.keypoints).abs().max() > 0.5
     torch.testing.assert_close(moved.float(), rolling.keypoints, atol=0.01, rtol=0)

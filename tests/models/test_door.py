@@ -231,8 +231,6 @@ WRONG = [
     (lambda: A.Rotate90(90), ValueError, "quarter turns; got 90, which would be degrees"),
     (lambda: A.Rotate90((-90, 90)), ValueError, "degrees"),
     (lambda: A.RandomResizedCrop(32, scale=0.5), TypeError, "scale must be a range"),
-    (lambda: ct.RollingShutter(0.01, [0, 1, 0], samples=2.5), TypeError, "samples must be a whole number"),
-    (lambda: ct.RollingShutter(0.01, [0, 1, 0], samples="8"), TypeError, "samples must be a whole number"),
     (lambda: ct.vignetting(MIXED, torch.ones(3)), ValueError, "one for each of 2 cameras"),
     (lambda: REPROJECTION(LENS, UV, torch.rand(9, 3)), ValueError, r"pixels \(17, 2\) of target and \(9, 2\)"),
     (lambda: FLIP(image=IMAGE, keypoints=torch.rand(17, 3)), ValueError, r"\[..., 2\] goes in as keypoints_valid"),

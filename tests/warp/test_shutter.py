@@ -57,7 +57,7 @@ def test_a_room_rendered_row_by_row(direction):
     matrix = matrix[:, None] if direction in ("down", "up") else matrix[None]
     rolled = expose(camera, lambda rays: room.radiance((matrix @ rays[..., None])[..., 0]), samples=4)
     still = room.render(camera, samples=4)
-    undo = ct.Warp(camera, camera, shutter=shutter(rates=rates, direction=direction), mode="bicubic")
+    undo = ct.ShutterWarp(camera, camera, shutter=shutter(rates=rates, direction=direction), mode="bicubic")
     put_on = undo.inverse()
     for warp, before, after in ((undo, rolled, still), (put_on, still, rolled)):
         # of half the resolution: what resampling costs at edges one pixel wide is not asked here
@@ -86,7 +86,7 @@ def test_points_are_where_their_own_row_sees_them(direction):
         found.append(track[i] + share * (track[i + 1] - track[i]) if crosses else [np.nan, np.nan])
     expected = torch.from_numpy(np.array(found))
     still, seen = camera.project(torch.from_numpy(points))
-    warp = ct.Warp(camera, camera, target_shutter=shutter(direction=direction))
+    warp = ct.ShutterWarp(camera, camera, target_shutter=shutter(direction=direction))
     moved, valid = warp.transform_points(still)
     use = valid & seen & camera.contains(expected)
     assert use.sum() > 15
@@ -103,8 +103,8 @@ def test_without_a_readout_it_is_the_plain_warp(name, dtype):
     turn = torch.linalg.matrix_exp(torch.tensor([[0.0, -0.2, 0.1], [0.2, 0, -0.3], [-0.1, 0.3, 0]], dtype=dtype))
     image = torch.rand(2, 3, 240, 320, dtype=dtype)
     plain, warp = (
-        ct.Warp(camera, straight.requires_grad_(False), turn, **options)
-        for options in ({}, {name: shutter(dtype, readout=0.0)})
+        kind(camera, straight.requires_grad_(False), turn, **options)
+        for kind, options in ((ct.Warp, {}), (ct.ShutterWarp, {name: shutter(dtype, readout=0.0)}))
     )
     # the turn is rounded alike or not, a few times: some hundred pixels from the centre
     close = partial(torch.testing.assert_close, rtol=0, atol=4096 * torch.finfo(dtype).eps)
@@ -118,10 +118,10 @@ def test_without_a_readout_it_is_the_plain_warp(name, dtype):
 def test_both_shutters_one_lens_for_another():
     camera, other = fisheye(), ct.Pinhole.from_fov(80, image_size=(240, 320)).double().requires_grad_(False)
     down, up = shutter(), shutter(direction="up", rates=(1.0, -2.0, 0.5))
-    warp = ct.Warp(camera, other, shutter=down, target_shutter=up)
+    warp = ct.ShutterWarp(camera, other, shutter=down, target_shutter=up)
     pixels = torch.tensor([[150.0, 60.0], [200.0, 140.0]], dtype=torch.float64)
-    between = ct.Warp(camera, other, shutter=down).transform_points(pixels)[0]
-    expected = ct.Warp(other, other, target_shutter=up).transform_points(between)[0]
+    between = ct.ShutterWarp(camera, other, shutter=down).transform_points(pixels)[0]
+    expected = ct.ShutterWarp(other, other, target_shutter=up).transform_points(between)[0]
     moved, valid = warp.transform_points(pixels)
     assert valid.all()
     assert torch.allclose(moved, expected, atol=1e-9)
@@ -133,9 +133,9 @@ def test_both_shutters_one_lens_for_another():
 
 def test_a_scene_that_overtakes_the_rows_is_invalid_and_finite():
     camera = fisheye((60, 80))
-    warp = ct.Warp(camera, camera, target_shutter=shutter(rates=(60.0, 0.0, 0.0), readout=0.1))
+    warp = ct.ShutterWarp(camera, camera, target_shutter=shutter(rates=(60.0, 0.0, 0.0), readout=0.1))
     rates = torch.tensor([60.0, 0.0, 0.0], dtype=torch.float64, requires_grad=True)
-    learned = ct.Warp(camera, camera, target_shutter=ct.RollingShutter(0.1, rates))
+    learned = ct.ShutterWarp(camera, camera, target_shutter=ct.RollingShutter(0.1, rates))
     for each in (warp, learned):
         moved, valid = each.transform_points(camera.pixel_grid())
         assert not valid.all()
@@ -143,43 +143,6 @@ def test_a_scene_that_overtakes_the_rows_is_invalid_and_finite():
         assert torch.isfinite(each.grid()).all()
     moved.sum().backward()
     assert torch.isfinite(rates.grad).all()
-
-
-def test_an_exposure_blurs_by_the_turn_meanwhile():
-    camera = fisheye((120, 160), dtype=torch.float32)
-    image = torch.zeros(1, 1, 120, 160)
-    image[..., 40, 60] = 1.0
-    options = {"exposure": 0.02, "samples": 16}
-    warp = ct.Warp(camera, camera, target_shutter=ct.RollingShutter(0.0, (0.0, 3.0, 0.0), **options))
-    blurred = warp(image)
-    # turned to the right, the scene passes to the left: by f w t, about, along the row
-    lit = (blurred[0, 0] > 1e-3).nonzero()
-    length = float(lit[:, 1].max() - lit[:, 1].min())
-    assert abs(length - float(camera.intrinsics[0]) * 3.0 * 0.02) < 2.5
-    assert abs(float((blurred[0, 0] * torch.arange(160)).sum() / blurred.sum()) - 60) < 0.2
-    assert abs(float(blurred.sum()) - 1) < 0.1
-    # labels, masks and an exposure of nothing stay
-    assert torch.equal(warp(image, mode="nearest"), image)
-    assert torch.equal(warp.transform_points(torch.tensor([[60.0, 40.0]]))[0].round(), torch.tensor([[60.0, 40.0]]))
-    none = ct.RollingShutter(0.0, (0.0, 3.0, 0.0), exposure=0.0)
-    assert torch.equal(ct.Warp(camera, camera, target_shutter=none)(image), ct.Warp(camera, camera)(image))
-    flat = torch.full((1, 3, 120, 160), 100, dtype=torch.uint8)
-    turning = ct.RollingShutter(0.01, (1.0, 3.0, 0.0), **options)
-    inner = ct.Warp(camera, camera, target_shutter=turning)(flat)[..., 20:-20, 20:-20]
-    assert inner.dtype == torch.uint8
-    assert (inner.int() - 100).abs().max() <= 1
-
-
-def test_the_mean_of_an_exposure_is_that_of_its_moments():
-    camera = fisheye((120, 160), dtype=torch.float64)
-    image = torch.rand(1, 1, 120, 160, dtype=torch.float64)
-    made = ct.Warp(camera, camera, target_shutter=shutter(readout=0.0, exposure=0.01, samples=2))(image)
-    parts = []
-    for t in (-0.0025, 0.0025):
-        back = torch.from_numpy(turns([t], RATES)[0].T)
-        parts.append(ct.Warp(camera, camera, back)(image))
-    inside = (slice(None), slice(None), slice(8, -8), slice(8, -8))
-    assert torch.allclose(made[inside], ((parts[0] + parts[1]) / 2)[inside], atol=1e-9)
 
 
 def test_times_are_those_of_rows():
@@ -197,7 +160,7 @@ def test_transforms_of_functions_and_a_batch_of_several_models():
     pixels = torch.tensor([[100.0, 60.0], [160.0, 200.0]], dtype=torch.float64)
 
     def moved(rates):
-        warp = ct.Warp(camera, camera, target_shutter=ct.RollingShutter(torch.tensor(READOUT).double(), rates))
+        warp = ct.ShutterWarp(camera, camera, target_shutter=ct.RollingShutter(torch.tensor(READOUT).double(), rates))
         return warp.transform_points(pixels)[0]
 
     rates = torch.tensor(RATES, dtype=torch.float64)
@@ -205,10 +168,21 @@ def test_transforms_of_functions_and_a_batch_of_several_models():
     assert torch.allclose(torch.func.jacrev(moved)(rates), expected, atol=1e-7)
     assert torch.allclose(torch.func.jacfwd(moved)(rates), expected, atol=1e-5)
     mixed = ct.Mixed([camera, ct.Pinhole.from_fov(80, image_size=(240, 320)).double().requires_grad_(False)])
-    together = ct.Warp(mixed, mixed, shutter=shutter())
+    together = ct.ShutterWarp(mixed, mixed, shutter=shutter())
     result, valid = together.transform_points(pixels.expand(2, -1, -1))
     for i in range(2):
-        alone, also = ct.Warp(mixed[i], mixed[i], shutter=shutter()).transform_points(pixels)
+        alone, also = ct.ShutterWarp(mixed[i], mixed[i], shutter=shutter()).transform_points(pixels)
         assert torch.allclose(result[i], alone, atol=1e-12)
         assert torch.equal(valid[i], also)
     assert together(torch.rand(2, 1, 240, 320)).shape == (2, 1, 240, 320)
+
+
+def test_states_of_0_3_load_unless_they_blur():
+    made = shutter()
+    state = made.state_dict()
+    assert sorted(state) == ["rates", "readout"]
+    other = shutter(rates=(0.0, 0.0, 0.0))
+    other.load_state_dict({**state, "exposure": torch.tensor(0.0)})
+    assert torch.equal(other.rates, made.rates)
+    with pytest.raises(ValueError, match=r"exposure, which is gone: see .Leaving 0\.3."):
+        other.load_state_dict({**state, "exposure": torch.tensor(0.01)})

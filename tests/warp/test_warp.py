@@ -203,7 +203,7 @@ def test_boxes_around_images_of_planes_and_of_moving_cameras_are_on_them():
     shutter = ct.RollingShutter(0.02, [0.3, 0.5, 0.1])
     for warp in (
         ct.PlaneWarp(camera, camera, near, [0.0, 0.0, 1.0], 2.0),
-        ct.Warp(camera, camera, shutter=shutter, target_shutter=shutter),
+        ct.ShutterWarp(camera, camera, shutter=shutter, target_shutter=shutter),
     ):
         assert warp.transform_boxes(box)[1].tolist() == [True, False]
         assert warp.inverse().transform_boxes(box)[1].tolist() == [True, False]

@@ -1,0 +1,66 @@
+"""A rolling shutter, drawn at random, before the camera of a sample."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import torch
+
+from camtorch.augment.augmentation import Augmentation, EditOptions, as_range
+from camtorch.augment.change import Part
+from camtorch.camera import Camera
+from camtorch.warp.sampling import one_of
+from camtorch.warp.shutter import DIRECTIONS, Direction, RollingShutter, ShutterWarp
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
+
+class RandomShutter(Augmentation):
+    """The sample as a rolling shutter sees it while the camera turns: images, and labels by the row that sees them.
+
+    The camera stays. Points in space, gaze and poses are those of the middle of the readout. In a `Compose` it goes
+    last, after the mount or the lens, and all is sampled once. Blur is left to others, as kornia's `RandomMotionBlur`.
+
+    Args:
+        readout: seconds from the first row to the last: a number, or (low, high). Below 0 it reads the other way.
+        rates: degrees per second about x (up), y (right) and z (clockwise), each drawn for itself: (low, high), or a
+            number x for x to either side of 0.
+        direction: in which the sensor is read; see `RollingShutter`.
+        options: camera, p, same_on_batch, fields, mode, padding_mode, fill, antialias, tolerance, mask_fill and
+            valid_mask; see `Augmentation`.
+
+    Raises:
+        ValueError: If a range is in the wrong order or out of bounds, or the direction is unknown.
+        TypeError: If a range is none, or a keyword is unknown.
+    """
+
+    keeps_lens: ClassVar[bool] = True
+
+    def __init__(
+        self,
+        readout: float | Sequence[float],
+        rates: float | Sequence[float],
+        *,
+        direction: Direction = "down",
+        **options: Unpack[EditOptions],
+    ):
+        name = type(self).__name__
+        if "min_filled" in options:
+            raise TypeError(f"{name}: there is no min_filled here; RandomCamera has it")
+        readout = (readout, readout) if isinstance(readout, (int, float)) else readout
+        ranges = {
+            "rates": as_range(rates, "rates", name, least=-3600, most=3600, size=3),
+            "readout": as_range(readout, "readout", name, least=-1, most=1),
+        }
+        super().__init__(ranges, **options)
+        self.direction: Direction = one_of(direction, DIRECTIONS, "direction", name)
+
+    def _part(self, rows: list[int] | None, source: Camera, draw: Mapping[str, Any]) -> Part:
+        values = self._like(source, self._values(source, draw))
+        shutter = RollingShutter(values["readout"], torch.deg2rad(values["rates"]), direction=self.direction)
+        return Part(rows, ShutterWarp(source, source, target_shutter=shutter, **self.options), source)
+
+    def tell_of_empty_images(self, camera: Camera) -> None:
+        """A rim may be empty, and no more."""
