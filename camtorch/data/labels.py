@@ -24,6 +24,7 @@ from camtorch._arguments import check_path
 from camtorch._photographs import load_stored
 from camtorch.augment.landmarks import LANDMARKS, TableLike
 from camtorch.augment.sample import KINDS, Sample
+from camtorch.camera import Camera
 from camtorch.data.columns import camera_of
 from camtorch.io.record import LEFT
 from camtorch.models import BrownConrady, Pinhole
@@ -330,16 +331,7 @@ class Vcd(Samples):
             sample["actions"] = [self._root["actions"][uid]["type"] for uid in content.get("actions", {})]
         if (pinhole := self._properties(stream).get("intrinsics_pinhole")) is not None:
             with _failing_at(f"{self.path}, streams.{stream}.intrinsics_pinhole", "", ValueError, *_UNLIKE):
-                matrix, lens = (
-                    next((pinhole[name] for name in names if name in pinhole), None)
-                    for names in (
-                        ("camera_matrix", "camera_matrix_3x4"),
-                        ("distortion_coeffs", "distortion_coeffs_1xN"),
-                    )
-                )
-                model, matrix = BrownConrady if lens else Pinhole, np.reshape(matrix, (3, 4))[:, :3].astype(np.float64)
-                size = pinhole["height_px"], pinhole["width_px"]
-                sample["camera"] = model.from_matrix(matrix, lens or None, image_size=size).requires_grad_(False)
+                sample["camera"] = _pinhole(**pinhole)
         return sample
 
     def _numbers_of(self, kind: str, n: int, frame: Json, stream: str, place: str) -> tuple[Tensor, list[str]]:
@@ -357,6 +349,15 @@ class Vcd(Samples):
         path = self._named(Path(uri).name, ("", folder), place)
         image = _image_at(path) if path.suffix.lower() in _SUFFIXES else _video_frame(path, at)
         return {} if image is None else {"image": image}
+
+
+def _pinhole(height_px: int, width_px: int, **lens: Any) -> Camera:
+    """Return the camera of OpenLABEL's `intrinsics_pinhole`, or of VCD 4's, which says the shapes in its names."""
+    matrix = lens["camera_matrix" if "camera_matrix" in lens else "camera_matrix_3x4"]
+    distortion = lens.get("distortion_coeffs", lens.get("distortion_coeffs_1xN")) or None
+    K = np.reshape(matrix, (3, 4))[:, :3].astype(np.float64)  # noqa: N806
+    camera = (BrownConrady if distortion else Pinhole).from_matrix(K, distortion, image_size=(height_px, width_px))
+    return camera.requires_grad_(False)
 
 
 def _video_frame(path: Path, number: int) -> Tensor | None:

@@ -1,6 +1,7 @@
 """Contents of files as keys and values: YAML, JSON, OpenCV's XML, Python literals and NumPy archives, never trusted.
 
-A file that is refused, whatever it holds, has cost at most a second for 10 MB and ten times its size in memory.
+A file that is refused, whatever it holds, has cost at most a second for 10 MB and ten times its size in memory. All
+functions raise CameraFileError for what they refuse.
 """
 
 from __future__ import annotations
@@ -9,12 +10,15 @@ import ast
 import json
 import os
 import re
+from collections.abc import Iterable
 from typing import Any, NoReturn
 from xml.etree import ElementTree
 
 from camtorch.io._errors import CameraFileError
 from camtorch.io.npz import parse_archive
 from camtorch.io.record import repeated
+
+Path = str | os.PathLike[str]
 
 LARGEST_FILE = 1 << 24
 _LARGEST_STORAGE = 1 << 20  # of YAML and of OpenCV's XML
@@ -39,11 +43,7 @@ _OTHERS = (
 
 
 def path_of(path: Any, owner: str, file: str = "file") -> str:
-    """What `owner` was given as the path of a kind of file, as text.
-
-    Raises:
-        TypeError: it is no path. CameraFileError: it has a NUL character.
-    """
+    """Return the path of a kind of file that `owner` was given, as text; a TypeError if it is none."""
     try:
         name = os.fsdecode(path)
     except TypeError:
@@ -54,12 +54,14 @@ def path_of(path: Any, owner: str, file: str = "file") -> str:
     return name
 
 
-def read_bytes(path: str | os.PathLike[str], largest: int = LARGEST_FILE) -> bytes:
-    """The content of a file that is not suspiciously large.
+def check_ordinary(path: Path) -> None:
+    """Refuse devices and pipes, which may have no end."""
+    if os.path.exists(path) and not os.path.isfile(path) and not os.path.isdir(path):
+        raise CameraFileError(path, "content", "no ordinary file")
 
-    Raises:
-        CameraFileError: no ordinary file, nothing in it, more bytes than `largest`. OSError: it cannot be opened.
-    """
+
+def read_bytes(path: Path, largest: int = LARGEST_FILE) -> bytes:
+    """Return the content of an ordinary file that is neither empty nor suspiciously large."""
     check_ordinary(path)
     with open(path, "rb") as file:
         size = os.fstat(file.fileno()).st_size
@@ -71,22 +73,8 @@ def read_bytes(path: str | os.PathLike[str], largest: int = LARGEST_FILE) -> byt
     return content
 
 
-def check_ordinary(path: str | os.PathLike[str]) -> None:
-    """Refuse devices and pipes, which may have no end.
-
-    Raises:
-        CameraFileError: it is one.
-    """
-    if os.path.exists(path) and not os.path.isfile(path) and not os.path.isdir(path):
-        raise CameraFileError(path, "content", "no ordinary file")
-
-
-def decoded(path: str | os.PathLike[str], content: bytes) -> str:
-    """The text of a content.
-
-    Raises:
-        CameraFileError: it is none.
-    """
+def decoded(path: Path, content: bytes) -> str:
+    """Return the text of a content."""
     try:
         return content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -94,11 +82,10 @@ def decoded(path: str | os.PathLike[str], content: bytes) -> str:
         raise CameraFileError(path, f"byte {error.start}", reason) from None
 
 
-def parse_mapping(path: str | os.PathLike[str], content: bytes) -> dict[str, Any]:
-    """The keys of a content. Values are text, lists and mappings: numbers stay text until someone asks, but for JSON's.
+def parse_mapping(path: Path, content: bytes) -> dict[str, Any]:
+    """Return the keys of a content. Values are text, lists and mappings, and JSON's are numbers.
 
-    Raises:
-        CameraFileError: nothing known, a key twice, tags other than `!!opencv-matrix`, no mapping, too large.
+    Refused are unknown kinds, a key twice, tags other than `!!opencv-matrix`, and more values than a camera has.
     """
     try:
         keys = parse_archive(path, content) if content.startswith(b"PK\3\4") else _from_text(path, content)
@@ -109,31 +96,23 @@ def parse_mapping(path: str | os.PathLike[str], content: bytes) -> dict[str, Any
     return keys
 
 
-def _from_text(path: str | os.PathLike[str], content: bytes) -> Any:
+def _from_text(path: Path, content: bytes) -> Any:
     text = decoded(path, content)
-    if _is_literal(text):
+    # a brace, perhaps after comments, and a key in quotes unlike JSON's; one regular expression would be slow
+    start = re.sub(r"#[^\n]*", "", text[:_START]).split()[:2]
+    if re.match(r"\{(?:'|\"(?:lens_?model|distortion_model)\")", "".join(start)):
         return _from_literal(path, text)
-    if re.match(r"\s*\{", text):
-        return parse_json(path, text)
-    if re.match(r"\s*<", text):
-        return _from_storage(path, text)
-    return _from_yaml(path, text)
+    kind = text.lstrip()[:1]
+    return parse_json(path, text) if kind == "{" else (_from_storage if kind == "<" else _from_yaml)(path, text)
 
 
-def _check_length(path: str | os.PathLike[str], text: str, most: int, kind: str) -> None:
+def _check_length(path: Path, text: str, most: int, kind: str) -> None:
     if len(text) > most:
         raise CameraFileError(path, "size", f"more than {most >> 10} KiB of {kind}")
 
 
-# -- JSON
-
-
-def parse_json(path: str | os.PathLike[str], text: str) -> Any:
-    """The value of a text of JSON, all numbers floats.
-
-    Raises:
-        CameraFileError: no JSON, a key twice, more values than are worth their memory. RecursionError: nested deeply.
-    """
+def parse_json(path: Path, text: str) -> Any:
+    """Return the value of a text of JSON, all numbers floats; a RecursionError if it is nested deeply."""
     size = text.count(",") + 3 * text.count("[") + 6 * text.count("{") + 5 * text.count(":")
     if size > max(_MOST_JSON_UNITS, len(text) // _BYTES_PER_UNIT):
         raise CameraFileError(path, "content", "too many values")
@@ -154,17 +133,8 @@ def parse_json(path: str | os.PathLike[str], text: str) -> Any:
         raise CameraFileError(path, "content", error) from None
 
 
-# -- Python literals, as mrcal writes them
-
-
-def _is_literal(text: str) -> bool:
-    """Whether this is the start of one: a brace, perhaps after comments, and a key in quotes unlike JSON's."""
-    # Python's regular expressions remember every repetition of a group
-    start = re.sub(r"#[^\n]*", "", text[:_START]).split()[:2]
-    return re.match(r"\{(?:'|\"(?:lens_?model|distortion_model)\")", "".join(start)) is not None
-
-
-def _from_literal(path: str | os.PathLike[str], text: str) -> Any:
+def _from_literal(path: Path, text: str) -> Any:
+    """Return a Python literal, as mrcal writes it, as JSON would have it."""
     text = _OPTIMIZATION_INPUTS.sub(r"\1''", text)
     _check_length(path, text, _LARGEST_LITERAL, "a Python literal")
     try:
@@ -176,7 +146,6 @@ def _from_literal(path: str | os.PathLike[str], text: str) -> Any:
 
 
 def _with_floats(value: Any) -> Any:
-    """A literal as JSON has it."""
     if isinstance(value, dict):
         return {str(key): _with_floats(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
@@ -187,12 +156,8 @@ def _with_floats(value: Any) -> Any:
 # -- XML, in which OpenCV has keys in <opencv_storage>, and sequences as words or as elements called _
 
 
-def parse_xml(path: str | os.PathLike[str], text: str) -> ElementTree.Element:
-    """The root of a text of XML.
-
-    Raises:
-        CameraFileError: no XML, a document type or an entity declared, more elements than are worth their memory.
-    """
+def parse_xml(path: Path, text: str) -> ElementTree.Element:
+    """Return the root of a text of XML; document types, entities and very many elements are refused."""
     if declared := re.search(r"<!(?:DOCTYPE|ENTITY|ELEMENT|ATTLIST|NOTATION)", text, re.IGNORECASE):
         line = text.count("\n", 0, declared.start()) + 1
         raise CameraFileError(path, f"line {line}", "a document type, which could define entities: not read")
@@ -207,26 +172,24 @@ def parse_xml(path: str | os.PathLike[str], text: str) -> ElementTree.Element:
         raise CameraFileError(path, "content", error) from None
 
 
-def _from_storage(path: str | os.PathLike[str], text: str) -> Any:
+def _from_storage(path: Path, text: str) -> Any:
     _check_length(path, text, _LARGEST_STORAGE, "XML")
     root = parse_xml(path, text)
     if root.tag == "lensdatabase":
         raise CameraFileError(path, "content", "lensfun's lenses, which lensfunpy reads, for ct.lenses.from_lensfun")
     if root.tag != "opencv_storage":
-        raise CameraFileError(
-            path, "content", f"<{root.tag:.60}> where <opencv_storage> belongs: XML is read where OpenCV wrote it"
-        )
+        where = f"<{root.tag:.60}> where <opencv_storage> belongs"
+        raise CameraFileError(path, "content", f"{where}: XML is read where OpenCV wrote it")
     return _keys_of(path, root)
 
 
-def _keys_of(path: str | os.PathLike[str], element: ElementTree.Element) -> dict[str, Any]:
-    names = [child.tag for child in element]
-    if (twice := repeated(names)) is not None:
+def _keys_of(path: Path, element: ElementTree.Element) -> dict[str, Any]:
+    if (twice := repeated(child.tag for child in element)) is not None:
         raise CameraFileError(path, f"{element.tag:.60}", f"the key {twice!r:.60} stands there twice")
     return {child.tag: _value_of(path, child) for child in element}
 
 
-def _value_of(path: str | os.PathLike[str], element: ElementTree.Element) -> Any:
+def _value_of(path: Path, element: ElementTree.Element) -> Any:
     if any(child.tag != "_" for child in element):
         return _keys_of(path, element)
     words = [word[1] or word[2] or "" for word in _WORD.finditer(element.text or "")]
@@ -238,97 +201,91 @@ def _value_of(path: str | os.PathLike[str], element: ElementTree.Element) -> Any
 # -- YAML
 
 
-def _from_yaml(path: str | os.PathLike[str], text: str) -> Any:
+def _from_yaml(path: Path, text: str) -> Any:
     import yaml  # a fiftieth of a second: only when needed
 
     _check_length(path, text, _LARGEST_STORAGE, "YAML")
     text = re.sub(r"\A(\s*)%YAML[^\r\n]*", r"\1", text)  # "%YAML:1.0", as OpenCV writes it, is not YAML
     if "\n%" in text:  # libyaml compares each with all
         raise CameraFileError(path, "content", "YAML directives, which no calibration has")
-    tree = _YamlTree(path)
+    loader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
     try:
-        # events, not yaml.load: no recursion, no tags, and none of YAML 1.1's ideas of what is a number
-        for event in yaml.parse(text, getattr(yaml, "CSafeLoader", yaml.SafeLoader)):
-            tree.take(event, type(event).__name__)
+        # events, not yaml.load: no tags, and none of YAML 1.1's ideas of what is a number
+        return _Yaml(path, yaml.parse(text, loader)).document()
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         reason = getattr(error, "problem", None) or getattr(error, "reason", None) or "no reason given"
         where = f"line {mark.line + 1}" if mark else "content"
         raise CameraFileError(path, where, f"not readable as YAML: {reason}") from None
     except (ValueError, OverflowError) as error:
-        if isinstance(error, CameraFileError):
-            raise
-        raise CameraFileError(path, "content", error) from None
-    return tree.root
+        raise error if isinstance(error, CameraFileError) else CameraFileError(path, "content", error) from None
 
 
-class _YamlTree:
-    """Lists and mappings, built of the events of a parser."""
+class _Yaml:
+    """Texts, lists and mappings of the events of a parser."""
 
-    def __init__(self, path: str | os.PathLike[str]):
-        self.path = path
-        self.line = self.documents = self.count = 0
-        self.root: Any = None
-        self.open: list[list[Any]] = []  # container, key that waits for its value, anchor, count before it
-        self.anchors: dict[str, tuple[Any, int]] = {}  # value, and how many values it is
+    def __init__(self, path: Path, events: Iterable[Any]):
+        self.path, self.events = path, iter(events)
+        self.anchors: dict[str, tuple[Any, int]] = {}
 
-    def fail(self, reason: object) -> NoReturn:
-        raise CameraFileError(self.path, f"line {self.line}", reason) from None
+    def fail(self, event: Any, reason: str) -> NoReturn:
+        raise CameraFileError(self.path, f"line {event.start_mark.line + 1}", reason) from None
 
-    def take(self, event: Any, kind: str) -> None:
-        """The next event, of a class of that name."""
-        self.line = event.start_mark.line + 1
-        if kind == "DocumentStartEvent":
-            self.documents += 1
-            if self.documents > 2:
-                self.fail("a third document in the file")
-        elif self.documents > 1:
-            # rostopic ends a message with ---, which begins an empty document
-            if getattr(event, "value", "") or kind in ("SequenceStartEvent", "MappingStartEvent", "AliasEvent"):
-                self.fail("a second document in the file")
-        elif kind == "ScalarEvent":
-            self.check_tag(event.tag, "str")
-            self.put(event.value, event.anchor, 1)
-        elif kind in ("SequenceStartEvent", "MappingStartEvent"):
-            is_list = kind == "SequenceStartEvent"
-            self.check_tag(event.tag, *(("seq",) if is_list else ("map", "opencv-matrix", "opencv-nd-matrix")))
-            if len(self.open) >= _DEEPEST:
-                self.fail("nested too deeply")
-            if self.open and isinstance(self.open[-1][0], dict) and self.open[-1][1] is None:
-                self.fail("a key that is no text")
-            self.open.append([[] if is_list else {}, None, event.anchor, self.count])
-        elif kind in ("SequenceEndEvent", "MappingEndEvent"):
-            container, _, anchor, before = self.open.pop()
-            self.put(container, anchor, self.count - before + 1, new=1)
-        elif kind == "AliasEvent":
-            value, size = self.anchors.get(event.anchor) or self.fail(f"nothing is called {event.anchor!r:.60}")
-            self.put(value, None, size)
+    def document(self) -> Any:
+        """Return the first document; a second one must be empty: rostopic ends a message with ---."""
+        value, count = None, 0
+        for event in self.events:
+            kind = type(event).__name__
+            count += kind == "DocumentStartEvent"
+            if kind in _TAGS and count == 1:
+                value, _ = self.value(event, 0)
+            elif count > 2 or (kind in _TAGS and getattr(event, "value", None) != ""):
+                self.fail(event, "a second document in the file")
+        return value
 
-    def check_tag(self, tag: str | None, *names: str) -> None:
-        if tag not in (None, "!", *(f"tag:yaml.org,2002:{name}" for name in names)):
-            if tag == "tag:yaml.org,2002:opencv-matrix":
-                self.fail("expected keys and values after !!opencv-matrix")
-            self.fail(f"could not determine a constructor for the tag {tag!r:.80}: nothing is constructed here")
+    def value(self, event: Any, depth: int) -> tuple[Any, int]:
+        """Return the value that begins with an event, and how many values it has for a reader who follows aliases."""
+        kind = type(event).__name__
+        if kind == "AliasEvent":
+            return self.anchors.get(event.anchor) or self.fail(event, f"nothing is called {event.anchor!r:.60}")
+        if event.tag not in _TAGS[kind]:
+            self.fail(event, f"the tag {event.tag!r:.80}: nothing is constructed here, and a matrix is keys and values")
+        found = (event.value, 1) if kind == "ScalarEvent" else self.container(event, kind == "MappingStartEvent", depth)
+        if event.anchor:
+            self.anchors[event.anchor] = found
+        return found
 
-    def put(self, value: Any, anchor: str | None, size: int, new: int | None = None) -> None:
-        """A value of so many values, which in a mapping is a key or what belongs to it."""
-        self.count += size if new is None else new  # an alias costs nothing here, but whoever walks through it pays
-        if self.count > _MOST_VALUES:
-            self.fail(f"too many values: more than {_MOST_VALUES} are not read")
-        if anchor:
-            self.anchors[anchor] = (value, size)
-        if not self.open:
-            self.root = value
-            return
-        top = self.open[-1]
-        container, key = top[:2]
-        if isinstance(container, list):
-            container.append(value)
-        elif key is not None:
-            container[key], top[1] = value, None
-        elif not isinstance(value, str):
-            self.fail("a key that is no text")
-        elif value in container:
-            self.fail(f"the key {value!r:.60} stands there twice")
-        else:
-            top[1] = value
+    def container(self, start: Any, is_mapping: bool, depth: int) -> tuple[Any, int]:
+        """Return a list or a mapping; its anchor is known only behind it, so that it cannot be in itself."""
+        if depth >= _DEEPEST:
+            self.fail(start, "nested too deeply")
+        values, keys, count = list[Any](), dict[str, Any](), 1
+        for event in self.events:
+            if type(event).__name__ in ("SequenceEndEvent", "MappingEndEvent"):
+                break
+            value, size = self.value(event, depth + 1)
+            count += size
+            if not is_mapping:
+                values.append(value)
+            elif not isinstance(value, str):
+                self.fail(event, "a key that is no text")
+            elif value in keys:
+                self.fail(event, f"the key {value!r:.60} stands there twice")
+            else:
+                keys[value], size = self.value(next(self.events), depth + 1)
+                count += size
+            if count > _MOST_VALUES:
+                self.fail(event, f"too many values: more than {_MOST_VALUES} are not read")
+        return keys if is_mapping else values, count
+
+
+# event that begins a value -> the tags that it may have
+_TAGS = {
+    kind: (None, "!", *(f"tag:yaml.org,2002:{name}" for name in names))
+    for kind, *names in (
+        ("ScalarEvent", "str"),
+        ("AliasEvent",),
+        ("SequenceStartEvent", "seq"),
+        ("MappingStartEvent", "map", "opencv-matrix", "opencv-nd-matrix"),
+    )
+}

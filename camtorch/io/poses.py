@@ -26,7 +26,7 @@ UPRIGHT = np.array([1.0, -1.0, -1.0, 1.0])
 
 
 def as_float64(values: Any) -> Tensor:
-    """Numbers of a file as a tensor."""
+    """Return numbers of a file as a tensor."""
     return torch.as_tensor(values, dtype=torch.float64)
 
 
@@ -43,16 +43,12 @@ def check_near(place: Place, values: Any) -> None:
     _check(place, right, lambda row: f"a number beyond {_FARTHEST:g}, or none")
 
 
-# -- reading: single poses, or a batch of them
+# -- reading: single poses, or a batch of them; with `undo` the pose that undoes it. All raise CameraFileError
 
 
 @torch.no_grad()
 def pose(place: Place, rotation: Any, translation: Any, undo: bool = False) -> Extrinsics:
-    """The pose of rotation vectors and translations (*B, 3), or with `undo` the pose that undoes it.
-
-    Raises:
-        CameraFileError: numbers too large to compute with, or that no pose has.
-    """
+    """Return the pose of rotation vectors and translations (*B, 3)."""
     for values in (rotation, translation):
         check_near(place, values)
     try:
@@ -63,25 +59,20 @@ def pose(place: Place, rotation: Any, translation: Any, undo: bool = False) -> E
 
 
 def from_matrices(place: Place, rows: Any, undo: bool = False) -> Extrinsics:
-    """The pose of matrices (*B, 4, 4) or (*B, 3, 4); otherwise as `pose`.
-
-    Raises:
-        CameraFileError: also for a matrix whose rotation is none.
-    """
-    matrices = as_float64(rows)
-    rotations = matrices[..., :3, :3]
-    error, determinant = rotation_error(rotations), torch.linalg.det(rotations)
-
-    def reason(row: int) -> str:
-        off, det = error.flatten()[row], determinant.flatten()[row]
-        return f"no rotation: R R^T misses the identity by {off:.2g}, and det R = {det:.6g}"
-
-    _check(place, (error < _ORTHOGONAL) & (determinant > 0), reason)
-    return pose(place, rotation_vector(rotations), matrices[..., :3, 3], undo)
+    """Return the pose of matrices (*B, 4, 4) or (*B, 3, 4)."""
+    rotations, translations = as_float64(rows)[..., :3, :3], as_float64(rows)[..., :3, 3]
+    error, det = rotation_error(rotations).flatten(), torch.linalg.det(rotations).flatten()
+    right = (error < _ORTHOGONAL) & (det > 0)
+    _check(
+        place,
+        right,
+        lambda row: f"no rotation: R R^T misses the identity by {error[row]:.2g}, and det R = {det[row]:.6g}",
+    )
+    return pose(place, rotation_vector(rotations), translations, undo)
 
 
 def rows_of(record: Record) -> list[list[float]]:
-    """The 4 x 4 or 3 x 4 matrix of a pose as 4 x 4."""
+    """Return the 4 x 4 or 3 x 4 matrix of a pose as 4 x 4."""
     rows = record.rows(4 if len(record) == 4 else 3, 4)
     if rows[3:] and rows[3] != [0, 0, 0, 1]:
         record.fail(f"the last row is not 0 0 0 1, but {rows[3]}")
@@ -89,25 +80,17 @@ def rows_of(record: Record) -> list[list[float]]:
 
 
 def from_rows(record: Record, undo: bool = False) -> Extrinsics:
-    """The pose of a 4 x 4 or 3 x 4 matrix, as `from_matrices`."""
+    """Return the pose of a 4 x 4 or 3 x 4 matrix."""
     return from_matrices(record, rows_of(record), undo)
 
 
 def from_quaternions(place: Place, values: Any, undo: bool = False) -> Extrinsics:
-    """The pose of (*B, 7), unit quaternions w, x, y, z and translations; otherwise as `pose`.
-
-    Raises:
-        CameraFileError: also for a quaternion that is not of unit length.
-    """
-    numbers = as_float64(values)
-    quaternions = numbers[..., :4]
-    norm = quaternions.norm(dim=-1)
-
-    def reason(row: int) -> str:
-        return f"a quaternion of length {norm.flatten()[row]:.6g}, which is no rotation"
-
-    _check(place, (norm - 1).abs() < _ORTHOGONAL, reason)
-    return pose(place, quaternion_vector(quaternions), numbers[..., 4:], undo)
+    """Return the pose of (*B, 7), unit quaternions w, x, y, z and translations."""
+    quaternions, translations = as_float64(values).tensor_split([4], -1)
+    norm = quaternions.norm(dim=-1).flatten()
+    right = (norm - 1).abs() < _ORTHOGONAL
+    _check(place, right, lambda row: f"a quaternion of length {norm[row]:.6g}, which is no rotation")
+    return pose(place, quaternion_vector(quaternions), translations, undo)
 
 
 # -- writing
@@ -115,7 +98,7 @@ def from_quaternions(place: Place, values: Any, undo: bool = False) -> Extrinsic
 
 @torch.no_grad()
 def in_float64(extrinsics: Extrinsics, undo: bool = False) -> Extrinsics:
-    """A copy in float64, or what undoes it."""
+    """Return a copy in float64, or the pose that undoes it."""
     rotation, translation = (t.detach().double().cpu() for t in (extrinsics.rotation, extrinsics.translation))
     copy = Extrinsics(rotation[..., None], translation)
     return copy.inverse() if undo else copy
@@ -123,13 +106,13 @@ def in_float64(extrinsics: Extrinsics, undo: bool = False) -> Extrinsics:
 
 @torch.no_grad()
 def matrices(extrinsics: Extrinsics, undo: bool = False) -> Tensor:
-    """The (*B, 4, 4) matrices of a pose, or of what undoes it, in float64."""
+    """Return the (*B, 4, 4) matrices of a pose, or of the one that undoes it, in float64."""
     return in_float64(extrinsics, undo).matrix() + 0.0  # which makes -0.0 zero
 
 
 @torch.no_grad()
 def quaternions(extrinsics: Extrinsics, undo: bool = False) -> Tensor:
-    """The quaternions w, x, y, z and translations (*B, 7) of a pose, or of what undoes it, in float64."""
+    """Return the quaternions w, x, y, z and translations (*B, 7) of a pose, or of the one that undoes it."""
     there = in_float64(extrinsics, undo)
     return torch.cat((vector_quaternion(there.rotation), there.translation), -1) + 0.0
 
@@ -140,17 +123,11 @@ def is_identity(extrinsics: Extrinsics | None) -> bool:
 
 
 def all_of(rig: Rig, lossy: Lossy) -> Extrinsics:
-    """All poses of a rig as one batch in float64, in the order of their names.
-
-    Raises:
-        CameraFileError: batches, or numbers that are not finite.
-    """
-    batch = rig.extrinsics.batch
-    rows: list[list[float]] = []
-    if batch is not None:
-        vectors = (t.detach().double().cpu().expand(len(batch), 3) for t in (batch.rotation, batch.translation))
-        rows = torch.cat(list(vectors), -1).tolist()
-    values = []
+    """Return all poses of a rig as one batch in float64, in the order of their names; batches are refused."""
+    batch, rows, values = rig.extrinsics.batch, list[list[float]](), []
+    if batch is not None:  # not one by one, of many images
+        vectors = [t.detach().double().cpu().expand(len(batch), 3) for t in (batch.rotation, batch.translation)]
+        rows = torch.cat(vectors, -1).tolist()
     for name in rig.extrinsics:
         row = rig.extrinsics.row(name)
         if row is None or not all(map(math.isfinite, rows[row])):
