@@ -48,7 +48,6 @@ from camtorch.networks.canonical import CanonicalCamera as CanonicalCamera
 from camtorch.networks.head import CameraHead as CameraHead
 from camtorch.parametrize import PositiveFocal as PositiveFocal
 from camtorch.parametrize import TiedFocal as TiedFocal
-from camtorch.report.report import write_report as write_report
 from camtorch.rig import Rig as Rig
 from camtorch.stereo.rectification import Rectification as Rectification
 from camtorch.stereo.rectification import rectify as rectify

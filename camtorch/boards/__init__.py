@@ -1,1 +1,1 @@
-"""Boards that are photographed to calibrate: printed, found in images, kept in files of corners."""
+"""Boards that are photographed to calibrate: what they are, and finding them in images."""

@@ -5,7 +5,8 @@ from __future__ import annotations
 import glob
 import os
 import re
-from collections.abc import Iterable, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -16,15 +17,14 @@ from numpy.typing import NDArray
 
 from camtorch._arguments import as_number, shown, warn
 from camtorch._photographs import read_stored
-from camtorch.boards.boards import Board, board_of, opencv
-from camtorch.boards.corners import ImageCorners, usual_sizes
+from camtorch.boards.boards import Board, as_board, opencv
 from camtorch.boards.detection import detect
 
 _OWNER = "find_board"
 _IMAGES = frozenset({".bmp", ".jpeg", ".jpg", ".pgm", ".png", ".ppm", ".tif", ".tiff", ".webp"})
-"""Suffixes, in lower case, of the files that are taken from a folder."""
 _NAMED = 6  # images left out, in the warning
-_RED, _GREEN, _BLUE = 0.299, 0.587, 0.114
+_RGB = 0.299, 0.587, 0.114
+_EITHER_WAY = 0.2065, 0.587, 0.2065  # of RGB or BGR: boards are black and white
 
 
 class BoardObservations(NamedTuple):
@@ -72,110 +72,86 @@ def find_board(images: Any, board: Any, *, square: float = 1.0, **options: Any) 
         TypeError: something that is no image. ImportError: there is no OpenCV.
     """
     opencv(_OWNER)
-    wanted = as_board(board, as_number(square, "square", _OWNER), options)
-    given = _given(images)
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        found = list(pool.map(lambda one: corners_in(wanted, *one), given))
-    usual = usual_sizes(found).get("")
-    if usual is None:
-        reasons = "; ".join(f"{one.path}: {one.reason}" for one in found)
-        raise ValueError(f"{_OWNER}: {wanted.words()} is in none of {len(given)} images: {reasons:.500}")
-    left_out = [f"{one.path} ({why})" for one in found if (why := one.unusable(usual))]
-    used = [one for one in found if not one.unusable(usual)]
+    wanted = as_board(board, as_number(square, "square", _OWNER), options, _OWNER)
+    found = search(wanted, _given(images))
+    used, left_out = usable(found)
+    if not used:
+        reasons = "; ".join(f"{path}: {why}" for path, why in left_out)
+        raise ValueError(f"{_OWNER}: {wanted.words()} is in none of {len(found)} images: {reasons:.500}")
     if left_out:
+        named = ", ".join(f"{path} ({why})" for path, why in left_out[:_NAMED])
         more = f" and {len(left_out) - _NAMED} more" if len(left_out) > _NAMED else ""
-        warn(
-            f"{_OWNER}: {len(left_out)} of {len(given)} images are left out: {', '.join(left_out[:_NAMED])}{more}",
-        )
-    points, pixels = [wanted.points()] * len(used), [one.pixels for one in used]
-    return BoardObservations(points, pixels, [str(one.path) for one in used], usual)
-
-
-def as_board(board: Any, square: float, options: dict[str, Any]) -> Board:
-    """The board of words as "charuco 5x7", or of OpenCV's (9, 6)."""
-    if isinstance(board, (tuple, list)) and len(board) == 2:
-        board = f"{board[0]}x{board[1]}"
-    match = (
-        re.fullmatch(r"\s*(?:([a-z]+)\s+)?(\d+)\s*[x,]\s*(\d+)\s*", board.lower()) if isinstance(board, str) else None
+        warn(f"{_OWNER}: {len(left_out)} of {len(found)} images are left out: {named}{more}")
+    size = used[0].image_size
+    return BoardObservations(
+        [wanted.points()] * len(used), [one.pixels for one in used], [str(one.path) for one in used], size
     )
-    if match is None:
-        raise ValueError(
-            f'{_OWNER}: board must be "9x6" (inner corners of a chessboard), "charuco 5x7" or "aprilgrid 6x6"; got '
-            f"{shown(board)}"
-        )
-    kind = match[1] or "chessboard"
-    own = {"type": kind, "columns": int(match[2]), "rows": int(match[3]), "square": square, **options}
-    if kind == "charuco":
-        own.setdefault("marker", 0.75 * square)
-    return board_of(own)
 
 
-def _given(images: Any) -> list[tuple[Path, NDArray[Any] | None]]:
-    """The path of each image, or a name and the array of one that is in memory."""
-    if isinstance(images, (str, os.PathLike)):
-        images = [images]
-    if isinstance(images, (np.ndarray, torch.Tensor)):
-        images = [images] if images.ndim == 2 or (images.ndim == 3 and _is_colour(images)) else list(images)
-    if not isinstance(images, Sequence):
-        raise TypeError(f"{_OWNER}: images must be paths or arrays; got {shown(images)}")
-    if not images:
-        raise ValueError(f"{_OWNER}: no images")
-    given: list[tuple[Path, NDArray[Any] | None]] = []
-    for i, one in enumerate(images):
-        if isinstance(one, (str, os.PathLike)):
-            given += [(path, None) for path in gather([os.fspath(one)])]
-        elif isinstance(one, torch.Tensor) or hasattr(one, "__array_interface__"):  # as images of PIL have it
-            array = one if isinstance(one, torch.Tensor) else np.asarray(one)
-            given.append((Path(f"image {i}"), _grey_of(array, f"images[{i}]")))
-        else:
-            raise TypeError(f"{_OWNER}: images[{i}] must be a path or an array; got {shown(one)}")
-    return given
+# -- what the command uses as well
 
 
-def _is_colour(image: Any) -> bool:
-    first, last = (3, 4, 1), (3, 4, 1)
-    return image.shape[0] in first if isinstance(image, torch.Tensor) else image.shape[-1] in last
+class ImageCorners(NamedTuple):
+    """What one image shows of a board."""
+
+    path: Path
+    image_size: tuple[int, int]
+    """(height, width)."""
+    pixels: NDArray[np.float64]
+    """(N, 2) of the board's points, NaN if unseen."""
+    reason: str
+    """Why nothing was found, or empty."""
 
 
-def _grey_of(image: Any, name: str) -> NDArray[Any]:
-    """(H, W) of grey values."""
-    array = image.detach().cpu().numpy() if isinstance(image, torch.Tensor) else image
-    if array.ndim == 3 and _is_colour(image):
-        array = np.moveaxis(array, 0, -1) if isinstance(image, torch.Tensor) else array
-    if array.ndim not in (2, 3) or (array.ndim == 3 and array.shape[-1] not in (1, 3, 4)) or not array.size:
-        raise ValueError(
-            f"{_OWNER}: {name} must be an array (H, W) or (H, W, C), or a tensor (C, H, W); got {tuple(image.shape)}"
-        )
-    if array.dtype.kind == "f":
-        if float(array.max()) > 1:
-            raise ValueError(f"{_OWNER}: {name} is of floating point, from 0 to 1; got up to {float(array.max()):g}")
-        array = np.rint(255 * array).astype(np.uint8)
-    if array.dtype not in (np.uint8, np.uint16):
-        raise ValueError(f"{_OWNER}: {name} must be uint8 or uint16; got {array.dtype}")
-    if array.ndim == 2 or array.shape[-1] == 1:
-        return np.ascontiguousarray(array.reshape(array.shape[:2]))
-    # red and blue may have changed places: of black and white they are the same
-    weights = (_RED + _BLUE) / 2, _GREEN, (_RED + _BLUE) / 2
-    return np.rint(array[..., :3].astype(np.float32) @ np.array(weights, np.float32)).astype(array.dtype)
+Image = tuple[Path, "NDArray[Any] | None"]
+"""The path of an image, or a name for it and its grey values (H, W)."""
 
 
-def corners_in(board: Board, path: Path, grey: NDArray[Any] | None = None) -> ImageCorners:
-    """What an image shows, which is read unless its grey values (H, W) are given."""
+def search(board: Board, images: Sequence[Image], done: Callable[[], object] = lambda: None) -> list[ImageCorners]:
+    """Search images for a board by all cores; `done` is called after each."""
+
+    def one(image: Image) -> ImageCorners:
+        try:
+            return _search(board, *image)
+        finally:
+            done()
+
+    pool = ThreadPoolExecutor(os.cpu_count())
     try:
-        grey = read_grey(path) if grey is None else grey
+        return list(pool.map(one, images))
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def _search(board: Board, path: Path, grey: NDArray[Any] | None) -> ImageCorners:
+    try:
+        if grey is None:
+            grey = _grey_of(read_stored(path)[0], _RGB)
     except (ValueError, OSError) as error:
-        nothing = np.full((len(board.points()), 2), np.nan)
-        why = getattr(error, "strerror", None) or str(error)
-        return ImageCorners(path, None, nothing, " ".join(why.removeprefix(f"{path}: ").split()))
-    found = detect(board, grey)
-    return ImageCorners(path, (grey.shape[0], grey.shape[1]), found.pixels, found.reason)
+        why = " ".join((getattr(error, "strerror", None) or str(error)).removeprefix(f"{path}: ").split())
+        return ImageCorners(path, (0, 0), np.full((len(board.points()), 2), np.nan), why)
+    return ImageCorners(path, (grey.shape[0], grey.shape[1]), *detect(board, grey))
+
+
+def usable(found: Sequence[ImageCorners]) -> tuple[list[ImageCorners], list[tuple[Path, str]]]:
+    """Return what says something of a camera: the board, seen at the usual size; and the others, with the reason."""
+    sizes = Counter(one.image_size for one in found if not one.reason)
+    usual = sizes.most_common(1)[0][0] if sizes else (0, 0)
+    other = "{1}x{0}, but most images are {3}x{2}"
+    used, left_out = list[ImageCorners](), list[tuple[Path, str]]()
+    for one in found:
+        if one.reason or one.image_size != usual:
+            left_out.append((one.path, one.reason or other.format(*one.image_size, *usual)))
+        else:
+            used.append(one)
+    return used, left_out
 
 
 def gather(words: Iterable[str]) -> list[Path]:
-    """Images, each once, in natural order, of files, folders (not those in them), and patterns.
+    """Return images, each once, in natural order, of files, folders (not those in them), and patterns.
 
     Raises:
-        ValueError: a word that means no image.
+        ValueError: If a word means no image.
     """
     found: dict[str, Path] = {}
     for word in words:
@@ -200,11 +176,49 @@ def natural(path: Path) -> list[tuple[int, int, str]]:
     return [(0, int(part), "") if part.isdecimal() else (1, 0, part.lower()) for part in parts]
 
 
-def read_grey(path: Path) -> NDArray[np.uint8] | NDArray[np.uint16]:
-    """(H, W) of an image file, as stored; see `read_stored`."""
-    pixels = read_stored(path)[0].numpy()
-    if len(pixels) < 3:
-        return np.ascontiguousarray(pixels[0])
-    red, green, blue = pixels[:3].astype(np.float32)
-    grey: np.ndarray = np.rint(_RED * red + _GREEN * green + _BLUE * blue).astype(np.uint8)
-    return grey
+# -- images in memory
+
+
+def _given(images: Any) -> list[Image]:
+    if isinstance(images, (str, os.PathLike)):
+        images = [images]
+    if isinstance(images, (np.ndarray, torch.Tensor)):
+        images = [images] if images.ndim == 2 or (images.ndim == 3 and _has_channels(images)) else list(images)
+    if not isinstance(images, Sequence):
+        raise TypeError(f"{_OWNER}: images must be paths or arrays; got {shown(images)}")
+    if not images:
+        raise ValueError(f"{_OWNER}: no images")
+    given: list[Image] = []
+    for i, one in enumerate(images):
+        if isinstance(one, (str, os.PathLike)):
+            given += [(path, None) for path in gather([os.fspath(one)])]
+        elif isinstance(one, torch.Tensor) or hasattr(one, "__array_interface__"):  # as images of PIL have it
+            array = one if isinstance(one, torch.Tensor) else np.asarray(one)
+            given.append((Path(f"image {i}"), _grey_of(array, _EITHER_WAY, f"images[{i}]")))
+        else:
+            raise TypeError(f"{_OWNER}: images[{i}] must be a path or an array; got {shown(one)}")
+    return given
+
+
+def _has_channels(image: Any) -> bool:
+    return image.shape[0 if isinstance(image, torch.Tensor) else -1] in (1, 2, 3, 4)
+
+
+def _grey_of(image: Any, weights: Sequence[float], name: str = "image") -> NDArray[Any]:
+    """Return the grey values (H, W) of an array (H, W, C) or a tensor (C, H, W), colours by their weights."""
+    array = image.detach().cpu().numpy() if isinstance(image, torch.Tensor) else image
+    if array.ndim not in (2, 3) or (array.ndim == 3 and not _has_channels(image)) or not array.size:
+        raise ValueError(
+            f"{_OWNER}: {name} must be an array (H, W) or (H, W, C), or a tensor (C, H, W); got {tuple(image.shape)}"
+        )
+    if array.ndim == 3 and isinstance(image, torch.Tensor):
+        array = np.moveaxis(array, 0, -1)
+    if array.dtype.kind == "f":
+        if float(array.max()) > 1:
+            raise ValueError(f"{_OWNER}: {name} is of floating point, from 0 to 1; got up to {float(array.max()):g}")
+        array = np.rint(255 * array).astype(np.uint8)
+    if array.dtype not in (np.uint8, np.uint16):
+        raise ValueError(f"{_OWNER}: {name} must be uint8 or uint16; got {array.dtype}")
+    if array.ndim == 3 and array.shape[-1] > 2:
+        array = np.rint(array[..., :3].astype(np.float32) @ np.array(weights, np.float32)).astype(array.dtype)
+    return np.ascontiguousarray(array if array.ndim == 2 else array[..., 0])

@@ -261,7 +261,6 @@ WRONG = [
     (lambda: ct.triangulate(7, [POSE] * 2, torch.ones(2, 5, 2)), TypeError, r"cameras must be Camera in a list; got a"),
     (lambda: ct.fit("mei", PIXELS, RAYS, weights=torch.ones(3)), ValueError, r"weights must broadcast against the"),
     (lambda: ct.fit("mei", PIXELS, RAYS, weights=-torch.ones(SIZE)), ValueError, r"weights must be .*got down to -1"),
-    (lambda: ct.write_report(CAMERA, "a.html"), TypeError, r"calibration must be what calibrate returns; got Kannala"),
     # models, files, maps
     (lambda: ct.WoodScape.from_woodscape([20, 0, 0, 0], image_size=None), ValueError, r"give its image_size=\(height"),
     (lambda: ct.WoodScape.from_woodscape([20, 0, 0, 0], 3, image_size=SIZE), ValueError, r"offset must be \(2,\) ="),

@@ -1,1 +1,0 @@
-"""Reports of calibrations: one HTML file to look at and to print."""
