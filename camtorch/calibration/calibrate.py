@@ -239,13 +239,13 @@ class Calibration:
     def __repr__(self) -> str:
         values = [*self.camera.intrinsics.tolist(), *self.camera.distortion.tolist()]
         pairs = zip(self.parameter_names, values, self.std.tolist(), strict=True)
-        numbers = [f"  {name} = {value:.7g}" + (f" +- {std:.2g}" if std else "") for name, value, std in pairs]
+        numbers = [f"  {name} = {value:.7g}" + (f" +- {std:.2g}" if std else ", held") for name, value, std in pairs]
         count, seen = len(self.views), int(self.observations.seen.sum())
         head = (
             f"Calibration({type(self.camera).__name__}: rms {self.rms:.4g} px, sigma {self.sigma:.4g} px, "
             f"{count} view{'s' * (count != 1)}, {seen} corners{'' if self.converged else ', NOT CONVERGED'})"
         )
-        return "\n".join((head, *numbers, *(f"  ! {text}" for text in self.warnings)))
+        return "\n".join((head, *numbers, *(f"  ! {text}" for text in self.warnings), f"  {self.verdict}"))
 
 
 @on_one_thread

@@ -37,9 +37,9 @@ def run(arguments: argparse.Namespace) -> None:
             "this board looks the same after a turn: the corner nearest to the top left of an image is taken for its "
             "first one, so hold the cameras alike. An even and an odd number of corners, as 9x6, leave no doubt"
         )
+    views, sizes = find_views(cameras, board, "" if arguments.square is None else "m")
     if arguments.square is None:
         note("no --square is given: distances are in sides of a square")
-    views, sizes = find_views(cameras, board, "" if arguments.square is None else "m")
     result = _calibrated(arguments, board, views, sizes, candidates)
     if not result.converged:
         raise ValueError(

@@ -137,7 +137,7 @@ def _calibrate(commands: Commands) -> None:
         "calibrate",
         help="calibrate a camera or a rig from photographs or a video of a board",
         description="Calibrate a camera from photographs of a board: camtorch calibrate images/*.jpg --board 9x6 "
-        "--square 25mm -o camera.yml --report report.html. A video, board.mp4, does as well: sharp frames that differ "
+        "--square 25mm -o camera.yml. A video, board.mp4, does as well: sharp frames that differ "
         "are taken.",
     )
     add = command.add_argument
@@ -146,7 +146,18 @@ def _calibrate(commands: Commands) -> None:
     rig("--left", nargs="+", metavar="IMAGE", help="of the left camera of a pair")
     rig("--right", nargs="+", metavar="IMAGE", help="of the right one")
     rig("--rig", nargs="+", metavar="NAME=IMAGE", help="of any number of cameras: a folder or a pattern")
-    _board_options(command, "if left out, distances are in squares")
+    board = command.add_argument_group("board").add_argument
+    board("--type", choices=_BOARDS, help="chessboard by default")
+    text = "columns and rows: of a chessboard's inner corners, of ChArUco's squares, of AprilGrid's tags"
+    board("--board", type=words.board, metavar="CxR", help=text)
+    text = "the side of a square or AprilTag, as 30mm, or in metres: 0.03; if left out, distances are in squares"
+    board("--square", type=words.length, metavar="LENGTH", help=text)
+    board("--marker", type=words.length, metavar="LENGTH", help="of ChArUco; by default 3/4 of a square")
+    board("--legacy", action="store_true", help="a ChArUco board drawn by OpenCV before 4.6")
+    board("--spacing", type=float, metavar="PART", help="of AprilTags, in sides of a tag; 0.3 by default")
+    board("--border", type=int, metavar="CELLS", help="of AprilTags; 2 by default, as Kalibr prints")
+    text = "of markers, as OpenCV calls it; 5X5_1000 for ChArUco and APRILTAG_36h11 by default"
+    board("--dictionary", metavar="NAME", help=text)
     lens = command.add_argument_group("camera").add_argument
     lens("--model", metavar="KEY", help="kannala_brandt, brown_conrady ...; by default the one that fits")
     lens("--count", type=int, metavar="N", help="of coefficients, where the model leaves a choice")
@@ -154,13 +165,6 @@ def _calibrate(commands: Commands) -> None:
     lens("--loss", choices=("huber", "cauchy"), help="for corners of which some are wrong")
     lens("--loss-scale", type=float, default=1.0, metavar="PX", help="of that loss; 1 by default")
     lens("--bend", action="store_true", help="the board is not quite flat: find its bend as well")
-    add(
-        "--corners",
-        type=words.path,
-        metavar="FILE",
-        help="a .json to keep corners in; without images, to take them from",
-    )
-    add("--report", type=words.path, metavar="FILE", help="an .html to look at: how far the result can be trusted")
     add("--format", help=f"{_FORMAT}, OpenCV's for .yml")
     _output(add, "camera.json", "the calibration")
 
@@ -208,22 +212,6 @@ def _projection(add: Add) -> None:
     text = "horizontal field of view of the new image; by default that of the old one, up to 120 in perspective"
     add("--fov", type=float, metavar="DEGREES", help=text)
     add("--size", type=words.size, metavar="WxH", help="size of the new image; by default the old one's")
-
-
-def _board_options(command: argparse.ArgumentParser, square: str) -> None:
-    """The board, of which `square` says what its side is without --square."""
-    add = command.add_argument_group("board").add_argument
-    add("--type", choices=_BOARDS, help="chessboard by default")
-    text = "columns and rows: of a chessboard's inner corners, of ChArUco's squares, of AprilGrid's tags"
-    add("--board", type=words.board, metavar="CxR", help=text)
-    text = f"the side of a square or AprilTag, as 30mm, or in metres: 0.03; {square}"
-    add("--square", type=words.length, metavar="LENGTH", help=text)
-    add("--marker", type=words.length, metavar="LENGTH", help="of ChArUco; by default 3/4 of a square")
-    add("--legacy", action="store_true", help="a ChArUco board drawn by OpenCV before 4.6")
-    add("--spacing", type=float, metavar="PART", help="of AprilTags, in sides of a tag; 0.3 by default")
-    add("--border", type=int, metavar="CELLS", help="of AprilTags; 2 by default, as Kalibr prints")
-    text = "of markers, as OpenCV calls it; 5X5_1000 for ChArUco and APRILTAG_36h11 by default"
-    add("--dictionary", metavar="NAME", help=text)
 
 
 def _output(add: Add, default: str | None, text: str = "the new image") -> None:

@@ -74,7 +74,7 @@ def _draw_residuals(ax: Axes, calibration: Calibration, pixels: np.ndarray, erro
     # an even choice of all lengths, the longest last and so above the others
     some = np.argsort(lengths, kind="stable")[np.linspace(0, len(lengths) - 1, min(len(lengths), _ARROWS)).astype(int)]
     usual = float(np.quantile(lengths, 0.98)) if len(lengths) else 0.0
-    longer = magnification(0.03 * max(height, width) / max(usual, 1e-9))
+    longer = magnification(0.05 * max(height, width) / max(usual, 1e-9))
     arrows = ax.quiver(
         *pixels[some].T,
         *errors[some].T * longer,

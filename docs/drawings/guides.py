@@ -250,8 +250,12 @@ def calibration() -> Image.Image:
         axis.imshow(views[i][0], cmap="gray", vmin=0, vmax=255)
         axis.plot(*seen[i].T, "o", color="#e0245e", markersize=3.5)
         axis.set(xticks=[], yticks=[], title=f"photograph {i}, and its corners")
-    ct.plot.uncertainty(result, axes[1, 1])
-    axes[1, 1].set_title("how far projections are known")
+    sigma = result.uncertainty(result.camera.pixel_grid(4).double()).numpy(force=True)
+    shown = axes[1, 1].imshow(
+        sigma, cmap="magma_r", vmax=np.nanquantile(sigma, 0.97), extent=(-0.5, 639.5, 479.5, -0.5)
+    )
+    figure.colorbar(shown, ax=axes[1, 1], label="px", shrink=0.8)
+    axes[1, 1].set(xticks=[], yticks=[], title="how far projections are known")
     return drawn(figure)
 
 

@@ -44,7 +44,8 @@ def figures(text: str) -> Image.Image:
     tiles = []
     for number in plt.get_fignums():
         figure = plt.figure(number)
-        figure.set_size_inches(7.2, 5.4)
+        if len(plt.get_fignums()) > 1:
+            figure.set_size_inches(7.2, 5.4)
         tiles.append(drawn(figure, dpi=83))
     columns = min(2, len(tiles))
     width, height = tiles[0].size

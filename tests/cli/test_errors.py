@@ -6,10 +6,8 @@ import sys
 import pytest
 import torch
 from command_line import FILES, LEVEL, opened, refused, write_photograph
-from test_calibrate_cli import corners_of
 
 import camtorch as ct
-from camtorch.boards.corners import write_corners
 
 PHOTO = "in.png --camera camera.yml"
 CASES = {
@@ -128,12 +126,7 @@ CASES = {
         ("calibrate in.png --board 9x6 -o camera.foo", "camera.foo: the name does not say the format"),
         ("calibrate in.png --board 9x6 -o in.png --force", "would overwrite in.png, which is read"),
         ("calibrate in.png --board 9x6 -o exists.json", "exists.json: exists already; --force"),
-        ("calibrate in.png --board 9x6 -o new.json --report exists.json", "exists.json: exists already; --force"),
-        ("calibrate in.png --board 9x6 -o new.json --report new.json", "must be different files"),
-        ("calibrate in.png --board 9x6 -o new.json --corners new.json", "must be different files"),
-        ("calibrate in.png --board 9x6 --corners exists.json", "exists.json: no file of corners"),
-        ("calibrate --corners corners.json --fixed fx,k3", "--fixed: no focal length is known to be held"),
-        ("calibrate in.png --board 8x6 --corners corners.json", "holds corners of chessboard, 9x6 inner corners"),
+        ("calibrate in.png --board 9x6 --fixed fx,k3", "--fixed: no focal length is known to be held"),
     ],
 }
 
@@ -148,7 +141,6 @@ def files(tmp_path_factory):
     (folder / "images").mkdir()
     (folder / "empty").mkdir()
     (folder / "exists.json").write_text("{}")
-    write_corners(corners_of(count=3), folder / "corners.json")
     shutil.copy(folder / "in.png", folder / "images")
     (folder / "film.mkv").write_bytes(b"no video")
     opened(folder / "in.png").convert("RGBA").save(folder / "alpha.png")
@@ -172,8 +164,6 @@ def test_errors_are_one_line_and_leave_nothing(files, monkeypatch, capsys, group
     ("module", "words", "text"),
     [
         ("matplotlib", "show camera.yml -o out.png", "pip install 'camtorch[plot]'"),
-        ("matplotlib", "calibrate --corners corners.json --report report.html", "pip install 'camtorch[plot]'"),
-        ("jinja2", "calibrate --corners corners.json --report report.html", "pip install 'camtorch[plot]'"),
         ("av", "dewarp in.png film.mkv --camera camera.yml -o out/", "pip install 'camtorch[video]'"),
     ],
 )
