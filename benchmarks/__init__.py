@@ -1,14 +1,12 @@
 """Speed, memory and accuracy of camtorch beside OpenCV, kornia and the floor of the machine: `python -m benchmarks`.
 
-What makes the figures comparable, here once for all subjects:
+One file is one subject: its `TABLES` name the contestants, and its `rows(options)` measures them.
 
-* All contestants of one operation are timed in turns within one process, after a warm-up, and medians are taken: eager
-  timings move by up to two between processes, ratios within one process do not.
-* What a contestant wants in another shape or type is converted before the clock starts, unless the conversion is what
-  the column is about ("tensor in, tensor out").
-* "project" and "unproject" run under `torch.no_grad()`; "f+b" is forward and backward, with gradients to the input and
-  to every parameter.
-* Every speed has an error beside it, against the same camera in float64.
+* All contestants of a row take turns within one process, after a warm-up, and medians are taken: eager timings move by
+  up to two between processes, ratios within one process do not.
+* What a contestant wants in another shape or type is converted before the clock starts.
+* "project" and "unproject" run under `torch.no_grad()`; "and backward" has gradients to the input and every parameter.
+* Points, images and stereo have an error beside each speed, against the same camera in float64.
 """
 
 import os

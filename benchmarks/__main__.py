@@ -1,130 +1,82 @@
 """The command line: `python -m benchmarks --help`."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys
 import time
-from dataclasses import asdict
 from pathlib import Path
 
 try:
     import cv2
     import torch
 
-    from benchmarks import (
-        augment,
-        calibration,
-        cameras,
-        folders,
-        images,
-        load,
-        loader,
-        machine,
-        points,
-        samples,
-        scaling,
-        stereo,
-    )
-    from benchmarks.options import Options, progress
+    from benchmarks import augment, calibration, cameras, folders, harness, images, points, samples, stereo
 except ModuleNotFoundError as error:
     sys.exit(f"{error}. The benchmarks need more than camtorch: pip install -e '.[benchmark]'")
 
 SUBJECTS = {
-    "points": points,
-    "images": images,
-    "samples": samples,
-    "augment": augment,
-    "loader": loader,
-    "calibration": calibration,
-    "stereo": stereo,
-    "folders": folders,
-    "load": load,
-    "scaling": scaling,
+    module.__name__.rpartition(".")[2]: module
+    for module in (points, images, stereo, augment, samples, calibration, folders)
 }
-# torch keeps so many compiled versions of one function and then gives up; here every contestant is a version
-_COMPILED_VERSIONS = 64
+TABLES = {table.name: table for subject in SUBJECTS.values() for table in subject.TABLES}
+_COMPILED_VERSIONS = 64  # of one function, before torch gives up; here every contestant is a version
 
 
 def main(arguments: list[str] | None = None) -> None:
     """Measure what the arguments ask for, and print it."""
     parser = _parser()
-    given = parser.parse_args(arguments)
-    if given.device == "cuda" and not torch.cuda.is_available():
+    options = parser.parse_args(arguments, harness.Options())
+    if min(n for n in (options.size, options.threads, options.repeats) if n is not None) < 1:
+        parser.error("--size, --threads and --repeats must be at least 1")
+    if options.device == "cuda" and not torch.cuda.is_available():
         parser.error("--device cuda: torch sees no GPU here")
-    torch.set_num_threads(given.threads)
-    cv2.setNumThreads(given.threads)
+    arguments = vars(options) | {"json": str(options.json)}
+    torch.set_num_threads(options.threads)
+    cv2.setNumThreads(options.threads)
     torch._dynamo.config.recompile_limit = _COMPILED_VERSIONS
-    options = Options(
-        size=given.size or (10_000 if given.quick else 1_000_000),
-        models=tuple(given.model),
-        device=torch.device(given.device),
-        threads=given.threads,
-        repeats=given.repeats or (3 if given.quick else 9),
-        seconds=given.seconds,
-        compile=given.compile and not given.quick,
-        quick=given.quick,
-    )
-    facts = machine.describe(options.device)
-    print(", ".join(f"{name}: {fact}" for name, fact in facts.items()), flush=True)
-    print(f"Medians of at most {options.repeats} rounds, in which the contestants take turns.", flush=True)
-    results = {}
+    options.device = torch.device(options.device)
+    options.size = options.size or (10_000 if options.quick else 1_000_000)
+    options.repeats = options.repeats or (3 if options.quick else 9)
+    options.compile = options.compile and not options.quick
+    facts = harness.machine(options.device)
+    print(*(f"{name}: {fact}" for name, fact in facts.items()), sep=", ")
+    print(f"Medians of at most {options.repeats} rounds, ± the distance of their quartiles.", flush=True)
+    results: dict[str, dict[str, dict[str, harness.Figure]]] = {}
     start = time.perf_counter()
-    for name in given.subject or SUBJECTS:
-        records, tables = SUBJECTS[name].run(options)
-        results[name] = [asdict(record) for record in records]
-        progress("")
-        print("".join(tables), flush=True)
+    for name in options.subject or SUBJECTS:
+        for row in SUBJECTS[name].rows(options):
+            results.setdefault(row.table, {})[row.name] = dict(row.figures)
+        harness.progress("")
+        for table in SUBJECTS[name].TABLES:
+            if found := results.get(table.name):
+                print(f"\n### {table.name}\n\n{table.markdown(found, spread=True)}", flush=True)
     print(f"({time.perf_counter() - start:.0f} s)")
-    if given.json:
-        content = {"machine": facts, "arguments": vars(given) | {"json": str(given.json)}, "results": results}
-        given.json.write_text(json.dumps(content, indent=1) + "\n")
+    if options.json:
+        content = {"machine": facts, "arguments": arguments, "results": results}
+        options.json.write_text(json.dumps(content, indent=1) + "\n")
 
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks",
         description="Measure camtorch beside OpenCV, kornia and the floor of this machine: speed, memory and accuracy. "
-        "Tables go to stdout as markdown, progress to stderr. (2.0x) means: takes twice as long.",
+        "Tables go to stdout as markdown, progress to stderr. (2.0x) means twice camtorch's time.",
     )
-    parser.add_argument("subject", nargs="*", choices=list(SUBJECTS), help="default: all")
-    parser.add_argument("--size", type=_positive, metavar="N", help="points of the subject points (default: 1000000)")
-    parser.add_argument(
-        "--model",
-        nargs="+",
-        choices=tuple(cameras.COEFFICIENTS),
-        default=[],
-        metavar="KEY",
-        help=f"only these models; of {', '.join(cameras.COEFFICIENTS)}. images, calibration, stereo and scaling have "
-        "a few",
+    add = parser.add_argument
+    keys = tuple(cameras.COEFFICIENTS)
+    add("subject", nargs="*", choices=list(SUBJECTS), help="default: all")
+    add("--size", type=int, metavar="N", help="points of the subject points (default: 1000000)")
+    add("--model", nargs="+", choices=keys, default=[], metavar="KEY", help=f"only these models of {', '.join(keys)}")
+    add("--device", choices=("cpu", "cuda"), default="cpu", help="where tensors live (default: cpu)")
+    add("--threads", type=int, default=2, help="of torch and of OpenCV (default: 2)")
+    add("--repeats", type=int, metavar="R", help="rounds that medians are taken of (default: 9)")
+    add(
+        "--seconds", type=float, default=0.6, metavar="S", help="for the rounds of a row, three at least (default: 0.6)"
     )
-    parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="where tensors live (default: cpu)")
-    parser.add_argument("--threads", type=_positive, default=2, help="of torch and of OpenCV (default: 2)")
-    parser.add_argument("--repeats", type=_positive, metavar="R", help="rounds that medians are taken of (default: 9)")
-    parser.add_argument(
-        "--seconds",
-        type=float,
-        default=0.6,
-        metavar="S",
-        help="for the rounds of one operation: slow contestants take fewer, three at least (default: 0.6)",
-    )
-    parser.add_argument(
-        "--no-compile",
-        dest="compile",
-        action="store_false",
-        help="without torch.compile, which takes about a minute a model",
-    )
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write the machine and every figure to this file")
-    parser.add_argument("--quick", action="store_true", help="small inputs, nothing compiled: does everything work?")
+    add("--no-compile", dest="compile", action="store_false", help="without torch.compile: about a minute a model")
+    add("--json", type=Path, metavar="FILE", help="write the machine and every figure to this file")
+    add("--quick", action="store_true", help="small inputs, nothing compiled: does everything work?")
     return parser
-
-
-def _positive(text: str) -> int:
-    value = int(text)
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"must be at least 1; got {value}")
-    return value
 
 
 if __name__ == "__main__":

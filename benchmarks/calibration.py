@@ -4,16 +4,10 @@ The views are made: a board of 9 by 6 corners about random pixels of a camera, t
 0.2 px of noise. All start from nothing: no focal length is given. camtorch always finds the covariances as well; of
 OpenCV that is calibrateCameraExtended, whose time grows with more than the number of views, so that it takes part up to
 200 of them, as does its fisheye calibration, which has no covariances.
-
-What is required is judged by the fastest rounds.
 """
 
-from __future__ import annotations
-
 import math
-from collections.abc import Callable
-from functools import partial
-from typing import NamedTuple
+from collections.abc import Callable, Iterator
 
 import cv2
 import numpy as np
@@ -22,35 +16,36 @@ from torch import Tensor
 
 import camtorch as ct
 from benchmarks import cameras
+from benchmarks.harness import NAMES, OPENCV, OURS, Figure, Options, Row, Table, measure
 from benchmarks.memory import growth
-from benchmarks.options import Options, progress
-from benchmarks.point_peers import OPENCV, OURS
-from benchmarks.tables import Record, only, table
-from benchmarks.timing import measure
-from benchmarks.verdict import Requirement, verdict
 from camtorch.rotations import rotation_matrix
 
-MODELS = ("brown_conrady", "kannala_brandt")
-VIEWS, QUICK_VIEWS = (10, 50, 200, 2000), (10, 20)
-POSES, QUICK_POSES = 1000, 20
-COLUMNS, ROWS, SQUARE, NOISE = 9, 6, 0.025, 0.2
-_SECONDS = {200: 1.0, 2000: 10.0}  # that so many views may take
-_POSE_SECONDS = 0.1
-_LINEAR = 1.3  # times as much for each of ten times as many views
-CALIBRATE, POSE = "calibrate", "solve_pnp"
 EXTENDED = "OpenCV, covariances"
+_EVERYONE = {who: (who,) for who in (OURS, OPENCV, EXTENDED)}
+TABLES = (
+    Table("calibration", "54 corners a view, s", _EVERYONE, 1),
+    Table("calibration, residuals", "rms, px", _EVERYONE, 1, None),
+    Table("calibration, memory", "at the most, MB", {OURS: (OURS,)}, 1e-6),
+)
+MODELS = ("brown_conrady", "kannala_brandt")
+VIEWS, QUICK_VIEWS, POSES, QUICK_POSES = (10, 50, 200, 2000), (10, 20), 1000, 20
+COLUMNS, ROWS, SQUARE, NOISE = 9, 6, 0.025, 0.2
 _MOST = 200  # views, for the slow ones
 
 
-class Views(NamedTuple):
-    """Boards that a camera sees: object points (N, 3), image points (V, N, 2), float64."""
+def rows(options: Options) -> Iterator[Row]:
+    """Measure calibrations of more and more views, then the poses."""
+    counts, poses = (QUICK_VIEWS, QUICK_POSES) if options.quick else (VIEWS, POSES)
+    with torch.no_grad():
+        for key in options.chosen(MODELS):
+            camera = cameras.camera(key, torch.device("cpu"), torch.float64)
+            for count in counts:
+                yield from _calibrations(key, *_views(camera, count), options)
+            yield _poses(key, camera.to(options.device), *_views(camera, poses), options)
 
-    board: Tensor
-    pixels: Tensor
 
-
-def views(camera: ct.Camera, count: int) -> Views:
-    """So many views with all corners in the image."""
+def _views(camera: ct.Camera, count: int) -> tuple[Tensor, Tensor]:
+    """The board (N, 3), and its corners (V, N, 2) in so many views that have them all; float64."""
     generator = torch.Generator().manual_seed(0)
     y, x = torch.meshgrid(torch.arange(ROWS), torch.arange(COLUMNS), indexing="ij")
     board = torch.stack((x, y, 0 * x), -1).reshape(-1, 3).double() * SQUARE
@@ -68,110 +63,44 @@ def views(camera: ct.Camera, count: int) -> Views:
         turn = towards @ rotation_matrix(axis) @ rotation_matrix(roll)
         points = (board - board.mean(0)) @ turn.mT + (rays * (0.2 + 0.4 * uniform[:, 5:]))[:, None]
         pixels, valid = camera.project(points)
-        inside = (valid[..., None] & (pixels >= 0) & (pixels <= size - 1)).all(-1).all(-1)
-        kept.append(pixels[inside])
+        kept.append(pixels[(valid[..., None] & (pixels >= 0) & (pixels <= size - 1)).all(-1).all(-1)])
     pixels = torch.cat(kept)[:count]
-    return Views(board, pixels + NOISE * torch.randn(pixels.shape, generator=generator, dtype=torch.float64))
+    return board, pixels + NOISE * torch.randn(pixels.shape, generator=generator, dtype=torch.float64)
 
 
-def run(options: Options) -> tuple[list[Record], list[str]]:
-    """Measure; the records and the tables."""
-    keys = options.chosen(MODELS)
-    times, poses, errors, memory = [], [], [], []
-    with torch.no_grad():
-        for key in keys:
-            camera = cameras.camera(key, options.device, torch.float64).cpu()
-            for count in QUICK_VIEWS if options.quick else VIEWS:
-                made = views(camera, count)
-                times += _calibrations(key, made, options)
-                errors += _errors(key, made)
-                memory += _memory(key, made, options)
-            poses += _poses(camera, key, options)
-    tables = [
-        table("Calibration: seconds, for V views of 54 corners (times camtorch)", only(times, "seconds"), beside=OURS),
-        table("Calibration: rms of the residuals, px", errors),
-        table("Calibration: megabytes at the most, beyond the input", memory, scale=1e-6),
-        table("Poses: milliseconds (times camtorch)", only(poses, "seconds"), scale=1e3, beside=OURS),
-        verdict(_requirements(times, poses, memory)),
-    ]
-    return times + poses + errors + memory, tables
+def _calibrations(key: str, board: Tensor, pixels: Tensor, options: Options) -> Iterator[Row]:
+    """Times, residuals and memory of one number of views."""
+    here = board.to(options.device), pixels.to(options.device)
+    calibrate = lambda: ct.calibrate(key, *here, image_size=cameras.SIZE)
+    runs: dict[str, Callable[[], float]] = {OURS: lambda: float(calibrate().rms), **_peers(key, board, pixels)}
+    name = f"{NAMES[key]}, calibrate, V = {len(pixels)}"
+    yield measure("calibration", name, runs, options)
+    yield Row("calibration, residuals", name, {who: Figure(rms()) for who, rms in runs.items()})
+    yield Row("calibration, memory", name, {OURS: Figure(growth(calibrate, options.device)[0])})
 
 
-def _ours(key: str, made: Views, device: torch.device) -> ct.Calibration:
-    return ct.calibrate(key, made.board.to(device), made.pixels.to(device), image_size=cameras.SIZE)
-
-
-def _peers(key: str, made: Views) -> dict[str, Callable[[], float]]:
+def _peers(key: str, board: Tensor, pixels: Tensor) -> dict[str, Callable[[], float]]:
     """By contestant, what gives OpenCV's rms."""
-    boards, pixels, size = [made.board.numpy()] * len(made.pixels), [*made.pixels.numpy()], cameras.SIZE[::-1]
-    few = len(made.pixels) <= _MOST
+    few = len(pixels) <= _MOST
+    both, size = ([board.numpy()] * len(pixels), [*pixels.numpy()]), cameras.SIZE[::-1]
     if key == "kannala_brandt":
         flags = cv2.CALIB_RECOMPUTE_EXTRINSIC | cv2.CALIB_FIX_SKEW  # without the first it ends 21 px off
-        rows = [[points[None] for points in views] for views in (boards, pixels)]
-        return {OPENCV: lambda: cv2.fisheye.calibrate(*rows, size, None, None, flags=flags)[0]} if few else {}
-    singles = [[points.astype(np.float32) for points in views] for views in (boards, pixels)]
-    plain = {OPENCV: lambda: cv2.calibrateCamera(*singles, size, None, None)[0]}
-    return plain | ({EXTENDED: lambda: cv2.calibrateCameraExtended(*singles, size, None, None)[0]} if few else {})
+        views = [[points[None] for points in views] for views in both]
+        return {OPENCV: lambda: cv2.fisheye.calibrate(*views, size, None, None, flags=flags)[0]} if few else {}
+    views = [[points.astype(np.float32) for points in views] for views in both]
+    plain = {OPENCV: lambda: cv2.calibrateCamera(*views, size, None, None)[0]}
+    return plain | ({EXTENDED: lambda: cv2.calibrateCameraExtended(*views, size, None, None)[0]} if few else {})
 
 
-def _calibrations(key: str, made: Views, options: Options) -> list[Record]:
-    runs: dict[str, Callable[[], object]] = {OURS: partial(_ours, key, made, options.device)}
-    runs |= _peers(key, made)
-    return measure(f"{key}, {CALIBRATE}", f"V = {len(made.pixels)}", runs, options)
-
-
-def _errors(key: str, made: Views) -> list[Record]:
-    column = f"V = {len(made.pixels)}"
-    progress(f"{key}, {CALIBRATE}, {column}: errors")
-    records = [Record(key, OURS, column, "rms", _ours(key, made, made.pixels.device).rms)]
-    return records + [Record(key, name, column, "rms", rms()) for name, rms in _peers(key, made).items()]
-
-
-def _memory(key: str, made: Views, options: Options) -> list[Record]:
-    most, _ = growth(partial(_ours, key, made, options.device), options.device)
-    return [Record(key, OURS, f"V = {len(made.pixels)}", "bytes", most)]
-
-
-def _poses(camera: ct.Camera, key: str, options: Options) -> list[Record]:
+def _poses(key: str, camera: ct.Camera, board: Tensor, pixels: Tensor, options: Options) -> Row:
     """Poses of so many boards, all at once, and by OpenCV one after the other."""
-    made = views(camera, QUICK_POSES if options.quick else POSES)
-    count, device = len(made.pixels), options.device
-    ours, board, pixels = camera.to(device), made.board.expand(count, -1, -1).to(device), made.pixels.to(device)
+    count, device = len(pixels), options.device
+    here = board.expand(count, -1, -1).to(device), pixels.to(device)
     matrix, lens = cameras.matrix(), np.array(cameras.COEFFICIENTS[key])
     solve = cv2.fisheye.solvePnP if key == "kannala_brandt" else cv2.solvePnP
-    objects, images = made.board.numpy(), made.pixels.numpy()
+    objects, images = board.numpy(), pixels.numpy()
     runs = {
-        OURS: lambda: ct.solve_pnp(ours, board, pixels),
+        OURS: lambda: ct.solve_pnp(camera, *here),
         OPENCV: lambda: [solve(objects[:, None], image[:, None], matrix, lens) for image in images],
     }
-    return measure(f"{key}, {POSE}", f"{count:,} poses", runs, options)
-
-
-def _requirements(times: list[Record], poses: list[Record], memory: list[Record]) -> list[Requirement]:
-    fastest = {(r.case, r.operation): r.value for r in only(times, "fastest") if r.contestant == OURS}
-    most = {(r.case, r.operation): r.value for r in memory}
-    found = [
-        Requirement(
-            f"{views:,} views of 54 corners: at most {limit:g} s",
-            limit,
-            {case: value for (case, column), value in fastest.items() if column == f"V = {views}"},
-            at_most=True,
-            unit=" s",
-        )
-        for views, limit in _SECONDS.items()
-    ]
-    for text, values in (("time", fastest), ("memory", most)):
-        ratios = {
-            case: value / (10 * values[case, "V = 200"])
-            for (case, column), value in values.items()
-            if column == "V = 2000"
-        }
-        name = f"{text} linear in views: from 200 to 2,000 of them, a view at most {_LINEAR}x"
-        found.append(Requirement(name, _LINEAR, ratios, at_most=True))
-    slow = {
-        r.case: r.value for r in only(poses, "fastest") if r.contestant == OURS and r.operation == f"{POSES:,} poses"
-    }
-    found.append(
-        Requirement(f"{POSES:,} poses: at most {_POSE_SECONDS} s", _POSE_SECONDS, slow, at_most=True, unit=" s")
-    )
-    return found
+    return measure("calibration", f"{NAMES[key]}, solve_pnp, {count:,} poses", runs, options)

@@ -1,7 +1,5 @@
 """A real-looking camera of every model, and directions to look at with it."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -17,47 +15,24 @@ COEFFICIENTS: dict[str, tuple[float, ...]] = {
     "pinhole": (),
     "brown_conrady": (-0.05, 0.01, 1e-3, -5e-4, 1e-3),
     "kannala_brandt": _FISHEYE,
-    "fisheye62": (*_FISHEYE, 1e-4, 0.0, 1e-3, -5e-4),
     "fisheye624": (*_FISHEYE, 1e-4, 0.0, 1e-3, -5e-4, 1e-3, -1e-4, 5e-4, 1e-4),
     "thin_prism_fisheye": (0.02, -0.01, 1e-3, -5e-4, 0.003, -0.001, 1e-3, 5e-4),
     "f_theta": (-0.09, 0.14, -0.02),
     "f_theta_backward": (0.02, -0.03, 0.004),
-    "f_theta_sheared": (1e-3, -1e-3, -0.09, 0.14, -0.02),
-    "f_theta_backward_sheared": (1e-3, -1e-3, 0.02, -0.03, 0.004),
-    "woodscape": (-0.09, 0.14, -0.02),
-    # theta (1 + 0.02 theta^2 - 0.01 theta^4 + ...) every 15 degrees
-    "tabulated": (
-        *(math.radians(15 * i) for i in range(1, 9)),
-        *(0.26214, 0.52610, 0.79234, 1.05939, 1.32257, 1.57240, 1.79311, 1.96014),
-    ),
-    "ucm": (0.6,),
     "eucm": (0.6, 1.1),
     "double_sphere": (-0.1, 0.6),
     "mei": (1.2, -0.05, 0.01, 1e-3, -5e-4),
     "fov": (0.9,),
     "division": (-0.2,),
-    "equisolid": _FISHEYE,
-    "stereographic": _FISHEYE,
-    "orthographic_fisheye": _FISHEYE,
-    "cylindrical": (),
     "equirectangular": (),
 }
-"""Of the size that calibrations of such lenses come out with; every term that a model has is at work."""
+"""Models of each kind, with values as calibrations of such lenses have them; every term is at work."""
 
 TIMED_ANGLE = 75
-_WITHIN_90 = ("pinhole", "brown_conrady", "orthographic_fisheye")
-
-
-def angles(key: str) -> tuple[int, ...]:
-    """Degrees from the axis up to which the errors of a model are looked at.
-
-    The timed domain, and either one inside the image of a perspective camera or one past its plane.
-    """
-    return (45, TIMED_ANGLE) if key in _WITHIN_90 else (TIMED_ANGLE, 100)
 
 
 def intrinsics(size: tuple[int, int]) -> tuple[float, float, float, float]:
-    """fx fy cx cy of the sample cameras with another image, of the same field of view across."""
+    """Return fx fy cx cy for another image, of the same field of view across."""
     (height, width), (fx, fy, _, _) = size, INTRINSICS
     return fx * width / SIZE[1], fy * width / SIZE[1], (width - 1) / 2, (height - 1) / 2
 
@@ -70,9 +45,9 @@ def camera(
     size: tuple[int, int] = SIZE,
     batch: int | None = None,
 ) -> ct.Camera:
-    """The sample camera of a model, learnable; or a batch of them, each a little longer than the one before.
+    """Return the sample camera of a model, learnable; or a batch, each a little longer than the one before.
 
-    Its values are rounded to float32 in every dtype, so that all are the same camera.
+    Values are rounded to float32 in every dtype, so that all are the same camera.
     """
     focal = torch.tensor(intrinsics(size))
     lens = torch.tensor(COEFFICIENTS[key])
@@ -84,13 +59,13 @@ def camera(
 
 
 def matrix() -> np.ndarray:
-    """(3, 3) float64: K of the sample cameras."""
+    """Return K of the sample cameras, (3, 3) float64."""
     fx, fy, cx, cy = INTRINSICS
     return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
 
 
 def points(count: int, degrees: float, device: torch.device) -> Tensor:
-    """(count, 3): directions uniform in the angle from the axis, at distances from 1 to 4."""
+    """Return (count, 3): directions uniform in the angle from the axis, at distances from 1 to 4."""
     generator = torch.Generator().manual_seed(0)
     angle, azimuth, distance = torch.rand(3, count, generator=generator, dtype=torch.float64)
     angle, azimuth, distance = angle * math.radians(degrees), azimuth * 2 * math.pi, 1 + 3 * distance

@@ -1,160 +1,179 @@
-"""Images: dewarping with a map that is kept, with maps computed each time, and with gradients.
+"""Images: dewarping with a map that is kept, and with maps computed each time.
 
-The error is the largest difference, in grey levels, to `grid_sample` in float64 with positions from a float64 camera,
-over the pixels whose interpolation stays inside the image. The images are noise, whose neighbours differ by up
-to 255: an error of a position of 0.01 px shows as some 2 grey levels. Results in uint8 are up to 0.5 off by rounding.
-
-What is required is judged by the fastest rounds.
+OpenCV and deltacamera have their images as arrays (H, W, C), or (H, W) of one channel, before the clock starts, and
+give lists of such. The error is the largest difference, in grey levels, to `grid_sample` in float64 with positions from
+a float64 camera, over the pixels whose interpolation stays inside the image. The images are noise, whose neighbours
+differ by up to 255: 0.01 px shows as some 2 grey levels. Results in uint8 are up to 0.5 off by rounding.
 """
 
-from __future__ import annotations
+from collections.abc import Callable, Iterator
+from functools import partial
+from itertools import product
+from typing import Any
 
-from collections.abc import Iterator, Sequence
-from dataclasses import replace
-
+import cv2
+import numpy as np
 import torch
 import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
+from kornia.geometry.calibration import undistort_image
 from torch import Tensor
 
 import camtorch as ct
-from benchmarks import footprint
-from benchmarks.image_peers import (
-    CACHED,
-    CLONE,
-    DELTACAMERA,
-    FRESH,
-    GRID_SAMPLE,
-    LATTICE,
-    OPENCV_MAPS,
-    OPERATIONS,
-    Task,
-    as_tensor,
-    contestants,
-)
-from benchmarks.options import Options, progress
-from benchmarks.point_peers import KORNIA, OURS
-from benchmarks.tables import Record, only, relative, table
-from benchmarks.timing import measure, threads
-from benchmarks.verdict import Requirement, figures, times_faster, verdict
+from benchmarks import cameras
+from benchmarks.harness import KORNIA, NAMES, OURS, Figure, Options, Row, Run, Table, measure, threads
+from benchmarks.memory import peak
+
+try:
+    import deltacamera as dc
+except ModuleNotFoundError:
+    dc = None
 
 MODELS = ("kannala_brandt", "brown_conrady")
 SMALL, LARGE, QUICK = (480, 640), (720, 1280), (120, 160)
-_ONE_THREAD = ", 1 thread"
-_LEARNING = ((1, 3, LARGE), (8, 3, SMALL), (8, 3, QUICK))  # whose gradients are timed
-_JUDGED = 2  # images of a batch whose errors are looked at
+KEPT, NEW = "kept map", "new cameras"
+DELTACAMERA, GRID_SAMPLE, CLONE = "deltacamera", "`grid_sample` alone", "clone"
+OPENCV_MAPS = "OpenCV, float map", "OpenCV, fixed-point map"
+_EVERYONE = {OURS: (OURS,), "OpenCV": OPENCV_MAPS} | {who: (who,) for who in (DELTACAMERA, KORNIA, GRID_SAMPLE)}
+TABLES = (
+    Table("images", "images, ms", {**_EVERYONE, CLONE: (CLONE,)}, alone=(CLONE,)),
+    Table("images, 1 thread", "images, 1 thread, ms", {**_EVERYONE, CLONE: (CLONE,)}, alone=(CLONE,)),
+    Table("images, errors", "largest difference, grey levels", _EVERYONE, 1, None),
+    Table("images, memory", "at the peak, in sizes of the result", _EVERYONE, 1, None),
+)
+_JUDGED = 2  # images of a batch whose errors are taken
 
 
-def run(options: Options) -> tuple[list[Record], list[str]]:
-    """Measure; the records and the tables."""
-    found = [task for key in options.chosen(MODELS) for task in tasks(key, options)]
-    records = [record for task in found for record in _task(task, options)]
-    weighed = [task for task in found if task.batch > 1 and not task.last and task.size != SMALL]
-    records += footprint.measured(weighed, options)
-    seconds = only(records, "seconds")
-    title = f"Images: milliseconds on {options.threads} threads, where not on one (times camtorch)"
-    tables = [
-        table(title, seconds, scale=1e3, beside=OURS),
-        table("Images: time in clones of the images", relative(seconds, CLONE)),
-        table("Images: largest difference to float64, in grey levels", only(records, "error")),
-        table("Images: memory at the peak of a warp, in sizes of its result", only(records, "peak")),
-        verdict(requirements(records)),
-    ]
-    return records, tables
+class Task:
+    """Images of random noise, which no error of a position can hide in.
+
+    "kept map" is one camera for all of them, into the target that `ct.Dewarp` chose. "new cameras" are as many
+    different cameras, made anew each time, into a pinhole camera of the same K: what every peer can do.
+    """
+
+    def __init__(self, key: str, batch: int, shape: tuple[int, int, int], dtype: torch.dtype, device: torch.device):
+        self.key, self.size, self.device = key, shape[1:], device
+        self.name = f"{NAMES[key]}, {batch} of {'x'.join(map(str, shape))} {str(dtype).removeprefix('torch.')}"
+        generator = torch.Generator().manual_seed(0)
+        bytes_ = torch.randint(256, (batch, *shape), generator=generator, dtype=torch.uint8)
+        self.images = bytes_.to(device, dtype)
+        arrays = [np.ascontiguousarray(image.permute(1, 2, 0).numpy()) for image in bytes_.to(dtype)]
+        self.arrays = [array[..., 0] for array in arrays] if shape[0] == 1 else arrays
+        self.dewarp = ct.Dewarp(self.camera())
+        self.new = self.warp_of(self.camera(batch))
+
+    def camera(self, batch: int | None = None, dtype: torch.dtype = torch.float32) -> ct.Camera:
+        """Return the camera of all images, or a batch of them."""
+        camera = cameras.camera(self.key, self.device, dtype, size=self.size, batch=batch)
+        return camera.requires_grad_(False)
+
+    def warp_of(self, source: ct.Camera) -> ct.Warp:
+        """Return the warp to pinhole cameras of the same K."""
+        return ct.Warp(source, ct.Pinhole(source.intrinsics, image_size=self.size).requires_grad_(False))
 
 
-def tasks(key: str, options: Options) -> list[Task]:
-    """What is measured of a model."""
+def rows(options: Options) -> Iterator[Row]:
+    """Measure every kind of image: speed, errors, memory."""
     full, byte = torch.float32, torch.uint8
+    asked = [(batch, (3, *LARGE), dtype) for batch in (1, 8) for dtype in (full, byte)]
+    asked += [(8, (3, *SMALL), byte), (8, (3, *SMALL), full), (8, (1, *SMALL), byte)]
     if options.quick:
-        asked = [(1, 3, QUICK, full, False), (8, 3, QUICK, full, False), (8, 1, QUICK, byte, False)]
-        asked += [(1, 3, QUICK, byte, True)]
+        asked = [(1, (3, *QUICK), full), (8, (3, *QUICK), full), (8, (1, *QUICK), byte)]
+    for key, kind in product(options.chosen(MODELS), asked):
+        task = Task(key, *kind, options.device)
+        for operation, runs in contestants(task).items():
+            name = f"{task.name}, {operation}"
+            yield measure("images", name, runs, options)
+            if len(task.images) == 1 or task.size != LARGE:  # the others are as wrong
+                yield Row("images, errors", name, _errors(task, operation, runs))
+            elif options.device.type == "cpu":
+                peaks = {who: peak(run) for who, run in runs.items() if who not in (CLONE, DELTACAMERA)}
+                sizes = {who: Figure(most / task.images.nbytes) for who, most in peaks.items() if most is not None}
+                yield Row("images, memory", name, sizes)
+            if options.device.type == "cpu":
+                runs.pop(KORNIA, None)  # the slowest by far
+                with threads(1):
+                    yield measure("images, 1 thread", name, runs, options)
+
+
+def _errors(task: Task, operation: str, runs: dict[str, Run]) -> dict[str, Figure]:
+    images, double = task.images[:_JUDGED], torch.float64
+    if operation == KEPT:
+        target = task.dewarp.target
+        straight = ct.Pinhole(target.intrinsics.double(), image_size=target.image_size).requires_grad_(False)
+        warp = ct.Warp(task.camera(dtype=double), straight)
     else:
-        asked = [(batch, 3, LARGE, dtype, False) for batch in (1, 8) for dtype in (full, byte)]
-        asked += [(batch, 3, LARGE, byte, True) for batch in (1, 8)]
-        asked += [(8, 1, SMALL, byte, False), (8, 3, SMALL, byte, False), (8, 3, SMALL, full, False)]
-    return [Task(key, *shape, dtype, options.device, last) for *shape, dtype, last in asked]
+        warp = task.warp_of(task.camera(len(images), double))
+    truth, inside = true_images(images, warp)
+    results = {who: as_tensor(run())[:_JUDGED] for who, run in runs.items() if who != CLONE}
+    return {who: Figure((result - truth).abs()[inside].max().item()) for who, result in results.items()}
 
 
-def requirements(records: Sequence[Record]) -> list[Requirement]:
-    """What has to hold of the times and of the memory."""
-    rows = figures(records, "fastest")
-    cached, fresh = (
-        {row: times for row, times in rows.items() if row[1].startswith(operation)} for operation in (CACHED, FRESH)
-    )
-    large = {row: times for row, times in cached.items() if " 8x" in row[0] and "x720x1280 float32" in row[0]}
-    byte = {row: times for row, times in cached.items() if "uint8" in row[0]}
-    found = [
-        Requirement("cached map, 8 float32: 1.5 times OpenCV", 1.5, times_faster(large, OURS, OPENCV_MAPS)),
-        Requirement("cached map, 8 float32: 2.5 times grid_sample", 2.5, times_faster(large, OURS, [GRID_SAMPLE])),
-        Requirement("cached map, uint8: 1.25 times OpenCV", 1.25, times_faster(byte, OURS, OPENCV_MAPS)),
-    ]
-    for key, bound in (("brown_conrady", 2.0), ("kannala_brandt", 8.0)):
-        ours = {row: times for row, times in fresh.items() if row[0].startswith(key)}
-        text = f"fresh maps, {key}, tolerance=0.01: {bound:g} times OpenCV"
-        found.append(Requirement(text, bound, times_faster(ours, LATTICE, OPENCV_MAPS)))
-    for name, peers in (("OpenCV", OPENCV_MAPS), (KORNIA, [KORNIA]), (DELTACAMERA, [DELTACAMERA])):
-        ratios = {**times_faster(cached, OURS, peers), **times_faster(fresh, OURS, peers)}
-        found.append(Requirement(f"every row: no slower than {name}", 1.0, ratios))
-    for operation, text in ((CACHED, "a map that is there"), (FRESH, "fresh maps")):
-        peaks = {
-            f"{r.case}, {r.contestant}": r.value
-            for r in only(records, "peak")
-            if r.contestant in (OURS, LATTICE) and r.operation == operation
-        }
-        text = f"memory of a warp, {text}: at most 1.1 results"
-        found.append(Requirement(text, 1.1, peaks, at_most=True))
+def true_images(images: Tensor, warp: ct.Warp) -> tuple[Tensor, Tensor]:
+    """Return (B, C, H, W) in float64, and where no neighbour lies off the image, from the cameras of `warp`."""
+    with torch.no_grad():
+        rays, has_ray = warp.target.rays()
+        pixels, mapped = warp.source.project(rays @ warp.rotation if warp.rotation is not None else rays)
+        last = pixels.new_tensor([warp.source.width - 1, warp.source.height - 1])
+        inside = ((pixels > 0) & (pixels < last)).all(-1) & has_ray & mapped
+        grid = 2 * pixels / last - 1
+        truth = F.grid_sample(images.double(), grid.expand(len(images), *grid.shape[-3:]), align_corners=True)
+    return truth, inside.expand(len(images), *inside.shape[-2:]).unsqueeze(1).expand_as(truth)
+
+
+def as_tensor(result: object) -> Tensor:
+    """Return (B, C, H, W) of what a contestant gave."""
+    if isinstance(result, Tensor):
+        return result
+    return torch.stack([torch.from_numpy(array).reshape(*array.shape[:2], -1).permute(2, 0, 1) for array in result])
+
+
+def contestants(task: Task) -> dict[str, dict[str, Run]]:
+    """Return operation -> name -> what is timed, which gives a tensor or a list of arrays."""
+    images, arrays, dewarp, given = task.images, task.arrays, task.dewarp, task.new.source
+    pairs = [(task.new.source[i], task.new.target[i]) for i in range(len(images))]
+
+    def new() -> Tensor:
+        values = [p.clone() for p in (given.intrinsics, given.distortion)]  # from which nothing was computed yet
+        return task.warp_of(type(given)(*values, image_size=task.size).requires_grad_(False))(images)
+
+    # camtorch as a user writes it; uint8 in, uint8 out
+    found: dict[str, dict[str, Run]] = {KEPT: {OURS: lambda: dewarp(images)}, NEW: {OURS: new}}
+    for name, kind in zip(OPENCV_MAPS, (cv2.CV_32FC1, cv2.CV_16SC2), strict=True):
+        kept = opencv_maps(dewarp.source, dewarp.target, np.eye(3), kind)()
+        makers = [opencv_maps(*pair, np.eye(3), kind) for pair in pairs]
+        found[KEPT][name] = partial(_remap, arrays, [lambda kept=kept: kept] * len(arrays))
+        found[NEW][name] = partial(_remap, arrays, makers)
+    if dc is not None:
+        lenses = [tuple(map(_deltacamera, pair)) for pair in [(dewarp.source, dewarp.target), *pairs]]
+        # its best case: the map, or for new cameras what it keeps of each lens, is in its cache
+        found[KEPT][DELTACAMERA] = lambda: [dc.reproject_image(a, *lenses[0], cache_maps=True) for a in arrays]
+        found[NEW][DELTACAMERA] = lambda: [dc.reproject_image(a, *ab) for a, ab in zip(arrays, lenses[1:], strict=True)]
+    if images.is_floating_point():
+        grid = dewarp.grid().expand(len(images), -1, -1, -1)
+        found[KEPT][GRID_SAMPLE] = lambda: F.grid_sample(images, grid, align_corners=False)
+        if task.key == "brown_conrady":  # which kornia knows; it computes its map every time
+            found[NEW][KORNIA] = lambda: undistort_image(images, given.K, given.distortion)
+    for runs in found.values():
+        runs[CLONE] = images.clone
     return found
 
 
-def _task(task: Task, options: Options) -> Iterator[Record]:
-    """One kind of image: speed, then errors."""
-    progress(f"{task.name}: preparing")
-    everyone = contestants(task)
-    timed = []
-    for operation in OPERATIONS:
-        runs = {who: operations[operation] for who, operations in everyone.items() if operation in operations}
-        if operation in (CACHED, FRESH):
-            timed += measure(task.name, operation, runs, options)
-            if options.threads > 1 and options.device.type == "cpu":
-                alone = {who: run for who, run in runs.items() if who != KORNIA}  # the slowest by far
-                with threads(1):
-                    timed += measure(task.name, operation + _ONE_THREAD, alone, options)
-        elif (task.batch, task.channels, task.size) in _LEARNING:
-            timed += measure(task.name, operation, runs, options)
-    order = list(everyone)
-    yield from sorted(timed, key=lambda record: order.index(record.contestant))
-    if task.batch > 1 and task.size == LARGE:
-        return  # as wrong as one image, or as smaller ones
-    truths = {CACHED: ct.Warp(task.camera(dtype=torch.float64), _double(task.dewarp.target))}
-    first = replace(task, batch=min(task.batch, _JUDGED))
-    truths[FRESH] = first.fresh(dtype=torch.float64)
-    for operation, warp in truths.items():
-        truth, inside = _truth(task.images[: first.batch], warp)
-        for who, operations in everyone.items():
-            if operation not in operations or who == CLONE:
-                continue
-            progress(f"{task.name}, {operation}: errors of {who}")
-            result = as_tensor(operations[operation]())[: len(truth)]
-            yield Record(task.name, who, operation, "error", (result - truth).abs()[inside].max().item())
+def _remap(arrays: list[np.ndarray], makers: list[Callable[[], tuple[np.ndarray, np.ndarray]]]) -> list[np.ndarray]:
+    return [cv2.remap(array, *make(), cv2.INTER_LINEAR) for array, make in zip(arrays, makers, strict=True)]
 
 
-def _double(camera: ct.Camera) -> ct.Camera:
-    """A copy of a pinhole camera in float64."""
-    return ct.Pinhole(camera.intrinsics.detach().double(), image_size=camera.image_size)
+def opencv_maps(
+    source: ct.Camera, target: ct.Camera, rotation: np.ndarray, kind: int
+) -> Callable[[], tuple[np.ndarray, np.ndarray]]:
+    """Return what makes the maps of `cv2.remap`, from numbers that are there as OpenCV takes them."""
+    lens, straight = (camera.K.cpu().double().numpy() for camera in (source, target))
+    module = cv2.fisheye if isinstance(source, ct.KannalaBrandt) else cv2
+    coefficients, size = source.distortion.cpu().double().numpy(), target.image_size[::-1]
+    return partial(module.initUndistortRectifyMap, lens, coefficients, rotation, straight, size, kind)
 
 
-def _truth(images: Tensor, warp: ct.Warp) -> tuple[Tensor, Tensor]:
-    """(B, C, H, W) in float64, and where no neighbour lies off the image.
-
-    It takes from `warp` its two cameras, and makes the positions and the sampling without it.
-    """
-    with torch.no_grad():
-        rays, has_ray = warp.target.rays()
-        pixels, mapped = warp.source.project(rays)
-        height, width = warp.source.image_size
-        last = pixels.new_tensor([width - 1, height - 1])
-        inside = ((pixels > 0) & (pixels < last)).all(-1) & has_ray & mapped
-        grid = 2 * pixels / last - 1
-        grid = grid.expand(len(images), *grid.shape[-3:])
-        truth = F.grid_sample(images.double(), grid, align_corners=True)
-    return truth, inside.expand(len(images), *inside.shape[-2:]).unsqueeze(1).expand_as(truth)
+def _deltacamera(camera: ct.Camera) -> Any:
+    coefficients = camera.distortion.cpu().numpy()
+    lens = dc.FisheyeKannalaBrandt if isinstance(camera, ct.KannalaBrandt) else dc.BrownConradyEx
+    model = lens(coefficients) if coefficients.size else None
+    return dc.Camera(intrinsic_matrix=camera.K.cpu().numpy(), distortion_model=model, image_shape=camera.image_size)

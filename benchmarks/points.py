@@ -1,108 +1,236 @@
-"""Points: every model in both directions, forward and backward, eager and compiled, beside the peers.
+"""Points: a model in both directions, forward and backward, eager and compiled.
 
-Directions are uniform up to 75 degrees. The errors of `unproject` are taken where a pixel ought to be: the ray
-that came out is projected in float64, and compared with the pixel that went in.
+OpenCV and kornia's lenses map the plane z = 1, so that they cannot tell a ray past 90 degrees from its mirror image;
+kornia's are even spared the division by z here. The errors of `unproject` are taken where a pixel ought to be: the
+ray is projected in float64, and compared with the pixel that went in.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import lru_cache
+from itertools import cycle
+from typing import Any
 
+import cv2
+import numpy as np
 import torch
+from kornia.geometry import calibration
+from kornia.geometry.camera import distortion_kannala_brandt as kannala_brandt
 from torch import Tensor
 
 import camtorch as ct
 from benchmarks import cameras
-from benchmarks.memory import growth, kept_for_backward
-from benchmarks.options import Options, progress
-from benchmarks.passes import passes, prepared
-from benchmarks.point_peers import COMPILED, COPY, FLOOR, OPENCV, OURS, PLANES, Contestant, contestants
-from benchmarks.tables import Record, only, relative, table
-from benchmarks.timing import measure
+from benchmarks.harness import KORNIA, NAMES, OPENCV, OURS, Figure, Options, Row, Run, Table, measure
+from benchmarks.memory import kept_for_backward
 
-_OFF = 1.0  # pixels: an answer further off than this is counted as wrong
+COMPILED, PLANES, COPY = "compiled", "compiled, planes", "cold copy"
+_EVERYONE = {who: (who,) for who in (OURS, COMPILED, PLANES, OPENCV, KORNIA)}
+TABLES = (
+    Table(
+        "points",
+        "1M float32 points, ms",
+        {**_EVERYONE, COPY: (COPY,)},
+        alone=(COMPILED, PLANES, COPY),
+    ),
+    Table("points, memory", "bytes a point that wait for the backward pass, input included", _EVERYONE, 1, None),
+    Table("points, errors", "largest error, px, where there is an answer", _EVERYONE, 1, None),
+    Table("points, lost", "% without an answer, or off by more than 1 px", _EVERYONE, 100, None),
+)
+_WITHIN_90 = ("pinhole", "brown_conrady")
+_OFF = 1.0  # pixels: an answer further off is wrong
 _COMPILED = ("kannala_brandt", "brown_conrady", "fisheye624")  # unless asked for models: each takes half a minute
-_MOST_JUDGED = 250_000  # points whose errors are looked at
+_MOST_JUDGED = 250_000  # points whose errors are taken
+_COLD_BYTES = 256 * 2**20  # a copy from memory that was not touched for so many bytes finds nothing in a cache
 
 
-def run(options: Options) -> tuple[list[Record], list[str]]:
-    """Measure; the records and the tables."""
-    records = [r for key in options.chosen(tuple(cameras.COEFFICIENTS)) for r in _model(key, options)]
-    seconds = only(records, "seconds")
-    compiling = only(records, "first call", lambda who: who in (COMPILED, PLANES))
-    count = f"{options.size:,} points"
-    tables = [
-        table(f"Points: milliseconds per {count} (times camtorch eager)", seconds, scale=1e3, beside=OURS),
-        table("Points: time in cold copies of 20 bytes per point", relative(seconds, COPY)),
-        table("Points: seconds to compile", compiling),
-        table("Points: bytes per point that wait for the backward pass, input included", only(records, "kept")),
-        table("Points: bytes per point at the peak, beyond the input", only(records, "peak")),
-        table("Points: largest error in pixels, where there is an answer", only(records, "error")),
-        table("Points: percent without an answer, or off by more than 1 px", only(records, "lost"), scale=100),
-    ]
-    return records, tables
+@dataclass(frozen=True)
+class Direction:
+    """One direction of one contestant.
+
+    `call` is timed; `prepare` makes what it takes of (N, 3) points or (N, 2) pixels, `answer` makes pixels or rays of
+    what it gives, NaN where that is called invalid. `learns` receives gradients besides the input; None has none.
+    """
+
+    call: Callable[[Any], Any]
+    prepare: Callable[[Tensor], Any] = lambda x: x
+    answer: Callable[[Any], Tensor] = lambda result: result
+    learns: tuple[Tensor, ...] | None = ()
+
+    def values(self, source: Any) -> Tensor:
+        """Return the part of the result that has gradients."""
+        result = self.call(source)
+        return result if isinstance(result, Tensor) else result[0]
 
 
-def _model(key: str, options: Options) -> Iterator[Record]:
-    """Everything about one model. What was compiled for another is forgotten first."""
-    torch.compiler.reset()
-    everyone = contestants(key, options.device, options.compile and (key in _COMPILED or key in options.models))
-    reference = cameras.camera(key, options.device, torch.float64)
-    points = cameras.points(options.size, cameras.TIMED_ANGLE, options.device)
-    for name, source in (("project", points), ("unproject", pixels_of(reference, points))):
-        for operation, runs in passes(everyone, name, source):
-            records = measure(key, operation, runs, options)
-            yield from records
-            # OpenCV allocates where torch does not see it, and of the floor nobody wants to know
-            seen = {r.contestant for r in records} - {OPENCV, *FLOOR}
-            for who in (who for who in runs if who in seen):
-                progress(f"{key}, {operation}: memory of {who}")
-                yield Record(key, who, operation, "peak", growth(runs[who], options.device)[0] / options.size)
-        for who, (direction, x) in prepared(everyone, name, source).items():
-            if direction.learns is not None and who in seen:
-                kept = kept_for_backward(direction.values, x, options.device)
-                yield Record(key, who, name, "kept", kept / options.size)
-    for degrees in cameras.angles(key):
-        yield from _errors(key, reference, everyone, degrees, options)
+Contestants = dict[str, Direction]
 
 
-def pixels_of(reference: ct.Camera, points: Tensor) -> Tensor:
-    """(*B, *N, 2) float32, contiguous: where the reference sees the points."""
+def rows(options: Options) -> Iterator[Row]:
+    """Measure every model."""
+    for key in options.chosen(tuple(cameras.COEFFICIENTS)):
+        torch.compiler.reset()  # what was compiled for another model
+        compiled = options.compile and (key in _COMPILED or key in options.models)
+        reference = cameras.camera(key, options.device, torch.float64)
+        points = cameras.points(options.size, cameras.TIMED_ANGLE, options.device)
+        for way, source in (("project", points), ("unproject", _pixels(reference, points))):
+            everyone = contestants(key, way, options.device, compiled=compiled)
+            yield from _way(f"{NAMES.get(key, key)} {way}", everyone, source, options)
+            for degrees in (45, 75) if key in _WITHIN_90 else (75, 100):
+                yield from _errors(f"{NAMES.get(key, key)} {way}", way, everyone, reference, degrees, options)
+
+
+def contestants(key: str, way: str, device: torch.device, *, compiled: bool) -> Contestants:
+    """Return who can do a direction of a model, the floor of the machine last."""
+    lens = cameras.camera(key, device)
+    learns = tuple(p for p in lens.parameters() if p.numel())
+    masked = lambda result: torch.where(result[1][..., None], result[0], torch.nan)
+    call = getattr(lens, way)
+    found = {OURS: Direction(call, answer=masked, learns=learns)}
+    if compiled:
+        planes = lambda points: points.T.contiguous().movedim(0, -1)
+        kinds = {COMPILED: lambda x: x} | ({PLANES: planes} if way == "project" else {})
+        for name, prepare in kinds.items():
+            found[name] = Direction(torch.compile(call, dynamic=False), prepare, masked, learns)
+    peers = {"kannala_brandt": _fisheye_peers, "brown_conrady": _perspective_peers}.get(key)
+    if peers is not None:
+        found |= {who: both[way == "unproject"] for who, both in peers(cameras.COEFFICIENTS[key], device).items()}
+    return found | {COPY: Direction(lambda run: run(), lambda x: _cold_copy(len(x), device), learns=None)}
+
+
+def _fisheye_peers(lens: tuple[float, ...], device: torch.device) -> dict[str, tuple[Direction, Direction]]:
+    flat = torch.tensor((*cameras.INTRINSICS, *lens), device=device).requires_grad_()
+    project = lambda x: kannala_brandt.distort_points_kannala_brandt(x, flat)
+    unproject = lambda x: kannala_brandt.undistort_points_kannala_brandt(x, flat)
+    kornia = Direction(project, _ahead, learns=(flat,)), Direction(unproject, answer=_on_plane, learns=(flat,))
+    return {OPENCV: _opencv(cv2.fisheye, lens), KORNIA: kornia}
+
+
+def _perspective_peers(lens: tuple[float, ...], device: torch.device) -> dict[str, tuple[Direction, Direction]]:
+    matrix = torch.tensor(cameras.matrix()[None], dtype=torch.float32, device=device)
+    learns = matrix.requires_grad_(), torch.tensor([lens], device=device).requires_grad_()
+    focal, centre = torch.tensor(cameras.INTRINSICS, dtype=torch.float64, device=device).split(2)
+    kornia = (
+        Direction(
+            lambda x: calibration.distort_points(x, *learns),
+            lambda points: (_ahead(points.double()) * focal + centre).float()[None],  # of a camera without distortion
+            lambda pixels: pixels[0],
+            learns,
+        ),
+        Direction(
+            lambda x: calibration.undistort_points(x, *learns),
+            lambda pixels: pixels[None],
+            lambda pixels: _on_plane((pixels[0].double() - centre) / focal),
+            learns,
+        ),
+    )
+    return {OPENCV: _opencv(cv2, lens), KORNIA: kornia}
+
+
+def _opencv(module: Any, lens: tuple[float, ...]) -> tuple[Direction, Direction]:
+    """In float32, as its callers' points are."""
+    still, matrix, coefficients = np.zeros(3), cameras.matrix(), np.array(lens)
+    as_array = lambda x: x.cpu().numpy()[None]
+    project = lambda p: module.projectPoints(p, still, still, matrix, coefficients)
+    unproject = lambda p: module.undistortPoints(p, matrix, coefficients)
+    return (
+        Direction(project, as_array, lambda r: torch.from_numpy(r[0].reshape(-1, 2)), None),
+        Direction(unproject, as_array, lambda r: _on_plane(torch.from_numpy(r.reshape(-1, 2))), None),
+    )
+
+
+def _ahead(points: Tensor) -> Tensor:
+    return points[:, :2] / points[:, 2:]
+
+
+def _on_plane(pixels: Tensor) -> Tensor:
+    return torch.nn.functional.pad(pixels, (0, 1), value=1.0)
+
+
+def _cold_copy(count: int, device: torch.device) -> Run:
+    """Copy five planes, the 12 bytes of a point and the 8 of a pixel, between places that go round a large buffer."""
+    places = cycle(zip(*_places(5 * count, device), strict=True))
+
+    def run() -> None:
+        source, target = next(places)
+        target.copy_(source)
+
+    return run
+
+
+@lru_cache(maxsize=1)
+def _places(width: int, device: torch.device) -> Tensor:
+    """(2, n, width), written to: memory that is only reserved reads as one page of zeros, which no cache would miss."""
+    return torch.ones(2, max(2, -(-_COLD_BYTES // (4 * width))), width, device=device)
+
+
+def _pixels(reference: ct.Camera, points: Tensor) -> Tensor:
     with torch.no_grad():
         return reference.project(points.double())[0].float().contiguous()
 
 
+def _way(name: str, everyone: Contestants, source: Tensor, options: Options) -> Iterator[Row]:
+    """Forward, and forward with backward; a cold copy is the floor of either."""
+    inputs = {who: direction.prepare(source) for who, direction in everyone.items()}
+    forward = {who: _inference(direction, inputs[who]) for who, direction in everyone.items()}
+    both = {who: _learning(d, inputs[who]) for who, d in everyone.items() if d.learns is not None}
+    both[COPY] = forward[COPY]
+    for text, runs in ((name, forward), (f"{name} and backward", both)):
+        found, million = measure("points", text, runs, options).figures, 1e6 / len(source)
+        scaled = {who: f._replace(median=f.median * million) for who, f in found.items()}
+        yield Row("points", text, scaled)
+    kept = {
+        who: kept_for_backward(everyone[who].values, inputs[who]) / len(source)
+        for who in both
+        if who in found and who != COPY
+    }
+    yield Row("points, memory", name, {who: Figure(value) for who, value in kept.items()})
+
+
+def _inference(direction: Direction, source: Any) -> Run:
+    def run():
+        with torch.no_grad():
+            return direction.call(source)
+
+    return run
+
+
+def _learning(direction: Direction, source: Tensor) -> Run:
+    """Forward and backward, to the input and all parameters; the gradient has the result's layout, as a loss's has."""
+    gradient = None
+
+    def run():
+        nonlocal gradient
+        leaf = source.detach().requires_grad_()
+        values = direction.values(leaf)
+        gradient = torch.ones_like(values) if gradient is None else gradient
+        return torch.autograd.grad(values, (leaf, *direction.learns), gradient)
+
+    return run
+
+
 def _errors(
-    key: str, reference: ct.Camera, everyone: list[Contestant], degrees: int, options: Options
-) -> Iterator[Record]:
-    """The errors over all directions up to an angle, of those that the model maps."""
+    name: str, way: str, everyone: Contestants, reference: ct.Camera, degrees: int, options: Options
+) -> Iterator[Row]:
+    """The errors over all directions up to an angle that the model maps."""
     points = cameras.points(min(options.size, _MOST_JUDGED), degrees, options.device)
     with torch.no_grad():
         truth, mapped = reference.project(points.double())
-    asked = truth.float().contiguous()
-
-    def of_pixels(pixels: Tensor) -> Tensor:
-        return (pixels.double() - truth).norm(dim=-1)
-
-    def of_rays(rays: Tensor) -> Tensor:
-        pixels, valid = reference.project(rays.double())
-        return torch.where(valid, (pixels - asked.double()).norm(dim=-1), torch.nan)
-
-    judged: dict[str, tuple[Tensor, Callable[[Tensor], Tensor]]] = {
-        "project": (points, of_pixels),
-        "unproject": (asked, of_rays),
-    }
-    for name, (source, error_of) in judged.items():
-        for who, (direction, x) in prepared(everyone, name, source).items():
-            if who in FLOOR:
-                continue
-            progress(f"{key}, {name} up to {degrees} degrees: errors of {who}")
-            try:
-                with torch.no_grad():
-                    error = error_of(direction.answer(direction.call(x)).to(options.device))[mapped]
-            except Exception:  # it has failed, and been named, when it was timed
-                continue
-            answered = error[torch.isfinite(error)]
-            operation = f"{name}, {degrees}°"
-            yield Record(key, who, operation, "error", answered.max().item() if answered.numel() else float("nan"))
-            yield Record(key, who, operation, "lost", 1 - (error <= _OFF).double().mean().item())
+    source = points if way == "project" else truth.float().contiguous()
+    errors, lost = {}, {}
+    for who, direction in everyone.items():
+        if who == COPY:
+            continue
+        try:
+            with torch.no_grad():
+                found = direction.answer(direction.call(direction.prepare(source))).to(options.device).double()
+        except Exception:  # it was named when it was timed
+            continue
+        if way == "unproject":
+            found, valid = reference.project(found)
+            found = torch.where(valid[..., None], found, torch.nan)
+        error = (found - (truth if way == "project" else source.double())).norm(dim=-1)[mapped]
+        answered = error[torch.isfinite(error)]
+        errors[who] = Figure(answered.max().item() if answered.numel() else float("nan"))
+        lost[who] = Figure(1 - (error <= _OFF).double().mean().item())
+    yield Row("points, errors", f"{name} up to {degrees}°", errors)
+    yield Row("points, lost", f"{name} up to {degrees}°", lost)

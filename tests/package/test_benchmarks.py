@@ -1,90 +1,48 @@
-"""The benchmarks measure everyone in turns, judge what is required, and leave no busy process behind."""
+"""The benchmarks measure everyone in turns, and the page shows the figures of one run."""
 
 import json
 import math
-import os
-import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
 
 from benchmarks import page
-from benchmarks.verdict import Requirement, verdict
+from benchmarks.harness import Figure, Table, figure
 
 ROOT = Path(__file__).resolve().parents[2]
-linux = pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks at processes in Linux's /proc")
 
 
 @pytest.mark.slow
-def test_a_quick_run_measures_everyone_and_writes_every_figure(tmp_path):
+@pytest.mark.parametrize("subjects", [["points", "images", "stereo"], ["augment", "samples", "calibration"]])
+def test_a_quick_run_measures_everyone_and_writes_every_figure(tmp_path, subjects):
     path = tmp_path / "figures.json"
-    command = [sys.executable, "-m", "benchmarks", "images", "--quick", "--threads", "1", "--repeats", "1"]
+    command = [sys.executable, "-m", "benchmarks", *subjects, "--quick", "--threads", "1", "--repeats", "1"]
     command += ["--seconds", "0", "--model", "kannala_brandt", "--json", str(path)]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=900)
     assert done.returncode == 0, done.stderr[-2000:]
     assert "failed" not in done.stderr
-    assert "### What is required" in done.stdout
-    found = json.loads(path.read_text())["results"]["images"]
-    times = [figure["value"] for figure in found if figure["quantity"] == "seconds"]
-    assert times
-    assert all(math.isfinite(value) and value > 0 for value in times)
-    assert {"camtorch", "OpenCV, float map"} <= {figure["contestant"] for figure in found}
+    results = json.loads(path.read_text())["results"]
+    for subject in subjects:
+        assert f"### {subject}\n" in done.stdout
+        for row, figures in results[subject].items():
+            assert "camtorch" in figures, row
+            assert all(math.isfinite(median) and median > 0 for median, _ in figures.values()), row
 
 
-def test_the_verdict_names_the_worst_row():
-    least = Requirement("at least 2", 2.0, {"a": 3.0, "b": 1.5, "c": 2.0})
-    most = Requirement("at most 2", 2.0, {"a": 3.0, "b": 2.5, "c": 2.0}, at_most=True)
-    unknown = Requirement("at most 1", 1.0, {"a": 0.5, "b": math.nan}, at_most=True)
-    assert (least.worst, most.worst, unknown.worst[0]) == (("b", 1.5), ("a", 3.0), "b")
-    lines = verdict([least, most, unknown, Requirement("of nothing", 1.0, {})]).splitlines()
-    judgements = [line.split("|")[-2].strip() for line in lines if line.startswith("| at")]
-    assert judgements == ["NOT in 1", "NOT in 2", "NOT in 1"]
-    assert "of nothing" not in "\n".join(lines)
-    assert verdict([Requirement("holds", 2.0, {"a": 2.0})]).splitlines()[-1].endswith("ok |")
-
-
-@linux
-@pytest.mark.parametrize("ending", [signal.SIGKILL, signal.SIGTERM])
-def test_busy_processes_end_with_whoever_started_them(ending):
-    code = """
-import signal, time
-from benchmarks import page
-from benchmarks.busy import Busy
-signal.signal(signal.SIGINT, signal.default_int_handler)  # what runs in the background ignores it
-with Busy(2) as busy:
-    busy.spin(1)
-    print(*busy.ids, flush=True)
-    time.sleep(60)
-"""
-    command = [sys.executable, "-c", code]
-    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL) as it:
-        ids = [int(pid) for pid in it.stdout.readline().split()]
-        assert len(ids) == 2
-        assert all(map(_runs, ids))
-        os.kill(it.pid, ending)
-        it.wait(30)
-    end = time.monotonic() + 10
-    while any(map(_runs, ids)) and time.monotonic() < end:
-        time.sleep(0.05)
-    assert not any(map(_runs, ids))
-
-
-def _runs(pid: int) -> bool:
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] not in "ZX"
-    except (FileNotFoundError, ProcessLookupError):
-        return False
+def test_a_table_shows_the_best_of_a_column_beside_ours_and_the_spread():
+    table = Table("points", "ms", {"camtorch": ("camtorch",), "OpenCV": ("float", "fixed"), "kornia": ("kornia",)})
+    rows = {"project": {"camtorch": figure([2e-3, 2e-3]), "float": Figure(6e-3), "fixed": Figure(5e-3, 0.1)}}
+    assert table.markdown(rows).splitlines()[2] == "| project | 2.0 | 5.0 (2.5x) | - |"
+    assert table.markdown(rows, spread=True).splitlines()[2] == "| project | 2.0 ±0% | 5.0 ±10% (2.5x) | - |"
 
 
 def test_the_page_shows_the_figures_of_one_run():
     run = json.loads(page.FIGURES.read_text())
     assert page.filled(page.PAGE.read_text(), run) == page.PAGE.read_text()
-    changed = json.loads(page.FIGURES.read_text())
-    for record in changed["results"]["points"]:
-        record["value"] *= 3
-    assert page.filled(page.PAGE.read_text(), changed) != page.PAGE.read_text()
-    with pytest.raises(ValueError, match="0 places <!-- machine -->"):
+    for figures in run["results"]["points"].values():
+        figures["camtorch"][0] *= 3
+    assert page.filled(page.PAGE.read_text(), run) != page.PAGE.read_text()
+    with pytest.raises(ValueError, match="the page's places must be those of the run"):
         page.filled("", run)
