@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from itertools import accumulate
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, NoReturn, cast
+from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn, cast
 
 import torch
 from torch import Tensor, nn
@@ -66,35 +66,24 @@ class Mixed(Camera):
     """
 
     is_mixed = True
-    one_size: ClassVar[bool] = True
-    """Whether the images of all must be of one size."""
-    one_dtype: ClassVar[bool] = True
-    """Whether the numbers of all become those of the widest dtype."""
     cameras: nn.ModuleList
     """What it was made of: single cameras and batches."""
 
     def __init__(self, cameras: Iterable[Camera], *, order: Sequence[int] | None = None):
         members = _members(cameras)
-        if self.one_size:
-            _check_sizes(members, type(self).__name__)
+        _check_sizes(members, "Mixed")
         given = [(i, row) for i, camera in enumerate(members) for row in range(_count(camera))]
         super(Camera, self).__init__()  # it has no numbers of its own
         self.cameras = nn.ModuleList(members)
-        sizes = {camera.image_size for camera in members}
-        self.image_size: tuple[int, int] | None = members[0].image_size if len(sizes) == 1 else None
+        self.image_size: tuple[int, int] | None = members[0].image_size
         self._places = tuple(given if order is None else [given[i] for i in _as_order(order, len(given))])
         self._rays, self._fields = Memo(), Memo()
         kinds: dict[tuple[object, ...], list[int]] = {}
         for row, (i, _) in enumerate(self._places):
-            kinds.setdefault(self._kind(members[i]), []).append(row)
+            kinds.setdefault(kind(members[i]), []).append(row)
         self._groups = tuple(self._group(members, rows) for rows in kinds.values())
         places_in_groups = {row: n for n, row in enumerate(row for group in self._groups for row in group.rows)}
         self._order = tuple(places_in_groups[row] for row in range(len(self._places)))
-
-    @staticmethod
-    def _kind(camera: Camera) -> tuple[object, ...]:
-        """What the cameras of a group have in common."""
-        return kind(camera)
 
     def _group(self, members: Sequence[Camera], rows: Sequence[int]) -> _Group:
         places = [self._places[row] for row in rows]
@@ -149,7 +138,7 @@ class Mixed(Camera):
         for group in self._groups:
             pairs = [members[i]._tensors for i in group.members]
             tensors += [_joined(numbers, group) for numbers in zip(*pairs, strict=True)]
-        if not self.one_dtype or all(t.dtype == tensors[0].dtype for t in tensors):
+        if all(t.dtype == tensors[0].dtype for t in tensors):
             return tuple(tensors)
         wide = working_dtype(tensors[0], *tensors)
         return tuple(t.to(wide) for t in tensors)
@@ -333,19 +322,6 @@ class Mixed(Camera):
         )
         named = ", ".join(f"{count} {name}" for name, count in counts.items())
         return f"Mixed({named}, image_size={self.image_size})"
-
-
-class Listed(Mixed):
-    """The cameras of a list, inside of augmentations, which give a list again.
-
-    Their images may be of several sizes, and each keeps its dtype and whether it learns.
-    """
-
-    one_size = one_dtype = False
-
-    @staticmethod
-    def _kind(camera: Camera) -> tuple[object, ...]:
-        return *kind(camera), *((t.dtype, t.requires_grad) for t in camera._tensors)
 
 
 def cat(cameras: Iterable[Camera], *_more: object) -> Camera:

@@ -361,10 +361,10 @@ class Augmentation(SampleTransform):
         groups: list[tuple[list[int] | None, Camera]] = [(None, camera)]
         if isinstance(camera, Mixed):
             groups = list(camera.groups)
-        if 0 < self.p < 1 and self.image_size is not None and _sizes(groups) != {self.image_size}:
+        if 0 < self.p < 1 and self.image_size not in (None, camera.image_size):
             raise ValueError(
                 f"{self._name}: with p < 1 the image_size must be that of the images, so that all come out alike; "
-                f"got image_size={self.image_size} for images of {', '.join(map(str, _sizes(groups)))}"
+                f"got image_size={self.image_size} for images of {camera.image_size}"
             )
 
         def part(rows: list[int] | None, source: Camera) -> Part:
@@ -384,12 +384,12 @@ class Augmentation(SampleTransform):
                     own = [rows[n] for n in here]
                     parts.append(part(own, source) if moves else Part(own, None, source))
         sizes = {part.target.image_size for part in parts}
-        if len(sizes) > 1 and len(_sizes(groups)) == 1:
+        if len(sizes) > 1:
             found = sorted(map(str, sizes))
             raise ValueError(
                 f"{self._name}: samples of one batch would come out in the sizes {found}; with p < 1 the size must stay"
             )
-        return Change(count, parts, batch_type=type(camera) if isinstance(camera, Mixed) else None)
+        return Change(count, parts, mixed=isinstance(camera, Mixed))
 
     def _checked_draw(self, draw: Mapping[str, Tensor]) -> Mapping[str, Any]:
         """As arrays, where nothing records what becomes of it."""
@@ -581,11 +581,6 @@ class Augmentation(SampleTransform):
         parts = [f"{name}={interval}" for name, interval in self.ranges.items()]
         options = {"p": self.p, "same_on_batch": self.same_on_batch, **self.options, "min_filled": self.min_filled}
         return ", ".join(parts + [f"{name}={value!r}" for name, value in options.items()])
-
-
-def _sizes(groups: Sequence[tuple[list[int] | None, Camera]]) -> set[tuple[int, int] | None]:
-    """Of the images of groups of cameras."""
-    return {camera.image_size for _, camera in groups}
 
 
 def _are_alike(value: Any) -> bool:

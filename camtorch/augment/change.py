@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from typing import Any, TypeVar
@@ -19,7 +19,7 @@ from camtorch._evaluation import rows_of
 from camtorch._module import remade
 from camtorch._numbers import joined
 from camtorch.camera import Camera
-from camtorch.mixed import Listed, Mixed
+from camtorch.mixed import Mixed
 from camtorch.projection.compiled import Native
 from camtorch.projection.rows import single_native
 from camtorch.rotations import turn
@@ -219,13 +219,13 @@ class Change:
     Args:
         count: how many samples.
         parts: every sample is in one of them.
-        batch_type: `Mixed` or `Listed` if the cameras came so; None: as one camera, or a batch of one model.
+        mixed: whether the cameras came as a `Mixed`, and come out so, be they of one model.
         gate: (count,) bool, where values may not be looked at: which rows of the only part move.
     """
 
     count: int
     parts: list[Part]
-    batch_type: type[Mixed] | None
+    mixed: bool
     gate: Tensor | None
 
     def __init__(
@@ -233,10 +233,10 @@ class Change:
         count: int,
         parts: Sequence[Part],
         *,
-        batch_type: type[Mixed] | None = None,
+        mixed: bool = False,
         gate: Tensor | None = None,
     ):
-        self.count, self.parts, self.batch_type, self.gate = count, list(parts), batch_type, gate
+        self.count, self.parts, self.mixed, self.gate = count, list(parts), mixed, gate
         rows = [row for part in self.parts for row in part.rows or ()]
         self._inverse: Change | None = None
         self._order: list[int] | None = sorted(range(len(rows)), key=rows.__getitem__) if rows else None
@@ -284,12 +284,10 @@ class Change:
         rows = [part.rows for part in self.parts if part.rows is not None]
         if not rows:
             return batches[0]
-        sizes = {camera.image_size for camera in cameras}
-        together = (self.batch_type or (Mixed if len(sizes) == 1 else Listed)).of_groups(
-            list(zip(rows, batches, strict=True))
-        )
+        check_sizes(camera._size_for("Change") for camera in cameras)
+        together = Mixed.of_groups(list(zip(rows, batches, strict=True)))
         groups = together.groups
-        return groups[0][1] if self.batch_type is None and len(groups) == 1 else together
+        return together if self.mixed or len(groups) > 1 else groups[0][1]
 
     @property
     def _counts(self) -> list[int]:
@@ -329,10 +327,9 @@ class Change:
         """
         if self.gate is not None or second.gate is not None:
             raise ValueError("Compose: what is compiled needs p=1 of all but edits, as it may not look at draws")
-        kinds = [kind for kind in (self.batch_type, second.batch_type) if kind is not None]
-        batch_type = Listed if Listed in kinds else Mixed if kinds else None
+        mixed = self.mixed or second.mixed
         if all(part.rows is None for part in (*self.parts, *second.parts)):
-            return Change(self.count, [_joined(self.parts[0], second.parts[0])], batch_type=batch_type)
+            return Change(self.count, [_joined(self.parts[0], second.parts[0])], mixed=mixed)
         parts = []
         everyone = list(range(self.count))
         for a in self.parts:
@@ -345,7 +342,7 @@ class Change:
                     one = a if len(rows) == len(own) else a.take(of_a)
                     other = b if rows == its else b.take([place[row] for row in rows])
                     parts.append(replace(_joined(one, other), rows=rows))
-        return Change(self.count, parts, batch_type=batch_type)
+        return Change(self.count, parts, mixed=mixed)
 
     def with_options(self, options: Options) -> Change:
         """The change with its warps made anew by other options."""
@@ -355,7 +352,7 @@ class Change:
             else part.by(lambda warp: _optioned(warp, options))
             for part in self.parts
         ]
-        return Change(self.count, parts, batch_type=self.batch_type, gate=self.gate)
+        return Change(self.count, parts, mixed=self.mixed, gate=self.gate)
 
     def row(self, i: int) -> Change:
         """The change of one sample."""
@@ -372,7 +369,7 @@ class Change:
             part if part.moves is None else Part(part.rows, part.warp.inverse(), part.warp.target)
             for part in self.parts
         ]
-        self._inverse = Change(self.count, parts, batch_type=self.batch_type, gate=self.gate)
+        self._inverse = Change(self.count, parts, mixed=self.mixed, gate=self.gate)
         return self._inverse
 
     def each(
@@ -544,12 +541,12 @@ def by_kinds(
     camera = alone(camera)
     if not isinstance(camera, Mixed):
         return Change(count, [part(None, camera)], gate=gate)
-    return Change(count, [part(rows, source) for rows, source in camera.groups], batch_type=type(camera), gate=gate)
+    return Change(count, [part(rows, source) for rows, source in camera.groups], mixed=True, gate=gate)
 
 
 def as_one(camera: Camera | Sequence[Camera]) -> Camera:
     """One camera or a batch as it is, and a list of single ones as a batch."""
-    return camera if isinstance(camera, Camera) else Listed(camera)
+    return camera if isinstance(camera, Camera) else Mixed(camera)
 
 
 def alone(camera: Camera) -> Camera:
@@ -575,13 +572,19 @@ def _no_turn(dtype: torch.dtype) -> Tensor:
 
 
 def _rows_together(pieces: Sequence[Tensor]) -> Tensor:
-    sizes = {tuple(piece.shape[-2:]) for piece in pieces}
-    if pieces[0].ndim > 2 and len(sizes) > 1:  # of images: the rest keeps its shape
-        raise ValueError(
-            f"samples of one batch would come out in the sizes {sorted(sizes)}; as lists of images they may, "
-            "and same_on_batch=True moves all alike"
-        )
+    if pieces[0].ndim > 2:  # of images: the rest keeps its shape
+        check_sizes((piece.shape[-2], piece.shape[-1]) for piece in pieces)
     return torch.cat(tuple(pieces))
+
+
+def check_sizes(sizes: Iterable[tuple[int, int]], owner: str = "Change") -> None:
+    """Raise a ValueError unless the images of a batch come out in one size."""
+    found = set(sizes)
+    if len(found) > 1:
+        raise ValueError(
+            f"{owner}: samples of one batch would come out in the sizes {sorted(found)}; same_on_batch=True moves all "
+            "alike, and single samples may be of any size"
+        )
 
 
 def _gated(gate: Tensor, moved: Tensor, kept: Tensor) -> Tensor:

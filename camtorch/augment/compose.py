@@ -11,11 +11,10 @@ from torch import Tensor, nn
 
 from camtorch._arguments import as_mapping
 from camtorch.augment.augmentation import Augmentation, Range, draw
-from camtorch.augment.change import Change
+from camtorch.augment.change import Change, check_sizes
 from camtorch.augment.edits import Edit, change_by
 from camtorch.augment.landmarks import Mirroring
 from camtorch.camera import Camera
-from camtorch.mixed import Listed
 
 _OF_IMAGES = ("mode", "padding_mode", "fill", "tolerance")
 
@@ -174,11 +173,7 @@ class Compose(Augmentation):
             (first, *others) = step.parts  # one camera for all where it is one
             camera = step.target if others or first.rows is not None else first.target
         assert total is not None
-        sizes = {part.image_size for part in total.parts}
-        if len(sizes) > 1 and total.batch_type is not Listed:
-            raise ValueError(
-                f"{self._name}: samples of one batch would come out in the sizes {sorted(map(str, sizes))}"
-            )
+        check_sizes((part.image_size for part in total.parts), self._name)
         return total.with_options(options)  # type: ignore[arg-type]
 
     def _steps(self, draw: Mapping[str, Any]) -> list[tuple[Augmentation, dict[str, Any]]]:

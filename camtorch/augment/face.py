@@ -14,7 +14,6 @@ from camtorch._module import remade, typed_as
 from camtorch.augment.change import Change, Part, alone
 from camtorch.augment.sample import Sample, SampleOptions, SampleTransform, on_samples
 from camtorch.camera import Camera
-from camtorch.mixed import Listed
 from camtorch.models import Pinhole
 from camtorch.rotations import check_rotation, rotation_matrix
 from camtorch.warp.warp import Warp
@@ -136,7 +135,7 @@ class FaceNormalizer(SampleTransform):
         """
         sample = self._given(sample, fields)
         named, batched, _, camera = self._batch(sample)
-        if isinstance(camera, Listed):
+        if not isinstance(sample.get("camera", camera), Camera):
             raise TypeError(f"{self._name}: camera must be a Camera; got {no_camera(sample['camera'])}")
         kinds = {name: value for name, (_, value) in named.items()}
         listed = [name for name in ("head_pose", "rvec", "tvec", "face_center") if isinstance(kinds.get(name), list)]

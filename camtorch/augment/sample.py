@@ -35,7 +35,6 @@ from camtorch._tracing import may_look
 from camtorch.augment.change import Change, Part, View, alone, as_one
 from camtorch.augment.landmarks import Mirroring, exchanged
 from camtorch.camera import Camera
-from camtorch.mixed import Listed
 from camtorch.models import Pinhole
 from camtorch.rotations import are_rotations, check_rotation, rotation_matrix, rotation_vector
 from camtorch.warp.at_once import at_once, batch_at_once
@@ -449,10 +448,10 @@ class SampleTransform(nn.Module):
                     f"{self._name}: {name} is {tuple(first.shape)}, which seems to have its channels last; they come "
                     f"first, (B, C, H, W), and camtorch.augment.numpy takes arrays as they are. A camera tells: {how}"
                 )
-            if found in IMAGES and isinstance(value, list):
-                return Listed([Unknown.of((one.shape[-2], one.shape[-1])) for one in value])
             if found in IMAGES:
-                return Unknown.of((value.shape[-2], value.shape[-1]))
+                items = value if isinstance(value, list) else [value]
+                self._check_one_size(name, {(one.shape[-2], one.shape[-1]) for one in items})
+                return Unknown.of((items[0].shape[-2], items[0].shape[-1]))
         raise ValueError(
             f"{self._name}: the sample holds neither an image nor a camera, and how large the image is decides where "
             f"labels go; {how}"
@@ -561,7 +560,7 @@ class SampleTransform(nn.Module):
         return named, batched, count, camera
 
     def _check_cameras(self, camera: object, count: int, named: Named, batched: bool) -> None:
-        several = isinstance(camera, (list, tuple, Listed))
+        several = isinstance(camera, (list, tuple))
         cameras: list[Any] = list(camera) if several else [camera]  # type: ignore[call-overload]
         if not cameras:
             raise ValueError(f"{self._name}: an empty list of cameras; no samples have one camera, too")
@@ -581,6 +580,14 @@ class SampleTransform(nn.Module):
                     shapes = [v.shape for v in value] if isinstance(value, list) else [value.shape[not batched :]]
                     for shape in shapes[i : i + 1] if several and isinstance(value, list) else shapes:
                         self._check_size(field, tuple(shape), name, one.image_size)
+        self._check_one_size("camera", {one.image_size for one in cameras})
+
+    def _check_one_size(self, name: str, sizes: set[tuple[int, int]]) -> None:
+        if len(sizes) > 1:
+            raise ValueError(
+                f"{self._name}: the images of a batch are of one size; got {name} of {sorted(sizes)} (height, width). "
+                "Give the samples one by one, as a DataLoader's workers do, or resize them before"
+            )
 
     def _check_size(self, field: str, shape: tuple[int, ...], name: str, size: tuple[int, int]) -> None:
         if shape[-2:] == size:
@@ -639,7 +646,7 @@ class SampleTransform(nn.Module):
         if not isinstance(change.parts[0].camera, Unknown):
             # the change keeps cameras of its own, to go back by
             target = change.target.clone() if batched else change.single
-            moved["camera"] = list(target) if isinstance(target, Listed) else target
+            moved["camera"] = list(target) if isinstance(sample.get("camera"), (list, tuple)) else target
         return moved
 
     def _mirror(self, moved: Sample, named: Named, mirrored: Tensor | None, batched: bool) -> None:

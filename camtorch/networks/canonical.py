@@ -15,7 +15,7 @@ from camtorch._module import typed_as
 from camtorch.augment.change import Change, Part, alone, as_one, by_kinds
 from camtorch.augment.sample import Named, Sample, SampleTransform, on_samples
 from camtorch.camera import Camera
-from camtorch.mixed import Listed, Mixed
+from camtorch.mixed import Mixed
 from camtorch.projection.rays import slopes_at_axis
 from camtorch.warp.affine import AffineWarp
 
@@ -109,7 +109,7 @@ class CanonicalCamera(SampleTransform):
         else:
             moved = self._resized(sample, named, batched, self._change(camera, count))
             own = camera.clone()
-            moved["source_camera"] = list(own) if isinstance(own, Listed) else own
+            moved["source_camera"] = list(own) if isinstance(sample.get("camera"), (list, tuple)) else own
         moved["scale"] = scale if batched else scale.squeeze(0)
         return moved
 
@@ -175,19 +175,19 @@ class CanonicalCamera(SampleTransform):
 
     def _change(self, camera: Camera, count: int) -> Change:
         """From the cameras to those with the focal length."""
+        height, width = camera.height, camera.width
+        if (size := self.image_size) is None:
+            scales = self.scale(camera).double().flatten().tolist()
+            sizes = {(max(round(height * s), 1), max(round(width * s), 1)) for s in scales}
+            if len(sizes) > 1:
+                raise ValueError(
+                    f"{self._name}: images of several focal lengths would come out in the sizes {sorted(sizes)}; "
+                    "image_size=(height, width) cuts or fills them to one"
+                )
+            size = sizes.pop() if sizes else (height, width)
 
         def part(rows: list[int] | None, source: Camera) -> Part:
             scale = self.scale(source).double()
-            height, width = source.height, source.width
-            size = self.image_size
-            if size is None:
-                sizes = {(max(round(height * s), 1), max(round(width * s), 1)) for s in scale.flatten().tolist()}
-                if len(sizes) > 1:
-                    raise ValueError(
-                        f"{self._name}: images of several focal lengths would come out in the sizes {sorted(sizes)}; "
-                        "image_size=(height, width) cuts or fills them to one"
-                    )
-                size = sizes.pop()
             zero = torch.zeros_like(scale)
             # the middle, from outer edge to outer edge, stays in the middle
             left, top = (

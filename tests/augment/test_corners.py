@@ -7,7 +7,7 @@ import pytest
 import torch
 
 import camtorch as ct
-from camtorch.augment import PRESETS, FaceNormalizer, RandomCamera, RandomLens, RandomMount
+from camtorch.augment import PRESETS, FaceNormalizer, HorizontalFlip, RandomCamera, RandomLens, RandomMount
 
 # wide lenses for narrow images, on purpose
 pytestmark = pytest.mark.filterwarnings("ignore:.*will show nothing")
@@ -103,13 +103,15 @@ def test_a_camera_in_a_batch_of_one_serves_all(camera):
     torch.testing.assert_close(ours["keypoints"], alone["keypoints"])
 
 
-def test_cameras_of_several_sizes(camera):
-    cameras = [camera, camera.resize(50, 70)]
+def test_a_batch_is_of_one_size(camera):
+    cameras, two = [camera, camera.resize(50, 70)], "the images of a batch are of one size; got {} of .*one by one"
     images = [torch.rand(3, 60, 80), torch.rand(3, 50, 70)]
-    out = RandomMount(image_size=(30, 40))(image=images, camera=cameras, keypoints=torch.rand(2, 3, 2) * 40)
-    assert [tuple(image.shape) for image in out["image"]] == [(3, 30, 40)] * 2
-    out = RandomMount()(image=images, camera=cameras)
-    assert [tuple(image.shape) for image in out["image"]] == [(3, 60, 80), (3, 50, 70)]
+    with pytest.raises(ValueError, match=two.format("camera")):
+        RandomMount(image_size=(30, 40))(image=images, camera=cameras, keypoints=torch.rand(2, 3, 2) * 40)
+    with pytest.raises(ValueError, match=two.format("image")):
+        HorizontalFlip()(image=images)
+    alike = [image[:, :50, :70] for image in images]
+    assert [tuple(image.shape) for image in HorizontalFlip(p=1.0)(image=alike)["image"]] == [(3, 50, 70)] * 2
     with pytest.raises(ValueError, match="an empty list of cameras"):
         RandomMount()(keypoints=torch.zeros(0, 3, 2), camera=[])
 

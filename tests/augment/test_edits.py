@@ -503,7 +503,7 @@ def test_samples_without_a_camera():
     assert out["gaze"].tolist() == [-1.0, 1.0, 1.0]
     back = edits.inverse(image=out["image"], keypoints=out["keypoints"])
     torch.testing.assert_close(back["keypoints"], torch.tensor([[0.0, 0.0], [63.0, 47.0]]), atol=1e-5, rtol=0)
-    images = [torch.rand(1, 20, 30), torch.rand(1, 40, 30)]
+    images = torch.rand(2, 1, 20, 30)
     listed = A.HorizontalFlip(p=1.0)(image=images, keypoints=[torch.zeros(1, 2), torch.zeros(2, 2)])
     assert [k[0, 0].item() for k in listed["keypoints"]] == [29.0, 29.0]
     assert torch.equal(listed["image"][1], images[1].flip(-1))
