@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import importlib
 import json
 import operator
@@ -9,7 +10,7 @@ import os
 import re
 import struct
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -31,6 +32,9 @@ from camtorch.models import BrownConrady, Pinhole
 from camtorch.rotations import rotation_matrix
 
 Json = dict[str, Any]
+Opened = tuple[Sequence[Any], TableLike | None]
+"""An entry for each sample, and the table of a mirror."""
+
 _SUFFIXES = (".jpg", ".png", ".jpeg", ".bmp", ".JPG", ".PNG")
 _UP = 3  # folders above the labels in which images are looked for
 _UNLIKE = TypeError, KeyError, AttributeError, IndexError  # what reading JSON of another kind raises
@@ -43,206 +47,125 @@ class Samples(Dataset[Sample]):
     `DataLoader`, `Subset` and `ConcatDataset` take it. No file stays open.
     """
 
-    format: str
     path: Path
+    format: str
     images: Path | None
     """The folder of the images; None: it is looked for, see `ct.data.read`."""
-    landmarks: TableLike | None = None
+    landmarks: TableLike | None
     """Of the keypoints, which change places in a mirror: for `landmarks=` of the augmentations. None: not known."""
 
-    def __init__(self, path: Path, images: Path | None = None):
-        self.path, self.images = path, images
-        self._entries = self._open()
+    def __init__(self, path: Path, format: str, images: Path | None):
+        self.path, self.format, self.images = path, format, images
+        opened, self._sample = _FORMATS[format]
+        self._entries, self.landmarks = opened(path)
 
     def __len__(self) -> int:
         return len(self._entries)
 
     def __getitem__(self, index: int) -> Sample:
-        number = operator.index(index)
-        if not -len(self) <= number < len(self):
-            raise IndexError(f"{self.path}: sample {number} of {len(self)}")
-        sample = self._sample(number % len(self))
-        if (path := sample.get("path")) is not None:
-            sample = {"image": _image_at(path), **sample, "path": str(path)}
-        return sample
+        sample = self._sample(self, self._entries[operator.index(index)])
+        return (
+            sample | {"image": _image_at(sample["path"]), "path": str(sample["path"])} if "path" in sample else sample
+        )
 
     def __iter__(self) -> Iterator[Sample]:
-        return (self[i] for i in range(len(self)))
+        return map(self.__getitem__, range(len(self)))
 
     def __repr__(self) -> str:
         return f"<{len(self)} samples of {self.format} in {str(self.path)!r}>"
 
-    def _open(self) -> Sequence[Any]:
-        """Return an entry for each sample."""
-        raise NotImplementedError
 
-    def _sample(self, number: int) -> Sample:
-        """Return the labels of a sample, and the `path` of its image."""
-        raise NotImplementedError
-
-    def _beside(self, labels: Path) -> Path:
-        """Return the image of the name of a file of labels."""
-        named = [(self.images or labels.parent) / (labels.stem + suffix) for suffix in _SUFFIXES]
-        if found := next(filter(Path.is_file, named), None):
-            return found
-        raise ValueError(
-            f"{labels}: no image beside it; it would be {named[0]}, or end with {', '.join(_SUFFIXES[1:4])}"
-        )
-
-    def _named(self, name: Any, folders: Sequence[str], place: object) -> Path:
-        """Return the file that labels name, in the folder of images, or these beside the labels or `_UP` above."""
-        parts = PurePosixPath(name if isinstance(name, str) and "\0" not in name else "")
-        if parts.is_absolute() or ".." in parts.parts or not parts.name:
-            raise ValueError(f"{place}: the name of a file within the folder of images was expected; got {name!r:.60}")
-        above = [self.path.parent, *self.path.resolve().parent.parents][: _UP + 1]
-        for file in (root / folder / parts for root in ([self.images] if self.images else above) for folder in folders):
-            if os.path.isfile(file):  # False, too, for names that no file can have
-                return file
-        where = f"in {self.images}" if self.images else f"beside the labels or up to {_UP} folders above, nor in "
-        hint = "" if self.images else f"{', '.join(filter(None, folders))} there; read(..., images=FOLDER) says where"
-        raise ValueError(f"{place}: no file {name!r:.200} {where}{hint}")
+def _coco(path: Path) -> Opened:
+    content = _json(path)
+    with _failing_at(path, "not as COCO has it: ", *_UNLIKE):
+        images = {one["id"]: one for one in content["images"]}
+        entries = [
+            (i, images.get(one.get("image_id")), {name: v for name, v in one.items() if name != "segmentation"})
+            for i, one in enumerate(content["annotations"])
+        ]
+        names = next((one["keypoints"] for one in content.get("categories", ()) if one.get("keypoints")), ())
+        known = [name for name, table in LANDMARKS.items() if len(table) == len(names)]
+        mirrored = [name.replace("left", "right") for name in names]
+        pairs = [(i, names.index(other)) for i, other in enumerate(mirrored) if other in names and other != names[i]]
+        return entries, known[0] if known else pairs or None
 
 
-class Coco(Samples):
-    """COCO's keypoints: a sample for each annotation: a person, a face. Images without any have none.
-
-    `keypoints` (N, 2), of which `keypoints_valid` are labelled, and `boxes` (1, 4): COCO has them between the edges of
-    pixels, so half a pixel is taken off. Outlines are left out. Fields of a sample in an annotation, as `gaze`, and a
-    `camera` in an image, an object of `model`, `intrinsics`, `distortion` and `image_size`, are read if they are there.
-    """
-
-    format = "coco"
-
-    def _open(self) -> list[Json]:
-        content = _json(self.path)
-        with _failing_at(self.path, "not as COCO has it: ", *_UNLIKE):
-            self._images = {one["id"]: one for one in content["images"]}
-            names = next((one["keypoints"] for one in content.get("categories", ()) if one.get("keypoints")), ())
-            self.landmarks = _table([str(name) for name in names])
-            return [{name: v for name, v in one.items() if name != "segmentation"} for one in content["annotations"]]
-
-    def _sample(self, number: int) -> Sample:
-        place, one = f"{self.path}, annotations[{number}]", self._entries[number]
-        with _failing_at(place, "not as COCO has it: ", *_UNLIKE):
-            image = self._images.get(one["image_id"])
-            if image is None:
-                raise ValueError(f"{place}: no image has the id {one['image_id']!r:.60}")
-            year = self.path.stem.rpartition("_")[2]  # of person_keypoints_train2017
-            path = self._named(image["file_name"], ("", "images", self.path.stem, year, f"images/{year}"), place)
-            sample: Sample = {"path": path, "category_id": one.get("category_id", -1)}
-            fields = [name for name in KINDS if name != "keypoints" and one.get(name)]
-            sample |= {name: _numbers(one[name], place, name) for name in fields}
-            if one.get("keypoints"):
-                rows = _numbers(one["keypoints"], place, "keypoints", -1, 3)
-                sample |= {"keypoints": rows[:, :2].clone(), "keypoints_valid": rows[:, 2] > 0}
-            if one.get("bbox"):
-                corner, size = _numbers(one["bbox"], place, "bbox", 1, 4).split(2, 1)
-                sample["boxes"] = torch.cat((corner, corner + size), 1) - 0.5
-            if image.get("camera") is not None:
-                with _failing_at(f"{place}, the image's camera", "", ValueError):
-                    sample["camera"] = camera_of(image["camera"], "camera")
-            return sample
+def _coco_sample(samples: Samples, entry: tuple[int, Json | None, Json]) -> Sample:
+    number, image, one = entry
+    place = f"{samples.path}, annotations[{number}]"
+    if image is None:
+        raise ValueError(f"{place}: no image has the id {one.get('image_id')!r:.60}")
+    with _failing_at(place, "not as COCO has it: ", *_UNLIKE):
+        stem, year = samples.path.stem, samples.path.stem.rpartition("_")[2]  # of person_keypoints_train2017
+        path = _find(samples, place, image["file_name"], ("images", stem, year, f"images/{year}"))
+        fields = [name for name in KINDS if name != "keypoints" and one.get(name)]
+        sample: Sample = {name: _numbers(one[name], place, name) for name in fields}
+        if one.get("keypoints"):
+            rows = _numbers(one["keypoints"], place, "keypoints", -1, 3)
+            sample |= {"keypoints": rows[:, :2].clone(), "keypoints_valid": rows[:, 2] > 0}
+        if one.get("bbox"):
+            corner, size = _numbers(one["bbox"], place, "bbox", 1, 4).split(2, 1)
+            sample["boxes"] = torch.cat((corner, corner + size), 1) - 0.5
+        if image.get("camera") is not None:
+            with _failing_at(f"{place}, the image's camera", "", ValueError):
+                sample["camera"] = camera_of(image["camera"], "camera")
+        return {**sample, "path": path, "category_id": one.get("category_id", -1)}
 
 
-def _table(names: list[str]) -> TableLike | None:
-    """Return the table that is known of so many keypoints; else pairs of left and right in their names."""
-    known = [name for name, table in LANDMARKS.items() if len(table) == len(names)]
-    pairs = [(names.index(one), i) for i, name in enumerate(names) if (one := name.replace("left", "right")) in names]
-    return known[0] if known else [(i, other) for i, other in pairs if i != other] or None
+def _wflw(path: Path) -> Opened:
+    lines = enumerate(path.read_bytes().split(b"\n"), 1)
+    return [(f"line {i}", line) for i, line in lines if line.strip()], "wflw98"
 
 
 _ATTRIBUTES = ("pose", "expression", "illumination", "make_up", "occlusion", "blur")
 
 
-class Wflw(Samples):
-    """WFLW: a line is a face: 98 points x y, the corners of a box, six attributes of 0 or 1, the image's name.
-
-    The lists of its subsets, `list_98pt_test`, have the points and the name alone.
-    """
-
-    format, landmarks = "wflw", "wflw98"
-
-    def _open(self) -> list[tuple[int, bytes]]:
-        lines = enumerate(self.path.read_bytes().split(b"\n"), 1)
-        return [(i, line) for i, line in lines if line.strip()]
-
-    def _sample(self, number: int) -> Sample:
-        i, line = self._entries[number]
-        place = f"{self.path}, line {i}"
-        words = _text(line, place).strip().split(maxsplit=206)
-        if len(words) not in (197, 207):
-            what = "98 points, a box, six attributes and the name of an image are 207 words"
-            raise ValueError(f"{place}: {what}, or 197 without box and attributes; got {len(words)}")
-        sample: Sample = {"keypoints": _numbers(words[:196], place, "points", 98, 2)}
-        if len(words) == 207:
-            if not set(words[200:206]) <= {"0", "1"}:
-                raise ValueError(f"{place}: attributes must be 0 or 1; got {' '.join(words[200:206])}")
-            sample["boxes"] = _numbers(words[196:200], place, "a box", 1, 4)
-            sample["attributes"] = dict(zip(_ATTRIBUTES, map(int, words[200:206]), strict=True))
-        return {**sample, "path": self._named(words[-1], ("", "WFLW_images", "images"), place)}
+def _wflw_sample(samples: Samples, entry: tuple[str, bytes]) -> Sample:
+    place = f"{samples.path}, {entry[0]}"
+    words = _text(entry[1], place).strip().split(maxsplit=206)
+    if len(words) not in (197, 207):
+        what = "98 points, a box, six attributes and the name of an image are 207 words"
+        raise ValueError(f"{place}: {what}, or 197 without box and attributes; got {len(words)}")
+    sample: Sample = {"keypoints": _numbers(words[:196], place, "points", 98, 2)}
+    if len(words) == 207:
+        if not set(words[200:206]) <= {"0", "1"}:
+            raise ValueError(f"{place}: attributes must be 0 or 1; got {' '.join(words[200:206])}")
+        sample["boxes"] = _numbers(words[196:200], place, "a box", 1, 4)
+        sample["attributes"] = dict(zip(_ATTRIBUTES, map(int, words[200:206]), strict=True))
+    return {**sample, "path": _find(samples, place, words[-1], ("WFLW_images", "images"))}
 
 
-class Pts(Samples):
-    """300W: 68 points in a .pts beside its image; the top-left pixel of the file is (1, 1), that of a sample (0, 0).
-
-    That the files count from one, as Matlab, is what menpo takes them for too, a library of some of 300W's authors.
-    """
-
-    format, landmarks = "300w", "ibug68"
-
-    def _open(self) -> list[Path]:
-        return _files(self.path, ".pts")
-
-    def _sample(self, number: int) -> Sample:
-        path = self._entries[number]
-        head, begin, rest = _text(path.read_bytes(), path).partition("{")
-        body, end, _ = rest.partition("}")
-        if not begin or not all(":" in line for line in head.splitlines() if line.strip()):
-            raise ValueError(f"{path}, line 1: version: 1, n_points: 68 and {{ were expected; got {head!r:.60}")
-        lines = [(i, line) for i, line in enumerate(body.split("\n"), head.count("\n") + 1) if line.strip()]
-        points = [_numbers(line.split(), f"{path}, line {i}", "a point", 2) for i, line in lines]
-        if len(points) != 68 or not end:
-            cut = "" if end else " and no }: the file is cut short"
-            raise ValueError(
-                f"{path}, line {lines[-1][0] if lines else 1}: 68 points were expected; got {len(lines)}{cut}"
-            )
-        return {"keypoints": torch.stack(points) - 1, "path": self._beside(path)}
+def _files(suffix: str, path: Path) -> Opened:
+    files = [path] if path.is_file() else sorted(one for one in path.rglob("*") if one.suffix.lower() == suffix)
+    if not files:
+        raise ValueError(f"{path}: no {suffix} in this folder, nor beneath it")
+    return files, "ibug68"
 
 
-class Mat(Samples):
-    """300W-LP and AFLW2000-3D: a .mat beside its image, with 68 points and the pose of the head.
+def _pts_sample(samples: Samples, path: Path) -> Sample:
+    head, begin, rest = _text(path.read_bytes(), path).partition("{")
+    body, end, _ = rest.partition("}")
+    if not begin or not all(":" in line for line in head.splitlines() if line.strip()):
+        raise ValueError(f"{path}, line 1: version: 1, n_points: 68 and {{ were expected; got {head!r:.60}")
+    lines = [(i, line) for i, line in enumerate(body.split("\n"), head.count("\n") + 1) if line.strip()]
+    points = [_numbers(line.split(), f"{path}, line {i}", "a point", 2) for i, line in lines]
+    if len(points) != 68 or not end:
+        cut = "" if end else " and no }: the file is cut short"
+        raise ValueError(f"{path}, line {lines[-1][0] if lines else 1}: 68 points were expected; got {len(lines)}{cut}")
+    return {"keypoints": torch.stack(points) - 1, "path": _find(samples, path, path.stem, (), _SUFFIXES)}
 
-    The points are `pt2d`, or `pt3d_68` where that holds no 68, as AFLW2000's, whose `pt2d` are 21 others. They count
-    pixels from (1, 1), as Matlab; those of a sample from (0, 0).
 
-    `Pose_Para` begins with pitch, yaw and roll in radians: R = Rx(-pitch) Ry(-yaw) Rz(-roll), by right-handed turns
-    in 3DDFA's frame, x right, y up, z out of the image (Zhu et al., Face Alignment Across Large Poses, 2016; the order
-    and the signs are those of the code of 3DDFA). `head_pose` (4, 4) is the same turn in the frame of a camera, and of
-    a head that faces it, x right, y down, z away: Rx(-pitch) Ry(yaw) Rz(roll), so that the nose points along -z of
-    it: up for a positive pitch, to the left of the image for a positive yaw. Angles of another order,
-    Ry(yaw) Rx(-pitch) Rz(roll), differ where two of them are large. The fit is a scaled orthographic one, which knows
-    no distance: the translation is 0, and there is no camera.
-    """
-
-    format, landmarks = "300w_lp", "ibug68"
-
-    def _open(self) -> list[Path]:
-        return _files(self.path, ".mat")
-
-    def _sample(self, number: int) -> Sample:
-        path = self._entries[number]
-        arrays = _matlab(path)
-        points = [array[:2].T for name in ("pt2d", "pt3d_68") if (array := arrays.get(name, _NONE)).shape[1:] == (68,)]
-        pose, shapes = arrays.get("Pose_Para", _NONE).ravel(), {name: array.shape for name, array in arrays.items()}
-        if not points or pose.size != 7:
-            raise ValueError(
-                f"{path}: pt2d (2, 68) or pt3d_68 (3, 68), and Pose_Para (1, 7) were expected; got {shapes}"
-            )
-        (pitch, yaw, roll), (x, y, z) = _numbers(pose[:3], path, "Pose_Para"), torch.eye(3)
-        head = torch.eye(4)
-        head[:3, :3] = rotation_matrix(-pitch * x) @ rotation_matrix(yaw * y) @ rotation_matrix(roll * z)
-        keypoints = _numbers(points[0], path, "points", 68, 2) - 1
-        return {"keypoints": keypoints, "head_pose": head, "path": self._beside(path)}
+def _mat_sample(samples: Samples, path: Path) -> Sample:
+    arrays = _matlab(path)
+    points = [array[:2].T for name in ("pt2d", "pt3d_68") if (array := arrays.get(name, _NONE)).shape[1:] == (68,)]
+    pose, shapes = arrays.get("Pose_Para", _NONE).ravel(), {name: array.shape for name, array in arrays.items()}
+    if not points or pose.size != 7:
+        raise ValueError(f"{path}: pt2d (2, 68) or pt3d_68 (3, 68), and Pose_Para (1, 7) were expected; got {shapes}")
+    # 3DDFA's matrix is Rx(-pitch) Ry(-yaw) Rz(-roll) in its own frame, y up and z out of the image
+    (pitch, yaw, roll), (x, y, z), head = _numbers(pose[:3], path, "Pose_Para"), torch.eye(3), torch.eye(4)
+    head[:3, :3] = rotation_matrix(-pitch * x) @ rotation_matrix(yaw * y) @ rotation_matrix(roll * z)
+    keypoints = _numbers(points[0], path, "points", 68, 2) - 1
+    return {"keypoints": keypoints, "head_pose": head, "path": _find(samples, path, path.stem, (), _SUFFIXES)}
 
 
 _NONE = np.zeros(0)
@@ -286,69 +209,51 @@ def _elements(content: bytes) -> Iterator[tuple[int, bytes]]:
         at = after
 
 
-class Vcd(Samples):
-    """OpenLABEL 1.0 and VCD 4, as the Driver Monitoring Dataset has them: a sample for each frame of each camera.
+def _vcd(path: Path) -> Opened:
+    content = _json(path)
+    with _failing_at(path, "not as OpenLABEL has it: ", ValueError, *_UNLIKE):
+        root: Json = content.get("openlabel") or content["vcd"]
+        cameras = {name: one for name, one in root.get("streams", {}).items() if one.get("type", "camera") == "camera"}
+        properties = {name: one.get("stream_properties", {}) for name, one in cameras.items()}
+        shifts = {name: one.get("sync", {}).get("frame_shift", 0) for name, one in properties.items()} or {"": 0}
+        first, frames = min(0, *shifts.values(), 0), sorted(root["frames"], key=int)
+        return [
+            (root, frame, name, cameras.get(name, {}).get("uri"), int(frame) - shift + first, properties.get(name, {}))
+            for frame in frames
+            for name, shift in shifts.items()
+        ], None
 
-    `boxes` (M, 4) of all objects' `bbox`, which are x and y of the middle, width and height, with `box_names`;
-    `keypoints` (N, 2) of their `point2d`, in the file's order, with `point_names`: those whose `coordinate_system` is
-    the camera's stream, or is not said. `actions`: the types of those in this frame, as "gaze_zone/front". `camera`:
-    of a stream's `intrinsics_pinhole`. `frame` is the number in the file, `stream` the name of the camera.
 
-    `image` is the frame of the stream's video (by PyAV, `camtorch[video]`), which lies by its path or its name beside
-    the file: the DMD's `frame_shift` counts from the first frame of the camera that began first. A sample has none
-    where a video has not begun or has ended, and of a stream without `uri`. An image as `uri` is taken for all frames.
-    """
-
-    format = "vcd"
-
-    def _open(self) -> list[tuple[str, str]]:
-        content = _json(self.path)
-        with _failing_at(self.path, "not as OpenLABEL has it: ", ValueError, *_UNLIKE):
-            self._root: Json = content.get("openlabel") or content["vcd"]
-            self._streams: Json = self._root.get("streams", {})
-            cameras = [name for name, one in self._streams.items() if one.get("type", "camera") == "camera"] or [""]
-            self._shifts = {name: self._properties(name).get("sync", {}).get("frame_shift", 0) for name in cameras}
-            return [(frame, name) for frame in sorted(self._root["frames"], key=int) for name in cameras]
-
-    def _properties(self, stream: str) -> Json:
-        properties: Json = self._streams.get(stream, {}).get("stream_properties", {})
-        return properties
-
-    def _sample(self, number: int) -> Sample:
-        frame, stream = self._entries[number]
-        place = f"{self.path}, frames.{frame}"
-        with _failing_at(place, "not as OpenLABEL has it: ", *_UNLIKE):
-            content, sample = self._root["frames"][frame], Sample(frame=int(frame), stream=stream)
-            at = int(frame) - self._shifts[stream] + min(0, *self._shifts.values(), 0)
-            if uri := self._streams.get(stream, {}).get("uri"):
-                sample |= self._image(uri, at, place)
-            found = {
-                kind: self._numbers_of(kind, n, content, stream, place) for kind, n in (("bbox", 4), ("point2d", 2))
-            }
-            middle, size = found["bbox"][0].split(2, 1)
-            sample |= {"boxes": torch.cat((middle - size / 2, middle + size / 2), 1), "box_names": found["bbox"][1]}
-            sample["keypoints"], sample["point_names"] = found["point2d"]
-            sample["actions"] = [self._root["actions"][uid]["type"] for uid in content.get("actions", {})]
-        if (pinhole := self._properties(stream).get("intrinsics_pinhole")) is not None:
-            with _failing_at(f"{self.path}, streams.{stream}.intrinsics_pinhole", "", ValueError, *_UNLIKE):
-                sample["camera"] = _pinhole(**pinhole)
-        return sample
-
-    def _numbers_of(self, kind: str, n: int, frame: Json, stream: str, place: str) -> tuple[Tensor, list[str]]:
-        """Return the numbers (N, n) and names of one kind of a frame's objects, as a camera sees them."""
-        names, rows = [], [torch.zeros(0, n)]
-        for uid, one in frame.get("objects", {}).items():
-            for item in one.get("object_data", {}).get(kind, ()):
-                if item.get("coordinate_system", stream) == stream or not stream:
-                    names.append(f"{self._root['objects'][uid]['type']}/{item.get('name', '')}")
-                    rows.append(_numbers(item["val"], f"{place}.objects.{uid}", kind, 1, n))
-        return torch.cat(rows), names
-
-    def _image(self, uri: str, at: int, place: str) -> Sample:
-        folder = "" if Path(uri).is_absolute() or ".." in Path(uri).parts else str(Path(uri).parent)
-        path = self._named(Path(uri).name, ("", folder), place)
-        image = _image_at(path) if path.suffix.lower() in _SUFFIXES else _video_frame(path, at)
-        return {} if image is None else {"image": image}
+def _vcd_sample(samples: Samples, entry: tuple[Json, str, str, str | None, int, Json]) -> Sample:
+    root, frame, stream, uri, at, properties = entry
+    place, sample = f"{samples.path}, frames.{frame}", Sample(frame=int(frame), stream=stream)
+    with _failing_at(place, "not as OpenLABEL has it: ", *_UNLIKE):
+        content = root["frames"][frame]
+        if uri:
+            away = Path(uri).is_absolute() or ".." in Path(uri).parts
+            path = _find(samples, place, Path(uri).name, ("" if away else str(Path(uri).parent),))
+            image = _image_at(path) if path.suffix.lower() in _SUFFIXES else _video_frame(path, at)
+            sample |= {} if image is None else {"image": image}
+        for kind, count, field, names in (
+            ("bbox", 4, "boxes", "box_names"),
+            ("point2d", 2, "keypoints", "point_names"),
+        ):
+            items = [
+                (uid, item)
+                for uid, one in content.get("objects", {}).items()
+                for item in one.get("object_data", {}).get(kind, ())
+                if item.get("coordinate_system", stream) == stream or not stream
+            ]
+            rows = [_numbers(item["val"], f"{place}.objects.{uid}", kind, 1, count) for uid, item in items]
+            sample[field] = torch.cat([torch.zeros(0, count), *rows])
+            sample[names] = [f"{root['objects'][uid]['type']}/{item.get('name', '')}" for uid, item in items]
+        middle, size = sample["boxes"].split(2, 1)
+        sample["boxes"] = torch.cat((middle - size / 2, middle + size / 2), 1)
+        sample["actions"] = [root["actions"][uid]["type"] for uid in content.get("actions", {})]
+    if (pinhole := properties.get("intrinsics_pinhole")) is not None:
+        with _failing_at(f"{samples.path}, streams.{stream}.intrinsics_pinhole", "", ValueError, *_UNLIKE):
+            sample["camera"] = _pinhole(**pinhole)
+    return sample
 
 
 def _pinhole(height_px: int, width_px: int, **lens: Any) -> Camera:
@@ -381,12 +286,27 @@ def _video_frame(path: Path, number: int) -> Tensor | None:
 # -- what formats share
 
 
-def _files(path: Path, suffix: str) -> list[Path]:
-    """Return the file itself, or those of a suffix in a folder and beneath it."""
-    files = [path] if path.is_file() else sorted(one for one in path.rglob("*") if one.suffix.lower() == suffix)
-    if not files:
-        raise ValueError(f"{path}: no {suffix} in this folder, nor beneath it")
-    return files
+def _find(
+    samples: Samples, place: object, name: Any, folders: Sequence[str] = (), suffixes: Sequence[str] = ("",)
+) -> Path:
+    """Return the image of a name and one of some suffixes: in `samples.images`, or beside the file that names it.
+
+    With `folders`, which data sets have for their images, it may also be in one of these, or up to `_UP` higher.
+    """
+    parts = PurePosixPath(name if isinstance(name, str) and "\0" not in name else "")
+    if parts.is_absolute() or ".." in parts.parts or not parts.name:
+        raise ValueError(f"{place}: the name of a file within the folder of images was expected; got {name!r:.60}")
+    labels = Path(place) if isinstance(place, Path) else samples.path
+    roots = [labels.parent, *labels.resolve().parent.parents][: _UP + 1 if folders else 1]
+    for root in [samples.images] if samples.images else roots:
+        for folder in ("", *folders):
+            for suffix in suffixes:
+                if os.path.isfile(file := f"{root / folder / parts}{suffix}"):  # False, too, for impossible names
+                    return Path(file)
+    where = f" or in {', '.join(map(repr, folders))} there or up to {_UP} folders above" if folders else ""
+    ends = f" with one of {' '.join(suffixes[:4])}" if len(suffixes) > 1 else ""
+    hint = "; read(..., images=FOLDER) says where"
+    raise ValueError(f"{place}: no file {name!r:.200}{ends} in {samples.images or f'{roots[0]}{where}{hint}'}")
 
 
 def _image_at(path: Path) -> Tensor:
@@ -429,8 +349,14 @@ def _numbers(values: Any, place: object, what: str, *shape: int) -> Tensor:
         raise ValueError(f"{place}: {what} must be {wanted}finite numbers; got {values!s:.80}") from None
 
 
-_FORMATS: dict[str, type[Samples]] = {kind.format: kind for kind in (Coco, Wflw, Pts, Mat, Vcd)}
-_OF_SUFFIX = {".pts": "300w", ".mat": "300w_lp"}
+_FORMATS: dict[str, tuple[Callable[[Path], Opened], Callable[[Samples, Any], Sample]]] = {
+    "coco": (_coco, _coco_sample),
+    "wflw": (_wflw, _wflw_sample),
+    "300w": (functools.partial(_files, ".pts"), _pts_sample),
+    "300w_lp": (functools.partial(_files, ".mat"), _mat_sample),
+    "vcd": (_vcd, _vcd_sample),
+}
+_OF_SUFFIX = {".pts": "300w", ".mat": "300w_lp", ".txt": "wflw"}
 
 
 def read(
@@ -444,22 +370,29 @@ def read(
 
     A sample is a dict as augmentations take it: `image` (3, H, W) uint8, or (1, H, W) if it is grey; float32 labels in
     pixels with the middle of the top-left one at (0, 0), in the format's own order; and `path`, of the image. A
-    sample is one face or one person; an image with two of them is in two samples. In pixels are `keypoints` (N, 2) and
-    `boxes` (M, 4) x1, y1, x2, y2.
+    sample is one face or one person; an image with two of them is in two samples.
 
-    | format | path | fields |
-    |---|---|---|
-    | `"coco"` | .json of keypoints | keypoints, boxes, see `Coco` |
-    | `"wflw"` | list of WFLW, .txt | 98 keypoints, boxes, attributes, see `Wflw` |
-    | `"300w"` | .pts, or a folder of such | 68 keypoints, see `Pts` |
-    | `"300w_lp"` | .mat of 300W-LP or AFLW2000-3D, or a folder | 68 keypoints, head_pose, see `Mat` |
-    | `"vcd"` | OpenLABEL or VCD, .json, as the DMD | boxes, keypoints, actions, camera, see `Vcd` |
+    * `"coco"`, a .json of keypoints: `keypoints` (N, 2), of which `keypoints_valid` are labelled, and `boxes` (1, 4)
+      x1, y1, x2, y2: COCO has them between the edges of pixels, so half a pixel is taken off. Fields of a sample in an
+      annotation, as `gaze`, and an image's `camera`, as columns of `ct.data.to_columns`, are read if they are there.
+    * `"wflw"`, a list of WFLW, .txt: 98 `keypoints`, and `boxes` (1, 4) and `attributes` if the list has them.
+    * `"300w"`, a .pts or a folder of such: 68 `keypoints`. The files count from (1, 1), as Matlab, as menpo takes them.
+    * `"300w_lp"`, a .mat of 300W-LP or AFLW2000-3D, or a folder of such: 68 `keypoints`, of `pt2d` or else `pt3d_68`,
+      which count from (1, 1), and `head_pose` (4, 4), of which `Pose_Para` says pitch, yaw and roll. It is 3DDFA's turn
+      (Zhu et al., Face Alignment Across Large Poses, 2016) in the frame of a camera, Rx(-pitch) Ry(yaw) Rz(roll): the
+      nose points along -z of it, up for a positive pitch, to the left of the image for a positive yaw. The fit knows no
+      distance: the translation is 0.
+    * `"vcd"`, OpenLABEL 1.0 or VCD 4, .json, as the Driver Monitoring Dataset has them, a sample for each `frame` and
+      camera, `stream`: `boxes` (M, 4) and `box_names` of all objects' `bbox`; `keypoints` (N, 2) and `point_names` of
+      their `point2d`, if their `coordinate_system` is this stream or is not said; `actions`, as "gaze_zone/front";
+      `camera`, of `intrinsics_pinhole`. `image` is the frame of the stream's video (by PyAV), by the DMD's
+      `frame_shift`; there is none before the video begins, after its end, and without `uri`.
 
     Args:
         path: of a file or a folder.
-        format: one of these; by default it is seen from suffixes and the first lines.
-        images: the folder of the images. By default they are looked for beside the labels, and for `"coco"`, `"wflw"`
-            and `"vcd"`, whose labels name them, in folders of the data set's names there or up to three folders above.
+        format: one of these; by default the suffix, and of JSON its beginning, says it.
+        images: the folder of the images. By default they are looked for beside the labels, and those that labels name
+            also in folders of the data set's names, there or up to three folders above.
 
     Returns:
         Samples: `len`, `[i]`, iteration; `samples.landmarks` is the table that a mirror needs.
@@ -478,21 +411,19 @@ def read(
     if folder is not None and not folder.is_dir():
         raise FileNotFoundError(f"read: no folder of images {str(images)!r}")
     name = _format_of(found) if format is None else format
-    if found.is_dir() and name not in _OF_SUFFIX.values():
+    if found.is_dir() and name not in ("300w", "300w_lp"):
         raise ValueError(f"read: the labels of {name} are a file; {str(found)!r} is a folder")
-    return _FORMATS[name](found, folder)
+    return Samples(found, name, folder)
 
 
 def _format_of(path: Path) -> str:
-    """Return the one format that suffixes, or the beginning of a text, say."""
-    files = path.rglob("*") if path.is_dir() else [path]
-    names = sorted({_OF_SUFFIX[suffix] for one in files if (suffix := one.suffix.lower()) in _OF_SUFFIX})
+    """Return the one format that suffixes, or the beginning of JSON, say."""
+    suffixes = {one.suffix.lower() for one in path.rglob("*")} - {".txt"} if path.is_dir() else {path.suffix.lower()}
+    names = sorted(_OF_SUFFIX[suffix] for suffix in suffixes & _OF_SUFFIX.keys())
     if path.is_file() and not names:
         with path.open("rb") as file:
-            begin = file.read(1 << 16).removeprefix(b"\xef\xbb\xbf").lstrip()
-        keys = re.findall(rb'"(openlabel|vcd|images|annotations)"\s*:', begin) if begin[:1] == b"{" else []
+            keys = re.findall(rb'"(openlabel|vcd|images|annotations)"\s*:', file.read(1 << 16))
         names = ["vcd" if keys[0] in (b"openlabel", b"vcd") else "coco"] if keys else []
-        names += ["wflw"] if len(begin.partition(b"\n")[0].split()) in (197, 207) else []
     if len(names) != 1:
         seen = f"seems to be of {' and '.join(names) or 'no known format'}"
         raise ValueError(f"read: {str(path)!r} {seen}; format= one of {', '.join(_FORMATS)} says which")
