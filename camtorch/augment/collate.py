@@ -24,8 +24,8 @@ def collate(samples: Sequence[object]) -> object:
 
     As torch's own `default_collate`, which stacks tensors, arrays and numbers; but tensors and arrays whose shapes
     differ, such as the keypoints of several faces, come as the list of tensors that the augmentations take. Cameras
-    become a batch, a `ct.Mixed` where they are of several models, or a list where their images are of several sizes; so
-    they do by `default_collate`.
+    become a batch, or a `ct.Mixed` if they are of several models; so they do by `default_collate`. Cameras whose images
+    differ in size come as a list, which no augmentation takes: augment such samples in the workers, one by one.
 
     In a worker on Linux, batches go into shared memory that is used again when the main process has let go of them,
     as new memory takes as long to get as images take to be augmented; of no more bytes than were in use at once. What
@@ -61,7 +61,7 @@ def _others(function: Callable[..., Any], batch: Sequence[Any], *, collate_fn_ma
 
 
 def collate_cameras(batch: Sequence[Camera], *, collate_fn_map: Any = None) -> Camera | list[Camera]:
-    """Single cameras as one batch, of several models if need be, or as a list where they are of several sizes."""
+    """Single cameras as one batch, of several models if need be, or as a list if their images differ in size."""
     if any(camera.batch_shape for camera in batch) or len({camera.image_size for camera in batch}) > 1:
         return list(batch)
     return cat(batch)

@@ -176,7 +176,8 @@ class CanonicalCamera(SampleTransform):
     def _change(self, camera: Camera, count: int) -> Change:
         """From the cameras to those with the focal length."""
         height, width = camera.height, camera.width
-        if (size := self.image_size) is None:
+        size = self.image_size or (height, width)
+        if self.image_size is None:
             scales = self.scale(camera).double().flatten().tolist()
             sizes = {(max(round(height * s), 1), max(round(width * s), 1)) for s in scales}
             if len(sizes) > 1:
@@ -184,7 +185,7 @@ class CanonicalCamera(SampleTransform):
                     f"{self._name}: images of several focal lengths would come out in the sizes {sorted(sizes)}; "
                     "image_size=(height, width) cuts or fills them to one"
                 )
-            size = sizes.pop() if sizes else (height, width)
+            size = sizes.pop() if sizes else size
 
         def part(rows: list[int] | None, source: Camera) -> Part:
             scale = self.scale(source).double()

@@ -732,6 +732,6 @@ def test_quarter_turns_of_several_models_are_told_of_where_images_are_one_tensor
     )
     torch.manual_seed(draw)
     change = rotate.change(cameras, rotate.draw(2, torch.Generator().manual_seed(draw)))
-    with pytest.raises(ValueError, match=r"in the sizes \[\(16, 24\), \(24, 16\)\]; as lists"):
+    with pytest.raises(ValueError, match=r"in the sizes \[\(16, 24\), \(24, 16\)\]; same_on_batch"):
         change.images(images)
     assert change.points(torch.zeros(2, 5, 2))[0].shape == (2, 5, 2)
