@@ -94,7 +94,7 @@ def solved(
     start: poses about the middle of the points that are seen, on which most agree; of all that is seen without.
     """
     batch, count, _ = pixels.shape
-    native.add_tables(count)
+    native.add_table()
     while True:
         rotations, translations = pixels.new_empty(batch, 3, 3), pixels.new_empty(batch, 3)
         if start is not None:

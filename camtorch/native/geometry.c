@@ -15,13 +15,6 @@
 #define ALIGNED __attribute__((aligned(64)))
 #define INLINE static inline __attribute__((always_inline))
 #define NOT_INLINE __attribute__((noinline))
-/* Where surfaces are evaluated, vectors of 512 bits gain a tenth; compilers before do not know the attribute for certain */
-#if defined __AVX512F__ && !defined __clang__ && __GNUC__ >= 12
-#define WIDE NOT_INLINE __attribute__((target("prefer-vector-width=512")))
-#else
-#define WIDE NOT_INLINE
-#endif
-
 #define JOINED_(a, b) a##_##b
 #define JOINED(a, b) JOINED_(a, b)
 #define THIS(name) JOINED(name, VARIANT)
@@ -31,18 +24,13 @@ enum { MOST_STEPS = 5 };  /* of Newton's method; what then still moves is left t
 enum { START_ROUNDS = 6, DAMPED_STEPS = 60 }; /* of a search */
 enum { SQUARE = 64, PROBES = 5 }; /* pixels of a cell of a lattice; of these, where one in doubt is looked at */
 enum { PADDED = 8 };      /* numbers of a factor that loops are made for */
-enum { BENT = 21 };       /* of each polynomial of a windshield: those of order 5 */
 #define PI 3.14159265358979323846
 
 /* Over the points of a block; `n` is a multiple of LANES */
 #define EACH(i) for (int i = 0; i < (n & -LANES); i++)
 
-/* Loops that compilers would unroll, but make vectors of; and that they shall unroll */
-#define KEPT_LOOP _Pragma("GCC unroll 1")
-#define UNROLLED_LOOP _Pragma("GCC unroll 8")
-
 /* Charts that have loops of their own: unified ones of alpha 0, and of no xi those of alpha 1, of alpha 1/2, and others */
-enum { SHIFTED = LINEARITY + 1, SPHERICAL, HALFWAY, ENHANCED };
+enum { SHIFTED = SPHERE + 1, SPHERICAL, HALFWAY, ENHANCED };
 /* Factors that have: polynomials of few numbers and of some, and so on; any other one */
 enum { FEW, SOME, RATIO, ROOTS, ANGLES, ALL, ANY };
 
@@ -54,7 +42,7 @@ enum { FEW, SOME, RATIO, ROOTS, ANGLES, ALL, ANY };
         WAY(PERSPECTIVE, __VA_ARGS__) WAY(EQUIDISTANT, __VA_ARGS__) WAY(EQUISOLID, __VA_ARGS__)                        \
         WAY(UNIFIED, __VA_ARGS__) WAY(FOV, __VA_ARGS__) WAY(ONE_DIVISION, __VA_ARGS__) WAY(INVERTED, __VA_ARGS__)      \
         WAY(CYLINDER, __VA_ARGS__) WAY(SPHERE, __VA_ARGS__) WAY(SHIFTED, __VA_ARGS__) WAY(SPHERICAL, __VA_ARGS__)      \
-        WAY(HALFWAY, __VA_ARGS__) WAY(ENHANCED, __VA_ARGS__) WAY(LINEARITY, __VA_ARGS__)                               \
+        WAY(HALFWAY, __VA_ARGS__) WAY(ENHANCED, __VA_ARGS__)                                                           \
     }
 #define FORM(name, made, n, m, ...) CASE(name, enum { kind = made, count = n, below = m }; __VA_ARGS__)
 #define EACH_FORM(given, ...)                                                                                          \
@@ -65,29 +53,15 @@ enum { FEW, SOME, RATIO, ROOTS, ANGLES, ALL, ANY };
         FORM(ALL, ANGLE_OF_ALL_POWERS, PADDED, 0, __VA_ARGS__)                                                         \
     }
 
-/* The same for the orders of a windshield's polynomials, or those up to which both are padded */
-#define ORDERS(name, ...) CASE(name, enum { across = name, down = name }; __VA_ARGS__)
-#define EACH_ORDER(given, own, ...)                                                                                    \
-    switch (given) {                                                                                                   \
-        ORDERS(2, __VA_ARGS__) ORDERS(3, __VA_ARGS__) ORDERS(5, __VA_ARGS__)                                           \
-    default: {                                                                                                         \
-        const int across = own[0], down = own[1];                                                                      \
-        __VA_ARGS__                                                                                                    \
-    }                                                                                                                  \
-    }
-
 int32_t THIS(classify)(const Classification *);
 void THIS(sample_image)(const Job *, int64_t);
 
-/* How many numbers the map before a chart has */
-static int numbers_of_map(const Part *part) { return part->map == TURN ? 9 : part->map == BEND ? part->across + part->down : 0; }
-
 /* How many numbers a part has: the `parameters` of its chart or stage */
 static int numbers_of(const Part *part) {
-    int count = numbers_of_map(part);
+    int count = 0;
     if (part->kind == UNIFIED)
-        count += !!(part->flags & HAS_XI) + !!(part->flags & HAS_ALPHA) + !!(part->flags & HAS_BETA);
-    if (part->kind == FOV || part->kind == ONE_DIVISION || part->kind == LINEARITY) count += 1;
+        count = !!(part->flags & HAS_XI) + !!(part->flags & HAS_ALPHA) + !!(part->flags & HAS_BETA);
+    if (part->kind == FOV || part->kind == ONE_DIVISION) count = 1;
     if (part->kind == HOMOGRAPHY) count = 9;
     if (part->kind == SHEAR) count = 2;
     if (part->kind == SURFACE) count = 4 + 2 * part->n * part->m;

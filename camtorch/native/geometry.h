@@ -10,16 +10,13 @@
 #include "sampler.h"
 
 /* Charts: rays to a plane; the numbers of each are its `parameters` */
-enum { PERSPECTIVE, EQUIDISTANT, EQUISOLID, UNIFIED, FOV, ONE_DIVISION, INVERTED, CYLINDER, SPHERE, LINEARITY };
+enum { PERSPECTIVE, EQUIDISTANT, EQUISOLID, UNIFIED, FOV, ONE_DIVISION, INVERTED, CYLINDER, SPHERE };
 /* Flags of charts: which of xi, alpha, beta are numbers, and whether x and y change places */
 enum { HAS_XI = 1, HAS_ALPHA = 2, HAS_BETA = 4, TRANSVERSE = 8 };
 
-/* Maps of rays before a chart, whose numbers come before the chart's: none, a rotation, a windshield of n and m numbers */
-enum { NO_MAP, TURN, BEND };
-
 /* Stages of a lens on that plane */
 enum { PLANAR = 16, HOMOGRAPHY, SHEAR, SURFACE };
-/* Flags of the planar stage; those of a surface of n x m control points, at least 4 x 4, are its order */
+/* Flags of the planar stage; those of a surface of n x m control points are its order */
 enum { TANGENTIAL = 1, PRISM = 2 };
 
 /* Radial factors, of the planar stage and of the inverted chart; n numbers each, n + m the ratio, 4 n the table */
@@ -31,19 +28,13 @@ enum { NODES = 1024 };   /* of the table of an inverse, see `radial_inverse.tabu
 enum { MOST_RADII = 512 }; /* on which a lens is followed outwards by bounds of its stages */
 enum { AZIMUTHS = 336 }; /* on which limits are given, see `fold.limits_and_extent` */
 enum { RADII = 80 };     /* on each of them: half over the whole chart, half around the fold of a radial factor */
-/* The inverse of a surface, nearly: a polynomial of CELL numbers on each of GRID x GRID cells, after where these are */
-enum { GRID = 60, CELL = 16, START = CELL * (1 + GRID * GRID) };
-/* A squared radius, the middle of a box and its size, see `box_of` */
-enum { BOX = 5 };
-/* Numbers of a piece of a surface: 4 x 4 coefficients, of du and dv each */
-enum { PIECE = 32 };
 /* Radii (RADII); how far out they are sent on each azimuth (AZIMUTHS, RADII), ascending; how far the image reaches in each
    direction (AZIMUTHS) */
 enum { EXTENT = RADII + AZIMUTHS * RADII + AZIMUTHS };
 
 /* A chart or a stage */
 typedef struct {
-    int32_t kind, flags, factor, n, m, map, across, down; /* the last two of a windshield */
+    int32_t kind, flags, factor, n, m;
     double constant; /* alpha of a unified chart that does not learn it; cells past its edge that belong to a surface */
 } Part;
 
@@ -63,12 +54,6 @@ typedef struct {
     const void *inner2, *usual2, *limits2, *extent, *table;
     const uint8_t *stagewise;
     const void *circle2;
-    /* of a lens that is a surface, or a surface after a radial factor: where a point is in the domain for certain, of each
-       piece of it (c, n m, of which as many are used), and up to the squared radius of the factor's fold in a box of the
-       surface (c, BOX); where to start the inverse of the surface (c, START); the surface as polynomials (c, PIECE of each
-       piece), or NULL, see `pieces_of` */
-    const uint8_t *certain;
-    const void *certain2, *start, *pieces;
     /* of an inverted chart: the squared radius and the squared angle of its fold, the table of its inverse */
     const void *chart_inner2, *chart_most2, *chart_table;
 } Cameras;
@@ -91,8 +76,6 @@ typedef struct {
     void *inner2, *usual2, *circle2, *table; /* (c), (c), (c), (c, 2 + 2 NODES); see `Cameras` */
     void *limits2, *extent;                  /* (c, AZIMUTHS), (c, EXTENT): both or none */
     uint8_t *stagewise;                      /* (c); with circle2 */
-    uint8_t *certain;                        /* (c, n m) */
-    void *certain2, *start, *pieces; /* (c, BOX) and (c, START), which read `certain`; (c, PIECE of each piece) */
 } Domain;
 
 enum { PROJECT, UNPROJECT, PROJECT_VJP, UNPROJECT_VJP };

@@ -10,7 +10,7 @@
 typedef struct {
     R xi, alpha, beta; /* of a unified chart */
     R k;               /* of one division */
-    R omega, slope, slope_by_omega, tan2, tan2_by_omega; /* of the fov chart; omega is the linearity of that chart too */
+    R omega, slope, slope_by_omega, tan2, tan2_by_omega; /* of the fov chart */
 } T(Chart);
 
 /* A radial factor, and for which of the loops over factors its numbers are padded with zeros */
@@ -26,31 +26,17 @@ typedef struct {
     R px, py, s0, s1, s2, s3;
 } T(Plane);
 
-/* A box of the plane of a surface: in cells, how far it goes to each side of its middle */
-typedef struct {
-    R sa, sb, ca, cb, across, down;
-} T(Edge);
-
 /* A camera: its numbers, by parts, and what follows from them alone */
 typedef struct {
     const Part *parts;
     int stages, way, swapped, is_radial, by_stages, usable;
     int follows, waits; /* whether the lens is to be followed along each azimuth, and yet has to be */
-    int is_partial;     /* whether nothing of its domain is known, but for the surface that it ends with */
     int ends;           /* whether it ends at the edge of a surface; not while it is followed */
-    const R *map, *numbers[MOST_PARTS], *constants; /* those of the map before the chart; of the parts */
-    /* a windshield's polynomials, padded with zeros to an order that loops are made for, or 0; their own orders; by how much
-       both bend at the most */
-    R bent[2][BENT], bend;
-    int order, orders[2];
+    const R *numbers[MOST_PARTS], *constants; /* those of the parts */
     T(Factor) factors[MOST_PARTS];
     T(Plane) planes[MOST_PARTS];
     R fx, fy, cx, cy, inner2, usual2, circle2;
-    const R *limits2, *extent, *table, *start, *pieces;
-    int all_certain, has_box, is_boxed; /* all pieces of the surface; a box of it; and it is the only stage */
-    T(Edge) box;
-    R certain2, beside2; /* of a circle beside that box, in which points are certain as well; -1: none */
-    R curve; /* see `bend_of` */
+    const R *limits2, *extent, *table;
     R chart_inner2, chart_most2;
     const R *chart_table;
     T(Chart) chart;
@@ -76,8 +62,6 @@ static void T(prepare_chart)(T(Camera) *c) {
         else c->way = fixed && chart->alpha == 1 ? SPHERICAL : ENHANCED;
     } else if (part->kind == ONE_DIVISION) {
         chart->k = k[0];
-    } else if (part->kind == LINEARITY) {
-        chart->omega = k[0];
     } else if (part->kind == FOV) {
         const double omega = k[0], t = omega * omega / 4;
         const double tanc = t < 1e-4 ? 1 + t * (1 / 3.0 + t * (2 / 15.0 + t * 17 / 315.0)) : tan(omega / 2) / (omega / 2);
@@ -98,12 +82,6 @@ INLINE R T(angle_per_radius)(R rho2, R z) {
 
 /* z' + root where difference = root^2 - z^2, without the cancellation behind */
 INLINE R T(sum_of)(R z, R root, R difference) { return z > 0 ? z + root : difference / (z > 0 ? 1 : root - z); }
-
-/* tan(w) / w or sin(w) / w, w = L theta, and the sine and the cosine of which it is made */
-INLINE R T(stretched)(R linearity, R t, R *sinc, R *cosine) {
-    T(turn)(t, sinc, cosine);
-    return linearity > 0 ? *sinc / *cosine : *sinc;
-}
 
 /* The scale of a ray, and whether it is covered: optics' `margin` > 0 */
 INLINE R T(scale)(const T(Chart) k, const int way, R x, R y, R z, I *ok) {
@@ -148,14 +126,6 @@ INLINE R T(scale)(const T(Chart) k, const int way, R x, R y, R z, I *ok) {
         const R below = T(sum_of)(z, T(root)(square), difference);
         *ok = (FARTHEST / 2 * below - far > 0) & (square > 0);
         return 2 / below;
-    }
-    case LINEARITY: {
-        const R angle = T(angle_per_radius)(rho2, z), turned = k.omega * angle, t = turned * turned * rho2;
-        const R limit = (R)(PI / 2) - 1 / (R)FARTHEST;
-        const I inside = ((z > 0) | (rho2 > FLOOR / EPS)) & (limit - T(absolute)(turned) * T(root)(rho2) > 0);
-        R sine, cosine;
-        *ok = inside;
-        return angle * T(stretched)(k.omega, inside ? t : 0, &sine, &cosine);
     }
     default: /* EQUIDISTANT, and the angle of an INVERTED chart */
         *ok = (z > 0) | (rho2 > FLOOR / EPS);
@@ -215,15 +185,6 @@ INLINE void T(scale_slopes)(const T(Chart) k, const int way, R x, R y, R z, R s,
     case ONE_DIVISION: {
         const R root = T(root)(z * z - 4 * k.k * rho2);
         *along = -s / root, *out = 2 * k.k * s * s / root;
-        break;
-    }
-    case LINEARITY: {
-        /* the radius grows by the angle as the square of one over the cosine, or as the cosine */
-        const R turned = k.omega * T(angle_per_radius)(rho2, z);
-        R sine, cosine;
-        T(stretched)(k.omega, turned * turned * rho2, &sine, &cosine);
-        *along = -(k.omega > 0 ? 1 / (cosine * cosine) : cosine) / (rho2 + z * z);
-        *out = -(*along * z + s) / (rho2 + FLOOR);
         break;
     }
     default:
@@ -286,19 +247,6 @@ static void T(to_plane_sums)(const T(Camera) *c, int n, const R *restrict x, con
         }
         *sums += T(total)(n, w);
         break;
-    case LINEARITY: /* r / theta is a function of w = L theta, w times whose derivative is that by L times L */
-        EACH(i) {
-            const R rho2 = x[i] * x[i] + y[i] * y[i], angle = T(angle_per_radius)(rho2, z[i]), turned = k.omega * angle;
-            R sine, cosine;
-            T(stretched)(k.omega, turned * turned * rho2, &sine, &cosine);
-            const R by_angle = k.omega > 0 ? 1 / (cosine * cosine) : cosine;
-            const R t2 = turned * turned * rho2, even = k.omega > 0 ? (R)(2 / 3.0) : (R)(-1 / 3.0);
-            const R next = k.omega > 0 ? (R)(8 / 15.0) : (R)(1 / 30.0), last = k.omega > 0 ? (R)(34 / 105.0) : (R)(-1 / 840.0);
-            const R bend = t2 < (R)1e-3 ? even + t2 * (next + t2 * last) : (by_angle - s[i] / angle) / t2;
-            w[i] = (ga[i] * x[i] + gb[i] * y[i]) * angle * bend * turned * angle * rho2;
-        }
-        *sums += T(total)(n, w);
-        break;
     case INVERTED: /* d(scale) = -scale dR / (R + 2 t R') */
         EACH(i) {
             t[i] = (x[i] * x[i] + y[i] * y[i]) * s[i] * s[i];
@@ -340,11 +288,6 @@ INLINE I T(on_plane)(const T(Chart) k, const int way, R a, R b) {
     case ONE_DIVISION: return (1 - 2 * (R)NEAR_SIDE - k.k * r2 > 0) & (FARTHEST / 2 - far > 0);
     case CYLINDER: return (half_turn - T(absolute)(a) > 0) & (FARTHEST - T(absolute)(b) > 0);
     case SPHERE: return (half_turn - T(absolute)(a) > 0) & ((R)(PI / 2) - T(absolute)(b) > 0);
-    case LINEARITY: {
-        const R square = k.omega * k.omega * r2, left = k.omega > 0 ? 1 : 1 - square;
-        const R theta = T(root)(r2) * T(angle_per_radius)(square, T(root)(left > 0 ? left : 0));
-        return ((R)PI * (1 - 64 * EPS) - theta > 0) & (left - 64 * EPS > 0) & (FARTHEST / 2 - far > 0);
-    }
     case INVERTED: return 1; /* see `cover` */
     default: return (R)(PI * PI) - r2 > 0;
     }
@@ -392,19 +335,6 @@ INLINE void T(turned)(const T(Chart) k, const int way, R r2, R *s, R *z, R *ds, 
             const R by_length =
                 -length * length * length * (across * across + r2 * across * by_across + cosine * by_cosine);
             *ds = by_across * length + across * by_length, *dz = by_cosine * length + cosine * by_length;
-        }
-        break;
-    }
-    case LINEARITY: {
-        const R square = k.omega * k.omega * r2, left = k.omega > 0 ? 1 : T(root)(1 - square);
-        const R factor = T(angle_per_radius)(square, left), angle2 = factor * factor * r2;
-        R sine, cosine;
-        T(turn)(angle2, &sine, &cosine);
-        *s = factor * sine, *z = cosine;
-        if (ds) {
-            /* d(theta)/dr, and twice the derivatives by r^2 */
-            const R by_r = k.omega > 0 ? 1 / (1 + square) : 1 / left, along = factor * by_r;
-            *ds = (cosine * by_r - *s) / (r2 + FLOOR), *dz = -sine * along;
         }
         break;
     }
@@ -483,21 +413,6 @@ static void T(to_ray_sums)(const T(Camera) *c, int n, const R *restrict a, const
             const R by_length = -length * length * length * (r2 * across * by_across + cosine * by_cosine);
             w[i] = (gx[i] * a[i] + gy[i] * b[i]) * (by_across * length + across * by_length) +
                    gz[i] * (by_cosine * length + cosine * by_length);
-        }
-        *sums += T(total)(n, w);
-        break;
-    case LINEARITY: /* theta is a function of L r over L */
-        EACH(i) {
-            const R r2 = a[i] * a[i] + b[i] * b[i], square = k.omega * k.omega * r2;
-            const R left = k.omega > 0 ? 1 : T(root)(1 - square), factor = T(angle_per_radius)(square, left);
-            R sine, cosine;
-            T(turn)(factor * factor * r2, &sine, &cosine);
-            const R by_r = k.omega > 0 ? 1 / (1 + square) : 1 / left;
-            const R by_angle = (gx[i] * a[i] + gy[i] * b[i]) * cosine - gz[i] * factor * sine * r2;
-            const R even = k.omega > 0 ? (R)(-2 / 3.0) : (R)(1 / 3.0), next = k.omega > 0 ? (R)0.8 : (R)0.3;
-            const R last = k.omega > 0 ? (R)(-6 / 7.0) : (R)(15 / 56.0);
-            const R bend = square < (R)1e-3 ? even + square * (next + square * last) : (by_r - factor) / square;
-            w[i] = by_angle * bend * k.omega * r2;
         }
         *sums += T(total)(n, w);
         break;

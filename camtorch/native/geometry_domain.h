@@ -355,187 +355,6 @@ static void put(void *to, int64_t at, double value, int is_double) {
 
 #include "geometry_azimuths.h"
 
-/* -- surfaces */
-
-/* Whether a piece of a surface is regular, whose control points begin there: its slopes lie between those of the lines from
-   control point to control point */
-static int is_regular(const Part *part, const double *k, const double *at) {
-    double ua = INFINITY, vb = INFINITY, ub = 0, va = 0, all = 0;
-    for (int j = 0; j <= part->flags; j++)
-        for (int i = 0; i <= part->flags; i++) {
-            const double *here = at + 2 * ((int64_t)j * part->n + i), *below = here + 2 * (int64_t)part->n;
-            if (i < part->flags) {
-                const double by_a = 1 + (here[2] - here[0]) * k[0], side = fabs(here[3] - here[1]) * k[0];
-                ua = by_a < ua ? by_a : ua, va = side > va ? side : va, all += by_a + side;
-            }
-            if (j < part->flags) {
-                const double by_b = 1 + (below[1] - here[1]) * k[1], side = fabs(below[0] - here[0]) * k[1];
-                vb = by_b < vb ? by_b : vb, ub = side > ub ? side : ub, all += by_b + side;
-            }
-        }
-    /* what is not a number is in all of them */
-    return all == all && ua > 0 && vb > 0 && ua * vb - ub * va > 0.01;
-}
-
-/* Of each piece, whether the surface is regular there and all the way from the centre */
-static void certain_of(const Camera_double *c, uint8_t *certain) {
-    const Part *part = c->parts + c->stages;
-    const double *k = c->numbers[c->stages];
-    const int across = part->n - part->flags, down = part->m - part->flags;
-    double unused;
-    const int first = piece_double(pieces_on_double(c), 0, 0, &unused, &unused), first_i = first % across, first_j = first / across;
-    for (int by_j = -1; by_j <= 1; by_j += 2)
-        for (int by_i = -1; by_i <= 1; by_i += 2)
-            for (int j = first_j; j >= 0 && j < down; j += by_j)
-                for (int i = first_i; i >= 0 && i < across; i += by_i) {
-                    const int here = j * across + i, before = i == first_i || certain[here - by_i];
-                    certain[here] = before && (j == first_j || certain[here - by_j * across]) &&
-                                    is_regular(part, k, k + 4 + 2 * (j * part->n + i));
-                }
-}
-
-/* Whether a surface is regular on squares of an eighth of a cell in a row, the first of which has its middle there: by how
-   much slopes change at the most */
-static int is_regular_along(const Camera_double *c, double bend, int axis, int count, double a, double b) {
-    const double *k = c->numbers[c->stages], step = 0.125 / k[axis], change = bend * hypot(0.0625 / k[0], 0.0625 / k[1]);
-    ALIGNED double x[BLOCK], y[BLOCK], u[BLOCK], v[BLOCK];
-    Jacobian_double to;
-    int ok = 1;
-    for (int first = 0; first < count; first += BLOCK) {
-        for (int i = 0; i < BLOCK; i++) {
-            const double far = step * (first + i < count ? first + i : count - 1);
-            x[i] = axis ? a : a + far, y[i] = axis ? b + far : b;
-        }
-        stage_double(c, c->stages, BLOCK, x, y, u, v, &to);
-        for (int i = 0; i < BLOCK; i++) {
-            const double ua = to.ua[i], ub = to.ub[i], va = to.va[i], vb = to.vb[i];
-            ok &= ua - change > 0 && vb - change > 0 && ua * vb - ub * va - change * sqrt(ua * ua + ub * ub + va * va + vb * vb) > 0;
-        }
-    }
-    return ok;
-}
-
-/* (4) of a box in which a surface is regular: its middle, and in cells how far it goes across and down. Of all pieces, less
-   at each turn the row or column at its rim that has most others, and then with a part of these */
-static void box_of(const Camera_double *c, const uint8_t *certain, double *box) {
-    const Part *part = c->parts + c->stages;
-    const double *k = c->numbers[c->stages], bend = bend_of_double(part, k);
-    const int size[2] = {part->n - part->flags, part->m - part->flags};
-    int ends[2][2] = {{0, size[0]}, {0, size[1]}}, counts[4], worst = 0; /* left and right, top and bottom */
-    do {
-        memset(counts, 0, sizeof counts);
-        for (int side = 0; side < 4; side++) {
-            const int axis = side / 2, line = ends[axis][side % 2] - side % 2;
-            for (int i = ends[!axis][0]; i < ends[!axis][1]; i++) counts[side] += !certain[axis ? line * size[0] + i : i * size[0] + line];
-            worst = counts[side] > counts[worst] ? side : worst;
-        }
-        if (counts[worst]) ends[worst / 2][worst % 2] += worst % 2 ? -1 : 1;
-    } while (counts[worst] && ends[worst / 2][0] < ends[worst / 2][1]);
-    double found[2][2];
-    for (int side = 0; side < 4; side++) found[side / 2][side % 2] = ends[side / 2][side % 2] - size[side / 2] / 2.0;
-    for (int side = 0; side < 4 && !counts[worst]; side++) {
-        const int axis = side / 2, other = !axis, is_last = side % 2;
-        const double outwards = is_last ? 0.125 : -0.125;
-        double *end = found[axis] + is_last, place[2];
-        for (; fabs(*end) < size[axis] / 2.0; *end += outwards) {
-            place[axis] = *end + outwards / 2, place[other] = found[other][0] + 0.0625;
-            const int count = (int)(8 * (found[other][1] - found[other][0]));
-            if (!is_regular_along(c, bend, other, count, k[2] + place[0] / k[0], k[3] + place[1] / k[1])) break;
-        }
-    }
-    for (int axis = 0; axis < 2; axis++) {
-        box[axis] = k[2 + axis] + (found[axis][0] + found[axis][1]) / 2 / k[axis];
-        box[2 + axis] = (found[axis][1] - found[axis][0]) / 2 - 1e-4; /* that rounding carries nothing out of */
-    }
-}
-
-/* (PIECE of each piece): a surface as polynomials of the place in a piece: of each power of that down, those of that across
-   in the order 0, 2, 1, 3 */
-static void pieces_of(const Part *part, const double *k, void *pieces, int64_t at, int is_double) {
-    static const int place[4] = {0, 2, 1, 3};
-    const double(*powers)[8] = powers_of_double[part->flags == 3 ? 0 : 1];
-    for (int j = 0; j < part->m - part->flags; j++)
-        for (int i = 0; i < part->n - part->flags; i++, at += PIECE) {
-            double made[4][8] = {{0}};
-            for (int row = 0; row <= part->flags; row++) {
-                const double *from = k + 4 + 2 * ((int64_t)(j + row) * part->n + i);
-                double across[8];
-                for (int p = 0; p < 4; p++)
-                    for (int axis = 0; axis < 2; axis++) {
-                        double sum = 0;
-                        for (int column = 0; column <= part->flags; column++)
-                            sum += powers[place[p]][2 * column] * from[2 * column + axis];
-                        across[2 * p + axis] = sum;
-                    }
-                for (int q = 0; q < 4; q++)
-                    for (int p = 0; p < 8; p++) made[q][p] += powers[q][2 * row] * across[p];
-            }
-            for (int p = 0; p < PIECE; p++) put(pieces, at + p, made[p / 8][p % 8], is_double);
-        }
-}
-
-/* (START): the inverse of the last stage, a surface, on the box around what it sends its regular box to. First where
-   the cells are, as of a surface. Of each cell its middle; slopes across and down; by how much these change across; and
-   down */
-static void start_of(const Domain *d, int64_t camera, const uint8_t *certain) {
-    enum { SIDE = GRID + 4 }; /* the middles of cells, and two around: whole vectors */
-    Camera_double c;
-    lens_of(d, camera, &c);
-    const Part *part = c.parts + c.stages;
-    const double *k = c.numbers[c.stages];
-    ALIGNED double a[BLOCK], b[BLOCK], u[BLOCK], v[BLOCK], box[4];
-    ALIGNED int64_t ok[BLOCK];
-    double low[2] = {INFINITY, INFINITY}, high[2] = {-INFINITY, -INFINITY}, found[2][SIDE][SIDE], start[CELL] = {0};
-    box_of(&c, certain, box);
-    if (!(box[2] > 0 && box[3] > 0)) box[0] = k[2], box[1] = k[3], box[2] = part->n / 2.0, box[3] = part->m / 2.0;
-    for (int j = 0; j < SIDE; j++) {
-        for (int i = 0; i < SIDE; i++)
-            a[i] = box[0] + (2 * i / (SIDE - 1.0) - 1) * box[2] / k[0], b[i] = box[1] + (2 * j / (SIDE - 1.0) - 1) * box[3] / k[1];
-        stage_double(&c, c.stages, SIDE, a, b, u, v, NULL);
-        for (int i = 0; i < SIDE; i++) {
-            low[0] = u[i] < low[0] ? u[i] : low[0], high[0] = u[i] > high[0] ? u[i] : high[0];
-            low[1] = v[i] < low[1] ? v[i] : low[1], high[1] = v[i] > high[1] ? v[i] : high[1];
-        }
-    }
-    for (int axis = 0; axis < 2; axis++) {
-        const int is_box = low[axis] < high[axis];
-        start[axis] = GRID / (is_box ? high[axis] - low[axis] : 2 * box[2 + axis] / k[axis]);
-        start[2 + axis] = is_box ? (low[axis] + high[axis]) / 2 : k[2 + axis];
-    }
-    for (int i = 0; i < CELL; i++) put(d->start, camera * START + i, start[i], (int)d->is_double);
-    for (int j = 0; j < SIDE; j++) {
-        for (int i = 0; i < SIDE; i++) {
-            u[i] = start[2] + (i - (SIDE - 1) / 2.0) / start[0], v[i] = start[3] + (j - (SIDE - 1) / 2.0) / start[1];
-            if (j) a[i] = found[0][j - 1][i], b[i] = found[1][j - 1][i] + 1 / start[1]; /* as in the row before */
-        }
-        if (!j) start_double(&c, c.stages, SIDE, u, v, a, b);
-        newton_double(&c, c.stages, SIDE, u, v, a, b, ok, 1);
-        for (int i = 0; i < SIDE; i++) {
-            found[0][j][i] = ok[i] ? a[i] : u[i], found[1][j][i] = ok[i] ? b[i] : v[i];
-        }
-    }
-    for (int j = 2; j < SIDE - 2; j++)
-        for (int i = 2; i < SIDE - 2; i++) {
-            double made[CELL] = {0};
-            for (int axis = 0; axis < 2; axis++) {
-                const double *f = &found[axis][j][i], *over = f - SIDE, *under = f + SIDE;
-                const double right = f[1] - f[-1], below = under[0] - over[0];
-                /* of thirds, which are left out, what is least without them */
-                const double third = (f[2] - f[-2]) / 2 - right, down = (f[2 * SIDE] - f[-2 * SIDE]) / 2 - below;
-                const double mixed = (under[1] - under[-1]) / 2 - right + (over[1] - over[-1]) / 2;
-                const double other = (under[1] - over[1]) / 2 - below + (under[-1] - over[-1]) / 2;
-                const double turn = (under[1] - under[-1] - over[1] + over[-1]) / 8;
-                made[axis] = f[0];
-                made[4 + axis] = right / 2 - third * (1 / 6.0 - 1 / 32.0) + mixed / 16;
-                made[6 + axis] = below / 2 - down * (1 / 6.0 - 1 / 32.0) + other / 16;
-                made[8 + axis] = (f[1] - 2 * f[0] + f[-1]) / 2, made[14 + axis] = (under[0] - 2 * f[0] + over[0]) / 2;
-                made[10 + axis] = made[12 + axis] = turn;
-            }
-            for (int p = 0; p < CELL; p++)
-                put(d->start, camera * START + CELL * (1 + (j - 2) * GRID + i - 2) + p, made[p], (int)d->is_double);
-        }
-}
-
 /* Fills in what of a `Domain` is wanted */
 void THIS(domain)(const Domain *d) {
     const int is_double = (int)d->is_double;
@@ -545,8 +364,8 @@ void THIS(domain)(const Domain *d) {
         Lens lens = {d, first, numbers + numbers_of(d->parts), d->constants + c * d->constant_count};
         Part factor;
         if (d->is_chart) {
-            factor = d->parts[0], factor.kind = PLANAR, factor.flags = factor.map = 0;
-            lens.part = &factor, lens.numbers = numbers + numbers_of_map(d->parts);
+            factor = d->parts[0], factor.kind = PLANAR, factor.flags = 0;
+            lens.part = &factor, lens.numbers = numbers;
         }
         double fold = 0, table[2 + 2 * NODES];
         const int has_factor = lens.part->factor != NO_FACTOR;
@@ -580,19 +399,6 @@ void THIS(domain)(const Domain *d) {
             lens_of(d, c, &camera);
             follow(d, c, &camera, has_factor ? fold : NAN, end);
         }
-        const Part *last = d->parts + d->part_count - 1;
-        if (d->certain) {
-            Camera_double camera;
-            uint8_t *certain = d->certain + c * last->n * last->m;
-            lens_of(d, c, &camera);
-            certain_of(&camera, certain);
-            double box[BOX] = {within(has_factor ? fold : end, end, is_double)};
-            if (d->certain2) box_of(&camera, certain, box + 1);
-            for (int i = 0; d->certain2 && i < BOX; i++) put(d->certain2, BOX * c + i, box[i], is_double);
-        }
-        const double *controls = numbers + d->parameter_count - numbers_of(last);
-        if (d->pieces) pieces_of(last, controls, d->pieces, c * PIECE * (last->n - last->flags) * (last->m - last->flags), is_double);
-        if (d->start) start_of(d, c, d->certain + c * last->n * last->m);
         if (d->table && has_factor) {
             tabulate(&lens, fold, usual_end, table);
             for (int i = 0; i < 2 + 2 * NODES; i++) put(d->table, c * (2 + 2 * NODES) + i, table[i], is_double);

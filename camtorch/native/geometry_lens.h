@@ -255,223 +255,56 @@ INLINE void T(adjugate)(const R *k, R *m) {
         }
 }
 
-/* Points in their cells: where their 4 x 4 control points begin, the place along a, whether of order 2 these are the last
-   of a row, the weights of rows and, if wanted, how much these change from row to row. Of order 2 the fourth row, or at the
-   end the first, has no part */
-typedef struct {
-    ALIGNED R x[BLOCK], y[4][BLOCK], by_y[4][BLOCK];
-    ALIGNED I is_last[BLOCK];
-    ALIGNED int32_t at[BLOCK];
-} T(Cells);
-
-/* The place in a cell of a place in cells, the first of four control points, and whether of order 2 they are the last ones */
-INLINE void T(place)(const int order, int n, R size, R *restrict w, I *restrict first, I *restrict is_last) {
-    const R half = order == 3 ? 0 : (R)0.5, most = size - (R)order;
-    EACH(i) {
-        R cell = T(whole)(w[i] + half);
-        cell = cell > 1 ? cell : 1, cell = cell < most ? cell : most;
-        is_last[i] = (order == 2) & (cell >= size - 2);
-        w[i] -= cell, first[i] = (I)cell - 1 - is_last[i];
+/* Along one axis of a surface: the weights of the order + 1 control points that have a part in a point, by how much these
+   change from cell to cell, and the first of the points. w: the place in cells, from the first control point on */
+INLINE int64_t T(spline)(const int order, int size, R w, R *restrict weight, R *restrict slope) {
+    const R last = (R)(size - order);
+    R cell = T(whole)(order == 3 ? w : w + (R)0.5);
+    cell = cell > 1 ? cell : 1, cell = cell < last ? cell : last;
+    const R x = w - cell, xx = x * x, y = 1 - x;
+    if (order == 3) {
+        weight[0] = y * y * y / 6, weight[1] = (x / 2 - 1) * xx + (R)(2 / 3.0);
+        weight[2] = ((1 - x) * x + 1) * x / 2 + (R)(1 / 6.0), weight[3] = xx * x / 6;
+        slope[0] = -y * y / 2, slope[1] = ((R)1.5 * x - 2) * x;
+        slope[2] = (R)0.5 + (1 - (R)1.5 * x) * x, slope[3] = xx / 2;
+    } else {
+        weight[0] = (xx - x) / 2 + (R)0.125, weight[1] = (R)0.75 - xx, weight[2] = (xx + x) / 2 + (R)0.125;
+        slope[0] = x - (R)0.5, slope[1] = -2 * x, slope[2] = x + (R)0.5;
     }
+    return (int64_t)cell - 1;
 }
 
-INLINE void T(weigh)(const int order, int n, const I *restrict is_last, R (*restrict w)[BLOCK], R (*restrict by)[BLOCK]) {
-    EACH(i) { /* w[0]: the place in a cell */
-        const R x = w[0][i], xx = x * x, y = 1 - x;
-        if (order == 3) {
-            w[0][i] = y * y * y * (R)(1 / 6.0), w[1][i] = (x / 2 - 1) * xx + (R)(2 / 3.0);
-            w[2][i] = ((1 - x) * x + 1) * x / 2 + (R)(1 / 6.0), w[3][i] = xx * x * (R)(1 / 6.0);
-            if (by) by[0][i] = -y * y / 2, by[1][i] = ((R)1.5 * x - 2) * x, by[2][i] = (R)0.5 + (1 - (R)1.5 * x) * x, by[3][i] = xx / 2;
-        } else {
-            const I last = is_last[i];
-            const R p = (xx - x) / 2 + (R)0.125, q = (R)0.75 - xx, r = (xx + x) / 2 + (R)0.125, s = x - (R)0.5, t = x + (R)0.5;
-            w[0][i] = last ? 0 : p, w[1][i] = last ? p : q, w[2][i] = last ? q : r, w[3][i] = last ? r : 0;
-            if (by) by[0][i] = last ? 0 : s, by[1][i] = last ? s : -2 * x, by[2][i] = last ? -2 * x : t, by[3][i] = last ? t : 0;
-        }
-    }
-}
-
-INLINE void T(cells_of)(const Part *part, const R *k, const int order, const int slopes, int n, const R *restrict a,
-                        const R *restrict b, T(Cells) *restrict c) {
-    const R columns = (R)part->n, rows = (R)part->m, sa = k[0], sb = k[1], ca = k[2], cb = k[3];
-    ALIGNED I i_first[BLOCK], j_first[BLOCK], is_last[BLOCK];
-    EACH(i) c->x[i] = (a[i] - ca) * sa + (columns - 1) / 2, c->y[0][i] = (b[i] - cb) * sb + (rows - 1) / 2;
-    T(place)(order, n, columns, c->x, i_first, c->is_last), T(place)(order, n, rows, c->y[0], j_first, is_last);
-    T(weigh)(order, n, is_last, c->y, slopes ? c->by_y : NULL);
-    EACH(i) c->at[i] = (int32_t)(2 * (j_first[i] * part->n + i_first[i]));
-}
-
-static void T(cells)(const Part *part, const R *k, int n, const R *restrict a, const R *restrict b, T(Cells) *restrict c) {
-    if (part->flags == 3) T(cells_of)(part, k, 3, 0, n, a, b, c);
-    else T(cells_of)(part, k, 2, 0, n, a, b, c);
-}
-
-/* Weights of four columns, of du and dv each, by powers of the place in a cell: of order 3, of order 2, and of that at the
-   end of a row */
-static const ALIGNED R T(powers_of)[3][4][8] = {
-    {{1 / 6.0, 1 / 6.0, 2 / 3.0, 2 / 3.0, 1 / 6.0, 1 / 6.0, 0, 0}, {-0.5, -0.5, 0, 0, 0.5, 0.5, 0, 0},
-     {0.5, 0.5, -1, -1, 0.5, 0.5, 0, 0}, {-1 / 6.0, -1 / 6.0, 0.5, 0.5, -0.5, -0.5, 1 / 6.0, 1 / 6.0}},
-    {{0.125, 0.125, 0.75, 0.75, 0.125, 0.125, 0, 0}, {-0.5, -0.5, 0, 0, 0.5, 0.5, 0, 0}, {0.5, 0.5, -1, -1, 0.5, 0.5, 0, 0}},
-    {{0, 0, 0.125, 0.125, 0.75, 0.75, 0.125, 0.125}, {0, 0, -0.5, -0.5, 0, 0, 0.5, 0.5}, {0, 0, 0.5, 0.5, -1, -1, 0.5, 0.5}},
-};
-
-INLINE R T(weight)(const R (*restrict k)[8], const int order, const int column, R x, R *slope) {
-    R value = k[2][column], by_x = value;
-    if (order == 3) value += k[3][column] * x, by_x = value + k[3][column] * x;
-    value = value * x + k[1][column];
-    if (slope) *slope = by_x * x + value;
-    return value * x + k[0][column];
-}
-
-INLINE void T(halves)(const R *restrict eight, R *restrict four) {
-    KEPT_LOOP for (int j = 0; j < 4; j++) four[j] = eight[j] + eight[j + 4];
+/* The weights and slopes of a point of a surface along both axes; where in the surface its control points begin */
+INLINE int64_t T(patch)(const Part *part, const R *k, const int order, R a, R b, R (*restrict weight)[4],
+                        R (*restrict slope)[4]) {
+    const R place_a = (a - k[2]) * k[0] + (R)(part->n - 1) / 2, place_b = (b - k[3]) * k[1] + (R)(part->m - 1) / 2;
+    const int64_t column = T(spline)(order, part->n, place_a, weight[0], slope[0]);
+    return 2 * (T(spline)(order, part->m, place_b, weight[1], slope[1]) * part->n + column);
 }
 
 INLINE void T(surface_of)(const Part *part, const R *k, const int order, int n, const R *restrict a, const R *restrict b,
                           R *restrict u, R *restrict v, T(Jacobian) *restrict to) {
-    T(Cells) c;
-    ALIGNED R sums[4 * BLOCK], by_a[4 * BLOCK], by_b[4 * BLOCK];
-    ALIGNED R made[8], across[8], down[8];
-    const int64_t width = 2 * (int64_t)part->n;
-    const R sa = k[0], sb = k[1], *restrict controls = k + 4;
-    T(cells_of)(part, k, order, to != NULL, n, a, b, &c);
+    const int width = 2 * (order + 1); /* du and dv of a row of control points */
     for (int i = 0; i < n; i++) {
-        const R *restrict row = controls + c.at[i], x = c.x[i];
-        const R p = c.y[0][i], q = c.y[1][i], r = c.y[2][i], s = c.y[3][i];
-        const R(*restrict powers)[8] = T(powers_of)[order == 3 ? 0 : 1 + c.is_last[i]];
-        if (!to) {
-            KEPT_LOOP for (int j = 0; j < 8; j++)
-                made[j] = ((p * row[j] + q * row[width + j]) + (r * row[2 * width + j] + s * row[3 * width + j])) *
-                          T(weight)(powers, order, j, x, NULL);
-            T(halves)(made, sums + 4 * i);
-            continue;
+        R weight[2][4], slope[2][4], line[8] = {0}, change[8] = {0}, sum[2] = {0}, by_a[2] = {0}, by_b[2] = {0};
+        const R *at = k + 4 + T(patch)(part, k, order, a[i], b[i], weight, slope);
+        for (int q = 0; q <= order; q++, at += 2 * part->n)
+            for (int j = 0; j < width; j++) line[j] += weight[1][q] * at[j], change[j] += slope[1][q] * at[j];
+        for (int j = 0; j < width; j++) {
+            sum[j % 2] += weight[0][j / 2] * line[j];
+            by_a[j % 2] += slope[0][j / 2] * line[j], by_b[j % 2] += weight[0][j / 2] * change[j];
         }
-        const R dp = c.by_y[0][i], dq = c.by_y[1][i], dr = c.by_y[2][i], ds = c.by_y[3][i];
-        KEPT_LOOP for (int j = 0; j < 8; j++) {
-            const R first = row[j], second = row[width + j], third = row[2 * width + j], fourth = row[3 * width + j];
-            const R sum = (p * first + q * second) + (r * third + s * fourth);
-            R slope;
-            const R weight = T(weight)(powers, order, j, x, &slope);
-            made[j] = sum * weight, across[j] = sum * slope;
-            down[j] = ((dp * first + dq * second) + (dr * third + ds * fourth)) * weight;
-        }
-        T(halves)(made, sums + 4 * i), T(halves)(across, by_a + 4 * i), T(halves)(down, by_b + 4 * i);
-    }
-    EACH(i) u[i] = a[i] + (sums[4 * i] + sums[4 * i + 2]), v[i] = b[i] + (sums[4 * i + 1] + sums[4 * i + 3]);
-    if (!to) return;
-    EACH(i) {
-        to->ua[i] = (by_a[4 * i] + by_a[4 * i + 2]) * sa + 1, to->va[i] = (by_a[4 * i + 1] + by_a[4 * i + 3]) * sa;
-        to->ub[i] = (by_b[4 * i] + by_b[4 * i + 2]) * sb, to->vb[i] = (by_b[4 * i + 1] + by_b[4 * i + 3]) * sb + 1;
+        u[i] = a[i] + sum[0], v[i] = b[i] + sum[1];
+        if (!to) continue;
+        to->ua[i] = 1 + by_a[0] * k[0], to->va[i] = by_a[1] * k[0];
+        to->ub[i] = by_b[0] * k[1], to->vb[i] = 1 + by_b[1] * k[1];
     }
 }
 
-static void T(surface)(const Part *part, const R *k, int n, const R *restrict a, const R *restrict b, R *restrict u,
-                       R *restrict v, T(Jacobian) *restrict to) {
-    if (part->flags == 3) {
-        if (to) T(surface_of)(part, k, 3, n, a, b, u, v, to);
-        else T(surface_of)(part, k, 3, n, a, b, u, v, NULL);
-    } else if (to) T(surface_of)(part, k, 2, n, a, b, u, v, to);
-    else T(surface_of)(part, k, 2, n, a, b, u, v, NULL);
-}
-
-/* By how much the slopes of a surface, along a line, change at the most on a unit: second derivatives of a spline lie
-   between the second differences of its control points */
-static R T(bend_of)(const Part *part, const R *k) {
-    const int64_t row = 2 * (int64_t)part->n;
-    R sum = 0;
-    for (int axis = 0; axis < 2; axis++) {
-        R along = 0, mixed = 0;
-        for (int j = 0; j < part->m; j++)
-            for (int i = 0; i < part->n; i++) {
-                const R *at = k + 4 + row * j + 2 * i + axis;
-                if (i > 1) along = T(most)(along, T(absolute)(at[0] - 2 * at[-2] + at[-4]));
-                if (j > 1) along = T(most)(along, T(absolute)(at[0] - 2 * at[-row] + at[-2 * row]));
-                if (i && j) mixed = T(most)(mixed, T(absolute)(at[0] - at[-2] - at[-row] + at[-row - 2]));
-            }
-        sum += (along + mixed) * (along + mixed);
-    }
-    return T(root)(sum) * T(most)(k[0] * k[0], k[1] * k[1]);
-}
-
-/* The pieces of a surface, the last stage, by value */
-typedef struct {
-    R sa, sb, ca, cb, middle_a, middle_b, half, last_i, last_j;
-    int32_t across;
-} T(Pieces);
-
-INLINE T(Pieces) T(pieces_on)(const T(Camera) *c) {
-    const Part *part = c->parts + c->stages;
-    const R *k = c->numbers[c->stages];
-    const int across = part->n - part->flags, down = part->m - part->flags;
-    return (T(Pieces)){k[0], k[1], k[2], k[3], (R)(part->n - 1) / 2, (R)(part->m - 1) / 2, part->flags == 3 ? 0 : (R)0.5,
-                       (R)across, (R)down, across};
-}
-
-/* The piece that a point lies on, or that goes on there, and the place on it */
-INLINE int32_t T(piece)(const T(Pieces) of, R a, R b, R *x, R *y) {
-    const R p = (a - of.ca) * of.sa + of.middle_a, q = (b - of.cb) * of.sb + of.middle_b;
-    R i = T(whole)(p + of.half);
-    R j = T(whole)(q + of.half);
-    i = i > 1 ? i : 1, i = i < of.last_i ? i : of.last_i;
-    j = j > 1 ? j : 1, j = j < of.last_j ? j : of.last_j;
-    *x = p - i, *y = q - j;
-    return ((int32_t)j - 1) * of.across + (int32_t)i - 1;
-}
-
-/* A surface, the last stage, of whose pieces the polynomials are known, see `pieces_of`: of each point the place across and,
-   of the powers 0 and 2 of that, the numbers of the part that is even there; if wanted, of that which is odd, and of the
-   slope down */
-INLINE void T(patches_of)(const T(Camera) *c, const int order, const int slopes, int n, const R *restrict a,
-                          const R *restrict b, R *restrict x, R *restrict low, R *restrict high, R *restrict down) {
-    const T(Pieces) pieces = T(pieces_on)(c);
-    ALIGNED R y[BLOCK];
-    ALIGNED int32_t at[BLOCK];
-    EACH(i) at[i] = T(piece)(pieces, a[i], b[i], x + i, y + i);
-    for (int i = 0; i < n; i++) {
-        const R *restrict piece = c->pieces + (int64_t)PIECE * at[i], p = x[i], q = y[i];
-        ALIGNED R sum[8], slope[8];
-        KEPT_LOOP for (int j = 0; j < 8; j++) {
-            R by = piece[16 + j], w = by;
-            if (order == 3) w += piece[24 + j] * q, by = piece[24 + j] * q + w;
-            w = w * q + piece[8 + j];
-            slope[j] = by * q + w, sum[j] = w * q + piece[j];
-        }
-        KEPT_LOOP for (int j = 0; j < 4; j++) low[4 * i + j] = sum[4 + j] * p + sum[j];
-        if (!slopes) continue;
-        KEPT_LOOP for (int j = 0; j < 4; j++) high[4 * i + j] = sum[4 + j], down[4 * i + j] = slope[4 + j] * p + slope[j];
-    }
-}
-
-INLINE void T(patch)(const R *low, R x, R a, R b, R *u, R *v) {
-    *u = a + (low[2] * x * x + low[0]), *v = b + (low[3] * x * x + low[1]);
-}
-
-INLINE void T(patch_slopes)(const int order, const R *low, const R *high, const R *down, R x, R sa, R sb, R *ua, R *ub, R *va,
-                            R *vb) {
-    const R xx = x * x, p = order == 3 ? high[2] * xx : 0, q = order == 3 ? high[3] * xx : 0;
-    *ua = (p + (2 * x * low[2] + high[0])) * sa + 1, *va = (q + (2 * x * low[3] + high[1])) * sa;
-    *ub = (down[2] * xx + down[0]) * sb, *vb = (down[3] * xx + down[1]) * sb + 1;
-}
-
-INLINE void T(patches_by)(const T(Camera) *c, const int order, int n, const R *restrict a, const R *restrict b, R *restrict u,
-                          R *restrict v, T(Jacobian) *restrict to) {
-    const R *k = c->numbers[c->stages], sa = k[0], sb = k[1];
-    ALIGNED R x[BLOCK], low[4 * BLOCK], high[4 * BLOCK], down[4 * BLOCK];
-    T(patches_of)(c, order, to != NULL, n, a, b, x, low, high, down);
-    EACH(i) T(patch)(low + 4 * i, x[i], a[i], b[i], u + i, v + i);
-    if (!to) return;
-    EACH(i)
-        T(patch_slopes)(order, low + 4 * i, high + 4 * i, down + 4 * i, x[i], sa, sb, to->ua + i, to->ub + i, to->va + i,
-                        to->vb + i);
-}
-
-static WIDE void T(patches)(const T(Camera) *c, int n, const R *restrict a, const R *restrict b, R *restrict u, R *restrict v,
-                            T(Jacobian) *restrict to) {
-    if (c->parts[c->stages].flags == 3) {
-        if (to) T(patches_by)(c, 3, n, a, b, u, v, to);
-        else T(patches_by)(c, 3, n, a, b, u, v, NULL);
-    } else if (to) T(patches_by)(c, 2, n, a, b, u, v, to);
-    else T(patches_by)(c, 2, n, a, b, u, v, NULL);
+static NOT_INLINE void T(surface)(const Part *part, const R *k, int n, const R *restrict a, const R *restrict b,
+                                  R *restrict u, R *restrict v, T(Jacobian) *restrict to) {
+    if (part->flags == 3) T(surface_of)(part, k, 3, n, a, b, u, v, to);
+    else T(surface_of)(part, k, 2, n, a, b, u, v, to);
 }
 
 /* Cells and centre are constants: their sums stay 0 */
@@ -480,20 +313,14 @@ static void T(surface_vjp)(const Part *part, const R *k, int n, const R *restric
     ALIGNED R u[BLOCK], v[BLOCK];
     T(Jacobian) to;
     T(surface)(part, k, n, a, b, u, v, &to);
-    if (sums) {
-        T(Cells) c;
-        T(cells)(part, k, n, a, b, &c);
-        for (int i = 0; i < n; i++) {
-            const R(*powers)[8] = T(powers_of)[part->flags == 3 ? 0 : 1 + c.is_last[i]];
-            for (int p = 0; p < 4; p++) {
-                const R across = T(weight)(powers, part->flags, 2 * p, c.x[i], NULL);
-                for (int q = 0; q < 4; q++) {
-                    double *here = sums + 4 + c.at[i] + 2 * ((int64_t)part->n * q + p);
-                    const R w = c.y[q][i] * across;
-                    here[0] += w * gu[i], here[1] += w * gv[i];
-                }
+    for (int i = 0; sums && i < n; i++) {
+        R weight[2][4], slope[2][4];
+        double *at = sums + 4 + T(patch)(part, k, part->flags, a[i], b[i], weight, slope);
+        for (int q = 0; q <= part->flags; q++, at += 2 * part->n)
+            for (int p = 0; p <= part->flags; p++) {
+                const R w = weight[1][q] * weight[0][p];
+                at[2 * p] += w * gu[i], at[2 * p + 1] += w * gv[i];
             }
-        }
     }
     EACH(i) {
         const R along = gu[i] * to.ua[i] + gv[i] * to.va[i];
@@ -508,22 +335,6 @@ INLINE R T(surface_edge)(const Part *part, const R *k, R behind, R a, R b) {
     return across < down ? across : across == across ? down : -1;
 }
 
-/* What is certain of a surface that is the last stage: up to its edge and a hair behind, no further */
-INLINE T(Edge) T(edge_of)(const T(Camera) *c) {
-    const Part *part = c->parts + c->stages;
-    const R *k = c->numbers[c->stages], behind = (R)1e-4;
-    return (T(Edge)){k[0], k[1], k[2], k[3], (R)(part->n - part->flags) / 2 + behind, (R)(part->m - part->flags) / 2 + behind};
-}
-
-INLINE I T(on_edge)(const T(Edge) e, R a, R b) {
-    return (e.across - T(absolute)((a - e.ca) * e.sa) > 0) & (e.down - T(absolute)((b - e.cb) * e.sb) > 0);
-}
-
-INLINE I T(in_box)(const T(Edge) box, R certain2, R beside2, R a, R b) {
-    const R square = a * a + b * b;
-    return (T(on_edge)(box, a, b) & (certain2 - square > 0)) | (beside2 - square > 0);
-}
-
 static void T(stage)(const T(Camera) *c, int stage, int n, const R *a, const R *b, R *u, R *v, T(Jacobian) *to) {
     const Part *part = c->parts + stage;
     const R *k = c->numbers[stage];
@@ -531,18 +342,8 @@ static void T(stage)(const T(Camera) *c, int stage, int n, const R *a, const R *
     else if (part->kind == SHEAR) {
         EACH(i) u[i] = a[i] + k[1] * b[i], v[i] = b[i] + k[0] * a[i];
         if (to) EACH(i) to->ua[i] = to->vb[i] = 1, to->ub[i] = k[1], to->va[i] = k[0];
-    } else if (part->kind == SURFACE && c->pieces && stage == c->stages) T(patches)(c, n, a, b, u, v, to);
-    else if (part->kind == SURFACE) T(surface)(part, k, n, a, b, u, v, to);
+    } else if (part->kind == SURFACE) T(surface)(part, k, n, a, b, u, v, to);
     else T(planar)(c, stage, n, a, b, u, v, to);
-}
-
-/* Points that are in the domain for certain, of a surface after a radial factor */
-static void T(certain)(const T(Camera) *c, int n, const R *restrict a, const R *restrict b, I *restrict ok) {
-    ALIGNED R x[BLOCK], y[BLOCK];
-    const R certain2 = c->certain2;
-    const T(Edge) box = c->box;
-    T(stage)(c, 1, n, a, b, x, y, NULL);
-    EACH(i) ok[i] = T(on_edge)(box, x[i], y[i]) & (certain2 - (a[i] * a[i] + b[i] * b[i]) > 0);
 }
 
 /* Where the stages from `first` on send points, not in place; the Jacobian of all of them; if wanted, `least`: positive
@@ -595,7 +396,7 @@ static void T(lens_vjp)(const T(Camera) *c, int n, const R *restrict a, const R 
     for (int j = 1; j < c->stages; j++) T(stage)(c, j, n, x[j - 1], y[j - 1], x[j], y[j], NULL);
     for (int j = c->stages; j >= 1; j--) {
         const R *k = c->numbers[j];
-        double *part = sums ? sums + (k - c->map) : NULL;
+        double *part = sums ? sums + (k - c->numbers[0]) : NULL;
         if (c->parts[j].kind == HOMOGRAPHY) T(homography_vjp)(k, n, x[j - 1], y[j - 1], gu, gv, part);
         else if (c->parts[j].kind == SHEAR) {
             if (part) part[0] += T(dot)(n, gv, x[j - 1]), part[1] += T(dot)(n, gu, y[j - 1]);

@@ -10,34 +10,12 @@ static void T(prepare_stage)(T(Camera) *c, int j) {
     if (part->flags & PRISM) plane->s0 = k[0], plane->s1 = k[1], plane->s2 = k[2], plane->s3 = k[3];
 }
 
-/* See `bivariate` */
-static void T(prepare_bent)(T(Camera) *c) {
-    const int counts[2] = {c->parts->across, c->parts->down};
-    const R *numbers = c->map;
-    for (int j = 0; j < 2; numbers += counts[j++])
-        while ((c->orders[j] + 1) * (c->orders[j] + 2) / 2 < counts[j]) c->orders[j]++;
-    const int most = c->orders[0] > c->orders[1] ? c->orders[0] : c->orders[1];
-    c->order = most <= 2 ? 2 : most <= 3 ? 3 : most <= 5 ? 5 : 0, c->bend = 0, numbers = c->map;
-    for (int j = 0; j < 2; j++)
-        for (int q = 0, place = 0; q <= c->orders[j]; q++)
-            for (int p = 0; p <= c->orders[j] - q; p++, numbers++) {
-                const int degree = p + q;
-                R size = T(absolute)(*numbers) * (R)(degree * (degree - 1));
-                for (int k = 2; k < degree; k++) size *= (R)(PI / 2);
-                c->bend += size;
-                if (c->order) c->bent[j][place + p] = *numbers;
-                if (p == c->orders[j] - q) place += c->order + 1 - q;
-            }
-}
-
 static void T(prepare)(const Cameras *all, int64_t camera, T(Camera) *c) {
     const R *numbers = (const R *)all->parameters + camera * all->parameter_count;
     const R *intrinsics = (const R *)all->intrinsics + 4 * camera;
     memset(c, 0, sizeof *c);
     c->parts = all->parts, c->stages = (int)all->part_count - 1;
-    c->map = numbers;
     for (int j = 0; j <= c->stages; j++) c->numbers[j] = numbers, numbers += numbers_of(c->parts + j);
-    c->numbers[0] += numbers_of_map(c->parts);
     c->constants = (const R *)all->constants + camera * all->constant_count;
     c->fx = intrinsics[0], c->fy = intrinsics[1], c->cx = intrinsics[2], c->cy = intrinsics[3];
     c->usable = !all->usable || all->usable[camera];
@@ -49,30 +27,12 @@ static void T(prepare)(const Cameras *all, int64_t camera, T(Camera) *c) {
         c->is_radial = c->stages == 1 && first->kind == PLANAR && !first->flags;
         c->by_stages = all->stagewise && all->stagewise[camera];
         c->follows = !c->is_radial && !c->by_stages;
-        c->is_partial = !all->inner2;
-        c->inner2 = c->usable && all->inner2 ? ((const R *)all->inner2)[camera] : -1;
+        c->inner2 = c->usable ? ((const R *)all->inner2)[camera] : -1;
         c->usual2 = all->usual2 ? ((const R *)all->usual2)[camera] : c->inner2;
         c->circle2 = all->circle2 ? ((const R *)all->circle2)[camera] : 0;
         c->limits2 = all->limits2 ? (const R *)all->limits2 + camera * AZIMUTHS : NULL;
         c->extent = all->extent ? (const R *)all->extent + camera * EXTENT : NULL;
         c->waits = c->follows && !c->extent;
-        if (all->certain) {
-            const Part *last = c->parts + c->stages;
-            const uint8_t *certain = all->certain + camera * last->n * last->m;
-            c->all_certain = 1, c->box = T(edge_of)(c);
-            for (int i = 0; i < (last->n - last->flags) * (last->m - last->flags); i++) c->all_certain &= certain[i];
-            if (all->certain2 && c->follows) {
-                const R *box = (const R *)all->certain2 + BOX * camera;
-                c->has_box = 1, c->is_boxed = c->stages == 1, c->certain2 = box[0], c->beside2 = c->all_certain ? -1 : c->usual2;
-                if (!c->all_certain) c->box.ca = box[1], c->box.cb = box[2], c->box.across = box[3], c->box.down = box[4];
-            }
-        }
-        if (all->pieces) {
-            const Part *last = c->parts + c->stages;
-            c->pieces = (const R *)all->pieces + camera * PIECE * (last->n - last->flags) * (last->m - last->flags);
-            c->curve = T(bend_of)(last, c->numbers[c->stages]);
-        }
-        c->start = all->start ? (const R *)all->start + camera * START : NULL;
         c->table = all->table ? (const R *)all->table + camera * (2 + 2 * NODES) : NULL;
     }
     if (c->parts->kind == INVERTED) {
@@ -80,7 +40,6 @@ static void T(prepare)(const Cameras *all, int64_t camera, T(Camera) *c) {
         c->chart_most2 = ((const R *)all->chart_most2)[camera];
         c->chart_table = (const R *)all->chart_table + camera * (2 + 2 * NODES);
     }
-    if (c->parts->map == BEND) T(prepare_bent)(c);
     T(prepare_chart)(c);
 }
 
@@ -177,8 +136,6 @@ static int T(beyond)(const T(Camera) *c, int count, int n, T(Seen) *s) {
     return waiting;
 }
 
-/* -- the map of rays before a chart, in place; optics/ray_maps.py */
-
 static void T(product)(const R *m, int across, int down, int n, R *restrict x, R *restrict y, R *restrict z) {
     const R a = m[0], b = m[across], c = m[2 * across], d = m[down], e = m[down + across], f = m[down + 2 * across];
     const R g = m[2 * down], h = m[2 * down + across], k = m[2 * (down + across)];
@@ -188,221 +145,11 @@ static void T(product)(const R *m, int across, int down, int n, R *restrict x, R
     }
 }
 
-/* Points times `shrink`, zeros where they are too near to the origin; see `see_by` */
-static void T(shrunk)(int n, R *restrict x, R *restrict y, R *restrict z, R *restrict shrink) {
-    EACH(i) {
-        const R size = T(most)(T(most)(T(absolute)(x[i]), T(absolute)(y[i])), T(absolute)(z[i]));
-        const R factor = size > FLOOR ? T(shrink)(size) : 0;
-        x[i] *= factor, y[i] *= factor, z[i] *= factor, shrink[i] = factor;
-    }
-}
-
 /* The step that a Jacobian sends to (du, dv), some finite one where it is singular; one over its determinant */
 INLINE R T(step)(R ua, R ub, R va, R vb, R du, R dv, R *da, R *db) {
     const R determinant = ua * vb - ub * va, one = determinant / (determinant * determinant + FLOOR);
     *da = (vb * du - ub * dv) * one, *db = (ua * dv - va * du) * one;
     return one;
-}
-
-/* -- a windshield: polynomials of the angles phi = asin(x) and theta = asin(y) */
-
-typedef struct {
-    ALIGNED R phi[BLOCK], theta[BLOCK], p[BLOCK], q[BLOCK], side[BLOCK];
-    T(Jacobian) by; /* of p and q by phi and theta */
-} T(Bent);
-
-/* A polynomial and its derivatives: coefficients of 1, phi, phi^2, ..., then theta (1, phi, ...) and so on */
-INLINE R T(bivariate)(const R *c, const int order, R phi, R theta, R *by_phi, R *by_theta) {
-    const R *row = c + (order + 1) * (order + 2) / 2;
-    R value = 0, along = 0, down = 0;
-    UNROLLED_LOOP for (int size = 1; size <= order + 1; size++) {
-        row -= size;
-        R inner = row[size - 1], slope = 0;
-        UNROLLED_LOOP for (int k = size - 2; k >= 0; k--) slope = slope * phi + inner, inner = inner * phi + row[k];
-        down = down * theta + value, along = along * theta + slope, value = value * theta + inner;
-    }
-    *by_phi = along, *by_theta = down;
-    return value;
-}
-
-/* The polynomials of a windshield where loops of `order` find them */
-typedef struct {
-    R padded[2][BENT];
-    const R *p, *q;
-} T(Shield);
-
-INLINE void T(shield_of)(const T(Camera) *c, T(Shield) *made) {
-    memcpy(made->padded, c->bent, sizeof made->padded);
-    made->p = c->order ? made->padded[0] : c->map, made->q = c->order ? made->padded[1] : c->map + c->parts->across;
-}
-
-/* Adds the sums of phi^i theta^j weight */
-static void T(bivariate_sums)(int count, int n, const R *restrict phi, const R *restrict theta, const R *restrict weight,
-                              double *sums) {
-    ALIGNED R row[BLOCK], term[BLOCK];
-    int size = 1;
-    while (size * (size + 1) / 2 < count) size++;
-    EACH(i) row[i] = weight[i];
-    for (; size > 0; size--) {
-        EACH(i) term[i] = row[i];
-        for (int k = 0; k < size; k++) {
-            *sums++ += T(total)(n, term);
-            EACH(i) term[i] *= phi[i];
-        }
-        EACH(i) row[i] *= theta[i];
-    }
-}
-
-/* z^2 of the ray of angles, and its x and y */
-INLINE R T(ray_of)(R phi, R theta, R *x, R *y) {
-    R sine, cosine, other, unused;
-    T(turn)(phi * phi, &sine, &cosine), T(turn)(theta * theta, &other, &unused);
-    *x = phi * sine, *y = theta * other;
-    return cosine * cosine - *y * *y;
-}
-
-static void T(both)(const T(Camera) *c, int n, T(Bent) *b) {
-    T(Shield) shield;
-    T(shield_of)(c, &shield);
-    EACH_ORDER(c->order, c->orders, EACH(i) {
-        b->p[i] = T(bivariate)(shield.p, across, b->phi[i], b->theta[i], b->by.ua + i, b->by.ub + i);
-        b->q[i] = T(bivariate)(shield.q, down, b->phi[i], b->theta[i], b->by.va + i, b->by.vb + i);
-    })
-}
-
-static void T(angles_of)(int n, const R *restrict x, const R *restrict y, const R *restrict z, T(Bent) *b) {
-    EACH(i) {
-        b->phi[i] = T(atan2)(x[i], T(root)(y[i] * y[i] + z[i] * z[i] + FLOOR));
-        b->theta[i] = T(atan2)(y[i], T(root)(x[i] * x[i] + z[i] * z[i] + FLOOR));
-        b->side[i] = z[i] < 0 ? -1 : 1;
-    }
-}
-
-/* The cotangents of angles of those of their rays, and of rays of those of their angles */
-static void T(ray_of_vjp)(int n, const R *restrict phi, const R *restrict theta, const R *restrict gx,
-                          const R *restrict gy, const R *restrict gz, R *restrict g_phi, R *restrict g_theta) {
-    EACH(i) {
-        R x, y, sine, cosine, other;
-        const R z2 = T(ray_of)(phi[i], theta[i], &x, &y), by_z = gz[i] / T(root)(z2 > FLOOR ? z2 : 1);
-        T(turn)(phi[i] * phi[i], &sine, &cosine), T(turn)(theta[i] * theta[i], &sine, &other);
-        g_phi[i] = cosine * (gx[i] - by_z * x), g_theta[i] = other * (gy[i] - by_z * y);
-    }
-}
-
-static void T(angles_vjp)(int n, const R *restrict x, const R *restrict y, const R *restrict z, const R *restrict g_phi,
-                          const R *restrict g_theta, R *restrict gx, R *restrict gy, R *restrict gz) {
-    EACH(i) {
-        const R xx = x[i] * x[i], yy = y[i] * y[i], zz = z[i] * z[i], one = 1 / (xx + yy + zz);
-        const R s = T(root)(yy + zz + FLOOR), t = T(root)(xx + zz + FLOOR);
-        const R a = g_phi[i] * one, b = g_theta[i] * one, in = a * x[i] / s + b * y[i] / t;
-        gx[i] = a * s - b * y[i] * x[i] / t, gy[i] = b * t - a * x[i] * y[i] / s, gz[i] = -in * z[i];
-    }
-}
-
-/* Unit rays behind the shield to those in front of it; `ok` where there is one */
-static void T(unbend)(const T(Camera) *c, int n, T(Bent) *b, R *restrict x, R *restrict y, R *restrict z, I *restrict ok) {
-    ALIGNED R p[BLOCK], q[BLOCK], area[BLOCK];
-    ALIGNED I done[BLOCK];
-    /* as of `change`, and so far within that rounding carries none across */
-    const R half = (R)(PI / 2), longest = (R)0.5, least = (R)NEAR_SIDE, inner = least + 256 * EPS, bend = c->bend;
-    T(Shield) shield;
-    T(shield_of)(c, &shield);
-    T(angles_of)(n, x, y, z, b);
-    /* from the inverse of the linear part */
-    const R *of_p = c->map, *of_q = c->map + c->parts->across, p0 = of_p[0], q0 = of_q[0];
-    const R ua = c->orders[0] ? of_p[1] : 0, ub = c->orders[0] ? of_p[c->orders[0] + 1] : 0;
-    const R va = c->orders[1] ? of_q[1] : 0, vb = c->orders[1] ? of_q[c->orders[1] + 1] : 0;
-    EACH(i) {
-        R da, db;
-        p[i] = b->phi[i], q[i] = b->theta[i], done[i] = !ok[i];
-        T(step)(ua, ub, va, vb, p[i] - p0, q[i] - q0, &da, &db);
-        b->phi[i] = T(inside)(-half, da, half), b->theta[i] = T(inside)(-half, db, half);
-    }
-    for (int count = 0; count < 13; count++) {
-        I all = 1;
-        EACH_ORDER(c->order, c->orders, EACH(i) {
-            R ua, ub, va, vb, da, db;
-            const R phi = b->phi[i], theta = b->theta[i];
-            const R du = p[i] - T(bivariate)(shield.p, across, phi, theta, &ua, &ub);
-            const R dv = q[i] - T(bivariate)(shield.q, down, phi, theta, &va, &vb), off = T(absolute)(du) + T(absolute)(dv);
-            T(step)(ua, ub, va, vb, du, dv, &da, &db);
-            da = T(inside)(-longest, da, longest), db = T(inside)(-longest, db, longest);
-            const R here = ua * vb - ub * va, size = T(absolute)(da) + T(absolute)(db);
-            const R change = 2 * bend * size * (T(absolute)(ua) + T(absolute)(ub) + T(absolute)(va) + T(absolute)(vb) + bend * size);
-            /* found; or so near that the next step leaves nothing, and changes nothing either */
-            const I was = done[i] != 0, found = off < (count < 12 ? 4 : 64) * EPS;
-            const I next = (4 * EPS - bend * (size * size) > 0) & (here - change - inner > 0);
-            b->phi[i] = was | found ? phi : T(inside)(-half, phi + da, half);
-            b->theta[i] = was | found ? theta : T(inside)(-half, theta + db, half);
-            area[i] = was ? area[i] : here;
-            done[i] = was | found | next, all &= done[i];
-        })
-        if (all) break;
-    }
-    EACH(i) {
-        const R after2 = z[i] * z[i], last = T(most)(T(absolute)(p[i]), T(absolute)(q[i]));
-        const R z2 = T(ray_of)(b->phi[i], b->theta[i], x + i, y + i);
-        ok[i] &= done[i] & (b->side[i] > 0) & (half - last - inner > 0) & (area[i] - inner > 0);
-        ok[i] &= (after2 - inner > 0) & (z2 - (least * least + 256 * EPS) > 0), z[i] = T(root)(z2 > 0 ? z2 : 0);
-    }
-}
-
-static void T(change)(const T(Camera) *c, int n, T(Seen) *s) {
-    if (!c->parts->map) return;
-    T(shrunk)(n, s->x, s->y, s->z, s->shrink);
-    if (c->parts->map == BEND) {
-        T(Bent) b;
-        const R half = (R)(PI / 2), least = (R)NEAR_SIDE;
-        T(angles_of)(n, s->x, s->y, s->z, &b);
-        T(both)(c, n, &b);
-        EACH(i) { /* where the polynomials are regular, and rays ahead before and after */
-            const R x = s->x[i], y = s->y[i], z = s->z[i], p = b.p[i], q = b.q[i], area = b.by.ua[i] * b.by.vb[i] - b.by.ub[i] * b.by.va[i];
-            const R z2 = T(ray_of)(p, q, s->x + i, s->y + i);
-            I ok = (half - T(most)(T(absolute)(p), T(absolute)(q)) - least > 0) & (area - least > 0) & (z2 - least > 0);
-            ok &= (z > 0) & (z * z - least * least * (x * x + y * y + z * z) > 0) & (s->shrink[i] > 0);
-            s->z[i] = ok & (T(absolute)(x + y + z) < 8) ? T(root)(z2) : NAN; /* nor what is not a number */
-        }
-        return;
-    }
-    T(product)(c->map, 1, 3, n, s->x, s->y, s->z);
-}
-
-/* Adds the sums of the products of components, row by row */
-static void T(outer)(int n, const R *x, const R *y, const R *z, const R *p, const R *q, const R *r, double *sums) {
-    const R *rows[] = {x, y, z}, *columns[] = {p, q, r};
-    for (int i = 0; i < 9; i++) sums[i] += T(dot)(n, rows[i / 3], columns[i % 3]);
-}
-
-/* The cotangents of points of those of what they become; adds those of the numbers */
-static void T(change_vjp)(const T(Camera) *c, int n, T(Seen) *s, R *restrict gx, R *restrict gy, R *restrict gz,
-                          double *sums) {
-    T(shrunk)(n, s->x, s->y, s->z, s->shrink);
-    EACH(i) {
-        const int ok = s->ok[i] != 0;
-        s->x[i] = ok ? s->x[i] : 0, s->y[i] = ok ? s->y[i] : 0, s->z[i] = ok ? s->z[i] : 1;
-        s->shrink[i] = ok ? s->shrink[i] : 0;
-    }
-    if (c->parts->map == BEND) {
-        T(Bent) b;
-        ALIGNED R gp[BLOCK], gq[BLOCK];
-        T(angles_of)(n, s->x, s->y, s->z, &b);
-        T(both)(c, n, &b);
-        EACH(i) b.p[i] = s->ok[i] ? b.p[i] : 0, b.q[i] = s->ok[i] ? b.q[i] : 0;
-        T(ray_of_vjp)(n, b.p, b.q, gx, gy, gz, gp, gq);
-        if (sums) {
-            T(bivariate_sums)(c->parts->across, n, b.phi, b.theta, gp, sums);
-            T(bivariate_sums)(c->parts->down, n, b.phi, b.theta, gq, sums + c->parts->across);
-        }
-        EACH(i) {
-            const R p = gp[i], q = gq[i];
-            gp[i] = p * b.by.ua[i] + q * b.by.va[i], gq[i] = p * b.by.ub[i] + q * b.by.vb[i];
-        }
-        T(angles_vjp)(n, s->x, s->y, s->z, gp, gq, gx, gy, gz);
-    } else {
-        if (sums) T(outer)(n, gx, gy, gz, s->x, s->y, s->z, sums);
-        T(product)(c->map, 3, 1, n, gx, gy, gz);
-    }
-    EACH(i) gx[i] *= s->shrink[i], gy[i] *= s->shrink[i], gz[i] *= s->shrink[i];
 }
 
 /* Points of covered rays on the chart's plane, the centre elsewhere; keeps: rays, the axis elsewhere, and their scale too.
@@ -458,19 +205,9 @@ static int T(see)(const T(Camera) *c, int keeps, int count, int n, T(Seen) *s) {
                s->z, s->shrink, s->scale, swapped ? s->b : s->a, swapped ? s->a : s->b, s->ok);
     if (!later) return 0;
     if (c->way == INVERTED) T(see_inverted)(c, keeps, n, s);
-    if (c->is_boxed) {
-        const T(Edge) box = c->box;
-        const R certain2 = c->certain2, beside2 = c->beside2;
-        EACH(i) s->ok[i] += s->ok[i] & !T(in_box)(box, certain2, beside2, s->a[i], s->b[i]), outside |= s->ok[i];
-    } else EACH(i) {
+    EACH(i) {
         s->ok[i] += s->ok[i] & !(inner2 - (s->a[i] * s->a[i] + s->b[i] * s->b[i]) > 0); /* 2: beyond */
         outside |= s->ok[i];
-    }
-    if (outside & 2 && c->has_box && !c->is_boxed) {
-        ALIGNED I certain[BLOCK];
-        T(certain)(c, n, s->a, s->b, certain);
-        outside = 0;
-        EACH(i) s->ok[i] = s->ok[i] == 2 && certain[i] ? 1 : s->ok[i], outside |= s->ok[i];
     }
     if (!(outside & 2) && c->way != INVERTED) return 0;
     if (outside & 2 && c->follows) waiting = T(beyond)(c, count, n, s);
@@ -488,7 +225,6 @@ static int T(see)(const T(Camera) *c, int keeps, int count, int n, T(Seen) *s) {
 
 /* Points `s` to pixels, -1 where they are not `ok`. How many wait for limits */
 static int T(pixels_of)(const T(Camera) *c, int count, int n, T(Seen) *s, R *restrict u, R *restrict v) {
-    T(change)(c, n, s);
     const int waiting = T(see)(c, 0, count, n, s);
     const R fx = c->fx, fy = c->fy, cx = c->cx, cy = c->cy;
     if (c->is_radial) { /* most often */
@@ -543,7 +279,6 @@ static void T(project_vjp)(const T(Camera) *c, const Rows *rows, int64_t camera,
     T(Seen) s;
     ALIGNED R gu[BLOCK], gv[BLOCK], gx[BLOCK], gy[BLOCK], gz[BLOCK], by_angle[BLOCK];
     T(load_points)(points, from, count, n, s.x, s.y, s.z);
-    T(change)(c, n, &s);
     T(see)(c, 1, count, n, &s);
     const R *to_u = T(load)(cotangents, by[1], count, n, gx, 0);
     const R *to_v = T(load)(cotangents + by[2], by[1], count, n, gy, 0);
@@ -564,17 +299,11 @@ static void T(project_vjp)(const T(Camera) *c, const Rows *rows, int64_t camera,
         T(radial)(c->factors, n, gx, gy, gz);
         EACH(i) by_angle[i] = 1 / (gy[i] + 2 * gx[i] * gz[i]);
     }
-    const int of_map = numbers_of_map(c->parts);
-    if (sums) T(to_plane_sums)(c, n, s.x, s.y, s.z, s.scale, by_angle, gu, gv, sums + of_map);
-    if (!rows->results && !of_map) return;
+    if (sums) T(to_plane_sums)(c, n, s.x, s.y, s.z, s.scale, by_angle, gu, gv, sums);
+    if (!rows->results) return;
     const int swapped = c->swapped;
     T(unsee)(c, n, swapped ? s.y : s.x, swapped ? s.x : s.y, s.z, s.shrink, s.scale, by_angle, swapped ? gv : gu,
              swapped ? gu : gv, swapped ? gy : gx, swapped ? gx : gy, gz);
-    if (of_map) {
-        T(load_points)(points, from, count, n, s.x, s.y, s.z);
-        T(change_vjp)(c, n, &s, gx, gy, gz, sums);
-        if (!rows->results) return;
-    }
     T(store)((R *)rows->results + camera * to[0] + first * to[1], to, 3, count, gx, gy, gz);
 }
 
@@ -666,33 +395,11 @@ static void T(cover)(const T(Camera) *c, int n, R *a, R *b, const I *known, I *o
     if (c->way == INVERTED) T(cover_inverted)(c, n, a, b, ok);
 }
 
-/* Points near those that a surface sends to (u, v), from a table of that, see `start_of` */
-static WIDE void T(begin_surface)(const R *restrict table, int n, const R *restrict u, const R *restrict v, R *restrict a,
-                             R *restrict b) {
-    const R across = table[0], down = table[1], half_u = GRID / 2 / across, half_v = GRID / 2 / down;
-    const R left = table[2] - half_u, right = table[2] + half_u, top = table[3] - half_v, bottom = table[3] + half_v;
-    ALIGNED R x[BLOCK], y[BLOCK], sums[4 * BLOCK];
-    ALIGNED int32_t at[BLOCK];
-    EACH(i) {
-        const R p = (T(inside)(left, u[i], right) - left) * across, q = (T(inside)(top, v[i], bottom) - top) * down;
-        /* rounding may carry the end of the last cell past that */
-        const R column = T(whole)(p * (1 - 8 * EPS)), row = T(whole)(q * (1 - 8 * EPS)), place = row * GRID + column;
-        x[i] = p - column - (R)0.5, y[i] = q - row - (R)0.5, at[i] = (int32_t)T(inside)(0, place, GRID * GRID - 1);
-    }
-    for (int i = 0; i < n; i++) {
-        const R *restrict cell = table + (int64_t)CELL * (1 + at[i]), p = x[i], q = y[i], place[4] = {p, p, q, q};
-        KEPT_LOOP for (int j = 0; j < 4; j++)
-            sums[4 * i + j] = ((cell[8 + j] * p + cell[4 + j]) + cell[12 + j] * q) * place[j] + cell[j];
-    }
-    EACH(i) a[i] = sums[4 * i] + sums[4 * i + 2], b[i] = sums[4 * i + 1] + sums[4 * i + 3];
-}
-
 /* Points near those that the stages from `first` on send to (u, v) */
 static void T(start)(const T(Camera) *c, int first, int n, const R *u, const R *v, R *restrict a, R *restrict b) {
     ALIGNED R x[BLOCK], y[BLOCK];
-    if (c->start) T(begin_surface)(c->start, n, u, v, a, b);
-    else EACH(i) a[i] = u[i], b[i] = v[i];
-    for (int j = c->stages - !!c->start; j >= first; j--) {
+    EACH(i) a[i] = u[i], b[i] = v[i];
+    for (int j = c->stages; j >= first; j--) {
         const R *k = c->numbers[j];
         if (c->parts[j].kind == HOMOGRAPHY) {
             R m[9];
@@ -727,38 +434,12 @@ static void T(start)(const T(Camera) *c, int first, int n, const R *u, const R *
     }
 }
 
-/* bend: what Newton's method leaves of a step: it times the step's square times the norm of the Jacobian's inverse, to be
-   less than 1; or none where nothing is known of it */
-INLINE I T(step_of)(R *a, R *b, R du, R dv, R ua, R ub, R va, R vb, const R *bend, I ok) {
+INLINE I T(step_of)(R *a, R *b, R du, R dv, R ua, R ub, R va, R vb, I ok) {
     R da, db;
-    const R one = T(absolute)(T(step)(ua, ub, va, vb, du, dv, &da, &db)), p = *a + da, q = *b + db, step2 = da * da + db * db;
-    const R off = bend ? *bend * step2 * one : 0;
-    const R left = bend ? 1 - off * off * (ua * ua + ub * ub + va * va + vb * vb) : EPS / 64 * (p * p + q * q + (R)0.01) - step2;
+    const R one = T(absolute)(T(step)(ua, ub, va, vb, du, dv, &da, &db)), p = *a + da, q = *b + db;
+    const R left = EPS / 64 * (p * p + q * q + (R)0.01) - (da * da + db * db);
     *a = ok ? *a : p, *b = ok ? *b : q;
     return ok | ((left > 0) & (one > 0));
-}
-
-/* The same of a surface of that order whose pieces are known */
-INLINE void T(step_on_pieces)(const T(Camera) *c, const int order, int n, const R *restrict u, const R *restrict v,
-                              R *restrict a, R *restrict b, I *restrict ok) {
-    const Part *part = c->parts + c->stages;
-    const R *k = c->numbers[c->stages], sa = k[0], sb = k[1];
-    const R half_a = (R)(part->n - part->flags) / 2 / sa, half_b = (R)(part->m - part->flags) / 2 / sb;
-    const R bend = c->curve / EPS / T(root)(half_a * half_a + half_b * half_b);
-    ALIGNED R x[BLOCK], low[4 * BLOCK], high[4 * BLOCK], down[4 * BLOCK];
-    T(patches_of)(c, order, 1, n, a, b, x, low, high, down);
-    EACH(i) {
-        R p, q, ua, ub, va, vb;
-        T(patch)(low + 4 * i, x[i], a[i], b[i], &p, &q);
-        T(patch_slopes)(order, low + 4 * i, high + 4 * i, down + 4 * i, x[i], sa, sb, &ua, &ub, &va, &vb);
-        ok[i] = T(step_of)(a + i, b + i, u[i] - p, v[i] - q, ua, ub, va, vb, &bend, ok[i]);
-    }
-}
-
-static WIDE void T(steps_on_pieces)(const T(Camera) *c, int n, const R *restrict u, const R *restrict v, R *restrict a,
-                                    R *restrict b, I *restrict ok) {
-    if (c->parts[c->stages].flags == 3) T(step_on_pieces)(c, 3, n, u, v, a, b, ok);
-    else T(step_on_pieces)(c, 2, n, u, v, a, b, ok);
 }
 
 /* A step of Newton's method for the stages from `first` on, of points that are not `ok`: are they now? */
@@ -774,15 +455,13 @@ static void T(newton_step)(const T(Camera) *c, int first, int n, const R *restri
             R p, q, ua, ub, va, vb;
             T(planar_at)(k, a[i], b[i], x[i], &p, &q);
             T(planar_slopes)(k, a[i], b[i], x[i], y[i], &ua, &ub, &va, &vb);
-            ok[i] = T(step_of)(a + i, b + i, u[i] - p, v[i] - q, ua, ub, va, vb, NULL, ok[i]);
+            ok[i] = T(step_of)(a + i, b + i, u[i] - p, v[i] - q, ua, ub, va, vb, ok[i]);
         }
-    } else if (first == c->stages && c->pieces) {
-        T(steps_on_pieces)(c, n, u, v, a, b, ok);
     } else {
         T(Jacobian) to;
         T(lens)(c, first, n, a, b, x, y, &to, NULL);
         EACH(i)
-            ok[i] = T(step_of)(a + i, b + i, u[i] - x[i], v[i] - y[i], to.ua[i], to.ub[i], to.va[i], to.vb[i], NULL, ok[i]);
+            ok[i] = T(step_of)(a + i, b + i, u[i] - x[i], v[i] - y[i], to.ua[i], to.ub[i], to.va[i], to.vb[i], ok[i]);
     }
 }
 
@@ -840,7 +519,7 @@ static void T(search)(const T(Camera) *c, int n, const R *restrict u, const R *r
 /* `invert`, from a table and a few steps; what is not `ok`, and yet possible, is left */
 static void T(invert)(const T(Camera) *c, int n, const R *restrict u, const R *restrict v, R *restrict a, R *restrict b,
                       I *restrict ok, I *restrict possible) {
-    const int fewest = (IS_DOUBLE ? 3 : 2) - !!c->pieces;
+    const int fewest = IS_DOUBLE ? 3 : 2;
     ALIGNED R p[BLOCK], q[BLOCK];
     if (c->is_radial) {
         T(invert_radial)(c, n, u, v, a, b, ok, possible);
@@ -861,8 +540,7 @@ static void T(invert)(const T(Camera) *c, int n, const R *restrict u, const R *r
         }
     } else {
         const int has_table = c->table != NULL;
-        const R usual2 = c->usual2 * (1 - 32 * EPS), certain2 = c->certain2, beside2 = c->beside2, further = 1 + 32 * EPS;
-        const T(Edge) box = c->box;
+        const R usual2 = c->usual2 * (1 - 32 * EPS), further = 1 + 32 * EPS;
         T(start)(c, has_table ? 2 : 1, n, u, v, a, b);
         if (has_table) {
             ALIGNED R r2[BLOCK], scale[BLOCK];
@@ -873,16 +551,8 @@ static void T(invert)(const T(Camera) *c, int n, const R *restrict u, const R *r
         T(newton)(c, 1, n, u, v, a, b, ok, fewest);
         I outside = 0;
         EACH(i) possible[i] = ok[i]; /* converged, somewhere */
-        if (c->is_boxed) EACH(i) ok[i] &= T(in_box)(box, certain2, beside2, a[i] * further, b[i] * further);
-        else EACH(i) ok[i] &= usual2 - (a[i] * a[i] + b[i] * b[i]) > 0;
+        EACH(i) ok[i] &= usual2 - (a[i] * a[i] + b[i] * b[i]) > 0;
         EACH(i) outside |= possible[i] & !ok[i];
-        if (outside && c->has_box && !c->is_boxed) {
-            ALIGNED I certain[BLOCK];
-            outside = 0;
-            EACH(i) p[i] = a[i] * further, q[i] = b[i] * further;
-            T(certain)(c, n, p, q, certain);
-            EACH(i) ok[i] |= possible[i] & certain[i], outside |= possible[i] & !ok[i];
-        }
         if (outside && c->ends && c->limits2) { /* no circle: much of an image lies beyond any within its edge */
             ALIGNED R x[BLOCK], y[BLOCK], least[BLOCK];
             ALIGNED I inside[BLOCK];
@@ -937,13 +607,6 @@ static void T(solutions)(const T(Camera) *c, int n, R *restrict u, R *restrict v
         if (c->way == INVERTED) T(cover_inverted)(c, n, u, v, ok);
     } else T(cover)(c, n, u, v, known, ok);
     T(rays)(c, n, u, v, ok, x, y, z);
-    if (c->parts->map) {
-        T(Bent) bent;
-        if (c->parts->map == BEND) T(unbend)(c, n, &bent, x, y, z, ok);
-        else T(product)(c->map, 3, 1, n, x, y, z);
-        EACH(i) u[i] = ok[i] ? u[i] : 0, v[i] = ok[i] ? v[i] : 0;
-        EACH(i) x[i] = ok[i] ? x[i] : 0, y[i] = ok[i] ? y[i] : 0, z[i] = ok[i] ? z[i] : 1;
-    }
 }
 
 /* How many wait for an extent */
@@ -990,33 +653,7 @@ static void T(unproject_vjp)(const T(Camera) *c, const Rows *rows, int64_t camer
         gx[i] = is_known ? to_x[i] : 0, gy[i] = is_known ? to_y[i] : 0, gz[i] = is_known ? to_z[i] : 0;
     }
     for (int i = count; i < n; i++) gx[i] = gy[i] = gz[i] = 0;
-    if (c->parts->map) {
-        ALIGNED R rx[BLOCK], ry[BLOCK], rz[BLOCK];
-        ALIGNED I all[BLOCK];
-        EACH(i) all[i] = 1;
-        T(rays)(c, n, a, b, all, rx, ry, rz);
-        if (c->parts->map == BEND) {
-            T(Bent) bent;
-            ALIGNED R gp[BLOCK], gq[BLOCK], p[BLOCK], q[BLOCK], s[BLOCK];
-            EACH(i) p[i] = rx[i], q[i] = ry[i], s[i] = rz[i];
-            T(unbend)(c, n, &bent, p, q, s, all), T(both)(c, n, &bent);
-            T(ray_of_vjp)(n, bent.phi, bent.theta, gx, gy, gz, gp, gq);
-            EACH(i) {
-                R da, db;
-                T(step)(bent.by.ua[i], bent.by.va[i], bent.by.ub[i], bent.by.vb[i], gp[i], gq[i], &da, &db);
-                gp[i] = da, gq[i] = db, p[i] = -da, q[i] = -db;
-            }
-            if (sums) {
-                T(bivariate_sums)(c->parts->across, n, bent.phi, bent.theta, p, sums + 4);
-                T(bivariate_sums)(c->parts->down, n, bent.phi, bent.theta, q, sums + 4 + c->parts->across);
-            }
-            T(angles_vjp)(n, rx, ry, rz, gp, gq, gx, gy, gz);
-        } else {
-            if (sums) T(outer)(n, rx, ry, rz, gx, gy, gz, sums + 4);
-            T(product)(c->map, 1, 3, n, gx, gy, gz);
-        }
-    }
-    T(rays_vjp)(c, n, a, b, gx, gy, gz, ga, gb, sums ? sums + 4 + numbers_of_map(c->parts) : NULL);
+    T(rays_vjp)(c, n, a, b, gx, gy, gz, ga, gb, sums ? sums + 4 : NULL);
     if (c->stages) {
         T(Jacobian) jacobian;
         T(lens)(c, 1, n, a, b, x, y, &jacobian, NULL), u = x, v = y;

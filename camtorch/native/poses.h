@@ -10,7 +10,6 @@
 static inline Cameras only(const Cameras *all, int64_t at) {
     Cameras one = *all;
     if (all->cameras == 1) return one;
-    const Part *last = all->parts + all->part_count - 1;
     one.cameras = 1;
 #define MOVED(field, size) if (one.field) one.field = (const void *)((const double *)one.field + at * (size))
     MOVED(intrinsics, 4);
@@ -22,16 +21,12 @@ static inline Cameras only(const Cameras *all, int64_t at) {
     MOVED(extent, EXTENT);
     MOVED(table, 2 + 2 * NODES);
     MOVED(circle2, 1);
-    MOVED(certain2, BOX);
-    MOVED(pieces, PIECE * (last->n - last->flags) * (last->m - last->flags));
-    MOVED(start, START);
     MOVED(chart_inner2, 1);
     MOVED(chart_most2, 1);
     MOVED(chart_table, 2 + 2 * NODES);
 #undef MOVED
     if (one.usable) one.usable += at;
     if (one.stagewise) one.stagewise += at;
-    if (one.certain) one.certain += at * last->n * last->m;
     return one;
 }
 

@@ -15,7 +15,7 @@ enum { UINT8, BOOL, UINT16, FLOAT32, BYTES1, BYTES2, BYTES4, BYTES8, TYPES };
 enum { NEAREST, BILINEAR, BICUBIC };
 enum { ZEROS, BORDER, REFLECTION };
 
-enum { SCRATCH = 37 };
+enum { SCRATCH = 25 };
 enum { STEP = 8 }; /* pixels between the nodes of a lattice */
 /* quintics do there, which are to be laid; cubics may miss; to be computed next; and others that have no place in `exact` */
 enum { CELL_QUINTIC = -5, CELL_DOUBT, CELL_NEXT, CELL_EMPTY, CELL_CUBIC };

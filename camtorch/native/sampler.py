@@ -28,7 +28,7 @@ _Job = ctypes.c_char * struct.calcsize("35q4iq")
 CLASSIFICATION = "12q3di2q"
 """`Classification` of sampler.h."""
 _Classification = struct.Struct(CLASSIFICATION).pack
-SCRATCH = 37  # numbers of float32 for each column of a lattice and eight more
+SCRATCH = 25  # numbers of float32 for each column of a lattice and eight more
 Later = list[tuple["ctypes.Array[ctypes.c_char]", int, object]]
 """Images that `finish` makes: how, in how many tiles, and what has to live until then."""
 _WORTH = 8  # pixels that may be copied for one that is made: interpolated one by one they would take longer

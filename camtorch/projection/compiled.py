@@ -36,9 +36,6 @@ _MOST_PARTS, _MOST_DEGREE = 5, 64
 _TABLE = 2 + 2 * 1024
 _RADII, _FOLLOWED, _AZIMUTHS = 512, 80, 336
 _EXTENT = _FOLLOWED + _AZIMUTHS * (_FOLLOWED + 1)
-_START, _PIECE, _BOX = 16 * (1 + 60 * 60), 32, 5
-_MOST_CONTROLS = 64 * 64  # of a surface whose pieces, of 16 times the memory, pay
-_FOR_START = 1 << 15  # points of a camera for which such a table pays
 
 _HAS_XI, _HAS_ALPHA, _HAS_BETA, _TRANSVERSE = 1, 2, 4, 8
 _TANGENTIAL, _PRISM = 1, 2
@@ -53,9 +50,6 @@ class _Part(ctypes.Structure):
         ("factor", c_int32),
         ("n", c_int32),
         ("m", c_int32),
-        ("map", c_int32),
-        ("across", c_int32),
-        ("down", c_int32),
         ("constant", c_double),
     )
 
@@ -81,10 +75,6 @@ class _Cameras(ctypes.Structure):
         ("table", c_void_p),
         ("stagewise", c_void_p),
         ("circle2", c_void_p),
-        ("certain", c_void_p),
-        ("certain2", c_void_p),
-        ("start", c_void_p),
-        ("pieces", c_void_p),
         ("chart_inner2", c_void_p),
         ("chart_most2", c_void_p),
         ("chart_table", c_void_p),
@@ -127,10 +117,6 @@ class _Domain(ctypes.Structure):
         ("limits2", c_void_p),
         ("extent", c_void_p),
         ("stagewise", c_void_p),
-        ("certain", c_void_p),
-        ("certain2", c_void_p),
-        ("start", c_void_p),
-        ("pieces", c_void_p),
     )
 
 
@@ -149,12 +135,6 @@ class Plan:
     has_rest: bool
     is_long: bool
     """Whether a radial factor has so many numbers that its fold is not found by a root."""
-    controls: int
-    """Of a surface, the last stage."""
-    is_plain: bool
-    """Whether that comes after nothing or a radial factor."""
-    pieces: int
-    """How many numbers say what its pieces are."""
 
     def __init__(self, chart: Chart, lens: Lens, parts: Sequence[_Part], coefficients: Sequence[Tensor]):
         """Of the optics of coefficients, columns, whatever their values."""
@@ -170,11 +150,6 @@ class Plan:
         self.has_stages, self.is_radial = bool(lens.stages), lens.is_radial
         self.has_factor, self.has_rest = lens.radial is not None, lens.rest is not None
         self.is_long = any(part.factor and part.n + part.m > _MOST_DEGREE for part in parts)
-        *before, last = lens.stages or (None,)
-        self.is_plain = isinstance(last, optics.Surface) and (not before or (len(before) == 1 and before[0].is_radial))
-        end = parts[-1]
-        self.controls = end.n * end.m if isinstance(last, optics.Surface) else 0
-        self.pieces = _PIECE * (end.n - end.flags) * (end.m - end.flags) if 0 < self.controls <= _MOST_CONTROLS else 0
         self._ends: dict[torch.dtype, tuple[float, float]] = {}
         self._radii: dict[tuple[torch.dtype, int], Tensor] = {}
 
@@ -247,9 +222,7 @@ class Lenses:
             struct.constants, struct.constant_count = self._keep_columns(constants), len(constants)
         if plan.is_chart:
             self._add_chart()
-        if plan.controls:  # that pixels move by: most often nobody asks for more
-            self._add_surface()
-        elif plan.has_stages:
+        if plan.has_stages:
             self._add_domain(tables)
 
     def _optics(self) -> tuple[Chart, Lens]:
@@ -302,35 +275,21 @@ class Lenses:
         struct = self.struct
         struct.chart_inner2, struct.chart_table, struct.chart_most2 = inner2, place, self._keep(table[:, 1])
 
-    def _add_surface(self) -> None:
-        plan, wanted = self.plan, {"certain": self._new(self.plan.controls, torch.uint8)}
-        wanted |= {"pieces": self._new(plan.pieces)} if plan.pieces else {}
-        self._ask(wanted)
-        for name, place in wanted.items():
-            setattr(self.struct, name, place)
-
-    def whole(self) -> _Cameras:
-        """What it has, and all of the domain."""
-        if self.plan.has_stages and self.struct.inner2 is None:
-            self._add_domain(tables=False)
-        return self.struct
-
     def _add_domain(self, tables: bool) -> None:
         plan = self.plan
         if plan.is_chart:  # whose end is that of a search
             domain = self._slow_domain()
             self.struct.usual2, self.struct.inner2 = self._keep(domain.usual2), self._keep(domain.inner2)
             return
-        has_certain = plan.is_plain and self.struct.certain is not None
-        names = ["inner2", "usual2", *["circle2", "stagewise"] * plan.has_rest, *["certain2"] * has_certain]
-        counts = [_BOX if name == "certain2" else 1 for name in names]
+        names = ["inner2", "usual2", *["circle2", "stagewise"] * plan.has_rest]
+        counts = [1] * len(names)
         if tables and plan.has_factor:  # at once, as there will be pixels
             names, counts = [*names, "table"], [*counts, _TABLE]
         start, step = self._new(sum(counts)), self.cameras * self.dtype.itemsize
         wanted = {name: start + step * i for name, i in zip(names, accumulate(counts, initial=0), strict=False)}
         radii = {} if plan.is_radial else {"radii": self._keep(plan.radii(lambda: self._optics()[0], _RADII, self._k))}
-        self._ask(wanted | radii | ({"certain": self.struct.certain} if has_certain else {}))
-        for name, place in reversed(wanted.items()):  # inner2 last, by which another thread sees that all is there
+        self._ask(wanted | radii)
+        for name, place in wanted.items():
             setattr(self.struct, name, place)
 
     def inverse_table(self) -> int:
@@ -340,14 +299,6 @@ class Lenses:
             self._ask({"table": table})
             self.struct.table = table  # when it is whole, for another thread may be looking
         return int(self.struct.table)
-
-    def surface_table(self) -> int:
-        """The same of the inverse of a surface."""
-        if self.struct.start is None:
-            table = self._new(_START)
-            self._ask({"start": table, "certain": self.struct.certain})
-            self.struct.start = table
-        return int(self.struct.start)
 
     def followed(self) -> tuple[int, int]:
         """The limits of each azimuth, and where the lens sends it: asked for only when a point lies far out."""
@@ -403,8 +354,7 @@ class Native:
     cameras: int
     dtype: torch.dtype
     parameters: int
-    bare: int
-    """The pointer where pixels move, which takes no more of the domain than there is, and says if it wants more."""
+    pointer: int
 
     def __init__(self, lenses: Lenses, intrinsics: Tensor, usable: Tensor | None):
         """See `native_of`."""
@@ -412,51 +362,20 @@ class Native:
         self._kept = intrinsics.contiguous(), None if usable is None else (usable > 0).contiguous()
         self.cameras, self.dtype, self.parameters = intrinsics.shape[0], intrinsics.dtype, lenses.plan.parameters
         self.struct.intrinsics, self.struct.usable = map(_address, self._kept)
-        self.bare = addressof(self.struct)
-
-    @property
-    def pointer(self) -> int:
-        """With all of the domain."""
-        if self._is_partial:
-            self._complete()
-        return self.bare
-
-    @property
-    def _is_partial(self) -> bool:
-        return self.plan.controls > 0 and self.struct.inner2 is None
-
-    def _complete(self) -> None:
-        whole = self._lenses.whole()
-        for name in ("usual2", "circle2", "stagewise", "certain2", "inner2"):
-            setattr(self.struct, name, getattr(whole, name))
+        self.pointer = addressof(self.struct)
 
     def before(self, intrinsics: Tensor) -> Native:
         """The same lenses with other intrinsics (C, 4), all usable."""
         return Native(self._lenses, intrinsics, None)
 
-    def add_tables(self, count: int, moving: bool = False) -> None:
-        """Have what the inverse of so many pixels of each camera starts from; where pixels move, unless that is by a
-        surface alone, as C says.
-        """
-        if self._is_partial:
-            if moving:
-                return
-            self._complete()
+    def add_table(self) -> None:
+        """Have what the inverse of a radial factor starts from."""
         if self.plan.has_factor and self.struct.table is None:
             self.struct.table = self._lenses.inverse_table()
-        if count >= _FOR_START and self.plan.is_plain and self.plan.controls and self.struct.start is None:
-            self.struct.start = self._lenses.surface_table()
 
     def follow(self) -> None:
         """Have the limits of each azimuth, and where it is sent."""
         self.struct.limits2, self.struct.extent = self._lenses.followed()
-
-    def add_what_is_left(self) -> None:
-        """What C wants to move pixels: the domain and its tables, or else what `follow` has."""
-        if self._is_partial or (self.plan.has_factor and self.struct.table is None):
-            self.add_tables(0)
-        else:
-            self.follow()
 
 
 def native_of(
@@ -519,8 +438,6 @@ def _chart(chart: Chart) -> _Part | None:
 def _stage(stage: Stage) -> _Part | None:
     kind = _code(stage)
     if kind is not None and isinstance(stage, optics.Surface):
-        if min(stage.columns, stage.rows) < 4:
-            return None
         return _Part(kind, stage.order, 0, stage.columns, stage.rows, constant=stage.behind)
     if kind is None or not isinstance(stage, optics.Planar):
         return None if kind is None else _Part(kind)
@@ -582,7 +499,7 @@ def unproject(native: Native, pixels: Tensor, keeps: bool = False) -> Unprojecte
     rays = _empty((3, cameras, count), native.dtype)
     valid = torch.empty(cameras, count, dtype=torch.bool, device="cpu")
     solution = _empty((2, cameras, count), native.dtype) if keeps else None
-    native.add_tables(count)
+    native.add_table()
     rows = pixels.data_ptr(), *pixels.stride(), *_planes(rays, cameras, count), valid.data_ptr()
     given = *rows, _address(solution), *_NO_ROWS, 0
     if _call(native, cameras, count, UNPROJECT, given):
@@ -663,10 +580,10 @@ class Between:
         self.dtype = start.dtype
         count, strides = (1, (0, 0)) if turns is None else (turns.numel() // 9, turns.stride())
         self.cameras = max(start.cameras, end.cameras, count)
-        start.add_tables(0, moving=True)
+        start.add_table()
         self._size = size
         by_camera = strides[0] if count > 1 else 0
-        self._given = start.bare, end.bare, _address(turns), by_camera, *strides[-2:], self.cameras
+        self._given = start.pointer, end.pointer, _address(turns), by_camera, *strides[-2:], self.cameras
 
     def rows(self, pixels: Tensor, form: int) -> tuple[Tensor, Tensor]:
         """Pixels (C or 1, N, 2) to (C, N, 2), and valid (C, N).
@@ -675,7 +592,6 @@ class Between:
             the same, of which only those on the image are valid.
         """
         count = pixels.shape[1]
-        self._start.add_tables(count, moving=True)
         result = torch.empty(self.cameras, count, 2, dtype=self._start.dtype, device="cpu")
         valid = torch.empty(self.cameras, count, dtype=torch.bool, device="cpu")
         rows = *rows_of(pixels), result.data_ptr(), 2 * count, 2, 1, valid.data_ptr(), count, _TILE
@@ -707,7 +623,6 @@ class Between:
                 of float32 alone.
         """
         cameras, dtype, count = self.cameras, self._start.dtype, probes.shape[1]
-        self._start.add_tables(size[0] * size[1], moving=True)  # one in 64 is a node; some are exact
         n, m = (-(-side // 8) for side in size)
         nodes, most, is_double = (n + 5) * (m + 5), cameras * n * m, dtype == torch.float64
         result = torch.empty(cameras, 2, count, dtype=dtype, device="cpu")
@@ -744,7 +659,7 @@ class Between:
                 return flags
             for flag, native in ((LEFT_FROM, self._start), (LEFT_TO, self._end)):
                 if flags & flag:
-                    native.add_what_is_left()
+                    native.follow()
 
 
 class _Kept(threading.local):

@@ -300,7 +300,7 @@ class _Call:
         to_moves, to_jobs = itertools.count(first_move, _MOVE), itertools.count(self._first_job, _JOB)
         self._slots = [(next(to_moves if make is None else to_jobs), make) for make in makers]
         self._tiles = max((sampler.tiles_of(sampler.empty(image, 1, size)) for image, _ in images), default=1)
-        self._sizes, self._pixels, self._dtype, self._lead = sizes, size[0] * size[1], dtype, 0 if batched else 1
+        self._sizes, self._dtype, self._lead = sizes, dtype, 0 if batched else 1
         self._kept = room, probes, kept  # what the words point to
         self._may_shrink = _smooth(images)
 
@@ -312,10 +312,10 @@ class _Call:
             if not _surely_keeps_size(Between(target, source, turns, self._sizes[0], False), self._sizes):
                 return None
         words, turn = self._words, 0 if rotation is None else rotation.data_ptr()
-        target.add_tables(self._pixels if self._jobs else 0, moving=True)
+        target.add_table()
         if self._moves:
-            source.add_tables(0, moving=True)
-        words[_HEAD], words[_HEAD + 1], words[_HEAD + 2] = target.bare, source.bare, turn
+            source.add_table()
+        words[_HEAD], words[_HEAD + 1], words[_HEAD + 2] = target.pointer, source.pointer, turn
         results: list[tuple[Tensor, Tensor | None]] = []
         given = []  # pixels in the dtype of the cameras, for as long as the call
         for value, (at, make) in zip(values, self._slots, strict=True):
@@ -326,7 +326,7 @@ class _Call:
                     given.append(value)
                 result = torch.empty(shape, dtype=self._dtype, device="cpu")
                 valid = torch.empty(shape[:-1], dtype=torch.bool, device="cpu")
-                words[at], words[at + 1], words[at + 2] = source.bare, target.bare, turn
+                words[at], words[at + 1], words[at + 2] = source.pointer, target.pointer, turn
                 words[at + 10], words[at + 14], words[at + 18] = value.data_ptr(), result.data_ptr(), valid.data_ptr()
                 results.append((result, valid))
             else:
@@ -343,9 +343,9 @@ class _Call:
             # of the lattice, else of the pixels, which go the other way
             left, (start, end) = (flags, (target, source)) if flags < _PIXELS else (flags // _PIXELS, (source, target))
             if left & LEFT_FROM:
-                start.add_what_is_left()
+                start.follow()
             if left & LEFT_TO:
-                end.add_what_is_left()
+                end.follow()
             if flags >= _PIXELS:  # the images are made
                 words[1] = 0
         if not is_whole:

@@ -66,20 +66,9 @@ int32_t classify_fuzzed(const Classification *given) {
     return todo;
 }
 
-/* Pixels, and a lattice, of cameras to themselves, turned, or to these without the surface at the end of their lens */
+/* Pixels, and a lattice, of cameras to themselves, some turned */
 static int moved(const Cameras *cameras, int64_t tile) {
     const int d = (int)cameras->is_double, fits = below(2);
-    const Part *last = cameras->parts + cameras->part_count - 1;
-    Cameras bent = *cameras, bare = *cameras;
-    void *fewer = NULL;
-    if (last->kind == SURFACE && below(4)) {
-        const int64_t item = d ? 8 : 4, all = cameras->parameter_count, kept = all - 4 - 2 * last->n * last->m;
-        bare.part_count--, bare.parameter_count = kept, bare.parameters = fewer = malloc((size_t)(kept * cameras->cameras * item) + !kept);
-        for (int64_t i = 0; i < cameras->cameras; i++)
-            memcpy((char *)fewer + i * kept * item, (const char *)cameras->parameters + i * all * item, (size_t)(kept * item));
-        bare.stagewise = bare.certain = NULL, bare.circle2 = bare.certain2 = bare.start = bare.pieces = NULL;
-        if (below(2)) bare.table = NULL;
-    }
     const int64_t c = cameras->cameras, height = 1 + below(70), width = 1 + below(90);
     const int64_t rows = (height + 7) / 8, columns = (width + 7) / 8, nodes = (rows + 5) * (columns + 5);
     const int64_t n = fits ? nodes + 2 * (height + width) : 1 + below(700), size = d ? 8 : 4;
@@ -87,11 +76,8 @@ static int moved(const Cameras *cameras, int64_t tile) {
     Move move = {0};
     void *turns = filled(d, 9 * c, 1, 0), *narrow = NULL, *valid = malloc((size_t)(c * n));
     int64_t following = 0, used = 0;
-    if (bent.certain && below(2)) /* nothing more is known of its domain */
-        bent.stagewise = NULL, bent.inner2 = bent.usual2 = bent.circle2 = bent.certain2 = bent.table = bent.limits2 = bent.extent = NULL;
-    move.from = &bent, move.to = fewer ? &bare : &bent, move.cameras = c, move.form = fits ? POSITIONS : below(3);
-    if (fewer && below(2)) move.from = &bare, move.to = &bent;
-    if (below(fewer ? 4 : 2) == 0) {
+    move.from = move.to = cameras, move.cameras = c, move.form = fits ? POSITIONS : below(3);
+    if (below(2)) {
         const int64_t back = below(2);
         move.turns = turns, move.turn_strides[0] = 9 * below(2);
         move.turn_strides[1] = back ? 1 : 3, move.turn_strides[2] = back ? 3 : 1;
@@ -133,7 +119,7 @@ static int moved(const Cameras *cameras, int64_t tile) {
         /* what is moved off the image has its place, which may be too far for a number */
         fine &= fits || move.form == ON_IMAGE || ((uint8_t *)valid)[camera * n + point] == 1 || isfinite(value);
     }
-    free(turns), free(narrow), free(valid), free(pixels), free(results), free(fewer);
+    free(turns), free(narrow), free(valid), free(pixels), free(results);
     return fine;
 }
 
@@ -146,20 +132,13 @@ static int fuzz(void) {
     int used = 0, fine = 1;
     memset(parts, 0, sizeof parts);
     const int d = (int)below(2), direction = (int)below(4), is_vjp = direction >= PROJECT_VJP;
-    parts[0].kind = (int32_t)below(LINEARITY + 1);
+    parts[0].kind = (int32_t)below(SPHERE + 1);
     if (parts[0].kind == CYLINDER || parts[0].kind == SPHERE) parts[0].flags = below(2) ? TRANSVERSE : 0;
     if (parts[0].kind == UNIFIED) parts[0].flags = (int32_t)below(8), parts[0].constant = (double)below(3) / 2;
     if (parts[0].kind == UNIFIED)
         for (i = 1; i < 8; i *= 2) numbers += !!(parts[0].flags & i);
-    if (parts[0].kind == FOV || parts[0].kind == ONE_DIVISION || parts[0].kind == LINEARITY) numbers = 1;
+    if (parts[0].kind == FOV || parts[0].kind == ONE_DIVISION) numbers = 1;
     if (parts[0].kind == INVERTED) numbers = factor_of(parts, POLYNOMIAL, ANGLE_OF_ALL_POWERS);
-    parts[0].map = (int32_t)below(3);
-    if (parts[0].map == TURN) numbers += 9;
-    if (parts[0].map == BEND) {
-        const int32_t across = (int32_t)below(8), down = (int32_t)below(8); /* orders */
-        parts[0].across = (across + 1) * (across + 2) / 2, parts[0].down = (down + 1) * (down + 2) / 2;
-        numbers += parts[0].across + parts[0].down;
-    }
     cameras.part_count = 1 + below(4);
     for (i = 1; i < cameras.part_count; i++) {
         Part *part = parts + i;
@@ -167,7 +146,7 @@ static int fuzz(void) {
         if (part->kind == HOMOGRAPHY) numbers += 9;
         if (part->kind == SHEAR) numbers += 2;
         if (part->kind == SURFACE) {
-            part->flags = 2 + (int32_t)below(2), part->n = 4 + (int32_t)below(5), part->m = 4 + (int32_t)below(5);
+            part->flags = 2 + (int32_t)below(2), part->n = part->flags + 1 + (int32_t)below(5), part->m = part->flags + 1 + (int32_t)below(5);
             numbers += 4 + 2 * part->n * part->m;
         }
         if (part->kind != PLANAR) continue;
@@ -194,17 +173,6 @@ static int fuzz(void) {
         for (i = 0; i < c; i++) by_stages[i] = (uint8_t)below(2);
         cameras.stagewise = by_stages, cameras.circle2 = KEPT(filled(d, c, 2, 2));
     }
-    const Part *last = parts + cameras.part_count - 1;
-    const int64_t controls = last->kind == SURFACE ? last->n * last->m : 0;
-    const int64_t pieces = controls ? PIECE * (last->n - last->flags) * (last->m - last->flags) : 0;
-    if (controls && below(4)) {
-        uint8_t *certain = KEPT(malloc((size_t)(c * controls)));
-        const int all = below(4) > 0;
-        for (i = 0; i < c * controls; i++) certain[i] = (uint8_t)(all || below(2));
-        cameras.certain = certain, cameras.certain2 = KEPT(filled(d, c * BOX, 2, 2));
-        if (below(2)) cameras.pieces = KEPT(filled(d, c * pieces, 2, 0));
-        if (below(4)) cameras.start = KEPT(filled(d, c * START, 2, 0));
-    }
     if (parts[0].kind == INVERTED) {
         cameras.chart_inner2 = KEPT(filled(d, c, 2, 2)), cameras.chart_most2 = KEPT(filled(d, c, 2, 2));
         cameras.chart_table = KEPT(filled(d, c * (2 + 2 * NODES), 1, 1));
@@ -221,10 +189,6 @@ static int fuzz(void) {
     domain.is_radial = has_factor && !many && !(parts[1].flags & (TANGENTIAL | PRISM));
     domain.inner2 = KEPT(filled(d, c, 0, 0)), domain.usual2 = KEPT(filled(d, c, 0, 0));
     domain.table = KEPT(filled(d, c * (2 + 2 * NODES), 0, 0));
-    if (controls && !domain.is_chart) {
-        domain.certain = KEPT(malloc((size_t)(c * controls))), domain.certain2 = KEPT(filled(d, c * BOX, 0, 0));
-        domain.start = KEPT(filled(d, c * START, 0, 0)), domain.pieces = KEPT(filled(d, c * pieces, 0, 0));
-    }
     if (has_factor && many && !domain.is_chart)
         domain.circle2 = KEPT(filled(d, c, 0, 0)), domain.stagewise = KEPT(malloc((size_t)c));
     if (cameras.part_count > 1 && !domain.is_chart && below(4) == 0) {
