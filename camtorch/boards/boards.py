@@ -33,28 +33,14 @@ def opencv(owner: str) -> Any:
 
 @dataclass(frozen=True)
 class Board:
-    """What all kinds of boards have.
-
-    Raises:
-        ValueError: If no board has such numbers.
-    """
+    """What all kinds of boards have: `columns` and `rows` of what is `counted`, and the side of a `square` or tag."""
 
     columns: int
     rows: int
     square: float = 1.0
     kind: ClassVar[str]
     counted: ClassVar[str]
-    """What `columns` and `rows` count."""
     least: ClassVar[int] = 3  # OpenCV finds no smaller ones
-
-    def __post_init__(self) -> None:
-        owner = type(self).__name__
-        if min(self.columns, self.rows) < self.least:
-            raise ValueError(
-                f"{owner}: at least {self.least}x{self.least} {self.counted} are needed; got {self.columns}x{self.rows}"
-            )
-        if not 0 < self.square < float("inf"):
-            raise ValueError(f"{owner}: lengths must be positive and finite; got {self.square:g}")
 
     @property
     def is_symmetric(self) -> bool:
@@ -63,11 +49,11 @@ class Board:
 
     def points(self) -> NDArray[np.float64]:
         """Return the points (N, 3), row by row from the top left."""
-        x, y = np.meshgrid(*(self.square * along for along in self._grid()))
+        x, y = np.meshgrid(*(self.square * self._places(count) for count in (self.columns, self.rows)))
         return np.stack([x, y, np.zeros_like(x)], -1).reshape(-1, 3)
 
-    def _grid(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return where the columns and the rows of points are, in squares."""
+    def _places(self, count: int) -> NDArray[np.float64]:
+        """Return where points are along a side, in squares."""
         raise NotImplementedError
 
     def words(self, unit: str = "") -> str:
@@ -79,7 +65,7 @@ class Board:
 
 @dataclass(frozen=True)
 class Chessboard(Board):
-    """A chessboard of `columns` x `rows` inner corners, as OpenCV counts; it has one square more each way."""
+    """A chessboard, whose inner corners OpenCV counts; it has one square more each way."""
 
     kind = "chessboard"
     counted = "inner corners"
@@ -88,18 +74,15 @@ class Chessboard(Board):
     def is_symmetric(self) -> bool:
         return (self.columns + self.rows) % 2 == 0  # else a half turn exchanges black and white
 
-    def _grid(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        return np.arange(float(self.columns)), np.arange(float(self.rows))
+    def _places(self, count: int) -> NDArray[np.float64]:
+        return np.arange(float(count))
 
 
 @dataclass(frozen=True)
 class Charuco(Board):
-    """OpenCV's ChArUco: a chessboard of `columns` x `rows` squares, with markers in the white ones; a part is enough.
+    """OpenCV's ChArUco: a chessboard with markers in its white squares, so that a part of it is enough.
 
-    Args:
-        marker: Side of a marker.
-        dictionary: Markers' dictionary, as OpenCV calls it, without DICT_.
-        legacy: Whether a white square is at the top left if the rows are even: boards of OpenCV before 4.6.
+    `legacy` boards, of OpenCV before 4.6, have a white square at the top left if the rows are even.
     """
 
     marker: float = 0.75
@@ -108,25 +91,16 @@ class Charuco(Board):
     kind = "charuco"
     counted = "squares"
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not 0 < self.marker < self.square:
-            got = f"{self.marker:g} in {self.square:g}"
-            raise ValueError(f"Charuco: a marker must be smaller than its square; got {got}")
-
-    def _grid(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        return np.arange(1.0, self.columns), np.arange(1.0, self.rows)
+    def _places(self, count: int) -> NDArray[np.float64]:
+        return np.arange(1.0, count)
 
 
 @dataclass(frozen=True)
 class AprilGrid(Board):
-    """Kalibr's grid of `columns` x `rows` AprilTags; tag 0 is at the bottom left, numbers grow to the right, then up.
+    """Kalibr's grid of AprilTags; tag 0 is at the bottom left, numbers grow to the right, then up.
 
-    Args:
-        square: Side of a tag with its black border.
-        spacing: Gap between two tags, in sides of a tag.
-        dictionary: Tags' dictionary, as OpenCV calls it, without DICT_.
-        border: Black border around a tag's code, in cells: Kalibr prints 2, others 1.
+    `spacing` is the gap between two tags in sides of a tag, `border` the black cells around a tag's code: Kalibr prints
+    2, others 1.
     """
 
     spacing: float = 0.3
@@ -136,18 +110,8 @@ class AprilGrid(Board):
     counted = "tags"
     least = 2
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not 0 < self.spacing <= 2:
-            raise ValueError(
-                f"AprilGrid: the spacing is a part of a tag's side, above 0 and at most 2; got {self.spacing:g}"
-            )
-        if self.border not in (1, 2, 3):
-            raise ValueError(f"AprilGrid: a tag's border is 1, 2 or 3 cells; got {self.border}")
-
-    def _grid(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        x, y = ((np.arange(n)[:, None] * (1 + self.spacing) + (0.0, 1.0)).ravel() for n in (self.columns, self.rows))
-        return x, y
+    def _places(self, count: int) -> NDArray[np.float64]:
+        return np.ravel(np.arange(count)[:, None] * (1 + self.spacing) + (0.0, 1.0))
 
     def corners_of(self, tag: int) -> list[int]:
         """Return the numbers of a tag's points, clockwise from its top left."""
@@ -180,6 +144,17 @@ def as_board(board: Any, square: float, options: dict[str, Any], owner: str) -> 
     known = [field.name for field in fields(kind)][3:]
     if strange := sorted(set(options) - set(known)):
         raise ValueError(f"{owner}: a {kind.kind} takes {', '.join(known) or 'no option'}; got {', '.join(strange)}")
-    if kind is Charuco:
-        options = {"marker": 0.75 * square} | options
-    return kind(int(match[2]), int(match[3]), square, **options)
+    options = ({"marker": 0.75 * square} if kind is Charuco else {}) | options
+    found = kind(int(match[2]), int(match[3]), square, **options)
+    least, got = kind.least, f"{found.columns}x{found.rows}"
+    if min(found.columns, found.rows) < least:
+        raise ValueError(f"{owner}: at least {least}x{least} {kind.counted} are needed; got {got}")
+    if not 0 < square < float("inf"):
+        raise ValueError(f"{owner}: lengths must be positive and finite; got {square:g}")
+    if isinstance(found, Charuco) and not 0 < found.marker < square:
+        raise ValueError(f"{owner}: a marker must be smaller than its square; got {found.marker:g} in {square:g}")
+    if isinstance(found, AprilGrid) and not 0 < found.spacing <= 2:
+        raise ValueError(f"{owner}: spacing is a part of a tag's side, above 0 and at most 2; got {found.spacing:g}")
+    if isinstance(found, AprilGrid) and found.border not in (1, 2, 3):
+        raise ValueError(f"{owner}: a tag's border is 1, 2 or 3 cells; got {found.border}")
+    return found

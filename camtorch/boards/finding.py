@@ -109,18 +109,12 @@ Image = tuple[Path, "NDArray[Any] | None"]
 
 def search(board: Board, images: Sequence[Image], done: Callable[[], object] = lambda: None) -> list[ImageCorners]:
     """Search images for a board by all cores; `done` is called after each."""
-
-    def one(image: Image) -> ImageCorners:
-        try:
-            return _search(board, *image)
-        finally:
+    found = []
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        for one in pool.map(lambda image: _search(board, *image), images):
+            found.append(one)
             done()
-
-    pool = ThreadPoolExecutor(os.cpu_count())
-    try:
-        return list(pool.map(one, images))
-    finally:
-        pool.shutdown(cancel_futures=True)
+    return found
 
 
 def _search(board: Board, path: Path, grey: NDArray[Any] | None) -> ImageCorners:
@@ -138,13 +132,9 @@ def usable(found: Sequence[ImageCorners]) -> tuple[list[ImageCorners], list[tupl
     sizes = Counter(one.image_size for one in found if not one.reason)
     usual = sizes.most_common(1)[0][0] if sizes else (0, 0)
     other = "{1}x{0}, but most images are {3}x{2}"
-    used, left_out = list[ImageCorners](), list[tuple[Path, str]]()
-    for one in found:
-        if one.reason or one.image_size != usual:
-            left_out.append((one.path, one.reason or other.format(*one.image_size, *usual)))
-        else:
-            used.append(one)
-    return used, left_out
+    used = [one for one in found if not one.reason and one.image_size == usual]
+    reasons = [(one.path, one.reason or other.format(*one.image_size, *usual)) for one in found]
+    return used, [why for one, why in zip(found, reasons, strict=True) if one.reason or one.image_size != usual]
 
 
 def gather(words: Iterable[str]) -> list[Path]:

@@ -9,20 +9,17 @@ from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
 
 import torch
-from torch import Tensor
 
-from camtorch._arguments import columns
-from camtorch.calibration.bundle import Adjusted, Bundle, Free, Sight, State
+from camtorch.calibration.bundle import Adjusted, Sight, pixel_jacobians
 from camtorch.calibration.observations import named
 from camtorch.calibration.uncertainty import Spread, worst
+from camtorch.camera import fixed_camera
 from camtorch.projection.rays import angles_from_axis, image_edges, image_lattice
 
 if TYPE_CHECKING:
     from camtorch.calibration.calibrate import Calibration
 
-FINE, ROUGH = 0.5, 3.0
-"""Px, the standard deviations of projections that are good enough to measure by, and to look at images."""
-
+_FINE, _ROUGH = 0.5, 3.0  # px, standard deviations of projections to measure by, and to look at images
 _CELLS, _PATTERN = 32, 8  # along the longer side: of the map of uncertainty, and of that of residuals
 _FEW_VIEWS = 6
 _ALIKE = math.radians(30)  # the largest angle between two boards
@@ -33,7 +30,6 @@ _CORNER_NOISE = 1.0  # px, more than detectors leave
 _WORSE_VIEW = 3.0  # times the median of all views
 _PATTERN_SHARE = 0.3  # of the residuals
 _CERTAIN = 5.0  # standard deviations
-_GAIN = 0.02  # of the sum of squares, for which a model may have more parameters
 _USUAL_NOISE = 0.1  # px
 _OPEN = 0.02  # of the corners' extent: the uncertainty of projections that are not determined
 _OPEN_COEFFICIENT = 0.1  # standard deviation
@@ -41,225 +37,105 @@ _MISFIT = 3.0  # px, the median residual of views that no camera fits
 _MOST_OF_A_VIEW = 0.8  # of its corners
 
 _TILTED = "Tilt the board by 30 to 45 degrees to all sides"
-_ROWS, _COLUMNS = ("top", "", "bottom"), ("left", "", "right")
+_NOISE = "one standard deviation in the worst direction"
 
 
 class Zone(NamedTuple):
-    """A ninth of the image."""
+    """A ninth of the image: the parts of it near corners, and with rays; px, the largest uncertainty, NaN without."""
 
     name: str
     share: float
-    """The part of its cells that corners lie in or next to."""
     rays: float
-    """The part of its cells that have rays."""
     uncertainty: float
-    """Px, the largest there, of directions; NaN where it has no ray."""
 
 
 class Survey:
-    """Numbers of a calibration that sentences are made of, over a map of the image."""
-
-    shape: tuple[int, ...]
-    pixels: Tensor
+    """Numbers of a calibration that sentences are made of, over a map (rows, columns) of the image."""
 
     def __init__(self, calibration: Calibration):
-        self.calibration = calibration
+        self.calibration, self.seen = calibration, calibration.observations.seen
         cell = max(calibration.image_size) / _CELLS
         rows, columns = self.shape = tuple(max(1, round(side / cell)) for side in calibration.image_size)
         # with the edges of the cells every second is a middle
-        self.pixels = image_lattice(calibration.camera, 2 * rows + 1, 2 * columns + 1)[1::2, 1::2]
-        """(rows, columns, 2) the middle of each cell."""
-
-    @property
-    def parameters(self) -> Tensor:
-        """(4 + n,)."""
-        return self.calibration.spread.parameters[0]
-
-    @cached_property
-    def rays(self) -> tuple[Tensor, Tensor]:
-        """Of the cells (rows, columns, 3), and whether there is one."""
-        with torch.no_grad():
-            return self.calibration.camera.unproject(self.pixels)
-
-    @cached_property
-    def angles(self) -> Tensor:
-        """(rows, columns) radians from the axis, NaN where there is no ray."""
-        rays, valid = self.rays
-        return torch.where(valid, angles_from_axis(rays), torch.nan)
+        pixels = image_lattice(calibration.camera, 2 * rows + 1, 2 * columns + 1)[1::2, 1::2]
+        rays, self.has_ray = calibration.camera.unproject(pixels)
+        self.angles = torch.where(self.has_ray, angles_from_axis(rays), torch.nan)  # radians from the axis
+        self.uncertainty = calibration.uncertainty(pixels)  # px, of directions; NaN without a ray
+        self.corners = calibration.observations.pixels[self.seen]
+        self.rounding = torch.finfo(torch.float32).eps * float(self.corners.abs().amax())  # px: corners may be float32
+        pose = calibration.extrinsics.matrix().to(self.seen.device)
+        self.points = calibration.observations.points @ pose[:, :3, :3].mT + pose[:, None, :3, 3]  # of the camera
+        angles = angles_from_axis(self.points[self.seen]).sort().values
+        self.reach = float(angles[math.ceil(0.995 * len(angles)) - 1])  # but for one corner in 200, which may be wrong
+        self.image_reach = float(self.angles.nan_to_num(0.0).amax())
+        # the lens ends beyond the circle that a fisheye shows, which corners reach
+        self.ends_in_the_dark = self.reach > _FISHEYE and self.image_reach > self.reach + _RIM
 
     @cached_property
-    def uncertainty(self) -> Tensor:
-        """(rows, columns) px, of directions; NaN where there is no ray."""
-        return self.calibration.uncertainty(self.pixels)
-
-    @cached_property
-    def seen(self) -> Tensor:
-        """(V, N) bool."""
-        return self.calibration.observations.seen
-
-    @cached_property
-    def corners(self) -> Tensor:
-        """(M, 2) all that were seen."""
-        return self.calibration.observations.pixels[self.seen]
-
-    @property
-    def rounding(self) -> float:
-        """px: residuals up to here say nothing, for corners and poses often come in float32."""
-        return torch.finfo(torch.float32).eps * float(self.corners.abs().amax())
-
-    @cached_property
-    def points(self) -> Tensor:
-        """(V, N, 3) those of the boards in the camera's frame."""
-        with torch.no_grad():
-            pose = self.calibration.extrinsics.matrix().to(self.seen.device)
-            return self.calibration.observations.points @ pose[:, :3, :3].mT + pose[:, None, :3, 3]
-
-    @cached_property
-    def reach(self) -> float:
-        """Radians from the axis, of the corner that is furthest from it but for one in 200, which may be wrong."""
-        angles = angles_from_axis(self.points[self.seen])
-        return float(angles.sort().values[math.ceil(0.995 * len(angles)) - 1])
-
-    @cached_property
-    def image_reach(self) -> float:
-        """Radians from the axis, of the ray of the image that is furthest from it."""
-        return float(self.angles.nan_to_num(0.0).amax())
-
-    @property
-    def ends_in_the_dark(self) -> bool:
-        """Whether the lens ends beyond the circle that a fisheye shows, where corners reach."""
-        return self.reach > _FISHEYE and self.image_reach > self.reach + _RIM
-
-    @cached_property
-    def covered(self) -> Tensor:
-        """(rows, columns) bool: in the cell or in one next to it there is a corner."""
+    def zones(self) -> list[Zone]:
+        """Nine, by rows."""
         low, high = image_edges(self.calibration.image_size, self.corners)
         count = self.corners.new_tensor(self.shape[::-1])
         index = ((self.corners - low) / (high - low) * count).long().clamp(min=0)
         column, row = torch.minimum(index, count.long() - 1).unbind(-1)
         cells = torch.zeros(self.shape, dtype=self.corners.dtype, device=self.corners.device)
         cells[row, column] = 1
-        return torch.nn.functional.max_pool2d(cells[None, None], 3, 1, 1)[0, 0] > 0
-
-    @cached_property
-    def loose_focal(self) -> float:
-        """The standard deviation of the focal length at the axis over itself: the worse of both.
-
-        In some models a coefficient does nearly what the parameter called focal length does.
-        """
-        with torch.inference_mode(False), torch.enable_grad():
-            p = self.parameters.detach().clone().requires_grad_()
-            x, y = (p.new_zeros(1, 1).requires_grad_() for _ in range(2))
-            chart, lens = self.calibration.spread.model.optics(columns(p[None, 4:]))
-            a, b = chart.to_plane(x, y, torch.ones_like(x), order=2)
-            if lens.stages:
-                a, b = lens(a, b)
-            pairs = (p[0] * a, x), (p[1] * b, y)
-            focal = [torch.autograd.grad(to.sum(), of, create_graph=True)[0].sum() for to, of in pairs]
-            slopes = [torch.autograd.grad(f, p, retain_graph=True)[0] for f in focal]
-        factor = self.calibration.spread.factor[0, : len(p)]
-        stds = [float(torch.linalg.vector_norm(slope @ factor)) for slope in slopes]
-        return max(std / abs(float(f.detach())) for std, f in zip(stds, focal, strict=True))
-
-    @cached_property
-    def zones(self) -> list[Zone]:
-        """Nine, by rows."""
+        covered = torch.nn.functional.max_pool2d(cells[None, None], 3, 1, 1)[0, 0]
+        bands, parts = (torch.arange(n, device="cpu").tensor_split(3) for n in self.shape)
         result = []
-        bands, parts = (torch.arange(count, device="cpu").tensor_split(3) for count in self.shape)
         for (i, band), (j, part) in itertools.product(enumerate(bands), enumerate(parts)):
             here = self.uncertainty[band][:, part]
             known = here[~here.isnan()]
-            name = " ".join(filter(None, (_ROWS[i], _COLUMNS[j]))) or "middle"
-            share = float(self.covered[band][:, part].double().mean())
-            result.append(Zone(name, share, len(known) / here.numel(), float(known.amax()) if len(known) else math.nan))
+            name = " ".join(filter(None, (("top", "", "bottom")[i], ("left", "", "right")[j]))) or "middle"
+            share, most = float(covered[band][:, part].mean()), float(known.amax()) if len(known) else math.nan
+            result.append(Zone(name, share, len(known) / here.numel(), most))
         return result
 
     @property
     def missing(self) -> list[Zone]:
         """Where there are few corners, and the lens is much less certain than in the middle or has no rays at all."""
         middle = self.zones[4].uncertainty
-        limit = max(FINE, 3 * middle) if math.isfinite(middle) else FINE
-        return [
-            zone
-            for zone in self.zones
-            if zone.share < 0.5
-            and (zone.uncertainty > limit or zone.rays < 0.5)
-            and not (zone.rays < 0.5 and self.ends_in_the_dark)
-        ]
+        limit = max(_FINE, 3 * middle) if math.isfinite(middle) else _FINE
+        few = (zone for zone in self.zones if zone.share < 0.5)
+        return [z for z in few if (not self.ends_in_the_dark if z.rays < 0.5 else z.uncertainty > limit)]
 
     def good_within(self, limit: float, furthest: float = math.inf) -> tuple[float, float]:
-        """The angle from the axis up to which projections are known to `limit` px, and the part of the image within it.
-
-        furthest: radians, an angle beyond which they count as unknown.
-        """
-        known, angles = self.uncertainty.nan_to_num(torch.inf), self.angles
-        bad = ~((known <= limit) & (angles <= furthest)) & ~angles.isnan()
-        within = angles < torch.where(bad, angles, torch.inf).amin()
-        return float(torch.where(within, angles, 0.0).amax()), float(within.double().mean())
+        """Return the angle from the axis up to which projections are known to `limit` px, and its part of the image."""
+        known = self.uncertainty.nan_to_num(torch.inf)
+        bad = ~((known <= limit) & (self.angles <= furthest)) & self.has_ray
+        within = self.angles < torch.where(bad, self.angles, torch.inf).amin()
+        return float(torch.where(within, self.angles, 0.0).amax()), float(within.double().mean())
 
     @cached_property
-    def normals(self) -> Tensor | None:
-        """(V, 3) of the boards, towards the camera; None if some are no planes."""
+    def tilt(self) -> float:
+        """Radians, the largest angle between two boards; infinite if some are no planes."""
         weights = self.seen.to(self.points)[..., None]
         middle = (self.points * weights).sum(1, keepdim=True) / weights.sum(1, keepdim=True).clamp(min=1)
         _, sizes, axes = torch.linalg.svd((self.points - middle) * weights, full_matrices=False)
         used = self.seen.any(-1)
         if not bool(used.any()) or bool((sizes[used, 2] > 1e-3 * sizes[used, 1]).any()):
-            return None
-        normals = axes[used, 2]
-        return torch.where((normals * middle[used, 0]).sum(-1, keepdim=True) > 0, -normals, normals)
-
-    @cached_property
-    def tilt(self) -> float:
-        """Radians, the largest angle between two boards; infinite if some are no planes."""
-        if self.normals is None:
             return math.inf
-        return float(torch.acos((self.normals @ self.normals.mT).clamp(-1, 1)).amax())
+        normals = axes[used, 2]
+        normals = torch.where((normals * middle[used, 0]).sum(-1, keepdim=True) > 0, -normals, normals)
+        return float(torch.acos((normals @ normals.mT).clamp(-1, 1)).amax())
 
-    @cached_property
-    def view_rms(self) -> Tensor:
-        """(V,) px per point; NaN where nothing was seen."""
-        squares = self.calibration.point_residuals.square().sum(-1) * self.seen
-        return (squares.sum(-1) / self.seen.sum(-1)).sqrt()
+    @property
+    def loose_focal(self) -> float:
+        """The standard deviation of the focal length at the axis over itself: the worse of both.
 
-    @cached_property
-    def gains(self) -> tuple[tuple[float, float, float], tuple[int, float] | None]:
-        """What more parameters would gain, by the linear problem: parts of the sum of squares.
-
-        Of the board's bend: the two numbers, and its gain, 0 where it learned or does not apply. Of more coefficients:
-        how many in all, and their gain; None where the model takes no more.
+        In some models a coefficient does nearly what the parameter called focal length does.
         """
-        calibration, adjusted = self.calibration, self.calibration.adjusted
-        none = (0.0, 0.0, 0.0), None
-        state, cost = adjusted.state, float(adjusted.cost[0])
-        if len(state.parameters) > 1 or not cost > 0 or not self.learns.any():
-            return none
-        points, seen = calibration.observations.points, self.seen
-        ends = torch.stack((points[seen].amin(0), points[seen].amax(0)))
-        points = torch.where(seen[..., None], points - ends.mean(0), 0.0)
-        model = calibration.spread.model
-        sight = Sight(model, points[None], calibration.observations.pixels[None], adjusted.weights[0])
-        bend = none[0]
-        if not any(calibration.bend) and self.normals is not None and float(points.abs().amax((0, 1))[2]) == 0:
-            free = Free((self.learns,), (False,), bend=True)
-            step, gain = _more(Bundle([sight], state, free, None, 1.0), state, 2)
-            bend = (*step.tolist(), gain / cost)
-        count = len(self.parameters) - 4
-        names = model.names_of(count)
-        counts = [n for n in (*model.fit_counts, count + 1, count + 2, count + 3, count + 4) if n > count]
-        longer = ((n, model.names_of(n) or ()) for n in counts)
-        more = next((n for n, its in longer if its and its[:count] == names and not any(model.ideal(n)[count:])), None)
-        if more is None or not bool(self.learns[4:].all()):
-            return bend, None
-        free = Free((torch.cat((self.learns, self.learns.new_ones(more - count))),), (False,))
-        ideal = self.parameters.new_tensor(model.ideal(more))[count:]
-        wider = state._replace(parameters=(torch.cat((state.parameters[0], ideal[None]), -1),))
-        _, gain = _more(Bundle([sight], wider, free, None, 1.0), wider, more - count)
-        return bend, (more, gain / cost)
+        spread, near = self.calibration.spread, 1e-4
+        camera = fixed_camera(spread.model, spread.parameters[:, :4], spread.parameters[:, 4:])
+        rays = spread.parameters.new_tensor([[0.0, 0, 1], [near, 0, 1], [0, near, 1]])
+        by_ray, by_parameters = (jacobians[0] for jacobians in pixel_jacobians(camera, rays[None]))
+        slopes = torch.stack([by_parameters[i + 1, i] - by_parameters[0, i] for i in (0, 1)]) / near
+        stds = torch.linalg.vector_norm(slopes @ spread.factor[0, : slopes.shape[-1]], dim=-1)
+        return float((stds / by_ray[0, :, :2].diagonal().abs()).amax())
 
     @property
     def pattern_share(self) -> float:
-        """The part of the residuals' size that is a mean over a part of the image, 0 where chance may have done it."""
+        """The part of the residuals' size that is a mean over a part of the image; 0 if chance may have done it."""
         use = self.calibration.point_inliers
         residuals, pixels = self.calibration.point_residuals[use], self.calibration.observations.pixels[use]
         side = max(self.calibration.image_size) / _PATTERN
@@ -268,34 +144,11 @@ class Survey:
         cell = place[:, 1].clamp(max=rows - 1) * columns + place[:, 0].clamp(max=columns - 1)
         sums = residuals.new_zeros(rows * columns, 2).index_add_(0, cell, residuals)
         counts = cell.bincount(minlength=rows * columns)
-        here = counts > 0
-        variance = float(residuals.square().mean()) if len(residuals) else 0.0
-        if variance == 0:
-            return 0.0
-        squares = float((sums[here].square().sum(-1) / counts[here]).sum() / variance)
-        free = 2 * int(here.sum())
+        variance, free = float(residuals.square().mean()) if len(residuals) else 0.0, 2 * int((counts > 0).sum())
+        squares = float((sums.square().sum(-1) / counts.clamp(min=1)).sum()) / variance if variance else 0.0
         if squares - free < _CERTAIN * math.sqrt(2 * free):
             return 0.0
         return math.sqrt((squares - free) / (2 * len(residuals)))
-
-    @cached_property
-    def learns(self) -> Tensor:
-        """(4 + n,) bool: which parameters were free."""
-        mine = [i for c, i in self.calibration.adjusted.equations.columns if c == self.calibration.index]
-        learns = torch.zeros(len(self.parameters), dtype=torch.bool, device=self.parameters.device)
-        learns[[i for i in mine if i < len(learns)]] = True
-        return learns
-
-
-def _more(bundle: Bundle, state: State, count: int) -> tuple[Tensor, float]:
-    """The step of the last unknowns, and how much the sum of squares would fall by them, were the problem linear."""
-    shared = bundle.equations(bundle.flat(state)).shared[0, :-1]
-    triangle, right = shared[-count:, -count - 1 : -1], shared[-count:, -1]
-    scale = torch.linalg.vector_norm(shared[:, -count - 1 : -1], dim=0).clamp(min=torch.finfo(shared.dtype).tiny)
-    if bool((triangle.diagonal().abs() < 1e-9 * scale).any()):
-        return torch.zeros_like(right), 0.0
-    step = -torch.linalg.solve_triangular(triangle, right[:, None], upper=True)[:, 0]
-    return step, float(right.square().sum())
 
 
 # -- sentences
@@ -303,9 +156,9 @@ def _more(bundle: Bundle, state: State, count: int) -> tuple[Tensor, float]:
 
 @torch.no_grad()
 def warnings(calibration: Calibration) -> list[str]:
-    """What the data do not carry, and what does not fit: each with what to do. Empty where all is well."""
+    """Return what the data do not carry, and what does not fit: each with what to do. Empty if all is well."""
     survey = Survey(calibration)
-    finders = (_search, _noise, _outliers, _bad_views, _views, _loose, _twins, _coverage, _angles, _pattern, _needless)
+    finders = (_search, _residuals, _views, _loose, _twins, _coverage, _pattern)
     return [text for find in finders for text in find(survey)]
 
 
@@ -325,46 +178,37 @@ def _search(survey: Survey) -> Iterator[str]:
         )
 
 
-def _noise(survey: Survey) -> Iterator[str]:
-    sigma = survey.calibration.sigma
-    if sigma > _CORNER_NOISE * max(1.0, max(survey.calibration.image_size) / 2000):
+def _residuals(survey: Survey) -> Iterator[str]:
+    calibration, seen, inliers = survey.calibration, survey.seen, survey.calibration.point_inliers
+    if calibration.sigma > _CORNER_NOISE * max(1.0, max(calibration.image_size) / 2000):
         yield (
-            f"What is left is {_px(sigma)} per coordinate, far more than corners are wrong by: the board may be bent "
-            "or not as described, images out of focus or smeared, or the model not that of the lens"
+            f"What is left is {_px(calibration.sigma)} per coordinate, far more than corners are wrong by: the board "
+            "may be bent or not as described, images out of focus or smeared, or the model not that of the lens"
         )
-
-
-def _outliers(survey: Survey) -> Iterator[str]:
-    calibration, seen = survey.calibration, survey.seen
-    inliers = calibration.point_inliers
-    bad = seen & ~inliers
-    per_view, count = bad.sum(-1), int(bad.sum())
-    lengths = torch.linalg.vector_norm(calibration.point_residuals, dim=-1)
-    usual = math.sqrt(float(lengths[inliers].square().mean()) / 2) if bool(inliers.any()) else 0.0
-    # of the lengths of normal errors so many are beyond three standard deviations, and none beyond six
-    if count > 3 + 2 * math.exp(-4.5) * int(seen.sum()) or bool((lengths[bad] > 6 * usual).any()):
+    bad, squares = seen & ~inliers, calibration.point_residuals.square().sum(-1)
+    per_view, count, total = bad.sum(-1), int(bad.sum()), int(seen.sum())
+    usual = float(squares[inliers].mean()) / 2 if bool(inliers.any()) else 0.0
+    # so many lengths of normal errors are beyond three standard deviations, and none beyond six
+    if count > 3 + 2 * math.exp(-4.5) * total or bool((squares[bad] > 36 * usual).any()):
         most = int(per_view.argmax())
         robust = "" if calibration.loss else ': loss="huber" keeps them from pulling'
         yield (
-            f"{count} of {int(seen.sum())} corners are outliers, {int(per_view[most])} of them in view "
+            f"{count} of {total} corners are outliers, {int(per_view[most])} of them in view "
             f"{calibration.views[most]}{robust}. Look at the views"
         )
-    (lost,) = (per_view > _MOST_OF_A_VIEW * seen.sum(-1)).nonzero(as_tuple=True)
-    if len(lost) and calibration.loss:
+    lost = (per_view > _MOST_OF_A_VIEW * seen.sum(-1)).nonzero()[:, 0].tolist()
+    if lost and calibration.loss:
         yield (
-            f"Nearly all corners of {_numbered(survey, lost)} are outliers, as where they are numbered in another "
+            f"Nearly all corners of {_named(calibration, lost)} are outliers, as where they are numbered in another "
             "order. Leave such views out: they make all parameters look less certain"
         )
-
-
-def _bad_views(survey: Survey) -> Iterator[str]:
-    rms = survey.view_rms
-    usual = float(rms[~rms.isnan()].median())
-    (bad,) = (rms > max(_WORSE_VIEW * usual, survey.rounding)).nonzero(as_tuple=True)
-    if len(bad) and len(rms) >= _FEW_VIEWS:
+    rms = ((squares * seen).sum(-1) / seen.sum(-1)).sqrt()
+    middle = float(rms[~rms.isnan()].median())
+    worse = (rms > max(_WORSE_VIEW * middle, survey.rounding)).nonzero()[:, 0].tolist()
+    if worse and len(rms) >= _FEW_VIEWS:
         yield (
-            f"Worse than the others fit {_numbered(survey, bad)}, up to {_px(float(rms[bad].amax()))} where "
-            f"{_px(usual)} is usual: look at their corners, or leave them out"
+            f"Worse than the others fit {_named(calibration, worse)}, up to {_px(float(rms[worse].amax()))} where "
+            f"{_px(middle)} is usual: look at their corners, or leave them out"
         )
 
 
@@ -397,34 +241,29 @@ def _loose(survey: Survey) -> Iterator[str]:
 
 
 def _twins(survey: Survey) -> Iterator[str]:
-    calibration = survey.calibration
-    if calibration.twins:
-        names = [0, *range(4, len(calibration.parameter_names))]
-        found, *others = (
-            ", ".join(f"{calibration.parameter_names[i]} {values[i]:.4g}" for i in names)
-            for values in (survey.parameters.tolist(), *calibration.twins)
-        )
+    found = survey.calibration
+    if found.twins:
+        names = (found.parameter_names[0], *found.parameter_names[4:])
+        optima = [(p[0], *p[4:]) for p in (found.spread.parameters[0].tolist(), *found.twins)]
+        first, *others = (", ".join(f"{n} {v:.4g}" for n, v in zip(names, p, strict=True)) for p in optima)
         yield (
-            "The parameters are not known, though projections are where corners were seen. As well as "
-            f"{found} fit {'; '.join(others)}. Compare no parameters, or take eucm or kannala_brandt"
+            f"The parameters are not known, though projections are where corners were seen. As well as {first} fit "
+            f"{'; '.join(others)}. Compare no parameters, or take eucm or kannala_brandt"
         )
 
 
 def _coverage(survey: Survey) -> Iterator[str]:
     if missing := survey.missing:
         yield f"Few corners or none in {_places(missing)} of the image. Hold the board there, near to the edges"
-
-
-def _angles(survey: Survey) -> Iterator[str]:
     reach, end = survey.reach, survey.image_reach
-    lost = float((~survey.rays[1]).double().mean())
+    lost = float((~survey.has_ray).double().mean())
     if lost > 0.001 and not survey.ends_in_the_dark:
         yield (
             f"The fitted lens ends inside the image: {_percent(lost)} of the pixels have no ray, beyond {_degrees(end)}"
             f" from the axis, where corners reach {_degrees(reach)}. Take views with corners further out, or a model "
             "with fewer coefficients or of a wider lens"
         )
-    if end > reach + _BEYOND and survey.good_within(ROUGH)[0] < end:
+    if end > reach + _BEYOND and survey.good_within(_ROUGH)[0] < end:
         yield (
             f"Corners reach {_degrees(reach)} from the axis, and the image {_degrees(end)}: beyond what was seen the "
             "lens is a guess. Hold the board nearer to the corners of the image"
@@ -432,104 +271,47 @@ def _angles(survey: Survey) -> Iterator[str]:
 
 
 def _pattern(survey: Survey) -> Iterator[str]:
-    calibration = survey.calibration
-    if calibration.rms <= survey.rounding:
-        return
-    bend, more = survey.gains
-    share = survey.pattern_share
-    least = max(_GAIN, (_CERTAIN * calibration.sigma) ** 2 / max(float(calibration.adjusted.cost[0]), 1e-300))
-    if bend[2] > least and share < 2 * _PATTERN_SHARE and len(survey.seen) >= _FEW_VIEWS:
-        points = calibration.observations.points[survey.seen]
-        sides = (points.amax(0) - points.amin(0))[:2].tolist()
-        x, y = (_percent(abs(value) / side) for value, side in zip(bend[:2], sides, strict=True))
+    rms = survey.calibration.rms
+    if rms > survey.rounding and (share := survey.pattern_share) > _PATTERN_SHARE:
         yield (
-            f"The board seems to be bent, by {x} of its length along its x and {y} along its y: the squares of the "
-            f"residuals would fall by {_percent(bend[2])}. bend=True finds its shape; a stiff board is better"
-        )
-    if more is not None and more[1] > max(least, _PATTERN_SHARE * share):
-        yield (
-            f"The model does not quite fit: with count={more[0]} coefficients the squares of the residuals would fall "
-            f"by {_percent(more[1])}"
-        )
-    elif share > _PATTERN_SHARE:
-        yield (
-            f"The residuals have a pattern over the image, of {_px(share * calibration.rms)}: the model is not that of "
-            "the lens, or the board is not as described. Try brown_conrady, kannala_brandt or fisheye624, or bend=True"
-        )
-
-
-def _needless(survey: Survey) -> Iterator[str]:
-    calibration = survey.calibration
-    names = calibration.parameter_names[4:]
-    ideal = calibration.spread.model.ideal(len(names))
-    values = survey.parameters[4:]
-    std, covariance = calibration.std[4:], calibration.covariance[4:, 4:]
-    series: dict[str, list[int]] = {}
-    for i, name in enumerate(names):
-        if not ideal[i] and name[-1].isdigit():  # else it is no term of a series
-            series.setdefault(name.rstrip("0123456789"), []).append(i)
-    taken: list[int] = []
-    for members in series.values():
-        # the last terms of a series; together coefficients may say what each alone does not
-        for i in reversed(members):
-            some = [*taken, i]
-            scale = std[some]
-            if float(scale[-1]) == 0:
-                continue
-            correlation = covariance[some][:, some] / scale[:, None] / scale
-            scaled = (values[some] / scale)[:, None]
-            square = float((scaled.mT @ torch.linalg.pinv(correlation, hermitian=True) @ scaled)[0, 0])
-            if square > len(some) + 2 * math.sqrt(2 * len(some)):
-                break
-            taken = some
-    if taken:
-        found = [names[i] for i in sorted(taken)]
-        yield (
-            f"{_listed(found)} cannot be told from zero, and the data do not need that: {_fixed(found)} makes the rest "
-            "more certain"
+            f"The residuals have a pattern over the image, of {_px(share * rms)}: the model is not that of the lens, "
+            "or the board is bent. Try brown_conrady with count=8, kannala_brandt or fisheye624, or bend=True"
         )
 
 
 @torch.no_grad()
 def verdict(calibration: Calibration) -> str:
-    """One paragraph: what the camera is good for, up to which angle, and what to photograph next."""
+    """Return a paragraph: what the camera is good for, up to which angle, and what to photograph next."""
     survey = Survey(calibration)
     if not calibration.converged:
         return next(_search(survey)) + "."
     middle = survey.zones[4].uncertainty
-    # what the model makes of rays that no corner was near is not told by the noise
-    fine, fine_share = survey.good_within(FINE, survey.reach + _BEYOND)
-    rough, rough_share = survey.good_within(ROUGH)
-    noise = "one standard deviation in the worst direction"
+    # the noise does not tell what the model makes of rays that no corner was near
+    fine, fine_share = survey.good_within(_FINE, survey.reach + _BEYOND)
+    rough, rough_share = survey.good_within(_ROUGH)
+    good = f"Not for measuring: projections are known to {_px(middle)} in the middle ({_NOISE})."
     if fine_share > 0:
         there = float(survey.uncertainty[survey.angles <= fine].amax())
         good = (
             f"Good for measuring up to {_degrees(fine)} from the optical axis, {_percent(fine_share)} of the image: "
-            f"projections are known to {_px(middle)} in the middle and to {_px(there)} at worst ({noise})."
+            f"projections are known to {_px(middle)} in the middle and to {_px(there)} at worst ({_NOISE})."
         )
-    else:
-        good = f"Not for measuring: projections are known to {_px(middle)} in the middle ({noise})."
     if rough_share > fine_share:
         good += f" Good for looking at up to {_degrees(rough)}, {_percent(rough_share)} of the image."
     reach = f"Corners were seen up to {_degrees(survey.reach)}; the image goes to {_degrees(survey.image_reach)}."
-    return f"{good} {reach} {_next(survey)}"
-
-
-def _next(survey: Survey) -> str:
-    """What to photograph next."""
-    middle = survey.zones[4].uncertainty
-    loose = [zone for zone in survey.zones if zone.rays >= 0.5 and zone.uncertainty > max(FINE, 2 * middle)]
-    wanted = survey.missing or sorted(loose, key=lambda zone: -zone.uncertainty)[:3]
+    loose = [zone for zone in survey.zones if zone.rays >= 0.5 and zone.uncertainty > max(_FINE, 2 * middle)]
     tilt = f" {_TILTED}." if survey.tilt < _ALIKE else ""
-    if wanted:
-        return (
+    if wanted := survey.missing or sorted(loose, key=lambda zone: -zone.uncertainty)[:3]:
+        ahead = (
             f"Next, hold the board in {_places(wanted)} of the image, so near that its corners reach the edges.{tilt}"
         )
-    if tilt:
-        return f"Next:{tilt}"
-    if middle > FINE:
-        return "Next, take more views, near and tilted: four times as many halve the uncertainty."
-    return "It needs no more views; four times as many would halve the uncertainty."
+    elif tilt:
+        ahead = f"Next:{tilt}"
+    elif middle > _FINE:
+        ahead = "Next, take more views, near and tilted: four times as many halve the uncertainty."
+    else:
+        ahead = "It needs no more views; four times as many would halve the uncertainty."
+    return f"{good} {reach} {ahead}"
 
 
 @torch.inference_mode()
@@ -538,12 +320,12 @@ def check_determined(
 ) -> None:
     """Refuse a problem in which the views of a camera leave it open, as those of boards that are all parallel do.
 
-    It is open where corners that are wrong by a tenth of a pixel leave the projections of what was seen uncertain by a
+    It is open if corners that are wrong by a tenth of a pixel leave the projections of what was seen uncertain by a
     fiftieth of the extent of the corners: a matter of where the boards were, which corners without noise cannot hide.
-    Several views that no camera fits are wrong, not open, and what warnings are for. found: of noise of 1 px.
+    Several views that no camera fits are wrong, not open: they get warnings. found: of noise of 1 px.
 
     Raises:
-        ValueError: it is open, with what to do.
+        ValueError: If it is open, with what to do.
     """
     found = found.scaled(adjusted.cost.new_full((1,), _USUAL_NOISE))
     seen = sight.weights[0] > 0
@@ -563,8 +345,9 @@ def check_determined(
     open_ones = [name for name, is_open in zip(names, (std > limits).tolist(), strict=True) if is_open]
     free = [name for name, size in zip(names, std.tolist(), strict=True) if size > 0]
     hold = [name for name in free if name not in ("fx", "fy")] or free
-    what = "a single view of this board leaves" if views == 1 else f"these {views} views leave"
-    why = "" if views == 1 else ", as boards that are all nearly parallel do"
+    what, why = f"these {views} views leave", ", as boards that are all nearly parallel do"
+    if views == 1:
+        what, why = "a single view of this board leaves", ""
     raise ValueError(
         f"{owner}: {what} {_listed(open_ones or free)} undetermined{why}. Take 10 to 20 views. {_TILTED}, or hold "
         f"parameters: {_fixed(hold)}"
@@ -574,8 +357,8 @@ def check_determined(
 # -- words
 
 
-def _numbered(survey: Survey, rows: Tensor) -> str:
-    return named([survey.calibration.views[i] for i in rows.tolist()])
+def _named(calibration: Calibration, rows: list[int]) -> str:
+    return named([calibration.views[row] for row in rows])
 
 
 def _listed(names: Sequence[str]) -> str:

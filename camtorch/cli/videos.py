@@ -99,12 +99,6 @@ def size_of(path: Path) -> tuple[int, int] | None:
     return None
 
 
-def length_of(path: Path) -> float:
-    """Return about how many seconds it takes; 0 if the file does not say it."""
-    with _opened(path) as (container, _):
-        return _span(container)[1]
-
-
 def count_of(path: Path) -> int | None:
     """Return about how many frames it has; None if the file does not say it."""
     with _opened(path) as (container, stream):

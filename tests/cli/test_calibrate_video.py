@@ -63,7 +63,6 @@ def test_time_stamps_may_begin_late(tmp_path):
             frame.pts, frame.time_base = hour * RATE + i, Fraction(1, RATE)
             file.mux(stream.encode(frame))
         file.mux(stream.encode(None))
-    assert videos.length_of(path) == pytest.approx(3, abs=0.3)
     assert [seconds for seconds, _ in videos.frames(path)] == [i / RATE for i in range(3 * RATE)]
 
 
