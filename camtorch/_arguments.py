@@ -20,6 +20,9 @@ from camtorch._tracing import in_graph, is_concrete, is_eager, keeps_graph, may_
 Numbers: TypeAlias = "Tensor | np.ndarray[Any, Any] | np.number[Any] | float | list[Any] | tuple[Any, ...]"
 """What users pass as numbers: a tensor, an array, a number, or lists of them."""
 
+LEFT = "What left camtorch stands in docs/leaving-0.3.md"
+"""For errors on names that are not known."""
+
 Taken = ParamSpec("Taken")
 Result = TypeVar("Result")
 

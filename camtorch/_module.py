@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.utils.parametrize import type_before_parametrizations
 
-from camtorch._arguments import shown
+from camtorch._arguments import LEFT, shown
 from camtorch._tracing import (
     has_tangent,
     in_graph,
@@ -124,6 +124,10 @@ class GeometryModule(nn.Module):
         """What its numbers are those of: a state of another one is refused. Empty: its keys tell."""
         return ""
 
+    def _has_left(self, name: str) -> bool:
+        """Whether no model has this name, of a state."""
+        return False
+
     def _save_to_state_dict(self, destination: Any, prefix: str, keep_vars: bool) -> None:
         super()._save_to_state_dict(destination, prefix, keep_vars)
         if self._model_name() and hasattr(destination, "_metadata"):
@@ -134,7 +138,7 @@ class GeometryModule(nn.Module):
         mine, its = self._model_name(), metadata.get("model")
         if mine and its not in (None, mine):
             where = f" {prefix[:-1]}" if prefix else ""
-            errors.append(f"the state{where} is of {its}, and the module of {mine}")
+            errors.append(f"the state{where} is of {its}, and the module of {mine}" + f". {LEFT}" * self._has_left(its))
             return
         super()._load_from_state_dict(*arguments)
         # what has no values is in no state_dict, and follows what was assigned in the place of meta tensors

@@ -357,6 +357,9 @@ class Camera(Freezable):
         # a class that adds methods alone is of the model that it is made from
         return next(cls.__name__ for cls in type(self).__mro__ if "optics" in cls.__dict__)
 
+    def _has_left(self, name: str) -> bool:
+        return name not in {model.__name__ for model in MODELS.values()}
+
     @classmethod
     def counts_text(cls) -> str:
         """How many coefficients the model takes, in words."""

@@ -21,13 +21,12 @@ from PIL import Image
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from camtorch._arguments import check_path
+from camtorch._arguments import LEFT, check_path
 from camtorch._photographs import load_stored
 from camtorch.augment.landmarks import LANDMARKS, TableLike
 from camtorch.augment.sample import KINDS, Sample
 from camtorch.camera import Camera
 from camtorch.data.columns import camera_of
-from camtorch.io.record import LEFT
 from camtorch.models import BrownConrady, Pinhole
 from camtorch.rotations import rotation_matrix
 

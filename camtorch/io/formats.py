@@ -11,6 +11,7 @@ import codecs
 import fnmatch
 import os
 
+from camtorch._arguments import LEFT
 from camtorch.camera import Camera
 from camtorch.io import (
     aria,
@@ -33,7 +34,7 @@ from camtorch.io import (
 from camtorch.io._errors import CameraFileError
 from camtorch.io.parsing import parse_mapping, path_of, read_bytes
 from camtorch.io.protocol import ContentFormat, KeyFormat, Names, WrittenFormat
-from camtorch.io.record import LEFT, Record
+from camtorch.io.record import Record
 from camtorch.io.writing import replacing
 from camtorch.rig import Rig
 

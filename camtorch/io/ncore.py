@@ -6,9 +6,10 @@ from typing import Any
 
 import numpy as np
 
+from camtorch._arguments import LEFT
 from camtorch.camera import Camera
 from camtorch.io.protocol import Names
-from camtorch.io.record import LEFT, Record, one_of
+from camtorch.io.record import Record, one_of
 from camtorch.models import FTheta, FThetaBackward
 from camtorch.rig import Rig
 

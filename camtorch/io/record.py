@@ -12,11 +12,11 @@ from typing import Any, NoReturn
 import torch
 from torch import nn
 
+from camtorch._arguments import LEFT
 from camtorch.camera import Camera, as_model
 from camtorch.io._errors import CameraFileError
 from camtorch.models import MODELS
 
-LEFT = "What left camtorch stands in docs/leaving-0.3.md"
 LARGEST_SIDE = 1 << 20
 _MOST_CAMERAS = 20_000
 _SHOWN = 8

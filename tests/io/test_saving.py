@@ -306,6 +306,18 @@ def test_a_file_of_version_0_2_0_loads(tmp_path):
     assert_same(rig, ct.Rig({"left": lens}, {"left": pose}))
 
 
+def test_models_that_are_not_there_any_more_name_the_page(tmp_path):
+    for model in ("gone", "brown_conrady:gone=3,3"):
+        (tmp_path / "rig.json").write_text(FIRST_FILE.replace("brown_conrady", model))
+        with pytest.raises(ct.CameraFileError, match=r"rig.json: cameras.left: .*gone.*docs/leaving-0\.3\.md"):
+            ct.load(tmp_path / "rig.json")
+    state = camera().state_dict()
+    for name, hint in (("Gone", r"\. What left camtorch stands in docs/leaving-0\.3\.md"), ("Pinhole", "$")):
+        state._metadata[""]["model"] = name
+        with pytest.raises(RuntimeError, match=f"the state is of {name}, and the module of BrownConrady{hint}"):
+            camera().load_state_dict(state)
+
+
 def test_state_of_version_0_2_0_loads():
     lens = camera("kannala_brandt", [0.1, 0.2, 0.3, 0.4])
     pose = ct.Extrinsics([0.5, 0.0, 0.0], [0.0, 0.25, 0.0])
