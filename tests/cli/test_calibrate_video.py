@@ -66,13 +66,6 @@ def test_time_stamps_may_begin_late(tmp_path):
     assert [seconds for seconds, _ in videos.frames(path)] == [i / RATE for i in range(3 * RATE)]
 
 
-def test_videos_are_for_one_camera(tmp_path, capsys, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "board.mp4").touch()
-    assert main(["calibrate", "--left", "board.mp4", "--right", "board.mp4", *WORDS, "-o", "rig.json"]) == 2
-    assert "videos are for one camera" in capsys.readouterr().err
-
-
 def test_a_video_without_a_board_says_so(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with av.open("grey.mp4", "w") as file:

@@ -115,6 +115,7 @@ CASES = {
         ("calibrate --rig in.png --board 9x6", "--rig takes NAME=IMAGE, as in cam0=folder"),
         ("calibrate --rig cam0=in.png --board 9x6", "--rig takes several cameras"),
         ("calibrate --left in.png --right in.png --board 9x6", "in.png: is given as an image of two cameras"),
+        ("calibrate --left film.mkv --right film.mkv --board 9x6", "film.mkv: videos are for one camera"),
         (
             "calibrate in.png --board 9x6 --model lens",
             "--model: there is no camera model 'lens'; known are brown_conrady",
