@@ -15,7 +15,7 @@ from torch.nn.utils import parametrize
 
 from camtorch._arguments import Numbers, as_points, warn
 from camtorch._module import Memo, is_constant, with_values
-from camtorch._portable import is_portable_export
+from camtorch._portable import portable_export
 from camtorch._tracing import (
     FAKE_MODE,
     has_tangent,
@@ -87,7 +87,8 @@ def evaluated(
             cameras = rows_of(camera, intrinsics, distortion)
             cameras = cameras.with_all_tables()
         order = 1 if keeps_graph(rows) else 0
-        return direction.traced(type(camera), rows, intrinsics, distortion, cameras, order)
+        with portable_export():
+            return direction.traced(type(camera), rows, intrinsics, distortion, cameras, order)
     intrinsics, distortion = (per_row(t, lead, rows) for t in tensors)
     inputs, cameras_of = (rows, intrinsics, distortion), cameras_of or partial(rows_of, camera)
     if _is_plain(inputs):
@@ -108,8 +109,6 @@ def evaluated(
     # what is compiled has no derivatives of derivatives
     order = 1 if torch.compiler.is_compiling() else 2
     known = all(is_concrete(t) and not has_tangent(t) for t in inputs[1:])
-    if is_portable_export() and not keeps_graph(*inputs):
-        inputs = rows, intrinsics.detach(), distortion.detach()
     return direction.traced(type(camera), *inputs, cameras_of(*inputs[1:]) if known else None, order)
 
 

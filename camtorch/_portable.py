@@ -1,9 +1,10 @@
-"""What is recorded for other runtimes: of torch's operators only those that they have too, and loops."""
+"""Constant cameras recorded for other runtimes: of torch's operators only those that they have too, and loops."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from functools import reduce
 
 import torch
@@ -11,117 +12,69 @@ from torch import Tensor
 
 from camtorch._arguments import broadcast_shapes
 
+_recording = False
+
 
 def is_portable_export() -> bool:
-    """Whether a program is exported that runs without operators of our own.
-
-    Not where dynamo reads the code itself (`strict=True`), which does not follow all of it.
-    """
-    return torch.compiler.is_exporting() and not torch.compiler.is_dynamo_compiling()
+    """Whether a camera, a constant of an exported program, is recorded without operators of our own."""
+    return _recording
 
 
-_MOST_BITS = 100
-"""ONNX gets numbers of float64 programs by way of float32, and beyond its range as 0 or as infinite."""
+@contextmanager
+def portable_export() -> Iterator[None]:
+    """Record a camera so in here."""
+    global _recording
+    before, _recording = _recording, True
+    try:
+        yield
+    finally:
+        _recording = before
+
 
 # the optimiser of ONNX programs leaves out terms that are nearly 0 and factors that are nearly 1, to 1e-8 and 1e-5
 
 
 def plus(a: Tensor, least: float) -> Tensor:
-    """The sum of a tensor and of a number that is nearly nothing, and yet is to be there."""
+    """Return the sum of a tensor and a tiny number, which is not left out."""
     if not torch.compiler.is_exporting():
         return a + least
     bits = -math.floor(math.log2(abs(least)))
-    steps = [_MOST_BITS] * (bits // _MOST_BITS) + [bits % _MOST_BITS]
-    for step in steps:  # powers of two cost no bit
-        a = a * 2.0**step
-    a = a + least * 2.0**bits
-    for step in steps:
-        a = a * 2.0**-step
-    return a
+    # powers of two cost no bit; numbers of float64 programs go by way of float32, in which 2^100 is one
+    steps = [2.0**100] * (bits // 100) + [2.0 ** (bits % 100)]
+    a = reduce(torch.mul, steps, a) + least * 2.0**bits
+    return reduce(torch.mul, (1 / step for step in steps), a)
 
 
 def times(a: Tensor, nearly_one: float) -> Tensor:
-    """The product of a tensor and of a number beside 1."""
+    """Return the product of a tensor and a number next to 1."""
     return a * nearly_one if not torch.compiler.is_exporting() else a * 0.5 * (2 * nearly_one)
 
 
-def hypot(a: Tensor, b: Tensor) -> Tensor:
-    """The length of (a, b), elsewhere of what has a square that is a number."""
-    return (a * a + b * b).sqrt() if torch.compiler.is_exporting() else torch.hypot(a, b)
-
-
 def as_index(position: Tensor) -> Tensor:
-    """The integer below a position, in as few bits as serve; NaN becomes some integer."""
+    """Return the integer below a position, in as few bits as serve; NaN becomes some integer."""
     return position.to(torch.int64 if torch.compiler.is_exporting() else torch.int32)
 
 
-def leading(flags: Tensor) -> Tensor:
-    """(..., S) -> (..., 1): how many of the flags are set before the first that is not."""
-    if torch.compiler.is_exporting():
-        return (flags.logical_not().long().cumsum(-1) == 0).long().sum(-1, keepdim=True)
-    return flags.long().cumprod(-1).sum(-1, keepdim=True)
-
-
-def running_max(values: Tensor) -> Tensor:
-    """(..., S): the largest up to each."""
-    if not torch.compiler.is_exporting():
-        return torch.cummax(values, -1).values
-    step = 1
-    while step < values.shape[-1]:
-        values = torch.cat((values[..., :step], torch.maximum(values[..., step:], values[..., :-step])), -1)
-        step *= 2
-    return values
-
-
-def count_not_above(table: Tensor, values: Tensor) -> Tensor:
-    """(..., M): how many entries of the ascending table (..., S) are not above each of the values (..., M)."""
-    if not torch.compiler.is_exporting():
-        return torch.searchsorted(table.contiguous(), values.contiguous(), right=True)
-    size = table.shape[-1]
-    low, high = (torch.full_like(values, end, dtype=torch.int64) for end in (0, size))
-    for _ in range(size.bit_length()):
-        middle = (low + high) // 2
-        above = table.gather(-1, middle.clamp(max=size - 1)) > values
-        settled = low >= high
-        low = torch.where(above | settled, low, middle + 1)
-        high = torch.where(above & ~settled, middle, high)
-    return low
-
-
 def of_points(k: Tensor, camera: Tensor) -> tuple[Tensor, ...]:
-    """The columns (M,) of coefficients (C, n), of points seen by the cameras of these indices, for `repeat` as well."""
+    """Return the columns (M,) of coefficients (C, n) for points seen by the cameras of these indices."""
     if is_portable_export():  # a recorded loop takes no views of one tensor, and no tensor of size one
         return tuple(c[camera] for c in k.unbind(-1))
     # a single camera serves all points
     return (k[0].unsqueeze(-1) if len(k) == 1 else k[camera].mT).unbind(0)
 
 
-def choose(flag: bool | Tensor, chosen: Tensor, other: Tensor) -> Tensor:
-    """One of two tensors, by a flag that `repeat` counts."""
-    if isinstance(flag, Tensor):
-        return torch.where(flag, chosen, other)
-    return chosen if flag else other
-
-
 def repeat(
     step: Callable[..., tuple[Tensor, ...]], moves: Tensor, state: Sequence[Tensor], most: int
 ) -> tuple[Tensor, ...]:
-    """A loop that is recorded as one.
+    """Return moves and state after at most so many steps; a step maps both to new ones of the same shapes and dtypes.
 
-    Args:
-        step: of how many were made, moves and the state to new moves and a new state, of the same shapes and dtypes.
-        moves: bool, any of which keeps the loop going.
-        state: tensors.
-        most: steps.
-
-    Returns:
-        moves and the state at last.
+    `moves`, bool, keeps the loop going while any of it is set. An exported program records a loop.
     """
     if not is_portable_export():
-        for count in range(most):
+        for _ in range(most):
             if not bool(moves.any()):
                 break
-            moves, *state = step(count, moves, *state)
+            moves, *state = step(moves, *state)
         return (moves, *state)
     # private, and not imported with torch
     from torch._higher_order_ops.while_loop import while_loop
@@ -130,7 +83,7 @@ def repeat(
         return (count < most) & moves.any()
 
     def body(count: Tensor, *state: Tensor) -> tuple[Tensor, ...]:
-        return (count + 1, *step(count, *state))
+        return (count + 1, *step(*state))
 
     start = (torch.zeros((), dtype=torch.int64, device=moves.device), moves, *(w.clone() for w in state))
     result: tuple[Tensor, ...] = while_loop(goes_on, body, start)
@@ -138,10 +91,9 @@ def repeat(
 
 
 def piece_of(nodes: tuple[Tensor, ...], place: Tensor) -> Tensor:
-    """How many of the nodes, columns that broadcast against planes, lie at or before each place."""
+    """Return how many of the nodes, columns that broadcast against planes, lie at or before each place."""
     if torch.compiler.is_exporting():  # one by one: few, or the memory of all comparisons
-        passed = [(node <= place).long() for node in nodes]
-        return reduce(torch.add, passed)
+        return reduce(torch.add, [(node <= place).long() for node in nodes])
     table = torch.stack(nodes, -1).contiguous()
     if not table.shape[:-1] or table.shape[-2] != 1:  # nodes of a place's own
         return torch.searchsorted(table, place.unsqueeze(-1).contiguous(), right=True).squeeze(-1)
@@ -150,7 +102,7 @@ def piece_of(nodes: tuple[Tensor, ...], place: Tensor) -> Tensor:
 
 
 def pick(columns: Sequence[Tensor], index: Tensor) -> Tensor:
-    """From each plane's own columns the one of that index."""
+    """Return from each plane's own columns the one of that index."""
     if torch.compiler.is_exporting():  # no sizes are compared, which may be unknown
         found = columns[0] + torch.zeros_like(index, dtype=columns[0].dtype)
         for i, column in enumerate(columns[1:], 1):
@@ -162,7 +114,7 @@ def pick(columns: Sequence[Tensor], index: Tensor) -> Tensor:
 
 
 def solve_tridiagonal(below: Tensor, main: Tensor, above: Tensor, right: Tensor) -> Tensor:
-    """The solution (*B, N) of equations with diagonals (*B, N - 1), (*B, N), (*B, N - 1)."""
+    """Return the solution (*B, N) of equations with diagonals (*B, N - 1), (*B, N), (*B, N - 1)."""
     if not torch.compiler.is_exporting():
         matrix = torch.diag_embed(main) + torch.diag_embed(above, 1) + torch.diag_embed(below, -1)
         found: Tensor = torch.linalg.solve(matrix, right.unsqueeze(-1)).squeeze(-1)
@@ -180,14 +132,14 @@ def solve_tridiagonal(below: Tensor, main: Tensor, above: Tensor, right: Tensor)
 
 
 def unbound(table: Tensor) -> tuple[Tensor, ...]:
-    """The columns (...) of a table (..., N)."""
+    """Return the columns (...) of a table (..., N)."""
     columns = table.unbind(-1)
     # a recorded loop takes no views of one tensor
     return tuple(c.clone() for c in columns) if torch.compiler.is_exporting() else columns
 
 
 def exported_atan2(y: Tensor, x: Tensor) -> Tensor:
-    """torch.atan2 for ONNX, whose composed one is -pi at y = 0 behind; ONNX Runtime has none in float64."""
+    """Return torch.atan2 for ONNX, whose composed one is -pi at y = 0 behind; ONNX Runtime has none in float64."""
     y, x = torch.broadcast_tensors(y, x)
     behind = (y == 0) & (x < 0)
     if y.dtype != torch.float64:

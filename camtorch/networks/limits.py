@@ -14,33 +14,26 @@ from camtorch.optics.backprojection import FURTHEST, Inverted
 
 if TYPE_CHECKING:
     from camtorch.camera import Camera
-    from camtorch.optics.charts import Chart, Planes2
+    from camtorch.optics.charts import Chart
 
 BEYOND = 1.02
 """How much further out than the image is asked, where its rim is safe from rounding."""
 _NODES = 48  # of Chebyshev: what a polynomial of t = radius^2 is between them is hardly more than on them
-_LEAST, _MOST = 0.05, 4.0  # the slope of a lens, and how far out it sends points, compared with the lens given
-_FLATTEST, _STEEPEST = 0.25, 20.0  # the same of charts: angle by radius
 _KEPT = 0.02  # of the way from the lens given to where a formula ends
 _AZIMUTHS = 360  # a shear near its end has its least in a narrow sector
 _AT_AXIS = 1e-6  # of the radius; further out a chart of a large xi or alpha may have no rays
-_FIRST, _LAST, _GRID = 1e-3, 1e3, 32
-_NEARER = 3
-_ROUNDS, _PARTS = 5, 8
-_STEP = 1e-6
+_FIRST, _LAST, _GRID, _NEARER = 1e-3, 1e3, 32, 3  # where the end is looked for first, and how many times nearer
+_ROUNDS, _PARTS = 5, 8  # in which it is bracketed more closely
+_STEP = 1e-6  # by which the slope of the margin at the end is taken
 
-
-Profile = dict[str, Tensor]
-"""A lens from the axis outwards, (*C, nodes) each at the nodes of a disc, of the names in `_MARGINS` that it has."""
-
+# positive for a lens in the set, by the ratio of its profile to that of the lens given
 _MARGINS: dict[str, Callable[[Tensor], Tensor]] = {
     "room": lambda ratio: ratio - _KEPT,  # positive where the chart has rays
-    "turns": lambda ratio: torch.minimum(ratio / _FLATTEST - 1, 1 - ratio / _STEEPEST),  # angles from node to node
-    "slope": lambda ratio: ratio - _LEAST,  # a lower bound in all directions
-    "reach": lambda ratio: 1 - ratio / _MOST,  # an upper bound of how many times further out points come to lie
+    "turns": lambda ratio: torch.minimum(ratio / 0.25 - 1, 1 - ratio / 20.0),  # angles from node to node
+    "slope": lambda ratio: ratio - 0.05,  # a lower bound in all directions
+    "reach": lambda ratio: 1 - ratio / 4.0,  # an upper bound of how many times further out points come to lie
     "defined": lambda ratio: ratio - _KEPT,  # positive where the formula exists
 }
-"""Positive for a lens in the set, by the ratio of its profile to that of the lens given."""
 
 
 class Limits:
@@ -51,33 +44,27 @@ class Limits:
     most twenty times as steep as the one given. It is convex where all terms of a lens are of one stage and linear in
     the coefficients: polynomials, decentering, thin prisms. Elsewhere only lines from the lens given are looked at.
 
-    Coefficients are (*C, n) and radii of discs, on the plane of the chart, (*C, 1).
+    Coefficients are (*C, n) and radii of discs, on the plane of the chart, (*C, 1); `given` is (n,).
     """
 
-    model: type[Camera]
-    given: Tensor
-    bends: bool
-    is_radial: bool
-
     def __init__(self, model: type[Camera], given: Tensor):
-        """given: (n,), the coefficients of the lens from which others are seen."""
         self.model, self.given = model, given
         chart, lens = model.optics(columns(given))
         self.bends = len(chart.parameters) > 0
         self.is_radial = len(lens.stages) == 0 or lens.is_radial
 
     def disc(self, k: Tensor, radius: Tensor) -> Tensor:
-        """The disc of another lens that shows, near the axis, what that of the lens given shows.
+        """Return the disc of another lens that shows, near the axis, what that of the lens given shows.
 
         Coefficients that scale the whole image, as the xi of `DoubleSphere`, so leave the field of view nearly alone.
         """
         if not self.bends:
             return radius
-        near = _AT_AXIS * radius
-        return radius * _angles(self._chart(self.given), near) / _angles(self._chart(k), near)
+        given, other = (_angles(self.model.optics(columns(w))[0], _AT_AXIS * radius) for w in (self.given, k))
+        return radius * given / other
 
     def filled(self, k: Tensor, radius: Tensor) -> Tensor:
-        """(*C, 1): the radius of the largest circle of the sensor, in focal lengths, that the disc fills."""
+        """Return the radius (*C, 1) of the largest circle of the sensor, in focal lengths, that the disc fills."""
         _, lens = self.model.optics(columns(k))
         if not lens.stages:
             return radius
@@ -85,10 +72,8 @@ class Limits:
         turn = torch.arange(count, dtype=k.dtype, device=k.device) * (2 * math.pi / count)
         return torch.hypot(*lens(radius * turn.cos(), radius * turn.sin())).amin(-1, keepdim=True)
 
-    def _chart(self, k: Tensor) -> Chart:
-        return self.model.optics(columns(k))[0]
-
-    def _profile(self, k: Tensor, radius: Tensor) -> Profile:
+    def _profile(self, k: Tensor, radius: Tensor) -> dict[str, Tensor]:
+        """Return a lens from the axis outwards, (*C, nodes) each, by the names in `_MARGINS` that it has."""
         share = torch.arange(1, _NODES + 1, dtype=k.dtype, device=k.device) * (math.pi / (2 * _NODES))
         radii = BEYOND * self.disc(k, radius) * share.sin()
         chart, lens = self.model.optics(columns(k))
@@ -104,66 +89,56 @@ class Limits:
         defined = self.model.defined(k.unbind(-1))
         return profile if defined is None else {**profile, "defined": defined.unsqueeze(-1)}
 
-    def _margin(self, k: Tensor, radius: Tensor, given: Profile) -> Tensor:
-        """(*C): positive for coefficients in the set; given: the profile of the lens given."""
-        here = self._profile(k, radius).items()
-        least = [_MARGINS[name](value / given[name]).nan_to_num(nan=-1.0).amin(-1) for name, value in here]
-        return torch.stack(torch.broadcast_tensors(*least)).amin(0)
-
     def along(self, direction: Tensor, radius: Tensor) -> Tensor:
-        """(C, 1): how many times a direction (C, n) may be added to the coefficients given before the set ends.
+        """Return how many times (C, 1) a direction (C, n) may be added to the given coefficients before the set ends.
 
         A thousand times if not before, and the first end if there are several. Its derivatives are exact, but for those
         of higher order.
         """
+        # where both terms of a hypotenuse are zero it has no gradient
+        start = self.given.to(direction) + torch.finfo(direction.dtype).tiny ** 0.5
+
+        def margin(times: Tensor, direction: Tensor, radius: Tensor, given: dict[str, Tensor]) -> Tensor:
+            """Return what is positive (C, S) in the set, with the direction added so many times (C, S)."""
+            here = self._profile(start + times.unsqueeze(-1) * direction.unsqueeze(-2), radius.unsqueeze(-2))
+            least = [_MARGINS[name](value / given[name]).nan_to_num(nan=-1.0).amin(-1) for name, value in here.items()]
+            return torch.stack(torch.broadcast_tensors(*least)).amin(0)
+
         with torch.no_grad():
-            plain = direction.detach(), radius.detach()
-            given = self._profile(self._start(direction), plain[1].unsqueeze(-2))
-            times, ends = self._end(*plain, given)
+            plain = direction.detach(), radius.detach(), self._profile(start, radius.detach().unsqueeze(-2))
+            times, ends = _end(lambda times: margin(times, *plain), direction)
             step = _STEP * times
-            ahead, behind = (self._at(times + change, *plain, given) for change in (step, -step))
-            slope = (ahead - behind) / (2 * step)
+            slope = (margin(times + step, *plain) - margin(times - step, *plain)) / (2 * step)
             ends &= slope < 0
         # the implicit function: where the margin would change, the end moves until it does not
         # where none was found it is that of the lens given, as elsewhere there need not be a formula to derive
         direction = torch.where(ends, direction, 0.0)
-        margin = self._at(times, direction, radius, self._profile(self._start(direction), radius.unsqueeze(-2)))
-        moved = (margin - margin.detach()) / torch.where(ends, slope, 1.0)
+        there = margin(times, direction, radius, self._profile(start, radius.unsqueeze(-2)))
+        moved = (there - there.detach()) / torch.where(ends, slope, 1.0)
         return times - torch.where(ends, moved, 0.0)
 
-    def _at(self, times: Tensor, direction: Tensor, radius: Tensor, given: Profile) -> Tensor:
-        """(C, S): the margin with the direction added so many times, (C, S)."""
-        k = self._start(direction) + times.unsqueeze(-1) * direction.unsqueeze(-2)
-        return self._margin(k, radius.unsqueeze(-2), given)
 
-    def _start(self, like: Tensor) -> Tensor:
-        # where both terms of a hypotenuse are zero it has no gradient
-        nearly_zero: float = torch.finfo(like.dtype).tiny ** 0.5
-        return self.given.to(like) + nearly_zero
-
-    def _end(self, direction: Tensor, radius: Tensor, given: Profile) -> Planes2:
-        """(C, 1): where the margin is lost first, and bool: whether it is."""
-        share = torch.linspace(0, 1, _GRID, dtype=direction.dtype, device=direction.device)
-        nearest = torch.full_like(direction[:, :1], _FIRST)
-        for _ in range(_NEARER):  # where a coefficient does next to nothing, 1 is far out in that of others
-            inside = self._at(nearest, direction, radius, given) > 0
-            nearest = torch.where(inside, nearest, nearest * (_FIRST / _LAST))
-        times = nearest * (_LAST / _FIRST) ** share
-        low, ends = torch.zeros_like(times[:, :1]), None
-        parts = torch.arange(1, _PARTS + 1, dtype=direction.dtype, device=direction.device) / _PARTS
-        for _ in range(_ROUNDS):
-            kept = (self._at(times, direction, radius, given) > 0).long().cumprod(-1).sum(-1, keepdim=True)
-            ends = kept < times.shape[-1] if ends is None else ends
-            low = torch.where(kept > 0, times.gather(-1, (kept - 1).clamp(min=0)), low)
-            high = times.gather(-1, kept.clamp(max=times.shape[-1] - 1))
-            times = low + (high - low) * parts
-        assert ends is not None
-        before, after = (self._at(end, direction, radius, given) for end in (low, high))
-        fraction = (before / (before - after)).nan_to_num(nan=0.0).clamp(0, 1)
-        return low + (high - low) * torch.where(ends, fraction, 0.0), ends
+def _end(margin: Callable[[Tensor], Tensor], like: Tensor) -> tuple[Tensor, Tensor]:
+    """Return where a margin of times (C, S) is lost first, (C, 1), and whether it is."""
+    nearest = torch.full_like(like[:, :1], _FIRST)
+    for _ in range(_NEARER):  # where a coefficient does next to nothing, 1 is far out in that of others
+        nearest = torch.where(margin(nearest) > 0, nearest, nearest * (_FIRST / _LAST))
+    share = torch.linspace(0, 1, _GRID, dtype=like.dtype, device=like.device)
+    parts = torch.arange(1, _PARTS + 1, dtype=like.dtype, device=like.device) / _PARTS
+    times, low, ends = nearest * (_LAST / _FIRST) ** share, torch.zeros_like(nearest), None
+    for _ in range(_ROUNDS):
+        kept = (margin(times) > 0).long().cumprod(-1).sum(-1, keepdim=True)
+        ends = kept < times.shape[-1] if ends is None else ends
+        low = torch.where(kept > 0, times.gather(-1, (kept - 1).clamp(min=0)), low)
+        high = times.gather(-1, kept.clamp(max=times.shape[-1] - 1))
+        times = low + (high - low) * parts
+    assert ends is not None
+    before, after = margin(low), margin(high)
+    fraction = (before / (before - after)).nan_to_num(nan=0.0).clamp(0, 1)
+    return low + (high - low) * torch.where(ends, fraction, 0.0), ends
 
 
 def _angles(chart: Chart, radii: Tensor) -> Tensor:
-    """The angles from the axis of points that far from it."""
+    """Return the angles from the axis of points that far from it."""
     x, _, z = chart.to_ray(radii, torch.zeros_like(radii), 1)
     return torch.atan2(x, z)

@@ -27,32 +27,27 @@ _AZIMUTHS = 16
 
 @dataclass
 class Prior:
-    """A lens, and from where to where its focal length goes.
-
-    Attributes:
-        model: its class.
-        lens: (n,) coefficients, float64.
-        focal: the geometric mean of fx and fy.
-        aspect: log(fy / fx).
-        middle: cx, cy.
-        discs: radii on the plane of the chart that reach as far as the farthest corner: at the greatest focal length,
-            at `focal`, and at the least.
-    """
+    """A lens, and from where to where its focal length goes."""
 
     model: type[Camera]
     lens: Tensor
+    """(n,) coefficients, float64."""
     focal: float
+    """The geometric mean of fx and fy."""
     aspect: float
+    """log(fy / fx)."""
     middle: tuple[float, float]
+    """cx, cy."""
     discs: tuple[float, float, float]
+    """Radii on the chart's plane of the farthest corner: at the greatest focal length, at `focal`, and at the least."""
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the coefficients."""
+        """Names of the coefficients."""
         return self.model.names_of(len(self.lens)) or ()
 
     def scales(self, discs: Tensor) -> Tensor:
-        """(K, n): by how much a coefficient changes for 1, with discs of radii (K,); 0 for what changes nothing.
+        """Return how much a coefficient changes for 1, (K, n), with discs of radii (K,); 0 for what changes nothing.
 
         That moves the rim by a tenth of its distance from the axis, by a hundredth in what is lopsided.
         """
@@ -62,14 +57,14 @@ class Prior:
             k = self.lens.expand(len(a), -1).clone().requires_grad_()
             rays = self.model.optics(columns(k.detach()))[0].to_ray(a, b, 1)
             chart, lens = self.model.optics(columns(k))
-            p, q = lens(*chart.to_plane(*rays, 1)) if lens.stages else chart.to_plane(*rays, 1)
+            planes = lens(*chart.to_plane(*rays, 1)) if lens.stages else chart.to_plane(*rays, 1)
             moved = [
-                torch.autograd.grad(w.sum(), k, retain_graph=True, allow_unused=True)[0] if w.requires_grad else None
-                for w in (p, q)
+                torch.autograd.grad(w.sum(), k, retain_graph=True, materialize_grads=True, allow_unused=True)[0]
+                if w.requires_grad
+                else torch.zeros_like(k)
+                for w in planes
             ]
-        by_k = [torch.zeros_like(k) if m is None else m for m in moved]
-        moved_by = torch.hypot(*by_k) / torch.hypot(p, q).detach()
-        most = moved_by.unflatten(0, (len(discs), len(_TURNS))).amax(1)
+        most = (torch.hypot(*moved) / torch.hypot(*planes).detach()).unflatten(0, (len(discs), len(_TURNS))).amax(1)
         odd = self.model.odd_in_x | self.model.odd_in_y
         share = _RIM * torch.tensor([_LOPSIDED if name in odd else 1.0 for name in self.names], dtype=discs.dtype)
         return torch.where(most > 0, share / most.clamp(min=1e-300), 0.0)
@@ -78,34 +73,29 @@ class Prior:
 def prior_of(
     asked: Model, image_size: tuple[int, int], centre: float, aspect: float, fov: Sequence[float] | None, owner: str
 ) -> Prior:
-    """The prior of a model, or of a camera to start from, and the discs that a range of fields of view takes.
+    """Return the prior of a model, or of a camera to start from, and the discs that a range of fields of view takes.
 
-    Args:
-        asked: the model, its number of coefficients, and the camera.
-        image_size: (height, width).
-        centre: see `CameraHead`.
-        aspect: by how much the logarithm of fy / fx may change.
-        fov: degrees; see `CameraHead`.
-        owner: of errors.
+    `aspect` is by how much the logarithm of fy / fx may change; centre and fov are those of `CameraHead`.
 
     Raises:
-        ValueError: no such range, one that the lens does not reach, a camera that is not within it; panoramas.
+        ValueError: If the lens does not reach the range, or the camera is not within it, or is a panorama.
     """
-    degrees, start, (height, width) = _as_fov(fov, owner), asked.start, image_size
-    given, middle, ratio = None, ((width - 1) / 2, (height - 1) / 2), 0.0
+    degrees, start, given, ratio = _as_fov(fov, owner), asked.start, None, 0.0
+    middle = ((image_size[1] - 1) / 2, (image_size[0] - 1) / 2)
     if start is not None:
-        fx, fy, cx, cy = start.intrinsics.detach().double().flatten().tolist()
-        given, middle, ratio = math.sqrt(fx * fy), (cx, cy), math.log(fy / fx)
-    sides = [max(c + 0.5, side - 0.5 - c) + centre * side for c, side in zip(middle, (width, height), strict=True)]
+        fx, fy, *middle = start.intrinsics.detach().double().flatten().tolist()
+        given, ratio = math.sqrt(fx * fy), math.log(fy / fx)
+    sides = [max(c + 0.5, side - 0.5 - c) + centre * side for c, side in zip(middle, image_size[::-1], strict=True)]
     stretches = [math.exp((ratio + sign * aspect) / 2) for sign in (-1, 1)]
     far = max(math.hypot(sides[0] * stretch, sides[1] / stretch) for stretch in stretches)
     found = []
     for lens in _lenses(asked):
-        plane = _plane(asked.kind, lens)
         if not asked.kind.optics(columns(lens))[0].has_scale:
             raise ValueError(
                 f"{owner}: {asked.kind.__name__} is a panorama, or has an axis of its own: no head predicts it"
             )
+        numbers = lens.new_tensor([1.0, 1.0, 0.0, 0.0]), *([lens] if len(lens) else [])
+        plane = asked.kind(*numbers).requires_grad_(False)
         if given is not None and degrees is None:
             ranges = [(given * _LONGER, given, given / times) for times in _SHORTER]
         else:
@@ -115,12 +105,11 @@ def prior_of(
             ranges = [(longest, given or math.sqrt(longest * shortest), shortest)] if bool(reached.all()) else []
         for longest, focal_length, shortest in ranges:
             if not shortest * (1 - 1e-6) <= focal_length <= longest * (1 + 1e-6):
-                raise ValueError(
-                    f"{owner}: the given camera has a field of view that is not within fov={tuple(fov or ())}"
-                )
-            discs = [_disc(plane, far / f) for f in (longest, focal_length, shortest)]
-            if all(discs):
-                found.append(Prior(asked.kind, lens, focal_length, ratio, middle, (discs[0], discs[1], discs[2])))
+                within = f"the given camera has a field of view that is not within fov={tuple(fov or ())}"
+                raise ValueError(f"{owner}: {within}")
+            first, second, third = (_disc(plane, far / f) for f in (longest, focal_length, shortest))
+            if first and second and third:
+                found.append(Prior(asked.kind, lens, focal_length, ratio, tuple(middle), (first, second, third)))
                 break
     if found:
         return _liveliest(found)
@@ -137,16 +126,15 @@ def prior_of(
 
 
 def _liveliest(priors: list[Prior]) -> Prior:
-    """The first one, unless coefficients do nothing there that do something elsewhere, as the omega of `FOV` at 0.
+    """Return the first, unless coefficients do nothing there that do something elsewhere, as the omega of `FOV` at 0.
 
-    Then that of most coefficients of which the one that does least does most.
+    Then return that of most coefficients of which the one that does least does most.
     """
     scales = [prior.scales(torch.tensor(prior.discs, dtype=torch.float64)) for prior in priors]
     counts = [int((scale > 0).all(0).sum()) for scale in scales]
     if counts[0] == max(counts):
         return priors[0]
-    some = [i for i, count in enumerate(counts) if count == max(counts)]
-    return priors[min(some, key=lambda i: float(scales[i].amax()))]
+    return priors[min((i for i, n in enumerate(counts) if n == max(counts)), key=lambda i: float(scales[i].amax()))]
 
 
 def _as_fov(fov: Sequence[float] | None, owner: str) -> tuple[float, float] | None:
@@ -163,7 +151,7 @@ def _as_fov(fov: Sequence[float] | None, owner: str) -> tuple[float, float] | No
 
 
 def _lenses(asked: Model) -> Iterator[Tensor]:
-    """The coefficients of the camera; or those of an ideal one, and those that fits of the model start from."""
+    """Return the coefficients of the camera; or those of an ideal one, and those that fits of the model start from."""
     if asked.start is not None:
         yield asked.start.distortion.detach().double().reshape(-1).cpu()
         return
@@ -173,14 +161,8 @@ def _lenses(asked: Model) -> Iterator[Tensor]:
         yield torch.tensor([{**ideal, **values}[name] for name in names], dtype=torch.float64)
 
 
-def _plane(model: type[Camera], lens: Tensor) -> Camera:
-    """The camera of focal length 1 with its principal point at 0."""
-    intrinsics = lens.new_tensor([1.0, 1.0, 0.0, 0.0])
-    return (model(intrinsics, lens) if len(lens) else model(intrinsics)).requires_grad_(False)
-
-
 def _disc(plane: Camera, reach: float) -> float:
-    """The radius of the disc of the chart's plane that is seen up to a distance from the centre; 0 where none is."""
+    """Return the radius of the disc of the chart's plane that is seen up to a distance from the centre, or 0."""
     turn = torch.arange(_AZIMUTHS, dtype=torch.float64) * (2 * math.pi / _AZIMUTHS)
     rim = BEYOND * reach * torch.stack((turn.cos(), turn.sin()), -1)
     if not bool(plane.unproject(rim)[1].all()):

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from camtorch._portable import is_portable_export, times
-from camtorch._tracing import is_fake, set_aside
+from camtorch._tracing import set_aside
 from camtorch.optics.charts import Chart, Equidistant, Planes3, even_steps_and_ratios
 from camtorch.optics.radial import RadialFactor
 from camtorch.optics.radial_inverse import RadialInverse
@@ -44,8 +44,7 @@ class Inverted(Chart):
         if torch.compiler.is_compiling() and not is_portable_export():
             return RadialInverse(self.factor, self.parameters, FURTHEST)
         if self._known is None:
-            known = is_portable_export() and not any(map(is_fake, self.parameters))  # a constant of an exported program
-            with set_aside() if known else nullcontext():
+            with set_aside() if is_portable_export() else nullcontext():  # a constant of an exported program
                 self._known = RadialInverse(self.factor, self.parameters, FURTHEST)
         return self._known
 

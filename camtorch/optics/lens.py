@@ -16,7 +16,6 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from camtorch._portable import hypot, running_max
 from camtorch.optics.derivatives import jacobian_of
 from camtorch.optics.radial import RadialFactor
 
@@ -81,7 +80,7 @@ class Stage:
         a, b = ((radius.unsqueeze(-1) * c).flatten(-2) for c in (torch.cos(turn), torch.sin(turn)))
         at = self.at(a, b)
         shape = (radius.shape[-1], _DIRECTIONS)
-        orientation, distance = at.orientation.unflatten(-1, shape), hypot(*at.value).unflatten(-1, shape)
+        orientation, distance = at.orientation.unflatten(-1, shape), torch.hypot(*at.value).unflatten(-1, shape)
         least, furthest = orientation.amin(-1), distance.amax(-1)
         missed = (orientation - orientation.roll(1, -1)).abs().amax(-1)
         return least - missed / 2, furthest + (distance - distance.roll(1, -1)).abs().amax(-1) / 2
@@ -179,12 +178,12 @@ class Planar(Stage):
         if self.radial:
             least, furthest = self.radial.orientation(radius), radius * self.radial(t).abs()
         if self.tangential:
-            p = hypot(*self.tangential)
+            p = torch.hypot(*self.tangential)
             least, furthest = least - 6 * p * radius, furthest + 3 * p * t
         if self.prism:
             s0, s1, s2, s3 = self.prism
-            least = least - 2 * radius * hypot(s0 + 2 * t * s1, s2 + 2 * t * s3)
-            furthest = furthest + t * hypot(s0 + t * s1, s2 + t * s3)
+            least = least - 2 * radius * torch.hypot(s0 + 2 * t * s1, s2 + 2 * t * s3)
+            furthest = furthest + t * torch.hypot(s0 + t * s1, s2 + t * s3)
         return least, furthest
 
     def start(self, u: Tensor, v: Tensor) -> Planes2:
@@ -275,11 +274,11 @@ class Homography(Stage):
     def lower_bound(self, radius: Tensor) -> Planes2:
         """See `Planar.lower_bound`; here the bound is one of the orientation itself."""
         h00, h01, h02, h10, h11, h12, h20, h21, h22 = self.parameters
-        slope = hypot(h20, h21)
+        slope = torch.hypot(h20, h21)
         nearest = h22 - slope * radius
-        size = torch.maximum(hypot(h00, h10), hypot(h01, h11)) * math.sqrt(2)
+        size = torch.maximum(torch.hypot(h00, h10), torch.hypot(h01, h11)) * math.sqrt(2)
         # past the horizon nothing is certain
-        seen = (size * radius + hypot(h02, h12)) / torch.where(nearest > 0, nearest, torch.nan)
+        seen = (size * radius + torch.hypot(h02, h12)) / torch.where(nearest > 0, nearest, torch.nan)
         minors = self._adjugate()
         turned = h20 * minors[2] + h21 * minors[5] + h22 * minors[8]
         return torch.minimum(torch.minimum(nearest, turned), h00 + h11 - slope * seen), seen
@@ -421,7 +420,7 @@ class Lens:
             least, radius = stage.lower_bound(radius)
             bounds.append(least)
             # the next stage sees what any smaller circle becomes as well
-            radius = running_max(radius)
+            radius = radius.cummax(-1).values
         return torch.stack(torch.broadcast_tensors(*bounds)).amin(0), radius
 
     def start(self, u: Tensor, v: Tensor) -> Planes2:

@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from camtorch._portable import leading, pick, piece_of, plus, solve_tridiagonal, unbound
+from camtorch._portable import pick, piece_of, plus, solve_tridiagonal, unbound
 from camtorch._registry import register
 from camtorch.optics.derivatives import derivatives_of
 from camtorch.optics.special import angle_per_radius, first_root, root
@@ -246,7 +246,7 @@ class RadiusTable(RadialFactor):
         """The first node that r does not ascend from, or the last one."""
         # the filter sees to it that r ascends wherever the table does
         nodes, secants = self._table
-        return nodes.gather(-1, leading(secants > 0)).squeeze(-1)
+        return nodes.gather(-1, (secants > 0).long().cumprod(-1).sum(-1, keepdim=True)).squeeze(-1)
 
     def __call__(self, t: Tensor) -> Tensor:
         return self.derivatives(t, 0)[0]

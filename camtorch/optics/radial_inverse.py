@@ -11,17 +11,7 @@ from torch import Tensor
 
 from camtorch._arguments import columns
 from camtorch._module import Memo
-from camtorch._portable import (
-    as_index,
-    choose,
-    count_not_above,
-    is_portable_export,
-    leading,
-    of_points,
-    repeat,
-    running_max,
-    times,
-)
+from camtorch._portable import as_index, is_portable_export, of_points, repeat, times
 from camtorch._registry import CLASSES
 from camtorch._tracing import is_concrete
 from camtorch.optics.charts import even_steps_and_ratios
@@ -83,9 +73,9 @@ def fold_of(radial: RadialFactor, sampled: Callable[[], Tensor], end: float | Te
     """
     if radial.fold is not None:
         return radial.fold.clamp(max=end)
-    # of numbers that are not known, or that another runtime is to compute with, it is looked for
+    # of numbers that are not known it is looked for
     k = radial.parameters[0]
-    known = k.dtype == torch.float64 and not k.is_meta and not is_portable_export()
+    known = k.dtype == torch.float64 and not k.is_meta
     if known and (fold := radial.closed_fold()) is not None:
         fold = fold.clamp(max=end)
 
@@ -125,7 +115,7 @@ def fold_of(radial: RadialFactor, sampled: Callable[[], Tensor], end: float | Te
     for _ in range(2):
         inner = low + (high - low) * steps
         # the upper end counts as lost, whatever rounding says of it
-        first = leading(orientation(inner) > 0).clamp(1, _PARTS)
+        first = (orientation(inner) > 0).long().cumprod(-1).sum(-1, keepdim=True).clamp(1, _PARTS)
         low, high = inner.gather(-1, first - 1), inner.gather(-1, first)
     before, after = orientation(low), orientation(high)
     crossing = (before > 0) & (after < 0)
@@ -142,11 +132,11 @@ def tabulate(radial: RadialFactor, fold: Tensor, usual_end: float | Tensor) -> T
     u = torch.linspace(0, 1, _NODES + 1, dtype=fold.dtype, device=fold.device)
     square = _square(u, end * end)
     factor = radial(square)
-    r2 = running_max(square * factor * factor)
+    r2 = (square * factor * factor).cummax(-1).values
     reach2 = r2[..., -1:]
     # where the nodes' images lie, and what lies at nodes that are even there
     at = _variable(r2, reach2)
-    cell = (count_not_above(at, u.expand_as(at)) - 1).clamp(0, _NODES - 1)
+    cell = (torch.searchsorted(at, u.expand_as(at).contiguous(), right=True) - 1).clamp(0, _NODES - 1)
     low, high = at.gather(-1, cell), at.gather(-1, cell + 1)
     scale = factor.reciprocal()
     before, step = scale.gather(-1, cell), scale.diff(dim=-1).gather(-1, cell)
@@ -242,9 +232,7 @@ def bracketed(radial: RadialFactor, r2: Tensor, inner2: Tensor) -> Tensor:
     eps = torch.finfo(r2.dtype).eps
     wanted, high = r2.sqrt(), inner2.sqrt().expand_as(r2)
 
-    def step(
-        count: int | Tensor, moves: Tensor, rho: Tensor, low: Tensor, high: Tensor, width: Tensor
-    ) -> tuple[Tensor, ...]:
+    def ahead_of(rho: Tensor, low: Tensor, high: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         t = rho * rho
         value, first, second = radial.derivatives(t, 2)
         slope, bend = value + 2 * t * first, rho * (6 * first + 4 * t * second)
@@ -252,15 +240,20 @@ def bracketed(radial: RadialFactor, r2: Tensor, inner2: Tensor) -> Tensor:
         low, high = torch.where(error > 0, rho, low), torch.where(error > 0, high, rho)
         denominator = slope.abs() + (slope * slope + 2 * bend * error).clamp(min=0).sqrt()
         ahead = rho + 2 * error / torch.where(denominator > 0, denominator, 1.0)
-        ahead = torch.minimum(torch.maximum(ahead, low), high)
+        return torch.minimum(torch.maximum(ahead, low), high), low, high
+
+    def step(moves: Tensor, rho: Tensor, low: Tensor, high: Tensor, width: Tensor) -> tuple[Tensor, ...]:
+        ahead, low, high = ahead_of(rho, low, high)
         moves = moves & ((ahead - rho).abs() > 2 * eps * rho)
-        odd = count % 2 == 1
-        ahead = choose(odd, torch.where(high - low > width / 2, (low + high) / 2, ahead), ahead)
-        return moves, torch.where(moves, ahead, rho), low, high, choose(odd, high - low, width)
+        rho = torch.where(moves, ahead, rho)
+        ahead, low, high = ahead_of(rho, low, high)
+        moves = moves & ((ahead - rho).abs() > 2 * eps * rho)
+        ahead = torch.where(high - low > width / 2, (low + high) / 2, ahead)
+        return moves, torch.where(moves, ahead, rho), low, high, high - low
 
     rho = torch.minimum(wanted, high)
     state = rho, torch.zeros_like(r2), high, high
-    _, rho, *_ = repeat(step, torch.ones_like(rho, dtype=torch.bool), state, -4 * int(math.log2(eps)))
+    _, rho, *_ = repeat(step, torch.ones_like(rho, dtype=torch.bool), state, -2 * int(math.log2(eps)))
     return radial(rho * rho).reciprocal()
 
 
@@ -319,7 +312,7 @@ _tables = Memo(8)
 
 
 def _made_tables(name: str, k: Tensor, end: float) -> tuple[Tensor, Tensor]:
-    wide = k if is_portable_export() else precise(k)  # ONNX Runtime has no arc tangent in float64
+    wide = precise(k)
     radial = CLASSES[name](columns(wide))
     fold = fold_of(
         radial,

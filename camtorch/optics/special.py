@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from camtorch._portable import exported_atan2, is_portable_export, plus
+from camtorch._portable import exported_atan2, plus
 
 # Below these the power series is used. Its first dropped term is below 1e-21 and the closed form above
 # them still has a first derivative good to 1e-13 of the function's own scale.
@@ -74,7 +74,7 @@ def cosc_root(t: Tensor) -> Tensor:
 
 def atan2(y: Tensor, x: Tensor) -> Tensor:
     """torch.atan2, also for ONNX."""
-    return exported_atan2(y, x) if is_portable_export() else torch.atan2(y, x)
+    return exported_atan2(y, x) if torch.compiler.is_exporting() else torch.atan2(y, x)
 
 
 def angle_per_radius(rho2: Tensor, z: Tensor, order: int = 2) -> Tensor:

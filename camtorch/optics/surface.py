@@ -12,7 +12,6 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from camtorch._portable import hypot
 from camtorch.optics.lens import Jacobian, Planes2, Stage, StageAt
 
 BEHIND = 1e-4  # cells past its edge that belong to a surface, so that what lies on the edge is on it in any rounding
@@ -85,7 +84,7 @@ class Surface(Stage):
             for size, more, s, c in ((self.columns, more_a, sa, ca), (self.rows, more_b, sb, cb)):
                 middle = torch.arange(size - more, dtype=radius.dtype, device=radius.device) - (size - 1 - more) / 2
                 sides.append(((middle / s + c).abs() - (reach - more / 2) / s).clamp(min=0))
-            return hypot(sides[0].unsqueeze(-2), sides[1].unsqueeze(-1)).flatten(-2)
+            return torch.hypot(sides[0].unsqueeze(-2), sides[1].unsqueeze(-1)).flatten(-2)
 
         def most(values: Tensor, begin: Tensor) -> Tensor:
             """(*C, S): the largest (*C, 1, P) of those that begin before each radius; 0 if all are less."""
@@ -98,7 +97,7 @@ class Surface(Stage):
         across = (most(along[..., 1].abs(), here) + most(down[..., 0].abs(), there)) / 2
         edge = [(n - self.order) / 2 / s - c.abs() for n, s, c in ((self.columns, sa, ca), (self.rows, sb, cb))]
         inside = torch.minimum(*edge).squeeze(-1) - radius
-        far = radius + most(hypot(*grid.unbind(-1)), nearest(0, 0))
+        far = radius + most(torch.hypot(*grid.unbind(-1)), nearest(0, 0))
         return torch.where(inside > 0, 1 - steepest - across, inside.clamp(max=-1e-3)), far
 
     def start(self, u: Tensor, v: Tensor) -> Planes2:

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from camtorch._arguments import columns
 from camtorch._module import Memo
-from camtorch._portable import is_portable_export, of_points, plus
+from camtorch._portable import of_points, plus
 from camtorch.optics.radial_inverse import RADII, InverseTable, first_loss, fold_of, precise, tabulate, within
 from camtorch.projection.fold import AZIMUTHS, Extent, azimuth, limits_and_extent
 
@@ -33,8 +33,6 @@ def _per_camera(make: Callable[[Domain], Tensor]) -> cached_property[Tensor]:
     """A table (C, ...) that is made when it is first asked for."""
 
     def table(self: Domain) -> Tensor:
-        if is_portable_export():
-            return make(self)
         # what inference mode makes could not be used in a graph later
         with torch.inference_mode(False), torch.no_grad():
             return make(self)
@@ -80,14 +78,7 @@ class Domain:
         return self
 
     def with_all_tables(self) -> Domain:
-        """The same, with all tables that a graph may ask for: those of values that are known, or recorded with it."""
-        if is_portable_export():
-            if self.lens.stages and not self.lens.is_radial:
-                stagewise = torch.isfinite(self.circle2) if self.lens.rest is not None else None
-                limits2, extent = limits_and_extent(self.optics, self.k)
-                limits2 = limits2 if stagewise is None else torch.where(stagewise, 0.0, limits2)
-                self._set(stagewise=stagewise, all_stagewise=False, limits2=limits2, extent=extent)
-            return self
+        """The same, with all tables that a graph may ask for, of values that are known."""
         # constants: none is a view of another
         made = Domain(self.optics, self.k.clone())
         made.chart, made.lens = self.optics([c.clone() for c in columns(self.k)])

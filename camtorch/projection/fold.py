@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from camtorch._arguments import columns
-from camtorch._portable import as_index, hypot, is_portable_export, repeat, running_max
+from camtorch._portable import as_index
 from camtorch.optics.radial_inverse import first_loss
 
 if TYPE_CHECKING:
@@ -21,7 +21,6 @@ AZIMUTHS = 336  # no further apart than 1.4 degrees
 _RADII = 2048  # to find the fold of the radial factor
 _SMOOTH, _BULGE = 0.02, 0.001
 _DIP = 65  # radii at which a dip between two nodes is looked at
-_RECORDED_LOOKS = 2  # at such dips, one after the other, in an exported program
 _COARSE, _CLOSE = 40, 40  # on each of many azimuths: over the whole chart, and around the fold of the radial factor
 _FAR = 20.0  # focal lengths: no image goes further, and there lenses may differ much between two azimuths
 _BEYOND, _ASIDE = 1.01, 4  # what an extent allows for outside of its rim and, in azimuths, beside it
@@ -149,15 +148,6 @@ def _lost(lens: Lens, a: Tensor, b: Tensor, radii: Tensor, orientation: Tensor) 
     last = orientation.shape[-1] - 1
     steps = torch.linspace(-1, 1, _DIP, dtype=orientation.dtype, device=orientation.device)
 
-    def look(count: int | Tensor, dips: Tensor, spared: Tensor, lost: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        node = lost.round().long().clamp(max=last).unsqueeze(-1)
-        radius = _radius_at(radii, (node + steps).clamp(0, last))
-        spared_now = dips & (lens.at(a * radius, b * radius).orientation > 0).all(-1, keepdim=True)
-        spared = spared.scatter(-1, node, spared.gather(-1, node) | spared_now)
-        lost = first_loss(orientation, spared)
-        # of those rows that are not done
-        return assumed(lost) & spared_now, spared, lost
-
     def assumed(lost: Tensor) -> Tensor:
         node = lost.round().long().clamp(max=last).unsqueeze(-1)
         return (lost <= last).unsqueeze(-1) & (orientation.gather(-1, node) > 0)
@@ -165,18 +155,21 @@ def _lost(lens: Lens, a: Tensor, b: Tensor, radii: Tensor, orientation: Tensor) 
     spared = torch.zeros_like(orientation, dtype=torch.bool)
     lost = first_loss(orientation, spared)
     dips = assumed(lost)
-    if is_portable_export():  # few are spared at all
-        for count in range(_RECORDED_LOOKS):
-            dips, spared, lost = look(count, dips, spared, lost)
-        return lost
-    return repeat(look, dips, (spared, lost), orientation.shape[-1])[-1]
+    while bool(dips.any()):
+        node = lost.round().long().clamp(max=last).unsqueeze(-1)
+        radius = _radius_at(radii, (node + steps).clamp(0, last))
+        spared_now = dips & (lens.at(a * radius, b * radius).orientation > 0).all(-1, keepdim=True)
+        spared = spared.scatter(-1, node, spared.gather(-1, node) | spared_now)
+        lost = first_loss(orientation, spared)
+        dips = assumed(lost) & spared_now  # of those rows that are not done
+    return lost
 
 
 def _directions(like: Tensor) -> tuple[Tensor, Tensor]:
     """The unit vectors of the azimuths, in even steps along the rim of the diamond |a| + |b| = 1."""
     turn = torch.arange(AZIMUTHS, dtype=like.dtype, device=like.device) * (4 / AZIMUTHS)
     a, b = (turn - 2).abs() - 1, 1 - ((turn + 1).remainder(4) - 2).abs()
-    length = hypot(a, b)
+    length = torch.hypot(a, b)
     return a / length, b / length
 
 
@@ -224,4 +217,4 @@ def _ascending(reach: Tensor, lost: Tensor) -> Tensor:
     """How far from the centre the lens sends each node, ascending; infinite past the fold."""
     nodes = torch.arange(reach.shape[-1], dtype=reach.dtype, device=reach.device)
     before = (nodes < lost.unsqueeze(-1)) & (reach < torch.inf)
-    return running_max(torch.where(before, reach, torch.inf))
+    return torch.where(before, reach, torch.inf).cummax(-1).values

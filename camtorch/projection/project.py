@@ -63,7 +63,7 @@ class Project:
         usual = Traced.of(model, intrinsics, distortion, cameras)
 
         def evaluate(x: Tensor, y: Tensor, z: Tensor, intrinsics: Tensor, distortion: Tensor) -> tuple[Tensor, Tensor]:
-            chart, lens = model.optics(columns(distortion))
+            chart, lens = usual.optics(distortion)
             rays, mask = _normalise(chart, x, y, z)
             a, b = chart.to_plane(*rays, order)
             if lens.stages:

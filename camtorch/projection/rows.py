@@ -19,6 +19,8 @@ from camtorch.projection.ops import tables
 
 if TYPE_CHECKING:
     from camtorch.camera import Camera
+    from camtorch.optics.charts import Chart
+    from camtorch.optics.lens import Lens
 
 Planes2 = tuple[Tensor, Tensor]
 Planes3 = tuple[Tensor, Tensor, Tensor]
@@ -162,9 +164,7 @@ class Traced(NamedTuple):
             usable = able.to(intrinsics.dtype)
             k = torch.where(able, distortion.detach(), _ideal(model, intrinsics, distortion)[1])
             domain = Domain(model.optics, k)
-            if is_portable_export():
-                domain.with_all_tables()
-            elif domain.lens.stages:
+            if domain.lens.stages:
                 domain.with_tables(*tables(model._model, k))
         if usable is not None:
             ideal = _ideal(model, intrinsics, distortion)
@@ -172,6 +172,10 @@ class Traced(NamedTuple):
                 torch.where(usable > 0, t, w) for t, w in zip((intrinsics, distortion), ideal, strict=True)
             )
         return cls(model, intrinsics, distortion, domain, usable)
+
+    def optics(self, distortion: Tensor) -> tuple[Chart, Lens]:
+        """Those of the coefficients as a graph has them; of a constant camera they are made already."""
+        return (self.domain.chart, self.domain.lens) if is_portable_export() else self.model.optics(columns(distortion))
 
 
 def replace(mask: Tensor | None, plane: Tensor, value: float) -> Tensor:

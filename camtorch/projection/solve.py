@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from camtorch._portable import hypot, is_portable_export, repeat, times
+from camtorch._portable import is_portable_export, repeat, times
 from camtorch.optics.lens import newton_step
 from camtorch.optics.radial_inverse import bracketed
 from camtorch.projection.domain import regular
@@ -53,7 +53,7 @@ def _search_recorded(domain: Domain, camera: Tensor, u: Tensor, v: Tensor) -> tu
         by_stages = a, b, there & within
         if domain.all_stagewise:
             return by_stages
-    within = hypot(u, v) <= domain.extent.furthest[camera, azimuth(u, v)]
+    within = (u * u + v * v).sqrt() <= domain.extent.furthest[camera, azimuth(u, v)]
     a, b, there = _Search(domain, camera, within=within)(u, v)
     found = a, b, there & within
     if by_stages is None:
@@ -93,7 +93,7 @@ def _first_image(domain: Domain, camera: Tensor, u: Tensor, v: Tensor) -> tuple[
 def _within_extents(domain: Domain, camera: Tensor, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """`search` of any other lens, for the points within the extent of what it shows."""
     a, b, found = torch.zeros_like(u), torch.zeros_like(u), torch.zeros_like(u, dtype=torch.bool)
-    (some,) = (hypot(u, v) <= domain.extent.furthest[camera, azimuth(u, v)]).nonzero(as_tuple=True)
+    (some,) = (torch.hypot(u, v) <= domain.extent.furthest[camera, azimuth(u, v)]).nonzero(as_tuple=True)
     if len(some):
         a[some], b[some], found[some] = _Search(domain, camera[some])(u[some], v[some])
     return a, b, found
@@ -187,7 +187,7 @@ class _Search:
             active = (torch.maximum((u - x).abs(), (v - y).abs()) > enough) & (length > _GIVE_UP)
             return active if self.within is None else active & self.within
 
-        def step(count: int | Tensor, active: Tensor, length: Tensor, *state: Tensor) -> tuple[Tensor, ...]:
+        def step(active: Tensor, length: Tensor, *state: Tensor) -> tuple[Tensor, ...]:
             a, b, x, y, ua, ub, va, vb = state
             jacobian = ua, ub, va, vb
             da, db, _ = newton_step(jacobian, u - x, v - y)
@@ -215,7 +215,7 @@ class _Search:
         target, wanted = (u * u + v * v).sqrt(), torch.atan2(v, u)
         extent = self.domain.extent
 
-        def look(count: int | Tensor, far: Tensor, *state: Tensor) -> tuple[Tensor, ...]:
+        def look(far: Tensor, *state: Tensor) -> tuple[Tensor, ...]:
             a, b, best, angle, step, last_off = state
             c, s = torch.cos(angle), torch.sin(angle)
             rho = extent.start(self.camera, target, c, s)

@@ -186,7 +186,7 @@ class Unproject:
         mask, a, b = mask * solved, replace(solved, a, 0.0), replace(solved, b, 0.0)
 
         def evaluate(u: Tensor, v: Tensor, intrinsics: Tensor, distortion: Tensor) -> Tensor:
-            chart, lens = model.optics(columns(distortion))
+            chart, lens = usual.optics(distortion)
             (p, q), _ = _to_target(u, v, columns(intrinsics))
             p, q = replace(mask, p, 0.0), replace(mask, q, 0.0)
             here = (p, q) if not lens.stages else attach(lens, (a, b), (p, q), order) if order else (a, b)
