@@ -50,21 +50,20 @@ def test_omnidir(tmp_path, suffix, xi):
     assert torch.equal(again.distortion, camera.distortion)
 
 
-def test_an_omnidir_pair_as_opencv_writes_it(tmp_path):
+@pytest.mark.parametrize("keys", [("R", "T"), ("om", "T"), ("rvec", "tvec")])
+def test_an_omnidir_pair_is_posed_by_matrices_and_by_vectors(path, keys):
     text = "".join(
         f"camera_matrix_{i}: {K}\ndistortion_coefficients_{i}: [0.1, 0.01, 0.001, {i}]\nxi_{i}: {i}.5\n" for i in (1, 2)
     )
-    path = written(tmp_path / "pair.yml", text + "rvec: [0.1, 0.2, 0.3]\ntvec: [1, 2, 3]\n")
-    rig = ct.load(path)
-    assert [camera.distortion.tolist() for camera in rig.cameras.values()] == [
-        [1.5, 0.1, 0.01, 0.001, 1.0],
-        [2.5, 0.1, 0.01, 0.001, 2.0],
-    ]
-    assert rig.extrinsics["2"].rotation.tolist() == [0.1, 0.2, 0.3]
-    assert rig.extrinsics["2"].translation.tolist() == [1, 2, 3]
+    turn, shift = torch.tensor([0.1, 0.2, 0.3], dtype=torch.float64), [1.0, 2, 3]
+    pose = ct.Extrinsics(turn, torch.tensor(shift, dtype=torch.float64))
+    rotation = pose.matrix()[:3, :3].flatten().tolist() if keys[0] == "R" else turn.tolist()
+    rig = ct.load(written(path, text + f"{keys[0]}: {rotation}\n{keys[1]}: {shift}\n"))
+    lenses = [camera.distortion.tolist() for camera in rig.cameras.values()]
+    assert lenses == [[1.5, 0.1, 0.01, 0.001, 1.0], [2.5, 0.1, 0.01, 0.001, 2.0]]
+    torch.testing.assert_close(rig.between("1", "2").matrix(), pose.matrix(), rtol=0, atol=1e-15)
     ct.save(rig, path)
-    for name, camera in ct.load(path).cameras.items():
-        assert torch.equal(camera.distortion, rig.cameras[name].distortion)
+    assert [camera.distortion.tolist() for camera in ct.load(path).cameras.values()] == lenses
 
 
 @pytest.mark.parametrize("key", ["distCoeff", "dist_coef", "d", "distCoeffsMat", "distortion_parameters", "dist"])
