@@ -6,13 +6,12 @@ import torch
 
 import camtorch as ct
 
-from . import SIZE, close, equal, plane, points, trap
+from . import SIZE, equal, plane, points
 
 HEIGHT, WIDTH = SIZE
 HALF, WHOLE = min(SIZE) / 2, torch.tensor([WIDTH, HEIGHT])
 FLIP = torch.tensor([-1.0, -1.0, 1.0])
 POSE = ct.Extrinsics([0.1, -0.2, 0.05], [0.1, 0.2, 0.3]).requires_grad_(False)
-SECOND = ct.Extrinsics([0.3, 0.0, 0.1], [0.0, 1.0, 0.0]).requires_grad_(False)
 R, T = POSE.matrix()[None, :3, :3].mT * FLIP, POSE.translation[None] * FLIP
 FOCAL, PRINCIPAL = torch.tensor([[1.2, 1.3]]), torch.tensor([[0.1, -0.2]])
 POINTS = torch.from_numpy(points()).float()
@@ -66,17 +65,6 @@ def fields_of_view():
     yield ct.Pinhole.from_fov(50, image_size=SIZE[::-1], axis="horizontal").fx, torch.tensor(focal * HALF), 1e-4
 
 
-def matrix(shift):
-    (fx, fy), (cx, cy) = (HALF * FOCAL[0]).tolist(), screen(PRINCIPAL[0]).tolist()
-    return torch.tensor([[fx, 0, cx - shift], [0, fy, cy - shift], [0, 0, 1]])
-
-
-def by_rows():
-    """Matrices of theirs multiply rows from the right."""
-    rows = [pose.matrix().mT for pose in (POSE, SECOND)]
-    return (torch.nn.functional.pad(POINTS, (0, 1), value=1.0) @ rows[0] @ rows[1])[:, :3]
-
-
 equal("pytorch3d.renderer", {
     "PerspectiveCameras PerspectiveCameras.transform_points_screen PerspectiveCameras.transform_points_ndc "
     "PerspectiveCameras.get_world_to_view_transform": lambda: [
@@ -96,20 +84,3 @@ equal("pytorch3d.renderer", {
         (EXTRINSICS.position[0], -T[0] @ R[0].mT, 1e-5),
     ],
 })  # fmt: skip
-equal("pytorch3d.utils", {
-    "opencv_from_cameras_projection cameras_from_opencv_projection": lambda: [
-        (CAMERA.K[0], matrix(0.5), 1e-4), (ct.Pinhole.from_matrix(matrix(0.0)).K, matrix(0.0), 1e-4)
-    ],
-})  # fmt: skip
-equal("pytorch3d.transforms", {
-    "axis_angle_to_matrix Transform3d.get_matrix Transform3d.compose": lambda: [
-        (SECOND.compose(POSE)(POINTS), by_rows(), 1e-5)
-    ],
-})  # fmt: skip
-
-
-@trap
-def mirrored_pixels():
-    assert not ct.Pinhole([75.0, 75.0, 79.5, 59.5]).project([[0.1, 0.2, -1.0]])[1]
-    assert ct.Fisheye624([75.0, 75.0, 79.5, 59.5], torch.zeros(12)).project([[1.0, 0.0, -0.2]])[1]
-    close(VIEW[:, 2:], POSE(POINTS)[:, 2:], 1e-6)

@@ -1,17 +1,15 @@
 """What users write, and the types they get; test_types.py has it checked in a project that installed camtorch."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor, nn
-from torch.utils.data import DataLoader, Dataset
 from typing_extensions import assert_type
 
 import camtorch as ct
-from camtorch.optics import Chart, Equidistant, Lens, Planar, Polynomial
 
 Pair = tuple[Tensor, Tensor]
 
@@ -122,44 +120,3 @@ def augmentations(camera: ct.Camera) -> None:
     assert_type(chain.to("cpu"), ct.augment.Compose)
     seeded = ct.data.Seeded(ct.augment.RandomMount(roll=5, camera=camera), seed=0)
     assert_type(seeded(image=torch.rand(3, 480, 640), key=3), dict[str, Any])
-
-    class Images(Dataset[dict[str, Any]]):
-        def __len__(self) -> int:
-            return 4
-
-        def __getitem__(self, index: int) -> dict[str, Any]:
-            return seeded(image=torch.rand(3, 480, 640), boxes=torch.tensor([[10.0, 10.0, 90.0, 90.0]]), key=index)
-
-    for batch in DataLoader(Images(), batch_size=2, collate_fn=ct.augment.collate):
-        assert len(batch["image"]) == 2
-
-
-def own_model() -> None:
-    """It has what every camera has."""
-
-    class Quintic(ct.Camera):
-        """A model of a user's own: r = theta (1 + k theta^4)."""
-
-        key = "typed_quintic"
-        distortion_names = ("k",)
-        default_count = 1
-
-        @staticmethod
-        def optics(k: Sequence[Tensor]) -> tuple[Chart, Lens]:
-            return Equidistant(), Lens(Planar(Polynomial((torch.zeros_like(k[0]), k[0]))))
-
-    camera = Quintic([280.0, 280, 320, 240], [0.01], image_size=(480, 640))
-    assert_type(camera.resize(240, 320), Quintic)
-    assert_type(camera.convert(ct.KannalaBrandt).camera, ct.KannalaBrandt)
-
-
-def calibrations(camera: ct.Camera) -> None:
-    """Corners as OpenCV has them."""
-    board = np.array([[x, y, 0] for y in range(5) for x in range(6)]) * 0.03
-    poses = [ct.Extrinsics([0.3 * i - 0.5, 0.2 * i, 0], [-0.1, -0.1, 0.3]) for i in range(5)]
-    corners = [camera(pose(torch.as_tensor(board)))[0].detach().numpy() for pose in poses]
-    found = ct.calibrate("pinhole", board, corners, image_size=(480, 640))
-    assert_type(found.camera, ct.Camera)
-    assert_type(found.extrinsics, ct.Extrinsics)
-    assert_type(found.rms, float)
-    assert_type(found.uncertainty([[320.0, 240.0]]), Tensor)

@@ -12,7 +12,7 @@ import surround_view
 import torch
 import train_faces
 from PIL import Image
-from scenes import cabin, faces, room
+from scenes import cabin, faces
 from scenes.faces import NAMES, SIDE, SIZE, Photographs, Samples
 
 import camtorch as ct
@@ -82,23 +82,6 @@ def test_the_car_park_comes_back(tmp_path):
 # -- predict_camera
 
 
-def test_photographs_are_what_their_cameras_see():
-    # of a panorama whose red is the height of the ray, in the frame in which it was taken
-    focal = 128 / math.pi
-    panorama = ct.Equirectangular([focal, focal, 127.5, 63.5], image_size=(128, 256)).requires_grad_(False)
-    rays, valid = panorama.rays()
-    height = torch.where(valid, rays[..., 1], 0.0).expand(1, 3, -1, -1)
-    cameras = predict_camera.lenses(4, torch.Generator().manual_seed(0))
-    images = predict_camera.photographs(panorama, height, cameras, torch.Generator().manual_seed(1))
-    # heights are a linear function of the rays of the camera, whatever it is turned by
-    rays = cameras.rays()[0].flatten(1, 2)
-    seen = images[:, 0].flatten(1).unsqueeze(-1)
-    down = torch.linalg.lstsq(rays, seen).solution
-    assert (rays @ down - seen).abs().max() < 0.01
-    torch.testing.assert_close(down.norm(dim=1), torch.ones(4, 1), atol=0.01, rtol=0)
-    assert down[:, 1].min() > math.cos(math.radians(25))
-
-
 @pytest.mark.slow
 def test_a_few_steps_bring_rays_nearer_to_those_of_unseen_cameras(tmp_path):
     result = predict_camera.run(steps=60, tests=60, around=4, seed=1)
@@ -157,23 +140,6 @@ def test_labels_of_tests_are_true(drivers):
     assert bool((still.weight == 1).all())
     assert torch.equal(still.rays, rolling.rays)
     assert 0.5 < (still.keypoints - rolling.keypoints).abs().max() < 10
-
-
-@pytest.mark.slow
-def test_faces_before_a_rolling_shutter_are_those_that_a_warp_makes(drivers):
-    drivers, rates = drivers[:2], torch.tensor([[1.0, -2.0, 1.5], [-1.0, 1.5, 2.0]])
-    camera = faces.lens("dms90")
-    still, rolling = (faces.seen_by(camera, drivers, torch.zeros(2, 3), r) for r in (0 * rates, rates))
-    near, _ = faces.cut(camera, *camera.project(faces.points_of(drivers)))
-    readout = SIDE * faces.READOUT / SIZE[0] * camera.fx / near.fx
-    # a camera that turns sees the scene turn the other way
-    shutter = ct.RollingShutter(readout, -rates.double()).requires_grad_(False)
-    warp = ct.ShutterWarp(near, near, target_shutter=shutter, padding_mode="border")
-    moved, _ = warp.transform_points(still.keypoints.double())
-    assert (still.keypoints - rolling.keypoints).abs().max() > 0.5
-    torch.testing.assert_close(moved.float(), rolling.keypoints, atol=0.01, rtol=0)
-    off, before = ((image - rolling.image).square().mean() for image in (warp(still.image), still.image))
-    assert off < 0.2 * before
 
 
 @pytest.mark.slow
@@ -243,19 +209,3 @@ def test_regions_and_shares_are_those_of_the_car_by_each_mount(name):
     heads = torch.stack((turned, straight, straight)).double()
     share = driver_monitoring.head_share(gaze.double() @ turn, turn.T @ heads, pose)
     torch.testing.assert_close(share, torch.tensor([1.0, 0, 0]).double(), atol=1e-6, rtol=0)
-
-
-# -- the scenes and OpenCV
-
-
-@pytest.mark.slow
-def test_a_rendered_chart_is_found_where_it_is():
-    cv2 = pytest.importorskip("cv2")
-    camera = ct.Pinhole([1500.0, 1500, 0, 599.5], image_size=(1200, 1200)).double().requires_grad_(False)
-    image = (255 * room.render(camera, samples=4).mean(0)).round().byte().numpy()
-    points = room.keypoints()
-    truth = camera.project(points[points[:, 2] == points[:, 2].max()])[0].numpy().astype(np.float32)
-    start = truth + 0.6 * np.sin(np.arange(truth.size)).reshape(truth.shape).astype(np.float32)
-    stop = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 50, 1e-4)
-    found = cv2.cornerSubPix(image, start.reshape(-1, 1, 2).copy(), (6, 6), (-1, -1), stop)[:, 0]
-    assert np.linalg.norm(found - truth, axis=1).max() < 0.25  # light and shade move the finder somewhat
