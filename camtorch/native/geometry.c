@@ -64,7 +64,7 @@ static int numbers_of(const Part *part) {
     if (part->kind == FOV || part->kind == ONE_DIVISION) count = 1;
     if (part->kind == HOMOGRAPHY) count = 9;
     if (part->kind == SHEAR) count = 2;
-    if (part->kind == SURFACE) count = 4 + 2 * part->n * part->m;
+    if (part->kind == SURFACE) count = 2 * part->n * part->m;
     if (part->kind == PLANAR) count = 2 * !!(part->flags & TANGENTIAL) + 4 * !!(part->flags & PRISM);
     if (part->factor == RADIUS_TABLE) return count + 4 * part->n;
     return part->factor == NO_FACTOR ? count : count + part->n + (part->factor == RATIONAL ? part->m : 0);

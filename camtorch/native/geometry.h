@@ -36,6 +36,7 @@ enum { EXTENT = RADII + AZIMUTHS * RADII + AZIMUTHS };
 typedef struct {
     int32_t kind, flags, factor, n, m;
     double constant; /* alpha of a unified chart that does not learn it; cells past its edge that belong to a surface */
+    double cells[2], centre[2]; /* of a surface: how many lie on a unit of a and of b; its middle */
 } Part;
 
 /* Cameras (c) of one model. Pointers are to numbers of one type, float or double, without gaps */
@@ -49,8 +50,9 @@ typedef struct {
     int64_t constant_count;
     const uint8_t *usable; /* (c), or NULL: all are. The numbers of one that is not are those of any that is */
     /* of a lens: squared radii up to which it is regular, and no further out than images reach; squared limits (c,
-       AZIMUTHS) and where it sends azimuths (c, EXTENT), or NULL: not yet known; tables of the inverse (c, 2 + 2 NODES), or NULL; whether it goes stage by stage (c), or NULL:
-       none; the squared radius (c) of the circle that its image lies in then */
+       AZIMUTHS) and where it sends azimuths (c, EXTENT), or NULL: not yet known; tables of the inverse
+       (c, 2 + 2 NODES), or NULL; whether it goes stage by stage (c), or NULL: none; the squared radius (c) of the circle
+       that its image lies in then */
     const void *inner2, *usual2, *limits2, *extent, *table;
     const uint8_t *stagewise;
     const void *circle2;

@@ -250,20 +250,21 @@ static void reach(int n, const double *radius, double begin, double value, doubl
 /* Slopes of a spline lie between those of the lines from control point to control point */
 static void bound_surface(const Part *part, const double *k, int n, double *radius, double *least) {
     double steepest[MOST_RADII] = {0}, over[MOST_RADII] = {0}, down[MOST_RADII] = {0}, far[MOST_RADII] = {0};
+    const double *s = part->cells;
     double begin[2];
     const int size[2] = {part->n, part->m};
     for (int j = 0; j < size[1]; j++)
         for (int i = 0; i < size[0]; i++) {
-            const double *at = k + 4 + 2 * (j * size[0] + i);
+            const double *at = k + 2 * (j * size[0] + i);
             for (int more = 0; more < 3; more++) { /* the point, and the lines along a and along b */
                 if ((more == 1 && i + 1 == size[0]) || (more == 2 && j + 1 == size[1])) continue;
                 for (int axis = 0; axis < 2; axis++) {
                     const double line = more == axis + 1, place = (axis ? j : i) - (size[axis] - 1 - line) / 2;
-                    const double away = fabs(place / k[axis] + k[2 + axis]) - ((part->flags + 1 - line) / 2) / k[axis];
+                    const double away = fabs(place / s[axis] + part->centre[axis]) - ((part->flags + 1 - line) / 2) / s[axis];
                     begin[axis] = away > 0 ? away : 0;
                 }
                 const double out = hypot(begin[0], begin[1]);
-                const double *next = at + (more == 2 ? 2 * size[0] : 2), scale = more ? k[more - 1] : 1;
+                const double *next = at + (more == 2 ? 2 * size[0] : 2), scale = more ? s[more - 1] : 1;
                 if (!more) reach(n, radius, out, hypot(at[0], at[1]), far);
                 else {
                     const double by_x = (next[0] - at[0]) * scale, by_y = (next[1] - at[1]) * scale;
@@ -272,8 +273,8 @@ static void bound_surface(const Part *part, const double *k, int n, double *radi
                 }
             }
         }
-    const double end_a = (size[0] - part->flags) / 2.0 / k[0] - fabs(k[2]);
-    const double end_b = (size[1] - part->flags) / 2.0 / k[1] - fabs(k[3]), end = end_a < end_b ? end_a : end_b;
+    const double end_a = (size[0] - part->flags) / 2.0 / s[0] - fabs(part->centre[0]);
+    const double end_b = (size[1] - part->flags) / 2.0 / s[1] - fabs(part->centre[1]), end = end_a < end_b ? end_a : end_b;
     for (int i = 0; i < n; i++) {
         double *const all[4] = {steepest, over, down, far};
         for (int j = 0; i && j < 4; j++) all[j][i] = all[j][i - 1] > all[j][i] ? all[j][i - 1] : all[j][i];

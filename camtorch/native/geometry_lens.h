@@ -275,19 +275,20 @@ INLINE int64_t T(spline)(const int order, int size, R w, R *restrict weight, R *
 }
 
 /* The weights and slopes of a point of a surface along both axes; where in the surface its control points begin */
-INLINE int64_t T(patch)(const Part *part, const R *k, const int order, R a, R b, R (*restrict weight)[4],
-                        R (*restrict slope)[4]) {
-    const R place_a = (a - k[2]) * k[0] + (R)(part->n - 1) / 2, place_b = (b - k[3]) * k[1] + (R)(part->m - 1) / 2;
-    const int64_t column = T(spline)(order, part->n, place_a, weight[0], slope[0]);
-    return 2 * (T(spline)(order, part->m, place_b, weight[1], slope[1]) * part->n + column);
+INLINE int64_t T(patch)(const Part *part, const int order, R a, R b, R (*restrict weight)[4], R (*restrict slope)[4]) {
+    const R across = (a - (R)part->centre[0]) * (R)part->cells[0] + (R)(part->n - 1) / 2;
+    const R down = (b - (R)part->centre[1]) * (R)part->cells[1] + (R)(part->m - 1) / 2;
+    const int64_t column = T(spline)(order, part->n, across, weight[0], slope[0]);
+    return 2 * (T(spline)(order, part->m, down, weight[1], slope[1]) * part->n + column);
 }
 
 INLINE void T(surface_of)(const Part *part, const R *k, const int order, int n, const R *restrict a, const R *restrict b,
                           R *restrict u, R *restrict v, T(Jacobian) *restrict to) {
     const int width = 2 * (order + 1); /* du and dv of a row of control points */
+    const R sa = (R)part->cells[0], sb = (R)part->cells[1];
     for (int i = 0; i < n; i++) {
         R weight[2][4], slope[2][4], line[8] = {0}, change[8] = {0}, sum[2] = {0}, by_a[2] = {0}, by_b[2] = {0};
-        const R *at = k + 4 + T(patch)(part, k, order, a[i], b[i], weight, slope);
+        const R *at = k + T(patch)(part, order, a[i], b[i], weight, slope);
         for (int q = 0; q <= order; q++, at += 2 * part->n)
             for (int j = 0; j < width; j++) line[j] += weight[1][q] * at[j], change[j] += slope[1][q] * at[j];
         for (int j = 0; j < width; j++) {
@@ -296,8 +297,8 @@ INLINE void T(surface_of)(const Part *part, const R *k, const int order, int n, 
         }
         u[i] = a[i] + sum[0], v[i] = b[i] + sum[1];
         if (!to) continue;
-        to->ua[i] = 1 + by_a[0] * k[0], to->va[i] = by_a[1] * k[0];
-        to->ub[i] = by_b[0] * k[1], to->vb[i] = 1 + by_b[1] * k[1];
+        to->ua[i] = 1 + by_a[0] * sa, to->va[i] = by_a[1] * sa;
+        to->ub[i] = by_b[0] * sb, to->vb[i] = 1 + by_b[1] * sb;
     }
 }
 
@@ -307,7 +308,6 @@ static NOT_INLINE void T(surface)(const Part *part, const R *k, int n, const R *
     else T(surface_of)(part, k, 2, n, a, b, u, v, to);
 }
 
-/* Cells and centre are constants: their sums stay 0 */
 static void T(surface_vjp)(const Part *part, const R *k, int n, const R *restrict a, const R *restrict b,
                            R *restrict gu, R *restrict gv, double *sums) {
     ALIGNED R u[BLOCK], v[BLOCK];
@@ -315,7 +315,7 @@ static void T(surface_vjp)(const Part *part, const R *k, int n, const R *restric
     T(surface)(part, k, n, a, b, u, v, &to);
     for (int i = 0; sums && i < n; i++) {
         R weight[2][4], slope[2][4];
-        double *at = sums + 4 + T(patch)(part, k, part->flags, a[i], b[i], weight, slope);
+        double *at = sums + T(patch)(part, part->flags, a[i], b[i], weight, slope);
         for (int q = 0; q <= part->flags; q++, at += 2 * part->n)
             for (int p = 0; p <= part->flags; p++) {
                 const R w = weight[1][q] * weight[0][p];
@@ -329,9 +329,11 @@ static void T(surface_vjp)(const Part *part, const R *k, int n, const R *restric
 }
 
 /* In cells, positive up to the edge of a surface and so many behind */
-INLINE R T(surface_edge)(const Part *part, const R *k, R behind, R a, R b) {
-    const R across = (R)(part->n - part->flags) / 2 + behind - T(absolute)((a - k[2]) * k[0]);
-    const R down = (R)(part->m - part->flags) / 2 + behind - T(absolute)((b - k[3]) * k[1]);
+INLINE R T(surface_edge)(const Part *part, R a, R b) {
+    const R behind = (R)part->constant, p = (a - (R)part->centre[0]) * (R)part->cells[0];
+    const R q = (b - (R)part->centre[1]) * (R)part->cells[1];
+    const R across = (R)(part->n - part->flags) / 2 + behind - T(absolute)(p);
+    const R down = (R)(part->m - part->flags) / 2 + behind - T(absolute)(q);
     return across < down ? across : across == across ? down : -1;
 }
 
@@ -367,7 +369,7 @@ static void T(lens)(const T(Camera) *c, int first, int n, const R *a, const R *b
             else if (c->parts[j].factor == RATIONAL) {
                 EACH(i) margin[i] = T(horner)(k + c->parts[j].n, c->parts[j].m, x[i] * x[i] + y[i] * y[i], NULL);
             } else if (c->parts[j].kind == SURFACE && c->ends) {
-                EACH(i) margin[i] = T(surface_edge)(c->parts + j, k, (R)c->parts[j].constant, x[i], y[i]);
+                EACH(i) margin[i] = T(surface_edge)(c->parts + j, x[i], y[i]);
             } else EACH(i) margin[i] = INFINITY;
             EACH(i) {
                 /* a turn by half a circle has a positive determinant too: the trace tells it */

@@ -416,13 +416,13 @@ static void T(start)(const T(Camera) *c, int first, int n, const R *u, const R *
             }
         } else if (c->parts[j].kind == SURFACE) {
             const Part *part = c->parts + j;
-            const R across = (R)(part->n - part->flags) / 2 / k[0], down = (R)(part->m - part->flags) / 2 / k[1];
+            const R across = (R)(part->n - part->flags) / 2 / (R)part->cells[0], ca = (R)part->centre[0];
+            const R down = (R)(part->m - part->flags) / 2 / (R)part->cells[1], cb = (R)part->centre[1];
             ALIGNED R p[BLOCK], q[BLOCK];
             EACH(i) p[i] = a[i], q[i] = b[i];
             for (int count = 0; count < 3; count++) { /* on the surface, behind which it may be anywhere */
                 EACH(i) {
-                    a[i] = a[i] > k[2] - across ? a[i] : k[2] - across, a[i] = a[i] < k[2] + across ? a[i] : k[2] + across;
-                    b[i] = b[i] > k[3] - down ? b[i] : k[3] - down, b[i] = b[i] < k[3] + down ? b[i] : k[3] + down;
+                    a[i] = T(inside)(ca - across, a[i], ca + across), b[i] = T(inside)(cb - down, b[i], cb + down);
                 }
                 T(stage)(c, j, n, a, b, x, y, NULL);
                 EACH(i) a[i] += p[i] - x[i], b[i] += q[i] - y[i];

@@ -31,9 +31,8 @@ class Surface(Stage):
         columns: control points along a, more than the order.
         rows: along b.
         order: 2 or 3.
-        cells: (sa, sb), how many lie on a unit of a and of b, positive: numbers, or columns as the controls, which
-            are constants.
-        centre: (ca, cb), the middle of the grid, likewise. The origin of the plane has to be on the surface.
+        cells: (sa, sb), how many lie on a unit of a and of b, positive.
+        centre: (ca, cb), the middle of the grid. The origin of the plane has to be on the surface.
         behind: cells past its edge that belong to it.
     """
 
@@ -42,6 +41,8 @@ class Surface(Stage):
     columns: int
     rows: int
     order: int
+    cells: tuple[float, float]
+    centre: tuple[float, float]
     behind: float
 
     def __init__(
@@ -51,17 +52,13 @@ class Surface(Stage):
         rows: int,
         *,
         order: int = 3,
-        cells: tuple[Tensor | float, Tensor | float],
-        centre: tuple[Tensor | float, Tensor | float] = (0.0, 0.0),
+        cells: tuple[float, float],
+        centre: tuple[float, float] = (0.0, 0.0),
         behind: float = BEHIND,
     ):
         self.columns, self.rows, self.order, self.behind = columns, rows, order, behind
-        place = [
-            w if isinstance(w, Tensor) else torch.full_like(controls[0], w, requires_grad=False)
-            for w in (*cells, *centre)
-        ]
-        place = [w.detach() if w.requires_grad else w for w in place]
-        self.parameters: tuple[Tensor, ...] = (*place, *controls)
+        self.cells, self.centre = cells, centre
+        self.parameters: tuple[Tensor, ...] = tuple(controls)
 
     def __call__(self, a: Tensor, b: Tensor) -> Planes2:
         return self.at(a, b).value
@@ -74,40 +71,39 @@ class Surface(Stage):
         """See `Stage.lower_bound`: slopes of a spline lie between those of the lines from control point to control
         point, and it between these, of those that have a part in it within the circle.
         """
-        sa, sb, ca, cb = (w.unsqueeze(-1) for w in self.parameters[:4])
-        grid = torch.stack(self.parameters[4:], -1).unflatten(-1, (self.rows, self.columns, 2))
+        grid = torch.stack(self.parameters, -1).unflatten(-1, (self.rows, self.columns, 2))
+        sizes = self.columns, self.rows
 
         def nearest(more_a: int, more_b: int) -> Tensor:
-            """(*C, 1, P): how far from the origin it begins what differences along a or b have a part in."""
+            """(P,): how far from the origin it begins what differences along a or b have a part in."""
             reach = (self.order + 1) / 2
             sides = []
-            for size, more, s, c in ((self.columns, more_a, sa, ca), (self.rows, more_b, sb, cb)):
+            for size, more, s, c in zip(sizes, (more_a, more_b), self.cells, self.centre, strict=True):
                 middle = torch.arange(size - more, dtype=radius.dtype, device=radius.device) - (size - 1 - more) / 2
                 sides.append(((middle / s + c).abs() - (reach - more / 2) / s).clamp(min=0))
             return torch.hypot(sides[0].unsqueeze(-2), sides[1].unsqueeze(-1)).flatten(-2)
 
         def most(values: Tensor, begin: Tensor) -> Tensor:
-            """(*C, S): the largest (*C, 1, P) of those that begin before each radius; 0 if all are less."""
+            """(*C, S): the largest of (*C, 1, P) that begin before each radius; 0 if all are less."""
             values = torch.where(begin <= radius.unsqueeze(-1), values.flatten(-2), 0.0)
             return values.amax(-1)
 
-        along, down = grid.diff(dim=-2) * sa[..., None, None], grid.diff(dim=-3) * sb[..., None, None]
+        along, down = grid.diff(dim=-2) * self.cells[0], grid.diff(dim=-3) * self.cells[1]
         here, there = nearest(1, 0), nearest(0, 1)
         steepest = torch.maximum(most(-along[..., 0], here), most(-down[..., 1], there))
         across = (most(along[..., 1].abs(), here) + most(down[..., 0].abs(), there)) / 2
-        edge = [(n - self.order) / 2 / s - c.abs() for n, s, c in ((self.columns, sa, ca), (self.rows, sb, cb))]
-        inside = torch.minimum(*edge).squeeze(-1) - radius
+        edge = [(n - self.order) / 2 / s - abs(c) for n, s, c in zip(sizes, self.cells, self.centre, strict=True)]
+        inside = min(edge) - radius
         far = radius + most(torch.hypot(*grid.unbind(-1)), nearest(0, 0))
         return torch.where(inside > 0, 1 - steepest - across, inside.clamp(max=-1e-3)), far
 
     def start(self, u: Tensor, v: Tensor) -> Planes2:
         """A point near the one that is sent to (u, v)."""
-        sa, sb, ca, cb = self.parameters[:4]
+        (sa, sb), (ca, cb) = self.cells, self.centre
         half_a, half_b = (self.columns - self.order) / 2 / sa, (self.rows - self.order) / 2 / sb
         a, b = u, v
         for _ in range(3):  # on the surface, behind which it may be anywhere
-            a = torch.minimum(torch.maximum(a, ca - half_a), ca + half_a)
-            b = torch.minimum(torch.maximum(b, cb - half_b), cb + half_b)
+            a, b = a.clamp(ca - half_a, ca + half_a), b.clamp(cb - half_b, cb + half_b)
             x, y = self.at(a, b).value
             a, b = a + u - x, b + v - y
         return a, b
@@ -127,7 +123,7 @@ class SurfaceAt(StageAt):
         """The first of the control points that have a part in it, weights (..., order + 1), and their slopes."""
         stage, w = self.stage, (self.a, self.b)[axis]
         size = (stage.columns, stage.rows)[axis]
-        position = (w - stage.parameters[2 + axis]) * stage.parameters[axis] + (size - 1) / 2
+        position = (w - stage.centre[axis]) * stage.cells[axis] + (size - 1) / 2
         near = position.detach().nan_to_num(0.0)
         cell = (near.floor() if stage.order == 3 else (near + 0.5).floor()).clamp(1, size - stage.order)
         x = position - cell
@@ -142,7 +138,7 @@ class SurfaceAt(StageAt):
     def _at_points(self) -> tuple[Tensor, ...]:
         """Control points (..., order + 1, order + 1, 2), rows first, and weights and slopes along a and b."""
         stage = self.stage
-        controls = stage.parameters[4:]
+        controls = stage.parameters
         points = torch.stack(controls, -1).unflatten(-1, (len(controls) // 2, 2)).flatten(0, -2)
         (i, wa, da), (j, wb, db) = self._place(0), self._place(1)
         # of each camera, or point, its own
@@ -166,7 +162,7 @@ class SurfaceAt(StageAt):
     @property
     def jacobian(self) -> Jacobian:
         patch, wa, da, wb, db = self._patch
-        sa, sb = self.stage.parameters[:2]
+        sa, sb = self.stage.cells
         (ua, va), (ub, vb) = self._sum(patch, da, wb), self._sum(patch, wa, db)
         return 1 + ua * sa, ub * sb, va * sa, 1 + vb * sb
 
@@ -174,6 +170,6 @@ class SurfaceAt(StageAt):
     def edge(self) -> Tensor:
         """In cells."""
         stage = self.stage
-        sa, sb, ca, cb = stage.parameters[:4]
+        (sa, sb), (ca, cb) = stage.cells, stage.centre
         across = (stage.columns - stage.order) / 2 + stage.behind - ((self.a - ca) * sa).abs()
         return torch.minimum(across, (stage.rows - stage.order) / 2 + stage.behind - ((self.b - cb) * sb).abs())

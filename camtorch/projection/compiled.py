@@ -41,43 +41,39 @@ _HAS_XI, _HAS_ALPHA, _HAS_BETA, _TRANSVERSE = 1, 2, 4, 8
 _TANGENTIAL, _PRISM = 1, 2
 
 
+def _fields(text: str, **others: type) -> tuple[tuple[str, type], ...]:
+    """Those of a struct, by name: *pointers, numbers of 64 bits, and `others` of their own types."""
+    return tuple((w.lstrip("*"), others.get(w, c_void_p if w[0] == "*" else c_int64)) for w in text.split())
+
+
 class _Part(ctypes.Structure):
     """`Part` of geometry.h."""
 
     _fields_ = (
-        ("kind", c_int32),
-        ("flags", c_int32),
-        ("factor", c_int32),
-        ("n", c_int32),
-        ("m", c_int32),
+        *((name, c_int32) for name in ("kind", "flags", "factor", "n", "m")),
         ("constant", c_double),
+        ("cells", c_double * 2),
+        ("centre", c_double * 2),
     )
 
 
 class _Cameras(ctypes.Structure):
     """`Cameras` of geometry.h."""
 
-    _fields_ = (
-        ("parts", c_void_p),
-        ("part_count", c_int64),
-        ("is_double", c_int64),
-        ("cameras", c_int64),
-        ("intrinsics", c_void_p),
-        ("parameters", c_void_p),
-        ("parameter_count", c_int64),
-        ("constants", c_void_p),
-        ("constant_count", c_int64),
-        ("usable", c_void_p),
-        ("inner2", c_void_p),
-        ("usual2", c_void_p),
-        ("limits2", c_void_p),
-        ("extent", c_void_p),
-        ("table", c_void_p),
-        ("stagewise", c_void_p),
-        ("circle2", c_void_p),
-        ("chart_inner2", c_void_p),
-        ("chart_most2", c_void_p),
-        ("chart_table", c_void_p),
+    _fields_ = _fields(
+        "*parts part_count is_double cameras *intrinsics *parameters parameter_count *constants constant_count *usable "
+        "*inner2 *usual2 *limits2 *extent *table *stagewise *circle2 *chart_inner2 *chart_most2 *chart_table"
+    )
+
+
+class _Domain(ctypes.Structure):
+    """`Domain` of geometry.h."""
+
+    _fields_ = _fields(
+        "*parts part_count is_double cameras *parameters parameter_count *constants constant_count is_chart is_radial "
+        "*ends *usual_ends *folds most *radii *coarse *even *inner2 *usual2 *circle2 *table *limits2 *extent "
+        "*stagewise",
+        most=c_double,
     )
 
 
@@ -87,37 +83,6 @@ packed_lattices: Callable[..., bytes] = struct.Struct(f"8q2d12q{CLASSIFICATION}6
 POSITIONS, PIXELS, ON_IMAGE = range(3)
 LEFT_FROM, LEFT_TO, LEFT_MOST = 1, 2, 4
 _NO_ROWS = (0, 0, 0, 0)
-
-
-class _Domain(ctypes.Structure):
-    """`Domain` of geometry.h."""
-
-    _fields_ = (
-        ("parts", c_void_p),
-        ("part_count", c_int64),
-        ("is_double", c_int64),
-        ("cameras", c_int64),
-        ("parameters", c_void_p),
-        ("parameter_count", c_int64),
-        ("constants", c_void_p),
-        ("constant_count", c_int64),
-        ("is_chart", c_int64),
-        ("is_radial", c_int64),
-        ("ends", c_void_p),
-        ("usual_ends", c_void_p),
-        ("folds", c_void_p),
-        ("most", c_double),
-        ("radii", c_void_p),
-        ("coarse", c_void_p),
-        ("even", c_void_p),
-        ("inner2", c_void_p),
-        ("usual2", c_void_p),
-        ("circle2", c_void_p),
-        ("table", c_void_p),
-        ("limits2", c_void_p),
-        ("extent", c_void_p),
-        ("stagewise", c_void_p),
-    )
 
 
 class Plan:
@@ -282,11 +247,9 @@ class Lenses:
             self.struct.usual2, self.struct.inner2 = self._keep(domain.usual2), self._keep(domain.inner2)
             return
         names = ["inner2", "usual2", *["circle2", "stagewise"] * plan.has_rest]
-        counts = [1] * len(names)
-        if tables and plan.has_factor:  # at once, as there will be pixels
-            names, counts = [*names, "table"], [*counts, _TABLE]
-        start, step = self._new(sum(counts)), self.cameras * self.dtype.itemsize
-        wanted = {name: start + step * i for name, i in zip(names, accumulate(counts, initial=0), strict=False)}
+        has_table = tables and plan.has_factor  # at once, as there will be pixels
+        start, step = self._new(len(names) + _TABLE * has_table), self.cameras * self.dtype.itemsize
+        wanted = {name: start + step * i for i, name in enumerate([*names, *["table"] * has_table])}
         radii = {} if plan.is_radial else {"radii": self._keep(plan.radii(lambda: self._optics()[0], _RADII, self._k))}
         self._ask(wanted | radii)
         for name, place in wanted.items():
@@ -438,7 +401,7 @@ def _chart(chart: Chart) -> _Part | None:
 def _stage(stage: Stage) -> _Part | None:
     kind = _code(stage)
     if kind is not None and isinstance(stage, optics.Surface):
-        return _Part(kind, stage.order, 0, stage.columns, stage.rows, constant=stage.behind)
+        return _Part(kind, stage.order, 0, stage.columns, stage.rows, stage.behind, stage.cells, stage.centre)
     if kind is None or not isinstance(stage, optics.Planar):
         return None if kind is None else _Part(kind)
     part, radial = _Part(kind, _TANGENTIAL * bool(stage.tangential) | _PRISM * bool(stage.prism)), stage.radial

@@ -147,7 +147,8 @@ static int fuzz(void) {
         if (part->kind == SHEAR) numbers += 2;
         if (part->kind == SURFACE) {
             part->flags = 2 + (int32_t)below(2), part->n = part->flags + 1 + (int32_t)below(5), part->m = part->flags + 1 + (int32_t)below(5);
-            numbers += 4 + 2 * part->n * part->m;
+            numbers += 2 * part->n * part->m;
+            for (int axis = 0; axis < 2; axis++) part->cells[axis] = 4 * share() - 1, part->centre[axis] = 2 * share() - 1;
         }
         if (part->kind != PLANAR) continue;
         part->flags = (int32_t)below(4);
