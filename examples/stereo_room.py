@@ -58,7 +58,7 @@ def match(left: Tensor, right: Tensor, least: float, most: float) -> Tensor:
     sides = 0, 0, max(start + count, 0), max(-start, 0)  # OpenCV leaves out columns that it would compare with none
     images = [image.permute(1, 2, 0).contiguous().numpy() for image in (left, right)]
     padded = [cv2.copyMakeBorder(image, *sides, cv2.BORDER_REPLICATE) for image in images]
-    matcher = cv2.StereoSGBM_create(start, count, 5, 600, 2400, 1, 0, 10, 100, 2)
+    matcher = cv2.StereoSGBM.create(start, count, 5, 600, 2400, 1, 0, 10, 100, 2)
     found = matcher.compute(*padded)[:, sides[2] : sides[2] + left.shape[-1]]
     return torch.from_numpy(np.where(found < 16 * start, np.nan, found / 16))  # OpenCV's are sixteenths
 

@@ -1,4 +1,4 @@
-"""What users pass as object points and image points, brought into padded tensors, and results brought back."""
+"""What users pass to a calibration, object points and image points, as padded tensors; results in the same form."""
 
 from __future__ import annotations
 
@@ -8,12 +8,14 @@ from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from camtorch._arguments import Numbers, as_image_size, as_values, shown, warn
 
 Points: TypeAlias = "Numbers | Sequence[Numbers | None]"
 """Points of all views: a tensor, an array, or a list with one of them, or None, for each view."""
+Array: TypeAlias = NDArray[Any]
 
 _LEAST_CORNERS = 4
 _FLAT = 1e-5  # the width of a set of points over its length, below which it is a line
@@ -71,11 +73,9 @@ class Layout(NamedTuple):
 
         (V', *, k) for one tensor of V' views, or a list of a tensor (*, k) for each view.
         """
-        empty = False if values.dtype == torch.bool else torch.nan
-        rest = values.shape[2:]
-        seen = self.seen.reshape(*self.seen.shape, *[1] * len(rest))
-        full = values.new_full((len(self.shapes), *values.shape[1:]), empty)
-        full[self.views] = torch.where(seen, values, torch.full_like(values, empty))
+        rest, empty = values.shape[2:], values.new_tensor(False if values.dtype == torch.bool else torch.nan)
+        full = empty.repeat(len(self.shapes), *values.shape[1:])
+        full[self.views] = torch.where(self.seen.reshape(*self.seen.shape, *[1] * len(rest)), values, empty)
         if self.stacked:
             return full.reshape(len(full), *self.shapes[0], *rest)
         return [row[: math.prod(shape)].reshape(*shape, *rest) for row, shape in zip(full, self.shapes, strict=True)]
@@ -84,17 +84,7 @@ class Layout(NamedTuple):
 def as_observations(
     object_points: Points, image_points: Points, image_size: Sequence[int], owner: str
 ) -> tuple[Observations, Layout]:
-    """What one camera sees: the views that have corners, and the form to bring results back into.
-
-    Args:
-        object_points: (N, 3) for all views, (V, N, 3), or a list of (N_i, 3), in the board's frame.
-        image_points: (V, N, 2) or a list of (N_i, 2), in which None is a view without corners; rows with NaN are
-            unseen. In both, points may be OpenCV's (N, 1, 2), (1, N, 2).
-        image_size: (height, width) in pixels.
-        owner: the name of the function that asks, for messages.
-
-    Warns:
-        UserWarning: a view has no corner, or those of an earlier one, and is left out.
+    """What one camera sees, of what `calibrate` takes: the views that have corners, and the form to bring results back.
 
     Raises:
         ValueError: shapes and numbers that do not fit, views of too few corners, corners on a line, corners twice,
@@ -114,17 +104,13 @@ def as_rig_observations(
 ) -> dict[str, tuple[Observations, Layout]]:
     """What the cameras of a rig see: of every camera the same views of the same boards, by name in the models' order.
 
-    Image points are None or NaN where a camera does not see the board of a view.
-
     Raises:
-        ValueError: what `as_observations` refuses; names that differ; a camera that sees nothing; cameras that no
-            board links. TypeError: no mappings.
+        ValueError: what `as_observations` refuses; names that differ; cameras that no board links. TypeError: no dicts.
     """
     for argument, given in {"models": models, "image_points": image_points, "image_sizes": image_sizes}.items():
         if not isinstance(given, Mapping) or not all(isinstance(name, str) for name in given):
             raise TypeError(
-                f"{owner}: {argument} must map names of cameras to theirs, as {{'left': ..., 'right': ...}}; "
-                f"got {type(given).__name__} {shown(given)}"
+                f"{owner}: {argument} must map names of cameras to theirs; got {type(given).__name__} {shown(given)}"
             )
         if not given or set(given) != set(models):
             raise ValueError(
@@ -154,9 +140,6 @@ def repeats(cameras: Sequence[Observations], residuals: Sequence[Tensor]) -> Ten
     return order[first[group] != order].sort().values
 
 
-# -- forms
-
-
 def _observed(
     object_points: Points, image_points: Mapping[str, Points], image_sizes: Mapping[str, Any], owner: str
 ) -> dict[str, tuple[Observations, Layout]]:
@@ -166,207 +149,190 @@ def _observed(
     order: noise makes those of no two photographs equal.
     """
     labels = {name: f"image_points[{name!r}]" if name else "image_points" for name in image_points}
-    sizes = {}
-    for name in image_points:
-        size_name = f"image_sizes[{name!r}]" if name else "image_size"
-        if (size := as_image_size(image_sizes[name], owner, size_name)) is None:
-            raise ValueError(f"{owner}: {size_name} is missing: (height, width) in pixels, as image.shape[:2]")
-        sizes[name] = size_name, size
-    views = {name: _in_views(given, 2, labels[name], owner) for name, given in image_points.items()}
-    board = _in_views(object_points, 3, "object_points", owner).rows
-    counts = {labels[name]: len(given.rows) for name, given in views.items()}
-    if len(board) > 1 or board[0] is None:
-        counts["object_points"] = len(board)
-    if len(set(counts.values())) > 1:
-        raise ValueError(f"{owner}: all arguments must have the same views; got numbers of views {counts}")
-    number = len(next(iter(views.values())).rows)
-    boards = [torch.empty(0, 3) if rows is None else rows for rows in (board * number if len(board) == 1 else board)]
-    device = next(rows.device for given in views.values() for rows in given.rows if rows is not None)
-    points = _padded(boards, max(map(len, boards)), 3, device)
-    pixels, seen = {}, {}
-    for name, given in views.items():
-        for i, (rows, of_board) in enumerate(zip(given.rows, boards, strict=True)):
-            if rows is not None and len(rows) not in (0, len(of_board)):
+    given = {name: _in_views(image_points[name], 2, label, owner) for name, label in labels.items()}
+    boards, *_ = _in_views(object_points, 3, "object_points", owner)
+    numbers = {label: len(given[name][0]) for name, label in labels.items()}
+    numbers |= {"object_points": len(boards)} if len(boards) > 1 or boards[0] is None else {}
+    if len(set(numbers.values())) > 1:
+        raise ValueError(f"{owner}: all arguments must have the same views; got numbers of views {numbers}")
+    boards = boards * len(next(iter(given.values()))[0]) if len(boards) == 1 else boards
+    lengths = [0 if board is None else len(board) for board in boards]
+    points, sizes, pixels = _padded(boards, max(lengths), 3), {}, {}
+    seen: dict[str, Array] = {}
+    for name, (views, *_) in given.items():
+        size_label = f"image_sizes[{name!r}]" if name else "image_size"
+        if (size := as_image_size(image_sizes[name], owner, size_label)) is None:
+            raise ValueError(f"{owner}: {size_label} is missing: (height, width) in pixels, as image.shape[:2]")
+        for i, (view, length) in enumerate(zip(views, lengths, strict=True)):
+            if view is not None and len(view) not in (0, length):
                 raise ValueError(
-                    f"{owner}: view {i}: object_points are {len(of_board)} corners (of a chessboard its inner ones), "
-                    f"and {labels[name]}[{i}] are {len(rows)}; corners that were not found are rows of NaN"
+                    f"{owner}: view {i}: object_points are {length} corners (of a chessboard its inner ones), and "
+                    f"{labels[name]}[{i}] are {len(view)}; corners that were not found are rows of NaN"
                 )
-        pixels[name] = _padded(given.rows, points.shape[1], 2, device)
-        seen[name] = ~pixels[name].isnan().any(-1)
+        of = _padded(views, max(lengths), 2)
+        seen[name] = ~np.isnan(of.sum(-1))
+        sizes[name], pixels[name] = size, np.where(seen[name][..., None], of, np.nan)
         _check_corners(points, pixels[name], seen[name], labels[name], owner)
-        _check_inside(pixels[name], seen[name], labels[name], *sizes[name], owner)
-    sees = torch.stack([of.any(-1) for of in seen.values()])
-    _check_links(list(views), sees, owner)
-    has = sees.any(0)
-    # complex numbers have an order: by u, then by v
-    corners = {name: torch.where(seen[name], torch.view_as_complex(of), torch.inf) for name, of in pixels.items()}
-    ordered = np.concatenate([np.sort(of.numpy(force=True) + 0.0, 1) for of in corners.values()], 1)
+        _check_inside(pixels[name], seen[name], labels[name], size, size_label, owner)
+    sees: Array = np.stack([of.any(-1) for of in seen.values()])
+    _check_links(list(given), sees, owner)
     first: dict[bytes, int] = {}
-    copy = has & torch.tensor([first.setdefault(row.tobytes(), i) != i for i, row in enumerate(ordered)], device=device)
+    has: Array = np.any(sees, 0)
+    rows = enumerate(np.concatenate([_ordered(of) for of in pixels.values()], 1) + 0.0)
+    copy: Array = has & np.array([first.setdefault(row.tobytes(), i) != i for i, row in rows])
     for left_out, why in ((~has, "nothing was seen"), (copy, "the corners are those of another view")):
-        if bool(left_out.any()):
+        if left_out.any():
             warn(f"{owner}: left out, as {why} in {_views_of(left_out)}")
-    kept = (has & ~copy).nonzero()[:, 0]
-    found = {}
-    for name, given in views.items():
-        of = seen[name][kept]
-        some = Observations(points[kept].nan_to_num(nan=0.0), torch.where(of[..., None], pixels[name][kept], 0.0), of)
-        shapes = tuple((len(b),) if shape is None else shape for b, shape in zip(boards, given.shapes, strict=True))
-        copies = tuple((copy & seen[name].any(-1)).nonzero()[:, 0].tolist())
-        found[name] = some, Layout(shapes, given.stacked, kept, of, sizes[name][1], copies)
+    every = [v for value in image_points.values() for v in (value if isinstance(value, (list, tuple)) else [value])]
+    device = next((view.device for view in every if isinstance(view, Tensor)), torch.device("cpu"))
+    kept, found = np.flatnonzero(has & ~copy), {}
+    for name, (_, shapes, stacked) in given.items():
+        arrays = np.nan_to_num(points[kept]), np.nan_to_num(pixels[name][kept]), seen[name][kept], kept
+        *corners, numbered = (torch.as_tensor(array, device=device) for array in arrays)
+        forms = tuple((n,) if shape is None else shape for n, shape in zip(lengths, shapes, strict=True))
+        copies = tuple(np.flatnonzero(copy & seen[name].any(-1)).tolist())
+        found[name] = Observations(*corners), Layout(forms, stacked, numbered, corners[2], sizes[name], copies)
     return found
 
 
-class _Views(NamedTuple):
-    """Points as they came, in views: (n, size) and the shape before the last dim, None where nothing was passed."""
+def _in_views(
+    value: Points, size: int, name: str, owner: str
+) -> tuple[list[Array | None], list[tuple[int, ...] | None], bool]:
+    """Points (n, size) of each view and the shapes they came in, None for no points; whether they were one array.
 
-    rows: list[Tensor | None]
-    shapes: list[tuple[int, ...] | None]
-    stacked: bool
-
-
-def _in_views(value: Points, size: int, name: str, owner: str) -> _Views:
-    """Image points have a dim for views, or are in a list; object points may be one set."""
-    if isinstance(value, np.ndarray) and value.dtype == object:
-        value = list(value)
-    parts: list[Tensor | None]
-    listed, single = isinstance(value, (list, tuple)), False
+    Image points have a dim for views, or are in a list; object points may be one set.
+    """
+    parts: list[Array | None] = []
     if isinstance(value, (list, tuple)):
-        parts = [None if p is None else _as_float64(p, size, f"{name}[{i}]", owner) for i, p in enumerate(value)]
-        if any(p is not None for p in parts) and all(p is None or (p.ndim == 1 and len(p)) for p in parts):
-            listed, single, parts = False, True, [_as_float64(value, size, name, owner)]  # rows of numbers
-    else:
-        whole = _as_float64(value, size, name, owner)
+        parts = [None if p is None else _as_array(p, size, f"{name}[{i}]", owner) for i, p in enumerate(value)]
+    are_rows = bool(parts) and all(p is not None and p.ndim == 1 <= p.size for p in parts)  # of numbers
+    stacked, is_one = are_rows or not isinstance(value, (list, tuple)), False
+    if stacked:
+        whole = _as_array(value, size, name, owner)
         # (N, 1, size) is OpenCV's form of one set of points
-        single = whole.ndim < 3 or (whole.ndim == 3 and whole.shape[1] == 1 < whole.shape[0])
-        parts = [whole] if single else list(whole)
-    if not any(part is not None for part in parts):
+        is_one = whole.ndim < 3 or (whole.ndim == 3 and whole.shape[1] == 1 < whole.shape[0])
+        parts = [whole] if is_one else list(whole)
+    if all(part is None for part in parts):
         raise ValueError(f"{owner}: {name} has no view with points; got {shown(value)}")
-    rows: list[Tensor | None] = []
+    rows: list[Array | None] = []
     for i, part in enumerate(parts):
-        if part is None or not part.numel():
-            rows.append(None if part is None else part.new_empty(0, size))
-            continue
-        flat = part.reshape(-1, part.shape[-1]) if part.ndim == 3 and 1 in part.shape[:2] else part
-        if flat.ndim != 2 or flat.shape[1] != size or (single and size == 2):
-            shape = part.shape if listed or single else (len(parts), *part.shape)
-            form = f"(N, {size})" if listed or size == 3 else f"(V, N, {size}) or a list of (N_i, {size})"
-            raise ValueError(f"{owner}: {name}{f'[{i}]' * listed} must be {form}; got shape {tuple(shape)}")
+        flat = part if part is None or part.size else np.empty((0, size))
+        if flat is not None and flat.ndim == 3 and 1 in flat.shape[:2]:
+            flat = flat.reshape(-1, flat.shape[-1])
+        if flat is not None and (flat.ndim != 2 or flat.shape[1] != size or (is_one and size == 2)):
+            form = f"(V, N, {size}) or a list of (N_i, {size})" if stacked and size == 2 else f"(N, {size})"
+            shape = whole.shape if stacked or part is None else part.shape
+            raise ValueError(f"{owner}: {name}{'' if stacked else f'[{i}]'} must be {form}; got shape {shape}")
         rows.append(flat)
-    return _Views(rows, [None if p is None else tuple(p.shape[:-1]) or (0,) for p in parts], not listed)
+    return rows, [None if p is None else p.shape[:-1] or (0,) for p in parts], stacked
 
 
-def _as_float64(value: Any, size: int, name: str, owner: str) -> Tensor:
-    """A detached float64 tensor; None among the numbers, or the rows, of a list is NaN."""
+def _as_array(value: Any, size: int, name: str, owner: str) -> Array:
+    """A float64 array; None among the numbers of a list is NaN."""
     if isinstance(value, (list, tuple)):
-        rows = [row.detach().cpu().numpy() if isinstance(row, Tensor) else row for row in value]
         try:
-            value = np.asarray([[math.nan] * size if row is None else row for row in rows], np.float64)
+            rows = [
+                [math.nan] * size if v is None else v.numpy(force=True) if isinstance(v, Tensor) else v for v in value
+            ]
+            value = np.asarray(rows, np.float64)
         except (TypeError, ValueError) as error:
             raise type(error)(f"{owner}: {name} must be rows of {size} numbers; got {shown(value)}: {error}") from None
-    values = as_values(value, name, owner)
+    values = as_values(value, name, owner, torch.device("cpu"))
     if values.is_meta:
         raise ValueError(f"{owner}: {name} is on the device meta, and has no values")
-    return values.detach().to(torch.float64)
+    array: Array = values.detach().double().numpy(force=True)
+    return array
 
 
-def _padded(views: Sequence[Tensor | None], count: int, size: int, device: torch.device) -> Tensor:
+def _padded(views: Sequence[Array | None], count: int, size: int) -> Array:
     """(V, count, size), NaN where there is nothing."""
-    given = [points for points in views if points is not None and len(points) == count]
-    if len(given) == len(views):
-        return torch.stack(given).to(device, torch.float64)
-    padded = torch.full((len(views), count, size), torch.nan, dtype=torch.float64, device=device)
+    padded = np.full((len(views), count, size), np.nan)
     for row, points in zip(padded, views, strict=True):
         if points is not None:
             row[: len(points)] = points
     return padded
 
 
-# -- what is in them
+def _ordered(rows: Array) -> Array:
+    """Rows (V, N, k) of each view in the order of their numbers, NaN last."""
+    return np.take_along_axis(rows, np.lexsort(np.moveaxis(rows, -1, 0))[..., None], 1)
 
 
-def _check_corners(points: Tensor, pixels: Tensor, seen: Tensor, name: str, owner: str) -> None:
+def _repeated(rows: Array, times: int) -> Array:
+    """(V,) whether so many of the rows (V, N, k) of a view are equal; NaN equals nothing."""
+    ordered = _ordered(rows)
+    same: Array = (ordered[:, times - 1 :] == ordered[:, : rows.shape[1] - times + 1]).all(-1).any(-1)
+    return same
+
+
+def _check_corners(points: Array, pixels: Array, seen: Array, name: str, owner: str) -> None:
     """Refuse corners from which no pose can be told; points (V, N, 3) and pixels (V, N, 2) are NaN where padded."""
-
-    def refuse(views: Tensor, words: str) -> None:
-        if bool(views.any()):
-            raise ValueError(f"{owner}: {_views_of(views)}: {words}")
-
-    refuse(pixels.isinf().any(-1).any(-1), f"{name} is infinite; what is unseen is NaN")
-    number, has = seen.sum(-1), seen.any(-1)
-    if not bool(has.any()):
+    number, corners = seen.sum(-1), np.where(seen[..., None], points, np.nan)
+    if not number.any():
         raise ValueError(f"{owner}: {name} is NaN everywhere: no view has a corner")
-    few = has & (number < _LEAST_CORNERS)
-    refuse(few, f"{name} has fewer than {_LEAST_CORNERS} seen corners; leave it out, or make it None or NaN")
-    refuse((~points.isfinite().all(-1) & seen).any(-1), "object_points are not finite where image_points are")
-    known = torch.where(seen[..., None], points, 0.0)
-    reach = known.abs().amax((1, 2))
-    if not _LEAST_UNIT < float(reach.max()) < _MOST_UNIT and bool(reach.any()):
-        raise ValueError(
-            f"{owner}: object_points reach {float(reach.max()):.3g}; give them in a unit near the size of the board"
-        )
-    offsets = (known - (known.sum(1) / number.clamp(min=1)[:, None])[:, None]) * seen[..., None]
-    spread = torch.linalg.eigvalsh(offsets.mT @ offsets).clamp(min=0).sqrt()  # (V, 3) ascending
-    thin = spread[:, 1] <= torch.maximum(_FLAT * spread[:, 2], _ROUNDING * reach)
-    refuse(has & thin, "the object_points of its seen corners lie on one line, or are the same point")
-    refuse(_repeated(known, seen, 2), "object_points has a corner twice; a board has each once")
-    at_one = _repeated(pixels, seen, _SAME_PIXEL)
-    refuse(at_one, f"{name} has {_SAME_PIXEL} or more corners at one pixel; corners that were not found are NaN")
+    known = np.nan_to_num(corners, posinf=0.0, neginf=0.0)
+    reach = np.abs(known).max((1, 2))
+    known = known / np.where(reach > 0, reach, 1.0)[:, None, None]
+    offsets = (known - known.sum(1, keepdims=True) / np.maximum(number, 1)[:, None, None]) * seen[..., None]
+    spread = np.sqrt(np.linalg.eigvalsh(offsets.swapaxes(1, 2) @ offsets).clip(min=0))  # (V, 3) ascending
+    thin = spread[:, 1] <= np.maximum(_FLAT * spread[:, 2], _ROUNDING)
+    odd, at_one = (reach > 0) & ((reach <= _LEAST_UNIT) | (reach >= _MOST_UNIT)), _repeated(pixels, _SAME_PIXEL)
+    for wrong, words in (
+        (np.isinf(pixels).any((1, 2)), f"{name} is infinite; what is unseen is NaN"),
+        (number < _LEAST_CORNERS, f"{name} has fewer than {_LEAST_CORNERS} seen corners; leave it out, or make it NaN"),
+        ((~np.isfinite(corners).all(-1) & seen).any(-1), "object_points are not finite where image_points are"),
+        (odd, f"object_points reach {reach.max():.3g}; give them in a unit near the size of the board"),
+        (thin, "the object_points of its seen corners lie on one line, or are the same point"),
+        (_repeated(corners, 2), "object_points has a corner twice; a board has each once"),
+        (at_one, f"{name} has {_SAME_PIXEL} or more corners at one pixel; corners that were not found are NaN"),
+    ):
+        if (wrong & (number > 0)).any():
+            raise ValueError(f"{owner}: {_views_of(wrong & (number > 0))}: {words}")
 
 
-def _repeated(rows: Tensor, seen: Tensor, times: int) -> Tensor:
-    """(V,) whether so many of the seen rows (V, N, k) of a view are equal."""
-    # equal rows have equal sums of multiples that no two others have in common, and stand together once sorted
-    sums = torch.where(seen, (rows * rows.new_tensor([1.0, 2**0.5, 3**0.5])[: rows.shape[-1]]).sum(-1), torch.nan)
-    order = sums.argsort(-1)
-    ordered, both = rows.gather(1, order[..., None].expand_as(rows)), seen.gather(1, order)
-    before, after = slice(None, rows.shape[1] - times + 1), slice(times - 1, None)
-    same = (ordered[:, after] == ordered[:, before]).all(-1) & both[:, after] & both[:, before]
-    return same.any(-1)
-
-
-def _check_inside(pixels: Tensor, seen: Tensor, name: str, size_name: str, size: tuple[int, int], owner: str) -> None:
+def _check_inside(pixels: Array, seen: Array, name: str, size: tuple[int, int], size_name: str, owner: str) -> None:
     """Refuse pixels that are not those of such an image."""
-    found, (height, width) = pixels[seen], size
-    low, high = ("({:.6g}, {:.6g})".format(*end.tolist()) for end in (found.amin(0), found.amax(0)))
-    if float(found.abs().max()) < _NORMALISED < min(size) / 2:
+    found = pixels[seen]
+    low, high = ("({:.6g}, {:.6g})".format(*end) for end in (found.min(0), found.max(0)))
+    if np.abs(found).max() < _NORMALISED < min(size) / 2:
         raise ValueError(
-            f"{owner}: {name} reaches from {low} to {high} in an image of {height} x {width}: pixels are asked for, "
+            f"{owner}: {name} reaches from {low} to {high} in an image of {size[0]} x {size[1]}: pixels are asked for, "
             "not normalised coordinates"
         )
 
-    def outside(rows: int, columns: int, rim: float) -> Tensor:
-        limits = pixels.new_tensor([columns - 1.0, rows - 1.0])
-        return seen & ((pixels < -rim * max(size)) | (pixels > limits + rim * max(size))).any(-1)
+    def outside(sides: tuple[int, int], rim: float) -> Array:
+        over = np.maximum(pixels - np.array(sides[::-1]) + 1.0, -pixels)
+        far: Array = (over > rim * max(size)).any(-1)  # NaN is not
+        return far
 
-    out = outside(height, width, _RIM)
+    out = outside(size, _RIM)
     number, total = int(out.sum()), len(found)
-    exchanged = number > _FEW_OUTSIDE * total and int(outside(width, height, _RIM).sum()) <= _FEW_LEFT * number
-    views = (out.sum(-1) > _MOST_OF_A_VIEW * seen.sum(-1)) | outside(height, width, _NOWHERE).any(-1)
-    if exchanged or number > _MANY_OUTSIDE * total or bool(views.any()):
+    exchanged = number > _FEW_OUTSIDE * total and int(outside(size[::-1], _RIM).sum()) <= _FEW_LEFT * number
+    views: Array = (out.sum(-1) > _MOST_OF_A_VIEW * seen.sum(-1)) | outside(size, _NOWHERE).any(-1)
+    if exchanged or number > _MANY_OUTSIDE * total or views.any():
         raise ValueError(
             f"{owner}: {number} of {total} corners of {name} lie outside the image of {size_name} {size}, in "
-            f"{_views_of(views if bool(views.any()) else out.any(-1))}; they reach from {low} to {high}: {size_name} "
+            f"{_views_of(views if views.any() else out.sum(-1))}; they reach from {low} to {high}: {size_name} "
             "is (height, width) of all images, as image.shape[:2], points are (u, v), and unseen corners NaN"
         )
 
 
-def _check_links(names: list[str], sees: Tensor, owner: str) -> None:
+def _check_links(names: list[str], sees: Array, owner: str) -> None:
     """Refuse cameras, sees (C, V), of which some share no view, not even by way of others, with the first."""
-    linked = torch.arange(len(names), device=sees.device) == 0
+    linked = np.arange(len(names)) == 0
     for _ in names:
         linked = linked | (sees & sees[linked].any(0)).any(-1)
-    apart = [repr(name) for name, is_linked in zip(names, linked.tolist(), strict=True) if not is_linked]
-    if apart:
+    if not linked.all():
+        apart = ", ".join(repr(name) for name, is_linked in zip(names, linked, strict=True) if not is_linked)
         raise ValueError(
-            f"{owner}: {', '.join(apart)} never sees a board in the same view as {names[0]!r}, nor as a "
+            f"{owner}: {apart} never sees a board in the same view as {names[0]!r}, nor as a "
             "camera that does: where it is cannot be told; take views that both see, or calibrate it alone"
         )
 
 
-def _views_of(views: Tensor) -> str:
+def _views_of(views: Array) -> str:
     """The views of a mask (V,) in words."""
-    return named(views.nonzero()[:, 0].tolist())
+    return named(np.flatnonzero(views).tolist())
 
 
 def named(views: Sequence[int]) -> str:

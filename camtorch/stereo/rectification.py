@@ -41,10 +41,10 @@ _STEEP = math.tan(math.radians(60))  # beyond it the rim of a perspective image 
 _NEAR_POLE = math.radians(75)  # where a panorama about the baseline hardly resolves distances
 
 
-_KINDS: dict[str, tuple[type[Camera], type[Camera], float, float]] = {
-    "perspective": (Pinhole, Pinhole, _STEEP, _STEEP),
-    "latlon": (LatLon, Equirectangular, _NEAR_POLE, _TURN),
-    "cylindrical": (TransverseCylindrical, Cylindrical, math.tan(_NEAR_POLE), _TURN),
+_KINDS: dict[str, tuple[tuple[type[Camera], type[Camera]], tuple[float, float]]] = {
+    "perspective": ((Pinhole, Pinhole), (_STEEP, _STEEP)),
+    "latlon": ((LatLon, Equirectangular), (_NEAR_POLE, _TURN)),
+    "cylindrical": ((TransverseCylindrical, Cylindrical), (math.tan(_NEAR_POLE), _TURN)),
 }
 """The models whose rows, and whose columns, correspond; how far their plane reaches along the baseline, and across."""
 _LINE = 129  # points along the middle of an image
@@ -299,7 +299,7 @@ def rectify(
             raise ValueError(f"rectify: {name} must be one of {known}; got {shown(value)}")
     size, vertical = as_image_size(image_size, "rectify"), as_flag(vertical, "vertical", "rectify")
     check_pose("rectify", extrinsics, "right from left", left=left, right=right)
-    model = _KINDS[projection][vertical]
+    model = _KINDS[projection][0][vertical]
     with torch.no_grad():
         turns = _frame(extrinsics, vertical, align)
         low, high, focal = _extent([(left, turns[0]), (right, turns[1])], projection, vertical)
@@ -374,10 +374,11 @@ def _extent(views: list[tuple[Camera, Tensor]], projection: str, vertical: bool)
     Raises:
         ValueError: nothing that both see.
     """
-    like, reach = views[0][1], _KINDS[projection][2:]
-    plane = _KINDS[projection][vertical](like.new_tensor([1.0, 1.0, 0.0, 0.0]))
+    like, (models, reach) = views[0][1], _KINDS[projection]
+    plane = models[vertical](like.new_tensor([1.0, 1.0, 0.0, 0.0]))
     limit = torch.tensor(reach[::-1] if vertical else reach).to(like)
-    lows, highs = [], []
+    lows: list[Tensor] = []
+    highs: list[Tensor] = []
     for camera, rotation in views:  # what the middle row and column of the image show
         lines = middle_lines(camera, rotation, plane, limit, _LINE)
         for ends, none in ((lows, torch.inf), (highs, -torch.inf)):
