@@ -17,8 +17,8 @@ class Names:
         format: its key in `camtorch.load` and `camtorch.save`.
         title: what errors call it.
         suffixes: those of the files that are written, with the dot; content says what a file to read is.
-        patterns: names of files, as fnmatch has them, that mean this format when one is written without another word;
-            of several formats the one with the longest pattern that fits is taken.
+        patterns: names of files, as fnmatch has them, that are written in this format if no other is asked for; of
+            several formats the one with the longest pattern that fits is taken.
         in_folder: files that stand for the folder they are in, the first that is there.
     """
 
@@ -30,38 +30,27 @@ class Names:
 
 
 class Format(Protocol):
-    """Any module of a format."""
+    """Any module of a format. What it cannot read or hold is a CameraFileError, as of `record.fail`."""
 
     @property
-    def NAMES(self) -> Names:  # noqa: N802
-        """What it and its files are called."""
+    def NAMES(self) -> Names: ...  # noqa: N802
 
 
 class KeyFormat(Format, Protocol):
-    """A module that reads keys and values: YAML, JSON, XML, Python literals, NumPy archives."""
+    """A module that reads keys and values, of YAML, JSON, XML, Python literals or NumPy archives, in float64."""
 
-    def matches(self, keys: dict[str, Any]) -> bool:
-        """Whether these are the keys of such a file."""
-
-    def parse(self, record: Record) -> Rig:
-        """The cameras of the keys, in float64. Raises CameraFileError, as `record.fail` does."""
+    def matches(self, keys: dict[str, Any]) -> bool: ...
+    def parse(self, record: Record) -> Rig: ...
 
 
 class ContentFormat(Format, Protocol):
-    """A module that reads files of any other kind."""
+    """A module that reads files of any other kind, with the files beside them, in float64."""
 
-    def matches(self, path: str, content: bytes) -> bool:
-        """Whether this is such a file."""
-
-    def read(self, path: str, content: bytes) -> Rig:
-        """The cameras of a file, in float64, with what lies beside it. Raises CameraFileError."""
+    def matches(self, path: str, content: bytes) -> bool: ...
+    def read(self, path: str, content: bytes) -> Rig: ...
 
 
 class WrittenFormat(Format, Protocol):
-    """A module that writes."""
+    """A module that writes: the text of a file; or the contents of files that are no text, or several, by paths."""
 
-    def render(self, rig: Rig, path: str) -> str | dict[str, bytes]:
-        """The text of a file; or the contents of files that are no text, or several, by their paths.
-
-        Raises CameraFileError for what the format cannot hold.
-        """
+    def render(self, rig: Rig, path: str) -> str | dict[str, bytes]: ...
