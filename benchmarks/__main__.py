@@ -10,13 +10,12 @@ try:
     import cv2
     import torch
 
-    from benchmarks import augment, calibration, cameras, folders, harness, images, points, samples, stereo
+    from benchmarks import augment, calibration, cameras, folders, harness, images, points, samples
 except ModuleNotFoundError as error:
     sys.exit(f"{error}. The benchmarks need more than camtorch: pip install -e '.[benchmark]'")
 
 SUBJECTS = {
-    module.__name__.rpartition(".")[2]: module
-    for module in (points, images, stereo, augment, samples, calibration, folders)
+    module.__name__.rpartition(".")[2]: module for module in (points, images, augment, samples, calibration, folders)
 }
 TABLES = {table.name: table for subject in SUBJECTS.values() for table in subject.TABLES}
 _COMPILED_VERSIONS = 64  # of one function, before torch gives up; here every contestant is a version
@@ -46,7 +45,6 @@ def main(arguments: list[str] | None = None) -> None:
     for name in options.subject or SUBJECTS:
         for row in SUBJECTS[name].rows(options):
             results.setdefault(row.table, {})[row.name] = dict(row.figures)
-        harness.progress("")
         for table in SUBJECTS[name].TABLES:
             if found := results.get(table.name):
                 print(f"\n### {table.name}\n\n{table.markdown(found, spread=True)}", flush=True)

@@ -137,14 +137,9 @@ def _chains(size: tuple[int, int], options: Options) -> dict[str, Run]:
 def _torchvision(images: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
     """`RandomResizedCrop` of the images' own size and `RandomHorizontalFlip` of v2: the operators that both call."""
     height, width = images.shape[-2:]
-    for _ in range(10):
-        area = height * width * float(torch.empty(1).uniform_(0.08, 1.0))
-        ratio = float(torch.exp(torch.empty(1).uniform_(math.log(3 / 4), math.log(4 / 3))))
-        w, h = round(math.sqrt(area * ratio)), round(math.sqrt(area / ratio))
-        if 0 < w <= width and 0 < h <= height:
-            break
-    else:
-        w, h = width, height
+    area, ratio = float(torch.empty(1).uniform_(0.08, 1.0)), torch.empty(1).uniform_(math.log(3 / 4), math.log(4 / 3))
+    w = min(width, round(math.sqrt(area * height * width * math.exp(ratio))))
+    h = min(height, round(area * height * width / w))
     top, left = int(torch.randint(0, height - h + 1, (1,))), int(torch.randint(0, width - w + 1, (1,)))
     images = images[..., top : top + h, left : left + w]
     images = F.interpolate(images, (height, width), mode="bilinear", align_corners=False, antialias=True)

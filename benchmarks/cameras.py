@@ -16,15 +16,10 @@ COEFFICIENTS: dict[str, tuple[float, ...]] = {
     "brown_conrady": (-0.05, 0.01, 1e-3, -5e-4, 1e-3),
     "kannala_brandt": _FISHEYE,
     "fisheye624": (*_FISHEYE, 1e-4, 0.0, 1e-3, -5e-4, 1e-3, -1e-4, 5e-4, 1e-4),
-    "thin_prism_fisheye": (0.02, -0.01, 1e-3, -5e-4, 0.003, -0.001, 1e-3, 5e-4),
     "f_theta": (-0.09, 0.14, -0.02),
-    "f_theta_backward": (0.02, -0.03, 0.004),
     "eucm": (0.6, 1.1),
     "double_sphere": (-0.1, 0.6),
     "mei": (1.2, -0.05, 0.01, 1e-3, -5e-4),
-    "fov": (0.9,),
-    "division": (-0.2,),
-    "equirectangular": (),
 }
 """Models of each kind, with values as calibrations of such lenses have them; every term is at work."""
 

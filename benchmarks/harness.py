@@ -57,15 +57,9 @@ class Row(NamedTuple):
 
 @dataclass(frozen=True)
 class Table:
-    """Who is shown, and how.
+    """Who is shown, and how: for each heading the best of its contestants, times `scale`.
 
-    Args:
-        name: of its rows, and of its place on the page.
-        title: head of the first column, with the unit.
-        columns: heading -> contestants, of whom the best is shown.
-        scale: multiplies every figure, for example 1e3 for milliseconds.
-        alone: headings without "(1.5x)" beside the figure; None for all.
-        rate: whether more is better.
+    Headings in `alone` have no "(1.5x)" beside the figure; None stands for all. `rate` means that more is better.
     """
 
     name: str
@@ -119,8 +113,7 @@ def measure(table: str, name: str, runs: Mapping[str, Run], options: Options, *,
             run()
             calls[who] = max(1, math.ceil(shortest / clocked(run, options.device)))
         except Exception as error:
-            progress("")
-            sys.stderr.write(f"{name}: {who} failed: {type(error).__name__}: {str(error).splitlines()[:1]}\n")
+            progress(f"{name}: {who} failed: {type(error).__name__}: {str(error).splitlines()[:1]}")
     rounds: dict[str, list[float]] = {who: [] for who in calls}
     share = options.seconds / max(len(calls), 1)
     gc.collect()
@@ -168,12 +161,8 @@ def threads(count: int) -> Iterator[None]:
 
 
 def progress(text: str) -> None:
-    """Write to stderr what is being measured: one line that is overwritten, or a line each if that is a file."""
-    if sys.stderr.isatty():
-        sys.stderr.write(f"\r\x1b[K{text[:110]}")
-    elif text:
-        sys.stderr.write(f"{text}\n")
-    sys.stderr.flush()
+    """Write to stderr what is being measured."""
+    print(text, file=sys.stderr, flush=True)
 
 
 def machine(device: torch.device) -> dict[str, str | int]:

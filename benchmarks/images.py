@@ -1,4 +1,4 @@
-"""Images: dewarping with a map that is kept, and with maps computed each time.
+"""Images: dewarping with a map that is kept, and with maps computed each time; and pairs rectified by kept maps.
 
 OpenCV and deltacamera have their images as arrays (H, W, C), or (H, W) of one channel, before the clock starts, and
 give lists of such. The error is the largest difference, in grey levels, to `grid_sample` in float64 with positions from
@@ -34,11 +34,14 @@ KEPT, NEW = "kept map", "new cameras"
 DELTACAMERA, GRID_SAMPLE, CLONE = "deltacamera", "`grid_sample` alone", "clone"
 OPENCV_MAPS = "OpenCV, float map", "OpenCV, fixed-point map"
 _EVERYONE = {OURS: (OURS,), "OpenCV": OPENCV_MAPS} | {who: (who,) for who in (DELTACAMERA, KORNIA, GRID_SAMPLE)}
+_PAIR = {OURS: (OURS,), "OpenCV": OPENCV_MAPS}
 TABLES = (
     Table("images", "images, ms", {**_EVERYONE, CLONE: (CLONE,)}, alone=(CLONE,)),
     Table("images, 1 thread", "images, 1 thread, ms", {**_EVERYONE, CLONE: (CLONE,)}, alone=(CLONE,)),
     Table("images, errors", "largest difference, grey levels", _EVERYONE, 1, None),
     Table("images, memory", "at the peak, in sizes of the result", _EVERYONE, 1, None),
+    Table("stereo", "a pair rectified, ms", _PAIR),
+    Table("stereo, errors", "largest difference, grey levels", _PAIR, 1, None),
 )
 _JUDGED = 2  # images of a batch whose errors are taken
 
@@ -72,7 +75,7 @@ class Task:
 
 
 def rows(options: Options) -> Iterator[Row]:
-    """Measure every kind of image: speed, errors, memory."""
+    """Measure every kind of image, then pairs: speed, errors, memory."""
     full, byte = torch.float32, torch.uint8
     asked = [(batch, (3, *LARGE), dtype) for batch in (1, 8) for dtype in (full, byte)]
     asked += [(8, (3, *SMALL), byte), (8, (3, *SMALL), full), (8, (1, *SMALL), byte)]
@@ -93,6 +96,9 @@ def rows(options: Options) -> Iterator[Row]:
                 runs.pop(KORNIA, None)  # the slowest by far
                 with threads(1):
                     yield measure("images, 1 thread", name, runs, options)
+    with torch.no_grad():
+        for key, channels in product(options.chosen(MODELS), (1, 3)):
+            yield from _pair(key, channels, options)
 
 
 def _errors(task: Task, operation: str, runs: dict[str, Run]) -> dict[str, Figure]:
@@ -177,3 +183,43 @@ def _deltacamera(camera: ct.Camera) -> Any:
     lens = dc.FisheyeKannalaBrandt if isinstance(camera, ct.KannalaBrandt) else dc.BrownConradyEx
     model = lens(coefficients) if coefficients.size else None
     return dc.Camera(intrinsic_matrix=camera.K.cpu().numpy(), distortion_model=model, image_shape=camera.image_size)
+
+
+def rectification(key: str, size: tuple[int, int], dtype: torch.dtype, device: torch.device) -> ct.Rectification:
+    """Return two cameras of a model, a little turned against each other, into images of their size."""
+    camera = cameras.camera(key, device, dtype, size=size).requires_grad_(False)
+    extrinsics = ct.Extrinsics([0.01, -0.02, 0.015], [-0.1, 0.002, -0.001]).to(device).requires_grad_(False)
+    wide = np.degrees(2 * np.arctan(size[1] / 2 / float(camera.intrinsics[0])))
+    return ct.rectify(camera, camera, extrinsics, fov=float(wide), image_size=size, align="opencv")
+
+
+def _pair(key: str, channels: int, options: Options) -> Iterator[Row]:
+    size, device = QUICK if options.quick else LARGE, options.device
+    ours = rectification(key, size, torch.float32, device)
+    generator = torch.Generator().manual_seed(0)
+    images = torch.randint(256, (2, 1, channels, *size), generator=generator, dtype=torch.uint8).to(device)
+    arrays = [np.ascontiguousarray(image[0].permute(1, 2, 0).cpu().numpy()) for image in images]
+    runs: dict[str, Run] = {OURS: lambda: ours(*images)}
+    for name, kind in zip(OPENCV_MAPS, (cv2.CV_32FC1, cv2.CV_16SC2), strict=True):
+        runs[name] = _remap_pair(ours, arrays, kind)
+    case = f"{NAMES[key]}, {channels}x{size[0]}x{size[1]} uint8"
+    yield measure("stereo", case, runs, options)
+    if options.threads > 1 and device.type == "cpu":
+        with threads(1):
+            yield measure("stereo", f"{case}, 1 thread", runs, options)
+    double = rectification(key, size, torch.float64, device)
+    found = [true_images(image, warp) for image, warp in zip(images, (double.left, double.right), strict=True)]
+    truth, inside = map(torch.cat, zip(*found, strict=True))
+    errors = {}
+    for name, run in runs.items():
+        pair = run()
+        made = torch.cat(pair) if isinstance(pair, tuple) else as_tensor(pair)
+        errors[name] = Figure((made.double() - truth).abs()[inside].max().item())
+    yield Row("stereo, errors", case, errors)
+
+
+def _remap_pair(found: ct.Rectification, arrays: list[np.ndarray], kind: int) -> Run:
+    """OpenCV's maps of the same rectified cameras, made once."""
+    sides = (found.source_left, found.rotation_left), (found.source_right, found.rotation_right)
+    maps = [opencv_maps(camera, found.camera_left, turn.cpu().numpy(), kind)() for camera, turn in sides]
+    return lambda: [cv2.remap(array, *pair, cv2.INTER_LINEAR) for array, pair in zip(arrays, maps, strict=True)]

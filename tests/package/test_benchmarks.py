@@ -15,7 +15,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("subjects", [["points", "images", "stereo"], ["augment", "samples", "calibration"]])
+@pytest.mark.parametrize("subjects", [["points", "images"], ["augment", "samples", "calibration"]])
 def test_a_quick_run_measures_everyone_and_writes_every_figure(tmp_path, subjects):
     path = tmp_path / "figures.json"
     command = [sys.executable, "-m", "benchmarks", *subjects, "--quick", "--threads", "1", "--repeats", "1"]
