@@ -36,7 +36,7 @@ class Prior:
     """The geometric mean of fx and fy."""
     aspect: float
     """log(fy / fx)."""
-    middle: tuple[float, float]
+    middle: list[float]
     """cx, cy."""
     discs: tuple[float, float, float]
     """Radii on the chart's plane of the farthest corner: at the greatest focal length, at `focal`, and at the least."""
@@ -81,7 +81,7 @@ def prior_of(
         ValueError: If the lens does not reach the range, or the camera is not within it, or is a panorama.
     """
     degrees, start, given, ratio = _as_fov(fov, owner), asked.start, None, 0.0
-    middle = ((image_size[1] - 1) / 2, (image_size[0] - 1) / 2)
+    middle = [(side - 1) / 2 for side in image_size[::-1]]
     if start is not None:
         fx, fy, *middle = start.intrinsics.detach().double().flatten().tolist()
         given, ratio = math.sqrt(fx * fy), math.log(fy / fx)
@@ -109,19 +109,17 @@ def prior_of(
                 raise ValueError(f"{owner}: {within}")
             first, second, third = (_disc(plane, far / f) for f in (longest, focal_length, shortest))
             if first and second and third:
-                found.append(Prior(asked.kind, lens, focal_length, ratio, tuple(middle), (first, second, third)))
+                found.append(Prior(asked.kind, lens, focal_length, ratio, middle, (first, second, third)))
                 break
     if found:
         return _liveliest(found)
-    if start is not None:
-        raise ValueError(
-            f"{owner}: the camera has no rays for the corners of images of {image_size}, with its principal point "
-            f"moved by up to centre={centre} of them" + ("" if degrees is None else f", and fov={degrees}") + ". A "
-            "smaller centre, a narrower fov, or the camera of a crop"
-        )
+    who, other = (
+        ("the camera", "a crop's camera") if start is not None else (asked.kind.__name__, "a model that sees further")
+    )
+    angles = f" with fov={degrees or _FOV}" if degrees or start is None else ""
     raise ValueError(
-        f"{owner}: {asked.kind.__name__} has no rays for the corners of images of {image_size} with "
-        f"fov={degrees or _FOV} and centre={centre}. A narrower fov, a smaller centre, or a model that sees further"
+        f"{owner}: {who} has no rays for the corners of images of {image_size}{angles} and a principal point moved by "
+        f"up to centre={centre} of them. A narrower fov, a smaller centre, or {other}"
     )
 
 
