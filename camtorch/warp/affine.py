@@ -15,8 +15,9 @@ from camtorch._tracing import in_transform, is_concrete, may_look
 from camtorch.camera import Camera
 from camtorch.native import sampler
 from camtorch.warp.grid import Lattice, Sampling, straight_lattice
-from camtorch.warp.routes import positions, route_of
-from camtorch.warp.sampling import SHRINKS, SURELY, Fill, Mode, PaddingMode, Sampler, joined, render
+from camtorch.warp.panorama import lengths
+from camtorch.warp.routes import lengthened, positions, route_of
+from camtorch.warp.sampling import SHRINKS, SURELY, Fill, Mode, PaddingMode, Sampler, render
 from camtorch.warp.warp import Warp, checked
 
 _MOST = 8  # times that an image is halved
@@ -68,7 +69,7 @@ class MirrorWarp(Warp):
             if smooth and route_of(self, images) == "kept":
                 where = positions(self, "kept", sampler.padding_mode)
                 if self._halvings is None:
-                    self._halvings = _halvings(where, self.source._size_for("Warp"))
+                    self._halvings = _halvings(where, self._sampled)
                 if any(self._halvings):
                     return self._smoothed(images, where, self._halvings, sampler)
         return super().forward(images, mode=mode, padding_mode=padding_mode, fill=fill)
@@ -76,8 +77,7 @@ class MirrorWarp(Warp):
     def _smoothed(self, images: Tensor, where: Sampling | Lattice, halvings: list[int], sampler: Sampler) -> Tensor:
         """Sampled from images that torch's antialiased interpolation halved so many times, for each camera."""
         result = self._empty(images)
-        if where.seam is not None:
-            images, where = joined(images, where, 4 << max(halvings))
+        images = lengthened(self, images)
         images = images.expand(len(result), -1, -1, -1)
         halvings = halvings * (len(result) // len(halvings))
         every = len(set(halvings)) == 1
@@ -123,6 +123,7 @@ class AffineWarp(MirrorWarp):
     """
 
     is_an_operator = False
+    _seam = None
     matrix: Tensor
     batch_shape: torch.Size
 
@@ -306,21 +307,19 @@ def _alike(kinds: list[Any]) -> list[tuple[slice, Any]]:
     return [(slice(i, i + 1), kind) for i, kind in enumerate(kinds)]
 
 
-def _halvings(where: Sampling | Lattice, size: tuple[int, int]) -> list[int]:
+def _halvings(where: Sampling | Lattice, source: Camera) -> list[int]:
     """For every camera, how often to halve its image so that at most one and a half pixels of it come to one."""
     apart, every = (8, 4) if isinstance(where, Lattice) else (1, 32)
     planes = where.nodes if isinstance(where, Lattice) else where.grid.detach().movedim(-1, 1)
     planes = planes[:, :, ::every, ::every]
     seen = (planes.abs() <= 1).all(1)
-    grid, planes = planes, planes * planes.new_tensor([size[1] / 2, size[0] / 2])[:, None, None]
+    height, width = source._size_for("Warp")
+    grid, planes = planes, planes * planes.new_tensor([width / 2, height / 2])[:, None, None]
     total, count = planes.new_zeros(len(planes)), planes.new_zeros(len(planes))
     for dim in (-1, -2):
         n = planes.shape[dim] - 1
-        steps = planes.diff(dim=dim)
-        if where.seam is None:
-            steps = torch.hypot(*steps.unbind(1))
-        else:
-            steps = where.seam.distance(steps.movedim(1, -1), grid.narrow(dim, 0, n).movedim(1, -1), size)
+        (across, down), (u, v) = planes.diff(dim=dim).unbind(1), grid.narrow(dim, 0, n).unbind(1)
+        steps = lengths(source, (across, down), (u, v))
         both = seen.narrow(dim, 0, n) & seen.narrow(dim, 1, n)
         total, count = total + (steps * both).sum((1, 2)), count + both.sum((1, 2))
     scale = total / (count.clamp(min=1) * apart * every)

@@ -23,7 +23,7 @@ from camtorch.projection import compiled
 from camtorch.projection.compiled import LEFT_FROM, LEFT_MOST, LEFT_TO, POSITIONS, Between, Native
 from camtorch.warp.grid import FEWEST, MOST_KEPT, STEP, kept_probes
 from camtorch.warp.moving import between
-from camtorch.warp.panorama import seam_of
+from camtorch.warp.panorama import goes_round
 from camtorch.warp.sampling import PADDINGS, SHRINKS, SURELY, Options, Sampler
 
 if TYPE_CHECKING:
@@ -42,17 +42,19 @@ Sizes = tuple[tuple[int, int], tuple[int, int]]
 
 
 def _is_used_once(warp: Warp) -> bool:
-    """Whether its positions come from a lattice that nobody keeps, of cameras that stand still."""
-    return warp.is_an_operator and warp._pinned is None and bool(warp.tolerance) and not warp.antialias
+    """Whether its positions come from a lattice that nobody keeps, of cameras that stand still and do not go round."""
+    if not warp.is_an_operator or warp._pinned is not None or not warp.tolerance or warp.antialias:
+        return False
+    return goes_round(warp.source) is None and goes_round(warp.target) is None
 
 
 def between_of(warp: Warp) -> tuple[Native, Native, Tensor | None] | None:
     """Source, target and rotation of a single warp for compiled code; None where it has to go step by step.
 
-    That is where its positions are kept, exact, antialiased throughout, in a graph, traced, or have a seam.
+    That is where its positions are kept, exact, antialiased throughout, in a graph, traced, or of a whole turn.
     """
     source, target, rotation = warp.source, warp.target, warp.rotation
-    if warp.batch_shape or not _is_used_once(warp) or seam_of(source) is not None or seam_of(target) is not None:
+    if warp.batch_shape or not _is_used_once(warp):
         return None
     made = compiled_of((source, target), target.intrinsics, *(() if rotation is None else (rotation,)))
     return None if made is None else (*made[0], rotation)  # type: ignore[return-value]

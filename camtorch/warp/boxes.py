@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from camtorch.warp.warp import Warp
 
 _EDGE_SAMPLES = 64  # per edge: one of 500 px bent to a radius of 300 px is then enclosed to 0.03 px
+_ROUNDED = 1e-3  # pixels from the edges of panoramas, where rounding would take rays away
 _LATTICE = 16  # steps across and down the target, between points that are looked for in what a polygon encloses
 
 
@@ -90,6 +91,8 @@ def _inside(warp: Warp, corners: Tensor, like: Tensor) -> tuple[Tensor, Tensor]:
     """
     height, width = warp.target._size_for("Warp")
     share = torch.linspace(0, 1, _LATTICE + 1, dtype=like.dtype, device=like.device)
+    if isinstance(warp.target, PANORAMAS):
+        share = share.clamp(_ROUNDED / height, 1 - _ROUNDED / height)
     lattice = torch.cartesian_prod(share * width, share * height) - 0.5
     with torch.no_grad():
         shown, seen = warp._move(lattice.expand(*warp.batch_shape, *lattice.shape), back=True)

@@ -20,7 +20,7 @@ from camtorch.native.sampler import CUBIC, DOUBT, EMPTY, TODO, classify
 from camtorch.projection.compiled import POSITIONS, Between
 from camtorch.rotations import turn
 from camtorch.warp.moving import between
-from camtorch.warp.panorama import Seam, rays_of, seam_of, seen_by
+from camtorch.warp.panorama import goes_round, lengths, off_poles, within_turn
 
 OUTSIDE = -9.0  # a sampling position that no image reaches, not even with its interpolation margin
 _FAR = 100.0  # positions beyond are drawn in: grid_sample casts them to integers
@@ -44,22 +44,16 @@ class Sampling(NamedTuple):
     """(B or 1, h, W') bool: the pixel has a ray, and the source maps it."""
     scale: Tensor | None
     """(B or 1, h, W'): see `local_scale`; None where nobody asks for it."""
-    seam: Seam | None = None
-    """Which edges of the source's image meet."""
 
     def cameras(self, rows: slice | Tensor) -> Sampling:
         """Of these cameras of the batch."""
         scale = None if self.scale is None else self.scale[rows]
-        return Sampling(self.grid[rows], self.mapped[rows], scale, self.seam)
+        return Sampling(self.grid[rows], self.mapped[rows], scale)
 
     def part(self, down: slice, across: slice = slice(None)) -> Sampling:
         """Of these rows and columns of the target."""
         scale = None if self.scale is None else self.scale[:, down, across]
-        return Sampling(self.grid[:, down, across], self.mapped[:, down, across], scale, self.seam)
-
-    def on(self, scale: Tensor, shift: Tensor) -> Sampling:
-        """On images that are longer beyond the seam: positions times `scale` (2,), plus `shift` (2,)."""
-        return self._replace(grid=self.grid * scale.to(self.grid) + shift.to(self.grid), seam=None)
+        return Sampling(self.grid[:, down, across], self.mapped[:, down, across], scale)
 
 
 class Lattice:
@@ -73,26 +67,19 @@ class Lattice:
         cells: (B, n, m) int32: `EMPTY`, `CUBIC`, or the cell's place in `exact`.
         exact: (2, K, 8, 8), positions, NaN where none is mapped.
         size: (h, w) of the target.
-        seam: which edges of the source's image meet.
     """
 
     nodes: Tensor
     cells: Tensor
     exact: Tensor
     size: tuple[int, int]
-    seam: Seam | None
 
-    def __init__(self, nodes: Tensor, cells: Tensor, exact: Tensor, size: tuple[int, int], seam: Seam | None = None):
-        self.nodes, self.cells, self.exact, self.size, self.seam = nodes, cells, exact, size, seam
+    def __init__(self, nodes: Tensor, cells: Tensor, exact: Tensor, size: tuple[int, int]):
+        self.nodes, self.cells, self.exact, self.size = nodes, cells, exact, size
 
     def cameras(self, rows: slice | Tensor) -> Lattice:
         """Of these cameras of the batch."""
-        return Lattice(self.nodes[rows], self.cells[rows], self.exact, self.size, self.seam)
-
-    def on(self, scale: Tensor, shift: Tensor) -> Lattice:
-        """See `Sampling.on`."""
-        a, b = (values.to(self.nodes)[:, None, None] for values in (scale, shift))
-        return Lattice(self.nodes * a + b, self.cells, self.exact * a[..., None] + b[..., None], self.size)
+        return Lattice(self.nodes[rows], self.cells[rows], self.exact, self.size)
 
     @property
     def single(self) -> Lattice:
@@ -102,7 +89,7 @@ class Lattice:
 
     @cached_property
     def _narrowed(self) -> Lattice:
-        return Lattice(self.nodes.float(), self.cells, self.exact.float(), self.size, self.seam)
+        return Lattice(self.nodes.float(), self.cells, self.exact.float(), self.size)
 
     @cached_property
     def pixels(self) -> Sampling:
@@ -125,7 +112,7 @@ class Lattice:
             known = ~exact[:, 0].isnan()
             blocks[camera, :, i, :, j] = torch.where(known[:, None], exact, OUTSIDE)
             seen.unflatten(1, (n, STEP)).unflatten(3, (m, STEP))[camera, i, :, j] = known
-        return Sampling(planes[:, :, :height, :width].movedim(1, -1), seen[:, :height, :width], None, self.seam)
+        return Sampling(planes[:, :, :height, :width].movedim(1, -1), seen[:, :height, :width], None)
 
 
 def is_plain(*tensors: Tensor) -> bool:
@@ -160,7 +147,7 @@ def locate(
             if lattice is not None:
                 return lattice
             tolerance = 0.0
-        return Sampling(*tabulate(source, target, rotation, tolerance, rows, padding), None, seam_of(source))
+        return Sampling(*tabulate(source, target, rotation, tolerance, rows, padding), None)
     # the scale is that between neighbours
     around = range(max(rows.start - 1, 0), min(rows.stop + 1, target._size_for("Warp")[0]))
     where = scaled(source, *tabulate(source, target, rotation, tolerance, around, padding))
@@ -169,8 +156,7 @@ def locate(
 
 def scaled(source: Camera, grid: Tensor, mapped: Tensor) -> Sampling:
     """Positions with the scale by which antialiasing goes."""
-    seam = seam_of(source)
-    return Sampling(grid, mapped, local_scale(grid.detach(), mapped, source._size_for("Warp"), seam), seam)
+    return Sampling(grid, mapped, local_scale(grid.detach(), mapped, source))
 
 
 @on_one_thread
@@ -218,6 +204,8 @@ def tabulate(
 
 
 def _native(source: Camera, target: Camera, rotation: Tensor | None, like: Tensor) -> Between | None:
+    if goes_round(source) is not None or goes_round(target) is not None:
+        return None
     return between(target, source, None if rotation is None else rotation.mT, like)
 
 
@@ -249,10 +237,11 @@ def _positions(
         return found.unflatten(1, pixels.shape[-3:-1]), mapped.unflatten(1, pixels.shape[-3:-1])
     if pixels.ndim == 3 and target.batch_shape:
         pixels = pixels.expand(*target.batch_shape, *pixels.shape)
-    rays, has_ray = rays_of(target, pixels)
+    rays, has_ray = target.unproject(within_turn(target, pixels))
     if rays.ndim == 3:
         rays, has_ray = rays.unsqueeze(0), has_ray.unsqueeze(0)
-    seen, mapped = seen_by(source, turn(None if rotation is None else rotation.mT, rays, "rays"))
+    rays = turn(None if rotation is None else rotation.mT, rays, "rays")
+    seen, mapped = source.project(off_poles(source, rays))
     del rays
     mapped = mapped & has_ray
     return to_positions(seen, mapped, source._size_for("Warp")), mapped
@@ -277,22 +266,21 @@ def to_positions(seen: Tensor, mapped: Tensor, size: tuple[int, int]) -> Tensor:
     return torch.where(mapped, torch.stack(planes), OUTSIDE).movedim(0, -1)
 
 
-def local_scale(grid: Tensor, mapped: Tensor, size: tuple[int, int], seam: Seam | None) -> Tensor:
+def local_scale(grid: Tensor, mapped: Tensor, source: Camera) -> Tensor:
     """(B, H', W'): how many source pixels lie between neighbours of the target, in the direction with more of them.
 
     Args:
         grid: (B, H', W', 2), sampling positions.
         mapped: (B, H', W') bool: there is such a position.
-        size: (height, width) of the source.
-        seam: of the source.
+        source: the camera of the images.
     """
-    half = grid.new_tensor([size[1] / 2, size[0] / 2])
+    height, width = source._size_for("Warp")
     scale = grid.new_zeros(grid.shape[:-1])
     for dim in (1, 2):
         n = grid.shape[dim] - 1
-        here = grid.narrow(dim, 0, n)
-        step = (grid.narrow(dim, 1, n) - here) * half
-        step = step.norm(dim=-1) if seam is None else seam.distance(step, here, size)
+        u, v = here = grid.narrow(dim, 0, n).unbind(-1)
+        right, down = grid.narrow(dim, 1, n).unbind(-1)
+        step = lengths(source, ((right - u) * (width / 2), (down - v) * (height / 2)), here)
         step = step * (mapped.narrow(dim, 1, n) & mapped.narrow(dim, 0, n))
         for start in (0, 1):
             part = scale.narrow(dim, start, n)
@@ -326,11 +314,11 @@ def on_lattice(
     native = _native(source, target, rotation, like)
     if native is None and not is_eager(like):
         return None
-    nodes, seam, size = (n + 5) * (m + 5), seam_of(source), source._size_for("Warp")
+    nodes, size = (n + 5) * (m + 5), source._size_for("Warp")
     pixels = kept_probes(rows, width, like.dtype) if nodes <= MOST_KEPT else _probes(rows, width, like)
     if native is not None:
         made = native.lattices(pixels, (height, width), rows.start, tolerance, padding)
-        return None if made is None else Lattice(*made, (height, width), seam)
+        return None if made is None else Lattice(*made, (height, width))
     exact = partial(_positions, source, target, rotation, None)
     positions, mapped = exact(pixels)  # (B, 1, N, 2)
     lattice = positions[:, 0, :nodes].movedim(-1, 1).contiguous().unflatten(2, (n + 5, m + 5))
@@ -341,7 +329,7 @@ def on_lattice(
     computed = like.new_empty(2, 0, STEP, STEP)
     if most:
         computed = _compute(exact, rows.start, cells, (cells == TODO) | (cells == DOUBT), like)
-    return Lattice(lattice, cells, computed, (height, width), seam)
+    return Lattice(lattice, cells, computed, (height, width))
 
 
 def straight_lattice(matrix: Tensor, rows: range, width: int, dtype: torch.dtype) -> Lattice:

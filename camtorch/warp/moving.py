@@ -10,7 +10,6 @@ from camtorch._evaluation import compiled_of
 from camtorch.camera import Camera
 from camtorch.projection.compiled import ON_IMAGE, PIXELS, Between
 from camtorch.rotations import turn
-from camtorch.warp.panorama import rays_of, seam_of, seen_by
 
 
 def between(start: Camera, end: Camera, rotation: Tensor | None, like: Tensor) -> Between | None:
@@ -22,8 +21,6 @@ def between(start: Camera, end: Camera, rotation: Tensor | None, like: Tensor) -
         rotation: (3, 3) or (B, 3, 3), `ray_end = R ray_start`, or None.
         like: the pixels, or others of their dtype.
     """
-    if seam_of(start) is not None or seam_of(end) is not None:
-        return None
     made = compiled_of((start, end), like, *(() if rotation is None else (rotation,)))
     if made is None:
         return None
@@ -44,8 +41,8 @@ def moved_pixels(
         if ready is not None and ((pixels.ndim > 1 and pixels.shape[0] == ready.cameras) or not ready.is_batch):
             moved, valid = ready.rows(pixels.reshape(ready.cameras, -1, 2), ON_IMAGE if on_image else PIXELS)
             return moved.view(pixels.shape), valid.view(pixels.shape[:-1])
-    rays, has_ray = rays_of(start, pixels)
-    moved, mapped = seen_by(end, turn(rotation, rays, "pixels"))
+    rays, has_ray = start.unproject(pixels)
+    moved, mapped = end.project(turn(rotation, rays, "pixels"))
     valid = mapped & has_ray
     moved = torch.where(valid.unsqueeze(-1), moved, -1.0)
     return moved, valid & end.contains(moved) if on_image else valid

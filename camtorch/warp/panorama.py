@@ -1,4 +1,4 @@
-"""Panoramas of a whole turn: images whose left and right edges meet, and whose rows go on beyond the poles."""
+"""Panoramas of a whole turn: images that a warp makes longer, by what lies beyond the edges that meet."""
 
 from __future__ import annotations
 
@@ -8,79 +8,58 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from camtorch._arguments import Numbers, as_coordinates, values_of
+from camtorch._arguments import values_of
+from camtorch._module import remade
 from camtorch.camera import Camera
 from camtorch.models import Cylindrical, Equirectangular, LatLon, TransverseCylindrical
 
 _NEAR = 0.05  # pixels by which a whole turn may miss the edges: a focal length of two decimals does by 0.03
+_RIM = 16  # pixels beyond an edge: what bicubic samples of images that are halved three times read
 _SPHERES = Equirectangular, LatLon
 _DOWN = LatLon, TransverseCylindrical
 PANORAMAS = Equirectangular, Cylindrical, *_DOWN
 
 
 class Seam(NamedTuple):
-    """Which edges of a panorama meet."""
+    """By how much images of a whole turn become longer."""
 
     axis: int
     """0: the turn goes across, so that left and right meet; 1: down, so that top and bottom do."""
-    ends: tuple[float, float]
-    """The latitudes of the other two edges in radians: half of pi at a pole, and 0 on a cylinder."""
+    rims: tuple[int, int, int, int]
+    """Pixels on the left, right, top and bottom."""
 
-    @property
-    def poles(self) -> tuple[bool, bool]:
-        """Whether the other two edges are poles."""
-        first, last = (abs(end) == math.pi / 2 for end in self.ends)
-        return first, last
-
-    def drawn_in(self, grid: Tensor) -> Tensor:
-        """Positions (..., 2) as of `grid_sample`; those that rounding took beyond edges that meet, on the edge."""
-        planes = list(grid.unbind(-1))
-        planes[self.axis] = planes[self.axis].clamp(-1, 1)
-        first, last = self.poles
-        if first or last:
-            planes[1 - self.axis] = planes[1 - self.axis].clamp(-1 if first else None, 1 if last else None)
-        return torch.stack(planes, -1)
-
-    def distance(self, steps: Tensor, grid: Tensor, size: tuple[int, int]) -> Tensor:
-        """(...): the lengths of steps, the shorter way round; towards a pole steps across are shorter in the scene.
-
-        Args:
-            steps: (..., 2), in pixels.
-            grid: (..., 2), where they begin, as of `grid_sample`.
-            size: (height, width) of the image.
-        """
-        period = size[1 - self.axis]
-        along = steps[..., self.axis]
-        low, high = self.ends
-        latitude = low + (grid[..., 1 - self.axis] + 1) * ((high - low) / 2)
-        along = (along - period * (along / period).round()) * latitude.cos()
-        return torch.hypot(along, steps[..., 1 - self.axis])
-
-    def margins(self, images: Tensor, margin: int) -> tuple[tuple[int, int], tuple[int, int]]:
-        """By how many pixels `around` makes images (B, C, H, W) longer: (left, right), (top, bottom)."""
-        sides = images.shape[-1], images.shape[-2]
-        turn = (min(margin, sides[self.axis]),) * 2
-        first, last = (min(margin, sides[1 - self.axis]) * pole for pole in self.poles)
-        return (turn, (first, last)) if self.axis == 0 else ((first, last), turn)
-
-    def around(self, images: Tensor, margin: int) -> Tensor:
-        """Images (B, C, H, W) with as many pixels more at the edges that meet, of what lies beyond them."""
+    def around(self, images: Tensor) -> Tensor:
+        """Return images (B, C, H, W) with the pixels that lie beyond their edges."""
         if self.axis:
-            return self._replace(axis=0).around(images.mT, margin).mT
-        (turn, _), (first, last) = self.margins(images, margin)
+            return Seam(0, (*self.rims[2:], *self.rims[:2])).around(images.mT).mT
+        left, right, top, bottom = self.rims
         width, rows = images.shape[-1], [images]
         # beyond a pole lies what is half a turn on, upside down
-        order = torch.arange(max(first, last) - 1, -1, -1, device=images.device)
-        if first:
-            rows.insert(0, images[..., :first, :].roll(width // 2, -1)[..., order[-first:], :])
-        if last:
-            rows.append(images[..., -last:, :].roll(width // 2, -1)[..., order[-last:], :])
+        order = torch.arange(max(top, bottom) - 1, -1, -1, device=images.device)
+        if top:
+            rows.insert(0, images[..., :top, :].roll(width // 2, -1)[..., order[-top:], :])
+        if bottom:
+            rows.append(images[..., -bottom:, :].roll(width // 2, -1)[..., order[-bottom:], :])
         images = torch.cat(rows, -2) if len(rows) > 1 else images
-        return torch.cat((images[..., -turn:], images, images[..., :turn]), -1)
+        return torch.cat((images[..., -left:], images, images[..., :right]), -1)
+
+    def before(self, camera: Camera) -> Camera:
+        """Return the camera of these longer images."""
+        left, right, top, bottom = self.rims
+        height, width = camera._size_for("Warp")
+        intrinsics = camera.intrinsics + camera.intrinsics.new_tensor([0.0, 0.0, left, top])
+        size = height + top + bottom, width + left + right
+        return remade(camera, intrinsics=intrinsics, distortion=camera.distortion, image_size=size)
+
+    def on_image(self, grid: Tensor, size: tuple[int, int]) -> Tensor:
+        """Return positions (..., 2) on the longer images as those on the images of a size."""
+        (height, width), (left, right, top, bottom) = size, self.rims
+        scale = grid.new_tensor([(left + width + right) / width, (top + height + bottom) / height])
+        return grid * scale + grid.new_tensor([(right - left) / width, (bottom - top) / height])
 
 
 def seam_of(camera: Camera) -> Seam | None:
-    """Which edges of a camera's image meet; None for a camera that is no panorama of a whole turn.
+    """Return by how much a camera's images become longer; None if it is no panorama of a whole turn.
 
     While the values may not be looked at, it is what was found when they last could be.
     """
@@ -95,59 +74,72 @@ def seam_of(camera: Camera) -> Seam | None:
 def _found(camera: Camera, numbers: Tensor) -> Seam | None:
     axis = int(isinstance(camera, _DOWN))
     sides = camera._size_for("Warp")[::-1]
-    turn, focal, centre = numbers[:, axis], numbers[:, 1 - axis], numbers[:, 3 - axis]
-    if not len(numbers) or not bool(((2 * math.pi * turn - sides[axis]).abs() < _NEAR).all()):
+    side, other = sides[axis], sides[1 - axis]
+    if not len(numbers) or not bool(((math.tau * numbers[:, axis] - side).abs() < _NEAR).all()):
         return None
+    # the model has pixels for half a turn to either side of its principal point, which may lie anywhere
+    low, high = (float(end) - (side - 1) / 2 for end in torch.aminmax(numbers[:, 2 + axis]))
+    rims = [math.ceil(max(beyond, 0.0)) + min(_RIM, side) for beyond in (-low, high)]
+    if max(rims) > side:
+        return None
+    poles = [0, 0]
+    if isinstance(camera, _SPHERES):
+        focal, centre = numbers[:, 1 - axis], numbers[:, 3 - axis]
+        for i, (edge, pole) in enumerate(((-0.5, -math.pi / 2), (other - 0.5, math.pi / 2))):
+            if bool(((edge - centre - pole * focal).abs() < _NEAR).all()):
+                poles[i] = min(_RIM, other)
+    first, second = (rims, poles) if axis == 0 else (poles, rims)
+    return Seam(axis, (first[0], first[1], second[0], second[1]))
+
+
+def goes_round(camera: Camera) -> Tensor | None:
+    """Return the numbers (C, 4) of a panorama whose images show a whole turn, or more of it; None for other cameras."""
+    if not isinstance(camera, PANORAMAS) or (numbers := values_of(camera.intrinsics)) is None:
+        return None
+    axis, numbers = int(isinstance(camera, _DOWN)), numbers.reshape(-1, 4)
+    return numbers if bool((math.tau * numbers[:, axis] < camera._size_for("Warp")[1 - axis] + _NEAR).all()) else None
+
+
+def lengths(camera: Camera, steps: tuple[Tensor, Tensor], grid: tuple[Tensor, Tensor]) -> Tensor:
+    """Return the lengths (B, h, w) of steps across and down from positions `grid` on a camera's image, in pixels.
+
+    Where it goes all the way round they are the shorter way round, and towards a pole as short as in the scene.
+    """
+    if (numbers := goes_round(camera)) is None:
+        return torch.hypot(*steps)
+    axis, sides = int(isinstance(camera, _DOWN)), camera._size_for("Warp")[::-1]
+    numbers, other = numbers[..., None, None].to(grid[0]), 1 - axis
+    period = math.tau * numbers[:, axis]
+    along = steps[axis] - period * (steps[axis] / period).round()
+    if isinstance(camera, _SPHERES):
+        place = ((grid[other] + 1) * sides[other] - 1) / 2
+        along = along * ((place - numbers[:, 2 + other]) / numbers[:, other]).cos()
+    return torch.hypot(along, steps[other])
+
+
+def off_poles(camera: Camera, rays: Tensor) -> Tensor:
+    """Return rays (..., 3) off the poles of a sphere, for which its image has a row of pixels and its model none."""
     if not isinstance(camera, _SPHERES):
-        return Seam(axis, (0.0, 0.0))
-    ends = []
-    for edge, pole in ((-0.5, -math.pi / 2), (sides[1 - axis] - 0.5, math.pi / 2)):
-        is_pole = bool(((edge - centre - pole * focal).abs() < _NEAR).all())
-        ends.append(pole if is_pole else float((edge - centre[0]) / focal[0]))
-    return Seam(axis, (ends[0], ends[1]))
+        return rays
+    axis, planes = int(isinstance(camera, _DOWN)), list(rays.unbind(-1))
+    least = planes[1 - axis].abs() * torch.finfo(rays.dtype).eps
+    at_pole = torch.maximum(planes[axis].abs(), planes[2].abs()) < least
+    planes[2] = torch.where(at_pole, least, planes[2])
+    return torch.stack(planes, -1)
 
 
-def seen_by(source: Camera, rays: Tensor) -> tuple[Tensor, Tensor]:
-    """As `source.project`, of rays (..., 3); a panorama of a whole turn has every pixel on its image, and its poles.
+def within_turn(camera: Camera, pixels: Tensor) -> Tensor:
+    """Return pixels (h, w, 2) or (B, h, w, 2), those of a whole turn less than half of it from the principal point.
 
-    Straight up, where a panorama has a row of pixels and the model none, it is one of them.
+    It may lie anywhere on such an image, and the model has rays for these alone.
     """
-    seam = seam_of(source)
-    if seam is None:
-        return source.project(rays)
-    if any(seam.poles):
-        planes = list(rays.unbind(-1))
-        least = planes[1 - seam.axis].abs() * torch.finfo(rays.dtype).eps
-        at_pole = torch.maximum(planes[seam.axis].abs(), planes[2].abs()) < least
-        planes[2] = torch.where(at_pole, least, planes[2])
-        rays = torch.stack(planes, -1)
-    pixels, mapped = source.project(rays)
-    period = source._size_for("Warp")[1 - seam.axis]
-    planes = list(pixels.unbind(-1))
-    turns = ((planes[seam.axis].detach() + 0.5) / period).floor()
-    planes[seam.axis] = planes[seam.axis] - turns * period
-    return torch.stack(planes, -1), mapped
-
-
-def rays_of(target: Camera, pixels: Numbers) -> tuple[Tensor, Tensor]:
-    """As `target.unproject`, of pixels (..., 2); a panorama of a whole turn has rays all the way round.
-
-    The model has them up to half a turn from its principal point, which may lie anywhere on such an image.
-    """
-    seam = seam_of(target)
-    if seam is None:
-        return target.unproject(pixels)
-    pixels = as_coordinates(pixels, "pixels", 2, "Warp", target.intrinsics.device, "B, *N")
-    period = target._size_for("Warp")[1 - seam.axis]
-    planes = list(pixels.unbind(-1))
-    numbers = target.intrinsics.detach()
+    if seam_of(camera) is None:
+        return pixels
+    axis, sides = int(isinstance(camera, _DOWN)), camera._size_for("Warp")[::-1]
+    numbers, planes = camera.intrinsics.detach(), list(pixels.unbind(-1))
     numbers = numbers.reshape(*numbers.shape[:-1], *[1] * (pixels.ndim - numbers.ndim), 4)
-    nearly = 1 - 8 * torch.finfo(numbers.dtype).eps  # the ends themselves are rounded beyond them
-    for axis, angle in ((seam.axis, math.pi), (1 - seam.axis, math.pi / 2)):
-        offset, end = planes[axis] - numbers[..., 2 + axis], angle * nearly * numbers[..., axis]
-        if axis == seam.axis:
-            offset = offset - (offset.detach() / period).round() * period
-        elif not all(seam.poles):
-            continue
-        planes[axis] = numbers[..., 2 + axis] + torch.maximum(torch.minimum(offset, end), -end)
-    return target.unproject(torch.stack(planes, -1))
+    offset = planes[axis] - numbers[..., 2 + axis]
+    offset = offset - (offset / sides[axis]).round() * sides[axis]
+    end = math.pi * (1 - 8 * torch.finfo(numbers.dtype).eps) * numbers[..., axis]  # itself it is rounded beyond
+    planes[axis] = numbers[..., 2 + axis] + torch.maximum(torch.minimum(offset, end), -end)
+    return torch.stack(torch.broadcast_tensors(*planes), -1)

@@ -12,7 +12,7 @@ from camtorch.camera import Camera
 from camtorch.extrinsics import Extrinsics
 from camtorch.rotations import rotate_planes, rotation_matrix
 from camtorch.warp.grid import Sampling, pixels_of_rows, scaled, to_positions
-from camtorch.warp.panorama import rays_of, seam_of, seen_by
+from camtorch.warp.panorama import off_poles
 from camtorch.warp.sampling import PaddingMode, WarpOptions
 from camtorch.warp.warp import Warp
 
@@ -59,23 +59,25 @@ class ProxyWarp(Warp):
 
     def _locate(self, rows: range, padding: PaddingMode, tolerance: float) -> Sampling:
         if not self.antialias:
-            return Sampling(*self._of_rows(rows), None, seam_of(self.source))
+            return Sampling(*self._of_rows(rows), None)
         # the scale is that between neighbours
         around = range(max(rows.start - 1, 0), min(rows.stop + 1, self.target._size_for("Warp")[0]))
-        where = scaled(self.source, *self._of_rows(around))
+        where = scaled(self._sampled, *self._of_rows(around))
         return where.part(slice(rows.start - around.start, rows.stop - around.start))
 
     def _of_rows(self, rows: range) -> tuple[Tensor, Tensor]:
         pixels = pixels_of_rows(self.target, rows)
         batch = self.batch_shape or (1,)
         seen, mapped = self._move(pixels.expand(*batch, *pixels.shape), back=True)
-        return to_positions(seen, mapped, self.source._size_for("Warp")), mapped
+        if self._seam is not None:
+            seen = seen + seen.new_tensor(self._seam.rims[::2])
+        return to_positions(seen, mapped, self._sampled._size_for("Warp")), mapped
 
     def _move(self, pixels: Numbers, back: bool = False, on_image: bool = False) -> tuple[Tensor, Tensor]:
         source, target = (self.target, self.source) if back else (self.source, self.target)
-        rays, has_ray = rays_of(source, pixels)
+        rays, has_ray = source.unproject(pixels)
         directions, meets = self._carried(rays, of_source=not back)
-        seen, mapped = seen_by(target, directions)
+        seen, mapped = target.project(off_poles(target, directions))
         valid = mapped & has_ray & meets
         seen = torch.where(valid.unsqueeze(-1), seen, -1.0)
         return seen, valid & target.contains(seen) if on_image else valid

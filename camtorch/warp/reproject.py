@@ -15,7 +15,7 @@ from camtorch.extrinsics import Extrinsics
 from camtorch.projection.depth import as_depth, depth_scale
 from camtorch.rotations import rotation_matrix
 from camtorch.warp.grid import Sampling, is_plain, to_positions
-from camtorch.warp.panorama import seam_of, seen_by
+from camtorch.warp.panorama import off_poles, seam_of
 from camtorch.warp.proxy import beside, check_pose, turned
 from camtorch.warp.sampling import MODES, PADDINGS, Fill, Mode, PaddingMode, as_fill, one_of, render
 from camtorch.warp.warp import as_sized
@@ -127,11 +127,11 @@ class Reproject(GeometryModule):
         # an image that stays where it is, or is shifted by whole pixels, is copied to the bit
         plain = steps == 1 and is_plain(seen) and holds((seen == seen.round()).all(-1) | ~valid)
         mode: Mode = "nearest" if plain else self.mode
-        positions = to_positions(seen.flatten(1, 2), valid.flatten(1, 2), size)
-        seam = seam_of(self.source)
-        inner = positions.detach() if seam is None else seam.drawn_in(positions.detach())
-        valid = valid & (inner.abs() <= 1).all(-1).view(valid.shape)
-        where = Sampling(positions, valid.flatten(1, 2), None, seam)
+        if (seam := seam_of(self.source)) is not None:  # the image goes on beyond its edges
+            images, seen = seam.around(images), seen + seen.new_tensor(seam.rims[::2])
+        positions = to_positions(seen.flatten(1, 2), valid.flatten(1, 2), (images.shape[-2], images.shape[-1]))
+        valid = valid & (positions.detach().abs() <= 1).all(-1).view(valid.shape)
+        where = Sampling(positions, valid.flatten(1, 2), None)
         result = render(images, where, mode, self.padding_mode, self.fill)
         valid = valid.expand(max(rows, len(result)), *valid.shape[1:])[:, None]
         if steps == 1:
@@ -156,7 +156,7 @@ class Reproject(GeometryModule):
         points = torch.stack([torch.addcmul(start, along, scale) for start, along in parts], -1)
         if self.source.batch_shape and len(points) != len(self.source.intrinsics):
             points = points.expand(len(self.source.intrinsics), *points.shape[1:])
-        pixels, mapped = seen_by(self.source, points)
+        pixels, mapped = self.source.project(off_poles(self.source, points))
         far = points[..., 2] if kind == "z" else torch.linalg.vector_norm(points.detach(), dim=-1)
         return _snapped(pixels), mapped & good, far
 

@@ -23,8 +23,7 @@ from camtorch._tracing import (
 from camtorch.native.sampler import Later, empty
 from camtorch.warp import compiled
 from camtorch.warp.grid import Lattice, Sampling, scaled
-from camtorch.warp.panorama import seam_of
-from camtorch.warp.sampling import PADDINGS, PaddingMode, Pyramid, Sampler, render
+from camtorch.warp.sampling import PADDINGS, PaddingMode, Pyramid, Sampler, laid_as, render
 
 if TYPE_CHECKING:
     from camtorch.warp.warp import Warp
@@ -59,10 +58,10 @@ def route_of(warp: Warp, images: Tensor | None = None) -> Route:
 
 def warped(warp: Warp, images: Tensor, sampler: Sampler, later: Later | None = None) -> Tensor:
     """The images of a warp; those given are checked. With `later`, `finish` may have to make them."""
-    route = route_of(warp, images)
+    route, images = route_of(warp, images), lengthened(warp, images)
     if route == "operator":
         options = warp.tolerance, warp.antialias, _reach(warp, sampler.padding_mode), sampler
-        return compiled.warped(images, warp.source, warp.target, warp.rotation, *options)
+        return compiled.warped(images, warp._sampled, warp.target, warp.rotation, *options)
     if route == "strips":
         cameras = math.prod(warp.batch_shape)
         result = empty(images, len(images) if cameras == 1 else cameras, warp.target._size_for("Warp"))
@@ -72,6 +71,11 @@ def warped(warp: Warp, images: Tensor, sampler: Sampler, later: Later | None = N
                 render(images, where, *sampler, kept, result[:, :, rows])
         return result
     return render(images, positions(warp, route, sampler.padding_mode), *sampler, later=later)
+
+
+def lengthened(warp: Warp, images: Tensor) -> Tensor:
+    """Return the images that a warp samples: those of a whole turn go on beyond their edges."""
+    return images if warp._seam is None else laid_as(images, warp._seam.around(images))
 
 
 def positions(warp: Warp, route: Route, padding: PaddingMode = "zeros") -> Sampling | Lattice:
@@ -107,10 +111,10 @@ def _computed(warp: Warp, reach: PaddingMode) -> Sampling | Lattice:
     """The positions of all pixels, without a graph, which serve a padding."""
     if not (_is_operator(warp) and warp.tolerance and warp.target.intrinsics.is_cpu):
         return warp._locate(range(warp.target._size_for("Warp")[0]), reach, warp.tolerance)
-    grid, mapped = compiled.positions(warp.source, warp.target, warp.rotation, warp.tolerance, reach)
+    grid, mapped = compiled.positions(warp._sampled, warp.target, warp.rotation, warp.tolerance, reach)
     if warp.antialias:
-        return scaled(warp.source, grid, mapped)
-    return Sampling(grid, mapped, None, seam_of(warp.source))
+        return scaled(warp._sampled, grid, mapped)
+    return Sampling(grid, mapped, None)
 
 
 def strips(
@@ -131,6 +135,7 @@ def in_strips(
 ) -> Iterator[tuple[slice, Tensor, Tensor]]:
     """See `Warp.strips`."""
     kept: dict[int, Pyramid] = {}
+    images = lengthened(warp, images)
     for rows, where in strips(warp, sampler.padding_mode, count):
         with torch.no_grad():
             part, valid = render(images, where, *sampler, kept), _on_image(warp, where)
@@ -148,10 +153,9 @@ def valid_mask(warp: Warp) -> Tensor:
 def _on_image(warp: Warp, where: Sampling | Lattice) -> Tensor:
     """(B or 1, 1, h, W') bool: whether the source maps pixels onto its image."""
     where = where.pixels if isinstance(where, Lattice) else where
-    grid = where.grid.detach()
-    grid = grid if where.seam is None else where.seam.drawn_in(grid)
-    pixels = (grid + 1) * grid.new_tensor(warp.source._size_for("Warp")[::-1]) / 2 - 0.5
-    return (where.mapped & warp.source.contains(pixels)).unsqueeze(1)
+    grid, source = where.grid.detach(), warp._sampled
+    pixels = (grid + 1) * grid.new_tensor(source._size_for("Warp")[::-1]) / 2 - 0.5
+    return (where.mapped & source.contains(pixels)).unsqueeze(1)
 
 
 def pinned(warp: Warp) -> Sampling | Lattice | None:

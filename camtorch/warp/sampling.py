@@ -71,8 +71,6 @@ def render(
         (B, C, h, W') of the dtype of the images. Half precision is sampled in float32; integers are rounded and stay
         in their range, bool is true from one half on; the nearest integers are those of the image.
     """
-    if where.seam is not None:
-        images, where = joined(images, where, _margin(images, where, mode))
     dtype = images.dtype
     cameras = where.cells.shape[0] if isinstance(where, Lattice) else where.grid.shape[0]
     count = images.shape[0] if cameras == 1 else cameras
@@ -85,34 +83,11 @@ def render(
     result = _natively(images, where, how, out, later)
     if result is None:
         result = _by_torch(images, where, how, kept)
-        result = _laid_as(images, result) if out is None else out.copy_(result)
+        result = laid_as(images, result) if out is None else out.copy_(result)
     return result
 
 
-def joined(images: Tensor, where: Sampling | Lattice, margin: int) -> tuple[Tensor, Sampling | Lattice]:
-    """Images (B, C, H, W) with `margin` pixels more beyond edges that meet, and where these are sampled."""
-    seam = where.seam
-    if seam is None:
-        return images, where
-    ends = seam.margins(images, margin)
-    sides = images.shape[-1], images.shape[-2]
-    longer = [side + first + last for side, (first, last) in zip(sides, ends, strict=True)]
-    scale = torch.tensor([side / more for side, more in zip(sides, longer, strict=True)], dtype=torch.float64)
-    shift = torch.tensor(
-        [(first - last) / more for (first, last), more in zip(ends, longer, strict=True)], dtype=torch.float64
-    )
-    return _laid_as(images, seam.around(images, margin)), where.on(scale, shift)
-
-
-def _margin(images: Tensor, where: Sampling | Lattice, mode: Mode) -> int:
-    """Pixels beyond the edges that have a part in what is sampled, and one for what is lost in rounding."""
-    if isinstance(where, Lattice) or where.scale is None or mode == "nearest":
-        return _REACH[mode] + 1
-    # at the last level as far as a sample reaches, and as far again for its own filter
-    return 2 * _REACH[mode] << _level_count(where.scale.clamp(min=1).log2(), images)
-
-
-def _laid_as(images: Tensor, result: Tensor) -> Tensor:
+def laid_as(images: Tensor, result: Tensor) -> Tensor:
     """The result with its channels last in memory if the images have them there."""
     if in_transform() or sampler.layout(images) == torch.contiguous_format:
         return result

@@ -12,7 +12,6 @@ from torch.nn.functional import max_pool2d
 from camtorch.camera import Camera
 from camtorch.projection.depth import as_depth, depth_scale
 from camtorch.warp.grid import Sampling, to_positions
-from camtorch.warp.panorama import rays_of, seam_of, seen_by
 from camtorch.warp.sampling import PaddingMode
 from camtorch.warp.warp import Warp
 
@@ -36,6 +35,7 @@ class ShiftedWarp(Warp):
     """
 
     is_an_operator: ClassVar[bool] = False
+    _seam = None
     batch_shape: torch.Size
     shift: Tensor
     distance: Tensor
@@ -82,15 +82,13 @@ class ShiftedWarp(Warp):
         """Distances (B, 1, H, W) from the source as those from the target (B, 1, H', W'), 0 for none."""
         seen, mapped = self._surface()
         length = _between(distance[:, 0].expand(len(seen), -1, -1), seen.to(distance))
-        rays = rays_of(self.source, seen)[0].to(distance)
+        rays = self.source.unproject(seen)[0].to(distance)
         away = _length(rays * length[..., None] - self.shift.to(distance)[:, None, None])
         return torch.where(mapped & (length > 0), away, 0.0)[:, None]
 
     def _locate(self, rows: range, padding: PaddingMode, tolerance: float) -> Sampling:
         seen, mapped = (t[:, rows.start : rows.stop] for t in self._surface())
-        return Sampling(
-            to_positions(seen.clone(), mapped, self.source._size_for("Warp")), mapped, None, seam_of(self.source)
-        )
+        return Sampling(to_positions(seen.clone(), mapped, self.source._size_for("Warp")), mapped, None)
 
     def _move(self, pixels: Any, back: bool = False, on_image: bool = False) -> tuple[Tensor, Tensor]:
         if back:
@@ -101,9 +99,9 @@ class ShiftedWarp(Warp):
             index = at.reshape(len(mapped), -1)
             found = seen.flatten(1, 2).gather(1, index[..., None].expand(-1, -1, 2)).view(pixels.shape)
             return found, mapped.flatten(1).gather(1, index).view(at.shape)
-        rays, has_ray = rays_of(self.source, pixels)
+        rays, has_ray = self.source.unproject(pixels)
         length = _between(self.distance.to(rays), pixels.detach())
-        moved, mapped = seen_by(self.target, self.transform_positions(rays * length[..., None]))
+        moved, mapped = self.target.project(self.transform_positions(rays * length[..., None]))
         valid = has_ray & mapped & (length > 0)
         moved = torch.where(valid[..., None], moved, -1.0)
         return moved, valid & self.target.contains(moved) if on_image else valid
@@ -134,7 +132,7 @@ class ShiftedWarp(Warp):
         far, along = far[left], rays[left]
         for _ in range(_STEPS):
             at = self.shift[i] + far[:, None] * along
-            pixels, mapped = seen_by(source, at)
+            pixels, mapped = source.project(at)
             there = _between(self.distance[i : i + 1], pixels[None])[0]
             off = there - _length(at)
             met = mapped & (there > 0) & (off.abs() < _CLOSE * there)
@@ -150,7 +148,7 @@ class ShiftedWarp(Warp):
         height, width = size
         rays = _rays(self.source)[0]
         points = self.transform_positions((rays * self.distance[..., None]).flatten(1, 2)).view(*self.distance.shape, 3)
-        pixels, mapped = seen_by(self.target, points)
+        pixels, mapped = self.target.project(points)
         u, v = pixels.round().unbind(-1)
         on = mapped & (self.distance > 0) & (u >= 0) & (u < width) & (v >= 0) & (v < height)
         place = torch.where(on, v * width + u, 0.0).long().flatten(1)
@@ -170,7 +168,7 @@ class ShiftedWarp(Warp):
 def _rays(camera: Camera) -> tuple[Tensor, Tensor]:
     """(*B, H, W, 3) of all pixels, and whether they have some."""
     grid = camera.pixel_grid()
-    return rays_of(camera, grid.expand(*camera.batch_shape, *grid.shape))
+    return camera.unproject(grid.expand(*camera.batch_shape, *grid.shape))
 
 
 def _between(distance: Tensor, pixels: Tensor) -> Tensor:

@@ -16,7 +16,6 @@ from camtorch.camera import Camera
 from camtorch.models import Pinhole
 from camtorch.projection.rays import slopes_at_axis
 from camtorch.rotations import mount_rotation
-from camtorch.warp.panorama import rays_of
 from camtorch.warp.sampling import Mode, blended
 from camtorch.warp.warp import Warp, as_sized
 
@@ -288,7 +287,7 @@ def looking_at(
             raise ValueError(f"{owner}: box {i}, {boxes[i].tolist()}, {what}")
 
     low, high = boxes.detach().double().split(2, -1)
-    axis, has_ray = rays_of(camera, (low + high) / 2)
+    axis, has_ray = camera.unproject((low + high) / 2)
     refuse(~has_ray, "has no ray in its middle: the lens does not see there")
     axis = axis / axis.norm(dim=-1, keepdim=True)
     across = torch.stack((axis[:, 2], torch.zeros_like(axis[:, 0]), -axis[:, 0]), -1)
@@ -307,7 +306,7 @@ def looking_at(
     for _ in range(_ROUNDS):
         share = (place[..., None] + half * steps).clamp(0, 1)  # (B, 4, 1 or 2, K)
         pixels = start + share[..., None] * edge
-        rays, seen = rays_of(camera, pixels.flatten(1, 3))
+        rays, seen = camera.unproject(pixels.flatten(1, 3))
         turned = (rays @ rotation.mT).view(*share.shape, 3)
         seen = seen.view(share.shape)
         refuse(
@@ -343,9 +342,9 @@ def _where_lenses_end(
     own = camera[box.tolist()] if camera.batch_shape else camera
     for _ in range(_HALVES):
         middle = (inner + outer) / 2
-        has_ray = rays_of(own, start[box, side, 0, 0] + middle[:, None] * edge[box, side, 0, 0])[1]
+        has_ray = own.unproject(start[box, side, 0, 0] + middle[:, None] * edge[box, side, 0, 0])[1]
         inner, outer = torch.where(has_ray, middle, inner), torch.where(has_ray, outer, middle)
-    rays = rays_of(own, start[box, side, 0, 0] + inner[:, None] * edge[box, side, 0, 0])[0]
+    rays = own.unproject(start[box, side, 0, 0] + inner[:, None] * edge[box, side, 0, 0])[0]
     turned = (rotation[box] @ rays[..., None])[..., 0]
     slopes = turned[:, :2].abs() / turned[:, 2:].clamp(min=1e-9)
     return farthest.scatter_reduce(0, box[:, None].expand(-1, 2), slopes, "amax")

@@ -16,9 +16,9 @@ from camtorch.camera import Camera
 from camtorch.rotations import as_rotation, turn
 from camtorch.warp import routes
 from camtorch.warp.boxes import enclosed, moved_boxes
-from camtorch.warp.grid import Lattice, Sampling, locate
+from camtorch.warp.grid import OUTSIDE, Lattice, Sampling, locate
 from camtorch.warp.moving import moved_pixels
-from camtorch.warp.panorama import seam_of
+from camtorch.warp.panorama import Seam, seam_of
 from camtorch.warp.sampling import (
     MODES,
     PADDINGS,
@@ -82,7 +82,7 @@ class Warp(GeometryModule):
 
     The image of a panorama of a whole turn goes on beyond its seam and its poles: of an `Equirectangular` or
     `Cylindrical` source as wide as 2 pi, or a `LatLon` or `TransverseCylindrical` one as tall, to 0.05 pixels, all of a
-    batch. That takes a slightly larger copy of it. Behind a `shutter`, or in a `Mixed`, it ends at its edges.
+    batch. That takes a slightly larger copy of it. In a `Mixed`, or a `ShutterWarp`, it ends at its edges.
 
     The sampling grid is kept while nothing that it depends on can learn or has changed. In a network the cameras are
     part of it: `warp.requires_grad_(False)` keeps an optimizer from moving them, `warp.source.freeze("fx")` one number.
@@ -245,7 +245,11 @@ class Warp(GeometryModule):
 
     def grid(self) -> Tensor:
         """(B or 1, H', W', 2): positions for `grid_sample(..., align_corners=False)`; -9 where there is none."""
-        return routes.by_pixel(self).grid.clone(memory_format=torch.contiguous_format)
+        where, seam = routes.by_pixel(self), self._seam
+        if seam is None:
+            return where.grid.clone(memory_format=torch.contiguous_format)
+        grid = seam.on_image(where.grid, self.source._size_for("Warp"))
+        return torch.where(where.mapped.unsqueeze(-1), grid, OUTSIDE)
 
     def valid_mask(self) -> Tensor:
         """(B or 1, 1, H', W') bool: the pixel has a ray, and the source sees it on its image."""
@@ -267,12 +271,23 @@ class Warp(GeometryModule):
 
     def _locate(self, rows: range, padding: PaddingMode, tolerance: float) -> Sampling | Lattice:
         """Those of some rows of the target, which serve a padding, within a tolerance."""
-        return locate(*self._ends, self.rotation, tolerance, self.antialias, rows, padding)
+        return locate(self._sampled, self._ends[1], self.rotation, tolerance, self.antialias, rows, padding)
 
     @property
     def _ends(self) -> tuple[Camera, Camera]:
         """Source and target, by which positions are found."""
         return self.source, self.target
+
+    @property
+    def _seam(self) -> Seam | None:
+        """By how much the source's images become longer before they are sampled."""
+        return seam_of(self._ends[0])
+
+    @property
+    def _sampled(self) -> Camera:
+        """The source, of these images."""
+        source, seam = self._ends[0], self._seam
+        return source if seam is None else seam.before(source)
 
     # -- labels
 
