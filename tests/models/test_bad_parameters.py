@@ -4,7 +4,7 @@ import copy
 
 import pytest
 import torch
-from cameras import each_kind, every_model, fan, make, one, spread
+from cameras import constants, each_kind, every_model, fan, make, one, spread
 from torch.nn.utils import parametrize
 
 import camtorch as ct
@@ -13,33 +13,43 @@ POINTS = fan(40, 4, 3)
 
 
 def predicted(key):
-    """Intrinsics of a batch as a network makes them, of which some rows are no camera's; and which are."""
-    camera = spread(key)
-    leaf = camera.intrinsics.detach().repeat(5, 1).requires_grad_()
-    bad = torch.full((5, 4), torch.inf, dtype=torch.float64)
-    bad[1, 0], bad[3, 1], bad[4, 2] = -300.0, 0.0, torch.nan
-    good = bad.eq(torch.inf).all(-1)
-    return leaf, torch.where(bad == torch.inf, leaf, bad), camera.distortion.detach(), good
+    """Leaves of a batch as a network makes it, its numbers, of which some rows are no camera's; and which are."""
+    camera, count = spread(key), 7
+    leaves = [t.detach().repeat(count, 1).requires_grad_() for t in (camera.intrinsics, camera.distortion)]
+    numbers, good = [leaf * 1 for leaf in leaves], torch.ones(count, dtype=torch.bool)
+    for row, column, value in ((1, 0, -300.0), (3, 1, 0.0), (4, 2, torch.nan), (5, 3, torch.inf)):
+        numbers[0][row, column], good[row] = value, False
+    if camera.distortion_names:
+        numbers[1][6, -1], good[6] = torch.nan, False
+    return leaves, numbers, good
 
 
 @each_kind
 @pytest.mark.parametrize("graph", [True, False])
 def test_bad_rows_of_a_predicted_batch_are_invalid_and_the_others_live(key, graph):
+    """The results of the others and their gradients are those of cameras that are alone, and reach every number."""
     with torch.set_grad_enabled(graph):
-        leaf, intrinsics, distortion, good = predicted(key)
-        camera = make(key, intrinsics, distortion, image_size=(480, 640))
-        pixels, valid = camera.project(POINTS.expand(5, -1, 3))
-        rays, has_ray = camera.unproject(torch.full((5, 3, 2), 250.0, dtype=torch.float64))
-    reference = make(key, intrinsics.detach()[0], distortion)
-    assert torch.equal(valid, reference.project(POINTS)[1] & good[:, None])
+        leaves, numbers, good = predicted(key)
+        camera = make(key, *numbers, image_size=(480, 640))
+        points, at = POINTS.expand(len(good), -1, 3), torch.full((len(good), 3, 2), 250.0, dtype=torch.float64)
+        (pixels, valid), (rays, has_ray) = camera.project(points), camera.unproject(at)
+    alone = make(key, *(leaf.detach()[0] for leaf in leaves))
+    expected, seen = alone.project(POINTS)
+    assert torch.equal(valid, seen & good[:, None])
+    assert pixels.isfinite().all()
+    assert rays.isfinite().all()
     # torch.atan2 rounds the last elements of a tensor otherwise than the others
-    torch.testing.assert_close(pixels[2], reference.project(POINTS)[0], rtol=1e-15, atol=0)
+    torch.testing.assert_close(pixels[2], expected, rtol=1e-15, atol=0)
     assert torch.equal(has_ray[:, 0], good)
     assert [c.project(POINTS)[1].any().item() for c in camera] == good.tolist()
     if graph:
-        (pixels.sum() + rays.sum()).backward()
-        assert leaf.grad.isfinite().all()
-        assert torch.equal(leaf.grad.any(-1), good)
+        (pixels.sum() + rays.square().sum()).backward()
+        (expected.sum() + alone.unproject(at[0])[0].square().sum()).backward()
+        for leaf, one in zip(leaves, alone.parameters(), strict=False):
+            assert leaf.grad.isfinite().all()
+            assert not leaf.grad[~good].any()
+            torch.testing.assert_close(leaf.grad[2], one.grad)
+            assert (one.grad[constants(alone) if one is alone.distortion else 0 :] != 0).all()
 
 
 @every_model

@@ -260,20 +260,6 @@ def test_derivatives_at_the_axis(key, offset):
     torch.testing.assert_close(result.detach(), expected, rtol=0, atol=fx * (1e-12 + 4 * offset))
 
 
-@few_calibrations
-def test_unproject_derivatives_are_the_inverse_of_those_of_project(key, name):
-    camera = real(key)[name]
-    pixels = pixel_lattice(camera, 5, 7)
-    rays, valid = camera.unproject(pixels)
-    pixels, rays = pixels[valid], rays[valid].detach()
-    condition = rad_per_px(camera, rays) * camera.intrinsics[0].item()
-    forward = vmap(jacrev(lambda p: camera.project(p)[0]))(rays)
-    backward = vmap(jacrev(lambda p: camera.unproject(p)[0]))(pixels)
-    identity = torch.eye(2, dtype=torch.float64).expand(len(pixels), 2, 2)
-    error = (forward @ backward - identity).abs().amax((-1, -2))
-    assert (error < 1e-11 * condition.clamp(min=1)).all(), error.max()
-
-
 # -- what is not valid
 
 
@@ -303,10 +289,11 @@ def check_bad_rows(camera, method, good, bad):
     assert (by_value[len(good) :] == 0).all()
 
     alone = good.clone().requires_grad_()
-    result, valid = getattr(camera, method)(alone)
+    by_itself, valid = getattr(camera, method)(alone)
     assert valid.all()
-    expected = torch.autograd.grad((result * weights[: len(good)]).sum(), [alone, *parameters])
     close = 100 * torch.finfo(result.dtype).eps
+    torch.testing.assert_close(result[: len(good)], by_itself, rtol=close, atol=close)
+    expected = torch.autograd.grad((by_itself * weights[: len(good)]).sum(), [alone, *parameters])
     for mine, reference in zip((by_value[: len(good)], *by_parameter), expected, strict=True):
         # sums over points, of which some cancel
         torch.testing.assert_close(mine, reference, rtol=close, atol=close * float(reference.abs().max()))
@@ -317,24 +304,6 @@ def check_bad_rows(camera, method, good, bad):
 def test_bad_points(key, dtype):
     camera = one(key).to(dtype)
     check_bad_rows(camera, "project", near_and_far_rays().to(dtype), torch.tensor(bad_points(camera), dtype=dtype))
-
-
-@each_kind
-@pytest.mark.parametrize("number", [math.nan, -math.inf, 1e30])
-def test_one_bad_number_among_good_ones(key, number):
-    """Nothing else in the batch draws attention to it."""
-    camera = one(key)
-    for method, values in (("project", near_and_far_rays() + 1.0), ("unproject", pixel_lattice(camera, 3, 4))):
-        expected, valid = getattr(camera, method)(values)
-        for column in range(values.shape[-1]):
-            broken = values.clone()
-            broken[1, column] = number
-            result, still_valid = getattr(camera, method)(broken)
-            assert result.isfinite().all()
-            assert math.isfinite(number) or not still_valid[1]
-            others = torch.arange(len(values)) != 1
-            assert torch.equal(still_valid[others], valid[others])
-            torch.testing.assert_close(result[others], expected[others], rtol=1e-13, atol=1e-13)
 
 
 @each_kind
@@ -560,29 +529,6 @@ def test_nothing_is_found_beyond_the_fold(key, data):
         assert not camera.unproject(centre + outside * rim)[1].any()
 
 
-@few_calibrations
-@both_precisions
-def test_pixels_around_the_image_of_the_fold(key, name, dtype):
-    """A hair inside or outside the last pixel that has a ray: invalid, or a ray that projects there."""
-    camera = real(key)[name]
-    samples, azimuths = 3000, 8
-    pixels, valid = camera.project(fan(end_degrees(camera), samples, azimuths))
-    pixels, valid = pixels.detach().view(samples, azimuths, 2), valid.view(samples, azimuths)
-    rim = pixels[valid.sum(0) - 1, torch.arange(azimuths)][~valid[-1]]
-    # further out the rounding of a float32 ray alone moves the pixel by more than the limit
-    rim = rim[(rim - camera.intrinsics[2:].detach()).norm(dim=-1) < 5 * max(camera.image_size)]
-    centre = camera.intrinsics[2:].detach()
-    hair = 10.0 ** torch.linspace(-16, -3, 40, dtype=torch.float64)
-    around = (centre + (rim - centre) * torch.cat((1 - hair, 1 + hair))[:, None, None]).view(-1, 2).to(dtype)
-    camera = camera.to(dtype)
-    rays, valid = camera.unproject(around)
-    again, reachable = camera.project(rays)
-    # single precision: looser than on an image, for some of these lenses fold a thousand times further out
-    limit = pixel_limit(around, px=1e-9 if dtype == torch.float64 else 1e-2)
-    right = reachable & ((again - around).norm(dim=-1) < limit)
-    assert right[valid].all(), (around[valid & ~right][:3].tolist(), again[valid & ~right][:3].tolist())
-
-
 def rim_of(camera, azimuths):
     """(M, 2): pixels of the last valid rays on some azimuths, by bisection, those that are no more than images away."""
     phi = torch.linspace(0.1, 2 * math.pi + 0.1, azimuths + 1, dtype=torch.float64)[:-1]
@@ -601,6 +547,24 @@ def rim_of(camera, azimuths):
     pixels = project(low)[0].detach()
     near = (pixels - camera.intrinsics[2:].detach()).norm(dim=-1) < 5 * max(camera.image_size)
     return pixels[invalid.any(0) & near]
+
+
+@few_calibrations
+@both_precisions
+def test_pixels_around_the_image_of_the_fold(key, name, dtype):
+    """A hair inside or outside the last pixel that has a ray: invalid, or a ray that projects there."""
+    camera = real(key)[name]
+    rim = rim_of(camera, 8)
+    centre = camera.intrinsics[2:].detach()
+    hair = 10.0 ** torch.linspace(-16, -3, 40, dtype=torch.float64)
+    around = (centre + (rim - centre) * torch.cat((1 - hair, 1 + hair))[:, None, None]).view(-1, 2).to(dtype)
+    camera = camera.to(dtype)
+    rays, valid = camera.unproject(around)
+    again, reachable = camera.project(rays)
+    # single precision: looser than on an image, for some of these lenses fold a thousand times further out
+    limit = pixel_limit(around, px=1e-9 if dtype == torch.float64 else 1e-2)
+    right = reachable & ((again - around).norm(dim=-1) < limit)
+    assert right[valid].all(), (around[valid & ~right][:3].tolist(), again[valid & ~right][:3].tolist())
 
 
 @every_model

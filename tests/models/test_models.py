@@ -2,6 +2,7 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
 from cameras import KEYS, RANGES, fan, one, pixel_lattice, real, spread
@@ -68,19 +69,35 @@ def test_the_same_camera(first, second):
     torch.testing.assert_close(rays, others, rtol=0, atol=1e-12)
 
 
-def test_f_theta_from_the_polynomial_of_angles():
-    """Of pixels, as DriveWorks has it; and its inverse by bisection."""
-    bw = torch.tensor([3.3e-3, 2.0e-8, -1.5e-10, 1.0e-13], dtype=torch.float64)
-    made = ct.FThetaBackward.from_polynomial(INTRINSICS[2:], bw)
-    distance = torch.tensor([1e-3, 10, 200, 500], dtype=torch.float64)
-    theta = sum(c * distance ** (i + 1) for i, c in enumerate(bw))
-    rays, valid = made.unproject(INTRINSICS[2:] + torch.stack((distance, 0 * distance), -1))
+@pytest.mark.parametrize("cde", [(1.0000840425491333, -2.8e-5, -7.3e-5), (1.1, -0.1, 0.2), (0.9, 0.0, 0.0)])
+def test_f_theta_is_nvidias_formula(cde):
+    centre, pixels = np.array([1909.309, 1103.279]), np.array([3139.486, 164.573, -442.129, 259.583, 153.666])
+    camera = ct.FTheta.from_polynomial(centre, pixels, linear_cde=cde, image_size=(2168, 3848))
+    rays = fan(38)[24:]
+    c, d, e = cde
+    rho = rays[:, :2].norm(dim=-1, keepdim=True)
+    theta = torch.atan2(rho, rays[:, 2:])
+    flat = sum(k * theta**i for i, k in enumerate(pixels, 1)) * rays[:, :2] / rho
+    expected = flat @ torch.tensor([[c, d], [e, 1]], dtype=torch.float64).T + torch.from_numpy(centre)
+    found, valid = camera.project(rays)
     assert valid.all()
-    # a rounding of the pixel, in radians
-    torch.testing.assert_close(torch.atan2(rays[:, 0], rays[:, 2]), theta, rtol=1e-13, atol=500 * 2**-52 * 3.3e-3)
-    pixels, valid = made.project(torch.stack((theta.sin(), 0 * theta, theta.cos()), -1))
+    assert isinstance(camera, ct.FThetaSheared) == (d != 0)
+    torch.testing.assert_close(found.detach(), expected, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("cde", [(1.0, 0.0, 0.0), (1.1, -0.1, 0.2)])
+def test_f_theta_backward_is_nvidias_formula(cde):
+    centre, angles = np.array([1904.948, 1090.516]), np.array([5.3809e-4, -1.2021e-9, 4.5657e-12, -5.5811e-16])
+    camera = ct.FThetaBackward.from_polynomial(centre, angles, linear_cde=np.array(cde), image_size=(2168, 3848))
+    pixels = torch.tensor([[100.0, 200.0], [3000.0, 50.0], [1900.0, 2000.0], [3700.0, 2100.0]], dtype=torch.float64)
+    rays, valid = camera.unproject(pixels)
+    c, d, e = cde
+    flat = np.linalg.solve([[c, d], [e, 1]], (pixels.numpy() - centre).T).T
+    radius = np.linalg.norm(flat, axis=-1, keepdims=True)
+    theta = sum(k * radius**i for i, k in enumerate(angles, 1))
     assert valid.all()
-    torch.testing.assert_close(pixels[:, 0] - INTRINSICS[2], distance, rtol=1e-12, atol=1e-12)
+    expected = torch.from_numpy(np.concatenate((np.sin(theta) * flat / radius, np.cos(theta)), -1))
+    torch.testing.assert_close(rays.detach(), expected, rtol=0, atol=1e-12)
 
 
 def test_the_inverse_of_an_angle_is_valid_before_it_turns_back():

@@ -9,7 +9,6 @@ import pytest
 import torch
 from cameras import (
     KEYS,
-    constants,
     each_kind,
     every_model,
     fan,
@@ -310,63 +309,6 @@ def test_plain_values_become_parameters(key):
     assert ct.MODELS[key]([300, 300, 320, 240]).intrinsics.is_floating_point()
     parameter = nn.Parameter(camera.intrinsics.detach())
     assert ct.MODELS[key](parameter).intrinsics is parameter
-
-
-@each_kind
-@both_directions
-def test_gradients_reach_the_network_that_predicted_the_camera(key, method):
-    camera = spread(key).float()
-    count = len(camera.distortion_names)
-    torch.manual_seed(0)
-    network = nn.Linear(5, 4 + count)
-    images = torch.rand(3, 5)
-    predicted = network(images)
-    intrinsics = camera.intrinsics.detach() * (1 + 0.1 * predicted[:, :4])
-    distortion = camera.distortion.detach() * (1 + 0.1 * predicted[:, 4:])
-    seen = make(key, intrinsics, distortion)
-    assert seen.batch_shape == (3,)
-    assert list(seen.parameters()) == []
-    values = fan(100, 4, 5).float() if method == "project" else pixel_lattice(camera, 4, 5)
-    result, valid = getattr(seen, method)(values.expand(3, *values.shape))
-    assert valid.any()
-    (result**2).sum().backward()
-    assert network.weight.grad.isfinite().all()
-    reached = network.weight.grad.abs().amax(-1) > 0
-    assert torch.cat((reached[:4], reached[4 + constants(camera) :])).all()
-
-
-@pytest.mark.filterwarnings("ignore:.*became unusable")
-@each_kind
-@both_directions
-@pytest.mark.parametrize("broken", ["nan focal", "negative focal", "zero focal", "infinite centre", "nan coefficient"])
-def test_parameters_driven_astray_are_invalid_not_nan(key, method, broken):
-    """One camera of a batch is lost: its results are invalid, finite and without gradient; the others do not notice."""
-    single, values = module_and_input(key, method)
-    camera = single if method == "project" else single.camera
-    batch = [p.detach().expand(2, -1).clone() for p in (camera.intrinsics, camera.distortion)]
-    name = "nan coefficient" if broken == "nan coefficient" and camera.distortion_names else broken
-    both = make(key, *batch)
-    values = values.expand(2, *values.shape).clone().requires_grad_()
-    weights = torch.linspace(1, 2, 3, dtype=torch.float64)[: 5 - values.shape[-1]]
-    expected, expected_valid = getattr(make(key, *batch), method)(values)
-    (expected_gradient,) = torch.autograd.grad((expected * weights).sum(), values)
-    with torch.no_grad():
-        place = {"nan focal": (0, torch.nan), "negative focal": (1, -300.0), "zero focal": (0, 0.0)}
-        if name == "nan coefficient" and camera.distortion_names:
-            both.distortion[1, 0] = torch.nan
-        else:
-            index, value = place.get(name, (2, torch.inf))
-            both.intrinsics[1, index] = value
-    result, valid = getattr(both, method)(values)
-    assert result.isfinite().all()
-    assert not valid[1].any()
-    assert_same((result[0], valid[0]), (expected[0], expected_valid[0]))
-    gradient, *by_parameter = torch.autograd.grad((result * weights).sum(), [values, *both.parameters()])
-    assert (gradient[1] == 0).all()
-    torch.testing.assert_close(gradient[0], expected_gradient[0])
-    for parameter in by_parameter:
-        assert parameter.isfinite().all()
-        assert (parameter[1] == 0).all()
 
 
 # -- dtypes

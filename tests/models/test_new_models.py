@@ -179,23 +179,15 @@ def test_valid_up_to_the_fold(model):
 
 
 @every_camera
-@pytest.mark.parametrize("method", ["project", "unproject"])
-def test_without_a_graph(model, method):
-    camera = camera_of(model)
-    values = fan(50) if method == "project" else camera.project(fan(50))[0].detach()
-    expected = getattr(camera, method)(values)[0].detach()
-    for context in (torch.no_grad(), torch.inference_mode()):
-        with context:
-            torch.testing.assert_close(getattr(camera_of(model), method)(values)[0], expected)
-
-
-@every_camera
-def test_reverse_mode_of_torch_func(model):
-    camera = camera_of(model)
-    ray = fan(50)[100]
-    for method, value in ((camera.project, ray), (camera.unproject, camera.project(ray)[0].detach())):
-        found = torch.func.jacrev(lambda v, m=method: m(v)[0])(value)
-        expected = torch.autograd.functional.jacobian(lambda v, m=method: m(v)[0], value)
+def test_without_a_graph_and_in_transforms(model):
+    camera, rays = camera_of(model), fan(50)
+    for method, values in (("project", rays), ("unproject", camera.project(rays)[0].detach())):
+        call = getattr(camera, method)
+        for context in (torch.no_grad(), torch.inference_mode()):
+            with context:
+                torch.testing.assert_close(getattr(camera_of(model), method)(values)[0], call(values)[0].detach())
+        found = torch.func.jacrev(lambda v, call=call: call(v)[0])(values[100])
+        expected = torch.autograd.functional.jacobian(lambda v, call=call: call(v)[0], values[100])
         torch.testing.assert_close(found, expected, rtol=1e-9, atol=1e-9)
 
 

@@ -572,29 +572,6 @@ def test_forks_while_others_warp():
         assert (warp(images).numpy() == expected).all()
 
 
-class Warped(torch.utils.data.Dataset):
-    """Warped where it is asked for: in workers."""
-
-    def __init__(self):
-        self.warp = larger(0.01)
-
-    def __len__(self):
-        return 6
-
-    def __getitem__(self, i):
-        return self.warp(samples(1, i))[0], torch.get_num_threads()
-
-
-@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork")
-def test_workers_of_a_loader():
-    images = Warped()
-    expected = [images[i][0] for i in range(len(images))]
-    loader = torch.utils.data.DataLoader(images, batch_size=2, num_workers=2, multiprocessing_context="fork")
-    batches = list(loader)
-    assert torch.equal(torch.cat([batch for batch, _ in batches]), torch.stack(expected))
-    assert {int(n) for _, counts in batches for n in counts} == {1}
-
-
 # -- memory
 
 PEAK = """
