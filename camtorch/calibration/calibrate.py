@@ -105,10 +105,8 @@ def as_model(
     if not isinstance(fixed, Collection) or isinstance(fixed, Mapping):
         raise TypeError(f'{owner}: fixed must be names of parameters, as ("cx", "cy"), or "all"; got {fixed!r}')
     fixed = (names if fixed == "all" else (fixed,)) if isinstance(fixed, str) else tuple(fixed)
-    if start is not None and (smooth := model.smoothness()) is not None:
-        # a surface does what these do as well
-        own = zip(names[4:], smooth.any(0).tolist(), strict=True)
-        fixed = (*fixed, *INTRINSICS, *(name for name, is_in in own if not is_in))
+    if start is not None and model.smoothness() is not None:
+        fixed = (*fixed, *INTRINSICS)  # a surface does what these do as well
     unknown = [name for name in fixed if not isinstance(name, str) or name not in names]
     if unknown:
         raise ValueError(

@@ -90,9 +90,8 @@ def _fit_linear(
 ) -> Tensor:
     """`fit` of a lens that is linear in its coefficients: at these focal lengths and pixels of the axis, at once."""
     parameters = torch.cat((slopes, slopes.new_tensor(camera.ideal(smooth.shape[-1])).expand(len(slopes), -1)), -1)
-    free = torch.nn.functional.pad(smooth.any(0), (4, 0), value=True)
-    free = free if fixed is None else free & fixed.isnan()
-    parameters = parameters if fixed is None else torch.where(fixed.isnan(), parameters, fixed)
+    fixed = torch.full_like(parameters[0], torch.nan) if fixed is None else fixed
+    free, parameters = fixed.isnan(), torch.where(fixed.isnan(), parameters, fixed)
     seen, _, by_k = sensor_jacobians(camera, parameters[:, 4:], observations.rays)
     weights = (observations.weights * seen.covered)[:, None]
     slope = (by_k[:, :, free[4:]] * (parameters[:, :2, None] * weights)[:, :, None]).movedim(2, -1).flatten(1, 2)
