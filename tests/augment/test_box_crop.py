@@ -100,10 +100,10 @@ def test_boxes_that_are_none_are_refused(boxes, message):
 
 
 def test_a_box_seen_straight_up_has_no_way_up():
-    focal = 100 / math.pi
-    camera = ct.Equirectangular([focal, focal, 99.5, 49.5], image_size=(100, 200)).double().requires_grad_(False)
+    up = 60 * math.pi / 2
+    camera = ct.KannalaBrandt([60.0, 60.0, 99.5, up], [0.0] * 4, image_size=(200, 200)).double().requires_grad_(False)
     with pytest.raises(ValueError, match=r"box 0.*y axis"):
-        ct.views.look_at(camera, [98, -2, 102, 1], SIZE)
+        ct.views.look_at(camera, [97.5, -2.0, 101.5, 2.0], SIZE)
 
 
 def test_single_boxes_and_batches():
