@@ -128,33 +128,6 @@ def _natively(
     return result
 
 
-def blended(parts: Iterable[Tensor], weights: Iterable[Tensor], mode: Mode) -> Tensor:
-    """Images in one: their weighted mean, or with "nearest" each pixel of the image that weighs most there.
-
-    Where an image has no weight it has no part, whatever it holds; where none has any, pixels are 0.
-
-    Args:
-        parts: (B, C, H, W) of one dtype; B may be 1 for some.
-        weights: of each, not negative, broadcast against it; those of a pixel add up to 1.
-        mode: see `sample`.
-
-    Returns:
-        (B, C, H, W), with "nearest" of the same dtype, else as of `widen`.
-    """
-    result: Tensor | None = None
-    most: Tensor | float = 0.0
-    for part, weight in zip(parts, weights, strict=True):
-        if mode == "nearest":
-            before = part.new_zeros(()) if result is None else result
-            result, most = torch.where(weight > most, part, before), weight.clamp(min=most)
-        else:
-            wide = widen(part)
-            share = torch.where(weight > 0, wide * weight.to(wide.dtype), 0.0)
-            result = share if result is None else result + share
-    assert result is not None
-    return result
-
-
 def _by_torch(images: Tensor, where: Sampling | Lattice, how: Sampler, kept: dict[int, Pyramid] | None) -> Tensor:
     """What `grid_sample` makes of B images."""
     count, dtype = images.shape[0], images.dtype

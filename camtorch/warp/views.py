@@ -16,7 +16,7 @@ from camtorch.camera import Camera
 from camtorch.models import Pinhole
 from camtorch.projection.rays import slopes_at_axis
 from camtorch.rotations import mount_rotation
-from camtorch.warp.sampling import Mode, blended
+from camtorch.warp.sampling import Mode
 from camtorch.warp.warp import Warp, as_sized
 
 __all__ = ["FACES", "Views", "cube", "look_at", "ring"]
@@ -24,8 +24,8 @@ __all__ = ["FACES", "Views", "cube", "look_at", "ring"]
 FACES = ("front", "right", "back", "left", "up", "down")
 """Of a cube, as the camera sees them from within; its own axis goes through the middle of the front."""
 _ALONG = 65  # samples of an edge of a box, and of the steps to either side of the farthest of them
-_HALVES = 50  # of the step between two samples, between which the image of a lens ends
 _ROUNDS = 3  # of such samples: 2e-6 of an edge
+_MORE_ROUNDS = 8  # where a lens ends on the outline, and slopes may grow without bounds
 _VIRTUAL = Pinhole([1.0, 1.0, 0.0, 0.0]).detach()
 _STRAIGHT_UP = 1e-6  # radians from the y axis: what float32 cameras leave of none
 _OVERLAP = 1.25  # the width of a view in a ring over the step to the next one
@@ -123,11 +123,15 @@ class Views(GeometryModule):
             raise ValueError(
                 f"Views: views must be a tensor (B, {len(self)}, C, {size[0]}, {size[1]}); got {shown(views)}"
             )
-        weights = self.weights()
-        images = views if self.mode == "nearest" else widen(views)
-        parts = (warp(images[:, i]) for i, warp in enumerate(self.backs))
-        valid = (weights.sum(0) > 0)[None, None]
-        return narrow(blended(parts, weights, self.mode), views.dtype), valid
+        weights, nearest = self.weights()[:, None], self.mode == "nearest"
+        images = views if nearest else widen(views)
+        parts = torch.stack([warp(images[:, i]) for i, warp in enumerate(self.backs)], 1)
+        valid = (weights.sum(0) > 0)[None]
+        if nearest:
+            most = weights.argmax(0)[None, None].expand(len(parts), 1, *parts.shape[2:])
+            return torch.where(valid, parts.gather(1, most)[:, 0], 0), valid
+        shares = torch.where(weights > 0, parts * weights.to(parts.dtype), 0.0)
+        return narrow(shares.sum(1), views.dtype), valid
 
     def extra_repr(self) -> str:
         """The views."""
@@ -303,12 +307,14 @@ def looking_at(
     steps = torch.linspace(-1, 1, _ALONG, dtype=torch.float64, device=boxes.device)
     place, half = torch.full((len(boxes), 4, 1), 0.5, dtype=torch.float64, device=boxes.device), 0.5
     farthest = torch.full((len(boxes), 2), -math.inf, dtype=torch.float64, device=boxes.device)
-    for _ in range(_ROUNDS):
+    all_seen = True
+    for i in range(_MORE_ROUNDS):
         share = (place[..., None] + half * steps).clamp(0, 1)  # (B, 4, 1 or 2, K)
         pixels = start + share[..., None] * edge
         rays, seen = camera.unproject(pixels.flatten(1, 3))
         turned = (rays @ rotation.mT).view(*share.shape, 3)
         seen = seen.view(share.shape)
+        all_seen = all_seen and bool(seen.all())
         refuse(
             (seen & (turned[..., 2] <= 1e-9)).flatten(1).any(-1), "has an outline 90 degrees or more from its middle"
         )
@@ -316,35 +322,11 @@ def looking_at(
         slopes = torch.where(seen[..., None], slopes, -math.inf)
         slopes = slopes.expand(-1, -1, 2, -1, -1).diagonal(dim1=2, dim2=4).mT  # (B, 4, 2, K)
         best, index = slopes.max(-1)
-        if half == 0.5:
-            farthest = _where_lenses_end(camera, start, edge, share, seen, rotation, farthest)
         farthest = torch.maximum(farthest, best.amax(1))
+        if i == _ROUNDS - 1 and all_seen:
+            break
         place, half = share.expand(*best.shape, -1).gather(-1, index[..., None])[..., 0], 2 * half / (_ALONG - 1)
     refuse(~torch.isfinite(farthest).all(-1), "has no ray on its outline")
     sides = farthest.new_tensor(size[::-1])
     focal = (sides / 2 / farthest).amin(-1, keepdim=True).expand(-1, 2)
     return torch.cat((focal, ((sides - 1) / 2).expand_as(focal)), -1), rotation
-
-
-def _where_lenses_end(
-    camera: Camera, start: Tensor, edge: Tensor, share: Tensor, seen: Tensor, rotation: Tensor, farthest: Tensor
-) -> Tensor:
-    """`farthest` (B, 2) with the slopes of the last rays of edges, near which they may grow without bounds.
-
-    Between neighbours of samples (B, 4, 1, K) of which one has a ray.
-    """
-    box, side, _, left = (seen[..., 1:] != seen[..., :-1]).nonzero(as_tuple=True)
-    if not len(box):
-        return farthest
-    low, high = share[box, side, 0, left], share[box, side, 0, left + 1]
-    first = seen[box, side, 0, left]
-    inner, outer = torch.where(first, low, high), torch.where(first, high, low)
-    own = camera[box.tolist()] if camera.batch_shape else camera
-    for _ in range(_HALVES):
-        middle = (inner + outer) / 2
-        has_ray = own.unproject(start[box, side, 0, 0] + middle[:, None] * edge[box, side, 0, 0])[1]
-        inner, outer = torch.where(has_ray, middle, inner), torch.where(has_ray, outer, middle)
-    rays = own.unproject(start[box, side, 0, 0] + inner[:, None] * edge[box, side, 0, 0])[0]
-    turned = (rotation[box] @ rays[..., None])[..., 0]
-    slopes = turned[:, :2].abs() / turned[:, 2:].clamp(min=1e-9)
-    return farthest.scatter_reduce(0, box[:, None].expand(-1, 2), slopes, "amax")
