@@ -1,0 +1,44 @@
+"""Every public name of 0.3 works as before, or stands on the page about what left."""
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+from public_names import names
+
+ROOT = Path(__file__).parents[2]
+PAGE = ROOT / "docs" / "leaving-0.3.md"
+OLD = json.loads(Path(__file__).with_name("names-0.3.json").read_text())
+
+
+@pytest.fixture(scope="module")
+def new():
+    return set(names())
+
+
+def on_the_page():
+    """Names in the first column of the page's tables."""
+    cells = [line.replace(r"\|", "").split("|")[1] for line in PAGE.read_text().splitlines() if line.startswith("| ")]
+    return {span for cell in cells for span in re.findall(r"`([^`]+)`", cell)}
+
+
+def with_holders(name):
+    """The name, and those of what it belongs to: `ct.Warp.save(step=)`, `ct.Warp.save`, `ct.Warp`."""
+    while name:
+        yield name
+        cut = name.rfind("(") if name.endswith(")") else max(name.rfind("."), name.rfind(" "))
+        name = name[: max(cut, 0)]
+
+
+def test_every_name_that_went_stands_on_the_page(new):
+    known = on_the_page()
+    assert len(OLD) > 2000
+    assert [name for name in OLD if name not in new and known.isdisjoint(with_holders(name))] == []
+
+
+def test_the_page_names_nothing_that_is_there_or_never_was(new):
+    holders = {holder for name in OLD for holder in with_holders(name)}
+    there = {holder for name in new for holder in with_holders(name)}
+    assert sorted(on_the_page() - holders) == []
+    assert sorted(on_the_page() & there) == []
