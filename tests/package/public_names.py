@@ -17,6 +17,7 @@ import re
 import types
 from pathlib import Path
 
+import pytest
 import torch
 
 import camtorch as ct
@@ -149,12 +150,14 @@ def of_commands():
 
 
 def of_formats():
-    from camtorch.data import read
     from camtorch.maps import formats as maps
 
     yield from (f"camera format {name}" for name in ct.io.FORMATS)
     yield from (f"map format {name}" for name in maps.FORMATS)
-    yield from (f"label format {name}" for name in inspect.getmodule(read).FORMATS)
+    with pytest.raises(ValueError, match="one of") as refused:
+        ct.data.read(".", format="?")
+    known = re.search(r"one of ([\w, ]+)", str(refused.value))[1]
+    yield from (f"label format {name}" for name in known.split(", "))
     yield from (f"model {name}" for name in ct.MODELS)
     yield from (f"landmarks {name}" for name in ct.augment.LANDMARKS)
     yield from (f"lens preset {name}" for name in ct.augment.PRESETS)
