@@ -18,17 +18,13 @@ from camtorch import (
 from camtorch import (
     plot as plot,
 )
-from camtorch.boards.finding import BoardObservations as BoardObservations
 from camtorch.boards.finding import find_board as find_board
-from camtorch.calibration.calibrate import Calibration as Calibration
 from camtorch.calibration.calibrate import calibrate as calibrate
 from camtorch.calibration.from_rays import fit as fit
 from camtorch.calibration.pnp import solve_pnp as solve_pnp
-from camtorch.calibration.rig import RigCalibration as RigCalibration
 from camtorch.calibration.rig import calibrate_rig as calibrate_rig
 from camtorch.calibration.triangulate import triangulate as triangulate
 from camtorch.camera import Camera as Camera
-from camtorch.convert.conversion import Conversion as Conversion
 from camtorch.extrinsics import Extrinsics as Extrinsics
 from camtorch.extrinsics import head_angles as head_angles
 from camtorch.extrinsics import head_rotation as head_rotation
@@ -38,18 +34,13 @@ from camtorch.io import save as save
 from camtorch.maps.formats import load_map as load_map
 from camtorch.maps.formats import save_map as save_map
 from camtorch.maps.lookup import LookupMap as LookupMap
-from camtorch.maps.report import MapReport as MapReport
 from camtorch.mixed import Mixed as Mixed
 from camtorch.mixed import cat as cat
 from camtorch.models import *  # noqa: F403 (the list is there)
-from camtorch.native.library import native_available as native_available
 from camtorch.networks import losses as losses
 from camtorch.networks.canonical import CanonicalCamera as CanonicalCamera
 from camtorch.networks.head import CameraHead as CameraHead
-from camtorch.parametrize import PositiveFocal as PositiveFocal
-from camtorch.parametrize import TiedFocal as TiedFocal
 from camtorch.rig import Rig as Rig
-from camtorch.stereo.rectification import Rectification as Rectification
 from camtorch.stereo.rectification import rectify as rectify
 from camtorch.viewer.viewer import write_viewer as write_viewer
 from camtorch.warp import views as views

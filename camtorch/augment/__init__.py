@@ -3,6 +3,9 @@
 `camtorch.augment.kornia`, `.torchvision`, `.albumentations` and `.numpy` are the same for those libraries' pipelines.
 """
 
+from typing import TYPE_CHECKING
+
+from camtorch import LEFT
 from camtorch.augment.augmentation import Augmentation, Range
 from camtorch.augment.box_crop import BoxCrop
 from camtorch.augment.change import Change
@@ -59,3 +62,9 @@ __all__ = [
     "outlines",
     "to_pitch_yaw",
 ]
+
+
+if not TYPE_CHECKING:  # a checker knows the names, and no others
+
+    def __getattr__(name: str) -> None:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}. {LEFT}")

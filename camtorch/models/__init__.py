@@ -13,8 +13,10 @@ from camtorch.models.double_sphere import DoubleSphere
 from camtorch.models.equirectangular import Equirectangular
 from camtorch.models.equisolid import Equisolid
 from camtorch.models.eucm import EUCM
-from camtorch.models.f_theta import FTheta, FThetaSheared
-from camtorch.models.f_theta_backward import FThetaBackward, FThetaBackwardSheared
+from camtorch.models.f_theta import FTheta
+from camtorch.models.f_theta import FThetaSheared as FThetaSheared
+from camtorch.models.f_theta_backward import FThetaBackward
+from camtorch.models.f_theta_backward import FThetaBackwardSheared as FThetaBackwardSheared
 from camtorch.models.fisheye62 import Fisheye62
 from camtorch.models.fisheye624 import Fisheye624, FisheyeRadTanThinPrism
 from camtorch.models.fov import FOV
@@ -45,8 +47,6 @@ __all__ = [
     "Equisolid",
     "FTheta",
     "FThetaBackward",
-    "FThetaBackwardSheared",
-    "FThetaSheared",
     "Fisheye62",
     "Fisheye624",
     "FisheyeRadTanThinPrism",

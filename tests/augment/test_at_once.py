@@ -22,6 +22,7 @@ from camtorch.augment import (
     Resize,
     Rotate90,
 )
+from camtorch.native.library import native_available
 
 SIZE = (96, 130)
 DTYPES = torch.float32, torch.float64
@@ -115,7 +116,7 @@ LAST = {
 }
 
 
-@pytest.mark.skipif(not ct.native_available(), reason="formulas of torch round numbers of a batch differently")
+@pytest.mark.skipif(not native_available(), reason="formulas of torch round numbers of a batch differently")
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("name", LAST)
 def test_a_sample_of_a_batch_is_what_it_is_alone(name, dtype):

@@ -8,6 +8,7 @@ import torch
 from torch.nn.utils import parametrize
 
 import camtorch as ct
+from camtorch.networks.parametrize import TiedFocal
 
 from . import SIZE, close, elsewhere, equal, photograph, pixels, plane, points, row, trap, warped
 
@@ -163,7 +164,7 @@ def quaternions(tmp_path):
 @functools.partial(trap, slow=True)
 def one_focal_length(tmp_path):
     camera = lens(params=[75.0, 75.0, 80.0, 60.0, -0.1, 0.0, 0.0, 0.0]).requires_grad_()
-    parametrize.register_parametrization(camera, "intrinsics", ct.TiedFocal())
+    parametrize.register_parametrization(camera, "intrinsics", TiedFocal())
     camera.project(torch.from_numpy(points()))[0][..., 0].sum().backward()
     torch.optim.SGD(camera.parameters(), 1e-4).step()
     assert camera.fx == camera.fy != 75.0

@@ -16,6 +16,8 @@ from coming_from import CHECKS, TRAPS
 import camtorch as ct
 import camtorch.augment.kornia
 import camtorch.augment.numpy
+from camtorch.calibration.calibrate import Calibration
+from camtorch.stereo.rectification import Rectification
 
 PAGES = sorted((Path(__file__).parents[2] / "docs" / "coming-from").glob("*.md"))
 LIBRARIES = [name for name in ("albumentations", "cv2", "kornia", "pycolmap") if importlib.util.find_spec(name)]
@@ -23,9 +25,9 @@ for _page in ("opencv", "kornia", "colmap", "pytorch3d", "nvtorchcam", *({"album
     importlib.import_module(f"coming_from.{_page}")  # which registers its checks
 INSTANCES = {
     "augment": ct.augment.Augmentation,
-    "calibration": ct.Calibration,
+    "calibration": Calibration,
     "camera": ct.Camera,
-    "pair": ct.Rectification,
+    "pair": Rectification,
     "extrinsics": ct.Extrinsics,
     "pose": ct.Extrinsics,
     "rig": ct.Rig,

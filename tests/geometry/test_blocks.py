@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import camtorch as ct
+from camtorch.native.library import native_available
 from camtorch.optics.charts import Perspective
 from camtorch.warp import grid, sampling
 from camtorch.warp.grid import Sampling
@@ -49,7 +50,7 @@ def test_planes_and_triples_are_the_same(key, method):
         torch.testing.assert_close(result, expected, rtol=1e-12, atol=1e-10)
 
 
-@pytest.mark.skipif(not ct.native_available(), reason="autograd keeps more of the formula")
+@pytest.mark.skipif(not native_available(), reason="autograd keeps more of the formula")
 @each_kind
 @pytest.mark.parametrize(("method", "limit"), [("project", 32), ("unproject", 40)])
 def test_bytes_kept_for_backward(key, method, limit):

@@ -15,6 +15,7 @@ from test_blocks import everything
 import camtorch as ct
 from camtorch import _threads
 from camtorch._threads import spread
+from camtorch.native.library import native_available
 
 
 class Pieces:
@@ -169,7 +170,7 @@ def test_this_thread_alone_is_limited_and_to_the_end_of_the_function():
     assert seen == 2 * [(1, 3), (1, 3), (3, 3), (3, 3)]
 
 
-@pytest.mark.skipif(not ct.native_available(), reason="torch splits its operations")
+@pytest.mark.skipif(not native_available(), reason="torch splits its operations")
 @pytest.mark.parametrize("key", RARE_ARE_SLOW)
 @pytest.mark.parametrize("method", ["project", "unproject"])
 def test_results_do_not_depend_on_threads(key, method):

@@ -10,8 +10,9 @@ from cameras import one
 from torch.overrides import TorchFunctionMode
 
 import camtorch as ct
+from camtorch.native.library import native_available
 
-pytestmark = pytest.mark.skipif(not ct.native_available(), reason="needs the compiled library")
+pytestmark = pytest.mark.skipif(not native_available(), reason="needs the compiled library")
 
 # files, functions
 MOST = {"project": (7, 22), "unproject": (7, 22)}

@@ -8,6 +8,7 @@ from cameras import constants, each_kind, every_model, fan, make, one, spread
 from torch.nn.utils import parametrize
 
 import camtorch as ct
+from camtorch.networks.parametrize import PositiveFocal, TiedFocal
 
 POINTS = fan(40, 4, 3)
 
@@ -75,7 +76,7 @@ def test_bad_poses_of_a_predicted_batch():
 
 # -- parametrizations
 
-PARAMETRIZATIONS = pytest.mark.parametrize("parametrization", [ct.PositiveFocal, ct.TiedFocal])
+PARAMETRIZATIONS = pytest.mark.parametrize("parametrization", [PositiveFocal, TiedFocal])
 
 
 def tied(key, **options):
@@ -125,7 +126,7 @@ def test_training_never_leaves_the_positive(parametrization, batch):
     fx, fy = camera.fx.detach(), camera.fy.detach()
     assert (fx > 0).all()
     assert (fx < 3.9).all()
-    assert torch.equal(fx, fy) == (parametrization is ct.TiedFocal)
+    assert torch.equal(fx, fy) == (parametrization is TiedFocal)
 
 
 @PARAMETRIZATIONS
@@ -156,7 +157,7 @@ def test_parametrized_cameras_are_of_their_model(parametrization, tmp_path):
 
 def test_tied_focal_lengths_are_the_geometric_mean():
     camera = ct.Pinhole([100.0, 400.0, 3.0, 4.0])
-    parametrize.register_parametrization(camera, "intrinsics", ct.TiedFocal())
+    parametrize.register_parametrization(camera, "intrinsics", TiedFocal())
     torch.testing.assert_close(camera.intrinsics.detach(), torch.tensor([200.0, 200.0, 3.0, 4.0]))
 
 

@@ -11,6 +11,7 @@ import torch
 from cameras import KEYS, every_model, make, spread
 
 import camtorch as ct
+from camtorch.networks.parametrize import PositiveFocal
 
 INTRINSICS = [300.0, 310.0, 320.0, 240.0]
 SIZE, K, EYE = (480, 640), np.array([[300.0, 0.0, 320.0], [0.0, 310.0, 240.0], [0.0, 0.0, 1.0]]), torch.eye(4)
@@ -47,7 +48,7 @@ def of_size(size):
 
 def parametrized():
     camera = LENS.clone()
-    torch.nn.utils.parametrize.register_parametrization(camera, "intrinsics", ct.PositiveFocal())
+    torch.nn.utils.parametrize.register_parametrization(camera, "intrinsics", PositiveFocal())
     return camera
 
 

@@ -9,6 +9,7 @@ import torch
 from cameras import each_kind, spread
 
 import camtorch as ct
+from camtorch.networks.parametrize import PositiveFocal
 
 
 def names_of(camera):
@@ -128,7 +129,7 @@ def test_copies_pickles_and_states_keep_it():
 
 def test_beside_a_parametrized_tensor():
     camera = spread("kannala_brandt")
-    torch.nn.utils.parametrize.register_parametrization(camera, "intrinsics", ct.PositiveFocal())
+    torch.nn.utils.parametrize.register_parametrization(camera, "intrinsics", PositiveFocal())
     assert "frozen=(k1)" in repr(camera.freeze("k1"))
 
 

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import pytest
 
-import camtorch as ct
 from camtorch.native import build as building
 from camtorch.native import library
 from camtorch.native.build import LIBRARY, REASON, BuildError, build
+from camtorch.native.library import native_available
 
 ROOT = Path(__file__).parents[2]
 COMPILER = os.environ.get("CC") or next(filter(shutil.which, ("cc", "gcc", "clang")), None)
@@ -191,4 +191,4 @@ def test_where_none_was_built_version_says_why(tmp_path):
 
 
 def test_it_says_whether_it_is_there():
-    assert ct.native_available() is (library.library() is not None)
+    assert native_available() is (library.library() is not None)

@@ -7,15 +7,15 @@ import pytest
 import torch
 from cameras import KEYS, every_model, fan, make, one, pixel_lattice, real, spread
 
-import camtorch as ct
 from camtorch._arguments import columns
+from camtorch.native.library import native_available
 from camtorch.optics import Equidistant, Lens, Stage
 from camtorch.projection import compiled as geometry
 from camtorch.projection.project import Project
 from camtorch.projection.rows import Cameras
 from camtorch.projection.unproject import Unproject
 
-pytestmark = pytest.mark.skipif(not ct.native_available(), reason="the library is not compiled here, or turned off")
+pytestmark = pytest.mark.skipif(not native_available(), reason="the library is not compiled here, or turned off")
 
 # one calibration of each model and the others, which take a while
 each_kind = pytest.mark.parametrize(

@@ -7,8 +7,9 @@ import torch
 from cameras import DISTINCT, KEYS, make, one, pixel_lattice, slow_unless
 
 import camtorch as ct
+from camtorch.native.library import native_available
 
-pytestmark = pytest.mark.skipif(not ct.native_available(), reason="the library is not compiled here, or turned off")
+pytestmark = pytest.mark.skipif(not native_available(), reason="the library is not compiled here, or turned off")
 
 each_key = pytest.mark.parametrize("key", KEYS)
 each_dtype = pytest.mark.parametrize("dtype", [torch.float64, torch.float32])

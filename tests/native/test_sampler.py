@@ -17,7 +17,7 @@ import camtorch as ct
 from camtorch._dtypes import widen
 from camtorch.native import build as building
 from camtorch.native import sampler
-from camtorch.native.library import library
+from camtorch.native.library import library, native_available
 from camtorch.warp import grid as positions
 from camtorch.warp import routes, sampling
 from camtorch.warp.grid import Lattice, Sampling
@@ -27,7 +27,7 @@ PADDINGS = ("zeros", "border", "reflection")
 FLOATS = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
 INTEGERS = (torch.bool, torch.uint8, torch.int8, torch.uint16, torch.int16, torch.int32, torch.int64)
 
-pytestmark = pytest.mark.skipif(not ct.native_available(), reason="the sampler is not compiled here, or turned off")
+pytestmark = pytest.mark.skipif(not native_available(), reason="the sampler is not compiled here, or turned off")
 
 
 @contextmanager

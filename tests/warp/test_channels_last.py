@@ -13,9 +13,10 @@ from torch.profiler import ProfilerActivity, profile
 
 import camtorch as ct
 import camtorch.augment.numpy
+from camtorch.native.library import native_available
 
 SIZE = (50, 70)
-needs_native = pytest.mark.skipif(not ct.native_available(), reason="there is no compiled sampler")
+needs_native = pytest.mark.skipif(not native_available(), reason="there is no compiled sampler")
 
 
 def camera(size=SIZE):

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 import camtorch as ct
+from camtorch.native.library import native_available
 from camtorch.warp.routes import by_pixel
 
 SIZE = (120, 160)
@@ -103,7 +104,7 @@ def test_pixels_without_a_ray_take_the_fill_in_every_padding_mode():
 # -- tolerance
 
 
-@pytest.mark.skipif(not ct.native_available(), reason="without the compiled library positions are exact")
+@pytest.mark.skipif(not native_available(), reason="without the compiled library positions are exact")
 def test_a_lattice_is_used_and_small_images_do_without():
     camera, target = pinhole(dtype=torch.float64), pinhole(focal=120.0, dtype=torch.float64)
     rotation = turn(10, 5, 20, dtype=torch.float64)

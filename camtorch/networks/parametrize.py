@@ -9,7 +9,7 @@ from torch import Tensor, nn
 class PositiveFocal(nn.Module):
     """Focal lengths that no step of an optimizer makes negative: their logarithms learn, fx and fy each.
 
-        torch.nn.utils.parametrize.register_parametrization(camera, "intrinsics", ct.PositiveFocal())
+        torch.nn.utils.parametrize.register_parametrization(camera, "intrinsics", PositiveFocal())
 
     An optimizer's step of 0.01 is one percent of a focal length; the principal point learns as it is, in pixels.
     """
