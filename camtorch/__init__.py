@@ -9,8 +9,6 @@ if TYPE_CHECKING:
     from camtorch.models import *  # noqa: F403
 
 __version__ = "0.4.0.dev0"
-LEFT = "What left camtorch stands in docs/leaving-0.3.md"
-"""The end of errors about names that are not known."""
 
 # What is public needs torch, which takes a second to import; `camtorch --help` does not. So names come at first use.
 
@@ -28,6 +26,8 @@ if not TYPE_CHECKING:  # a checker knows the names, and no others
             _load()
             if name in globals():
                 return globals()[name]
+        from camtorch._arguments import LEFT
+
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}. {LEFT}")
 
 

@@ -5,7 +5,7 @@
 
 from typing import TYPE_CHECKING
 
-from camtorch import LEFT
+from camtorch._arguments import LEFT
 from camtorch.augment.augmentation import Augmentation, Range
 from camtorch.augment.box_crop import BoxCrop
 from camtorch.augment.change import Change

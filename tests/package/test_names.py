@@ -25,6 +25,7 @@ def on_the_page():
 
 def with_holders(name):
     """The name, and those of what it belongs to: `ct.Warp.save(step=)`, `ct.Warp.save`, `ct.Warp`."""
+    name = name.replace("ct.models.", "ct.")
     while name:
         yield name
         cut = name.rfind("(") if name.endswith(")") else max(name.rfind("."), name.rfind(" "))
