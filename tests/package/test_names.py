@@ -41,3 +41,22 @@ def test_every_name_that_went_stands_on_the_page(new):
 def test_the_page_names_nothing_that_is_there(new):
     there = {holder for name in new for holder in with_holders(name)}
     assert sorted(on_the_page() & there) == []
+
+
+def words():
+    for line in Path(__file__).with_name("words-gone.txt").read_text().splitlines():
+        word, *places = line.partition("#")[0].split() or [""]
+        if word:
+            yield pytest.param(word, places, id=word)
+
+
+@pytest.mark.parametrize(("word", "places"), [*words()])
+def test_a_word_that_left_is_nowhere_in_the_package(word, places):
+    files = [ROOT / name for name in ("README.md", "pyproject.toml", "mkdocs.yml", ".ci/run")]
+    files += [
+        file for file in (ROOT / "camtorch").rglob("*") if file.suffix in (".py", ".c", ".h", ".js", ".html", ".json")
+    ]
+    assert len(files) > 200
+    found = [str(file.relative_to(ROOT)) for file in files if word in file.read_text("utf-8").lower()]
+    assert sorted(set(found) - set(places)) == []
+    assert word in PAGE.read_text("utf-8").lower()
