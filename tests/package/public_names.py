@@ -87,7 +87,7 @@ def of_value(name, value, public_classes):
         yield from (f"{name}({word}=)" for word in keywords(value))
         bases = [base for base in value.__mro__[1:] if base in public_classes]
         inherited = {member for base in (*bases, torch.nn.Module, dict, tuple, Exception) for member in dir(base)}
-        for member in public({*dir(value), *getattr(value, "__dataclass_fields__", ())} - inherited):
+        for member in public({*dir(value), *getattr(value, "__annotations__", ())} - inherited):
             attribute = inspect.getattr_static(value, member, None)
             yield f"{name}.{member}"
             if isinstance(attribute, (types.FunctionType, classmethod, staticmethod)):
