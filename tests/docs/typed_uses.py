@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from typing_extensions import assert_type
 
 import camtorch as ct
+from camtorch.convert.conversion import Conversion
 
 Pair = tuple[Tensor, Tensor]
 
@@ -43,7 +44,7 @@ def cameras() -> ct.KannalaBrandt:
     assert_type(ct.MODELS["pinhole"], type[ct.Camera])
     assert_type(ct.MODELS["pinhole"].from_fov(60, image_size=(4, 4)), ct.Camera)
     assert_type(ct.Mixed([batch[0], camera]).project(torch.rand(2, 5, 3)), Pair)
-    assert_type(camera.convert(ct.Fisheye624), ct.Conversion[ct.Fisheye624])
+    assert_type(camera.convert(ct.Fisheye624), Conversion[ct.Fisheye624])
     assert_type(camera.convert(ct.Fisheye624, max_angle=1.0).camera, ct.Fisheye624)
     assert_type(camera.convert("fisheye624").camera, ct.Camera)
     assert_type(camera.convert(ct.Pinhole).rms, Tensor)
