@@ -22,6 +22,7 @@ import camtorch as ct
 from benchmarks import cameras
 from benchmarks.harness import KORNIA, NAMES, OURS, Figure, Options, Row, Run, Table, measure, threads
 from benchmarks.memory import peak
+from camtorch.stereo.rectification import Rectification
 
 try:
     import deltacamera as dc
@@ -185,7 +186,7 @@ def _deltacamera(camera: ct.Camera) -> Any:
     return dc.Camera(intrinsic_matrix=camera.K.cpu().numpy(), distortion_model=model, image_shape=camera.image_size)
 
 
-def rectification(key: str, size: tuple[int, int], dtype: torch.dtype, device: torch.device) -> ct.Rectification:
+def rectification(key: str, size: tuple[int, int], dtype: torch.dtype, device: torch.device) -> Rectification:
     """Return two cameras of a model, a little turned against each other, into images of their size."""
     camera = cameras.camera(key, device, dtype, size=size).requires_grad_(False)
     extrinsics = ct.Extrinsics([0.01, -0.02, 0.015], [-0.1, 0.002, -0.001]).to(device).requires_grad_(False)
@@ -218,7 +219,7 @@ def _pair(key: str, channels: int, options: Options) -> Iterator[Row]:
     yield Row("stereo, errors", case, errors)
 
 
-def _remap_pair(found: ct.Rectification, arrays: list[np.ndarray], kind: int) -> Run:
+def _remap_pair(found: Rectification, arrays: list[np.ndarray], kind: int) -> Run:
     """OpenCV's maps of the same rectified cameras, made once."""
     sides = (found.source_left, found.rotation_left), (found.source_right, found.rotation_right)
     maps = [opencv_maps(camera, found.camera_left, turn.cpu().numpy(), kind)() for camera, turn in sides]

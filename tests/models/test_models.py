@@ -81,7 +81,7 @@ def test_f_theta_is_nvidias_formula(cde):
     expected = flat @ torch.tensor([[c, d], [e, 1]], dtype=torch.float64).T + torch.from_numpy(centre)
     found, valid = camera.project(rays)
     assert valid.all()
-    assert isinstance(camera, ct.FThetaSheared) == (d != 0)
+    assert isinstance(camera, ct.models.FThetaSheared) == (d != 0)
     torch.testing.assert_close(found.detach(), expected, rtol=0, atol=1e-9)
 
 
