@@ -282,29 +282,40 @@ INLINE int64_t T(patch)(const Part *part, const int order, R a, R b, R (*restric
     return 2 * (T(spline)(order, part->m, down, weight[1], slope[1]) * part->n + column);
 }
 
+/* Of du and dv of rows of control points, weighted by row, what the weights of columns make of both */
+INLINE void T(across)(const int order, const R *restrict line, const R *restrict weight, R *restrict sum) {
+    R made[8];
+    for (int j = 0; j < 2 * (order + 1); j++) made[j] = line[j] * weight[j / 2];
+    for (int axis = 0; axis < 2; axis++)
+        sum[axis] = (made[axis] + made[2 + axis]) + (order == 3 ? made[4 + axis] + made[6 + axis] : made[4 + axis]);
+}
+
 INLINE void T(surface_of)(const Part *part, const R *k, const int order, int n, const R *restrict a, const R *restrict b,
                           R *restrict u, R *restrict v, T(Jacobian) *restrict to) {
-    const int width = 2 * (order + 1); /* du and dv of a row of control points */
+    const int width = 2 * (order + 1);
     const R sa = (R)part->cells[0], sb = (R)part->cells[1];
+    const int64_t row = 2 * (int64_t)part->n;
     for (int i = 0; i < n; i++) {
-        R weight[2][4], slope[2][4], line[8] = {0}, change[8] = {0}, sum[2] = {0}, by_a[2] = {0}, by_b[2] = {0};
-        const R *at = k + T(patch)(part, order, a[i], b[i], weight, slope);
-        for (int q = 0; q <= order; q++, at += 2 * part->n)
-            for (int j = 0; j < width; j++) line[j] += weight[1][q] * at[j], change[j] += slope[1][q] * at[j];
-        for (int j = 0; j < width; j++) {
-            sum[j % 2] += weight[0][j / 2] * line[j];
-            by_a[j % 2] += slope[0][j / 2] * line[j], by_b[j % 2] += weight[0][j / 2] * change[j];
-        }
+        R weight[2][4] = {{0}}, slope[2][4] = {{0}}, line[8], sum[2];
+        const R *restrict at = k + T(patch)(part, order, a[i], b[i], weight, slope), *restrict last = order == 3 ? at + 3 * row : at;
+        for (int j = 0; j < width; j++)
+            line[j] = (weight[1][0] * at[j] + weight[1][1] * at[row + j]) + (weight[1][2] * at[2 * row + j] + weight[1][3] * last[j]);
+        T(across)(order, line, weight[0], sum);
         u[i] = a[i] + sum[0], v[i] = b[i] + sum[1];
         if (!to) continue;
-        to->ua[i] = 1 + by_a[0] * sa, to->va[i] = by_a[1] * sa;
-        to->ub[i] = by_b[0] * sb, to->vb[i] = 1 + by_b[1] * sb;
+        T(across)(order, line, slope[0], sum);
+        to->ua[i] = 1 + sum[0] * sa, to->va[i] = sum[1] * sa;
+        for (int j = 0; j < width; j++)
+            line[j] = (slope[1][0] * at[j] + slope[1][1] * at[row + j]) + (slope[1][2] * at[2 * row + j] + slope[1][3] * last[j]);
+        T(across)(order, line, weight[0], sum);
+        to->ub[i] = sum[0] * sb, to->vb[i] = 1 + sum[1] * sb;
     }
 }
 
 static NOT_INLINE void T(surface)(const Part *part, const R *k, int n, const R *restrict a, const R *restrict b,
                                   R *restrict u, R *restrict v, T(Jacobian) *restrict to) {
-    if (part->flags == 3) T(surface_of)(part, k, 3, n, a, b, u, v, to);
+    if (part->flags == 3 && to) T(surface_of)(part, k, 3, n, a, b, u, v, to);
+    else if (part->flags == 3) T(surface_of)(part, k, 3, n, a, b, u, v, NULL);
     else T(surface_of)(part, k, 2, n, a, b, u, v, to);
 }
 
