@@ -13,6 +13,7 @@ from torch import Tensor
 from torch.nn.utils import parametrize
 
 from camtorch._arguments import (
+    LEFT,
     Numbers,
     as_image_size,
     as_whole,
@@ -336,7 +337,7 @@ class Camera(Freezable):
     @classmethod
     def variant(cls, text: str) -> type[Camera]:
         """Return the class of the key `key:text`, such as another grid of `Splined`; a ValueError if there is none."""
-        raise ValueError(f"{cls.__name__}: there is no variant {text!r:.60}")
+        raise ValueError(f"{cls.__name__}: there is no variant {text!r:.60}. {LEFT}")
 
     @classmethod
     def smoothness(cls) -> Tensor | None:
@@ -729,7 +730,8 @@ def as_model(model: type[Camera] | str, owner: str) -> type[Camera]:
             keys = {name.lower(): key for key, cls in MODELS.items() for name in (key, cls.__name__)} | _ELSEWHERE
             close = difflib.get_close_matches(model.lower(), keys, 1)
             meant = f"did you mean {keys[close[0]]!r}? Known" if close else "known"
-            raise ValueError(f"{owner}: there is no camera model {model!r}; {meant} are {', '.join(sorted(MODELS))}")
+            keys_text = ", ".join(sorted(MODELS))
+            raise ValueError(f"{owner}: there is no camera model {model!r}; {meant} are {keys_text}. {LEFT}")
         return MODELS[model]
     if isinstance(model, type) and model.__module__ == parametrize.__name__:  # of one parametrized camera
         model = model.__bases__[0]
