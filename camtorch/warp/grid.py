@@ -278,9 +278,9 @@ def local_scale(grid: Tensor, mapped: Tensor, source: Camera) -> Tensor:
     scale = grid.new_zeros(grid.shape[:-1])
     for dim in (1, 2):
         n = grid.shape[dim] - 1
-        u, v = here = grid.narrow(dim, 0, n).unbind(-1)
+        u, v = grid.narrow(dim, 0, n).unbind(-1)
         right, down = grid.narrow(dim, 1, n).unbind(-1)
-        step = lengths(source, ((right - u) * (width / 2), (down - v) * (height / 2)), here)
+        step = lengths(source, ((right - u) * (width / 2), (down - v) * (height / 2)), (u, v))
         step = step * (mapped.narrow(dim, 1, n) & mapped.narrow(dim, 0, n))
         for start in (0, 1):
             part = scale.narrow(dim, start, n)
