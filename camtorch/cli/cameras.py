@@ -1,4 +1,4 @@
-"""What the command line reads: the cameras of a calibration file, by the options that say which and of what model."""
+"""The cameras of a calibration file, by the options that say which, and of what model."""
 
 from __future__ import annotations
 
@@ -7,46 +7,41 @@ import warnings
 from collections.abc import Callable, Sequence
 from itertools import chain
 from pathlib import Path
-from typing import Any
 
 from camtorch import lenses
 from camtorch.camera import Camera, as_model
 from camtorch.cli.terminal import note
 from camtorch.cli.words import GUESS, LENS
-from camtorch.extrinsics import Extrinsics
 from camtorch.io import load, opencv
 from camtorch.rig import Rig
 
 _ASPECT = 0.01  # the part by which the aspect ratios of a camera and an image may differ, as sizes are rounded
 _WIDE = 100  # degrees, horizontally, from which on lenses are rather fisheyes
+Size = tuple[int, int]
+"""(height, width)."""
 
 
 def read_rig(
-    path: Path,
-    name: str | None = None,
-    model: str | None = None,
-    size: tuple[int, int] | None = None,
-    *,
-    stated: bool = False,
+    path: Path, name: str | None = None, model: str | None = None, size: Size | None = None, *, stated: bool = False
 ) -> Rig:
-    """The cameras of a file.
+    """Read the cameras of a file.
 
     Args:
-        path: a file of any format; `LENS` and the name of a real lens, best one of the aspect ratio of `size`; or
+        path: A file of any format; `LENS` and the name of a real lens, best one of the aspect ratio of `size`; or
             `GUESS` and a field of view of images of `size`.
-        name: the only camera wanted.
-        model: a key of `camtorch.MODELS`, for OpenCV's files, which may not say it.
-        size: (height, width), for cameras whose file does not say it.
-        stated: whether a file that leaves the model open is refused, rather than taken for the usual one.
+        name: The only camera wanted.
+        model: A key of `camtorch.MODELS`, for OpenCV's files, which may not state it.
+        size: For cameras whose file does not state it.
+        stated: Whether a file that leaves the model open is refused, rather than read as the usual one.
 
     Raises:
-        CameraFileError: the file cannot be used. ValueError: no camera of that name, or of another size; a model for a
-            file that says its own, or none for one that leaves it open and has to say it.
+        CameraFileError: If the file cannot be used. ValueError: If no camera has that name, or one is of another size;
+            if a model is given for a file that states its own, or none for one that has to state it and does not.
     """
     if str(path).startswith(LENS):
-        return _of_lens(str(path).removeprefix(LENS), size)
+        return _lens(str(path).removeprefix(LENS), size)
     if str(path).startswith(GUESS):
-        return _guessed(str(path).removeprefix(GUESS), model, size)
+        return _guess(str(path).removeprefix(GUESS), model, size)
     rig = load(path) if model is None else opencv.read_rig(path, model)
     if stated and model is None and rig.format == "opencv" and _leaves_open(path):
         raise ValueError(
@@ -65,7 +60,7 @@ def read_rig(
     return rig
 
 
-def _of_lens(words: str, size: tuple[int, int] | None) -> Rig:
+def _lens(words: str, size: Size | None) -> Rig:
     try:
         lenses.find(words)
     except ValueError as error:
@@ -76,7 +71,7 @@ def _of_lens(words: str, size: tuple[int, int] | None) -> Rig:
     return Rig({"camera": found[0].camera()})
 
 
-def _guessed(fov: str, model: str | None, size: tuple[int, int] | None) -> Rig:
+def _guess(fov: str, model: str | None, size: Size | None) -> Rig:
     if size is None:
         raise ValueError(f"{GUESS}{fov}: a field of view is one of an image, and of what size is not known here")
     kind = as_model(model or ("pinhole" if float(fov) < _WIDE else "kannala_brandt"), "--model")
@@ -92,87 +87,60 @@ def _leaves_open(path: Path) -> bool:
     return any(issubclass(warning.category, opencv.AmbiguousModelWarning) for warning in caught)
 
 
-def _one(path: Path, rig: Rig, name: str | None = None) -> tuple[str, Camera]:
-    """The camera of that name, or the only one, and its name."""
+def _one(path: Path, rig: Rig, name: str | None = None) -> Camera:
+    """Return the camera of that name, or the only one."""
     if name is None and len(rig.cameras) > 1:
         raise ValueError(f"{path}: several cameras; --name says which: {', '.join(rig.cameras)}")
     name = next(iter(rig.cameras)) if name is None else name
     camera = rig.camera_of(name)
     if camera.batch_shape:
         raise ValueError(f"{path}: {name} is a batch of {tuple(camera.batch_shape)} cameras; here one is needed")
-    return name, camera
-
-
-def read_camera(
-    path: Path, name: str | None = None, model: str | None = None, size: tuple[int, int] | None = None
-) -> Camera:
-    """The one camera of a file, or the one of that name; see `read_rig`.
-
-    Raises:
-        ValueError: there are several, or a batch.
-    """
-    return _one(path, read_rig(path, name, model, size))[1]
-
-
-def read_other(path: Path, name: str | None = None, model: str | None = None) -> Camera:
-    """The camera to compare with: the only one of its file, or the one of that name; a model if the file needs one."""
-    rig = read_rig(path, model=model if model is not None and _leaves_open(path) else None)
-    return _one(path, rig, None if len(rig.cameras) == 1 else name)[1]
-
-
-def read_posed(image: Path, size: tuple[int, int], arguments: argparse.Namespace) -> tuple[Camera, Extrinsics | None]:
-    """The camera that took an image of that (height, width), by the options of `_photograph`; and its pose.
-
-    Raises:
-        ValueError: as `read_camera`; no file is given, or it is for another size and is not to be scaled.
-    """
-    rig, name, camera = _unfitted(image, size, arguments)
-    return fitting(camera, arguments.camera, image, size, arguments.rescale), rig.extrinsics.get(name)
-
-
-def read_for_many(
-    images: Sequence[Path], size_of: Callable[[Path], tuple[int, int] | None], arguments: argparse.Namespace
-) -> Camera:
-    """The camera that took many images, by the options of `_photograph`; see `fitting`.
-
-    Where its file states no size, it is for the first image that has one, by which a lens is chosen, or guessed, too.
-
-    Raises:
-        ValueError: as `read_camera`; no file is given; it is for another size than all images, and not to be scaled.
-    """
-    sized = ((image, size) for image in images if (size := size_of(image)))
-    first, size = next(sized, (images[0], None))
-    camera = _unfitted(first, size, arguments)[2]
-    if size is not None:
-        sizes = chain([size], (other for _, other in sized))  # read as far as one fits
-        if camera.image_size is None or all(_unfitting(camera, one, arguments.rescale) for one in sizes):
-            camera = fitting(camera, arguments.camera, first, size, arguments.rescale)
     return camera
 
 
-def _unfitted(image: Path, size: tuple[int, int] | None, arguments: argparse.Namespace) -> tuple[Rig, str, Camera]:
+def read_camera(path: Path, name: str | None = None, model: str | None = None, size: Size | None = None) -> Camera:
+    """Read the one camera of a file, or the one of that name; see `read_rig`."""
+    return _one(path, read_rig(path, name, model, size))
+
+
+def read_other(path: Path, name: str | None = None, model: str | None = None) -> Camera:
+    """Read the camera to compare with: the only one of its file, or the one of that name; a model if it needs one."""
+    rig = read_rig(path, model=model if model is not None and _leaves_open(path) else None)
+    return _one(path, rig, None if len(rig.cameras) == 1 else name)
+
+
+def read_for_images(
+    images: Sequence[Path], size_of: Callable[[Path], Size | None], arguments: argparse.Namespace
+) -> Camera:
+    """Read the camera that took images, by the options `--camera`, `--lens` or `--guess-fov`; see `fitting`.
+
+    If its file states no size, it is for the first image that has one, for which a lens is chosen, or guessed, too.
+
+    Raises:
+        ValueError: As `read_camera`; if no file is given; if it fits none of the images.
+    """
     path: Path | None = arguments.camera
+    sized = ((image, size) for image in images if (size := size_of(image)))
+    first, size = next(sized, (images[0], None))
     if path is None:
         raise ValueError(
-            f"{image}: which camera took it? --camera FILE, its calibration, says so, or --lens NAME: an image alone "
+            f"{first}: which camera took it? --camera FILE, its calibration, says so, or --lens NAME: an image alone "
             "does not tell; --guess-fov DEGREES guesses"
         )
     is_file = not str(path).startswith((LENS, GUESS))
-    rig = read_rig(path, arguments.name, arguments.from_model, None if is_file else size)
-    return rig, *_one(path, rig)
+    camera = read_camera(path, arguments.name, arguments.from_model, None if is_file else size)
+    if size is not None:
+        sizes = chain([size], (other for _, other in sized))  # read as far as one fits
+        if camera.image_size is None or all(_unfitting(camera, one, arguments.rescale) for one in sizes):
+            camera = fitting(camera, path, first, size, arguments.rescale)
+    return camera
 
 
-def settings_of(camera: Camera) -> dict[str, Any]:
-    """A camera as JSON, for the account of a job."""
-    values = {name: getattr(camera, name).detach().tolist() for name in ("intrinsics", "distortion")}
-    return {"model": camera.key, "image_size": camera.image_size, **values}
-
-
-def fitting(camera: Camera, path: Path, image: Path, size: tuple[int, int], rescale: bool) -> Camera:
-    """The camera of a file for an image of that (height, width), which the camera gets where it has none.
+def fitting(camera: Camera, path: Path, image: Path, size: Size, rescale: bool) -> Camera:
+    """Return the camera of a file for an image of that size, which the camera gets if it has none.
 
     Raises:
-        ValueError: it is for another size and is not to be scaled.
+        ValueError: If it is for another size and is not to be scaled.
     """
     if camera.image_size is None:
         camera.image_size = size
@@ -183,8 +151,8 @@ def fitting(camera: Camera, path: Path, image: Path, size: tuple[int, int], resc
     return camera if camera.image_size == size else camera.resize(*size)
 
 
-def _unfitting(camera: Camera, size: tuple[int, int], rescale: bool) -> str:
-    """Why a camera is not one of images of that (height, width), if it is not."""
+def _unfitting(camera: Camera, size: Size, rescale: bool) -> str:
+    """Return why a camera is not one of images of that size, if it is not."""
     if camera.image_size == size:
         return ""
     if size == (camera.width, camera.height):
@@ -198,5 +166,5 @@ def _unfitting(camera: Camera, size: tuple[int, int], rescale: bool) -> str:
     )
 
 
-def _shown(size: tuple[int, int]) -> str:
+def _shown(size: Size) -> str:
     return f"{size[1]}x{size[0]}"

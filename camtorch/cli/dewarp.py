@@ -226,7 +226,7 @@ def _without(source: Path, text: str) -> str:
 
 def _dewarping(arguments: argparse.Namespace, sources: Sequence[Path]) -> Dewarping:
     """Return what is done to each; the camera gets the size of the first image if its file states none."""
-    camera = cameras.read_for_many(sources, _size_of, arguments)
+    camera = cameras.read_for_images(sources, _size_of, arguments)
     if any(map(videos.is_video, sources)):
         videos.require()
     encoder = videos.Encoder(arguments.codec, arguments.crf)
