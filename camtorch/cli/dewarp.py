@@ -44,13 +44,14 @@ class Dewarping:
     fov: float | None
     """Degrees."""
     image_size: tuple[int, int] | None
-    encoder: videos.Encoder
+    encoder: dict[str, Any]
+    """Options of `videos.remake`."""
     _warps: dict[tuple[int, int], tuple[Dewarp, dict[str, Any]]] = field(default_factory=dict)
 
     def __call__(self, source: Path, target: Path, **options: Any) -> dict[str, Any]:
         """Return facts about the new camera; options are those of `videos.remake`."""
         if videos.is_video(source):
-            return videos.remake(source, target, lambda size: self._warp(source, size), self.encoder, **options)
+            return videos.remake(source, target, lambda size: self._warp(source, size), **self.encoder, **options)
         image, orientation = _photographs.read_stored(source)
         rows, columns = image.shape[-2:]
         warp, facts = self._warp(source, (rows, columns))
@@ -229,7 +230,7 @@ def _dewarping(arguments: argparse.Namespace, sources: Sequence[Path]) -> Dewarp
     camera = cameras.read_for_images(sources, _size_of, arguments)
     if any(map(videos.is_video, sources)):
         videos.require()
-    encoder = videos.Encoder(arguments.codec, arguments.crf)
+    encoder = {"codec": arguments.codec, "crf": arguments.crf}
     work = Dewarping(
         camera, arguments.camera, arguments.rescale, arguments.projection, arguments.fov, arguments.size, encoder
     )

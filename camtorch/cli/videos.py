@@ -6,7 +6,6 @@ import contextlib
 import importlib
 import os
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -38,16 +37,6 @@ _COLOURS = ("color_range", "colorspace", "color_primaries", "color_trc")
 
 class VideoFileError(ValueError):
     """A video that cannot be read or written. The text names the file and the reason."""
-
-
-@dataclass(frozen=True)
-class Encoder:
-    """How videos are written."""
-
-    codec: str | None = None
-    """Of CODECS; by default what suits the format."""
-    crf: int | None = None
-    """Its quality; by default one at which hardly anything is lost."""
 
 
 def is_video(path: Path) -> bool:
@@ -110,9 +99,8 @@ def frames(path: Path) -> Iterator[tuple[float, Any]]:
     with _opened(path) as (container, stream):
         start = None
         for frame, _ in _decoded(container, stream):
-            seconds = float(frame.pts * frame.time_base)
-            start = seconds if start is None else start
-            yield seconds - start, frame
+            start = frame.time if start is None else start
+            yield frame.time - start, frame
 
 
 def _span(container: Any) -> tuple[float, float]:
@@ -157,23 +145,26 @@ def _decoded(container: Any, stream: Any, *others: Any) -> Iterator[tuple[Any, A
 # -- writing
 
 
+@torch.no_grad()
 def remake(
     source: Path,
     target: Path,
     warp_of: Callable[[tuple[int, int]], tuple[Warp, dict[str, Any]]],
-    encoder: Encoder,
+    codec: str | None = None,
+    crf: int | None = None,
     done: Callable[[], object] = lambda: None,
 ) -> dict[str, Any]:
     """Write a video of the warped frames of another one, whole or not at all, with the folders that lack.
 
     Time stamps, sound, subtitles, the rotation with which it is shown, and the meaning of colours are those of the
-    source. Pixels are square then, and of eight bits in 4:2:0.
+    source. Frames are warped as nearly all are stored, in YUV of eight bits in 4:2:0, which is half the work of RGB.
 
     Args:
         source: A video.
         target: A new one, whose suffix says the format.
         warp_of: Returns the warp for frames of a (height, width), and facts about it.
-        encoder: How it is written.
+        codec: Of CODECS; by default what suits the format.
+        crf: Its quality; by default one at which hardly anything is lost.
         done: Is called after each frame.
 
     Returns:
@@ -187,7 +178,9 @@ def remake(
     if first is None:
         raise VideoFileError(f"{source}: no frame of it can be read")
     warp, facts = warp_of((first.height, first.width))
-    warps, count, end = _plane_warps(warp, first), 0, 0.0
+    black = 0 if first.reformat(format="yuv420p").color_range == 2 else 16
+    whole, colour = _still(warp, black), _still(warp, 128, halved=True)
+    count, end = 0, 0.0
     target.parent.mkdir(parents=True, exist_ok=True)
     # bitexact: no random identifiers
     options = {"format": WRITTEN[target.suffix.lower()], "options": {"fflags": "+bitexact"}}
@@ -196,7 +189,7 @@ def remake(
         _opened(source) as (container, stream),
         require().open(file, "w", **options) as output,
     ):
-        new = _new_stream(output, warp.target, first, _rate(stream), encoder, target)
+        new = _new_stream(output, first, _rate(stream), codec, crf, target, warp.target)
         others = [other for other in container.streams if other.type in ("audio", "subtitle")]
         copies = {other.index: _copied_stream(output, other, source, target) for other in others}
         begin, length = _span(container)
@@ -209,8 +202,13 @@ def remake(
             if (frame.height, frame.width) != (first.height, first.width):
                 was, now = f"{first.width}x{first.height}", f"{frame.width}x{frame.height}"
                 raise VideoFileError(f"{source}: its frames are {was}, then {now}")
-            end = max(end, float(frame.pts * frame.time_base + 1 / _rate(stream)) - begin)
-            output.mux(new.encode(_warped(warps, frame)))
+            end = max(end, frame.time + float(1 / _rate(stream)) - begin)
+            old, made = frame.reformat(format="yuv420p"), require().VideoFrame(new.width, new.height, "yuv420p")
+            for plane, pixels, target_pixels in zip((whole, colour, colour), _planes(old), _planes(made), strict=True):
+                target_pixels[:] = plane(torch.from_numpy(pixels)[None, None])[0, 0].numpy()
+            for name in ("pts", "time_base", "duration", *_COLOURS):
+                setattr(made, name, getattr(old, name))
+            output.mux(new.encode(made))
             count += 1
             done()
         output.mux(new.encode(None))
@@ -219,18 +217,16 @@ def remake(
     return facts | {"frames": count}
 
 
-def _plane_warps(warp: Warp, first: Any) -> tuple[Warp, Warp, Warp]:
-    """Return the warps of the planes of YUV 4:2:0, of brightness and of two colours of half the resolution.
+def _planes(frame: Any) -> Iterator[np.ndarray[Any, Any]]:
+    """Yield the planes (H, W) of a frame, brightness and two colours of half the resolution; they share its memory."""
+    for plane in frame.planes:
+        yield np.frombuffer(plane, np.uint8).reshape(-1, plane.line_size)[: plane.height, : plane.width]
 
-    Nearly all videos are stored so, and warping that is half the work of RGB.
-    """
-    black = 0 if first.reformat(format="yuv420p").color_range == 2 else 16
-    pairs = ((warp.source, warp.target, black), (_halved(warp.source), _halved(warp.target), 128))
-    whole, half = (
-        Warp(source, target, warp.rotation, fill=float(fill), tolerance=warp.tolerance).requires_grad_(False)
-        for source, target, fill in pairs
-    )
-    return whole, half, half
+
+def _still(warp: Warp, fill: int, *, halved: bool = False) -> Warp:
+    """Return the warp of the planes of brightness, or of colours, which does not learn."""
+    source, target = (_halved(warp.source), _halved(warp.target)) if halved else (warp.source, warp.target)
+    return Warp(source, target, warp.rotation, fill=float(fill), tolerance=warp.tolerance).requires_grad_(False)
 
 
 def _halved(camera: Camera) -> Camera:
@@ -241,26 +237,10 @@ def _halved(camera: Camera) -> Camera:
     return camera.replace(intrinsics=camera.intrinsics.detach() + shift)
 
 
-@torch.no_grad()
-def _warped(warps: tuple[Warp, Warp, Warp], frame: Any) -> Any:
-    """Return the warped frame, of the same time."""
-    frame = frame.reformat(format="yuv420p")
-    new = require().VideoFrame(warps[0].target.width, warps[0].target.height, "yuv420p")
-    for warp, old, made in zip(warps, _planes(frame), _planes(new), strict=True):
-        made[:] = warp(torch.from_numpy(old)[None, None])[0, 0].numpy()
-    for name in ("pts", "time_base", "duration", *_COLOURS):
-        setattr(new, name, getattr(frame, name))
-    return new
-
-
-def _planes(frame: Any) -> Iterator[np.ndarray[Any, Any]]:
-    """Yield the planes (H, W) of a frame, which share its memory."""
-    for plane in frame.planes:
-        yield np.frombuffer(plane, np.uint8).reshape(-1, plane.line_size)[: plane.height, : plane.width]
-
-
-def _new_stream(output: Any, camera: Camera, first: Any, rate: Fraction, encoder: Encoder, target: Path) -> Any:
-    codec = encoder.codec or ("libvpx-vp9" if output.format.name == "webm" else "libx264")
+def _new_stream(
+    output: Any, first: Any, rate: Fraction, codec: str | None, crf: int | None, target: Path, camera: Camera
+) -> Any:
+    codec = codec or ("libvpx-vp9" if output.format.name == "webm" else "libx264")
     if codec == "libx264" and (camera.width % 2 or camera.height % 2):
         size = f"{camera.width}x{camera.height}"
         raise VideoFileError(f"{target}: {size}, but {codec} wants even numbers; --size names them")
@@ -273,9 +253,8 @@ def _new_stream(output: Any, camera: Camera, first: Any, rate: Fraction, encoder
     for name in _COLOURS:
         setattr(stream.codec_context, name, getattr(like, name))
     stream.codec_context.thread_count = _THREADS
-    stream.options = CODECS[codec] | ({} if encoder.crf is None else {"crf": str(encoder.crf)})
-    matrix = first.side_data.get("DISPLAYMATRIX")
-    if matrix is not None:
+    stream.options = CODECS[codec] | ({} if crf is None else {"crf": str(crf)})
+    if matrix := first.side_data.get("DISPLAYMATRIX"):
         stream.set_display_matrix(np.frombuffer(matrix, np.int32).tolist())
     return stream
 
