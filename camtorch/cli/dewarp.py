@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import torch
@@ -20,7 +18,6 @@ from camtorch.cli.commands import are_several
 from camtorch.cli.processes import Outcome, Pair
 from camtorch.cli.targets import IMAGES
 from camtorch.cli.terminal import bar, note, say
-from camtorch.io.writing import all_left_over
 from camtorch.warp.dewarp import Dewarp, Projection
 from camtorch.warp.warp import Warp
 
@@ -111,7 +108,7 @@ def _single(arguments: argparse.Namespace, source: Path) -> None:
     is_video = videos.is_video(source)
     output = Path(arguments.output or f"dewarped{videos.written_suffix(source) if is_video else '.png'}")
     targets.check(output, force=arguments.force, inputs=(source, arguments.camera))
-    _writer(source).check_kind(output)
+    (videos if is_video else images).check_kind(output)
     if not source.exists():
         raise ValueError(f"{source}: no such file")
     work = _dewarping(arguments, [source])
@@ -129,51 +126,36 @@ def _single(arguments: argparse.Namespace, source: Path) -> None:
 
 def _many(arguments: argparse.Namespace) -> int:
     """Make all files, and print what became of them; return the exit status, 1 if any failed."""
-    output = _folder(arguments)
-    pairs = [(path, _target(path, output / place, arguments.suffix)) for path, place in _found(arguments, output)]
+    if any(Path(name).suffix.lower() in _CALIBRATIONS for name in arguments.image):
+        raise ValueError(
+            f"{' '.join(arguments.image)}: all of them are taken for images; --camera names the calibration, and -o "
+            "the new image: camtorch dewarp photo.jpg --camera camera.yml -o straight.png"
+        )
+    known = IMAGES | videos.FORMATS
+    output = targets.folder(arguments.output, known)
+    found = targets.find(arguments.image, known, output)
+    pairs = [(path, _target(path, output / place, arguments.suffix)) for path, place in found]
     others = [arguments.camera] if arguments.camera else []
     todo = targets.to_make(pairs, others, resume=arguments.resume, force=arguments.force)
-    work = _dewarping(arguments, [source for source, _ in pairs])
-    outcomes = _outcomes(work, todo, arguments)
-    for line, names in _notes(outcomes).items():
-        note(f"{names[0]}: {line}" if len(names) == 1 else f"{names[0]} and {len(names) - 1} more: {line}")
-    failed = [source for source, _ in todo if outcomes[source].failure]
-    for source in failed:
-        say(f"error: {source}: {_without(source, outcomes[source].failure)}")
-    facts = [{**one.facts, "frames": 0} for one in outcomes.values() if not one.failure]
+    work = _dewarping(arguments, [path for path, _ in found])
+    notes, failed, facts = dict[str, list[Path]](), dict[Path, str](), list[dict[str, Any]]()
+    for (source, _), outcome in _made(work, todo, arguments):
+        for text in outcome.notes:
+            notes.setdefault(text.removeprefix(str(source)).lstrip(": "), []).append(source)
+        if outcome.failure:
+            failed[source] = outcome.failure.removeprefix(str(source)).lstrip(": ")
+        else:
+            facts.append({**outcome.facts, "frames": 0})
+    for text, sources in notes.items():
+        note(f"{sources[0]} {text}" if len(sources) == 1 else f"{sources[0]} and {len(sources) - 1} more: {text}")
+    for source, text in failed.items():
+        say(f"error: {source}: {text}")
     alike = facts and all(one == facts[0] for one in facts)
     parts = [f"{len(facts)} of {len(pairs)} files made" + (f", {_described(arguments, facts[0])}" if alike else "")]
     parts += [f"{len(pairs) - len(todo)} were there already"] if len(pairs) > len(todo) else []
     parts += [f"{len(failed)} failed"] if failed else []
     print(f"{output}: {'; '.join(parts)}")
     return 1 if failed else 0
-
-
-def _folder(arguments: argparse.Namespace) -> Path:
-    """Return the folder of outputs."""
-    if any(Path(name).suffix.lower() in _CALIBRATIONS for name in arguments.image):
-        raise ValueError(
-            f"{' '.join(arguments.image)}: all of them are taken for images; --camera names the calibration, and -o "
-            "the new image: camtorch dewarp photo.jpg --camera camera.yml -o straight.png"
-        )
-    if arguments.output is None:
-        raise ValueError("into which folder? -o OUT/ names it, for several images or a folder of them")
-    path = Path(arguments.output)
-    if os.path.lexists(path) and not path.is_dir():
-        raise ValueError(f"{path}: is no folder, which -o names for several images or a folder of them")
-    is_file = path.suffix.lower() in IMAGES | videos.FORMATS and not arguments.output.endswith(_SLASHES)
-    if is_file and not path.exists():
-        raise ValueError(f"{path}: is the name of one file, but there may be several; -o OUT/ names a folder")
-    return path
-
-
-def _found(arguments: argparse.Namespace, output: Path) -> list[tuple[Path, Path]]:
-    return targets.find(arguments.image, IMAGES | videos.FORMATS, output)
-
-
-def _writer(source: Path) -> ModuleType:
-    """Return the module that writes what is made of a file."""
-    return videos if videos.is_video(source) else images
 
 
 def _target(source: Path, target: Path, suffix: str | None) -> Path:
@@ -183,51 +165,35 @@ def _target(source: Path, target: Path, suffix: str | None) -> Path:
         target = target.with_suffix(videos.written_suffix(source))
     if suffix is not None and is_video == videos.is_video(Path("any" + suffix)):
         target = target.with_suffix(suffix)
-    _writer(source).check_kind(target)
+    (videos if is_video else images).check_kind(target)
     return target
 
 
-def _outcomes(work: Dewarping, todo: Sequence[Pair], arguments: argparse.Namespace) -> dict[Path, Outcome]:
-    """Make files, and return what became of them by their sources."""
+def _made(work: Dewarping, todo: Sequence[Pair], arguments: argparse.Namespace) -> list[tuple[Pair, Outcome]]:
+    """Make files by processes, and return what became of them."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    count = max(min(arguments.jobs or cores, len(todo)), 1)
-    outcomes: dict[Path, Outcome] = {}
-    _remove_left_over(todo)
+    count, outcomes = max(min(arguments.jobs or cores, len(todo)), 1), list[tuple[Pair, Outcome]]()
+    targets.remove_left_over(todo)
     try:
         with bar("dewarp", len(todo), "files") as shown:
-            for (source, _), outcome in processes.each(work, todo, count):
-                outcomes[source] = outcome
+            for outcome in processes.each(work, todo, count):
+                outcomes.append(outcome)
                 shown.update()
     except ChildProcessError as error:
         raise ValueError(f"{error}; --resume goes on where it was broken off, --jobs 1 needs the least") from None
     finally:
-        _remove_left_over(todo)
-    return {source: outcomes[source] for source, _ in todo}
-
-
-def _remove_left_over(todo: Sequence[Pair]) -> None:
-    """Remove the halves of files that a process which was killed left beside outputs."""
-    for path in all_left_over(os.path.realpath(target) for _, target in todo):
-        with contextlib.suppress(OSError):
-            os.unlink(path)
-
-
-def _notes(outcomes: dict[Path, Outcome]) -> dict[str, list[Path]]:
-    """Return notes without the names of files, with the files that they are about."""
-    notes: dict[str, list[Path]] = {}
-    for source, outcome in outcomes.items():
-        for text in outcome.notes:
-            notes.setdefault(_without(source, text), []).append(source)
-    return notes
-
-
-def _without(source: Path, text: str) -> str:
-    return text.removeprefix(str(source)).lstrip(": ")
+        targets.remove_left_over(todo)
+    order = {pair: i for i, pair in enumerate(todo)}
+    return sorted(outcomes, key=lambda one: order[one[0]])
 
 
 def _dewarping(arguments: argparse.Namespace, sources: Sequence[Path]) -> Dewarping:
     """Return what is done to each; the camera gets the size of the first image if its file states none."""
-    camera = cameras.read_for_images(sources, _size_of, arguments)
+
+    def size_of(source: Path) -> tuple[int, int] | None:
+        return videos.size_of(source) if videos.is_video(source) else _photographs.size_of(source)
+
+    camera = cameras.read_for_images(sources, size_of, arguments)
     if any(map(videos.is_video, sources)):
         videos.require()
     encoder = {"codec": arguments.codec, "crf": arguments.crf}
@@ -237,10 +203,6 @@ def _dewarping(arguments: argparse.Namespace, sources: Sequence[Path]) -> Dewarp
     if camera.image_size is not None:
         work.warp_of(camera)  # an error of the options is one of all files
     return work
-
-
-def _size_of(source: Path) -> tuple[int, int] | None:
-    return videos.size_of(source) if videos.is_video(source) else _photographs.size_of(source)
 
 
 def _described(arguments: argparse.Namespace, facts: dict[str, Any]) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import glob
 import os
 from collections.abc import Collection, Iterable, Iterator, Sequence
@@ -10,6 +11,7 @@ from pathlib import Path
 
 from camtorch.boards.finding import natural
 from camtorch.cli.processes import Pair
+from camtorch.io.writing import all_left_over
 
 IMAGES = frozenset({".bmp", ".jpeg", ".jpg", ".pgm", ".png", ".ppm", ".tif", ".tiff", ".webp"})
 """Suffixes, in lower case, of the images that are taken from a folder, and of those that are written."""
@@ -37,6 +39,18 @@ def check(path: Path, *, force: bool, inputs: tuple[Path | None, ...] = ()) -> N
 
 
 # -- many files
+
+
+def folder(text: str | None, suffixes: Collection[str]) -> Path:
+    """Return the folder that -o names, for files of these suffixes."""
+    if text is None:
+        raise ValueError("into which folder? -o OUT/ names it, for several images or a folder of them")
+    path = Path(text)
+    if os.path.lexists(path) and not path.is_dir():
+        raise ValueError(f"{path}: is no folder, which -o names for several images or a folder of them")
+    if path.suffix.lower() in suffixes and not path.exists() and not text.endswith(("/", os.sep)):
+        raise ValueError(f"{path}: is the name of one file, but there may be several; -o OUT/ names a folder")
+    return path
 
 
 def find(words: Sequence[str], suffixes: Collection[str], output: Path) -> list[tuple[Path, Path]]:
@@ -126,3 +140,10 @@ def to_make(pairs: Sequence[Pair], others: Iterable[Path], *, resume: bool, forc
             f"{there[0]}: exists already{more}; --resume goes on where a run was broken off, --force overwrites"
         )
     return list(pairs)
+
+
+def remove_left_over(pairs: Iterable[Pair]) -> None:
+    """Remove the halves of files that a process which was killed left beside outputs."""
+    for path in all_left_over(os.path.realpath(target) for _, target in pairs):
+        with contextlib.suppress(OSError):
+            os.unlink(path)
