@@ -16,7 +16,7 @@ from typing import Any, NoReturn
 
 from camtorch import __version__
 from camtorch.cli import commands, processes
-from camtorch.cli.terminal import lacks_memory, note, reason, say, shown
+from camtorch.cli.terminal import lacks_memory, note, reason, say
 from camtorch.native import library
 
 _INTERRUPT, _PIPE = 128 + 2, 128 + 13  # as shells number signals
@@ -59,8 +59,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         module = f"camtorch.cli.{arguments.command}"
         if commands.uses_processes(arguments):
             processes.prepare(module)  # they import what they need while this one does
-        with shown("loading PyTorch"):
-            command = importlib.import_module(module)
+        command = importlib.import_module(module)
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", UserWarning)
             status: int = command.run(arguments) or 0

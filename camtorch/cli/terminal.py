@@ -37,19 +37,6 @@ def lacks_memory(error: Exception) -> bool:
     return isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and "allocate memory" in str(error))
 
 
-@contextlib.contextmanager
-def shown(what: str) -> Iterator[None]:
-    """Show a line on a terminal during the block."""
-    is_terminal = sys.stderr.isatty()
-    if is_terminal:
-        print(f"camtorch: {what}", end="", file=sys.stderr, flush=True)
-    try:
-        yield
-    finally:
-        if is_terminal:
-            print("\r\x1b[K", end="", file=sys.stderr, flush=True)  # erases the line
-
-
 def bar(what: str, total: float | None, unit: str = "", **options: Any) -> Any:
     """Return a tqdm bar for work that takes more than a moment; a file or a pipe gets one twice a minute. Close it."""
     from tqdm import tqdm  # type: ignore[import-untyped]  # not before: `--help` does without

@@ -265,31 +265,27 @@ def test_killed_at_any_moment_and_resumed(folder):
 
 
 @pytest.mark.slow
-def test_an_interrupt_is_one_line(folder):
+@pytest.mark.parametrize("who", ["all", "one"])
+def test_a_run_that_is_broken_off_is_one_line(folder, who):
+    """By an interrupt, or because a process is killed."""
     write_images({f"{i}.png": "RGB" for i in range(10, 400)})
     process = started(*WORDS, "--jobs", 2, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
     while len(list(Path("out").glob("*"))) < 9:
         assert process.poll() is None
         time.sleep(0.01)
-    process.send_signal(signal.SIGINT)
-    assert process.communicate(timeout=30) == ("", "camtorch: interrupted\n")
-    assert process.returncode == 130
+    if who == "all":
+        process.send_signal(signal.SIGINT)
+    else:
+        others = [int(found.name) for found in Path("/proc").glob("[0-9]*")]
+        os.kill(max(one for one in others if os.getpgid(one) == process.pid), signal.SIGKILL)
+    printed = {
+        "all": "interrupted\n",
+        "one": "error: a process was killed, perhaps for lack of memory; --resume goes on",
+    }
+    out, error = process.communicate(timeout=30)
+    assert (out, error.count("\n")) == ("", 1)
+    assert error.startswith(f"camtorch: {printed[who]}")
+    assert process.returncode == {"all": 130, "one": 2}[who]
     assert group_has_ended(process.pid)
     assert len(outputs()) < 390
     assert all_left_over(os.path.realpath(path).replace("/in/", "/out/") for path in Path("in").rglob("*")) == []
-
-
-@pytest.mark.slow
-def test_a_process_that_is_killed_ends_the_run_with_an_error(folder):
-    write_images({f"{i}.png": "RGB" for i in range(10, 400)})
-    process = started(*WORDS, "--jobs", 2, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
-    while len(list(Path("out").glob("*"))) < 9:
-        assert process.poll() is None
-        time.sleep(0.01)
-    for found in Path("/proc").glob("[0-9]*"):  # those of the group that have its pool's lines to read
-        if os.getpgid(int(found.name)) == process.pid != int(found.name):
-            victim = int(found.name)
-    os.kill(victim, signal.SIGKILL)
-    _, error = process.communicate(timeout=30)
-    assert error.startswith("camtorch: error: a process was killed, perhaps for lack of memory; --resume goes on")
-    assert process.returncode == 2
