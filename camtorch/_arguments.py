@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import importlib
 import math
 import operator
 import os
@@ -52,6 +53,16 @@ def warn(text: str, category: type[Warning] = UserWarning) -> None:
     while frame.f_back is not None and frame.f_code.co_filename.startswith(_INSIDE):
         level, frame = level + 1, frame.f_back
     warnings.warn(text, category, stacklevel=level)
+
+
+def imported(module: str, needs: str, extra: str, has: str = "__name__") -> Any:
+    """Return an optional module, if it `has` that; raise an ImportError that says how to install it otherwise."""
+    try:
+        found = importlib.import_module(module)
+        operator.attrgetter(has)(found)
+    except (ImportError, AttributeError):
+        raise ImportError(f"{needs}: pip install -e '.[{extra}]' in a checkout of camtorch") from None
+    return found
 
 
 # torch stands between a module's caller and its forward

@@ -5,7 +5,6 @@ The frame lies in the board: x right, y down, z away from the viewer, as OpenCV'
 
 from __future__ import annotations
 
-import importlib
 import re
 from dataclasses import dataclass, fields
 from typing import Any, ClassVar
@@ -13,22 +12,12 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from camtorch._arguments import shown
+from camtorch._arguments import imported, shown
 
 
 def opencv(owner: str) -> Any:
-    """Return the module cv2.
-
-    Raises:
-        ImportError: If it is not installed, or older than 4.8.
-    """
-    try:
-        module = importlib.import_module("cv2")
-    except ImportError:
-        module = None
-    if not hasattr(getattr(module, "aruco", None), "CharucoDetector"):
-        raise ImportError(f'{owner} needs OpenCV 4.8 or newer: pip install "camtorch[calibrate]"')
-    return module
+    """Return the module cv2, or raise an ImportError if it is not installed or older than 4.8."""
+    return imported("cv2", f"{owner} needs OpenCV 4.8 or newer", "calibrate", has="aruco.CharucoDetector")
 
 
 @dataclass(frozen=True)

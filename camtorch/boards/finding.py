@@ -55,7 +55,7 @@ def find_board(images: Any, board: Any, *, square: float = 1.0, **options: Any) 
 
     Files are taken as they are stored, and not turned by their Exif orientation, since a camera is that of stored
     pixels. Images without the board, that cannot be read, or of another size than most are left out, and one warning
-    names them. It needs OpenCV: `pip install "camtorch[calibrate]"`.
+    names them. It needs OpenCV: `pip install -e ".[calibrate]"`.
 
     Args:
         images: a path, a folder, a pattern as "photos/*.jpg", or a list of these; or arrays (H, W), (H, W, C), tensors

@@ -56,7 +56,7 @@ def _dewarp(commands: Commands) -> None:
     many("--jobs", type=words.count(1024), metavar="N", help="processes; by default as many as there are cores")
     text = "of new images or videos; by default those of the old ones"
     many("--suffix", type=words.suffix, metavar=".EXT", help=text)
-    video = command.add_argument_group("videos (pip install 'camtorch[video]')").add_argument
+    video = command.add_argument_group("videos (pip install -e '.[video]')").add_argument
     codecs = ("libx264", "libvpx-vp9", "ffv1")
     video("--codec", choices=codecs, help="the encoder; libx264 by default, in .webm libvpx-vp9; ffv1 loses nothing")
     video("--crf", type=int, metavar="N", help="its quality, lower is better; 18 in libx264")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import importlib
 import os
 from collections.abc import Callable, Iterator
 from fractions import Fraction
@@ -13,6 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from camtorch._arguments import imported
 from camtorch.camera import Camera
 from camtorch.io.writing import replacing
 from camtorch.warp.warp import Warp
@@ -58,10 +58,7 @@ def check_kind(path: Path) -> None:
 
 def require() -> Any:
     """Return PyAV, or raise an ImportError that says how to install it."""
-    try:
-        return importlib.import_module("av")
-    except ImportError:
-        raise ImportError("videos take PyAV, which is not installed: pip install 'camtorch[video]'") from None
+    return imported("av", "videos need PyAV", "video")
 
 
 # -- reading

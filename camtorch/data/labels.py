@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import importlib
 import json
 import operator
 import os
@@ -21,7 +20,7 @@ from PIL import Image
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from camtorch._arguments import LEFT, check_path
+from camtorch._arguments import LEFT, check_path, imported
 from camtorch._photographs import load_stored
 from camtorch.augment.landmarks import LANDMARKS, TableLike
 from camtorch.augment.sample import KINDS, Sample
@@ -266,10 +265,7 @@ def _pinhole(height_px: int, width_px: int, **lens: Any) -> Camera:
 
 def _video_frame(path: Path, number: int) -> Tensor | None:
     """Return a frame of a video of a constant rate, by its number from 0; None if it has not begun, or has ended."""
-    try:
-        av = importlib.import_module("av")
-    except ImportError:
-        raise ImportError(f'{path}: videos need PyAV: pip install "camtorch[video]"') from None
+    av = imported("av", f"{path}: videos need PyAV", "video")
     errors = av.error.FFmpegError, IndexError, TypeError, ZeroDivisionError
     with _failing_at(path, "not a whole video: ", *errors), av.open(str(path)) as container:
         stream = container.streams.video[0]
@@ -399,7 +395,7 @@ def read(
     Raises:
         ValueError: a file that is not of the format, cut short, or in another encoding, here or when a sample is asked
             for; the text names the file and the place. A format that is not known or not seen. FileNotFoundError: no
-            such path. ImportError: videos need PyAV, `pip install "camtorch[video]"`.
+            such path. ImportError: videos need PyAV, `pip install -e ".[video]"`.
     """
     check_path(path, "read")
     found, folder = Path(path), None if images is None else Path(images)

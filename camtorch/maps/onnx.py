@@ -8,12 +8,12 @@ too, but for a panorama of a whole turn, which GridSample ends at its edges; ali
 from __future__ import annotations
 
 from collections.abc import Mapping
-from types import ModuleType
 from typing import Any
 
 import numpy as np
 import torch
 
+from camtorch._arguments import imported
 from camtorch.maps.exact import Exact
 from camtorch.maps.lookup import OUTSIDE, LookupMap
 from camtorch.maps.protocol import MapFormat, checked
@@ -55,14 +55,8 @@ class ONNX(MapFormat):
         return LookupMap(torch.from_numpy(positions), size, self.name, {"dtype": kind})
 
 
-def _needed() -> ModuleType:
-    try:
-        import onnx
-        import onnx.helper
-        import onnx.numpy_helper
-    except ImportError:
-        raise ImportError('models of ONNX need onnx: pip install "camtorch[onnx]"') from None
-    return onnx
+def _needed() -> Any:
+    return imported("onnx", "models of ONNX need onnx", "onnx")
 
 
 def _model(exact: Exact, dtype: str) -> Any:

@@ -1,4 +1,4 @@
-"""Plots of cameras and calibrations, by matplotlib (`pip install camtorch[plot]`): each function draws on Axes, `ax`,
+"""Plots of cameras and calibrations, by matplotlib (`pip install -e ".[plot]"`): each function draws on Axes, `ax`,
 by default new ones, and returns them; `calibration` and `portrait` return a Figure. Without matplotlib an ImportError
 says how to install it.
 """

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from camtorch._arguments import imported
+
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.colors import ListedColormap
@@ -25,10 +27,7 @@ _LEVELS |= {"distortion": ("viridis_r", 0.15, 1)}
 
 def require_matplotlib() -> None:
     """Raise an ImportError that says how to install it, unless it is there."""
-    try:
-        import matplotlib  # noqa: F401
-    except ImportError:
-        raise ImportError("plots need matplotlib: pip install 'camtorch[plot]'") from None
+    imported("matplotlib", "plots need matplotlib", "plot")
 
 
 def axes_or_new(ax: Axes | None) -> Axes:

@@ -1,6 +1,6 @@
 """Executes the notebooks and saves them with what they show: python docs/notebooks/execute.py [NOTEBOOK ...].
 
-Wants camtorch[notebooks]. Each runs in a folder of its own, with a copy of the files that lie beside it.
+Needs `pip install -e ".[notebooks]"`. Each runs in a folder of its own, with a copy of the files that lie beside it.
 """
 
 import json

@@ -164,8 +164,8 @@ def test_errors_are_one_line_and_leave_nothing(files, monkeypatch, capsys, group
 @pytest.mark.parametrize(
     ("module", "words", "text"),
     [
-        ("matplotlib", "show camera.yml -o out.png", "pip install 'camtorch[plot]'"),
-        ("av", "dewarp in.png film.mkv --camera camera.yml -o out/", "pip install 'camtorch[video]'"),
+        ("matplotlib", "show camera.yml -o out.png", "pip install -e '.[plot]' in a checkout"),
+        ("av", "dewarp in.png film.mkv --camera camera.yml -o out/", "pip install -e '.[video]' in a checkout"),
     ],
 )
 def test_a_package_that_lacks_is_named(files, monkeypatch, capsys, module, words, text):
