@@ -123,15 +123,17 @@ class Views(GeometryModule):
             raise ValueError(
                 f"Views: views must be a tensor (B, {len(self)}, C, {size[0]}, {size[1]}); got {shown(views)}"
             )
-        weights, nearest = self.weights()[:, None], self.mode == "nearest"
-        images = views if nearest else widen(views)
-        parts = torch.stack([warp(images[:, i]) for i, warp in enumerate(self.backs)], 1)
+        weights = self.weights()[:, None]
         valid = (weights.sum(0) > 0)[None]
-        if nearest:
-            most = weights.argmax(0)[None, None].expand(len(parts), 1, *parts.shape[2:])
-            return torch.where(valid, parts.gather(1, most)[:, 0], 0), valid
-        shares = torch.where(weights > 0, parts * weights.to(parts.dtype), 0.0)
-        return narrow(shares.sum(1), views.dtype), valid
+        images = views if self.mode == "nearest" else widen(views)
+        parts = [warp(images[:, i]) for i, warp in enumerate(self.backs)]
+        if self.mode != "nearest":
+            shares = [torch.where(w > 0, p * w.to(p.dtype), 0.0) for p, w in zip(parts, weights, strict=True)]
+            return narrow(torch.stack(shares).sum(0), views.dtype), valid
+        result, most = torch.zeros_like(parts[0]), torch.zeros_like(weights[0])
+        for part, weight in zip(parts, weights, strict=True):
+            result, most = torch.where(weight > most, part, result), weight.maximum(most)
+        return result, valid
 
     def extra_repr(self) -> str:
         """The views."""
