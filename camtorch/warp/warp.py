@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from camtorch._arguments import Numbers, as_coordinates, as_whole, broadcast_shapes, check_devices, no_camera
+from camtorch._arguments import LEFT, Numbers, as_coordinates, as_whole, broadcast_shapes, check_devices, no_camera
 from camtorch._module import GeometryModule, Memo, typed_as
 from camtorch.camera import Camera
 from camtorch.rotations import as_rotation, turn
@@ -333,6 +333,12 @@ class Warp(GeometryModule):
         """Turn directions (B, *N, 3), or (*N, 3), from the source's to the target's frame; lengths stay."""
         rays = as_coordinates(rays, "rays", 3, "Warp", self.source.intrinsics.device, "B, *N")
         return turn(self.rotation, rays, "rays")
+
+    def __getattr__(self, name: str) -> Tensor | nn.Module:
+        try:
+            return super().__getattr__(name)
+        except AttributeError as error:
+            raise AttributeError(f"{error}. {LEFT}") from None
 
     def inverse(self) -> Warp:
         """The warp from target to source. What lay outside the image, or between its pixels, stays lost."""

@@ -7,6 +7,9 @@ from pathlib import Path
 import pytest
 from public_names import names
 
+import camtorch as ct
+from camtorch.cli.main import make_parser
+
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "leaving-0.3.md"
 OLD = json.loads(Path(__file__).with_name("names-0.3.json").read_text())
@@ -60,3 +63,22 @@ def test_a_word_that_left_is_nowhere_in_the_package(word, places):
     found = [str(file.relative_to(ROOT)) for file in files if word in file.read_text("utf-8").lower()]
     assert sorted(set(found) - set(places)) == []
     assert word in PAGE.read_text("utf-8").lower()
+
+
+CAMERA = ct.Pinhole([300.0, 300.0, 319.5, 239.5], image_size=(480, 640))
+TYPED = {
+    "a name": lambda: ct.Windshield,
+    "a name in a room": lambda: ct.augment.RandomElastic,
+    "a method": lambda: ct.Warp(CAMERA, CAMERA).save,
+    "a format": lambda: ct.save(CAMERA, "camera.json", format="carla"),
+    "a format of maps": lambda: ct.save_map(ct.Warp(CAMERA, CAMERA), "map.exr", format="stmap"),
+    "a format of labels": lambda: ct.data.read(".", format="lapa"),
+    "a model": lambda: CAMERA.convert("cahvor"),
+    "a command": lambda: make_parser().parse_args(["rectify"]),
+}
+
+
+@pytest.mark.parametrize("use", TYPED.values(), ids=TYPED)
+def test_an_error_about_an_old_name_leads_to_the_page(use):
+    with pytest.raises((AttributeError, ValueError), match=re.escape(f"docs/{PAGE.name}")):
+        use()
