@@ -57,9 +57,8 @@ def parse(record: Record) -> Rig:
     return Rig(cameras, extrinsics)
 
 
-def render(rig: Rig, path: str) -> str:
+def render(rig: Rig, lossy: Lossy) -> str:
     """The text of a file that projectaria_tools reads."""
-    lossy = Lossy(path, NAMES.title)
     entries = []
     for name, extrinsics in lossy.all_posed(rig).items():
         camera = rig.cameras[name]

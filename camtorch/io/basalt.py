@@ -61,9 +61,8 @@ def parse(record: Record) -> Rig:
     return Rig(cameras, extrinsics)
 
 
-def render(rig: Rig, path: str) -> str:
+def render(rig: Rig, lossy: Lossy) -> str:
     """The text of a file; the cameras lose their names, and the IMU is Basalt's default."""
-    lossy = Lossy(path, NAMES.title)
     placed, models, sizes = [], [], []
     for name, extrinsics in lossy.all_posed(rig).items():
         camera = rig.cameras[name]

@@ -100,9 +100,8 @@ def _tensor(record: Record, last: int) -> Tensor:
     return values
 
 
-def render(rig: Rig, path: str) -> str:
+def render(rig: Rig, lossy: Lossy) -> str:
     """The text of a file. Numbers are float64, which holds those of a float32 camera exactly."""
-    lossy = Lossy(path, NAMES.title)
     cameras, extrinsics = {}, {}
     for name, camera in rig.cameras.items():
         intrinsics, distortion = _rows(camera.intrinsics, camera.distortion)

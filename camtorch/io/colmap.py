@@ -262,12 +262,11 @@ def _images_from_bytes(path: str, file: BinaryIO) -> Iterator[_ImageEntry]:
 # -- writing
 
 
-def render(rig: Rig, path: str) -> dict[str, bytes]:
+def render(rig: Rig, lossy: Lossy) -> dict[str, bytes]:
     """The files of a rig: cameras, and images beside them where there are poses.
 
     Each camera takes the smallest model that holds its values, and its id where its name is one.
     """
-    lossy = Lossy(path, NAMES.title)
     ids = [int(name) if re.fullmatch(r"0|[1-9]\d{0,9}", name) else -1 for name in rig.cameras]
     if not all(0 <= i <= _LARGEST_ID for i in ids):
         ids = list(range(1, len(ids) + 1))
@@ -276,6 +275,7 @@ def render(rig: Rig, path: str) -> dict[str, bytes]:
     for name, camera in rig.cameras.items():
         height, width = lossy.size(name, camera)
         entries.append((identities[name], *_smallest(lossy, name, camera), width, height))
+    path = lossy.path
     if not path.endswith(NAMES.suffixes):  # a folder that is not there yet
         path = os.path.join(path, "cameras.txt")
     binary = path.endswith(".bin")

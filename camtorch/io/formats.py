@@ -35,7 +35,7 @@ from camtorch.io._errors import CameraFileError
 from camtorch.io.parsing import parse_mapping, path_of, read_bytes
 from camtorch.io.protocol import ContentFormat, KeyFormat, Names, WrittenFormat
 from camtorch.io.record import Record
-from camtorch.io.writing import replacing
+from camtorch.io.writing import Lossy, replacing
 from camtorch.rig import Rig
 
 # read, in the order in which they are asked
@@ -186,7 +186,8 @@ def rendered(rig: Rig | Camera, path: str | os.PathLike[str], format: str | None
             raise ValueError(f"{path}: is a folder; {format} is one file, so name it")
         path = next(filter(os.path.exists, inside), inside[-1])
     try:
-        found = next(module for module in _WRITTEN if module.NAMES.format == format).render(rig, path)
+        module = next(module for module in _WRITTEN if module.NAMES.format == format)
+        found = module.render(rig, Lossy(path, module.NAMES.title))
         return {path: found.encode()} if isinstance(found, str) else found
     except UnicodeEncodeError as error:
         raise CameraFileError(path, "names", f"{error.object!r:.60} is no text that a file can hold") from None

@@ -75,9 +75,8 @@ def _extrinsics(record: Record, names: list[str]) -> dict[str, Extrinsics]:
     return chain
 
 
-def render(rig: Rig, path: str) -> str:
+def render(rig: Rig, lossy: Lossy) -> str:
     """The text of a file; the cameras become cam0, cam1, ... in their order."""
-    lossy = Lossy(path, NAMES.title)
     lossy.no_images(rig)
     posed = lossy.all_posed(rig) if rig.extrinsics or len(rig.cameras) > 1 else {}
     first = next(iter(posed.values()), None)

@@ -66,9 +66,8 @@ def _splined(name: Record) -> tuple[str, int] | None:
     return model.key, model.default_count
 
 
-def render(rig: Rig, path: str) -> str:
+def render(rig: Rig, lossy: Lossy) -> str:
     """The text of a file."""
-    lossy = Lossy(path, NAMES.title)
     name, camera = lossy.only_camera(rig)
     lossy.no_images(rig)
     height, width = lossy.size(name, camera)

@@ -129,9 +129,8 @@ def panorama(size: tuple[int, int]) -> list[float]:
     return [width / (2 * math.pi), height / math.pi, width / 2 - 0.5, height / 2 - 0.5]
 
 
-def render(rig: Rig, path: str) -> str:
+def render(rig: Rig, lossy: Lossy) -> str:
     """The text of a file: one camera for all, or one for each frame."""
-    lossy = Lossy(path, NAMES.title)
     written = {name: _entries(lossy, name, camera) for name, camera in rig.cameras.items()}
     models = {name: entries.pop("camera_model") for name, entries in written.items()}
     if len(set(models.values())) != 1:

@@ -50,10 +50,7 @@ def read(path: str, content: bytes) -> Rig:
 
 
 def _table(path: str, content: bytes) -> Record:
-    try:
-        return Record(path, parse_json(path, decoded(path, content)))
-    except (RecursionError, MemoryError):
-        Record(path, None).fail("nested too deeply")
+    return Record(path, parse_json(path, decoded(path, content)))
 
 
 def _camera(sensor: Record) -> Camera:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 from typing import Any, NoReturn
@@ -13,11 +14,10 @@ from camtorch._numbers import warn_of_order
 from camtorch.camera import Camera
 from camtorch.extrinsics import Extrinsics
 from camtorch.io import poses
-from camtorch.io.filestorage import Value, text_for
 from camtorch.io.parsing import parse_mapping, read_bytes
 from camtorch.io.protocol import Names
 from camtorch.io.record import Record
-from camtorch.io.writing import Lossy
+from camtorch.io.writing import Lossy, number
 from camtorch.models import MODELS
 from camtorch.rig import Rig
 
@@ -196,20 +196,19 @@ class _File:
 # -- writing
 
 
-def render(rig: Rig, path: str) -> str:
+def render(rig: Rig, lossy: Lossy) -> str:
     """The text of a file of one camera, or of several of which the second of two may have a pose."""
-    lossy = Lossy(path, NAMES.title)
     lossy.no_images(rig)
     names, ends = list(rig.cameras), list(rig.cameras)
     if len(names) == 1:
         ends = [names[0] if re.fullmatch(_NAMES, names[0]) else ""]
     elif not all(name and re.fullmatch(_NAMES, name) for name in names):
         ends = [str(i + 1) for i in range(len(names))]
-    values: dict[str, Value] = {}
+    values: dict[str, Any] = {}
     for name, end in zip(names, ends, strict=True):
         _add_camera(lossy, values, name, rig.cameras[name], end)
     _add_pose(lossy, values, rig, sorted(zip(ends, names, strict=True)))
-    return text_for(path, values)
+    return _text(os.path.splitext(lossy.path)[1].lower(), values)
 
 
 def _add_camera(lossy: Lossy, values: dict[str, Any], name: str, camera: Camera, end: str) -> None:
@@ -230,12 +229,10 @@ def _add_camera(lossy: Lossy, values: dict[str, Any], name: str, camera: Camera,
     says = key != "mei" and (fisheye or len(distortion) == _FISHEYE_COUNT or end)
     if says and values.setdefault("fisheye_model", fisheye) != fisheye:
         lossy.fail(name, "a lens unlike that of the cameras before it; OpenCV's file has one fisheye_model for all")
-    short = {"": ("camera_matrix", "distortion_coefficients")}
     joint = "_" if end.isalpha() else ""
-    matrix_key, distortion_key = short.get(end, (f"M{joint}{end}", f"D{joint}{end}"))
-    values[matrix_key] = [[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]
+    values[f"M{joint}{end}" if end else "camera_matrix"] = [[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]
     if distortion:
-        values[distortion_key] = [[value] for value in distortion]
+        values[f"D{joint}{end}" if end else "distortion_coefficients"] = [[value] for value in distortion]
 
 
 def _add_pose(lossy: Lossy, values: dict[str, Any], rig: Rig, ends_and_names: list[tuple[str, str]]) -> None:
@@ -249,3 +246,24 @@ def _add_pose(lossy: Lossy, values: dict[str, Any], rig: Rig, ends_and_names: li
         values["T"] = [row[3:] for row in rows[:3]]
     else:
         lossy.no_pose(rig)
+
+
+def _text(suffix: str, values: dict[str, Any]) -> str:
+    """Return numbers, and matrices as lists of rows, as `cv2.FileStorage` writes them: JSON, XML, or else YAML."""
+    yaml, xml, whole = ["%YAML:1.0", "---"], ['<?xml version="1.0"?>', "<opencv_storage>"], dict[str, Any]()
+    for key, value in values.items():
+        if not isinstance(value, list):
+            text = number(value) if isinstance(value, float) else str(value)
+            yaml.append(f"{key}: {text}")
+            xml.append(f"<{key}>{text}</{key}>")
+            whole[key] = value
+            continue
+        rows, cols, data = len(value), len(value[0]), [v for row in value for v in row]
+        yaml += [f"{key}: !!opencv-matrix", f"   rows: {rows}", f"   cols: {cols}", "   dt: d"]
+        yaml.append(f"   data: [ {', '.join(map(number, data))} ]")
+        xml += [f'<{key} type_id="opencv-matrix">', f"  <rows>{rows}</rows>", f"  <cols>{cols}</cols>", "  <dt>d</dt>"]
+        xml += ["  <data>", f"    {' '.join(map(number, data))}</data></{key}>"]
+        whole[key] = {"type_id": "opencv-matrix", "rows": rows, "cols": cols, "dt": "d", "data": data}
+    if suffix == ".json":
+        return json.dumps(whole, indent=4, allow_nan=False) + "\n"
+    return "\n".join([*xml, "</opencv_storage>"] if suffix == ".xml" else yaml) + "\n"

@@ -112,7 +112,7 @@ def _check_length(path: Path, text: str, most: int, kind: str) -> None:
 
 
 def parse_json(path: Path, text: str) -> Any:
-    """Return the value of a text of JSON, all numbers floats; a RecursionError if it is nested deeply."""
+    """Return the value of a text of JSON, all numbers floats."""
     size = text.count(",") + 3 * text.count("[") + 6 * text.count("{") + 5 * text.count(":")
     if size > max(_MOST_JSON_UNITS, len(text) // _BYTES_PER_UNIT):
         raise CameraFileError(path, "content", "too many values")
@@ -124,9 +124,10 @@ def parse_json(path: Path, text: str) -> Any:
         return keys
 
     # floats at once: no text is made of a number, and integers of any length are no work
-    options: dict[str, Any] = {"parse_int": float, "parse_constant": float}
     try:
-        return json.loads(text, object_pairs_hook=unique, **options)
+        return json.loads(text, object_pairs_hook=unique, parse_int=float, parse_constant=float)
+    except RecursionError:
+        raise CameraFileError(path, "content", "nested too deeply") from None
     except json.JSONDecodeError as error:
         raise CameraFileError(path, f"line {error.lineno}", error.msg) from None
     except ValueError as error:
@@ -279,13 +280,11 @@ class _Yaml:
         return keys if is_mapping else values, count
 
 
+_TAG = "tag:yaml.org,2002:{}".format
 # event that begins a value -> the tags that it may have
-_TAGS = {
-    kind: (None, "!", *(f"tag:yaml.org,2002:{name}" for name in names))
-    for kind, *names in (
-        ("ScalarEvent", "str"),
-        ("AliasEvent",),
-        ("SequenceStartEvent", "seq"),
-        ("MappingStartEvent", "map", "opencv-matrix", "opencv-nd-matrix"),
-    )
+_TAGS: dict[str, tuple[str | None, ...]] = {
+    "ScalarEvent": (None, "!", _TAG("str")),
+    "AliasEvent": (),
+    "SequenceStartEvent": (None, "!", _TAG("seq")),
+    "MappingStartEvent": (None, "!", _TAG("map"), _TAG("opencv-matrix"), _TAG("opencv-nd-matrix")),
 }

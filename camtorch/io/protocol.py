@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 from camtorch.io.record import Record
+from camtorch.io.writing import Lossy
 from camtorch.rig import Rig
 
 
@@ -53,4 +54,4 @@ class ContentFormat(Format, Protocol):
 class WrittenFormat(Format, Protocol):
     """A module that writes: the text of a file; or the contents of files that are no text, or several, by paths."""
 
-    def render(self, rig: Rig, path: str) -> str | dict[str, bytes]: ...
+    def render(self, rig: Rig, lossy: Lossy) -> str | dict[str, bytes]: ...

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 import os
+from collections import Counter
 from collections.abc import Collection, Iterable, Iterator
 from itertools import islice
 from typing import Any, NoReturn
@@ -211,13 +212,8 @@ class Record:
 
 
 def repeated(names: Iterable[str]) -> str | None:
-    """The first of the names that stands there a second time."""
-    seen: set[str] = set()
-    for name in names:
-        if name in seen:
-            return name
-        seen.add(name)
-    return None
+    """Return the first of the names that stands there more than once."""
+    return next((name for name, count in Counter(names).items() if count > 1), None)
 
 
 def one_of(record: Record, names: Collection[str]) -> str:

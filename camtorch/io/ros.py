@@ -50,9 +50,8 @@ def _either(record: Record, *keys: str) -> Record:
     return record[next((key for key in keys if key in record), keys[0])]
 
 
-def render(rig: Rig, path: str) -> str:
+def render(rig: Rig, lossy: Lossy) -> str:
     """The text of a file: R is the identity, and P is K."""
-    lossy = Lossy(path, NAMES.title)
     name, camera = lossy.only_camera(rig)
     lossy.no_pose(rig)
     height, width = lossy.size(name, camera)
