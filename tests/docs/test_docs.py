@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from boards import STEREO, opencv_left, seen_by, stereo
+from boards import STEREO, seen_by, stereo
 from photographs import fisheye, photograph
 from PIL import Image
 from videos import write_video
@@ -48,36 +48,21 @@ def commands():
 @functools.cache
 def photographs():
     """Of a board by a fisheye."""
-    board = Chessboard(9, 6, 0.024)
-    poses = [
-        ((0.5 * np.cos(a), 0.5 * np.sin(a), 0.1), (0.06 * np.sin(a) - 0.1, 0.05 * np.cos(a) - 0.07, 0.2 + 0.01 * a))
-        for a in np.linspace(0, 6, 6)
-    ]
-    return [photograph(board, fisheye(), *pose)[0] for pose in poses]
-
-
-def write_corners():
-    """Of OpenCV's photographs."""
-    left, _ = opencv_left()
-    unseen = np.full_like(left.image_points[:1], np.nan)  # as an image in which no board was found
-    seen = np.concatenate([left.image_points[:2], unseen, left.image_points[2:8]])
-    np.savez("corners.npz", object_points=left.object_points, image_points=seen)
+    turns = ((0.5 * np.cos(a), 0.5 * np.sin(a), 0.1) for a in np.linspace(0, 6, 6))
+    places = ((0.06 * np.sin(a) - 0.1, 0.05 * np.cos(a) - 0.07, 0.2 + 0.01 * a) for a in np.linspace(0, 6, 6))
+    return [photograph(Chessboard(9, 6, 0.024), fisheye(), *pose)[0] for pose in zip(turns, places, strict=True)]
 
 
 def write_calibration_data():
-    """Corners of a stereo pair, and photographs, as the pages on calibration speak of them."""
+    """Corners of one camera and of a pair, poses of a robot, and photographs, as the pages on calibration have them."""
     pair, right, *_ = stereo(8)
     np.savez("stereo.npz", object_points=pair.object_points, left=pair.image_points, right=right)
-    pair, turns, shifts = seen_by(STEREO["left"], 8)
-    boards = np.tile(np.eye(4), (8, 1, 1))
-    boards[:, :3, :3], boards[:, :3, 3] = turns, shifts
-    # the hand is where the camera is, and the board where the base is
-    np.savez(
-        "robot.npz",
-        object_points=pair.object_points,
-        image_points=pair.image_points,
-        base_from_hand=np.linalg.inv(boards),
-    )
+    seen, turns, shifts = seen_by(STEREO["left"], 8)
+    corners = {"object_points": seen.object_points, "image_points": seen.image_points}
+    np.savez("corners.npz", **corners)
+    hand = torch.eye(4).double().repeat(8, 1, 1)  # where the camera is, and the base is where the board is
+    hand[:, :3, :3], hand[:, :3, 3] = turns, shifts
+    np.savez("robot.npz", base_from_hand=hand.inverse(), **corners)
     Path("images").mkdir()
     for i, image in enumerate(photographs()):
         Image.fromarray(image).save(f"images/{i}.jpg", quality=95)
@@ -108,8 +93,6 @@ def folder(tmp_path, monkeypatch, request):
         Path("sparse/0").mkdir(parents=True)
         pose = ct.Extrinsics([0.0, 0.1, 0.0], [0.0, 0.0, 0.1]).double()
         ct.save(ct.Rig({"1": camera}, {"a.jpg": pose}, images={"a.jpg": "1"}), "sparse/0/cameras.bin", format="colmap")
-    if "corners.npz" in text:
-        write_corners()
     if "images/*.jpg" in text:
         write_calibration_data()
     known = dict(ct.MODELS)
@@ -122,7 +105,6 @@ def folder(tmp_path, monkeypatch, request):
 
 
 @pytest.mark.filterwarnings("ignore:.*LeafSpec:FutureWarning")  # torch's own, in torch.onnx.export
-@pytest.mark.filterwarnings("ignore:.*nothing was seen in view 2:UserWarning")  # which is so in corners.npz
 # Python 3.12 and later warn of forks beside threads, ray of itself; webdataset leaves its files to the collector
 @pytest.mark.filterwarnings(
     "ignore:.*fork.*:DeprecationWarning", "ignore::DeprecationWarning:ray", "ignore:unclosed file:ResourceWarning"
@@ -152,13 +134,9 @@ def test_photographs_are_read_as_they_are_stored():
 
 def test_every_public_name_has_a_place_in_the_reference():
     reference = "\n".join(page.read_text() for page in (ROOT / "docs" / "api").glob("*.md"))
-    missing = []
-    for room in (ct, ct.augment, ct.data, ct.io, ct.lenses, ct.losses, ct.views):
-        for name in getattr(room, "__all__", ()):
-            value = getattr(room, name)
-            if callable(value) and f".{value.__name__}\n" not in reference + "\n":
-                missing.append(f"{room.__name__}.{name}")
-    assert not missing
+    rooms = (ct, ct.augment, ct.data, ct.io, ct.lenses, ct.losses, ct.views)
+    values = [getattr(room, name) for room in rooms for name in room.__all__]
+    assert [v for v in values if callable(v) and f".{v.__name__}\n" not in reference + "\n"] == []
 
 
 def test_every_format_has_a_row():
@@ -176,23 +154,16 @@ def test_every_page_is_in_the_navigation():
 def test_links_of_the_root_lead_somewhere():
     """The strict build of the site checks those of docs/."""
     links = [
-        (page.name, target)
-        for page in ROOT.glob("*.md")
-        for target in re.findall(r"\]\(([^)\s]+)\)", page.read_text())
-        if "://" not in target
+        (page, link) for page in ROOT.glob("*.md") for link in re.findall(r"\]\((?!https?:)(\S+?)\)", page.read_text())
     ]
     assert links
-    broken = []
-    for page, target in links:
-        path, _, anchor = target.partition("#")
-        path = path or page
-        text = (ROOT / path).read_text() if path.endswith(".md") and (ROOT / path).exists() else ""
-        anchors = [
-            re.sub(r"[^\w\s-]", "", title).lower().replace(" ", "-") for title in re.findall(r"^#+ (.*)", text, re.M)
-        ]
-        if not (ROOT / path).exists() or (anchor and anchor not in anchors):
-            broken.append((page, target))
-    assert not broken
+    for page, link in links:
+        path, _, anchor = link.partition("#")
+        target = ROOT / path if path else page
+        assert target.exists(), (page.name, link)
+        if anchor:
+            titles = re.findall(r"^#+ (.*)", target.read_text(), re.M)
+            assert anchor in [re.sub(r"[^\w\s-]", "", title).lower().replace(" ", "-") for title in titles], link
 
 
 def test_the_page_of_commands_is_what_the_parser_knows():
