@@ -70,13 +70,9 @@ _INSIDE = tuple(os.path.dirname(file) + os.sep for file in (__file__, torch.__fi
 
 
 def as_real(value: Numbers, name: str, owner: str) -> Tensor:
-    """A floating-point tensor of finite numbers: the tensor itself, or made of an array, a list, or a list of arrays.
+    """Return floating-point finite numbers: the tensor itself, or one made of an array, a list, or a list of arrays.
 
     Lists and integers take torch's default dtype, arrays and tensors keep theirs.
-
-    Raises:
-        TypeError: not real numbers, or a list of tensors that require grad, whose graph would be lost.
-        ValueError: NaN or infinite values.
     """
     if type(value) in (list, tuple) and {float, int}.issuperset(map(type, value)):  # type: ignore[arg-type]
         value = torch.tensor(value, dtype=torch.get_default_dtype())
@@ -168,21 +164,12 @@ def _as_plain(value: Numbers) -> Numbers:
 
 
 def is_predicted(value: Tensor) -> bool:
-    """Whether a network may have made these rows of a batch: of them some may be bad, and the others shall live.
-
-    A tensor with batch dims, in a graph or, as predictions are at inference, where none is recorded.
-    """
+    """Whether a network may have made these rows of a batch, of which some may be bad: a graph, or nothing records."""
     return value.ndim > 1 and not isinstance(value, nn.Parameter) and (in_graph(value) or not torch.is_grad_enabled())
 
 
 def as_vectors(value: Numbers, name: str, owner: str) -> Tensor:
-    """(*B, 3) vectors, as a tensor of finite numbers: OpenCV's columns (*B, 3, 1) and its array (1, 3) are vectors too.
-
-    A tensor (1, 3) is a batch of one.
-
-    Raises:
-        TypeError: not real numbers. ValueError: another shape, NaN or infinite values.
-    """
+    """Return (*B, 3) finite vectors, also of OpenCV's columns (*B, 3, 1) and arrays (1, 3)."""
     vectors = as_real(value, name, owner)
     if vectors.ndim > 1 and vectors.shape[-2:] == (3, 1):
         flat = vectors.squeeze(-1)
@@ -203,11 +190,7 @@ def as_vectors(value: Numbers, name: str, owner: str) -> Tensor:
 
 
 def as_image_size(value: Any, owner: str, name: str = "image_size") -> tuple[int, int] | None:
-    """(height, width) as two positive ints, or None.
-
-    Raises:
-        TypeError: not two integers. ValueError: one of them is not positive.
-    """
+    """Return (height, width) as two positive ints, or None."""
     if value is None:
         return None
     if type(value) is tuple and [type(side) for side in value] == [int, int] and min(value) > 0:
@@ -246,11 +229,7 @@ def no_camera(value: object) -> str:
 
 
 def as_whole(value: Any, name: str, owner: str, least: int | None = None) -> int:
-    """A whole number.
-
-    Raises:
-        TypeError: it is none. ValueError: it is below the least.
-    """
+    """Return a whole number, not below the least."""
     try:
         whole = operator.index(value)
     except (TypeError, RuntimeError):
@@ -261,11 +240,7 @@ def as_whole(value: Any, name: str, owner: str, least: int | None = None) -> int
 
 
 def as_flag(value: Any, name: str, owner: str) -> bool:
-    """True or False.
-
-    Raises:
-        TypeError: neither, as "False" is.
-    """
+    """Return True or False, of what is one of them and not "False"."""
     plain = value.item() if isinstance(value, (Tensor, np.ndarray, np.generic)) and not value.ndim else value
     if isinstance(plain, int) and plain in (0, 1):
         return bool(plain)
@@ -273,11 +248,7 @@ def as_flag(value: Any, name: str, owner: str) -> bool:
 
 
 def as_number(value: Any, name: str, owner: str) -> float:
-    """A number, NaN and infinity among them.
-
-    Raises:
-        TypeError: it is none.
-    """
+    """Return a number, NaN and infinity among them."""
     try:
         if isinstance(value, (str, bytes)):
             raise TypeError
@@ -287,11 +258,7 @@ def as_number(value: Any, name: str, owner: str) -> float:
 
 
 def as_part(value: Any, name: str, owner: str, kind: str = "part") -> float:
-    """A part of a whole, as a probability is one.
-
-    Raises:
-        TypeError: no number. ValueError: one that is not within [0, 1].
-    """
+    """Return a part of a whole, within [0, 1], as a probability is one."""
     part = as_number(value, name, owner)
     if not 0 <= part <= 1:
         raise ValueError(f"{owner}: {name} must be a {kind} in [0, 1]; got {value!r}")
@@ -299,11 +266,7 @@ def as_part(value: Any, name: str, owner: str, kind: str = "part") -> float:
 
 
 def as_fov(value: Any, owner: str, most: float, means: str = "") -> float:
-    """A field of view in degrees: above 2 pi, and below `most`, or up to it where that is a whole turn.
-
-    Raises:
-        TypeError: no number. ValueError: another one; up to 2 pi the error says that it seems to be radians.
-    """
+    """Return a field of view in degrees: above 2 pi, and below `most`, or up to it where that is a whole turn."""
     fov = as_number(value, "fov", owner)
     if not (0 < fov < most or fov == most == 360):
         upto = "up to" if most == 360 else "below"
@@ -323,11 +286,7 @@ def check_degrees(least: float, fov: object, owner: str) -> None:
 
 
 def as_mapping(value: Any, name: str, owner: str, form: str) -> Mapping[Any, Any]:
-    """A mapping, or what torch has instead of one; an empty one of None.
-
-    Raises:
-        TypeError: it is none.
-    """
+    """Return a mapping, also of what torch has instead of one; an empty one of None."""
     if value is None:
         return {}
     if isinstance(value, (nn.ModuleDict, nn.ParameterDict)):
@@ -365,10 +324,7 @@ def check_boxes(boxes: Tensor, name: str, owner: str) -> None:
 
 
 def check_radians(vectors: Tensor, name: str, owner: str) -> None:
-    """Raise a ValueError for plain rotation vectors (..., 3) of more than two turns, which are degrees.
-
-    A turn is the longest that there is a use for; one that an optimiser moved may be somewhat longer.
-    """
+    """Raise a ValueError for plain rotation vectors (..., 3) of more than two turns, the most of any use."""
     if not may_look(vectors) or is_kept(vectors) or is_predicted(vectors):
         return
     if bool((vectors.square().sum(-1) > (4 * math.pi) ** 2 * (1 + 1e-6)).any()):
@@ -397,11 +353,7 @@ def check_devices(owner: str, **tensors: Tensor) -> None:
 
 
 def broadcast_shapes(*shapes: Sequence[int]) -> torch.Size:
-    """The shape that all shapes broadcast to. torch.broadcast_shapes imports sympy, for a third of a second.
-
-    Raises:
-        ValueError: there is none.
-    """
+    """Return the shape that all shapes broadcast to. torch's own imports sympy, for a third of a second."""
     if shapes and shapes.count(shapes[0]) == len(shapes):
         return torch.Size(shapes[0])
     shape: list[int] = []
@@ -416,11 +368,7 @@ def broadcast_shapes(*shapes: Sequence[int]) -> torch.Size:
 
 
 def as_batch(owner: str, **shapes: Sequence[int]) -> torch.Size:
-    """The batch dims, all but the last, that the named shapes broadcast to.
-
-    Raises:
-        ValueError: they do not.
-    """
+    """Return the batch dims, all but the last, that the named shapes broadcast to."""
     try:
         return broadcast_shapes(*(shape[:-1] for shape in shapes.values()))
     except ValueError:
@@ -438,11 +386,7 @@ def working_dtype(values: Tensor, *parameters: Tensor) -> torch.dtype:
 
 
 def as_values(values: Numbers, name: str, owner: str, device: torch.device | None = None) -> Tensor:
-    """A tensor of real numbers, NaN and infinity among them, of what is one or can be made one.
-
-    Raises:
-        TypeError: it cannot.
-    """
+    """Return a tensor of real numbers, NaN and infinity among them."""
     if not isinstance(values, Tensor):
         _check_list(values, name, owner)
         try:
@@ -462,11 +406,7 @@ def as_coordinates(
     form: str = "...",
     means: str = "",
 ) -> Tensor:
-    """A tensor (..., size) of real numbers; whole ones take torch's default dtype.
-
-    Raises:
-        TypeError: not real numbers. ValueError: another shape.
-    """
+    """Return a tensor (..., size) of real numbers; whole ones take torch's default dtype."""
     values = as_values(values, name, owner, device)
     if values.ndim == 0 or values.shape[-1] != size:
         raise ValueError(f"{owner}: {name} must be ({form}, {size}){means}; got shape {tuple(values.shape)}")
@@ -476,11 +416,7 @@ def as_coordinates(
 def as_points(
     values: Numbers, name: str, size: int, batch: torch.Size, parameters: Sequence[Tensor], owner: str
 ) -> tuple[Tensor, torch.Size]:
-    """What users pass as (*B, *N, size), in the dtype to compute in and with the batch dims of `batch`; and *B.
-
-    Raises:
-        TypeError: not real numbers. ValueError: the shape does not fit `batch`.
-    """
+    """Return (*B, *N, size) in the dtype to compute in and with the batch dims of `batch`; and *B."""
     device = parameters[0].device
     values = as_values(values, name, owner, device)
     if values.device != device:
@@ -509,11 +445,7 @@ def as_points(
 def as_rows(
     values: Numbers, name: str, size: int, batch: torch.Size, parameters: Sequence[Tensor], owner: str
 ) -> tuple[Tensor, torch.Size, Callable[[Tensor], Tensor]]:
-    """Bring (*B, *N, size) into rows (C, N, size), one for each camera; see `as_points`.
-
-    Returns the rows, in the dtype to compute in; the batch dims that C counts; and a function that gives results their
-    shape back: planes (count, C, N) become a view (*B, *N, count).
-    """
+    """Return (*B, *N, size) as rows (C, N, size), one a camera; *B; and what makes (*B, *N, count) of (count, C, N)."""
     values, lead = as_points(values, name, size, batch, parameters, owner)
     shape = values.shape[:-1]
 

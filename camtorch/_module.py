@@ -82,10 +82,7 @@ class GeometryModule(nn.Module):
             self.__dict__["_own"] = {**self.__dict__.get("_own", {}), name: getattr(self, name)}
 
     def hold(self, name: str, value: Tensor, shape: tuple[int, ...]) -> None:
-        """Register plain values as a new Parameter of that shape, a Parameter or a tensor of a graph as it is.
-
-        Those keep their own shape, which broadcasts to `shape`: a lens shared by a batch of cameras stays one.
-        """
+        """Register plain values as a new Parameter of that shape, a Parameter or a tensor of a graph as it is."""
         if shape[-1] == 0:  # an optimizer has nothing to learn here
             self.put(name, value if value.shape == shape and not value.requires_grad else value.detach().expand(shape))
         elif is_parameter(value):
@@ -172,10 +169,7 @@ class GeometryModule(nn.Module):
 
 
 def is_constant(module: nn.Module) -> bool:
-    """Whether a module is exported whose tensors are its own and do not learn, so that their values are known.
-
-    Those that it is given, by functional_call or as inputs of the program, are not.
-    """
+    """Whether a module is exported whose tensors are its own, not given, and do not learn: their values are known."""
     if not is_exporting() or torch.compiler.is_dynamo_compiling():
         return False
     for part in module.modules():
@@ -310,10 +304,9 @@ def model_of(module: Made) -> type[Made]:
 
 
 def remade(module: Made, **changes: Any) -> Made:
-    """The module with other tensors and attributes, which are not checked: what camtorch computed needs no check.
+    """Return the module with other tensors and attributes, which are not checked, nor copied.
 
-    A Parameter and a tensor of a graph are kept as they are. Any other tensor is held as it is, without a copy, by a
-    Parameter that does not learn.
+    A Parameter and a tensor of a graph are kept as they are, any other tensor by a Parameter that does not learn.
     """
     model: Any = model_of(module)
     tensors = {name: changes.pop(name) if name in changes else getattr(module, name) for name in module.tensor_names}

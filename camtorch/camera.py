@@ -717,11 +717,7 @@ def _add_model(model: type[Camera]) -> None:
 
 
 def as_model(model: type[Camera] | str, owner: str) -> type[Camera]:
-    """A camera model, or the one of that key in `MODELS`.
-
-    Raises:
-        TypeError: no camera model. ValueError: an unknown key.
-    """
+    """Return a camera model, or the one of that key in `MODELS`."""
     if isinstance(model, str):
         key, *texts = model.split(":")
         if texts and key in MODELS:
@@ -750,10 +746,7 @@ def __getattr__(name: str) -> type[Camera]:
 def fixed_camera(
     model: type[Camera], intrinsics: Tensor, distortion: Tensor, image_size: Sequence[int] | None = None
 ) -> Camera:
-    """The camera of a model and numbers (*B, 4) and (*B, n) that are not checked, without a graph to them.
-
-    Bad numbers give results that are invalid, and no error.
-    """
+    """Return the camera of unchecked numbers (*B, 4) and (*B, n), without a graph; bad ones give invalid results."""
     size = None if image_size is None else (image_size[0], image_size[1])
     template = _ideal_camera(model, distortion.shape[-1])  # type: ignore[arg-type]  # a class can be hashed
     return remade(template, intrinsics=intrinsics.detach(), distortion=distortion.detach(), image_size=size)

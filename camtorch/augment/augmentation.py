@@ -79,11 +79,7 @@ def as_range(
     most: float = math.inf,
     size: int | None = None,
 ) -> Range:
-    """A checked range of (low, high); a single number x is the range from `around` - x to `around` + x.
-
-    Raises:
-        TypeError: neither a number nor two. ValueError: NaN, the wrong order, or outside of [least, most].
-    """
+    """Return a checked range of (low, high); a single number x is that from `around` - x to `around` + x."""
     try:
         if isinstance(value, Iterable) and not isinstance(value, str):
             low, high = map(float, value)
@@ -151,12 +147,10 @@ def draw(
     generator: torch.Generator | None,
     spans: Spans | None = None,
 ) -> tuple[dict[str, Any], Spans]:
-    """`apply` (count,) bool, which is true with probability p, and a value (count,) or (count, size) for every range;
-    and what is to be given as `spans` for the next draw.
+    """Return `apply` (count,), true with probability p, a value (count,) or (count, size) of every range; and `spans`.
 
-    The numbers come in the order in which kornia asks for them: first the gate, if there is a choice, then the ranges.
-    They are lists of one sample and arrays of several, which take less time than tensors, and tensors where the
-    generator is on another device or what is done with them is compiled.
+    The order is kornia's: the gate, if there is a choice, then the ranges. Lists of one sample and arrays of several
+    take less time than tensors, which come where the generator is on another device, or code is compiled.
     """
     if not (generator is None or isinstance(generator, torch.Generator)):
         raise TypeError(f"draw: generator must be a torch.Generator, or None; got {shown(generator)}")
@@ -325,12 +319,7 @@ class Augmentation(SampleTransform):
         return values
 
     def with_boxes(self, draw: Mapping[str, Any], boxes: Tensor | Sequence[Tensor] | None) -> Mapping[str, Any]:
-        """A draw with the boxes of samples that it needs, where it has not got them.
-
-        Args:
-            draw: as of `draw`.
-            boxes: of the samples (B, M, 4), or (M, 4) each; None if they have none.
-        """
+        """Return a draw with the boxes it needs of those of samples, (B, M, 4), or (M, 4) each, or None."""
         missing = {name: index for name, index in self.crops.items() if name not in draw}
         if not missing:
             return draw
@@ -426,9 +415,7 @@ class Augmentation(SampleTransform):
         return Part(rows, warp, source, *self._seen_through(warp, more))
 
     def _values(self, source: Camera, draw: Mapping[str, Any]) -> dict[str, Any]:
-        """What was drawn, (*B,) or (*B, size): of a single camera without batch dims where all samples draw the same,
-        as one map then serves them all; of arrays then plain numbers.
-        """
+        """Return what was drawn, (*B,) or (*B, size), where all is alike once: one map then serves all samples."""
         values = {name: value for name, value in draw.items() if name != "apply"}
         if not source.batch_shape and (len(draw["apply"]) == 1 or all(map(_are_alike, values.values()))):
             values = {
@@ -603,11 +590,7 @@ def check_front_end(owner: str, augmentation: object, camera: object, *kinds: ty
 def check_single(
     owner: str, camera: Camera, sizes: Sequence[tuple[str, tuple[int, ...]]], hint: str = ""
 ) -> tuple[int, int]:
-    """The image_size of a single camera.
-
-    Raises:
-        ValueError: a batch, no image_size, or images, by name, of other sizes.
-    """
+    """Return the image_size of a single camera, which is that of images by name."""
     if camera.image_size is None or camera.batch_shape:
         raise ValueError(
             f"{owner}: the camera must have an image_size and no batch dims; got image_size {camera.image_size} and "
@@ -625,11 +608,7 @@ def check_single(
 def camera_of_sample(
     owner: str, augmentation: Augmentation, camera: object, sizes: Sequence[tuple[str, tuple[int, ...]]]
 ) -> Camera:
-    """The single camera of a sample whose images are of these sizes: the one given, the augmentation's, or none known.
-
-    Raises:
-        ValueError: none is known, and the augmentation needs one; a batch; images of another size.
-    """
+    """Return the single camera of a sample whose images are of these sizes: given, the augmentation's, or unknown."""
     camera = augmentation.camera if camera is None else camera
     if camera is None and sizes and not augmentation.needs_camera:
         height, width = sizes[0][1]
@@ -644,10 +623,9 @@ def camera_of_sample(
 def move_points(
     augmentation: Augmentation, change: Change, pixels: Tensor, made: tuple[Tensor, Tensor] | None = None
 ) -> tuple[Tensor, Tensor]:
-    """Keypoints (B, *N, 2) moved, and valid (B, *N); landmarks in their order in a mirror.
+    """Return keypoints (B, *N, 2) moved, and valid (B, *N); landmarks in their order in a mirror.
 
-    (-1, -1), by which front ends say that a point has no place, stays that, and is not valid. What `together` has made
-    of them is not made again.
+    (-1, -1), by which front ends say that a point has no place, stays that. made: what `together` has made of them.
     """
     lost = (pixels == -1).all(-1)
     moved, valid = change.points(pixels) if made is None else made

@@ -158,11 +158,7 @@ def _rows_of_warp(warp: Warp, camera: Camera, index: list[int]) -> Warp:
 
 
 def _joined(a: Part, b: Part) -> Part:
-    """One part that does with one warp what two do one after the other.
-
-    Raises:
-        ValueError: the colours or the light of a lens seen through another one.
-    """
+    """Return one part that does with one warp what two do one after the other."""
     if b.moves is None:
         return a
     if a.moves is None:
@@ -534,10 +530,7 @@ class Change:
 def by_kinds(
     count: int, camera: Camera, part: Callable[[list[int] | None, Camera], Part], gate: Tensor | None = None
 ) -> Change:
-    """The change of samples by one camera or a batch of them: `part` makes the part of each kind of camera.
-
-    Its arguments are those rows, None for all, and their cameras.
-    """
+    """Return the change of samples by cameras: `part` takes the rows, None for all, and the cameras of each kind."""
     camera = alone(camera)
     if not isinstance(camera, Mixed):
         return Change(count, [part(None, camera)], gate=gate)

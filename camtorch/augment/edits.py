@@ -134,10 +134,7 @@ def _map(across: float, left: float, down: float, top: float) -> Tensor:
 
 
 def _box_to(size: tuple[int, int], corner: Tensor, sides: Tensor) -> Tensor:
-    """(*B, 2, 3): the map that brings a box, from its outer edges on, to an image of a size.
-
-    Its corner (left, top), and its sides (width, height), are (*B, 2).
-    """
+    """Return (*B, 2, 3) from boxes, (left, top) and (width, height) of outer edges (*B, 2), to images of a size."""
     scale = sides.new_tensor(size[::-1]) / sides
     shift = (0.5 - corner) * scale - 0.5
     return torch.cat((torch.diag_embed(scale), shift.unsqueeze(-1)), -1)

@@ -27,16 +27,16 @@ _HALVINGS = 10
 
 
 def filled(source: Camera, target: Camera, rotation: Tensor | None) -> Tensor:
-    """(*B,): the part of the target's image that shows something of the source's; 1 where its whole rim does.
-
-    As told by points that are spread evenly without rows, which a rim might run along: multiples of the inverse powers
-    of the root of x^3 = x + 1, modulo 1.
-    """
+    """Return (*B,): the part of the target's image that shows something of the source's; 1 where its whole rim does."""
     return _part_shown(source, target, _points(target), rotation)
 
 
 def _points(camera: Camera) -> Tensor:
-    """(N, 2): the pixels that `filled` looks at, those of the rim at the end."""
+    """Return the pixels (N, 2) that `filled` looks at, those of the rim at the end.
+
+    They are spread evenly without rows, which a rim might run along: multiples of the inverse powers of the root of x^3
+    = x + 1, modulo 1.
+    """
     height, width = camera.height, camera.width
     steps = torch.arange(1, _POINTS + 1, dtype=torch.float64)[:, None]
     spread = (steps / torch.tensor([_ROOT, _ROOT**2], dtype=torch.float64)).frac()
@@ -71,14 +71,10 @@ def scaled(camera: Camera, factor: Tensor) -> Camera:
 
 
 def enough(source: Camera, target: Camera, rotation: Tensor | None, share: float) -> tuple[Tensor, Tensor, Tensor]:
-    """The least that is to be done so that a `share` of the target's image shows something of the source's.
+    """Return the factor (*B,) on focal lengths and the rotation (*B, 3, 3) that fill `share`, and the part filled.
 
-    First the target zooms, up to four times. Where that is not enough it turns half as far from the source, a quarter
-    as far, or not at all.
-
-    Returns:
-        factor (*B,) on the target's focal lengths, at least 1; the rotation (*B, 3, 3); and the part (*B,) that is
-        filled then, which is below `share` where the source does not even see the target's axis. Graph-free.
+    The target zooms, up to four times, and then turns less far. The part is below `share` if the source does not see
+    its axis.
     """
     share = min(share + _CARE, 1.0)
     with torch.no_grad():
@@ -121,10 +117,7 @@ def _enough(source: Camera, target: Camera, rotation: Tensor, share: float) -> t
 def _least_zoom(
     part_shown: Callable[[Tensor], Tensor], at_first: Tensor, share: float, most: float
 ) -> tuple[Tensor, Tensor]:
-    """(*B,) each: the least factor of at least 1, or `most`, and the part of the image that is shown with it.
-
-    part_shown: of a zoom. at_first: without one.
-    """
+    """Return the least factor (*B,) from 1 to `most`, and the part of the image that is shown with it."""
     low, high = torch.ones_like(at_first), torch.full_like(at_first, most)
     high, at_high = torch.where(at_first >= share, low, high), at_first
     for _ in range(_HALVINGS):

@@ -64,11 +64,7 @@ class Table:
 
 
 def as_table(value: TableLike, owner: str) -> Table:
-    """The table that a name, an order, or a list of pairs says.
-
-    Raises:
-        ValueError: an unknown name, an order of which twice is not once around.
-    """
+    """Return the table that a name, an order, or a list of pairs says."""
     if isinstance(value, str):
         if value not in LANDMARKS:
             raise ValueError(
@@ -108,14 +104,7 @@ _LEFT, _RIGHT = "_left", "_right"
 
 
 class Mirroring:
-    """What a mirror changes beside places and directions: names of landmarks, of fields, and sides of heads.
-
-    Args:
-        landmarks: a table for all fields that may hold landmarks, or by their names; None: they keep their order.
-        lateral_axis: "x", "y" or "z" of a head's own frame, from one of its sides to the other.
-        swap_sides: whether fields `..._left` and `..._right` change places.
-        owner: the augmentation, for errors.
-    """
+    """What a mirror changes beside places and directions: names of landmarks, of fields, and sides of heads."""
 
     lateral: int
     """The number of the lateral axis."""
@@ -149,11 +138,7 @@ class Mirroring:
         self.key = self._named, self._one, self.lateral, self.swap_sides
 
     def order(self, name: str, kind: str | None, count: int) -> tuple[int, ...] | None:
-        """The order of `count` landmarks of a field in a mirror, or None if they keep theirs.
-
-        Raises:
-            ValueError: a table of another number.
-        """
+        """Return the order of `count` landmarks of a field in a mirror, or None if they keep theirs."""
         table = self._named.get(name) if self._named is not None else self._one
         if table is None:
             if self._named is None and self._one is None and kind in _HOLD[:2] and (meant := _FACES.get(count)):
@@ -174,10 +159,7 @@ class Mirroring:
         return order
 
     def swapped(self, name: str, kind: str | None, value: Tensor, mirrored: Tensor, flags: bool = False) -> Tensor:
-        """Landmarks (B, N, ...) with those of mirrored rows, (B,) bool, in their order in a mirror.
-
-        Kind None is of what does not move itself and has a table by its name, as the visibility of each landmark.
-        """
+        """Return landmarks (B, N, ...), mirrored rows in their order in a mirror; kind None: what does not move."""
         if kind is None and value.ndim < 2:
             raise ValueError(
                 f"{self.owner}: {name} has a table of landmarks, and must be (B, N, ...); got {shown(value)}"
@@ -193,11 +175,7 @@ class Mirroring:
         return torch.where(_lifted(mirrored, value), other, value)
 
     def sides(self, names: Iterable[str]) -> list[tuple[str, str]]:
-        """The fields that change places.
-
-        Raises:
-            ValueError: one has no other.
-        """
+        """Return the fields that change places, each with its other."""
         found = []
         names = set(names)
         for name in sorted(names) if self.swap_sides else ():

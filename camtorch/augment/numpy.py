@@ -155,11 +155,7 @@ class Transform:
     def _entry(
         self, name: str, value: Any, sample: Mapping[str, Any], size: tuple[int, int] | None, form: Any
     ) -> tuple[dict[str, Tensor], Restore | None]:
-        """A field as the augmentation takes it, tensors, and how it gets its layout back.
-
-        The latter is a function of what became of the tensors, and of the new image_size; None for what is passed on.
-        What is right of a `form`, the way of it is remembered.
-        """
+        """Return a field as tensors, and what gives them, and a new image_size, their layout back; or None."""
         if name in OWN or value is None:
             return {}, None
         if name == _SEEN or (name.endswith("_valid") and name.removesuffix("_valid") in sample):

@@ -173,11 +173,7 @@ class RandomCamera(Augmentation):
         self._among = None if among is None else (among.low, among.high)
 
     def _without(self, options: Mapping[str, object], *names: str) -> dict[str, Any]:
-        """None for the ranges that a class does without.
-
-        Raises:
-            TypeError: one of them is asked for.
-        """
+        """Return None for the ranges that a class does without; a TypeError if one is asked for."""
         for name in names:
             if name in options:
                 raise TypeError(f"{type(self).__name__}: there is no {name} here; RandomCamera has it")
@@ -268,10 +264,7 @@ class RandomCamera(Augmentation):
         return shades, light
 
     def _tell_of_zoom(self, source: Camera, target: Camera, factor: Tensor, found: Tensor) -> None:
-        """Warn, once a process, if `min_filled` zoomed to less than the least field of view that was asked for.
-
-        Where zoom, focal or crop were drawn to narrow the image so far, it was asked for that.
-        """
+        """Warn, once a process, if `min_filled`, and not a draw, zoomed to less than the `fov` that was asked for."""
         asked = self._among[0] if self._among else self.ranges["fov"].low if "fov" in self.ranges else None
         share = self.min_filled or 0.0
         key = self._name, asked, share
@@ -362,7 +355,7 @@ class RandomCamera(Augmentation):
 
 
 def _sized(base: Camera, size: tuple[int, int], fov: Any, xp: Any) -> Sequence[Any]:
-    """fx, fy, cx, cy of a lens before an image of another size, showing as much in width or a fov in degrees.
+    """Return fx, fy, cx, cy of a lens before an image of another size, as wide as it was or of a fov in degrees.
 
     The old image is scaled to the new width, and cropped or padded evenly to the new height.
     """
@@ -395,10 +388,7 @@ def _sized(base: Camera, size: tuple[int, int], fov: Any, xp: Any) -> Sequence[A
 
 
 def _seen_across(base: Camera, sine: Any, cosine: Any) -> Any:
-    """The pixels between two rays to either side of the axis, or of each of arrays of them (B,).
-
-    None where compiled code does not say.
-    """
+    """Return the pixels, one or (B,), between rays to either side of the axis; None without compiled code."""
     native = None if base.batch_shape else rows_of(base, base.intrinsics, base.distortion).native
     if native is None:
         return None
@@ -554,17 +544,12 @@ def _light(camera: Camera, loss: Tensor) -> Tensor:
 
 
 def jittered(camera: Camera, amounts: Tensor, nominal: Tensor) -> Tensor:
-    """Distortion coefficients (*B, n) of lenses like that of `camera`.
+    """Return distortion coefficients (*B, n) of lenses like that of `camera`, moved by amounts (*B, 16).
 
-    Every coefficient moves until it has moved the image's rim by its amount, together at most by the largest amount.
-    Where the new lens could not be inverted on the rim of what the old one shows, its coefficients move as far the
-    other way; or half as far, or a quarter, and so on; or stay.
-
-    Args:
-        camera: with image_size, and without batch dims or with those of the amounts.
-        amounts: (*B, 16), shares of the distance from the image's centre to its corner, signed.
-        nominal: (4,) or (*B, 4), intrinsics of the same lens before anything was drawn: what a coefficient does to the
-            rim is measured there.
+    Every coefficient moves until it has moved the image's rim by its amount, a share of the distance from the centre to
+    the corner of a lens of `nominal` intrinsics; together at most by the largest amount. Where the new lens could not
+    be inverted on the rim of what the old one shows, they move as far the other way; or half as far, and so on; or
+    stay.
     """
     with torch.no_grad():
         return _jittered(camera, amounts, nominal)[0]
@@ -648,10 +633,7 @@ _measured: dict[tuple[object, ...], Any] = {}
 
 
 def _kept(measure: Callable[..., T], camera: Camera, *inputs: Tensor, size: tuple[int, int] | None = None) -> T:
-    """`measure(camera, *inputs)`, of which these tensors are all that counts: mostly the lens is the same one.
-
-    size: of its images, (height, width), by default its own.
-    """
+    """Return `measure(camera, *inputs)`, of which these tensors and the size of images are all that counts, kept."""
     values = [(t.dtype, t.shape, t.device, t.detach().cpu().numpy().tobytes()) for t in inputs]
     key = measure, type(camera), size or camera.image_size, *values
     found: T | None = _measured.pop(key, None)
@@ -672,10 +654,7 @@ def _of_lens(camera: Camera, distortion: Tensor, nominal: Tensor) -> tuple[Array
 
 
 def _sensitivity(camera: Camera, distortion: Tensor, nominal: Tensor) -> Tensor:
-    """(*B, n): by how much to change a coefficient for an amount of 1, with these coefficients and intrinsics.
-
-    That moves the rim by its share of the distance from the centre to the corner.
-    """
+    """Return (*B, n): by how much to change each coefficient so that the rim moves from centre to corner."""
     count, size = distortion.shape[-1], camera._size_for("its sensitivity")
     batch = broadcast_shapes(nominal.shape[:-1], distortion.shape[:-1])
     intrinsics, k = (
@@ -709,9 +688,7 @@ def _over(size: tuple[int, int]) -> Tensor:
 
 
 def _defined(camera: Camera, distortion: Tensor, otherwise: Tensor) -> tuple[Tensor, Tensor | None]:
-    """Coefficients (*B, n), others where the model's formula does not exist for them; and where it does, (*B,) bool,
-    None: everywhere.
-    """
+    """Return coefficients (*B, n), others where the model has no formula for them; and where, (*B,), None: nowhere."""
     sense = camera.defined(distortion.unbind(-1))
     if sense is None:
         return distortion, None
@@ -719,10 +696,9 @@ def _defined(camera: Camera, distortion: Tensor, otherwise: Tensor) -> tuple[Ten
 
 
 def _rim(camera: Camera) -> Tensor:
-    """(C, N, 2): the pixels of the outline of what the cameras (C,) show of the image.
+    """Return (C, N, 2): pixels of the outline of what cameras show of the image; the principal point for the rest.
 
-    Of both: the image's edges, and where the lens ends on it; the principal point for what it does not show. What is
-    mapped has no holes: a lens that is invertible on the outline is so inside.
+    A lens that is invertible on the image's edges and where it ends on the image is so inside.
     """
     size = camera._size_for("its rim")
     border = _border(size, camera.intrinsics.dtype).to(camera.intrinsics.device)

@@ -172,11 +172,7 @@ _RANKS = {kind: (not field.decides, i) for i, (kind, field) in enumerate(KINDS.i
 
 
 def kind_of(name: str, value: object, own: Mapping[str, str], owner: str) -> str | None:
-    """The key in `KINDS` of a field, or None if it stays as it is.
-
-    Raises:
-        ValueError: numbers of an unknown name, which might be geometry.
-    """
+    """Return the key in `KINDS` of a field, None if it stays; numbers of an unknown name may be geometry: an error."""
     if name in own:
         return None if own[name] == KEEP else own[name]
     if name.endswith("_valid"):
@@ -223,11 +219,7 @@ def moves(kind: str, value: Tensor) -> Move:
 
 
 def as_tensor(value: object, name: str, kind: str, owner: str) -> Tensor:
-    """The value of a field as a tensor.
-
-    Raises:
-        TypeError: it is neither a tensor nor an array of real numbers.
-    """
+    """Return the value of a field as a tensor of real numbers."""
     if isinstance(value, np.ndarray) and value.dtype.kind in "fiub":
         value = torch.from_numpy(value)
     if not isinstance(value, Tensor) or value.dtype.is_complex:
@@ -304,11 +296,7 @@ def _tell_of_parts(name: str, boxes: Tensor, owner: str) -> None:
 
 
 def is_batch(named: Named, camera: object) -> bool:
-    """Whether a sample of name -> (kind, value) is a batch of samples.
-
-    The field that decides is the first of: an image, pixels, boxes; else cameras with a batch dim, and else any
-    field with more dims than one sample has.
-    """
+    """Whether name -> (kind, value) is a batch: the first image, pixels or boxes says, else cameras, else any field."""
     if isinstance(camera, (list, tuple)):
         return True
     for kind, value in sorted(named.values(), key=lambda pair: _RANKS[pair[0]]):
@@ -334,9 +322,7 @@ class Unknown(Pinhole):
 
 
 def on_samples(method: Callable[P, R]) -> Callable[P, R]:
-    """A method that moves samples: on one thread of torch, and in a worker of a DataLoader, which no graph can leave,
-    without one.
-    """
+    """Return a method that moves samples on one thread, and in a DataLoader's worker, no graph leaves, without."""
 
     @on_one_thread
     @functools.wraps(method)
@@ -484,11 +470,9 @@ class SampleTransform(nn.Module):
         return named
 
     def _batch(self, sample: Sample, predicted: bool = False) -> tuple[Named, bool, int, Camera]:
-        """The fields that move, all with a batch dim; whether the sample had one; its size, and its cameras.
+        """Return the fields that move, as a batch; whether the sample was one; its size, and its cameras.
 
-        What samples of one form have in common is found and checked once.
-
-        predicted: whether it may hold what networks made, whose values may be bad.
+        What samples of one form have in common is found and checked once. predicted: values may be bad.
         """
         camera: Any = sample.get("camera")
         camera = self._held("camera") if camera is None else camera

@@ -27,14 +27,9 @@ _NEARLY = 1e-6  # and those of the way back
 
 
 class MirrorWarp(Warp):
-    """A `Warp` whose rotation may be a mirror as well: `ray_target = Q ray_source`, Q orthogonal, of either sign.
+    """A `Warp` whose rotation, not checked, may be a mirror as well: `ray_target = Q ray_source`, Q orthogonal.
 
-    Args:
-        source, target: as of `Warp`.
-        rotation: (3, 3) or (B, 3, 3), which is not checked; or None.
-        antialias: as of `Warp`; None: images that shrink by more than one and a half are halved before, by torch's
-            antialiased interpolation, which takes less time.
-        options: mode and so on, as of `Warp`.
+    With antialias=None images that shrink by more than one and a half are halved before, which takes less time.
     """
 
     batch_shape: torch.Size
@@ -110,16 +105,8 @@ class MirrorWarp(Warp):
 class AffineWarp(MirrorWarp):
     """The image of `source` edited: its pixels move by an affine map, also those that see nothing.
 
-    Whole steps, flips and quarter turns copy pixels, bit by bit. What shrinks by antialiasing is made by torch's
-    interpolate, of a box of whole pixels, and else as by `Warp`.
-
-    Args:
-        source: the camera of the given images.
-        target: that of the edited ones.
-        matrix: (2, 3) or (B, 2, 3) in float64, from pixels (u, v, 1) of the source to those of the target; along the
-            axes, in any order.
-        rotation: what the edit does to rays: a mirror, or a quarter turn, about the axis.
-        options: mode and so on, as of `Warp`.
+    Whole steps, flips and quarter turns copy pixels, bit by bit. `matrix`, (2, 3) or (B, 2, 3) in float64 and along the
+    axes, maps pixels (u, v, 1) of the source to those of the target, `rotation` is what that does to rays.
     """
 
     is_an_operator = False
@@ -227,10 +214,7 @@ class AffineWarp(MirrorWarp):
         return result
 
     def _shrunk(self, images: Tensor, mode: Mode) -> Tensor | None:
-        """By torch's antialiased interpolation, if something shrinks and boxes of whole pixels become the results.
-
-        Bit by bit what torchvision's resize makes of the box.
-        """
+        """Return what torch's antialiased resize makes of boxes of whole pixels; None for others."""
         if not (self.antialias or self._decides) or mode == "nearest" or images.dtype == torch.bool:
             return None
         height, width = self.target._size_for("Warp")

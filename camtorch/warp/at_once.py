@@ -49,10 +49,7 @@ def _is_used_once(warp: Warp) -> bool:
 
 
 def between_of(warp: Warp) -> tuple[Native, Native, Tensor | None] | None:
-    """Source, target and rotation of a single warp for compiled code; None where it has to go step by step.
-
-    That is where its positions are kept, exact, antialiased throughout, in a graph, traced, or of a whole turn.
-    """
+    """Return source, target and rotation of a single warp for compiled code; None where it has to go step by step."""
     source, target, rotation = warp.source, warp.target, warp.rotation
     if warp.batch_shape or not _is_used_once(warp):
         return None
@@ -107,14 +104,9 @@ def _surely_keeps_size(back: Between, sizes: Sizes) -> bool:
 
 
 def batch_at_once(warp: Warp, images: Sequence[tuple[Tensor, Sampler]]) -> list[Tensor] | None:
-    """Images (B, C, H, W) of a warp of B cameras that is used once: each thread takes a sample, to its last pixel.
+    """Return images (B, C, H, W) of a warp of B cameras that is used once: each thread takes whole samples.
 
-    None where lattices do not do, images lie too oddly in memory or shrink, there are too few samples for the threads,
-    or something is in a graph or traced.
-
-    Args:
-        warp: from each sample's camera to another one.
-        images: and how they are sampled.
+    None where lattices do not do, images lie oddly in memory or shrink, threads would idle, or something is traced.
     """
     tensors = [image for image, _ in images]
     if not images or not is_eager(*tensors):
@@ -168,19 +160,10 @@ def at_once(
     hows: Sequence[Sampler | None],
     batched: bool = True,
 ) -> list[tuple[Tensor, Tensor | None]] | None:
-    """The images of a sample and its pixels, with a batch dim of one or without; and which pixels are valid.
+    """Return the images of a sample and its pixels, with a batch dim of one or without; and which pixels are valid.
 
-    None where a lattice does not do, images shrink, lie too oddly in memory, or something is in a graph or traced.
-
-    Args:
-        source: the camera of the images, single.
-        target: that of the images to make.
-        rotation: (3, 3), `ray_target = R ray_source`, or None.
-        sizes: of the images.
-        options: of a `Warp` whose tolerance is positive, or of a `MirrorWarp` that decides where to antialias.
-        values: images (1, C, H, W), masks (1, H, W) as well; and pixels (1, *N, 2) of the source's image.
-        hows: how images are sampled; None for pixels, which move as by `Warp.transform_points`.
-        batched: whether results have the batch dim.
+    None where a lattice does not do, images shrink, lie oddly in memory, or something is traced. Values are images (1,
+    C, H, W), masks (1, H, W) as well, and, where `hows` has None, pixels (1, *N, 2) of the source's image.
     """
     tolerance, antialias = options["tolerance"], options["antialias"]
     if not tolerance or antialias or not is_eager(*values):

@@ -66,11 +66,9 @@ def edges_of(boxes: Tensor) -> Tensor:
 
 
 def enclosing(boxes: Tensor, moved: Tensor, on_image: Tensor) -> tuple[Tensor, Tensor] | None:
-    """`moved_boxes` of plain boxes (..., 4) whose edges are moved already, to no panorama; None where that takes more,
-    as one of them is moved in part, off the image, or turned inside out.
+    """Return `moved_boxes` of plain boxes (..., 4) whose `edges_of` went to `moved` (..., N, 2), or not, (-1, -1).
 
-    moved: (..., N, 2), where their `edges_of` went, (-1, -1) for points without a place.
-    on_image: (..., N), whether that is on the image.
+    None if one is moved in part, off the image, or turned inside out. on_image: (..., N).
     """
     places, seen, given = moved.numpy(), on_image.numpy(), boxes.numpy()
     if not seen.all() and not (seen.any(-1).all() and (seen | (places != -1).any(-1)).all()):
@@ -85,10 +83,7 @@ def enclosing(boxes: Tensor, moved: Tensor, on_image: Tensor) -> tuple[Tensor, T
 
 
 def _inside(warp: Warp, corners: Tensor, like: Tensor) -> tuple[Tensor, Tensor]:
-    """Points (N, 2) of a lattice from edge to edge of the target, and (B, *M, N): which show what polygons enclose.
-
-    They find what encloses the whole image, or such parts of it as show the source, and has no edge there.
-    """
+    """Return a lattice (N, 2) over the target, and (B, *M, N): which of its points show what polygons enclose."""
     height, width = warp.target._size_for("Warp")
     share = torch.linspace(0, 1, _LATTICE + 1, dtype=like.dtype, device=like.device)
     if isinstance(warp.target, PANORAMAS):

@@ -145,19 +145,10 @@ def _sees_backward(camera: Camera, rotation: Tensor | None) -> Tensor:
 def middle_lines(
     camera: Camera, rotation: Tensor | None, plane: Camera, limit: Tensor, samples: int
 ) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]]:
-    """The middle row and column of an image on the plane of a projection: first the line that lies rather across.
+    """Return an image's middle row and column on a projection's plane, (*B, N, 2) and shown (*B, N), level first.
 
-    Corners would have a wide lens fill a panorama with what hardly any pixel shows.
-
-    Args:
-        camera: of the image.
-        rotation: (3, 3) or (B, 3, 3), to the camera of the plane.
-        plane: of focal length 1 and principal point 0.
-        limit: (2,), beyond which the plane is cut: what is beyond it shows that there is something up to it.
-        samples: along a line; more stand at its ends.
-
-    Returns:
-        Points (*B, N, 2) and whether they are shown (*B, N) bool, for each line.
+    Corners would have a wide lens fill a panorama with what hardly any pixel shows. The plane, of focal length 1, is
+    cut at the limit (2,): what is beyond it shows that there is something up to it.
     """
     found = []
     for line in (image_lattice(camera, 3, 3)[1], image_lattice(camera, 3, 3)[:, 1]):

@@ -57,16 +57,10 @@ class Sampling(NamedTuple):
 
 
 class Lattice:
-    """Where every pixel of a target samples the source's image, by positions at every eighth pixel.
+    """Where every pixel of a target (h, w) samples the source's image, by `nodes` (B, 2, n + 5, m + 5) of every eighth.
 
-    Between nodes a cubic is laid through four of them along each axis. Cells where that would not do have positions
-    for each of their pixels.
-
-    Args:
-        nodes: (B, 2, n + 5, m + 5), positions as of `grid_sample`, from pixel (-16, -16) on.
-        cells: (B, n, m) int32: `EMPTY`, `CUBIC`, or the cell's place in `exact`.
-        exact: (2, K, 8, 8), positions, NaN where none is mapped.
-        size: (h, w) of the target.
+    Nodes begin at pixel (-16, -16); a cubic is laid through four along each axis. `cells` (B, n, m) int32 are `EMPTY`,
+    `CUBIC`, or a place in `exact` (2, K, 8, 8), positions for each pixel, NaN where none is mapped.
     """
 
     nodes: Tensor
@@ -130,17 +124,7 @@ def locate(
     rows: range,
     padding: str,
 ) -> Sampling | Lattice:
-    """Where some rows of a target sample the source's image: on a lattice, if one does and nothing asks for pixels.
-
-    Args:
-        source: the camera of the images.
-        target: the camera of the images to make.
-        rotation: see `tabulate`.
-        tolerance: see `Warp`.
-        antialias: whether `Sampling.scale` is asked for.
-        rows: of the target.
-        padding: see `on_lattice`.
-    """
+    """Return where rows of a target sample the source's image: by a lattice if one does."""
     if not antialias:
         if tolerance and not torch.compiler.is_compiling():
             lattice = on_lattice(source, target, rotation, tolerance, rows, padding)
@@ -168,16 +152,7 @@ def tabulate(
     rows: range | None = None,
     padding: str = "zeros",
 ) -> tuple[Tensor, Tensor]:
-    """The sampling positions of a target's pixels, and which of them are mapped: see `Exact`.
-
-    Args:
-        source: the camera of the images.
-        target: the camera of the images to make.
-        rotation: (3, 3) or (B, 3, 3), `ray_target = R ray_source`, or None.
-        tolerance: see `Warp`; above zero the CPU may take `on_lattice`.
-        rows: of the target; all by default.
-        padding: see `on_lattice`.
-    """
+    """Return the sampling positions of a target's pixels, and which are mapped, see `Exact`; maybe by `on_lattice`."""
     height, width = target._size_for("Warp")
     rows = range(height) if rows is None else rows
     like = _like(target)
@@ -248,10 +223,7 @@ def _positions(
 
 
 def to_positions(seen: Tensor, mapped: Tensor, size: tuple[int, int]) -> Tensor:
-    """Pixels (..., 2) of an image of a size as sampling positions, `OUTSIDE` where they are not mapped, (...).
-
-    Without a graph that happens in the memory of the pixels.
-    """
+    """Return pixels (..., 2) of an image as sampling positions, in the same memory if there is no graph."""
     if may_look(seen) and is_plain(seen):
         for plane, side in zip(seen.unbind(-1), size[::-1], strict=True):
             plane.mul_(2 / side).add_(1 / side - 1)
@@ -267,13 +239,7 @@ def to_positions(seen: Tensor, mapped: Tensor, size: tuple[int, int]) -> Tensor:
 
 
 def local_scale(grid: Tensor, mapped: Tensor, source: Camera) -> Tensor:
-    """(B, H', W'): how many source pixels lie between neighbours of the target, in the direction with more of them.
-
-    Args:
-        grid: (B, H', W', 2), sampling positions.
-        mapped: (B, H', W') bool: there is such a position.
-        source: the camera of the images.
-    """
+    """Return (B, H', W'): how many source pixels lie between neighbours of the target, in the direction with more."""
     height, width = source._size_for("Warp")
     scale = grid.new_zeros(grid.shape[:-1])
     for dim in (1, 2):
@@ -291,21 +257,12 @@ def local_scale(grid: Tensor, mapped: Tensor, source: Camera) -> Tensor:
 def on_lattice(
     source: Camera, target: Camera, rotation: Tensor | None, tolerance: float, rows: range, padding: str
 ) -> Lattice | None:
-    """Positions within `tolerance` pixels of the exact ones, from a lattice of every eighth pixel.
+    """Return positions within `tolerance` pixels of the exact ones, from a lattice of every eighth pixel.
 
-    Where fourth differences say that cubics may miss by more than the tolerance, positions in the middle of a cell and
-    of its sides decide: where cubics do miss, a cell's pixels come one by one, from quintics if these do not, else from
-    the cameras, as at the limit of what is mapped and beside it. None if the cameras gave most of the image. What is
-    mapped, or is not, between four nodes alone and away from that limit is not seen.
-
-    Args:
-        source: the camera of the images.
-        target: the camera of the images to make.
-        rotation: see `tabulate`.
-        tolerance: positive, in pixels of the source.
-        rows: of the target.
-        padding: that the positions are for. Those that "zeros" shows nothing of, and coordinates beyond the rim, which
-            "border" draws in, keep no tolerance. For "reflection" all do, and so serve every padding.
+    Where fourth differences say that cubics may miss, positions in the middle of a cell and of its sides decide. There
+    a cell's pixels come one by one, from quintics if these do not miss, else from the cameras, as at the limit of what
+    is mapped. None if that is most of the image. What ends between four nodes alone is not seen. Positions that the
+    padding needs no more of, outside of the image, keep no tolerance; for "reflection" all do.
     """
     like, (height, width) = _like(target), (len(rows), target._size_for("Warp")[1])
     n, m = math.ceil(height / STEP), math.ceil(width / STEP)  # cells
@@ -333,14 +290,7 @@ def on_lattice(
 
 
 def straight_lattice(matrix: Tensor, rows: range, width: int, dtype: torch.dtype) -> Lattice:
-    """The lattice of positions that are an affine function of the target's pixels.
-
-    Args:
-        matrix: (B, 2, 3), from pixels (u, v, 1) to positions.
-        rows: of the target.
-        width: of the target.
-        dtype: of the lattice.
-    """
+    """Return the lattice of positions that are an affine function (B, 2, 3) of the target's pixels."""
     count, n, m = len(matrix), math.ceil(len(rows) / STEP), math.ceil(width / STEP)
     v, u = ((torch.arange(k + 5, dtype=matrix.dtype, device=matrix.device) - 2) * STEP for k in (n, m))
     across, down, shift = (column[..., None, None] for column in matrix.unbind(-1))
@@ -377,14 +327,9 @@ def _rim(rows: range, width: int, like: Tensor) -> Tensor:
 
 
 def _compute(exact: Exact, first: int, cells: Tensor, todo: Tensor, like: Tensor) -> Tensor:
-    """Exact positions (2, K, 8, 8) of cells, whose places are written into `cells`.
+    """Return exact positions (2, K, 8, 8) of the cells to do (B, n, m), and write their places into `cells`.
 
-    Args:
-        exact: see `Exact`.
-        first: row of the target where the lattice begins.
-        cells: (B, n, m) int32.
-        todo: (B, n, m) bool, those to begin with: where what is mapped ends in one, its neighbours follow.
-        like: a tensor of the dtype to compute in.
+    Where what is mapped ends in one, its neighbours follow.
     """
     parts, count = [like.new_empty(2, 0, STEP, STEP)], 0
     done, places = torch.zeros_like(todo), cells.flatten(1)

@@ -13,14 +13,7 @@ from camtorch.rotations import turn
 
 
 def between(start: Camera, end: Camera, rotation: Tensor | None, like: Tensor) -> Between | None:
-    """The compiled geometry from one camera to another, for pixels without a graph; None where there is none.
-
-    Args:
-        start: of the pixels.
-        end: that sees their rays.
-        rotation: (3, 3) or (B, 3, 3), `ray_end = R ray_start`, or None.
-        like: the pixels, or others of their dtype.
-    """
+    """Return the compiled geometry from camera to camera for pixels of the dtype of `like`; None in a graph."""
     made = compiled_of((start, end), like, *(() if rotation is None else (rotation,)))
     if made is None:
         return None
@@ -33,9 +26,7 @@ def between(start: Camera, end: Camera, rotation: Tensor | None, like: Tensor) -
 def moved_pixels(
     start: Camera, end: Camera, rotation: Tensor | None, pixels: Numbers, on_image: bool = False
 ) -> tuple[Tensor, Tensor]:
-    """Pixels (B, *N, 2), or (*N, 2), of one camera to another's, (-1, -1) without a place there, and whether they have;
-    with `on_image`, whether that is on the image. Other arguments as of `between`.
-    """
+    """Return pixels (B, *N, 2), or (*N, 2), of one camera as another's, (-1, -1) for none, and whether there is one."""
     if isinstance(pixels, Tensor) and pixels.ndim > 0 and pixels.shape[-1] == 2:
         ready = between(start, end, rotation, pixels)
         if ready is not None and ((pixels.ndim > 1 and pixels.shape[0] == ready.cameras) or not ready.is_batch):

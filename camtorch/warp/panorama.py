@@ -59,10 +59,7 @@ class Seam(NamedTuple):
 
 
 def seam_of(camera: Camera) -> Seam | None:
-    """Return by how much a camera's images become longer; None if it is no panorama of a whole turn.
-
-    While the values may not be looked at, it is what was found when they last could be.
-    """
+    """Return by how much images of a whole turn become longer, or None; traced, what it was before."""
     if not isinstance(camera, PANORAMAS):
         return None
     numbers = values_of(camera.intrinsics)
@@ -101,10 +98,7 @@ def goes_round(camera: Camera) -> Tensor | None:
 
 
 def lengths(camera: Camera, steps: tuple[Tensor, Tensor], grid: tuple[Tensor, Tensor]) -> Tensor:
-    """Return the lengths (B, h, w) of steps across and down from positions `grid` on a camera's image, in pixels.
-
-    Where it goes all the way round they are the shorter way round, and towards a pole as short as in the scene.
-    """
+    """Return the lengths (B, h, w) of steps on a camera's image in pixels; on a panorama as in the scene."""
     if (numbers := goes_round(camera)) is None:
         return torch.hypot(*steps)
     axis, sides = int(isinstance(camera, _DOWN)), camera._size_for("Warp")[::-1]
@@ -129,10 +123,7 @@ def off_poles(camera: Camera, rays: Tensor) -> Tensor:
 
 
 def within_turn(camera: Camera, pixels: Tensor) -> Tensor:
-    """Return pixels (h, w, 2) or (B, h, w, 2), those of a whole turn less than half of it from the principal point.
-
-    It may lie anywhere on such an image, and the model has rays for these alone.
-    """
+    """Return pixels ([B,] h, w, 2), those of a whole turn as those for which the model has rays."""
     if seam_of(camera) is None:
         return pixels
     axis, sides = int(isinstance(camera, _DOWN)), camera._size_for("Warp")[::-1]

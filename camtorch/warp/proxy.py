@@ -21,10 +21,7 @@ if TYPE_CHECKING:
 
 
 class ProxyWarp(Warp):
-    """A `Warp` to a camera at another place: both see the same points of a proxy of the scene.
-
-    Positions are exact, and full-size: no lattice.
-    """
+    """A `Warp` to a camera at another place, of which both see the same points of a proxy; exact, without a lattice."""
 
     is_an_operator = False
     batch_shape: torch.Size
@@ -41,9 +38,7 @@ class ProxyWarp(Warp):
         return rotation_matrix(self.extrinsics.rotation), self.extrinsics.translation
 
     def _nearness(self, rays: Tensor, of_source: bool) -> tuple[Tensor, Tensor]:
-        """One over the distance to the proxy along unit rays (B, *N, 3) of the source or of the target, and whether
-        they meet it.
-        """
+        """Return 1 / distance to the proxy along unit rays (B, *N, 3) of either camera, and whether they meet it."""
         raise NotImplementedError
 
     def _inputs(self) -> list[Tensor]:
@@ -89,11 +84,7 @@ class ProxyWarp(Warp):
 
 
 def check_pose(owner: str, extrinsics: Extrinsics, between: str, **cameras: Camera) -> torch.Size:
-    """The batch dim, or none, of cameras and of the pose between them.
-
-    Raises:
-        ValueError: batch dims that do not fit, or more than one; several devices. TypeError: no extrinsics.
-    """
+    """Return the batch dim, or none, of cameras and of the pose between them."""
     if not isinstance(extrinsics, Extrinsics):
         raise TypeError(
             f"{owner}: extrinsics must be Extrinsics, {between}; got {type(extrinsics).__name__}. "

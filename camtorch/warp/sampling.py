@@ -53,23 +53,11 @@ def render(
     out: Tensor | None = None,
     later: sampler.Later | None = None,
 ) -> Tensor:
-    """The images that a warp makes.
+    """Return the images (B, C, h, W') that a warp makes of (B or 1, C, H, W), in their dtype.
 
-    Images that are computed in another dtype are copied in parts, large ones as far as a tile of the target reads.
-
-    Args:
-        images: (B or 1, C, H, W), floating point, integer or bool.
-        where: positions of B cameras, or of one for all images.
-        mode: one of `MODES`.
-        padding_mode: one of `PADDINGS`.
-        fill: the value of pixels that show nothing, one or C.
-        kept: holds the halves of the images from one call to the next.
-        out: where to write the result, if it has no graph.
-        later: what compiled code is to do is left to `sampler.finish`, and goes in here.
-
-    Returns:
-        (B, C, h, W') of the dtype of the images. Half precision is sampled in float32; integers are rounded and stay
-        in their range, bool is true from one half on; the nearest integers are those of the image.
+    Half precision is sampled in float32; integers are rounded and stay in their range, bool is true from one half on.
+    What is computed in another dtype is copied in parts. `kept` holds halves of the images for the next call, `out`
+    takes a result without a graph, and `later` what compiled code is to do by `sampler.finish`.
     """
     dtype = images.dtype
     cameras = where.cells.shape[0] if isinstance(where, Lattice) else where.grid.shape[0]
@@ -101,11 +89,7 @@ def _natively(
     out: Tensor | None = None,
     later: sampler.Later | None = None,
 ) -> Tensor | None:
-    """What compiled code makes, or None: here is decided whether it does.
-
-    It wants the library, memory of the CPU, no graph and no transform, nobody who records what torch does, a dtype that
-    it knows, and no antialiasing.
-    """
+    """Return what compiled code makes; None with a graph, a transform, another device or dtype, or antialiasing."""
     mode, padding_mode, fill = how
     positions = where.nodes if isinstance(where, Lattice) else where.grid
     if not (is_eager(images, positions) and native_available() and sampler.takes(images.dtype, mode)):
@@ -174,10 +158,7 @@ def _render_tiles(result: Tensor, levels: Pyramid, where: Sampling, how: Sampler
 
 
 def _read(images: Tensor, where: Sampling, how: Sampler) -> tuple[Tensor, Tensor]:
-    """The part of the images that is read, as of `widen`, and the positions on it.
-
-    What is cut off at the image's own edges alone, or has no part in the result, leaves the padding as it is.
-    """
+    """Return the part of the images that is read, as of `widen`, and the positions on it; padding stays as it is."""
     reach, slices, axes = _REACH[how.mode], [], []
     sides, planes = images.shape[:-3:-1], where.grid.unbind(-1)
     ranges = [[float(end) for end in torch.aminmax(plane)] for plane in planes]
@@ -224,11 +205,7 @@ def _render(images: Tensor, grid: Tensor, where: Sampling, levels: Pyramid, how:
 
 
 class Pyramid:
-    """Images, and their half, which is a pyramid again, as soon as it is asked for.
-
-    The method is mip mapping (Williams, Pyramidal Parametrics, 1983): every level halves the image by a triangle
-    filter, and between levels is interpolated.
-    """
+    """Images, and their half, a pyramid again, when it is asked for (Williams, Pyramidal Parametrics, 1983)."""
 
     images: Tensor
     finite: bool
@@ -251,16 +228,7 @@ class Pyramid:
 def _minified(
     result: Tensor, levels: Pyramid, grid: Tensor, scale: Tensor, mode: Mode, padding_mode: PaddingMode
 ) -> Tensor:
-    """The result of `sample`, in which a pixel that covers n source pixels takes the mean of about as many.
-
-    Args:
-        result: (B, C, H', W'), sampled from the images themselves.
-        levels: of these images.
-        grid: (B or 1, H', W', 2).
-        scale: (B or 1, H', W') of `local_scale`.
-        mode: see `sample`.
-        padding_mode: see `sample`.
-    """
+    """Return the result of `sample`, in which a pixel that covers n source pixels takes the mean of about as many."""
     level = scale.clamp(min=1).log2().unsqueeze(1)
     for n in range(_level_count(level, levels.images)):
         levels = levels.half
@@ -279,18 +247,10 @@ def _level_count(level: Tensor, images: Tensor) -> int:
 
 
 def sample(images: Tensor, grid: Tensor, mode: Mode, padding_mode: PaddingMode, finite: bool = False) -> Tensor:
-    """`grid_sample` with align_corners=False.
+    """Return `grid_sample` with align_corners=False of images (B, C, H, W) at a grid (B or 1, H', W', 2).
 
-    Args:
-        images: (B, C, H, W) of a dtype to compute in.
-        grid: (B or 1, H', W', 2), normalised positions.
-        mode: one of `MODES`.
-        padding_mode: one of `PADDINGS`.
-        finite: no pixel is infinite or NaN.
-
-    Returns:
-        (B, C, H', W'). On a CPU, and unless it is compiled, an infinite or NaN pixel has a part in those bicubic
-        samples alone in which it has a weight.
+    On a CPU an infinite or NaN pixel has a part in those bicubic samples alone in which it has a weight. finite: there
+    is none.
     """
     grid = grid.to(images.dtype)
     if not (isinstance(images.shape[0], int) and len(grid) == len(images)):  # an exported program is to say no more
@@ -356,10 +316,7 @@ def _sample_again(result: Tensor, images: Tensor, grid: Tensor, padding_mode: Pa
 
 
 def _taps(position: Tensor, side: int, padding_mode: PaddingMode) -> list[tuple[Tensor, Tensor]]:
-    """The four pixels along an axis that have a part in positions (K,), and their weights, both (K,).
-
-    The cubic convolution of torch and OpenCV: Keys, 1981, with a = -3/4.
-    """
+    """Return the four pixels (K,) along an axis at positions (K,), and their weights (Keys, 1981, with a = -3/4)."""
     u = ((position + 1) * side - 1) / 2
     cell = u.floor()
     t = u - cell
@@ -439,11 +396,7 @@ class TolerantOptions(WarpOptions, total=False):
 def as_options(
     owner: str, mode: str, padding_mode: str, fill: Fill, antialias: bool | None, tolerance: float | None
 ) -> Options:
-    """The checked options of a `Warp`, by name.
-
-    Raises:
-        ValueError: a mode that does not exist, a fill or a tolerance that is none. TypeError: a fill that is no number.
-    """
+    """Return the checked options of a `Warp`, by name."""
     tolerance = None if tolerance is None else as_number(tolerance, "tolerance", owner)
     if tolerance is not None and not 0 <= tolerance < math.inf:
         raise ValueError(f"{owner}: tolerance must be a number of pixels, zero or more; got {tolerance!r}")

@@ -24,14 +24,8 @@ _MOST_GAPS = 8  # px between pixels that were neighbours, of an image that is en
 class ShiftedWarp(Warp):
     """A warp to a camera at another place: `p_target = R (p_source - shift)`, for images whose depth is known.
 
-    Each ray of the target is followed to the surface that the source sees, the nearest one first. What the source does
-    not see, because something stands before it or its depth is not known, is not mapped. Pixels have the depth of their
-    place in the source's image.
-
-    Args:
-        depth: (B, 1, H, W) of the source, positive where it is known.
-        kind: what depth holds, "z" or "distance".
-        shift: (B, 3), how far the camera moves, in its own frame.
+    Each ray of the target is followed to the nearest surface that the source sees; what it does not see, or has no
+    depth (B, 1, H, W), is not mapped. Pixels have the depth of their place in the source's image.
     """
 
     is_an_operator: ClassVar[bool] = False
@@ -122,10 +116,7 @@ class ShiftedWarp(Warp):
         return self._found
 
     def _followed(self, i: int, rays: Tensor, has_ray: Tensor, far: Tensor) -> tuple[Tensor, Tensor]:
-        """Pixels (N, 2) where a sample's rays (N, 3) from the new place meet what its camera saw, and whether they do.
-
-        far: (N,), how far that may be.
-        """
+        """Return pixels (N, 2) where rays (N, 3) of a sample from the new place meet a surface, and whether they do."""
         source = self.source[i] if self.source.batch_shape else self.source
         seen, good = rays.new_zeros(len(rays), 2), torch.zeros_like(has_ray)
         left = has_ray.nonzero()[:, 0]  # the rays that are not settled
@@ -172,10 +163,7 @@ def _rays(camera: Camera) -> tuple[Tensor, Tensor]:
 
 
 def _between(distance: Tensor, pixels: Tensor) -> Tensor:
-    """Distances (B, *N) at pixels (B, *N, 2) of maps (B, H, W), 0 where none is known.
-
-    Linear between the four pixels around; where these show two surfaces, or nothing, that of the nearest one.
-    """
+    """Return distances (B, *N) at pixels of maps (B, H, W), 0 if unknown: linear, between surfaces the nearest."""
     height, width = distance.shape[1:]
     u, v = pixels.reshape(len(distance), -1, 2).unbind(-1)
     on = (u >= -0.5) & (u <= width - 0.5) & (v >= -0.5) & (v <= height - 0.5)

@@ -288,10 +288,9 @@ class InMotion:
         return self.shutter.turned(rays, self.shutter._share(pixels, self.size), 1.0), valid
 
     def project(self, rays: Tensor) -> tuple[Tensor, Tensor]:
-        """As of a camera. When a ray is seen depends on where: that is solved without a graph, and then goes one step
-        of Newton's method with one, which has the derivatives of the solution.
+        """Return pixels and valid as of a camera, not where the scene passes as fast as rows are read, or faster.
 
-        Not valid where the scene passes as fast as rows are read, or faster.
+        When a ray is seen depends on where: a step of Newton's method has the derivatives of the solution.
         """
         rays, _ = as_points(rays, "points", 3, self.batch_shape, self.camera._tensors[:1], "Warp")
         side = self.size[1 if self.shutter.direction in ("right", "left") else 0]

@@ -88,10 +88,7 @@ class Views(GeometryModule):
 
     @torch.no_grad()
     def weights(self) -> Tensor:
-        """(N, H, W): the part that each view has in each pixel of the wide image; where any has one, they add up to 1.
-
-        It falls linearly to the border of a view.
-        """
+        """Return (N, H, W): the part of each view in the wide image, which falls to its border; they add up to 1."""
         pixels = self.view.pixel_grid()
         ends = pixels.new_tensor([self.view.width, self.view.height])
         ramp = torch.minimum(pixels + 1, ends - pixels).amin(-1)[None, None]

@@ -301,9 +301,7 @@ class Warp(GeometryModule):
         return self._move(pixels, on_image=True)
 
     def _move(self, pixels: Numbers, back: bool = False, on_image: bool = False) -> tuple[Tensor, Tensor]:
-        """Pixels of the source to the target's image, or back, and whether they have a place there, on it or not; see
-        `moved_pixels`.
-        """
+        """Return pixels of the source on the target's image, or back, and whether there is one; see `moved_pixels`."""
         (source, target), rotation = self._ends, self.rotation
         if back:
             source, target, rotation = target, source, None if rotation is None else rotation.mT
