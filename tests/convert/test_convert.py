@@ -15,6 +15,7 @@ F64 = {"dtype": torch.float64}
 SIZE = (480, 640)
 ROUNDING = 1e-11  # px
 
+AT_40 = {"max_angle": radians(40)}
 few_models = pytest.mark.parametrize(
     "key", slow_unless({"fisheye624", "kannala_brandt", "division"}.__contains__, KEYS)
 )
@@ -33,10 +34,10 @@ def fisheye(batch=(), seed=0, **options):
     )
 
 
-def pixels_apart(source, result, count=2000, seed=1):
-    """The distances at random pixels of the image that the result speaks for, measured anew; and which those are."""
+def pixels_apart(source, result):
+    """The distances at random pixels of the image that the result speaks for, measured anew; and their share."""
     height, width = source.image_size
-    draw = torch.rand(count, 2, generator=torch.Generator().manual_seed(seed), **F64)
+    draw = torch.rand(2000, 2, generator=torch.Generator().manual_seed(1), **F64)
     pixels = draw * torch.tensor([width, height], **F64) - 0.5
     with torch.no_grad():
         rays, valid = source.double().unproject(pixels)
@@ -44,7 +45,7 @@ def pixels_apart(source, result, count=2000, seed=1):
         use = valid & (angle < result.max_angle)
         new, mapped = result.camera.project(rays[use])
     assert bool(mapped.all())
-    return (new - pixels[use]).norm(dim=-1), valid, use
+    return (new - pixels[use]).norm(dim=-1), float(use.sum() / valid.sum())
 
 
 def check(source, result):
@@ -78,23 +79,17 @@ def test_to_the_same_model_is_a_copy(key):
 
 
 @few_models
-def test_from_every_model_as_the_numbers_say(key):
-    source = one(key)
-    result = source.convert(ct.KannalaBrandt, count=4)
-    check(source, result)
-    errors, valid, use = pixels_apart(source, result)
-    assert float(errors.max()) <= 1.05 * float(result.max_error) + 1e-9
-    assert float(errors.square().mean().sqrt()) == pytest.approx(float(result.rms), rel=0.1, abs=1e-9)
-    assert float(use.sum() / valid.sum()) == pytest.approx(float(result.valid_fraction), abs=0.03)
-
-
-@few_models
-def test_to_every_model_as_the_numbers_say(key):
-    source = ct.KannalaBrandt([300.0, 305, 321, 238], [0.02, -0.01, 0.003, -0.001], image_size=SIZE)
-    result = source.convert(key, max_angle=radians(40))
-    check(source, result)
-    errors, _, _ = pixels_apart(source, result)
-    assert float(errors.max()) <= 1.05 * float(result.max_error) + 1e-9
+def test_from_and_to_every_model_as_the_numbers_say(key):
+    for source, target, options in (
+        (one(key), ct.KannalaBrandt, {"count": 4}),
+        (ct.KannalaBrandt([300.0, 305, 321, 238], [0.02, -0.01, 0.003, -0.001], image_size=SIZE), key, AT_40),
+    ):
+        result = source.convert(target, **options)
+        check(source, result)
+        errors, share = pixels_apart(source, result)
+        assert float(errors.max()) <= 1.05 * float(result.max_error) + 1e-9
+        assert float(errors.square().mean().sqrt()) == pytest.approx(float(result.rms), rel=0.1, abs=1e-9)
+        assert share == pytest.approx(float(result.valid_fraction), abs=0.03)
     assert float(result.max_angle) == pytest.approx(radians(40), abs=0.02)
     # what has coefficients can follow a lens, what has none cannot
     assert float(result.max_error) < (20 if one(key).distortion_names else 60)
@@ -154,26 +149,22 @@ def test_a_table_of_a_lens_that_is_nearly_radial(p):
 # -- related models
 
 
-def same_numbers(a, b):
-    return torch.equal(a.intrinsics, b.intrinsics) and torch.equal(a.distortion, b.distortion)
-
-
-@pytest.mark.parametrize("names", [("kannala_brandt", "fisheye62", "fisheye624")])
-def test_special_cases_are_padded_and_come_back_bit_by_bit(names):
+def test_special_cases_are_padded_and_come_back_bit_by_bit():
     source = golden("kannala_brandt__auto_190deg_a")
-    camera = source
-    for name in names[1:]:
-        result = camera.convert(name)
-        assert bool(result.exact)
-        assert float(result.max_error) < ROUNDING
-        assert float(result.valid_fraction) == 1
-        camera = result.camera
-    assert torch.equal(camera.distortion[:4], source.distortion)
-    assert not bool(camera.distortion[4:].any())
-    back = camera.convert("kannala_brandt", count=4)
-    assert bool(back.exact)
-    assert same_numbers(back.camera, source)
-    assert same_numbers(camera.convert("fisheye62").camera.convert("kannala_brandt", count=4).camera, source)
+    for names in (("fisheye62",), ("fisheye62", "fisheye624")):
+        camera = source
+        for name in names:
+            result = camera.convert(name)
+            assert bool(result.exact)
+            assert float(result.max_error) < ROUNDING
+            assert float(result.valid_fraction) == 1
+            camera = result.camera
+        assert torch.equal(camera.distortion[:4], source.distortion)
+        assert not bool(camera.distortion[4:].any())
+        back = camera.convert("kannala_brandt", count=4)
+        assert bool(back.exact)
+        assert torch.equal(back.camera.intrinsics, source.intrinsics)
+        assert torch.equal(back.camera.distortion, source.distortion)
 
 
 def test_what_would_be_lost_is_fitted_row_by_row():
@@ -203,10 +194,7 @@ def test_a_related_model_gets_as_many_coefficients_as_it_needs():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("target", "options"),
-    [("brown_conrady", {"max_angle": 0.8, "count": 5}), ("equirectangular", {})],
-)
+@pytest.mark.parametrize(("target", "options"), [("brown_conrady", {"max_angle": 0.8, "count": 5}), ("latlon", {})])
 def test_a_batch_is_its_rows_one_by_one(target, options):
     source = fisheye((4, 8))
     together = source.convert(target, **options)
@@ -216,10 +204,8 @@ def test_a_batch_is_its_rows_one_by_one(target, options):
         alone = row.convert(target, **options)
         for name in ("rms", "max_error", "max_angle", "valid_fraction"):
             torch.testing.assert_close(getattr(together, name)[i, j], getattr(alone, name), rtol=1e-7, atol=1e-9)
-        for name in ("intrinsics", "distortion"):
-            torch.testing.assert_close(
-                getattr(together.camera, name)[i, j], getattr(alone.camera, name), rtol=1e-7, atol=1e-8
-            )
+        for whole, part in zip(together.camera[i, j]._tensors, alone.camera._tensors, strict=True):
+            torch.testing.assert_close(whole, part, rtol=1e-7, atol=1e-8)
 
 
 @pytest.mark.filterwarnings("ignore:.*became unusable")
@@ -233,16 +219,6 @@ def test_a_row_that_is_no_camera_leaves_the_others_alone():
     assert float(after.max_error[1]) == float(after.rms[1]) == math.inf
     assert float(after.valid_fraction[1]) == float(after.max_angle[1]) == 0
     torch.testing.assert_close(after.camera.distortion[[0, 2]], before.camera.distortion[[0, 2]], rtol=1e-7, atol=1e-8)
-
-
-def test_a_shared_lens_serves_the_batch():
-    lens = torch.nn.Parameter(torch.tensor([0.02, -0.01, 0.003, -0.001], **F64))
-    source = ct.KannalaBrandt(
-        torch.tensor([[300.0, 300, 320, 240], [280, 280, 320, 240]], **F64), lens, image_size=SIZE
-    )
-    result = source.convert("fisheye624")
-    assert result.camera.distortion.shape == (2, 12)
-    assert result.exact.tolist() == [True, True]
 
 
 # -- what is asked for
@@ -353,27 +329,18 @@ def largest(source, result, rows=481, columns=641):
     return float(torch.where(mapped, (new - old).norm(dim=-1), 0.0).max())
 
 
-@pytest.mark.slow
-@each_kind
+@pytest.mark.parametrize("key", slow_unless({"division", "fisheye624"}.__contains__, sorted(DISTINCT)))
 @given(data=st.data())
 @settings(max_examples=2)
 def test_nothing_between_the_nodes_of_drawn_cameras_is_worse(key, data):
     source = data.draw(drawn(key, wild=data.draw(st.booleans()))).requires_grad_(False)
     angle = data.draw(st.sampled_from([None, 0.3, 0.7, 1.2]))
     result = source.convert(data.draw(st.sampled_from(KEYS)), max_angle=angle)
+    check(source, result)
     # what no lens of the other model comes near changes more between the nodes: 1 % of 218 px has been seen
     margin = 1.005 if float(result.max_error) < 50 else 1.02
     if bool(torch.isfinite(result.max_error)):
         assert largest(source, result) <= margin * float(result.max_error) + 1e-9
-
-
-@pytest.mark.parametrize("key", slow_unless({"division", "fisheye624"}.__contains__, sorted(DISTINCT)))
-@given(data=st.data())
-@settings(max_examples=1)
-def test_wild_cameras_become_something_finite(key, data):
-    source = data.draw(drawn(key, wild=True))
-    result = source.convert(data.draw(st.sampled_from(KEYS)))
-    check(source, result)
 
 
 @pytest.mark.parametrize("key", slow_unless({"brown_conrady"}.__contains__, ["brown_conrady", "division"]))
