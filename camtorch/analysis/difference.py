@@ -67,14 +67,8 @@ class Difference(NamedTuple):
 def difference(a: Camera, b: Camera, *, remove_rotation: bool = False) -> Difference:
     """Compare two single cameras over the image of the first.
 
-    Args:
-        a: the camera whose image is looked at.
-        b: the other camera, of an image of the same size, or of none stated.
-        remove_rotation: whether the rays are turned first, by the one rotation that brings those of the cameras
-            closest: two calibrations of one camera may differ by where they look.
-
-    Raises:
-        ValueError: a batch, no image size, or two different ones.
+    `remove_rotation` first turns the rays by the one rotation that brings those of the cameras closest: two
+    calibrations of one camera may differ by where they look.
     """
     for camera in (a, b):
         if camera.batch_shape:

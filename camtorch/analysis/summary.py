@@ -64,11 +64,7 @@ class Summary:
 
 @torch.no_grad()
 def summarise(camera: Camera) -> Summary:
-    """The summary of a camera.
-
-    Raises:
-        ValueError: the camera is a batch.
-    """
+    """Return the summary of a single camera."""
     if camera.batch_shape:
         raise ValueError(f"summary: camera must be a single one; got batch dims {tuple(camera.batch_shape)}")
     angles = torch.linspace(0, math.pi, _ANGLES).to(camera.intrinsics)

@@ -14,11 +14,7 @@ from camtorch.camera import Camera
 
 
 def as_tensor(values: Numbers, name: str, owner: str, device: torch.device) -> Tensor:
-    """A tensor of real numbers, NaN among them: of a tensor, an array, lists, or a list of such of one shape.
-
-    Raises:
-        TypeError: no real numbers. ValueError: parts of different shapes.
-    """
+    """Return a tensor of real numbers, NaN among them: of a tensor, an array, or lists, also of such of one shape."""
     if isinstance(values, (list, tuple)) and values and all(getattr(v, "ndim", 0) for v in values):
         parts = [as_tensor(v, f"{name}[{i}]", owner, device) for i, v in enumerate(values)]
         if len({part.shape for part in parts}) > 1:
@@ -29,11 +25,7 @@ def as_tensor(values: Numbers, name: str, owner: str, device: torch.device) -> T
 
 
 def as_vectors(values: Numbers, name: str, size: int, owner: str, device: torch.device) -> Tensor:
-    """(*B, N, size) of that, or of OpenCV's (*B, N, 1, size).
-
-    Raises:
-        TypeError: no real numbers. ValueError: another shape.
-    """
+    """Return (*B, N, size) from such values, or from OpenCV's (*B, N, 1, size)."""
     vectors = as_tensor(values, name, owner, device)
     if vectors.ndim > 2 and vectors.shape[-2] == 1 and vectors.shape[-3] > 1:
         vectors = vectors.squeeze(-2)

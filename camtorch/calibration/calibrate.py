@@ -67,13 +67,7 @@ def as_model(
     fixed: Collection[str] | str,
     owner: str,
 ) -> Model:
-    """What the arguments of `calibrate` say about the camera.
-
-    Raises:
-        ValueError: no such model, a number of coefficients that it does not take, unknown names in `fixed`, a start
-            that is another model, that has a batch, or that is missing where a focal length is fixed. TypeError: no
-            model.
-    """
+    """Return which camera the arguments of `calibrate` ask for."""
     if isinstance(model, Camera):
         if start is not None:
             raise ValueError(f"{owner}: model is a camera to start from already; got start={start!r} as well")
@@ -82,13 +76,10 @@ def as_model(
     if start is not None:
         if not isinstance(start, Camera):
             raise TypeError(f"{owner}: start must be a camera; got {no_camera(start)}")
-        if (
-            model.smoothness() is not None
-            and not start.batch_shape
-            and type_before_parametrizations(start) is not model
-        ):
-            start = start.convert(model).camera
-        if type_before_parametrizations(start) is not model or start.batch_shape.numel() != 1:
+        is_other = type_before_parametrizations(start) is not model
+        if is_other and model.smoothness() is not None and not start.batch_shape:
+            start, is_other = start.convert(model).camera, False
+        if is_other or start.batch_shape.numel() != 1:
             raise ValueError(
                 f"{owner}: start must be one {model.__name__}, as start.convert({model.__name__}).camera is; got "
                 f"{type(start).__name__} with batch_shape={tuple(start.batch_shape)}"
@@ -296,9 +287,7 @@ def calibrate(
     if not result.converged:
         ends = [] if bool(result.adjusted.converged[0]) else ["the search did not end at an optimum"]
         ends += [f"{lost} corners have no pixel in it: a surface has to reach further"] if (lost := result.lost) else []
-        warn(
-            f"{owner}: {', and '.join(ends)} (rms {result.rms:.4g} px); do not use it. See its warnings",
-        )
+        warn(f"{owner}: {', and '.join(ends)} (rms {result.rms:.4g} px); do not use it. See its warnings")
     return result
 
 
@@ -347,7 +336,8 @@ class Search:
     @cached_property
     def seen(self) -> Observations:
         """What was given, with the boards about their middle."""
-        return self.given.about(self.middle)
+        points = torch.where(self.given.seen[..., None], self.given.points - self.middle, 0.0)
+        return self.given._replace(points=points)
 
     @property
     def sight(self) -> Sight:
@@ -461,11 +451,7 @@ class Results(NamedTuple):
 def results(
     searches: Sequence[Search], adjusted: Adjusted, free: Free, object_points: Any, image_points: Sequence[Any]
 ) -> Results:
-    """What an optimum says; a better one in another basin of a model takes its place. Points are as they were passed.
-
-    Raises:
-        ValueError: the data leave the problem open.
-    """
+    """Return the results of an optimum, or of a better one in another basin; points are as they were passed."""
     sights, optima = [search.sight for search in searches], []
     for c, search in enumerate(searches):
         adjusted, found = search.other_optima(c, sights, adjusted, free)
@@ -478,17 +464,39 @@ def results(
     residuals, valid = (torch.cat([t[0] for t in of_all]) for of_all in (adjusted.residuals, adjusted.valid))
     views = torch.stack([one.seen.any(-1) for one in given]).any(0)
     parameters = unknowns(sights, adjusted, int(views.sum()))
-    loss, loss_scale = searches[0].loss, searches[0].loss_scale
-    inliers, sigma, noise = noise_of(residuals, seen, valid, loss, loss_scale, parameters)
+    inliers, sigma, noise = noise_of(residuals, seen, valid, searches[0].loss, searches[0].loss_scale, parameters)
     # views that repeat others widen what is uncertain as if there were so many less
     again = repeats(given, [r[0] for r in adjusted.residuals])
     noise = noise * math.sqrt(len(views) / (len(views) - len(again)))
-    cameras = []
+    cameras, state = [], adjusted.state
     for c, (search, pixels, own) in enumerate(zip(searches, image_points, inliers.split(len(views)), strict=True)):
-        copies = search.layout.views[again[search.given.seen[again].any(-1)]].tolist()
-        layout = search.layout._replace(copies=tuple(sorted({*search.layout.copies, *copies})))
-        passed = object_points, pixels
-        cameras.append(_result(adjusted, c, search, layout, own, sigma, spreads[c].scaled(noise.reshape(1)), passed))
+        asked, one, layout = search.asked, search.given, search.layout
+        copies = layout.views[again[one.seen[again].any(-1)]].tolist()
+        off, has_pixel = adjusted.residuals[c][0], adjusted.valid[c][0]
+        rotations, translations = (t[0] for t in _seen_from(state, c))
+        camera = Calibration(
+            camera=asked.camera(state.parameters[c][0], layout.image_size),
+            extrinsics=Extrinsics(rotation_vector(rotations).unsqueeze(-1), translations - rotations @ search.middle),
+            rms=rms_of(off, one.seen),
+            sigma=float(sigma),
+            residuals=layout.restore(torch.where(has_pixel[..., None], off, torch.nan)),
+            inliers=layout.restore(own),
+            parameter_names=asked.names,
+            spread=spreads[c].scaled(noise.reshape(1)),
+            converged=bool(adjusted.converged[0]) and bool((has_pixel | ~one.seen).all()),
+            bend=(float(state.bend[0, 0]), float(state.bend[0, 1])),
+            image_size=layout.image_size,
+            views=tuple(layout.views.tolist()),
+            copies=tuple(sorted({*layout.copies, *copies})),
+            object_points=object_points,
+            image_points=pixels,
+            observations=one,
+            adjusted=adjusted,
+            point_inliers=own,
+            loss=search.loss,
+            index=c,
+        )
+        cameras.append(camera)
     for camera, ends in zip(cameras, optima, strict=True):
         camera.twins = () if ends is None else ends.twins(camera)
     return Results(adjusted, cameras, rms_of(residuals, seen), float(sigma), noise)
@@ -536,41 +544,3 @@ def noise_of(
     if loss is None:
         return inliers, whole, whole
     return inliers, sigma, noise_under(loss, loss_scale, residuals, seen & valid, free)
-
-
-def _result(
-    adjusted: Adjusted,
-    camera: int,
-    search: Search,
-    layout: Layout,
-    inliers: Tensor,
-    sigma: Tensor,
-    spread: Spread,
-    passed: tuple[Any, Any],
-) -> Calibration:
-    """The result for one of the cameras."""
-    asked, seen = search.asked, search.given
-    state, residuals, valid = adjusted.state, adjusted.residuals[camera][0], adjusted.valid[camera][0]
-    rotations, translations = (t[0] for t in _seen_from(state, camera))
-    return Calibration(
-        camera=asked.camera(state.parameters[camera][0], layout.image_size),
-        extrinsics=Extrinsics(rotation_vector(rotations).unsqueeze(-1), translations - rotations @ search.middle),
-        rms=rms_of(residuals, seen.seen),
-        sigma=float(sigma),
-        residuals=layout.restore(torch.where(valid[..., None], residuals, torch.nan)),
-        inliers=layout.restore(inliers),
-        parameter_names=asked.names,
-        spread=spread,
-        converged=bool(adjusted.converged[0]) and bool((valid | ~seen.seen).all()),
-        bend=(float(state.bend[0, 0]), float(state.bend[0, 1])),
-        image_size=layout.image_size,
-        views=tuple(layout.views.tolist()),
-        copies=layout.copies,
-        object_points=passed[0],
-        image_points=passed[1],
-        observations=seen,
-        adjusted=adjusted,
-        point_inliers=inliers,
-        loss=search.loss,
-        index=camera,
-    )

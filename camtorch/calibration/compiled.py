@@ -53,10 +53,7 @@ def can_search(*tensors: Tensor) -> bool:
 
 
 def from_rays(points: Tensor, rays: Tensor, weights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Rotations (B, 2, 3, 3), translations (B, 2, 3) and valid (B, 2), of what `poses_from_rays` takes.
-
-    points: (P, N, 3), the same for each P rows.
-    """
+    """Return (B, 2, 3, 3), (B, 2, 3) and valid (B, 2) for `poses_from_rays`; points (P, N, 3) serve P rows each."""
     count = len(rays)
     rotations, translations = rays.new_empty(count, 2, 3, 3), rays.new_empty(count, 2, 3)
     valid = torch.empty(count, 2, dtype=torch.bool, device="cpu")
@@ -67,10 +64,7 @@ def from_rays(points: Tensor, rays: Tensor, weights: Tensor) -> tuple[Tensor, Te
 def refined(
     native: Native, points: Tensor, pixels: Tensor, weights: Tensor, start: tuple[Tensor, Tensor], search: Search
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Rotations (B, 3, 3), translations (B, 3) and costs (B,) of the minima that poses lead to.
-
-    points: (P, N, 3). pixels: (B, N, 2). weights: (B, N) of the squares.
-    """
+    """Return the minima (B, 3, 3), (B, 3) that poses lead to, and costs (B,), of points (P, N, 3), pixels (B, N, 2)."""
     while True:
         rotations, translations = (t.clone(memory_format=torch.contiguous_format) for t in start)
         converged, costs = torch.empty(len(pixels), dtype=torch.bool, device="cpu"), pixels.new_empty(len(pixels))
@@ -89,10 +83,7 @@ def solved(
     start: tuple[Tensor, Tensor] | None = None,
     threshold: float = 0.0,
 ) -> Solved:
-    """The poses of what `solve_pnp` takes, (P, N, 3), (B, N, 2) and (B, N).
-
-    start: poses about the middle of the points that are seen, on which most agree; of all that is seen without.
-    """
+    """Return poses of (P, N, 3), (B, N, 2), (B, N), near `start`, about the middle of what is seen, if it is given."""
     batch, count, _ = pixels.shape
     native.add_table()
     while True:

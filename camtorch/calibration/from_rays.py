@@ -149,11 +149,7 @@ def _observations(pixels: Tensor, rays: Tensor, weights: Numbers | None, dims: i
 
 
 def _unified(seen: fitting.Observations, owner: str) -> Camera:
-    """The unified lenses (C,) that see the rays best, of a few: focal lengths and axis are linear in the pixels.
-
-    Raises:
-        ValueError: none has a positive focal length.
-    """
+    """Return the best of a few unified lenses (C,): their focal lengths and axis are linear in the pixels."""
     lenses, costs = [], []
     x, y, z = seen.rays.unbind(-1)
     for alpha in _ALPHAS:

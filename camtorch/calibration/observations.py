@@ -47,10 +47,6 @@ class Observations(NamedTuple):
         """Those of some views, given by numbers or by a mask."""
         return Observations(*(t[views] for t in self))
 
-    def about(self, middle: Tensor) -> Observations:
-        """With the points about another origin (3,)."""
-        return self._replace(points=torch.where(self.seen[..., None], self.points - middle, 0.0))
-
 
 class Layout(NamedTuple):
     """The form in which the image points of one camera came."""
@@ -84,12 +80,7 @@ class Layout(NamedTuple):
 def as_observations(
     object_points: Points, image_points: Points, image_size: Sequence[int], owner: str
 ) -> tuple[Observations, Layout]:
-    """What one camera sees, of what `calibrate` takes: the views that have corners, and the form to bring results back.
-
-    Raises:
-        ValueError: shapes and numbers that do not fit, views of too few corners, corners on a line, corners twice,
-            corners outside the image, infinite values. TypeError: no numbers.
-    """
+    """Return what one camera sees, only views that have corners, and the form to bring results back to."""
     if isinstance(image_points, Mapping):
         raise TypeError(f"{owner}: image_points of one camera are a tensor or a list; cameras by name make a rig")
     return _observed(object_points, {"": image_points}, {"": image_size}, owner)[""]
@@ -102,11 +93,7 @@ def as_rig_observations(
     models: Mapping[str, Any],
     owner: str,
 ) -> dict[str, tuple[Observations, Layout]]:
-    """What the cameras of a rig see: of every camera the same views of the same boards, by name in the models' order.
-
-    Raises:
-        ValueError: what `as_observations` refuses; names that differ; cameras that no board links. TypeError: no dicts.
-    """
+    """Return what each camera of a rig sees of the same boards, by name in the order of the models."""
     for argument, given in {"models": models, "image_points": image_points, "image_sizes": image_sizes}.items():
         if not isinstance(given, Mapping) or not all(isinstance(name, str) for name in given):
             raise TypeError(

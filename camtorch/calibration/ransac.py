@@ -86,7 +86,7 @@ class _Lines(NamedTuple):
 
 
 def consensus(points: Tensor, rays: Tensor, slopes: Tensor, seen: Tensor, threshold: float) -> Consensus:
-    """The poses, camera from object, with the least sum of squared distances of points from rays, cut at a threshold.
+    """Return the poses, camera from object, of least squared distances of points from rays, each cut at a threshold.
 
     Few points are drawn (by a generator of its own, the same for all rows, whose results so do not depend on each
     other), as often as it takes to meet some without an outlier several times, judged by how many points agree with the
@@ -95,12 +95,8 @@ def consensus(points: Tensor, rays: Tensor, slopes: Tensor, seen: Tensor, thresh
     J. Matas and J. Kittler, Locally Optimized RANSAC, DAGM 2003, with the cut squares of P. Torr and A. Zisserman,
     MLESAC, CVIU 2000.
 
-    Args:
-        points: (B, N, 3), finite.
-        rays: (B, N, 3), of unit length.
-        slopes: (B, N, 2, 3): the pixels by the rays, across them.
-        seen: (B, N) bool: the others have no part in it.
-        threshold: px.
+    Points (B, N, 3) are finite, rays (B, N, 3) of unit length; slopes (B, N, 2, 3) are the pixels by the rays, across
+    them; what is not `seen`, bool (B, N), has no part in it. The threshold is in px.
     """
     measures = torch.cat((slopes, rays[..., None, :]), -2).transpose(1, 2)
     lines = _Lines(points, torch.where(seen[:, None, :, None], measures, 0.0), threshold)

@@ -69,7 +69,7 @@ def start_from_nothing(
     loss: str | None = None,
     loss_scale: float = 1.0,
 ) -> State:
-    """A camera of the model, B = 1, and the poses of all views, from which an adjustment reaches the optimum.
+    """Return a camera of the model, B = 1, and the poses of all views, from which an adjustment reaches the optimum.
 
     Unified cameras of all widths are tried, their axis in the middle of the image: the rays of the pixels give poses in
     closed form, and those a score. The best few are refined together, and the model is fitted to what is best then,
@@ -77,9 +77,6 @@ def start_from_nothing(
     ones do not matter. Parameters that are `fixed` are held: coefficients as in `Camera.ideal`, the principal point in
     the middle of the image. The loss, in px, is that of the adjustment, and decides where several cameras are nearly as
     good.
-
-    Raises:
-        ValueError: corners lie further from the axis than the model reaches.
     """
     few = _few(observations, image_size)
     lens = first = _unified(few, image_size, fixed)
@@ -438,10 +435,7 @@ def _focal_at_axis(camera: Camera) -> Tensor:
 
 
 def _check_reach(lens: _Lens, few: Observations, other: _Lens) -> None:
-    """Raise a ValueError where the model has no pixel for many of the corners, or for some and errs with the others.
-
-    other: a lens that reaches them.
-    """
+    """Raise a ValueError if the model loses many corners, or some and errs with the others; `other` reaches them."""
     lost = int(lens.lost(few).sum())
     if lost > (_LOST * int(few.seen.sum()) if lens.scale <= _ERRS * other.scale else 0):
         inliers = few.seen & (other.errors(few)[0] < _OUTLIER * other.scale)

@@ -163,12 +163,7 @@ def worst(covariances: Tensor) -> Tensor:
 
 @torch.no_grad()
 def uncertainty(spread: Spread, pixels: Numbers, distance: Numbers = math.inf) -> Tensor:
-    """`Calibration.uncertainty` of a single problem.
-
-    Raises:
-        ValueError: pixels of another shape, distances that are not positive or do not fit the pixels.
-        TypeError: not numbers.
-    """
+    """Return `Calibration.uncertainty` of a single problem."""
     owner, like = "uncertainty", spread.parameters
     pixels, distance = (
         as_values(value, name, owner, like.device).detach().to(like)

@@ -318,14 +318,11 @@ def verdict(calibration: Calibration) -> str:
 def check_determined(
     adjusted: Adjusted, camera: int, found: Spread, names: Sequence[str], sight: Sight, owner: str
 ) -> None:
-    """Refuse a problem in which the views of a camera leave it open, as those of boards that are all parallel do.
+    """Raise a ValueError if the views of a camera leave it open, as those of boards that are all parallel do.
 
     It is open if corners that are wrong by a tenth of a pixel leave the projections of what was seen uncertain by a
     fiftieth of the extent of the corners: a matter of where the boards were, which corners without noise cannot hide.
     Several views that no camera fits are wrong, not open: they get warnings. found: of noise of 1 px.
-
-    Raises:
-        ValueError: If it is open, with what to do.
     """
     found = found.scaled(adjusted.cost.new_full((1,), _USUAL_NOISE))
     seen = sight.weights[0] > 0

@@ -9,15 +9,11 @@ from torch import Tensor
 
 
 def attached(objective: Callable[[Tensor], Tensor], optimum: Tensor, valid: Tensor) -> Tensor:
-    """The optimum with a graph, of the same value, for first derivatives by whatever the objective depends on.
+    """Return the optimum (B, K) with a graph, for first derivatives by whatever the objective depends on.
 
-    The gradient of the objective is zero at an optimum and stays zero when it moves: one step by Newton's method, with
-    the exact Hessian, has the derivatives of the optimum however that was found.
-
-    Args:
-        objective: of unknowns (B, K) the costs (B,), each of its own row, differentiable twice.
-        optimum: (B, K), where it is least.
-        valid: (B,) bool; other rows get no gradient.
+    The gradient of the objective, of costs (B,) that are each of its own row, is zero at an optimum and stays zero when
+    it moves: one step by Newton's method, with the exact Hessian, has the derivatives of the optimum however that was
+    found. Rows that are not valid, bool (B,), get no gradient.
     """
     with torch.enable_grad():
         unknowns = optimum.detach().requires_grad_()

@@ -53,18 +53,18 @@ class Prior:
         """
         turn = discs.new_tensor(_TURNS)
         a, b = ((discs[:, None] * c).reshape(-1, 1) for c in (turn.cos(), turn.sin()))
-        with torch.enable_grad():
-            k = self.lens.expand(len(a), -1).clone().requires_grad_()
-            rays = self.model.optics(columns(k.detach()))[0].to_ray(a, b, 1)
+        k = self.lens.expand(len(a), -1)
+        rays = self.model.optics(columns(k))[0].to_ray(a, b, 1)
+
+        def planes(k: Tensor) -> Tensor:
             chart, lens = self.model.optics(columns(k))
-            planes = lens(*chart.to_plane(*rays, 1)) if lens.stages else chart.to_plane(*rays, 1)
-            moved = [
-                torch.autograd.grad(w.sum(), k, retain_graph=True, materialize_grads=True, allow_unused=True)[0]
-                if w.requires_grad
-                else torch.zeros_like(k)
-                for w in planes
-            ]
-        most = (torch.hypot(*moved) / torch.hypot(*planes).detach()).unflatten(0, (len(discs), len(_TURNS))).amax(1)
+            on_plane = chart.to_plane(*rays, 1)
+            return torch.stack(lens(*on_plane) if lens.stages else on_plane).squeeze(-1)
+
+        with torch.enable_grad():
+            moved = torch.autograd.functional.jacobian(lambda k: planes(k).sum(-1), k)
+        most = torch.hypot(*moved) / torch.hypot(*planes(k))[:, None]
+        most = most.unflatten(0, (len(discs), len(_TURNS))).amax(1)
         odd = self.model.odd_in_x | self.model.odd_in_y
         share = _RIM * torch.tensor([_LOPSIDED if name in odd else 1.0 for name in self.names], dtype=discs.dtype)
         return torch.where(most > 0, share / most.clamp(min=1e-300), 0.0)
@@ -76,9 +76,6 @@ def prior_of(
     """Return the prior of a model, or of a camera to start from, and the discs that a range of fields of view takes.
 
     `aspect` is by how much the logarithm of fy / fx may change; centre and fov are those of `CameraHead`.
-
-    Raises:
-        ValueError: If the lens does not reach the range, or the camera is not within it, or is a panorama.
     """
     degrees, start, given, ratio = _as_fov(fov, owner), asked.start, None, 0.0
     middle = [(side - 1) / 2 for side in image_size[::-1]]

@@ -63,12 +63,6 @@ class Rectification(GeometryModule):
     Where the cameras or the extrinsics learn, the warps are made anew each time, and gradients reach them.
     """
 
-    source_left: Camera
-    source_right: Camera
-    extrinsics: Extrinsics
-    camera_right: Camera
-    vertical: bool
-
     def __init__(
         self,
         source_left: Camera,
@@ -329,12 +323,9 @@ def rectify(
 
 
 def _frame(extrinsics: Extrinsics, vertical: bool, align: Align) -> tuple[Tensor, Tensor, Tensor]:
-    """Rotations (*B, 3, 3) of the left and the right camera to their common frame, and the right one's place, (*B,).
+    """Return rotations (*B, 3, 3) of both cameras to their common frame, and the right one's place (*B,), in float64.
 
-    In float64, with a graph where the extrinsics learn.
-
-    Raises:
-        ValueError: no baseline, or a view along it.
+    With a graph if the extrinsics learn.
     """
     vector, translation = extrinsics.rotation.double(), extrinsics.translation.double()
     length = torch.linalg.vector_norm(translation, dim=-1)
@@ -369,11 +360,7 @@ def _unit(axis: int, like: Tensor) -> Tensor:
 
 
 def _extent(views: list[tuple[Camera, Tensor]], projection: str, vertical: bool) -> tuple[Tensor, Tensor, Tensor]:
-    """Lows and highs (*B, 2) on the plane of a projection, and (*B,) the focal length that loses nothing in the middle.
-
-    Raises:
-        ValueError: nothing that both see.
-    """
+    """Return lows and highs (*B, 2) on the plane, and (*B,) the focal length that loses nothing in the middle."""
     like, (models, reach) = views[0][1], _KINDS[projection]
     plane = models[vertical](like.new_tensor([1.0, 1.0, 0.0, 0.0]))
     limit = torch.tensor(reach[::-1] if vertical else reach).to(like)
@@ -408,11 +395,7 @@ def _scale(camera: Camera, rotation: Tensor, plane: Camera, middle: Tensor) -> T
 
 
 def _half(angles: list[float], projection: str, vertical: bool, usual: Tensor, fov: Any) -> Tensor:
-    """(*B, 2): half the width and the height of the plane of a projection, as usual where no angle is given.
-
-    Raises:
-        ValueError: angles that it does not reach.
-    """
+    """Return half the width and the height (*B, 2) of the plane of a projection, `usual` where no angle is given."""
     if len(angles) not in (1, 2):
         raise ValueError(f"rectify: fov must be horizontal, or (horizontal, vertical) degrees; got {fov!r}")
     half = usual.clone()
