@@ -4,6 +4,7 @@ import copy
 import functools
 import math
 import pickle
+import re
 
 import pytest
 import torch
@@ -45,26 +46,23 @@ def all_have_rays(camera, rows=9, columns=11) -> torch.Tensor:
     return (valid & again & near).all(-1)
 
 
-def valid_cameras(key, number, **options):
-    generator = torch.Generator().manual_seed(1)
-    layer = head(key, **options)
-    with torch.no_grad():
-        for scale in (0.3, 1.0, 5.0, 1e9):
-            random(layer, scale, generator)
-            for features in torch.randn(number // 4, 16, generator=generator).split(500):
-                yield layer(features)
-
-
 COUNTS = [("brown_conrady", {"count": n, "shared_focal": False, "centre": 0.3}) for n in (5, 8, 14)]
 EACH = [pytest.param(k, {}, marks=() if k in DISTINCT - {"f_theta_backward"} else pytest.mark.slow) for k in KEYS]
 
 
 @pytest.mark.parametrize(("key", "options"), EACH + COUNTS)
-def test_random_weights_give_cameras_with_a_ray_for_every_point_of_the_image(key, options):
-    for camera in valid_cameras(key, 80 if not options else 40, **options):
+def test_all_numbers_give_cameras_with_a_ray_for_every_point_of_the_image_and_gradients(key, options):
+    layer, generator = head(key, **options), torch.Generator().manual_seed(0)
+    for size, count in ((0.3, 20), (1, 300), (5, 50), (1e3, 20), (1e5, 20), (1e6, 100), (1e9, 20), (1e30, 20)):
+        numbers = size * torch.randn(count, len(layer.names), generator=generator)
+        numbers = (size * numbers.sign() if count == 20 and size > 1 else numbers).requires_grad_()
+        camera = layer.camera(numbers)
         assert bool(all_have_rays(camera).all())
         assert bool((camera.intrinsics[..., :2] > 0).all())
         assert camera.distortion.shape[-1] == options.get("count", camera.distortion.shape[-1])
+        (gradient,) = torch.autograd.grad(camera.intrinsics.sum() + camera.distortion.sum(), numbers)
+        for found in (camera.intrinsics, camera.distortion, gradient):
+            assert bool(torch.isfinite(found).all())
 
 
 def test_the_limits_are_near():
@@ -162,22 +160,6 @@ def test_gradients_do_not_vanish_far_out():
     assert (numbers.grad.abs() > 1e-3).all()
 
 
-@pytest.mark.parametrize("key", slow_unless(DISTINCT.__contains__, sorted(USUAL - PANORAMAS - OTHERS - {"pinhole"})))
-def test_all_numbers_make_finite_cameras_and_gradients(key):
-    layer = head(key)
-    count = 300 if key in ("double_sphere", "mei") else 100
-    ordinary = torch.randn(count, len(layer.names), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    large = [size * ordinary[:128] for size in (1e4, 1e6)]
-    large += [size * ordinary[:16].sign() for size in (1e3, 1e4, 1e5, 1e6, 1e9, 1e30)]
-    for part in torch.cat((ordinary, 10 * ordinary[:50], *large)).float().split(500):
-        numbers = part.clone().requires_grad_()
-        camera = layer.camera(numbers)
-        assert bool(all_have_rays(camera, 3, 3).all())
-        (gradient,) = torch.autograd.grad(camera.intrinsics.sum() + camera.distortion.sum(), numbers)
-        for found in (camera.intrinsics, camera.distortion, gradient):
-            assert bool(torch.isfinite(found).all())
-
-
 @pytest.mark.slow
 def test_it_learns_a_camera_from_its_rays():
     truth = ct.KannalaBrandt([300.0, 300.0, 330.0, 230.0], [-0.05, 0.02, -0.01, 0.002], image_size=SIZE)
@@ -256,29 +238,31 @@ def test_it_compiles_whole():
     torch.testing.assert_close(compiled(features), numbers(features))
 
 
-@pytest.mark.parametrize(
-    ("model", "options", "said"),
-    [
-        ("pinhole", {"image_size": None}, "image_size=(height, width)"),
-        ("equirectangular", {}, "panorama"),
-        ("pinhole", {"fov": (0.7, 2.0)}, "radians"),
-        ("pinhole", {"fov": (120, 40)}, "from the least to the greatest"),
-        ("pinhole", {"fov": (90, 190)}, "no rays for the corners"),
-        ("orthographic_fisheye", {"fov": None}, "A narrower fov"),
-        ("pinhole", {"fixed": "fx"}, "fov=(90, 90)"),
-        ("pinhole", {"fixed": ("k1",)}, "Pinhole has fx, fy, cx, cy"),
-        ("brown_conrady", {"count": 6}, "4, 5, 8, 12 or 14"),
-        ("kannala_brant", {}, "did you mean"),
-        ("pinhole", {"centre": 0.7}, "below 0.5"),
-        (CAMERAS[0], {"image_size": (48, 64)}, "images of (480, 640)"),
-        (CAMERAS[0], {"fov": (20, 30)}, "not within"),
-        (ct.KannalaBrandt([200.0, 200, 320, 240], [-0.2, 0, 0, 0], image_size=SIZE), {}, "a crop's camera"),
-    ],
-)
+REFUSED = [
+    ("pinhole", {"image_size": None}, "image_size=(height, width)"),
+    ("equirectangular", {}, "panorama"),
+    ("pinhole", {"fov": (0.7, 2.0)}, "radians"),
+    ("pinhole", {"fov": (120, 40)}, "from the least to the greatest"),
+    ("pinhole", {"fov": (90, 190)}, "no rays for the corners"),
+    ("orthographic_fisheye", {"fov": None}, "A narrower fov"),
+    ("pinhole", {"fixed": "fx"}, "fov=(90, 90)"),
+    ("pinhole", {"fixed": ("k1",)}, "Pinhole has fx, fy, cx, cy"),
+    ("brown_conrady", {"count": 6}, "4, 5, 8, 12 or 14"),
+    ("kannala_brant", {}, "did you mean"),
+    ("pinhole", {"centre": 0.7}, "below 0.5"),
+    (CAMERAS[0], {"image_size": (48, 64)}, "images of (480, 640)"),
+    (CAMERAS[0], {"fov": (20, 30)}, "not within"),
+    (ct.KannalaBrandt([200.0, 200, 320, 240], [-0.2, 0, 0, 0], image_size=SIZE), {}, "a crop's camera"),
+    ("pinhole", {"fov": 90}, "as (40, 120); got 90"),
+    (torch.nn.Linear, {}, "camera model"),
+]
+
+
+@pytest.mark.parametrize(("model", "options", "said"), REFUSED)
 def test_what_is_refused(model, options, said):
-    with pytest.raises(ValueError, match="CameraHead") as error:
+    error = TypeError if model is torch.nn.Linear or options == {"fov": 90} else ValueError
+    with pytest.raises(error, match=f"CameraHead.*{re.escape(said)}"):
         ct.CameraHead(16, model, **{"image_size": None if isinstance(model, ct.Camera) else SIZE, **options})
-    assert said in str(error.value)
 
 
 def test_features_of_another_size_are_refused():
@@ -287,7 +271,3 @@ def test_features_of_another_size_are_refused():
         layer(torch.zeros(2, 8))
     with pytest.raises(ValueError, match=r"numbers must be \(\*B, 3\), focal, cx, cy"):
         layer.camera(torch.zeros(2, 8))
-    with pytest.raises(TypeError, match=r"as \(40, 120\); got 90"):
-        ct.CameraHead(16, "pinhole", image_size=SIZE, fov=90)
-    with pytest.raises(TypeError, match="camera model"):
-        ct.CameraHead(16, torch.nn.Linear, image_size=SIZE)
