@@ -1,6 +1,6 @@
 """What the checks of the rows of the pages "Coming from" have in common; beside this is one file a library."""
 
-import inspect
+import functools
 from pathlib import Path
 
 import cv2
@@ -28,25 +28,22 @@ def row(*keys, slow=False):
 def equal(module, table, slow=False):
     """Register rows where the same comes out of both: names -> what gives pairs (ours, theirs[, atol])."""
     for names, pairs in table.items():
+        row(*(f"{module}.{name}" for name in names.split()), slow=slow)(functools.partial(_are_close, pairs))
 
-        def check(pairs=pairs):
-            for pair in pairs():
-                close(*pair)
 
-        check.__signature__ = inspect.Signature()
-        row(*(f"{module}.{name}" for name in names.split()), slow=slow)(check)
+def _are_close(pairs):
+    for pair in pairs():
+        close(*pair)
 
 
 def elsewhere(module, table):
     """Register rows that tests of other rooms hold to: names -> "room/file.py::name" of the test."""
     for names, test in table.items():
+        row(*(f"{module}.{name}" for name in names.split()))(functools.partial(_is_there, *test.split("::")))
 
-        def check(test=test):
-            file, _, name = test.partition("::")
-            assert f"def {name}(" in (Path(__file__).parents[1] / file).read_text()
 
-        check.__signature__ = inspect.Signature()
-        row(*(f"{module}.{name}" for name in names.split()))(check)
+def _is_there(file, name):
+    assert f"def {name}(" in (Path(__file__).parents[1] / file).read_text()
 
 
 def trap(check, slow=False):
@@ -63,8 +60,8 @@ def close(ours, theirs, atol=1e-9):
     if ours.dtype != np.uint8:
         np.testing.assert_allclose(ours, theirs, rtol=0, atol=atol)
         return
-    shown = ((theirs > 0) & (ours > 0)).all(-1).astype(np.uint8)
-    inner = cv2.erode(shown, np.ones((5, 5)), borderValue=0).astype(bool)
+    shown = ((theirs > 0) & (ours > 0)).all(-1)
+    inner = cv2.erode(shown.astype(np.uint8), np.ones((5, 5)), borderValue=0) > 0
     assert inner.mean() > 0.2
     assert np.abs(ours.astype(int) - theirs.astype(int))[inner].max() <= 2
 
@@ -79,9 +76,9 @@ def pixels(count=50, seed=0):
     return np.random.default_rng(seed).uniform((5, 5), (SIZE[1] - 5, SIZE[0] - 5), (count, 2))
 
 
-def photograph(size=SIZE):
+def photograph():
     """(H, W, 3) uint8, smooth, so that how it is interpolated does not matter, and nowhere 0."""
-    y, x = np.mgrid[: size[0], : size[1]]
+    y, x = np.mgrid[: SIZE[0], : SIZE[1]]
     return (127 + 100 * np.stack([np.sin(x / 12 + i) * np.cos(y / 15 - i) for i in range(3)], -1)).astype(np.uint8)
 
 

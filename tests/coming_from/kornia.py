@@ -1,5 +1,7 @@
 """The rows of the page on kornia."""
 
+import math
+
 import cv2
 import kornia.augmentation as K  # noqa: N812 (everybody's name for it)
 import kornia.geometry as geometry
@@ -22,15 +24,8 @@ D4 = torch.tensor([0.02, -0.01, 0.003, -0.001], dtype=torch.float64)
 NUMBERS_AND_D4, ONE = torch.cat([NUMBERS, D4]), torch.full((50, 1), 2.5, dtype=torch.float64)
 UNIT, GRAPHICS = torch.tensor([1.0, 1, 0, 0]).double(), torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]).double())
 TILTED = torch.cat([D5, torch.zeros(7), torch.tensor([0.02, -0.01])]).double()
-POSE, SECOND, NOWHERE, BESIDE = (
-    ct.Extrinsics(np.array(turn), np.array(shift)).requires_grad_(False)
-    for turn, shift in (
-        ([0.1, -0.2, 0.05], [0.1, 0.2, 0.3]),
-        ([0.3, 0.1, -0.2], [1.0, 2.0, 3.0]),
-        ([0.0, 0.0, 0.0], [0.0, 0.0, 0.0]),
-        ([0.0, 0.0, 0.0], [-0.12, 0.0, 0.0]),
-    )
-)
+VECTORS = np.array([[0.1, -0.2, 0.05, 0.1, 0.2, 0.3], [0.3, 0.1, -0.2, 1.0, 2.0, 3.0], 6 * [0], [0, 0, 0, -0.12, 0, 0]])
+POSE, SECOND, NOWHERE, BESIDE = (ct.Extrinsics(v[:3], v[3:]).requires_grad_(False) for v in VECTORS)
 POINTS, PIXELS = torch.from_numpy(points()), torch.from_numpy(pixels())
 PINHOLE, OTHERS = (ct.Pinhole.from_matrix(m, image_size=SIZE).requires_grad_(False) for m in (MATRIX, OTHER))
 LENS = ct.BrownConrady.from_matrix(MATRIX, D5, image_size=SIZE).requires_grad_(False)
@@ -39,7 +34,7 @@ SQUARE = ct.Pinhole([75.0, 75.0, 79.5, 59.5], image_size=SIZE).requires_grad_(Fa
 DEPTH = 2 + torch.rand(1, 1, *SIZE, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
 IMAGE = as_images(photograph()).double() / 255
 SPOT = torch.tensor([[[100.0, 30.0]]])
-calibration, camera, K3 = geometry.calibration, geometry.camera, sensors.KannalaBrandtK3
+calibration, camera = geometry.calibration, geometry.camera
 
 
 def theirs(pose=POSE):
@@ -63,10 +58,6 @@ def both_see():
     return torch.stack([PINHOLE(pose(POINTS))[0] for pose in (NOWHERE, POSE)])
 
 
-def matrices(*poses):
-    return [pose.matrix()[None] for pose in poses]
-
-
 def positions(warp):
     """(x, y) that a warp samples at, each (1, H, W)."""
     return (((warp.grid().double()[..., i] + 1) * size - 1) / 2 for i, size in enumerate(SIZE[::-1]))
@@ -78,8 +69,9 @@ def moved(augmentation):
     return sample["keypoints"], sample["image"].shape[-2:]
 
 
-def kornias(augmentation):
-    """The same by kornia's."""
+def kornias(name, *values, **options):
+    """The same by an augmentation of kornia's."""
+    augmentation = getattr(K, name)(*values, p=1.0, **options)
     pipeline = K.AugmentationSequential(augmentation, data_keys=["input", "keypoints"])
     image, spot = pipeline(torch.zeros(1, 1, *SIZE), SPOT)
     return spot, image.shape[-2:]
@@ -126,22 +118,20 @@ def by_homography():
 
 
 def crops():
-    """Their places and sizes; of random ones the sizes."""
-    ours, others = moved(ct.augment.CenterCrop((60, 80))), kornias(K.CenterCrop((60, 80), p=1.0))
-    assert ours[1] == others[1]
-    yield ours[0], others[0], 1e-3
-    for name in ("RandomResizedCrop", "RandomCrop"):
-        yield moved(getattr(ct.augment, name)((60, 80)))[1], kornias(getattr(K, name)((60, 80), p=1.0))[1]
+    """Their sizes, and where the middle one lies."""
+    for name in ("CenterCrop", "RandomResizedCrop", "RandomCrop"):
+        yield moved(getattr(ct.augment, name)((60, 80)))[1], kornias(name, (60, 80))[1]
+    yield moved(ct.augment.CenterCrop((60, 80)))[0], kornias("CenterCrop", (60, 80))[0], 1e-3
 
 
 def resized():
     """Pixel edges scale, as OpenCV's; kornia's corners do unless it is told."""
     spot, _ = moved(ct.augment.Resize((60, 80)))
     small = cv2.resize(np.arange(160, dtype=np.float32)[None], (80, 1), interpolation=cv2.INTER_LINEAR)[0]
-    yield spot, kornias(K.Resize((60, 80), align_corners=False))[0], 1e-4
+    yield spot, kornias("Resize", (60, 80), align_corners=False)[0], 1e-4
     yield spot[0, 0, 0], np.float32(49.75), 1e-4
     yield np.interp(100.0, small, np.arange(80.0)), np.float64(49.75), 1e-4
-    yield kornias(K.Resize((60, 80)))[0][0, 0, 0], np.float32(100 * 79 / 159), 1e-3
+    yield kornias("Resize", (60, 80))[0][0, 0, 0], np.float32(100 * 79 / 159), 1e-3
 
 
 def edited():
@@ -149,12 +139,9 @@ def edited():
     ray, _ = PINHOLE.unproject(torch.tensor([100.0, 30.0], dtype=torch.float64))
     image = torch.zeros(1, 1, *SIZE)
     image[..., 30, 100] = 1
-    for function, edited, mirror in (
-        (geometry.hflip, PINHOLE.hflip(), [-1, 1, 1]),
-        (geometry.vflip, PINHOLE.vflip(), [1, -1, 1]),
-    ):
-        place = function(image)[0, 0].nonzero()[0].flip(0)
-        yield edited.project(ray * torch.tensor(mirror))[0], place.double()
+    for name, mirror in (("hflip", [-1, 1, 1]), ("vflip", [1, -1, 1])):
+        place = getattr(geometry, name)(image)[0, 0].nonzero()[0].flip(0)
+        yield getattr(PINHOLE, name)().project(ray * torch.tensor(mirror))[0], place.double()
     line = torch.zeros(1, 1, *SIZE)
     line[..., 100:102] = 1  # its middle is at column 100.5
     small = geometry.resize(line, (60, 80), align_corners=False, antialias=False)[0, 0, 30]
@@ -222,8 +209,10 @@ equal("kornia.geometry", {
         POSE.inverse().matrix(),
     )],
     "linalg.compose_transformations linalg.relative_transformation": lambda: [
-        (POSE.compose(SECOND).matrix(), geometry.compose_transformations(*matrices(POSE, SECOND))[0]),
-        (POSE.inverse().compose(SECOND).matrix(), geometry.relative_transformation(*matrices(POSE, SECOND))[0]),
+        (first.compose(SECOND).matrix(), theirs(POSE.matrix()[None], SECOND.matrix()[None])[0])
+        for first, theirs in (
+            (POSE, geometry.compose_transformations), (POSE.inverse(), geometry.relative_transformation)
+        )
     ],
 })  # fmt: skip
 equal("kornia.geometry", {
@@ -238,32 +227,24 @@ equal("kornia.geometry", {
         )[0], 1e-6,
     )],
 }, slow=True)  # fmt: skip
+EIGHT, BROWN = torch.cat([NUMBERS, TILTED[:8]]), sensors.CameraModelType.BROWN_CONRADY
 equal("kornia.sensors.camera", {
-    "CameraModel": lambda: [(
-        ct.BrownConrady(NUMBERS, TILTED[:8]).project(POINTS)[0],
-        sensors.CameraModel(
-            ImageSize(*SIZE), sensors.CameraModelType.BROWN_CONRADY, torch.cat([NUMBERS, TILTED[:8]])
-        ).project(Vector3(POINTS)).data,
-    )],
-    "KannalaBrandtK3": lambda: [
-        (FISHEYE.project(POINTS)[0], K3(ImageSize(*SIZE), NUMBERS_AND_D4).project(Vector3(POINTS)).data)
-    ],
-    "PinholeModel": lambda: [
-        (PINHOLE.project(POINTS)[0], sensors.PinholeModel(ImageSize(*SIZE), NUMBERS).project(Vector3(POINTS)).data)
-    ],
+    name: lambda ours=ours, theirs=theirs: [(ours.project(POINTS)[0], theirs.project(Vector3(POINTS)).data)]
+    for name, ours, theirs in (
+        ("CameraModel", ct.BrownConrady(NUMBERS, TILTED[:8]), sensors.CameraModel(ImageSize(*SIZE), BROWN, EIGHT)),
+        ("KannalaBrandtK3", FISHEYE, sensors.KannalaBrandtK3(ImageSize(*SIZE), NUMBERS_AND_D4)),
+        ("PinholeModel", PINHOLE, sensors.PinholeModel(ImageSize(*SIZE), NUMBERS)),
+    )
 })  # fmt: skip
 equal("kornia.augmentation", {
     "RandomHorizontalFlip": lambda: [
-        (moved(ct.augment.HorizontalFlip(p=1.0))[0], kornias(K.RandomHorizontalFlip(p=1.0))[0]),
-        (moved(ct.augment.VerticalFlip(p=1.0))[0], kornias(K.RandomVerticalFlip(p=1.0))[0]),
+        (moved(ct.augment.HorizontalFlip(p=1.0))[0], kornias("RandomHorizontalFlip")[0]),
+        (moved(ct.augment.VerticalFlip(p=1.0))[0], kornias("RandomVerticalFlip")[0]),
     ],
-    "RandomRotation": lambda: [
-        (moved(turned(roll=(20.0, 20.0)))[0], kornias(K.RandomRotation((20.0, 20.0), p=1.0))[0], 1e-3)
-    ],
+    "RandomRotation": lambda: [(moved(turned(roll=(20, 20)))[0], kornias("RandomRotation", (20.0, 20.0))[0], 1e-3)],
     "RandomRotation90": lambda: [  # about the same middle; kornia keeps the size
-        (moved(ct.augment.Rotate90(1))[0] - torch.tensor([59.5, 79.5]),
-         kornias(K.RandomRotation90((1, 1), p=1.0))[0] - torch.tensor([79.5, 59.5]), 1e-3),
-        (moved(ct.augment.Rotate90(1))[1], kornias(K.RandomRotation90((1, 1), p=1.0))[1][::-1]),
+        (moved(ct.augment.Rotate90(1))[0] + torch.tensor([20, -20]), kornias("RandomRotation90", (1, 1))[0], 1e-3),
+        (moved(ct.augment.Rotate90(1))[1], kornias("RandomRotation90", (1, 1))[1][::-1]),
     ],
     "RandomPerspective": lambda: [by_homography()],
     "RandomResizedCrop": crops,
@@ -289,10 +270,10 @@ def behind_and_past():
     assert not PINHOLE.project(behind)[1]
     weak = torch.tensor([0.01, 0.0, 0.0, 0.0], dtype=torch.float64)
     lens = ct.KannalaBrandt(NUMBERS, weak).requires_grad_(False)
-    angle = torch.tensor(2.0, dtype=torch.float64)
-    uv, _ = lens.project(torch.stack([angle.sin(), 0 * angle, angle.cos()]))
-    close(camera.undistort_points_kannala_brandt(uv, torch.cat([NUMBERS, weak]))[0], -angle.tan(), 1e-6)
-    close(lens.unproject(uv)[0], torch.stack([angle.sin(), 0 * angle, angle.cos()]), 1e-9)
+    ray = torch.tensor([math.sin(2), 0.0, math.cos(2)], dtype=torch.float64)
+    uv, _ = lens.project(ray)
+    close(camera.undistort_points_kannala_brandt(uv, torch.cat([NUMBERS, weak]))[0], -ray[0] / ray[2], 1e-6)
+    close(lens.unproject(uv)[0], ray, 1e-9)
 
 
 @trap

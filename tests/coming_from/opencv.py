@@ -2,10 +2,9 @@
 
 import cv2
 import numpy as np
-import pytest
 import torch
-from boards import chessboard, opencv_left
-from cameras import GOLDEN
+from boards import chessboard
+from cameras import GOLDEN, golden_camera
 
 import camtorch as ct
 
@@ -13,15 +12,17 @@ from . import SIZE, as_images, close, elsewhere, equal, photograph, pixels, plan
 
 WH = SIZE[::-1]
 K = np.array([[75.0, 0, 79.5], [0, 77.5, 59.5], [0, 0, 1]])
+BY_EDGES = K + 0.5 * np.eye(3)[2] * [[1], [1], [0]]  # the edges of the image are at 0 and its width
 P = np.array([[50.0, 0, 75.0], [0, 52.5, 55.0], [0, 0, 1]])
 D5 = np.array([-0.28, 0.1, 1e-3, -5e-4, -0.01])
 D4 = np.array([[0.02], [-0.01], [0.003], [-0.001]])
 XI = np.array([1.2])
 RVEC, TVEC = np.array([[0.1], [-0.2], [0.05]]), np.array([[0.1], [0.2], [1.0]])
-SECOND = (np.array([[0.3], [0.1], [-0.2]]), np.array([[1.0], [2.0], [3.0]]))
+POSED, SECOND = (RVEC, TVEC), (np.array([[0.3], [0.1], [-0.2]]), np.array([[1.0], [2.0], [3.0]]))
 R = cv2.Rodrigues(np.array([0.1, -0.05, 0.2]))[0]
+MARKER = np.array([[-0.5, 0.5, 0], [0.5, 0.5, 0], [0.5, -0.5, 0], [-0.5, -0.5, 0]])
 FINE = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 200, 1e-14)
-X, UV, FLAT = points(), pixels(), points()[:, :2]
+X, UV = points(), pixels()
 POSE = ct.Extrinsics(RVEC, TVEC).requires_grad_(False)
 BROWN = ct.BrownConrady.from_matrix(K, D5, image_size=SIZE).requires_grad_(False)
 FISHEYE = ct.KannalaBrandt.from_matrix(K, D4, image_size=SIZE).requires_grad_(False)
@@ -33,16 +34,12 @@ def tensor(array):
     return torch.from_numpy(np.asarray(array))
 
 
-def seen(camera):
-    return camera(POSE(tensor(X)))[0]
-
-
 def moved(target):
     return ct.Warp(BROWN, target).transform_points(tensor(UV))[0]
 
 
-def remapped(map1, map2):
-    return cv2.remap(photograph(), map1, map2, cv2.INTER_LINEAR)
+def remapped(maps):
+    return cv2.remap(photograph(), *maps, cv2.INTER_LINEAR)
 
 
 def rectified(module, lens):
@@ -55,13 +52,10 @@ def by_grid(maps):
     return torch.nn.functional.grid_sample(as_images(photograph()).float(), grid[None], align_corners=False)
 
 
-def best_matrix():
+def by_best_matrix():
     new, _ = cv2.getOptimalNewCameraMatrix(K, D5, WH, 0.0)
-    return new, ct.Pinhole.from_matrix(new, image_size=SIZE).requires_grad_(False)
-
-
-def composed():
-    return ct.Extrinsics(*(column[:, 0] for column in SECOND)).compose(POSE)
+    target = ct.Pinhole.from_matrix(new, image_size=SIZE).requires_grad_(False)
+    return warped(ct.Warp(BROWN, target)), cv2.undistort(photograph(), K, D5, None, new)
 
 
 def spherical(xyz):
@@ -75,37 +69,23 @@ def spherical(xyz):
     return np.stack([u, v], -1) @ K[:2, :2].T + K[:2, 2]
 
 
-def corners(pose):
-    """Of a marker, (1, 4, 2), seen by a fisheye."""
-    square = np.array([[-0.5, 0.5, 0], [0.5, 0.5, 0], [0.5, -0.5, 0], [-0.5, -0.5, 0]])
-    return square, cv2.fisheye.projectPoints(square[None], *pose, K, D4)[0]
-
-
-def of_fisheye(board, uv):
-    """(ours, theirs): rotation and translation."""
-    found, _, valid = ct.solve_pnp(FISHEYE, board, uv)
+def by_fisheye(board):
+    """Poses from what a fisheye sees: ours, and OpenCV's."""
+    uv, _ = cv2.fisheye.projectPoints(board[None], RVEC, TVEC, K, D4)
+    found, _, valid = ct.solve_pnp(FISHEYE, board[None], uv)
     assert valid.all()
-    _, rvec, tvec = cv2.fisheye.solvePnP(board[None], uv[None], K, D4)
-    return (found.rotation, rvec[:, 0], 1e-5), (found.translation, tvec[:, 0], 1e-5)
-
-
-def middle():
-    """K with the principal point of OpenCV, which takes the edges of the image to be at 0 and its width."""
-    return np.array([[75.0, 0, 80.0], [0, 77.5, 60.0], [0, 0, 1]])
+    _, *theirs = cv2.fisheye.solvePnP(board[None], uv, K, D4)
+    return [(found.rotation, theirs[0].T, 1e-5), (found.translation, theirs[1].T, 1e-5)]
 
 
 def turned_plane():
     """The homography of a plane, and what warps it."""
-    normal = np.array([[0.1], [0.2], [1.0]])
-    to_plane = K @ (cv2.Rodrigues(RVEC)[0] + TVEC / 10 @ normal.T / 2.0) @ np.linalg.inv(P)
+    normal, here = np.array([[0.1, 0.2, 1.0]]), ct.Pinhole.from_matrix(K, image_size=SIZE).requires_grad_(False)
+    from_plane = P @ np.linalg.inv(cv2.Rodrigues(RVEC)[0] + TVEC / 10 @ normal / 2.0) @ np.linalg.inv(K)
     pose = ct.Extrinsics(RVEC, TVEC / 10).requires_grad_(False)
-    here = ct.Pinhole.from_matrix(K, image_size=SIZE).requires_grad_(False)
-    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    return (
-        (warped(ct.PlaneWarp(here, TARGET, pose, normal[:, 0], 2.0)),
-         cv2.warpPerspective(photograph(), to_plane, WH, flags=flags)),
-        (warped(ct.Warp(here, TARGET, tensor(R))), cv2.warpPerspective(photograph(), P @ R @ np.linalg.inv(K), WH)),
-    )  # fmt: skip
+    ours = ct.PlaneWarp(here, TARGET, pose, normal[0], 2.0), ct.Warp(here, TARGET, tensor(R))
+    for warp, matrix in zip(ours, (from_plane, P @ R @ np.linalg.inv(K)), strict=True):
+        yield warped(warp), cv2.warpPerspective(photograph(), matrix, WH)
 
 
 def panorama():
@@ -118,7 +98,7 @@ def panorama():
 
 
 equal("cv2", {
-    "projectPoints": lambda: [(seen(BROWN), cv2.projectPoints(X, RVEC, TVEC, K, D5)[0][:, 0])],
+    "projectPoints": lambda: [(BROWN(POSE(X))[0], cv2.projectPoints(X, RVEC, TVEC, K, D5)[0][:, 0])],
     "undistortPoints": lambda: [
         # shaped as OpenCV's, whose undistortImagePoints takes 5 steps
         (plane(BROWN.unproject(tensor(UV[:, None]))[0]), cv2.undistortPoints(UV, K, D5, criteria=FINE)),
@@ -130,43 +110,35 @@ equal("cv2", {
         (cv2.undistort(photograph(), K, D5), cv2.undistort(photograph(), K, D5, None, K)),
     ],
     "initUndistortRectifyMap remap fisheye.initUndistortRectifyMap": lambda: [
-        *((warped(ct.Warp(camera, TARGET, tensor(R))), remapped(*rectified(module, lens)))
+        *((warped(ct.Warp(camera, TARGET, tensor(R))), remapped(rectified(module, lens)))
           for camera, module, lens in ((BROWN, cv2, D5), (FISHEYE, cv2.fisheye, D4))),
-        (by_grid(rectified(cv2, D5)).byte()[0].permute(1, 2, 0), remapped(*rectified(cv2, D5))),
+        (by_grid(rectified(cv2, D5)).byte()[0].permute(1, 2, 0), remapped(rectified(cv2, D5))),
         (warped(ct.Warp(FISHEYE, TARGET)), cv2.fisheye.undistortImage(photograph(), K, D4, Knew=P)),
     ],
     "initInverseRectificationMap": lambda: [(
         warped(ct.Warp(BROWN, TARGET, tensor(R)).inverse()),
-        remapped(*cv2.initInverseRectificationMap(K, D5, R, P, WH, cv2.CV_32FC1)),
+        remapped(cv2.initInverseRectificationMap(K, D5, R, P, WH, cv2.CV_32FC1)),
     )],
-    "getOptimalNewCameraMatrix": lambda: [
-        (warped(ct.Warp(BROWN, best_matrix()[1])), cv2.undistort(photograph(), K, D5, None, best_matrix()[0]))
-    ],
+    "getOptimalNewCameraMatrix": lambda: [by_best_matrix()],
     "Rodrigues": lambda: [
         (POSE.matrix()[:3, :3], cv2.Rodrigues(RVEC)[0]),
         (ct.Extrinsics(cv2.Rodrigues(RVEC)[0], TVEC).rotation, RVEC[:, 0]),
     ],
     "composeRT": lambda: [
-        (composed().rotation, cv2.composeRT(RVEC, TVEC, *SECOND)[0][:, 0]),
-        (composed().translation, cv2.composeRT(RVEC, TVEC, *SECOND)[1][:, 0]),
+        (getattr(ct.Extrinsics(*SECOND).compose(POSE), name), cv2.composeRT(RVEC, TVEC, *SECOND)[i][:, 0])
+        for i, name in enumerate(("rotation", "translation"))
     ],
     "warpPerspective": turned_plane,
     "calibrationMatrixValues": lambda: [
-        (ct.Pinhole.from_matrix(K, image_size=SIZE).fov[:2], cv2.calibrationMatrixValues(middle(), WH, 1, 1)[:2])
+        (ct.Pinhole.from_matrix(K, image_size=SIZE).fov[:2], cv2.calibrationMatrixValues(BY_EDGES, WH, 1, 1)[:2])
     ],
-    "aruco.ArucoDetector.detectMarkers": lambda: [(
-        ct.solve_pnp(FISHEYE, corners((RVEC, TVEC))[0][None], corners((RVEC, TVEC))[1])[0].translation, TVEC.T, 1e-6
-    )],
-    "fisheye.projectPoints": lambda: [(seen(FISHEYE), cv2.fisheye.projectPoints(X[None], RVEC, TVEC, K, D4)[0][0])],
-    "fisheye.distortPoints": lambda: [(
-        FISHEYE.project(np.c_[FLAT, np.ones(50)])[0], cv2.fisheye.distortPoints(FLAT[None], K, D4)[0]
-    )],
-    "fisheye.undistortPoints": lambda: [(
-        plane(FISHEYE.unproject(UV)[0]), cv2.fisheye.undistortPoints(UV[None], K, D4, criteria=FINE)[0], 1e-6
-    )],
-    "fisheye.solvePnP": lambda: of_fisheye(
-        points(12), cv2.fisheye.projectPoints(points(12)[None], RVEC, TVEC, K, D4)[0][0]
-    ),
+    "aruco.ArucoDetector.detectMarkers": lambda: by_fisheye(MARKER),
+    "fisheye.projectPoints": lambda: [(FISHEYE(POSE(X))[0], cv2.fisheye.projectPoints(X[None], *POSED, K, D4)[0][0])],
+    "fisheye.distortPoints": lambda: [(FISHEYE.project(X)[0], cv2.fisheye.distortPoints(plane(X)[None], K, D4)[0])],
+    "fisheye.undistortPoints": lambda: [
+        (plane(FISHEYE.unproject(UV)[0]), cv2.fisheye.undistortPoints(UV[None], K, D4, criteria=FINE)[0], 1e-6)
+    ],
+    "fisheye.solvePnP": lambda: by_fisheye(points(12)),
     "omnidir.projectPoints": lambda: [(MEI.project(X)[0], spherical(X))],
     "omnidir.undistortPoints omnidir.initUndistortRectifyMap": lambda: [
         (plane(MEI.unproject(spherical(X))[0]), plane(X))
@@ -180,6 +152,10 @@ elsewhere("cv2", {
     "triangulatePoints": "calibration/test_triangulate.py::test_as_opencv_for_exact_pixels_of_pinholes",
     "calibrateCamera calibrateCameraExtended CALIB_RATIONAL_MODEL":
         "calibration/test_calibration.py::test_opencvs_optimum_from_nothing",
+    "CALIB_FIX_PRINCIPAL_POINT CALIB_ZERO_TANGENT_DIST CALIB_FIX_K3":
+        "calibration/test_calibration.py::test_fixed_coefficients",
+    "CALIB_USE_INTRINSIC_GUESS CALIB_FIX_FOCAL_LENGTH":
+        "calibration/test_calibration.py::test_a_coefficient_held_at_its_best_value_changes_no_other",
     "omnidir.calibrate": "calibration/test_calibration.py::test_corners_without_noise_have_an_optimum",
     "stereoCalibrate fisheye.stereoCalibrate":
         "calibration/test_calibration_rig.py::test_cameras_and_poses_are_found_within_their_sigma",
@@ -207,40 +183,6 @@ def fisheye_stereo():
     theirs, *_ = cv2.fisheye.stereoRectify(K, D4, K, D4, WH, turn, shift, cv2.CALIB_ZERO_DISPARITY)
     ours = ct.rectify(FISHEYE, FISHEYE, ct.Extrinsics(turn, shift), align="opencv")
     close(ours.rotation_left, theirs, 1e-6)
-
-
-GUESS = np.array([[536.0, 0, 342], [0, 536.0, 235], [0, 0, 1]])
-START = ct.BrownConrady.from_matrix(GUESS, np.zeros(5), image_size=(480, 640))
-FLAGS = {
-    "FIX_PRINCIPAL_POINT": {"count": 5, "fixed": ("cx", "cy")},
-    "ZERO_TANGENT_DIST": {"count": 5, "fixed": ("p1", "p2")},
-    "FIX_K3": {"count": 4},
-    "USE_INTRINSIC_GUESS FIX_FOCAL_LENGTH": {"start": START, "fixed": ("fx", "fy")},
-}
-
-
-def same_calibrations(flags, options):
-    """Of thirteen views of OpenCV's left camera."""
-    left, _ = opencv_left()
-    board, wh = left.object_points.numpy().astype(np.float32), left.image_size[::-1]
-    views = [uv.numpy().astype(np.float32)[:, None] for uv in left.image_points]
-    guess = (GUESS.copy(), np.zeros(5)) if "start" in options else (None, None)
-    rms, matrix, distortion, *_ = cv2.calibrateCamera([board] * 13, views, wh, *guess, flags=flags)
-    ours = ct.calibrate("brown_conrady", board, views, image_size=wh[::-1], **options)
-    assert ours.rms == pytest.approx(rms, rel=1e-9)
-    close(ours.camera.K, matrix, 1e-4)
-    count = ours.camera.distortion.shape[-1]
-    # of the standard deviations, where coefficients trade with each other
-    off = np.abs(ours.camera.distortion.detach().numpy() - distortion.ravel()[:count])
-    assert (off <= 1e-3 * ours.std[4:].numpy() + 1e-7).all()
-    assert not distortion.ravel()[count:].any()
-    return ()
-
-
-for _names, _options in FLAGS.items():
-    _flags = sum(getattr(cv2, f"CALIB_{name}") for name in _names.split())
-    _keys = " ".join(f"CALIB_{name}" for name in _names.split())
-    equal("cv2", {_keys: lambda flags=_flags, options=_options: same_calibrations(flags, options)}, slow=True)
 
 
 @row("cv2.fisheye.calibrate", slow=True)
@@ -282,8 +224,8 @@ def behind_the_camera():
     ahead, behind = np.array([[0.5, 0.2, 1.0]]), np.array([[-0.5, -0.2, -1.0]])
     nothing = np.zeros(3), np.zeros(3), K
     close(cv2.projectPoints(ahead, *nothing, D5)[0], cv2.projectPoints(behind, *nothing, D5)[0])
-    seen, mirrored = (cv2.fisheye.projectPoints(one[None], *nothing, D4)[0] for one in (ahead, behind))
-    close(seen, mirrored)
+    mirrored, _ = cv2.fisheye.projectPoints(behind[None], *nothing, D4)
+    close(cv2.fisheye.projectPoints(ahead[None], *nothing, D4)[0], mirrored)
     assert not BROWN.project(behind)[1]
     assert np.abs(FISHEYE.project(behind)[0].numpy() - mirrored[0]).max() > 100
     back, _ = FISHEYE.unproject(np.array([[79.5 + 125, 59.5]]))
@@ -293,12 +235,10 @@ def behind_the_camera():
 @trap
 def steps_of_undistort_points():
     def off(name):
-        case = GOLDEN[name]
-        parameters = tensor(case["parameters"])
-        camera = ct.BrownConrady(parameters[:4], parameters[4:], image_size=case["image_size"]).requires_grad_(False)
+        camera = golden_camera(GOLDEN[name]).requires_grad_(False)
         rim = camera.pixel_grid(stride=40).double().reshape(-1, 2)
-        flat = cv2.undistortPoints(rim.numpy(), camera.K.numpy(), parameters[4:].numpy())[:, 0]
-        back, _ = camera.project(torch.cat([tensor(flat), torch.ones(len(flat), 1)], 1))
+        flat = cv2.undistortPoints(rim.numpy(), camera.K.numpy(), camera.distortion.numpy())[:, 0]
+        back, _ = camera.project(np.c_[flat, np.ones(len(flat))])
         return (back - rim).norm(dim=-1)[camera.unproject(rim)[1]].max().item()
 
     assert 0.001 < off("cv2__projectpoints_d5_opencv_left_published") < 0.004
