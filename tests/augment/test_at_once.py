@@ -1,13 +1,10 @@
 """A single sample is made by one call of compiled code, to the very numbers that its change makes step by step."""
 
-import importlib
 import math
 
 import numpy as np
-import PIL.Image
 import pytest
 import torch
-from torchvision_stand_in import torchvision_of
 
 import camtorch as ct
 import camtorch.augment.numpy
@@ -243,55 +240,6 @@ def test_odd_samples_as_step_by_step(form, name, monkeypatch):
     assert out.keys() == expected.keys()
     for field in expected.keys() - {"camera"}:
         torch.testing.assert_close(out[field], expected[field], rtol=0, atol=0, equal_nan=True)
-
-
-@pytest.fixture(params=["torchvision", "albumentations"])
-def transform(request, monkeypatch):
-    """A function of an augmentation, an image (H, W, 3), a mask and pixels, of arrays, by another library's classes."""
-    if request.param == "albumentations":
-        A = pytest.importorskip("albumentations", reason="albumentations is not installed")  # noqa: N806
-        front_end = importlib.import_module("camtorch.augment.albumentations")
-
-        def transform(augment, image, mask, pixels):
-            both = A.KeypointParams("xy", remove_invisible=False)
-            pipeline = A.Compose([front_end.Transform(augment)], keypoint_params=both, seed=3)
-            out = pipeline(image=image, mask=mask, keypoints=pixels)
-            return out["image"], out["mask"], out["keypoints"]
-
-        yield transform
-        return
-    with torchvision_of("stand-in", monkeypatch) as tv_tensors:
-        front_end = importlib.import_module("camtorch.augment.torchvision")
-
-        def transform(augment, image, mask, pixels):
-            torch.manual_seed(3)
-            planes = tv_tensors.Image(torch.from_numpy(image).permute(2, 0, 1))
-            points = tv_tensors.KeyPoints(torch.from_numpy(pixels), canvas_size=SIZE)
-            sample = {"again": planes, "image": planes, "mask": tv_tensors.Mask(torch.from_numpy(mask)), "at": points}
-            sample["shown"] = PIL.Image.fromarray(image)
-            out = front_end.Transform(augment)(sample)
-            assert out["again"].data_ptr() != out["image"].data_ptr()
-            assert torch.equal(out["again"], out["image"])
-            np.testing.assert_array_equal(np.asarray(out["shown"]), out["image"].permute(1, 2, 0).numpy())
-            return out["image"].permute(1, 2, 0).numpy(), out["mask"].numpy(), out["at"].numpy()
-
-        yield transform
-
-
-@pytest.mark.parametrize("name", AUGMENTATIONS)
-def test_front_ends_as_step_by_step(transform, name, monkeypatch):
-    augment, random = AUGMENTATIONS[name](), np.random.default_rng(0)
-    augment.camera = example("brown_conrady", SIZE).requires_grad_(False)
-    image = random.integers(256, size=(*SIZE, 3), dtype=np.uint8)
-    mask = random.integers(9, size=SIZE, dtype=np.uint8)
-    pixels = random.uniform(-10, 140, (9, 2)).astype(np.float32)
-    pixels[3] = -1
-    got = transform(augment, image, mask, pixels)
-    monkeypatch.setattr(camtorch.augment.sample, "at_once", lambda *given: None)
-    for made, expected in zip(got, transform(augment, image, mask, pixels), strict=True):
-        assert made.dtype == expected.dtype
-        np.testing.assert_array_equal(made, expected)
-    assert (got[2][3] == -1).all()
 
 
 @pytest.mark.parametrize("name", ["mount", "chain that decides", "flipped chain"])

@@ -1,13 +1,11 @@
 """Cameras that look at boxes: `ct.views.look_at`, and `BoxCrop`, which moves whole samples by it."""
 
-import importlib
 import math
 
 import numpy as np
 import pytest
 import torch
 from cameras import every_model, one
-from torchvision_stand_in import torchvision_of
 
 import camtorch as ct
 import camtorch.augment.kornia
@@ -168,62 +166,6 @@ def test_in_a_chain_the_box_moves_with_what_comes_before():
     assert torch.isfinite(out["boxes"]).all()
 
 
-def test_every_front_end_crops_the_same():
-    camera, (sample, i) = fisheye(), (sample_of(fisheye()), 1)
-    generator = np.random.default_rng(0)
-    image = generator.integers(0, 255, (480, 640, 3), dtype=np.uint8)
-    boxes, points = (sample[name][i].float() for name in ("boxes", "keypoints"))
-    tensor = torch.from_numpy(image).permute(2, 0, 1)[None]
-    crop = ct.augment.BoxCrop(SIZE)
-    want = crop(image=tensor, boxes=boxes[None], keypoints=points[None], camera=camera)
-    out = ct.augment.numpy.Transform(crop)(image=image, boxes=boxes.numpy(), keypoints=points.numpy(), camera=camera)
-    np.testing.assert_array_equal(out["image"], want["image"][0].permute(1, 2, 0).numpy())
-    np.testing.assert_array_equal(out["keypoints"], want["keypoints"][0].numpy())
-
-    kornia = ct.augment.kornia
-    aug = kornia.BoxCrop(camera, SIZE)
-    images = tensor.float() / 255
-    params = aug.forward_parameters(images.shape)
-    with pytest.raises(ValueError, match="with_boxes"):
-        aug(images, params=params)
-    moved = aug(images, params=kornia.with_boxes(params, boxes[None, 0]))
-    torch.testing.assert_close(moved, crop(image=images, boxes=boxes[None], camera=camera)["image"])
-
-
-def test_pipelines_of_albumentations_crop_the_same():
-    A = pytest.importorskip("albumentations", reason="albumentations is not installed")  # noqa: N806
-    front_end = importlib.import_module("camtorch.augment.albumentations")
-    camera, (sample, i) = fisheye(), (sample_of(fisheye()), 1)
-    image = np.random.default_rng(0).integers(0, 255, (480, 640, 3), dtype=np.uint8)
-    tensor = torch.from_numpy(image).permute(2, 0, 1)[None]
-    boxes, points = (sample[name][i].float() for name in ("boxes", "keypoints"))
-    crop = ct.augment.BoxCrop(SIZE)
-    pipeline = A.Compose(
-        [front_end.Transform(crop, camera)],
-        bbox_params=A.BboxParams("pascal_voc", label_fields=["kinds"], filter_invalid_bboxes=False, clip=False),
-        keypoint_params=A.KeypointParams("xy", remove_invisible=False),
-    )
-    inside = boxes.clamp(min=0).numpy() + 0.5
-    inside = np.minimum(inside, [640, 480, 640, 480])
-    given = torch.from_numpy(inside - 0.5)[None].float()
-    want = crop(image=tensor, boxes=given, keypoints=points[None], camera=camera)
-    out = pipeline(image=image, bboxes=inside, kinds=[0, 1], keypoints=points.numpy())
-    np.testing.assert_allclose(out["keypoints"], want["keypoints"][0].numpy(), atol=1e-3)
-
-
-def test_transforms_of_torchvision_crop_the_same(monkeypatch):
-    camera, image = fisheye(), torch.rand(3, 480, 640)
-    crop = ct.augment.BoxCrop(SIZE)
-    want = crop(image=image, boxes=torch.tensor([[99.5, 99.5, 199.5, 219.5]]), camera=camera)
-    with torchvision_of("stand-in", monkeypatch) as tv_tensors:
-        transform = importlib.import_module("camtorch.augment.torchvision").Transform(crop, camera)
-        boxes = tv_tensors.BoundingBoxes(
-            torch.tensor([[100.0, 100, 100, 120]]), format=tv_tensors.BoundingBoxFormat.XYWH, canvas_size=(480, 640)
-        )
-        out = transform({"image": tv_tensors.Image(image), "boxes": boxes})
-    torch.testing.assert_close(torch.Tensor(out["image"]), want["image"], atol=1e-4, rtol=0)
-
-
 def test_samples_without_the_box_are_refused():
     camera = fisheye()
     image, boxes = torch.zeros(2, 1, 480, 640), [torch.tensor([[1.0, 1, 9, 9]]), torch.empty(0, 4)]
@@ -234,3 +176,14 @@ def test_samples_without_the_box_are_refused():
     for margin in (-0.5, float("nan")):
         with pytest.raises(ValueError, match="margin"):
             ct.augment.BoxCrop(SIZE, margin=margin)
+
+
+def test_kornia_crops_the_same():
+    camera, kornia, images = fisheye(), ct.augment.kornia, torch.rand(1, 3, 480, 640)
+    boxes = sample_of(camera)["boxes"][1].float()
+    aug = kornia.BoxCrop(camera, SIZE)
+    params = aug.forward_parameters(images.shape)
+    with pytest.raises(ValueError, match="with_boxes"):
+        aug(images, params=params)
+    moved = aug(images, params=kornia.with_boxes(params, boxes[None, 0]))
+    torch.testing.assert_close(moved, ct.augment.BoxCrop(SIZE)(image=images, boxes=boxes[None], camera=camera)["image"])

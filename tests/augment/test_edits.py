@@ -1,9 +1,6 @@
 """Edits with all that a sample holds: the camera, the labels and the image agree, along any chain of them."""
 
-import copy
-import importlib
 import json
-import pickle
 import random
 from pathlib import Path
 
@@ -12,7 +9,6 @@ import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F  # noqa: N812
-from torchvision_stand_in import torchvision_of
 
 import camtorch as ct
 import camtorch.augment.kornia as fronts
@@ -99,11 +95,9 @@ def test_the_camera_follows_every_edit(name, model):
     torch.testing.assert_close(*turns, atol=1e-9, rtol=0)
 
 
-@pytest.mark.parametrize(
-    ("dtype", "bound", "rounds"), [(torch.float64, 1e-9, 4), (torch.float32, 1e-4, 4)], ids=["float64", "float32"]
-)
-def test_a_thousand_chains(dtype, bound, rounds):
-    rng = random.Random(3)
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_a_thousand_chains(dtype):
+    rng, rounds = random.Random(3), 4
     lens = camera(dtype=dtype, size=(240, 320))
     makers = [
         A.HorizontalFlip,
@@ -118,7 +112,7 @@ def test_a_thousand_chains(dtype, bound, rounds):
     for seed in range(rounds):
         chain = A.Compose([rng.choice(makers)() for _ in range(rng.randint(1, 7))])
         torch.manual_seed(seed)
-        assert missed(chain(sample(lens, count=1000 // rounds))) < bound
+        assert missed(chain(sample(lens, count=1000 // rounds))) < (1e-9 if dtype == torch.float64 else 1e-4)
 
 
 # -- what an independent computation says
@@ -161,37 +155,36 @@ MAKERS = {
 def test_an_independent_computation_agrees(names):
     lens = camera(ct.Fisheye624)
     given = sample(lens, count=1, number=5)
-    rng = np.random.default_rng(0)
-    depth = rng.uniform(1, 2, SIZE)
+    depth = np.random.default_rng(0).uniform(1, 2, SIZE)
     total, pixels, shown, edits = np.eye(3), given["keypoints"][0].numpy(), depth, []
-    crops = False
     for name in names:
         edits.append(MAKERS[name](shown.shape))
         shown, pixels, turn = by_numpy(shown, pixels, name)
-        total, crops = turn @ total, crops or name == "crop"
+        total = turn @ total
     chain = A.Compose(edits) if len(edits) > 1 else edits[0]
-    fields = {"depth": depth, "distance_2": depth, "mask": (depth * 100).astype(np.int64)}
-    out = chain(given, **{name: torch.from_numpy(value)[None] for name, value in fields.items()})
-    np.testing.assert_allclose(out["keypoints"][0], pixels, atol=1e-9)
-    for name in ("gaze", "tvec"):
-        np.testing.assert_allclose(out[name][0], total @ given[name][0].numpy(), atol=1e-12)
-    np.testing.assert_allclose(out["points"][0], given["points"][0].numpy() @ total.T, atol=1e-12)
-    np.testing.assert_allclose(out["rotation"][0], total, atol=1e-12)
-    mirror = np.diag([np.linalg.det(total), 1, 1])
-    head = total @ given["head_pose"][0, :3, :3].numpy() @ mirror
-    np.testing.assert_allclose(out["head_pose"][0, :3, :3], head, atol=1e-12)
-    np.testing.assert_allclose(out["head_pose"][0, :3, 3], total @ given["head_pose"][0, :3, 3].numpy(), atol=1e-12)
+    maps = {"depth": depth, "distance_2": depth, "mask": (depth * 100).astype(np.int64)}
+    maps |= {} if "triple" in names else {"image": depth[None]}  # which interpolates images
+    out = chain(given, **{name: torch.from_numpy(value)[None] for name, value in maps.items()})
+    mirror, pose = np.diag([np.linalg.det(total), 1, 1]), given["head_pose"][0].numpy()
+    for name, found, expected in (
+        ("keypoints", out["keypoints"][0], pixels),
+        ("gaze", out["gaze"][0], total @ given["gaze"][0].numpy()),
+        ("tvec", out["tvec"][0], total @ given["tvec"][0].numpy()),
+        ("points", out["points"][0], given["points"][0].numpy() @ total.T),
+        ("rotation", out["rotation"][0], total),
+        ("head", out["head_pose"][0, :3, :3], total @ pose[:3, :3] @ mirror),
+        ("place", out["head_pose"][0, :3, 3], total @ pose[:3, 3]),
+        *[("rvec", *(ct.rotations.rotation_matrix(s["rvec"][0]).numpy() for s in (out, given)))],
+    ):
+        expected = total @ expected @ mirror if name == "rvec" else expected
+        np.testing.assert_allclose(found, expected, atol=1e-9 if name == "keypoints" else 1e-12, err_msg=name)
     assert np.linalg.det(out["head_pose"][0, :3, :3]) == pytest.approx(1)
-    rvec = ct.rotations.rotation_matrix(out["rvec"][0]).numpy()
-    np.testing.assert_allclose(
-        rvec, total @ ct.rotations.rotation_matrix(given["rvec"][0]).numpy() @ mirror, atol=1e-12
-    )
     # where a crop cut something off, and the last camera sees it again, it is shown
-    same = shown != 0 if crops else np.ones_like(shown, bool)
-    for name in ("depth", "distance_2"):
-        assert out[name].shape == (1, *shown.shape)
-        np.testing.assert_array_equal(out[name][0].numpy()[same], shown[same])
-    np.testing.assert_array_equal(out["mask"][0].numpy()[same], (shown * 100).astype(np.int64)[same])
+    same = shown != 0 if "crop" in names else np.ones_like(shown, bool)
+    for name in maps:
+        expected = (shown * 100).astype(np.int64) if name == "mask" else shown
+        assert out[name].shape[-2:] == shown.shape
+        np.testing.assert_array_equal(out[name].numpy().reshape(shown.shape)[same], expected[same])
 
 
 def test_depth_through_edits_and_another_mount():
@@ -214,19 +207,15 @@ def test_depth_through_edits_and_another_mount():
 def test_whole_steps_copy_pixels(dtype):
     generator = torch.Generator().manual_seed(0)
     image = torch.randint(0, 2 if dtype == torch.bool else 200, (4, 3, *SIZE), generator=generator).to(dtype)
-    assert torch.equal(A.HorizontalFlip(p=1.0)(image=image)["image"], image.flip(-1))
-    assert torch.equal(A.VerticalFlip(p=1.0)(image=image[0])["image"], image[0].flip(-2))
     for k in range(4):
         assert torch.equal(A.Rotate90(k)(image=image)["image"], torch.rot90(image, k, (-2, -1)))
     padded = A.Pad((1, 2, 3, 4), fill=1)(image=image)["image"]
     assert torch.equal(padded, F.pad(image, (1, 3, 2, 4), value=1))
-    assert torch.equal(A.CenterCrop((30, 40))(image=image)["image"], image[..., 9:39, 12:52])
     torch.manual_seed(4)
     some = A.HorizontalFlip()
     out = some(image=image, mask=image)
-    rows = some.last.mirrored
-    assert rows.tolist() == [False, False, True, True] or 0 < rows.sum() < 4
-    expected = torch.where(rows[:, None, None, None], image.flip(-1), image)
+    assert 0 < some.last.mirrored.sum() < 4
+    expected = torch.where(some.last.mirrored[:, None, None, None], image.flip(-1), image)
     assert torch.equal(out["image"], expected)
     assert torch.equal(out["mask"], expected)
 
@@ -304,12 +293,13 @@ def test_a_chain_is_one_resampling(monkeypatch):
 
 def test_a_chain_is_its_parts_one_after_the_other():
     lens = camera(ct.Fisheye624)
-    given = sample(lens, count=5)
-    chain = mixture()
-    torch.manual_seed(7)
-    out = chain(given)
-    torch.manual_seed(7)
-    steps = torch.nn.Sequential(*chain.augmentations)(given)
+    given, chain = sample(lens, count=5), mixture()
+    nested = A.Compose([A.Compose(chain.parts[:2]), *chain.parts[2:]])
+    outs = []
+    for run in (chain, torch.nn.Sequential(*chain.augmentations), nested):
+        torch.manual_seed(7)
+        outs.append(run(given))
+    out, steps, in_two = outs
     for name in ("points", "gaze", "head_pose", "rotation"):
         torch.testing.assert_close(out[name], steps[name], atol=1e-9, rtol=0)
     both = steps["keypoints_valid"]  # all the way
@@ -317,18 +307,10 @@ def test_a_chain_is_its_parts_one_after_the_other():
     assert both.float().mean() > 0.4
     torch.testing.assert_close(out["keypoints"][both], steps["keypoints"][both], atol=1e-9, rtol=0)
     torch.testing.assert_close(out["camera"].intrinsics, steps["camera"].intrinsics)
-    draw = chain.draw(5, torch.Generator().manual_seed(2))
-    again = chain(given, draw=draw)
-    assert torch.equal(again["keypoints"], chain(given, draw=draw)["keypoints"])
-    back = chain.inverse(again)
+    torch.testing.assert_close(in_two["keypoints"], out["keypoints"], atol=1e-9, rtol=0)
+    back = chain.inverse(chain(given, draw=chain.draw(5, torch.Generator().manual_seed(2))))
     torch.testing.assert_close(back["keypoints"], given["keypoints"], atol=1e-8, rtol=0)
     torch.testing.assert_close(back["head_pose"], given["head_pose"], atol=1e-9, rtol=0)
-    nested = A.Compose([A.Compose(chain.parts[:2]), *chain.parts[2:]])
-    torch.manual_seed(7)
-    torch.testing.assert_close(nested(given)["keypoints"], out["keypoints"], atol=1e-9, rtol=0)
-    assert torch.equal(pickle.loads(pickle.dumps(chain))(given, draw=draw)["keypoints"], again["keypoints"])
-    copied = copy.deepcopy(chain)(given, draw=draw)
-    assert torch.equal(copied["keypoints"], again["keypoints"])
 
 
 def test_rows_that_nothing_applies_to_stay():
@@ -562,65 +544,17 @@ def test_gradients_reach_images_labels_and_cameras():
             tensor.grad = None
 
 
-def test_empty_batches():
-    lens = camera(dtype=torch.float32)
-    fields = {"image": torch.rand(0, 3, *SIZE), "keypoints": torch.rand(0, 5, 2), "camera": lens}
-    for chain in (A.HorizontalFlip(), A.RandomResizedCrop(20), A.Compose([A.Resize(20), A.HorizontalFlip()])):
-        out = chain(**fields)
-        assert out["image"].shape[0] == out["keypoints"].shape[0] == 0
-
-
 # -- in other pipelines
-
-
-def by_hand(image, keypoints, lens):
-    """The chain of the front ends: mirrored, then padded; landmarks 0 and 1 change places."""
-    chain = A.Compose([A.HorizontalFlip(p=1.0, landmarks=[(0, 1)]), A.Pad((1, 2, 3, 4))])
-    return chain, chain(image=image, keypoints=keypoints, **({} if lens is None else {"camera": lens}))
-
-
-@pytest.mark.parametrize("lens", [None, camera(dtype=torch.float32)], ids=["no camera", "camera"])
-def test_arrays(lens):
-    image, points = torch.randint(0, 256, (3, *SIZE), dtype=torch.uint8), torch.rand(4, 2) * 40
-    chain, expected = by_hand(image, points, lens)
-    given = {} if lens is None else {"camera": lens}
-    array = image.permute(1, 2, 0).numpy()
-    out = ct.augment.numpy.Transform(chain)(image=array, keypoints=points.numpy(), masks=[array], **given)
-    np.testing.assert_array_equal(out["image"], expected["image"].permute(1, 2, 0).numpy())
-    np.testing.assert_array_equal(out["masks"][0], out["image"])
-    np.testing.assert_array_equal(out["keypoints"], expected["keypoints"].numpy())
-    assert ("camera" in out) == (lens is not None)
-    empty = ct.augment.numpy.Transform(chain)(image=array, masks=np.zeros((0, *SIZE), np.uint8), **given)
-    assert empty["masks"].shape == (0, 54, 68)
-
-
-@pytest.mark.parametrize("kind", ["stand-in", "real"])
-@pytest.mark.parametrize("lens", [None, camera(dtype=torch.float32)], ids=["no camera", "camera"])
-def test_torchvision(kind, lens, monkeypatch):
-    with torchvision_of(kind, monkeypatch) as tv_tensors:
-        front = importlib.import_module("camtorch.augment.torchvision")
-        image, points = torch.randint(0, 256, (3, *SIZE), dtype=torch.uint8), torch.rand(4, 2) * 40
-        chain, expected = by_hand(image, points, lens)
-        given = {"image": tv_tensors.Image(image)}
-        if hasattr(tv_tensors, "KeyPoints"):
-            given["points"] = tv_tensors.KeyPoints(points, canvas_size=SIZE)
-        out = front.Transform(chain, lens)(given)
-        assert torch.equal(out["image"].as_subclass(torch.Tensor), expected["image"])
-        if "points" in given:
-            assert torch.equal(out["points"].as_subclass(torch.Tensor), expected["keypoints"])
-            assert tuple(out["points"].canvas_size) == (54, 68)
-        with pytest.raises(ValueError, match="no camera"):
-            front.Transform(A.Compose([A.HorizontalFlip(), A.RandomLens()]))(given)
 
 
 def test_kornia():
     lens = camera(dtype=torch.float32)
     image, points = torch.rand(2, 3, *SIZE), torch.rand(2, 4, 2) * 40
-    chain, expected = by_hand(image, points, lens)
+    chain = A.Compose([A.HorizontalFlip(p=1.0, landmarks=[(0, 1)]), A.Pad((1, 2, 3, 4))])
+    expected = chain(image=image, keypoints=points, camera=lens)
     pipeline = K.AugmentationSequential(fronts.CameraAugmentation(chain, lens), data_keys=["input", "keypoints"])
-    moved, keypoints = pipeline(image, points)
-    torch.testing.assert_close(moved, expected["image"])
-    torch.testing.assert_close(keypoints, expected["keypoints"])
+    for moved, name in zip(pipeline(image, points), ("image", "keypoints"), strict=True):
+        torch.testing.assert_close(moved, expected[name])
     assert torch.equal(fronts.HorizontalFlip(lens, p=1.0)(image), image.flip(-1))
     assert torch.equal(fronts.Rotate90(lens, 1)(image), torch.rot90(image, 1, (-2, -1)))
     both = fronts.Compose(lens, [A.RandomResizedCrop(SIZE), A.HorizontalFlip(), A.RandomLens()])
@@ -630,20 +564,6 @@ def test_kornia():
     torch.manual_seed(0)
     direct = both.augmentation(image=image, camera=lens)
     torch.testing.assert_close(direct["camera"].intrinsics, both.last.target.intrinsics)
-
-
-def test_albumentations():
-    albumentations = pytest.importorskip("albumentations", reason="albumentations is not installed")
-    front = importlib.import_module("camtorch.augment.albumentations")
-    image, points = torch.randint(0, 256, (3, *SIZE), dtype=torch.uint8), torch.rand(4, 2) * 40
-    for lens in (None, camera(dtype=torch.float32)):
-        chain, expected = by_hand(image, points, lens)
-        keypoints = albumentations.KeypointParams(format="xy", remove_invisible=False)
-        pipeline = albumentations.Compose([front.Transform(chain, lens)], keypoint_params=keypoints)
-        out = pipeline(image=image.permute(1, 2, 0).numpy(), keypoints=points.numpy())
-        np.testing.assert_array_equal(out["image"], expected["image"].permute(1, 2, 0).numpy())
-        np.testing.assert_allclose(out["keypoints"], expected["keypoints"].numpy(), atol=1e-4)
-        assert ("camera" in out) == (lens is not None)
 
 
 # -- what goes wrong is told
@@ -682,20 +602,6 @@ def test_wrong_arguments_are_told():
         A.Rotate90(1)(image=image, camera=ct.Cylindrical([20.0, 20, 32, 24], image_size=SIZE).requires_grad_(False))
 
 
-@pytest.mark.slow
-def test_chains_compile():
-    lens = camera(ct.Pinhole, torch.float32, (96, 128))
-    given = {"image": torch.rand(2, 3, 96, 128), "keypoints": torch.rand(2, 5, 2) * 90, "gaze": torch.ones(2, 3)}
-    chain = mixture(camera=lens)
-    draw = chain.draw(2, torch.Generator().manual_seed(0))
-    expected = chain(given, draw=draw)
-    compiled = torch.compile(lambda sample, draw: chain(sample, draw=draw), fullgraph=True, backend="eager")
-    out = compiled(given, draw)
-    torch.testing.assert_close(out["keypoints"], expected["keypoints"], atol=1e-3, rtol=0)
-    torch.testing.assert_close(out["gaze"], expected["gaze"])
-    assert (out["image"] - expected["image"]).abs().mean() < 1e-3
-
-
 @pytest.mark.parametrize("name", ["CenterCrop", "RandomCrop", "RandomResizedCrop"])
 def test_boxes_stay_where_any_of_their_mask_does(name):
     torch.manual_seed(0)
@@ -721,17 +627,9 @@ def test_boxes_stay_where_any_of_their_mask_does(name):
 
 
 def test_quarter_turns_of_several_models_are_told_of_where_images_are_one_tensor():
-    cameras = [
-        model.from_fov(60, image_size=(16, 24)).requires_grad_(False) for model in (ct.Pinhole, ct.KannalaBrandt)
-    ]
-    rotate, images = ct.augment.Rotate90(), torch.rand(2, 3, 16, 24)
-    draw = next(
-        seed
-        for seed in range(50)
-        if (rotate.draw(2, torch.Generator().manual_seed(seed))["times"] * 4).long().tolist() == [0, 1]
-    )
-    torch.manual_seed(draw)
-    change = rotate.change(cameras, rotate.draw(2, torch.Generator().manual_seed(draw)))
+    cameras = [m.from_fov(60, image_size=(16, 24)).requires_grad_(False) for m in (ct.Pinhole, ct.KannalaBrandt)]
+    draw = {"apply": torch.ones(2, dtype=torch.bool), "times": torch.tensor([0.1, 0.3])}
+    change = A.Rotate90().change(cameras, draw)
     with pytest.raises(ValueError, match=r"in the sizes \[\(16, 24\), \(24, 16\)\]; same_on_batch"):
-        change.images(images)
+        change.images(torch.rand(2, 3, 16, 24))
     assert change.points(torch.zeros(2, 5, 2))[0].shape == (2, 5, 2)
