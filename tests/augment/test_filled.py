@@ -120,19 +120,6 @@ def test_a_batch_is_its_samples_and_replays_are_identical(name):
             torch.testing.assert_close(alone["keypoints"], out["keypoints"][i], atol=1e-2, rtol=0)
 
 
-@pytest.mark.slow
-def test_compiled_it_is_the_same():
-    augmentation = RandomCamera("dms130", camera=pinhole(), fov="source", min_filled=0.9)
-    draw = augmentation.draw(2, torch.Generator().manual_seed(0))
-    points = torch.rand(2, 5, 2) * 100
-
-    def run(points, draw):
-        return augmentation(keypoints=points, draw=draw)["keypoints"]
-
-    compiled = torch.compile(run, fullgraph=True, backend="eager")(points, draw)
-    torch.testing.assert_close(compiled, run(points, draw), atol=2e-3, rtol=1e-4)
-
-
 def test_gradients_pass_and_the_zoom_counts_as_given():
     camera = ct.Pinhole([100.0, 100.0, 79.5, 59.5], image_size=SIZE)
     out = RandomCamera("dms130", camera=camera, min_filled=0.9)(keypoints=torch.rand(2, 5, 2) * 50 + 40)
