@@ -206,6 +206,14 @@ def as_image_size(value: Any, owner: str, name: str = "image_size") -> tuple[int
     return height, width
 
 
+def as_known_size(value: Any, owner: str) -> tuple[int, int]:
+    """Return (height, width) as two positive ints."""
+    size = as_image_size(value, owner)
+    if size is None:
+        raise TypeError(f"{owner}: image_size must be two integers (height, width); got None")
+    return size
+
+
 def shown(value: object) -> str:
     """What was passed, for an error: of tensors and arrays the shape, of anything else the beginning."""
     if isinstance(value, (Tensor, np.ndarray)) and value.ndim:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from camtorch._arguments import as_image_size, as_whole
+from camtorch._arguments import as_known_size, as_whole
 from camtorch.augment.augmentation import Augmentation, EditOptions, as_range
 from camtorch.camera import Camera
 from camtorch.rotations import mount_rotation
@@ -65,10 +65,7 @@ class BoxCrop(Augmentation):
         if zoom is not None:
             ranges["zoom"] = as_range(zoom, "zoom", name, around=1, least=1e-3, most=1e3)
         super().__init__(ranges, **options)
-        size = as_image_size(image_size, name)
-        if size is None:
-            raise TypeError(f"{name}: image_size must be two integers (height, width); got None")
-        self.image_size, self.margin = size, as_margin(margin, name)
+        self.image_size, self.margin = as_known_size(image_size, name), as_margin(margin, name)
         self.crops = {"box": as_whole(index, "index", name)}
 
     def new_camera(self, source: Camera, values: Mapping[str, Tensor]) -> tuple[Camera, Tensor | None]:

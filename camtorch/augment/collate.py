@@ -24,8 +24,8 @@ def collate(samples: Sequence[object]) -> object:
 
     As torch's own `default_collate`, which stacks tensors, arrays and numbers; but tensors and arrays whose shapes
     differ, such as the keypoints of several faces, come as the list of tensors that the augmentations take. Cameras
-    become a batch, or a `ct.Mixed` if they are of several models; so they do by `default_collate`. Cameras whose images
-    differ in size come as a list, which no augmentation takes: augment such samples in the workers, one by one.
+    become a batch, or a `ct.Mixed` if they are of several models; so they do by `default_collate`. Their images are of
+    one size: augment others in the workers, one by one.
 
     In a worker on Linux, batches go into shared memory that is used again when the main process has let go of them,
     as new memory takes as long to get as images take to be augmented; of no more bytes than were in use at once. What
@@ -33,7 +33,8 @@ def collate(samples: Sequence[object]) -> object:
     "file_system" all goes torch's own way.
 
     Raises:
-        TypeError: no list of samples; what cannot be collated, as by `default_collate`. ValueError: an empty list.
+        TypeError: no list of samples; what cannot be collated, as by `default_collate`. ValueError: an empty list,
+            cameras whose images differ in size.
     """
     if not is_list(samples):
         raise TypeError(f"collate: samples must be a list of samples; got {type(samples).__name__}")
@@ -61,10 +62,8 @@ def _others(function: Callable[..., Any], batch: Sequence[Any], *, collate_fn_ma
 
 
 def collate_cameras(batch: Sequence[Camera], *, collate_fn_map: Any = None) -> Camera | list[Camera]:
-    """Single cameras as one batch, of several models if need be, or as a list if their images differ in size."""
-    if any(camera.batch_shape for camera in batch) or len({camera.image_size for camera in batch}) > 1:
-        return list(batch)
-    return cat(batch)
+    """Return single cameras as one batch, of several models if need be; others as a list."""
+    return list(batch) if any(camera.batch_shape for camera in batch) else cat(batch)
 
 
 # Samples that hold cameras then go through a DataLoader as they are. torch documents this map for the purpose.

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from camtorch._arguments import as_image_size, as_number, fails, no_camera, shown
+from camtorch._arguments import as_known_size, as_number, fails, no_camera, shown
 from camtorch._module import remade, typed_as
 from camtorch.augment.change import Change, Part, alone
 from camtorch.augment.sample import Sample, SampleOptions, SampleTransform, on_samples
@@ -75,10 +75,7 @@ class FaceNormalizer(SampleTransform):
         for name, value in (("focal", self.focal), ("distance", self.distance)):
             if not 0 < value < float("inf"):
                 raise ValueError(f"{self._name}: {name} must be positive; got {value!r}")
-        size = as_image_size(image_size, self._name)
-        if size is None:
-            raise TypeError(f"{self._name}: image_size must be two integers (height, width); got None")
-        height, width = self.image_size = size
+        height, width = self.image_size = as_known_size(image_size, self._name)
         self.axis = (width / 2, height / 2)
         if axis is not None:
             given = tuple(axis) if isinstance(axis, (Sequence, Tensor, np.ndarray)) else ()

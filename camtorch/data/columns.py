@@ -9,8 +9,8 @@ import numpy as np
 import torch
 
 from camtorch._arguments import no_camera
-from camtorch.augment.collate import collate_cameras
 from camtorch.camera import MODELS, Camera, as_model
+from camtorch.mixed import cat
 
 PARTS = ("model", "intrinsics", "distortion", "image_size")
 
@@ -64,7 +64,8 @@ def from_columns(columns: Mapping[str, Any], name: str = "camera") -> Camera | l
     if isinstance(parts["model"], str) or np.ndim(parts["model"]) == 0:
         return camera_of(parts, "from_columns")
     rows = [{part: values[i] for part, values in parts.items()} for i in range(len(parts["model"]))]
-    return collate_cameras([camera_of(row, "from_columns") for row in rows])
+    cameras = [camera_of(row, "from_columns") for row in rows]
+    return cameras if len({camera.image_size for camera in cameras}) > 1 else cat(cameras)
 
 
 def camera_of(parts: Mapping[str, Any], owner: str) -> Camera:

@@ -17,7 +17,7 @@ from camtorch.native import sampler
 from camtorch.warp.grid import Lattice, Sampling, straight_lattice
 from camtorch.warp.panorama import lengths
 from camtorch.warp.routes import lengthened, positions, route_of
-from camtorch.warp.sampling import SHRINKS, SURELY, Fill, Mode, PaddingMode, Sampler, render
+from camtorch.warp.sampling import SHRINKS, SURELY, Mode, PaddingMode, Sampler, render
 from camtorch.warp.warp import Warp, checked
 
 _MOST = 8  # times that an image is halved
@@ -48,18 +48,11 @@ class MirrorWarp(Warp):
         self._decides = antialias is None
         self._halvings: list[int] | None = None
 
-    def forward(
-        self,
-        images: Tensor,
-        *,
-        mode: Mode | None = None,
-        padding_mode: PaddingMode | None = None,
-        fill: Fill | None = None,
-    ) -> Tensor:
+    def forward(self, images: Tensor, **how: Any) -> Tensor:
         """Warped images, as of `Warp.forward`; smaller ones of them where they shrink."""
         plain = not (torch.compiler.is_compiling() or in_transform()) and is_concrete(self.target.intrinsics)
         if self._decides and plain and (self._halvings is None or any(self._halvings)):
-            sampler = checked(self, images, mode, padding_mode, fill)
+            sampler = checked(self, images, **how)
             smooth = sampler.mode != "nearest" and images.dtype != torch.bool
             if smooth and route_of(self, images) == "kept":
                 where = positions(self, "kept", sampler.padding_mode)
@@ -67,7 +60,7 @@ class MirrorWarp(Warp):
                     self._halvings = _halvings(where, self._sampled)
                 if any(self._halvings):
                     return self._smoothed(images, where, self._halvings, sampler)
-        return super().forward(images, mode=mode, padding_mode=padding_mode, fill=fill)
+        return super().forward(images, **how)
 
     def _smoothed(self, images: Tensor, where: Sampling | Lattice, halvings: list[int], sampler: Sampler) -> Tensor:
         """Sampled from images that torch's antialiased interpolation halved so many times, for each camera."""
@@ -139,16 +132,9 @@ class AffineWarp(MirrorWarp):
 
     # -- images
 
-    def forward(
-        self,
-        images: Tensor,
-        *,
-        mode: Mode | None = None,
-        padding_mode: PaddingMode | None = None,
-        fill: Fill | None = None,
-    ) -> Tensor:
+    def forward(self, images: Tensor, **how: Any) -> Tensor:
         """Edited images, as of `Warp.forward`."""
-        mode, padding_mode, values = checked(self, images, mode, padding_mode, fill)
+        mode, padding_mode, values = checked(self, images, **how)
         if images.ndim == 4 and may_look(self.matrix) and not in_transform():
             made = self._copied(images, values) if padding_mode == "zeros" else None
             made = self._shrunk(images, mode) if made is None else made

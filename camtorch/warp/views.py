@@ -9,13 +9,14 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor, nn
 
-from camtorch._arguments import Numbers, as_fov, as_image_size, as_number, as_values, as_whole, check_boxes, shown
+from camtorch._arguments import Numbers, as_fov, as_known_size, as_number, as_values, as_whole, check_boxes, shown
 from camtorch._dtypes import narrow, widen
 from camtorch._module import GeometryModule, remade, typed_as
 from camtorch.camera import Camera
 from camtorch.models import Pinhole
 from camtorch.projection.rays import slopes_at_axis
 from camtorch.rotations import mount_rotation
+from camtorch.warp.boxes import corners_of
 from camtorch.warp.sampling import Mode
 from camtorch.warp.warp import Warp, as_sized
 
@@ -32,17 +33,11 @@ _OVERLAP = 1.25  # the width of a view in a ring over the step to the next one
 
 
 class Views(GeometryModule):
-    """Pinhole views of one camera's image: what `cube` and `ring` make.
+    """Pinhole views of one camera's image, all of the camera `view`: what `cube` and `ring` make.
 
     `views(images)` makes them, `views.back(...)` puts what a network made of them together again. `warps[i]` moves
-    points and boxes to view i, `warps[i].inverse()` back; `rotations[i]` is `ray_view = R ray_camera`.
-
-    Args:
-        camera: of the wide images.
-        view: the pinhole camera of every view.
-        rotations: (N, 3, 3), `ray_view = R ray_camera`.
-        names: of the views.
-        mode: as `Warp` takes it; "nearest" for labels, there and back.
+    points and boxes to view i, `warps[i].inverse()` back; `rotations[i]`, (3, 3), is `ray_view = R ray_camera`. The
+    `mode` is that of `Warp`; "nearest" for labels, there and back.
     """
 
     rotations: Tensor
@@ -102,18 +97,11 @@ class Views(GeometryModule):
         return whole / torch.where(total > 0, total, 1.0)
 
     def back(self, views: Tensor) -> tuple[Tensor, Tensor]:
-        """Views, or what was made of them, in the wide image.
+        """Put views (B, N, C, S, S), or what was made of them, together in the wide image.
 
-        Args:
-            views: (B, N, C, S, S).
-
-        Returns:
-            (B, C, H, W) of the same dtype, and valid (1, 1, H, W) bool: some view shows the pixel. Views are averaged
-            by their weights, and integers rounded; with mode="nearest" a pixel is that of the view with the largest
-            weight, as labels have no mean.
-
-        Raises:
-            ValueError: another shape.
+        Returns (B, C, H, W) of the same dtype, and valid (1, 1, H, W) bool: some view shows the pixel. Views are
+        averaged by their weights, and integers rounded; with mode="nearest" a pixel is that of the view with the
+        largest weight, as labels have no mean.
         """
         size = self.view._size_for("Views")
         if not isinstance(views, Tensor) or views.ndim != 5 or views.shape[1] != len(self) or views.shape[-2:] != size:
@@ -138,17 +126,13 @@ class Views(GeometryModule):
 
 
 def cube(camera: Camera, size: int | None = None, *, mode: Mode = "bilinear") -> Views:
-    """The six faces of a cube about a camera, of 90 degrees each: front, right, back, left, up, down.
+    """Return the six faces of a cube about a camera, of 90 degrees each: front, right, back, left, up, down.
 
-    Args:
-        camera: of the wide images, with image_size.
-        size: pixels along the sides of a face; as fine in its middle as the image at the axis by default.
-        mode: as `Warp` takes it.
+    The sides of a face have `size` pixels; by default it is as fine in its middle as the image at the axis.
     """
-    size = _size(camera, size, math.pi / 2, "cube")
     angles = torch.tensor([[0, 0], [90, 0], [180, 0], [-90, 0], [0, 90], [0, -90]], dtype=torch.float64)
     rotations = mount_rotation(angles[:, 0], angles[:, 1], torch.zeros(6, dtype=torch.float64))
-    return _views(camera, size, math.pi / 2, rotations, FACES, mode)
+    return _views(camera, size, math.pi / 2, rotations, FACES, mode, "cube")
 
 
 def ring(
@@ -160,7 +144,7 @@ def ring(
     pitch: float = 0.0,
     mode: Mode = "bilinear",
 ) -> Views:
-    """Views side by side from left to right, over what a camera sees.
+    """Return `count` views side by side from left to right, over what a camera sees.
 
     Args:
         camera: of the wide images, with image_size.
@@ -169,9 +153,6 @@ def ring(
         size: pixels along the sides of a view; as fine in its middle as the image at the axis by default.
         pitch: degrees that all look up.
         mode: as `Warp` takes it.
-
-    Raises:
-        ValueError: no views, or a field of view that no pinhole has.
     """
     count, pitch = as_whole(count, "count", "ring", least=1), as_number(pitch, "pitch", "ring")
     seen = float(as_sized(camera, "camera", "ring").field_of_view.detach()[..., 0].max())
@@ -180,23 +161,20 @@ def ring(
     wide = min(_OVERLAP * step, widest) if fov is None else math.radians(as_fov(fov, "ring", 180))
     yaws = torch.rad2deg((torch.arange(count, dtype=torch.float64) - (count - 1) / 2) * step)
     rotations = mount_rotation(yaws, torch.full_like(yaws, pitch), torch.zeros_like(yaws))
-    size = _size(camera, size, wide, "ring")
-    return _views(camera, size, wide, rotations, tuple(f"{yaw:.4g} degrees" for yaw in yaws.tolist()), mode)
+    return _views(camera, size, wide, rotations, tuple(f"{yaw:.4g} degrees" for yaw in yaws.tolist()), mode, "ring")
 
 
-def _size(camera: Camera, size: int | None, fov: float, owner: str) -> int:
+def _views(
+    camera: Camera, size: int | None, fov: float, rotations: Tensor, names: tuple[str, ...], mode: Mode, owner: str
+) -> Views:
     as_sized(camera, "camera", owner)
     if camera.batch_shape:
         raise ValueError(f"{owner}: takes one camera; got batch_shape={tuple(camera.batch_shape)}")
-    if size is not None:
-        return as_whole(size, "size", owner, least=1)
-    with torch.no_grad():
-        slope = slopes_at_axis(camera.optics, camera.distortion[None])
-        focal = float((camera.intrinsics[:2] * slope[0]).max())
-    return max(2, round(2 * focal * math.tan(fov / 2)))
-
-
-def _views(camera: Camera, size: int, fov: float, rotations: Tensor, names: tuple[str, ...], mode: Mode) -> Views:
+    if size is None:
+        with torch.no_grad():
+            slope = slopes_at_axis(camera.optics, camera.distortion[None])
+            size = max(2, round(2 * float((camera.intrinsics[:2] * slope[0]).max()) * math.tan(fov / 2)))
+    size = as_whole(size, "size", owner, least=1)
     focal, centre = size / 2 / math.tan(fov / 2), (size - 1) / 2
     intrinsics = camera.intrinsics.detach().new_tensor([focal, focal, centre, centre])
     view = Pinhole(nn.Parameter(intrinsics, requires_grad=False), image_size=(size, size))
@@ -204,7 +182,7 @@ def _views(camera: Camera, size: int, fov: float, rotations: Tensor, names: tupl
 
 
 def look_at(camera: Camera, boxes: Numbers, image_size: Sequence[int], *, margin: float = 0.25) -> Warp:
-    """A pinhole camera that looks at a box, as the detector of faces or of people gives it: a crop without perspective.
+    """Return a warp to a pinhole camera that looks at a box, as of a face detector: a crop without perspective.
 
     A plain crop of a face away from the axis is the face as seen from the side of the lens: wider, leaning, and turned
     against the same face on the axis. The new camera looks along the ray of the box's middle, and the source's y axis
@@ -224,8 +202,7 @@ def look_at(camera: Camera, boxes: Numbers, image_size: Sequence[int], *, margin
         from them count as given, without gradients.
 
     Raises:
-        ValueError: boxes of another shape, without extent, beside the image, without a ray in the middle or parallel
-            to the camera's y axis there, or with an outline 90 degrees or more from it: the text names the box.
+        ValueError: boxes that cannot be looked at: the text names the box.
     """
     camera, owner = as_sized(camera, "camera", "look_at"), "look_at"
     given = as_values(boxes, "boxes", owner, camera.intrinsics.device)
@@ -236,17 +213,14 @@ def look_at(camera: Camera, boxes: Numbers, image_size: Sequence[int], *, margin
     batch = tuple(camera.batch_shape)
     if len(batch) > 1 or (batch and given.ndim == 2 and len(given) != batch[0]):
         raise ValueError(f"{owner}: {len(given)} boxes do not fit a camera of batch dims {batch}")
-    size = as_image_size(image_size, owner)
-    if size is None:
-        raise TypeError(f"{owner}: image_size must be two integers (height, width); got None")
+    size = as_known_size(image_size, owner)
     rows = given if given.ndim == 2 else given.expand(*(batch or (1,)), 4)
     check_extents(rows, camera, "boxes", owner)
     intrinsics, rotation = looking_at(camera, rows, size, as_margin(margin, owner), owner)
     if given.ndim == 1 and not batch:
         intrinsics, rotation = intrinsics[0], rotation[0]
-    intrinsics, rotation = (
-        t.to(torch.promote_types(camera.intrinsics.dtype, torch.float32)) for t in (intrinsics, rotation)
-    )
+    dtype = torch.promote_types(camera.intrinsics.dtype, torch.float32)
+    intrinsics, rotation = intrinsics.to(dtype), rotation.to(dtype)
     return Warp(camera, pinhole(intrinsics, size)).turned_by(rotation)
 
 
@@ -299,24 +273,19 @@ def looking_at(
     across = across / length
     rotation = torch.stack((across, torch.linalg.cross(axis, across), axis), -2)
     moved = margin * (high - low)
-    (left, top), (right, bottom) = (low - moved).unbind(-1), (high + moved).unbind(-1)
-    corners = torch.stack([torch.stack(c, -1) for c in ((left, top), (right, top), (right, bottom), (left, bottom))], 1)
+    corners = corners_of(torch.cat((low - moved, high + moved), -1))
     start, edge = corners[:, :, None, None], (corners.roll(-1, 1) - corners)[:, :, None, None]
     # along each edge the largest slope x / z, and the largest y / z: closer and closer to where it is
-    steps = torch.linspace(-1, 1, _ALONG, dtype=torch.float64, device=boxes.device)
-    place, half = torch.full((len(boxes), 4, 1), 0.5, dtype=torch.float64, device=boxes.device), 0.5
-    farthest = torch.full((len(boxes), 2), -math.inf, dtype=torch.float64, device=boxes.device)
-    all_seen = True
+    steps = torch.linspace(-1, 1, _ALONG, dtype=low.dtype, device=low.device)
+    place, half, all_seen = low.new_full((len(boxes), 4, 1), 0.5), 0.5, True
+    farthest = low.new_full((len(boxes), 2), -math.inf)
     for i in range(_MORE_ROUNDS):
         share = (place[..., None] + half * steps).clamp(0, 1)  # (B, 4, 1 or 2, K)
-        pixels = start + share[..., None] * edge
-        rays, seen = camera.unproject(pixels.flatten(1, 3))
-        turned = (rays @ rotation.mT).view(*share.shape, 3)
-        seen = seen.view(share.shape)
+        rays, seen = camera.unproject((start + share[..., None] * edge).flatten(1, 3))
+        turned, seen = (rays @ rotation.mT).view(*share.shape, 3), seen.view(share.shape)
         all_seen = all_seen and bool(seen.all())
-        refuse(
-            (seen & (turned[..., 2] <= 1e-9)).flatten(1).any(-1), "has an outline 90 degrees or more from its middle"
-        )
+        behind = (seen & (turned[..., 2] <= 1e-9)).flatten(1).any(-1)
+        refuse(behind, "has an outline 90 degrees or more from its middle")
         slopes = turned[..., :2].abs() / turned[..., 2:].clamp(min=1e-9)
         slopes = torch.where(seen[..., None], slopes, -math.inf)
         slopes = slopes.expand(-1, -1, 2, -1, -1).diagonal(dim1=2, dim2=4).mT  # (B, 4, 2, K)

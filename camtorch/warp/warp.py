@@ -399,7 +399,11 @@ def _check_parts(source: Camera, target: Camera, rotation: Tensor | None) -> tor
 
 
 def checked(
-    warp: Warp, images: Tensor, mode: Mode | None, padding_mode: PaddingMode | None, fill: Fill | None
+    warp: Warp,
+    images: Tensor,
+    mode: Mode | None = None,
+    padding_mode: PaddingMode | None = None,
+    fill: Fill | None = None,
 ) -> Sampler:
     """How a warp samples images in one call, if they and its options are as `Warp.forward` wants them."""
     expected = warp.source._size_for("Warp")
