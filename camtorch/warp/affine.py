@@ -32,8 +32,6 @@ class MirrorWarp(Warp):
     With antialias=None images that shrink by more than one and a half are halved before, which takes less time.
     """
 
-    batch_shape: torch.Size
-
     def __init__(
         self,
         source: Camera,
@@ -105,7 +103,6 @@ class AffineWarp(MirrorWarp):
     is_an_operator = False
     _seam = None
     matrix: Tensor
-    batch_shape: torch.Size
 
     def __init__(self, source: Camera, target: Camera, matrix: Tensor, rotation: Tensor | None, **options: Any):
         super().__init__(source, target, rotation, **options)

@@ -24,7 +24,6 @@ class ProxyWarp(Warp):
     """A `Warp` to a camera at another place, of which both see the same points of a proxy; exact, without a lattice."""
 
     is_an_operator = False
-    batch_shape: torch.Size
 
     def __init__(self, source: Camera, target: Camera, extrinsics: Extrinsics, **options: Unpack[WarpOptions]):
         super().__init__(source, target, tolerance=0.0, **options)

@@ -30,7 +30,6 @@ class ShiftedWarp(Warp):
 
     is_an_operator: ClassVar[bool] = False
     _seam = None
-    batch_shape: torch.Size
     shift: Tensor
     distance: Tensor
     """(B, H, W): along the rays of the source; 0 where it is not known."""

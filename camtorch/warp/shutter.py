@@ -105,9 +105,15 @@ class RollingShutter(GeometryModule):
 
     # -- for a warp
 
-    def each(self, change: Callable[[Tensor, int], Tensor]) -> RollingShutter:
-        """Return the shutter whose numbers are `change` of them and of their dims without a batch dim."""
-        return RollingShutter(change(self.readout, 0), change(self.rates, 1), direction=self.direction)
+    def rows_of(self, index: list[int]) -> RollingShutter:
+        """Return the shutter of these rows of a batch."""
+        rates = self.rates[index] if self.rates.ndim == 2 else self.rates
+        readout = self.readout[index] if self.readout.ndim else self.readout
+        return RollingShutter(readout, rates, direction=self.direction)
+
+    def detach(self) -> RollingShutter:
+        """Return the shutter of the same numbers, which do not learn."""
+        return RollingShutter(self.readout.detach(), self.rates.detach(), direction=self.direction)
 
     def _share(self, pixels: Tensor, size: tuple[int, int]) -> Tensor:
         """When pixels (..., 2) are read, in readouts from the middle one."""
@@ -180,7 +186,6 @@ class ShutterWarp(MirrorWarp):
 
     is_an_operator = False
     keeps_lens = True
-    batch_shape: torch.Size
     shutter: RollingShutter | None
     target_shutter: RollingShutter | None
 
@@ -226,21 +231,21 @@ class ShutterWarp(MirrorWarp):
     def detach(self) -> Warp:
         """See `Warp.detach`."""
         rotation = None if self.rotation is None else self.rotation.detach()
-        options = {**self.options, **self._shutters(lambda numbers, _: numbers.detach())}
+        options = {**self.options, **self._shutters(RollingShutter.detach)}
         return self.between(self.source.detach(), self.target.detach(), rotation, **options)
 
     def rows_of(self, source: Camera, target: Camera, rotation: Tensor | None, index: list[int]) -> Warp:
         """See `Warp.rows_of`."""
-        shutters = self._shutters(lambda numbers, dims: numbers[index] if numbers.ndim > dims else numbers)
+        shutters = self._shutters(lambda shutter: shutter.rows_of(index))
         return self.between(source, target, rotation, **self.options, **shutters)
 
     def follow(self, first: Warp) -> Warp:
         """See `Warp.follow`."""
         return self.between(first.source, first.target, first.rotation, **self.options)
 
-    def _shutters(self, change: Callable[[Tensor, int], Tensor]) -> dict[str, RollingShutter | None]:
+    def _shutters(self, change: Callable[[RollingShutter], RollingShutter]) -> dict[str, RollingShutter | None]:
         both = {"shutter": self.shutter, "target_shutter": self.target_shutter}
-        return {name: None if shutter is None else shutter.each(change) for name, shutter in both.items()}
+        return {name: None if each is None else change(each) for name, each in both.items()}
 
 
 def _behind(shutter: RollingShutter | None, camera: Camera) -> Camera:
