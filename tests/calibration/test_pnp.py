@@ -255,25 +255,26 @@ def test_shapes():
     assert single.rms.dtype == single.extrinsics.translation.dtype == torch.float32
 
 
-SIX, SEEN = torch.rand(6, 3), torch.rand(6, 2)
+SIX, SEEN, LENS = torch.rand(6, 3), torch.rand(6, 2), lens(60)
+BAD = [
+    ((None, SIX, SEEN), {}, "camera must be a camera"),
+    ((LENS, SIX, SIX), {}, "pixels must be"),
+    ((LENS, SEEN, SEEN), {}, "object_points must be"),
+    ((LENS, SIX, SEEN[:5]), {}, "not the same number"),
+    ((LENS, SIX[:3], SEEN[:3]), {}, "4 points at least"),
+    ((LENS, SIX.expand(2, 6, 3), SEEN.expand(3, 6, 2)), {}, "do not fit"),
+    ((LENS, [SIX, SIX[:5]], SEEN), {}, "one shape"),
+    ((LENS, "points", SEEN), {}, "object_points must be"),
+    ((LENS, SIX, SEEN), {"weights": -torch.ones(6)}, "weights must not be negative"),
+    ((LENS, SIX, SEEN), {"weights": torch.ones(5)}, "weights must be"),
+    ((LENS, SIX, SEEN), {"threshold": 0}, "threshold must be positive"),
+    ((LENS, SIX, SEEN), {"threshold": -1.0}, "threshold must be positive"),
+    ((LENS, SIX, SEEN), {"threshold": "2 px"}, "threshold"),
+]
 
 
-@pytest.mark.parametrize(
-    ("arguments", "error", "says"),
-    [
-        ((None, SIX, SEEN), TypeError, "camera must be a camera"),
-        ((lens(60), SIX, SIX), ValueError, "pixels must be"),
-        ((lens(60), SEEN, SEEN), ValueError, "object_points must be"),
-        ((lens(60), SIX, SEEN[:5]), ValueError, "not the same number"),
-        ((lens(60), SIX[:3], SEEN[:3]), ValueError, "4 points at least"),
-        ((lens(60), SIX.expand(2, 6, 3), SEEN.expand(3, 6, 2)), ValueError, "do not fit"),
-        ((lens(60), [SIX, SIX[:5]], SEEN), ValueError, "one shape"),
-        ((lens(60), "points", SEEN), TypeError, "object_points must be"),
-        ((lens(60), SIX, SEEN, -torch.ones(6)), ValueError, "weights must not be negative"),
-        ((lens(60), SIX, SEEN, torch.ones(5)), ValueError, "weights must be"),
-    ],
-)
-def test_bad_arguments(arguments, error, says):
-    weights = arguments[3] if len(arguments) > 3 else None
-    with pytest.raises(error, match=rf"solve_pnp: .*{says}"):
-        ct.solve_pnp(*arguments[:3], weights=weights)
+@pytest.mark.parametrize(("arguments", "options", "says"), BAD)
+def test_bad_arguments(arguments, options, says):
+    is_kind = arguments[0] is None or isinstance(arguments[1], str) or "2 px" in options.values()
+    with pytest.raises(TypeError if is_kind else ValueError, match=rf"solve_pnp: .*{says}"):
+        ct.solve_pnp(*arguments, **options)

@@ -5,6 +5,7 @@ import pickle
 
 import pytest
 import torch
+from cameras import slow_unless
 from test_pnp import SIZE, lens, scenes
 
 import camtorch as ct
@@ -41,25 +42,23 @@ def found_by(fov, count, points, share, seed=0):
     return pose.valid & (mine < 3 * best.clamp(min=NOISE)), mine / best
 
 
-@pytest.mark.parametrize(("fov", "points", "share"), [(10, 8, 0.3), (60, 30, 0.6), (190, 30, 0.6)])
-def test_outliers_do_not_matter(fov, points, share):
-    good, ratio = found_by(fov, 10, points, share)
-    assert good.all()
-    assert ratio.median() < 1.01
+MANY = 1000, (10, 60, 130, 190)
+CASES = [
+    *((10, (fov,), (points,), share, 1.0) for fov, points, share in ((10, 8, 0.3), (60, 30, 0.6), (190, 30, 0.6))),
+    *((*MANY, (8, 12, 30, 68), 0.3, 0.99), (*MANY, (15, 20, 30, 68), 0.6, 0.99), (*MANY, (68,), 0.9, 0.95)),
+]
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(("share", "least"), [(0.3, 0.99), (0.6, 0.99), (0.9, 0.95)])
-def test_a_thousand_problems(share, least):
-    counts = {0.3: (8, 12, 30, 68), 0.6: (15, 20, 30, 68), 0.9: (68,)}[share]
-    parts = [
-        found_by(fov, 1000 // (len(counts) * 4), points, share, seed)
-        for points in counts
-        for seed, fov in enumerate((10, 60, 130, 190))
-    ]
+@pytest.mark.parametrize(
+    ("problems", "fovs", "counts", "share", "least"), slow_unless(lambda case: case[0] == 10, CASES)
+)
+def test_outliers_do_not_matter(problems, fovs, counts, share, least):
+    each = problems // (len(counts) * len(fovs))
+    parts = [found_by(fov, each, points, share, seed) for points in counts for seed, fov in enumerate(fovs)]
     good, ratio = (torch.cat(part) for part in zip(*parts, strict=True))
-    assert good.double().mean() > least
-    assert ratio[good].mean() < 1.02
+    assert good.double().mean() >= least
+    assert ratio.median() < 1.01
+    assert ratio[good].mean() < 1.02 or problems == 10
 
 
 def test_inliers_are_what_the_pose_is_of():
@@ -189,11 +188,3 @@ def test_gradients_are_those_of_the_inliers():
         grads.append(pixels.grad)
     torch.testing.assert_close(*grads, rtol=1e-4, atol=1e-6)
     assert not grads[0][~pose.inliers].any()
-
-
-@pytest.mark.parametrize(
-    ("threshold", "says"), [(0, "must be positive"), (-1.0, "must be positive"), ("2 px", "threshold")]
-)
-def test_bad_thresholds(threshold, says):
-    with pytest.raises((ValueError, TypeError), match=f"solve_pnp: .*{says}"):
-        ct.solve_pnp(lens(60), torch.rand(6, 3), torch.rand(6, 2), threshold=threshold)
