@@ -162,8 +162,6 @@ class Calibration:
     copies: tuple[int, ...]
     """The numbers of the views that show another one again: equal ones are left out, nearly equal ones widen the
     uncertainties until they count as one."""
-    object_points: Any = field(repr=False)
-    image_points: Any = field(repr=False)
     observations: Observations = field(repr=False)
     adjusted: Adjusted = field(repr=False)
     point_inliers: Tensor = field(repr=False)
@@ -282,8 +280,7 @@ def calibrate(
     told = as_options(loss, loss_scale, bend, progress, owner)
     asked = as_model(model, count, start, fixed, owner)
     search = Search(owner, asked, seen, middle_of([seen]), layout, loss, loss_scale)
-    found = results([search], search.alone(bend, told), search.free(bend), object_points, [image_points])
-    result = found.cameras[0]
+    (result,) = results([search], search.alone(bend, told), search.free(bend)).cameras
     if not result.converged:
         ends = [] if bool(result.adjusted.converged[0]) else ["the search did not end at an optimum"]
         ends += [f"{lost} corners have no pixel in it: a surface has to reach further"] if (lost := result.lost) else []
@@ -448,10 +445,8 @@ class Results(NamedTuple):
     noise: Tensor
 
 
-def results(
-    searches: Sequence[Search], adjusted: Adjusted, free: Free, object_points: Any, image_points: Sequence[Any]
-) -> Results:
-    """Return the results of an optimum, or of a better one in another basin; points are as they were passed."""
+def results(searches: Sequence[Search], adjusted: Adjusted, free: Free) -> Results:
+    """Return the results of an optimum, or of a better one in another basin of a model."""
     sights, optima = [search.sight for search in searches], []
     for c, search in enumerate(searches):
         adjusted, found = search.other_optima(c, sights, adjusted, free)
@@ -469,7 +464,7 @@ def results(
     again = repeats(given, [r[0] for r in adjusted.residuals])
     noise = noise * math.sqrt(len(views) / (len(views) - len(again)))
     cameras, state = [], adjusted.state
-    for c, (search, pixels, own) in enumerate(zip(searches, image_points, inliers.split(len(views)), strict=True)):
+    for c, (search, own) in enumerate(zip(searches, inliers.split(len(views)), strict=True)):
         asked, one, layout = search.asked, search.given, search.layout
         copies = layout.views[again[one.seen[again].any(-1)]].tolist()
         off, has_pixel = adjusted.residuals[c][0], adjusted.valid[c][0]
@@ -488,8 +483,6 @@ def results(
             image_size=layout.image_size,
             views=tuple(layout.views.tolist()),
             copies=tuple(sorted({*layout.copies, *copies})),
-            object_points=object_points,
-            image_points=pixels,
             observations=one,
             adjusted=adjusted,
             point_inliers=own,

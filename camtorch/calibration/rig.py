@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import torch
@@ -44,9 +44,6 @@ class RigCalibration:
     """As in `Calibration`."""
     views: tuple[int, ...]
     """The numbers of the views that some camera saw, of those that were passed, without copies of others."""
-    adjusted: Adjusted = field(repr=False)
-    factor: Tensor = field(repr=False)
-    """(G, G) F: F F^T is the covariance of what all views share, of `adjusted.equations.columns`."""
 
     @property
     def residuals(self) -> dict[str, Any]:
@@ -153,7 +150,7 @@ def calibrate_rig(
     free = Free(learns, tuple(c > 0 for c in range(len(searches))), bend=bend)
     first = _joined(sights, [_alone(search) for search in searches], free)
     adjusted = searches[0].adjusted(sights, first, free, steps=STEPS, progress=told)
-    found = results(searches, adjusted, free, object_points, [image_points[name] for name in observed])
+    found = results(searches, adjusted, free)
     cameras = dict(zip(observed, found.cameras, strict=True))
     state = found.adjusted.state
     rotations, translations = (t[0] for t in state.boards)
@@ -161,24 +158,21 @@ def calibrate_rig(
         name: Extrinsics(rotation_vector(r).unsqueeze(-1), t)
         for name, r, t in zip(observed, *(t[0] for t in state.mounts), strict=True)
     }
-    factor = shared_factor(found.adjusted.equations)[0] * found.noise
     result = RigCalibration(
         rig=Rig({name: c.camera for name, c in cameras.items()}, mounts),
         boards=Extrinsics(rotation_vector(rotations).unsqueeze(-1), translations - rotations @ middle),
         rms=found.rms,
         sigma=found.sigma,
         cameras=cameras,
-        mount_std=_mount_std(found.adjusted, list(observed), factor),
+        mount_std=_mount_std(found.adjusted, list(observed), found.noise),
         converged=all(c.converged for c in found.cameras),
         bend=found.cameras[0].bend,
         views=found.cameras[0].views,
-        adjusted=found.adjusted,
-        factor=factor,
     )
     if not result.converged:
         warn(
             f"{owner}: the search did not end at an optimum (rms {result.rms:.4g} px); do not use it. See its "
-            "warnings, and whether each view was taken by all cameras at the same moment",
+            "warnings, and whether each view was taken by all cameras at the same moment"
         )
     return result
 
@@ -247,9 +241,9 @@ def _between(a: _Alone, b: _Alone) -> tuple[Tensor, Tensor]:
     return rotations[middle], translations[middle]
 
 
-def _mount_std(adjusted: Adjusted, names: list[str], factor: Tensor) -> dict[str, Tensor]:
-    """(6,) by the name of a camera; zeros for the first one."""
-    std = torch.linalg.vector_norm(factor, dim=-1)
+def _mount_std(adjusted: Adjusted, names: list[str], noise: Tensor) -> dict[str, Tensor]:
+    """Return the deviations (6,) of each camera's pose by its name; zeros for the first one."""
+    std = torch.linalg.vector_norm(shared_factor(adjusted.equations)[0] * noise, dim=-1)
     result = {name: std.new_zeros(6) for name in names}
     for value, (camera, i) in zip(std, adjusted.equations.columns, strict=True):
         count = adjusted.state.parameters[camera].shape[-1]

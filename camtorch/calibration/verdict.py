@@ -347,7 +347,7 @@ def check_determined(
         what, why = "a single view of this board leaves", ""
     raise ValueError(
         f"{owner}: {what} {_listed(open_ones or free)} undetermined{why}. Take 10 to 20 views. {_TILTED}, or hold "
-        f"parameters: {_fixed(hold)}"
+        f"parameters: fixed={tuple(hold)}"
     )
 
 
@@ -364,12 +364,6 @@ def _listed(names: Sequence[str]) -> str:
 
 def _places(zones: Sequence[Zone]) -> str:
     return _listed([f"the {zone.name}" for zone in zones])
-
-
-def _fixed(names: Sequence[str]) -> str:
-    """The argument, as one writes it."""
-    quoted = ", ".join(f'"{name}"' for name in names)
-    return f"fixed=({quoted}{',' * (len(names) == 1)})"
 
 
 def _px(value: float) -> str:

@@ -180,10 +180,8 @@ def reprojection(
             f"{owner}: pixels {tuple(pixels.shape)} of target and {tuple(found.shape)} of the points do not fit "
             "together"
         ) from None
-    valid = valid & seen
     # of a point without a pixel the distance has no gradient
-    distance = torch.linalg.vector_norm(off, dim=-1)
-    return _reduced(distance, valid, weights, reduction, owner)
+    return _reduced(torch.linalg.vector_norm(off, dim=-1), valid & seen, weights, reduction, owner)
 
 
 def _check(predicted: object, target: object, owner: str) -> torch.Size:

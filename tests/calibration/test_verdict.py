@@ -157,7 +157,7 @@ def test_a_single_view_of_a_plane(key, tilt):
     with pytest.raises(ValueError, match=words) as raised:
         found(key, corners)
     # what it says can be done
-    result = found(key, corners, fixed=re.findall(r'"(\w+)"', str(raised.value)))
+    result = found(key, corners, fixed=re.findall(r"'(\w+)'", str(raised.value)))
     one(result.warnings, r"Few views \(1\)")
 
 
