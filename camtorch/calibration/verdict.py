@@ -49,7 +49,7 @@ class Zone(NamedTuple):
     uncertainty: float
 
 
-class Survey:
+class _Survey:
     """Numbers of a calibration that sentences are made of, over a map (rows, columns) of the image."""
 
     def __init__(self, calibration: Calibration):
@@ -157,12 +157,12 @@ class Survey:
 @torch.no_grad()
 def warnings(calibration: Calibration) -> list[str]:
     """Return what the data do not carry, and what does not fit: each with what to do. Empty if all is well."""
-    survey = Survey(calibration)
+    survey = _Survey(calibration)
     finders = (_search, _residuals, _views, _loose, _twins, _coverage, _pattern)
     return [text for find in finders for text in find(survey)]
 
 
-def _search(survey: Survey) -> Iterator[str]:
+def _search(survey: _Survey) -> Iterator[str]:
     found = survey.calibration
     if lost := found.lost:
         yield (
@@ -178,7 +178,7 @@ def _search(survey: Survey) -> Iterator[str]:
         )
 
 
-def _residuals(survey: Survey) -> Iterator[str]:
+def _residuals(survey: _Survey) -> Iterator[str]:
     calibration, seen, inliers = survey.calibration, survey.seen, survey.calibration.point_inliers
     if calibration.sigma > _CORNER_NOISE * max(1.0, max(calibration.image_size) / 2000):
         yield (
@@ -212,7 +212,7 @@ def _residuals(survey: Survey) -> Iterator[str]:
         )
 
 
-def _views(survey: Survey) -> Iterator[str]:
+def _views(survey: _Survey) -> Iterator[str]:
     calibration = survey.calibration
     if calibration.copies:
         yield (
@@ -225,7 +225,7 @@ def _views(survey: Survey) -> Iterator[str]:
         yield f"Few views ({count}): a bad one has nothing to be told by. Take 10 to 20. {_TILTED}"
 
 
-def _loose(survey: Survey) -> Iterator[str]:
+def _loose(survey: _Survey) -> Iterator[str]:
     loose = survey.loose_focal
     if loose > _LOOSE_FOCAL:
         why = "Take views in which the board is near and tilted, and fills the image"
@@ -240,7 +240,7 @@ def _loose(survey: Survey) -> Iterator[str]:
         )
 
 
-def _twins(survey: Survey) -> Iterator[str]:
+def _twins(survey: _Survey) -> Iterator[str]:
     found = survey.calibration
     if found.twins:
         names = (found.parameter_names[0], *found.parameter_names[4:])
@@ -252,7 +252,7 @@ def _twins(survey: Survey) -> Iterator[str]:
         )
 
 
-def _coverage(survey: Survey) -> Iterator[str]:
+def _coverage(survey: _Survey) -> Iterator[str]:
     if missing := survey.missing:
         yield f"Few corners or none in {_places(missing)} of the image. Hold the board there, near to the edges"
     reach, end = survey.reach, survey.image_reach
@@ -270,7 +270,7 @@ def _coverage(survey: Survey) -> Iterator[str]:
         )
 
 
-def _pattern(survey: Survey) -> Iterator[str]:
+def _pattern(survey: _Survey) -> Iterator[str]:
     rms = survey.calibration.rms
     if rms > survey.rounding and (share := survey.pattern_share) > _PATTERN_SHARE:
         yield (
@@ -282,7 +282,7 @@ def _pattern(survey: Survey) -> Iterator[str]:
 @torch.no_grad()
 def verdict(calibration: Calibration) -> str:
     """Return a paragraph: what the camera is good for, up to which angle, and what to photograph next."""
-    survey = Survey(calibration)
+    survey = _Survey(calibration)
     if not calibration.converged:
         return next(_search(survey)) + "."
     middle = survey.zones[4].uncertainty

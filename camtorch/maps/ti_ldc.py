@@ -40,7 +40,8 @@ class TILDC(Table):
 
     name = "ti_ldc"
     options: tuple[str, ...] = ("step", "block", "clip")
-    step, steps = 8, tuple(1 << m for m in range(8))
+    step = 8
+    steps = tuple(1 << m for m in range(8))
 
     def encode(self, path: str, exact: Exact, options: Mapping[str, Any]) -> tuple[bytes, dict[str, Any]]:
         if "step" in options:

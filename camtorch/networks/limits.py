@@ -48,7 +48,8 @@ class Limits:
     """
 
     def __init__(self, model: type[Camera], given: Tensor):
-        self.model, self.given = model, given
+        self.model = model
+        self.given = given
         chart, lens = model.optics(columns(given))
         self.bends = len(chart.parameters) > 0
         self.is_radial = len(lens.stages) == 0 or lens.is_radial

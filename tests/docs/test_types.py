@@ -23,7 +23,7 @@ TOLERATED = (
     r"\"(findChessboardCornersSB|remap)\"",  # likewise
     r"\"Tensor \| None\" has no attribute|\"(isfinite|abs)\" is not a known attribute of \"None\"",  # torch's, of .grad
     r"parameter \"dataset\"|\"DataLoader\" has incompatible type|annotation for \"sampler\"",  # torch's, of DataLoader
-    r"webdataset|onnxruntime|h5py|\"ray|albumentations|torchvision",  # without types, or not installed
+    r"webdataset|onnxruntime|h5py|\"ray|albumentations|torchvision|tqdm|driver_monitoring",  # no types or not there
     r"\"NDArray\[float64\] \| None\"|\"allclose\"",  # pycolmap's
 )
 
