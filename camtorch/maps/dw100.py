@@ -30,7 +30,7 @@ class DW100(Table):
     name = "dw100"
     options: tuple[str, ...] = ("clip",)
     step = 16
-    steps = (16,)
+    steps: tuple[int, ...] = (16,)
 
     def pack(self, path: str, mesh: Mesh, exact: Exact, options: Mapping[str, Any]) -> tuple[bytes, dict[str, Any]]:
         """See `Table`; raise a CameraFileError for sizes and positions that the hardware does not take."""

@@ -41,7 +41,7 @@ class TILDC(Table):
     name = "ti_ldc"
     options: tuple[str, ...] = ("step", "block", "clip")
     step = 8
-    steps = tuple(1 << m for m in range(8))
+    steps: tuple[int, ...] = tuple(1 << m for m in range(8))
 
     def encode(self, path: str, exact: Exact, options: Mapping[str, Any]) -> tuple[bytes, dict[str, Any]]:
         if "step" in options:

@@ -51,8 +51,8 @@ class Limits:
         self.model = model
         self.given = given
         chart, lens = model.optics(columns(given))
-        self.bends = len(chart.parameters) > 0
-        self.is_radial = len(lens.stages) == 0 or lens.is_radial
+        self.bends: bool = len(chart.parameters) > 0
+        self.is_radial: bool = len(lens.stages) == 0 or lens.is_radial
 
     def disc(self, k: Tensor, radius: Tensor) -> Tensor:
         """Return the disc of another lens that shows, near the axis, what that of the lens given shows.

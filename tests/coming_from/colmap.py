@@ -1,6 +1,7 @@
 """The rows of the page on COLMAP."""
 
 import functools
+import re
 
 import numpy as np
 import pycolmap
@@ -70,11 +71,14 @@ def reconstruction(camera):
 def rescaled():
     camera = theirs()
     camera.rescale(80, 60)
-    return camera.params[:4]
+    return LENS.resize(60, 80).intrinsics + HALF, camera.params[:4]
 
 
-def image():
-    return reconstruction(theirs()).images[7]
+def imaged():
+    image = reconstruction(theirs()).images[7]
+    yield POSE.matrix()[:3], image.cam_from_world().matrix()
+    yield POSE.position, image.projection_center()
+    yield LENS(POSE(X))[0][0] + 0.5, image.project_point(X[0])
 
 
 def undistorted():
@@ -85,7 +89,7 @@ def undistorted():
 
 
 def posed():
-    seen = LENS(POSE(torch.from_numpy(X)))[0]
+    seen = LENS(POSE(X))[0]
     found = pycolmap.estimate_and_refine_absolute_pose(seen.numpy() + 0.5, X, theirs())
     ours = ct.solve_pnp(LENS, X, seen, threshold=2).extrinsics
     return ours.matrix()[:3], found["cam_from_world"].matrix(), 1e-6
@@ -98,12 +102,8 @@ equal("pycolmap", {
         (plane(LENS.unproject(UV - 0.5)[0]), theirs().cam_from_img(UV), 1e-7),
     ],
     "Camera.calibration_matrix": lambda: [(LENS.K + IN_K, theirs().calibration_matrix())],
-    "Camera.rescale": lambda: [(LENS.resize(60, 80).intrinsics + HALF, rescaled())],
-    "Image.cam_from_world Image.projection_center Image.project_point": lambda: [
-        (POSE.matrix()[:3], image().cam_from_world().matrix()),
-        (POSE.position, image().projection_center()),
-        (LENS(POSE(torch.from_numpy(X[0])))[0] + 0.5, image().project_point(X[0])),
-    ],
+    "Camera.rescale": lambda: [rescaled()],
+    "Image.cam_from_world Image.projection_center Image.project_point": imaged,
     "Rigid3d.matrix Rigid3d.inverse": lambda: [
         (POSE.inverse().matrix()[:3], moved().inverse().matrix()),
         (POSE.compose(SECOND).matrix()[:3], (moved() * moved(SECOND)).matrix()),
@@ -127,12 +127,11 @@ def read(tmp_path):
 
 @row("pycolmap.triangulate_point", "pycolmap.estimate_triangulation", slow=True)
 def triangulate():
-    here = ct.Extrinsics(np.zeros(3), np.zeros(3)).requires_grad_(False)
-    world = torch.from_numpy(points(20))
-    seen = torch.stack([LENS(pose)[0] for pose in (here(world), POSE(world))])
-    found, _, valid = ct.triangulate([LENS, LENS], [here, POSE], seen)
+    poses = ct.Extrinsics(np.zeros(3), np.zeros(3)).requires_grad_(False), POSE
+    seen = torch.stack([LENS(pose(X))[0] for pose in poses])
+    found, _, valid = ct.triangulate([LENS, LENS], [*poses], seen)
     assert valid.all()
-    matrices = [pose.matrix()[:3].numpy() for pose in (here, POSE)]
+    matrices = [pose.matrix()[:3].numpy() for pose in poses]
     close(found[0], pycolmap.triangulate_point(*matrices, *plane(LENS.unproject(seen)[0]).numpy()[:, 0]), 1e-6)
     robust = pycolmap.estimate_triangulation(seen[:, 0].numpy() + 0.5, [pycolmap.Rigid3d(), moved()], [theirs()] * 2)
     close(found[0], robust["xyz"], 1e-3)
@@ -156,8 +155,7 @@ for _kind, _names in MODELS.items():
 @trap
 def quaternions(tmp_path):
     reconstruction(theirs()).write_text(tmp_path)
-    line = next(line for line in (tmp_path / "images.txt").read_text().splitlines() if line.endswith("a.jpg"))
-    w, x, y, z = map(float, line.split()[1:5])
+    w, x, y, z = map(float, re.search(r"^7 (.*) 1 a.jpg$", (tmp_path / "images.txt").read_text(), re.M)[1].split()[:4])
     close(moved().rotation.quat, [x, y, z, w], 1e-9)
 
 
@@ -165,7 +163,7 @@ def quaternions(tmp_path):
 def one_focal_length(tmp_path):
     camera = lens(params=[75.0, 75.0, 80.0, 60.0, -0.1, 0.0, 0.0, 0.0]).requires_grad_()
     parametrize.register_parametrization(camera, "intrinsics", TiedFocal())
-    camera.project(torch.from_numpy(points()))[0][..., 0].sum().backward()
+    camera.project(X)[0][..., 0].sum().backward()
     torch.optim.SGD(camera.parameters(), 1e-4).step()
     assert camera.fx == camera.fy != 75.0
     parametrize.remove_parametrizations(camera, "intrinsics")
@@ -177,13 +175,11 @@ def one_focal_length(tmp_path):
 
 @trap
 def past_ninety_degrees():
-    angle = 1.7
-    beside = np.array([[np.sin(angle), 0.0, np.cos(angle)]])
+    beside = np.array([[np.sin(1.7), 0.0, np.cos(1.7)]])
     camera, ours = theirs("OPENCV_FISHEYE", FISHEYE), lens(ct.KannalaBrandt, FISHEYE)
     assert np.isnan(camera.img_from_cam(beside)).all()
     close(camera.img_from_cam(beside, check_cheirality=False), camera.img_from_cam(-beside))
-    uv, valid = ours.project(torch.from_numpy(beside))
-    assert valid
-    assert uv[0, 0] > 180
+    uv, valid = ours.project(beside)
+    assert valid & (uv[0, 0] > 180)
     close(ours.unproject(uv)[0], beside)
     assert camera.cam_ray_from_img(uv.numpy() + 0.5)[0, 2] > 0.4
