@@ -9,7 +9,9 @@ Pixels without a position get -32768, which `cv2.remap` fills by BORDER_CONSTANT
 
 from __future__ import annotations
 
+import base64
 import io
+import re
 from collections.abc import Mapping
 from typing import Any
 
@@ -18,7 +20,6 @@ import torch
 
 from camtorch.io._errors import CameraFileError
 from camtorch.io.npz import arrays_of
-from camtorch.maps.arrays import as_storage, from_storage
 from camtorch.maps.exact import Exact
 from camtorch.maps.lookup import LookupMap
 from camtorch.maps.protocol import MOST_PIXELS, SIZES, MapFormat, checked
@@ -27,6 +28,11 @@ _NOWHERE = -32768
 _LONGEST = 32766  # pixels: cv2.remap wants sides below SHRT_MAX
 _PARTS = 32  # of a pixel
 _LARGEST_ARRAY = 8 * MOST_PIXELS
+# matrices in YAML, with their data in base64
+_TYPES = {"f": "<f4", "d": "<f8", "s": "<i2", "w": "<u2", "i": "<i4", "u": "u1"}
+_LETTERS = {np.dtype(code): letter for letter, code in _TYPES.items()}
+_HEADER = 24  # bytes before the data in base64, which say the type once more
+_LINE = 76  # characters of base64 in a line
 
 
 class OpenCV(MapFormat):
@@ -51,7 +57,7 @@ class OpenCV(MapFormat):
             maps = {name: positions[..., i].astype("<f4") for i, name in enumerate(("map1", "map2"))}
         arrays = {**maps, **{name: np.array(side) for name, side in zip(SIZES[:2], exact.source_size, strict=True)}}
         if not path.lower().endswith(".npz"):
-            return as_storage(arrays), {}
+            return _as_yaml(arrays), {}
         file = io.BytesIO()
         np.savez(file, **arrays)
         return file.getvalue(), {}
@@ -61,7 +67,7 @@ class OpenCV(MapFormat):
         return content.startswith((b"PK\3\4", b"%YAML"))
 
     def decode(self, content: bytes, described: Mapping[str, Any]) -> LookupMap:
-        found = arrays_of(content, _LARGEST_ARRAY) if content.startswith(b"PK") else from_storage(content)
+        found = arrays_of(content, _LARGEST_ARRAY) if content.startswith(b"PK") else _from_yaml(content)
         arrays = {name: array for name, array in found.items() if array is not None}
         first, second = arrays["map1"], arrays["map2"]
         is_fixed = first.dtype == np.int16
@@ -75,3 +81,41 @@ class OpenCV(MapFormat):
         positions[(positions <= _NOWHERE).any(-1) | ~np.isfinite(positions).all(-1)] = np.nan
         size = checked("source_size", [int(arrays[key]) for key in SIZES[:2]])
         return LookupMap(torch.from_numpy(positions), size, "opencv_fixed" if is_fixed else "opencv", {})
+
+
+def _as_yaml(arrays: dict[str, np.ndarray]) -> bytes:
+    """Return what `cv2.FileStorage` reads: matrices as it writes them with WRITE_BASE64, and whole numbers."""
+    parts = [b"%YAML:1.0\n---\n"]
+    for key, value in arrays.items():
+        if value.ndim == 0:
+            parts.append(f"{key}: {value}\n".encode())
+            continue
+        rows, columns, channels = value.shape if value.ndim == 3 else (*value.shape, 1)
+        letter = _LETTERS[value.dtype]
+        dt = letter if channels == 1 else f'"{channels}{letter}"'
+        text = base64.b64encode(f"{channels}{letter}".ljust(_HEADER).encode() + np.ascontiguousarray(value).tobytes())
+        parts.append(f"{key}: !!opencv-matrix\n   rows: {rows}\n   cols: {columns}\n   dt: {dt}\n".encode())
+        parts.append(b"   data: !!binary |\n")
+        parts += [b"    %b\n" % text[i : i + _LINE] for i in range(0, len(text), _LINE)]
+    return b"".join(parts)
+
+
+_MATRIX = re.compile(
+    rb'^([\w.-]{1,99}): !!opencv-matrix\s{1,9}rows: (\d{1,9})\s{1,9}cols: (\d{1,9})\s{1,9}dt: "?(\d{0,3})([a-z])"?'
+    rb"\s{1,9}data: !!binary \|",
+    re.MULTILINE,
+)
+_NUMBER = re.compile(rb"^([\w.-]{1,99}): (\d{1,9})\s*$", re.MULTILINE)
+_END = re.compile(rb"^\S|\Z", re.MULTILINE)
+
+
+def _from_yaml(content: bytes) -> dict[str, np.ndarray]:
+    """Return the matrices of such a file, (rows, columns[, channels]), and the whole numbers; raise if damaged."""
+    arrays = {found[1].decode(): np.array(int(found[2])) for found in _NUMBER.finditer(content)}
+    for found in _MATRIX.finditer(content):
+        end = _END.search(content, found.end())
+        data = base64.b64decode(b"".join(content[found.end() : end and end.start()].split()), validate=True)
+        values = np.frombuffer(data, _TYPES[found[5].decode()], offset=_HEADER)
+        channels = (int(found[4]),) if found[4] else ()
+        arrays[found[1].decode()] = values.reshape(int(found[2]), int(found[3]), *channels)
+    return arrays
