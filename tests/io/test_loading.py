@@ -39,21 +39,24 @@ def test_what_editors_do_to_a_file_is_no_fault_of_it(name, start, end, tmp_path)
     assert_same(ct.load(path), ct.load(FILES / name))
 
 
+def saved(path):
+    ct.save(ct.Pinhole([500.0, 500, 320, 240]), path)
+
+
 def test_no_path(tmp_path):
-    with pytest.raises(TypeError, match="load: path must be that of a calibration file; got dict"):
-        ct.load({"K": K})
+    for call, path, error, told in (
+        (ct.load, {"K": K}, TypeError, "load: path must be that of a calibration file; got dict"),
+        (saved, None, TypeError, "save: path must be that of a calibration file; got NoneType"),
+        (ct.load, "camera\0.json", ct.CameraFileError, "path: a NUL character"),
+        (saved, "camera\0.json", ct.CameraFileError, "path: a NUL character"),
+        (ct.load, tmp_path / "nowhere.yml", FileNotFoundError, r"nowhere\.yml"),
+        (ct.load, tmp_path, ct.CameraFileError, r"folder: has none of cameras\.bin, cameras\.txt, transforms\.json"),
+    ):
+        with pytest.raises(error, match=told) as caught:
+            call(path)
+        assert str(caught.value).isprintable()
     with open(FILES / "opencv_camera.yml") as file, pytest.raises(TypeError, match=r"TextIOWrapper.*file\.name"):
         ct.load(file)
-    with pytest.raises(TypeError, match="save: path must be that of a calibration file; got NoneType"):
-        ct.save(ct.Pinhole([500.0, 500, 320, 240]), None)
-    for call in (ct.load, lambda path: ct.save(ct.Pinhole([500.0, 500, 320, 240]), path)):
-        with pytest.raises(ct.CameraFileError, match=r"path: a NUL character") as caught:
-            call("camera\0.json")
-        assert str(caught.value).isprintable()
-    with pytest.raises(FileNotFoundError, match=r"nowhere\.yml"):
-        ct.load(tmp_path / "nowhere.yml")
-    with pytest.raises(ct.CameraFileError, match=r"folder: has none of cameras\.bin, cameras\.txt, transforms\.json"):
-        ct.load(tmp_path)
 
 
 # -- NumPy archives

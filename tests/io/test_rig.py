@@ -162,27 +162,18 @@ def test_who_takes_it_for_a_camera_is_told_where_those_are():
 LENS = ct.BrownConrady([500.0, 505, 320, 240], [-0.2, 0.05, 0.001, -0.001, 0.0], image_size=(480, 640))
 
 
-def pair(first=([0.0] * 3, [0.0] * 3)):
-    poses = {"left": ct.Extrinsics(*first), "right": ct.Extrinsics([0.02, -0.05, 0.01], [-0.12, 0.005, 0.004])}
-    return ct.Rig({"left": LENS, "right": LENS}, poses).double().requires_grad_(False)
-
-
-def test_a_file_with_two_cameras_gives_a_pair_to_rectify(tmp_path):
-    rig = pair(([0.3, 0.1, -0.2], [0.5, -0.4, 0.1]))
+def test_a_file_with_two_cameras_gives_a_pair_to_rectify_whose_poses_learn(tmp_path):
+    poses = [[0.3, 0.1, -0.2], [0.5, -0.4, 0.1]], [[0.02, -0.05, 0.01], [-0.12, 0.005, 0.004]]
+    left, right = (ct.Extrinsics(*pose) for pose in poses)
+    rig = ct.Rig({"left": LENS, "right": LENS}, {"left": left, "right": right}).double()
     ct.save(rig, tmp_path / "rig.json")
     again = ct.load(tmp_path / "rig.json")
-    left, right = again
-    found = again.between(left, right)
+    found = again.between("left", "right")
     first, second = (rig.extrinsics[name].matrix() for name in rig)
     torch.testing.assert_close(found.matrix(), second @ first.inverse(), rtol=0, atol=1e-14)
-    rectified = ct.rectify(again[left], again[right], found)
+    rectified = ct.rectify(again["left"], again["right"], found)
     assert rectified.baseline.item() == pytest.approx(found.translation.norm().item(), rel=1e-14)
-
-
-def test_gradients_reach_the_poses_of_the_rig():
-    rig = pair(([0.3, 0.1, -0.2], [0.5, -0.4, 0.1])).requires_grad_(True)
-    rectification = ct.rectify(rig["left"], rig["right"], rig.between("left", "right"))
-    rectification.baseline.backward()
+    ct.rectify(LENS, LENS, rig.between("left", "right")).baseline.backward()
     for pose in rig.extrinsics.values():
         assert pose.translation.grad.norm() > 0
     assert rig.extrinsics["left"].rotation.grad.norm() > 0
