@@ -1,28 +1,32 @@
-"""One sample of arrays after another, each with its labels and its camera, by whatever moves them."""
+"""Rows and samples of arrays, moved one by one: what Ray Data's `map_batches` and WebDataset's `map` call."""
 
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import Any, TypeAlias
 
 import numpy as np
 from torch import Tensor
 
-from camtorch._arguments import as_mapping
+from camtorch._arguments import as_mapping, is_list, shown
 from camtorch.augment.augmentation import Augmentation
 from camtorch.augment.change import Part
 from camtorch.augment.face import FaceNormalizer
 from camtorch.augment.numpy import Transform
-from camtorch.augment.sample import IMAGES, KINDS, Sample, kind_of
+from camtorch.augment.sample import IMAGES, KEEP, KINDS, Sample, kind_of
 from camtorch.camera import Camera
-from camtorch.data.columns import camera_of
+from camtorch.data.columns import PARTS, camera_of, to_columns
 from camtorch.data.seeded import Key, Seeded
 from camtorch.warp.proxy import ProxyWarp
 from camtorch.warp.warp import Warp
 
+Array: TypeAlias = "np.ndarray[Any, Any]"
+Batch = dict[str, Any]
+"""Column -> an array or a list, of as many rows as all others."""
 Moves = Augmentation | FaceNormalizer | Warp
 """What moves samples."""
+_ENDINGS = ("jpg", "jpeg", "png", "webp", "ppm", "pgm", "tif", "tiff", "bmp", "npy")
 
 
 class Always(Augmentation):
@@ -125,3 +129,225 @@ def _dense(name: str, value: Any, kind: str = "") -> Any:
         if parts and all(isinstance(part, np.ndarray) and part.shape == parts[0].shape for part in parts):
             return np.stack(parts)
     return value
+
+
+class MapBatches(Mover):
+    """Augments, or warps, batches of rows: the function of Ray Data's `map_batches`, and of whatever calls like it.
+
+        rows = ray.data.read_images("images/", include_paths=True)
+        rows = rows.map_batches(ct.data.MapBatches(augment, key="path", seed=0), batch_size=32)
+
+    Columns are arrays (B, ...), or arrays of objects where rows differ in shape, and named as the fields of an
+    `Augmentation`, without its batch dim:
+
+    * `image` (B, H, W, C) or (B, H, W), channels last, usually uint8; `mask`, `depth`, `distance` likewise.
+    * `keypoints` (B, N, 2), `boxes` or `bboxes` (B, M, 4) x1 y1 x2 y2, `polygons`, in pixels with the centre of the
+      top-left one at (0, 0); `gaze` (B, 3), `head_pose` (B, 4, 4), `rvec`, `tvec`, `points`, and all others.
+    * The camera of every row as numbers, `camera_model`, `camera_intrinsics` (B, 4), `camera_distortion` (B, n) and
+      `camera_image_size` (B, 2), see `to_columns`; without them that of the augmentation, or of the warp.
+
+    They come out with their layout and dtype, coordinates of whole numbers in float32, beside `keypoints_valid` (B, N)
+    and so on, `rotation` (B, 3, 3) and the columns of the new camera, of which `from_columns` makes a batch of cameras.
+    All other columns are passed on; numbers that might be geometry have to be named in `fields`.
+
+    Every row is computed by itself, and drawn by its key: so it comes out the same to the bit, in whatever batch, block
+    or worker, and in a loop in one process.
+
+    Args:
+        transform: an augmentation, or a `Warp` or `Dewarp`.
+        key: the column that names a row for ever, of whole numbers or strings, or a list of such columns. Only what
+            draws needs it. Paths should begin at the folder of the data set where they differ between machines.
+        seed, epoch: of what is drawn.
+        fields: column -> kind, for columns of other names; "keep" passes one on as it is. See `Augmentation`.
+
+    Raises:
+        TypeError: nothing that moves samples. ValueError: no key for what draws.
+    """
+
+    def __init__(
+        self,
+        transform: Moves,
+        *,
+        key: str | Sequence[str] | None = None,
+        seed: int = 0,
+        epoch: int = 0,
+        fields: Mapping[str, str] | None = None,
+    ):
+        super().__init__(transform, seed, epoch, fields)
+        self._keys = [key] if isinstance(key, str) else list(key) if is_list(key) else []
+        if not (key is None or isinstance(key, str) or is_list(key)) or not all(isinstance(k, str) for k in self._keys):
+            raise TypeError(f"{self._owner}: key must be the name of a column, or several in a list; got {shown(key)}")
+        if self._seeded is not None and not self._keys:
+            raise ValueError(
+                f'{self._owner}: key must name the column whose value names a row, as in key="path" after '
+                "read_images(..., include_paths=True): what a row draws follows from it, and not from its place; "
+                f"got key={key!r}"
+            )
+
+    def __call__(self, batch: Mapping[str, Any]) -> Batch:
+        """A batch, moved row by row.
+
+        Raises:
+            ValueError: columns of several lengths, no column of the key, and what the augmentation raises. TypeError:
+                no dict of columns.
+        """
+        if not isinstance(batch, Mapping) or not all(hasattr(column, "__len__") for column in batch.values()):
+            kind = shown(batch) if isinstance(batch, Mapping) else type(batch).__name__
+            raise TypeError(f'{self._owner}: a batch must be a dict of arrays, as of batch_format="numpy"; got {kind}')
+        counts = {name: len(column) for name, column in batch.items()}
+        if len(set(counts.values())) > 1:
+            raise ValueError(f"{self._owner}: all columns must have as many rows; got {counts}")
+        missing = [name for name in self._keys if name not in batch]
+        if missing:
+            raise ValueError(f"{self._owner}: no column {missing[0]!r} to name the rows; there are {', '.join(batch)}")
+        count = max(counts.values(), default=0)
+        rows = [self._row({name: column[i] for name, column in batch.items()}) for i in range(count)]
+        if not rows:
+            return dict(batch)
+        names = list(dict.fromkeys(name for row in rows for name in row))
+        result = {**batch, **{name: _column([row.get(name) for row in rows]) for name in names}}
+        for name, column in batch.items():  # of one type in all blocks
+            if name in names and _is_objects(column) and not _is_objects(result[name]):
+                result[name] = _objects(list(result[name]))
+        return result
+
+    def _row(self, row: dict[str, Any]) -> Sample:
+        """What has changed in a row."""
+        values = [row.pop(name) for name in self._keys]
+        values = [value.item() if isinstance(value, np.generic) else value for value in values]
+        key: Key | None = tuple(values) if len(values) > 1 else values[0] if values else None
+        row["camera"] = {part: row.pop(f"camera_{part}") for part in PARTS if f"camera_{part}" in row} or None
+        moved = dict(self._moved(key, row))
+        camera = moved.pop("camera", None)
+        return moved if camera is None else {**moved, **to_columns(camera)}
+
+
+def _is_objects(column: Any) -> bool:
+    return isinstance(column, np.ndarray) and column.dtype == object
+
+
+def _column(values: list[Any]) -> Array:
+    """Rows as one array, of objects where their shapes or types differ."""
+    if len({(getattr(v, "shape", None), getattr(v, "dtype", type(v))) for v in values}) == 1 and values[0] is not None:
+        return np.stack(values) if isinstance(values[0], np.ndarray) else np.asarray(values)
+    return _objects(values)
+
+
+def _objects(values: list[Any]) -> Array:
+    column = np.empty(len(values), object)
+    for i, value in enumerate(values):
+        column[i] = value
+    return column
+
+
+class MapSamples(Mover):
+    """Augments, or warps, samples of a WebDataset pipeline, one by one: the function of its `.map`.
+
+        samples = wds.WebDataset("train-{00..15}.tar").decode("rgb8")
+        samples = samples.map(ct.data.MapSamples(augment, seed=0))
+
+    A sample is a dict of decoded entries:
+
+    * `jpg`, `png`, `webp` and so on: the image, a uint8 array (H, W, C) or (H, W). `mask.png`, `depth.npy`: what the
+      name says, moved as such.
+    * `json`: an object of labels, named as the fields of an `Augmentation`, of numbers in lists or arrays:
+      `keypoints` [[x, y], ...], `boxes` [[x1, y1, x2, y2], ...], `gaze` [x, y, z], `head_pose` and so on; and `camera`,
+      an object of `model`, `intrinsics`, `distortion` and `image_size`, if the transform has none.
+
+    Lists come out as lists, arrays as arrays, in the same places. `keypoints_valid` and so on, `rotation` and the new
+    `camera` join the labels, so that a `ShardWriter` can write what comes out. Everything else is passed on.
+
+    A sample is drawn by its key: it comes out the same to the bit from whatever shard, node or worker.
+
+    Args:
+        transform: an augmentation, or a `Warp` or `Dewarp`.
+        key: the entry that names a sample for ever. Where several shards hold the same keys, something that tells
+            them apart has to be put in.
+        labels: the entry of labels.
+        seed, epoch: of what is drawn.
+        fields: name -> kind, for entries and labels of other names; "keep" passes one on as it is.
+
+    Raises:
+        TypeError: nothing that moves samples.
+    """
+
+    def __init__(
+        self,
+        transform: Moves,
+        *,
+        key: str = "__key__",
+        labels: str = "json",
+        seed: int = 0,
+        epoch: int = 0,
+        fields: Mapping[str, str] | None = None,
+    ):
+        super().__init__(transform, seed, epoch, fields)
+        for name, value in (("key", key), ("labels", labels)):
+            if not isinstance(value, str):
+                raise TypeError(f"{self._owner}: {name} must name an entry of a sample; got {shown(value)}")
+        self._key, self._labels = key, labels
+
+    def __call__(self, sample: Mapping[str, Any]) -> dict[str, Any]:
+        """A sample, moved.
+
+        Raises:
+            ValueError: no key, images that are not decoded, and what the augmentation raises. TypeError: no dict.
+        """
+        owner = self._owner
+        if not isinstance(sample, Mapping):
+            raise TypeError(
+                f"{owner}: a sample must be a dict of entries, before .to_tuple; got {type(sample).__name__}"
+            )
+        if self._seeded is not None and self._key not in sample:
+            raise ValueError(f"{owner}: no {self._key!r} to name the sample; it has {', '.join(map(str, sample))}")
+        labels = sample.get(self._labels, {})
+        if not isinstance(labels, Mapping):
+            raise TypeError(
+                f"{owner}: {self._labels} must be an object of labels; got {type(labels).__name__}"
+                + (". Undecoded ones are decoded by .decode()" if isinstance(labels, bytes) else "")
+            )
+        entry_of: dict[str, str] = {}
+        for entry, value in sample.items():
+            if (field := self._field(entry, value)) is not None:
+                if field in entry_of or field in labels:
+                    raise ValueError(f"{owner}: {entry} and {entry_of.get(field, self._labels)} both hold {field}")
+                entry_of[field] = entry
+        moved = self._moved(sample.get(self._key), {**labels, **{f: sample[entry] for f, entry in entry_of.items()}})
+        result, told = dict(sample), dict(labels)
+        for name, value in moved.items():
+            if name in entry_of:
+                result[entry_of[name]] = value
+            elif name == "image_valid":
+                result[f"{name}.npy"] = value
+            elif isinstance(value, Camera):
+                told[name] = dict(zip(PARTS, map(_plain, to_columns(value).values()), strict=True))
+            else:
+                told[name] = value if isinstance(labels.get(name), np.ndarray) else _plain(value)
+        result[self._labels] = told
+        return result
+
+    def _field(self, entry: str, value: Any) -> str | None:
+        """The field that an entry holds, or None if it is passed on."""
+        owner, (stem, _, ending) = self._owner, entry.rpartition(".")
+        if entry in self._fields or entry.startswith("__") or entry in (self._key, self._labels):
+            return entry if entry in self._fields else None
+        name = stem if ending in _ENDINGS else entry
+        if not stem and ending in _ENDINGS and ending != "npy":
+            name = "image"
+        if ending in _ENDINGS and isinstance(value, (bytes, bytearray)):
+            raise ValueError(f'{owner}: {entry} is not decoded; .decode("rgb8") before .map makes arrays of images')
+        if self._moves(name or entry, value):
+            if not isinstance(value, np.ndarray):
+                raise TypeError(f"{owner}: {entry} must be a numpy array; got {type(value).__name__}")
+            return name
+        if ending in _ENDINGS and np.ndim(value) >= 2 and name not in self._fields:
+            raise ValueError(
+                f"{owner}: whether {entry} moves is not known; fields={{{entry!r}: KIND}} says so, where KIND is "
+                f"{', '.join(IMAGES)} or {KEEP}, among others"
+            )
+        return None
+
+
+def _plain(value: Any) -> Any:
+    """Of Python's own types, as JSON takes them."""
+    return value.tolist() if isinstance(value, (np.ndarray, np.generic)) else value

@@ -203,16 +203,3 @@ def test_the_command_line_knows_them(tmp_path, monkeypatch, capsys):
     assert "KannalaBrandt" in capsys.readouterr().out
     assert main(["lenses", "GoPro", "HERO99"]) == 2
     assert "the nearest are" in capsys.readouterr().err
-
-
-@pytest.mark.slow
-def test_the_command_line_draws_real_lenses(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    Image.new("RGB", (96, 64), (90, 120, 30)).save("in.png")
-    ct.save(ct.KannalaBrandt.from_fov(170, image_size=(64, 96)), "camera.json")
-    assert main(["augment", "in.png", "--camera", "camera.json", "--preset", "real", "--fov", "80,120", "-n", "2"]) == 0
-    lines = capsys.readouterr().out.splitlines()
-    widths = [float(line.split("real, ")[1].split(" degrees")[0]) for line in lines[:2]]
-    assert all(80 <= width <= 120 for width in widths)
-    assert main(["augment", "--list"]) == 0
-    assert "real         kannala_brandt" in capsys.readouterr().out

@@ -125,11 +125,10 @@ def test_what_another_decoder_reads_is_as_far_off_as_the_report_says(name, forma
     assert (again.source_size, again.target_size) == ((200, 320), (184, 312))
 
 
-@pytest.mark.parametrize("step", [8, 16])
-def test_meshes_of_a_fisheye_are_as_near_as_their_fractions_allow(step, tmp_path):
+@pytest.mark.parametrize(("format", "most"), [("ti_ldc", 0.09), ("dw100", 0.15)])
+def test_meshes_of_a_fisheye_are_as_near_as_their_fractions_allow(format, most, tmp_path):
     """The panorama of 170 degrees, the hardest: an eighth of a pixel alone is off by 0.0884."""
     warp = ct.Dewarp(fisheye(), projection="cylindrical", fov=170)
-    format, most = ("ti_ldc", 0.09) if step == 8 else ("dw100", 0.15)
     assert ct.save_map(warp, tmp_path / "map.bin", format).max_error <= most
 
 
@@ -440,10 +439,9 @@ def test_the_command_writes_a_map_and_measures_one(folder, capsys):
     assert "80x60 from 320x200" in capsys.readouterr().out
 
 
-def test_masks_stay_bool_and_integers_whole(tmp_path):
-    camera = ct.Pinhole([10.0, 10.0, 3.5, 3.5], image_size=(8, 8)).requires_grad_(False)
-    ct.save_map(ct.Warp(camera, camera), tmp_path / "map.npz")
-    found = ct.load_map(tmp_path / "map.npz")
+def test_masks_stay_bool_and_integers_whole():
+    places = torch.stack(torch.meshgrid(torch.arange(8.0), torch.arange(8.0), indexing="xy"), -1).double()
+    found = ct.LookupMap(places, (8, 8), "test", {})
     mask = torch.arange(64).reshape(1, 1, 8, 8) % 3 == 0
     assert found(mask).equal(mask)
     for dtype in (torch.uint8, torch.uint16, torch.int32, torch.int64):
