@@ -1,9 +1,8 @@
 """Every format: what the files say, and that it comes back."""
 
-import math
-
 import pytest
 import torch
+from colmap_models import from_colmap
 from rigs import FILES, MANIFEST, POINT, SAMPLES, SUFFIXES, assert_same, float64, load
 
 import camtorch as ct
@@ -72,33 +71,15 @@ def test_values_of_the_manifest(name, label, expected):
         assert torch.allclose(pixel, float64(reference[label]), rtol=0, atol=1e-9)
 
 
-COLMAP = {
-    "SIMPLE_PINHOLE": ("pinhole", 1, 0),
-    "PINHOLE": ("pinhole", 2, 0),
-    "SIMPLE_RADIAL": ("brown_conrady", 1, 3),
-    "RADIAL": ("brown_conrady", 1, 2),
-    "OPENCV": ("brown_conrady", 2, 0),
-    "FULL_OPENCV": ("brown_conrady", 2, 0),
-    "OPENCV_FISHEYE": ("kannala_brandt", 2, 0),
-    "FOV": ("fov", 2, 0),
-    "RAD_TAN_THIN_PRISM_FISHEYE": ("fisheye624", 2, 0),
-    "EUCM": ("eucm", 2, 0),
-    "SIMPLE_DIVISION": ("division", 1, 0),
-}
-
-
 @pytest.mark.parametrize("suffix", ["txt", "bin"])
 @pytest.mark.parametrize("entry", MANIFEST["cameras.txt"]["expected"], ids=lambda entry: entry["model"])
 def test_each_model_of_colmap(entry, suffix, tmp_path):
     path, name, values = tmp_path / f"cameras.{suffix}", entry["model"], entry["params"]
     (tmp_path / "one.txt").write_text(f"7 {name} {entry['width']} {entry['height']} {' '.join(map(repr, values))}\n")
-    if name == "EQUIRECTANGULAR":
-        expected = ct.Equirectangular(float64([1024 / math.pi, 1024 / math.pi, 1023.5, 511.5]), image_size=(1024, 2048))
-    else:
-        key, focals, zeros = COLMAP[name]
-        core = float64([values[0], values[focals - 1], values[focals] - 0.5, values[focals + 1] - 0.5])
-        rest = (float64(values[focals + 2 :] + [0.0] * zeros),) if len(values) > focals + 2 else ()
-        expected = ct.MODELS[key](core, *rest, image_size=(entry["height"], entry["width"]))
+    key, (fx, fy, cx, cy), distortion = from_colmap(name, values)
+    rest = (float64(distortion),) if distortion else ()
+    core, size = float64([fx, fy, cx - 0.5, cy - 0.5]), (entry["height"], entry["width"])
+    expected = ct.MODELS[key](core, *rest, image_size=size)
     rig = ct.load(tmp_path / "one.txt")
     ct.save(rig, path)
     assert_same(rig, ct.Rig({"7": expected}))

@@ -15,6 +15,7 @@ from camtorch.lenses.collection import columns
 from camtorch.lenses.drawing import lenses_for
 from camtorch.warp.boxes import along_edges
 
+COLUMNS = ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4", "height", "width", "rms_px", "readout_ms")
 SAMPLE = Path(__file__).parents[1] / "files" / "lenses.csv"
 """Some rows of the collection, as they were published, with their numbers."""
 NUMBERS = "ad94623534940b7809d22a2b41f3526d4c7fc6e703053c5101587317b8e97c0e"
@@ -37,19 +38,12 @@ def test_every_number_of_the_collection_is_there_to_the_bit():
 @pytest.mark.parametrize("row", rows(), ids=lambda row: row["index"])
 def test_an_entry_says_what_the_collection_says(row):
     lens = ct.lenses.search()[int(row["index"])]
-    assert (lens.brand, lens.body, lens.lens, lens.setting) == tuple(
-        row[n] for n in ("brand", "camera", "lens", "setting")
-    )
-    assert lens.intrinsics == tuple(float(row[n]) for n in ("fx", "fy", "cx", "cy"))
-    assert lens.distortion == tuple(float(row[f"k{i}"]) for i in range(1, 5))
-    assert lens.image_size == (int(row["height"]), int(row["width"]))
-    assert lens.rms == float(row["rms_px"])
-    assert lens.readout_ms == (float(row["readout_ms"]) if row["readout_ms"] else None)
-    assert lens.is_optical == (
-        not row["digital_lens"]
-        and float(row["fx"]) > 0
-        and all(row[n] in ("", "1", "1.0") for n in ("h_stretch", "v_stretch"))
-    )
+    texts = [row[n] for n in ("brand", "camera", "lens", "setting")]
+    numbers = [float(row[n]) if row[n] else None for n in COLUMNS]
+    assert [lens.brand, lens.body, lens.lens, lens.setting] == texts
+    assert [*lens.intrinsics, *lens.distortion, *lens.image_size, lens.rms, lens.readout_ms] == numbers
+    whole = all(row[n] in ("", "1", "1.0") for n in ("h_stretch", "v_stretch"))
+    assert lens.is_optical == (not row["digital_lens"] and float(row["fx"]) > 0 and whole)
     assert lens.name in repr(lens)
     if float(row["fx"]) < 0:
         with pytest.raises(ValueError, match="astray"):
