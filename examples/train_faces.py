@@ -33,11 +33,7 @@ TRAINING_SETS = {
     "own": "the other cameras' own images",
     "own_rays": "... and rays",
 }
-TESTS = {
-    "seen": "the same camera",
-    "mounts": "other lenses and mounts",
-    "shutter": "... and rolling shutters",
-}
+TESTS = {"seen": "the same camera", "mounts": "other lenses and mounts", "shutter": "... and rolling shutters"}
 YAW, PITCH, ROLL = 35.0, 20.0, 25.0  # degrees, wider than those of the tests: nobody knows the mounts to come
 LOOKS = 50  # steps between two looks at the tests
 Augment = Callable[[Photographs, Tensor, torch.Generator], Samples]

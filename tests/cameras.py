@@ -122,7 +122,7 @@ CALIBRATIONS = {
 
 # Cameras with one continuous derivative on the axis, and no second one
 NOT_ANALYTIC = {
-    *("f_theta", "f_theta_backward", "f_theta_backward_sheared", "f_theta_sheared", "ocamcalib", "woodscape"),
+    *("f_theta", "f_theta_backward", "f_theta_backward_sheared", "f_theta_sheared", "ocamcalib", "woodscape")
 }
 
 

@@ -22,11 +22,7 @@ _MODELS = {
     "RADIAL_FISHEYE": ("kannala_brandt", "f cx cy k1 k2", "k1 k2"),
     "OPENCV_FISHEYE": ("kannala_brandt", "fx fy cx cy k1 k2 k3 k4", "k1 k2 k3 k4"),
     "FOV": ("fov", "fx fy cx cy omega", "omega"),
-    "THIN_PRISM_FISHEYE": (
-        "thin_prism_fisheye",
-        "fx fy cx cy k1 k2 p1 p2 k3 k4 sx1 sy1",
-        "k1 k2 p1 p2 k3 k4 sx1 sy1",
-    ),
+    "THIN_PRISM_FISHEYE": ("thin_prism_fisheye", "fx fy cx cy k1 k2 p1 p2 k3 k4 sx1 sy1", "k1 k2 p1 p2 k3 k4 sx1 sy1"),
     "RAD_TAN_THIN_PRISM_FISHEYE": (
         "fisheye624",
         "fx fy cx cy k0 k1 k2 k3 k4 k5 p0 p1 s0 s1 s2 s3",

@@ -62,14 +62,7 @@ class Drawing:
         )
 
     def text(
-        self,
-        at: Point,
-        text: str,
-        colour: str = INK,
-        size: int = 26,
-        *,
-        anchor: str = "start",
-        bold: bool = False,
+        self, at: Point, text: str, colour: str = INK, size: int = 26, *, anchor: str = "start", bold: bool = False
     ) -> None:
         """A line of text that begins, has its middle, or ends ("start", "middle", "end") on a baseline."""
         weight = ' font-weight="bold"' if bold else ""

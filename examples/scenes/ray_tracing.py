@@ -175,13 +175,7 @@ def _under_head(p: Planes, normal: Tensor, scene: Scene, k: Tensor) -> Tensor:
 
 
 def _lit(
-    albedo: Tensor,
-    normal: Tensor,
-    shade: Tensor,
-    ray: Planes,
-    scene: Scene,
-    k: Tensor,
-    gloss: Tensor | float,
+    albedo: Tensor, normal: Tensor, shade: Tensor, ray: Planes, scene: Scene, k: Tensor, gloss: Tensor | float
 ) -> Tensor:
     """(3, N): light from points: the sun through the windscreen, sky through the side windows, soft light around."""
     n = normal

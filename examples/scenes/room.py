@@ -181,12 +181,7 @@ def visible(points: Tensor) -> Tensor:
 
 
 def render(
-    camera: Camera,
-    rotation: Tensor | None = None,
-    *,
-    place: Place = _MIDDLE,
-    samples: int = 12,
-    rough: bool = False,
+    camera: Camera, rotation: Tensor | None = None, *, place: Place = _MIDDLE, samples: int = 12, rough: bool = False
 ) -> Tensor:
     """The image (3, H, W) in [0, 1] that a camera takes of the room; black where it has no rays.
 

@@ -22,7 +22,7 @@ import torch
 
 import camtorch as ct
 
-ROOMS = (
+ROOMS = [
     "augment",
     "augment.kornia",
     "augment.numpy",
@@ -35,7 +35,7 @@ ROOMS = (
     "optics",
     "plot",
     "views",
-)
+]
 FRONT_ENDS = ("augment.albumentations", "augment.torchvision")
 """These are read as text, because the libraries that they need may not be installed."""
 
@@ -57,15 +57,14 @@ def keywords(function):
             parameters = inspect.signature(maker).parameters.values()
         except (TypeError, ValueError):
             break
-        kinds = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
-        names += [p.name for p in parameters if p.kind in kinds and p.name not in ("self", "cls")]
-        rest = next((p for p in parameters if p.kind == inspect.Parameter.VAR_KEYWORD), None)
+        names += [p.name for p in parameters if p.kind in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY)]
+        rest = next((p for p in parameters if p.kind == p.VAR_KEYWORD), None)
         options = unpacked(str(rest.annotation), inspect.unwrap(maker)) if rest else []
         names += options
         if options or rest is None:
             break
     inherited = {"ranges"} if len(makers) > 1 and "ranges" not in inspect.signature(makers[0]).parameters else set()
-    return sorted({name for name in names if not name.startswith("_")} - inherited)
+    return public({*names} - inherited - {"self", "cls"})
 
 
 def unpacked(annotation, function):
@@ -130,16 +129,15 @@ def of_front_ends():
             if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
                 name = f"ct.{room}.{node.name}"
                 yield name
-                for made in node.body:
-                    if isinstance(made, ast.FunctionDef) and made.name == "__init__":
-                        words = [word.arg for word in (*made.args.args[1:], *made.args.kwonlyargs)]
-                        yield from (f"{name}({word}=)" for word in words)
+                makers = [made.args for made in node.body if getattr(made, "name", "") == "__init__"]
+                words = [word.arg for maker in makers for word in (*maker.args[1:], *maker.kwonlyargs)]
+                yield from (f"{name}({word}=)" for word in words)
 
 
 def of_commands():
     from camtorch.cli.main import make_parser
 
-    (commands,) = (a for a in make_parser()._actions if isinstance(a, argparse._SubParsersAction))
+    (commands,) = (action for action in make_parser()._actions if isinstance(action, argparse._SubParsersAction))
     for command, parser in commands.choices.items():
         yield f"camtorch {command}"
         for action in parser._actions:
@@ -165,10 +163,8 @@ def of_formats():
 
 def of_extras():
     text = (Path(__file__).parents[2] / "pyproject.toml").read_text("utf-8")
-    extras = re.findall(
-        r"^([\w-]+) = \[", text.partition("[project.optional-dependencies]")[2].partition("\n[")[0], re.M
-    )
-    yield from (f"camtorch[{name}]" for name in extras if not name.endswith("test"))
+    extras = text.partition("[project.optional-dependencies]")[2].partition("\n[")[0]
+    yield from (f"camtorch[{name}]" for name in re.findall(r"^([\w-]+) = \[", extras, re.M) if name[-4:] != "test")
 
 
 def names():

@@ -20,10 +20,7 @@ def python(code, *words, expect=0):
     return done.stdout + done.stderr
 
 
-@pytest.mark.parametrize(
-    "words",
-    [["--version"], ["dewarp", "--help"], ["dewarp", "--fov", "x"]],
-)
+@pytest.mark.parametrize("words", [["--version"], ["dewarp", "--help"], ["dewarp", "--fov", "x"]])
 def test_the_command_answers_without_torch(words):
     code = """
 import sys

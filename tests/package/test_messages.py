@@ -48,11 +48,7 @@ WRONG = [
     (lambda: ct.Pinhole([9.0] * 4, image_size=EYE), TypeError, r"\(height, width\); got ndarray of shape \(3, 3\)"),
     (lambda: ct.Extrinsics(0, 0, 1), TypeError, r"It takes ct.Extrinsics\(\[rx, ry, rz\], \[tx, ty, tz\]\)"),
     (lambda: CAMERA.resize((12, 16)), TypeError, r"It takes camera.resize\(height, width\), two numbers"),
-    (
-        lambda: ct.Splined(np.ones(4), HOLED),
-        ValueError,
-        r"1 of 160 numbers are not, first distortion\[7\] = nan$",
-    ),
+    (lambda: ct.Splined(np.ones(4), HOLED), ValueError, r"1 of 160 numbers are not, first distortion\[7\] = nan$"),
     (lambda: ct.Camera.from_fov(90, image_size=SIZE), TypeError, r"ct.MODELS has all models"),
     (lambda: BOX_CROP(image=IMAGES[0], boxes=[[3.0, 4, 9, 9]]), TypeError, r"as torch.tensor\(numbers\); a list has a"),
     (lambda: MOUNT(image=IMAGES[0], keypoint=torch.ones(3, 2)), ValueError, r"real numbers.* Did you mean 'keypoints'"),
