@@ -1,9 +1,7 @@
 """Laws of Warp: images, labels and derivatives move together."""
 
-import copy
 import itertools
 import math
-import pickle
 
 import pytest
 import torch
@@ -63,21 +61,17 @@ def test_a_pinhole_turned_is_a_homography():
 
 def test_boxes_enclose_the_curved_outline():
     # a source that bends straight edges outwards: the corners alone would cut the box off
-    warp = ct.Warp(
-        ct.Pinhole(torch.tensor([300.0, 300, 320, 240], dtype=torch.float64), image_size=(480, 640)),
-        ct.KannalaBrandt(torch.tensor([300.0, 300, 320, 240], dtype=torch.float64), image_size=(480, 640)),
-    )
+    numbers = torch.tensor([300.0, 300, 320, 240], dtype=torch.float64)
+    warp = ct.Warp(*(model(numbers, image_size=(480, 640)) for model in (ct.Pinhole, ct.KannalaBrandt)))
     box = torch.tensor([[100.0, 20.0, 540.0, 460.0]], dtype=torch.float64)
     moved, valid = warp.transform_boxes(box)
     assert valid.all()
-    fine = torch.linspace(0, 1, 5001, dtype=torch.float64)
-    x, y = 100 + 440 * fine, 20 + 440 * fine
-    sides = [(x, 20 + 0 * x), (x, 460 + 0 * x), (100 + 0 * y, y), (540 + 0 * y, y)]
-    outline, _ = warp.transform_points(torch.cat([torch.stack(side, -1) for side in sides]))
+    outline, _ = warp.transform_points(ct.augment.outlines(box, 5000)[0])
     expected = torch.cat((outline.amin(0), outline.amax(0)))
     torch.testing.assert_close(moved[0], expected, atol=0.03, rtol=0)
-    corners, _ = warp.transform_points(torch.stack((x[[0, -1]], y[[0, -1]]), -1))
-    assert moved[0, 0] < corners[0, 0] - 1  # the corners would miss more than a pixel
+    assert moved[0, 0] < warp.transform_points(box[:, :2])[0][0, 0] - 1  # the corners would miss more than a pixel
+    assert [tuple(result.shape) for result in warp.transform_boxes(torch.zeros(0, 4))] == [(0, 4), (0,)]
+    assert warp.transform_points(torch.zeros(0, 2))[0].shape == (0, 2)
 
 
 def test_boxes_with_their_corners_out_of_order_are_invalid():
@@ -220,30 +214,21 @@ def test_bicubic_overshoot_stays_in_the_range_of_integers():
 
 
 def test_the_grid_is_kept_until_something_changes():
-    warp = ct.Warp(fisheye(), pinhole()).requires_grad_(False)
-    first = warp.grid()
-    warp.grid().zero_()
-    warp.valid_mask().zero_()
+    rotation, straight = turn(30), ct.Warp(fisheye(), pinhole()).requires_grad_(False)
+    warp = ct.Warp(fisheye(), pinhole(), rotation).requires_grad_(False)
+    first, turned = straight.grid(), warp.grid()
+    rotation.copy_(rotation.T.clone())
+    assert torch.equal(warp.grid(), turned)  # plain values are copied
+    warp.rotation = None
     assert torch.equal(warp.grid(), first)
-    assert warp.valid_mask().any()
-    warp.source.intrinsics.data.add_(1.0)
-    second = warp.grid()
-    assert not torch.equal(second, first)
     warp.source.intrinsics.requires_grad_(True)
     assert warp.grid().requires_grad
-    warp.load_state_dict(ct.Warp(fisheye(), pinhole()).state_dict(), strict=True)
+    warp.source.intrinsics.data.add_(1.0)
+    warp.load_state_dict(straight.state_dict(), strict=True)
     with torch.no_grad():
         assert torch.equal(warp.grid(), first)
-    rotation = turn(30)
-    turned = ct.Warp(fisheye(), pinhole(), rotation).requires_grad_(False)
-    before = turned.grid()
-    rotation.copy_(rotation.T.clone())
-    assert torch.equal(turned.grid(), before)  # plain values are copied
-    turned.rotation = None
-    assert not torch.equal(turned.grid(), before)
-    assert torch.equal(turned.grid(), first)
-    turned.target = ct.Equirectangular([30.0, 30.0, 31.5, 23.5], image_size=SIZE).requires_grad_(False)
-    assert not torch.equal(turned.grid(), first)
+    warp.target = ct.Equirectangular([30.0, 30.0, 31.5, 23.5], image_size=SIZE).requires_grad_(False)
+    assert not torch.equal(warp.grid(), first)
 
 
 def test_a_grid_kept_from_inference_mode_serves_training():
@@ -253,37 +238,6 @@ def test_a_grid_kept_from_inference_mode_serves_training():
     images = smooth(dtype=torch.float32).requires_grad_()
     warp(images).sum().backward()
     assert images.grad.abs().sum() > 0
-
-
-def test_copies_pickles_and_transforms():
-    rotation = torch.nn.Parameter(turn(5))
-    warp = ct.Warp(fisheye(), pinhole(), rotation)
-    images = smooth(dtype=torch.float32)
-    expected = warp(images)
-    for copied in (copy.deepcopy(warp), pickle.loads(pickle.dumps(warp))):
-        assert torch.equal(copied(images), expected)
-    state = dict(warp.named_parameters())
-    assert set(state) == {"rotation", "source.intrinsics", "source.distortion", "target.intrinsics"}
-    again = torch.func.functional_call(warp, {"source.intrinsics": state["source.intrinsics"] + 1}, (images,))
-    assert not torch.equal(again, expected)
-    many = torch.func.vmap(
-        lambda k: torch.func.functional_call(warp, {"source.intrinsics": k}, (images,)),
-    )(torch.stack([state["source.intrinsics"]] * 2))
-    torch.testing.assert_close(many[1], expected, atol=1e-5, rtol=0)
-    forward = torch.func.jacfwd(lambda k: torch.func.functional_call(warp, {"source.intrinsics": k}, (images,)).sum())
-    reverse = torch.func.jacrev(lambda k: torch.func.functional_call(warp, {"source.intrinsics": k}, (images,)).sum())
-    torch.testing.assert_close(
-        forward(state["source.intrinsics"]), reverse(state["source.intrinsics"]), atol=1e-2, rtol=1e-3
-    )
-
-
-def test_empty_batches_and_no_points():
-    warp = ct.Warp(fisheye(), pinhole())
-    assert warp(torch.zeros(0, 3, *SIZE)).shape == (0, 3, *SIZE)
-    assert warp.transform_points(torch.zeros(0, 2))[0].shape == (0, 2)
-    boxes, valid = warp.transform_boxes(torch.zeros(0, 4))
-    assert boxes.shape == (0, 4)
-    assert valid.shape == (0,)
 
 
 @pytest.mark.slow
@@ -334,3 +288,19 @@ def test_a_box_about_a_pole_encloses_it():
     assert valid
     assert boxes[1] <= 0
     assert boxes[2] - boxes[0] > 600
+
+
+def test_transforms_of_functions():
+    warp = ct.Warp(fisheye(), pinhole(), torch.nn.Parameter(turn(5)))
+    images, state = smooth(dtype=torch.float32), dict(warp.named_parameters())
+    assert set(state) == {"rotation", "source.intrinsics", "source.distortion", "target.intrinsics"}
+    k = state["source.intrinsics"]
+
+    def made(k):
+        return torch.func.functional_call(warp, {"source.intrinsics": k}, (images,))
+
+    expected = warp(images)
+    assert not torch.equal(made(k + 1), expected)
+    torch.testing.assert_close(torch.func.vmap(made)(torch.stack((k, k)))[1], expected, atol=1e-5, rtol=0)
+    forward, reverse = (jacobian(lambda k: made(k).sum())(k) for jacobian in (torch.func.jacfwd, torch.func.jacrev))
+    torch.testing.assert_close(forward, reverse, atol=1e-2, rtol=1e-3)
