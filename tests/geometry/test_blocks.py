@@ -80,15 +80,13 @@ def test_bytes_kept_for_backward(key, method, limit):
 @pytest.mark.parametrize("end", [20, 179])
 def test_few_points_of_a_learning_camera(key, dtype, end):
     learning = spread(key, dtype)
-    frozen = learning.detach()
-    rays = fan(end, 20, 12).to(dtype)
-    (expected, valid), (pixels, found) = (camera.project(rays) for camera in (frozen, learning))
-    assert torch.equal(found, valid)
-    assert torch.equal(pixels, expected)
-    values = expected[valid] if end < 90 else pixel_lattice(frozen, 20, 30).to(dtype) * 1.5 - 100
-    (expected, valid), (rays, found) = (camera.unproject(values) for camera in (frozen, learning))
-    assert torch.equal(found, valid)
-    torch.testing.assert_close(rays, expected, rtol=0, atol=200 * torch.finfo(dtype).eps)
+    frozen, rays = learning.detach(), fan(end, 20, 12).to(dtype)
+    pixels, valid = frozen.project(rays)
+    values = pixels[valid] if end < 90 else pixel_lattice(frozen, 20, 30).to(dtype) * 1.5 - 100
+    for method, some, atol in (("project", rays, 0), ("unproject", values, 200 * torch.finfo(dtype).eps)):
+        (expected, valid), (result, found) = (getattr(camera, method)(some) for camera in (frozen, learning))
+        assert torch.equal(found, valid)
+        torch.testing.assert_close(result, expected, rtol=0, atol=atol)
 
 
 @pytest.mark.parametrize("key", RARE_ARE_SLOW)

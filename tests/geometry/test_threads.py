@@ -1,11 +1,13 @@
 """Threads: who shares work, what comes of errors, forks and several callers, and that results do not depend on it."""
 
+import contextlib
 import signal
 import subprocess
 import sys
 import threading
 import time
 from collections import deque
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 import torch
@@ -56,63 +58,58 @@ def test_workers_are_kept():
     assert threading.active_count() == before
 
 
-def test_what_has_begun_is_waited_for():
-    ended, begun = [], threading.Event()
-    caller = threading.get_ident()
-
-    def work():
-        if threading.get_ident() == caller:
-            begun.wait(10)
-            return
-        begun.set()
-        time.sleep(0.05)
-        ended.append(1)
-
-    spread(work, 2)
-    assert ended == [1]
-
-
-@pytest.mark.parametrize("where", ["caller", "worker"])
-def test_an_error_reaches_the_caller(where):
-    caller, begun = threading.get_ident(), threading.Event()
-
-    def work():
-        here = "caller" if threading.get_ident() == caller else "worker"
-        if here == "worker":
-            begun.set()
-        begun.wait(10)
-        if here == where:
-            raise ZeroDivisionError(here)
-
-    with pytest.raises(ZeroDivisionError, match=where):
-        spread(work, 2)
-    test_all_threads_share_the_work(2)
-
-
 @pytest.mark.skipif(not hasattr(signal, "pthread_kill"), reason="signals of threads")
-def test_an_interruption_waits_for_workers():
-    """They write into memory that the caller keeps alive."""
-    caller, begun, ended = threading.main_thread().ident, threading.Event(), []
+@pytest.mark.parametrize("interrupted", [False, True])
+def test_what_has_begun_is_waited_for(interrupted):
+    """Workers write into memory that the caller keeps alive."""
+    caller, ended = threading.main_thread().ident, []
     if threading.get_ident() != caller:
         pytest.skip("signals reach the main thread only")
 
-    def work():
-        if threading.get_ident() == caller:
-            begun.wait(10)
-            return
-        begun.set()
+    def of_worker():
         time.sleep(0.05)  # the caller waits by now
-        signal.pthread_kill(caller, signal.SIGINT)
-        time.sleep(0.05)
+        if interrupted:
+            signal.pthread_kill(caller, signal.SIGINT)
+            time.sleep(0.05)
         ended.append(1)
 
     usual = signal.signal(signal.SIGINT, signal.default_int_handler)  # what runs in the background ignores it
     try:
-        with pytest.raises(KeyboardInterrupt):
-            spread(work, 2)
+        with pytest.raises(KeyboardInterrupt) if interrupted else contextlib.nullcontext():
+            spread(work_of_two(nothing, of_worker), 2)
     finally:
         signal.signal(signal.SIGINT, usual)
     assert ended == [1]
+
+
+def work_of_two(of_caller, of_worker):
+    """Work of two threads: each does its part once the worker has begun."""
+    caller, begun = threading.get_ident(), threading.Event()
+
+    def work():
+        if threading.get_ident() == caller:
+            begun.wait(10)
+            of_caller()
+        else:
+            begun.set()
+            of_worker()
+
+    return work
+
+
+def fail():
+    raise ZeroDivisionError
+
+
+def nothing():
+    pass
+
+
+@pytest.mark.parametrize("parts", [(fail, nothing), (nothing, fail)], ids=["caller", "worker"])
+def test_an_error_reaches_the_caller(parts):
+    with pytest.raises(ZeroDivisionError):
+        spread(work_of_two(*parts), 2)
+    test_all_threads_share_the_work(2)
 
 
 def test_work_that_spreads_itself():
@@ -121,11 +118,8 @@ def test_work_that_spreads_itself():
 
     def work():
         while left:
-            try:
-                pieces = left.popleft()
-            except IndexError:
-                return
-            spread(pieces, 2)
+            with contextlib.suppress(IndexError):
+                spread(left.popleft(), 2)
 
     spread(work, 2)
     assert all(sorted(pieces.done) == list(range(10)) for pieces in inner)
@@ -134,24 +128,22 @@ def test_work_that_spreads_itself():
 # -- the threads of torch
 
 
-can_limit = pytest.mark.skipif(_threads._limits is None, reason="torch's threads are not OpenMP's")
-
-
-@pytest.fixture
-def three_threads():
+@contextlib.contextmanager
+def torch_threads(count):
     before = torch.get_num_threads()
-    torch.set_num_threads(3)
+    torch.set_num_threads(count)
     yield
     torch.set_num_threads(before)
 
 
-@can_limit
-@pytest.mark.usefixtures("three_threads")
+@pytest.mark.skipif(_threads._limits is None, reason="torch's threads are not OpenMP's")
 def test_this_thread_alone_is_limited_and_to_the_end_of_the_function():
     seen = []
 
     def look():
         seen.append((torch.get_num_threads(), _threads.thread_count()))
+
+    inner = _threads.on_one_thread(look)
 
     @_threads.on_one_thread
     def outer():
@@ -162,11 +154,11 @@ def test_this_thread_alone_is_limited_and_to_the_end_of_the_function():
         other.join()
         raise ZeroDivisionError
 
-    inner = _threads.on_one_thread(look)
-    for _ in range(2):
-        with pytest.raises(ZeroDivisionError):
-            outer()
-        look()
+    with torch_threads(3):
+        for _ in range(2):
+            with pytest.raises(ZeroDivisionError):
+                outer()
+            look()
     assert seen == 2 * [(1, 3), (1, 3), (3, 3), (3, 3)]
 
 
@@ -178,29 +170,20 @@ def test_results_do_not_depend_on_threads(key, method):
     values = torch.randn(count, 3, generator=generator) + torch.tensor([0.0, 0, 1.5])
     if method == "unproject":
         values = camera.project(values)[0].detach()
-    found, before = [], torch.get_num_threads()
-    try:
-        for threads in (1, 3):
-            torch.set_num_threads(threads)
+    found = []
+    for threads in (1, 3):
+        with torch_threads(threads):
             found.append(everything(camera, method, values))
-    finally:
-        torch.set_num_threads(before)
-    for result, expected in zip(*found, strict=True):
-        assert torch.equal(result, expected)
+    assert all(torch.equal(result, expected) for result, expected in zip(*found, strict=True))
 
 
 def test_several_threads_use_one_camera():
     camera = one("fisheye624").float()
     points = torch.randn(50_000, 3, generator=torch.Generator().manual_seed(0))
     expected = ct.Fisheye624(camera.intrinsics.detach(), camera.distortion.detach()).project(points)
-    found = []
-    callers = [threading.Thread(target=lambda: found.append(camera.project(points))) for _ in range(4)]
-    for caller in callers:
-        caller.start()
-    for caller in callers:
-        caller.join()
-    assert len(found) == 4
-    assert all(torch.equal(a, b) for results in found for a, b in zip(results, expected, strict=True))
+    with ThreadPoolExecutor(4) as callers:
+        for results in callers.map(camera.project, [points] * 4):
+            assert all(torch.equal(a, b) for a, b in zip(results, expected, strict=True))
 
 
 def test_threads_end_before_the_interpreter():
