@@ -108,11 +108,7 @@ def test_there_and_back():
     transform = ct.augment.numpy.Transform(ct.augment.RandomMount(), camera())
     out = transform(image=image, keypoints=points[:2], gaze=[0.0, 0.6, -0.8])
     back = transform.inverse(**out)
-    for name, value, atol in (
-        ("keypoints", points[:2], 1e-3),
-        ("gaze", [0, 0.6, -0.8], 1e-6),
-        ("rotation", np.eye(3), 1e-6),
-    ):
+    for name, value in (("keypoints", points[:2]), ("gaze", [0, 0.6, -0.8]), ("rotation", np.eye(3))):
         np.testing.assert_allclose(back[name], value, atol=1e-3 if name == "keypoints" else 1e-6)
     draw = transform.augmentation.draw(1, torch.Generator().manual_seed(5))
     moved = transform(keypoints=points, generator=torch.Generator().manual_seed(5))["keypoints"]
