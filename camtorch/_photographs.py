@@ -21,16 +21,17 @@ from camtorch._arguments import warn
 ORIENTATION = 0x0112  # the Exif tag, also of TIFF
 _WIDTH, _HEIGHT = 256, 257  # tags of TIFF
 _DEEP = ("I;16", "I;16B", "I;16L", "I;16N", "I")
-_TURN = Image.Transpose
-_BACK = {
-    2: _TURN.FLIP_LEFT_RIGHT,
-    3: _TURN.ROTATE_180,
-    4: _TURN.FLIP_TOP_BOTTOM,
-    5: _TURN.TRANSPOSE,
-    6: _TURN.ROTATE_90,
-    7: _TURN.TRANSVERSE,
-    8: _TURN.ROTATE_270,
-}
+_T = Image.Transpose
+_TURNS = (
+    _T.FLIP_LEFT_RIGHT,
+    _T.ROTATE_180,
+    _T.FLIP_TOP_BOTTOM,
+    _T.TRANSPOSE,
+    _T.ROTATE_90,
+    _T.TRANSVERSE,
+    _T.ROTATE_270,
+)
+_BACK = dict(enumerate(_TURNS, 2))
 """By orientation, what undoes the turn."""
 
 
@@ -61,12 +62,9 @@ def size_of(path: Path) -> tuple[int, int] | None:
 def read_stored(path: Path) -> tuple[Tensor, int | None]:
     """Read an image as it is stored, and its Exif orientation, by which it is not turned.
 
-    It warns of what is left out: the lower bits of deep colours, which Pillow does not read, and all images but the
-    first.
-
-    Returns:
-        (C, H, W) uint8 with C = 1 grey, 2 grey and alpha, 3 RGB or 4 RGBA; or (1, H, W) uint16 for deep grey images.
-        Other kinds of image (palette, CMYK, ...) come as RGB or RGBA.
+    Pixels are (C, H, W) uint8 with C = 1 grey, 2 grey and alpha, 3 RGB or 4 RGBA, also of other kinds (palette, CMYK);
+    or (1, H, W) uint16 of deep grey images. It warns of what is left out: the lower bits of deep colours, which Pillow
+    does not read, and all images but the first.
 
     Raises:
         ImageFileError: If there is no such file, no image, a damaged one, floating-point pixels, or more than 16 bits.
@@ -85,15 +83,13 @@ def read_stored(path: Path) -> tuple[Tensor, int | None]:
             raise ImageFileError(f"{path}: floating-point pixels; 8-bit and 16-bit images can be read")
         if image.mode in _DEEP:
             deep = np.asarray(image)
-            low, high = int(deep.min()), int(deep.max())
+            low, high = deep.min(), deep.max()
             if low < 0 or high > 65535:
                 raise ImageFileError(f"{path}: pixels from {low} to {high}; 8-bit and 16-bit images can be read")
             return torch.from_numpy(deep.astype(np.uint16))[None], orientation
-        clear = "transparency" in image.info or image.mode in ("PA", "RGBa", "La")
-        if clear or image.mode not in ("L", "LA", "RGB", "RGBA"):
-            colours = "L" if image.mode in ("1", "L", "La") else "RGB"
-            image = image.convert(colours + "A" if clear else colours)
-        pixels = torch.from_numpy(np.array(image))
+        clear = "transparency" in image.info or image.mode in ("LA", "PA", "RGBA", "RGBa", "La")
+        kind = ("L" if image.mode in ("1", "L", "LA", "La") else "RGB") + ("A" if clear else "")
+        pixels = torch.from_numpy(np.array(image if image.mode == kind else image.convert(kind)))
     return (pixels[None] if pixels.ndim == 2 else pixels.permute(2, 0, 1)), orientation
 
 

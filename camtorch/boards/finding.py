@@ -21,7 +21,8 @@ from camtorch.boards.boards import Board, as_board, opencv
 from camtorch.boards.detection import detect
 
 _OWNER = "find_board"
-_IMAGES = frozenset({".bmp", ".jpeg", ".jpg", ".pgm", ".png", ".ppm", ".tif", ".tiff", ".webp"})
+IMAGES = frozenset({".bmp", ".jpeg", ".jpg", ".pgm", ".png", ".ppm", ".tif", ".tiff", ".webp"})
+"""Suffixes, in lower case, of images in folders, and of those that are written."""
 _NAMED = 6  # images left out, in the warning
 _RGB = 0.299, 0.587, 0.114
 _EITHER_WAY = 0.2065, 0.587, 0.2065  # of RGB or BGR: boards are black and white
@@ -147,7 +148,7 @@ def gather(words: Iterable[str]) -> list[Path]:
     for word in words:
         path = Path(word)
         if path.is_dir():
-            paths = [p for p in path.iterdir() if p.suffix.lower() in _IMAGES and p.is_file()]
+            paths = [p for p in path.iterdir() if p.suffix.lower() in IMAGES and p.is_file()]
             if not paths:
                 raise ValueError(f"{word}: a folder without images")
         elif os.path.lexists(word) or not glob.has_magic(word):

@@ -24,15 +24,10 @@ Size = tuple[int, int]
 def read_rig(
     path: Path, name: str | None = None, model: str | None = None, size: Size | None = None, *, stated: bool = False
 ) -> Rig:
-    """Read the cameras of a file.
+    """Read the cameras of a file, of `LENS` and the name of a real lens, or of `GUESS` and a field of view.
 
-    Args:
-        path: A file of any format; `LENS` and the name of a real lens, best one of the aspect ratio of `size`; or
-            `GUESS` and a field of view of images of `size`.
-        name: The only camera wanted.
-        model: A key of `camtorch.MODELS`, for OpenCV's files, which may not state it.
-        size: For cameras whose file does not state it.
-        stated: Whether a file that leaves the model open is refused, rather than read as the usual one.
+    `name` is the only camera wanted; `model` is of OpenCV's files, which may not state it; `size` is for cameras whose
+    file does not state it. If `stated`, a file that leaves the model open is refused.
 
     Raises:
         CameraFileError: If the file cannot be used. ValueError: If no camera has that name, or one is of another size;
@@ -87,17 +82,6 @@ def _leaves_open(path: Path) -> bool:
     return any(issubclass(warning.category, opencv.AmbiguousModelWarning) for warning in caught)
 
 
-def _one(path: Path, rig: Rig, name: str | None = None) -> Camera:
-    """Return the camera of that name, or the only one."""
-    if name is None and len(rig.cameras) > 1:
-        raise ValueError(f"{path}: several cameras; --name says which: {', '.join(rig.cameras)}")
-    name = next(iter(rig.cameras)) if name is None else name
-    camera = rig.camera_of(name)
-    if camera.batch_shape:
-        raise ValueError(f"{path}: {name} is a batch of {tuple(camera.batch_shape)} cameras; here one is needed")
-    return camera
-
-
 def read_camera(path: Path, name: str | None = None, model: str | None = None, size: Size | None = None) -> Camera:
     """Read the one camera of a file, or the one of that name; see `read_rig`."""
     return _one(path, read_rig(path, name, model, size))
@@ -109,15 +93,24 @@ def read_other(path: Path, name: str | None = None, model: str | None = None) ->
     return _one(path, rig, None if len(rig.cameras) == 1 else name)
 
 
+def _one(path: Path, rig: Rig, name: str | None = None) -> Camera:
+    """Return the camera of that name, or the only one."""
+    if name is None and len(rig.cameras) > 1:
+        raise ValueError(f"{path}: several cameras; --name says which: {', '.join(rig.cameras)}")
+    name = name or next(iter(rig.cameras))
+    camera = rig.camera_of(name)
+    if camera.batch_shape:
+        raise ValueError(f"{path}: {name} is a batch of {tuple(camera.batch_shape)} cameras; here one is needed")
+    return camera
+
+
 def read_for_images(
     images: Sequence[Path], size_of: Callable[[Path], Size | None], arguments: argparse.Namespace
 ) -> Camera:
     """Read the camera that took images, by the options `--camera`, `--lens` or `--guess-fov`; see `fitting`.
 
-    If its file states no size, it is for the first image that has one, for which a lens is chosen, or guessed, too.
-
-    Raises:
-        ValueError: As `read_camera`; if no file is given; if it fits none of the images.
+    If its file states no size, it is for the first image that has one, for which a lens is chosen, or guessed, too. A
+    camera that fits none of the images is an error.
     """
     path: Path | None = arguments.camera
     sized = ((image, size) for image in images if (size := size_of(image)))

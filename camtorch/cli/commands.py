@@ -43,22 +43,20 @@ def _dewarp(commands: Commands) -> None:
         "folder: camtorch dewarp images/ --camera camera.yml -o straight/",
     )
     add = command.add_argument
-    text = "the image; or images, videos, folders, quoted patterns"
-    add("image", type=words.raw_path, nargs="+", metavar="IMAGE", help=text)
+    add("image", type=words.raw_path, nargs="+", metavar="IMAGE", help="images, videos, folders, quoted patterns")
     _projection(add)
     _photograph(command)
-    text = "the new image, dewarped.png by default; OUT/, a folder, where there are several"
+    text = "the new image, dewarped.png by default; OUT/, a folder, for several"
     add("-o", "--output", type=words.raw_path, metavar="OUT", help=text)
     if_there = command.add_mutually_exclusive_group().add_argument
     _force(if_there)
     if_there("--resume", action="store_true", help="make only what OUT/ does not hold yet, as after a broken run")
     many = command.add_argument_group("many files").add_argument
     many("--jobs", type=words.count(1024), metavar="N", help="processes; by default as many as there are cores")
-    text = "of new images or videos; by default those of the old ones"
-    many("--suffix", type=words.suffix, metavar=".EXT", help=text)
+    many("--suffix", type=words.suffix, metavar=".EXT", help="of new images or videos, else as the old ones")
     video = command.add_argument_group("videos (pip install -e '.[video]')").add_argument
-    codecs = ("libx264", "libvpx-vp9", "ffv1")
-    video("--codec", choices=codecs, help="the encoder; libx264 by default, in .webm libvpx-vp9; ffv1 loses nothing")
+    text = "the encoder; libx264 by default, in .webm libvpx-vp9; ffv1 loses nothing"
+    video("--codec", choices=("libx264", "libvpx-vp9", "ffv1"), help=text)
     video("--crf", type=int, metavar="N", help="its quality, lower is better; 18 in libx264")
 
 
@@ -74,18 +72,15 @@ def _map(commands: Commands) -> None:
     _calibration(add, size="--camera-size")
     target = command.add_argument_group("the new image").add_argument
     _projection(target)
-    text = "a calibration: the new image is what that camera would see"
-    target("--target", type=words.path, metavar="FILE", help=text)
+    target("--target", type=words.path, metavar="FILE", help="a calibration: what that camera would see")
     file = command.add_argument_group("the map").add_argument
-    text = "opencv, opencv_fixed, dw100, ti_ldc or onnx; by default what OUT's name says"
-    file("--format", help=text)
+    file("--format", help="opencv, opencv_fixed, dw100, ti_ldc or onnx; by default what OUT's name says")
     file("--step", type=int, metavar="PIXELS", help="ti_ldc: between nodes; 8 by default")
     file("--block", type=words.size, metavar="WxH", help="ti_ldc: of the new image; by default what fits")
     file("--dtype", choices=("float32", "uint8"), help="onnx: of images; float32 by default")
     file("--clip", action="store_true", default=None, help="dw100, ti_ldc: draw in what they cannot hold")
-    text = "write nothing; say how far this map is from the dewarping"
-    file("--check", type=words.path, metavar="MAP", help=text)
-    _output(add, None, "the map")
+    file("--check", type=words.path, metavar="MAP", help="write nothing; say how far this map is from the dewarping")
+    _output(add, "the map")
 
 
 def _convert(commands: Commands) -> None:
@@ -111,10 +106,9 @@ def _show(commands: Commands) -> None:
     add("input", type=words.path, metavar="FILE", help="a calibration file")
     add("--against", type=words.path, metavar="OTHER", help="another calibration, to compare with")
     _calibration(add)
-    text = "a page that shows the lens live: one file that needs no other"
-    add("--html", type=words.path, metavar="PAGE", help=text)
+    add("--html", type=words.path, metavar="PAGE", help="a page that shows the lens live: one file that needs no other")
     add("--image", type=words.path, metavar="PHOTO", help="of the camera, for the page")
-    _output(add, None, "an image: distortion, radius over angle")
+    _output(add, "an image: distortion, radius over angle")
 
 
 def _lenses(commands: Commands) -> None:
@@ -129,7 +123,7 @@ def _lenses(commands: Commands) -> None:
     add("--size", type=words.size, metavar="WxH", help="of images: only lenses of that aspect ratio, scaled to it")
     add("-n", type=words.count(100000), default=10, metavar="N", help="how many are listed at most; 10 by default")
     add("--format", help=_FORMAT)
-    _output(add, None, "the calibration of the first")
+    _output(add, "the calibration of the first")
 
 
 def _calibrate(commands: Commands) -> None:
@@ -137,8 +131,7 @@ def _calibrate(commands: Commands) -> None:
         "calibrate",
         help="calibrate a camera or a rig from photographs or a video of a board",
         description="Calibrate a camera from photographs of a board: camtorch calibrate images/*.jpg --board 9x6 "
-        "--square 25mm -o camera.yml. A video, board.mp4, does as well: sharp frames that differ "
-        "are taken.",
+        "--square 25mm -o camera.yml. A video, board.mp4, does as well: sharp frames that differ are taken.",
     )
     add = command.add_argument
     add("images", nargs="*", metavar="IMAGE", help="files, quoted patterns, or folders; or a video")
@@ -156,8 +149,7 @@ def _calibrate(commands: Commands) -> None:
     board("--legacy", action="store_true", help="a ChArUco board drawn by OpenCV before 4.6")
     board("--spacing", type=float, metavar="PART", help="of AprilTags, in sides of a tag; 0.3 by default")
     board("--border", type=int, metavar="CELLS", help="of AprilTags; 2 by default, as Kalibr prints")
-    text = "of markers, as OpenCV calls it; 5X5_1000 for ChArUco and APRILTAG_36h11 by default"
-    board("--dictionary", metavar="NAME", help=text)
+    board("--dictionary", metavar="NAME", help="of markers, by OpenCV's name; by default 5X5_1000, or APRILTAG_36h11")
     lens = command.add_argument_group("camera").add_argument
     lens("--model", metavar="KEY", help="kannala_brandt, brown_conrady ...; by default the one that fits")
     lens("--count", type=int, metavar="N", help="of coefficients, where the model leaves a choice")
@@ -166,7 +158,7 @@ def _calibrate(commands: Commands) -> None:
     lens("--loss-scale", type=float, default=1.0, metavar="PX", help="of that loss; 1 by default")
     lens("--bend", action="store_true", help="the board is not quite flat: find its bend as well")
     add("--format", help=f"{_FORMAT}, OpenCV's for .yml")
-    _output(add, "camera.json", "the calibration")
+    _output(add, "the calibration; camera.json by default", Path("camera.json"))
 
 
 # -- options of several commands
@@ -179,13 +171,13 @@ def _photograph(command: argparse.ArgumentParser) -> None:
     text = "instead of a calibration, a real lens by its name: camtorch lenses lists them"
     which("--lens", type=lambda text: words.path(words.LENS + text), dest="camera", metavar="NAME", help=text)
     text = (
-        "instead of a calibration, a guess: a camera of this horizontal field of view, pinhole below 100 degrees, "
-        "equidistant kannala_brandt from there on, or what --model says"
+        "instead, a guess by its horizontal field of view: pinhole below 100 degrees, else kannala_brandt, or --model"
     )
     which("--guess-fov", type=words.guess, dest="camera", metavar="DEGREES", help=text)
     _from_model(command.add_argument, "--model")
-    command.add_argument("--name", help="which camera, in a file with several")
-    _rescale(command.add_argument)
+    add = command.add_argument
+    add("--name", help="which camera, in a file with several")
+    add("--rescale", action="store_true", help="scale the camera to the image's resolution, of the same aspect ratio")
 
 
 def _calibration(add: Add, of_name: str = "which camera, in a file with several", size: str = "--size") -> None:
@@ -200,10 +192,6 @@ def _from_model(add: Add, *others: str) -> None:
     add("--from-model", *others, metavar="KEY", help=text)
 
 
-def _rescale(add: Add) -> None:
-    add("--rescale", action="store_true", help="scale the camera to the image's resolution, of the same aspect ratio")
-
-
 def _projection(add: Add) -> None:
     """What a dewarped image shows."""
     ways = ("perspective", "stereographic", "cylindrical", "equirectangular")
@@ -214,11 +202,9 @@ def _projection(add: Add) -> None:
     add("--size", type=words.size, metavar="WxH", help="size of the new image; by default the old one's")
 
 
-def _output(add: Add, default: str | None, text: str = "the new image") -> None:
+def _output(add: Add, text: str, default: Path | None = None) -> None:
     """Where the result goes."""
-    usual = f"; {default} by default" if default else ""
-    path = default and Path(default)
-    add("-o", "--output", type=words.path, default=path, metavar="OUT", help=text + usual)
+    add("-o", "--output", type=words.path, default=default, metavar="OUT", help=text)
     _force(add)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -12,13 +12,13 @@ from typing import Any
 import torch
 
 from camtorch import _photographs
+from camtorch.boards.finding import IMAGES
 from camtorch.camera import Camera
 from camtorch.cli import cameras, images, processes, targets, videos
 from camtorch.cli.commands import are_several
 from camtorch.cli.processes import Outcome, Pair
-from camtorch.cli.targets import IMAGES
 from camtorch.cli.terminal import bar, note, say
-from camtorch.warp.dewarp import Dewarp, Projection
+from camtorch.warp.dewarp import Dewarp
 from camtorch.warp.warp import Warp
 
 _SLASHES = ("/", os.sep)
@@ -33,22 +33,14 @@ class Dewarping:
     """Makes one file of another. The map is computed once for each size of image."""
 
     camera: Camera
-    """Of a known size."""
-    path: Path
-    """Of the file it is from."""
-    rescale: bool
-    projection: Projection
-    fov: float | None
-    """Degrees."""
-    image_size: tuple[int, int] | None
-    encoder: dict[str, Any]
-    """Options of `videos.remake`."""
+    arguments: argparse.Namespace
     _warps: dict[tuple[int, int], tuple[Dewarp, dict[str, Any]]] = field(default_factory=dict)
 
-    def __call__(self, source: Path, target: Path, **options: Any) -> dict[str, Any]:
-        """Return facts about the new camera; options are those of `videos.remake`."""
+    def __call__(self, source: Path, target: Path, done: Callable[[], object] = lambda: None) -> dict[str, Any]:
+        """Return facts about the new camera; `done` is called after each frame of a video."""
         if videos.is_video(source):
-            return videos.remake(source, target, lambda size: self._warp(source, size), **self.encoder, **options)
+            codec, crf = self.arguments.codec, self.arguments.crf
+            return videos.remake(source, target, lambda size: self._warp(source, size), codec, crf, done)
         image, orientation = _photographs.read_stored(source)
         rows, columns = image.shape[-2:]
         warp, facts = self._warp(source, (rows, columns))
@@ -60,15 +52,15 @@ class Dewarping:
 
     def warp_of(self, camera: Camera) -> Dewarp:
         """Return the warp of images of a camera."""
-        return Dewarp(
-            camera, projection=self.projection, fov=self.fov, image_size=self.image_size, tolerance=_TOLERANCE
-        )
+        given = self.arguments
+        return Dewarp(camera, projection=given.projection, fov=given.fov, image_size=given.size, tolerance=_TOLERANCE)
 
     def _warp(self, source: Path, size: tuple[int, int]) -> tuple[Dewarp, dict[str, Any]]:
         if size not in self._warps:
             if len(self._warps) >= _MOST_KEPT:
                 del self._warps[next(iter(self._warps))]
-            warp = self.warp_of(cameras.fitting(self.camera, self.path, source, size, self.rescale))
+            camera = cameras.fitting(self.camera, self.arguments.camera, source, size, self.arguments.rescale)
+            warp = self.warp_of(camera)
             self._warps[size] = warp, _facts(warp)
         return self._warps[size]
 
@@ -114,7 +106,7 @@ def _single(arguments: argparse.Namespace, source: Path) -> None:
     work = _dewarping(arguments, [source])
     if is_video:
         with bar("dewarping", videos.count_of(source), "frames") as shown:
-            facts = work(source, output, done=shown.update)
+            facts = work(source, output, shown.update)
         end = f", {facts['frames']} frames"
     else:
         facts = work(source, output)
@@ -139,13 +131,13 @@ def _many(arguments: argparse.Namespace) -> int:
     todo = targets.to_make(pairs, others, resume=arguments.resume, force=arguments.force)
     work = _dewarping(arguments, [path for path, _ in found])
     notes, failed, facts = dict[str, list[Path]](), dict[Path, str](), list[dict[str, Any]]()
-    for (source, _), outcome in _made(work, todo, arguments):
+    for (source, _), outcome in zip(todo, _outcomes(work, todo, arguments.jobs), strict=True):
         for text in outcome.notes:
             notes.setdefault(text.removeprefix(str(source)).lstrip(": "), []).append(source)
         if outcome.failure:
             failed[source] = outcome.failure.removeprefix(str(source)).lstrip(": ")
         else:
-            facts.append({**outcome.facts, "frames": 0})
+            facts.append(outcome.facts | {"frames": 0})
     for text, sources in notes.items():
         note(f"{sources[0]} {text}" if len(sources) == 1 else f"{sources[0]} and {len(sources) - 1} more: {text}")
     for source, text in failed.items():
@@ -169,22 +161,17 @@ def _target(source: Path, target: Path, suffix: str | None) -> Path:
     return target
 
 
-def _made(work: Dewarping, todo: Sequence[Pair], arguments: argparse.Namespace) -> list[tuple[Pair, Outcome]]:
-    """Make files by processes, and return what became of them."""
+def _outcomes(work: Dewarping, todo: Sequence[Pair], jobs: int | None) -> list[Outcome]:
+    """Make files by processes, and return what became of each."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    count, outcomes = max(min(arguments.jobs or cores, len(todo)), 1), list[tuple[Pair, Outcome]]()
     targets.remove_left_over(todo)
     try:
         with bar("dewarp", len(todo), "files") as shown:
-            for outcome in processes.each(work, todo, count):
-                outcomes.append(outcome)
-                shown.update()
+            return processes.each(work, todo, max(min(jobs or cores, len(todo)), 1), shown.update)
     except ChildProcessError as error:
         raise ValueError(f"{error}; --resume goes on where it was broken off, --jobs 1 needs the least") from None
     finally:
         targets.remove_left_over(todo)
-    order = {pair: i for i, pair in enumerate(todo)}
-    return sorted(outcomes, key=lambda one: order[one[0]])
 
 
 def _dewarping(arguments: argparse.Namespace, sources: Sequence[Path]) -> Dewarping:
@@ -193,15 +180,11 @@ def _dewarping(arguments: argparse.Namespace, sources: Sequence[Path]) -> Dewarp
     def size_of(source: Path) -> tuple[int, int] | None:
         return videos.size_of(source) if videos.is_video(source) else _photographs.size_of(source)
 
-    camera = cameras.read_for_images(sources, size_of, arguments)
+    work = Dewarping(cameras.read_for_images(sources, size_of, arguments), arguments)
     if any(map(videos.is_video, sources)):
         videos.require()
-    encoder = {"codec": arguments.codec, "crf": arguments.crf}
-    work = Dewarping(
-        camera, arguments.camera, arguments.rescale, arguments.projection, arguments.fov, arguments.size, encoder
-    )
-    if camera.image_size is not None:
-        work.warp_of(camera)  # an error of the options is one of all files
+    if work.camera.image_size is not None:
+        work.warp_of(work.camera)  # an error of the options is one of all files
     return work
 
 

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from camtorch._arguments import warn
 from camtorch._photographs import ORIENTATION, ImageFileError
-from camtorch.cli.targets import IMAGES
+from camtorch.boards.finding import IMAGES
 from camtorch.io.writing import replacing
 
 _KEEP_ORIENTATION = ("JPEG", "PNG", "TIFF", "WEBP")

@@ -9,7 +9,7 @@ import signal
 import sys
 import threading
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field
@@ -45,8 +45,8 @@ def prepare(module: str) -> None:
         forkserver.ensure_running()
 
 
-def each(work: Work, pairs: Sequence[Pair], count: int) -> Iterator[tuple[Pair, Outcome]]:
-    """Yield pairs with their outcomes as they are done, by `count` processes; a single one is this process.
+def each(work: Work, pairs: Sequence[Pair], count: int, done: Callable[[], object]) -> list[Outcome]:
+    """Return what becomes of pairs by `count` processes; a single one is this process. `done` is called after each.
 
     Processes end at once after an error or an interrupt.
 
@@ -54,15 +54,20 @@ def each(work: Work, pairs: Sequence[Pair], count: int) -> Iterator[tuple[Pair, 
         ChildProcessError: If a process was killed.
     """
     if count == 1:
-        yield from ((pair, _attempt(work, pair)) for pair in pairs)
-        return
+        outcomes = []
+        for pair in pairs:
+            outcomes.append(_attempt(work, pair))
+            done()
+        return outcomes
     others = multiprocessing.active_children()
     # pickled here, because multiprocessing would share the memory of tensors
     begin = (pickle.dumps(work),)
     executor = ProcessPoolExecutor(count, multiprocessing.get_context(_HOW), _begin, begin)
     try:
-        futures = {executor.submit(_attempt_here, pair): pair for pair in pairs}
-        yield from ((futures[future], future.result()) for future in as_completed(futures))
+        futures = [executor.submit(_attempt_here, pair) for pair in pairs]
+        for _ in as_completed(futures):
+            done()
+        return [future.result() for future in futures]
     except BrokenProcessPool:
         raise ChildProcessError("a process was killed, perhaps for lack of memory") from None
     except BaseException:
@@ -97,12 +102,10 @@ def _attempt_here(pair: Pair) -> Outcome:
 
 
 def _attempt(work: Work, pair: Pair) -> Outcome:
-    outcome = Outcome()
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", UserWarning)
         try:
-            outcome.facts = work(*pair)
+            facts = work(*pair)
         except Exception as error:
             return Outcome(failure=reason(error))
-    outcome.notes = list(dict.fromkeys(str(warning.message) for warning in caught))
-    return outcome
+    return Outcome(facts, notes=list(dict.fromkeys(str(warning.message) for warning in caught)))

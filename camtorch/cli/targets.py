@@ -13,17 +13,9 @@ from camtorch.boards.finding import natural
 from camtorch.cli.processes import Pair
 from camtorch.io.writing import all_left_over
 
-IMAGES = frozenset({".bmp", ".jpeg", ".jpg", ".pgm", ".png", ".ppm", ".tif", ".tiff", ".webp"})
-"""Suffixes, in lower case, of the images that are taken from a folder, and of those that are written."""
-
 
 def check(path: Path, *, force: bool, inputs: tuple[Path | None, ...] = ()) -> None:
-    """Check that a file can be written.
-
-    Raises:
-        ValueError: If the path is a folder, or one of the inputs, also by a link; if it exists and `force` is false; if
-            no folder is there to write to, or to make it in.
-    """
+    """Raise a ValueError if a file cannot be written, is an input, also by a link, or exists and `force` is false."""
     if path.is_dir():
         raise ValueError(f"{path}: is a folder; name a file in it")
     for given in inputs:
@@ -58,10 +50,7 @@ def find(words: Sequence[str], suffixes: Collection[str], output: Path) -> list[
 
     Words are files of any suffix; patterns, as a quoted 'in/**/*.jpg'; and folders with all folders in them, whose tree
     is kept; if there are several words, folders keep their names as well. Names that begin with a dot are left out, as
-    is the folder of outputs where it lies within a folder that is read. Links are followed.
-
-    Raises:
-        ValueError: If a word means no file. OSError: If a folder cannot be read.
+    is the folder of outputs within a folder that is read. Links are followed. A word without a file is a ValueError.
     """
     files: dict[str, tuple[Path, Path]] = {}
     out = os.path.realpath(output)
@@ -101,11 +90,8 @@ def _below(root: Path) -> Iterator[Path]:
 
     for name, folders, names in os.walk(root, followlinks=True, onerror=refuse):
         real = os.path.realpath(name)
-        folders[:] = [
-            one
-            for one in folders
-            if not one.startswith(".") and not _is_below(real, os.path.realpath(os.path.join(name, one)))
-        ]
+        shown = [one for one in folders if not one.startswith(".")]
+        folders[:] = [one for one in shown if not _is_below(real, os.path.realpath(os.path.join(name, one)))]
         yield from (Path(name, one) for one in names if not one.startswith("."))
 
 
@@ -116,11 +102,8 @@ def _is_below(path: str, folder: str) -> bool:
 def to_make(pairs: Sequence[Pair], others: Iterable[Path], *, resume: bool, force: bool) -> list[Pair]:
     """Return the pairs whose files are to be made; with `resume` those that are there are left out.
 
-    An empty file is what a loss of power leaves of one that was there, and is made again.
-
-    Raises:
-        ValueError: If files would be written over each other, or over one that is read, also one of `others`; if a file
-            exists, unless `resume` or `force` is given.
+    An empty file is what a loss of power leaves of one that was there, and is made again. It is a ValueError if files
+    would be written over each other, or over one that is read, also one of `others`; or if one is there already.
     """
     read = {os.path.realpath(path): path for path in (*(source for source, _ in pairs), *others)}
     written: dict[str, Path] = {}

@@ -21,22 +21,13 @@ WRITTEN = {".mp4": "mp4", ".m4v": "mp4", ".mov": "mov", ".mkv": "matroska", ".we
 """What ffmpeg calls the formats of files with these suffixes, in lower case."""
 FORMATS = frozenset({*WRITTEN, ".avi", ".mts", ".ts"})
 """Suffixes of what is read."""
-CODECS: dict[str, dict[str, str]] = {
-    # how x264 weighs blocks by what refers to them is not the same each time
-    "libx264": {"crf": "18", "mbtree": "0"},
-    "libvpx-vp9": {"crf": "24", "b": "0"},
-    "ffv1": {},
-}
-"""Encoders with their options."""
+# encoders with their options; how x264 weighs blocks by what refers to them (mbtree) is not the same each time
+_CODECS = {"libx264": {"crf": "18", "mbtree": "0"}, "libvpx-vp9": {"crf": "24", "b": "0"}, "ffv1": dict[str, str]()}
 _READ = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpegts"  # no playlists, which would have other files read
 _THREADS = 4  # of an encoder: what it makes depends on their number, and must not depend on the machine's
 _CUT = 0.5  # seconds that may be missing at the end
 _COLOURS = ("color_range", "colorspace", "color_primaries", "color_trc")
 """What the colours of a frame mean."""
-
-
-class VideoFileError(ValueError):
-    """A video that cannot be read or written. The text names the file and the reason."""
 
 
 def is_video(path: Path) -> bool:
@@ -50,10 +41,10 @@ def written_suffix(path: Path) -> str:
 
 
 def check_kind(path: Path) -> None:
-    """Raise a VideoFileError if the name is of no format that videos are written as."""
+    """Raise a ValueError if the name is of no format that videos are written as."""
     if path.suffix.lower() not in WRITTEN:
         what = path.suffix or "no suffix"
-        raise VideoFileError(f"{path}: {what}: no video is written as that; try {', '.join(WRITTEN)}")
+        raise ValueError(f"{path}: {what}: no video is written as that; try {', '.join(WRITTEN)}")
 
 
 def require() -> Any:
@@ -66,21 +57,21 @@ def require() -> Any:
 
 @contextlib.contextmanager
 def _opened(path: Path) -> Iterator[tuple[Any, Any]]:
-    """Open a file, and yield it and its first video stream; errors of ffmpeg in the block are VideoFileErrors."""
+    """Open a file, and yield it and its first video stream; errors of ffmpeg in the block are ValueErrors."""
     av = require()
     try:
         with av.open(os.fspath(path), options={"format_whitelist": _READ}) as container:
             if not container.streams.video:
-                raise VideoFileError(f"{path}: no video is in it")
+                raise ValueError(f"{path}: no video is in it")
             container.streams.video[0].thread_type = "AUTO"
             yield container, container.streams.video[0]
     except av.error.FFmpegError as error:
-        raise VideoFileError(f"{path}: {error.strerror}") from None
+        raise ValueError(f"{path}: {error.strerror}") from None
 
 
 def size_of(path: Path) -> tuple[int, int] | None:
     """Return (height, width) of a video; None of anything else."""
-    with contextlib.suppress(VideoFileError), _opened(path) as (_, stream):
+    with contextlib.suppress(ValueError), _opened(path) as (_, stream):
         return stream.codec_context.height, stream.codec_context.width
     return None
 
@@ -151,32 +142,20 @@ def remake(
     crf: int | None = None,
     done: Callable[[], object] = lambda: None,
 ) -> dict[str, Any]:
-    """Write a video of the warped frames of another one, whole or not at all, with the folders that lack.
+    """Write a video of warped frames, whole or not at all; return facts about the warp, and "frames", their number.
 
     Time stamps, sound, subtitles, the rotation with which it is shown, and the meaning of colours are those of the
     source. Frames are warped as nearly all are stored, in YUV of eight bits in 4:2:0, which is half the work of RGB.
-
-    Args:
-        source: A video.
-        target: A new one, whose suffix says the format.
-        warp_of: Returns the warp for frames of a (height, width), and facts about it.
-        codec: Of CODECS; by default what suits the format.
-        crf: Its quality; by default one at which hardly anything is lost.
-        done: Is called after each frame.
-
-    Returns:
-        The facts about the warp, and "frames", how many there are.
-
-    Raises:
-        VideoFileError: If the source is no video, ends too early or changes its size; if it cannot be written so.
+    `warp_of` returns the warp for frames of a (height, width) with its facts; `done` is called after each frame.
     """
     with _opened(source) as (container, stream):
-        first, _ = next(_decoded(container, stream), (None, None))
+        first = next((frame for frame, _ in _decoded(container, stream)), None)
     if first is None:
-        raise VideoFileError(f"{source}: no frame of it can be read")
+        raise ValueError(f"{source}: no frame of it can be read")
     warp, facts = warp_of((first.height, first.width))
     black = 0 if first.reformat(format="yuv420p").color_range == 2 else 16
-    whole, colour = _still(warp, black), _still(warp, 128, halved=True)
+    colour = _still(_halved(warp.source), _halved(warp.target), warp, 128)
+    warps = _still(warp.source, warp.target, warp, black), colour, colour
     count, end = 0, 0.0
     target.parent.mkdir(parents=True, exist_ok=True)
     # bitexact: no random identifiers
@@ -198,10 +177,10 @@ def remake(
                 continue
             if (frame.height, frame.width) != (first.height, first.width):
                 was, now = f"{first.width}x{first.height}", f"{frame.width}x{frame.height}"
-                raise VideoFileError(f"{source}: its frames are {was}, then {now}")
+                raise ValueError(f"{source}: its frames are {was}, then {now}")
             end = max(end, frame.time + float(1 / _rate(stream)) - begin)
             old, made = frame.reformat(format="yuv420p"), require().VideoFrame(new.width, new.height, "yuv420p")
-            for plane, pixels, target_pixels in zip((whole, colour, colour), _planes(old), _planes(made), strict=True):
+            for plane, pixels, target_pixels in zip(warps, _planes(old), _planes(made), strict=True):
                 target_pixels[:] = plane(torch.from_numpy(pixels)[None, None])[0, 0].numpy()
             for name in ("pts", "time_base", "duration", *_COLOURS):
                 setattr(made, name, getattr(old, name))
@@ -210,7 +189,7 @@ def remake(
             done()
         output.mux(new.encode(None))
         if length - end > max(_CUT, 0.02 * length):
-            raise VideoFileError(f"{source}: ends after {end:.1f} of {length:.1f} seconds; it is cut off or damaged")
+            raise ValueError(f"{source}: ends after {end:.1f} of {length:.1f} seconds; it is cut off or damaged")
     return facts | {"frames": count}
 
 
@@ -220,10 +199,9 @@ def _planes(frame: Any) -> Iterator[np.ndarray[Any, Any]]:
         yield np.frombuffer(plane, np.uint8).reshape(-1, plane.line_size)[: plane.height, : plane.width]
 
 
-def _still(warp: Warp, fill: int, *, halved: bool = False) -> Warp:
-    """Return the warp of the planes of brightness, or of colours, which does not learn."""
-    source, target = (_halved(warp.source), _halved(warp.target)) if halved else (warp.source, warp.target)
-    return Warp(source, target, warp.rotation, fill=float(fill), tolerance=warp.tolerance).requires_grad_(False)
+def _still(source: Camera, target: Camera, like: Warp, fill: int) -> Warp:
+    """Return the warp of a plane, which does not learn."""
+    return Warp(source, target, like.rotation, fill=float(fill), tolerance=like.tolerance).requires_grad_(False)
 
 
 def _halved(camera: Camera) -> Camera:
@@ -240,17 +218,17 @@ def _new_stream(
     codec = codec or ("libvpx-vp9" if output.format.name == "webm" else "libx264")
     if codec == "libx264" and (camera.width % 2 or camera.height % 2):
         size = f"{camera.width}x{camera.height}"
-        raise VideoFileError(f"{target}: {size}, but {codec} wants even numbers; --size names them")
+        raise ValueError(f"{target}: {size}, but {codec} wants even numbers; --size names them")
     try:
         stream = output.add_stream(codec, rate=rate, time_base=first.time_base)
     except ValueError as error:
-        raise VideoFileError(f"{target}: {error}; --codec names another encoder") from None
+        raise ValueError(f"{target}: {error}; --codec names another encoder") from None
     stream.width, stream.height, stream.pix_fmt = camera.width, camera.height, "yuv420p"
     like = first.reformat(format="yuv420p")
     for name in _COLOURS:
         setattr(stream.codec_context, name, getattr(like, name))
     stream.codec_context.thread_count = _THREADS
-    stream.options = CODECS[codec] | ({} if crf is None else {"crf": str(crf)})
+    stream.options = _CODECS[codec] | ({} if crf is None else {"crf": str(crf)})
     if matrix := first.side_data.get("DISPLAYMATRIX"):
         stream.set_display_matrix(np.frombuffer(matrix, np.int32).tolist())
     return stream
@@ -261,10 +239,8 @@ def _copied_stream(output: Any, other: Any, source: Path, target: Path) -> Any:
     try:
         copy = output.add_stream_from_template(other)
     except ValueError:
-        raise VideoFileError(
-            f"{source}: its {other.type}, {other.codec_context.name}, cannot be kept in {target.suffix}; .mkv takes "
-            "nearly all"
-        ) from None
+        kind = f"{other.type}, {other.codec_context.name}"
+        raise ValueError(f"{source}: its {kind}, cannot be kept in {target.suffix}; .mkv takes nearly all") from None
     if "language" in other.metadata:
         copy.metadata["language"] = other.metadata["language"]
     return copy

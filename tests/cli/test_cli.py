@@ -14,7 +14,7 @@ from PIL import Image
 
 import camtorch as ct
 from camtorch._photographs import size_of
-from camtorch.cli.targets import IMAGES
+from camtorch.boards.finding import IMAGES
 
 
 def test_dewarp_writes_what_dewarp_makes(folder, capsys):

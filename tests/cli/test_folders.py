@@ -15,6 +15,7 @@ import pytest
 from command_line import MATRIX, command, opened, refused
 from PIL import Image
 
+from camtorch.boards.finding import IMAGES
 from camtorch.cli import targets
 from camtorch.io.writing import all_left_over
 
@@ -61,7 +62,7 @@ def tree(tmp_path, monkeypatch):
         Path(name).write_text(name)
 
     def found(*words, output="out"):
-        return {str(path): str(place) for path, place in targets.find(words, targets.IMAGES, Path(output))}
+        return {str(path): str(place) for path, place in targets.find(words, IMAGES, Path(output))}
 
     return found
 
