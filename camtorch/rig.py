@@ -44,19 +44,16 @@ class NamedModules(nn.Module, MutableMapping[str, M]):
         self.batch = None
         if isinstance(modules, NamedModules):
             self._places = dict(modules._places)
-            for key, module in modules._modules.items():
-                self._modules[key] = module
+            self._modules.update(modules._modules)
             self.batch = modules.batch
         else:
             word = "cameras" if kind.__name__ == "Camera" else kind.__name__.lower()
             for name, module in as_mapping(modules, word, "Rig", f"{{'left': {kind.__name__}}}").items():
                 self[name] = module
-        if batch is not None or names:
-            self._add_rows(list(names), batch)
-
-    def _add_rows(self, names: list[str], batch: M | None) -> None:
-        owner = self._kind.__name__
-        if not isinstance(batch, self._kind):
+        if batch is None and not names:
+            return
+        owner = kind.__name__
+        if not isinstance(batch, kind):
             raise TypeError(f"{owner}: the batch of named rows must be {owner}; got {type(batch).__name__}")
         if batch.batch_shape != (len(names),):
             raise ValueError(f"{owner}: {len(names)} names do not fit a batch {tuple(batch.batch_shape)}")

@@ -48,13 +48,7 @@ class Always(Augmentation):
 
 
 class Mover:
-    """Moves single samples of arrays by their keys; the common part of `MapBatches` and `MapSamples`.
-
-    Args:
-        transform: what moves them.
-        seed, epoch: of what is drawn.
-        fields: name -> kind, beside those of an augmentation.
-    """
+    """Moves single samples of arrays by their keys; the common part of `MapBatches` and `MapSamples`."""
 
     def __init__(self, transform: Moves, seed: int, epoch: int, fields: Mapping[str, str] | None):
         self._owner = owner = type(self).__name__

@@ -168,15 +168,7 @@ def _add(
 
 
 def _read_images(path: str) -> tuple[dict[str, str], np.ndarray, bool, Callable[[int], Record]]:
-    """The images of an images.txt or images.bin.
-
-    Returns:
-        Their names with the ids of their cameras; (N, 7) quaternions w, x, y, z and translations; whether any of them
-        has points; and of a row where it stands.
-
-    Raises:
-        CameraFileError: it is none, or two images have one name.
-    """
+    """Return the cameras of images by their names, poses (N, 7), whether there are points, and the places of rows."""
     check_ordinary(path)
     unit, entries = ("byte", _images_from_bytes) if path.endswith(".bin") else ("line", _images_from_text)
     images: dict[str, str] = {}
@@ -337,11 +329,7 @@ def _as_bytes(entries: list[tuple[Any, ...]]) -> bytes:
 
 
 def _images_content(lossy: Lossy, rig: Rig, identities: dict[str, int], path: str, binary: bool) -> bytes:
-    """The file of a rig's poses.
-
-    Raises:
-        CameraFileError: the file that is there has points, which would be lost.
-    """
+    """Return the file of a rig's poses; refuse to lose the points of a file that is there."""
     entries = []
     for name, values in zip(rig.extrinsics, poses.quaternions(poses.all_of(rig, lossy)).tolist(), strict=True):
         if not name or "\0" in name or (not binary and (name.split() != [name])):

@@ -19,10 +19,9 @@ _LARGEST_ARRAY = 1 << 16  # bytes; that of a camera has 14 numbers
 
 
 def arrays_of(content: bytes, largest: int) -> dict[str, np.ndarray | None]:
-    """The arrays of numbers of an archive by their names; None for damaged or larger ones, and those of objects.
+    """Return arrays of numbers by their names; None for damaged or larger ones, and for objects.
 
-    Raises:
-        BadZipFile, zlib.error, OSError, EOFError, ValueError, RuntimeError, NotImplementedError: a damaged archive.
+    A damaged archive raises BadZipFile, zlib.error, OSError, EOFError, ValueError, RuntimeError, NotImplementedError.
     """
     if content.count(b"PK\1\2") > _MOST_ARRAYS:
         raise ValueError(f"more than {_MOST_ARRAYS} arrays")
@@ -39,11 +38,7 @@ def arrays_of(content: bytes, largest: int) -> dict[str, np.ndarray | None]:
 
 
 def parse_archive(path: str | os.PathLike[str], content: bytes) -> dict[str, Any]:
-    """The keys of an archive, as `camtorch.io.parsing.parse_mapping`: arrays as lists; None as in `arrays_of`.
-
-    Raises:
-        CameraFileError: another archive, or a damaged one; a size whose order is not known.
-    """
+    """Return the keys of an archive, arrays as lists; refuse damaged ones, and sizes whose order is not known."""
     try:
         arrays = arrays_of(content, _LARGEST_ARRAY)
     except (zipfile.BadZipFile, zlib.error, OSError, EOFError, ValueError, RuntimeError, NotImplementedError) as error:
@@ -51,10 +46,6 @@ def parse_archive(path: str | os.PathLike[str], content: bytes) -> dict[str, Any
     keys = {name: None if array is None else array.astype(np.float64).tolist() for name, array in arrays.items()}
     for name, value in keys.items():
         if name.lower() in _SIZES and isinstance(value, list) and len(value) == 2 and value[0] != value[1]:
-            raise CameraFileError(
-                path,
-                name,
-                f"{value[0]:g} {value[1]:g} may be (width, height) or (height, width); "
-                "save image_width and image_height",
-            )
+            either = f"{value[0]:g} {value[1]:g} may be (width, height) or (height, width)"
+            raise CameraFileError(path, name, f"{either}; save image_width and image_height")
     return keys

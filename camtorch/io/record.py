@@ -25,17 +25,7 @@ _LONGEST_NUMBER = 400  # no double needs as many characters
 
 
 class Record:
-    """A value of a file: text, a float, True, False, None, a list or a mapping. Text may be a number.
-
-    Args:
-        path: the file.
-        value: what stands there.
-        place: where it stands.
-    """
-
-    path: str | os.PathLike[str]
-    value: Any
-    place: str
+    """A value of a file and its place: text, a float, True, False, None, a list or a mapping. Text may be a number."""
 
     def __init__(self, path: str | os.PathLike[str], value: Any, place: str = ""):
         self.path, self.value, self.place = path, value, place

@@ -99,12 +99,7 @@ def as_json(value: object) -> str:
 
 @dataclass(frozen=True)
 class Lossy:
-    """The values that are written to a file of a format, or errors that say which of them would be lost.
-
-    Args:
-        path: the file.
-        format: what the errors call the format.
-    """
+    """The values that are written to the file `path` of a format, or errors that say which of them would be lost."""
 
     path: str
     format: str

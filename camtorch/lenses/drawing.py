@@ -64,12 +64,9 @@ def _good() -> tuple[Tensor, Tensor, Tensor, Tensor]:
 
 
 def covering(intrinsics: Tensor, reach: Tensor, size: tuple[int, int]) -> Tensor:
-    """(*B,): the factor, at least 1, on the focal lengths with which every pixel of an image has a ray.
+    """Return the factor (*B,), at least 1, on focal lengths with which all pixels of an image have rays.
 
-    Args:
-        intrinsics: (*B, 4).
-        reach: (*B,), the radius of the image at the lens's fold in focal lengths.
-        size: (height, width) of the image.
+    `reach` (*B,) is the radius of the image at the lens's fold in focal lengths.
     """
     fx, fy, cx, cy = intrinsics.unbind(-1)
     height, width = size
@@ -80,17 +77,10 @@ def covering(intrinsics: Tensor, reach: Tensor, size: tuple[int, int]) -> Tensor
 
 @lru_cache(maxsize=16)
 def lenses_for(size: tuple[int, int], fov: tuple[float, float] | None) -> Lenses:
-    """The lenses whose images of a size have a horizontal field of view in a range, in degrees.
+    """Return the lenses whose images of a size have a horizontal field of view in a range, in degrees; None: all.
 
-    A calibrated image is scaled until it covers the new one, and cropped evenly. Where pixels then have no ray, the
-    focal lengths grow until they have.
-
-    Args:
-        size: (height, width).
-        fov: (low, high), or None for all lenses.
-
-    Raises:
-        ValueError: there are none.
+    A calibrated image is scaled until it covers the new one, and cropped evenly. If pixels then have no ray, the focal
+    lengths grow until they have.
     """
     sizes, intrinsics, distortion, reach = _good()
     new = sizes.new_tensor(size)

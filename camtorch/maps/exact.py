@@ -15,15 +15,7 @@ _STRIP = 1 << 19  # pixels computed at a time
 
 
 class Exact:
-    """Positions on the source's image by pixels of the target, as the cameras say: no lattice, nothing rounded.
-
-    Args:
-        warp: a single one; the present values of parameters are used.
-        owner: the function that needs it, for errors.
-
-    Raises:
-        ValueError: If the warp is a batch.
-    """
+    """Positions on the source's image by pixels of the target, as the cameras say: no lattice, nothing rounded."""
 
     positions: Floats
     """(H', W', 2): x and y in pixels of the source for every pixel of the target; finite, on its image or off."""

@@ -98,11 +98,7 @@ def _counts(step: int, size: tuple[int, int]) -> tuple[int, int]:
 
 
 def mesh_of(path: str, exact: Exact, step: int) -> Mesh:
-    """Return the mesh of a warp, exact at its nodes, and smoothly continued to those that have no position.
-
-    Raises:
-        CameraFileError: If positions leap across the source from one pixel to the next; `path` is that of the map.
-    """
+    """Return the mesh of a warp, exact at its nodes, smoothly continued to those without a position; refuse seams."""
     if leaps := _leaps(exact):
         raise CameraFileError(
             path,
@@ -166,8 +162,7 @@ def _continued(nodes: Floats, known: Bools, low: Floats, high: Floats) -> Floats
 def held(path: str, format: str, mesh: Mesh, low: Floats, high: Floats, *, clip: bool) -> Mesh:
     """Return the mesh with its nodes drawn in to the least and largest x and y (..., 2) that a format holds.
 
-    Raises:
-        CameraFileError: If nodes of shown pixels lie more than half a pixel beyond, unless `clip` is set.
+    Unless `clip` is set, nodes of shown pixels that lie more than half a pixel beyond are refused.
     """
     beyond = ((mesh.nodes < low - _SLACK) | (mesh.nodes > high + _SLACK)).any(-1)
     if mesh.needed is not None and not clip and (lost := beyond & mesh.needed).any():
