@@ -49,8 +49,7 @@ def _containers() -> Iterator[tuple[str, Any]]:
 class GeometryModule(nn.Module):
     """A module whose tensors are geometry: Parameters, or tensors of a graph, never of less than float32."""
 
-    _own: dict[str, Tensor | None]
-    """The tensors that were registered, also while others stand in their place."""
+    _own: dict[str, Tensor | None]  # the tensors that were registered, also while others stand in their place
 
     def __init__(self, modules: Mapping[str, nn.Module | None] = MappingProxyType({}), /, **attributes: Any):
         """With these attributes, which are no modules, and parts."""
@@ -209,8 +208,7 @@ class BatchedModule(GeometryModule):
 
     tensor_names: ClassVar[tuple[str, ...]]
     """Of the tensors (*B, n); each may have fewer batch dims, or of size 1, where it is shared."""
-    memo_names: ClassVar[tuple[str, ...]] = ()
-    """Of what is kept of their values, which begins empty in another module."""
+    memo_names: ClassVar[tuple[str, ...]] = ()  # of what is kept of their values, which begins empty in another module
 
     @property
     def batch_shape(self) -> torch.Size:
@@ -382,8 +380,7 @@ class Memo:
     """
 
     capacity: int = 1
-    result: Any = None
-    """The one that was asked for last, of whatever inputs."""
+    result: Any = None  # the one that was asked for last, of whatever inputs
     _kept: Sequence[tuple[tuple[Any, ...], list[Tensor], Any]] = ()  # the last one used is first
 
     def __init__(self, capacity: int = 1) -> None:

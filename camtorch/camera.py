@@ -12,16 +12,7 @@ import torch
 from torch import Tensor
 from torch.nn.utils import parametrize
 
-from camtorch._arguments import (
-    LEFT,
-    Numbers,
-    as_image_size,
-    as_whole,
-    broadcast_shapes,
-    hinting,
-    is_predicted,
-    shown,
-)
+from camtorch._arguments import LEFT, Numbers, as_image_size, as_whole, broadcast_shapes, hinting, is_predicted, shown
 from camtorch._editing import check_crop, edited_by, quarter_turns
 from camtorch._evaluation import evaluated, mapped
 from camtorch._freezing import PREFIX, Freezable, with_frozen

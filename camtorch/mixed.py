@@ -32,14 +32,10 @@ class _Group(NamedTuple):
     """Cameras of one model and number of coefficients, which are evaluated at once."""
 
     model: type[Camera]
-    members: tuple[int, ...]
-    """Which modules it is made of."""
-    counts: tuple[int | None, ...]
-    """How many cameras each of them is; None for a single one."""
-    taken: tuple[int, ...] | None
-    """Which rows of those, one after the other; None for all of them in their order."""
-    rows: tuple[int, ...]
-    """The place of each in the batch, ascending."""
+    members: tuple[int, ...]  # which modules it is made of
+    counts: tuple[int | None, ...]  # how many cameras each of them is; None for a single one
+    taken: tuple[int, ...] | None  # which rows of those, one after the other; None for all of them in their order
+    rows: tuple[int, ...]  # the place of each in the batch, ascending
     memo: Memo
 
 
@@ -309,10 +305,7 @@ class Mixed(Camera):
         """Of a model."""
         cls._refuse("constructor from numbers", "make each camera by its model, and ct.Mixed([...]) of them")
 
-    @classmethod
-    def from_fov(cls, *_: Any, **__: Any) -> NoReturn:
-        """Of a model."""
-        cls._refuse("constructor from numbers", "make each camera by its model, and ct.Mixed([...]) of them")
+    from_fov = from_matrix
 
     def __repr__(self) -> str:
         counts = Counter(

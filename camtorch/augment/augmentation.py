@@ -109,20 +109,16 @@ class Spans:
     wide: NDArray[np.float64]
     total: int
     _places: list[tuple[str, slice, tuple[int, int] | None]]
+    _ends: list[tuple[float, float]]
 
     def __init__(self, ranges: Mapping[str, Range], rows: int):
-        self.ranges, self.rows, self._places = dict(ranges), rows, []
-        counts = [rows * (interval.size or 1) for interval in ranges.values()]
-        self.low = np.repeat([interval.low for interval in ranges.values()] or [0.0], counts or [0])
-        self.wide = np.repeat([interval.high - interval.low for interval in ranges.values()] or [0.0], counts or [0])
-        self.total = sum(counts)
-        every = [interval for interval, n in zip(ranges.values(), counts, strict=True) for _ in range(n)]
-        self._ends = [(interval.low, interval.high - interval.low) for interval in every]
-        end = 0
-        for (name, interval), count in zip(ranges.items(), counts, strict=True):
-            shape = (rows, interval.size) if interval.size else None
-            self._places.append((name, slice(end, end + count), shape))
-            end += count
+        self.ranges, self.rows, self._places, self._ends = dict(ranges), rows, [], []
+        for name, interval in ranges.items():
+            start, shape = len(self._ends), (rows, interval.size) if interval.size else None
+            self._ends += [(interval.low, interval.high - interval.low)] * (rows * (interval.size or 1))
+            self._places.append((name, slice(start, len(self._ends)), shape))
+        self.total = len(self._ends)
+        self.low, self.wide = np.array(self._ends, np.float64).reshape(-1, 2).T.copy()
 
     def alone(self, shares: Sequence[float]) -> dict[str, list[Any]]:
         """The values of one row as plain numbers, (1,) or (1, size)."""
@@ -347,9 +343,6 @@ class Augmentation(SampleTransform):
     def _change(self, camera: Camera, draw: Mapping[str, Any]) -> Change:
         applied, camera = draw["apply"], alone(camera)
         count = len(applied)
-        groups: list[tuple[list[int] | None, Camera]] = [(None, camera)]
-        if isinstance(camera, Mixed):
-            groups = list(camera.groups)
         if 0 < self.p < 1 and self.image_size not in (None, camera.image_size):
             raise ValueError(
                 f"{self._name}: with p < 1 the image_size must be that of the images, so that all come out alike; "
@@ -364,8 +357,7 @@ class Augmentation(SampleTransform):
         if all(chosen):  # traced, all rows move, and a gate chooses
             return by_kinds(count, camera, part, None if looks or self.p == 1 else applied)
         parts = []
-        for rows, group in groups:
-            rows = list(range(count)) if rows is None else rows
+        for rows, group in camera.groups if isinstance(camera, Mixed) else [(list(range(count)), camera)]:
             for moves in (True, False):
                 here = [n for n, row in enumerate(rows) if chosen[row] == moves]
                 if here:
@@ -448,7 +440,7 @@ class Augmentation(SampleTransform):
         warn(
             f"{self._name}: min_filled={share:g} is out of reach for {few} of {found.numel()} new images, of "
             f"which down to {float(found.min()):.0%} shows something: the camera of the images does not see along the "
-            "axis of the new one",
+            "axis of the new one"
         )
 
     def _tell_of_zoom(self, source: Camera, target: Camera, factor: Tensor, found: Tensor) -> None:
@@ -473,7 +465,7 @@ class Augmentation(SampleTransform):
                 f"{self._name}: of the new images {1 - float(shares.mean()):.0%} will show nothing, and of some "
                 f"{1 - float(shares.min()):.0%}, as the camera of the images does not see so far. min_filled=0.9 zooms "
                 "until that much of every image shows something; fov='source', in lenses, takes one as wide as the "
-                "images are; min_filled=0 says that it is meant so",
+                "images are; min_filled=0 says that it is meant so"
             )
 
     # -- applying

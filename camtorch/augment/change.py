@@ -43,22 +43,15 @@ def _same(value: Tensor) -> Tensor:
 class View:
     """The new camera of a single sample as plain numbers, of which modules are made when somebody asks for them."""
 
-    base: Camera
-    """Of whose model and dtype it is."""
+    base: Camera  # of whose model and dtype it is
     intrinsics: Sequence[float]
-    distortion: Tensor
-    """(n,)."""
+    distortion: Tensor  # (n,)
     image_size: tuple[int, int]
-    rotation: Tensor | None
-    """(3, 3), or None."""
-    options: Options
-    """Of the warp that leads to it."""
-    start: Native | None = None
-    """The camera before, for compiled code."""
-    lens: Native | None = None
-    """One of the same lens as the new camera, if there is one already."""
-    made: Warp | None = field(default=None, init=False)
-    """The warp, once somebody has asked for it."""
+    rotation: Tensor | None  # (3, 3), or None
+    options: Options  # of the warp that leads to it
+    start: Native | None = None  # the camera before, for compiled code
+    lens: Native | None = None  # one of the same lens as the new camera, if there is one already
+    made: Warp | None = field(default=None, init=False)  # the warp, once somebody has asked for it
 
     @cached_property
     def target(self) -> Camera:
@@ -93,16 +86,11 @@ class View:
 class Part:
     """Rows of a batch that move by one warp, or stay as they are."""
 
-    rows: list[int] | None
-    """Which samples of the batch, or None for all."""
-    moves: Warp | View | None
-    """By what; None: nothing happens to these rows."""
-    camera: Camera
-    """Before the change; the warp's source."""
-    shades: tuple[Warp, Warp] | None = None
-    """How red and blue move, where they do not move as green."""
-    light: Tensor | None = None
-    """(n or 1, 1, H', W'): what the lens lets through."""
+    rows: list[int] | None  # which samples of the batch, or None for all
+    moves: Warp | View | None  # by what; None: nothing happens to these rows
+    camera: Camera  # before the change; the warp's source
+    shades: tuple[Warp, Warp] | None = None  # how red and blue move, where they do not move as green
+    light: Tensor | None = None  # (n or 1, 1, H', W'): what the lens lets through
 
     @property
     def warp(self) -> Warp:
@@ -224,14 +212,7 @@ class Change:
     mixed: bool
     gate: Tensor | None
 
-    def __init__(
-        self,
-        count: int,
-        parts: Sequence[Part],
-        *,
-        mixed: bool = False,
-        gate: Tensor | None = None,
-    ):
+    def __init__(self, count: int, parts: Sequence[Part], *, mixed: bool = False, gate: Tensor | None = None):
         self.count, self.parts, self.mixed, self.gate = count, list(parts), mixed, gate
         rows = [row for part in self.parts for row in part.rows or ()]
         self._inverse: Change | None = None

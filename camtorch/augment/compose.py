@@ -82,13 +82,7 @@ class Compose(Augmentation):
         for i, part in enumerate(parts):
             ranges[f"{i}.apply"] = Range(0, 1)
             ranges |= {f"{i}.{key}": interval for key, interval in part.ranges.items()}
-        super().__init__(
-            ranges,
-            camera=camera,
-            fields=fields,
-            antialias=antialias,
-            **options,
-        )
+        super().__init__(ranges, camera=camera, fields=fields, antialias=antialias, **options)
         self.augmentations = nn.ModuleList(parts)
         self.crops: Mapping[str, int] = {
             f"{i}.{key}": index for i, part in enumerate(parts) for key, index in part.crops.items()

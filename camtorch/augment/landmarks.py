@@ -53,8 +53,7 @@ class Table:
     """Which landmarks change places."""
 
     order: tuple[int, ...]
-    exact: bool
-    """Whether it is of just so many landmarks; pairs alone do not say."""
+    exact: bool  # whether it is of just so many landmarks; pairs alone do not say
 
     def of(self, count: int) -> tuple[int, ...] | None:
         """For so many landmarks; None if it is of another number."""
@@ -106,12 +105,9 @@ _LEFT, _RIGHT = "_left", "_right"
 class Mirroring:
     """What a mirror changes beside places and directions: names of landmarks, of fields, and sides of heads."""
 
-    lateral: int
-    """The number of the lateral axis."""
-    by_name: tuple[str, ...]
-    """The fields that tables are given for by name."""
-    key: object
-    """Equal for those that do the same."""
+    lateral: int  # the number of the lateral axis
+    by_name: tuple[str, ...]  # the fields that tables are given for by name
+    key: object  # equal for those that do the same
     owner: str
     swap_sides: bool
 
@@ -145,7 +141,7 @@ class Mirroring:
                 warn(
                     f"{self.owner}: {name} holds {count} points and mirrored faces keep their order: point 0 is then "
                     f"on the other side. landmarks={meant!r}, if that is their order, puts them right; "
-                    "landmarks={} says that they shall keep it",
+                    "landmarks={} says that they shall keep it"
                 )
             return None
         order = table.of(count)

@@ -74,21 +74,7 @@ class Transform:
         generator: torch.Generator | None = None,
         **fields: Any,
     ) -> Sample:
-        """Augment a sample, keyword arguments, or a dict, or both.
-
-        Args:
-            sample: fields; see the class.
-            draw: of `augmentation.draw(1)`, to be applied again.
-            generator: to draw from instead of torch's own.
-            fields: more fields.
-
-        Returns:
-            A new dict.
-
-        Raises:
-            ValueError: arrays of wrong shapes, and what the augmentation raises. TypeError: a field that is no array of
-                real numbers.
-        """
+        """Augment a sample, keyword arguments, or a dict, or both; arguments are those of `Augmentation.forward`."""
         options = {"draw": draw, "generator": generator}
         return self._moved(self.augmentation.forward, sample, fields, options, self.camera)
 

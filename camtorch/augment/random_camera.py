@@ -51,8 +51,8 @@ _PARTS = 1.0, -1.0, 0.5, -0.5, 0.25, -0.25, 0.125, -0.125  # of a step, in the o
 _REAL = "real"
 _TURNS = "yaw", "pitch", "roll"
 _SHIFTS = "shift_x", "shift_y", "shift_z"
-_DEPTHS = {"depth": "of_depth", "distance": "of_distance"}
-"""Fields of samples that say how far away things are, and their names in a draw."""
+_DEPTHS = {"of_depth": ("depth", "z"), "of_distance": ("distance", "distance")}
+"""In a draw, how far away things are: the field of samples that says so, and what it holds."""
 _FOCAL, _CENTRE, _DISTORTION, _CROP = (0.95, 1.05), (-0.02, 0.02), (-0.02, 0.02), (0.9, 1.0)
 _LENS_FOCAL, _LENS_CENTRE, _LENS_DISTORTION = (0.9, 1.1), (-0.03, 0.03), (-0.05, 0.05)
 _USUAL = _FOCAL, _CENTRE, _DISTORTION, _CROP, _LENS_FOCAL, _LENS_CENTRE, _LENS_DISTORTION
@@ -281,7 +281,7 @@ class RandomCamera(Augmentation):
             f"{self._name}: asked for fov={asked:g} degrees at least, an image is {float(made[less].min()):.0f} wide: "
             f"min_filled={share:g} zooms until so much of it is filled, and the camera of the images, "
             f"{float(source.fov[..., 0].max()):.0f} degrees wide, shows no more where the new one looks. fov='source' "
-            "asks for what it has; with min_filled=0 the rest stays empty",
+            "asks for what it has; with min_filled=0 the rest stays empty"
         )
 
     def _target(
@@ -440,9 +440,9 @@ class RandomMount(RandomCamera):
         draw = super()._of_sample(draw, named)
         if _SHIFTS[0] not in self.ranges:
             return draw
-        for kind, key in _DEPTHS.items():
+        for key, (field, _) in _DEPTHS.items():
             for found, value in named.values():
-                if found == kind and isinstance(value, Tensor):
+                if found == field and isinstance(value, Tensor):
                     return {**draw, key: value if value.ndim == 4 else value[:, None]}
         raise ValueError(
             f"{self._name}: shift moves the camera, and near things against far ones: the sample needs depth (B, 1, H, "
@@ -450,21 +450,18 @@ class RandomMount(RandomCamera):
         )
 
     def _checked_draw(self, draw: Mapping[str, Tensor]) -> Mapping[str, Any]:
-        return {**super()._checked_draw(draw), **{key: draw[key] for key in _DEPTHS.values() if key in draw}}
+        return {**super()._checked_draw(draw), **{key: draw[key] for key in _DEPTHS if key in draw}}
 
     def _part(self, rows: list[int] | None, source: Camera, draw: Mapping[str, Any]) -> Part:
         if _SHIFTS[0] not in self.ranges:
             return super()._part(rows, source, draw)
-        depth = {key: draw[key] for key in _DEPTHS.values() if key in draw}
-        if not depth:
+        key = next((key for key in reversed(_DEPTHS) if key in draw), None)
+        if key is None:
             raise ValueError(f"{self._name}: shift needs the sample's depth; call the augmentation with the sample")
-        (key, values), count = depth.popitem(), len(draw["apply"])
         part = super()._part(rows, source, {name: v for name, v in draw.items() if name not in (*_SHIFTS, key)})
         shifts = [torch.as_tensor(draw[name], dtype=torch.float64) for name in _SHIFTS]
-        shift = torch.stack(shifts, -1).expand(count, 3)
-        kind = next(kind for kind, name in _DEPTHS.items() if name == key)
-        kind = "z" if kind == "depth" else kind
-        warp = ShiftedWarp(source, part.target, part.warp.rotation, values, kind, shift, **self.options)
+        shift = torch.stack(shifts, -1).expand(len(draw["apply"]), 3)
+        warp = ShiftedWarp(source, part.target, part.warp.rotation, draw[key], _DEPTHS[key][1], shift, **self.options)
         return replace(part, moves=warp)
 
 

@@ -67,18 +67,12 @@ Move = Callable[[Change, Tensor, Mapping[str, float]], Any]
 class Field:
     """A kind of data."""
 
-    dims: int
-    """The least number of dims of a single sample."""
-    most_dims: int
-    """The most."""
-    last: tuple[int, ...]
-    """What its last dim may be; empty: anything."""
-    shape: str
-    """In words, of a batch."""
-    move: Move
-    """(change, batch, options) -> batch, or (batch, valid)."""
-    decides: bool = False
-    """Whether its number of dims tells a batch from a single sample."""
+    dims: int  # the least number of dims of a single sample
+    most_dims: int  # the most
+    last: tuple[int, ...]  # what its last dim may be; empty: anything
+    shape: str  # in words, of a batch
+    move: Move  # (change, batch, options) -> batch, or (batch, valid)
+    decides: bool = False  # whether its number of dims tells a batch from a single sample
 
 
 def _planes(move: Move) -> Move:
@@ -125,10 +119,6 @@ _ROUNDING = 0.01
 _MOST_FORMS = 16  # of samples that a transform remembers
 
 
-def _rays(change: Change, rays: Tensor, options: Mapping[str, float]) -> Tensor:
-    return change.rays(rays)
-
-
 def _positions(change: Change, points: Tensor, options: Mapping[str, float]) -> Tensor:
     return change.positions(points)
 
@@ -137,7 +127,9 @@ def _pixels(change: Change, pixels: Tensor, options: Mapping[str, float]) -> tup
     return change.points(pixels)
 
 
-_DIRECTIONS = Field(1, _MANY, (3,), "(B, *N, 3) directions of the camera frame", _rays)
+_DIRECTIONS = Field(
+    1, _MANY, (3,), "(B, *N, 3) directions of the camera frame", lambda change, rays, _: change.rays(rays)
+)
 _POSE = Field(2, 2, (4,), "(B, 4, 4) or (B, 3, 4), camera from head", _pose)
 _MASKS = "(B, C, H, W) or (B, H, W)"
 _DEPTHS = "(B, 1, H, W) or (B, H, W), along"
@@ -355,10 +347,8 @@ class SampleTransform(nn.Module):
     fields: dict[str, str]
     mask_fill: float
     valid_mask: bool
-    options: Options
-    """Of warps."""
-    antialias: bool | None
-    """As in `options`, but None where each warp says."""
+    options: Options  # of warps
+    antialias: bool | None  # as in `options`, but None where each warp says
     other_words: ClassVar[Mapping[str, str]] = {}
     """Words that people try as keywords -> the keyword, for the hint of an error."""
 
@@ -416,11 +406,9 @@ class SampleTransform(nn.Module):
             return f"; did you mean {cls.other_words.get(close[0], close[0])!r}?"
         return f"; known are {', '.join(dict.fromkeys(known))}"
 
-    mirroring: Mirroring | None = None
-    """What changes places where an augmentation mirrors; None: it never does."""
+    mirroring: Mirroring | None = None  # what changes places where an augmentation mirrors; None: it never does
 
-    needs_camera: bool = True
-    """Whether samples, or it, need a camera; edits do not."""
+    needs_camera: bool = True  # whether samples, or it, need a camera; edits do not
 
     def _camera_of(self, named: Named) -> Camera:
         """The camera of a sample that has none, nor the augmentation."""

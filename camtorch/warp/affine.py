@@ -33,13 +33,7 @@ class MirrorWarp(Warp):
     """
 
     def __init__(
-        self,
-        source: Camera,
-        target: Camera,
-        rotation: Tensor | None,
-        *,
-        antialias: bool | None = False,
-        **options: Any,
+        self, source: Camera, target: Camera, rotation: Tensor | None, *, antialias: bool | None = False, **options: Any
     ):
         super().__init__(source, target, None, antialias=bool(antialias), **options)
         self.turned_by(rotation)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from contextlib import nullcontext
+from dataclasses import dataclass
 from functools import cached_property, lru_cache, partial, reduce
 from typing import NamedTuple
 
@@ -38,12 +39,9 @@ Exact = Callable[[Tensor], tuple[Tensor, Tensor]]
 class Sampling(NamedTuple):
     """Where some rows of a target, or all of them, sample the source's image."""
 
-    grid: Tensor
-    """(B or 1, h, W', 2): positions as of `grid_sample`, `OUTSIDE` where there is none."""
-    mapped: Tensor
-    """(B or 1, h, W') bool: the pixel has a ray, and the source maps it."""
-    scale: Tensor | None
-    """(B or 1, h, W'): see `local_scale`; None where nobody asks for it."""
+    grid: Tensor  # (B or 1, h, W', 2): positions as of `grid_sample`, `OUTSIDE` where there is none
+    mapped: Tensor  # (B or 1, h, W') bool: the pixel has a ray, and the source maps it
+    scale: Tensor | None  # (B or 1, h, W'): see `local_scale`; None where nobody asks for it
 
     def cameras(self, rows: slice | Tensor) -> Sampling:
         """Of these cameras of the batch."""
@@ -56,6 +54,7 @@ class Sampling(NamedTuple):
         return Sampling(self.grid[:, down, across], self.mapped[:, down, across], scale)
 
 
+@dataclass(eq=False)
 class Lattice:
     """Where every pixel of a target (h, w) samples the source's image, by `nodes` (B, 2, n + 5, m + 5) of every eighth.
 
@@ -67,9 +66,6 @@ class Lattice:
     cells: Tensor
     exact: Tensor
     size: tuple[int, int]
-
-    def __init__(self, nodes: Tensor, cells: Tensor, exact: Tensor, size: tuple[int, int]):
-        self.nodes, self.cells, self.exact, self.size = nodes, cells, exact, size
 
     def cameras(self, rows: slice | Tensor) -> Lattice:
         """Of these cameras of the batch."""
@@ -132,9 +128,16 @@ def locate(
                 return lattice
             tolerance = 0.0
         return Sampling(*tabulate(source, target, rotation, tolerance, rows, padding), None)
-    # the scale is that between neighbours
-    around = range(max(rows.start - 1, 0), min(rows.stop + 1, target._size_for("Warp")[0]))
-    where = scaled(source, *tabulate(source, target, rotation, tolerance, around, padding))
+    found = partial(tabulate, source, target, rotation, tolerance, padding=padding)
+    return scaled_rows(source, rows, target._size_for("Warp")[0], found)
+
+
+def scaled_rows(
+    source: Camera, rows: range, height: int, positions: Callable[[range], tuple[Tensor, Tensor]]
+) -> Sampling:
+    """Return the `positions` of rows of a target with their scale, which is that between neighbours."""
+    around = range(max(rows.start - 1, 0), min(rows.stop + 1, height))
+    where = scaled(source, *positions(around))
     return where if around == rows else where.part(slice(rows.start - around.start, rows.stop - around.start))
 
 

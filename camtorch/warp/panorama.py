@@ -23,10 +23,8 @@ PANORAMAS = Equirectangular, Cylindrical, *_DOWN
 class Seam(NamedTuple):
     """By how much images of a whole turn become longer."""
 
-    axis: int
-    """0: the turn goes across, so that left and right meet; 1: down, so that top and bottom do."""
-    rims: tuple[int, int, int, int]
-    """Pixels on the left, right, top and bottom."""
+    axis: int  # 0: the turn goes across, so that left and right meet; 1: down, so that top and bottom do
+    rims: tuple[int, int, int, int]  # pixels on the left, right, top and bottom
 
     def around(self, images: Tensor) -> Tensor:
         """Return images (B, C, H, W) with the pixels that lie beyond their edges."""

@@ -11,7 +11,7 @@ from camtorch._arguments import Numbers, as_batch, as_coordinates, check_devices
 from camtorch.camera import Camera
 from camtorch.extrinsics import Extrinsics
 from camtorch.rotations import rotate_planes, rotation_matrix
-from camtorch.warp.grid import Sampling, pixels_of_rows, scaled, to_positions
+from camtorch.warp.grid import Sampling, pixels_of_rows, scaled_rows, to_positions
 from camtorch.warp.panorama import off_poles
 from camtorch.warp.sampling import PaddingMode, WarpOptions
 from camtorch.warp.warp import Warp
@@ -54,10 +54,7 @@ class ProxyWarp(Warp):
     def _locate(self, rows: range, padding: PaddingMode, tolerance: float) -> Sampling:
         if not self.antialias:
             return Sampling(*self._of_rows(rows), None)
-        # the scale is that between neighbours
-        around = range(max(rows.start - 1, 0), min(rows.stop + 1, self.target._size_for("Warp")[0]))
-        where = scaled(self._sampled, *self._of_rows(around))
-        return where.part(slice(rows.start - around.start, rows.stop - around.start))
+        return scaled_rows(self._sampled, rows, self.target._size_for("Warp")[0], self._of_rows)
 
     def _of_rows(self, rows: range) -> tuple[Tensor, Tensor]:
         pixels = pixels_of_rows(self.target, rows)

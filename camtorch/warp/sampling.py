@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Literal, NamedTuple, TypedDict, TypeVar, get_args
 
@@ -143,7 +144,7 @@ def _by_torch(images: Tensor, where: Sampling | Lattice, how: Sampler, kept: dic
 
 
 def _levels(kept: dict[int, Pyramid] | None, i: int, images: Tensor, finite: bool) -> Pyramid:
-    """Of the images from the i-th on: those kept, with the halves that they have got."""
+    """Return the images from the i-th on: those kept, with the halves that they have got."""
     return Pyramid(images, finite) if kept is None else kept.setdefault(i, Pyramid(images, finite))
 
 
@@ -204,23 +205,20 @@ def _render(images: Tensor, grid: Tensor, where: Sampling, levels: Pyramid, how:
     return result
 
 
+@dataclass(eq=False)
 class Pyramid:
     """Images, and their half, a pyramid again, when it is asked for (Williams, Pyramidal Parametrics, 1983)."""
 
     images: Tensor
     finite: bool
 
-    def __init__(self, images: Tensor, finite: bool):
-        self.images, self.finite = images, finite
-
     @cached_property
     def half(self) -> Pyramid:
         """Of a dtype to compute in."""
         size = [max(side // 2, 1) for side in self.images.shape[-2:]]
         # a copy in another dtype is large
-        channels = self.images.split(
-            1 if self.images.dtype != wide_dtype(self.images.dtype) else self.images.shape[1], 1
-        )
+        step = 1 if self.images.dtype != wide_dtype(self.images.dtype) else self.images.shape[1]
+        channels = self.images.split(step, 1)
         halves = [F.interpolate(widen(c), size, mode="bilinear", align_corners=False, antialias=True) for c in channels]
         return Pyramid(torch.cat(halves, 1), self.finite)
 
@@ -351,21 +349,17 @@ def _pick(images: Tensor, where: Sampling, how: Sampler) -> Tensor:
     limits = torch.iinfo(images.dtype)
     values = [min(max(round(value), limits.min), limits.max) for value in how.fill]
     value = torch.tensor(values, dtype=images.dtype, device=images.device)[:, None, None]
-    u, v, inside = _nearest(where.grid, images.shape[-2:], how.padding_mode)
+    height, width = images.shape[-2:]
+    u, v = (
+        _padded(((position + 1) * side - 1) / 2, side, how.padding_mode).round()
+        for position, side in zip(where.grid.unbind(-1), (width, height), strict=True)
+    )
+    inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
     seen = inside if how.padding_mode == "zeros" else where.mapped
-    index = torch.where(inside, v.long() * images.shape[-1] + u.long(), 0).flatten(1).unsqueeze(1)
+    index = torch.where(inside, v.long() * width + u.long(), 0).flatten(1).unsqueeze(1)
     pixels = images.view(SIGNED.get(images.dtype, images.dtype)).flatten(2)
     picked = pixels.gather(2, index.expand(*images.shape[:2], -1)).view(images.dtype)
     return torch.where(seen.unsqueeze(1), picked.unflatten(2, where.grid.shape[1:3]), value)
-
-
-def _nearest(grid: Tensor, size: torch.Size, padding_mode: PaddingMode) -> tuple[Tensor, Tensor, Tensor]:
-    """The pixel nearest to each position of a grid (B, h, w, 2): u and v (B, h, w), and whether it is on the image."""
-    u, v = (
-        _padded(((position + 1) * side - 1) / 2, side, padding_mode).round()
-        for position, side in zip(grid.unbind(-1), size[::-1], strict=True)
-    )
-    return u, v, (u >= 0) & (u < size[1]) & (v >= 0) & (v < size[0])
 
 
 class Options(TypedDict):

@@ -31,8 +31,7 @@ class ShiftedWarp(Warp):
     is_an_operator: ClassVar[bool] = False
     _seam = None
     shift: Tensor
-    distance: Tensor
-    """(B, H, W): along the rays of the source; 0 where it is not known."""
+    distance: Tensor  # (B, H, W): along the rays of the source; 0 where it is not known
 
     def __init__(
         self,

@@ -128,13 +128,7 @@ class Warp(GeometryModule):
         self._set(source, target, options, _check_parts(source, target, rotation))
         self.turned_by(rotation)
 
-    def _set(
-        self,
-        source: Camera,
-        target: Camera,
-        options: Options,
-        batch: torch.Size | None = None,
-    ) -> None:
+    def _set(self, source: Camera, target: Camera, options: Options, batch: torch.Size | None = None) -> None:
         if batch is None:
             batch = broadcast_shapes(source.batch_shape, target.batch_shape)
         super().__init__(
