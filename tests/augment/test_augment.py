@@ -110,24 +110,18 @@ def test_every_field_moves_together_between_any_two_models(key, which):
     torch.testing.assert_close(back["points"], points, atol=1e-5, rtol=0)
 
 
-@pytest.mark.parametrize(
-    ("angle", "moves"),
-    [("yaw", (-1, 0)), ("pitch", (0, 1)), ("roll", None)],
-)
+@pytest.mark.parametrize(("angle", "moves"), [("yaw", (-1, 0)), ("pitch", (0, 1)), ("roll", None)])
 def test_signs_of_the_angles(angle, moves):
     """Turning right moves the image left, looking up moves it down, leaning right turns it counterclockwise."""
-    camera = pinhole()
-    none = dict.fromkeys(("yaw", "pitch", "roll"), (0, 0))
-    augmentation = RandomMount(camera=camera, **{**none, angle: (10, 10)})
+    still, ten = dict.fromkeys(("yaw", "pitch", "roll"), (0, 0)), math.radians(10)
+    augmentation = RandomMount(camera=pinhole(), **{**still, angle: (10, 10)})
     centre = (torch.tensor(SIZE[::-1]) - 1) / 2
     pixel = centre if moves else centre + torch.tensor([100.0, 0.0])
     shift = augmentation(keypoints=pixel[None])["keypoints"][0] - pixel
+    expected = torch.tensor([math.cos(ten) - 1, -math.sin(ten)]) * 100
     if moves:
-        expected = torch.tensor(moves) * 250 * math.tan(math.radians(10))
-    else:
-        turned = torch.tensor([math.cos(math.radians(10)), -math.sin(math.radians(10))]) * 100
-        expected = turned - torch.tensor([100.0, 0.0])
-    torch.testing.assert_close(shift, expected.float(), atol=1e-3, rtol=0)
+        expected = torch.tensor(moves) * 250 * math.tan(ten)
+    torch.testing.assert_close(shift, expected, atol=1e-3, rtol=0)
 
 
 def sample(count=3, camera=None):
@@ -309,16 +303,14 @@ def test_poses_turn_with_the_camera():
     batch = sample()
     out = RandomMount(roll=60)(batch)
     rotation = out["rotation"]
-    expected = torch.eye(4).repeat(3, 1, 1)
-    expected[:, :3] = rotation @ batch["head_pose"][:, :3]
-    torch.testing.assert_close(out["head_pose"], expected, atol=1e-6, rtol=0)
-    before, after = (ct.Extrinsics(s["rvec"], s["tvec"]) for s in (batch, out))
-    head = torch.rand(3, 9, 3)
-    torch.testing.assert_close(after(head), torch.einsum("bij,bnj->bni", rotation, before(head)), atol=2e-6, rtol=0)
-    gaze = ct.augment.from_pitch_yaw(out["pitch_yaw"])
-    straight = torch.einsum("bij,bj->bi", rotation, ct.augment.from_pitch_yaw(batch["pitch_yaw"]))
-    torch.testing.assert_close(gaze, straight, atol=1e-6, rtol=0)
-    assert torch.equal(ct.augment.from_pitch_yaw(torch.zeros(2)), torch.tensor([0.0, 0.0, -1.0]))
+    torch.testing.assert_close(out["head_pose"][:, :3], rotation @ batch["head_pose"][:, :3], atol=1e-6, rtol=0)
+    assert torch.equal(out["head_pose"][:, 3], batch["head_pose"][:, 3])
+    head, straight = torch.rand(3, 9, 3), ct.augment.from_pitch_yaw
+    after, before = (ct.Extrinsics(s["rvec"], s["tvec"])(head) for s in (out, batch))
+    torch.testing.assert_close(after, before @ rotation.mT, atol=2e-6, rtol=0)
+    gaze = rotation @ straight(batch["pitch_yaw"])[..., None]
+    torch.testing.assert_close(straight(out["pitch_yaw"]), gaze[..., 0], atol=1e-6, rtol=0)
+    assert torch.equal(straight(torch.zeros(2)), torch.tensor([0.0, 0.0, -1.0]))
 
 
 def test_jittered_lenses_stay_invertible_and_bounded():
@@ -466,14 +458,13 @@ def test_padding_and_fill():
     batch = sample()
     mount = {"yaw": (40, 40), "pitch": (0, 0), "roll": (0, 0), "tolerance": 0}  # a lattice may differ by padding
     black, grey = (RandomMount(**mount, fill=fill, mask_fill=9, valid_mask=True)(batch) for fill in (0.0, 0.5))
-    seen = black["image_valid"].expand_as(black["image"])
-    assert 0.1 < seen.float().mean() < 0.9
-    inside = torch.nn.functional.max_pool2d((~black["image_valid"]).float(), 7, 1, 3).expand_as(seen) == 0
-    torch.testing.assert_close(black["image"][inside], grey["image"][inside])
-    outside = torch.nn.functional.max_pool2d(seen.float(), 3, 1, 1) == 0
-    assert (grey["image"][outside] == 0.5).all()
-    assert (black["mask"][:, None].expand_as(seen)[~seen] == 9).all()
     border = RandomMount(**mount, padding_mode="border")(batch)["image"]
+    seen = black["image_valid"].expand_as(border)
+    assert 0.1 < seen.float().mean() < 0.9
+    inside, outside = (torch.nn.functional.max_pool2d(w.float(), 7, 1, 3) == 0 for w in (~seen, seen))
+    torch.testing.assert_close(black["image"][inside], grey["image"][inside])
+    assert (grey["image"][outside] == 0.5).all()
+    assert (black["mask"][~seen[:, 0]] == 9).all()
     assert (border[outside] > 0).any()
     # which cells are interpolated depends on the padding: 0.001 px of an image whose pixels differ by 1 at the most
     torch.testing.assert_close(border[inside], black["image"][inside], atol=1e-3, rtol=0)

@@ -44,19 +44,20 @@ def test_kornia_has_the_flags_of_the_keypoints_it_moved():
         assert torch.equal(again.keypoints_valid, aug.keypoints_valid)
 
 
-def test_what_one_augmentation_lost_the_next_ones_do_not_find():
-    turned = ct.augment.RandomCamera("pinhole", fov=60, yaw=(150, 150), pitch=0, roll=0, min_filled=0, distortion=None)
+def turned_away():
+    """Two augmentations with their cameras: the second would find again what the first one lost."""
+    away = ct.augment.RandomCamera("pinhole", fov=60, yaw=(150, 150), pitch=0, roll=0, min_filled=0, distortion=None)
     pinhole = ct.Pinhole([55.0, 55.0, 31.5, 23.5], image_size=SIZE).requires_grad_(False)
     rolled = ct.augment.RandomMount(yaw=0, pitch=0, roll=(180, 180))
-    seq = K.AugmentationSequential(
-        ct.augment.kornia.CameraAugmentation(turned, fisheye()),
-        ct.augment.kornia.CameraAugmentation(rolled, pinhole.crop(-2, -2, *SIZE)),
-        data_keys=["input", "keypoints"],
-    )
+    return (away, fisheye()), (rolled, pinhole.crop(-2, -2, *SIZE))
+
+
+def test_what_one_augmentation_lost_the_next_ones_do_not_find():
+    both = [ct.augment.kornia.CameraAugmentation(*one) for one in turned_away()]
+    seq = K.AugmentationSequential(*both, data_keys=["input", "keypoints"])
     _, moved = seq(torch.rand(1, 1, *SIZE), POINTS[None, :1])
-    assert not seq[0].keypoints_valid.any()
     assert moved.tolist() == [[[-1, -1]]]
-    assert not seq[1].keypoints_valid.any()
+    assert not any(aug.keypoints_valid.any() for aug in both)
 
 
 # -- torchvision
@@ -100,13 +101,8 @@ def test_torchvision_s_flags_go_on_through_chains(vision):
     assert target["keypoints_valid"].tolist() == [False, False, True, False]
     skipped = front_end.Transform(narrow(p=0), fisheye(), valid=True)(*sample(tv))[1]
     assert skipped["keypoints_valid"].tolist() == [True, True, True, False]
-    turned = ct.augment.RandomCamera("pinhole", fov=60, yaw=(150, 150), pitch=0, roll=0, min_filled=0)
-    pinhole = ct.Pinhole([55.0, 55.0, 31.5, 23.5], image_size=SIZE).requires_grad_(False)
-    rolled = ct.augment.RandomMount(yaw=0, pitch=0, roll=(180, 180))
-    first = front_end.Transform(turned, fisheye(), valid=True)
-    second = front_end.Transform(rolled, pinhole.crop(-2, -2, *SIZE), valid=True)
+    first, second = (front_end.Transform(*one, valid=True) for one in turned_away())
     _, lost = second(*first(*sample(tv)))
-    assert lost["keypoints"].as_subclass(torch.Tensor)[0].tolist() == [-1, -1]
-    assert lost["boxes"].as_subclass(torch.Tensor)[0].tolist() == [-1, -1, -1, -1]
-    assert not lost["keypoints_valid"].any()
-    assert not lost["boxes_valid"].any()
+    for name in ("keypoints", "boxes"):
+        assert (lost[name].as_subclass(torch.Tensor)[0] == -1).all()
+        assert not lost[f"{name}_valid"].any()

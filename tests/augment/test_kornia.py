@@ -118,20 +118,18 @@ def test_boxes_of_several_counts_and_without_batch():
 
 
 def test_masks_keep_class_ids_and_lists_are_warped_one_by_one():
-    seq = K.AugmentationSequential(
-        adapter.RandomCamera(camera(), mask_fill=255, tolerance=0.0), data_keys=["input", "mask", "keypoints"]
-    )
+    aug = adapter.RandomCamera(camera(), mask_fill=255, tolerance=0.0)
+    seq = K.AugmentationSequential(aug, data_keys=["input", "mask", "keypoints"])
     torch.manual_seed(7)
     _, together, moved = seq(images(), masks(), points())
     assert together.dtype == torch.int64
     assert set(together.unique().tolist()) <= {*range(200), 255}
-    params, last = seq._params, seq[0].last
+    params = seq._params
     _, listed, again = seq(images(), list(masks()), points(), params=params)
     assert equal([mask.reshape(1, *SIZE) for mask in listed], together)
     assert torch.equal(moved, again)
-    assert seq[0].last.count == last.count == 3
-    alone = seq(images(), masks()[:, 0], points(), params=params)[1]
-    assert torch.equal(alone, together)
+    assert aug.last.count == 3
+    assert torch.equal(seq(images(), masks()[:, 0], points(), params=params)[1], together)
 
 
 def test_soft_masks_take_the_resampling_they_ask_for():
@@ -180,24 +178,22 @@ def test_rows_that_p_skips_are_bit_identical(cls):
 
 
 def test_same_on_batch_and_p_batch():
-    aug = adapter.RandomCamera(camera(), same_on_batch=True)
     same = images(1).expand(3, -1, -1, -1)
-    warped = aug(same)
-    assert torch.equal(warped[0], warped[2])
-    assert not torch.equal(warped[0], same[0])
     # a container overrides what its children say
-    seq = K.AugmentationSequential(adapter.RandomCamera(camera()), same_on_batch=True)
-    warped = seq(same)
-    assert torch.equal(warped[0], warped[2])
-    never = adapter.RandomCamera(camera(), p_batch=0.0)
-    assert torch.equal(never(same), same)
+    for one in (
+        adapter.RandomCamera(camera(), same_on_batch=True),
+        K.AugmentationSequential(adapter.RandomCamera(camera()), same_on_batch=True),
+    ):
+        warped = one(same)
+        assert torch.equal(warped[0], warped[2])
+        assert not torch.equal(warped[0], same[0])
     torch.manual_seed(1)
-    whole = adapter.RandomCamera(camera(), p_batch=0.5)
-    applied = set()
-    for _ in range(8):
-        whole(same)
-        applied.add(tuple(whole._params["batch_prob"].tolist()))
-    assert applied == {(0.0,) * 3, (1.0,) * 3}
+    for p, gates in ((0.0, {(0.0,) * 3}), (0.5, {(0.0,) * 3, (1.0,) * 3})):
+        aug, applied = adapter.RandomCamera(camera(), p_batch=p), set()
+        for _ in range(8):
+            assert torch.equal(aug(same), same) == (aug._params["batch_prob"] == 0).all()
+            applied.add(tuple(aug._params["batch_prob"].tolist()))
+        assert applied == gates
 
 
 def test_keepdim_and_images_without_batch():

@@ -40,7 +40,8 @@ class Samples(Dataset):
         image, points = torch.linspace(0, 1, 12 * 16).reshape(1, *SIZE), torch.tensor([[7.0, 5.0], [2.0, 3.0]])
         if self.arrays:
             image, points = image[0].numpy(), points.numpy()
-        return self.transform(image=image, keypoints=points, gaze=np.float32([0, 0, -1]), camera=self.camera, id=index)
+        out = self.transform(image=image, keypoints=points, gaze=np.float32([0, 0, -1]), camera=self.camera, id=index)
+        return {**out, "threads": torch.get_num_threads()}
 
 
 def batches(context, arrays=False):
@@ -63,6 +64,7 @@ def test_workers_differ_and_runs_repeat(arrays):
     runs = [batches("fork", arrays), batches("fork", arrays), *([] if arrays else [batches("spawn")])]
     for run in runs:
         assert torch.cat([batch["id"] for batch in run]).tolist() == list(range(COUNT))
+        assert all((batch["threads"] == 1).all() for batch in run)  # as torch gives a worker
         for batch, first in zip(run, runs[0], strict=True):
             for name in ("image", "keypoints", "keypoints_valid", "gaze", "rotation"):
                 assert torch.equal(batch[name], first[name]), name

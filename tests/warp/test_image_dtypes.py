@@ -1,4 +1,4 @@
-"""Laws of what images hold: ids of every width, pixels that are no numbers, wrong layouts, and no graph in vain."""
+"""Laws of what images hold: ids of every width, pixels that are no numbers, and no pixels at all."""
 
 import numpy as np
 import pytest
@@ -117,9 +117,6 @@ def test_no_channels_and_no_images_make_none(mode, options):
             result = ct.Warp(fisheye(), pinhole(), mode=mode, **options)(torch.zeros(*shape, *SIZE, dtype=dtype))
             assert result.shape == (*shape, *SIZE)
             assert result.dtype == dtype
-
-
-# -- no graph in vain
 
 
 # -- what is handed out belongs to the caller

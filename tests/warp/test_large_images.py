@@ -51,23 +51,17 @@ def test_tiles_of_a_large_image_change_nothing(dtype, mode, padding_mode, monkey
 
 
 @pytest.mark.parametrize(("rows", "antialias"), [(1, False), (7, True), (16, False), (None, True)])
-def test_strips_are_the_rows_of_the_whole(rows, antialias):
-    one = ct.Warp(*pair(), antialias=antialias, fill=3.0)
+@pytest.mark.parametrize("cameras", [1, 2])
+def test_strips_are_the_rows_of_the_whole(rows, antialias, cameras):
+    *pair_of_them, turned = pair()
+    turned = turned if cameras == 1 else torch.stack((turned, pair((0.0, 0, 5))[2]))
+    one = ct.Warp(*pair_of_them, turned, antialias=antialias, fill=3.0)
     for given in (images(torch.uint8, 2), images(torch.float32)):
         strips = list(one.strips(given, rows=rows))
         assert [part.stop for part, _, _ in strips][-1] == 70
         assert [part.start for part, _, _ in strips] == [0, *(part.stop for part, _, _ in strips)][:-1]
         assert torch.equal(torch.cat([part for _, part, _ in strips], 2), one(given))
         assert torch.equal(torch.cat([valid for _, _, valid in strips], 2), one.valid_mask())
-
-
-def test_strips_of_a_batch_of_cameras_and_of_one_image():
-    source, target, _ = pair()
-    turned = torch.stack([ct.augment.mount_rotation(*(torch.tensor(a) for a in (yaw, 0.0, 5.0))) for yaw in (0.0, 40)])
-    one = ct.Warp(source, target, turned)
-    strips = list(one.strips(images(torch.uint8), rows=20))
-    assert torch.equal(torch.cat([part for _, part, _ in strips], 2), one(images(torch.uint8)))
-    assert strips[0][2].shape == (2, 1, 20, 100)
 
 
 def test_long_grids_are_neither_made_at_once_nor_kept(monkeypatch):
