@@ -297,17 +297,13 @@ def test_a_surface_is_learnt_to_the_noise_and_one_that_ends_before_the_corners_s
     noise, draw = 0.1, torch.Generator().manual_seed(1)
     model = ct.Splined.with_grid(columns=8, rows=7, fov_x=100)
     bumps = 0.01 * torch.randn(model.default_count, generator=draw, dtype=torch.float64)
-    true = model(torch.tensor([300.0, 300.0, 319.5, 199.5], dtype=torch.float64), bumps, image_size=(400, 640))
-    y, x = torch.meshgrid(torch.arange(8.0) - 3.5, torch.arange(11.0) - 5, indexing="ij")
-    board = 0.03 * torch.stack((x, y, 0 * x), -1).reshape(-1, 3).double()
-    turns = torch.randn(14, 3, generator=draw, dtype=torch.float64) * torch.tensor([0.5, 0.5, 0.15])
-    places = torch.rand(14, 3, generator=draw, dtype=torch.float64) * torch.tensor([0.24, 0.18, 0.1])
-    views = ct.Extrinsics(turns, places + torch.tensor([-0.12, -0.09, 0.16]))
-    points = views(board[None].expand(14, -1, -1))
-    pixels, _ = true.project(points)
-    pixels = pixels.detach() + noise * torch.randn(pixels.shape, generator=draw, dtype=torch.float64)
+    true = model(torch.tensor([300.0, 300, 319.5, 199.5], dtype=torch.float64), bumps, image_size=(400, 640))
+    (board, seen, _), turns, shifts = seen_by(
+        true, 14, noise=noise, columns=11, rows=8, square=0.03, near=0.15, far=0.3
+    )
+    points = board @ turns.mT + shifts[:, None]
     _, valid = true.project(points * torch.tensor([1.06, 1.06, 1.0]))  # as the found one may stand a little askew
-    seen = torch.where((valid & true.contains(pixels))[..., None], pixels, torch.nan)
+    seen[~valid] = torch.nan
 
     def learnt(kind):
         start = first.convert(kind).camera
