@@ -117,12 +117,10 @@ def seen(
     loss: tuple[str | None, float],
     learnt: Sequence[int] | None = None,
 ) -> tuple[Seen, Tensor, Tensor]:
-    """What cameras (B,), or one, make of points (B, V, N, 3) whose pixels (B, V, N, 2) are known.
+    """Return what cameras (B,), or one, make of points (B, V, N, 3) whose pixels (B, V, N, 2) are known.
 
-    Also `Equations.view` and `Equations.shared`, if it is said what columns are by.
-
-    poses: (B, V, 3, 3), (B, V, 3). weights: (B, V, N) of the squares. loss: name and scale. learnt: numbers of
-    intrinsics, and of coefficients from 4 on.
+    Also `Equations.view` and `Equations.shared`, if `learnt` says which intrinsics, and coefficients from 4 on, learn.
+    poses: (B, V, 3, 3), (B, V, 3). weights: (B, V, N) of the squares. loss: name and scale.
     """
     compiled, plan, left = library(), native.plan, c_int64(0)
     assert compiled is not None  # or nobody has a `Native`

@@ -282,7 +282,7 @@ def _consensus(task: _Task, threshold: float) -> tuple[Tensor, Tensor]:
     pixels, seen = task.camera.project((task.rays[:, :, None] + moves).flatten(1, 2))
     pixels, seen = pixels.unflatten(1, (-1, 4)), seen.unflatten(1, (-1, 4)).all(-1)
     slopes = ((pixels[:, :, :3] - pixels[:, :, 3:]) / _MOVE).mT
-    return consensus(task.points, task.rays, slopes, seen & (task.weights > 0), threshold)[:2]
+    return consensus(task.points, task.rays, slopes, seen & (task.weights > 0), threshold)
 
 
 # -- by torch

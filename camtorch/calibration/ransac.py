@@ -27,14 +27,6 @@ _SHARED = 1 << 16  # points of samples that threads are woken for
 _Agreement = struct.Struct("12qdq").pack  # `Agreement` of native/consensus.h
 
 
-class Consensus(NamedTuple):
-    """Of B rows: rotations (B, 3, 3), translations (B, 3), and the sum of squares (B,), cut at the threshold's."""
-
-    rotations: Tensor
-    translations: Tensor
-    cost: Tensor
-
-
 class _Lines(NamedTuple):
     """Points and the rays that shall see them, of B rows, as far as distances in px go.
 
@@ -85,7 +77,7 @@ class _Lines(NamedTuple):
         return torch.cat((turn @ poses[..., :3], poses[..., 3:] + step[..., 3:, :]), -1)
 
 
-def consensus(points: Tensor, rays: Tensor, slopes: Tensor, seen: Tensor, threshold: float) -> Consensus:
+def consensus(points: Tensor, rays: Tensor, slopes: Tensor, seen: Tensor, threshold: float) -> tuple[Tensor, Tensor]:
     """Return the poses, camera from object, of least squared distances of points from rays, each cut at a threshold.
 
     Few points are drawn (by a generator of its own, the same for all rows, whose results so do not depend on each
@@ -120,7 +112,7 @@ def consensus(points: Tensor, rays: Tensor, slopes: Tensor, seen: Tensor, thresh
         share = torch.stack([(share - i) / (few - i) for i in range(size)]).prod(0)
         most = _MOST_OF_FOUR if compiled is None else _MOST
         rows = rows[drawn * share < _SURE] if drawn < most else rows[:0]
-    return Consensus(best[..., :3], best[..., 3], costs)
+    return best[..., :3], best[..., 3]
 
 
 class _Search(NamedTuple):

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
-from camtorch.calibration.bundle import SETTLED, Adjusted, Free, Poses, Sight, State, adjust, minima, pixel_jacobians
+from camtorch.calibration.bundle import SETTLED, Adjusted, Free, Poses, Sight, State, adjust, minima
 from camtorch.calibration.rays import poses_from_rays
 from camtorch.camera import Camera, fixed_camera
 from camtorch.convert import fitting, views
@@ -383,7 +383,7 @@ def _refined(lens: _Lens, few: Observations, free: Free, loss: tuple[str | None,
 def _fitted(lens: _Lens, few: Observations, model: type[Camera], count: int, fixed: Collection[str]) -> _Lens:
     """Cameras (S,) of another model that see the corners, as the boards lie, where they were seen."""
     camera = lens.camera
-    slopes = torch.cat((_focal_at_axis(camera), camera.intrinsics[:, 2:]), -1)
+    slopes = views.focal_at_axis(camera)
     rays = torch.nn.functional.normalize(lens.boards.moved(few.points), dim=-1)
     inliers = few.seen & (lens.errors(few) < _OUTLIER * lens.scale)
     reach = torch.where(inliers, angles_from_axis(rays), 0.0).amax((-1, -2))
@@ -412,7 +412,7 @@ def _fitted(lens: _Lens, few: Observations, model: type[Camera], count: int, fix
     seen = fitting.Observations(*(t.expand(len(begun), *t.shape[1:]) for t in seen))
     slopes = slopes.expand(len(begun), -1)
     ones = slopes.new_tensor([1.0, 1.0, 0.0, 0.0]).expand_as(slopes)
-    focal = slopes[:, :2] / _focal_at_axis(fixed_camera(model, ones, begun)).clamp(min=_LEAST_SLOPE)
+    focal = slopes[:, :2] / views.focal_at_axis(fixed_camera(model, ones, begun))[:, :2].clamp(min=_LEAST_SLOPE)
     parameters = torch.cat((focal, slopes[:, 2:], begun), -1)
     _, valid = fixed_camera(model, parameters[:, :4], begun).project(seen.rays)
     if values or not bool((valid | (seen.weights == 0)).all()):
@@ -424,14 +424,6 @@ def _fitted(lens: _Lens, few: Observations, model: type[Camera], count: int, fix
         if name in fixed:
             parameters[:, i] = (lens.image_size[3 - i] - 1) / 2
     return _Lens(model, parameters, lens.boards.expand(len(parameters)), lens.scale, lens.image_size)
-
-
-def _focal_at_axis(camera: Camera) -> Tensor:
-    """(C, 2) px per radian at the axis of cameras (C,); the stated ones where the coefficients make no lens."""
-    stated = camera.intrinsics[:, :2]
-    axis = stated.new_tensor([0.0, 0.0, 1.0]).expand(len(stated), 1, 3)
-    slopes = pixel_jacobians(camera, axis, False)[0][:, 0, :, :2].diagonal(dim1=-2, dim2=-1)
-    return torch.where(torch.isfinite(slopes) & (slopes > 0), slopes, stated)
 
 
 def _check_reach(lens: _Lens, few: Observations, other: _Lens) -> None:

@@ -184,13 +184,11 @@ def reprojection(
     return _reduced(torch.linalg.vector_norm(off, dim=-1), valid & seen, weights, reduction, owner)
 
 
-def _check(predicted: object, target: object, owner: str) -> torch.Size:
+def _check(predicted: Camera, target: Camera, owner: str) -> torch.Size:
     """The batch dims of two cameras."""
     for camera, name in ((predicted, "predicted"), (target, "target")):
         if not isinstance(camera, Camera):
             raise TypeError(f"{owner}: {name} must be a Camera; got {no_camera(camera)}")
-    assert isinstance(predicted, Camera)
-    assert isinstance(target, Camera)
     shapes = predicted.batch_shape, target.batch_shape
     try:
         return broadcast_shapes(*shapes)
