@@ -65,50 +65,27 @@ RANGES = {
     "fisheye624": {"k": (0.05, 0.5), "p": (2e-3, 0.05), "s": (2e-3, 0.05)},
 }
 
+_OCAM, _NCORE, _PIXEL = 206.517, 3139.4858, 5.3808565e-4
 # Real calibrations of models that no reference file is of: intrinsics, distortion, image size
 CALIBRATIONS = {
     # WoodScape, as its polynomial in pixels: 339.749, -31.988, 48.275, -7.201, and an offset of (3.942, -3.093)
-    "woodscape": (
-        (339.749, 339.749, 643.442, 479.407),
-        (-31.988 / 339.749, 48.275 / 339.749, -7.201 / 339.749),
-        (966, 1280),
-    ),
+    "woodscape": ((339.749, 339.749, 643.442, 479.407), [w / 339.749 for w in (-31.988, 48.275, -7.201)], (966, 1280)),
     # a result of the toolbox, printed in the README of omni_cam: ss is -206.517, 0, 2.207161e-3, -4.879622e-6,
     # 1.865656e-8, the centre is row 241.800066 and column 394.552874, and c, d, e are 1.00033, 0.000219, 0.000257
     "ocamcalib": (
-        (206.517, 206.517 * 1.00033, 394.552874, 241.800066),
-        (
-            0.000219 / 1.00033,
-            0.000257,
-            0.0,
-            *(-w * 206.517**i for i, w in enumerate((2.207161e-3, -4.879622e-6, 1.865656e-8), 1)),
-        ),
+        (_OCAM, _OCAM * 1.00033, 394.552874, 241.800066),
+        (2.19e-4 / 1.00033, 2.57e-4, 0, -2.207161e-3 * _OCAM, 4.879622e-6 * _OCAM**2, -1.865656e-8 * _OCAM**3),
         (480, 752),
     ),
-    # cameras in the tests of nvidia-ncore, one by its angles and one by its pixels, whose polynomials are in pixels:
-    # 3139.48583984375, 164.5725860595703, ...; 0.0005380856455303729, -1.2021251771798802e-09, ...
+    # cameras in the tests of nvidia-ncore, one by its angles and one by its pixels, whose polynomials are in pixels
     "f_theta_sheared": (
-        (3139.48583984375 * 1.0000840425491333, 3139.48583984375, 1909.3092041015625, 1103.27880859375),
-        (
-            -7.300000288523734e-05,
-            -2.8000000384054147e-05 / 1.0000840425491333,
-            *(
-                w / 3139.48583984375
-                for w in (164.5725860595703, -442.12896728515625, 259.5827331542969, 153.66644287109375)
-            ),
-        ),
+        (_NCORE * 1.000084, _NCORE, 1909.3092, 1103.2788),
+        (-7.3e-5, -2.8e-5 / 1.000084, *(w / _NCORE for w in (164.57259, -442.12897, 259.58273, 153.66644))),
         (2168, 3848),
     ),
     "f_theta_backward_sheared": (
-        (1.1 / 0.0005380856455303729, 1 / 0.0005380856455303729, 1904.948486328125, 1090.5164794921875),
-        (
-            0.02,
-            -0.01 / 1.1,
-            *(
-                w / 0.0005380856455303729**i
-                for i, w in enumerate((-1.2021251771798802e-09, 4.5657002484267295e-12, -5.581118088908714e-16), 2)
-            ),
-        ),
+        (1.1 / _PIXEL, 1 / _PIXEL, 1904.9485, 1090.5165),
+        (0.02, -0.01 / 1.1, -1.2021252e-9 / _PIXEL**2, 4.5657002e-12 / _PIXEL**3, -5.5811181e-16 / _PIXEL**4),
         (2168, 3848),
     ),
     # KITTI-360, calibration/image_02.yaml
@@ -189,7 +166,7 @@ def real(key) -> dict:
     }
     if key in CALIBRATIONS:
         intrinsics, distortion, size = CALIBRATIONS[key]
-        return {"published": make(key, tensor(list(intrinsics)), tensor(list(distortion)), image_size=size)}
+        return {"published": make(key, tensor([*intrinsics]), tensor([*distortion]), image_size=size)}
     default = make(key, torch.tensor([300.0, 310.0, 318.5, 242.25], dtype=torch.float64), image_size=(480, 640))
     return named or {"default": default}
 

@@ -20,40 +20,29 @@ def write_video(
     codec="mpeg4",
     pixels="yuv420p",
     tick=Fraction(1, 30),
-    rate=30,
     rotation=None,
     sound=None,
     words=None,
     matrix=None,
     full=None,
 ):
-    """A video with a frame at each of these multiples of `tick`.
+    """Write a video with a frame at each of these multiples of `tick`, in seconds.
 
-    Args:
-        path: its suffix says the format.
-        times: of frames.
-        size: (height, width).
-        codec: of frames; likewise `pixels`, their format.
-        tick: seconds.
-        rate: frames a second, as the file says it.
-        rotation: degrees with which it is to be shown.
-        sound: an encoder, of a tone as long as the video.
-        words: a file of subtitles.
-        matrix, full: what colours mean, as ffmpeg numbers it.
+    `sound` is the encoder of a tone as long as the video, `words` a file of subtitles; `matrix` and `full` number what
+    colours mean, as ffmpeg does; the video is to be shown with a `rotation`, in degrees.
     """
     import av
 
     with av.open(path, "w") as file:
-        file.metadata["title"] = "waves"
-        stream = file.add_stream(codec, rate=rate, time_base=tick)
+        stream = file.add_stream(codec, rate=30, time_base=tick)
         stream.width, stream.height, stream.pix_fmt = size[1], size[0], pixels
         stream.codec_context.qscale, stream.codec_context.global_quality = True, 2 * 118
         if matrix is not None:
             stream.codec_context.colorspace, stream.codec_context.color_range = matrix, full
         if rotation is not None:
             stream.set_display_rotation(rotation)
-        tone = None if sound is None else file.add_stream(sound, rate=48000, layout="mono")
-        if tone is not None:
+        if sound is not None:
+            tone = file.add_stream(sound, rate=48000, layout="mono")
             tone.metadata["language"] = "fin"
         if words is not None:
             with av.open(words) as text:
@@ -63,7 +52,7 @@ def write_video(
             frame = av.VideoFrame.from_ndarray(pattern(*size, number), format="rgb24").reformat(format=pixels)
             frame.pts, frame.time_base = time, tick
             file.mux(stream.encode(frame))
-        if tone is not None:
+        if sound is not None:
             count = tone.codec_context.frame_size or 1024
             for number in range(int((times[-1] + 1) * tick * 48000 / count)):
                 wave = 0.2 * np.sin(0.05 * np.arange(number * count, (number + 1) * count))
@@ -79,22 +68,20 @@ def write_video(
 
 
 def read_video(path):
-    """What a video says of itself, in a dictionary."""
+    """Return what a video says of itself, in a dictionary."""
     import av
 
     with av.open(path) as file:
         stream = file.streams.video[0]
         frames = list(file.decode(stream))
-        context = stream.codec_context
         about = {
             "times": [float(frame.pts * frame.time_base) for frame in frames],
             "frames": frames,
             "rate": stream.average_rate,
             "rotation": frames[0].rotation,
             "matrix": (frames[0].colorspace, frames[0].color_range),
-            "codec": context.name,
-            "pixels": context.pix_fmt,
-            "title": file.metadata.get("title"),
+            "codec": stream.codec_context.name,
+            "pixels": stream.codec_context.pix_fmt,
             "languages": [other.language for other in file.streams.audio],
         }
     with av.open(path) as file:

@@ -17,6 +17,7 @@ from camtorch.analysis.summary import summarise  # noqa: E402
 from camtorch.projection.rays import ideal, ray_fan  # noqa: E402
 
 SIZE = (480, 640)
+ON_AXES = plot.distortion_field, plot.radius_curve, lambda camera, ax: plot.difference(camera, camera, ax)
 
 
 def fisheye(**changes):
@@ -38,13 +39,11 @@ def test_every_model_has_a_portrait(key):
 
 
 def test_each_function_draws_on_the_axes_it_gets():
-    camera = fisheye()
-    for draw in (plot.distortion_field, plot.radius_curve, lambda c, ax: plot.difference(c, c, ax)):
+    for draw in ON_AXES:
         ax = axes()
-        assert draw(camera, ax) is ax
+        assert draw(fisheye(), ax) is ax
         ax.figure.canvas.draw()
-    ax = plot.difference(camera, camera)
-    matplotlib.pyplot.close(ax.figure)
+    assert plot.difference(fisheye(), fisheye()).figure is matplotlib.pyplot.gcf()
 
 
 def test_the_field_goes_from_the_ideal_pixel_to_the_actual_one():
@@ -97,9 +96,9 @@ def test_what_shows_nothing_is_left_out():
     ax = plot.difference(wide.pad(400, 400, 400, 400), ahead, axes())
     assert ax.images[0].get_array().mask.mean() > 0.3
     folded, nothing = (ct.BrownConrady([300.0, 300, cx, 240], [-0.5, 0, 0, 0], image_size=SIZE) for cx in (320, 9e5))
-    for camera in (folded, nothing):
-        for draw in (plot.distortion_field, plot.radius_curve, lambda c, ax: plot.difference(c, c, ax)):
-            draw(camera, axes()).figure.canvas.draw()
+    for draw in ON_AXES:
+        draw(folded, axes()).figure.canvas.draw()
+        draw(nothing, axes()).figure.canvas.draw()
 
 
 def test_cameras_of_a_rig_are_where_they_are():
@@ -121,15 +120,14 @@ def test_cameras_of_a_rig_are_where_they_are():
 
 def test_the_door():
     batch = ct.Pinhole(torch.ones(2, 4), image_size=SIZE)
-    for draw in (plot.distortion_field, plot.radius_curve, lambda c: plot.difference(c, c)):
-        with pytest.raises(ValueError, match=r"must be (a )?single"):
-            draw(batch)
-    with pytest.raises(ValueError, match="needs the camera's image_size"):
-        plot.distortion_field(ct.Pinhole([1.0, 1, 0, 0]))
-    with pytest.raises(ValueError, match="must be of one size"):
-        plot.difference(fisheye(), fisheye(image_size=(10, 10)))
-    with pytest.raises(ValueError, match="1 cameras, and labels for 2"):
-        plot.radius_curve(fisheye(), labels=["a", "b"])
-    with pytest.raises(TypeError, match=r"ax must be Axes of matplotlib; got KannalaBrandt. Several cameras are one"):
-        plot.radius_curve(fisheye(), fisheye())
+    for error, match, *calls in (
+        (ValueError, r"must be (a )?single", *(lambda draw=draw: draw(batch, None) for draw in ON_AXES)),
+        (ValueError, "needs the camera's image_size", lambda: plot.distortion_field(ct.Pinhole([1.0, 1, 0, 0]))),
+        (ValueError, "must be of one size", lambda: plot.difference(fisheye(), fisheye(image_size=(10, 10)))),
+        (ValueError, "1 cameras, and labels for 2", lambda: plot.radius_curve(fisheye(), labels=["a", "b"])),
+        (TypeError, "Axes.*; got KannalaBrandt. Several cameras", lambda: plot.radius_curve(fisheye(), fisheye())),
+    ):
+        for call in calls:
+            with pytest.raises(error, match=match):
+                call()
     matplotlib.pyplot.close("all")
