@@ -16,6 +16,7 @@ def write_video(
     path,
     times,
     *,
+    images=None,
     size=(64, 96),
     codec="mpeg4",
     pixels="yuv420p",
@@ -25,17 +26,20 @@ def write_video(
     words=None,
     matrix=None,
     full=None,
+    **options,
 ):
     """Write a video with a frame at each of these multiples of `tick`, in seconds.
 
+    It shows `images`, (H, W) uint8 each, or a pattern of `size`; `options` are the encoder's.
     `sound` is the encoder of a tone as long as the video, `words` a file of subtitles; `matrix` and `full` number what
     colours mean, as ffmpeg does; the video is to be shown with a `rotation`, in degrees.
     """
     import av
 
-    with av.open(path, "w") as file:
-        stream = file.add_stream(codec, rate=30, time_base=tick)
-        stream.width, stream.height, stream.pix_fmt = size[1], size[0], pixels
+    shown = images or [pattern(*size, number) for number in range(len(times))]
+    with av.open(str(path), "w") as file:
+        stream = file.add_stream(codec, rate=30, time_base=tick, options=options)
+        (stream.height, stream.width), stream.pix_fmt = shown[0].shape[:2], pixels
         stream.codec_context.qscale, stream.codec_context.global_quality = True, 2 * 118
         if matrix is not None:
             stream.codec_context.colorspace, stream.codec_context.color_range = matrix, full
@@ -48,8 +52,9 @@ def write_video(
             with av.open(words) as text:
                 said = file.add_stream_from_template(text.streams[0])
                 packets = [packet for packet in text.demux() if packet.dts is not None]
-        for number, time in enumerate(times):
-            frame = av.VideoFrame.from_ndarray(pattern(*size, number), format="rgb24").reformat(format=pixels)
+        for image, time in zip(shown, times, strict=True):
+            form = "gray" if image.ndim == 2 else "rgb24"
+            frame = av.VideoFrame.from_ndarray(image, format=form).reformat(format=pixels)
             frame.pts, frame.time_base = time, tick
             file.mux(stream.encode(frame))
         if sound is not None:

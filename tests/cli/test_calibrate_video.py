@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from photographs import fisheye, photograph
 from test_calibrate_cli import BOARD, WORDS, assert_near, poses
+from videos import write_video
 
 import camtorch as ct
-from camtorch.cli import searching, videos
+from camtorch.cli import searching
 from camtorch.cli.main import main
 
-av = pytest.importorskip("av")
-RATE = 4
+pytest.importorskip("av")
 
 
 @pytest.fixture(scope="module")
@@ -27,12 +27,7 @@ def filmed(tmp_path_factory):
     sharp = [images[0], images[1], blurred, images[2], images[3], blurred, again]
     shown = [frame for image in sharp for frame in (blurred, image)]
     path = tmp_path_factory.mktemp("film") / "board.mp4"
-    with av.open(str(path), "w") as file:
-        stream = file.add_stream("libx264", rate=RATE, options={"crf": "10"})
-        stream.height, stream.width, stream.pix_fmt = *images[0].shape, "yuv420p"
-        for image in shown:
-            file.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="gray")))
-        file.mux(stream.encode(None))
+    write_video(path, range(len(shown)), images=shown, codec="libx264", tick=Fraction(1, 4), crf="10")
     return path, truth
 
 
@@ -52,27 +47,9 @@ def test_sharp_frames_that_differ_are_taken(filmed, tmp_path, capsys, monkeypatc
         assert np.nanmax(np.linalg.norm(image.pixels - pixels, axis=1)) < 0.5
 
 
-def test_time_stamps_may_begin_late(tmp_path):
-    board, hour = photograph(BOARD, fisheye(), *map(list, next(iter(poses(BOARD, 1)))), seed=0)[0], 3600
-    path = tmp_path / "live.mkv"
-    with av.open(str(path), "w") as file:
-        stream = file.add_stream("ffv1", rate=RATE)
-        stream.height, stream.width, stream.pix_fmt = *board.shape, "gray"
-        for i in range(3 * RATE):
-            frame = av.VideoFrame.from_ndarray(board, format="gray")
-            frame.pts, frame.time_base = hour * RATE + i, Fraction(1, RATE)
-            file.mux(stream.encode(frame))
-        file.mux(stream.encode(None))
-    assert [seconds for seconds, _ in videos.frames(path)] == [i / RATE for i in range(3 * RATE)]
-
-
 def test_a_video_without_a_board_says_so(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    with av.open("grey.mp4", "w") as file:
-        stream = file.add_stream("libx264", rate=RATE)
-        stream.height, stream.width, stream.pix_fmt = 64, 96, "yuv420p"
-        file.mux(stream.encode(av.VideoFrame.from_ndarray(np.full((64, 96), 90, np.uint8), format="gray")))
-        file.mux(stream.encode(None))
+    write_video("grey.mp4", [0], images=[np.full((64, 96), 90, np.uint8)])
     assert main(["calibrate", "grey.mp4", *WORDS, "-o", "camera.yml"]) == 2
     out, err = capsys.readouterr()
     assert out == "grey.mp4: of 1 sharp frames 0 show the board, and 0 of these differ\n"

@@ -30,7 +30,6 @@ CASES = {
         (f"dewarp {PHOTO} -o in.png/o.png", "in.png is no folder"),
         (f"dewarp {PHOTO} -o o.ico", "o.ico: .ico: no image is written as that; try .bmp"),
         (f"dewarp {PHOTO} -o a\0b.png", "'a\\x00b.png' is no name of a file"),
-        (f"dewarp {PHOTO} -o o.docx", "o.docx: .docx: no image is written as that"),
         (f"dewarp {PHOTO} -o o", "o: no suffix: no image is written as that"),
         (f"dewarp {PHOTO} -o .", "is a folder"),
         (f"dewarp {PHOTO} -o cut.png", "cut.png: exists already; --force"),
@@ -42,13 +41,10 @@ CASES = {
         (f"dewarp {PHOTO} --model brown_conrady", "says that the model is kannala_brandt; do not name brown_conrady"),
         (f"dewarp {PHOTO} --size 80", "'80' is not WIDTHxHEIGHT"),
         (f"dewarp {PHOTO} --size 0x9", "each of 1 to 32768 pixels"),
-        (f"dewarp {PHOTO} --fov wide", "--fov: invalid float"),
         (f"dewarp {PHOTO} --fov 180", "below 180 for perspective; got 180"),
         (f"dewarp {PHOTO} --fov nan", "fov must be in degrees, above 0"),
         (f"dewarp {PHOTO} --fov 2.1", "2.1 seems to be radians"),
         ("dewarp in.png --guess-fov 2.1", "'2.1' is no field of view in degrees, as 120"),
-        ("dewarp in.png --guess-fov 361", "'361' is no field of view in degrees, as 120"),
-        ("dewarp in.png --guess-fov wide", "'wide' is no field of view"),
         (f"dewarp in.png --camera {FILES}/opencv_stereo.yml", "several cameras; --name says which"),
     ],
     "many": [
@@ -57,7 +53,6 @@ CASES = {
         ("dewarp images none --camera camera.yml -o out", "none: no such file or folder"),
         ("dewarp images --camera camera.yml -o camera.yml", "camera.yml: is no folder"),
         ("dewarp images --camera camera.yml -o o.png", "o.png: is the name of one file"),
-        ("dewarp images -o out", "which camera took it? --camera FILE"),
         ("dewarp images --camera camera.yml -o images", "would overwrite images/in.png, which is read"),
         ("dewarp in.png images/in.png --camera camera.yml -o out", "would both be written to"),
         ("dewarp images --camera camera.yml -o out --fov 200", "below 180 for perspective; got 200"),
@@ -68,7 +63,6 @@ CASES = {
         (f"dewarp {PHOTO} -o o.png --resume", "--resume is for folders"),
     ],
     "show": [
-        ("show camera.yml -o camera.yml --force", "camera.yml: would overwrite camera.yml, which is read"),
         ("show bare.yml --against camera.yml", "bare.yml states no image size; --size says which"),
         ("show camera.yml --size 640x480", "camera.yml: camera is for 96x64, not 640x480"),
         (f"show {FILES}/opencv_stereo.yml -o o.png", "--name says which camera is meant: 1, 2"),
@@ -80,7 +74,6 @@ CASES = {
     ],
     "convert": [
         ("convert camera.yml bad.yml --model fisheye624", "bad.yml: exists already; --force"),
-        ("convert camera.yml camera.yml --force", "camera.yml: would overwrite camera.yml, which is read"),
         ("convert camera.yml . --format opencv --force", ".: is a folder; opencv is one file"),
         ("convert camera.yml o.yml --model fisheye63", "did you mean 'fisheye62'? Known are"),
         ("convert camera.yml o.yml --model brown_conrady --count 6", "got count=6"),
@@ -88,17 +81,11 @@ CASES = {
     ],
     "map": [
         ("map camera.yml", "-o OUT writes one, --check MAP measures one"),
-        (
-            "map camera.yml a.npz --size 9x9",
-            "unrecognized arguments: a.npz; -o a.npz names what is written (see camtorch",
-        ),
+        ("map camera.yml a.npz --size 9x9", "unrecognized arguments: a.npz; -o a.npz names what is written (see camt"),
         ("show camera.yml bad.yml", "unrecognized arguments: bad.yml (see camtorch --help)"),
         ("map camera.yml --sise 9x9", "unrecognized arguments: --sise 9x9 (see camtorch --help; commands and options"),
         ("map camera.yml -o a.bin", "does not say the format"),
-        ("map camera.yml -o camera.yml --format opencv", "would overwrite camera.yml"),
         ("map rig.json --name left -o rig --format dw100 --force", "rig.json: would overwrite"),
-        ("map camera.yml -o a.npz --fov 2.1", "2.1 seems to be radians"),
-        ("map camera.yml -o a.npz --fov 200", "below 180 for perspective; got 200"),
         ("map camera.yml -o a.npz --target camera.yml --size 10x10", "--size is for a dewarping"),
         ("map bare.yml -o a.npz", "bare.yml states no image size; --camera-size WxH says it"),
         ("map camera.yml -o a.npz --step 8", "opencv has no step"),
@@ -116,17 +103,12 @@ CASES = {
         ("calibrate --rig cam0=in.png --board 9x6", "--rig takes several cameras"),
         ("calibrate --left in.png --right in.png --board 9x6", "in.png: is given as an image of two cameras"),
         ("calibrate --left film.mkv --right film.mkv --board 9x6", "film.mkv: videos are for one camera"),
-        (
-            "calibrate in.png --board 9x6 --model lens",
-            "--model: there is no camera model 'lens'; known are brown_conrady",
-        ),
-        ("calibrate in.png --board 9x6 --model fisheye", "did you mean 'kannala_brandt'?"),
+        ("calibrate in.png --board 9x6 --model lens", "--model: there is no camera model 'lens'; known are brown_con"),
         ("calibrate in.png --board 9x6 --model fisheye62 -o new.yml", "-o camera.json holds every model"),
         ("calibrate in.png --board 9x6 --model fisheye62 --count 3", "--count: fisheye62 takes n = 8"),
         ("calibrate in.png --board 9x6 --count 3", "--count is for a --model"),
         ("calibrate in.png --board 9x6 -o camera.foo", "camera.foo: the name does not say the format"),
         ("calibrate in.png --board 9x6 -o in.png --force", "would overwrite in.png, which is read"),
-        ("calibrate in.png --board 9x6 -o exists.json", "exists.json: exists already; --force"),
         ("calibrate in.png --board 9x6 --fixed fx,k3", "--fixed: no focal length is known to be held"),
     ],
 }
@@ -141,7 +123,6 @@ def files(tmp_path_factory):
     (folder / "cut.png").write_bytes((folder / "in.png").read_bytes()[:3000])
     (folder / "images").mkdir()
     (folder / "empty").mkdir()
-    (folder / "exists.json").write_text("{}")
     shutil.copy(folder / "in.png", folder / "images")
     (folder / "film.mkv").write_bytes(b"no video")
     opened(folder / "in.png").convert("RGBA").save(folder / "alpha.png")

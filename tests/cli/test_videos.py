@@ -12,6 +12,7 @@ from test_folders import outputs
 from videos import read_video, write_video
 
 import camtorch as ct
+from camtorch.cli import videos
 
 av = pytest.importorskip("av")
 WORDS = ["dewarp", "in.mkv", "--camera", "camera.yml", "-o", "out.mkv"]
@@ -93,6 +94,7 @@ def test_formats_of_files(folder, suffix, codec, sound):
 
 def test_a_recording_may_begin_late(folder):
     write_video("in.mkv", range(108000, 108010))
+    assert np.allclose([seconds for seconds, _ in videos.frames(Path("in.mkv"))], np.arange(10) / 30, atol=1e-3)
     command(*WORDS)
     assert np.allclose(read_video("in.mkv")["times"], read_video("out.mkv")["times"], atol=1e-3)
 
