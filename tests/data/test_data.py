@@ -35,7 +35,7 @@ def rows(count=4, ragged=False):
             "image": rng.integers(0, 255, (*SIZE, 3), np.uint8),
             "mask": rng.integers(0, 3, SIZE),
             "keypoints": rng.uniform(2, 20, (i % 4 if ragged else 3, 2)).astype(np.float32),
-            "boxes": rng.uniform(2, 10, (1, 4)) * [1, 1, 2, 2],
+            "boxes": rng.uniform([2, 2, 10, 10], [10, 10, 20, 20], (1, 4)),
             "gaze": np.float32([0.1, 0, -1]),
             "head_pose": np.eye(4, dtype=np.float32),
             "label": i,

@@ -109,9 +109,7 @@ REFUSED = {
         ("<k1>", "<b2>-0.3</b2><k1>", r"calibration\.b2: -0\.3, which no model here has"),
         ("<k1>", "<k4>0.1</k4><k1>", r"calibration\.k4: 0\.1, which no model here has"),
         (">frame<", ">spherical<", "'spherical' is not known here; known are equidistant"),
-        ("<f>3239.2350850187408</f>", "", r"calibration\.f: missing"),
         ("<f>3239", "<f>nan", r"calibration\.f: 'nan\.2350850187408' is no finite number"),
-        ("<width>5472", "<width>-1", r"calibration\.width: -1 is no number of pixels"),
         ("</k1>", "", "line [0-9]+: not XML: mismatched tag"),
         ("<calibration>", "<!DOCTYPE x []><calibration>", "a document type|<calibration> wh"),
     ],
@@ -138,12 +136,7 @@ REFUSED = {
     ],
     "ncore_ftheta.json": [
         ("principal_point", "middle", r"^[^:]*: camera_model_parameters\.principal_point: mis"),
-        ("3848", "0", r"^[^:]*: camera_model_parameters\.resolution\[0\]: 0 is no number"),
-        (
-            '_parameters": null',
-            '_parameters": {"horizontal_poly": [0, 1, 0]}',
-            r": .* a windshield, .*leaving-0\.3\.md",
-        ),
+        ('_parameters": null', '_parameters": {"horizontal_poly": [0]}', r": .* a windshield, .*leaving-0\.3\.md"),
     ],
 }
 
@@ -156,13 +149,10 @@ def test_what_is_refused(name, old, new, reason, tmp_path):
         ct.load(changed(tmp_path, name, (old, new)))
 
 
-@pytest.mark.parametrize(
-    ("kind", "lens", "core"),
-    [
-        ("PINHOLE", "k1: 0.1, k2: 0.2, p1: 0.3, p2: 0.4", "fx: 5, fy: 6, cx: 7, cy: 8"),
-        ("KANNALA_BRANDT", "", "k2: 0.1, k3: 0.2, k4: 0.3, k5: 0.4, mu: 5, mv: 6, u0: 7, v0: 8"),
-    ],
-)
+@pytest.mark.parametrize(("kind", "lens", "core"), [
+    ("PINHOLE", "k1: 0.1, k2: 0.2, p1: 0.3, p2: 0.4", "fx: 5, fy: 6, cx: 7, cy: 8"),
+    ("KANNALA_BRANDT", "", "k2: 0.1, k3: 0.2, k4: 0.3, k5: 0.4, mu: 5, mv: 6, u0: 7, v0: 8"),
+])  # fmt: skip
 def test_other_models_of_camodocal(kind, lens, core, tmp_path):
     head = f"model_type: {kind}\ncamera_name: a\nimage_width: 640\nimage_height: 480\n"
     (tmp_path / "a.yaml").write_text(f"{head}distortion_parameters: {{{lens}}}\nprojection_parameters: {{{core}}}\n")
