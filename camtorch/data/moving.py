@@ -54,7 +54,7 @@ class Mover:
         self._owner = owner = type(self).__name__
         self._fields = dict(as_mapping(fields, "fields", owner, "{'lidar': 'points'}"))
         self._seeded: Seeded | None = None
-        self._fixed: Transform | None = None
+        self._fixed: Transform
         if isinstance(transform, (Augmentation, FaceNormalizer)):
             transform = copy.copy(transform)
             transform.fields = self._fields = {**transform.fields, **self._fields}
@@ -83,9 +83,8 @@ class Mover:
             camera = row.get("camera")
             if camera is not None:
                 fields["camera"] = camera if isinstance(camera, Camera) else self._camera(camera, fields)
-            if self._fixed is not None:
+            if self._seeded is None:
                 return self._fixed(fields)
-            assert self._seeded is not None
             return self._seeded(fields, key=key)  # type: ignore[arg-type]
         except (ValueError, TypeError) as error:
             which = "" if key is None else f"sample {key!r:.200}: "
