@@ -1,8 +1,8 @@
 """The galleries of the documentation: everything public has its place, its image and its code there."""
 
+import importlib
 import inspect
 import re
-import sys
 from pathlib import Path
 from typing import get_args
 
@@ -20,12 +20,9 @@ LARGEST = 150_000  # bytes of an image
 @pytest.fixture(scope="module")
 def pages():
     """The module by which images are made from pages."""
-    sys.path.insert(0, str(DOCS))
-    try:
-        from drawings import pages
-    finally:
-        sys.path.remove(str(DOCS))
-    return pages
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(DOCS)
+        return importlib.import_module("drawings.pages")
 
 
 def own_models():
@@ -97,20 +94,11 @@ def test_printed_formulas_are_what_models_compute(pages):
         np.testing.assert_allclose(pixels[valid].detach(), printed[valid], rtol=0, atol=1e-6, err_msg=name)
 
 
-def augmentations():
-    """Those that are no base of others."""
-    bases = {ct.augment.Augmentation, ct.augment.Edit}
-    found = {name: getattr(ct.augment, name) for name in ct.augment.__all__}
-    return {name for name, value in found.items() if _moves_samples(value) and value not in bases}
-
-
-def _moves_samples(value):
-    return isinstance(value, type) and issubclass(value, torch.nn.Module)
-
-
 def test_every_augmentation_has_its_place_and_image(pages):
     found = pages.sections("augmentations.md")
-    assert {title.split()[0] for title in found} == augmentations()
+    values = {name: getattr(ct.augment, name) for name in set(ct.augment.__all__) - {"Augmentation", "Edit"}}
+    modules = {name for name, value in values.items() if inspect.isclass(value) and issubclass(value, torch.nn.Module)}
+    assert {title.split()[0] for title in found} == modules
     for section in found.values():
         assert "ct.augment." in pages.code(section)
         (name,) = re.findall(r"\(\.\./images/(augment/.*?)\)", section)
@@ -119,9 +107,7 @@ def test_every_augmentation_has_its_place_and_image(pages):
 
 def test_every_option_of_cameras_is_shown(pages):
     shown = " ".join(pages.code(section) for section in pages.sections("augmentations.md").values())
-    options = [
-        name for name in inspect.signature(ct.augment.RandomCamera).parameters if name not in ("like", "options")
-    ]
+    options = inspect.signature(ct.augment.RandomCamera).parameters.keys() - {"like", "options"}
     assert [name for name in options if not re.search(rf'\b{name}"?[=:]', shown)] == []
 
 

@@ -52,30 +52,21 @@ def project(tmp_path_factory):
     return folder
 
 
-def run(project, *command):
-    """What a command prints in the project's environment."""
+def run(project, checker, *arguments):
+    """Return what a checker prints in the project's environment."""
+    if importlib.util.find_spec(checker) is None:
+        pytest.skip(f"{checker} is not installed; .ci/run installs it")
     kept = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "MYPYPATH")}
     path = f"{project / '.venv' / 'bin'}{os.pathsep}{os.environ['PATH']}"
     environment = {**kept, "PATH": path, "PYRIGHT_PYTHON_IGNORE_WARNINGS": "1"}
+    command = [sys.executable, "-m", checker, *arguments]
     return subprocess.run(command, cwd=project, env=environment, capture_output=True, text=True).stdout
 
 
-def mypy(project, *arguments):
-    """What mypy says, strictly; what it knows of torch it keeps."""
-    pytest.importorskip("mypy")
-    python = project / ".venv" / "bin" / "python"
-    options = ["--strict", "--python-version=3.10", f"--python-executable={python}", "--config-file="]
-    cache = f"--cache-dir={ROOT / '.mypy_cache' / 'project'}"
-    return run(project, sys.executable, "-m", "mypy", *options, cache, *arguments)
-
-
 def pyright(project, *arguments, **settings):
-    """What pyright says."""
-    if importlib.util.find_spec("pyright") is None:
-        pytest.skip("pyright is not installed; .ci/run installs it")
     settings = {"venvPath": ".", "venv": ".venv", "pythonVersion": "3.10", **settings}
     (project / "pyrightconfig.json").write_text(json.dumps(settings))
-    return run(project, sys.executable, "-m", "pyright", *arguments)
+    return run(project, "pyright", *arguments)
 
 
 def is_of_others(line):
@@ -86,7 +77,12 @@ def is_of_others(line):
 
 @pytest.mark.slow
 def test_mypy_finds_what_is_wrong_and_no_error_on_any_page(project):
-    said = mypy(project, *UNTYPED, "uses", "pages")
+    python, cache = (
+        project / ".venv" / "bin" / "python",
+        ROOT / ".mypy_cache" / "project",
+    )  # kept, for torch
+    options = ["--strict", "--python-version=3.10", f"--python-executable={python}", "--config-file="]
+    said = run(project, "mypy", *options, f"--cache-dir={cache}", *UNTYPED, "uses", "pages")
     assert re.search(r"\d\d+ source files", said), said
     found = [line for line in said.splitlines() if "error:" in line]
     assert [line for line in found if line.startswith("uses") or not is_of_others(line)] == []

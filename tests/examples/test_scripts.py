@@ -104,31 +104,29 @@ def seen(drivers) -> Photographs:
     return Photographs(torch.rand(len(drivers), 3, *SIZE), faces.points_of(drivers), drivers.gaze, faces.teacher())
 
 
-def learned_from(name: str, seen: Photographs) -> Samples:
-    torch.manual_seed(1)
-    index = torch.arange(len(seen.image))
-    return train_faces.AUGMENTATIONS[name](seen, index, torch.Generator().manual_seed(1))
-
-
 def looks_true(samples: Samples, drivers: cabin.Drivers) -> None:
     """Landmarks lie as far from the gaze, by angle, as they do before the camera: whatever turned, all turned."""
-    whole = samples.weight > 0
+    whole, normalize = samples.weight > 0, torch.nn.functional.normalize
     assert whole.double().mean() > 0.4
-    there = torch.nn.functional.normalize(faces.points_of(drivers)[:, : len(NAMES)], dim=-1)
+    there = normalize(faces.points_of(drivers)[:, : len(NAMES)], dim=-1)
     cosines = (there * drivers.gaze[:, None]).sum(-1).float()
     # rays between those of the image's corners: of faces, within a degree
     x, y = (samples.keypoints / (SIDE - 1))[..., None].unbind(-2)
     a, b, c, d = samples.rays[:, None].unbind(2)
-    rays = torch.nn.functional.normalize((1 - y) * ((1 - x) * a + x * b) + y * ((1 - x) * c + x * d), dim=-1)
+    rays = normalize((1 - y) * ((1 - x) * a + x * b) + y * ((1 - x) * c + x * d), dim=-1)
     assert (cosines - (rays * samples.gaze[:, None]).sum(-1))[whole].abs().max() < 0.03
     assert bool(((samples.keypoints > -1) & (samples.keypoints < SIDE))[whole].all())
 
 
 @pytest.mark.parametrize("name", ["plain", "camtorch", "own"])
 def test_labels_learned_from_are_true(name, seen, drivers):
-    samples = learned_from(name, seen)
+    def learned():
+        torch.manual_seed(1)
+        return train_faces.AUGMENTATIONS[name](seen, torch.arange(len(seen.image)), torch.Generator().manual_seed(1))
+
+    samples = learned()
     looks_true(samples, drivers)
-    assert all(torch.equal(*pair) for pair in zip(samples, learned_from(name, seen), strict=True))
+    assert all(torch.equal(*pair) for pair in zip(samples, learned(), strict=True))
 
 
 @pytest.mark.slow
