@@ -123,36 +123,31 @@ def test_labels_move_with_the_crop_and_back():
 
 
 def test_in_a_chain_the_box_moves_with_what_comes_before():
-    camera = fisheye(torch.float64)
-    sample = sample_of(camera)
-    mount = ct.augment.RandomMount(yaw=(20, 20), pitch=None, roll=None)
-    crop = ct.augment.BoxCrop(SIZE, index=1)
-    chain = ct.augment.Compose([mount, crop, ct.augment.HorizontalFlip(p=1)], camera=camera)
-    first = mount(sample, camera=camera)
-    want = ct.augment.HorizontalFlip(p=1)(crop(first))
-    out = chain(sample)
+    camera, A = fisheye(torch.float64), ct.augment  # noqa: N806
+    sample, crop, flip = sample_of(camera), A.BoxCrop(SIZE, index=1), A.HorizontalFlip(p=1)
+    mount, away = (A.RandomMount(yaw=(yaw, yaw), pitch=None, roll=None, min_filled=0) for yaw in (20, 95))
+    want = flip(crop(mount(sample, camera=camera)))
+    out = A.Compose([mount, crop, flip], camera=camera)(sample)
     for name in ("keypoints", "gaze", "points"):
         torch.testing.assert_close(out[name], want[name])
     torch.testing.assert_close(out["camera"].intrinsics, want["camera"].intrinsics)
-    image = torch.rand(3, 1, 480, 640)
-    away = ct.augment.Compose(
-        [ct.augment.RandomMount(yaw=(95, 95), pitch=None, roll=None, min_filled=0), crop], camera=camera
-    )
-    out = away(image=image, boxes=torch.tensor([[[10.0, 200, 60, 260]]]).expand(3, 2, 4))
+    boxes = torch.tensor([[[10.0, 200, 60, 260]]]).expand(3, 2, 4)
+    out = A.Compose([away, crop], camera=camera)(image=torch.rand(3, 1, 480, 640), boxes=boxes)
     assert not out["boxes_valid"].any()  # and nothing is raised
     assert torch.isfinite(out["boxes"]).all()
 
 
 def test_samples_without_the_box_are_refused():
-    camera = fisheye()
     image, boxes = torch.zeros(2, 1, 480, 640), [torch.tensor([[1.0, 1, 9, 9]]), torch.empty(0, 4)]
-    with pytest.raises(ValueError, match="no boxes"):
-        ct.augment.BoxCrop(SIZE, camera=camera)(image=image)
-    with pytest.raises(ValueError, match="sample 1 has 0 boxes"):
-        ct.augment.BoxCrop(SIZE, camera=camera)(image=image, boxes=boxes)
-    for margin in (-0.5, float("nan")):
-        with pytest.raises(ValueError, match="margin"):
-            ct.augment.BoxCrop(SIZE, margin=margin)
+    crop = ct.augment.BoxCrop(SIZE, camera=fisheye())
+    for call, text in (
+        (lambda: crop(image=image), "no boxes"),
+        (lambda: crop(image=image, boxes=boxes), "sample 1 has 0 boxes"),
+        (lambda: ct.augment.BoxCrop(SIZE, margin=-0.5), "margin"),
+        (lambda: ct.augment.BoxCrop(SIZE, margin=float("nan")), "margin"),
+    ):
+        with pytest.raises(ValueError, match=text):
+            call()
 
 
 def test_kornia_crops_the_same():

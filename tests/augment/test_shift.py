@@ -124,20 +124,17 @@ def test_batches_half_precision_and_arrays():
 
 
 def test_without_depth_it_says_so():
-    augment = ct.augment.RandomMount(shift=(0.02, 0.02, 0), camera=lens())
-    with pytest.raises(ValueError, match="needs depth"):
-        augment(image=torch.zeros(1, 120, 160))
-    with pytest.raises(ValueError, match="depth"):
-        augment.change(None, augment.draw(1))
-    with pytest.raises(ValueError, match="floating point"):
-        augment(image=torch.zeros(1, 120, 160), depth=torch.full((1, 120, 160), 600, dtype=torch.int32))
-    with pytest.raises(ValueError, match="goes before"):
-        ct.augment.Compose([augment])
-    with pytest.raises(TypeError, match="three lengths"):
-        ct.augment.RandomMount(shift=0.02)
-    with pytest.raises(ValueError, match="chromatic"):
-        ct.augment.RandomMount(shift=(0.02, 0, 0), chromatic=0.01)
-    sample = sample_of(lens())
-    out = augment(sample)
-    with pytest.raises(ValueError, match="no inverse"):
-        augment.inverse(out)
+    mount, camera, image = ct.augment.RandomMount, lens(), torch.zeros(1, 120, 160)
+    augment, whole = mount(shift=(0.02, 0.02, 0), camera=camera), torch.full((1, 120, 160), 600, dtype=torch.int32)
+    out = augment(sample_of(camera))
+    for call, text in (
+        (lambda: augment(image=image), "needs depth"),
+        (lambda: augment.change(None, augment.draw(1)), "depth"),
+        (lambda: augment(image=image, depth=whole), "floating point"),
+        (lambda: ct.augment.Compose([augment]), "goes before"),
+        (lambda: mount(shift=0.02), "three lengths"),
+        (lambda: mount(shift=(0.02, 0, 0), chromatic=0.01), "chromatic"),
+        (lambda: augment.inverse(out), "no inverse"),
+    ):
+        with pytest.raises((TypeError, ValueError), match=text):
+            call()

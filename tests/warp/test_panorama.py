@@ -128,28 +128,26 @@ def test_the_nearest_label_across_the_seam_is_exact(dtype):
 
 @pytest.mark.slow
 def test_every_way_to_make_the_images_agrees():
-    camera = whole("equirectangular", torch.float32)
+    camera, learner = (whole("equirectangular", torch.float32, learns=learns) for learns in (False, True))
     target = ct.Pinhole.from_fov(100, image_size=(80, 96)).requires_grad_(False)
     rotation = mount_rotation(*torch.tensor([170.0, 50, 20]))
     image = torch.cat([image_of(camera)] * 3, 1)
-    warp = ct.Warp(camera, target, rotation)
+    warp, learning = (ct.Warp(source, target, rotation) for source in (camera, learner))
     expected = warp(image)
     assert off(expected[:, :1], target, rotation, 1.0) < 2e-4
+    still = ct.Extrinsics.from_matrix(rotation.mT, torch.zeros(3))
     made = {
         "channels last": warp(image.contiguous(memory_format=torch.channels_last)),
         "pinned": ct.Warp(camera, target, rotation).pin()(image),
         "exact": ct.Warp(camera, target, rotation, tolerance=0)(image),
-        "compiled": torch.compile(warp, fullgraph=True, backend="eager")(image),
         "mapped": torch.func.vmap(lambda one: warp(one[None])[0])(image),
         "exported": torch.export.export(warp, (image,)).module()(image),
         "strips": torch.cat([part for _, part, _ in warp.strips(image, rows=13)], 2),
-        "learning": ct.Warp(whole("equirectangular", torch.float32, learns=True), target, rotation)(image),
-        "at infinity": ct.Reproject(camera, target, ct.Extrinsics.from_matrix(rotation.mT, torch.zeros(3)))(
-            image, torch.ones(1, 1, 80, 96)
-        )[0],
+        "learning": learning(image),
+        "at infinity": ct.Reproject(camera, target, still)(image, torch.ones(1, 1, 80, 96))[0],
+        "compiled": torch.compile(warp, fullgraph=True, backend="eager")(image),
+        "compiled while it learns": torch.compile(learning, fullgraph=True, backend="eager")(image),
     }
-    learning = ct.Warp(whole("equirectangular", torch.float32, learns=True), target, rotation)
-    made["compiled while it learns"] = torch.compile(learning, fullgraph=True, backend="eager")(image)
     for how, result in made.items():
         # an image is as smooth as a thousandth of a pixel, and a float32 is as fine
         assert (result - expected).abs().max() < 1e-4, how
@@ -197,14 +195,16 @@ def test_less_than_a_whole_turn_ends_at_its_edges(missing):
 @pytest.mark.parametrize("centre", [0.0, 100.0, 159.5])
 def test_a_whole_turn_is_shown_wherever_it_begins(centre):
     """As a target too. Labels go where the image goes, if the model has rays for both of their pixels."""
-    focal = 320 / (2 * math.pi)
-    panorama = ct.Equirectangular([focal, focal, centre, 79.5], image_size=(160, 320)).requires_grad_(False)
+    focal, image = 320 / (2 * math.pi), torch.rand(1, 1, 160, 320)
+    panorama, straight = (
+        ct.Equirectangular([focal, focal, middle, 79.5], image_size=(160, 320)).requires_grad_(False)
+        for middle in (centre, centre + 20)
+    )
     views = ct.views.cube(panorama, size=90)
-    images, valid = views.back(views(torch.ones(1, 1, 160, 320)))
+    ones, valid = views.back(views(torch.ones_like(image)))
     assert valid.all()
-    torch.testing.assert_close(images, torch.ones_like(images))
-    straight = ct.Equirectangular([focal, focal, centre + 20, 79.5], image_size=(160, 320)).requires_grad_(False)
-    warp, image = ct.Warp(panorama, straight), torch.rand(1, 1, 160, 320)
+    torch.testing.assert_close(ones, torch.ones_like(image))
+    warp = ct.Warp(panorama, straight)
     torch.testing.assert_close(warp(image), image.roll(20, -1), atol=5e-4, rtol=0)  # of float32 positions
     pixels = torch.rand(200, 2) * torch.tensor([319.0, 159.0])
     moved, valid = warp.transform_points(pixels)
