@@ -126,10 +126,9 @@ def test_depth_of_any_kind_of_number(camera, dtype):
 
 
 def test_what_inference_mode_saw_can_be_inverted_in_training(camera):
-    mount = RandomMount(camera=camera)
-    image = torch.rand(1, 3, *SIZE)
+    mount, image = RandomMount(camera=camera), torch.rand(1, 3, *SIZE)
     with torch.inference_mode():
-        mount(image=image)
+        assert not mount(image=image)["camera"].intrinsics.is_inference()
     weight = torch.ones(1, requires_grad=True)
     mount.inverse(image=image * weight)["image"].sum().backward()
     assert torch.isfinite(weight.grad).all()

@@ -54,22 +54,17 @@ def test_the_example_zooms_all_that_a_sample_holds():
 
 def test_one_s_own_has_all_that_others_have():
     upright = Upright(30.0, camera=camera(), p=0.5, min_filled=0.8)
-    draw = upright.draw(6, torch.Generator().manual_seed(0))
-    points = torch.rand(6, 4, 2) * 40
-    out = upright(image=torch.rand(6, 1, *SIZE), keypoints=points, draw=draw)
-    skipped = ~draw["apply"]
-    assert torch.equal(out["keypoints"][skipped], points[skipped])
+    draw, points = upright.draw(6, torch.Generator().manual_seed(0)), torch.rand(6, 4, 2) * 40
+    out, applied = upright(image=torch.rand(6, 1, *SIZE), keypoints=points, draw=draw), draw["apply"]
+    assert torch.equal(out["keypoints"][~applied], points[~applied])
+    assert (out["rotation"][applied, 0, 0] < 0.99).all()
     again = pickle.loads(pickle.dumps(upright))(keypoints=points, draw=draw)
     assert torch.equal(again["keypoints"], out["keypoints"])
-    turned = out["rotation"][~skipped]
-    assert (turned[:, 0, 0] < 0.99).all()
     cameras = [camera(), ct.Pinhole([50.0, 50.0, 31.5, 23.5], image_size=SIZE).requires_grad_(False)] * 3
     listed = upright(keypoints=points, camera=cameras, draw=draw)
     assert [type(c) for c in listed["camera"]] == [type(c) for c in cameras]
-    moved = ct.augment.numpy.Transform(upright)(image=torch.rand(*SIZE).numpy())
-    assert moved["image"].shape == SIZE
-    aug = ct.augment.kornia.CameraAugmentation(upright)
-    assert aug(torch.rand(2, 1, *SIZE)).shape == (2, 1, *SIZE)
+    assert ct.augment.numpy.Transform(upright)(image=torch.rand(*SIZE).numpy())["image"].shape == SIZE
+    assert ct.augment.kornia.CameraAugmentation(upright)(torch.rand(2, 1, *SIZE)).shape == (2, 1, *SIZE)
 
 
 def test_what_it_gets_wrong_is_told():

@@ -5,6 +5,7 @@ import math
 
 import pytest
 import torch
+from cameras import make
 
 import camtorch as ct
 
@@ -103,42 +104,38 @@ def test_boxes_off_the_image_keep_their_place_and_say_so():
     assert moved[2].tolist() == [-1, -1, -1, -1]
 
 
-def lenses():
-    """By name; two have an image circle or a fold within the image."""
-    numbers = {
-        "kannala_brandt": ([20, 20.5, 32, 23], [0.02, -0.01, 0.004, -0.001]),
-        "small_circle": ([8, 8, 32, 23], [0.02, -0.01, 0.004, -0.001]),
-        "brown_conrady": ([35, 35, 31, 24], [-0.5, 0.1, 0.001, 0.002]),
-        "pinhole": ([40, 40, 31.5, 23.5], None),
-        "equirectangular": ([20, 20, 31.5, 23.5], None),
-    }
-    return {
-        name: ct.MODELS[name.replace("small_circle", "kannala_brandt")](
-            torch.tensor(intrinsics, dtype=torch.float64),
-            *([] if distortion is None else [torch.tensor(distortion, dtype=torch.float64)]),
-            image_size=SIZE,
-        ).requires_grad_(False)
-        for name, (intrinsics, distortion) in numbers.items()
-    }
+NUMBERS = {
+    "kannala_brandt": ([20, 20.5, 32, 23], [0.02, -0.01, 0.004, -0.001]),
+    "small_circle": ([8, 8, 32, 23], [0.02, -0.01, 0.004, -0.001]),
+    "brown_conrady": ([35, 35, 31, 24], [-0.5, 0.1, 0.001, 0.002]),
+    "pinhole": ([40, 40, 31.5, 23.5], []),
+    "equirectangular": ([20, 20, 31.5, 23.5], []),
+}
+
+
+def lens(name):
+    """Two have an image circle or a fold within the image."""
+    intrinsics, distortion = (torch.tensor(values, dtype=torch.float64) for values in NUMBERS[name])
+    key = name.replace("small_circle", "kannala_brandt")
+    return make(key, intrinsics, distortion, image_size=SIZE).requires_grad_(False)
 
 
 @pytest.mark.parametrize(
-    ("source", "target"),
-    [pair for pair in itertools.combinations(sorted(lenses()), 2) if pair[0] != "pinhole"],
+    ("source", "target"), [pair for pair in itertools.combinations(sorted(NUMBERS), 2) if pair[0] != "pinhole"]
 )
 def test_a_box_is_on_the_image_if_a_ray_of_the_image_comes_back_inside(source, target):
-    generator = torch.Generator().manual_seed(len(source) * 100 + len(target))
-    whole, fine = lenses(), 4
+    generator, fine = torch.Generator().manual_seed(len(source) * 100 + len(target)), 4
     for angles in ((12, -8, 30), (160, 40, 10)):
         height, width, top, left = torch.randint(8, 40, (4,), generator=generator).tolist()
-        camera = whole[target].crop(top - 10, left - 10, height, width)
-        warp = ct.Warp(whole[source], camera, turn(*angles, torch.float64))
+        camera = lens(target).crop(top - 10, left - 10, height, width)
+        large = camera.resize(height * fine, width * fine)
+        warp = ct.Warp(lens(source), camera, turn(*angles, torch.float64))
         middles = torch.rand(40, 2, generator=generator, dtype=torch.float64) * 90 - 15
         sides = 10 ** (0.3 + 2 * torch.rand(40, 2, generator=generator, dtype=torch.float64))
         boxes = torch.cat((middles - sides / 2, middles + sides / 2), -1)
         moved, valid = warp.transform_boxes(boxes)
         # where four by four points of every pixel come from
-        grid = ct.Warp(warp.source, camera.resize(height * fine, width * fine), warp.rotation).grid()[0]
+        grid = ct.Warp(warp.source, large, warp.rotation).grid()[0]
         seen = (grid != -9).all(-1)
         places = ((grid + 1) * grid.new_tensor([SIZE[1], SIZE[0]]) - 1) / 2
 
@@ -146,16 +143,14 @@ def test_a_box_is_on_the_image_if_a_ray_of_the_image_comes_back_inside(source, t
             low, high = (boxes[:, None, None, :2] <= places + margin), (boxes[:, None, None, 2:] >= places - margin)
             return (low & high).all(-1) & seen
 
-        shown = inside(0.0)
         pixel = fine * torch.stack([(places - places.roll(1, dim)).abs().amax(-1) for dim in (0, 1)]).amax(0)[..., None]
         # what is a pixel thick, and more, is found; what is found is there to a pixel
-        thick = -torch.nn.functional.max_pool2d(-shown.double(), 2 * fine + 1, 1, fine) > 0
+        thick = -torch.nn.functional.max_pool2d(-inside(0.0).double(), 2 * fine + 1, 1, fine) > 0
         assert bool(valid[thick.flatten(1).any(-1)].all())
         if bool(seen.any()):
             assert not bool(valid[~inside(pixel).flatten(1).any(-1)].any())
         # of what its outline does not say the box knows to a step of the lattice
-        pixels = (camera.resize(height * fine, width * fine).pixel_grid() + 0.5) / fine - 0.5
-        step = torch.tensor([width, height]) / 16 + 1
+        pixels, step = (large.pixel_grid() + 0.5) / fine - 0.5, torch.tensor([width, height]) / 16 + 1
         rows = thick.flatten(1).any(-1) & warp.transform_points(boxes.unflatten(-1, (2, 2)))[1].all(-1)
         for box, there in zip(moved[rows], thick[rows], strict=True):
             assert bool((pixels[there] >= box[:2] - step).all() & (pixels[there] <= box[2:] + step).all())
@@ -178,14 +173,14 @@ def test_boxes_around_the_whole_image_are_on_it():
     assert valid.tolist() == [True, False, False, True]
     assert bool((enclosing[:, 2:] > 0).all())
     # no part of the outline has a ray: the box is that of what the image shows
-    lens = lenses()["small_circle"]
+    circle = lens("small_circle")
     boxes = torch.tensor([[-500.0, -500.0, 500.0, 500.0]] * 2, dtype=torch.float64, requires_grad=True)
-    moved, valid = ct.Warp(lens, pinhole(dtype=torch.float64)).transform_boxes(boxes)
+    moved, valid = ct.Warp(circle, pinhole(dtype=torch.float64)).transform_boxes(boxes)
     assert valid.all()
     torch.testing.assert_close(moved[0].detach(), torch.tensor([-0.5, -0.5, 63.5, 47.5], dtype=torch.float64))
     moved.sum().backward()
     assert bool((boxes.grad == 0).all())
-    assert not ct.Warp(lens, pinhole(dtype=torch.float64), turn(180, dtype=torch.float64)).transform_boxes(
+    assert not ct.Warp(circle, pinhole(dtype=torch.float64), turn(180, dtype=torch.float64)).transform_boxes(
         [[-500.0, -500.0, 0.0, 500.0]]
     )[1]
 
