@@ -14,7 +14,6 @@ from camtorch.boards.boards import AprilGrid, Board, Charuco, Chessboard, opencv
 Pixels = NDArray[np.float64]
 Grey = NDArray[np.uint8]
 
-NOT_FOUND = "no board found"
 _FEWEST = 6  # points that tell the pose of a board well
 _PIXELS = 3e6  # of an image in which chessboards are searched for; they are refined in the whole one
 _SMALL = 1.5e6  # pixels of an image that is also searched for markers at twice the size
@@ -43,15 +42,14 @@ def detect(board: Board, image: NDArray[Any]) -> Detection:
         image = np.clip((image.astype(np.float32) - low) * (255 / max(high - low, 1)), 0, 255)
     find: Any = {Chessboard: _chessboard, Charuco: _charuco, AprilGrid: _aprilgrid}[type(board)]
     pixels = find(cv2, board, np.ascontiguousarray(image, np.uint8))
-    seen, points = np.isfinite(pixels[:, 0]), board.points()
-    reason = ""
+    seen = np.isfinite(pixels[:, 0])
     if not seen.any():
-        reason = NOT_FOUND
-    elif seen.sum() < _FEWEST:
-        reason = f"only {seen.sum()} points of the board found, of which {_FEWEST} are needed"
-    elif np.linalg.matrix_rank(np.diff(points[seen], axis=0)) < 2:
-        reason = "the points found lie on one line, which does not tell where the board is"
-    return Detection(_nothing(board) if reason else pixels, reason)
+        return Detection(pixels, "no board found")
+    if seen.sum() < _FEWEST:
+        return Detection(_nothing(board), f"only {seen.sum()} points found, of which {_FEWEST} are needed")
+    if np.linalg.matrix_rank(np.diff(board.points()[seen], axis=0)) < 2:
+        return Detection(_nothing(board), "the points found lie on one line, which does not tell where the board is")
+    return Detection(pixels)
 
 
 def _nothing(board: Board) -> Pixels:

@@ -31,33 +31,25 @@ def find_views(
 ) -> tuple[Views, dict[str, tuple[int, int]]]:
     """Return the views of a board that a calibration can use, and the (height, width) of each camera, "" for one alone.
 
-    What was found is printed, and a note names each image that is left out, with the reason.
-
-    Raises:
-        ValueError: If there are too few.
+    What was found is printed, and a note names each image that is left out, with the reason; too few are a ValueError.
     """
-    found: dict[str, list[tuple[str, ImageCorners]]]
     if len(cameras) == 1:
         ((name, paths),) = cameras.items()
-        films = [path for path in paths if videos.is_video(path)]
-        images = _search(board, [(path, None) for path in paths if path not in films])
-        images += [image for path in films for image in _search_video(path, board)]
-        found = {name: [(str(i), image) for i, image in enumerate(images)]}
-        order = list(map(str, range(len(images))))
+        images = _search(board, [(path, None) for path in paths if not videos.is_video(path)])
+        images += [image for path in paths if videos.is_video(path) for image in _search_video(path, board)]
+        keys = [(name, str(i)) for i in range(len(images))]
     else:
         together = take_together(cameras)
-        places = [(name, view, path) for view, of_view in together.items() for name, path in of_view.items()]
-        twice = [path for path, count in Counter(path for *_, path in places).items() if count > 1]
-        if twice:
+        keys = [(name, view) for view, of_view in together.items() for name in of_view]
+        taken = [path for of_view in together.values() for path in of_view.values()]
+        if twice := [path for path, count in Counter(taken).items() if count > 1]:
             raise ValueError(f"{twice[0]}: is given as an image of two cameras")
         print(f"{len(together)} views of {', '.join(cameras)}")
-        images = _search(board, [(path, None) for *_, path in places])
-        found, order = {name: [] for name in cameras}, list(together)
-        for (name, view, _), image in zip(places, images, strict=True):
-            found[name].append((view, image))
-    views: Views = {view: {} for view in order}
+        images = _search(board, [(path, None) for path in taken])
+    views: Views = {view: {} for _, view in keys}
     sizes: dict[str, tuple[int, int]] = {}
-    for name, seen in found.items():
+    for name in cameras:
+        seen = [(view, image) for (camera, view), image in zip(keys, images, strict=True) if camera == name]
         used, left_out = usable([image for _, image in seen])
         for path, why in left_out:
             note(f"{path} is left out: {why}")
@@ -143,6 +135,10 @@ def _sharpest(path: Path) -> list[_Moment]:
     """Return the sharpest frame of each moment; moments are longer in long videos."""
     cv2: Any = opencv("finding boards in images")
     best, moment = dict[int, _Moment](), _MOMENT
+
+    def keep(number: int, one: _Moment) -> None:
+        best[number] = max(best.get(number, one), one, key=lambda of: of[1])
+
     with bar(f"reading {path.name}", None, "frames") as shown:
         for seconds, frame in videos.frames(path):
             shown.update()
@@ -153,11 +149,9 @@ def _sharpest(path: Path) -> list[_Moment]:
                 )
             grey = frame.to_ndarray(format="gray")
             small = cv2.resize(grey, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
-            one = seconds, float(cv2.Laplacian(small, cv2.CV_32F).var()), grey
-            number = int(seconds / moment)
-            best[number] = max(best.get(number, one), one, key=lambda of: of[1])
+            keep(int(seconds / moment), (seconds, float(cv2.Laplacian(small, cv2.CV_32F).var()), grey))
             if len(best) >= 2 * _MOMENTS:
                 moments, best, moment = best, {}, 2 * moment
                 for old, other in moments.items():
-                    best[old // 2] = max(best.get(old // 2, other), other, key=lambda of: of[1])
+                    keep(old // 2, other)
     return list(best.values())

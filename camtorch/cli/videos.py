@@ -153,9 +153,13 @@ def remake(
     if first is None:
         raise ValueError(f"{source}: no frame of it can be read")
     warp, facts = warp_of((first.height, first.width))
-    black = 0 if first.reformat(format="yuv420p").color_range == 2 else 16
-    colour = _still(_halved(warp.source), _halved(warp.target), warp, 128)
-    warps = _still(warp.source, warp.target, warp, black), colour, colour
+    black = 0.0 if first.reformat(format="yuv420p").color_range == 2 else 16.0
+
+    def still(source: Camera, target: Camera, fill: float) -> Warp:
+        return Warp(source, target, warp.rotation, fill=fill, tolerance=warp.tolerance).requires_grad_(False)
+
+    colour = still(_halved(warp.source), _halved(warp.target), 128.0)
+    warps = still(warp.source, warp.target, black), colour, colour
     count, end = 0, 0.0
     target.parent.mkdir(parents=True, exist_ok=True)
     # bitexact: no random identifiers
@@ -197,11 +201,6 @@ def _planes(frame: Any) -> Iterator[np.ndarray[Any, Any]]:
     """Yield the planes (H, W) of a frame, brightness and two colours of half the resolution; they share its memory."""
     for plane in frame.planes:
         yield np.frombuffer(plane, np.uint8).reshape(-1, plane.line_size)[: plane.height, : plane.width]
-
-
-def _still(source: Camera, target: Camera, like: Warp, fill: int) -> Warp:
-    """Return the warp of a plane, which does not learn."""
-    return Warp(source, target, like.rotation, fill=float(fill), tolerance=like.tolerance).requires_grad_(False)
 
 
 def _halved(camera: Camera) -> Camera:
