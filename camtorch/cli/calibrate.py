@@ -46,8 +46,7 @@ def run(arguments: argparse.Namespace) -> None:
             f"no optimum was found (rms {result.rms:.4g} px), so nothing is written: are --board and the images right? "
             "Another --model, or --loss huber where some corners are wrong, may help"
         )
-    is_rig = isinstance(result, RigCalibration)
-    names = list(views) if is_rig else [of_view[""].path.name for of_view in views.values()]
+    names = list(views) if isinstance(result, RigCalibration) else [of_view[""].path.name for of_view in views.values()]
     print(_with_options(_named(repr(result), names)))
     if arguments.bend:
         across, down = (f"{bend:.3g}" for bend in result.bend)
@@ -86,11 +85,7 @@ def _board(arguments: argparse.Namespace) -> Board:
 
 
 def _candidates(arguments: argparse.Namespace) -> list[tuple[str, int]]:
-    """Return the models to try, with numbers of coefficients, that the file to be written can hold.
-
-    Raises:
-        ValueError: If the name does not say the format, or it holds no camera of the model.
-    """
+    """Return the models to try, with numbers of coefficients, that the file to be written can hold; if none, raise."""
     path, model, count = arguments.output, arguments.model, arguments.count
     if arguments.format is None and path.suffix.lower() in (".yml", ".yaml"):  # which is written by several
         arguments.format = "opencv"
@@ -131,13 +126,10 @@ def _calibrated(
     """Return the calibration of a camera, or of the rig if there are several."""
     fixed = tuple(filter(None, (arguments.fixed or "").split(",")))
     options = {"fixed": fixed, "loss": arguments.loss, "loss_scale": arguments.loss_scale}
-    points, models, counts = board.points(), {}, {}
+    points, pixels, models, counts = board.points(), {}, {}, {}
     unseen = np.full((len(points), 2), np.nan)
-    pixels = {
-        name: np.stack([of_view[name].pixels if name in of_view else unseen for of_view in views.values()])
-        for name in sizes
-    }
     for name, size in sizes.items():
+        pixels[name] = np.stack([of_view[name].pixels if name in of_view else unseen for of_view in views.values()])
         models[name], counts[name] = candidates[0]
         if len(candidates) > 1:
             seen = pixels[name][[name in of_view for of_view in views.values()]]

@@ -100,7 +100,7 @@ def _single(arguments: argparse.Namespace, source: Path) -> None:
     is_video = videos.is_video(source)
     output = Path(arguments.output or f"dewarped{videos.written_suffix(source) if is_video else '.png'}")
     targets.check(output, force=arguments.force, inputs=(source, arguments.camera))
-    (videos if is_video else images).check_kind(output)
+    images.check_kind(output, is_video=is_video)
     if not source.exists():
         raise ValueError(f"{source}: no such file")
     work = _dewarping(arguments, [source])
@@ -157,7 +157,7 @@ def _target(source: Path, target: Path, suffix: str | None) -> Path:
         target = target.with_suffix(videos.written_suffix(source))
     if suffix is not None and is_video == videos.is_video(Path("any" + suffix)):
         target = target.with_suffix(suffix)
-    (videos if is_video else images).check_kind(target)
+    images.check_kind(target, is_video=is_video)
     return target
 
 

@@ -11,16 +11,18 @@ from torch import Tensor
 from camtorch._arguments import warn
 from camtorch._photographs import ORIENTATION, ImageFileError
 from camtorch.boards.finding import IMAGES
+from camtorch.cli import videos
 from camtorch.io.writing import replacing
 
 _KEEP_ORIENTATION = ("JPEG", "PNG", "TIFF", "WEBP")
 
 
-def check_kind(path: Path) -> None:
-    """Raise an ImageFileError if the name is of no file type that images are written as."""
-    if path.suffix.lower() not in IMAGES:
-        what = path.suffix or "no suffix"
-        raise ImageFileError(f"{path}: {what}: no image is written as that; try {', '.join(sorted(IMAGES))}")
+def check_kind(path: Path, *, is_video: bool = False) -> None:
+    """Raise an ImageFileError if the name is of no file type that images, or videos, are written as."""
+    known = list(videos.WRITTEN) if is_video else sorted(IMAGES)
+    if path.suffix.lower() not in known:
+        what, kind = path.suffix or "no suffix", "video" if is_video else "image"
+        raise ImageFileError(f"{path}: {what}: no {kind} is written as that; try {', '.join(known)}")
 
 
 def from_tensor(image: Tensor) -> Image.Image:

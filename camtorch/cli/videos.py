@@ -40,13 +40,6 @@ def written_suffix(path: Path) -> str:
     return path.suffix if path.suffix.lower() in WRITTEN else ".mkv"
 
 
-def check_kind(path: Path) -> None:
-    """Raise a ValueError if the name is of no format that videos are written as."""
-    if path.suffix.lower() not in WRITTEN:
-        what = path.suffix or "no suffix"
-        raise ValueError(f"{path}: {what}: no video is written as that; try {', '.join(WRITTEN)}")
-
-
 def require() -> Any:
     """Return PyAV, or raise an ImportError that says how to install it."""
     return imported("av", "videos need PyAV", "video")

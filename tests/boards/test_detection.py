@@ -5,8 +5,9 @@ import numpy as np
 import pytest
 from photographs import fisheye, photograph
 
+import camtorch as ct
 from camtorch.boards import detection
-from camtorch.boards.boards import AprilGrid, Charuco, Chessboard, as_board
+from camtorch.boards.boards import AprilGrid, Charuco, Chessboard
 from camtorch.boards.detection import detect
 
 BOARDS = [Chessboard(9, 6, 0.03), Charuco(9, 7, 0.03, 0.022, "4X4_50"), AprilGrid(5, 4, 0.05)]
@@ -146,23 +147,18 @@ def test_points_are_row_by_row_as_opencv_has_them(board):
 
 
 @pytest.mark.parametrize(
-    ("words", "square", "options", "text"),
+    ("words", "options", "text"),
     [
-        ("2x6", 1.0, {}, "at least 3x3 inner corners are needed; got 2x6"),
-        ("9x6", 0.0, {}, "must be positive"),
-        ("9x6", float("nan"), {}, "must be positive"),
-        ("9x6", 1.0, {"spacing": 0.3}, "a chessboard takes no option; got spacing"),
-        ("charuco 5x7", 0.02, {"marker": 0.03}, "a marker must be smaller than its square"),
-        ("aprilgrid 6x6", 0.03, {"spacing": 0}, "above 0 and at most 2; got 0"),
-        ("aprilgrid 6x6", 0.03, {"border": 0}, "1, 2 or 3 cells; got 0"),
-        ("circles 6x6", 1.0, {}, "one of chessboard, charuco, aprilgrid; got 'circles'"),
+        ("2x6", {}, "at least 3x3 inner corners are needed; got 2x6"),
+        ("9x6", {"square": float("nan")}, "must be positive"),
+        ("9x6", {"spacing": 0.3}, "a chessboard takes no option; got spacing"),
+        ("charuco 5x7", {"square": 0.02, "marker": 0.03}, "a marker must be smaller than its square"),
+        ("aprilgrid 6x6", {"spacing": 0}, "above 0 and at most 2; got 0"),
+        ("aprilgrid 6x6", {"border": 0}, "1, 2 or 3 cells; got 0"),
+        ("circles 6x6", {}, "one of chessboard, charuco, aprilgrid; got 'circles'"),
+        ("charuco 5x7", {"dictionary": "x"}, "no dictionary of markers is called 'x'; OpenCV has 4x4_100"),
     ],
 )
-def test_bad_boards(words, square, options, text):
+def test_bad_boards(words, options, text):
     with pytest.raises(ValueError, match=text):
-        as_board(words, square, options, "find_board")
-
-
-def test_a_dictionary_that_opencv_does_not_have():
-    with pytest.raises(ValueError, match="no dictionary of markers is called 'x'; OpenCV has 4x4_100"):
-        detect(Charuco(5, 7, dictionary="x"), np.zeros((80, 80), np.uint8))
+        ct.find_board(np.zeros((80, 80), np.uint8), words, **options)
