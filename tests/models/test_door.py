@@ -8,7 +8,7 @@ from collections import UserList
 import numpy as np
 import pytest
 import torch
-from cameras import KEYS, every_model, make, spread
+from cameras import every_model, make, spread
 
 import camtorch as ct
 from camtorch.networks.parametrize import PositiveFocal
@@ -42,6 +42,12 @@ def from_fov(fov, **options):
     return ct.Pinhole.from_fov(fov, **({"image_size": SIZE} | options))
 
 
+def from_changed(row, column, value):
+    matrix = K.copy()
+    matrix[row, column] = value
+    return ct.KannalaBrandt.from_matrix(matrix)
+
+
 def of_size(size):
     return ct.KannalaBrandt(INTRINSICS, image_size=size)
 
@@ -61,27 +67,30 @@ WRONG = [
     (lambda: ct.Pinhole([300.0, -310.0, 320.0, 240.0]), ValueError, r"^Pinhole: focal lengths .*-310\.0"),
     (lambda: ct.Pinhole([INTRINSICS, [300.0, -1.0, 320.0, 240.0]]), ValueError, r"^Pinhole: focal lengths .*-1\.0"),
     (lambda: ct.Pinhole([NAN, 300.0, 320.0, 240.0]), ValueError, r"^Pinhole: intrinsics .*nan"),
-    (lambda: ct.Pinhole([300.0, 300.0, math.inf, 240.0]), ValueError, r"^Pinhole: intrinsics .*inf"),
     (lambda: ct.Pinhole(leaf(NAN, 300.0, 320.0, 240.0)), ValueError, r"^Pinhole: intrinsics .*nan"),
     (lambda: ct.Pinhole(leaf(-300.0, 300.0, 320.0, 240.0)), ValueError, r"^Pinhole: focal lengths .*-300\.0"),
     (lambda: ct.Fisheye624("300 300 320 240"), TypeError, r"^Fisheye624: intrinsics .*str"),
-    (lambda: ct.Fisheye624(None), TypeError, r"^Fisheye624: intrinsics .*NoneType"),
     (lambda: ct.Fisheye624({"fx": 300}), TypeError, r"^Fisheye624: intrinsics .*dict"),
     (lambda: ct.Fisheye624(torch.ones(4, dtype=torch.complex64)), TypeError, r"intrinsics .*complex64"),
     (lambda: ct.Fisheye624(torch.ones(4, dtype=torch.bool)), TypeError, r"intrinsics .*bool"),
     (lambda: ct.Pinhole(np.array(INTRINSICS)[:, None]), ValueError, r"intrinsics\[\.\.\., 0\]"),
+    # matrices
+    (lambda: from_changed(0, 1, 0.25), ValueError, r"KannalaBrandt.*skew.*0\.25.*ignore_skew"),
+    (lambda: from_changed(2, 2, 2.0), ValueError, r"KannalaBrandt.*K.*2\.0"),
+    (lambda: from_changed(2, 0, 0.5), ValueError, r"KannalaBrandt.*K.*0\.5"),
+    (lambda: from_changed(1, 0, 0.75), ValueError, r"KannalaBrandt.*K.*0\.75"),
+    (lambda: from_changed(0, 0, -300.0), ValueError, r"KannalaBrandt.*focal.*-300\.0"),
+    (lambda: ct.Pinhole.from_matrix(K[:2]), ValueError, r"Pinhole.*K.*\(2, 3\)"),
+    (lambda: ct.Pinhole.from_matrix("K"), TypeError, "K"),
+    (lambda: ct.Pinhole.from_matrix(None), TypeError, "K"),
     # sizes
     (lambda: of_size(640), TypeError, r"^KannalaBrandt: image_size .*height.*640"),
     (lambda: of_size("480x640"), TypeError, r"image_size .*height.*480x640"),
     (lambda: of_size((480.5, 640)), TypeError, r"image_size .*height.*\(480\.5, 640\)"),
-    (lambda: of_size(("480", "640")), TypeError, r"image_size .*height.*\('480', '640'\)"),
-    (lambda: of_size((None, 640)), TypeError, r"image_size .*height.*\(None, 640\)"),
     (lambda: of_size((480,)), TypeError, r"image_size .*height.*\(480,\)"),
     (lambda: of_size((480, 640, 3)), TypeError, r"image_size .*height.*\(480, 640, 3\)"),
     (lambda: of_size((0, 640)), ValueError, r"image_size .*height.*\(0, 640\)"),
-    (lambda: of_size((480, -640)), ValueError, r"image_size .*height.*\(480, -640\)"),
     (lambda: CAMERA.resize(0, 10), ValueError, r"^Pinhole.*\(0, 10\)"),
-    (lambda: CAMERA.resize(10, -1), ValueError, r"^Pinhole.*\(10, -1\)"),
     (lambda: CAMERA.resize(10.5, 10), TypeError, r"^Pinhole.*\(10\.5, 10\)"),
     (lambda: CAMERA.crop(0, 0, 0, 10), ValueError, r"^Pinhole.*\(0, 10\)"),
     (lambda: CAMERA.crop(0, 0, 10.5, 10), TypeError, r"^Pinhole.*\(10\.5, 10\)"),
@@ -99,7 +108,6 @@ WRONG = [
     (lambda: CAMERA.rays(0), ValueError, "at least 1"),
     (lambda: CAMERA.resize(48, 64).rays(64), ValueError, r"larger than images of \(48, 64\).*: .resize\(64, 64\), or"),
     # other numbers of models
-    (lambda: GENERAL(INTRINSICS, [-1.0, 0.1]), ValueError, r"^KannalaBrandt.*coefficient.*-1\.0"),
     (lambda: GENERAL(INTRINSICS, [0.0, 0.1]), ValueError, r"^KannalaBrandt.*coefficient.*0\.0"),
     (lambda: GENERAL(INTRINSICS, [1.0, NAN]), ValueError, "^KannalaBrandt.*coefficients.*nan"),
     (lambda: GENERAL(INTRINSICS, []), ValueError, r"^KannalaBrandt.*coefficients.*\(0,\)"),
@@ -134,19 +142,15 @@ WRONG = [
     (lambda: CAMERA.convert("splined:16x11"), ValueError, "is how a grid is written"),
     # fields of view
     (lambda: from_fov(0), ValueError, r"^Pinhole\.from_fov: .*above 0"),
-    (lambda: from_fov(-60), ValueError, r"^Pinhole\.from_fov: .*above 0"),
     (lambda: from_fov(361), ValueError, r"^Pinhole\.from_fov: .*up to 360"),
     (lambda: from_fov(180), ValueError, r"no horizontal field of view of 180.*179\.9"),
-    (lambda: from_fov(200, axis="diagonal"), ValueError, "no diagonal field of view of 200"),
     (lambda: from_fov(60, axis="x"), ValueError, "axis must be one of .*'x'"),
     (lambda: from_fov(60, image_size=None), ValueError, r"^Pinhole\.from_fov: .*image_size"),
     (lambda: from_fov(NAN), ValueError, r"^Pinhole\.from_fov: .*finite"),
     # parts, values, polylines
     (lambda: CAMERA[0], TypeError, "Pinhole: it has no batch dims"),
     (lambda: len(CAMERA), TypeError, "Pinhole: it has no batch dims"),
-    (lambda: iter(CAMERA), TypeError, "Pinhole: it has no batch dims"),
     (lambda: PAIR[3], IndexError, r"Pinhole: 3 of a batch \(2,\)"),
-    (lambda: PAIR[0, 1], IndexError, r"Pinhole: \(0, 1\) of a batch \(2,\)"),
     (lambda: PAIR[::-1], TypeError, r"got slice\(None, None, -1\)\. Slices go forwards"),
     (lambda: MIXED[::-1], TypeError, r"got slice\(None, None, -1\)\. Slices go forwards"),
     (lambda: LENS.replace(intrinsics=[1.0, 2.0]), ValueError, r"KannalaBrandt: intrinsics must be \(\*B, 4\)"),
@@ -216,10 +220,8 @@ WRONG = [
     (lambda: POSE(RVEC, np.zeros((4, 1))), ValueError, r"translation .*\(4, 1\)"),
     (lambda: POSE(torch.nn.Parameter(torch.zeros(3, 1)), TVEC), ValueError, r"Parameter rotation .*\(3, 1\)"),
     (lambda: POSE([0, 90, 0], TVEC), ValueError, "rotation holds.*radians; an angle of .* seems to be degrees"),
-    (lambda: POSE(torch.tensor([[0.1] * 3, [0.0, -30, 0]]), TVEC), ValueError, "seems to be degrees"),
     (lambda: POSE([[[0.0], [45.0], [0.0]]], TVEC), ValueError, "seems to be degrees"),
     (lambda: ct.Warp(CAMERA, CAMERA, RVEC), ValueError, r"rotation must be .*Extrinsics\(vector"),
-    (lambda: ct.Warp(CAMERA, CAMERA, RVEC[:, None]), ValueError, r"rotation must be .*Extrinsics\(vector"),
     (lambda: ct.head_angles(EYE[:2, :2]), ValueError, r"^head_angles: .*\(\.\.\., 3, 3\); got shape \(2, 2\)"),
     (lambda: ct.head_angles(np.diag([1.0, 1, -1])), ValueError, "^head_angles: .*must hold rotation matrices"),
     (lambda: ct.head_angles(np.full((3, 3), NAN)), ValueError, "^head_angles: .*pose"),
@@ -230,7 +232,6 @@ WRONG = [
     # what people try first of edits, losses and shutters
     (lambda: A.Resize([]), TypeError, "size must be whole numbers"),
     (lambda: A.Rotate90(90), ValueError, "quarter turns; got 90, which would be degrees"),
-    (lambda: A.Rotate90((-90, 90)), ValueError, "degrees"),
     (lambda: A.RandomResizedCrop(32, scale=0.5), TypeError, "scale must be a range"),
     (lambda: ct.vignetting(MIXED, torch.ones(3)), ValueError, "one for each of 2 cameras"),
     (lambda: REPROJECTION(LENS, UV, torch.rand(9, 3)), ValueError, r"pixels \(17, 2\) of target and \(9, 2\)"),
@@ -250,30 +251,19 @@ def refuses(error, *words):
     return pytest.raises(error, match=re.compile(".*".join(re.escape(word) for word in words), re.DOTALL))
 
 
-DISTORTED = [key for key in KEYS if ct.MODELS[key].distortion_names]
-with_distortion = pytest.mark.parametrize("key", DISTORTED)
-
-
-@with_distortion
-def test_number_of_coefficients(key):
+@every_model
+def test_coefficients(key):
     model = ct.MODELS[key]
+    if not model.distortion_names:
+        with pytest.raises((TypeError, ValueError)):
+            model(INTRINSICS, [0.01, 0.02, 0.03, 0.04])
+        return
     refused = [n for n in range(20) if model.names_of(n) is None]
     assert refused
     for n in refused:
         # it says what the model takes, by name
         with refuses(ValueError, model.__name__, "distortion", model.distortion_names[0], f"({n},)"):
             model(INTRINSICS, [0.01] * n)
-
-
-@pytest.mark.parametrize("key", [key for key in KEYS if key not in DISTORTED])
-def test_coefficients_for_a_model_that_takes_none(key):
-    with pytest.raises((TypeError, ValueError)):
-        ct.MODELS[key](INTRINSICS, [0.01, 0.02, 0.03, 0.04])
-
-
-@with_distortion
-def test_values_of_coefficients(key):
-    model = ct.MODELS[key]
     good = [0.01] * model.default_count
     for value in (float("nan"), float("inf")):
         with refuses(ValueError, model.__name__, "distortion", str(value)):
@@ -284,11 +274,6 @@ def test_values_of_coefficients(key):
         model(INTRINSICS, 0.1)
     with refuses(ValueError, model.__name__, "intrinsics (2, 4)", f"distortion (3, {len(good)})"):
         model(torch.tensor([INTRINSICS] * 2), torch.tensor([good] * 3))
-
-
-@pytest.mark.parametrize("size", [(np.int64(480), np.int32(640)), [480, 640], torch.Size([480, 640])])
-def test_image_sizes_that_are_integers_are_taken(size):
-    assert ct.Pinhole(INTRINSICS, image_size=size).image_size == (480, 640)
 
 
 @every_model
@@ -316,31 +301,12 @@ def test_values(key, method, argument, columns):
         refused(ValueError, wrong, "(2, 3)", str(tuple(wrong.shape)), of=deep)
 
 
-@every_model
-def test_matrix(key):
-    model = ct.MODELS[key]
-    K = torch.tensor([[300.0, 0, 320], [0, 310, 240], [0, 0, 1]])  # noqa: N806
-
-    def changed(row, column, value):
-        wrong = K.clone()
-        wrong[row, column] = value
-        return wrong
-
-    with refuses(ValueError, model.__name__, "skew", "0.25", "ignore_skew"):
-        model.from_matrix(changed(0, 1, 0.25))
-    with refuses(ValueError, model.__name__, "K", "(2, 3)"):
-        model.from_matrix(K[:2])
-    for row, column, value in ((2, 2, 2.0), (2, 0, 0.5), (1, 0, 0.75)):
-        with refuses(ValueError, model.__name__, "K", str(value)):
-            model.from_matrix(changed(row, column, value))
-    with refuses(ValueError, model.__name__, "focal", "-300.0"):
-        model.from_matrix(changed(0, 0, -300.0))
-    for wrong in ("K", None):
-        with pytest.raises(TypeError, match="K"):
-            model.from_matrix(wrong)
-
-
 # -- what is not refused
+
+
+@pytest.mark.parametrize("size", [(np.int64(480), np.int32(640)), [480, 640], torch.Size([480, 640])])
+def test_image_sizes_that_are_integers_are_taken(size):
+    assert ct.Pinhole(INTRINSICS, image_size=size).image_size == (480, 640)
 
 
 @pytest.mark.parametrize("yes", [1, np.bool_(True), np.int64(1), np.array(True), torch.tensor(True), torch.tensor(1)])

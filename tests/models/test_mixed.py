@@ -6,7 +6,7 @@ import pickle
 import pytest
 import torch
 from cameras import DISTINCT, KEYS, make, real
-from test_laws import EDITS, FLIPS
+from test_laws import EDITS
 
 import camtorch as ct
 
@@ -114,7 +114,7 @@ def same(batch, cameras):
     )
 
 
-@pytest.mark.parametrize("edit", [*(edit for edit, *_ in (EDITS | FLIPS).values()), lambda camera: camera.rot90()])
+@pytest.mark.parametrize("edit", [edit for edit, *_ in EDITS.values()])
 def test_edits_are_those_of_each_camera_and_gradients_go_there(edit):
     cameras = models()
     edited = edit(ct.Mixed(cameras))
@@ -146,6 +146,8 @@ def test_parts_and_members():
     assert [rows for rows, _ in mixed.groups] == [[0], [1], [2], [3], [4, 5]]
     assert torch.equal(mixed.K[4], cameras[4].K)
     assert torch.equal(mixed.field_of_view[4], cameras[4].field_of_view)
+    wide = ct.Mixed([cameras[0], models()[4].double()])
+    assert wide.project(torch.randn(2, 3, 3))[0].dtype == torch.float64
 
 
 def test_batches_mixed_batches_and_orders_among_the_cameras():
@@ -165,23 +167,16 @@ def test_batches_mixed_batches_and_orders_among_the_cameras():
     assert torch.equal(again.project(points)[0], turned.project(points)[0])
 
 
-def test_the_widest_dtype_is_that_of_all():
-    cameras = [models()[0], models()[4].double()]
-    pixels, _ = ct.Mixed(cameras).project(torch.randn(2, 3, 3))
-    assert pixels.dtype == torch.float64
-
-
 def test_it_is_a_module():
     mixed, points = ct.Mixed(models()), torch.randn(6, 3, 3)
     expected = mixed(points)[0]
-    for twin in (copy.deepcopy(mixed), pickle.loads(pickle.dumps(mixed))):
-        assert torch.equal(twin(points)[0], expected)
-        twin[0].intrinsics.data += 1
-    assert torch.equal(mixed(points)[0], expected)
     other = ct.Mixed(models())
     other[4].intrinsics.data += 1
     other.load_state_dict(mixed.state_dict())
-    assert torch.equal(other(points)[0], expected)
+    for twin in (other, copy.deepcopy(mixed), pickle.loads(pickle.dumps(mixed))):
+        assert torch.equal(twin(points)[0], expected)
+        twin[0].intrinsics.data += 1
+    assert torch.equal(mixed(points)[0], expected)
     assert other.double()(points)[0].dtype == torch.float64
     assert other.half()[0].intrinsics.dtype == torch.float64  # never of less than float32
     doubled = {name: 2 * value for name, value in mixed.state_dict().items() if "intrinsics" in name}
@@ -192,35 +187,23 @@ def test_it_is_a_module():
 
 
 def test_predicted_cameras_inside():
-    features, points = torch.randn(2, 8), torch.rand(4, 5, 3) + 0.5
-    network = torch.nn.Linear(8, 4)
-    batch = ct.Pinhole(50 + network(features), image_size=SIZE)
-    mixed = ct.Mixed([models(learns=False)[4], batch, ct.KannalaBrandt(40 + network(features[0]), image_size=SIZE)])
-    pixels, _ = mixed.project(points)
-    (by_weight,) = torch.autograd.grad(pixels.sum(), network.weight, retain_graph=True)
+    shift, points = torch.zeros(4, requires_grad=True), torch.rand(4, 5, 3) + 0.5
+    batch = ct.Pinhole((50 + shift).expand(2, 4), image_size=SIZE)
+    mixed = ct.Mixed([models(learns=False)[4], batch, ct.KannalaBrandt(40 + shift, image_size=SIZE)])
+    (found,) = torch.autograd.grad(mixed.project(points)[0].sum(), shift, retain_graph=True)
     expected = batch.project(points[1:3])[0].sum() + mixed[3].project(points[3])[0].sum()
-    (wanted,) = torch.autograd.grad(expected, network.weight)
-    assert torch.allclose(by_weight, wanted, rtol=1e-4)
+    torch.testing.assert_close(found, torch.autograd.grad(expected, shift)[0])
 
 
 @pytest.mark.slow
 def test_compiled_where_the_groups_are_fixed():
-    pinhole, *_, division = models()
-    mixed, points = ct.Mixed([division, pinhole, division]), torch.randn(3, 3, 3)
-    pixels, valid = torch.compile(mixed.project, fullgraph=True, backend="eager")(points)
-    assert torch.allclose(pixels, mixed.project(points)[0], atol=1e-4)
-    assert torch.equal(valid, mixed.project(points)[1])
-
-
-@pytest.mark.slow
-def test_augmentations_are_compiled_too():
     mixed, images = ct.Mixed([models(learns=False)[i] for i in (4, 0, 5)]), torch.rand(3, 3, *SIZE)
     augment = ct.augment.RandomMount(yaw=2, pitch=2, roll=2, p=0.5)
-    draw = augment.draw(3)
+    draw, points = augment.draw(3), torch.randn(3, 3, 3)
 
     def step(images):
         moved = augment(image=images, camera=mixed, draw=draw)
-        return moved["image"], moved["camera"].rays(stride=8)[0]
+        return moved["image"], moved["camera"].rays(stride=8)[0], mixed.project(points)[0]
 
     for now, then in zip(torch.compile(step, fullgraph=True, backend="eager")(images), step(images), strict=True):
         assert torch.allclose(now, then, atol=1e-4)

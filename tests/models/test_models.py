@@ -26,12 +26,10 @@ def test_rows_of_transverse_panoramas_are_planes_through_the_baseline(model):
 
 
 def test_latlon_is_a_file_of_mrcal(tmp_path):
-    made = ct.LatLon(INTRINSICS, image_size=(480, 640))
-    ct.save(made, tmp_path / "panorama.cameramodel")
-    assert "LENSMODEL_LATLON" in (tmp_path / "panorama.cameramodel").read_text()
-    read = ct.load(tmp_path / "panorama.cameramodel").camera
-    assert isinstance(read, ct.LatLon)
-    assert torch.equal(read.intrinsics, made.intrinsics)
+    path = tmp_path / "panorama.cameramodel"
+    ct.save(ct.LatLon(INTRINSICS, image_size=(480, 640)), path)
+    assert "LENSMODEL_LATLON" in path.read_text()
+    assert type(ct.load(path).camera) is ct.LatLon
 
 
 @pytest.mark.parametrize(
@@ -191,8 +189,8 @@ def test_the_angles_of_a_table_do_not_learn():
     made = spread("tabulated")
     made.project(fan(60))[0].sum().backward()
     angles, radii = made.distortion.grad.chunk(2)
-    assert (angles == 0).all()
-    assert (radii != 0).any()
+    assert not angles.any()
+    assert radii.all()
 
 
 # Models of which nobody published a calibration with its image size

@@ -7,17 +7,7 @@ import re
 
 import pytest
 import torch
-from cameras import (
-    KEYS,
-    each_kind,
-    every_model,
-    fan,
-    make,
-    one,
-    pixel_lattice,
-    slow_unless,
-    spread,
-)
+from cameras import KEYS, each_kind, every_model, fan, make, one, pixel_lattice, slow_unless, spread
 from torch import nn
 from torch.func import functional_call, jacfwd, jacrev, vmap
 
@@ -110,13 +100,6 @@ def test_export(key, method):
         assert_same(exported(rows), module(rows))
 
 
-@pytest.mark.slow
-def test_export_of_a_dewarp():
-    dewarp = ct.Dewarp(one("pinhole").float().requires_grad_(False), image_size=(6, 8))
-    images = torch.rand(1, 3, *one("pinhole").image_size)
-    torch.testing.assert_close(loaded(dewarp, images)(images), dewarp(images))
-
-
 @each_kind
 @both_directions
 def test_vmap_over_values(key, method):
@@ -128,12 +111,19 @@ def test_vmap_over_values(key, method):
 
 @each_kind
 @both_directions
-def test_vmap_over_cameras(key, method):
+def test_functional_calls_also_in_vmap(key, method):
     module, values = module_and_input(key, method)
+    before = module(values)
     stacked = {name: torch.stack((p, 1.05 * p, 0.9 * p)) for name, p in parameters_of(module).items()}
     results = vmap(lambda parameters: functional_call(module, parameters, (values,)))(stacked)
     for i in range(3):
-        assert_same([r[i] for r in results], functional_call(module, {n: p[i] for n, p in stacked.items()}, (values,)))
+        changed = {name: p[i] for name, p in stacked.items()}
+        fresh = copy.deepcopy(module)
+        fresh.load_state_dict(changed)
+        expected = fresh(values)
+        assert_same(functional_call(module, changed, (values,)), expected)
+        assert_same([result[i] for result in results], expected)
+    assert_same(module(values), before)
 
 
 @both_directions
@@ -167,27 +157,14 @@ def test_forward_and_reverse_mode_agree(key, method):
 
 @each_kind
 @both_directions
-def test_functional_call(key, method):
-    module, values = module_and_input(key, method)
-    before = module(values)
-    changed = {name: p * 1.02 for name, p in parameters_of(module).items()}
-    fresh = copy.deepcopy(module)
-    fresh.load_state_dict(changed)
-    assert_same(functional_call(module, changed, (values,)), fresh(values))
-    assert_same(module(values), before)
-
-
-@each_kind
-@both_directions
 def test_gradient_checkpointing_and_inference_mode(key, method):
     module, values = module_and_input(key, method)
     with torch.inference_mode():
         inferred = [t.clone() for t in module(values)]
-    result = module(values)
-    assert_same(inferred, [t.detach() for t in result])
-    result[0].sum().backward()
     checkpointed = torch.utils.checkpoint.checkpoint(module, values, use_reentrant=False)
-    assert_same(checkpointed, result)
+    for results in (inferred, checkpointed):
+        assert_same(results, module(values))
+    checkpointed[0].sum().backward()
 
 
 # -- copies and files
@@ -205,18 +182,12 @@ def test_copies(key, copied):
     assert again.image_size == camera.image_size
     assert again.distortion_names == camera.distortion_names
     assert [p.requires_grad for p in again.parameters()] == [p.requires_grad for p in camera.parameters()]
-    assert_same(again.project(points), expected)
+    predicted = make(key, *(t.detach().requires_grad_() * 1 for t in (camera.intrinsics, camera.distortion)))
+    for one_again in (again, copied(predicted)):
+        assert_same(one_again.project(points), expected)
     with torch.no_grad():
         again.intrinsics *= 2
     assert_same(camera.project(points), expected)
-
-
-@each_kind
-def test_copies_of_a_predicted_camera_have_the_values(key):
-    parameters = [t.detach().requires_grad_() for t in (spread(key).intrinsics, spread(key).distortion)]
-    camera = make(key, *(p * 1 for p in parameters))
-    for again in (copy.deepcopy(camera), pickle.loads(pickle.dumps(camera))):
-        assert_same(again.project(fan(40)), camera.project(fan(40)))
 
 
 def test_a_state_knows_its_model(tmp_path):
@@ -251,24 +222,10 @@ def test_a_state_knows_its_model(tmp_path):
 
 
 @each_kind
-def test_state_dict_is_strict(key):
-    camera = spread(key)
-    state = camera.state_dict()
-    expected = {"intrinsics", "distortion"} if camera.distortion_names else {"intrinsics"}
-    assert set(state) == expected
-    other = make(key, 2 * camera.intrinsics.detach(), 0.5 * camera.distortion.detach())
-    points = fan(60, 5, 7)
-    other.project(points)
-    other.load_state_dict(state, strict=True)
-    assert_same(other.project(points), camera.project(points))
-    with pytest.raises(RuntimeError, match="intrinsics"):
-        other.load_state_dict({}, strict=True)
-
-
-@each_kind
 def test_every_change_of_a_parameter_is_noticed(key):
     """Whatever a camera keeps between calls, it follows its parameters."""
-    camera = spread(key)
+    camera, state = spread(key), spread(key).state_dict()
+    assert set(state) == ({"intrinsics", "distortion"} if camera.distortion_names else {"intrinsics"})
     points, pixels = fan(60, 5, 7), pixel_lattice(camera, 4, 5)
 
     def check():
@@ -289,6 +246,11 @@ def test_every_change_of_a_parameter_is_noticed(key):
     camera.project(points)[0].sum().backward()
     optimizer.step()
     check()
+    camera.load_state_dict(state)
+    check()
+    assert_same(camera.state_dict().values(), state.values())
+    with pytest.raises(RuntimeError, match="intrinsics"):
+        camera.load_state_dict({})
 
 
 # -- learning
@@ -298,15 +260,13 @@ def test_every_change_of_a_parameter_is_noticed(key):
 def test_plain_values_become_parameters(key):
     camera = spread(key)
     assert camera.intrinsics.requires_grad
-    count = 2 if camera.distortion_names else 1
-    assert len(list(camera.parameters())) == count
     values = camera.intrinsics.tolist()
     for plain in (values, camera.intrinsics.detach().numpy(), camera.intrinsics.detach()):
         again = ct.MODELS[key](plain)
         assert isinstance(again.intrinsics, nn.Parameter)
         assert again.intrinsics is not plain
-    assert ct.MODELS[key](values).intrinsics.dtype == torch.get_default_dtype()
-    assert ct.MODELS[key]([300, 300, 320, 240]).intrinsics.is_floating_point()
+    for plain in (values, [300, 300, 320, 240], camera.intrinsics.detach().half()):
+        assert ct.MODELS[key](plain).intrinsics.dtype == torch.float32
     parameter = nn.Parameter(camera.intrinsics.detach())
     assert ct.MODELS[key](parameter).intrinsics is parameter
 
@@ -359,12 +319,6 @@ def test_dtype_promotion(key, method, of_camera, of_values, expected):
     assert_same((result, valid), module(values.to(expected)))
 
 
-@each_kind
-def test_half_parameters_become_float32(key):
-    intrinsics = torch.tensor([300.0, 310.0, 320.0, 240.0])
-    assert ct.MODELS[key](intrinsics.half()).intrinsics.dtype == torch.float32
-
-
 # -- what one sees
 
 
@@ -380,24 +334,6 @@ def test_repr(key):
         assert re.search(rf"\b{name}={re.escape(f'{value:.6g}')}", text)
     batched = make(key, camera.intrinsics.detach().expand(2, 4), camera.distortion.detach())
     assert "batch_shape=(2,)" in repr(batched)
-
-
-@each_kind
-def test_forward_is_project_and_layers_chain(key):
-    camera = one(key)
-    points = fan(60, 5, 7)
-    assert_same(camera(points), camera.project(points))
-    mounted = nn.Sequential(ct.Extrinsics([0.0, 0.0, 0.0], [0.0, 0.0, 0.0]).double(), camera)
-    assert_same(mounted(points), camera.project(points))
-
-
-def test_the_models_that_must_be_there():
-    names = {"pinhole", "brown_conrady", "kannala_brandt", "fisheye62", "fisheye624"}
-    assert names <= set(ct.MODELS)
-    assert ct.FisheyeRadTanThinPrism is ct.Fisheye624
-    for key, model in ct.MODELS.items():
-        assert model.key == key
-        assert issubclass(model, ct.Camera)
 
 
 def test_an_edited_camera_learns_what_the_original_learns():

@@ -101,26 +101,10 @@ def camera_of(model, dtype=torch.float64):
 
 @every_camera
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_there_and_back(model, dtype):
-    camera = camera_of(model, dtype)
-    rays = fan(50).to(dtype)
-    pixels, valid = camera.project(rays)
-    assert valid.all()
-    again, valid = camera.unproject(pixels)
-    assert valid.all()
-    torch.testing.assert_close(again, rays, rtol=0, atol=500 * torch.finfo(dtype).eps)
-    grid = camera.pixel_grid()[::20, ::20]
-    rays, valid = camera.unproject(grid)
-    assert valid.float().mean() > 0.5
-    torch.testing.assert_close(camera.project(rays)[0][valid], grid[valid], rtol=0, atol=1e4 * torch.finfo(dtype).eps)
-
-
-@every_camera
-def test_the_formula_is_the_one_stated(model):
-    """Against the pixel that the stated formulas give, one by one."""
-    camera = camera_of(model)
-    rays, k = fan(50), torch.tensor(CAMERAS[model], dtype=torch.float64)
-    chart, lens = model.optics(k.unbind())
+def test_the_stated_formula_there_and_back(model, dtype):
+    camera, rays = camera_of(model, dtype), fan(50).to(dtype)
+    eps = torch.finfo(dtype).eps
+    chart, lens = model.optics(torch.tensor(CAMERAS[model], dtype=dtype).unbind())
     a, b = chart.to_plane(*rays.unbind(-1))
     for stage in lens.stages:
         if isinstance(stage, Planar):
@@ -128,13 +112,17 @@ def test_the_formula_is_the_one_stated(model):
             a, b = a * factor, b * factor
         else:
             a, b = stage(a, b)
+    pixels, valid = camera.project(rays)
+    assert valid.all()
     expected = camera.intrinsics[:2] * torch.stack((a, b), -1) + camera.intrinsics[2:]
-    torch.testing.assert_close(camera.project(rays)[0], expected, rtol=1e-12, atol=1e-10)
-
-
-def check_derivatives(function, inputs):
-    assert gradcheck(function, inputs, atol=1e-4)
-    assert gradgradcheck(function, inputs, atol=1e-4, fast_mode=True)
+    torch.testing.assert_close(pixels, expected, rtol=5000 * eps, atol=1e4 * eps)
+    again, valid = camera.unproject(pixels)
+    assert valid.all()
+    torch.testing.assert_close(again, rays, rtol=0, atol=500 * eps)
+    grid = camera.pixel_grid()[::20, ::20]
+    rays, valid = camera.unproject(grid)
+    assert valid.float().mean() > 0.5
+    torch.testing.assert_close(camera.project(rays)[0][valid], grid[valid], rtol=0, atol=1e4 * eps)
 
 
 @pytest.mark.parametrize("model", slow_unless({Waved}.__contains__, list(CAMERAS)))
@@ -142,9 +130,14 @@ def test_derivatives(model):
     camera = camera_of(model)
     leaves = [p.detach().clone().requires_grad_() for p in camera.parameters()]
     points = (fan(50, 2, 2)[2:] * 1.7).requires_grad_()
-    check_derivatives(lambda p, *q: model(*q).project(p)[0], (points, *leaves))
     pixels = camera.project(points)[0].detach().requires_grad_()
-    check_derivatives(lambda p, *q: model(*q).unproject(p)[0], (pixels, *leaves))
+    for method, values in (("project", points), ("unproject", pixels)):
+
+        def call(p, *q, method=method):
+            return getattr(model(*q), method)(p)[0]
+
+        assert gradcheck(call, (values, *leaves), atol=1e-4)
+        assert gradgradcheck(call, (values, *leaves), atol=1e-4, fast_mode=True)
 
 
 FOLDED = {Waved: ((-0.1, -0.03, 0.2, -0.1), 80), WavedAlone: ((0.4, -0.3), 60), Grown: ((-0.4,), 80)}  # and degrees
@@ -179,29 +172,22 @@ def test_valid_up_to_the_fold(model):
 
 
 @every_camera
-def test_without_a_graph_and_in_transforms(model):
+def test_without_a_graph_in_transforms_and_compiled(model):
     camera, rays = camera_of(model), fan(50)
     for method, values in (("project", rays), ("unproject", camera.project(rays)[0].detach())):
         call = getattr(camera, method)
+        expected = call(values)[0].detach()
         for context in (torch.no_grad(), torch.inference_mode()):
             with context:
-                torch.testing.assert_close(getattr(camera_of(model), method)(values)[0], call(values)[0].detach())
+                torch.testing.assert_close(getattr(camera_of(model), method)(values)[0], expected)
+        mapped = torch.func.vmap(lambda v, call=call: call(v)[0])(values)
+        torch.testing.assert_close(mapped.detach(), expected, rtol=1e-9, atol=1e-9)
         found = torch.func.jacrev(lambda v, call=call: call(v)[0])(values[100])
         expected = torch.autograd.functional.jacobian(lambda v, call=call: call(v)[0], values[100])
         torch.testing.assert_close(found, expected, rtol=1e-9, atol=1e-9)
-
-
-@pytest.mark.slow
-def test_traced():
-    camera = camera_of(Waved)
-    rays = fan(50)
-    pixels, _ = camera.project(rays)
-    compiled = torch.compile(camera, backend="eager", fullgraph=True)
-    torch.testing.assert_close(compiled(rays)[0], pixels, rtol=1e-9, atol=1e-9)
-    for method, values in (("project", rays), ("unproject", pixels.detach())):
-        expected = getattr(camera, method)(values)[0]
-        mapped = torch.func.vmap(lambda v, m=method: getattr(camera, m)(v)[0])(values.view(5, -1, values.shape[-1]))
-        torch.testing.assert_close(mapped.flatten(0, 1), expected, rtol=1e-9, atol=1e-9)
+    if model is Waved:
+        compiled = torch.compile(camera, backend="eager", fullgraph=True)
+        torch.testing.assert_close(compiled(rays)[0], camera.project(rays)[0], rtol=1e-9, atol=1e-9)
 
 
 def test_batches_of_a_chart_that_is_looked_up_before_a_lens():

@@ -14,20 +14,36 @@ SANITIZERS = ["-fsanitize=address,undefined,float-cast-overflow", "-fno-sanitize
 
 
 @pytest.fixture(params=["baseline", "best"])
-def fuzzed(request, tmp_path):
-    """Builds sources of the library with a driver and sanitizers, for a kind of CPU, and runs so many random jobs."""
-    variant = request.param if request.param in building.VARIANTS else library().camtorch_variant().decode()
+def variant(request):
+    """The options for one kind of CPU, by the name that drivers of a single variant give it."""
+    name = request.param if request.param in building.VARIANTS else library().camtorch_variant().decode()
+    return {"fuzzed": building.VARIANTS[name]}
 
-    def run(driver, sources, jobs):
-        command = [*building._compiler(None), *building._FLAGS, "-O1", "-g", f"-I{building._HERE}", *SANITIZERS]
+
+@pytest.fixture
+def fuzzed(tmp_path):
+    """Builds a driver, and sources of the library for some variants, with sanitizers, and runs random jobs."""
+
+    def run(driver, sources, variants, first, jobs):
+        command = [*building._compiler(None), "-std=gnu11", "-g", "-Wno-psabi", f"-I{building._HERE}", *SANITIZERS]
         (tmp_path / "empty.c").write_text("int main(void) { return 0; }\n")
         if subprocess.run([*command, "empty.c", "-o", "empty"], cwd=tmp_path, capture_output=True).returncode:
             pytest.skip(f"{command[0]} has no sanitizers")
-        paths = [*(str(building._HERE / name) for name in sources), str(HERE / driver)]
-        command += ["-DVARIANT=fuzzed", *building.VARIANTS[variant], *paths, "-lm", "-o", "fuzz"]
-        subprocess.run(command, cwd=tmp_path, check=True)
-        environment = os.environ | {"ASAN_OPTIONS": "detect_leaks=0"}
-        done = subprocess.run([tmp_path / "fuzz", "1", str(jobs)], capture_output=True, text=True, env=environment)
+        units = [[str(HERE / driver), *(f"-DHAS_{name.upper()}" for name in variants)]]
+        for name, options in variants.items():
+            words = [*building._FLAGS, *options, f"-DVARIANT={name}"]
+            units += [[*words, str(building._HERE / source)] for source in sources]
+        compilers = [
+            subprocess.Popen([*command, *unit, "-O1", "-c", "-o", f"{i}.o"], cwd=tmp_path)
+            for i, unit in enumerate(units)
+        ]
+        assert [compiler.wait() for compiler in compilers] == [0] * len(units)
+        objects = [f"{i}.o" for i in range(len(units))]
+        subprocess.run([*command, *objects, "-lm", "-o", "fuzz"], cwd=tmp_path, check=True)
+        # what is allocated is the driver's own, and not each debugger lets leaks be looked for
+        environment, words = os.environ | {"ASAN_OPTIONS": "detect_leaks=0"}, [str(first), str(jobs)]
+        done = subprocess.run([tmp_path / "fuzz", *words], capture_output=True, text=True, env=environment)
         assert done.returncode == 0, done.stdout + done.stderr
+        return done.stdout.split()[::2]
 
     return run

@@ -7,5 +7,5 @@ from camtorch.native.library import library
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(library() is None, reason="there is no library")]
 
 
-def test_no_read_outside_and_nothing_undefined(fuzzed):
-    fuzzed("poses_fuzz.c", ["poses.c", "views.c"], 4000)
+def test_no_read_outside_and_nothing_undefined(fuzzed, variant):
+    fuzzed("poses_fuzz.c", ["poses.c", "views.c"], variant, 1, 4000)

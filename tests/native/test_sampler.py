@@ -8,7 +8,6 @@ import sys
 import threading
 from contextlib import contextmanager
 from itertools import product
-from pathlib import Path
 
 import pytest
 import torch
@@ -248,13 +247,8 @@ def test_every_layout_of_a_grid(dtype):
     }
     for grid in layouts.values():
         assert torch.equal(both(images, Sampling(grid, mapped, None), "bilinear", "zeros"), expected)
-    for shared in (
-        base[:1],
-        base[:1].expand(3, -1, -1, -1),
-        base[:, :1].expand(base.shape),
-        base[:, :, :1].expand(base.shape),
-    ):
-        both(images, Sampling(shared, mapped[: len(shared)], None), "bilinear", "reflection")
+    for grid in [base[:1], *(part.expand(base.shape) for part in (base[:1], base[:, :1], base[:, :, :1]))]:
+        both(images, Sampling(grid, mapped[: len(grid)], None), "bilinear", "reflection")
     one = both(images[:1], Sampling(base, mapped, None), "bilinear", "border")
     assert torch.equal(one[1], both(images[:1], Sampling(base[1:2], mapped[:1], None), "bilinear", "border")[0])
 
@@ -271,20 +265,17 @@ def test_positions_that_are_far_or_no_numbers(dtype, mode, padding):
             grid[..., ::3, 0] = strange
             if both_axes:
                 grid[..., 1] = strange
-            result = sampling.render(
-                images, Sampling(grid, torch.ones(1, *size, dtype=torch.bool), None), mode, padding, (1.0,)
-            )
+            where = Sampling(grid, torch.ones(1, *size, dtype=torch.bool), None)
+            result = sampling.render(images, where, mode, padding, (1.0,))
             assert result.shape == (1, 3, *size)
             assert result.isfinite().all()
             if math.isnan(strange) or (padding == "zeros" and abs(strange) > 2):
                 assert (result[..., ::3] == 1).all()
-            if padding == "border" and not math.isnan(strange) and not both_axes:
-                last = 36 if strange > 1 else 0
-                if abs(strange) > 2:
-                    # half-way between two rows
-                    assert (result[..., ::3] == result[..., :1, :1]).all()
-                    edge = images[:, :, 11, last].double()
-                    assert ((result[:, :, 0, 0].double() - edge).abs() <= 1e-6 * extent(dtype)).all()
+            if padding == "border" and abs(strange) > 2 and not both_axes:
+                # half-way between two rows
+                assert (result[..., ::3] == result[..., :1, :1]).all()
+                edge = images[:, :, 11, 36 if strange > 1 else 0].double()
+                assert ((result[:, :, 0, 0].double() - edge).abs() <= 1e-6 * extent(dtype)).all()
 
 
 @pytest.mark.parametrize("source", [(3, 20000), (20000, 3), (1, 20000)])
@@ -301,37 +292,6 @@ def test_wide_images(source):
 
 # -- no read outside
 
-FUZZ = Path(__file__).parent / "sampler_fuzz.c"
-# the way without vectors is what the others are compared with
-PLAIN = ("-DCAMTORCH_PLAIN",)
-
-
-def fuzz(folder, names, sanitizers, first, count):
-    """Build some variants of the sampler with sanitizers, and give them jobs by chance."""
-    try:
-        command = [*building._compiler(None), "-std=gnu11", "-g", "-Wno-psabi", f"-I{building._HERE}", *sanitizers]
-    except building.BuildError as error:
-        pytest.skip(str(error))
-    (folder / "empty.c").write_text("int main(void) { return 0; }\n")
-    if subprocess.run([*command, "empty.c", "-o", "empty"], cwd=folder, capture_output=True).returncode:
-        pytest.skip(f"{command[0]} has no sanitizers: {' '.join(sanitizers)}")
-    flags = {"plain": PLAIN, **{name: building.VARIANTS[name] for name in names}}
-    has = [f"-DHAS_{name.upper()}" for name in names]
-    units = [["-O1", str(FUZZ), "-c", "-o", "driver.o", *has]]
-    for name, options in flags.items():
-        units.append([*building._FLAGS, "-O1", *options, f"-DVARIANT={name}"])
-        units[-1] += [str(building._HERE / "kernel.c"), "-c", "-o", f"{name}.o"]
-    compilers = [subprocess.Popen([*command, *unit], cwd=folder) for unit in units]
-    assert all(compiler.wait() == 0 for compiler in compilers)
-    subprocess.run(
-        [*command, *(f"{name}.o" for name in ("driver", *flags)), "-lm", "-o", "fuzz"], cwd=folder, check=True
-    )
-    # what is allocated is the driver's own, and not each debugger lets leaks be looked for
-    here = os.environ | {"ASAN_OPTIONS": "detect_leaks=0"}
-    done = subprocess.run([folder / "fuzz", str(first), str(count)], capture_output=True, text=True, env=here)
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert done.stdout.split()[::2] == list(names)
-
 
 def runs_here():
     """The variants that this CPU runs, the best one last."""
@@ -340,9 +300,10 @@ def runs_here():
 
 
 @pytest.mark.slow
-def test_no_read_outside_and_nothing_undefined_in_any_variant(tmp_path):
-    sanitizers = ["-fsanitize=address,undefined,float-cast-overflow", "-fno-sanitize-recover=all"]
-    fuzz(tmp_path, runs_here(), sanitizers, 4_000, 250)
+def test_no_read_outside_and_nothing_undefined_in_any_variant(fuzzed):
+    variants = {name: building.VARIANTS[name] for name in runs_here()}
+    # the way without vectors is what the others are compared with
+    assert fuzzed("sampler_fuzz.c", ["kernel.c"], {"plain": ("-DCAMTORCH_PLAIN",)} | variants, 4000, 250) == [*variants]
 
 
 # -- positions from a lattice
@@ -431,9 +392,17 @@ def test_strange_tensors_are_images(kind, mode):
             torch.testing.assert_close(result.detach().as_subclass(torch.Tensor), expected, atol=1e-4, rtol=0)
 
 
+@contextmanager
+def default_dtype_of_double():
+    torch.set_default_dtype(torch.float64)
+    try:
+        yield
+    finally:
+        torch.set_default_dtype(torch.float32)
+
+
 @pytest.mark.parametrize(
-    ("dtype", "mode"),
-    [*zip((torch.uint8, torch.float32, torch.float16), ("bilinear", "bicubic", "nearest"), strict=True)],
+    ("dtype", "mode"), [(torch.uint8, "bilinear"), (torch.float32, "bicubic"), (torch.float16, "nearest")]
 )
 def test_another_default_device_or_dtype_changes_nothing(dtype, mode):
     images = pixels(dtype, (2, 3, 120, 160))
@@ -444,16 +413,10 @@ def test_another_default_device_or_dtype_changes_nothing(dtype, mode):
         def fresh(warp=warp):
             return ct.Warp(warp.source, warp.target, tolerance=warp.tolerance, mode=mode)
 
-        with torch.device("meta"):
-            assert torch.equal(fresh()(images), expected)
-            assert torch.equal(warp(images, mode=mode), expected)
-        with torch.autocast("cpu", dtype=torch.bfloat16):
-            assert torch.equal(fresh()(images), expected)
-        torch.set_default_dtype(torch.float64)
-        try:
-            assert torch.equal(fresh()(images), expected)
-        finally:
-            torch.set_default_dtype(torch.float32)
+        for context in (torch.device("meta"), torch.autocast("cpu", dtype=torch.bfloat16), default_dtype_of_double()):
+            with context:
+                assert torch.equal(fresh()(images), expected)
+                assert torch.equal(warp(images, mode=mode), expected)
 
 
 @pytest.mark.parametrize("warp", warps())
@@ -509,13 +472,10 @@ def test_results_do_not_depend_on_threads(tolerance):
     images, results = samples(), []
     for count in (1, 3, 2):
         with threads(count):
-            for given_images in (images, images.float(), hwc(images)):
-                warp = larger(tolerance)
-                results.append(
-                    (warp(given_images), warp(given_images, mode="nearest"), warp(given_images, mode="bicubic"))
-                )
-    for i, made in enumerate(results):
-        assert all(map(torch.equal, made, results[i % 3]))
+            given = [(larger(tolerance), one) for one in (images, images.float(), hwc(images))]
+            results.append([warp(one, mode=mode) for warp, one in given for mode in MODES])
+    for made in results[1:]:
+        assert all(map(torch.equal, made, results[0]))
 
 
 def test_many_threads_warp_at_once():
@@ -575,38 +535,32 @@ def test_forks_while_others_warp():
 # -- memory
 
 PEAK = """
+import itertools
 import torch
 import camtorch as ct
 from camtorch.native import memory
 
-
 def told(key):
     return next(int(line.split()[1]) for line in open("/proc/self/status") if line.startswith(key)) * 1024
 
-
-def check(kind, count, size, dtype, tolerance, last, kept):
+torch.set_num_threads(1)
+cases = [("kept", 8, (720, 1280), *rest) for rest in itertools.product((torch.uint8, torch.float32), (0.01, 0.0))]
+cases += [("fresh", 1, (3000, 4000), torch.uint8, 0.01)]
+for layout, case in itertools.product((torch.contiguous_format, torch.channels_last), cases):
+    kind, count, size, dtype, tolerance = case
     intrinsics = [size[1] / 3, size[1] / 3, size[1] / 2, size[0] / 2]
     source = ct.KannalaBrandt(intrinsics, [0.02, -0.01, 0.004, -0.001], image_size=size).requires_grad_(False)
     warp = ct.Warp(source, ct.Pinhole(intrinsics, image_size=size).requires_grad_(False), tolerance=tolerance)
-    images = torch.ones(count, 3, *size, dtype=dtype)
-    if last:
-        images = images.contiguous(memory_format=torch.channels_last)
-    if kept:
+    images = torch.ones(count, 3, *size, dtype=dtype).contiguous(memory_format=layout)
+    if kind == "kept":
         warp(images[:1])
     memory.release()
     before = told("VmRSS")
     with open("/proc/self/clear_refs", "w") as file:
         file.write("5")
     result = warp(images)
-    print(kind, dtype, "channels last" if last else "planes", tolerance, (told("VmHWM") - before) / result.nbytes)
-
-
-torch.set_num_threads(1)
-for last in (False, True):
-    for dtype in (torch.uint8, torch.float32):
-        check("kept", 8, (720, 1280), dtype, 0.01, last, True)
-        check("kept", 8, (720, 1280), dtype, 0.0, last, True)
-    check("fresh", 1, (3000, 4000), torch.uint8, 0.01, last, False)
+    print(layout, case, (told("VmHWM") - before) / result.nbytes)
+    del result, images
 """
 
 

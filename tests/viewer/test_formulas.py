@@ -72,12 +72,7 @@ def test_the_page_is_small_and_asks_for_nothing(tmp_path):
     assert "default-src 'none'" in text
     for outside in ("http://", "https://", "src=", "@import"):
         assert outside not in text
-
-
-def test_numbers_are_as_they_were_written():
-    described = viewer._described(fisheye())
-    assert described["distortion"] == [0.02, -0.01, 0.003, -0.001]
-    assert described["names"] == ["k1", "k2", "k3", "k4"]
+    assert '"distortion":[0.02,-0.01,0.003,-0.001]' in text  # numbers are as they were written
 
 
 @pytest.mark.parametrize("kind", ["path", "array", "tensor", "grey"])
