@@ -11,8 +11,9 @@ from torch import Tensor
 
 from camtorch._arguments import are_numbers, as_image_size, fails
 from camtorch._module import learning_as, remade
-from camtorch._numbers import joined, split, wide
+from camtorch._numbers import joined, split
 from camtorch._tracing import is_concrete
+from camtorch.optics.radial_inverse import precise
 
 if TYPE_CHECKING:
     from camtorch.camera import Camera
@@ -45,11 +46,7 @@ def check_crop(camera: Camera, corner: tuple[int, int], size: tuple[int, int]) -
 
 
 def edited_by(camera: CameraT, matrix: Sequence[Sequence[float]], size: Sequence[int]) -> CameraT:
-    """The camera of an image whose pixels all move by one map (2, 3); it learns where the camera does.
-
-    Raises:
-        ValueError: a size that is not positive; and as `edited`. TypeError: a size that is not whole.
-    """
+    """Return the camera of an image whose pixels all move by one map (2, 3); it learns where the camera does."""
     new_size = as_image_size(size, type(camera).__name__)
     if camera.is_mixed:
         return cast("Mixed", camera).by_groups(lambda group: edited_by(group, matrix, size))  # type: ignore[return-value]
@@ -57,16 +54,10 @@ def edited_by(camera: CameraT, matrix: Sequence[Sequence[float]], size: Sequence
 
 
 def edited(camera: CameraT, matrix: Tensor | Sequence[Sequence[float]], image_size: tuple[int, int] | None) -> CameraT:
-    """The camera of an image whose pixels move by a map each.
+    """Return the camera of an image whose pixels move by a map each; batch dims broadcast.
 
-    Args:
-        camera: of batch dims that broadcast with those of the maps.
-        matrix: (*B, 2, 3), from pixels (u, v, 1) to those of the edited image: a quarter turn clockwise or none,
-            flips, scales, and a shift.
-        image_size: (height, width) of the edited image.
-
-    Raises:
-        ValueError: a quarter turn of a model that is not the same on its side.
+    matrix: (*B, 2, 3), from pixels (u, v, 1) to those of the edited image: a quarter turn clockwise or none, flips,
+    scales, and a shift. Raises a ValueError if the model has no quarter turn.
     """
     if camera.is_mixed:
         return cast("Mixed", camera).by_groups(lambda group: edited(group, matrix, image_size))  # type: ignore[return-value]
@@ -74,18 +65,16 @@ def edited(camera: CameraT, matrix: Tensor | Sequence[Sequence[float]], image_si
     xp: Any = np if are_numbers(own, camera.distortion, *given) else torch
     rows: Any = matrix
     if isinstance(matrix, Tensor):
-        maps: Any = matrix.detach().double().numpy() if xp is np else wide(matrix)
+        maps: Any = matrix.detach().double().numpy() if xp is np else precise(matrix)
         rows = [[maps[..., i, j] for j in range(3)] for i in range(2)]
     (a, b, left), (c, d, top) = rows
     fx, fy, cx, cy = split(own, xp)
-    numbers = (
-        *(abs(a) * fx + abs(b) * fy, abs(c) * fx + abs(d) * fy),
-        *(a * cx + b * cy + left, c * cx + d * cy + top),
-    )
+    focal = abs(a) * fx + abs(b) * fy, abs(c) * fx + abs(d) * fy
+    centre = a * cx + b * cy + left, c * cx + d * cy + top
     turned = b != 0
     turns = np.any(turned) if not isinstance(turned, Tensor) else not is_concrete(turned) or bool(turned.any())
     distortion = _edited_distortion(camera, a - b, c + d, turned if turns else None)
-    return remade(camera, intrinsics=joined(numbers, own, xp), distortion=distortion, image_size=image_size)
+    return remade(camera, intrinsics=joined((*focal, *centre), own, xp), distortion=distortion, image_size=image_size)
 
 
 def _edited_distortion(camera: Camera, across: Any, down: Any, on_side: Any) -> Tensor:

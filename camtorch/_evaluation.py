@@ -68,24 +68,16 @@ def evaluated(
     tensors: Sequence[Tensor],
     cameras_of: Callable[[Tensor, Tensor], Cameras] | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Planes (size, C, N), and valid (C, N), of rows (C, N, size) seen by cameras of this model.
+    """Return planes (size, C, N), and valid (C, N), of rows (C, N, size) seen by cameras of this model.
 
     The one place that decides the regime: the compiled geometry on a CPU where torch neither traces nor transforms,
-    else the formula, recorded by torch.
-
-    Args:
-        camera: of the model.
-        direction: the way.
-        rows: points or pixels.
-        lead: the batch dims that C counts.
-        tensors: the cameras' intrinsics and distortion.
-        cameras_of: what is kept of those, if others than this camera are meant.
+    else the formula, recorded by torch. lead: the batch dims that C counts. cameras_of: what is kept of the tensors,
+    if others than this camera are meant.
     """
     if is_exporting() and cameras_of is None and is_constant(camera) and all(isinstance(side, int) for side in lead):
         with with_values(camera):
             intrinsics, distortion = (per_row(t, lead, rows) for t in camera._tensors)
-            cameras = rows_of(camera, intrinsics, distortion)
-            cameras = cameras.with_all_tables()
+            cameras = rows_of(camera, intrinsics, distortion).with_all_tables()
         order = 1 if keeps_graph(rows) else 0
         with portable_export():
             return direction.traced(type(camera), rows, intrinsics, distortion, cameras, order)
@@ -113,11 +105,10 @@ def evaluated(
 
 
 def compiled_of(cameras: Sequence[Camera], *values: Tensor) -> tuple[list[Native], bool] | None:
-    """The compiled geometry of cameras (B,), or of one, each, for values of the dtype of the first of them; and whether
-    any of them is a batch.
+    """Return the compiled geometry of cameras, each (B,) or single, and whether any of them is a batch.
 
-    None where `evaluated` would take another regime, where the result would have a graph, and of cameras that are more
-    than one model, or behind a shutter.
+    None if `evaluated` would take another regime for values of the dtype of the first, if the result would have a
+    graph, and of cameras of several models, or behind a shutter.
     """
     pairs, dtype, is_batch, inputs = [], values[0].dtype, False, [*values]
     for camera in cameras:
@@ -210,11 +201,8 @@ def _warn_of_unusable(camera: Camera, cameras: Cameras, usable: Tensor) -> None:
         camera._warned = True
         name = parametrize.type_before_parametrizations(camera).__name__
         where = f" of camera {int(bad[0, 0])} in the batch" if len(cameras.given[0]) > 1 else ""
-        keeps = (
-            "; focal lengths stay positive after torch.nn.utils.parametrize.register_parametrization(camera, "
-            '"intrinsics", camtorch.PositiveFocal())'
-        )
-        keeps = keeps if found[0] == "intrinsics" else ""
+        keeps = "; focal lengths stay positive after torch.nn.utils.parametrize.register_parametrization(camera, "
+        keeps = f'{keeps}"intrinsics", camtorch.PositiveFocal())' if found[0] == "intrinsics" else ""
         warn(
             f"{name}: {found[0]}{where} became unusable: {found[1]}. All its results are invalid "
             f"and its gradients zero from here on. A smaller learning rate keeps it from there{keeps}",
@@ -238,8 +226,7 @@ def new_cameras(memo: Memo, model: type[Camera], intrinsics: Tensor, distortion:
     if in_transform():  # what a transform makes dies with it
         return Cameras(model, intrinsics, distortion)
     # what inference mode makes could not be used in a graph later
-    outside = torch.inference_mode(False) if torch.is_inference_mode_enabled() else nullcontext()
-    with outside:
+    with torch.inference_mode(False) if torch.is_inference_mode_enabled() else nullcontext():
         memo.result = cameras = Cameras(model, intrinsics, distortion)
     return cameras
 

@@ -29,6 +29,7 @@ from camtorch._arguments import (
 from camtorch._freezing import INTRINSICS, frozen_names
 from camtorch._module import remade
 from camtorch._tracing import is_eager
+from camtorch.optics.radial_inverse import precise
 from camtorch.projection.rays import AXES, focal_for
 
 if TYPE_CHECKING:
@@ -122,11 +123,7 @@ def described(camera: Camera) -> str:
 
 
 def checked_intrinsics(model: type[Camera], intrinsics: Numbers) -> Tensor:
-    """Intrinsics (*B, 4) as a tensor, of a camera of this model.
-
-    Raises:
-        ValueError, TypeError: as `Camera`.
-    """
+    """Return intrinsics (*B, 4) as a tensor, of a camera of this model; raise as `Camera` does."""
     owner = model.__name__
     intrinsics = as_real(intrinsics, "intrinsics", owner)
     if intrinsics.ndim == 0 or intrinsics.shape[-1] != 4:
@@ -137,9 +134,8 @@ def checked_intrinsics(model: type[Camera], intrinsics: Numbers) -> Tensor:
         )
     row = row_of(intrinsics)
     if not is_predicted(intrinsics) and (fails(intrinsics[..., :2] > 0) if row is None else min(row[:2]) <= 0):
-        hint = (
-            f". Of matrices (4, 4) use {owner}.from_matrix(K[..., :3, :3])" if intrinsics.shape[-2:] == (4, 4) else ""
-        )
+        hint = f". Of matrices (4, 4) use {owner}.from_matrix(K[..., :3, :3])"
+        hint = hint if intrinsics.shape[-2:] == (4, 4) else ""
         raise ValueError(
             f"{owner}: focal lengths must be positive; got fx, fy = {intrinsics[..., :2].tolist()!s:.200}{hint}"
         )
@@ -147,11 +143,7 @@ def checked_intrinsics(model: type[Camera], intrinsics: Numbers) -> Tensor:
 
 
 def checked_distortion(model: type[Camera], distortion: Numbers, intrinsics: Tensor) -> Tensor:
-    """Distortion (*B, n) as a tensor, of a camera of this model and of these intrinsics.
-
-    Raises:
-        ValueError, TypeError: as `Camera`.
-    """
+    """Return distortion (*B, n) as a tensor, of a camera of this model and intrinsics; raise as `Camera` does."""
     owner = model.__name__
     distortion = as_real(distortion, "distortion", owner)
     row = row_of(distortion)
@@ -213,15 +205,10 @@ def as_numbers_of(camera: Camera, value: Numbers, name: str) -> Tensor:
     return torch.as_tensor(np.asarray(value, dtype=np.float64)).to(camera.intrinsics)
 
 
-def wide(values: Tensor) -> Tensor:
-    """In float64, where a device has that."""
-    return values.float() if values.device.type == "mps" else values.double()
-
-
 def split(intrinsics: Tensor, xp: Any) -> Sequence[Any]:
     """fx, fy, cx, cy of intrinsics (*B, 4) in float64, as tensors, or as numbers and arrays."""
     if xp is torch:
-        return wide(intrinsics).unbind(-1)
+        return precise(intrinsics).unbind(-1)
     return intrinsics.tolist() if intrinsics.ndim == 1 else intrinsics.detach().double().numpy().T
 
 
@@ -257,9 +244,9 @@ def _column_hint(distortion: Tensor) -> str:
 
 def numbers_of_matrix(
     model: type[Camera],
-    K: Numbers,  # noqa: N803
+    K: Numbers,
     distortion: Numbers | None,
-    ignore_skew: bool,
+    ignore_skew: bool,  # noqa: N803
 ) -> tuple[Tensor] | tuple[Tensor, Tensor]:
     """Intrinsics, and distortion where it is given, of a matrix K; see `Camera.from_matrix`."""
     owner = model.__name__

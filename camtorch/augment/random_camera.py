@@ -17,7 +17,7 @@ from torch.nn.utils.parametrize import type_before_parametrizations
 from camtorch._arguments import are_numbers, as_image_size, broadcast_shapes, check_degrees, fails, warn
 from camtorch._evaluation import rows_of
 from camtorch._module import Memo, remade
-from camtorch._numbers import joined, split, wide
+from camtorch._numbers import joined, split
 from camtorch._opaque import CameraNumbers, opaque
 from camtorch._tracing import in_graph, is_eager
 from camtorch.augment.augmentation import Augmentation, Range, as_range
@@ -28,6 +28,7 @@ from camtorch.augment.sample import Named
 from camtorch.camera import Camera
 from camtorch.lenses.drawing import FOLD, covering, drawn
 from camtorch.models import MODELS, KannalaBrandt
+from camtorch.optics.radial_inverse import precise
 from camtorch.projection.compiled import Native, project, project_numbers, unproject
 from camtorch.projection.rays import field_of_view, pixel_lattice, polar_rays, reach
 from camtorch.projection.rows import Cameras, single_native
@@ -190,7 +191,7 @@ class RandomCamera(Augmentation):
             # a hundred operations on some numbers, for each of which torch takes microseconds
             of_one = not source.batch_shape and not any(isinstance(value, np.ndarray) for value in values.values())
             return self._made(source, values, math if of_one else np)
-        like = wide(source.intrinsics.detach())
+        like = precise(source.intrinsics.detach())
         return self._made(source, {name: torch.as_tensor(value).to(like) for name, value in values.items()}, torch)
 
     def _are_plain(self, source: Camera) -> bool:

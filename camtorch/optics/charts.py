@@ -147,27 +147,15 @@ class Equidistant(Chart):
         return torch.maximum(z, torch.addcmul(plus(x * x, -floor), y, y))
 
     def scale(self, x: Tensor, y: Tensor, z: Tensor, order: int = 2) -> Tensor:
-        rho2 = torch.addcmul(x * x, y, y)
-        if order > 1:
-            return angle_per_radius(rho2, z)
-        rho = plus(rho2, floor_of(z.dtype)).sqrt()
-        return atan2(rho, z) / rho
+        return angle_per_radius(torch.addcmul(x * x, y, y), z, order)
 
     def on_plane(self, a: Tensor, b: Tensor) -> Tensor:
         return math.pi**2 - torch.addcmul(a * a, b, b)
 
     def to_ray(self, a: Tensor, b: Tensor, order: int = 2) -> Planes3:
         theta2 = torch.addcmul(a * a, b, b)
-        sinc, cos = self._turned(theta2, order)
-        return a * sinc, b * sinc, cos
-
-    @staticmethod
-    def _turned(theta2: Tensor, order: int) -> Planes2:
-        """sin(theta) / theta and cos(theta)."""
-        if order > 1:
-            return sinc_root(theta2), cos_root(theta2)
-        theta = plus(theta2, floor_of(theta2.dtype)).sqrt()
-        return torch.sin(theta) / theta, torch.cos(theta)
+        sinc = sinc_root(theta2, order)
+        return a * sinc, b * sinc, cos_root(theta2, order)
 
     def end(self, dtype: torch.dtype) -> float | Tensor:
         return math.pi
@@ -259,11 +247,6 @@ class Transverse(Chart):
         return x, y, z
 
 
-def _length(x: Tensor, y: Tensor, z: Tensor) -> tuple[Tensor, Tensor]:
-    rho2 = torch.addcmul(x * x, y, y)
-    return rho2, torch.addcmul(rho2, z, z).sqrt()
-
-
 def _sum(z: Tensor, root: Tensor, difference: Tensor) -> Tensor:
     """The sum z + root where difference = root^2 - z^2, without the cancellation for z < 0."""
     ahead = z > 0
@@ -279,7 +262,8 @@ class Equisolid(Chart):
         return Equidistant().margin(x, y, z)
 
     def scale(self, x: Tensor, y: Tensor, z: Tensor, order: int = 2) -> Tensor:
-        rho2, distance = _length(x, y, z)
+        rho2 = torch.addcmul(x * x, y, y)
+        distance = torch.addcmul(rho2, z, z).sqrt()
         return (2 / (distance * _sum(z, distance, rho2))).sqrt()
 
     def on_plane(self, a: Tensor, b: Tensor) -> Tensor:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
@@ -67,14 +67,10 @@ class Stage:
         return StageAt(self, a, b)
 
     def lower_bound(self, radius: Tensor) -> Planes2:
-        """How regular the stage is on circles, and how far from the centre their points go.
+        """Return bounds on circles of ascending radii (*C, S).
 
-        Args:
-            radius: (*C, S) ascending.
-
-        Returns:
-            Positive where the orientation is certainly positive on the whole circle; an upper bound of the distances.
-            By default both are read off points of the circle, with what they may miss in between.
+        Positive where the orientation is certainly positive on the whole circle; and how far from the centre its points
+        go at the most. By default both are read off points of the circle, with what they may miss in between.
         """
         turn = torch.arange(_DIRECTIONS, dtype=radius.dtype, device=radius.device) * (2 * math.pi / _DIRECTIONS)
         a, b = ((radius.unsqueeze(-1) * c).flatten(-2) for c in (torch.cos(turn), torch.sin(turn)))
@@ -456,19 +452,20 @@ class LensAt:
     @property
     def margin(self) -> Tensor | None:
         """The smallest of the stages: positive where the lens is defined; None where it is so everywhere."""
-        margins = [margin for stage in self.stages if (margin := stage.margin) is not None]
-        return functools.reduce(torch.minimum, margins) if margins else None
+        return _least(stage.margin for stage in self.stages)
 
     @property
     def edge(self) -> Tensor | None:
         """The smallest of the stages: positive up to where the lens ends; None where it does not."""
-        edges = [edge for edge in [stage.edge for stage in self.stages] if edge is not None]
-        return functools.reduce(torch.minimum, edges) if edges else None
+        return _least(stage.edge for stage in self.stages)
 
     @property
     def orientation(self) -> Tensor:
         """The smallest of the stages: positive where the lens is defined, regular and not turned over."""
-        least = self.stages[0].orientation
-        for stage in self.stages[1:]:
-            least = torch.minimum(least, stage.orientation)
-        return least
+        return functools.reduce(torch.minimum, [stage.orientation for stage in self.stages])
+
+
+def _least(margins: Iterable[Tensor | None]) -> Tensor | None:
+    """Return the smallest of those that are there."""
+    known = [margin for margin in margins if margin is not None]
+    return functools.reduce(torch.minimum, known) if known else None

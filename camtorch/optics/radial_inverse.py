@@ -23,6 +23,8 @@ RADII = 1024
 """At how many radii a factor is followed to its fold."""
 _PARTS = 256  # of the interval in which a fold is looked for; twice, then the secant
 _NODES = 1024  # of the table of an inverse
+TABLE_WIDTH = 2 + 2 * _NODES
+"""The number of columns of `tabulate`."""
 _LIMITING = 16  # roots of a radius, to one whose image is a number
 _HALF_WAY = 2.0  # the squared radius in the middle of the table of a lens that never folds
 MOST_STEPS = 5
@@ -164,11 +166,6 @@ def _variable(r2: Tensor, top2: Tensor) -> Tensor:
     return 1 - (1 - x).clamp(min=0).sqrt()
 
 
-def table_width() -> int:
-    """The number of columns of `tabulate`."""
-    return 2 + 2 * _NODES
-
-
 class InverseTable:
     """The factor by which the inverse of a radial factor scales a point, tabulated over the point's squared radius r2.
 
@@ -273,13 +270,7 @@ class RadialInverse:
     most2: Tensor
 
     def __init__(self, factor: type[RadialFactor], parameters: Sequence[Tensor], end: float):
-        """Factors of cameras, or of single points.
-
-        Args:
-            factor: a class whose instances are made of their coefficients.
-            parameters: the coefficients, columns (C, 1), or (M,) of single points.
-            end: the radius up to which the factor is used.
-        """
+        """Tabulate a class of factors, of coefficients (C, 1) of cameras or (M,) of single points, up to a radius."""
         parameters = [w.detach() for w in parameters]
         self.factor, self.radial, self.end = factor, factor(parameters), end
         self.of_points = parameters[0].ndim < 2
@@ -314,12 +305,8 @@ _tables = Memo(8)
 def _made_tables(name: str, k: Tensor, end: float) -> tuple[Tensor, Tensor]:
     wide = precise(k)
     radial = CLASSES[name](columns(wide))
-    fold = fold_of(
-        radial,
-        lambda: even_steps_and_ratios(RADII, end, end, wide, torch.positive),
-        end,
-        torch.finfo(k.dtype).max ** 0.25,
-    )
+    most = torch.finfo(k.dtype).max ** 0.25
+    fold = fold_of(radial, lambda: even_steps_and_ratios(RADII, end, end, wide, torch.positive), end, most)
     return within(fold.to(k.dtype)), tabulate(radial, fold, end).to(k.dtype)
 
 

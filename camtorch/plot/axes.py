@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -12,6 +12,7 @@ from camtorch._arguments import imported
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.colors import ListedColormap
+    from matplotlib.quiver import Quiver
 
     from camtorch.camera import Camera
 
@@ -31,11 +32,7 @@ def require_matplotlib() -> None:
 
 
 def axes_or_new(ax: Axes | None) -> Axes:
-    """The Axes, or new ones in a figure of their own.
-
-    Raises:
-        TypeError: something else.
-    """
+    """Return the Axes, or new ones in a figure of their own; raise a TypeError for anything else."""
     if ax is not None:
         if not hasattr(ax, "get_figure"):
             raise TypeError(
@@ -69,6 +66,11 @@ def draw_frame(ax: Axes, height: int, width: int) -> tuple[float, float, float, 
     ax.spines[:].set_visible(False)
     ax.plot([-0.5, width - 0.5, width - 0.5, -0.5, -0.5], [-0.5, -0.5, height - 0.5, height - 0.5, -0.5], color=INK)
     return -0.5, width - 0.5, height - 0.5, -0.5
+
+
+def draw_arrows(ax: Axes, *planes: np.ndarray, colours: str, **options: Any) -> Quiver:
+    """Draw arrows in the image's pixels: u and v of their starts and of their ways, and what their colours show."""
+    return ax.quiver(*planes, cmap=levels(colours), angles="xy", scale_units="xy", scale=1, width=0.0025, **options)
 
 
 def magnification(most: float) -> int:

@@ -12,6 +12,7 @@ from camtorch.plot.axes import (
     COLOURS,
     INK,
     NO_RAYS,
+    draw_arrows,
     draw_frame,
     levels,
     magnification,
@@ -75,17 +76,8 @@ def _draw_residuals(ax: Axes, calibration: Calibration, pixels: np.ndarray, erro
     some = np.argsort(lengths, kind="stable")[np.linspace(0, len(lengths) - 1, min(len(lengths), _ARROWS)).astype(int)]
     usual = float(np.quantile(lengths, 0.98)) if len(lengths) else 0.0
     longer = magnification(0.05 * max(height, width) / max(usual, 1e-9))
-    arrows = ax.quiver(
-        *pixels[some].T,
-        *errors[some].T * longer,
-        lengths[some],
-        cmap=levels("residuals"),
-        clim=(0, usual or 1.0),
-        angles="xy",
-        scale_units="xy",
-        scale=1,
-        width=0.0025,
-    )
+    planes = *pixels[some].T, *errors[some].T * longer, lengths[some]
+    arrows = draw_arrows(ax, *planes, colours="residuals", clim=(0, usual or 1.0))
     ax.figure.colorbar(arrows, ax=ax, label="px", shrink=0.8, pad=0.02, extend="max")
     less = "" if len(some) == len(lengths) else f" of {len(lengths):,}"
     ax.set_title(f"{head}residuals of {len(some):,}{less} corners, {longer:,} times as long")

@@ -20,8 +20,8 @@ from camtorch.plot.axes import (
     PALE,
     axes_or_new,
     check_single,
+    draw_arrows,
     draw_frame,
-    levels,
     magnification,
     printable,
     require_matplotlib,
@@ -84,18 +84,8 @@ def distortion_field(camera: Camera, ax: Axes | None = None, *, count: int = 21)
         longer = magnification(0.7 * step / max(float(length.quantile(0.9)), _NOTHING))
         if float(length.max()) < _NOTHING:
             along, length, longer = 0 * along, 0 * length, 1
-        arrows = ax.quiver(
-            *[plane.numpy(force=True) for plane in (*(end - longer * along).T, *(longer * along).T, length)],
-            angles="xy",
-            scale_units="xy",
-            scale=1,
-            width=0.0024,
-            headwidth=4,
-            headlength=5,
-            cmap=levels("distortion"),
-            zorder=3,
-        )
-        _bar(ax, arrows, length)
+        planes = [plane.numpy(force=True) for plane in (*(end - longer * along).T, *(longer * along).T, length)]
+        _bar(ax, draw_arrows(ax, *planes, colours="distortion", headwidth=4, headlength=5, zorder=3), length)
     cx, cy = camera.intrinsics[2:].tolist()
     ax.plot([cx], [cy], "+", color=COLOURS[1], markersize=11, markeredgewidth=1.6, zorder=4)
     times = f", {longer} times as long" if longer > 1 else ""

@@ -22,6 +22,7 @@ from camtorch.native import memory
 from camtorch.native.library import library
 from camtorch.native.sampler import CLASSIFICATION, PADDINGS, SCRATCH
 from camtorch.optics.backprojection import FURTHEST
+from camtorch.optics.radial_inverse import TABLE_WIDTH
 
 if TYPE_CHECKING:
     from camtorch.optics.charts import Chart
@@ -33,7 +34,6 @@ PROJECT, UNPROJECT, PROJECT_VJP, UNPROJECT_VJP = range(4)
 _TILE = 1 << 14  # points of a tile, some 30 us
 _SHARED = 1 << 15  # points that threads are woken for
 _MOST_PARTS, _MOST_DEGREE = 5, 64
-_TABLE = 2 + 2 * 1024
 _RADII, _FOLLOWED, _AZIMUTHS = 512, 80, 336
 _EXTENT = _FOLLOWED + _AZIMUTHS * (_FOLLOWED + 1)
 
@@ -234,7 +234,7 @@ class Lenses:
 
     def _add_chart(self) -> None:
         """The fold and the inverse of a chart that is given the other way round."""
-        table, inner2 = torch.empty(self.cameras, _TABLE, dtype=self.dtype, device="cpu"), self._new(1)
+        table, inner2 = torch.empty(self.cameras, TABLE_WIDTH, dtype=self.dtype, device="cpu"), self._new(1)
         place = self._keep(table)
         self._ask({"inner2": inner2, "table": place, "is_chart": True})
         struct = self.struct
@@ -248,7 +248,7 @@ class Lenses:
             return
         names = ["inner2", "usual2", *["circle2", "stagewise"] * plan.has_rest]
         has_table = tables and plan.has_factor  # at once, as there will be pixels
-        start, step = self._new(len(names) + _TABLE * has_table), self.cameras * self.dtype.itemsize
+        start, step = self._new(len(names) + TABLE_WIDTH * has_table), self.cameras * self.dtype.itemsize
         wanted = {name: start + step * i for i, name in enumerate([*names, *["table"] * has_table])}
         radii = {} if plan.is_radial else {"radii": self._keep(plan.radii(lambda: self._optics()[0], _RADII, self._k))}
         self._ask(wanted | radii)
@@ -258,7 +258,7 @@ class Lenses:
     def inverse_table(self) -> int:
         """What the inverse of the radial factor starts from; it is made when it is first asked for."""
         if self.struct.table is None:
-            table = self._new(_TABLE)
+            table = self._new(TABLE_WIDTH)
             self._ask({"table": table})
             self.struct.table = table  # when it is whole, for another thread may be looking
         return int(self.struct.table)
@@ -273,8 +273,7 @@ class Lenses:
             for name, count in (("radii", _RADII), ("even", _FOLLOWED), ("coarse", _FOLLOWED // 2)):
                 wanted[name] = self._keep(self.plan.radii(lambda: chart, count, like))
             if self.plan.is_chart:
-                end = chart.end(self.dtype)
-                wanted["ends"] = self._keep_ends(end)
+                wanted["ends"] = self._keep_ends(chart.end(self.dtype))
             self._ask(wanted)
             struct.extent, struct.limits2 = wanted["extent"], wanted["limits2"]
         return struct.limits2, struct.extent
@@ -349,17 +348,10 @@ def native_of(
     domain: Callable[[], Domain],
     tables: bool = False,
 ) -> Native | None:
-    """Cameras as the compiled geometry takes them.
+    """Return cameras of intrinsics (C, 4) and coefficients (C, n) as the compiled geometry takes them.
 
-    None where there is no library, on another device, and where a part of the optics has no code: a user's own.
-
-    Args:
-        optics_of: of the model.
-        intrinsics: (C, 4).
-        k: (C, n), coefficients.
-        usable: the mask (C, 1) of the cameras that are usable, None if all are.
-        domain: makes that of the lenses, for what the compiled geometry does not do.
-        tables: whether what the inverse starts from is sure to be wanted.
+    None without a library, on another device, and if a part of the optics has no code: a user's own. usable: (C, 1),
+    None if all are. domain: for what the compiled geometry does not do. tables: whether the inverse is sure to come.
     """
     if library() is None or not intrinsics.is_cpu or not k.shape[0]:
         return None
@@ -430,9 +422,7 @@ def project_numbers(native: Native, points: Sequence[float]) -> list[float] | No
     kind, count = (c_double if native.dtype == torch.float64 else c_float), len(points) // 3
     given, pixels, valid = (kind * len(points))(*points), (kind * (2 * count))(), (c_bool * count)()
     rows = addressof(given), 0, 3, 1, addressof(pixels), 0, 2, 1, addressof(valid), 0, *_NO_ROWS, 0
-    if _call(native, 1, count, PROJECT, rows):
-        native.follow()
-        _call(native, 1, count, PROJECT, rows)
+    _call_and_follow(native, 1, count, PROJECT, rows)
     return list(pixels) if all(valid) else None
 
 
@@ -442,9 +432,7 @@ def project(native: Native, points: Tensor) -> tuple[Tensor, Tensor]:
     pixels = _empty((2, cameras, count), native.dtype)
     valid = torch.empty(cameras, count, dtype=torch.bool, device="cpu")
     rows = points.data_ptr(), *points.stride(), *_planes(pixels, cameras, count), valid.data_ptr(), 0, *_NO_ROWS, 0
-    if _call(native, cameras, count, PROJECT, rows):
-        native.follow()
-        _call(native, cameras, count, PROJECT, rows)
+    _call_and_follow(native, cameras, count, PROJECT, rows)
     return pixels, valid
 
 
@@ -464,18 +452,14 @@ def unproject(native: Native, pixels: Tensor, keeps: bool = False) -> Unprojecte
     solution = _empty((2, cameras, count), native.dtype) if keeps else None
     native.add_table()
     rows = pixels.data_ptr(), *pixels.stride(), *_planes(rays, cameras, count), valid.data_ptr()
-    given = *rows, _address(solution), *_NO_ROWS, 0
-    if _call(native, cameras, count, UNPROJECT, given):
-        native.follow()
-        _call(native, cameras, count, UNPROJECT, given)
+    _call_and_follow(native, cameras, count, UNPROJECT, (*rows, _address(solution), *_NO_ROWS, 0))
     return Unprojected(rays, valid, solution)
 
 
 def project_vjp(
     native: Native, points: Tensor, cotangents: Tensor, want_points: bool, want_parameters: bool
 ) -> tuple[Tensor | None, Tensor | None]:
-    """The cotangents of points (C, N, 3), and of the cameras (C, 4 + n): intrinsics, the chart's and the lens's
-    `parameters`.
+    """Return the cotangents of points (C, N, 3), and of the cameras (C, 4 + n): intrinsics, `parameters` of the optics.
 
     cotangents: of pixels, (2, C, N), of any strides.
     """
@@ -505,10 +489,7 @@ def project_jacobians(native: Native, points: Tensor, by_camera: bool) -> tuple[
 def unproject_vjp(
     native: Native, valid: Tensor, solution: Tensor, cotangents: Tensor, want_pixels: bool, want_parameters: bool
 ) -> tuple[Tensor | None, Tensor | None]:
-    """The cotangents of pixels (C, N, 2), and of the cameras; see `project_vjp`.
-
-    valid, solution: of `unproject`.
-    """
+    """Return the cotangents of pixels (C, N, 2), and of the cameras, of results of `unproject`; see `project_vjp`."""
     cameras, count = valid.shape
     results = _empty((cameras, count, 2), native.dtype) if want_pixels else None
     sums = _sums(native, cameras, count) if want_parameters else None
@@ -572,18 +553,10 @@ class Between:
         padding: str,
         jobs: Callable[[tuple[int, ...]], list[bytes]] = lambda on_lattice: [],
     ) -> Lattices | None:
-        """Positions from nodes and from pixels at the rim: see `warp.grid.on_lattice`.
+        """Return positions from probes (1, N, 2) at nodes and at the rim, None if most cells would have their own.
 
-        None where most cells would have positions of their own.
-
-        Args:
-            probes: (1, N, 2): of the nodes, then of the rim.
-            size: (h, w) of the target.
-            first_row: of the target.
-            tolerance: in pixels of the source.
-            padding: that positions are for.
-            jobs: `Job` of sampler.h, of images (C, ...) that are sampled in the same call, by where the lattices lie;
-                of float32 alone.
+        See `warp.grid.on_lattice`. size: (h, w) of the target. tolerance: in pixels of the source. jobs: `Job` of
+        sampler.h, of images (C, ...) that are sampled in the same call, by where the lattices lie; of float32 alone.
         """
         cameras, dtype, count = self.cameras, self._start.dtype, probes.shape[1]
         n, m = (-(-side // 8) for side in size)
@@ -695,6 +668,13 @@ def _call(native: Native, cameras: int, count: int, direction: int, rows: tuple[
     left: list[int] = []
     spread(lambda: left.append(run(call)), min(thread_count(), -(-count // _TILE) * cameras))
     return sum(left)
+
+
+def _call_and_follow(native: Native, cameras: int, count: int, direction: int, rows: tuple[int, ...]) -> None:
+    """Call, and again with the limits of each azimuth if a point lies so far out that they decide."""
+    if _call(native, cameras, count, direction, rows):
+        native.follow()
+        _call(native, cameras, count, direction, rows)
 
 
 @functools.cache

@@ -52,9 +52,7 @@ def patch_centres(size: tuple[int, int], stride: int, like: Tensor, owner: str) 
         raise ValueError(f"{owner}: stride must be at least 1; got {step}")
     if any(side % step for side in size):
         height, width = size
-        fewer, more = (
-            [side // step * step for side in sides] for sides in (size, (height + step - 1, width + step - 1))
-        )
+        fewer, more = ([(side + extra) // step * step for side in size] for extra in (0, step - 1))
         pads = more[1] - width, more[0] - height
         if not all(fewer):
             raise ValueError(
@@ -75,11 +73,7 @@ def patch_centres(size: tuple[int, int], stride: int, like: Tensor, owner: str) 
 
 
 def over_image(
-    camera: Camera,
-    memo: Memo,
-    inputs: Sequence[Tensor],
-    stride: int,
-    function: Callable[[Tensor], tuple[Tensor, ...]],
+    camera: Camera, memo: Memo, inputs: Sequence[Tensor], stride: int, function: Callable[[Tensor], tuple[Tensor, ...]]
 ) -> tuple[Tensor, ...]:
     """What a function makes of all pixels or patches (*B, H, W, 2) of a camera, kept where nothing of `inputs` learns.
 
@@ -116,10 +110,8 @@ def plucker(rays: Tensor, valid: Tensor, extrinsics: Extrinsics | None, owner: s
     planes = [plane.to(dtype).expand(*batch, height, width).flatten(-2) for plane in rays.unbind(-1)]
     direction = rotate_planes(rotation_matrix(-extrinsics.rotation).to(dtype), (*planes,)).movedim(0, -1)
     moment = torch.linalg.cross(extrinsics.position.to(dtype).unsqueeze(-2).expand_as(direction), direction)
-    lines, valid = (
-        torch.cat((direction, moment), -1).unflatten(-2, (height, width)),
-        valid.expand(*batch, height, width),
-    )
+    lines = torch.cat((direction, moment), -1).unflatten(-2, (height, width))
+    valid = valid.expand(*batch, height, width)
     return torch.where(valid[..., None], lines, 0.0), valid
 
 
@@ -168,18 +160,15 @@ def local_frames(at: Tangents) -> tuple[Tensor, Tensor, Tensor]:
     """
     turned = (torch.linalg.cross(at.across, at.down) * at.rays).sum(-1)
     valid = at.valid & torch.isfinite(turned) & (turned > torch.finfo(turned.dtype).tiny)
-    given = zip(
-        (at.rays, at.across, at.down), torch.eye(3, dtype=turned.dtype, device=turned.device).roll(1, 0), strict=True
-    )
+    axes = torch.eye(3, dtype=turned.dtype, device=turned.device).roll(1, 0)
+    given = zip((at.rays, at.across, at.down), axes, strict=True)
     z, across, down = (torch.where(valid[..., None], vector, axis) for vector, axis in given)
     wide = across.square().sum(-1).sqrt()
     x = across / wide[..., None]
     y = torch.linalg.cross(z, x)
     skew, tall = (down * x).sum(-1), (down * y).sum(-1)
-    per_unit = torch.stack((1 / wide, -skew / (wide * tall), torch.zeros_like(wide), 1 / tall), -1).unflatten(
-        -1, (2, 2)
-    )
-    return torch.stack((x, y, z), -2), per_unit, valid
+    per_unit = torch.stack((1 / wide, -skew / (wide * tall), torch.zeros_like(wide), 1 / tall), -1)
+    return torch.stack((x, y, z), -2), per_unit.unflatten(-1, (2, 2)), valid
 
 
 def local_pinhole(camera: Camera, pixels: Numbers) -> tuple[Tensor, Tensor]:
@@ -201,15 +190,15 @@ def perspective_field(camera: Camera, gravity: Numbers, stride: int) -> tuple[Te
         raise ValueError(f"{owner}: gravity must have a direction, as (0, 1, 0); got {down.tolist()}")
     down = down.to(camera.intrinsics.device)
     _broadcast(camera.batch_shape, down.shape[:-1], "gravity", owner)
-    inputs = *camera._tensors, down
-    latitude, up, valid = over_image(
-        camera, camera._fields, inputs, stride, lambda pixels: _field(camera, down, pixels)
-    )
+
+    def field(pixels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        return _field(down, *local_frames(tangents(camera, pixels)))
+
+    latitude, up, valid = over_image(camera, camera._fields, (*camera._tensors, down), stride, field)
     return latitude, up, valid
 
 
-def _field(camera: Camera, gravity: Tensor, pixels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    frame, per_unit, valid = local_frames(tangents(camera, pixels))
+def _field(gravity: Tensor, frame: Tensor, per_unit: Tensor, valid: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     upward = -gravity / gravity.square().sum(-1, keepdim=True).sqrt()
     seen = (frame * upward[..., None, None, None, :].to(frame.dtype)).sum(-1)  # x, y, z of the local frame
     across, along = seen[..., :2], seen[..., 2]

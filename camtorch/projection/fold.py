@@ -28,21 +28,13 @@ _SPAN = 12  # how many azimuths the rim may go on from one to the next, and besi
 
 
 def limits_and_extent(optics: Optics, k: Tensor) -> tuple[Tensor, Extent]:
-    """Lenses that are not radial, followed outwards on azimuths of the chart's plane. Graph-free.
+    """Follow lenses of coefficients (C, n) that are not radial outwards on azimuths of the chart's plane. Graph-free.
 
-    On each azimuth the orientation of the lens (positive where it is regular) is followed outwards. It is
-    lost at the first node where it is not positive, or at the bottom of a parabola through three nodes that
-    dips below zero between them. Up to there the orientation changes its sign once at the most, so that its
-    value at the point itself tells exactly on which side of the fold the point lies.
-
+    Returns (C, azimuths), the squared radius, up to the next azimuth, before which the orientation decides; and the
+    extents. The orientation (positive where the lens is regular) is lost at the first node where it is not positive,
+    or at the bottom of a parabola through three nodes that dips below zero between them. Up to there it changes its
+    sign once at the most, so that its value at the point itself tells exactly on which side of the fold the point lies.
     Such a lens mostly folds where its radial factor does: there the radii are dense.
-
-    Args:
-        optics: a model's.
-        k: (C, n) coefficients of cameras, in the dtype and on the device of the points.
-
-    Returns:
-        (C, azimuths) the squared radius, up to the next azimuth, before which the orientation decides; and the extents.
     """
     chart, lens = optics(columns(k))
     radii = _around(lens.radial, chart, chart.radii(_RADII, k)).expand(k.shape[0], -1)
@@ -50,11 +42,12 @@ def limits_and_extent(optics: Optics, k: Tensor) -> tuple[Tensor, Extent]:
     rows = radii.repeat_interleave(AZIMUTHS, 0)
     chart, lens = optics(columns(k.repeat_interleave(AZIMUTHS, 0)))
     directions = (c.repeat(k.shape[0]) for c in _directions(radii))
-    lost, *rest = _followed(chart, lens, rows, *directions)
-    of_each = lost.unflatten(0, (-1, AZIMUTHS))
-    pairs = torch.stack((of_each, of_each.roll(-1, -1)), -1).flatten(0, 1)
+    followed = _followed(chart, lens, rows, *directions)
+    lost, reach, *rim = (w.unflatten(0, (-1, AZIMUTHS)) for w in followed)
+    pairs = torch.stack((lost, lost.roll(-1, -1)), -1).flatten(0, 1)
     limits = _limit(chart, rows, pairs).unflatten(0, (-1, AZIMUTHS))
-    return limits * limits, _extent(radii, *rest)
+    envelope = _envelope(*rim)
+    return limits * limits, Extent(radii, reach, torch.where(envelope < _FAR, envelope, torch.inf))
 
 
 def _limit(chart: Chart, radii: Tensor, lost: Tensor) -> Tensor:
@@ -76,7 +69,9 @@ def _followed(chart: Chart, lens: Lens, radii: Tensor, a: Tensor, b: Tensor) -> 
     at = lens.at(a * radii, b * radii)
     lost = _lost(lens, a, b, radii, at.orientation)
     (x, y), end = at.value, chart.end(radii.dtype)
-    reach = _ascending((x * x + y * y).sqrt(), lost)
+    reach = (x * x + y * y).sqrt()
+    index = torch.arange(reach.shape[-1], dtype=reach.dtype, device=reach.device)
+    reach = torch.where((index < lost.unsqueeze(-1)) & (reach < torch.inf), reach, torch.inf).cummax(-1).values
     nodes = lost.clamp(max=radii.shape[-1] - 1).unsqueeze(-1)
     last = _radius_at(radii, nodes).clamp(max=end)
     x, y = lens.at(a * last, b * last, order=0).value
@@ -87,13 +82,6 @@ def _followed(chart: Chart, lens: Lens, radii: Tensor, a: Tensor, b: Tensor) -> 
     margin = lens.at(a * beyond, b * beyond).margin
     open_ended = furthest.isnan() if margin is None else furthest.isnan() | ~(margin > 0)
     return lost, reach, torch.where(open_ended, torch.inf, furthest).squeeze(-1), x.squeeze(-1), y.squeeze(-1)
-
-
-def _extent(radii: Tensor, reach: Tensor, furthest: Tensor, x: Tensor, y: Tensor) -> Extent:
-    """Of cameras (G,), whose azimuths are rows (G azimuths, ...)."""
-    reach, furthest, x, y = (w.unflatten(0, (-1, AZIMUTHS)) for w in (reach, furthest, x, y))
-    envelope = _envelope(furthest, x, y)
-    return Extent(radii, reach, torch.where(envelope < _FAR, envelope, torch.inf))
 
 
 class Extent(NamedTuple):
@@ -211,10 +199,3 @@ def _radius_at(radii: Tensor, position: Tensor) -> Tensor:
     index = position.floor().long().clamp(max=last)
     inner, outer = radii.gather(-1, index), radii.gather(-1, (index + 1).clamp(max=last))
     return torch.where(position <= last, inner + (position - index) * (outer - inner), torch.inf)
-
-
-def _ascending(reach: Tensor, lost: Tensor) -> Tensor:
-    """How far from the centre the lens sends each node, ascending; infinite past the fold."""
-    nodes = torch.arange(reach.shape[-1], dtype=reach.dtype, device=reach.device)
-    before = (nodes < lost.unsqueeze(-1)) & (reach < torch.inf)
-    return torch.where(before, reach, torch.inf).cummax(-1).values

@@ -15,7 +15,7 @@ from torch.utils.checkpoint import checkpoint
 from camtorch._arguments import columns
 from camtorch._registry import CLASSES
 from camtorch._tracing import in_transform, is_for_here, keeps_graph
-from camtorch.optics.radial_inverse import table_width
+from camtorch.optics.radial_inverse import TABLE_WIDTH
 from camtorch.projection.domain import Domain, domain_of
 from camtorch.projection.fold import AZIMUTHS
 from camtorch.projection.solve import search
@@ -43,7 +43,7 @@ def tables(model: str, k: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 @tables.register_fake
 def _(model: str, k: Tensor) -> tuple[Tensor, ...]:
     lens = CLASSES[model].optics(columns(k))[1]
-    widths = 1, 0 if lens.is_radial else AZIMUTHS, table_width() if lens.radial else 0
+    widths = 1, 0 if lens.is_radial else AZIMUTHS, TABLE_WIDTH if lens.radial else 0
     return tuple(k.new_empty(len(k), width) for width in widths)
 
 

@@ -98,9 +98,8 @@ class _Edges:
 
 def _region(camera: Camera) -> tuple[Tensor, float]:
     """The middle of the image, and how far from it curves go on."""
-    fx, fy, cx, cy = camera.intrinsics.detach().double().tolist()
+    intrinsics = camera.intrinsics.detach().double()
     if camera.image_size is None:
-        return torch.tensor([cx, cy], dtype=torch.float64, device=camera.intrinsics.device), _FARTHEST * max(fx, fy)
+        return intrinsics[2:], _FARTHEST * float(intrinsics[:2].max())
     height, width = camera.image_size
-    middle = torch.tensor([width / 2, height / 2], dtype=torch.float64, device=camera.intrinsics.device)
-    return middle, _FARTHEST * max(height, width)
+    return intrinsics.new_tensor([width / 2, height / 2]), _FARTHEST * max(height, width)

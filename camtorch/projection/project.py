@@ -11,7 +11,7 @@ from camtorch._arguments import columns
 from camtorch.optics.charts import Planes3, floor_of
 from camtorch.projection import compiled
 from camtorch.projection.ops import as_kept, positive, power_of_two, to_planes, without_keeping
-from camtorch.projection.rows import Cameras, Traced, both, replace, to_mask
+from camtorch.projection.rows import Cameras, Traced, replace, to_mask
 
 if TYPE_CHECKING:
     from camtorch.camera import Camera
@@ -50,15 +50,9 @@ class Project:
         cameras: Cameras | None,
         order: int = 2,
     ) -> tuple[Tensor, Tensor]:
-        """The formula, recorded in a graph or by a transform.
+        """Evaluate the formula, recorded in a graph or by a transform.
 
-        Args:
-            model: of the cameras.
-            points: in rows.
-            intrinsics: of the cameras.
-            distortion: of the cameras.
-            cameras: those of the parameters, if values may be looked at.
-            order: of the derivatives that shall be exact.
+        cameras: those of the parameters, if values may be looked at. order: of the derivatives that have to be exact.
         """
         usual = Traced.of(model, intrinsics, distortion, cameras)
 
@@ -72,8 +66,7 @@ class Project:
                 a, b, t = (replace(inside, w, 0.0) for w in (a, b, t))
                 mask = mask * inside
                 a, b = lens.at(a, b, 0, t).value
-            seen = both(mask, usual.usable)
-            assert seen is not None
+            seen = mask if usual.usable is None else mask * usual.usable
             focal_x, focal_y, centre_x, centre_y = columns(intrinsics)
             planes = focal_x * a + centre_x, focal_y * b + centre_y
             pixels = torch.stack([replace(seen, w, INVALID_PIXEL) for w in planes])

@@ -49,9 +49,8 @@ def pixel_lattice(low: Tensor, high: Tensor, rows: int, columns: int) -> Tensor:
 
 def ray_fan(angles: Tensor, azimuths: int) -> Tensor:
     """(*C, K) angles from the axis -> (*C, K, azimuths, 3) rays, evenly around it; none where panoramas are cut."""
-    return polar_rays(
-        angles[..., None], (torch.arange(azimuths, device=angles.device).to(angles) + 0.25) * (2 * math.pi / azimuths)
-    )
+    around = (torch.arange(azimuths, device=angles.device).to(angles) + 0.25) * (2 * math.pi / azimuths)
+    return polar_rays(angles[..., None], around)
 
 
 def polar_rays(angles: Tensor, azimuths: Tensor) -> Tensor:
@@ -98,17 +97,10 @@ def ideal(camera: CameraT) -> CameraT:
 def reach(
     covers: Callable[[Tensor], Tensor], azimuths: Tensor, *, most: float = math.pi, steps: int, rounds: int
 ) -> Tensor:
-    """The angle from the axis, up to `most`, before which all rays towards an azimuth are covered: 0 if none is.
+    """Return the angle (*B, K) up to `most` before which all rays towards azimuths (K,) are covered: 0 if none is.
 
-    Args:
-        covers: from unit rays (*B or nothing, K, S, 3) to bool (*B, K, S).
-        azimuths: (K,) radians.
-        most: radians.
-        steps: to look at in a round, the first of which goes over everything.
-        rounds: each goes over the step of the one before in which the end lies.
-
-    Returns:
-        (*B, K).
+    covers: from unit rays (*B or nothing, K, S, 3) to bool (*B, K, S). The first round goes over everything, each later
+    one over the step of the one before in which the end lies.
     """
     share = torch.linspace(0, 1, steps + 1, dtype=azimuths.dtype, device=azimuths.device)
     low, width = azimuths.new_zeros(len(azimuths), 1), most
@@ -164,21 +156,14 @@ def field_of_view(camera: Camera) -> Tensor:
 
 @torch.no_grad()
 def focal_for(camera: Camera, fov: Tensor, image_size: tuple[int, int], axis: str) -> tuple[Tensor, Tensor]:
-    """(*B,) the focal length at which an image with its centre on the axis has a field of view; and whether one has.
+    """Return the focal length (*B,) at which an image with its centre on the axis has a field of view; and whether.
 
-    Where none has it, it is the focal length of the widest.
-
-    Args:
-        camera: of focal length 1 and principal point 0; float64.
-        fov: (*B,) radians along the `axis`, one of `AXES`.
-        image_size: (height, width).
-        axis: the outer edges between which the angle is, those of the wider diagonal for "diagonal".
+    If none has it, it is the focal length of the widest. camera: of focal length 1 and principal point 0; float64.
+    fov: (*B,) radians between outer edges, of the wider diagonal for "diagonal".
     """
     height, width = image_size
-    ends = {"horizontal": [(width, 0)], "vertical": [(0, height)], "diagonal": [(width, height), (width, -height)]}[
-        axis
-    ]
-    half = fov.new_tensor(ends) / 2
+    ends = {"horizontal": [(width, 0)], "vertical": [(0, height)], "diagonal": [(width, height), (width, -height)]}
+    half = fov.new_tensor(ends[axis]) / 2
 
     def angle(per_pixel: Tensor) -> Tensor:
         """(*B, K): between both ends, for (*B, K) plane units a pixel; infinite where one has no ray."""

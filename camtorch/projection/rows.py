@@ -23,8 +23,6 @@ if TYPE_CHECKING:
     from camtorch.optics.lens import Lens
 
 Planes2 = tuple[Tensor, Tensor]
-Planes3 = tuple[Tensor, Tensor, Tensor]
-
 
 _MOST_LOOKED_AT = 512  # numbers that are looked at one by one
 
@@ -76,21 +74,11 @@ class Cameras:
     @cached_property
     def native(self) -> compiled.Native | None:
         """For the compiled geometry, None where it has not got this model, or is not there."""
-        return compiled.native_of(
-            self._model.optics,
-            self.intrinsics,
-            self.k,
-            self.usable,
-            partial(_domain, self._model, self.k, self._learns),
-        )
+        domain = partial(_domain, self._model, self.k, self._learns)
+        return compiled.native_of(self._model.optics, self.intrinsics, self.k, self.usable, domain)
 
     def cotangents(self, sums: Tensor | None, wanted: Sequence[bool]) -> tuple[Tensor | None, Tensor | None]:
-        """Those of intrinsics and distortion, of which the compiled geometry gives those of the formula's parameters.
-
-        Args:
-            sums: (C, 4 + n): of the intrinsics, and of the `parameters` of chart and lens.
-            wanted: whether those of intrinsics and distortion are.
-        """
+        """Return those of intrinsics and distortion, if wanted, of sums (C, 4 + n): see `compiled.project_vjp`."""
         if sums is None:
             return None, None
         return sums[:, :4] if wanted[0] else None, self._of_coefficients(sums[:, 4:]) if wanted[1] else None
@@ -127,9 +115,8 @@ def _are_plain(model: type[Camera], intrinsics: Tensor, distortion: Tensor) -> b
     if distortion.numel() and not model.always_defined and model.defined(distortion.unbind(-1)) is not None:
         return False
     rows = intrinsics.tolist()
-    return math.isfinite(math.fsum(map(sum, (*rows, *distortion.tolist())))) and all(
-        fx > 0 and fy > 0 for fx, fy, *_ in rows
-    )
+    total = math.fsum(map(sum, (*rows, *distortion.tolist())))
+    return math.isfinite(total) and all(fx > 0 and fy > 0 for fx, fy, *_ in rows)
 
 
 def _usable(model: type[Camera], intrinsics: Tensor, distortion: Tensor) -> Tensor:
@@ -178,20 +165,11 @@ class Traced(NamedTuple):
         return (self.domain.chart, self.domain.lens) if is_portable_export() else self.model.optics(columns(distortion))
 
 
-def replace(mask: Tensor | None, plane: Tensor, value: float) -> Tensor:
-    """The plane where the mask is 1, and the value where it is 0; None is a mask of ones."""
-    return plane if mask is None else torch.where(mask > 0, plane, value)
-
-
-def both(*masks: Tensor | None) -> Tensor | None:
-    """Where all masks are 1. Of the dtype of the planes: compiled code writes bools one by one."""
-    product = None
-    for mask in masks:
-        if mask is not None:
-            product = mask if product is None else product * mask
-    return product
+def replace(mask: Tensor, plane: Tensor, value: float) -> Tensor:
+    """Return the plane where the mask is 1, and the value where it is 0."""
+    return torch.where(mask > 0, plane, value)
 
 
 def to_mask(margin: Tensor) -> Tensor:
-    """1 where a margin is positive, else 0."""
+    """Return 1 where a margin is positive, else 0, in its dtype: compiled code writes bools one by one."""
     return (margin.detach() > 0).to(margin.dtype)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from typing import TYPE_CHECKING
 
 import torch
@@ -17,6 +19,7 @@ if TYPE_CHECKING:
     from camtorch.projection.domain import Domain
 
 Planes2 = tuple[Tensor, Tensor]
+Found = tuple[Tensor, Tensor, Tensor]
 
 _START_ROUNDS = 6
 _CLOSE = 0.02
@@ -26,7 +29,7 @@ _STAGE_STEPS = 12  # the first ones may take off no more than a third, see `doma
 _FIRST_STEPS, _LATE_STEPS = 6, 54  # the late ones lie next to a fold, or so far out that a prism dominates
 
 
-def search(domain: Domain, camera: Tensor, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def search(domain: Domain, camera: Tensor, u: Tensor, v: Tensor) -> Found:
     """The point in the domain that the lens sends to (u, v), and whether there is one: planes (M,) of single points.
 
     camera: (M,) the index of each point's camera. Takes many steps, and finds what lies next to a fold as well.
@@ -35,16 +38,14 @@ def search(domain: Domain, camera: Tensor, u: Tensor, v: Tensor) -> tuple[Tensor
         return _Search(domain, camera)(u, v)
     if is_portable_export():
         return _search_recorded(domain, camera, u, v)
-    a, b, found = torch.zeros_like(u), torch.zeros_like(u), torch.zeros_like(u, dtype=torch.bool)
-    stagewise = torch.zeros_like(found) if domain.stagewise is None else domain.stagewise[camera, 0]
-    for ways, way in ((stagewise, _by_stages), (~stagewise, _within_extents)):
-        (some,) = ways.nonzero(as_tuple=True)
-        if len(some):
-            a[some], b[some], found[some] = way(domain, camera[some], u[some], v[some])
-    return a, b, found
+    if domain.stagewise is None:
+        return _within_extents(domain, camera, u, v)
+    stagewise = domain.stagewise[camera, 0]
+    found = _found_of(stagewise, u, lambda some: _by_stages(domain, camera[some], u[some], v[some]))
+    return _found_of(~stagewise, u, lambda some: _within_extents(domain, camera[some], u[some], v[some]), found)
 
 
-def _search_recorded(domain: Domain, camera: Tensor, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _search_recorded(domain: Domain, camera: Tensor, u: Tensor, v: Tensor) -> Found:
     """The same of lenses that are not radial, without a look at values."""
     by_stages = None
     if domain.stagewise is not None:
@@ -64,15 +65,11 @@ def _search_recorded(domain: Domain, camera: Tensor, u: Tensor, v: Tensor) -> tu
     return a, b, (stagewise & by_stages[2]) | (~stagewise & found[2])  # ONNX Runtime selects no bool
 
 
-def _by_stages(domain: Domain, camera: Tensor, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _by_stages(domain: Domain, camera: Tensor, u: Tensor, v: Tensor) -> Found:
     """`search` where only the first stage, which is radial, has a limit: what it would have to reach tells at once."""
-    a, b, found = torch.zeros_like(u), torch.zeros_like(u), torch.zeros_like(u, dtype=torch.bool)
     (p, q), within = _first_image(domain, camera, u, v)
-    (some,) = within.nonzero(as_tuple=True)
-    if len(some):
-        alone = _Search(domain, camera[some], is_circle=True)
-        a[some], b[some], found[some] = alone(u[some], v[some], (p[some], q[some]))
-    return a, b, found
+    alone = partial(_Search, domain, is_circle=True)
+    return _found_of(within, u, lambda some: alone(camera[some])(u[some], v[some], (p[some], q[some])))
 
 
 def _first_image(domain: Domain, camera: Tensor, u: Tensor, v: Tensor) -> tuple[Planes2, Tensor]:
@@ -90,36 +87,31 @@ def _first_image(domain: Domain, camera: Tensor, u: Tensor, v: Tensor) -> tuple[
     return (p, q), (u * u + v * v <= domain.circle2[camera, 0]) & (p * p + q * q <= most2)
 
 
-def _within_extents(domain: Domain, camera: Tensor, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _within_extents(domain: Domain, camera: Tensor, u: Tensor, v: Tensor) -> Found:
     """`search` of any other lens, for the points within the extent of what it shows."""
-    a, b, found = torch.zeros_like(u), torch.zeros_like(u), torch.zeros_like(u, dtype=torch.bool)
-    (some,) = (torch.hypot(u, v) <= domain.extent.furthest[camera, azimuth(u, v)]).nonzero(as_tuple=True)
+    within = torch.hypot(u, v) <= domain.extent.furthest[camera, azimuth(u, v)]
+    return _found_of(within, u, lambda some: _Search(domain, camera[some])(u[some], v[some]))
+
+
+def _found_of(chosen: Tensor, like: Tensor, find: Callable[[Tensor], Found], into: Found | None = None) -> Found:
+    """Return what is found of the points that are chosen, by their indices; nothing, or `into`, of the others."""
+    a, b, found = into or (torch.zeros_like(like), torch.zeros_like(like), torch.zeros_like(chosen))
+    (some,) = chosen.nonzero(as_tuple=True)
     if len(some):
-        a[some], b[some], found[some] = _Search(domain, camera[some])(u[some], v[some])
+        a[some], b[some], found[some] = find(some)
     return a, b, found
 
 
 class _Search:
     """The lenses of single points (M,), and the inverse by bracketing and damped steps."""
 
-    def __init__(
-        self,
-        domain: Domain,
-        camera: Tensor,
-        *,
-        is_circle: bool = False,
-        within: Tensor | None = None,
-    ):
-        """is_circle: whether the fold is one, as it is for every radial lens.
-
-        within: (M,) bool: of a recorded search, the points that it is for.
-        """
-        self.domain, self.camera = domain, camera
-        self.within = within
+    def __init__(self, domain: Domain, camera: Tensor, *, is_circle: bool = False, within: Tensor | None = None):
+        """is_circle: whether the fold is one, as of every radial lens. within: (M,), what a recorded search is for."""
+        self.domain, self.camera, self.within = domain, camera, within
         self.chart, self.lens = domain.optics_of(camera)
         self.is_circle = is_circle or self.lens.is_radial
 
-    def __call__(self, u: Tensor, v: Tensor, first: Planes2 | None = None) -> tuple[Tensor, Tensor, Tensor]:
+    def __call__(self, u: Tensor, v: Tensor, first: Planes2 | None = None) -> Found:
         """first: where the first stage has to send the points, if the fold is a circle; by default to (u, v)."""
         a, b = self.radial(*(first or (u, v))) if self.is_circle else self.planar(u, v)
         at = self.lens.at(a, b)
@@ -173,7 +165,7 @@ class _Search:
             a[late], b[late], _ = alone._newton(u[late], v[late], a[late], b[late], _LATE_STEPS)
         return a, b
 
-    def _newton(self, u: Tensor, v: Tensor, a: Tensor, b: Tensor, steps: int) -> tuple[Tensor, Tensor, Tensor]:
+    def _newton(self, u: Tensor, v: Tensor, a: Tensor, b: Tensor, steps: int) -> Found:
         """Each step is shortened until it comes nearer and stays in the domain.
 
         Nearer in Deuflhard's sense: the next step by the same Jacobian is shorter. Where a lens stretches one direction

@@ -125,7 +125,7 @@ def test_with_the_distortion_of_a_lens_and_in_a_batch(key):
     for wanted in (degrees[0], degrees):
         camera = type(lens).from_fov(wanted, image_size=SIZE, distortion=lens.distortion.detach())
         assert camera.intrinsics.dtype == torch.float64
-        assert torch.equal(camera.distortion, lens.distortion)
+        assert torch.equal(camera.distortion, lens.distortion.expand_as(camera.distortion))
         torch.testing.assert_close(camera.fov[..., 0], wanted, rtol=1e-8, atol=0)
     several = type(lens).from_fov(60, image_size=SIZE, distortion=lens.distortion.detach().expand(2, -1))
     assert several.batch_shape == (2,)
