@@ -244,9 +244,9 @@ def _column_hint(distortion: Tensor) -> str:
 
 def numbers_of_matrix(
     model: type[Camera],
-    K: Numbers,
+    K: Numbers,  # noqa: N803
     distortion: Numbers | None,
-    ignore_skew: bool,  # noqa: N803
+    ignore_skew: bool,
 ) -> tuple[Tensor] | tuple[Tensor, Tensor]:
     """Intrinsics, and distortion where it is given, of a matrix K; see `Camera.from_matrix`."""
     owner = model.__name__
