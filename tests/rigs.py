@@ -10,7 +10,7 @@ from camtorch.io import formats
 
 FILES = Path(__file__).parent / "files"
 MANIFEST = json.loads((FILES / "MANIFEST.json").read_text())
-SUFFIXES = {name: names.suffixes[0] for name, names in formats.WRITTEN.items() if name in formats.READ}
+SUFFIXES = {name: names.suffixes[0] for name, names in formats.WRITTEN.items()}
 POINT = (0.1, -0.2, 1.0)
 
 

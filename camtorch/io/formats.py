@@ -10,6 +10,7 @@ from __future__ import annotations
 import codecs
 import fnmatch
 import os
+from typing import Any
 
 from camtorch._arguments import LEFT
 from camtorch.camera import Camera
@@ -54,22 +55,10 @@ _BY_KEYS: tuple[KeyFormat, ...] = (
     camodocal,
     opencv,
 )
-
-_WRITTEN: tuple[WrittenFormat, ...] = (
-    aria,
-    basalt,
-    camtorch_json,
-    colmap,
-    kalibr,
-    mrcal,
-    nerfstudio,
-    opencv,
-    ros,
-)
-
-READ = {m.NAMES.format: m.NAMES for m in (*_BY_CONTENT, *_BY_KEYS)}
-WRITTEN = {m.NAMES.format: m.NAMES for m in _WRITTEN}
-FORMATS = tuple(READ | WRITTEN)
+_MODULES: dict[str, Any] = {module.NAMES.format: module for module in (*_BY_CONTENT, *_BY_KEYS)}
+READ: dict[str, Names] = {format: module.NAMES for format, module in _MODULES.items()}
+WRITTEN = {format: READ[format] for format, module in _MODULES.items() if hasattr(module, "render")}
+FORMATS = tuple(READ)
 _OPENMVG = "OpenMVG's scene, which is not read: openMVG_main_openMVG2Colmap writes it in COLMAP's format"
 
 
@@ -186,7 +175,7 @@ def rendered(rig: Rig | Camera, path: str | os.PathLike[str], format: str | None
             raise ValueError(f"{path}: is a folder; {format} is one file, so name it")
         path = next(filter(os.path.exists, inside), inside[-1])
     try:
-        module = next(module for module in _WRITTEN if module.NAMES.format == format)
+        module: WrittenFormat = _MODULES[format]
         found = module.render(rig, Lossy(path, module.NAMES.title))
         return {path: found.encode()} if isinstance(found, str) else found
     except UnicodeEncodeError as error:
