@@ -103,11 +103,8 @@ def as_range(
 class Spans:
     """Ranges, ready to draw a value of each for some samples."""
 
-    ranges: dict[str, Range]
-    rows: int
     low: NDArray[np.float64]
     wide: NDArray[np.float64]
-    total: int
     _places: list[tuple[str, slice, tuple[int, int] | None]]
     _ends: list[tuple[float, float]]
 

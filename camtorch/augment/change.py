@@ -39,6 +39,10 @@ def _same(value: Tensor) -> Tensor:
     return value
 
 
+def _as_is(camera: Camera, rows: Tensor) -> Tensor:
+    return rows
+
+
 @dataclass
 class View:
     """The new camera of a single sample as plain numbers, of which modules are made when somebody asks for them."""
@@ -229,9 +233,8 @@ class Change:
         after = [part.target for part in self.parts]
         if self.gate is not None:
             gates = [self.gate if part.rows is None else self.gate[part.rows] for part in self.parts]
-            after = [
-                _chosen(gate, camera, part.camera) for gate, camera, part in zip(gates, after, self.parts, strict=True)
-            ]
+            chosen = zip(gates, after, self.parts, strict=True)
+            after = [_chosen(gate, camera, part.camera) for gate, camera, part in chosen]
         return self._cameras(after)
 
     @property
@@ -387,7 +390,7 @@ class Change:
                 moved = warp.pin().forward(rows, **options)
             return moved if part.light is None else narrow(widen(moved) * part.light.to(moved.device), rows.dtype)
 
-        return self.each(images, move, lambda camera, rows: rows)
+        return self.each(images, move, _as_is)
 
     def labels(self, masks: Tensor, fill: float = 0.0, mode: Mode = "nearest") -> Tensor:
         """Masks (count, C, H, W) of any dtype, the nearest value of each; `fill` where nothing is seen."""
@@ -395,27 +398,24 @@ class Change:
         def move(part: Part, rows: Tensor) -> Tensor:
             return part.warp.pin().forward(rows, mode=mode, padding_mode="zeros", fill=fill)
 
-        return self.each(masks, move, lambda camera, rows: rows)
+        return self.each(masks, move, _as_is)
 
     def valid_mask(self) -> Tensor:
         """(count, 1, H', W') bool: where the images show something."""
         camera = self.parts[0].camera
-        everywhere = torch.ones(
-            self.count, 1, camera.height, camera.width, dtype=torch.bool, device=camera.intrinsics.device
-        )
+        shape = self.count, 1, camera.height, camera.width
+        everywhere = torch.ones(shape, dtype=torch.bool, device=camera.intrinsics.device)
         return self.each(
-            everywhere,
-            lambda part, rows: part.warp.pin().valid_mask().expand(len(rows), -1, -1, -1),
-            lambda camera, rows: rows,
+            everywhere, lambda part, rows: part.warp.pin().valid_mask().expand(len(rows), -1, -1, -1), _as_is
         )
 
     def points(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
         """Pixels (count, *N, 2), and valid (count, *N): on the image."""
-        return self.each(
-            pixels,
-            lambda part, rows: part.warp.transform_points(rows),
-            lambda camera, rows: (rows, camera.contains(rows)),
-        )
+
+        def stay(camera: Camera, rows: Tensor) -> tuple[Tensor, Tensor]:
+            return rows, camera.contains(rows)
+
+        return self.each(pixels, lambda part, rows: part.warp.transform_points(rows), stay)
 
     def boxes(self, boxes: Tensor) -> tuple[Tensor, Tensor]:
         """Boxes (count, *N, 4) of x1, y1, x2, y2, and valid (count, *N)."""
@@ -458,7 +458,7 @@ class Change:
             still = (rotation == _eye(rotation)).all(-1).all(-1)
             return torch.where(still.reshape(-1, *[1] * (rows.ndim - 1)), rows.to(moved), moved)
 
-        return self.each(rays, move, lambda camera, rows: rows)
+        return self.each(rays, move, _as_is)
 
     def positions(self, points: Tensor) -> Tensor:
         """Points (count, *N, 3) of the camera frame: as `rays`, and those of a camera that moves shift."""
@@ -468,7 +468,7 @@ class Change:
                 return part.moves.transform_positions(rows)
             return rows.clone() if part.rotation is None else turn(part.rotation, rows, "points")
 
-        return self.each(points, move, lambda camera, rows: rows)
+        return self.each(points, move, _as_is)
 
     def distance(self, distance: Tensor) -> Tensor:
         """Distance from the camera (count, C, H, W); 0 where nothing is known."""
@@ -479,7 +479,7 @@ class Change:
                 return narrow(warp.moved_distance(widen(rows)), rows.dtype)
             return warp.pin()(rows, mode="nearest", padding_mode="zeros", fill=0.0)
 
-        return self.each(distance, move, lambda camera, rows: rows)
+        return self.each(distance, move, _as_is)
 
     def depth(self, depth: Tensor) -> Tensor:
         """Depth along z (count, 1, H, W), positive in front; 0 where nothing is known.
@@ -505,7 +505,7 @@ class Change:
             moved = warp.pin()(distance, mode="nearest", padding_mode="zeros", fill=0.0) * after
             return narrow(moved, rows.dtype)
 
-        return self.each(depth, move, lambda camera, rows: rows)
+        return self.each(depth, move, _as_is)
 
 
 def by_kinds(

@@ -108,8 +108,6 @@ class Mirroring:
     lateral: int  # the number of the lateral axis
     by_name: tuple[str, ...]  # the fields that tables are given for by name
     key: object  # equal for those that do the same
-    owner: str
-    swap_sides: bool
 
     def __init__(
         self,

@@ -344,11 +344,6 @@ class SampleOptions(TypedDict, total=False):
 class SampleTransform(nn.Module):
     """Moves all fields of a sample by one change of cameras. See `Augmentation` and `FaceNormalizer`."""
 
-    fields: dict[str, str]
-    mask_fill: float
-    valid_mask: bool
-    options: Options  # of warps
-    antialias: bool | None  # as in `options`, but None where each warp says
     other_words: ClassVar[Mapping[str, str]] = {}
     """Words that people try as keywords -> the keyword, for the hint of an error."""
 
@@ -373,11 +368,12 @@ class SampleTransform(nn.Module):
         if camera is not None and not isinstance(camera, Camera):
             raise TypeError(f"{self._name}: camera must be a Camera; got {no_camera(camera)}")
         self.camera = camera
-        self.fields = dict(as_mapping(fields, "fields", self._name, "{'lidar': 'points'}"))
+        self.fields: dict[str, str] = dict(as_mapping(fields, "fields", self._name, "{'lidar': 'points'}"))
         wrong = {k: v for k, v in self.fields.items() if v not in (*KINDS, KEEP)}
         if wrong:
             raise ValueError(f"{self._name}: fields maps names to {', '.join(KINDS)} or {KEEP}; got {wrong}")
-        self.options = as_options(self._name, mode, padding_mode, fill, antialias, tolerance)
+        self.options: Options = as_options(self._name, mode, padding_mode, fill, antialias, tolerance)
+        # None where each warp says
         self.antialias = None if antialias is None else self.options["antialias"]
         self.mask_fill = as_number(mask_fill, "mask_fill", self._name)
         self.valid_mask = as_flag(valid_mask, "valid_mask", self._name)

@@ -48,7 +48,7 @@ class ShiftedWarp(Warp):
         count = len(shift)
         as_depth(depth, kind, source._size_for("RandomMount"), "RandomMount", depth.device)
         with torch.no_grad():
-            rays, has_ray = _rays(source)
+            rays, has_ray = source.rays()
             length, known = depth_scale(depth[:, 0].to(rays), rays, has_ray, kind)
             distance = torch.where(known, length, 0.0).expand(count, -1, -1)
         self.batch_shape = torch.Size((count,))
@@ -103,7 +103,7 @@ class ShiftedWarp(Warp):
         """Where in the source's image (B, H', W', 2) each pixel of the target is seen, and whether it is."""
         if self._found is None:
             size = self.target._size_for("Warp")
-            rays, has_ray = _rays(self.target)
+            rays, has_ray = self.target.rays()
             far = self._nearest(size).flatten(1)
             count = len(far)
             rays, has_ray = rays.expand(count, *size, 3).flatten(1, 2), has_ray.expand(count, *size).flatten(1)
@@ -135,7 +135,7 @@ class ShiftedWarp(Warp):
     def _nearest(self, size: tuple[int, int]) -> Tensor:
         """(B, H', W'): about how far the nearest surface is that the target sees; 0 where nothing is near."""
         height, width = size
-        rays = _rays(self.source)[0]
+        rays = self.source.rays()[0]
         points = self.transform_positions((rays * self.distance[..., None]).flatten(1, 2)).view(*self.distance.shape, 3)
         pixels, mapped = self.target.project(points)
         u, v = pixels.round().unbind(-1)
@@ -152,12 +152,6 @@ class ShiftedWarp(Warp):
             close = max_pool2d(close, shape, 1, (shape[0] // 2, shape[1] // 2))
         found = -close[:, 0]
         return torch.where(found < 1e30, found, 0.0)
-
-
-def _rays(camera: Camera) -> tuple[Tensor, Tensor]:
-    """(*B, H, W, 3) of all pixels, and whether they have some."""
-    grid = camera.pixel_grid()
-    return camera.unproject(grid.expand(*camera.batch_shape, *grid.shape))
 
 
 def _between(distance: Tensor, pixels: Tensor) -> Tensor:

@@ -255,11 +255,6 @@ def _behind(shutter: RollingShutter | None, camera: Camera) -> Camera:
 class InMotion:
     """A camera behind a rolling shutter, as a warp sees one: rays are those of the middle of the readout."""
 
-    camera: Camera
-    shutter: RollingShutter
-    batch_shape: torch.Size
-    size: tuple[int, int]
-
     def __init__(self, camera: Camera, shutter: RollingShutter):
         self.camera, self.shutter = camera, shutter
         self.batch_shape = broadcast_shapes(camera.batch_shape, shutter.batch_shape)
