@@ -10,7 +10,6 @@ from pathlib import Path
 
 import pytest
 import torch
-from colmap_models import from_colmap
 from hypothesis import strategies as st
 
 import camtorch as ct
@@ -148,10 +147,6 @@ def golden_camera(case):
     """The camera of a file; a brown_conrady vector loses no coefficient, be it zero."""
     parameters = tensor(case["parameters"])
     size = tuple(case["image_size"])
-    if "colmap" in case:
-        key, *numbers = from_colmap(case["colmap"], case["parameters"])
-        assert key == case["family"]
-        return make(key, *(tensor(list(v)) for v in numbers), image_size=size)
     if case["family"] == "kannala_brandt_general":
         return ct.KannalaBrandt.from_general(parameters[:4], parameters[4:], image_size=size)
     return make(case["family"], parameters[:4], parameters[4:], image_size=size)
