@@ -592,25 +592,22 @@ def test_wrong_arguments_are_told():
 @pytest.mark.parametrize("name", ["CenterCrop", "RandomCrop", "RandomResizedCrop"])
 def test_boxes_stay_where_any_of_their_mask_does(name):
     torch.manual_seed(0)
-    edit = getattr(ct.augment, name)((112, 112))
     corners = torch.rand(60, 2, 2) * torch.tensor([420.0, 340.0]) - 50
     boxes = torch.cat((corners.amin(1), corners.amax(1) + 2), -1).round()
     boxes[0] = torch.tensor([60.0, 40.0, 260.0, 200.0])
-    v, u = torch.meshgrid(torch.arange(240), torch.arange(320), indexing="ij")
-    low, high = boxes[:, :2, None, None], boxes[:, 2:, None, None]
-    masks = (u >= low[:, 0]) & (u <= high[:, 0]) & (v >= low[:, 1]) & (v <= high[:, 1])
-    out = edit(image=torch.zeros(60, 1, 240, 320), mask=masks, boxes=boxes[:, None])
-    shown = out["mask"].flatten(1).any(-1)
+    pixels = torch.cartesian_prod(torch.arange(240), torch.arange(320)).flip(-1)
+    masks = ((pixels >= boxes[:, None, :2]) & (pixels <= boxes[:, None, 2:])).all(-1).view(60, 240, 320)
+    out = getattr(A, name)((112, 112))(image=torch.zeros(60, 1, 240, 320), mask=masks, boxes=boxes[:, None])
+    shown, (moved, valid) = out["mask"].flatten(1).any(-1), (out[key][:, 0] for key in ("boxes", "boxes_valid"))
     assert shown.any()
-    assert out["boxes_valid"][:, 0][shown].all()
+    assert valid[shown].all()
     # what has no pixel of the mask ends within one of the image's edge, or was nowhere on the image
-    left, top, right, bottom = out["boxes"][:, 0].unbind(-1)
-    near = (left < 114) & (top < 114) & (right > -2) & (bottom > -2)
-    assert not out["boxes_valid"][:, 0][~near].any()
+    near = (moved[:, :2] < 114).all(-1) & (moved[:, 2:] > -2).all(-1)
+    assert not valid[~near].any()
     # nor is a sample that stays asked otherwise
     camera = ct.Pinhole([300.0, 300.0, 159.5, 119.5], image_size=(240, 320)).requires_grad_(False)
     boxes = torch.stack((boxes[0] + 400, 100 * boxes[0] - 9000))
-    assert ct.augment.RandomMount(p=0.0, camera=camera)(boxes=boxes)["boxes_valid"].tolist() == [False, True]
+    assert A.RandomMount(p=0.0, camera=camera)(boxes=boxes)["boxes_valid"].tolist() == [False, True]
 
 
 def test_quarter_turns_of_several_models_are_told_of_where_images_are_one_tensor():

@@ -258,24 +258,6 @@ def test_export_takes_any_number_of_cameras_that_are_inputs(monkeypatch):
         torch.testing.assert_close(exported(*given(count)), Seen()(*given(count)), atol=1e-4, rtol=0)
 
 
-def test_forward_mode_through_a_kept_grid():
-    warp = ct.Warp(fisheye(dtype=torch.float64), pinhole(dtype=torch.float64)).requires_grad_(False)
-    images, shift = smooth(), torch.tensor([1.0, 0.5, -2.0, 1.5], dtype=torch.float64)
-    warp(images)
-    step = 1e-6
-
-    def image(k):
-        return torch.func.functional_call(warp, {"source.intrinsics": k}, (images,))
-
-    k = warp.source.intrinsics.detach()
-    with torch.autograd.forward_ad.dual_level():
-        dual = image(torch.autograd.forward_ad.make_dual(k, shift))
-        tangent = torch.autograd.forward_ad.unpack_dual(dual).tangent
-    expected = (image(k + step * shift) - image(k - step * shift)) / (2 * step)
-    # where a sampling position crosses a pixel within the step, the difference is none of one polynomial
-    assert ((tangent - expected).abs() < 1e-6).double().mean() > 0.999
-
-
 def test_a_box_about_a_pole_encloses_it():
     camera = ct.KannalaBrandt([150.0, 150.0, 319.5, 239.5], [0.0, 0, 0, 0], image_size=(480, 640))
     panorama = ct.Equirectangular([640 / (2 * torch.pi)] * 2 + [319.5, 159.5], image_size=(320, 640))
@@ -286,8 +268,9 @@ def test_a_box_about_a_pole_encloses_it():
 
 
 def test_transforms_of_functions():
-    warp = ct.Warp(fisheye(), pinhole(), torch.nn.Parameter(turn(5)))
-    images, state = smooth(dtype=torch.float32), dict(warp.named_parameters())
+    """Through a grid that is kept, too."""
+    warp = ct.Warp(fisheye(dtype=torch.float64), pinhole(dtype=torch.float64), torch.nn.Parameter(turn(5).double()))
+    images, state = smooth(), dict(warp.requires_grad_(False).named_parameters())
     assert set(state) == {"rotation", "source.intrinsics", "source.distortion", "target.intrinsics"}
     k = state["source.intrinsics"]
 
@@ -296,6 +279,7 @@ def test_transforms_of_functions():
 
     expected = warp(images)
     assert not torch.equal(made(k + 1), expected)
-    torch.testing.assert_close(torch.func.vmap(made)(torch.stack((k, k)))[1], expected, atol=1e-5, rtol=0)
+    torch.testing.assert_close(torch.func.vmap(made)(torch.stack((k, k)))[1], expected, atol=1e-9, rtol=0)
     forward, reverse = (jacobian(lambda k: made(k).sum())(k) for jacobian in (torch.func.jacfwd, torch.func.jacrev))
-    torch.testing.assert_close(forward, reverse, atol=1e-2, rtol=1e-3)
+    assert forward.all()
+    torch.testing.assert_close(forward, reverse)
