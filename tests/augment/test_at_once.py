@@ -9,18 +9,9 @@ import torch
 import camtorch as ct
 import camtorch.augment.numpy
 import camtorch.augment.sample
-from camtorch.augment import (
-    Compose,
-    HorizontalFlip,
-    RandomCamera,
-    RandomLens,
-    RandomMount,
-    RandomResizedCrop,
-    Resize,
-    Rotate90,
-)
 from camtorch.native.library import native_available
 
+A = ct.augment
 SIZE = (96, 130)
 DTYPES = torch.float32, torch.float64
 LENSES = {
@@ -41,16 +32,16 @@ def example(key, size):
 
 
 AUGMENTATIONS = {
-    "mount": lambda: RandomMount(zoom=0.2, padding_mode="border"),
-    "lens": lambda: RandomLens(mode="bicubic", fill=(1, 2, 3), mask_fill=7),
-    "another lens": lambda: RandomCamera("dms60", image_size=(90, 120), min_filled=0),
-    "filled": lambda: RandomMount(min_filled=0.9, p=0.7),
-    "chain": lambda: Compose([RandomMount(), RandomLens()], antialias=False),
-    "chain that decides": lambda: Compose([RandomMount(), RandomLens()]),
-    "flipped chain": lambda: Compose([RandomResizedCrop(SIZE, scale=(0.5, 1)), HorizontalFlip(), RandomLens()]),
-    "chain that shrinks": lambda: Compose([RandomMount(), RandomLens(), Resize((40, 54))], mask_fill=3),
-    "a lens that shrinks": lambda: Compose([RandomCamera("dms60", image_size=(64, 70), min_filled=0)]),
-    "edits": lambda: Compose([RandomResizedCrop((64, 80), scale=(0.3, 0.6)), HorizontalFlip()], fill=9),
+    "mount": lambda: A.RandomMount(zoom=0.2, padding_mode="border"),
+    "lens": lambda: A.RandomLens(mode="bicubic", fill=(1, 2, 3), mask_fill=7),
+    "another lens": lambda: A.RandomCamera("dms60", image_size=(90, 120), min_filled=0),
+    "filled": lambda: A.RandomMount(min_filled=0.9, p=0.7),
+    "chain": lambda: A.Compose([A.RandomMount(), A.RandomLens()], antialias=False),
+    "chain that decides": lambda: A.Compose([A.RandomMount(), A.RandomLens()]),
+    "flipped chain": lambda: A.Compose([A.RandomResizedCrop(SIZE, scale=(0.5, 1)), A.HorizontalFlip(), A.RandomLens()]),
+    "chain that shrinks": lambda: A.Compose([A.RandomMount(), A.RandomLens(), A.Resize((40, 54))], mask_fill=3),
+    "a lens that shrinks": lambda: A.Compose([A.RandomCamera("dms60", image_size=(64, 70), min_filled=0)]),
+    "edits": lambda: A.Compose([A.RandomResizedCrop((64, 80), scale=(0.3, 0.6)), A.HorizontalFlip()], fill=9),
 }
 
 
@@ -104,12 +95,12 @@ def test_batches_as_step_by_step(key, name, threads):
 
 
 LAST = {
-    "lens": lambda: RandomLens("pinhole", fov=(65, 80), min_filled=0),
-    "fisheye": lambda: RandomLens("kannala_brandt", fov=(65, 80), min_filled=0),
-    "its like": lambda: RandomLens(min_filled=0),
-    "mount": lambda: RandomMount(min_filled=0),
-    "quarters": lambda: Rotate90((0, 2), step=2),
-    "camera": lambda: RandomCamera(min_filled=0.9),
+    "lens": lambda: A.RandomLens("pinhole", fov=(65, 80), min_filled=0),
+    "fisheye": lambda: A.RandomLens("kannala_brandt", fov=(65, 80), min_filled=0),
+    "its like": lambda: A.RandomLens(min_filled=0),
+    "mount": lambda: A.RandomMount(min_filled=0),
+    "quarters": lambda: A.Rotate90((0, 2), step=2),
+    "camera": lambda: A.RandomCamera(min_filled=0.9),
 }
 
 
@@ -117,7 +108,7 @@ LAST = {
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("name", LAST)
 def test_a_sample_of_a_batch_is_what_it_is_alone(name, dtype):
-    augment = Compose([RandomResizedCrop(SIZE), HorizontalFlip(landmarks={}), LAST[name]()])
+    augment = A.Compose([A.RandomResizedCrop(SIZE), A.HorizontalFlip(landmarks={}), LAST[name]()])
     camera, alone = example("brown_conrady", SIZE).to(dtype).requires_grad_(False), sample_for(dtype)
     alone |= {"boxes": torch.tensor([[20, 20, 60, 50]], dtype=dtype), "gaze": torch.tensor([0.6, 0, -0.8], dtype=dtype)}
     torch.manual_seed(0)
@@ -150,7 +141,7 @@ def test_pixels_of_half_precision_stay_finite(lead):
     camera = ct.KannalaBrandt([focal, focal, 48.0, 32.0], [0.0] * 4, image_size=(64, 96)).requires_grad_(False)
     flat = dict.fromkeys(("yaw", "pitch", "roll", "focal", "centre", "distortion", "crop"))
     pixels = torch.tensor([[88.0, 32.0], [50.0, 30.0]]).half().expand(*lead, 2, 2)
-    out = RandomCamera("pinhole", fov=(60, 60), camera=camera, **flat)(keypoints=pixels)
+    out = A.RandomCamera("pinhole", fov=(60, 60), camera=camera, **flat)(keypoints=pixels)
     assert out["keypoints"].dtype == torch.float16
     assert torch.isfinite(out["keypoints"]).all()
     assert out["keypoints_valid"].tolist() == torch.tensor([False, True]).expand(*lead, 2).tolist()
@@ -176,7 +167,7 @@ def odd_samples():
 @pytest.mark.parametrize("form", odd_samples())
 def test_odd_samples_as_step_by_step(form, name, monkeypatch):
     sample, camera = odd_samples()[form], example("brown_conrady", SIZE).requires_grad_(False)
-    augment = RandomMount() if name == "mount" else RandomLens() if name == "lens" else AUGMENTATIONS[name]()
+    augment = A.RandomMount() if name == "mount" else A.RandomLens() if name == "lens" else AUGMENTATIONS[name]()
     torch.manual_seed(0)
     out = augment(sample, camera=camera)
     monkeypatch.setattr(camtorch.augment.sample, "at_once", lambda *given: None)
@@ -198,7 +189,7 @@ def test_what_goes_at_once_makes_no_warp(name):
 @pytest.mark.parametrize("antialias", [None, False])
 def test_a_mirrored_chain_goes_back(antialias):
     camera = example("brown_conrady", SIZE).requires_grad_(False)
-    augment = Compose([HorizontalFlip(p=1, landmarks=[(0, 1)]), RandomLens()], camera=camera, antialias=antialias)
+    augment = A.Compose([A.HorizontalFlip(p=1, landmarks=[(0, 1)]), A.RandomLens()], camera=camera, antialias=antialias)
     sample = {**sample_for(torch.float32), "gaze": torch.tensor([0.1, 0.2, -0.9])}
     out = augment(sample)
     assert torch.linalg.det(out["rotation"]) < 0
@@ -211,7 +202,7 @@ def test_a_mirrored_chain_goes_back(antialias):
 def test_samples_of_any_form_follow_each_other():
     """What one form of samples is known by says nothing of the next one."""
     random = np.random.default_rng(0)
-    transform = camtorch.augment.numpy.Transform(RandomMount(camera=example("pinhole", SIZE).requires_grad_(False)))
+    transform = camtorch.augment.numpy.Transform(A.RandomMount(camera=example("pinhole", SIZE).requires_grad_(False)))
     for shape, dtype in (((*SIZE, 3), "uint8"), (SIZE, "float32"), ((*SIZE, 1), "uint16"), ((*SIZE, 5), "uint8")):
         image = random.integers(0, 200, shape).astype(dtype)
         for keypoints, count in ((np.zeros((0, 2)), 0), ([[3, 4]], 1)):

@@ -9,20 +9,12 @@ import torch
 from cameras import DISTINCT, KEYS, PAIRS, slow_unless, spread
 
 import camtorch as ct
-from camtorch.augment import (
-    PRESETS,
-    Compose,
-    HorizontalFlip,
-    RandomCamera,
-    RandomLens,
-    RandomMount,
-    RandomResizedCrop,
-    Resize,
-)
+from camtorch.augment import PRESETS, RandomCamera, RandomLens, RandomMount
 
 # wide lenses for narrow images, on purpose
 pytestmark = pytest.mark.filterwarnings("ignore:.*will show nothing")
 
+A = ct.augment
 SIZE = (240, 320)
 
 
@@ -159,7 +151,7 @@ AUGMENTATIONS = {
     "family": lambda **options: RandomLens("kannala_brandt", fov=(80, 110), **options),
     "camera": lambda **options: RandomCamera("dms130", chromatic=0.004, vignetting=(0.2, 0.5), **options),
     "filled": lambda **options: RandomCamera("dms130", fov="source", min_filled=0.9, **options),
-    "chain": lambda **options: Compose([RandomResizedCrop((60, 80)), HorizontalFlip(), RandomLens()], **options),
+    "chain": lambda **options: A.Compose([A.RandomResizedCrop((60, 80)), A.HorizontalFlip(), RandomLens()], **options),
 }
 
 
@@ -393,7 +385,8 @@ def test_chromatic_aberration_scales_red_and_blue():
 def test_empty_batches():
     empty = {k: v[:0] if isinstance(v, torch.Tensor) else v for k, v in sample().items()}
     makers = [lambda make=make: make(image_size=(30, 40)) for name, make in AUGMENTATIONS.items() if name != "chain"]
-    for make in (*makers, lambda: Compose([Resize((30, 40)), HorizontalFlip()]), lambda: RandomResizedCrop((30, 40))):
+    makers += [lambda: A.RandomResizedCrop((30, 40)), lambda: A.Compose([A.Resize((30, 40)), A.HorizontalFlip()])]
+    for make in makers:
         out = make()(empty)
         assert out["image"].shape == (0, 3, 30, 40)
         assert out["keypoints_valid"].shape == (0, 7)
