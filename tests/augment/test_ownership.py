@@ -4,35 +4,24 @@ import copy
 
 import pytest
 import torch
+from test_augment import pinhole
+from test_augment import sample as every_field
 
 import camtorch as ct
 from camtorch.augment import FaceNormalizer, RandomCamera, RandomLens, RandomMount
 
-SIZE, COUNT = (24, 32), 3
+SIZE, COUNT = (60, 80), 3
 
 
 def camera(count=None):
-    numbers = torch.tensor([24.0, 24.0, 15.5, 11.5])
-    return ct.Pinhole(numbers if count is None else numbers.repeat(count, 1), image_size=SIZE).requires_grad_(False)
+    one = pinhole(focal=60.0, size=SIZE)
+    return one if count is None else one.replace(intrinsics=one.intrinsics.repeat(count, 1)).requires_grad_(False)
 
 
 def sample(own):
-    pose = torch.eye(4).repeat(COUNT, 1, 1)
-    pose[:, 2, 3] = 1.0
-    return {
-        "image": torch.rand(COUNT, 3, *SIZE),
-        "mask": torch.ones(COUNT, *SIZE),
-        "depth": torch.ones(COUNT, 1, *SIZE),
-        "keypoints": torch.rand(COUNT, 4, 2) * 20,
-        "keypoints_valid": torch.ones(COUNT, 4, dtype=torch.bool),
-        "boxes": torch.tensor([[[4.0, 4, 20, 16]]]).repeat(COUNT, 1, 1),
-        "gaze": torch.rand(COUNT, 3),
-        "pitch_yaw": torch.rand(COUNT, 2),
-        "points": torch.rand(COUNT, 5, 3),
-        "head_pose": pose,
-        "image_valid": torch.ones(COUNT, 1, *SIZE, dtype=torch.bool),
-        "camera": own,
-    }
+    masks = {"keypoints_valid": torch.ones(COUNT, 7), "image_valid": torch.ones(COUNT, 1, *SIZE)}
+    fields = {name: value for name, value in every_field(COUNT, own).items() if name not in ("label", "name")}
+    return fields | {name: value.bool() for name, value in masks.items()}
 
 
 def tensors(values):
