@@ -182,22 +182,22 @@ def spread(key, dtype=torch.float64):
     """A camera with every coefficient away from zero, so that no term of the formula can be forgotten."""
     count = len(one(key).distortion_names)
     sign = torch.tensor([1.0, -1.0]).repeat(count)[:count]
-    limits = torch.tensor([_limits(key, name, wild=False) for name in one(key).distortion_names]).view(-1, 2)
+    limits = torch.tensor([limits_of(key, name, wild=False) for name in one(key).distortion_names]).view(-1, 2)
     middle, half = limits.mean(-1), (limits[:, 1] - limits[:, 0]) / 2
-    distortion = _summed(key, middle + 0.3 * sign * half)
+    distortion = nodes_of_steps(key, middle + 0.3 * sign * half)
     slope = axis_slope(key, distortion.tolist())
     intrinsics = torch.tensor([301.0 / slope, 310.5 / slope, 318.25, 243.5], dtype=dtype)
     return make(key, intrinsics, distortion.to(dtype), image_size=(480, 640))
 
 
-def _limits(key, name, wild):
+def limits_of(key, name, wild):
     ranges = RANGES.get(key, {})
     letters = max((letters for letters in ranges if name.startswith(letters)), key=len, default=None)
     limits = ranges[letters][wild] if letters else 0.0
     return limits if isinstance(limits, tuple) else (-limits, limits)
 
 
-def _summed(key, numbers):
+def nodes_of_steps(key, numbers):
     """The nodes of steps; a table begins to ascend."""
     if key != "tabulated":
         return numbers
@@ -217,13 +217,13 @@ def drawn(draw, key, wild):
     counts = [n for n in range(1, 15) if RANGES.get(key) and model.names_of(n)]
     names = model.names_of(draw(st.sampled_from(counts))) if counts else ()
     focal, aspect, across, down = number(150, 600), number(0.9, 1.1), number(-20, 20), number(-20, 20)
-    distortion = [number(*_limits(key, name, wild)) for name in names]
+    distortion = [number(*limits_of(key, name, wild)) for name in names]
     if RANGES.get(key) and not counts:  # too many to be drawn one by one
         generator = torch.Generator().manual_seed(draw(st.integers(0, 1 << 20)))
-        limits = torch.tensor([_limits(key, name, wild) for name in model.distortion_names], dtype=torch.float64)
+        limits = torch.tensor([limits_of(key, name, wild) for name in model.distortion_names], dtype=torch.float64)
         share = torch.rand(len(limits), generator=generator, dtype=torch.float64)
         distortion = (limits[:, 0] + share * limits.diff()[:, 0]).tolist()
-    distortion = _summed(key, torch.tensor(distortion, dtype=torch.float64)).tolist()
+    distortion = nodes_of_steps(key, torch.tensor(distortion, dtype=torch.float64)).tolist()
     focal /= axis_slope(key, distortion)
     intrinsics = [focal, focal * aspect, 320 + across, 240 + down]
     intrinsics, distortion = (torch.tensor(v, dtype=torch.float64) for v in (intrinsics, distortion))

@@ -16,11 +16,7 @@ KINDS = ("z", "distance")
 
 
 def as_depth(depth: Numbers, kind: str, size: tuple[int, int], owner: str, device: torch.device) -> Tensor:
-    """A depth map (B, D, H, W) or (H, W) of a size, as users pass it.
-
-    Raises:
-        ValueError: another shape, integers, an unknown kind. TypeError: no numbers.
-    """
+    """Check a depth map (B, D, H, W) or (H, W) of a size, as users pass it, and its kind."""
     if not isinstance(kind, str) or kind not in KINDS:
         raise ValueError(f'{owner}: kind must be "z" (along the optical axis) or "distance"; got {kind!r}')
     depth = as_values(depth, "depth", owner, device)
@@ -39,13 +35,9 @@ def as_depth(depth: Numbers, kind: str, size: tuple[int, int], owner: str, devic
 
 
 def depth_scale(depth: Tensor, rays: Tensor, valid: Tensor, kind: str) -> tuple[Tensor, Tensor]:
-    """How far along unit rays the points of depths lie, (*B, H, W), and which of the depths count.
+    """Return how far along unit rays (*B, H, W, 3) the points of depths lie, (*B, H, W), and which depths count.
 
-    Args:
-        depth: (*B, H, W), or whatever broadcasts against the rays without their last dim.
-        rays: (*B, H, W, 3).
-        valid: (*B, H, W) bool.
-        kind: one of `KINDS`.
+    depth: whatever broadcasts against the rays without their last dim. kind: one of `KINDS`.
     """
     z = rays[..., 2]
     ahead = valid & (z > 0) if kind == "z" else valid

@@ -42,11 +42,7 @@ def on_image(pixels: Numbers, size: tuple[int, int], owner: str) -> Tensor:
 
 
 def patch_centres(size: tuple[int, int], stride: int, like: Tensor, owner: str) -> Tensor:
-    """(H / stride, W / stride, 2): the middle of every patch of stride x stride pixels.
-
-    Raises:
-        ValueError: a stride below 1, or one that does not divide the size.
-    """
+    """Return the middles (H / stride, W / stride, 2) of patches of stride x stride pixels, which have to fill it."""
     step = as_whole(stride, "stride", owner)
     if step < 1:
         raise ValueError(f"{owner}: stride must be at least 1; got {step}")

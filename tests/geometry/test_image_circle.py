@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from cameras import DISTINCT, KEYS, _limits, _summed, axis_slope, fan, make, one, pixel_lattice, slow_unless
+from cameras import DISTINCT, KEYS, axis_slope, fan, limits_of, make, nodes_of_steps, one, pixel_lattice, slow_unless
 
 import camtorch as ct
 from camtorch._arguments import columns
@@ -26,13 +26,13 @@ def lenses(key, size, count=12):
     """A batch of lenses: 'mild', as real ones are, or up to the 'plausible' or the 'wild' limits of the laws."""
     generator = torch.Generator().manual_seed(count)
     names = one(key).distortion_names
-    limits = torch.tensor([_limits(key, name, size == "wild") for name in names], dtype=torch.float64).view(-1, 2)
+    limits = torch.tensor([limits_of(key, name, size == "wild") for name in names], dtype=torch.float64).view(-1, 2)
     share = torch.rand(count, len(names), generator=generator, dtype=torch.float64)
     distortion = limits[:, 0] + (limits[:, 1] - limits[:, 0]) * share
     if size == "mild":
         lopsided = torch.tensor([name in one(key).odd_in_x | one(key).odd_in_y for name in names])
         distortion = torch.where(lopsided, distortion / 4, distortion)
-    distortion = torch.stack([_summed(key, row) for row in distortion])
+    distortion = torch.stack([nodes_of_steps(key, row) for row in distortion])
     slopes = torch.tensor([axis_slope(key, row.tolist()) for row in distortion], dtype=torch.float64)
     focal = torch.linspace(150, 400, count, dtype=torch.float64) / slopes
     intrinsics = torch.stack((focal, focal * 1.05, *(torch.full_like(focal, c) for c in (322.0, 236.0))), -1)

@@ -209,39 +209,24 @@ derivative_cameras = pytest.mark.parametrize(
 
 
 @derivative_cameras
-def test_derivatives_of_project(key, camera_of):
-    camera = camera_of(key)
-    points = (near_and_far_rays() * 1.7).requires_grad_()
-    assert camera.project(points)[1].all()
-
-    def project(points, *parameters):
-        return learning(camera, *parameters).project(points)[0]
-
-    inputs = (points, *leaves(camera))
-    assert gradcheck(project, inputs)
-    if key in NOT_ANALYTIC:
-        inputs = (points[3:].detach().requires_grad_(), *inputs[1:])
-    # along random directions: entry by entry it takes three times as long
-    assert gradgradcheck(project, inputs, fast_mode=True)
-
-
-@derivative_cameras
-def test_derivatives_of_unproject(key, camera_of):
-    camera = camera_of(key)
-    fx, _, cx, cy = camera.intrinsics.tolist()
-    fx *= axis_slope(key, camera.distortion.tolist())
-    pixels = fx * near_and_far_rays()[:, :2] + torch.tensor([cx, cy], dtype=torch.float64)
-    assert camera.unproject(pixels)[1].all()
-
-    def unproject(pixels, *parameters):
+@pytest.mark.parametrize("method", ["project", "unproject"])
+def test_derivatives(key, camera_of, method):
+    camera, values, scale = camera_of(key), near_and_far_rays() * 1.7, 1.0
+    if method == "unproject":
         # pixels in units of the focal length: steps of the numerical derivative must not drown in their rounding
-        return learning(camera, *parameters).unproject(pixels * fx)[0]
+        scale = camera.intrinsics[0].item() * axis_slope(key, camera.distortion.tolist())
+        values = near_and_far_rays()[:, :2] + camera.intrinsics.detach()[2:] / scale
+    assert getattr(camera, method)(values * scale)[1].all()
 
-    inputs = ((pixels / fx).requires_grad_(), *leaves(camera))
-    assert gradcheck(unproject, inputs)
+    def function(values, *parameters):
+        return getattr(learning(camera, *parameters), method)(values * scale)[0]
+
+    inputs = (values.requires_grad_(), *leaves(camera))
+    assert gradcheck(function, inputs)
     if key in NOT_ANALYTIC:
-        inputs = (inputs[0][3:].detach().requires_grad_(), *inputs[1:])
-    assert gradgradcheck(unproject, inputs, fast_mode=True)
+        inputs = (values[3:].detach().requires_grad_(), *inputs[1:])
+    # along random directions: entry by entry it takes three times as long
+    assert gradgradcheck(function, inputs, fast_mode=True)
 
 
 @every_model
@@ -273,13 +258,21 @@ def bad_points(camera):
     return never
 
 
-def bad_pixels(camera):
-    return [[math.nan, 0], [0, math.nan], [math.inf, 0], [3, -math.inf], [math.nan, math.nan]]
+BAD_PIXELS = [[math.nan, 0], [0, math.nan], [math.inf, 0], [3, -math.inf], [math.nan, math.nan]]
 
 
-def check_bad_rows(camera, method, good, bad):
+@every_model
+@both_precisions
+@pytest.mark.parametrize("method", ["project", "unproject"])
+def test_bad_rows(key, dtype, method):
     """Bad rows: invalid, finite, no gradient. Good rows and parameters: what they would be without the bad ones."""
+    camera = one(key).to(dtype)
     parameters = [p for p in camera.parameters() if p.requires_grad]
+    if method == "project":
+        good, bad = near_and_far_rays().to(dtype), torch.tensor(bad_points(camera), dtype=dtype)
+    else:
+        good, bad = pixel_lattice(camera, 5, 7), torch.tensor(BAD_PIXELS, dtype=dtype)
+        good = good[camera.unproject(good)[1]]
     values = torch.cat((good, bad)).requires_grad_()
     result, valid = getattr(camera, method)(values)
     assert result.isfinite().all()
@@ -297,13 +290,6 @@ def check_bad_rows(camera, method, good, bad):
     for mine, reference in zip((by_value[: len(good)], *by_parameter), expected, strict=True):
         # sums over points, of which some cancel
         torch.testing.assert_close(mine, reference, rtol=close, atol=close * float(reference.abs().max()))
-
-
-@every_model
-@both_precisions
-def test_bad_points(key, dtype):
-    camera = one(key).to(dtype)
-    check_bad_rows(camera, "project", near_and_far_rays().to(dtype), torch.tensor(bad_points(camera), dtype=dtype))
 
 
 @each_kind
@@ -356,15 +342,6 @@ def test_pixels_far_beyond_every_image(key, dtype):
             stretch = vmap(jacrev(lambda ray, camera=camera: camera.project(ray)[0]))(rays.detach()).norm(dim=(-1, -2))
             limit = 100 * torch.finfo(dtype).eps * (distance + stretch)
             assert ((again - pixels).norm(dim=-1) < limit)[valid & reachable].all(), distance
-
-
-@every_model
-@both_precisions
-def test_bad_pixels(key, dtype):
-    camera = one(key).to(dtype)
-    good = pixel_lattice(camera, 5, 7)
-    good = good[camera.unproject(good)[1]]
-    check_bad_rows(camera, "unproject", good, torch.tensor(bad_pixels(camera), dtype=dtype))
 
 
 @distinct_models
@@ -588,20 +565,16 @@ def test_what_a_pixel_sees_is_seen(key, dtype, data):
 # -- batches
 
 
-@each_kind
+@pytest.mark.parametrize("key", [*sorted(DISTINCT), "ocamcalib"])  # whose chart is looked up before a lens
 @pytest.mark.parametrize(("batch", "dims"), [((3,), ()), ((2, 3), (4, 2)), ((1,), (2, 1, 3))])
 def test_batch_equals_loop(key, batch, dims):
     generator = torch.Generator().manual_seed(1)
     single = spread(key)
     count = math.prod(batch)
     draw = 1 + 0.1 * torch.rand(count, 1, generator=generator, dtype=torch.float64)
-    cameras = [
-        make(key, *(p.detach() for p in (single.intrinsics * scale, single.distortion / scale))) for scale in draw
-    ]
-    batched = make(
-        key, *(torch.stack(p).detach() for p in zip(*((c.intrinsics, c.distortion) for c in cameras), strict=True))
-    )
-    batched = make(key, batched.intrinsics.detach().view(*batch, 4), batched.distortion.detach().view(*batch, -1))
+    intrinsics, distortion = single.intrinsics.detach() * draw, single.distortion.detach() / draw
+    cameras = [make(key, *numbers) for numbers in zip(intrinsics, distortion, strict=True)]
+    batched = make(key, intrinsics.view(*batch, 4), distortion.view(*batch, distortion.shape[-1]))
     assert batched.batch_shape == batch
     assert batched.K.shape == (*batch, 3, 3)
     points = torch.rand(*batch, *dims, 3, generator=generator, dtype=torch.float64) - 0.5

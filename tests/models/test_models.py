@@ -110,16 +110,6 @@ def test_the_inverse_of_an_angle_is_valid_before_it_turns_back():
     assert pixels[0, 0].item() == pytest.approx((INTRINSICS[2] + INTRINSICS[0] * end).item(), abs=1e-2)
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize(("model", "coefficients"), [(ct.Division, (0.1, 0.05)), (ct.FThetaBackward, (-0.4,))])
-def test_pixels_next_to_the_end_of_an_inverse(model, coefficients, dtype):
-    made = model(INTRINSICS.to(dtype), torch.tensor(coefficients, dtype=dtype))
-    pixels = INTRINSICS[2:] + torch.stack((torch.linspace(0, 900, 100_001), torch.zeros(100_001)), -1)
-    rays, valid = made.unproject(pixels.to(dtype))
-    assert 1000 < valid.sum() < len(valid)
-    assert made.project(rays)[1][valid].all()
-
-
 def test_woodscape_from_its_numbers():
     k = [339.749, -31.988, 48.275, -7.201]
     made = ct.WoodScape.from_woodscape(torch.tensor(k).double(), (3.942, -3.093), image_size=(966, 1280))

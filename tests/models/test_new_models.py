@@ -190,21 +190,6 @@ def test_without_a_graph_in_transforms_and_compiled(model):
         torch.testing.assert_close(compiled(rays)[0], camera.project(rays)[0], rtol=1e-9, atol=1e-9)
 
 
-def test_batches_of_a_chart_that_is_looked_up_before_a_lens():
-    single = camera_of(Backwards)
-    scale = torch.tensor([[1.0], [1.02], [0.9]], dtype=torch.float64)
-    batch = Backwards(single.intrinsics.detach() * scale, single.distortion.detach() * scale)
-    grid = torch.stack(torch.meshgrid(torch.arange(-600, 1300, 150), torch.arange(-600, 1300, 150), indexing="xy"), -1)
-    rays, valid = batch.unproject(grid.double().expand(3, *grid.shape))
-    for i in range(3):
-        alone = Backwards(batch.intrinsics[i].detach(), batch.distortion[i].detach())
-        one_ray, one_valid = alone.unproject(grid.double())
-        assert torch.equal(one_valid, valid[i])
-        torch.testing.assert_close(rays[i], one_ray, rtol=0, atol=1e-12)
-        assert one_valid.any()
-        torch.testing.assert_close(alone.project(one_ray)[0][one_valid], grid.double()[one_valid], rtol=0, atol=1e-7)
-
-
 def test_no_pixel_is_the_end_of_a_chart():
     """A chart that is looked up ends where its angle ceases to ascend, and no further out."""
     camera = Backwards([100.0, 100, 64, 64], [-0.3, 0.0, 0.9, 0.0, 0.0], image_size=(128, 128)).double()

@@ -335,11 +335,15 @@ def test_lattices_of_a_batch_of_cameras_and_images():
 # -- what is no plain memory of the CPU, and who watches
 
 
+def warp_of(tolerance, scale=1):
+    source = ct.KannalaBrandt([100.0, 100, 80, 60], [0.02, -0.01, 0.004, -0.001], image_size=(120, 160))
+    target = ct.Pinhole([80.0, 80, 80, 60], image_size=(120, 160))
+    source, target = (c.requires_grad_(False).resize(120 * scale, 160 * scale) for c in (source, target))
+    return ct.Warp(source, target, tolerance=tolerance)
+
+
 def warps():
-    lens = [0.02, -0.01, 0.004, -0.001]
-    source = ct.KannalaBrandt([100.0, 100, 80, 60], lens, image_size=(120, 160)).requires_grad_(False)
-    target = ct.Pinhole([80.0, 80, 80, 60], image_size=(120, 160)).requires_grad_(False)
-    return [ct.Warp(source, target, tolerance=tolerance) for tolerance in (0.0, 0.01)]
+    return [warp_of(tolerance) for tolerance in (0.0, 0.01)]
 
 
 def images_of_floats():
@@ -461,25 +465,19 @@ def samples(count=2, seed=0):
     return pixels(torch.uint8, (count, 3, 480, 640), seed)
 
 
-def larger(tolerance):
-    camera = ct.KannalaBrandt([300.0, 300, 319.5, 239.5], [0.02, -0.01, 0.003, -0.001], image_size=(480, 640))
-    target = ct.Pinhole([250.0, 250, 319.5, 239.5], image_size=(480, 640))
-    return ct.Warp(camera.requires_grad_(False), target.requires_grad_(False), tolerance=tolerance)
-
-
 @pytest.mark.parametrize("tolerance", [0.0, 0.01])
 def test_results_do_not_depend_on_threads(tolerance):
     images, results = samples(), []
     for count in (1, 3, 2):
         with threads(count):
-            given = [(larger(tolerance), one) for one in (images, images.float(), hwc(images))]
+            given = [(warp_of(tolerance, 4), one) for one in (images, images.float(), hwc(images))]
             results.append([warp(one, mode=mode) for warp, one in given for mode in MODES])
     for made in results[1:]:
         assert all(map(torch.equal, made, results[0]))
 
 
 def test_many_threads_warp_at_once():
-    warp, wrong = larger(0.01), []
+    warp, wrong = warp_of(0.01, 4), []
     given_images = [samples(2, seed) for seed in range(4)]
     expected = [warp(images) for images in given_images]
 
@@ -503,7 +501,7 @@ def test_many_threads_warp_at_once():
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork")
 @pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")  # which may leave a child without its threads
 def test_forks_while_others_warp():
-    warp, images = larger(0.01), samples()
+    warp, images = warp_of(0.01, 4), samples()
     expected, ended = warp(images).numpy(), threading.Event()
 
     def run():

@@ -5,7 +5,7 @@ import random
 import shutil
 
 import torch
-from cameras import CALIBRATIONS, GOLDEN, RANGES, golden_camera, make
+from cameras import CALIBRATIONS, GOLDEN, RANGES, golden_camera, limits_of, make, nodes_of_steps
 
 import camtorch as ct
 from camtorch.viewer.viewer import models
@@ -28,21 +28,11 @@ def preset(key):
 
 def drawn(key, which, seed):
     """A camera with coefficients from the ranges of the laws: plausible for 0, wild for 1."""
-    pick, sums, values = random.Random(f"{key} {seed}"), {}, []
-    names = ct.MODELS[key].names_of(ct.MODELS[key].default_count)
-    for name in names:
-        prefix = max((p for p in RANGES[key] if name.startswith(p)), key=len, default=None)
-        if prefix is None:
-            values.append(0.0)
-            continue
-        limits = RANGES[key][prefix][which]
-        value = pick.uniform(*(limits if isinstance(limits, tuple) else (-limits, limits)))
-        if key == "tabulated":  # steps
-            sums[prefix] = value = sums.get(prefix, 0.0) + value
-        values.append(value)
-    distortion = torch.tensor(values, dtype=torch.float64)
+    pick, names = random.Random(f"{key} {seed}"), ct.MODELS[key].names_of(ct.MODELS[key].default_count)
+    values = [pick.uniform(*limits_of(key, name, which)) for name in names]
+    distortion = nodes_of_steps(key, torch.tensor(values, dtype=torch.float64))
     if key == "tabulated":
-        distortion[:6] *= min(1.0, 3.0 / values[5])
+        distortion[:6] *= min(1.0, 3.0 / float(distortion[5]))
     return make(key, torch.tensor([300.0, 310.0, 322.0, 238.0], dtype=torch.float64), distortion, image_size=(480, 640))
 
 
