@@ -171,14 +171,6 @@ def test_a_step_to_a_negative_focal_length_is_said_once(key):
     assert not camera.unproject(POINTS[:, :2])[1].any()
 
 
-def test_which_camera_of_a_batch_and_what_of_it():
-    camera = ct.Mei(torch.tensor([[300.0, 300.0, 319.5, 239.5]] * 4), torch.zeros(4, 5))
-    with torch.no_grad():
-        camera.distortion[2, 0] = -1.5
-    with pytest.warns(UserWarning, match=r"Mei: distortion of camera 2 in the batch became unusable: .* xi > -1"):
-        assert camera.unproject(torch.ones(4, 1, 2))[1].tolist() == [[True], [True], [False], [True]]
-
-
 @pytest.mark.filterwarnings("ignore:.*became unusable")
 def test_a_compiled_warp_of_a_bad_camera_shows_nothing():
     source = ct.KannalaBrandt([15.0, 15.0, 12.0, 9.0], [0.0, 0.0, 0.0, 0.0], image_size=(80, 96)).requires_grad_(False)

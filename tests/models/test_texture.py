@@ -169,7 +169,7 @@ def test_reasons_in_batches_and_of_cameras_that_learning_broke():
     camera = ct.Mei(torch.tensor([[300.0, 300.0, 319.5, 239.5]] * 4), torch.zeros(4, 5))
     with torch.no_grad():
         camera.intrinsics[1, 0], camera.intrinsics[2, 3], camera.distortion[3, 0] = -3.0, math.nan, -1.5
-    with pytest.warns(UserWarning, match="camera 1 in the batch became unusable"):
+    with pytest.warns(UserWarning, match="Mei: intrinsics of camera 1 in the batch became unusable: fx = -3"):
         lines = camera.explain(torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]]).expand(4, 2, 3))
     assert lines[0] == "valid"
     assert lines[1].startswith("the chart does not cover it")
