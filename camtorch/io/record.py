@@ -28,7 +28,9 @@ class Record:
     """A value of a file and its place: text, a float, True, False, None, a list or a mapping. Text may be a number."""
 
     def __init__(self, path: str | os.PathLike[str], value: Any, place: str = ""):
-        self.path, self.value, self.place = path, value, place
+        self.path = path
+        self.value = value
+        self.place = place
 
     def fail(self, reason: object) -> NoReturn:
         """Raise the CameraFileError of this place."""

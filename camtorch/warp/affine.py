@@ -101,7 +101,7 @@ class AffineWarp(MirrorWarp):
     def __init__(self, source: Camera, target: Camera, matrix: Tensor, rotation: Tensor | None, **options: Any):
         super().__init__(source, target, rotation, **options)
         self.register_buffer("matrix", matrix, persistent=False)
-        self.batch_shape = broadcast_shapes(self.batch_shape, matrix.shape[:-2])
+        self.batch_shape: torch.Size = broadcast_shapes(self.batch_shape, matrix.shape[:-2])
 
     def between(self, source: Camera, target: Camera, rotation: Tensor | None, **options: Any) -> Warp:
         """See `Warp.between`; the map of pixels stays."""

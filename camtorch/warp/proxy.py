@@ -27,7 +27,7 @@ class ProxyWarp(Warp):
 
     def __init__(self, source: Camera, target: Camera, extrinsics: Extrinsics, **options: Unpack[WarpOptions]):
         super().__init__(source, target, tolerance=0.0, **options)
-        self.batch_shape = check_pose(
+        self.batch_shape: torch.Size = check_pose(
             type(self).__name__, extrinsics, "source from target", source=source, target=target
         )
         self.extrinsics = extrinsics

@@ -51,7 +51,7 @@ class ShiftedWarp(Warp):
             rays, has_ray = source.rays()
             length, known = depth_scale(depth[:, 0].to(rays), rays, has_ray, kind)
             distance = torch.where(known, length, 0.0).expand(count, -1, -1)
-        self.batch_shape = torch.Size((count,))
+        self.batch_shape: torch.Size = torch.Size((count,))
         self.register_buffer("shift", shift.to(rays), persistent=False)
         self.register_buffer("distance", distance, persistent=False)
         self._found: tuple[Tensor, Tensor] | None = None

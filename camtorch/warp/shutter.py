@@ -210,7 +210,7 @@ class ShutterWarp(MirrorWarp):
                 raise TypeError(f"ShutterWarp: {name} must be a RollingShutter; got {type(each).__name__}. {hint}")
             shapes |= {} if each is None else {name: (*each.batch_shape, 1)}
             setattr(self, name, each)
-        self.batch_shape = as_batch("ShutterWarp", **shapes)
+        self.batch_shape: torch.Size = as_batch("ShutterWarp", **shapes)
         self.turned_by(rotation)
 
     @property

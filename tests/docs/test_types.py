@@ -28,7 +28,9 @@ TOLERATED = (
 )
 
 # of models, whose types are those of `Camera`
-CONSTANTS = re.compile(r"\.(special_cases|fit_starts|fit_counts|fit_bounds|odd_in_x|odd_in_y|quarter_turn)$")
+CONSTANTS = re.compile(
+    r"\.(special_cases|fit_starts|fit_counts|fit_bounds|odd_in_x|odd_in_y|quarter_turn)$|Mixed\.from_fov$"
+)
 FRONT_ENDS = ("camtorch.augment.albumentations.", "camtorch.augment.torchvision.")
 """What has bases of libraries that are not installed here."""
 
