@@ -109,12 +109,14 @@ class Spans:
     _ends: list[tuple[float, float]]
 
     def __init__(self, ranges: Mapping[str, Range], rows: int):
-        self.ranges, self.rows, self._places, self._ends = dict(ranges), rows, [], []
+        self.ranges: dict[str, Range] = dict(ranges)
+        self.rows = rows
+        self._places, self._ends = [], []
         for name, interval in ranges.items():
             start, shape = len(self._ends), (rows, interval.size) if interval.size else None
             self._ends += [(interval.low, interval.high - interval.low)] * (rows * (interval.size or 1))
             self._places.append((name, slice(start, len(self._ends)), shape))
-        self.total = len(self._ends)
+        self.total: int = len(self._ends)
         self.low, self.wide = np.array(self._ends, np.float64).reshape(-1, 2).T.copy()
 
     def alone(self, shares: Sequence[float]) -> dict[str, list[Any]]:

@@ -120,8 +120,9 @@ class Mirroring:
             raise ValueError(
                 f"{owner}: lateral_axis must be 'x', 'y' or 'z', of the head's frame; got {shown(lateral_axis)}"
             )
-        self.lateral, self.owner = "xyz".index(lateral_axis), owner
-        self.swap_sides = as_flag(swap_sides, "swap_sides", owner)
+        self.lateral = "xyz".index(lateral_axis)
+        self.owner = owner
+        self.swap_sides: bool = as_flag(swap_sides, "swap_sides", owner)
         self._named: dict[str, Table | None] | None = None
         self._one: Table | None = None
         if isinstance(landmarks, Mapping):

@@ -374,9 +374,9 @@ class SampleTransform(nn.Module):
             raise ValueError(f"{self._name}: fields maps names to {', '.join(KINDS)} or {KEEP}; got {wrong}")
         self.options: Options = as_options(self._name, mode, padding_mode, fill, antialias, tolerance)
         # None where each warp says
-        self.antialias = None if antialias is None else self.options["antialias"]
-        self.mask_fill = as_number(mask_fill, "mask_fill", self._name)
-        self.valid_mask = as_flag(valid_mask, "valid_mask", self._name)
+        self.antialias: bool | None = None if antialias is None else self.options["antialias"]
+        self.mask_fill: float = as_number(mask_fill, "mask_fill", self._name)
+        self.valid_mask: bool = as_flag(valid_mask, "valid_mask", self._name)
         self._forms: dict[tuple[Any, ...], tuple[list[tuple[str, str]], bool, int]] = {}
 
     def __init_subclass__(cls, **options: Any) -> None:

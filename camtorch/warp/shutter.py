@@ -256,9 +256,10 @@ class InMotion:
     """A camera behind a rolling shutter, as a warp sees one: rays are those of the middle of the readout."""
 
     def __init__(self, camera: Camera, shutter: RollingShutter):
-        self.camera, self.shutter = camera, shutter
-        self.batch_shape = broadcast_shapes(camera.batch_shape, shutter.batch_shape)
-        self.size = camera._size_for("Warp")
+        self.camera = camera
+        self.shutter = shutter
+        self.batch_shape: torch.Size = broadcast_shapes(camera.batch_shape, shutter.batch_shape)
+        self.size: tuple[int, int] = camera._size_for("Warp")
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self.camera, name)
