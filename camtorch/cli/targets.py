@@ -36,7 +36,7 @@ def check(path: Path, *, force: bool, inputs: tuple[Path | None, ...] = ()) -> N
 def folder(text: str | None, suffixes: Collection[str]) -> Path:
     """Return the folder that -o names, for files of these suffixes."""
     if text is None:
-        raise ValueError("into which folder? -o OUT/ names it, for several images or a folder of them")
+        raise ValueError("into which folder? -o OUT/ names it, for several images or a folder; for one, -o out.png")
     path = Path(text)
     if os.path.lexists(path) and not path.is_dir():
         raise ValueError(f"{path}: is no folder, which -o names for several images or a folder of them")

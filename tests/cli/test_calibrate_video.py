@@ -6,12 +6,11 @@ import cv2
 import numpy as np
 import pytest
 from photographs import fisheye, photograph
-from test_calibrate_cli import BOARD, WORDS, assert_near, poses
+from test_calibrate_cli import BOARD, WORDS, assert_near, calibrate, poses
 from videos import write_video
 
 import camtorch as ct
 from camtorch.cli import searching
-from camtorch.cli.main import main
 
 pytest.importorskip("av")
 
@@ -35,7 +34,7 @@ def filmed(tmp_path_factory):
 def test_sharp_frames_that_differ_are_taken(filmed, tmp_path, capsys, monkeypatch):
     path, truth = filmed
     monkeypatch.chdir(tmp_path)
-    assert main(["calibrate", str(path), *WORDS, "-o", "camera.yml"]) == 0
+    calibrate(path, *WORDS, "-o", "camera.yml")
     assert capsys.readouterr().out.startswith(
         f"{path}: of 5 sharp frames 5 show the board, and 4 of these differ\n"
         "chessboard, 9x6 inner corners, squares of 30 mm: in 4 of 4 images of 640x480, "
@@ -50,7 +49,7 @@ def test_sharp_frames_that_differ_are_taken(filmed, tmp_path, capsys, monkeypatc
 def test_a_video_without_a_board_says_so(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     write_video("grey.mp4", [0], images=[np.full((64, 96), 90, np.uint8)])
-    assert main(["calibrate", "grey.mp4", *WORDS, "-o", "camera.yml"]) == 2
+    calibrate("grey.mp4", *WORDS, "-o", "camera.yml", expect=2)
     out, err = capsys.readouterr()
     assert out == "grey.mp4: of 1 sharp frames 0 show the board, and 0 of these differ\n"
     assert "grey.mp4 is left out: no board found in its frames" in err
