@@ -133,20 +133,17 @@ class Part:
         """These rows of the part, as all there is."""
         camera = _rows_of(self.camera, index)
         light = self.light if self.light is None or len(self.light) == 1 else self.light[index]
-        return replace(self.by(lambda warp: _rows_of_warp(warp, camera, index)), rows=None, camera=camera, light=light)
+
+        def rows_of(warp: Warp) -> Warp:
+            rotation = warp.rotation if warp.rotation is None or warp.rotation.ndim == 2 else warp.rotation[index]
+            return warp.rows_of(camera, _rows_of(warp.target, index), rotation, index)
+
+        return replace(self.by(rows_of), rows=None, camera=camera, light=light)
 
 
 def _rows_of(camera: Camera, index: list[int]) -> Camera:
     """The cameras of these rows; one without batch dims serves all of them."""
     return camera[index] if camera.batch_shape else camera
-
-
-def _rows_of_warp(warp: Warp, camera: Camera, index: list[int]) -> Warp:
-    """The warp of these rows, whose cameras before it are given."""
-    rotation, target = warp.rotation, _rows_of(warp.target, index)
-    if rotation is not None and rotation.ndim == 3:
-        rotation = rotation[index]
-    return warp.rows_of(camera, target, rotation, index)
 
 
 def _joined(a: Part, b: Part) -> Part:

@@ -151,7 +151,10 @@ class Compose(Augmentation):
 
     def _change(self, camera: Camera, draw: Mapping[str, Any]) -> Change:
         total, options = None, {**self.options, "antialias": self.antialias}
-        steps = self._steps(draw)
+        steps = []
+        for i, part in enumerate(self.parts):
+            own = {name: draw[f"{i}.{name}"] for name in ("apply", *part.ranges, *part.crops)}
+            steps.append((part, {**own, "apply": (own["apply"] > 0.5) & draw["apply"]}))
         while steps:
             edits = []
             while steps and isinstance(steps[0][0], Edit):  # those that follow each other are one
@@ -169,14 +172,6 @@ class Compose(Augmentation):
         assert total is not None
         check_sizes((part.image_size for part in total.parts), self._name)
         return total.with_options(options)  # type: ignore[arg-type]
-
-    def _steps(self, draw: Mapping[str, Any]) -> list[tuple[Augmentation, dict[str, Any]]]:
-        """The augmentations, and what each was drawn."""
-        steps = []
-        for i, part in enumerate(self.parts):
-            own = {name: draw[f"{i}.{name}"] for name in ("apply", *part.ranges, *part.crops)}
-            steps.append((part, {**own, "apply": (own["apply"] > 0.5) & draw["apply"]}))
-        return steps
 
     def extra_repr(self) -> str:
         """The options."""

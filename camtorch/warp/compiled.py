@@ -78,12 +78,9 @@ def warped(
     turned = None if rotation is None else rotation.detach()
     # numbers as words: integers of fills may be ids, which no float holds
     options = str(antialias), padding, how.mode, how.padding_mode, ",".join(map(repr, how.fill))
-    (result,) = _warp(images.detach(), source, target, turned, float(tolerance), *options, str(_is_last(images)))
+    is_last = str(layout(images) == torch.channels_last)
+    (result,) = _warp(images.detach(), source, target, turned, float(tolerance), *options, is_last)
     return result
-
-
-def _is_last(images: Tensor) -> bool:
-    return layout(images) == torch.channels_last
 
 
 def _laid(images: Tensor, is_last: str) -> Tensor:
