@@ -38,7 +38,9 @@ def hinting(hint: str) -> Callable[[Callable[Taken, Result]], Callable[Taken, Re
                 return function(*args, **kwargs)
             except TypeError as error:
                 is_inner = error.__traceback__ is None or error.__traceback__.tb_next is not None
-                if is_inner and not any(f"unexpected keyword argument {name!r}" in str(error) for name in kwargs):
+                if any(f"unexpected keyword argument {name!r}" in str(error) for name in kwargs):
+                    raise TypeError(f"{error}. {hint}. {LEFT}") from None
+                if is_inner:
                     raise
                 raise TypeError(f"{error}. {hint}") from None
 

@@ -2,7 +2,7 @@
 
 python examples/augment_coco.py images/ labels.json camera.yml new/ --preset dms60 --seed 0
 
-The draw of an image follows from its file name and the seed, so every run makes the same files. Keypoints that leave
+The draw of an image follows from its file name and the seed, so every run makes the same files, over those of a run before. Keypoints that leave
 the image become 0, 0, 0; annotations that leave it are left out, as are masks in runs of pixels.
 """
 
@@ -59,7 +59,7 @@ def move(annotations: list[Any], image: torch.Tensor, camera: ct.Camera, augment
         labels = {"bbox": torch.cat([low, high - low]).tolist(), "num_keypoints": int((flags > 0).sum())}
         labels |= {"area": sum(map(area, outlines)) or float((high - low).prod())}
         labels |= {"segmentation": [outline.flatten().tolist() for outline in outlines]}
-        labels |= {"keypoints": torch.cat([new["keypoints"][now] * (flags > 0), flags], dim=1).flatten().tolist()}
+        labels |= {"keypoints": torch.cat([new["keypoints"][now].where(flags > 0, 0), flags], dim=1).flatten().tolist()}
         found += [one | labels] if is_there and (high > low).all() else []
     return new | {"annotations": found}
 

@@ -1,6 +1,6 @@
 """Sees a car park from above by a car's four fisheyes: a `ct.BirdsEye` each, blended where they overlap.
 
-python examples/surround_view.py -o above.png
+python examples/surround_view.py -o above.png # rendering the four images takes some minutes
 """
 
 import argparse

@@ -17,6 +17,7 @@ from torch.utils.data import get_worker_info
 
 from camtorch._arguments import (
     GUESS_CAMERA,
+    LEFT,
     are_numbers,
     as_coordinates,
     as_flag,
@@ -364,7 +365,7 @@ class SampleTransform(nn.Module):
         super().__init__()
         self._name = type(self).__name__
         for name in unknown:
-            raise TypeError(f"{self._name}: unknown keyword {name!r}{self._meant(name)}")
+            raise TypeError(f"{self._name}: unknown keyword {name!r}{self._meant(name)}. {LEFT}")
         if camera is not None and not isinstance(camera, Camera):
             raise TypeError(f"{self._name}: camera must be a Camera; got {no_camera(camera)}")
         self.camera = camera

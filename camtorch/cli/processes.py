@@ -42,7 +42,12 @@ def prepare(module: str) -> None:
         from multiprocessing import forkserver
 
         multiprocessing.set_forkserver_preload([__name__, module])
-        forkserver.ensure_running()
+        # the server inherits the mask: an interrupt is handled here, and would show its traceback while it imports
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        try:
+            forkserver.ensure_running()
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def each(work: Work, pairs: Sequence[Pair], count: int, done: Callable[[], object]) -> list[Outcome]:
