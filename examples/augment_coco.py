@@ -2,8 +2,8 @@
 
 python examples/augment_coco.py images/ labels.json camera.yml new/ --preset dms60 --seed 0
 
-The draw of an image follows from its file name and the seed, so every run makes the same files, over those of a run before. Keypoints that leave
-the image become 0, 0, 0; annotations that leave it are left out, as are masks in runs of pixels.
+The draw of an image follows from its file name and the seed: a second run writes the same files over the first's.
+Keypoints that leave the image become 0, 0, 0; annotations that leave it are left out, as are masks in runs of pixels.
 """
 
 import argparse
