@@ -1,4 +1,4 @@
-"""From images of drivers with boxes to landmarks, head pose and gaze (some minutes): what a plain crop costs.
+"""From images of drivers with boxes to landmarks, head pose and gaze (ten to twenty minutes): what a plain crop costs.
 
 Drivers sit all over the image of a camera of 130 degrees. Two equal networks learn from crops of their faces: plain
 ones, the square around the box, and those of `ct.augment.BoxCrop`, a camera that looks at the face, and that turns its

@@ -102,7 +102,12 @@ def _convert(commands: Commands) -> None:
 
 
 def _show(commands: Commands) -> None:
-    add = commands.add_parser("show", help="what a calibration says, in numbers and in an image").add_argument
+    add = commands.add_parser(
+        "show",
+        help="what a calibration says, in numbers and in an image",
+        description="Print the cameras of a calibration file, compare two of them, or draw one: camtorch show "
+        "camera.yml -o lens.png",
+    ).add_argument
     add("input", type=words.path, metavar="FILE", help="a calibration file")
     add("--against", type=words.path, metavar="OTHER", help="another calibration, to compare with")
     _calibration(add)
