@@ -1,53 +1,16 @@
 """What is said of a point does not depend on what else is in its batch, nor on the parts in which that is evaluated."""
 
-import math
-
 import pytest
 import torch
 import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
-from cameras import RARE_ARE_SLOW, drawn, each_kind, fan, make, one, pixel_lattice, spread
+from cameras import RARE_ARE_SLOW, drawn, each_kind, fan, one, pixel_lattice, spread
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import camtorch as ct
 from camtorch.native.library import native_available
-from camtorch.optics.charts import Perspective
-from camtorch.warp import grid, sampling
+from camtorch.warp import sampling
 from camtorch.warp.grid import Sampling
-
-
-def batch_of(key, count):
-    single = spread(key)
-    scale = 1 + 0.05 * torch.arange(count, dtype=torch.float64)[:, None]
-    return make(key, single.intrinsics.detach() * scale, single.distortion.detach() * scale, image_size=(480, 640))
-
-
-def awkward_points(key, count):
-    """Valid ones, and in between what is behind, beyond the fold, at the origin, huge, tiny, or no number."""
-    points = fan(88 if isinstance(one(key).optics(spread(key).distortion.unbind(-1))[0], Perspective) else 170)
-    bad = [[0, 0, 0], [math.nan, 1, 1], [0, 0, -1], [1e-3, 0, -1], [math.inf, 0, 1], [1e200, 1e199, 1e200]]
-    bad += [[1e-80, 2e-80, 3e-80], [0, 0, 1], [0, 0, 1e-5], [3, 4, 1e-3]]
-    points = torch.cat((points, torch.tensor(bad, dtype=torch.float64)))
-    generator = torch.Generator().manual_seed(0)
-    return points[torch.randint(len(points), (count,), generator=generator)]
-
-
-def everything(camera, method, values):
-    values = values.clone().requires_grad_()
-    result, valid = getattr(camera, method)(values)
-    weights = torch.linspace(-1, 2, result.numel(), dtype=result.dtype).view_as(result)
-    leaves = [values, *(p for p in camera.parameters() if p.numel())]
-    return result.detach(), valid, *torch.autograd.grad((result * weights).sum(), leaves)
-
-
-@each_kind
-@pytest.mark.parametrize("method", ["project", "unproject"])
-def test_planes_and_triples_are_the_same(key, method):
-    camera = one(key)
-    values = awkward_points(key, 200) if method == "project" else pixel_lattice(camera)
-    planes = values.T.contiguous().T
-    for result, expected in zip(everything(camera, method, planes), everything(camera, method, values), strict=True):
-        torch.testing.assert_close(result, expected, rtol=1e-12, atol=1e-10)
 
 
 @pytest.mark.skipif(not native_available(), reason="autograd keeps more of the formula")
@@ -111,26 +74,6 @@ def test_a_pixel_is_valid_alone_as_in_a_batch(key):
     law()
 
 
-@pytest.mark.slow
-def test_two_classes_of_one_name_keep_their_own_lens():
-    def build(factor):
-        class Mine(ct.KannalaBrandt):
-            @staticmethod
-            def optics(k):
-                return ct.KannalaBrandt.optics([factor * c for c in k])
-
-        return Mine
-
-    first, second = build(1.0), build(3.0)
-    points = torch.tensor([[0.5, 0.2, 1.0]])
-    for model in (first, second, first):
-        camera = model([300.0, 300, 320, 240], [0.05, 0.0, 0.0, 0.0])
-        compiled = torch.compile(camera.unproject, backend="eager", fullgraph=True)
-        pixels = camera.project(points)[0].detach()
-        torch.testing.assert_close(compiled(pixels)[0], camera.unproject(pixels)[0])
-    assert first._model != second._model
-
-
 # -- images
 
 
@@ -152,20 +95,6 @@ def test_parts_of_images_change_nothing(threads, count, dtype, monkeypatch):
             expected = expected.round().clamp(0, 255)
         assert result.dtype == dtype
         assert torch.equal(result, expected >= 0.5 if dtype == torch.bool else expected.to(dtype))
-
-
-@pytest.mark.parametrize("cameras", [None, 3])
-def test_strips_of_a_map_change_nothing(cameras, monkeypatch):
-    source = batch_of("brown_conrady", cameras) if cameras else spread("brown_conrady")
-    target = ct.Cylindrical([15.0, 12.0, 30.5, 20.25], image_size=(41, 63))
-    for one_camera in (source, target):
-        one_camera.requires_grad_(False)
-    whole = ct.Warp(source, target)
-    monkeypatch.setattr(grid, "_STRIP", 7 * 63)
-    strips = ct.Warp(source, target)
-    assert torch.equal(strips.grid(), whole.grid())
-    assert torch.equal(strips.valid_mask(), whole.valid_mask())
-    assert (whole.grid() == -9).any()
 
 
 def test_no_cameras_make_no_images():

@@ -1,4 +1,4 @@
-"""Threads: who shares work, what comes of errors, forks and several callers, and that results do not depend on it."""
+"""Threads: who shares work, and what comes of errors and of several callers."""
 
 import contextlib
 import signal
@@ -11,13 +11,11 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 import torch
-from cameras import RARE_ARE_SLOW, one
-from test_blocks import everything
+from cameras import one
 
 import camtorch as ct
 from camtorch import _threads
 from camtorch._threads import spread
-from camtorch.native.library import native_available
 
 
 class Pieces:
@@ -160,21 +158,6 @@ def test_this_thread_alone_is_limited_and_to_the_end_of_the_function():
                 outer()
             look()
     assert seen == 2 * [(1, 3), (1, 3), (3, 3), (3, 3)]
-
-
-@pytest.mark.skipif(not native_available(), reason="torch splits its operations")
-@pytest.mark.parametrize("key", RARE_ARE_SLOW)
-@pytest.mark.parametrize("method", ["project", "unproject"])
-def test_results_do_not_depend_on_threads(key, method):
-    camera, generator, count = one(key).float(), torch.Generator().manual_seed(0), 70_001
-    values = torch.randn(count, 3, generator=generator) + torch.tensor([0.0, 0, 1.5])
-    if method == "unproject":
-        values = camera.project(values)[0].detach()
-    found = []
-    for threads in (1, 3):
-        with torch_threads(threads):
-            found.append(everything(camera, method, values))
-    assert all(torch.equal(result, expected) for result, expected in zip(*found, strict=True))
 
 
 def test_several_threads_use_one_camera():

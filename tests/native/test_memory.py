@@ -88,18 +88,6 @@ def test_it_can_be_copied_sent_and_shared():
     assert made().data_ptr() == place  # which sharing has left
 
 
-def test_it_may_be_written_to_with_a_graph():
-    with torch.no_grad():
-        tensor = made().fill_(2)
-    weight = torch.tensor(3.0, requires_grad=True)
-    tensor.mul_(weight)
-    tensor.sum().backward()
-    assert weight.grad == 2 * tensor.numel()
-    tensor.detach_()
-    with torch.inference_mode():
-        assert made().is_inference()
-
-
 def test_threads_never_share_it():
     wrong = []
 

@@ -465,17 +465,6 @@ def samples(count=2, seed=0):
     return pixels(torch.uint8, (count, 3, 480, 640), seed)
 
 
-@pytest.mark.parametrize("tolerance", [0.0, 0.01])
-def test_results_do_not_depend_on_threads(tolerance):
-    images, results = samples(), []
-    for count in (1, 3, 2):
-        with threads(count):
-            given = [(warp_of(tolerance, 4), one) for one in (images, images.float(), hwc(images))]
-            results.append([warp(one, mode=mode) for warp, one in given for mode in MODES])
-    for made in results[1:]:
-        assert all(map(torch.equal, made, results[0]))
-
-
 def test_many_threads_warp_at_once():
     warp, wrong = warp_of(0.01, 4), []
     given_images = [samples(2, seed) for seed in range(4)]
