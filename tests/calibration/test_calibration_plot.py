@@ -5,7 +5,7 @@ import re
 import numpy as np
 import pytest
 import torch
-from boards import opencv_left, stereo
+from boards import opencv_left
 
 import camtorch as ct
 
@@ -47,13 +47,3 @@ def test_residuals_and_uncertainty_are_those_of_the_calibration():
     values = found.uncertainty(found.camera.pixel_grid(8).double())
     median = float(re.search(r"median ([\d.]+) px", right.get_title())[1])
     assert median == pytest.approx(float(values[values.isfinite()].quantile(0.5)), rel=0.1)
-
-
-def test_each_camera_of_a_rig_has_a_row():
-    corners, seen, _, _ = stereo(views=8)
-    points = {"left": corners.image_points, "$right\udc80": seen}
-    sizes = dict(zip(points, ((480, 640), (600, 800)), strict=True))
-    models = dict(zip(points, ("kannala_brandt", "brown_conrady"), strict=True))
-    figure = ct.plot.calibration(ct.calibrate_rig(models, corners.object_points, points, image_sizes=sizes))
-    titles = [ax.get_title().partition(": ")[0] for ax in figure.axes[:4]]
-    assert titles == ["left"] * 2 + ["$right\N{REPLACEMENT CHARACTER}"] * 2

@@ -152,13 +152,6 @@ def test_convert_overwrites_no_images_unasked(folder, capsys):
     assert list(ct.load("cameras.txt").extrinsics) == list(rig.extrinsics)
 
 
-def test_a_batch_is_converted_and_the_worst_of_it_told(folder, capsys):
-    ct.save(ct.KannalaBrandt(torch.tensor([[28.0, 28, 47, 32]] * 2), torch.zeros(2, 4), image_size=(64, 96)), "b.json")
-    command("convert", "b.json", "new/folder/out.json", "--model", "fisheye624")
-    assert "camera, kannala_brandt to fisheye624: exact, up to " in capsys.readouterr().out
-    assert ct.load("new/folder/out.json").camera.batch_shape == (2,)
-
-
 def test_show_compares_without_an_image(folder, capsys):
     """Of a rig the camera of that name, of a file of one camera that one."""
     chain = FILES / "kalibr_camchain.yaml"
@@ -205,13 +198,6 @@ def test_the_summary_of_a_pinhole_is_known():
     assert (summary.seen, summary.corners) == (1, ((0, 0),) * 4)
     right = summarise(camera.crop(0, 320, 480, 320))
     assert right.fov[0] == pytest.approx(45)
-
-
-def test_the_summary_of_a_wide_fisheye_passes_half_a_circle():
-    camera = ct.KannalaBrandt([100.0, 100.0, 199.5, 99.5], [0.0] * 4, image_size=(200, 400)).double()
-    summary = summarise(camera)
-    assert summary.fov[:2] == pytest.approx((math.degrees(4), math.degrees(2)))
-    assert summary.fov[2] == pytest.approx(math.degrees(20**0.5), abs=0.05)
 
 
 def test_a_summary_says_what_it_cannot_know():

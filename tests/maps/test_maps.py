@@ -332,13 +332,6 @@ def test_one_warp_is_saved_whether_it_learns_or_not(tmp_path):
     assert ct.save_map(ct.Dewarp(single), tmp_path / "map.npz").max_error < 1e-4
 
 
-def test_shutters_are_saved(tmp_path):
-    warp = ct.ShutterWarp(small().source, small().target, shutter=ct.RollingShutter(0.03, [1.0, -5.0, 4.0]))
-    assert ct.save_map(warp, tmp_path / "map.npz").max_error < 1e-4
-    assert off(ct.load_map(tmp_path / "map.npz").positions, warp).max() < 1e-4
-    assert off(positions(small())[0], warp).max() > 1
-
-
 def test_what_stood_there_stays_where_saving_fails(tmp_path):
     path = tmp_path / "map.bin"
     ct.save_map(small(), path, "dw100")
@@ -437,16 +430,6 @@ def test_the_command_writes_a_map_and_measures_one(folder, capsys):
     ct.save(ct.Pinhole.from_fov(50, image_size=(60, 80)), "view.json")
     assert main(["map", "camera.json", "--target", "view.json", "-o", "a.npz"]) == 0
     assert "80x60 from 320x200" in capsys.readouterr().out
-
-
-def test_masks_stay_bool_and_integers_whole():
-    places = torch.stack(torch.meshgrid(torch.arange(8.0), torch.arange(8.0), indexing="xy"), -1).double()
-    found = ct.LookupMap(places, (8, 8), "test", {})
-    mask = torch.arange(64).reshape(1, 1, 8, 8) % 3 == 0
-    assert found(mask).equal(mask)
-    for dtype in (torch.uint8, torch.uint16, torch.int32, torch.int64):
-        labels = (torch.arange(64).reshape(1, 1, 8, 8) + 100).to(dtype)
-        assert found(labels, mode="nearest").equal(labels)
 
 
 @pytest.mark.parametrize("mode", ["nearest", "bilinear", "bicubic"])

@@ -201,51 +201,6 @@ def test_the_exporter_of_recorded_runs_takes_no_camera(method):
         legacy_onnx(Network(), (torch.rand(5, 2 + (method == "project")),))
 
 
-# -- networks
-
-
-class Network(nn.Module):
-    """Features of an undistorted image and the rays of all its pixels: both from learning cameras."""
-
-    def __init__(self):
-        super().__init__()
-        self.dewarp = ct.Dewarp(fisheye(), tolerance=0.0)  # as the program's
-        self.layer = nn.Conv2d(6, 4, 3, padding=1)
-
-    def forward(self, images):
-        images = self.dewarp(images)
-        rays, _ = self.dewarp.target.rays()
-        rays = rays.movedim(-1, 0).expand(images.shape[0], -1, -1, -1)
-        return self.layer(torch.cat((images, rays), 1))
-
-
-@pytest.mark.slow
-def test_a_network_that_learns_its_camera():
-    network, images = Network(), smooth(2)
-    before = network(images)
-    with torch.no_grad():
-        network.dewarp.source.intrinsics[:2] *= 1.2
-    _, run = to_onnx(network, images[:1], dynamic_shapes={"images": {0: "batch"}})
-    result = network(images).detach()
-    assert (result - before).abs().max() > 0.01
-    torch.testing.assert_close(run(images)[0], result, atol=1e-5, rtol=1e-5)
-
-
-def test_what_functional_call_puts_in_a_camera_is_no_constant():
-    class Replaced(nn.Module):
-        def __init__(self):
-            super().__init__()
-            self.camera = ct.Pinhole([60.0, 60.0, 63.5, 47.5]).requires_grad_(False)
-
-        def forward(self, points, focal):
-            values = {"intrinsics": self.camera.intrinsics * focal}
-            return torch.func.functional_call(self.camera, values, (points,))[0]
-
-    points, focal = torch.rand(5, 3) + 0.1, torch.ones(1)
-    program = torch.export.export(Replaced(), (points, focal)).module()
-    torch.testing.assert_close(program(points, 2 * focal), Replaced()(points, 2 * focal))
-
-
 # -- torch.export
 
 ELSEWHERE = """

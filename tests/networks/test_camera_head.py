@@ -207,19 +207,6 @@ def test_rows_are_independent_and_a_bad_one_is_alone():
     assert bool(all_have_rays(layer(1e30 * features[2:].flip(0))).all())
 
 
-@pytest.mark.slow
-def test_it_compiles_whole():
-    layer = random(head("kannala_brandt", 4), 1.0, torch.Generator().manual_seed(0))
-
-    def numbers(features):
-        camera = layer(features)
-        return camera.intrinsics, camera.distortion
-
-    features = torch.randn(3, 4)
-    compiled = torch.compile(numbers, backend="eager", fullgraph=True)
-    torch.testing.assert_close(compiled(features), numbers(features))
-
-
 REFUSED = [
     ("pinhole", {"image_size": None}, "image_size=(height, width)"),
     ("equirectangular", {}, "panorama"),
