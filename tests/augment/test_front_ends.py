@@ -113,18 +113,6 @@ def test_there_and_back():
     np.testing.assert_allclose(again["keypoints"], points[:2], atol=1e-3)
 
 
-def test_faces_are_normalised():
-    image, _, points, _ = images()
-    transform = ct.augment.numpy.Transform(ct.augment.FaceNormalizer(focal=40, distance=0.6, image_size=(16, 16)))
-    fields = {"rvec": np.array([0.1, 0.2, 0.0]), "tvec": np.array([0.05, -0.02, 0.5])}
-    out = transform(image=image, keypoints=points[:1], camera=camera(), **fields)
-    assert out["image"].shape == (16, 16, 3)
-    assert out["scale"] == pytest.approx(0.6 / np.linalg.norm(fields["tvec"]), rel=1e-6)
-    np.testing.assert_allclose(out["tvec"], [0, 0, np.linalg.norm(fields["tvec"])], atol=1e-6)
-    back = transform.inverse(**{name: out[name] for name in ("keypoints", "camera", "rotation", "source_camera")})
-    np.testing.assert_allclose(back["keypoints"], points[:1], atol=1e-3)
-
-
 @pytest.mark.parametrize("name", ["keypoints", "landmarks"])
 def test_keypoints_keep_the_shape_of_opencv(name):
     image, _, array, _ = images()

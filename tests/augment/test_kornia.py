@@ -1,14 +1,12 @@
 import copy
 import importlib
 import io
-import math
 import pickle
 
 import kornia.augmentation as K  # noqa: N812
 import pytest
 import torch
 from kornia.augmentation.container.params import ParamItem
-from kornia.constants import DataKey
 from kornia.geometry.boxes import Boxes
 from kornia.geometry.keypoints import Keypoints
 
@@ -103,17 +101,6 @@ def test_boxes_off_the_image_are_invalid_and_zero():
     assert boxes._valid.all()
 
 
-def test_boxes_of_several_counts_and_without_batch():
-    aug = adapter.RandomMount(camera())
-    aug(images(2))
-    ragged = Boxes([vertices(1)[0].expand(2, 4, 2).contiguous(), vertices(1)[0]])
-    moved = aug.transform_boxes(ragged, aug._params, aug.flags).to_tensor("xyxy")
-    assert [len(rows) for rows in moved] == [2, 1]
-    aug(images(1))
-    assert aug.transform_boxes(Boxes(vertices(1)[0]), aug._params, aug.flags).data.shape == (1, 4, 2)
-    assert aug.transform_keypoints(Keypoints(points(1)[0]), aug._params, aug.flags).data.shape == (5, 2)
-
-
 # -- masks
 
 
@@ -130,29 +117,6 @@ def test_masks_keep_class_ids_and_lists_are_warped_one_by_one():
     assert torch.equal(moved, again)
     assert aug.last.count == 3
     assert torch.equal(seq(images(), masks()[:, 0], points(), params=params)[1], together)
-
-
-def test_soft_masks_take_the_resampling_they_ask_for():
-    soft = images().round()
-    options = {DataKey.MASK: {"resample": "bilinear", "align_corners": None}}
-    torch.manual_seed(8)
-    aug = adapter.RandomMount(camera())
-    hard, smooth = (K.AugmentationSequential(aug, data_keys=["input", "mask"], extra_args=e) for e in (None, options))
-    _, nearest = hard(images(), soft)
-    image, linear = smooth(soft, soft, params=hard._params)
-    assert set(nearest.unique().tolist()) == {0, 1}
-    assert torch.equal(image, linear)
-    assert not torch.equal(nearest, linear)
-    assert torch.equal(aug(soft, params=hard._params[0].data, resample="nearest"), nearest)
-
-
-def test_lens_colours_and_light_leave_masks_alone():
-    aug = adapter.RandomLens(camera(), chromatic=(0.05, 0.05), vignetting=0.5, fill=(0.1, 0.2, 0.3), mode="nearest")
-    before = images(2, 3)
-    seq = K.AugmentationSequential(aug, data_keys=["input", "mask"])
-    image, mask = seq(before, before)
-    assert set(mask.unique().tolist()) <= {0.0, *before.unique().tolist()}
-    assert (image[:, :, HEIGHT // 2, WIDTH // 2] > 0).all()
 
 
 # -- gates
@@ -304,20 +268,6 @@ def test_another_output_size_reaches_the_next_child():
         adapter.RandomCamera(camera(), image_size=(60, 90), p=0.5)(images(8))
 
 
-@pytest.mark.parametrize("options", [{}, {"p": 0.5}, {"image_size": (60, 90)}])
-def test_empty_batches_and_no_labels(options):
-    aug = adapter.RandomCamera(camera(), **options)
-    seq = K.AugmentationSequential(aug, K.RandomHorizontalFlip(p=1.0), data_keys=KEYS)
-    moved = seq(*batch(0))
-    assert moved[0].shape == moved[1].shape == (0, 1, *options.get("image_size", SIZE))
-    assert [value.shape for value in moved[2:]] == [(0, 5, 2), (0, 1, 4, 2)]
-    assert [value.shape for value in seq.inverse(*moved)] == [value.shape for value in batch(0)]
-    seq = K.AugmentationSequential(adapter.RandomMount(camera()), data_keys=["input", "keypoints", "bbox_xyxy"])
-    labels = torch.zeros(3, 0, 2), torch.zeros(3, 0, 4)
-    for way in (seq, seq.inverse):
-        assert [value.shape for value in way(images(), *labels)[1:]] == [(3, 0, 2), (3, 0, 4)]
-
-
 # -- containers
 
 
@@ -403,17 +353,6 @@ def test_every_sample_its_own_camera():
     assert equal([m.reshape(1, *SIZE) for m in seq(images(), list(masks()), *batch()[2:], params=params)[1]], together)
 
 
-def test_every_clip_its_own_camera():
-    aug = adapter.RandomMount(camera())
-    video = K.VideoSequential(aug)
-    clips = images(6).unflatten(0, (2, 3))
-    params = video.forward_parameters(clips.shape)
-    video(clips, params=adapter.with_cameras(params, several(2)))
-    assert torch.equal(aug.last.source.intrinsics, several(2).intrinsics.repeat_interleave(3, 0))
-    video(clips, params=adapter.with_cameras(params, several(6)))
-    assert torch.equal(aug.last.source.intrinsics, several(6).intrinsics)
-
-
 @pytest.mark.parametrize("of", [adapter.RandomLens, adapter.RandomCamera])
 def test_camera_and_lens_go_in_by_name(of):
     made = []
@@ -481,20 +420,6 @@ def test_dtypes(dtype):
     assert all(torch.isfinite(v).all() for v in moved)
 
 
-def test_gradients_reach_image_and_keypoints():
-    image, keypoints, corners = (v.double().requires_grad_() for v in (images(2), points(2), vertices(2)))
-    seq = K.AugmentationSequential(adapter.RandomCamera(camera(), p=0.7), data_keys=["input", "keypoints", "bbox"])
-    moved = seq(image, keypoints, corners)
-    sum((v**2).sum() for v in moved).backward()
-    assert all(torch.isfinite(v.grad).all() and v.grad.abs().sum() > 0 for v in (image, keypoints, corners))
-    aug = seq[0]
-
-    def one(pixels):
-        return aug.transform_keypoints(Keypoints(pixels), aug._params, aug.flags).data
-
-    assert torch.autograd.gradcheck(one, keypoints, atol=1e-3, rtol=1e-3)
-
-
 @pytest.mark.parametrize("key", ["input", "keypoints"])
 def test_gradients_reach_a_learnable_camera(key):
     own = camera().requires_grad_(True)
@@ -515,17 +440,6 @@ def test_gradients_reach_a_learnable_camera(key):
     aug(images(), params=adapter.with_cameras(aug.forward_parameters(images().shape), leaves)).sum().backward()
     assert (leaves.intrinsics.grad != 0).any(1).all()
     assert torch.equal(pickle.loads(pickle.dumps(aug)).last.rotation, aug.last.rotation)
-
-
-# -- compiled
-
-
-def test_last_turns_what_has_no_data_key():
-    aug = adapter.RandomMount(camera(), yaw=(7, 7), pitch=0, roll=0)
-    aug(images())
-    ahead = aug.last.rays(torch.tensor([[0.0, 0.0, 1.0]]).expand(3, 3))
-    assert torch.allclose(torch.rad2deg(torch.atan2(ahead[:, 0], ahead[:, 2])), torch.full((3,), -7.0), atol=1e-4)
-    assert math.isclose(float(aug.last.target.intrinsics[0, 0]), 95, abs_tol=1e-4)
 
 
 def test_a_kornia_too_old_is_told(monkeypatch):

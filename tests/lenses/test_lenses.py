@@ -161,20 +161,6 @@ def test_fields_of_view_that_no_lens_has_are_refused():
         ct.augment.RandomLens("reel")
 
 
-@pytest.mark.slow
-def test_draws_are_compiled():
-    augment = ct.augment.RandomLens("real", fov=(60, 100), camera=source((48, 64)), min_filled=0)
-    draw, image = augment.draw(2, torch.Generator().manual_seed(0)), torch.rand(2, 3, 48, 64)
-
-    def step(image):
-        sample = augment(image=image, draw=draw)
-        return sample["image"], sample["camera"].distortion
-
-    compiled = torch.compile(step, fullgraph=True, backend="eager")(image)
-    for now, then in zip(compiled, step(image), strict=True):
-        torch.testing.assert_close(now, then, atol=1e-3, rtol=0)
-
-
 def test_the_command_line_knows_them(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert main(["lenses", "GoPro", "HERO9", "wide", "-n", "2", "-o", "hero.json"]) == 0

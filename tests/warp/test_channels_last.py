@@ -162,17 +162,6 @@ def test_channels_last_give_channels_last(name, index):
         assert float((difference > 0.5).double().mean()) < 0.01
 
 
-@pytest.mark.parametrize(("size", "channels"), [((1, 1), 1), ((1, 6), 3), ((6, 1), 2), ((1, 1), 5)])
-@pytest.mark.parametrize("mode", ["bilinear", "bicubic", "nearest"])
-def test_channels_last_of_the_smallest_images(size, channels, mode):
-    warp = ct.Dewarp(camera(size), mode=mode)
-    image = torch.from_numpy(colours(channels + 1, size=size))
-    for images in (image[None, ..., :channels].permute(0, 3, 1, 2), image[None, None, ..., 0]):
-        moved = warp(images)
-        assert moved.shape == images.shape
-        assert int((moved.int() - warp(images.clone(memory_format=torch.contiguous_format)).int()).abs().max()) <= 1
-
-
 def test_the_rule_holds_with_gradients_and_options():
     images = torch.from_numpy(colours(dtype=np.float32))[None].permute(0, 3, 1, 2).requires_grad_()
     for warp in (ct.Dewarp(camera()), ct.Dewarp(camera().requires_grad_()), ct.Dewarp(camera(), antialias=True)):

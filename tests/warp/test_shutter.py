@@ -163,23 +163,3 @@ def test_states_of_0_3_load_unless_they_blur():
     assert torch.equal(other.rates, made.rates)
     with pytest.raises(ValueError, match=r"exposure, which is gone: see .Leaving 0\.3."):
         other.load_state_dict({**state, "exposure": torch.tensor(0.01)})
-
-
-@pytest.mark.slow
-def test_forward_mode_and_a_batch_of_several_models():
-    camera, rates = fisheye(), torch.tensor(RATES, dtype=torch.float64)
-    pixels = torch.tensor([[100.0, 60.0], [160.0, 200.0]], dtype=torch.float64)
-
-    def moved(rates):
-        warp = ct.ShutterWarp(camera, camera, target_shutter=ct.RollingShutter(torch.tensor(READOUT).double(), rates))
-        return warp.transform_points(pixels)[0]
-
-    assert torch.allclose(torch.func.jacfwd(moved)(rates), torch.func.jacrev(moved)(rates), atol=1e-5)
-    mixed = ct.Mixed([camera, ct.Pinhole.from_fov(80, image_size=(240, 320)).double().requires_grad_(False)])
-    together, *alone = (ct.ShutterWarp(c, c, shutter=shutter()) for c in (mixed, *mixed))
-    result, valid = together.transform_points(pixels.expand(2, -1, -1))
-    for i, warp in enumerate(alone):
-        one, also = warp.transform_points(pixels)
-        assert torch.allclose(result[i], one, atol=1e-12)
-        assert torch.equal(valid[i], also)
-    assert together(torch.rand(2, 1, 240, 320)).shape == (2, 1, 240, 320)
