@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 from torch.nn.utils.parametrize import type_before_parametrizations
 
-from camtorch._arguments import are_numbers, as_image_size, broadcast_shapes, check_degrees, fails, warn
+from camtorch._arguments import LEFT, are_numbers, as_image_size, broadcast_shapes, check_degrees, fails, warn
 from camtorch._evaluation import rows_of
 from camtorch._module import Memo, remade
 from camtorch._numbers import joined, split
@@ -215,6 +215,11 @@ class RandomCamera(Augmentation):
         elements = mount_elements([xp.cos(a) for a in angles], [xp.sin(a) for a in angles])
         rotation = joined(elements, like, xp)
         return rotation.view(3, 3) if xp is math else rotation.view(*rotation.shape[:-1], 3, 3)
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        if "rates" in state["ranges"]:
+            raise ValueError(f"{type(self).__name__}: the saved augmentation draws a rolling shutter. {LEFT}")
+        super().__setstate__(state)  # type: ignore[no-untyped-call]
 
     def _part(self, rows: list[int] | None, source: Camera, draw: Mapping[str, Any]) -> Part:
         view = self._view(source, draw)

@@ -200,7 +200,7 @@ class Record:
         try:
             return as_model(key, "file")
         except ValueError as error:
-            self.fail(f"{error}. {LEFT}")
+            self.fail(str(error) if LEFT in str(error) else f"{error}. {LEFT}")
 
 
 def repeated(names: Iterable[str]) -> str | None:

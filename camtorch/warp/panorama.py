@@ -74,9 +74,10 @@ def _found(camera: Camera, numbers: Tensor) -> Seam | None:
         return None
     # the model has pixels for half a turn to either side of its principal point, which may lie anywhere
     low, high = (float(end) - (side - 1) / 2 for end in torch.aminmax(numbers[:, 2 + axis]))
-    rims = [math.ceil(max(beyond, 0.0)) + min(_RIM, side) for beyond in (-low, high)]
-    if max(rims) > side:
+    beyond = [math.ceil(max(end, 0.0)) for end in (-low, high)]
+    if max(beyond) > side:
         return None
+    rims = [end + min(_RIM, side - end) for end in beyond]
     poles = [0, 0]
     if isinstance(camera, _SPHERES):
         focal, centre = numbers[:, 1 - axis], numbers[:, 3 - axis]

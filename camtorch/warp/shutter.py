@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from camtorch._arguments import (
+    LEFT,
     Numbers,
     as_batch,
     as_coordinates,
@@ -145,10 +146,12 @@ class RollingShutter(GeometryModule):
         return torch.stack(planes, -1)
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *given: Any) -> None:
-        exposure = state_dict.pop(f"{prefix}exposure", None)  # of 0.3
-        if exposure is not None and fails(exposure == 0):
-            raise ValueError('RollingShutter: the state has an exposure, which is gone: see "Leaving 0.3" in the docs')
+        _check_exposure(state_dict.pop(f"{prefix}exposure", None))
         super()._load_from_state_dict(state_dict, prefix, *given)
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        _check_exposure(state["_buffers"].pop("exposure", None))
+        super().__setstate__(state)  # type: ignore[no-untyped-call]
 
     def extra_repr(self) -> str:
         """The readout, the rates and the direction."""
@@ -161,6 +164,12 @@ class RollingShutter(GeometryModule):
 def _lead(value: Tensor, ndim: int, inner: int = 0) -> Tensor:
     """(B, ...) before points with `ndim` leading dims; what has no batch dim serves all."""
     return value if value.ndim == inner else value.reshape(len(value), *[1] * (ndim - 1), *value.shape[1:])
+
+
+def _check_exposure(exposure: Tensor | None) -> None:
+    """Raise if a state of 0.3 has an exposure."""
+    if exposure is not None and fails(exposure == 0):
+        raise ValueError(f"RollingShutter: the state has an exposure, and no shutter has one any more. {LEFT}")
 
 
 class ShutterWarp(MirrorWarp):

@@ -365,6 +365,13 @@ class Warp(GeometryModule):
             "tolerance": self._tolerance,
         }
 
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        parts = {name for kind in type(self).__mro__ for name in getattr(kind, "__annotations__", ())}
+        for name, part in state["_modules"].items():
+            if part is not None and name not in parts:
+                raise ValueError(f"{type(self).__name__}: the saved warp has a {name}, which none has any more. {LEFT}")
+        super().__setstate__(state)  # type: ignore[no-untyped-call]
+
     def __getstate__(self) -> dict[str, Any]:
         return {**super().__getstate__(), "_pinned": None}
 

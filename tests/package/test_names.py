@@ -1,10 +1,12 @@
 """Every public name of 0.3 works as before, or stands on the page about what left."""
 
 import json
+import pickle
 import re
 from pathlib import Path
 
 import pytest
+import torch
 from public_names import names
 
 import camtorch as ct
@@ -76,6 +78,38 @@ TYPED = {
     "a model": lambda: CAMERA.convert("cahvor"),
     "a command": lambda: make_parser().parse_args(["rectify"]),
 }
+
+
+def with_shutter():
+    warp = ct.Warp(CAMERA, CAMERA)
+    warp.add_module("shutter", ct.RollingShutter(0.03, [1.0, 2.0, 3.0]))
+    return warp
+
+
+def with_rates():
+    augmentation = ct.augment.RandomMount(yaw=5)
+    augmentation.ranges["rates"] = augmentation.ranges["yaw"]
+    return augmentation
+
+
+def with_exposure(seconds=0.01):
+    shutter = ct.RollingShutter(0.03, [0.1, 0.2, 0.3])
+    shutter.register_buffer("exposure", torch.tensor(seconds))
+    return shutter
+
+
+TYPED |= {
+    f"a pickle {made.__name__}": lambda made=made: copied(made()) for made in (with_shutter, with_rates, with_exposure)
+}
+
+
+def copied(module):
+    return pickle.loads(pickle.dumps(module))
+
+
+def test_a_pickled_shutter_without_an_exposure_loads():
+    shutter = copied(with_exposure(0.0))
+    shutter.load_state_dict(shutter.state_dict())
 
 
 @pytest.mark.parametrize("use", TYPED.values(), ids=TYPED)

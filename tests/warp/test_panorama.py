@@ -210,3 +210,13 @@ def test_a_whole_turn_is_shown_wherever_it_begins(centre):
     moved, valid = warp.transform_points(pixels)
     assert valid.sum() > 70
     torch.testing.assert_close(moved[valid, 0], (pixels[valid, 0] + 20.5) % 320 - 0.5, atol=1e-3, rtol=0)
+
+
+@pytest.mark.parametrize("width", [4, 10, 16, 24])
+@pytest.mark.parametrize("centre", [0.0, 0.25, 0.5, 1.0])
+def test_a_tiny_panorama_shows_its_whole_turn(width, centre):
+    focal = width / math.tau
+    source = ct.Equirectangular([focal, focal, width * centre - 0.5, width / 4 - 0.5], image_size=(width // 2, width))
+    target = ct.Pinhole([20.0, 20, 19.5, 19.5], image_size=(40, 40)).requires_grad_(False)
+    for turn in (torch.eye(3), torch.diag(torch.tensor([-1.0, 1, -1]))):
+        assert ct.Warp(source.requires_grad_(False), target, turn).valid_mask().all()
