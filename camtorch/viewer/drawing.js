@@ -1180,7 +1180,7 @@ const Viewer = (() => {
     const own = DATA.camera; // a splined one may have a grid that no preset has
     if (own) DATA.models[own.model] ??= { ...own, counts: [own.distortion.length] };
     const keys = Object.keys(DATA.models).filter((key) => Formulas.MODELS.includes(key.split(":")[0]));
-    const options = () => keys.map((key) => new Option(titleOf(key), key));
+    const options = () => keys.map((key) => new Option(DATA.models[key].class, key));
     $("model").replaceChildren(...options());
     $("models").replaceChildren(...options());
     makeRenderer(new URLSearchParams(location.hash.slice(1)).get("draw"));
