@@ -195,6 +195,7 @@ class ShutterWarp(MirrorWarp):
 
     is_an_operator = False
     keeps_lens = True
+    _has_shutters = True
     shutter: RollingShutter | None
     target_shutter: RollingShutter | None
 

@@ -96,6 +96,7 @@ class Warp(GeometryModule):
     _decides = False  # for itself where to antialias
     is_an_operator: ClassVar[bool] = True
     """Whether compiled code calls it as one: the cameras and the rotation are all there is to it."""
+    _has_shutters: ClassVar[bool] = False
     keeps_lens: ClassVar[bool] = False
     """Whether it may follow another warp, and is then what `follow` makes of that."""
     batch_shape: torch.Size
@@ -366,10 +367,9 @@ class Warp(GeometryModule):
         }
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        parts = {name for kind in type(self).__mro__ for name in getattr(kind, "__annotations__", ())}
-        for name, part in state["_modules"].items():
-            if part is not None and name not in parts:
-                raise ValueError(f"{type(self).__name__}: the saved warp has a {name}, which none has any more. {LEFT}")
+        lost = [name for name in ("shutter", "target_shutter") if state["_modules"].get(name) is not None]
+        if lost and not self._has_shutters:
+            raise ValueError(f"{type(self).__name__}: the saved warp has a {lost[0]}, which a Warp had in 0.3. {LEFT}")
         super().__setstate__(state)  # type: ignore[no-untyped-call]
 
     def __getstate__(self) -> dict[str, Any]:
