@@ -128,7 +128,7 @@ def _posed(path: str, chunk: ElementTree.Element, cameras: dict[str, Camera], se
     places = [Record(path, _values(one), f"camera {name:.60}") for one, name in zip(elements, names, strict=True)]
     images, rows = {}, []
     for name, place in zip(names, places, strict=True):
-        images[name] = sensors[place.value["sensor_id"]]
+        images[name] = sensors[place["sensor_id"].text()]
         if name in cameras and name != images[name]:
             place.fail("a sensor has this name")
         row = np.array(_numbers(place["transform"], 16)).reshape(4, 4)

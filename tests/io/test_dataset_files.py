@@ -119,6 +119,7 @@ REFUSED = {
         (">0.12354192447331316<", ">1e300<", r"component\.transform: a number beyond 1e\+100"),
         ("<covariance>", "<corrections><a/></corrections><covariance>", "corrections beside"),
         ("</document>", "<chunk/></document>", "2 chunks; one is read"),
+        ('label="fisheye.jpg">', 'label="fisheye.jpg">x', r"camera fisheye\.jpg: not keys and values, but 'x'"),
     ],
     "woodscape.json": [
         ("radial_poly", "other", r"intrinsic\.model: 'other' is not known here"),

@@ -102,6 +102,15 @@ def test_wrong_values(tmp_path_factory, data, name):
     loads_or_says_why(written(tmp_path_factory.getbasetemp() / name, json.dumps(whole)))
 
 
+@pytest.mark.parametrize("name", [name for name in SAMPLES if name.endswith(".xml")])
+def test_stray_text_in_any_element(name, tmp_path):
+    whole = (FILES / name).read_text()
+    places = [tag.end() for tag in re.finditer(r"<\w[^>]*[^/>]>", whole)]
+    for place in places:
+        loads_or_says_why(written(tmp_path / name, whole[:place] + "stray" + whole[place:]))
+    assert len(places) > 5
+
+
 # -- what someone would do on purpose
 
 K = "[500, 0, 320, 0, 500, 240, 0, 0, 1]"
