@@ -533,11 +533,7 @@ class Augmentation(SampleTransform):
                 f"{self._name}: the sample's camera {sample['camera']!r:.60} is not the one that this change made: "
                 "the sample is of another call, whose draw= and the camera= before it are wanted"
             )
-        change = change.inverse()
-        named, batched, count, _ = self._batch({**sample, "camera": change.source}, predicted=True)
-        if count != change.count:
-            raise ValueError(f"{self._name}: the change is of {change.count} samples, here are {count}")
-        return self._moved(sample, named, batched, change)
+        return self.moved_by(change.inverse(), sample, predicted=True)
 
     def _of_sample(self, draw: Mapping[str, Any], named: Named) -> Mapping[str, Any]:
         """A draw with what it needs of a sample: boxes are those of that name, or the first of that kind."""

@@ -166,7 +166,7 @@ class FaceNormalizer(SampleTransform):
         if missing:
             raise ValueError(f"{self._name}: to go back, the sample needs {', '.join(missing)} as they came out")
         normal, source, rotation = (sample.pop(name) for name in ("camera", "source_camera", "rotation"))
-        named, batched, count, _ = self._batch({**sample, "camera": normal}, predicted=True)
+        named, batched, count, _ = self._batch(sample, normal, predicted=True)
         before = sample.get("source_rotation")
         rotation = rotation if before is None else rotation @ before.mT
         rotation = rotation if rotation.ndim == 3 else rotation.unsqueeze(0)

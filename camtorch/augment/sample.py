@@ -441,29 +441,38 @@ class SampleTransform(nn.Module):
             raise TypeError(f"{self._name}: a sample is a dict of fields, or keywords, as in image=...; got {got}")
         return sample if isinstance(sample, Single) and not fields else {**(sample or {}), **fields}
 
-    def _sorted(self, sample: Sample) -> Named:
+    def _sorted(self, sample: Sample, fields: Mapping[str, str]) -> Named:
         """The fields that move."""
         named: Named = {}
         for name, value in sample.items():
             if name in OWN or value is None:
                 continue
-            found = kind_of(name, value, self.fields, self._name)
+            found = kind_of(name, value, fields, self._name)
             if found is not None:
                 if not isinstance(value, (list, tuple)):
                     value = as_tensor(value, name, found, self._name)
                 named[name] = (found, value)
         return named
 
-    def _batch(self, sample: Sample, predicted: bool = False) -> tuple[Named, bool, int, Camera]:
+    def _batch(
+        self, sample: Sample, camera: Any = None, predicted: bool = False, kinds: Mapping[str, str] | None = None
+    ) -> tuple[Named, bool, int, Camera]:
         """Return the fields that move, as a batch; whether the sample was one; its size, and its cameras.
 
-        What samples of one form have in common is found and checked once. predicted: values may be bad.
+        What samples of one form have in common is found and checked once.
+
+        Args:
+            sample: the fields.
+            camera: to be taken instead of the sample's.
+            predicted: whether values may be bad.
+            kinds: name -> kind, in addition to `fields`.
         """
-        camera: Any = sample.get("camera")
+        camera = sample.get("camera") if camera is None else camera
         camera = self._held("camera") if camera is None else camera
-        form = self._form_of(sample, camera)
+        fields = {**self.fields, **kinds} if kinds else self.fields
+        form = self._form_of(sample, camera, fields)
         if form is None or (known := self._forms.get(form)) is None:
-            result = self._checked_batch(sample, camera, predicted)
+            result = self._checked_batch(sample, camera, fields, predicted)
             named, batched, count, _ = result
             if (
                 form is not None
@@ -482,7 +491,7 @@ class SampleTransform(nn.Module):
         named = {name: (found, sample[name] if batched else sample[name].unsqueeze(0)) for name, found in kinds}
         return named, batched, count, camera
 
-    def _form_of(self, sample: Sample, camera: object) -> tuple[Any, ...] | None:
+    def _form_of(self, sample: Sample, camera: object, fields: Mapping[str, str]) -> tuple[Any, ...] | None:
         """All that the fields of a sample are checked for but their values; None where that is more than tensors."""
         if not isinstance(camera, Camera) or camera.is_mixed:
             return None
@@ -495,10 +504,12 @@ class SampleTransform(nn.Module):
                 parts += name, type(value)
             else:
                 return None
-        return *parts, *self.fields.items()
+        return *parts, *fields.items()
 
-    def _checked_batch(self, sample: Sample, camera: Any, predicted: bool) -> tuple[Named, bool, int, Camera]:
-        named = self._sorted(sample)
+    def _checked_batch(
+        self, sample: Sample, camera: Any, fields: Mapping[str, str], predicted: bool
+    ) -> tuple[Named, bool, int, Camera]:
+        named = self._sorted(sample, fields)
         if not named:
             raise ValueError(f"{self._name}: the sample has no field that moves; known are {', '.join(KINDS)}")
         camera = self._camera_of(named) if camera is None else camera
@@ -571,6 +582,33 @@ class SampleTransform(nn.Module):
             f"{self._name}: {field} is {shape[-2:]} (height, width), but the image_size of {name} is {size}. "
             "camera.resize, .crop and .pad give the camera of an edited image"
         )
+
+    @on_samples
+    def moved_by(
+        self,
+        change: Change,
+        sample: Mapping[str, Any],
+        kinds: Mapping[str, str] | None = None,
+        predicted: bool = False,
+    ) -> Sample:
+        """Move a sample by a change that exists, as `forward` does after its draw.
+
+        Args:
+            change: of as many samples; its `source` are the cameras of the sample.
+            sample: the fields, a `Single` for those of one sample whatever their dims.
+            kinds: name -> kind, in addition to `fields`, of what its name alone does not say.
+            predicted: whether values may be bad.
+
+        Returns:
+            A new dict with all fields moved, and their validity, `camera` and `rotation`.
+        """
+        sample = self._given(sample, {})
+        first = change.parts[0]
+        camera = first.camera if first.rows is None else change.source
+        named, batched, count, _ = self._batch(sample, camera, predicted, kinds)
+        if count != change.count:
+            raise ValueError(f"{self._name}: the change is of {change.count} samples, here are {count}")
+        return self._moved(sample, named, batched, change)
 
     def _moved(self, sample: Sample, named: Named, batched: bool, change: Change) -> Sample:
         """The sample after a change; `named` holds its fields as a batch."""

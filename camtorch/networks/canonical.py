@@ -133,7 +133,7 @@ class CanonicalCamera(SampleTransform):
         source = as_one(source)
         change = self._change(source, len(source) if source.batch_shape else 1)
         target = change.target if source.batch_shape else alone(change.target)  # a batch dim would be the sample's
-        named, batched, count, _ = self._batch({**sample, "camera": target}, predicted=True)
+        named, batched, count, _ = self._batch(sample, target, predicted=True)
         change = change if change.count == count else self._change(source, count)
         return self._resized(sample, named, batched, change.inverse())
 
