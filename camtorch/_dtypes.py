@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
@@ -33,3 +34,14 @@ def narrow(values: Tensor, dtype: torch.dtype) -> Tensor:
         top = float(high) if int(float(high)) == high else math.nextafter(float(high), 0.0)
         values = values.round().clamp(float(low), top)
     return values.to(dtype)
+
+
+def as_pixels(fill: Sequence[float], dtype: torch.dtype, device: torch.device | str = "cpu") -> Tensor:
+    """Return the values (C or 1, 1, 1) of channels in a dtype: rounded, in range, true from one half on."""
+    values: Sequence[float] = fill
+    if dtype == torch.bool:
+        values = [value >= 0.5 for value in fill]
+    elif not dtype.is_floating_point:
+        low, high = torch.iinfo(dtype).min, torch.iinfo(dtype).max
+        values = [min(max(round(value), low), high) for value in fill]
+    return torch.tensor(values, dtype=dtype, device=device)[:, None, None]

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from camtorch._dtypes import as_pixels
 from camtorch._threads import spread, thread_count
 from camtorch.native import memory
 from camtorch.native.library import library
@@ -163,13 +164,7 @@ def _shared(tensor: Tensor) -> int:
 def _fills(fill: tuple[float, ...], dtype: torch.dtype) -> tuple[int, int, Tensor, Tensor]:
     """Where values lie in float32, and as pixels: rounded, in range, true from one half on; and who holds them."""
     values = torch.tensor(fill, dtype=torch.float32, device="cpu")
-    if dtype == torch.bool:
-        elements = torch.tensor([value >= 0.5 for value in fill], device="cpu")
-    else:
-        if not dtype.is_floating_point:
-            low, high = torch.iinfo(dtype).min, torch.iinfo(dtype).max
-            fill = tuple(min(max(round(value), low), high) for value in fill)
-        elements = torch.tensor(fill, dtype=dtype, device="cpu")
+    elements = as_pixels(fill, dtype)
     return values.data_ptr(), elements.data_ptr(), values, elements
 
 

@@ -10,7 +10,7 @@ import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
 from torch import Tensor
 
 from camtorch._arguments import Numbers, as_values, broadcast_shapes
-from camtorch._dtypes import SIGNED, narrow, widen
+from camtorch._dtypes import SIGNED, as_pixels, narrow, widen
 from camtorch._tracing import in_transform, is_concrete, may_look
 from camtorch.camera import Camera
 from camtorch.native import sampler
@@ -72,7 +72,8 @@ class MirrorWarp(Warp):
             made = render(here, where if every else where.cameras(rows), *sampler)
             if every:
                 return made
-            result[rows] = made
+            for row, one in zip(rows.tolist(), made, strict=True):  # unsigned integers have no index_put
+                result[row] = one
         return result
 
     def _empty(self, images: Tensor) -> Tensor:
@@ -186,7 +187,7 @@ class AffineWarp(MirrorWarp):
             x, y, right, bottom = max(left, 0), max(top, 0), left + view.shape[-1], top + view.shape[-2]
             right, bottom = max(min(right, width), x), max(min(bottom, height), y)
             if (x, y, right, bottom) != (0, 0, width, height):
-                result[row] = result.new_tensor(fill).view(-1, 1, 1) if len(fill) > 1 else fill[0]
+                result[row] = as_pixels(fill, result.dtype, result.device)
             result[row, :, y:bottom, x:right] = view[..., y - top : bottom - top, x - left : right - left]
         return result
 
@@ -212,8 +213,8 @@ class AffineWarp(MirrorWarp):
             view = images[part, :, top:bottom, left:right]
             view = view if plain else widen(view)
             view = F.interpolate(view, (height, width), mode=mode, align_corners=False, antialias=True)
-            view = view if plain else narrow(view, images.dtype)
-            results.append(view.flip(flip) if flip else view)
+            view = view.flip(flip) if flip else view  # before it is of an unsigned dtype, which has no flip
+            results.append(view if plain else narrow(view, images.dtype))
         return results[0] if len(results) == 1 else torch.cat(results)
 
     @property

@@ -13,7 +13,7 @@ import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
 from torch import Tensor
 
 from camtorch._arguments import as_flag, as_number, shown
-from camtorch._dtypes import SIGNED, narrow, wide_dtype, widen
+from camtorch._dtypes import SIGNED, as_pixels, narrow, wide_dtype, widen
 from camtorch._threads import thread_count
 from camtorch._tracing import converted, in_transform, is_concrete, is_eager, may_look
 from camtorch.native import sampler
@@ -346,9 +346,7 @@ def _padded(u: Tensor, side: int, padding_mode: PaddingMode) -> Tensor:
 
 def _pick(images: Tensor, where: Sampling, how: Sampler) -> Tensor:
     """The nearest of integers (B, C, H, W), moved and not computed with: no float holds every id."""
-    limits = torch.iinfo(images.dtype)
-    values = [min(max(round(value), limits.min), limits.max) for value in how.fill]
-    value = torch.tensor(values, dtype=images.dtype, device=images.device)[:, None, None]
+    value = as_pixels(how.fill, images.dtype, images.device)
     height, width = images.shape[-2:]
     u, v = (
         _padded(((position + 1) * side - 1) / 2, side, how.padding_mode).round()

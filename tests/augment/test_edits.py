@@ -262,6 +262,30 @@ def mixture(**options):
     )
 
 
+@pytest.mark.parametrize("dtype", ["uint16", "uint32", "uint64"])
+@pytest.mark.parametrize("name", ["flip", "mount", "turn", "pad"])
+def test_chains_take_all_unsigned_integers(name, dtype):
+    lens = ct.KannalaBrandt([200.0, 200, 159.5, 119.5], [0.01, 0, 0, 0], image_size=(240, 320))
+    augment = {
+        "flip": lambda: A.Compose([A.RandomResizedCrop(40), A.HorizontalFlip()]),
+        "mount": lambda: A.Compose([A.RandomMount(yaw=10, camera=lens), A.RandomResizedCrop(40)]),
+        "turn": lambda: A.Compose([A.CenterCrop(200), A.Rotate90(), A.Resize(20)]),
+        "pad": lambda: A.Compose([A.HorizontalFlip(), A.CenterCrop((250, 400))], fill=(-1.0, 7.6, 3.0)),
+    }[name]()
+    images = torch.randint(0, 256, (3, 3, 240, 320), generator=torch.Generator().manual_seed(0))
+    for seed in range(5):
+        for count in (3, 1):
+            draw = augment.draw(count, torch.Generator().manual_seed(seed))
+            expected = augment(image=images[:count].double(), draw=draw)["image"].clamp(min=0)
+            moved = augment(image=images[:count].to(getattr(torch, dtype)), draw=draw)["image"]
+            assert moved.dtype == getattr(torch, dtype)
+            assert (moved.double() - expected).abs().max() <= 1  # two roundings
+        single = camtorch.augment.numpy.Transform(augment)(
+            image=images[0].permute(1, 2, 0).numpy().astype(dtype), draw=draw
+        )
+        assert (single["image"] == moved[0].permute(1, 2, 0).numpy()).all()
+
+
 def test_a_chain_shows_what_its_last_camera_sees():
     lens = camera(ct.Fisheye624, torch.float32, (96, 128))
     image = scene(lens.rays()[0]).expand(4, -1, -1, -1)
