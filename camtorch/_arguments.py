@@ -18,7 +18,7 @@ from torch import Tensor, nn
 
 from camtorch._tracing import in_graph, is_concrete, is_eager, keeps_graph, may_look
 
-Numbers: TypeAlias = "Tensor | np.ndarray[Any, Any] | np.number[Any] | float | list[Any] | tuple[Any, ...]"
+Numbers: TypeAlias = Tensor | np.ndarray[Any, Any] | np.number[Any] | float | list[Any] | tuple[Any, ...]
 """What users pass as numbers: a tensor, an array, a number, or lists of them."""
 
 LEFT = "What left camtorch stands in docs/leaving-0.3.md"

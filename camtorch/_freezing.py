@@ -7,13 +7,12 @@ from typing import TYPE_CHECKING, Any, cast
 
 import torch
 from torch import Tensor
+from typing_extensions import Self
 
 from camtorch._module import BatchedModule, is_parameter
 from camtorch._tracing import in_transform, is_concrete, is_recorded
 
 if TYPE_CHECKING:
-    from typing_extensions import Self
-
     from camtorch.camera import Camera
 
 INTRINSICS = "fx", "fy", "cx", "cy"

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, cast
 import torch
 from torch import Tensor
 from torch.nn.utils import parametrize
+from typing_extensions import Self, TypeVar
 
 from camtorch._arguments import LEFT, Numbers, as_image_size, as_whole, broadcast_shapes, hinting, is_predicted, shown
 from camtorch._editing import check_crop, edited_by, quarter_turns
@@ -29,6 +30,7 @@ from camtorch._numbers import (
 )
 from camtorch._registry import register
 from camtorch.convert.conversion import Conversion, convert
+from camtorch.extrinsics import Extrinsics
 from camtorch.optics.charts import Chart
 from camtorch.optics.lens import Lens
 from camtorch.projection.depth import backproject
@@ -39,12 +41,7 @@ from camtorch.projection.project import Project
 from camtorch.projection.rays import field_of_view
 from camtorch.projection.unproject import Unproject
 
-if TYPE_CHECKING:
-    from typing_extensions import Self, TypeVar
-
-    from camtorch.extrinsics import Extrinsics
-
-    Model = TypeVar("Model", bound="Camera", default="Camera")
+Model = TypeVar("Model", bound="Camera", default="Camera")
 
 MODELS: dict[str, type[Camera]] = {}
 """Every camera model by its key; defining a model adds it."""

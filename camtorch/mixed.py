@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn, cast
 import torch
 from torch import Tensor, nn
 from torch.nn.utils.parametrize import type_before_parametrizations
+from typing_extensions import Self
 
 from camtorch._arguments import Numbers, as_image_size, as_points, no_camera, shown, working_dtype
 from camtorch._evaluation import new_cameras, per_row
@@ -23,8 +24,6 @@ from camtorch.projection.project import Project
 from camtorch.projection.unproject import Unproject
 
 if TYPE_CHECKING:
-    from typing_extensions import Self
-
     from camtorch.projection.rows import Cameras
 
 

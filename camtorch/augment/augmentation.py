@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
+from typing_extensions import Unpack
 
 from camtorch._arguments import (
     GUESS_CAMERA,
@@ -34,9 +35,6 @@ from camtorch.augment.sample import Named, Sample, SampleOptions, SampleTransfor
 from camtorch.camera import Camera
 from camtorch.mixed import Mixed
 from camtorch.warp.warp import Warp
-
-if TYPE_CHECKING:
-    from typing_extensions import Unpack
 
 _FEW = 2 / 3  # of what an image shows of its own camera: with less than that, on average, a warning says so
 _TRIES = 8

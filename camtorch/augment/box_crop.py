@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
+from typing_extensions import Unpack
 
 from camtorch._arguments import as_known_size, as_whole
 from camtorch.augment.augmentation import Augmentation, EditOptions, as_range
 from camtorch.camera import Camera
 from camtorch.rotations import mount_rotation
 from camtorch.warp.views import as_margin, check_extents, looking_at, pinhole
-
-if TYPE_CHECKING:
-    from typing_extensions import Unpack
 
 RangeLike = float | Sequence[float]
 

@@ -5,10 +5,11 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor
+from typing_extensions import Unpack
 
 from camtorch._arguments import as_image_size, as_whole, fails, holds
 from camtorch._editing import edited, quarter_turns
@@ -17,9 +18,6 @@ from camtorch.augment.change import Change, Part, by_kinds
 from camtorch.augment.landmarks import Mirroring, TableLike
 from camtorch.camera import Camera
 from camtorch.warp.affine import AffineWarp, after, on_rays
-
-if TYPE_CHECKING:
-    from typing_extensions import Unpack
 
 Size = int | Sequence[int]
 

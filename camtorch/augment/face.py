@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 from torch import Tensor
+from typing_extensions import Unpack
 
 from camtorch._arguments import as_known_size, as_number, fails, no_camera, shown
 from camtorch._module import remade, typed_as
@@ -17,9 +18,6 @@ from camtorch.camera import Camera
 from camtorch.models import Pinhole
 from camtorch.rotations import check_rotation, rotation_matrix
 from camtorch.warp.warp import Warp
-
-if TYPE_CHECKING:
-    from typing_extensions import Unpack
 
 _ODD = 50.0  # times the distance: no face is meant to be so much nearer or farther; units differ
 

@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import torch
+from typing_extensions import Unpack
 
 from camtorch.augment.augmentation import Augmentation, EditOptions, as_range
 from camtorch.augment.change import Part
 from camtorch.camera import Camera
 from camtorch.warp.sampling import one_of
 from camtorch.warp.shutter import DIRECTIONS, Direction, RollingShutter, ShutterWarp
-
-if TYPE_CHECKING:
-    from typing_extensions import Unpack
 
 
 class RandomShutter(Augmentation):

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from camtorch._arguments import Numbers, as_image_size, as_values, shown, warn
 
-Points: TypeAlias = "Numbers | Sequence[Numbers | None]"
+Points: TypeAlias = Numbers | Sequence[Numbers | None]
 """Points of all views: a tensor, an array, or a list with one of them, or None, for each view."""
 Array: TypeAlias = NDArray[Any]
 

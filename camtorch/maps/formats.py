@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import json
 import os
-from typing import TYPE_CHECKING, Any, Literal, TypedDict
+from typing import Any, Literal, TypedDict
+
+from typing_extensions import Unpack
 
 from camtorch.io._errors import CameraFileError
 from camtorch.io.parsing import path_of, read_bytes
@@ -21,9 +23,6 @@ from camtorch.maps.protocol import SIZES, MapFormat
 from camtorch.maps.report import MapReport, measure
 from camtorch.maps.ti_ldc import TILDC
 from camtorch.warp.warp import Warp
-
-if TYPE_CHECKING:
-    from typing_extensions import Unpack
 
 # in the order in which they are asked
 _FORMATS: dict[str, MapFormat] = {

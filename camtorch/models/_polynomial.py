@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, ClassVar, cast
+from typing import ClassVar, cast
 
 import torch
+from torch import Tensor
+from typing_extensions import Self
 
 from camtorch._arguments import Numbers, as_batch, as_number, as_real, fails, holds, is_list
 from camtorch.camera import Camera
-
-if TYPE_CHECKING:
-    from torch import Tensor
-    from typing_extensions import Self
 
 
 class OddPolynomial(Camera):

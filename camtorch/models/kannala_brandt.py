@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
+from typing_extensions import Self
 
 from camtorch._arguments import Numbers, as_batch, as_real, fails
 from camtorch.models._polynomial import OddPolynomial
 from camtorch.optics import Chart, Equidistant, Lens, Planar, Polynomial
-
-if TYPE_CHECKING:
-    from typing_extensions import Self
 
 
 class KannalaBrandt(OddPolynomial):

@@ -4,19 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from types import MappingProxyType
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import torch
 from torch import Tensor
+from typing_extensions import Self
 
 from camtorch._arguments import Numbers, as_real, fails
 from camtorch.camera import Camera
 from camtorch.optics import AnglePerRadius, Chart, Inverted, Lens, RadiusPolynomial, Shear
 from camtorch.optics.radial import RadialFactor
 from camtorch.optics.special import first_root
-
-if TYPE_CHECKING:
-    from typing_extensions import Self
 
 
 class AngleOfAllPowers(AnglePerRadius):

@@ -5,17 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from types import MappingProxyType
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
+from typing_extensions import Self
 
 from camtorch._arguments import Numbers, as_number, as_real
 from camtorch.camera import Camera
 from camtorch.optics import Chart, EquidistantUpTo, Lens, Planar, RadiusTable
-
-if TYPE_CHECKING:
-    from typing_extensions import Self
 
 
 class Tabulated(Camera):

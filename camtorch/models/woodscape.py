@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
+
+from typing_extensions import Self
 
 from camtorch._arguments import Numbers, as_image_size, as_real
 from camtorch.models._polynomial import FreePolynomial
 from camtorch.models.f_theta import FTheta
-
-if TYPE_CHECKING:
-    from typing_extensions import Self
 
 
 class WoodScape(FTheta):

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Literal, TypedDict, overload
+from typing import Literal, TypedDict, overload
 
 import torch
 from torch import Tensor
+from typing_extensions import Unpack
 
 from camtorch._arguments import (
     Numbers,
@@ -19,9 +20,6 @@ from camtorch._arguments import (
     shown,
 )
 from camtorch.camera import Camera
-
-if TYPE_CHECKING:
-    from typing_extensions import Unpack
 
 __all__ = ["angles", "rays", "reprojection"]
 

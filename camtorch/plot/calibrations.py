@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 
+from camtorch.calibration.calibrate import Calibration
+from camtorch.calibration.rig import RigCalibration
 from camtorch.plot.axes import (
     COLOURS,
     INK,
@@ -25,9 +27,8 @@ from camtorch.projection.rays import image_lattice
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-
-    from camtorch.calibration.calibrate import Calibration
-    from camtorch.calibration.rig import RigCalibration
+else:  # it is optional, and takes a second: for those who ask for hints at runtime
+    Axes = Figure = Any
 
 _ARROWS = 15_000  # as many as an image has room for
 _LATTICE = 96  # of the map of uncertainty, along the longer side

@@ -9,9 +9,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
+from torch import Tensor
 from torch.nn.utils.parametrize import type_before_parametrizations
 
 from camtorch.analysis import difference as differences
+from camtorch.camera import Camera
 from camtorch.plot.axes import (
     COLOURS,
     GREY,
@@ -28,16 +30,15 @@ from camtorch.plot.axes import (
     size_of,
 )
 from camtorch.projection.rays import angles_from_axis, followed, ideal, image_lattice
+from camtorch.rig import Rig
 from camtorch.rotations import rotation_matrix
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.cm import ScalarMappable
     from matplotlib.figure import Figure
-    from torch import Tensor
-
-    from camtorch.camera import Camera
-    from camtorch.rig import Rig
+else:  # it is optional, and takes a second: for those who ask for hints at runtime
+    Axes = Figure = Any
 
 _AZIMUTHS, _ANGLES = 32, 721
 _NOTHING = 1e-6  # px: what is less is rounding, and shown as none

@@ -14,10 +14,12 @@ import re
 import zlib
 from functools import cache
 from importlib import resources
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
+from PIL import Image
 
 from camtorch._arguments import check_path
 from camtorch._module import model_of
@@ -28,12 +30,6 @@ from camtorch.lenses.collection import columns
 from camtorch.models import Splined
 from camtorch.projection.explanation import unusable
 
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from numpy.typing import NDArray
-    from PIL import Image
-
 _SIDE, _QUALITY = 1920, 85  # px of the longer side of a photograph, and of its JPEG file
 _MOST_COUNT = 40  # coefficients that a model of any number of them is given in the page
 _FOCAL, _BEND = 0.25, 0.1  # px: what a focal length, a centre and a coefficient of a packed lens are rounded to
@@ -43,7 +39,7 @@ _FOCAL, _BEND = 0.25, 0.1  # px: what a focal length, a centre and a coefficient
 def write_viewer(
     camera: Camera,
     path: str | os.PathLike[str],
-    image: str | os.PathLike[str] | Path | Image.Image | NDArray[Any] | torch.Tensor | None = None,
+    image: str | os.PathLike[str] | Image.Image | NDArray[Any] | torch.Tensor | None = None,
 ) -> None:
     """Write a page that shows a lens live: one HTML file that needs no other and no network.
 

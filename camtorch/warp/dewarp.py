@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import torch
 from torch import Tensor, nn
+from typing_extensions import Unpack
 
 from camtorch._arguments import as_fov, as_image_size, broadcast_shapes, hinting
 from camtorch.camera import Camera
@@ -16,9 +17,6 @@ from camtorch.projection.rays import around_ends, image_lattice
 from camtorch.rotations import as_rotation
 from camtorch.warp.sampling import TolerantOptions
 from camtorch.warp.warp import Warp, as_sized
-
-if TYPE_CHECKING:
-    from typing_extensions import Unpack
 
 Projection = Literal["perspective", "stereographic", "cylindrical", "equirectangular"]
 

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, cast
+from typing import cast
 
 import torch
 from torch import Tensor, nn
+from typing_extensions import Unpack
 
 from camtorch._arguments import Numbers, as_batch, as_coordinates, as_number, as_own, as_real, fails, shown, values_of
 from camtorch.camera import Camera
@@ -14,9 +15,6 @@ from camtorch.extrinsics import Extrinsics
 from camtorch.models import Pinhole
 from camtorch.warp.proxy import ProxyWarp, beside
 from camtorch.warp.sampling import WarpOptions
-
-if TYPE_CHECKING:
-    from typing_extensions import Unpack
 
 _GRAZING = 1e-9  # the cosine of a ray to the plane's normal from which on it does not meet the plane
 

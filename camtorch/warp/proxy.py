@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import torch
 from torch import Tensor
+from typing_extensions import Unpack
 
 from camtorch._arguments import Numbers, as_batch, as_coordinates, check_devices
 from camtorch.camera import Camera
@@ -15,9 +14,6 @@ from camtorch.warp.grid import Sampling, pixels_of_rows, scaled_rows, to_positio
 from camtorch.warp.panorama import off_poles
 from camtorch.warp.sampling import PaddingMode, WarpOptions
 from camtorch.warp.warp import Warp
-
-if TYPE_CHECKING:
-    from typing_extensions import Unpack
 
 
 class ProxyWarp(Warp):

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, Literal, cast, get_args
+from typing import Any, Literal, cast, get_args
 
 import torch
 from torch import Tensor, nn
+from typing_extensions import Unpack
 
 from camtorch._arguments import (
     LEFT,
@@ -30,9 +31,6 @@ from camtorch.rotations import as_rotation
 from camtorch.warp.affine import MirrorWarp
 from camtorch.warp.sampling import TolerantOptions
 from camtorch.warp.warp import Warp
-
-if TYPE_CHECKING:
-    from typing_extensions import Unpack
 
 Direction = Literal["down", "up", "right", "left"]
 DIRECTIONS: tuple[Direction, ...] = get_args(Direction)

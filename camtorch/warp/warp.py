@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 import torch
 from torch import Tensor, nn
+from typing_extensions import Self
 
 from camtorch._arguments import LEFT, Numbers, as_coordinates, as_whole, broadcast_shapes, check_devices, no_camera
 from camtorch._module import GeometryModule, Memo, typed_as
@@ -31,10 +32,6 @@ from camtorch.warp.sampling import (
     as_options,
     one_of,
 )
-
-if TYPE_CHECKING:
-    from typing_extensions import Self
-
 
 _SINGLE = 1e-3  # pixels: some ulps of a position in an image a thousand pixels wide, computed in float32
 
