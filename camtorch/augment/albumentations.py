@@ -60,9 +60,9 @@ class Transform(A.DualTransform):
     camera: Camera | None
 
     def __init__(self, augmentation: Augmentation, camera: Camera | None = None, p: float | None = None):
-        check_front_end(_OWNER, augmentation, camera)
+        self.camera = check_front_end(_OWNER, augmentation, camera)
         super().__init__(p=augmentation.p if p is None else p)
-        self.augmentation, self.camera = augmentation, camera
+        self.augmentation = augmentation
         self._arrays = arrays.Transform(augmentation)
 
     @property
@@ -78,9 +78,8 @@ class Transform(A.DualTransform):
     def __call__(self, *args: Any, force_apply: bool = False, **data: Any) -> dict[str, Any]:
         """Transform a sample of keyword arguments; see the class."""
         result: dict[str, Any] = super().__call__(*args, force_apply=force_apply, **data)
-        if result.get("camera") is None and not isinstance(source := self._source(data), Unknown):
-            result["camera"] = source
-        return result
+        camera = self._source(data) if result.get("camera") is None else result["camera"]
+        return result if isinstance(camera, Unknown) else {**result, "camera": camera.detach()}
 
     def get_params(self) -> dict[str, Any]:
         generator = torch.Generator().manual_seed(self.py_random.getrandbits(63))

@@ -23,7 +23,6 @@ from camtorch._arguments import (
     as_whole,
     fails,
     holds,
-    no_camera,
     shown,
     warn,
 )
@@ -31,7 +30,7 @@ from camtorch._module import typed_as
 from camtorch._tracing import is_concrete, may_look
 from camtorch.augment.change import Change, Part, alone, as_one, by_kinds
 from camtorch.augment.filling import enough, filled, scaled
-from camtorch.augment.sample import Named, Sample, SampleOptions, SampleTransform, Unknown, on_samples
+from camtorch.augment.sample import Named, Sample, SampleOptions, SampleTransform, Unknown, fixed_copy, on_samples
 from camtorch.camera import Camera
 from camtorch.mixed import Mixed
 from camtorch.warp.warp import Warp
@@ -196,8 +195,8 @@ class Augmentation(SampleTransform):
     Turning the camera and changing its lens move all of it exactly. Moving the camera elsewhere shifts near things
     against far ones, which takes depth: `RandomMount(shift=...)` does it for samples that have some.
 
-    Gradients go to images, labels and a camera that learns; what a lens is jittered by counts as given, and so does
-    what it is zoomed by for `min_filled`.
+    Gradients go to images, labels and a sample's camera that learns; what a lens is jittered by counts as given, and so
+    does what it is zoomed by for `min_filled`.
 
     **One's own augmentation** is a subclass that names the ranges it draws from, and writes `new_camera`: the camera
     after the change, and how far it is turned. All fields, front ends, replays and options then come by themselves:
@@ -214,7 +213,8 @@ class Augmentation(SampleTransform):
 
     Args:
         ranges: name -> `Range`, in the order in which they are drawn.
-        camera: of samples that do not bring one.
+        camera: of samples that do not bring one. The augmentation keeps a copy, which does not learn, nor follow later
+            changes of the camera.
         p, same_on_batch: how likely a sample is augmented at all; the same draw for the whole batch.
         fields: name -> kind, for fields of other names; "keep" leaves one as it is.
         mode, padding_mode, fill, antialias, tolerance: of images; see `Warp`.
@@ -564,12 +564,11 @@ def _are_alike(value: Any) -> bool:
 # -- for front ends, which hold an augmentation and the camera of their images
 
 
-def check_front_end(owner: str, augmentation: object, camera: object, *kinds: type[SampleTransform]) -> None:
-    """Raise a TypeError unless this is an augmentation, or one of other kinds, and that a camera or None."""
+def check_front_end(owner: str, augmentation: object, camera: object, *kinds: type[SampleTransform]) -> Camera | None:
+    """Return a fixed copy of the camera, or None; a TypeError if `augmentation` is none, nor of other `kinds`."""
     if not isinstance(augmentation, kinds or Augmentation):
         raise TypeError(f"{owner}: augmentation must be an Augmentation; got {type(augmentation).__name__}")
-    if camera is not None and not isinstance(camera, Camera):
-        raise TypeError(f"{owner}: camera must be a Camera; got {no_camera(camera)}")
+    return fixed_copy(camera, owner)
 
 
 def check_single(

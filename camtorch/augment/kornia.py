@@ -28,7 +28,7 @@ from camtorch.augment.augmentation import Augmentation, check_front_end, check_s
 from camtorch.augment.change import Change
 from camtorch.augment.collate import collate_cameras
 from camtorch.augment.presets import PresetName
-from camtorch.augment.sample import on_samples
+from camtorch.augment.sample import fixed_copy, on_samples
 from camtorch.camera import Camera
 from camtorch.warp.sampling import Mode
 
@@ -70,8 +70,8 @@ class CameraAugmentation(GeometricAugmentationBase2D):
 
     Args:
         augmentation: a `camtorch.augment.Augmentation`, for example a `RandomCamera`.
-        camera: the Camera of the images, which may learn; by default the augmentation's own. `with_cameras` gives
-            every sample its own.
+        camera: the Camera of the images, of which this keeps a copy that does not learn; by default the augmentation's.
+            `with_cameras` gives every sample its own, which may learn.
         p, p_batch: how likely a sample, and a batch, is augmented at all; p by default as the augmentation says.
         same_on_batch: the same draw for the whole batch; by default as the augmentation says.
         keepdim: whether images without batch dim stay without.
@@ -111,8 +111,8 @@ class CameraAugmentation(GeometricAugmentationBase2D):
         keepdim: bool = False,
     ):
         name = type(self).__name__
-        check_front_end(name, augmentation, camera)
-        camera = augmentation.camera if camera is None else camera
+        camera = check_front_end(name, augmentation, camera)
+        camera = fixed_copy(augmentation.camera, name) if camera is None else camera
         if not isinstance(camera, Camera):
             raise TypeError(f"{name}: camera must be the Camera of the images; got {type(camera).__name__}")
         own_size = check_single(name, camera, (), ". with_cameras gives every sample its own")

@@ -61,9 +61,8 @@ class Transform:
     """
 
     def __init__(self, augmentation: Augmentation | FaceNormalizer, camera: Camera | None = None):
-        check_front_end(_OWNER, augmentation, camera, Augmentation, FaceNormalizer)
+        self.camera = check_front_end(_OWNER, augmentation, camera, Augmentation, FaceNormalizer)
         self.augmentation = augmentation
-        self.camera = camera
         self._ways: dict[Any, Callable[[str, Array], tuple[dict[str, Tensor], Restore]]] = {}
 
     def __call__(

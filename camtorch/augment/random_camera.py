@@ -24,7 +24,7 @@ from camtorch.augment.augmentation import Augmentation, Range, as_range
 from camtorch.augment.change import Part, View
 from camtorch.augment.filling import enough, scaled
 from camtorch.augment.presets import PRESETS, PresetName
-from camtorch.augment.sample import Named
+from camtorch.augment.sample import Named, fixed_copy
 from camtorch.camera import Camera
 from camtorch.lenses.drawing import FOLD, covering, drawn
 from camtorch.models import MODELS, KannalaBrandt
@@ -500,7 +500,7 @@ def _as_like(like: Camera | str | None, owner: str) -> Camera | None:
     if like is None or isinstance(like, Camera):
         if like is not None and like.batch_shape:
             raise ValueError(f"{owner}: like must be a single camera; got batch dims {tuple(like.batch_shape)}")
-        return None if like is None else like.detach()
+        return fixed_copy(like, owner)
     if isinstance(like, str) and like in PRESETS:
         return PRESETS[like].camera()
     if isinstance(like, str) and like in MODELS:

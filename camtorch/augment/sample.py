@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import difflib
 import functools
 import inspect
@@ -314,18 +315,37 @@ class Unknown(Pinhole):
         return cls(torch.tensor([1.0, 1.0, 0.0, 0.0]), image_size=size).requires_grad_(False)
 
 
+def fixed_copy(camera: object, owner: str) -> Camera | None:
+    """Return a copy of the `camera` of an `owner`, which does not learn with it; None of None."""
+    if camera is not None and not isinstance(camera, Camera):
+        raise TypeError(f"{owner}: camera must be a Camera; got {no_camera(camera)}")
+    own = copy.deepcopy(camera)
+    for tensor in () if own is None else (*own.parameters(), *own.buffers()):
+        tensor.requires_grad_(False)
+    return own
+
+
 def on_samples(method: Callable[P, R]) -> Callable[P, R]:
-    """Return a method that moves samples on one thread, and in a DataLoader's worker, no graph leaves, without."""
+    """Return a method that moves samples on one thread, and in a DataLoader's worker without a graph."""
 
     @on_one_thread
     @functools.wraps(method)
-    def wrapped(*args: P.args, **kwargs: P.kwargs) -> R:
+    def wrapped(*args: P.args, **kwargs: P.kwargs) -> Any:
         if torch.compiler.is_compiling() or get_worker_info() is None:
             return method(*args, **kwargs)
         with torch.no_grad():
-            return method(*args, **kwargs)
+            result: Any = method(*args, **kwargs)
+        return {name: _detached(value) for name, value in result.items()} if isinstance(result, dict) else result
 
     return wrapped
+
+
+def _detached(value: Any) -> Any:
+    """Return a tensor, a camera or a list of them without its graph, and any other value as it is."""
+    if isinstance(value, list):
+        return list(map(_detached, value))
+    learns = isinstance(value, (Tensor, Camera)) and any(t.requires_grad for t in getattr(value, "_tensors", (value,)))
+    return value.detach() if learns else value
 
 
 class SampleOptions(TypedDict, total=False):
@@ -366,9 +386,7 @@ class SampleTransform(nn.Module):
         self._name = type(self).__name__
         for name in unknown:
             raise TypeError(f"{self._name}: unknown keyword {name!r}{self._meant(name)}. {LEFT}")
-        if camera is not None and not isinstance(camera, Camera):
-            raise TypeError(f"{self._name}: camera must be a Camera; got {no_camera(camera)}")
-        self.camera = camera
+        self.camera = fixed_copy(camera, self._name)
         self.fields: dict[str, str] = dict(as_mapping(fields, "fields", self._name, "{'lidar': 'points'}"))
         wrong = {k: v for k, v in self.fields.items() if v not in (*KINDS, KEEP)}
         if wrong:

@@ -80,9 +80,8 @@ class Transform(v2.Transform):
 
     def __init__(self, augmentation: Augmentation, camera: Camera | None = None, *, valid: bool = False):
         super().__init__()
-        check_front_end(_OWNER, augmentation, camera)
+        self.camera, self.valid = check_front_end(_OWNER, augmentation, camera), bool(valid)
         self.augmentation = augmentation
-        self.camera, self.valid = camera, bool(valid)
         self._flags: list[tuple[Tensor, Tensor]] = []
 
     def forward(self, *inputs: Any) -> Any:

@@ -83,6 +83,7 @@ class Warp(GeometryModule):
 
     The sampling grid is kept while nothing that it depends on can learn or has changed. In a network the cameras are
     part of it: `warp.requires_grad_(False)` keeps an optimizer from moving them, `warp.source.freeze("fx")` one number.
+    `print(warp)` shows "learns" if a camera or the rotation requires grad, and "fixed" if none does.
 
     Raises:
         ValueError: a mode that does not exist, cameras without image_size, a rotation of another shape or that is
@@ -373,9 +374,10 @@ class Warp(GeometryModule):
         return {**super().__getstate__(), "_pinned": None}
 
     def extra_repr(self) -> str:
-        """The options."""
+        """Return the options, then "learns" if a camera or the rotation requires grad, else "fixed"."""
         said = {**self.options, "tolerance": self.tolerance, "rotation": self.rotation is not None}
-        return ", ".join(f"{name}={value!r}" for name, value in said.items())
+        learns = any(t.requires_grad for t in (*self.parameters(), *self.buffers()))
+        return ", ".join([*(f"{name}={value!r}" for name, value in said.items()), "learns" if learns else "fixed"])
 
 
 def _check_parts(source: Camera, target: Camera, rotation: Tensor | None) -> torch.Size:

@@ -137,13 +137,6 @@ def test_an_image_is_no_sample(camera):
         RandomMount(camera=camera)(torch.zeros(1, 3, *SIZE))
 
 
-def test_a_lens_to_take_after_does_not_learn(camera):
-    out = RandomCamera(ct.Pinhole([30.0, 30.0, 19.5, 14.5], image_size=SIZE), camera=camera)(
-        keypoints=torch.zeros(1, 2)
-    )
-    assert not out["keypoints"].requires_grad
-
-
 def test_own_names_and_fields_to_keep(camera):
     batch = {
         "eye": torch.rand(2, 4, 2),

@@ -113,7 +113,7 @@ def test_no_more_is_zoomed_than_needed():
 
 def test_gradients_pass_and_the_zoom_counts_as_given():
     camera = ct.Pinhole([100.0, 100.0, 79.5, 59.5], image_size=SIZE)
-    out = RandomCamera("dms130", camera=camera, min_filled=0.9)(keypoints=torch.rand(2, 5, 2) * 50 + 40)
+    out = RandomCamera("dms130", min_filled=0.9)(keypoints=torch.rand(2, 5, 2) * 50 + 40, camera=camera)
     out["keypoints"][out["keypoints_valid"]].sum().backward()
     assert torch.isfinite(camera.intrinsics.grad).all()
     assert camera.intrinsics.grad.abs().sum() > 0

@@ -79,7 +79,8 @@ def test_a_seed_gives_the_warps_of_the_sample_call(name, p, same_on_batch):
 def test_a_made_augmentation_brings_its_camera_p_and_same_on_batch():
     made = augment.RandomMount(camera=camera(), p=0.25, same_on_batch=True)
     aug = adapter.CameraAugmentation(made)
-    assert (aug.p, aug.same_on_batch, aug.camera) == (0.25, True, made.camera)
+    assert (aug.p, aug.same_on_batch) == (0.25, True)
+    assert torch.equal(aug.camera.intrinsics, made.camera.intrinsics)
     assert adapter.CameraAugmentation(made, camera(), p=1.0).p == 1
     assert "yaw=(-10, 10)" in repr(aug)
 
@@ -421,24 +422,21 @@ def test_dtypes(dtype):
 
 
 @pytest.mark.parametrize("key", ["input", "keypoints"])
-def test_gradients_reach_a_learnable_camera(key):
-    own = camera().requires_grad_(True)
-    seq = K.AugmentationSequential(adapter.RandomCamera(own), data_keys=["input", "keypoints"])
-    assert any(value is own.intrinsics for value in seq.parameters())
+def test_gradients_reach_cameras_of_samples(key):
+    own = several().requires_grad_(True)
+    seq = K.AugmentationSequential(adapter.RandomCamera(camera()), data_keys=["input", "keypoints"])
+    params = adapter.with_cameras(seq.forward_parameters(images().shape), own)
     for _ in range(2):
-        moved = dict(zip(("input", "keypoints"), seq(images(), points()), strict=True))
+        moved = dict(zip(("input", "keypoints"), seq(images(), points(), params=params), strict=True))
         for gradient in torch.autograd.grad((moved[key] ** 2).sum(), (own.intrinsics, own.distortion)):
             assert torch.isfinite(gradient).all()
-            assert gradient.any()
+            assert (gradient != 0).any(1).all()
     with torch.no_grad():
-        frozen = seq(images(), points(), params=seq._params)
+        frozen = seq(images(), points(), params=params)
     # without a graph, maps may come from a lattice
     assert torch.allclose(frozen[0], moved["input"], atol=0.02)
-    copy.deepcopy(seq)
-    leaves = several().requires_grad_(True)
     aug = adapter.RandomMount(camera())
-    aug(images(), params=adapter.with_cameras(aug.forward_parameters(images().shape), leaves)).sum().backward()
-    assert (leaves.intrinsics.grad != 0).any(1).all()
+    aug(images(), params=adapter.with_cameras(aug.forward_parameters(images().shape), own))
     assert torch.equal(pickle.loads(pickle.dumps(aug)).last.rotation, aug.last.rotation)
 
 

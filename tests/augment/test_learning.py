@@ -1,0 +1,102 @@
+"""A camera given to an augmentation is copied and does not learn; that of a sample learns, except in a worker."""
+
+import importlib
+import inspect
+
+import pytest
+import torch
+from torch import nn
+from torch.utils.data import DataLoader
+from torchvision_stand_in import torchvision_of
+
+import camtorch as ct
+from camtorch import augment
+from camtorch.augment import kornia as adapter
+from camtorch.augment.sample import SampleTransform
+
+SIZE, MOUNT = (48, 64), augment.RandomMount()
+GIVEN = {"Compose": ([MOUNT],), "RandomShutter": (0.02, 30), "Pad": (2,), "Rotate90": (1,), "BoxCrop": ((32, 32),)}
+GIVEN |= dict.fromkeys(("CenterCrop", "RandomCrop", "Resize", "RandomResizedCrop"), (32,)) | {"CanonicalCamera": (60,)}
+CLASSES = [one for one in vars(augment).values() if inspect.isclass(one) and issubclass(one, SampleTransform)]
+BATCHES = {
+    one.__name__: lambda lens, one=one: one(*GIVEN.get(one.__name__, ()), camera=lens)
+    for one in (*CLASSES, ct.CanonicalCamera)
+    if one not in (augment.Augmentation, augment.Edit)
+}
+BATCHES |= {"part": lambda lens: augment.Compose([augment.RandomMount(camera=lens)])}
+SINGLE = {
+    "like": lambda lens: augment.RandomCamera(lens, camera=lens),
+    "kornia": lambda lens: adapter.RandomLens(lens, lens),
+    "kornia's part": lambda lens: adapter.CameraAugmentation(augment.RandomMount(camera=lens)),
+    "torchvision": lambda lens: importlib.import_module("camtorch.augment.torchvision").Transform(MOUNT, lens),
+}
+KINDS = "plain", "subclass", "parametrized", "predicted"
+
+
+class Own(ct.Pinhole):
+    """A model of somebody's own."""
+
+
+def lens_of(kind="plain"):
+    lens = (Own if kind == "subclass" else ct.Pinhole)([40.0, 40.0, 31.5, 23.5], image_size=SIZE)
+    if kind == "parametrized":
+        nn.utils.parametrize.register_parametrization(lens, "intrinsics", nn.Softplus())
+    return {"predicted": lens.replace(intrinsics=2 * lens.intrinsics), "mixed": ct.Mixed([lens, lens])}.get(kind, lens)
+
+
+def moved(held, lens=None, weight=1.0):
+    """What comes out of a batch of two samples."""
+    pose = torch.tensor([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 600], [0, 0, 0, 1]])
+    fields = {"image": weight * torch.ones(1, *SIZE), "boxes": torch.tensor([[5.0, 5, 40, 40]]), "head_pose": pose}
+    fields = {name: value.expand(2, *value.shape) for name, value in fields.items()} | (
+        {"camera": lens} if lens else {}
+    )
+    return held(fields) if isinstance(held, SampleTransform) else {"image": held(fields["image"])}
+
+
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [*((name, kind) for name in BATCHES | SINGLE for kind in KINDS), *((name, "mixed") for name in BATCHES)],
+)
+def test_a_given_camera_is_copied_and_does_not_learn(name, kind, monkeypatch):
+    lens, weight = lens_of(kind), nn.Parameter(torch.ones(()))
+    with torchvision_of("stand-in", monkeypatch):
+        held = (BATCHES | SINGLE)[name](lens)
+        cameras = [part for part in held.modules() if type(part) is type(lens)]
+        before = [camera.intrinsics.clone() for camera in cameras]
+        optimizer = torch.optim.Adam(nn.ModuleList([held, nn.ParameterList([weight])]).parameters(), lr=1.0)
+        moved(held, weight=weight)["image"].sum().backward()
+        optimizer.step()
+    for tensor in (*lens.parameters(), lens.intrinsics):
+        tensor.data += 1.0
+    assert cameras
+    assert {f"camera.{key}" for key in lens.state_dict()} <= held.state_dict().keys()
+    assert weight.item() < 0.5
+    assert not any(tensor.requires_grad for tensor in (*held.parameters(), *held.buffers()))
+    assert all(torch.equal(camera.intrinsics, was) for camera, was in zip(cameras, before, strict=True))
+
+
+@pytest.mark.parametrize("make", [ct.Dewarp, lambda lens: ct.Warp(lens_of().requires_grad_(False), lens)])
+def test_a_warp_says_whether_it_learns(make):
+    warp, matrix = make(lens_of()), torch.eye(3).requires_grad_()
+    assert ", learns\n" in repr(warp)
+    assert ", fixed\n" in repr(warp.requires_grad_(False))
+    assert ", learns\n" in repr(ct.Warp(warp.source, warp.target, matrix))
+
+
+class Learning(dict):
+    """Name -> the names of what learns among all that an augmentation makes of a sample whose camera learns."""
+
+    def __getitem__(self, name):
+        out = moved(super().__getitem__(name)(None), lens_of())
+        tensors = {n: v._tensors if isinstance(v, ct.Camera) else [v] for n, v in out.items()}
+        return {n for n, found in tensors.items() if any(tensor.requires_grad for tensor in found)}
+
+
+@pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
+def test_a_sample_s_camera_learns_but_not_in_a_worker():
+    samples = Learning(BATCHES, still=lambda lens: augment.RandomMount(p=0.0))
+    assert all(samples[name] for name in samples)
+    if "fork" in torch.multiprocessing.get_all_start_methods():
+        options = {"num_workers": 1, "multiprocessing_context": "fork", "sampler": list(samples)}
+        assert all(batch == [set()] for batch in DataLoader(samples, collate_fn=list, **options))
