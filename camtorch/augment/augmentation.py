@@ -492,6 +492,15 @@ class Augmentation(SampleTransform):
                 field that might be geometry, a draw of another size. TypeError: a field that is no tensor.
         """
         sample = self._given(sample, fields)
+        if clips := self._clips(sample):
+            own = sample.get("camera")
+            own = self.camera if own is None else own
+            frames = clips.frames(alone(own) if isinstance(own, Camera) else own)
+            drawn = self.drawn(clips.shape[0], self.p, self.same_on_batch, generator) if draw is None else draw
+            each = clips.shape[1]  # of what a draw needs of a sample, that of the first frame counts
+            first = {n: (kind, value[::each]) for n, (kind, value) in self._sorted(frames, self.fields).items()}
+            draw = {n: clips.repeated(value, f"draw[{n!r}]") for n, value in self._of_sample(drawn, first).items()}
+            return clips.restored(self.forward(frames, draw=draw))
         named, batched, count, camera = self._batch(sample)
         if draw is None:
             numbers = self._numbers(count, self.p, self.same_on_batch, generator)
@@ -523,6 +532,11 @@ class Augmentation(SampleTransform):
             ValueError: nothing was called, or the sample's camera is not the one that the change made.
         """
         sample = self._given(sample, fields)
+        if clips := self._clips(sample):
+            if draw is not None:
+                draw = {name: clips.repeated(value, f"draw[{name!r}]") for name, value in draw.items()}
+                camera = clips.repeated(self.camera if camera is None else camera, "camera")
+            return clips.restored(self.inverse(clips.frames(sample.get("camera")), draw=draw, camera=camera))
         change = self.last if draw is None else self.change(camera, draw)
         if change is None:
             raise ValueError(f"{self._name}: nothing to invert; call it first, or give draw= and camera=")

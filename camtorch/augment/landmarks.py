@@ -21,6 +21,11 @@ def _order(count: int, *runs: tuple[int, int, int]) -> tuple[int, ...]:
     return tuple(order)
 
 
+# runs (first, last, step): landmark i of first ... last changes places with i + step
+_MESH = (3, 3, 245), (7, 7, 242), (20, 93, 230), (95, 150, 229), (153, 163, 227), (165, 167, 226), (169, 174, 225)
+_MESH += (176, 194, 224), (196, 196, 223), (198, 198, 222), (201, 247, 220)
+_MESHES = [(i, i, 2 * i + step) for first, last, step in _MESH for i in range(first, last + 1)]
+
 LANDMARKS: dict[str, tuple[int, ...]] = {
     "ibug68": _order(
         68,
@@ -41,9 +46,12 @@ LANDMARKS: dict[str, tuple[int, ...]] = {
         *((84, 86, 174), (91, 92, 186), (96, 97, 196), (101, 101, 204)),
     ),
     "coco17": _order(17, *((i, i, 2 * i + 1) for i in range(1, 17, 2))),
+    "mediapipe468": _order(468, *_MESHES),
+    "mediapipe478": _order(478, *_MESHES, (468, 468, 941), (469, 471, 945), (472, 472, 949)),  # irises
 }
 """Name -> for every landmark, the one that it changes places with, or itself: the 68 of iBUG (300-W, dlib), the 98 of
-WFLW, the 106 of LaPa (JD-landmark; InsightFace has 106 in another order), and the 17 keypoints of COCO."""
+WFLW, the 106 of LaPa (JD-landmark; InsightFace has 106 in another order), the 17 keypoints of COCO, and MediaPipe's
+face mesh of 468 points, or of 478 with both irises."""
 
 TableLike = str | Sequence[int] | Sequence[Sequence[int]]
 
@@ -97,7 +105,9 @@ def as_table(value: TableLike, owner: str) -> Table:
     return Table(tuple(order), not pairs)
 
 
-_FACES = {68: "ibug68", 98: "wflw98", 106: "lapa106"}  # numbers of points that hardly anything else has
+# numbers of points that hardly anything else has
+_FACES = {len(LANDMARKS[name]): name for name in ("ibug68", "wflw98", "lapa106", "mediapipe468", "mediapipe478")}
+_told: set[int] = set()  # numbers of points of which this process has warned
 _HOLD = ("keypoints", "landmarks", "points")  # kinds of fields that may be landmarks
 _LEFT, _RIGHT = "_left", "_right"
 
@@ -136,37 +146,47 @@ class Mirroring:
         """Return the order of `count` landmarks of a field in a mirror, or None if they keep theirs."""
         table = self._named.get(name) if self._named is not None else self._one
         if table is None:
-            if self._named is None and self._one is None and kind in _HOLD[:2] and (meant := _FACES.get(count)):
+            meant = _FACES.get(count) if self._named is None and kind in _HOLD[:2] else None
+            if meant is not None and count not in _told:
+                _told.add(count)
                 warn(
                     f"{self.owner}: {name} holds {count} points and mirrored faces keep their order: point 0 is then "
                     f"on the other side. landmarks={meant!r}, if that is their order, puts them right; "
                     "landmarks={} says that they shall keep it"
                 )
             return None
-        order = table.of(count)
+        order, own = table.of(count), len(table.order)
         # 3D points may be others
         if order is None and (kind != "points" or self._named is not None):
             others = [known for known, its in LANDMARKS.items() if len(its) == count]
-            raise ValueError(
-                f"{self.owner}: {name} holds {count} points, the table of landmarks {len(table.order)}. "
-                f"landmarks={{{name!r}: {others[0] if others else None!r}}} says it by field"
-            )
+            hint = f"landmarks={{{name!r}: {repr(others[0]) if others else '[(left, right), ...]'}}} says it by field"
+            if not others and count % own == 0:
+                hint = f"Several faces go in as (B, F, {own}, 2): {name}.unflatten(-2, (-1, {own}))"
+            raise ValueError(f"{self.owner}: {name} holds {count} points, the table of landmarks {own}. {hint}")
         return order
 
-    def swapped(self, name: str, kind: str | None, value: Tensor, mirrored: Tensor, flags: bool = False) -> Tensor:
-        """Return landmarks (B, N, ...), mirrored rows in their order in a mirror; kind None: what does not move."""
+    def swapped(
+        self, name: str, kind: str | None, value: Tensor, mirrored: Tensor, flags: bool = False, axis: int = 1
+    ) -> Tensor:
+        """Return landmarks (B, *F, N, ...), mirrored rows in their order in a mirror.
+
+        kind None: what does not move, with its landmarks along `axis`. flags: it has no coordinates.
+        """
         if kind is None and value.ndim < 2:
             raise ValueError(
                 f"{self.owner}: {name} has a table of landmarks, and must be (B, N, ...); got {shown(value)}"
             )
         if (kind is not None and kind not in _HOLD) or value.ndim < (2 if flags else 3):
             return value
-        order = self.order(name, kind, value.shape[1])
+        if kind is not None:
+            axis = value.ndim - (1 if flags else 2)
+            axis -= axis > 1 and value.shape[axis] == 1  # OpenCV's (B, N, 1, 2)
+        order = self.order(name, kind, value.shape[axis])
         if order is None:
             return value
         if len(mirrored) != len(value):  # of what nobody else has looked at
             raise ValueError(f"{self.owner}: {name} is of {len(value)} samples, other fields are of {len(mirrored)}")
-        other = value.index_select(1, torch.tensor(order, device=value.device))
+        other = value.index_select(axis, torch.tensor(order, device=value.device))
         return torch.where(_lifted(mirrored, value), other, value)
 
     def sides(self, names: Iterable[str]) -> list[tuple[str, str]]:

@@ -35,6 +35,7 @@ from camtorch._arguments import (
 from camtorch._threads import on_one_thread
 from camtorch._tracing import may_look
 from camtorch.augment.change import Change, Part, View, alone, as_one
+from camtorch.augment.clips import Clips
 from camtorch.augment.landmarks import Mirroring, exchanged
 from camtorch.camera import Camera
 from camtorch.models import Pinhole
@@ -141,7 +142,7 @@ KINDS = {
     "mask": Field(2, 3, (), _MASKS, _planes(lambda change, masks, given: change.labels(masks, given["mask_fill"]))),
     "depth": Field(2, 3, (), f"{_DEPTHS} z", _planes(lambda change, depth, _: change.depth(depth))),
     "distance": Field(2, 3, (), f"{_DEPTHS} the ray", _planes(lambda change, distance, _: change.distance(distance))),
-    "keypoints": Field(2, 3, (2,), "(B, N, 2) pixels x, y", _pixels, True),
+    "keypoints": Field(2, 3, (2,), "(B, N, 2) or (B, F, N, 2) pixels x, y", _pixels, True),
     "polygons": Field(3, 3, (2,), "(B, M, K, 2) corners x, y", _pixels, True),
     "boxes": Field(2, 2, (4,), "(B, M, 4) pixels x1, y1, x2, y2", lambda change, boxes, _: change.boxes(boxes), True),
     "landmarks": Field(2, 3, (2, 3), "(B, N, 2) pixels or (B, N, 3) points of the camera frame", _pixels, True),
@@ -157,7 +158,6 @@ KINDS = {
 }
 _CHECKED = ("boxes", "rvec", "head_pose", "pose", "pitch_yaw")
 """Whose values are checked, not their shape alone."""
-_SINGLE_FILE = ("keypoints", "landmarks")  # which OpenCV has as (N, 1, 2)
 _ALIASES = {"images": "image", "masks": "mask", "bboxes": "boxes", "point": "points", "face_center": "points"}
 OWN = ("camera", "source_camera", "source_rotation", "scale")  # these come with a change and do not move
 
@@ -238,13 +238,13 @@ def check(kind: str, name: str, value: Tensor, batched: bool, owner: str) -> Non
     field = KINDS[kind]
     dims = value.ndim - batched
     least, most = field.dims, field.most_dims
-    if kind in _SINGLE_FILE and dims == most and value.shape[-2] != 1:
-        most -= 1
     if not least <= dims <= most or (field.last and value.shape[-1] not in field.last):
         what = field.shape if batched else field.shape.replace("(B, ", "(")
         hint = _hint(name)
         if kind in ("rvec", "tvec") and value.shape[-2:] == (3, 1):
             hint = f". OpenCV's column goes in as {name}[..., 0]"
+        if kind == "image" and value.ndim == 5:
+            hint = f". The frames of clips go in as a batch, by {name}.flatten(0, 1)"
         if kind == "keypoints" and value.ndim and value.shape[-1] == 3:
             hint = f". Of x, y and visibility, [..., 2] goes in as {name}_valid=..., a flag for each"
         raise ValueError(f"{owner}: {name} must be {what}; got shape {tuple(value.shape)}{hint}")
@@ -459,6 +459,21 @@ class SampleTransform(nn.Module):
             raise TypeError(f"{self._name}: a sample is a dict of fields, or keywords, as in image=...; got {got}")
         return sample if isinstance(sample, Single) and not fields else {**(sample or {}), **fields}
 
+    def _clips(self, sample: Sample, kinds: Mapping[str, str] | None = None) -> Clips | None:
+        """Return the clips of a sample, if an image has the dims (B, T, C, H, W)."""
+        if all(getattr(value, "ndim", 0) != 5 for value in sample.values()):
+            return None
+        fields = {**self.fields, **(kinds or {})}
+        given = {name: value for name, value in sample.items() if name not in OWN and value is not None}
+        found = {name: kind_of(name, value, fields, self._name) for name, value in given.items()}
+        images = [name for name, kind in found.items() if kind == "image" and getattr(given[name], "ndim", 0) == 5]
+        if not images:
+            return None
+        own = {name for name, kind in found.items() if kind is not None and name != "rotation"}
+        own |= {f"{name}_valid" for name in own} | {"image_valid", *(self.mirroring.by_name if self.mirroring else ())}
+        shape = tuple(given[images[0]].shape[:2])
+        return Clips(sample, [name for name in given if name in own], shape, self._name, images[0])
+
     def _sorted(self, sample: Sample, fields: Mapping[str, str]) -> Named:
         """The fields that move."""
         named: Named = {}
@@ -621,6 +636,8 @@ class SampleTransform(nn.Module):
             A new dict with all fields moved, and their validity, `camera` and `rotation`.
         """
         sample = self._given(sample, {})
+        if clips := self._clips(sample, kinds):
+            return clips.restored(self.moved_by(change, clips.frames(None), kinds, predicted))
         first = change.parts[0]
         camera = first.camera if first.rows is None else change.source
         named, batched, count, _ = self._batch(sample, camera, predicted, kinds)
@@ -687,6 +704,12 @@ class SampleTransform(nn.Module):
                     f"{type(value).__name__}"
                 )
             moved[name] = [torch.as_tensor(v) for v in value] if several else torch.as_tensor(value)
+        faces = {  # (F, N) of landmarks of several faces
+            tuple(one.shape[-3:-1])
+            for found, value in named.values()
+            for one in (value if isinstance(value, list) else value[:1])
+            if found in ("keypoints", "landmarks") and one.ndim == 3
+        }
         for name, (found, _) in {**named, **kept}.items():
             for key, flags in ((name, found is None), (f"{name}_valid", True)):
                 if key not in moved:
@@ -694,11 +717,12 @@ class SampleTransform(nn.Module):
                 now, single = moved[key], not (batched or isinstance(moved[key], list))
                 now = now[None] if single else now
                 rows = torch.zeros(len(now), dtype=torch.bool) if mirrored is None else mirrored
+                axis = 2 if len(now) and tuple(now[0].shape[:2]) in faces else 1
                 if isinstance(now, list):
                     pairs = zip(now, rows, strict=False)
-                    moved[key] = [mirroring.swapped(name, found, v[None], row[None], flags)[0] for v, row in pairs]
+                    moved[key] = [mirroring.swapped(name, found, v[None], r[None], flags, axis)[0] for v, r in pairs]
                 else:
-                    swapped = mirroring.swapped(name, found, now, rows, flags)
+                    swapped = mirroring.swapped(name, found, now, rows, flags, axis)
                     moved[key] = swapped[0] if single else swapped
         for left, right in sides if mirrored is not None else ():
             for pair in ((left, right), (f"{left}_valid", f"{right}_valid")):
