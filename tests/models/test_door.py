@@ -23,6 +23,7 @@ POSE, FROM, TABLE = ct.Extrinsics, ct.Extrinsics.from_matrix, ct.Tabulated.from_
 R, RVEC, TVEC = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), np.array([0.1, -0.2, 0.3]), np.array([1.0, 2.0, 3.0])
 OCAM, SS, CENTRE = ct.OCamCalib.from_ocamcalib, (-206.517, 0.0, 2.207161e-03), (241.8, 394.6)
 NAN, A, REPROJECTION = math.nan, ct.augment, ct.losses.reprojection
+SIZED = {"pixel_grid": (), "contains": ([0, 0],), "resize": (9, 9), "pad": (1, 1, 1, 1), "hflip": (), "vflip": ()}
 FLIP, IMAGE, UV = A.HorizontalFlip(1.0, landmarks="coco17"), torch.rand(3, *SIZE), torch.rand(17, 2)
 
 
@@ -62,17 +63,12 @@ WRONG = [
     # intrinsics
     (lambda: ct.Fisheye624([300.0, 320.0, 240.0]), ValueError, r"^Fisheye624: intrinsics .*\(3,\)"),
     (lambda: ct.Fisheye624(np.eye(3)), ValueError, r"^Fisheye624: intrinsics .*\(3, 3\).*from_matrix"),
-    (lambda: ct.Fisheye624(5.0), ValueError, r"^Fisheye624: intrinsics .*\(\)"),
     (lambda: ct.Pinhole([0.0, 300.0, 320.0, 240.0]), ValueError, r"^Pinhole: focal lengths .*0\.0"),
-    (lambda: ct.Pinhole([300.0, -310.0, 320.0, 240.0]), ValueError, r"^Pinhole: focal lengths .*-310\.0"),
     (lambda: ct.Pinhole([INTRINSICS, [300.0, -1.0, 320.0, 240.0]]), ValueError, r"^Pinhole: focal lengths .*-1\.0"),
-    (lambda: ct.Pinhole([NAN, 300.0, 320.0, 240.0]), ValueError, r"^Pinhole: intrinsics .*nan"),
     (lambda: ct.Pinhole(leaf(NAN, 300.0, 320.0, 240.0)), ValueError, r"^Pinhole: intrinsics .*nan"),
     (lambda: ct.Pinhole(leaf(-300.0, 300.0, 320.0, 240.0)), ValueError, r"^Pinhole: focal lengths .*-300\.0"),
     (lambda: ct.Fisheye624("300 300 320 240"), TypeError, r"^Fisheye624: intrinsics .*str"),
-    (lambda: ct.Fisheye624({"fx": 300}), TypeError, r"^Fisheye624: intrinsics .*dict"),
     (lambda: ct.Fisheye624(torch.ones(4, dtype=torch.complex64)), TypeError, r"intrinsics .*complex64"),
-    (lambda: ct.Fisheye624(torch.ones(4, dtype=torch.bool)), TypeError, r"intrinsics .*bool"),
     (lambda: ct.Pinhole(np.array(INTRINSICS)[:, None]), ValueError, r"intrinsics\[\.\.\., 0\]"),
     # matrices
     (lambda: from_changed(0, 1, 0.25), ValueError, r"KannalaBrandt.*skew.*0\.25.*ignore_skew"),
@@ -82,12 +78,9 @@ WRONG = [
     (lambda: from_changed(0, 0, -300.0), ValueError, r"KannalaBrandt.*focal.*-300\.0"),
     (lambda: ct.Pinhole.from_matrix(K[:2]), ValueError, r"Pinhole.*K.*\(2, 3\)"),
     (lambda: ct.Pinhole.from_matrix("K"), TypeError, "K"),
-    (lambda: ct.Pinhole.from_matrix(None), TypeError, "K"),
     # sizes
     (lambda: of_size(640), TypeError, r"^KannalaBrandt: image_size .*height.*640"),
-    (lambda: of_size("480x640"), TypeError, r"image_size .*height.*480x640"),
     (lambda: of_size((480.5, 640)), TypeError, r"image_size .*height.*\(480\.5, 640\)"),
-    (lambda: of_size((480,)), TypeError, r"image_size .*height.*\(480,\)"),
     (lambda: of_size((480, 640, 3)), TypeError, r"image_size .*height.*\(480, 640, 3\)"),
     (lambda: of_size((0, 640)), ValueError, r"image_size .*height.*\(0, 640\)"),
     (lambda: CAMERA.resize(0, 10), ValueError, r"^Pinhole.*\(0, 10\)"),
@@ -95,13 +88,10 @@ WRONG = [
     (lambda: CAMERA.crop(0, 0, 0, 10), ValueError, r"^Pinhole.*\(0, 10\)"),
     (lambda: CAMERA.crop(0, 0, 10.5, 10), TypeError, r"^Pinhole.*\(10\.5, 10\)"),
     (lambda: CAMERA.pad(-700, 0, 0, 0), ValueError, r"^Pinhole.*\(480, -60\)"),
-    (lambda: BARE.pixel_grid(), ValueError, "^Pinhole.*pixel_grid.*image_size"),
-    (lambda: BARE.rays(), ValueError, "^Pinhole.*pixel_grid.*image_size"),
-    (lambda: BARE.contains(torch.zeros(2)), ValueError, "^Pinhole.*contains.*image_size"),
-    (lambda: BARE.resize(10, 10), ValueError, "^Pinhole.*resize.*image_size"),
-    (lambda: BARE.pad(1, 1, 1, 1), ValueError, "^Pinhole.*pad.*image_size"),
-    (lambda: BARE.hflip(), ValueError, "^Pinhole.*hflip.*image_size"),
-    (lambda: BARE.vflip(), ValueError, "^Pinhole.*vflip.*image_size"),
+    *(
+        (lambda name=name, given=given: getattr(BARE, name)(*given), ValueError, f"^Pinhole.*{name}.*image_size")
+        for name, given in SIZED.items()
+    ),
     (lambda: BARE.width, ValueError, r"^Pinhole: width needs .*image_size"),
     (lambda: BARE.fov, ValueError, "image"),
     (lambda: CAMERA.rays(stride=14), ValueError, r"stride 14 .* \.crop\(0, 0, 476, 630\) .* \.pad\(0, 4, 0, 10\)"),
@@ -114,7 +104,6 @@ WRONG = [
     (lambda: GENERAL(INTRINSICS, "1 2"), TypeError, "^KannalaBrandt.*coefficients.*str"),
     (lambda: GENERAL([1.0, 2.0, 3.0], [1.0, 0.1]), ValueError, r"intrinsics.*\(3,\)"),
     (lambda: ct.Pinhole.from_matrix(K, np.zeros((1, 5))), ValueError, r"no distortion.*\(1, 5\).*BrownConrady"),
-    (lambda: ct.Equirectangular.from_matrix(K, np.zeros(5)), ValueError, r"no distortion.*\(5,\).*BrownConrady"),
     (lambda: ct.KannalaBrandt(INTRINSICS, np.zeros((4, 1, 1))), ValueError, "coefficients of one lens"),
     (lambda: ct.FTheta.from_polynomial([1.0], [1.0, 2]), ValueError, "centre"),
     (lambda: ct.FTheta.from_polynomial([1.0, 2], [1.0]), ValueError, "n >= 2"),
@@ -142,7 +131,6 @@ WRONG = [
     (lambda: CAMERA.convert("splined:16x11"), ValueError, "is how a grid is written"),
     # fields of view
     (lambda: from_fov(0), ValueError, r"^Pinhole\.from_fov: .*above 0"),
-    (lambda: from_fov(361), ValueError, r"^Pinhole\.from_fov: .*up to 360"),
     (lambda: from_fov(180), ValueError, r"no horizontal field of view of 180.*179\.9"),
     (lambda: from_fov(60, axis="x"), ValueError, "axis must be one of .*'x'"),
     (lambda: from_fov(60, image_size=None), ValueError, r"^Pinhole\.from_fov: .*image_size"),
@@ -211,16 +199,11 @@ WRONG = [
     (lambda: POSE(RVEC, TVEC)(torch.zeros(4, 2)), ValueError, r"points_world .*\(4, 2\)"),
     (lambda: POSE(R, np.zeros((3, 3))), ValueError, r"from_matrix\(rotation, tr.*rotation\[\.\.\., None\]"),
     (lambda: POSE(np.ones((3, 3)), TVEC), ValueError, r"rotation matrices.*rotation\[\.\.\., None\]"),
-    (lambda: POSE(2 * R, TVEC), ValueError, "rotation matrices"),
     (lambda: POSE(-R, TVEC), ValueError, "rotation matrices.*det"),
-    (lambda: FROM((2 * R, TVEC)), ValueError, "rotation matrices"),
-    (lambda: FROM((RVEC, TVEC)), ValueError, r"\(2, 3\)"),
     (lambda: FROM(RVEC, TVEC), ValueError, r"\(3,\).*Extrinsics\(rotation, translation\)"),
-    (lambda: POSE(np.zeros((3, 2)), TVEC), ValueError, r"rotation .*\(3, 2\)"),
     (lambda: POSE(RVEC, np.zeros((4, 1))), ValueError, r"translation .*\(4, 1\)"),
     (lambda: POSE(torch.nn.Parameter(torch.zeros(3, 1)), TVEC), ValueError, r"Parameter rotation .*\(3, 1\)"),
     (lambda: POSE([0, 90, 0], TVEC), ValueError, "rotation holds.*radians; an angle of .* seems to be degrees"),
-    (lambda: POSE([[[0.0], [45.0], [0.0]]], TVEC), ValueError, "seems to be degrees"),
     (lambda: ct.Warp(CAMERA, CAMERA, RVEC), ValueError, r"rotation must be .*Extrinsics\(vector"),
     (lambda: ct.head_angles(EYE[:2, :2]), ValueError, r"^head_angles: .*\(\.\.\., 3, 3\); got shape \(2, 2\)"),
     (lambda: ct.head_angles(np.diag([1.0, 1, -1])), ValueError, "^head_angles: .*must hold rotation matrices"),

@@ -1,7 +1,6 @@
 """A camera is a torch module like any other: compiled, transformed, exported, copied, saved, learned, predicted."""
 
 import copy
-import io
 import pickle
 import re
 
@@ -80,35 +79,6 @@ def test_compile_to_machine_code():
     assert_same(compiled(points), camera(points), rtol=1e-12, atol=0)
 
 
-def loaded(module, values, **options):
-    """A module that was exported, saved and loaded."""
-    file = io.BytesIO()
-    torch.export.save(torch.export.export(module, (values,), **options), file)
-    file.seek(0)
-    return torch.export.load(file).module()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("key", "method"), [("kannala_brandt", "project"), ("pinhole", "project"), ("equirectangular", "unproject")]
-)
-def test_export(key, method):
-    module, values = module_and_input(key, method)
-    module.requires_grad_(False)
-    exported = loaded(module, values, dynamic_shapes=({0: torch.export.Dim("count", min=2)},))
-    for rows in (values, values[:9]):
-        assert_same(exported(rows), module(rows))
-
-
-@each_kind
-@both_directions
-def test_vmap_over_values(key, method):
-    module, values = module_and_input(key, method)
-    assert_same(vmap(module)(values), module(values))
-    grid = values[:32].unflatten(0, (4, 8))
-    assert_same(vmap(vmap(module))(grid), module(grid))
-
-
 @each_kind
 @both_directions
 def test_functional_calls_also_in_vmap(key, method):
@@ -157,14 +127,21 @@ def test_forward_and_reverse_mode_agree(key, method):
 
 @each_kind
 @both_directions
-def test_gradient_checkpointing_and_inference_mode(key, method):
-    module, values = module_and_input(key, method)
+def test_transforms_and_contexts_of_torch_change_nothing(key, method):
+    module, values = module_and_input(key, method, torch.float32)
+    expected = module(values)
     with torch.inference_mode():
         inferred = [t.clone() for t in module(values)]
+    with torch.autocast("cpu", torch.bfloat16):
+        assert_same(module(values), expected, rtol=0, atol=0)
     checkpointed = torch.utils.checkpoint.checkpoint(module, values, use_reentrant=False)
     for results in (inferred, checkpointed):
-        assert_same(results, module(values))
+        assert_same(results, expected)
     checkpointed[0].sum().backward()
+    module, values = module_and_input(key, method)
+    assert_same(vmap(module)(values), module(values))
+    grid = values[:32].unflatten(0, (4, 8))
+    assert_same(vmap(vmap(module))(grid), module(grid))
 
 
 # -- copies and files
@@ -275,17 +252,6 @@ def test_plain_values_become_parameters(key):
 
 
 @each_kind
-@both_directions
-def test_autocast_does_not_touch_geometry(key, method):
-    module, values = module_and_input(key, method, torch.float32)
-    expected = module(values)
-    with torch.autocast("cpu", torch.bfloat16):
-        results = module(values)
-    assert results[0].dtype == torch.float32
-    assert_same(results, expected, rtol=0, atol=0)
-
-
-@each_kind
 def test_low_precision_networks_keep_their_geometry(key):
     network = nn.ModuleDict({"layer": nn.Linear(2, 2), "camera": one(key).float()})
     before = network["camera"].intrinsics.detach().clone()
@@ -343,3 +309,34 @@ def test_an_edited_camera_learns_what_the_original_learns():
     assert not any(p.requires_grad for p in edited.parameters())
     edited.project(torch.tensor([0.1, 0.2, 1.0]))[0].sum().backward()
     assert (camera.distortion.grad != 0).all()
+
+
+# -- results belong to the caller
+
+
+@each_kind
+@both_directions
+@pytest.mark.parametrize("rows", [(), (2, 3)])
+def test_results_may_be_edited_in_place(key, method, rows):
+    """The gradient is that of the same edits made out of place."""
+    _, values = module_and_input(key, method)
+    values, camera = values.expand(*rows, -1, -1), one(key)
+    gradients = []
+    for in_place in (True, False):
+        leaves = [p.detach().clone().requires_grad_() for p in camera.parameters()]
+        points = values.clone().requires_grad_()
+        result, valid = getattr(type(camera)(*leaves), method)(points)
+        keep = torch.arange(valid.shape[-1]) % 3 > 0
+        weights = torch.linspace(-1, 2, result.numel(), dtype=result.dtype).view_as(result)
+        if in_place:
+            valid &= keep
+            result *= weights
+            result[..., 0] += 1.0
+            result[~valid] = 7.0
+            valid |= True
+        else:
+            result = torch.where((valid & keep)[..., None], result * weights + torch.eye(result.shape[-1])[0], 7.0)
+        result.square().sum().backward()
+        gradients.append([points.grad, *(leaf.grad for leaf in leaves)])
+    for edited, expected in zip(*gradients, strict=True):
+        torch.testing.assert_close(edited, expected, rtol=1e-9, atol=1e-9)
