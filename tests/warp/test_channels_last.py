@@ -1,7 +1,6 @@
 """Images whose channels come last in memory, as NumPy, OpenCV and Pillow have them: read and written where they lie."""
 
 import functools
-import math
 import re
 import warnings
 
@@ -201,20 +200,3 @@ def test_the_error_for_an_array_says_lines_that_work(name):
     assert np.abs(made.astype(int) - np.asarray(array).astype(int)).mean() < 80  # the same image, bent
     if isinstance(array, np.ndarray) and all(step > 0 for step in array.strides):
         assert images.data_ptr() == array.ctypes.data
-
-
-@pytest.mark.parametrize("size", [(60, 80), (60, 43), (60, 42), (5, 64)])
-@pytest.mark.parametrize("shrunk", [1.0, 1.3, 1.6, 2.4, 2.6, 3.0])
-def test_colours_are_those_of_planes_however_much_images_shrink(shrunk, size):
-    """Sixteen pixels are read from parts of rows, as long as they lie in these."""
-    middle = [(size[1] - 1) / 2, (size[0] - 1) / 2]
-    source, target = (ct.Pinhole([f, f, *middle], image_size=size) for f in (90.0, 90.0 / shrunk))
-    image = torch.from_numpy(colours(size=size)).permute(2, 0, 1)[None]
-    for roll in (0.0, 0.05, 0.3, 3.1):
-        cos, sin = math.cos(roll), math.sin(roll)
-        rotation = torch.tensor([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]])
-        warp = ct.Warp(source, target, rotation).requires_grad_(False)
-        assert image.is_contiguous(memory_format=torch.channels_last)
-        together, planes = warp(image), warp(image.contiguous())
-        assert (together.int() - planes.int()).abs().max() <= 1
-        assert (together - warp(image.contiguous().float())).abs().max() < 0.52

@@ -1,6 +1,5 @@
 """Rolling shutters: undone and put on as rows are rendered one by one, there and back, with gradients."""
 
-import math
 from functools import partial
 
 import numpy as np
@@ -26,14 +25,10 @@ def shutter(dtype=torch.float64, rates=RATES, readout=READOUT, **options):
 
 
 def turns(times, rates):
-    """(N, 3, 3) NumPy alone: frame at time 0 from the camera's at each time, which turns at constant rates."""
-    result = []
-    for t in times:
-        x, y, z = np.array(rates) * t
-        angle = math.sqrt(x * x + y * y + z * z)
-        k = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) / max(angle, 1e-300)
-        result.append(np.eye(3) + math.sin(angle) * k + (1 - math.cos(angle)) * k @ k)
-    return np.stack(result)
+    """(N, 3, 3): frame at time 0 from the camera's at each time, which turns at constant rates."""
+    x, y, z = rates
+    skew = torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]], dtype=torch.float64)
+    return torch.linalg.matrix_exp(torch.from_numpy(times)[:, None, None] * skew).numpy()
 
 
 def moments(size, direction):

@@ -49,17 +49,6 @@ def test_the_identity_warp_is_the_identity(key):
     torch.testing.assert_close(moved[seen], pixels[seen], atol=1e-10, rtol=0)
 
 
-def test_a_pinhole_turned_is_a_homography():
-    camera, rotation = pinhole(dtype=torch.float64), turn(7, -4, 11, torch.float64)
-    homography = camera.K.detach() @ rotation @ torch.linalg.inv(camera.K.detach())
-    pixels = torch.cat((camera.pixel_grid(), torch.ones(*SIZE, 1, dtype=torch.float64)), -1)
-    expected = pixels @ homography.T
-    moved, valid = ct.Warp(camera, camera, rotation).transform_points(camera.pixel_grid())
-    expected = expected[..., :2] / expected[..., 2:]
-    torch.testing.assert_close(moved.detach(), expected, atol=1e-9, rtol=0)
-    assert torch.equal(valid, camera.contains(expected))
-
-
 def test_boxes_enclose_the_curved_outline():
     # a source that bends straight edges outwards: the corners alone would cut the box off
     numbers = torch.tensor([300.0, 300, 320, 240], dtype=torch.float64)
