@@ -16,29 +16,6 @@ from . import SIZE, close, elsewhere, equal, photograph, pixels, plane, points, 
 HEIGHT, WIDTH = SIZE
 FISHEYE = [75.0, 77.5, 80.0, 60.0, 0.02, -0.01, 0.003, -0.001]
 OPENCV = [75.0, 77.5, 80.0, 60.0, -0.28, 0.1, 1e-3, -5e-4]
-RADTAN = [0.02, -0.01, 3e-3, -1e-3, 1e-4, -1e-4, 1e-3, -5e-4, 1e-3, 2e-4, 2e-3, 1e-4]
-MODELS = {
-    ct.Pinhole: {"SIMPLE_PINHOLE": [], "PINHOLE": []},
-    ct.BrownConrady: {
-        "SIMPLE_RADIAL": [-0.1],
-        "RADIAL": [-0.1, 0.02],
-        "OPENCV": [-0.1, 0.02, 1e-3, -5e-4],
-        "FULL_OPENCV": [-0.1, 0.02, 1e-3, -5e-4, 0.001, 0.01, 0.002, -0.003],
-    },
-    ct.KannalaBrandt: {
-        "SIMPLE_FISHEYE": [],
-        "FISHEYE": [],
-        "SIMPLE_RADIAL_FISHEYE": [0.02],
-        "RADIAL_FISHEYE": [0.02, -0.01],
-        "OPENCV_FISHEYE": [0.02, -0.01, 0.003, -0.001],
-    },
-    ct.ThinPrismFisheye: {"THIN_PRISM_FISHEYE": [0.02, -0.01, 1e-3, -5e-4, 0.002, -0.001, 1e-3, 2e-3]},
-    ct.Fisheye624: {"RAD_TAN_THIN_PRISM_FISHEYE": RADTAN},
-    ct.FOV: {"FOV": [0.8]},
-    ct.Division: {"SIMPLE_DIVISION": [-0.1], "DIVISION": [-0.1]},
-    ct.EUCM: {"EUCM": [0.6, 1.1]},
-    ct.Equirectangular: {"EQUIRECTANGULAR": None},
-}
 X, UV, HALF = points(), pixels(), torch.tensor([0, 0, 0.5, 0.5])
 IN_K = torch.tensor([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
 POSE = ct.Extrinsics(np.array([0.1, -0.2, 0.05]), np.array([0.1, 0.2, 0.3])).requires_grad_(False)
@@ -111,7 +88,12 @@ equal("pycolmap", {
     "undistort_camera": lambda: [undistorted()],
     "estimate_and_refine_absolute_pose": lambda: [posed()],
 })  # fmt: skip
-elsewhere("pycolmap", {"Reconstruction.write Reconstruction.images": "io/test_file_tools.py::test_colmap"})
+elsewhere("pycolmap", {
+    "Reconstruction.write Reconstruction.images": "io/test_file_tools.py::test_colmap",
+    "CameraModelId.SIMPLE_PINHOLE CameraModelId.SIMPLE_RADIAL CameraModelId.SIMPLE_FISHEYE CameraModelId.FOV "
+    "CameraModelId.THIN_PRISM_FISHEYE CameraModelId.RAD_TAN_THIN_PRISM_FISHEYE CameraModelId.SIMPLE_DIVISION "
+    "CameraModelId.EUCM CameraModelId.EQUIRECTANGULAR": "io/test_files.py::test_each_model_of_colmap",
+})  # fmt: skip
 
 
 @row("pycolmap.Reconstruction", "pycolmap.Reconstruction.cameras")
@@ -135,21 +117,6 @@ def triangulate():
     close(found[0], pycolmap.triangulate_point(*matrices, *plane(LENS.unproject(seen)[0]).numpy()[:, 0]), 1e-6)
     robust = pycolmap.estimate_triangulation(seen[:, 0].numpy() + 0.5, [pycolmap.Rigid3d(), moved()], [theirs()] * 2)
     close(found[0], robust["xyz"], 1e-3)
-
-
-def same_model(kind, tmp_path):
-    for name, distortion in MODELS[kind].items():
-        focal = [75.0] if name.startswith(("SIMPLE", "RADIAL")) else [75.0, 77.5]
-        camera = theirs(name, [WIDTH, HEIGHT] if distortion is None else [*focal, 80.0, 60.0, *distortion])
-        (tmp_path / name).mkdir()
-        reconstruction(camera).write(tmp_path / name)
-        ours = ct.load(tmp_path / name)["a.jpg"]
-        assert type(ours) is kind
-        close(ours.project(X)[0] + 0.5, camera.img_from_cam(X), 1e-6)
-
-
-for _kind, _names in MODELS.items():
-    row(f"pycolmap.CameraModelId.{next(iter(_names))}")(functools.partial(same_model, _kind))
 
 
 @trap
