@@ -89,7 +89,7 @@ equal("pycolmap", {
     "estimate_and_refine_absolute_pose": lambda: [posed()],
 })  # fmt: skip
 elsewhere("pycolmap", {
-    "Reconstruction.write Reconstruction.images": "io/test_file_tools.py::test_colmap",
+    "Reconstruction.write Reconstruction.images": "io/test_files.py::test_colmap",
     "CameraModelId.SIMPLE_PINHOLE CameraModelId.SIMPLE_RADIAL CameraModelId.SIMPLE_FISHEYE CameraModelId.FOV "
     "CameraModelId.THIN_PRISM_FISHEYE CameraModelId.RAD_TAN_THIN_PRISM_FISHEYE CameraModelId.SIMPLE_DIVISION "
     "CameraModelId.EUCM CameraModelId.EQUIRECTANGULAR": "io/test_files.py::test_each_model_of_colmap",

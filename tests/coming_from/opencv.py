@@ -169,7 +169,7 @@ elsewhere("cv2", {
     "stereoRectify reprojectImageTo3D": "stereo/test_rectify.py::test_opencv_has_the_same_matrices",
     "findChessboardCornersSB":
         "boards/test_detection.py::test_noisy_and_blurred_chessboards_are_found_no_worse_than_by_their_sectors",
-    "FileStorage": "io/test_file_tools.py::test_opencv",
+    "FileStorage": "io/test_files.py::test_opencv",
 })  # fmt: skip
 
 

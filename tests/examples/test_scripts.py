@@ -1,6 +1,8 @@
 """The scripts: what they measure can fail, what they learn from is labelled truly, and each writes its figure."""
 
+import json
 import math
+from pathlib import Path
 
 import dewarp_room
 import driver_monitoring
@@ -11,8 +13,10 @@ import stereo_room
 import surround_view
 import torch
 import train_faces
+from boards import FOLDER, ov_plane
 from PIL import Image
-from scenes import cabin, faces
+from scenes import cabin, driver, faces
+from scenes.cabin import CLASSES, LANDMARKS, random_drivers, render_classes
 from scenes.faces import NAMES, SIDE, SIZE, Photographs, Samples
 
 import camtorch as ct
@@ -207,3 +211,48 @@ def test_regions_and_shares_are_those_of_the_car_by_each_mount(name):
     heads = torch.stack((turned, straight, straight)).double()
     share = driver_monitoring.head_share(gaze.double() @ turn, turn.T @ heads, pose)
     torch.testing.assert_close(share, torch.tensor([1.0, 0, 0]).double(), atol=1e-6, rtol=0)
+
+
+# -- the photograph of the README
+
+PHOTOGRAPHS = Path(__file__).parents[2] / "examples" / "photographs"
+
+
+def test_the_calibration_fits_the_photograph():
+    camera = ct.load(PHOTOGRAPHS / "fisheye.yml").camera.requires_grad_(False)
+    with Image.open(PHOTOGRAPHS / "fisheye.jpg") as image:
+        assert image.size == (camera.width, camera.height)
+    views = [view["image"] for view in json.loads((FOLDER / "ov_plane.json").read_text())["train"]]
+    train = ov_plane("train")
+    seen = train.image_points[views.index("br0_cam01-2020-05-07-14-00-30")]
+    _, rms, valid = ct.solve_pnp(camera, train.object_points, seen)
+    assert valid
+    assert rms < 0.6
+    # columns of the board lie on straight lines once it is dewarped, and do not before
+    straight, on_image = ct.Dewarp(camera).transform_points(seen)
+
+    def bend(pixels):
+        columns = zip(pixels.view(22, 22, 2).transpose(0, 1), on_image.view(22, 22).T, strict=True)
+        lines = [column[use] for column, use in columns if use.sum() > 5]
+        return max(float(torch.linalg.svdvals(line - line.mean(0))[1]) / len(line) ** 0.5 for line in lines)
+
+    assert bend(straight) < 1
+    assert bend(seen) > 10
+
+
+# -- scenes
+
+
+def test_landmarks_are_on_the_surface_that_is_seen():
+    drivers = random_drivers(4, torch.Generator().manual_seed(3), spread=0.4)
+    front = ["right_eye_inner", "left_eye_inner", "nose_tip", "mouth_top", "mouth_bottom", "mouth_left", "mouth_right"]
+    points = drivers.landmarks()[..., [LANDMARKS.index(name) for name in front], :].float()
+    local = (points - drivers.pose[:, None, :3, 3].float()) @ drivers.pose[:, :3, :3].float()
+    shape = driver.Shape._make(c[:, None].float() for c in driver.shape_of(drivers.looks))
+    assert driver.skin(tuple(local.unbind(-1)), shape).abs().max() < 5e-4
+    camera = ct.Pinhole([80.0, 80.0, 39.5, 39.5], image_size=(80, 80)).requires_grad_(False)
+    classes, at = render_classes(camera, drivers)[:, 0], camera.project(points)[0].round().long()
+    kinds = torch.stack([c[p[:, 1], p[:, 0]] for c, p in zip(classes, at, strict=True)])
+    assert bool(((kinds == CLASSES.index("skin")) | (kinds == CLASSES.index("eye"))).all())
+    for low, marks in zip(camera.project(drivers.face_box_points())[0], camera.project(points)[0], strict=True):
+        assert bool(((marks > low.amin(0) - 1) & (marks < low.amax(0) + 1)).all())

@@ -9,6 +9,7 @@ import torch
 from torch.autograd import gradcheck, gradgradcheck
 
 import camtorch as ct
+from camtorch.rotations import are_rotations, nearest_rotation, rotation_matrix
 
 F64 = torch.float64
 ROTATIONS = {
@@ -128,3 +129,75 @@ def test_what_learnt_large_angles_is_not_refused(tmp_path):
         one.compose(one)
     ct.save(ct.Rig({"a": ct.Pinhole.from_fov(90, image_size=(48, 64))}, {"a": pose}), tmp_path / "rig.json")
     assert torch.equal(ct.load(tmp_path / "rig.json").extrinsics["a"].rotation, pose.rotation.double())
+
+
+# -- pitch, yaw and roll of heads
+
+STRAIGHT = torch.tensor([[math.pi / 2, 0.4, 0.0], [-math.pi / 2, -2.0, 0.0]], dtype=torch.float64)
+
+
+def angles(count=200):
+    drawn = torch.rand(count, 3, generator=torch.Generator().manual_seed(0)).double() * 2 - 1
+    return drawn * torch.tensor([math.pi / 2, math.pi, math.pi]) * 0.999
+
+
+def by_axes(pitch, yaw, roll):
+    """Ry(yaw) Rx(-pitch) Rz(roll)."""
+    vectors = torch.diag(torch.tensor([-pitch, yaw, roll], dtype=F64))
+    x, y, z = torch.linalg.matrix_exp(torch.linalg.cross(vectors[:, None], torch.eye(3, dtype=F64)[None]).mT)
+    return y @ x @ z
+
+
+def test_turns_are_those_about_the_axes():
+    given = torch.cat((angles(), STRAIGHT))
+    expected = torch.stack([by_axes(*row) for row in given.tolist()])
+    torch.testing.assert_close(ct.head_rotation(given), expected, rtol=0, atol=1e-14)
+    torch.testing.assert_close(ct.head_angles(expected), given, rtol=0, atol=1e-12)
+    assert not ct.head_angles(torch.eye(3)).any()
+
+
+def test_the_nose_has_the_angles_of_a_gaze():
+    rotation = ct.head_rotation(angles())
+    assert torch.allclose(ct.augment.to_pitch_yaw(-rotation[..., 2]), ct.head_angles(rotation)[:, :2])
+
+
+def test_signs():
+    """Seen in the image: up, to the image's left, clockwise."""
+    pitch, yaw, roll = ct.head_rotation(0.1 * torch.eye(3))
+    assert (-pitch[1, 2]) < 0
+    assert (-yaw[0, 2]) < 0
+    assert roll[1, 0] > 0
+
+
+def test_what_goes_in():
+    rotation = ct.head_rotation(angles(6))
+    extrinsics = ct.Extrinsics.from_matrix(rotation, torch.zeros(6, 3).double())
+    one = ct.Extrinsics(extrinsics.rotation[0], torch.zeros(4, 3).double())
+    assert ct.head_angles(one).shape == (4, 3)
+    for pose in (extrinsics, extrinsics.matrix(), rotation, [*rotation.numpy()], rotation.view(2, 3, 3, 3)):
+        torch.testing.assert_close(ct.head_angles(pose).reshape(6, 3), angles(6))
+    assert ct.head_angles(rotation.half()).dtype == torch.float32
+
+
+def test_gradients_of_angles():
+    given = angles(5).requires_grad_()
+    assert torch.autograd.gradcheck(lambda a: ct.head_angles(ct.head_rotation(a)), given)
+    for rows in (STRAIGHT, torch.zeros(1, 3).double()):
+        rotation = ct.head_rotation(rows).requires_grad_()
+        ct.head_angles(rotation).sum().backward()
+        assert torch.isfinite(rotation.grad).all()
+
+
+# -- rotations alone
+
+
+def test_no_rotation_is_nearer_than_the_nearest():
+    """Of any matrix, also of those that mirror."""
+    draw = torch.Generator().manual_seed(0)
+    matrices = torch.randn(40, 3, 3, generator=draw, dtype=torch.float64)
+    found = nearest_rotation(matrices)
+    assert are_rotations(found).all()
+    others = rotation_matrix(3 * torch.randn(5000, 1, 3, generator=draw, dtype=torch.float64))
+    off, least = ((matrices - turned).square().sum((-1, -2)) for turned in (found, others))
+    assert (off <= least.amin(0)).all()
+    assert bool((torch.linalg.det(matrices) < 0).any())
