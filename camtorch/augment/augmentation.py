@@ -163,11 +163,22 @@ def draw(
     return (values if rows == count else {name: value[[0] * count] for name, value in values.items()}), spans
 
 
-class EditOptions(SampleOptions, total=False):
-    """What every edit takes; see `Edit`."""
+class FlipOptions(SampleOptions, total=False):
+    """Options of flips, which have a `p` of their own; see `Augmentation`."""
+
+    same_on_batch: bool
+
+
+class EditOptions(FlipOptions, total=False):
+    """Options of edits and of what keeps its field of view; see `Augmentation`."""
 
     p: float
-    same_on_batch: bool
+
+
+class FilledOptions(EditOptions, total=False):
+    """Options of random cameras; see `Augmentation`."""
+
+    min_filled: float | None
 
 
 class Augmentation(SampleTransform):

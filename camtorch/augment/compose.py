@@ -8,9 +8,10 @@ from typing import Any, cast
 import numpy as np
 import torch
 from torch import Tensor, nn
+from typing_extensions import Unpack
 
 from camtorch._arguments import as_mapping
-from camtorch.augment.augmentation import Augmentation, Range, draw
+from camtorch.augment.augmentation import Augmentation, EditOptions, Range, draw
 from camtorch.augment.change import Change, check_sizes
 from camtorch.augment.edits import Edit, change_by
 from camtorch.augment.landmarks import Mirroring
@@ -54,11 +55,7 @@ class Compose(Augmentation):
     def __init__(
         self,
         augmentations: Iterable[Augmentation],
-        *,
-        camera: Camera | None = None,
-        fields: Mapping[str, str] | None = None,
-        antialias: bool | None = None,
-        **options: Any,
+        **options: Unpack[EditOptions],
     ):
         name = type(self).__name__
         parts = list(augmentations) if isinstance(augmentations, Iterable) else [augmentations]
@@ -70,19 +67,19 @@ class Compose(Augmentation):
                 )
         if not parts:
             raise ValueError(f"{name}: no augmentations")
-        if options.get("min_filled") is not None:
-            raise TypeError(f"{name}: there is no min_filled here; the lenses in it have it")
-        camera = next((part.camera for part in parts if part.camera is not None), None) if camera is None else camera
-        fields = {key: value for part in parts for key, value in part.fields.items()} | dict(
-            as_mapping(fields, "fields", name, "{'lidar': 'points'}")
+        if options.get("camera") is None:
+            options["camera"] = next((part.camera for part in parts if part.camera is not None), None)
+        options["fields"] = {key: value for part in parts for key, value in part.fields.items()} | dict(
+            as_mapping(options.get("fields"), "fields", name, "{'lidar': 'points'}")
         )
+        options.setdefault("antialias", None)
         if any(part.valid_mask for part in parts):
             options.setdefault("valid_mask", True)
         ranges: dict[str, Range] = {}
         for i, part in enumerate(parts):
             ranges[f"{i}.apply"] = Range(0, 1)
             ranges |= {f"{i}.{key}": interval for key, interval in part.ranges.items()}
-        super().__init__(ranges, camera=camera, fields=fields, antialias=antialias, **options)
+        super().__init__(ranges, **options)
         self.augmentations = nn.ModuleList(parts)
         self.crops: Mapping[str, int] = {
             f"{i}.{key}": index for i, part in enumerate(parts) for key, index in part.crops.items()

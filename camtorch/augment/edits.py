@@ -13,7 +13,7 @@ from typing_extensions import Unpack
 
 from camtorch._arguments import as_image_size, as_whole, fails, holds
 from camtorch._editing import edited, quarter_turns
-from camtorch.augment.augmentation import Augmentation, EditOptions, Range, as_range
+from camtorch.augment.augmentation import Augmentation, EditOptions, FlipOptions, Range, as_range
 from camtorch.augment.change import Change, Part, by_kinds
 from camtorch.augment.landmarks import Mirroring, TableLike
 from camtorch.camera import Camera
@@ -40,10 +40,9 @@ class Edit(Augmentation):
             `Augmentation`.
     """
 
-    def __init__(self, ranges: Mapping[str, Range] | None = None, *, antialias: bool | None = None, **options: Any):
-        if options.get("min_filled") is not None:
-            raise TypeError(f"{type(self).__name__}: there is no min_filled here; RandomCamera has it")
-        super().__init__(ranges, antialias=antialias, **options)
+    def __init__(self, ranges: Mapping[str, Range] | None = None, **options: Unpack[EditOptions]):
+        options.setdefault("antialias", None)
+        super().__init__(ranges, **options)
 
     needs_camera = False
 
@@ -143,7 +142,7 @@ class _Sized(Edit):
 
     image_size: tuple[int, int]
 
-    def __init__(self, size: Size, ranges: Mapping[str, Range] | None = None, **options: Any):
+    def __init__(self, size: Size, ranges: Mapping[str, Range] | None = None, **options: Unpack[EditOptions]):
         super().__init__(ranges, **options)
         self.image_size = _as_size(size, self._name)
 
@@ -340,7 +339,7 @@ class _Flip(Edit):
         landmarks: TableLike | Mapping[str, TableLike | None] | None = None,
         lateral_axis: str = "x",
         swap_sides: bool = True,
-        **options: Any,
+        **options: Unpack[FlipOptions],
     ):
         super().__init__(p=p, **options)
         self.mirroring: Mirroring | None = Mirroring(landmarks, lateral_axis, swap_sides, self._name)

@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.utils.parametrize import type_before_parametrizations
+from typing_extensions import Unpack
 
 from camtorch._arguments import LEFT, are_numbers, as_image_size, broadcast_shapes, check_degrees, fails, warn
 from camtorch._evaluation import rows_of
@@ -20,7 +21,7 @@ from camtorch._module import Memo, remade
 from camtorch._numbers import joined, split
 from camtorch._opaque import CameraNumbers, opaque
 from camtorch._tracing import in_graph, is_eager
-from camtorch.augment.augmentation import Augmentation, Range, as_range
+from camtorch.augment.augmentation import Augmentation, FilledOptions, Range, as_range
 from camtorch.augment.change import Part, View
 from camtorch.augment.filling import enough, scaled
 from camtorch.augment.presets import PRESETS, PresetName
@@ -40,6 +41,7 @@ from camtorch.warp.vignetting import vignetting
 from camtorch.warp.warp import Warp
 
 RangeLike = float | Sequence[float]
+Auto = RangeLike | Literal["auto"] | None
 Array = np.ndarray[Any, Any]
 T = TypeVar("T")
 
@@ -54,15 +56,21 @@ _TURNS = "yaw", "pitch", "roll"
 _SHIFTS = "shift_x", "shift_y", "shift_z"
 _DEPTHS = {"of_depth": ("depth", "z"), "of_distance": ("distance", "distance")}
 """In a draw, how far away things are: the field of samples that says so, and what it holds."""
-_FOCAL, _CENTRE, _DISTORTION, _CROP = (0.95, 1.05), (-0.02, 0.02), (-0.02, 0.02), (0.9, 1.0)
-_LENS_FOCAL, _LENS_CENTRE, _LENS_DISTORTION = (0.9, 1.1), (-0.03, 0.03), (-0.05, 0.05)
-_USUAL = _FOCAL, _CENTRE, _DISTORTION, _CROP, _LENS_FOCAL, _LENS_CENTRE, _LENS_DISTORTION
 _SIDE = 9
 _LESS = 0.9  # of the least field of view that was asked for: below that a warning says so
 _told: set[tuple[object, ...]] = set()
 _EDGE_SAMPLES = 32
 _AZIMUTHS = 128
 _ANGLES = 64
+
+
+class LensOptions(FilledOptions, total=False):
+    """Options that `RandomMount` and `RandomLens` have in common; see `RandomCamera`."""
+
+    chromatic: RangeLike | None
+    vignetting: RangeLike | None
+    cos4: RangeLike | None
+    image_size: Sequence[int] | None
 
 
 class RandomCamera(Augmentation):
@@ -76,7 +84,7 @@ class RandomCamera(Augmentation):
             not learn. The name of a preset, see `PRESETS`. A key of `ct.MODELS`, for that model with zero
             coefficients; it needs `fov`. "real": for each sample one of 7,000 calibrated lenses (`ct.lenses`), even
             chances for all whose images, cropped to the new shape, have a field of view in the range of `fov`. Every
-            pixel has a ray. As lenses vary enough, focal, centre, distortion and crop then do nothing unless given.
+            pixel has a ray. As lenses vary enough, the "auto" of focal, centre, distortion and crop is then None.
         camera: of samples that do not bring one.
         yaw: degrees by which the camera turns to its right.
         pitch: degrees by which it then looks up.
@@ -88,11 +96,12 @@ class RandomCamera(Augmentation):
             scaled up to that. A turn then still leaves a rim empty, which `min_filled` takes away. Where `min_filled`
             leaves less than 0.9 of the least number given here, one warning a process says so; the new camera's `fov`
             is what came.
-        focal: factor on the focal lengths, for lenses made alike.
-        centre: how far the principal point moves, as a part of the image's width and height.
+        focal: factor on the focal lengths, for lenses made alike; "auto" is (0.95, 1.05).
+        centre: how far the principal point moves, as a part of the image's width and height; "auto" is 0.02.
         distortion: by what part of the distance from the centre to the corner all coefficients together may move
-            the image's rim; see `jittered`, which also keeps the lens invertible over the image.
-        crop: part of the image's width and height that is kept, at a random place, and enlarged to the full size.
+            the image's rim; see `jittered`, which also keeps the lens invertible over the image. "auto" is 0.02.
+        crop: part of the image's width and height that is kept, at a random place, and enlarged to the full size;
+            "auto" is (0.9, 1).
         chromatic: lateral chromatic aberration: by what factor less one red and blue, each for itself, are larger than
             green. Shown by images of three channels, taken as red, green, blue.
         vignetting: the part of the light that is lost in the image's farthest corner; it grows with the square of
@@ -113,6 +122,7 @@ class RandomCamera(Augmentation):
         **{"center": "centre", "size": "image_size"},
     }
     beside_the_camera: ClassVar[frozenset[str]] = frozenset({"chromatic", "vignetting", "cos4"})
+    _usual_ranges: ClassVar[Sequence[RangeLike]] = (0.95, 1.05), (-0.02, 0.02), (-0.02, 0.02), (0.9, 1.0)
     like: Camera | None
 
     def __init__(
@@ -124,15 +134,15 @@ class RandomCamera(Augmentation):
         roll: RangeLike | None = (-10.0, 10.0),
         zoom: RangeLike | None = (1.0, 1.0),
         fov: RangeLike | Literal["source"] | None = None,
-        focal: RangeLike | None = _FOCAL,
-        centre: RangeLike | None = _CENTRE,
-        distortion: RangeLike | None = _DISTORTION,
-        crop: RangeLike | None = _CROP,
+        focal: Auto = "auto",
+        centre: Auto = "auto",
+        distortion: Auto = "auto",
+        crop: Auto = "auto",
         chromatic: RangeLike | None = None,
         vignetting: RangeLike | None = None,
         cos4: RangeLike | None = None,
         image_size: Sequence[int] | None = None,
-        **options: Any,
+        **options: Unpack[FilledOptions],
     ):
         super().__init__(**options)
         self.fov = "source" if isinstance(fov, str) and fov == "source" else None
@@ -140,12 +150,10 @@ class RandomCamera(Augmentation):
         self.image_size: tuple[int, int] | None = as_image_size(image_size, self._name)
         self._is_real = isinstance(like, str) and like == _REAL
         self.like = None if self._is_real else _as_like(like, self._name)
-        if self._is_real:
-            # the default itself: equal numbers may have been given
-            focal, centre, distortion, crop = (
-                None if any(given is usual for usual in _USUAL) else given
-                for given in (focal, centre, distortion, crop)
-            )
+        focal, centre, distortion, crop = (
+            (None if self._is_real else usual) if isinstance(given, str) and given == "auto" else given
+            for given, usual in zip((focal, centre, distortion, crop), self._usual_ranges, strict=True)
+        )
         if self.like is not None and self.like.image_size is None and fov is None:
             raise ValueError(f"{self._name}: like={like!r} says nothing of the field of view; give fov=(low, high)")
         tiny, huge = 1e-3, 1e3
@@ -172,13 +180,6 @@ class RandomCamera(Augmentation):
             check_degrees(self.ranges["fov"].low, fov, self._name)
         among = self.ranges.pop("fov", None) if self._is_real else None
         self._among = None if among is None else (among.low, among.high)
-
-    def _without(self, options: Mapping[str, object], *names: str) -> dict[str, Any]:
-        """Return None for the ranges that a class does without; a TypeError if one is asked for."""
-        for name in names:
-            if name in options:
-                raise TypeError(f"{type(self).__name__}: there is no {name} here; RandomCamera has it")
-        return dict.fromkeys(names)
 
     def new_camera(self, source: Camera, values: Mapping[str, Tensor]) -> tuple[Camera, Tensor | None]:
         """The new camera and its turn; see `Augmentation.new_camera`."""
@@ -408,8 +409,8 @@ def _seen_across(base: Camera, sine: Any, cosine: Any) -> Any:
 class RandomMount(RandomCamera):
     """The camera turned and rolled where it stands, and zoomed: any lens keeps its coefficients.
 
-    Args are those of `RandomCamera`: yaw, pitch, roll in degrees, zoom, and all options. On a pinhole camera this is
-    the homography K' R K^-1.
+    Args are those of `RandomCamera`: yaw, pitch, roll in degrees, zoom, a range of `fov`, chromatic, vignetting, cos4,
+    image_size, and all options. On a pinhole camera this is the homography K' R K^-1.
 
     `shift=(dx, dy, dz)` also moves the camera: right, down and forward by lengths of the unit of the depth, each a
     range, or a number for as much to either side. It is for some centimetres, and for samples that have `depth` or
@@ -425,14 +426,13 @@ class RandomMount(RandomCamera):
         roll: RangeLike | None = (-10.0, 10.0),
         zoom: RangeLike | None = (1.0, 1.0),
         shift: Sequence[RangeLike] | None = None,
-        **options: Any,
+        fov: RangeLike | None = None,
+        **options: Unpack[LensOptions],
     ):
-        if isinstance(options.get("fov"), str):
-            raise ValueError(
-                f"{type(self).__name__}: the lens stays, so fov is a range of degrees; got {options['fov']!r}"
-            )
-        none = self._without(options, "focal", "centre", "distortion", "crop")
-        super().__init__(yaw=yaw, pitch=pitch, roll=roll, zoom=zoom, **none, **options)
+        if isinstance(fov, str):
+            raise ValueError(f"{type(self).__name__}: the lens stays, so fov is a range of degrees; got {fov!r}")
+        none: dict[str, Any] = dict.fromkeys(("focal", "centre", "distortion", "crop"))
+        super().__init__(yaw=yaw, pitch=pitch, roll=roll, zoom=zoom, fov=fov, **none, **options)
         if shift is None:
             return
         if isinstance(shift, (str, int, float)) or len(shift) != len(_SHIFTS):
@@ -474,22 +474,25 @@ class RandomMount(RandomCamera):
 class RandomLens(RandomCamera):
     """Another lens before the camera, which stays where it looks.
 
-    Args are those of `RandomCamera`: like, fov, focal, centre, distortion, chromatic, vignetting, and all options. From
-    pinhole data, `RandomLens("kannala_brandt", fov=(120, 140))` makes a fisheye's, `RandomLens("real", fov=(100, 150))`
-    that of lenses that exist.
+    Args are those of `RandomCamera`: like, fov, focal, centre, distortion, chromatic, vignetting, cos4, image_size, and
+    all options; "auto" is (0.9, 1.1) for focal, 0.03 for centre and 0.05 for distortion, and None with like="real".
+    From pinhole data, `RandomLens("kannala_brandt", fov=(120, 140))` makes a fisheye's, `RandomLens("real", fov=(100,
+    150))` that of lenses that exist.
     """
+
+    _usual_ranges: ClassVar[Sequence[RangeLike]] = (0.9, 1.1), (-0.03, 0.03), (-0.05, 0.05), (1.0, 1.0)
 
     def __init__(
         self,
         like: Camera | PresetName | str | None = None,
         *,
         fov: RangeLike | Literal["source"] | None = None,
-        focal: RangeLike | None = _LENS_FOCAL,
-        centre: RangeLike | None = _LENS_CENTRE,
-        distortion: RangeLike | None = _LENS_DISTORTION,
-        **options: Any,
+        focal: Auto = "auto",
+        centre: Auto = "auto",
+        distortion: Auto = "auto",
+        **options: Unpack[LensOptions],
     ):
-        none = self._without(options, "yaw", "pitch", "roll", "zoom", "crop")
+        none: dict[str, Any] = dict.fromkeys(("yaw", "pitch", "roll", "zoom", "crop"))
         super().__init__(like, fov=fov, focal=focal, centre=centre, distortion=distortion, **none, **options)
 
 

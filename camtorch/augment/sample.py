@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import difflib
 import functools
@@ -9,12 +10,13 @@ import inspect
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, ParamSpec, TypedDict, TypeVar, cast
+from typing import Any, ClassVar, ParamSpec, TypedDict, TypeVar, cast, get_args, get_origin, get_type_hints
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.utils.data import get_worker_info
+from typing_extensions import Unpack
 
 from camtorch._arguments import (
     GUESS_CAMERA,
@@ -362,6 +364,24 @@ class SampleOptions(TypedDict, total=False):
     tolerance: float
 
 
+@functools.cache
+def _keywords(transform: type) -> dict[str, None]:
+    """Return the keywords that a class of transforms takes, also by options: those of a TypedDict, or of its base."""
+    names: dict[str, None] = {}
+    for owner in transform.__mro__:
+        if "__init__" in vars(owner):
+            own, hints = vars(owner)["__init__"], {}
+            _, *parameters = inspect.signature(own).parameters.values()
+            names |= dict.fromkeys(p.name for p in parameters if p.kind is not p.VAR_KEYWORD)
+            if not parameters or (rest := parameters[-1].name) in names:
+                break
+            with contextlib.suppress(NameError):  # of what is imported for checkers alone
+                hints = get_type_hints(own)
+            if get_origin(hints.get(rest)) is Unpack:
+                return names | dict.fromkeys(get_type_hints(get_args(hints[rest])[0]))
+    return names
+
+
 class SampleTransform(nn.Module):
     """Moves all fields of a sample by one change of cameras. See `Augmentation` and `FaceNormalizer`."""
 
@@ -380,12 +400,9 @@ class SampleTransform(nn.Module):
         valid_mask: bool = False,
         antialias: bool | None = False,
         tolerance: float = 0.001,
-        **unknown: object,
     ):
         super().__init__()
         self._name = type(self).__name__
-        for name in unknown:
-            raise TypeError(f"{self._name}: unknown keyword {name!r}{self._meant(name)}. {LEFT}")
         self.camera = fixed_copy(camera, self._name)
         self.fields: dict[str, str] = dict(as_mapping(fields, "fields", self._name, "{'lidar': 'points'}"))
         wrong = {k: v for k, v in self.fields.items() if v not in (*KINDS, KEEP)}
@@ -401,25 +418,28 @@ class SampleTransform(nn.Module):
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
         own: Any = vars(cls).get("__init__")
-        if (code := getattr(own, "__code__", None)) is not None:
-            names = code.co_varnames[1 : code.co_argcount + code.co_kwonlyargcount]
-            by_name = ", ".join(f"{name}=..." for name in names)
-            cls.__init__ = hinting(f"By name: {cls.__name__}({by_name})")(own)  # type: ignore[method-assign]
+        if (code := getattr(own, "__code__", None)) is None:
+            return
+        names = code.co_varnames[1 : code.co_argcount + code.co_kwonlyargcount]
+        hinted = hinting(f"By name: {cls.__name__}({', '.join(f'{name}=...' for name in names)})")(own)
+
+        @functools.wraps(own)
+        def checked(self: SampleTransform, *args: Any, **kwargs: Any) -> None:
+            for word in kwargs:
+                if word not in _keywords(cls):  # type: ignore[arg-type]  # a class can be hashed
+                    raise TypeError(f"{type(self).__name__}: unknown keyword {word!r}; {cls._meant(word)}. {LEFT}")
+            hinted(self, *args, **kwargs)
+
+        cls.__init__ = checked  # type: ignore[method-assign]
 
     @classmethod
     def _meant(cls, word: str) -> str:
-        """The keyword that somebody may have meant."""
-        known = [
-            parameter.name
-            for owner in cls.__mro__
-            if "__init__" in vars(owner) and issubclass(owner, SampleTransform)
-            for parameter in inspect.signature(vars(owner)["__init__"]).parameters.values()
-            if parameter.kind is not parameter.VAR_KEYWORD and parameter.name != "self"
-        ]
+        """Return the keyword that somebody may have meant, and all that are known."""
+        known = [*_keywords(cls)]  # type: ignore[arg-type]  # a class can be hashed
         close = difflib.get_close_matches(word, [*known, *cls.other_words], 1)
-        if close:
-            return f"; did you mean {cls.other_words.get(close[0], close[0])!r}?"
-        return f"; known are {', '.join(dict.fromkeys(known))}"
+        meant = f"did you mean {cls.other_words.get(close[0], close[0])!r}? Known" if close else "known"
+        has = next((base.__name__ for base in cls.__mro__[1:-2] if word in _keywords(base)), None)
+        return f"{meant} are {', '.join(known)}" + (f". {has} has it" if has else "")
 
     mirroring: Mirroring | None = None  # what changes places where an augmentation mirrors; None: it never does
 

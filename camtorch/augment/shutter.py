@@ -45,8 +45,6 @@ class RandomShutter(Augmentation):
         **options: Unpack[EditOptions],
     ):
         name = type(self).__name__
-        if "min_filled" in options:
-            raise TypeError(f"{name}: there is no min_filled here; RandomCamera has it")
         readout = (readout, readout) if isinstance(readout, (int, float)) else readout
         ranges = {
             "rates": as_range(rates, "rates", name, least=-3600, most=3600, size=3),

@@ -49,8 +49,8 @@ def test_options(options, text):
         (lambda: RandomLens(distorsion=0.1), "RandomLens: unknown keyword 'distorsion'; did you mean 'distortion'?"),
         (lambda: RandomLens(min_fill=0.9), "RandomLens: unknown keyword 'min_fill'; did you mean 'min_filled'?"),
         (lambda: RandomLens(xyz=1), "RandomLens: unknown keyword 'xyz'; known are like, fov, focal, .*min_filled"),
-        (lambda: RandomMount(focal=(0.9, 1.1)), "RandomMount: there is no focal here; RandomCamera has it"),
-        (lambda: RandomLens(yaw=5), "RandomLens: there is no yaw here; RandomCamera has it"),
+        (lambda: RandomMount(focal=(0.9, 1.1)), "RandomMount: unknown keyword .focal.; .*RandomCamera has it"),
+        (lambda: RandomLens(yaw=5), "RandomLens: unknown keyword .yaw.; .*RandomCamera has it"),
     ],
 )
 def test_keywords_that_do_not_exist(make, text):

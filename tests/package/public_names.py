@@ -48,9 +48,7 @@ def keywords(function):
     """Return the names that a caller may pass by keyword, also through `**options`."""
     makers = [function]
     if inspect.isclass(function):  # what a class passes on goes to the next one
-        bases = [base for base in function.__mro__ if "__init__" in vars(base)]
-        # RandomMount and RandomLens refuse the other ranges of RandomCamera
-        makers = [base.__init__ for base in bases if base.__name__ != "RandomCamera" or base is function]
+        makers = [base.__init__ for base in function.__mro__ if "__init__" in vars(base)]
     names = []
     for maker in makers:
         try:

@@ -157,7 +157,11 @@ WRONG = [
     (lambda: augment.RandomMount().draw(2, 7), TypeError, r"generator must be a torch.Generator, or None; got 7"),
     (lambda: augment.Rotate90((0, 1, 2)), ValueError, r"Rotate90: times must be one number or \(least, most\)"),
     (lambda: augment.Rotate90((3, 1)), ValueError, r"Rotate90: times must be \(least, most\), and step positive"),
-    (lambda: augment.Compose([augment.RandomMount()], min_filled=1), TypeError, r"Compose: there is no min_filled"),
+    (
+        lambda: augment.Compose([augment.RandomMount()], min_filled=1),
+        TypeError,
+        r"Compose: unknown keyword .min_filled",
+    ),
     (lambda: augment.FaceNormalizer(axis=3), TypeError, r"FaceNormalizer: axis must be a pixel \(u, v\); got 3"),
     (lambda: augment.FaceNormalizer()(image=IMAGES, camera="c"), TypeError, r"FaceNormalizer: camera must be a Camera"),
     (lambda: augment.collate([]), ValueError, r"collate: samples must not be empty"),
