@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import difflib
 import functools
+import importlib
 import inspect
+import os
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, cast
 
@@ -246,6 +248,51 @@ class Camera(Freezable):
                 unknown axis.
         """
         return camera_of_fov(cls, fov, image_size, axis, distortion)
+
+    # -- as a file and as plain values; camtorch.io imports this file, and is imported when it is needed
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> Self:
+        """Return the camera of a calibration file that has one camera, in float64 and frozen.
+
+        In a configuration it names a camera by its file: `class_path: camtorch.Camera.load` of jsonargparse,
+        `_target_: camtorch.Camera.load` of Hydra.
+
+        Args:
+            path: A file of any format that `ct.load` reads.
+
+        Raises:
+            ValueError: If the file cannot be used, has several cameras, or one of another model than this class.
+        """
+        camera: Self = importlib.import_module("camtorch.io.formats").load_camera(cls, path)
+        return camera
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the camera as plain numbers, strings and lists, as camtorch's JSON has it.
+
+        Returns:
+            The keys model, intrinsics, distortion_names and distortion if there is any, image_size, and "dtype":
+            "float32" unless it is float64. `from_dict` gives the same numbers, to the last bit; whether they learn is
+            not kept.
+
+        Raises:
+            TypeError: If it is a `Mixed`, or a model without a key. ValueError: If a number is not finite.
+        """
+        values: dict[str, Any] = importlib.import_module("camtorch.io.camtorch_json").dict_of(self)
+        return values
+
+    @classmethod
+    def from_dict(cls, d: Mapping[str, Any]) -> Self:
+        """Return the frozen camera of a dict as `to_dict` makes it; of any model if called on `ct.Camera`.
+
+        Args:
+            d: model (a key of `ct.MODELS`) and intrinsics; if there are any, distortion, image_size and dtype.
+
+        Raises:
+            ValueError: If a key is missing, unknown or has a wrong value, or the model is another than this class.
+        """
+        camera: Self = importlib.import_module("camtorch.io.camtorch_json").made_of(cls, d, Camera)
+        return camera
 
     def replace(
         self,

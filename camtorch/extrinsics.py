@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import importlib
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -135,6 +137,21 @@ class Extrinsics(BatchedModule):
             rotation, translation = matrix[..., :3, :3], matrix[..., :3, 3]
         check_rotation(rotation, "matrix", "Extrinsics")
         return cls(rotation_vector(rotation).unsqueeze(-1), as_vectors(translation, "translation", "Extrinsics"))
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return rotation and translation as plain lists, with "dtype": "float32" unless it is float64."""
+        values: dict[str, Any] = importlib.import_module("camtorch.io.camtorch_json").dict_of(self)
+        return values
+
+    @classmethod
+    def from_dict(cls, d: Mapping[str, Any]) -> Extrinsics:
+        """Return the frozen pose of a dict as `to_dict` makes it.
+
+        Raises:
+            ValueError: If a key is missing, unknown or has a wrong value.
+        """
+        pose: Extrinsics = importlib.import_module("camtorch.io.camtorch_json").made_of(cls, d, Extrinsics)
+        return pose
 
     def inverse(self) -> Extrinsics:
         """World from camera."""

@@ -2,26 +2,34 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+import functools
+from collections.abc import Mapping, Sequence
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor, nn
 
-from camtorch._arguments import broadcast_shapes
-from camtorch._module import remade
+from camtorch._arguments import broadcast_shapes, is_list
+from camtorch._module import BatchedModule, remade
 from camtorch.camera import Camera
 from camtorch.extrinsics import Extrinsics
 from camtorch.io import poses
 from camtorch.io.protocol import Names
-from camtorch.io.record import Record
+from camtorch.io.record import Record, one_of
 from camtorch.io.writing import Lossy, as_json
 from camtorch.rig import Rig
+
+Made = TypeVar("Made", bound=BatchedModule)
 
 NAMES = Names("camtorch", "camtorch", (".json",), ("*.json",))
 
 _VERSION = 1
 _DEEPEST_BATCH = 8
+_DTYPES = {"float32": torch.float32, "float64": torch.float64}
+_KEYS: dict[type, tuple[str, ...]] = {
+    Camera: ("model", "intrinsics", "distortion_names", "distortion", "image_size", "dtype"),
+    Extrinsics: ("rotation", "translation", "dtype"),
+}
 
 
 def matches(keys: dict[str, Any]) -> bool:
@@ -42,15 +50,42 @@ def parse(record: Record) -> Rig:
             images[name] = entry["camera"].text()
         if images.get(name, name) not in cameras:
             entry.fail(f"of the camera {images.get(name, name)!r:.60}, which is not in the file")
-        rotation, translation = _tensor(entry["rotation"], 3), _tensor(entry["translation"], 3)
-        _same_batch(entry, rotation, translation)
-        for key, values in (("rotation", rotation), ("translation", translation)):
-            poses.check_near(entry[key], values.flatten())
-        extrinsics[name] = rotation, translation
+        extrinsics[name] = _vectors(entry)
     if extrinsics and extrinsics.keys() == images.keys() and all(t.ndim == 1 for _, t in extrinsics.values()):
         batch = _pose(*map(torch.stack, zip(*extrinsics.values(), strict=True)))
         return Rig(cameras, (list(extrinsics), batch), images=images)
     return Rig(cameras, {name: _pose(*vectors) for name, vectors in extrinsics.items()}, images=images)
+
+
+def made_of(kind: type[Made], d: Mapping[str, Any], base: type[Camera | Extrinsics]) -> Made:
+    """Return the camera or the pose of a dict as `dict_of` makes it, frozen; a CameraFileError names a wrong key."""
+    record = Record(f"{kind.__name__}.from_dict", _plain(d))
+    known = _KEYS[base]
+    for key in record.keys():  # noqa: SIM118
+        if key not in known:
+            record[key].fail(f"is not known; known are {', '.join(known)}")
+    made: Any = _camera(record) if base is Camera else _pose(*_vectors(record))
+    if not isinstance(made, kind):
+        record["model"].fail(f"a {type(made).__name__}, which is no {kind.__name__}; ct.Camera.from_dict takes any")
+    dtype = _DTYPES[one_of(record["dtype"], _DTYPES)] if "dtype" in record else torch.float64
+    return made.to(dtype).requires_grad_(False)
+
+
+def _plain(value: Any) -> Any:
+    """Return what JSON would give, of other mappings and sequences too, as those of configurations are."""
+    if isinstance(value, Mapping):
+        return {key: _plain(item) for key, item in value.items()}
+    if is_list(value):
+        return [_plain(item) for item in value]
+    return float(value) if type(value) is int else value
+
+
+def _vectors(record: Record) -> tuple[Tensor, Tensor]:
+    rotation, translation = _tensor(record["rotation"], 3), _tensor(record["translation"], 3)
+    _same_batch(record, rotation, translation)
+    for key, values in (("rotation", rotation), ("translation", translation)):
+        poses.check_near(record[key], values.flatten())
+    return rotation, translation
 
 
 def _pose(rotation: Tensor, translation: Tensor) -> Extrinsics:
@@ -62,11 +97,11 @@ def _pose(rotation: Tensor, translation: Tensor) -> Extrinsics:
 def _camera(record: Record) -> Camera:
     key = record["model"].text()
     names = [name.text() for name in record["distortion_names"]] if "distortion_names" in record else []
-    kind = record.model(key)
+    kind = record["model"].model(key)
     arguments = [_tensor(record["intrinsics"], 4)]
-    if names:
-        if list(kind.names_of(len(names)) or ()) != names:
-            record["distortion_names"].fail(f"not those of {kind.__name__}, which takes {kind.counts_text()}")
+    if names and list(kind.names_of(len(names)) or ()) != names:
+        record["distortion_names"].fail(f"not those of {kind.__name__}, which takes {kind.counts_text()}")
+    if names or "distortion" in record:
         arguments.append(_tensor(record["distortion"], len(names)))
     size = None
     if "image_size" in record:
@@ -88,13 +123,13 @@ def _same_batch(record: Record, *tensors: Tensor) -> None:
 
 
 def _tensor(record: Record, last: int) -> Tensor:
-    """Numbers (*B, last)."""
+    """Numbers (*B, last), of any last dim if that is 0."""
     try:
         values = torch.tensor(record.value, dtype=torch.float64)
     except (ValueError, TypeError, RuntimeError) as error:
         record.fail(f"not numbers (*B, {last}): {error}")
-    if not 0 < values.ndim <= _DEEPEST_BATCH or values.shape[-1] != last:
-        record.fail(f"numbers (*B, {last}); these are {tuple(values.shape)}")
+    if not 0 < values.ndim <= _DEEPEST_BATCH or values.shape[-1] != (last or values.shape[-1]):
+        record.fail(f"numbers (*B, {last or 'n'}); these are {tuple(values.shape)}")
     if not bool(values.isfinite().all()):
         record.fail("numbers that are not finite")
     return values
@@ -102,25 +137,37 @@ def _tensor(record: Record, last: int) -> Tensor:
 
 def render(rig: Rig, lossy: Lossy) -> str:
     """The text of a file. Numbers are float64, which holds those of a float32 camera exactly."""
-    cameras, extrinsics = {}, {}
-    for name, camera in rig.cameras.items():
-        intrinsics, distortion = _rows(camera.intrinsics, camera.distortion)
-        entry: dict[str, Any] = {"model": camera.key, "intrinsics": _values(lossy, name, intrinsics)}
-        if camera.distortion.shape[-1]:
-            entry["distortion_names"] = list(camera.distortion_names)
-            entry["distortion"] = _values(lossy, name, distortion)
-        if camera.image_size is not None:
-            entry["image_size"] = list(camera.image_size)
-        cameras[name] = entry
-    for name, pose in rig.extrinsics.items():
-        rotation, translation = _rows(pose.rotation, pose.translation)
-        extrinsics[name] = {
-            "rotation": _values(lossy, name, rotation),
-            "translation": _values(lossy, name, translation),
-        }
+    cameras = {name: _entry(camera, lossy, name) for name, camera in rig.cameras.items()}
+    extrinsics = {name: _entry(pose, lossy, name) for name, pose in rig.extrinsics.items()}
+    for name, entry in extrinsics.items():
         if name in rig.images:
-            extrinsics[name]["camera"] = rig.images[name]
+            entry["camera"] = rig.images[name]
     return as_json({"camtorch": _VERSION, "cameras": cameras, "extrinsics": extrinsics})
+
+
+def dict_of(one: Camera | Extrinsics) -> dict[str, Any]:
+    """Return a camera or a pose as a file has it, and its dtype if that is not float64."""
+    owner = f"{type(one).__name__}.to_dict"
+    if isinstance(one, Camera) and one.is_mixed:
+        raise TypeError(f"{owner}: a dict has one model; [camera.to_dict() for camera in mixed] has all")
+    if isinstance(one, Camera) and not one.key:
+        raise TypeError(f"{owner}: {type(one).__name__} has no key of its own to be loaded by")
+    entry = _entry(one, Lossy(owner, NAMES.title), "numbers")
+    dtype = str(functools.reduce(torch.promote_types, [getattr(one, name).dtype for name in one.tensor_names]))
+    return entry if dtype == "torch.float64" else {**entry, "dtype": dtype.removeprefix("torch.")}
+
+
+def _entry(one: Camera | Extrinsics, lossy: Lossy, name: str) -> dict[str, Any]:
+    first, second = _rows(*(getattr(one, key) for key in one.tensor_names))
+    if isinstance(one, Extrinsics):
+        return {"rotation": _values(lossy, name, first), "translation": _values(lossy, name, second)}
+    entry: dict[str, Any] = {"model": one.key, "intrinsics": _values(lossy, name, first)}
+    if second.shape[-1]:
+        entry["distortion_names"] = list(one.distortion_names)
+        entry["distortion"] = _values(lossy, name, second)
+    if one.image_size is not None:
+        entry["image_size"] = list(one.image_size)
+    return entry
 
 
 def _rows(*tensors: Tensor) -> list[Tensor]:

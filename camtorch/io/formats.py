@@ -10,7 +10,7 @@ from __future__ import annotations
 import codecs
 import fnmatch
 import os
-from typing import Any
+from typing import Any, TypeVar
 
 from camtorch._arguments import LEFT
 from camtorch.camera import Camera
@@ -38,6 +38,8 @@ from camtorch.io.protocol import ContentFormat, KeyFormat, Names, WrittenFormat
 from camtorch.io.record import Record
 from camtorch.io.writing import Lossy, replacing
 from camtorch.rig import Rig
+
+Kind = TypeVar("Kind", bound=Camera)
 
 # read, in the order in which they are asked
 _BY_CONTENT: tuple[ContentFormat, ...] = (colmap, metashape, nuscenes, ocamcalib)
@@ -99,6 +101,18 @@ def load(path: str | os.PathLike[str], format: str | None = None) -> Rig:
         raise CameraFileError(path, "cameras", "none")
     rig.format = format
     return rig.requires_grad_(False)
+
+
+def load_camera(kind: type[Kind], path: str | os.PathLike[str]) -> Kind:
+    """Return the camera of a calibration file that has one, of a model."""
+    rig, owner = load(path), f"{kind.__name__}.load: {os.fspath(path)}"
+    if len(rig.cameras) != 1:
+        names = ", ".join(map(repr, rig.cameras))
+        raise ValueError(f"{owner} must have one camera; it has {names}. ct.load(path)[name] is one of them")
+    if not isinstance(rig.camera, kind):
+        its = type(rig.camera).__name__
+        raise ValueError(f"{owner} must have a {kind.__name__}; it has a {its}, which ct.Camera.load takes")
+    return rig.camera
 
 
 def _read(path: str, content: bytes, format: str | None) -> tuple[Rig, str]:

@@ -196,7 +196,8 @@ class Record:
     def model(self, key: str) -> type[Camera]:
         """The model of that key."""
         if key.partition(":")[0] not in MODELS:
-            self.fail(f"needs the camera model {key!r:.60}, which this camtorch does not have. {LEFT}")
+            known = ", ".join(sorted(MODELS))
+            self.fail(f"needs the camera model {key!r:.60}, which this camtorch does not have; it has {known}. {LEFT}")
         try:
             return as_model(key, "file")
         except ValueError as error:

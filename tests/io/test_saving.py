@@ -284,7 +284,7 @@ def test_a_file_of_version_0_2_0_loads(tmp_path):
 def test_models_that_are_not_there_any_more_name_the_page(tmp_path):
     for model in ("gone", "brown_conrady:gone=3,3"):
         (tmp_path / "rig.json").write_text(FIRST_FILE.replace("brown_conrady", model))
-        with pytest.raises(ct.CameraFileError, match=r"rig.json: cameras.left: .*gone.*docs/leaving-0\.3\.md"):
+        with pytest.raises(ct.CameraFileError, match=r"rig.json: cameras.left.model: .*gone.*docs/leaving-0\.3\.md"):
             ct.load(tmp_path / "rig.json")
     state = camera().state_dict()
     for name, hint in (("Gone", r"\. What left camtorch stands in docs/leaving-0\.3\.md"), ("Pinhole", "$")):
