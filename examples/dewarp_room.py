@@ -75,7 +75,7 @@ def main(output: str, height: int = 480, samples: int = 6) -> dict[str, Study]:
     print(f"{'':<14}{'PSNR':>10}{'edges bent by':>16}{'after dewarping':>18}{'keypoints off by':>19}")
     studies = {}
     for (name, fov), row in zip(LENSES.items(), axes, strict=True):
-        camera = ct.augment.PRESETS[name].camera().double().requires_grad_(False)
+        camera = ct.augment.PRESETS[name].camera().double()
         camera = camera.resize(height, round(height * camera.width / camera.height))
         studies[name] = s = study(camera, fov, samples)
         numbers = f"{s.psnr:7.1f} dB{s.bends[0]:13.2f} px{s.bends[1]:15.0e} px{s.keypoint_error:16.0e} px"

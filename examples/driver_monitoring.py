@@ -285,7 +285,7 @@ def learn_landmarks(path: str, steps: int = 600) -> Network:
     crops = []
     for sample in read(path):
         height, width = sample["image"].shape[-2:]
-        camera = sample.get("camera") or ct.Pinhole.from_fov(60, image_size=(height, width)).requires_grad_(False)
+        camera = sample.get("camera") or ct.Pinhole.from_fov(60, image_size=(height, width))
         kept = {name: sample[name] for name in ("image", "boxes", "keypoints")}
         crops.append(ct.augment.BoxCrop((2 * SIDE, 2 * SIDE), margin=2 * MARGIN, camera=camera)(kept))
     data = {name: torch.stack([crop[name] for crop in crops]) for name in ("image", "keypoints")}

@@ -263,7 +263,7 @@ def photograph_dewarped() -> Image.Image:
     """What the first command of the README makes."""
     folder = EXAMPLES / "photographs"
     image = torch.from_numpy(np.array(Image.open(folder / "fisheye.jpg").convert("RGB"))).permute(2, 0, 1)
-    camera = ct.load(folder / "fisheye.yml").camera.requires_grad_(False)
+    camera = ct.load(folder / "fisheye.yml").camera
     after = ct.Dewarp(camera)(image[None])[0]
     panels = [(image, "a photograph of a fisheye"), (after, "dewarped")]
     return in_rows([(shown(part, 290, 464), title) for part, title in panels], 2)

@@ -108,7 +108,7 @@ def by_others(drivers: cabin.Drivers, generator: torch.Generator, *, rolling: bo
 
 def lens(name: str) -> Camera:
     """The lens of a preset, its image cut to the shape of `SIZE` and scaled to it."""
-    camera = PRESETS[name].camera().double().requires_grad_(False)
+    camera = PRESETS[name].camera().double()
     rows = min(camera.height, camera.width * SIZE[0] // SIZE[1])
     columns = rows * SIZE[1] // SIZE[0]
     return camera.crop((camera.height - rows) // 2, (camera.width - columns) // 2, rows, columns).resize(*SIZE)
