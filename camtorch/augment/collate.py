@@ -63,6 +63,8 @@ def _others(function: Callable[..., Any], batch: Sequence[Any], *, collate_fn_ma
 
 def collate_cameras(batch: Sequence[Camera], *, collate_fn_map: Any = None) -> Camera | list[Camera]:
     """Return single cameras as one batch, of several models if need be; others as a list."""
+    if get_worker_info() is not None:  # which no graph can leave
+        batch = [camera.detach() for camera in batch]
     return list(batch) if any(camera.batch_shape for camera in batch) else cat(batch)
 
 

@@ -1,4 +1,4 @@
-"""Augmentations in the workers of a DataLoader, and a learnable camera in DistributedDataParallel."""
+"""Augmentations in the workers of a DataLoader."""
 
 import pickle
 
@@ -9,7 +9,6 @@ from torch.utils.data import DataLoader, Dataset
 
 import camtorch as ct
 import camtorch.augment.numpy
-from camtorch.augment import kornia as adapter
 
 SIZE = (12, 16)
 COUNT = 8
@@ -79,32 +78,6 @@ def test_workers_differ_and_runs_repeat(arrays):
     assert len(moved.flatten(1).unique(dim=0)) == len(moved)
 
 
-class Seen(Dataset):
-    """What a camera that learns makes of images and points, without an augmentation and by kornia's."""
-
-    def __init__(self):
-        self.dewarp, self.augmentation = ct.Dewarp(camera()), adapter.RandomLens(camera())
-
-    def __len__(self):
-        return 2
-
-    def __getitem__(self, index):
-        image, points = torch.rand(1, 1, *SIZE), torch.tensor([[7.0, 5.0]])
-        moved = self.augmentation(image)[0]
-        assert not moved.requires_grad
-        return {"image": self.dewarp(image)[0], "pixels": self.dewarp.transform_points(points)[0], "moved": moved}
-
-
-@pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
-@pytest.mark.parametrize("context", ["fork", pytest.param("spawn", marks=pytest.mark.slow)])
-def test_what_a_worker_sends_has_no_graph(context):
-    if context not in torch.multiprocessing.get_all_start_methods():
-        pytest.skip("this system cannot fork")
-    options = {"num_workers": 1, "multiprocessing_context": context, "collate_fn": ct.augment.collate}
-    (batch,) = DataLoader(Seen(), batch_size=2, **options)
-    assert not any(value.requires_grad for value in batch.values())
-
-
 def test_an_augmentation_pickles_with_its_options():
     for one in (augmentation(p=0.5, fill=0.3), ct.augment.RandomLens("dms90"), ct.augment.FaceNormalizer(focal=40)):
         assert repr(pickle.loads(pickle.dumps(one))) == repr(one)
@@ -115,6 +88,4 @@ def test_an_augmentation_pickles_with_its_options():
     assert second.last is None
     assert torch.equal(second(image=image, draw=draw)["image"], before["image"])
     copy = pickle.loads(pickle.dumps(ct.augment.numpy.Transform(first)))
-    # without a graph positions are rounded otherwise, by 1e-6 px or so
-    again = copy(image=image[0].numpy(), draw=draw)["image"]
-    np.testing.assert_allclose(again, before["image"][0].detach().numpy(), rtol=0, atol=1e-5)
+    assert np.array_equal(copy(image=image[0].numpy(), draw=draw)["image"], before["image"][0].numpy())
