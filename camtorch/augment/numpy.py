@@ -18,36 +18,30 @@ from torch import Tensor
 from camtorch.augment.augmentation import Augmentation, check_front_end
 from camtorch.augment.change import Change
 from camtorch.augment.face import FaceNormalizer
-from camtorch.augment.sample import IMAGES, KINDS, OWN, Sample, Single, check, kind_of
+from camtorch.augment.sample import _ALIASES, IMAGES, KINDS, OWN, Sample, Single, kind_of
 from camtorch.camera import Camera
 
 Array: TypeAlias = "np.ndarray[Any, Any]"
-Restore = Callable[[list[Tensor], tuple[int, int]], Any]
 _OWNER = "numpy.Transform"
-_SEEN = "image_valid"
+_VALID = "_valid"
 _FEW = 4  # channels
-_MOST_FORMS = 64  # of fields whose way is remembered
 
 
 class Transform:
     """An augmentation, or a `FaceNormalizer`, of one sample of numpy arrays.
 
-    The fields are those of `Augmentation`, without their batch dim, and images have their channels last:
+    The fields are those of `Augmentation`, by the same names and without their batch dim:
 
-    * `image` (H, W, C) or (H, W), of any real dtype, usually uint8, uint16 or float32; `mask`, `depth`, `distance`
-      likewise. `images` and `masks` are lists of such, or arrays (N, H, W) or (N, H, W, C). Three channels are red,
-      green, blue, which matters to chromatic aberration only.
-    * `keypoints` (N, 2), or OpenCV's (N, 1, 2); `bboxes` or `boxes` (M, 4) as x1 y1 x2 y2; both in pixels with
-      the centre of the top-left one at (0, 0). Boxes between pixel edges, albumentations' "pascal_voc", are these
-      plus 0.5.
-    * `gaze` (3,), `head_pose` (4, 4), `rvec` (3,), `tvec` (3,), `points` (N, 3), and all other fields.
-    * `camera`: the camera of the images, unless this or the augmentation has one. Edits need none.
+    * Images, masks and depth have their channels last, (H, W, C) or (H, W), and any real dtype. Under a plural name
+      they are lists of such arrays, or one array (N, H, W) or (N, H, W, C).
+    * Labels have the shape of a single sample, with several faces too. Lists of numbers are taken for arrays. Pixels
+      have the centre of the top-left one at (0, 0); boxes of albumentations' "pascal_voc" are these plus 0.5.
+    * The camera of the images is in the sample, or given to this or the augmentation. Edits need none.
 
-    Whatever is no field is passed on as it is. All arrays come out with the layout and the dtype that they came in
-    with, but coordinates of whole numbers come out in float32. Beside them come `keypoints_valid` (N,), `bboxes_valid`
-    (M,) and so on, bool, the new `camera`, and `rotation` (3, 3). Nothing is ever dropped or sorted: what left the
-    image has a False there. Pipelines of albumentations, with their `bbox_params` and `keypoint_params`, take the
-    `Transform` of `camtorch.augment.albumentations`.
+    Everything else is passed on; unknown names that hold numbers are refused, as by `Augmentation`. Arrays come out in
+    the layout and the dtype that they had, coordinates of whole numbers in float32. Validity, the new `camera` and
+    `rotation` (3, 3) come out as well. Nothing is dropped or sorted. For pipelines with `bbox_params` and
+    `keypoint_params`, use the `Transform` of `camtorch.augment.albumentations`.
 
     Numbers are drawn from torch's generator, `torch.manual_seed`, which DataLoader seeds differently in each of its
     workers, and not from numpy's. The same seed draws the same in every front end. Nothing is differentiated.
@@ -57,13 +51,12 @@ class Transform:
         camera: of samples that hold none; by default the augmentation's.
 
     Raises:
-        TypeError: it is no augmentation; a camera that is none.
+        TypeError: If it is no augmentation, or the camera is none.
     """
 
     def __init__(self, augmentation: Augmentation | FaceNormalizer, camera: Camera | None = None):
         self.camera = check_front_end(_OWNER, augmentation, camera, Augmentation, FaceNormalizer)
         self.augmentation = augmentation
-        self._ways: dict[Any, Callable[[str, Array], tuple[dict[str, Tensor], Restore]]] = {}
 
     def __call__(
         self,
@@ -109,85 +102,54 @@ class Transform:
         sample = {**(sample or {}), **fields}
         if otherwise is not None and sample.get("camera") is None:
             sample["camera"] = otherwise
-        inside = Single()
-        entries: dict[str, tuple[dict[str, Tensor], Restore | None]] = {}
+        entries = {}
         camera = sample.get("camera")
         size = getattr(self.augmentation._held("camera") if camera is None else camera, "image_size", None)
-        context = size, *self.augmentation.fields.items()
         for name, value in sample.items():
-            is_array = isinstance(value, np.ndarray)
-            form = (name, value.dtype, value.shape, *context) if is_array else None
-            way = self._ways.get(form)
-            entries[name] = way(name, value) if way else self._entry(name, value, sample, size, form)
-            tensors, restore = entries[name]
-            inside.update({name: value} if restore is None else tensors)
+            entries[name] = self._entry(name, value, sample, size)
+        inside = {key: tensor for tensors, _ in entries.values() for key, tensor in tensors.items()}
         with torch.no_grad():
-            moved = move(inside, **{key: value for key, value in options.items() if value is not None})
-        after: Any = moved.get("camera")
-        if after is None and isinstance(self.last, Change):
-            after = self.last.parts[0].target
-        result = {}
-        for name, (tensors, restore) in entries.items():
-            if restore is not None and tensors.keys() <= moved.keys():
-                result[name] = restore([moved.pop(key) for key in tensors], after.image_size)
-            elif name in moved:
-                result[name] = moved.pop(name)
+            moved = move(Single(inside), **{key: value for key, value in options.items() if value is not None})
+        result = {name: to(moved) for name, (tensors, to) in entries.items() if tensors.keys() <= moved.keys()}
         for name, value in moved.items():
-            value = _plain(value) if isinstance(value, Tensor) else value
-            result[name] = value[0] if name == _SEEN else value
+            if name not in inside:
+                value = _plain(value) if isinstance(value, Tensor) else value
+                flat = name.endswith(_VALID) and self._kind(name, value, sample) in IMAGES
+                result[name] = value[0] if flat else value
         return result
 
-    def _entry(
-        self, name: str, value: Any, sample: Mapping[str, Any], size: tuple[int, int] | None, form: Any
-    ) -> tuple[dict[str, Tensor], Restore | None]:
-        """Return a field as tensors, and what gives them, and a new image_size, their layout back; or None."""
-        if name in OWN or value is None:
-            return {}, None
-        if name == _SEEN or (name.endswith("_valid") and name.removesuffix("_valid") in sample):
-            valid = _tensor(np.asarray(value, dtype=bool))
-            if name == _SEEN:
-                return {name: valid[None]}, lambda moved, size: moved[0][0].cpu().numpy()
-            return {name: valid}, lambda moved, size: moved[0].cpu().numpy()
+    def _kind(self, name: str, value: Any, sample: Mapping[str, Any]) -> str | None:
+        """Return the kind of a field, or of the field whose validity this is; None if it stays."""
         kind = kind_of(name, value, self.augmentation.fields, _OWNER)
-        if kind is None:
-            mirroring = self.augmentation.mirroring
-            if mirroring is None or name not in mirroring.by_name:
-                return {}, None
-            return {name: _tensor(_checked(name, np.asarray(value)))}, lambda moved, size: moved[0].cpu().numpy()
+        if kind is None and name.endswith(_VALID):
+            name = name.removesuffix(_VALID)
+            kind = kind_of(name, sample.get(name), self.augmentation.fields, _OWNER)
+            kind = kind if kind not in IMAGES or np.ndim(value) > 1 else None  # a flag for each sample
+        return kind
+
+    def _entry(
+        self, name: str, value: Any, sample: Mapping[str, Any], size: tuple[int, int] | None
+    ) -> tuple[Sample, Callable[[Sample], Any]]:
+        """Return a field as tensors, and what gives them their layout back."""
+        kind = None if name in OWN or value is None else self._kind(name, value, sample)
+        mirroring = self.augmentation.mirroring
+        if kind is None and (mirroring is None or name not in mirroring.by_name):
+            return {name: value}, lambda moved: moved[name]
         if kind not in IMAGES:
-            numbers = _checked(name, _numbers(value, kind))
-            check(kind, name, _tensor(numbers), False, _OWNER)
-            if numbers is value:
-                self._remember(form, _labels)
-            return _labels(name, numbers)
+            array = _checked(name, _numbers(value, name, kind))
+            return {name: _tensor(array)}, lambda moved: _plain(moved[name]).astype(array.dtype, copy=False)
         many = isinstance(value, (list, tuple))
-        if not many and name not in ("images", "masks"):
-            as_tensor(name, value, size)
-            self._remember(form, _image)
-            return _image(name, value)
-        # names that begin with their kind are known to the augmentation
-        tensors = {f"{kind}_{name}[{i}]": as_tensor(f"{name}[{i}]", one, size) for i, one in enumerate(value)}
-
-        def restore(moved: list[Tensor], size: tuple[int, int]) -> Any:
-            arrays = [as_array(image, one) for image, one in zip(moved, value, strict=True)]
-            if many:
-                return arrays
-            return np.stack(arrays) if arrays else np.zeros((0, *size, *value.shape[3:]), value.dtype)
-
-        return tensors, restore
-
-    def _remember(self, form: Any, way: Callable[[str, Array], tuple[dict[str, Tensor], Restore]]) -> None:
-        if len(self._ways) >= _MOST_FORMS:
-            self._ways.clear()
-        self._ways[form] = way
-
-
-def _labels(name: str, array: Array) -> tuple[dict[str, Tensor], Restore]:
-    return {name: _tensor(array)}, lambda moved, size: _plain(moved[0]).astype(array.dtype, copy=False)
-
-
-def _image(name: str, array: Array) -> tuple[dict[str, Tensor], Restore]:
-    return {name: _planes(array)}, lambda moved, size: as_array(moved[0], array)
+        if not many and name not in _ALIASES:
+            value = np.asarray(value, bool) if name.endswith(_VALID) else value
+            return {name: as_tensor(name, value, size)}, lambda moved: as_array(moved[name], value)
+        key = f"{kind}_{name}"  # which begins with its kind, and is known to the augmentation
+        if not many and not len(value):  # what changes is the size, of an image without channels
+            empty = _tensor(value.reshape(value.shape[:3]))
+            return {key: empty}, lambda moved: np.empty((*moved[key].shape, *value.shape[3:]), value.dtype)
+        parts = {f"{key}[{i}]": (f"{name}[{i}]", one) for i, one in enumerate(value)}
+        tensors = {key: as_tensor(*part, size) for key, part in parts.items()}
+        to = list if many else np.stack
+        return tensors, lambda moved: to([as_array(moved[key], one) for key, (_, one) in parts.items()])
 
 
 def _plain(tensor: Tensor) -> Array:
@@ -200,8 +162,12 @@ def _planes(array: Array) -> Tensor:
     return tensor.permute(2, 0, 1) if array.ndim == 3 else tensor[None]
 
 
-def _numbers(value: Any, kind: str) -> Any:
-    """Coordinates of floating point; a list of numbers is taken for an array."""
+def _numbers(value: Any, name: str, kind: str | None) -> Any:
+    """Coordinates of floating point, flags of bool; a list of numbers is taken for an array."""
+    if name.endswith(_VALID):
+        return np.asarray(value, bool)
+    if kind is None:
+        return np.asarray(value)
     if isinstance(value, (list, tuple)):
         try:
             value = np.asarray(value, np.float32)

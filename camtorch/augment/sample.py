@@ -169,17 +169,22 @@ _RANKS = {kind: (not field.decides, i) for i, (kind, field) in enumerate(KINDS.i
 
 def kind_of(name: str, value: object, own: Mapping[str, str], owner: str) -> str | None:
     """Return the key in `KINDS` of a field, None if it stays; numbers of an unknown name may be geometry: an error."""
+    if not isinstance(name, str):
+        raise TypeError(f"{owner}: a sample must have strings for names; got {name!r:.80}")
     if name in own:
         return None if own[name] == KEEP else own[name]
     if name.endswith("_valid"):
         return None
     base = name if name in KINDS else _ALIASES.get(name)
-    if base is None:
+    if base is None and isinstance(value, (Tensor, np.ndarray, list, tuple)):  # no image_path, mask_id
         begins = sorted((k for k in KINDS if name.startswith(k + "_")), key=len)  # compilers know no max by a key
         base = begins[-1] if begins else None
-        if base is not None and not isinstance(value, (Tensor, np.ndarray, list, tuple)):
-            return None  # image_path, mask_id
-    if base is None and (_holds_reals(value) or _holds_planes(name, value)):
+    if base is None and _may_be_geometry(name, value):
+        if isinstance(value, Mapping):
+            raise ValueError(
+                f"{owner}: {name!r} holds real numbers in a dict, and fields move only at the top of a sample. Put them "
+                f"there, or leave the dict as it is by fields={{{name!r}: '{KEEP}'}}"
+            )
         close = _close_to(name)
         meant = f"Did you mean {close[0]!r}? " if close else ""
         raise ValueError(
@@ -193,20 +198,21 @@ def _close_to(name: str) -> list[str]:
     return ["mask"] if name.startswith("seg") else difflib.get_close_matches(name, KINDS, 1)
 
 
-def _holds_planes(name: str, value: object) -> bool:
-    """Whether whole numbers may be masks, boxes or points: more than a row a sample, or named like such."""
-    return isinstance(value, (Tensor, np.ndarray)) and (value.ndim > 2 or (value.ndim == 2 and bool(_close_to(name))))
-
-
-def _holds_reals(value: object) -> bool:
-    """Whether there are real numbers in it that might be geometry; a number alone is none."""
+def _may_be_geometry(name: str, value: object) -> bool:
+    """Whether it holds real numbers, or whole ones of more than a row a sample or with such a name; not one alone."""
     if isinstance(value, Mapping):
-        return any(map(_holds_reals, value.values()))
+        return any(_may_be_geometry(str(key), item) for key, item in value.items())
     if isinstance(value, (list, tuple)):
-        return any(isinstance(item, float) or _holds_reals(item) for item in value)
+        return any(isinstance(item, float) or _may_be_geometry(name, item) for item in value)
     if isinstance(value, np.ndarray):
-        return value.ndim > 0 and np.issubdtype(value.dtype, np.floating)
-    return isinstance(value, Tensor) and value.ndim > 0 and value.dtype.is_floating_point
+        if value.dtype == object:
+            return _may_be_geometry(name, value.tolist())
+        reals = bool(np.issubdtype(value.dtype, np.floating))
+    elif isinstance(value, Tensor):
+        reals = value.dtype.is_floating_point
+    else:
+        return False
+    return value.ndim > (0 if reals else 2) or (value.ndim == 2 and bool(_close_to(name)))
 
 
 def moves(kind: str, value: Tensor) -> Move:
@@ -474,7 +480,7 @@ class SampleTransform(nn.Module):
 
     def _given(self, sample: Mapping[str, object] | None, fields: Mapping[str, object]) -> Sample:
         """The sample and the keyword arguments as one dict."""
-        if sample is not None and not isinstance(sample, Mapping):
+        if not (sample is None or hasattr(sample, "keys")):
             got = type(sample).__name__
             raise TypeError(f"{self._name}: a sample is a dict of fields, or keywords, as in image=...; got {got}")
         return sample if isinstance(sample, Single) and not fields else {**(sample or {}), **fields}
@@ -689,18 +695,18 @@ class SampleTransform(nn.Module):
                 valid = valid if batched or valid is None else valid.squeeze(0)
             if valid is not None:
                 moved[f"{name}_valid"] = self._still(f"{name}_valid", valid, sample.get(f"{name}_valid"))
-        before = sample.get("image_valid")
-        if before is not None:
-            before = torch.as_tensor(before) != 0
-            before = before if batched else before.unsqueeze(0)
-            if before.ndim != 4 or len(before) != change.count:
-                raise ValueError(f"{self._name}: image_valid must be (B, 1, H, W); got shape {tuple(before.shape)}")
-            before = change.labels(before)
-        if self.valid_mask and any(found == "image" for found, _ in named.values()):
-            before = change.valid_mask() if before is None else before & change.valid_mask()
-        if before is not None:
-            before = before.contiguous()
-            moved["image_valid"] = before if batched else before.squeeze(0)
+        for key in dict.fromkeys(("image_valid", *(f"{n}_valid" for n, (k, _) in named.items() if k in IMAGES))):
+            seen = sample.get(key)
+            if seen is not None and (key == "image_valid" or getattr(seen, "ndim", 0) > 1 + batched):
+                seen = torch.as_tensor(seen) != 0
+                seen = seen if batched else seen.unsqueeze(0)
+                if len(seen) != change.count or not (seen.ndim == 4 or (seen.ndim == 3 and key != "image_valid")):
+                    raise ValueError(f"{self._name}: {key} must be (B, 1, H, W); got shape {tuple(seen.shape)}")
+                seen = KINDS["mask"].move(change, seen, {"mask_fill": 0.0})
+            if key == "image_valid" and self.valid_mask and any(found == "image" for found, _ in named.values()):
+                seen = change.valid_mask() if seen is None else seen & change.valid_mask()
+            if isinstance(seen, Tensor):
+                moved[key] = seen.contiguous() if batched else seen.squeeze(0).contiguous()
         if "rotation" not in named:
             moved["rotation"] = change.rotation.clone() if batched else change.single_rotation
         if self.mirroring is not None:

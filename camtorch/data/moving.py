@@ -79,7 +79,8 @@ class Mover:
         """
         try:
             moving = {name: value for name, value in row.items() if self._moves(name, value)}
-            fields = {name: _dense(name, value, self._fields.get(name, name)) for name, value in moving.items()}
+            kinds = {name: kind_of(name, value, self._fields, self._owner) or "" for name, value in moving.items()}
+            fields = {name: _dense(name, value, kinds[name]) for name, value in moving.items()}
             camera = row.get("camera")
             if camera is not None:
                 fields["camera"] = camera if isinstance(camera, Camera) else self._camera(camera, fields)

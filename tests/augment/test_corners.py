@@ -3,6 +3,7 @@
 import copy
 import math
 
+import numpy as np
 import pytest
 import torch
 
@@ -147,8 +148,16 @@ def test_fields_that_only_sound_like_geometry(camera):
     sample = {"keypoints": torch.zeros(1, 1, 2), "image_path": "a.png", "mask_id": 7, "boxes_note": None}
     out = mount(sample)
     assert (out["image_path"], out["mask_id"]) == ("a.png", 7)
-    for hidden in ({"meta": {"boxes": torch.zeros(1, 4)}}, {"scores": [0.5, 0.25]}):
-        with pytest.raises(ValueError, match="holds real numbers"):
+    for hidden in (
+        *({"meta": {"boxes": torch.zeros(1, 4)}}, {"meta": {"deeper": {"mask": torch.ones(1, 3, 4).long()}}}),
+        *({"scores": [0.5, 0.25]}, {"views": [torch.ones(3, 4, 5, dtype=torch.uint8)]}, {"image_meta": {"k": [1.5]}}),
+        {"ragged": np.array([np.ones(2), None], object)},
+    ):
+        with pytest.raises(ValueError, match=rf"'{next(iter(hidden))}' holds real numbers.*fields={{"):
             mount(sample, **hidden)
+        own = RandomMount(camera=camera, fields=dict.fromkeys(hidden, "keep"))
+        assert own(sample, **hidden)[next(iter(hidden))] is next(iter(hidden.values()))
+    with pytest.raises(TypeError, match="a sample must have strings for names; got 3"):
+        mount({3: torch.zeros(1, 2)})
     with pytest.raises(ValueError, match=r"fields=\{'boxes_label': 'keep'\} leaves it as it is"):
         mount(sample, boxes_label=torch.zeros(1, 3))

@@ -84,12 +84,16 @@ def test_layouts_lists_and_what_was_valid_before():
         keypoints_valid=np.array([False, True]),
         bboxes=[],
         depth=mask.astype(np.float32),
+        depth_valid=mask > 0,
+        mask_parts_valid=True,
     )
     assert out["image"].shape == out["depth"].shape == out["image_valid"].shape == (20, 30)
     assert out["image_valid"].dtype == bool
     assert [one.shape for one in out["images"]] == [(20, 30, 3), (20, 30)]
     assert [(one.shape, one.dtype.name) for one in out["masks"]] == [((20, 30), "int64"), ((20, 30, 1), "bool")]
     np.testing.assert_array_equal(out["masks"][0] > 0, out["masks"][1][..., 0])
+    np.testing.assert_array_equal(out["depth_valid"], out["masks"][1][..., 0])
+    assert out["mask_parts_valid"] is True
     assert (out["mask_parts"], out["bboxes"].shape, out["keypoints"].dtype) == ([], (0, 4), np.float32)
     assert out["keypoints_valid"].tolist() == [False, True]
     draw = transform.augmentation.draw(1)
