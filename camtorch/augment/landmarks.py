@@ -22,8 +22,10 @@ def _order(count: int, *runs: tuple[int, int, int]) -> tuple[int, ...]:
 
 
 # runs (first, last, step): landmark i of first ... last changes places with i + step
-_MESH = (3, 3, 245), (7, 7, 242), (20, 93, 230), (95, 150, 229), (153, 163, 227), (165, 167, 226), (169, 174, 225)
-_MESH += (176, 194, 224), (196, 196, 223), (198, 198, 222), (201, 247, 220)
+_MESH = [
+    *((3, 3, 245), (7, 7, 242), (20, 93, 230), (95, 150, 229), (153, 163, 227), (165, 167, 226)),
+    *((169, 174, 225), (176, 194, 224), (196, 196, 223), (198, 198, 222), (201, 247, 220)),
+]
 _MESHES = [(i, i, 2 * i + step) for first, last, step in _MESH for i in range(first, last + 1)]
 
 LANDMARKS: dict[str, tuple[int, ...]] = {

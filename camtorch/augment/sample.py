@@ -182,7 +182,7 @@ def kind_of(name: str, value: object, own: Mapping[str, str], owner: str) -> str
     if base is None and _may_be_geometry(name, value):
         if isinstance(value, Mapping):
             raise ValueError(
-                f"{owner}: {name!r} holds real numbers in a dict, and fields move only at the top of a sample. Put them "
+                f"{owner}: {name!r} holds real numbers in a dict, and fields move only at the top of samples. Put them "
                 f"there, or leave the dict as it is by fields={{{name!r}: '{KEEP}'}}"
             )
         close = _close_to(name)
@@ -542,12 +542,12 @@ class SampleTransform(nn.Module):
                     self._forms.pop(next(iter(self._forms)), None)
                 self._forms[form] = [(name, found) for name, (found, _) in named.items()], batched, count
             return result
-        kinds, batched, count = known
+        own, batched, count = known
         if not predicted:
-            for name, found in kinds:
+            for name, found in own:
                 if found in _CHECKED:
                     check_values(found, name, sample[name], self._name)
-        named = {name: (found, sample[name] if batched else sample[name].unsqueeze(0)) for name, found in kinds}
+        named = {name: (found, sample[name] if batched else sample[name].unsqueeze(0)) for name, found in own}
         return named, batched, count, camera
 
     def _form_of(self, sample: Sample, camera: object, fields: Mapping[str, str]) -> tuple[Any, ...] | None:
