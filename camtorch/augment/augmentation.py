@@ -184,24 +184,27 @@ class FilledOptions(EditOptions, total=False):
 class Augmentation(SampleTransform):
     """A random change of cameras, `sample -> sample`: every field moves by the same warps.
 
-    A sample is a dict, or keyword arguments, of any of these fields, of a batch or (without B) of a single sample;
-    a name may go on after an underscore, as in `gaze_left` or `mask_iris`. Masks, points and boxes whose number differs
-    between samples come as a list of tensors, one for each sample.
+    A sample is a dict, or keyword arguments, with any of these fields. They hold a batch, or without B a single sample.
+    A name may go on after an underscore, as in `gaze_left` or `mask_iris`. If the number of masks, points or boxes
+    differs between samples, pass a list with a tensor for each sample.
 
-    * `image` (B, C, H, W); `mask` (B, C, H, W) or (B, H, W), of any dtype, moved by the nearest value; `depth` along z
-      and `distance` along the ray, likewise.
-    * `keypoints` (B, N, 2), or OpenCV's (B, N, 1, 2), and `polygons` (B, M, K, 2) in pixels, `boxes` (B, M, 4) as
-      x1 y1 x2 y2. Count and order stay; beside them comes `keypoints_valid` and so on, bool: it lies on the new
-      image (and was valid before, if the sample says so). A box with x2 < x1 or y2 < y1 is not valid.
-    * `points` (B, N, 3) of the camera frame; `landmarks` are keypoints or points by their last dim.
-    * `gaze`, `directions` (B, *N, 3): turned by R, nothing else. `pitch_yaw` (B, *N, 2): a gaze in the angles of
-      ETH-XGaze.
-    * `head_pose`, `pose` (B, 4, 4) camera from head; or `rvec` (B, 3) and `tvec` (B, 3), as of OpenCV.
+    * `image` (B, C, H, W). `mask` (B, C, H, W) or (B, H, W) of any dtype takes the nearest value. So do `depth` along z
+      and `distance` along the ray.
+    * `keypoints` (B, N, 2), of several faces (B, F, N, 2), or OpenCV's (B, N, 1, 2); `polygons` (B, M, K, 2); `boxes`
+      (B, M, 4) as x1 y1 x2 y2; all in pixels. Count and order stay. `keypoints_valid` and so on come out as bool: the
+      point lies on the new image, and was valid before if the sample says so. A box with x2 < x1 or y2 < y1 is invalid.
+    * `points` (B, *N, 3) of the camera frame. `landmarks` are keypoints or points, by their last dim.
+    * `gaze`, `directions` (B, *N, 3) turn by R. `pitch_yaw` (B, *N, 2) is a gaze in the angles of ETH-XGaze.
+    * `head_pose`, `pose` (B, 4, 4), camera from head; or `rvec` (B, 3) and `tvec` (B, 3) of OpenCV.
     * `camera`: the camera of the image, one for all, a batch, a `ct.Mixed` of any models, or a list of single ones.
-      What comes out is the camera of the new image, for which all 3D fields hold.
+      The camera of the new image comes out, and all 3D fields hold for it.
+
+    An image (B, T, C, H, W) holds clips: all frames of a clip move by one draw. All fields are then (B, T, ...), and
+    the camera is one for all or (B,). `BoxCrop` looks at the box of the first frame.
 
     `rotation` (B, 3, 3) comes out: `ray_after = R ray_before`, over all augmentations that the sample went through.
-    Everything else stays as it is; unknown names that hold real numbers are refused, as they might be geometry.
+    Other fields stay as they are. An unknown name that holds numbers which might be geometry, also in a dict in the
+    sample, raises an error; `fields` says what it is.
 
     Turning the camera and changing its lens move all of it exactly. Moving the camera elsewhere shifts near things
     against far ones, which takes depth: `RandomMount(shift=...)` does it for samples that have some.

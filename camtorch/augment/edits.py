@@ -354,10 +354,10 @@ class HorizontalFlip(_Flip):
 
     Args:
         p: how likely.
-        landmarks: which landmarks change places: one of `LANDMARKS` ("ibug68", "wflw98", "lapa106", "coco17"), or for
-            each landmark the other one's index, or pairs (left, right); for all of keypoints, landmarks and points, or
-            a dict by field, which may name what does not move, as the visibility of each, too. None: all keep their
-            order.
+        landmarks: which landmarks of each face change places: one of `LANDMARKS` ("ibug68", "wflw98", "lapa106",
+            "coco17", "mediapipe468", "mediapipe478"), or for each landmark the other one's index, or pairs (left,
+            right); for all of keypoints, landmarks and points, or a dict by field, which may name what does not move,
+            as the visibility of each, too. None: all keep their order.
         lateral_axis: "x", "y" or "z", of the head's own frame, from one side of the head to the other.
         swap_sides: whether fields named `..._left` and `..._right` change places.
         options: see `Edit`.
