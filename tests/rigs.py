@@ -19,7 +19,6 @@ def float64(values):
 
 
 def load(name):
-    """A sample file."""
     return ct.load(FILES / name)
 
 

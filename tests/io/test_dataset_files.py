@@ -13,7 +13,6 @@ POINT = np.array([0.3, -0.2, 1.5])
 
 
 def rotation_of(w, x, y, z):
-    """The matrix of a quaternion."""
     w, x, y, z = np.array([w, x, y, z]) / np.linalg.norm([w, x, y, z])
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     return np.eye(3) + 2 * w * cross + 2 * cross @ cross
@@ -25,7 +24,6 @@ def seen(rig, name, point):
 
 
 def changed(tmp_path, name, *changes):
-    """A sample with some of its text exchanged."""
     text = (FILES / name).read_text()
     for old, new in changes:
         assert old in text

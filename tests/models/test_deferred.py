@@ -43,7 +43,6 @@ def results(layer):
 
 
 def varied(layer):
-    """The same layer with values of its own."""
     with torch.no_grad():
         for i, p in enumerate(layer.parameters()):
             p.mul_(1 + 0.01 * i)

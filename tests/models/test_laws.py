@@ -731,7 +731,6 @@ def test_pixel_grid_and_rays(key):
 @settings(max_examples=2)
 @given(data=st.data())
 def test_coefficients_left_out_are_zeros(key, data):
-    """A camera with fewer coefficients is the one with zeros in their place."""
     camera = data.draw(drawn(key, False))
     count = len(camera.distortion_names)
     if key == "tabulated":  # where zeros are another table

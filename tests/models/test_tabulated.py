@@ -36,7 +36,6 @@ class Reference:
         self.end = nodes[falls[0]] if len(falls) else nodes[-1]
 
     def radius(self, theta):
-        """r, by Hermite's basis."""
         i = np.clip(np.searchsorted(self.nodes, theta, side="right") - 1, 0, len(self.steps) - 1)
         h, s = self.steps[i], (theta - self.nodes[i]) / self.steps[i]
         near = (1 + 2 * s) * self.values[i] + s * h * self.slopes[i]
@@ -44,7 +43,6 @@ class Reference:
         return (1 - s) ** 2 * near + s**2 * far
 
     def angle(self, r):
-        """theta, by bisection."""
         low, high = np.zeros_like(r), np.full_like(r, self.end)
         for _ in range(80):
             middle = (low + high) / 2
@@ -54,13 +52,11 @@ class Reference:
 
 
 def data_sheet():
-    """In micrometres, every half degree."""
     angles = np.radians(np.arange(0.5, 100.25, 0.5))
     return angles, np.round(3 * (angles - 0.02 * angles**3 + 0.003 * angles**5), 3)
 
 
 def drawn(seed, most=60, ratio=29.0):
-    """A table that ascends, with slopes of any ratio up to that one."""
     source = np.random.default_rng(seed)
     angles = np.cumsum(source.uniform(0.05, 1, source.integers(3, most)))
     angles *= source.uniform(0.2, 1.8) / angles[-1]

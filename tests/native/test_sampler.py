@@ -351,8 +351,6 @@ def images_of_floats():
 
 
 class Wrapped(torch.Tensor):
-    """Whose values are elsewhere."""
-
     @staticmethod
     def __new__(cls, inner):
         return torch.Tensor._make_wrapper_subclass(cls, inner.shape, dtype=inner.dtype, strides=inner.stride())
@@ -461,7 +459,6 @@ def threads(count):
 
 
 def samples(count=2, seed=0):
-    """Images large enough to be shared out in tiles."""
     return pixels(torch.uint8, (count, 3, 480, 640), seed)
 
 

@@ -14,7 +14,6 @@ ENVIRONMENT = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
 
 
 def python(code, *words, expect=0):
-    """What a fresh process prints."""
     done = subprocess.run([sys.executable, "-c", code, *words], capture_output=True, text=True, env=ENVIRONMENT)
     assert done.returncode == expect, done.stderr
     return done.stdout + done.stderr

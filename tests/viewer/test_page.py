@@ -81,7 +81,6 @@ def fisheye():
 
 
 def photograph(path, height=240, width=320):
-    """Smooth, so that ways to interpolate agree."""
     v, u = np.mgrid[:height, :width].astype(float)
     planes = [np.sin(u / 25), np.cos(v / 20), np.sin((u + v) / 30)]
     Image.fromarray((127.5 + 120 * np.stack(planes, -1)).astype(np.uint8)).save(path)
