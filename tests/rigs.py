@@ -26,8 +26,7 @@ def assert_same(a, b, atol=0.0):
     """The same rig: cameras to the last bit, poses to the rounding of what their rotations are written as."""
     assert list(a.cameras) == list(b.cameras)
     for one, other in zip(a.cameras.values(), b.cameras.values(), strict=True):
-        assert type(one) is type(other)
-        assert one.image_size == other.image_size
+        assert (type(one), one.image_size) == (type(other), other.image_size)
         assert one.intrinsics.dtype == other.intrinsics.dtype == torch.float64
         assert torch.equal(one.intrinsics, other.intrinsics)
         assert torch.equal(one.distortion, other.distortion)

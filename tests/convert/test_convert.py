@@ -55,8 +55,7 @@ def check(source, result):
     assert parameters.dtype == torch.float64
     assert bool(torch.isfinite(parameters).all())
     assert all(number.shape == source.batch_shape and not bool(number.isnan().any()) for number in numbers)
-    assert result.camera.batch_shape == source.batch_shape
-    assert result.camera.image_size == source.image_size
+    assert (result.camera.batch_shape, result.camera.image_size) == (source.batch_shape, source.image_size)
     assert bool((result.rms <= result.max_error).all())
     assert bool(((result.valid_fraction >= 0) & (result.valid_fraction <= 1)).all())
     assert bool(((result.max_angle >= 0) & (result.max_angle <= math.pi + 1e-9)).all())

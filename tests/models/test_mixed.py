@@ -129,8 +129,7 @@ def test_edits_are_those_of_each_camera_and_gradients_go_there(edit):
 def test_parts_and_members():
     cameras = models()
     mixed = ct.Mixed(cameras)
-    assert len(mixed) == 6
-    assert mixed.batch_shape == (6,)
+    assert (len(mixed), mixed.batch_shape) == (6, (6,))
     assert mixed[4] is cameras[4]
     assert mixed[-1] is cameras[5]
     assert list(mixed) == cameras

@@ -124,8 +124,7 @@ def test_arrays_of_points():
     camera = ct.KannalaBrandt.from_matrix(K, coefficients(4), image_size=(480, 640))
     points = np.random.default_rng(0).normal((0, 0, 4), size=(7, 1, 3))
     pixels, valid = camera.project(points)
-    assert pixels.shape == (7, 1, 2)
-    assert pixels.dtype == torch.float64
+    assert (pixels.shape, pixels.dtype) == ((7, 1, 2), torch.float64)
     assert valid.shape == (7, 1)
     rays, _ = camera.unproject(pixels.detach().numpy())
     torch.testing.assert_close(rays.detach(), torch.tensor(points / np.linalg.norm(points, axis=-1, keepdims=True)))

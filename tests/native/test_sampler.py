@@ -91,8 +91,7 @@ def between(grid, source):
 
 
 def compare(result, expected, mode, unsure, span):
-    assert result.dtype == expected.dtype
-    assert result.shape == expected.shape
+    assert (result.dtype, result.shape) == (expected.dtype, expected.shape)
     if not result.numel():
         return
     unsure = unsure.unsqueeze(1).expand_as(result)
