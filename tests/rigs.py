@@ -18,6 +18,12 @@ def float64(values):
     return torch.tensor(values, dtype=torch.float64)
 
 
+def tables(path):
+    """Return the names and the rows of the tables in a text: a name in brackets, and rows of cells between arrows."""
+    tables = (table.split("]\n") for table in path.read_text().split("\n\n[")[1:])
+    return [(name, [row.split(" => ") for row in rows.splitlines()]) for name, rows in tables]
+
+
 def load(name):
     return ct.load(FILES / name)
 

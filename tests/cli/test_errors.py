@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 from command_line import FILES, LEVEL, opened, refused, write_photograph
+from rigs import tables
 
 import camtorch as ct
 
@@ -30,13 +31,7 @@ def files(tmp_path_factory):
     return folder
 
 
-def cases():
-    """Return the rows of errors.txt, words and what is said of them, by their groups."""
-    groups = (group.split("]\n") for group in Path(__file__).with_name("errors.txt").read_text().split("\n\n[")[1:])
-    return {name: [row.split(" => ") for row in rows.splitlines()] for name, rows in groups}
-
-
-@pytest.mark.parametrize(("group", "rows"), cases().items(), ids=cases())
+@pytest.mark.parametrize(("group", "rows"), tables(Path(__file__).with_name("errors.txt")))
 def test_errors_are_one_line_and_leave_nothing(files, monkeypatch, capsys, group, rows):
     monkeypatch.chdir(files)
     before = {path: path.read_bytes() for path in files.rglob("*.*")}

@@ -69,13 +69,6 @@ def test_deferred_initialisation(key, fill):
     assert layer["camera"].intrinsics.grad.any()
 
 
-def test_assigned_double_precision():
-    with torch.device("meta"):
-        camera = ct.Pinhole([1.0, 1.0, 0.0, 0.0])
-    camera.load_state_dict(ct.Pinhole([300.0, 310.0, 31.5, 23.5]).double().state_dict(), assign=True)
-    assert camera.intrinsics.dtype == camera.distortion.dtype == camera.project(POINTS)[0].dtype == torch.float64
-
-
 @pytest.mark.parametrize(
     "mode", [pytest.param(FakeTensorMode, marks=pytest.mark.slow), lambda: torch.device("meta")], ids=["fake", "meta"]
 )
