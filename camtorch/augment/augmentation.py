@@ -630,23 +630,3 @@ def camera_of_sample(
         raise ValueError(f"{owner}: no camera; {how}; got {shown(camera)}. {GUESS_CAMERA}")
     check_single(owner, camera, sizes)
     return camera
-
-
-def move_points(
-    augmentation: Augmentation, change: Change, pixels: Tensor, made: tuple[Tensor, Tensor] | None = None
-) -> tuple[Tensor, Tensor]:
-    """Return keypoints (B, *N, 2) moved, and valid (B, *N); landmarks in their order in a mirror.
-
-    (-1, -1), by which front ends say that a point has no place, stays that. made: what `together` has made of them.
-    """
-    lost = (pixels == -1).all(-1)
-    moved, valid = change.points(pixels) if made is None else made
-    moved, valid = torch.where(lost.unsqueeze(-1), -1.0, moved), valid & ~lost
-    mirroring = augmentation.mirroring
-    order = None if mirroring is None else mirroring.order("keypoints", "keypoints", pixels.shape[-2])
-    mirrored = None if order is None else change.mirrored
-    if mirrored is None:
-        return moved, valid
-    rows, index = mirrored.reshape(-1, *[1] * (valid.ndim - 1)), torch.tensor(order, device=pixels.device)
-    moved = torch.where(rows.unsqueeze(-1), moved.index_select(-2, index), moved)
-    return moved, torch.where(rows, valid.index_select(-1, index), valid)

@@ -1,34 +1,43 @@
 """The augmentations as kornia's: in AugmentationSequential and VideoSequential, for every data key, beside its own.
 
+kornia's containers hand on the fields of a dict (`data_keys=None`) that they do not know without telling anybody. So
+this module, once imported, wraps `forward` and `inverse` of `AugmentationSequential`: if one holds a
+`CameraAugmentation`, such fields move by their names, as in `Augmentation`, and their validity comes out beside them.
+Numbers under an unknown name that might be geometry raise an error; `fields={"lidar": "points", "logits": "keep"}` of
+the augmentation says what they are. A "camera" is the camera of the images and comes out as the new one. kornia's own
+augmentations that move pixels are refused next to such fields, as they would leave them behind.
+
 `import camtorch` does not load this module, nor kornia.
 """
 
 from __future__ import annotations
 
+import functools
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, TypeAlias, cast
 
 import kornia
 import torch
-from kornia.augmentation import GeometricAugmentationBase2D
+from kornia.augmentation import AugmentationSequential, GeometricAugmentationBase2D, IntensityAugmentationBase2D
+from kornia.augmentation.base import _BasicAugmentationBase
 from kornia.augmentation.container.params import ParamItem
 from kornia.augmentation.utils import _transform_output_shape
-from kornia.constants import Resample, SamplePadding
+from kornia.constants import DataKey, Resample, SamplePadding
 from kornia.geometry.boxes import Boxes
 from kornia.geometry.keypoints import Keypoints
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn.utils.parametrize import type_before_parametrizations
 
 from camtorch._arguments import as_part, as_values, check_boxes, fails, shown
 from camtorch._dtypes import narrow, widen
 from camtorch._module import Memo, remade
 from camtorch.augment import box_crop, compose, edits, random_camera
-from camtorch.augment.augmentation import Augmentation, check_front_end, check_single, move_points
+from camtorch.augment.augmentation import Augmentation, check_front_end, check_single
 from camtorch.augment.change import Change
 from camtorch.augment.collate import collate_cameras
 from camtorch.augment.presets import PresetName
-from camtorch.augment.sample import fixed_copy, on_samples
+from camtorch.augment.sample import OWN, Sample, Single, fixed_copy, kind_of, on_samples
 from camtorch.camera import Camera
 from camtorch.warp.sampling import Mode
 
@@ -47,24 +56,19 @@ __all__ = [
     "Pad",
     "RandomCamera",
     "RandomCrop",
-    "RandomLens",
-    "RandomMount",
-    "RandomResizedCrop",
-    "Resize",
-    "Rotate90",
-    "VerticalFlip",
-    "with_boxes",
-    "with_cameras",
 ]
+__all__ += ["RandomLens", "RandomMount", "RandomResizedCrop", "Resize", "Rotate90", "VerticalFlip"]
+__all__ += ["with_boxes", "with_cameras"]
 
 Params: TypeAlias = dict[str, Tensor]
 Flags: TypeAlias = dict[str, Any]
+_POINTS = "keypoints"
 _KIND = "source_kind"
 _NUMBERS = "source_intrinsics", "source_distortion"
 
 
 class CameraAugmentation(GeometricAugmentationBase2D):
-    r"""An augmentation of camtorch as one of kornia: image, masks, keypoints and boxes move by the same warps.
+    r"""An augmentation of camtorch as one of kornia: images, masks, keypoints and boxes move by the same warps.
 
     The same seed gives the same warps as calling the augmentation itself on a sample.
 
@@ -79,19 +83,16 @@ class CameraAugmentation(GeometricAugmentationBase2D):
     Convention:
         - pixel coordinates are ``(x, y)`` at integer pixel centres, as in all of kornia and camtorch.
           ``align_corners`` means nothing; ``resample`` and ``padding_mode`` can be overridden by a call.
-        - keypoints keep their count and order. ``keypoints_valid`` (B, N), an attribute, is which of those last moved
-          lie on their new image. One without a place there becomes ``(-1, -1)``, and stays that, not valid, in
-          whatever augmentations of camtorch follow.
-        - boxes become those that enclose their moved outlines, which are curved; they are not clipped. A box of which
-          no part, outline or inside, is on the new image is invalid, which kornia exports as zeros.
+        - keypoints keep their count and order, ``landmarks`` of a flip apart. One without a place on the new image
+          becomes ``(-1, -1)``, and stays that in all augmentations of camtorch that follow. The attribute
+          ``keypoints_valid`` (B, N) says which of the last call lie on their image.
+        - boxes enclose their moved outlines, which are curved, and are not clipped. One of which no part is on the new
+          image is invalid, which kornia exports as zeros; they stay zeros in ``inverse``.
         - masks take the nearest value, the augmentation's `mask_fill` where nothing is seen, and never the colours and
           the light of the lens. ``extra_args={DataKey.MASK: {"resample": "bilinear"}}`` is for soft ones.
+        - in a dict (``data_keys=None``) fields that kornia does not know move by their names, see the module.
         - the warp is no matrix: ``transform_matrix`` is NaN, also of a container that holds the augmentation. ``last``
-          and ``change(params)`` give what there is instead: the cameras before and after, and how far it turned.
-        - edits of camtorch move the camera along, which kornia's own do not; ``landmarks`` of a flip are for keypoints.
-          A chain in one `Compose` samples images once.
-        - gaze, poses and 3D points have no data key in kornia, and containers leave them as they are. Turn them
-          by ``aug.last.rays(...)``, or call the augmentation itself with samples.
+          and ``change(params)`` give the cameras before and after, and how far they turned.
         - ``inverse`` takes everything back by the inverse warp. What left the image, or fell between its pixels, is
           lost; boxes have grown; chromatic aberration and vignetting stay.
         - params are tensors, drawn on the CPU wherever the module is. A replay is bit-identical.
@@ -223,8 +224,13 @@ class CameraAugmentation(GeometricAugmentationBase2D):
         self, input: Keypoints, params: Params, flags: Flags, transform: Tensor | None = None, *, back: bool = False
     ) -> Keypoints:
         rows = input.data if input.data.ndim == 3 else input.data.unsqueeze(0)
-        own = self.augmentation
-        moved, valid = self._move(params, rows, lambda change, pixels: move_points(own, change, pixels), back)
+
+        def move(change: Change, pixels: Tensor) -> tuple[Tensor, Tensor]:
+            given = torch.where((pixels == -1).all(-1, keepdim=True), torch.nan, pixels)
+            moved = self.augmentation.moved_by(change, {_POINTS: given}, predicted=True)
+            return torch.where(moved[_POINTS].isnan(), -1.0, moved[_POINTS]), moved[f"{_POINTS}_valid"]
+
+        moved, valid = self._move(params, rows, move, back)
         result = input.clone()
         result._data, self.keypoints_valid = moved.reshape(input.shape), valid.reshape(input.shape[:-1])
         return result
@@ -238,6 +244,18 @@ class CameraAugmentation(GeometricAugmentationBase2D):
         result._data = moved.reshape(input.shape)
         result._valid = input._valid & seen.reshape(input._valid.shape)
         return result
+
+    @on_samples
+    def _move_fields(self, params: Params, fields: Sample, kinds: dict[str, str], back: bool) -> Sample:
+        """Move the fields of a dict that kornia does not know; their flags come beside them."""
+        device = next((value.device for value in fields.values() if isinstance(value, Tensor)), torch.device("cpu"))
+        clips = int(params["video_batch_size"]) if "video_batch_size" in params else None
+        flat = {n: v.flatten(0, 1) for n, v in fields.items()} if clips else fields
+        with torch.autocast(device.type, enabled=False):
+            change = self.change(params, device)
+            moved = self.augmentation.moved_by(change.inverse() if back else change, flat, kinds, predicted=back)
+        kept = {n: v for n, v in moved.items() if n in fields or n.removesuffix("_valid") in kinds}
+        return {n: v.unflatten(0, (clips, -1)) for n, v in kept.items()} if clips else type(fields)(kept)
 
     def inverse_inputs(
         self, input: Tensor, params: Params, flags: Flags, transform: Tensor | None = None, **kwargs: Any
@@ -285,21 +303,6 @@ class _Random(CameraAugmentation):
 
     _wraps: Callable[..., Augmentation]
 
-    def __init_subclass__(cls, wraps: type[Augmentation], **options: Any):
-        super().__init_subclass__(**options)
-        cls._wraps, name = wraps, wraps.__name__
-        cls.__doc__ = f"""`camtorch.augment.{name}` for kornia. {cls.__doc__}
-
-        Args:
-            camera: of the images.
-            given, options: those of `camtorch.augment.{name}`; what comes first there follows the camera, or goes by
-                name.
-            p, p_batch, same_on_batch, keepdim: see `CameraAugmentation`.
-
-        Convention:
-            as `CameraAugmentation`; yaw, pitch and roll are degrees by which the camera turns, not the image.
-        """
-
     def __init__(
         self,
         *given: Camera | PresetName | str,
@@ -321,56 +324,29 @@ class _Random(CameraAugmentation):
         super().__init__(made, first, p=p, p_batch=p_batch, same_on_batch=same_on_batch, keepdim=keepdim)
 
 
-class RandomMount(_Random, wraps=random_camera.RandomMount):
-    """The camera turned and rolled where it stands, and zoomed."""
+def _named(wraps: type[Augmentation]) -> type[_Random]:
+    """Return a class for kornia, of the name of an augmentation."""
+    name, first = wraps.__name__, (wraps.__doc__ or "").partition("\n")[0]
+    text = f"""`camtorch.augment.{name}` for kornia. {first}
+
+    Args:
+        camera: of the images.
+        given, options: those of `camtorch.augment.{name}`; what comes first there follows the camera, or goes by name.
+        p, p_batch, same_on_batch, keepdim: see `CameraAugmentation`.
+
+    Convention:
+        as `CameraAugmentation`; yaw, pitch and roll are degrees by which the camera turns, not the image.
+    """
+    return type(name, (_Random,), {"_wraps": wraps, "__doc__": text, "__module__": __name__})
 
 
-class RandomLens(_Random, wraps=random_camera.RandomLens):
-    """Another lens before the camera, which stays where it looks."""
-
-
-class RandomCamera(_Random, wraps=random_camera.RandomCamera):
-    """Another camera in the same place, turned and with another lens."""
-
-
-class RandomResizedCrop(_Random, wraps=edits.RandomResizedCrop):
-    """A box at random, of another size."""
-
-
-class RandomCrop(_Random, wraps=edits.RandomCrop):
-    """A box of a size at random."""
-
-
-class CenterCrop(_Random, wraps=edits.CenterCrop):
-    """The middle of the image."""
-
-
-class Resize(_Random, wraps=edits.Resize):
-    """The image in another size."""
-
-
-class Pad(_Random, wraps=edits.Pad):
-    """A rim around the image."""
-
-
-class HorizontalFlip(_Random, wraps=edits.HorizontalFlip):
-    """Mirrored left to right, landmarks in their order in a mirror."""
-
-
-class VerticalFlip(_Random, wraps=edits.VerticalFlip):
-    """Mirrored top to bottom."""
-
-
-class Rotate90(_Random, wraps=edits.Rotate90):
-    """Turned by quarters."""
-
-
-class BoxCrop(_Random, wraps=box_crop.BoxCrop):
-    """What a camera sees that looks at a box of the sample, which `with_boxes` gives."""
-
-
-class Compose(_Random, wraps=compose.Compose):
-    """Several augmentations of camtorch, not of kornia, as one."""
+RandomMount, RandomLens, RandomCamera = map(
+    _named, (random_camera.RandomMount, random_camera.RandomLens, random_camera.RandomCamera)
+)
+RandomResizedCrop, RandomCrop, CenterCrop = map(_named, (edits.RandomResizedCrop, edits.RandomCrop, edits.CenterCrop))
+Resize, Pad, Rotate90 = map(_named, (edits.Resize, edits.Pad, edits.Rotate90))
+HorizontalFlip, VerticalFlip = map(_named, (edits.HorizontalFlip, edits.VerticalFlip))
+BoxCrop, Compose = map(_named, (box_crop.BoxCrop, compose.Compose))
 
 
 def with_boxes(params: Any, boxes: Tensor) -> Any:
@@ -379,26 +355,19 @@ def with_boxes(params: Any, boxes: Tensor) -> Any:
     `params = aug.forward_parameters(images.shape)`, then `aug(images, params=with_boxes(params, boxes))`.
 
     Raises:
-        ValueError: another shape or number, or nothing among the params that crops.
+        ValueError: If the boxes have another shape or number, or nothing among the params crops.
     """
     given = as_values(boxes, "boxes", "with_boxes")
     check_boxes(given, "boxes", "with_boxes")
-    found: list[str] = []
 
-    def changed(params: Any) -> Any:
-        if not isinstance(params, dict):
-            return [p._replace(data=changed(p.data)) if isinstance(p, ParamItem) and p.data else p for p in params]
+    def own(params: Params) -> Params:
         names = [name for name in params if name.rpartition(".")[2] == "box"]
-        found.extend(names)
         for name in names:
             if tuple(given.shape) != (len(params[name]), 4):
                 raise ValueError(f"with_boxes: boxes must be ({len(params[name])}, 4); got {tuple(given.shape)}")
-        return {**params, **dict.fromkeys(names, given)}
+        return dict.fromkeys(names, given)
 
-    result = changed(params)
-    if not found:
-        raise ValueError(f"with_boxes: params must be those of a BoxCrop; got {shown(params)}")
-    return result
+    return _with(params, own, "with_boxes: params must be those of a BoxCrop")
 
 
 def with_cameras(params: Any, cameras: Camera | Sequence[Camera]) -> Any:
@@ -411,8 +380,8 @@ def with_cameras(params: Any, cameras: Camera | Sequence[Camera]) -> Any:
         cameras: a batch, or a list, that differ only in their numbers. Of a video, one for each clip or each frame.
 
     Raises:
-        ValueError: cameras of another kind or number, or no camera augmentation among the params.
-        TypeError: they are no cameras.
+        ValueError: If the cameras are of another kind or number, or the params of no camera augmentation.
+        TypeError: If they are no cameras.
     """
     if isinstance(cameras, (list, tuple)) and all(isinstance(camera, Camera) for camera in cameras):
         cameras = collate_cameras(cameras)
@@ -422,17 +391,28 @@ def with_cameras(params: Any, cameras: Camera | Sequence[Camera]) -> Any:
             "with_cameras: cameras must be a Camera with a batch dim, or single ones of one model and size, in a list; "
             f"got {got}"
         )
-    found: list[Params] = []
+
+    def own(params: Params) -> Params:
+        return _numbers(params, cameras) if _KIND in params else {}
+
+    return _with(params, own, "with_cameras: params must be those of a camera augmentation")
+
+
+def _with(params: Any, own: Callable[[Params], Params], need: str) -> Any:
+    """Return params, of one augmentation or a list, with what `own` gives for each; an error if nothing."""
+    found = False
 
     def changed(params: Any) -> Any:
-        if isinstance(params, dict):
-            found.extend([params] if _KIND in params else [])
-            return {**params, **_numbers(params, cameras)} if _KIND in params else params
-        return [p._replace(data=changed(p.data)) if isinstance(p, ParamItem) and p.data else p for p in params]
+        nonlocal found
+        if not isinstance(params, dict):
+            return [p._replace(data=changed(p.data)) if isinstance(p, ParamItem) and p.data else p for p in params]
+        more = own(params)
+        found = found or bool(more)
+        return {**params, **more}
 
     result = changed(params)
     if not found:
-        raise ValueError(f"with_cameras: params must be those of a camera augmentation; got {shown(params)}")
+        raise ValueError(f"{need}; got {shown(params)}")
     return result
 
 
@@ -457,3 +437,98 @@ def _kind(camera: Camera) -> list[int]:
         camera.distortion.shape[-1],
         *(camera.image_size or (0, 0)),
     ]
+
+
+# -- dicts
+
+
+def _fields(container: Any, sample: Sample, ours: list[CameraAugmentation]) -> tuple[Sample, dict[str, str]]:
+    """Return the fields of a dict that kornia does not know and that move, and their kinds."""
+    owner, own = type(container).__name__, {n: k for one in ours for n, k in one.augmentation.fields.items()}
+    tables = {n for one in ours if one.augmentation.mirroring for n in one.augmentation.mirroring.by_name}
+    given = {name: sample[name] for name in container._read_datakeys_from_dict([*sample])[1] if name not in OWN}
+    kinds = {n: kind for n, v in given.items() if v is not None and (kind := kind_of(n, v, own, owner)) is not None}
+    known = CameraAugmentation, IntensityAugmentationBase2D
+    theirs = [
+        one for one in container.modules() if isinstance(one, _BasicAugmentationBase) and not isinstance(one, known)
+    ]
+    names = [*kinds, *(["camera"] if sample.get("camera") is not None else [])]
+    if theirs and names:
+        other = type(theirs[0]).__name__
+        name = next((name for name in (other, other.removeprefix("Random")) if name in __all__), None)
+        how = f"camtorch.augment.kornia.{name}, which moves" if name else "augmentations of camtorch alone, which move"
+        raise ValueError(f"{owner}: {other} of kornia would leave {', '.join(names)} behind. Use {how} everything")
+    return {n: v for n, v in given.items() if n in kinds or n.removesuffix("_valid") in kinds or n in tables}, kinds
+
+
+def _applied(container: nn.Module, params: list[ParamItem]) -> Iterator[tuple[CameraAugmentation, Params]]:
+    """Yield the camera augmentations that were applied, in order, with their params."""
+    for item in params:
+        module = container.get_submodule(item.name)
+        if isinstance(module, CameraAugmentation):
+            yield module, cast("Params", item.data)
+        elif isinstance(item.data, list):
+            yield from _applied(module, item.data)
+
+
+def _with_fields(call: Callable[..., Any], back: bool) -> Callable[..., Any]:
+    """Return `forward` or `inverse` of a container, for fields that kornia does not know as well."""
+    call = getattr(call, "__wrapped__", call)  # of a module that is imported again
+
+    @functools.wraps(call)
+    def wrapped(self: Any, *args: Any, params: Any = None, data_keys: Any = None) -> Any:
+        ours = [one for one in self.modules() if isinstance(one, CameraAugmentation)]
+        if not ours or len(args) != 1 or not isinstance(args[0], dict):
+            return call(self, *args, params=params, data_keys=data_keys)
+        sample, camera = args[0], args[0].get("camera")
+        fields, kinds = _fields(self, sample, ours)
+        image = next((v for n, v in sample.items() if self._read_datakeys_from_dict((n,))[0] == [DataKey.INPUT]), None)
+        if camera is not None and len(ours) > 1:
+            raise ValueError(
+                f"{type(self).__name__}: a camera must be that of one camera augmentation; got {len(ours)}. "
+                "camtorch.augment.kornia.Compose makes one of several"
+            )
+        if camera is not None and not back:
+            if params is None and image is not None:
+                dims = (3, 5) if self.contains_video_sequential else (2, 4)
+                params = self.forward_parameters(self.autofill_dim(image, dim_range=dims)[1])
+            params = with_cameras(params, camera)
+        result = call(self, sample, params=params)
+        alone = image is not None and image.ndim < 4
+        fields = Single(fields) if alone else fields
+        applied = list(_applied(self, self._params if params is None else params))
+        for one, own in reversed(applied) if back else applied:
+            fields = one._move_fields(own, fields, kinds, back) if kinds else fields
+            if camera is not None:
+                cameras = one.change(own).source if back else one.change(own).target
+                cameras = (cameras[0] if alone else cameras).clone()
+                result["camera"] = list(cameras) if isinstance(camera, list) else cameras
+        return {**result, **fields}
+
+    return wrapped
+
+
+def _lost_stay_lost(call: Callable[..., Boxes]) -> Callable[..., Boxes]:
+    """Return `_preproc_boxes` of a container for boxes of zeros, as it exports lost ones: it takes none of no width."""
+    call = getattr(call, "__wrapped__", call)
+
+    @functools.wraps(call)
+    def wrapped(self: Any, boxes: Any, key: DataKey) -> Boxes:
+        if not isinstance(boxes, Tensor) or not any(isinstance(one, CameraAugmentation) for one in self.modules()):
+            return call(self, boxes, key)
+        lost = (boxes == 0).all(-1) if key is not DataKey.BBOX else (boxes == 0).all(-1).all(-1)
+        if key is DataKey.BBOX_XYWH:
+            boxes = torch.where(lost.unsqueeze(-1), boxes.new_tensor((0, 0, 1, 1)), boxes)
+        result = call(self, boxes, key)
+        result._valid = result._valid & ~lost.reshape(result._valid.shape)
+        return result
+
+    return wrapped
+
+
+for _name, _made in (
+    ("forward", _with_fields(AugmentationSequential.forward, False)),
+    ("inverse", _with_fields(AugmentationSequential.inverse, True)),
+    ("_preproc_boxes", _lost_stay_lost(AugmentationSequential._preproc_boxes)),
+):
+    setattr(AugmentationSequential, _name, _made)

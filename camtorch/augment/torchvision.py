@@ -1,4 +1,4 @@
-"""Augmentations as a transform of torchvision.transforms.v2, for samples of tv_tensors.
+"""Augmentations as a transform of torchvision.transforms.v2: tv_tensors move by their type, all else by its name.
 
     transform = camtorch.augment.torchvision.Transform(camtorch.augment.RandomMount(yaw=20), camera)
     image, target = transform(image, target)
@@ -9,19 +9,22 @@ The module is imported by name: `import camtorch.augment.torchvision`.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
-from torch.utils._pytree import tree_leaves
+from torch.utils._pytree import MappingKey, SequenceKey, keystr, tree_flatten_with_path, tree_unflatten
 
-from camtorch.augment.augmentation import Augmentation, camera_of_sample, check_front_end, move_points
+from camtorch.augment.augmentation import Augmentation, camera_of_sample, check_front_end
 from camtorch.augment.change import Change
-from camtorch.augment.numpy import as_array, as_tensor
-from camtorch.augment.sample import KINDS, together
+from camtorch.augment.numpy import as_array
+from camtorch.augment.numpy import as_tensor as as_planes
+from camtorch.augment.sample import IMAGES, KINDS, OWN, Sample, Single, as_tensor, kind_of, on_samples
 from camtorch.camera import Camera
+from camtorch.warp.boxes import lattice_of, turned
 
 try:
     import PIL.Image
@@ -34,34 +37,37 @@ except Exception as error:  # a binary that does not match fails with a RuntimeE
     ) from error
 
 _OWNER = "torchvision.Transform"
-_NO_COLOURS = "1", "P", "PA"  # modes of PIL
-# since torchvision 0.23
-_PLACES: Any = (tv_tensors.BoundingBoxes, *([tv_tensors.KeyPoints] if hasattr(tv_tensors, "KeyPoints") else []))
+_KINDS = {PIL.Image.Image: "image", tv_tensors.Image: "image", tv_tensors.Video: "image", tv_tensors.Mask: "mask"}
+_KINDS |= {tv_tensors.BoundingBoxes: "boxes"}
+if hasattr(tv_tensors, "KeyPoints"):  # since torchvision 0.23
+    _KINDS[tv_tensors.KeyPoints] = "keypoints"
+_TURNED, _STEPS = "polygons", 33  # rotated boxes move as points all over them, so many along each side
+_HELD = Tensor, np.ndarray
 
 
 class Transform(v2.Transform):
-    """A transform of v2: one draw for all that a sample holds, a dict or any other nest.
+    """An augmentation among those of v2: one draw for everything in a sample, a dict or any other nest.
 
-    * `Image` (..., C, H, W), `Video` (..., T, C, H, W), PIL images, and by v2's rule the first plain tensor
-      of a sample without any of these.
-    * `Mask` (..., H, W), by the nearest value.
-    * `KeyPoints` (..., 2), for torchvision as for camtorch in pixels whose centres are whole numbers. One that has no
-      place on the new camera becomes (-1, -1), and stays that in whatever transforms of camtorch follow.
-    * `BoundingBoxes` of every format without rotation, whose coordinates are torchvision's, between pixel edges. The
-      new ones enclose all of what the old ones did, with whole numbers too, and are not clamped:
-      `v2.ClampBoundingBoxes` and `v2.SanitizeBoundingBoxes` follow where wanted. One that has no place on the new
-      camera becomes (-1, -1, -1, -1) in XYXY, which has no area.
-    * A `Camera` in the sample is the sample's camera, and comes out as that of the new image. Edits, and `Compose` of
-      them alone, need none.
+    Values move by their type:
 
-    `valid=True` gives all `KeyPoints` and `BoundingBoxes` that are values of dicts a flag for each point or box beside
-    them: `target["keypoints_valid"]`, a plain bool tensor, for `target["keypoints"]`. It says that the point, or a part
-    of the box, lies on the new image, and was valid before if the dict said so. Order and count stay, so a DataLoader
-    collates them as it does the points.
+    * `Image`, `Video` (..., C, H, W) and PIL images; all frames of a clip share the draw. `Mask` (..., H, W) takes the
+      nearest value.
+    * `KeyPoints` (..., 2), in pixels whose centres are whole numbers. A point without a place on the new image
+      becomes (-1, -1), and stays that in all following transforms of camtorch.
+    * `BoundingBoxes` of every format, in torchvision's coordinates between pixel edges. The new boxes enclose the old
+      ones, rotated boxes along their moved x axis, and are not clamped. A box without a place becomes
+      (-1, -1, -1, -1) in XYXY.
+    * `Camera`, the camera of the images, becomes that of the new image. Edits, and `Compose` of edits, need none.
 
-    Formats and dtypes stay; canvas_size becomes that of the new camera. All else stays as it is, also
-    3D labels in plain tensors: `last.rotation` (1, 3, 3), or `last.rays`, turns them. Gradients
-    reach the inputs, not the cameras.
+    Plain tensors and arrays move by the name of their key, as in `Augmentation`: "gaze", "depth" and so on. An array
+    of an image is (H, W, C) or (H, W). Labels of a clip may have its leading dims. Numbers under an unknown name that
+    might be geometry raise an error; `fields={"lidar": "points", "logits": "keep"}` of the augmentation says what they
+    are. An element of a tuple is named by its place: `fields={"[1]": "keep"}`. As in v2, the first plain tensor is
+    the image if the sample has no other image and its name means nothing else.
+
+    `valid=True` adds a flag for each point or box of a dict: `target["keypoints_valid"]`, a bool tensor, for
+    `target["keypoints"]`: on the new image, and valid before. Flags that are in a sample already are always updated.
+    Count, order, formats and dtypes stay; canvas_size is the new camera's. Gradients reach the inputs, not the cameras.
 
     Args:
         augmentation: what to do.
@@ -69,12 +75,11 @@ class Transform(v2.Transform):
         valid: whether points and boxes in dicts get flags.
 
     Raises:
-        TypeError: it is no augmentation; a camera that is none; an image of a sample as a NumPy array.
-        ValueError: no camera, or one with batch dims; images, boxes or points that are not of the camera's
-            image_size; rotated boxes; PIL images of palettes or single bits.
+        TypeError: If `augmentation` is no Augmentation, or labels are lists of plain numbers.
+        ValueError: If there is no camera, or one with batch dims; if images, boxes or points are not of the camera's
+            image_size; if numbers under an unknown name might be geometry; if a PIL image holds no colours.
     """
 
-    _transformed_types = (torch.Tensor, PIL.Image.Image, Camera)
     camera: Camera | None
     valid: bool
 
@@ -82,181 +87,152 @@ class Transform(v2.Transform):
         super().__init__()
         self.camera, self.valid = check_front_end(_OWNER, augmentation, camera), bool(valid)
         self.augmentation = augmentation
-        self._flags: list[tuple[Tensor, Tensor]] = []
-
-    def forward(self, *inputs: Any) -> Any:
-        if any(isinstance(one, np.ndarray) and one.ndim > 1 and one.dtype == np.uint8 for one in tree_leaves(inputs)):
-            raise TypeError(f"{_OWNER}: an array would stay as it is; v2.ToImage() before makes an Image of it")
-        outputs = super().forward(*inputs)
-        if self.valid:
-            _put(outputs, self._flags)
-        self._flags = []
-        return outputs
 
     @property
     def last(self) -> Change | None:
         """The change of the last call: its `source`, `target` and `rotation`."""
         return self.augmentation.last
 
-    def make_params(self, flat_inputs: list[Any]) -> dict[str, Any]:
-        """Draw once for all inputs of a sample.
-
-        Returns:
-            `change`, `camera`, the new one, and `made`, the inputs that are moved already, and what became of them.
-        """
-        cameras = [one for one in flat_inputs if isinstance(one, Camera)]
+    @on_samples
+    def forward(self, *inputs: Any) -> Any:
+        own = self.augmentation
+        flat, spec = tree_flatten_with_path(inputs if len(inputs) > 1 else inputs[0])
+        names = [_name(path) for path, _ in flat]
+        twice = len(set(names)) < len(names)
+        leaves, fields, sizes = [leaf for _, leaf in flat], {}, []
+        for i, kind in self._kinds(flat, names).items():
+            path, size = flat[i][0], getattr(leaves[i], "canvas_size", None)
+            key = f"{keystr(path[:-1] if isinstance(path[-1], MappingKey) else path)}/{names[i]}" if twice else names[i]
+            fields[i] = key, *_native(names[i], leaves[i], kind)
+            if size or kind in IMAGES:
+                sizes.append((type(leaves[i]).__name__, tuple(size or fields[i][2].shape[-2:])))
+        cameras = [i for i, leaf in enumerate(leaves) if isinstance(leaf, Camera)]
         if len(cameras) > 1:
-            raise ValueError(f"{_OWNER}: a sample has one camera; here are {len(cameras)}")
-        sizes = [(type(one).__name__, size) for one in flat_inputs if (size := _size(one)) is not None]
-        camera = camera_of_sample(_OWNER, self.augmentation, cameras[0] if cameras else self.camera, sizes)
+            raise ValueError(f"{_OWNER}: a sample must have one camera; got {len(cameras)}")
+        camera = camera_of_sample(_OWNER, own, leaves[cameras[0]] if cameras else self.camera, sizes)
+        learns = torch.is_grad_enabled() and any(isinstance(leaf, Tensor) and leaf.requires_grad for leaf in leaves)
         with torch.no_grad():
-            self.augmentation.tell_of_empty_images(camera)
-            boxes = next((one for one in flat_inputs if isinstance(one, tv_tensors.BoundingBoxes)), None)
-            if boxes is not None and self.augmentation.crops:
-                plain = boxes.as_subclass(torch.Tensor)
-                boxes = torch.cat(_ends(plain.reshape(-1, 4), boxes.format.value), -1)[None] - 0.5
-            change = self.augmentation.change(camera, self.augmentation.with_boxes(self.augmentation.draw(1), boxes))
-            self.augmentation.last, self._flags = change, []
-            fields = {str(i): field for i, one in enumerate(flat_inputs) if (field := _field(one)) is not None}
-            made = together(change, fields, self.augmentation.mask_fill)
-            left = [(flat_inputs[int(i)], result) for i, result in made.items()]
-            return {"change": change, "camera": change.single, "made": left}
+            own.tell_of_empty_images(camera)
+            named = {key: (kind, value[None]) for key, kind, value, _ in fields.values() if kind}
+            # a graph of the camera would make the warp slower, and could not leave a DataLoader's worker
+            change = own.change(camera.detach() if learns else camera, own._of_sample(own.draw(1), named))
+        own.last = change
+        with torch.set_grad_enabled(learns):
+            moved = _moved(own, change, [field[:3] for field in fields.values()])
+            for i, (key, kind, _, back) in fields.items():
+                if change.parts[0].moves is not None or not kind or type(leaves[i]) in _HELD:
+                    leaves[i] = back(moved[key], change)
+        for i in cameras:
+            leaves[i] = change.single
+        result = tree_unflatten(leaves, spec)
+        for i, (key, *_) in fields.items() if self.valid else ():
+            path, valid = flat[i][0], moved.get(f"{key}_valid")
+            if valid is not None and path and isinstance(path[-1], MappingKey):
+                holder = result
+                for step in path[:-1]:
+                    holder = step.get(holder)
+                holder.setdefault(f"{names[i]}_valid", valid if isinstance(leaves[i], Tensor) else valid.numpy())
+        return result
 
-    def transform(self, inpt: Any, params: dict[str, Any]) -> Any:
-        """Move one input of a sample by the `params` of `make_params`."""
-        # a graph of the camera would make the warp slower, and could not leave a DataLoader's worker
-        with torch.set_grad_enabled(torch.is_grad_enabled() and getattr(inpt, "requires_grad", False)):
-            left = params.get("made", [])
-            place = next((i for i, (one, _) in enumerate(left) if one is inpt), None)
-            made = None if place is None else left.pop(place)[1]
-            return self._moved(inpt, params["change"], params["camera"], made)
-
-    def _moved(self, inpt: Any, change: Change, camera: Camera, made: Any = None) -> Any:
-        if isinstance(inpt, Camera):
-            return camera
-        plain = inpt.as_subclass(torch.Tensor) if isinstance(inpt, tv_tensors.TVTensor) else inpt
-        if isinstance(inpt, _PLACES):
-            of_boxes = isinstance(inpt, tv_tensors.BoundingBoxes)
-            moved, valid = _boxes(change, plain, inpt.format.value) if of_boxes else self._points(change, plain, made)
-            if change.parts[0].moves is None:
-                moved = plain
-            result = tv_tensors.wrap(moved, like=inpt, canvas_size=camera.image_size)
-            self._flags.append((result, valid))
-            return result
-        if change.parts[0].moves is None:
-            return inpt
-        if isinstance(inpt, PIL.Image.Image):
-            return _pil(change, inpt, made)
-        if isinstance(inpt, tv_tensors.Mask):
-            masks = _labels(change, plain, self.augmentation.mask_fill) if made is None else made[0][0]
-            return tv_tensors.wrap(masks, like=inpt)
-        if isinstance(inpt, tv_tensors.TVTensor) and not isinstance(inpt, (tv_tensors.Image, tv_tensors.Video)):
-            return inpt
-        images = _images(change, plain) if made is None else made[0][0]
-        return tv_tensors.wrap(images, like=inpt) if isinstance(inpt, tv_tensors.TVTensor) else images
-
-    def _points(self, change: Change, points: Tensor, made: Any) -> tuple[Tensor, Tensor]:
-        """Pixels (..., 2), and valid (...)."""
-        number = points.shape[-2] if points.ndim > 1 else 1
-        rows = _wide(points).reshape(1, math.prod(points.shape[:-2]), number, 2)
-        moved, valid = move_points(self.augmentation, change, rows, made)
-        moved = moved if points.is_floating_point() else moved.round()
-        return moved.reshape(points.shape).to(points.dtype), valid.reshape(points.shape[:-1])
+    def _kinds(self, flat: list[Any], names: list[str]) -> dict[int, str | None]:
+        """Return the kind of each leaf that moves, and None for those that may be flags or orders of landmarks."""
+        fields, unknown = self.augmentation.fields, dict[int, ValueError]()
+        kinds: dict[int, str | None] = {}
+        for i, ((path, leaf), name) in enumerate(zip(flat, names, strict=True)):
+            if leaf is None or isinstance(leaf, Camera) or name in OWN:
+                continue
+            kinds[i] = next((kind for of, kind in _KINDS.items() if isinstance(leaf, of)), None)
+            # a list of plain numbers is looked at as one value
+            listed = len(path) > 1 and isinstance(path[-1], SequenceKey) and isinstance(leaf, (int, float))
+            try:
+                kinds[i] = kinds[i] or kind_of(name, [leaf] if listed else leaf, fields, _OWNER)
+            except ValueError as error:
+                unknown[i] = error
+        if IMAGES[0] not in kinds.values():
+            plain = (
+                i for i, k in kinds.items() if k is None and isinstance(flat[i][1], Tensor) and flat[i][1].ndim > 1
+            )
+            first = next((i for i in plain if names[i] not in fields and not names[i].endswith("_valid")), -1)
+            kinds |= {} if first < 0 else {first: IMAGES[0]}
+            unknown.pop(first, None)
+        for problem in unknown.values():
+            raise problem
+        return {i: k for i, k in kinds.items() if k or (isinstance(flat[i][1], _HELD) and names[i] not in fields)}
 
 
-def _put(outputs: Any, flags: list[tuple[Tensor, Tensor]]) -> None:
-    """Put flags beside their tensors into the dicts of a nest."""
-    if isinstance(outputs, (list, tuple)):
-        for item in outputs:
-            _put(item, flags)
-    if not isinstance(outputs, dict):
-        return
-    for name, value in list(outputs.items()):
-        _put(value, flags)
-        for tensor, valid in flags:
-            if value is tensor:
-                before = outputs.get(f"{name}_valid")
-                outputs[f"{name}_valid"] = valid if before is None else valid & (torch.as_tensor(before) != 0)
+def _name(path: Any) -> str:
+    """Return the last key of a path that is a word, or all of it."""
+    words = [getattr(step, "key", getattr(step, "name", None)) for step in path]
+    return next((word for word in reversed(words) if isinstance(word, str)), keystr(path) or "[0]")
 
 
-def _size(inpt: Any) -> tuple[int, int] | None:
-    """(height, width) of the image that an input is, or lies on."""
-    if isinstance(inpt, PIL.Image.Image):
-        return inpt.size[::-1]
-    if isinstance(inpt, _PLACES):
-        return tuple(inpt.canvas_size)
-    if isinstance(inpt, (tv_tensors.Image, tv_tensors.Video, tv_tensors.Mask)):
-        return tuple(inpt.shape[-2:])
-    return None if isinstance(inpt, (Camera, tv_tensors.TVTensor)) else tuple(inpt.shape[-2:])
+def _moved(own: Augmentation, change: Change, fields: list[tuple[str, str | None, Any]]) -> Sample:
+    """Return (key, kind, value) moved, by one change for all frames of those with more dims than single samples."""
+    leads = {key: tuple(v.shape[: max(0, v.ndim - KINDS[kind].most_dims)]) for key, kind, v in fields if kind}
+    moved: Sample = {}
+    for lead in dict.fromkeys([*leads.values(), ()]):
+        group = [field for field in fields if leads.get(field[0].removesuffix("_valid"), ()) == lead]
+        sample, kinds = {key: value for key, _, value in group}, {key: kind for key, kind, _ in group if kind}
+        if lead:
+            count = math.prod(lead)
+            frames = Change(count, [replace(part, rows=None) for part in change.parts])
+            new = own.moved_by(frames, {k: v.reshape(count, *v.shape[len(lead) :]) for k, v in sample.items()}, kinds)
+            moved |= {k: v.reshape(*lead, *v.shape[1:]) for k, v in new.items() if isinstance(v, Tensor)}
+        else:
+            moved |= own.moved_by(change, Single(sample), kinds) if kinds else sample
+    return moved
 
 
-def _field(inpt: Any) -> tuple[str, Tensor] | None:
-    """An input as the field of a batch of one; None for what moves by itself."""
-    if isinstance(inpt, PIL.Image.Image):
-        return None if inpt.mode in _NO_COLOURS else ("image", as_tensor("image", np.asarray(inpt))[None])
-    kinds = {"image": tv_tensors.Image, "mask": tv_tensors.Mask, "keypoints": _PLACES[1:]}
-    plain = None if isinstance(inpt, (Camera, tv_tensors.TVTensor)) else "image"
-    kind = next((kind for kind, types in kinds.items() if isinstance(inpt, types)), plain)
-    if kind is None or inpt.ndim != KINDS[kind].dims or inpt.requires_grad:
-        return None
-    value = inpt.as_subclass(torch.Tensor)[None]
-    return kind, _wide(value) if kind == "keypoints" else value
+def _native(name: str, leaf: Any, kind: str | None) -> tuple[str | None, Any, Callable[[Any, Change], Any]]:
+    """Return the kind and the value of a leaf for the native call, and what makes a leaf of the result again."""
+    if isinstance(leaf, PIL.Image.Image):
+        if leaf.mode in ("1", "P", "PA"):
+            raise ValueError(
+                f"{_OWNER}: values between those of a PIL image of mode {leaf.mode!r} mean nothing; "
+                "image.convert('RGB') makes it an image, tv_tensors.Mask(image) labels"
+            )
+        array = np.asarray(leaf)
 
+        def as_pil(new: Tensor, change: Change) -> Any:
+            made = as_array(new, array)
+            return PIL.Image.frombuffer(leaf.mode, made.shape[1::-1], made, "raw", leaf.mode, 0, 1)
 
-def _images(change: Change, images: Tensor) -> Tensor:
-    """Images (..., C, H, W), or (H, W), all of one sample."""
-    frames = images.reshape(-1, *images.shape[-3:]) if images.ndim > 2 else images[None, None]
-    spread = Change(len(frames), [replace(part, rows=None) for part in change.parts])
-    moved = spread.images(frames)
-    return moved.reshape(*images.shape[:-2], *moved.shape[-2:])
+        return kind, as_planes(name, array), as_pil
+    if not isinstance(leaf, Tensor):
+        if kind in IMAGES:
+            return kind, as_planes(name, leaf), lambda new, change: as_array(new, leaf)
+        return kind, as_tensor(leaf, name, kind, _OWNER) if kind else leaf, lambda new, change: np.asarray(new)
+    value, whole, canvas = leaf.as_subclass(Tensor), not leaf.is_floating_point(), hasattr(leaf, "canvas_size")
+    lacking = KINDS[kind].dims - value.ndim if kind else 0
+    value = value[(None,) * lacking]
+    form = getattr(leaf, "format", None)
+    turns = form is not None and value.shape[-1] > 4
+    if canvas:
+        value = value if value.dtype == torch.float64 else value.float()
+    if form is not None:
+        ends = tv_tensors.BoundingBoxFormat["XYXYXYXY" if turns else "XYXY"]
+        value = v2.functional.convert_bounding_box_format(value, form, ends)
+        value = value.trunc() if whole and not turns else value  # as torchvision reads whole numbers
+    if canvas:
+        lost = (value == -1).all(-1, keepdim=True)
+        value = torch.where(lost, torch.nan, value if form is None else value - 0.5)
+    if turns:
+        kind, value = _TURNED, lattice_of(value.unflatten(-1, (4, 2)), _STEPS)
 
+    def back(new: Tensor, change: Change) -> Any:
+        if turns:
+            new = turned(new, change.mirrored is not None and bool(change.rotation[0, 0, 0] < 0)).flatten(-2)
+        if canvas:
+            lost = ((new == -1) | new.isnan()).all(-1, keepdim=True)
+            new = torch.where(lost, -1.0, new if form is None else new + 0.5)
+        if form is not None:
+            if whole and not turns:  # rounding errors are no reason for another pixel
+                low, high = (new[..., :2] + 1e-3).floor(), (new[..., 2:] - 1e-3).ceil()
+                new = torch.cat((low, high + (high - low) % 2 if form.value == "CXCYWH" else high), -1)
+            new = v2.functional.convert_bounding_box_format(new, ends, form)
+        new = (new.round() if whole and canvas else new).to(leaf.dtype) if kind else new
+        size = {"canvas_size": change.parts[0].image_size} if canvas else {}
+        new = new[(0,) * lacking]
+        return tv_tensors.wrap(new, like=leaf, **size) if isinstance(leaf, tv_tensors.TVTensor) else new
 
-def _pil(change: Change, image: PIL.Image.Image, made: Any) -> PIL.Image.Image:
-    if image.mode in _NO_COLOURS:
-        raise ValueError(
-            f"{_OWNER}: values between those of a PIL image of mode {image.mode!r} mean nothing; "
-            "image.convert('RGB') makes it an image, tv_tensors.Mask(image) labels"
-        )
-    array = np.asarray(image)
-    images = change.images(as_tensor("image", array)[None]) if made is None else made[0]
-    moved = as_array(images[0], array)
-    return PIL.Image.frombuffer(image.mode, moved.shape[1::-1], moved, "raw", image.mode, 0, 1)
-
-
-def _labels(change: Change, masks: Tensor, fill: float) -> Tensor:
-    moved = change.labels(masks.reshape(1, math.prod(masks.shape[:-2]), *masks.shape[-2:]), fill)
-    return moved.reshape(*masks.shape[:-2], *moved.shape[-2:])
-
-
-def _ends(boxes: Tensor, form: str) -> tuple[Tensor, Tensor]:
-    """(M, 2) and (M, 2): the lower and the upper corners of boxes of one of torchvision's formats."""
-    if form not in ("XYXY", "XYWH", "CXCYWH"):
-        raise ValueError(
-            f"{_OWNER}: boxes of the format {form} turn with no lens; v2.ConvertBoundingBoxFormat('XYXY') encloses them"
-        )
-    one, two = _wide(boxes).chunk(2, -1)
-    low = one - two / 2 if form == "CXCYWH" else one
-    return low, {"XYXY": two, "XYWH": one + two, "CXCYWH": one + two / 2}[form]
-
-
-def _boxes(change: Change, boxes: Tensor, form: str) -> tuple[Tensor, Tensor]:
-    """Boxes (M, 4) between pixel edges, of one of torchvision's formats, and valid (M,)."""
-    low, high = _ends(boxes, form)
-    whole = not boxes.is_floating_point()
-    if whole:  # as torchvision reads them
-        low, high = low.trunc(), high.trunc()
-    given = torch.cat((low, high), -1)
-    moved, valid = (t[0] for t in change.boxes((given - 0.5)[None]))
-    lost = ((moved == -1) | (given == -1).all(-1, keepdim=True)).all(-1, keepdim=True)
-    low, high = torch.where(lost, -1.0, moved + 0.5).chunk(2, -1)
-    if whole:
-        # rounding errors are no reason for another pixel
-        low, high = (low + 1e-3).floor(), (high - 1e-3).ceil()
-        if form == "CXCYWH":  # whose centres are whole numbers too
-            high = high + (high - low) % 2
-    pairs = {"XYXY": (low, high), "XYWH": (low, high - low), "CXCYWH": ((low + high) / 2, high - low)}
-    return torch.cat(pairs[form], -1).to(boxes.dtype), valid & ~lost.squeeze(-1)
-
-
-def _wide(values: Tensor) -> Tensor:
-    return values if values.dtype == torch.float64 else values.float()
+    return kind, value, back

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -80,6 +81,31 @@ def enclosing(boxes: Tensor, moved: Tensor, on_image: Tensor) -> tuple[Tensor, T
     if not ((area > 0).all() and (given[..., 2:] > given[..., :2]).all()):
         return None
     return torch.from_numpy(np.concatenate((places.min(-2), places.max(-2)), -1)), on_image.any(-1)
+
+
+def lattice_of(corners: Tensor, steps: int) -> Tensor:
+    """(..., steps * steps, 2): points all over quadrilaterals (..., 4, 2), row by row from the first edge."""
+    share = torch.linspace(0, 1, steps, dtype=corners.dtype, device=corners.device)[:, None]
+    one, two, three, four = corners.unsqueeze(-2).unbind(-3)
+    left, right = (one + (four - one) * share).unsqueeze(-2), (two + (three - two) * share).unsqueeze(-2)
+    return (left + (right - left) * share).flatten(-3, -2)
+
+
+def turned(lattice: Tensor, backwards: bool = False) -> Tensor:
+    """(..., 4, 2): the corners of rectangles along the middle rows of moved lattices, about all points but (-1, -1).
+
+    backwards: whether rows run from right to left, in a mirror. Without any point all corners are -1.
+    """
+    steps = math.isqrt(lattice.shape[-2])
+    middle = lattice.unflatten(-2, (steps, steps))[..., steps // 2, steps // 2 - 1 : steps // 2 + 2, :]
+    found, known = (lattice != -1).any(-1), (middle != -1).any(-1)[..., [0, 2]].all(-1)
+    ahead = (middle[..., 0, :] - middle[..., 2, :]) * (1 if backwards else -1)
+    ahead = torch.where(known.unsqueeze(-1) & (ahead != 0).any(-1, keepdim=True), ahead, ahead.new_tensor((1.0, 0.0)))
+    ahead = ahead / ahead.norm(dim=-1, keepdim=True)
+    axes = torch.stack((ahead, torch.stack((-ahead[..., 1], ahead[..., 0]), -1)), -1)
+    local, found = lattice @ axes, found.unsqueeze(-1)
+    low, high = torch.where(found, local, torch.inf).amin(-2), torch.where(found, local, -torch.inf).amax(-2)
+    return torch.where(found.any(-2, keepdim=True), corners_of(torch.cat((low, high), -1)) @ axes.mT, -1.0)
 
 
 def _inside(warp: Warp, corners: Tensor, like: Tensor) -> tuple[Tensor, Tensor]:

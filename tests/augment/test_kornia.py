@@ -291,8 +291,8 @@ def test_nested_containers_and_random_apply():
 def test_dict_input():
     seq = K.AugmentationSequential(adapter.RandomMount(camera()), data_keys=None)
     given = dict(zip(("image", "mask_iris", "keypoints", "bbox"), batch(), strict=True)) | {"label": torch.arange(3)}
-    moved = seq({**given, "gaze": "stays"})
-    assert moved["gaze"] == "stays"
+    moved = seq({**given, "path": "stays"})
+    assert moved["path"] == "stays"
     assert (seq.inverse(moved)["keypoints"] - points()).abs().max() < 1e-3
 
 

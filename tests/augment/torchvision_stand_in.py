@@ -8,10 +8,8 @@ import re
 import sys
 import types
 
-import PIL.Image
 import pytest
 import torch
-from torch.utils._pytree import tree_flatten, tree_unflatten
 
 import camtorch as ct
 
@@ -46,25 +44,17 @@ def stand_in():
     tv_tensors.BoundingBoxFormat = enum.Enum("BoundingBoxFormat", {name: name for name in names})
     tv_tensors.wrap = lambda wrappee, *, like, **kwargs: type(like).wrap(wrappee, like, **kwargs)
 
-    class Transform(torch.nn.Module):
-        _transformed_types = (torch.Tensor, PIL.Image.Image)
-
-        def forward(self, *inputs):
-            flat, spec = tree_flatten(inputs if len(inputs) > 1 else inputs[0])
-            images = (tv_tensors.Image, tv_tensors.Video, PIL.Image.Image)
-            plain, needed = not any(isinstance(one, images) for one in flat), []
-            for one in flat:
-                needs = isinstance(one, self._transformed_types)
-                if isinstance(one, torch.Tensor) and not isinstance(one, TVTensor):
-                    needs, plain = plain, False
-                needed.append(needs)
-            params = self.make_params([one for one, needs in zip(flat, needed, strict=True) if needs])
-            pairs = zip(flat, needed, strict=True)
-            return tree_unflatten([self.transform(one, params) if needs else one for one, needs in pairs], spec)
+    def convert(boxes, old, new):
+        one, two = boxes[..., :2], boxes[..., 2:]
+        low = one - two / 2 if old.name == "CXCYWH" else one
+        high = two if old.name == "XYXY" else low + two
+        pairs = {"XYXY": (low, high), "XYWH": (low, high - low), "CXCYWH": ((low + high) / 2, high - low)}
+        return torch.cat(pairs[new.name], -1)
 
     names = ("torchvision", "torchvision.transforms", "torchvision.transforms.v2")
     torchvision, transforms, v2 = (types.ModuleType(name) for name in names)
-    v2.Transform, transforms.v2 = Transform, v2
+    v2.Transform, transforms.v2 = torch.nn.Module, v2
+    v2.functional = types.SimpleNamespace(convert_bounding_box_format=convert)
     torchvision.tv_tensors, torchvision.transforms = tv_tensors, transforms
     return {module.__name__: module for module in (torchvision, transforms, v2, tv_tensors)}
 

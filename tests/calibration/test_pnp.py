@@ -111,6 +111,7 @@ def test_poses_end_in_the_optimum(fovs, kind, count, points, noises):
 
 
 def opencvs_rms(points, seen, matrix, k, *start):
+    """What OpenCV's local search makes of a start."""
     r, t = cv2.solvePnPRefineLM(points, seen, matrix, k, *start)
     return np.sqrt(np.mean(np.sum((cv2.projectPoints(points, r, t, matrix, k)[0][:, 0] - seen) ** 2, -1)))
 

@@ -10,6 +10,8 @@ from camtorch.cli import terminal
 
 
 class Terminal(io.StringIO):
+    """A stream that is one."""
+
     def isatty(self):
         return True
 

@@ -266,6 +266,7 @@ def drcals_pair():
 
 
 def rectification(name):
+    """Ours, with the image of theirs."""
     case = CASES[name]
     width, height = case["width_height"]
     if name == "latlon":

@@ -37,6 +37,7 @@ def drawn(key, which, seed):
 
 
 def lenses_of(key):
+    """A preset, real calibrations, and drawn ones."""
     found = [preset(key)]
     if key in CALIBRATIONS:
         *numbers, size = CALIBRATIONS[key]
@@ -60,6 +61,7 @@ def asked(camera):
 
 
 def described(camera):
+    """As the page takes it."""
     pixels, points = asked(camera)
     numbers = {"intrinsics": camera.intrinsics.tolist(), "distortion": camera.distortion.tolist()}
     return {"model": camera.key, **numbers, "pixels": pixels.tolist(), "points": points.tolist()}
