@@ -6,56 +6,45 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 import torch
-from torch import Tensor
 
 from camtorch.camera import Camera
 
 
 @dataclass(frozen=True)
 class Clips:
-    """A sample of clips.
-
-    Args:
-        sample: as it was given.
-        fields: names of what moves, or says something of each frame.
-        shape: (B, T), those of the image `name`.
-        owner, name: for errors.
-    """
+    """A sample of clips, with the names of all that is of each frame."""
 
     sample: Mapping[str, Any]
     fields: Sequence[str]
-    shape: tuple[int, ...]
+    shape: tuple[int, ...]  # (B, T), that of `image`
+    image: str
     owner: str
-    name: str
 
     def frames(self, camera: Any) -> dict[str, Any]:
-        """Return the sample as a batch of B * T frames, each with the camera of its clip."""
-        values = {name: self._checked(name, self.sample[name]) for name in self.fields}
-        flat = {**self.sample, **{name: v.reshape(-1, *v.shape[2:]) for name, v in values.items()}}
-        flat |= {"camera": self.repeated(camera, "camera")} if camera is not None else {}
-        turned = self.sample.get("rotation")
-        return flat if turned is None else {**flat, "rotation": self.repeated(turned, "rotation")}
-
-    def _checked(self, name: str, value: Any) -> Tensor:
-        shape = tuple(getattr(value, "shape", ()))
-        if not isinstance(value, (Tensor, np.ndarray)) or shape[:2] != self.shape or not self.shape[1]:
-            wanted = ", ".join(map(str, self.shape)) if self.shape[1] else "B, T > 0"
-            raise ValueError(
-                f"{self.owner}: {name} must be ({wanted}, ...), for {self.name} holds clips (B, T, C, H, W); got "
-                f"{f'shape {shape}' if shape else type(value).__name__}"
-            )
-        return torch.as_tensor(value)
+        """Return the sample as a batch of B * T frames, each with the `camera` of its clip, if there is one."""
+        flat = dict(self.sample)
+        for name in self.fields:
+            value = flat[name]
+            shape = tuple(getattr(value, "shape", ()))
+            if shape[:2] != self.shape or not self.shape[1]:
+                raise ValueError(
+                    f"{self.owner}: {name} must be ({str(self.shape)[1:-1]}, ...), as {self.image} is of clips "
+                    f"(B, T > 0, ...); got {f'shape {shape}' if shape else type(value).__name__}"
+                )
+            flat[name] = torch.as_tensor(value).flatten(0, 1)
+        for name, value in (("camera", camera), ("rotation", flat.get("rotation"))):
+            flat |= {} if value is None else {name: self.repeated(value, name)}
+        return flat
 
     def repeated(self, value: Any, name: str) -> Any:
         """Return what there is of each clip, (B, ...), for each of its frames; one camera serves all."""
-        clips, frames = self.shape
-        rows = [i for i in range(clips) for _ in range(frames)]
         if not hasattr(value, "__len__") or (isinstance(value, Camera) and not value.batch_shape):
             return value
+        clips, frames = self.shape
         if len(value) != clips:
-            raise ValueError(f"{self.owner}: {name} is of {len(value)} clips, {self.name} of {clips}")
+            raise ValueError(f"{self.owner}: {name} is of {len(value)} clips, {self.image} of {clips}")
+        rows = [i for i in range(clips) for _ in range(frames)]
         return [value[i] for i in rows] if isinstance(value, (list, tuple)) else value[rows]
 
     def restored(self, moved: Mapping[str, Any]) -> dict[str, Any]:

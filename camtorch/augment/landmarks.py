@@ -168,11 +168,11 @@ class Mirroring:
         return order
 
     def swapped(
-        self, name: str, kind: str | None, value: Tensor, mirrored: Tensor, flags: bool = False, axis: int = 1
+        self, name: str, kind: str | None, value: Tensor, mirrored: Tensor, flags: bool, faces: set[tuple[int, ...]]
     ) -> Tensor:
         """Return landmarks (B, *F, N, ...), mirrored rows in their order in a mirror.
 
-        kind None: what does not move, with its landmarks along `axis`. flags: it has no coordinates.
+        kind None: what does not move, (B, N, ...), or of `faces` (F, N) (B, F, N, ...). flags: without coordinates.
         """
         if kind is None and value.ndim < 2:
             raise ValueError(
@@ -180,9 +180,10 @@ class Mirroring:
             )
         if (kind is not None and kind not in _HOLD) or value.ndim < (2 if flags else 3):
             return value
-        if kind is not None:
-            axis = value.ndim - (1 if flags else 2)
-            axis -= axis > 1 and value.shape[axis] == 1  # OpenCV's (B, N, 1, 2)
+        axis = value.ndim - (1 if flags else 2)
+        axis -= axis > 1 and value.shape[axis] == 1  # OpenCV's (B, N, 1, 2)
+        if kind is None:
+            axis = 2 if tuple(value.shape[1:3]) in faces else 1
         order = self.order(name, kind, value.shape[axis])
         if order is None:
             return value

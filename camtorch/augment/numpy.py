@@ -156,12 +156,6 @@ def _plain(tensor: Tensor) -> Array:
     return tensor.numpy() if tensor.is_cpu else tensor.cpu().numpy()
 
 
-def _planes(array: Array) -> Tensor:
-    """(C, H, W) of an array (H, W, C) or (H, W)."""
-    tensor = _tensor(array)
-    return tensor.permute(2, 0, 1) if array.ndim == 3 else tensor[None]
-
-
 def _numbers(value: Any, name: str, kind: str | None) -> Any:
     """Coordinates of floating point, flags of bool; a list of numbers is taken for an array."""
     if name.endswith(_VALID):
@@ -189,7 +183,8 @@ def as_tensor(name: str, value: object, size: tuple[int, int] | None = None) -> 
             f"{_OWNER}: {name} must be (H, W, C) or (H, W); got shape {shape}, which has its channels first: "
             "np.moveaxis(image, 0, -1) puts them last"
         )
-    return _planes(array)
+    tensor = _tensor(array)
+    return tensor.permute(2, 0, 1) if array.ndim == 3 else tensor[None]
 
 
 def as_array(image: Tensor, like: Array) -> Array:

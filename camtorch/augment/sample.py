@@ -498,7 +498,7 @@ class SampleTransform(nn.Module):
         own = {name for name, kind in found.items() if kind is not None and name != "rotation"}
         own |= {f"{name}_valid" for name in own} | {"image_valid", *(self.mirroring.by_name if self.mirroring else ())}
         shape = tuple(given[images[0]].shape[:2])
-        return Clips(sample, [name for name in given if name in own], shape, self._name, images[0])
+        return Clips(sample, [name for name in given if name in own], shape, images[0], self._name)
 
     def _sorted(self, sample: Sample, fields: Mapping[str, str]) -> Named:
         """The fields that move."""
@@ -518,13 +518,8 @@ class SampleTransform(nn.Module):
     ) -> tuple[Named, bool, int, Camera]:
         """Return the fields that move, as a batch; whether the sample was one; its size, and its cameras.
 
-        What samples of one form have in common is found and checked once.
-
-        Args:
-            sample: the fields.
-            camera: to be taken instead of the sample's.
-            predicted: whether values may be bad.
-            kinds: name -> kind, in addition to `fields`.
+        What samples of one form have in common is found and checked once. camera: instead of the sample's. predicted:
+        values may be bad. kinds: name -> kind, in addition to `fields`.
         """
         camera = sample.get("camera") if camera is None else camera
         camera = self._held("camera") if camera is None else camera
@@ -644,22 +639,15 @@ class SampleTransform(nn.Module):
 
     @on_samples
     def moved_by(
-        self,
-        change: Change,
-        sample: Mapping[str, Any],
-        kinds: Mapping[str, str] | None = None,
-        predicted: bool = False,
+        self, change: Change, sample: Mapping[str, Any], kinds: Mapping[str, str] | None = None, predicted: bool = False
     ) -> Sample:
         """Move a sample by a change that exists, as `forward` does after its draw.
 
         Args:
-            change: of as many samples; its `source` are the cameras of the sample.
-            sample: the fields, a `Single` for those of one sample whatever their dims.
-            kinds: name -> kind, in addition to `fields`, of what its name alone does not say.
+            change: of as many samples; its `source` are their cameras.
+            sample: the fields; a `Single` is one sample, whatever their dims.
+            kinds: name -> kind, in addition to `fields`.
             predicted: whether values may be bad.
-
-        Returns:
-            A new dict with all fields moved, and their validity, `camera` and `rotation`.
         """
         sample = self._given(sample, {})
         if clips := self._clips(sample, kinds):
@@ -697,16 +685,18 @@ class SampleTransform(nn.Module):
                 moved[f"{name}_valid"] = self._still(f"{name}_valid", valid, sample.get(f"{name}_valid"))
         for key in dict.fromkeys(("image_valid", *(f"{n}_valid" for n, (k, _) in named.items() if k in IMAGES))):
             seen = sample.get(key)
-            if seen is not None and (key == "image_valid" or getattr(seen, "ndim", 0) > 1 + batched):
+            if masked := getattr(seen, "ndim", 0) > 1 + batched:  # and no flag for each sample
                 seen = torch.as_tensor(seen) != 0
-                seen = seen if batched else seen.unsqueeze(0)
-                if len(seen) != change.count or not (seen.ndim == 4 or (seen.ndim == 3 and key != "image_valid")):
-                    raise ValueError(f"{self._name}: {key} must be (B, 1, H, W); got shape {tuple(seen.shape)}")
+                seen = seen if batched else seen[None]
+                if len(seen) != change.count:
+                    raise ValueError(f"{self._name}: {key} is of {len(seen)} samples, other fields of {change.count}")
                 seen = KINDS["mask"].move(change, seen, {"mask_fill": 0.0})
             if key == "image_valid" and self.valid_mask and any(found == "image" for found, _ in named.values()):
-                seen = change.valid_mask() if seen is None else seen & change.valid_mask()
-            if isinstance(seen, Tensor):
-                moved[key] = seen.contiguous() if batched else seen.squeeze(0).contiguous()
+                whole = change.valid_mask()
+                seen = whole if not masked else seen & (whole if seen.ndim == 4 else whole[:, 0])
+                masked = True
+            if masked:
+                moved[key] = seen.contiguous() if batched else seen[0].contiguous()
         if "rotation" not in named:
             moved["rotation"] = change.rotation.clone() if batched else change.single_rotation
         if self.mirroring is not None:
@@ -730,26 +720,21 @@ class SampleTransform(nn.Module):
                     f"{type(value).__name__}"
                 )
             moved[name] = [torch.as_tensor(v) for v in value] if several else torch.as_tensor(value)
-        faces = {  # (F, N) of landmarks of several faces
-            tuple(one.shape[-3:-1])
-            for found, value in named.values()
-            for one in (value if isinstance(value, list) else value[:1])
-            if found in ("keypoints", "landmarks") and one.ndim == 3
-        }
+        several = [one for kind, value in named.values() for one in _items(value) if kind in ("keypoints", "landmarks")]
+        faces = {tuple(one.shape[1:3]) for one in several if one.ndim == 4}  # (F, N)
         for name, (found, _) in {**named, **kept}.items():
             for key, flags in ((name, found is None), (f"{name}_valid", True)):
                 if key not in moved:
                     continue
                 now, single = moved[key], not (batched or isinstance(moved[key], list))
-                now = now[None] if single else now
-                rows = torch.zeros(len(now), dtype=torch.bool) if mirrored is None else mirrored
-                axis = 2 if len(now) and tuple(now[0].shape[:2]) in faces else 1
-                if isinstance(now, list):
-                    pairs = zip(now, rows, strict=False)
-                    moved[key] = [mirroring.swapped(name, found, v[None], r[None], flags, axis)[0] for v, r in pairs]
-                else:
-                    swapped = mirroring.swapped(name, found, now, rows, flags, axis)
-                    moved[key] = swapped[0] if single else swapped
+                items = _items(now[None] if single else now)
+                rows = torch.zeros(sum(map(len, items)), dtype=torch.bool) if mirrored is None else mirrored
+                each = rows.split(1) if isinstance(now, list) else [rows]
+                pairs = zip(items, each, strict=False)
+                swapped = [mirroring.swapped(name, found, value, row, flags, faces) for value, row in pairs]
+                moved[key] = (
+                    [v[0] for v in swapped] if isinstance(now, list) else swapped[0][0] if single else swapped[0]
+                )
         for left, right in sides if mirrored is not None else ():
             for pair in ((left, right), (f"{left}_valid", f"{right}_valid")):
                 if all(key in moved for key in pair):
@@ -776,6 +761,11 @@ class SampleTransform(nn.Module):
             raise ValueError(f"{self._name}: {name} must be {shapes}; got {[tuple(b.shape) for b in before]}")
         now = [v & b.to(v.device) for v, b in zip(now, before, strict=True)]
         return now if many else now[0]
+
+
+def _items(value: Any) -> list[Tensor]:
+    """Return a list of tensors as batches of one, a batch as the only one."""
+    return [one[None] for one in value] if isinstance(value, list) else [value]
 
 
 def _in_range(values: Tensor, dtype: torch.dtype) -> Tensor:

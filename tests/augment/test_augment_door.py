@@ -221,22 +221,3 @@ def test_labels_that_are_missing_or_just_within_are_taken(camera):
     }
     RandomMount(yaw=5, camera=camera)(sample)
     RandomMount(yaw=5, camera=camera)(head_pose=torch.full((4, 4), math.nan))
-
-
-@pytest.mark.parametrize("single", [False, True])
-@pytest.mark.parametrize("flip", [False, True])
-def test_a_change_that_exists_moves_a_sample_as_its_draw_does(camera, single, flip):
-    edit = [ct.augment.HorizontalFlip(p=1.0, landmarks=[(0, 1)])] * flip
-    augment = ct.augment.Compose([RandomMount(yaw=9, roll=20), *edit], camera=camera)
-    sample = {"image": torch.rand(2, 3, *SIZE), "keypoints": torch.rand(2, 4, 2) * 30, "gaze": torch.randn(2, 3)}
-    sample |= {"keypoints_valid": torch.tensor([[1, 0, 2, 1]] * 2), "boxes": torch.tensor([[[3.0, 3, 9, 8]]] * 2)}
-    sample = {name: value[0] for name, value in sample.items()} if single else sample
-    draw = augment.draw(1 if single else 2)
-    want = augment(sample, draw=draw)
-    kinds = {"stare": "gaze", "b": "boxes"}
-    given = {{"gaze": "stare", "boxes": "b"}.get(name, name): value for name, value in sample.items()}
-    moved = augment.moved_by(augment.change(camera, draw), given, kinds)
-    for name in want.keys() - {"camera"}:
-        assert torch.equal(moved[{"gaze": "stare"}.get(name, name.replace("boxes", "b"))], want[name]), name
-    with pytest.raises(ValueError, match="the change is of 3 samples, here are"):
-        augment.moved_by(augment.change(camera, augment.draw(3)), sample)

@@ -7,6 +7,7 @@ import camtorch as ct
 from camtorch import augment as A  # noqa: N812
 
 SIZE, PAIRS, B, T = (30, 40), [(0, 1), (3, 4)], 2, 3
+BOX = torch.tensor([3.0, 3, 20, 24])
 
 
 def camera(*batch):
@@ -33,7 +34,7 @@ def equal(one, other):
 @pytest.mark.parametrize("form", ["single", "batch", "list"])
 @pytest.mark.parametrize("name", [n for n in AUGMENTATIONS if n not in ("box", "shift")])
 def test_each_face_moves_as_it_does_alone(name, form):
-    augment, count = AUGMENTATIONS[name](), 5  # as many faces as points
+    augment, lens, count = AUGMENTATIONS[name](), camera(), 5  # as many faces as points
     augment.fields = {"visibility": "keep"}
     if name in ("mirror", "chain"):
         tables = ("keypoints", "landmarks", "points", "visibility")
@@ -42,19 +43,24 @@ def test_each_face_moves_as_it_does_alone(name, form):
     faces |= {"points": torch.randn(B, count, 5, 3), "keypoints_valid": torch.rand(B, count, 5) > 0.3}
     faces |= {"visibility": torch.randint(3, (B, count, 5)), "keypoints_pixels": torch.rand(B, count, 5, 2)}
     image, draw = torch.rand(B, 3, *SIZE), augment.draw(1 if form == "single" else B)
-    image = image[0] if form == "single" else image
+    give = {"single": lambda v: v[0], "batch": lambda v: v, "list": list}[form]
 
-    def moved(fields):
-        give = {"single": lambda v: v[0], "batch": lambda v: v, "list": list}[form]
-        out = augment({"image": image, **{n: give(v) for n, v in fields.items()}}, camera=lens, draw=draw)
+    def stacked(out):
         return {n: torch.stack(v) if isinstance(v, list) else v for n, v in out.items() if n != "camera"}
 
-    lens = camera()
-    together = moved(faces)
-    each = [moved({name: value[:, i] for name, value in faces.items()}) for i in range(count)]
-    axis = 0 if form == "single" else 1
+    def moved(fields):
+        given = {"image": image[0] if form == "single" else image, **{n: give(v) for n, v in fields.items()}}
+        return given, stacked(augment(given, camera=lens, draw=draw))
+
+    given, together = moved(faces)
+    each = [moved({name: value[:, i] for name, value in faces.items()})[1] for i in range(count)]
     for key in {*faces, "keypoints_pixels_valid"}:
-        equal(together[key], torch.stack([one[key] for one in each], axis))
+        equal(together[key], torch.stack([one[key] for one in each], 0 if form == "single" else 1))
+    # a change that exists moves them as its draw does, whatever their names
+    given["pixels"] = given.pop("keypoints_pixels")
+    again = stacked(augment.moved_by(augment.change(lens, draw), given, {"pixels": "keypoints"}))
+    for key in together:
+        equal(again[key.replace("keypoints_pixels", "pixels")], together[key])
 
 
 @pytest.mark.parametrize("clips", [1, B])
@@ -62,69 +68,53 @@ def test_each_face_moves_as_it_does_alone(name, form):
 @pytest.mark.parametrize("name", AUGMENTATIONS)
 def test_clips_move_as_their_frames_by_one_draw(name, cameras, clips):
     augment, lens = AUGMENTATIONS[name](), camera(*[clips] * (cameras in ("batch", "list")))
-    sample = {
-        "image": torch.randint(256, (clips, T, 3, *SIZE), dtype=torch.uint8),
-        "image_valid": torch.rand(clips, T, 1, *SIZE) > 0.1,
-        "mask": torch.randint(5, (clips, T, *SIZE)),
-        "depth": torch.rand(clips, T, 1, *SIZE) + 1,
-        "keypoints": torch.rand(clips, T, 5, 2) * 30,
-        "keypoints_faces": torch.rand(clips, T, 4, 5, 2) * 30,
-        "keypoints_valid": torch.rand(clips, T, 5) > 0.3,
-        "boxes": torch.tensor([3.0, 3, 20, 24]) + torch.rand(clips, T, 2, 4),
-        "gaze": torch.randn(clips, T, 3),
-        "head_pose": torch.eye(4).expand(clips, T, 4, 4),
-    }
+    first = clips, T
+    sample = {"image": torch.randint(256, (*first, 3, *SIZE), dtype=torch.uint8), "mask": torch.rand(*first, *SIZE)}
+    sample |= {"image_valid": torch.rand(*first, 1, *SIZE) > 0.1, "depth": torch.rand(*first, 1, *SIZE) + 1}
+    sample |= {"keypoints": torch.rand(*first, 5, 2) * 30, "keypoints_faces": torch.rand(*first, 4, 5, 2) * 30}
+    sample |= {"keypoints_valid": torch.rand(*first, 5) > 0.3, "boxes": torch.rand(*first, 2, 4) + BOX}
+    sample |= {"gaze": torch.randn(*first, 3), "head_pose": torch.eye(4).expand(*first, 4, 4)}
     rest = {"names": ["a"] * clips, "index": torch.arange(clips), "rotation": torch.eye(3).expand(clips, 3, 3)}
     draw = augment.with_boxes(augment.draw(clips), sample["boxes"][:, 0])
     if cameras == "own":
         augment.camera = lens
-    given = {} if cameras == "own" else {"camera": list(lens) if cameras == "list" else lens}
-    out = augment(sample, **rest, **given, draw={n: v for n, v in draw.items() if n not in augment.crops})
+    own = {} if cameras == "own" else {"camera": list(lens) if cameras == "list" else lens}
+    out = augment(sample, **rest, **own, draw={n: v for n, v in draw.items() if n not in augment.crops})
     rows = torch.arange(clips).repeat_interleave(T)
     frames = {n: v.flatten(0, 1) for n, v in sample.items()} | {"rotation": rest["rotation"][rows]}
-    if lens.batch_shape and clips > 1:
-        lens = lens[rows.tolist()]
-    want = augment(
-        frames, draw={n: v[rows] for n, v in draw.items()}, camera=lens[0] if clips == 1 and lens.batch_shape else lens
-    )
+    lens = lens[0 if clips == 1 else rows.tolist()] if lens.batch_shape else lens
+    want = augment(frames, draw={n: v[rows] for n, v in draw.items()}, camera=lens)
     for key in want.keys() - {"camera", "rotation"}:
-        equal(out[key], want[key].unflatten(0, (clips, T)))
+        equal(out[key], want[key].unflatten(0, first))
     equal(out["rotation"], want["rotation"][::T])
     new = ct.Mixed(out["camera"]) if cameras == "list" else out["camera"]
-    assert tuple(new.batch_shape) == (clips,)
     equal(new.intrinsics, want["camera"].intrinsics[::T])
-    assert out["names"] is rest["names"]
-    assert out["index"] is rest["index"]
-    if name not in ("shift", "half of them"):
-        for options in ({}, {"draw": draw, "camera": given.get("camera")}):
-            if not options:
-                augment(sample, **rest, **given, draw=draw)
-            back = augment.inverse(out, **options)
-            torch.testing.assert_close(back["gaze"], sample["gaze"])
-            seen = out["keypoints_valid"]
-            torch.testing.assert_close(back["keypoints"][seen], sample["keypoints"][seen], atol=1e-3, rtol=0)
-            assert back["image"].shape == sample["image"].shape
+    assert all(out[key] is rest[key] for key in ("names", "index"))
+    for options in ({}, {"draw": draw, **own}) if name not in ("shift", "half of them") else ():
+        back = augment.inverse(out, **options)
+        torch.testing.assert_close(back["gaze"], sample["gaze"])
+        seen = out["keypoints_valid"]
+        torch.testing.assert_close(back["keypoints"][seen], sample["keypoints"][seen], atol=1e-3, rtol=0)
+        assert back["image"].shape == sample["image"].shape
 
 
 @pytest.mark.parametrize(
     ("fields", "says"),
     [
-        (
-            {"keypoints": torch.zeros(B, 4, 5, 2)},
-            r"keypoints must be \(2, 3, ...\), for image holds clips .* \(2, 4, 5, 2\)",
-        ),
+        ({"keypoints": torch.zeros(B, 4, 5, 2)}, r"keypoints must be \(2, 3, .*image is of clips.* \(2, 4, 5, 2\)"),
         ({"gaze": torch.zeros(B, 3)}, r"gaze must be"),
-        ({"gaze": torch.zeros(3, T, 3)}, r"gaze must be \(2, 3, ...\).* got shape \(3, 3, 3\)"),
         ({"boxes": [torch.zeros(1, 4)] * B}, r"boxes must be \(2, 3, ...\).* got list"),
         ({"keypoints": torch.zeros(B, T, 5, 2), "keypoints_valid": torch.ones(B, 5)}, "keypoints_valid must be"),
-        ({"image_left": torch.zeros(B, 3, *SIZE)}, "image_left must be"),
         ({"camera": camera(3)}, "camera is of 3 clips, image of 2"),
         ({"rotation": torch.eye(3)}, "rotation is of 3 clips, image of 2"),
         ({"draw": A.RandomMount().draw(3)}, r"draw\['apply'\] is of 3 clips, image of 2"),
     ],
 )
 def test_what_does_not_fit_a_clip_is_told_by_name(fields, says):
+    mount = A.RandomMount(camera=camera())
     with pytest.raises(ValueError, match=f"RandomMount: {says}"):
-        A.RandomMount(camera=camera())(image=torch.zeros(B, T, 3, *SIZE), **fields)
+        mount(image=torch.zeros(B, T, 3, *SIZE), **fields)
+    with pytest.raises(ValueError, match="RandomMount: the change is of 3 samples, here are 6"):
+        mount.moved_by(mount.change(None, mount.draw(3)), {"image": torch.zeros(B, T, 3, *SIZE)})
     with pytest.raises(ValueError, match=r"FaceNormalizer: image must be \(B, C, H, W\); .* image.flatten\(0, 1\)"):
         A.FaceNormalizer(camera=camera())(image=torch.zeros(B, T, 3, *SIZE), head_pose=torch.eye(4))
