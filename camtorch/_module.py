@@ -44,7 +44,23 @@ def _containers() -> Iterator[tuple[str, Any]]:
     return zip(_CONTAINERS, [kind() for kind in _KINDS], strict=True)
 
 
-class GeometryModule(nn.Module):
+class UnsharedState(nn.Module):
+    """A module whose state can be saved by safetensors, which refuses tensors that share memory."""
+
+    def state_dict(self, *args: Any, **options: Any) -> Any:
+        """Return the state as `nn.Module` does; of tensors that share memory, as of one camera twice, copies."""
+        state = super().state_dict(*args, **options)
+        if self._modules and not options.get("keep_vars", False):
+            seen: set[int] = set()
+            for name, tensor in state.items():
+                if type(tensor) is Tensor and tensor.numel() and name.startswith(options.get("prefix", "")):
+                    place = tensor.untyped_storage().data_ptr()
+                    state[name] = tensor.clone() if place in seen else tensor
+                    seen.add(place)
+        return state
+
+
+class GeometryModule(UnsharedState):
     """A module whose tensors are geometry: Parameters, or tensors of a graph, never of less than float32."""
 
     _own: dict[str, Tensor | None]  # the tensors that were registered, also while others stand in their place

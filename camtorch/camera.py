@@ -252,7 +252,7 @@ class Camera(Freezable):
     # -- as a file and as plain values; camtorch.io imports this file, and is imported when it is needed
 
     @classmethod
-    def load(cls, path: str | os.PathLike[str]) -> Self:
+    def load(cls, path: str | os.PathLike[str]) -> Camera:  # no Self, which jsonargparse takes for no class
         """Return the camera of a calibration file that has one camera, in float64 and frozen.
 
         In a configuration it names a camera by its file: `class_path: camtorch.Camera.load` of jsonargparse,
@@ -264,7 +264,7 @@ class Camera(Freezable):
         Raises:
             ValueError: If the file cannot be used, has several cameras, or one of another model than this class.
         """
-        camera: Self = importlib.import_module("camtorch.io.formats").load_camera(cls, path)
+        camera: Camera = importlib.import_module("camtorch.io.formats").load_camera(cls, path)
         return camera
 
     def to_dict(self) -> dict[str, Any]:
@@ -282,7 +282,7 @@ class Camera(Freezable):
         return values
 
     @classmethod
-    def from_dict(cls, d: Mapping[str, Any]) -> Self:
+    def from_dict(cls, d: Mapping[str, Any]) -> Camera:
         """Return the frozen camera of a dict as `to_dict` makes it; of any model if called on `ct.Camera`.
 
         Args:
@@ -291,7 +291,7 @@ class Camera(Freezable):
         Raises:
             ValueError: If a key is missing, unknown or has a wrong value, or the model is another than this class.
         """
-        camera: Self = importlib.import_module("camtorch.io.camtorch_json").made_of(cls, d, Camera)
+        camera: Camera = importlib.import_module("camtorch.io.camtorch_json").made_of(cls, d, Camera)
         return camera
 
     def replace(

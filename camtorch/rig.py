@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torch.nn.utils.parametrize import type_before_parametrizations
 
 from camtorch._arguments import as_mapping, shown, values_of
-from camtorch._module import BatchedModule
+from camtorch._module import BatchedModule, UnsharedState
 from camtorch.camera import Camera
 from camtorch.extrinsics import Extrinsics
 
@@ -114,7 +114,7 @@ class NamedModules(nn.Module, MutableMapping[str, M]):
         return "\n".join((f"{self._kind.__name__} by name:", *lines))
 
 
-class Rig(nn.Module):
+class Rig(UnsharedState):
     """Cameras by name, and their poses.
 
     A module: `.to`, `.float`, `state_dict` and `requires_grad_` reach all cameras and poses. And a mapping of names

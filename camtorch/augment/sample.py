@@ -483,7 +483,7 @@ class SampleTransform(nn.Module):
         if not (sample is None or hasattr(sample, "keys")):
             got = type(sample).__name__
             raise TypeError(f"{self._name}: a sample is a dict of fields, or keywords, as in image=...; got {got}")
-        return sample if isinstance(sample, Single) and not fields else {**(sample or {}), **fields}
+        return sample if isinstance(sample, Single) and not fields else {**({} if sample is None else sample), **fields}
 
     def _clips(self, sample: Sample, kinds: Mapping[str, str] | None = None) -> Clips | None:
         """Return the clips of a sample, if an image has the dims (B, T, C, H, W)."""
