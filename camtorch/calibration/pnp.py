@@ -82,7 +82,7 @@ def solve_pnp(
 
     Any camera model, rays of any angle, four points or more, on a plane or not, and no start: closed forms on rays give
     it (`camtorch.calibration.rays`), the Levenberg-Marquardt method the optimum. Points on a plane may have two
-    minima: both are refined, and the better one is returned.
+    minima, four points more: all are refined, and the best one is returned.
 
     With a threshold some points may be anywhere: poses of triples of points are compared by how many others agree
     (RANSAC on rays, `camtorch.calibration.ransac`), and the best one is refined by these alone. The triples are always

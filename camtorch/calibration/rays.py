@@ -247,7 +247,9 @@ def _rotations_in_space(local: Tensor, rays: Tensor, weights: Tensor, distances:
     def costs(rotations: Tensor) -> Tensor:
         return torch.where(distances.depths(rotations) > 0, distances.of_rotations(rotations), torch.inf)
 
-    for count, steps in ((_STARTS, 2), (_FEW, _STEPS)):
+    # four points have up to four minima near each other, which two steps do not tell apart
+    few = _STARTS if bool(((weights > 0).sum(-1) <= 4).any()) else _FEW
+    for count, steps in ((_STARTS, 2), (few, _STEPS)):
         rotations = distances.descended(_taken(rotations, costs(rotations).argsort(-1)[:, :count]), steps)
     cost = costs(rotations)
     best = _taken(rotations, cost.argmin(-1, keepdim=True))

@@ -1,7 +1,6 @@
 /* Poses on which many points agree: a round of samples for each row. What the search is, and its sources, stand in
  * camtorch/calibration/ransac.py. */
 #include "consensus.h"
-#include "small.h"
 
 enum { BLOCK = 64, TRIED = 8, STEPS = 3 };
 
@@ -135,7 +134,7 @@ static void frame(double corners[3][3], double *found) {
    is narrow: the squared sides (0, 1), (1, 2) and (2, 0) of a triangle with corners s_i along rays r_i are, with
    e = |r_i - r_j|^2, (s_i - s_j)^2 + e s_i s_j, which are quadratic forms of p = s_0 - s_2, q = s_1 - s_2 and w = s_2:
    `constant` of the first term, `one` of the second what there is of p w and q w, beside w^2. */
-static int poses_of_three(double points[3][3], double rays[3][3], double poses[4][12]) {
+int THIS(poses_of_three)(double points[3][3], double rays[3][3], double poses[4][12]) {
     static const double one[3][9] = {
         {0, 0, .5, 0, 0, .5, .5, .5, 0}, {0, 0, 0, 0, 0, .5, 0, .5, 0}, {0, 0, .5, 0, 0, 0, .5, 0, 0}};
     static const double constant[3][9] = {{1, -1, 0, -1, 1, 0, 0, 0, 0}, {0, 0, 0, 0, 1, 0, 0, 0, 0}, {1}};
@@ -232,7 +231,7 @@ static void round_of(const Agreement *given, int64_t place) {
                 points[corner][axis] = lines.points[axis * n + three[corner]];
                 rays[corner][axis] = lines.measures[(6 + axis) * n + three[corner]];
             }
-        for (int found = poses_of_three(points, rays, poses); found-- > 0;) {
+        for (int found = THIS(poses_of_three)(points, rays, poses); found-- > 0;) {
             double cost = cost_of(&lines, poses[found], costs[TRIED - 1], NULL);
             if (!(cost < costs[TRIED - 1])) continue;
             int at = TRIED - 1;

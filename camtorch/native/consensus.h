@@ -2,7 +2,7 @@
 #ifndef CAMTORCH_CONSENSUS_H
 #define CAMTORCH_CONSENSUS_H
 
-#include <stdint.h>
+#include "small.h"
 
 typedef struct {
     const double *points, *measures; /* (b, 3, n), (b, 3, 3, n) */
@@ -15,5 +15,9 @@ typedef struct {
     double most;   /* the threshold's square */
     int64_t *next; /* the row that whoever is free takes */
 } Agreement;
+
+#ifdef VARIANT
+int THIS(poses_of_three)(double points[3][3], double rays[3][3], double poses[4][12]);
+#endif
 
 #endif

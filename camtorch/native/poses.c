@@ -3,6 +3,7 @@
 #include <float.h>
 #include <stdlib.h>
 
+#include "consensus.h"
 #include "views.h"
 
 #define FLAT 1e-6
@@ -548,12 +549,39 @@ static double or_better(const Poses *given, Row *row, double *rotation, double *
     return found;
 }
 
+/* Takes the lowest minimum that poses of three of four points lead to, if it is lower; its cost */
+static double by_three(const Poses *given, Row *row, double *rotation, double *translation, double cost) {
+    double points[3][3], rays[3][3], poses[4][12], turned[9], shifted[3];
+    int64_t places[4];
+    int complete;
+    for (int64_t i = 0, seen = 0; i < row->count; i++)
+        if (row->weights[i] > 0) places[seen++] = 3 * i;
+    cost *= 1 - 1e-6; /* less is rounding */
+    for (int without = 0; without < 4; without++) {
+        for (int k = 0; k < 3; k++) {
+            const int64_t place = places[k + (k >= without)];
+            memcpy(points[k], row->points + place, sizeof *points), memcpy(rays[k], row->rays + place, sizeof *rays);
+        }
+        for (int left = THIS(poses_of_three)(points, rays, poses); left-- > 0;) {
+            for (int k = 0; k < 3; k++) {
+                memcpy(turned + 3 * k, poses[left] + 4 * k, 3 * sizeof *turned);
+                shifted[k] = poses[left][4 * k + 3];
+            }
+            if (trace_of_turn(turned, rotation) > SAME_TRACE) continue;
+            if (cost_of(given, row, turned, shifted, &complete) <= WORSE * cost)
+                cost = or_better(given, row, rotation, translation, cost, turned, shifted);
+        }
+    }
+    return cost;
+}
+
 /* The pose of least cost of all that is seen; its cost */
 static double solve(const Poses *given, Row *row, double *rotation, double *translation) {
     double rotations[2][9], translations[2][3], costs[2], mirror[9], shift[3];
     uint8_t valid[2];
     int complete;
-    const int few = prepare(given, row) <= FEW;
+    const int64_t seen = prepare(given, row);
+    const int few = seen <= FEW;
     from_rays(row, rotations, translations, valid);
     for (int i = 0; i < 2; i++) costs[i] = valid[i] ? cost_of(given, row, rotations[i], translations[i], &complete) : INFINITY;
     const int best = costs[1] < costs[0];
@@ -566,7 +594,7 @@ static double solve(const Poses *given, Row *row, double *rotation, double *tran
     if (isfinite(cost) && mirrored(row, rotation, translation, mirror, shift) &&
         ((few && !valid[!best]) || cost_of(given, row, mirror, shift, &complete) <= WORSE * cost))
         cost = or_better(given, row, rotation, translation, cost, mirror, shift);
-    return cost;
+    return seen == 4 && cost > 4 * given->nothing * given->nothing ? by_three(given, row, rotation, translation, cost) : cost;
 }
 
 /* The pose of least cost of the points on which most agree, from one that is near: in turns, which points these are, and a
