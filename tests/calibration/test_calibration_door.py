@@ -214,8 +214,6 @@ def test_corners_at_the_rim_and_a_few_outliers_are_taken():
     assert as_observations(BOARD, image_points, SIZE, OWNER)[0].seen.all()
 
 
-# -- rigs
-
 MODELS = {"left": "kannala_brandt", "right": "kannala_brandt"}
 SIZES = {"left": SIZE, "right": (600, 800)}
 

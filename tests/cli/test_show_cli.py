@@ -13,8 +13,6 @@ from command_line import FILES, FISHEYE, MATRIX, command, opened, refused
 import camtorch as ct
 from camtorch.analysis.summary import summarise
 
-# -- show
-
 
 def test_show_prints_a_summary(folder, capsys):
     command("show", "camera.yml")
@@ -60,9 +58,6 @@ def test_show_draws_an_image(folder, capsys):
         assert f"{len(words)}.png: distortion, radius over angle{end}\n" in capsys.readouterr().out
     assert opened("2.png").width > opened("0.png").width
     assert len(opened("2.png").convert("L").histogram()) > 100
-
-
-# -- convert
 
 
 def test_convert_writes_the_new_camera(folder, capsys):
@@ -173,9 +168,6 @@ def test_show_says_how_much_is_alike_where_the_rim_is_not(folder, capsys):
     rms, over, median, alike = map(float, found.groups())
     assert median < 1 < rms
     assert 50 < alike < over
-
-
-# -- the numbers of a summary
 
 
 @pytest.mark.parametrize(

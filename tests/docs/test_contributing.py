@@ -131,9 +131,6 @@ def test_a_walk_ends_with_green_tests(page, copy):
     assert done.returncode == 0, done.stdout + done.stderr
 
 
-# -- the rooms
-
-
 def rooms():
     """Of the table in CONTRIBUTING.md, in order: the names in camtorch/ that each row is about."""
     text = (ROOT / "CONTRIBUTING.md").read_text().split("## Where things are")[1].split("\n## ")[0]

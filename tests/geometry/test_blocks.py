@@ -74,9 +74,6 @@ def test_a_pixel_is_valid_alone_as_in_a_batch(key):
     law()
 
 
-# -- images
-
-
 @pytest.mark.parametrize("threads", [1, 2, 3])
 @pytest.mark.parametrize("count", [1, 2, 4, 5])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.float16, torch.uint8, torch.bool])

@@ -106,8 +106,6 @@ def test_real_lenses_are_valid_up_to_the_first_root():
     assert not valid_at("kannala_brandt", coefficients[some], folds[some] * (1 + 1e-12)).any()
 
 
-# -- the limit of what a lens shows, found once: pixels beyond cost nothing, and none is lost that has a ray
-
 LENSES = [key for key in KEYS if one(key).distortion_names]
 STAGES = [key for key in LENSES if type(one(key)).optics(columns(one(key).distortion[None]))[1].stages]
 

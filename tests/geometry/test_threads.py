@@ -123,9 +123,6 @@ def test_work_that_spreads_itself():
     assert all(sorted(pieces.done) == list(range(10)) for pieces in inner)
 
 
-# -- the threads of torch
-
-
 @contextlib.contextmanager
 def torch_threads(count):
     before = torch.get_num_threads()

@@ -15,9 +15,6 @@ K = np.array([[500.0, 0, 320], [0, 501, 240], [0, 0, 1]])
 D = np.array([[0.3, 0.1, 0.001, -0.002, 0.05]])
 
 
-# -- paths
-
-
 @pytest.mark.parametrize("kind", [str, Path, os.fsencode])
 def test_paths_of_every_kind(kind):
     assert ct.load(kind(str(FILES / "opencv_camera.yml"))).camera.image_size == (800, 1280)
@@ -57,9 +54,6 @@ def test_no_path(tmp_path):
         assert str(caught.value).isprintable()
     with open(FILES / "opencv_camera.yml") as file, pytest.raises(TypeError, match=r"TextIOWrapper.*file\.name"):
         ct.load(file)
-
-
-# -- NumPy archives
 
 
 @pytest.mark.parametrize("save", [np.savez, np.savez_compressed])

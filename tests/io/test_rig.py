@@ -157,8 +157,6 @@ def test_who_takes_it_for_a_camera_is_told_where_those_are():
         ct.augment.RandomMount(camera="pinhole")
 
 
-# -- what stands between two of its cameras
-
 LENS = ct.BrownConrady([500.0, 505, 320, 240], [-0.2, 0.05, 0.001, -0.001, 0.0], image_size=(480, 640))
 
 

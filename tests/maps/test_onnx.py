@@ -48,9 +48,6 @@ def smooth(batch=1):
     return nn.functional.interpolate(torch.rand(batch, 3, 12, 16), (96, 128), mode="bicubic").clamp(0, 1)
 
 
-# -- warps whose map is a constant
-
-
 def kinds(model):
     return [node.op_type for node in model.graph]
 
@@ -89,9 +86,6 @@ def test_a_dewarp_takes_any_batch_and_bytes():
     off = (result.double() - expected).abs()
     assert off.max() <= 1
     assert (off > 0).double().mean() < 3e-3
-
-
-# -- cameras as constants
 
 
 class Both(nn.Module):
@@ -165,9 +159,6 @@ def test_a_camera_that_is_made_of_inputs_is_a_program_with_operators_of_camtorch
         torch.onnx.export(module, given, dynamo=True, verbose=False)
 
 
-# -- what records the calls of one run
-
-
 def legacy_onnx(module, inputs):
     torch.onnx.export(module, inputs, io.BytesIO(), dynamo=False)
 
@@ -200,8 +191,6 @@ def test_the_exporter_of_recorded_runs_takes_no_camera(method):
     ):
         legacy_onnx(Network(), (torch.rand(5, 2 + (method == "project")),))
 
-
-# -- torch.export
 
 ELSEWHERE = """
 import sys, torch

@@ -74,8 +74,6 @@ def test_bad_poses_of_a_predicted_batch():
     assert pixels.isfinite().all()
 
 
-# -- parametrizations
-
 PARAMETRIZATIONS = pytest.mark.parametrize("parametrization", [PositiveFocal, TiedFocal])
 
 
@@ -152,9 +150,6 @@ def test_parametrized_cameras_are_of_their_model(parametrization, tmp_path):
     loaded = ct.load(path).cameras["camera"]
     assert type(loaded) is ct.KannalaBrandt
     torch.testing.assert_close(loaded.intrinsics, plain.intrinsics, check_dtype=False)
-
-
-# -- what learning broke is said
 
 
 @each_kind

@@ -131,8 +131,6 @@ def test_what_learnt_large_angles_is_not_refused(tmp_path):
     assert torch.equal(ct.load(tmp_path / "rig.json").extrinsics["a"].rotation, pose.rotation.double())
 
 
-# -- pitch, yaw and roll of heads
-
 STRAIGHT = torch.tensor([[math.pi / 2, 0.4, 0.0], [-math.pi / 2, -2.0, 0.0]], dtype=torch.float64)
 
 
@@ -186,9 +184,6 @@ def test_gradients_of_angles():
         rotation = ct.head_rotation(rows).requires_grad_()
         ct.head_angles(rotation).sum().backward()
         assert torch.isfinite(rotation.grad).all()
-
-
-# -- rotations alone
 
 
 def test_no_rotation_is_nearer_than_the_nearest():

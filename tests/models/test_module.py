@@ -42,9 +42,6 @@ def parameters_of(module):
     return {name: p.detach() for name, p in module.named_parameters()}
 
 
-# -- compile, export, transforms
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("key", "method"), [("kannala_brandt", "unproject"), ("fisheye624", "project"), ("brown_conrady", "project")]
@@ -144,9 +141,6 @@ def test_transforms_and_contexts_of_torch_change_nothing(key, method):
     assert_same(vmap(vmap(module))(grid), module(grid))
 
 
-# -- copies and files
-
-
 @each_kind
 @pytest.mark.parametrize("copied", [copy.deepcopy, lambda c: pickle.loads(pickle.dumps(c))], ids=["deepcopy", "pickle"])
 def test_copies(key, copied):
@@ -230,9 +224,6 @@ def test_every_change_of_a_parameter_is_noticed(key):
         camera.load_state_dict({})
 
 
-# -- learning
-
-
 @each_kind
 def test_plain_values_become_parameters(key):
     camera = spread(key)
@@ -246,9 +237,6 @@ def test_plain_values_become_parameters(key):
         assert ct.MODELS[key](plain).intrinsics.dtype == torch.float32
     parameter = nn.Parameter(camera.intrinsics.detach())
     assert ct.MODELS[key](parameter).intrinsics is parameter
-
-
-# -- dtypes
 
 
 @each_kind
@@ -285,9 +273,6 @@ def test_dtype_promotion(key, method, of_camera, of_values, expected):
     assert_same((result, valid), module(values.to(expected)))
 
 
-# -- what one sees
-
-
 @every_model
 def test_repr(key):
     camera = spread(key)
@@ -309,9 +294,6 @@ def test_an_edited_camera_learns_what_the_original_learns():
     assert not any(p.requires_grad for p in edited.parameters())
     edited.project(torch.tensor([0.1, 0.2, 1.0]))[0].sum().backward()
     assert (camera.distortion.grad != 0).all()
-
-
-# -- results belong to the caller
 
 
 @each_kind

@@ -205,9 +205,6 @@ def test_no_pixel_is_the_end_of_a_chart():
         torch.testing.assert_close(again, pixels[valid], rtol=0, atol=1e-5)
 
 
-# -- classes
-
-
 @pytest.fixture
 def models():
     kept = dict(ct.MODELS)

@@ -41,9 +41,6 @@ def test_rays_are_those_of_the_toolbox():
         np.testing.assert_allclose(ray, [right, down, -backwards], atol=1e-14)
 
 
-# -- the file
-
-
 def test_a_file_is_the_camera_of_its_numbers_which_look_along_z_or_against_it(tmp_path):
     path = tmp_path / "calib_results.txt"
     path.write_text(text(more="#camera Intrinsics\n\n300 0 1 0 300 2 0 0 1\n"))

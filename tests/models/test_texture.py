@@ -24,9 +24,6 @@ def test_numbers_by_name():
     assert ct.UCM([1.0, 2.0, 3.0, 4.0], torch.zeros(5, 1)).fy.tolist() == [2.0] * 5
 
 
-# -- parts of a batch
-
-
 def batch_of(key):
     camera = spread(key)
     scales = torch.tensor([[1.0, 1.1, 0.9], [1.2, 0.8, 1.05]], dtype=torch.float64)[..., None]
@@ -66,8 +63,6 @@ def test_gradients_of_a_part_are_the_batch_s_and_its_values_are_shared():
     assert camera.intrinsics[1, 0] == 7
 
 
-# -- field of view
-
 OF_RADIUS = {
     ct.Pinhole: lambda r: math.atan(r / 300),
     ct.KannalaBrandt: lambda r: r / 300,
@@ -104,9 +99,6 @@ def test_field_of_view_of_a_batch_is_that_of_its_cameras(key):
     torch.testing.assert_close(batch.field_of_view[1, 2], batch[1, 2].field_of_view)
 
 
-# -- from a field of view
-
-
 @each_kind
 @pytest.mark.parametrize(("axis", "degrees"), [("horizontal", 95), ("vertical", 25), ("diagonal", 60.5)])
 def test_a_camera_of_a_field_of_view(key, axis, degrees):
@@ -130,9 +122,6 @@ def test_with_the_distortion_of_a_lens_and_in_a_batch(key):
         torch.testing.assert_close(camera.fov[..., 0], wanted, rtol=1e-8, atol=0)
     several = ct.KannalaBrandt.from_fov(60, image_size=SIZE, distortion=torch.full((2, 2), 0.01))
     assert several.batch_shape == (2,)
-
-
-# -- why a point has no pixel
 
 
 @every_model
@@ -178,8 +167,6 @@ def test_reasons_in_batches_and_of_cameras_that_learning_broke():
     assert lines[4:6] == ["the camera itself is unusable: cy = nan"] * 2
     assert lines[6:] == ["the camera itself is unusable: the formula needs xi > -1"] * 2
 
-
-# -- values
 
 SMALL = (60, 80)
 

@@ -130,9 +130,6 @@ def both(images, where, mode, padding, fill=(0.0,), span=None):
     return result
 
 
-# -- every dtype, mode and padding, wherever images lie in memory
-
-
 def hwc(images):
     return images.contiguous(memory_format=torch.channels_last)
 
@@ -290,9 +287,6 @@ def test_wide_images(source):
     both((100 + 100 * smooth).to(torch.uint8), where, "nearest", "reflection")
 
 
-# -- no read outside
-
-
 def runs_here():
     """The variants that this CPU runs, the best one last."""
     names = list(building.VARIANTS)
@@ -304,9 +298,6 @@ def test_no_read_outside_and_nothing_undefined_in_any_variant(fuzzed):
     variants = {name: building.VARIANTS[name] for name in runs_here()}
     # the way without vectors is what the others are compared with
     assert fuzzed("sampler_fuzz.c", ["kernel.c"], {"plain": ("-DCAMTORCH_PLAIN",)} | variants, 4000, 250) == [*variants]
-
-
-# -- positions from a lattice
 
 
 def kept(warp):
@@ -330,9 +321,6 @@ def test_lattices_of_a_batch_of_cameras_and_images():
             off = (alone(hwc(images))[i].double() - result[i].double()).abs().max()
             assert off <= (0 if mode == "nearest" else 1e-4 if dtype == torch.float32 else 1)
         both(hwc(images), kept(batch), "nearest", padding, (1.0,))
-
-
-# -- what is no plain memory of the CPU, and who watches
 
 
 def warp_of(tolerance, scale=1):
@@ -447,9 +435,6 @@ def test_fills_of_any_size(fill):
                 assert warp(torch.zeros(1, 1, 120, 160, dtype=dtype), fill=fill, mode=mode).dtype == dtype
 
 
-# -- threads, forks and workers
-
-
 @contextmanager
 def threads(count):
     before = torch.get_num_threads()
@@ -518,8 +503,6 @@ def test_forks_while_others_warp():
         assert [os.waitpid(child, 0)[1] for child in children] == [0] * 5
         assert (warp(images).numpy() == expected).all()
 
-
-# -- memory
 
 PEAK = """
 import itertools

@@ -27,9 +27,6 @@ def turn(*degrees, dtype=torch.float32):
     return ct.augment.mount_rotation(*(torch.tensor(float(d), dtype=dtype) for d in (*degrees, 0, 0)[:3]))
 
 
-# -- ids
-
-
 def ids(dtype, count=1):
     """The largest numbers of a dtype, each once: float64 holds few of them."""
     pixels = torch.arange(count * 2 * SIZE[0] * SIZE[1], dtype=torch.int64).view(count, 2, *SIZE)
@@ -80,9 +77,6 @@ def test_wide_unsigned_integers_stay_in_range(mode, padding_mode):
         assert result[0, 0, 15:25, 20:30].to(torch.float64).min() >= float(torch.iinfo(dtype).max) * (1 - 1e-15)
 
 
-# -- pixels that are no numbers
-
-
 @pytest.mark.parametrize("bad", [torch.inf, torch.nan])
 @pytest.mark.parametrize("padding_mode", PADDINGS)
 def test_a_pixel_that_is_no_number_stays_in_its_neighbourhood(padding_mode, bad):
@@ -105,9 +99,6 @@ def test_a_pixel_that_is_no_number_stays_in_its_neighbourhood(padding_mode, bad)
                 assert (~finite).nonzero().tolist() == [[0, 0, row, column]]
 
 
-# -- layouts
-
-
 @pytest.mark.parametrize(
     ("mode", "options"), [*zip(MODES, ({"antialias": True}, {"fill": 3.0}, {"padding_mode": "border"}), strict=True)]
 )
@@ -117,9 +108,6 @@ def test_no_channels_and_no_images_make_none(mode, options):
             result = ct.Warp(fisheye(), pinhole(), mode=mode, **options)(torch.zeros(*shape, *SIZE, dtype=dtype))
             assert result.shape == (*shape, *SIZE)
             assert result.dtype == dtype
-
-
-# -- what is handed out belongs to the caller
 
 
 def test_masks_and_grids_may_be_changed():

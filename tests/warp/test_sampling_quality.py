@@ -22,9 +22,6 @@ def turn(*degrees, dtype=torch.float32):
     return ct.augment.mount_rotation(*angles)
 
 
-# -- shrinking
-
-
 def zone_plate(side=512):
     """(1, 1, side, side): rings whose frequency grows evenly, to that of the pixels at the middle of the edges."""
     at = torch.arange(side, dtype=torch.float64) - (side - 1) / 2
@@ -76,9 +73,6 @@ def test_antialias_follows_the_local_scale():
     assert (smooth(ones)[inner] == 200).all()
 
 
-# -- filling
-
-
 @pytest.mark.parametrize("mode", ["bilinear", "nearest", "bicubic"])
 def test_fill_takes_the_place_of_black(mode):
     camera, rotation = pinhole(), turn(25, 10, 30)
@@ -99,9 +93,6 @@ def test_pixels_without_a_ray_take_the_fill_in_every_padding_mode():
         without = ~by_pixel(warp).mapped[0]
         assert without.any()
         assert (warp(torch.rand(1, 1, *SIZE))[0, 0][without] == 7).all()
-
-
-# -- tolerance
 
 
 @pytest.mark.skipif(not native_available(), reason="without the compiled library positions are exact")
