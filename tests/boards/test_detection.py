@@ -55,7 +55,7 @@ def test_chessboards_keep_their_order_however_they_are_turned(columns):
     board = Chessboard(columns, 6 if columns != 5 else 5, 0.02)
     assert board.is_symmetric == (columns != 9)
     middle = board.points().mean(0)[:2]
-    for roll in (0.2, -0.3, 0.3 + np.pi) if columns == 9 else (0.2, -0.3):
+    for roll in (0.2, 0.3 + np.pi) if columns == 9 else (0.2, -0.3):
         turn = np.array([[np.cos(roll), -np.sin(roll)], [np.sin(roll), np.cos(roll)]])
         image, truth = photograph(board, fisheye(), (0.0, 0.0, roll), (*(-turn @ middle), 0.22))
         assert errors(board, image, truth, least=1.0).max() < 0.6
@@ -198,6 +198,9 @@ def test_paths_and_arrays_give_the_same_and_calibrate(views, tmp_path):
     assert calibration.rms < 0.6
 
 
+SMALL = fisheye().resize(240, 320)
+
+
 @pytest.mark.parametrize(
     "form",
     [
@@ -209,8 +212,8 @@ def test_paths_and_arrays_give_the_same_and_calibrate(views, tmp_path):
         lambda image: image.astype(np.uint16) * 257,
     ],
 )
-def test_one_image_in_any_form(views, form):
-    image, true = views[0]
+def test_one_image_in_any_form(form):
+    image, true = photograph(CHESSBOARD, SMALL, *POSES[0])
     found = ct.find_board(form(image), (9, 6), square=0.03)
     assert found.names == ["image 0"]
     assert np.nanmax(np.abs(found.image_points[0] - true)) < 0.6

@@ -149,7 +149,11 @@ def test_models_that_the_file_cannot_hold_are_not_tried(photographs, capsys, mon
     [
         ("a.png", "a board was found in 0 of 1 images, and 3 are needed"),
         ("a.png --model splined", "splined learns a surface over a lens that is known"),
-        ("PHOTOS --model kannala_brandt --fixed q", "fixed names 'q'; KannalaBrandt has fx, fy"),
+        pytest.param(
+            "PHOTOS --model kannala_brandt --fixed q",
+            "fixed names 'q'; KannalaBrandt has fx, fy",
+            marks=pytest.mark.slow,
+        ),
     ],
 )
 def test_what_cannot_be_calibrated(photographs, capsys, words, text):

@@ -183,7 +183,7 @@ rotations = st.lists(st.floats(-3, 3), min_size=3, max_size=3) | st.permutations
 vectors = st.tuples(rotations, st.lists(st.floats(-1e3, 1e3), min_size=3, max_size=3))
 
 
-@settings(max_examples=3, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=2, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(first=st.one_of(st.just(([0.0] * 3,) * 2), vectors), second=vectors)
 def test_any_poses_survive(first, second, tmp_path):
     camera = ct.Pinhole(float64([500, 501, 320, 240]), image_size=(480, 640))

@@ -80,7 +80,7 @@ junk = st.recursive(
 STRUCTURED = [name for name in SAMPLES if name.endswith(".json")]
 
 
-@settings(max_examples=15)
+@settings(max_examples=10)
 @given(data=st.data(), name=st.sampled_from(STRUCTURED))
 def test_wrong_values(tmp_path_factory, data, name):
     """One value of a good file, anywhere in it, becomes something else, or goes."""

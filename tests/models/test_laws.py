@@ -544,7 +544,7 @@ def test_pixels_around_the_image_of_the_fold(key, name, dtype):
     assert right[valid].all(), (around[valid & ~right][:3].tolist(), again[valid & ~right][:3].tolist())
 
 
-@every_model
+@distinct_models
 @both_precisions
 @settings(max_examples=2)
 @given(data=st.data())

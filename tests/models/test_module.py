@@ -57,7 +57,7 @@ def test_compile_without_graph_breaks(key, method):
     assert_same(*gradients)
 
 
-@pytest.mark.parametrize("key", slow_unless("splined".__eq__, KEYS))
+@pytest.mark.parametrize("key", slow_unless("kannala_brandt".__eq__, KEYS))
 @both_directions
 def test_compile_takes_every_model(key, method):
     module, values = module_and_input(key, method)

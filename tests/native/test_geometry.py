@@ -100,7 +100,7 @@ def test_projects_as_the_formula_does(key, dtype):
             expected, valid = formula_of(camera, Project, p)
             exact = (camera.distortion.double(), moved(camera, 16, 3))
             others = [make(camera.key, camera.intrinsics.double(), k) for k in exact]
-            near = [formula_of(other, Project, _moved(p, 64 * eps, seed))[1] for other in others for seed in range(3)]
+            near = [formula_of(other, Project, _moved(p, 64 * eps, seed))[1] for other in others for seed in range(2)]
         found, found_valid = (w[..., 0, :] for w in geometry.project(native(camera), p[None]))
         found = found.mT
         # next to a fold rounding decides
@@ -121,7 +121,7 @@ def test_unprojects_as_the_formula_does(key, dtype):
         with torch.no_grad():
             expected, valid = formula_of(camera, Unproject, q)
             exact = make(camera.key, camera.intrinsics.double(), camera.distortion.double())
-            around = [formula_of(exact, Unproject, _moved(q, 32 * eps, seed)) for seed in range(3)]
+            around = [formula_of(exact, Unproject, _moved(q, 32 * eps, seed)) for seed in range(2)]
             there = formula_of(exact, Unproject, q.double())[0]
         found = geometry.unproject(native(camera), q[None], keeps=True)
         rays, found_valid = found.rays[:, 0].mT, found.valid[0]

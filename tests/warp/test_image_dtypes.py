@@ -53,7 +53,7 @@ def test_ids_come_out_exactly(dtype):
         assert (np.array(result.flatten(0, 1).tolist(), dtype=object) == expected).all()
 
 
-def test_ids_of_a_batch_of_cameras_traced_and_in_transforms():
+def test_ids_of_a_batch_of_cameras_and_in_transforms():
     rotations = torch.stack([turn(yaw, 0, 5) for yaw in (0, 30, 60)])
     warp = ct.Warp(fisheye(), pinhole(), rotations, mode="nearest")
     given = ids(torch.int64, 3)
@@ -61,7 +61,6 @@ def test_ids_of_a_batch_of_cameras_traced_and_in_transforms():
     for i in range(3):
         single = ct.Warp(fisheye(), pinhole(), rotations[i], mode="nearest")
         assert torch.equal(single(given[i : i + 1])[0], result[i])
-    assert torch.equal(torch.compile(warp, fullgraph=True, backend="eager")(given), result)
     alone = ct.Warp(fisheye(), pinhole(), turn(20), mode="nearest")
     assert torch.equal(torch.func.vmap(lambda image: alone(image[None])[0])(given), alone(given))
 
