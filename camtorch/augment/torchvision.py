@@ -113,7 +113,8 @@ class Transform(v2.Transform):
         learns = torch.is_grad_enabled() and any(isinstance(leaf, Tensor) and leaf.requires_grad for leaf in leaves)
         with torch.no_grad():
             own.tell_of_empty_images(camera)
-            named = {key: (kind, value[None]) for key, kind, value, _ in fields.values() if kind}
+            of_boxes = ((k, kind, v) for k, kind, v, _ in fields.values() if kind and v.ndim > 1)
+            named = {k: (kind, v.reshape(-1, *v.shape[-2:])[:1]) for k, kind, v in of_boxes}
             # a graph of the camera would make the warp slower, and could not leave a DataLoader's worker
             change = own.change(camera.detach() if learns else camera, own._of_sample(own.draw(1), named))
         own.last = change
@@ -169,17 +170,18 @@ def _name(path: Any) -> str:
 def _moved(own: Augmentation, change: Change, fields: list[tuple[str, str | None, Any]]) -> Sample:
     """Return (key, kind, value) moved, by one change for all frames of those with more dims than single samples."""
     leads = {key: tuple(v.shape[: max(0, v.ndim - KINDS[kind].most_dims)]) for key, kind, v in fields if kind}
-    moved: Sample = {}
-    for lead in dict.fromkeys([*leads.values(), ()]):
+    moved: Sample = {key: value for key, _, value in fields}
+    for lead in dict.fromkeys(leads.values()):
         group = [field for field in fields if leads.get(field[0].removesuffix("_valid"), ()) == lead]
         sample, kinds = {key: value for key, _, value in group}, {key: kind for key, kind, _ in group if kind}
         if lead:
             count = math.prod(lead)
             frames = Change(count, [replace(part, rows=None) for part in change.parts])
             new = own.moved_by(frames, {k: v.reshape(count, *v.shape[len(lead) :]) for k, v in sample.items()}, kinds)
-            moved |= {k: v.reshape(*lead, *v.shape[1:]) for k, v in new.items() if isinstance(v, Tensor)}
         else:
-            moved |= own.moved_by(change, Single(sample), kinds) if kinds else sample
+            new = own.moved_by(change, Single(sample), kinds)
+        new = {key: value for key, value in new.items() if key in sample or key.removesuffix("_valid") in kinds}
+        moved |= {key: value.reshape(*lead, *value.shape[1:]) for key, value in new.items()} if lead else new
     return moved
 
 

@@ -1,10 +1,10 @@
-"""A law of all front ends: a sample comes out as its tensors do, whatever the augmentation."""
+"""A law of all front ends: whatever a sample holds comes out as by the native call, or is refused."""
 
+import ast
 import contextlib
 import importlib
 
 import numpy as np
-import PIL.Image
 import pytest
 import torch
 from torchvision_stand_in import torchvision_of
@@ -12,65 +12,90 @@ from torchvision_stand_in import torchvision_of
 import camtorch as ct
 import camtorch.augment.numpy
 from camtorch.augment import BoxCrop, Compose, HorizontalFlip, Pad, RandomCamera, RandomMount, RandomResizedCrop
+from camtorch.augment.sample import _ALIASES, IMAGES, KINDS
 
-SIZE = (96, 130)
+SIZE = 48, 64
 EDITS = {
-    "mirrored and padded": lambda: Compose([HorizontalFlip(p=1.0, landmarks=[(0, 1)]), Pad((1, 2, 3, 4))]),
-    "a part": lambda: Compose([RandomResizedCrop((64, 80), scale=(0.3, 0.6)), HorizontalFlip()], fill=9),
+    "mirrored and padded": lambda **o: Compose([HorizontalFlip(p=1.0, landmarks=[(0, 1)]), Pad((1, 2, 3, 4))], **o),
+    "a part": lambda **o: Compose([RandomResizedCrop((40, 50), scale=(0.3, 0.6)), Pad(1)], fill=9, **o),
 }
 AUGMENTATIONS = {
-    "mount": lambda: RandomMount(zoom=0.2, padding_mode="border"),
-    "filled": lambda: RandomMount(min_filled=0.9, p=0.7),
-    "another lens": lambda: RandomCamera("dms60", image_size=(90, 120), min_filled=0),
-    "a chain": lambda: Compose([RandomMount(), RandomCamera("dms60", image_size=(64, 70), min_filled=0)], mask_fill=3),
-    "a box": lambda: BoxCrop((70, 64), yaw=4, zoom=(0.9, 1.1)),
+    "mount": lambda **o: RandomMount(zoom=0.2, padding_mode="border", **o),
+    "filled": lambda **o: RandomMount(min_filled=0.9, p=0.7, **o),
+    "a chain": lambda **o: Compose([RandomMount(), RandomCamera("dms60", image_size=(40, 50), min_filled=0)], **o),
+    "a box": lambda **o: BoxCrop((40, 44), yaw=4, zoom=(0.9, 1.1), **o),
     **EDITS,
 }
 
 
 def camera():
-    lens = [-0.2, 0.05, 1e-3, -1e-3]
-    return ct.BrownConrady([130.0, 130, 64.5, 47.5], lens, image_size=SIZE).requires_grad_(False)
+    return ct.BrownConrady([65.0, 65, 31.5, 23.5], [-0.2, 0.05, 1e-3, -1e-3], image_size=SIZE).requires_grad_(False)
 
 
-def by_tensors(augment, lens, sample, **options):
-    image, mask, keypoints, boxes = (torch.from_numpy(value) for value in sample)
-    fields = {"image": image.permute(2, 0, 1), "mask": mask, "keypoints": keypoints, "boxes": boxes}
-    out = augment(fields | ({} if lens is None else {"camera": lens}), **options)
-    return out["image"].permute(1, 2, 0), out["mask"], out["keypoints"], out["boxes"]
+def sample(*batch):
+    """A field of every kind, two faces among them, for all front ends; channels come last in memory as in arrays."""
+    seeded = torch.Generator().manual_seed(1)
+
+    def pixels(*shape):
+        return torch.rand(*batch, *shape, 2, generator=seeded) * 30 + 8
+
+    def rays(*shape):
+        return torch.nn.functional.normalize(torch.randn(*batch, *shape, 3, generator=seeded), dim=-1)
+
+    pose = torch.eye(4).repeat(*batch, 1, 1)
+    fields = {name: rays() for name in ("gaze", "rvec", "tvec")} | {name: rays(4) for name in ("points", "directions")}
+    fields |= {name: torch.rand(*batch, 1, *SIZE, generator=seeded) for name in ("depth", "distance")}
+    return fields | {
+        "image": torch.rand(*batch, *SIZE, 3, generator=seeded).movedim(-1, -3),
+        "mask": torch.randint(9, (*batch, 1, *SIZE), generator=seeded, dtype=torch.uint8),
+        "keypoints": pixels(5),
+        "landmarks": pixels(2, 5),
+        "polygons": pixels(2, 4),
+        "boxes": torch.tensor([[9.0, 8, 41, 38]]).repeat(*batch, 1, 1),
+        "pitch_yaw": pixels() / 100,
+        "head_pose": pose,
+        "pose": pose,
+        "rotation": pose[..., :3, :3],
+    }
 
 
-def by_arrays(augment, lens, sample, _):
-    image, mask, keypoints, boxes = sample
-    out = ct.augment.numpy.Transform(augment, lens)(image=image, mask=mask, keypoints=keypoints, bboxes=boxes)
-    assert ("camera" in out) == (lens is not None)
-    return (out["image"], out["mask"], out["keypoints"], out["bboxes"]), {}
+def by_arrays(augment, lens, fields, _):
+    arrays = {n: v.movedim(-3, -1).numpy() if n in IMAGES else v.numpy() for n, v in fields.items()}
+    return as_tensors(ct.augment.numpy.Transform(augment, lens)(**arrays)), {}
 
 
-def by_torchvision(augment, lens, sample, tv):
-    image, mask, keypoints, boxes = (torch.from_numpy(value) for value in sample)
-    planes = tv.Image(image.permute(2, 0, 1))
-    given = {"again": planes, "image": planes, "mask": tv.Mask(mask), "shown": PIL.Image.fromarray(sample[0])}
-    given["points"] = tv.KeyPoints(keypoints, canvas_size=SIZE)
-    given["boxes"] = tv.BoundingBoxes(boxes + 0.5, format=tv.BoundingBoxFormat.XYXY, canvas_size=SIZE)
-    out = importlib.import_module("camtorch.augment.torchvision").Transform(augment, lens)(given)
-    assert out["again"].data_ptr() != out["image"].data_ptr()
-    assert torch.equal(out["again"], out["image"])
-    assert tuple(out["points"].canvas_size) == tuple(out["image"].shape[1:])
-    moved = out["image"].permute(1, 2, 0)
-    np.testing.assert_array_equal(np.asarray(out["shown"]), moved.numpy())
-    return (moved, out["mask"], out["points"], out["boxes"].as_subclass(torch.Tensor) - 0.5), {}
+def as_tensors(out):
+    out = {n: torch.as_tensor(v) for n, v in out.items() if isinstance(v, np.ndarray)}
+    return {n: v.movedim(-1, -3) if n in IMAGES else v for n, v in out.items()}
 
 
-def by_albumentations(augment, lens, sample, _):
+def by_albumentations(augment, lens, fields, _):
     A = pytest.importorskip("albumentations", reason="albumentations is not installed")  # noqa: N806
-    one = importlib.import_module("camtorch.augment.albumentations").Transform(augment, lens)
-    kinds = {"bbox_params": A.BboxParams("pascal_voc"), "keypoint_params": A.KeypointParams("xy", None, False)}
-    image, mask, keypoints, boxes = sample
-    out = A.Compose([one], **kinds)(image=image, mask=mask, keypoints=keypoints, bboxes=boxes + 0.5)
-    assert ("camera" in out) == (lens is not None)
-    draw = {name: torch.tensor(value, dtype=torch.float64) for name, value in one.params["draw"].items()}
-    return (out["image"], out["mask"], out["keypoints"], None), {"draw": draw}
+    one = importlib.import_module("camtorch.augment.albumentations").Transform(augment, lens, p=1)
+    arrays = {n: v.movedim(-3, -1).numpy() if n in IMAGES else v.numpy() for n, v in fields.items()}
+    out = A.Compose([one], keypoint_params=A.KeypointParams("xy", None, False))(**arrays)
+    return as_tensors(out), {"draw": {n: torch.tensor(v, dtype=torch.float64) for n, v in one.params["draw"].items()}}
+
+
+def by_torchvision(augment, lens, fields, tv):
+    """A nest, of which some is known by its type and the rest by its name."""
+    transform = importlib.import_module("camtorch.augment.torchvision").Transform(augment, lens, valid=True)
+    target = {name: value for name, value in fields.items() if name != "image"}
+    image, mask = tv.Image(fields["image"]), tv.Mask(target.pop("mask"))
+    points = tv.KeyPoints(target.pop("keypoints"), canvas_size=SIZE)
+    image, (moved, mask, points) = transform(image, ({"label": 3, **target}, mask, points))
+    assert moved.pop("label") == 3
+    assert points.canvas_size == tuple(image.shape[-2:])
+    typed = {"image": image, "mask": mask, "keypoints": points}
+    return {**moved, **{name: value.as_subclass(torch.Tensor) for name, value in typed.items()}}, {}
+
+
+def by_kornia(augment, lens, fields, _):
+    K = pytest.importorskip("kornia.augmentation")  # noqa: N806
+    adapter = importlib.import_module("camtorch.augment.kornia")
+    single = fields["image"].ndim == 3
+    pipeline = K.AugmentationSequential(adapter.CameraAugmentation(augment, lens), data_keys=None, keepdim=single)
+    return pipeline({"label": 3, **fields}), {}
 
 
 FRONT_ENDS = {
@@ -78,24 +103,67 @@ FRONT_ENDS = {
     "torchvision": (by_torchvision, "real"),
     "its stand-in": (by_torchvision, "stand-in"),
     "albumentations": (by_albumentations, None),
+    "kornia": (by_kornia, None),
 }
 
 
-@pytest.mark.parametrize("name", [*AUGMENTATIONS, *(f"{name}, no camera" for name in EDITS)])
-@pytest.mark.parametrize("front_end", FRONT_ENDS)
-def test_a_sample_moves_as_its_tensors_do(front_end, name, monkeypatch):
-    augment, lens = AUGMENTATIONS[name.split(",")[0]](), None if "no camera" in name else camera()
-    random = np.random.default_rng(0)
-    image = random.integers(256, size=(*SIZE, 3), dtype=np.uint8)
-    mask, keypoints = random.integers(9, size=SIZE, dtype=np.uint8), random.uniform(2, 90, (9, 2)).astype(np.float32)
-    sample = image, mask, keypoints, np.array([[40.0, 30, 90, 80]], np.float32)
+def both(front_end, augment, lens, fields, monkeypatch):
+    """What comes of the fields by a front end, and by the native call with the same draw."""
     move, kind = FRONT_ENDS[front_end]
     torch.manual_seed(3)
     with torchvision_of(kind, monkeypatch) if kind else contextlib.nullcontext() as tv_tensors:
-        moved, draw = move(augment, lens, sample, tv_tensors)
+        moved, draw = move(augment, lens, fields, tv_tensors)
     torch.manual_seed(3)
-    for i, (one, other) in enumerate(zip(moved, by_tensors(augment, lens, sample, **draw), strict=True)):
-        if one is not None:
-            assert one.shape == other.shape
-            assert torch.as_tensor(one).dtype == other.dtype
-            np.testing.assert_allclose(one, other, rtol=0, atol=1e-3 * (i > 1))
+    return moved, augment(fields if lens is None else {**fields, "camera": lens}, **draw)
+
+
+@pytest.mark.filterwarnings("ignore:.*will show nothing")
+@pytest.mark.parametrize("batch", [(), (2,)], ids=["single", "batch"])
+@pytest.mark.parametrize("name", [*AUGMENTATIONS, *(f"{name}, no camera" for name in EDITS)])
+@pytest.mark.parametrize("front_end", FRONT_ENDS)
+def test_all_fields_move_as_by_the_native_call(front_end, name, batch, monkeypatch):
+    lens = None if "no camera" in name else camera()
+    if front_end == "kornia" and (lens is None or name == "a box"):
+        pytest.skip("kornia's wants a camera, and boxes by with_boxes")
+    if batch and front_end in ("arrays", "albumentations"):
+        pytest.skip("single samples alone")
+    clip = bool(batch) and front_end != "kornia"  # of which all frames have one draw
+    augment = AUGMENTATIONS[name.split(",")[0]](same_on_batch=clip)
+    fields = sample(*batch)
+    assert fields.keys() == KINDS.keys()
+    moved, want = both(front_end, augment, lens, fields, monkeypatch)
+    for key in fields.keys() | {n for n in want if n.endswith("_valid") and n in moved}:
+        tolerance = 1e-5 if (front_end, key) == ("albumentations", "keypoints") else 0
+        torch.testing.assert_close(
+            moved[key], want[key], rtol=0, atol=tolerance, msg=lambda text, key=key: f"{key}: {text}"
+        )
+
+
+@pytest.mark.parametrize("front_end", FRONT_ENDS)
+def test_numbers_of_unknown_names_are_refused(front_end, monkeypatch):
+    batch = (2,) if front_end == "kornia" else ()
+    fields = sample(*batch) | {"lidar": sample(*batch)["points"]}
+    with pytest.raises(ValueError, match=r"'lidar' holds real numbers.*fields=\{'lidar': KIND\}"):
+        both(front_end, RandomMount(), camera(), fields, monkeypatch)
+    for kind in ("keep", "points"):
+        moved, want = both(front_end, RandomMount(fields={"lidar": kind}), camera(), fields, monkeypatch)
+        assert torch.equal(moved["lidar"], want["lidar"])
+        assert torch.equal(moved["lidar"], fields["lidar"]) == (kind == "keep")
+
+
+# names of a container's own targets, kinds of its own types, and names of arguments
+THEIR_OWN = {
+    "albumentations": {"image", "images", "mask", "masks", "bboxes", "keypoints"},
+    "torchvision": {"image", "mask", "boxes", "keypoints", "polygons"},
+    "kornia": {"keypoints", "boxes", "images"},
+    "numpy": set(),
+}
+
+
+@pytest.mark.parametrize("front_end", THEIR_OWN)
+def test_front_ends_name_no_fields(front_end):
+    source = (ct.augment.numpy.__file__).replace("numpy.py", f"{front_end}.py")
+    with open(source, encoding="utf-8") as file:
+        tree = ast.parse(file.read())
+    texts = {node.value for node in ast.walk(tree) if isinstance(node, ast.Constant)}
+    assert texts & {*KINDS, *_ALIASES} <= THEIR_OWN[front_end]
