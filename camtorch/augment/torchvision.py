@@ -114,7 +114,7 @@ class Transform(v2.Transform):
         with torch.no_grad():
             own.tell_of_empty_images(camera)
             of_boxes = ((k, kind, v) for k, kind, v, _ in fields.values() if kind and v.ndim > 1)
-            named = {k: (kind, v.reshape(-1, *v.shape[-2:])[:1]) for k, kind, v in of_boxes}
+            named = {k: (kind, v.reshape(math.prod(v.shape[:-2]), *v.shape[-2:])[:1]) for k, kind, v in of_boxes}
             # a graph of the camera would make the warp slower, and could not leave a DataLoader's worker
             change = own.change(camera.detach() if learns else camera, own._of_sample(own.draw(1), named))
         own.last = change
@@ -170,6 +170,11 @@ def _name(path: Any) -> str:
 def _moved(own: Augmentation, change: Change, fields: list[tuple[str, str | None, Any]]) -> Sample:
     """Return (key, kind, value) moved, by one change for all frames of those with more dims than single samples."""
     leads = {key: tuple(v.shape[: max(0, v.ndim - KINDS[kind].most_dims)]) for key, kind, v in fields if kind}
+    # flags of a box are flags of all its points, and one of its points is enough
+    of_points = {f"{key}_valid" for key, kind, value in fields if kind == _TURNED and value.shape[-2] == _STEPS**2}
+    fields = [
+        (k, kind, torch.as_tensor(v)[..., None].expand(-1, _STEPS**2) if k in of_points else v) for k, kind, v in fields
+    ]
     moved: Sample = {key: value for key, _, value in fields}
     for lead in dict.fromkeys(leads.values()):
         group = [field for field in fields if leads.get(field[0].removesuffix("_valid"), ()) == lead]
@@ -182,7 +187,7 @@ def _moved(own: Augmentation, change: Change, fields: list[tuple[str, str | None
             new = own.moved_by(change, Single(sample), kinds)
         new = {key: value for key, value in new.items() if key in sample or key.removesuffix("_valid") in kinds}
         moved |= {key: value.reshape(*lead, *value.shape[1:]) for key, value in new.items()} if lead else new
-    return moved
+    return {key: value.any(-1) if key in of_points else value for key, value in moved.items()}
 
 
 def _native(name: str, leaf: Any, kind: str | None) -> tuple[str | None, Any, Callable[[Any, Change], Any]]:
@@ -223,7 +228,7 @@ def _native(name: str, leaf: Any, kind: str | None) -> tuple[str | None, Any, Ca
 
     def back(new: Tensor, change: Change) -> Any:
         if turns:
-            new = turned(new, change.mirrored is not None and bool(change.rotation[0, 0, 0] < 0)).flatten(-2)
+            new = turned(new, change.mirrored is not None).flatten(-2)
         if canvas:
             lost = ((new == -1) | new.isnan()).all(-1, keepdim=True)
             new = torch.where(lost, -1.0, new if form is None else new + 0.5)

@@ -91,15 +91,15 @@ def lattice_of(corners: Tensor, steps: int) -> Tensor:
     return (left + (right - left) * share).flatten(-3, -2)
 
 
-def turned(lattice: Tensor, backwards: bool = False) -> Tensor:
+def turned(lattice: Tensor, mirrored: bool = False) -> Tensor:
     """(..., 4, 2): the corners of rectangles along the middle rows of moved lattices, about all points but (-1, -1).
 
-    backwards: whether rows run from right to left, in a mirror. Without any point all corners are -1.
+    mirrored: whether they go round the other way, and along their rows backwards. Without any point all are -1.
     """
     steps = math.isqrt(lattice.shape[-2])
     middle = lattice.unflatten(-2, (steps, steps))[..., steps // 2, steps // 2 - 1 : steps // 2 + 2, :]
     found, known = (lattice != -1).any(-1), (middle != -1).any(-1)[..., [0, 2]].all(-1)
-    ahead = (middle[..., 0, :] - middle[..., 2, :]) * (1 if backwards else -1)
+    ahead = (middle[..., 0, :] - middle[..., 2, :]) * (1 if mirrored else -1)
     ahead = torch.where(known.unsqueeze(-1) & (ahead != 0).any(-1, keepdim=True), ahead, ahead.new_tensor((1.0, 0.0)))
     ahead = ahead / ahead.norm(dim=-1, keepdim=True)
     axes = torch.stack((ahead, torch.stack((-ahead[..., 1], ahead[..., 0]), -1)), -1)

@@ -94,18 +94,3 @@ def test_what_is_wrong_is_told():
         A.Compose([ct.augment.albumentations.Transform(ct.augment.RandomMount())])(image=sample()["image"])
     with pytest.raises(ValueError, match=r"image is \(47, 64\) \(height, width\), but the camera's image_size is"):
         A.Compose([transform()])(image=sample()["image"][1:])
-
-
-def test_boxes_and_rays_of_a_pipeline_move_as_those_of_arrays():
-    one = transform()
-    out = compose(one)(**sample())
-    drawn = {name: torch.tensor(value, dtype=torch.float64) for name, value in one.params["draw"].items()}
-    plain = sample() | {"bboxes": sample()["bboxes"] - 0.5}
-    want = ct.augment.numpy.Transform(one.augmentation)(**plain, camera=camera(), draw=drawn)
-    np.testing.assert_allclose(out["gaze"], want["gaze"], atol=1e-6)
-    inside = np.clip(want["bboxes"] + 0.5, 0, [64, 48, 64, 48])
-    np.testing.assert_allclose(out["bboxes"], inside, atol=1e-3)
-    torch.testing.assert_close(out["camera"].intrinsics, want["camera"].intrinsics)
-    rows, columns = np.nonzero(out["mask"])
-    extent = [columns.min(), rows.min(), columns.max() + 1, rows.max() + 1]
-    assert np.abs(np.array(extent) - out["bboxes"][0]).max() < 1.5

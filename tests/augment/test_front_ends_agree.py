@@ -73,7 +73,10 @@ def by_albumentations(augment, lens, fields, _):
     A = pytest.importorskip("albumentations", reason="albumentations is not installed")  # noqa: N806
     one = importlib.import_module("camtorch.augment.albumentations").Transform(augment, lens, p=1)
     arrays = {n: v.movedim(-3, -1).numpy() if n in IMAGES else v.numpy() for n, v in fields.items()}
-    out = A.Compose([one], keypoint_params=A.KeypointParams("xy", None, False))(**arrays)
+    params = {"bbox_params": A.BboxParams("pascal_voc"), "keypoint_params": A.KeypointParams("xy", None, False)}
+    out = A.Compose([one], **params)(**arrays, bboxes=arrays["boxes"] + 0.5)
+    size = np.array(out["image"].shape[1::-1] * 2)
+    np.testing.assert_allclose(out["bboxes"], np.clip(out["boxes"] + 0.5, 0, size), atol=1e-3)
     return as_tensors(out), {"draw": {n: torch.tensor(v, dtype=torch.float64) for n, v in one.params["draw"].items()}}
 
 
@@ -95,7 +98,10 @@ def by_kornia(augment, lens, fields, _):
     adapter = importlib.import_module("camtorch.augment.kornia")
     single = fields["image"].ndim == 3
     pipeline = K.AugmentationSequential(adapter.CameraAugmentation(augment, lens), data_keys=None, keepdim=single)
-    return pipeline({"label": 3, **fields}), {}
+    corners = fields["boxes"][..., [0, 1, 2, 1, 2, 3, 0, 3]].unflatten(-1, (4, 2))
+    out = pipeline({"label": 3, "bbox": corners, **fields})
+    torch.testing.assert_close(out["bbox"][..., [0, 2], :].flatten(-2), out["boxes"])
+    return out, {}
 
 
 FRONT_ENDS = {
@@ -117,16 +123,21 @@ def both(front_end, augment, lens, fields, monkeypatch):
     return moved, augment(fields if lens is None else {**fields, "camera": lens}, **draw)
 
 
+CASES = [
+    (front_end, name, batch)
+    for front_end in FRONT_ENDS
+    for name in (*AUGMENTATIONS, *(f"{name}, no camera" for name in EDITS))
+    for batch in ((), (2,))
+    # batches are for tensors, and kornia's wants a camera, and boxes by `with_boxes`
+    if not (batch and front_end in ("arrays", "albumentations"))
+    and not (front_end == "kornia" and (name == "a box" or "no camera" in name))
+]
+
+
 @pytest.mark.filterwarnings("ignore:.*will show nothing")
-@pytest.mark.parametrize("batch", [(), (2,)], ids=["single", "batch"])
-@pytest.mark.parametrize("name", [*AUGMENTATIONS, *(f"{name}, no camera" for name in EDITS)])
-@pytest.mark.parametrize("front_end", FRONT_ENDS)
+@pytest.mark.parametrize(("front_end", "name", "batch"), CASES)
 def test_all_fields_move_as_by_the_native_call(front_end, name, batch, monkeypatch):
     lens = None if "no camera" in name else camera()
-    if front_end == "kornia" and (lens is None or name == "a box"):
-        pytest.skip("kornia's wants a camera, and boxes by with_boxes")
-    if batch and front_end in ("arrays", "albumentations"):
-        pytest.skip("single samples alone")
     clip = bool(batch) and front_end != "kornia"  # of which all frames have one draw
     augment = AUGMENTATIONS[name.split(",")[0]](same_on_batch=clip)
     fields = sample(*batch)

@@ -8,7 +8,6 @@ import pytest
 import torch
 from kornia.augmentation.container.params import ParamItem
 from kornia.geometry.boxes import Boxes
-from kornia.geometry.keypoints import Keypoints
 
 import camtorch as ct
 from camtorch import augment
@@ -52,30 +51,6 @@ def equal(first, second):
     return all(torch.equal(a, b) for a, b in zip(first, second, strict=True))
 
 
-# -- the same as the call on a sample
-
-
-@pytest.mark.parametrize("same_on_batch", [False, True])
-@pytest.mark.parametrize("p", [1.0, 0.5])
-@pytest.mark.parametrize("name", ["RandomMount", "RandomLens", "RandomCamera"])
-def test_a_seed_gives_the_warps_of_the_sample_call(name, p, same_on_batch):
-    own, wrapped = camera(), getattr(augment, name)(p=p, same_on_batch=same_on_batch)
-    aug = getattr(adapter, name)(own, p=p, same_on_batch=same_on_batch)
-    given = {"image": images(), "keypoints": points(), "boxes": vertices()[:, :, [0, 2]].flatten(2), "camera": own}
-    for seed in range(2):
-        torch.manual_seed(seed)
-        warped = aug(images())
-        torch.manual_seed(seed)
-        sample = wrapped(given)
-        assert torch.equal(warped, sample["image"])
-        assert torch.equal(aug.last.rotation, sample["rotation"])
-        moved = aug.transform_keypoints(Keypoints(points()), aug._params, aug.flags)
-        assert torch.equal(moved.data, sample["keypoints"])
-        boxes = aug.transform_boxes(Boxes(vertices()), aug._params, aug.flags)
-        torch.testing.assert_close(boxes.data[:, :, [0, 2]].flatten(2), sample["boxes"])
-        assert torch.equal(aug.last.target.intrinsics, sample["camera"].intrinsics)
-
-
 def test_a_made_augmentation_brings_its_camera_p_and_same_on_batch():
     made = augment.RandomMount(camera=camera(), p=0.25, same_on_batch=True)
     aug = adapter.CameraAugmentation(made)
@@ -85,21 +60,25 @@ def test_a_made_augmentation_brings_its_camera_p_and_same_on_batch():
     assert "yaw=(-10, 10)" in repr(aug)
 
 
-# -- labels
-
-
-def test_boxes_off_the_image_are_invalid_and_zero():
+@pytest.mark.parametrize("key", ["bbox_xywh", "bbox_xyxy", "bbox"])
+def test_boxes_off_the_image_are_zeros_and_stay_that(key):
     corners = vertices(2).repeat(1, 2, 1, 1)
     corners[:, 1] += 4000
-    boxes = Boxes(corners.clone())
+    own, boxes = (
+        Boxes(corners.clone()),
+        Boxes(corners).to_tensor({"bbox": "vertices_plus"}.get(key, key.removeprefix("bbox_"))),
+    )
     aug = adapter.RandomMount(camera())
-    aug(images(2))
-    moved = aug.transform_boxes(boxes, aug._params, aug.flags)
-    assert moved._valid.tolist() == [[True, False]] * 2
-    assert torch.isfinite(moved.data).all()
-    assert (moved.to_tensor("xyxy")[:, 1] == 0).all()
-    assert torch.equal(boxes.data, corners)
-    assert boxes._valid.all()
+    seq = K.AugmentationSequential(aug, K.RandomHorizontalFlip(p=1.0), data_keys=["input", key])
+    image, moved = seq(images(2), boxes)
+    valid = aug.transform_boxes(own, aug._params, aug.flags)._valid
+    assert valid.tolist() == [[True, False]] * 2
+    assert torch.equal(own.data, corners)
+    assert own._valid.all()
+    _, back = seq.inverse(image, moved)
+    for value in (moved, back):
+        assert (value[:, 1] == 0).all()
+        assert (value[:, 0] != 0).all()
 
 
 # -- masks
@@ -288,12 +267,65 @@ def test_nested_containers_and_random_apply():
         assert (seq.inverse(*first, params=params)[2] - points()).abs().max() < 2e-3
 
 
-def test_dict_input():
-    seq = K.AugmentationSequential(adapter.RandomMount(camera()), data_keys=None)
+def test_fields_of_dicts_that_kornia_does_not_know():
     given = dict(zip(("image", "mask_iris", "keypoints", "bbox"), batch(), strict=True)) | {"label": torch.arange(3)}
-    moved = seq({**given, "path": "stays"})
+    given |= {
+        "gaze": points(3, 3).mT.contiguous() / 99,
+        "boxes": torch.rand(3, 1, 4).sort().values * 60,
+        "path": "stays",
+    }
+    mount, lens = adapter.RandomMount(camera()), adapter.RandomLens(camera(), p=0.5)
+    seq = K.AugmentationSequential(K.ImageSequential(mount), K.ColorJiggle(), lens, data_keys=None)
+    torch.manual_seed(2)
+    moved = seq(given)
+    assert torch.equal(moved["gaze"], lens.last.rays(mount.last.rays(given["gaze"])))
     assert moved["path"] == "stays"
-    assert (seq.inverse(moved)["keypoints"] - points()).abs().max() < 1e-3
+    assert moved["boxes_valid"].shape == (3, 1)
+    back = seq.inverse(moved)
+    for key in ("keypoints", "gaze"):
+        assert (back[key] - given[key]).abs().max() < 1e-3
+    again = seq({name: value for name, value in given.items() if name != "image"}, params=seq._params)
+    assert torch.equal(again["gaze"], moved["gaze"])
+
+
+def test_a_camera_of_a_dict_is_that_of_its_images():
+    cameras, mount = several(), adapter.RandomMount(camera())
+    seq = K.AugmentationSequential(mount, data_keys=None)
+    torch.manual_seed(2)
+    moved = seq({"image": images(), "camera": cameras})
+    torch.manual_seed(2)
+    want = augment.RandomMount()(image=images(), camera=cameras)
+    assert torch.equal(moved["image"], want["image"])
+    assert torch.equal(moved["camera"].intrinsics, want["camera"].intrinsics)
+    assert torch.equal(seq.inverse(moved)["camera"].intrinsics, cameras.intrinsics)
+    alone = seq({"image": images(1)[0], "gaze": torch.ones(3), "camera": camera()})
+    assert (alone["gaze"].shape, alone["camera"].batch_shape) == ((3,), ())
+    video = K.AugmentationSequential(K.VideoSequential(mount, data_format="BTCHW", same_on_frame=True), data_keys=None)
+    clip = images(1).expand(2, 3, -1, -1, -1)
+    moved = video({"image": clip, "gaze": torch.ones(2, 3, 3), "camera": [camera(), camera()]})
+    assert torch.equal(moved["gaze"][:, 0], moved["gaze"][:, 2])
+    assert not torch.equal(moved["gaze"][0], moved["gaze"][1])
+    assert len(moved["camera"]) == 6
+
+
+@pytest.mark.parametrize("field", [{"gaze": torch.ones(3, 3)}, {"camera": camera()}])
+def test_what_would_leave_fields_behind_is_refused(field):
+    for others, text in (
+        (
+            [K.RandomHorizontalFlip()],
+            "RandomHorizontalFlip of kornia would leave .* Use camtorch.augment.kornia.HorizontalFlip",
+        ),
+        (
+            [K.ImageSequential(K.RandomAffine(3.0))],
+            "RandomAffine of kornia would leave .* Use augmentations of camtorch",
+        ),
+        ([adapter.RandomLens(camera())], "a camera must be .* camtorch.augment.kornia.Compose"),
+    ):
+        seq = K.AugmentationSequential(adapter.RandomMount(camera()), *others, data_keys=None)
+        assert seq({"image": images()})["image"].shape == images().shape
+        if "gaze" not in field or "of kornia" in text:
+            with pytest.raises(ValueError, match=text):
+                seq({"image": images(), **field})
 
 
 @pytest.mark.parametrize("same_on_batch", [False, True])
