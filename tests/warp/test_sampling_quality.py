@@ -122,3 +122,25 @@ def test_options_reach_the_inverse_and_dewarp():
     options = {"mode": "bicubic", "padding_mode": "border", "fill": (0.5,), "antialias": True, "tolerance": 0.01}
     warp = ct.Dewarp(pinhole(), **options)
     assert warp.options == options == warp.inverse().options
+
+
+@pytest.mark.parametrize(("padding", "errors"), [("border", (2e-4, 1e-3, 1e-3)), ("reflection", (2e-4, 0.04, 0.2))])
+def test_far_outside_positions_are_as_exact_as_the_limits_say(padding, errors):
+    """On the image, and up to 3,000 and 10,000 pixels outside; compiled and recorded."""
+    images = torch.rand(1, 3, 240, 320, generator=torch.Generator().manual_seed(0))
+    middle = [159.5, 119.5]
+    pinhole = ct.Pinhole([200.0, 200.0, *middle], image_size=(240, 320))
+    fisheye = ct.KannalaBrandt([100.0, 100.0, *middle], [0.02, -0.01, 3e-3, -1e-3], image_size=(240, 320))
+
+    def warped(images, dtype, learns=False):
+        cameras = (camera.clone().to(dtype).requires_grad_(learns) for camera in (pinhole, fisheye))
+        return ct.Warp(*cameras, padding_mode=padding, tolerance=0.0)(images).detach().double()
+
+    grid = ct.Warp(pinhole.clone().double(), fisheye.clone().double()).grid().detach().reshape(240, 320, 2)
+    outside = ((grid.abs() - 1) * torch.tensor([160.0, 120.0])).amax(-1).expand(1, 3, -1, -1)
+    exact = warped(images.double(), torch.float64)
+    for learns in (False, True):
+        away = (warped(images, torch.float32, learns) - exact).abs()
+        for distance, error in zip((0, 3000, 10_000), errors, strict=True):
+            assert away[outside < distance].max() < error
+    assert (warped(images, torch.float64) - warped(images, torch.float64, True)).abs().max() < 2e-5
