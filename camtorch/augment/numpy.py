@@ -99,7 +99,7 @@ class Transform:
             raise TypeError(
                 f"{_OWNER}: the fields go in by name, as in transform(image=...); got {type(sample).__name__}"
             )
-        sample = {**(sample or {}), **fields}
+        sample = {**({} if sample is None else sample), **fields}
         if otherwise is not None and sample.get("camera") is None:
             sample["camera"] = otherwise
         entries = {}

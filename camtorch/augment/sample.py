@@ -652,6 +652,11 @@ class SampleTransform(nn.Module):
         sample = self._given(sample, {})
         if clips := self._clips(sample, kinds):
             return clips.restored(self.moved_by(change, clips.frames(None), kinds, predicted))
+        if change.count == 1:
+            own = self._sorted(sample, {**self.fields, **(kinds or {})}).values()
+            sizes = {len(value) if isinstance(value, (list, tuple)) else value.shape[:1].numel() for _, value in own}
+            if sizes != {1} and all(kind != "image" for kind, _ in own):
+                sample = Single(sample)  # labels of several faces, without the image that tells
         first = change.parts[0]
         camera = first.camera if first.rows is None else change.source
         named, batched, count, _ = self._batch(sample, camera, predicted, kinds)
@@ -684,7 +689,7 @@ class SampleTransform(nn.Module):
             if valid is not None:
                 moved[f"{name}_valid"] = self._still(f"{name}_valid", valid, sample.get(f"{name}_valid"))
         for key in dict.fromkeys(("image_valid", *(f"{n}_valid" for n, (k, _) in named.items() if k in IMAGES))):
-            seen = sample.get(key)
+            seen: Any = sample.get(key)
             if masked := getattr(seen, "ndim", 0) > 1 + batched:  # and no flag for each sample
                 seen = torch.as_tensor(seen) != 0
                 seen = seen if batched else seen[None]
@@ -720,8 +725,8 @@ class SampleTransform(nn.Module):
                     f"{type(value).__name__}"
                 )
             moved[name] = [torch.as_tensor(v) for v in value] if several else torch.as_tensor(value)
-        several = [one for kind, value in named.values() for one in _items(value) if kind in ("keypoints", "landmarks")]
-        faces = {tuple(one.shape[1:3]) for one in several if one.ndim == 4}  # (F, N)
+        pixels = [one for kind, value in named.values() for one in _items(value) if kind in ("keypoints", "landmarks")]
+        faces = {tuple(one.shape[1:3]) for one in pixels if one.ndim == 4}  # (F, N)
         for name, (found, _) in {**named, **kept}.items():
             for key, flags in ((name, found is None), (f"{name}_valid", True)):
                 if key not in moved:
