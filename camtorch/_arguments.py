@@ -71,25 +71,25 @@ def imported(module: str, needs: str, extra: str, has: str = "__name__") -> Any:
 _INSIDE = tuple(os.path.dirname(file) + os.sep for file in (__file__, torch.__file__))
 
 
-def as_real(value: Numbers, name: str, owner: str) -> Tensor:
+def as_real(value: Numbers, name: str, owner: str, device: torch.device | None = None) -> Tensor:
     """Return floating-point finite numbers: the tensor itself, or one made of an array, a list, or a list of arrays.
 
-    Lists and integers take torch's default dtype, arrays and tensors keep theirs.
+    Lists and integers take torch's default dtype, arrays and tensors keep theirs. A tensor must be on `device`, if any.
     """
     if type(value) in (list, tuple) and {float, int}.issuperset(map(type, value)):  # type: ignore[arg-type]
-        value = torch.tensor(value, dtype=torch.get_default_dtype())
+        value = torch.tensor(value, dtype=torch.get_default_dtype(), device=device)
     elif not isinstance(value, Tensor):
         _check_list(value, name, owner)
         try:
             if isinstance(value, (list, tuple)) and value and all(getattr(v, "ndim", 0) for v in value):
-                value = torch.stack([torch.as_tensor(_as_plain(v)) for v in value])
+                value = torch.stack([torch.as_tensor(_as_plain(v), device=device) for v in value])
             else:
-                value = torch.as_tensor(_as_plain(value))
+                value = torch.as_tensor(_as_plain(value), device=device)
         except (TypeError, ValueError, RuntimeError) as error:
             raise TypeError(
                 f"{owner}: {name} must be numbers (a tensor, an array or a list); got {type(value).__name__}: {error}"
             ) from None
-    _check_real(value, name, owner)
+    _check_real(value, name, owner, device)
     if not value.dtype.is_floating_point:
         value = value.to(torch.get_default_dtype())
     row = row_of(value)
@@ -148,11 +148,14 @@ def _check_list(value: object, name: str, owner: str) -> None:
         raise TypeError(f"{owner}: {name} is a list of tensors that require grad; torch.stack them")
 
 
-def _check_real(value: Tensor, name: str, owner: str) -> None:
+def _check_real(value: Tensor, name: str, owner: str, device: torch.device | None) -> None:
     if value.dtype.is_complex or value.dtype == torch.bool:
         raise TypeError(f"{owner}: {name} must be real numbers; got dtype {value.dtype}")
     if value.layout is not torch.strided:
         raise TypeError(f"{owner}: {name} must be a dense tensor; got {value.layout}, of which .to_dense() makes one")
+    if device is not None and value.device != device:
+        where = f"must be on {device}, like the other tensors; got {value.device}"
+        raise ValueError(f"{owner}: {name} {where}. .to(device) brings them together")
 
 
 def _as_plain(value: Numbers) -> Numbers:
@@ -170,9 +173,9 @@ def is_predicted(value: Tensor) -> bool:
     return value.ndim > 1 and not isinstance(value, nn.Parameter) and (in_graph(value) or not torch.is_grad_enabled())
 
 
-def as_vectors(value: Numbers, name: str, owner: str) -> Tensor:
+def as_vectors(value: Numbers, name: str, owner: str, device: torch.device | None = None) -> Tensor:
     """Return (*B, 3) finite vectors, also of OpenCV's columns (*B, 3, 1) and arrays (1, 3)."""
-    vectors = as_real(value, name, owner)
+    vectors = as_real(value, name, owner, device)
     if vectors.ndim > 1 and vectors.shape[-2:] == (3, 1):
         flat = vectors.squeeze(-1)
     elif vectors.shape == (1, 3) and not isinstance(value, (Tensor, list, tuple)):
@@ -354,9 +357,9 @@ def check_angles(angles: Tensor, owner: str) -> None:
         )
 
 
-def check_devices(owner: str, **tensors: Tensor) -> None:
+def check_devices(owner: str, /, **tensors: Tensor | None) -> None:
     """Raise a ValueError unless all are on one device."""
-    devices = {name: tensor.device for name, tensor in tensors.items()}
+    devices = {name: tensor.device for name, tensor in tensors.items() if tensor is not None}
     if len(set(devices.values())) > 1:
         where = ", ".join(f"{name} is on {device}" for name, device in devices.items())
         raise ValueError(f"{owner}: {where}; .to(device) brings them together")
@@ -396,14 +399,14 @@ def working_dtype(values: Tensor, *parameters: Tensor) -> torch.dtype:
 
 
 def as_values(values: Numbers, name: str, owner: str, device: torch.device | None = None) -> Tensor:
-    """Return a tensor of real numbers, NaN and infinity among them."""
+    """Return a tensor of real numbers, NaN and infinity among them; one that is given must be on `device`, if any."""
     if not isinstance(values, Tensor):
         _check_list(values, name, owner)
         try:
             values = torch.as_tensor(_as_plain(values), device=device)
         except (TypeError, ValueError, RuntimeError) as error:
             raise TypeError(f"{owner}: {name} must be a tensor; got {type(values).__name__}: {error}") from None
-    _check_real(values, name, owner)
+    _check_real(values, name, owner, device)
     return values
 
 
@@ -427,12 +430,7 @@ def as_points(
     values: Numbers, name: str, size: int, batch: torch.Size, parameters: Sequence[Tensor], owner: str
 ) -> tuple[Tensor, torch.Size]:
     """Return (*B, *N, size) in the dtype to compute in and with the batch dims of `batch`; and *B."""
-    device = parameters[0].device
-    values = as_values(values, name, owner, device)
-    if values.device != device:
-        raise ValueError(
-            f"{owner}: {name} must be on {device}, as {owner}; got {values.device}. .to(device) brings them together"
-        )
+    values = as_values(values, name, owner, parameters[0].device)
     takes = f"{name} must be (*B, *N, {size}) with batch dims *B = {tuple(batch)}"
     if values.ndim == 0 or values.shape[-1] != size:
         turned = values.ndim > 1 and values.shape[-2] == size

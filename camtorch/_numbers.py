@@ -18,6 +18,7 @@ from camtorch._arguments import (
     as_image_size,
     as_real,
     check_degrees,
+    check_devices,
     fails,
     is_kept,
     is_predicted,
@@ -145,7 +146,7 @@ def checked_intrinsics(model: type[Camera], intrinsics: Numbers) -> Tensor:
 def checked_distortion(model: type[Camera], distortion: Numbers, intrinsics: Tensor) -> Tensor:
     """Return distortion (*B, n) as a tensor, of a camera of this model and intrinsics; raise as `Camera` does."""
     owner = model.__name__
-    distortion = as_real(distortion, "distortion", owner)
+    distortion = as_real(distortion, "distortion", owner, intrinsics.device)
     row = row_of(distortion)
     if row is not None and len(row) == 2 and min(row) >= _SIZE_LIKE and all(map(float.is_integer, row)):
         raise ValueError(f"{owner}: distortion {row} seems to be an image size; image_size=(height, width) is one")
@@ -185,6 +186,7 @@ def replaced(
         k = changes["distortion"] = checked_distortion(model, as_numbers_of(camera, distortion, "distortion"), now)
         changes["distortion_names"] = model.names_of(k.shape[-1])
     batch = as_batch(model.__name__, intrinsics=now.shape, distortion=k.shape)
+    check_devices(model.__name__, intrinsics=now, distortion=k)
     size = changes.get("image_size", camera.image_size)
     if intrinsics is not None and size is not None:
         warn_of_order(now, size, model.__name__)
@@ -265,7 +267,7 @@ def numbers_of_matrix(
     intrinsics = torch.stack((K[..., 0, 0], K[..., 1, 1], K[..., 0, 2], K[..., 1, 2]), -1)
     if distortion is None:
         return (intrinsics,)
-    distortion = as_real(distortion, "distortion", owner)
+    distortion = as_real(distortion, "distortion", owner, K.device)
     if not model.distortion_names:
         return intrinsics, distortion  # which the constructor refuses
     if K.ndim == 2 and distortion.numel() == max(distortion.shape, default=0):
@@ -297,13 +299,14 @@ def camera_of_fov(
         raise ValueError(f"{owner}: a field of view is one of an image; give its image_size=(height, width)")
     if not isinstance(axis, str) or axis not in AXES:
         raise ValueError(f"{owner}: axis must be one of {AXES}; got {shown(axis)}")
-    fov = torch.tensor(fov, dtype=torch.float64) if isinstance(fov, (int, float)) else fov
+    device = distortion.device if isinstance(distortion, Tensor) else None
+    fov = torch.tensor(fov, dtype=torch.float64, device=device) if isinstance(fov, (int, float)) else fov
     degrees = as_real(fov, "fov", owner).detach().double()
     if fails((degrees > 0) & (degrees <= 360)):
         raise ValueError(f"{owner}: fov must be in degrees, above 0 and up to 360; got {degrees.tolist()}")
     if (known := values_of(degrees)) is not None and known.numel():
         check_degrees(float(known.min()), known.tolist(), owner)
-    given = () if distortion is None else (as_real(distortion, "distortion", owner),)
+    given = () if distortion is None else (as_real(distortion, "distortion", owner, degrees.device),)
     plane = model(degrees.new_tensor([1.0, 1.0, 0.0, 0.0]), *(t.detach().double() for t in given))
     degrees = degrees.expand(as_batch(owner, fov=(*degrees.shape, 1), distortion=plane.distortion.shape))
     focal, reached = focal_for(plane, degrees.deg2rad(), size, axis)

@@ -66,10 +66,11 @@ class Extrinsics(BatchedModule):
                 f"Extrinsics: translation is missing beside rotation, a {shown(rotation)}; "
                 "ct.Extrinsics.from_matrix(T) takes a matrix (4, 4), mrcal's rt is rt[:3], rt[3:], [0.0, 0, 0] is none"
             )
-        translation = as_vectors(translation, "translation", "Extrinsics")
+        device = rotation.device if isinstance(rotation, Tensor) else None
+        translation = as_vectors(translation, "translation", "Extrinsics", device)
         # columns (3, 3, 1) are vectors without a doubt
         undecided = as_real(rotation, "rotation", "Extrinsics").shape[-2:] == (3, 3)
-        rotation = as_vectors(rotation, "rotation", "Extrinsics")
+        rotation = as_vectors(rotation, "rotation", "Extrinsics", translation.device)
         if undecided and _are_matrices(rotation, translation):
             rotation = rotation_vector(rotation)
         check_radians(rotation, "rotation", "Extrinsics")
@@ -136,7 +137,7 @@ class Extrinsics(BatchedModule):
                 raise ValueError(f"Extrinsics: the last row of matrix must be 0 0 0 1; got {bottom.tolist()}")
             rotation, translation = matrix[..., :3, :3], matrix[..., :3, 3]
         check_rotation(rotation, "matrix", "Extrinsics")
-        return cls(rotation_vector(rotation).unsqueeze(-1), as_vectors(translation, "translation", "Extrinsics"))
+        return cls(rotation_vector(rotation).unsqueeze(-1), translation)
 
     def to_dict(self) -> dict[str, Any]:
         """Return rotation and translation as plain lists, with "dtype": "float32" unless it is float64."""

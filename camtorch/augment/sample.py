@@ -28,6 +28,7 @@ from camtorch._arguments import (
     as_number,
     check_angles,
     check_boxes,
+    check_devices,
     check_radians,
     fails,
     hinting,
@@ -587,9 +588,9 @@ class SampleTransform(nn.Module):
             if own != count:
                 raise ValueError(f"{self._name}: {name} is of {own} samples, other fields are of {count}")
         self._check_cameras(camera, count, named, batched)
-        tensors = (v for _, value in named.values() for v in (value if isinstance(value, list) else [value]))
-        first, camera = next(tensors, None), alone(as_one(camera))
-        device = torch.device("cpu") if first is None else first.device
+        held = {name: v for name, (_, value) in named.items() for v in (value if isinstance(value, list) else [value])}
+        check_devices(self._name, **held)
+        device, camera = next((v.device for v in held.values()), torch.device("cpu")), alone(as_one(camera))
         camera = camera if camera.intrinsics.device == device else camera.each(lambda t: t.to(device))
         return named, batched, count, camera
 

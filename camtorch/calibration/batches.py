@@ -21,7 +21,7 @@ def as_tensor(values: Numbers, name: str, owner: str, device: torch.device) -> T
             shapes = ", ".join(str(tuple(part.shape)) for part in parts[:8])
             raise ValueError(f"{owner}: the parts of {name} must have one shape; got {shapes}. Pad pixels with NaN")
         return torch.stack(parts)
-    return as_values(_as_plain(values), name, owner, device).to(device)
+    return as_values(_as_plain(values), name, owner, device)
 
 
 def as_vectors(values: Numbers, name: str, size: int, owner: str, device: torch.device) -> Tensor:

@@ -63,8 +63,8 @@ def fit(
     start = asked.start
     size = as_image_size(image_size, owner) or (None if start is None else start.image_size)
     kept = _fixed(asked, size, owner)
-    given_pixels = as_values(pixels, "pixels", owner).detach().double()
     given_rays = as_values(rays, "rays", owner).detach().double()
+    given_pixels = as_values(pixels, "pixels", owner, given_rays.device).detach().double()
     dims = given_pixels.ndim - 1
     form = given_pixels.shape[-1:], given_rays.shape[-1:], given_rays.shape[-1 - dims : -1]
     if dims < 1 or form != ((2,), (3,), given_pixels.shape[:-1]):
@@ -127,12 +127,12 @@ def _observations(pixels: Tensor, rays: Tensor, weights: Numbers | None, dims: i
     """Rows of unit rays; what is not finite, or of no length, has no weight."""
     shape = rays.shape[:-1]
     flat_rays = rays.reshape(math.prod(shape[:-dims]), math.prod(shape[-dims:]), 3)
-    flat_pixels = pixels.to(rays.device).expand(*shape, 2).reshape(*flat_rays.shape[:2], 2)
+    flat_pixels = pixels.expand(*shape, 2).reshape(*flat_rays.shape[:2], 2)
     lengths = torch.linalg.vector_norm(flat_rays, dim=-1, keepdim=True)
     good = torch.isfinite(flat_rays).all(-1) & torch.isfinite(flat_pixels).all(-1) & (lengths[..., 0] > 0)
     flat_weights = good.double()
     if weights is not None:
-        given = as_values(weights, "weights", owner).detach().to(rays)
+        given = as_values(weights, "weights", owner, rays.device).detach().to(rays)
         try:
             given = given.expand(shape).reshape(good.shape)
         except RuntimeError:

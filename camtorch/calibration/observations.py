@@ -224,7 +224,7 @@ def _as_array(value: Any, size: int, name: str, owner: str) -> Array:
             value = np.asarray(rows, np.float64)
         except (TypeError, ValueError) as error:
             raise type(error)(f"{owner}: {name} must be rows of {size} numbers; got {shown(value)}: {error}") from None
-    values = as_values(value, name, owner, torch.device("cpu"))
+    values = as_values(value, name, owner, value.device if isinstance(value, Tensor) else torch.device("cpu"))
     if values.is_meta:
         raise ValueError(f"{owner}: {name} is on the device meta, and has no values")
     array: Array = values.detach().double().numpy(force=True)

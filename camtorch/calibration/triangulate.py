@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from camtorch._arguments import Numbers, hinting, working_dtype
+from camtorch._arguments import Numbers, check_devices, hinting, working_dtype
 from camtorch._module import BatchedModule
 from camtorch._threads import on_one_thread
 from camtorch.calibration.batches import as_tensor, learns, root_of, rows_of
@@ -83,6 +83,7 @@ def triangulate(
         )
     if count < 2:
         raise ValueError(f"triangulate: it takes two cameras at least; got {count}")
+    check_devices("triangulate", pixels=seen_at, **{f"extrinsics[{i}]": p.rotation for i, p in enumerate(poses)})
     dtype = working_dtype(seen_at, *(t for camera in given for t in camera._tensors), *(p.rotation for p in poses))
     rows = [rows_of(camera, torch.Size()) for camera in given]
     matrices = torch.stack([pose.matrix().double() for pose in poses])

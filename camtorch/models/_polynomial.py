@@ -78,7 +78,7 @@ class FreePolynomial(Camera):
         """
         aspect_ratio = as_number(aspect_ratio, "aspect_ratio", cls.__name__)
         centre = as_real(centre, "centre", cls.__name__)
-        coefficients = as_real(coefficients, "coefficients", cls.__name__)
+        coefficients = as_real(coefficients, "coefficients", cls.__name__, centre.device)
         if centre.ndim == 0 or centre.shape[-1] != 2:
             raise ValueError(f"{cls.__name__}: centre must be (*B, 2) = cx, cy; got shape {tuple(centre.shape)}")
         if coefficients.ndim == 0 or coefficients.shape[-1] < 2:
@@ -89,7 +89,7 @@ class FreePolynomial(Camera):
                 f"{cls.__name__}: the first coefficient, of the first power, must be positive; got {first.tolist()}. "
                 "A constant before it, which is zero, is left out"
             )
-        linear = as_real(linear_cde, "linear_cde", cls.__name__)
+        linear = as_real(linear_cde, "linear_cde", cls.__name__, centre.device)
         if linear.ndim == 0 or linear.shape[-1] != 3:
             raise ValueError(f"{cls.__name__}: linear_cde must be (*B, 3) = c, d, e; got shape {tuple(linear.shape)}")
         if is_list(linear_cde):  # in the precision of what it belongs to

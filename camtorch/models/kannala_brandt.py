@@ -48,7 +48,7 @@ class KannalaBrandt(OddPolynomial):
             ValueError: no coefficients, or a first one that is not positive.
         """
         intrinsics = as_real(intrinsics, "intrinsics", cls.__name__)
-        coefficients = as_real(coefficients, "coefficients", cls.__name__)
+        coefficients = as_real(coefficients, "coefficients", cls.__name__, intrinsics.device)
         if intrinsics.ndim == 0 or intrinsics.shape[-1] != 4:
             raise ValueError(f"{cls.__name__}: intrinsics must be (*B, 4); got shape {tuple(intrinsics.shape)}")
         if coefficients.ndim == 0 or coefficients.shape[-1] == 0:

@@ -85,8 +85,9 @@ class OCamCalib(Camera):
             ValueError: another shape; ss[0] that is zero; c that is not positive.
         """
         owner = cls.__name__
-        named = ((polynomial, "polynomial"), (centre, "centre"), (affine, "affine"))
-        polynomial, centre, affine = (as_real(value, name, owner) for value, name in named)
+        polynomial = as_real(polynomial, "polynomial", owner)
+        named = (centre, "centre"), (affine, "affine")
+        centre, affine = (as_real(value, name, owner, polynomial.device) for value, name in named)
         shapes = [tuple(t.shape) for t in (polynomial, centre, affine)]
         if polynomial.ndim != 1 or len(polynomial) < 2 or shapes[1:] != [(2,), (3,)]:
             raise ValueError(f"{owner}: polynomial must be (n,), n >= 2, centre (2,), affine (3,); got shapes {shapes}")

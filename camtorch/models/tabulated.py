@@ -100,8 +100,8 @@ class Tabulated(Camera):
         """
         pixels_per_unit = as_number(pixels_per_unit, "pixels_per_unit", cls.__name__)
         centre = as_real(centre, "centre", cls.__name__)
-        angles = as_real(angles, "angles", cls.__name__)
-        radii = as_real(radii, "radii", cls.__name__)
+        angles = as_real(angles, "angles", cls.__name__, centre.device)
+        radii = as_real(radii, "radii", cls.__name__, centre.device)
         if centre.shape != (2,) or angles.ndim != 1 or angles.shape != radii.shape:
             shapes = [tuple(t.shape) for t in (centre, angles, radii)]
             raise ValueError(f"{cls.__name__}: centre must be (2,), angles and radii (N,); got shapes {shapes}")

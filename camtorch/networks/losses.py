@@ -35,7 +35,8 @@ def angles(first: Tensor, second: Tensor) -> Tensor:
         first: of any length but zero.
         second: likewise; both broadcast.
     """
-    first, second = (as_coordinates(w, name, 3, "angles") for w, name in ((first, "first"), (second, "second")))
+    first = as_coordinates(first, "first", 3, "angles")
+    second = as_coordinates(second, "second", 3, "angles", first.device)
     as_batch("angles", first=first.shape, second=second.shape)
     a, b = (w / torch.linalg.vector_norm(w, dim=-1, keepdim=True) for w in (first, second))
     # the norm has a gradient of zero at zero

@@ -49,7 +49,7 @@ def enclosed(warp: Warp, corners: Tensor) -> tuple[Tensor, Tensor]:
     plain = valid & mapped.all(-1) & (_area(corners) * _area(moved) > 0)
     if isinstance(warp.target, PANORAMAS) or not holds(plain):
         lattice, inside = _inside(warp, corners, moved)
-        inside = inside & finite
+        inside = inside & finite & (isinstance(warp.target, PANORAMAS) | ~plain.unsqueeze(-1))  # each row by itself
         some, valid = some | inside.any(-1), valid | inside.any(-1)
         inside = inside.unsqueeze(-1)
         low = torch.minimum(low, torch.where(inside, lattice, torch.inf).amin(-2))

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 from typing_extensions import Unpack
 
-from camtorch._arguments import as_fov, as_image_size, broadcast_shapes, hinting
+from camtorch._arguments import as_fov, as_image_size, broadcast_shapes, check_devices, hinting
 from camtorch.camera import Camera
 from camtorch.models import UCM, Cylindrical, Equirectangular, Pinhole
 from camtorch.projection.rays import around_ends, image_lattice
@@ -86,6 +86,7 @@ class Dewarp(Warp):
         own = as_sized(camera, "camera", "Dewarp")._size_for("Dewarp")
         size = as_image_size(image_size, "Dewarp") or own
         rotation = as_rotation(rotation, "Dewarp")
+        check_devices("Dewarp", camera=camera.intrinsics, rotation=rotation)
         model = _PROJECTIONS[projection][0]
         with torch.no_grad():
             if fov is not None:

@@ -57,7 +57,8 @@ class PlaneWarp(ProxyWarp):
     ):
         super().__init__(source, target, extrinsics, **options)
         owner = type(self).__name__
-        normal, distance = as_real(normal, "normal", owner), as_real(distance, "distance", owner)
+        device = source.intrinsics.device
+        normal, distance = as_real(normal, "normal", owner, device), as_real(distance, "distance", owner, device)
         if normal.ndim not in (1, 2) or normal.shape[-1] != 3 or distance.ndim > 1:
             raise ValueError(
                 f"{owner}: normal must be (3,) or (B, 3) and distance a number or (B,); got {tuple(normal.shape)} and "

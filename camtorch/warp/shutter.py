@@ -20,6 +20,7 @@ from camtorch._arguments import (
     as_real,
     as_vectors,
     broadcast_shapes,
+    check_devices,
     fails,
     shown,
     values_of,
@@ -74,7 +75,8 @@ class RollingShutter(GeometryModule):
     def __init__(self, readout: Numbers, rates: Numbers, *, direction: Direction = "down"):
         super().__init__()
         owner = "RollingShutter"
-        rates, readout = as_vectors(rates, "rates", owner), as_real(readout, "readout", owner)
+        rates = as_vectors(rates, "rates", owner, readout.device if isinstance(readout, Tensor) else None)
+        readout = as_real(readout, "readout", owner, rates.device)
         if not isinstance(direction, str) or direction not in DIRECTIONS:
             raise ValueError(f"{owner}: direction must be one of {DIRECTIONS}; got {shown(direction)}")
         if readout.ndim > 1:
@@ -218,6 +220,7 @@ class ShutterWarp(MirrorWarp):
                 raise TypeError(f"ShutterWarp: {name} must be a RollingShutter; got {type(each).__name__}. {hint}")
             shapes |= {} if each is None else {name: (*each.batch_shape, 1)}
             setattr(self, name, each)
+        check_devices("ShutterWarp", source=source.intrinsics, **{n: s.rates for n, s in shutters.items() if s})
         self.batch_shape: torch.Size = as_batch("ShutterWarp", **shapes)
         self.turned_by(rotation)
 

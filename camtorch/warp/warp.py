@@ -384,8 +384,7 @@ def _check_parts(source: Camera, target: Camera, rotation: Tensor | None) -> tor
     """How many of each a warp is between; raises what is wrong with that, and with them."""
     as_sized(source, "source", "Warp")
     as_sized(target, "target", "Warp")
-    if source.intrinsics.device != target.intrinsics.device:
-        check_devices("Warp", source=source.intrinsics, target=target.intrinsics)
+    check_devices("Warp", source=source.intrinsics, target=target.intrinsics, rotation=rotation)
     shapes = [tuple(source.batch_shape), tuple(target.batch_shape)]
     shapes += [] if rotation is None else [tuple(rotation.shape[:-2])]
     try:

@@ -21,7 +21,7 @@ WARP = ct.Warp(CAMERA, BATCH[0])
 MOUNT = ct.augment.RandomMount(camera=CAMERA)
 PAIR = ct.rectify(BATCH[0], BATCH[0], POSE, fov=57.3, image_size=SIZE)
 PIXELS, RAYS = CAMERA.pixel_grid(), CAMERA.rays()[0]
-IMAGES, META = torch.zeros(2, 3, *SIZE), torch.zeros(5, 3, device="meta")
+IMAGES = torch.zeros(2, 3, *SIZE)
 LEAF, EYE, HOLED = torch.ones((), requires_grad=True), np.eye(3), np.where(np.arange(160) == 7, math.nan, 0.0)
 DEEP, THREE = ct.Reproject(CAMERA, CAMERA, POSE), ct.RollingShutter(0.03, torch.zeros(3, 3))
 NORMAL = [0.1, 0.3, 1.0]
@@ -59,12 +59,9 @@ WRONG = [
     (lambda: ct.Pinhole([LEAF] * 4), TypeError, r"Pinhole: intrinsics is a list of tensors that require grad"),
     (lambda: CAMERA.project([LEAF] * 3), TypeError, r"points is a list of tensors that require grad; torch.stack"),
     (lambda: CAMERA.project(torch.ones(5, 3).to_sparse()), TypeError, r"points must be a dense tensor; got"),
-    (lambda: CAMERA.project(META), ValueError, r"points must be on cpu, as KannalaBrandt; got meta"),
     (lambda: CAMERA.project(np.ones((3, 7))), ValueError, r"shape \(3, 7\)\. One in each column, they .* points\.T"),
     (lambda: ct.Warp(np.eye(3), CAMERA), TypeError, r"got ndarray \(3, 3\); ct\.BrownConrady\.from_matrix\(K, "),
     (lambda: CAMERA.contains(torch.ones(3)), ValueError, r"pixels must be \(..., 2\); got shape \(3,\)"),
-    (lambda: WARP(IMAGES.to("meta")), ValueError, r"Warp: images is on meta, source is on cpu; .to\(device\)"),
-    (lambda: ct.Warp(CAMERA, BATCH[0].to("meta")), ValueError, r"source is on cpu, target is on meta"),
     (lambda: WARP.strips(IMAGES, rows=2.5), TypeError, r"Warp: rows must be a whole number; got 2.5"),
     (lambda: POSE.compose(np.eye(4)), TypeError, r"Extrinsics: compose takes Extrinsics; got ndarray"),
     (lambda: augment.from_pitch_yaw("up"), TypeError, r"from_pitch_yaw: angles must be a tensor; got str"),

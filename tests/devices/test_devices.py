@@ -1,0 +1,62 @@
+"""Devices: results on a pretended one are those of the CPU, a mix is refused, and no name is forgotten."""
+
+import copy
+
+import pytest
+import torch
+from pretended import try_cases
+from table import BROWN, CASES, DEPTH, FISHEYE, IMAGES, PIXELS, POINTS, POSE, SHUTTER
+
+import camtorch as ct
+from camtorch import augment, losses, views
+
+OTHERS = {
+    *("calibrate", "calibrate_rig", "find_board", "load", "load_map", "save", "save_map", "write_viewer", "LookupMap"),
+    *("CameraFileError", "FisheyeRadTanThinPrism", "augment.Augmentation", "augment.Change", "augment.Edit"),
+    *("augment.Preset", "augment.Range", "augment.face_points", "views.Views"),
+}
+"""Names that compute on the host, of files and boards; other names of what is in the table, and its bases and parts."""
+
+
+def test_every_public_name_is_in_the_table():
+    modules = {"": ct, "augment.": augment, "losses.": losses, "views.": views}
+    public = {prefix + name for prefix, module in modules.items() for name in module.__all__}
+    found = {name for name in public if callable(eval(name, vars(ct)))}
+    assert found - {name.partition(" ")[0] for name in CASES} == OTHERS
+
+
+def test_results_are_those_of_the_cpu_and_costs_do_not_grow():
+    failed, table = try_cases("table")
+    print(table)
+    assert not failed, table
+
+
+K = FISHEYE.distortion.detach()
+MIXED = {
+    "distortion": lambda to: ct.KannalaBrandt(to(FISHEYE).intrinsics.detach(), K),
+    "replace": lambda to: to(FISHEYE).replace(distortion=K),
+    "cat": lambda to: ct.cat([to(FISHEYE), FISHEYE]),
+    "Mixed": lambda to: ct.Mixed([to(FISHEYE), BROWN]),
+    "project": lambda to: to(FISHEYE).project(POINTS),
+    "backproject": lambda to: FISHEYE.backproject(to(DEPTH)),
+    "translation": lambda to: ct.Extrinsics(to(torch.zeros(3)), torch.zeros(3)),
+    "compose": lambda to: to(POSE).compose(POSE),
+    "Warp": lambda to: ct.Warp(to(FISHEYE), BROWN),
+    "rotation": lambda to: ct.Dewarp(to(FISHEYE), rotation=torch.eye(3)),
+    "images": lambda to: ct.Dewarp(to(FISHEYE))(IMAGES),
+    "depth": lambda to: ct.Reproject(to(FISHEYE), to(BROWN), to(POSE))(to(IMAGES), DEPTH),
+    "normal": lambda to: ct.PlaneWarp(to(BROWN), to(BROWN), to(POSE), torch.ones(3), 2.0),
+    "shutter": lambda to: ct.ShutterWarp(to(FISHEYE), to(BROWN), shutter=SHUTTER),
+    "rectify": lambda to: ct.rectify(to(BROWN), to(BROWN), POSE),
+    "triangulate": lambda to: ct.triangulate([to(FISHEYE)] * 2, [to(POSE), POSE], to(PIXELS)),
+    "solve_pnp": lambda to: ct.solve_pnp(to(FISHEYE), POINTS, to(PIXELS)),
+    "fit": lambda to: ct.fit("kannala_brandt", to(PIXELS), POINTS),
+    "angles": lambda to: losses.angles(to(POINTS), POINTS),
+    "a sample": lambda to: augment.HorizontalFlip()(image=to(IMAGES), keypoints=PIXELS),
+}
+
+
+@pytest.mark.parametrize("call", MIXED.values(), ids=MIXED)
+def test_a_mix_of_devices_is_refused(call):
+    with pytest.raises(ValueError, match=r"(meta.*cpu|cpu.*meta).*\.to\(device\) brings them together"):
+        call(lambda value: copy.deepcopy(value).to("meta"))
