@@ -161,8 +161,7 @@ def _chosen(trials: list[Trial], fitted: list[Trial]) -> Selection:
     named = f"{best.model} with {best.count} coefficients" if best.count else best.model
     error = f"{best.held_out:.4g} px on views that it was not fitted to"
     if best is least:
-        why = f"{named}: {error}, the smallest error"
-    else:
-        part = 100 * (1 - least.held_out / best.held_out)
-        why = f"{named}: {error}; {least.model} with {least.count} has {part:.1f} % less, which is no more than chance"
+        return Selection(trials, best, f"{named}: {error}, the smallest error")
+    part = 100 * (1 - least.held_out / best.held_out)
+    why = f"{named}: {error}; {least.model} with {least.count} has {part:.1f} % less, which is no more than chance"
     return Selection(trials, best, why)

@@ -47,7 +47,7 @@ def run(arguments: argparse.Namespace) -> None:
             "Another --model, or --loss huber where some corners are wrong, may help"
         )
     names = list(views) if isinstance(result, RigCalibration) else [of_view[""].path.name for of_view in views.values()]
-    print(_with_options(_named(repr(result), names)))
+    print(_in_words_of_the_command(repr(result), names))
     if arguments.bend:
         across, down = (f"{bend:.3g}" for bend in result.bend)
         print(f"board: its middle lies {across} off its left and right, {down} off its top and bottom")
@@ -149,13 +149,9 @@ def _calibrated(
     return calibrate_rig(models, points, pixels, image_sizes=sizes, count=counts, bend=arguments.bend, **options)
 
 
-def _named(text: str, names: Sequence[str]) -> str:
-    """Return a text in which the views that it numbers have their names."""
+def _in_words_of_the_command(text: str, names: Sequence[str]) -> str:
+    """Return a text with names of views for their numbers, and options for arguments of `ct.calibrate`."""
     numbered = r"\b([Vv]iews? )(\d+(?:, \d+)*)"
-    return re.sub(numbered, lambda m: m[1] + re.sub(r"\d+", lambda n: names[int(n[0])], m[2]), text)
-
-
-def _with_options(text: str) -> str:
-    """Return a text in which arguments of `ct.calibrate` are the options of the command."""
+    text = re.sub(numbered, lambda m: m[1] + re.sub(r"\d+", lambda n: names[int(n[0])], m[2]), text)
     text = re.sub(r'fixed=\("(.*?)",?\)', lambda m: f"--fixed {m[1].replace(chr(34), '').replace(' ', '')}", text)
     return re.sub(r"count=(\d+)", r"--count \1", text.replace("bend=True", "--bend"))

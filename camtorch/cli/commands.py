@@ -24,11 +24,6 @@ def add_all(commands: Commands) -> None:
         add(commands)
 
 
-def uses_processes(arguments: argparse.Namespace) -> bool:
-    """Whether a command may be one on many files, for which processes are started early."""
-    return arguments.command == "dewarp" and arguments.jobs != 1 and are_several(arguments.image)
-
-
 def are_several(names: list[str]) -> bool:
     """Whether names mean more than one file."""
     is_pattern = glob.has_magic(names[0]) and not os.path.lexists(names[0])

@@ -45,9 +45,9 @@ class Dewarping:
         rows, columns = image.shape[-2:]
         warp, facts = self._warp(source, (rows, columns))
         with torch.no_grad():
-            result = warp(image[None])[0]
+            result = warp(image[None])[0].permute(1, 2, 0).contiguous()
         del image  # of hundreds of megabytes, perhaps
-        images.write(target, images.from_tensor(result), orientation=orientation, synced=False)
+        images.write(target, result.numpy(), orientation=orientation, synced=False)
         return facts
 
     def warp_of(self, camera: Camera) -> Dewarp:

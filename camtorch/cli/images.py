@@ -1,12 +1,12 @@
-"""Image files written from tensors, by Pillow."""
+"""Image files written from arrays, by Pillow."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import Any
 
+from numpy.typing import NDArray
 from PIL import Image
-from torch import Tensor
 
 from camtorch._arguments import warn
 from camtorch._photographs import ORIENTATION, ImageFileError
@@ -25,20 +25,15 @@ def check_kind(path: Path, *, is_video: bool = False) -> None:
         raise ImageFileError(f"{path}: {what}: no {kind} is written as that; try {', '.join(known)}")
 
 
-def from_tensor(image: Tensor) -> Image.Image:
-    """Return a Pillow image of (C, H, W) uint8 or (1, H, W) uint16."""
-    pixels = image.permute(1, 2, 0).contiguous().numpy()
-    return Image.fromarray(pixels[..., 0] if pixels.shape[-1] == 1 else pixels)
-
-
-def write(path: Path, image: Image.Image, *, orientation: int | None = None, synced: bool = True) -> None:
-    """Write a Pillow image, whole or not at all, and the folders that lack; `synced` as of `replacing`.
+def write(path: Path, pixels: NDArray[Any], *, orientation: int | None = None, synced: bool = True) -> None:
+    """Write (H, W, C) uint8 or (H, W, 1) uint16, whole or not at all, with missing folders; `synced` as of `replacing`.
 
     It warns if the file type does not hold the Exif orientation of the original.
 
     Raises:
         ImageFileError: If the file type does not take such pixels, or the disk does not take the file.
     """
+    image = Image.fromarray(pixels[..., 0] if pixels.shape[-1] == 1 else pixels)
     kind = Image.registered_extensions()[path.suffix.lower()]
     options: dict[str, Any] = {"quality": 95}
     if orientation is not None:

@@ -57,7 +57,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         arguments = make_parser().parse_args(argv)
         module = f"camtorch.cli.{arguments.command}"
-        if commands.uses_processes(arguments):
+        if arguments.command == "dewarp" and arguments.jobs != 1 and commands.are_several(arguments.image):
             processes.prepare(module)  # they import what they need while this one does
         command = importlib.import_module(module)
         with warnings.catch_warnings(record=True) as caught:

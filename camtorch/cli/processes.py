@@ -61,7 +61,7 @@ def each(work: Work, pairs: Sequence[Pair], count: int, done: Callable[[], objec
     if count == 1:
         outcomes = []
         for pair in pairs:
-            outcomes.append(_attempt(work, pair))
+            outcomes.append(_attempt(pair, work))
             done()
         return outcomes
     others = multiprocessing.active_children()
@@ -69,7 +69,7 @@ def each(work: Work, pairs: Sequence[Pair], count: int, done: Callable[[], objec
     begin = (pickle.dumps(work),)
     executor = ProcessPoolExecutor(count, multiprocessing.get_context(_HOW), _begin, begin)
     try:
-        futures = [executor.submit(_attempt_here, pair) for pair in pairs]
+        futures = [executor.submit(_attempt, pair) for pair in pairs]
         for _ in as_completed(futures):
             done()
         return [future.result() for future in futures]
@@ -102,15 +102,12 @@ def _end_with_parent() -> None:
     os._exit(1)
 
 
-def _attempt_here(pair: Pair) -> Outcome:
-    return _attempt(_work, pair)
-
-
-def _attempt(work: Work, pair: Pair) -> Outcome:
+def _attempt(pair: Pair, work: Work | None = None) -> Outcome:
+    """Make a file, by default by the work of this process."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", UserWarning)
         try:
-            facts = work(*pair)
+            facts = (work or _work)(*pair)
         except Exception as error:
             return Outcome(failure=reason(error))
     return Outcome(facts, notes=list(dict.fromkeys(str(warning.message) for warning in caught)))

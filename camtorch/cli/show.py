@@ -6,7 +6,6 @@ import argparse
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
 
 from camtorch.analysis.difference import difference
 from camtorch.analysis.summary import summarise
@@ -69,4 +68,4 @@ def _draw(path: Path, camera: Camera, other: Camera | None, title: str) -> None:
 
     canvas = FigureCanvasAgg(plot.portrait(camera, other, title=title))
     canvas.draw()
-    images.write(path, Image.fromarray(np.array(canvas.buffer_rgba())[..., :3]))
+    images.write(path, np.array(canvas.buffer_rgba())[..., :3])

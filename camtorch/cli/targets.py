@@ -115,7 +115,7 @@ def to_make(pairs: Sequence[Pair], others: Iterable[Path], *, resume: bool, forc
             raise ValueError(f"{target}: would overwrite {read[place]}, which is read; name another folder")
         written[place] = source
     if resume:
-        return [pair for pair in pairs if not (pair[1].is_file() and pair[1].stat().st_size)]
+        return [(source, target) for source, target in pairs if not (target.is_file() and target.stat().st_size)]
     there = [target for _, target in pairs if os.path.lexists(target)]
     if there and not force:
         more = f", and {len(there) - 1} more of {len(pairs)}" if len(there) > 1 else ""

@@ -159,12 +159,8 @@ def _compiler(named: str | None) -> list[str]:
     raise BuildError(f"no C compiler: none of {', '.join(names)} is on the PATH, and CC names none")
 
 
-def _main() -> None:
+if __name__ == "__main__":
     try:
         print(build())
     except (BuildError, OSError) as error:
         sys.exit(f"camtorch.native.build: {error}")
-
-
-if __name__ == "__main__":
-    _main()

@@ -165,9 +165,8 @@ def difference(a: Camera, b: Camera, ax: Axes | None = None, *, remove_rotation:
     ax.set_facecolor(NO_RAYS)
     image = ax.imshow(values, extent=edges, cmap="magma_r", interpolation="nearest")
     _bar(ax, image, compared.apart[compared.both])
-    turned = ""
-    if remove_rotation:
-        turned = f", turned by {math.degrees(differences.angle(compared.rotation)):.3g} degrees"
+    degrees = math.degrees(differences.angle(compared.rotation))
+    turned = f", turned by {degrees:.3g} degrees" if remove_rotation else ""
     ax.set_title(f"{a.key} and {b.key}: {compared}{turned}")
     return ax
 

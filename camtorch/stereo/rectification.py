@@ -368,13 +368,11 @@ def _extent(views: list[tuple[Camera, Tensor]], projection: str, vertical: bool)
     like, (models, reach) = views[0][1], _KINDS[projection]
     plane = models[vertical](like.new_tensor([1.0, 1.0, 0.0, 0.0]))
     limit = torch.tensor(reach[::-1] if vertical else reach).to(like)
-    lows: list[Tensor] = []
-    highs: list[Tensor] = []
-    for camera, rotation in views:  # what the middle row and column of the image show
-        lines = middle_lines(camera, rotation, plane, limit, _LINE)
-        for ends, none in ((lows, torch.inf), (highs, -torch.inf)):
-            of_lines = [torch.where(valid, p[..., i], none) for i, (p, valid) in enumerate(lines)]
-            ends.append(torch.stack([t.amin(-1) if none > 0 else t.amax(-1) for t in of_lines], -1))
+    lows, highs = list[Tensor](), list[Tensor]()
+    for view in views:  # what the middle row and column of the image show
+        lines = [(p[..., i], valid) for i, (p, valid) in enumerate(middle_lines(*view, plane, limit, _LINE))]
+        lows.append(torch.stack([torch.where(valid, p, torch.inf).amin(-1) for p, valid in lines], -1))
+        highs.append(torch.stack([torch.where(valid, p, -torch.inf).amax(-1) for p, valid in lines], -1))
     is_across = torch.tensor([vertical, not vertical], device=limit.device)
     low = torch.where(is_across, torch.maximum(*lows), torch.minimum(*lows))
     high = torch.where(is_across, torch.minimum(*highs), torch.maximum(*highs))
