@@ -65,14 +65,18 @@ def edited(camera: CameraT, matrix: Tensor | Sequence[Sequence[float]], image_si
     xp: Any = np if are_numbers(own, camera.distortion, *given) else torch
     rows: Any = matrix
     if isinstance(matrix, Tensor):
-        maps: Any = matrix.detach().double().numpy() if xp is np else precise(matrix)
+        maps: Any = matrix.detach().double().numpy() if xp is np else precise(matrix.to(own.device))
         rows = [[maps[..., i, j] for j in range(3)] for i in range(2)]
     (a, b, left), (c, d, top) = rows
     fx, fy, cx, cy = split(own, xp)
     focal = abs(a) * fx + abs(b) * fy, abs(c) * fx + abs(d) * fy
     centre = a * cx + b * cy + left, c * cx + d * cy + top
     turned = b != 0
-    turns = np.any(turned) if not isinstance(turned, Tensor) else not is_concrete(turned) or bool(turned.any())
+    # asked of the matrix where it was drawn, so that no device is waited for
+    if isinstance(matrix, Tensor) and xp is torch:
+        turns = not is_concrete(matrix) or bool((matrix[..., 0, 1] != 0).any())
+    else:
+        turns = bool(np.any(turned))
     distortion = _edited_distortion(camera, a - b, c + d, turned if turns else None)
     return remade(camera, intrinsics=joined((*focal, *centre), own, xp), distortion=distortion, image_size=image_size)
 

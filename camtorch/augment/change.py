@@ -166,9 +166,9 @@ def _joined(a: Part, b: Part) -> Part:
             return replace(b, rows=a.rows, camera=a.camera, moves=replace(b.moves, rotation=rotation, start=start))
         moved = b.by(lambda warp: MirrorWarp(a.camera, warp.target, rotation))
         return replace(moved, rows=a.rows, camera=a.camera)
-    edit, size = b.moves.matrix, b.moves.target.image_size
+    edit, size = b.moves.map, b.moves.target.image_size
     if isinstance(a.moves, AffineWarp):
-        matrix = after(edit, a.moves.matrix)
+        matrix = after(edit, a.moves.map)
         return replace(a, moves=AffineWarp(a.camera, edited(a.camera, matrix, size), matrix, rotation))
     light = None if a.light is None else b.moves(a.light, padding_mode="border")
     moved = a.by(lambda warp: MirrorWarp(a.camera, edited(warp.target, edit, size), rotation))

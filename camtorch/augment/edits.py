@@ -17,7 +17,7 @@ from camtorch.augment.augmentation import Augmentation, EditOptions, FlipOptions
 from camtorch.augment.change import Change, Part, by_kinds
 from camtorch.augment.landmarks import Mirroring, TableLike
 from camtorch.camera import Camera
-from camtorch.warp.affine import AffineWarp, after, on_rays
+from camtorch.warp.affine import AffineWarp, Map, Rows, after, as_tensor, on_rays
 
 Size = int | Sequence[int]
 
@@ -49,7 +49,7 @@ class Edit(Augmentation):
     # -- what a subclass writes
 
     @abstractmethod
-    def edit(self, size: tuple[int, int], values: Mapping[str, Tensor]) -> tuple[Tensor, tuple[int, int]]:
+    def edit(self, size: tuple[int, int], values: Mapping[str, Tensor]) -> tuple[Map, tuple[int, int]]:
         """The map of pixels, and the new size.
 
         Args:
@@ -57,8 +57,8 @@ class Edit(Augmentation):
             values: what was drawn, (*B,) or (*B, n) in float64, as of `Augmentation.new_camera`.
 
         Returns:
-            (*B, 2, 3) or (2, 3) in float64, from pixels (u, v, 1) to those of the new image, along its axes, and
-            (height, width).
+            (*B, 2, 3) or (2, 3) in float64, from pixels (u, v, 1) to those of the new image, along its axes, or rows
+            of plain numbers, which compiled code sees; and (height, width).
         """
 
     def size_after(self, size: tuple[int, int]) -> tuple[int, int]:
@@ -73,7 +73,7 @@ class Edit(Augmentation):
     def _change(self, camera: Camera, draw: Mapping[str, Any]) -> Change:
         return change_by([(self, draw)], camera, {**self.options, "antialias": self.antialias})
 
-    def map_of(self, draw: Mapping[str, Any], size: tuple[int, int]) -> tuple[Tensor | None, tuple[int, int]]:
+    def map_of(self, draw: Mapping[str, Any], size: tuple[int, int]) -> tuple[Map | None, tuple[int, int]]:
         """What a draw does to images of a size: `edit`, where it applies; None where it never does."""
         applied = torch.as_tensor(draw["apply"])
         given = {name: value for name, value in draw.items() if name != "apply"}
@@ -89,6 +89,7 @@ class Edit(Augmentation):
             return matrix, new
         if holds(~applied):
             return None, new
+        matrix = as_tensor(matrix)
         still = matrix.new_tensor([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
         return torch.where(applied[:, None, None].to(matrix.device), matrix, still), new
 
@@ -101,7 +102,8 @@ def change_by(edits: Sequence[tuple[Edit, Mapping[str, Any]]], camera: Camera, o
     """What edits and their draws, one after the other, do to images of `camera`, by warps of these options."""
 
     def part(rows: list[int] | None, source: Camera) -> Part:
-        matrix, size = None, (source.height, source.width)
+        matrix: Map | None = None
+        size = (source.height, source.width)
         for edit, draw in edits:
             here = draw if rows is None else {name: value[rows] for name, value in draw.items()}
             one, size = edit.map_of(here, size)
@@ -109,25 +111,27 @@ def change_by(edits: Sequence[tuple[Edit, Mapping[str, Any]]], camera: Camera, o
                 matrix = one if matrix is None else after(one, matrix)
         if matrix is None:
             return Part(rows, None, source)
-        if matrix.ndim == 3 and not source.batch_shape and holds(matrix == matrix[:1]):
+        if isinstance(matrix, Tensor) and matrix.ndim == 3 and not source.batch_shape and holds(matrix == matrix[:1]):
             matrix = matrix[0]  # one map serves the whole batch
-        matrix = matrix.to(source.intrinsics.device)
         warp = AffineWarp(source, edited(source, matrix, size), matrix, _turn(matrix, source), **options)
         return Part(rows, warp, source)
 
     return by_kinds(len(edits[0][1]["apply"]), camera, part)
 
 
-def _turn(matrix: Tensor, source: Camera) -> Tensor | None:
+def _turn(matrix: Map, source: Camera) -> Tensor | None:
     """(*B, 3, 3): what an edit does to rays; None: nothing."""
-    if holds(matrix[..., :2].diagonal(dim1=-2, dim2=-1) > 0):
+    if not isinstance(matrix, Tensor) and matrix[0][0] > 0 and matrix[1][1] > 0:
         return None
-    return on_rays(matrix).to(torch.promote_types(source.intrinsics.dtype, torch.float32))
+    own, like = as_tensor(matrix), source.intrinsics
+    if holds(own[..., :2].diagonal(dim1=-2, dim2=-1) > 0):
+        return None
+    return on_rays(own).to(like.device, torch.promote_types(like.dtype, torch.float32))
 
 
-def _map(across: float, left: float, down: float, top: float) -> Tensor:
+def _map(across: float, left: float, down: float, top: float) -> Rows:
     """(2, 3): (across u + left, down v + top)."""
-    return torch.tensor([[across, 0.0, left], [0.0, down, top]], dtype=torch.float64)
+    return (across, 0.0, float(left)), (0.0, down, float(top))
 
 
 def _box_to(size: tuple[int, int], corner: Tensor, sides: Tensor) -> Tensor:
@@ -175,7 +179,7 @@ class RandomResizedCrop(_Sized):
         }
         super().__init__(size, ranges, **options)
 
-    def edit(self, size: tuple[int, int], values: Mapping[str, Tensor]) -> tuple[Tensor, tuple[int, int]]:
+    def edit(self, size: tuple[int, int], values: Mapping[str, Tensor]) -> tuple[Map, tuple[int, int]]:
         rows, cols = size
         ratio = values["ratio"].exp()
         width = (values["scale"] * rows * cols * ratio).sqrt()
@@ -196,7 +200,7 @@ class RandomCrop(_Sized):
     def __init__(self, size: Size, **options: Unpack[EditOptions]):
         super().__init__(size, {"place": Range(0, 1, 2)}, **options)
 
-    def edit(self, size: tuple[int, int], values: Mapping[str, Tensor]) -> tuple[Tensor, tuple[int, int]]:
+    def edit(self, size: tuple[int, int], values: Mapping[str, Tensor]) -> tuple[Map, tuple[int, int]]:
         (height, width), new = size, self.image_size
         if new[0] > height or new[1] > width:
             raise ValueError(f"{self._name}: the box {new} must lie within the image, which is {size}; Pad enlarges it")
@@ -215,7 +219,7 @@ class CenterCrop(_Sized):
     def __init__(self, size: Size, **options: Unpack[EditOptions]):
         super().__init__(size, **options)
 
-    def edit(self, size: tuple[int, int], values: Mapping[str, Tensor]) -> tuple[Tensor, tuple[int, int]]:
+    def edit(self, size: tuple[int, int], values: Mapping[str, Tensor]) -> tuple[Map, tuple[int, int]]:
         top, left = ((before - now) // 2 for before, now in zip(size, self.image_size, strict=True))
         return _map(1.0, -left, 1.0, -top), self.image_size
 
@@ -238,7 +242,7 @@ class Resize(Edit):
         if self.shorter is not None and self.shorter < 1:
             raise ValueError(f"{self._name}: size must be positive; got {size!r}")
 
-    def edit(self, size: tuple[int, int], values: Mapping[str, Tensor]) -> tuple[Tensor, tuple[int, int]]:
+    def edit(self, size: tuple[int, int], values: Mapping[str, Tensor]) -> tuple[Map, tuple[int, int]]:
         height, width = size
         if self.image_size is None and self.shorter is not None:
             height, width = (max(int(self.shorter * side / min(size)), 1) for side in size)
@@ -274,7 +278,7 @@ class Pad(Edit):
                 )
             self.padding = sides * (4 // len(sides))
 
-    def edit(self, size: tuple[int, int], values: Mapping[str, Tensor]) -> tuple[Tensor, tuple[int, int]]:
+    def edit(self, size: tuple[int, int], values: Mapping[str, Tensor]) -> tuple[Map, tuple[int, int]]:
         if self.least is not None:
             new = max(self.least[0], size[0]), max(self.least[1], size[1])
             top, left = ((now - before) // 2 for before, now in zip(size, new, strict=True))
@@ -314,7 +318,7 @@ class Rotate90(Edit):
     def size_after(self, size: tuple[int, int]) -> tuple[int, int]:
         return size[::-1] if self.times[0] % 2 else size
 
-    def edit(self, size: tuple[int, int], values: Mapping[str, Tensor]) -> tuple[Tensor, tuple[int, int]]:
+    def edit(self, size: tuple[int, int], values: Mapping[str, Tensor]) -> tuple[Map, tuple[int, int]]:
         (low, high, step), (height, width) = self.times, size
         count = (high - low) // step + 1
         turns = (low + step * (values["times"] * count).floor().clamp(max=count - 1)).long() % 4
@@ -363,7 +367,7 @@ class HorizontalFlip(_Flip):
         options: see `Edit`.
     """
 
-    def edit(self, size: tuple[int, int], values: Mapping[str, Tensor]) -> tuple[Tensor, tuple[int, int]]:
+    def edit(self, size: tuple[int, int], values: Mapping[str, Tensor]) -> tuple[Map, tuple[int, int]]:
         return _map(-1.0, size[1] - 1, 1.0, 0.0), size
 
 
@@ -373,7 +377,7 @@ class VerticalFlip(_Flip):
     Args are those of `HorizontalFlip`.
     """
 
-    def edit(self, size: tuple[int, int], values: Mapping[str, Tensor]) -> tuple[Tensor, tuple[int, int]]:
+    def edit(self, size: tuple[int, int], values: Mapping[str, Tensor]) -> tuple[Map, tuple[int, int]]:
         return _map(1.0, 0.0, -1.0, size[0] - 1), size
 
 

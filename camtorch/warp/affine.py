@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from functools import cached_property
-from typing import Any
+import ast
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
@@ -11,13 +13,15 @@ from torch import Tensor
 
 from camtorch._arguments import Numbers, as_values, broadcast_shapes
 from camtorch._dtypes import SIGNED, as_pixels, narrow, widen
-from camtorch._tracing import in_transform, is_concrete, may_look
+from camtorch._opaque import opaque
+from camtorch._tracing import in_transform, is_concrete, keeps_graph
 from camtorch.camera import Camera
-from camtorch.native import sampler
-from camtorch.warp.grid import Lattice, Sampling, straight_lattice
+from camtorch.native.sampler import empty
+from camtorch.warp import compiled
+from camtorch.warp.grid import STEP, Lattice, Sampling, coarse, straight_lattice
 from camtorch.warp.panorama import lengths
-from camtorch.warp.routes import lengthened, positions, route_of
-from camtorch.warp.sampling import SHRINKS, SURELY, Mode, PaddingMode, Sampler, render
+from camtorch.warp.routes import Route, lengthened, positions, route_of, warped
+from camtorch.warp.sampling import SHRINKS, PaddingMode, Sampler, render
 from camtorch.warp.warp import Warp, checked
 
 _MOST = 8  # times that an image is halved
@@ -26,11 +30,28 @@ _WHOLE = 1e-9  # pixels by which the numbers of a map may miss whole ones
 _NEARLY = 1e-6  # and those of the way back
 
 
+Rows = tuple[tuple[float, float, float], tuple[float, float, float]]
+Map = Tensor | Rows
+"""(*B, 2, 3) in float64, from pixels (u, v, 1) to others; one for all that is known while code is traced as numbers."""
+
+
+class Way(NamedTuple):
+    """How an image is made: copied, or resized by torch, or, without a move and a box, halved and sampled."""
+
+    padding_mode: PaddingMode
+    halvings: int = 0
+    move: tuple[int, ...] = ()  # of pixels by whole numbers, a map
+    box: tuple[int, ...] = ()  # of whole pixels: left, top, right, bottom
+    flips: tuple[int, ...] = ()  # dims
+
+
 class MirrorWarp(Warp):
     """A `Warp` whose rotation, not checked, may be a mirror as well: `ray_target = Q ray_source`, Q orthogonal.
 
     With antialias=None images that shrink by more than one and a half are halved before, which takes less time.
     """
+
+    map: Map | None = None
 
     def __init__(
         self, source: Camera, target: Camera, rotation: Tensor | None, *, antialias: bool | None = False, **options: Any
@@ -41,47 +62,72 @@ class MirrorWarp(Warp):
         self._halvings: list[int] | None = None
 
     def forward(self, images: Tensor, **how: Any) -> Tensor:
-        """Warped images, as of `Warp.forward`; smaller ones of them where they shrink."""
-        plain = not (torch.compiler.is_compiling() or in_transform()) and is_concrete(self.target.intrinsics)
-        if self._decides and plain and (self._halvings is None or any(self._halvings)):
-            sampler = checked(self, images, **how)
-            smooth = sampler.mode != "nearest" and images.dtype != torch.bool
-            if smooth and route_of(self, images) == "kept":
-                where = positions(self, "kept", sampler.padding_mode)
-                if self._halvings is None:
-                    self._halvings = _halvings(where, self._sampled)
-                if any(self._halvings):
-                    return self._smoothed(images, where, self._halvings, sampler)
-        return super().forward(images, **how)
-
-    def _smoothed(self, images: Tensor, where: Sampling | Lattice, halvings: list[int], sampler: Sampler) -> Tensor:
-        """Sampled from images that torch's antialiased interpolation halved so many times, for each camera."""
+        """Warped images, as of `Warp.forward`, each in its own way: smaller ones of them where they shrink."""
+        sampler = checked(self, images, **how)
+        smooth = sampler.mode != "nearest" and images.dtype != torch.bool
+        called = torch.compiler.is_compiling() and not torch.onnx.is_in_onnx_export()
+        if called and self._depends(smooth) and not keeps_graph(images, *self._inputs()):
+            options = None if self._decides else self.antialias, sampler.padding_mode, sampler
+            cameras = self.source, self.target, self.rotation
+            matrix = None if self.map is None else as_tensor(self.map)
+            return compiled.warped(images, *cameras, self.tolerance, *options, matrix, _edited)
+        route = route_of(self, images)
+        ways = None if in_transform() else self._ways(sampler, smooth, route)
+        if not ways:
+            return warped(self, images, sampler)
+        images = images.expand(len(ways), -1, -1, -1) if len(ways) > 1 else images
+        if all(way == ways[0] for way in ways):
+            return self._made(images, ways[0], sampler)
         result = self._empty(images)
-        images = lengthened(self, images)
-        images = images.expand(len(result), -1, -1, -1)
-        halvings = halvings * (len(result) // len(halvings))
-        every = len(set(halvings)) == 1
-        for k in sorted(set(halvings)):
-            rows = torch.tensor([i for i, n in enumerate(halvings) if n == k], device=images.device)
-            here = images if every else images[rows]
-            if k:
-                size = [max(-(-side >> k), 1) for side in images.shape[-2:]]
-                plain = images.dtype in _PLAIN
-                small = F.interpolate(here if plain else widen(here), size, mode="bilinear", antialias=True)
-                here = small if plain else narrow(small, images.dtype)
-            made = render(here, where if every else where.cameras(rows), *sampler)
-            if every:
-                return made
-            for row, one in zip(rows.tolist(), made, strict=True):  # unsigned integers have no index_put
+        for way in dict.fromkeys(ways):
+            rows = [i for i, other in enumerate(ways) if other == way]
+            if way.move or way.box:
+                for i in rows:
+                    self._made(images[i : i + 1], way, sampler, out=result[i : i + 1])
+                continue
+            made = self._made(images[rows], way, sampler, torch.tensor(rows, device=images.device))
+            for row, one in zip(rows, made, strict=True):  # unsigned integers have no index_put
                 result[row] = one
         return result
+
+    def _depends(self, smooth: bool) -> bool:
+        """Whether the ways depend on what is traced."""
+        return self._decides and smooth and self.is_an_operator and not (self.source.is_mixed or self.target.is_mixed)
+
+    def _ways(self, sampler: Sampler, smooth: bool, route: Route) -> list[Way] | None:
+        """Return the ways of the rows, or one for all; None for that of any `Warp`."""
+        if not (self._decides and smooth and route == "kept" and is_concrete(self.target.intrinsics)):
+            return None
+        if self._halvings is None:
+            self._halvings = _halvings(positions(self, "kept", sampler.padding_mode), self._sampled)
+        return [Way(sampler.padding_mode, k) for k in self._halvings] if any(self._halvings) else None
+
+    def _made(
+        self, images: Tensor, way: Way, sampler: Sampler, rows: Tensor | None = None, out: Tensor | None = None
+    ) -> Tensor:
+        """Return images of one way: these rows, or all. What is not sampled may go to `out`."""
+        if way.move:
+            return _copied(images, way.move, sampler.fill, self._empty(images) if out is None else out)
+        if way.box:
+            left, top, right, bottom = way.box
+            images, size = images[..., top:bottom, left:right], self.target._size_for("Warp")
+            made = _resized(images, size, sampler.mode, way.flips)
+            return made if out is None else out.copy_(made)
+        sampler = sampler._replace(padding_mode=way.padding_mode)
+        if rows is None and not way.halvings:
+            return warped(self, images, sampler)
+        images = lengthened(self, images)
+        if way.halvings:
+            images = _resized(images, [max(-(-side >> way.halvings), 1) for side in images.shape[-2:]])
+        where = positions(self, route_of(self, images), way.padding_mode)
+        return render(images, where if rows is None else where.cameras(rows), *sampler)
 
     def _empty(self, images: Tensor) -> Tensor:
         cameras, size = self.batch_shape.numel(), self.target._size_for("Warp")
         count = len(images) if cameras == 1 else cameras
-        if images.requires_grad or not images.is_cpu:
+        if images.requires_grad or not images.is_cpu or torch.compiler.is_compiling():
             return images.new_empty(count, images.shape[1], *size)
-        return sampler.empty(images, count, size)
+        return empty(images, count, size)
 
     def between(self, source: Camera, target: Camera, rotation: Tensor | None, **options: Any) -> Warp:
         """See `Warp.between`."""
@@ -97,26 +143,36 @@ class AffineWarp(MirrorWarp):
 
     is_an_operator = False
     _seam = None
+    map: Map
     matrix: Tensor
 
-    def __init__(self, source: Camera, target: Camera, matrix: Tensor, rotation: Tensor | None, **options: Any):
+    def __init__(self, source: Camera, target: Camera, matrix: Map, rotation: Tensor | None, **options: Any):
         super().__init__(source, target, rotation, **options)
-        self.register_buffer("matrix", matrix, persistent=False)
-        self.batch_shape: torch.Size = broadcast_shapes(self.batch_shape, matrix.shape[:-2])
+        self.map = matrix
+        own = as_tensor(matrix)
+        self.register_buffer("matrix", own.to(source.intrinsics.device), persistent=False)
+        self.batch_shape: torch.Size = broadcast_shapes(self.batch_shape, own.shape[:-2])
+        # numbers choose the way, the same on every device: a draw's are on the CPU, and no device is waited for
+        self._numbers: list[Rows] = own.reshape(-1, 2, 3).tolist() if own is matrix and is_concrete(own) else []
+        if not isinstance(matrix, Tensor):
+            self._numbers = [matrix]
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**super().__getstate__(), "map": self.map.detach() if isinstance(self.map, Tensor) else self.map}
 
     def between(self, source: Camera, target: Camera, rotation: Tensor | None, **options: Any) -> Warp:
         """See `Warp.between`; the map of pixels stays."""
-        return AffineWarp(source, target, self.matrix, rotation, **options)
+        return AffineWarp(source, target, self.map, rotation, **options)
 
     def rows_of(self, source: Camera, target: Camera, rotation: Tensor | None, index: list[int]) -> Warp:
         """See `Warp.rows_of`."""
-        matrix = self.matrix if self.matrix.ndim == 2 else self.matrix[index]
-        return AffineWarp(source, target, matrix, rotation, **self.options)
+        own = self.map[index] if isinstance(self.map, Tensor) and self.map.ndim == 3 else self.map
+        return AffineWarp(source, target, own, rotation, **self.options)
 
     def inverse(self) -> Warp:
         """The edit back. What it cut off stays lost."""
         rotation = None if self.rotation is None else self.rotation.mT
-        return AffineWarp(self.target, self.source, inverted(self.matrix), rotation, **self.options)
+        return AffineWarp(self.target, self.source, inverted(self.map), rotation, **self.options)
 
     def pin(self) -> Warp:
         """Nothing: copied and shrunk images ask for no positions, and the others' are kept as they are asked for."""
@@ -124,98 +180,14 @@ class AffineWarp(MirrorWarp):
 
     # -- images
 
-    def forward(self, images: Tensor, **how: Any) -> Tensor:
-        """Edited images, as of `Warp.forward`."""
-        mode, padding_mode, values = checked(self, images, **how)
-        if images.ndim == 4 and may_look(self.matrix) and not in_transform():
-            made = self._copied(images, values) if padding_mode == "zeros" else None
-            made = self._shrunk(images, mode) if made is None else made
-            if made is not None:
-                return made
-            if self._halvings is None and bool((self._scale < SURELY * SHRINKS).all()):
-                self._halvings = [0] * len(self._maps)
-            if padding_mode == "zeros" and self._is_inside:
-                padding_mode = "border"  # up to the outer edges of its pixels an image ends nowhere
-        return super().forward(images, mode=mode, padding_mode=padding_mode, fill=values)
+    def _depends(self, smooth: bool) -> bool:
+        return not self._numbers
 
-    @cached_property
-    def _is_inside(self) -> bool:
-        """Whether the edited images show nothing but the image."""
-        low, high = self._edges.amin(1), self._edges.amax(1)
-        size = self._edges.new_tensor(self.source._size_for("Warp")[::-1])
-        return bool((low > -_NEARLY).all() & (high < size + _NEARLY).all())
-
-    @cached_property
-    def _back(self) -> Tensor:
-        """(B or 1, 2, 3): the maps back, without a graph."""
-        return inverted(self._maps.detach())
-
-    @cached_property
-    def _scale(self) -> Tensor:
-        """(B or 1, 2): the pixels of the image, across and down, that come to one of the result."""
-        return self._back[:, :, :2].abs().sum(-1)
-
-    @cached_property
-    def _edges(self) -> Tensor:
-        """(B or 1, 2, 2): where two opposite corners of the edited image lie, from the corner of the image's pixels."""
-        height, width = self.target._size_for("Warp")
-        back = self._back
-        ends = back.new_tensor([[-0.5, -0.5], [width - 0.5, height - 0.5]])
-        return (back[:, None, :, :2] * ends[None, :, None]).sum(-1) + back[:, None, :, 2] + 0.5
-
-    def _copied(self, images: Tensor, fill: tuple[float, ...]) -> Tensor | None:
-        """By pixels copied, if the map brings whole pixels to whole pixels."""
-        matrices = self._maps
-        linear = matrices[:, :, :2]
-        if not bool((linear.abs().sum(-1) == 1).all() & ((matrices - matrices.round()).abs() < _WHOLE).all()):
-            return None
-        height, width = self.target._size_for("Warp")
-        moves = [tuple(tuple(map(round, row)) for row in matrix) for matrix in matrices.tolist()]
-        result = self._empty(images)
-        images = images.expand(len(result), -1, -1, -1)
-        for row, ((a, b, left), (c, d, top)) in _alike(moves):
-            view = images[row]
-            if b:
-                view = view.mT
-            dims = [dim for dim, sign in ((-1, a + b), (-2, c + d)) if sign < 0]
-            if dims:  # torch flips none of those without a sign
-                signed = SIGNED.get(view.dtype)  # a view by a dtype, be it the same, has no gradient
-                view = view.flip(dims) if signed is None else view.view(signed).flip(dims).view(view.dtype)
-            # of the first pixel of the view
-            left -= (view.shape[-1] - 1) * (a + b < 0)
-            top -= (view.shape[-2] - 1) * (c + d < 0)
-            x, y, right, bottom = max(left, 0), max(top, 0), left + view.shape[-1], top + view.shape[-2]
-            right, bottom = max(min(right, width), x), max(min(bottom, height), y)
-            if (x, y, right, bottom) != (0, 0, width, height):
-                result[row] = as_pixels(fill, result.dtype, result.device)
-            result[row, :, y:bottom, x:right] = view[..., y - top : bottom - top, x - left : right - left]
-        return result
-
-    def _shrunk(self, images: Tensor, mode: Mode) -> Tensor | None:
-        """Return what torch's antialiased resize makes of boxes of whole pixels; None for others."""
-        if not (self.antialias or self._decides) or mode == "nearest" or images.dtype == torch.bool:
-            return None
-        height, width = self.target._size_for("Warp")
-        back, least = self._back, 1 if self.antialias else SHRINKS
-        if not bool((back[:, 0, 1] == 0).all() & (self._scale > least).any()):
-            return None
-        edges = self._edges
-        if not (self._is_inside and bool((edges - edges.round()).abs().max() < _NEARLY)):
-            return None
-        boxes = torch.cat((edges.amin(1), edges.amax(1)), 1).round().long().tolist()
-        flips = [[dim for dim, sign in ((-1, a), (-2, d)) if sign < 0] for ((a, *_), (_, d, _)) in back.tolist()]
-        images = images.expand(len(boxes), -1, -1, -1) if len(boxes) > len(images) else images
-        plain = images.dtype in _PLAIN
-        results = []
-        for part, ((left, top, right, bottom), flip) in _alike(
-            [*zip(map(tuple, boxes), map(tuple, flips), strict=True)]
-        ):
-            view = images[part, :, top:bottom, left:right]
-            view = view if plain else widen(view)
-            view = F.interpolate(view, (height, width), mode=mode, align_corners=False, antialias=True)
-            view = view.flip(flip) if flip else view  # before it is of an unsigned dtype, which has no flip
-            results.append(view if plain else narrow(view, images.dtype))
-        return results[0] if len(results) == 1 else torch.cat(results)
+    def _ways(self, sampler: Sampler, smooth: bool, route: Route) -> list[Way] | None:
+        least: float = 1 if self.antialias else SHRINKS if self._decides else math.inf
+        least, decides = least if smooth else math.inf, smooth and self._decides and route == "kept"
+        sizes = self.source._size_for("Warp"), self.target._size_for("Warp")
+        return [_way(rows, *sizes, sampler.padding_mode, least, decides) for rows in self._numbers]
 
     @property
     def _maps(self) -> Tensor:
@@ -262,18 +234,72 @@ class AffineWarp(MirrorWarp):
         return moved, valid & self.target.contains(moved) if on_image else valid
 
 
-def _alike(kinds: list[Any]) -> list[tuple[slice, Any]]:
-    """The rows of a batch that are treated alike: all of them, or each alone."""
-    if all(kind == kinds[0] for kind in kinds):
-        return [(slice(None), kinds[0])]
-    return [(slice(i, i + 1), kind) for i, kind in enumerate(kinds)]
+def _copied(images: Tensor, move: tuple[int, ...], fill: tuple[float, ...], result: Tensor) -> Tensor:
+    """Return the result, to which pixels are copied by a map of whole numbers."""
+    height, width = result.shape[-2:]
+    a, b, left, c, d, top = move
+    view = images.mT if b else images
+    dims = [dim for dim, sign in ((-1, a + b), (-2, c + d)) if sign < 0]
+    if dims:  # torch flips none of those without a sign
+        signed = SIGNED.get(view.dtype)  # a view by a dtype, be it the same, has no gradient
+        view = view.flip(dims) if signed is None else view.view(signed).flip(dims).view(view.dtype)
+    # of the first pixel of the view
+    left -= (view.shape[-1] - 1) * (a + b < 0)
+    top -= (view.shape[-2] - 1) * (c + d < 0)
+    x, y, right, bottom = max(left, 0), max(top, 0), left + view.shape[-1], top + view.shape[-2]
+    right, bottom = max(min(right, width), x), max(min(bottom, height), y)
+    if (x, y, right, bottom) != (0, 0, width, height):
+        result[:] = as_pixels(fill, result.dtype, result.device)
+    result[:, :, y:bottom, x:right] = view[..., y - top : bottom - top, x - left : right - left]
+    return result
+
+
+def _resized(images: Tensor, size: Sequence[int], mode: str = "bilinear", flips: tuple[int, ...] = ()) -> Tensor:
+    """Return what torch's antialiased resize makes of images, flipped."""
+    plain = images.dtype in _PLAIN
+    made = F.interpolate(images if plain else widen(images), size, mode=mode, align_corners=False, antialias=True)
+    made = made.flip(flips) if flips else made  # before they are of an unsigned dtype, which has no flip
+    return made if plain else narrow(made, images.dtype)
+
+
+def _way(
+    rows: Rows, before: tuple[int, int], after: tuple[int, int], padding: PaddingMode, least: float, decides: bool
+) -> Way:
+    """Return how a map edits an image of a size, to a size; resized by torch if more than `least` pixels become one."""
+    (a, b, left), (c, d, top) = rows
+    whole = tuple(round(x) for x in (a, b, left, c, d, top))
+    near = all(abs(x - n) < _WHOLE for x, n in zip((a, b, left, c, d, top), whole, strict=True))
+    if near and abs(a) + abs(b) == abs(c) + abs(d) == 1 and padding == "zeros":
+        return Way(padding, move=whole)
+    (a, b, left), (c, d, top) = inverted(rows)
+    # where two opposite corners of the edited image lie, from the corner of the image's pixels
+    corners = (-0.5, -0.5), (after[1] - 0.5, after[0] - 0.5)
+    ends = [(a * u + b * v + left + 0.5, c * u + d * v + top + 0.5) for u, v in corners]
+    (x, right), (y, bottom) = (sorted(places) for places in zip(*ends, strict=True))
+    is_inside = min(x, y) > -_NEARLY and right < before[1] + _NEARLY and bottom < before[0] + _NEARLY
+    box = tuple(round(edge) for edge in (x, y, right, bottom))
+    near = all(abs(edge - n) < _NEARLY for edge, n in zip((x, y, right, bottom), box, strict=True))
+    if near and is_inside and b == 0 and max(abs(a), abs(d)) > least:
+        return Way(padding, box=box, flips=tuple(dim for dim, sign in ((-1, a), (-2, d)) if sign < 0))
+    halvings = _halved((math.hypot(a, c) + math.hypot(b, d)) / 2) if decides else 0
+    # up to the outer edges of its pixels an image ends nowhere
+    return Way("border" if is_inside and padding == "zeros" else padding, halvings)
+
+
+def _halved(scale: float) -> int:
+    """Return how often to halve an image so that at most one and a half pixels of it come to one."""
+    return min(max(math.ceil(math.log2(max(scale / SHRINKS, 0.5))), 0), _MOST)
 
 
 def _halvings(where: Sampling | Lattice, source: Camera) -> list[int]:
-    """For every camera, how often to halve its image so that at most one and a half pixels of it come to one."""
-    apart, every = (8, 4) if isinstance(where, Lattice) else (1, 32)
-    planes = where.nodes if isinstance(where, Lattice) else where.grid.detach().movedim(-1, 1)
-    planes = planes[:, :, ::every, ::every]
+    """For every camera, how often to halve its image, by pixels of the target in the same places for all routes."""
+    first, step = coarse(where.size if isinstance(where, Lattice) else where.grid.shape[1:3])
+    if isinstance(where, Lattice) and step >= STEP:
+        planes = where.nodes[..., 2:-3, 2:-3]  # those of the target's pixels
+        planes = planes[..., first // STEP :: step // STEP, first // STEP :: step // STEP]
+    else:
+        grid = where.pixels.grid if isinstance(where, Lattice) else where.grid
+        planes = grid.detach().movedim(-1, 1)[..., first::step, first::step]
     seen = (planes.abs() <= 1).all(1)
     height, width = source._size_for("Warp")
     grid, planes = planes, planes * planes.new_tensor([width / 2, height / 2])[:, None, None]
@@ -284,23 +310,49 @@ def _halvings(where: Sampling | Lattice, source: Camera) -> list[int]:
         steps = lengths(source, (across, down), (u, v))
         both = seen.narrow(dim, 0, n) & seen.narrow(dim, 1, n)
         total, count = total + (steps * both).sum((1, 2)), count + both.sum((1, 2))
-    scale = total / (count.clamp(min=1) * apart * every)
-    return (scale / SHRINKS).clamp(min=0.5).log2().ceil().long().clamp(min=0, max=_MOST).tolist()
+    return [_halved(scale) for scale in (total / (count.clamp(min=1) * step)).tolist()]
 
 
-def inverted(matrix: Tensor) -> Tensor:
+@opaque(compiled.warp_shapes)
+def _edited(
+    images: Tensor, source: Camera, target: Camera, rotation: Tensor | None, tolerance: float, *options: Any
+) -> tuple[Tensor]:
+    """The images of an edit, whose way its values tell; options as of `compiled.warped`."""
+    antialias, _, mode, padding_mode, fill, matrix, is_last = options
+    how: Any = {"mode": mode, "padding_mode": padding_mode, "fill": ast.literal_eval(f"({fill},)")}
+    how |= {"antialias": ast.literal_eval(antialias), "tolerance": tolerance}
+    warp: Warp = MirrorWarp(source, target, rotation, **how)
+    if matrix is not None:
+        warp = AffineWarp(source, target, matrix, rotation, **how)
+    return (compiled.laid(warp(images), is_last),)
+
+
+def as_tensor(matrix: Map) -> Tensor:
+    """The map (*B, 2, 3) in float64."""
+    return matrix if isinstance(matrix, Tensor) else torch.tensor(matrix, dtype=torch.float64)
+
+
+def inverted(matrix: Map) -> Any:
     """(*B, 2, 3): the maps back."""
-    (a, b, left), (c, d, top) = (row.unbind(-1) for row in matrix.unbind(-2))
+    rows: Any = matrix.flatten(-2).unbind(-1) if isinstance(matrix, Tensor) else (*matrix[0], *matrix[1])
+    a, b, left, c, d, top = rows
     scale = 1 / (a * d - b * c)
     a, b, c, d = d * scale, -b * scale, -c * scale, a * scale
-    rows = a, b, -(a * left + b * top), c, d, -(c * left + d * top)
-    back: Tensor = torch.stack(rows, -1).unflatten(-1, (2, 3))
-    return back
+    rows = (a, b, -(a * left + b * top)), (c, d, -(c * left + d * top))
+    return torch.stack([*rows[0], *rows[1]], -1).unflatten(-1, (2, 3)) if isinstance(matrix, Tensor) else rows
 
 
-def after(second: Tensor, first: Tensor) -> Tensor:
+def after(second: Map, first: Map) -> Map:
     """(*B, 2, 3): the first map, then the second."""
-    return second[..., :2] @ first + F.pad(second[..., 2:], (2, 0))
+    if isinstance(second, Tensor) or isinstance(first, Tensor):
+        second, first = as_tensor(second), as_tensor(first)
+        return second[..., :2] @ first + F.pad(second[..., 2:], (2, 0))
+    (a, b, left), (c, d, top) = second
+    (e, f, x), (g, h, y) = first
+    return (
+        (a * e + b * g, a * f + b * h, a * x + b * y + left),
+        (c * e + d * g, c * f + d * h, c * x + d * y + top),
+    )
 
 
 def on_rays(matrix: Tensor) -> Tensor:

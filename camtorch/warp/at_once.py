@@ -21,7 +21,7 @@ from camtorch.native import memory, sampler
 from camtorch.native.library import library
 from camtorch.projection import compiled
 from camtorch.projection.compiled import LEFT_FROM, LEFT_MOST, LEFT_TO, POSITIONS, Between, Native
-from camtorch.warp.grid import FEWEST, MOST_KEPT, STEP, kept_probes
+from camtorch.warp.grid import FEWEST, MOST_KEPT, STEP, coarse, kept_probes
 from camtorch.warp.moving import between
 from camtorch.warp.panorama import goes_round
 from camtorch.warp.sampling import PADDINGS, SHRINKS, SURELY, Options, Sampler
@@ -35,7 +35,6 @@ _FEW = 2  # tiles of an image that one thread makes alone
 _EVEN = 4  # samples a thread from which on it matters little that the last ones leave some threads idle
 _ALIGNED = 64
 _PIXELS = 1 << 3  # flags of what is left of pixels are times this
-_APART = 4 * STEP  # pixels between those that tell how far an image shrinks
 
 Sizes = tuple[tuple[int, int], tuple[int, int]]
 """(height, width) of the source's image, and of the target's."""
@@ -81,17 +80,17 @@ def _smooth(images: Sequence[tuple[Tensor, Sampler]]) -> bool:
 
 
 @functools.lru_cache(maxsize=16)
-def _coarse(size: tuple[int, int], dtype: torch.dtype) -> tuple[Tensor, tuple[int, int]]:
-    """(1, N, 2): every fourth node of a lattice, and how many down and across."""
-    n, m = (math.ceil(side / STEP) + 5 for side in size)
+def _coarse(size: tuple[int, int], dtype: torch.dtype) -> tuple[Tensor, tuple[int, int], int]:
+    """(1, N, 2): pixels that tell how far an image shrinks, how many down and across, and their step."""
+    first, step = coarse(size)
     with torch.inference_mode(False):
-        nodes = kept_probes(range(size[0]), size[1], dtype)[:, : n * m].view(n, m, 2)[::4, ::4]
-        return nodes.reshape(1, -1, 2), (nodes.shape[0], nodes.shape[1])
+        v, u = (torch.arange(first, side, step, dtype=dtype, device="cpu") for side in size)
+        return torch.stack(torch.meshgrid(u, v, indexing="xy"), -1).view(1, -1, 2), (len(v), len(u)), step
 
 
 def _surely_keeps_size(back: Between, sizes: Sizes) -> bool:
     """Whether no image shrinks so far that a `MirrorWarp` would halve it; back: from the target to the source."""
-    nodes, shape = _coarse(sizes[1], back.dtype)
+    nodes, shape, step = _coarse(sizes[1], back.dtype)
     places = back.rows(nodes, POSITIONS)[0].numpy().reshape(-1, *shape, 2)
     seen: np.ndarray[Any, Any] = np.all(abs(places) <= 1, axis=-1)
     places = places * np.array([sizes[0][1] / 2, sizes[0][0] / 2], places.dtype)
@@ -100,7 +99,7 @@ def _surely_keeps_size(back: Between, sizes: Sizes) -> bool:
     for steps, both in ((down, seen[:, 1:] & seen[:, :-1]), (across, seen[:, :, 1:] & seen[:, :, :-1])):
         total = total + (np.hypot(steps[..., 0], steps[..., 1]) * both).sum((1, 2))
         count = count + both.sum((1, 2))
-    return bool((total < SURELY * SHRINKS * _APART * np.maximum(count, 1)).all())
+    return bool((total < SURELY * SHRINKS * step * np.maximum(count, 1)).all())
 
 
 def batch_at_once(warp: Warp, images: Sequence[tuple[Tensor, Sampler]]) -> list[Tensor] | None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ast
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -70,35 +70,43 @@ def warped(
     target: Camera,
     rotation: Tensor | None,
     tolerance: float,
-    antialias: bool,
+    antialias: bool | None,
     padding: str,
     how: Sampler,
+    matrix: Tensor | None = None,
+    by: Callable[..., tuple[Tensor, ...]] | None = None,
 ) -> Tensor:
-    """The images (B, C, h, w) of a warp; arguments as of `Warp`, and the padding of `on_lattice`."""
+    """The images (B, C, h, w) of a warp; arguments as of `Warp`, and the padding of `on_lattice`.
+
+    By another operator than that of a `Warp`, the map of an edit is for.
+    """
     turned = None if rotation is None else rotation.detach()
     # numbers as words: integers of fills may be ids, which no float holds
     options = str(antialias), padding, how.mode, how.padding_mode, ",".join(map(repr, how.fill))
     is_last = str(layout(images) == torch.channels_last)
-    (result,) = _warp(images.detach(), source, target, turned, float(tolerance), *options, is_last)
+    given = (*options, matrix, is_last) if by else (*options, is_last)
+    (result,) = (by or _warp)(images.detach(), source, target, turned, float(tolerance), *given)
     return result
 
 
-def _laid(images: Tensor, is_last: str) -> Tensor:
+def laid(images: Tensor, is_last: str) -> Tensor:
+    """Return images with their channels last in memory, or plane by plane."""
     return images.contiguous(memory_format=torch.channels_last if is_last == "True" else torch.contiguous_format)
 
 
-def _warp_shapes(
+def warp_shapes(
     images: Tensor, source: CameraNumbers, target: CameraNumbers, rotation: Tensor | None, *options: Any
 ) -> tuple[Tensor]:
+    """Return the form of what an operator makes of images, between cameras of these numbers."""
     count = _count(rotation, *source[:2], *target[:2])
     result = images.new_empty(images.shape[0] if count == 1 else count, images.shape[1], *target.image_size)
-    return (_laid(result, options[-1]),)
+    return (laid(result, options[-1]),)
 
 
 _located = Memo(2)  # masks are warped after their images, and cameras may be still
 
 
-@opaque(_warp_shapes)
+@opaque(warp_shapes)
 def _warp(
     images: Tensor,
     source: Camera,
@@ -122,4 +130,4 @@ def _warp(
     where = _located(inputs, (source._form, target._form, tolerance, antialias, padding, rotation is None), positions)
     how = one_of(mode, MODES, "mode", "Warp"), one_of(padding_mode, PADDINGS, "padding_mode", "Warp")
     values = tuple(ast.literal_eval(f"({fill},)"))
-    return (_laid(render(images, where, *how, values), is_last),)
+    return (laid(render(images, where, *how, values), is_last),)

@@ -292,6 +292,11 @@ def on_lattice(
     return Lattice(lattice, cells, computed, (height, width))
 
 
+def coarse(size: tuple[int, ...]) -> tuple[int, int]:
+    """Return the first, and the step, of the pixels of targets (h, w) that tell how far images shrink."""
+    return (16, 32) if min(size) >= 64 else (0, STEP) if min(size) > STEP else (0, 1)
+
+
 def straight_lattice(matrix: Tensor, rows: range, width: int, dtype: torch.dtype) -> Lattice:
     """Return the lattice of positions that are an affine function (B, 2, 3) of the target's pixels."""
     count, n, m = len(matrix), math.ceil(len(rows) / STEP), math.ceil(width / STEP)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any, Literal, NamedTuple, TypedDict, TypeVar, get_args
 
 import torch
@@ -211,10 +210,16 @@ class Pyramid:
 
     images: Tensor
     finite: bool
+    _half: Pyramid | None = None
 
-    @cached_property
+    @property
     def half(self) -> Pyramid:
         """Of a dtype to compute in."""
+        if self._half is None:  # no cached_property, whose lock compilers refuse
+            self._half = self._halved()
+        return self._half
+
+    def _halved(self) -> Pyramid:
         size = [max(side // 2, 1) for side in self.images.shape[-2:]]
         # a copy in another dtype is large
         step = 1 if self.images.dtype != wide_dtype(self.images.dtype) else self.images.shape[1]

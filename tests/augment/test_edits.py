@@ -286,6 +286,30 @@ def test_chains_take_all_unsigned_integers(name, dtype):
         assert (single["image"] == moved[0].permute(1, 2, 0).numpy()).all()
 
 
+@pytest.mark.parametrize("antialias", [None, True])
+def test_an_image_is_the_same_in_every_batch(antialias):
+    images = torch.rand(6, 3, 120, 160, generator=torch.Generator().manual_seed(0))
+    for parts in ([A.RandomResizedCrop(60)], [A.CenterCrop(100), A.Rotate90(), A.RandomResizedCrop(40)]):
+        augment = A.Compose(parts, antialias=antialias)
+        draw = augment.draw(6, torch.Generator().manual_seed(0))
+        together = augment(image=images, draw=draw)["image"]
+        for i in range(6):
+            alone = augment(image=images[i : i + 1], draw={key: value[i : i + 1] for key, value in draw.items()})
+            assert (alone["image"][0] - together[i]).abs().max() < 1e-4
+
+
+@pytest.mark.parametrize("side", [12, 30, 90])
+def test_small_images_are_smoothed_before_a_lens(side):
+    lens = ct.Pinhole([200.0, 200, 159.5, 119.5], image_size=(240, 320))
+    augment = A.Compose([A.RandomMount(yaw=5, pitch=5, camera=lens), A.Resize((side, side))])
+    image = torch.zeros(1, 1, 240, 320)
+    image[..., ::2] = 1
+    for images in (image, image.repeat(4, 1, 1, 1)):  # one sample, and a batch
+        out = augment(image=images, generator=torch.Generator().manual_seed(0))["image"]
+        seen = out[..., side // 3 : -side // 3, side // 3 : -side // 3]
+        assert (seen - 0.5).abs().max() < 0.1  # stripes are grey from afar
+
+
 def test_a_chain_shows_what_its_last_camera_sees():
     lens = camera(ct.Fisheye624, torch.float32, (96, 128))
     image = scene(lens.rays()[0]).expand(4, -1, -1, -1)
