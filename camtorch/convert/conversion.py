@@ -129,7 +129,6 @@ class _Task(NamedTuple):
     tolerance: float
 
     def of(self, rows: Tensor) -> _Task:
-        """Those of the rows."""
         intrinsics, distortion = (t[rows] for t in self.source.camera._tensors)
         camera = remade(self.source.camera, intrinsics=intrinsics, distortion=distortion)
         return self._replace(source=self.source.of(camera, rows))
@@ -156,7 +155,6 @@ class _Result(NamedTuple):
         return results
 
     def of(self, rows: Tensor) -> _Result:
-        """Those of the rows."""
         return _Result(*(t[rows] for t in self))
 
     def padded(self, width: int) -> _Result:

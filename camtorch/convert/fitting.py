@@ -179,11 +179,9 @@ class _Fit:
         (self.free,) = (low < high).any(0).nonzero(as_tuple=True)
 
     def cost(self, state: tuple[Tensor, ...], rows: Tensor) -> Tensor:
-        """(R,)."""
         return _cost(self.camera, self.observations.of(rows), state[0])
 
     def linearised(self, state: tuple[Tensor, ...], rows: Tensor) -> System:
-        """At parameters."""
         (parameters,), free = state, self.free
         residuals, slopes = _linearised(self.camera, self.observations.of(rows), parameters)
         slope, values = (slopes @ residuals[..., None])[:, free, 0], parameters[:, free]
@@ -195,7 +193,6 @@ class _Fit:
         return System(Equations(none, triangle), 0, held)
 
     def moved(self, state: tuple[Tensor, ...], step: tuple[Tensor, ...], rows: Tensor) -> tuple[Tensor, ...]:
-        """Within the bounds."""
         new = state[0].clone()
         new[:, self.free] += step[1]
         return (new.clamp(self.low[rows], self.high[rows]),)

@@ -80,12 +80,10 @@ def find(words: str, *, image_size: Sequence[int] | None = None) -> KannalaBrand
 
 
 def _squeezed(text: str) -> str:
-    """Letters and numbers alone."""
     return _NO_SPACE.sub("", " ".join(_WORD.findall(unicodedata.normalize("NFKC", text).casefold())))
 
 
 def _terms(words: str, function: str) -> list[str]:
-    """What is to be found in a name."""
     if not isinstance(words, str):
         raise TypeError(f"lenses.{function}: words must be a text; got {type(words).__name__}")
     return [term for term in map(_squeezed, words.split()) if term]

@@ -117,10 +117,10 @@ def load_map(path: str | os.PathLike[str], format: str | None = None) -> LookupM
     described = _read_description(name) if chosen is None or chosen.described else {}
     chosen = chosen or _FORMATS.get(str(described.get("format")))
     if chosen is None:
-        what = f"not that of a known map, and no {_description(name)} says it; say format: {_KNOWN}"
+        what = f"not that of a known map, and no {name}.json says it; say format: {_KNOWN}"
         raise CameraFileError(name, "content", what)
     if described.get("format", chosen.name) != chosen.name:
-        raise CameraFileError(_description(name), "format", f"describes {described['format']!r:.60}, not {chosen.name}")
+        raise CameraFileError(f"{name}.json", "format", f"describes {described['format']!r:.60}, not {chosen.name}")
     try:
         read = chosen.decode(content, described)
     except ImportError:
@@ -136,7 +136,7 @@ def load_map(path: str | os.PathLike[str], format: str | None = None) -> LookupM
 def files_of(path: str | os.PathLike[str], format: str | None = None) -> tuple[str, ...]:
     """Return the files that `save_map` writes: that of the path, and beside a bare table its description."""
     name = path_of(path, "save_map")
-    return (name, _description(name)) if _chosen(name, format).described else (name,)
+    return (name, f"{name}.json") if _chosen(name, format).described else (name,)
 
 
 def check_map(warp: Warp, path: str | os.PathLike[str], format: str | None = None) -> MapReport:
@@ -148,14 +148,9 @@ def check_map(warp: Warp, path: str | os.PathLike[str], format: str | None = Non
 _NO_FACTS = ("format", *SIZES, "max_error", "rms_error")
 
 
-def _description(path: str) -> str:
-    """Return the file that says what a bare table does not."""
-    return path + ".json"
-
-
 def _read_description(path: str) -> dict[str, Any]:
     """Return what stands beside a bare table, or nothing."""
-    beside = _description(path)
+    beside = f"{path}.json"
     if not os.path.isfile(beside):
         return {}
     with open(beside, "rb") as file:
@@ -170,7 +165,6 @@ def _read_description(path: str) -> dict[str, Any]:
 
 
 def _chosen(path: str, format: str | None) -> MapFormat:
-    """Return the format to write."""
     if format is not None:
         return _named(format)
     suffix = os.path.splitext(path)[1].lower()

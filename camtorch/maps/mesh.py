@@ -99,7 +99,10 @@ def _counts(step: int, size: tuple[int, int]) -> tuple[int, int]:
 
 def mesh_of(path: str, exact: Exact, step: int) -> Mesh:
     """Return the mesh of a warp, exact at its nodes, smoothly continued to those without a position; refuse seams."""
-    if leaps := _leaps(exact):
+    half, leaps = np.array(exact.source_size[::-1], np.float64) / 2, 0
+    for p, shown in ((exact.positions, exact.shown), (exact.positions.swapaxes(0, 1), exact.shown.T)):
+        leaps += int(((np.abs(np.diff(p, axis=0)) > half).any(-1) & shown[1:] & shown[:-1]).sum())
+    if leaps:
         raise CameraFileError(
             path,
             "mesh",
@@ -117,14 +120,6 @@ def mesh_of(path: str, exact: Exact, step: int) -> Mesh:
     # nodes far off do not tell where to go on
     nodes = _continued(np.where(needed[..., None], nodes, nodes.clip(low, high)), mapped, low, high)
     return Mesh(step, nodes, needed)
-
-
-def _leaps(exact: Exact) -> int:
-    """Count the shown pixels that are half the source away from a shown neighbour."""
-    half, count = np.array(exact.source_size[::-1], np.float64) / 2, 0
-    for p, shown in ((exact.positions, exact.shown), (exact.positions.swapaxes(0, 1), exact.shown.T)):
-        count += int(((np.abs(np.diff(p, axis=0)) > half).any(-1) & shown[1:] & shown[:-1]).sum())
-    return count
 
 
 def _continued(nodes: Floats, known: Bools, low: Floats, high: Floats) -> Floats:

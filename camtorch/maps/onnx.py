@@ -72,7 +72,6 @@ def _model(exact: Exact, dtype: str) -> Any:
     nodes: list[Any] = []
 
     def add(kind: str, *inputs: str, **attributes: Any) -> str:
-        """Add a node, and return the name of its output."""
         nodes.append(helper.make_node(kind, list(inputs), [f"step{len(nodes)}"], **attributes))
         return f"step{len(nodes) - 1}"
 

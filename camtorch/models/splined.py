@@ -157,8 +157,6 @@ def _searched(kind: type[Splined]) -> type[Splined]:
 
 
 def _of_grid(order: int, columns: int, rows: int, fov_x: int) -> dict[str, Any]:
-    """What depends on the grid."""
-
     def mirror(turn: str, place: Any) -> Mapping[str, str]:
         signs = {axis: "-" if axis == turn else "" for axis in "xy"}
         pairs = [(i, j) for j in range(rows) for i in range(columns)]

@@ -140,6 +140,5 @@ def _end(margin: Callable[[Tensor], Tensor], like: Tensor) -> tuple[Tensor, Tens
 
 
 def _angles(chart: Chart, radii: Tensor) -> Tensor:
-    """Return the angles from the axis of points that far from it."""
     x, _, z = chart.to_ray(radii, torch.zeros_like(radii), 1)
     return torch.atan2(x, z)

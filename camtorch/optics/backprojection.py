@@ -57,10 +57,8 @@ class Inverted(Chart):
     def scale(self, x: Tensor, y: Tensor, z: Tensor, order: int = 2) -> Tensor:
         angle = Equidistant().scale(x, y, z, order)
         theta2 = torch.minimum(torch.addcmul(x * x, y, y) * angle * angle, self._inverse.most2)
-        return angle * self._attached(self._inverse(theta2.detach()), theta2, order)
-
-    def _attached(self, scale: Tensor, theta2: Tensor, order: int) -> Tensor:
-        """The solution of s R(theta2 s^2) = 1 with its derivatives, as `solve.attach` does it."""
+        # the solution of s R(theta2 s^2) = 1 with its derivatives, as `solve.attach` does it
+        scale = self._inverse(theta2.detach())
         with torch.no_grad():
             t = theta2.detach() * scale * scale
             factor, slope = self._inverse.radial.derivatives(t, 1)
@@ -68,7 +66,7 @@ class Inverted(Chart):
         radial = self._radial
         for _ in range(max(order, 1)):
             scale = scale + (1 - scale * radial(theta2 * scale * scale)) * step
-        return scale
+        return angle * scale
 
     def on_plane(self, a: Tensor, b: Tensor) -> Tensor:
         t = torch.addcmul(a * a, b, b)

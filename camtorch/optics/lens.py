@@ -127,14 +127,10 @@ class StageAt:
     @property
     def orientation(self) -> Tensor:
         """Positive where the map is defined, regular and not turned over; `edge` has no part in it."""
-        orientation, margin = _orientation(self.jacobian), self.margin
+        (ua, ub, va, vb), margin = self.jacobian, self.margin
+        # a turn by half a circle has a positive determinant too: the trace tells it from a regular map
+        orientation = torch.minimum(torch.addcmul(ua * vb, ub, va, value=-1), ua + vb)
         return orientation if margin is None else torch.minimum(orientation, margin)
-
-
-def _orientation(jacobian: Jacobian) -> Tensor:
-    ua, ub, va, vb = jacobian
-    # a turn by half a circle has a positive determinant too: the trace tells it from a regular map
-    return torch.minimum(torch.addcmul(ua * vb, ub, va, value=-1), ua + vb)
 
 
 @dataclass
@@ -286,7 +282,6 @@ class Homography(Stage):
         return (r00 * u + r01 * v + r02) * reciprocal, (r10 * u + r11 * v + r12) * reciprocal
 
     def _adjugate(self) -> tuple[Tensor, ...]:
-        """The inverse matrix times the determinant."""
         h00, h01, h02, h10, h11, h12, h20, h21, h22 = self.parameters
         return (
             *(h11 * h22 - h12 * h21, h02 * h21 - h01 * h22, h01 * h12 - h02 * h11),

@@ -156,7 +156,6 @@ def tabulate(radial: RadialFactor, fold: Tensor, usual_end: float | Tensor) -> T
 
 
 def _square(u: Tensor, top2: Tensor) -> Tensor:
-    """The inverse of `_variable`."""
     x = u * (2 - u) * (top2 / (top2 + _HALF_WAY))
     return _HALF_WAY * x / (1 - x)
 

@@ -191,7 +191,6 @@ class Lenses:
             self._add_domain(tables)
 
     def _optics(self) -> tuple[Chart, Lens]:
-        """In double precision."""
         return self._optics_of(columns(self._k.double()))
 
     @functools.cached_property
@@ -642,12 +641,10 @@ def _planes(results: Tensor, cameras: int, count: int) -> tuple[int, int, int, i
 
 
 def _points(results: Tensor | None) -> tuple[int, ...]:
-    """The same of (C, N, size)."""
     return _NO_ROWS if results is None else (results.data_ptr(), *results.stride())
 
 
 def _cotangents(given: Tensor, cameras: int, count: int) -> tuple[int, int, int, int]:
-    """The same of (size, C, N) of any strides."""
     assert given.shape[1:] == (cameras, count)  # else C would read elsewhere
     component, camera, point = given.stride()
     return given.data_ptr(), camera, point, component

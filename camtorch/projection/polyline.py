@@ -87,7 +87,6 @@ class _Edges:
             self.angle = high - self.low
 
     def at(self, places: Tensor) -> Tensor:
-        """(K, 3)."""
         edge = places.long().clamp(max=self.count - 1)
         share = places - edge
         along = self.foot[edge] + self.near[edge] * torch.tan(self.low[edge] + share * self.angle[edge])

@@ -46,7 +46,6 @@ def search(domain: Domain, camera: Tensor, u: Tensor, v: Tensor) -> Found:
 
 
 def _search_recorded(domain: Domain, camera: Tensor, u: Tensor, v: Tensor) -> Found:
-    """The same of lenses that are not radial, without a look at values."""
     by_stages = None
     if domain.stagewise is not None:
         first, within = _first_image(domain, camera, u, v)
@@ -147,7 +146,6 @@ class _Search:
         return regular_there
 
     def radial(self, u: Tensor, v: Tensor) -> Planes2:
-        """In a bracket up to the fold, by the radial factor alone."""
         # at the fold itself the root of a rounded fold may lie beyond the rounded limit
         fold2 = times(self.domain.inner2[self.camera, 0], 1 - 64 * torch.finfo(u.dtype).eps)
         assert self.lens.radial is not None

@@ -102,7 +102,6 @@ def _invert_radial(domain: Domain, u: Tensor, v: Tensor) -> Found:
 
 
 def _newton(lens: Lens, u: Tensor, v: Tensor, a: Tensor, b: Tensor) -> Found:
-    """From (a, b) on, wherever that leads."""
     short2, converged = short(u.dtype) ** 2, None
     for _ in range(MOST_STEPS):
         at = lens.at(a, b)

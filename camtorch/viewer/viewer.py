@@ -87,7 +87,6 @@ def _file(name: str) -> str:
 
 
 def _described(camera: Camera) -> dict[str, Any]:
-    """A camera as the page reads it."""
     if not isinstance(camera, Camera) or camera.is_mixed:
         has_one = isinstance(getattr(camera, "camera", None), Camera)
         hint = ". Of a rig it takes rig.camera, or one of rig.cameras" if has_one else ""
@@ -142,7 +141,6 @@ def models() -> dict[str, dict[str, Any]]:
 
 
 def _constructor(kind: type[Camera]) -> str:
-    """In `ct`; of splined lenses with their grid."""
     if not issubclass(kind, Splined) or kind is Splined:
         return kind.__name__
     return f"Splined.with_grid(columns={kind.columns}, rows={kind.rows}, fov_x={kind.fov_x}, order={kind.order})"
