@@ -18,8 +18,13 @@ def float64(values):
     return torch.tensor(values, dtype=torch.float64)
 
 
+def tables(path):
+    """Return the names and the rows of the tables in a text: a name in brackets, and rows of cells between arrows."""
+    tables = (table.split("]\n") for table in path.read_text().split("\n\n[")[1:])
+    return [(name, [row.split(" => ") for row in rows.splitlines()]) for name, rows in tables]
+
+
 def load(name):
-    """A sample file."""
     return ct.load(FILES / name)
 
 
@@ -27,8 +32,7 @@ def assert_same(a, b, atol=0.0):
     """The same rig: cameras to the last bit, poses to the rounding of what their rotations are written as."""
     assert list(a.cameras) == list(b.cameras)
     for one, other in zip(a.cameras.values(), b.cameras.values(), strict=True):
-        assert type(one) is type(other)
-        assert one.image_size == other.image_size
+        assert (type(one), one.image_size) == (type(other), other.image_size)
         assert one.intrinsics.dtype == other.intrinsics.dtype == torch.float64
         assert torch.equal(one.intrinsics, other.intrinsics)
         assert torch.equal(one.distortion, other.distortion)

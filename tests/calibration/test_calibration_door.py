@@ -117,7 +117,6 @@ def test_copies_of_views_are_left_out(order):
 
 
 def test_views_of_different_corners():
-    """As ChArUco boards are found."""
     which = [np.arange(54), np.arange(10, 40), np.arange(0, 54, 3)]
     points, image_points = [BOARD[w] for w in which], [VIEWS[i][w][:, None] for i, w in enumerate(which)]
     observations, layout = as_observations(points, image_points, SIZE, OWNER)

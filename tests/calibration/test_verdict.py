@@ -29,14 +29,12 @@ def found(model, corners, **options):
 
 
 def one(texts, words):
-    """The only warning of those words."""
     matching = [text for text in texts if re.search(words, text)]
     assert len(matching) == 1, texts
     return matching[0]
 
 
 def views(camera, rotations, translations, noise=0.15):
-    """Corners of boards at given poses."""
     board = chessboard(9, 6, 0.025)
     with torch.no_grad():
         pixels, valid = camera.project((board - board.mean(0)) @ rotations.mT + translations[:, None])
@@ -46,7 +44,6 @@ def views(camera, rotations, translations, noise=0.15):
 
 
 def all_over(count, tilt=0.6, width=0.24, distance=0.4):
-    """Poses all over a narrow camera's image."""
     generator = torch.Generator().manual_seed(0)
     turns = (torch.rand(count, 3, generator=generator, **F64) - 0.5) * 2 * tilt
     side = (torch.rand(count, 2, generator=generator, **F64) - 0.5) * torch.tensor([width, 0.75 * width], **F64)

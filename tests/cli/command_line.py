@@ -16,12 +16,10 @@ LEVEL = "K: [80, 0, 47.5, 0, 80, 31.5, 0, 0, 1]"
 
 
 def camera():
-    """That of camera.yml."""
     return ct.KannalaBrandt([28.0, 28, 47, 32], [-0.02, 0.004, -0.003, 0.0006], image_size=(64, 96)).double()
 
 
 def write_photograph(folder):
-    """in.png and camera.yml."""
     (folder / "camera.yml").write_text(FISHEYE + MATRIX)
     colours = np.random.default_rng(0).integers(0, 256, (64, 96, 3), dtype=np.uint8)
     Image.fromarray(colours).save(folder / "in.png")
@@ -43,7 +41,6 @@ def refused(capsys, *words):
 
 
 def opened(path):
-    """An image that keeps no file open."""
     with Image.open(path) as image:
         image.load()
         return image

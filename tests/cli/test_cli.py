@@ -132,7 +132,6 @@ def test_transparency_by_a_colour_stays(folder, mode, clear):
 
 
 def tagged(path, orientation, **options):
-    """in.png with an Exif orientation."""
     exif = Image.Exif()
     exif[0x0112] = orientation
     opened("in.png").save(path, exif=exif, **options)

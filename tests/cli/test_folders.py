@@ -25,7 +25,6 @@ WORDS = ["dewarp", "in", "--camera", "camera.yml", "-o", "out/"]
 
 @pytest.fixture
 def folder(folder):
-    """Images of one camera in folders."""
     write_images({"1.png": "RGB", "2.jpg": "RGB", "deep/1.png": "L", "deep/er/3.tif": "I;16", "deep/4.webp": "RGBA"})
     return folder
 
@@ -43,7 +42,6 @@ def write_images(modes, seed=0):
 
 
 def outputs(place="out"):
-    """The contents of all files."""
     return {str(path.relative_to(place)): path.read_bytes() for path in Path(place).rglob("*") if path.is_file()}
 
 

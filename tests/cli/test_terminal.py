@@ -10,8 +10,6 @@ from camtorch.cli import terminal
 
 
 class Terminal(io.StringIO):
-    """A stream that is one."""
-
     def isatty(self):
         return True
 

@@ -88,7 +88,6 @@ def as_images(array):
 
 
 def warped(warp):
-    """What a warp makes of the photograph, as an array."""
     return warp(as_images(photograph()))[0].permute(1, 2, 0).numpy()
 
 

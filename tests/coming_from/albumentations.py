@@ -118,7 +118,6 @@ elsewhere("albumentations", {
 
 
 def optical(mode, k=0.3):
-    """As on the page."""
     if mode == "fisheye":
         radius = np.hypot(WIDTH / 2, HEIGHT / 2)
         intrinsics, distortion = np.array([radius, radius, WIDTH / 2, HEIGHT / 2]), np.array([k, 0.0, 0.0, 0.0])

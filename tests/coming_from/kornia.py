@@ -64,13 +64,11 @@ def positions(warp):
 
 
 def moved(augmentation):
-    """What becomes of SPOT by ours, and the size of the image."""
     sample = augmentation(image=torch.zeros(1, 1, *SIZE), keypoints=SPOT)
     return sample["keypoints"], sample["image"].shape[-2:]
 
 
 def kornias(name, *values, **options):
-    """The same by an augmentation of kornia's."""
     augmentation = getattr(K, name)(*values, p=1.0, **options)
     pipeline = K.AugmentationSequential(augmentation, data_keys=["input", "keypoints"])
     image, spot = pipeline(torch.zeros(1, 1, *SIZE), SPOT)

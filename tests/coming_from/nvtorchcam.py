@@ -20,7 +20,6 @@ THETA, ACROSS = RAYS[:, 2:].acos(), torch.nn.functional.normalize(POINTS[:, :2],
 
 
 def normalised(uv, affine=None):
-    """-1 ... 1 between the edges; or before the affine map."""
     seen = (uv + 0.5) / HALF - 1
     return seen if affine is None else (seen - affine[2:]) / affine[:2]
 

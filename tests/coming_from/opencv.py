@@ -47,7 +47,6 @@ def rectified(module, lens):
 
 
 def by_grid(maps):
-    """Maps of one's own, as on the page."""
     grid = (2 * tensor(np.stack(maps, -1)) + 1) / torch.tensor(WH) - 1
     return torch.nn.functional.grid_sample(as_images(photograph()).float(), grid[None], align_corners=False)
 
@@ -208,7 +207,6 @@ def fisheye_calibrate():
 
 @row("cv2.resize", "cv2.flip", "cv2.rotate")
 def edits():
-    """Where a pixel goes with its image, the camera of the edited image sees its ray."""
     uv = np.array([100.0, 50.0])
     x, y, z = BROWN.unproject(uv)[0]
     image = np.zeros(SIZE, np.float32)

@@ -55,8 +55,7 @@ def check(source, result):
     assert parameters.dtype == torch.float64
     assert bool(torch.isfinite(parameters).all())
     assert all(number.shape == source.batch_shape and not bool(number.isnan().any()) for number in numbers)
-    assert result.camera.batch_shape == source.batch_shape
-    assert result.camera.image_size == source.image_size
+    assert (result.camera.batch_shape, result.camera.image_size) == (source.batch_shape, source.image_size)
     assert bool((result.rms <= result.max_error).all())
     assert bool(((result.valid_fraction >= 0) & (result.valid_fraction <= 1)).all())
     assert bool(((result.max_angle >= 0) & (result.max_angle <= math.pi + 1e-9)).all())
@@ -100,7 +99,7 @@ CLOSE = [
     (lambda: golden("kannala_brandt__auto_190deg_a"), "brown_conrady", {"count": 8, "max_angle": radians(75)}, 0.1),
     (lambda: make("brown_conrady", torch.tensor([500.0, 500, 320, 240]), torch.tensor([-0.1, 0.02, 0, 0]),
                   image_size=SIZE), "kannala_brandt", {}, 0.01),
-    (lambda: golden("brown_conrady__d5_dms_ir_62deg"), "fisheye624", {}, 0.1),
+    (lambda: golden("brown_conrady__d5_dms_ir_62deg").crop(300, 700, 200, 300).hflip(), "fisheye624", {}, 0.1),
     (lambda: golden("brown_conrady__d4_smartphone_tele"), "fisheye62", {}, 0.1),
     (lambda: golden("pinhole__smartphone_main"), "kannala_brandt", {}, 0.01),
     (lambda: golden("kannala_brandt__dms_130deg_a"), "brown_conrady", {"count": 8}, 1.0),
@@ -268,14 +267,6 @@ def test_the_new_camera_learns_as_the_old_one_did():
     half = fisheye().float().convert("fisheye62")
     assert half.camera.intrinsics.dtype == torch.float64
     assert bool(half.exact)
-
-
-def test_edited_images():
-    source = golden("brown_conrady__d5_dms_ir_62deg")
-    for edited in (source.crop(300, 700, 200, 300), source.hflip(), source.resize(100, 160)):
-        result = edited.convert("fisheye624")
-        check(edited, result)
-        assert float(result.max_error) < 0.1
 
 
 @pytest.mark.parametrize(

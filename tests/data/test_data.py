@@ -27,7 +27,6 @@ def augmentation(**options):
 
 
 def rows(count=4, ragged=False):
-    """A list of rows."""
     rng = np.random.default_rng(0)
     return [
         {
@@ -278,7 +277,6 @@ def test_wrong_batches_are_told():
 
 
 def write_shards(folder, some, count):
-    """Shards of samples, taken in turns."""
     paths = [folder / f"{count}-{i}.tar" for i in range(count)]
     for i, path in enumerate(paths):
         with wds.TarWriter(str(path)) as tar:

@@ -48,8 +48,6 @@ def assert_as_by_one_process(found, function):
 
 
 class Where:
-    """Says which process a batch was in; the first one waits for the second."""
-
     def __init__(self, folder):
         self.folder = Path(folder)
 

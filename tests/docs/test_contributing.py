@@ -26,7 +26,6 @@ class Step(NamedTuple):
 
 
 def steps(page):
-    """Of a page, in order."""
     text = (ROOT / "docs" / "contributing" / page).read_text()
     blocks = re.findall(r'^```(\w+)(?: title="(.*?)")?\n(.*?)^```$', text, re.M | re.S)
     assert len(blocks) == len(re.findall("^```", text, re.M)) / 2

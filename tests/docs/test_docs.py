@@ -47,7 +47,6 @@ def commands():
 
 @functools.cache
 def photographs():
-    """Of a board by a fisheye."""
     turns = ((0.5 * np.cos(a), 0.5 * np.sin(a), 0.1) for a in np.linspace(0, 6, 6))
     places = ((0.06 * np.sin(a) - 0.1, 0.05 * np.cos(a) - 0.07, 0.2 + 0.01 * a) for a in np.linspace(0, 6, 6))
     return [photograph(Chessboard(9, 6, 0.024), fisheye(), *pose)[0] for pose in zip(turns, places, strict=True)]
@@ -70,7 +69,6 @@ def write_calibration_data():
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch, request):
-    """The current folder, with the files that the pages speak of."""
     torch.manual_seed(0)
     monkeypatch.chdir(tmp_path)
     Path("examples").symlink_to(ROOT / "examples")

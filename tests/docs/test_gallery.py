@@ -19,7 +19,6 @@ LARGEST = 150_000  # bytes of an image
 
 @pytest.fixture(scope="module")
 def pages():
-    """The module by which images are made from pages."""
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(DOCS)
         return importlib.import_module("drawings.pages")

@@ -27,7 +27,6 @@ def code(path):
 
 
 def command(text):
-    """What a line of Jupyter's, !camtorch ..., does."""
     assert main(shlex.split(text)) == 0, text
 
 

@@ -55,7 +55,6 @@ def project(tmp_path_factory):
 
 
 def run(project, checker, *arguments):
-    """Return what a checker prints in the project's environment."""
     if importlib.util.find_spec(checker) is None:
         pytest.skip(f"{checker} is not installed; .ci/run installs it")
     kept = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "MYPYPATH")}

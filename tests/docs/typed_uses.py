@@ -16,7 +16,6 @@ Pair = tuple[Tensor, Tensor]
 
 
 def cameras() -> ct.KannalaBrandt:
-    """Plain values of any kind go in, and what comes out is of the same class."""
     image = np.zeros((480, 640, 3), np.uint8)
     camera = ct.KannalaBrandt([300, 300.0, 320, 240], np.zeros(4), image_size=image.shape[:2])
     ct.Pinhole((300, 300, 320, 240), image_size=torch.rand(3, 480, 640).shape[-2:])
@@ -47,7 +46,6 @@ def cameras() -> ct.KannalaBrandt:
 
 
 def files(folder: Path) -> None:
-    """Paths are strings or Paths."""
     camera = ct.Pinhole.from_fov(60, image_size=(480, 640))
     ct.save(camera, folder / "camera.json")
     rig = ct.load(str(folder / "camera.json"))
@@ -61,7 +59,6 @@ def files(folder: Path) -> None:
 
 
 def warps(camera: ct.Camera) -> None:
-    """Images stay tensors, and calls have the types of `forward`."""
     images = torch.rand(1, 3, 480, 640)
     dewarp = ct.Dewarp(camera, projection="cylindrical", image_size=images.shape[-2:])
     assert_type(dewarp(images), Tensor)
@@ -88,8 +85,6 @@ def warps(camera: ct.Camera) -> None:
 
 
 class Shifted(ct.augment.Augmentation):
-    """An augmentation of a user's own."""
-
     def __init__(self, shift: tuple[float, float] = (-5, 5), **options: Any):
         super().__init__({"shift": ct.augment.Range(*shift)}, **options)
 
@@ -100,7 +95,6 @@ class Shifted(ct.augment.Augmentation):
 
 
 def augmentations(camera: ct.Camera) -> None:
-    """Samples are dicts, and so is what comes out."""
     camera = camera.requires_grad_(False)
     augment = ct.augment.RandomCamera("dms130", fov="source", yaw=5, pitch=(-5, 5), camera=camera)
     sample = {"image": torch.rand(2, 3, 480, 640), "keypoints": torch.rand(2, 5, 2) * 400}

@@ -121,7 +121,7 @@ class Leaning(ct.KannalaBrandt):
 
 
 def batch_of(key, size, count=12):
-    """A batch of batch_of: 'mild', as real ones are, or up to the 'plausible' or the 'wild' limits of the laws."""
+    """A batch of lenses: 'mild', as real ones are, or up to the 'plausible' or the 'wild' limits of the laws."""
     generator = torch.Generator().manual_seed(count)
     names = one(key).distortion_names
     limits = torch.tensor([limits_of(key, name, size == "wild") for name in names], dtype=torch.float64).view(-1, 2)

@@ -5,7 +5,7 @@ import math
 
 import numpy as np
 import pytest
-from rigs import FILES, float64, load
+from rigs import FILES, float64, load, tables
 
 import camtorch as ct
 
@@ -13,7 +13,6 @@ POINT = np.array([0.3, -0.2, 1.5])
 
 
 def rotation_of(w, x, y, z):
-    """The matrix of a quaternion."""
     w, x, y, z = np.array([w, x, y, z]) / np.linalg.norm([w, x, y, z])
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     return np.eye(3) + 2 * w * cross + 2 * cross @ cross
@@ -25,7 +24,6 @@ def seen(rig, name, point):
 
 
 def changed(tmp_path, name, *changes):
-    """A sample with some of its text exchanged."""
     text = (FILES / name).read_text()
     for old, new in changes:
         assert old in text
@@ -104,46 +102,8 @@ def test_sensors_and_images_of_metashape_that_are_called_the_same_get_their_ids(
     assert str(with_text) == str(load("metashape_cameras.xml"))
 
 
-REFUSED = {
-    "metashape_calibration.xml": [
-        ("<k1>", "<b2>-0.3</b2><k1>", r"calibration\.b2: -0\.3, which no model here has"),
-        ("<k1>", "<k4>0.1</k4><k1>", r"calibration\.k4: 0\.1, which no model here has"),
-        (">frame<", ">spherical<", "'spherical' is not known here; known are equidistant"),
-        ("<f>3239", "<f>nan", r"calibration\.f: 'nan\.2350850187408' is no finite number"),
-        ("</k1>", "", "line [0-9]+: not XML: mismatched tag"),
-        ("<calibration>", "<!DOCTYPE x []><calibration>", "a document type|<calibration> wh"),
-    ],
-    "metashape_cameras.xml": [
-        ("0.5 0 0 -1 -0.25", "0.5 0 0 2 -0.25", r"camera fisheye\.jpg: no rotation"),
-        ("2 0 0 0 1<", "2 0 0 0<", r"camera fisheye\.jpg\.transform: 15 numbers where 16"),
-        (">0.12354192447331316<", ">1e300<", r"component\.transform: a number beyond 1e\+100"),
-        ("<covariance>", "<corrections><a/></corrections><covariance>", "corrections beside"),
-        ("</document>", "<chunk/></document>", "2 chunks; one is read"),
-        ('label="fisheye.jpg">', 'label="fisheye.jpg">x', r"camera fisheye\.jpg: not keys and values, but 'x'"),
-    ],
-    "woodscape.json": [
-        ("radial_poly", "other", r"intrinsic\.model: 'other' is not known here"),
-        ("339.749", "0", r"intrinsic\.k1: 0, where the focal length belongs"),
-        ("0.5946", "5.946", "extrinsic: a quaternion of length"),
-    ],
-    "gyroflow.json": [
-        ('"digital_lens": null', '"digital_lens": "gopro_superview"', "digital_lens: 'gopro_superview'"),
-        ('"distortion_model": null', '"distortion_model": "ptlens"', "distortion_model: 'ptlens' is not"),
-        ('_horizontal_stretch": 1.0', '_horizontal_stretch": 1.33', "1.33, which no model"),
-    ],
-    "camodocal_kitti360.yaml": [
-        ("MEI", "SCARAMUZZA", "model_type: 'SCARAMUZZA' is not known here; known are KANNALA"),
-        ("   xi: 2", "   xi: x2", r"mirror_parameters\.xi: .* is no finite number"),
-    ],
-    "ncore_ftheta.json": [
-        ("principal_point", "middle", r"^[^:]*: camera_model_parameters\.principal_point: mis"),
-        ('_parameters": null', '_parameters": {"horizontal_poly": [0]}', r": .* a windshield, .*leaving-0\.3\.md"),
-    ],
-}
-
-
 @pytest.mark.parametrize(
-    ("name", "old", "new", "reason"), [(name, *case) for name, cases in REFUSED.items() for case in cases]
+    ("name", "old", "new", "reason"), [(name, *row) for name, rows in tables(FILES / "refused.txt") for row in rows]
 )
 def test_what_is_refused(name, old, new, reason, tmp_path):
     with pytest.raises(ct.CameraFileError, match=reason):

@@ -235,7 +235,6 @@ MB = 1 << 20
 
 
 def filled(unit, size=6 * MB, start=b"", end=b""):
-    """A content of about that size, of one piece again and again."""
     return start + unit * (size // len(unit)) + end
 
 

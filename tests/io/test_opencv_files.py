@@ -98,7 +98,6 @@ avg_reprojection_error: 0.2
 
 
 def test_arrays_of_one_dimension(tmp_path):
-    """As OpenCV 5 writes them."""
     yaml = f"%YAML:1.0\n---\nK: {K}\nD: !!opencv-nd-matrix\n   sizes: [ 5 ]\n   dt: d\n   data: [ 0.3, 0.1, 0, 0, 0 ]\n"
     whole = {"K": K, "D": {"type_id": "opencv-nd-matrix", "sizes": [5], "dt": "d", "data": [0.3, 0.1, 0, 0, 0]}}
     xml = (

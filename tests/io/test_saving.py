@@ -8,7 +8,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from rigs import SUFFIXES, assert_same, float64, load
+from rigs import FILES, SUFFIXES, assert_same, float64, load
 
 import camtorch as ct
 
@@ -258,24 +258,11 @@ def test_what_cannot_be_saved_is_told(rig, arguments, error, told):
 
 # -- what versions before this one saved
 
-FIRST_FILE = """{
-  "camtorch": 1,
-  "cameras": {
-    "left": {
-      "model": "brown_conrady",
-      "intrinsics": [ 300.5, 301.25, 319.5, 239.5 ],
-      "distortion_names": [ "k1", "k2", "p1", "p2", "k3" ],
-      "distortion": [ -0.25, 0.125, 0.0625, -0.03125, 0.5 ],
-      "image_size": [ 480, 640 ]
-    }
-  },
-  "extrinsics": { "left": { "rotation": [ 0.5, 0.0, 0.0 ], "translation": [ 0.0, 0.25, 0.0 ] } }
-}"""
+FIRST_FILE = (FILES / "camtorch_0.2.0.json").read_text()
 
 
-def test_a_file_of_version_0_2_0_loads(tmp_path):
-    (tmp_path / "rig.json").write_text(FIRST_FILE)
-    rig = ct.load(tmp_path / "rig.json")
+def test_a_file_of_version_0_2_0_loads():
+    rig = load("camtorch_0.2.0.json")
     lens = camera(distortion=[-0.25, 0.125, 0.0625, -0.03125, 0.5], core=[300.5, 301.25, 319.5, 239.5])
     pose = ct.Extrinsics(float64([0.5, 0, 0]), float64([0, 0.25, 0]))
     assert_same(rig, ct.Rig({"left": lens}, {"left": pose}))

@@ -208,7 +208,6 @@ def between_pinholes(source, target):
 
 
 def across_the_seam():
-    """Of a panorama of a whole turn, seen backwards."""
     panorama = ct.Equirectangular([256 / math.tau, 256 / math.tau, 127.5, 63.5], image_size=(128, 256)).double()
     view = ct.Pinhole.from_fov(60, image_size=(160, 200)).double()
     return ct.Warp(panorama, view, torch.diag(torch.tensor([-1.0, 1, -1])).double())

@@ -13,7 +13,6 @@ EPS = torch.finfo(torch.float64).eps
 
 
 def beyond(error, limit):
-    """The largest error in units of its limit."""
     return (error / limit).max().item()
 
 

@@ -575,15 +575,13 @@ def test_batch_equals_loop(key, batch, dims):
     intrinsics, distortion = single.intrinsics.detach() * draw, single.distortion.detach() / draw
     cameras = [make(key, *numbers) for numbers in zip(intrinsics, distortion, strict=True)]
     batched = make(key, intrinsics.view(*batch, 4), distortion.view(*batch, distortion.shape[-1]))
-    assert batched.batch_shape == batch
-    assert batched.K.shape == (*batch, 3, 3)
+    assert (batched.batch_shape, batched.K.shape) == (batch, (*batch, 3, 3))
     points = torch.rand(*batch, *dims, 3, generator=generator, dtype=torch.float64) - 0.5
     points[..., 2] += 0.8
     for method, values in (("project", points), ("unproject", 480 * (points[..., :2] + 0.5))):
         results, valid = getattr(batched, method)(values)
         assert results.shape == (*batch, *dims, 5 - values.shape[-1])
-        assert valid.shape == (*batch, *dims)
-        assert valid.dtype == torch.bool
+        assert (valid.shape, valid.dtype) == ((*batch, *dims), torch.bool)
         loop = [getattr(c, method)(v) for c, v in zip(cameras, values.reshape(count, *dims, -1), strict=True)]
         torch.testing.assert_close(
             results.reshape(count, *dims, -1), torch.stack([r for r, _ in loop]), rtol=1e-13, atol=1e-13
@@ -653,8 +651,7 @@ def test_edits(key, name):
         return torch.cat((across * torch.tensor(signs), rays[..., 2:]), -1)
 
     edited = edit(camera)
-    assert type(edited) is type(camera)
-    assert edited.image_size == size
+    assert (type(edited), edited.image_size) == (type(camera), size)
     assert (edited.intrinsics[..., :2] > 0).all()
     points, lattice = fan(end_degrees(camera)), pixel_lattice(camera)
     pixels, valid = camera.project(points)
@@ -708,8 +705,7 @@ def test_contains_the_outer_pixel_edges(key):
 def test_pixel_grid_and_rays(key):
     camera = spread(key).resize(6, 8)
     grid = camera.pixel_grid()
-    assert grid.shape == (6, 8, 2)
-    assert grid.dtype == torch.float64
+    assert (grid.shape, grid.dtype) == ((6, 8, 2), torch.float64)
     assert grid[2, 5].tolist() == [5, 2]
     assert grid[-1, -1].tolist() == [7, 5]
     assert camera.contains(grid).all()
@@ -731,7 +727,6 @@ def test_pixel_grid_and_rays(key):
 @settings(max_examples=2)
 @given(data=st.data())
 def test_coefficients_left_out_are_zeros(key, data):
-    """A camera with fewer coefficients is the one with zeros in their place."""
     camera = data.draw(drawn(key, False))
     count = len(camera.distortion_names)
     if key == "tabulated":  # where zeros are another table

@@ -17,14 +17,6 @@ def camera(model, *coefficients, scale=1.0):
     return model(intrinsics, *([torch.tensor(coefficients, dtype=torch.float64)] if coefficients else []))
 
 
-@pytest.mark.parametrize("model", [ct.LatLon, ct.TransverseCylindrical])
-def test_rows_of_transverse_panoramas_are_planes_through_the_baseline(model):
-    rays = torch.nn.functional.normalize(fan(175), dim=-1)
-    moved = rays * 3 + torch.tensor([0.7, 0, 0]).double()
-    rows, others = (camera(model).project(points)[0][:, 1] for points in (rays, moved))
-    torch.testing.assert_close(rows, others, rtol=0, atol=1e-10)
-
-
 def test_latlon_is_a_file_of_mrcal(tmp_path):
     path = tmp_path / "panorama.cameramodel"
     ct.save(ct.LatLon(INTRINSICS, image_size=(480, 640)), path)

@@ -149,8 +149,7 @@ def test_copies(key, copied):
     points = fan(100, 5, 7)
     expected = camera.project(points)
     again = copied(camera)
-    assert type(again) is type(camera)
-    assert again.image_size == camera.image_size
+    assert (type(again), again.image_size) == (type(camera), camera.image_size)
     assert again.distortion_names == camera.distortion_names
     assert [p.requires_grad for p in again.parameters()] == [p.requires_grad for p in camera.parameters()]
     predicted = make(key, *(t.detach().requires_grad_() * 1 for t in (camera.intrinsics, camera.distortion)))

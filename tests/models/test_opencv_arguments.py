@@ -1,8 +1,6 @@
 """What OpenCV's calibrations hand out is taken for what it is, whatever its shape, or refused with a hint."""
 
 import itertools
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -118,33 +116,6 @@ def test_a_rotation_matrix_is_no_three_vectors(batch):
     predicted = POSE(T(RVEC), [0.0, 0, 0]).matrix()[:3, :3].detach().requires_grad_()
     POSE(predicted, torch.zeros(3))(torch.ones(3)).sum().backward()
     assert predicted.grad.any()
-
-
-def test_arrays_of_points():
-    camera = ct.KannalaBrandt.from_matrix(K, coefficients(4), image_size=(480, 640))
-    points = np.random.default_rng(0).normal((0, 0, 4), size=(7, 1, 3))
-    pixels, valid = camera.project(points)
-    assert pixels.shape == (7, 1, 2)
-    assert pixels.dtype == torch.float64
-    assert valid.shape == (7, 1)
-    rays, _ = camera.unproject(pixels.detach().numpy())
-    torch.testing.assert_close(rays.detach(), torch.tensor(points / np.linalg.norm(points, axis=-1, keepdims=True)))
-    whole = np.array([[[320, 240]], [[5, 7]]])
-    torch.testing.assert_close(camera.unproject(whole)[0], camera.unproject(whole.astype(np.float64))[0])
-
-
-@pytest.mark.slow
-def test_the_first_camera_does_not_import_sympy():
-    code = """
-import sys, torch, camtorch as ct
-camera = ct.KannalaBrandt([300, 300, 319.5, 239.5], image_size=(480, 640))
-layer = torch.nn.Sequential(ct.Extrinsics([0, 0, 0.1], [0, 0, 0]), camera)
-layer(torch.rand(10, 3))
-camera.rays()
-ct.Dewarp(camera.requires_grad_(False))(torch.rand(1, 3, 480, 640))
-assert "sympy" not in sys.modules
-"""
-    subprocess.run([sys.executable, "-c", code], check=True)
 
 
 def test_arrays_of_any_layout_are_numbers():

@@ -42,8 +42,7 @@ def test_parts_of_a_batch_are_its_cameras(key):
     places = torch.arange(6).view(2, 3)
     for index in INDICES:
         part = batch[index]
-        assert type(part) is type(batch)
-        assert part.image_size == SIZE
+        assert (type(part), part.image_size) == (type(batch), SIZE)
         assert part.distortion_names == batch.distortion_names
         found = part.project(points.expand(*part.batch_shape, *points.shape))
         for mine, whole in zip(found, expected, strict=True):
@@ -195,8 +194,7 @@ MADE = {
 def test_what_is_made_of_a_camera_has_its_numbers_and_learns_where_it_does(key, way, learns):
     camera = camera_of(key, torch.float64, learns)
     made = MADE[way](camera)
-    assert type(made) is type(camera)
-    assert made.image_size == SMALL
+    assert (type(made), made.image_size) == (type(camera), SMALL)
     assert made.distortion_names == camera.distortion_names
     assert made.intrinsics.dtype == torch.float64
     assert torch.equal(numbers(made), numbers(camera).expand_as(numbers(made)))
@@ -215,8 +213,7 @@ def test_numbers_are_replaced(key, learns):
     camera = camera_of(key, torch.float64, learns)
     new = camera.replace(intrinsics=[30.0, 31.0, 40.0, 28.0], distortion=camera.distortion.tolist())
     assert new.intrinsics.tolist() == [30.0, 31.0, 40.0, 28.0]
-    assert new.intrinsics.dtype == torch.float64
-    assert new.intrinsics.requires_grad == learns
+    assert (new.intrinsics.dtype, new.intrinsics.requires_grad) == (torch.float64, learns)
     assert torch.equal(new.distortion, camera.distortion)
     batch = camera.replace(intrinsics=torch.ones(3, 4, dtype=torch.float64))
     assert batch.batch_shape == (3,)

@@ -114,7 +114,6 @@ def copy(folder):
 
 
 def python(folder, *words, **environment):
-    """What a fresh process that has camtorch in `folder` prints."""
     environment = {k: v for k, v in os.environ.items() if k != "CAMTORCH_NATIVE"} | environment
     words = [sys.executable, "-W", "error", *words]
     environment["PYTHONPATH"] = str(folder)
@@ -123,7 +122,6 @@ def python(folder, *words, **environment):
 
 
 def version(folder, **environment):
-    """What `camtorch --version` prints, without an import of torch."""
     return python(folder, "-m", "camtorch", "--version", **environment)
 
 

@@ -91,8 +91,7 @@ def between(grid, source):
 
 
 def compare(result, expected, mode, unsure, span):
-    assert result.dtype == expected.dtype
-    assert result.shape == expected.shape
+    assert (result.dtype, result.shape) == (expected.dtype, expected.shape)
     if not result.numel():
         return
     unsure = unsure.unsqueeze(1).expand_as(result)
@@ -339,8 +338,6 @@ def images_of_floats():
 
 
 class Wrapped(torch.Tensor):
-    """Whose values are elsewhere."""
-
     @staticmethod
     def __new__(cls, inner):
         return torch.Tensor._make_wrapper_subclass(cls, inner.shape, dtype=inner.dtype, strides=inner.stride())
@@ -446,7 +443,6 @@ def threads(count):
 
 
 def samples(count=2, seed=0):
-    """Images large enough to be shared out in tiles."""
     return pixels(torch.uint8, (count, 3, 480, 640), seed)
 
 
@@ -515,7 +511,7 @@ def told(key):
 
 torch.set_num_threads(1)
 cases = [("kept", 8, (720, 1280), *rest) for rest in itertools.product((torch.uint8, torch.float32), (0.01, 0.0))]
-cases += [("fresh", 1, (3000, 4000), torch.uint8, 0.01)]
+cases += [(kind, 1, (3000, 4000), torch.uint8, 0.01) for kind in ("fresh", "strips")]
 for layout, case in itertools.product((torch.contiguous_format, torch.channels_last), cases):
     kind, count, size, dtype, tolerance = case
     intrinsics = [size[1] / 3, size[1] / 3, size[1] / 2, size[0] / 2]
@@ -528,8 +524,8 @@ for layout, case in itertools.product((torch.contiguous_format, torch.channels_l
     before = told("VmRSS")
     with open("/proc/self/clear_refs", "w") as file:
         file.write("5")
-    result = warp(images)
-    print(layout, case, (told("VmHWM") - before) / result.nbytes)
+    result = warp(images) if kind != "strips" else sum(1 for _ in warp.strips(images, rows=64))
+    print(layout, case, (told("VmHWM") - before) / images.nbytes)
     del result, images
 """
 
@@ -540,7 +536,7 @@ def test_the_peak_of_memory_is_the_result():
     # what is given back is not to count as room for what comes
     here = os.environ | {"MALLOC_TRIM_THRESHOLD_": "0", "MALLOC_MMAP_THRESHOLD_": "65536"}
     done = subprocess.run([sys.executable, "-c", PEAK], capture_output=True, text=True, env=here, check=True)
-    parts = [float(line.split()[-1]) for line in done.stdout.splitlines()]
-    assert len(parts) == 10
-    assert max(parts) <= 1.1, done.stdout
-    assert min(parts) > 0.9, done.stdout  # it is measured
+    parts = {line.rpartition(" ")[0]: float(line.split()[-1]) for line in done.stdout.splitlines()}
+    assert len(parts) == 12
+    for what, part in parts.items():  # of strips a few
+        assert 0.2 < part < 0.8 if "strips" in what else 0.9 < part <= 1.1, done.stdout

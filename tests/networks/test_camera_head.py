@@ -31,7 +31,6 @@ def made(key, features, **options):
 
 
 def random(layer, scale, generator):
-    """With random weights, whose numbers have that size."""
     for parameter in layer.linear.parameters():
         torch.nn.init.normal_(parameter, std=scale / math.sqrt(layer.linear.in_features + 1), generator=generator)
     return layer

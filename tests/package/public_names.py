@@ -166,7 +166,6 @@ def of_extras():
 
 
 def names():
-    """Return all of them, sorted."""
     return sorted({*of_modules(), *of_front_ends(), *of_commands(), *of_formats(), *of_extras()})
 
 

@@ -14,7 +14,6 @@ ENVIRONMENT = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
 
 
 def python(code, *words, expect=0):
-    """What a fresh process prints."""
     done = subprocess.run([sys.executable, "-c", code, *words], capture_output=True, text=True, env=ENVIRONMENT)
     assert done.returncode == expect, done.stderr
     return done.stdout + done.stderr
@@ -54,11 +53,19 @@ focal = torch.nn.Parameter(torch.ones(4))
 function = torch.compile(lambda p: ct.Pinhole(2 * focal).project(p)[0], backend="eager", fullgraph=True)
 print(function(torch.ones(3))[0].item())
 """: "4.0",
+    """
+import sys, torch, camtorch as ct
+camera = ct.KannalaBrandt([300, 300, 319.5, 239.5], image_size=(480, 640))
+torch.nn.Sequential(ct.Extrinsics([0, 0, 0.1], [0, 0, 0]), camera)(torch.rand(10, 3))
+camera.rays()
+ct.Dewarp(camera.requires_grad_(False))(torch.rand(1, 3, 480, 640))
+print("sympy" in sys.modules)
+""": "False",
 }
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("code", FIRST_USES, ids=["names", "compiled"])
+@pytest.mark.parametrize("code", FIRST_USES, ids=["names", "compiled", "no sympy"])
 def test_what_is_used_first_may_be_anything(code):
     assert python(code).strip() == FIRST_USES[code]
 

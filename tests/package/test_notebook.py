@@ -15,7 +15,6 @@ NUMBERS = 100.0, 100.0, 99.5, 79.5
 
 
 def shown(camera):
-    """The text, and the paths of the image; None without one."""
     text, svg = re.fullmatch(
         r"<pre[^>]*>(.*?)</pre>(?:(<svg.*</svg>)<div>.*</div>)?", camera._repr_html_(), re.S
     ).groups()

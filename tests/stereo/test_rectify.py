@@ -266,7 +266,6 @@ def drcals_pair():
 
 
 def rectification(name):
-    """Ours, with the image of theirs."""
     case = CASES[name]
     width, height = case["width_height"]
     if name == "latlon":

@@ -37,7 +37,6 @@ def drawn(key, which, seed):
 
 
 def lenses_of(key):
-    """A preset, real calibrations, and drawn ones."""
     found = [preset(key)]
     if key in CALIBRATIONS:
         *numbers, size = CALIBRATIONS[key]
@@ -61,7 +60,6 @@ def asked(camera):
 
 
 def described(camera):
-    """As the page takes it."""
     pixels, points = asked(camera)
     numbers = {"intrinsics": camera.intrinsics.tolist(), "distortion": camera.distortion.tolist()}
     return {"model": camera.key, **numbers, "pixels": pixels.tolist(), "points": points.tolist()}

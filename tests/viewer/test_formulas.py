@@ -93,7 +93,6 @@ def test_a_photograph_is_kept_at_a_moderate_size(kind, tmp_path):
 
 
 def unpacked(packed):
-    """The columns of integers, as the page reads them."""
     planes = zlib.decompress(base64.b64decode(packed["numbers"]), -15)
     columns, at, count = [], 0, packed["count"]
     for width in packed["widths"]:

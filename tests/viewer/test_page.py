@@ -81,7 +81,6 @@ def fisheye():
 
 
 def photograph(path, height=240, width=320):
-    """Smooth, so that ways to interpolate agree."""
     v, u = np.mgrid[:height, :width].astype(float)
     planes = [np.sin(u / 25), np.cos(v / 20), np.sin((u + v) / 30)]
     Image.fromarray((127.5 + 120 * np.stack(planes, -1)).astype(np.uint8)).save(path)
@@ -99,8 +98,7 @@ def test_every_model_is_shown_by_its_address(key, opened):
     assert files
     for name, text in files:
         loaded = read(name, text)
-        assert type(loaded) is type(camera)
-        assert loaded.image_size == camera.image_size
+        assert (type(loaded), loaded.image_size) == (type(camera), camera.image_size)
         torch.testing.assert_close(loaded.intrinsics.detach(), camera.intrinsics.detach(), rtol=0, atol=1e-11)
         torch.testing.assert_close(loaded.distortion.detach(), camera.distortion.detach(), rtol=0, atol=0)
 

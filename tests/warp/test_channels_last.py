@@ -25,7 +25,6 @@ def camera(size=SIZE):
 
 
 def colours(channels=3, dtype=np.uint8, size=SIZE):
-    """(H, W, C) of random numbers."""
     return np.random.default_rng(0).integers(0, 250, (*size, channels)).astype(dtype)
 
 

@@ -105,8 +105,7 @@ def test_no_channels_and_no_images_make_none(mode, options):
     for dtype in (torch.float32, torch.uint8, torch.int64):
         for shape in ((2, 0), (0, 3), (0, 0)):
             result = ct.Warp(fisheye(), pinhole(), mode=mode, **options)(torch.zeros(*shape, *SIZE, dtype=dtype))
-            assert result.shape == (*shape, *SIZE)
-            assert result.dtype == dtype
+            assert (result.shape, result.dtype) == ((*shape, *SIZE), dtype)
 
 
 def test_masks_and_grids_may_be_changed():

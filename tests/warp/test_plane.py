@@ -77,8 +77,7 @@ def test_beyond_the_horizon_nothing_is_valid():
 def test_a_chessboard_on_the_floor_lies_on_its_grid(dtype):
     camera, extrinsics = wide((1080, 1440)), above_ground()
     eye = ct.BirdsEye(camera.to(dtype), extrinsics.to(dtype), x=(-2, 3), y=(0, 4), resolution=0.01)
-    assert eye.target.image_size == (400, 500)
-    assert eye.grid_points.shape == (400, 500, 2)
+    assert (eye.target.image_size, eye.grid_points.shape) == ((400, 500), (400, 500, 2))
     torch.testing.assert_close(
         eye.grid_points[0, 0].double(), torch.tensor([-1.995, 3.995]).double(), rtol=0, atol=1e-6
     )

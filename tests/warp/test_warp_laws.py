@@ -193,8 +193,7 @@ def test_images_keep_their_dtype_and_integers_have_no_graph(kind, dtype):
     learning = KINDS[kind][0](numbers(kind)).requires_grad_(True)
     images = (200 * smooth()).abs().to(dtype)
     result, exact = made(learning, images) if kind != "depth" else learning(images, DEPTH)[0], None
-    assert result.dtype == dtype
-    assert result.requires_grad == dtype.is_floating_point
+    assert (result.dtype, result.requires_grad) == (dtype, dtype.is_floating_point)
     exact = made(still(kind), images.double()) if kind != "depth" else still(kind)(images.double(), DEPTH)[0]
     exact = (exact >= 0.5).double() if dtype == torch.bool else exact
     bound = {torch.bool: 0, torch.float16: 0.2, torch.float32: 0.02}.get(dtype, 0.51)
