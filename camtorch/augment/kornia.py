@@ -303,25 +303,16 @@ class _Random(CameraAugmentation):
 
     _wraps: Callable[..., Augmentation]
 
-    def __init__(
-        self,
-        *given: Camera | PresetName | str,
-        camera: Camera | None = None,
-        p: float | None = None,
-        p_batch: float = 1.0,
-        same_on_batch: bool = False,
-        keepdim: bool = False,
-        **options: Any,
-    ):
+    def __init__(self, *given: Camera | PresetName | str, camera: Camera | None = None, **options: Any):
         name = type(self).__name__
         first, own = (given[0], given[1:]) if camera is None and given else (camera, given)
         if not isinstance(first, Camera):
-            example, got = f"{name}(camera)", type(first).__name__
-            if isinstance(first, str):
-                example, got = f"{name}(camera, {first!r})", repr(first)
-            raise TypeError(f"{name}: camera must be the Camera of the images and comes first: {example}; got {got}")
-        made = self._wraps(*own, **options)
-        super().__init__(made, first, p=p, p_batch=p_batch, same_on_batch=same_on_batch, keepdim=keepdim)
+            preset, got = (f", {first!r}", repr(first)) if isinstance(first, str) else ("", type(first).__name__)
+            raise TypeError(
+                f"{name}: camera must be the Camera of the images and comes first: {name}(camera{preset}); got {got}"
+            )
+        theirs = {key: options.pop(key) for key in ("p", "p_batch", "same_on_batch", "keepdim") if key in options}
+        super().__init__(self._wraps(*own, **options), first, **theirs)
 
 
 def _named(wraps: type[Augmentation]) -> type[_Random]:
@@ -447,6 +438,8 @@ def _fields(container: Any, sample: Sample, ours: list[CameraAugmentation]) -> t
     owner, own = type(container).__name__, {n: k for one in ours for n, k in one.augmentation.fields.items()}
     tables = {n for one in ours if one.augmentation.mirroring for n in one.augmentation.mirroring.by_name}
     given = {name: sample[name] for name in container._read_datakeys_from_dict([*sample])[1] if name not in OWN}
+    if flags := [name for name in sample if name.endswith("_valid") and name not in given]:
+        raise ValueError(f"{owner}: kornia would not read {flags[0]} as flags. Use the augmentation's keypoints_valid")
     kinds = {n: kind for n, v in given.items() if v is not None and (kind := kind_of(n, v, own, owner)) is not None}
     known = CameraAugmentation, IntensityAugmentationBase2D
     theirs = [

@@ -145,8 +145,8 @@ class Mirroring:
         self.key = self._named, self._one, self.lateral, self.swap_sides
 
     def order(self, name: str, kind: str | None, count: int) -> tuple[int, ...] | None:
-        """Return the order of `count` landmarks of a field in a mirror, or None if they keep theirs."""
-        table = self._named.get(name) if self._named is not None else self._one
+        """Return the order of `count` landmarks of a field in a mirror, or None; a name may have a path before it."""
+        table = self._named.get(name.rpartition("/")[2]) if self._named is not None else self._one
         if table is None:
             meant = _FACES.get(count) if self._named is None and kind in _HOLD[:2] else None
             if meant is not None and count not in _told:

@@ -717,7 +717,8 @@ class SampleTransform(nn.Module):
         """Let landmarks and fields of a moved sample change places where they are seen in a mirror."""
         mirroring = cast("Mirroring", self.mirroring)
         sides = mirroring.sides(named)  # that none lacks the other, whatever was drawn
-        kept = {name: (None, moved[name]) for name in mirroring.by_name if name in moved and name not in named}
+        others = (name for name in moved if name.rpartition("/")[2] in mirroring.by_name and name not in named)
+        kept = {name: (None, moved[name]) for name in others}
         for name, (_, value) in kept.items():  # what says something of each landmark, and does not move itself
             several = isinstance(value, (list, tuple)) and all(isinstance(v, (Tensor, np.ndarray)) for v in value)
             if not several and not isinstance(value, (Tensor, np.ndarray)):

@@ -22,7 +22,7 @@ from camtorch.augment.augmentation import Augmentation, camera_of_sample, check_
 from camtorch.augment.change import Change
 from camtorch.augment.numpy import as_array
 from camtorch.augment.numpy import as_tensor as as_planes
-from camtorch.augment.sample import IMAGES, KINDS, OWN, Sample, Single, as_tensor, kind_of, on_samples
+from camtorch.augment.sample import IMAGES, KEEP, KINDS, OWN, Sample, Single, as_tensor, kind_of, on_samples
 from camtorch.camera import Camera
 from camtorch.warp.boxes import lattice_of, turned
 
@@ -158,7 +158,7 @@ class Transform(v2.Transform):
             unknown.pop(first, None)
         for problem in unknown.values():
             raise problem
-        return {i: k for i, k in kinds.items() if k or (isinstance(flat[i][1], _HELD) and names[i] not in fields)}
+        return {i: kind for i, kind in kinds.items() if kind or isinstance(flat[i][1], _HELD)}
 
 
 def _name(path: Any) -> str:
@@ -178,15 +178,12 @@ def _moved(own: Augmentation, change: Change, fields: list[tuple[str, str | None
     moved: Sample = {key: value for key, _, value in fields}
     for lead in dict.fromkeys(leads.values()):
         group = [field for field in fields if leads.get(field[0].removesuffix("_valid"), ()) == lead]
-        sample, kinds = {key: value for key, _, value in group}, {key: kind for key, kind, _ in group if kind}
-        if lead:
-            count = math.prod(lead)
-            frames = Change(count, [replace(part, rows=None) for part in change.parts])
-            new = own.moved_by(frames, {k: v.reshape(count, *v.shape[len(lead) :]) for k, v in sample.items()}, kinds)
-        else:
-            new = own.moved_by(change, Single(sample), kinds)
+        sample, kinds = {key: value for key, _, value in group}, {key: kind or KEEP for key, kind, _ in group}
+        frames = Change(math.prod(lead), [replace(part, rows=None) for part in change.parts])
+        flat = {key: value.reshape(frames.count, *value.shape[len(lead) :]) for key, value in sample.items() if lead}
+        new = own.moved_by(frames, flat, kinds) if lead else own.moved_by(change, Single(sample), kinds)
         new = {key: value for key, value in new.items() if key in sample or key.removesuffix("_valid") in kinds}
-        moved |= {key: value.reshape(*lead, *value.shape[1:]) for key, value in new.items()} if lead else new
+        moved |= {key: value.reshape(*lead, *value.shape[1:]) if lead else value for key, value in new.items()}
     return {key: value.any(-1) if key in of_points else value for key, value in moved.items()}
 
 
@@ -205,12 +202,14 @@ def _native(name: str, leaf: Any, kind: str | None) -> tuple[str | None, Any, Ca
             return PIL.Image.frombuffer(leaf.mode, made.shape[1::-1], made, "raw", leaf.mode, 0, 1)
 
         return kind, as_planes(name, array), as_pil
+    if not kind:
+        return kind, leaf, lambda new, change: new if isinstance(leaf, Tensor) else np.asarray(new)
     if not isinstance(leaf, Tensor):
         if kind in IMAGES:
             return kind, as_planes(name, leaf), lambda new, change: as_array(new, leaf)
-        return kind, as_tensor(leaf, name, kind, _OWNER) if kind else leaf, lambda new, change: np.asarray(new)
+        return kind, as_tensor(leaf, name, kind, _OWNER), lambda new, change: np.asarray(new)
     value, whole, canvas = leaf.as_subclass(Tensor), not leaf.is_floating_point(), hasattr(leaf, "canvas_size")
-    lacking = KINDS[kind].dims - value.ndim if kind else 0
+    lacking = KINDS[kind].dims - value.ndim
     value = value[(None,) * lacking]
     form = getattr(leaf, "format", None)
     turns = form is not None and value.shape[-1] > 4
@@ -237,9 +236,8 @@ def _native(name: str, leaf: Any, kind: str | None) -> tuple[str | None, Any, Ca
                 low, high = (new[..., :2] + 1e-3).floor(), (new[..., 2:] - 1e-3).ceil()
                 new = torch.cat((low, high + (high - low) % 2 if form.value == "CXCYWH" else high), -1)
             new = v2.functional.convert_bounding_box_format(new, ends, form)
-        new = (new.round() if whole and canvas else new).to(leaf.dtype) if kind else new
+        new = (new.round() if whole and canvas else new)[(0,) * lacking]
         size = {"canvas_size": change.parts[0].image_size} if canvas else {}
-        new = new[(0,) * lacking]
-        return tv_tensors.wrap(new, like=leaf, **size) if isinstance(leaf, tv_tensors.TVTensor) else new
+        return tv_tensors.wrap(new.to(leaf.dtype), like=leaf, **size) if isinstance(leaf, tv_tensors.TVTensor) else new
 
     return kind, value, back

@@ -67,6 +67,8 @@ def test_what_has_no_place_is_where_its_params_look():
 
 
 def test_p_and_chains_of_cameras():
+    none = {"bboxes": np.zeros((0, 4)), "names": [], "keypoints": np.zeros((0, 2))}
+    assert len(compose(transform())(**sample() | none)["bboxes"]) == 0
     never = compose(transform(p=0))(**sample())
     np.testing.assert_array_equal(never["image"], sample()["image"])
     assert torch.equal(never["camera"].intrinsics, camera().intrinsics)

@@ -166,7 +166,7 @@ def test_nests_of_clips_and_of_names_that_are_there_twice(vision):
     image, mask, points, _ = images()
     planes, mask, points = torch.from_numpy(image).permute(2, 0, 1), torch.from_numpy(mask), torch.from_numpy(points)
     gaze = torch.tensor([0.6, 0.0, 0.8]), torch.tensor([0.0, 0.0, 1.0])
-    sides = {"gaze_left": gaze[0], "gaze_right": gaze[1]}
+    sides = {"gaze_left": gaze[0], "gaze_right": gaze[1], "marks": points, "seen": torch.tensor([0.0, 1, 2, 3])}
     sample = {
         "nested": [tv.Mask(mask.expand(2, -1, -1)), "text", torch.ones(3)],
         "video": tv.Video(planes.expand(2, 4, -1, -1, -1)),
@@ -175,8 +175,9 @@ def test_nests_of_clips_and_of_names_that_are_there_twice(vision):
         "passenger": {**sides, "array": np.ones((4, 2), np.float32)},
         "camera": camera(),
     }
-    own = {"fields": {"nested": "keep", "array": "keypoints"}, "camera": camera()}
-    for augment in (augmentation(**own), ct.augment.HorizontalFlip(p=1, **own)):
+    own = {"nested": "keep", "array": "keypoints", "marks": "keypoints", "seen": "keep"}
+    own, landmarks = {"fields": own, "camera": camera()}, {key: [(0, 1)] for key in ("marks", "seen")}
+    for augment in (augmentation(**own), ct.augment.HorizontalFlip(p=1, landmarks=landmarks, **own)):
         torch.manual_seed(3)
         out = front_end.Transform(augment)(sample)
         torch.manual_seed(3)

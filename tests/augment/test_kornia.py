@@ -326,6 +326,8 @@ def test_what_would_leave_fields_behind_is_refused(field):
         if "gaze" not in field or "of kornia" in text:
             with pytest.raises(ValueError, match=text):
                 seq({"image": images(), **field})
+        with pytest.raises(ValueError, match="kornia would not read keypoints_valid as flags"):
+            seq({"image": images(), "keypoints": points(3, 2), "keypoints_valid": torch.ones(3, 2)})
 
 
 @pytest.mark.parametrize("same_on_batch", [False, True])
