@@ -59,9 +59,8 @@ def sample(*batch):
     }
 
 
-def by_arrays(augment, lens, fields, _):
-    arrays = {n: v.movedim(-3, -1).numpy() if n in IMAGES else v.numpy() for n, v in fields.items()}
-    return as_tensors(ct.augment.numpy.Transform(augment, lens)(**arrays)), {}
+def as_arrays(fields):
+    return {n: v.movedim(-3, -1).numpy() if n in IMAGES else v.numpy() for n, v in fields.items()}
 
 
 def as_tensors(out):
@@ -69,10 +68,14 @@ def as_tensors(out):
     return {n: v.movedim(-1, -3) if n in IMAGES else v for n, v in out.items()}
 
 
+def by_arrays(augment, lens, fields, _):
+    return as_tensors(ct.augment.numpy.Transform(augment, lens)(**as_arrays(fields))), {}
+
+
 def by_albumentations(augment, lens, fields, _):
     A = pytest.importorskip("albumentations", reason="albumentations is not installed")  # noqa: N806
     one = importlib.import_module("camtorch.augment.albumentations").Transform(augment, lens, p=1)
-    arrays = {n: v.movedim(-3, -1).numpy() if n in IMAGES else v.numpy() for n, v in fields.items()}
+    arrays = as_arrays(fields)
     params = {"bbox_params": A.BboxParams("pascal_voc"), "keypoint_params": A.KeypointParams("xy", None, False)}
     out = A.Compose([one], **params)(**arrays, bboxes=arrays["boxes"] + 0.5)
     size = np.array(out["image"].shape[1::-1] * 2)
