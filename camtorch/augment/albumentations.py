@@ -20,7 +20,7 @@ from albumentations.core.type_definitions import Targets
 from camtorch.augment import numpy as arrays
 from camtorch.augment.augmentation import Augmentation, camera_of_sample, check_front_end
 from camtorch.augment.change import Change
-from camtorch.augment.sample import KINDS, Unknown, kind_of
+from camtorch.augment.sample import KINDS, Unknown, detached, kind_of
 from camtorch.camera import Camera
 
 _OWNER = "albumentations.Transform"
@@ -45,7 +45,7 @@ class Transform(A.DualTransform):
 
     Args:
         augmentation: what to do.
-        camera: of samples that hold none; by default the augmentation's.
+        camera: of samples that hold none; by default the augmentation's. It is copied, and does not learn.
         p: how likely a sample is augmented; by default as the augmentation says.
 
     Raises:
@@ -77,7 +77,7 @@ class Transform(A.DualTransform):
         """Transform a sample of keyword arguments; see the class."""
         result: dict[str, Any] = super().__call__(*args, force_apply=force_apply, **data)
         camera = self._source(data) if result.get("camera") is None else result["camera"]
-        return result if isinstance(camera, Unknown) else {**result, "camera": camera.detach()}
+        return result if isinstance(camera, Unknown) else {**result, "camera": detached(camera)}
 
     def get_params(self) -> dict[str, Any]:
         generator = torch.Generator().manual_seed(self.py_random.getrandbits(63))
@@ -85,25 +85,25 @@ class Transform(A.DualTransform):
         return {"draw": {name: value.tolist() for name, value in drawn.items()}}
 
     def apply_with_params(self, params: dict[str, Any], *args: Any, **data: Any) -> dict[str, Any]:
-        camera, names = self._source(data), {}
+        camera, places = self._source(data), {}
         fields = {} if isinstance(camera, Unknown) else {"camera": camera}
         for i, (name, value) in enumerate(data.items()):
             target = self._additional_targets.get(name, name)
             own = name in ("camera", "applied_transforms", self.save_key) or value is None
             if not own and not (target in _OWN[4:] and len(value) == 0):  # a name that begins with its kind is known
-                names[name] = name if name == target else f"{kind_of(target, value, {}, _OWNER)}_{i}"
-                fields[names[name]] = _given(target, value, camera)
-        drawn = {name: torch.tensor(value, dtype=torch.float64) for name, value in params["draw"].items()}
-        moved = self._arrays(fields, draw=drawn)
+                field = name if name == target else f"{kind_of(target, value, {}, _OWNER)}_{i}"
+                places[field], fields[field] = (name, target), _given(target, value, camera)
+        draw = {name: torch.from_numpy(np.array(value, np.float64)) for name, value in params["draw"].items()}
+        moved = self._arrays(fields, draw=draw)
         change = self.augmentation.last
         assert change is not None  # of this call
-        result, size = dict(data), change.parts[0].image_size
-        for name, field in names.items():
-            target, seen = self._additional_targets.get(name, name), moved.get(f"{field}_valid")
-            result[name] = _taken(target, data[name], moved[field], seen, size)
+        result = data | {name: moved[name] for name in ("camera",) if name in moved}
+        for field, (name, target) in places.items():
+            seen = moved.get(f"{field}_valid")
+            result[name] = _taken(target, data[name], moved[field], seen, change.parts[0].image_size)
             if seen is not None and target not in _OWN:
                 result[f"{name}_valid"] = seen
-        return {**result, "camera": moved["camera"]} if "camera" in moved else result
+        return result
 
     def _source(self, data: dict[str, Any]) -> Camera:
         sizes = [(name, np.shape(data[name])[:2]) for name in ("image", "mask") if data.get(name) is not None]

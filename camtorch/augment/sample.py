@@ -344,15 +344,15 @@ def on_samples(method: Callable[P, R]) -> Callable[P, R]:
             return method(*args, **kwargs)
         with torch.no_grad():
             result: Any = method(*args, **kwargs)
-        return {name: _detached(value) for name, value in result.items()} if isinstance(result, dict) else result
+        return {name: detached(value) for name, value in result.items()} if isinstance(result, dict) else result
 
     return wrapped
 
 
-def _detached(value: Any) -> Any:
+def detached(value: Any) -> Any:
     """Return a tensor, a camera or a list of them without its graph, and any other value as it is."""
     if isinstance(value, list):
-        return list(map(_detached, value))
+        return list(map(detached, value))
     learns = isinstance(value, (Tensor, Camera)) and any(t.requires_grad for t in getattr(value, "_tensors", (value,)))
     return value.detach() if learns else value
 

@@ -20,10 +20,9 @@ from torch.utils._pytree import MappingKey, SequenceKey, keystr, tree_flatten_wi
 
 from camtorch.augment.augmentation import Augmentation, camera_of_sample, check_front_end
 from camtorch.augment.change import Change
-from camtorch.augment.numpy import as_array
-from camtorch.augment.numpy import as_tensor as as_planes
 from camtorch.augment.sample import IMAGES, KEEP, KINDS, OWN, Sample, Single, as_tensor, kind_of, on_samples
 from camtorch.camera import Camera
+from camtorch.warp.arrays import as_array, as_planes
 from camtorch.warp.boxes import lattice_of, turned
 
 try:
@@ -71,7 +70,7 @@ class Transform(v2.Transform):
 
     Args:
         augmentation: what to do.
-        camera: of samples that hold none; by default the augmentation's.
+        camera: of samples that hold none; by default the augmentation's. It is copied, and does not learn.
         valid: whether points and boxes in dicts get flags.
 
     Raises:
@@ -201,12 +200,12 @@ def _native(name: str, leaf: Any, kind: str | None) -> tuple[str | None, Any, Ca
             made = as_array(new, array)
             return PIL.Image.frombuffer(leaf.mode, made.shape[1::-1], made, "raw", leaf.mode, 0, 1)
 
-        return kind, as_planes(name, array), as_pil
+        return kind, as_planes(array, name, _OWNER), as_pil
     if not kind:
         return kind, leaf, lambda new, change: new if isinstance(leaf, Tensor) else np.asarray(new)
     if not isinstance(leaf, Tensor):
         if kind in IMAGES:
-            return kind, as_planes(name, leaf), lambda new, change: as_array(new, leaf)
+            return kind, as_planes(leaf, name, _OWNER), lambda new, change: as_array(new, leaf)
         return kind, as_tensor(leaf, name, kind, _OWNER), lambda new, change: np.asarray(new)
     value, whole, canvas = leaf.as_subclass(Tensor), not leaf.is_floating_point(), hasattr(leaf, "canvas_size")
     lacking = KINDS[kind].dims - value.ndim
