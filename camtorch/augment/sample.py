@@ -9,7 +9,7 @@ import functools
 import inspect
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar, ParamSpec, TypedDict, TypeVar, cast, get_args, get_origin, get_type_hints
 
 import numpy as np
@@ -58,6 +58,10 @@ Named = dict[str, tuple[str, Any]]
 
 class Single(dict[str, Any]):
     """A sample that is known to be a single one, without batch dims."""
+
+
+class Frames(Single):
+    """A single sample whose values may have leading dims, as those of clips have: all of them move by one change."""
 
 
 # -- the kinds of fields
@@ -488,7 +492,7 @@ class SampleTransform(nn.Module):
 
     def _clips(self, sample: Sample, kinds: Mapping[str, str] | None = None) -> Clips | None:
         """Return the clips of a sample, if an image has the dims (B, T, C, H, W)."""
-        if all(getattr(value, "ndim", 0) != 5 for value in sample.values()):
+        if isinstance(sample, Single) or all(getattr(value, "ndim", 0) != 5 for value in sample.values()):
             return None
         fields = {**self.fields, **(kinds or {})}
         given = {name: value for name, value in sample.items() if name not in OWN and value is not None}
@@ -576,8 +580,9 @@ class SampleTransform(nn.Module):
                 [as_tensor(v, f"{name}[{i}]", found, self._name) for i, v in enumerate(value)] if several else [value]
             )
             for i, item in enumerate(items):
-                which = f"{name}[{i}]" if several else name
-                check(found, which, item, batched and not several, self._name)
+                which, more = f"{name}[{i}]" if several else name, item.ndim - KINDS[found].most_dims
+                frame = item.new_empty(item.shape[more:]) if more > 0 and isinstance(sample, Frames) else item
+                check(found, which, frame, batched and not several, self._name)
                 if not predicted:
                     check_values(found, which, item, self._name)
                     if found == "boxes" and "image" in named:
@@ -696,7 +701,7 @@ class SampleTransform(nn.Module):
                 seen = seen if batched else seen[None]
                 if len(seen) != change.count:
                     raise ValueError(f"{self._name}: {key} is of {len(seen)} samples, other fields of {change.count}")
-                seen = KINDS["mask"].move(change, seen, {"mask_fill": 0.0})
+                seen, _ = self._one(change, "mask", seen, {"mask_fill": 0.0})
             if key == "image_valid" and self.valid_mask and any(found == "image" for found, _ in named.values()):
                 whole = change.valid_mask()
                 seen = whole if not masked else seen & (whole if seen.ndim == 4 else whole[:, 0])
@@ -752,6 +757,12 @@ class SampleTransform(nn.Module):
 
     @staticmethod
     def _one(change: Change, found: str, value: Tensor, options: Mapping[str, float]) -> tuple[Tensor, Tensor | None]:
+        lead = value.shape[1 : value.ndim - KINDS[found].most_dims]  # of frames
+        if lead:
+            frames = Change(math.prod(lead), [replace(part, rows=None) for part in change.parts])
+            moved = SampleTransform._one(frames, found, value.flatten(0, len(lead)), options)
+            result, valid = (None if v is None else v.reshape(1, *lead, *v.shape[1:]) for v in moved)
+            return cast("Tensor", result), valid
         result = moves(found, value)(change, value, options)
         result, valid = result if isinstance(result, tuple) else (result, None)
         # geometry is computed in float32 at least; what came in half precision goes out in it
@@ -801,6 +812,8 @@ def together(
     for name, (found, value) in named.items():
         if found in ("depth", "distance") or isinstance(value, list):  # which ask for positions again
             return {}
+        if value.ndim - 1 > KINDS[found].most_dims:  # frames
+            continue
         if found == "image" and len(fill) in (1, value.shape[1]):
             hows[name] = Sampler(mode, padding_mode, fill)
         elif found == "mask":

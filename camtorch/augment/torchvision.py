@@ -8,9 +8,9 @@ The module is imported by name: `import camtorch.augment.torchvision`.
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -20,7 +20,7 @@ from torch.utils._pytree import MappingKey, SequenceKey, keystr, tree_flatten_wi
 
 from camtorch.augment.augmentation import Augmentation, camera_of_sample, check_front_end
 from camtorch.augment.change import Change
-from camtorch.augment.sample import IMAGES, KEEP, KINDS, OWN, Sample, Single, as_tensor, kind_of, on_samples
+from camtorch.augment.sample import IMAGES, KEEP, KINDS, OWN, Frames, as_tensor, kind_of, on_samples
 from camtorch.camera import Camera
 from camtorch.warp.arrays import as_array, as_planes
 from camtorch.warp.boxes import lattice_of, turned
@@ -96,66 +96,70 @@ class Transform(v2.Transform):
     def forward(self, *inputs: Any) -> Any:
         own = self.augmentation
         flat, spec = tree_flatten_with_path(inputs if len(inputs) > 1 else inputs[0])
-        names = [_name(path) for path, _ in flat]
-        twice = len(set(names)) < len(names)
-        leaves, fields, sizes = [leaf for _, leaf in flat], {}, []
+        paths, leaves = [path for path, _ in flat], [leaf for _, leaf in flat]
+        names = [_name(path) for path in paths]
+        keys, fields, sizes = list(names), {}, []
+        if len(set(names)) < len(names):
+            places = (keystr(path[:-1] if path and isinstance(path[-1], MappingKey) else path) for path in paths)
+            keys = [f"{place}/{name}" for place, name in zip(places, names, strict=True)]
         for i, kind in self._kinds(flat, names).items():
-            path, size = flat[i][0], getattr(leaves[i], "canvas_size", None)
-            key = f"{keystr(path[:-1] if isinstance(path[-1], MappingKey) else path)}/{names[i]}" if twice else names[i]
-            fields[i] = key, *_native(names[i], leaves[i], kind)
+            fields[i], size = _native(names[i], leaves[i], kind), getattr(leaves[i], "canvas_size", None)
             if size or kind in IMAGES:
-                sizes.append((type(leaves[i]).__name__, tuple(size or fields[i][2].shape[-2:])))
+                sizes.append((type(leaves[i]).__name__, tuple(size or fields[i][1].shape[-2:])))
         cameras = [i for i, leaf in enumerate(leaves) if isinstance(leaf, Camera)]
         if len(cameras) > 1:
             raise ValueError(f"{_OWNER}: a sample must have one camera; got {len(cameras)}")
         camera = camera_of_sample(_OWNER, own, leaves[cameras[0]] if cameras else self.camera, sizes)
         learns = torch.is_grad_enabled() and any(isinstance(leaf, Tensor) and leaf.requires_grad for leaf in leaves)
+        kinds = {keys[i]: kind or KEEP for i, (kind, _, _) in fields.items()}
+        # flags of a rotated box are flags of all its points, and one of its points is enough
+        of_points = {f"{keys[i]}_valid" for i, (k, v, _) in fields.items() if k == _TURNED and v.shape[-2] == _STEPS**2}
+        sample = Frames({keys[i]: value for i, (_, value, _) in fields.items()})
+        for key in of_points & sample.keys():
+            sample[key] = torch.as_tensor(sample[key])[..., None].repeat_interleave(_STEPS**2, -1)
         with torch.no_grad():
             own.tell_of_empty_images(camera)
-            of_boxes = ((k, kind, v) for k, kind, v, _ in fields.values() if kind and v.ndim > 1)
+            of_boxes = ((keys[i], kind, v) for i, (kind, v, _) in fields.items() if kind and v.ndim > 1)
             named = {k: (kind, v.reshape(math.prod(v.shape[:-2]), *v.shape[-2:])[:1]) for k, kind, v in of_boxes}
             # a graph of the camera would make the warp slower, and could not leave a DataLoader's worker
             change = own.change(camera.detach() if learns else camera, own._of_sample(own.draw(1), named))
         own.last = change
         with torch.set_grad_enabled(learns):
-            moved = _moved(own, change, [field[:3] for field in fields.values()])
-            for i, (key, kind, _, back) in fields.items():
+            moved = own.moved_by(change, sample, kinds)
+            moved |= {key: moved[key].any(-1) for key in of_points}
+            for i, (kind, _, back) in fields.items():
                 if change.parts[0].moves is not None or not kind or type(leaves[i]) in _HELD:
-                    leaves[i] = back(moved[key], change)
+                    leaves[i] = back(moved[keys[i]], change)
         for i in cameras:
             leaves[i] = change.single
         result = tree_unflatten(leaves, spec)
-        for i, (key, *_) in fields.items() if self.valid else ():
-            path, valid = flat[i][0], moved.get(f"{key}_valid")
+        for i in fields if self.valid else ():
+            path, valid = paths[i], moved.get(f"{keys[i]}_valid")
             if valid is not None and path and isinstance(path[-1], MappingKey):
-                holder = result
-                for step in path[:-1]:
-                    holder = step.get(holder)
+                holder = functools.reduce(lambda held, step: step.get(held), path[:-1], result)
                 holder.setdefault(f"{names[i]}_valid", valid if isinstance(leaves[i], Tensor) else valid.numpy())
         return result
 
     def _kinds(self, flat: list[Any], names: list[str]) -> dict[int, str | None]:
         """Return the kind of each leaf that moves, and None for those that may be flags or orders of landmarks."""
-        fields, unknown = self.augmentation.fields, dict[int, ValueError]()
+        fields, problems = self.augmentation.fields, dict[int, ValueError]()
         kinds: dict[int, str | None] = {}
         for i, ((path, leaf), name) in enumerate(zip(flat, names, strict=True)):
             if leaf is None or isinstance(leaf, Camera) or name in OWN:
                 continue
-            kinds[i] = next((kind for of, kind in _KINDS.items() if isinstance(leaf, of)), None)
             # a list of plain numbers is looked at as one value
             listed = len(path) > 1 and isinstance(path[-1], SequenceKey) and isinstance(leaf, (int, float))
+            kinds[i] = next((kind for of, kind in _KINDS.items() if isinstance(leaf, of)), None)
             try:
                 kinds[i] = kinds[i] or kind_of(name, [leaf] if listed else leaf, fields, _OWNER)
             except ValueError as error:
-                unknown[i] = error
+                problems[i] = error
         if IMAGES[0] not in kinds.values():
-            plain = (
-                i for i, k in kinds.items() if k is None and isinstance(flat[i][1], Tensor) and flat[i][1].ndim > 1
-            )
-            first = next((i for i in plain if names[i] not in fields and not names[i].endswith("_valid")), -1)
+            free = (i for i, kind in kinds.items() if not (kind or names[i] in fields or names[i].endswith("_valid")))
+            first = next((i for i in free if isinstance(flat[i][1], Tensor) and flat[i][1].ndim > 1), -1)
             kinds |= {} if first < 0 else {first: IMAGES[0]}
-            unknown.pop(first, None)
-        for problem in unknown.values():
+            problems.pop(first, None)
+        for problem in problems.values():
             raise problem
         return {i: kind for i, kind in kinds.items() if kind or isinstance(flat[i][1], _HELD)}
 
@@ -164,26 +168,6 @@ def _name(path: Any) -> str:
     """Return the last key of a path that is a word, or all of it."""
     words = [getattr(step, "key", getattr(step, "name", None)) for step in path]
     return next((word for word in reversed(words) if isinstance(word, str)), keystr(path) or "[0]")
-
-
-def _moved(own: Augmentation, change: Change, fields: list[tuple[str, str | None, Any]]) -> Sample:
-    """Return (key, kind, value) moved, by one change for all frames of those with more dims than single samples."""
-    leads = {key: tuple(v.shape[: max(0, v.ndim - KINDS[kind].most_dims)]) for key, kind, v in fields if kind}
-    # flags of a box are flags of all its points, and one of its points is enough
-    of_points = {f"{key}_valid" for key, kind, value in fields if kind == _TURNED and value.shape[-2] == _STEPS**2}
-    fields = [
-        (k, kind, torch.as_tensor(v)[..., None].expand(-1, _STEPS**2) if k in of_points else v) for k, kind, v in fields
-    ]
-    moved: Sample = {key: value for key, _, value in fields}
-    for lead in dict.fromkeys(leads.values()):
-        group = [field for field in fields if leads.get(field[0].removesuffix("_valid"), ()) == lead]
-        sample, kinds = {key: value for key, _, value in group}, {key: kind or KEEP for key, kind, _ in group}
-        frames = Change(math.prod(lead), [replace(part, rows=None) for part in change.parts])
-        flat = {key: value.reshape(frames.count, *value.shape[len(lead) :]) for key, value in sample.items() if lead}
-        new = own.moved_by(frames, flat, kinds) if lead else own.moved_by(change, Single(sample), kinds)
-        new = {key: value for key, value in new.items() if key in sample or key.removesuffix("_valid") in kinds}
-        moved |= {key: value.reshape(*lead, *value.shape[1:]) if lead else value for key, value in new.items()}
-    return {key: value.any(-1) if key in of_points else value for key, value in moved.items()}
 
 
 def _native(name: str, leaf: Any, kind: str | None) -> tuple[str | None, Any, Callable[[Any, Change], Any]]:
@@ -207,20 +191,16 @@ def _native(name: str, leaf: Any, kind: str | None) -> tuple[str | None, Any, Ca
         if kind in IMAGES:
             return kind, as_planes(leaf, name, _OWNER), lambda new, change: as_array(new, leaf)
         return kind, as_tensor(leaf, name, kind, _OWNER), lambda new, change: np.asarray(new)
-    value, whole, canvas = leaf.as_subclass(Tensor), not leaf.is_floating_point(), hasattr(leaf, "canvas_size")
-    lacking = KINDS[kind].dims - value.ndim
-    value = value[(None,) * lacking]
-    form = getattr(leaf, "format", None)
+    lacking, form, canvas = KINDS[kind].dims - leaf.ndim, getattr(leaf, "format", None), hasattr(leaf, "canvas_size")
+    value, whole, edge = leaf.as_subclass(Tensor)[(None,) * lacking], not leaf.is_floating_point(), 0.5 if form else 0.0
     turns = form is not None and value.shape[-1] > 4
     if canvas:
         value = value if value.dtype == torch.float64 else value.float()
-    if form is not None:
-        ends = tv_tensors.BoundingBoxFormat["XYXYXYXY" if turns else "XYXY"]
-        value = v2.functional.convert_bounding_box_format(value, form, ends)
-        value = value.trunc() if whole and not turns else value  # as torchvision reads whole numbers
-    if canvas:
-        lost = (value == -1).all(-1, keepdim=True)
-        value = torch.where(lost, torch.nan, value if form is None else value - 0.5)
+        if form is not None:
+            ends = tv_tensors.BoundingBoxFormat["XYXYXYXY" if turns else "XYXY"]
+            value = v2.functional.convert_bounding_box_format(value, form, ends)
+            value = value.trunc() if whole and not turns else value  # as torchvision reads whole numbers
+        value = torch.where((value == -1).all(-1, keepdim=True), torch.nan, value - edge)
     if turns:
         kind, value = _TURNED, lattice_of(value.unflatten(-1, (4, 2)), _STEPS)
 
@@ -228,8 +208,7 @@ def _native(name: str, leaf: Any, kind: str | None) -> tuple[str | None, Any, Ca
         if turns:
             new = turned(new, change.mirrored is not None).flatten(-2)
         if canvas:
-            lost = ((new == -1) | new.isnan()).all(-1, keepdim=True)
-            new = torch.where(lost, -1.0, new if form is None else new + 0.5)
+            new = torch.where(((new == -1) | new.isnan()).all(-1, keepdim=True), -1.0, new + edge)
         if form is not None:
             if whole and not turns:  # rounding errors are no reason for another pixel
                 low, high = (new[..., :2] + 1e-3).floor(), (new[..., 2:] - 1e-3).ceil()
