@@ -21,6 +21,7 @@ import kornia
 import torch
 from kornia.augmentation import AugmentationSequential, GeometricAugmentationBase2D, IntensityAugmentationBase2D
 from kornia.augmentation.base import _BasicAugmentationBase
+from kornia.augmentation.container.image import ImageSequential
 from kornia.augmentation.container.params import ParamItem
 from kornia.augmentation.utils import _transform_output_shape
 from kornia.constants import DataKey, Resample, SamplePadding
@@ -28,6 +29,7 @@ from kornia.geometry.boxes import Boxes
 from kornia.geometry.keypoints import Keypoints
 from torch import Tensor, nn
 from torch.nn.utils.parametrize import type_before_parametrizations
+from torch.utils._pytree import tree_map
 
 from camtorch._arguments import as_part, as_values, check_boxes, fails, shown
 from camtorch._dtypes import narrow, widen
@@ -47,24 +49,12 @@ if not hasattr(GeometricAugmentationBase2D, "_gate"):
         f"{kornia.__version__}"
     )
 
-__all__ = [
-    "BoxCrop",
-    "CameraAugmentation",
-    "CenterCrop",
-    "Compose",
-    "HorizontalFlip",
-    "Pad",
-    "RandomCamera",
-    "RandomCrop",
-]
-__all__ += ["RandomLens", "RandomMount", "RandomResizedCrop", "Resize", "Rotate90", "VerticalFlip"]
-__all__ += ["with_boxes", "with_cameras"]
-
 Params: TypeAlias = dict[str, Tensor]
 Flags: TypeAlias = dict[str, Any]
 _POINTS = "keypoints"
 _KIND = "source_kind"
 _NUMBERS = "source_intrinsics", "source_distortion"
+_BACK = "back"  # a flag of what moves back
 
 
 class CameraAugmentation(GeometricAugmentationBase2D):
@@ -114,8 +104,8 @@ class CameraAugmentation(GeometricAugmentationBase2D):
         name = type(self).__name__
         camera = check_front_end(name, augmentation, camera)
         camera = fixed_copy(augmentation.camera, name) if camera is None else camera
-        if not isinstance(camera, Camera):
-            raise TypeError(f"{name}: camera must be the Camera of the images; got {type(camera).__name__}")
+        if camera is None:
+            raise TypeError(f"{name}: camera must be the Camera of the images; got NoneType")
         own_size = check_single(name, camera, (), ". with_cameras gives every sample its own")
         p = augmentation.p if p is None else as_part(p, "p", name, "probability")
         p_batch = as_part(p_batch, "p_batch", name, "probability")
@@ -156,12 +146,9 @@ class CameraAugmentation(GeometricAugmentationBase2D):
     def change(self, params: Params | None = None, device: torch.device | None = None) -> Change:
         """What params, by default the last, do to a batch: `source`, `target`, `rotation`, `points(...)` and so on."""
         params = self._params if params is None else params
-        missing = [
-            name for name in ("batch_prob", *self.augmentation.ranges, *self.augmentation.crops) if name not in params
-        ]
-        if missing:
-            raise ValueError(f"{type(self).__name__}: the params lack {', '.join(missing)}; call it first")
         own = *self.augmentation.ranges, *self.augmentation.crops
+        if missing := [name for name in ("batch_prob", *own) if name not in params]:
+            raise ValueError(f"{type(self).__name__}: the params lack {', '.join(missing)}; call it first")
         values = {"apply": self._gate(params), **{name: params[name] for name in own}}
         if self.augmentation.crops and any(fails(~values[name].isnan()) for name in self.augmentation.crops):
             raise ValueError(
@@ -189,64 +176,59 @@ class CameraAugmentation(GeometricAugmentationBase2D):
         same = intrinsics is own[0] and distortion is own[1]
         return self.camera if same else remade(self.camera, intrinsics=intrinsics, distortion=distortion)
 
-    # -- moving
+    # -- moving, forth, or back if the flags say so
 
     @on_samples
-    def _move(self, params: Params, value: Tensor, move: Callable[[Change, Tensor], Any], back: bool = False) -> Any:
-        """`move(change, value)`, in the dtype of the value; positions in half precision would be off by pixels."""
+    def _move(self, value: Tensor, params: Params, flags: Flags, move: Callable[[Change, Tensor], Any]) -> Any:
+        """Return `move(change, value)` in the value's dtype; positions in half precision would be off by pixels."""
         with torch.autocast(value.device.type, enabled=False):
             change = self.change(params, value.device)
             if len(value) != change.count:
                 raise ValueError(f"{type(self).__name__}: params for {change.count} samples, here are {len(value)}")
-            moved = move(change.inverse() if back else change, value)
+            moved = move(change.inverse() if _BACK in flags else change, value)
         moved, valid = moved if isinstance(moved, tuple) else (moved, None)
         moved = narrow(moved, value.dtype)
-        if back:  # what moves forth is blended by kornia
+        if _BACK in flags:  # what moves forth is blended by kornia
             moved = self._blend_by_prob(moved, value, self._gate(params))
         return moved if valid is None else (moved, valid)
 
-    def apply_transform(
-        self, input: Tensor, params: Params, flags: Flags, transform: Tensor | None = None, *, back: bool = False
-    ) -> Tensor:
+    def _move_rows(
+        self, input: Any, dims: int, params: Params, flags: Flags, move: Callable[[Change, Tensor], Any]
+    ) -> tuple[Any, Tensor]:
+        """Return Keypoints or Boxes, whose data (B, ...) has so many dims or lacks the first, moved; and the valid."""
+        moved, valid = self._move(input.data[(None,) * (dims - input.data.ndim)], params, flags, move)
+        result = input.clone()
+        result._data = moved.reshape(input.shape)
+        return result, valid.reshape(input.shape[: 2 - dims])
+
+    def apply_transform(self, input: Tensor, params: Params, flags: Flags, transform: Any = None) -> Tensor:
         options = {"mode": Resample.get(flags["resample"]).name.lower()}
         options["padding_mode"] = SamplePadding.get(flags["padding_mode"]).name.lower()
-        moved: Tensor = self._move(params, input, lambda change, images: change.images(images, **options), back)
+        moved: Tensor = self._move(input, params, flags, lambda change, images: change.images(images, **options))
         return moved
 
-    def apply_transform_mask(
-        self, input: Tensor, params: Params, flags: Flags, transform: Tensor | None = None, *, back: bool = False
-    ) -> Tensor:
+    def apply_transform_mask(self, input: Tensor, params: Params, flags: Flags, transform: Any = None) -> Tensor:
         fill, mode = self.augmentation.mask_fill, cast("Mode", Resample.get(flags["resample"]).name.lower())
-        moved: Tensor = self._move(params, input, lambda change, masks: change.labels(masks, fill, mode), back)
+        moved: Tensor = self._move(input, params, flags, lambda change, masks: change.labels(masks, fill, mode))
         return moved
 
-    def apply_transform_keypoint(
-        self, input: Keypoints, params: Params, flags: Flags, transform: Tensor | None = None, *, back: bool = False
-    ) -> Keypoints:
-        rows = input.data if input.data.ndim == 3 else input.data.unsqueeze(0)
-
+    def apply_transform_keypoint(self, input: Keypoints, params: Params, flags: Flags, transform: Any = None) -> Any:
         def move(change: Change, pixels: Tensor) -> tuple[Tensor, Tensor]:
             given = torch.where((pixels == -1).all(-1, keepdim=True), torch.nan, pixels)
             moved = self.augmentation.moved_by(change, {_POINTS: given}, predicted=True)
             return torch.where(moved[_POINTS].isnan(), -1.0, moved[_POINTS]), moved[f"{_POINTS}_valid"]
 
-        moved, valid = self._move(params, rows, move, back)
-        result = input.clone()
-        result._data, self.keypoints_valid = moved.reshape(input.shape), valid.reshape(input.shape[:-1])
+        result, self.keypoints_valid = self._move_rows(input, 3, params, flags, move)
         return result
 
-    def apply_transform_box(
-        self, input: Boxes, params: Params, flags: Flags, transform: Tensor | None = None, *, back: bool = False
-    ) -> Boxes:
-        rows = input.data if input.data.ndim == 4 else input.data.unsqueeze(0)
-        moved, seen = self._move(params, rows, lambda change, corners: change.quadrilaterals(widen(corners)), back)
-        result = input.clone()
-        result._data = moved.reshape(input.shape)
-        result._valid = input._valid & seen.reshape(input._valid.shape)
+    def apply_transform_box(self, input: Boxes, params: Params, flags: Flags, transform: Any = None) -> Boxes:
+        result: Boxes
+        result, seen = self._move_rows(input, 4, params, flags, lambda change, c: change.quadrilaterals(widen(c)))
+        result._valid = result._valid & seen
         return result
 
     @on_samples
-    def _move_fields(self, params: Params, fields: Sample, kinds: dict[str, str], back: bool) -> Sample:
+    def _move_fields(self, fields: Sample, params: Params, kinds: dict[str, str], back: bool) -> Sample:
         """Move the fields of a dict that kornia does not know; their flags come beside them."""
         device = next((value.device for value in fields.values() if isinstance(value, Tensor)), torch.device("cpu"))
         clips = int(params["video_batch_size"]) if "video_batch_size" in params else None
@@ -258,28 +240,23 @@ class CameraAugmentation(GeometricAugmentationBase2D):
         return {n: v.unflatten(0, (clips, -1)) for n, v in kept.items()} if clips else type(fields)(kept)
 
     def inverse_inputs(
-        self, input: Tensor, params: Params, flags: Flags, transform: Tensor | None = None, **kwargs: Any
+        self, input: Tensor, params: Params, flags: Flags, transform: Any = None, **kwargs: Any
     ) -> Tensor:
-        return self.apply_transform(self.transform_tensor(input), params, {**flags, **kwargs}, back=True)
+        return self.apply_transform(self.transform_tensor(input), params, {**flags, **kwargs, _BACK: True})
 
     def inverse_masks(
-        self, input: Tensor, params: Params, flags: Flags, transform: Tensor | None = None, **kwargs: Any
+        self, input: Tensor, params: Params, flags: Flags, transform: Any = None, **kwargs: Any
     ) -> Tensor:
-        shape = params["forward_input_shape"]
-        flags = {**flags, "resample": Resample.NEAREST, **kwargs}
+        shape, flags = params["forward_input_shape"], {**flags, "resample": Resample.NEAREST, **kwargs, _BACK: True}
         rows = self.transform_tensor(input, shape=shape, match_channel=False)
-        moved = self.apply_transform_mask(rows, params, flags, back=True)
+        moved = self.apply_transform_mask(rows, params, flags)
         return _transform_output_shape(moved, input.shape, reference_shape=shape) if self.keepdim else moved
 
-    def inverse_keypoints(
-        self, input: Keypoints, params: Params, flags: Flags, transform: Tensor | None = None, **kwargs: Any
-    ) -> Keypoints:
-        return self.apply_transform_keypoint(input, params, flags, back=True)
+    def inverse_keypoints(self, input: Keypoints, params: Params, flags: Flags, *_: Any, **kwargs: Any) -> Any:
+        return self.apply_transform_keypoint(input, params, {_BACK: True})
 
-    def inverse_boxes(
-        self, input: Boxes, params: Params, flags: Flags, transform: Tensor | None = None, **kwargs: Any
-    ) -> Boxes:
-        return self.apply_transform_box(input, params, flags, back=True)
+    def inverse_boxes(self, input: Boxes, params: Params, flags: Flags, *_: Any, **kwargs: Any) -> Boxes:
+        return self.apply_transform_box(input, params, {_BACK: True})
 
     def compute_transformation(self, input: Tensor, params: Params, flags: Flags) -> Tensor:
         """(B, 3, 3) of NaN: there is no matrix, and an identity would be silently wrong."""
@@ -289,13 +266,16 @@ class CameraAugmentation(GeometricAugmentationBase2D):
         return transform
 
     def __getstate__(self) -> dict[str, Any]:
-        # a tensor of a graph can be neither copied nor pickled
-        kept = {k: v.detach() if isinstance(v, Tensor) else v for k, v in self._params.items()}
-        return {**self.__dict__, "_params": kept}
+        return {**self.__dict__, "_params": _without_graph(self._params)}
 
     def __repr__(self) -> str:
         ranges = "".join(f"{name}={interval}, " for name, interval in self.augmentation.ranges.items())
         return super().__repr__().replace("(", f"({ranges}", 1)
+
+
+def _without_graph(params: Any) -> Any:
+    """Return params without the graph of their tensors, which could neither be copied nor pickled."""
+    return tree_map(lambda value: value.detach() if isinstance(value, Tensor) else value, params)
 
 
 class _Random(CameraAugmentation):
@@ -331,13 +311,12 @@ def _named(wraps: type[Augmentation]) -> type[_Random]:
     return type(name, (_Random,), {"_wraps": wraps, "__doc__": text, "__module__": __name__})
 
 
-RandomMount, RandomLens, RandomCamera = map(
-    _named, (random_camera.RandomMount, random_camera.RandomLens, random_camera.RandomCamera)
-)
+RandomMount, RandomLens = _named(random_camera.RandomMount), _named(random_camera.RandomLens)
+RandomCamera, BoxCrop, Compose = _named(random_camera.RandomCamera), _named(box_crop.BoxCrop), _named(compose.Compose)
 RandomResizedCrop, RandomCrop, CenterCrop = map(_named, (edits.RandomResizedCrop, edits.RandomCrop, edits.CenterCrop))
 Resize, Pad, Rotate90 = map(_named, (edits.Resize, edits.Pad, edits.Rotate90))
 HorizontalFlip, VerticalFlip = map(_named, (edits.HorizontalFlip, edits.VerticalFlip))
-BoxCrop, Compose = map(_named, (box_crop.BoxCrop, compose.Compose))
+__all__ = ["CameraAugmentation", "with_boxes", "with_cameras", *(one.__name__ for one in _Random.__subclasses__())]
 
 
 def with_boxes(params: Any, boxes: Tensor) -> Any:
@@ -350,15 +329,12 @@ def with_boxes(params: Any, boxes: Tensor) -> Any:
     """
     given = as_values(boxes, "boxes", "with_boxes")
     check_boxes(given, "boxes", "with_boxes")
-
-    def own(params: Params) -> Params:
-        names = [name for name in params if name.rpartition(".")[2] == "box"]
-        for name in names:
-            if tuple(given.shape) != (len(params[name]), 4):
-                raise ValueError(f"with_boxes: boxes must be ({len(params[name])}, 4); got {tuple(given.shape)}")
-        return dict.fromkeys(names, given)
-
-    return _with(params, own, "with_boxes: params must be those of a BoxCrop")
+    result, found = _edited(params, "box", "with_boxes: params must be those of a BoxCrop")
+    for own, name in found:
+        if tuple(given.shape) != (len(own[name]), 4):
+            raise ValueError(f"with_boxes: boxes must be ({len(own[name])}, 4); got {tuple(given.shape)}")
+        own[name] = given
+    return result
 
 
 def with_cameras(params: Any, cameras: Camera | Sequence[Camera]) -> Any:
@@ -382,43 +358,35 @@ def with_cameras(params: Any, cameras: Camera | Sequence[Camera]) -> Any:
             "with_cameras: cameras must be a Camera with a batch dim, or single ones of one model and size, in a list; "
             f"got {got}"
         )
-
-    def own(params: Params) -> Params:
-        return _numbers(params, cameras) if _KIND in params else {}
-
-    return _with(params, own, "with_cameras: params must be those of a camera augmentation")
-
-
-def _with(params: Any, own: Callable[[Params], Params], need: str) -> Any:
-    """Return params, of one augmentation or a list, with what `own` gives for each; an error if nothing."""
-    found = False
-
-    def changed(params: Any) -> Any:
-        nonlocal found
-        if not isinstance(params, dict):
-            return [p._replace(data=changed(p.data)) if isinstance(p, ParamItem) and p.data else p for p in params]
-        more = own(params)
-        found = found or bool(more)
-        return {**params, **more}
-
-    result = changed(params)
-    if not found:
-        raise ValueError(f"{need}; got {shown(params)}")
+    result, found = _edited(params, _KIND, "with_cameras: params must be those of a camera augmentation")
+    for own, name in found:
+        kinds, kind, batch = own[name], _kind(cameras), tuple(cameras.batch_shape)
+        if len(kinds) and kinds[0].tolist() != kind:
+            need, got = (f"{k[1]} coefficients and image_size {tuple(k[2:])}" for k in (kinds[0].tolist(), kind))
+            raise ValueError(
+                f"with_cameras: needs the augmentation's model, {need}; got {type(cameras).__name__}, {got}"
+            )
+        count, clips = len(kinds), int(own.get("video_batch_size", len(kinds)))
+        if batch not in ((), (1,), (count,), (clips,)):
+            raise ValueError(f"with_cameras: the params are for {count} samples; got cameras of batch dims {batch}")
+        for key, numbers in zip(_NUMBERS, (cameras.intrinsics, cameras.distortion), strict=True):
+            rows = numbers.expand(*(batch or (1,)), -1)
+            own[key] = rows[[i * len(rows) // count for i in range(count)]]
     return result
 
 
-def _numbers(params: Params, cameras: Camera) -> dict[str, Tensor]:
-    kinds, kind, batch = params[_KIND], _kind(cameras), tuple(cameras.batch_shape)
-    if len(kinds) and kinds[0].tolist() != kind:
-        need, got = (f"{k[1]} coefficients and image_size {tuple(k[2:])}" for k in (kinds[0].tolist(), kind))
-        raise ValueError(f"with_cameras: needs the augmentation's model, {need}; got {type(cameras).__name__}, {got}")
-    count, clips = len(kinds), int(params.get("video_batch_size", len(kinds)))
-    if batch not in ((), (1,), (count,), (clips,)):
-        raise ValueError(f"with_cameras: the params are for {count} samples; got cameras of batch dims {batch}")
-    frames = count // clips if batch == (clips,) and clips else 1
-    numbers = (t.expand(*(batch or (1,)), -1) for t in (cameras.intrinsics, cameras.distortion))
-    rows = (t.repeat_interleave(frames, 0).expand(count, -1) for t in numbers)
-    return dict(zip(_NUMBERS, rows, strict=True))
+def _edited(params: Any, name: str, need: str) -> tuple[Any, list[tuple[Params, str]]]:
+    """Return a copy of params, of one augmentation or a list, and where in it are those of a name; an error if none."""
+    result, found = tree_map(lambda value: value, params), list[tuple[Params, str]]()
+    parts = [result]
+    for part in parts:
+        if isinstance(part, dict):
+            found += [(part, key) for key in part if key.rpartition(".")[2] == name]
+        else:
+            parts += [item.data for item in part if isinstance(item, ParamItem) and item.data]
+    if not found:
+        raise ValueError(f"{need}; got {shown(params)}")
+    return result, found
 
 
 def _kind(camera: Camera) -> list[int]:
@@ -464,64 +432,72 @@ def _applied(container: nn.Module, params: list[ParamItem]) -> Iterator[tuple[Ca
             yield from _applied(module, item.data)
 
 
-def _with_fields(call: Callable[..., Any], back: bool) -> Callable[..., Any]:
-    """Return `forward` or `inverse` of a container, for fields that kornia does not know as well."""
+def _put(of: type[nn.Module], name: str, **options: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """Put `own(call, container, *args)` in the place of a method `call` of containers with a CameraAugmentation."""
+    call = getattr(of, name)
     call = getattr(call, "__wrapped__", call)  # of a module that is imported again
 
-    @functools.wraps(call)
-    def wrapped(self: Any, *args: Any, params: Any = None, data_keys: Any = None) -> Any:
-        ours = [one for one in self.modules() if isinstance(one, CameraAugmentation)]
-        if not ours or len(args) != 1 or not isinstance(args[0], dict):
-            return call(self, *args, params=params, data_keys=data_keys)
-        sample, camera = args[0], args[0].get("camera")
-        fields, kinds = _fields(self, sample, ours)
-        image = next((v for n, v in sample.items() if self._read_datakeys_from_dict((n,))[0] == [DataKey.INPUT]), None)
-        if camera is not None and len(ours) > 1:
-            raise ValueError(
-                f"{type(self).__name__}: a camera must be that of one camera augmentation; got {len(ours)}. "
-                "camtorch.augment.kornia.Compose makes one of several"
-            )
-        if camera is not None and not back:
-            if params is None and image is not None:
-                dims = (3, 5) if self.contains_video_sequential else (2, 4)
-                params = self.forward_parameters(self.autofill_dim(image, dim_range=dims)[1])
-            params = with_cameras(params, camera)
-        result = call(self, sample, params=params)
-        alone = image is not None and image.ndim < 4
-        fields = Single(fields) if alone else fields
-        applied = list(_applied(self, self._params if params is None else params))
-        for one, own in reversed(applied) if back else applied:
-            fields = one._move_fields(own, fields, kinds, back) if kinds else fields
-            if camera is not None:
-                cameras = one.change(own).source if back else one.change(own).target
-                cameras = (cameras[0] if alone else cameras).clone()
-                result["camera"] = list(cameras) if isinstance(camera, list) else cameras
-        return {**result, **fields}
+    def put(own: Callable[..., Any]) -> Callable[..., Any]:
+        @functools.wraps(call)
+        def method(self: Any, *args: Any, **kwargs: Any) -> Any:
+            if not any(isinstance(one, CameraAugmentation) for one in self.modules()):
+                return call(self, *args, **kwargs)
+            return own(call, self, *args, **options, **kwargs)
 
-    return wrapped
+        setattr(of, name, method)
+        return own
+
+    return put
 
 
-def _lost_stay_lost(call: Callable[..., Boxes]) -> Callable[..., Boxes]:
-    """Return `_preproc_boxes` of a container for boxes of zeros, as it exports lost ones: it takes none of no width."""
-    call = getattr(call, "__wrapped__", call)
+@_put(AugmentationSequential, "forward", back=False)
+@_put(AugmentationSequential, "inverse", back=True)
+def _with_fields(
+    call: Callable[..., Any], self: Any, *args: Any, back: bool, params: Any = None, data_keys: Any = None
+) -> Any:
+    """Move dicts with the fields that kornia does not know."""
+    if len(args) != 1 or not isinstance(args[0], dict):
+        return call(self, *args, params=params, data_keys=data_keys)
+    ours = [one for one in self.modules() if isinstance(one, CameraAugmentation)]
+    sample, camera = args[0], args[0].get("camera")
+    fields, kinds = _fields(self, sample, ours)
+    image = next((v for n, v in sample.items() if self._read_datakeys_from_dict((n,))[0] == [DataKey.INPUT]), None)
+    if camera is not None and len(ours) > 1:
+        raise ValueError(
+            f"{type(self).__name__}: a camera must be that of one camera augmentation; got {len(ours)}. "
+            "camtorch.augment.kornia.Compose makes one of several"
+        )
+    if camera is not None and not back:
+        if params is None and image is not None:
+            dims = (3, 5) if self.contains_video_sequential else (2, 4)
+            params = self.forward_parameters(self.autofill_dim(image, dim_range=dims)[1])
+        params = with_cameras(params, camera)
+    result = call(self, sample, params=params)
+    alone = image is not None and image.ndim < 4
+    fields = Single(fields) if alone else fields
+    applied = list(_applied(self, self._params if params is None else params))
+    for one, own in reversed(applied) if back else applied:
+        fields = one._move_fields(fields, own, kinds, back) if kinds else fields
+        if camera is not None:
+            cameras = one.change(own).source if back else one.change(own).target
+            cameras = (cameras[0] if alone else cameras).clone()
+            result["camera"] = list(cameras) if isinstance(camera, list) else cameras
+    return {**result, **fields}
 
-    @functools.wraps(call)
-    def wrapped(self: Any, boxes: Any, key: DataKey) -> Boxes:
-        if not isinstance(boxes, Tensor) or not any(isinstance(one, CameraAugmentation) for one in self.modules()):
-            return call(self, boxes, key)
-        lost = (boxes == 0).all(-1) if key is not DataKey.BBOX else (boxes == 0).all(-1).all(-1)
-        if key is DataKey.BBOX_XYWH:
-            boxes = torch.where(lost.unsqueeze(-1), boxes.new_tensor((0, 0, 1, 1)), boxes)
-        result = call(self, boxes, key)
-        result._valid = result._valid & ~lost.reshape(result._valid.shape)
-        return result
 
-    return wrapped
+@_put(AugmentationSequential, "_preproc_boxes")
+def _lost_stay_lost(call: Callable[..., Boxes], self: Any, boxes: Any, key: DataKey) -> Boxes:
+    """Take boxes of zeros, as kornia exports lost ones, for lost: it takes none of no width."""
+    if not isinstance(boxes, Tensor):
+        return call(self, boxes, key)
+    lost = (boxes == 0).all(-1) if key is not DataKey.BBOX else (boxes == 0).all(-1).all(-1)
+    if key is DataKey.BBOX_XYWH:
+        boxes = torch.where(lost.unsqueeze(-1), boxes.new_tensor((0, 0, 1, 1)), boxes)
+    result = call(self, boxes, key)
+    result._valid = result._valid & ~lost.reshape(result._valid.shape)
+    return result
 
 
-for _name, _made in (
-    ("forward", _with_fields(AugmentationSequential.forward, False)),
-    ("inverse", _with_fields(AugmentationSequential.inverse, True)),
-    ("_preproc_boxes", _lost_stay_lost(AugmentationSequential._preproc_boxes)),
-):
-    setattr(AugmentationSequential, _name, _made)
+@_put(ImageSequential, "__getstate__")
+def _copied(call: Callable[..., dict[str, Any]], self: Any) -> dict[str, Any]:
+    return {**call(self), "_params": _without_graph(self._params)}
