@@ -252,10 +252,10 @@ class CameraAugmentation(GeometricAugmentationBase2D):
         moved = self.apply_transform_mask(rows, params, flags)
         return _transform_output_shape(moved, input.shape, reference_shape=shape) if self.keepdim else moved
 
-    def inverse_keypoints(self, input: Keypoints, params: Params, flags: Flags, *_: Any, **kwargs: Any) -> Any:
+    def inverse_keypoints(self, input: Any, params: Params, flags: Flags, transform: Any = None, **_: Any) -> Any:
         return self.apply_transform_keypoint(input, params, {_BACK: True})
 
-    def inverse_boxes(self, input: Boxes, params: Params, flags: Flags, *_: Any, **kwargs: Any) -> Boxes:
+    def inverse_boxes(self, input: Any, params: Params, flags: Flags, transform: Any = None, **_: Any) -> Boxes:
         return self.apply_transform_box(input, params, {_BACK: True})
 
     def compute_transformation(self, input: Tensor, params: Params, flags: Flags) -> Tensor:
@@ -266,16 +266,17 @@ class CameraAugmentation(GeometricAugmentationBase2D):
         return transform
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_params": _without_graph(self._params)}
+        return _without_graph(self.__dict__)
 
     def __repr__(self) -> str:
         ranges = "".join(f"{name}={interval}, " for name, interval in self.augmentation.ranges.items())
         return super().__repr__().replace("(", f"({ranges}", 1)
 
 
-def _without_graph(params: Any) -> Any:
-    """Return params without the graph of their tensors, which could neither be copied nor pickled."""
-    return tree_map(lambda value: value.detach() if isinstance(value, Tensor) else value, params)
+def _without_graph(state: dict[str, Any]) -> dict[str, Any]:
+    """Return a state without the graph of its params, which could neither be copied nor pickled."""
+    kept: dict[str, Any] = tree_map(lambda v: v.detach() if isinstance(v, Tensor) and v.grad_fn else v, state)
+    return kept
 
 
 class _Random(CameraAugmentation):
@@ -369,9 +370,9 @@ def with_cameras(params: Any, cameras: Camera | Sequence[Camera]) -> Any:
         count, clips = len(kinds), int(own.get("video_batch_size", len(kinds)))
         if batch not in ((), (1,), (count,), (clips,)):
             raise ValueError(f"with_cameras: the params are for {count} samples; got cameras of batch dims {batch}")
+        frames = count // clips if batch == (clips,) and clips else 1
         for key, numbers in zip(_NUMBERS, (cameras.intrinsics, cameras.distortion), strict=True):
-            rows = numbers.expand(*(batch or (1,)), -1)
-            own[key] = rows[[i * len(rows) // count for i in range(count)]]
+            own[key] = numbers.expand(*(batch or (1,)), -1).repeat_interleave(frames, 0).expand(count, -1)
     return result
 
 
@@ -498,6 +499,4 @@ def _lost_stay_lost(call: Callable[..., Boxes], self: Any, boxes: Any, key: Data
     return result
 
 
-@_put(ImageSequential, "__getstate__")
-def _copied(call: Callable[..., dict[str, Any]], self: Any) -> dict[str, Any]:
-    return {**call(self), "_params": _without_graph(self._params)}
+_put(ImageSequential, "__getstate__")(lambda call, self: _without_graph(call(self)))
