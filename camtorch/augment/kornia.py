@@ -13,8 +13,7 @@ augmentations that move pixels are refused next to such fields, as they would le
 from __future__ import annotations
 
 import functools
-import zlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from typing import Any, TypeAlias, cast
 
 import kornia
@@ -28,18 +27,16 @@ from kornia.constants import DataKey, Resample, SamplePadding
 from kornia.geometry.boxes import Boxes
 from kornia.geometry.keypoints import Keypoints
 from torch import Tensor, nn
-from torch.nn.utils.parametrize import type_before_parametrizations
-from torch.utils._pytree import tree_map
 
-from camtorch._arguments import as_part, as_values, check_boxes, fails, shown
+from camtorch._arguments import as_part, fails
 from camtorch._dtypes import narrow, widen
-from camtorch._module import Memo, remade
+from camtorch._module import Memo
 from camtorch.augment import box_crop, compose, edits, random_camera
 from camtorch.augment.augmentation import Augmentation, check_front_end, check_single
 from camtorch.augment.change import Change
-from camtorch.augment.collate import collate_cameras
+from camtorch.augment.params import KIND, camera_of, kind_of_camera, with_boxes, with_cameras
 from camtorch.augment.presets import PresetName
-from camtorch.augment.sample import OWN, Sample, Single, fixed_copy, kind_of, on_samples
+from camtorch.augment.sample import OWN, Sample, Single, detached, fixed_copy, kind_of, on_samples
 from camtorch.camera import Camera
 from camtorch.warp.sampling import Mode
 
@@ -52,8 +49,6 @@ if not hasattr(GeometricAugmentationBase2D, "_gate"):
 Params: TypeAlias = dict[str, Tensor]
 Flags: TypeAlias = dict[str, Any]
 _POINTS = "keypoints"
-_KIND = "source_kind"
-_NUMBERS = "source_intrinsics", "source_distortion"
 _BACK = "back"  # a flag of what moves back
 
 
@@ -117,7 +112,6 @@ class CameraAugmentation(GeometricAugmentationBase2D):
         size = augmentation.size_after(own_size)
         if size != own_size:
             self.flags["size"] = size
-        self._kind = _kind(camera)
         self.keypoints_valid: Tensor | None = None
         """(B, N) bool: which of the keypoints that were moved last lie on their image."""
         # lists of masks come row by row between other labels of the batch
@@ -138,7 +132,7 @@ class CameraAugmentation(GeometricAugmentationBase2D):
         drawn = self.augmentation.drawn(count, 1.0, self.same_on_batch)
         del drawn["apply"]
         drawn |= {name: torch.full((count, 4), torch.nan) for name in self.augmentation.crops}
-        drawn[_KIND] = torch.tensor(self._kind).expand(count, -1).contiguous()
+        drawn[KIND] = torch.tensor(kind_of_camera(self.camera)).expand(count, -1).contiguous()
         if "size" in self.flags:
             drawn["output_size"] = torch.tensor(self.flags["size"]).expand(count, -1).contiguous()
         return drawn
@@ -155,7 +149,7 @@ class CameraAugmentation(GeometricAugmentationBase2D):
                 f"{type(self).__name__}: kornia hands on boxes after images, so that they go in before: "
                 "params = aug.forward_parameters(images.shape), then aug(images, params=with_boxes(params, boxes))"
             )
-        camera = self._source(params, device)
+        camera = camera_of(params, self.camera, device)
         inputs = [*values.values(), camera.intrinsics, camera.distortion]
         inputs += [*self.augmentation.parameters(), *self.augmentation.buffers()]
         if torch.is_grad_enabled() and any(t.requires_grad for t in inputs):
@@ -168,13 +162,6 @@ class CameraAugmentation(GeometricAugmentationBase2D):
     def last(self) -> Change | None:
         """The change of the last call."""
         return self.change() if self._params else None
-
-    def _source(self, params: Params, device: torch.device | None) -> Camera:
-        own = self.camera.intrinsics, self.camera.distortion
-        device = own[0].device if device is None else device
-        intrinsics, distortion = (params.get(n, value).to(device) for n, value in zip(_NUMBERS, own, strict=True))
-        same = intrinsics is own[0] and distortion is own[1]
-        return self.camera if same else remade(self.camera, intrinsics=intrinsics, distortion=distortion)
 
     # -- moving, forth, or back if the flags say so
 
@@ -266,17 +253,12 @@ class CameraAugmentation(GeometricAugmentationBase2D):
         return transform
 
     def __getstate__(self) -> dict[str, Any]:
-        return _without_graph(self.__dict__)
+        state: dict[str, Any] = detached(self.__dict__)  # params of a graph could be neither copied nor pickled
+        return state
 
     def __repr__(self) -> str:
         ranges = "".join(f"{name}={interval}, " for name, interval in self.augmentation.ranges.items())
         return super().__repr__().replace("(", f"({ranges}", 1)
-
-
-def _without_graph(state: dict[str, Any]) -> dict[str, Any]:
-    """Return a state without the graph of its params, which could neither be copied nor pickled."""
-    kept: dict[str, Any] = tree_map(lambda v: v.detach() if isinstance(v, Tensor) and v.grad_fn else v, state)
-    return kept
 
 
 class _Random(CameraAugmentation):
@@ -318,85 +300,6 @@ RandomResizedCrop, RandomCrop, CenterCrop = map(_named, (edits.RandomResizedCrop
 Resize, Pad, Rotate90 = map(_named, (edits.Resize, edits.Pad, edits.Rotate90))
 HorizontalFlip, VerticalFlip = map(_named, (edits.HorizontalFlip, edits.VerticalFlip))
 __all__ = ["CameraAugmentation", "with_boxes", "with_cameras", *(one.__name__ for one in _Random.__subclasses__())]
-
-
-def with_boxes(params: Any, boxes: Tensor) -> Any:
-    """Params with the boxes (B, 4) that a `BoxCrop` crops, pixels x1, y1, x2, y2: of one augmentation, or a container.
-
-    `params = aug.forward_parameters(images.shape)`, then `aug(images, params=with_boxes(params, boxes))`.
-
-    Raises:
-        ValueError: If the boxes have another shape or number, or nothing among the params crops.
-    """
-    given = as_values(boxes, "boxes", "with_boxes")
-    check_boxes(given, "boxes", "with_boxes")
-    result, found = _edited(params, "box", "with_boxes: params must be those of a BoxCrop")
-    for own, name in found:
-        if tuple(given.shape) != (len(own[name]), 4):
-            raise ValueError(f"with_boxes: boxes must be ({len(own[name])}, 4); got {tuple(given.shape)}")
-        own[name] = given
-    return result
-
-
-def with_cameras(params: Any, cameras: Camera | Sequence[Camera]) -> Any:
-    """Params for images whose cameras differ in their numbers: of one augmentation, or the list of a container.
-
-    `params = aug.forward_parameters(images.shape)`, then `aug(images, params=with_cameras(params, cameras))`.
-
-    Args:
-        params: they stay as they are.
-        cameras: a batch, or a list, that differ only in their numbers. Of a video, one for each clip or each frame.
-
-    Raises:
-        ValueError: If the cameras are of another kind or number, or the params of no camera augmentation.
-        TypeError: If they are no cameras.
-    """
-    if isinstance(cameras, (list, tuple)) and all(isinstance(camera, Camera) for camera in cameras):
-        cameras = collate_cameras(cameras)
-    if not isinstance(cameras, Camera) or cameras.is_mixed:
-        got = [type(one).__name__ for one in cameras] if isinstance(cameras, list) else type(cameras).__name__
-        raise TypeError(
-            "with_cameras: cameras must be a Camera with a batch dim, or single ones of one model and size, in a list; "
-            f"got {got}"
-        )
-    result, found = _edited(params, _KIND, "with_cameras: params must be those of a camera augmentation")
-    for own, name in found:
-        kinds, kind, batch = own[name], _kind(cameras), tuple(cameras.batch_shape)
-        if len(kinds) and kinds[0].tolist() != kind:
-            need, got = (f"{k[1]} coefficients and image_size {tuple(k[2:])}" for k in (kinds[0].tolist(), kind))
-            raise ValueError(
-                f"with_cameras: needs the augmentation's model, {need}; got {type(cameras).__name__}, {got}"
-            )
-        count, clips = len(kinds), int(own.get("video_batch_size", len(kinds)))
-        if batch not in ((), (1,), (count,), (clips,)):
-            raise ValueError(f"with_cameras: the params are for {count} samples; got cameras of batch dims {batch}")
-        frames = count // clips if batch == (clips,) and clips else 1
-        for key, numbers in zip(_NUMBERS, (cameras.intrinsics, cameras.distortion), strict=True):
-            own[key] = numbers.expand(*(batch or (1,)), -1).repeat_interleave(frames, 0).expand(count, -1)
-    return result
-
-
-def _edited(params: Any, name: str, need: str) -> tuple[Any, list[tuple[Params, str]]]:
-    """Return a copy of params, of one augmentation or a list, and where in it are those of a name; an error if none."""
-    result, found = tree_map(lambda value: value, params), list[tuple[Params, str]]()
-    parts = [result]
-    for part in parts:
-        if isinstance(part, dict):
-            found += [(part, key) for key in part if key.rpartition(".")[2] == name]
-        else:
-            parts += [item.data for item in part if isinstance(item, ParamItem) and item.data]
-    if not found:
-        raise ValueError(f"{need}; got {shown(params)}")
-    return result, found
-
-
-def _kind(camera: Camera) -> list[int]:
-    """Model, number of coefficients and image_size as integers, for params hold tensors only."""
-    return [
-        zlib.crc32(type_before_parametrizations(camera).__name__.encode()),
-        camera.distortion.shape[-1],
-        *(camera.image_size or (0, 0)),
-    ]
 
 
 # -- dicts
@@ -499,4 +402,4 @@ def _lost_stay_lost(call: Callable[..., Boxes], self: Any, boxes: Any, key: Data
     return result
 
 
-_put(ImageSequential, "__getstate__")(lambda call, self: _without_graph(call(self)))
+_put(ImageSequential, "__getstate__")(lambda call, self: detached(call(self)))

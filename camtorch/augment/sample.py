@@ -15,6 +15,7 @@ from typing import Any, ClassVar, ParamSpec, TypedDict, TypeVar, cast, get_args,
 import numpy as np
 import torch
 from torch import Tensor, nn
+from torch.utils._pytree import tree_map
 from torch.utils.data import get_worker_info
 from typing_extensions import Unpack
 
@@ -347,18 +348,19 @@ def on_samples(method: Callable[P, R]) -> Callable[P, R]:
         if torch.compiler.is_compiling() or get_worker_info() is None:
             return method(*args, **kwargs)
         with torch.no_grad():
-            result: Any = method(*args, **kwargs)
-        return {name: detached(value) for name, value in result.items()} if isinstance(result, dict) else result
+            return detached(method(*args, **kwargs))
 
     return wrapped
 
 
 def detached(value: Any) -> Any:
-    """Return a tensor, a camera or a list of them without its graph, and any other value as it is."""
-    if isinstance(value, list):
-        return list(map(detached, value))
-    learns = isinstance(value, (Tensor, Camera)) and any(t.requires_grad for t in getattr(value, "_tensors", (value,)))
-    return value.detach() if learns else value
+    """Return a value, also a dict or a list of them, in which no tensor and no camera has a graph."""
+
+    def of(one: Any) -> Any:
+        learns = isinstance(one, (Tensor, Camera)) and any(t.requires_grad for t in getattr(one, "_tensors", (one,)))
+        return one.detach() if learns else one
+
+    return tree_map(of, value)
 
 
 class SampleOptions(TypedDict, total=False):
