@@ -515,7 +515,17 @@ class Augmentation(SampleTransform):
             first = {n: (kind, value[::each]) for n, (kind, value) in self._sorted(frames, self.fields).items()}
             draw = {n: clips.repeated(value, f"draw[{n!r}]") for n, value in self._of_sample(drawn, first).items()}
             return clips.restored(self.forward(frames, draw=draw))
-        named, batched, count, camera = self._batch(sample)
+        return self._augmented(sample, draw=draw, generator=generator)
+
+    def _augmented(
+        self,
+        sample: Sample,
+        kinds: Mapping[str, str] | None = None,
+        draw: Mapping[str, Tensor] | None = None,
+        generator: torch.Generator | None = None,
+    ) -> Sample:
+        """Return a sample moved by one change; kinds: name -> kind, in addition to `fields`."""
+        named, batched, count, camera = self._batch(sample, kinds=kinds)
         if draw is None:
             numbers = self._numbers(count, self.p, self.same_on_batch, generator)
             change = self._change(camera, self._of_sample(numbers, named))
@@ -566,7 +576,8 @@ class Augmentation(SampleTransform):
         if not self.crops:
             return draw
         found: dict[str, Any] = {name: value for name, (kind, value) in named.items() if kind == "boxes"}
-        return self.with_boxes(draw, found.get("boxes", next(iter(found.values()), None)))
+        boxes = found.get("boxes", next(iter(found.values()), None))
+        return self.with_boxes(draw, boxes.flatten(0, -3)[:1] if getattr(boxes, "ndim", 0) > 3 else boxes)
 
     if TYPE_CHECKING:
 

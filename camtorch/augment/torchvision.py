@@ -9,9 +9,8 @@ The module is imported by name: `import camtorch.augment.torchvision`.
 from __future__ import annotations
 
 import functools
-import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -20,9 +19,9 @@ from torch.utils._pytree import MappingKey, SequenceKey, keystr, tree_flatten_wi
 
 from camtorch.augment.augmentation import Augmentation, camera_of_sample, check_front_end
 from camtorch.augment.change import Change
-from camtorch.augment.sample import IMAGES, KEEP, KINDS, OWN, Frames, as_tensor, kind_of, on_samples
+from camtorch.augment.sample import IMAGES, KEEP, KINDS, OWN, Frames, as_tensor, detached, kind_of, on_samples
 from camtorch.camera import Camera
-from camtorch.warp.arrays import as_array, as_planes
+from camtorch.warp.arrays import as_planes_of
 from camtorch.warp.boxes import lattice_of, turned
 
 try:
@@ -110,28 +109,21 @@ class Transform(v2.Transform):
         if len(cameras) > 1:
             raise ValueError(f"{_OWNER}: a sample must have one camera; got {len(cameras)}")
         camera = camera_of_sample(_OWNER, own, leaves[cameras[0]] if cameras else self.camera, sizes)
-        learns = torch.is_grad_enabled() and any(isinstance(leaf, Tensor) and leaf.requires_grad for leaf in leaves)
         kinds = {keys[i]: kind or KEEP for i, (kind, _, _) in fields.items()}
+        # a graph of the camera would make the warp slower, and could not leave a DataLoader's worker
+        sample = Frames({keys[i]: value for i, (_, value, _) in fields.items()}, camera=detached(camera))
         # flags of a rotated box are flags of all its points, and one of its points is enough
         of_points = {f"{keys[i]}_valid" for i, (k, v, _) in fields.items() if k == _TURNED and v.shape[-2] == _STEPS**2}
-        sample = Frames({keys[i]: value for i, (_, value, _) in fields.items()})
         for key in of_points & sample.keys():
             sample[key] = torch.as_tensor(sample[key])[..., None].repeat_interleave(_STEPS**2, -1)
-        with torch.no_grad():
-            own.tell_of_empty_images(camera)
-            of_boxes = ((keys[i], kind, v) for i, (kind, v, _) in fields.items() if kind and v.ndim > 1)
-            named = {k: (kind, v.reshape(math.prod(v.shape[:-2]), *v.shape[-2:])[:1]) for k, kind, v in of_boxes}
-            # a graph of the camera would make the warp slower, and could not leave a DataLoader's worker
-            change = own.change(camera.detach() if learns else camera, own._of_sample(own.draw(1), named))
-        own.last = change
-        with torch.set_grad_enabled(learns):
-            moved = own.moved_by(change, sample, kinds)
-            moved |= {key: moved[key].any(-1) for key in of_points}
-            for i, (kind, _, back) in fields.items():
-                if change.parts[0].moves is not None or not kind or type(leaves[i]) in _HELD:
-                    leaves[i] = back(moved[keys[i]], change)
+        moved = own._augmented(sample, kinds)
+        moved |= {key: moved[key].any(-1) for key in of_points}
+        change = cast("Change", own.last)
+        for i, (kind, _, back) in fields.items():
+            if change.parts[0].moves is not None or not kind or type(leaves[i]) in _HELD:
+                leaves[i] = back(moved[keys[i]], change)
         for i in cameras:
-            leaves[i] = change.single
+            leaves[i] = moved["camera"]
         result = tree_unflatten(leaves, spec)
         for i in fields if self.valid else ():
             path, valid = paths[i], moved.get(f"{keys[i]}_valid")
@@ -172,25 +164,12 @@ def _name(path: Any) -> str:
 
 def _native(name: str, leaf: Any, kind: str | None) -> tuple[str | None, Any, Callable[[Any, Change], Any]]:
     """Return the kind and the value of a leaf for the native call, and what makes a leaf of the result again."""
-    if isinstance(leaf, PIL.Image.Image):
-        if leaf.mode in ("1", "P", "PA"):
-            raise ValueError(
-                f"{_OWNER}: values between those of a PIL image of mode {leaf.mode!r} mean nothing; "
-                "image.convert('RGB') makes it an image, tv_tensors.Mask(image) labels"
-            )
-        array = np.asarray(leaf)
-
-        def as_pil(new: Tensor, change: Change) -> Any:
-            made = as_array(new, array)
-            return PIL.Image.frombuffer(leaf.mode, made.shape[1::-1], made, "raw", leaf.mode, 0, 1)
-
-        return kind, as_planes(array, name, _OWNER), as_pil
-    if not kind:
-        return kind, leaf, lambda new, change: new if isinstance(leaf, Tensor) else np.asarray(new)
-    if not isinstance(leaf, Tensor):
-        if kind in IMAGES:
-            return kind, as_planes(leaf, name, _OWNER), lambda new, change: as_array(new, leaf)
-        return kind, as_tensor(leaf, name, kind, _OWNER), lambda new, change: np.asarray(new)
+    if not isinstance(leaf, Tensor) and kind in IMAGES:
+        value, restored = as_planes_of(leaf, name, _OWNER)
+        return kind, value, lambda new, change: restored(new)
+    if not isinstance(leaf, Tensor) or not kind:
+        value = as_tensor(leaf, name, kind, _OWNER) if kind else leaf
+        return kind, value, lambda new, change: new if isinstance(leaf, Tensor) else np.asarray(new)
     lacking, form, canvas = KINDS[kind].dims - leaf.ndim, getattr(leaf, "format", None), hasattr(leaf, "canvas_size")
     value, whole, edge = leaf.as_subclass(Tensor)[(None,) * lacking], not leaf.is_floating_point(), 0.5 if form else 0.0
     turns = form is not None and value.shape[-1] > 4

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import importlib
+from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any, TypeAlias
 
@@ -53,3 +55,22 @@ def as_array(image: Tensor, like: Array) -> Array:
     """Return an image (C, H, W) in the layout and the dtype of `like`: without a copy if its channels are last too."""
     planes = plain(image)
     return np.ascontiguousarray(planes.transpose(1, 2, 0) if like.ndim == 3 else planes[0], like.dtype)
+
+
+def as_planes_of(image: Any, name: str, owner: str) -> tuple[Tensor, Callable[[Tensor], Any]]:
+    """Return an array or a PIL image as planes (C, H, W), and what makes planes one of its kind."""
+    mode = None if isinstance(image, np.ndarray) else getattr(image, "mode", None)
+    if mode in ("1", "P", "PA"):
+        raise ValueError(
+            f"{owner}: values between those of a PIL image of mode {mode!r} mean nothing; "
+            "image.convert('RGB') makes it an image, tv_tensors.Mask(image) labels"
+        )
+    array = image if mode is None else np.asarray(image)
+
+    def restored(planes: Tensor) -> Any:
+        made = as_array(planes, array)
+        if mode is None:
+            return made
+        return importlib.import_module("PIL.Image").frombuffer(mode, made.shape[1::-1], made, "raw", mode, 0, 1)
+
+    return as_planes(array, name, owner), restored
