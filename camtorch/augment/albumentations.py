@@ -18,8 +18,7 @@ import torch
 from albumentations.core.type_definitions import Targets
 
 from camtorch.augment import numpy as arrays
-from camtorch.augment.augmentation import Augmentation, camera_of_sample, check_front_end
-from camtorch.augment.change import Change
+from camtorch.augment.augmentation import Augmentation, FrontEnd, camera_of_sample, check_front_end
 from camtorch.augment.sample import KINDS, Unknown, detached, kind_of
 from camtorch.camera import Camera
 
@@ -27,7 +26,7 @@ _OWNER = "albumentations.Transform"
 _OWN = "image", "images", "mask", "masks", "bboxes", "keypoints"  # targets of pipelines
 
 
-class Transform(A.DualTransform):
+class Transform(FrontEnd, A.DualTransform):
     """An augmentation among those of albumentations: all that a sample holds moves by one draw.
 
     The targets of pipelines are given and filtered as its `bbox_params` and `keypoint_params` say. A keypoint without a
@@ -67,11 +66,6 @@ class Transform(A.DualTransform):
     def targets(self) -> dict[str, Callable[..., Any]]:
         nothing: Callable[..., Any] = self.apply  # they move together, see `apply_with_params`
         return dict.fromkeys((*KINDS, *_OWN, *self.augmentation.fields, "camera"), nothing)
-
-    @property
-    def last(self) -> Change | None:
-        """The change of the last sample that it was applied to: its `source`, `target` and `rotation`."""
-        return self.augmentation.last
 
     def __call__(self, *args: Any, force_apply: bool = False, **data: Any) -> dict[str, Any]:
         """Transform a sample of keyword arguments; see the class."""

@@ -603,6 +603,18 @@ def _are_alike(value: Any) -> bool:
 # -- for front ends, which hold an augmentation and the camera of their images
 
 
+class FrontEnd:
+    """What takes the samples of a library to an augmentation."""
+
+    augmentation: Any
+
+    @property
+    def last(self) -> Change | None:
+        """The change of the last call: its `source`, `target` and `rotation`."""
+        change: Change | None = getattr(self.augmentation, "last", None)
+        return change
+
+
 def check_front_end(owner: str, augmentation: object, camera: object, *kinds: type[SampleTransform]) -> Camera | None:
     """Return a fixed copy of the camera, or None; a TypeError if `augmentation` is none, nor of other `kinds`."""
     if not isinstance(augmentation, kinds or Augmentation):

@@ -34,7 +34,7 @@ from camtorch._module import Memo
 from camtorch.augment import box_crop, compose, edits, random_camera
 from camtorch.augment.augmentation import Augmentation, check_front_end, check_single
 from camtorch.augment.change import Change
-from camtorch.augment.params import KIND, camera_of, kind_of_camera, with_boxes, with_cameras
+from camtorch.augment.params import KIND, Params, camera_of, kind_of_camera, with_boxes, with_cameras
 from camtorch.augment.presets import PresetName
 from camtorch.augment.sample import OWN, Sample, Single, detached, fixed_copy, kind_of, on_samples
 from camtorch.camera import Camera
@@ -46,7 +46,6 @@ if not hasattr(GeometricAugmentationBase2D, "_gate"):
         f"{kornia.__version__}"
     )
 
-Params: TypeAlias = dict[str, Tensor]
 Flags: TypeAlias = dict[str, Any]
 _POINTS = "keypoints"
 _BACK = "back"  # a flag of what moves back
@@ -69,10 +68,9 @@ class CameraAugmentation(GeometricAugmentationBase2D):
         - pixel coordinates are ``(x, y)`` at integer pixel centres, as in all of kornia and camtorch.
           ``align_corners`` means nothing; ``resample`` and ``padding_mode`` can be overridden by a call.
         - keypoints keep their count and order, ``landmarks`` of a flip apart. One without a place on the new image
-          becomes ``(-1, -1)``, and stays that in all augmentations of camtorch that follow. The attribute
-          ``keypoints_valid`` (B, N) says which of the last call lie on their image.
-        - boxes enclose their moved outlines, which are curved, and are not clipped. One of which no part is on the new
-          image is invalid, which kornia exports as zeros; they stay zeros in ``inverse``.
+          becomes ``(-1, -1)``, and stays that in all augmentations of camtorch that follow.
+        - boxes enclose their moved outlines, which are curved, and are not clipped. A box off the new image is
+          invalid, which kornia exports as zeros; they stay zeros in ``inverse``.
         - masks take the nearest value, the augmentation's `mask_fill` where nothing is seen, and never the colours and
           the light of the lens. ``extra_args={DataKey.MASK: {"resample": "bilinear"}}`` is for soft ones.
         - in a dict (``data_keys=None``) fields that kornia does not know move by their names, see the module.
@@ -102,15 +100,16 @@ class CameraAugmentation(GeometricAugmentationBase2D):
         if camera is None:
             raise TypeError(f"{name}: camera must be the Camera of the images; got NoneType")
         own_size = check_single(name, camera, (), ". with_cameras gives every sample its own")
-        p = augmentation.p if p is None else as_part(p, "p", name, "probability")
-        p_batch = as_part(p_batch, "p_batch", name, "probability")
-        same_on_batch = augmentation.same_on_batch if same_on_batch is None else same_on_batch
-        super().__init__(p=p, p_batch=p_batch, same_on_batch=same_on_batch, keepdim=keepdim)
-        self.augmentation, self.camera = augmentation, camera
-        self.flags: dict[str, Any] = {"resample": Resample.get(augmentation.options["mode"]), "align_corners": False}
-        self.flags["padding_mode"] = SamplePadding.get(augmentation.options["padding_mode"])
-        size = augmentation.size_after(own_size)
-        if size != own_size:
+        super().__init__(
+            p=augmentation.p if p is None else as_part(p, "p", name, "probability"),
+            p_batch=as_part(p_batch, "p_batch", name, "probability"),
+            same_on_batch=augmentation.same_on_batch if same_on_batch is None else same_on_batch,
+            keepdim=keepdim,
+        )
+        self.augmentation, self.camera, options = augmentation, camera, augmentation.options
+        self.flags: dict[str, Any] = {"resample": Resample.get(options["mode"]), "align_corners": False}
+        self.flags["padding_mode"] = SamplePadding.get(options["padding_mode"])
+        if (size := augmentation.size_after(own_size)) != own_size:
             self.flags["size"] = size
         self.keypoints_valid: Tensor | None = None
         """(B, N) bool: which of the keypoints that were moved last lie on their image."""
@@ -166,7 +165,9 @@ class CameraAugmentation(GeometricAugmentationBase2D):
     # -- moving, forth, or back if the flags say so
 
     @on_samples
-    def _move(self, value: Tensor, params: Params, flags: Flags, move: Callable[[Change, Tensor], Any]) -> Any:
+    def _move(
+        self, value: Tensor, params: Params, flags: Flags, move: Callable[[Change, Tensor], Any]
+    ) -> tuple[Tensor, Any]:
         """Return `move(change, value)` in the value's dtype; positions in half precision would be off by pixels."""
         with torch.autocast(value.device.type, enabled=False):
             change = self.change(params, value.device)
@@ -177,7 +178,7 @@ class CameraAugmentation(GeometricAugmentationBase2D):
         moved = narrow(moved, value.dtype)
         if _BACK in flags:  # what moves forth is blended by kornia
             moved = self._blend_by_prob(moved, value, self._gate(params))
-        return moved if valid is None else (moved, valid)
+        return moved, valid
 
     def _move_rows(
         self, input: Any, dims: int, params: Params, flags: Flags, move: Callable[[Change, Tensor], Any]
@@ -191,13 +192,11 @@ class CameraAugmentation(GeometricAugmentationBase2D):
     def apply_transform(self, input: Tensor, params: Params, flags: Flags, transform: Any = None) -> Tensor:
         options = {"mode": Resample.get(flags["resample"]).name.lower()}
         options["padding_mode"] = SamplePadding.get(flags["padding_mode"]).name.lower()
-        moved: Tensor = self._move(input, params, flags, lambda change, images: change.images(images, **options))
-        return moved
+        return self._move(input, params, flags, lambda change, images: change.images(images, **options))[0]
 
     def apply_transform_mask(self, input: Tensor, params: Params, flags: Flags, transform: Any = None) -> Tensor:
         fill, mode = self.augmentation.mask_fill, cast("Mode", Resample.get(flags["resample"]).name.lower())
-        moved: Tensor = self._move(input, params, flags, lambda change, masks: change.labels(masks, fill, mode))
-        return moved
+        return self._move(input, params, flags, lambda change, masks: change.labels(masks, fill, mode))[0]
 
     def apply_transform_keypoint(self, input: Keypoints, params: Params, flags: Flags, transform: Any = None) -> Any:
         def move(change: Change, pixels: Tensor) -> tuple[Tensor, Tensor]:
@@ -313,13 +312,10 @@ def _fields(container: Any, sample: Sample, ours: list[CameraAugmentation]) -> t
     if flags := [name for name in sample if name.endswith("_valid") and name not in given]:
         raise ValueError(f"{owner}: kornia would not read {flags[0]} as flags. Use the augmentation's keypoints_valid")
     kinds = {n: kind for n, v in given.items() if v is not None and (kind := kind_of(n, v, own, owner)) is not None}
-    known = CameraAugmentation, IntensityAugmentationBase2D
-    theirs = [
-        one for one in container.modules() if isinstance(one, _BasicAugmentationBase) and not isinstance(one, known)
-    ]
     names = [*kinds, *(["camera"] if sample.get("camera") is not None else [])]
-    if theirs and names:
-        other = type(theirs[0]).__name__
+    known = CameraAugmentation, IntensityAugmentationBase2D
+    theirs = (m for m in container.modules() if isinstance(m, _BasicAugmentationBase) and not isinstance(m, known))
+    for other in (type(module).__name__ for module in theirs if names):
         name = next((name for name in (other, other.removeprefix("Random")) if name in __all__), None)
         how = f"camtorch.augment.kornia.{name}, which moves" if name else "augmentations of camtorch alone, which move"
         raise ValueError(f"{owner}: {other} of kornia would leave {', '.join(names)} behind. Use {how} everything")

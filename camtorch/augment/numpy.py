@@ -16,8 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from camtorch.augment.augmentation import Augmentation, check_front_end
-from camtorch.augment.change import Change
+from camtorch.augment.augmentation import Augmentation, FrontEnd, check_front_end
 from camtorch.augment.face import FaceNormalizer
 from camtorch.augment.sample import _ALIASES, IMAGES, KINDS, OWN, Sample, Single, kind_of
 from camtorch.camera import Camera
@@ -27,7 +26,7 @@ _OWNER = "numpy.Transform"
 _VALID = "_valid"
 
 
-class Transform:
+class Transform(FrontEnd):
     """An augmentation, or a `FaceNormalizer`, of one sample of numpy arrays.
 
     The fields are those of `Augmentation`, by the same names and without their batch dim:
@@ -83,11 +82,6 @@ class Transform:
         if draw is None and camera is not None:
             fields["camera"] = camera
         return self._moved(self.augmentation.inverse, sample, fields, options)
-
-    @property
-    def last(self) -> Change | None:
-        """The change of the last call: its `source`, `target` and `rotation`."""
-        return getattr(self.augmentation, "last", None)
 
     def __repr__(self) -> str:
         return f"Transform({self.augmentation!r})"

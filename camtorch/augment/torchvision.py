@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 from torch.utils._pytree import MappingKey, SequenceKey, keystr, tree_flatten_with_path, tree_unflatten
 
-from camtorch.augment.augmentation import Augmentation, camera_of_sample, check_front_end
+from camtorch.augment.augmentation import Augmentation, FrontEnd, camera_of_sample, check_front_end
 from camtorch.augment.change import Change
 from camtorch.augment.sample import IMAGES, KEEP, KINDS, OWN, Frames, as_tensor, detached, kind_of, on_samples
 from camtorch.camera import Camera
@@ -43,7 +43,7 @@ _TURNED, _STEPS = "polygons", 33  # rotated boxes move as points all over them, 
 _HELD = Tensor, np.ndarray
 
 
-class Transform(v2.Transform):
+class Transform(FrontEnd, v2.Transform):
     """An augmentation among those of v2: one draw for everything in a sample, a dict or any other nest.
 
     Values move by their type:
@@ -85,11 +85,6 @@ class Transform(v2.Transform):
         super().__init__()
         self.camera, self.valid = check_front_end(_OWNER, augmentation, camera), bool(valid)
         self.augmentation = augmentation
-
-    @property
-    def last(self) -> Change | None:
-        """The change of the last call: its `source`, `target` and `rotation`."""
-        return self.augmentation.last
 
     @on_samples
     def forward(self, *inputs: Any) -> Any:
