@@ -72,11 +72,9 @@ def edited(camera: CameraT, matrix: Tensor | Sequence[Sequence[float]], image_si
     focal = abs(a) * fx + abs(b) * fy, abs(c) * fx + abs(d) * fy
     centre = a * cx + b * cy + left, c * cx + d * cy + top
     turned = b != 0
-    # asked of the matrix where it was drawn, so that no device is waited for
-    if isinstance(matrix, Tensor) and xp is torch:
-        turns = not is_concrete(matrix) or bool((matrix[..., 0, 1] != 0).any())
-    else:
-        turns = bool(np.any(turned))
+    turns = turned
+    if isinstance(matrix, Tensor):  # asked where it was drawn, so that no device is waited for
+        turns = np.any(turned) if xp is np else not is_concrete(matrix) or bool((matrix[..., 0, 1] != 0).any())
     distortion = _edited_distortion(camera, a - b, c + d, turned if turns else None)
     return remade(camera, intrinsics=joined((*focal, *centre), own, xp), distortion=distortion, image_size=image_size)
 

@@ -1,0 +1,59 @@
+"""One answer everywhere: every case of `cases` is the same compiled, exported, without the library and on a device."""
+
+import os
+import subprocess
+import sys
+
+import cases
+import pytest
+import torch
+from cameras import slow_unless
+from pretended import tensors_of, try_cases
+
+REFUSED = {"BoxCrop", "Compose: size, shutter", "RandomMount, shift", "RandomShutter"}
+"""Calls that torch.compile refuses."""
+INSIDE = ("Compose: mount", "Compose: crop, mount", "Compose: flip, lens", "RandomMount", "RandomLens", "RandomCamera")
+NOT_EXPORTED = (*INSIDE, *REFUSED, "FaceNormalizer", "CanonicalCamera", "CameraHead", "labels: Plane")
+"""Calls that torch.export refuses, or takes longest for."""
+QUICK = {"Warp, bilinear, zeros", "views.ring", "rectify", "Resize", "Resize, antialias", "RandomResizedCrop", "Pad"}
+QUICK |= {"HorizontalFlip", "Compose: crop, crop", "Compose: crop, turn, size"}
+every = pytest.mark.parametrize("name", slow_unless(QUICK.__contains__, [n for n in cases.CASES if n not in REFUSED]))
+
+
+def assert_same(found, expected):
+    """Assert that tensors differ by a grey level at most, or 1e-3."""
+    assert len(found) == len(expected)
+    for here, there in zip(found, expected, strict=True):
+        assert here.dtype == there.dtype
+        least = 0 if there.dtype == torch.bool else 1e-3 if there.is_floating_point() else 1
+        torch.testing.assert_close(here.double(), there.double(), atol=least, rtol=0, equal_nan=True)
+
+
+@every
+@torch.no_grad()
+def test_compiled(name):
+    program, inputs = cases.PROGRAMS[name].on("cpu")
+    compiled = torch.compile(program, fullgraph=True, backend="aot_eager")
+    assert_same(list(tensors_of(compiled(*inputs))), cases.answer(name))
+
+
+@every
+@torch.no_grad()
+def test_exported(name):
+    if name.startswith(NOT_EXPORTED):
+        pytest.skip("it is not exported")
+    program, inputs = cases.PROGRAMS[name].on("cpu")
+    exported = torch.export.export(program, tuple(inputs)).module()
+    assert_same(list(tensors_of(exported(*inputs))), cases.answer(name))
+
+
+def test_without_the_compiled_library(tmp_path):
+    command = [sys.executable, "-W", "error", cases.__file__, str(tmp_path / "answers.pt")]
+    subprocess.run(command, env={**os.environ, "CAMTORCH_NATIVE": "0"}, check=True)
+    for name, expected in torch.load(tmp_path / "answers.pt").items():
+        assert_same(cases.answer(name), expected)
+
+
+def test_on_another_device():
+    failed, table = try_cases("cases")
+    assert not failed, table
