@@ -576,7 +576,7 @@ class Augmentation(SampleTransform):
         if not self.crops:
             return draw
         found: dict[str, Any] = {name: value for name, (kind, value) in named.items() if kind == "boxes"}
-        boxes = found.get("boxes", next(iter(found.values()), None))
+        boxes: Any = found.get("boxes", next(iter(found.values()), None))
         return self.with_boxes(draw, boxes.flatten(0, -3)[:1] if getattr(boxes, "ndim", 0) > 3 else boxes)
 
     if TYPE_CHECKING:
