@@ -1,32 +1,26 @@
 """The augmentations as kornia's: in AugmentationSequential and VideoSequential, for every data key, beside its own.
 
-kornia's containers hand on the fields of a dict (`data_keys=None`) that they do not know without telling anybody. So
-this module, once imported, wraps `forward` and `inverse` of `AugmentationSequential`: if one holds a
-`CameraAugmentation`, such fields move by their names, as in `Augmentation`, and their validity comes out beside them.
-Numbers under an unknown name that might be geometry raise an error; `fields={"lidar": "points", "logits": "keep"}` of
-the augmentation says what they are. A "camera" is the camera of the images and comes out as the new one. kornia's own
-augmentations that move pixels are refused next to such fields, as they would leave them behind.
+Fields of a dict (`data_keys=None`) that kornia does not know move by their names, as in `Augmentation`, and their
+validity comes out beside them. Numbers under an unknown name that might be geometry raise an error;
+`fields={"lidar": "points", "logits": "keep"}` of the augmentation says what they are. A "camera" is the camera of the
+images and comes out as the new one. kornia's own augmentations that move pixels are refused next to such fields, as
+they would leave them behind.
 
 `import camtorch` does not load this module, nor kornia.
 """
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any, TypeAlias, cast
 
-import kornia
 import torch
-from kornia.augmentation import AugmentationSequential, GeometricAugmentationBase2D, IntensityAugmentationBase2D
-from kornia.augmentation.base import _BasicAugmentationBase
-from kornia.augmentation.container.image import ImageSequential
-from kornia.augmentation.container.params import ParamItem
+from kornia.augmentation import GeometricAugmentationBase2D
 from kornia.augmentation.utils import _transform_output_shape
-from kornia.constants import DataKey, Resample, SamplePadding
+from kornia.constants import Resample, SamplePadding
 from kornia.geometry.boxes import Boxes
 from kornia.geometry.keypoints import Keypoints
-from torch import Tensor, nn
+from torch import Tensor
 
 from camtorch._arguments import as_part, fails
 from camtorch._dtypes import narrow, widen
@@ -34,24 +28,18 @@ from camtorch._module import Memo
 from camtorch.augment import box_crop, compose, edits, random_camera
 from camtorch.augment.augmentation import Augmentation, check_front_end, check_single
 from camtorch.augment.change import Change
-from camtorch.augment.params import KIND, Params, camera_of, kind_of_camera, with_boxes, with_cameras
+from camtorch.augment.containers import KIND, InContainers, Params, camera_of, kind_of_camera, with_boxes, with_cameras
 from camtorch.augment.presets import PresetName
-from camtorch.augment.sample import OWN, Sample, Single, detached, fixed_copy, kind_of, on_samples
+from camtorch.augment.sample import detached, fixed_copy, on_samples
 from camtorch.camera import Camera
 from camtorch.warp.sampling import Mode
-
-if not hasattr(GeometricAugmentationBase2D, "_gate"):
-    raise ImportError(
-        "camtorch.augment.kornia needs kornia 0.9 or newer, which needs Python 3.11; installed is kornia "
-        f"{kornia.__version__}"
-    )
 
 Flags: TypeAlias = dict[str, Any]
 _POINTS = "keypoints"
 _BACK = "back"  # a flag of what moves back
 
 
-class CameraAugmentation(GeometricAugmentationBase2D):
+class CameraAugmentation(InContainers, GeometricAugmentationBase2D):
     r"""An augmentation of camtorch as one of kornia: images, masks, keypoints and boxes move by the same warps.
 
     The same seed gives the same warps as calling the augmentation itself on a sample.
@@ -213,18 +201,6 @@ class CameraAugmentation(GeometricAugmentationBase2D):
         result._valid = result._valid & seen
         return result
 
-    @on_samples
-    def _move_fields(self, fields: Sample, params: Params, kinds: dict[str, str], back: bool) -> Sample:
-        """Move the fields of a dict that kornia does not know; their flags come beside them."""
-        device = next((value.device for value in fields.values() if isinstance(value, Tensor)), torch.device("cpu"))
-        clips = int(params["video_batch_size"]) if "video_batch_size" in params else None
-        flat = {n: v.flatten(0, 1) for n, v in fields.items()} if clips else fields
-        with torch.autocast(device.type, enabled=False):
-            change = self.change(params, device)
-            moved = self.augmentation.moved_by(change.inverse() if back else change, flat, kinds, predicted=back)
-        kept = {n: v for n, v in moved.items() if n in fields or n.removesuffix("_valid") in kinds}
-        return {n: v.unflatten(0, (clips, -1)) for n, v in kept.items()} if clips else type(fields)(kept)
-
     def inverse_inputs(
         self, input: Tensor, params: Params, flags: Flags, transform: Any = None, **kwargs: Any
     ) -> Tensor:
@@ -299,103 +275,3 @@ RandomResizedCrop, RandomCrop, CenterCrop = map(_named, (edits.RandomResizedCrop
 Resize, Pad, Rotate90 = map(_named, (edits.Resize, edits.Pad, edits.Rotate90))
 HorizontalFlip, VerticalFlip = map(_named, (edits.HorizontalFlip, edits.VerticalFlip))
 __all__ = ["CameraAugmentation", "with_boxes", "with_cameras", *(one.__name__ for one in _Random.__subclasses__())]
-
-
-# -- dicts
-
-
-def _fields(container: Any, sample: Sample, ours: list[CameraAugmentation]) -> tuple[Sample, dict[str, str]]:
-    """Return the fields of a dict that kornia does not know and that move, and their kinds."""
-    owner, own = type(container).__name__, {n: k for one in ours for n, k in one.augmentation.fields.items()}
-    tables = {n for one in ours if one.augmentation.mirroring for n in one.augmentation.mirroring.by_name}
-    given = {name: sample[name] for name in container._read_datakeys_from_dict([*sample])[1] if name not in OWN}
-    if flags := [name for name in sample if name.endswith("_valid") and name not in given]:
-        raise ValueError(f"{owner}: kornia would not read {flags[0]} as flags. Use the augmentation's keypoints_valid")
-    kinds = {n: kind for n, v in given.items() if v is not None and (kind := kind_of(n, v, own, owner)) is not None}
-    names = [*kinds, *(["camera"] if sample.get("camera") is not None else [])]
-    known = CameraAugmentation, IntensityAugmentationBase2D
-    theirs = (m for m in container.modules() if isinstance(m, _BasicAugmentationBase) and not isinstance(m, known))
-    for other in (type(module).__name__ for module in theirs if names):
-        name = next((name for name in (other, other.removeprefix("Random")) if name in __all__), None)
-        how = f"camtorch.augment.kornia.{name}, which moves" if name else "augmentations of camtorch alone, which move"
-        raise ValueError(f"{owner}: {other} of kornia would leave {', '.join(names)} behind. Use {how} everything")
-    return {n: v for n, v in given.items() if n in kinds or n.removesuffix("_valid") in kinds or n in tables}, kinds
-
-
-def _applied(container: nn.Module, params: list[ParamItem]) -> Iterator[tuple[CameraAugmentation, Params]]:
-    """Yield the camera augmentations that were applied, in order, with their params."""
-    for item in params:
-        module = container.get_submodule(item.name)
-        if isinstance(module, CameraAugmentation):
-            yield module, cast("Params", item.data)
-        elif isinstance(item.data, list):
-            yield from _applied(module, item.data)
-
-
-def _put(of: type[nn.Module], name: str, **options: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Put `own(call, container, *args)` in the place of a method `call` of containers with a CameraAugmentation."""
-    call = getattr(of, name)
-    call = getattr(call, "__wrapped__", call)  # of a module that is imported again
-
-    def put(own: Callable[..., Any]) -> Callable[..., Any]:
-        @functools.wraps(call)
-        def method(self: Any, *args: Any, **kwargs: Any) -> Any:
-            if not any(isinstance(one, CameraAugmentation) for one in self.modules()):
-                return call(self, *args, **kwargs)
-            return own(call, self, *args, **options, **kwargs)
-
-        setattr(of, name, method)
-        return own
-
-    return put
-
-
-@_put(AugmentationSequential, "forward", back=False)
-@_put(AugmentationSequential, "inverse", back=True)
-def _with_fields(
-    call: Callable[..., Any], self: Any, *args: Any, back: bool, params: Any = None, data_keys: Any = None
-) -> Any:
-    """Move dicts with the fields that kornia does not know."""
-    if len(args) != 1 or not isinstance(args[0], dict):
-        return call(self, *args, params=params, data_keys=data_keys)
-    ours = [one for one in self.modules() if isinstance(one, CameraAugmentation)]
-    sample, camera = args[0], args[0].get("camera")
-    fields, kinds = _fields(self, sample, ours)
-    image = next((v for n, v in sample.items() if self._read_datakeys_from_dict((n,))[0] == [DataKey.INPUT]), None)
-    if camera is not None and len(ours) > 1:
-        raise ValueError(
-            f"{type(self).__name__}: a camera must be that of one camera augmentation; got {len(ours)}. "
-            "camtorch.augment.kornia.Compose makes one of several"
-        )
-    if camera is not None and not back:
-        if params is None and image is not None:
-            dims = (3, 5) if self.contains_video_sequential else (2, 4)
-            params = self.forward_parameters(self.autofill_dim(image, dim_range=dims)[1])
-        params = with_cameras(params, camera)
-    result = call(self, sample, params=params)
-    alone = image is not None and image.ndim < 4
-    fields = Single(fields) if alone else fields
-    applied = list(_applied(self, self._params if params is None else params))
-    for one, own in reversed(applied) if back else applied:
-        fields = one._move_fields(fields, own, kinds, back) if kinds else fields
-        if camera is not None:
-            cameras = one.change(own).source if back else one.change(own).target
-            cameras = (cameras[0] if alone else cameras).clone()
-            result["camera"] = list(cameras) if isinstance(camera, list) else cameras
-    return {**result, **fields}
-
-
-@_put(AugmentationSequential, "_preproc_boxes")
-def _lost_stay_lost(call: Callable[..., Boxes], self: Any, boxes: Any, key: DataKey) -> Boxes:
-    """Take boxes of zeros, as kornia exports lost ones, for lost: it takes none of no width."""
-    if not isinstance(boxes, Tensor):
-        return call(self, boxes, key)
-    lost = (boxes == 0).all(-1) if key is not DataKey.BBOX else (boxes == 0).all(-1).all(-1)
-    if key is DataKey.BBOX_XYWH:
-        boxes = torch.where(lost.unsqueeze(-1), boxes.new_tensor((0, 0, 1, 1)), boxes)
-    result = call(self, boxes, key)
-    result._valid = result._valid & ~lost.reshape(result._valid.shape)
-    return result
-
-
-_put(ImageSequential, "__getstate__")(lambda call, self: detached(call(self)))

@@ -171,6 +171,7 @@ THEIR_OWN = {
     "torchvision": {"image", "mask", "boxes", "keypoints", "polygons"},
     "kornia": {"keypoints", "boxes", "images"},
     "numpy": set(),
+    "containers": {"boxes"},
 }
 
 

@@ -11,6 +11,7 @@ from kornia.geometry.boxes import Boxes
 
 import camtorch as ct
 from camtorch import augment
+from camtorch.augment import containers
 from camtorch.augment import kornia as adapter
 
 HEIGHT, WIDTH = SIZE = 96, 128
@@ -453,4 +454,4 @@ def test_gradients_reach_cameras_of_samples(key):
 def test_a_kornia_too_old_is_told(monkeypatch):
     monkeypatch.delattr("kornia.augmentation.base._AugmentationBase._gate")
     with pytest.raises(ImportError, match=r"needs kornia 0\.9 or newer, .* installed is kornia "):
-        importlib.reload(adapter)
+        importlib.reload(containers)

@@ -1,0 +1,246 @@
+"""kornia's containers of camera augmentations: dicts move whole, and params carry cameras and boxes of the samples.
+
+kornia hands on the fields of a dict that it does not know without telling anybody. So this module wraps `forward` and
+`inverse` of its containers, and the way in which they take boxes and are copied.
+"""
+
+from __future__ import annotations
+
+import functools
+import zlib
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, TypeAlias
+
+import kornia
+import torch
+from kornia.augmentation import AugmentationSequential, GeometricAugmentationBase2D, IntensityAugmentationBase2D
+from kornia.augmentation.base import _BasicAugmentationBase
+from kornia.augmentation.container.image import ImageSequential
+from kornia.augmentation.container.params import ParamItem
+from kornia.constants import DataKey
+from kornia.geometry.boxes import Boxes
+from torch import Tensor, nn
+from torch.nn.utils.parametrize import type_before_parametrizations
+from torch.utils._pytree import tree_map
+
+from camtorch import augment
+from camtorch._arguments import as_values, check_boxes, shown
+from camtorch._module import remade
+from camtorch.augment.augmentation import Augmentation
+from camtorch.augment.change import Change
+from camtorch.augment.collate import collate_cameras
+from camtorch.augment.sample import OWN, Sample, Single, detached, kind_of, on_samples
+from camtorch.camera import Camera
+
+if not hasattr(GeometricAugmentationBase2D, "_gate"):
+    raise ImportError(
+        "camtorch.augment.kornia needs kornia 0.9 or newer, which needs Python 3.11; installed is kornia "
+        f"{kornia.__version__}"
+    )
+
+Params: TypeAlias = dict[str, Tensor]
+KIND = "source_kind"
+_NUMBERS = "source_intrinsics", "source_distortion"
+
+
+class InContainers:
+    """An augmentation that moves the fields of dicts which kornia's containers do not know."""
+
+    augmentation: Augmentation
+    change: Callable[..., Change]
+
+    @on_samples
+    def _move_fields(self, fields: Sample, params: Params, kinds: dict[str, str], back: bool) -> Sample:
+        """Move the fields of a dict that kornia does not know; their flags come beside them."""
+        device = next((value.device for value in fields.values() if isinstance(value, Tensor)), torch.device("cpu"))
+        clips = int(params["video_batch_size"]) if "video_batch_size" in params else None
+        flat = {n: v.flatten(0, 1) for n, v in fields.items()} if clips else fields
+        with torch.autocast(device.type, enabled=False):
+            change = self.change(params, device)
+            moved = self.augmentation.moved_by(change.inverse() if back else change, flat, kinds, predicted=back)
+        kept = {n: v for n, v in moved.items() if n in fields or n.removesuffix("_valid") in kinds}
+        return {n: v.unflatten(0, (clips, -1)) for n, v in kept.items()} if clips else type(fields)(kept)
+
+
+def with_boxes(params: Any, boxes: Tensor) -> Any:
+    """Params with the boxes (B, 4) that a `BoxCrop` crops, pixels x1, y1, x2, y2: of one augmentation, or a container.
+
+    `params = aug.forward_parameters(images.shape)`, then `aug(images, params=with_boxes(params, boxes))`.
+
+    Raises:
+        ValueError: If the boxes have another shape or number, or nothing among the params crops.
+    """
+    given = as_values(boxes, "boxes", "with_boxes")
+    check_boxes(given, "boxes", "with_boxes")
+    result, found = _edited(params, "box", "with_boxes: params must be those of a BoxCrop")
+    for own, name in found:
+        if tuple(given.shape) != (len(own[name]), 4):
+            raise ValueError(f"with_boxes: boxes must be ({len(own[name])}, 4); got {tuple(given.shape)}")
+        own[name] = given
+    return result
+
+
+def with_cameras(params: Any, cameras: Camera | Sequence[Camera]) -> Any:
+    """Params for images whose cameras differ in their numbers: of one augmentation, or the list of a container.
+
+    `params = aug.forward_parameters(images.shape)`, then `aug(images, params=with_cameras(params, cameras))`.
+
+    Args:
+        params: they stay as they are.
+        cameras: a batch, or a list, that differ only in their numbers. Of a video, one for each clip or each frame.
+
+    Raises:
+        ValueError: If the cameras are of another kind or number, or the params of no camera augmentation.
+        TypeError: If they are no cameras.
+    """
+    if isinstance(cameras, (list, tuple)) and all(isinstance(camera, Camera) for camera in cameras):
+        cameras = collate_cameras(cameras)
+    if not isinstance(cameras, Camera) or cameras.is_mixed:
+        got = [type(one).__name__ for one in cameras] if isinstance(cameras, list) else type(cameras).__name__
+        raise TypeError(
+            "with_cameras: cameras must be a Camera with a batch dim, or single ones of one model and size, in a list; "
+            f"got {got}"
+        )
+    result, found = _edited(params, KIND, "with_cameras: params must be those of a camera augmentation")
+    for own, name in found:
+        kinds, kind, batch = own[name], kind_of_camera(cameras), tuple(cameras.batch_shape)
+        if len(kinds) and kinds[0].tolist() != kind:
+            need, got = (f"{k[1]} coefficients and image_size {tuple(k[2:])}" for k in (kinds[0].tolist(), kind))
+            raise ValueError(
+                f"with_cameras: needs the augmentation's model, {need}; got {type(cameras).__name__}, {got}"
+            )
+        count, clips = len(kinds), int(own.get("video_batch_size", len(kinds)))
+        if batch not in ((), (1,), (count,), (clips,)):
+            raise ValueError(f"with_cameras: the params are for {count} samples; got cameras of batch dims {batch}")
+        frames = count // clips if batch == (clips,) and clips else 1
+        for key, numbers in zip(_NUMBERS, (cameras.intrinsics, cameras.distortion), strict=True):
+            own[key] = numbers.expand(*(batch or (1,)), -1).repeat_interleave(frames, 0).expand(count, -1)
+    return result
+
+
+def _edited(params: Any, name: str, need: str) -> tuple[Any, list[tuple[Params, str]]]:
+    """Return a copy of params, of one augmentation or a list, and where in it are those of a name; an error if none."""
+    result = tree_map(lambda value: value, params)
+    found = [(part, key) for _, part in _parts(result) for key in part if key.rpartition(".")[2] == name]
+    if not found:
+        raise ValueError(f"{need}; got {shown(params)}")
+    return result, found
+
+
+def _parts(params: Any, module: nn.Module | None = None) -> Iterator[tuple[nn.Module | None, Params]]:
+    """Yield the params of single augmentations, in order, with the augmentation if they are those of `module`."""
+    if isinstance(params, dict):
+        yield module, params
+    for item in params if isinstance(params, (list, tuple)) else ():
+        if isinstance(item, ParamItem):
+            yield from _parts(item.data, None if module is None else module.get_submodule(item.name))
+
+
+def camera_of(params: Params, own: Camera, device: torch.device | None) -> Camera:
+    """Return the camera with the numbers that the params carry, by default those of `own`."""
+    given = own.intrinsics, own.distortion
+    device = own.intrinsics.device if device is None else device
+    intrinsics, distortion = (params.get(n, value).to(device) for n, value in zip(_NUMBERS, given, strict=True))
+    same = intrinsics is given[0] and distortion is given[1]
+    return own if same else remade(own, intrinsics=intrinsics, distortion=distortion)
+
+
+def kind_of_camera(camera: Camera) -> list[int]:
+    """Model, number of coefficients and image_size as integers, for params hold tensors only."""
+    return [
+        zlib.crc32(type_before_parametrizations(camera).__name__.encode()),
+        camera.distortion.shape[-1],
+        *(camera.image_size or (0, 0)),
+    ]
+
+
+# -- dicts
+
+
+def _fields(container: Any, sample: Sample, ours: list[InContainers]) -> tuple[Sample, dict[str, str]]:
+    """Return the fields of a dict that kornia does not know and that move, and their kinds."""
+    owner, own = type(container).__name__, {n: k for one in ours for n, k in one.augmentation.fields.items()}
+    tables = {n for one in ours if one.augmentation.mirroring for n in one.augmentation.mirroring.by_name}
+    given = {name: sample[name] for name in container._read_datakeys_from_dict([*sample])[1] if name not in OWN}
+    if flags := [name for name in sample if name.endswith("_valid") and name not in given]:
+        raise ValueError(f"{owner}: kornia would not read {flags[0]} as flags. Use the augmentation's keypoints_valid")
+    kinds = {n: kind for n, v in given.items() if v is not None and (kind := kind_of(n, v, own, owner)) is not None}
+    names = [*kinds, *(["camera"] if sample.get("camera") is not None else [])]
+    known = InContainers, IntensityAugmentationBase2D
+    theirs = (m for m in container.modules() if isinstance(m, _BasicAugmentationBase) and not isinstance(m, known))
+    for other in (type(module).__name__ for module in theirs if names):
+        name = next((name for name in (other, other.removeprefix("Random")) if hasattr(augment, name)), None)
+        how = f"camtorch.augment.kornia.{name}, which moves" if name else "augmentations of camtorch alone, which move"
+        raise ValueError(f"{owner}: {other} of kornia would leave {', '.join(names)} behind. Use {how} everything")
+    return {n: v for n, v in given.items() if n in kinds or n.removesuffix("_valid") in kinds or n in tables}, kinds
+
+
+def _put(of: type[nn.Module], name: str, **options: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """Put `own(call, container, *args)` in the place of a method `call` of containers with such an augmentation."""
+    call = getattr(of, name)
+    call = getattr(call, "__wrapped__", call)  # of a module that is imported again
+
+    def put(own: Callable[..., Any]) -> Callable[..., Any]:
+        @functools.wraps(call)
+        def method(self: Any, *args: Any, **kwargs: Any) -> Any:
+            if not any(isinstance(one, InContainers) for one in self.modules()):
+                return call(self, *args, **kwargs)
+            return own(call, self, *args, **options, **kwargs)
+
+        setattr(of, name, method)
+        return own
+
+    return put
+
+
+@_put(AugmentationSequential, "forward", back=False)
+@_put(AugmentationSequential, "inverse", back=True)
+def _with_fields(
+    call: Callable[..., Any], self: Any, *args: Any, back: bool, params: Any = None, data_keys: Any = None
+) -> Any:
+    """Move dicts with the fields that kornia does not know."""
+    if len(args) != 1 or not isinstance(args[0], dict):
+        return call(self, *args, params=params, data_keys=data_keys)
+    ours = [one for one in self.modules() if isinstance(one, InContainers)]
+    sample, camera = args[0], args[0].get("camera")
+    fields, kinds = _fields(self, sample, ours)
+    image = next((v for n, v in sample.items() if self._read_datakeys_from_dict((n,))[0] == [DataKey.INPUT]), None)
+    if camera is not None and len(ours) > 1:
+        raise ValueError(
+            f"{type(self).__name__}: a camera must be that of one camera augmentation; got {len(ours)}. "
+            "camtorch.augment.kornia.Compose makes one of several"
+        )
+    if camera is not None and not back:
+        if params is None and image is not None:
+            dims = (3, 5) if self.contains_video_sequential else (2, 4)
+            params = self.forward_parameters(self.autofill_dim(image, dim_range=dims)[1])
+        params = with_cameras(params, camera)
+    result = call(self, sample, params=params)
+    alone = image is not None and image.ndim < 4
+    fields = Single(fields) if alone else fields
+    applied = [*_parts(self._params if params is None else params, self)]
+    for one, own in reversed(applied) if back else applied:
+        if not isinstance(one, InContainers):
+            continue
+        fields = one._move_fields(fields, own, kinds, back) if kinds else fields
+        if camera is not None:
+            cameras = one.change(own).source if back else one.change(own).target
+            cameras = (cameras[0] if alone else cameras).clone()
+            result["camera"] = list(cameras) if isinstance(camera, list) else cameras
+    return {**result, **fields}
+
+
+@_put(AugmentationSequential, "_preproc_boxes")
+def _lost_stay_lost(call: Callable[..., Boxes], self: Any, boxes: Any, key: DataKey) -> Boxes:
+    """Take boxes of zeros, as kornia exports lost ones, for lost: it takes none of no width."""
+    if not isinstance(boxes, Tensor):
+        return call(self, boxes, key)
+    lost = (boxes == 0).all(-1) if key is not DataKey.BBOX else (boxes == 0).all(-1).all(-1)
+    if key is DataKey.BBOX_XYWH:
+        boxes = torch.where(lost.unsqueeze(-1), boxes.new_tensor((0, 0, 1, 1)), boxes)
+    result = call(self, boxes, key)
+    result._valid = result._valid & ~lost.reshape(result._valid.shape)
+    return result
+
+
+_put(ImageSequential, "__getstate__")(lambda call, self: detached(call(self)))
