@@ -18,7 +18,7 @@ import camtorch as ct
 from benchmarks import cameras
 from benchmarks.harness import NAMES, OPENCV, OURS, Figure, Options, Row, Table, measure
 from benchmarks.memory import growth
-from camtorch.rotations import rotation_matrix
+from camtorch.poses.rotations import rotation_matrix
 
 EXTENDED = "OpenCV, covariances"
 _EVERYONE = {who: (who,) for who in (OURS, OPENCV, EXTENDED)}

@@ -26,7 +26,7 @@ if not TYPE_CHECKING:  # a checker knows the names, and no others
             _load()
             if name in globals():
                 return globals()[name]
-        from camtorch._arguments import LEFT
+        from camtorch.values.arguments import LEFT
 
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}. {LEFT}")
 

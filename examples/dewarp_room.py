@@ -13,7 +13,7 @@ from scenes import room
 from torch import Tensor
 
 import camtorch as ct
-from camtorch.rotations import mount_rotation
+from camtorch.poses.rotations import mount_rotation
 
 LENSES = {"webcam": 52, "dms90": 76, "tumvi": 85, "aria": 95, "surround190": 105}
 """A preset, and the degrees to which its images are dewarped."""

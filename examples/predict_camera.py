@@ -16,7 +16,7 @@ from scenes import room
 from torch import Tensor, nn
 
 import camtorch as ct
-from camtorch.rotations import mount_rotation
+from camtorch.poses.rotations import mount_rotation
 
 SIZE = (48, 64)
 FOV, ALPHA = (55.0, 125.0), (0.0, 0.7)  # horizontally, in degrees; from perspective to more than equidistant

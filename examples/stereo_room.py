@@ -15,7 +15,7 @@ from scenes import room
 from torch import Tensor
 
 import camtorch as ct
-from camtorch.rotations import rotation_matrix
+from camtorch.poses.rotations import rotation_matrix
 
 BASELINE = 0.25  # metres
 LEFT, RIGHT = (rotation_matrix(torch.tensor(r).double()) for r in ([-0.04, 0.05, 0.02], [0.03, -0.06, -0.03]))

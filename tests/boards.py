@@ -9,7 +9,7 @@ from typing import NamedTuple
 import torch
 
 import camtorch as ct
-from camtorch.rotations import rotation_matrix
+from camtorch.poses.rotations import rotation_matrix
 
 STEREO = {
     "left": ct.KannalaBrandt([300.0, 301.0, 321.0, 238.0], [0.02, -0.01, 0.003, -0.001], image_size=(480, 640)),

@@ -8,7 +8,7 @@ import torch
 
 import camtorch as ct
 from camtorch.boards.boards import AprilGrid, Charuco
-from camtorch.rotations import rotation_matrix
+from camtorch.poses.rotations import rotation_matrix
 
 SHARP, SCALE, MARGIN = 2, 3000, 30  # finer rays; pixels a metre of paper; pixels around a board
 

@@ -8,9 +8,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from camtorch.camera import Camera
-from camtorch.projection.rays import image_lattice
-from camtorch.rotations import nearest_rotation
+from camtorch.cameras.camera import Camera
+from camtorch.poses.rotations import nearest_rotation
+from camtorch.rays.lattices import image_lattice
 
 _LONG = 400  # pixels of the lattice along the longer side
 _ROUNDING = 1e-9  # px, far above that of two equal cameras

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import torch
 from torch.nn.utils.parametrize import type_before_parametrizations
 
-from camtorch.camera import Camera
-from camtorch.projection.rays import followed, ideal, image_lattice
+from camtorch.cameras.camera import Camera
+from camtorch.rays.lattices import followed, ideal, image_lattice
 
 _SIDE = 129  # of a lattice over the image
 _ANGLES, _AZIMUTHS = 3601, 32

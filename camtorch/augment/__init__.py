@@ -5,7 +5,6 @@
 
 from typing import TYPE_CHECKING
 
-from camtorch._arguments import LEFT
 from camtorch.augment.augmentation import Augmentation, Range
 from camtorch.augment.box_crop import BoxCrop
 from camtorch.augment.change import Change
@@ -29,7 +28,8 @@ from camtorch.augment.presets import PRESETS, Preset
 from camtorch.augment.random_camera import RandomCamera, RandomLens, RandomMount
 from camtorch.augment.sample import from_pitch_yaw, to_pitch_yaw
 from camtorch.augment.shutter import RandomShutter
-from camtorch.rotations import mount_rotation
+from camtorch.poses.rotations import mount_rotation
+from camtorch.values.arguments import LEFT
 from camtorch.warp.boxes import outlines
 
 __all__ = [

@@ -20,7 +20,7 @@ from albumentations.core.type_definitions import Targets
 from camtorch.augment import numpy as arrays
 from camtorch.augment.augmentation import Augmentation, FrontEnd, camera_of_sample, check_front_end
 from camtorch.augment.sample import KINDS, Unknown, detached, kind_of
-from camtorch.camera import Camera
+from camtorch.cameras.camera import Camera
 
 _OWNER = "albumentations.Transform"
 _OWN = "image", "images", "mask", "masks", "bboxes", "keypoints"  # targets of pipelines

@@ -13,7 +13,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 from typing_extensions import Unpack
 
-from camtorch._arguments import (
+from camtorch.augment.change import Change, Part, alone, as_one, by_kinds
+from camtorch.augment.filling import enough, filled, scaled
+from camtorch.augment.sample import Named, Sample, SampleOptions, SampleTransform, Unknown, fixed_copy, on_samples
+from camtorch.cameras.camera import Camera
+from camtorch.cameras.mixed import Mixed
+from camtorch.evaluate.regime import is_concrete, may_look
+from camtorch.values.arguments import (
     GUESS_CAMERA,
     are_numbers,
     as_flag,
@@ -26,13 +32,7 @@ from camtorch._arguments import (
     shown,
     warn,
 )
-from camtorch._module import typed_as
-from camtorch._tracing import is_concrete, may_look
-from camtorch.augment.change import Change, Part, alone, as_one, by_kinds
-from camtorch.augment.filling import enough, filled, scaled
-from camtorch.augment.sample import Named, Sample, SampleOptions, SampleTransform, Unknown, fixed_copy, on_samples
-from camtorch.camera import Camera
-from camtorch.mixed import Mixed
+from camtorch.values.module import typed_as
 from camtorch.warp.warp import Warp
 
 _FEW = 2 / 3  # of what an image shows of its own camera: with less than that, on average, a warning says so

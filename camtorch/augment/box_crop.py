@@ -8,10 +8,10 @@ import torch
 from torch import Tensor
 from typing_extensions import Unpack
 
-from camtorch._arguments import as_known_size, as_whole
 from camtorch.augment.augmentation import Augmentation, EditOptions, as_range
-from camtorch.camera import Camera
-from camtorch.rotations import mount_rotation
+from camtorch.cameras.camera import Camera
+from camtorch.poses.rotations import mount_rotation
+from camtorch.values.arguments import as_known_size, as_whole
 from camtorch.warp.views import as_margin, check_extents, looking_at, pinhole
 
 RangeLike = float | Sequence[float]

@@ -12,17 +12,17 @@ import torch
 from torch import Tensor, nn
 from torch.nn.utils.parametrize import type_before_parametrizations
 
-from camtorch._arguments import are_numbers, fails, holds
-from camtorch._dtypes import narrow, widen
-from camtorch._editing import edited
-from camtorch._evaluation import rows_of
-from camtorch._module import remade
-from camtorch._numbers import joined
-from camtorch.camera import Camera
-from camtorch.mixed import Mixed
+from camtorch.cameras.camera import Camera
+from camtorch.cameras.editing import edited
+from camtorch.cameras.mixed import Mixed
+from camtorch.cameras.numbers import joined
+from camtorch.poses.rotations import turn
 from camtorch.projection.compiled import Native
+from camtorch.projection.evaluation import rows_of
 from camtorch.projection.rows import single_native
-from camtorch.rotations import turn
+from camtorch.values.arguments import are_numbers, fails, holds
+from camtorch.values.dtypes import narrow, widen
+from camtorch.values.module import remade
 from camtorch.warp.affine import AffineWarp, MirrorWarp, after
 from camtorch.warp.at_once import between_of
 from camtorch.warp.boxes import corners_of, in_order

@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 
-from camtorch.camera import Camera
+from camtorch.cameras.camera import Camera
 
 
 @dataclass(frozen=True)

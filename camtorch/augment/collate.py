@@ -13,10 +13,10 @@ from torch.utils.data import get_worker_info
 from torch.utils.data._utils.collate import collate as collate_by
 from torch.utils.data._utils.collate import default_collate_fn_map
 
-from camtorch._arguments import is_list
 from camtorch.augment.sending import stacked, within_message
-from camtorch.camera import Camera
-from camtorch.mixed import cat
+from camtorch.cameras.camera import Camera
+from camtorch.cameras.mixed import cat
+from camtorch.values.arguments import is_list
 
 
 def collate(samples: Sequence[object]) -> object:

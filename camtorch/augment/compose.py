@@ -10,12 +10,12 @@ import torch
 from torch import Tensor, nn
 from typing_extensions import Unpack
 
-from camtorch._arguments import as_mapping
 from camtorch.augment.augmentation import Augmentation, EditOptions, Range, draw
 from camtorch.augment.change import Change, check_sizes
 from camtorch.augment.edits import Edit, change_by
 from camtorch.augment.landmarks import Mirroring
-from camtorch.camera import Camera
+from camtorch.cameras.camera import Camera
+from camtorch.values.arguments import as_mapping
 
 _OF_IMAGES = ("mode", "padding_mode", "fill", "tolerance")
 

@@ -24,13 +24,13 @@ from torch.nn.utils.parametrize import type_before_parametrizations
 from torch.utils._pytree import tree_map
 
 from camtorch import augment
-from camtorch._arguments import as_values, check_boxes, shown
-from camtorch._module import remade
 from camtorch.augment.augmentation import Augmentation
 from camtorch.augment.change import Change
 from camtorch.augment.collate import collate_cameras
 from camtorch.augment.sample import OWN, Sample, Single, detached, kind_of, on_samples
-from camtorch.camera import Camera
+from camtorch.cameras.camera import Camera
+from camtorch.values.arguments import as_values, check_boxes, shown
+from camtorch.values.module import remade
 
 if not hasattr(GeometricAugmentationBase2D, "_gate"):
     raise ImportError(

@@ -11,12 +11,12 @@ import torch
 from torch import Tensor
 from typing_extensions import Unpack
 
-from camtorch._arguments import as_image_size, as_whole, fails, holds
-from camtorch._editing import edited, quarter_turns
 from camtorch.augment.augmentation import Augmentation, EditOptions, FlipOptions, Range, as_range
 from camtorch.augment.change import Change, Part, by_kinds
 from camtorch.augment.landmarks import Mirroring, TableLike
-from camtorch.camera import Camera
+from camtorch.cameras.camera import Camera
+from camtorch.cameras.editing import edited, quarter_turns
+from camtorch.values.arguments import as_image_size, as_whole, fails, holds
 from camtorch.warp.affine import AffineWarp, Map, Rows, after, as_tensor, on_rays
 
 Size = int | Sequence[int]

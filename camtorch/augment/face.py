@@ -10,13 +10,13 @@ import torch
 from torch import Tensor
 from typing_extensions import Unpack
 
-from camtorch._arguments import as_known_size, as_number, fails, no_camera, shown
-from camtorch._module import remade, typed_as
 from camtorch.augment.change import Change, Part, alone
 from camtorch.augment.sample import Sample, SampleOptions, SampleTransform, on_samples
-from camtorch.camera import Camera
+from camtorch.cameras.camera import Camera
 from camtorch.models import Pinhole
-from camtorch.rotations import check_rotation, rotation_matrix
+from camtorch.poses.rotations import check_rotation, rotation_matrix
+from camtorch.values.arguments import as_known_size, as_number, fails, no_camera, shown
+from camtorch.values.module import remade, typed_as
 from camtorch.warp.warp import Warp
 
 _ODD = 50.0  # times the distance: no face is meant to be so much nearer or farther; units differ

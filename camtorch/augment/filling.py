@@ -8,11 +8,11 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from camtorch._arguments import broadcast_shapes
-from camtorch._module import remade
-from camtorch._opaque import CameraNumbers, opaque
-from camtorch.camera import Camera
-from camtorch.rotations import rotation_matrix, rotation_vector
+from camtorch.cameras.camera import Camera
+from camtorch.cameras.opaque import CameraNumbers, opaque
+from camtorch.poses.rotations import rotation_matrix, rotation_vector
+from camtorch.values.arguments import broadcast_shapes
+from camtorch.values.module import remade
 from camtorch.warp.boxes import along_edges
 from camtorch.warp.moving import moved_pixels
 

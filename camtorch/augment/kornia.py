@@ -22,16 +22,16 @@ from kornia.geometry.boxes import Boxes
 from kornia.geometry.keypoints import Keypoints
 from torch import Tensor
 
-from camtorch._arguments import as_part, fails
-from camtorch._dtypes import narrow, widen
-from camtorch._module import Memo
 from camtorch.augment import box_crop, compose, edits, random_camera
 from camtorch.augment.augmentation import Augmentation, check_front_end, check_single
 from camtorch.augment.change import Change
 from camtorch.augment.containers import KIND, InContainers, Params, camera_of, kind_of_camera, with_boxes, with_cameras
 from camtorch.augment.presets import PresetName
 from camtorch.augment.sample import detached, fixed_copy, on_samples
-from camtorch.camera import Camera
+from camtorch.cameras.camera import Camera
+from camtorch.values.arguments import as_part, fails
+from camtorch.values.dtypes import narrow, widen
+from camtorch.values.module import Memo
 from camtorch.warp.sampling import Mode
 
 Flags: TypeAlias = dict[str, Any]

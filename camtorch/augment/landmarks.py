@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from camtorch._arguments import as_flag, as_whole, shown, warn
+from camtorch.values.arguments import as_flag, as_whole, shown, warn
 
 
 def _order(count: int, *runs: tuple[int, int, int]) -> tuple[int, ...]:

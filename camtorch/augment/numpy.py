@@ -19,7 +19,7 @@ from torch import Tensor
 from camtorch.augment.augmentation import Augmentation, FrontEnd, check_front_end
 from camtorch.augment.face import FaceNormalizer
 from camtorch.augment.sample import _ALIASES, IMAGES, KINDS, OWN, Sample, Single, kind_of
-from camtorch.camera import Camera
+from camtorch.cameras.camera import Camera
 from camtorch.warp.arrays import as_array, as_planes, as_tensor, plain
 
 _OWNER = "numpy.Transform"

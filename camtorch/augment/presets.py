@@ -7,7 +7,7 @@ from typing import Literal
 
 import torch
 
-from camtorch.camera import Camera, fixed_camera
+from camtorch.cameras.camera import Camera, fixed_camera
 from camtorch.models import MODELS
 
 

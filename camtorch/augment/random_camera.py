@@ -15,25 +15,25 @@ from torch import Tensor
 from torch.nn.utils.parametrize import type_before_parametrizations
 from typing_extensions import Unpack
 
-from camtorch._arguments import LEFT, are_numbers, as_image_size, broadcast_shapes, check_degrees, fails, warn
-from camtorch._evaluation import rows_of
-from camtorch._module import Memo, remade
-from camtorch._numbers import joined, split
-from camtorch._opaque import CameraNumbers, opaque
-from camtorch._tracing import in_graph, is_eager
 from camtorch.augment.augmentation import Augmentation, FilledOptions, Range, as_range
 from camtorch.augment.change import Part, View
 from camtorch.augment.filling import enough, scaled
 from camtorch.augment.presets import PRESETS, PresetName
 from camtorch.augment.sample import Named, fixed_copy
-from camtorch.camera import Camera
+from camtorch.cameras.camera import Camera
+from camtorch.cameras.numbers import joined, split
+from camtorch.cameras.opaque import CameraNumbers, opaque
+from camtorch.evaluate.regime import in_graph, is_eager
 from camtorch.lenses.drawing import FOLD, covering, drawn
 from camtorch.models import MODELS, KannalaBrandt
 from camtorch.optics.radial_inverse import precise
+from camtorch.poses.rotations import mount_elements
 from camtorch.projection.compiled import Native, project, project_numbers, unproject
-from camtorch.projection.rays import field_of_view, pixel_lattice, polar_rays, reach
+from camtorch.projection.evaluation import rows_of
 from camtorch.projection.rows import Cameras, single_native
-from camtorch.rotations import mount_elements
+from camtorch.rays.lattices import field_of_view, pixel_lattice, polar_rays, reach
+from camtorch.values.arguments import LEFT, are_numbers, as_image_size, broadcast_shapes, check_degrees, fails, warn
+from camtorch.values.module import Memo, remade
 from camtorch.warp.boxes import along_edges
 from camtorch.warp.panorama import PANORAMAS
 from camtorch.warp.shifted import ShiftedWarp

@@ -19,7 +19,14 @@ from torch.utils._pytree import tree_map
 from torch.utils.data import get_worker_info
 from typing_extensions import Unpack
 
-from camtorch._arguments import (
+from camtorch.augment.change import Change, Part, View, alone, as_one
+from camtorch.augment.clips import Clips
+from camtorch.augment.landmarks import Mirroring, exchanged
+from camtorch.cameras.camera import Camera
+from camtorch.evaluate.regime import may_look
+from camtorch.models import Pinhole
+from camtorch.poses.rotations import are_rotations, check_rotation, rotation_matrix, rotation_vector
+from camtorch.values.arguments import (
     GUESS_CAMERA,
     LEFT,
     are_numbers,
@@ -36,14 +43,7 @@ from camtorch._arguments import (
     no_camera,
     warn,
 )
-from camtorch._threads import on_one_thread
-from camtorch._tracing import may_look
-from camtorch.augment.change import Change, Part, View, alone, as_one
-from camtorch.augment.clips import Clips
-from camtorch.augment.landmarks import Mirroring, exchanged
-from camtorch.camera import Camera
-from camtorch.models import Pinhole
-from camtorch.rotations import are_rotations, check_rotation, rotation_matrix, rotation_vector
+from camtorch.values.threads import on_one_thread
 from camtorch.warp.at_once import at_once, batch_at_once
 from camtorch.warp.boxes import edges_of, enclosing
 from camtorch.warp.sampling import Options, Sampler, as_options

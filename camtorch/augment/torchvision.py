@@ -20,7 +20,7 @@ from torch.utils._pytree import MappingKey, SequenceKey, keystr, tree_flatten_wi
 from camtorch.augment.augmentation import Augmentation, FrontEnd, camera_of_sample, check_front_end
 from camtorch.augment.change import Change
 from camtorch.augment.sample import IMAGES, KEEP, KINDS, OWN, Frames, as_tensor, detached, kind_of, on_samples
-from camtorch.camera import Camera
+from camtorch.cameras.camera import Camera
 from camtorch.warp.arrays import as_planes_of
 from camtorch.warp.boxes import lattice_of, turned
 

@@ -12,7 +12,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from camtorch._arguments import imported, shown
+from camtorch.values.arguments import imported, shown
 
 
 def opencv(owner: str) -> Any:

@@ -15,10 +15,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from camtorch._arguments import as_number, shown, warn
-from camtorch._photographs import read_stored
 from camtorch.boards.boards import Board, as_board, opencv
 from camtorch.boards.detection import detect
+from camtorch.io.photographs import read_stored
+from camtorch.values.arguments import as_number, shown, warn
 
 _OWNER = "find_board"
 IMAGES = frozenset({".bmp", ".jpeg", ".jpg", ".pgm", ".png", ".ppm", ".tif", ".tiff", ".webp"})

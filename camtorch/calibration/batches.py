@@ -8,9 +8,9 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from camtorch._arguments import Numbers, _as_plain, as_values
-from camtorch._module import BatchedModule, remade
-from camtorch.camera import Camera
+from camtorch.cameras.camera import Camera
+from camtorch.values.arguments import Numbers, _as_plain, as_values
+from camtorch.values.module import BatchedModule, remade
 
 
 def as_tensor(values: Numbers, name: str, owner: str, device: torch.device) -> Tensor:

@@ -16,17 +16,17 @@ import torch
 from torch import Tensor
 from torch.nn.utils.parametrize import type_before_parametrizations
 
-from camtorch._evaluation import compiled_of
-from camtorch._module import remade
 from camtorch.calibration import compiled as compiled_poses
-from camtorch.camera import Camera, fixed_camera
+from camtorch.cameras.camera import Camera, fixed_camera
 from camtorch.convert.fitting import bounds
 from camtorch.least_squares.equations import Equations, System, padded, triangle_of_few
 from camtorch.least_squares.jacobians import sensor_jacobians
 from camtorch.least_squares.levenberg_marquardt import FIRST_DAMPING, minimise, rounding_of
+from camtorch.poses.rotations import small_turn
 from camtorch.projection import compiled
+from camtorch.projection.evaluation import compiled_of
 from camtorch.projection.rows import Cameras
-from camtorch.rotations import small_turn
+from camtorch.values.module import remade
 
 if TYPE_CHECKING:
     from camtorch.calibration.observations import Observations

@@ -12,18 +12,18 @@ import torch
 from torch import Tensor
 from torch.nn.utils.parametrize import type_before_parametrizations
 
-from camtorch._arguments import as_flag, as_number, as_whole, hinting, no_camera, shown, warn
-from camtorch._freezing import INTRINSICS, frozen_names
-from camtorch._threads import on_one_thread
 from camtorch.calibration.bundle import LOSSES, Adjusted, Free, Poses, Prior, Sight, State, adjust
 from camtorch.calibration.observations import Layout, Observations, Points, as_observations, repeats
 from camtorch.calibration.start import other_cameras, other_poses, poses_for, start_from_nothing
 from camtorch.calibration.uncertainty import Spread, noise_under, shared_factor, spread, uncertainty
 from camtorch.calibration.verdict import check_determined, verdict, warnings
-from camtorch.camera import Camera
-from camtorch.camera import as_model as as_kind
-from camtorch.extrinsics import Extrinsics
-from camtorch.rotations import rotation_vector
+from camtorch.cameras.camera import Camera
+from camtorch.cameras.camera import as_model as as_kind
+from camtorch.cameras.freezing import INTRINSICS, frozen_names
+from camtorch.poses.extrinsics import Extrinsics
+from camtorch.poses.rotations import rotation_vector
+from camtorch.values.arguments import as_flag, as_number, as_whole, hinting, no_camera, shown, warn
+from camtorch.values.threads import on_one_thread
 
 STEPS = 300
 _MANY = 100  # coefficients

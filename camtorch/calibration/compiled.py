@@ -10,10 +10,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from camtorch._threads import spread, thread_count
 from camtorch.native.library import library
+from camtorch.poses.rotations import small_turn
 from camtorch.projection.compiled import Native
-from camtorch.rotations import small_turn
+from camtorch.values.threads import spread, thread_count
 
 _FROM_RAYS, _REFINED, _SOLVED, _AGREED = range(4)
 _LOSSES = (None, "huber", "cauchy")

@@ -8,14 +8,14 @@ from collections.abc import Collection, Sequence
 import torch
 from torch import Tensor
 
-from camtorch._arguments import Numbers, as_image_size, as_values
-from camtorch._threads import on_one_thread
 from camtorch.calibration.calibrate import Model, as_model
-from camtorch.camera import Camera, fixed_camera
+from camtorch.cameras.camera import Camera, fixed_camera
 from camtorch.convert import fitting, views
 from camtorch.convert.conversion import Conversion
 from camtorch.models import UCM
-from camtorch.projection.rays import angles_from_axis
+from camtorch.rays.lattices import angles_from_axis
+from camtorch.values.arguments import Numbers, as_image_size, as_values
+from camtorch.values.threads import on_one_thread
 
 _ALPHAS = (0.0, 0.35, 0.5, 0.6, 0.65, 0.75)
 """Of the unified lenses that are tried first: perspective for 0, stereographic for 1/2, nearly equidistant for 0.65."""

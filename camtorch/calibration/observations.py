@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from camtorch._arguments import Numbers, as_image_size, as_values, shown, warn
+from camtorch.values.arguments import Numbers, as_image_size, as_values, shown, warn
 
 Points: TypeAlias = Numbers | Sequence[Numbers | None]
 """Points of all views: a tensor, an array, or a list with one of them, or None, for each view."""

@@ -10,20 +10,20 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from camtorch._arguments import Numbers, as_number, broadcast_shapes, hinting, no_camera, working_dtype
-from camtorch._evaluation import compiled_of
-from camtorch._module import remade
-from camtorch._threads import on_one_thread
 from camtorch.calibration.batches import as_tensor, as_vectors, learns, root_of, rows_of
 from camtorch.calibration.bundle import Poses, Sight, posed
 from camtorch.calibration.compiled import Search, Solved, solved
 from camtorch.calibration.ransac import consensus
 from camtorch.calibration.rays import poses_from_rays
-from camtorch.camera import Camera
-from camtorch.extrinsics import Extrinsics
+from camtorch.cameras.camera import Camera
+from camtorch.cameras.mixed import Mixed
 from camtorch.least_squares.implicit import attached
-from camtorch.mixed import Mixed
-from camtorch.rotations import rotation_matrix, rotation_vector, skew_matrix
+from camtorch.poses.extrinsics import Extrinsics
+from camtorch.poses.rotations import rotation_matrix, rotation_vector, skew_matrix
+from camtorch.projection.evaluation import compiled_of
+from camtorch.values.arguments import Numbers, as_number, broadcast_shapes, hinting, no_camera, working_dtype
+from camtorch.values.module import remade
+from camtorch.values.threads import on_one_thread
 
 _LEAST = 4  # points
 _FEW = 5  # points, that may have minima far from where they start

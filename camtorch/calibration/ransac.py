@@ -10,10 +10,10 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from camtorch._threads import spread, thread_count
 from camtorch.calibration.rays import poses_from_rays
 from camtorch.native.library import library
-from camtorch.rotations import small_turn
+from camtorch.poses.rotations import small_turn
+from camtorch.values.threads import spread, thread_count
 
 LEAST = 4  # points that make a pose
 _TOLD = 6  # points that agree by chance too rarely to be looked for in vain

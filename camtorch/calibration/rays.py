@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from camtorch.calibration.compiled import can_search, from_rays
-from camtorch.rotations import nearest_rotation, small_turn
+from camtorch.poses.rotations import nearest_rotation, small_turn
 
 _PAIRS = ((0, 1, 2), (1, 3, 4), (2, 4, 5))  # of symmetric matrices, the place among six entries
 _FLAT = 1e-6  # of the points' extent: less counts as none

@@ -10,16 +10,16 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from camtorch._arguments import warn
-from camtorch._threads import on_one_thread
 from camtorch.calibration.bundle import Adjusted, Bundle, Free, Poses, Sight, State
 from camtorch.calibration.calibrate import STEPS, Calibration, Search, as_model, as_options, middle_of, results
 from camtorch.calibration.observations import Points, as_rig_observations
 from camtorch.calibration.uncertainty import shared_factor
-from camtorch.camera import Camera
-from camtorch.extrinsics import Extrinsics
-from camtorch.rig import Rig
-from camtorch.rotations import rotation_vector
+from camtorch.cameras.camera import Camera
+from camtorch.cameras.rig import Rig
+from camtorch.poses.extrinsics import Extrinsics
+from camtorch.poses.rotations import rotation_vector
+from camtorch.values.arguments import warn
+from camtorch.values.threads import on_one_thread
 
 
 @dataclass(repr=False)

@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from camtorch._freezing import INTRINSICS
 from camtorch.calibration.calibrate import Calibration, calibrate
 from camtorch.calibration.observations import Points, as_observations
-from camtorch.camera import MODELS, Camera
+from camtorch.cameras.camera import MODELS, Camera
+from camtorch.cameras.freezing import INTRINSICS
 
 Array = NDArray[Any]
 

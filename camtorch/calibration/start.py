@@ -11,10 +11,10 @@ from torch import Tensor
 
 from camtorch.calibration.bundle import SETTLED, Adjusted, Free, Poses, Sight, State, adjust, minima
 from camtorch.calibration.rays import poses_from_rays
-from camtorch.camera import Camera, fixed_camera
+from camtorch.cameras.camera import Camera, fixed_camera
 from camtorch.convert import fitting, views
 from camtorch.models import UCM, KannalaBrandt
-from camtorch.projection.rays import angles_from_axis
+from camtorch.rays.lattices import angles_from_axis
 
 if TYPE_CHECKING:
     from camtorch.calibration.observations import Observations

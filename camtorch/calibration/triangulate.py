@@ -9,15 +9,15 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from camtorch._arguments import Numbers, check_devices, hinting, working_dtype
-from camtorch._module import BatchedModule
-from camtorch._threads import on_one_thread
 from camtorch.calibration.batches import as_tensor, learns, root_of, rows_of
 from camtorch.calibration.bundle import Bundle, Free, Poses, Sight, State
-from camtorch.camera import Camera
-from camtorch.extrinsics import Extrinsics
+from camtorch.cameras.camera import Camera
 from camtorch.least_squares.implicit import attached
 from camtorch.least_squares.levenberg_marquardt import minimise
+from camtorch.poses.extrinsics import Extrinsics
+from camtorch.values.arguments import Numbers, check_devices, hinting, working_dtype
+from camtorch.values.module import BatchedModule
+from camtorch.values.threads import on_one_thread
 
 M = TypeVar("M", bound=BatchedModule)
 

@@ -8,11 +8,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from camtorch._arguments import Numbers, as_values
 from camtorch.calibration.bundle import Adjusted, pixel_jacobians, robust
-from camtorch.camera import Camera, fixed_camera
+from camtorch.cameras.camera import Camera, fixed_camera
 from camtorch.least_squares.equations import Equations
-from camtorch.rotations import skew_matrix
+from camtorch.poses.rotations import skew_matrix
+from camtorch.values.arguments import Numbers, as_values
 
 _PIXELS = 1 << 15  # that are looked at together
 # Relative to the greatest singular value. Parameters of which a camera has one too many, as the turn of a panorama and

@@ -13,8 +13,8 @@ import torch
 from camtorch.calibration.bundle import Adjusted, Sight, pixel_jacobians
 from camtorch.calibration.observations import named
 from camtorch.calibration.uncertainty import Spread, worst
-from camtorch.camera import fixed_camera
-from camtorch.projection.rays import angles_from_axis, image_edges, image_lattice
+from camtorch.cameras.camera import fixed_camera
+from camtorch.rays.lattices import angles_from_axis, image_edges, image_lattice
 
 if TYPE_CHECKING:
     from camtorch.calibration.calibrate import Calibration

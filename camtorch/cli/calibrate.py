@@ -14,7 +14,7 @@ from camtorch.boards.finding import gather
 from camtorch.calibration import selection
 from camtorch.calibration.calibrate import Calibration, calibrate
 from camtorch.calibration.rig import RigCalibration, calibrate_rig
-from camtorch.camera import MODELS, as_model
+from camtorch.cameras.camera import MODELS, as_model
 from camtorch.cli import targets
 from camtorch.cli.searching import Views, find_views
 from camtorch.cli.terminal import note, progress

@@ -9,11 +9,11 @@ from itertools import chain
 from pathlib import Path
 
 from camtorch import lenses
-from camtorch.camera import Camera, as_model
+from camtorch.cameras.camera import Camera, as_model
+from camtorch.cameras.rig import Rig
 from camtorch.cli.terminal import note
 from camtorch.cli.words import GUESS, LENS
 from camtorch.io import load, opencv
-from camtorch.rig import Rig
 
 _ASPECT = 0.01  # the part by which the aspect ratios of a camera and an image may differ, as sizes are rounded
 _WIDE = 100  # degrees, horizontally, from which on lenses are rather fisheyes

@@ -6,11 +6,11 @@ import argparse
 import math
 from pathlib import Path
 
+from camtorch.cameras.rig import Rig
 from camtorch.cli import targets
 from camtorch.cli.cameras import read_rig
 from camtorch.cli.terminal import note
 from camtorch.io import formats
-from camtorch.rig import Rig
 
 
 def run(arguments: argparse.Namespace) -> None:

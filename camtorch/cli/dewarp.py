@@ -11,13 +11,13 @@ from typing import Any
 
 import torch
 
-from camtorch import _photographs
 from camtorch.boards.finding import IMAGES
-from camtorch.camera import Camera
+from camtorch.cameras.camera import Camera
 from camtorch.cli import cameras, images, processes, targets, videos
 from camtorch.cli.commands import are_several
 from camtorch.cli.processes import Outcome, Pair
 from camtorch.cli.terminal import bar, note, say
+from camtorch.io import photographs as _photographs
 from camtorch.warp.dewarp import Dewarp
 from camtorch.warp.warp import Warp
 

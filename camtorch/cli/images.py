@@ -8,11 +8,11 @@ from typing import Any
 from numpy.typing import NDArray
 from PIL import Image
 
-from camtorch._arguments import warn
-from camtorch._photographs import ORIENTATION, ImageFileError
 from camtorch.boards.finding import IMAGES
 from camtorch.cli import videos
+from camtorch.io.photographs import ORIENTATION, ImageFileError
 from camtorch.io.writing import replacing
+from camtorch.values.arguments import warn
 
 _KEEP_ORIENTATION = ("JPEG", "PNG", "TIFF", "WEBP")
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from camtorch.analysis.difference import difference
 from camtorch.analysis.summary import summarise
-from camtorch.camera import Camera
+from camtorch.cameras.camera import Camera
 from camtorch.cli import images, targets
 from camtorch.cli.cameras import read_other, read_rig
 from camtorch.plot.axes import require_matplotlib

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from camtorch._arguments import imported
-from camtorch.camera import Camera
+from camtorch.cameras.camera import Camera
 from camtorch.io.writing import replacing
+from camtorch.values.arguments import imported
 from camtorch.warp.warp import Warp
 
 WRITTEN = {".mp4": "mp4", ".m4v": "mp4", ".mov": "mov", ".mkv": "matroska", ".webm": "webm"}

@@ -11,15 +11,15 @@ import torch
 from torch import Tensor, nn
 from torch.nn.utils.parametrize import type_before_parametrizations
 
-from camtorch._arguments import as_image_size, as_number, as_whole
-from camtorch._module import remade
 from camtorch.convert import views
 from camtorch.convert.fitting import fit, refine_minimax
 from camtorch.convert.measuring import Reference, measure, reference
 from camtorch.convert.relations import carry_over, default_count
+from camtorch.values.arguments import as_image_size, as_number, as_whole
+from camtorch.values.module import remade
 
 if TYPE_CHECKING:
-    from camtorch.camera import Camera
+    from camtorch.cameras.camera import Camera
 
 CameraT = TypeVar("CameraT", bound="Camera", covariant=True)
 

@@ -7,14 +7,14 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
-from camtorch._arguments import columns
 from camtorch.least_squares.equations import Equations, System, padded
 from camtorch.least_squares.jacobians import SensorPoints, sensor_jacobians, to_sensor
 from camtorch.least_squares.levenberg_marquardt import FIRST_DAMPING, LEAST_DAMPING, minimise, rounding_of
-from camtorch.projection.rays import slopes_at_axis
+from camtorch.rays.lattices import slopes_at_axis
+from camtorch.values.arguments import columns
 
 if TYPE_CHECKING:
-    from camtorch.camera import Camera
+    from camtorch.cameras.camera import Camera
 
 _MOST_STEPS = 60
 _ROUNDS = 3

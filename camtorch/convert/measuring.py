@@ -12,10 +12,10 @@ from torch.nn.functional import max_pool2d
 
 from camtorch.convert import views
 from camtorch.least_squares.jacobians import to_sensor
-from camtorch.projection.rays import ray_fan
+from camtorch.rays.lattices import ray_fan
 
 if TYPE_CHECKING:
-    from camtorch.camera import Camera
+    from camtorch.cameras.camera import Camera
 
 _SIDE = 193  # of the lattice of pixels to compare at
 _PEAKS, _ROUNDS, _RIM = 16, 4, 720  # that are climbed, in so many rounds; rays at the largest angle

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from camtorch.convert.fitting import Observations
-from camtorch.projection.rays import (
+from camtorch.rays.lattices import (
     angles_from_axis,
     image_edges,
     pixel_lattice,
@@ -20,7 +20,7 @@ from camtorch.projection.rays import (
 )
 
 if TYPE_CHECKING:
-    from camtorch.camera import Camera
+    from camtorch.cameras.camera import Camera
 
 _ANGLES, _AZIMUTHS, _RADII = 180, 16, 64  # at which a camera is looked at as a whole
 _END_AHEAD = math.radians(87)  # of rays, for a camera without an image that does not see sideways

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from camtorch._arguments import no_camera
-from camtorch.camera import MODELS, Camera, as_model
-from camtorch.mixed import cat
+from camtorch.cameras.camera import MODELS, Camera, as_model
+from camtorch.cameras.mixed import cat
+from camtorch.values.arguments import no_camera
 
 PARTS = ("model", "intrinsics", "distortion", "image_size")
 

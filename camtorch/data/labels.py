@@ -20,14 +20,14 @@ from PIL import Image
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from camtorch._arguments import LEFT, check_path, imported
-from camtorch._photographs import load_stored
 from camtorch.augment.landmarks import LANDMARKS, TableLike
 from camtorch.augment.sample import KINDS, Sample
-from camtorch.camera import Camera
+from camtorch.cameras.camera import Camera
 from camtorch.data.columns import camera_of
+from camtorch.io.photographs import load_stored
 from camtorch.models import BrownConrady, Pinhole
-from camtorch.rotations import rotation_matrix
+from camtorch.poses.rotations import rotation_matrix
+from camtorch.values.arguments import LEFT, check_path, imported
 
 Json = dict[str, Any]
 Opened = tuple[Sequence[Any], TableLike | None]

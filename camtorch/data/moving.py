@@ -9,15 +9,15 @@ from typing import Any, TypeAlias
 import numpy as np
 from torch import Tensor
 
-from camtorch._arguments import as_mapping, is_list, shown
 from camtorch.augment.augmentation import Augmentation
 from camtorch.augment.change import Part
 from camtorch.augment.face import FaceNormalizer
 from camtorch.augment.numpy import Transform
 from camtorch.augment.sample import IMAGES, KEEP, KINDS, Sample, kind_of
-from camtorch.camera import Camera
+from camtorch.cameras.camera import Camera
 from camtorch.data.columns import PARTS, camera_of, to_columns
 from camtorch.data.seeded import Key, Seeded
+from camtorch.values.arguments import as_mapping, is_list, shown
 from camtorch.warp.proxy import ProxyWarp
 from camtorch.warp.warp import Warp
 

@@ -10,10 +10,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from camtorch._arguments import as_whole
 from camtorch.augment.augmentation import Augmentation
 from camtorch.augment.numpy import Transform
 from camtorch.augment.sample import Sample
+from camtorch.values.arguments import as_whole
 
 Key = int | str | Sequence["int | str"]
 """What names a sample: its index, its path, or a tuple of several of these."""

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
+from camtorch.cameras.rig import Rig
 from camtorch.io import poses
 from camtorch.io.protocol import Names
 from camtorch.io.record import Record, one_of
 from camtorch.io.writing import Lossy, as_json
-from camtorch.rig import Rig
 
 NAMES = Names("basalt", "Basalt", (".json",))
 

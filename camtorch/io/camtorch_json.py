@@ -9,15 +9,15 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor, nn
 
-from camtorch._arguments import broadcast_shapes, is_list
-from camtorch._module import BatchedModule, remade
-from camtorch.camera import Camera
-from camtorch.extrinsics import Extrinsics
+from camtorch.cameras.camera import Camera
+from camtorch.cameras.rig import Rig
 from camtorch.io import poses
 from camtorch.io.protocol import Names
 from camtorch.io.record import Record, one_of
 from camtorch.io.writing import Lossy, as_json
-from camtorch.rig import Rig
+from camtorch.poses.extrinsics import Extrinsics
+from camtorch.values.arguments import broadcast_shapes, is_list
+from camtorch.values.module import BatchedModule, remade
 
 Made = TypeVar("Made", bound=BatchedModule)
 

@@ -15,14 +15,14 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from camtorch.camera import Camera
+from camtorch.cameras.camera import Camera
+from camtorch.cameras.rig import Rig
 from camtorch.io import poses
 from camtorch.io.nerfstudio import panorama
 from camtorch.io.parsing import check_ordinary, decoded
 from camtorch.io.protocol import Names
 from camtorch.io.record import Record
 from camtorch.io.writing import Lossy, number
-from camtorch.rig import Rig
 
 NAMES = Names("colmap", "COLMAP", (".txt", ".bin"), ("*.txt", "*.bin"), ("cameras.bin", "cameras.txt"))
 

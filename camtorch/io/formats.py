@@ -12,8 +12,8 @@ import fnmatch
 import os
 from typing import Any, TypeVar
 
-from camtorch._arguments import LEFT
-from camtorch.camera import Camera
+from camtorch.cameras.camera import Camera
+from camtorch.cameras.rig import Rig
 from camtorch.io import (
     aria,
     basalt,
@@ -37,7 +37,7 @@ from camtorch.io.parsing import parse_mapping, path_of, read_bytes
 from camtorch.io.protocol import ContentFormat, KeyFormat, Names, WrittenFormat
 from camtorch.io.record import Record
 from camtorch.io.writing import Lossy, replacing
-from camtorch.rig import Rig
+from camtorch.values.arguments import LEFT
 
 Kind = TypeVar("Kind", bound=Camera)
 

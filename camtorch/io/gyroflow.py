@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
+from camtorch.cameras.rig import Rig
 from camtorch.io.protocol import Names
 from camtorch.io.record import Record, one_of
-from camtorch.rig import Rig
 
 NAMES = Names("gyroflow", "Gyroflow")
 

@@ -9,13 +9,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from camtorch.camera import Camera
-from camtorch.extrinsics import Extrinsics
+from camtorch.cameras.camera import Camera
+from camtorch.cameras.rig import Rig
 from camtorch.io import poses
 from camtorch.io.protocol import Names
 from camtorch.io.record import Record
 from camtorch.io.writing import Lossy, listed
-from camtorch.rig import Rig
+from camtorch.poses.extrinsics import Extrinsics
 
 NAMES = Names("kalibr", "Kalibr", (".yaml", ".yml"), ("*camchain*",))
 

@@ -9,12 +9,12 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from camtorch.camera import Camera
+from camtorch.cameras.camera import Camera
+from camtorch.cameras.rig import Rig
 from camtorch.io import poses
 from camtorch.io.parsing import decoded, parse_xml
 from camtorch.io.protocol import Names
 from camtorch.io.record import Record, one_of
-from camtorch.rig import Rig
 
 NAMES = Names("metashape", "Metashape")
 

@@ -5,14 +5,14 @@ from __future__ import annotations
 import re
 from typing import Any
 
-from camtorch._arguments import LEFT
-from camtorch.extrinsics import Extrinsics
+from camtorch.cameras.rig import Rig
 from camtorch.io import poses
 from camtorch.io.protocol import Names
 from camtorch.io.record import Record
 from camtorch.io.writing import Lossy, number
 from camtorch.models import Splined
-from camtorch.rig import Rig
+from camtorch.poses.extrinsics import Extrinsics
+from camtorch.values.arguments import LEFT
 
 NAMES = Names("mrcal", "mrcal", (".cameramodel",), ("*.cameramodel",))
 

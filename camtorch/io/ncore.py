@@ -6,12 +6,12 @@ from typing import Any
 
 import numpy as np
 
-from camtorch._arguments import LEFT
-from camtorch.camera import Camera
+from camtorch.cameras.camera import Camera
+from camtorch.cameras.rig import Rig
 from camtorch.io.protocol import Names
 from camtorch.io.record import Record, one_of
 from camtorch.models import FTheta, FThetaBackward
-from camtorch.rig import Rig
+from camtorch.values.arguments import LEFT
 
 NAMES = Names("ncore", "ncore")
 

@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from camtorch.camera import Camera
+from camtorch.cameras.camera import Camera
+from camtorch.cameras.rig import Rig
 from camtorch.io import poses
 from camtorch.io.protocol import Names
 from camtorch.io.record import Record, one_of
 from camtorch.io.writing import Lossy, as_json
-from camtorch.rig import Rig
 
 NAMES = Names("nerfstudio", "Nerfstudio", (".json",), ("transforms*.json",), ("transforms.json",))
 

@@ -6,12 +6,12 @@ import os
 import re
 from collections import Counter
 
-from camtorch.camera import Camera
+from camtorch.cameras.camera import Camera
+from camtorch.cameras.rig import Rig
 from camtorch.io import poses
 from camtorch.io.parsing import decoded, parse_json, read_bytes
 from camtorch.io.protocol import Names
 from camtorch.io.record import Record
-from camtorch.rig import Rig
 
 NAMES = Names("nuscenes", "nuScenes")
 

@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import re
 
+from camtorch.cameras.rig import Rig
 from camtorch.io import poses
 from camtorch.io._errors import CameraFileError
 from camtorch.io.parsing import decoded
 from camtorch.io.protocol import Names
 from camtorch.io.record import Record
 from camtorch.models import OCamCalib
-from camtorch.rig import Rig
 
 NAMES = Names("ocamcalib", "OCamCalib")
 

@@ -9,17 +9,17 @@ from typing import Any, NoReturn
 
 import torch
 
-from camtorch._arguments import check_path, shown, warn
-from camtorch._numbers import warn_of_order
-from camtorch.camera import Camera
-from camtorch.extrinsics import Extrinsics
+from camtorch.cameras.camera import Camera
+from camtorch.cameras.numbers import warn_of_order
+from camtorch.cameras.rig import Rig
 from camtorch.io import poses
 from camtorch.io.parsing import parse_mapping, read_bytes
 from camtorch.io.protocol import Names
 from camtorch.io.record import Record
 from camtorch.io.writing import Lossy, number
 from camtorch.models import MODELS
-from camtorch.rig import Rig
+from camtorch.poses.extrinsics import Extrinsics
+from camtorch.values.arguments import check_path, shown, warn
 
 NAMES = Names("opencv", "OpenCV", (".yml", ".yaml", ".json", ".xml"), ("*.xml",))
 

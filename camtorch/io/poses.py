@@ -10,11 +10,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from camtorch.extrinsics import Extrinsics
+from camtorch.cameras.rig import Rig
 from camtorch.io.record import Record
 from camtorch.io.writing import Lossy
-from camtorch.rig import Rig
-from camtorch.rotations import quaternion_vector, rotation_error, rotation_vector, vector_quaternion
+from camtorch.poses.extrinsics import Extrinsics
+from camtorch.poses.rotations import quaternion_vector, rotation_error, rotation_vector, vector_quaternion
 
 Place = Record | Callable[[int], Record]
 """Where a pose stands in a file, for errors; of a batch of poses a function of the row."""

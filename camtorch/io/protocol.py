@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Protocol
 
+from camtorch.cameras.rig import Rig
 from camtorch.io.record import Record
 from camtorch.io.writing import Lossy
-from camtorch.rig import Rig
 
 
 @dataclass(frozen=True)

@@ -13,10 +13,10 @@ from typing import Any, NoReturn
 import torch
 from torch import nn
 
-from camtorch._arguments import LEFT
-from camtorch.camera import Camera, as_model
+from camtorch.cameras.camera import Camera, as_model
 from camtorch.io._errors import CameraFileError
 from camtorch.models import MODELS
+from camtorch.values.arguments import LEFT
 
 LARGEST_SIDE = 1 << 20
 _MOST_CAMERAS = 20_000

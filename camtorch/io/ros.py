@@ -5,10 +5,10 @@ from __future__ import annotations
 import json
 from typing import Any
 
+from camtorch.cameras.rig import Rig
 from camtorch.io.protocol import Names
 from camtorch.io.record import Record, one_of
 from camtorch.io.writing import Lossy, listed
-from camtorch.rig import Rig
 
 NAMES = Names("ros", "ROS camera_info", (".yaml", ".yml"), ("*camera_info*", "*camerainfo*"))
 

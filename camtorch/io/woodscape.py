@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
+from camtorch.cameras.rig import Rig
 from camtorch.io import poses
 from camtorch.io.protocol import Names
 from camtorch.io.record import Record, one_of
-from camtorch.rig import Rig
 
 NAMES = Names("woodscape", "WoodScape")
 _POWERS = ("k1", "k2", "k3", "k4")

@@ -18,10 +18,10 @@ from typing import IO, NoReturn
 
 from torch import Tensor
 
-from camtorch.camera import Camera
-from camtorch.extrinsics import Extrinsics
+from camtorch.cameras.camera import Camera
+from camtorch.cameras.rig import Rig
 from camtorch.io._errors import CameraFileError
-from camtorch.rig import Rig
+from camtorch.poses.extrinsics import Extrinsics
 
 _PART = re.compile(r"[.]([0-9a-f]{16})[0-9a-f]{8}[.]part")
 

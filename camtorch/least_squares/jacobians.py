@@ -10,11 +10,11 @@ import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
-from camtorch._arguments import columns
 from camtorch.optics.backprojection import Inverted
+from camtorch.values.arguments import columns
 
 if TYPE_CHECKING:
-    from camtorch.camera import Camera
+    from camtorch.cameras.camera import Camera
 
 FURTHEST = 20.0
 """The furthest from the centre of a chart's plane that a fit looks: 87 degrees in perspective."""

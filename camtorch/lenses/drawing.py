@@ -9,7 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from camtorch._opaque import opaque
+from camtorch.cameras.opaque import opaque
 from camtorch.lenses.collection import as_number, columns, is_as_seen
 from camtorch.models import KannalaBrandt
 from camtorch.projection.domain import Domain

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from camtorch._arguments import as_image_size, as_number
 from camtorch.models import Tabulated
+from camtorch.values.arguments import as_image_size, as_number
 
 _DIAGONAL = math.hypot(36, 24)  # mm, of a sensor with crop factor 1
 _ASPECTS = (3 / 2, 4 / 3, 16 / 9, 1.0)  # of the images that lenses were calibrated with, most of them the first one

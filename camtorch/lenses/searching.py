@@ -8,9 +8,9 @@ import unicodedata
 from collections.abc import Sequence
 from functools import cache
 
-from camtorch._arguments import GUESS_CAMERA, as_image_size
 from camtorch.lenses.collection import Lens, entries
 from camtorch.models import KannalaBrandt
+from camtorch.values.arguments import GUESS_CAMERA, as_image_size
 
 _WORD = re.compile(r"\d+(?:\.\d+)?|[^\W\d_]+")
 _NO_SPACE = re.compile(r"(?<!\d) | (?!\d)")  # but between two numbers

@@ -10,8 +10,8 @@ import torch
 import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
 from torch import Tensor
 
-from camtorch._dtypes import narrow, widen
 from camtorch.maps.exact import Exact
+from camtorch.values.dtypes import narrow, widen
 from camtorch.warp.warp import Warp
 
 OUTSIDE = -9.0

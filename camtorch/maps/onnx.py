@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 import torch
 
-from camtorch._arguments import imported
 from camtorch.maps.exact import Exact
 from camtorch.maps.lookup import OUTSIDE, LookupMap
 from camtorch.maps.protocol import MapFormat, checked
+from camtorch.values.arguments import imported
 
 _OPSET, _IR = 16, 8
 _DTYPES = ("float32", "uint8")

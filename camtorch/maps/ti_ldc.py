@@ -20,10 +20,10 @@ from typing import Any
 
 import numpy as np
 
-from camtorch._arguments import as_image_size, as_whole
 from camtorch.io._errors import CameraFileError
 from camtorch.maps.exact import Exact, Floats
 from camtorch.maps.mesh import Mesh, Table, held, rounded, table
+from camtorch.values.arguments import as_image_size, as_whole
 
 _PARTS = 8
 _LOW, _HIGH = -(1 << 15), (1 << 15) - 1

@@ -5,7 +5,7 @@ here is a map between the directions from one point and pixels. `OrthographicFis
 another thing.
 """
 
-from camtorch.camera import MODELS
+from camtorch.cameras.camera import MODELS
 from camtorch.models.brown_conrady import BrownConrady
 from camtorch.models.cylindrical import Cylindrical
 from camtorch.models.division import Division

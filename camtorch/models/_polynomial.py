@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 from typing_extensions import Self
 
-from camtorch._arguments import Numbers, as_batch, as_number, as_real, fails, holds, is_list
-from camtorch.camera import Camera
+from camtorch.cameras.camera import Camera
+from camtorch.values.arguments import Numbers, as_batch, as_number, as_real, fails, holds, is_list
 
 
 class OddPolynomial(Camera):

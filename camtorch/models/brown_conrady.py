@@ -8,7 +8,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from camtorch.camera import Camera
+from camtorch.cameras.camera import Camera
 from camtorch.optics import Chart, Lens, Perspective, Planar, Polynomial, Rational, Tilt
 
 

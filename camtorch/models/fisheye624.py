@@ -5,7 +5,7 @@ from types import MappingProxyType
 
 from torch import Tensor
 
-from camtorch.camera import Camera
+from camtorch.cameras.camera import Camera
 from camtorch.optics import Chart, Equidistant, Lens, Planar, Polynomial
 
 

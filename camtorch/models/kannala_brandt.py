@@ -8,9 +8,9 @@ import torch
 from torch import Tensor
 from typing_extensions import Self
 
-from camtorch._arguments import Numbers, as_batch, as_real, fails
 from camtorch.models._polynomial import OddPolynomial
 from camtorch.optics import Chart, Equidistant, Lens, Planar, Polynomial
+from camtorch.values.arguments import Numbers, as_batch, as_real, fails
 
 
 class KannalaBrandt(OddPolynomial):

@@ -10,11 +10,11 @@ import torch
 from torch import Tensor
 from typing_extensions import Self
 
-from camtorch._arguments import Numbers, as_real, fails
-from camtorch.camera import Camera
+from camtorch.cameras.camera import Camera
 from camtorch.optics import AnglePerRadius, Chart, Inverted, Lens, RadiusPolynomial, Shear
 from camtorch.optics.radial import RadialFactor
 from camtorch.optics.special import first_root
+from camtorch.values.arguments import Numbers, as_real, fails
 
 
 class AngleOfAllPowers(AnglePerRadius):

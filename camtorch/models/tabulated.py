@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 from typing_extensions import Self
 
-from camtorch._arguments import Numbers, as_number, as_real
-from camtorch.camera import Camera
+from camtorch.cameras.camera import Camera
 from camtorch.optics import Chart, EquidistantUpTo, Lens, Planar, RadiusTable
+from camtorch.values.arguments import Numbers, as_number, as_real
 
 
 class Tabulated(Camera):

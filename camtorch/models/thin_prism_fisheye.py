@@ -6,7 +6,7 @@ from types import MappingProxyType
 import torch
 from torch import Tensor
 
-from camtorch.camera import Camera
+from camtorch.cameras.camera import Camera
 from camtorch.optics import Chart, Equidistant, Lens, Planar, Polynomial
 
 

@@ -7,9 +7,9 @@ from typing import ClassVar
 
 from typing_extensions import Self
 
-from camtorch._arguments import Numbers, as_image_size, as_real
 from camtorch.models._polynomial import FreePolynomial
 from camtorch.models.f_theta import FTheta
+from camtorch.values.arguments import Numbers, as_image_size, as_real
 
 
 class WoodScape(FTheta):

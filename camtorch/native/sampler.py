@@ -11,10 +11,10 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from camtorch._dtypes import as_pixels
-from camtorch._threads import spread, thread_count
 from camtorch.native import memory
 from camtorch.native.library import library
+from camtorch.values.dtypes import as_pixels
+from camtorch.values.threads import spread, thread_count
 
 DOUBT, EMPTY, CUBIC, TODO = -4, -2, -1, 0
 """Cells of a lattice: whose cubics may miss, showing nothing, between whose nodes lie cubics, wanting positions."""

@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, Any, Literal
 import torch
 from torch import Tensor
 
-from camtorch._arguments import as_image_size, as_number, no_camera, shown
-from camtorch._editing import edited
-from camtorch._module import typed_as
 from camtorch.augment.change import Change, Part, alone, as_one, by_kinds
 from camtorch.augment.sample import Named, Sample, SampleTransform, on_samples
-from camtorch.camera import Camera
-from camtorch.mixed import Mixed
-from camtorch.projection.rays import slopes_at_axis
+from camtorch.cameras.camera import Camera
+from camtorch.cameras.editing import edited
+from camtorch.cameras.mixed import Mixed
+from camtorch.rays.lattices import slopes_at_axis
+from camtorch.values.arguments import as_image_size, as_number, no_camera, shown
+from camtorch.values.module import typed_as
 from camtorch.warp.affine import AffineWarp
 
 _LENGTHS = ("depth", "distance", "points", "tvec")

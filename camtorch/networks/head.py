@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor, nn
 
-from camtorch._arguments import as_flag, as_image_size, as_number, as_values, as_whole
-from camtorch._module import GeometryModule, typed_as
 from camtorch.calibration.calibrate import as_model
-from camtorch.camera import Camera
+from camtorch.cameras.camera import Camera
 from camtorch.networks.limits import Limits
 from camtorch.networks.prior import prior_of
 from camtorch.optics.radial_inverse import precise
+from camtorch.values.arguments import as_flag, as_image_size, as_number, as_values, as_whole
+from camtorch.values.module import GeometryModule, typed_as
 
 _ASPECT = 0.1
 _LARGEST = 1e6  # whose square is a number, and whose gradient is nothing

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from camtorch._arguments import columns
 from camtorch.optics.backprojection import FURTHEST, Inverted
+from camtorch.values.arguments import columns
 
 if TYPE_CHECKING:
-    from camtorch.camera import Camera
+    from camtorch.cameras.camera import Camera
     from camtorch.optics.charts import Chart
 
 BEYOND = 1.02

@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 from typing_extensions import Unpack
 
-from camtorch._arguments import (
+from camtorch.cameras.camera import Camera
+from camtorch.values.arguments import (
     Numbers,
     as_batch,
     as_coordinates,
@@ -19,7 +20,6 @@ from camtorch._arguments import (
     no_camera,
     shown,
 )
-from camtorch.camera import Camera
 
 __all__ = ["angles", "rays", "reprojection"]
 

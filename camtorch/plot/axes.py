@@ -7,14 +7,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from camtorch._arguments import imported
+from camtorch.values.arguments import imported
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.colors import ListedColormap
     from matplotlib.quiver import Quiver
 
-    from camtorch.camera import Camera
+    from camtorch.cameras.camera import Camera
 
 INK, GREY, PALE = "#2b2a2e", "#8a8378", "#efe9dd"
 COLOURS = ("#1e64f0", "#e21d48", "#0b8a5f", "#b86e00", "#7a3fc2", "#5a6472")

@@ -22,7 +22,7 @@ from camtorch.plot.axes import (
     require_matplotlib,
     size_of,
 )
-from camtorch.projection.rays import image_lattice
+from camtorch.rays.lattices import image_lattice
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

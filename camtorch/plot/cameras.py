@@ -13,7 +13,8 @@ from torch import Tensor
 from torch.nn.utils.parametrize import type_before_parametrizations
 
 from camtorch.analysis import difference as differences
-from camtorch.camera import Camera
+from camtorch.cameras.camera import Camera
+from camtorch.cameras.rig import Rig
 from camtorch.plot.axes import (
     COLOURS,
     GREY,
@@ -29,9 +30,8 @@ from camtorch.plot.axes import (
     require_matplotlib,
     size_of,
 )
-from camtorch.projection.rays import angles_from_axis, followed, ideal, image_lattice
-from camtorch.rig import Rig
-from camtorch.rotations import rotation_matrix
+from camtorch.poses.rotations import rotation_matrix
+from camtorch.rays.lattices import angles_from_axis, followed, ideal, image_lattice
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

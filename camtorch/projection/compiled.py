@@ -16,13 +16,13 @@ import torch
 from torch import Tensor
 
 from camtorch import optics
-from camtorch._arguments import columns
-from camtorch._threads import spread, thread_count
 from camtorch.native import memory
 from camtorch.native.library import library
 from camtorch.native.sampler import CLASSIFICATION, PADDINGS, SCRATCH
 from camtorch.optics.backprojection import FURTHEST
 from camtorch.optics.radial_inverse import TABLE_WIDTH
+from camtorch.values.arguments import columns
+from camtorch.values.threads import spread, thread_count
 
 if TYPE_CHECKING:
     from camtorch.optics.charts import Chart

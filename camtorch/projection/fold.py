@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
-from camtorch._arguments import columns
-from camtorch._portable import as_index
+from camtorch.evaluate.portable import as_index
 from camtorch.optics.radial_inverse import first_loss
+from camtorch.values.arguments import columns
 
 if TYPE_CHECKING:
     from camtorch.optics.charts import Chart

@@ -12,13 +12,13 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from camtorch._arguments import columns
-from camtorch._registry import CLASSES
-from camtorch._tracing import in_transform, is_for_here, keeps_graph
+from camtorch.evaluate.regime import in_transform, is_for_here, keeps_graph
 from camtorch.optics.radial_inverse import TABLE_WIDTH
 from camtorch.projection.domain import Domain, domain_of
 from camtorch.projection.fold import AZIMUTHS
 from camtorch.projection.solve import search
+from camtorch.values.arguments import columns
+from camtorch.values.registry import CLASSES
 
 Result = TypeVar("Result")
 

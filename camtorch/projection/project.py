@@ -7,14 +7,14 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from camtorch._arguments import columns
 from camtorch.optics.charts import Planes3, floor_of
 from camtorch.projection import compiled
 from camtorch.projection.ops import as_kept, positive, power_of_two, to_planes, without_keeping
 from camtorch.projection.rows import Cameras, Traced, replace, to_mask
+from camtorch.values.arguments import columns
 
 if TYPE_CHECKING:
-    from camtorch.camera import Camera
+    from camtorch.cameras.camera import Camera
     from camtorch.optics.charts import Chart
 
 INVALID_PIXEL = -1.0  # outside every image, so that `contains` is False for it as well

@@ -11,14 +11,14 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
-from camtorch._arguments import columns, holds
-from camtorch._portable import is_portable_export
+from camtorch.evaluate.portable import is_portable_export
 from camtorch.projection import compiled
 from camtorch.projection.domain import Domain, domain_of
 from camtorch.projection.ops import tables
+from camtorch.values.arguments import columns, holds
 
 if TYPE_CHECKING:
-    from camtorch.camera import Camera
+    from camtorch.cameras.camera import Camera
     from camtorch.optics.charts import Chart
     from camtorch.optics.lens import Lens
 

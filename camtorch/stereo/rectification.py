@@ -10,7 +10,12 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import normalize
 
-from camtorch._arguments import (
+from camtorch.cameras.camera import Camera
+from camtorch.models import Cylindrical, Equirectangular, LatLon, Pinhole, TransverseCylindrical
+from camtorch.native.sampler import Later, finish
+from camtorch.poses.extrinsics import Extrinsics
+from camtorch.poses.rotations import rotation_matrix, skew_matrix
+from camtorch.values.arguments import (
     Numbers,
     as_flag,
     as_fov,
@@ -22,12 +27,7 @@ from camtorch._arguments import (
     hinting,
     shown,
 )
-from camtorch._module import GeometryModule, Memo, typed_as
-from camtorch.camera import Camera
-from camtorch.extrinsics import Extrinsics
-from camtorch.models import Cylindrical, Equirectangular, LatLon, Pinhole, TransverseCylindrical
-from camtorch.native.sampler import Later, finish
-from camtorch.rotations import rotation_matrix, skew_matrix
+from camtorch.values.module import GeometryModule, Memo, typed_as
 from camtorch.warp import routes
 from camtorch.warp.dewarp import middle_lines
 from camtorch.warp.proxy import check_pose

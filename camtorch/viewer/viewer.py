@@ -21,14 +21,14 @@ import torch
 from numpy.typing import NDArray
 from PIL import Image
 
-from camtorch._arguments import check_path
-from camtorch._module import model_of
-from camtorch._photographs import as_jpeg
-from camtorch.camera import MODELS, Camera
+from camtorch.cameras.camera import MODELS, Camera
+from camtorch.io.photographs import as_jpeg
 from camtorch.io.writing import replacing
 from camtorch.lenses.collection import columns
 from camtorch.models import Splined
-from camtorch.projection.explanation import unusable
+from camtorch.rays.explanation import unusable
+from camtorch.values.arguments import check_path
+from camtorch.values.module import model_of
 
 _SIDE, _QUALITY = 1920, 85  # px of the longer side of a photograph, and of its JPEG file
 _MOST_COUNT = 40  # coefficients that a model of any number of them is given in the page

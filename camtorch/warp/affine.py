@@ -11,12 +11,12 @@ import torch
 import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
 from torch import Tensor
 
-from camtorch._arguments import Numbers, as_values, broadcast_shapes
-from camtorch._dtypes import SIGNED, as_pixels, narrow, widen
-from camtorch._opaque import opaque
-from camtorch._tracing import in_transform, is_concrete, keeps_graph
-from camtorch.camera import Camera
+from camtorch.cameras.camera import Camera
+from camtorch.cameras.opaque import opaque
+from camtorch.evaluate.regime import in_transform, is_concrete, keeps_graph
 from camtorch.native.sampler import empty
+from camtorch.values.arguments import Numbers, as_values, broadcast_shapes
+from camtorch.values.dtypes import SIGNED, as_pixels, narrow, widen
 from camtorch.warp import compiled
 from camtorch.warp.grid import STEP, Lattice, Sampling, coarse, straight_lattice
 from camtorch.warp.panorama import lengths

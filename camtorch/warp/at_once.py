@@ -14,13 +14,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from camtorch._evaluation import compiled_of
-from camtorch._threads import spread, thread_count
-from camtorch._tracing import is_eager
+from camtorch.evaluate.regime import is_eager
 from camtorch.native import memory, sampler
 from camtorch.native.library import library
 from camtorch.projection import compiled
 from camtorch.projection.compiled import LEFT_FROM, LEFT_MOST, LEFT_TO, POSITIONS, Between, Native
+from camtorch.projection.evaluation import compiled_of
+from camtorch.values.threads import spread, thread_count
 from camtorch.warp.grid import FEWEST, MOST_KEPT, STEP, coarse, kept_probes
 from camtorch.warp.moving import between
 from camtorch.warp.panorama import goes_round

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from camtorch._arguments import Numbers, as_coordinates, as_values, as_whole, check_boxes, holds, is_predicted
+from camtorch.values.arguments import Numbers, as_coordinates, as_values, as_whole, check_boxes, holds, is_predicted
 from camtorch.warp.panorama import PANORAMAS
 
 if TYPE_CHECKING:

@@ -10,11 +10,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from camtorch._arguments import broadcast_shapes
-from camtorch._module import Memo
-from camtorch._opaque import CameraNumbers, opaque
-from camtorch.camera import Camera
+from camtorch.cameras.camera import Camera
+from camtorch.cameras.opaque import CameraNumbers, opaque
 from camtorch.native.sampler import layout
+from camtorch.values.arguments import broadcast_shapes
+from camtorch.values.module import Memo
 from camtorch.warp.grid import Lattice, Sampling, locate, tabulate
 from camtorch.warp.sampling import MODES, PADDINGS, Sampler, one_of, render
 

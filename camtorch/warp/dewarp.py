@@ -10,11 +10,11 @@ import torch
 from torch import Tensor, nn
 from typing_extensions import Unpack
 
-from camtorch._arguments import as_fov, as_image_size, broadcast_shapes, check_devices, hinting
-from camtorch.camera import Camera
+from camtorch.cameras.camera import Camera
 from camtorch.models import UCM, Cylindrical, Equirectangular, Pinhole
-from camtorch.projection.rays import around_ends, image_lattice
-from camtorch.rotations import as_rotation
+from camtorch.poses.rotations import as_rotation
+from camtorch.rays.lattices import around_ends, image_lattice
+from camtorch.values.arguments import as_fov, as_image_size, broadcast_shapes, check_devices, hinting
 from camtorch.warp.sampling import TolerantOptions
 from camtorch.warp.warp import Warp, as_sized
 

@@ -13,13 +13,13 @@ import torch
 import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
 from torch import Tensor
 
-from camtorch._threads import on_one_thread
-from camtorch._tracing import in_graph, in_jit_trace, in_transform, is_concrete, is_eager, may_look, set_aside
-from camtorch.camera import Camera
+from camtorch.cameras.camera import Camera
+from camtorch.evaluate.regime import in_graph, in_jit_trace, in_transform, is_concrete, is_eager, may_look, set_aside
 from camtorch.native.library import native_available
 from camtorch.native.sampler import CUBIC, DOUBT, EMPTY, TODO, classify
+from camtorch.poses.rotations import turn
 from camtorch.projection.compiled import POSITIONS, Between
-from camtorch.rotations import turn
+from camtorch.values.threads import on_one_thread
 from camtorch.warp.moving import between
 from camtorch.warp.panorama import goes_round, lengths, off_poles, within_turn
 

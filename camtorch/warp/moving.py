@@ -5,11 +5,11 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from camtorch._arguments import Numbers
-from camtorch._evaluation import compiled_of
-from camtorch.camera import Camera
+from camtorch.cameras.camera import Camera
+from camtorch.poses.rotations import turn
 from camtorch.projection.compiled import ON_IMAGE, PIXELS, Between
-from camtorch.rotations import turn
+from camtorch.projection.evaluation import compiled_of
+from camtorch.values.arguments import Numbers
 
 
 def between(start: Camera, end: Camera, rotation: Tensor | None, like: Tensor) -> Between | None:

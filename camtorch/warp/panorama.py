@@ -8,10 +8,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from camtorch._arguments import values_of
-from camtorch._module import remade
-from camtorch.camera import Camera
+from camtorch.cameras.camera import Camera
 from camtorch.models import Cylindrical, Equirectangular, LatLon, TransverseCylindrical
+from camtorch.values.arguments import values_of
+from camtorch.values.module import remade
 
 _NEAR = 0.05  # pixels by which a whole turn may miss the edges: a focal length of two decimals does by 0.03
 _RIM = 16  # pixels beyond an edge: what bicubic samples of images that are halved three times read

@@ -9,10 +9,20 @@ import torch
 from torch import Tensor, nn
 from typing_extensions import Unpack
 
-from camtorch._arguments import Numbers, as_batch, as_coordinates, as_number, as_own, as_real, fails, shown, values_of
-from camtorch.camera import Camera
-from camtorch.extrinsics import Extrinsics
+from camtorch.cameras.camera import Camera
 from camtorch.models import Pinhole
+from camtorch.poses.extrinsics import Extrinsics
+from camtorch.values.arguments import (
+    Numbers,
+    as_batch,
+    as_coordinates,
+    as_number,
+    as_own,
+    as_real,
+    fails,
+    shown,
+    values_of,
+)
 from camtorch.warp.proxy import ProxyWarp, beside
 from camtorch.warp.sampling import WarpOptions
 

@@ -6,10 +6,10 @@ import torch
 from torch import Tensor
 from typing_extensions import Unpack
 
-from camtorch._arguments import Numbers, as_batch, as_coordinates, check_devices
-from camtorch.camera import Camera
-from camtorch.extrinsics import Extrinsics
-from camtorch.rotations import rotate_planes, rotation_matrix
+from camtorch.cameras.camera import Camera
+from camtorch.poses.extrinsics import Extrinsics
+from camtorch.poses.rotations import rotate_planes, rotation_matrix
+from camtorch.values.arguments import Numbers, as_batch, as_coordinates, check_devices
 from camtorch.warp.grid import Sampling, pixels_of_rows, scaled_rows, to_positions
 from camtorch.warp.panorama import off_poles
 from camtorch.warp.sampling import PaddingMode, WarpOptions

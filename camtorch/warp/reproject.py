@@ -8,12 +8,12 @@ import torch
 from torch import Tensor
 from torch.nn.functional import max_pool2d, pad
 
-from camtorch._arguments import Numbers, as_number, check_devices, holds
-from camtorch._module import GeometryModule, Memo, typed_as
-from camtorch.camera import Camera
-from camtorch.extrinsics import Extrinsics
-from camtorch.projection.depth import as_depth, depth_scale
-from camtorch.rotations import rotation_matrix
+from camtorch.cameras.camera import Camera
+from camtorch.poses.extrinsics import Extrinsics
+from camtorch.poses.rotations import rotation_matrix
+from camtorch.rays.depth import as_depth, depth_scale
+from camtorch.values.arguments import Numbers, as_number, check_devices, holds
+from camtorch.values.module import GeometryModule, Memo, typed_as
 from camtorch.warp.grid import Sampling, is_plain, to_positions
 from camtorch.warp.panorama import off_poles, seam_of
 from camtorch.warp.proxy import beside, check_pose, turned

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Literal
 import torch
 from torch import Tensor
 
-from camtorch._module import Memo, is_constant, with_values
-from camtorch._tracing import (
+from camtorch.evaluate.regime import (
     in_graph,
     in_jit_trace,
     in_transform,
@@ -21,6 +20,7 @@ from camtorch._tracing import (
     set_aside,
 )
 from camtorch.native.sampler import Later, empty
+from camtorch.values.module import Memo, is_constant, with_values
 from camtorch.warp import compiled
 from camtorch.warp.grid import Lattice, Sampling, scaled
 from camtorch.warp.sampling import PADDINGS, PaddingMode, Pyramid, Sampler, laid_as, render

@@ -11,12 +11,12 @@ import torch
 import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
 from torch import Tensor
 
-from camtorch._arguments import as_flag, as_number, shown
-from camtorch._dtypes import SIGNED, as_pixels, narrow, wide_dtype, widen
-from camtorch._threads import thread_count
-from camtorch._tracing import converted, in_transform, is_concrete, is_eager, may_look
+from camtorch.evaluate.regime import converted, in_transform, is_concrete, is_eager, may_look
 from camtorch.native import sampler
 from camtorch.native.library import native_available
+from camtorch.values.arguments import as_flag, as_number, shown
+from camtorch.values.dtypes import SIGNED, as_pixels, narrow, wide_dtype, widen
+from camtorch.values.threads import thread_count
 from camtorch.warp.grid import Lattice, Sampling, is_plain
 
 Mode = Literal["nearest", "bilinear", "bicubic"]

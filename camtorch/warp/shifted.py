@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
-from camtorch.camera import Camera
-from camtorch.projection.depth import as_depth, depth_scale
+from camtorch.cameras.camera import Camera
+from camtorch.rays.depth import as_depth, depth_scale
 from camtorch.warp.grid import Sampling, to_positions
 from camtorch.warp.sampling import PaddingMode
 from camtorch.warp.warp import Warp

@@ -9,7 +9,10 @@ import torch
 from torch import Tensor, nn
 from typing_extensions import Unpack
 
-from camtorch._arguments import (
+from camtorch.cameras.camera import Camera
+from camtorch.optics.special import cosc_root, sinc_root
+from camtorch.poses.rotations import as_rotation
+from camtorch.values.arguments import (
     LEFT,
     Numbers,
     as_batch,
@@ -25,10 +28,7 @@ from camtorch._arguments import (
     shown,
     values_of,
 )
-from camtorch._module import GeometryModule
-from camtorch.camera import Camera
-from camtorch.optics.special import cosc_root, sinc_root
-from camtorch.rotations import as_rotation
+from camtorch.values.module import GeometryModule
 from camtorch.warp.affine import MirrorWarp
 from camtorch.warp.sampling import TolerantOptions
 from camtorch.warp.warp import Warp

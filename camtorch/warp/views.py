@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor, nn
 
-from camtorch._arguments import Numbers, as_fov, as_known_size, as_number, as_values, as_whole, check_boxes, shown
-from camtorch._dtypes import narrow, widen
-from camtorch._module import GeometryModule, remade, typed_as
-from camtorch.camera import Camera
+from camtorch.cameras.camera import Camera
 from camtorch.models import Pinhole
-from camtorch.projection.rays import slopes_at_axis
-from camtorch.rotations import mount_rotation
+from camtorch.poses.rotations import mount_rotation
+from camtorch.rays.lattices import slopes_at_axis
+from camtorch.values.arguments import Numbers, as_fov, as_known_size, as_number, as_values, as_whole, check_boxes, shown
+from camtorch.values.dtypes import narrow, widen
+from camtorch.values.module import GeometryModule, remade, typed_as
 from camtorch.warp.boxes import corners_of
 from camtorch.warp.sampling import Mode
 from camtorch.warp.warp import Warp, as_sized

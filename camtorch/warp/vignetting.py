@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from camtorch._arguments import as_values
-from camtorch.camera import Camera
+from camtorch.cameras.camera import Camera
+from camtorch.values.arguments import as_values
 from camtorch.warp.warp import as_sized
 
 _LEAST = 0.1  # of a cosine: from 84 degrees on the light stays as it is there

@@ -11,10 +11,18 @@ import torch
 from torch import Tensor, nn
 from typing_extensions import Self
 
-from camtorch._arguments import LEFT, Numbers, as_coordinates, as_whole, broadcast_shapes, check_devices, no_camera
-from camtorch._module import GeometryModule, Memo, typed_as
-from camtorch.camera import Camera
-from camtorch.rotations import as_rotation, turn
+from camtorch.cameras.camera import Camera
+from camtorch.poses.rotations import as_rotation, turn
+from camtorch.values.arguments import (
+    LEFT,
+    Numbers,
+    as_coordinates,
+    as_whole,
+    broadcast_shapes,
+    check_devices,
+    no_camera,
+)
+from camtorch.values.module import GeometryModule, Memo, typed_as
 from camtorch.warp import routes
 from camtorch.warp.boxes import enclosed, moved_boxes
 from camtorch.warp.grid import OUTSIDE, Lattice, Sampling, locate

@@ -7,7 +7,7 @@ import math
 import torch
 
 import camtorch as ct
-from camtorch.rotations import mount_rotation
+from camtorch.poses.rotations import mount_rotation
 from drawings.pages import IMAGES
 from drawings.svg import BLUE, GREEN, GREY, INK, PALE, PAPER, RED, RIM, VIOLET, Drawing, Point
 

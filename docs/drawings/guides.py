@@ -18,7 +18,7 @@ from scenes.portrait import driver
 import camtorch as ct
 from camtorch.augment.sample import Sample
 from camtorch.boards.boards import Chessboard
-from camtorch.rotations import mount_rotation
+from camtorch.poses.rotations import mount_rotation
 from drawings.marks import INK, PAPER, marked, shown
 from drawings.pages import EXAMPLES, IMAGES
 from drawings.sheets import drawn, in_rows, tiles

@@ -14,7 +14,7 @@ from scenes import room
 
 import camtorch as ct
 from camtorch.plot.axes import COLOURS, GREY, INK, NO_RAYS
-from camtorch.projection.rays import followed, image_lattice
+from camtorch.rays.lattices import followed, image_lattice
 from drawings.pages import IMAGES, code, sections
 from drawings.sheets import GAP, WIDTH, drawn
 from drawings.svg import PAPER, RIM

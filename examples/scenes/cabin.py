@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from camtorch.camera import Camera
+from camtorch.cameras.camera import Camera
 from scenes import driver, landmarks
 from scenes.driver import FRIENDLY, LOOKS
 from scenes.exposure import corner_rays, in_strips, lattice

@@ -10,10 +10,10 @@ import math
 import torch
 from torch import Tensor
 
-from camtorch.camera import Camera
-from camtorch.extrinsics import Extrinsics
+from camtorch.cameras.camera import Camera
+from camtorch.cameras.rig import Rig
 from camtorch.models import KannalaBrandt
-from camtorch.rig import Rig
+from camtorch.poses.extrinsics import Extrinsics
 from scenes.exposure import expose, in_strips
 from scenes.walls import colour, soft
 

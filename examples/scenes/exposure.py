@@ -10,7 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 import torch
 from torch import Tensor
 
-from camtorch.camera import Camera
+from camtorch.cameras.camera import Camera
 
 _ROWS = 120  # of a strip, whatever the number of cores, for the same image
 

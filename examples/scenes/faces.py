@@ -12,9 +12,9 @@ import torch
 from torch import Tensor
 
 from camtorch.augment import PRESETS
-from camtorch.camera import Camera
+from camtorch.cameras.camera import Camera
 from camtorch.models import Pinhole
-from camtorch.rotations import mount_rotation, rotation_matrix
+from camtorch.poses.rotations import mount_rotation, rotation_matrix
 from scenes import cabin
 
 NAMES = (

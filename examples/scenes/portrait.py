@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from camtorch.camera import Camera
+from camtorch.cameras.camera import Camera
 from camtorch.models import Pinhole
-from camtorch.rotations import mount_rotation
+from camtorch.poses.rotations import mount_rotation
 from scenes import cabin
 
 

@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from camtorch.camera import Camera
+from camtorch.cameras.camera import Camera
 from scenes import walls
 from scenes.exposure import expose, in_strips
 

@@ -10,7 +10,7 @@ from cameras import DISTINCT, one, slow_unless
 from torch.testing import assert_close
 
 import camtorch as ct
-from camtorch.rotations import rotation_matrix
+from camtorch.poses.rotations import rotation_matrix
 
 LEFT, OPTIMA = opencv_left()
 slow = pytest.mark.slow

@@ -7,7 +7,7 @@ import torch
 from boards import chessboard
 
 import camtorch as ct
-from camtorch.rotations import rotation_matrix, rotation_vector
+from camtorch.poses.rotations import rotation_matrix, rotation_vector
 
 NOISE = 0.2
 BOARD = chessboard(9, 6, 0.05)

@@ -10,7 +10,7 @@ import torch
 from cameras import slow_unless
 
 import camtorch as ct
-from camtorch.rotations import rotation_matrix
+from camtorch.poses.rotations import rotation_matrix
 
 SIZE = (960, 1280)
 

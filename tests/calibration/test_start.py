@@ -8,7 +8,7 @@ import pytest
 import torch
 
 import camtorch as ct
-from camtorch.rotations import rotation_matrix
+from camtorch.poses.rotations import rotation_matrix
 
 SIZE = (480, 640)
 DISTORTION = {

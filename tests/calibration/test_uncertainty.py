@@ -9,7 +9,7 @@ from boards import seen_by
 import camtorch as ct
 from camtorch.calibration.bundle import Free, Poses, Sight, State, adjust, pixel_jacobians
 from camtorch.calibration.uncertainty import noise_under, spread, uncertainty
-from camtorch.rotations import rotation_matrix
+from camtorch.poses.rotations import rotation_matrix
 
 pytestmark = pytest.mark.slow
 

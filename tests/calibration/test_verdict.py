@@ -9,7 +9,7 @@ from boards import chessboard, ov_plane, seen_by
 
 import camtorch as ct
 from camtorch.calibration import calibrate
-from camtorch.rotations import rotation_matrix
+from camtorch.poses.rotations import rotation_matrix
 
 F64 = {"dtype": torch.float64}
 SIZE = (480, 640)

@@ -15,7 +15,7 @@ import camtorch as ct
 from camtorch.boards.boards import Chessboard
 from camtorch.calibration import selection
 from camtorch.cli import searching
-from camtorch.rotations import rotation_matrix
+from camtorch.poses.rotations import rotation_matrix
 
 BOARD = Chessboard(9, 6, 0.03)
 WORDS = ("--board", "9x6", "--square", "30mm", "--model", "kannala_brandt", "--fixed", "k3,k4")

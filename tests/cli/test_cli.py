@@ -13,8 +13,8 @@ from command_line import FILES, LEVEL, MATRIX, camera, command, opened, pixels, 
 from PIL import Image
 
 import camtorch as ct
-from camtorch._photographs import size_of
 from camtorch.boards.finding import IMAGES
+from camtorch.io.photographs import size_of
 
 
 def test_dewarp_writes_what_dewarp_makes(folder, capsys):

@@ -7,8 +7,8 @@ from cameras import DISTINCT, KEYS, axis_slope, fan, limits_of, make, nodes_of_s
 
 import camtorch as ct
 from camtorch import lenses
-from camtorch._arguments import columns
 from camtorch.optics import Equidistant, Lens, Planar, Polynomial, Tilt
+from camtorch.values.arguments import columns
 
 COUNT = 60
 

@@ -14,8 +14,8 @@ import torch
 from cameras import one
 
 import camtorch as ct
-from camtorch import _threads
-from camtorch._threads import spread
+from camtorch.values import threads as _threads
+from camtorch.values.threads import spread
 
 
 class Pieces:
@@ -175,7 +175,7 @@ def check():
     names = [thread.name for thread in threading.enumerate()]
     print("worked" if worked else "alone", names)
 
-from camtorch._threads import spread
+from camtorch.values.threads import spread
 worked, both = [], threading.Barrier(2)
 spread(lambda: worked.append(both.wait(20)), 2)
 """

@@ -9,7 +9,7 @@ import torch
 from torch.autograd import gradcheck, gradgradcheck
 
 import camtorch as ct
-from camtorch.rotations import are_rotations, nearest_rotation, rotation_matrix
+from camtorch.poses.rotations import are_rotations, nearest_rotation, rotation_matrix
 
 F64 = torch.float64
 ROTATIONS = {

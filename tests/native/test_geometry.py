@@ -8,13 +8,13 @@ import torch
 from cameras import KEYS, constants, every_model, fan, make, one, pixel_lattice, real, spread
 
 import camtorch as ct
-from camtorch._arguments import columns
 from camtorch.native.library import native_available
 from camtorch.optics import Equidistant, Lens, Stage
 from camtorch.projection import compiled as geometry
 from camtorch.projection.project import Project
 from camtorch.projection.rows import Cameras
 from camtorch.projection.unproject import Unproject
+from camtorch.values.arguments import columns
 
 pytestmark = pytest.mark.skipif(not native_available(), reason="the library is not compiled here, or turned off")
 

@@ -13,10 +13,10 @@ import pytest
 import torch
 
 import camtorch as ct
-from camtorch._dtypes import widen
 from camtorch.native import build as building
 from camtorch.native import sampler
 from camtorch.native.library import library, native_available
+from camtorch.values.dtypes import widen
 from camtorch.warp import grid as positions
 from camtorch.warp import routes, sampling
 from camtorch.warp.grid import Lattice, Sampling

@@ -11,7 +11,7 @@ import torch
 from cameras import DISTINCT, USUAL, slow_unless
 
 import camtorch as ct
-from camtorch.projection.rays import image_lattice
+from camtorch.rays.lattices import image_lattice
 
 SIZE = (480, 640)
 PANORAMAS = {"cylindrical", "equirectangular", "latlon", "transverse_cylindrical"}

@@ -28,7 +28,7 @@ try:
     main(sys.argv[1:])
 except SystemExit:
     pass
-heavy = {"torch", "numpy", "PIL", "yaml", "kornia", "matplotlib", "camtorch.camera"}
+heavy = {"torch", "numpy", "PIL", "yaml", "kornia", "matplotlib", "camtorch.cameras.camera"}
 print("loaded:", sorted(heavy & set(sys.modules)))
 """
     assert "loaded: []" in python(code, *words)

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure  # noqa: E402
 
 from camtorch import plot  # noqa: E402
 from camtorch.analysis.summary import summarise  # noqa: E402
-from camtorch.projection.rays import ideal, ray_fan  # noqa: E402
+from camtorch.rays.lattices import ideal, ray_fan  # noqa: E402
 
 SIZE = (480, 640)
 ON_AXES = plot.distortion_field, plot.radius_curve, lambda camera, ax: plot.difference(camera, camera, ax)

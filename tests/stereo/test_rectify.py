@@ -10,7 +10,7 @@ import torch
 from cameras import KEYS, one
 
 import camtorch as ct
-from camtorch.rotations import rotation_matrix
+from camtorch.poses.rotations import rotation_matrix
 from camtorch.stereo.rectification import Rectification
 
 PROJECTIONS = ("perspective", "latlon", "cylindrical")

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 import camtorch as ct
-from camtorch.rotations import mount_rotation
+from camtorch.poses.rotations import mount_rotation
 from camtorch.warp.affine import MirrorWarp
 
 WIDE, TALL = 256, 128

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 import camtorch as ct
-from camtorch.rotations import rotation_matrix
+from camtorch.poses.rotations import rotation_matrix
 
 TURN, SHIFT = torch.tensor([0.05, -0.1, 0.03]).double(), torch.tensor([0.2, -0.1, 0.15]).double()
 NORMAL, DISTANCE = torch.tensor([0.1, 0.3, 1.0]).double(), 2.5

@@ -8,7 +8,7 @@ import torch
 from cameras import slow_unless
 
 import camtorch as ct
-from camtorch.rotations import rotation_matrix
+from camtorch.poses.rotations import rotation_matrix
 
 SIZE, SMALL = (24, 32), (10, 14)
 NUMBERS = {

@@ -9,7 +9,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import torch
 from torch import Tensor
 
-from camtorch._arguments import (
+from camtorch.optics.derivatives import goes_forward
+from camtorch.poses.extrinsics import Extrinsics
+from camtorch.poses.rotations import rotate_planes, rotation_matrix
+from camtorch.values.arguments import (
     Numbers,
     as_points,
     as_values,
@@ -20,13 +23,10 @@ from camtorch._arguments import (
     fails,
     working_dtype,
 )
-from camtorch.extrinsics import Extrinsics
-from camtorch.optics.derivatives import goes_forward
-from camtorch.rotations import rotate_planes, rotation_matrix
 
 if TYPE_CHECKING:
-    from camtorch._module import Memo
-    from camtorch.camera import Camera
+    from camtorch.cameras.camera import Camera
+    from camtorch.values.module import Memo
 
 _MOST_KEPT = 1 << 19  # rays, of 6 MB in float32: what every camera of a large data set may keep
 _STRAIGHT = 1e-24  # the squared sine of the angle to the vertical up to which a ray goes straight up or down

@@ -9,11 +9,11 @@ import torch
 from torch import Tensor
 from typing_extensions import Self
 
-from camtorch._module import BatchedModule, is_parameter
-from camtorch._tracing import in_transform, is_concrete, is_recorded
+from camtorch.evaluate.regime import in_transform, is_concrete, is_recorded
+from camtorch.values.module import BatchedModule, is_parameter
 
 if TYPE_CHECKING:
-    from camtorch.camera import Camera
+    from camtorch.cameras.camera import Camera
 
 INTRINSICS = "fx", "fy", "cx", "cy"
 PREFIX = "_frozen_"

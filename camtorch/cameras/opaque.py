@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from camtorch._registry import CLASSES
-from camtorch.camera import Camera, fixed_camera
+from camtorch.cameras.camera import Camera, fixed_camera
+from camtorch.values.registry import CLASSES
 
 Function = Callable[..., tuple[Tensor, ...]]
 

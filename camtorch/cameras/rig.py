@@ -9,10 +9,10 @@ from typing import TypeVar, cast
 from torch import Tensor, nn
 from torch.nn.utils.parametrize import type_before_parametrizations
 
-from camtorch._arguments import as_mapping, shown, values_of
-from camtorch._module import BatchedModule, UnsharedState
-from camtorch.camera import Camera
-from camtorch.extrinsics import Extrinsics
+from camtorch.cameras.camera import Camera
+from camtorch.poses.extrinsics import Extrinsics
+from camtorch.values.arguments import as_mapping, shown, values_of
+from camtorch.values.module import BatchedModule, UnsharedState
 
 M = TypeVar("M", bound=BatchedModule)
 _SHOWN = 8

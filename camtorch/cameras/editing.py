@@ -9,15 +9,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from camtorch._arguments import are_numbers, as_image_size, fails
-from camtorch._module import learning_as, remade
-from camtorch._numbers import joined, split
-from camtorch._tracing import is_concrete
+from camtorch.cameras.numbers import joined, split
+from camtorch.evaluate.regime import is_concrete
 from camtorch.optics.radial_inverse import precise
+from camtorch.values.arguments import are_numbers, as_image_size, fails
+from camtorch.values.module import learning_as, remade
 
 if TYPE_CHECKING:
-    from camtorch.camera import Camera
-    from camtorch.mixed import Mixed
+    from camtorch.cameras.camera import Camera
+    from camtorch.cameras.mixed import Mixed
 
 CameraT = TypeVar("CameraT", bound="Camera")
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import torch
 
 if TYPE_CHECKING:
-    from camtorch.camera import Camera
+    from camtorch.cameras.camera import Camera
 
 _WIDTH = 260  # px of the image
 _CELLS = 48  # of the lattice on which pixels without rays are looked for, along the wider side

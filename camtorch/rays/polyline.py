@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from camtorch._arguments import Numbers, as_points
-from camtorch.extrinsics import Extrinsics
+from camtorch.poses.extrinsics import Extrinsics
+from camtorch.values.arguments import Numbers, as_points
 
 if TYPE_CHECKING:
-    from camtorch.camera import Camera
+    from camtorch.cameras.camera import Camera
 
 _FIRST = 32  # pieces of an edge, of equal angles, before any is divided
 _LONGEST, _NEAR = 20.0, 0.05  # px: between points, and from a piece to its curve

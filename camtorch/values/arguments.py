@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from camtorch._tracing import in_graph, is_concrete, is_eager, keeps_graph, may_look
+from camtorch.evaluate.regime import in_graph, is_concrete, is_eager, keeps_graph, may_look
 
 Numbers: TypeAlias = Tensor | np.ndarray[Any, Any] | np.number[Any] | float | list[Any] | tuple[Any, ...]
 """What users pass as numbers: a tensor, an array, a number, or lists of them."""

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from camtorch._arguments import Numbers, as_values
+from camtorch.values.arguments import Numbers, as_values
 
 if TYPE_CHECKING:
-    from camtorch.camera import Camera
+    from camtorch.cameras.camera import Camera
 
 KINDS = ("z", "distance")
 

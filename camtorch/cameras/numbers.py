@@ -11,7 +11,11 @@ import torch
 from torch import Tensor, nn
 from torch.nn.utils.parametrize import type_before_parametrizations
 
-from camtorch._arguments import (
+from camtorch.cameras.freezing import INTRINSICS, frozen_names
+from camtorch.evaluate.regime import is_eager
+from camtorch.optics.radial_inverse import precise
+from camtorch.rays.lattices import AXES, focal_for
+from camtorch.values.arguments import (
     Numbers,
     as_batch,
     as_flag,
@@ -27,14 +31,10 @@ from camtorch._arguments import (
     values_of,
     warn,
 )
-from camtorch._freezing import INTRINSICS, frozen_names
-from camtorch._module import remade
-from camtorch._tracing import is_eager
-from camtorch.optics.radial_inverse import precise
-from camtorch.projection.rays import AXES, focal_for
+from camtorch.values.module import remade
 
 if TYPE_CHECKING:
-    from camtorch.camera import Camera
+    from camtorch.cameras.camera import Camera
 
 CameraT = TypeVar("CameraT", bound="Camera")
 _Checked = tuple[Tensor, Tensor, tuple[str, ...], torch.Size, tuple[int, int] | None]

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, TypeVar
 import torch
 from torch import Tensor
 
-from camtorch._arguments import columns
-from camtorch._module import remade
 from camtorch.optics.derivatives import jacobian_of
+from camtorch.values.arguments import columns
+from camtorch.values.module import remade
 
 if TYPE_CHECKING:
-    from camtorch.camera import Camera
+    from camtorch.cameras.camera import Camera
     from camtorch.projection.domain import Optics
 
     CameraT = TypeVar("CameraT", bound=Camera)

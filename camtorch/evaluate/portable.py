@@ -10,7 +10,7 @@ from functools import reduce
 import torch
 from torch import Tensor
 
-from camtorch._arguments import broadcast_shapes
+from camtorch.values.arguments import broadcast_shapes
 
 _recording = False
 

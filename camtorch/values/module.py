@@ -12,8 +12,7 @@ from torch import Tensor, nn
 from torch.nn.utils.parametrize import type_before_parametrizations
 from typing_extensions import Self
 
-from camtorch._arguments import LEFT, shown
-from camtorch._tracing import (
+from camtorch.evaluate.regime import (
     has_tangent,
     in_graph,
     in_transform,
@@ -24,6 +23,7 @@ from camtorch._tracing import (
     keeps_graph,
     set_aside,
 )
+from camtorch.values.arguments import LEFT, shown
 
 P = ParamSpec("P")
 R = TypeVar("R")

@@ -10,7 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from camtorch._arguments import (
+from camtorch.poses.rotations import are_rotations, check_rotation, rotate_planes, rotation_matrix, rotation_vector
+from camtorch.values.arguments import (
     Numbers,
     as_batch,
     as_coordinates,
@@ -26,8 +27,7 @@ from camtorch._arguments import (
     shown,
     values_of,
 )
-from camtorch._module import BatchedModule, learning_as, remade, typed_as
-from camtorch.rotations import are_rotations, check_rotation, rotate_planes, rotation_matrix, rotation_vector
+from camtorch.values.module import BatchedModule, learning_as, remade, typed_as
 
 
 class Extrinsics(BatchedModule):
@@ -193,7 +193,7 @@ def head_angles(pose: Extrinsics | Numbers) -> Tensor:
     identity faces the camera. R = Ry(yaw) Rx(-pitch) Rz(roll), right-handed turns about the camera's axes: the nose
     points along R (0, 0, -1), whose pitch and yaw these are as of a gaze (`ct.augment.to_pitch_yaw`, the signs of
     ETH-XGaze), and a positive roll leans clockwise in the image about that axis. Where the nose points straight up or
-    down, roll is 0. Values and gradients are finite everywhere. `camtorch.rotations.mount_rotation`, which turns
+    down, roll is 0. Values and gradients are finite everywhere. `camtorch.poses.rotations.mount_rotation`, which turns
     cameras, has another order: yaw, pitch, roll, in degrees.
 
     Args:

@@ -13,10 +13,8 @@ from torch import Tensor, nn
 from torch.autograd import Function, forward_ad
 from torch.nn.utils import parametrize
 
-from camtorch._arguments import Numbers, as_points, warn
-from camtorch._module import Memo, is_constant, with_values
-from camtorch._portable import portable_export
-from camtorch._tracing import (
+from camtorch.evaluate.portable import portable_export
+from camtorch.evaluate.regime import (
     FAKE_MODE,
     has_tangent,
     in_jit_trace,
@@ -28,13 +26,15 @@ from camtorch._tracing import (
     is_recorded,
     keeps_graph,
 )
-from camtorch.projection.explanation import unusable
 from camtorch.projection.project import Project
 from camtorch.projection.rows import Cameras
 from camtorch.projection.unproject import Unproject
+from camtorch.rays.explanation import unusable
+from camtorch.values.arguments import Numbers, as_points, warn
+from camtorch.values.module import Memo, is_constant, with_values
 
 if TYPE_CHECKING:
-    from camtorch.camera import Camera
+    from camtorch.cameras.camera import Camera
     from camtorch.projection.compiled import Native
 
 

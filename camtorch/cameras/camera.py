@@ -15,13 +15,10 @@ from torch import Tensor
 from torch.nn.utils import parametrize
 from typing_extensions import Self, TypeVar
 
-from camtorch._arguments import LEFT, Numbers, as_image_size, as_whole, broadcast_shapes, hinting, is_predicted, shown
-from camtorch._editing import check_crop, edited_by, quarter_turns
-from camtorch._evaluation import evaluated, mapped
-from camtorch._freezing import PREFIX, Freezable, with_frozen
-from camtorch._module import Memo, remade, typed_as
-from camtorch._notebook import as_html
-from camtorch._numbers import (
+from camtorch.cameras.editing import check_crop, edited_by, quarter_turns
+from camtorch.cameras.freezing import PREFIX, Freezable, with_frozen
+from camtorch.cameras.notebook import as_html
+from camtorch.cameras.numbers import (
     at_a_glance,
     camera_of_fov,
     checked_numbers,
@@ -30,18 +27,30 @@ from camtorch._numbers import (
     replaced,
     warn_of_exchange,
 )
-from camtorch._registry import register
 from camtorch.convert.conversion import Conversion, convert
-from camtorch.extrinsics import Extrinsics
 from camtorch.optics.charts import Chart
 from camtorch.optics.lens import Lens
-from camtorch.projection.depth import backproject
-from camtorch.projection.explanation import explain
-from camtorch.projection.fields import local_pinhole, on_image, over_image, patch_centres, perspective_field, plucker
-from camtorch.projection.polyline import project_polyline
+from camtorch.poses.extrinsics import Extrinsics
+from camtorch.projection.evaluation import evaluated, mapped
 from camtorch.projection.project import Project
-from camtorch.projection.rays import field_of_view
 from camtorch.projection.unproject import Unproject
+from camtorch.rays.depth import backproject
+from camtorch.rays.explanation import explain
+from camtorch.rays.fields import local_pinhole, on_image, over_image, patch_centres, perspective_field, plucker
+from camtorch.rays.lattices import field_of_view
+from camtorch.rays.polyline import project_polyline
+from camtorch.values.arguments import (
+    LEFT,
+    Numbers,
+    as_image_size,
+    as_whole,
+    broadcast_shapes,
+    hinting,
+    is_predicted,
+    shown,
+)
+from camtorch.values.module import Memo, remade, typed_as
+from camtorch.values.registry import register
 
 Model = TypeVar("Model", bound="Camera", default="Camera")
 

@@ -16,7 +16,7 @@ import torch
 from PIL import Image, UnidentifiedImageError
 from torch import Tensor
 
-from camtorch._arguments import warn
+from camtorch.values.arguments import warn
 
 ORIENTATION = 0x0112  # the Exif tag, also of TIFF
 _WIDTH, _HEIGHT = 256, 257  # tags of TIFF

@@ -8,9 +8,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from camtorch._arguments import Numbers, as_own, as_real, as_rows, as_values, check_devices, fails, holds
-from camtorch._tracing import is_eager
+from camtorch.evaluate.regime import is_eager
 from camtorch.optics.special import angle_per_radius, cos_root, cosc_root, sinc_root
+from camtorch.values.arguments import Numbers, as_own, as_real, as_rows, as_values, check_devices, fails, holds
 
 _NEARLY = 1e-3  # by which R R^T may miss the identity
 

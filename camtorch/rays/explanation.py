@@ -8,15 +8,15 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from camtorch._arguments import Numbers, as_values, columns, working_dtype
-from camtorch._module import remade
 from camtorch.optics.charts import floor_of
-from camtorch.projection.rays import angles_from_axis, reach
+from camtorch.rays.lattices import angles_from_axis, reach
+from camtorch.values.arguments import Numbers, as_values, columns, working_dtype
+from camtorch.values.module import remade
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from camtorch.camera import Camera
+    from camtorch.cameras.camera import Camera
 
 _STEPS = 256
 

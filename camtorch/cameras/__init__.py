@@ -1,0 +1,1 @@
+"""Cameras: one, several of several models, rigs."""

@@ -1,0 +1,1 @@
+"""What everybody uses: arguments, modules, threads."""
