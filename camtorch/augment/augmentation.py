@@ -18,20 +18,9 @@ from camtorch.augment.filling import enough, filled, scaled
 from camtorch.augment.sample import Named, Sample, SampleOptions, SampleTransform, Unknown, fixed_copy, on_samples
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.mixed import Mixed
+from camtorch.evaluate.known import are_numbers, known_false, known_true
 from camtorch.evaluate.regime import is_concrete, may_look
-from camtorch.values.arguments import (
-    GUESS_CAMERA,
-    are_numbers,
-    as_flag,
-    as_mapping,
-    as_number,
-    as_part,
-    as_whole,
-    fails,
-    holds,
-    shown,
-    warn,
-)
+from camtorch.values.arguments import GUESS_CAMERA, as_flag, as_mapping, as_number, as_part, as_whole, shown, warn
 from camtorch.values.module import typed_as
 from camtorch.warp.warp import Warp
 
@@ -445,7 +434,7 @@ class Augmentation(SampleTransform):
 
     def _tell_of_too_few(self, found: Tensor, share: float) -> None:
         """Warn, once, if less than a share of some images was found filled."""
-        if self._warned or not fails(found >= share):
+        if self._warned or not known_false(found >= share):
             return
         self._warned, few = True, int((found < share).sum())
         warn(
@@ -597,7 +586,7 @@ class Augmentation(SampleTransform):
 def _are_alike(value: Any) -> bool:
     """Whether all rows of an array or a tensor are known to be the same."""
     same = value == value[:1]
-    return same.size > 0 and bool(same.all()) if isinstance(same, np.ndarray) else holds(same)
+    return same.size > 0 and bool(same.all()) if isinstance(same, np.ndarray) else known_true(same)
 
 
 # -- for front ends, which hold an augmentation and the camera of their images

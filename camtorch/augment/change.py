@@ -16,11 +16,11 @@ from camtorch.cameras.camera import Camera
 from camtorch.cameras.editing import edited
 from camtorch.cameras.mixed import Mixed
 from camtorch.cameras.numbers import joined
+from camtorch.evaluate.known import are_numbers, known_false, known_true
 from camtorch.poses.rotations import turn
 from camtorch.projection.compiled import Native
 from camtorch.projection.evaluation import rows_of
 from camtorch.projection.rows import single_native
-from camtorch.values.arguments import are_numbers, fails, holds
 from camtorch.values.dtypes import narrow, widen
 from camtorch.values.module import remade
 from camtorch.warp.affine import AffineWarp, MirrorWarp, after
@@ -252,7 +252,7 @@ class Change:
     def leads_to(self, camera: Camera | Sequence[Camera]) -> bool:
         """Whether these may be the cameras after: of their number and intrinsics, where one may look."""
         ours, theirs = (one.intrinsics.detach().reshape(-1, 4) for one in (self.target, as_one(camera)))
-        return ours.shape == theirs.shape and not fails(
+        return ours.shape == theirs.shape and not known_false(
             torch.isclose(ours.double(), theirs.to(ours.device).double(), _ROUNDED)
         )
 
@@ -295,7 +295,7 @@ class Change:
             for t, n in zip(turns, self._counts, strict=True)
         ]
         rows = flags[0] if self._order is None else torch.cat(flags)[self._order]
-        return None if holds(~rows) else rows
+        return None if known_true(~rows) else rows
 
     def then(self, second: Change) -> Change:
         """This change, and then another one of the cameras that this one ends with, by single warps.

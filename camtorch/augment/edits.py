@@ -16,7 +16,8 @@ from camtorch.augment.change import Change, Part, by_kinds
 from camtorch.augment.landmarks import Mirroring, TableLike
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.editing import edited, quarter_turns
-from camtorch.values.arguments import as_image_size, as_whole, fails, holds
+from camtorch.evaluate.known import known_false, known_true
+from camtorch.values.arguments import as_image_size, as_whole
 from camtorch.warp.affine import AffineWarp, Map, Rows, after, as_tensor, on_rays
 
 Size = int | Sequence[int]
@@ -79,7 +80,7 @@ class Edit(Augmentation):
         given = {name: value for name, value in draw.items() if name != "apply"}
         values = {name: torch.as_tensor(value, dtype=torch.float64) for name, value in given.items()}
         matrix, new = self.edit(size, values)
-        all_are = holds(applied) or (self.p == 1 and not fails(applied))
+        all_are = known_true(applied) or (self.p == 1 and not known_false(applied))
         if new != size and (not all_are or 0 < self.p < 1):
             raise ValueError(
                 f"{self._name}: with p < 1 images must keep their size, so that all come out alike; here they "
@@ -87,7 +88,7 @@ class Edit(Augmentation):
             )
         if all_are:
             return matrix, new
-        if holds(~applied):
+        if known_true(~applied):
             return None, new
         matrix = as_tensor(matrix)
         still = matrix.new_tensor([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
@@ -111,7 +112,12 @@ def change_by(edits: Sequence[tuple[Edit, Mapping[str, Any]]], camera: Camera, o
                 matrix = one if matrix is None else after(one, matrix)
         if matrix is None:
             return Part(rows, None, source)
-        if isinstance(matrix, Tensor) and matrix.ndim == 3 and not source.batch_shape and holds(matrix == matrix[:1]):
+        if (
+            isinstance(matrix, Tensor)
+            and matrix.ndim == 3
+            and not source.batch_shape
+            and known_true(matrix == matrix[:1])
+        ):
             matrix = matrix[0]  # one map serves the whole batch
         warp = AffineWarp(source, edited(source, matrix, size), matrix, _turn(matrix, source), **options)
         return Part(rows, warp, source)
@@ -124,7 +130,7 @@ def _turn(matrix: Map, source: Camera) -> Tensor | None:
     if not isinstance(matrix, Tensor) and matrix[0][0] > 0 and matrix[1][1] > 0:
         return None
     own, like = as_tensor(matrix), source.intrinsics
-    if holds(own[..., :2].diagonal(dim1=-2, dim2=-1) > 0):
+    if known_true(own[..., :2].diagonal(dim1=-2, dim2=-1) > 0):
         return None
     return on_rays(own).to(like.device, torch.promote_types(like.dtype, torch.float32))
 
@@ -324,12 +330,12 @@ class Rotate90(Edit):
         turns = (low + step * (values["times"] * count).floor().clamp(max=count - 1)).long() % 4
         maps = turns.new_tensor(quarter_turns(size), dtype=torch.float64)
         on_side = turns % 2
-        if height != width and fails(on_side == on_side[:1]):
+        if height != width and known_false(on_side == on_side[:1]):
             raise ValueError(
                 f"{self._name}: samples of one batch would come out in the sizes {size} and {size[::-1]}; "
                 "same_on_batch=True turns all alike, step=2 leaves images as they lie"
             )
-        turned = fails(on_side == 0) or bool(low % 2 and not holds(on_side == 0))
+        turned = known_false(on_side == 0) or bool(low % 2 and not known_true(on_side == 0))
         return maps[turns], size[::-1] if turned else size
 
 

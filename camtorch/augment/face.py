@@ -13,9 +13,10 @@ from typing_extensions import Unpack
 from camtorch.augment.change import Change, Part, alone
 from camtorch.augment.sample import Sample, SampleOptions, SampleTransform, on_samples
 from camtorch.cameras.camera import Camera
+from camtorch.evaluate.known import known_false
 from camtorch.models import Pinhole
 from camtorch.poses.rotations import check_rotation, rotation_matrix
-from camtorch.values.arguments import as_known_size, as_number, fails, no_camera, shown
+from camtorch.values.arguments import as_known_size, as_number, no_camera, shown
 from camtorch.values.module import remade, typed_as
 from camtorch.warp.warp import Warp
 
@@ -108,7 +109,7 @@ class FaceNormalizer(SampleTransform):
                 f"its centre at {centre[row].tolist()}"
             )
         scale = self.distance / distance.detach()
-        if fails((scale < _ODD) & (scale > 1 / _ODD)):
+        if known_false((scale < _ODD) & (scale > 1 / _ODD)):
             at = ", ".join(f"{d:.4g}" for d in distance.flatten().tolist())
             raise ValueError(
                 f"{self._name}: faces are at distances of {at}, but distance={self.distance:g}; both must be in one "

@@ -29,9 +29,10 @@ from camtorch.augment.containers import KIND, InContainers, Params, camera_of, k
 from camtorch.augment.presets import PresetName
 from camtorch.augment.sample import detached, fixed_copy, on_samples
 from camtorch.cameras.camera import Camera
-from camtorch.values.arguments import as_part, fails
+from camtorch.evaluate.kept import Memo
+from camtorch.evaluate.known import known_false
+from camtorch.values.arguments import as_part
 from camtorch.values.dtypes import narrow, widen
-from camtorch.values.module import Memo
 from camtorch.warp.sampling import Mode
 
 Flags: TypeAlias = dict[str, Any]
@@ -131,7 +132,7 @@ class CameraAugmentation(InContainers, GeometricAugmentationBase2D):
         if missing := [name for name in ("batch_prob", *own) if name not in params]:
             raise ValueError(f"{type(self).__name__}: the params lack {', '.join(missing)}; call it first")
         values = {"apply": self._gate(params), **{name: params[name] for name in own}}
-        if self.augmentation.crops and any(fails(~values[name].isnan()) for name in self.augmentation.crops):
+        if self.augmentation.crops and any(known_false(~values[name].isnan()) for name in self.augmentation.crops):
             raise ValueError(
                 f"{type(self).__name__}: kornia hands on boxes after images, so that they go in before: "
                 "params = aug.forward_parameters(images.shape), then aug(images, params=with_boxes(params, boxes))"

@@ -23,6 +23,8 @@ from camtorch.augment.sample import Named, fixed_copy
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.numbers import joined, split
 from camtorch.cameras.opaque import CameraNumbers, opaque
+from camtorch.evaluate.kept import Memo
+from camtorch.evaluate.known import are_numbers, known_false
 from camtorch.evaluate.regime import in_graph, is_eager
 from camtorch.lenses.drawing import FOLD, covering, drawn
 from camtorch.models import MODELS, KannalaBrandt
@@ -32,8 +34,8 @@ from camtorch.projection.compiled import Native, project, project_numbers, unpro
 from camtorch.projection.evaluation import rows_of
 from camtorch.projection.rows import Cameras, single_native
 from camtorch.rays.lattices import field_of_view, pixel_lattice, polar_rays, reach
-from camtorch.values.arguments import LEFT, are_numbers, as_image_size, broadcast_shapes, check_degrees, fails, warn
-from camtorch.values.module import Memo, remade
+from camtorch.values.arguments import LEFT, as_image_size, broadcast_shapes, check_degrees, warn
+from camtorch.values.module import remade
 from camtorch.warp.boxes import along_edges
 from camtorch.warp.panorama import PANORAMAS
 from camtorch.warp.shifted import ShiftedWarp
@@ -275,7 +277,7 @@ class RandomCamera(Augmentation):
         asked = self._among[0] if self._among else self.ranges["fov"].low if "fov" in self.ranges else None
         share = self.min_filled or 0.0
         key = self._name, asked, share
-        if asked is None or key in _told or not fails(factor <= 1):
+        if asked is None or key in _told or not known_false(factor <= 1):
             return
         made = _across(target)
         least = torch.minimum(_across(scaled(target, 1 / factor)), torch.full_like(made, asked))
@@ -386,7 +388,7 @@ def _sized(base: Camera, size: tuple[int, int], fov: Any, xp: Any) -> Sequence[A
     if base.batch_shape:
         rays = rays.expand(*broadcast_shapes(rays.shape, (*base.batch_shape, 2, 3)))
     pixels, valid = base.project(rays)
-    if fails(valid):
+    if known_false(valid):
         widest = float(fov if xp is math else fov.max())
         raise ValueError(f"fov: a {base.key} lens of these coefficients does not reach {widest:g} degrees")
     wide = pixels[..., 1, 0] - pixels[..., 0, 0]

@@ -23,13 +23,13 @@ from camtorch.augment.change import Change, Part, View, alone, as_one
 from camtorch.augment.clips import Clips
 from camtorch.augment.landmarks import Mirroring, exchanged
 from camtorch.cameras.camera import Camera
+from camtorch.evaluate.known import are_numbers, known_false
 from camtorch.evaluate.regime import may_look
 from camtorch.models import Pinhole
 from camtorch.poses.rotations import are_rotations, check_rotation, rotation_matrix, rotation_vector
 from camtorch.values.arguments import (
     GUESS_CAMERA,
     LEFT,
-    are_numbers,
     as_coordinates,
     as_flag,
     as_mapping,
@@ -38,7 +38,6 @@ from camtorch.values.arguments import (
     check_boxes,
     check_devices,
     check_radians,
-    fails,
     hinting,
     no_camera,
     warn,
@@ -281,12 +280,12 @@ def check_values(kind: str, name: str, value: Tensor, owner: str) -> None:
     elif kind in ("head_pose", "pose") and value.is_cpu and not value.requires_grad:
         rotations = value[..., :3, :3]
         wrong = ~are_rotations(rotations) & torch.isfinite(rotations).flatten(-2).all(-1)
-        if fails(~wrong):
+        if known_false(~wrong):
             check_rotation(rotations[wrong][:1], name, owner)
     elif kind == "pitch_yaw" and value.is_cpu and not value.requires_grad:
         # with room for the rounding of half precision
         beyond = value.abs() > value.new_tensor([math.pi / 2, math.pi]) * (1 + _ROUNDING)
-        if fails(~beyond):
+        if known_false(~beyond):
             pitch, yaw = value[beyond.any(-1)][0].tolist()
             raise ValueError(
                 f"{owner}: {name} must be radians, pitch within pi / 2 and yaw within pi; got {pitch:.6g}, {yaw:.6g}. "

@@ -28,6 +28,8 @@ from camtorch.cameras.numbers import (
     warn_of_exchange,
 )
 from camtorch.convert.conversion import Conversion, convert
+from camtorch.evaluate.kept import Memo
+from camtorch.evaluate.known import is_predicted
 from camtorch.optics.charts import Chart
 from camtorch.optics.lens import Lens
 from camtorch.poses.extrinsics import Extrinsics
@@ -39,17 +41,8 @@ from camtorch.rays.explanation import explain
 from camtorch.rays.fields import local_pinhole, on_image, over_image, patch_centres, perspective_field, plucker
 from camtorch.rays.lattices import field_of_view
 from camtorch.rays.polyline import project_polyline
-from camtorch.values.arguments import (
-    LEFT,
-    Numbers,
-    as_image_size,
-    as_whole,
-    broadcast_shapes,
-    hinting,
-    is_predicted,
-    shown,
-)
-from camtorch.values.module import Memo, remade, typed_as
+from camtorch.values.arguments import LEFT, Numbers, as_image_size, as_whole, broadcast_shapes, hinting, shown
+from camtorch.values.module import remade, typed_as
 from camtorch.values.registry import register
 
 Model = TypeVar("Model", bound="Camera", default="Camera")

@@ -10,9 +10,10 @@ import torch
 from torch import Tensor
 
 from camtorch.cameras.numbers import joined, split
+from camtorch.evaluate.known import are_numbers, known_false
 from camtorch.evaluate.regime import is_concrete
 from camtorch.optics.radial_inverse import precise
-from camtorch.values.arguments import are_numbers, as_image_size, fails
+from camtorch.values.arguments import as_image_size
 from camtorch.values.module import learning_as, remade
 
 if TYPE_CHECKING:
@@ -105,7 +106,7 @@ def _on_side(camera: Camera) -> Tensor:
         )
     if {"tau_x", "tau_y"} <= {*names}:
         tilts = camera.distortion[..., [names.index("tau_x"), names.index("tau_y")]]
-        if fails((tilts == 0).any(-1)):
+        if known_false((tilts == 0).any(-1)):
             raise ValueError(
                 f"{owner}: a sensor tilted about both axes, tau_x, tau_y = {tilts.tolist()}, has no "
                 "quarter turn: the model tilts about one after the other"

@@ -16,12 +16,13 @@ from typing_extensions import Self
 
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.numbers import as_numbers_of
+from camtorch.evaluate.kept import Memo
 from camtorch.projection.evaluation import new_cameras, per_row
 from camtorch.projection.evaluation import rows_of as camera_rows
 from camtorch.projection.project import Project
 from camtorch.projection.unproject import Unproject
 from camtorch.values.arguments import Numbers, as_image_size, as_points, no_camera, shown, working_dtype
-from camtorch.values.module import Memo, refused_index, remade
+from camtorch.values.module import refused_index, remade
 
 if TYPE_CHECKING:
     from camtorch.projection.rows import Cameras

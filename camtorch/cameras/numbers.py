@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from torch.nn.utils.parametrize import type_before_parametrizations
 
 from camtorch.cameras.freezing import INTRINSICS, frozen_names
+from camtorch.evaluate.known import is_kept, is_predicted, known_false, row_of, values_of
 from camtorch.evaluate.regime import is_eager
 from camtorch.optics.radial_inverse import precise
 from camtorch.rays.lattices import AXES, focal_for
@@ -23,12 +24,7 @@ from camtorch.values.arguments import (
     as_real,
     check_degrees,
     check_devices,
-    fails,
-    is_kept,
-    is_predicted,
-    row_of,
     shown,
-    values_of,
     warn,
 )
 from camtorch.values.module import remade
@@ -134,7 +130,7 @@ def checked_intrinsics(model: type[Camera], intrinsics: Numbers) -> Tensor:
             f"{owner}: intrinsics must be (*B, 4) = fx, fy, cx, cy; got shape {tuple(intrinsics.shape)}{hint}"
         )
     row = row_of(intrinsics)
-    if not is_predicted(intrinsics) and (fails(intrinsics[..., :2] > 0) if row is None else min(row[:2]) <= 0):
+    if not is_predicted(intrinsics) and (known_false(intrinsics[..., :2] > 0) if row is None else min(row[:2]) <= 0):
         hint = f". Of matrices (4, 4) use {owner}.from_matrix(K[..., :3, :3])"
         hint = hint if intrinsics.shape[-2:] == (4, 4) else ""
         raise ValueError(
@@ -166,7 +162,7 @@ def checked_distortion(model: type[Camera], distortion: Numbers, intrinsics: Ten
         )
     is_known = model.always_defined or is_predicted(distortion)
     defined = None if is_known else model.defined(distortion.unbind(-1))
-    if defined is not None and fails(defined > 0):
+    if defined is not None and known_false(defined > 0):
         raise ValueError(f"{owner}: the formula needs {model.defined_text}; got {distortion.tolist()}")
     return distortion
 
@@ -257,9 +253,9 @@ def numbers_of_matrix(
         hint = ". Of larger ones it is K[..., :3, :3]" if min(K.shape[-2:], default=0) >= 3 else ""
         raise ValueError(f"{owner}: K must be (*B, 3, 3); got shape {tuple(K.shape)}{hint}")
     bottom, skew = K[..., 2, :].detach(), K[..., 0, 1].detach()
-    if fails(bottom == bottom.new_tensor([0, 0, 1])) or fails(K[..., 1, 0] == 0):
+    if known_false(bottom == bottom.new_tensor([0, 0, 1])) or known_false(K[..., 1, 0] == 0):
         raise ValueError(f"{owner}: K must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]; got {K.tolist()}")
-    if not as_flag(ignore_skew, "ignore_skew", owner) and fails(skew == 0):
+    if not as_flag(ignore_skew, "ignore_skew", owner) and known_false(skew == 0):
         raise ValueError(
             f"{owner}: K has a skew K[0, 1] = {skew.tolist()}, which this model does not have; "
             "ignore_skew=True drops it"
@@ -302,7 +298,7 @@ def camera_of_fov(
     device = distortion.device if isinstance(distortion, Tensor) else None
     fov = torch.tensor(fov, dtype=torch.float64, device=device) if isinstance(fov, (int, float)) else fov
     degrees = as_real(fov, "fov", owner).detach().double()
-    if fails((degrees > 0) & (degrees <= 360)):
+    if known_false((degrees > 0) & (degrees <= 360)):
         raise ValueError(f"{owner}: fov must be in degrees, above 0 and up to 360; got {degrees.tolist()}")
     if (known := values_of(degrees)) is not None and known.numel():
         check_degrees(float(known.min()), known.tolist(), owner)
@@ -314,7 +310,7 @@ def camera_of_fov(
     intrinsics = torch.cat((focal[..., None], focal[..., None], centre), -1)
     intrinsics = intrinsics.to(given[0].dtype if given else torch.get_default_dtype())
     made = model(intrinsics, *given, image_size=size)
-    if fails(reached):
+    if known_false(reached):
         widest = made.fov[..., AXES.index(axis)].flatten().tolist()
         raise ValueError(
             f"{owner}: this lens has no {axis} field of view of {degrees.tolist()} degrees; its widest is "

@@ -10,8 +10,6 @@ from functools import reduce
 import torch
 from torch import Tensor
 
-from camtorch.values.arguments import broadcast_shapes
-
 _recording = False
 
 
@@ -109,8 +107,8 @@ def pick(columns: Sequence[Tensor], index: Tensor) -> Tensor:
             found = torch.where(index == i, column, found)
         return found
     table = torch.stack(torch.broadcast_tensors(*columns), -1)
-    shape = broadcast_shapes(table.shape[:-1], index.shape)
-    return table.expand(*shape, -1).gather(-1, index.expand(shape).unsqueeze(-1)).squeeze(-1)
+    _, index = torch.broadcast_tensors(table[..., 0], index)
+    return table.expand(*index.shape, -1).gather(-1, index.unsqueeze(-1)).squeeze(-1)
 
 
 def solve_tridiagonal(below: Tensor, main: Tensor, above: Tensor, right: Tensor) -> Tensor:

@@ -10,7 +10,8 @@ from torch import Tensor
 from typing_extensions import Self
 
 from camtorch.cameras.camera import Camera
-from camtorch.values.arguments import Numbers, as_batch, as_number, as_real, fails, holds, is_list
+from camtorch.evaluate.known import known_false, known_true
+from camtorch.values.arguments import Numbers, as_batch, as_number, as_real, is_list
 
 
 class OddPolynomial(Camera):
@@ -84,7 +85,7 @@ class FreePolynomial(Camera):
         if coefficients.ndim == 0 or coefficients.shape[-1] < 2:
             raise ValueError(f"{cls.__name__}: coefficients must be (*B, n), n >= 2; got {tuple(coefficients.shape)}")
         first = coefficients[..., :1]
-        if fails(first > 0):
+        if known_false(first > 0):
             raise ValueError(
                 f"{cls.__name__}: the first coefficient, of the first power, must be positive; got {first.tolist()}. "
                 "A constant before it, which is zero, is left out"
@@ -95,14 +96,14 @@ class FreePolynomial(Camera):
         if is_list(linear_cde):  # in the precision of what it belongs to
             linear = torch.tensor(linear_cde, dtype=coefficients.dtype, device=coefficients.device)
         c, d, e = linear.split(1, -1)
-        if fails((c > 0) & (c > d * e)):
+        if known_false((c > 0) & (c > d * e)):
             raise ValueError(
                 f"{cls.__name__}: linear_cde = c, d, e must have c > 0 and c > d e; got {linear.tolist()}. Files that "
                 "have zeros mean 1, 0, 0"
             )
         batch = as_batch(cls.__name__, centre=centre.shape, coefficients=coefficients.shape, linear_cde=linear.shape)
         is_straight = linear_cde == (1.0, 0.0, 0.0) if isinstance(linear_cde, tuple) else False
-        is_straight = is_straight or (not linear.requires_grad and holds(linear[..., 1:] == 0))
+        is_straight = is_straight or (not linear.requires_grad and known_true(linear[..., 1:] == 0))
         focal, distortion = cls._scaled(coefficients)
         focal = torch.cat((focal * c, focal.expand(*batch, 1) * aspect_ratio), -1)
         intrinsics = torch.cat(torch.broadcast_tensors(focal, centre), -1)

@@ -8,9 +8,10 @@ import torch
 from torch import Tensor
 from typing_extensions import Self
 
+from camtorch.evaluate.known import known_false
 from camtorch.models._polynomial import OddPolynomial
 from camtorch.optics import Chart, Equidistant, Lens, Planar, Polynomial
-from camtorch.values.arguments import Numbers, as_batch, as_real, fails
+from camtorch.values.arguments import Numbers, as_batch, as_real
 
 
 class KannalaBrandt(OddPolynomial):
@@ -54,7 +55,7 @@ class KannalaBrandt(OddPolynomial):
         if coefficients.ndim == 0 or coefficients.shape[-1] == 0:
             raise ValueError(f"{cls.__name__}: coefficients must be (*B, n), n >= 1; got {tuple(coefficients.shape)}")
         first = coefficients[..., :1]
-        if fails(first > 0):
+        if known_false(first > 0):
             raise ValueError(f"{cls.__name__}: the first coefficient must be positive; got {first.tolist()}")
         as_batch(cls.__name__, intrinsics=intrinsics.shape, coefficients=coefficients.shape)
         focal, centre = torch.broadcast_tensors(intrinsics[..., :2] * first, intrinsics[..., 2:])

@@ -11,10 +11,11 @@ from torch import Tensor
 from typing_extensions import Self
 
 from camtorch.cameras.camera import Camera
+from camtorch.evaluate.known import known_false
 from camtorch.optics import AnglePerRadius, Chart, Inverted, Lens, RadiusPolynomial, Shear
 from camtorch.optics.radial import RadialFactor
 from camtorch.optics.special import first_root
-from camtorch.values.arguments import Numbers, as_real, fails
+from camtorch.values.arguments import Numbers, as_real
 
 
 class AngleOfAllPowers(AnglePerRadius):
@@ -91,7 +92,7 @@ class OCamCalib(Camera):
         shapes = [tuple(t.shape) for t in (polynomial, centre, affine)]
         if polynomial.ndim != 1 or len(polynomial) < 2 or shapes[1:] != [(2,), (3,)]:
             raise ValueError(f"{owner}: polynomial must be (n,), n >= 2, centre (2,), affine (3,); got shapes {shapes}")
-        if fails((polynomial[0] != 0) & (affine[0] > 0)):
+        if known_false((polynomial[0] != 0) & (affine[0] > 0)):
             raise ValueError(
                 f"{owner}: ss[0], the focal length, must not be zero, and c must be positive; got ss[0] = "
                 f"{float(polynomial[0])}, c = {float(affine[0])}"

@@ -13,10 +13,11 @@ from torch import Tensor
 
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.freezing import INTRINSICS, frozen_names
+from camtorch.evaluate.known import values_of
 from camtorch.optics import Chart, Lens, Surface, Unified
 from camtorch.optics.charts import even_steps_and_ratios
 from camtorch.optics.surface import BEHIND
-from camtorch.values.arguments import as_whole, hinting, values_of
+from camtorch.values.arguments import as_whole, hinting
 
 _VARIANT = re.compile(r"order=(\d),columns=(\d{1,3}),rows=(\d{1,3}),fov_x=(\d{1,3})")
 

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
+from camtorch.evaluate.kept import Memo
 from camtorch.evaluate.portable import as_index, is_portable_export, of_points, repeat, times
 from camtorch.evaluate.regime import is_concrete
 from camtorch.optics.charts import even_steps_and_ratios
 from camtorch.values.arguments import columns
-from camtorch.values.module import Memo
 from camtorch.values.registry import CLASSES
 
 if TYPE_CHECKING:

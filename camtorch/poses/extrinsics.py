@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from camtorch.evaluate.known import known_false, values_of
 from camtorch.poses.rotations import are_rotations, check_rotation, rotate_planes, rotation_matrix, rotation_vector
 from camtorch.values.arguments import (
     Numbers,
@@ -22,10 +23,8 @@ from camtorch.values.arguments import (
     check_angles,
     check_devices,
     check_radians,
-    fails,
     hinting,
     shown,
-    values_of,
 )
 from camtorch.values.module import BatchedModule, learning_as, remade, typed_as
 
@@ -133,7 +132,7 @@ class Extrinsics(BatchedModule):
                     f"Extrinsics: matrix must be (*B, 4, 4) or (*B, 3, 4); got shape {tuple(matrix.shape)}{hint}"
                 )
             bottom = matrix[..., 3:, :].detach()
-            if fails(bottom == bottom.new_tensor([0, 0, 0, 1])):
+            if known_false(bottom == bottom.new_tensor([0, 0, 0, 1])):
                 raise ValueError(f"Extrinsics: the last row of matrix must be 0 0 0 1; got {bottom.tolist()}")
             rotation, translation = matrix[..., :3, :3], matrix[..., :3, 3]
         check_rotation(rotation, "matrix", "Extrinsics")

@@ -8,9 +8,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from camtorch.evaluate.known import as_own, known_false, known_true
 from camtorch.evaluate.regime import is_eager
 from camtorch.optics.special import angle_per_radius, cos_root, cosc_root, sinc_root
-from camtorch.values.arguments import Numbers, as_own, as_real, as_rows, as_values, check_devices, fails, holds
+from camtorch.values.arguments import Numbers, as_real, as_rows, as_values, check_devices
 
 _NEARLY = 1e-3  # by which R R^T may miss the identity
 
@@ -99,7 +100,7 @@ def rotate_planes(matrix: Tensor, planes: tuple[Tensor, ...], whole: Tensor | No
     a, b, c = matrix.movedim((-1, -2), (0, 1)).unsqueeze(-1).unbind(0)
     # a sum shows what is not finite: the whole planes are looked at once
     sums = [plane.detach().sum() for plane in (planes if whole is None else (whole,))]
-    if x.is_cpu and holds(torch.isfinite(sums[0] if len(sums) == 1 else torch.stack(sums))):
+    if x.is_cpu and known_true(torch.isfinite(sums[0] if len(sums) == 1 else torch.stack(sums))):
         return torch.addcmul(torch.addcmul(a * x, b, y), c, z)
     finite = torch.isfinite(x) & torch.isfinite(y) & torch.isfinite(z)
     x, y, z = (torch.where(finite, plane, 0.0) for plane in planes)
@@ -108,7 +109,7 @@ def rotate_planes(matrix: Tensor, planes: tuple[Tensor, ...], whole: Tensor | No
 
 def check_rotation(matrix: Tensor, name: str, owner: str, hint: str = "") -> None:
     """Raise a ValueError unless (*B, 3, 3) are rotations, to the precision that files store them with."""
-    if fails(are_rotations(matrix)):
+    if known_false(are_rotations(matrix)):
         values = matrix.detach().double()
         error = rotation_error(values).max().item()
         raise ValueError(

@@ -13,6 +13,8 @@ from torch import Tensor, nn
 from torch.autograd import Function, forward_ad
 from torch.nn.utils import parametrize
 
+from camtorch.evaluate.export import is_constant, with_values
+from camtorch.evaluate.kept import Memo
 from camtorch.evaluate.portable import portable_export
 from camtorch.evaluate.regime import (
     FAKE_MODE,
@@ -31,7 +33,6 @@ from camtorch.projection.rows import Cameras
 from camtorch.projection.unproject import Unproject
 from camtorch.rays.explanation import unusable
 from camtorch.values.arguments import Numbers, as_points, warn
-from camtorch.values.module import Memo, is_constant, with_values
 
 if TYPE_CHECKING:
     from camtorch.cameras.camera import Camera

@@ -11,11 +11,12 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
+from camtorch.evaluate.known import known_true
 from camtorch.evaluate.portable import is_portable_export
 from camtorch.projection import compiled
 from camtorch.projection.domain import Domain, domain_of
 from camtorch.projection.ops import tables
-from camtorch.values.arguments import columns, holds
+from camtorch.values.arguments import columns
 
 if TYPE_CHECKING:
     from camtorch.cameras.camera import Camera
@@ -46,7 +47,7 @@ class Cameras:
         if intrinsics.ndim == 1:
             values = values[0][None], values[1][None]
         self.given, self.usable = values, None
-        if not (_are_plain(model, *values) or holds(usable := _usable(model, *values))):
+        if not (_are_plain(model, *values) or known_true(usable := _usable(model, *values))):
             ideal = _ideal(model, *values)
             values = torch.where(usable, values[0], ideal[0]), torch.where(usable, values[1], ideal[1])
             self.usable = usable.to(intrinsics.dtype)  # (C, 1)

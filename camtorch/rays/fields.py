@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import torch
 from torch import Tensor
 
+from camtorch.evaluate.known import known_false
 from camtorch.optics.derivatives import goes_forward
 from camtorch.poses.extrinsics import Extrinsics
 from camtorch.poses.rotations import rotate_planes, rotation_matrix
@@ -20,13 +21,12 @@ from camtorch.values.arguments import (
     as_whole,
     broadcast_shapes,
     check_devices,
-    fails,
     working_dtype,
 )
 
 if TYPE_CHECKING:
     from camtorch.cameras.camera import Camera
-    from camtorch.values.module import Memo
+    from camtorch.evaluate.kept import Memo
 
 _MOST_KEPT = 1 << 19  # rays, of 6 MB in float32: what every camera of a large data set may keep
 _STRAIGHT = 1e-24  # the squared sine of the angle to the vertical up to which a ray goes straight up or down
@@ -182,7 +182,7 @@ def perspective_field(camera: Camera, gravity: Numbers, stride: int) -> tuple[Te
     """Latitude (*B, H, W), up (*B, H, W, 2) and valid (*B, H, W); see `Camera.perspective_field`."""
     owner = f"{type(camera).__name__}.perspective_field"
     down = as_vectors(gravity, "gravity", owner)
-    if fails((down != 0).any(-1)):
+    if known_false((down != 0).any(-1)):
         raise ValueError(f"{owner}: gravity must have a direction, as (0, 1, 0); got {down.tolist()}")
     down = down.to(camera.intrinsics.device)
     _broadcast(camera.batch_shape, down.shape[:-1], "gravity", owner)

@@ -11,6 +11,8 @@ from torch import Tensor, nn
 from torch.nn.functional import normalize
 
 from camtorch.cameras.camera import Camera
+from camtorch.evaluate.kept import Memo
+from camtorch.evaluate.known import known_false
 from camtorch.models import Cylindrical, Equirectangular, LatLon, Pinhole, TransverseCylindrical
 from camtorch.native.sampler import Later, finish
 from camtorch.poses.extrinsics import Extrinsics
@@ -23,11 +25,10 @@ from camtorch.values.arguments import (
     as_number,
     as_points,
     as_values,
-    fails,
     hinting,
     shown,
 )
-from camtorch.values.module import GeometryModule, Memo, typed_as
+from camtorch.values.module import GeometryModule, typed_as
 from camtorch.warp import routes
 from camtorch.warp.dewarp import middle_lines
 from camtorch.warp.proxy import check_pose
@@ -333,7 +334,7 @@ def _frame(extrinsics: Extrinsics, vertical: bool, align: Align) -> tuple[Tensor
     """
     vector, translation = extrinsics.rotation.double(), extrinsics.translation.double()
     length = torch.linalg.vector_norm(translation, dim=-1)
-    if fails(length > 0):
+    if known_false(length > 0):
         raise ValueError(f"rectify: the cameras stand at one place; extrinsics.translation is {translation.tolist()}")
     axis, rotation = int(vertical), rotation_matrix(vector)
     to_middle = rotation_matrix(vector / 2) if align == "opencv" else torch.eye(3).to(rotation)
@@ -348,7 +349,7 @@ def _frame(extrinsics: Extrinsics, vertical: bool, align: Align) -> tuple[Tensor
         return turn @ to_middle, turn @ to_middle.mT, sign * length
     view = rotation[..., 2, :] + _unit(2, rotation)
     ahead = view - (view * along).sum(-1, keepdim=True) * along
-    if fails(torch.linalg.vector_norm(ahead, dim=-1) > _PARALLEL):
+    if known_false(torch.linalg.vector_norm(ahead, dim=-1) > _PARALLEL):
         raise ValueError(
             "rectify: the cameras look along their baseline, or away from each other: no direction lies before both"
         )

@@ -16,7 +16,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from camtorch.evaluate.regime import in_graph, is_concrete, is_eager, keeps_graph, may_look
+from camtorch.evaluate.known import is_kept, is_predicted, known_false, row_of
+from camtorch.evaluate.regime import is_concrete, may_look
 
 Numbers: TypeAlias = Tensor | np.ndarray[Any, Any] | np.number[Any] | float | list[Any] | tuple[Any, ...]
 """What users pass as numbers: a tensor, an array, a number, or lists of them."""
@@ -105,44 +106,6 @@ def as_real(value: Numbers, name: str, owner: str, device: torch.device | None =
     return value
 
 
-def fails(condition: Tensor) -> bool:
-    """Whether a condition is known not to hold everywhere: what is traced is not checked."""
-    return is_concrete(condition) and not bool(condition.all())
-
-
-def holds(condition: Tensor) -> bool:
-    """Whether a condition is known to hold everywhere: False where that would take more than a quick look."""
-    return may_look(condition) and bool(condition.all())
-
-
-def values_of(tensor: Tensor) -> Tensor | None:
-    """The values in float64 in the CPU's memory; None where they may not be looked at."""
-    return tensor.detach().to("cpu", torch.float64) if is_concrete(tensor) else None
-
-
-def are_numbers(*tensors: Tensor) -> bool:
-    """Whether nothing records what is computed of tensors, which lie in the CPU's memory and may be looked at."""
-    return is_eager(*tensors) and not keeps_graph(*tensors) and all(type(t) in _PLAIN for t in tensors)
-
-
-_PLAIN = Tensor, nn.Parameter
-
-
-def is_kept(value: Tensor) -> bool:
-    """Whether a module keeps the tensor itself: a Parameter, or a tensor of a graph. Of other values it has a copy."""
-    return isinstance(value, nn.Parameter) or in_graph(value)
-
-
-def as_own(value: Tensor) -> Tensor:
-    """A tensor that `is_kept` as it is, of other values a copy."""
-    return value if is_kept(value) else value.detach().clone()
-
-
-def row_of(value: Tensor) -> list[float] | None:
-    """The numbers of a single short row (n,) that may be looked at: less time than one operator of torch takes."""
-    return value.tolist() if value.ndim == 1 and value.shape[0] <= 64 and is_concrete(value) else None
-
-
 def _check_list(value: object, name: str, owner: str) -> None:
     if isinstance(value, (list, tuple)) and any(isinstance(v, Tensor) and v.requires_grad for v in value):
         raise TypeError(f"{owner}: {name} is a list of tensors that require grad; torch.stack them")
@@ -166,11 +129,6 @@ def _as_plain(value: Numbers) -> Numbers:
         odd = not value.dtype.isnative or not value.flags.writeable or any(step < 0 for step in value.strides)
         return value.astype(value.dtype.newbyteorder("="), order="C", copy=True) if odd else value
     return value
-
-
-def is_predicted(value: Tensor) -> bool:
-    """Whether a network may have made these rows of a batch, of which some may be bad: a graph, or nothing records."""
-    return value.ndim > 1 and not isinstance(value, nn.Parameter) and (in_graph(value) or not torch.is_grad_enabled())
 
 
 def as_vectors(value: Numbers, name: str, owner: str, device: torch.device | None = None) -> Tensor:
@@ -350,7 +308,7 @@ def check_radians(vectors: Tensor, name: str, owner: str) -> None:
 
 def check_angles(angles: Tensor, owner: str) -> None:
     """Raise a ValueError for plain angles of more than a turn, which are degrees."""
-    if not is_predicted(angles) and fails(~(angles.abs() > 2 * math.pi * (1 + 1e-6))):
+    if not is_predicted(angles) and known_false(~(angles.abs() > 2 * math.pi * (1 + 1e-6))):
         raise ValueError(
             f"{owner}: angles must be radians; {float(angles.abs().max()):.4g} seems to be degrees, which "
             "torch.deg2rad() or math.radians() converts"

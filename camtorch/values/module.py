@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from types import MappingProxyType
 from typing import Any, ClassVar, ParamSpec, TypeVar, cast
 
@@ -12,16 +11,9 @@ from torch import Tensor, nn
 from torch.nn.utils.parametrize import type_before_parametrizations
 from typing_extensions import Self
 
+from camtorch.evaluate.kept import Memo
 from camtorch.evaluate.regime import (
-    has_tangent,
     in_graph,
-    in_transform,
-    is_concrete,
-    is_eager,
-    is_exporting,
-    is_fake,
-    keeps_graph,
-    set_aside,
 )
 from camtorch.values.arguments import LEFT, shown
 
@@ -179,42 +171,6 @@ class GeometryModule(UnsharedState):
         }
         state["_own"] = {**self._parameters, **state["_buffers"]}
         return state
-
-
-def is_constant(module: nn.Module) -> bool:
-    """Whether a module is exported whose tensors are its own, not given, and do not learn: their values are known."""
-    if not is_exporting() or torch.compiler.is_dynamo_compiling():
-        return False
-    for part in module.modules():
-        own = part.__dict__.get("_own", {})
-        for name, tensor in (*part._parameters.items(), *part._buffers.items()):
-            known = own.get(name)
-            if tensor is None or tensor is known:
-                continue
-            if known is None or not is_fake(tensor) or is_fake(known) or keeps_graph(tensor):
-                return False
-            mode: Any = getattr(tensor, "fake_mode", None)
-            if mode.from_tensor(known, static_shapes=True) is not tensor:
-                return False
-    return True
-
-
-@contextmanager
-def with_values(module: nn.Module) -> Iterator[None]:
-    """Nothing is traced in here, and a module that `is_constant` has its own tensors, to make constants from."""
-    places: list[tuple[dict[str, Any], str, Tensor]] = []
-    for part in module.modules():
-        own = part.__dict__.get("_own", {})
-        places += [(tensors, name, own[name]) for tensors in (part._parameters, part._buffers) for name in tensors]
-    traced = [tensors[name] for tensors, name, _ in places]
-    with set_aside():
-        try:
-            for tensors, name, own in places:
-                tensors[name] = own
-            yield
-        finally:
-            for (tensors, name, _), tensor in zip(places, traced, strict=True):
-                tensors[name] = tensor
 
 
 class BatchedModule(GeometryModule):
@@ -384,55 +340,3 @@ def is_parameter(tensor: Tensor) -> bool:
     """Whether it is an `nn.Parameter`, which torch asks a metaclass."""
     kind = type(tensor)
     return kind is nn.Parameter or (kind is not Tensor and isinstance(tensor, nn.Parameter))
-
-
-class Memo:
-    """The last results of a computation, by the values of its inputs.
-
-    Values are compared, not versions: a change through `.data`, or by functional_call, leaves no other trace.
-    Nothing is kept while the values may not be looked at. Copies and pickles begin empty.
-    """
-
-    capacity: int = 1
-    result: Any = None  # the one that was asked for last, of whatever inputs
-    _kept: Sequence[tuple[tuple[Any, ...], list[Tensor], Any]] = ()  # the last one used is first
-
-    def __init__(self, capacity: int = 1) -> None:
-        if capacity != 1:
-            self.capacity = capacity
-
-    def __call__(self, inputs: Sequence[Tensor], options: tuple[Any, ...], compute: Callable[[], Any]) -> Any:
-        """`compute()` without a graph, or its kept result; it depends on the tensors `inputs` and on `options`."""
-        if not is_eager(*inputs) and not all(is_concrete(t) and not has_tangent(t) for t in inputs):
-            return compute()
-        known = self._kept
-        for i, entry in enumerate(known):
-            if options == entry[0] and all(map(same, inputs, entry[1])):
-                if i:  # a list of its own: another thread may be looking at this one
-                    self._kept = [entry, *known[:i], *known[i + 1 :]]
-                self.result = entry[2]
-                return entry[2]
-        if in_transform():  # what a transform makes dies with it
-            return compute()
-        # what inference mode makes could not be used in a graph later
-        with torch.inference_mode(False), torch.no_grad():
-            copies = [t.clone() for t in inputs]
-            result = compute()
-        self._kept, self.result = [(options, copies, result), *self._kept[: self.capacity - 1]], result
-        return result
-
-    def copies(
-        self, inputs: Sequence[Tensor], options: tuple[Any, ...], compute: Callable[[], tuple[Tensor, ...]]
-    ) -> tuple[Tensor, ...]:
-        """Tensors that belong to the caller: copies of those kept, or new ones where an input learns."""
-        if torch.is_grad_enabled() and any(map(in_graph, inputs)):
-            return compute()
-        return tuple(t.clone() for t in self(inputs, options, compute))
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {"capacity": self.capacity}
-
-
-def same(a: Tensor, b: Tensor) -> bool:
-    """Whether shape, dtype, device and all values agree."""
-    return a.dtype == b.dtype and a.device == b.device and torch.equal(a, b)  # of other shapes it says no

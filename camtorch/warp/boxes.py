@@ -9,7 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from camtorch.values.arguments import Numbers, as_coordinates, as_values, as_whole, check_boxes, holds, is_predicted
+from camtorch.evaluate.known import is_predicted, known_true
+from camtorch.values.arguments import Numbers, as_coordinates, as_values, as_whole, check_boxes
 from camtorch.warp.panorama import PANORAMAS
 
 if TYPE_CHECKING:
@@ -47,7 +48,7 @@ def enclosed(warp: Warp, corners: Tensor) -> tuple[Tensor, Tensor]:
     some, valid = mapped.any(-1), (mapped & warp.target.contains(moved)).any(-1)
     # a polygon about a direction that the target does not map is turned inside out
     plain = valid & mapped.all(-1) & (_area(corners) * _area(moved) > 0)
-    if isinstance(warp.target, PANORAMAS) or not holds(plain):
+    if isinstance(warp.target, PANORAMAS) or not known_true(plain):
         lattice, inside = _inside(warp, corners, moved)
         inside = inside & finite & (isinstance(warp.target, PANORAMAS) | ~plain.unsqueeze(-1))  # each row by itself
         some, valid = some | inside.any(-1), valid | inside.any(-1)

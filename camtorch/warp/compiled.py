@@ -12,9 +12,9 @@ from torch import Tensor
 
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.opaque import CameraNumbers, opaque
+from camtorch.evaluate.kept import Memo
 from camtorch.native.sampler import layout
 from camtorch.values.arguments import broadcast_shapes
-from camtorch.values.module import Memo
 from camtorch.warp.grid import Lattice, Sampling, locate, tabulate
 from camtorch.warp.sampling import MODES, PADDINGS, Sampler, one_of, render
 

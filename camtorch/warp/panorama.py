@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from camtorch.cameras.camera import Camera
+from camtorch.evaluate.known import values_of
 from camtorch.models import Cylindrical, Equirectangular, LatLon, TransverseCylindrical
-from camtorch.values.arguments import values_of
 from camtorch.values.module import remade
 
 _NEAR = 0.05  # pixels by which a whole turn may miss the edges: a focal length of two decimals does by 0.03

@@ -10,19 +10,10 @@ from torch import Tensor, nn
 from typing_extensions import Unpack
 
 from camtorch.cameras.camera import Camera
+from camtorch.evaluate.known import as_own, known_false, values_of
 from camtorch.models import Pinhole
 from camtorch.poses.extrinsics import Extrinsics
-from camtorch.values.arguments import (
-    Numbers,
-    as_batch,
-    as_coordinates,
-    as_number,
-    as_own,
-    as_real,
-    fails,
-    shown,
-    values_of,
-)
+from camtorch.values.arguments import Numbers, as_batch, as_coordinates, as_number, as_real, shown
 from camtorch.warp.proxy import ProxyWarp, beside
 from camtorch.warp.sampling import WarpOptions
 
@@ -177,7 +168,7 @@ class BirdsEye(PlaneWarp):
     def _check(self, owner: str) -> None:
         """Raise a ValueError where the camera is not above the ground."""
         place = self.extrinsics.position.detach()
-        if fails(place[..., 2] > 0):
+        if known_false(place[..., 2] > 0):
             raise ValueError(
                 f"{owner}: the camera stands at {place.tolist()} on the ground, whose z points up; it has to be above. "
                 "Are the extrinsics camera from ground?"

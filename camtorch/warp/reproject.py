@@ -9,11 +9,13 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d, pad
 
 from camtorch.cameras.camera import Camera
+from camtorch.evaluate.kept import Memo
+from camtorch.evaluate.known import known_true
 from camtorch.poses.extrinsics import Extrinsics
 from camtorch.poses.rotations import rotation_matrix
 from camtorch.rays.depth import as_depth, depth_scale
-from camtorch.values.arguments import Numbers, as_number, check_devices, holds
-from camtorch.values.module import GeometryModule, Memo, typed_as
+from camtorch.values.arguments import Numbers, as_number, check_devices
+from camtorch.values.module import GeometryModule, typed_as
 from camtorch.warp.grid import Sampling, is_plain, to_positions
 from camtorch.warp.panorama import off_poles, seam_of
 from camtorch.warp.proxy import beside, check_pose, turned
@@ -125,7 +127,7 @@ class Reproject(GeometryModule):
             valid = valid & self._shows(seen, far, source_depth, kind, as_number(tolerance, "tolerance", owner), owner)
         rows, steps = seen.shape[0], seen.shape[1]
         # an image that stays where it is, or is shifted by whole pixels, is copied to the bit
-        plain = steps == 1 and is_plain(seen) and holds((seen == seen.round()).all(-1) | ~valid)
+        plain = steps == 1 and is_plain(seen) and known_true((seen == seen.round()).all(-1) | ~valid)
         mode: Mode = "nearest" if plain else self.mode
         if (seam := seam_of(self.source)) is not None:  # the image goes on beyond its edges
             images, seen = seam.around(images), seen + seen.new_tensor(seam.rims[::2])

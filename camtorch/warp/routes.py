@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Literal
 import torch
 from torch import Tensor
 
+from camtorch.evaluate.export import is_constant, with_values
+from camtorch.evaluate.kept import Memo
 from camtorch.evaluate.regime import (
     in_graph,
     in_jit_trace,
@@ -20,7 +22,6 @@ from camtorch.evaluate.regime import (
     set_aside,
 )
 from camtorch.native.sampler import Later, empty
-from camtorch.values.module import Memo, is_constant, with_values
 from camtorch.warp import compiled
 from camtorch.warp.grid import Lattice, Sampling, scaled
 from camtorch.warp.sampling import PADDINGS, PaddingMode, Pyramid, Sampler, laid_as, render

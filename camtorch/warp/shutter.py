@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from typing_extensions import Unpack
 
 from camtorch.cameras.camera import Camera
+from camtorch.evaluate.known import as_own, known_false, values_of
 from camtorch.optics.special import cosc_root, sinc_root
 from camtorch.poses.rotations import as_rotation
 from camtorch.values.arguments import (
@@ -18,15 +19,12 @@ from camtorch.values.arguments import (
     as_batch,
     as_coordinates,
     as_known_size,
-    as_own,
     as_points,
     as_real,
     as_vectors,
     broadcast_shapes,
     check_devices,
-    fails,
     shown,
-    values_of,
 )
 from camtorch.values.module import GeometryModule
 from camtorch.warp.affine import MirrorWarp
@@ -81,11 +79,11 @@ class RollingShutter(GeometryModule):
             raise ValueError(f"{owner}: direction must be one of {DIRECTIONS}; got {shown(direction)}")
         if readout.ndim > 1:
             raise ValueError(f"{owner}: readout must be a number or (B,); got shape {tuple(readout.shape)}")
-        if fails(readout.detach().abs() < _LONGEST):
+        if known_false(readout.detach().abs() < _LONGEST):
             raise ValueError(
                 f"{owner}: readout is in seconds; got {readout.tolist()}, which would be milliseconds: readout / 1000"
             )
-        if fails(rates.detach().abs() < _FASTEST):
+        if known_false(rates.detach().abs() < _FASTEST):
             raise ValueError(
                 f"{owner}: rates are in radians per second; got {rates.tolist()}, which would be degrees: numpy.deg2rad"
             )
@@ -168,7 +166,7 @@ def _lead(value: Tensor, ndim: int, inner: int = 0) -> Tensor:
 
 def _check_exposure(exposure: Tensor | None) -> None:
     """Raise if a state of 0.3 has an exposure."""
-    if exposure is not None and fails(exposure == 0):
+    if exposure is not None and known_false(exposure == 0):
         raise ValueError(f"RollingShutter: the state has an exposure, and no shutter has one any more. {LEFT}")
 
 

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from typing_extensions import Self
 
 from camtorch.cameras.camera import Camera
+from camtorch.evaluate.kept import Memo
 from camtorch.poses.rotations import as_rotation, turn
 from camtorch.values.arguments import (
     LEFT,
@@ -22,7 +23,7 @@ from camtorch.values.arguments import (
     check_devices,
     no_camera,
 )
-from camtorch.values.module import GeometryModule, Memo, typed_as
+from camtorch.values.module import GeometryModule, typed_as
 from camtorch.warp import routes
 from camtorch.warp.boxes import enclosed, moved_boxes
 from camtorch.warp.grid import OUTSIDE, Lattice, Sampling, locate

@@ -1,0 +1,63 @@
+"""What is kept of a computation while the values that it was made of stay."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from camtorch.evaluate.regime import has_tangent, in_graph, in_transform, is_concrete, is_eager
+
+
+class Memo:
+    """The last results of a computation, by the values of its inputs.
+
+    Values are compared, not versions: a change through `.data`, or by functional_call, leaves no other trace.
+    Nothing is kept while the values may not be looked at. Copies and pickles begin empty.
+    """
+
+    capacity: int = 1
+    result: Any = None  # the one that was asked for last, of whatever inputs
+    _kept: Sequence[tuple[tuple[Any, ...], list[Tensor], Any]] = ()  # the last one used is first
+
+    def __init__(self, capacity: int = 1) -> None:
+        if capacity != 1:
+            self.capacity = capacity
+
+    def __call__(self, inputs: Sequence[Tensor], options: tuple[Any, ...], compute: Callable[[], Any]) -> Any:
+        """`compute()` without a graph, or its kept result; it depends on the tensors `inputs` and on `options`."""
+        if not is_eager(*inputs) and not all(is_concrete(t) and not has_tangent(t) for t in inputs):
+            return compute()
+        known = self._kept
+        for i, entry in enumerate(known):
+            if options == entry[0] and all(map(same, inputs, entry[1])):
+                if i:  # a list of its own: another thread may be looking at this one
+                    self._kept = [entry, *known[:i], *known[i + 1 :]]
+                self.result = entry[2]
+                return entry[2]
+        if in_transform():  # what a transform makes dies with it
+            return compute()
+        # what inference mode makes could not be used in a graph later
+        with torch.inference_mode(False), torch.no_grad():
+            copies = [t.clone() for t in inputs]
+            result = compute()
+        self._kept, self.result = [(options, copies, result), *self._kept[: self.capacity - 1]], result
+        return result
+
+    def copies(
+        self, inputs: Sequence[Tensor], options: tuple[Any, ...], compute: Callable[[], tuple[Tensor, ...]]
+    ) -> tuple[Tensor, ...]:
+        """Tensors that belong to the caller: copies of those kept, or new ones where an input learns."""
+        if torch.is_grad_enabled() and any(map(in_graph, inputs)):
+            return compute()
+        return tuple(t.clone() for t in self(inputs, options, compute))
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {"capacity": self.capacity}
+
+
+def same(a: Tensor, b: Tensor) -> bool:
+    """Whether shape, dtype, device and all values agree."""
+    return a.dtype == b.dtype and a.device == b.device and torch.equal(a, b)  # of other shapes it says no

@@ -1,0 +1,51 @@
+"""What is known of tensors when a call begins: their values, if they may be looked at, and whether they learn."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from camtorch.evaluate.regime import in_graph, is_concrete, is_eager, keeps_graph, may_look
+
+
+def known_false(condition: Tensor) -> bool:
+    """Return whether a condition is known to fail somewhere: what is traced is not checked."""
+    return is_concrete(condition) and not bool(condition.all())
+
+
+def known_true(condition: Tensor) -> bool:
+    """Return whether a condition is known to hold everywhere: False if that would take more than a quick look."""
+    return may_look(condition) and bool(condition.all())
+
+
+def values_of(tensor: Tensor) -> Tensor | None:
+    """The values in float64 in the CPU's memory; None where they may not be looked at."""
+    return tensor.detach().to("cpu", torch.float64) if is_concrete(tensor) else None
+
+
+def are_numbers(*tensors: Tensor) -> bool:
+    """Whether nothing records what is computed of tensors, which lie in the CPU's memory and may be looked at."""
+    return is_eager(*tensors) and not keeps_graph(*tensors) and all(type(t) in _PLAIN for t in tensors)
+
+
+_PLAIN = Tensor, nn.Parameter
+
+
+def is_kept(value: Tensor) -> bool:
+    """Whether a module keeps the tensor itself: a Parameter, or a tensor of a graph. Of other values it has a copy."""
+    return isinstance(value, nn.Parameter) or in_graph(value)
+
+
+def as_own(value: Tensor) -> Tensor:
+    """A tensor that `is_kept` as it is, of other values a copy."""
+    return value if is_kept(value) else value.detach().clone()
+
+
+def row_of(value: Tensor) -> list[float] | None:
+    """The numbers of a single short row (n,) that may be looked at: less time than one operator of torch takes."""
+    return value.tolist() if value.ndim == 1 and value.shape[0] <= 64 and is_concrete(value) else None
+
+
+def is_predicted(value: Tensor) -> bool:
+    """Whether a network may have made these rows of a batch, of which some may be bad: a graph, or nothing records."""
+    return value.ndim > 1 and not isinstance(value, nn.Parameter) and (in_graph(value) or not torch.is_grad_enabled())
