@@ -69,7 +69,7 @@ def imported(module: str, needs: str, extra: str, has: str = "__name__") -> Any:
 
 
 # torch stands between a module's caller and its forward
-_INSIDE = tuple(os.path.dirname(file) + os.sep for file in (__file__, torch.__file__))
+_INSIDE = tuple(os.path.dirname(file) + os.sep for file in (os.path.dirname(__file__), torch.__file__))
 
 
 def as_real(value: Numbers, name: str, owner: str, device: torch.device | None = None) -> Tensor:
