@@ -11,9 +11,10 @@ import torch
 from torch import Tensor
 
 from camtorch.calibration.bundle import Adjusted, Bundle, Free, Poses, Sight, State
-from camtorch.calibration.calibrate import STEPS, Calibration, Search, as_model, as_options, middle_of, results
+from camtorch.calibration.calibrate import STEPS, Search, as_model, as_options, middle_of, results
 from camtorch.calibration.observations import Points, as_rig_observations
 from camtorch.calibration.uncertainty import shared_factor
+from camtorch.calibration.verdict import Calibration
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.rig import Rig
 from camtorch.poses.extrinsics import Extrinsics

@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from camtorch.calibration.calibrate import Calibration, calibrate
+from camtorch.calibration.calibrate import calibrate
 from camtorch.calibration.observations import Points, as_observations
+from camtorch.calibration.verdict import Calibration
 from camtorch.cameras.camera import MODELS, Camera
 from camtorch.cameras.freezing import INTRINSICS
 

@@ -1,23 +1,23 @@
-"""What a calibration is good for, and what its data do not carry: in words, each with what to do."""
+"""What a calibration found, what it is good for and what its data do not carry: in words, each with what to do."""
 
 from __future__ import annotations
 
 import itertools
 import math
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING, NamedTuple
+from typing import Any, NamedTuple
 
 import torch
+from torch import Tensor
 
 from camtorch.calibration.bundle import Adjusted, Sight, pixel_jacobians
-from camtorch.calibration.observations import named
-from camtorch.calibration.uncertainty import Spread, worst
-from camtorch.cameras.camera import fixed_camera
+from camtorch.calibration.observations import Observations, named
+from camtorch.calibration.uncertainty import Spread, uncertainty, worst
+from camtorch.cameras.camera import Camera, fixed_camera
+from camtorch.poses.extrinsics import Extrinsics
 from camtorch.rays.lattices import angles_from_axis, image_edges, image_lattice
-
-if TYPE_CHECKING:
-    from camtorch.calibration.calibrate import Calibration
 
 _FINE, _ROUGH = 0.5, 3.0  # px, standard deviations of projections to measure by, and to look at images
 _CELLS, _PATTERN = 32, 8  # along the longer side: of the map of uncertainty, and of that of residuals
@@ -38,6 +38,115 @@ _MOST_OF_A_VIEW = 0.8  # of its corners
 
 _TILTED = "Tilt the board by 30 to 45 degrees to all sides"
 _NOISE = "one standard deviation in the worst direction"
+
+
+@dataclass(repr=False)
+class Calibration:
+    """What `calibrate` found, and how far it can be trusted.
+
+    Units are pixels, and for poses those of the object points. The pose of a view is `extrinsics[i]`; views without a
+    corner have none, nor have those that are equal to others, see `views`.
+    """
+
+    camera: Camera
+    """The camera: float64, an ordinary module that goes on learning."""
+    extrinsics: Extrinsics
+    """Camera from board, of batch dims (V,)."""
+    rms: float
+    """The root of the mean squared length of the residuals, per point, as OpenCV's."""
+    sigma: float
+    """The standard deviation of a coordinate of a pixel: sqrt(sum of squares / (2 N - parameters)). With a robust loss
+    that of the inliers."""
+    residuals: Any
+    """Projected minus observed, in the shape or the list form of the image points; NaN where nothing was seen, in
+    views left out, and where a camera that did not converge has no pixel for what was seen."""
+    inliers: Any
+    """Bool, in the same form: the residual is shorter than max(3 loss_scale, 3 sigma of the inliers)."""
+    parameter_names: tuple[str, ...]
+    """fx, fy, cx, cy and the names of the coefficients."""
+    spread: Spread = field(repr=False)
+    """What the noise of the corners does to the parameters and the poses."""
+    converged: bool
+    """Whether nothing was left to gain when the search ended, and every corner that was seen has a pixel."""
+    bend: tuple[float, float]
+    """How far the middle of the board lies off the plane of its edges, along x and y; zeros unless it was asked for."""
+    image_size: tuple[int, int]
+    views: tuple[int, ...]
+    """The numbers of the views that have poses, of those that were passed."""
+    copies: tuple[int, ...]
+    """The numbers of the views that show another one again: equal ones are left out, nearly equal ones widen the
+    uncertainties until they count as one."""
+    observations: Observations = field(repr=False)
+    adjusted: Adjusted = field(repr=False)
+    point_inliers: Tensor = field(repr=False)
+    """(V, N) bool, the inliers of `observations`."""
+    loss: str | None = None
+    """The robust loss, if there was one."""
+    index: int = field(default=0, repr=False)
+    """Which of the cameras that were adjusted together it is."""
+    twins: tuple[tuple[float, ...], ...] = field(default=(), repr=False)
+    """The parameters of other optima that fit as well, to within the noise: of such a camera projections are known
+    where corners were seen, and its parameters are not. Double spheres have them."""
+
+    @property
+    def covariance(self) -> Tensor:
+        """(P, P) of the parameters, in their order; 0 for those that were fixed.
+
+        With a robust loss that of the weighted problem at its optimum, by the noise that the loss leaves: intervals
+        hold where outliers fall on all corners alike, and are somewhat too narrow where they gather in some views.
+        """
+        return self.spread.covariance[0]
+
+    @property
+    def std(self) -> Tensor:
+        """(P,) the standard deviations of the parameters; 0 for those that were fixed."""
+        return self.spread.std[0]
+
+    @property
+    def point_residuals(self) -> Tensor:
+        """(V, N, 2) the residuals of `observations`."""
+        return self.adjusted.residuals[self.index][0]
+
+    @property
+    def lost(self) -> int:
+        """How many corners were seen that have no pixel in the camera, because it ends before them."""
+        return int((self.observations.seen & ~self.adjusted.valid[self.index][0]).sum())
+
+    def uncertainty(self, pixels: Any, distance: float = math.inf) -> Tensor:
+        """How far the camera may be wrong about pixels, were it calibrated again from other images of such quality.
+
+        The standard deviation in the worst direction of where a point is seen, with the poses of the boards in their
+        own uncertainty: mrcal's mean-pcam.
+
+        Args:
+            pixels: (..., 2).
+            distance: from the camera, in units of the object points.
+
+        Returns:
+            (...,) px; NaN where a pixel has no ray.
+        """
+        return uncertainty(self.spread, pixels, distance)
+
+    @cached_property
+    def warnings(self) -> list[str]:
+        """What the data do not carry, and what does not fit, in words: each with what to do."""
+        return warnings(self)
+
+    @property
+    def verdict(self) -> str:
+        """In words: what it is good for, up to which angle, and what to photograph next."""
+        return verdict(self)
+
+    def __repr__(self) -> str:
+        values = [*self.camera.intrinsics.tolist(), *self.camera.distortion.tolist()]
+        pairs = zip(self.parameter_names, values, self.std.tolist(), strict=True)
+        numbers = [f"  {name} = {value:.7g}" + (f" +- {std:.2g}" if std else ", held") for name, value, std in pairs]
+        count, seen = len(self.views), int(self.observations.seen.sum())
+        head = (
+            f"Calibration({type(self.camera).__name__}: rms {self.rms:.4g} px, sigma {self.sigma:.4g} px, "
+            f"{count} view{'s' * (count != 1)}, {seen} corners{'' if self.converged else ', NOT CONVERGED'})"
+        )
+        return "\n".join((head, *numbers, *(f"  ! {text}" for text in self.warnings), f"  {self.verdict}"))
 
 
 class Zone(NamedTuple):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, TypeVar, cast
+from typing import Any, TypeVar, cast
 
 import numpy as np
 import torch
@@ -13,14 +13,11 @@ from camtorch.cameras.numbers import joined, split
 from camtorch.evaluate.known import are_numbers, known_false
 from camtorch.evaluate.regime import is_concrete
 from camtorch.optics.radial_inverse import precise
+from camtorch.projection.camera_like import CameraLike
 from camtorch.values.arguments import as_image_size
 from camtorch.values.module import learning_as, remade
 
-if TYPE_CHECKING:
-    from camtorch.cameras.camera import Camera
-    from camtorch.cameras.mixed import Mixed
-
-CameraT = TypeVar("CameraT", bound="Camera")
+CameraT = TypeVar("CameraT", bound=CameraLike)
 
 
 def quarter_turns(image_size: tuple[int, int]) -> tuple[tuple[tuple[int, int, int], tuple[int, int, int]], ...]:
@@ -34,7 +31,7 @@ def quarter_turns(image_size: tuple[int, int]) -> tuple[tuple[tuple[int, int, in
     )
 
 
-def check_crop(camera: Camera, corner: tuple[int, int], size: tuple[int, int]) -> None:
+def check_crop(camera: CameraLike, corner: tuple[int, int], size: tuple[int, int]) -> None:
     """Raise a ValueError if a part, its corner (top, left) and its size, holds no pixel of the camera's image."""
     known = camera.image_size
     if known is None:
@@ -50,7 +47,7 @@ def edited_by(camera: CameraT, matrix: Sequence[Sequence[float]], size: Sequence
     """Return the camera of an image whose pixels all move by one map (2, 3); it learns where the camera does."""
     new_size = as_image_size(size, type(camera).__name__)
     if camera.is_mixed:
-        return cast("Mixed", camera).by_groups(lambda group: edited_by(group, matrix, size))  # type: ignore[return-value]
+        return cast("CameraT", cast("Any", camera).by_groups(lambda group: edited_by(group, matrix, size)))
     return learning_as(edited(camera, matrix, new_size), camera)
 
 
@@ -61,7 +58,7 @@ def edited(camera: CameraT, matrix: Tensor | Sequence[Sequence[float]], image_si
     scales, and a shift. Raises a ValueError if the model has no quarter turn.
     """
     if camera.is_mixed:
-        return cast("Mixed", camera).by_groups(lambda group: edited(group, matrix, image_size))  # type: ignore[return-value]
+        return cast("CameraT", cast("Any", camera).by_groups(lambda group: edited(group, matrix, image_size)))
     own, given = camera.intrinsics, [matrix] if isinstance(matrix, Tensor) else []
     xp: Any = np if are_numbers(own, camera.distortion, *given) else torch
     rows: Any = matrix
@@ -80,7 +77,7 @@ def edited(camera: CameraT, matrix: Tensor | Sequence[Sequence[float]], image_si
     return remade(camera, intrinsics=joined((*focal, *centre), own, xp), distortion=distortion, image_size=image_size)
 
 
-def _edited_distortion(camera: Camera, across: Any, down: Any, on_side: Any) -> Tensor:
+def _edited_distortion(camera: CameraLike, across: Any, down: Any, on_side: Any) -> Tensor:
     """Coefficients after a quarter turn clockwise where it is on its side, (*B,) bool, and flips by signs (*B,)."""
     k, names = camera.distortion, camera.distortion_names
     if on_side is not None:
@@ -96,7 +93,7 @@ def _edited_distortion(camera: Camera, across: Any, down: Any, on_side: Any) -> 
     return k.clone() if k is camera.distortion else k
 
 
-def _on_side(camera: Camera) -> Tensor:
+def _on_side(camera: CameraLike) -> Tensor:
     """(*B, n): the coefficients when the image is turned clockwise by a quarter."""
     names, turned, owner = camera.distortion_names, camera.quarter_turn, type(camera).__name__
     if turned is None or not {*camera.odd_in_x, *camera.odd_in_y} <= turned.keys():

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 import torch
 from torch import Tensor
 from typing_extensions import Self
 
 from camtorch.evaluate.regime import in_transform, is_concrete, is_recorded
-from camtorch.values.module import BatchedModule, is_parameter
-
-if TYPE_CHECKING:
-    from camtorch.cameras.camera import Camera
+from camtorch.projection.camera_like import CameraLike
+from camtorch.values.module import is_parameter
 
 INTRINSICS = "fx", "fy", "cx", "cy"
 PREFIX = "_frozen_"
@@ -54,7 +52,7 @@ def _hooks_of(tensor: Tensor) -> list[int]:
     return [key for key, hook in (tensor._backward_hooks or {}).items() if isinstance(hook, _Masked)]
 
 
-def frozen_names(camera: Camera) -> tuple[str, ...]:
+def frozen_names(camera: CameraLike) -> tuple[str, ...]:
     """Of all frozen parameters."""
     found = []
     for tensor, names in _tensors_of(camera):
@@ -65,7 +63,7 @@ def frozen_names(camera: Camera) -> tuple[str, ...]:
     return tuple(found)
 
 
-def _freeze(camera: Camera, names: Sequence[str], frozen: bool) -> None:
+def _freeze(camera: CameraLike, names: Sequence[str], frozen: bool) -> None:
     """Freeze, or let learn again, the parameters of these names; all of them for none."""
     owner = f"{type(camera).__name__}.{'freeze' if frozen else 'unfreeze'}"
     if camera.is_mixed:
@@ -95,12 +93,12 @@ def _freeze(camera: Camera, names: Sequence[str], frozen: bool) -> None:
             camera.put(PREFIX + tensor, now)
 
 
-def _tensors_of(camera: Camera) -> tuple[tuple[str, tuple[str, ...]], ...]:
+def _tensors_of(camera: CameraLike) -> tuple[tuple[str, tuple[str, ...]], ...]:
     """What holds them, and the names of its columns; a Mixed has none of its own."""
     return () if camera.is_mixed else (("intrinsics", INTRINSICS), ("distortion", tuple(camera.distortion_names)))
 
 
-class Freezable(BatchedModule):
+class Freezable(CameraLike):
     """What a camera is beside its optics: a module whose parameters can be frozen by name."""
 
     def freeze(self, *names: str) -> Self:
@@ -113,18 +111,18 @@ class Freezable(BatchedModule):
         Args:
             names: "fx", "fy", "cx", "cy", and of `distortion_names`; all parameters if there are none.
         """
-        _freeze(cast("Camera", self), names, True)
+        _freeze(cast(CameraLike, self), names, True)
         return self
 
     def unfreeze(self, *names: str) -> Self:
         """Let parameters that were frozen learn again, from the values that they have; all of them for no name."""
-        _freeze(cast("Camera", self), names, False)
+        _freeze(cast(CameraLike, self), names, False)
         return self
 
     def _save_to_state_dict(self, destination: Any, prefix: str, keep_vars: bool) -> None:
         super()._save_to_state_dict(destination, prefix, keep_vars)
         # it shares the memory of the Parameters, which are as they were frozen once they were looked at
-        camera = cast("Camera", self)
+        camera = cast(CameraLike, self)
         for tensor, _ in _tensors_of(camera):
             getattr(camera, tensor)
         if (names := frozen_names(camera)) and hasattr(destination, "_metadata"):
@@ -133,7 +131,7 @@ class Freezable(BatchedModule):
     def _load_from_state_dict(self, *arguments: Any) -> None:
         super()._load_from_state_dict(*arguments)
         # what is frozen has the values of the state, and what the state says is frozen too
-        camera = cast("Camera", self)
+        camera = cast(CameraLike, self)
         names = {*frozen_names(camera), *arguments[2].get("frozen", ())}
         for tensor, _ in _tensors_of(camera):
             camera._buffers.pop(PREFIX + tensor, None)

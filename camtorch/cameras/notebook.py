@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import html
 import math
-from typing import TYPE_CHECKING
 
 import torch
 
-if TYPE_CHECKING:
-    from camtorch.cameras.camera import Camera
+from camtorch.projection.camera_like import CameraLike
 
 _WIDTH = 260  # px of the image
 _CELLS = 48  # of the lattice on which pixels without rays are looked for, along the wider side
@@ -18,7 +16,7 @@ _FEW = 7  # circles are enough
 
 
 @torch.no_grad()
-def as_html(camera: Camera) -> str:
+def as_html(camera: CameraLike) -> str:
     """The text of `repr`; of a single camera with image_size also circles of equal angle, grey where it is blind."""
     text = f'<pre style="margin: 0">{html.escape(repr(camera))}</pre>'
     if camera.is_mixed or camera.batch_shape or camera.image_size is None:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, TypeVar
+from collections.abc import Callable, Sequence
+from typing import Any, TypeVar, cast
 
 import numpy as np
 import torch
@@ -15,6 +15,7 @@ from camtorch.cameras.freezing import INTRINSICS, frozen_names
 from camtorch.evaluate.known import is_kept, is_predicted, known_false, row_of, values_of
 from camtorch.evaluate.regime import is_eager
 from camtorch.optics.radial_inverse import precise
+from camtorch.projection.camera_like import CameraLike
 from camtorch.rays.lattices import AXES, focal_for
 from camtorch.values.arguments import (
     Numbers,
@@ -29,10 +30,7 @@ from camtorch.values.arguments import (
 )
 from camtorch.values.module import remade
 
-if TYPE_CHECKING:
-    from camtorch.cameras.camera import Camera
-
-CameraT = TypeVar("CameraT", bound="Camera")
+CameraT = TypeVar("CameraT", bound=CameraLike)
 _Checked = tuple[Tensor, Tensor, tuple[str, ...], torch.Size, tuple[int, int] | None]
 
 _OF_CALIBRATE_CAMERA = 5, 8, 12, 14  # OpenCV's numbers of coefficients; 4 may be of its fisheye, too
@@ -46,7 +44,7 @@ _CENTRED, _NEAR = 0.1, 0.05
 
 
 def checked_numbers(
-    model: type[Camera], intrinsics: Numbers, distortion: Numbers | None, image_size: Sequence[int] | None
+    model: type[CameraLike], intrinsics: Numbers, distortion: Numbers | None, image_size: Sequence[int] | None
 ) -> _Checked:
     """Intrinsics, distortion, its names, batch dims and image size of a camera of this model that is made of them."""
     owner = model.__name__
@@ -64,7 +62,7 @@ def checked_numbers(
     return intrinsics, distortion, model.names_of(distortion.shape[-1]) or (), batch, size
 
 
-def at_a_glance(model: type[Camera], intrinsics: Any, distortion: Any, size: Any) -> _Checked | None:
+def at_a_glance(model: type[CameraLike], intrinsics: Any, distortion: Any, size: Any) -> _Checked | None:
     """As `checked_numbers`, Parameters of a single camera, if all is right at a glance; None where that is not enough.
 
     It is of lists of numbers, and of plain tensors.
@@ -100,11 +98,11 @@ def at_a_glance(model: type[Camera], intrinsics: Any, distortion: Any, size: Any
 
 
 @functools.lru_cache(maxsize=256)
-def _names_of(model: type[Camera], count: int) -> tuple[str, ...] | None:
+def _names_of(model: type[CameraLike], count: int) -> tuple[str, ...] | None:
     return model.names_of(count)
 
 
-def described(camera: Camera) -> str:
+def described(camera: CameraLike) -> str:
     """Batch, size and, of a single camera, its numbers, for `repr`."""
     parts = [f"batch_shape={tuple(camera.batch_shape)}"] if camera.batch_shape else []
     numbers = None if camera.batch_shape else values_of(torch.cat(camera._tensors, -1))
@@ -119,7 +117,7 @@ def described(camera: Camera) -> str:
     return ", ".join(parts)
 
 
-def checked_intrinsics(model: type[Camera], intrinsics: Numbers) -> Tensor:
+def checked_intrinsics(model: type[CameraLike], intrinsics: Numbers) -> Tensor:
     """Return intrinsics (*B, 4) as a tensor, of a camera of this model; raise as `Camera` does."""
     owner = model.__name__
     intrinsics = as_real(intrinsics, "intrinsics", owner)
@@ -139,7 +137,7 @@ def checked_intrinsics(model: type[Camera], intrinsics: Numbers) -> Tensor:
     return intrinsics
 
 
-def checked_distortion(model: type[Camera], distortion: Numbers, intrinsics: Tensor) -> Tensor:
+def checked_distortion(model: type[CameraLike], distortion: Numbers, intrinsics: Tensor) -> Tensor:
     """Return distortion (*B, n) as a tensor, of a camera of this model and intrinsics; raise as `Camera` does."""
     owner = model.__name__
     distortion = as_real(distortion, "distortion", owner, intrinsics.device)
@@ -195,7 +193,7 @@ def replaced(
     return remade(camera, **changes)
 
 
-def as_numbers_of(camera: Camera, value: Numbers, name: str) -> Tensor:
+def as_numbers_of(camera: CameraLike, value: Numbers, name: str) -> Tensor:
     """What is no tensor takes the camera's dtype and device."""
     if isinstance(value, Tensor):
         return value
@@ -226,7 +224,7 @@ def joined(numbers: Sequence[Any], like: Tensor, xp: Any) -> Tensor:
     return torch.from_numpy(made)
 
 
-def _is_column(model: type[Camera], distortion: Tensor) -> bool:
+def _is_column(model: type[CameraLike], distortion: Tensor) -> bool:
     """Whether it may be one camera's coefficients as OpenCV's column (n, 1), n > 1."""
     count = max(distortion.shape[:-1], default=1) if distortion.shape[-1:] == (1,) else 1
     return count > 1 and model.names_of(count) is not None
@@ -241,7 +239,7 @@ def _column_hint(distortion: Tensor) -> str:
 
 
 def numbers_of_matrix(
-    model: type[Camera],
+    model: type[CameraLike],
     K: Numbers,  # noqa: N803
     distortion: Numbers | None,
     ignore_skew: bool,
@@ -303,13 +301,14 @@ def camera_of_fov(
     if (known := values_of(degrees)) is not None and known.numel():
         check_degrees(float(known.min()), known.tolist(), owner)
     given = () if distortion is None else (as_real(distortion, "distortion", owner, degrees.device),)
-    plane = model(degrees.new_tensor([1.0, 1.0, 0.0, 0.0]), *(t.detach().double() for t in given))
+    make = cast("Callable[..., CameraT]", model)
+    plane = make(degrees.new_tensor([1.0, 1.0, 0.0, 0.0]), *(t.detach().double() for t in given))
     degrees = degrees.expand(as_batch(owner, fov=(*degrees.shape, 1), distortion=plane.distortion.shape))
     focal, reached = focal_for(plane, degrees.deg2rad(), size, axis)
     centre = focal.new_tensor([(size[1] - 1) / 2, (size[0] - 1) / 2]).expand(*focal.shape, 2)
     intrinsics = torch.cat((focal[..., None], focal[..., None], centre), -1)
     intrinsics = intrinsics.to(given[0].dtype if given else torch.get_default_dtype())
-    made = model(intrinsics, *given, image_size=size)
+    made = make(intrinsics, *given, image_size=size)
     if known_false(reached):
         widest = made.fov[..., AXES.index(axis)].flatten().tolist()
         raise ValueError(

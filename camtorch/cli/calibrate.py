@@ -12,8 +12,9 @@ import numpy as np
 from camtorch.boards.boards import Board, as_board
 from camtorch.boards.finding import gather
 from camtorch.calibration import selection
-from camtorch.calibration.calibrate import Calibration, calibrate
+from camtorch.calibration.calibrate import calibrate
 from camtorch.calibration.rig import RigCalibration, calibrate_rig
+from camtorch.calibration.verdict import Calibration
 from camtorch.cameras.camera import MODELS, as_model
 from camtorch.cli import targets
 from camtorch.cli.searching import Views, find_views

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Generic, NamedTuple, TypeVar
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -15,13 +15,11 @@ from camtorch.convert import views
 from camtorch.convert.fitting import fit, refine_minimax
 from camtorch.convert.measuring import Reference, measure, reference
 from camtorch.convert.relations import carry_over, default_count
+from camtorch.projection.camera_like import CameraLike
 from camtorch.values.arguments import as_image_size, as_number, as_whole
 from camtorch.values.module import remade
 
-if TYPE_CHECKING:
-    from camtorch.cameras.camera import Camera
-
-CameraT = TypeVar("CameraT", bound="Camera", covariant=True)
+CameraT = TypeVar("CameraT", bound=CameraLike, covariant=True)
 
 _FIT_SIDE = 33  # of the lattice of pixels to fit to
 _ROWS = 64  # of a batch that are worked on at a time
@@ -66,9 +64,9 @@ class Conversion(Generic[CameraT]):
 
 @torch.no_grad()
 def convert(
-    source: Camera,
+    source: CameraLike,
     model: type[CameraT],
-    models: Mapping[str, type[Camera]],
+    models: Mapping[str, type[CameraLike]],
     *,
     count: int | None,
     image_size: Sequence[int] | None,
@@ -121,9 +119,9 @@ class _Task(NamedTuple):
     """Some rows to convert."""
 
     source: Reference
-    model: type[Camera]
-    models: Mapping[str, type[Camera]]
-    build: Callable[[Tensor], Camera]
+    model: type[CameraLike]
+    models: Mapping[str, type[CameraLike]]
+    build: Callable[[Tensor], CameraLike]
     image_size: tuple[int, int] | None
     limit: float
     tolerance: float

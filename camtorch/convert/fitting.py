@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -10,11 +10,9 @@ from torch import Tensor
 from camtorch.least_squares.equations import Equations, System, padded
 from camtorch.least_squares.jacobians import SensorPoints, sensor_jacobians, to_sensor
 from camtorch.least_squares.levenberg_marquardt import FIRST_DAMPING, LEAST_DAMPING, minimise, rounding_of
+from camtorch.projection.camera_like import CameraLike
 from camtorch.rays.lattices import slopes_at_axis
 from camtorch.values.arguments import columns
-
-if TYPE_CHECKING:
-    from camtorch.cameras.camera import Camera
 
 _MOST_STEPS = 60
 _ROUNDS = 3
@@ -39,7 +37,7 @@ class Observations(NamedTuple):
 
 
 def fit(
-    camera: Camera,
+    camera: CameraLike,
     observations: Observations,
     starts: Tensor,
     slopes: Tensor,
@@ -86,7 +84,7 @@ def fit(
 
 
 def _fit_linear(
-    camera: Camera, observations: Observations, slopes: Tensor, smooth: Tensor, fixed: Tensor | None
+    camera: CameraLike, observations: Observations, slopes: Tensor, smooth: Tensor, fixed: Tensor | None
 ) -> Tensor:
     """`fit` of a lens that is linear in its coefficients: at these focal lengths and pixels of the axis, at once."""
     parameters = torch.cat((slopes, slopes.new_tensor(camera.ideal(smooth.shape[-1])).expand(len(slopes), -1)), -1)
@@ -104,7 +102,7 @@ def _fit_linear(
     return parameters
 
 
-def refine_minimax(camera: Camera, observations: Observations, parameters: Tensor) -> Tensor:
+def refine_minimax(camera: CameraLike, observations: Observations, parameters: Tensor) -> Tensor:
     """Parameters (C, 4 + n) near those given at which the largest error is smaller; no row depends on another.
 
     Lawson's algorithm: weighted least squares over and over, the weight of a square multiplied by its error each time,
@@ -135,14 +133,14 @@ def refine_minimax(camera: Camera, observations: Observations, parameters: Tenso
     return best
 
 
-def _distances(observations: Observations, camera: Camera, parameters: Tensor) -> Tensor:
+def _distances(observations: Observations, camera: CameraLike, parameters: Tensor) -> Tensor:
     """(C, N) pixels."""
     residuals = _residuals(observations, parameters, to_sensor(camera, parameters[:, 4:], observations.rays))
     distances: Tensor = torch.linalg.vector_norm(residuals, dim=1)
     return distances
 
 
-def bounds(camera: Camera, parameters: Tensor) -> tuple[Tensor, Tensor]:
+def bounds(camera: CameraLike, parameters: Tensor) -> tuple[Tensor, Tensor]:
     """The least and the greatest parameters (C, 4 + n); a focal length stays within a factor of 1000."""
     low, high = torch.full_like(parameters, -torch.inf), torch.full_like(parameters, torch.inf)
     low[:, :2], high[:, :2] = parameters[:, :2] * 1e-3, parameters[:, :2] * 1e3
@@ -159,7 +157,7 @@ def _residuals(observations: Observations, parameters: Tensor, seen: SensorPoint
     return torch.stack((fx * seen.a + cx - u, fy * seen.b + cy - v), 1) * observations.weights[:, None]
 
 
-def _cost(camera: Camera, observations: Observations, parameters: Tensor) -> Tensor:
+def _cost(camera: CameraLike, observations: Observations, parameters: Tensor) -> Tensor:
     """(C,) the sum of squares; infinite where a ray that counts is not covered, or the coefficients make no camera."""
     seen = to_sensor(camera, parameters[:, 4:], observations.rays)
     lost = (~seen.covered & (observations.weights > 0)).any(-1)
@@ -173,7 +171,7 @@ def _cost(camera: Camera, observations: Observations, parameters: Tensor) -> Ten
 class _Fit:
     """The problem, for `levenberg_marquardt.minimise`: the state is the parameters (C, P)."""
 
-    def __init__(self, camera: Camera, observations: Observations, low: Tensor, high: Tensor):
+    def __init__(self, camera: CameraLike, observations: Observations, low: Tensor, high: Tensor):
         self.camera, self.observations, self.low, self.high = camera, observations, low, high
         self.rounding = rounding_of(observations.pixels, observations.weights.square())
         (self.free,) = (low < high).any(0).nonzero(as_tuple=True)
@@ -198,7 +196,7 @@ class _Fit:
         return (new.clamp(self.low[rows], self.high[rows]),)
 
 
-def _linearised(camera: Camera, observations: Observations, parameters: Tensor) -> tuple[Tensor, Tensor]:
+def _linearised(camera: CameraLike, observations: Observations, parameters: Tensor) -> tuple[Tensor, Tensor]:
     """The residuals (C, 2 N), and their derivatives (C, P, 2 N) by the parameters."""
     seen, _, by_k = sensor_jacobians(camera, parameters[:, 4:], observations.rays)
     fx, fy, _, _ = columns(parameters[:, :4])
@@ -211,7 +209,7 @@ def _linearised(camera: Camera, observations: Observations, parameters: Tensor) 
 
 
 def _refine(
-    camera: Camera,
+    camera: CameraLike,
     observations: Observations,
     parameters: Tensor,
     low: Tensor,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -12,10 +12,8 @@ from torch.nn.functional import max_pool2d
 
 from camtorch.convert import views
 from camtorch.least_squares.jacobians import to_sensor
+from camtorch.projection.camera_like import CameraLike
 from camtorch.rays.lattices import ray_fan
-
-if TYPE_CHECKING:
-    from camtorch.cameras.camera import Camera
 
 _SIDE = 193  # of the lattice of pixels to compare at
 _PEAKS, _ROUNDS, _RIM = 16, 4, 720  # that are climbed, in so many rounds; rays at the largest angle
@@ -25,7 +23,7 @@ _ROUNDING = 1e-9  # px
 class Reference(NamedTuple):
     """The rays of cameras (C,) that others are compared on: up to an angle, and all that the image has."""
 
-    camera: Camera
+    camera: CameraLike
     image_size: tuple[int, int] | None
     lattice: views.Lattice
     rays: views.SampledRays
@@ -36,13 +34,13 @@ class Reference(NamedTuple):
         """(C,) the largest angle from the axis, up to the limit; 0 where nothing is seen."""
         return torch.where(self.rays.valid, self.rays.angles, 0.0).amax(-1)
 
-    def of(self, camera: Camera, rows: Tensor) -> Reference:
+    def of(self, camera: CameraLike, rows: Tensor) -> Reference:
         """That of some rows, and their cameras."""
         parts = self.lattice.of(rows), self.rays.of(rows), self.all_rays.of(rows)
         return Reference(camera, self.image_size, *parts)
 
 
-def reference(camera: Camera, image_size: tuple[int, int] | None, limit: float) -> Reference:
+def reference(camera: CameraLike, image_size: tuple[int, int] | None, limit: float) -> Reference:
     """The rays of cameras (C,); those count that are up to an angle from the axis."""
     lattice = views.lattice(camera, image_size, _SIDE, limit)
     rays = lattice.sampled(camera, lattice.nodes())
@@ -59,7 +57,7 @@ class Measures(NamedTuple):
     valid_fraction: Tensor
 
 
-def measure(target: Camera, k: Tensor, exact: Tensor, source: Reference) -> Measures:
+def measure(target: CameraLike, k: Tensor, exact: Tensor, source: Reference) -> Measures:
     """Compare cameras (C,), of coefficients (C, n), with those that they were made of.
 
     The root of the mean square is that of the lattice's nodes. The largest error is searched: from the highest peaks

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-if TYPE_CHECKING:
-    from camtorch.cameras.camera import Camera
+from camtorch.projection.camera_like import CameraLike
 
-    Model = type[Camera]
+if TYPE_CHECKING:
+    Model = type[CameraLike]
     Models = Mapping[str, Model]
     Step = tuple[Model, Mapping[str, str]]
     """A model, and what the coefficients of the one before are called there; those left out are lost."""
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 _MANY = 33
 
 
-def default_count(model: Model, source: Camera, models: Models) -> int:
+def default_count(model: Model, source: CameraLike, models: Models) -> int:
     """How many coefficients the model takes to hold those of a related camera, and its own number at least."""
     if isinstance(source, model):
         return len(source.distortion_names)
@@ -34,7 +34,7 @@ def default_count(model: Model, source: Camera, models: Models) -> int:
 
 
 def carry_over(
-    source: Camera, values: Tensor, model: Model, names: tuple[str, ...], models: Models
+    source: CameraLike, values: Tensor, model: Model, names: tuple[str, ...], models: Models
 ) -> tuple[Tensor, Tensor] | None:
     """The coefficients (C, n) of a camera as those of a related model, and whether nothing is lost: bool (C,).
 
@@ -88,7 +88,7 @@ def _renamed(name: str, steps: list[Step]) -> str | None:
     return name
 
 
-def _ideal_value(source: Camera, name: str, steps: list[Step]) -> float:
+def _ideal_value(source: CameraLike, name: str, steps: list[Step]) -> float:
     """The value at which the coefficient may be lost: the ideal one of the last model that has it."""
     model, known = type(source), source.distortion_names
     for later, names in steps:

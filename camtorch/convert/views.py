@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from camtorch.convert.fitting import Observations
+from camtorch.projection.camera_like import CameraLike
 from camtorch.rays.lattices import (
     angles_from_axis,
     image_edges,
@@ -18,9 +19,6 @@ from camtorch.rays.lattices import (
     reach,
     slopes_at_axis,
 )
-
-if TYPE_CHECKING:
-    from camtorch.cameras.camera import Camera
 
 _ANGLES, _AZIMUTHS, _RADII = 180, 16, 64  # at which a camera is looked at as a whole
 _END_AHEAD = math.radians(87)  # of rays, for a camera without an image that does not see sideways
@@ -72,7 +70,7 @@ class Lattice(NamedTuple):
         inside = places.clamp(self.low[:, None], self.high[:, None])
         return inside if self.are_pixels else torch.stack((inside[..., 0], places[..., 1]), -1)
 
-    def sampled(self, camera: Camera, places: Tensor) -> SampledRays:
+    def sampled(self, camera: CameraLike, places: Tensor) -> SampledRays:
         """The rays of a camera at places (C, N, 2)."""
         if self.are_pixels:
             rays, found = camera.unproject(places)
@@ -83,7 +81,7 @@ class Lattice(NamedTuple):
         return SampledRays(rays, pixels, valid & found & (angles_from_axis(rays) <= self.limit * (1 + 1e-12)))
 
 
-def lattice(camera: Camera, image_size: tuple[int, int] | None, side: int, limit: float) -> Lattice:
+def lattice(camera: CameraLike, image_size: tuple[int, int] | None, side: int, limit: float) -> Lattice:
     """Over the part of the image that an angle leaves, its edges included; without an image, over all directions."""
     count = len(camera.intrinsics)
     if image_size is None:
@@ -102,13 +100,13 @@ def lattice(camera: Camera, image_size: tuple[int, int] | None, side: int, limit
     return Lattice(low, high, side, True, limit)
 
 
-def sample(camera: Camera, image_size: tuple[int, int] | None, side: int, limit: float) -> SampledRays:
+def sample(camera: CameraLike, image_size: tuple[int, int] | None, side: int, limit: float) -> SampledRays:
     """side^2 rays on the image, or in all directions, of which those count that the camera has up to an angle."""
     nodes = lattice(camera, image_size, side, limit)
     return nodes.sampled(camera, nodes.nodes())
 
 
-def sample_with_rings(camera: Camera, image_size: tuple[int, int] | None, side: int, limit: float) -> SampledRays:
+def sample_with_rings(camera: CameraLike, image_size: tuple[int, int] | None, side: int, limit: float) -> SampledRays:
     """`sample`, and rays on circles around the axis, over which the errors of a radial lens change."""
     whole = sample(camera, image_size, side, limit)
     reach = torch.where(whole.valid, whole.angles, 0.0).amax(-1, keepdim=True)
@@ -116,7 +114,7 @@ def sample_with_rings(camera: Camera, image_size: tuple[int, int] | None, side: 
     return SampledRays(*(torch.cat(pair, 1) for pair in zip(whole, rings, strict=True)))
 
 
-def seen(camera: Camera, image_size: tuple[int, int] | None, fan: Tensor) -> SampledRays:
+def seen(camera: CameraLike, image_size: tuple[int, int] | None, fan: Tensor) -> SampledRays:
     """Rays (C, A, N, 3), of which those count that are on the image."""
     rays = fan.flatten(1, 2)
     pixels, valid = camera.project(rays)
@@ -126,7 +124,7 @@ def seen(camera: Camera, image_size: tuple[int, int] | None, fan: Tensor) -> Sam
     return SampledRays(rays, pixels, valid)
 
 
-def _reach(camera: Camera, limit: float) -> Tensor:
+def _reach(camera: CameraLike, limit: float) -> Tensor:
     """(C, 1): the angle up to which a camera has rays on some azimuth."""
     azimuths = (torch.arange(_AZIMUTHS).to(camera.intrinsics) + 0.25) * (2 * math.pi / _AZIMUTHS)
 
@@ -137,7 +135,7 @@ def _reach(camera: Camera, limit: float) -> Tensor:
     return torch.where(ends < math.pi / 2, ends.clamp(max=_END_AHEAD), ends).clamp(max=limit)
 
 
-def focal_at_axis(camera: Camera) -> Tensor:
+def focal_at_axis(camera: CameraLike) -> Tensor:
     """(C, 4): the focal lengths at the axis, and the pixel of the axis."""
     slopes = slopes_at_axis(camera.optics, camera.distortion)
     stated = camera.intrinsics
@@ -146,7 +144,7 @@ def focal_at_axis(camera: Camera) -> Tensor:
     return torch.cat((stated[:, :2] * slopes, stated[:, 2:]), -1)
 
 
-def radii(camera: Camera, slopes: Tensor, reach: Tensor) -> tuple[Tensor, Tensor]:
+def radii(camera: CameraLike, slopes: Tensor, reach: Tensor) -> tuple[Tensor, Tensor]:
     """Angles and radii as `Camera.fit_start` gets them; reach: (C,) the last angle, 0 where nothing is seen."""
     steps = torch.arange(1, _RADII + 1, **_like(camera)) / _RADII
     angles = torch.where(reach > 0, reach, 1.0)[:, None] * steps
@@ -162,6 +160,6 @@ def radii(camera: Camera, slopes: Tensor, reach: Tensor) -> tuple[Tensor, Tensor
     return angles, torch.where(seen > 0, radii, end + slope * (index - at))
 
 
-def _like(camera: Camera) -> dict[str, Any]:
+def _like(camera: CameraLike) -> dict[str, Any]:
     # steps of float32 would go past half a circle
     return {"dtype": camera.intrinsics.dtype, "device": camera.intrinsics.device}

@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
 from camtorch.optics.backprojection import Inverted
+from camtorch.projection.camera_like import CameraLike
 from camtorch.values.arguments import columns
-
-if TYPE_CHECKING:
-    from camtorch.cameras.camera import Camera
 
 FURTHEST = 20.0
 """The furthest from the centre of a chart's plane that a fit looks: 87 degrees in perspective."""
@@ -36,13 +34,13 @@ class SensorJacobians(NamedTuple):
     by_k: Tensor
 
 
-def to_sensor(camera: Camera | type[Camera], k: Tensor, rays: Tensor) -> SensorPoints:
+def to_sensor(camera: CameraLike | type[CameraLike], k: Tensor, rays: Tensor) -> SensorPoints:
     """Rays (C, N, 3) through the chart and the lens of coefficients (C, n), whether or not they lie before a fold."""
     return _to_sensor(camera, columns(k), rays.unbind(-1), FURTHEST)
 
 
 def _to_sensor(
-    camera: Camera | type[Camera], k: Sequence[Tensor], rays: Sequence[Tensor], furthest: float
+    camera: CameraLike | type[CameraLike], k: Sequence[Tensor], rays: Sequence[Tensor], furthest: float
 ) -> SensorPoints:
     chart, lens = camera.optics(k)
     x, y, z = rays
@@ -59,7 +57,7 @@ def _to_sensor(
 
 
 def sensor_jacobians(
-    camera: Camera | type[Camera], k: Tensor, rays: Tensor, furthest: float = FURTHEST
+    camera: CameraLike | type[CameraLike], k: Tensor, rays: Tensor, furthest: float = FURTHEST
 ) -> SensorJacobians:
     """`to_sensor` with its exact derivatives by the rays (C, N, 3), at their length, and the coefficients (C, n)."""
     chart, _ = camera.optics(columns(k))
@@ -71,7 +69,7 @@ def sensor_jacobians(
     )
 
 
-def _backward(camera: Camera | type[Camera], k: Tensor, rays: Tensor, furthest: float) -> SensorJacobians:
+def _backward(camera: CameraLike | type[CameraLike], k: Tensor, rays: Tensor, furthest: float) -> SensorJacobians:
     """Twice backward, whatever the number of coefficients, of which each point has its own."""
     with torch.inference_mode(False), torch.enable_grad():
         shape = rays.shape[:-1]
@@ -93,7 +91,7 @@ def _copied(plane: Tensor) -> Tensor:
     return plane.clone(memory_format=torch.contiguous_format)
 
 
-def _forward(camera: Camera | type[Camera], k: Tensor, rays: Tensor, furthest: float) -> SensorJacobians:
+def _forward(camera: CameraLike | type[CameraLike], k: Tensor, rays: Tensor, furthest: float) -> SensorJacobians:
     """Once forward, on a row more for each direction: vmap would take Python's word for many operations."""
     count = k.shape[-1] + 3
     directions = torch.eye(count, dtype=k.dtype, device=k.device)

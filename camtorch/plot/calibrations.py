@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from camtorch.calibration.calibrate import Calibration
 from camtorch.calibration.rig import RigCalibration
+from camtorch.calibration.verdict import Calibration
 from camtorch.plot.axes import (
     COLOURS,
     INK,

@@ -27,8 +27,9 @@ from camtorch.values.threads import spread, thread_count
 if TYPE_CHECKING:
     from camtorch.optics.charts import Chart
     from camtorch.optics.lens import Lens, Stage
+    from camtorch.optics.model_spec import Optics
     from camtorch.optics.radial import RadialFactor
-    from camtorch.projection.domain import Domain, Optics
+    from camtorch.projection.domain import Domain
 
 PROJECT, UNPROJECT, PROJECT_VJP, UNPROJECT_VJP = range(4)
 _TILE = 1 << 14  # points of a tile, some 30 us

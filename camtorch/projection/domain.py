@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -18,8 +18,7 @@ from camtorch.values.arguments import columns
 if TYPE_CHECKING:
     from camtorch.optics.charts import Chart
     from camtorch.optics.lens import Lens
-
-Optics = Callable[[Sequence[Tensor]], tuple["Chart", "Lens"]]
+    from camtorch.optics.model_spec import Optics
 
 _RADII = 512
 _AT_ONCE = 6  # cameras whose azimuths are followed at a time

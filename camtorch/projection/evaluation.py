@@ -28,19 +28,18 @@ from camtorch.evaluate.regime import (
     is_recorded,
     keeps_graph,
 )
+from camtorch.projection.camera_like import CameraLike
 from camtorch.projection.project import Project
-from camtorch.projection.rows import Cameras
+from camtorch.projection.rows import Cameras, unusable
 from camtorch.projection.unproject import Unproject
-from camtorch.rays.explanation import unusable
 from camtorch.values.arguments import Numbers, as_points, warn
 
 if TYPE_CHECKING:
-    from camtorch.cameras.camera import Camera
     from camtorch.projection.compiled import Native
 
 
 def mapped(
-    camera: Camera, direction: type[Project] | type[Unproject], values: Numbers, name: str, size: int
+    camera: CameraLike, direction: type[Project] | type[Unproject], values: Numbers, name: str, size: int
 ) -> tuple[Tensor, Tensor]:
     """Values (*B, *N, size) by compiled code, or by the recorded formula: see `evaluated`."""
     batch, tensors = camera.batch_shape, camera._tensors
@@ -62,7 +61,7 @@ def mapped(
 
 
 def evaluated(
-    camera: Camera,
+    camera: CameraLike,
     direction: type[Project] | type[Unproject],
     rows: Tensor,
     lead: torch.Size,
@@ -105,7 +104,7 @@ def evaluated(
     return direction.traced(type(camera), *inputs, cameras_of(*inputs[1:]) if known else None, order)
 
 
-def compiled_of(cameras: Sequence[Camera], *values: Tensor) -> tuple[list[Native], bool] | None:
+def compiled_of(cameras: Sequence[CameraLike], *values: Tensor) -> tuple[list[Native], bool] | None:
     """Return the compiled geometry of cameras, each (B,) or single, and whether any of them is a batch.
 
     None if `evaluated` would take another regime for values of the dtype of the first, if the result would have a
@@ -147,7 +146,7 @@ class _Native(Function):
         intrinsics: Tensor,
         distortion: Tensor,
         cameras: Cameras,
-        model: type[Camera],
+        model: type[CameraLike],
         direction: type[Project] | type[Unproject],
     ) -> tuple[Tensor, Tensor]:
         made = cameras.native
@@ -184,7 +183,7 @@ def _by_formula(ctx: Any, inputs: Sequence[Tensor], by_planes: Tensor) -> tuple[
     return tuple([next(gradients) if needed else None for needed in wanted])
 
 
-def rows_of(camera: Camera, intrinsics: Tensor, distortion: Tensor) -> Cameras:
+def rows_of(camera: CameraLike, intrinsics: Tensor, distortion: Tensor) -> Cameras:
     """The rows' cameras, kept until a value changes."""
     cameras: Cameras | None = camera._memo.result
     if cameras is None or not cameras.are(intrinsics, distortion):
@@ -194,7 +193,7 @@ def rows_of(camera: Camera, intrinsics: Tensor, distortion: Tensor) -> Cameras:
     return cameras
 
 
-def _warn_of_unusable(camera: Camera, cameras: Cameras, usable: Tensor) -> None:
+def _warn_of_unusable(camera: CameraLike, cameras: Cameras, usable: Tensor) -> None:
     """Say once that learning drove Parameters of this module to where no camera is, and no gradient leads back."""
     bad = (usable <= 0).flatten().nonzero()
     found = unusable(camera, *(t[bad[0, 0]] for t in cameras.given)) if len(bad) else None
@@ -222,7 +221,7 @@ def _is_plain(inputs: Sequence[Tensor]) -> bool:
     return all((type(t) is Tensor and not t.is_meta) or is_concrete(t) for t in inputs)
 
 
-def new_cameras(memo: Memo, model: type[Camera], intrinsics: Tensor, distortion: Tensor) -> Cameras:
+def new_cameras(memo: Memo, model: type[CameraLike], intrinsics: Tensor, distortion: Tensor) -> Cameras:
     """The cameras (C,) of one model, kept in a memo."""
     if in_transform():  # what a transform makes dies with it
         return Cameras(model, intrinsics, distortion)

@@ -14,8 +14,8 @@ from camtorch.values.arguments import columns
 if TYPE_CHECKING:
     from camtorch.optics.charts import Chart
     from camtorch.optics.lens import Lens
+    from camtorch.optics.model_spec import Optics
     from camtorch.optics.radial import RadialFactor
-    from camtorch.projection.domain import Optics
 
 AZIMUTHS = 336  # no further apart than 1.4 degrees
 _RADII = 2048  # to find the fold of the radial factor

@@ -9,12 +9,12 @@ from torch import Tensor
 
 from camtorch.optics.charts import Planes3, floor_of
 from camtorch.projection import compiled
+from camtorch.projection.camera_like import CameraLike
 from camtorch.projection.ops import as_kept, positive, power_of_two, to_planes, without_keeping
 from camtorch.projection.rows import Cameras, Traced, replace, to_mask
 from camtorch.values.arguments import columns
 
 if TYPE_CHECKING:
-    from camtorch.cameras.camera import Camera
     from camtorch.optics.charts import Chart
 
 INVALID_PIXEL = -1.0  # outside every image, so that `contains` is False for it as well
@@ -43,7 +43,7 @@ class Project:
 
     @staticmethod
     def traced(
-        model: type[Camera],
+        model: type[CameraLike],
         points: Tensor,
         intrinsics: Tensor,
         distortion: Tensor,

@@ -14,12 +14,12 @@ from torch import Tensor
 from camtorch.evaluate.known import known_true
 from camtorch.evaluate.portable import is_portable_export
 from camtorch.projection import compiled
+from camtorch.projection.camera_like import CameraLike
 from camtorch.projection.domain import Domain, domain_of
 from camtorch.projection.ops import tables
 from camtorch.values.arguments import columns
 
 if TYPE_CHECKING:
-    from camtorch.cameras.camera import Camera
     from camtorch.optics.charts import Chart
     from camtorch.optics.lens import Lens
 
@@ -40,7 +40,7 @@ class Cameras:
     k: Tensor
     usable: Tensor | None
 
-    def __init__(self, model: type[Camera], intrinsics: Tensor, distortion: Tensor):
+    def __init__(self, model: type[CameraLike], intrinsics: Tensor, distortion: Tensor):
         """Of concrete values (C, 4), (C, n); or (4,), (n,) of one."""
         self._model, self._learns = model, distortion.requires_grad
         self._alone = values = intrinsics.detach().clone(), distortion.detach().clone()
@@ -98,18 +98,18 @@ class Cameras:
         return by_coefficients
 
 
-def single_native(model: type[Camera], intrinsics: Tensor, k: Tensor) -> compiled.Native | None:
+def single_native(model: type[CameraLike], intrinsics: Tensor, k: Tensor) -> compiled.Native | None:
     """A camera of numbers (4,) and (n,) that are known to be usable, for the compiled geometry, if that knows it."""
     k = k.detach()[None]
     return compiled.native_of(model.optics, intrinsics[None], k, None, partial(_domain, model, k, False), tables=True)
 
 
-def _domain(model: type[Camera], k: Tensor, learns: bool) -> Domain:
+def _domain(model: type[CameraLike], k: Tensor, learns: bool) -> Domain:
     # what learns will not be seen again
     return Domain(model.optics, k) if learns else domain_of(model._model, k, model.optics)
 
 
-def _are_plain(model: type[Camera], intrinsics: Tensor, distortion: Tensor) -> bool:
+def _are_plain(model: type[CameraLike], intrinsics: Tensor, distortion: Tensor) -> bool:
     """Whether a short look says that all are usable."""
     if not intrinsics.is_cpu or not 0 < intrinsics.numel() + distortion.numel() <= _MOST_LOOKED_AT:
         return False
@@ -120,7 +120,7 @@ def _are_plain(model: type[Camera], intrinsics: Tensor, distortion: Tensor) -> b
     return math.isfinite(total) and all(fx > 0 and fy > 0 for fx, fy, *_ in rows)
 
 
-def _usable(model: type[Camera], intrinsics: Tensor, distortion: Tensor) -> Tensor:
+def _usable(model: type[CameraLike], intrinsics: Tensor, distortion: Tensor) -> Tensor:
     """Bool (C, 1): finite, with focal lengths that are positive, and coefficients for which the formula exists."""
     finite = torch.isfinite(intrinsics).all(-1) & torch.isfinite(distortion).all(-1)
     usable = finite & (intrinsics[..., :2] > 0).all(-1)
@@ -128,7 +128,24 @@ def _usable(model: type[Camera], intrinsics: Tensor, distortion: Tensor) -> Tens
     return (usable if defined is None else usable & (defined > 0)).unsqueeze(-1)
 
 
-def _ideal(model: type[Camera], intrinsics: Tensor, distortion: Tensor) -> tuple[float, float | Tensor]:
+def unusable(camera: CameraLike, intrinsics: Tensor, distortion: Tensor) -> tuple[str, str] | None:
+    """Why a camera of this model and these values, (4,) and (n,), has no pixels at all: the tensor, and what it has."""
+    for tensor, names, values in (
+        ("intrinsics", ("fx", "fy", "cx", "cy"), intrinsics.tolist()),
+        ("distortion", camera.distortion_names, distortion.tolist()),
+    ):
+        for name, value in zip(names, values, strict=True):
+            if not math.isfinite(value):
+                return tensor, f"{name} = {value}"
+            if name in ("fx", "fy") and value <= 0:
+                return tensor, f"{name} = {value:.6g} is not positive"
+    defined = camera.defined(distortion.unbind(-1)) if camera.distortion_names else None
+    if defined is not None and not bool(defined > 0):
+        return "distortion", f"the formula needs {camera.defined_text}"
+    return None
+
+
+def _ideal(model: type[CameraLike], intrinsics: Tensor, distortion: Tensor) -> tuple[float, float | Tensor]:
     ideal = model.ideal(distortion.shape[-1])
     return 1.0, distortion.new_tensor(ideal) if any(ideal) else 0.0
 
@@ -136,14 +153,14 @@ def _ideal(model: type[Camera], intrinsics: Tensor, distortion: Tensor) -> tuple
 class Traced(NamedTuple):
     """What a graph is recorded of: parameters that can be used, and what follows from their values."""
 
-    model: type[Camera]
+    model: type[CameraLike]
     intrinsics: Tensor
     distortion: Tensor
     domain: Domain
     usable: Tensor | None
 
     @classmethod
-    def of(cls, model: type[Camera], intrinsics: Tensor, distortion: Tensor, cameras: Cameras | None) -> Traced:
+    def of(cls, model: type[CameraLike], intrinsics: Tensor, distortion: Tensor, cameras: Cameras | None) -> Traced:
         """cameras: those of the parameters, if their values may be looked at."""
         if cameras is not None:
             domain, usable = cameras.domain, cameras.usable

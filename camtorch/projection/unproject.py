@@ -11,13 +11,13 @@ from camtorch.evaluate.portable import is_portable_export, times
 from camtorch.optics.lens import newton_step
 from camtorch.optics.radial_inverse import MOST_STEPS, short, solve
 from camtorch.projection import compiled
+from camtorch.projection.camera_like import CameraLike
 from camtorch.projection.ops import order_of, positive, search_in_place, search_open, to_planes, without_keeping
 from camtorch.projection.rows import Cameras, Planes2, Traced, replace, to_mask
 from camtorch.projection.solve import search
 from camtorch.values.arguments import columns
 
 if TYPE_CHECKING:
-    from camtorch.cameras.camera import Camera
     from camtorch.optics.lens import Lens
     from camtorch.projection.domain import Domain
 
@@ -152,7 +152,7 @@ class Unproject:
 
     @staticmethod
     def traced(
-        model: type[Camera],
+        model: type[CameraLike],
         pixels: Tensor,
         intrinsics: Tensor,
         distortion: Tensor,

@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import torch
 from torch import Tensor
 
+from camtorch.projection.camera_like import CameraLike
 from camtorch.values.arguments import Numbers, as_values
-
-if TYPE_CHECKING:
-    from camtorch.cameras.camera import Camera
 
 KINDS = ("z", "distance")
 
@@ -46,7 +42,7 @@ def depth_scale(depth: Tensor, rays: Tensor, valid: Tensor, kind: str) -> tuple[
     return (length / torch.where(ahead, z, 1.0) if kind == "z" else length), good
 
 
-def backproject(camera: Camera, depth: Numbers, kind: str) -> tuple[Tensor, Tensor]:
+def backproject(camera: CameraLike, depth: Numbers, kind: str) -> tuple[Tensor, Tensor]:
     """Points (*B, H, W, 3), and valid (*B, H, W); see `Camera.backproject`."""
     owner, batch = f"{type(camera).__name__}.backproject", camera.batch_shape
     depth = as_depth(depth, kind, camera._size_for("backproject"), owner, camera.intrinsics.device)

@@ -9,6 +9,8 @@ import torch
 from torch import Tensor
 
 from camtorch.optics.charts import floor_of
+from camtorch.projection.camera_like import CameraLike
+from camtorch.projection.rows import unusable
 from camtorch.rays.lattices import angles_from_axis, reach
 from camtorch.values.arguments import Numbers, as_values, columns, working_dtype
 from camtorch.values.module import remade
@@ -16,13 +18,12 @@ from camtorch.values.module import remade
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from camtorch.cameras.camera import Camera
 
 _STEPS = 256
 
 
 @torch.no_grad()
-def explain(camera: Camera, points: Numbers) -> list[str]:
+def explain(camera: CameraLike, points: Numbers) -> list[str]:
     """See `Camera.explain`."""
     valid = camera.project(points)[1]
     parameters = camera.intrinsics, camera.distortion
@@ -44,24 +45,7 @@ def explain(camera: Camera, points: Numbers) -> list[str]:
     return lines
 
 
-def unusable(camera: Camera, intrinsics: Tensor, distortion: Tensor) -> tuple[str, str] | None:
-    """Why a camera of this model and these values, (4,) and (n,), has no pixels at all: the tensor, and what it has."""
-    for tensor, names, values in (
-        ("intrinsics", ("fx", "fy", "cx", "cy"), intrinsics.tolist()),
-        ("distortion", camera.distortion_names, distortion.tolist()),
-    ):
-        for name, value in zip(names, values, strict=True):
-            if not math.isfinite(value):
-                return tensor, f"{name} = {value}"
-            if name in ("fx", "fy") and value <= 0:
-                return tensor, f"{name} = {value:.6g} is not positive"
-    defined = camera.defined(distortion.unbind(-1)) if camera.distortion_names else None
-    if defined is not None and not bool(defined > 0):
-        return "distortion", f"the formula needs {camera.defined_text}"
-    return None
-
-
-def _reason(camera: Camera, row: dict[str, Tensor], point: Tensor) -> str:
+def _reason(camera: CameraLike, row: dict[str, Tensor], point: Tensor) -> str:
     """Why a camera of this model with a row of usable values has no pixel for a point (3,)."""
     camera = remade(camera, **row)
     shown = ", ".join(f"{value:.6g}" for value in point.tolist())

@@ -13,6 +13,7 @@ from camtorch.evaluate.known import known_false
 from camtorch.optics.derivatives import goes_forward
 from camtorch.poses.extrinsics import Extrinsics
 from camtorch.poses.rotations import rotate_planes, rotation_matrix
+from camtorch.projection.camera_like import CameraLike
 from camtorch.values.arguments import (
     Numbers,
     as_points,
@@ -25,7 +26,6 @@ from camtorch.values.arguments import (
 )
 
 if TYPE_CHECKING:
-    from camtorch.cameras.camera import Camera
     from camtorch.evaluate.kept import Memo
 
 _MOST_KEPT = 1 << 19  # rays, of 6 MB in float32: what every camera of a large data set may keep
@@ -69,7 +69,11 @@ def patch_centres(size: tuple[int, int], stride: int, like: Tensor, owner: str) 
 
 
 def over_image(
-    camera: Camera, memo: Memo, inputs: Sequence[Tensor], stride: int, function: Callable[[Tensor], tuple[Tensor, ...]]
+    camera: CameraLike,
+    memo: Memo,
+    inputs: Sequence[Tensor],
+    stride: int,
+    function: Callable[[Tensor], tuple[Tensor, ...]],
 ) -> tuple[Tensor, ...]:
     """What a function makes of all pixels or patches (*B, H, W, 2) of a camera, kept where nothing of `inputs` learns.
 
@@ -129,7 +133,7 @@ class Tangents(NamedTuple):
     valid: Tensor
 
 
-def tangents(camera: Camera, pixels: Tensor) -> Tangents:
+def tangents(camera: CameraLike, pixels: Tensor) -> Tangents:
     """Rays of pixels (*B, *N, 2) with their exact derivatives, in a graph where the camera or the pixels are in one."""
     if goes_forward(pixels):
         right, below = (pixels.new_tensor(unit).expand_as(pixels) for unit in ((1.0, 0.0), (0.0, 1.0)))
@@ -167,7 +171,7 @@ def local_frames(at: Tangents) -> tuple[Tensor, Tensor, Tensor]:
     return torch.stack((x, y, z), -2), per_unit.unflatten(-1, (2, 2)), valid
 
 
-def local_pinhole(camera: Camera, pixels: Numbers) -> tuple[Tensor, Tensor]:
+def local_pinhole(camera: CameraLike, pixels: Numbers) -> tuple[Tensor, Tensor]:
     """Rotations (..., 3, 3) and matrices K (..., 3, 3); see `Camera.local_pinhole`."""
     owner = f"{type(camera).__name__}.local_pinhole"
     pixels, _ = as_points(pixels, "pixels", 2, camera.batch_shape, camera._tensors, owner)
@@ -178,7 +182,7 @@ def local_pinhole(camera: Camera, pixels: Numbers) -> tuple[Tensor, Tensor]:
     return rotation, torch.cat((top, bottom), -2)
 
 
-def perspective_field(camera: Camera, gravity: Numbers, stride: int) -> tuple[Tensor, Tensor, Tensor]:
+def perspective_field(camera: CameraLike, gravity: Numbers, stride: int) -> tuple[Tensor, Tensor, Tensor]:
     """Latitude (*B, H, W), up (*B, H, W, 2) and valid (*B, H, W); see `Camera.perspective_field`."""
     owner = f"{type(camera).__name__}.perspective_field"
     down = as_vectors(gravity, "gravity", owner)

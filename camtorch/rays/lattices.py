@@ -10,14 +10,14 @@ import torch
 from torch import Tensor
 
 from camtorch.optics.derivatives import jacobian_of
+from camtorch.projection.camera_like import CameraLike
 from camtorch.values.arguments import columns
 from camtorch.values.module import remade
 
 if TYPE_CHECKING:
-    from camtorch.cameras.camera import Camera
-    from camtorch.projection.domain import Optics
+    from camtorch.optics.model_spec import Optics
 
-    CameraT = TypeVar("CameraT", bound=Camera)
+    CameraT = TypeVar("CameraT", bound=CameraLike)
 
 AXES = ("horizontal", "vertical", "diagonal")
 """The lines of an image along which a field of view is."""
@@ -31,7 +31,7 @@ def image_edges(image_size: tuple[int, int], like: Tensor) -> tuple[Tensor, Tens
     return like.new_full((2,), -0.5), like.new_tensor([width - 0.5, height - 0.5])
 
 
-def image_lattice(camera: Camera, rows: int, columns: int) -> Tensor:
+def image_lattice(camera: CameraLike, rows: int, columns: int) -> Tensor:
     """(rows, columns, 2): pixels in even steps from outer edge to outer edge of the image."""
     return pixel_lattice(*image_edges(camera._size_for("a lattice of pixels"), camera.intrinsics), rows, columns)
 
@@ -112,7 +112,7 @@ def reach(
     return low.squeeze(-1)
 
 
-def followed(camera: Camera, angles: Tensor, azimuths: int) -> tuple[Tensor, Tensor]:
+def followed(camera: CameraLike, angles: Tensor, azimuths: int) -> tuple[Tensor, Tensor]:
     """Pixels (*C, K, azimuths, 2) of a fan of ascending angles (*C, K), and whether all is valid up to there."""
     pixels, valid = camera.project(ray_fan(angles, azimuths))
     return pixels, valid.long().cumprod(-2).bool()
@@ -127,7 +127,7 @@ def around_ends(share: Tensor, valid: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def field_of_view(camera: Camera) -> Tensor:
+def field_of_view(camera: CameraLike) -> Tensor:
     """(*B, 3) radians: horizontal and vertical through the principal point, and on the wider diagonal of the image.
 
     From outer edge to outer edge, or as far as there are rays; 0 where there are none. Graph-free.
@@ -155,7 +155,7 @@ def field_of_view(camera: Camera) -> Tensor:
 
 
 @torch.no_grad()
-def focal_for(camera: Camera, fov: Tensor, image_size: tuple[int, int], axis: str) -> tuple[Tensor, Tensor]:
+def focal_for(camera: CameraLike, fov: Tensor, image_size: tuple[int, int], axis: str) -> tuple[Tensor, Tensor]:
     """Return the focal length (*B,) at which an image with its centre on the axis has a field of view; and whether.
 
     If none has it, it is the focal length of the widest. camera: of focal length 1 and principal point 0; float64.

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import torch
 from torch import Tensor
 
 from camtorch.poses.extrinsics import Extrinsics
+from camtorch.projection.camera_like import CameraLike
 from camtorch.values.arguments import Numbers, as_points
-
-if TYPE_CHECKING:
-    from camtorch.cameras.camera import Camera
 
 _FIRST = 32  # pieces of an edge, of equal angles, before any is divided
 _LONGEST, _NEAR = 20.0, 0.05  # px: between points, and from a piece to its curve
@@ -20,7 +16,7 @@ _FARTHEST = 16.0  # times the image: a pinhole sees what is 90 degrees from its 
 _ROUNDS = 60
 
 
-def project_polyline(camera: Camera, points: Numbers, extrinsics: Extrinsics | None) -> list[Tensor]:
+def project_polyline(camera: CameraLike, points: Numbers, extrinsics: Extrinsics | None) -> list[Tensor]:
     """See `Camera.project_polyline`."""
     owner = f"{type(camera).__name__}.project_polyline"
     if camera.batch_shape:
@@ -95,7 +91,7 @@ class _Edges:
         return self.start[edge] + along[:, None] * self.way[edge]
 
 
-def _region(camera: Camera) -> tuple[Tensor, float]:
+def _region(camera: CameraLike) -> tuple[Tensor, float]:
     """The middle of the image, and how far from it curves go on."""
     intrinsics = camera.intrinsics.detach().double()
     if camera.image_size is None:

@@ -26,7 +26,7 @@ from camtorch.io.photographs import as_jpeg
 from camtorch.io.writing import replacing
 from camtorch.lenses.collection import columns
 from camtorch.models import Splined
-from camtorch.rays.explanation import unusable
+from camtorch.projection.rows import unusable
 from camtorch.values.arguments import check_path
 from camtorch.values.module import model_of
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -11,17 +10,15 @@ from torch import Tensor
 
 from camtorch.evaluate.known import is_predicted, known_true
 from camtorch.values.arguments import Numbers, as_coordinates, as_values, as_whole, check_boxes
+from camtorch.warp.pair import CameraPair
 from camtorch.warp.panorama import PANORAMAS
-
-if TYPE_CHECKING:
-    from camtorch.warp.warp import Warp
 
 _EDGE_SAMPLES = 64  # per edge: one of 500 px bent to a radius of 300 px is then enclosed to 0.03 px
 _ROUNDED = 1e-3  # pixels from the edges of panoramas, where rounding would take rays away
 _LATTICE = 16  # steps across and down the target, between points that are looked for in what a polygon encloses
 
 
-def moved_boxes(warp: Warp, boxes: Numbers) -> tuple[Tensor, Tensor]:
+def moved_boxes(warp: CameraPair, boxes: Numbers) -> tuple[Tensor, Tensor]:
     """See `Warp.transform_boxes`."""
     boxes = as_values(boxes, "boxes", "Warp", warp.source.intrinsics.device)
     if boxes.ndim == 0 or boxes.shape[-1] != 4:
@@ -35,7 +32,7 @@ def moved_boxes(warp: Warp, boxes: Numbers) -> tuple[Tensor, Tensor]:
     return torch.where(ordered.unsqueeze(-1), enclosing, -1.0), valid & ordered
 
 
-def enclosed(warp: Warp, corners: Tensor) -> tuple[Tensor, Tensor]:
+def enclosed(warp: CameraPair, corners: Tensor) -> tuple[Tensor, Tensor]:
     """See `Warp.enclose`."""
     corners = as_coordinates(corners, "corners", 2, "Warp", warp.source.intrinsics.device, "B, *N, K")
     if corners.ndim < 2:
@@ -109,7 +106,7 @@ def turned(lattice: Tensor, mirrored: bool = False) -> Tensor:
     return torch.where(found.any(-2, keepdim=True), corners_of(torch.cat((low, high), -1)) @ axes.mT, -1.0)
 
 
-def _inside(warp: Warp, corners: Tensor, like: Tensor) -> tuple[Tensor, Tensor]:
+def _inside(warp: CameraPair, corners: Tensor, like: Tensor) -> tuple[Tensor, Tensor]:
     """Return a lattice (N, 2) over the target, and (B, *M, N): which of its points show what polygons enclose."""
     height, width = warp.target._size_for("Warp")
     share = torch.linspace(0, 1, _LATTICE + 1, dtype=like.dtype, device=like.device)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -24,10 +24,8 @@ from camtorch.evaluate.regime import (
 from camtorch.native.sampler import Later, empty
 from camtorch.warp import compiled
 from camtorch.warp.grid import Lattice, Sampling, scaled
+from camtorch.warp.pair import CameraPair
 from camtorch.warp.sampling import PADDINGS, PaddingMode, Pyramid, Sampler, laid_as, render
-
-if TYPE_CHECKING:
-    from camtorch.warp.warp import Warp
 
 Route = Literal["operator", "strips", "graph", "kept"]
 
@@ -35,7 +33,7 @@ _MOST_KEPT = 1 << 25  # pixels of a grid; longer ones, of 256 MB in float32, are
 _STRIP = 1 << 21  # pixels of such a strip
 
 
-def route_of(warp: Warp, images: Tensor | None = None) -> Route:
+def route_of(warp: CameraPair, images: Tensor | None = None) -> Route:
     """The route of a call; the lattice and the native sampler are chosen below, by `locate` and `render`.
 
     * "operator": compiled code calls one operator, and traces nothing of it;
@@ -57,7 +55,7 @@ def route_of(warp: Warp, images: Tensor | None = None) -> Route:
     return "graph" if learns else "kept"
 
 
-def warped(warp: Warp, images: Tensor, sampler: Sampler, later: Later | None = None) -> Tensor:
+def warped(warp: CameraPair, images: Tensor, sampler: Sampler, later: Later | None = None) -> Tensor:
     """The images of a warp; those given are checked. With `later`, `finish` may have to make them."""
     route, images = route_of(warp, images), lengthened(warp, images)
     if route == "operator":
@@ -74,12 +72,12 @@ def warped(warp: Warp, images: Tensor, sampler: Sampler, later: Later | None = N
     return render(images, positions(warp, route, sampler.padding_mode), *sampler, later=later)
 
 
-def lengthened(warp: Warp, images: Tensor) -> Tensor:
+def lengthened(warp: CameraPair, images: Tensor) -> Tensor:
     """Return the images that a warp samples: those of a whole turn go on beyond their edges."""
     return images if warp._seam is None else laid_as(images, warp._seam.around(images))
 
 
-def positions(warp: Warp, route: Route, padding: PaddingMode = "zeros") -> Sampling | Lattice:
+def positions(warp: CameraPair, route: Route, padding: PaddingMode = "zeros") -> Sampling | Lattice:
     """Where all pixels of the target sample the source's image, by the route "graph" or "kept"."""
     if route == "graph":
         if in_jit_trace():
@@ -102,13 +100,13 @@ def positions(warp: Warp, route: Route, padding: PaddingMode = "zeros") -> Sampl
     return kept
 
 
-def by_pixel(warp: Warp) -> Sampling:
+def by_pixel(warp: CameraPair) -> Sampling:
     """The positions of all pixels, one by one."""
     where = positions(warp, "graph" if route_of(warp) == "graph" else "kept")
     return where.pixels if isinstance(where, Lattice) else where
 
 
-def _computed(warp: Warp, reach: PaddingMode) -> Sampling | Lattice:
+def _computed(warp: CameraPair, reach: PaddingMode) -> Sampling | Lattice:
     """The positions of all pixels, without a graph, which serve a padding."""
     if not (_is_operator(warp) and warp.tolerance and warp.target.intrinsics.is_cpu):
         return warp._locate(range(warp.target._size_for("Warp")[0]), reach, warp.tolerance)
@@ -119,7 +117,7 @@ def _computed(warp: Warp, reach: PaddingMode) -> Sampling | Lattice:
 
 
 def strips(
-    warp: Warp, padding: PaddingMode = "zeros", count: int | None = None
+    warp: CameraPair, padding: PaddingMode = "zeros", count: int | None = None
 ) -> Iterator[tuple[slice, Sampling | Lattice]]:
     """Rows of the target, `count` at a time, and where they sample the source's image."""
     height, width = warp.target._size_for("Warp")
@@ -132,7 +130,7 @@ def strips(
 
 
 def in_strips(
-    warp: Warp, images: Tensor, count: int | None, sampler: Sampler
+    warp: CameraPair, images: Tensor, count: int | None, sampler: Sampler
 ) -> Iterator[tuple[slice, Tensor, Tensor]]:
     """See `Warp.strips`."""
     kept: dict[int, Pyramid] = {}
@@ -144,14 +142,14 @@ def in_strips(
 
 
 @torch.no_grad()
-def valid_mask(warp: Warp) -> Tensor:
+def valid_mask(warp: CameraPair) -> Tensor:
     """See `Warp.valid_mask`."""
     if route_of(warp) == "strips":
         return torch.cat([_on_image(warp, where) for _, where in strips(warp)], 2)
     return _on_image(warp, positions(warp, "kept"))
 
 
-def _on_image(warp: Warp, where: Sampling | Lattice) -> Tensor:
+def _on_image(warp: CameraPair, where: Sampling | Lattice) -> Tensor:
     """(B or 1, 1, h, W') bool: whether the source maps pixels onto its image."""
     where = where.pixels if isinstance(where, Lattice) else where
     grid, source = where.grid.detach(), warp._sampled
@@ -159,7 +157,7 @@ def _on_image(warp: Warp, where: Sampling | Lattice) -> Tensor:
     return (where.mapped & source.contains(pixels)).unsqueeze(1)
 
 
-def pinned(warp: Warp) -> Sampling | Lattice | None:
+def pinned(warp: CameraPair) -> Sampling | Lattice | None:
     """The positions that a warp keeps from now on, with their graph; None where they are not to be kept."""
     # what a transform makes dies with it; what inference mode makes could not be used in a graph later; the operator
     # of compiled code keeps its own
@@ -172,18 +170,18 @@ def pinned(warp: Warp) -> Sampling | Lattice | None:
     return positions(warp, "kept") if is_exporting() else _computed(warp, warp.padding_mode)
 
 
-def _reach(warp: Warp, padding: PaddingMode) -> PaddingMode:
+def _reach(warp: CameraPair, padding: PaddingMode) -> PaddingMode:
     """The padding that positions are for which serve the warp's own, and this one."""
     # of equal words compilers know no max by a key
     return PADDINGS[max(PADDINGS.index(warp.padding_mode), PADDINGS.index(padding))]
 
 
-def _is_operator(warp: Warp) -> bool:
+def _is_operator(warp: CameraPair) -> bool:
     """Whether code is compiled that calls this warp as one; it knows cameras of one model."""
     return is_for_here() and warp.is_an_operator and not (warp.source.is_mixed or warp.target.is_mixed)
 
 
-def _is_long(warp: Warp) -> bool:
+def _is_long(warp: CameraPair) -> bool:
     """Whether the grid is not to be made at once, nor kept."""
     # compared first, sizes that a program leaves open would be bounded in it
     if warp._pinned is not None or torch.compiler.is_compiling():
@@ -193,7 +191,7 @@ def _is_long(warp: Warp) -> bool:
     return not in_transform() and all(t.is_cpu and is_concrete(t) for t in warp._inputs())
 
 
-def _constant(warp: Warp, padding: PaddingMode) -> Sampling | None:
+def _constant(warp: CameraPair, padding: PaddingMode) -> Sampling | None:
     """The positions as a constant of an exported program, unless they depend on what it is given."""
     is_pinned = warp._pinned is not None
     if not is_pinned and not is_constant(warp):

@@ -12,7 +12,6 @@ from torch import Tensor, nn
 from typing_extensions import Self
 
 from camtorch.cameras.camera import Camera
-from camtorch.evaluate.kept import Memo
 from camtorch.poses.rotations import as_rotation, turn
 from camtorch.values.arguments import (
     LEFT,
@@ -23,12 +22,11 @@ from camtorch.values.arguments import (
     check_devices,
     no_camera,
 )
-from camtorch.values.module import GeometryModule, typed_as
+from camtorch.values.module import typed_as
 from camtorch.warp import routes
 from camtorch.warp.boxes import enclosed, moved_boxes
-from camtorch.warp.grid import OUTSIDE, Lattice, Sampling, locate
-from camtorch.warp.moving import moved_pixels
-from camtorch.warp.panorama import Seam, seam_of
+from camtorch.warp.grid import OUTSIDE
+from camtorch.warp.pair import CameraPair
 from camtorch.warp.sampling import (
     MODES,
     PADDINGS,
@@ -42,8 +40,6 @@ from camtorch.warp.sampling import (
     one_of,
 )
 
-_SINGLE = 1e-3  # pixels: some ulps of a position in an image a thousand pixels wide, computed in float32
-
 
 def as_sized(camera: Camera, name: str, owner: str) -> Camera:
     """The camera, if it is one and knows the size of its image."""
@@ -54,17 +50,7 @@ def as_sized(camera: Camera, name: str, owner: str) -> Camera:
     return camera
 
 
-def _part(held: str, name: str) -> Any:
-    """The property of a part of a module, in the dict where it mostly is: `nn.Module.__getattr__` looks in all."""
-
-    def part(module: nn.Module) -> Any:
-        parts = module.__dict__[held]
-        return parts[name] if name in parts else nn.Module.__getattr__(module, name)
-
-    return property(part)
-
-
-class Warp(GeometryModule):
+class Warp(CameraPair):
     """The image that `target` would see, made from the image of `source`, both at one place.
 
     Convention: `ray_target = R ray_source` (OpenCV's rectification R). Images are (B, C, H, W). Points, boxes and
@@ -101,23 +87,9 @@ class Warp(GeometryModule):
     """
 
     _decides = False  # for itself where to antialias
-    is_an_operator: ClassVar[bool] = True
-    """Whether compiled code calls it as one: the cameras and the rotation are all there is to it."""
     _has_shutters: ClassVar[bool] = False
     keeps_lens: ClassVar[bool] = False
     """Whether it may follow another warp, and is then what `follow` makes of that."""
-    batch_shape: torch.Size
-    mode: Mode
-    padding_mode: PaddingMode
-    _tolerance: float | None
-    _memos: dict[PaddingMode, Memo]
-    _constants: Memo
-    _pinned: Sampling | Lattice | None
-    source: Camera = _part("_modules", "source")
-    target: Camera = _part("_modules", "target")
-    rotation: Tensor | None = _part("_buffers", "rotation")
-    fill: tuple[float, ...]
-    antialias: bool
 
     def __init__(
         self,
@@ -136,44 +108,12 @@ class Warp(GeometryModule):
         self._set(source, target, options, _check_parts(source, target, rotation))
         self.turned_by(rotation)
 
-    def _set(self, source: Camera, target: Camera, options: Options, batch: torch.Size | None = None) -> None:
-        if batch is None:
-            batch = broadcast_shapes(source.batch_shape, target.batch_shape)
-        super().__init__(
-            {"source": source, "target": target},
-            batch_shape=batch,
-            mode=options["mode"],
-            padding_mode=options["padding_mode"],
-            fill=options["fill"],
-            antialias=options["antialias"],
-            _tolerance=options["tolerance"],
-            _memos={},
-            _pinned=None,
-            _constants=Memo(),
-        )
-        seam_of(source)  # while its values may be looked at: traced code asks for it too
-
     @classmethod
     def unchecked(cls, *given: Any) -> Self:
         """A warp, without a rotation as yet, of arguments as of `_set` that are known to be right."""
         warp = cls.__new__(cls)
         warp._set(*given)
         return warp
-
-    def turned_by(self, rotation: Tensor | None) -> Self:
-        """This warp, made without a rotation, with one that is not checked: (3, 3) or (B, 3, 3)."""
-        self.put("rotation", rotation, persistent=rotation is not None and not rotation.requires_grad)
-        if rotation is not None and rotation.shape[:-2] != self.batch_shape:
-            self.batch_shape = broadcast_shapes(self.batch_shape, rotation.shape[:-2])
-        return self
-
-    @property
-    def tolerance(self) -> float:
-        """Pixels of the source by which sampling positions may be off."""
-        if self._tolerance is not None:
-            return self._tolerance
-        single = all(camera.intrinsics.dtype == torch.float32 for camera in (self.source, self.target))
-        return _SINGLE if single else 0.0
 
     # -- images
 
@@ -263,34 +203,6 @@ class Warp(GeometryModule):
             self.__dict__["_pinned"] = routes.pinned(self)  # as nn.Module would, after some questions
         return self
 
-    # -- what its positions follow from
-
-    def _inputs(self) -> list[Tensor]:
-        """All tensors that they depend on."""
-        (source, target), rotation = self._ends, self.rotation
-        found = [*source._tensors, *target._tensors]
-        return found if rotation is None else [*found, rotation]
-
-    def _locate(self, rows: range, padding: PaddingMode, tolerance: float) -> Sampling | Lattice:
-        """Those of some rows of the target, which serve a padding, within a tolerance."""
-        return locate(self._sampled, self._ends[1], self.rotation, tolerance, self.antialias, rows, padding)
-
-    @property
-    def _ends(self) -> tuple[Camera, Camera]:
-        """Source and target, by which positions are found."""
-        return self.source, self.target
-
-    @property
-    def _seam(self) -> Seam | None:
-        """By how much the source's images become longer before they are sampled."""
-        return seam_of(self._ends[0])
-
-    @property
-    def _sampled(self) -> Camera:
-        """The source, of these images."""
-        source, seam = self._ends[0], self._seam
-        return source if seam is None else seam.before(source)
-
     # -- labels
 
     def transform_points(self, pixels: Numbers) -> tuple[Tensor, Tensor]:
@@ -301,13 +213,6 @@ class Warp(GeometryModule):
             it on its image. Pixels off the image keep their place; those without one get (-1, -1).
         """
         return self._move(pixels, on_image=True)
-
-    def _move(self, pixels: Numbers, back: bool = False, on_image: bool = False) -> tuple[Tensor, Tensor]:
-        """Return pixels of the source on the target's image, or back, and whether there is one; see `moved_pixels`."""
-        (source, target), rotation = self._ends, self.rotation
-        if back:
-            source, target, rotation = target, source, None if rotation is None else rotation.mT
-        return moved_pixels(source, target, rotation, pixels, on_image)
 
     def transform_boxes(self, boxes: Numbers) -> tuple[Tensor, Tensor]:
         """Move boxes (B, *N, 4), or (*N, 4): x1, y1, x2, y2 in pixel-centre coordinates.

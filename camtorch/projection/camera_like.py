@@ -1,0 +1,58 @@
+"""What the inside of camtorch may ask of a camera; `Camera` is one, and nothing below cameras/ imports it."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from torch import Tensor
+
+from camtorch.evaluate.kept import Memo
+from camtorch.optics.model_spec import ModelSpec
+from camtorch.values.arguments import Numbers
+from camtorch.values.module import BatchedModule
+
+
+class CameraLike(ModelSpec, BatchedModule):
+    """A model with numbers: tensors, a size, a form, and both directions."""
+
+    is_mixed: ClassVar[bool] = False
+    """Whether it is a batch of several models, which have no coefficients in common; see `Mixed`."""
+    image_size: tuple[int, int] | None
+    _memo: Memo
+    _rays: Memo
+    _fields: Memo
+    _warned: bool
+
+    if TYPE_CHECKING:
+        intrinsics: Tensor
+        distortion: Tensor
+
+        @property
+        def fov(self) -> Tensor: ...
+
+        def project(self, points: Numbers) -> tuple[Tensor, Tensor]: ...
+
+        def unproject(self, pixels: Numbers) -> tuple[Tensor, Tensor]: ...
+
+        def rays(self, stride: int = 1) -> tuple[Tensor, Tensor]: ...
+
+        def pixel_grid(self, stride: int = 1) -> Tensor: ...
+
+        def _evaluate(
+            self, direction: Any, rows: Tensor, lead: Any, tensors: Any, cameras_of: Any = None
+        ) -> tuple[Tensor, Tensor]: ...
+
+    @property
+    def _tensors(self) -> tuple[Tensor, ...]:
+        """All that the camera learns, or could."""
+        return self.intrinsics, self.distortion
+
+    @property
+    def _form(self) -> tuple[object, ...]:
+        """What else it is: cameras of one form and equal tensors are the same."""
+        return type(self), self.image_size
+
+    def _size_for(self, what: str) -> tuple[int, int]:
+        if self.image_size is None:
+            raise ValueError(f"{type(self).__name__}: {what} needs the camera's image_size=(height, width)")
+        return self.image_size

@@ -1,0 +1,116 @@
+"""Two cameras at one place, and what the way of images and points from one to the other follows from."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor, nn
+from typing_extensions import Self
+
+from camtorch.cameras.camera import Camera
+from camtorch.evaluate.kept import Memo
+from camtorch.values.arguments import Numbers, broadcast_shapes
+from camtorch.values.module import GeometryModule
+from camtorch.warp.grid import Lattice, Sampling, locate
+from camtorch.warp.moving import moved_pixels
+from camtorch.warp.panorama import Seam, seam_of
+from camtorch.warp.sampling import Mode, Options, PaddingMode
+
+_SINGLE = 1e-3  # pixels: some ulps of a position in an image a thousand pixels wide, computed in float32
+
+
+def _part(held: str, name: str) -> Any:
+    """The property of a part of a module, in the dict where it mostly is: `nn.Module.__getattr__` looks in all."""
+
+    def part(module: nn.Module) -> Any:
+        parts = module.__dict__[held]
+        return parts[name] if name in parts else nn.Module.__getattr__(module, name)
+
+    return property(part)
+
+
+class CameraPair(GeometryModule):
+    """What a `Warp` is beside its calls: source, target, rotation and options; and where target pixels lie."""
+
+    is_an_operator: ClassVar[bool] = True
+    """Whether compiled code calls it as one: the cameras and the rotation are all there is to it."""
+    batch_shape: torch.Size
+    mode: Mode
+    padding_mode: PaddingMode
+    _tolerance: float | None
+    _memos: dict[PaddingMode, Memo]
+    _constants: Memo
+    _pinned: Sampling | Lattice | None
+    source: Camera = _part("_modules", "source")
+    target: Camera = _part("_modules", "target")
+    rotation: Tensor | None = _part("_buffers", "rotation")
+    fill: tuple[float, ...]
+    antialias: bool
+
+    def _set(self, source: Camera, target: Camera, options: Options, batch: torch.Size | None = None) -> None:
+        if batch is None:
+            batch = broadcast_shapes(source.batch_shape, target.batch_shape)
+        super().__init__(
+            {"source": source, "target": target},
+            batch_shape=batch,
+            mode=options["mode"],
+            padding_mode=options["padding_mode"],
+            fill=options["fill"],
+            antialias=options["antialias"],
+            _tolerance=options["tolerance"],
+            _memos={},
+            _pinned=None,
+            _constants=Memo(),
+        )
+        seam_of(source)  # while its values may be looked at: traced code asks for it too
+
+    def turned_by(self, rotation: Tensor | None) -> Self:
+        """This warp, made without a rotation, with one that is not checked: (3, 3) or (B, 3, 3)."""
+        self.put("rotation", rotation, persistent=rotation is not None and not rotation.requires_grad)
+        if rotation is not None and rotation.shape[:-2] != self.batch_shape:
+            self.batch_shape = broadcast_shapes(self.batch_shape, rotation.shape[:-2])
+        return self
+
+    @property
+    def tolerance(self) -> float:
+        """Pixels of the source by which sampling positions may be off."""
+        if self._tolerance is not None:
+            return self._tolerance
+        single = all(camera.intrinsics.dtype == torch.float32 for camera in (self.source, self.target))
+        return _SINGLE if single else 0.0
+
+    # -- what its positions follow from
+
+    def _inputs(self) -> list[Tensor]:
+        """All tensors that they depend on."""
+        (source, target), rotation = self._ends, self.rotation
+        found = [*source._tensors, *target._tensors]
+        return found if rotation is None else [*found, rotation]
+
+    def _locate(self, rows: range, padding: PaddingMode, tolerance: float) -> Sampling | Lattice:
+        """Those of some rows of the target, which serve a padding, within a tolerance."""
+        return locate(self._sampled, self._ends[1], self.rotation, tolerance, self.antialias, rows, padding)
+
+    @property
+    def _ends(self) -> tuple[Camera, Camera]:
+        """Source and target, by which positions are found."""
+        return self.source, self.target
+
+    @property
+    def _seam(self) -> Seam | None:
+        """By how much the source's images become longer before they are sampled."""
+        return seam_of(self._ends[0])
+
+    @property
+    def _sampled(self) -> Camera:
+        """The source, of these images."""
+        source, seam = self._ends[0], self._seam
+        return source if seam is None else seam.before(source)
+
+    def _move(self, pixels: Numbers, back: bool = False, on_image: bool = False) -> tuple[Tensor, Tensor]:
+        """Return pixels of the source on the target's image, or back, and whether there is one; see `moved_pixels`."""
+        (source, target), rotation = self._ends, self.rotation
+        if back:
+            source, target, rotation = target, source, None if rotation is None else rotation.mT
+        return moved_pixels(source, target, rotation, pixels, on_image)
