@@ -121,6 +121,7 @@ class Camera(Freezable):
     """
 
     _repr_html_ = as_html
+    image_size: tuple[int, int] | None
     tensor_names: ClassVar[tuple[str, ...]] = ("intrinsics", "distortion")
     memo_names: ClassVar[tuple[str, ...]] = ("_memo", "_rays", "_fields")
     intrinsics: Tensor = _held("intrinsics", "(*B, 4) fx, fy, cx, cy in pixels.")

@@ -15,7 +15,7 @@ from camtorch.values.module import GeometryModule
 from camtorch.warp.grid import Lattice, Sampling, locate
 from camtorch.warp.moving import moved_pixels
 from camtorch.warp.panorama import Seam, seam_of
-from camtorch.warp.sampling import Mode, Options, PaddingMode
+from camtorch.warp.sampling import Options, PaddingMode
 
 _SINGLE = 1e-3  # pixels: some ulps of a position in an image a thousand pixels wide, computed in float32
 
@@ -36,7 +36,6 @@ class CameraPair(GeometryModule):
     is_an_operator: ClassVar[bool] = True
     """Whether compiled code calls it as one: the cameras and the rotation are all there is to it."""
     batch_shape: torch.Size
-    mode: Mode
     padding_mode: PaddingMode
     _tolerance: float | None
     _memos: dict[PaddingMode, Memo]
@@ -45,7 +44,6 @@ class CameraPair(GeometryModule):
     source: Camera = _part("_modules", "source")
     target: Camera = _part("_modules", "target")
     rotation: Tensor | None = _part("_buffers", "rotation")
-    fill: tuple[float, ...]
     antialias: bool
 
     def _set(self, source: Camera, target: Camera, options: Options, batch: torch.Size | None = None) -> None:

@@ -87,6 +87,11 @@ class Warp(CameraPair):
     """
 
     _decides = False  # for itself where to antialias
+    batch_shape: torch.Size
+    mode: Mode
+    padding_mode: PaddingMode
+    fill: tuple[float, ...]
+    antialias: bool
     _has_shutters: ClassVar[bool] = False
     keeps_lens: ClassVar[bool] = False
     """Whether it may follow another warp, and is then what `follow` makes of that."""

@@ -14,6 +14,7 @@ import camtorch as ct
 import camtorch.augment.kornia as fronts
 import camtorch.augment.numpy
 import camtorch.augment.sample
+from camtorch.poses import rotations
 from camtorch.warp import sampling
 
 A = ct.augment
@@ -40,7 +41,7 @@ def sample(lens, count=3, number=12, seed=0):
     points = torch.randn(count, number, 3, generator=generator, dtype=torch.float64) * 0.3
     points = (points + torch.tensor([0.0, 0.0, 1.5])).to(dtype)
     pose = torch.eye(4).repeat(count, 1, 1).double()
-    pose[:, :3, :3] = ct.rotations.rotation_matrix(torch.randn(count, 3, generator=generator).double())
+    pose[:, :3, :3] = rotations.rotation_matrix(torch.randn(count, 3, generator=generator).double())
     pose[:, :3, 3] = torch.randn(count, 3, generator=generator).double() + 2
     return {
         "keypoints": lens.project(points)[0],
@@ -91,7 +92,7 @@ def test_the_camera_follows_every_edit(name, model):
     back = edit.inverse(out)
     for key in ("keypoints", "points", "gaze", "head_pose"):
         torch.testing.assert_close(back[key], given[key], atol=1e-9, rtol=0)
-    turns = [ct.rotations.rotation_matrix(s["rvec"]) for s in (back, given)]
+    turns = [rotations.rotation_matrix(s["rvec"]) for s in (back, given)]
     torch.testing.assert_close(*turns, atol=1e-9, rtol=0)
 
 
@@ -174,7 +175,7 @@ def test_an_independent_computation_agrees(names):
         ("rotation", out["rotation"][0], total),
         ("head", out["head_pose"][0, :3, :3], total @ pose[:3, :3] @ mirror),
         ("place", out["head_pose"][0, :3, 3], total @ pose[:3, 3]),
-        *[("rvec", *(ct.rotations.rotation_matrix(s["rvec"][0]).numpy() for s in (out, given)))],
+        *[("rvec", *(rotations.rotation_matrix(s["rvec"][0]).numpy() for s in (out, given)))],
     ):
         expected = total @ expected @ mirror if name == "rvec" else expected
         np.testing.assert_allclose(found, expected, atol=1e-9 if name == "keypoints" else 1e-12, err_msg=name)

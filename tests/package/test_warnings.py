@@ -38,4 +38,5 @@ def test_there_is_one_way_to_warn():
     calls = {
         path.relative_to(folder).as_posix() for path in folder.rglob("*.py") if "warnings.warn(" in path.read_text()
     }
-    assert calls == {"_arguments.py", "native/library.py"}  # the library is loaded at its first use, wherever that is
+    # the library is loaded at its first use, wherever that is
+    assert calls == {"values/arguments.py", "native/library.py"}
