@@ -11,7 +11,7 @@ from torch import Tensor
 from camtorch.calibration.calibrate import Model, as_model
 from camtorch.cameras.camera import Camera, fixed_camera
 from camtorch.convert import fitting, views
-from camtorch.convert.conversion import Conversion
+from camtorch.convert.result import Conversion
 from camtorch.models import UCM
 from camtorch.rays.lattices import angles_from_axis
 from camtorch.values.arguments import Numbers, as_image_size, as_values

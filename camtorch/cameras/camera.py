@@ -7,7 +7,7 @@ import functools
 import importlib
 import inspect
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, MutableMapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, cast
 
 import torch
@@ -17,7 +17,6 @@ from typing_extensions import Self, TypeVar
 
 from camtorch.cameras.editing import check_crop, edited_by, quarter_turns
 from camtorch.cameras.freezing import PREFIX, Freezable, with_frozen
-from camtorch.cameras.notebook import as_html
 from camtorch.cameras.numbers import (
     at_a_glance,
     camera_of_fov,
@@ -27,7 +26,7 @@ from camtorch.cameras.numbers import (
     replaced,
     warn_of_exchange,
 )
-from camtorch.convert.conversion import Conversion, convert
+from camtorch.convert.result import Conversion
 from camtorch.evaluate.kept import Memo
 from camtorch.evaluate.known import is_predicted
 from camtorch.poses.extrinsics import Extrinsics
@@ -35,17 +34,45 @@ from camtorch.projection.evaluation import evaluated, mapped
 from camtorch.projection.project import Project
 from camtorch.projection.unproject import Unproject
 from camtorch.rays.depth import backproject
-from camtorch.rays.explanation import explain
 from camtorch.rays.fields import local_pinhole, on_image, over_image, patch_centres, perspective_field, plucker
 from camtorch.rays.lattices import field_of_view
-from camtorch.rays.polyline import project_polyline
 from camtorch.values.arguments import LEFT, Numbers, as_image_size, as_whole, broadcast_shapes, hinting, shown
 from camtorch.values.module import remade, typed_as
 from camtorch.values.registry import register
 
 Model = TypeVar("Model", bound="Camera", default="Camera")
 
-MODELS: dict[str, type[Camera]] = {}
+
+class _Models(MutableMapping[str, "type[Camera]"]):
+    """The classes that are defined, and the files of others, each of which is imported when its key is looked up."""
+
+    def __init__(self) -> None:
+        self.classes: dict[str, type[Camera]] = {}
+        self.files: dict[str, str] = {}
+
+    def __getitem__(self, key: str) -> type[Camera]:
+        if key not in self.classes and key in self.files:
+            importlib.import_module(self.files[key])
+        return self.classes[key]
+
+    def __setitem__(self, key: str, model: type[Camera]) -> None:
+        self.classes[key] = model
+
+    def __delitem__(self, key: str) -> None:
+        del self.classes[key]
+        self.files.pop(key, None)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter({**self.files, **self.classes})
+
+    def __len__(self) -> int:
+        return len({**self.files, **self.classes})
+
+    def __repr__(self) -> str:
+        return f"MODELS({', '.join(self)})"
+
+
+MODELS = _Models()
 """Every camera model by its key; defining a model adds it."""
 
 _ELSEWHERE = {
@@ -120,7 +147,6 @@ class Camera(Freezable):
             states no model.
     """
 
-    _repr_html_ = as_html
     image_size: tuple[int, int] | None
     tensor_names: ClassVar[tuple[str, ...]] = ("intrinsics", "distortion")
     memo_names: ClassVar[tuple[str, ...]] = ("_memo", "_rays", "_fields")
@@ -362,6 +388,8 @@ class Camera(Freezable):
         Returns:
             Pixels (M, 2) of each curve; none where nothing is seen. Where an edge is cut has no gradient.
         """
+        from camtorch.rays.polyline import project_polyline  # a room that few calls need
+
         return project_polyline(self, points, extrinsics)
 
     _evaluate = evaluated
@@ -496,6 +524,8 @@ class Camera(Freezable):
             ...", "beyond the fold at ... degrees: ..." or "beyond the edge of the surface at ..."; angles from the
             optical axis, along the azimuth of the point.
         """
+        from camtorch.rays.explanation import explain  # a room that few calls need
+
         return explain(self, points)
 
     # -- the camera of an edited image. It has no Parameters of its own while the original learns: its intrinsics are
@@ -591,6 +621,8 @@ class Camera(Freezable):
             TypeError: no camera model. ValueError: an unknown key, a count that the model does not take, a
                 `max_angle` that is not positive or beyond pi, a `tolerance` that is not positive.
         """
+        from camtorch.convert.conversion import convert  # a room that few calls need
+
         return convert(
             self,
             cast("type[Model]", as_model(model, f"{type(self).__name__}.convert")),
@@ -601,6 +633,11 @@ class Camera(Freezable):
             tolerance=tolerance,
             **options,
         )
+
+    def _repr_html_(self) -> str:
+        from camtorch.cameras.notebook import as_html  # which notebooks alone need
+
+        return as_html(self)
 
     def extra_repr(self) -> str:
         """Batch, size and, for a single camera, its numbers."""

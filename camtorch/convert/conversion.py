@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, Generic, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -15,51 +14,14 @@ from camtorch.convert import views
 from camtorch.convert.fitting import fit, refine_minimax
 from camtorch.convert.measuring import Reference, measure, reference
 from camtorch.convert.relations import carry_over, default_count
+from camtorch.convert.result import CameraT, Conversion
 from camtorch.projection.camera_like import CameraLike
 from camtorch.values.arguments import as_image_size, as_number, as_whole
 from camtorch.values.module import remade
 
-CameraT = TypeVar("CameraT", bound=CameraLike, covariant=True)
-
 _FIT_SIDE = 33  # of the lattice of pixels to fit to
 _ROWS = 64  # of a batch that are worked on at a time
 _WORTH_IT = 0.5  # of the largest error before: then more coefficients are taken
-
-
-@dataclass
-class Conversion(Generic[CameraT]):
-    """A camera of another model and how it differs from the one that it was made of.
-
-    Compared are the pixels at which both see the same rays, on a lattice over the image of the old camera, its outer
-    edges included; without an image, on rays in all directions. Each number has the batch shape of the camera.
-    """
-
-    camera: CameraT
-    """The new camera."""
-    rms: Tensor
-    """The root of the mean squared distance in pixels, up to `max_angle`."""
-    max_error: Tensor
-    """The largest distance in pixels, up to `max_angle`."""
-    max_angle: Tensor
-    """The angle from the optical axis, in radians, up to which the new camera has a pixel for each compared ray, and
-    beyond which nothing is promised: the image's largest, the one asked for, or where the new model ends."""
-    valid_fraction: Tensor
-    """The part of the image, of what the old camera has rays for, that lies within `max_angle`."""
-    exact: Tensor
-    """Bool: the models are related, and the numbers were taken over bit by bit; what differs is rounding."""
-    source_name: str = "camera"
-
-    def __repr__(self) -> str:
-        many = f" x {self.rms.numel()}" if self.rms.ndim else ""
-        head = f"{self.source_name} -> {type(self.camera).__name__}{many}: "
-        if bool(self.exact.all()):
-            text = "exact"
-        else:
-            worst = "at worst " if self.rms.ndim else ""
-            text = f"{worst}rms {float(self.rms.max()):.3g} px, max {float(self.max_error.max()):.3g} px"
-        angle, part = math.degrees(float(self.max_angle.min())), 100 * float(self.valid_fraction.min())
-        what = "the image" if self.camera.image_size else "the rays"
-        return f"Conversion({head}{text}, up to {angle:.1f} degrees, {part:.4g} % of {what})"
 
 
 @torch.no_grad()

@@ -5,34 +5,41 @@ here is a map between the directions from one point and pixels. `OrthographicFis
 another thing.
 """
 
+import importlib
+from typing import TYPE_CHECKING, Any
+
 from camtorch.cameras.camera import MODELS
-from camtorch.models.brown_conrady import BrownConrady
-from camtorch.models.cylindrical import Cylindrical
-from camtorch.models.division import Division
-from camtorch.models.double_sphere import DoubleSphere
-from camtorch.models.equirectangular import Equirectangular
-from camtorch.models.equisolid import Equisolid
-from camtorch.models.eucm import EUCM
-from camtorch.models.f_theta import FTheta
-from camtorch.models.f_theta import FThetaSheared as FThetaSheared
-from camtorch.models.f_theta_backward import FThetaBackward
-from camtorch.models.f_theta_backward import FThetaBackwardSheared as FThetaBackwardSheared
-from camtorch.models.fisheye62 import Fisheye62
-from camtorch.models.fisheye624 import Fisheye624, FisheyeRadTanThinPrism
-from camtorch.models.fov import FOV
-from camtorch.models.kannala_brandt import KannalaBrandt
-from camtorch.models.lat_lon import LatLon
-from camtorch.models.mei import Mei
-from camtorch.models.ocamcalib import OCamCalib
-from camtorch.models.orthographic_fisheye import OrthographicFisheye
-from camtorch.models.pinhole import Pinhole
-from camtorch.models.splined import Splined
-from camtorch.models.stereographic import Stereographic
-from camtorch.models.tabulated import Tabulated
-from camtorch.models.thin_prism_fisheye import ThinPrismFisheye
-from camtorch.models.transverse_cylindrical import TransverseCylindrical
-from camtorch.models.ucm import UCM
-from camtorch.models.woodscape import WoodScape
+from camtorch.values.arguments import LEFT
+
+if TYPE_CHECKING:
+    from camtorch.models.brown_conrady import BrownConrady as BrownConrady
+    from camtorch.models.cylindrical import Cylindrical as Cylindrical
+    from camtorch.models.division import Division as Division
+    from camtorch.models.double_sphere import DoubleSphere as DoubleSphere
+    from camtorch.models.equirectangular import Equirectangular as Equirectangular
+    from camtorch.models.equisolid import Equisolid as Equisolid
+    from camtorch.models.eucm import EUCM as EUCM
+    from camtorch.models.f_theta import FTheta as FTheta
+    from camtorch.models.f_theta import FThetaSheared as FThetaSheared
+    from camtorch.models.f_theta_backward import FThetaBackward as FThetaBackward
+    from camtorch.models.f_theta_backward import FThetaBackwardSheared as FThetaBackwardSheared
+    from camtorch.models.fisheye62 import Fisheye62 as Fisheye62
+    from camtorch.models.fisheye624 import Fisheye624 as Fisheye624
+    from camtorch.models.fisheye624 import FisheyeRadTanThinPrism as FisheyeRadTanThinPrism
+    from camtorch.models.fov import FOV as FOV
+    from camtorch.models.kannala_brandt import KannalaBrandt as KannalaBrandt
+    from camtorch.models.lat_lon import LatLon as LatLon
+    from camtorch.models.mei import Mei as Mei
+    from camtorch.models.ocamcalib import OCamCalib as OCamCalib
+    from camtorch.models.orthographic_fisheye import OrthographicFisheye as OrthographicFisheye
+    from camtorch.models.pinhole import Pinhole as Pinhole
+    from camtorch.models.splined import Splined as Splined
+    from camtorch.models.stereographic import Stereographic as Stereographic
+    from camtorch.models.tabulated import Tabulated as Tabulated
+    from camtorch.models.thin_prism_fisheye import ThinPrismFisheye as ThinPrismFisheye
+    from camtorch.models.transverse_cylindrical import TransverseCylindrical as TransverseCylindrical
+    from camtorch.models.ucm import UCM as UCM
+    from camtorch.models.woodscape import WoodScape as WoodScape
 
 __all__ = [
     "EUCM",
@@ -63,3 +70,52 @@ __all__ = [
     "TransverseCylindrical",
     "WoodScape",
 ]
+
+# the file of each class, which is imported when the class, or its key in MODELS, is asked for
+_FILES = {
+    "BrownConrady": "brown_conrady",
+    "Cylindrical": "cylindrical",
+    "Division": "division",
+    "DoubleSphere": "double_sphere",
+    "Equirectangular": "equirectangular",
+    "Equisolid": "equisolid",
+    "EUCM": "eucm",
+    "FTheta": "f_theta",
+    "FThetaSheared": "f_theta",
+    "FThetaBackward": "f_theta_backward",
+    "FThetaBackwardSheared": "f_theta_backward",
+    "Fisheye62": "fisheye62",
+    "Fisheye624": "fisheye624",
+    "FisheyeRadTanThinPrism": "fisheye624",
+    "FOV": "fov",
+    "KannalaBrandt": "kannala_brandt",
+    "LatLon": "lat_lon",
+    "Mei": "mei",
+    "OCamCalib": "ocamcalib",
+    "OrthographicFisheye": "orthographic_fisheye",
+    "Pinhole": "pinhole",
+    "Splined": "splined",
+    "Stereographic": "stereographic",
+    "Tabulated": "tabulated",
+    "ThinPrismFisheye": "thin_prism_fisheye",
+    "TransverseCylindrical": "transverse_cylindrical",
+    "UCM": "ucm",
+    "WoodScape": "woodscape",
+}
+_KEYS = {"LatLon": "latlon", "FThetaSheared": "f_theta_sheared", "FThetaBackwardSheared": "f_theta_backward_sheared"}
+"""Of classes whose key is not the name of the file."""
+
+
+MODELS.files.update({_KEYS.get(name, file): f"{__name__}.{file}" for name, file in _FILES.items()})
+
+if not TYPE_CHECKING:  # a checker knows the names, and no others
+
+    def __getattr__(name: str) -> Any:
+        if name not in _FILES:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}. {LEFT}")
+        globals()[name] = found = getattr(importlib.import_module(f"{__name__}.{_FILES[name]}"), name)
+        return found
+
+
+def __dir__() -> list[str]:
+    return [*_FILES, *globals()]
