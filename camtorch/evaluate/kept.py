@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from typing import Any
 
 import torch
@@ -39,11 +40,18 @@ class Memo:
                 return entry[2]
         if in_transform():  # what a transform makes dies with it
             return compute()
-        # what inference mode makes could not be used in a graph later
-        with torch.inference_mode(False), torch.no_grad():
+        with torch.inference_mode(False), torch.no_grad():  # what that makes could not be used in a graph later
             copies = [t.clone() for t in inputs]
             result = compute()
         self._kept, self.result = [(options, copies, result), *self._kept[: self.capacity - 1]], result
+        return result
+
+    def renew(self, compute: Callable[[], Any]) -> Any:
+        """`compute()`, which is the result from now on."""
+        if in_transform():  # what a transform makes dies with it
+            return compute()
+        with torch.inference_mode(False) if torch.is_inference_mode_enabled() else nullcontext():
+            self.result = result = compute()
         return result
 
     def copies(

@@ -23,9 +23,14 @@ def values_of(tensor: Tensor) -> Tensor | None:
     return tensor.detach().to("cpu", torch.float64) if is_concrete(tensor) else None
 
 
+def are_free(*tensors: Tensor) -> bool:
+    """Return whether nothing records what is computed of tensors, which lie in the CPU's memory."""
+    return is_eager(*tensors) and not keeps_graph(*tensors)
+
+
 def are_numbers(*tensors: Tensor) -> bool:
     """Whether nothing records what is computed of tensors, which lie in the CPU's memory and may be looked at."""
-    return is_eager(*tensors) and not keeps_graph(*tensors) and all(type(t) in _PLAIN for t in tensors)
+    return are_free(*tensors) and all(type(t) in _PLAIN for t in tensors)
 
 
 _PLAIN = Tensor, nn.Parameter

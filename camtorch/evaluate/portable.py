@@ -10,6 +10,8 @@ from functools import reduce
 import torch
 from torch import Tensor
 
+from camtorch.evaluate.regime import keeps_graph
+
 _recording = False
 
 
@@ -19,12 +21,12 @@ def is_portable_export() -> bool:
 
 
 @contextmanager
-def portable_export() -> Iterator[None]:
-    """Record a camera so in here."""
+def portable_export(inputs: Tensor) -> Iterator[int]:
+    """Record a camera so in here; yields the order of the derivatives by inputs that the record must have."""
     global _recording
     before, _recording = _recording, True
     try:
-        yield
+        yield 1 if keeps_graph(inputs) else 0
     finally:
         _recording = before
 

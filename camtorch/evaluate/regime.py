@@ -66,6 +66,16 @@ def in_memory(tensor: Tensor) -> bool:
     return mine == _PLAIN or (keys | _DENSE).raw_repr() == _PLAIN
 
 
+def nothing_is_under_way() -> bool:
+    """Return whether torch neither compiles nor transforms, nor has shapes alone: of all that could be, asked once."""
+    return not (
+        torch.compiler.is_compiling()
+        or torch._C._functorch.peek_interpreter_stack() is not None
+        or forward_ad._current_level >= 0
+        or torch._C._get_dispatch_mode(FAKE_MODE) is not None
+    )
+
+
 def is_recorded() -> bool:
     """Whether torch's operators are recorded, or a mode changes what they do: what goes past them would be lost."""
     return in_jit_trace() or torch._C._len_torch_dispatch_stack() > 0

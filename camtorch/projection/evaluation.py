@@ -4,30 +4,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from contextlib import nullcontext
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor, nn
-from torch.autograd import Function, forward_ad
+from torch.autograd import Function
 from torch.nn.utils import parametrize
 
+from camtorch.evaluate.door import is_native, way_of
 from camtorch.evaluate.export import is_constant, with_values
 from camtorch.evaluate.kept import Memo
+from camtorch.evaluate.known import are_free
 from camtorch.evaluate.portable import portable_export
-from camtorch.evaluate.regime import (
-    FAKE_MODE,
-    has_tangent,
-    in_jit_trace,
-    in_memory,
-    in_transform,
-    is_concrete,
-    is_eager,
-    is_exporting,
-    is_recorded,
-    keeps_graph,
-)
 from camtorch.projection.camera_like import CameraLike
 from camtorch.projection.project import Project
 from camtorch.projection.rows import Cameras, unusable
@@ -74,34 +63,22 @@ def evaluated(
     else the formula, recorded by torch. lead: the batch dims that C counts. cameras_of: what is kept of the tensors,
     if others than this camera are meant.
     """
-    if is_exporting() and cameras_of is None and is_constant(camera) and all(isinstance(side, int) for side in lead):
+    if cameras_of is None and is_constant(camera) and all(isinstance(side, int) for side in lead):
         with with_values(camera):
             intrinsics, distortion = (per_row(t, lead, rows) for t in camera._tensors)
             cameras = rows_of(camera, intrinsics, distortion).with_all_tables()
-        order = 1 if keeps_graph(rows) else 0
-        with portable_export():
+        with portable_export(rows) as order:
             return direction.traced(type(camera), rows, intrinsics, distortion, cameras, order)
     intrinsics, distortion = (per_row(t, lead, rows) for t in tensors)
     inputs, cameras_of = (rows, intrinsics, distortion), cameras_of or partial(rows_of, camera)
-    if _is_plain(inputs):
-        if in_jit_trace() and torch.onnx.is_in_onnx_export():
-            raise RuntimeError(
-                f"{type(camera).__name__}: torch.onnx.export(dynamo=False) cannot record a camera; dynamo=True can. "
-                "What a frozen camera or warp keeps is a constant: camera.rays() and warp(images), with "
-                "requires_grad_(False) and called once before the export"
-            )
-        if in_memory(rows) and not is_recorded():
-            cameras = cameras_of(intrinsics, distortion)
-            if (made := cameras.native) is not None:
-                learns = rows.requires_grad or intrinsics.requires_grad or distortion.requires_grad
-                if learns and torch.is_grad_enabled():
-                    planes, valid = _Native.apply(*inputs, cameras, type(camera), direction)  # type: ignore[no-untyped-call]
-                    return planes, valid
-                return direction.native(made, rows.detach())[:2]
-    # what is compiled has no derivatives of derivatives
-    order = 1 if torch.compiler.is_compiling() else 2
-    known = all(is_concrete(t) and not has_tangent(t) for t in inputs[1:])
-    return direction.traced(type(camera), *inputs, cameras_of(*inputs[1:]) if known else None, order)
+    way = way_of(*inputs, owner=type(camera).__name__)
+    known = cameras_of(intrinsics, distortion) if way.is_known else None
+    if way.is_native and known is not None and (made := known.native) is not None:
+        if way.learns:
+            planes, valid = _Native.apply(*inputs, known, type(camera), direction)  # type: ignore[no-untyped-call]
+            return planes, valid
+        return direction.native(made, rows.detach())[:2]
+    return direction.traced(type(camera), *inputs, known, way.order)
 
 
 def compiled_of(cameras: Sequence[CameraLike], *values: Tensor) -> tuple[list[Native], bool] | None:
@@ -116,9 +93,7 @@ def compiled_of(cameras: Sequence[CameraLike], *values: Tensor) -> tuple[list[Na
             return None
         pairs.append(camera._tensors)
         inputs += pairs[-1]
-    if not (dtype.is_floating_point and is_eager(*inputs)):
-        return None
-    if torch.is_grad_enabled() and any(t.requires_grad for t in inputs):
+    if not (dtype.is_floating_point and are_free(*inputs)):
         return None
     made = []
     for camera, (intrinsics, distortion) in zip(cameras, pairs, strict=True):
@@ -165,7 +140,7 @@ class _Native(Function):
             return (None,) * 6
         rows, intrinsics, distortion, *kept = ctx.saved_tensors
         wanted, cameras = ctx.needs_input_grad, ctx.cameras
-        if torch.is_grad_enabled() or is_recorded() or not in_memory(by_planes):
+        if torch.is_grad_enabled() or not is_native(by_planes):
             again = _by_formula(ctx, (rows, intrinsics, distortion), by_planes)
             return *again, None, None, None
         of_parameters = wanted[1] or wanted[2]
@@ -209,25 +184,9 @@ def _warn_of_unusable(camera: CameraLike, cameras: Cameras, usable: Tensor) -> N
         )
 
 
-def _is_plain(inputs: Sequence[Tensor]) -> bool:
-    """Whether nothing is traced and no transform is under way, of all that could be: asked once a call."""
-    if (
-        torch.compiler.is_compiling()
-        or torch._C._functorch.peek_interpreter_stack() is not None
-        or forward_ad._current_level >= 0
-        or torch._C._get_dispatch_mode(FAKE_MODE) is not None
-    ):
-        return False
-    return all((type(t) is Tensor and not t.is_meta) or is_concrete(t) for t in inputs)
-
-
 def new_cameras(memo: Memo, model: type[CameraLike], intrinsics: Tensor, distortion: Tensor) -> Cameras:
     """The cameras (C,) of one model, kept in a memo."""
-    if in_transform():  # what a transform makes dies with it
-        return Cameras(model, intrinsics, distortion)
-    # what inference mode makes could not be used in a graph later
-    with torch.inference_mode(False) if torch.is_inference_mode_enabled() else nullcontext():
-        memo.result = cameras = Cameras(model, intrinsics, distortion)
+    cameras: Cameras = memo.renew(lambda: Cameras(model, intrinsics, distortion))
     return cameras
 
 

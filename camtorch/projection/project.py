@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from camtorch.evaluate.recorded import as_kept, positive, power_of_two, to_planes, without_keeping
 from camtorch.optics.charts import Planes3, floor_of
 from camtorch.projection import compiled
 from camtorch.projection.camera_like import CameraLike
-from camtorch.projection.ops import as_kept, positive, power_of_two, to_planes, without_keeping
 from camtorch.projection.rows import Cameras, Traced, replace, to_mask
 from camtorch.values.arguments import columns
 

@@ -8,11 +8,12 @@ import torch
 from torch import Tensor
 
 from camtorch.evaluate.portable import is_portable_export, times
+from camtorch.evaluate.recorded import order_of, positive, to_planes, without_keeping
 from camtorch.optics.lens import newton_step
 from camtorch.optics.radial_inverse import MOST_STEPS, short, solve
 from camtorch.projection import compiled
 from camtorch.projection.camera_like import CameraLike
-from camtorch.projection.ops import order_of, positive, search_in_place, search_open, to_planes, without_keeping
+from camtorch.projection.ops import search_in_place, search_open
 from camtorch.projection.rows import Cameras, Planes2, Traced, replace, to_mask
 from camtorch.projection.solve import search
 from camtorch.values.arguments import columns

@@ -1,0 +1,94 @@
+"""What torch records of the formula, in the form that its compilers make least of: planes, masks, kept values."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+import torch
+from torch import Tensor
+from torch.utils.checkpoint import checkpoint
+
+from camtorch.evaluate.regime import in_transform, is_for_here, keeps_graph
+
+Result = TypeVar("Result")
+
+
+@torch.library.custom_op("camtorch::transposed", mutates_args=())
+def _transposed(points: Tensor, to_planes: bool) -> Tensor:
+    if not to_planes:
+        return torch.stack(points.unbind(0), -1)
+    planes = points.new_empty(points.shape[-1], *points.shape[:-1])
+    for plane, interleaved in zip(planes, points.unbind(-1), strict=True):
+        torch.sub(interleaved, 0, out=plane)  # twice as fast as a copy, and bit for bit the same
+    return planes
+
+
+@_transposed.register_fake
+def _(points: Tensor, to_planes: bool) -> Tensor:
+    size = points.shape
+    return points.new_empty((size[-1], *size[:-1]) if to_planes else (*size[1:], size[0]))
+
+
+def _note_way(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+    ctx.to_planes = inputs[1]
+
+
+_transposed.register_autograd(
+    lambda ctx, cotangent: (_transposed(cotangent, not ctx.to_planes), None), setup_context=_note_way
+)
+
+
+def to_planes(rows: Tensor) -> tuple[Tensor, ...]:
+    """(C, N, size) as planes (C, N). Compiled code for CPUs reads interleaved planes one by one."""
+    interleaved = is_for_here() and rows.device.type == "cpu" and rows.stride(-2) != 1
+    interleaved = interleaved and not in_transform()  # the operator has no forward mode
+    return (_transposed(rows, True) if interleaved else rows.movedim(-1, 0)).unbind(0)
+
+
+@torch.library.custom_op("camtorch::positive", mutates_args=())
+def _positive(mask: Tensor) -> Tensor:
+    return mask > 0
+
+
+@_positive.register_fake
+def _(mask: Tensor) -> Tensor:
+    return torch.empty_like(mask, dtype=torch.bool)
+
+
+def positive(mask: Tensor) -> Tensor:
+    """The mask as bool. Compiled code for CPUs writes bools one by one: ten times slower than this detour."""
+    compiled = is_for_here() and mask.device.type == "cpu"
+    return _positive(mask.detach()) if compiled else mask > 0
+
+
+def as_kept(plane: Tensor) -> Tensor:
+    """The plane, for inductor to compute once: it repeats the whole expression of what is used twice while it compiles.
+
+    That grows exponentially with the depth. Of views by strides it knows that they need a place in memory.
+    """
+    return torch.as_strided(plane, plane.shape, plane.stride()) if is_for_here() else plane
+
+
+def power_of_two(size: Tensor) -> Tensor:
+    """The largest one not above: to divide by it costs no bit."""
+    if torch.compiler.is_compiling():  # which leaves its vectors for bits
+        return size
+    if in_transform():  # torch.vmap looks at no bits before torch 2.11
+        return size / torch.frexp(size).mantissa / 2
+    exponent, integer = (0x7F800000, torch.int32) if size.dtype == torch.float32 else (0x7FF << 52, torch.int64)
+    return (size.view(integer) & exponent).view(size.dtype)
+
+
+def order_of(order: int, *inputs: Tensor) -> int:
+    """Of the derivatives that a recorded inverse has to have: compiled code that does not learn needs none."""
+    compiled = torch.compiler.is_compiling() and not in_transform()
+    return 0 if compiled and not keeps_graph(*inputs) else order
+
+
+def without_keeping(function: Callable[..., Result], *inputs: Tensor) -> Result:
+    """`function(*inputs)`; where that is compiled, backward computes it again from the inputs, which alone are kept."""
+    if torch.compiler.is_compiling() and torch.is_grad_enabled() and any(t.requires_grad for t in inputs):
+        result: Result = checkpoint(function, *inputs, use_reentrant=False, preserve_rng_state=False)
+        return result
+    return function(*inputs)
