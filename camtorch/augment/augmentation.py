@@ -18,8 +18,8 @@ from camtorch.augment.filling import enough, filled, scaled
 from camtorch.augment.sample import Named, Sample, SampleOptions, SampleTransform, Unknown, fixed_copy, on_samples
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.mixed import Mixed
+from camtorch.evaluate.door import is_concrete, may_look
 from camtorch.evaluate.known import are_numbers, known_false, known_true
-from camtorch.evaluate.regime import is_concrete, may_look
 from camtorch.values.arguments import GUESS_CAMERA, as_flag, as_mapping, as_number, as_part, as_whole, shown, warn
 from camtorch.values.module import typed_as
 from camtorch.warp.warp import Warp

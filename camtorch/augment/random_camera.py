@@ -23,9 +23,9 @@ from camtorch.augment.sample import Named, fixed_copy
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.numbers import joined, split
 from camtorch.cameras.opaque import CameraNumbers, opaque
+from camtorch.evaluate.door import in_graph, is_eager
 from camtorch.evaluate.kept import Memo
 from camtorch.evaluate.known import are_numbers, known_false
-from camtorch.evaluate.regime import in_graph, is_eager
 from camtorch.lenses.drawing import FOLD, covering, drawn
 from camtorch.models import MODELS, KannalaBrandt
 from camtorch.optics.radial_inverse import precise

@@ -23,8 +23,8 @@ from camtorch.augment.change import Change, Part, View, alone, as_one
 from camtorch.augment.clips import Clips
 from camtorch.augment.landmarks import Mirroring, exchanged
 from camtorch.cameras.camera import Camera
+from camtorch.evaluate.door import may_look
 from camtorch.evaluate.known import are_numbers, known_false
-from camtorch.evaluate.regime import may_look
 from camtorch.models import Pinhole
 from camtorch.poses.rotations import are_rotations, check_rotation, rotation_matrix, rotation_vector
 from camtorch.values.arguments import (

@@ -31,8 +31,8 @@ from camtorch.evaluate.kept import Memo
 from camtorch.evaluate.known import is_predicted
 from camtorch.poses.extrinsics import Extrinsics
 from camtorch.projection.evaluation import evaluated, mapped
-from camtorch.projection.project import Project
-from camtorch.projection.unproject import Unproject
+from camtorch.projection.project import PROJECT
+from camtorch.projection.unproject import UNPROJECT
 from camtorch.rays.depth import backproject
 from camtorch.rays.fields import local_pinhole, on_image, over_image, patch_centres, perspective_field, plucker
 from camtorch.rays.lattices import field_of_view
@@ -360,7 +360,7 @@ class Camera(Freezable):
             lies before the fold of the lens. Whether the pixel is on the image is another question: `contains`.
             An invalid point gets the pixel (-1, -1) and zero gradient.
         """
-        return mapped(self, Project, points, "points", 3)
+        return mapped(self, PROJECT, points, "points", 3)
 
     def unproject(self, pixels: Numbers) -> tuple[Tensor, Tensor]:
         """The ray through each pixel.
@@ -372,7 +372,7 @@ class Camera(Freezable):
             rays (*B, *N, 3) of unit length (a point at distance d is `rays * d`), and valid (*B, *N) bool: the
             ray projects to this pixel. An invalid pixel gets the optical axis (0, 0, 1) and zero gradient.
         """
-        return mapped(self, Unproject, pixels, "pixels", 2)
+        return mapped(self, UNPROJECT, pixels, "pixels", 2)
 
     def project_polyline(self, points: Numbers, extrinsics: Extrinsics | None = None) -> list[Tensor]:
         """The curves that straight edges in space become: a 3D box in a fisheye's image, a lane, a horizon.
@@ -393,6 +393,11 @@ class Camera(Freezable):
         return project_polyline(self, points, extrinsics)
 
     _evaluate = evaluated
+
+    @property
+    def _tensors(self) -> tuple[Tensor, ...]:
+        """All that the camera learns, or could."""
+        return self.intrinsics, self.distortion
 
     # -- the image
 

@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from camtorch.cameras.numbers import joined, split
+from camtorch.evaluate.door import is_concrete
 from camtorch.evaluate.known import are_numbers, known_false
-from camtorch.evaluate.regime import is_concrete
 from camtorch.optics.radial_inverse import precise
 from camtorch.projection.camera_like import CameraLike
 from camtorch.values.arguments import as_image_size

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from typing_extensions import Self
 
-from camtorch.evaluate.regime import in_transform, is_concrete, is_recorded
+from camtorch.evaluate.door import in_transform, is_concrete, is_recorded
 from camtorch.projection.camera_like import CameraLike
 from camtorch.values.module import is_parameter
 

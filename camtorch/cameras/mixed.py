@@ -17,15 +17,13 @@ from typing_extensions import Self
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.numbers import as_numbers_of
 from camtorch.evaluate.kept import Memo
-from camtorch.projection.evaluation import new_cameras, per_row
+from camtorch.projection.evaluation import kept_cameras, per_row
 from camtorch.projection.evaluation import rows_of as camera_rows
-from camtorch.projection.project import Project
-from camtorch.projection.unproject import Unproject
 from camtorch.values.arguments import Numbers, as_image_size, as_points, no_camera, shown, working_dtype
 from camtorch.values.module import refused_index, remade
 
 if TYPE_CHECKING:
-    from camtorch.projection.rows import Cameras
+    from camtorch.projection.rows import Cameras, Direction
 
 
 class _Group(NamedTuple):
@@ -177,7 +175,7 @@ class Mixed(Camera):
 
     def _evaluate(
         self,
-        direction: type[Project] | type[Unproject],
+        direction: Direction,
         rows: Tensor,
         lead: torch.Size,
         tensors: Sequence[Tensor],
@@ -203,9 +201,7 @@ class Mixed(Camera):
         group = self._groups[n]
 
         def cameras(intrinsics: Tensor, distortion: Tensor) -> Cameras:
-            found: Cameras | None = group.memo.result
-            if found is None or not found.are(intrinsics, distortion):
-                found = new_cameras(group.memo, group.model, intrinsics, distortion)
+            found = kept_cameras(group.memo, group.model, intrinsics, distortion)
             if found.usable is not None:
                 for member in map(self._member, group.members):
                     if not member._warned:

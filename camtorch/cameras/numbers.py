@@ -12,8 +12,8 @@ from torch import Tensor, nn
 from torch.nn.utils.parametrize import type_before_parametrizations
 
 from camtorch.cameras.freezing import INTRINSICS, frozen_names
+from camtorch.evaluate.door import is_eager
 from camtorch.evaluate.known import is_kept, is_predicted, known_false, row_of, values_of
-from camtorch.evaluate.regime import is_eager
 from camtorch.optics.radial_inverse import precise
 from camtorch.projection.camera_like import CameraLike
 from camtorch.rays.lattices import AXES, focal_for

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from camtorch.evaluate.regime import is_exporting, is_fake, keeps_graph, set_aside
+from camtorch.evaluate.door import is_exporting, is_fake, keeps_graph, set_aside
 
 
 def is_constant(module: nn.Module) -> bool:

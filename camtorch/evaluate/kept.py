@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from camtorch.evaluate.regime import has_tangent, in_graph, in_transform, is_concrete, is_eager
+from camtorch.evaluate.door import has_tangent, in_graph, in_transform, is_concrete, is_eager
 
 
 class Memo:

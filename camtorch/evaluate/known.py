@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from camtorch.evaluate.regime import in_graph, is_concrete, is_eager, keeps_graph, may_look
+from camtorch.evaluate.door import in_graph, is_concrete, is_eager, keeps_graph, may_look
 
 
 def known_false(condition: Tensor) -> bool:

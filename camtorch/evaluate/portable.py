@@ -10,7 +10,7 @@ from functools import reduce
 import torch
 from torch import Tensor
 
-from camtorch.evaluate.regime import keeps_graph
+from camtorch.evaluate.door import keeps_graph
 
 _recording = False
 

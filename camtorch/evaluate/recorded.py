@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from camtorch.evaluate.regime import in_transform, is_for_here, keeps_graph
+from camtorch.evaluate.door import in_transform, is_for_here, keeps_graph
 
 Result = TypeVar("Result")
 

@@ -10,8 +10,8 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
+from camtorch.evaluate.door import set_aside
 from camtorch.evaluate.portable import is_portable_export, times
-from camtorch.evaluate.regime import set_aside
 from camtorch.optics.charts import Chart, Equidistant, Planes3, even_steps_and_ratios
 from camtorch.optics.radial import RadialFactor
 from camtorch.optics.radial_inverse import RadialInverse

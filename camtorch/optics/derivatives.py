@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from camtorch.evaluate.regime import in_transform, is_concrete
+from camtorch.evaluate.door import in_transform, is_concrete
 
 
 def goes_forward(tensor: Tensor) -> bool:

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
+from camtorch.evaluate.door import is_concrete
 from camtorch.evaluate.kept import Memo
 from camtorch.evaluate.portable import as_index, is_portable_export, of_points, repeat, times
-from camtorch.evaluate.regime import is_concrete
 from camtorch.optics.charts import even_steps_and_ratios
 from camtorch.values.arguments import columns
 from camtorch.values.registry import CLASSES

@@ -28,6 +28,9 @@ class CameraLike(ModelSpec, BatchedModule):
         distortion: Tensor
 
         @property
+        def _tensors(self) -> tuple[Tensor, ...]: ...
+
+        @property
         def fov(self) -> Tensor: ...
 
         def project(self, points: Numbers) -> tuple[Tensor, Tensor]: ...
@@ -41,11 +44,6 @@ class CameraLike(ModelSpec, BatchedModule):
         def _evaluate(
             self, direction: Any, rows: Tensor, lead: Any, tensors: Any, cameras_of: Any = None
         ) -> tuple[Tensor, Tensor]: ...
-
-    @property
-    def _tensors(self) -> tuple[Tensor, ...]:
-        """All that the camera learns, or could."""
-        return self.intrinsics, self.distortion
 
     @property
     def _form(self) -> tuple[object, ...]:

@@ -431,7 +431,18 @@ def project(native: Native, points: Tensor) -> tuple[Tensor, Tensor]:
     cameras, count, _ = points.shape
     pixels = _empty((2, cameras, count), native.dtype)
     valid = torch.empty(cameras, count, dtype=torch.bool, device="cpu")
-    rows = points.data_ptr(), *points.stride(), *_planes(pixels, cameras, count), valid.data_ptr(), 0, *_NO_ROWS, 0
+    rows = (
+        points.data_ptr(),
+        *points.stride(),
+        pixels.data_ptr(),
+        count,
+        1,
+        cameras * count,
+        valid.data_ptr(),
+        0,
+        *_NO_ROWS,
+        0,
+    )
     _call_and_follow(native, cameras, count, PROJECT, rows)
     return pixels, valid
 
@@ -451,7 +462,7 @@ def unproject(native: Native, pixels: Tensor, keeps: bool = False) -> Unprojecte
     valid = torch.empty(cameras, count, dtype=torch.bool, device="cpu")
     solution = _empty((2, cameras, count), native.dtype) if keeps else None
     native.add_table()
-    rows = pixels.data_ptr(), *pixels.stride(), *_planes(rays, cameras, count), valid.data_ptr()
+    rows = pixels.data_ptr(), *pixels.stride(), rays.data_ptr(), count, 1, cameras * count, valid.data_ptr()
     _call_and_follow(native, cameras, count, UNPROJECT, (*rows, _address(solution), *_NO_ROWS, 0))
     return Unprojected(rays, valid, solution)
 
@@ -634,11 +645,6 @@ def _empty(size: tuple[int, int, int], dtype: torch.dtype) -> Tensor:
 def _sums(native: Native, cameras: int, count: int) -> Tensor:
     tiles = -(-count // _TILE)
     return torch.zeros(cameras, tiles, 4 + native.parameters, dtype=torch.float64, device="cpu")
-
-
-def _planes(results: Tensor, cameras: int, count: int) -> tuple[int, int, int, int]:
-    """Where new ones lie, (size, C, N), and their strides by camera, point and component."""
-    return results.data_ptr(), count, 1, cameras * count
 
 
 def _points(results: Tensor | None) -> tuple[int, ...]:

@@ -12,30 +12,27 @@ from torch import Tensor, nn
 from torch.autograd import Function
 from torch.nn.utils import parametrize
 
-from camtorch.evaluate.door import is_native, way_of
+from camtorch.evaluate.door import is_exporting, is_native, way_of
 from camtorch.evaluate.export import is_constant, with_values
 from camtorch.evaluate.kept import Memo
 from camtorch.evaluate.known import are_free
 from camtorch.evaluate.portable import portable_export
 from camtorch.projection.camera_like import CameraLike
-from camtorch.projection.project import Project
-from camtorch.projection.rows import Cameras, unusable
-from camtorch.projection.unproject import Unproject
+from camtorch.projection.rows import Cameras, Direction, unusable
 from camtorch.values.arguments import Numbers, as_points, warn
 
 if TYPE_CHECKING:
     from camtorch.projection.compiled import Native
 
 
-def mapped(
-    camera: CameraLike, direction: type[Project] | type[Unproject], values: Numbers, name: str, size: int
-) -> tuple[Tensor, Tensor]:
+def mapped(camera: CameraLike, direction: Direction, values: Numbers, name: str, size: int) -> tuple[Tensor, Tensor]:
     """Values (*B, *N, size) by compiled code, or by the recorded formula: see `evaluated`."""
     batch, tensors = camera.batch_shape, camera._tensors
     lead, dims = batch, len(batch)
     if (
         not isinstance(values, Tensor)
-        or any(t.dtype != values.dtype for t in tensors)
+        or values.dtype != tensors[0].dtype
+        or values.dtype != tensors[-1].dtype  # those of a Mixed are all alike
         or values.device != tensors[0].device
         or values.layout is not torch.strided
         or values.ndim <= dims
@@ -51,7 +48,7 @@ def mapped(
 
 def evaluated(
     camera: CameraLike,
-    direction: type[Project] | type[Unproject],
+    direction: Direction,
     rows: Tensor,
     lead: torch.Size,
     tensors: Sequence[Tensor],
@@ -63,13 +60,13 @@ def evaluated(
     else the formula, recorded by torch. lead: the batch dims that C counts. cameras_of: what is kept of the tensors,
     if others than this camera are meant.
     """
-    if cameras_of is None and is_constant(camera) and all(isinstance(side, int) for side in lead):
+    if is_exporting() and cameras_of is None and is_constant(camera) and all(isinstance(side, int) for side in lead):
         with with_values(camera):
             intrinsics, distortion = (per_row(t, lead, rows) for t in camera._tensors)
             cameras = rows_of(camera, intrinsics, distortion).with_all_tables()
         with portable_export(rows) as order:
-            return direction.traced(type(camera), rows, intrinsics, distortion, cameras, order)
-    intrinsics, distortion = (per_row(t, lead, rows) for t in tensors)
+            return direction.formula(type(camera), rows, intrinsics, distortion, cameras, order)
+    intrinsics, distortion = per_row(tensors[0], lead, rows), per_row(tensors[1], lead, rows)
     inputs, cameras_of = (rows, intrinsics, distortion), cameras_of or partial(rows_of, camera)
     way = way_of(*inputs, owner=type(camera).__name__)
     known = cameras_of(intrinsics, distortion) if way.is_known else None
@@ -77,8 +74,9 @@ def evaluated(
         if way.learns:
             planes, valid = _Native.apply(*inputs, known, type(camera), direction)  # type: ignore[no-untyped-call]
             return planes, valid
-        return direction.native(made, rows.detach())[:2]
-    return direction.traced(type(camera), *inputs, known, way.order)
+        planes, valid, *_ = direction.native(made, rows.detach())
+        return planes, valid
+    return direction.formula(type(camera), *inputs, known, way.order)
 
 
 def compiled_of(cameras: Sequence[CameraLike], *values: Tensor) -> tuple[list[Native], bool] | None:
@@ -122,11 +120,11 @@ class _Native(Function):
         distortion: Tensor,
         cameras: Cameras,
         model: type[CameraLike],
-        direction: type[Project] | type[Unproject],
+        direction: Direction,
     ) -> tuple[Tensor, Tensor]:
         made = cameras.native
         assert made is not None  # who calls has looked
-        planes, valid, kept = direction.native(made, rows, keeps=True)
+        planes, valid, kept = direction.native_keeping(made, rows)
         ctx.save_for_backward(rows, intrinsics, distortion, *kept)
         ctx.cameras, ctx.model, ctx.direction = cameras, model, direction
         ctx.mark_non_differentiable(valid)
@@ -153,19 +151,31 @@ def _by_formula(ctx: Any, inputs: Sequence[Tensor], by_planes: Tensor) -> tuple[
     wanted = ctx.needs_input_grad[:3]
     leaves = [t for t, needed in zip(inputs, wanted, strict=True) if needed]
     with torch.enable_grad():
-        planes, _ = ctx.direction.traced(ctx.model, *inputs, ctx.cameras)
+        planes, _ = ctx.direction.formula(ctx.model, *inputs, ctx.cameras)
         gradients = iter(torch.autograd.grad(planes, leaves, by_planes, create_graph=True, materialize_grads=True))
     return tuple([next(gradients) if needed else None for needed in wanted])
 
 
 def rows_of(camera: CameraLike, intrinsics: Tensor, distortion: Tensor) -> Cameras:
     """The rows' cameras, kept until a value changes."""
-    cameras: Cameras | None = camera._memo.result
-    if cameras is None or not cameras.are(intrinsics, distortion):
-        cameras = new_cameras(camera._memo, type(camera), intrinsics, distortion)
+    cameras = kept_cameras(camera._memo, type(camera), intrinsics, distortion)
     if cameras.usable is not None and not camera._warned:
         _warn_of_unusable(camera, cameras, cameras.usable)
     return cameras
+
+
+def kept_cameras(memo: Memo, model: type[CameraLike], intrinsics: Tensor, distortion: Tensor) -> Cameras:
+    """The cameras (C,) of one model, kept in a memo until a value changes."""
+    cameras: Cameras | None = memo.result
+    if cameras is not None:
+        given = cameras.given if intrinsics.ndim == 2 else cameras.alone
+        for now, then in ((intrinsics, given[0]), (distortion, given[1])):
+            if now.dtype != then.dtype or now.device != then.device or not torch.equal(now, then):
+                break
+        else:
+            return cameras
+    made: Cameras = memo.renew(lambda: Cameras(model, intrinsics, distortion))
+    return made
 
 
 def _warn_of_unusable(camera: CameraLike, cameras: Cameras, usable: Tensor) -> None:
@@ -182,12 +192,6 @@ def _warn_of_unusable(camera: CameraLike, cameras: Cameras, usable: Tensor) -> N
             f"{name}: {found[0]}{where} became unusable: {found[1]}. All its results are invalid "
             f"and its gradients zero from here on. A smaller learning rate keeps it from there{keeps}",
         )
-
-
-def new_cameras(memo: Memo, model: type[CameraLike], intrinsics: Tensor, distortion: Tensor) -> Cameras:
-    """The cameras (C,) of one model, kept in a memo."""
-    cameras: Cameras = memo.renew(lambda: Cameras(model, intrinsics, distortion))
-    return cameras
 
 
 def per_row(parameters: Tensor, lead: torch.Size, rows: Tensor) -> Tensor:

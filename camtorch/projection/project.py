@@ -11,7 +11,7 @@ from camtorch.evaluate.recorded import as_kept, positive, power_of_two, to_plane
 from camtorch.optics.charts import Planes3, floor_of
 from camtorch.projection import compiled
 from camtorch.projection.camera_like import CameraLike
-from camtorch.projection.rows import Cameras, Traced, replace, to_mask
+from camtorch.projection.rows import Cameras, Direction, Traced, replace, to_mask
 from camtorch.values.arguments import columns
 
 if TYPE_CHECKING:
@@ -38,51 +38,39 @@ def _normalise(chart: Chart, x: Tensor, y: Tensor, z: Tensor) -> tuple[Planes3, 
     return (x, y, z), mask
 
 
-class Project:
-    """Rows of points (C, N, 3), intrinsics (C, 4), distortion (C, n) -> pixels (2, C, N), valid (C, N)."""
+def _formula(
+    model: type[CameraLike],
+    points: Tensor,
+    intrinsics: Tensor,
+    distortion: Tensor,
+    cameras: Cameras | None,
+    order: int = 2,
+) -> tuple[Tensor, Tensor]:
+    """Points (C, N, 3) to pixels (2, C, N), and valid (C, N); see `Direction.formula`."""
+    usual = Traced.of(model, intrinsics, distortion, cameras)
 
-    @staticmethod
-    def traced(
-        model: type[CameraLike],
-        points: Tensor,
-        intrinsics: Tensor,
-        distortion: Tensor,
-        cameras: Cameras | None,
-        order: int = 2,
-    ) -> tuple[Tensor, Tensor]:
-        """Evaluate the formula, recorded in a graph or by a transform.
+    def evaluate(x: Tensor, y: Tensor, z: Tensor, intrinsics: Tensor, distortion: Tensor) -> tuple[Tensor, Tensor]:
+        chart, lens = usual.optics(distortion)
+        rays, mask = _normalise(chart, x, y, z)
+        a, b = chart.to_plane(*rays, order)
+        if lens.stages:
+            t = torch.addcmul(a * a, b, b)
+            inside = as_kept(to_mask(usual.domain.margin(a.detach(), b.detach(), t.detach())))
+            a, b, t = (replace(inside, w, 0.0) for w in (a, b, t))
+            mask = mask * inside
+            a, b = lens.at(a, b, 0, t).value
+        seen = mask if usual.usable is None else mask * usual.usable
+        focal_x, focal_y, centre_x, centre_y = columns(intrinsics)
+        planes = focal_x * a + centre_x, focal_y * b + centre_y
+        pixels = torch.stack([replace(seen, w, INVALID_PIXEL) for w in planes])
+        return pixels, seen.expand_as(pixels[0])
 
-        cameras: those of the parameters, if values may be looked at. order: of the derivatives that have to be exact.
-        """
-        usual = Traced.of(model, intrinsics, distortion, cameras)
+    pixels, mask = without_keeping(evaluate, *to_planes(points), usual.intrinsics, usual.distortion)
+    return pixels, positive(mask)
 
-        def evaluate(x: Tensor, y: Tensor, z: Tensor, intrinsics: Tensor, distortion: Tensor) -> tuple[Tensor, Tensor]:
-            chart, lens = usual.optics(distortion)
-            rays, mask = _normalise(chart, x, y, z)
-            a, b = chart.to_plane(*rays, order)
-            if lens.stages:
-                t = torch.addcmul(a * a, b, b)
-                inside = as_kept(to_mask(usual.domain.margin(a.detach(), b.detach(), t.detach())))
-                a, b, t = (replace(inside, w, 0.0) for w in (a, b, t))
-                mask = mask * inside
-                a, b = lens.at(a, b, 0, t).value
-            seen = mask if usual.usable is None else mask * usual.usable
-            focal_x, focal_y, centre_x, centre_y = columns(intrinsics)
-            planes = focal_x * a + centre_x, focal_y * b + centre_y
-            pixels = torch.stack([replace(seen, w, INVALID_PIXEL) for w in planes])
-            return pixels, seen.expand_as(pixels[0])
 
-        pixels, mask = without_keeping(evaluate, *to_planes(points), usual.intrinsics, usual.distortion)
-        return pixels, positive(mask)
+def _keeping(native: compiled.Native, points: Tensor) -> tuple[Tensor, Tensor, tuple[Tensor, ...]]:
+    return *compiled.project(native, points), (points,)
 
-    @staticmethod
-    def native(made: compiled.Native, points: Tensor, keeps: bool = False) -> tuple[Tensor, Tensor, tuple[Tensor, ...]]:
-        """The same by the compiled geometry, without a graph, and what `native_vjp` needs: the points."""
-        return *compiled.project(made, points), (points,)
 
-    @staticmethod
-    def native_vjp(
-        made: compiled.Native, points: Tensor, by_pixels: Tensor, want_points: bool, want_parameters: bool
-    ) -> tuple[Tensor | None, Tensor | None]:
-        """The cotangents of points and of the formula's parameters."""
-        return compiled.project_vjp(made, points, by_pixels, want_points, want_parameters)
+PROJECT = Direction(_formula, compiled.project, _keeping, compiled.project_vjp)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -38,12 +38,14 @@ class Cameras:
     given: tuple[Tensor, Tensor]
     intrinsics: Tensor
     k: Tensor
+    alone: tuple[Tensor, Tensor]
+    """`given`, as it was given: without a dim of cameras where there was none."""
     usable: Tensor | None
 
     def __init__(self, model: type[CameraLike], intrinsics: Tensor, distortion: Tensor):
         """Of concrete values (C, 4), (C, n); or (4,), (n,) of one."""
         self._model, self._learns = model, distortion.requires_grad
-        self._alone = values = intrinsics.detach().clone(), distortion.detach().clone()
+        self.alone = values = intrinsics.detach().clone(), distortion.detach().clone()
         if intrinsics.ndim == 1:
             values = values[0][None], values[1][None]
         self.given, self.usable = values, None
@@ -57,14 +59,6 @@ class Cameras:
     def domain(self) -> Domain:
         """That of the lenses."""
         return _domain(self._model, self.k, self._learns)
-
-    def are(self, intrinsics: Tensor, distortion: Tensor) -> bool:
-        """Whether they are those of these values."""
-        given = self.given if intrinsics.ndim == 2 else self._alone
-        for now, then in ((intrinsics, given[0]), (distortion, given[1])):
-            if now.dtype != then.dtype or now.device != then.device or not torch.equal(now, then):
-                return False
-        return True
 
     def with_all_tables(self) -> Cameras:
         """The same with all that a graph may ask for."""
@@ -148,6 +142,22 @@ def unusable(camera: CameraLike, intrinsics: Tensor, distortion: Tensor) -> tupl
 def _ideal(model: type[CameraLike], intrinsics: Tensor, distortion: Tensor) -> tuple[float, float | Tensor]:
     ideal = model.ideal(distortion.shape[-1])
     return 1.0, distortion.new_tensor(ideal) if any(ideal) else 0.0
+
+
+class Direction(NamedTuple):
+    """One direction of cameras (C,) of a model, of rows (C, N, size): as torch records it, and in compiled code."""
+
+    formula: Callable[..., tuple[Tensor, Tensor]]
+    """Of model, rows, intrinsics (C, 4), distortion (C, n), cameras and order, to planes (size, C, N), valid (C, N).
+
+    cameras: those of the parameters, if values may be looked at. order: of the derivatives that have to be exact.
+    """
+    native: Callable[[compiled.Native, Tensor], tuple[Any, ...]]
+    """Of compiled cameras and rows to planes, valid, and perhaps more."""
+    native_keeping: Callable[[compiled.Native, Tensor], tuple[Tensor, Tensor, tuple[Tensor, ...]]]
+    """To planes, valid, and what `native_vjp` needs of the call."""
+    native_vjp: Callable[..., tuple[Tensor | None, Tensor | None]]
+    """The cotangents of rows and of the numbers of the cameras."""
 
 
 class Traced(NamedTuple):

@@ -14,7 +14,7 @@ from camtorch.optics.radial_inverse import MOST_STEPS, short, solve
 from camtorch.projection import compiled
 from camtorch.projection.camera_like import CameraLike
 from camtorch.projection.ops import search_in_place, search_open
-from camtorch.projection.rows import Cameras, Planes2, Traced, replace, to_mask
+from camtorch.projection.rows import Cameras, Direction, Planes2, Traced, replace, to_mask
 from camtorch.projection.solve import search
 from camtorch.values.arguments import columns
 
@@ -148,73 +148,60 @@ def _to_target(u: Tensor, v: Tensor, intrinsics: tuple[Tensor, ...]) -> tuple[Pl
     return (p, q), mask
 
 
-class Unproject:
-    """Rows of pixels (C, N, 2), intrinsics (C, 4), distortion (C, n) -> rays (3, C, N), valid (C, N)."""
-
-    @staticmethod
-    def traced(
-        model: type[CameraLike],
-        pixels: Tensor,
-        intrinsics: Tensor,
-        distortion: Tensor,
-        cameras: Cameras | None,
-        order: int = 2,
-    ) -> tuple[Tensor, Tensor]:
-        """The formula, recorded in a graph or by a transform; see `Project.traced`."""
-        usual = Traced.of(model, intrinsics, distortion, cameras)
-        domain = usual.domain
-        u, v = to_planes(pixels)
-        # the solution has no graph; `attach` gives it its derivatives
-        (p, q), mask = _to_target(u.detach(), v.detach(), columns(usual.intrinsics.detach()))
-        mask = mask if usual.usable is None else mask * usual.usable
-        a, b = p, q = replace(mask, p, 0.0), replace(mask, q, 0.0)
-        if domain.lens.stages:
-            found = invert(domain, p, q)
-            if is_portable_export():
-                found = _search_recorded(domain, (p, q), found)
-            elif torch.compiler.is_compiling():
-                search_in_place(model._model, domain.k, p, q, *found)
-            else:
-                a, b, solved = search_open(model._model, domain.k, p, q, *found)
-                found = Found(a, b, solved, found.possible)
-            a, b, solved = found.a, found.b, found.solved
+def _formula(
+    model: type[CameraLike],
+    pixels: Tensor,
+    intrinsics: Tensor,
+    distortion: Tensor,
+    cameras: Cameras | None,
+    order: int = 2,
+) -> tuple[Tensor, Tensor]:
+    """Pixels (C, N, 2) to rays (3, C, N), and valid (C, N); see `Direction.formula`."""
+    usual = Traced.of(model, intrinsics, distortion, cameras)
+    domain = usual.domain
+    u, v = to_planes(pixels)
+    # the solution has no graph; `attach` gives it its derivatives
+    (p, q), mask = _to_target(u.detach(), v.detach(), columns(usual.intrinsics.detach()))
+    mask = mask if usual.usable is None else mask * usual.usable
+    a, b = p, q = replace(mask, p, 0.0), replace(mask, q, 0.0)
+    if domain.lens.stages:
+        found = invert(domain, p, q)
+        if is_portable_export():
+            found = _search_recorded(domain, (p, q), found)
+        elif torch.compiler.is_compiling():
+            search_in_place(model._model, domain.k, p, q, *found)
         else:
-            solved = domain.chart.on_plane(p, q)
-        solved = to_mask(solved)
-        seen = domain.chart.seen(replace(solved, a, 0.0), replace(solved, b, 0.0))
-        solved = solved if seen is None else solved * to_mask(seen)
-        mask, a, b = mask * solved, replace(solved, a, 0.0), replace(solved, b, 0.0)
+            a, b, solved = search_open(model._model, domain.k, p, q, *found)
+            found = Found(a, b, solved, found.possible)
+        a, b, solved = found.a, found.b, found.solved
+    else:
+        solved = domain.chart.on_plane(p, q)
+    solved = to_mask(solved)
+    seen = domain.chart.seen(replace(solved, a, 0.0), replace(solved, b, 0.0))
+    solved = solved if seen is None else solved * to_mask(seen)
+    mask, a, b = mask * solved, replace(solved, a, 0.0), replace(solved, b, 0.0)
 
-        def evaluate(u: Tensor, v: Tensor, intrinsics: Tensor, distortion: Tensor) -> Tensor:
-            chart, lens = usual.optics(distortion)
-            (p, q), _ = _to_target(u, v, columns(intrinsics))
-            p, q = replace(mask, p, 0.0), replace(mask, q, 0.0)
-            here = (p, q) if not lens.stages else attach(lens, (a, b), (p, q), order) if order else (a, b)
-            rays = zip(chart.to_ray(*here, order), (0.0, 0.0, 1.0), strict=True)
-            return torch.stack([replace(mask, w, axis) for w, axis in rays])
+    def evaluate(u: Tensor, v: Tensor, intrinsics: Tensor, distortion: Tensor) -> Tensor:
+        chart, lens = usual.optics(distortion)
+        (p, q), _ = _to_target(u, v, columns(intrinsics))
+        p, q = replace(mask, p, 0.0), replace(mask, q, 0.0)
+        here = (p, q) if not lens.stages else attach(lens, (a, b), (p, q), order) if order else (a, b)
+        rays = zip(chart.to_ray(*here, order), (0.0, 0.0, 1.0), strict=True)
+        return torch.stack([replace(mask, w, axis) for w, axis in rays])
 
-        order = order_of(order, pixels, intrinsics, distortion)
-        rays = without_keeping(evaluate, u, v, usual.intrinsics, usual.distortion)
-        return rays, positive(mask.expand_as(a))
+    order = order_of(order, pixels, intrinsics, distortion)
+    rays = without_keeping(evaluate, u, v, usual.intrinsics, usual.distortion)
+    return rays, positive(mask.expand_as(a))
 
-    @staticmethod
-    def native(made: compiled.Native, pixels: Tensor, keeps: bool = False) -> tuple[Tensor, Tensor, tuple[Tensor, ...]]:
-        """The same by the compiled geometry, without a graph, and what `native_vjp` needs of it, if it is kept."""
-        rays, valid, solution = compiled.unproject(made, pixels, keeps)
-        # a copy: what is handed out belongs to the caller
-        return rays, valid, (valid.clone(), solution) if solution is not None else ()
 
-    @staticmethod
-    def native_vjp(
-        made: compiled.Native,
-        valid: Tensor,
-        solution: Tensor,
-        by_rays: Tensor,
-        want_pixels: bool,
-        want_parameters: bool,
-    ) -> tuple[Tensor | None, Tensor | None]:
-        """The cotangents of pixels and of the formula's parameters."""
-        return compiled.unproject_vjp(made, valid, solution, by_rays, want_pixels, want_parameters)
+def _keeping(native: compiled.Native, pixels: Tensor) -> tuple[Tensor, Tensor, tuple[Tensor, ...]]:
+    rays, valid, solution = compiled.unproject(native, pixels, keeps=True)
+    assert solution is not None  # it is asked for
+    # a copy: what is handed out belongs to the caller
+    return rays, valid, (valid.clone(), solution)
+
+
+UNPROJECT = Direction(_formula, compiled.unproject, _keeping, compiled.unproject_vjp)
 
 
 def _search_recorded(domain: Domain, target: Planes2, found: Found) -> Found:

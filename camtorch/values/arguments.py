@@ -16,8 +16,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from camtorch.evaluate.door import is_concrete, may_look
 from camtorch.evaluate.known import is_kept, is_predicted, known_false, row_of
-from camtorch.evaluate.regime import is_concrete, may_look
 
 Numbers: TypeAlias = Tensor | np.ndarray[Any, Any] | np.number[Any] | float | list[Any] | tuple[Any, ...]
 """What users pass as numbers: a tensor, an array, a number, or lists of them."""

@@ -11,10 +11,10 @@ from torch import Tensor, nn
 from torch.nn.utils.parametrize import type_before_parametrizations
 from typing_extensions import Self
 
-from camtorch.evaluate.kept import Memo
-from camtorch.evaluate.regime import (
+from camtorch.evaluate.door import (
     in_graph,
 )
+from camtorch.evaluate.kept import Memo
 from camtorch.values.arguments import LEFT, shown
 
 P = ParamSpec("P")

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.opaque import opaque
-from camtorch.evaluate.regime import in_transform, is_concrete, keeps_graph
+from camtorch.evaluate.door import in_transform, is_concrete, keeps_graph
 from camtorch.native.sampler import empty
 from camtorch.values.arguments import Numbers, as_values, broadcast_shapes
 from camtorch.values.dtypes import SIGNED, as_pixels, narrow, widen

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from camtorch.evaluate.regime import is_eager
+from camtorch.evaluate.door import is_eager
 from camtorch.native import memory, sampler
 from camtorch.native.library import library
 from camtorch.projection import compiled

@@ -14,7 +14,7 @@ import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
 from torch import Tensor
 
 from camtorch.cameras.camera import Camera
-from camtorch.evaluate.regime import in_graph, in_jit_trace, in_transform, is_concrete, is_eager, may_look, set_aside
+from camtorch.evaluate.door import in_graph, in_jit_trace, in_transform, is_concrete, is_eager, may_look, set_aside
 from camtorch.native.library import native_available
 from camtorch.native.sampler import CUBIC, DOUBT, EMPTY, TODO, classify
 from camtorch.poses.rotations import turn

@@ -9,9 +9,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from camtorch.evaluate.export import is_constant, with_values
-from camtorch.evaluate.kept import Memo
-from camtorch.evaluate.regime import (
+from camtorch.evaluate.door import (
     in_graph,
     in_jit_trace,
     in_transform,
@@ -21,6 +19,8 @@ from camtorch.evaluate.regime import (
     keeps_graph,
     set_aside,
 )
+from camtorch.evaluate.export import is_constant, with_values
+from camtorch.evaluate.kept import Memo
 from camtorch.native.sampler import Later, empty
 from camtorch.warp import compiled
 from camtorch.warp.grid import Lattice, Sampling, scaled

@@ -11,7 +11,7 @@ import torch
 import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
 from torch import Tensor
 
-from camtorch.evaluate.regime import converted, in_transform, is_concrete, is_eager, may_look
+from camtorch.evaluate.door import converted, in_transform, is_concrete, is_eager, may_look
 from camtorch.native import sampler
 from camtorch.native.library import native_available
 from camtorch.values.arguments import as_flag, as_number, shown

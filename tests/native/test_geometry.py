@@ -11,9 +11,9 @@ import camtorch as ct
 from camtorch.native.library import native_available
 from camtorch.optics import Equidistant, Lens, Stage
 from camtorch.projection import compiled as geometry
-from camtorch.projection.project import Project
+from camtorch.projection.project import PROJECT
 from camtorch.projection.rows import Cameras
-from camtorch.projection.unproject import Unproject
+from camtorch.projection.unproject import UNPROJECT
 from camtorch.values.arguments import columns
 
 pytestmark = pytest.mark.skipif(not native_available(), reason="the library is not compiled here, or turned off")
@@ -41,7 +41,7 @@ def native(camera):
 def formula_of(camera, direction, values):
     """What the recorded formula says, (N, size), and of which it is valid; with a graph to the camera's parameters."""
     intrinsics, distortion = camera.intrinsics[None], camera.distortion[None]
-    planes, valid = direction.traced(
+    planes, valid = direction.formula(
         type(camera), values[None], intrinsics, distortion, Cameras(type(camera), intrinsics, distortion)
     )
     return planes[:, 0].mT, valid[0]
@@ -97,10 +97,10 @@ def test_projects_as_the_formula_does(key, dtype):
     p, eps = points(dtype), torch.finfo(dtype).eps
     for camera in cameras(key, dtype):
         with torch.no_grad():
-            expected, valid = formula_of(camera, Project, p)
+            expected, valid = formula_of(camera, PROJECT, p)
             exact = (camera.distortion.double(), moved(camera, 16, 3))
             others = [make(camera.key, camera.intrinsics.double(), k) for k in exact]
-            near = [formula_of(other, Project, _moved(p, 64 * eps, seed))[1] for other in others for seed in range(2)]
+            near = [formula_of(other, PROJECT, _moved(p, 64 * eps, seed))[1] for other in others for seed in range(2)]
         found, found_valid = (w[..., 0, :] for w in geometry.project(native(camera), p[None]))
         found = found.mT
         # next to a fold rounding decides
@@ -119,10 +119,10 @@ def test_unprojects_as_the_formula_does(key, dtype):
     for camera in cameras(key, dtype):
         q = pixels(camera)
         with torch.no_grad():
-            expected, valid = formula_of(camera, Unproject, q)
+            expected, valid = formula_of(camera, UNPROJECT, q)
             exact = make(camera.key, camera.intrinsics.double(), camera.distortion.double())
-            around = [formula_of(exact, Unproject, _moved(q, 32 * eps, seed)) for seed in range(2)]
-            there = formula_of(exact, Unproject, q.double())[0]
+            around = [formula_of(exact, UNPROJECT, _moved(q, 32 * eps, seed)) for seed in range(2)]
+            there = formula_of(exact, UNPROJECT, q.double())[0]
         found = geometry.unproject(native(camera), q[None], keeps=True)
         rays, found_valid = found.rays[:, 0].mT, found.valid[0]
         sure = torch.stack([ok for _, ok in around]).eq(valid).all(0)
@@ -164,12 +164,12 @@ def test_derivatives_are_those_of_the_formula(key, dtype):
         p = torch.cat((camera.unproject(q)[0].detach() * 2, q.new_tensor([[0, 0, 1], [math.nan, 0, 1]])))
         p.requires_grad_()
 
-        for direction, values, loss in ((Project, p, 256), (Unproject, q, 4096)):
+        for direction, values, loss in ((PROJECT, p, 256), (UNPROJECT, q, 4096)):
             out, _ = formula_of(camera, direction, values)
             weight = torch.randn(out.shape, generator=generator, dtype=dtype)
             expected = torch.autograd.grad(out, [values, *leaves], weight)
             rows, cotangents = values.detach()[None], weight.mT[:, None]
-            if direction is Project:
+            if direction is PROJECT:
                 by_value, sums = geometry.project_vjp(made, rows, cotangents, True, True)
             else:
                 solved = geometry.unproject(made, rows, keeps=True)
