@@ -21,6 +21,8 @@ if not TYPE_CHECKING:  # a checker knows the names, and no others
 
     def __getattr__(name: str) -> Any:
         place = PLACES.get(name)
+        if place is not None:
+            _register()
         if place is not None and place != __name__:
             module = importlib.import_module(place)
             found = getattr(module, name, None) or importlib.import_module(f"{place}.{name}")
@@ -39,5 +41,11 @@ def __dir__() -> list[str]:
     return [*__all__, *(name for name in globals() if name.startswith("__"))]
 
 
-if "torch" in sys.modules:  # what `torch.export.load` reads may have camtorch's operators
-    importlib.import_module("camtorch.cameras.opaque")
+def _register() -> None:
+    """Have torch know camtorch's operators, which `torch.export.load` may read, and batches of cameras."""
+    for file in ("opaque", "mixed"):
+        importlib.import_module(f"{__name__}.cameras.{file}")
+
+
+if "torch" in sys.modules:
+    _register()

@@ -10,12 +10,10 @@ import numpy as np
 import torch
 from torch import Tensor
 from torch.utils.data import get_worker_info
-from torch.utils.data._utils.collate import collate as collate_by
-from torch.utils.data._utils.collate import default_collate_fn_map
 
 from camtorch.augment.sending import stacked, within_message
-from camtorch.cameras.camera import Camera
-from camtorch.cameras.mixed import cat
+from camtorch.evaluate.private import collate as collate_by
+from camtorch.evaluate.private import collate_functions
 from camtorch.values.arguments import is_list
 
 
@@ -40,8 +38,8 @@ def collate(samples: Sequence[object]) -> object:
         raise TypeError(f"collate: samples must be a list of samples; got {type(samples).__name__}")
     if not samples:
         raise ValueError("collate: samples must not be empty; got an empty list")
-    others = {kind: functools.partial(_others, function) for kind, function in default_collate_fn_map.items()}
-    return collate_by(samples, collate_fn_map={**others, Tensor: _tensors, np.ndarray: _arrays})
+    others = {kind: functools.partial(_others, function) for kind, function in collate_functions().items()}
+    return collate_by(samples, {**others, Tensor: _tensors, np.ndarray: _arrays})
 
 
 def _tensors(batch: Sequence[Tensor], *, collate_fn_map: Any = None) -> Tensor | list[Tensor]:
@@ -50,7 +48,7 @@ def _tensors(batch: Sequence[Tensor], *, collate_fn_map: Any = None) -> Tensor |
     if len({tensor.shape for tensor in batch}) > 1:
         return list(batch)
     sent = stacked(batch)
-    return default_collate_fn_map[Tensor](batch, collate_fn_map=collate_fn_map) if sent is None else sent
+    return collate_functions()[Tensor](batch, collate_fn_map=collate_fn_map) if sent is None else sent
 
 
 def _arrays(batch: Sequence[np.ndarray], *, collate_fn_map: Any = None) -> Tensor | list[Tensor]:
@@ -59,14 +57,3 @@ def _arrays(batch: Sequence[np.ndarray], *, collate_fn_map: Any = None) -> Tenso
 
 def _others(function: Callable[..., Any], batch: Sequence[Any], *, collate_fn_map: Any = None) -> Any:
     return within_message(function(batch, collate_fn_map=collate_fn_map))
-
-
-def collate_cameras(batch: Sequence[Camera], *, collate_fn_map: Any = None) -> Camera | list[Camera]:
-    """Return single cameras as one batch, of several models if need be; others as a list."""
-    if get_worker_info() is not None:  # which no graph can leave
-        batch = [camera.detach() for camera in batch]
-    return list(batch) if any(camera.batch_shape for camera in batch) else cat(batch)
-
-
-# Samples that hold cameras then go through a DataLoader as they are. torch documents this map for the purpose.
-default_collate_fn_map[Camera] = collate_cameras

@@ -26,9 +26,9 @@ from torch.utils._pytree import tree_map
 from camtorch import augment
 from camtorch.augment.augmentation import Augmentation
 from camtorch.augment.change import Change
-from camtorch.augment.collate import collate_cameras
 from camtorch.augment.sample import OWN, Sample, Single, detached, kind_of, on_samples
 from camtorch.cameras.camera import Camera
+from camtorch.cameras.mixed import collate_cameras
 from camtorch.values.arguments import as_values, check_boxes, shown
 from camtorch.values.module import remade
 

@@ -22,6 +22,7 @@ from torch.multiprocessing import get_sharing_strategy
 from torch.multiprocessing.reductions import reduce_tensor
 from torch.utils.data import get_worker_info
 
+from camtorch.evaluate.private import NO_TORCH_FUNCTION
 from camtorch.native.memory import LIMIT, tensor_on
 
 _SMALL = 1 << 16
@@ -34,7 +35,7 @@ _HOME, _AWAY, _LOST = 0, 1, 2
 class _Sent(Tensor):
     """A batch in a worker, which comes out of the DataLoader as a plain tensor; so does what is computed from it."""
 
-    __torch_function__ = torch._C._disabled_torch_function_impl  # type: ignore[assignment]
+    __torch_function__ = NO_TORCH_FUNCTION
 
     def __reduce_ex__(self, protocol: Any) -> Any:
         return self.as_subclass(Tensor).__reduce_ex__(protocol)  # to files and the like

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Callable, Sequence
 from functools import wraps
 from typing import Any, NamedTuple
@@ -70,6 +71,12 @@ def opaque(shapes: Function) -> Callable[[Function], Function]:
     return decorate
 
 
+def _function(name: str) -> tuple[Function, Function]:
+    if name not in _FUNCTIONS:  # a saved program is loaded before what it calls
+        importlib.import_module(name.rpartition(".")[0])
+    return _FUNCTIONS[name]
+
+
 def _arguments(
     kinds: str, tensors: Sequence[Tensor], sizes: Sequence[int], floats: Sequence[float], camera: Callable[..., Any]
 ) -> list[Any]:
@@ -96,7 +103,7 @@ def _computed(
     def camera(model: str, *numbers: Any) -> Camera:
         return fixed_camera(CLASSES[model], *numbers)
 
-    return list(_FUNCTIONS[name][0](*_arguments(kinds, tensors, sizes, floats, camera)))
+    return list(_function(name)[0](*_arguments(kinds, tensors, sizes, floats, camera)))
 
 
 @_computed.register_fake
@@ -104,7 +111,7 @@ def _(name: str, kinds: str, tensors: Sequence[Tensor], sizes: Sequence[int], fl
     def numbers(_: str, *values: Any) -> CameraNumbers:
         return CameraNumbers(*values)
 
-    return list(_FUNCTIONS[name][1](*_arguments(kinds, tensors, sizes, floats, numbers)))
+    return list(_function(name)[1](*_arguments(kinds, tensors, sizes, floats, numbers)))
 
 
 @_computed.register_vmap

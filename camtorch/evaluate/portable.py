@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from camtorch.evaluate.door import keeps_graph
+from camtorch.evaluate.private import while_loop
 
 _recording = False
 
@@ -76,8 +77,6 @@ def repeat(
                 break
             moves, *state = step(moves, *state)
         return (moves, *state)
-    # private, and not imported with torch
-    from torch._higher_order_ops.while_loop import while_loop
 
     def goes_on(count: Tensor, moves: Tensor, *state: Tensor) -> Tensor:
         return (count < most) & moves.any()
@@ -86,8 +85,7 @@ def repeat(
         return (count + 1, *step(*state))
 
     start = (torch.zeros((), dtype=torch.int64, device=moves.device), moves, *(w.clone() for w in state))
-    result: tuple[Tensor, ...] = while_loop(goes_on, body, start)
-    return result[1:]
+    return while_loop(goes_on, body, start)[1:]
 
 
 def piece_of(nodes: tuple[Tensor, ...], place: Tensor) -> Tensor:

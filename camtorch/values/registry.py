@@ -2,9 +2,19 @@
 
 from __future__ import annotations
 
+import importlib
 from typing import Any
 
-CLASSES: dict[str, Any] = {}
+
+class _Classes(dict[str, Any]):
+    def __missing__(self, name: str) -> Any:
+        importlib.import_module(name.rpartition(".")[0])  # a saved program is loaded before what it is made of
+        if name not in self:
+            raise KeyError(name)
+        return self[name]
+
+
+CLASSES = _Classes()
 """Every class of cameras and of radial factors."""
 
 

@@ -15,6 +15,9 @@ from typing import ParamSpec, TypeVar
 
 import torch
 
+from camtorch.evaluate.door import in_jit_trace
+from camtorch.evaluate.private import TORCH_LIBRARY
+
 P = ParamSpec("P")
 R = TypeVar("R")
 
@@ -137,15 +140,13 @@ if hasattr(os, "register_at_fork"):  # not on Windows
 # process has the core of one. To a chain of a hundred operations that happens a hundred times. So such chains run on
 # one thread, or on several that each do a part of their own.
 
-_in_jit_trace: Callable[[], bool] = torch.jit.is_tracing  # type: ignore[attr-defined]
-
 
 def on_one_thread(function: Callable[P, R]) -> Callable[P, R]:
     """Leave the operations of a function undivided on the CPU; so their results are always the same."""
 
     @wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> R:
-        if torch.compiler.is_compiling() or _in_jit_trace() or _limits is None or _mine.threads:
+        if torch.compiler.is_compiling() or in_jit_trace() or _limits is None or _mine.threads:
             return function(*args, **kwargs)
         threads = torch.get_num_threads()
         if threads == 1:
@@ -178,7 +179,7 @@ def _find_limits() -> tuple[Callable[[int], object], Callable[[int], int]] | Non
     """How OpenMP, and MKL where it is used, are told among how many threads to split the work of the calling one."""
     if sys.platform == "win32":
         return None
-    torch_library = ctypes.CDLL(torch._C.__file__)
+    torch_library = ctypes.CDLL(TORCH_LIBRARY)
     openmp = getattr(torch_library, "omp_set_num_threads", None)
     return None if openmp is None else (openmp, getattr(torch_library, "MKL_Set_Num_Threads_Local", int))
 

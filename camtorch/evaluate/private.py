@@ -1,0 +1,37 @@
+"""Torch's private parts that camtorch uses beside those of `door`; tests hold them on every torch that is supported."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch.utils import _pytree as pytree  # noqa: F401 (trees with the paths of their leaves)
+
+NO_TORCH_FUNCTION: Any = torch._C._disabled_torch_function_impl
+"""The `__torch_function__` of a class of tensors of which operators make plain ones."""
+TORCH_LIBRARY: str = torch._C.__file__
+"""The shared library of torch, which has the functions of OpenMP and MKL that it uses."""
+
+
+def while_loop(condition: Callable[..., Any], body: Callable[..., Any], state: tuple[Any, ...]) -> tuple[Any, ...]:
+    """Return the state after a loop that is recorded as one."""
+    # not imported with torch
+    from torch._higher_order_ops.while_loop import while_loop as loop
+
+    result: tuple[Any, ...] = loop(condition, body, state)
+    return result
+
+
+def collate(batch: Any, functions: dict[Any, Callable[..., Any]]) -> Any:
+    """Return what `default_collate` makes of a batch, with a function for each type of its parts."""
+    from torch.utils.data._utils.collate import collate as collate_by
+
+    return collate_by(batch, collate_fn_map=functions)
+
+
+def collate_functions() -> dict[Any, Callable[..., Any]]:
+    """Return those of `default_collate`; what is added to them it knows from then on."""
+    from torch.utils.data._utils.collate import default_collate_fn_map
+
+    return default_collate_fn_map
