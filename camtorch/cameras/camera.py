@@ -33,7 +33,6 @@ from camtorch.poses.extrinsics import Extrinsics
 from camtorch.projection.evaluation import evaluated, mapped
 from camtorch.projection.project import PROJECT
 from camtorch.projection.unproject import UNPROJECT
-from camtorch.rays.depth import backproject
 from camtorch.rays.fields import local_pinhole, on_image, over_image, patch_centres, perspective_field, plucker
 from camtorch.rays.lattices import field_of_view
 from camtorch.values.arguments import LEFT, Numbers, as_image_size, as_whole, broadcast_shapes, hinting, shown
@@ -495,6 +494,8 @@ class Camera(Freezable):
         Raises:
             ValueError: another shape, integers, an unknown kind.
         """
+        from camtorch.rays.depth import backproject  # a room that few calls need
+
         return backproject(self, depth, kind)
 
     @property

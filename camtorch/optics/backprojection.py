@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from camtorch.evaluate.door import set_aside
-from camtorch.evaluate.portable import is_portable_export, times
+from camtorch.evaluate.export import is_portable_export, times
 from camtorch.optics.charts import Chart, Equidistant, Planes3, even_steps_and_ratios
 from camtorch.optics.radial import RadialFactor
 from camtorch.optics.radial_inverse import RadialInverse

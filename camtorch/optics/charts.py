@@ -13,7 +13,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from camtorch.evaluate.portable import plus
+from camtorch.evaluate.export import plus
 from camtorch.optics.special import angle_per_radius, atan2, cos_root, sinc_root, tanc_root
 
 Planes2 = tuple[Tensor, Tensor]

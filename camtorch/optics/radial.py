@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from camtorch.evaluate.portable import pick, piece_of, plus, solve_tridiagonal, unbound
+from camtorch.evaluate.export import pick, piece_of, plus, solve_tridiagonal, unbound
 from camtorch.optics.derivatives import derivatives_of
 from camtorch.optics.special import angle_per_radius, first_root, root
 from camtorch.values.registry import register

@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from camtorch.evaluate.door import is_concrete
+from camtorch.evaluate.export import as_index, is_portable_export, of_points, repeat, times
 from camtorch.evaluate.kept import Memo
-from camtorch.evaluate.portable import as_index, is_portable_export, of_points, repeat, times
 from camtorch.optics.charts import even_steps_and_ratios
 from camtorch.values.arguments import columns
 from camtorch.values.registry import CLASSES

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from camtorch.evaluate.export import of_points, plus
 from camtorch.evaluate.kept import Memo
-from camtorch.evaluate.portable import of_points, plus
 from camtorch.optics.radial_inverse import RADII, InverseTable, first_loss, fold_of, precise, tabulate, within
 from camtorch.projection.fold import AZIMUTHS, Extent, azimuth, limits_and_extent
 from camtorch.values.arguments import columns

@@ -13,10 +13,9 @@ from torch.autograd import Function
 from torch.nn.utils import parametrize
 
 from camtorch.evaluate.door import is_exporting, is_native, way_of
-from camtorch.evaluate.export import is_constant, with_values
+from camtorch.evaluate.export import is_constant, portable_export, with_values
 from camtorch.evaluate.kept import Memo
 from camtorch.evaluate.known import are_free
-from camtorch.evaluate.portable import portable_export
 from camtorch.projection.camera_like import CameraLike
 from camtorch.projection.rows import Cameras, Direction, unusable
 from camtorch.values.arguments import Numbers, as_points, warn

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
-from camtorch.evaluate.portable import as_index
+from camtorch.evaluate.export import as_index
 from camtorch.optics.radial_inverse import first_loss
 from camtorch.values.arguments import columns
 

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import torch
 from torch import Tensor
 
+from camtorch.evaluate.export import is_portable_export
 from camtorch.evaluate.known import known_true
-from camtorch.evaluate.portable import is_portable_export
 from camtorch.projection import compiled
 from camtorch.projection.camera_like import CameraLike
 from camtorch.projection.domain import Domain, domain_of

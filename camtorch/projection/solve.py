@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from camtorch.evaluate.portable import is_portable_export, repeat, times
+from camtorch.evaluate.export import is_portable_export, repeat, times
 from camtorch.optics.lens import newton_step
 from camtorch.optics.radial_inverse import bracketed
 from camtorch.projection.domain import regular

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
-from camtorch.evaluate.portable import is_portable_export, times
+from camtorch.evaluate.export import is_portable_export, times
 from camtorch.evaluate.recorded import order_of, positive, to_planes, without_keeping
 from camtorch.optics.lens import newton_step
 from camtorch.optics.radial_inverse import MOST_STEPS, short, solve
