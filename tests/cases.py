@@ -15,6 +15,7 @@ from torch.utils import _pytree as pytree
 import camtorch as ct
 from camtorch import augment as A  # noqa: N812
 from camtorch import losses, views
+from camtorch.poses.rotations import rotation_matrix
 
 SIZE = (48, 64)
 
@@ -28,7 +29,7 @@ BROWN = ct.BrownConrady([40.0, 41, 31, 24], [-0.2, 0.05, 1e-3, -5e-4], image_siz
 PINHOLE = ct.Pinhole([30.0, 30, 35.5, 19.5], image_size=(40, 72))
 BATCH = ct.Pinhole([[31.0, 30, 31, 23], [24, 25, 33, 24]], image_size=SIZE)
 PANORAMA = ct.Equirectangular([128 / 6.283185307, 64 / 3.141592653, 63.5, 31.5], image_size=(64, 128))
-TURN = ct.rotations.rotation_matrix(torch.tensor([0.12, -0.23, 0.31]))
+TURN = rotation_matrix(torch.tensor([0.12, -0.23, 0.31]))
 POSE = ct.Extrinsics([0.02, -0.05, 0.03], [-0.2, 0.02, 0.05])
 ABOVE = ct.Extrinsics([2.0, 0, 0], [0, 0.5, 1.5])
 SHUTTER = ct.RollingShutter(0.03, [0.8, 2.5, 1.6])

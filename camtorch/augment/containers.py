@@ -21,7 +21,6 @@ from kornia.constants import DataKey
 from kornia.geometry.boxes import Boxes
 from torch import Tensor, nn
 from torch.nn.utils.parametrize import type_before_parametrizations
-from torch.utils._pytree import tree_map
 
 from camtorch import augment
 from camtorch.augment.augmentation import Augmentation
@@ -29,6 +28,7 @@ from camtorch.augment.change import Change
 from camtorch.augment.sample import OWN, Sample, Single, detached, kind_of, on_samples
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.mixed import collate_cameras
+from camtorch.evaluate.private import pytree
 from camtorch.values.arguments import as_values, check_boxes, shown
 from camtorch.values.module import remade
 
@@ -120,7 +120,7 @@ def with_cameras(params: Any, cameras: Camera | Sequence[Camera]) -> Any:
 
 def _edited(params: Any, name: str, need: str) -> tuple[Any, list[tuple[Params, str]]]:
     """Return a copy of params, of one augmentation or a list, and where in it are those of a name; an error if none."""
-    result = tree_map(lambda value: value, params)
+    result = pytree.tree_map(lambda value: value, params)
     found = [(part, key) for _, part in _parts(result) for key in part if key.rpartition(".")[2] == name]
     if not found:
         raise ValueError(f"{need}; got {shown(params)}")

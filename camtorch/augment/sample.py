@@ -15,7 +15,6 @@ from typing import Any, ClassVar, ParamSpec, TypedDict, TypeVar, cast, get_args,
 import numpy as np
 import torch
 from torch import Tensor, nn
-from torch.utils._pytree import tree_map
 from torch.utils.data import get_worker_info
 from typing_extensions import Unpack
 
@@ -25,6 +24,7 @@ from camtorch.augment.landmarks import Mirroring, exchanged
 from camtorch.cameras.camera import Camera
 from camtorch.evaluate.door import may_look
 from camtorch.evaluate.known import are_numbers, known_false
+from camtorch.evaluate.private import pytree
 from camtorch.models import Pinhole
 from camtorch.poses.rotations import are_rotations, check_rotation, rotation_matrix, rotation_vector
 from camtorch.values.arguments import (
@@ -359,7 +359,7 @@ def detached(value: Any) -> Any:
         learns = isinstance(one, (Tensor, Camera)) and any(t.requires_grad for t in getattr(one, "_tensors", (one,)))
         return one.detach() if learns else one
 
-    return tree_map(of, value)
+    return pytree.tree_map(of, value)
 
 
 class SampleOptions(TypedDict, total=False):

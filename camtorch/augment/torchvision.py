@@ -15,12 +15,12 @@ from typing import Any, cast
 import numpy as np
 import torch
 from torch import Tensor
-from torch.utils._pytree import MappingKey, SequenceKey, keystr, tree_flatten_with_path, tree_unflatten
 
 from camtorch.augment.augmentation import Augmentation, FrontEnd, camera_of_sample, check_front_end
 from camtorch.augment.change import Change
 from camtorch.augment.sample import IMAGES, KEEP, KINDS, OWN, Frames, as_tensor, detached, kind_of, on_samples
 from camtorch.cameras.camera import Camera
+from camtorch.evaluate.private import pytree
 from camtorch.warp.arrays import as_planes_of
 from camtorch.warp.boxes import lattice_of, turned
 
@@ -89,12 +89,14 @@ class Transform(FrontEnd, v2.Transform):
     @on_samples
     def forward(self, *inputs: Any) -> Any:
         own = self.augmentation
-        flat, spec = tree_flatten_with_path(inputs if len(inputs) > 1 else inputs[0])
+        flat, spec = pytree.tree_flatten_with_path(inputs if len(inputs) > 1 else inputs[0])
         paths, leaves = [path for path, _ in flat], [leaf for _, leaf in flat]
         names = [_name(path) for path in paths]
         keys, fields, sizes = list(names), {}, []
         if len(set(names)) < len(names):
-            places = (keystr(path[:-1] if path and isinstance(path[-1], MappingKey) else path) for path in paths)
+            places = (
+                pytree.keystr(path[:-1] if path and isinstance(path[-1], pytree.MappingKey) else path) for path in paths
+            )
             keys = [f"{place}/{name}" for place, name in zip(places, names, strict=True)]
         for i, kind in self._kinds(flat, names).items():
             fields[i], size = _native(names[i], leaves[i], kind), getattr(leaves[i], "canvas_size", None)
@@ -119,10 +121,10 @@ class Transform(FrontEnd, v2.Transform):
                 leaves[i] = back(moved[keys[i]], change)
         for i in cameras:
             leaves[i] = moved["camera"]
-        result = tree_unflatten(leaves, spec)
+        result = pytree.tree_unflatten(leaves, spec)
         for i in fields if self.valid else ():
             path, valid = paths[i], moved.get(f"{keys[i]}_valid")
-            if valid is not None and path and isinstance(path[-1], MappingKey):
+            if valid is not None and path and isinstance(path[-1], pytree.MappingKey):
                 holder = functools.reduce(lambda held, step: step.get(held), path[:-1], result)
                 holder.setdefault(f"{names[i]}_valid", valid if isinstance(leaves[i], Tensor) else valid.numpy())
         return result
@@ -135,7 +137,7 @@ class Transform(FrontEnd, v2.Transform):
             if leaf is None or isinstance(leaf, Camera) or name in OWN:
                 continue
             # a list of plain numbers is looked at as one value
-            listed = len(path) > 1 and isinstance(path[-1], SequenceKey) and isinstance(leaf, (int, float))
+            listed = len(path) > 1 and isinstance(path[-1], pytree.SequenceKey) and isinstance(leaf, (int, float))
             kinds[i] = next((kind for of, kind in _KINDS.items() if isinstance(leaf, of)), None)
             try:
                 kinds[i] = kinds[i] or kind_of(name, [leaf] if listed else leaf, fields, _OWNER)
@@ -154,7 +156,7 @@ class Transform(FrontEnd, v2.Transform):
 def _name(path: Any) -> str:
     """Return the last key of a path that is a word, or all of it."""
     words = [getattr(step, "key", getattr(step, "name", None)) for step in path]
-    return next((word for word in reversed(words) if isinstance(word, str)), keystr(path) or "[0]")
+    return next((word for word in reversed(words) if isinstance(word, str)), pytree.keystr(path) or "[0]")
 
 
 def _native(name: str, leaf: Any, kind: str | None) -> tuple[str | None, Any, Callable[[Any, Change], Any]]:

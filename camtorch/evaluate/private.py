@@ -6,10 +6,12 @@ from collections.abc import Callable
 from typing import Any
 
 import torch
-from torch.utils import _pytree as pytree  # noqa: F401 (trees with the paths of their leaves)
+from torch.utils import _pytree
 
 NO_TORCH_FUNCTION: Any = torch._C._disabled_torch_function_impl
 """The `__torch_function__` of a class of tensors of which operators make plain ones."""
+pytree = _pytree
+"""Trees, with the paths of their leaves."""
 TORCH_LIBRARY: str = torch._C.__file__
 """The shared library of torch, which has the functions of OpenMP and MKL that it uses."""
 
