@@ -504,7 +504,7 @@ class Augmentation(SampleTransform):
             first = {n: (kind, value[::each]) for n, (kind, value) in self._sorted(frames, self.fields).items()}
             draw = {n: clips.repeated(value, f"draw[{n!r}]") for n, value in self._of_sample(drawn, first).items()}
             return clips.restored(self.forward(frames, draw=draw))
-        return self._augmented(sample, draw=draw, generator=generator)
+        return self._augmented(sample, draw=draw, generator=generator)[0]
 
     def _augmented(
         self,
@@ -512,8 +512,8 @@ class Augmentation(SampleTransform):
         kinds: Mapping[str, str] | None = None,
         draw: Mapping[str, Tensor] | None = None,
         generator: torch.Generator | None = None,
-    ) -> Sample:
-        """Return a sample moved by one change; kinds: name -> kind, in addition to `fields`."""
+    ) -> tuple[Sample, Change]:
+        """Return a sample moved by one change, and the change; kinds: name -> kind, in addition to `fields`."""
         named, batched, count, camera = self._batch(sample, kinds=kinds)
         if draw is None:
             numbers = self._numbers(count, self.p, self.same_on_batch, generator)
@@ -526,7 +526,7 @@ class Augmentation(SampleTransform):
             self.__dict__["last"] = change  # as nn.Module would, after some questions
             if count and not self._warned and "image" in [found for found, _ in named.values()]:
                 self.tell_of_empty_images(camera)
-        return self._moved(sample, named, batched, change)
+        return self._moved(sample, named, batched, change), change
 
     @on_samples
     def inverse(

@@ -175,26 +175,6 @@ def _fields(container: Any, sample: Sample, ours: list[InContainers]) -> tuple[S
     return {n: v for n, v in given.items() if n in kinds or n.removesuffix("_valid") in kinds or n in tables}, kinds
 
 
-def _put(of: type[nn.Module], name: str, **options: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Put `own(call, container, *args)` in the place of a method `call` of containers with such an augmentation."""
-    call = getattr(of, name)
-    call = getattr(call, "__wrapped__", call)  # of a module that is imported again
-
-    def put(own: Callable[..., Any]) -> Callable[..., Any]:
-        @functools.wraps(call)
-        def method(self: Any, *args: Any, **kwargs: Any) -> Any:
-            if not any(isinstance(one, InContainers) for one in self.modules()):
-                return call(self, *args, **kwargs)
-            return own(call, self, *args, **options, **kwargs)
-
-        setattr(of, name, method)
-        return own
-
-    return put
-
-
-@_put(AugmentationSequential, "forward", back=False)
-@_put(AugmentationSequential, "inverse", back=True)
 def _with_fields(
     call: Callable[..., Any], self: Any, *args: Any, back: bool, params: Any = None, data_keys: Any = None
 ) -> Any:
@@ -230,7 +210,6 @@ def _with_fields(
     return {**result, **fields}
 
 
-@_put(AugmentationSequential, "_preproc_boxes")
 def _lost_stay_lost(call: Callable[..., Boxes], self: Any, boxes: Any, key: DataKey) -> Boxes:
     """Take boxes of zeros, as kornia exports lost ones, for lost: it takes none of no width."""
     if not isinstance(boxes, Tensor):
@@ -243,4 +222,20 @@ def _lost_stay_lost(call: Callable[..., Boxes], self: Any, boxes: Any, key: Data
     return result
 
 
-_put(ImageSequential, "__getstate__")(lambda call, self: detached(call(self)))
+def _put(of: type[nn.Module], name: str, own: Callable[..., Any]) -> None:
+    """Put `own(call, container, *args)` in the place of a method `call` of containers with such an augmentation."""
+    call = getattr(of, name)
+    call = getattr(call, "__wrapped__", call)  # of a module that is imported again
+
+    @functools.wraps(call)
+    def method(self: Any, *args: Any, **kwargs: Any) -> Any:
+        ours = any(isinstance(one, InContainers) for one in self.modules())
+        return own(call, self, *args, **kwargs) if ours else call(self, *args, **kwargs)
+
+    setattr(of, name, method)
+
+
+_put(AugmentationSequential, "forward", functools.partial(_with_fields, back=False))
+_put(AugmentationSequential, "inverse", functools.partial(_with_fields, back=True))
+_put(AugmentationSequential, "_preproc_boxes", _lost_stay_lost)
+_put(ImageSequential, "__getstate__", lambda call, self: detached(call(self)))

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import torch
@@ -113,9 +113,9 @@ class Transform(FrontEnd, v2.Transform):
         of_points = {f"{keys[i]}_valid" for i, (k, v, _) in fields.items() if k == _TURNED and v.shape[-2] == _STEPS**2}
         for key in of_points & sample.keys():
             sample[key] = torch.as_tensor(sample[key])[..., None].repeat_interleave(_STEPS**2, -1)
-        moved = own._augmented(sample, kinds)
+        moved, change = own._augmented(sample, kinds)
         moved |= {key: moved[key].any(-1) for key in of_points}
-        change = cast("Change", own.last)
+        own.last = change
         for i, (kind, _, back) in fields.items():
             if change.parts[0].moves is not None or not kind or type(leaves[i]) in _HELD:
                 leaves[i] = back(moved[keys[i]], change)
