@@ -74,17 +74,13 @@ def summarise(camera: Camera) -> Summary:
     if camera.image_size is not None:
         result.fov = tuple(camera.fov.tolist())
         result.seen = float(camera.unproject(image_lattice(camera, _SIDE, _SIDE))[1].double().mean())
-        result.corners = _corners(camera)
+        pixels = image_lattice(camera, 2, 2).flatten(0, 1)
+        rays, valid = camera.unproject(pixels)
+        undistorted, covered = ideal(camera).project(rays)
+        # rounding is no distortion, and has a sign of its own
+        moved = ((pixels - undistorted).double().round(decimals=6) + 0.0).tolist()
+        result.corners = tuple(
+            "no ray" if not valid[i] else "past the ideal projection" if not covered[i] else tuple(moved[i])
+            for i in range(len(CORNERS))
+        )
     return result
-
-
-def _corners(camera: Camera) -> tuple[tuple[float, float] | str, ...]:
-    pixels = image_lattice(camera, 2, 2).flatten(0, 1)
-    rays, valid = camera.unproject(pixels)
-    undistorted, covered = ideal(camera).project(rays)
-    # rounding is no distortion, and has a sign of its own
-    moved = ((pixels - undistorted).double().round(decimals=6) + 0.0).tolist()
-    return tuple(
-        "no ray" if not valid[i] else "past the ideal projection" if not covered[i] else tuple(moved[i])
-        for i in range(len(CORNERS))
-    )

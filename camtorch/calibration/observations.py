@@ -162,7 +162,16 @@ def _observed(
         _check_corners(points, pixels[name], seen[name], labels[name], owner)
         _check_inside(pixels[name], seen[name], labels[name], size, size_label, owner)
     sees: Array = np.stack([of.any(-1) for of in seen.values()])
-    _check_links(list(given), sees, owner)
+    # cameras must share a view, at least by way of others, with the first
+    names, linked = list(given), np.arange(len(given)) == 0
+    for _ in names:
+        linked = linked | (sees & sees[linked].any(0)).any(-1)
+    if not linked.all():
+        apart = ", ".join(repr(name) for name, is_linked in zip(names, linked, strict=True) if not is_linked)
+        raise ValueError(
+            f"{owner}: {apart} never sees a board in the same view as {names[0]!r}, nor as a "
+            "camera that does: where it is cannot be told; take views that both see, or calibrate it alone"
+        )
     first: dict[bytes, int] = {}
     has: Array = np.any(sees, 0)
     rows = enumerate(np.concatenate([_ordered(of) for of in pixels.values()], 1) + 0.0)
@@ -301,19 +310,6 @@ def _check_inside(pixels: Array, seen: Array, name: str, size: tuple[int, int], 
             f"{owner}: {number} of {total} corners of {name} lie outside the image of {size_name} {size}, in "
             f"{_views_of(views if views.any() else out.sum(-1))}; they reach from {low} to {high}: {size_name} "
             "is (height, width) of all images, as image.shape[:2], points are (u, v), and unseen corners NaN"
-        )
-
-
-def _check_links(names: list[str], sees: Array, owner: str) -> None:
-    """Refuse cameras, sees (C, V), of which some share no view, not even by way of others, with the first."""
-    linked = np.arange(len(names)) == 0
-    for _ in names:
-        linked = linked | (sees & sees[linked].any(0)).any(-1)
-    if not linked.all():
-        apart = ", ".join(repr(name) for name, is_linked in zip(names, linked, strict=True) if not is_linked)
-        raise ValueError(
-            f"{owner}: {apart} never sees a board in the same view as {names[0]!r}, nor as a "
-            "camera that does: where it is cannot be told; take views that both see, or calibrate it alone"
         )
 
 

@@ -122,7 +122,16 @@ def solve_pnp(
         found = _compiled(given, threshold) or _searched(given, threshold)
     vectors, translations, rms = found.vectors, found.translations, found.rms
     if learns([given.camera], *given.tensors()):
-        vectors, translations, rms = _with_graph(given, found)
+        # the poses and the root mean squares with their derivatives
+        task = _Task.of(given)
+        task = task._replace(weights=torch.where(found.inliers, task.weights, 0.0))
+        middles = task.middles[..., None]
+        centred = found.translations + (rotation_matrix(found.vectors) @ middles)[..., 0]
+        unknowns = attached(task.cost, torch.cat((found.vectors, centred), -1), found.valid)
+        turns, centred = unknowns.split(3, -1)
+        shifts = centred - (rotation_matrix(turns) @ middles)[..., 0]
+        means = 2 * task.cost(unknowns) / task.weights.sum(-1).clamp(min=torch.finfo(torch.float64).tiny)
+        vectors, translations, rms = turns, shifts, root_of(means, found.valid)
     vectors, translations = (t.to(given.dtype).view(*given.batch, 3) for t in (vectors, translations))
     rms = rms.to(given.dtype).view(given.batch)
     inliers = found.inliers.view(*given.batch, found.inliers.shape[-1])
@@ -262,19 +271,6 @@ class _Task(NamedTuple):
         return 0.5 * (torch.where(valid, squares, 0.0) * self.weights).sum(-1)
 
 
-def _with_graph(given: _Given, found: Solved) -> tuple[Tensor, Tensor, Tensor]:
-    """The poses and the root mean squares with their derivatives."""
-    task = _Task.of(given)
-    task = task._replace(weights=torch.where(found.inliers, task.weights, 0.0))
-    middles = task.middles[..., None]
-    centred = found.translations + (rotation_matrix(found.vectors) @ middles)[..., 0]
-    unknowns = attached(task.cost, torch.cat((found.vectors, centred), -1), found.valid)
-    vectors, centred = unknowns.split(3, -1)
-    translations = centred - (rotation_matrix(vectors) @ middles)[..., 0]
-    means = 2 * task.cost(unknowns) / task.weights.sum(-1).clamp(min=torch.finfo(torch.float64).tiny)
-    return vectors, translations, root_of(means, found.valid)
-
-
 def _consensus(task: _Task, threshold: float) -> tuple[Tensor, Tensor]:
     """The poses on which most points agree: rotations (B, 3, 3), translations (B, 3)."""
     # where poses are only looked for, differences are derivatives
@@ -316,7 +312,21 @@ def _searched(given: _Given, threshold: float | None) -> Solved:
             found = _minimum(task, found.rotations, found.translations, _spread(task.points, near))
             before, near = near, _near(task._replace(weights=weights), found.rotations, found.translations, threshold)
         found = found._replace(costs=torch.where((near == before).all(-1), found.costs, torch.inf))
-    return _assessed(task, found)
+    # with what the noise does to them, of turns and of shifts of the origin
+    good = torch.isfinite(found.costs)
+    inliers = (task.weights > 0) & good[:, None]
+    eye = torch.eye(6, dtype=found.costs.dtype, device=found.costs.device)
+    by = found.triangles[..., :6].square().sum(-2).sqrt()
+    inverse, failed = torch.linalg.inv_ex(found.triangles[..., :6] / torch.where(by > 0, by, 1.0)[:, None])
+    inverse = inverse / by[..., None]
+    variance = found.costs / (2 * inliers.sum(-1) - 6).clamp(min=1)
+    away, carried = (found.rotations @ task.middles[..., None])[..., 0], eye.repeat(len(good), 1, 1)
+    carried[:, 3:, :3] = skew_matrix(away)
+    carried = carried @ inverse
+    covariance = carried @ carried.mT * variance[:, None, None]
+    covariance = torch.where((good & (failed == 0))[:, None, None], covariance, torch.nan)
+    rms = (found.costs / task.weights.sum(-1).clamp(min=torch.finfo(torch.float64).tiny)).sqrt()
+    return Solved(rotation_vector(found.rotations), found.translations - away, rms, good, inliers, covariance)
 
 
 class _Found(NamedTuple):
@@ -354,24 +364,6 @@ def _near(task: _Task, rotations: Tensor, translations: Tensor, threshold: float
     """Bool (B, N): the points that are seen near their pixels."""
     pixels, valid = task.camera.project(task.points @ rotations.mT + translations[:, None])
     return valid & (task.weights > 0) & ((pixels - task.pixels).square().sum(-1) < threshold**2)
-
-
-def _assessed(task: _Task, found: _Found) -> Solved:
-    """With what the noise does to them, of turns and of shifts of the origin."""
-    valid = torch.isfinite(found.costs)
-    inliers = (task.weights > 0) & valid[:, None]
-    eye = torch.eye(6, dtype=found.costs.dtype, device=found.costs.device)
-    by = found.triangles[..., :6].square().sum(-2).sqrt()
-    inverse, failed = torch.linalg.inv_ex(found.triangles[..., :6] / torch.where(by > 0, by, 1.0)[:, None])
-    inverse = inverse / by[..., None]
-    variance = found.costs / (2 * inliers.sum(-1) - 6).clamp(min=1)
-    away, carried = (found.rotations @ task.middles[..., None])[..., 0], eye.repeat(len(valid), 1, 1)
-    carried[:, 3:, :3] = skew_matrix(away)
-    carried = carried @ inverse
-    covariance = carried @ carried.mT * variance[:, None, None]
-    covariance = torch.where((valid & (failed == 0))[:, None, None], covariance, torch.nan)
-    rms = (found.costs / task.weights.sum(-1).clamp(min=torch.finfo(torch.float64).tiny)).sqrt()
-    return Solved(rotation_vector(found.rotations), found.translations - away, rms, valid, inliers, covariance)
 
 
 def _spread(points: Tensor, inliers: Tensor) -> Tensor:

@@ -242,7 +242,11 @@ def _rotations_in_space(local: Tensor, rays: Tensor, weights: Tensor, distances:
     from_afar = frame @ torch.cat((rows, torch.linalg.cross(rows[:, :1], rows[:, 1:])), 1)
     nearest = nearest_rotation(torch.cat((linear, from_afar[:, None]), 1))
     planar = _planar_starts(rays, weights, distances)
-    rotations = torch.cat((nearest, planar, frame[:, None] @ _right_turns(frame)), 1)
+    # (24, 3, 3): the rotations that take axes to axes
+    matrices = torch.eye(3, dtype=frame.dtype, device=frame.device)[torch.tensor([*permutations(range(3))])]
+    signs = torch.cartesian_prod(*[frame.new_tensor([1.0, -1.0])] * 3)
+    matrices = (matrices[:, None] * signs[:, None]).flatten(0, 1)
+    rotations = torch.cat((nearest, planar, frame[:, None] @ matrices[torch.linalg.det(matrices) > 0]), 1)
 
     def costs(rotations: Tensor) -> Tensor:
         return torch.where(distances.depths(rotations) > 0, distances.of_rotations(rotations), torch.inf)
@@ -261,11 +265,3 @@ def _rotations_in_space(local: Tensor, rays: Tensor, weights: Tensor, distances:
 def _taken(values: Tensor, index: Tensor) -> Tensor:
     """Of values (B, S, ...) those of an index (B, T)."""
     return torch.take_along_dim(values, index.view(*index.shape, *[1] * (values.ndim - 2)), 1)
-
-
-def _right_turns(like: Tensor) -> Tensor:
-    """(24, 3, 3): the rotations that take axes to axes."""
-    matrices = torch.eye(3, dtype=like.dtype, device=like.device)[torch.tensor([*permutations(range(3))])]
-    signs = torch.cartesian_prod(*[like.new_tensor([1.0, -1.0])] * 3)
-    matrices = (matrices[:, None] * signs[:, None]).flatten(0, 1)
-    return matrices[torch.linalg.det(matrices) > 0]

@@ -115,7 +115,22 @@ def select(
         names = [name for name in fixed if name in (*INTRINSICS, *(MODELS[model].names_of(count) or ()))]
         options = {"fixed": names, "loss": loss, "loss_scale": loss_scale}
         try:
-            trials.append(_tried(model, count, calibrated, weights, options))
+            numbers = np.arange(len(weights))
+            errors = np.full(len(numbers), np.nan)
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", UserWarning)  # a trial: what is amiss is in its numbers
+                whole = calibrated(numbers, model, count=count, **options)
+                if not whole.converged:
+                    raise ValueError("no optimum was found")
+                for fold in range(min(_FOLDS, len(numbers))):
+                    out = numbers % min(_FOLDS, len(numbers)) == fold
+                    part = calibrated(np.flatnonzero(~out), whole.camera, **options)
+                    posed = calibrated(np.flatnonzero(out), part.camera, fixed="all", loss=None)
+                    errors[out] = np.nanmean(np.square(np.asarray(posed.residuals)).sum(-1), axis=1)
+            held_out = math.sqrt(float((weights * errors).sum() / weights.sum()))
+            if not math.isfinite(held_out):
+                raise ValueError("views that it was not fitted to are lost")
+            trials.append(Trial(model, count, whole, whole.rms, held_out, errors))
         except ValueError as error:
             nothing = np.full(len(pixels), np.nan)
             trials.append(Trial(model, count, None, math.nan, math.nan, nothing, str(error)))
@@ -125,28 +140,6 @@ def select(
     if not fitted:
         raise ValueError(f"select: no model can be fitted; {trials[0].model}: {trials[0].reason}")
     return _chosen(trials, fitted)
-
-
-def _tried(
-    model: str, count: int, calibrated: Callable[..., Calibration], weights: Array, options: dict[str, Any]
-) -> Trial:
-    """calibrated: by some of the views. weights: (V,) the corners of each."""
-    numbers = np.arange(len(weights))
-    errors = np.full(len(numbers), np.nan)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # a trial: what is amiss is in its numbers
-        whole = calibrated(numbers, model, count=count, **options)
-        if not whole.converged:
-            raise ValueError("no optimum was found")
-        for fold in range(min(_FOLDS, len(numbers))):
-            out = numbers % min(_FOLDS, len(numbers)) == fold
-            part = calibrated(np.flatnonzero(~out), whole.camera, **options)
-            posed = calibrated(np.flatnonzero(out), part.camera, fixed="all", loss=None)
-            errors[out] = np.nanmean(np.square(np.asarray(posed.residuals)).sum(-1), axis=1)
-    held_out = math.sqrt(float((weights * errors).sum() / weights.sum()))
-    if not math.isfinite(held_out):
-        raise ValueError("views that it was not fitted to are lost")
-    return Trial(model, count, whole, whole.rms, held_out, errors)
 
 
 def _chosen(trials: list[Trial], fitted: list[Trial]) -> Selection:

@@ -88,7 +88,15 @@ def start_from_nothing(
     lens = _fitted(lens, few, model, count, fixed)
     if few is not observations or len(lens.parameters) > 1 or bool(lens.lost(few).any()):
         lens = _refined(lens, few, _free(model, count, fixed), (loss, loss_scale))
-        _check_reach(lens.of(slice(1)), few, first)
+        one = lens.of(slice(1))
+        lost = int(one.lost(few).sum())
+        if lost > (_LOST * int(few.seen.sum()) if one.scale <= _ERRS * first.scale else 0):
+            inliers = few.seen & (first.errors(few)[0] < _OUTLIER * first.scale)
+            furthest = math.degrees(float(angles_from_axis(first.boards.moved(few.points))[0][inliers].amax()))
+            raise ValueError(
+                f"calibrate: {one.model.__name__} has no pixels for {lost} of {int(few.seen.sum())} corners, "
+                f"seen up to about {furthest:.0f} degrees from the axis; kannala_brandt and other fisheye models do"
+            )
     state = lens.of(slice(1)).state
     if few is not observations:
         state = poses_for(state.parameters[0], observations, model, image_size, lens.scale)
@@ -424,15 +432,3 @@ def _fitted(lens: _Lens, few: Observations, model: type[Camera], count: int, fix
         if name in fixed:
             parameters[:, i] = (lens.image_size[3 - i] - 1) / 2
     return _Lens(model, parameters, lens.boards.expand(len(parameters)), lens.scale, lens.image_size)
-
-
-def _check_reach(lens: _Lens, few: Observations, other: _Lens) -> None:
-    """Raise a ValueError if the model loses many corners, or some and errs with the others; `other` reaches them."""
-    lost = int(lens.lost(few).sum())
-    if lost > (_LOST * int(few.seen.sum()) if lens.scale <= _ERRS * other.scale else 0):
-        inliers = few.seen & (other.errors(few)[0] < _OUTLIER * other.scale)
-        furthest = math.degrees(float(angles_from_axis(other.boards.moved(few.points))[0][inliers].amax()))
-        raise ValueError(
-            f"calibrate: {lens.model.__name__} has no pixels for {lost} of {int(few.seen.sum())} corners, "
-            f"seen up to about {furthest:.0f} degrees from the axis; kannala_brandt and other fisheye models do"
-        )

@@ -32,7 +32,11 @@ def run(arguments: argparse.Namespace) -> None:
     if {"fx", "fy"} & set((arguments.fixed or "").split(",")):
         raise ValueError("--fixed: no focal length is known to be held; in Python ct.calibrate(start=camera) has one")
     candidates = _candidates(arguments)
-    board = _board(arguments)
+    if arguments.board is None:
+        raise ValueError("which board? --board COLUMNSxROWS says so, as in 9x6")
+    options = {name: value for name in _BOARD_OPTIONS if (value := getattr(arguments, name)) not in (None, False)}
+    words = "{} {}x{}".format(arguments.type or "chessboard", *arguments.board)
+    board = as_board(words, arguments.square or 1.0, options, "--board")
     if board.is_symmetric and len(cameras) > 1:
         note(
             "this board looks the same after a turn: the corner nearest to the top left of an image is taken for its "
@@ -48,7 +52,12 @@ def run(arguments: argparse.Namespace) -> None:
             "Another --model, or --loss huber where some corners are wrong, may help"
         )
     names = list(views) if isinstance(result, RigCalibration) else [of_view[""].path.name for of_view in views.values()]
-    print(_in_words_of_the_command(repr(result), names))
+    # a text with names of views for their numbers, and options for arguments of `ct.calibrate`
+    text = repr(result)
+    numbered = r"\b([Vv]iews? )(\d+(?:, \d+)*)"
+    text = re.sub(numbered, lambda m: m[1] + re.sub(r"\d+", lambda n: names[int(n[0])], m[2]), text)
+    text = re.sub(r'fixed=\("(.*?)",?\)', lambda m: f"--fixed {m[1].replace(chr(34), '').replace(' ', '')}", text)
+    print(re.sub(r"count=(\d+)", r"--count \1", text.replace("bend=True", "--bend")))
     if arguments.bend:
         across, down = (f"{bend:.3g}" for bend in result.bend)
         print(f"board: its middle lies {across} off its left and right, {down} off its top and bottom")
@@ -75,14 +84,6 @@ def _cameras(arguments: argparse.Namespace) -> dict[str, list[Path]]:
     if not (pair or arguments.images):
         raise ValueError("which images? Files, quoted patterns or folders, or a video")
     return {name: gather(words) for name, words in (pair or {"": arguments.images}).items()}
-
-
-def _board(arguments: argparse.Namespace) -> Board:
-    if arguments.board is None:
-        raise ValueError("which board? --board COLUMNSxROWS says so, as in 9x6")
-    options = {name: value for name in _BOARD_OPTIONS if (value := getattr(arguments, name)) not in (None, False)}
-    words = "{} {}x{}".format(arguments.type or "chessboard", *arguments.board)
-    return as_board(words, arguments.square or 1.0, options, "--board")
 
 
 def _candidates(arguments: argparse.Namespace) -> list[tuple[str, int]]:
@@ -148,11 +149,3 @@ def _calibrated(
         own = {"image_size": sizes[""], "count": counts[""], "bend": arguments.bend}
         return calibrate(models[""], points, pixels[""], **own, **options)
     return calibrate_rig(models, points, pixels, image_sizes=sizes, count=counts, bend=arguments.bend, **options)
-
-
-def _in_words_of_the_command(text: str, names: Sequence[str]) -> str:
-    """Return a text with names of views for their numbers, and options for arguments of `ct.calibrate`."""
-    numbered = r"\b([Vv]iews? )(\d+(?:, \d+)*)"
-    text = re.sub(numbered, lambda m: m[1] + re.sub(r"\d+", lambda n: names[int(n[0])], m[2]), text)
-    text = re.sub(r'fixed=\("(.*?)",?\)', lambda m: f"--fixed {m[1].replace(chr(34), '').replace(' ', '')}", text)
-    return re.sub(r"count=(\d+)", r"--count \1", text.replace("bend=True", "--bend"))

@@ -34,9 +34,24 @@ def read_rig(
             if a model is given for a file that states its own, or none for one that has to state it and does not.
     """
     if str(path).startswith(LENS):
-        return _lens(str(path).removeprefix(LENS), size)
+        words = str(path).removeprefix(LENS)
+        try:
+            lenses.find(words)
+        except ValueError as error:
+            raise ValueError(f"{error}; on images so does --guess-fov DEGREES") from None
+        known = (size and lenses.search(words, image_size=size)) or lenses.search(words)
+        others = f", the best of {len(known)} that camtorch lenses lists" if len(known) > 1 else ""
+        note(f"{words}: {known[0]!r}{others}")
+        return Rig({"camera": known[0].camera()})
     if str(path).startswith(GUESS):
-        return _guess(str(path).removeprefix(GUESS), model, size)
+        fov = str(path).removeprefix(GUESS)
+        if size is None:
+            raise ValueError(f"{GUESS}{fov}: a field of view is one of an image, and of what size is not known here")
+        kind = as_model(model or ("pinhole" if float(fov) < _WIDE else "kannala_brandt"), "--model")
+        guessed = kind.from_fov(float(fov), image_size=size).double().requires_grad_(False)
+        focal = float(guessed.intrinsics[0])
+        note(f"{fov} degrees wide is a guess: {guessed.key}, {_shown(size)}, focal length {focal:.6g}")
+        return Rig({"camera": guessed})
     rig = load(path) if model is None else opencv.read_rig(path, model)
     if stated and model is None and rig.format == "opencv" and _leaves_open(path):
         raise ValueError(
@@ -53,26 +68,6 @@ def read_rig(
             raise ValueError(f"{path}: {found} is for {_shown(camera.image_size)}, not {_shown(size)}")
         camera.image_size = camera.image_size or size
     return rig
-
-
-def _lens(words: str, size: Size | None) -> Rig:
-    try:
-        lenses.find(words)
-    except ValueError as error:
-        raise ValueError(f"{error}; on images so does --guess-fov DEGREES") from None
-    found = (size and lenses.search(words, image_size=size)) or lenses.search(words)
-    others = f", the best of {len(found)} that camtorch lenses lists" if len(found) > 1 else ""
-    note(f"{words}: {found[0]!r}{others}")
-    return Rig({"camera": found[0].camera()})
-
-
-def _guess(fov: str, model: str | None, size: Size | None) -> Rig:
-    if size is None:
-        raise ValueError(f"{GUESS}{fov}: a field of view is one of an image, and of what size is not known here")
-    kind = as_model(model or ("pinhole" if float(fov) < _WIDE else "kannala_brandt"), "--model")
-    camera = kind.from_fov(float(fov), image_size=size).double().requires_grad_(False)
-    note(f"{fov} degrees wide is a guess: {camera.key}, {_shown(size)}, focal length {float(camera.intrinsics[0]):.6g}")
-    return Rig({"camera": camera})
 
 
 def _leaves_open(path: Path) -> bool:

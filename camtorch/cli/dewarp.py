@@ -92,11 +92,7 @@ def run(arguments: argparse.Namespace) -> int:
     for name in ("resume", "suffix"):
         if getattr(arguments, name):
             raise ValueError(f"--{name} is for folders: -o OUT/, with a slash, puts the new one into one")
-    _single(arguments, Path(arguments.image[0]))
-    return 0
-
-
-def _single(arguments: argparse.Namespace, source: Path) -> None:
+    source = Path(arguments.image[0])
     is_video = videos.is_video(source)
     output = Path(arguments.output or f"dewarped{videos.written_suffix(source) if is_video else '.png'}")
     targets.check(output, force=arguments.force, inputs=(source, arguments.camera))
@@ -114,6 +110,7 @@ def _single(arguments: argparse.Namespace, source: Path) -> None:
         if facts["shown"] < _MUCH and arguments.projection == "perspective" and arguments.fov is None:
             end += "; --projection stereographic or cylindrical shows more, and --fov says how much"
     print(f"{output}: {_described(arguments, facts)}{end}")
+    return 0
 
 
 def _many(arguments: argparse.Namespace) -> int:

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 
 import numpy as np
 
 from camtorch.analysis.difference import difference
 from camtorch.analysis.summary import summarise
-from camtorch.cameras.camera import Camera
 from camtorch.cli import images, targets
 from camtorch.cli.cameras import read_other, read_rig
 from camtorch.plot.axes import require_matplotlib
@@ -55,17 +53,14 @@ def run(arguments: argparse.Namespace) -> None:
         print(line)
     if output is not None:
         which = name if name != "camera" else camera.key
-        _draw(output, camera, other, f"{path.name}: {which}, {camera.width} x {camera.height}")
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+        from camtorch import plot
+
+        title = f"{path.name}: {which}, {camera.width} x {camera.height}"
+        canvas = FigureCanvasAgg(plot.portrait(camera, other, title=title))
+        canvas.draw()
+        images.write(output, np.array(canvas.buffer_rgba())[..., :3])
         print(f"{output}: distortion, radius over angle{', difference' if other is not None else ''}")
     if html is not None:
         print(f"{html}: the lens, live, to be opened in a browser")
-
-
-def _draw(path: Path, camera: Camera, other: Camera | None, title: str) -> None:
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-
-    from camtorch import plot
-
-    canvas = FigureCanvasAgg(plot.portrait(camera, other, title=title))
-    canvas.draw()
-    images.write(path, np.array(canvas.buffer_rgba())[..., :3])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -87,7 +86,21 @@ def measure(target: CameraLike, k: Tensor, exact: Tensor, source: Reference) -> 
 
     max_error = errors.amax(-1)
     if bool((max_error > _ROUNDING).any()):
-        max_error = torch.maximum(max_error, _climbed(source, errors, error_within))
+        # (C,) the largest error near the highest peaks of errors (C, side^2): each moves to the best of finer nodes
+        lattice = source.lattice
+        count, side = len(errors), lattice.side
+        field = errors.view(count, 1, side, side)
+        peaks = torch.where(field == max_pool2d(field, 3, 1, 1), field, 0.0).flatten(1)
+        places = lattice.nodes().gather(1, peaks.topk(_PEAKS).indices[..., None].expand(-1, -1, 2))
+        share = torch.linspace(-1, 1, 7, dtype=errors.dtype, device=errors.device)
+        offsets = torch.cartesian_prod(share, share)
+        step = ((lattice.high - lattice.low) / (side - 1))[:, None, None]
+        for _ in range(_ROUNDS):
+            near = lattice.between((places[:, :, None] + step * offsets).flatten(1, 2))
+            found, best = error_within(lattice.sampled(source.camera, near)).unflatten(1, (_PEAKS, -1)).max(-1)
+            places = near.unflatten(1, (_PEAKS, -1)).gather(2, best[..., None, None].expand(-1, -1, 1, 2))[:, :, 0]
+            step = step / 3
+        max_error = torch.maximum(max_error, found.amax(-1))
         rim = ray_fan(max_angle[:, None] * (1 - 1e-12), _RIM)
         max_error = torch.maximum(max_error, error_within(views.seen(source.camera, source.image_size, rim)).amax(-1))
     rms = (errors.square().sum(-1) / inside.sum(-1).clamp(min=1)).sqrt()
@@ -96,22 +109,3 @@ def measure(target: CameraLike, k: Tensor, exact: Tensor, source: Reference) -> 
     mapped = mapped if every is rays else compared(every)[1] & reached(every)
     shown = every.valid & mapped & (every.angles <= max_angle[:, None]) & some[:, None]
     return Measures(rms, max_error, max_angle, shown.sum(-1) / every.valid.sum(-1).clamp(min=1))
-
-
-def _climbed(source: Reference, errors: Tensor, error_at: Callable[[views.SampledRays], Tensor]) -> Tensor:
-    """(C,) the largest error near the highest peaks of errors (C, side^2): each moves to the best of finer nodes."""
-    lattice = source.lattice
-    count, side = len(errors), lattice.side
-    field = errors.view(count, 1, side, side)
-    peaks = torch.where(field == max_pool2d(field, 3, 1, 1), field, 0.0).flatten(1)
-    places = lattice.nodes().gather(1, peaks.topk(_PEAKS).indices[..., None].expand(-1, -1, 2))
-    share = torch.linspace(-1, 1, 7, dtype=errors.dtype, device=errors.device)
-    offsets = torch.cartesian_prod(share, share)
-    step = ((lattice.high - lattice.low) / (side - 1))[:, None, None]
-    for _ in range(_ROUNDS):
-        near = lattice.between((places[:, :, None] + step * offsets).flatten(1, 2))
-        found, best = error_at(lattice.sampled(source.camera, near)).unflatten(1, (_PEAKS, -1)).max(-1)
-        places = near.unflatten(1, (_PEAKS, -1)).gather(2, best[..., None, None].expand(-1, -1, 1, 2))[:, :, 0]
-        step = step / 3
-    largest: Tensor = found.amax(-1)
-    return largest

@@ -42,7 +42,14 @@ def read(path: str, content: bytes) -> Rig:
         name = channel if channel and often[channel] == 1 else sensor["token"].text()
         if name in cameras:
             sensor["token"].fail(f"a second sensor is called {name!r:.60}")
-        cameras[name] = _camera(sensor)
+        intrinsics = sensor["camera_intrinsic"].intrinsics()
+        lens = sensor.get("camera_distortion")  # of nuImages
+        distortion = [] if lens is None else lens.numbers()
+        if lens is not None and len(distortion) == 6 and distortion.pop():
+            lens.fail("a sixth coefficient, of fisheyes, whose formula nuImages does not say")
+        cameras[name] = sensor.camera(
+            "brown_conrady" if distortion else "pinhole", intrinsics, distortion, None, lens=lens
+        )
     if not cameras:
         return Rig({})
     values = [[*sensor["rotation"].numbers(4), *sensor["translation"].numbers(3)] for sensor in sensors]
@@ -51,12 +58,3 @@ def read(path: str, content: bytes) -> Rig:
 
 def _table(path: str, content: bytes) -> Record:
     return Record(path, parse_json(path, decoded(path, content)))
-
-
-def _camera(sensor: Record) -> Camera:
-    intrinsics = sensor["camera_intrinsic"].intrinsics()
-    lens = sensor.get("camera_distortion")  # of nuImages
-    distortion = [] if lens is None else lens.numbers()
-    if lens is not None and len(distortion) == 6 and distortion.pop():
-        lens.fail("a sixth coefficient, of fisheyes, whose formula nuImages does not say")
-    return sensor.camera("brown_conrady" if distortion else "pinhole", intrinsics, distortion, None, lens=lens)

@@ -207,7 +207,16 @@ def render(rig: Rig, lossy: Lossy) -> str:
     values: dict[str, Any] = {}
     for name, end in zip(names, ends, strict=True):
         _add_camera(lossy, values, name, rig.cameras[name], end)
-    _add_pose(lossy, values, rig, sorted(zip(ends, names, strict=True)))
+    last, both = zip(*sorted(zip(ends, names, strict=True)), strict=True)
+    if len(both) == 2 and list(last) in _PAIRS and both[1] in rig.extrinsics:
+        lossy.all_posed(rig)
+        if not poses.is_identity(rig.extrinsics[both[0]]):
+            lossy.fail(both[0], "its extrinsics would be lost; in OpenCV's file the first camera is where the rig is")
+        rows = poses.matrices(rig.extrinsics[both[1]]).tolist()
+        values["R"] = [row[:3] for row in rows[:3]]
+        values["T"] = [row[3:] for row in rows[:3]]
+    else:
+        lossy.no_pose(rig)
     return _text(os.path.splitext(lossy.path)[1].lower(), values)
 
 
@@ -233,19 +242,6 @@ def _add_camera(lossy: Lossy, values: dict[str, Any], name: str, camera: Camera,
     values[f"M{joint}{end}" if end else "camera_matrix"] = [[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]
     if distortion:
         values[f"D{joint}{end}" if end else "distortion_coefficients"] = [[value] for value in distortion]
-
-
-def _add_pose(lossy: Lossy, values: dict[str, Any], rig: Rig, ends_and_names: list[tuple[str, str]]) -> None:
-    ends, names = zip(*ends_and_names, strict=True)
-    if len(names) == 2 and list(ends) in _PAIRS and names[1] in rig.extrinsics:
-        lossy.all_posed(rig)
-        if not poses.is_identity(rig.extrinsics[names[0]]):
-            lossy.fail(names[0], "its extrinsics would be lost; in OpenCV's file the first camera is where the rig is")
-        rows = poses.matrices(rig.extrinsics[names[1]]).tolist()
-        values["R"] = [row[:3] for row in rows[:3]]
-        values["T"] = [row[3:] for row in rows[:3]]
-    else:
-        lossy.no_pose(rig)
 
 
 def _text(suffix: str, values: dict[str, Any]) -> str:

@@ -101,7 +101,15 @@ def _from_text(path: Path, content: bytes) -> Any:
     # a brace, perhaps after comments, and a key in quotes unlike JSON's; one regular expression would be slow
     start = re.sub(r"#[^\n]*", "", text[:_START]).split()[:2]
     if re.match(r"\{(?:'|\"(?:lens_?model|distortion_model)\")", "".join(start)):
-        return _from_literal(path, text)
+        # a Python literal, as mrcal writes it, as JSON would have it
+        text = _OPTIMIZATION_INPUTS.sub(r"\1''", text)
+        _check_length(path, text, _LARGEST_LITERAL, "a Python literal")
+        try:
+            return _with_floats(ast.literal_eval(ast.parse(text, mode="eval")))
+        except SyntaxError as error:
+            raise CameraFileError(path, f"line {error.lineno}" if error.lineno else "content", error.msg) from None
+        except (ValueError, TypeError):  # a list has no hash, as a key has
+            raise CameraFileError(path, "content", "something else than texts, numbers, lists and mappings") from None
     kind = text.lstrip()[:1]
     return parse_json(path, text) if kind == "{" else (_from_storage if kind == "<" else _from_yaml)(path, text)
 
@@ -132,18 +140,6 @@ def parse_json(path: Path, text: str) -> Any:
         raise CameraFileError(path, f"line {error.lineno}", error.msg) from None
     except ValueError as error:
         raise CameraFileError(path, "content", error) from None
-
-
-def _from_literal(path: Path, text: str) -> Any:
-    """Return a Python literal, as mrcal writes it, as JSON would have it."""
-    text = _OPTIMIZATION_INPUTS.sub(r"\1''", text)
-    _check_length(path, text, _LARGEST_LITERAL, "a Python literal")
-    try:
-        return _with_floats(ast.literal_eval(ast.parse(text, mode="eval")))
-    except SyntaxError as error:
-        raise CameraFileError(path, f"line {error.lineno}" if error.lineno else "content", error.msg) from None
-    except (ValueError, TypeError):  # a list has no hash, as a key has
-        raise CameraFileError(path, "content", "something else than texts, numbers, lists and mappings") from None
 
 
 def _with_floats(value: Any) -> Any:

@@ -66,7 +66,29 @@ class Table(MapFormat):
         """Return the nodes (n, m, 2) of a file; `blank` has their step and their places."""
 
     def encode(self, path: str, exact: Exact, options: Mapping[str, Any]) -> tuple[bytes, dict[str, Any]]:
-        mesh = mesh_of(path, exact, self._checked(options.get("step", self.step), "save_map"))
+        # the mesh of a warp, exact at its nodes, smoothly continued to those without a position; refuse seams
+        step = self._checked(options.get("step", self.step), "save_map")
+        half, leaps = np.array(exact.source_size[::-1], np.float64) / 2, 0
+        for p, shown in ((exact.positions, exact.shown), (exact.positions.swapaxes(0, 1), exact.shown.T)):
+            leaps += int(((np.abs(np.diff(p, axis=0)) > half).any(-1) & shown[1:] & shown[:-1]).sum())
+        if leaps:
+            raise CameraFileError(
+                path,
+                "mesh",
+                f"positions leap across the source beside {leaps} pixels, as at the seam of a panorama, and no mesh "
+                "does. A target that does not show the seam has one; opencv and onnx hold positions pixel by pixel",
+            )
+        n, m = _counts(step, exact.target_size)
+        down, across = np.nonzero(exact.shown)
+        blocks = np.zeros((n + 1, m + 1), np.bool_)  # each node between its four blocks
+        blocks[down // step + 1, across // step + 1] = True
+        needed = blocks[1:, 1:] | blocks[:-1, 1:] | blocks[1:, :-1] | blocks[:-1, :-1]
+        nodes, mapped = exact.at(step * np.arange(m, dtype=np.float64), step * np.arange(n, dtype=np.float64))
+        sides = np.array(exact.source_size[::-1], np.float64)
+        low, high = -_REACH * sides, (1 + _REACH) * sides
+        # nodes far off do not tell where to go on
+        nodes = _continued(np.where(needed[..., None], nodes, nodes.clip(low, high)), mapped, low, high)
+        mesh = Mesh(step, nodes, needed)
         content, facts = self.pack(path, mesh, exact, options)
         return content, {"step": mesh.step, "nodes": mesh.nodes.shape[:2], **facts}
 
@@ -95,31 +117,6 @@ def table(content: bytes, dtype: str, shape: tuple[int, ...]) -> np.ndarray:
 def _counts(step: int, size: tuple[int, int]) -> tuple[int, int]:
     """Return how many nodes there are down and across: the last ones are not below the size."""
     return -(-size[0] // step) + 1, -(-size[1] // step) + 1
-
-
-def mesh_of(path: str, exact: Exact, step: int) -> Mesh:
-    """Return the mesh of a warp, exact at its nodes, smoothly continued to those without a position; refuse seams."""
-    half, leaps = np.array(exact.source_size[::-1], np.float64) / 2, 0
-    for p, shown in ((exact.positions, exact.shown), (exact.positions.swapaxes(0, 1), exact.shown.T)):
-        leaps += int(((np.abs(np.diff(p, axis=0)) > half).any(-1) & shown[1:] & shown[:-1]).sum())
-    if leaps:
-        raise CameraFileError(
-            path,
-            "mesh",
-            f"positions leap across the source beside {leaps} pixels, as at the seam of a panorama, and no mesh does. "
-            "A target that does not show the seam has one; opencv and onnx hold positions pixel by pixel",
-        )
-    n, m = _counts(step, exact.target_size)
-    down, across = np.nonzero(exact.shown)
-    blocks = np.zeros((n + 1, m + 1), np.bool_)  # each node between its four blocks
-    blocks[down // step + 1, across // step + 1] = True
-    needed = blocks[1:, 1:] | blocks[:-1, 1:] | blocks[1:, :-1] | blocks[:-1, :-1]
-    nodes, mapped = exact.at(step * np.arange(m, dtype=np.float64), step * np.arange(n, dtype=np.float64))
-    sides = np.array(exact.source_size[::-1], np.float64)
-    low, high = -_REACH * sides, (1 + _REACH) * sides
-    # nodes far off do not tell where to go on
-    nodes = _continued(np.where(needed[..., None], nodes, nodes.clip(low, high)), mapped, low, high)
-    return Mesh(step, nodes, needed)
 
 
 def _continued(nodes: Floats, known: Bools, low: Floats, high: Floats) -> Floats:
@@ -182,7 +179,13 @@ def rounded(mesh: Mesh, exact: Exact, parts: int, low: Floats, high: Floats) -> 
     """
     values = mesh.nodes * parts
     least, most = low * parts, high * parts
-    outside = (_OUTWARDS * _bend(mesh.nodes) * parts).clip(-0.5, 0.5)
+    # the sum of the second differences along both axes, of (n, m, 2); at the ends those next to them
+    total = np.zeros_like(mesh.nodes)
+    for axis in (0, 1):
+        if mesh.nodes.shape[axis] > 2:
+            bend = np.diff(mesh.nodes, 2, axis)
+            total += np.concatenate((bend.take([0], axis), bend, bend.take([-1], axis)), axis)
+    outside = (_OUTWARDS * total * parts).clip(-0.5, 0.5)
     nodes = np.rint(values - outside).clip(least, most)
     either = np.floor(values).clip(least, most), np.ceil(values).clip(least, most)
     edge = np.array(exact.source_size[::-1], np.float64) - 1
@@ -217,13 +220,3 @@ def rounded(mesh: Mesh, exact: Exact, parts: int, low: Floats, high: Floats) -> 
         nodes[node], error[pixels] = value, off
     whole: np.ndarray = nodes.astype(np.int64)
     return whole
-
-
-def _bend(nodes: Floats) -> Floats:
-    """Return the sum of the second differences along both axes, of (n, m, 2); at the ends those next to them."""
-    total = np.zeros_like(nodes)
-    for axis in (0, 1):
-        if nodes.shape[axis] > 2:
-            bend = np.diff(nodes, 2, axis)
-            total += np.concatenate((bend.take([0], axis), bend, bend.take([-1], axis)), axis)
-    return total

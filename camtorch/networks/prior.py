@@ -109,7 +109,13 @@ def prior_of(
                 found.append(Prior(asked.kind, lens, focal_length, ratio, middle, (first, second, third)))
                 break
     if found:
-        return _liveliest(found)
+        # the first, unless coefficients do nothing there that do something elsewhere, as the omega of `FOV` at 0: then
+        # that of most coefficients of which the one that does least does most
+        scales = [prior.scales(torch.tensor(prior.discs, dtype=torch.float64)) for prior in found]
+        counts = [int((scale > 0).all(0).sum()) for scale in scales]
+        if counts[0] == max(counts):
+            return found[0]
+        return found[min((i for i, n in enumerate(counts) if n == max(counts)), key=lambda i: float(scales[i].amax()))]
     who, other = (
         ("the camera", "a crop's camera") if start is not None else (asked.kind.__name__, "a model that sees further")
     )
@@ -118,18 +124,6 @@ def prior_of(
         f"{owner}: {who} has no rays for the corners of images of {image_size}{angles} and a principal point moved by "
         f"up to centre={centre} of them. A narrower fov, a smaller centre, or {other}"
     )
-
-
-def _liveliest(priors: list[Prior]) -> Prior:
-    """Return the first, unless coefficients do nothing there that do something elsewhere, as the omega of `FOV` at 0.
-
-    Then return that of most coefficients of which the one that does least does most.
-    """
-    scales = [prior.scales(torch.tensor(prior.discs, dtype=torch.float64)) for prior in priors]
-    counts = [int((scale > 0).all(0).sum()) for scale in scales]
-    if counts[0] == max(counts):
-        return priors[0]
-    return priors[min((i for i, n in enumerate(counts) if n == max(counts)), key=lambda i: float(scales[i].amax()))]
 
 
 def _as_fov(fov: Sequence[float] | None, owner: str) -> tuple[float, float] | None:

@@ -93,18 +93,16 @@ def _draw_uncertainty(ax: Axes, calibration: Calibration, head: str) -> None:
     ax.fill_between([-0.5, width - 0.5], -0.5, height - 0.5, color=NO_RAYS, linewidth=0, zorder=0.5)
     ax.set_title(f"{head}sigma of a projection")
     if values.count():
-        bounds = _bands(values.compressed())
+        # bounds from 1, 2, 5, 10, ... around most values
+        low, high = (math.log10(max(value, 1e-6)) for value in np.quantile(values.compressed(), (0.01, 0.97)))
+        ladder = [
+            float(f"{digit}e{power}") for power in range(math.floor(low), math.ceil(high) + 1) for digit in (1, 2, 5)
+        ]
+        first = max(i for i, bound in enumerate(ladder) if i == 0 or bound <= 10**low)
+        last = next((i for i, bound in enumerate(ladder) if bound >= 10**high and i > first), len(ladder) - 1)
+        bounds = ladder[first : min(last, first + _BANDS) + 1]
         u, v = pixels[0, :, 0].numpy(force=True), pixels[:, 0, 1].numpy(force=True)
         colours = levels("uncertainty", len(bounds)).colors
         bands = ax.contourf(u, v, np.ma.maximum(values, bounds[0]), bounds, colors=colours, extend="max", zorder=1)
         ax.figure.colorbar(bands, ax=ax, label="px", format="%g", shrink=0.8, pad=0.02)
         ax.set_title(f"{head}sigma of a projection at infinity, median {np.median(values.compressed()):.2g} px")
-
-
-def _bands(values: np.ndarray) -> list[float]:
-    """Return bounds from 1, 2, 5, 10, ... around most values."""
-    low, high = (math.log10(max(value, 1e-6)) for value in np.quantile(values, (0.01, 0.97)))
-    ladder = [float(f"{digit}e{power}") for power in range(math.floor(low), math.ceil(high) + 1) for digit in (1, 2, 5)]
-    first = max(i for i, bound in enumerate(ladder) if i == 0 or bound <= 10**low)
-    last = next((i for i, bound in enumerate(ladder) if bound >= 10**high and i > first), len(ladder) - 1)
-    return ladder[first : min(last, first + _BANDS) + 1]

@@ -153,17 +153,6 @@ class Plan:
 _plans: dict[tuple[Optics, int], Plan | None] = {}
 
 
-def _plan(optics_of: Optics, k: Tensor) -> Plan | None:
-    """That of coefficients (C, n); None where a part of the optics has no code."""
-    key = optics_of, k.shape[-1]
-    if key not in _plans:
-        given = [c.clone() for c in columns(k[:1].double())]
-        chart, lens = optics_of(given)
-        parts = codes(chart, lens)
-        _plans[key] = None if parts is None else Plan(chart, lens, parts, given)
-    return _plans[key]
-
-
 class Lenses:
     """Those of cameras (C,) as the compiled geometry takes them: numbers, and what was found of their domains."""
 
@@ -355,7 +344,13 @@ def native_of(
     """
     if library() is None or not intrinsics.is_cpu or not k.shape[0]:
         return None
-    plan = _plan(optics_of, k)
+    key = optics_of, k.shape[-1]
+    if key not in _plans:
+        given = [c.clone() for c in columns(k[:1].double())]
+        chart, lens = optics_of(given)
+        parts = codes(chart, lens)
+        _plans[key] = None if parts is None else Plan(chart, lens, parts, given)
+    plan = _plans[key]
     return None if plan is None else Native(_lenses_of(plan, optics_of, k, domain, tables), intrinsics, usable)
 
 

@@ -138,28 +138,35 @@ class _Native(Function):
         rows, intrinsics, distortion, *kept = ctx.saved_tensors
         wanted, cameras = ctx.needs_input_grad, ctx.cameras
         if torch.is_grad_enabled() or not is_native(by_planes):
-            again = _by_formula(ctx, (rows, intrinsics, distortion), by_planes)
-            return *again, None, None, None
+            # by the formula, with a graph of their own
+            inputs, options = (rows, intrinsics, distortion), {"create_graph": True, "materialize_grads": True}
+            leaves = [t for t, needed in zip(inputs, wanted[:3], strict=True) if needed]
+            with torch.enable_grad():
+                planes = ctx.direction.formula(ctx.model, *inputs, cameras)[0]
+                gradients = iter(torch.autograd.grad(planes, leaves, by_planes, **options))
+            return *(next(gradients) if needed else None for needed in wanted[:3]), None, None, None
         of_parameters = wanted[1] or wanted[2]
         by_rows, sums = ctx.direction.native_vjp(cameras.native, *kept, by_planes, wanted[0], of_parameters)
         return by_rows, *cameras.cotangents(sums, wanted[1:3]), None, None, None
-
-
-def _by_formula(ctx: Any, inputs: Sequence[Tensor], by_planes: Tensor) -> tuple[Tensor | None, ...]:
-    """The cotangents of rows, intrinsics and distortion with a graph of their own."""
-    wanted = ctx.needs_input_grad[:3]
-    leaves = [t for t, needed in zip(inputs, wanted, strict=True) if needed]
-    with torch.enable_grad():
-        planes, _ = ctx.direction.formula(ctx.model, *inputs, ctx.cameras)
-        gradients = iter(torch.autograd.grad(planes, leaves, by_planes, create_graph=True, materialize_grads=True))
-    return tuple([next(gradients) if needed else None for needed in wanted])
 
 
 def rows_of(camera: CameraLike, intrinsics: Tensor, distortion: Tensor) -> Cameras:
     """The rows' cameras, kept until a value changes."""
     cameras = kept_cameras(camera._memo, type(camera), intrinsics, distortion)
     if cameras.usable is not None and not camera._warned:
-        _warn_of_unusable(camera, cameras, cameras.usable)
+        # say once that learning drove Parameters of this module to where no camera is, and no gradient leads back
+        bad = (cameras.usable <= 0).flatten().nonzero()
+        found = unusable(camera, *(t[bad[0, 0]] for t in cameras.given)) if len(bad) else None
+        if found is not None and isinstance(getattr(camera, found[0]), nn.Parameter):
+            camera._warned = True
+            name = parametrize.type_before_parametrizations(camera).__name__
+            where = f" of camera {int(bad[0, 0])} in the batch" if len(cameras.given[0]) > 1 else ""
+            keeps = "; focal lengths stay positive after torch.nn.utils.parametrize.register_parametrization(camera, "
+            keeps = f'{keeps}"intrinsics", camtorch.PositiveFocal())' if found[0] == "intrinsics" else ""
+            warn(
+                f"{name}: {found[0]}{where} became unusable: {found[1]}. All its results are invalid "
+                f"and its gradients zero from here on. A smaller learning rate keeps it from there{keeps}",
+            )
     return cameras
 
 
@@ -175,22 +182,6 @@ def kept_cameras(memo: Memo, model: type[CameraLike], intrinsics: Tensor, distor
             return cameras
     made: Cameras = memo.renew(lambda: Cameras(model, intrinsics, distortion))
     return made
-
-
-def _warn_of_unusable(camera: CameraLike, cameras: Cameras, usable: Tensor) -> None:
-    """Say once that learning drove Parameters of this module to where no camera is, and no gradient leads back."""
-    bad = (usable <= 0).flatten().nonzero()
-    found = unusable(camera, *(t[bad[0, 0]] for t in cameras.given)) if len(bad) else None
-    if found is not None and isinstance(getattr(camera, found[0]), nn.Parameter):
-        camera._warned = True
-        name = parametrize.type_before_parametrizations(camera).__name__
-        where = f" of camera {int(bad[0, 0])} in the batch" if len(cameras.given[0]) > 1 else ""
-        keeps = "; focal lengths stay positive after torch.nn.utils.parametrize.register_parametrization(camera, "
-        keeps = f'{keeps}"intrinsics", camtorch.PositiveFocal())' if found[0] == "intrinsics" else ""
-        warn(
-            f"{name}: {found[0]}{where} became unusable: {found[1]}. All its results are invalid "
-            f"and its gradients zero from here on. A smaller learning rate keeps it from there{keeps}",
-        )
 
 
 def per_row(parameters: Tensor, lead: torch.Size, rows: Tensor) -> Tensor:

@@ -45,20 +45,16 @@ def limits_and_extent(optics: Optics, k: Tensor) -> tuple[Tensor, Extent]:
     followed = _followed(chart, lens, rows, *directions)
     lost, reach, *rim = (w.unflatten(0, (-1, AZIMUTHS)) for w in followed)
     pairs = torch.stack((lost, lost.roll(-1, -1)), -1).flatten(0, 1)
-    limits = _limit(chart, rows, pairs).unflatten(0, (-1, AZIMUTHS))
-    envelope = _envelope(*rim)
-    return limits * limits, Extent(radii, reach, torch.where(envelope < _FAR, envelope, torch.inf))
-
-
-def _limit(chart: Chart, radii: Tensor, lost: Tensor) -> Tensor:
-    """(M,): the radius between two azimuths before which the orientation decides; radii (M, S), lost (M, 2) on both."""
-    limits = _radius_at(radii, lost)
-    nearer, further = limits.amin(-1), limits.amax(-1)
+    # (M,): the radius between two azimuths before which the orientation decides; radii (M, S), lost (M, 2) on both
+    ends = _radius_at(rows, pairs)
+    nearer, further = ends.amin(-1), ends.amax(-1)
     # Between two azimuths the fold moves smoothly, and may bulge: the orientation tells where it lies.
     # Or it ends there: then the nearer one is on the safe side.
-    smooth = (lost.diff(dim=-1).squeeze(-1).abs() <= 1.5) | (further <= (1 + _SMOOTH) * nearer)
+    smooth = (pairs.diff(dim=-1).squeeze(-1).abs() <= 1.5) | (further <= (1 + _SMOOTH) * nearer)
     limit = torch.where(smooth, further * (1 + _BULGE), nearer).unsqueeze(-1)
-    return limit.clamp(max=chart.end(limit.dtype)).squeeze(-1)
+    limits = limit.clamp(max=chart.end(limit.dtype)).squeeze(-1).unflatten(0, (-1, AZIMUTHS))
+    envelope = _envelope(*rim)
+    return limits * limits, Extent(radii, reach, torch.where(envelope < _FAR, envelope, torch.inf))
 
 
 def _followed(chart: Chart, lens: Lens, radii: Tensor, a: Tensor, b: Tensor) -> tuple[Tensor, ...]:

@@ -42,27 +42,23 @@ def invert(domain: Domain, u: Tensor, v: Tensor) -> Found:
         return _invert_radial(domain, u, v)
     if domain.all_stagewise:
         return _invert_stagewise(domain, u, v)
-    found = _invert_planar(domain, u, v)
-    if domain.stagewise is None:
-        return found
-    # each camera alike, whatever else is in its batch
-    pairs = zip(_invert_stagewise(domain, u, v), found, strict=True)
-    return Found(*(torch.where(domain.stagewise, stagewise, planar) for stagewise, planar in pairs))
-
-
-def _invert_planar(domain: Domain, u: Tensor, v: Tensor) -> Found:
     # in the plane, from the inverse of the radial factor
     a, b = domain.lens.start(u, v)
     if domain.inverse is not None:
         # a stage may have sent a pixel far off the image out of the floating-point range
         scale = domain.inverse(torch.addcmul(a * a, b, b).nan_to_num(0.0, 0.0))
         a, b = a * scale, b * scale
-    found = _newton(domain.lens, u, v, a, b)
+    inner = _newton(domain.lens, u, v, a, b)
     # further out than images reach a determinant may overflow, and a step seem short
     # nor must a ray's rounding carry it across the fold
     usual2 = times(domain.usual2, 1 - 32 * torch.finfo(u.dtype).eps)
-    inside = usual2 - torch.addcmul(found.a * found.a, found.b, found.b)
-    return found._replace(solved=torch.minimum(found.solved, inside))
+    inside = usual2 - torch.addcmul(inner.a * inner.a, inner.b, inner.b)
+    found = inner._replace(solved=torch.minimum(inner.solved, inside))
+    if domain.stagewise is None:
+        return found
+    # each camera alike, whatever else is in its batch
+    pairs = zip(_invert_stagewise(domain, u, v), found, strict=True)
+    return Found(*(torch.where(domain.stagewise, stagewise, planar) for stagewise, planar in pairs))
 
 
 def _invert_stagewise(domain: Domain, u: Tensor, v: Tensor) -> Found:

@@ -304,7 +304,15 @@ def rectify(
         low, high, focal = _extent([(left, turns[0]), (right, turns[1])], projection, vertical)
         angles = [] if fov is None else list(fov) if isinstance(fov, (tuple, list)) else [fov]
         if fov is not None:
-            high = _half(angles, projection, vertical, (high - low) / 2, fov)
+            if len(angles) not in (1, 2):
+                raise ValueError(f"rectify: fov must be horizontal, or (horizontal, vertical) degrees; got {fov!r}")
+            high = (high - low) / 2  # as usual where no angle is given
+            for i, given in enumerate(angles):
+                is_along = (i == 1) == vertical
+                most = 180 if is_along or projection == "perspective" else 360
+                angle = math.radians(as_fov(given, "rectify", most, f" for {projection}")) / 2
+                straight = projection == "perspective" or (projection == "cylindrical" and is_along)
+                high[..., i] = math.tan(angle) if straight else angle
             low = -high
         extent = high - low
         if size is None:
@@ -395,17 +403,3 @@ def _scale(camera: Camera, rotation: Tensor, plane: Camera, middle: Tensor) -> T
     pixels, valid = camera.project((rays @ rotation).to(camera.intrinsics.dtype))
     slopes = (pixels.double()[..., 1::2, :] - pixels[..., ::2, :]) / (2 * _STEP)
     return torch.where(valid.all(-1), torch.linalg.det(slopes).abs().sqrt(), 0.0)
-
-
-def _half(angles: list[float], projection: str, vertical: bool, usual: Tensor, fov: Any) -> Tensor:
-    """Return half the width and the height (*B, 2) of the plane of a projection, `usual` where no angle is given."""
-    if len(angles) not in (1, 2):
-        raise ValueError(f"rectify: fov must be horizontal, or (horizontal, vertical) degrees; got {fov!r}")
-    half = usual.clone()
-    for i, given in enumerate(angles):
-        is_along = (i == 1) == vertical
-        most = 180 if is_along or projection == "perspective" else 360
-        angle = math.radians(as_fov(given, "rectify", most, f" for {projection}")) / 2
-        straight = projection == "perspective" or (projection == "cylindrical" and is_along)
-        half[..., i] = math.tan(angle) if straight else angle
-    return half

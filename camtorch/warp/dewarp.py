@@ -120,7 +120,12 @@ def _fitted(camera: Camera, projection: str, size: tuple[int, int], rotation: Te
     low = torch.where(some, torch.where(shown, points, torch.inf).amin(-2), -1.0)
     high = torch.where(some, torch.where(shown, points, -torch.inf).amax(-2), 1.0)
     if projection not in _PLANES:
-        whole = _sees_backward(camera, rotation)
+        # (*B,) bool: the image shows what is on both sides of the seam of a panorama, which is then a whole turn
+        rays = camera.intrinsics.new_tensor([[-_SEAM, 0.0, -1.0], [_SEAM, 0.0, -1.0]])
+        rays = rays if rotation is None else rays @ rotation.to(rays.dtype)
+        batch = broadcast_shapes(camera.batch_shape, rays.shape[:-2])
+        pixels, valid = camera.project(rays.expand(*batch, 2, 3))
+        whole = (valid & camera.contains(pixels)).all(-1)
         ends = torch.stack((whole, torch.zeros_like(whole)), -1)
         low, high = torch.where(ends, -limit, low), torch.where(ends, limit, high)
     extent = torch.maximum(high - low, 1e-3 * limit)
@@ -130,15 +135,6 @@ def _fitted(camera: Camera, projection: str, size: tuple[int, int], rotation: Te
         focal = (target / extent)[..., :1]
     centre = (target - 1) / 2 - focal * (low + high) / 2
     return torch.cat((focal, focal, centre), -1)
-
-
-def _sees_backward(camera: Camera, rotation: Tensor | None) -> Tensor:
-    """(*B,) bool: the image shows what is on both sides of the seam of a panorama, which is then a whole turn."""
-    rays = camera.intrinsics.new_tensor([[-_SEAM, 0.0, -1.0], [_SEAM, 0.0, -1.0]])
-    rays = rays if rotation is None else rays @ rotation.to(rays.dtype)
-    batch = broadcast_shapes(camera.batch_shape, rays.shape[:-2])
-    pixels, valid = camera.project(rays.expand(*batch, 2, 3))
-    return (valid & camera.contains(pixels)).all(-1)
 
 
 def middle_lines(

@@ -366,7 +366,11 @@ def _compute(exact: Exact, first: int, cells: Tensor, todo: Tensor, like: Tensor
 
 def interpolated(nodes: Tensor, rows: int, columns: int) -> Tensor:
     """(B, 2, rows + 3, columns + 3) to (B, 2, 8 rows, 8 columns)."""
-    weights = _weights(nodes)
+    # (8, 4): of the nodes at -1, 0, 1, 2 in the cubic through them, at 0, 1/8, ..., 7/8
+    t = torch.arange(STEP, dtype=torch.float64, device=nodes.device) / STEP
+    before, at, after, beyond = t + 1, t, t - 1, t - 2
+    parts = -at * after * beyond / 6, before * after * beyond / 2, -before * at * beyond / 2, before * at * after / 6
+    weights = torch.stack(parts, -1).to(nodes.dtype)
     terms = (nodes[:, :, i : i + rows, None] * weights[:, i, None] for i in range(4))
     lines = reduce(torch.add, terms).flatten(2, 3)
     # torch may be told to multiply matrices in less than float32
@@ -383,11 +387,3 @@ def interpolated(nodes: Tensor, rows: int, columns: int) -> Tensor:
             block = lines[..., first : first + n + 3] @ spread[: n + 3, :n].flatten(1)
             result[..., first * STEP : (first + n) * STEP] = block
     return result
-
-
-def _weights(like: Tensor) -> Tensor:
-    """(8, 4): of the nodes at -1, 0, 1, 2 in the cubic through them, at 0, 1/8, ..., 7/8."""
-    t = torch.arange(STEP, dtype=torch.float64, device=like.device) / STEP
-    before, at, after, beyond = t + 1, t, t - 1, t - 2
-    terms = -at * after * beyond / 6, before * after * beyond / 2, -before * at * beyond / 2, before * at * after / 6
-    return torch.stack(terms, -1).to(like.dtype)

@@ -160,7 +160,11 @@ class Reproject(GeometryModule):
             points = points.expand(len(self.source.intrinsics), *points.shape[1:])
         pixels, mapped = self.source.project(off_poles(self.source, points))
         far = points[..., 2] if kind == "z" else torch.linalg.vector_norm(points.detach(), dim=-1)
-        return _snapped(pixels), mapped & good, far
+        # pixels that rounding moved off a pixel's centre go back there, with their gradient
+        near = pixels.detach().round()
+        off = near - pixels.detach()
+        off = torch.where(off.abs() <= _SNAP.get(pixels.dtype, 0.0), off, 0.0)
+        return pixels + off, mapped & good, far
 
     def _rays(self) -> tuple[Tensor, Tensor]:
         """The target's, kept while nothing can learn."""
@@ -192,11 +196,3 @@ class Reproject(GeometryModule):
         """The options."""
         options: dict[str, Any] = {"mode": self.mode, "padding_mode": self.padding_mode, "fill": self.fill}
         return ", ".join(f"{name}={value!r}" for name, value in options.items())
-
-
-def _snapped(pixels: Tensor) -> Tensor:
-    """Pixels that rounding moved off a pixel's centre go back there, with their gradient."""
-    near = pixels.detach().round()
-    off = near - pixels.detach()
-    off = torch.where(off.abs() <= _SNAP.get(pixels.dtype, 0.0), off, 0.0)
-    return pixels + off

@@ -120,7 +120,19 @@ def _by_torch(images: Tensor, where: Sampling | Lattice, how: Sampler, kept: dic
     if isinstance(where, Lattice):
         where = where.pixels
     if how.mode == "nearest" and not dtype.is_floating_point and dtype.itemsize > 2:
-        return _pick(images, where, how)
+        # the nearest of integers (B, C, H, W), moved and not computed with: no float holds every id
+        value = as_pixels(how.fill, images.dtype, images.device)
+        height, width = images.shape[-2:]
+        u, v = (
+            _padded(((position + 1) * side - 1) / 2, side, how.padding_mode).round()
+            for position, side in zip(where.grid.unbind(-1), (width, height), strict=True)
+        )
+        inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
+        seen = inside if how.padding_mode == "zeros" else where.mapped
+        index = torch.where(inside, v.long() * width + u.long(), 0).flatten(1).unsqueeze(1)
+        pixels = images.view(SIGNED.get(images.dtype, images.dtype)).flatten(2)
+        picked = pixels.gather(2, index.expand(*images.shape[:2], -1)).view(images.dtype)
+        return torch.where(seen.unsqueeze(1), picked.unflatten(2, where.grid.shape[1:3]), value)
     where = where._replace(grid=converted(where.grid, wide_dtype(dtype)))
     plain = plain and is_plain(where.grid)
     large = plain and not wide and math.prod(images.shape[1:]) > _LARGE
@@ -233,7 +245,8 @@ def _minified(
 ) -> Tensor:
     """Return the result of `sample`, in which a pixel that covers n source pixels takes the mean of about as many."""
     level = scale.clamp(min=1).log2().unsqueeze(1)
-    for n in range(_level_count(level, levels.images)):
+    last = min(levels.images.shape[-2:]).bit_length() - 1
+    for n in range(min(int(level.amax().ceil()) if may_look(level) else _TRACED_LEVELS, last)):
         levels = levels.half
         smaller = sample(levels.images, grid, mode, padding_mode, levels.finite)
         share = (level - n).clamp(0, 1).to(result)
@@ -241,12 +254,6 @@ def _minified(
         blended = torch.where(share < 1, torch.lerp(result, smaller, share), smaller)
         result = torch.where(share > 0, blended, result)
     return result
-
-
-def _level_count(level: Tensor, images: Tensor) -> int:
-    """How often images are halved for samples at these levels."""
-    last = min(images.shape[-2:]).bit_length() - 1
-    return min(int(level.amax().ceil()) if may_look(level) else _TRACED_LEVELS, last)
 
 
 def sample(images: Tensor, grid: Tensor, mode: Mode, padding_mode: PaddingMode, finite: bool = False) -> Tensor:
@@ -282,7 +289,19 @@ def _sample(images: Tensor, grid: Tensor, mode: Mode, padding_mode: PaddingMode,
         for image in zip(result, images, grid, strict=True):
             _sample_tiles(*image, threads, mode, padding_mode)
     if mode == "bicubic" and not finite and not math.isfinite(result.sum()):
-        _sample_again(result, images, grid, padding_mode)
+        # where the bicubic result is not finite, pixels without a weight, but for rounding, lose their part in it
+        b, y, x = (~torch.isfinite(result)).any(1).nonzero(as_tuple=True)
+        height, width = images.shape[-2:]
+        columns, rows = (
+            _taps(position, side, padding_mode)
+            for position, side in zip(grid[b, y, x].unbind(-1), (width, height), strict=True)
+        )
+        total = result.new_zeros(len(b), result.shape[1])
+        for j, by_row in rows:
+            for i, by_column in columns:
+                weight = (by_row * by_column).unsqueeze(-1)
+                total += torch.where(weight != 0, weight * images[b, :, j, i], 0)
+        result[b, :, y, x] = total
     return result
 
 
@@ -300,22 +319,6 @@ def _sample_tiles(
     if tiles < len(grid):
         rest = F.grid_sample(image[None], grid[None, tiles:], mode, padding_mode, align_corners=False)
         result[:, tiles:] = rest[0]
-
-
-def _sample_again(result: Tensor, images: Tensor, grid: Tensor, padding_mode: PaddingMode) -> None:
-    """Where the bicubic result is not finite, pixels without a weight, but for rounding, lose their part in it."""
-    b, y, x = (~torch.isfinite(result)).any(1).nonzero(as_tuple=True)
-    height, width = images.shape[-2:]
-    columns, rows = (
-        _taps(position, side, padding_mode)
-        for position, side in zip(grid[b, y, x].unbind(-1), (width, height), strict=True)
-    )
-    total = result.new_zeros(len(b), result.shape[1])
-    for j, by_row in rows:
-        for i, by_column in columns:
-            weight = (by_row * by_column).unsqueeze(-1)
-            total += torch.where(weight != 0, weight * images[b, :, j, i], 0)
-    result[b, :, y, x] = total
 
 
 def _taps(position: Tensor, side: int, padding_mode: PaddingMode) -> list[tuple[Tensor, Tensor]]:
@@ -347,22 +350,6 @@ def _padded(u: Tensor, side: int, padding_mode: PaddingMode) -> Tensor:
         u = (u + 0.5).remainder(2 * side) - 0.5
         u = torch.minimum(u, 2 * side - 1 - u)
     return u.clamp(0, side - 1)
-
-
-def _pick(images: Tensor, where: Sampling, how: Sampler) -> Tensor:
-    """The nearest of integers (B, C, H, W), moved and not computed with: no float holds every id."""
-    value = as_pixels(how.fill, images.dtype, images.device)
-    height, width = images.shape[-2:]
-    u, v = (
-        _padded(((position + 1) * side - 1) / 2, side, how.padding_mode).round()
-        for position, side in zip(where.grid.unbind(-1), (width, height), strict=True)
-    )
-    inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
-    seen = inside if how.padding_mode == "zeros" else where.mapped
-    index = torch.where(inside, v.long() * width + u.long(), 0).flatten(1).unsqueeze(1)
-    pixels = images.view(SIGNED.get(images.dtype, images.dtype)).flatten(2)
-    picked = pixels.gather(2, index.expand(*images.shape[:2], -1)).view(images.dtype)
-    return torch.where(seen.unsqueeze(1), picked.unflatten(2, where.grid.shape[1:3]), value)
 
 
 class Options(TypedDict):

@@ -110,7 +110,20 @@ class Warp(CameraPair):
     ):
         options = as_options("Warp", mode, padding_mode, fill, antialias, tolerance)
         rotation = as_rotation(rotation, "Warp")
-        self._set(source, target, options, _check_parts(source, target, rotation))
+        # how many of each a warp is between; raises what is wrong with that, and with them
+        as_sized(source, "source", "Warp")
+        as_sized(target, "target", "Warp")
+        check_devices("Warp", source=source.intrinsics, target=target.intrinsics, rotation=rotation)
+        shapes = [tuple(source.batch_shape), tuple(target.batch_shape)]
+        shapes += [] if rotation is None else [tuple(rotation.shape[:-2])]
+        try:
+            batch = broadcast_shapes(*shapes)
+        except ValueError:
+            batch = torch.Size((0, 0))  # none
+        if len(batch) > 1:
+            got = ", ".join(map(str, shapes))
+            raise ValueError(f"Warp: source, target and rotation may each have one batch dim, of one size; got {got}")
+        self._set(source, target, options, batch)
         self.turned_by(rotation)
 
     @classmethod
@@ -297,23 +310,6 @@ class Warp(CameraPair):
         said = {**self.options, "tolerance": self.tolerance, "rotation": self.rotation is not None}
         learns = any(t.requires_grad for t in (*self.parameters(), *self.buffers()))
         return ", ".join([*(f"{name}={value!r}" for name, value in said.items()), "learns" if learns else "fixed"])
-
-
-def _check_parts(source: Camera, target: Camera, rotation: Tensor | None) -> torch.Size:
-    """How many of each a warp is between; raises what is wrong with that, and with them."""
-    as_sized(source, "source", "Warp")
-    as_sized(target, "target", "Warp")
-    check_devices("Warp", source=source.intrinsics, target=target.intrinsics, rotation=rotation)
-    shapes = [tuple(source.batch_shape), tuple(target.batch_shape)]
-    shapes += [] if rotation is None else [tuple(rotation.shape[:-2])]
-    try:
-        batch = broadcast_shapes(*shapes)
-    except ValueError:
-        batch = torch.Size((0, 0))  # none
-    if len(batch) > 1:
-        got = ", ".join(map(str, shapes))
-        raise ValueError(f"Warp: source, target and rotation may each have one batch dim, of one size; got {got}")
-    return batch
 
 
 def checked(
