@@ -100,6 +100,7 @@ class CameraAugmentation(InContainers, GeometricAugmentationBase2D):
         self.flags["padding_mode"] = SamplePadding.get(options["padding_mode"])
         if (size := augmentation.size_after(own_size)) != own_size:
             self.flags["size"] = size
+        self._kind = kind_of_camera(camera)
         self.keypoints_valid: Tensor | None = None
         """(B, N) bool: which of the keypoints that were moved last lie on their image."""
         # lists of masks come row by row between other labels of the batch
@@ -120,7 +121,7 @@ class CameraAugmentation(InContainers, GeometricAugmentationBase2D):
         drawn = self.augmentation.drawn(count, 1.0, self.same_on_batch)
         del drawn["apply"]
         drawn |= {name: torch.full((count, 4), torch.nan) for name in self.augmentation.crops}
-        drawn[KIND] = torch.tensor(kind_of_camera(self.camera)).expand(count, -1).contiguous()
+        drawn[KIND] = torch.tensor(self._kind).expand(count, -1).contiguous()
         if "size" in self.flags:
             drawn["output_size"] = torch.tensor(self.flags["size"]).expand(count, -1).contiguous()
         return drawn

@@ -165,6 +165,25 @@ def test_numbers_of_unknown_names_are_refused(front_end, monkeypatch):
         assert torch.equal(moved["lidar"], fields["lidar"]) == (kind == "keep")
 
 
+@pytest.mark.slow  # for the compiler
+@pytest.mark.parametrize("front_end", ["kornia", "torchvision"])
+def test_front_ends_compile(front_end, monkeypatch):
+    fields = {name: sample(2)[name] for name in ("image", "keypoints")}
+    kornia, results = front_end == "kornia", []
+    with contextlib.nullcontext() if kornia else torchvision_of("real", monkeypatch):
+        module = importlib.import_module(f"camtorch.augment.{front_end}")
+        if kornia:
+            sequential = importlib.import_module("kornia.augmentation").AugmentationSequential
+            move = sequential(module.RandomMount(camera()), data_keys=["input", "keypoints"])
+        else:
+            move = module.Transform(RandomMount(), camera())
+        for call in (torch.compile(move, backend="eager", fullgraph=kornia), move):
+            torch.manual_seed(3)
+            results.append([*call(*fields.values())] if kornia else [*call(fields).values()])
+    for one, other in zip(*results, strict=True):
+        torch.testing.assert_close(one, other, rtol=0, atol=1e-3)
+
+
 # names of a container's own targets, kinds of its own types, and names of arguments
 THEIR_OWN = {
     "albumentations": {"image", "images", "mask", "masks", "bboxes", "keypoints"},
