@@ -147,7 +147,7 @@ class Mirroring:
     def order(self, name: str, kind: str | None, count: int) -> tuple[int, ...] | None:
         """Return the order of `count` landmarks of a field in a mirror, or None; a name may have a path before it."""
         table = self._named.get(name.rpartition("/")[2]) if self._named is not None else self._one
-        if table is None:
+        if table is None or count == 0:
             meant = _FACES.get(count) if self._named is None and kind in _HOLD[:2] else None
             if meant is not None and count not in _told:
                 _told.add(count)

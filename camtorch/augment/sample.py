@@ -181,7 +181,8 @@ def kind_of(name: str, value: object, own: Mapping[str, str], owner: str) -> str
     if name.endswith("_valid"):
         return None
     base = name if name in KINDS else _ALIASES.get(name)
-    if base is None and isinstance(value, (Tensor, np.ndarray, list, tuple)):  # no image_path, mask_id
+    # no image_path, mask_id, of one sample or of a batch
+    if base is None and isinstance(value, (Tensor, np.ndarray, list, tuple)) and not _is_text(value):
         begins = sorted((k for k in KINDS if name.startswith(k + "_")), key=len)  # compilers know no max by a key
         base = begins[-1] if begins else None
     if base is None and _may_be_geometry(name, value):
@@ -197,6 +198,11 @@ def kind_of(name: str, value: object, own: Mapping[str, str], owner: str) -> str
             f"fields={{{name!r}: KIND}} says so, where KIND is {', '.join(KINDS)} or {KEEP}"
         )
     return base
+
+
+def _is_text(value: Any) -> bool:
+    texts = value.flat if isinstance(value, np.ndarray) else value
+    return not isinstance(value, Tensor) and len(value) > 0 and all(isinstance(text, (str, bytes)) for text in texts)
 
 
 def _close_to(name: str) -> list[str]:

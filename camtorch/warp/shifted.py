@@ -88,7 +88,7 @@ class ShiftedWarp(Warp):
             u, v = pixels.round().long().unbind(-1)
             height, width = mapped.shape[1:]
             at = v.clamp(0, height - 1) * width + u.clamp(0, width - 1)
-            index = at.reshape(len(mapped), -1)
+            index = at.reshape(len(mapped), at.shape[1:].numel())
             found = seen.flatten(1, 2).gather(1, index[..., None].expand(-1, -1, 2)).view(pixels.shape)
             return found, mapped.flatten(1).gather(1, index).view(at.shape)
         rays, has_ray = self.source.unproject(pixels)
@@ -108,9 +108,11 @@ class ShiftedWarp(Warp):
             count = len(far)
             rays, has_ray = rays.expand(count, *size, 3).flatten(1, 2), has_ray.expand(count, *size).flatten(1)
             turned = rays if self.rotation is None else rays @ self.rotation.to(rays)
-            found = [self._followed(i, turned[i], has_ray[i], far[i]) for i in range(count)]
-            seen, good = (torch.stack(parts) for parts in zip(*found, strict=True))
-            self._found = seen.view(count, *size, 2), good.view(count, *size)
+            seen, good = turned.new_empty(count, *size, 2), has_ray.new_empty(count, *size)
+            for i in range(count):
+                pixels, meets = self._followed(i, turned[i], has_ray[i], far[i])
+                seen[i], good[i] = pixels.view(*size, 2), meets.view(size)
+            self._found = seen, good
         return self._found
 
     def _followed(self, i: int, rays: Tensor, has_ray: Tensor, far: Tensor) -> tuple[Tensor, Tensor]:
@@ -157,7 +159,7 @@ class ShiftedWarp(Warp):
 def _between(distance: Tensor, pixels: Tensor) -> Tensor:
     """Return distances (B, *N) at pixels of maps (B, H, W), 0 if unknown: linear, between surfaces the nearest."""
     height, width = distance.shape[1:]
-    u, v = pixels.reshape(len(distance), -1, 2).unbind(-1)
+    u, v = pixels.reshape(len(distance), pixels.shape[1:-1].numel(), 2).unbind(-1)
     on = (u >= -0.5) & (u <= width - 0.5) & (v >= -0.5) & (v <= height - 0.5)
     u, v = torch.where(on, u, 0.0).clamp(0, width - 1), torch.where(on, v, 0.0).clamp(0, height - 1)
     left, top = u.floor().clamp(max=max(width - 2, 0)), v.floor().clamp(max=max(height - 2, 0))

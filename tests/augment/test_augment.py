@@ -391,9 +391,12 @@ def test_empty_batches():
         assert out["image"].shape == (0, 3, 30, 40)
         assert out["keypoints_valid"].shape == (0, 7)
         assert out["camera"].batch_shape == (0,)
-    out = RandomMount()({**sample(), "keypoints": torch.zeros(3, 0, 2), "boxes": torch.zeros(3, 0, 4)})
-    assert out["keypoints"].shape == (3, 0, 2)
-    assert out["boxes_valid"].shape == (3, 0)
+    shifted = RandomMount(shift=(0.1,) * 3)({**empty, "depth": empty["image"][:, :1]})
+    assert shifted["depth"].shape == (0, 1, *empty["image"].shape[-2:])
+    for make in (RandomMount(), A.HorizontalFlip(1.0, landmarks={"keypoints": "ibug68"})):
+        out = make({**sample(), "keypoints": torch.zeros(3, 0, 2), "boxes": torch.zeros(3, 0, 4)})
+        assert out["keypoints"].shape == (3, 0, 2)
+        assert out["boxes_valid"].shape == (3, 0)
 
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float64, torch.uint8])
