@@ -74,7 +74,7 @@ def test_as_step_by_step(key, name, dtype):
         assert torch.equal(out["camera"].distortion, change.target.distortion[0])
 
 
-@pytest.mark.parametrize("threads", [1, 3])
+@pytest.mark.parametrize("threads", [pytest.param(1, marks=pytest.mark.slow), 3])
 @pytest.mark.parametrize("name", AUGMENTATIONS)
 @pytest.mark.parametrize("key", LENSES)
 def test_batches_as_step_by_step(key, name, threads):

@@ -1,7 +1,10 @@
 """Several faces in a sample move as each does alone; the frames of clips as those of a batch of one draw a clip."""
 
+from itertools import product
+
 import pytest
 import torch
+from cameras import slow_unless
 
 import camtorch as ct
 from camtorch import augment as A  # noqa: N812
@@ -69,9 +72,13 @@ def test_each_face_moves_as_it_does_alone(name, form):
         equal(again[key.replace("keypoints_pixels", "pixels")], together[key])
 
 
-@pytest.mark.parametrize("clips", [1, B])
-@pytest.mark.parametrize("cameras", ["one", "own", "batch", "list"])
-@pytest.mark.parametrize("name", AUGMENTATIONS)
+@pytest.mark.parametrize(
+    ("name", "cameras", "clips"),
+    slow_unless(
+        lambda case: case[2] == B or case[0] == "chain",
+        list(product(AUGMENTATIONS, ("one", "own", "batch", "list"), (1, B))),
+    ),
+)
 def test_clips_move_as_their_frames_by_one_draw(name, cameras, clips):
     augment, lens = AUGMENTATIONS[name](), camera(*[clips] * (cameras in ("batch", "list")))
     first = clips, T

@@ -326,7 +326,7 @@ def test_a_surface_is_learnt_to_the_noise_and_one_that_ends_before_the_corners_s
     assert short.residuals[lost].isnan().all()
 
 
-@pytest.mark.parametrize("order", [2, 3])
+@pytest.mark.parametrize("order", [pytest.param(2, marks=slow), 3])
 def test_a_surface_is_learnt_in_the_frame_of_its_start(order):
     """A surface can do what turns of the camera do; boards turned with it by up to 15 degrees."""
     lens = ct.KannalaBrandt([300.0, 302, 319.5, 199.5], [0.02, -0.01, 0, 0], image_size=(400, 640)).double()

@@ -73,7 +73,7 @@ def test_the_room_is_measured(tmp_path):
 
 
 def test_the_car_park_comes_back(tmp_path):
-    study = surround_view.study((200, 320), 0.05, 1)
+    study = surround_view.study((160, 256), 0.05, 1)
     assert study.valid.double().mean() > 0.95
     assert study.error < 4
     # as it does not where it is shifted by two pixels
