@@ -266,14 +266,14 @@ def mixture(**options):
 @pytest.mark.parametrize("dtype", ["uint16", pytest.param("uint32", marks=pytest.mark.slow), "uint64"])
 @pytest.mark.parametrize("name", ["flip", "mount", "turn", "pad"])
 def test_chains_take_all_unsigned_integers(name, dtype):
-    lens = ct.KannalaBrandt([100.0, 100, 79.5, 59.5], [0.01, 0, 0, 0], image_size=(120, 160))
+    lens = ct.KannalaBrandt([200.0, 200, 159.5, 119.5], [0.01, 0, 0, 0], image_size=(240, 320))
     augment = {
-        "flip": lambda: A.Compose([A.RandomResizedCrop(20), A.HorizontalFlip()]),
-        "mount": lambda: A.Compose([A.RandomMount(yaw=10, camera=lens), A.RandomResizedCrop(20)]),
-        "turn": lambda: A.Compose([A.CenterCrop(100), A.Rotate90(), A.Resize(10)]),
-        "pad": lambda: A.Compose([A.HorizontalFlip(), A.CenterCrop((125, 200))], fill=(-1.0, 7.6, 3.0)),
+        "flip": lambda: A.Compose([A.RandomResizedCrop(40), A.HorizontalFlip()]),
+        "mount": lambda: A.Compose([A.RandomMount(yaw=10, camera=lens), A.RandomResizedCrop(40)]),
+        "turn": lambda: A.Compose([A.CenterCrop(200), A.Rotate90(), A.Resize(20)]),
+        "pad": lambda: A.Compose([A.HorizontalFlip(), A.CenterCrop((250, 400))], fill=(-1.0, 7.6, 3.0)),
     }[name]()
-    images = torch.randint(0, 256, (3, 3, 120, 160), generator=torch.Generator().manual_seed(0))
+    images = torch.randint(0, 256, (3, 3, 240, 320), generator=torch.Generator().manual_seed(0))
     for seed in range(5):
         for count in (3, 1):
             draw = augment.draw(count, torch.Generator().manual_seed(seed))
