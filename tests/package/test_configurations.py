@@ -96,10 +96,11 @@ def file(tmp_path, monkeypatch):
 @pytest.mark.parametrize("case", CASES, ids=[path for path, _ in CASES])
 def test_configurations_and_tensordicts_are_as_by_hand(case):
     transform, batch = made(case, by_hand), {name: value[None] for name, value in SAMPLE.items()}
+    alone = moved(transform)
     for got, want in (
-        (moved(by_jsonargparse(case)), moved(transform)),
-        (moved(by_hydra(case)), moved(transform)),
-        (moved(transform, tensordict.TensorDict(SAMPLE)), moved(transform)),
+        (moved(by_jsonargparse(case)), alone),
+        (moved(by_hydra(case)), alone),
+        (moved(transform, tensordict.TensorDict(SAMPLE)), alone),
         (moved(transform, tensordict.TensorDict(batch, batch_size=[1])), moved(transform, batch)),
     ):
         assert got.keys() == want.keys()
