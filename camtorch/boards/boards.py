@@ -113,11 +113,7 @@ BOARDS: dict[str, type[Board]] = {board.kind: board for board in (Chessboard, Ch
 
 
 def as_board(board: Any, square: float, options: dict[str, Any], owner: str) -> Board:
-    """Return the board of words like "charuco 5x7", or of OpenCV's (9, 6).
-
-    Raises:
-        ValueError: If there is no such board, or it has no such option.
-    """
+    """Return the board of words like "charuco 5x7", or of OpenCV's (9, 6), if it exists and has such options."""
     if isinstance(board, (tuple, list)) and len(board) == 2:
         board = f"{board[0]}x{board[1]}"
     words = r"\s*(?:([a-z]+)\s+)?(\d+)\s*[x,]\s*(\d+)\s*"

@@ -64,9 +64,6 @@ def _refined(cv2: Any, grey: Grey, corners: Pixels, radius: float) -> Pixels:
     return np.asarray(refined.reshape(-1, 2), np.float64)
 
 
-# -- chessboards
-
-
 def _chessboard(cv2: Any, board: Chessboard, grey: Grey) -> Pixels:
     size, small, shrunk = (board.columns, board.rows), grey, math.sqrt(grey.size / _PIXELS)
     if shrunk > 1:
@@ -141,9 +138,6 @@ def _to_nearest(pixels: Pixels) -> Pixels:
     return np.partition(np.linalg.norm(pixels[:, None] - pixels, axis=-1), 1, axis=1)[:, 1]
 
 
-# -- boards with markers
-
-
 def _dictionary(cv2: Any, name: str) -> Any:
     known = {key[5:].lower(): key for key in dir(cv2.aruco) if key.startswith("DICT_")}
     key = known.get(name.lower().removeprefix("dict_"))
@@ -183,16 +177,12 @@ def _charuco(cv2: Any, board: Charuco, grey: Grey) -> Pixels:
         corners, ids, *_ = cv2.aruco.CharucoDetector(target, detectorParams=parameters).detectBoard(image)
         if ids is not None and len(ids) > count:
             most, count = _nothing(board), len(ids)
-            found = _from_centres(cv2, image, np.asarray(corners, np.float64).reshape(-1, 2))
+            places = np.asarray(corners, np.float64).reshape(-1, 2)
+            found = places + np.rint(2 * np.median(_refined(cv2, image, places, 3) - places, axis=0)) / 2
             most[ids.ravel()] = (found + 0.5) / scale - 0.5
         if count == len(most):
             break
     return most
-
-
-def _from_centres(cv2: Any, image: Grey, corners: Pixels) -> Pixels:
-    """Return ChArUco's corners with integers at pixels' centres: OpenCV 4 has them half a pixel further right, down."""
-    return corners + np.rint(2 * np.median(_refined(cv2, image, corners, 3) - corners, axis=0)) / 2
 
 
 def _aprilgrid(cv2: Any, board: AprilGrid, grey: Grey) -> Pixels:

@@ -89,9 +89,6 @@ def find_board(images: Any, board: Any, *, square: float = 1.0, **options: Any) 
     )
 
 
-# -- what the command uses as well
-
-
 class ImageCorners(NamedTuple):
     """What one image shows of a board."""
 
@@ -139,11 +136,7 @@ def usable(found: Sequence[ImageCorners]) -> tuple[list[ImageCorners], list[tupl
 
 
 def gather(words: Iterable[str]) -> list[Path]:
-    """Return images, each once, in natural order, of files, folders (not those in them), and patterns.
-
-    Raises:
-        ValueError: If a word means no image.
-    """
+    """Return images, each once, in natural order, of files, folders (not those in them), and patterns."""
     found: dict[str, Path] = {}
     for word in words:
         path = Path(word)
@@ -165,9 +158,6 @@ def natural(path: Path) -> list[tuple[int, int, str]]:
     """Return a key that sorts 2 before 10."""
     parts = re.split(r"(\d+)", str(path))
     return [(0, int(part), "") if part.isdecimal() else (1, 0, part.lower()) for part in parts]
-
-
-# -- images in memory
 
 
 def _given(images: Any) -> list[Image]:

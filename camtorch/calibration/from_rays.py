@@ -73,7 +73,28 @@ def fit(
             f"{tuple(given_pixels.shape)} and rays {tuple(given_rays.shape)}"
         )
     batch = given_rays.shape[: given_rays.ndim - 1 - dims]
-    seen = _observations(given_pixels, given_rays, weights, dims, owner)
+    # rows of unit rays; what is not finite, or of no length, has no weight
+    shape = given_rays.shape[:-1]
+    flat_rays = given_rays.reshape(math.prod(shape[:-dims]), math.prod(shape[-dims:]), 3)
+    flat_pixels = given_pixels.expand(*shape, 2).reshape(*flat_rays.shape[:2], 2)
+    lengths = torch.linalg.vector_norm(flat_rays, dim=-1, keepdim=True)
+    good = torch.isfinite(flat_rays).all(-1) & torch.isfinite(flat_pixels).all(-1) & (lengths[..., 0] > 0)
+    flat_weights = good.double()
+    if weights is not None:
+        given = as_values(weights, "weights", owner, given_rays.device).detach().to(given_rays)
+        try:
+            given = given.expand(shape).reshape(good.shape)
+        except RuntimeError:
+            raise ValueError(
+                f"{owner}: weights must broadcast against the rays {tuple(shape)}; got {tuple(given.shape)}"
+            ) from None
+        if bool((given < 0).any()) or not bool(torch.isfinite(given).all()):
+            raise ValueError(f"{owner}: weights must be finite, and not negative; got down to {float(given.min()):.4g}")
+        # of squares: the fit weighs errors
+        flat_weights = flat_weights * given.sqrt()
+    axis = flat_rays.new_tensor([0.0, 0.0, 1.0])
+    unit = torch.where(good[..., None], flat_rays / torch.where(good[..., None], lengths, 1.0), axis)
+    seen = fitting.Observations(unit, torch.where(good[..., None], flat_pixels, 0.0), flat_weights)
     counts = seen.weights > 0
     if not counts.numel() or not bool((counts.sum(-1) >= _LEAST).all()):
         raise ValueError(
@@ -121,31 +142,6 @@ def _fixed(asked: Model, size: tuple[int, int] | None, owner: str) -> Tensor | N
         ideal = asked.kind.ideal(asked.count)
         values = torch.tensor([torch.nan, torch.nan, (width - 1) / 2, (height - 1) / 2, *ideal], dtype=torch.float64)
     return torch.where(asked.free, torch.nan, values)
-
-
-def _observations(pixels: Tensor, rays: Tensor, weights: Numbers | None, dims: int, owner: str) -> fitting.Observations:
-    """Rows of unit rays; what is not finite, or of no length, has no weight."""
-    shape = rays.shape[:-1]
-    flat_rays = rays.reshape(math.prod(shape[:-dims]), math.prod(shape[-dims:]), 3)
-    flat_pixels = pixels.expand(*shape, 2).reshape(*flat_rays.shape[:2], 2)
-    lengths = torch.linalg.vector_norm(flat_rays, dim=-1, keepdim=True)
-    good = torch.isfinite(flat_rays).all(-1) & torch.isfinite(flat_pixels).all(-1) & (lengths[..., 0] > 0)
-    flat_weights = good.double()
-    if weights is not None:
-        given = as_values(weights, "weights", owner, rays.device).detach().to(rays)
-        try:
-            given = given.expand(shape).reshape(good.shape)
-        except RuntimeError:
-            raise ValueError(
-                f"{owner}: weights must broadcast against the rays {tuple(shape)}; got {tuple(given.shape)}"
-            ) from None
-        if bool((given < 0).any()) or not bool(torch.isfinite(given).all()):
-            raise ValueError(f"{owner}: weights must be finite, and not negative; got down to {float(given.min()):.4g}")
-        # of squares: the fit weighs errors
-        flat_weights = flat_weights * given.sqrt()
-    axis = flat_rays.new_tensor([0.0, 0.0, 1.0])
-    unit = torch.where(good[..., None], flat_rays / torch.where(good[..., None], lengths, 1.0), axis)
-    return fitting.Observations(unit, torch.where(good[..., None], flat_pixels, 0.0), flat_weights)
 
 
 def _unified(seen: fitting.Observations, owner: str) -> Camera:

@@ -281,9 +281,6 @@ def _consensus(task: _Task, threshold: float) -> tuple[Tensor, Tensor]:
     return consensus(task.points, task.rays, slopes, seen & (task.weights > 0), threshold)
 
 
-# -- by torch
-
-
 def _searched(given: _Given, threshold: float | None) -> Solved:
     """The same on any device, for any camera."""
     given = given._replace(points=given.points.detach(), pixels=given.pixels.detach())
@@ -294,7 +291,18 @@ def _searched(given: _Given, threshold: float | None) -> Solved:
         turns, shifts, valid = starts
         found = _least([_minimum(task, turns[:, i], shifts[:, i], valid[:, i]) for i in range(2)])
         # of points on a plane the other minimum may be one of pixels, and none of rays: of few, and of much noise
-        flat, turns, shifts = _mirrored(task, found.rotations, found.translations)
+        share = task.weights / task.weights.sum(-1, keepdim=True)
+        centre = (share[..., None] * task.points).sum(-2)
+        about = task.points - centre[:, None]
+        variances, axes = torch.linalg.eigh(((share[..., None] * about).mT @ about).nan_to_num(0.0))
+        flat, normal = variances[:, 0] <= _THIN**2 * variances[:, 2], axes[..., 0]
+        middle = (found.rotations @ centre[..., None])[..., 0] + found.translations
+        across_sight, in_plane = (
+            torch.eye(3, dtype=v.dtype, device=v.device) - 2 * v[..., :, None] * v[..., None, :]
+            for v in (normalize(middle, dim=-1), normal)
+        )
+        mirrored = across_sight @ found.rotations @ in_plane
+        turns, shifts = mirrored, middle - (mirrored @ centre[..., None])[..., 0]
         few = ~starts.valid[:, 1] & ((weights > 0).sum(-1) <= _FEW)
         near = 2 * task.cost(torch.cat((rotation_vector(turns), shifts), -1)) <= _WORSE * found.costs
         flat = flat & torch.isfinite(found.costs) & (few | near)
@@ -376,19 +384,3 @@ def _spread(points: Tensor, inliers: Tensor) -> Tensor:
     whole = moments.diagonal(dim1=-2, dim2=-1).sum(-1).square()
     enough: Tensor = (counts >= _LEAST) & (whole - moments.square().sum((-1, -2)) > 2 * _LINE**2 * whole)
     return enough
-
-
-def _mirrored(task: _Task, rotations: Tensor, translations: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Whether points are nearly on a plane, and poses whose normals of it are mirrored at the line of sight."""
-    share = task.weights / task.weights.sum(-1, keepdim=True)
-    centre = (share[..., None] * task.points).sum(-2)
-    centred = task.points - centre[:, None]
-    variances, axes = torch.linalg.eigh(((share[..., None] * centred).mT @ centred).nan_to_num(0.0))
-    flat, normal = variances[:, 0] <= _THIN**2 * variances[:, 2], axes[..., 0]
-    middle = (rotations @ centre[..., None])[..., 0] + translations
-    across_sight, in_plane = (
-        torch.eye(3, dtype=v.dtype, device=v.device) - 2 * v[..., :, None] * v[..., None, :]
-        for v in (normalize(middle, dim=-1), normal)
-    )
-    mirrored = across_sight @ rotations @ in_plane
-    return flat, mirrored, middle - (mirrored @ centre[..., None])[..., 0]

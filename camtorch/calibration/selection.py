@@ -98,9 +98,6 @@ def select(
 
     Arguments are those of `calibrate`; names in `fixed` that a model does not have are left out, and progress is called
     with the part that is done. candidates: models and their numbers of coefficients.
-
-    Raises:
-        ValueError: bad points; no model can be fitted.
     """
     seen, layout = as_observations(object_points, image_points, image_size, "select")
     points = seen.points.cpu().numpy()

@@ -138,7 +138,18 @@ def _solved(task: _Task, rays: Tensor) -> tuple[Tensor, Tensor]:
     rotations, translations, pixels = (t.detach() for t in task[1:4])
     seen, views = task.seen.to(pixels), task.seen.sum(0)
     positions, rays = -(rotations.mT @ translations[..., None])[..., 0], rays @ rotations
-    start, count = _nearest(positions, rays, seen), len(views)
+    # (P, 3): the points nearest to rays (C, P, 3) from positions (C, 3), then nearest by angle
+    eye = torch.eye(3, dtype=rays.dtype, device=rays.device)
+    weights, nearest = seen, seen.new_zeros(seen.shape[1], 3)
+    for _ in range(2):
+        across = weights[..., None, None] * (eye - rays[..., :, None] * rays[..., None, :])
+        right, total = (across @ positions[:, None, :, None]).sum(0), across.sum(0)
+        scale = total.diagonal(dim1=-2, dim2=-1).sum(-1)[:, None, None]
+        nearest = torch.linalg.solve_ex(total + (_LEAST * scale + _TINY) * eye, right)[0][..., 0]
+        nearest = torch.where(torch.isfinite(nearest), nearest, 0.0)
+        squares = (nearest - positions[:, None]).square().sum(-1)
+        weights = seen / torch.where(squares > 0, squares, 1.0)
+    start, count = nearest, len(views)
     if count == 0:
         return start, views.bool()
     middle = (seen[..., None] * positions[:, None]).sum(0) / views.clamp(min=1)[:, None]
@@ -180,21 +191,6 @@ def _solved(task: _Task, rays: Tensor) -> tuple[Tensor, Tensor]:
     for c in range(len(sights)):
         valid &= problem.look(c, found.state).valid[:, 0, 0] | ~task.seen[c]
     return torch.where(torch.isfinite(points), points, 0.0), valid
-
-
-def _nearest(positions: Tensor, rays: Tensor, seen: Tensor) -> Tensor:
-    """(P, 3): the points nearest to rays (C, P, 3) from positions (C, 3), then nearest by angle."""
-    eye = torch.eye(3, dtype=rays.dtype, device=rays.device)
-    weights, points = seen, seen.new_zeros(seen.shape[1], 3)
-    for _ in range(2):
-        across = weights[..., None, None] * (eye - rays[..., :, None] * rays[..., None, :])
-        right, total = (across @ positions[:, None, :, None]).sum(0), across.sum(0)
-        scale = total.diagonal(dim1=-2, dim2=-1).sum(-1)[:, None, None]
-        points = torch.linalg.solve_ex(total + (_LEAST * scale + _TINY) * eye, right)[0][..., 0]
-        points = torch.where(torch.isfinite(points), points, 0.0)
-        squares = (points - positions[:, None]).square().sum(-1)
-        weights = seen / torch.where(squares > 0, squares, 1.0)
-    return points
 
 
 def _is_ahead(points: Tensor, positions: Tensor, rays: Tensor, seen: Tensor) -> Tensor:

@@ -75,7 +75,23 @@ def spread(adjusted: Adjusted, model: type[Camera], camera: int) -> Spread:
     equations, state = adjusted.equations, adjusted.state
     parameters, mounts = state.parameters[camera], state.mounts
     shared = shared_factor(equations)
-    frame = _frame_factor(equations, state.boards.translations, shared)
+    # (B, 6, G + 6): the turn and the shift, the mean of all boards, that stem from `shared`, and from their own noise
+    view = equations.view
+    corner, right = view[..., :6], view[..., 6:-1]
+    diagonal = corner.diagonal(dim1=-2, dim2=-1).abs()
+    # a view in which too little is seen has no pose to go by
+    seen = (diagonal > torch.finfo(view.dtype).eps * diagonal.amax(-1, keepdim=True)).all(-1)
+    eye = torch.eye(6, dtype=view.dtype, device=view.device)
+    corner = torch.where(seen[..., None, None], corner, eye)
+    inverse = torch.linalg.solve_triangular(corner, eye.expand_as(corner), upper=True)
+    share = seen.to(view.dtype) / seen.sum(-1, keepdim=True).clamp(min=1)
+    inverse = inverse * share[..., None, None]
+    twist = inverse[..., :3, :]
+    # about the origin, not the board
+    carried = torch.cat((twist, inverse[..., 3:, :] + skew_matrix(state.boards.translations) @ twist), -2)
+    by_shared = -(carried @ right).sum(1)
+    by_noise = carried.movedim(1, -2).flatten(-2)  # (B, 6, 6 V)
+    frame = torch.cat((by_shared @ shared, torch.linalg.qr(by_noise.mT, mode="r").R.mT), -1)
     count = parameters.shape[-1]
     own = shared.new_zeros(len(shared), count + 6, shared.shape[-1])
     of_own = [(g, i) for g, (c, i) in enumerate(equations.columns) if c == camera]
@@ -130,29 +146,6 @@ def shared_factor(equations: Equations) -> Tensor:
     least = _LEAST * sizes[:, :1].clamp(min=torch.finfo(sizes.dtype).tiny)
     factor: Tensor = axes.mT / torch.maximum(sizes, least)[:, None] / scale[..., None]
     return factor
-
-
-def _frame_factor(equations: Equations, translations: Tensor, shared: Tensor) -> Tensor:
-    """(B, 6, G + 6): the turn and the shift, the mean of all boards, that stem from `shared`, and from their own noise.
-
-    A view's own step is -R11^-1 (R12 s + e), where s are the shared unknowns and e noise that is independent of them.
-    """
-    view = equations.view
-    corner, right = view[..., :6], view[..., 6:-1]
-    diagonal = corner.diagonal(dim1=-2, dim2=-1).abs()
-    # a view in which too little is seen has no pose to go by
-    seen = (diagonal > torch.finfo(view.dtype).eps * diagonal.amax(-1, keepdim=True)).all(-1)
-    eye = torch.eye(6, dtype=view.dtype, device=view.device)
-    corner = torch.where(seen[..., None, None], corner, eye)
-    inverse = torch.linalg.solve_triangular(corner, eye.expand_as(corner), upper=True)
-    share = seen.to(view.dtype) / seen.sum(-1, keepdim=True).clamp(min=1)
-    inverse = inverse * share[..., None, None]
-    turn = inverse[..., :3, :]
-    # about the origin, not the board
-    carried = torch.cat((turn, inverse[..., 3:, :] + skew_matrix(translations) @ turn), -2)
-    by_shared = -(carried @ right).sum(1)
-    by_noise = carried.movedim(1, -2).flatten(-2)  # (B, 6, 6 V)
-    return torch.cat((by_shared @ shared, torch.linalg.qr(by_noise.mT, mode="r").R.mT), -1)
 
 
 def worst(covariances: Tensor) -> Tensor:

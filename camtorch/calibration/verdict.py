@@ -260,9 +260,6 @@ class _Survey:
         return math.sqrt((squares - free) / (2 * len(residuals)))
 
 
-# -- sentences
-
-
 @torch.no_grad()
 def warnings(calibration: Calibration) -> list[str]:
     """Return what the data do not carry, and what does not fit: each with what to do. Empty if all is well."""
@@ -458,9 +455,6 @@ def check_determined(
         f"{owner}: {what} {_listed(open_ones or free)} undetermined{why}. Take 10 to 20 views. {_TILTED}, or hold "
         f"parameters: fixed={tuple(hold)}"
     )
-
-
-# -- words
 
 
 def _named(calibration: Calibration, rows: list[int]) -> str:

@@ -105,8 +105,6 @@ class Mixed(Camera):
             raise ValueError(f"Mixed: groups must fill every row once; got rows {rows}")
         return cls([camera for _, camera in groups], order=[place[row] for row in range(len(rows))])
 
-    # -- what it holds
-
     @property
     def groups(self) -> list[tuple[list[int], Camera]]:
         """The rows of each model and number of coefficients, and their cameras as a batch; gradients go to all."""
@@ -173,8 +171,6 @@ class Mixed(Camera):
             return tensor
         return tensor.index_select(dim, torch.tensor(self._order, device=tensor.device))
 
-    # -- both directions
-
     def _evaluate(
         self,
         direction: Direction,
@@ -217,8 +213,6 @@ class Mixed(Camera):
         """Why points (B, *N, 3) have no pixel, in words; see `Camera.explain`."""
         rows, _ = as_points(points, "points", 3, self.batch_shape, (self.intrinsics,), "Mixed")
         return [line for camera, mine in zip(self, rows, strict=True) for line in camera.explain(mine)]
-
-    # -- other cameras
 
     def by_groups(self, change: Callable[[Camera], Camera]) -> Self:
         """The batch of what `change` makes of each group."""

@@ -28,10 +28,6 @@ def read_rig(
 
     `name` is the only camera wanted; `model` is of OpenCV's files, which may not state it; `size` is for cameras whose
     file does not state it. If `stated`, a file that leaves the model open is refused.
-
-    Raises:
-        CameraFileError: If the file cannot be used. ValueError: If no camera has that name, or one is of another size;
-            if a model is given for a file that states its own, or none for one that has to state it and does not.
     """
     if str(path).startswith(LENS):
         words = str(path).removeprefix(LENS)
@@ -125,11 +121,7 @@ def read_for_images(
 
 
 def fitting(camera: Camera, path: Path, image: Path, size: Size, rescale: bool) -> Camera:
-    """Return the camera of a file for an image of that size, which the camera gets if it has none.
-
-    Raises:
-        ValueError: If it is for another size and is not to be scaled.
-    """
+    """Return the camera of a file for an image of that size, which the camera gets if it has none."""
     if camera.image_size is None:
         camera.image_size = size
         note(f"{path} states no image size; taken to be for {_shown(size)}, as {image} is")

@@ -161,9 +161,6 @@ def _calibrate(commands: Commands) -> None:
     _output(add, "the calibration; camera.json by default", Path("camera.json"))
 
 
-# -- options of several commands
-
-
 def _photograph(command: argparse.ArgumentParser) -> None:
     """The calibration of an image."""
     which = command.add_mutually_exclusive_group().add_argument

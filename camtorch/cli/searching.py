@@ -107,8 +107,6 @@ def _last_number(path: Path) -> str | None:
     return numbers[-1].lstrip("0") or "0" if numbers else None
 
 
-# -- videos
-
 _Moment = tuple[float, float, NDArray[np.uint8]]
 """When a frame is shown, in seconds; its sharpness; (H, W)."""
 

@@ -30,9 +30,6 @@ def check(path: Path, *, force: bool, inputs: tuple[Path | None, ...] = ()) -> N
         raise ValueError(f"{path}: the folder {folder} cannot be written to")
 
 
-# -- many files
-
-
 def folder(text: str | None, suffixes: Collection[str]) -> Path:
     """Return the folder that -o names, for files of these suffixes."""
     if text is None:

@@ -45,9 +45,6 @@ def require() -> Any:
     return imported("av", "videos need PyAV", "video")
 
 
-# -- reading
-
-
 @contextlib.contextmanager
 def _opened(path: Path) -> Iterator[tuple[Any, Any]]:
     """Open a file, and yield it and its first video stream; errors of ffmpeg in the block are ValueErrors."""
@@ -121,9 +118,6 @@ def _decoded(container: Any, stream: Any, *others: Any) -> Iterator[tuple[Any, A
             last = frame.pts = frame.pts if last is None else max(frame.pts, last + 1)
             count += 1
             yield frame, None
-
-
-# -- writing
 
 
 @torch.no_grad()

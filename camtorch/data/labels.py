@@ -278,9 +278,6 @@ def _video_frame(path: Path, number: int) -> Tensor | None:
     return None
 
 
-# -- what formats share
-
-
 def _find(
     samples: Samples, place: object, name: Any, folders: Sequence[str] = (), suffixes: Sequence[str] = ("",)
 ) -> Path:

@@ -251,9 +251,6 @@ def _images_from_bytes(path: str, file: BinaryIO) -> Iterator[_ImageEntry]:
         Record(path, None, f"byte {position}").fail(f"{size - position} bytes after the last image")
 
 
-# -- writing
-
-
 def render(rig: Rig, lossy: Lossy) -> dict[str, bytes]:
     """The files of a rig: cameras, and images beside them where there are poses.
 

@@ -193,9 +193,6 @@ class _File:
         return self.record[height].side(), self.record[width].side()
 
 
-# -- writing
-
-
 def render(rig: Rig, lossy: Lossy) -> str:
     """The text of a file of one camera, or of several of which the second of two may have a pose."""
     lossy.no_images(rig)

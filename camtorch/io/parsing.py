@@ -195,9 +195,6 @@ def _value_of(path: Path, element: ElementTree.Element) -> Any:
     return words[0]
 
 
-# -- YAML
-
-
 def _from_yaml(path: Path, text: str) -> Any:
     import yaml  # a fiftieth of a second: only when needed
 

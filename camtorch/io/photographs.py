@@ -64,10 +64,8 @@ def read_stored(path: Path) -> tuple[Tensor, int | None]:
 
     Pixels are (C, H, W) uint8 with C = 1 grey, 2 grey and alpha, 3 RGB or 4 RGBA, also of other kinds (palette, CMYK);
     or (1, H, W) uint16 of deep grey images. It warns of what is left out: the lower bits of deep colours, which Pillow
-    does not read, and all images but the first.
-
-    Raises:
-        ImageFileError: If there is no such file, no image, a damaged one, floating-point pixels, or more than 16 bits.
+    does not read, and all images but the first. An ImageFileError says that there is no such file, no image, a damaged
+    one, floating-point pixels, or more than 16 bits.
     """
     with _opened(path) as opened:
         count, tiles = getattr(opened, "n_frames", 1), getattr(opened, "tile", ())
@@ -94,10 +92,9 @@ def read_stored(path: Path) -> tuple[Tensor, int | None]:
 
 
 def as_jpeg(image: Any, size: tuple[int, int], name: str, owner: str, side: int, quality: int) -> bytes:
-    """Return a JPEG file of an image of any kind that users pass, its longer side no more than `side` pixels.
+    """Return a JPEG file of an image of any kind that users pass, whose (height, width) must be `size`.
 
-    Raises:
-        ValueError: If its (height, width) is not `size`. ImageFileError: If it cannot be read.
+    Its longer side is no more than `side` pixels. An ImageFileError says that the image cannot be read.
     """
     with contextlib.ExitStack() as stack:
         if isinstance(image, (str, bytes, os.PathLike)):

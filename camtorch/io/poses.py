@@ -93,9 +93,6 @@ def from_quaternions(place: Place, values: Any, undo: bool = False) -> Extrinsic
     return pose(place, quaternion_vector(quaternions), translations, undo)
 
 
-# -- writing
-
-
 @torch.no_grad()
 def in_float64(extrinsics: Extrinsics, undo: bool = False) -> Extrinsics:
     """Return a copy in float64, or the pose that undoes it."""

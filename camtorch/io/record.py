@@ -48,8 +48,6 @@ class Record:
             return f"a list of {len(self.value)}"
         return "nothing" if self.value is None else f"{self.value!r:.60}"
 
-    # -- mappings
-
     def keys(self) -> list[str]:
         """The keys of a mapping."""
         self._check(dict, "not keys and values")
@@ -76,8 +74,6 @@ class Record:
         key = key if key.isprintable() and len(key) <= 60 else f"{key!r:.60}"
         return f"{self.place}.{key}" if self.place else key
 
-    # -- lists
-
     def __iter__(self) -> Iterator[Record]:
         self._check(list, "no list")
         for i, item in enumerate(self.value):
@@ -86,8 +82,6 @@ class Record:
     def __len__(self) -> int:
         self._check(list, "no list")
         return len(self.value)
-
-    # -- values
 
     def text(self) -> str:
         """A text."""
@@ -151,8 +145,6 @@ class Record:
         if not isinstance(self.value, list):
             self.fail("is neither an OpenCV matrix nor a list of numbers")
         return [item.number() for row in self for item in (row if isinstance(row.value, list) else [row])]
-
-    # -- cameras
 
     def few(self, count: int) -> None:
         """Refuse a file of more cameras than anyone has: each costs some kilobytes and a tenth of a millisecond."""

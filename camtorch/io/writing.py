@@ -32,9 +32,6 @@ def replacing(*paths: str | os.PathLike[str], synced: bool = True) -> Iterator[l
 
     If the block raises, none does. All is on the disk before the first place changes; `synced=False` saves that, a
     hundredth of a second a file. If a path is a link, the file that it points to is replaced. Files keep their rights.
-
-    Raises:
-        OSError: If a folder does not exist, a place is taken by anything but an ordinary file, or the disk is full.
     """
     targets = [os.path.realpath(path) for path in paths]
     with contextlib.ExitStack() as stack:

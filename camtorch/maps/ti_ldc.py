@@ -88,7 +88,18 @@ def _fetched(
     """
     drawn = positions.clip(0, np.array(source[::-1], np.float64) - 1)
     for size in _BLOCKS if block is None else (block,):
-        padding, largest = _padding(drawn, size)
+        # the padding of blocks (height, width), and the largest part of the source fetched with it, (height, width)
+        height, width = drawn.shape[:2]
+        rows, columns = -(-height // size[0]), -(-width // size[1])
+        whole = np.pad(drawn, ((0, rows * size[0] - height), (0, columns * size[1] - width), (0, 0)), "edge")
+        blocks = whole.reshape(rows, size[0], columns, size[1], 2).transpose(0, 2, 1, 3, 4)
+        corners = blocks[:, :, [0, 0, -1, -1], [0, -1, 0, -1]]  # (rows, columns, 4, 2)
+        first, last = np.floor(corners.min(2)), np.ceil(corners.max(2))
+        flat = blocks.reshape(rows, columns, -1, 2)
+        low, high = np.floor(flat.min(2)) - _BEFORE, np.floor(flat.max(2)) + _AFTER
+        border = int(max((first - low).max(), (high - last).max(), 0))
+        across, down = (last - first).reshape(-1, 2).max(0) + 1 + 2 * border
+        padding, largest = border, (int(down), int(across))
         if padding <= _MOST_PADDING:
             return size, padding, largest
     raise CameraFileError(
@@ -97,18 +108,3 @@ def _fetched(
         f"blocks of {size[1]}x{size[0]} need {padding} pixels of the source around what their corners say; the LDC has "
         f"at most {_MOST_PADDING}{'' if block is None else '; smaller blocks need less'}",
     )
-
-
-def _padding(drawn: Floats, size: tuple[int, int]) -> tuple[int, tuple[int, int]]:
-    """The padding of blocks (height, width), and the largest part of the source fetched with it, (height, width)."""
-    height, width = drawn.shape[:2]
-    rows, columns = -(-height // size[0]), -(-width // size[1])
-    whole = np.pad(drawn, ((0, rows * size[0] - height), (0, columns * size[1] - width), (0, 0)), "edge")
-    blocks = whole.reshape(rows, size[0], columns, size[1], 2).transpose(0, 2, 1, 3, 4)
-    corners = blocks[:, :, [0, 0, -1, -1], [0, -1, 0, -1]]  # (rows, columns, 4, 2)
-    first, last = np.floor(corners.min(2)), np.ceil(corners.max(2))
-    flat = blocks.reshape(rows, columns, -1, 2)
-    low, high = np.floor(flat.min(2)) - _BEFORE, np.floor(flat.max(2)) + _AFTER
-    padding = int(max((first - low).max(), (high - last).max(), 0))
-    across, down = (last - first).reshape(-1, 2).max(0) + 1 + 2 * padding
-    return padding, (int(down), int(across))

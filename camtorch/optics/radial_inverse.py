@@ -47,9 +47,6 @@ def within(fold: Tensor) -> Tensor:
     return times(fold, 1 - 4 * torch.finfo(fold.dtype).eps) ** 2
 
 
-# -- the fold
-
-
 def first_loss(orientation: Tensor, spared: Tensor | None = None) -> Tensor:
     """(*B, A, S) -> (*B, A): the node, with a fraction at a dip, where it is first lost; S where it never is.
 
@@ -125,9 +122,6 @@ def fold_of(radial: RadialFactor, sampled: Callable[[], Tensor], end: float | Te
     return torch.where(some, low + fraction * (high - low), end)
 
 
-# -- the table
-
-
 def tabulate(radial: RadialFactor, fold: Tensor, usual_end: float | Tensor) -> Tensor:
     """(C, 2 + 2 nodes): what an `InverseTable` is made of."""
     end = fold.clamp(max=usual_end)
@@ -195,9 +189,6 @@ class InverseTable:
         node = node.flatten()
         value, step = self.values.flatten().index_select(0, node), self.steps.flatten().index_select(0, node)
         return torch.addcmul(value.view(r2.shape), fraction, step.view(r2.shape))
-
-
-# -- the solution
 
 
 def solve(radial: RadialFactor, table: InverseTable, r2: Tensor) -> tuple[Tensor, Tensor]:

@@ -237,9 +237,6 @@ def portrait(camera: Camera, other: Camera | None = None, *, title: str = "") ->
     return figure
 
 
-# -- parts of plots
-
-
 def _bar(ax: Axes, mappable: ScalarMappable, values: Tensor) -> None:
     """Colours for the range of values, without the few largest if they are far from the others."""
     most, many = (float(values.max()), float(values.quantile(0.98))) if values.numel() else (0.0, 0.0)

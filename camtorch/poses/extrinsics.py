@@ -246,11 +246,7 @@ def head_rotation(angles: Numbers) -> Tensor:
 
 
 def _are_matrices(rotation: Tensor, translation: Tensor) -> bool:
-    """Whether (..., 3) are rotation matrices (*B, 3, 3), and not three vectors each, beside a translation (*B, 3).
-
-    Raises:
-        ValueError: they may be both, or neither.
-    """
+    """Whether (..., 3) are rotation matrices (*B, 3, 3), and not three vectors each, beside a translation (*B, 3)."""
     beside = translation.ndim == rotation.ndim - 1
     if values_of(rotation) is None:
         return beside

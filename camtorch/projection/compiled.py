@@ -409,9 +409,6 @@ def _constants(lens: Lens) -> Sequence[Tensor]:
     return (*radial.nodes, radial.end) if isinstance(radial, optics.RadiusTable) else ()
 
 
-# -- calls
-
-
 def project_numbers(native: Native, points: Sequence[float]) -> list[float] | None:
     """x, y, z of some points to u, v of their pixels, by one camera; None where one is not valid."""
     kind, count = (c_double if native.dtype == torch.float64 else c_float), len(points) // 3

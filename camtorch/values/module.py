@@ -224,8 +224,6 @@ class BatchedModule(GeometryModule):
         if not self.batch_shape:
             raise TypeError(f"{type(self).__name__}: it has no batch dims, and cannot be {what}")
 
-    # -- as a value
-
     def detach(self) -> Self:
         """The same values without a graph: it shares them with this one, and does not learn."""
         return self.each(Tensor.detach)

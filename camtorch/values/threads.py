@@ -134,7 +134,6 @@ if hasattr(os, "register_at_fork"):  # not on Windows
     os.register_at_fork(after_in_child=_forked)
 
 
-# -- the threads of torch
 #
 # Each of its operations is split among them and waits until all have done their part: for milliseconds, where another
 # process has the core of one. To a chain of a hundred operations that happens a hundred times. So such chains run on

@@ -107,7 +107,23 @@ class MirrorWarp(Warp):
     ) -> Tensor:
         """Return images of one way: these rows, or all. What is not sampled may go to `out`."""
         if way.move:
-            return _copied(images, way.move, sampler.fill, self._empty(images) if out is None else out)
+            result = self._empty(images) if out is None else out
+            height, width = result.shape[-2:]
+            a, b, left, c, d, top = way.move
+            view = images.mT if b else images
+            dims = [dim for dim, sign in ((-1, a + b), (-2, c + d)) if sign < 0]
+            if dims:  # torch flips none of those without a sign
+                signed = SIGNED.get(view.dtype)  # a view by a dtype, be it the same, has no gradient
+                view = view.flip(dims) if signed is None else view.view(signed).flip(dims).view(view.dtype)
+            # of the first pixel of the view
+            left -= (view.shape[-1] - 1) * (a + b < 0)
+            top -= (view.shape[-2] - 1) * (c + d < 0)
+            x, y, right, bottom = max(left, 0), max(top, 0), left + view.shape[-1], top + view.shape[-2]
+            right, bottom = max(min(right, width), x), max(min(bottom, height), y)
+            if (x, y, right, bottom) != (0, 0, width, height):
+                result[:] = as_pixels(sampler.fill, result.dtype, result.device)
+            result[:, :, y:bottom, x:right] = view[..., y - top : bottom - top, x - left : right - left]
+            return result
         if way.box:
             left, top, right, bottom = way.box
             images, size = images[..., top:bottom, left:right], self.target._size_for("Warp")
@@ -130,7 +146,6 @@ class MirrorWarp(Warp):
         return empty(images, count, size)
 
     def between(self, source: Camera, target: Camera, rotation: Tensor | None, **options: Any) -> Warp:
-        """See `Warp.between`."""
         return MirrorWarp(source, target, rotation, **options)
 
 
@@ -165,7 +180,6 @@ class AffineWarp(MirrorWarp):
         return AffineWarp(source, target, self.map, rotation, **options)
 
     def rows_of(self, source: Camera, target: Camera, rotation: Tensor | None, index: list[int]) -> Warp:
-        """See `Warp.rows_of`."""
         own = self.map[index] if isinstance(self.map, Tensor) and self.map.ndim == 3 else self.map
         return AffineWarp(source, target, own, rotation, **self.options)
 
@@ -177,8 +191,6 @@ class AffineWarp(MirrorWarp):
     def pin(self) -> Warp:
         """Nothing: copied and shrunk images ask for no positions, and the others' are kept as they are asked for."""
         return self
-
-    # -- images
 
     def _depends(self, smooth: bool) -> bool:
         return not self._numbers
@@ -193,8 +205,6 @@ class AffineWarp(MirrorWarp):
     def _maps(self) -> Tensor:
         """(B or 1, 2, 3)."""
         return self.matrix.reshape(-1, 2, 3)
-
-    # -- positions
 
     def _inputs(self) -> list[Tensor]:
         return [self.matrix]
@@ -218,8 +228,6 @@ class AffineWarp(MirrorWarp):
         scale = (back[:, :, :2] * side / 2).abs().sum(-1).amax(-1)
         return Sampling(grid, mapped, scale.to(dtype)[:, None, None].expand(mapped.shape).contiguous())
 
-    # -- labels
-
     def _move(self, pixels: Numbers, back: bool = False, on_image: bool = False) -> tuple[Tensor, Tensor]:
         pixels = as_values(pixels, "pixels", "Warp", self.matrix.device)
         pixels = pixels if pixels.is_floating_point() else pixels.to(self.source.intrinsics.dtype)
@@ -232,26 +240,6 @@ class AffineWarp(MirrorWarp):
         dtype = torch.promote_types(pixels.dtype, torch.float32)
         moved = torch.where(valid.unsqueeze(-1), moved, -1.0).to(dtype)
         return moved, valid & self.target.contains(moved) if on_image else valid
-
-
-def _copied(images: Tensor, move: tuple[int, ...], fill: tuple[float, ...], result: Tensor) -> Tensor:
-    """Return the result, to which pixels are copied by a map of whole numbers."""
-    height, width = result.shape[-2:]
-    a, b, left, c, d, top = move
-    view = images.mT if b else images
-    dims = [dim for dim, sign in ((-1, a + b), (-2, c + d)) if sign < 0]
-    if dims:  # torch flips none of those without a sign
-        signed = SIGNED.get(view.dtype)  # a view by a dtype, be it the same, has no gradient
-        view = view.flip(dims) if signed is None else view.view(signed).flip(dims).view(view.dtype)
-    # of the first pixel of the view
-    left -= (view.shape[-1] - 1) * (a + b < 0)
-    top -= (view.shape[-2] - 1) * (c + d < 0)
-    x, y, right, bottom = max(left, 0), max(top, 0), left + view.shape[-1], top + view.shape[-2]
-    right, bottom = max(min(right, width), x), max(min(bottom, height), y)
-    if (x, y, right, bottom) != (0, 0, width, height):
-        result[:] = as_pixels(fill, result.dtype, result.device)
-    result[:, :, y:bottom, x:right] = view[..., y - top : bottom - top, x - left : right - left]
-    return result
 
 
 def _resized(images: Tensor, size: Sequence[int], mode: str = "bilinear", flips: tuple[int, ...] = ()) -> Tensor:

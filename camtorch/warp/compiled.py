@@ -51,9 +51,6 @@ def _positions(
     return grid.movedim(-1, 1).contiguous(), mapped.contiguous()
 
 
-# -- images
-
-
 def takes(images: Tensor, inputs: Sequence[Tensor]) -> bool:
     """Whether the operator makes the images of compiled code: on the CPU and without a graph.
 

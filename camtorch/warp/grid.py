@@ -315,7 +315,12 @@ def _probes(rows: range, width: int, like: Tensor) -> Tensor:
         for side in (len(rows), width)
     )
     nodes = torch.stack(torch.meshgrid(u, v + rows.start, indexing="xy"))
-    return torch.cat((nodes.flatten(1), _rim(rows, width, like).mT), 1).mT[None]
+    # (2 (w + h), 2): the pixels of the first and the last row, and of the first and the last column
+    down, across = (torch.arange(length, dtype=like.dtype, device=like.device) for length in (len(rows), width))
+    down += rows.start
+    sides = [(across, torch.full_like(across, end)) for end in (rows[0], rows[-1])]
+    sides += [(torch.full_like(down, end), down) for end in (0, width - 1)]
+    return torch.cat((nodes.flatten(1), torch.cat([torch.stack(pair, -1) for pair in sides]).mT), 1).mT[None]
 
 
 @lru_cache(maxsize=8)
@@ -323,15 +328,6 @@ def kept_probes(rows: range, width: int, dtype: torch.dtype) -> Tensor:
     """(1, N, 2), on the CPU: the nodes of a lattice, and then the pixels at the rim of the target."""
     with torch.inference_mode(False):
         return _probes(rows, width, torch.empty(0, dtype=dtype, device="cpu"))
-
-
-def _rim(rows: range, width: int, like: Tensor) -> Tensor:
-    """(2 (w + h), 2): the pixels of the first and the last row, and of the first and the last column."""
-    v, u = (torch.arange(side, dtype=like.dtype, device=like.device) for side in (len(rows), width))
-    v += rows.start
-    sides = [(u, torch.full_like(u, end)) for end in (rows[0], rows[-1])]
-    sides += [(torch.full_like(v, end), v) for end in (0, width - 1)]
-    return torch.cat([torch.stack(side, -1) for side in sides])
 
 
 def _compute(exact: Exact, first: int, cells: Tensor, todo: Tensor, like: Tensor) -> Tensor:

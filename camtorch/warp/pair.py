@@ -78,8 +78,6 @@ class CameraPair(GeometryModule):
         single = all(camera.intrinsics.dtype == torch.float32 for camera in (self.source, self.target))
         return _SINGLE if single else 0.0
 
-    # -- what its positions follow from
-
     def _inputs(self) -> list[Tensor]:
         """All tensors that they depend on."""
         (source, target), rotation = self._ends, self.rotation

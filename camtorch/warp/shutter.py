@@ -102,8 +102,6 @@ class RollingShutter(GeometryModule):
         values = as_coordinates(pixels, "pixels", 2, "RollingShutter", self.rates.device)
         return self._times(self._share(values, as_known_size(image_size, "RollingShutter")), values.ndim)
 
-    # -- for a warp
-
     def rows_of(self, index: list[int]) -> RollingShutter:
         """Return the shutter of these rows of a batch."""
         rates = self.rates[index] if self.rates.ndim == 2 else self.rates
@@ -238,18 +236,15 @@ class ShutterWarp(MirrorWarp):
         return ShutterWarp(source, target, **options).turned_by(rotation)
 
     def detach(self) -> Warp:
-        """See `Warp.detach`."""
         rotation = None if self.rotation is None else self.rotation.detach()
         options = {**self.options, **self._shutters(RollingShutter.detach)}
         return self.between(self.source.detach(), self.target.detach(), rotation, **options)
 
     def rows_of(self, source: Camera, target: Camera, rotation: Tensor | None, index: list[int]) -> Warp:
-        """See `Warp.rows_of`."""
         shutters = self._shutters(lambda shutter: shutter.rows_of(index))
         return self.between(source, target, rotation, **self.options, **shutters)
 
     def follow(self, first: Warp) -> Warp:
-        """See `Warp.follow`."""
         return self.between(first.source, first.target, first.rotation, **self.options)
 
     def _shutters(self, change: Callable[[RollingShutter], RollingShutter]) -> dict[str, RollingShutter | None]:
