@@ -266,7 +266,14 @@ class RandomCamera(Augmentation):
             red, blue = (scaled(warp.target, 1 + values["chromatic"][..., i]) for i in (0, 1))
             shades = self._warp(warp.source, red, warp.rotation), self._warp(warp.source, blue, warp.rotation)
         if "vignetting" in values:
-            light = _light(warp.target, values["vignetting"])
+            # (B or 1, 1, H, W): one less `loss` (*B,) in the farthest corner, by the square of the distance
+            height, width = warp.target.height, warp.target.width
+            cx, cy = warp.target.intrinsics.detach()[..., 2:].reshape(-1, 2, 1, 1).unbind(1)
+            grid = warp.target.pixel_grid()
+            square = (grid[..., 0] - cx) ** 2 + (grid[..., 1] - cy) ** 2
+            reach = [torch.maximum(c, side - 1 - c) for c, side in ((cx, width), (cy, height))]
+            farthest = (reach[0] ** 2 + reach[1] ** 2).clamp(min=1e-12)
+            light = (1 - values["vignetting"].reshape(-1, 1, 1) * square / farthest).unsqueeze(1)
         if "cos4" in values:
             natural = vignetting(warp.target, values["cos4"])
             light = natural if light is None else light * natural
@@ -535,17 +542,6 @@ def _pair(value: RangeLike | str | None) -> RangeLike | str | None:
 def _pairs(values: Any) -> Any:
     """Both of two numbers, or of (*B, 2) of them."""
     return values if isinstance(values, list) else (values[..., 0], values[..., 1])
-
-
-def _light(camera: Camera, loss: Tensor) -> Tensor:
-    """(B or 1, 1, H, W): one less `loss` (*B,) in the farthest corner, by the square of the distance."""
-    height, width = camera.height, camera.width
-    cx, cy = camera.intrinsics.detach()[..., 2:].reshape(-1, 2, 1, 1).unbind(1)
-    grid = camera.pixel_grid()
-    square = (grid[..., 0] - cx) ** 2 + (grid[..., 1] - cy) ** 2
-    reach = [torch.maximum(c, side - 1 - c) for c, side in ((cx, width), (cy, height))]
-    farthest = (reach[0] ** 2 + reach[1] ** 2).clamp(min=1e-12)
-    return (1 - loss.reshape(-1, 1, 1) * square / farthest).unsqueeze(1)
 
 
 # -- lenses like a given one: coefficients moved by what they do to the image, as far as it stays invertible

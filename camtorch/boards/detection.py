@@ -177,12 +177,16 @@ def _charuco(cv2: Any, board: Charuco, grey: Grey) -> Pixels:
         corners, ids, *_ = cv2.aruco.CharucoDetector(target, detectorParams=parameters).detectBoard(image)
         if ids is not None and len(ids) > count:
             most, count = _nothing(board), len(ids)
-            places = np.asarray(corners, np.float64).reshape(-1, 2)
-            found = places + np.rint(2 * np.median(_refined(cv2, image, places, 3) - places, axis=0)) / 2
+            found = _from_centres(cv2, image, np.asarray(corners, np.float64).reshape(-1, 2))
             most[ids.ravel()] = (found + 0.5) / scale - 0.5
         if count == len(most):
             break
     return most
+
+
+def _from_centres(cv2: Any, image: Grey, corners: Pixels) -> Pixels:
+    """Return ChArUco's corners with integers at pixels' centres: OpenCV 4 has them half a pixel further right, down."""
+    return corners + np.rint(2 * np.median(_refined(cv2, image, corners, 3) - corners, axis=0)) / 2
 
 
 def _aprilgrid(cv2: Any, board: AprilGrid, grey: Grey) -> Pixels:

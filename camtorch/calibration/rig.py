@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from camtorch.calibration.bundle import Adjusted, Bundle, Free, Poses, Sight, State
+from camtorch.calibration.bundle import Bundle, Free, Poses, Sight, State
 from camtorch.calibration.calibrate import STEPS, Search, as_model, as_options, middle_of, results
 from camtorch.calibration.observations import Points, as_rig_observations
 from camtorch.calibration.uncertainty import shared_factor
@@ -159,13 +159,21 @@ def calibrate_rig(
         name: Extrinsics(rotation_vector(r).unsqueeze(-1), t)
         for name, r, t in zip(observed, *(t[0] for t in state.mounts), strict=True)
     }
+    # the deviations (6,) of each camera's pose by its name; zeros for the first one
+    names = list(observed)
+    std = torch.linalg.vector_norm(shared_factor(found.adjusted.equations)[0] * found.noise, dim=-1)
+    stds = {name: std.new_zeros(6) for name in names}
+    for value, (camera, i) in zip(std, found.adjusted.equations.columns, strict=True):
+        size = found.adjusted.state.parameters[camera].shape[-1]
+        if camera >= 0 and i >= size:
+            stds[names[camera]][i - size] = value
     result = RigCalibration(
         rig=Rig({name: c.camera for name, c in cameras.items()}, mounts),
         boards=Extrinsics(rotation_vector(rotations).unsqueeze(-1), translations - rotations @ middle),
         rms=found.rms,
         sigma=found.sigma,
         cameras=cameras,
-        mount_std=_mount_std(found.adjusted, list(observed), found.noise),
+        mount_std=stds,
         converged=all(c.converged for c in found.cameras),
         bend=found.cameras[0].bend,
         views=found.cameras[0].views,
@@ -240,14 +248,3 @@ def _between(a: _Alone, b: _Alone) -> tuple[Tensor, Tensor]:
     shifted = (translations[:, None] - translations).norm(dim=-1) / length
     middle = (turned + shifted).median(-1).values.argmin()
     return rotations[middle], translations[middle]
-
-
-def _mount_std(adjusted: Adjusted, names: list[str], noise: Tensor) -> dict[str, Tensor]:
-    """Return the deviations (6,) of each camera's pose by its name; zeros for the first one."""
-    std = torch.linalg.vector_norm(shared_factor(adjusted.equations)[0] * noise, dim=-1)
-    result = {name: std.new_zeros(6) for name in names}
-    for value, (camera, i) in zip(std, adjusted.equations.columns, strict=True):
-        count = adjusted.state.parameters[camera].shape[-1]
-        if camera >= 0 and i >= count:
-            result[names[camera]][i - count] = value
-    return result

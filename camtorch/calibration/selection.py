@@ -136,10 +136,6 @@ def select(
     fitted = [trial for trial in trials if not trial.reason]
     if not fitted:
         raise ValueError(f"select: no model can be fitted; {trials[0].model}: {trials[0].reason}")
-    return _chosen(trials, fitted)
-
-
-def _chosen(trials: list[Trial], fitted: list[Trial]) -> Selection:
     least = min(fitted, key=lambda trial: trial.held_out)
 
     def as_good(trial: Trial) -> bool:
@@ -150,9 +146,9 @@ def _chosen(trials: list[Trial], fitted: list[Trial]) -> Selection:
 
     best = min(filter(as_good, fitted), key=lambda trial: trial.count)  # of as many the first, which is better known
     named = f"{best.model} with {best.count} coefficients" if best.count else best.model
-    error = f"{best.held_out:.4g} px on views that it was not fitted to"
+    off = f"{best.held_out:.4g} px on views that it was not fitted to"
     if best is least:
-        return Selection(trials, best, f"{named}: {error}, the smallest error")
-    part = 100 * (1 - least.held_out / best.held_out)
-    why = f"{named}: {error}; {least.model} with {least.count} has {part:.1f} % less, which is no more than chance"
+        return Selection(trials, best, f"{named}: {off}, the smallest error")
+    share = 100 * (1 - least.held_out / best.held_out)
+    why = f"{named}: {off}; {least.model} with {least.count} has {share:.1f} % less, which is no more than chance"
     return Selection(trials, best, why)

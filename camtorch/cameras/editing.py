@@ -81,7 +81,20 @@ def _edited_distortion(camera: CameraLike, across: Any, down: Any, on_side: Any)
     """Coefficients after a quarter turn clockwise where it is on its side, (*B,) bool, and flips by signs (*B,)."""
     k, names = camera.distortion, camera.distortion_names
     if on_side is not None:
-        k = torch.where(torch.as_tensor(on_side, device=k.device).unsqueeze(-1), _on_side(camera), k)
+        quarter, owner = camera.quarter_turn, type(camera).__name__
+        if quarter is None or not {*camera.odd_in_x, *camera.odd_in_y} <= quarter.keys():
+            raise ValueError(
+                f"{owner}: a quarter turn of the image has no camera of this model. "
+                "RandomMount(roll=...) turns the camera, and convert() gives one of another model"
+            )
+        if {"tau_x", "tau_y"} <= {*names}:
+            tilts = camera.distortion[..., [names.index("tau_x"), names.index("tau_y")]]
+            if known_false((tilts == 0).any(-1)):
+                raise ValueError(
+                    f"{owner}: a sensor tilted about both axes, tau_x, tau_y = {tilts.tolist()}, has no "
+                    "quarter turn: the model tilts about one after the other"
+                )
+        k = torch.where(torch.as_tensor(on_side, device=k.device).unsqueeze(-1), _renamed(k, names, quarter), k)
     for sign, mirrored in ((across, camera.mirror_x), (down, camera.mirror_y)):
         if mirrored:
             flipped = torch.as_tensor(sign < 0, device=k.device).unsqueeze(-1)
@@ -91,24 +104,6 @@ def _edited_distortion(camera: CameraLike, across: Any, down: Any, on_side: Any)
             is_odd = torch.tensor([name in odd for name in names], device=k.device)
             k = torch.where(is_odd & torch.as_tensor(sign < 0, device=k.device).unsqueeze(-1), -k, k)
     return k.clone() if k is camera.distortion else k
-
-
-def _on_side(camera: CameraLike) -> Tensor:
-    """(*B, n): the coefficients when the image is turned clockwise by a quarter."""
-    names, turned, owner = camera.distortion_names, camera.quarter_turn, type(camera).__name__
-    if turned is None or not {*camera.odd_in_x, *camera.odd_in_y} <= turned.keys():
-        raise ValueError(
-            f"{owner}: a quarter turn of the image has no camera of this model. "
-            "RandomMount(roll=...) turns the camera, and convert() gives one of another model"
-        )
-    if {"tau_x", "tau_y"} <= {*names}:
-        tilts = camera.distortion[..., [names.index("tau_x"), names.index("tau_y")]]
-        if known_false((tilts == 0).any(-1)):
-            raise ValueError(
-                f"{owner}: a sensor tilted about both axes, tau_x, tau_y = {tilts.tolist()}, has no "
-                "quarter turn: the model tilts about one after the other"
-            )
-    return _renamed(camera.distortion, names, turned)
 
 
 def _renamed(k: Tensor, names: Sequence[str], turned: Mapping[str, str]) -> Tensor:

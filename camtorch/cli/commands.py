@@ -40,7 +40,17 @@ def _dewarp(commands: Commands) -> None:
     add = command.add_argument
     add("image", type=words.raw_path, nargs="+", metavar="IMAGE", help="images, videos, folders, quoted patterns")
     _projection(add)
-    _photograph(command)
+    which = command.add_mutually_exclusive_group().add_argument
+    which("--camera", type=words.path, metavar="FILE", help="its calibration, of any format")
+    text = "instead of a calibration, a real lens by its name: camtorch lenses lists them"
+    which("--lens", type=lambda text: words.path(words.LENS + text), dest="camera", metavar="NAME", help=text)
+    text = (
+        "instead, a guess by its horizontal field of view: pinhole below 100 degrees, else kannala_brandt, or --model"
+    )
+    which("--guess-fov", type=words.guess, dest="camera", metavar="DEGREES", help=text)
+    _from_model(add, "--model")
+    add("--name", help="which camera, in a file with several")
+    add("--rescale", action="store_true", help="scale the camera to the image's resolution, of the same aspect ratio")
     text = "the new image, dewarped.png by default; OUT/, a folder, for several"
     add("-o", "--output", type=words.raw_path, metavar="OUT", help=text)
     if_there = command.add_mutually_exclusive_group().add_argument
@@ -159,22 +169,6 @@ def _calibrate(commands: Commands) -> None:
     lens("--bend", action="store_true", help="the board is not quite flat: find its bend as well")
     add("--format", help=f"{_FORMAT}, OpenCV's for .yml")
     _output(add, "the calibration; camera.json by default", Path("camera.json"))
-
-
-def _photograph(command: argparse.ArgumentParser) -> None:
-    """The calibration of an image."""
-    which = command.add_mutually_exclusive_group().add_argument
-    which("--camera", type=words.path, metavar="FILE", help="its calibration, of any format")
-    text = "instead of a calibration, a real lens by its name: camtorch lenses lists them"
-    which("--lens", type=lambda text: words.path(words.LENS + text), dest="camera", metavar="NAME", help=text)
-    text = (
-        "instead, a guess by its horizontal field of view: pinhole below 100 degrees, else kannala_brandt, or --model"
-    )
-    which("--guess-fov", type=words.guess, dest="camera", metavar="DEGREES", help=text)
-    _from_model(command.add_argument, "--model")
-    add = command.add_argument
-    add("--name", help="which camera, in a file with several")
-    add("--rescale", action="store_true", help="scale the camera to the image's resolution, of the same aspect ratio")
 
 
 def _calibration(add: Add, of_name: str = "which camera, in a file with several", size: str = "--size") -> None:

@@ -100,7 +100,12 @@ def as_jpeg(image: Any, size: tuple[int, int], name: str, owner: str, side: int,
         if isinstance(image, (str, bytes, os.PathLike)):
             image = stack.enter_context(_opened(Path(os.fsdecode(image))))
         elif not isinstance(image, Image.Image):
-            image = _from_array(image)
+            if isinstance(image, Tensor):
+                image = (image if image.ndim == 2 else image.movedim(0, -1)).numpy(force=True)
+            values = np.asarray(image)
+            if values.dtype.kind == "f":
+                values = (255 * values).clip(0, 255).astype(np.uint8)
+            image = Image.fromarray(values[..., 0] if values.ndim == 3 and values.shape[-1] == 1 else values)
         height, width = _stored_size(image)
         if (height, width) != size:
             raise ValueError(
@@ -117,15 +122,6 @@ def as_jpeg(image: Any, size: tuple[int, int], name: str, owner: str, side: int,
     file = io.BytesIO()
     image.save(file, "JPEG", quality=quality, optimize=True)
     return file.getvalue()
-
-
-def _from_array(image: Any) -> Image.Image:
-    if isinstance(image, Tensor):
-        image = (image if image.ndim == 2 else image.movedim(0, -1)).numpy(force=True)
-    values = np.asarray(image)
-    if values.dtype.kind == "f":
-        values = (255 * values).clip(0, 255).astype(np.uint8)
-    return Image.fromarray(values[..., 0] if values.ndim == 3 and values.shape[-1] == 1 else values)
 
 
 def _stored_size(image: Image.Image) -> tuple[int, int]:
