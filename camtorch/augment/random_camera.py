@@ -266,7 +266,7 @@ class RandomCamera(Augmentation):
             red, blue = (scaled(warp.target, 1 + values["chromatic"][..., i]) for i in (0, 1))
             shades = self._warp(warp.source, red, warp.rotation), self._warp(warp.source, blue, warp.rotation)
         if "vignetting" in values:
-            # (B or 1, 1, H, W): one less `loss` (*B,) in the farthest corner, by the square of the distance
+            # (B or 1, 1, H, W): it is lost by the square of the distance, so much in the farthest corner
             height, width = warp.target.height, warp.target.width
             cx, cy = warp.target.intrinsics.detach()[..., 2:].reshape(-1, 2, 1, 1).unbind(1)
             grid = warp.target.pixel_grid()

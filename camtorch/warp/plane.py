@@ -68,10 +68,7 @@ class PlaneWarp(ProxyWarp):
         cameras = (*self.batch_shape, 1)
         self.batch_shape = as_batch(owner, cameras=cameras, normal=normal.shape, distance=(*distance.shape, 1))
         for name, value in (("normal", normal), ("distance", distance)):
-            if isinstance(value, nn.Parameter):
-                self.register_parameter(name, value)
-            else:
-                self.register_buffer(name, as_own(value))
+            self.put(name, as_own(value), persistent=True)
         self._check(owner)
 
     def _check(self, owner: str) -> None:

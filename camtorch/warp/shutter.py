@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Any, Literal, cast, get_args
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from typing_extensions import Unpack
 
 from camtorch.cameras.camera import Camera
@@ -91,10 +91,7 @@ class RollingShutter(GeometryModule):
         if len(self.batch_shape) > 1:
             raise ValueError(f"{owner}: rates must be (3,) or (B, 3); got shape {tuple(rates.shape)}")
         for name, value in (("readout", readout), ("rates", rates)):
-            if isinstance(value, nn.Parameter):
-                self.register_parameter(name, value)
-            else:
-                self.register_buffer(name, as_own(value))
+            self.put(name, as_own(value), persistent=True)
         self.direction = direction
 
     def times(self, pixels: Numbers, image_size: tuple[int, int]) -> Tensor:
