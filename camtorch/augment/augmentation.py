@@ -267,8 +267,6 @@ class Augmentation(SampleTransform):
         self.last: Change | None = None
         """The change of the last call: its `source`, `target` and `rotation`."""
 
-    # -- what a subclass writes
-
     def new_camera(self, source: Camera, values: Mapping[str, Tensor]) -> tuple[Camera, Tensor | None]:
         """The camera after the change, with an image_size, and the rotation, `ray_after = R ray_before`, or None.
 
@@ -281,8 +279,6 @@ class Augmentation(SampleTransform):
             A camera without batch dims or of *B, made for example by `source.replace`, and (3, 3) or (*B, 3, 3).
         """
         raise NotImplementedError
-
-    # -- drawing
 
     def draw(self, count: int, generator: torch.Generator | None = None) -> dict[str, Tensor]:
         """Draw for `count` samples, without applying anything.
@@ -467,8 +463,6 @@ class Augmentation(SampleTransform):
                 "until that much of every image shows something; fov='source', in lenses, takes one as wide as the "
                 "images are; min_filled=0 says that it is meant so"
             )
-
-    # -- applying
 
     @on_samples
     def forward(

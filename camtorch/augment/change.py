@@ -371,8 +371,6 @@ class Change:
             moved = _both(lambda pair: _gated(gate, *pair), moved, stay(self.parts[0].camera, value))
         return moved
 
-    # -- what moves
-
     def images(self, images: Tensor, **options: Any) -> Tensor:
         """Images (count, C, H, W), with the colours and the light of the lens; options as of `Warp.forward`."""
 

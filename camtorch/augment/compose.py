@@ -124,8 +124,6 @@ class Compose(Augmentation):
         """The augmentations, in their order."""
         return cast("list[Augmentation]", list(self.augmentations))
 
-    # -- drawing
-
     def _numbers(self, count: int, p: float, same_on_batch: bool, generator: torch.Generator | None) -> dict[str, Any]:
         values: dict[str, Any] = draw({}, count, p, same_on_batch, generator)[0]
         values["apply"] = values["apply"] if isinstance(values["apply"], Tensor) else np.asarray(values["apply"])
@@ -139,8 +137,6 @@ class Compose(Augmentation):
         for part in self.parts:
             size = part.size_after(size)
         return size
-
-    # -- applying
 
     def tell_of_empty_images(self, camera: Camera) -> None:
         for part in self.parts:

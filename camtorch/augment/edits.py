@@ -47,8 +47,6 @@ class Edit(Augmentation):
 
     needs_camera = False
 
-    # -- what a subclass writes
-
     @abstractmethod
     def edit(self, size: tuple[int, int], values: Mapping[str, Tensor]) -> tuple[Map, tuple[int, int]]:
         """The map of pixels, and the new size.
@@ -65,8 +63,6 @@ class Edit(Augmentation):
     def size_after(self, size: tuple[int, int]) -> tuple[int, int]:
         nothing = {n: torch.full(() if r.size is None else (r.size,), r.low).double() for n, r in self.ranges.items()}
         return self.edit(size, nothing)[1]
-
-    # -- what follows from it
 
     def tell_of_empty_images(self, camera: Camera) -> None:
         """Nothing is empty that is not asked for."""

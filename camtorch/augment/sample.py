@@ -64,8 +64,6 @@ class Frames(Single):
     """A single sample whose values may have leading dims, as those of clips have: all of them move by one change."""
 
 
-# -- the kinds of fields
-
 KEEP = "keep"
 IMAGES = ("image", "mask", "depth", "distance")
 
@@ -322,9 +320,6 @@ def is_batch(named: Named, camera: object) -> bool:
     return any(value.ndim > KINDS[kind].dims for kind, value in named.values())
 
 
-# -- moving a sample
-
-
 class Unknown(Pinhole):
     """The camera of images of which only the size is known, while they are edited; no sample comes out with it."""
 
@@ -487,8 +482,6 @@ class SampleTransform(nn.Module):
     def _held(self, name: str) -> Camera | None:
         """A camera of its own, from the dict where it lies: `nn.Module` looks into all."""
         return cast("Camera | None", self._modules.get(name))
-
-    # -- moving
 
     def _given(self, sample: Mapping[str, object] | None, fields: Mapping[str, object]) -> Sample:
         """The sample and the keyword arguments as one dict."""

@@ -354,8 +354,6 @@ class Bundle:
         # that of a focal length is for what goes wrong
         self.is_bounded = any(c >= 0 and i >= 4 and self.cameras[c].fit_bounds for c, i in self.columns)
 
-    # -- the state, flat
-
     def flat(self, state: State) -> tuple[Tensor, ...]:
         """As tensors (B, ...)."""
         batch = len(state.boards.translations)
@@ -377,8 +375,6 @@ class Bundle:
             for c, i in self.columns
         ]
         return torch.stack(columns, -1) if columns else like.new_zeros(batch, 0)
-
-    # -- what is seen
 
     def points(self, c: int, state: State, sight: Sight) -> tuple[Tensor, Tensor, Tensor]:
         """(B, V, N, 3): those of the board as it lies, in the frame of the first camera, in that of this one."""
@@ -448,8 +444,6 @@ class Bundle:
             if sight.prior:
                 total = total + ((parameters - sight.prior.centre) @ sight.prior.root.mT).square().sum(-1)
         return total.nan_to_num(torch.inf, torch.inf)
-
-    # -- the linear problem
 
     def linearised(self, flat: Sequence[Tensor], rows: Tensor) -> System:
         """At a state."""

@@ -337,8 +337,6 @@ class Camera(Freezable):
     def _has_left(self, name: str) -> bool:
         return name not in {model.__name__ for model in MODELS.values()}
 
-    # -- both directions
-
     def forward(self, points: Numbers) -> tuple[Tensor, Tensor]:
         """The same as `project`."""
         return self.project(points)
@@ -397,8 +395,6 @@ class Camera(Freezable):
     def _tensors(self) -> tuple[Tensor, ...]:
         """All that the camera learns, or could."""
         return self.intrinsics, self.distortion
-
-    # -- the image
 
     def contains(self, pixels: Numbers) -> Tensor:
         """Bool (...): whether pixels (..., 2) lie on the image, its outer pixel edges included."""
@@ -587,8 +583,6 @@ class Camera(Freezable):
         """
         size, turns = self._size_for("rot90"), as_whole(k, "k", "rot90") % 4
         return edited_by(self, quarter_turns(size)[turns], size[::-1] if turns % 2 else size)
-
-    # -- another model
 
     def convert(
         self,

@@ -40,15 +40,13 @@ def is_concrete(tensor: Tensor) -> bool:
 
     Nor are there any on the meta device or in a FakeTensorMode, where modules are made of shapes alone.
     """
-    return not (_is_traced(tensor) or tensor.is_meta or _is_fake(tensor))
+    if _is_traced(tensor) or tensor.is_meta:
+        return False
+    return torch._C._get_dispatch_mode(FAKE_MODE) is None and not is_fake(tensor)
 
 
 def _is_traced(tensor: Tensor) -> bool:
     return torch.compiler.is_compiling() or torch._C._functorch.is_functorch_wrapped_tensor(tensor)
-
-
-def _is_fake(tensor: Tensor) -> bool:
-    return torch._C._get_dispatch_mode(FAKE_MODE) is not None or is_fake(tensor)
 
 
 def is_fake(tensor: Tensor) -> bool:

@@ -251,17 +251,13 @@ class RadiusTable(RadialFactor):
     def __call__(self, t: Tensor) -> Tensor:
         return self.derivatives(t, 0)[0]
 
-    def _at(self, t: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """The radius, whether it lies behind the end, its piece, how far from the piece's node it is mirrored to."""
+    def derivatives(self, t: Tensor, order: int) -> tuple[Tensor, ...]:
+        """R and its first `order` derivatives by t, up to two; at the centre finite, for what is multiplied by t."""
         radius = root(t)
         behind = radius > self.end
         place = torch.where(behind, (2 * self.end - radius).clamp(min=0), radius)
         piece = piece_of(self.nodes[1:], place)
-        return radius, behind, piece, place - pick(self.nodes, piece)
-
-    def derivatives(self, t: Tensor, order: int) -> tuple[Tensor, ...]:
-        """R and its first `order` derivatives by t, up to two; at the centre finite, for what is multiplied by t."""
-        radius, behind, piece, offset = self._at(t)
+        offset = place - pick(self.nodes, piece)  # from the piece's node
         zeroth, first, second, third = (pick(power, piece) for power in self.cubics)
         # on the first piece neither division nor root has a part in the derivatives of the outer terms
         central = (piece == 0) & ~behind

@@ -11,9 +11,7 @@ from torch import Tensor, nn
 from torch.nn.utils.parametrize import type_before_parametrizations
 from typing_extensions import Self
 
-from camtorch.evaluate.door import (
-    in_graph,
-)
+from camtorch.evaluate.door import in_graph
 from camtorch.evaluate.kept import Memo
 from camtorch.values.arguments import LEFT, shown
 

@@ -201,17 +201,12 @@ class AffineWarp(MirrorWarp):
         sizes = self.source._size_for("Warp"), self.target._size_for("Warp")
         return [_way(rows, *sizes, sampler.padding_mode, least, decides) for rows in self._numbers]
 
-    @property
-    def _maps(self) -> Tensor:
-        """(B or 1, 2, 3)."""
-        return self.matrix.reshape(-1, 2, 3)
-
     def _inputs(self) -> list[Tensor]:
         return [self.matrix]
 
     def _locate(self, rows: range, padding: PaddingMode, tolerance: float) -> Sampling | Lattice:
         width = self.target._size_for("Warp")[1]
-        back = inverted(self._maps)
+        back = inverted(self.matrix.reshape(-1, 2, 3))
         side = back.new_tensor(self.source._size_for("Warp")[::-1])[:, None]
         # pixels to positions: (2 u + 1) / W - 1
         back = torch.cat((back[:, :, :2] * 2 / side, (2 * back[:, :, 2:] + 1) / side - 1), -1)

@@ -85,24 +85,21 @@ class Lattice:
     def pixels(self) -> Sampling:
         """Pixel by pixel: a constant of what torch.jit.trace records, also where nobody has asked for it before."""
         with set_aside() if in_jit_trace() else nullcontext():
-            return self._by_pixel()
-
-    def _by_pixel(self) -> Sampling:
-        height, width = self.size
-        _, n, m = self.cells.shape
-        planes = interpolated(self.nodes[:, :, 1:-1, 1:-1], n, m)  # (B, 2, 8 n, 8 m)
-        blocks = planes.unflatten(2, (n, STEP)).unflatten(4, (m, STEP))
-        some = self.cells != EMPTY
-        camera, i, j = (~some).nonzero(as_tuple=True)
-        blocks[camera, :, i, :, j] = OUTSIDE
-        seen = some[:, :, None, :, None].expand(-1, -1, STEP, -1, STEP).flatten(3, 4).flatten(1, 2)
-        camera, i, j = (self.cells >= 0).nonzero(as_tuple=True)
-        if len(camera):
-            exact = self.exact[:, self.cells[camera, i, j].long()].transpose(0, 1)  # (K, 2, 8, 8)
-            known = ~exact[:, 0].isnan()
-            blocks[camera, :, i, :, j] = torch.where(known[:, None], exact, OUTSIDE)
-            seen.unflatten(1, (n, STEP)).unflatten(3, (m, STEP))[camera, i, :, j] = known
-        return Sampling(planes[:, :, :height, :width].movedim(1, -1), seen[:, :height, :width], None)
+            height, width = self.size
+            _, n, m = self.cells.shape
+            planes = interpolated(self.nodes[:, :, 1:-1, 1:-1], n, m)  # (B, 2, 8 n, 8 m)
+            blocks = planes.unflatten(2, (n, STEP)).unflatten(4, (m, STEP))
+            some = self.cells != EMPTY
+            camera, i, j = (~some).nonzero(as_tuple=True)
+            blocks[camera, :, i, :, j] = OUTSIDE
+            seen = some[:, :, None, :, None].expand(-1, -1, STEP, -1, STEP).flatten(3, 4).flatten(1, 2)
+            camera, i, j = (self.cells >= 0).nonzero(as_tuple=True)
+            if len(camera):
+                exact = self.exact[:, self.cells[camera, i, j].long()].transpose(0, 1)  # (K, 2, 8, 8)
+                known = ~exact[:, 0].isnan()
+                blocks[camera, :, i, :, j] = torch.where(known[:, None], exact, OUTSIDE)
+                seen.unflatten(1, (n, STEP)).unflatten(3, (m, STEP))[camera, i, :, j] = known
+            return Sampling(planes[:, :, :height, :width].movedim(1, -1), seen[:, :height, :width], None)
 
 
 def is_plain(*tensors: Tensor) -> bool:

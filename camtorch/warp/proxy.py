@@ -39,14 +39,6 @@ class ProxyWarp(Warp):
     def _inputs(self) -> list[Tensor]:
         return [*super()._inputs(), self.extrinsics.rotation, self.extrinsics.translation]
 
-    def _carried(self, rays: Tensor, of_source: bool) -> tuple[Tensor, Tensor]:
-        """Directions in which the other camera sees what unit rays (B, *N, 3) of one meet, and whether they do."""
-        rotation, shift = (t.to(rays.dtype) for t in self._pose())
-        if of_source:
-            rotation, shift = rotation.mT, -(rotation.mT @ shift[..., None])[..., 0]
-        near, meets = self._nearness(rays, of_source)
-        return turned(rotation, rays) + beside(shift, rays) * near[..., None], meets
-
     def _locate(self, rows: range, padding: PaddingMode, tolerance: float) -> Sampling:
         if not self.antialias:
             return Sampling(*self._of_rows(rows), None)
@@ -63,7 +55,12 @@ class ProxyWarp(Warp):
     def _move(self, pixels: Numbers, back: bool = False, on_image: bool = False) -> tuple[Tensor, Tensor]:
         source, target = (self.target, self.source) if back else (self.source, self.target)
         rays, has_ray = source.unproject(pixels)
-        directions, meets = self._carried(rays, of_source=not back)
+        # directions in which the other camera sees what the rays meet
+        rotation, shift = (t.to(rays.dtype) for t in self._pose())
+        if not back:
+            rotation, shift = rotation.mT, -(rotation.mT @ shift[..., None])[..., 0]
+        near, meets = self._nearness(rays, of_source=not back)
+        directions = turned(rotation, rays) + beside(shift, rays) * near[..., None]
         seen, mapped = target.project(off_poles(target, directions))
         valid = mapped & has_ray & meets
         seen = torch.where(valid.unsqueeze(-1), seen, -1.0)

@@ -133,8 +133,6 @@ class Warp(CameraPair):
         warp._set(*given)
         return warp
 
-    # -- images
-
     def forward(
         self,
         images: Tensor,
@@ -220,8 +218,6 @@ class Warp(CameraPair):
         if self._pinned is None:
             self.__dict__["_pinned"] = routes.pinned(self)  # as nn.Module would, after some questions
         return self
-
-    # -- labels
 
     def transform_points(self, pixels: Numbers) -> tuple[Tensor, Tensor]:
         """Move pixels (B, *N, 2), or (*N, 2) for cameras without batch, from the source's to the target's image.
