@@ -102,7 +102,7 @@ class FaceNormalizer(SampleTransform):
         down = torch.linalg.cross(forward, across)
         size = down.norm(dim=-1, keepdim=True)
         usable = torch.isfinite(size) & (size > 1e-6)
-        if not torch.compiler.is_compiling() and not bool(usable.all()):
+        if known_false(usable):
             row = int((~usable).flatten().nonzero()[0])
             raise ValueError(
                 f"{self._name}: a face is at the camera, not finite, or seen along the head's x axis; sample {row} has "

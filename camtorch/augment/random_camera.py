@@ -23,9 +23,9 @@ from camtorch.augment.sample import Named, fixed_copy
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.numbers import joined, split
 from camtorch.cameras.opaque import CameraNumbers, opaque
-from camtorch.evaluate.door import in_graph, is_eager
+from camtorch.evaluate.door import in_graph
 from camtorch.evaluate.kept import Memo
-from camtorch.evaluate.known import are_numbers, known_false
+from camtorch.evaluate.known import are_free, are_numbers, known_false
 from camtorch.lenses.drawing import FOLD, covering, drawn
 from camtorch.models import MODELS, KannalaBrandt
 from camtorch.optics.radial_inverse import precise
@@ -625,7 +625,7 @@ def _seen_through(
 ) -> tuple[Tensor, Tensor]:
     """What lenses of other numbers, (C, 4) and (C, n), make of pixels or rays (C, N, size); way: which of both."""
     made = Cameras(type_before_parametrizations(lens), intrinsics, distortion)
-    if made.native is None or not is_eager(values, intrinsics, distortion):
+    if made.native is None or not are_free(values, intrinsics, distortion):
         camera = remade(lens, intrinsics=intrinsics, distortion=distortion)
         return camera.project(values) if way is project else camera.unproject(values)
     planes, valid, *_ = way(made.native, values)

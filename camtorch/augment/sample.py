@@ -22,8 +22,7 @@ from camtorch.augment.change import Change, Part, View, alone, as_one
 from camtorch.augment.clips import Clips
 from camtorch.augment.landmarks import Mirroring, exchanged
 from camtorch.cameras.camera import Camera
-from camtorch.evaluate.door import may_look
-from camtorch.evaluate.known import are_numbers, known_false
+from camtorch.evaluate.known import are_numbers, known_false, known_true
 from camtorch.evaluate.private import pytree
 from camtorch.models import Pinhole
 from camtorch.poses.rotations import are_rotations, check_rotation, rotation_matrix, rotation_vector
@@ -299,7 +298,7 @@ def check_values(kind: str, name: str, value: Tensor, owner: str) -> None:
 
 def _tell_of_parts(name: str, boxes: Tensor, owner: str) -> None:
     """Warn of boxes that all lie between the centres of the first pixels, as parts of an image's sides do."""
-    if may_look(boxes) and bool((boxes == boxes.clamp(0, 1)).all() & (boxes % 1 != 0).any()):
+    if boxes.is_cpu and known_true((boxes == boxes.clamp(0, 1)).all() & (boxes % 1 != 0).any()):
         warn(
             f"{owner}: {name} must be pixels x1, y1, x2, y2, and all of these lie within [0, 1], as parts of an "
             "image's width and height do: times width and height, less 0.5, those are pixels"

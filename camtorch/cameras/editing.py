@@ -10,8 +10,7 @@ import torch
 from torch import Tensor
 
 from camtorch.cameras.numbers import joined, split
-from camtorch.evaluate.door import is_concrete
-from camtorch.evaluate.known import are_numbers, known_false
+from camtorch.evaluate.known import are_numbers, known_false, known_true
 from camtorch.optics.radial_inverse import precise
 from camtorch.projection.camera_like import CameraLike
 from camtorch.values.arguments import as_image_size
@@ -72,7 +71,7 @@ def edited(camera: CameraT, matrix: Tensor | Sequence[Sequence[float]], image_si
     turned = b != 0
     turns = turned
     if isinstance(matrix, Tensor):  # asked where it was drawn, so that no device is waited for
-        turns = np.any(turned) if xp is np else not is_concrete(matrix) or bool((matrix[..., 0, 1] != 0).any())
+        turns = np.any(turned) if xp is np else not known_true(matrix[..., 0, 1] == 0)
     distortion = _edited_distortion(camera, a - b, c + d, turned if turns else None)
     return remade(camera, intrinsics=joined((*focal, *centre), own, xp), distortion=distortion, image_size=image_size)
 

@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 from typing_extensions import Self
 
-from camtorch.evaluate.door import in_transform, is_concrete, is_recorded
+from camtorch.evaluate.door import is_recorded
+from camtorch.evaluate.known import is_unknown
 from camtorch.projection.camera_like import CameraLike
 from camtorch.values.module import is_parameter
 
@@ -37,7 +38,7 @@ def with_frozen(tensor: Tensor, frozen: Tensor) -> Tensor:
     looked at.
     """
     learns = frozen.isnan()
-    if not is_parameter(tensor) or not is_concrete(tensor) or in_transform() or is_recorded():
+    if not is_parameter(tensor) or is_unknown(tensor) or is_recorded():
         return torch.where(learns, tensor, frozen)
     values = torch.where(learns, tensor.detach(), frozen)
     if not torch.equal(values, tensor.detach()):

@@ -12,8 +12,7 @@ from torch import Tensor, nn
 from torch.nn.utils.parametrize import type_before_parametrizations
 
 from camtorch.cameras.freezing import INTRINSICS, frozen_names
-from camtorch.evaluate.door import is_eager
-from camtorch.evaluate.known import is_kept, is_predicted, known_false, row_of, values_of
+from camtorch.evaluate.known import are_free, is_kept, is_predicted, known_false, row_of, values_of
 from camtorch.optics.radial_inverse import precise
 from camtorch.projection.camera_like import CameraLike
 from camtorch.rays.lattices import AXES, focal_for
@@ -67,7 +66,7 @@ def at_a_glance(model: type[CameraLike], intrinsics: Any, distortion: Any, size:
 
     It is of lists of numbers, and of plain tensors.
     """
-    if not (model.always_defined and is_eager(*[value for value in (intrinsics, distortion) if type(value) is Tensor])):
+    if not (model.always_defined and are_free(*[value for value in (intrinsics, distortion) if type(value) is Tensor])):
         return None
     made: list[Tensor] = []
     rows: list[list[float]] = []

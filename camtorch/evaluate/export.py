@@ -137,8 +137,10 @@ def unbound(table: Tensor) -> tuple[Tensor, ...]:
     return tuple(c.clone() for c in columns) if torch.compiler.is_exporting() else columns
 
 
-def exported_atan2(y: Tensor, x: Tensor) -> Tensor:
-    """Return torch.atan2 for ONNX, whose composed one is -pi at y = 0 behind; ONNX Runtime has none in float64."""
+def atan2(y: Tensor, x: Tensor) -> Tensor:
+    """Return torch.atan2; ONNX's composed one is -pi at y = 0 behind, and ONNX Runtime has none in float64."""
+    if not torch.compiler.is_exporting():
+        return torch.atan2(y, x)
     y, x = torch.broadcast_tensors(y, x)
     behind = (y == 0) & (x < 0)
     if y.dtype != torch.float64:

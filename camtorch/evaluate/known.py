@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from camtorch.evaluate.door import in_graph, is_concrete, is_eager, keeps_graph, may_look
+from camtorch.evaluate.door import in_graph, in_transform, is_concrete, is_eager, keeps_graph, may_look
 
 
 def known_false(condition: Tensor) -> bool:
@@ -16,6 +16,16 @@ def known_false(condition: Tensor) -> bool:
 def known_true(condition: Tensor) -> bool:
     """Return whether a condition is known to hold everywhere: False if that would take more than a quick look."""
     return may_look(condition) and bool(condition.all())
+
+
+def is_unknown(tensor: Tensor) -> bool:
+    """Return whether values may not be looked at: traced, or within a transform, whose derivatives go forward."""
+    return in_transform() or not is_concrete(tensor)
+
+
+def are_plain(*tensors: Tensor) -> bool:
+    """Return whether tensors are the CPU's, and neither a graph nor a transform is at work."""
+    return not in_transform() and all(t.is_cpu and not in_graph(t) for t in tensors)
 
 
 def values_of(tensor: Tensor) -> Tensor | None:

@@ -13,8 +13,8 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from camtorch.evaluate.export import plus
-from camtorch.optics.special import angle_per_radius, atan2, cos_root, sinc_root, tanc_root
+from camtorch.evaluate.export import atan2, plus
+from camtorch.optics.special import angle_per_radius, cos_root, sinc_root, tanc_root
 
 Planes2 = tuple[Tensor, Tensor]
 Planes3 = tuple[Tensor, Tensor, Tensor]

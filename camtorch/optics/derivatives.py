@@ -10,17 +10,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from camtorch.evaluate.door import in_transform, is_concrete
-
-
-def goes_forward(tensor: Tensor) -> bool:
-    """Whether derivatives that no graph shall have go forward: transforms and compilers have no gradients."""
-    return in_transform() or not is_concrete(tensor)
+from camtorch.evaluate.known import is_unknown
 
 
 def jacobian_of(part: Any, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """du/da, du/db, dv/da, dv/db of a map (a, b) -> (u, v), such as a stage, of each point by itself. Graph-free."""
-    if goes_forward(a):
+    if is_unknown(a):
         one, zero = torch.ones_like(a), torch.zeros_like(a)
         (ua, va), (ub, vb) = (torch.func.jvp(part, (a, b), along)[1] for along in ((one, zero), (zero, one)))
         return ua, ub, va, vb
@@ -37,7 +32,7 @@ def derivatives_of(part: Any, t: Tensor, order: int) -> tuple[Tensor, ...]:
     """The value and the first `order` derivatives of a factor, of each number by itself; those are graph-free."""
     if order == 0:
         return (part(t),)
-    if goes_forward(t):
+    if is_unknown(t):
 
         def slope(of: Callable[[Tensor], Tensor]) -> Callable[[Tensor], Tensor]:
             return lambda t: torch.func.jvp(of, (t,), (torch.ones_like(t),))[1]

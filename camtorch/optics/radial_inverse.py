@@ -176,6 +176,7 @@ class InverseTable:
 
         is_constant: whether its parts are to be no views.
         """
+        self.is_constant = is_constant
         parts = table[..., :1], table[..., 1:2], table[..., 2 : 2 + _NODES], table[..., 2 + _NODES :]
         self.reach2, self.most2, self.values, self.steps = (p.clone() for p in parts) if is_constant else parts
 
@@ -266,9 +267,10 @@ class RadialInverse:
         self.of_points = parameters[0].ndim < 2
         self.k = torch.stack(parameters, -1).reshape(parameters[0].numel(), len(parameters))
         k, rows = self.k, None
+        self._table: InverseTable | None = None
         if is_portable_export():
             inner2, table = _made_tables(factor.name, k, end)
-            self._table = InverseTable(table)
+            self._table = InverseTable(table, is_constant=True)
             most2 = self._table.most2
         else:
             if self.of_points and len(k) > 1:
@@ -282,7 +284,7 @@ class RadialInverse:
         if self.of_points:
             return bracketed(self.radial, r2, self.inner2)
         rows = r2.unsqueeze(-1).flatten(1)
-        if is_portable_export():
+        if self._table is not None:
             inner2 = self.inner2.reshape(-1, 1)
             return _scale(self.factor.name, self.k, inner2, self._table, rows).view_as(r2)
         found = _inverse_of(self.factor.name, self.k, self.end, rows)[0]
@@ -304,7 +306,7 @@ def _scale(name: str, k: Tensor, inner2: Tensor, table: InverseTable, r2: Tensor
     """`solve` of coefficients (C, n) and squared radii (C, N), `bracketed` where Newton's method leaves it open."""
     scale, converged = solve(CLASSES[name](columns(k)), table, r2)
     camera, point = (~(converged > 0)).nonzero(as_tuple=True)
-    if is_portable_export() or len(camera):
+    if table.is_constant or len(camera):
         radial = CLASSES[name](of_points(k, camera))
         found = bracketed(radial, r2[camera, point], inner2[camera, 0])
         scale = scale.index_put((camera, point), found)

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from camtorch.evaluate.export import exported_atan2, plus
+from camtorch.evaluate.export import atan2, plus
 
 # Below these the power series is used. Its first dropped term is below 1e-21 and the closed form above
 # them still has a first derivative good to 1e-13 of the function's own scale.
@@ -70,11 +70,6 @@ def cosc_root(t: Tensor) -> Tensor:
         return 2 * ratio * ratio
 
     return _blend(t, _COSC, half_angle)
-
-
-def atan2(y: Tensor, x: Tensor) -> Tensor:
-    """torch.atan2, also for ONNX."""
-    return exported_atan2(y, x) if torch.compiler.is_exporting() else torch.atan2(y, x)
 
 
 def angle_per_radius(rho2: Tensor, z: Tensor, order: int = 2) -> Tensor:

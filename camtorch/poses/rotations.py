@@ -8,8 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from camtorch.evaluate.door import is_eager
-from camtorch.evaluate.known import as_own, known_false, known_true
+from camtorch.evaluate.known import are_free, as_own, known_false, known_true
 from camtorch.optics.special import angle_per_radius, cos_root, cosc_root, sinc_root
 from camtorch.values.arguments import Numbers, as_real, as_rows, as_values, check_devices
 
@@ -147,7 +146,7 @@ def as_rotation(rotation: Numbers | None, owner: str) -> Tensor | None:
 
 def _is_right(matrix: Tensor) -> bool:
     """Whether (3, 3) is a rotation at a glance, by plain numbers, which take less time than one operator of torch."""
-    if not (matrix.dtype in (torch.float32, torch.float64) and is_eager(matrix)):
+    if not (matrix.dtype in (torch.float32, torch.float64) and are_free(matrix)):
         return False
     (a, b, c), (d, e, f), (g, h, i) = matrix.tolist()
     squares = a * a + b * b + c * c, d * d + e * e + f * f, g * g + h * h + i * i

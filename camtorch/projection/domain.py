@@ -53,6 +53,8 @@ class Domain:
     k: Tensor
     chart: Chart
     lens: Lens
+    is_constant: bool = False
+    """Whether it is a constant of an exported program that other runtimes run."""
 
     def __init__(self, optics: Optics, k: Tensor):
         """optics: a model's. k: (C, n) coefficients, in the dtype and on the device of the points."""
@@ -81,6 +83,7 @@ class Domain:
         # constants: none is a view of another
         made = Domain(self.optics, self.k.clone())
         made.chart, made.lens = self.optics([c.clone() for c in columns(self.k)])
+        made.is_constant = True
         if not self.lens.stages:
             return made
         tables = ["inner2", "usual2", *(["circle2"] if self.lens.rest is not None else [])]

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import torch
 from torch import Tensor
 
-from camtorch.evaluate.export import is_portable_export
 from camtorch.evaluate.known import known_true
 from camtorch.projection import compiled
 from camtorch.projection.camera_like import CameraLike
@@ -190,7 +189,9 @@ class Traced(NamedTuple):
 
     def optics(self, distortion: Tensor) -> tuple[Chart, Lens]:
         """Those of the coefficients as a graph has them; of a constant camera they are made already."""
-        return (self.domain.chart, self.domain.lens) if is_portable_export() else self.model.optics(columns(distortion))
+        return (
+            (self.domain.chart, self.domain.lens) if self.domain.is_constant else self.model.optics(columns(distortion))
+        )
 
 
 def replace(mask: Tensor, plane: Tensor, value: float) -> Tensor:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from camtorch.evaluate.export import is_portable_export, repeat, times
+from camtorch.evaluate.export import repeat, times
 from camtorch.optics.lens import newton_step
 from camtorch.optics.radial_inverse import bracketed
 from camtorch.projection.domain import regular
@@ -36,7 +36,7 @@ def search(domain: Domain, camera: Tensor, u: Tensor, v: Tensor) -> Found:
     """
     if domain.lens.is_radial:
         return _Search(domain, camera)(u, v)
-    if is_portable_export():
+    if domain.is_constant:
         return _search_recorded(domain, camera, u, v)
     if domain.stagewise is None:
         return _within_extents(domain, camera, u, v)
@@ -154,7 +154,7 @@ class _Search:
 
     def planar(self, u: Tensor, v: Tensor) -> Planes2:
         """Newton's method; the few that need many steps go on by themselves."""
-        if is_portable_export():
+        if self.domain.is_constant:
             return self._newton(u, v, *self._start(u, v), _FIRST_STEPS + _LATE_STEPS)[:2]
         a, b, active = self._newton(u, v, *self._start(u, v), _FIRST_STEPS)
         (late,) = active.nonzero(as_tuple=True)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
-from camtorch.evaluate.export import is_portable_export, times
+from camtorch.evaluate.export import times
 from camtorch.evaluate.recorded import order_of, positive, to_planes, without_keeping
 from camtorch.optics.lens import newton_step
 from camtorch.optics.radial_inverse import MOST_STEPS, short, solve
@@ -162,7 +162,7 @@ def _formula(
     a, b = p, q = replace(mask, p, 0.0), replace(mask, q, 0.0)
     if domain.lens.stages:
         found = invert(domain, p, q)
-        if is_portable_export():
+        if domain.is_constant:
             found = _search_recorded(domain, (p, q), found)
         elif torch.compiler.is_compiling():
             search_in_place(model._model, domain.k, p, q, *found)

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import torch
 from torch import Tensor
 
-from camtorch.evaluate.known import known_false
-from camtorch.optics.derivatives import goes_forward
+from camtorch.evaluate.known import is_unknown, known_false
 from camtorch.poses.extrinsics import Extrinsics
 from camtorch.poses.rotations import rotate_planes, rotation_matrix
 from camtorch.projection.camera_like import CameraLike
@@ -135,7 +134,7 @@ class Tangents(NamedTuple):
 
 def tangents(camera: CameraLike, pixels: Tensor) -> Tangents:
     """Rays of pixels (*B, *N, 2) with their exact derivatives, in a graph where the camera or the pixels are in one."""
-    if goes_forward(pixels):
+    if is_unknown(pixels):
         right, below = (pixels.new_tensor(unit).expand_as(pixels) for unit in ((1.0, 0.0), (0.0, 1.0)))
         by_u: Any = torch.func.jvp(camera.unproject, (pixels,), (right,), has_aux=True)
         by_v: Any = torch.func.jvp(camera.unproject, (pixels,), (below,), has_aux=True)

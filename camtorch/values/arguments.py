@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from camtorch.evaluate.door import is_concrete, may_look
+from camtorch.evaluate.door import may_look
 from camtorch.evaluate.known import is_kept, is_predicted, known_false, row_of
 
 Numbers: TypeAlias = Tensor | np.ndarray[Any, Any] | np.number[Any] | float | list[Any] | tuple[Any, ...]
@@ -97,7 +97,7 @@ def as_real(value: Numbers, name: str, owner: str, device: torch.device | None =
     if row is not None:
         finite = all(map(math.isfinite, row))
     else:
-        finite = not is_concrete(value) or is_predicted(value) or bool(torch.isfinite(value).all())
+        finite = is_predicted(value) or not known_false(torch.isfinite(value))
     if not finite:
         wrong = (~value.detach().isfinite()).nonzero()
         first = wrong[0].tolist()

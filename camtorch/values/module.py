@@ -11,8 +11,8 @@ from torch import Tensor, nn
 from torch.nn.utils.parametrize import type_before_parametrizations
 from typing_extensions import Self
 
-from camtorch.evaluate.door import in_graph
 from camtorch.evaluate.kept import Memo
+from camtorch.evaluate.known import is_kept
 from camtorch.values.arguments import LEFT, shown
 
 P = ParamSpec("P")
@@ -90,7 +90,7 @@ class GeometryModule(UnsharedState):
             self.put(name, value if value.shape == shape and not value.requires_grad else value.detach().expand(shape))
         elif is_parameter(value):
             self.put(name, value)
-        elif in_graph(value):
+        elif is_kept(value):
             self.put(name, _widened(value))
         else:
             own = _widened(value)
@@ -323,7 +323,7 @@ def fixed(tensor: Tensor) -> Tensor:
     """A Parameter or a tensor of a graph as it is, and any other as a Parameter that does not learn, without a copy."""
     if is_parameter(tensor):
         return tensor
-    if in_graph(tensor):
+    if is_kept(tensor):
         if torch.compiler.is_compiling() or not tensor.is_leaf or tensor._base is None:
             return tensor
         if not tensor._base.requires_grad:

@@ -14,6 +14,7 @@ from torch import Tensor
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.opaque import opaque
 from camtorch.evaluate.door import in_transform, is_concrete, keeps_graph
+from camtorch.evaluate.known import are_plain, is_unknown
 from camtorch.native.sampler import empty
 from camtorch.values.arguments import Numbers, as_values, broadcast_shapes
 from camtorch.values.dtypes import SIGNED, as_pixels, narrow, widen
@@ -141,7 +142,7 @@ class MirrorWarp(Warp):
     def _empty(self, images: Tensor) -> Tensor:
         cameras, size = self.batch_shape.numel(), self.target._size_for("Warp")
         count = len(images) if cameras == 1 else cameras
-        if images.requires_grad or not images.is_cpu or torch.compiler.is_compiling():
+        if not are_plain(images):
             return images.new_empty(count, images.shape[1], *size)
         return empty(images, count, size)
 
@@ -211,7 +212,7 @@ class AffineWarp(MirrorWarp):
         # pixels to positions: (2 u + 1) / W - 1
         back = torch.cat((back[:, :, :2] * 2 / side, (2 * back[:, :, 2:] + 1) / side - 1), -1)
         dtype = torch.promote_types(self.source.intrinsics.dtype, torch.float32)
-        if tolerance and not self.antialias and back.is_cpu and is_concrete(back) and not in_transform():
+        if tolerance and not self.antialias and back.is_cpu and not is_unknown(back):
             return straight_lattice(back, rows, width, dtype)
         v, u = (torch.arange(n, dtype=back.dtype, device=back.device) for n in (len(rows), width))
         v = v + rows.start

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from camtorch.evaluate.door import is_eager
+from camtorch.evaluate.known import are_free
 from camtorch.native import memory, sampler
 from camtorch.native.library import library
 from camtorch.projection import compiled
@@ -108,7 +108,7 @@ def batch_at_once(warp: Warp, images: Sequence[tuple[Tensor, Sampler]]) -> list[
     None where lattices do not do, images lie oddly in memory or shrink, threads would idle, or something is traced.
     """
     tensors = [image for image, _ in images]
-    if not images or not is_eager(*tensors):
+    if not images or not are_free(*tensors):
         return None
     cameras, threads = math.prod(warp.batch_shape), thread_count()
     if cameras < 2 or (cameras % threads and cameras < _EVEN * threads):
@@ -165,9 +165,7 @@ def at_once(
     C, H, W), masks (1, H, W) as well, and, where `hows` has None, pixels (1, *N, 2) of the source's image.
     """
     tolerance, antialias = options["tolerance"], options["antialias"]
-    if not tolerance or antialias or not is_eager(*values):
-        return None
-    if torch.is_grad_enabled() and any(t.requires_grad for t in values):
+    if not tolerance or antialias or not are_free(*values):
         return None
     if rotation is not None and (rotation.dtype != source.dtype or not rotation.is_contiguous()):
         rotation = rotation.detach().to(source.dtype).contiguous()

@@ -14,7 +14,8 @@ import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
 from torch import Tensor
 
 from camtorch.cameras.camera import Camera
-from camtorch.evaluate.door import in_graph, in_jit_trace, in_transform, is_concrete, is_eager, may_look, set_aside
+from camtorch.evaluate.door import in_jit_trace, may_look, set_aside
+from camtorch.evaluate.known import are_free, are_plain, is_unknown
 from camtorch.native.library import native_available
 from camtorch.native.sampler import CUBIC, DOUBT, EMPTY, TODO, classify
 from camtorch.poses.rotations import turn
@@ -102,11 +103,6 @@ class Lattice:
             return Sampling(planes[:, :, :height, :width].movedim(1, -1), seen[:, :height, :width], None)
 
 
-def is_plain(*tensors: Tensor) -> bool:
-    """Whether tensors are the CPU's, and neither a graph nor a transform is at work."""
-    return not in_transform() and all(t.is_cpu and not in_graph(t) for t in tensors)
-
-
 @on_one_thread
 def locate(
     source: Camera,
@@ -156,7 +152,7 @@ def tabulate(
     height, width = target._size_for("Warp")
     rows = range(height) if rows is None else rows
     like = _like(target)
-    if in_transform() or not is_concrete(target.intrinsics):
+    if is_unknown(target.intrinsics):
         return _positions(source, target, rotation, None, _pixels(rows, width, like))
     if tolerance and like.is_cpu:
         lattice = on_lattice(source, target, rotation, tolerance, rows, padding)
@@ -224,7 +220,7 @@ def _positions(
 
 def to_positions(seen: Tensor, mapped: Tensor, size: tuple[int, int]) -> Tensor:
     """Return pixels (..., 2) of an image as sampling positions, in the same memory if there is no graph."""
-    if may_look(seen) and is_plain(seen):
+    if may_look(seen) and are_plain(seen):
         for plane, side in zip(seen.unbind(-1), size[::-1], strict=True):
             plane.mul_(2 / side).add_(1 / side - 1)
         seen.clamp_(-_FAR, _FAR)
@@ -269,7 +265,7 @@ def on_lattice(
     if min(n, m) < FEWEST or not native_available():
         return None
     native = _native(source, target, rotation, like)
-    if native is None and not is_eager(like):
+    if native is None and not are_free(like):
         return None
     nodes, size = (n + 5) * (m + 5), source._size_for("Warp")
     pixels = kept_probes(rows, width, like.dtype) if nodes <= MOST_KEPT else _probes(rows, width, like)

@@ -10,13 +10,13 @@ from torch.nn.functional import max_pool2d, pad
 
 from camtorch.cameras.camera import Camera
 from camtorch.evaluate.kept import Memo
-from camtorch.evaluate.known import known_true
+from camtorch.evaluate.known import are_plain, known_true
 from camtorch.poses.extrinsics import Extrinsics
 from camtorch.poses.rotations import rotation_matrix
 from camtorch.rays.depth import as_depth, depth_scale
 from camtorch.values.arguments import Numbers, as_number, check_devices
 from camtorch.values.module import GeometryModule, typed_as
-from camtorch.warp.grid import Sampling, is_plain, to_positions
+from camtorch.warp.grid import Sampling, to_positions
 from camtorch.warp.panorama import off_poles, seam_of
 from camtorch.warp.proxy import beside, check_pose, turned
 from camtorch.warp.sampling import MODES, PADDINGS, Fill, Mode, PaddingMode, as_fill, one_of, render
@@ -127,7 +127,7 @@ class Reproject(GeometryModule):
             valid = valid & self._shows(seen, far, source_depth, kind, as_number(tolerance, "tolerance", owner), owner)
         rows, steps = seen.shape[0], seen.shape[1]
         # an image that stays where it is, or is shifted by whole pixels, is copied to the bit
-        plain = steps == 1 and is_plain(seen) and known_true((seen == seen.round()).all(-1) | ~valid)
+        plain = steps == 1 and are_plain(seen) and known_true((seen == seen.round()).all(-1) | ~valid)
         mode: Mode = "nearest" if plain else self.mode
         if (seam := seam_of(self.source)) is not None:  # the image goes on beyond its edges
             images, seen = seam.around(images), seen + seen.new_tensor(seam.rims[::2])

@@ -13,7 +13,6 @@ from camtorch.evaluate.door import (
     in_graph,
     in_jit_trace,
     in_transform,
-    is_concrete,
     is_exporting,
     is_for_here,
     keeps_graph,
@@ -21,6 +20,7 @@ from camtorch.evaluate.door import (
 )
 from camtorch.evaluate.export import is_constant, with_values
 from camtorch.evaluate.kept import Memo
+from camtorch.evaluate.known import is_unknown
 from camtorch.native.sampler import Later, empty
 from camtorch.warp import compiled
 from camtorch.warp.grid import Lattice, Sampling, scaled
@@ -45,7 +45,7 @@ def route_of(warp: CameraPair, images: Tensor | None = None) -> Route:
         warp: the warp that is called.
         images: to be warped; None where positions alone are asked for.
     """
-    learns = warp._pinned is None and torch.is_grad_enabled() and keeps_graph(*warp._inputs())
+    learns = warp._pinned is None and keeps_graph(*warp._inputs())
     if images is not None:
         learns = learns and images.dtype.is_floating_point
         if not learns and _is_operator(warp) and compiled.takes(images, warp._inputs()):
@@ -165,7 +165,7 @@ def pinned(warp: CameraPair) -> Sampling | Lattice | None:
         return None
     if in_transform() or torch.is_inference_mode_enabled():
         return None
-    if torch.is_grad_enabled() and keeps_graph(*warp._inputs()):
+    if keeps_graph(*warp._inputs()):
         return positions(warp, "graph")
     return positions(warp, "kept") if is_exporting() else _computed(warp, warp.padding_mode)
 
@@ -188,7 +188,7 @@ def _is_long(warp: CameraPair) -> bool:
         return False
     if math.prod((*warp.batch_shape, *warp.target._size_for("Warp"))) <= _MOST_KEPT:
         return False
-    return not in_transform() and all(t.is_cpu and is_concrete(t) for t in warp._inputs())
+    return all(t.is_cpu and not is_unknown(t) for t in warp._inputs())
 
 
 def _constant(warp: CameraPair, padding: PaddingMode) -> Sampling | None:

@@ -12,12 +12,13 @@ import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
 from torch import Tensor
 
 from camtorch.evaluate.door import converted, in_transform, is_concrete, is_eager, may_look
+from camtorch.evaluate.known import are_plain
 from camtorch.native import sampler
 from camtorch.native.library import native_available
 from camtorch.values.arguments import as_flag, as_number, shown
 from camtorch.values.dtypes import SIGNED, as_pixels, narrow, wide_dtype, widen
 from camtorch.values.threads import thread_count
-from camtorch.warp.grid import Lattice, Sampling, is_plain
+from camtorch.warp.grid import Lattice, Sampling
 
 Mode = Literal["nearest", "bilinear", "bicubic"]
 PaddingMode = Literal["zeros", "border", "reflection"]
@@ -115,7 +116,7 @@ def _natively(
 def _by_torch(images: Tensor, where: Sampling | Lattice, how: Sampler, kept: dict[int, Pyramid] | None) -> Tensor:
     """What `grid_sample` makes of B images."""
     count, dtype = images.shape[0], images.dtype
-    plain = is_plain(images)
+    plain = are_plain(images)
     wide, finite = dtype == wide_dtype(dtype), not dtype.is_floating_point
     if isinstance(where, Lattice):
         where = where.pixels
@@ -134,7 +135,7 @@ def _by_torch(images: Tensor, where: Sampling | Lattice, how: Sampler, kept: dic
         picked = pixels.gather(2, index.expand(*images.shape[:2], -1)).view(images.dtype)
         return torch.where(seen.unsqueeze(1), picked.unflatten(2, where.grid.shape[1:3]), value)
     where = where._replace(grid=converted(where.grid, wide_dtype(dtype)))
-    plain = plain and is_plain(where.grid)
+    plain = plain and are_plain(where.grid)
     large = plain and not wide and math.prod(images.shape[1:]) > _LARGE
     # the same for all strips of an image, however many cores are free: the pyramids that they keep are of these parts
     step = count if wide or not plain else 1 if large else thread_count()
@@ -267,7 +268,7 @@ def sample(images: Tensor, grid: Tensor, mode: Mode, padding_mode: PaddingMode, 
         grid = grid.expand(images.shape[0], -1, -1, -1)
     if torch.compiler.is_compiling():  # which knows no jvp of one's own, nor needs it
         return F.grid_sample(images, grid, mode, padding_mode, align_corners=False)
-    if is_plain(images, grid):
+    if are_plain(images, grid):
         return _sample(images, grid, mode, padding_mode, finite)
     result: Tensor = _Sample.apply(images, grid, mode, padding_mode)  # type: ignore[no-untyped-call]
     return result
