@@ -18,8 +18,8 @@ from camtorch.augment.filling import enough, filled, scaled
 from camtorch.augment.sample import Named, Sample, SampleOptions, SampleTransform, Unknown, fixed_copy, on_samples
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.mixed import Mixed
-from camtorch.evaluate.door import is_concrete, may_look
-from camtorch.evaluate.known import are_numbers, known_false, known_true
+from camtorch.evaluate.door import may_look
+from camtorch.evaluate.known import are_known, are_numbers, known_false, known_true
 from camtorch.values.arguments import GUESS_CAMERA, as_flag, as_mapping, as_number, as_part, as_whole, shown, warn
 from camtorch.values.module import typed_as
 from camtorch.warp.warp import Warp
@@ -447,7 +447,7 @@ class Augmentation(SampleTransform):
         if self.min_filled is not None or self._warned or self.p == 0:
             return
         camera = camera[0] if camera.is_mixed else camera
-        if not is_concrete(camera.intrinsics):
+        if not are_known(camera.intrinsics):
             return
         self._warned = True
         values, _ = draw(self.ranges, _TRIES, 1.0, False, torch.Generator().manual_seed(0))

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
-from torch.utils.data import get_worker_info
 
 from camtorch.augment.sending import stacked, within_message
+from camtorch.evaluate.known import in_worker
 from camtorch.evaluate.private import collate as collate_by
 from camtorch.evaluate.private import collate_functions
 from camtorch.values.arguments import is_list
@@ -43,7 +43,7 @@ def collate(samples: Sequence[object]) -> object:
 
 
 def _tensors(batch: Sequence[Tensor], *, collate_fn_map: Any = None) -> Tensor | list[Tensor]:
-    if get_worker_info() is not None:  # which no graph can leave
+    if in_worker():  # which no graph can leave
         batch = [tensor.detach() for tensor in batch]
     if len({tensor.shape for tensor in batch}) > 1:
         return list(batch)

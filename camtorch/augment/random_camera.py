@@ -23,9 +23,8 @@ from camtorch.augment.sample import Named, fixed_copy
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.numbers import joined, split
 from camtorch.cameras.opaque import CameraNumbers, opaque
-from camtorch.evaluate.door import in_graph
 from camtorch.evaluate.kept import Memo
-from camtorch.evaluate.known import are_free, are_numbers, known_false
+from camtorch.evaluate.known import are_free, are_numbers, known_false, with_derivatives_of
 from camtorch.lenses.drawing import FOLD, covering, drawn
 from camtorch.models import MODELS, KannalaBrandt
 from camtorch.optics.radial_inverse import precise
@@ -339,8 +338,7 @@ class RandomCamera(Augmentation):
             usual = self._usual(base, size) if "fov" in values else joined(before, distortion, xp).detach()
             amounts = torch.as_tensor(values["distortion"], dtype=dtype, device=device)
             distortion = jittered(drawn_to, amounts, usual)
-            if in_graph(base.distortion):
-                distortion = base.distortion + (distortion - base.distortion.detach())
+            distortion = with_derivatives_of(base.distortion, distortion)
         if "crop" in values:  # a part of the image, enlarged to the full size
             share, (right, down) = values["crop"], _pairs(values["place"])
             left, top = (1 - share) * right * width, (1 - share) * down * height

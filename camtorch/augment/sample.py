@@ -15,14 +15,13 @@ from typing import Any, ClassVar, ParamSpec, TypedDict, TypeVar, cast, get_args,
 import numpy as np
 import torch
 from torch import Tensor, nn
-from torch.utils.data import get_worker_info
 from typing_extensions import Unpack
 
 from camtorch.augment.change import Change, Part, View, alone, as_one
 from camtorch.augment.clips import Clips
 from camtorch.augment.landmarks import Mirroring, exchanged
 from camtorch.cameras.camera import Camera
-from camtorch.evaluate.known import are_numbers, known_false, known_true
+from camtorch.evaluate.known import are_numbers, in_worker, known_false, known_true
 from camtorch.evaluate.private import pytree
 from camtorch.models import Pinhole
 from camtorch.poses.rotations import are_rotations, check_rotation, rotation_matrix, rotation_vector
@@ -344,7 +343,7 @@ def on_samples(method: Callable[P, R]) -> Callable[P, R]:
     @on_one_thread
     @functools.wraps(method)
     def wrapped(*args: P.args, **kwargs: P.kwargs) -> Any:
-        if torch.compiler.is_compiling() or get_worker_info() is None:
+        if not in_worker():
             return method(*args, **kwargs)
         with torch.no_grad():
             return detached(method(*args, **kwargs))

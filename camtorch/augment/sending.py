@@ -20,8 +20,8 @@ import torch
 from torch import Tensor, nn
 from torch.multiprocessing import get_sharing_strategy
 from torch.multiprocessing.reductions import reduce_tensor
-from torch.utils.data import get_worker_info
 
+from camtorch.evaluate.known import in_worker
 from camtorch.evaluate.private import NO_TORCH_FUNCTION
 from camtorch.native.memory import LIMIT, tensor_on
 
@@ -71,7 +71,7 @@ _forks = 0
 
 def within_message(value: Any) -> Any:
     """What a worker sends, as it is elsewhere; if it is a small tensor, or something else that has some, by value."""
-    if get_worker_info() is None:
+    if not in_worker():
         return value
     if _is_plain(value):
         return value.as_subclass(_Sent)
@@ -94,7 +94,7 @@ def _by_value(module: nn.Module) -> tuple[Callable[[bytes], Any], tuple[bytes]]:
 def stacked(batch: Sequence[Tensor]) -> Tensor | None:
     """A batch of tensors of one shape, ready to be sent; None where no worker asks, and where torch's own way does."""
     first = batch[0]
-    if get_worker_info() is None or any(t.dtype != first.dtype or not _is_plain(t) for t in batch):
+    if not in_worker() or any(t.dtype != first.dtype or not _is_plain(t) for t in batch):
         return None
     like = torch.empty(len(batch), *first.shape, dtype=first.dtype, device="meta")
     if like.nbytes < _SMALL:

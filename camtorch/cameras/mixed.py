@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn, cast
 import torch
 from torch import Tensor, nn
 from torch.nn.utils.parametrize import type_before_parametrizations
-from torch.utils.data import get_worker_info
 from typing_extensions import Self
 
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.numbers import as_numbers_of
 from camtorch.evaluate.kept import Memo
+from camtorch.evaluate.known import in_worker
 from camtorch.evaluate.private import collate_functions
 from camtorch.projection.evaluation import kept_cameras, per_row
 from camtorch.projection.evaluation import rows_of as camera_rows
@@ -409,7 +409,7 @@ def _joined(tensors: Sequence[Tensor], group: _Group) -> Tensor:
 
 def collate_cameras(batch: Sequence[Camera], *, collate_fn_map: Any = None) -> Camera | list[Camera]:
     """Return single cameras as one batch, of several models if need be; others as a list."""
-    if get_worker_info() is not None:  # which no graph can leave
+    if in_worker():  # which no graph can leave
         batch = [camera.detach() for camera in batch]
     return list(batch) if any(camera.batch_shape for camera in batch) else cat(batch)
 

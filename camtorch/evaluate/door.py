@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from types import NoneType
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.autograd import forward_ad
 from torch.utils._python_dispatch import _disable_current_modes
 
@@ -89,6 +89,24 @@ def keeps_graph(*tensors: Tensor) -> bool:
     return not (is_exporting() and torch.onnx.is_in_onnx_export())
 
 
+def is_constant(module: nn.Module) -> bool:
+    """Whether a module is exported whose tensors are its own, not given, and do not learn: their values are known."""
+    if not is_exporting() or torch.compiler.is_dynamo_compiling():
+        return False
+    for part in module.modules():
+        own = part.__dict__.get("_own", {})
+        for name, tensor in (*part._parameters.items(), *part._buffers.items()):
+            known = own.get(name)
+            if tensor is None or tensor is known:
+                continue
+            if known is None or not is_fake(tensor) or is_fake(known) or keeps_graph(tensor):
+                return False
+            mode: Any = getattr(tensor, "fake_mode", None)
+            if mode.from_tensor(known, static_shapes=True) is not tensor:
+                return False
+    return True
+
+
 @contextmanager
 def set_aside() -> Iterator[None]:
     """Nothing is traced in here: what is made of values becomes a constant of the graph that is being recorded."""
@@ -104,6 +122,19 @@ def set_aside() -> Iterator[None]:
             torch._C._set_tracing_state(recording)  # type: ignore[attr-defined]
             for name, flag in flags.items():
                 setattr(torch.compiler, name, flag)
+
+
+def outside_inference() -> AbstractContextManager[None]:
+    """Have tensors made in here serve a graph later, as those of inference mode could not; without a graph as yet."""
+    if torch.compiler.is_compiling() or not torch.is_inference_mode_enabled():
+        return nullcontext()
+    return _outside_inference()
+
+
+@contextmanager
+def _outside_inference() -> Iterator[None]:
+    with torch.inference_mode(False), torch.no_grad():
+        yield
 
 
 def converted(tensor: Tensor, dtype: torch.dtype) -> Tensor:

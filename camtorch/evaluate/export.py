@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from functools import reduce
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from camtorch.evaluate.door import is_exporting, is_fake, keeps_graph, set_aside
+from camtorch.evaluate.door import keeps_graph, set_aside
 from camtorch.evaluate.private import while_loop
 
 _recording = False
@@ -153,22 +153,9 @@ def atan2(y: Tensor, x: Tensor) -> Tensor:
     return nearly + (rest - rest * rest * rest / 3)
 
 
-def is_constant(module: nn.Module) -> bool:
-    """Whether a module is exported whose tensors are its own, not given, and do not learn: their values are known."""
-    if not is_exporting() or torch.compiler.is_dynamo_compiling():
-        return False
-    for part in module.modules():
-        own = part.__dict__.get("_own", {})
-        for name, tensor in (*part._parameters.items(), *part._buffers.items()):
-            known = own.get(name)
-            if tensor is None or tensor is known:
-                continue
-            if known is None or not is_fake(tensor) or is_fake(known) or keeps_graph(tensor):
-                return False
-            mode: Any = getattr(tensor, "fake_mode", None)
-            if mode.from_tensor(known, static_shapes=True) is not tensor:
-                return False
-    return True
+def as_constant() -> AbstractContextManager[None]:
+    """Have what is made in here be a constant, if a camera is recorded without operators of our own."""
+    return set_aside() if is_portable_export() else nullcontext()
 
 
 @contextmanager

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from contextlib import nullcontext
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from camtorch.evaluate.door import has_tangent, in_graph, in_transform, is_concrete, is_eager
+from camtorch.evaluate.door import has_tangent, in_graph, in_transform, is_concrete, is_eager, outside_inference
 
 
 class Memo:
@@ -50,7 +49,7 @@ class Memo:
         """`compute()`, which is the result from now on."""
         if in_transform():  # what a transform makes dies with it
             return compute()
-        with torch.inference_mode(False) if torch.is_inference_mode_enabled() else nullcontext():
+        with outside_inference():
             self.result = result = compute()
         return result
 

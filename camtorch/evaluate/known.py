@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor, nn
+from torch.utils.data import get_worker_info
 
-from camtorch.evaluate.door import in_graph, in_transform, is_concrete, is_eager, keeps_graph, may_look
+from camtorch.evaluate.door import in_graph, in_transform, is_concrete, is_eager, is_recorded, keeps_graph, may_look
 
 
 def known_false(condition: Tensor) -> bool:
@@ -26,6 +27,21 @@ def is_unknown(tensor: Tensor) -> bool:
 def are_plain(*tensors: Tensor) -> bool:
     """Return whether tensors are the CPU's, and neither a graph nor a transform is at work."""
     return not in_transform() and all(t.is_cpu and not in_graph(t) for t in tensors)
+
+
+def are_known(*tensors: Tensor) -> bool:
+    """Return whether the values of all tensors may be looked at."""
+    return all(map(is_concrete, tensors))
+
+
+def may_write(tensor: Tensor) -> bool:
+    """Return whether values may be replaced where they are: nothing has recorded them."""
+    return not is_unknown(tensor) and not is_recorded()
+
+
+def with_derivatives_of(source: Tensor, value: Tensor) -> Tensor:
+    """Return a value whose derivatives are those of the tensor that it was made from, if that is in a graph."""
+    return source + (value - source.detach()) if in_graph(source) else value
 
 
 def values_of(tensor: Tensor) -> Tensor | None:
@@ -64,3 +80,8 @@ def row_of(value: Tensor) -> list[float] | None:
 def is_predicted(value: Tensor) -> bool:
     """Whether a network may have made these rows of a batch, of which some may be bad: a graph, or nothing records."""
     return value.ndim > 1 and not isinstance(value, nn.Parameter) and (in_graph(value) or not torch.is_grad_enabled())
+
+
+def in_worker() -> bool:
+    """Return whether this process is a worker of a DataLoader: no graph can leave it."""
+    return not torch.compiler.is_compiling() and get_worker_info() is not None

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from contextlib import nullcontext
 from typing import ClassVar
 
 import torch
 from torch import Tensor
 
-from camtorch.evaluate.door import set_aside
-from camtorch.evaluate.export import is_portable_export, times
+from camtorch.evaluate.export import as_constant, is_portable_export, times
 from camtorch.optics.charts import Chart, Equidistant, Planes3, even_steps_and_ratios
 from camtorch.optics.radial import RadialFactor
 from camtorch.optics.radial_inverse import RadialInverse
@@ -44,7 +42,7 @@ class Inverted(Chart):
         if torch.compiler.is_compiling() and not is_portable_export():
             return RadialInverse(self.factor, self.parameters, FURTHEST)
         if self._known is None:
-            with set_aside() if is_portable_export() else nullcontext():  # a constant of an exported program
+            with as_constant():
                 self._known = RadialInverse(self.factor, self.parameters, FURTHEST)
         return self._known
 

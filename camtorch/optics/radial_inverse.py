@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from camtorch.evaluate.door import is_concrete
 from camtorch.evaluate.export import as_index, is_portable_export, of_points, repeat, times
 from camtorch.evaluate.kept import Memo
+from camtorch.evaluate.known import are_known
 from camtorch.optics.charts import even_steps_and_ratios
 from camtorch.values.arguments import columns
 from camtorch.values.registry import CLASSES
@@ -327,7 +327,7 @@ _radial_inverse = torch.library.custom_op("camtorch::radial_inverse", _found_inv
 
 def _inverse_of(name: str, k: Tensor, end: float, r2: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     # by the operator in graphs and transforms alone: its first call imports torch's compiler, which takes seconds
-    of = _found_inverse if is_concrete(k) and is_concrete(r2) else _radial_inverse
+    of = _found_inverse if are_known(k, r2) else _radial_inverse
     found: tuple[Tensor, Tensor, Tensor] = of(name, k, end, r2)
     return found
 

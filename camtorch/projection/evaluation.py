@@ -12,8 +12,8 @@ from torch import Tensor, nn
 from torch.autograd import Function
 from torch.nn.utils import parametrize
 
-from camtorch.evaluate.door import is_exporting, is_native, way_of
-from camtorch.evaluate.export import is_constant, portable_export, with_values
+from camtorch.evaluate.door import is_constant, is_native, way_of
+from camtorch.evaluate.export import portable_export, with_values
 from camtorch.evaluate.kept import Memo
 from camtorch.evaluate.known import are_free
 from camtorch.projection.camera_like import CameraLike
@@ -59,7 +59,7 @@ def evaluated(
     else the formula, recorded by torch. lead: the batch dims that C counts. cameras_of: what is kept of the tensors,
     if others than this camera are meant.
     """
-    if is_exporting() and cameras_of is None and is_constant(camera) and all(isinstance(side, int) for side in lead):
+    if cameras_of is None and is_constant(camera) and all(isinstance(side, int) for side in lead):
         with with_values(camera):
             intrinsics, distortion = (per_row(t, lead, rows) for t in camera._tensors)
             cameras = rows_of(camera, intrinsics, distortion).with_all_tables()

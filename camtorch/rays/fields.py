@@ -83,7 +83,7 @@ def over_image(
         grid = camera.pixel_grid(stride)
         return function(grid.expand(*camera.batch_shape, *grid.shape))
 
-    if torch.compiler.is_compiling():  # nothing is kept then, and a comparison would bound sizes that are left open
+    if is_unknown(camera.intrinsics):  # nothing is kept then, and a comparison would bound sizes that are left open
         return compute()
     step = max(as_whole(stride, "stride", "pixel_grid"), 1)
     if math.prod((*camera.batch_shape, *camera._size_for("pixel_grid"))) // step**2 > _MOST_KEPT:

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from torch.nn.utils.parametrize import type_before_parametrizations
 from typing_extensions import Self
 
+from camtorch.evaluate.door import outside_inference
 from camtorch.evaluate.kept import Memo
 from camtorch.evaluate.known import is_kept
 from camtorch.values.arguments import LEFT, shown
@@ -232,10 +233,7 @@ class BatchedModule(GeometryModule):
         As of a tensor, gradients of the copy go to this one where it learns; the copy of a fixed one is fixed.
         `copy.deepcopy` makes Parameters that learn by themselves.
         """
-        if torch.compiler.is_compiling() or not torch.is_inference_mode_enabled():
-            return self.each(torch.clone)
-        # what inference mode makes could not be used in a graph later
-        with torch.inference_mode(False), torch.no_grad():
+        with outside_inference():
             return self.each(torch.clone)
 
     def expand(self, *batch: int | Sequence[int]) -> Self:

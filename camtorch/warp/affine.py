@@ -13,8 +13,8 @@ from torch import Tensor
 
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.opaque import opaque
-from camtorch.evaluate.door import in_transform, is_concrete, keeps_graph
-from camtorch.evaluate.known import are_plain, is_unknown
+from camtorch.evaluate.door import in_transform, keeps_graph
+from camtorch.evaluate.known import are_known, are_plain, is_unknown
 from camtorch.native.sampler import empty
 from camtorch.values.arguments import Numbers, as_values, broadcast_shapes
 from camtorch.values.dtypes import SIGNED, as_pixels, narrow, widen
@@ -97,7 +97,7 @@ class MirrorWarp(Warp):
 
     def _ways(self, sampler: Sampler, smooth: bool, route: Route) -> list[Way] | None:
         """Return the ways of the rows, or one for all; None for that of any `Warp`."""
-        if not (self._decides and smooth and route == "kept" and is_concrete(self.target.intrinsics)):
+        if not (self._decides and smooth and route == "kept" and are_known(self.target.intrinsics)):
             return None
         if self._halvings is None:
             self._halvings = _halvings(positions(self, "kept", sampler.padding_mode), self._sampled)
@@ -169,7 +169,7 @@ class AffineWarp(MirrorWarp):
         self.register_buffer("matrix", own.to(source.intrinsics.device), persistent=False)
         self.batch_shape: torch.Size = broadcast_shapes(self.batch_shape, own.shape[:-2])
         # numbers choose the way, the same on every device: a draw's are on the CPU, and no device is waited for
-        self._numbers: list[Rows] = own.reshape(-1, 2, 3).tolist() if own is matrix and is_concrete(own) else []
+        self._numbers: list[Rows] = own.reshape(-1, 2, 3).tolist() if own is matrix and are_known(own) else []
         if not isinstance(matrix, Tensor):
             self._numbers = [matrix]
 

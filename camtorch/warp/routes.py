@@ -13,12 +13,13 @@ from camtorch.evaluate.door import (
     in_graph,
     in_jit_trace,
     in_transform,
+    is_constant,
     is_exporting,
     is_for_here,
     keeps_graph,
     set_aside,
 )
-from camtorch.evaluate.export import is_constant, with_values
+from camtorch.evaluate.export import with_values
 from camtorch.evaluate.kept import Memo
 from camtorch.evaluate.known import is_unknown
 from camtorch.native.sampler import Later, empty

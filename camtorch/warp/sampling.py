@@ -11,8 +11,8 @@ import torch
 import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
 from torch import Tensor
 
-from camtorch.evaluate.door import converted, in_transform, is_concrete, is_eager, may_look
-from camtorch.evaluate.known import are_plain
+from camtorch.evaluate.door import converted, in_transform, is_eager, may_look
+from camtorch.evaluate.known import are_known, are_plain
 from camtorch.native import sampler
 from camtorch.native.library import native_available
 from camtorch.values.arguments import as_flag, as_number, shown
@@ -423,7 +423,7 @@ class _Sample(torch.autograd.Function):
 
     @staticmethod
     def forward(images: Tensor, grid: Tensor, mode: Mode, padding_mode: PaddingMode) -> Tensor:
-        if images.is_cpu and is_concrete(images) and is_concrete(grid):
+        if images.is_cpu and are_known(images, grid):
             return _sample(images, grid, mode, padding_mode)
         return F.grid_sample(images, grid, mode, padding_mode, align_corners=False)
 
