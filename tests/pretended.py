@@ -51,6 +51,9 @@ class Pretended(torch.Tensor):
     def __torch_dispatch__(cls, operator, types, arguments=(), options=None):
         return run(operator, arguments, options or {})
 
+    def untyped_storage(self):
+        return self.on_host.untyped_storage()
+
     def tolist(self):
         COUNTS["syncs"] += 1
         return self.on_host.tolist()

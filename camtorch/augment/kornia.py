@@ -29,7 +29,7 @@ from camtorch.augment.containers import KIND, InContainers, Params, camera_of, k
 from camtorch.augment.presets import PresetName
 from camtorch.augment.sample import detached, fixed_copy, on_samples
 from camtorch.cameras.camera import Camera
-from camtorch.evaluate.kept import Memo
+from camtorch.evaluate.kept import Kept
 from camtorch.evaluate.known import known_false
 from camtorch.values.arguments import as_part
 from camtorch.values.dtypes import narrow, widen
@@ -104,7 +104,7 @@ class CameraAugmentation(InContainers, GeometricAugmentationBase2D):
         self.keypoints_valid: Tensor | None = None
         """(B, N) bool: which of the keypoints that were moved last lie on their image."""
         # lists of masks come row by row between other labels of the batch
-        self._memos = Memo(), Memo()
+        self._memos = Kept(), Kept()
 
     # -- parameters
 

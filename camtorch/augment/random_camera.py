@@ -23,7 +23,7 @@ from camtorch.augment.sample import Named, fixed_copy
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.numbers import joined, split
 from camtorch.cameras.opaque import CameraNumbers, opaque
-from camtorch.evaluate.kept import Memo
+from camtorch.evaluate.kept import Kept
 from camtorch.evaluate.known import are_free, are_numbers, known_false, with_derivatives_of
 from camtorch.lenses.drawing import FOLD, covering, drawn
 from camtorch.models import MODELS, KannalaBrandt
@@ -147,7 +147,7 @@ class RandomCamera(Augmentation):
     ):
         super().__init__(**options)
         self.fov = "source" if isinstance(fov, str) and fov == "source" else None
-        self._memo = Memo()
+        self._memo = Kept()
         self.image_size: tuple[int, int] | None = as_image_size(image_size, self._name)
         self._is_real = isinstance(like, str) and like == _REAL
         self.like = None if self._is_real else _as_like(like, self._name)

@@ -27,7 +27,7 @@ from camtorch.cameras.numbers import (
     warn_of_exchange,
 )
 from camtorch.convert.result import Conversion
-from camtorch.evaluate.kept import Memo
+from camtorch.evaluate.kept import Kept
 from camtorch.evaluate.known import is_predicted
 from camtorch.poses.extrinsics import Extrinsics
 from camtorch.projection.evaluation import evaluated, mapped
@@ -174,7 +174,7 @@ class Camera(Freezable):
         super().__init__(
             distortion_names=names,
             image_size=size,
-            **{name: Memo() for name in self.memo_names},
+            **{name: Kept() for name in self.memo_names},
             _warned=is_predicted(intrinsics) or is_predicted(distortion),
         )
         self.hold("intrinsics", intrinsics, (*batch, 4))

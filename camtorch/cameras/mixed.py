@@ -16,7 +16,7 @@ from typing_extensions import Self
 
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.numbers import as_numbers_of
-from camtorch.evaluate.kept import Memo
+from camtorch.evaluate.kept import Kept
 from camtorch.evaluate.known import in_worker
 from camtorch.evaluate.private import collate_functions
 from camtorch.projection.evaluation import kept_cameras, per_row
@@ -36,7 +36,7 @@ class _Group(NamedTuple):
     counts: tuple[int | None, ...]  # how many cameras each of them is; None for a single one
     taken: tuple[int, ...] | None  # which rows of those, one after the other; None for all of them in their order
     rows: tuple[int, ...]  # the place of each in the batch, ascending
-    memo: Memo
+    memo: Kept
 
 
 class Mixed(Camera):
@@ -73,7 +73,7 @@ class Mixed(Camera):
         self.cameras = nn.ModuleList(members)
         self.image_size: tuple[int, int] | None = members[0].image_size
         self._places = tuple(given if order is None else [given[i] for i in _as_order(order, len(given))])
-        self._rays, self._fields = Memo(), Memo()
+        self._rays, self._fields = Kept(), Kept()
         kinds: dict[tuple[object, ...], list[int]] = {}
         for row, (i, _) in enumerate(self._places):
             kinds.setdefault(kind(members[i]), []).append(row)
@@ -87,7 +87,7 @@ class Mixed(Camera):
         whole = index == tuple(range(sum(_count(members[i]) for i in used)))
         model: type[Camera] = type_before_parametrizations(members[used[0]])
         counts = tuple(len(members[i]) if members[i].batch_shape else None for i in used)
-        return _Group(model, used, counts, None if whole else index, tuple(rows), Memo())
+        return _Group(model, used, counts, None if whole else index, tuple(rows), Kept())
 
     @classmethod
     def of_groups(cls, groups: Sequence[tuple[Sequence[int], Camera]]) -> Self:

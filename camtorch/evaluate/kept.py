@@ -11,16 +11,17 @@ from torch import Tensor
 from camtorch.evaluate.door import has_tangent, in_graph, in_transform, is_concrete, is_eager, outside_inference
 
 
-class Memo:
-    """The last results of a computation, by the values of its inputs.
+class Kept:
+    """The last results of a computation, by its inputs: by their values on the CPU, by their memory elsewhere.
 
-    Values are compared, not versions: a change through `.data`, or by functional_call, leaves no other trace.
-    Nothing is kept while the values may not be looked at. Copies and pickles begin empty.
+    On the CPU values are compared, not versions: a change through `.data`, or by functional_call, leaves no other
+    trace. On another device a comparison would wait for it; there such a change is not seen. Nothing is kept while the
+    values may not be looked at. Copies and pickles begin empty.
     """
 
     capacity: int = 1
     result: Any = None  # the one that was asked for last, of whatever inputs
-    _kept: Sequence[tuple[tuple[Any, ...], list[Tensor], Any]] = ()  # the last one used is first
+    _kept: Sequence[tuple[tuple[Any, ...], list[Note], Any]] = ()  # the last one used is first
 
     def __init__(self, capacity: int = 1) -> None:
         if capacity != 1:
@@ -40,9 +41,9 @@ class Memo:
         if in_transform():  # what a transform makes dies with it
             return compute()
         with torch.inference_mode(False), torch.no_grad():  # what that makes could not be used in a graph later
-            copies = [t.clone() for t in inputs]
+            notes = [note(t) for t in inputs]
             result = compute()
-        self._kept, self.result = [(options, copies, result), *self._kept[: self.capacity - 1]], result
+        self._kept, self.result = [(options, notes, result), *self._kept[: self.capacity - 1]], result
         return result
 
     def renew(self, compute: Callable[[], Any]) -> Any:
@@ -65,6 +66,29 @@ class Memo:
         return {"capacity": self.capacity}
 
 
-def same(a: Tensor, b: Tensor) -> bool:
-    """Whether shape, dtype, device and all values agree."""
-    return a.dtype == b.dtype and a.device == b.device and torch.equal(a, b)  # of other shapes it says no
+Mark = tuple[Any, ...]
+Note = tuple[Tensor, Mark | None]
+"""What tells whether a tensor is as it was: its values and None, or the tensor, whose memory stays, and its mark."""
+
+
+def note(tensor: Tensor) -> Note:
+    """Return what `same` compares with."""
+    if tensor.is_cpu or tensor.is_inference():  # which has no version
+        return tensor.detach().clone(), None
+    return tensor.detach(), _mark(tensor)
+
+
+def same(tensor: Tensor, noted: Note) -> bool:
+    """Return whether shape, dtype, device and all values are as they were noted."""
+    then, mark = noted
+    if tensor.dtype != then.dtype or tensor.device != then.device:
+        return False
+    if mark is None or tensor.is_inference():
+        return torch.equal(tensor, then)  # of other shapes it says no
+    return mark == _mark(tensor)
+
+
+def _mark(tensor: Tensor) -> Mark:
+    # dims of one tell nothing: a camera's numbers come as (n,) and as (1, n)
+    steps = [pair for pair in zip(tensor.shape, tensor.stride(), strict=True) if pair[0] != 1]
+    return tensor.untyped_storage().data_ptr(), tensor.storage_offset(), tensor._version, steps

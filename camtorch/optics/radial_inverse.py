@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from camtorch.evaluate.export import as_index, is_portable_export, of_points, repeat, times
-from camtorch.evaluate.kept import Memo
+from camtorch.evaluate.kept import Kept
 from camtorch.evaluate.known import are_known
 from camtorch.optics.charts import even_steps_and_ratios
 from camtorch.values.arguments import columns
@@ -291,7 +291,7 @@ class RadialInverse:
         return found.view_as(r2)
 
 
-_tables = Memo(8)
+_tables = Kept(8)
 
 
 def _made_tables(name: str, k: Tensor, end: float) -> tuple[Tensor, Tensor]:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from torch import Tensor
 
-from camtorch.evaluate.kept import Memo
+from camtorch.evaluate.kept import Kept
 from camtorch.optics.model_spec import ModelSpec
 from camtorch.values.arguments import Numbers
 from camtorch.values.module import BatchedModule
@@ -18,9 +18,9 @@ class CameraLike(ModelSpec, BatchedModule):
     is_mixed: ClassVar[bool] = False
     """Whether it is a batch of several models, which have no coefficients in common; see `Mixed`."""
     image_size: tuple[int, int] | None
-    _memo: Memo
-    _rays: Memo
-    _fields: Memo
+    _memo: Kept
+    _rays: Kept
+    _fields: Kept
     _warned: bool
 
     if TYPE_CHECKING:

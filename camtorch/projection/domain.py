@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from camtorch.evaluate.export import of_points, plus
-from camtorch.evaluate.kept import Memo
+from camtorch.evaluate.kept import Kept
 from camtorch.optics.radial_inverse import RADII, InverseTable, first_loss, fold_of, precise, tabulate, within
 from camtorch.projection.fold import AZIMUTHS, Extent, azimuth, limits_and_extent
 from camtorch.values.arguments import columns
@@ -225,7 +225,7 @@ def regular(lens: Lens, a: Tensor, b: Tensor, to_edge: bool = True) -> Tensor:
     return plus(torch.nan_to_num(least, nan=-1.0), -(torch.finfo(a.dtype).tiny ** 0.25))
 
 
-_domains = Memo(24)  # of a batch of eight models before, while and after it changes
+_domains = Kept(24)  # of a batch of eight models before, while and after it changes
 
 
 def domain_of(model: str, k: Tensor, optics: Optics) -> Domain:

@@ -14,7 +14,7 @@ from torch.nn.utils import parametrize
 
 from camtorch.evaluate.door import is_constant, is_native, way_of
 from camtorch.evaluate.export import portable_export, with_values
-from camtorch.evaluate.kept import Memo
+from camtorch.evaluate.kept import Kept, same
 from camtorch.evaluate.known import are_free
 from camtorch.projection.camera_like import CameraLike
 from camtorch.projection.rows import Cameras, Direction, unusable
@@ -153,7 +153,8 @@ class _Native(Function):
 def rows_of(camera: CameraLike, intrinsics: Tensor, distortion: Tensor) -> Cameras:
     """The rows' cameras, kept until a value changes."""
     cameras = kept_cameras(camera._memo, type(camera), intrinsics, distortion)
-    if cameras.usable is not None and not camera._warned:
+    # on another device a look would wait for it
+    if cameras.usable is not None and cameras.usable.is_cpu and not camera._warned:
         # say once that learning drove Parameters of this module to where no camera is, and no gradient leads back
         bad = (cameras.usable <= 0).flatten().nonzero()
         found = unusable(camera, *(t[bad[0, 0]] for t in cameras.given)) if len(bad) else None
@@ -170,12 +171,17 @@ def rows_of(camera: CameraLike, intrinsics: Tensor, distortion: Tensor) -> Camer
     return cameras
 
 
-def kept_cameras(memo: Memo, model: type[CameraLike], intrinsics: Tensor, distortion: Tensor) -> Cameras:
+def kept_cameras(memo: Kept, model: type[CameraLike], intrinsics: Tensor, distortion: Tensor) -> Cameras:
     """The cameras (C,) of one model, kept in a memo until a value changes."""
     cameras: Cameras | None = memo.result
     if cameras is not None:
-        given = cameras.given if intrinsics.ndim == 2 else cameras.alone
-        for now, then in ((intrinsics, given[0]), (distortion, given[1])):
+        for now, (then, mark) in zip((intrinsics, distortion), cameras.notes, strict=True):
+            if mark is not None:
+                if not same(now, (then, mark)):
+                    break
+                continue
+            if now.ndim != then.ndim and now.numel() == then.numel():  # numbers of one camera
+                then = then[None] if now.ndim > then.ndim else then[0]
             if now.dtype != then.dtype or now.device != then.device or not torch.equal(now, then):
                 break
         else:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import torch
 from torch import Tensor
 
+from camtorch.evaluate.kept import Note, note
 from camtorch.evaluate.known import known_true
 from camtorch.projection import compiled
 from camtorch.projection.camera_like import CameraLike
@@ -37,14 +38,16 @@ class Cameras:
     given: tuple[Tensor, Tensor]
     intrinsics: Tensor
     k: Tensor
-    alone: tuple[Tensor, Tensor]
-    """`given`, as it was given: without a dim of cameras where there was none."""
+    notes: tuple[Note, Note]
+    """Of the tensors that were given."""
     usable: Tensor | None
 
     def __init__(self, model: type[CameraLike], intrinsics: Tensor, distortion: Tensor):
         """Of concrete values (C, 4), (C, n); or (4,), (n,) of one."""
         self._model, self._learns = model, distortion.requires_grad
-        self.alone = values = intrinsics.detach().clone(), distortion.detach().clone()
+        self.notes = note(intrinsics), note(distortion)
+        first, second = (then if mark is None else then.clone() for then, mark in self.notes)
+        values = first, second
         if intrinsics.ndim == 1:
             values = values[0][None], values[1][None]
         self.given, self.usable = values, None

@@ -25,7 +25,7 @@ from camtorch.values.arguments import (
 )
 
 if TYPE_CHECKING:
-    from camtorch.evaluate.kept import Memo
+    from camtorch.evaluate.kept import Kept
 
 _MOST_KEPT = 1 << 19  # rays, of 6 MB in float32: what every camera of a large data set may keep
 _STRAIGHT = 1e-24  # the squared sine of the angle to the vertical up to which a ray goes straight up or down
@@ -69,7 +69,7 @@ def patch_centres(size: tuple[int, int], stride: int, like: Tensor, owner: str) 
 
 def over_image(
     camera: CameraLike,
-    memo: Memo,
+    memo: Kept,
     inputs: Sequence[Tensor],
     stride: int,
     function: Callable[[Tensor], tuple[Tensor, ...]],

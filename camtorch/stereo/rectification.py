@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torch.nn.functional import normalize
 
 from camtorch.cameras.camera import Camera
-from camtorch.evaluate.kept import Memo
+from camtorch.evaluate.kept import Kept
 from camtorch.evaluate.known import known_false
 from camtorch.models import Cylindrical, Equirectangular, LatLon, Pinhole, TransverseCylindrical
 from camtorch.native.sampler import Later, finish
@@ -82,7 +82,7 @@ class Rectification(GeometryModule):
         self.camera_right = camera
         self.vertical = vertical
         self.projection, self.align = projection, align
-        self._axis, self._memo = int(vertical), Memo()
+        self._axis, self._memo = int(vertical), Kept()
 
     @property
     def rotation_left(self) -> Tensor:

@@ -12,7 +12,7 @@ from torch.nn.utils.parametrize import type_before_parametrizations
 from typing_extensions import Self
 
 from camtorch.evaluate.door import outside_inference
-from camtorch.evaluate.kept import Memo
+from camtorch.evaluate.kept import Kept
 from camtorch.evaluate.known import is_kept
 from camtorch.values.arguments import LEFT, shown
 
@@ -281,7 +281,7 @@ def remade(module: Made, **changes: Any) -> Made:
     state.update(module.__dict__, _is_full_backward_hook=None, **changes)
     state.update(_containers())
     for name in module.memo_names:
-        state[name] = Memo()
+        state[name] = Kept()
     for name, tensor in tensors.items():
         if tensor.shape[-1]:
             tensor = fixed(tensor)

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.opaque import CameraNumbers, opaque
-from camtorch.evaluate.kept import Memo
+from camtorch.evaluate.kept import Kept
 from camtorch.native.sampler import layout
 from camtorch.values.arguments import broadcast_shapes
 from camtorch.warp.grid import Lattice, Sampling, locate, tabulate
@@ -100,7 +100,7 @@ def warp_shapes(
     return (laid(result, options[-1]),)
 
 
-_located = Memo(2)  # masks are warped after their images, and cameras may be still
+_located = Kept(2)  # masks are warped after their images, and cameras may be still
 
 
 @opaque(warp_shapes)

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from typing_extensions import Self
 
 from camtorch.cameras.camera import Camera
-from camtorch.evaluate.kept import Memo
+from camtorch.evaluate.kept import Kept
 from camtorch.values.arguments import Numbers, broadcast_shapes
 from camtorch.values.module import GeometryModule
 from camtorch.warp.grid import Lattice, Sampling, locate
@@ -38,8 +38,8 @@ class CameraPair(GeometryModule):
     batch_shape: torch.Size
     padding_mode: PaddingMode
     _tolerance: float | None
-    _memos: dict[PaddingMode, Memo]
-    _constants: Memo
+    _memos: dict[PaddingMode, Kept]
+    _constants: Kept
     _pinned: Sampling | Lattice | None
     source: Camera = _part("_modules", "source")
     target: Camera = _part("_modules", "target")
@@ -59,7 +59,7 @@ class CameraPair(GeometryModule):
             _tolerance=options["tolerance"],
             _memos={},
             _pinned=None,
-            _constants=Memo(),
+            _constants=Kept(),
         )
         seam_of(source)  # while its values may be looked at: traced code asks for it too
 

@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d, pad
 
 from camtorch.cameras.camera import Camera
-from camtorch.evaluate.kept import Memo
+from camtorch.evaluate.kept import Kept
 from camtorch.evaluate.known import are_plain, known_true
 from camtorch.poses.extrinsics import Extrinsics
 from camtorch.poses.rotations import rotation_matrix
@@ -72,7 +72,7 @@ class Reproject(GeometryModule):
         self.mode = one_of(mode, MODES, "mode", owner)
         self.padding_mode = one_of(padding_mode, PADDINGS, "padding_mode", owner)
         self.fill = as_fill(fill, owner)
-        self._memo = Memo()
+        self._memo = Kept()
         seam_of(source)  # while its values may be looked at: traced code asks for it too
 
     def forward(

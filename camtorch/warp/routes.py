@@ -20,7 +20,7 @@ from camtorch.evaluate.door import (
     set_aside,
 )
 from camtorch.evaluate.export import with_values
-from camtorch.evaluate.kept import Memo
+from camtorch.evaluate.kept import Kept
 from camtorch.evaluate.known import is_unknown
 from camtorch.native.sampler import Later, empty
 from camtorch.warp import compiled
@@ -96,7 +96,7 @@ def positions(warp: CameraPair, route: Route, padding: PaddingMode = "zeros") ->
 
     (source, target), tolerance = warp._ends, warp.tolerance
     options = source._form, target._form, warp.rotation is None, warp.antialias, tolerance
-    memo = warp._memos.setdefault(reach if tolerance else "zeros", Memo())  # what is exact serves all
+    memo = warp._memos.setdefault(reach if tolerance else "zeros", Kept())  # what is exact serves all
     kept: Sampling | Lattice = memo(warp._inputs(), options, lambda: _computed(warp, reach))
     return kept
 
