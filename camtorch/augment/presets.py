@@ -7,7 +7,8 @@ from typing import Literal
 
 import torch
 
-from camtorch.cameras.camera import Camera, fixed_camera
+from camtorch.cameras.camera import Camera
+from camtorch.cameras.opaque import fixed_camera
 from camtorch.models import MODELS
 
 

@@ -17,7 +17,8 @@ from torch import Tensor
 from torch.nn.utils.parametrize import type_before_parametrizations
 
 from camtorch.calibration import compiled as compiled_poses
-from camtorch.cameras.camera import Camera, fixed_camera
+from camtorch.cameras.camera import Camera
+from camtorch.cameras.opaque import fixed_camera
 from camtorch.convert.fitting import bounds
 from camtorch.least_squares.equations import Equations, System, padded, triangle_of_few
 from camtorch.least_squares.jacobians import sensor_jacobians

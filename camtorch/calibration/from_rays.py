@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 
 from camtorch.calibration.calibrate import Model, as_model
-from camtorch.cameras.camera import Camera, fixed_camera
+from camtorch.cameras.camera import Camera
+from camtorch.cameras.opaque import fixed_camera
 from camtorch.convert import fitting, views
 from camtorch.convert.result import Conversion
 from camtorch.models import UCM

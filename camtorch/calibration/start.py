@@ -11,7 +11,8 @@ from torch import Tensor
 
 from camtorch.calibration.bundle import SETTLED, Adjusted, Free, Poses, Sight, State, adjust, minima
 from camtorch.calibration.rays import poses_from_rays
-from camtorch.cameras.camera import Camera, fixed_camera
+from camtorch.cameras.camera import Camera
+from camtorch.cameras.opaque import fixed_camera
 from camtorch.convert import fitting, views
 from camtorch.models import UCM, KannalaBrandt
 from camtorch.rays.lattices import angles_from_axis

@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 
 from camtorch.calibration.bundle import Adjusted, pixel_jacobians, robust
-from camtorch.cameras.camera import Camera, fixed_camera
+from camtorch.cameras.camera import Camera
+from camtorch.cameras.opaque import fixed_camera
 from camtorch.least_squares.equations import Equations
 from camtorch.poses.rotations import skew_matrix
 from camtorch.values.arguments import Numbers, as_values

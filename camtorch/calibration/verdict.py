@@ -15,7 +15,8 @@ from torch import Tensor
 from camtorch.calibration.bundle import Adjusted, Sight, pixel_jacobians
 from camtorch.calibration.observations import Observations, named
 from camtorch.calibration.uncertainty import Spread, uncertainty, worst
-from camtorch.cameras.camera import Camera, fixed_camera
+from camtorch.cameras.camera import Camera
+from camtorch.cameras.opaque import fixed_camera
 from camtorch.poses.extrinsics import Extrinsics
 from camtorch.rays.lattices import angles_from_axis, image_edges, image_lattice
 

@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-import difflib
-import functools
 import importlib
-import inspect
 import os
-from collections.abc import Iterator, Mapping, MutableMapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, cast
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn.utils import parametrize
 from typing_extensions import Self, TypeVar
 
-from camtorch.cameras.editing import check_crop, edited_by, quarter_turns
+from camtorch.cameras.catalogue import Catalogue
+from camtorch.cameras.editing import Editable
 from camtorch.cameras.freezing import PREFIX, Freezable, with_frozen
 from camtorch.cameras.numbers import (
     at_a_glance,
@@ -24,67 +22,26 @@ from camtorch.cameras.numbers import (
     described,
     numbers_of_matrix,
     replaced,
-    warn_of_exchange,
 )
 from camtorch.convert.result import Conversion
 from camtorch.evaluate.kept import Kept
 from camtorch.evaluate.known import is_predicted
+from camtorch.optics.model_spec import ModelSpec
 from camtorch.poses.extrinsics import Extrinsics
+from camtorch.projection.camera_like import CameraLike
 from camtorch.projection.evaluation import evaluated, mapped
 from camtorch.projection.project import PROJECT
 from camtorch.projection.unproject import UNPROJECT
 from camtorch.rays.fields import local_pinhole, on_image, over_image, patch_centres, perspective_field, plucker
 from camtorch.rays.lattices import field_of_view
-from camtorch.values.arguments import LEFT, Numbers, as_image_size, as_whole, broadcast_shapes, hinting, shown
-from camtorch.values.module import remade, typed_as
-from camtorch.values.registry import register
+from camtorch.values.arguments import Numbers, broadcast_shapes, hinting
+from camtorch.values.module import GeometryModule, typed_as
 
 Model = TypeVar("Model", bound="Camera", default="Camera")
 
 
-class _Models(MutableMapping[str, "type[Camera]"]):
-    """The classes that are defined, and the files of others, each of which is imported when its key is looked up."""
-
-    def __init__(self) -> None:
-        self.classes: dict[str, type[Camera]] = {}
-        self.files: dict[str, str] = {}
-
-    def __getitem__(self, key: str) -> type[Camera]:
-        if key not in self.classes and key in self.files:
-            importlib.import_module(self.files[key])
-        return self.classes[key]
-
-    def __setitem__(self, key: str, model: type[Camera]) -> None:
-        self.classes[key] = model
-
-    def __delitem__(self, key: str) -> None:
-        del self.classes[key]
-        self.files.pop(key, None)
-
-    def __iter__(self) -> Iterator[str]:
-        return iter({**self.files, **self.classes})
-
-    def __len__(self) -> int:
-        return len({**self.files, **self.classes})
-
-    def __repr__(self) -> str:
-        return f"MODELS({', '.join(self)})"
-
-
-MODELS = _Models()
+MODELS: Catalogue[type[Camera]] = Catalogue()
 """Every camera model by its key; defining a model adds it."""
-
-_ELSEWHERE = {
-    "opencv": "brown_conrady",
-    "plumb_bob": "brown_conrady",
-    "radtan": "brown_conrady",
-    "fisheye": "kannala_brandt",
-    "opencv_fisheye": "kannala_brandt",
-    "equidistant": "kannala_brandt",
-    "omnidir": "mei",
-}
-"""What OpenCV, ROS, Kalibr and COLMAP call some of them."""
-
 
 _NO_BATCH = torch.Size()
 
@@ -115,7 +72,7 @@ def _held(name: str, doc: str) -> Any:
     return property(tensor, doc=doc)
 
 
-class Camera(Freezable):
+class Camera(Freezable, Editable):
     """A learnable camera: `pixel = focal * lens(chart(ray)) + principal_point`.
 
     A model states its `key`, its `distortion_names` and its `optics`; all else is done here.
@@ -155,7 +112,7 @@ class Camera(Freezable):
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
         if cls.__module__ != parametrize.__name__:  # the class of one parametrized camera is no model of its own
-            _add_model(cls)
+            MODELS.add(cls)
 
     @hinting(
         "Numbers go in as lists, the size by name: ct.Pinhole([fx, fy, cx, cy], image_size=(height, width)), "
@@ -533,57 +490,6 @@ class Camera(Freezable):
     # -- the camera of an edited image. It has no Parameters of its own while the original learns: its intrinsics are
     # made from the original's, and that is where gradients go. From a frozen camera, or under no_grad, it is a copy.
 
-    def crop(self, top: int, left: int, height: int, width: int) -> Self:
-        """The camera of the part of the image whose top-left pixel is (left, top); it may reach outside.
-
-        Raises:
-            ValueError: a part without any pixel of the image.
-        """
-        top, left = (as_whole(v, name, "crop") for v, name in ((top, "top"), (left, "left")))
-        as_image_size((height, width), f"{type(self).__name__}.crop")
-        check_crop(self, (top, left), (height, width))
-        return edited_by(self, ((1, 0, -left), (0, 1, -top)), (height, width))
-
-    def pad(self, left: int, right: int, top: int, bottom: int) -> Self:
-        """The camera of the image with that many more pixels on each side."""
-        height, width = self._size_for("pad")
-        sides = ((left, "left"), (right, "right"), (top, "top"), (bottom, "bottom"))
-        left, right, top, bottom = (as_whole(value, name, "pad") for value, name in sides)
-        return edited_by(self, ((1, 0, left), (0, 1, top)), (height + top + bottom, width + left + right))
-
-    @hinting("It takes camera.resize(height, width), two numbers")
-    def resize(self, height: int, width: int) -> Self:
-        """The camera of the image scaled to that size; pixel edges scale, as with align_corners=False.
-
-        It warns where the new size is like the old one with height and width exchanged.
-        """
-        old_height, old_width = self._size_for("resize")
-        as_image_size((height, width), f"{type(self).__name__}.resize")
-        warn_of_exchange((old_height, old_width), (height, width), f"{type(self).__name__}.resize")
-        across, down = width / old_width, height / old_height
-        return edited_by(self, ((across, 0, (across - 1) / 2), (0, down, (down - 1) / 2)), (height, width))
-
-    def hflip(self) -> Self:
-        """The camera that sees the scene mirrored left to right: its image is this one's, flipped."""
-        height, width = self._size_for("hflip")
-        return edited_by(self, ((-1, 0, width - 1), (0, 1, 0)), (height, width))
-
-    def vflip(self) -> Self:
-        """The camera that sees the scene mirrored top to bottom: its image is this one's, flipped."""
-        height, width = self._size_for("vflip")
-        return edited_by(self, ((1, 0, 0), (0, -1, height - 1)), (height, width))
-
-    def rot90(self, k: int = 1) -> Self:
-        """The camera that leans on its side: its image is this one's, turned counterclockwise k times, as torch.rot90.
-
-        It sees points turned likewise: `camera.rot90().project((y, -x, z))` is the turned pixel (v, W - 1 - u).
-
-        Raises:
-            ValueError: a quarter turn of a model that is not the same on its side, such as a cylinder's.
-        """
-        size, turns = self._size_for("rot90"), as_whole(k, "k", "rot90") % 4
-        return edited_by(self, quarter_turns(size)[turns], size[::-1] if turns % 2 else size)
-
     def convert(
         self,
         model: type[Model] | str,
@@ -634,6 +540,13 @@ class Camera(Freezable):
             **options,
         )
 
+    def __dir__(self) -> list[str]:
+        """Return what users call: not what a model states, nor what modules are made of."""
+        inside = {*vars(ModelSpec), *vars(CameraLike), *dir(GeometryModule), "each", "memo_names", "tensor_names"}
+        inside -= {"distortion_names", "is_mixed", *dir(nn.Module)}
+        names: list[str] = super().__dir__()  # type: ignore[no-untyped-call]
+        return [n for n in names if n not in inside and (n[:1] != "_" or n[:2] == "__")]
+
     def _repr_html_(self) -> str:
         from camtorch.cameras.notebook import as_html  # which notebooks alone need
 
@@ -644,46 +557,9 @@ class Camera(Freezable):
         return described(self)
 
 
-def _add_model(model: type[Camera]) -> None:
-    """Check what a new model states, and let `MODELS` know it."""
-    for name in ("optics", "defined"):
-        stated = inspect.getattr_static(model, name)
-        if not isinstance(stated, staticmethod):
-            raise TypeError(
-                f"{model.__name__}: {name} must be a @staticmethod of the coefficients k alone; got a "
-                f"{type(stated).__name__}"
-            )
-    model._model = register(model)
-    model.always_defined = model.defined is Camera.defined
-    if "key" not in model.__dict__:
-        model.key = ""
-        return
-    known = MODELS.get(model.key)
-    # a class that is defined again, in a notebook, takes its own place
-    if known is not None and (known.__module__, known.__qualname__) != (model.__module__, model.__qualname__):
-        owner = f"{known.__module__}.{known.__qualname__}"
-        raise ValueError(f"{model.__name__}: the key {model.key!r} is that of {owner}; choose another")
-    MODELS[model.key] = model
-
-
 def as_model(model: type[Camera] | str, owner: str) -> type[Camera]:
     """Return a camera model, or the one of that key in `MODELS`."""
-    if isinstance(model, str):
-        key, *texts = model.split(":")
-        if texts and key in MODELS:
-            return functools.reduce(lambda kind, text: kind.variant(text), texts, MODELS[key])
-        if model not in MODELS:
-            keys = {name.lower(): key for key, cls in MODELS.items() for name in (key, cls.__name__)} | _ELSEWHERE
-            close = difflib.get_close_matches(model.lower(), keys, 1)
-            meant = f"did you mean {keys[close[0]]!r}? Known" if close else "known"
-            keys_text = ", ".join(sorted(MODELS))
-            raise ValueError(f"{owner}: there is no camera model {model!r}; {meant} are {keys_text}. {LEFT}")
-        return MODELS[model]
-    if isinstance(model, type) and model.__module__ == parametrize.__name__:  # of one parametrized camera
-        model = model.__bases__[0]
-    if not (isinstance(model, type) and issubclass(model, Camera) and model.optics is not Camera.optics):
-        raise TypeError(f"{owner}: model must be a camera model, or its key in ct.MODELS; got {shown(model)}")
-    return model
+    return MODELS.found(model, owner)
 
 
 def __getattr__(name: str) -> type[Camera]:
@@ -691,18 +567,3 @@ def __getattr__(name: str) -> type[Camera]:
     if ":" not in name:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return as_model(name, __name__)
-
-
-def fixed_camera(
-    model: type[Camera], intrinsics: Tensor, distortion: Tensor, image_size: Sequence[int] | None = None
-) -> Camera:
-    """Return the camera of unchecked numbers (*B, 4) and (*B, n), without a graph; bad ones give invalid results."""
-    size = None if image_size is None else (image_size[0], image_size[1])
-    template = _ideal_camera(model, distortion.shape[-1])  # type: ignore[arg-type]  # a class can be hashed
-    return remade(template, intrinsics=intrinsics.detach(), distortion=distortion.detach(), image_size=size)
-
-
-@functools.lru_cache(maxsize=32)
-def _ideal_camera(model: type[Camera], count: int) -> Camera:
-    with torch.inference_mode(False):
-        return model(torch.ones(4), *[torch.tensor(model.ideal(n)) for n in (count,) if n])

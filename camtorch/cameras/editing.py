@@ -8,12 +8,13 @@ from typing import Any, TypeVar, cast
 import numpy as np
 import torch
 from torch import Tensor
+from typing_extensions import Self
 
-from camtorch.cameras.numbers import joined, split
+from camtorch.cameras.numbers import joined, split, warn_of_exchange
 from camtorch.evaluate.known import are_numbers, known_false, known_true
 from camtorch.optics.radial_inverse import precise
 from camtorch.projection.camera_like import CameraLike
-from camtorch.values.arguments import as_image_size
+from camtorch.values.arguments import as_image_size, as_whole, hinting
 from camtorch.values.module import learning_as, remade
 
 CameraT = TypeVar("CameraT", bound=CameraLike)
@@ -111,3 +112,62 @@ def _renamed(k: Tensor, names: Sequence[str], turned: Mapping[str, str]) -> Tens
     source = [turned.get(name, name) for name in names]
     index = [places[name.removeprefix("-")] for name in source]
     return k[..., index] * k.new_tensor([-1.0 if name.startswith("-") else 1.0 for name in source])
+
+
+class Editable(CameraLike):
+    """The camera of an edited image.
+
+    It has no Parameters of its own while the original learns: its intrinsics are made from the original's, and that is
+    where gradients go. From a frozen camera, or under `no_grad`, it is a copy.
+    """
+
+    def crop(self, top: int, left: int, height: int, width: int) -> Self:
+        """The camera of the part of the image whose top-left pixel is (left, top); it may reach outside.
+
+        Raises:
+            ValueError: a part without any pixel of the image.
+        """
+        top, left = (as_whole(v, name, "crop") for v, name in ((top, "top"), (left, "left")))
+        as_image_size((height, width), f"{type(self).__name__}.crop")
+        check_crop(self, (top, left), (height, width))
+        return edited_by(self, ((1, 0, -left), (0, 1, -top)), (height, width))
+
+    def pad(self, left: int, right: int, top: int, bottom: int) -> Self:
+        """The camera of the image with that many more pixels on each side."""
+        height, width = self._size_for("pad")
+        sides = ((left, "left"), (right, "right"), (top, "top"), (bottom, "bottom"))
+        left, right, top, bottom = (as_whole(value, name, "pad") for value, name in sides)
+        return edited_by(self, ((1, 0, left), (0, 1, top)), (height + top + bottom, width + left + right))
+
+    @hinting("It takes camera.resize(height, width), two numbers")
+    def resize(self, height: int, width: int) -> Self:
+        """The camera of the image scaled to that size; pixel edges scale, as with align_corners=False.
+
+        It warns where the new size is like the old one with height and width exchanged.
+        """
+        old_height, old_width = self._size_for("resize")
+        as_image_size((height, width), f"{type(self).__name__}.resize")
+        warn_of_exchange((old_height, old_width), (height, width), f"{type(self).__name__}.resize")
+        across, down = width / old_width, height / old_height
+        return edited_by(self, ((across, 0, (across - 1) / 2), (0, down, (down - 1) / 2)), (height, width))
+
+    def hflip(self) -> Self:
+        """The camera that sees the scene mirrored left to right: its image is this one's, flipped."""
+        height, width = self._size_for("hflip")
+        return edited_by(self, ((-1, 0, width - 1), (0, 1, 0)), (height, width))
+
+    def vflip(self) -> Self:
+        """The camera that sees the scene mirrored top to bottom: its image is this one's, flipped."""
+        height, width = self._size_for("vflip")
+        return edited_by(self, ((1, 0, 0), (0, -1, height - 1)), (height, width))
+
+    def rot90(self, k: int = 1) -> Self:
+        """The camera that leans on its side: its image is this one's, turned counterclockwise k times, as torch.rot90.
+
+        It sees points turned likewise: `camera.rot90().project((y, -x, z))` is the turned pixel (v, W - 1 - u).
+
+        Raises:
+            ValueError: a quarter turn of a model that is not the same on its side, such as a cylinder's.
+        """
+        size, turns = self._size_for("rot90"), as_whole(k, "k", "rot90") % 4
+        return edited_by(self, quarter_turns(size)[turns], size[::-1] if turns % 2 else size)

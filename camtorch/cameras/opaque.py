@@ -2,18 +2,34 @@
 
 from __future__ import annotations
 
+import functools
 import importlib
 from collections.abc import Callable, Sequence
-from functools import wraps
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from camtorch.cameras.camera import Camera, fixed_camera
-from camtorch.values.registry import CLASSES
+from camtorch.cameras.camera import Camera
+from camtorch.evaluate.recorded import CLASSES
+from camtorch.values.module import remade
 
 Function = Callable[..., tuple[Tensor, ...]]
+
+
+def fixed_camera(
+    model: type[Camera], intrinsics: Tensor, distortion: Tensor, image_size: Sequence[int] | None = None
+) -> Camera:
+    """Return the camera of unchecked numbers (*B, 4) and (*B, n), without a graph; bad ones give invalid results."""
+    size = None if image_size is None else (image_size[0], image_size[1])
+    template = _ideal_camera(model, distortion.shape[-1])  # type: ignore[arg-type]  # a class can be hashed
+    return remade(template, intrinsics=intrinsics.detach(), distortion=distortion.detach(), image_size=size)
+
+
+@functools.lru_cache(maxsize=32)
+def _ideal_camera(model: type[Camera], count: int) -> Camera:
+    with torch.inference_mode(False):
+        return model(torch.ones(4), *[torch.tensor(model.ideal(n)) for n in (count,) if n])
 
 
 class CameraNumbers(NamedTuple):
@@ -40,7 +56,7 @@ def opaque(shapes: Function) -> Callable[[Function], Function]:
         name = f"{function.__module__}.{function.__qualname__}"
         _FUNCTIONS[name] = function, shapes
 
-        @wraps(function)
+        @functools.wraps(function)
         def call(*arguments: Any) -> tuple[Tensor, ...]:
             if not torch.compiler.is_compiling():
                 return function(*arguments)

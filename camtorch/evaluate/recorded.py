@@ -1,7 +1,8 @@
-"""What torch records of the formula, in the form that its compilers make least of: planes, masks, kept values."""
+"""What torch records of the formula, as its compilers do best: planes, masks, kept values, classes by their names."""
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Callable
 from typing import Any, TypeVar
 
@@ -92,3 +93,28 @@ def without_keeping(function: Callable[..., Result], *inputs: Tensor) -> Result:
         result: Result = checkpoint(function, *inputs, use_reentrant=False, preserve_rng_state=False)
         return result
     return function(*inputs)
+
+
+class _Classes(dict[str, Any]):
+    def __missing__(self, name: str) -> Any:
+        importlib.import_module(name.rpartition(".")[0])  # a saved program is loaded before what it is made of
+        if name not in self:
+            raise KeyError(name)
+        return self[name]
+
+
+CLASSES = _Classes()
+"""Every class of cameras and of radial factors."""
+
+
+def register(entry: type) -> str:
+    """The name under which a class is known from now on.
+
+    A class of the same name, made by a function that was called again, gets a name of its own.
+    """
+    wanted = name = f"{entry.__module__}.{entry.__qualname__}"
+    count = 2
+    while name in CLASSES:
+        name, count = f"{wanted}#{count}", count + 1
+    CLASSES[name] = entry
+    return name

@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 
 from camtorch.evaluate.export import pick, piece_of, plus, solve_tridiagonal, unbound
+from camtorch.evaluate.recorded import register
 from camtorch.optics.derivatives import derivatives_of
 from camtorch.optics.special import angle_per_radius, first_root, root
-from camtorch.values.registry import register
 
 
 class RadialFactor:

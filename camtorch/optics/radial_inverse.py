@@ -12,9 +12,9 @@ from torch import Tensor
 from camtorch.evaluate.export import as_index, is_portable_export, of_points, repeat, times
 from camtorch.evaluate.kept import Kept
 from camtorch.evaluate.known import are_known
+from camtorch.evaluate.recorded import CLASSES
 from camtorch.optics.charts import even_steps_and_ratios
 from camtorch.values.arguments import columns
-from camtorch.values.registry import CLASSES
 
 if TYPE_CHECKING:
     from camtorch.optics.radial import RadialFactor

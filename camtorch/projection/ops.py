@@ -10,12 +10,12 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 
+from camtorch.evaluate.recorded import CLASSES
 from camtorch.optics.radial_inverse import TABLE_WIDTH
 from camtorch.projection.domain import Domain, domain_of
 from camtorch.projection.fold import AZIMUTHS
 from camtorch.projection.solve import search
 from camtorch.values.arguments import columns
-from camtorch.values.registry import CLASSES
 
 Result = TypeVar("Result")
 
