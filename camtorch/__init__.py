@@ -3,6 +3,7 @@
 import importlib
 import importlib.util
 import sys
+import threading
 from typing import TYPE_CHECKING, Any
 
 from camtorch._public import PLACES
@@ -15,23 +16,25 @@ __version__ = "0.4.0.dev0"
 __all__ = sorted(PLACES)
 
 # What is public needs torch, which takes a second to import; `camtorch --help` does not. So names come at first use.
-
+_REGISTERED = f"{__name__}.cameras"  # has torch know operators of saved programs, and batches of cameras
+_LOCK = threading.RLock()  # a package and its files, imported by two threads at once, could be seen half made
 
 if not TYPE_CHECKING:  # a checker knows the names, and no others
 
     def __getattr__(name: str) -> Any:
         place = PLACES.get(name)
-        if place is not None:
-            _register()
-        if place is not None and place != __name__:
-            module = importlib.import_module(place)
-            found = getattr(module, name, None) or importlib.import_module(f"{place}.{name}")
-        elif not name.startswith("_") and importlib.util.find_spec(f"{__name__}.{name}"):
-            found = importlib.import_module(f"{__name__}.{name}")
-        else:
-            from camtorch.values.arguments import LEFT
+        with _LOCK:
+            if place is not None:
+                importlib.import_module(_REGISTERED)
+            if place is not None and place != __name__:
+                module = importlib.import_module(place)
+                found = getattr(module, name, None) or importlib.import_module(f"{place}.{name}")
+            elif not name.startswith("_") and importlib.util.find_spec(f"{__name__}.{name}"):
+                found = importlib.import_module(f"{__name__}.{name}")
+            else:
+                from camtorch.values.arguments import LEFT
 
-            raise AttributeError(f"module {__name__!r} has no attribute {name!r}. {LEFT}")
+                raise AttributeError(f"module {__name__!r} has no attribute {name!r}. {LEFT}")
         globals()[name] = found
         return found
 
@@ -41,11 +44,5 @@ def __dir__() -> list[str]:
     return [*__all__, *(name for name in globals() if name.startswith("__"))]
 
 
-def _register() -> None:
-    """Have torch know camtorch's operators, which `torch.export.load` may read, and batches of cameras."""
-    for file in ("opaque", "mixed"):
-        importlib.import_module(f"{__name__}.cameras.{file}")
-
-
-if "torch" in sys.modules:
-    _register()
+if "torch" in sys.modules:  # what `torch.export.load` reads may have camtorch's operators
+    importlib.import_module(_REGISTERED)

@@ -61,11 +61,19 @@ camera.rays()
 ct.Dewarp(camera.requires_grad_(False))(torch.rand(1, 3, 480, 640))
 print("sympy" in sys.modules)
 """: "False",
+    """
+import sys, camtorch as ct
+from concurrent.futures import ThreadPoolExecutor
+sys.setswitchinterval(1e-5)
+orders = [ct.__all__[i:] + ct.__all__[:i] for i in range(0, 64, 4)]
+with ThreadPoolExecutor(16) as pool:
+    print(len(list(pool.map(lambda names: [getattr(ct, name) for name in names], orders))))
+""": "16",
 }
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("code", FIRST_USES, ids=["names", "compiled", "no sympy"])
+@pytest.mark.parametrize("code", FIRST_USES, ids=["names", "compiled", "no sympy", "threads"])
 def test_what_is_used_first_may_be_anything(code):
     assert python(code).strip() == FIRST_USES[code]
 
@@ -73,8 +81,13 @@ def test_what_is_used_first_may_be_anything(code):
 @pytest.mark.slow
 def test_a_pickled_camera_needs_no_import(tmp_path):
     (tmp_path / "camera.pickle").write_bytes(pickle.dumps(ct.Pinhole([1.0, 2.0, 3.0, 4.0])))
-    code = "import pickle, sys\nprint(pickle.load(open(sys.argv[1], 'rb')))"
-    assert python(code, str(tmp_path / "camera.pickle")) == "Pinhole(fx=1, fy=2, cx=3, cy=4)\n"
+    code = """
+import pickle, sys
+camera = pickle.load(open(sys.argv[1], "rb"))
+from torch.utils.data import default_collate
+print(camera, *default_collate([camera, camera]).batch_shape)
+"""
+    assert python(code, str(tmp_path / "camera.pickle")) == "Pinhole(fx=1, fy=2, cx=3, cy=4) 2\n"
 
 
 @pytest.mark.slow
