@@ -206,31 +206,6 @@ def test_replay_is_bit_identical(name, tmp_path):
     assert torch.equal(alone["gaze"], first["gaze"])
 
 
-def test_draws_come_from_the_generator():
-    augmentation = RandomCamera("webcam", p=0.5)
-    draws = [augmentation.draw(4, torch.Generator().manual_seed(seed)) for seed in (0, 0, 1)]
-    assert all(torch.equal(a, b) for a, b in zip(draws[0].values(), draws[1].values(), strict=True))
-    assert not all(torch.equal(a, b) for a, b in zip(draws[0].values(), draws[2].values(), strict=True))
-    torch.manual_seed(7)
-    global_draw = augmentation.draw(4)
-    torch.manual_seed(7)
-    assert torch.equal(global_draw["yaw"], augmentation.draw(4)["yaw"])
-    for name, interval in augmentation.ranges.items():
-        values = augmentation.draw(200)[name]
-        assert interval.low <= values.min()
-        assert values.max() <= interval.high
-
-
-def test_same_on_batch():
-    augmentation = RandomCamera("dms90", same_on_batch=True)
-    batch = sample(3)
-    batch = {k: v[:1].expand_as(v) if isinstance(v, torch.Tensor) and k != "label" else v for k, v in batch.items()}
-    out = augmentation(batch)
-    assert out["camera"].batch_shape == (3,)
-    for name in ("image", "mask", "keypoints", "rotation", "boxes"):
-        assert torch.equal(out[name][:1].expand_as(out[name]), out[name])
-
-
 @pytest.mark.parametrize("name", ["mount", "family"])
 def test_skipped_samples_stay_bit_identical(name):
     augmentation, batch = AUGMENTATIONS[name](p=0.5), sample(8)
@@ -248,23 +223,6 @@ def test_skipped_samples_stay_bit_identical(name):
         assert [c.key for c in out["camera"]] == ["kannala_brandt" if a else "pinhole" for a in draw["apply"]]
     else:
         assert torch.equal(out["camera"].intrinsics[skipped][0], batch["camera"].intrinsics)
-
-
-def test_lists_hold_as_many_labels_as_each_sample_has():
-    batch = sample(3)
-    batch["keypoints"] = [torch.rand(n, 2) * 50 for n in (3, 0, 5)]
-    batch["boxes"] = [torch.tensor([[5.0, 5, 30, 30]]).repeat(n, 1) for n in (0, 2, 1)]
-    batch["mask_parts"] = [torch.ones(n, 60, 80) for n in (1, 3, 2)]
-    augmentation = RandomCamera("dms60")
-    draw = augmentation.draw(3)
-    out = augmentation(batch, draw=draw)
-    assert [len(k) for k in out["keypoints"]] == [3, 0, 5] == [len(k) for k in out["keypoints_valid"]]
-    assert [len(b) for b in out["boxes"]] == [0, 2, 1]
-    assert [m.shape for m in out["mask_parts"]] == [(1, 60, 80), (3, 60, 80), (2, 60, 80)]
-    one = augmentation(
-        keypoints=batch["keypoints"][2], camera=batch["camera"], draw={k: v[2:] for k, v in draw.items()}
-    )
-    torch.testing.assert_close(one["keypoints"], out["keypoints"][2], atol=1e-3, rtol=0)
 
 
 def test_chains_carry_camera_rotation_and_validity_on():
@@ -397,18 +355,6 @@ def test_empty_batches():
         out = make({**sample(), "keypoints": torch.zeros(3, 0, 2), "boxes": torch.zeros(3, 0, 4)})
         assert out["keypoints"].shape == (3, 0, 2)
         assert out["boxes_valid"].shape == (3, 0)
-
-
-@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float64, torch.uint8])
-def test_dtypes_stay(dtype):
-    batch = sample()
-    batch["image"] = (batch["image"] * 200).to(dtype)
-    batch["keypoints"] = batch["keypoints"].to(dtype)
-    out = RandomCamera("dms130", vignetting=0.3)(batch)
-    assert out["image"].dtype == dtype
-    assert out["keypoints"].dtype == (dtype if dtype.is_floating_point else torch.float32)
-    assert out["mask"].dtype == torch.int64
-    assert set(out["mask"].unique().tolist()) <= set(range(5))
 
 
 def test_gradients_reach_images_labels_and_a_learning_camera():

@@ -85,6 +85,10 @@ def test_lenses(camera):
         ({"image": torch.zeros(2, 3, 20, 40)}, r"image is \(20, 40\) \(height, width\), but the image_size of camera"),
         ({"mask": torch.zeros(2, 20, 40)}, r"mask is \(20, 40\) \(height, width\)"),
         ({"image": torch.zeros(2, 3, *SIZE), "keypoints": torch.zeros(3, 5, 2)}, "keypoints is of 3 samples, other"),
+        (
+            {"keypoints": torch.zeros(2, 5, 2), "keypoints_valid": torch.ones(2)},
+            r"keypoints_valid must be \(2, 5\); got \[\(2,\)\]",
+        ),
         ({"keypoints": torch.zeros(2, 5, 2, dtype=torch.complex64)}, "keypoints must be a tensor of real numbers"),
         ({"keypoints": 5}, "keypoints must be a tensor of real numbers, .*; got int"),
         ({"image": torch.zeros(2, 3, *SIZE), "stare": torch.zeros(2, 3)}, "'stare' holds real numbers, and whether"),

@@ -71,15 +71,6 @@ def test_a_list_of_images_shows_the_lens_as_a_batch_does(camera):
     torch.testing.assert_close(torch.stack(apart), together, atol=2e-3, rtol=0)
 
 
-def test_validity_that_comes_in_may_be_cocos(camera):
-    points = torch.tensor([[[10.0, 10.0], [30.0, 30.0], [50.0, 20.0]]])
-    mount = RandomMount(camera=camera, p=0)
-    out = mount(keypoints=points, keypoints_valid=torch.tensor([[0, 1, 2]]))
-    assert out["keypoints_valid"].tolist() == [[False, True, True]]
-    with pytest.raises(ValueError, match=r"keypoints_valid must be \(1, 3\); got \[\(3,\)\]"):
-        mount(keypoints=points, keypoints_valid=torch.ones(3))
-
-
 def test_a_gate_of_numbers_is_a_gate(camera):
     mount, points = RandomMount(camera=camera), torch.rand(2, 4, 2) * 50
     draw = mount.draw(2)

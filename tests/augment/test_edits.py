@@ -1,17 +1,14 @@
 """Edits with all that a sample holds: the camera, the labels and the image agree, along any chain of them."""
 
 import json
-import random
 from pathlib import Path
 
-import kornia.augmentation as K  # noqa: N812
 import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F  # noqa: N812
 
 import camtorch as ct
-import camtorch.augment.kornia as fronts
 import camtorch.augment.numpy
 import camtorch.augment.sample
 from camtorch.poses import rotations
@@ -96,26 +93,6 @@ def test_the_camera_follows_every_edit(name, model):
     torch.testing.assert_close(*turns, atol=1e-9, rtol=0)
 
 
-@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
-def test_a_thousand_chains(dtype):
-    rng, rounds = random.Random(3), 4
-    lens = camera(dtype=dtype, size=(240, 320))
-    makers = [
-        A.HorizontalFlip,
-        A.VerticalFlip,
-        lambda: A.Rotate90(rng.randint(0, 3)),
-        lambda: A.Resize((rng.randint(200, 300), rng.randint(200, 400))),
-        lambda: A.Pad(rng.randint(0, 40)),
-        lambda: A.CenterCrop((rng.randint(180, 300), rng.randint(180, 320))),
-        lambda: A.RandomResizedCrop((240, 320), scale=(0.3, 1.0)),
-    ]
-    lens = ct.BrownConrady(lens.intrinsics, lens.distortion[:5], image_size=(240, 320)).requires_grad_(False)
-    for seed in range(rounds):
-        chain = A.Compose([rng.choice(makers)() for _ in range(rng.randint(1, 7))])
-        torch.manual_seed(seed)
-        assert missed(chain(sample(lens, count=1000 // rounds))) < (1e-9 if dtype == torch.float64 else 1e-4)
-
-
 # -- what an independent computation says
 
 MIRRORS = {"hflip": np.diag([-1.0, 1, 1]), "vflip": np.diag([1.0, -1, 1])}
@@ -186,19 +163,6 @@ def test_an_independent_computation_agrees(names):
         expected = (shown * 100).astype(np.int64) if name == "mask" else shown
         assert out[name].shape[-2:] == shown.shape
         np.testing.assert_array_equal(out[name].numpy().reshape(shown.shape)[same], expected[same])
-
-
-def test_depth_through_edits_and_another_mount():
-    lens = camera(ct.Fisheye624)
-    chain = A.Compose([A.HorizontalFlip(p=1.0), A.RandomMount(yaw=(8, 8), pitch=(3, 3), roll=(20, 20)), A.Resize(40)])
-    rays, _ = lens.rays()
-    distance = torch.full((1, 1, *SIZE), 2.0, dtype=torch.float64)
-    out = chain(distance=distance, depth=distance * rays[..., 2], camera=lens)
-    z = out["camera"].rays()[0][..., 2].numpy()
-    seen = out["distance"][0, 0].numpy() != 0
-    assert 0.6 < seen.mean() < 1
-    np.testing.assert_allclose(out["distance"][0, 0].numpy()[seen], 2.0)
-    np.testing.assert_allclose(out["depth"][0].numpy()[0, seen], 2 * z.reshape(seen.shape)[seen], atol=1e-9)
 
 
 # -- images
@@ -572,44 +536,6 @@ def test_cameras_of_several_models():
             use = valid & out["keypoints_valid"][i]
             torch.testing.assert_close(pixels[use], out["keypoints"][i][use], atol=1e-9, rtol=0)
         assert type(out["camera"]) is type(many)
-
-
-def test_gradients_reach_images_labels_and_cameras():
-    lens = camera().requires_grad_(True)
-    image, points = (torch.rand(2, *rest, dtype=torch.float64, requires_grad=True) for rest in ((1, *SIZE), (3, 2)))
-    for chain in (
-        A.HorizontalFlip(p=0.0),
-        A.HorizontalFlip(p=1.0),
-        A.Compose([A.Resize(20), A.HorizontalFlip()]),
-        A.Compose([A.Pad(3), A.RandomMount()]),
-    ):
-        out = chain(image=image, keypoints=points, camera=lens)
-        loss = (out["image"] ** 2).sum() + out["keypoints"].sum() + out["camera"].intrinsics.sum()
-        *batches, numbers = torch.autograd.grad(loss, (image, points, lens.intrinsics))
-        assert all((gradient != 0).flatten(1).any(1).all() for gradient in batches)
-        assert numbers.any()
-
-
-# -- in other pipelines
-
-
-def test_kornia():
-    lens = camera(dtype=torch.float32)
-    image, points = torch.rand(2, 3, *SIZE), torch.rand(2, 4, 2) * 40
-    chain = A.Compose([A.HorizontalFlip(p=1.0, landmarks=[(0, 1)]), A.Pad((1, 2, 3, 4))])
-    expected = chain(image=image, keypoints=points, camera=lens)
-    pipeline = K.AugmentationSequential(fronts.CameraAugmentation(chain, lens), data_keys=["input", "keypoints"])
-    for moved, name in zip(pipeline(image, points), ("image", "keypoints"), strict=True):
-        torch.testing.assert_close(moved, expected[name])
-    assert torch.equal(fronts.HorizontalFlip(lens, p=1.0)(image), image.flip(-1))
-    assert torch.equal(fronts.Rotate90(lens, 1)(image), torch.rot90(image, 1, (-2, -1)))
-    both = fronts.Compose(lens, [A.RandomResizedCrop(SIZE), A.HorizontalFlip(), A.RandomLens()])
-    assert (both.p, fronts.HorizontalFlip(lens).p) == (1.0, 0.5)
-    torch.manual_seed(0)
-    assert both(image).shape == image.shape
-    torch.manual_seed(0)
-    direct = both.augmentation(image=image, camera=lens)
-    torch.testing.assert_close(direct["camera"].intrinsics, both.last.target.intrinsics)
 
 
 # -- what goes wrong is told
