@@ -18,8 +18,8 @@ from camtorch.cameras.mixed import Mixed
 from camtorch.cameras.numbers import joined
 from camtorch.evaluate.known import are_numbers, known_false, known_true
 from camtorch.poses.rotations import turn
-from camtorch.projection.compiled import Native
 from camtorch.projection.evaluation import rows_of
+from camtorch.projection.native_cameras import Native
 from camtorch.projection.rows import single_native
 from camtorch.values.dtypes import narrow, widen
 from camtorch.values.module import remade

@@ -29,8 +29,9 @@ from camtorch.lenses.drawing import FOLD, covering, drawn
 from camtorch.models import MODELS, KannalaBrandt
 from camtorch.optics.radial_inverse import precise
 from camtorch.poses.rotations import mount_elements
-from camtorch.projection.compiled import Native, project, project_numbers, unproject
+from camtorch.projection.compiled import project, project_numbers, unproject
 from camtorch.projection.evaluation import rows_of
+from camtorch.projection.native_cameras import Native
 from camtorch.projection.rows import Cameras, single_native
 from camtorch.rays.lattices import field_of_view, pixel_lattice, polar_rays, reach
 from camtorch.values.arguments import LEFT, as_image_size, broadcast_shapes, check_degrees, warn

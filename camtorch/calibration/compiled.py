@@ -12,7 +12,7 @@ from torch import Tensor
 
 from camtorch.native.library import library
 from camtorch.poses.rotations import small_turn
-from camtorch.projection.compiled import Native
+from camtorch.projection.native_cameras import Native
 from camtorch.values.threads import spread, thread_count
 
 _FROM_RAYS, _REFINED, _SOLVED, _AGREED = range(4)

@@ -21,7 +21,7 @@ from camtorch.projection.rows import Cameras, Direction, unusable
 from camtorch.values.arguments import Numbers, as_points, warn
 
 if TYPE_CHECKING:
-    from camtorch.projection.compiled import Native
+    from camtorch.projection.native_cameras import Native
 
 
 def mapped(camera: CameraLike, direction: Direction, values: Numbers, name: str, size: int) -> tuple[Tensor, Tensor]:

@@ -11,6 +11,7 @@ from camtorch.evaluate.recorded import as_kept, positive, power_of_two, to_plane
 from camtorch.optics.charts import Planes3, floor_of
 from camtorch.projection import compiled
 from camtorch.projection.camera_like import CameraLike
+from camtorch.projection.native_cameras import Native
 from camtorch.projection.rows import Cameras, Direction, Traced, replace, to_mask
 from camtorch.values.arguments import columns
 
@@ -69,7 +70,7 @@ def _formula(
     return pixels, positive(mask)
 
 
-def _keeping(native: compiled.Native, points: Tensor) -> tuple[Tensor, Tensor, tuple[Tensor, ...]]:
+def _keeping(native: Native, points: Tensor) -> tuple[Tensor, Tensor, tuple[Tensor, ...]]:
     return *compiled.project(native, points), (points,)
 
 

@@ -13,9 +13,9 @@ from torch import Tensor
 
 from camtorch.evaluate.kept import Note, note
 from camtorch.evaluate.known import known_true
-from camtorch.projection import compiled
 from camtorch.projection.camera_like import CameraLike
 from camtorch.projection.domain import Domain, domain_of
+from camtorch.projection.native_cameras import Native, native_of
 from camtorch.projection.ops import tables
 from camtorch.values.arguments import columns
 
@@ -69,10 +69,10 @@ class Cameras:
         return made
 
     @cached_property
-    def native(self) -> compiled.Native | None:
+    def native(self) -> Native | None:
         """For the compiled geometry, None where it has not got this model, or is not there."""
         domain = partial(_domain, self._model, self.k, self._learns)
-        return compiled.native_of(self._model.optics, self.intrinsics, self.k, self.usable, domain)
+        return native_of(self._model.optics, self.intrinsics, self.k, self.usable, domain)
 
     def cotangents(self, sums: Tensor | None, wanted: Sequence[bool]) -> tuple[Tensor | None, Tensor | None]:
         """Return those of intrinsics and distortion, if wanted, of sums (C, 4 + n): see `compiled.project_vjp`."""
@@ -94,10 +94,10 @@ class Cameras:
         return by_coefficients
 
 
-def single_native(model: type[CameraLike], intrinsics: Tensor, k: Tensor) -> compiled.Native | None:
+def single_native(model: type[CameraLike], intrinsics: Tensor, k: Tensor) -> Native | None:
     """A camera of numbers (4,) and (n,) that are known to be usable, for the compiled geometry, if that knows it."""
     k = k.detach()[None]
-    return compiled.native_of(model.optics, intrinsics[None], k, None, partial(_domain, model, k, False), tables=True)
+    return native_of(model.optics, intrinsics[None], k, None, partial(_domain, model, k, False), tables=True)
 
 
 def _domain(model: type[CameraLike], k: Tensor, learns: bool) -> Domain:
@@ -154,9 +154,9 @@ class Direction(NamedTuple):
 
     cameras: those of the parameters, if values may be looked at. order: of the derivatives that have to be exact.
     """
-    native: Callable[[compiled.Native, Tensor], tuple[Any, ...]]
+    native: Callable[[Native, Tensor], tuple[Any, ...]]
     """Of compiled cameras and rows to planes, valid, and perhaps more."""
-    native_keeping: Callable[[compiled.Native, Tensor], tuple[Tensor, Tensor, tuple[Tensor, ...]]]
+    native_keeping: Callable[[Native, Tensor], tuple[Tensor, Tensor, tuple[Tensor, ...]]]
     """To planes, valid, and what `native_vjp` needs of the call."""
     native_vjp: Callable[..., tuple[Tensor | None, Tensor | None]]
     """The cotangents of rows and of the numbers of the cameras."""

@@ -13,6 +13,7 @@ from camtorch.optics.lens import newton_step
 from camtorch.optics.radial_inverse import MOST_STEPS, short, solve
 from camtorch.projection import compiled
 from camtorch.projection.camera_like import CameraLike
+from camtorch.projection.native_cameras import Native
 from camtorch.projection.ops import search_in_place, search_open
 from camtorch.projection.rows import Cameras, Direction, Planes2, Traced, replace, to_mask
 from camtorch.projection.solve import search
@@ -190,7 +191,7 @@ def _formula(
     return rays, positive(mask.expand_as(a))
 
 
-def _keeping(native: compiled.Native, pixels: Tensor) -> tuple[Tensor, Tensor, tuple[Tensor, ...]]:
+def _keeping(native: Native, pixels: Tensor) -> tuple[Tensor, Tensor, tuple[Tensor, ...]]:
     rays, valid, solution = compiled.unproject(native, pixels, keeps=True)
     assert solution is not None  # it is asked for
     # a copy: what is handed out belongs to the caller

@@ -18,8 +18,9 @@ from camtorch.evaluate.known import are_free
 from camtorch.native import memory, sampler
 from camtorch.native.library import library
 from camtorch.projection import compiled
-from camtorch.projection.compiled import LEFT_FROM, LEFT_MOST, LEFT_TO, POSITIONS, Between, Native
+from camtorch.projection.compiled import LEFT_FROM, LEFT_MOST, LEFT_TO, POSITIONS, Between
 from camtorch.projection.evaluation import compiled_of
+from camtorch.projection.native_cameras import Native
 from camtorch.values.threads import spread, thread_count
 from camtorch.warp.grid import FEWEST, MOST_KEPT, STEP, coarse, kept_probes
 from camtorch.warp.moving import between

@@ -15,7 +15,7 @@ from camtorch.native.library import native_available
 pytestmark = pytest.mark.skipif(not native_available(), reason="needs the compiled library")
 
 # files, functions
-MOST = {"project": (4, 16), "unproject": (4, 18)}
+MOST = {"project": (4, 16), "unproject": (5, 18)}
 ROOT = Path(ct.__file__).parent
 
 

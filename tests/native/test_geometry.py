@@ -11,6 +11,7 @@ import camtorch as ct
 from camtorch.native.library import native_available
 from camtorch.optics import Equidistant, Lens, Stage
 from camtorch.projection import compiled as geometry
+from camtorch.projection import native_cameras
 from camtorch.projection.project import PROJECT
 from camtorch.projection.rows import Cameras
 from camtorch.projection.unproject import UNPROJECT
@@ -226,9 +227,9 @@ def test_what_users_make_has_no_code():
     class Wide(Equidistant):
         pass
 
-    assert geometry.codes(Equidistant(), Lens()) is not None
-    assert geometry.codes(Equidistant(), Lens(Wave())) is None
-    assert geometry.codes(Wide(), Lens()) is None
+    assert native_cameras.codes(Equidistant(), Lens()) is not None
+    assert native_cameras.codes(Equidistant(), Lens(Wave())) is None
+    assert native_cameras.codes(Wide(), Lens()) is None
 
 
 # -- pixels that are moved: one call says what unproject, turn and project say one by one
