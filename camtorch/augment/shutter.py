@@ -11,7 +11,7 @@ from typing_extensions import Unpack
 from camtorch.augment.augmentation import Augmentation, EditOptions, as_range
 from camtorch.augment.change import Part
 from camtorch.cameras.camera import Camera
-from camtorch.warp.sampling import one_of
+from camtorch.values.arguments import one_of
 from camtorch.warp.shutter import DIRECTIONS, Direction, RollingShutter, ShutterWarp
 
 

@@ -24,7 +24,7 @@ from camtorch.values.arguments import (
     as_real,
     check_degrees,
     check_devices,
-    shown,
+    one_of,
     warn,
 )
 from camtorch.values.module import remade
@@ -290,8 +290,7 @@ def camera_of_fov(
     size = as_image_size(image_size, owner)
     if size is None:
         raise ValueError(f"{owner}: a field of view is one of an image; give its image_size=(height, width)")
-    if not isinstance(axis, str) or axis not in AXES:
-        raise ValueError(f"{owner}: axis must be one of {AXES}; got {shown(axis)}")
+    one_of(axis, AXES, "axis", owner)
     device = distortion.device if isinstance(distortion, Tensor) else None
     fov = torch.tensor(fov, dtype=torch.float64, device=device) if isinstance(fov, (int, float)) else fov
     degrees = as_real(fov, "fov", owner).detach().double()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Sequence
 from contextlib import nullcontext
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor, nn
@@ -15,8 +15,8 @@ from camtorch.cameras.camera import Camera
 from camtorch.networks.limits import Limits
 from camtorch.networks.prior import prior_of
 from camtorch.optics.radial_inverse import precise
-from camtorch.values.arguments import as_flag, as_image_size, as_number, as_values, as_whole
-from camtorch.values.module import GeometryModule, typed_as
+from camtorch.values.arguments import as_coordinates, as_flag, as_image_size, as_number, as_whole
+from camtorch.values.module import GeometryModule
 
 _ASPECT = 0.1
 _LARGEST = 1e6  # whose square is a number, and whose gradient is nothing
@@ -144,31 +144,21 @@ class CameraHead(GeometryModule):
     def forward(self, features: Tensor) -> Camera:
         """The cameras (*B) of features (*B, features)."""
         owner = type(self).__name__
-        features = as_values(features, "features", owner)
-        if features.ndim == 0 or features.shape[-1] != self.linear.in_features:
-            raise ValueError(
-                f"{owner}: features must be (*B, {self.linear.in_features}); got shape {tuple(features.shape)}"
-            )
+        features = as_coordinates(features, "features", self.linear.in_features, owner, form="*B")
         device = features.device.type
         with torch.autocast(device, enabled=False) if torch.amp.is_autocast_available(device) else nullcontext():
             return self.camera(self.linear(features.to(self.linear.weight.dtype)))
 
     if TYPE_CHECKING:
-
-        @typed_as(forward)
-        def __call__(self, *args: Any, **options: Any) -> Any: ...
+        __call__ = forward
 
     def camera(self, numbers: Tensor) -> Camera:
         """The cameras (*B) of numbers (*B, n), in the order of `names`: for a layer of one's own in the place of
         the linear one. Beyond a million numbers are a million; what is NaN makes a camera without valid points.
         """
         owner = f"{type(self).__name__}.camera"
-        numbers = as_values(numbers, "numbers", owner)
-        if numbers.ndim == 0 or numbers.shape[-1] != len(self.names):
-            raise ValueError(
-                f"{owner}: numbers must be (*B, {len(self.names)}), {', '.join(self.names)}; got shape "
-                f"{tuple(numbers.shape)}"
-            )
+        means = f", {', '.join(self.names)}"
+        numbers = as_coordinates(numbers, "numbers", len(self.names), owner, form="*B", means=means)
         dtype = torch.promote_types(numbers.dtype, torch.float32)
         rows = precise(numbers.to(dtype).reshape(-1, len(self.names)).clamp(-_LARGEST, _LARGEST))
         first = len(self.names) - len(self._coefficients)

@@ -15,8 +15,8 @@ from camtorch.poses.rotations import rotate_planes, rotation_matrix
 from camtorch.projection.camera_like import CameraLike
 from camtorch.values.arguments import (
     Numbers,
+    as_coordinates,
     as_points,
-    as_values,
     as_vectors,
     as_whole,
     broadcast_shapes,
@@ -33,9 +33,7 @@ _STRAIGHT = 1e-24  # the squared sine of the angle to the vertical up to which a
 
 def on_image(pixels: Numbers, size: tuple[int, int], owner: str) -> Tensor:
     """See `Camera.contains`."""
-    pixels = as_values(pixels, "pixels", owner)
-    if pixels.ndim == 0 or pixels.shape[-1] != 2:
-        raise ValueError(f"{owner}: pixels must be (..., 2); got shape {tuple(pixels.shape)}")
+    pixels = as_coordinates(pixels, "pixels", 2, owner)
     (u, v), (height, width) = pixels.unbind(-1), size
     return (u >= -0.5) & (u <= width - 0.5) & (v >= -0.5) & (v <= height - 0.5)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 import torch
 from torch import Tensor, nn
@@ -26,9 +26,10 @@ from camtorch.values.arguments import (
     as_points,
     as_values,
     hinting,
+    one_of,
     shown,
 )
-from camtorch.values.module import GeometryModule, typed_as
+from camtorch.values.module import GeometryModule
 from camtorch.warp import routes
 from camtorch.warp.dewarp import middle_lines
 from camtorch.warp.proxy import check_pose
@@ -132,9 +133,7 @@ class Rectification(GeometryModule):
         return of_left, of_right
 
     if TYPE_CHECKING:
-
-        @typed_as(forward)
-        def __call__(self, *args: Any, **options: Any) -> Any: ...
+        __call__ = forward
 
     def valid_masks(self) -> tuple[Tensor, Tensor, Tensor]:
         """(B or 1, 1, H, W) bool: pixels that the left camera sees, that the right one sees, that both do."""
@@ -293,9 +292,8 @@ def rectify(
         TypeError: no cameras.
     """
     left, right = as_sized(left, "left", "rectify"), as_sized(right, "right", "rectify")
-    for value, name, known in ((projection, "projection", tuple(_KINDS)), (align, "align", ("mean", "opencv"))):
-        if not isinstance(value, str) or value not in known:
-            raise ValueError(f"rectify: {name} must be one of {known}; got {shown(value)}")
+    one_of(projection, tuple(_KINDS), "projection", "rectify")
+    one_of(align, ("mean", "opencv"), "align", "rectify")
     size, vertical = as_image_size(image_size, "rectify"), as_flag(vertical, "vertical", "rectify")
     check_pose("rectify", extrinsics, "right from left", left=left, right=right)
     model = _KINDS[projection][0][vertical]

@@ -27,6 +27,7 @@ LEFT = "What left camtorch stands in docs/leaving-0.3.md"
 
 Taken = ParamSpec("Taken")
 Result = TypeVar("Result")
+Name = TypeVar("Name", bound=str)
 
 
 def hinting(hint: str) -> Callable[[Callable[Taken, Result]], Callable[Taken, Result]]:
@@ -254,6 +255,14 @@ def check_degrees(least: float, fov: object, owner: str) -> None:
             "degrees. A camera of so narrow a view is made from its focal lengths: ct.Pinhole([fx, fy, cx, cy]), or "
             "from_matrix(K) of any model"
         )
+
+
+def one_of(value: str, allowed: tuple[Name, ...], name: str, owner: str) -> Name:
+    """The value, if it is allowed."""
+    for known in allowed if isinstance(value, str) else ():
+        if value == known:
+            return known
+    raise ValueError(f"{owner}: {name} must be one of {allowed}; got {shown(value)}")
 
 
 def as_mapping(value: Any, name: str, owner: str, form: str) -> Mapping[Any, Any]:

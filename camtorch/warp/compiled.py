@@ -14,9 +14,9 @@ from camtorch.cameras.camera import Camera
 from camtorch.cameras.opaque import CameraNumbers, opaque
 from camtorch.evaluate.kept import Kept
 from camtorch.native.sampler import layout
-from camtorch.values.arguments import broadcast_shapes
+from camtorch.values.arguments import broadcast_shapes, one_of
 from camtorch.warp.grid import Lattice, Sampling, locate, tabulate
-from camtorch.warp.sampling import MODES, PADDINGS, Sampler, one_of, render
+from camtorch.warp.sampling import MODES, PADDINGS, Sampler, render
 
 
 def positions(

@@ -14,7 +14,7 @@ from camtorch.cameras.camera import Camera
 from camtorch.models import UCM, Cylindrical, Equirectangular, Pinhole
 from camtorch.poses.rotations import as_rotation
 from camtorch.rays.lattices import around_ends, image_lattice
-from camtorch.values.arguments import as_fov, as_image_size, broadcast_shapes, check_devices, hinting
+from camtorch.values.arguments import as_fov, as_image_size, broadcast_shapes, check_devices, hinting, one_of
 from camtorch.warp.sampling import TolerantOptions
 from camtorch.warp.warp import Warp, as_sized
 
@@ -81,8 +81,7 @@ class Dewarp(Warp):
         rotation: Tensor | None = None,
         **options: Unpack[TolerantOptions],
     ):
-        if not isinstance(projection, str) or projection not in _PROJECTIONS:
-            raise ValueError(f"Dewarp: projection must be one of {tuple(_PROJECTIONS)}; got {projection!r}")
+        one_of(projection, tuple(_PROJECTIONS), "projection", "Dewarp")
         own = as_sized(camera, "camera", "Dewarp")._size_for("Dewarp")
         size = as_image_size(image_size, "Dewarp") or own
         rotation = as_rotation(rotation, "Dewarp")

@@ -14,12 +14,12 @@ from camtorch.evaluate.known import are_plain, known_true
 from camtorch.poses.extrinsics import Extrinsics
 from camtorch.poses.rotations import rotation_matrix
 from camtorch.rays.depth import as_depth, depth_scale
-from camtorch.values.arguments import Numbers, as_number, check_devices
-from camtorch.values.module import GeometryModule, typed_as
+from camtorch.values.arguments import Numbers, as_number, check_devices, one_of
+from camtorch.values.module import GeometryModule
 from camtorch.warp.grid import Sampling, to_positions
 from camtorch.warp.panorama import off_poles, seam_of
 from camtorch.warp.proxy import beside, check_pose, turned
-from camtorch.warp.sampling import MODES, PADDINGS, Fill, Mode, PaddingMode, as_fill, one_of, render
+from camtorch.warp.sampling import MODES, PADDINGS, Fill, Mode, PaddingMode, as_fill, render
 from camtorch.warp.warp import as_sized
 
 _SNAP = {torch.float32: 4e-3, torch.float64: 1e-8}  # px, within which rounding may have moved a pixel
@@ -141,9 +141,7 @@ class Reproject(GeometryModule):
         return result.unflatten(2, (steps, -1)), valid
 
     if TYPE_CHECKING:
-
-        @typed_as(forward)
-        def __call__(self, *args: Any, **options: Any) -> Any: ...
+        __call__ = forward
 
     def _seen(self, depth: Tensor, kind: str) -> tuple[Tensor, Tensor, Tensor]:
         """Pixels of the source (B, D, H', W', 2), whether there are some, and the depth at which it sees them."""

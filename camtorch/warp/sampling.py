@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple, TypedDict, TypeVar, get_args
+from typing import Any, Literal, NamedTuple, TypedDict, get_args
 
 import torch
 import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
@@ -15,7 +15,7 @@ from camtorch.evaluate.door import converted, in_transform, is_eager, may_look
 from camtorch.evaluate.known import are_known, are_plain
 from camtorch.native import sampler
 from camtorch.native.library import native_available
-from camtorch.values.arguments import as_flag, as_number, shown
+from camtorch.values.arguments import as_flag, as_number, one_of, shown
 from camtorch.values.dtypes import SIGNED, as_pixels, narrow, wide_dtype, widen
 from camtorch.values.threads import thread_count
 from camtorch.warp.grid import Lattice, Sampling
@@ -23,7 +23,6 @@ from camtorch.warp.grid import Lattice, Sampling
 Mode = Literal["nearest", "bilinear", "bicubic"]
 PaddingMode = Literal["zeros", "border", "reflection"]
 Fill = float | Sequence[float]
-Name = TypeVar("Name", bound=str)
 MODES: tuple[Mode, ...] = get_args(Mode)
 PADDINGS: tuple[PaddingMode, ...] = get_args(PaddingMode)
 
@@ -392,14 +391,6 @@ def as_options(
         "antialias": antialias is not None and as_flag(antialias, "antialias", owner),
         "tolerance": tolerance,
     }
-
-
-def one_of(value: str, allowed: tuple[Name, ...], name: str, owner: str) -> Name:
-    """The value, if it is allowed."""
-    for known in allowed if isinstance(value, str) else ():
-        if value == known:
-            return known
-    raise ValueError(f"{owner}: {name} must be one of {allowed}; got {shown(value)}")
 
 
 def as_fill(fill: Fill, owner: str) -> tuple[float, ...]:

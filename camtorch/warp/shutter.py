@@ -24,7 +24,7 @@ from camtorch.values.arguments import (
     as_vectors,
     broadcast_shapes,
     check_devices,
-    shown,
+    one_of,
 )
 from camtorch.values.module import GeometryModule
 from camtorch.warp.affine import MirrorWarp
@@ -75,8 +75,6 @@ class RollingShutter(GeometryModule):
         owner = "RollingShutter"
         rates = as_vectors(rates, "rates", owner, readout.device if isinstance(readout, Tensor) else None)
         readout = as_real(readout, "readout", owner, rates.device)
-        if not isinstance(direction, str) or direction not in DIRECTIONS:
-            raise ValueError(f"{owner}: direction must be one of {DIRECTIONS}; got {shown(direction)}")
         if readout.ndim > 1:
             raise ValueError(f"{owner}: readout must be a number or (B,); got shape {tuple(readout.shape)}")
         if known_false(readout.detach().abs() < _LONGEST):
@@ -92,7 +90,7 @@ class RollingShutter(GeometryModule):
             raise ValueError(f"{owner}: rates must be (3,) or (B, 3); got shape {tuple(rates.shape)}")
         for name, value in (("readout", readout), ("rates", rates)):
             self.put(name, as_own(value), persistent=True)
-        self.direction = direction
+        self.direction = one_of(direction, DIRECTIONS, "direction", owner)
 
     def times(self, pixels: Numbers, image_size: tuple[int, int]) -> Tensor:
         """(*B, *N): seconds from the middle of the readout at which pixels (*B, *N, 2) of an image are seen."""

@@ -21,24 +21,13 @@ from camtorch.values.arguments import (
     broadcast_shapes,
     check_devices,
     no_camera,
+    one_of,
 )
-from camtorch.values.module import typed_as
 from camtorch.warp import routes
 from camtorch.warp.boxes import enclosed, moved_boxes
 from camtorch.warp.grid import OUTSIDE
 from camtorch.warp.pair import CameraPair
-from camtorch.warp.sampling import (
-    MODES,
-    PADDINGS,
-    Fill,
-    Mode,
-    Options,
-    PaddingMode,
-    Sampler,
-    as_fill,
-    as_options,
-    one_of,
-)
+from camtorch.warp.sampling import MODES, PADDINGS, Fill, Mode, Options, PaddingMode, Sampler, as_fill, as_options
 
 
 def as_sized(camera: Camera, name: str, owner: str) -> Camera:
@@ -161,9 +150,7 @@ class Warp(CameraPair):
         return routes.warped(self, images, checked(self, images, mode, padding_mode, fill))
 
     if TYPE_CHECKING:
-
-        @typed_as(forward)
-        def __call__(self, *args: Any, **options: Any) -> Any: ...
+        __call__ = forward
 
     def strips(
         self,
