@@ -277,20 +277,6 @@ def bent(points: Tensor, bend: Tensor) -> tuple[Tensor, Tensor]:
     return points + flat * depth, slopes
 
 
-class _Look(NamedTuple):
-    """What a camera makes of a state.
-
-    residuals: (B, V, N, 2). valid, weights: (B, V, N), the weights of the squares. cost: (B, V). triangles: those of
-    `Equations`, without priors, where compiled code made them in passing.
-    """
-
-    residuals: Tensor
-    valid: Tensor
-    weights: Tensor
-    cost: Tensor
-    triangles: tuple[Tensor, Tensor] | None = None
-
-
 class Bundle:
     """The problem, for `levenberg_marquardt.minimise`: its state is flat, with the batch in front of every tensor."""
 
@@ -313,7 +299,7 @@ class Bundle:
     low: Tensor
     high: Tensor
     is_bounded: bool
-    _last: tuple[tuple[Tensor, ...], list[_Look]] | None
+    _last: tuple[tuple[Tensor, ...], list[compiled_poses.Look]] | None
 
     def __init__(self, sights: Sequence[Sight], state: State, free: Free, loss: str | None, loss_scale: float):
         self.free, self.loss, self.loss_scale = free, loss, loss_scale
@@ -394,7 +380,7 @@ class Bundle:
         parameters = state.parameters[c]
         return self.fixed[c] or remade(self.cameras[c], intrinsics=parameters[:, :4], distortion=parameters[:, 4:])
 
-    def look(self, c: int, flat: Sequence[Tensor], rows: Tensor | None = None) -> _Look:
+    def look(self, c: int, flat: Sequence[Tensor], rows: Tensor | None = None) -> compiled_poses.Look:
         """What a camera makes of a state."""
         state, sight = self.state(flat), self.sight(c, rows)
         if self.is_plain and len(state.bend):
@@ -405,24 +391,23 @@ class Bundle:
             has_triangles = native.plan.places is not None or all(i < 4 for i in own)
             given = sight.points, state.boards, sight.pixels, sight.weights, (self.loss, self.loss_scale)
             # the next step begins here, unless this one was in vain
-            made, *triangles = compiled_poses.seen(native, *given, own if has_triangles else None)
-            return _Look(*made, (triangles[0], triangles[1]) if has_triangles else None)
+            return compiled_poses.seen(native, *given, own if has_triangles else None)
         pixels, valid = self.camera(c, state).project(self.points(c, state, sight)[-1])
         residuals = torch.where((valid & (sight.weights > 0))[..., None], pixels - sight.pixels, 0.0)
         u, v = residuals.unbind(-1)
         cost, slope = robust(self.loss, self.loss_scale, u * u + v * v)
         lost, _ = robust(self.loss, self.loss_scale, cost.new_tensor(_LOST**2))
         cost = (torch.where(valid, cost, lost) * sight.weights).sum(-1)
-        return _Look(residuals, valid, torch.where(valid, slope * sight.weights, 0.0), cost)
+        return compiled_poses.Look(residuals, valid, torch.where(valid, slope * sight.weights, 0.0), cost)
 
-    def looks(self, flat: Sequence[Tensor], rows: Tensor) -> list[_Look]:
+    def looks(self, flat: Sequence[Tensor], rows: Tensor) -> list[compiled_poses.Look]:
         """Of all cameras: those of the last state again if it is that."""
         given, last = (rows, *flat), self._last
         if last is None or not all(a is b or torch.equal(a, b) for a, b in zip(given, last[0], strict=True)):
             self._last = last = given, [self.look(c, flat, rows) for c in range(len(self.sights))]
         return last[1]
 
-    def shown(self, c: int, flat: Sequence[Tensor], look: _Look) -> Tensor:
+    def shown(self, c: int, flat: Sequence[Tensor], look: compiled_poses.Look) -> Tensor:
         """(B, V, N): the points that a camera shows, and not only while it is searched."""
         kind = _kind(self.sights[c].model)
         if kind.searched() is kind:
@@ -502,7 +487,7 @@ class Bundle:
                 found.append(rows)
         return found
 
-    def rows_of(self, c: int, look: _Look, state: State, rows: Tensor) -> tuple[Tensor, list[int]]:
+    def rows_of(self, c: int, look: compiled_poses.Look, state: State, rows: Tensor) -> tuple[Tensor, list[int]]:
         """The rows (B, V, 2 N, L + F + 1) of a camera, and which of the shared unknowns its F columns are."""
         sight = self.sight(c, rows)
         turned, first, points = self.points(c, state, sight)

@@ -99,13 +99,18 @@ def solved(
         native.follow()
 
 
-class Seen(NamedTuple):
-    """See `Bundle.look`: residuals (B, V, N, 2), valid and weights (B, V, N), cost (B, V)."""
+class Look(NamedTuple):
+    """What a camera makes of a state; see `Bundle.look`.
+
+    residuals: (B, V, N, 2). valid, weights: (B, V, N), the weights of the squares. cost: (B, V). triangles: those of
+    `Equations`, without priors, where compiled code made them in passing.
+    """
 
     residuals: Tensor
     valid: Tensor
     weights: Tensor
     cost: Tensor
+    triangles: tuple[Tensor, Tensor] | None = None
 
 
 def seen(
@@ -116,18 +121,16 @@ def seen(
     weights: Tensor,
     loss: tuple[str | None, float],
     learnt: Sequence[int] | None = None,
-) -> tuple[Seen, Tensor, Tensor]:
+) -> Look:
     """Return what cameras (B,), or one, make of points (B, V, N, 3) whose pixels (B, V, N, 2) are known.
 
-    Also `Equations.view` and `Equations.shared`, if `learnt` says which intrinsics, and coefficients from 4 on, learn.
+    With triangles if `learnt` says which intrinsics, and coefficients from 4 on, learn.
     poses: (B, V, 3, 3), (B, V, 3). weights: (B, V, N) of the squares. loss: name and scale.
     """
     compiled, plan, left = library(), native.plan, c_int64(0)
     assert compiled is not None  # or nobody has a `Native`
     valid = torch.empty(weights.shape, dtype=torch.bool, device="cpu")
-    made = Seen(
-        pixels.new_empty(pixels.shape), valid, weights.new_empty(weights.shape), weights.new_empty(weights.shape[:2])
-    )
+    residuals, weighed, cost = (t.new_empty(t.shape) for t in (pixels, weights, weights[..., 0]))
     wanted = learnt or ()
     if plan.places is not None and not plan.is_all:  # the place of each coefficient among the parameters
         at = {4 + place: 4 + i for i, place in enumerate(plan.places.tolist())}
@@ -139,7 +142,7 @@ def seen(
     given = [t.contiguous() for t in (*poses, pixels, weights)]
     call = _Views(
         *(native.pointer, points.data_ptr(), *points.stride()[:2]),
-        *(t.data_ptr() for t in (*given, made.residuals, made.weights, made.valid, made.cost)),
+        *(t.data_ptr() for t in (*given, residuals, weighed, valid, cost)),
         *(*points.shape[:3], _LOSSES.index(loss[0]), loss[1]),
         *(addressof(numbers), size - 1, view.data_ptr(), shared.data_ptr(), addressof(left)),
     )
@@ -150,7 +153,7 @@ def seen(
         left.value = 0
         native.follow()
         compiled.camtorch_views(call)
-    return made, view, shared
+    return Look(residuals, valid, weighed, cost, None if learnt is None else (view, shared))
 
 
 def turned(rotations: Tensor, steps: Tensor) -> Tensor:

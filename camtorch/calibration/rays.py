@@ -27,10 +27,6 @@ class RayPoses(NamedTuple):
     translations: Tensor
     valid: Tensor
 
-    def moved(self, points: Tensor) -> Tensor:
-        """(B, S, N, 3): points (B, N, 3) of the object in the camera's frame."""
-        return points[:, None] @ self.rotations.mT + self.translations[:, :, None]
-
 
 def poses_from_rays(points: Tensor, rays: Tensor, weights: Tensor) -> RayPoses:
     """The poses, camera from object, in which known points lie on rays; the least angles first.

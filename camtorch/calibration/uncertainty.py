@@ -13,7 +13,7 @@ from camtorch.cameras.camera import Camera
 from camtorch.cameras.opaque import fixed_camera
 from camtorch.least_squares.equations import Equations
 from camtorch.poses.rotations import skew_matrix
-from camtorch.values.arguments import Numbers, as_values
+from camtorch.values.arguments import Numbers, as_coordinates, as_values
 
 _PIXELS = 1 << 15  # that are looked at together
 # Relative to the greatest singular value. Parameters of which a camera has one too many, as the turn of a panorama and
@@ -159,13 +159,9 @@ def worst(covariances: Tensor) -> Tensor:
 def uncertainty(spread: Spread, pixels: Numbers, distance: Numbers = math.inf) -> Tensor:
     """Return `Calibration.uncertainty` of a single problem."""
     owner, like = "uncertainty", spread.parameters
-    pixels, distance = (
-        as_values(value, name, owner, like.device).detach().to(like)
-        for value, name in ((pixels, "pixels"), (distance, "distance"))
-    )
+    pixels = as_coordinates(pixels, "pixels", 2, owner, like.device).detach().to(like)
+    distance = as_values(distance, "distance", owner, like.device).detach().to(like)
     shape = pixels.shape[:-1]
-    if pixels.ndim == 0 or pixels.shape[-1] != 2:
-        raise ValueError(f"{owner}: pixels must be (..., 2); got shape {tuple(pixels.shape)}")
     if not bool((distance > 0).all()):
         raise ValueError(
             f"{owner}: distance must be positive, in the unit of the board, or math.inf; got {distance.tolist()}"

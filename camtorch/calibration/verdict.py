@@ -129,14 +129,46 @@ class Calibration:
         return uncertainty(self.spread, pixels, distance)
 
     @cached_property
+    @torch.no_grad()
     def warnings(self) -> list[str]:
         """What the data do not carry, and what does not fit, in words: each with what to do."""
-        return warnings(self)
+        survey = _Survey(self)
+        finders = (_search, _residuals, _views, _loose, _twins, _coverage, _pattern)
+        return [text for find in finders for text in find(survey)]
 
     @property
+    @torch.no_grad()
     def verdict(self) -> str:
         """In words: what it is good for, up to which angle, and what to photograph next."""
-        return verdict(self)
+        survey = _Survey(self)
+        if not self.converged:
+            return next(_search(survey)) + "."
+        middle = survey.zones[4].uncertainty
+        # the noise does not tell what the model makes of rays that no corner was near
+        fine, fine_share = survey.good_within(_FINE, survey.reach + _BEYOND)
+        rough, rough_share = survey.good_within(_ROUGH)
+        good = f"Not for measuring: projections are known to {_px(middle)} in the middle ({_NOISE})."
+        if fine_share > 0:
+            there = float(survey.uncertainty[survey.angles <= fine].amax())
+            good = (
+                f"Good for measuring up to {_degrees(fine)} from the optical axis, {_percent(fine_share)} of the image"
+                f": projections are known to {_px(middle)} in the middle and to {_px(there)} at worst ({_NOISE})."
+            )
+        if rough_share > fine_share:
+            good += f" Good for looking at up to {_degrees(rough)}, {_percent(rough_share)} of the image."
+        reach = f"Corners were seen up to {_degrees(survey.reach)}; the image goes to {_degrees(survey.image_reach)}."
+        loose = [zone for zone in survey.zones if zone.rays >= 0.5 and zone.uncertainty > max(_FINE, 2 * middle)]
+        tilt = f" {_TILTED}." if survey.tilt < _ALIKE else ""
+        if wanted := survey.missing or sorted(loose, key=lambda zone: -zone.uncertainty)[:3]:
+            near = "so near that its corners reach the edges"
+            ahead = f"Next, hold the board in {_places(wanted)} of the image, {near}.{tilt}"
+        elif tilt:
+            ahead = f"Next:{tilt}"
+        elif middle > _FINE:
+            ahead = "Next, take more views, near and tilted: four times as many halve the uncertainty."
+        else:
+            ahead = "It needs no more views; four times as many would halve the uncertainty."
+        return f"{good} {reach} {ahead}"
 
     def __repr__(self) -> str:
         values = [*self.camera.intrinsics.tolist(), *self.camera.distortion.tolist()]
@@ -261,14 +293,6 @@ class _Survey:
         return math.sqrt((squares - free) / (2 * len(residuals)))
 
 
-@torch.no_grad()
-def warnings(calibration: Calibration) -> list[str]:
-    """Return what the data do not carry, and what does not fit: each with what to do. Empty if all is well."""
-    survey = _Survey(calibration)
-    finders = (_search, _residuals, _views, _loose, _twins, _coverage, _pattern)
-    return [text for find in finders for text in find(survey)]
-
-
 def _search(survey: _Survey) -> Iterator[str]:
     found = survey.calibration
     if lost := found.lost:
@@ -384,41 +408,6 @@ def _pattern(survey: _Survey) -> Iterator[str]:
             f"The residuals have a pattern over the image, of {_px(share * rms)}: the model is not that of the lens, "
             "or the board is bent. Try brown_conrady with count=8, kannala_brandt or fisheye624, or bend=True"
         )
-
-
-@torch.no_grad()
-def verdict(calibration: Calibration) -> str:
-    """Return a paragraph: what the camera is good for, up to which angle, and what to photograph next."""
-    survey = _Survey(calibration)
-    if not calibration.converged:
-        return next(_search(survey)) + "."
-    middle = survey.zones[4].uncertainty
-    # the noise does not tell what the model makes of rays that no corner was near
-    fine, fine_share = survey.good_within(_FINE, survey.reach + _BEYOND)
-    rough, rough_share = survey.good_within(_ROUGH)
-    good = f"Not for measuring: projections are known to {_px(middle)} in the middle ({_NOISE})."
-    if fine_share > 0:
-        there = float(survey.uncertainty[survey.angles <= fine].amax())
-        good = (
-            f"Good for measuring up to {_degrees(fine)} from the optical axis, {_percent(fine_share)} of the image: "
-            f"projections are known to {_px(middle)} in the middle and to {_px(there)} at worst ({_NOISE})."
-        )
-    if rough_share > fine_share:
-        good += f" Good for looking at up to {_degrees(rough)}, {_percent(rough_share)} of the image."
-    reach = f"Corners were seen up to {_degrees(survey.reach)}; the image goes to {_degrees(survey.image_reach)}."
-    loose = [zone for zone in survey.zones if zone.rays >= 0.5 and zone.uncertainty > max(_FINE, 2 * middle)]
-    tilt = f" {_TILTED}." if survey.tilt < _ALIKE else ""
-    if wanted := survey.missing or sorted(loose, key=lambda zone: -zone.uncertainty)[:3]:
-        ahead = (
-            f"Next, hold the board in {_places(wanted)} of the image, so near that its corners reach the edges.{tilt}"
-        )
-    elif tilt:
-        ahead = f"Next:{tilt}"
-    elif middle > _FINE:
-        ahead = "Next, take more views, near and tilted: four times as many halve the uncertainty."
-    else:
-        ahead = "It needs no more views; four times as many would halve the uncertainty."
-    return f"{good} {reach} {ahead}"
 
 
 @torch.inference_mode()
