@@ -154,7 +154,11 @@ def _joined(a: Part, b: Part) -> Part:
         return replace(b, rows=a.rows, camera=a.camera)
     if not isinstance(b.moves, View) and b.moves.keeps_lens:
         return a.by(b.moves.follow)
-    rotation = _both_turns(a.moves.rotation, b.moves.rotation)
+    first, rotation = a.moves.rotation, b.moves.rotation  # (3, 3) or (B, 3, 3): the first turn, then the second
+    if first is not None and rotation is not None:
+        dtype = torch.promote_types(first.dtype, rotation.dtype)
+        first = (rotation.to(dtype).unsqueeze(-1) * first.to(dtype).unsqueeze(-3)).sum(-2)
+    rotation = rotation if first is None else first
     if not isinstance(b.moves, AffineWarp):
         if a.shades is not None or a.light is not None:
             raise ValueError(
@@ -181,21 +185,6 @@ def _single(camera: Camera) -> Native | None:
         return None
     rows = rows_of(camera, *camera._tensors)
     return rows.native if rows.usable is None else None
-
-
-def _optioned(warp: Warp, options: Options) -> Warp:
-    if isinstance(warp, MirrorWarp) and warp.options == options:
-        return warp
-    make = warp.between if isinstance(warp, MirrorWarp) else MirrorWarp
-    return make(warp.source, warp.target, warp.rotation, **options)
-
-
-def _both_turns(first: Tensor | None, second: Tensor | None) -> Tensor | None:
-    """(3, 3) or (B, 3, 3): the first, then the second."""
-    if first is None or second is None:
-        return first if second is None else second
-    dtype = torch.promote_types(first.dtype, second.dtype)
-    return (second.to(dtype).unsqueeze(-1) * first.to(dtype).unsqueeze(-3)).sum(-2)
 
 
 class Change:
@@ -323,11 +312,16 @@ class Change:
 
     def with_options(self, options: Options) -> Change:
         """The change with its warps made anew by other options."""
+
+        def optioned(warp: Warp) -> Warp:
+            if isinstance(warp, MirrorWarp) and warp.options == options:
+                return warp
+            make = warp.between if isinstance(warp, MirrorWarp) else MirrorWarp
+            return make(warp.source, warp.target, warp.rotation, **options)
+
         parts = [
-            replace(part, moves=replace(part.moves, options=options))
-            if isinstance(part.moves, View)
-            else part.by(lambda warp: _optioned(warp, options))
-            for part in self.parts
+            replace(p, moves=replace(p.moves, options=options)) if isinstance(p.moves, View) else p.by(optioned)
+            for p in self.parts
         ]
         return Change(self.count, parts, mixed=self.mixed, gate=self.gate)
 
