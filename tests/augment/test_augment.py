@@ -380,22 +380,6 @@ def test_autocast_moves_nothing():
     torch.testing.assert_close(cast["image"], plain["image"], atol=1e-3, rtol=0)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["camera", "filled", "chain"])
-def test_compiled_in_one_graph(name):
-    augmentation, batch = AUGMENTATIONS[name](), sample(2)
-    batch = {k: batch[k] for k in ("image", "mask", "keypoints", "boxes", "gaze", "head_pose", "camera")}
-
-    def run(batch, draw):
-        out = augmentation(batch, draw=draw)
-        return {k: v for k, v in out.items() if isinstance(v, torch.Tensor)}
-
-    draw = augmentation.draw(2)
-    compiled = torch.compile(run, fullgraph=True, backend="eager")(batch, draw)
-    for name, value in run(batch, draw).items():
-        torch.testing.assert_close(compiled[name], value, atol=2e-3, rtol=1e-4)
-
-
 def test_padding_and_fill():
     batch = sample()
     mount = {"yaw": (40, 40), "pitch": (0, 0), "roll": (0, 0), "tolerance": 0}  # a lattice may differ by padding

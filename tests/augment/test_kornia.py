@@ -346,24 +346,6 @@ def several(count=3):
     return ct.BrownConrady(own.intrinsics * scale, own.distortion * scale, image_size=SIZE).requires_grad_(False)
 
 
-def test_every_sample_its_own_camera():
-    cameras, aug = several(), adapter.RandomCamera(camera(), tolerance=0.0)
-    params = aug.forward_parameters(images().shape)
-    with_own, listed = (adapter.with_cameras(params, given) for given in (cameras, list(cameras)))
-    assert "source_intrinsics" not in params
-    assert all(torch.equal(listed[name], with_own[name]) for name in with_own)
-    warped = aug(images(), params=with_own)
-    draw = {"apply": torch.ones(3), **aug._params}
-    assert torch.equal(warped, aug.augmentation(image=images(), camera=cameras, draw=draw)["image"])
-    seq = K.AugmentationSequential(K.AugmentationSequential(aug), K.RandomHorizontalFlip(p=0.0), data_keys=KEYS)
-    torch.manual_seed(14)
-    params = adapter.with_cameras(seq.forward_parameters(images().shape), cameras)
-    _, together, moved, _ = seq(*batch(), params=params)
-    assert torch.equal(moved, seq(*batch(), params=params)[2])
-    assert torch.equal(aug.last.source.intrinsics, cameras.intrinsics)
-    assert equal([m.reshape(1, *SIZE) for m in seq(images(), list(masks()), *batch()[2:], params=params)[1]], together)
-
-
 @pytest.mark.parametrize("of", [adapter.RandomLens, adapter.RandomCamera])
 def test_camera_and_lens_go_in_by_name(of):
     made = []

@@ -6,7 +6,7 @@ import stat
 
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from rigs import FILES, SUFFIXES, assert_same, float64, load
 
@@ -59,36 +59,6 @@ def test_values_that_are_not_finite_are_not_written(format, tmp_path):
 
 
 # -- what it can hold
-
-
-@settings(max_examples=60)
-@given(data=st.data())
-def test_every_model_in_our_own_file(tmp_path_factory, data):
-    path = tmp_path_factory.getbasetemp() / "own.json"
-    key = data.draw(st.sampled_from(sorted(ct.MODELS)))
-    core = [*data.draw(st.tuples(st.floats(1e-3, 1e5), st.floats(1e-3, 1e5))), data.draw(numbers), data.draw(numbers)]
-    count = ct.MODELS[key](CORE).distortion.shape[-1]
-    coefficients = data.draw(st.lists(st.floats(0.01, 0.99), min_size=count, max_size=count))
-    try:
-        one = camera(key, coefficients if count else None, core)
-    except ValueError:  # a model may take no such coefficients
-        return
-    ct.save(one, path)
-    assert_same(ct.load(path), ct.Rig({"camera": one}))
-
-
-def test_batches_float32_and_images_in_our_own_file(tmp_path):
-    path = tmp_path / "own.json"
-    batch = ct.BrownConrady(torch.rand(2, 3, 4) + 1, torch.rand(2, 3, 14))
-    poses = {"a": ct.Extrinsics(torch.rand(2, 3, 3, 1), torch.rand(3)), "x": ct.Extrinsics([0.1, 0, 0], [1, 2, 3])}
-    rig = ct.Rig({"a": batch, "b": camera()}, poses, images={"x": "b"})
-    ct.save(rig, path)
-    again = ct.load(path)
-    assert torch.equal(again.cameras["a"].distortion, batch.distortion.double())
-    assert again.extrinsics["a"].batch_shape == (2, 3)
-    assert again.images == {"x": "b"}
-    ct.save(again, path)
-    assert_same(ct.load(path), again)
 
 
 @pytest.mark.parametrize("key", ["rotation", "translation"])

@@ -159,14 +159,6 @@ def test_the_nose_has_the_angles_of_a_gaze():
     assert torch.allclose(ct.augment.to_pitch_yaw(-rotation[..., 2]), ct.head_angles(rotation)[:, :2])
 
 
-def test_signs():
-    """Seen in the image: up, to the image's left, clockwise."""
-    pitch, yaw, roll = ct.head_rotation(0.1 * torch.eye(3))
-    assert (-pitch[1, 2]) < 0
-    assert (-yaw[0, 2]) < 0
-    assert roll[1, 0] > 0
-
-
 def test_what_goes_in():
     rotation = ct.head_rotation(angles(6))
     extrinsics = ct.Extrinsics.from_matrix(rotation, torch.zeros(6, 3).double())

@@ -286,15 +286,6 @@ def test_repr(key):
     assert "batch_shape=(2,)" in repr(batched)
 
 
-def test_an_edited_camera_learns_what_the_original_learns():
-    camera = ct.KannalaBrandt([280.0, 280.0, 319.5, 239.5], [0.02, -0.01], image_size=(480, 640))
-    camera.intrinsics.requires_grad_(False)
-    edited = camera.crop(0, 0, 100, 100)
-    assert not any(p.requires_grad for p in edited.parameters())
-    edited.project(torch.tensor([0.1, 0.2, 1.0]))[0].sum().backward()
-    assert (camera.distortion.grad != 0).all()
-
-
 @each_kind
 @both_directions
 @pytest.mark.parametrize("rows", [(), (2, 3)])

@@ -52,16 +52,6 @@ def test_parts_of_a_batch_are_its_cameras(key):
     assert [[float(c.fx.detach()) for c in row] for row in batch] == batch.fx.tolist()
 
 
-def test_gradients_of_a_part_are_the_batch_s_and_its_values_are_shared():
-    camera = ct.KannalaBrandt(torch.tensor([[300.0, 300.0, 320.0, 240.0]] * 3), image_size=SIZE)
-    camera[1].project(torch.ones(3))[0].sum().backward()
-    assert camera.intrinsics.grad.any(-1).tolist() == [False, True, False]
-    frozen = camera.requires_grad_(False)[1]
-    assert not any(p.requires_grad for p in frozen.parameters())
-    frozen.intrinsics[0] = 7.0  # as by a row of a tensor
-    assert camera.intrinsics[1, 0] == 7
-
-
 OF_RADIUS = {
     ct.Pinhole: lambda r: math.atan(r / 300),
     ct.KannalaBrandt: lambda r: r / 300,
