@@ -29,7 +29,7 @@ from camtorch.evaluate.known import is_predicted
 from camtorch.optics.model_spec import ModelSpec
 from camtorch.poses.extrinsics import Extrinsics
 from camtorch.projection.camera_like import CameraLike
-from camtorch.projection.evaluation import evaluated, mapped
+from camtorch.projection.evaluation import evaluate_points, evaluate_rows
 from camtorch.projection.project import PROJECT
 from camtorch.projection.unproject import UNPROJECT
 from camtorch.rays.fields import local_pinhole, on_image, over_image, patch_centres, perspective_field, plucker
@@ -312,7 +312,7 @@ class Camera(Freezable, Editable):
             lies before the fold of the lens. Whether the pixel is on the image is another question: `contains`.
             An invalid point gets the pixel (-1, -1) and zero gradient.
         """
-        return mapped(self, PROJECT, points, "points", 3)
+        return evaluate_points(self, PROJECT, points, "points", 3, self.batch_shape, self._tensors)
 
     def unproject(self, pixels: Numbers) -> tuple[Tensor, Tensor]:
         """The ray through each pixel.
@@ -324,7 +324,7 @@ class Camera(Freezable, Editable):
             rays (*B, *N, 3) of unit length (a point at distance d is `rays * d`), and valid (*B, *N) bool: the
             ray projects to this pixel. An invalid pixel gets the optical axis (0, 0, 1) and zero gradient.
         """
-        return mapped(self, UNPROJECT, pixels, "pixels", 2)
+        return evaluate_points(self, UNPROJECT, pixels, "pixels", 2, self.batch_shape, self._tensors)
 
     def project_polyline(self, points: Numbers, extrinsics: Extrinsics | None = None) -> list[Tensor]:
         """The curves that straight edges in space become: a 3D box in a fisheye's image, a lane, a horizon.
@@ -344,7 +344,7 @@ class Camera(Freezable, Editable):
 
         return project_polyline(self, points, extrinsics)
 
-    _evaluate = evaluated
+    _evaluate = evaluate_rows
 
     @property
     def _tensors(self) -> tuple[Tensor, ...]:

@@ -172,13 +172,15 @@ class Way(NamedTuple):
     """Whether the values of the parameters may be looked at, so that what is made of them is kept."""
     order: int
     """Of the derivatives that the recorded formula must have exactly."""
+    is_constant: bool = False
+    """Whether the module is a constant of the program that is exported."""
 
 
 _NATIVE, _LEARNING = Way(True, False, True, 2), Way(True, True, True, 2)
 
 
-def way_of(values: Tensor, *parameters: Tensor, owner: str) -> Way:
-    """Return the way of a call with values and parameters; a RuntimeError where torch could record none."""
+def way_of(module: nn.Module, values: Tensor, *parameters: Tensor) -> Way:
+    """Return the way of a module's call with values and parameters; a RuntimeError where torch could record none."""
     # asked once a call, and in one place: each function more would take as long as what it asks
     is_plain = not (
         torch.compiler.is_compiling()
@@ -193,7 +195,7 @@ def way_of(values: Tensor, *parameters: Tensor, owner: str) -> Way:
     if is_plain:
         if in_jit_trace() and torch.onnx.is_in_onnx_export():
             raise RuntimeError(
-                f"{owner}: torch.onnx.export(dynamo=False) cannot record a camera; dynamo=True can. "
+                f"{type(module).__name__}: torch.onnx.export(dynamo=False) cannot record a camera; dynamo=True can. "
                 "What a frozen camera or warp keeps is a constant: camera.rays() and warp(images), with "
                 "requires_grad_(False) and called once before the export"
             )
@@ -201,7 +203,7 @@ def way_of(values: Tensor, *parameters: Tensor, owner: str) -> Way:
             return _LEARNING if learns and torch.is_grad_enabled() else _NATIVE
     is_known = all(is_concrete(t) and not has_tangent(t) for t in parameters)
     # what is compiled has no derivatives of derivatives
-    return Way(False, False, is_known, 1 if torch.compiler.is_compiling() else 2)
+    return Way(False, False, is_known, 1 if torch.compiler.is_compiling() else 2, is_constant(module))
 
 
 def is_native(values: Tensor) -> bool:

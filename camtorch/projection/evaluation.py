@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torch.autograd import Function
 from torch.nn.utils import parametrize
 
-from camtorch.evaluate.door import is_constant, is_native, way_of
+from camtorch.evaluate.door import is_native, way_of
 from camtorch.evaluate.export import portable_export, with_values
 from camtorch.evaluate.kept import Kept, same
 from camtorch.evaluate.known import are_free
@@ -24,9 +24,16 @@ if TYPE_CHECKING:
     from camtorch.projection.native_cameras import Native
 
 
-def mapped(camera: CameraLike, direction: Direction, values: Numbers, name: str, size: int) -> tuple[Tensor, Tensor]:
-    """Values (*B, *N, size) by compiled code, or by the recorded formula: see `evaluated`."""
-    batch, tensors = camera.batch_shape, camera._tensors
+def evaluate_points(
+    camera: CameraLike,
+    direction: Direction,
+    values: Numbers,
+    name: str,
+    size: int,
+    batch: torch.Size,
+    tensors: Sequence[Tensor],
+) -> tuple[Tensor, Tensor]:
+    """Return what a direction makes of values (*B, *N, size): see `evaluate_rows`."""
     lead, dims = batch, len(batch)
     if (
         not isinstance(values, Tensor)
@@ -45,7 +52,7 @@ def mapped(camera: CameraLike, direction: Direction, values: Numbers, name: str,
     return planes.reshape((planes.shape[0], *shape)).movedim(0, -1), valid.reshape(shape)
 
 
-def evaluated(
+def evaluate_rows(
     camera: CameraLike,
     direction: Direction,
     rows: Tensor,
@@ -59,15 +66,16 @@ def evaluated(
     else the formula, recorded by torch. lead: the batch dims that C counts. cameras_of: what is kept of the tensors,
     if others than this camera are meant.
     """
-    if cameras_of is None and is_constant(camera) and all(isinstance(side, int) for side in lead):
+    intrinsics, distortion = per_row(tensors[0], lead, rows), per_row(tensors[1], lead, rows)
+    inputs = rows, intrinsics, distortion
+    way = way_of(camera, *inputs)
+    if way.is_constant and cameras_of is None and all(isinstance(side, int) for side in lead):
         with with_values(camera):
             intrinsics, distortion = (per_row(t, lead, rows) for t in camera._tensors)
             cameras = rows_of(camera, intrinsics, distortion).with_all_tables()
         with portable_export(rows) as order:
             return direction.formula(type(camera), rows, intrinsics, distortion, cameras, order)
-    intrinsics, distortion = per_row(tensors[0], lead, rows), per_row(tensors[1], lead, rows)
-    inputs, cameras_of = (rows, intrinsics, distortion), cameras_of or partial(rows_of, camera)
-    way = way_of(*inputs, owner=type(camera).__name__)
+    cameras_of = cameras_of or partial(rows_of, camera)
     known = cameras_of(intrinsics, distortion) if way.is_known else None
     if way.is_native and known is not None and (made := known.native) is not None:
         if way.learns:
@@ -81,7 +89,7 @@ def evaluated(
 def compiled_of(cameras: Sequence[CameraLike], *values: Tensor) -> tuple[list[Native], bool] | None:
     """Return the compiled geometry of cameras, each (B,) or single, and whether any of them is a batch.
 
-    None if `evaluated` would take another regime for values of the dtype of the first, if the result would have a
+    None if `evaluate_rows` would take another regime for values of the dtype of the first, if the result would have a
     graph, and of cameras of several models, or behind a shutter.
     """
     pairs, dtype, is_batch, inputs = [], values[0].dtype, False, [*values]
