@@ -29,8 +29,8 @@ class Clips:
             shape = tuple(getattr(value, "shape", ()))
             if shape[:2] != self.shape or not self.shape[1]:
                 raise ValueError(
-                    f"{self.owner}: {name} must be ({str(self.shape)[1:-1]}, ...), as {self.image} is of clips "
-                    f"(B, T > 0, ...); got {f'shape {shape}' if shape else type(value).__name__}"
+                    f"{self.owner}: {name} must be ({self.shape[0]}, {self.shape[1] or 'T > 0'}, ...), as {self.image} "
+                    f"is of clips (B, T, ...); got {f'shape {shape}' if shape else type(value).__name__}"
                 )
             flat[name] = torch.as_tensor(value).flatten(0, 1)
         for name, value in (("camera", camera), ("rotation", flat.get("rotation"))):

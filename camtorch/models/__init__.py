@@ -118,4 +118,4 @@ if not TYPE_CHECKING:  # a checker knows the names, and no others
 
 
 def __dir__() -> list[str]:
-    return [*_FILES, *globals()]
+    return [*(globals() | _FILES)]

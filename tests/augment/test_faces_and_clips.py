@@ -116,6 +116,7 @@ def test_clips_move_as_their_frames_by_one_draw(name, cameras, clips):
     [
         ({"keypoints": torch.zeros(B, 4, 5, 2)}, r"keypoints must be \(2, 3, .*image is of clips.* \(2, 4, 5, 2\)"),
         ({"gaze": torch.zeros(B, 3)}, r"gaze must be"),
+        ({"image": torch.zeros(B, 0, 3, *SIZE)}, r"image must be \(2, T > 0, ...\).* got shape \(2, 0, "),
         ({"boxes": [torch.zeros(1, 4)] * B}, r"boxes must be \(2, 3, ...\).* got list"),
         ({"keypoints": torch.zeros(B, T, 5, 2), "keypoints_valid": torch.ones(B, 5)}, "keypoints_valid must be"),
         ({"camera": camera(3)}, "camera is of 3 clips, image of 2"),
@@ -126,7 +127,7 @@ def test_clips_move_as_their_frames_by_one_draw(name, cameras, clips):
 def test_what_does_not_fit_a_clip_is_told_by_name(fields, says):
     mount = A.RandomMount(camera=camera())
     with pytest.raises(ValueError, match=f"RandomMount: {says}"):
-        mount(image=torch.zeros(B, T, 3, *SIZE), **fields)
+        mount(**{"image": torch.zeros(B, T, 3, *SIZE)} | fields)
     with pytest.raises(ValueError, match="RandomMount: the change is of 3 samples, here are 6"):
         mount.moved_by(mount.change(None, mount.draw(3)), {"image": torch.zeros(B, T, 3, *SIZE)})
     with pytest.raises(ValueError, match=r"FaceNormalizer: image must be \(B, C, H, W\); .* image.flatten\(0, 1\)"):
