@@ -591,8 +591,7 @@ class FrontEnd:
     @property
     def last(self) -> Change | None:
         """The change of the last call: its `source`, `target` and `rotation`."""
-        change: Change | None = getattr(self.augmentation, "last", None)
-        return change
+        return getattr(self.augmentation, "last", None)
 
 
 def check_front_end(owner: str, augmentation: object, camera: object, *kinds: type[SampleTransform]) -> Camera | None:

@@ -144,8 +144,7 @@ class CameraAugmentation(InContainers, GeometricAugmentationBase2D):
         if torch.is_grad_enabled() and any(t.requires_grad for t in inputs):
             return self.augmentation.change(camera, values)
         memo = self._memos[len(values["apply"]) == 1]
-        kept: Change = memo(inputs, (str(self.augmentation.options),), lambda: self.augmentation.change(camera, values))
-        return kept
+        return memo(inputs, (str(self.augmentation.options),), lambda: self.augmentation.change(camera, values))
 
     @property
     def last(self) -> Change | None:

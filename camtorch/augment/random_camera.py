@@ -353,8 +353,7 @@ class RandomCamera(Augmentation):
             middle = base.intrinsics.new_tensor(self.ranges["fov"].middle)
             return joined(_sized(base, size, middle, torch), base.intrinsics, torch).detach()
 
-        kept: Tensor = self._memo(base._tensors, (type(base), base.image_size, size), made)
-        return kept
+        return self._memo(base._tensors, (type(base), base.image_size, size), made)
 
     def _from_source(self, source: Camera, base: Camera, size: tuple[int, int]) -> Tensor:
         """(*B, 4): intrinsics of the lens at most as wide as its like and as images of the source fill all of."""
@@ -365,8 +364,7 @@ class RandomCamera(Augmentation):
             whole = remade(base, intrinsics=intrinsics, image_size=size)
             return scaled(whole, enough(source, whole, None, 1.0)[0]).intrinsics.detach()
 
-        kept: Tensor = self._memo(source._tensors + base._tensors, (type(source), source.image_size, size), narrowed)
-        return kept
+        return self._memo(source._tensors + base._tensors, (type(source), source.image_size, size), narrowed)
 
 
 def _sized(base: Camera, size: tuple[int, int], fov: Any, xp: Any) -> Sequence[Any]:

@@ -236,8 +236,7 @@ def _as_array(value: Any, size: int, name: str, owner: str) -> Array:
     values = as_values(value, name, owner, value.device if isinstance(value, Tensor) else torch.device("cpu"))
     if values.is_meta:
         raise ValueError(f"{owner}: {name} is on the device meta, and has no values")
-    array: Array = values.detach().double().numpy(force=True)
-    return array
+    return values.detach().double().numpy(force=True)
 
 
 def _padded(views: Sequence[Array | None], count: int, size: int) -> Array:

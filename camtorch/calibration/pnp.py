@@ -382,5 +382,4 @@ def _spread(points: Tensor, inliers: Tensor) -> Tensor:
     moments = (weights[..., None] * centred).mT @ centred
     # of eigenvalues a > b > c, (a + b + c)^2 and 2 (a b + b c + c a)
     whole = moments.diagonal(dim1=-2, dim2=-1).sum(-1).square()
-    enough: Tensor = (counts >= _LEAST) & (whole - moments.square().sum((-1, -2)) > 2 * _LINE**2 * whole)
-    return enough
+    return (counts >= _LEAST) & (whole - moments.square().sum((-1, -2)) > 2 * _LINE**2 * whole)

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
 
 from camtorch.evaluate.door import has_tangent, in_graph, in_transform, is_concrete, is_eager, outside_inference
+
+T = TypeVar("T")
 
 
 class Kept:
@@ -27,7 +29,7 @@ class Kept:
         if capacity != 1:
             self.capacity = capacity
 
-    def __call__(self, inputs: Sequence[Tensor], options: tuple[Any, ...], compute: Callable[[], Any]) -> Any:
+    def __call__(self, inputs: Sequence[Tensor], options: tuple[Any, ...], compute: Callable[[], T]) -> T:
         """`compute()` without a graph, or its kept result; it depends on the tensors `inputs` and on `options`."""
         if not is_eager(*inputs) and not all(is_concrete(t) and not has_tangent(t) for t in inputs):
             return compute()
@@ -36,8 +38,9 @@ class Kept:
             if options == entry[0] and all(map(same, inputs, entry[1])):
                 if i:  # a list of its own: another thread may be looking at this one
                     self._kept = [entry, *known[:i], *known[i + 1 :]]
-                self.result = entry[2]
-                return entry[2]
+                found: T = entry[2]
+                self.result = found
+                return found
         if in_transform():  # what a transform makes dies with it
             return compute()
         with torch.inference_mode(False), torch.no_grad():  # what that makes could not be used in a graph later
@@ -46,7 +49,7 @@ class Kept:
         self._kept, self.result = [(options, notes, result), *self._kept[: self.capacity - 1]], result
         return result
 
-    def renew(self, compute: Callable[[], Any]) -> Any:
+    def renew(self, compute: Callable[[], T]) -> T:
         """`compute()`, which is the result from now on."""
         if in_transform():  # what a transform makes dies with it
             return compute()

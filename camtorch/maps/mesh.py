@@ -45,8 +45,7 @@ class Mesh:
         (i, down), (j, across) = (divmod(np.arange(side), self.step) for side in size)
         s, t = (down / self.step)[:, None, None], (across / self.step)[:, None]
         lines = self.nodes[i] * (1 - s) + self.nodes[i + 1] * s
-        between: Floats = lines[:, j] * (1 - t) + lines[:, j + 1] * t
-        return between
+        return lines[:, j] * (1 - t) + lines[:, j + 1] * t
 
 
 class Table(MapFormat):

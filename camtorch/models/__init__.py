@@ -6,6 +6,7 @@ another thing.
 """
 
 import importlib
+import re
 from typing import TYPE_CHECKING, Any
 
 from camtorch.cameras.camera import MODELS
@@ -71,35 +72,14 @@ __all__ = [
     "WoodScape",
 ]
 
-# the file of each class, which is imported when the class, or its key in MODELS, is asked for
-_FILES = {
-    "BrownConrady": "brown_conrady",
-    "Cylindrical": "cylindrical",
-    "Division": "division",
-    "DoubleSphere": "double_sphere",
-    "Equirectangular": "equirectangular",
-    "Equisolid": "equisolid",
-    "EUCM": "eucm",
+# the file of each class, which is imported when the class, or its key in MODELS, is asked for: mostly of its own name
+_FILES = {name: re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name).lower() for name in __all__ if name != "MODELS"} | {
     "FTheta": "f_theta",
     "FThetaSheared": "f_theta",
     "FThetaBackward": "f_theta_backward",
     "FThetaBackwardSheared": "f_theta_backward",
-    "Fisheye62": "fisheye62",
-    "Fisheye624": "fisheye624",
     "FisheyeRadTanThinPrism": "fisheye624",
-    "FOV": "fov",
-    "KannalaBrandt": "kannala_brandt",
-    "LatLon": "lat_lon",
-    "Mei": "mei",
     "OCamCalib": "ocamcalib",
-    "OrthographicFisheye": "orthographic_fisheye",
-    "Pinhole": "pinhole",
-    "Splined": "splined",
-    "Stereographic": "stereographic",
-    "Tabulated": "tabulated",
-    "ThinPrismFisheye": "thin_prism_fisheye",
-    "TransverseCylindrical": "transverse_cylindrical",
-    "UCM": "ucm",
     "WoodScape": "woodscape",
 }
 _KEYS = {"LatLon": "latlon", "FThetaSheared": "f_theta_sheared", "FThetaBackwardSheared": "f_theta_backward_sheared"}

@@ -328,8 +328,7 @@ _radial_inverse = torch.library.custom_op("camtorch::radial_inverse", _found_inv
 def _inverse_of(name: str, k: Tensor, end: float, r2: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     # by the operator in graphs and transforms alone: its first call imports torch's compiler, which takes seconds
     of = _found_inverse if are_known(k, r2) else _radial_inverse
-    found: tuple[Tensor, Tensor, Tensor] = of(name, k, end, r2)
-    return found
+    return of(name, k, end, r2)
 
 
 @_radial_inverse.register_fake

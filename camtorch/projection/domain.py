@@ -114,8 +114,7 @@ class Domain:
         _, lens = self.optics(columns(precise(self.k)))
         assert lens.radial is not None
         edge = self._fold * lens.radial(self._fold * self._fold)
-        edge2: Tensor = (edge * edge).to(self.k.dtype)
-        return edge2
+        return (edge * edge).to(self.k.dtype)
 
     @_per_camera
     def circle2(self) -> Tensor:
@@ -200,8 +199,7 @@ class Domain:
     @cached_property
     def usual2(self) -> Tensor:
         """(C, 1): `inner2`, but no further out than images reach."""
-        inner2: Tensor = self.inner2.clamp(max=self.chart.usual_end(self.k.dtype) ** 2)
-        return inner2
+        return self.inner2.clamp(max=self.chart.usual_end(self.k.dtype) ** 2)
 
     def margin(self, a: Tensor, b: Tensor, t: Tensor) -> Tensor:
         """Positive for the plane points (C, N) in the domain. t: a^2 + b^2."""
@@ -230,5 +228,4 @@ _domains = Kept(24)  # of a batch of eight models before, while and after it cha
 
 def domain_of(model: str, k: Tensor, optics: Optics) -> Domain:
     """The domain of these values: one of the last ones that were asked for, or a new one."""
-    found: Domain = _domains((k,), (model,), lambda: Domain(optics, k.detach().clone()))
-    return found
+    return _domains((k,), (model,), lambda: Domain(optics, k.detach().clone()))

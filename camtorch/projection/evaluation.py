@@ -195,8 +195,7 @@ def kept_cameras(memo: Kept, model: type[CameraLike], intrinsics: Tensor, distor
                 break
         else:
             return cameras
-    made: Cameras = memo.renew(lambda: Cameras(model, intrinsics, distortion))
-    return made
+    return memo.renew(lambda: Cameras(model, intrinsics, distortion))
 
 
 def per_row(parameters: Tensor, lead: torch.Size, rows: Tensor) -> Tensor:

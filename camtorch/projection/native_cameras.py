@@ -345,8 +345,7 @@ def codes(chart: Chart, lens: Lens) -> list[_Part] | None:
 
 def _code(part: Chart | Stage | RadialFactor | type[RadialFactor]) -> int | None:
     # a subclass may have another formula
-    code: int | None = vars(part if isinstance(part, type) else type(part)).get("code")
-    return code
+    return vars(part if isinstance(part, type) else type(part)).get("code")
 
 
 def _chart(chart: Chart) -> _Part | None:

@@ -142,8 +142,7 @@ class _Search:
         if self.is_circle:
             return inside
         before = t < self.domain.limits2[self.camera, azimuth(a, b)]
-        regular_there: Tensor = inside | (before & (regular(self.lens, a, b, to_edge) > 0))
-        return regular_there
+        return inside | (before & (regular(self.lens, a, b, to_edge) > 0))
 
     def radial(self, u: Tensor, v: Tensor) -> Planes2:
         # at the fold itself the root of a rounded fold may lie beyond the rounded limit

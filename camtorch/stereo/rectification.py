@@ -119,8 +119,7 @@ class Rectification(GeometryModule):
 
         inputs = self.extrinsics.rotation, self.extrinsics.translation
         learns = torch.is_grad_enabled() and any(t.requires_grad for t in inputs)
-        warps: tuple[Warp, ...] = make() if learns else self._memo(inputs, (), make)
-        return warps
+        return make() if learns else self._memo(inputs, (), make)
 
     def forward(self, left: Tensor, right: Tensor) -> tuple[Tensor, Tensor]:
         """Both images, (B, C, H, W) each, rectified."""

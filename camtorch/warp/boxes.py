@@ -130,8 +130,7 @@ def corners_of(boxes: Tensor) -> Tensor:
 
 def in_order(boxes: Tensor) -> Tensor:
     """(...) bool: whether boxes (..., 4) have x1 <= x2 and y1 <= y2; those of x, y, width, height seldom do."""
-    ordered: Tensor = (boxes[..., :2] <= boxes[..., 2:]).all(-1)
-    return ordered
+    return (boxes[..., :2] <= boxes[..., 2:]).all(-1)
 
 
 def along_edges(corners: Tensor, samples: int) -> Tensor:
@@ -155,8 +154,7 @@ def within(corners: Tensor, points: Tensor) -> Tensor:
     above = y1 <= y
     crossed = above != above.roll(-1, -1)
     to_the_right = ((x - x1) * down < across * (y - y1)) == (down > 0)
-    inside: Tensor = (crossed & to_the_right).sum(-1) % 2 == 1
-    return inside
+    return (crossed & to_the_right).sum(-1) % 2 == 1
 
 
 def outlines(boxes: Tensor, samples: int = 16) -> Tensor:

@@ -169,8 +169,7 @@ class Reproject(GeometryModule):
         inputs = self.target._tensors
         if torch.is_grad_enabled() and any(t.requires_grad for t in inputs):
             return self.target.rays()
-        kept: tuple[Tensor, Tensor] = self._memo(inputs, self.target._form, self.target.rays)
-        return kept
+        return self._memo(inputs, self.target._form, self.target.rays)
 
     def _shows(
         self, seen: Tensor, far: Tensor, source_depth: Numbers, kind: str, tolerance: float, owner: str

@@ -97,8 +97,7 @@ def positions(warp: CameraPair, route: Route, padding: PaddingMode = "zeros") ->
     (source, target), tolerance = warp._ends, warp.tolerance
     options = source._form, target._form, warp.rotation is None, warp.antialias, tolerance
     memo = warp._memos.setdefault(reach if tolerance else "zeros", Kept())  # what is exact serves all
-    kept: Sampling | Lattice = memo(warp._inputs(), options, lambda: _computed(warp, reach))
-    return kept
+    return memo(warp._inputs(), options, lambda: _computed(warp, reach))
 
 
 def by_pixel(warp: CameraPair) -> Sampling:
@@ -208,5 +207,4 @@ def _constant(warp: CameraPair, padding: PaddingMode) -> Sampling | None:
         if is_pinned:
             return own()
         options = _reach(warp, padding), warp.antialias, warp.tolerance
-        constant: Sampling = warp._constants(warp._inputs(), options, own)
-        return constant
+        return warp._constants(warp._inputs(), options, own)

@@ -40,5 +40,4 @@ def vignetting(camera: Camera, power: float | Tensor = 1.0) -> Tensor:
             f"vignetting: power must be a number, or one for each of {len(cosine)} cameras; got shape "
             f"{tuple(power.shape)}"
         )
-    made: Tensor = cosine ** (4 * power.reshape(-1, 1, 1, 1))
-    return made
+    return cosine ** (4 * power.reshape(-1, 1, 1, 1))
