@@ -2,7 +2,6 @@
 
 import copy
 import math
-import pickle
 
 import pytest
 import torch
@@ -77,19 +76,6 @@ def test_batch_equals_loop(point_dims):
         torch.testing.assert_close(batch(points)[i], single(points[i]))
         torch.testing.assert_close(batch.inverse().matrix()[i], single.inverse().matrix())
         torch.testing.assert_close(batch.compose(batch).matrix()[i], single.compose(single).matrix())
-
-
-def test_is_a_layer_and_a_module():
-    layer = torch.nn.Sequential(pose(ROTATIONS["some"]), ct.KannalaBrandt([300.0, 300.0, 320.0, 240.0]).double())
-    point = torch.tensor([0.1, 0.2, 3.0], dtype=F64)
-    pixels, valid = layer[1].project(layer[0](point))
-    assert bool(valid)
-    fresh = torch.nn.Sequential(pose([0.0, 0.0, 0.0]), ct.KannalaBrandt([1.0, 1.0, 0.0, 0.0]).double())
-    fresh.load_state_dict(layer.state_dict(), strict=True)
-    for one in (layer, copy.deepcopy(layer), pickle.loads(pickle.dumps(layer)), fresh):
-        assert torch.equal(one(point)[0], pixels)
-    with torch.autocast("cpu", dtype=torch.bfloat16):
-        assert torch.equal(layer(point)[0], pixels)
 
 
 def test_a_point_that_is_not_finite_leaves_the_gradient_of_the_pose_alone():

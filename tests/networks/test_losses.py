@@ -42,14 +42,6 @@ def test_gradients_of_angles_are_finite_everywhere():
     torch.testing.assert_close(near.grad[0, :2], torch.tensor([1.0, 0.0]), rtol=1e-3, atol=1e-3)
 
 
-def test_cameras_that_are_the_same_have_no_angle_between_them_and_finite_gradients():
-    predicted, _ = cameras(torch.float32)
-    loss = ct.losses.rays(predicted, predicted.convert(ct.KannalaBrandt).camera.float())
-    assert loss < 1e-6
-    loss.backward()
-    assert bool(torch.isfinite(predicted.intrinsics.grad).all())
-
-
 def test_rays_are_compared_over_the_image():
     predicted, target = cameras()
     found, valid = ct.losses.rays(predicted, target, samples=(6, 8), reduction="none")

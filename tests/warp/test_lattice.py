@@ -5,9 +5,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from cameras import KEYS, drawn, each_kind, make, real
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from cameras import each_kind, make, real
 
 import camtorch as ct
 from camtorch.warp.routes import by_pixel
@@ -74,33 +72,6 @@ def test_hard_warps_keep_their_tolerance(what):
         for of in (case["source"], case["target"])
     )  # fmt: skip
     check(source, target, None if case["rotation"] is None else torch.tensor(case["rotation"], dtype=dtype))
-
-
-SIDES = st.integers(64, 260)
-
-
-@st.composite
-def pairs(draw):
-    """Two cameras of any models, plausible or wild, of any zoom between them, and a rotation."""
-    cameras = []
-    for wild in (draw(st.booleans()), draw(st.booleans())):
-        camera = draw(drawn(draw(st.sampled_from(KEYS)), wild=wild)).double().requires_grad_(False)
-        cameras.append(camera.resize(draw(SIDES), draw(SIDES)))
-    if draw(st.booleans()):
-        height, width = cameras[0].image_size
-        cameras[0] = cameras[0].resize(4 * height, 4 * width)
-    if draw(st.booleans()):
-        cameras[1] = ct.Dewarp(cameras[0]).target.resize(draw(SIDES), draw(SIDES))
-    angles = [torch.tensor(draw(st.floats(-180, 180, width=32))) for _ in range(3)]
-    return *cameras, draw(st.sampled_from([None, ct.augment.mount_rotation(*angles)]))
-
-
-@pytest.mark.slow
-@given(pairs())
-@settings(max_examples=30)
-def test_drawn_warps_keep_their_tolerance(pair):
-    source, target, rotation = pair
-    check(source, target, None if rotation is None else rotation.double())
 
 
 def test_points_of_a_pinned_warp_are_those_of_its_cameras_and_learn_with_them():
