@@ -230,7 +230,9 @@ class RandomCamera(Augmentation):
 
     def _view(self, source: Camera, draw: Mapping[str, Any]) -> View | None:
         """What a draw makes of a single camera as plain numbers; None where it takes more than that."""
-        if self.min_filled or not self._is_usual or isinstance(draw["apply"], Tensor) or source.batch_shape:
+        usual = type(self).new_camera is RandomCamera.new_camera and self.options["tolerance"]  # or by another class
+        usual = usual and not self.options["antialias"] and self.beside_the_camera.isdisjoint(self.ranges)
+        if self.min_filled or not usual or isinstance(draw["apply"], Tensor) or source.batch_shape:
             return None
         if isinstance(source, PANORAMAS) or isinstance(self._held("like"), PANORAMAS):
             return None
@@ -250,12 +252,6 @@ class RandomCamera(Augmentation):
             return None
         turn = self._rotation(values, source.intrinsics, math)
         return View(base, numbers, distortion, size, turn, self.options, before.native, lens)
-
-    @property
-    def _is_usual(self) -> bool:
-        """Whether a camera is all that is drawn, and by this class."""
-        usual = type(self).new_camera is RandomCamera.new_camera and not self.options["antialias"]
-        return usual and bool(self.options["tolerance"]) and self.beside_the_camera.isdisjoint(self.ranges)
 
     def _warp(self, source: Camera, target: Camera, rotation: Tensor | None) -> Warp:
         return Warp.unchecked(source, target, self.options).turned_by(rotation)
@@ -569,8 +565,10 @@ def _jittered_alone(
     fx, fy, cx, cy = intrinsics.tolist()
     given = k.numpy()
     measured, end = _kept(_of_lens, base, k, nominal, size=size)
-    native = None
-    if model.always_defined and _is_within((fx, fy, cx, cy), end, size):
+    native, (height, width) = None, size
+    across, down = max(cx + 0.5, width - 0.5 - cx) / fx, max(cy + 0.5, height - 0.5 - cy) / fy
+    # all of the image is within the circle where the lens ends, with some room; see `covering`
+    if model.always_defined and math.hypot(across, down) <= FOLD * end:
         rim = _border(size, k.dtype)[None]
         steps = np.array([amounts[i % DRAWN] for i in range(len(given))], given.dtype) * measured
         for part in _PARTS:
@@ -584,13 +582,6 @@ def _jittered_alone(
         return k, None
     lens = remade(base, intrinsics=intrinsics, image_size=size).detach()
     return jittered(lens, torch.as_tensor(amounts, dtype=k.dtype), nominal), None
-
-
-def _is_within(numbers: Sequence[float], end: float, size: tuple[int, int]) -> bool:
-    """Whether all of an image is within a circle of a radius in focal lengths, with some room; see `covering`."""
-    (fx, fy, cx, cy), (height, width) = numbers, size
-    across, down = max(cx + 0.5, width - 0.5 - cx) / fx, max(cy + 0.5, height - 0.5 - cy) / fy
-    return math.hypot(across, down) <= FOLD * end
 
 
 @opaque(_shapes)

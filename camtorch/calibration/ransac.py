@@ -62,13 +62,11 @@ class _Lines(NamedTuple):
         near = self.squares(poses, forms) < self.threshold**2
         scale = torch.where(near, 1 / depth, 0.0)
         seen = measured[:, :, :2] * scale[:, :, None]
-        slopes = (self.measures[:, None, :2] - seen[..., None] * self.measures[:, None, 2:]) * scale[
-            :, :, None, :, None
-        ]
+        slopes = self.measures[:, None, :2] - seen[..., None] * self.measures[:, None, 2:]
+        slopes = slopes * scale[:, :, None, :, None]
         turned = self.points[:, None] @ poses[..., :3].mT
-        columns = torch.cat((torch.linalg.cross(turned[:, :, None].expand_as(slopes), slopes), slopes), -1).flatten(
-            2, 3
-        )
+        across = torch.linalg.cross(turned[:, :, None].expand_as(slopes), slopes)
+        columns = torch.cat((across, slopes), -1).flatten(2, 3)
         normal = columns.mT @ columns
         size = normal.diagonal(dim1=-2, dim2=-1)
         normal = normal + torch.diag_embed(1e-9 * size + 1e-300)

@@ -73,15 +73,9 @@ def minimise(
     A step that promises less than rounding does to a cost cannot be judged by the cost: it is the last one, and taken
     unless the cost grows by more than that.
 
-    Args:
-        problem: B of them.
-        state: where to start.
-        tolerance: (B,) the part of a cost that a step has to promise, or the search has ended.
-        tiny: (B,) costs up to which are as good as none.
-        going: (B,) bool, those to search; all if left out.
-        steps: at most so many, those that were tried in vain included.
-        damping: the first one.
-        progress: called after each step with its number and the costs.
+    Of B problems `tolerance` (B,) is the part of a cost that a step has to promise, or the search has ended; costs up
+    to `tiny` (B,) are as good as none; `going` (B,) bool are those to search, all if left out. `steps` counts those
+    that were tried in vain; `damping` is the first one; `progress` gets the number of each step and the costs.
     """
     device = state[0].device
     every = torch.arange(len(state[0]), device=device)

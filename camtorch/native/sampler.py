@@ -56,21 +56,14 @@ def sample(
 ) -> None:
     """Write the samples of images into `result`, at the positions of a grid or of a lattice.
 
-    All tensors are on the CPU and without a graph; images and results may have any strides.
-
-    Args:
-        images: (B, C, H, W), of a dtype that `takes` knows.
-        result: (B, C, h, w), of the same dtype.
-        mode: "nearest", "bilinear" or "bicubic".
-        padding: "zeros", "border" or "reflection".
-        fill: C values of pixels that show nothing, which "zeros" blends in; integers are those of integer images.
-        grid: (B or 1, h, w, 2) of float32 or float64: positions as of `grid_sample`.
-        mapped: (B or 1, h, w) bool: which of them there are; None where positions far outside say that there is none.
-        nodes: (B or 1, 2, n + 5, m + 5) of float32, the last two dims without gaps: positions at every eighth pixel,
-            from the one at (-16, -16) on.
-        cells: (B or 1, n, m) int32, contiguous: `EMPTY`, `CUBIC`, or the cell's place in `exact`.
-        exact: (2, K, 8, 8) of float32, contiguous: positions, NaN where there is none.
-        later: gets what is to be done, if this is to be done by `finish`, together with other images.
+    All tensors are on the CPU and without a graph. Images (B, C, H, W) and results (B, C, h, w) are of one dtype, which
+    `takes` knows, and may have any strides. `fill` has C values, of pixels that show nothing, which "zeros" blends in;
+    integers are those of integer images. Of a `grid` (B or 1, h, w, 2) of float32 or float64, positions as of
+    `grid_sample`, `mapped` (B or 1, h, w) bool says which there are; None where positions far outside say that there is
+    none. Of a lattice `nodes` (B or 1, 2, n + 5, m + 5) of float32, the last two dims without gaps, are the positions
+    at every eighth pixel, from the one at (-16, -16) on; `cells` (B or 1, n, m) int32, contiguous, are `EMPTY`, `CUBIC`
+    or the cell's place in `exact`, (2, K, 8, 8) of float32, contiguous: positions, NaN where there is none. `later`
+    gets what is to be done, if this is to be done by `finish`, together with other images.
     """
     if library() is None or 0 in result.shape:
         return
@@ -195,20 +188,12 @@ def classify(
     tolerance: float,
     padding: str,
 ) -> tuple[Tensor, int]:
-    """Which cells of a lattice are `EMPTY`, `CUBIC`, `DOUBT` or `TODO`. There is a library.
+    """Which cells (B, n, m) of a lattice are `EMPTY`, `CUBIC`, `DOUBT` or `TODO`, int32; and how many are `TODO` or in
+    `DOUBT` in the image with the most of them. There is a library.
 
-    Args:
-        nodes: (B, 2, n + 5, m + 5) of float32, positions; the last two dims without gaps.
-        mapped: (B, n + 5, m + 5) bool, likewise.
-        rim: (B, 2 (w + h)) bool, contiguous: which pixels of the target's rim are mapped: those of the top row, the
-            bottom row, the left column, the right column.
-        size: (h, w) of the target.
-        source: (height, width) of the source.
-        tolerance: in pixels of the source.
-        padding: "zeros", "border" or "reflection", of what is to be sampled.
-
-    Returns:
-        (B, n, m) int32, contiguous; and how many cells are `TODO` or in `DOUBT` in the image with the most of them.
+    Positions are `nodes` (B, 2, n + 5, m + 5) of float32 and `mapped` (B, n + 5, m + 5) bool, the last two dims without
+    gaps; `rim` (B, 2 (w + h)) bool, contiguous, says which pixels are mapped of the target's top row, bottom row, left
+    column and right column. `size` (h, w) is that of the target; the tolerance is in pixels of the source.
     """
     native = library()
     assert native is not None  # who calls has looked

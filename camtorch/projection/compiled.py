@@ -47,19 +47,8 @@ def project(native: Native, points: Tensor) -> tuple[Tensor, Tensor]:
     cameras, count, _ = points.shape
     pixels = _empty((2, cameras, count), native.dtype)
     valid = torch.empty(cameras, count, dtype=torch.bool, device="cpu")
-    rows = (
-        points.data_ptr(),
-        *points.stride(),
-        pixels.data_ptr(),
-        count,
-        1,
-        cameras * count,
-        valid.data_ptr(),
-        0,
-        *_NO_ROWS,
-        0,
-    )
-    _call_and_follow(native, cameras, count, PROJECT, rows)
+    places = points.data_ptr(), *points.stride(), pixels.data_ptr(), count, 1, cameras * count, valid.data_ptr()
+    _call_and_follow(native, cameras, count, PROJECT, (*places, 0, *_NO_ROWS, 0))
     return pixels, valid
 
 

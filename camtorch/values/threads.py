@@ -29,14 +29,8 @@ def spread(work: Callable[[], object], threads: int) -> None:
     must not hold the GIL, and in a worker it finds the state of torch that a new thread has.
 
     Who is needed for nothing is not waited for: a worker that has not begun when this thread's own run ends, because it
-    found no core, does not begin any more.
-
-    Args:
-        work: called once on each thread.
-        threads: how many at most, this one included.
-
-    Raises:
-        BaseException: the first one that any run raised, after all have ended.
+    found no core, does not begin any more. `threads` are those at most, this one included; the first exception that any
+    run raised is raised after all have ended.
     """
     if threads <= 1 or sys.is_finalizing():  # a new thread would never begin
         work()

@@ -52,12 +52,7 @@ def _positions(
 
 
 def takes(images: Tensor, inputs: Sequence[Tensor]) -> bool:
-    """Whether the operator makes the images of compiled code: on the CPU and without a graph.
-
-    Args:
-        images: of the source.
-        inputs: all that the positions depend on.
-    """
+    """Whether the operator makes images whose positions depend on `inputs` in compiled code: on the CPU, no graph."""
     return all(t.is_cpu and not (t.requires_grad and torch.is_grad_enabled()) for t in (images, *inputs))
 
 

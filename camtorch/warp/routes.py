@@ -35,16 +35,12 @@ _STRIP = 1 << 21  # pixels of such a strip
 
 
 def route_of(warp: CameraPair, images: Tensor | None = None) -> Route:
-    """The route of a call; the lattice and the native sampler are chosen below, by `locate` and `render`.
+    """The route of images, or of positions alone; the lattice and the sampler are chosen by `locate` and `render`.
 
     * "operator": compiled code calls one operator, and traces nothing of it;
     * "strips": the grid would be too long for memory, and is made part by part;
     * "graph": something learns, so that positions are computed anew with their graph;
     * "kept": positions without a graph, pinned or kept until an input changes.
-
-    Args:
-        warp: the warp that is called.
-        images: to be warped; None where positions alone are asked for.
     """
     learns = warp._pinned is None and keeps_graph(*warp._inputs())
     if images is not None:
