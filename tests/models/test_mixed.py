@@ -185,15 +185,6 @@ def test_it_is_a_module():
     assert mixed.to("meta").project(points.to("meta"))[0].shape == (6, 3, 2)
 
 
-def test_predicted_cameras_inside():
-    shift, points = torch.zeros(4, requires_grad=True), torch.rand(4, 5, 3) + 0.5
-    batch = ct.Pinhole((50 + shift).expand(2, 4), image_size=SIZE)
-    mixed = ct.Mixed([models(learns=False)[4], batch, ct.KannalaBrandt(40 + shift, image_size=SIZE)])
-    (found,) = torch.autograd.grad(mixed.project(points)[0].sum(), shift, retain_graph=True)
-    expected = batch.project(points[1:3])[0].sum() + mixed[3].project(points[3])[0].sum()
-    torch.testing.assert_close(found, torch.autograd.grad(expected, shift)[0])
-
-
 @pytest.mark.slow
 def test_compiled_where_the_groups_are_fixed():
     mixed, images = ct.Mixed([models(learns=False)[i] for i in (4, 0, 5)]), torch.rand(3, 3, *SIZE)
