@@ -56,10 +56,11 @@ class Transform(FrontEnd, A.DualTransform):
     _targets = (Targets.IMAGE, Targets.MASK, Targets.BBOXES, Targets.KEYPOINTS)
     augmentation: Augmentation
     camera: Camera | None
+    _name = _OWNER
 
     def __init__(self, augmentation: Augmentation, camera: Camera | None = None, p: float | None = None):
-        self.camera = check_front_end(_OWNER, augmentation, camera)
-        self.augmentation, self._arrays = augmentation, arrays.Transform(augmentation)
+        check_front_end(_OWNER, augmentation)
+        self.augmentation, self.camera, self._arrays = augmentation, camera, arrays.Transform(augmentation)
         super().__init__(p=augmentation.p if p is None else p)
 
     @property

@@ -15,7 +15,7 @@ from typing_extensions import Unpack
 
 from camtorch.augment.change import Change, Part, alone, as_one, by_kinds
 from camtorch.augment.filling import enough, filled, scaled
-from camtorch.augment.sample import Named, Sample, SampleOptions, SampleTransform, Unknown, fixed_copy, on_samples
+from camtorch.augment.sample import KeepsCamera, Named, Sample, SampleOptions, SampleTransform, Unknown, on_samples
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.mixed import Mixed
 from camtorch.evaluate.door import may_look
@@ -583,7 +583,7 @@ def _are_alike(value: Any) -> bool:
 # -- for front ends, which hold an augmentation and the camera of their images
 
 
-class FrontEnd:
+class FrontEnd(KeepsCamera):
     """What takes the samples of a library to an augmentation."""
 
     augmentation: Any
@@ -594,11 +594,10 @@ class FrontEnd:
         return getattr(self.augmentation, "last", None)
 
 
-def check_front_end(owner: str, augmentation: object, camera: object, *kinds: type[SampleTransform]) -> Camera | None:
-    """Return a fixed copy of the camera, or None; a TypeError if `augmentation` is none, nor of other `kinds`."""
+def check_front_end(owner: str, augmentation: object, *kinds: type[SampleTransform]) -> None:
+    """Raise a TypeError if `augmentation` is none, nor of other `kinds`."""
     if not isinstance(augmentation, kinds or Augmentation):
         raise TypeError(f"{owner}: augmentation must be an Augmentation; got {type(augmentation).__name__}")
-    return fixed_copy(camera, owner)
 
 
 def check_single(

@@ -25,7 +25,7 @@ from torch.nn.utils.parametrize import type_before_parametrizations
 from camtorch import augment
 from camtorch.augment.augmentation import Augmentation
 from camtorch.augment.change import Change
-from camtorch.augment.sample import OWN, Sample, Single, detached, kind_of, on_samples
+from camtorch.augment.sample import OWN, KeepsCamera, Sample, Single, detached, kind_of, on_samples
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.mixed import collate_cameras
 from camtorch.evaluate.private import pytree
@@ -43,7 +43,7 @@ KIND = "source_kind"
 _NUMBERS = "source_intrinsics", "source_distortion"
 
 
-class InContainers:
+class InContainers(KeepsCamera):
     """An augmentation that moves the fields of dicts which kornia's containers do not know."""
 
     augmentation: Augmentation

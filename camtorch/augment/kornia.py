@@ -27,11 +27,11 @@ from camtorch.augment.augmentation import Augmentation, check_front_end, check_s
 from camtorch.augment.change import Change
 from camtorch.augment.containers import KIND, InContainers, Params, camera_of, kind_of_camera, with_boxes, with_cameras
 from camtorch.augment.presets import PresetName
-from camtorch.augment.sample import detached, fixed_copy, on_samples
+from camtorch.augment.sample import detached, on_samples
 from camtorch.cameras.camera import Camera
 from camtorch.evaluate.kept import Kept
 from camtorch.evaluate.known import known_false
-from camtorch.values.arguments import as_part
+from camtorch.values.arguments import as_part, no_camera
 from camtorch.values.dtypes import narrow, widen
 from camtorch.warp.sampling import Mode
 
@@ -84,10 +84,10 @@ class CameraAugmentation(InContainers, GeometricAugmentationBase2D):
         keepdim: bool = False,
     ):
         name = type(self).__name__
-        camera = check_front_end(name, augmentation, camera)
-        camera = fixed_copy(augmentation.camera, name) if camera is None else camera
-        if camera is None:
-            raise TypeError(f"{name}: camera must be the Camera of the images; got NoneType")
+        check_front_end(name, augmentation)
+        camera = augmentation.camera if camera is None else camera
+        if not isinstance(camera, Camera):
+            raise TypeError(f"{name}: camera must be the Camera of the images; got {no_camera(camera)}")
         own_size = check_single(name, camera, (), ". with_cameras gives every sample its own")
         super().__init__(
             p=augmentation.p if p is None else as_part(p, "p", name, "probability"),

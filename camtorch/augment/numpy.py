@@ -53,9 +53,11 @@ class Transform(FrontEnd):
         TypeError: If it is no augmentation, or the camera is none.
     """
 
+    _name = _OWNER
+
     def __init__(self, augmentation: Augmentation | FaceNormalizer, camera: Camera | None = None):
-        self.camera = check_front_end(_OWNER, augmentation, camera, Augmentation, FaceNormalizer)
-        self.augmentation = augmentation
+        check_front_end(_OWNER, augmentation, Augmentation, FaceNormalizer)
+        self.augmentation, self.camera = augmentation, camera
 
     def __call__(
         self,

@@ -19,7 +19,7 @@ from camtorch.augment.augmentation import Augmentation, FilledOptions, Range, as
 from camtorch.augment.change import Part, View
 from camtorch.augment.filling import enough, scaled
 from camtorch.augment.presets import PRESETS, PresetName
-from camtorch.augment.sample import Named, fixed_copy
+from camtorch.augment.sample import Named
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.numbers import joined, split
 from camtorch.cameras.opaque import CameraNumbers, opaque
@@ -505,7 +505,7 @@ def _as_like(like: Camera | str | None, owner: str) -> Camera | None:
     if like is None or isinstance(like, Camera):
         if like is not None and like.batch_shape:
             raise ValueError(f"{owner}: like must be a single camera; got batch dims {tuple(like.batch_shape)}")
-        return fixed_copy(like, owner)
+        return like
     if isinstance(like, str) and like in PRESETS:
         return PRESETS[like].camera()
     if isinstance(like, str) and like in MODELS:

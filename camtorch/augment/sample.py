@@ -327,14 +327,19 @@ class Unknown(Pinhole):
         return cls(torch.tensor([1.0, 1.0, 0.0, 0.0]), image_size=size).requires_grad_(False)
 
 
-def fixed_copy(camera: object, owner: str) -> Camera | None:
-    """Return a copy of the `camera` of an `owner`, which does not learn with it; None of None."""
-    if camera is not None and not isinstance(camera, Camera):
-        raise TypeError(f"{owner}: camera must be a Camera; got {no_camera(camera)}")
-    own = copy.deepcopy(camera)
-    for tensor in () if own is None else (*own.parameters(), *own.buffers()):
-        tensor.requires_grad_(False)
-    return own
+class KeepsCamera:
+    """Keeps a copy of a `camera`, and of one that is `like` others, whenever it is set; the copy does not learn."""
+
+    _name: str = ""  # in errors; empty: that of the class
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if name == "camera" and not (value is None or isinstance(value, Camera)):
+            raise TypeError(f"{self._name or type(self).__name__}: camera must be a Camera; got {no_camera(value)}")
+        if name in ("camera", "like") and isinstance(value, Camera):
+            value = copy.deepcopy(value)
+            for tensor in (*value.parameters(), *value.buffers()):
+                tensor.requires_grad_(False)
+        super().__setattr__(name, value)
 
 
 def on_samples(method: Callable[P, R]) -> Callable[P, R]:
@@ -393,7 +398,7 @@ def _keywords(transform: type) -> dict[str, None]:
     return names
 
 
-class SampleTransform(nn.Module):
+class SampleTransform(KeepsCamera, nn.Module):
     """Moves all fields of a sample by one change of cameras. See `Augmentation` and `FaceNormalizer`."""
 
     other_words: ClassVar[Mapping[str, str]] = {}
@@ -414,7 +419,7 @@ class SampleTransform(nn.Module):
     ):
         super().__init__()
         self._name = type(self).__name__
-        self.camera = fixed_copy(camera, self._name)
+        self.camera = camera
         self.fields: dict[str, str] = dict(as_mapping(fields, "fields", self._name, "{'lidar': 'points'}"))
         wrong = {k: v for k, v in self.fields.items() if v not in (*KINDS, KEEP)}
         if wrong:

@@ -80,11 +80,12 @@ class Transform(FrontEnd, v2.Transform):
 
     camera: Camera | None
     valid: bool
+    _name = _OWNER
 
     def __init__(self, augmentation: Augmentation, camera: Camera | None = None, *, valid: bool = False):
         super().__init__()
-        self.camera, self.valid = check_front_end(_OWNER, augmentation, camera), bool(valid)
-        self.augmentation = augmentation
+        check_front_end(_OWNER, augmentation)
+        self.augmentation, self.camera, self.valid = augmentation, camera, bool(valid)
 
     @on_samples
     def forward(self, *inputs: Any) -> Any:

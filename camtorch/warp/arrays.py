@@ -71,6 +71,8 @@ def as_planes_of(image: Any, name: str, owner: str) -> tuple[Tensor, Callable[[T
         made = as_array(planes, array)
         if mode is None:
             return made
-        return importlib.import_module("PIL.Image").frombuffer(mode, made.shape[1::-1], made, "raw", mode, 0, 1)
+        new = importlib.import_module("PIL.Image").frombuffer(mode, made.shape[1::-1], made, "raw", mode, 0, 1)
+        new.info |= image.info  # as Pillow's own transforms do: Exif, with the orientation
+        return new
 
     return as_planes(array, name, owner), restored

@@ -291,8 +291,9 @@ def test_plain_tensors_and_pil_images(vision):
     assert label == 5
     for mode in ("RGB", "L", "RGBA", "CMYK", "F", "I;16"):
         source = PIL.Image.new(mode, SIZE[::-1], 9 if mode in ("L", "F", "I;16") else (9,) * len(mode))
+        source.info["exif"] = b"turned"
         moved, label = transform(source, 5)
-        assert (moved.mode, moved.size, label) == (mode, source.size, 5)
+        assert (moved.mode, moved.size, moved.info, label) == (mode, source.size, source.info, 5)
         assert np.asarray(moved).max() > 5
     assert not transform(plain.float()).requires_grad
     assert transform(plain.float().requires_grad_()).requires_grad

@@ -23,11 +23,13 @@ BATCHES = {
     for one in (*CLASSES, ct.CanonicalCamera)
     if one not in (augment.Augmentation, augment.Edit)
 }
+BATCHES |= {"set later": lambda lens: setattr(one := augment.RandomMount(), "camera", lens) or one}
 BATCHES |= {"part": lambda lens: augment.Compose([augment.RandomMount(camera=lens)])}
 SINGLE = {
     "like": lambda lens: augment.RandomCamera(lens, camera=lens),
     "kornia": lambda lens: adapter.RandomLens(lens, lens),
     "kornia's part": lambda lens: adapter.CameraAugmentation(augment.RandomMount(camera=lens)),
+    "kornia, set later": lambda lens: setattr(one := adapter.RandomMount(lens_of()), "camera", lens) or one,
     "torchvision": lambda lens: importlib.import_module("camtorch.augment.torchvision").Transform(MOUNT, lens),
 }
 
