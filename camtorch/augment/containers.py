@@ -25,7 +25,7 @@ from torch.nn.utils.parametrize import type_before_parametrizations
 from camtorch import augment
 from camtorch.augment.augmentation import Augmentation
 from camtorch.augment.change import Change
-from camtorch.augment.sample import OWN, KeepsCamera, Sample, Single, detached, kind_of, on_samples
+from camtorch.augment.sample import OWN, KeepsCamera, Sample, Single, detached, is_text, kind_of, on_samples
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.mixed import collate_cameras
 from camtorch.evaluate.private import pytree
@@ -157,18 +157,19 @@ def kind_of_camera(camera: Camera) -> list[int]:
 # -- dicts
 
 
-def _fields(container: Any, sample: Sample, ours: list[InContainers]) -> tuple[Sample, dict[str, str]]:
+def _fields(container: Any, sample: Sample, ours: list[InContainers], single: bool) -> tuple[Sample, dict[str, str]]:
     """Return the fields of a dict that kornia does not know and that move, and their kinds."""
     owner, own = type(container).__name__, {n: k for one in ours for n, k in one.augmentation.fields.items()}
     tables = {n for one in ours if one.augmentation.mirroring for n in one.augmentation.mirroring.by_name}
-    given = {name: sample[name] for name in container._read_datakeys_from_dict([*sample])[1] if name not in OWN}
+    theirs = {name: container._read_datakeys_from_dict((name,))[0] for name in sample if name not in OWN}
+    given = {name: sample[name] for name, keys in theirs.items() if keys in ([], [DataKey.CLASS], [DataKey.LABEL])}
     if flags := [name for name in sample if name.endswith("_valid") and name not in given]:
         raise ValueError(f"{owner}: kornia would not read {flags[0]} as flags. Use the augmentation's keypoints_valid")
-    kinds = {n: kind for n, v in given.items() if v is not None and (kind := kind_of(n, v, own, owner)) is not None}
+    kinds = {n: kind for n, v in given.items() if v is not None and (kind := kind_of(n, v, own, owner, single))}
     names = [*kinds, *(["camera"] if sample.get("camera") is not None else [])]
     known = InContainers, IntensityAugmentationBase2D
-    theirs = (m for m in container.modules() if isinstance(m, _BasicAugmentationBase) and not isinstance(m, known))
-    for other in (type(module).__name__ for module in theirs if names):
+    others = (m for m in container.modules() if isinstance(m, _BasicAugmentationBase) and not isinstance(m, known))
+    for other in (type(module).__name__ for module in others if names):
         name = next((name for name in (other, other.removeprefix("Random")) if hasattr(augment, name)), None)
         how = f"camtorch.augment.kornia.{name}, which moves" if name else "augmentations of camtorch alone, which move"
         raise ValueError(f"{owner}: {other} of kornia would leave {', '.join(names)} behind. Use {how} everything")
@@ -182,9 +183,12 @@ def _with_fields(
     if len(args) != 1 or not isinstance(args[0], dict):
         return call(self, *args, params=params, data_keys=data_keys)
     ours = [one for one in self.modules() if isinstance(one, InContainers)]
-    sample, camera = args[0], args[0].get("camera")
-    fields, kinds = _fields(self, sample, ours)
+    texts = {name: value for name, value in args[0].items() if is_text(value)}  # image_path is no image
+    sample, camera = {n: value for n, value in args[0].items() if n not in texts}, args[0].get("camera")
     image = next((v for n, v in sample.items() if self._read_datakeys_from_dict((n,))[0] == [DataKey.INPUT]), None)
+    alone = image is not None and image.ndim < 4
+    fields, kinds = _fields(self, sample, ours, alone)
+    fields = Single(fields) if alone else fields
     if camera is not None and len(ours) > 1:
         raise ValueError(
             f"{type(self).__name__}: a camera must be that of one camera augmentation; got {len(ours)}. "
@@ -196,8 +200,6 @@ def _with_fields(
             params = self.forward_parameters(self.autofill_dim(image, dim_range=dims)[1])
         params = with_cameras(params, camera)
     result = call(self, sample, params=params)
-    alone = image is not None and image.ndim < 4
-    fields = Single(fields) if alone else fields
     applied = [*_parts(self._params if params is None else params, self)]
     for one, own in reversed(applied) if back else applied:
         if not isinstance(one, InContainers):
@@ -207,7 +209,7 @@ def _with_fields(
             cameras = one.change(own).source if back else one.change(own).target
             cameras = (cameras[0] if alone else cameras).clone()
             result["camera"] = list(cameras) if isinstance(camera, list) else cameras
-    return {**result, **fields}
+    return {**result, **fields, **texts}
 
 
 def _lost_stay_lost(call: Callable[..., Boxes], self: Any, boxes: Any, key: DataKey) -> Boxes:

@@ -113,7 +113,7 @@ class Transform(FrontEnd):
 
     def _kind(self, name: str, value: Any, sample: Mapping[str, Any]) -> str | None:
         """Return the kind of a field, or of the field whose validity this is; None if it stays."""
-        kind = kind_of(name, value, self.augmentation.fields, _OWNER)
+        kind = kind_of(name, value, self.augmentation.fields, _OWNER, single=True)
         if kind is None and name.endswith(_VALID):
             name = name.removesuffix(_VALID)
             kind = kind_of(name, sample.get(name), self.augmentation.fields, _OWNER)

@@ -168,7 +168,7 @@ OWN = ("camera", "source_camera", "source_rotation", "scale")  # these come with
 _RANKS = {kind: (not field.decides, i) for i, (kind, field) in enumerate(KINDS.items())}
 
 
-def kind_of(name: str, value: object, own: Mapping[str, str], owner: str) -> str | None:
+def kind_of(name: str, value: object, own: Mapping[str, str], owner: str, single: bool = False) -> str | None:
     """Return the key in `KINDS` of a field, None if it stays; numbers of an unknown name may be geometry: an error."""
     if not isinstance(name, str):
         raise TypeError(f"{owner}: a sample must have strings for names; got {name!r:.80}")
@@ -178,10 +178,10 @@ def kind_of(name: str, value: object, own: Mapping[str, str], owner: str) -> str
         return None
     base = name if name in KINDS else _ALIASES.get(name)
     # no image_path, mask_id, of one sample or of a batch
-    if base is None and isinstance(value, (Tensor, np.ndarray, list, tuple)) and not _is_text(value):
+    if base is None and isinstance(value, (Tensor, np.ndarray, list, tuple)) and not is_text(value):
         begins = sorted((k for k in KINDS if name.startswith(k + "_")), key=len)  # compilers know no max by a key
         base = begins[-1] if begins else None
-    if base is None and _may_be_geometry(name, value):
+    if base is None and _may_be_geometry(name, value, single):
         if isinstance(value, Mapping):
             raise ValueError(
                 f"{owner}: {name!r} holds real numbers in a dict, and fields move only at the top of samples. Put them "
@@ -196,30 +196,36 @@ def kind_of(name: str, value: object, own: Mapping[str, str], owner: str) -> str
     return base
 
 
-def _is_text(value: Any) -> bool:
-    texts = value.flat if isinstance(value, np.ndarray) else value
-    return not isinstance(value, Tensor) and len(value) > 0 and all(isinstance(text, (str, bytes)) for text in texts)
+def is_text(value: Any) -> bool:
+    """Whether it holds strings, at least one and in lists of any depth, and nothing else."""
+    texts = pytree.tree_leaves(value.tolist() if isinstance(value, np.ndarray) and value.dtype.kind in "OSU" else value)
+    return len(texts) > 0 and all(isinstance(text, (str, bytes)) for text in texts)
 
 
+@functools.lru_cache(64)
 def _close_to(name: str) -> list[str]:
     return ["mask"] if name.startswith("seg") else difflib.get_close_matches(name, KINDS, 1)
 
 
-def _may_be_geometry(name: str, value: object) -> bool:
-    """Whether it holds real numbers, or whole ones of more than a row a sample or with such a name; not one alone."""
+def _may_be_geometry(name: str, value: Any, single: bool, above: int = 0) -> bool:
+    """Whether it holds real numbers, or whole ones of more than a row a sample or with such a name; not one alone.
+
+    above: the number of lists around it, which count as dims.
+    """
     if isinstance(value, Mapping):
-        return any(_may_be_geometry(str(key), item) for key, item in value.items())
+        return any(_may_be_geometry(str(key), item, single) for key, item in value.items())
+    if isinstance(value, np.ndarray) and value.dtype == object:
+        value = value.tolist()
     if isinstance(value, (list, tuple)):
-        return any(isinstance(item, float) or _may_be_geometry(name, item) for item in value)
-    if isinstance(value, np.ndarray):
-        if value.dtype == object:
-            return _may_be_geometry(name, value.tolist())
-        reals = bool(np.issubdtype(value.dtype, np.floating))
+        return any(_may_be_geometry(name, item, single, above + 1) for item in value)
+    if isinstance(value, (np.ndarray, np.generic)):
+        whole, known = value.dtype.kind in "iub", value.dtype.kind in "iubfcV"
     elif isinstance(value, Tensor):
-        reals = value.dtype.is_floating_point
+        whole, known = not (value.is_floating_point() or value.is_complex()), True
     else:
-        return False
-    return value.ndim > (0 if reals else 2) or (value.ndim == 2 and bool(_close_to(name)))
+        whole, known = not isinstance(value, float), isinstance(value, (int, float))
+    dims, row = above + getattr(value, "ndim", 0), 1 if single else 2
+    return known and (dims > (row if whole else 0) or (dims == row and bool(_close_to(name))))
 
 
 def moves(kind: str, value: Tensor) -> Move:
@@ -508,13 +514,13 @@ class SampleTransform(KeepsCamera, nn.Module):
         shape = tuple(given[images[0]].shape[:2])
         return Clips(sample, [name for name in given if name in own], shape, images[0], self._name)
 
-    def _sorted(self, sample: Sample, fields: Mapping[str, str]) -> Named:
+    def _sorted(self, sample: Sample, fields: Mapping[str, str], single: bool = False) -> Named:
         """The fields that move."""
         named: Named = {}
         for name, value in sample.items():
             if name in OWN or value is None:
                 continue
-            found = kind_of(name, value, fields, self._name)
+            found = kind_of(name, value, fields, self._name, single)
             if found is not None:
                 if not isinstance(value, (list, tuple)):
                     value = as_tensor(value, name, found, self._name)
@@ -576,6 +582,8 @@ class SampleTransform(KeepsCamera, nn.Module):
             raise ValueError(f"{self._name}: the sample has no field that moves; known are {', '.join(KINDS)}")
         camera = self._camera_of(named) if camera is None else camera
         batched = not isinstance(sample, Single) and is_batch(named, camera)
+        if not batched:
+            self._sorted(sample, fields, single=True)  # raises for whole numbers of more than a row
         count = -1
         for name, (found, value) in named.items():
             several = isinstance(value, (list, tuple))

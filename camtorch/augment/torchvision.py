@@ -134,14 +134,17 @@ class Transform(FrontEnd, v2.Transform):
         """Return the kind of each leaf that moves, and None for those that may be flags or orders of landmarks."""
         fields, problems = self.augmentation.fields, dict[int, ValueError]()
         kinds: dict[int, str | None] = {}
+        single = all(getattr(leaf, "ndim", 0) < 4 for _, leaf in flat)  # images of batches have as many dims
         for i, ((path, leaf), name) in enumerate(zip(flat, names, strict=True)):
             if leaf is None or isinstance(leaf, Camera) or name in OWN:
                 continue
             # a list of plain numbers is looked at as one value
-            listed = len(path) > 1 and isinstance(path[-1], pytree.SequenceKey) and isinstance(leaf, (int, float))
+            whole_path = (d for d, step in enumerate(reversed(path)) if not isinstance(step, pytree.SequenceKey))
+            lists = 0 if getattr(leaf, "ndim", 0) else next(whole_path, len(path) - 1)
+            value = functools.reduce(lambda held, _: [held], range(lists), leaf)
             kinds[i] = next((kind for of, kind in _KINDS.items() if isinstance(leaf, of)), None)
             try:
-                kinds[i] = kinds[i] or kind_of(name, [leaf] if listed else leaf, fields, _OWNER)
+                kinds[i] = kinds[i] or kind_of(name, value, fields, _OWNER, single)
             except ValueError as error:
                 problems[i] = error
         if IMAGES[0] not in kinds.values():

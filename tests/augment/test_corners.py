@@ -139,12 +139,12 @@ def test_fields_that_only_sound_like_geometry(camera):
     sample = {
         "keypoints": torch.zeros(1, 1, 2),
         "image_path": "a.png",
-        "mask_path": ["a"],
+        "mask_path": [("a",), []],
         "mask_id": 7,
         "boxes_note": None,
     }
     out = mount(sample)
-    assert (out["image_path"], out["mask_path"], out["mask_id"]) == ("a.png", ["a"], 7)
+    assert (out["image_path"], out["mask_path"], out["mask_id"]) == ("a.png", [("a",), []], 7)
     for hidden in (
         *({"meta": {"boxes": torch.zeros(1, 4)}}, {"meta": {"deeper": {"mask": torch.ones(1, 3, 4).long()}}}),
         *({"scores": [0.5, 0.25]}, {"views": [torch.ones(3, 4, 5, dtype=torch.uint8)]}, {"image_meta": {"k": [1.5]}}),

@@ -60,7 +60,8 @@ def sample(*batch):
 
 
 def as_arrays(fields):
-    return {n: v.movedim(-3, -1).numpy() if n in IMAGES else v.numpy() for n, v in fields.items()}
+    fields = {n: v.movedim(-3, -1) if n in IMAGES else v for n, v in fields.items()}
+    return {n: v.numpy() if isinstance(v, torch.Tensor) else v for n, v in fields.items()}
 
 
 def as_tensors(out):
@@ -102,7 +103,7 @@ def by_kornia(augment, lens, fields, _):
     single = fields["image"].ndim == 3
     pipeline = K.AugmentationSequential(adapter.CameraAugmentation(augment, lens), data_keys=None, keepdim=single)
     corners = fields["boxes"][..., [0, 1, 2, 1, 2, 3, 0, 3]].unflatten(-1, (4, 2))
-    out = pipeline({"label": 3, "bbox": corners, **fields})
+    out = pipeline({"label": 3, "image_path": [["a"], []], "bbox": corners, **fields})
     torch.testing.assert_close(out["bbox"][..., [0, 2], :].flatten(-2), out["boxes"])
     return out, {}
 
@@ -159,6 +160,13 @@ def test_numbers_of_unknown_names_are_refused(front_end, monkeypatch):
     fields = sample(*batch) | {"lidar": sample(*batch)["points"]}
     with pytest.raises(ValueError, match=r"'lidar' holds real numbers.*fields=\{'lidar': KIND\}"):
         both(front_end, RandomMount(), camera(), fields, monkeypatch)
+    for name, hidden in {
+        "keypts": [[10, 20], [30, 40]],
+        "eyes": [np.float32(3)] * 2,
+        "label_map": torch.ones(*batch, *SIZE, dtype=torch.uint8),
+    }.items():
+        with pytest.raises(ValueError, match=f"'{name}' holds real numbers"):
+            both(front_end, RandomMount(), camera(), sample(*batch) | {name: hidden}, monkeypatch)
     for kind in ("keep", "points"):
         moved, want = both(front_end, RandomMount(fields={"lidar": kind}), camera(), fields, monkeypatch)
         assert torch.equal(moved["lidar"], want["lidar"])
