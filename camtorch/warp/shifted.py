@@ -158,13 +158,12 @@ class ShiftedWarp(Warp):
 
 def _between(distance: Tensor, pixels: Tensor) -> Tensor:
     """Return distances (B, *N) at pixels of maps (B, H, W), 0 if unknown: linear, between surfaces the nearest."""
-    height, width = distance.shape[1:]
-    u, v = pixels.reshape(len(distance), pixels.shape[1:-1].numel(), 2).unbind(-1)
+    (height, width), dtype = distance.shape[1:], torch.promote_types(distance.dtype, pixels.dtype)
+    u, v = pixels.to(dtype).reshape(len(distance), pixels.shape[1:-1].numel(), 2).unbind(-1)
     on = (u >= -0.5) & (u <= width - 0.5) & (v >= -0.5) & (v <= height - 0.5)
     u, v = torch.where(on, u, 0.0).clamp(0, width - 1), torch.where(on, v, 0.0).clamp(0, height - 1)
     left, top = u.floor().clamp(max=max(width - 2, 0)), v.floor().clamp(max=max(height - 2, 0))
-    dtype = torch.promote_types(distance.dtype, pixels.dtype)
-    right, down = (u - left).to(dtype), (v - top).to(dtype)
+    right, down = u - left, v - top
     rows, at = distance.flatten(1).to(dtype), (top * width + left).long()
     across, below = int(width > 1), width * int(height > 1)
     a, b, c, d = (rows.gather(1, at + step) for step in (0, across, below, below + across))

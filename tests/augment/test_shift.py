@@ -138,3 +138,12 @@ def test_without_depth_it_says_so():
     ):
         with pytest.raises((TypeError, ValueError), match=text):
             call()
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_labels_in_half_precision_have_the_depth_of_their_place(dtype):
+    pixels, mount = (torch.rand(50, 2) * 110).to(dtype), ct.augment.RandomMount(shift=(0.03, 0.03, 0.03))
+    draw = mount.draw(1)
+    narrow, wide = (mount(sample_of(lens()), keypoints=points, draw=draw) for points in (pixels, pixels.double()))
+    torch.testing.assert_close(narrow["keypoints"], wide["keypoints"].to(dtype))
+    assert torch.equal(narrow["keypoints_valid"], wide["keypoints_valid"])
