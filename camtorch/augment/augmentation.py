@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from typing_extensions import Unpack
 
-from camtorch.augment.change import Change, Part, alone, as_one, by_kinds
+from camtorch.augment.change import Change, Part, alone, as_one, by_kinds, check_sizes
 from camtorch.augment.filling import enough, filled, scaled
 from camtorch.augment.sample import KeepsCamera, Named, Sample, SampleOptions, SampleTransform, Unknown, on_samples
 from camtorch.cameras.camera import Camera
@@ -359,12 +359,7 @@ class Augmentation(SampleTransform):
                     source = group[here] if group.batch_shape and len(here) < len(rows) else group
                     own = [rows[n] for n in here]
                     parts.append(part(own, source) if moves else Part(own, None, source))
-        sizes = {part.target.image_size for part in parts}
-        if len(sizes) > 1:
-            found = sorted(map(str, sizes))
-            raise ValueError(
-                f"{self._name}: samples of one batch would come out in the sizes {found}; with p < 1 the size must stay"
-            )
+        check_sizes((part.image_size for part in parts), self._name)
         return Change(count, parts, mixed=isinstance(camera, Mixed))
 
     def _checked_draw(self, draw: Mapping[str, Tensor]) -> Mapping[str, Any]:

@@ -362,7 +362,7 @@ class Change:
         if order is not None:
             moved = _both(lambda pieces: _rows_together(pieces)[order], *results)
         if gate is not None:
-            moved = _both(lambda pair: _gated(gate, *pair), moved, stay(self.parts[0].camera, value))
+            moved = _both(lambda pair: gated(gate, *pair), moved, stay(self.parts[0].camera, value))
         return moved
 
     def images(self, images: Tensor, **options: Any) -> Tensor:
@@ -545,12 +545,13 @@ def check_sizes(sizes: Iterable[tuple[int, int]], owner: str = "Change") -> None
     found = set(sizes)
     if len(found) > 1:
         raise ValueError(
-            f"{owner}: samples of one batch would come out in the sizes {sorted(found)}; same_on_batch=True moves all "
-            "alike, and single samples may be of any size"
+            f"{owner}: samples of one batch would come out in the sizes {sorted(found)}; same_on_batch=True "
+            "moves all alike, with p < 1 the size must stay, and single samples may be of any size"
         )
 
 
-def _gated(gate: Tensor, moved: Tensor, kept: Tensor) -> Tensor:
+def gated(gate: Tensor, moved: Tensor, kept: Tensor) -> Tensor:
+    """Return rows of `moved` where the gate (B,) is open, of `kept` elsewhere."""
     return torch.where(gate.to(moved.device).reshape(-1, *[1] * (moved.ndim - 1)), moved, kept.to(moved.dtype))
 
 

@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from camtorch.augment.change import gated
 from camtorch.values.arguments import as_flag, as_whole, shown, warn
 
 
@@ -190,7 +191,7 @@ class Mirroring:
         if len(mirrored) != len(value):  # of what nobody else has looked at
             raise ValueError(f"{self.owner}: {name} is of {len(value)} samples, other fields are of {len(mirrored)}")
         other = value.index_select(axis, torch.tensor(order, device=value.device))
-        return torch.where(_lifted(mirrored, value), other, value)
+        return gated(mirrored, other, value)
 
     def sides(self, names: Iterable[str]) -> list[tuple[str, str]]:
         """Return the fields that change places, each with its other."""
@@ -209,14 +210,9 @@ class Mirroring:
         return found
 
 
-def _lifted(rows: Tensor, like: Tensor) -> Tensor:
-    return rows.to(like.device).reshape(-1, *[1] * (like.ndim - 1))
-
-
 def exchanged(one: Any, other: Any, rows: Tensor) -> tuple[Any, Any]:
     """Two fields of a batch, tensors or lists, with the chosen rows, (B,) bool, changed for each other's."""
     if isinstance(one, Tensor) and isinstance(other, Tensor) and one.shape == other.shape:
-        chosen = _lifted(rows, one)
-        return torch.where(chosen, other, one), torch.where(chosen, one, other)
+        return gated(rows, other, one), gated(rows, one, other)
     pairs = [(b, a) if r else (a, b) for a, b, r in zip(one, other, rows.tolist(), strict=True)]
     return [a for a, _ in pairs], [b for _, b in pairs]

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor, nn
 from typing_extensions import Unpack
 
-from camtorch.augment.change import Change, Part, View, alone, as_one
+from camtorch.augment.change import Change, View, alone, as_one
 from camtorch.augment.clips import Clips
 from camtorch.augment.landmarks import Mirroring, exchanged
 from camtorch.cameras.camera import Camera
@@ -829,7 +829,9 @@ def together(
             hows[name] = Sampler(mode, padding_mode, fill)
         elif found == "mask":
             hows[name] = Sampler("nearest", "zeros", (mask_fill,))
-        elif is_single and (_are_quick(value, part) if found == "boxes" else moves(found, value) is _pixels):
+        elif is_single and found == "boxes" and isinstance(part.moves, View) and are_numbers(value):
+            hows |= {name: None} if value.dtype == part.moves.distortion.dtype else {}
+        elif is_single and found != "boxes" and moves(found, value) is _pixels:
             hows[name] = None
     fields = (named[name] for name in hows)
     values = [edges_of(value) if found == "boxes" else value for found, value in fields]
@@ -855,11 +857,6 @@ def together(
         else:
             results[name] = result if result.dtype == value.dtype else _in_range(result, value.dtype), valid
     return results
-
-
-def _are_quick(boxes: Tensor, part: Part) -> bool:
-    """Whether boxes may move by the compiled call of a single sample."""
-    return isinstance(part.moves, View) and boxes.dtype == part.moves.distortion.dtype and are_numbers(boxes)
 
 
 def from_pitch_yaw(angles: Tensor) -> Tensor:

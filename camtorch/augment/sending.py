@@ -76,7 +76,7 @@ def within_message(value: Any) -> Any:
     if _is_plain(value):
         return value.as_subclass(_Sent)
     if isinstance(value, nn.Module):
-        ForkingPickler.register(type(value), _by_value)
+        ForkingPickler.register(type(value), lambda module: (pickle.loads, (pickle.dumps(module),)))
     return value
 
 
@@ -85,10 +85,6 @@ def _is_plain(value: Any) -> bool:
     if type(value) is not Tensor or value.layout != torch.strided or not value.is_cpu:
         return False
     return not (value.requires_grad or value.is_quantized or value.is_conj() or value.is_neg())
-
-
-def _by_value(module: nn.Module) -> tuple[Callable[[bytes], Any], tuple[bytes]]:
-    return pickle.loads, (pickle.dumps(module),)
 
 
 def stacked(batch: Sequence[Tensor]) -> Tensor | None:
