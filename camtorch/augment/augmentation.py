@@ -575,9 +575,6 @@ def _are_alike(value: Any) -> bool:
     return same.size > 0 and bool(same.all()) if isinstance(same, np.ndarray) else known_true(same)
 
 
-# -- for front ends, which hold an augmentation and the camera of their images
-
-
 class FrontEnd(KeepsCamera):
     """What takes the samples of a library to an augmentation."""
 

@@ -154,9 +154,6 @@ def kind_of_camera(camera: Camera) -> list[int]:
     ]
 
 
-# -- dicts
-
-
 def _fields(container: Any, sample: Sample, ours: list[InContainers], single: bool) -> tuple[Sample, dict[str, str]]:
     """Return the fields of a dict that kornia does not know and that move, and their kinds."""
     owner, own = type(container).__name__, {n: k for one in ours for n, k in one.augmentation.fields.items()}

@@ -522,9 +522,8 @@ class SampleTransform(KeepsCamera, nn.Module):
                 continue
             found = kind_of(name, value, fields, self._name, single)
             if found is not None:
-                if not isinstance(value, (list, tuple)):
-                    value = as_tensor(value, name, found, self._name)
-                named[name] = (found, value)
+                several = isinstance(value, (list, tuple))
+                named[name] = found, value if several else as_tensor(value, name, found, self._name)
         return named
 
     def _batch(
