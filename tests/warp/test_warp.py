@@ -165,19 +165,6 @@ def test_boxes_around_the_whole_image_are_on_it():
     )[1]
 
 
-def test_boxes_around_images_of_planes_and_of_moving_cameras_are_on_them():
-    camera = pinhole(dtype=torch.float64)
-    box = torch.tensor([[-300.0, -200.0, 300.0, 200.0], [-300.0, -200.0, -250.0, 200.0]], dtype=torch.float64)
-    near = ct.Extrinsics(torch.zeros(3, dtype=torch.float64), torch.tensor([0.1, 0.0, -0.5], dtype=torch.float64))
-    shutter = ct.RollingShutter(0.02, [0.3, 0.5, 0.1])
-    for warp in (
-        ct.PlaneWarp(camera, camera, near, [0.0, 0.0, 1.0], 2.0),
-        ct.ShutterWarp(camera, camera, shutter=shutter, target_shutter=shutter),
-    ):
-        assert warp.transform_boxes(box)[1].tolist() == [True, False]
-        assert warp.inverse().transform_boxes(box)[1].tolist() == [True, False]
-
-
 def test_the_grid_is_kept_until_something_changes():
     rotation, straight = turn(30), ct.Warp(fisheye(), pinhole()).requires_grad_(False)
     warp = ct.Warp(fisheye(), pinhole(), rotation).requires_grad_(False)
