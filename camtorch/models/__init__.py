@@ -86,7 +86,7 @@ _KEYS = {"LatLon": "latlon", "FThetaSheared": "f_theta_sheared", "FThetaBackward
 """Of classes whose key is not the name of the file."""
 
 
-MODELS.files.update({_KEYS.get(name, file): f"{__name__}.{file}" for name, file in _FILES.items()})
+MODELS.files.update(sorted((_KEYS.get(name, file), f"{__name__}.{file}") for name, file in _FILES.items()))
 
 if not TYPE_CHECKING:  # a checker knows the names, and no others
 
