@@ -159,7 +159,7 @@ def pinned(warp: CameraPair) -> Sampling | Lattice | None:
     # of compiled code keeps its own
     if _is_operator(warp) and compiled.takes(warp.target.intrinsics.detach(), warp._inputs()):
         return None
-    if in_transform() or (not torch.compiler.is_compiling() and torch.is_inference_mode_enabled()):
+    if in_transform() or torch.is_inference_mode_enabled():
         return None
     if keeps_graph(*warp._inputs()):
         return positions(warp, "graph")

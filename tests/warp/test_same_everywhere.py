@@ -10,8 +10,8 @@ import torch
 from cameras import slow_unless
 from pretended import tensors_of, try_cases
 
-REFUSED = {"RandomMount, shift"}
-"""Calls that torch.compile refuses: a search for surfaces, whose length depends on depth."""
+REFUSED = {"BoxCrop", "Compose: size, shutter", "RandomMount, shift", "RandomShutter"}
+"""Calls that torch.compile refuses."""
 INSIDE = ("Compose: mount", "Compose: crop, mount", "Compose: flip, lens", "RandomMount", "RandomLens", "RandomCamera")
 NOT_EXPORTED = (*INSIDE, *REFUSED, "FaceNormalizer", "CanonicalCamera", "CameraHead", "labels: Plane")
 """Calls that torch.export refuses, or takes longest for."""
