@@ -17,7 +17,7 @@ from camtorch.evaluate.known import known_false
 from camtorch.models import Pinhole
 from camtorch.poses.rotations import check_rotation, rotation_matrix
 from camtorch.values.arguments import as_known_size, as_number, no_camera, shown
-from camtorch.values.module import remade
+from camtorch.values.module import remade, typed_as
 from camtorch.warp.warp import Warp
 
 _ODD = 50.0  # times the distance: no face is meant to be so much nearer or farther; units differ
@@ -177,7 +177,9 @@ class FaceNormalizer(SampleTransform):
         return moved
 
     if TYPE_CHECKING:
-        __call__ = forward
+
+        @typed_as(forward)
+        def __call__(self, *args: Any, **options: Any) -> Any: ...
 
     def extra_repr(self) -> str:
         """The virtual camera, and the options."""

@@ -26,7 +26,6 @@ from camtorch.augment import box_crop, compose, edits, random_camera
 from camtorch.augment.augmentation import Augmentation, check_front_end, check_single
 from camtorch.augment.change import Change
 from camtorch.augment.containers import KIND, InContainers, Params, camera_of, kind_of_camera, with_boxes, with_cameras
-from camtorch.augment.presets import PresetName
 from camtorch.augment.sample import detached, on_samples
 from camtorch.cameras.camera import Camera
 from camtorch.evaluate.kept import Kept
@@ -242,7 +241,7 @@ class _Random(CameraAugmentation):
 
     _wraps: Callable[..., Augmentation]
 
-    def __init__(self, *given: Camera | PresetName | str, camera: Camera | None = None, **options: Any):
+    def __init__(self, *given: Any, camera: Camera | None = None, **options: Any):
         name = type(self).__name__
         first, own = (given[0], given[1:]) if camera is None and given else (camera, given)
         if not isinstance(first, Camera):
@@ -270,9 +269,17 @@ def _named(wraps: type[Augmentation]) -> type[_Random]:
     return type(name, (_Random,), {"_wraps": wraps, "__doc__": text, "__module__": __name__})
 
 
-RandomMount, RandomLens = _named(random_camera.RandomMount), _named(random_camera.RandomLens)
-RandomCamera, BoxCrop, Compose = _named(random_camera.RandomCamera), _named(box_crop.BoxCrop), _named(compose.Compose)
-RandomResizedCrop, RandomCrop, CenterCrop = map(_named, (edits.RandomResizedCrop, edits.RandomCrop, edits.CenterCrop))
-Resize, Pad, Rotate90 = map(_named, (edits.Resize, edits.Pad, edits.Rotate90))
-HorizontalFlip, VerticalFlip = map(_named, (edits.HorizontalFlip, edits.VerticalFlip))
+RandomMount: type[_Random] = _named(random_camera.RandomMount)
+RandomLens: type[_Random] = _named(random_camera.RandomLens)
+RandomCamera: type[_Random] = _named(random_camera.RandomCamera)
+BoxCrop: type[_Random] = _named(box_crop.BoxCrop)
+Compose: type[_Random] = _named(compose.Compose)
+RandomResizedCrop: type[_Random] = _named(edits.RandomResizedCrop)
+RandomCrop: type[_Random] = _named(edits.RandomCrop)
+CenterCrop: type[_Random] = _named(edits.CenterCrop)
+Resize: type[_Random] = _named(edits.Resize)
+Pad: type[_Random] = _named(edits.Pad)
+Rotate90: type[_Random] = _named(edits.Rotate90)
+HorizontalFlip: type[_Random] = _named(edits.HorizontalFlip)
+VerticalFlip: type[_Random] = _named(edits.VerticalFlip)
 __all__ = ["CameraAugmentation", "with_boxes", "with_cameras", *(one.__name__ for one in _Random.__subclasses__())]

@@ -54,6 +54,8 @@ class Transform(FrontEnd):
     """
 
     _name = _OWNER
+    augmentation: Augmentation | FaceNormalizer
+    camera: Camera | None
 
     def __init__(self, augmentation: Augmentation | FaceNormalizer, camera: Camera | None = None):
         check_front_end(_OWNER, augmentation, Augmentation, FaceNormalizer)

@@ -73,7 +73,7 @@ def is_recorded() -> bool:
 in_jit_trace: Callable[[], bool] = torch.jit.is_tracing  # type: ignore[attr-defined]
 """Whether torch.jit.trace is at work."""
 
-is_exporting = torch.compiler.is_exporting
+is_exporting: Callable[[], bool] = torch.compiler.is_exporting
 """Whether what is traced shall run elsewhere, where there are no operators of our own."""
 
 

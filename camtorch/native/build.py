@@ -159,8 +159,12 @@ def _compiler(named: str | None) -> list[str]:
     raise BuildError(f"no C compiler: none of {', '.join(names)} is on the PATH, and CC names none")
 
 
-if __name__ == "__main__":
+def _main() -> None:
     try:
         print(build())
     except (BuildError, OSError) as error:
         sys.exit(f"camtorch.native.build: {error}")
+
+
+if __name__ == "__main__":
+    _main()

@@ -16,6 +16,7 @@ from camtorch.cameras.editing import edited
 from camtorch.cameras.mixed import Mixed
 from camtorch.rays.lattices import slopes_at_axis
 from camtorch.values.arguments import as_image_size, as_number, no_camera, shown
+from camtorch.values.module import typed_as
 from camtorch.warp.affine import AffineWarp
 
 _LENGTHS = ("depth", "distance", "points", "tvec")
@@ -137,7 +138,9 @@ class CanonicalCamera(SampleTransform):
         return self._resized(sample, named, batched, change.inverse())
 
     if TYPE_CHECKING:
-        __call__ = forward
+
+        @typed_as(forward)
+        def __call__(self, *args: Any, **options: Any) -> Any: ...
 
     def _scaled(self, sample: Sample, named: Named, batched: bool, scale: Tensor) -> Sample:
         """The sample with every length of the camera's frame times a factor (B,)."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import torch
 from torch import Tensor, nn
@@ -29,7 +29,7 @@ from camtorch.values.arguments import (
     one_of,
     shown,
 )
-from camtorch.values.module import GeometryModule
+from camtorch.values.module import GeometryModule, typed_as
 from camtorch.warp import routes
 from camtorch.warp.dewarp import middle_lines
 from camtorch.warp.proxy import check_pose
@@ -132,7 +132,9 @@ class Rectification(GeometryModule):
         return of_left, of_right
 
     if TYPE_CHECKING:
-        __call__ = forward
+
+        @typed_as(forward)
+        def __call__(self, *args: Any, **options: Any) -> Any: ...
 
     def valid_masks(self) -> tuple[Tensor, Tensor, Tensor]:
         """(B or 1, 1, H, W) bool: pixels that the left camera sees, that the right one sees, that both do."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor, nn
@@ -15,7 +15,7 @@ from camtorch.poses.rotations import mount_rotation
 from camtorch.rays.lattices import slopes_at_axis
 from camtorch.values.arguments import Numbers, as_fov, as_known_size, as_number, as_values, as_whole, check_boxes, shown
 from camtorch.values.dtypes import narrow, widen
-from camtorch.values.module import GeometryModule, remade
+from camtorch.values.module import GeometryModule, remade, typed_as
 from camtorch.warp.boxes import corners_of
 from camtorch.warp.sampling import Mode
 from camtorch.warp.warp import Warp, as_sized
@@ -73,7 +73,9 @@ class Views(GeometryModule):
         return torch.stack([warp(images) for warp in self], 1)
 
     if TYPE_CHECKING:
-        __call__ = forward
+
+        @typed_as(forward)
+        def __call__(self, *args: Any, **options: Any) -> Any: ...
 
     def valid_masks(self) -> Tensor:
         """(1, N, 1, S, S) bool: what of each view the camera sees."""

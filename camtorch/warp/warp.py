@@ -23,6 +23,7 @@ from camtorch.values.arguments import (
     no_camera,
     one_of,
 )
+from camtorch.values.module import typed_as
 from camtorch.warp import routes
 from camtorch.warp.boxes import enclosed, moved_boxes
 from camtorch.warp.grid import OUTSIDE
@@ -150,7 +151,9 @@ class Warp(CameraPair):
         return routes.warped(self, images, checked(self, images, mode, padding_mode, fill))
 
     if TYPE_CHECKING:
-        __call__ = forward
+
+        @typed_as(forward)
+        def __call__(self, *args: Any, **options: Any) -> Any: ...
 
     def strips(
         self,

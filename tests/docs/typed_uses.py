@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from typing_extensions import assert_type
 
 import camtorch as ct
-from camtorch.convert.conversion import Conversion
+from camtorch.convert.result import Conversion
 
 Pair = tuple[Tensor, Tensor]
 
