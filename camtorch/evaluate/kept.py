@@ -75,8 +75,8 @@ Note = tuple[Tensor, Mark | None]
 
 
 def note(tensor: Tensor) -> Note:
-    """Return what `same` compares with."""
-    if tensor.is_cpu or tensor.is_inference():  # which has no version
+    """Return what `same` compares with: values where there is no memory, as of a subclass, or no version."""
+    if tensor.is_cpu or tensor.is_inference() or (tensor.numel() and not tensor.untyped_storage().data_ptr()):
         return tensor.detach().clone(), None
     return tensor.detach(), _mark(tensor)
 
@@ -86,9 +86,9 @@ def same(tensor: Tensor, noted: Note) -> bool:
     then, mark = noted
     if tensor.dtype != then.dtype or tensor.device != then.device:
         return False
-    if mark is None or tensor.is_inference():
+    if mark is None:
         return torch.equal(tensor, then)  # of other shapes it says no
-    return mark == _mark(tensor)
+    return not tensor.is_inference() and mark == _mark(tensor)
 
 
 def _mark(tensor: Tensor) -> Mark:
