@@ -18,6 +18,11 @@ settings.register_profile("camtorch", derandomize=True, deadline=None, max_examp
 settings.load_profile("camtorch")
 
 
+def pytest_collection_modifyitems(items):
+    """Begin with the longest, or one core has nothing to do while the other ends."""
+    items.sort(key=lambda item: item.path.name not in ("test_devices.py", "test_same_everywhere.py"))
+
+
 @pytest.fixture(autouse=True)
 def _compiled_code_is_forgotten():
     """Programs of one function are counted, and refused from the ninth on, also where tests of their own made them."""
