@@ -19,12 +19,9 @@ _ROUNDING = 1e-9  # px, far above that of two equal cameras
 class Difference(NamedTuple):
     """Two cameras on a lattice (rows, columns) of pixels of the first one's image."""
 
-    apart: Tensor
-    """Pixels between the pixel and where the second camera shows its ray, float64."""
-    both: Tensor
-    """Bool: where both have the ray."""
-    rotation: Tensor
-    """(3, 3): by which the rays were turned."""
+    apart: Tensor  # pixels between the pixel and where the second camera shows its ray, float64
+    both: Tensor  # bool: where both have the ray
+    rotation: Tensor  # (3, 3): by which the rays were turned
 
     @property
     def rms(self) -> float:

@@ -27,8 +27,7 @@ class Summary:
     fov: tuple[float, float, float] | None = None
     """Degrees: horizontal and vertical through the principal point, and on the wider diagonal of the image, from
     outer edge to outer edge or as far as there are rays."""
-    seen: float | None = None
-    """The part of the image that has rays."""
+    seen: float | None = None  # the part of the image that has rays
     corners: tuple[tuple[float, float] | str, ...] | None = None
     """For each of CORNERS how many pixels right and down distortion moves what is there, or why that has no answer."""
 

@@ -131,9 +131,9 @@ def as_board(board: Any, square: float, options: dict[str, Any], owner: str) -> 
         raise ValueError(f"{owner}: a {kind.kind} takes {', '.join(known) or 'no option'}; got {', '.join(strange)}")
     options = ({"marker": 0.75 * square} if kind is Charuco else {}) | options
     found = kind(int(match[2]), int(match[3]), square, **options)
-    least, got = kind.least, f"{found.columns}x{found.rows}"
-    if min(found.columns, found.rows) < least:
-        raise ValueError(f"{owner}: at least {least}x{least} {kind.counted} are needed; got {got}")
+    if min(found.columns, found.rows) < kind.least:
+        least, got = f"{kind.least}x{kind.least}", f"{found.columns}x{found.rows}"
+        raise ValueError(f"{owner}: at least {least} {kind.counted} are needed; got {got}")
     if not 0 < square < float("inf"):
         raise ValueError(f"{owner}: lengths must be positive and finite; got {square:g}")
     if isinstance(found, Charuco) and not 0 < found.marker < square:

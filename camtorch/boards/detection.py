@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,17 +21,8 @@ _WINDOWS = (0.2, 0.3, 0.4)  # half the sides of windows around corners, in dista
 _STRAY = 0.15  # such distances between a corner and its place by its rows, from which it is wrong
 
 
-class Detection(NamedTuple):
-    """What one image shows of a board."""
-
-    pixels: Pixels
-    """(N, 2) of the board's points, NaN if unseen; all NaN if the image is of no use."""
-    reason: str = ""
-    """Why it is of no use, or empty."""
-
-
-def detect(board: Board, image: NDArray[Any]) -> Detection:
-    """Find a board in an image (H, W) of grey values, uint8 or uint16.
+def detect(board: Board, image: NDArray[Any]) -> tuple[Pixels, str]:
+    """Find a board in an image (H, W) of uint8 or uint16: pixels (N, 2), NaN if unseen; or all NaN, and the reason.
 
     A chessboard begins where black is at its top left. If that allows several orders (`board.is_symmetric`), the first
     point is the one nearest to the image's top left corner.
@@ -44,12 +35,12 @@ def detect(board: Board, image: NDArray[Any]) -> Detection:
     pixels = find(cv2, board, np.ascontiguousarray(image, np.uint8))
     seen = np.isfinite(pixels[:, 0])
     if not seen.any():
-        return Detection(pixels, "no board found")
+        return pixels, "no board found"
     if seen.sum() < _FEWEST:
-        return Detection(_nothing(board), f"only {seen.sum()} points found, of which {_FEWEST} are needed")
+        return _nothing(board), f"only {seen.sum()} points found, of which {_FEWEST} are needed"
     if np.linalg.matrix_rank(np.diff(board.points()[seen], axis=0)) < 2:
-        return Detection(_nothing(board), "the points found lie on one line, which does not tell where the board is")
-    return Detection(pixels)
+        return _nothing(board), "the points found lie on one line, which does not tell where the board is"
+    return pixels, ""
 
 
 def _nothing(board: Board) -> Pixels:
@@ -103,11 +94,10 @@ def _begins_with_black(grey: Grey, grid: Pixels) -> bool:
 
 
 def _at_gradients(cv2: Any, grey: Grey, grid: Pixels) -> Pixels:
-    """Return the corners (N, 2) as found, or moved to where gradients meet, in a smaller or larger window.
+    """Return the corners (N, 2) as found, or moved to where gradients meet, which is worse than nothing under noise.
 
-    Gradients are three times as exact in sharp images, and worse than nothing in noisy ones. A lens bends rows of
-    corners smoothly, so their third differences are noise: the least of it is taken. A corner far from where its rows
-    have it, as OpenCV returns some at the ends of steep ones, is searched for there, or unseen.
+    A lens bends rows of corners smoothly, so their third differences are noise: the least of it is taken. A corner far
+    from where its rows have it, as OpenCV returns some at the ends of steep ones, is searched for there, or unseen.
     """
     numbers = np.arange(grid[..., 0].size).reshape(grid.shape[:2])
     runs = [line[i : i + 4] for line in (*numbers, *numbers.T) for i in range(len(line) - 3)]
@@ -147,17 +137,13 @@ def _dictionary(cv2: Any, name: str) -> Any:
 
 
 def _passes(cv2: Any, grey: Grey, border: int = 1) -> list[tuple[Grey, int, Any]]:
-    """Return images to search for markers, how much larger they are, and the parameters; the most promising first.
-
-    A threshold's margin that is large for the image's noise keeps neighbours apart whose corners nearly touch; the
-    other one is OpenCV's own.
-    """
+    """Return images to search for markers, how much larger they are, and the parameters; the most promising first."""
     low, high = np.percentile(grey, (2, 98))
     images = [(grey, 1)]
     if grey.size < _SMALL:
         images.insert(0, (cv2.resize(grey, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC), 2))
     passes = []
-    for margin in (0.1 * float(high - low), 7.0):
+    for margin in (0.1 * float(high - low), 7.0):  # one that keeps apart what nearly touches, and OpenCV's own
         parameters = cv2.aruco.DetectorParameters()
         parameters.adaptiveThreshWinSizeMin, parameters.adaptiveThreshWinSizeMax = 5, 53
         parameters.adaptiveThreshWinSizeStep = 6

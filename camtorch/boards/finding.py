@@ -83,26 +83,20 @@ def find_board(images: Any, board: Any, *, square: float = 1.0, **options: Any) 
         named = ", ".join(f"{path} ({why})" for path, why in left_out[:_NAMED])
         more = f" and {len(left_out) - _NAMED} more" if len(left_out) > _NAMED else ""
         warn(f"{_OWNER}: {len(left_out)} of {len(found)} images are left out: {named}{more}")
-    size = used[0].image_size
-    return BoardObservations(
-        [wanted.points()] * len(used), [one.pixels for one in used], [str(one.path) for one in used], size
-    )
+    pixels, names = [one.pixels for one in used], [str(one.path) for one in used]
+    return BoardObservations([wanted.points()] * len(used), pixels, names, used[0].image_size)
 
 
 class ImageCorners(NamedTuple):
     """What one image shows of a board."""
 
     path: Path
-    image_size: tuple[int, int]
-    """(height, width)."""
-    pixels: NDArray[np.float64]
-    """(N, 2) of the board's points, NaN if unseen."""
-    reason: str
-    """Why nothing was found, or empty."""
+    image_size: tuple[int, int]  # (height, width)
+    pixels: NDArray[np.float64]  # (N, 2) of the board's points, NaN if unseen
+    reason: str  # why nothing was found, or empty
 
 
-Image = tuple[Path, "NDArray[Any] | None"]
-"""The path of an image, or a name for it and its grey values (H, W)."""
+Image = tuple[Path, "NDArray[Any] | None"]  # the path of an image, or a name for it and its grey values (H, W)
 
 
 def search(board: Board, images: Sequence[Image], done: Callable[[], object] = lambda: None) -> list[ImageCorners]:
@@ -117,8 +111,7 @@ def search(board: Board, images: Sequence[Image], done: Callable[[], object] = l
 
 def _search(board: Board, path: Path, grey: NDArray[Any] | None) -> ImageCorners:
     try:
-        if grey is None:
-            grey = _grey_of(read_stored(path)[0], _RGB)
+        grey = _grey_of(read_stored(path)[0], _RGB) if grey is None else grey
     except (ValueError, OSError) as error:
         why = " ".join((getattr(error, "strerror", None) or str(error)).removeprefix(f"{path}: ").split())
         return ImageCorners(path, (0, 0), np.full((len(board.points()), 2), np.nan), why)
@@ -163,7 +156,7 @@ def natural(path: Path) -> list[tuple[int, int, str]]:
 def _given(images: Any) -> list[Image]:
     if isinstance(images, (str, os.PathLike)):
         images = [images]
-    if isinstance(images, (np.ndarray, torch.Tensor)):
+    elif isinstance(images, (np.ndarray, torch.Tensor)):
         images = [images] if images.ndim == 2 or (images.ndim == 3 and _has_channels(images)) else list(images)
     if not isinstance(images, Sequence):
         raise TypeError(f"{_OWNER}: images must be paths or arrays; got {shown(images)}")

@@ -290,11 +290,9 @@ class Bundle:
     fixed: list[Camera | None]
     learns_bend: bool
     is_bent: bool
-    is_plain: bool
-    """Whether one camera sees flat boards that may be anywhere: what compiled code knows."""
+    is_plain: bool  # whether one camera sees flat boards that may be anywhere: what compiled code knows
     columns: tuple[tuple[int, int], ...]
-    learnt: list[tuple[Tensor, Tensor]]
-    """Of each camera the numbers of its columns, and of its parameters in them."""
+    learnt: list[tuple[Tensor, Tensor]]  # of each camera the numbers of its columns, and of its parameters in them
     unknowns: int
     low: Tensor
     high: Tensor

@@ -43,8 +43,7 @@ class Model:
     kind: type[Camera]
     count: int
     start: Camera | None
-    free: Tensor
-    """(4 + n,) bool, on the CPU."""
+    free: Tensor  # (4 + n,) bool, on the CPU
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -192,16 +191,14 @@ class Search:
     The boards are taken about their middle, where a pose's turn and its shift hardly depend on each other.
     """
 
-    owner: str
-    """Who asks, and which camera it is, for messages."""
+    owner: str  # who asks, and which camera it is, for messages
     asked: Model
     given: Observations
     middle: Tensor
     layout: Layout
     loss: str | None
     loss_scale: float
-    prior: Prior | None = None
-    """Of a surface: what its start says of it."""
+    prior: Prior | None = None  # of a surface: what its start says of it
 
     def __post_init__(self) -> None:
         kind, start = self.asked.kind, self.asked.start

@@ -36,12 +36,9 @@ _NAMED = 6  # views, in a message
 class Observations(NamedTuple):
     """Corners of boards and where one camera sees them: float64, padded to as many as the fullest view has."""
 
-    points: Tensor
-    """(V, N, 3) in the board's frame, 0 where padded."""
-    pixels: Tensor
-    """(V, N, 2), 0 where unseen."""
-    seen: Tensor
-    """(V, N) bool."""
+    points: Tensor  # (V, N, 3) in the board's frame, 0 where padded
+    pixels: Tensor  # (V, N, 2), 0 where unseen
+    seen: Tensor  # (V, N) bool
 
     def of(self, views: Tensor) -> Observations:
         """Those of some views, given by numbers or by a mask."""
@@ -53,14 +50,10 @@ class Layout(NamedTuple):
 
     shapes: tuple[tuple[int, ...], ...]
     """Of each view that was passed, without the last dim; where it was None, (N,) of its object points."""
-    stacked: bool
-    """Whether they were one tensor or array, not a list."""
-    views: Tensor
-    """(V,) the numbers of the views that have corners, of those that were passed."""
-    seen: Tensor
-    """(V, N) of the observations."""
-    image_size: tuple[int, int]
-    """(height, width)."""
+    stacked: bool  # whether they were one tensor or array, not a list
+    views: Tensor  # (V,) the numbers of the views that have corners, of those that were passed
+    seen: Tensor  # (V, N) of the observations
+    image_size: tuple[int, int]  # (height, width)
     copies: tuple[int, ...]
     """The numbers of the views, of those that were passed, that are no new evidence: see `_observed` and `repeats`."""
 

@@ -19,7 +19,7 @@ from camtorch.cameras.freezing import INTRINSICS
 
 Array = NDArray[Any]
 
-CANDIDATES: tuple[tuple[str, int], ...] = (
+CANDIDATES: tuple[tuple[str, int], ...] = (  # models that are tried, with their numbers of coefficients
     ("pinhole", 0),
     ("brown_conrady", 5),
     ("brown_conrady", 8),
@@ -30,13 +30,10 @@ CANDIDATES: tuple[tuple[str, int], ...] = (
     ("fisheye62", 8),
     ("fisheye624", 12),
 )
-"""Models that are tried, with their numbers of coefficients."""
 _FOLDS = 5
 _NOTHING = 1e-6  # px: errors up to here are rounding
-_WORSE = 0.01
-"""The part by which an error may be larger without a reason to take more coefficients."""
-_MUCH_WORSE = 0.05
-"""The part that is a reason, however much views differ."""
+_WORSE = 0.01  # the part by which an error may be larger without a reason to take more coefficients
+_MUCH_WORSE = 0.05  # the part that is a reason, however much views differ
 
 
 @dataclass
@@ -45,16 +42,11 @@ class Trial:
 
     model: str
     count: int
-    calibration: Calibration | None
-    """By all views, or None where that failed."""
-    rms: float
-    """Px per point of all views together, NaN where it failed."""
-    held_out: float
-    """Px per point of views that the camera was not fitted to, only their poses; NaN where it failed."""
-    errors: Array
-    """(V,) mean squared of each view, held out."""
-    reason: str = ""
-    """Why it failed, or empty."""
+    calibration: Calibration | None  # by all views, or None where that failed
+    rms: float  # px per point of all views together, NaN where it failed
+    held_out: float  # px per point of views that the camera was not fitted to, only their poses; NaN where it failed
+    errors: Array  # (V,) mean squared of each view, held out
+    reason: str = ""  # why it failed, or empty
 
 
 @dataclass

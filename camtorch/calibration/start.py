@@ -180,8 +180,7 @@ class _Lens(NamedTuple):
     model: type[Camera]
     parameters: Tensor
     boards: Poses
-    scale: float
-    """px: twice the error that most corners have."""
+    scale: float  # px: twice the error that most corners have
     image_size: tuple[int, int]
 
     @property

@@ -17,8 +17,7 @@ from camtorch.io import load, opencv
 
 _ASPECT = 0.01  # the part by which the aspect ratios of a camera and an image may differ, as sizes are rounded
 _WIDE = 100  # degrees, horizontally, from which on lenses are rather fisheyes
-Size = tuple[int, int]
-"""(height, width)."""
+Size = tuple[int, int]  # (height, width)
 
 
 def read_rig(

@@ -12,8 +12,7 @@ from typing import Any, TypeAlias
 from camtorch.cli import words
 
 Commands: TypeAlias = "argparse._SubParsersAction[Any]"
-Add: TypeAlias = Callable[..., Any]
-"""The method `add_argument` of a command, or of a group of its options."""
+Add: TypeAlias = Callable[..., Any]  # the method `add_argument` of a command, or of a group of its options
 _FORMAT = "of OUT; by default what its name says"
 _BOARDS = ("chessboard", "charuco", "aprilgrid")  # as `camtorch.boards` has them, which takes numpy to import
 

@@ -18,10 +18,8 @@ from typing import Any, TypeAlias
 
 from camtorch.cli.terminal import reason
 
-Pair: TypeAlias = tuple[Path, Path]
-"""A file that is read, and the file that is made of it."""
-Work: TypeAlias = Callable[[Path, Path], Any]
-"""Makes a file, whole or not at all, and returns facts about it."""
+Pair: TypeAlias = tuple[Path, Path]  # a file that is read, and the file that is made of it
+Work: TypeAlias = Callable[[Path, Path], Any]  # makes a file, whole or not at all, and returns facts about it
 _HOW = "spawn" if sys.platform == "win32" else "forkserver"
 _work: Work
 
@@ -31,8 +29,7 @@ class Outcome:
     """What became of a pair."""
 
     facts: Any = None
-    failure: str = ""
-    """Why no file was made; empty if one was."""
+    failure: str = ""  # why no file was made; empty if one was
     notes: list[str] = field(default_factory=list)
 
 

@@ -22,8 +22,7 @@ _MOMENTS = 80  # from twice as many on, each two become one
 _SHARP = 0.6  # of the sharpness of the moments next to it, below which one was all motion
 _APART = 0.01  # of the image's diagonal: views whose corners are nearer on average are the same
 
-Views = dict[str, dict[str, ImageCorners]]
-"""View -> camera -> what its image shows."""
+Views = dict[str, dict[str, ImageCorners]]  # view -> camera -> what its image shows
 
 
 def find_views(
@@ -107,8 +106,7 @@ def _last_number(path: Path) -> str | None:
     return numbers[-1].lstrip("0") or "0" if numbers else None
 
 
-_Moment = tuple[float, float, NDArray[np.uint8]]
-"""When a frame is shown, in seconds; its sharpness; (H, W)."""
+_Moment = tuple[float, float, NDArray[np.uint8]]  # when a frame is shown, in seconds; its sharpness; (H, W)
 
 
 def _search_video(path: Path, board: Board) -> list[ImageCorners]:

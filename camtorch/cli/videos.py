@@ -19,15 +19,13 @@ from camtorch.warp.warp import Warp
 
 WRITTEN = {".mp4": "mp4", ".m4v": "mp4", ".mov": "mov", ".mkv": "matroska", ".webm": "webm"}
 """What ffmpeg calls the formats of files with these suffixes, in lower case."""
-FORMATS = frozenset({*WRITTEN, ".avi", ".mts", ".ts"})
-"""Suffixes of what is read."""
+FORMATS = frozenset({*WRITTEN, ".avi", ".mts", ".ts"})  # suffixes of what is read
 # encoders with their options; how x264 weighs blocks by what refers to them (mbtree) is not the same each time
 _CODECS = {"libx264": {"crf": "18", "mbtree": "0"}, "libvpx-vp9": {"crf": "24", "b": "0"}, "ffv1": dict[str, str]()}
 _READ = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpegts"  # no playlists, which would have other files read
 _THREADS = 4  # of an encoder: what it makes depends on their number, and must not depend on the machine's
 _CUT = 0.5  # seconds that may be missing at the end
-_COLOURS = ("color_range", "colorspace", "color_primaries", "color_trc")
-"""What the colours of a frame mean."""
+_COLOURS = ("color_range", "colorspace", "color_primaries", "color_trc")  # what the colours of a frame mean
 
 
 def is_video(path: Path) -> bool:

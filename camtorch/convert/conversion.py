@@ -66,9 +66,8 @@ def convert(
     parts = []
     for intrinsics, distortion in zip(*(t.split(_ROWS) for t in tensors), strict=True):
         rays = reference(remade(source, intrinsics=intrinsics, distortion=distortion), image_size, limit)
-        parts.append(
-            _with_fewest_coefficients(_Task(rays, model, models, build, image_size, limit, float(tolerance)), counts)
-        )
+        task = _Task(rays, model, models, build, image_size, limit, tolerance)
+        parts.append(_with_fewest_coefficients(task, counts))
     most = max(part.parameters.shape[-1] for part in parts)
     result = _Result(*map(torch.cat, zip(*(part.padded(most) for part in parts), strict=True)))
     camera = build(result.parameters.reshape(*batch, most)).freeze_like(source)

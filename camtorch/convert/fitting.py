@@ -37,11 +37,7 @@ class Observations(NamedTuple):
 
 
 def fit(
-    camera: CameraLike,
-    observations: Observations,
-    starts: Tensor,
-    slopes: Tensor,
-    fixed: Tensor | None = None,
+    camera: CameraLike, observations: Observations, starts: Tensor, slopes: Tensor, fixed: Tensor | None = None
 ) -> Tensor:
     """The parameters (C, 4 + n) at which a camera sees the pixels of the rays as nearly as it can.
 
@@ -54,8 +50,7 @@ def fit(
         slopes: (C, 4) the focal lengths at the axis in x and y, and the pixel of the axis.
         fixed: (4 + n,) values that parameters keep, NaN for those that are looked for.
     """
-    smooth = camera.smoothness()
-    if smooth is not None:
+    if (smooth := camera.smoothness()) is not None:
         return _fit_linear(camera, observations, slopes, smooth.to(slopes), fixed)
     results, scores = [], []
     tiny = _NEARLY_NOTHING**2 * observations.weights.sum(-1)
@@ -97,16 +92,14 @@ def _fit_linear(
     errors = _residuals(observations._replace(weights=weights[:, 0]), parameters, seen).flatten(1)
     missing = -torch.cat((errors, (slight @ parameters[:, 4:, None])[..., 0]), -1)
     rows = torch.cat((slope, slight[..., free[4:]]), 1)
-    found = torch.linalg.lstsq(rows, missing[..., None]).solution[..., 0]
-    parameters[:, 4:][:, free[4:]] += found
+    parameters[:, 4:][:, free[4:]] += torch.linalg.lstsq(rows, missing[..., None]).solution[..., 0]
     return parameters
 
 
 def refine_minimax(camera: CameraLike, observations: Observations, parameters: Tensor) -> Tensor:
     """Parameters (C, 4 + n) near those given at which the largest error is smaller; no row depends on another.
 
-    Lawson's algorithm: weighted least squares over and over, the weight of a square multiplied by its error each time,
-    approach what has the least largest error.
+    Lawson's algorithm: weighted least squares over and over, the weight of a square multiplied by its error each time.
     """
     if camera.smoothness() is not None:  # more coefficients than errors have peaks
         return parameters
@@ -162,8 +155,7 @@ def _cost(camera: CameraLike, observations: Observations, parameters: Tensor) ->
     seen = to_sensor(camera, parameters[:, 4:], observations.rays)
     lost = (~seen.covered & (observations.weights > 0)).any(-1)
     cost = _residuals(observations, parameters, seen).square().sum((1, 2))
-    defined = camera.defined(parameters[:, 4:].unbind(-1))
-    if defined is not None:
+    if (defined := camera.defined(parameters[:, 4:].unbind(-1))) is not None:
         lost = lost | ~(defined > 0)
     return torch.where(lost | ~torch.isfinite(cost), torch.inf, cost)
 
@@ -180,8 +172,14 @@ class _Fit:
         return _cost(self.camera, self.observations.of(rows), state[0])
 
     def linearised(self, state: tuple[Tensor, ...], rows: Tensor) -> System:
-        (parameters,), free = state, self.free
-        residuals, slopes = _linearised(self.camera, self.observations.of(rows), parameters)
+        (parameters,), free, observations = state, self.free, self.observations.of(rows)
+        seen, _, by_k = sensor_jacobians(self.camera, parameters[:, 4:], observations.rays)
+        residuals = _residuals(observations, parameters, seen).flatten(1)
+        zero, one = torch.zeros_like(seen.a), torch.ones_like(seen.a)
+        by_intrinsics = [(seen.a, zero), (zero, seen.b), (one, zero), (zero, one)]
+        slopes = torch.stack([torch.stack(pair, 1) for pair in by_intrinsics], 1)
+        slopes = torch.cat((slopes, by_k.transpose(1, 2) * parameters[:, None, :2, None]), 1)
+        slopes = (slopes * observations.weights[:, None, None]).flatten(2)
         slope, values = (slopes @ residuals[..., None])[:, free, 0], parameters[:, free]
         # what would leave its bounds stays there, so that the others can move on
         held = (values <= self.low[rows][:, free]) & (slope > 0) | (values >= self.high[rows][:, free]) & (slope < 0)
@@ -196,18 +194,6 @@ class _Fit:
         return (new.clamp(self.low[rows], self.high[rows]),)
 
 
-def _linearised(camera: CameraLike, observations: Observations, parameters: Tensor) -> tuple[Tensor, Tensor]:
-    """The residuals (C, 2 N), and their derivatives (C, P, 2 N) by the parameters."""
-    seen, _, by_k = sensor_jacobians(camera, parameters[:, 4:], observations.rays)
-    fx, fy, _, _ = columns(parameters[:, :4])
-    zero, one = torch.zeros_like(seen.a), torch.ones_like(seen.a)
-    derivatives = [(seen.a, zero), (zero, seen.b), (one, zero), (zero, one)]
-    slopes = torch.stack([torch.stack(pair, 1) for pair in derivatives], 1)
-    slopes = torch.cat((slopes, by_k.transpose(1, 2) * torch.stack((fx, fy), 1)[:, None]), 1)
-    slopes = slopes * observations.weights[:, None, None]
-    return _residuals(observations, parameters, seen).flatten(1), slopes.flatten(2)
-
-
 def _refine(
     camera: CameraLike,
     observations: Observations,
@@ -216,12 +202,9 @@ def _refine(
     high: Tensor,
     going: Tensor,
     steps: int = _MOST_STEPS,
-    first_damping: float = FIRST_DAMPING,
+    damping: float = FIRST_DAMPING,
 ) -> Tensor:
     """The parameters (C, P) of least cost near those given, of the rows that are `going`."""
-    tiny = _NOTHING**2 * observations.weights.sum(-1)
-    problem = _Fit(camera, observations, low, high)
-    found = minimise(
-        problem, (parameters,), tolerance=_SETTLED, tiny=tiny, going=going, steps=steps, damping=first_damping
-    )
+    tiny, problem = _NOTHING**2 * observations.weights.sum(-1), _Fit(camera, observations, low, high)
+    found = minimise(problem, (parameters,), tolerance=_SETTLED, tiny=tiny, going=going, steps=steps, damping=damping)
     return found.state[0]

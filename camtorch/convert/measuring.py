@@ -35,8 +35,7 @@ class Reference(NamedTuple):
 
     def of(self, camera: CameraLike, rows: Tensor) -> Reference:
         """That of some rows, and their cameras."""
-        parts = self.lattice.of(rows), self.rays.of(rows), self.all_rays.of(rows)
-        return Reference(camera, self.image_size, *parts)
+        return Reference(camera, self.image_size, self.lattice.of(rows), self.rays.of(rows), self.all_rays.of(rows))
 
 
 def reference(camera: CameraLike, image_size: tuple[int, int] | None, limit: float) -> Reference:
@@ -47,17 +46,8 @@ def reference(camera: CameraLike, image_size: tuple[int, int] | None, limit: flo
     return Reference(camera, image_size, lattice, rays, all_rays)
 
 
-class Measures(NamedTuple):
-    """The numbers of a `Conversion`, (C,) each."""
-
-    rms: Tensor
-    max_error: Tensor
-    max_angle: Tensor
-    valid_fraction: Tensor
-
-
-def measure(target: CameraLike, k: Tensor, exact: Tensor, source: Reference) -> Measures:
-    """Compare cameras (C,), of coefficients (C, n), with those that they were made of.
+def measure(target: CameraLike, k: Tensor, exact: Tensor, source: Reference) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return rms, max_error, max_angle and valid_fraction (C,) of cameras (C,), of coefficients (C, n).
 
     The root of the mean square is that of the lattice's nodes. The largest error is searched: from the highest peaks
     among the nodes upwards, and on the rim of the largest angle.
@@ -71,10 +61,9 @@ def measure(target: CameraLike, k: Tensor, exact: Tensor, source: Reference) -> 
         # what was out of the reach of the fit is no part of its result
         return to_sensor(target, k, rays.rays).covered | exact[:, None]
 
-    rays = source.rays
+    rays, angles = source.rays, source.rays.angles
     errors, mapped = compared(rays)
     mapped = mapped & reached(rays)
-    angles = rays.angles
     first_hole = torch.where(rays.valid & ~mapped, angles, torch.inf).amin(-1, keepdim=True)
     inside = rays.valid & mapped & (angles < first_hole)
     errors, some = torch.where(inside, errors, 0.0), inside.any(-1)
@@ -108,4 +97,4 @@ def measure(target: CameraLike, k: Tensor, exact: Tensor, source: Reference) -> 
     every = source.all_rays
     mapped = mapped if every is rays else compared(every)[1] & reached(every)
     shown = every.valid & mapped & (every.angles <= max_angle[:, None]) & some[:, None]
-    return Measures(rms, max_error, max_angle, shown.sum(-1) / every.valid.sum(-1).clamp(min=1))
+    return rms, max_error, max_angle, shown.sum(-1) / every.valid.sum(-1).clamp(min=1)

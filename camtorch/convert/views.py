@@ -51,11 +51,9 @@ class Lattice(NamedTuple):
 
     low: Tensor
     high: Tensor
-    side: int
-    """The number of nodes along either coordinate, both ends included."""
+    side: int  # the number of nodes along either coordinate, both ends included
     are_pixels: bool
-    limit: float
-    """Radians from the axis, beyond which rays do not count."""
+    limit: float  # radians from the axis, beyond which rays do not count
 
     def of(self, rows: Tensor) -> Lattice:
         """That of some rows."""

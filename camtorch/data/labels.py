@@ -30,8 +30,7 @@ from camtorch.poses.rotations import rotation_matrix
 from camtorch.values.arguments import LEFT, check_path, imported
 
 Json = dict[str, Any]
-Opened = tuple[Sequence[Any], TableLike | None]
-"""An entry for each sample, and the table of a mirror."""
+Opened = tuple[Sequence[Any], TableLike | None]  # an entry for each sample, and the table of a mirror
 
 _SUFFIXES = (".jpg", ".png", ".jpeg", ".bmp", ".JPG", ".PNG")
 _UP = 3  # folders above the labels in which images are looked for

@@ -22,10 +22,8 @@ from camtorch.warp.proxy import ProxyWarp
 from camtorch.warp.warp import Warp
 
 Array: TypeAlias = "np.ndarray[Any, Any]"
-Batch = dict[str, Any]
-"""Column -> an array or a list, of as many rows as all others."""
-Moves = Augmentation | FaceNormalizer | Warp
-"""What moves samples."""
+Batch = dict[str, Any]  # column -> an array or a list, of as many rows as all others
+Moves = Augmentation | FaceNormalizer | Warp  # what moves samples
 _ENDINGS = ("jpg", "jpeg", "png", "webp", "ppm", "pgm", "tif", "tiff", "bmp", "npy")
 
 

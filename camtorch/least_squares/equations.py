@@ -39,9 +39,6 @@ _FIRM = 1e-4  # of the largest singular value: what is less belongs to unknowns 
 class System:
     """Linear problems with their damped steps: what `levenberg_marquardt.minimise` asks for."""
 
-    equations: Equations
-    decrement: Tensor
-
     def __init__(self, equations: Equations, width: int, held: Tensor):
         self.width = width
         of_views, own = equations.view.square().sum((1, 2)), equations.shared[:, :-1].square().sum(-2)
@@ -128,9 +125,8 @@ class System:
     def _left(self, of_views: Tensor, whole: Tensor) -> Tensor:
         """(R,) what of the decrement a step leaves."""
         view, shared = self.equations.view, self.equations.shared[:, :-1]
-        mine = (view[..., :-1] @ torch.cat((of_views, whole[:, None].expand(-1, view.shape[1], -1)), -1)[..., None])[
-            ..., 0
-        ]
+        steps = torch.cat((of_views, whole[:, None].expand(-1, view.shape[1], -1)), -1)
+        mine = (view[..., :-1] @ steps[..., None])[..., 0]
         ours = (shared[..., :-1] @ whole[..., None])[..., 0]
         return (mine + view[..., -1]).square().sum((-1, -2)) + (ours + shared[..., -1]).square().sum(-1)
 

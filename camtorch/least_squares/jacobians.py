@@ -14,8 +14,7 @@ from camtorch.optics.backprojection import Inverted
 from camtorch.projection.camera_like import CameraLike
 from camtorch.values.arguments import columns
 
-FURTHEST = 20.0
-"""The furthest from the centre of a chart's plane that a fit looks: 87 degrees in perspective."""
+FURTHEST = 20.0  # the furthest from the centre of a chart's plane that a fit looks: 87 degrees in perspective
 
 
 class SensorPoints(NamedTuple):

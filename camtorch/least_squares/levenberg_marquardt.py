@@ -11,8 +11,7 @@ from torch import Tensor
 
 from camtorch.least_squares.equations import System
 
-State = tuple[Tensor, ...]
-"""What is looked for: tensors (B, ...), a row for each problem."""
+State = tuple[Tensor, ...]  # what is looked for: tensors (B, ...), a row for each problem
 
 FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-4, 1e-15, 1e8
 _GOOD, _FAIR = 0.75, 0.25  # parts of what a step promised that were kept
@@ -21,8 +20,7 @@ _GOOD, _FAIR = 0.75, 0.25  # parts of what a step promised that were kept
 class Problem(Protocol):
     """Sums of squares to be made small, B of them; rows (R,) says which of them are meant."""
 
-    rounding: Tensor
-    """(B,) the sums of squares of what rounding does to the residuals, see `rounding_of`."""
+    rounding: Tensor  # (B,) the sums of squares of what rounding does to the residuals, see `rounding_of`
 
     def cost(self, state: State, rows: Tensor) -> Tensor:
         """(R,); infinite where a state cannot be."""

@@ -25,12 +25,9 @@ _EDGE = 1e-3  # degrees: what float32 may make of a field of view
 class Lenses(NamedTuple):
     """Lenses before images of one size, in float64."""
 
-    intrinsics: Tensor
-    """(N, 4)."""
-    distortion: Tensor
-    """(N, 4)."""
-    reach: Tensor
-    """(N,): the radius of the image at the lens's fold in focal lengths."""
+    intrinsics: Tensor  # (N, 4)
+    distortion: Tensor  # (N, 4)
+    reach: Tensor  # (N,): the radius of the image at the lens's fold in focal lengths
 
     def at(self, share: Tensor) -> Lenses:
         """Those at shares (*B,) of the way through the list, from 0 to 1."""

@@ -19,10 +19,8 @@ class Exact:
 
     positions: Floats
     """(H', W', 2): x and y in pixels of the source for every pixel of the target; finite, on its image or off."""
-    mapped: Bools
-    """(H', W'): the pixel has a ray, and the source maps it, on its image or off."""
-    shown: Bools
-    """(H', W'): the pixel shows something of the source's image, as `Warp.valid_mask`."""
+    mapped: Bools  # (H', W'): the pixel has a ray, and the source maps it, on its image or off
+    shown: Bools  # (H', W'): the pixel shows something of the source's image, as `Warp.valid_mask`
 
     def __init__(self, warp: Warp, owner: str):
         if not isinstance(warp, Warp):

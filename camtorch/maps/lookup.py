@@ -14,8 +14,7 @@ from camtorch.maps.exact import Exact
 from camtorch.values.dtypes import narrow, widen
 from camtorch.warp.warp import Warp
 
-OUTSIDE = -9.0
-"""A position of `grid_sample` that no image reaches."""
+OUTSIDE = -9.0  # a position of `grid_sample` that no image reaches
 _FAR = 100.0  # positions beyond are drawn in, as by `Warp`: float32 does not hold all of them, nor do integers
 
 

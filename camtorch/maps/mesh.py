@@ -29,8 +29,7 @@ class Mesh:
     """Positions at every `step` pixels of the target from the first to beyond the last, bilinear between them."""
 
     step: int
-    nodes: Floats
-    """(n, m, 2), x and y in pixels of the source."""
+    nodes: Floats  # (n, m, 2), x and y in pixels of the source
     needed: Bools | None = None
     """(n, m): nodes of blocks with a pixel that the warp shows; None for a mesh that was read."""
 
@@ -52,8 +51,7 @@ class Table(MapFormat):
     """A format whose file is a bare table of a mesh: sizes and step come from the description next to it."""
 
     described = True
-    step: int
-    """Pixels of the target between nodes, by default."""
+    step: int  # pixels of the target between nodes, by default
     steps: Sequence[int]
 
     @abstractmethod

@@ -9,10 +9,8 @@ from typing import Any
 from camtorch.maps.exact import Exact
 from camtorch.maps.lookup import LookupMap
 
-MOST_PIXELS = 1 << 26
-"""Of a map that is read: 8192 x 8192."""
-SIZES = "source_height", "source_width", "target_height", "target_width"
-"""What files and descriptions call them."""
+MOST_PIXELS = 1 << 26  # of a map that is read: 8192 x 8192
+SIZES = "source_height", "source_width", "target_height", "target_width"  # what files and descriptions call them
 _LONGEST = 1 << 16  # pixels along a side
 
 

@@ -16,8 +16,7 @@ if TYPE_CHECKING:
     from camtorch.cameras.camera import Camera
     from camtorch.optics.charts import Chart
 
-BEYOND = 1.02
-"""How much further out than the image is asked, where its rim is safe from rounding."""
+BEYOND = 1.02  # how much further out than the image is asked, where its rim is safe from rounding
 _NODES = 48  # of Chebyshev: what a polynomial of t = radius^2 is between them is hardly more than on them
 _KEPT = 0.02  # of the way from the lens given to where a formula ends
 _AZIMUTHS = 360  # a shear near its end has its least in a narrow sector

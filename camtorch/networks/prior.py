@@ -30,14 +30,10 @@ class Prior:
     """A lens, and from where to where its focal length goes."""
 
     model: type[Camera]
-    lens: Tensor
-    """(n,) coefficients, float64."""
-    focal: float
-    """The geometric mean of fx and fy."""
-    aspect: float
-    """log(fy / fx)."""
-    middle: list[float]
-    """cx, cy."""
+    lens: Tensor  # (n,) coefficients, float64
+    focal: float  # the geometric mean of fx and fy
+    aspect: float  # log(fy / fx)
+    middle: list[float]  # cx, cy
     discs: tuple[float, float, float]
     """Radii on the chart's plane of the farthest corner: at the greatest focal length, at `focal`, and at the least."""
 

@@ -42,13 +42,12 @@ _TURN = math.radians(170)  # up and down, that a panorama shows without being as
 _STEEP = math.tan(math.radians(60))  # beyond it the rim of a perspective image is stretched more than fourfold
 _NEAR_POLE = math.radians(75)  # where a panorama about the baseline hardly resolves distances
 
-
+# the models whose rows, and whose columns, correspond; how far their plane reaches along the baseline, and across
 _KINDS: dict[str, tuple[tuple[type[Camera], type[Camera]], tuple[float, float]]] = {
     "perspective": ((Pinhole, Pinhole), (_STEEP, _STEEP)),
     "latlon": ((LatLon, Equirectangular), (_NEAR_POLE, _TURN)),
     "cylindrical": ((TransverseCylindrical, Cylindrical), (math.tan(_NEAR_POLE), _TURN)),
 }
-"""The models whose rows, and whose columns, correspond; how far their plane reaches along the baseline, and across."""
 _LINE = 129  # points along the middle of an image
 _PARALLEL = 1e-6  # the part of the view direction across the baseline, below which there is none
 _STEP = 1e-4  # on the plane of a projection, over which its scale is measured
