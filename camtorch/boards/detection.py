@@ -130,8 +130,7 @@ def _to_nearest(pixels: Pixels) -> Pixels:
 
 def _dictionary(cv2: Any, name: str) -> Any:
     known = {key[5:].lower(): key for key in dir(cv2.aruco) if key.startswith("DICT_")}
-    key = known.get(name.lower().removeprefix("dict_"))
-    if key is None:
+    if (key := known.get(name.lower().removeprefix("dict_"))) is None:
         raise ValueError(f"board: no dictionary of markers is called {name!r}; OpenCV has {', '.join(sorted(known))}")
     return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, key))
 

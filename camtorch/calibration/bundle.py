@@ -342,8 +342,7 @@ class Bundle:
     def flat(self, state: State) -> tuple[Tensor, ...]:
         """As tensors (B, ...)."""
         batch = len(state.boards.translations)
-        parameters = [p.expand(batch, -1) for p in state.parameters]
-        return (*state.boards, *state.mounts, state.bend, *parameters)
+        return (*state.boards, *state.mounts, state.bend, *[p.expand(batch, -1) for p in state.parameters])
 
     def state(self, flat: Sequence[Tensor]) -> State:
         """The other way."""
@@ -503,8 +502,7 @@ class Bundle:
         if own:
             columns.append(by_parameters[..., own])
         count = state.parameters[c].shape[-1]
-        mine = [g for g, (camera, i) in enumerate(self.columns) if camera == c and i >= count]
-        if mine:
+        if mine := [g for g, (camera, i) in enumerate(self.columns) if camera == c and i >= count]:
             at += mine
             turned = first @ state.mounts.rotations[:, c, None].mT
             columns += [torch.linalg.cross(turned[..., None, :].expand_as(by_point), by_point, dim=-1), by_point]
@@ -513,8 +511,7 @@ class Bundle:
             along = by_first @ state.boards.rotations[:, :, None, :, 2:]
             columns.append(along * bent(sight.points, state.bend)[1][..., None, :])
         columns.append(look.residuals[..., None])
-        weight = look.weights.sqrt()[..., None, None]
-        return (torch.cat(columns, -1) * weight).flatten(2, 3), at
+        return (torch.cat(columns, -1) * look.weights.sqrt()[..., None, None]).flatten(2, 3), at
 
     def moved(self, flat: Sequence[Tensor], step: Sequence[Tensor], rows: Tensor) -> tuple[Tensor, ...]:
         """The state a step further; step: of the views (R, V, L), and of what they share (R, G)."""
@@ -522,8 +519,7 @@ class Bundle:
         of_views, shared = step
         boards, mounts, bend = state.boards, state.mounts, state.bend
         if self.width == 6:
-            turned = compiled_poses.turned(boards.rotations, of_views)
-            boards = Poses(turned, boards.translations + of_views[..., 3:])
+            boards = Poses(compiled_poses.turned(boards.rotations, of_views), boards.translations + of_views[..., 3:])
         else:
             boards = boards._replace(translations=boards.translations + of_views)
         parameters = []

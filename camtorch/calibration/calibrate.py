@@ -52,8 +52,7 @@ class Model:
 
     def camera(self, parameters: Tensor, image_size: tuple[int, int] | None) -> Camera:
         """That of parameters (*B, 4 + n), in which what is frozen in the camera to start from is frozen."""
-        parts = parameters.split((4, self.count) if self.count else 4, -1)
-        found = self.kind(*parts, image_size=image_size)
+        found = self.kind(*parameters.split((4, self.count) if self.count else 4, -1), image_size=image_size)
         if self.start is not None and (frozen := frozen_names(self.start)):
             found.freeze(*frozen)
         return found
@@ -97,8 +96,7 @@ def as_model(
     fixed = (names if fixed == "all" else (fixed,)) if isinstance(fixed, str) else tuple(fixed)
     if start is not None and model.smoothness() is not None:
         fixed = (*fixed, *INTRINSICS)  # a surface does what these do as well
-    unknown = [name for name in fixed if not isinstance(name, str) or name not in names]
-    if unknown:
+    if unknown := [name for name in fixed if not isinstance(name, str) or name not in names]:
         raise ValueError(
             f"{owner}: fixed names {', '.join(map(repr, unknown))}; {model.__name__} has {', '.join(names)}"
         )

@@ -233,8 +233,7 @@ def _compiled(given: _Given, threshold: float | None) -> Solved | None:
         return None
     start = None
     if threshold is not None:
-        task = _Task.of(given)
-        start = _consensus(task, threshold)
+        start = _consensus(_Task.of(given), threshold)
     return solved(made[0][0], points, pixels, weights, _SEARCH, start, threshold or 0.0)
 
 

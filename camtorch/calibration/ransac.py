@@ -71,8 +71,7 @@ class _Lines(NamedTuple):
         size = normal.diagonal(dim1=-2, dim2=-1)
         normal = normal + torch.diag_embed(1e-9 * size + 1e-300)
         step = -torch.linalg.solve_ex(normal, columns.mT @ seen.flatten(2)[..., None])[0]
-        turn = small_turn(step[..., :3, 0])
-        return torch.cat((turn @ poses[..., :3], poses[..., 3:] + step[..., 3:, :]), -1)
+        return torch.cat((small_turn(step[..., :3, 0]) @ poses[..., :3], poses[..., 3:] + step[..., 3:, :]), -1)
 
 
 def consensus(points: Tensor, rays: Tensor, slopes: Tensor, seen: Tensor, threshold: float) -> tuple[Tensor, Tensor]:

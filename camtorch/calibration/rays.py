@@ -84,8 +84,7 @@ def poses_from_rays(points: Tensor, rays: Tensor, weights: Tensor) -> RayPoses:
     translations, cosines = translations * side[..., None], cosines * side[..., None]
     ahead = (weights[:, None] * cosines.sign()).sum(-1) > 0
     # monotonous in the angles up to the half turn
-    score = (weights[:, None] * (1 - cosines)).sum(-1).nan_to_num(torch.inf)
-    order = score.argsort(-1)
+    order = (weights[:, None] * (1 - cosines)).sum(-1).nan_to_num(torch.inf).argsort(-1)
     rotations, translations, ahead = (_taken(t, order) for t in (rotations, translations, ahead))
     rotations = rotations @ axes.mT[:, None]
     translations = translations * size[:, None, None] - (rotations @ centre[:, None, :, None])[..., 0]
@@ -146,8 +145,7 @@ def _homography(sight: Tensor, distances: _Distances) -> Tensor:
     across = torch.linalg.eigh(small[:, :4, :4] - small[:, :4, 4:] @ along).eigenvectors[..., :1]
     entries = basis.mT @ torch.cat((across, -along @ across), 1)
     entries = torch.where((distances.to_depth[:, None] @ entries) < 0, -entries, entries)
-    columns = entries.view(-1, 3, 3)[..., :2]
-    return torch.cat((columns, distances.to_translation @ entries), -1)
+    return torch.cat((entries.view(-1, 3, 3)[..., :2], distances.to_translation @ entries), -1)
 
 
 class _Distances(NamedTuple):

@@ -217,8 +217,7 @@ def _joined(sights: list[Sight], alone: list[_Alone], free: Free) -> State:
     known = [0]
     while len(known) < len(alone):
         rest = [c for c in range(len(alone)) if c not in known]
-        links = together[known][:, rest]
-        i, j = divmod(int(links.argmax()), len(rest))
+        i, j = divmod(int(together[known][:, rest].argmax()), len(rest))
         a, b = known[i], rest[j]
         rotation, translation = _between(alone[a], alone[b])
         turns[b], shifts[b] = rotation @ turns[a], rotation @ shifts[a] + translation

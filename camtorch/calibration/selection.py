@@ -121,12 +121,10 @@ def select(
                 raise ValueError("views that it was not fitted to are lost")
             trials.append(Trial(model, count, whole, whole.rms, held_out, errors))
         except ValueError as error:
-            nothing = np.full(len(pixels), np.nan)
-            trials.append(Trial(model, count, None, math.nan, math.nan, nothing, str(error)))
+            trials.append(Trial(model, count, None, math.nan, math.nan, np.full(len(pixels), np.nan), str(error)))
         if progress is not None:
             progress(number / len(tried))
-    fitted = [trial for trial in trials if not trial.reason]
-    if not fitted:
+    if not (fitted := [trial for trial in trials if not trial.reason]):
         raise ValueError(f"select: no model can be fitted; {trials[0].model}: {trials[0].reason}")
     least = min(fitted, key=lambda trial: trial.held_out)
 

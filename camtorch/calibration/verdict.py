@@ -357,8 +357,7 @@ def _views(survey: _Survey) -> Iterator[str]:
 
 
 def _loose(survey: _Survey) -> Iterator[str]:
-    loose = survey.loose_focal
-    if loose > _LOOSE_FOCAL:
+    if (loose := survey.loose_focal) > _LOOSE_FOCAL:
         why = "Take views in which the board is near and tilted, and fills the image"
         if len(survey.seen) > 1 and survey.tilt < _ALIKE:
             why = f"All boards are parallel to within {_degrees(survey.tilt)}. {_TILTED}"

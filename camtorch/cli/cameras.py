@@ -88,8 +88,7 @@ def _one(path: Path, rig: Rig, name: str | None = None) -> Camera:
     if name is None and len(rig.cameras) > 1:
         raise ValueError(f"{path}: several cameras; --name says which: {', '.join(rig.cameras)}")
     name = name or next(iter(rig.cameras))
-    camera = rig.camera_of(name)
-    if camera.batch_shape:
+    if (camera := rig.camera_of(name)).batch_shape:
         raise ValueError(f"{path}: {name} is a batch of {tuple(camera.batch_shape)} cameras; here one is needed")
     return camera
 

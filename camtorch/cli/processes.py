@@ -63,8 +63,7 @@ def each(work: Work, pairs: Sequence[Pair], count: int, done: Callable[[], objec
         return outcomes
     others = multiprocessing.active_children()
     # pickled here, because multiprocessing would share the memory of tensors
-    begin = (pickle.dumps(work),)
-    executor = ProcessPoolExecutor(count, multiprocessing.get_context(_HOW), _begin, begin)
+    executor = ProcessPoolExecutor(count, multiprocessing.get_context(_HOW), _begin, (pickle.dumps(work),))
     try:
         futures = [executor.submit(_attempt, pair) for pair in pairs]
         for _ in as_completed(futures):

@@ -105,16 +105,14 @@ def to_make(pairs: Sequence[Pair], others: Iterable[Path], *, resume: bool, forc
     read = {os.path.realpath(path): path for path in (*(source for source, _ in pairs), *others)}
     written: dict[str, Path] = {}
     for source, target in pairs:
-        place = os.path.realpath(target)
-        if place in written:
+        if (place := os.path.realpath(target)) in written:
             raise ValueError(f"{written[place]} and {source} would both be written to {target}")
         if place in read:
             raise ValueError(f"{target}: would overwrite {read[place]}, which is read; name another folder")
         written[place] = source
     if resume:
         return [(source, target) for source, target in pairs if not (target.is_file() and target.stat().st_size)]
-    there = [target for _, target in pairs if os.path.lexists(target)]
-    if there and not force:
+    if (there := [target for _, target in pairs if os.path.lexists(target)]) and not force:
         more = f", and {len(there) - 1} more of {len(pairs)}" if len(there) > 1 else ""
         raise ValueError(
             f"{there[0]}: exists already{more}; --resume goes on where a run was broken off, --force overwrites"

@@ -44,8 +44,7 @@ def size(text: str) -> tuple[int, int]:
 
 def board(text: str) -> tuple[int, int]:
     """Return (columns, rows) of "COLUMNSxROWS"."""
-    counts = re.fullmatch(r"([0-9]{1,4})[xX]([0-9]{1,4})", text)
-    if not counts:
+    if not (counts := re.fullmatch(r"([0-9]{1,4})[xX]([0-9]{1,4})", text)):
         raise _WrongWord(f"{text!r} is not COLUMNSxROWS, as in 9x6")
     return int(counts[1]), int(counts[2])
 

@@ -42,8 +42,7 @@ def convert(
     max_angle = None if max_angle is None else as_number(max_angle, "max_angle", owner)
     if max_angle is not None and not 0 < max_angle <= math.pi * (1 + 1e-6):
         raise ValueError(f"{owner}: max_angle must be positive radians, up to pi; got {max_angle}")
-    tolerance = as_number(tolerance, "tolerance", owner)
-    if not tolerance > 0:
+    if not (tolerance := as_number(tolerance, "tolerance", owner)) > 0:
         raise ValueError(f"{owner}: tolerance must be positive; got {tolerance}")
     if count is None:
         least = default_count(model, source, models)
@@ -154,8 +153,7 @@ def _converted(task: _Task, count: int) -> _Result:
         taken, exact = carried[0], carried[1] & usable & (source.intrinsics[:, :2] > 0).all(-1)
         starts = torch.cat((starts, taken[None]))
         parameters = torch.where(exact[:, None], torch.cat((source.intrinsics, taken), -1), parameters)
-    rows = (~exact).nonzero()[:, 0]
-    if len(rows):
+    if len(rows := (~exact).nonzero()[:, 0]):
         parameters[rows] = fit(build(parameters), samples.observations.of(rows), starts[:, rows], slopes[rows])
     result = _measured(task, parameters, exact)
     # no camera of the model has a largest error below the least root of the mean square

@@ -24,8 +24,7 @@ def default_count(model: Model, source: CameraLike, models: Models) -> int:
     """How many coefficients the model takes to hold those of a related camera, and its own number at least."""
     if isinstance(source, model):
         return len(source.distortion_names)
-    steps = _path(type(source), model, models)
-    if steps is None:
+    if (steps := _path(type(source), model, models)) is None:
         return model.fit_counts[0] if model.fit_counts else model.default_count
     needed = {_renamed(name, steps) for name in source.distortion_names}
     named = {n: model.names_of(n) for n in range(model.default_count, _MANY)}
@@ -40,14 +39,12 @@ def carry_over(
 
     values: (C, its own n). models: those that may lie between, by key. None: the models are not related.
     """
-    steps = _path(type(source), model, models)
-    if steps is None:
+    if (steps := _path(type(source), model, models)) is None:
         return None
     result = values.new_tensor(model.ideal(len(names))).repeat(len(values), 1)
     lossless = torch.ones(len(values), dtype=torch.bool, device=values.device)
     for i, old in enumerate(source.distortion_names):
-        name = _renamed(old, steps)
-        if name in names:
+        if (name := _renamed(old, steps)) in names:
             result[:, names.index(name)] = values[:, i]
         else:
             lossless &= values[:, i] == _ideal_value(source, old, steps)
@@ -72,8 +69,7 @@ def _path(start: Model, end: Model, models: Models) -> list[Step] | None:
 def _neighbours(model: Model, models: Models) -> Iterator[Step]:
     for general in (model, *models.values()):
         for key, names in general.special_cases:
-            special = models.get(key)
-            if special is not None and general is model:
+            if (special := models.get(key)) is not None and general is model:
                 yield special, dict(zip(names, _all_names(special), strict=False))
             elif special is model:
                 yield general, dict(zip(_all_names(model), names, strict=False))

@@ -71,16 +71,12 @@ class Mover:
             self._seeded.set_epoch(epoch)
 
     def _moved(self, key: Key | None, row: Mapping[str, Any]) -> Sample:
-        """What changes of a row: fields that move, what is valid of them, `rotation`, and `camera`, a Camera.
-
-        A row has arrays, or lists of numbers; `camera` is one, or an object of its numbers.
-        """
+        """What changes of a row of arrays or lists: fields that move, what is valid of them, `rotation`, `camera`."""
         try:
             moving = {name: value for name, value in row.items() if self._moves(name, value)}
             kinds = {name: kind_of(name, value, self._fields, self._owner) or "" for name, value in moving.items()}
             fields = {name: _dense(name, value, kinds[name]) for name, value in moving.items()}
-            camera = row.get("camera")
-            if camera is not None:
+            if (camera := row.get("camera")) is not None:
                 fields["camera"] = camera if isinstance(camera, Camera) else self._camera(camera, fields)
             if self._seeded is None:
                 return self._fixed(fields)
@@ -189,8 +185,7 @@ class MapBatches(Mover):
         counts = {name: len(column) for name, column in batch.items()}
         if len(set(counts.values())) > 1:
             raise ValueError(f"{self._owner}: all columns must have as many rows; got {counts}")
-        missing = [name for name in self._keys if name not in batch]
-        if missing:
+        if missing := [name for name in self._keys if name not in batch]:
             raise ValueError(f"{self._owner}: no column {missing[0]!r} to name the rows; there are {', '.join(batch)}")
         count = max(counts.values(), default=0)
         rows = [self._row({name: column[i] for name, column in batch.items()}) for i in range(count)]
@@ -200,7 +195,7 @@ class MapBatches(Mover):
         result = {**batch, **{name: _column([row.get(name) for row in rows]) for name in names}}
         for name, column in batch.items():  # of one type in all blocks
             if name in names and _is_objects(column) and not _is_objects(result[name]):
-                result[name] = _objects(list(result[name]))
+                result[name] = np.fromiter(result[name], object)
         return result
 
     def _row(self, row: dict[str, Any]) -> Sample:
@@ -222,14 +217,7 @@ def _column(values: list[Any]) -> Array:
     """Rows as one array, of objects where their shapes or types differ."""
     if len({(getattr(v, "shape", None), getattr(v, "dtype", type(v))) for v in values}) == 1 and values[0] is not None:
         return np.stack(values) if isinstance(values[0], np.ndarray) else np.asarray(values)
-    return _objects(values)
-
-
-def _objects(values: list[Any]) -> Array:
-    column = np.empty(len(values), object)
-    for i, value in enumerate(values):
-        column[i] = value
-    return column
+    return np.fromiter(values, object)
 
 
 class MapSamples(Mover):

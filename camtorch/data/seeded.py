@@ -115,8 +115,7 @@ class Seeded:
 
     def draw(self, keys: Sequence[Key] | Tensor | np.ndarray[Any, Any]) -> dict[str, Tensor]:
         """The draw of a batch of samples, `augmentation.draw` of each one by itself."""
-        draws = [self._inner.draw(1, self.generator(key)) for key in keys]
-        if not draws:
+        if not (draws := [self._inner.draw(1, self.generator(key)) for key in keys]):
             return self._inner.draw(0)
         return {name: torch.cat([draw[name] for draw in draws]) for name in draws[0]}
 

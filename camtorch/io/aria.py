@@ -33,8 +33,7 @@ def parse(record: Record) -> Rig:
     cameras, extrinsics = {}, {}
     record.few(len(record["CameraCalibrations"]))
     for entry in record["CameraCalibrations"]:
-        name = entry["Label"].text()
-        if name in cameras:
+        if (name := entry["Label"].text()) in cameras:
             entry["Label"].fail(f"a second camera is called {name!r:.60}")
         projection = entry["Projection"]
         key, focals, count = _MODELS[one_of(projection["Name"], _MODELS)]
@@ -48,8 +47,7 @@ def parse(record: Record) -> Rig:
         cameras[name] = projection.camera(key, intrinsics, distortion, size)
         if "T_Device_Camera" in entry:
             place = entry["T_Device_Camera"]
-            quaternion = place["UnitQuaternion"]
-            if len(quaternion) != 2:
+            if len(quaternion := place["UnitQuaternion"]) != 2:
                 quaternion.fail(f"is not [w, [x, y, z]], but {quaternion.value!r:.60}")
             w, xyz = quaternion
             numbers = [w.number(), *xyz.numbers(3), *place["Translation"].numbers(3)]

@@ -117,8 +117,7 @@ def _camera(record: Record) -> Camera:
 
 def _same_batch(record: Record, *tensors: Tensor) -> None:
     """Refuse batch dims that would grow when they are broadcast: a small file is not to take much memory."""
-    shapes = {tuple(t.shape[:-1]) for t in tensors} - {()}
-    if len(shapes) > 1:
+    if len(shapes := {tuple(t.shape[:-1]) for t in tensors} - {()}) > 1:
         record.fail(f"batch dims that differ: {', '.join(map(str, sorted(shapes)))}")
 
 

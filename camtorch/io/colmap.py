@@ -277,8 +277,7 @@ def render(rig: Rig, lossy: Lossy) -> dict[str, bytes]:
             lossy.fail("extrinsics", f"no place: COLMAP has them in images{suffix} beside cameras, so {way}")
         contents[beside] = _images_content(lossy, rig, identities, beside, binary)
         # COLMAP opens no folder without its points
-        points = os.path.join(os.path.dirname(path), f"points3D{suffix}")
-        if not os.path.exists(points):
+        if not os.path.exists(points := os.path.join(os.path.dirname(path), f"points3D{suffix}")):
             contents[points] = struct.pack("<Q", 0) if binary else b"# Number of points: 0\n"
     elif beside is not None and os.path.exists(beside):
         lossy.fail("extrinsics", f"none, while {beside} has poses of images, which these cameras would get")

@@ -184,8 +184,7 @@ def rendered(rig: Rig | Camera, path: str | os.PathLike[str], format: str | None
             raise TypeError(f"{path}: {name} is a {type(camera).__name__}, which has no key of its own to be loaded by")
     format = _known(format, WRITTEN, "written") or _format_of(rig, path)
     if os.path.isdir(path):
-        inside = [os.path.join(path, name) for name in WRITTEN[format].in_folder]
-        if not inside:
+        if not (inside := [os.path.join(path, name) for name in WRITTEN[format].in_folder]):
             raise ValueError(f"{path}: is a folder; {format} is one file, so name it")
         path = next(filter(os.path.exists, inside), inside[-1])
     try:
@@ -215,8 +214,7 @@ def _format_of(rig: Rig, path: str) -> str:
     if folder:
         raise ValueError(f"{path}: is a folder; name a file, or say {' or '.join(f'format={f!r}' for f in formats)}")
     patterns = {pattern: names.format for names in fitting for pattern in names.patterns}
-    meant = [pattern for pattern in patterns if fnmatch.fnmatchcase(file, pattern)]
-    if meant:
+    if meant := [pattern for pattern in patterns if fnmatch.fnmatchcase(file, pattern)]:
         return patterns[max(meant, key=len)]
     may = f"it may be {', '.join(formats)}" if formats else f"written are {', '.join(sorted(WRITTEN))}"
     raise ValueError(

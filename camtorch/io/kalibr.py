@@ -44,8 +44,7 @@ def parse(record: Record) -> Rig:
     names = [name for _, name in numbered]
     if [number for number, _ in numbered] != list(range(len(numbered))):
         record.fail(f"the cameras are not numbered from cam0 on: {', '.join(names):.80}")
-    cameras = {name: _camera(record[name]) for name in names}
-    return Rig(cameras, _extrinsics(record, names))
+    return Rig({name: _camera(record[name]) for name in names}, _extrinsics(record, names))
 
 
 def _camera(record: Record) -> Camera:

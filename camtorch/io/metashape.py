@@ -41,8 +41,7 @@ def read(path: str, content: bytes) -> Rig:
     root = parse_xml(path, decoded(path, content))
     if root.tag == "calibration":
         return Rig({"camera": _camera(Record(path, _values(root), "calibration"))})
-    chunks = root.findall("chunk")
-    if len(chunks) != 1:
+    if len(chunks := root.findall("chunk")) != 1:
         Record(path, None, "document").fail(f"{len(chunks)} chunks; one is read, so export each to a file of its own")
     sensors = [sensor for sensor in chunks[0].iterfind("sensors/sensor") if sensor.find("calibration") is not None]
     Record(path, None, "sensors").few(len(sensors))
@@ -82,8 +81,7 @@ def _names(path: str, elements: list[ElementTree.Element]) -> list[str]:
 
 
 def _camera(record: Record) -> Camera:
-    kind = record["type" if "type" in record else "projection"]
-    key, names = _MODELS[one_of(kind, _MODELS)]
+    key, names = _MODELS[one_of(record["type" if "type" in record else "projection"], _MODELS)]
     resolution = record.get("resolution")
     sides = record if resolution is None else resolution
     height, width = sides["height"].side(), sides["width"].side()

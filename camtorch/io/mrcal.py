@@ -36,8 +36,7 @@ def matches(keys: dict[str, Any]) -> bool:
 def parse(record: Record) -> Rig:
     """The camera; the rig is mrcal's reference. The valid region and the optimization inputs are not read."""
     name = record["lens_model" if "lens_model" in record else "lensmodel"]
-    found = _splined(name) or _MODELS.get(name.text())
-    if found is None:
+    if (found := _splined(name) or _MODELS.get(name.text())) is None:
         known = ", ".join(sorted([*_MODELS, _SPLINED_NAME.format(3, 16, 11, 120)]))
         name.fail(f"{name.text()!r:.60} is not known here; known are {known}. {LEFT}")
     key, count = found
@@ -53,8 +52,7 @@ def parse(record: Record) -> Rig:
 
 def _splined(name: Record) -> tuple[str, int] | None:
     """The key and number of coefficients of a splined lens; None of another one."""
-    found = _SPLINED.fullmatch(name.text())
-    if found is None:
+    if (found := _SPLINED.fullmatch(name.text())) is None:
         return None
     if max(map(len, found.groups())) > 4:
         name.fail(f"{name.value!r:.100}: no grid of that size is read")

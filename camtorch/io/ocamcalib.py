@@ -38,8 +38,7 @@ def read(path: str, content: bytes) -> Rig:
     if len(content) > _LARGEST:
         raise CameraFileError(path, "size", f"{len(content)} bytes; a calibration of OCamCalib has one thousand")
     lines = [line.split() for line in decoded(path, content).splitlines()]
-    rows = [line for line in lines if line and not line[0].startswith("#")]
-    if len(rows) < len(_LINES):
+    if len(rows := [line for line in lines if line and not line[0].startswith("#")]) < len(_LINES):
         raise CameraFileError(path, _LINES[len(rows)], "missing")
     record = Record(path, dict(zip(_LINES, rows, strict=False)))
     polynomial, inverse, centre, affine, size = (record[name] for name in _LINES)

@@ -145,11 +145,9 @@ class _File:
 
     def stated(self) -> tuple[tuple[str, ...], str | None]:
         """The models that the flag of fisheyes leaves open, and its key; none where there is no flag."""
-        key = self.find(_FISHEYE)
-        if key is None:
+        if (key := self.find(_FISHEYE)) is None:
             return (), None
-        flag = self.record[key].value
-        if not isinstance(flag, (str, float, bool)):
+        if not isinstance(flag := self.record[key].value, (str, float, bool)):
             self.fail(key, "is neither true nor false")
         no = str(flag).strip().lower() in ("", "0", "0.", "0.0", "false", "no", "off", "n")
         return ("brown_conrady", "pinhole") if no else ("kannala_brandt",), key

@@ -64,8 +64,7 @@ def read_bytes(path: Path, largest: int = LARGEST_FILE) -> bytes:
     """Return the content of an ordinary file that is neither empty nor suspiciously large."""
     check_ordinary(path)
     with open(path, "rb") as file:
-        size = os.fstat(file.fileno()).st_size
-        if size > largest:
+        if (size := os.fstat(file.fileno()).st_size) > largest:
             raise CameraFileError(path, "size", f"more than {largest >> 20} MiB")
         content = file.read(size)
     if not content:
@@ -126,8 +125,7 @@ def parse_json(path: Path, text: str) -> Any:
         raise CameraFileError(path, "content", "too many values")
 
     def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-        keys = dict(pairs)
-        if len(keys) < len(pairs):
+        if len(keys := dict(pairs)) < len(pairs):
             raise ValueError(f"the key {repeated(key for key, _ in pairs)!r:.60} stands there twice")
         return keys
 

@@ -58,8 +58,7 @@ class Record:
         return key in self.value
 
     def __getitem__(self, key: str) -> Record:
-        found = self.get(key)
-        if found is None:
+        if (found := self.get(key)) is None:
             there = ", ".join(f"{name!r:.30}" for name in islice(self.value, _SHOWN)) or "nothing"
             more = ", ..." if len(self.value) > _SHOWN else ""
             Record(self.path, None, self.place_of(key)).fail(f"missing; there is {there}{more}")
@@ -138,8 +137,7 @@ class Record:
             name = "sizes" if "sizes" in self else "rows and cols"  # the former of any number of dimensions
             parts = [self[key] for key in name.split(" and ")]
             sizes = [n for part in parts for n in (part.numbers() if isinstance(part.value, list) else [part.number()])]
-            data = self["data"]
-            if len(data) != math.prod(sizes):
+            if len(data := self["data"]) != math.prod(sizes):
                 data.fail(f"{len(data)} numbers, where {name} say {' x '.join(f'{size:g}' for size in sizes)}")
             return data.numbers()
         if not isinstance(self.value, list):
@@ -174,8 +172,7 @@ class Record:
 
     def intrinsics(self) -> list[float]:
         """The focal lengths and principal point of the camera matrix, `flat`, that stands here."""
-        matrix = self.flat()
-        if len(matrix) != 9:
+        if len(matrix := self.flat()) != 9:
             self.fail(f"a camera matrix has 3 x 3 numbers, this has {len(matrix)}")
         fx, skew, cx, below, fy, cy, *bottom = matrix
         if skew:

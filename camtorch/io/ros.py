@@ -42,8 +42,7 @@ def parse(record: Record) -> Rig:
     elif len(distortion) not in counts:
         takes = " or ".join(map(str, counts)) or "none"
         coefficients.fail(f"{len(distortion)} coefficients; {record['distortion_model'].value!r} takes {takes}")
-    camera = coefficients.camera(key, intrinsics, distortion, (height, width))
-    return Rig({name or "camera": camera})
+    return Rig({name or "camera": coefficients.camera(key, intrinsics, distortion, (height, width))})
 
 
 def _either(record: Record, *keys: str) -> Record:

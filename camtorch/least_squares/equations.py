@@ -147,8 +147,7 @@ def triangle_of_few(rows: Tensor) -> Tensor:
 
 def _solved(triangle: Tensor, right: Tensor) -> Tensor:
     """Where the triangle is zero, nothing."""
-    diagonal = triangle.diagonal(dim1=-2, dim2=-1)
-    empty = diagonal == 0
+    empty = triangle.diagonal(dim1=-2, dim2=-1) == 0
     triangle = triangle + torch.diag_embed(empty.to(triangle.dtype))
     solution: Tensor = torch.linalg.solve_triangular(triangle, torch.where(empty[..., None], 0.0, right), upper=True)
     return solution

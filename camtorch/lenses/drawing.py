@@ -31,8 +31,7 @@ class Lenses(NamedTuple):
 
     def at(self, share: Tensor) -> Lenses:
         """Those at shares (*B,) of the way through the list, from 0 to 1."""
-        last = len(self.reach) - 1
-        index = (share * len(self.reach)).long().clamp(0, last).to(self.reach.device)
+        index = (share * len(self.reach)).long().clamp(0, len(self.reach) - 1).to(self.reach.device)
         return Lenses(*(column[index].to(share) for column in self))
 
 

@@ -60,16 +60,13 @@ def find(words: str, *, image_size: Sequence[int] | None = None) -> KannalaBrand
     """
     if not _terms(words, "find"):
         raise ValueError(f"lenses.find: words must name a camera or a lens, as 'GoPro HERO9 wide'; got {words!r}")
-    found = search(words)
-    if not found:
+    if not (found := search(words)):
         near = difflib.get_close_matches(words, dict.fromkeys(lens.name for lens in entries()), _SHOWN, 0.5)
         what = f"; the nearest are {', '.join(map(repr, near))}" if near else ""
         raise ValueError(f"lenses.find: no lens is called {words!r}{what}. {GUESS_CAMERA}")
-    size = as_image_size(image_size, "lenses.find")
-    if size is None:
+    if (size := as_image_size(image_size, "lenses.find")) is None:
         return found[0].camera()
-    fitting = search(words, image_size=size)
-    if not fitting:
+    if not (fitting := search(words, image_size=size)):
         sizes = sorted({lens.image_size for lens in found})
         raise ValueError(
             f"lenses.find: {words!r} was not calibrated for images of the aspect ratio of {size}, but (height, width) "

@@ -25,8 +25,7 @@ class Exact:
     def __init__(self, warp: Warp, owner: str):
         if not isinstance(warp, Warp):
             raise TypeError(f"{owner}: warp must be a Warp; got {type(warp).__name__}")
-        count = warp.batch_shape.numel()
-        if count != 1:
+        if (count := warp.batch_shape.numel()) != 1:
             raise ValueError(
                 f"{owner}: a map is of one warp, and this is a batch of {count}; camera[i] is one of a batch of "
                 "cameras, so take each ct.Warp(source[i], target[i], rotation[i])"

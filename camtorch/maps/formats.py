@@ -32,6 +32,7 @@ FORMATS = tuple(_FORMATS)
 
 _LARGEST_FILE = 1 << 31
 _LARGEST_DESCRIPTION = 1 << 16
+_NO_FACTS = ("format", *SIZES, "max_error", "rms_error")
 _KNOWN = f"known are {', '.join(FORMATS)}; docs/leaving-0.3.md says what to use for formats that left"
 
 
@@ -81,8 +82,7 @@ def save_map(
             raise ValueError(f"save_map: {chosen.name} has no {option}{takes}")
     if chosen.suffixes and not name.lower().endswith(chosen.suffixes):
         raise ValueError(f"{name}: files of {chosen.name} are called {', '.join(chosen.suffixes)}")
-    exact = Exact(warp, "save_map")
-    if not exact.shown.any():
+    if not (exact := Exact(warp, "save_map")).shown.any():
         raise ValueError(f"save_map: {name}: no pixel of the target shows anything of the source's image")
     content, facts = chosen.encode(name, exact, given)
     described = {"format": chosen.name, **dict(zip(SIZES, exact.source_size + exact.target_size, strict=True)), **facts}
@@ -112,8 +112,8 @@ def load_map(path: str | os.PathLike[str], format: str | None = None) -> LookupM
     """
     name = path_of(path, "load_map")
     content = read_bytes(name, _LARGEST_FILE)
-    chosen = None if format is None else _named(format)
-    chosen = chosen or next((known for known in _FORMATS.values() if known.matches(name, content)), None)
+    fitting = (known for known in _FORMATS.values() if known.matches(name, content))
+    chosen = next(fitting, None) if format is None else _named(format)
     described = _read_description(name) if chosen is None or chosen.described else {}
     chosen = chosen or _FORMATS.get(str(described.get("format")))
     if chosen is None:
@@ -145,13 +145,9 @@ def check_map(warp: Warp, path: str | os.PathLike[str], format: str | None = Non
     return measure(path_of(path, "check_map"), read, Exact(warp, "check_map"), (), read.facts)
 
 
-_NO_FACTS = ("format", *SIZES, "max_error", "rms_error")
-
-
 def _read_description(path: str) -> dict[str, Any]:
     """Return what stands beside a bare table, or nothing."""
-    beside = f"{path}.json"
-    if not os.path.isfile(beside):
+    if not os.path.isfile(beside := f"{path}.json"):
         return {}
     with open(beside, "rb") as file:
         content = file.read(_LARGEST_DESCRIPTION + 1)
@@ -178,7 +174,6 @@ def _chosen(path: str, format: str | None) -> MapFormat:
 
 
 def _named(format: str) -> MapFormat:
-    found = _FORMATS.get(str(format).lower())
-    if found is None:
+    if (found := _FORMATS.get(str(format).lower())) is None:
         raise ValueError(f"format: {format!r} is no format of a map that is known here; {_KNOWN}")
     return found

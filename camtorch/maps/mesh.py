@@ -15,6 +15,7 @@ from camtorch.io._errors import CameraFileError
 from camtorch.maps.exact import Bools, Exact, Floats
 from camtorch.maps.lookup import LookupMap
 from camtorch.maps.protocol import SIZES, MapFormat, checked
+from camtorch.values.arguments import as_whole
 
 _SLACK = 0.5  # pixels: as far as a pixel that shows the image may lie beyond the outermost pixel centres
 _OUTWARDS = 1 / 32  # of the second differences by which nodes round outwards
@@ -64,7 +65,7 @@ class Table(MapFormat):
 
     def encode(self, path: str, exact: Exact, options: Mapping[str, Any]) -> tuple[bytes, dict[str, Any]]:
         # the mesh of a warp, exact at its nodes, smoothly continued to those without a position; refuse seams
-        step = self._checked(options.get("step", self.step), "save_map")
+        step = self._checked(as_whole(options.get("step", self.step), "step", "save_map"), "save_map")
         half, leaps = np.array(exact.source_size[::-1], np.float64) / 2, 0
         for p, shown in ((exact.positions, exact.shown), (exact.positions.swapaxes(0, 1), exact.shown.T)):
             leaps += int(((np.abs(np.diff(p, axis=0)) > half).any(-1) & shown[1:] & shown[:-1]).sum())
@@ -119,8 +120,7 @@ def _counts(step: int, size: tuple[int, int]) -> tuple[int, int]:
 def _continued(nodes: Floats, known: Bools, low: Floats, high: Floats) -> Floats:
     """Return nodes (n, m, 2) with those that are not known laid out from their neighbours, ring by ring.
 
-    The first ring is where parabolas through three nodes go on, as it has a part in what is shown. Those behind it go
-    on along lines, each by half the step before, so that hardware is not sent across the image.
+    The first ring, which has a part in what is shown, goes on along parabolas, those behind it along shorter lines.
     """
     nodes, known = nodes.copy(), known.copy()
     n, m = known.shape
@@ -149,10 +149,7 @@ def _continued(nodes: Floats, known: Bools, low: Floats, high: Floats) -> Floats
 
 
 def held(path: str, format: str, mesh: Mesh, low: Floats, high: Floats, *, clip: bool) -> Mesh:
-    """Return the mesh with its nodes drawn in to the least and largest x and y (..., 2) that a format holds.
-
-    Unless `clip` is set, nodes of shown pixels that lie more than half a pixel beyond are refused.
-    """
+    """Return the mesh, nodes drawn in to `low` and `high`; refuse, unless `clip`, if shown pixels are far beyond."""
     beyond = ((mesh.nodes < low - _SLACK) | (mesh.nodes > high + _SLACK)).any(-1)
     if mesh.needed is not None and not clip and (lost := beyond & mesh.needed).any():
         worst = mesh.nodes[lost]
@@ -174,10 +171,8 @@ def rounded(mesh: Mesh, exact: Exact, parts: int, low: Floats, high: Floats) -> 
     is cut off, by an eighth of its second difference, so nodes round towards its outside; then those about the largest
     error round as is best there, until that helps no more.
     """
-    values = mesh.nodes * parts
-    least, most = low * parts, high * parts
-    # the sum of the second differences along both axes, of (n, m, 2); at the ends those next to them
-    total = np.zeros_like(mesh.nodes)
+    values, least, most = mesh.nodes * parts, low * parts, high * parts
+    total = np.zeros_like(mesh.nodes)  # of the second differences along both axes; at the ends those next to them
     for axis in (0, 1):
         if mesh.nodes.shape[axis] > 2:
             bend = np.diff(mesh.nodes, 2, axis)
@@ -208,8 +203,7 @@ def rounded(mesh: Mesh, exact: Exact, parts: int, low: Floats, high: Floats) -> 
             for x, y in itertools.product(either, either):
                 value = np.array([x[node][0], y[node][1]])
                 patch[node[0] - near[0].start, node[1] - near[1].start] = value
-                off = errors(patch, pixels)
-                if off.max() < least_error:
+                if (off := errors(patch, pixels)).max() < least_error:
                     least_error, best = float(off.max()), (node, value, pixels, off)
         if best is None:
             break

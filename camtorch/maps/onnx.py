@@ -20,6 +20,7 @@ from camtorch.values.arguments import imported
 
 _OPSET, _IR = 16, 8
 _DTYPES = ("float32", "uint8")
+_NEEDED = "onnx", "models of ONNX need onnx", "onnx"
 
 
 class ONNX(MapFormat):
@@ -44,7 +45,7 @@ class ONNX(MapFormat):
 
     def decode(self, content: bytes, described: Mapping[str, Any]) -> LookupMap:
         """See `MapFormat`. Models are read as they are written here."""
-        onnx = _needed()
+        onnx = imported(*_NEEDED)
         graph = onnx.load_model_from_string(content).graph
         (grid,) = (onnx.numpy_helper.to_array(t).astype(np.float64) for t in graph.initializer if t.name == "grid")
         images = graph.input[0].type.tensor_type
@@ -55,12 +56,8 @@ class ONNX(MapFormat):
         return LookupMap(torch.from_numpy(positions), size, self.name, {"dtype": kind})
 
 
-def _needed() -> Any:
-    return imported("onnx", "models of ONNX need onnx", "onnx")
-
-
 def _model(exact: Exact, dtype: str) -> Any:
-    onnx = _needed()
+    onnx = imported(*_NEEDED)
     helper, kinds = onnx.helper, onnx.TensorProto
     warp, (height, width) = exact.warp, exact.source_size
     with torch.no_grad():

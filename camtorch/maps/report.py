@@ -38,8 +38,7 @@ class MapReport:
 
     def __getattr__(self, name: str) -> Any:
         # a fact is an attribute
-        facts = self.__dict__.get("facts", {})
-        if name in facts:
+        if name in (facts := self.__dict__.get("facts", {})):
             return facts[name]
         raise AttributeError(f"MapReport of {self.__dict__.get('format')} has no {name!r}; it has {', '.join(facts)}")
 

@@ -23,7 +23,7 @@ import numpy as np
 from camtorch.io._errors import CameraFileError
 from camtorch.maps.exact import Exact, Floats
 from camtorch.maps.mesh import Mesh, Table, held, rounded, table
-from camtorch.values.arguments import as_image_size, as_whole
+from camtorch.values.arguments import as_image_size
 
 _PARTS = 8
 _LOW, _HIGH = -(1 << 15), (1 << 15) - 1
@@ -42,11 +42,6 @@ class TILDC(Table):
     options: tuple[str, ...] = ("step", "block", "clip")
     step = 8
     steps: tuple[int, ...] = tuple(1 << m for m in range(8))
-
-    def encode(self, path: str, exact: Exact, options: Mapping[str, Any]) -> tuple[bytes, dict[str, Any]]:
-        if "step" in options:
-            as_whole(options["step"], "step", "save_map")
-        return super().encode(path, exact, options)
 
     def pack(self, path: str, mesh: Mesh, exact: Exact, options: Mapping[str, Any]) -> tuple[bytes, dict[str, Any]]:
         """See `Table`; raise a CameraFileError for sizes, offsets or padding that the LDC does not take."""
@@ -83,12 +78,9 @@ def _pitch(columns: int) -> int:
 def _fetched(
     path: str, positions: Floats, source: tuple[int, int], block: tuple[int, int] | None
 ) -> tuple[tuple[int, int], int, tuple[int, int]]:
-    """Return the size of a block of the target, the padding that it needs, and the largest part of the source fetched;
-    raise a CameraFileError if that is more padding than the hardware has.
-    """
+    """Return the size of a block of the target, its padding, and the largest part of the source fetched, or raise."""
     drawn = positions.clip(0, np.array(source[::-1], np.float64) - 1)
     for size in _BLOCKS if block is None else (block,):
-        # the padding of blocks (height, width), and the largest part of the source fetched with it, (height, width)
         height, width = drawn.shape[:2]
         rows, columns = -(-height // size[0]), -(-width // size[1])
         whole = np.pad(drawn, ((0, rows * size[0] - height), (0, columns * size[1] - width), (0, 0)), "edge")
@@ -97,11 +89,10 @@ def _fetched(
         first, last = np.floor(corners.min(2)), np.ceil(corners.max(2))
         flat = blocks.reshape(rows, columns, -1, 2)
         low, high = np.floor(flat.min(2)) - _BEFORE, np.floor(flat.max(2)) + _AFTER
-        border = int(max((first - low).max(), (high - last).max(), 0))
-        across, down = (last - first).reshape(-1, 2).max(0) + 1 + 2 * border
-        padding, largest = border, (int(down), int(across))
+        padding = int(max((first - low).max(), (high - last).max(), 0))
         if padding <= _MOST_PADDING:
-            return size, padding, largest
+            across, down = (last - first).reshape(-1, 2).max(0) + 1 + 2 * padding
+            return size, padding, (int(down), int(across))
     raise CameraFileError(
         path,
         "pixel padding",

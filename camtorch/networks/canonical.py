@@ -127,8 +127,7 @@ class CanonicalCamera(SampleTransform):
         if self.scales == "depth":
             named, batched, count, camera = self._batch(sample, predicted=True)
             return self._scaled(sample, named, batched, 1 / self.scale(camera).expand(count))
-        source = sample.pop("source_camera", None)
-        if source is None:
+        if (source := sample.pop("source_camera", None)) is None:
             raise ValueError(f"{self._name}: to go back, the sample needs source_camera as it came out")
         source = as_one(source)
         change = self._change(source, len(source) if source.batch_shape else 1)

@@ -94,8 +94,7 @@ class CameraHead(GeometryModule):
             raise ValueError(f"{owner}: a focal length is held by its field of view, fov=(90, 90); got fixed={fixed!r}")
         asked = as_model(model, count, None, fixed, owner)
         known = None if asked.start is None else asked.start.image_size
-        size = as_image_size(image_size, owner) or known
-        if size is None:
+        if (size := as_image_size(image_size, owner) or known) is None:
             raise ValueError(f"{owner}: a camera is valid for an image; give its image_size=(height, width)")
         if known not in (None, size):
             raise ValueError(f"{owner}: the camera is of images of {known}; got image_size={size}")
@@ -198,8 +197,7 @@ class CameraHead(GeometryModule):
         table = self._scales.to(numbers)
         scale = torch.lerp(table[before[:, 0]], table[before[:, 0] + 1], place - before).exp()
         size = torch.linalg.vector_norm(numbers, dim=-1, keepdim=True)
-        index = torch.tensor(self._coefficients, device=numbers.device)
-        moves = none.index_copy(1, index, numbers * scale)
+        moves = none.index_copy(1, torch.tensor(self._coefficients, device=numbers.device), numbers * scale)
         gauge = size / limits.along(moves / size.clamp(min=1e-12), disc.exp())
         return moves * torch.rsqrt(1 + gauge * gauge)
 

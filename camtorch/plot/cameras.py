@@ -186,8 +186,7 @@ def rig(rig: Rig, ax: Axes | None = None) -> Axes:
         ValueError: no camera has a pose.
     """
     ax = axes_or_new(ax)
-    names = [name for name in rig.cameras if name in rig.extrinsics]
-    if not names:
+    if not (names := [name for name in rig.cameras if name in rig.extrinsics]):
         raise ValueError(f"plot: the cameras of a rig need extrinsics; got a rig of {list(rig.cameras)} without")
     places = torch.stack([rig.extrinsics[name].position for name in names]).double().numpy(force=True)
     spread = np.ptp(places, axis=0)

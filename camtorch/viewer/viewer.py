@@ -102,8 +102,7 @@ def _described(camera: Camera) -> dict[str, Any]:
         )
     size = camera._size_for("write_viewer")
     intrinsics, distortion = camera.intrinsics.detach().double(), camera.distortion.detach().double()
-    trouble = unusable(camera, intrinsics, distortion)
-    if trouble is not None:
+    if (trouble := unusable(camera, intrinsics, distortion)) is not None:
         raise ValueError(f"write_viewer: this camera has no pixels: {trouble[0]}: {trouble[1]}")
     return {
         "model": camera.key,
