@@ -122,9 +122,8 @@ class State(NamedTuple):
 
     def of(self, rows: Tensor) -> State:
         """Those of some problems, given by numbers."""
-        return State(
-            tuple(p[rows] for p in self.parameters), self.mounts.of(rows), self.boards.of(rows), self.bend[rows]
-        )
+        parameters = tuple(p[rows] for p in self.parameters)
+        return State(parameters, self.mounts.of(rows), self.boards.of(rows), self.bend[rows])
 
 
 class Free(NamedTuple):
@@ -280,28 +279,9 @@ def bent(points: Tensor, bend: Tensor) -> tuple[Tensor, Tensor]:
 class Bundle:
     """The problem, for `levenberg_marquardt.minimise`: its state is flat, with the batch in front of every tensor."""
 
-    free: Free
-    loss: str | None
-    loss_scale: float
-    sights: list[Sight]
-    cameras: list[Camera]
-    rounding: Tensor
-    are_shared: list[bool]
-    fixed: list[Camera | None]
-    learns_bend: bool
-    is_bent: bool
-    is_plain: bool  # whether one camera sees flat boards that may be anywhere: what compiled code knows
-    columns: tuple[tuple[int, int], ...]
-    learnt: list[tuple[Tensor, Tensor]]  # of each camera the numbers of its columns, and of its parameters in them
-    unknowns: int
-    low: Tensor
-    high: Tensor
-    is_bounded: bool
-    _last: tuple[tuple[Tensor, ...], list[compiled_poses.Look]] | None
-
     def __init__(self, sights: Sequence[Sight], state: State, free: Free, loss: str | None, loss_scale: float):
         self.free, self.loss, self.loss_scale = free, loss, loss_scale
-        self._last = None
+        self._last: tuple[tuple[Tensor, ...], list[compiled_poses.Look]] | None = None
         batch = state.boards.translations.shape[0]
         self.sights = [s.mapped(lambda t: t.expand(batch, *t.shape[1:])) for s in sights]
         self.cameras = [_template(s.model, p) for s, p in zip(sights, state.parameters, strict=True)]
@@ -314,28 +294,27 @@ class Bundle:
             remade(camera, intrinsics=p[0, :4], distortion=p[0, 4:]) if shared else None
             for camera, p, shared in zip(self.cameras, state.parameters, self.are_shared, strict=True)
         ]
-        self.learns_bend = free.bend
         self.columns = tuple(
             [(c, int(i)) for c, f in enumerate(free.parameters) for i in f.nonzero()[:, 0]]
             + [(c, len(free.parameters[c]) + i) for c, learns in enumerate(free.mounts) if learns for i in range(6)]
             + [(-1, i) for i in range(2) if free.bend]
         )
-        self.learnt = []
+        # of each camera the numbers of its columns, and of its parameters in them
+        self.learnt: list[tuple[Tensor, Tensor]] = []
         for c, p in enumerate(state.parameters):
             of = [(g, i) for g, (camera, i) in enumerate(self.columns) if camera == c and i < p.shape[-1]]
             at, own = torch.tensor(of, dtype=torch.long, device=p.device).view(-1, 2).unbind(-1)
             self.learnt.append((at, own))
         self.is_bent = free.bend or bool((state.bend != 0).any())
+        # whether one camera sees flat boards that may be anywhere, which is what compiled code knows
         plain = len(sights) == 1 and free.boards == "poses" and not (free.mounts[0] or self.is_bent)
         self.is_plain = plain and compiled_of(self.cameras, self.sights[0].pixels) is not None
-        self.width = 6 if free.boards == "poses" else 3
-        """Of the unknowns of a view."""
+        self.width = 6 if free.boards == "poses" else 3  # of the unknowns of a view
         views = torch.stack([(s.weights > 0).any(-1).any(0) for s in self.sights]).any(0).sum()
         self.unknowns = len(self.columns) + self.width * int(views)
-        sides = zip(*(bounds(camera, p) for camera, p in zip(self.cameras, state.parameters, strict=True)), strict=True)
-        self.low, self.high = (
-            self._of_columns(side, end) for side, end in zip(sides, (-torch.inf, torch.inf), strict=True)
-        )
+        ends = [bounds(camera, p) for camera, p in zip(self.cameras, state.parameters, strict=True)]
+        self.low = self._of_columns([low for low, _ in ends], -torch.inf)
+        self.high = self._of_columns([high for _, high in ends], torch.inf)
         # that of a focal length is for what goes wrong
         self.is_bounded = any(c >= 0 and i >= 4 and self.cameras[c].fit_bounds for c, i in self.columns)
 
@@ -350,15 +329,11 @@ class Bundle:
 
     def _of_columns(self, parameters: Sequence[Tensor], other: float) -> Tensor:
         """(B, G): those of the shared unknowns that are parameters, and another number for the others."""
-        like = parameters[0]
-        batch = max(map(len, parameters))
-        columns = [
-            parameters[c][:, i].expand(batch)
-            if c >= 0 and i < parameters[c].shape[-1]
-            else like.new_full((batch,), other)
-            for c, i in self.columns
-        ]
-        return torch.stack(columns, -1) if columns else like.new_zeros(batch, 0)
+        found = parameters[0].new_full((max(map(len, parameters)), len(self.columns)), other)
+        for g, (c, i) in enumerate(self.columns):
+            if c >= 0 and i < parameters[c].shape[-1]:
+                found[:, g] = parameters[c][:, i]
+        return found
 
     def points(self, c: int, state: State, sight: Sight) -> tuple[Tensor, Tensor, Tensor]:
         """(B, V, N, 3): those of the board as it lies, in the frame of the first camera, in that of this one."""
@@ -506,7 +481,7 @@ class Bundle:
             at += mine
             turned = first @ state.mounts.rotations[:, c, None].mT
             columns += [torch.linalg.cross(turned[..., None, :].expand_as(by_point), by_point, dim=-1), by_point]
-        if self.learns_bend:
+        if self.free.bend:
             at += [g for g, (camera, _) in enumerate(self.columns) if camera == -1]
             along = by_first @ state.boards.rotations[:, :, None, :, 2:]
             columns.append(along * bent(sight.points, state.bend)[1][..., None, :])
@@ -528,7 +503,7 @@ class Bundle:
                 low, high = (_of_rows(ends, rows)[:, at] for ends in (self.low, self.high))
                 p = p.index_copy(1, own, (p[:, own] + shared[:, at]).clamp(low, high))
             parameters.append(p)
-        if self.learns_bend:
+        if self.free.bend:
             bend = bend + shared[:, -2:]
         if any(self.free.mounts):
             turn, shift = torch.zeros_like(mounts.translations), torch.zeros_like(mounts.translations)
@@ -562,14 +537,14 @@ def pixel_jacobians(camera: Camera, points: Tensor, learns: bool = True) -> tupl
     (C, N, 2, 3) and (C, N, 2, 4 + n): zero where there is no pixel, and of no meaning where a point is not valid.
     """
     made = compiled_of([camera], points)
-    plan = None if made is None else made[0][0].plan
-    if made is not None and plan is not None and (not learns or plan.places is not None):
+    if made is not None and (not learns or made[0][0].plan.places is not None):
+        plan = made[0][0].plan
         by_point, by_own = (t.nan_to_num(0.0, 0.0, 0.0) for t in compiled.project_jacobians(made[0][0], points, learns))
-        if learns and plan.places is not None and not plan.is_all:
-            by_parameters = by_own.new_zeros(*by_own.shape[:-1], 4 + camera.distortion.shape[-1])
-            by_parameters[..., :4], by_parameters[..., 4 + plan.places] = by_own[..., :4], by_own[..., 4:]
-            return by_point, by_parameters
-        return by_point, by_own
+        if not learns or plan.places is None or plan.is_all:
+            return by_point, by_own
+        by_parameters = by_own.new_zeros(*by_own.shape[:-1], 4 + camera.distortion.shape[-1])
+        by_parameters[..., :4], by_parameters[..., 4 + plan.places] = by_own[..., :4], by_own[..., 4:]
+        return by_point, by_parameters
     intrinsics = camera.intrinsics.view(-1, 4)
     found = sensor_jacobians(camera, camera.distortion.view(len(intrinsics), -1), points, math.inf)
     focal = intrinsics[:, None, :2, None]

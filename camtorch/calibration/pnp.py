@@ -121,7 +121,7 @@ def solve_pnp(
     with torch.no_grad():
         found = _compiled(given, threshold) or _searched(given, threshold)
     vectors, translations, rms = found.vectors, found.translations, found.rms
-    if learns([given.camera], *given.tensors()):
+    if learns([given.camera], *(t for t in given[1:4] if t is not None)):
         # the poses and the root mean squares with their derivatives
         task = _Task.of(given)
         task = task._replace(weights=torch.where(found.inliers, task.weights, 0.0))
@@ -180,10 +180,6 @@ class _Given(NamedTuple):
     weights: Tensor | None  # (B, N)
     batch: torch.Size
     dtype: torch.dtype
-
-    def tensors(self) -> list[Tensor]:
-        """Those of points."""
-        return [t for t in self[1:4] if t is not None]
 
     @classmethod
     def of(cls, camera: Camera, object_points: Numbers, pixels: Numbers, weights: Numbers | None) -> _Given:
@@ -287,8 +283,7 @@ def _searched(given: _Given, threshold: float | None) -> Solved:
     weights = task.weights
     if threshold is None:
         starts = poses_from_rays(task.points, task.rays, weights)
-        turns, shifts, valid = starts
-        found = _least([_minimum(task, turns[:, i], shifts[:, i], valid[:, i]) for i in range(2)])
+        found = _least([_minimum(task, *(t[:, i] for t in starts)) for i in range(2)])
         # of points on a plane the other minimum may be one of pixels, and none of rays: of few, and of much noise
         share = task.weights / task.weights.sum(-1, keepdim=True)
         centre = (share[..., None] * task.points).sum(-2)
@@ -337,14 +332,12 @@ def _searched(given: _Given, threshold: float | None) -> Solved:
 
 
 class _Found(NamedTuple):
-    """Minima: costs (B,), infinite where there is none, rotations (B, 3, 3), translations (B, 3); and triangles
-    (B, 6, 7) of the derivatives by turn and shift, and of the residuals.
-    """
+    """Minima."""
 
-    costs: Tensor
-    rotations: Tensor
-    translations: Tensor
-    triangles: Tensor
+    costs: Tensor  # (B,), infinite where there is none
+    rotations: Tensor  # (B, 3, 3)
+    translations: Tensor  # (B, 3)
+    triangles: Tensor  # (B, 6, 7): of the derivatives by turn and shift, and of the residuals
 
 
 def _minimum(task: _Task, rotations: Tensor, translations: Tensor, valid: Tensor) -> _Found:

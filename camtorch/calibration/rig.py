@@ -137,11 +137,9 @@ def calibrate_rig(
     for given in (count, start, fixed):
         stray = [name for name in given if name not in observed] if isinstance(given, Mapping) else []
         if stray:
-            raise ValueError(
-                f"{owner}: no camera is called {', '.join(map(repr, stray))}; there are {', '.join(observed)}"
-            )
-    middle = middle_of([seen for seen, _ in observed.values()])
-    searches = []
+            unknown = ", ".join(map(repr, stray))
+            raise ValueError(f"{owner}: no camera is called {unknown}; there are {', '.join(observed)}")
+    middle, searches = middle_of([seen for seen, _ in observed.values()]), []
     for name, (seen, layout) in observed.items():
         of = f"{owner}: {name}"
         asked = as_model(models[name], _of(count, name, None), _of(start, name, None), _of(fixed, name, ()), of)
@@ -155,17 +153,14 @@ def calibrate_rig(
     cameras = dict(zip(observed, found.cameras, strict=True))
     state = found.adjusted.state
     rotations, translations = (t[0] for t in state.boards)
-    mounts = {
-        name: Extrinsics(rotation_vector(r).unsqueeze(-1), t)
-        for name, r, t in zip(observed, *(t[0] for t in state.mounts), strict=True)
-    }
+    posed = zip(observed, *(t[0] for t in state.mounts), strict=True)
+    mounts = {name: Extrinsics(rotation_vector(r).unsqueeze(-1), t) for name, r, t in posed}
     # the deviations (6,) of each camera's pose by its name; zeros for the first one
     names = list(observed)
     std = torch.linalg.vector_norm(shared_factor(found.adjusted.equations)[0] * found.noise, dim=-1)
     stds = {name: std.new_zeros(6) for name in names}
     for value, (camera, i) in zip(std, found.adjusted.equations.columns, strict=True):
-        size = found.adjusted.state.parameters[camera].shape[-1]
-        if camera >= 0 and i >= size:
+        if camera >= 0 and i >= (size := found.adjusted.state.parameters[camera].shape[-1]):
             stds[names[camera]][i - size] = value
     result = RigCalibration(
         rig=Rig({name: c.camera for name, c in cameras.items()}, mounts),

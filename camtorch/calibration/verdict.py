@@ -133,7 +133,7 @@ class Calibration:
     def warnings(self) -> list[str]:
         """What the data do not carry, and what does not fit, in words: each with what to do."""
         survey = _Survey(self)
-        finders = (_search, _residuals, _views, _loose, _twins, _coverage, _pattern)
+        finders = (_search, _residuals, _views, _parameters, _over_image)
         return [text for find in finders for text in find(survey)]
 
     @property
@@ -327,18 +327,19 @@ def _residuals(survey: _Survey) -> Iterator[str]:
             f"{count} of {total} corners are outliers, {int(per_view[most])} of them in view "
             f"{calibration.views[most]}{robust}. Look at the views"
         )
-    lost = (per_view > _MOST_OF_A_VIEW * seen.sum(-1)).nonzero()[:, 0].tolist()
+    lost = [calibration.views[i] for i in (per_view > _MOST_OF_A_VIEW * seen.sum(-1)).nonzero()[:, 0].tolist()]
     if lost and calibration.loss:
         yield (
-            f"Nearly all corners of {_named(calibration, lost)} are outliers, as where they are numbered in another "
+            f"Nearly all corners of {named(lost)} are outliers, as where they are numbered in another "
             "order. Leave such views out: they make all parameters look less certain"
         )
     rms = ((squares * seen).sum(-1) / seen.sum(-1)).sqrt()
     middle = float(rms[~rms.isnan()].median())
     worse = (rms > max(_WORSE_VIEW * middle, survey.rounding)).nonzero()[:, 0].tolist()
     if worse and len(rms) >= _FEW_VIEWS:
+        views = named([calibration.views[i] for i in worse])
         yield (
-            f"Worse than the others fit {_named(calibration, worse)}, up to {_px(float(rms[worse].amax()))} where "
+            f"Worse than the others fit {views}, up to {_px(float(rms[worse].amax()))} where "
             f"{_px(middle)} is usual: look at their corners, or leave them out"
         )
 
@@ -356,22 +357,18 @@ def _views(survey: _Survey) -> Iterator[str]:
         yield f"Few views ({count}): a bad one has nothing to be told by. Take 10 to 20. {_TILTED}"
 
 
-def _loose(survey: _Survey) -> Iterator[str]:
+def _parameters(survey: _Survey) -> Iterator[str]:
+    found = survey.calibration
     if (loose := survey.loose_focal) > _LOOSE_FOCAL:
         why = "Take views in which the board is near and tilted, and fills the image"
         if len(survey.seen) > 1 and survey.tilt < _ALIKE:
             why = f"All boards are parallel to within {_degrees(survey.tilt)}. {_TILTED}"
         yield f"The focal length is known to {_percent(loose)} only. {why}"
-    std = max(survey.calibration.std[2:4].tolist())
-    if std > _LOOSE_CENTRE * max(survey.calibration.image_size):
+    if (std := max(found.std[2:4].tolist())) > _LOOSE_CENTRE * max(found.image_size):
         yield (
             f"The principal point is known to {_px(std)} only. {_TILTED}, or hold it in the middle with "
             'fixed=("cx", "cy")'
         )
-
-
-def _twins(survey: _Survey) -> Iterator[str]:
-    found = survey.calibration
     if found.twins:
         names = (found.parameter_names[0], *found.parameter_names[4:])
         optima = [(p[0], *p[4:]) for p in (found.spread.parameters[0].tolist(), *found.twins)]
@@ -382,7 +379,7 @@ def _twins(survey: _Survey) -> Iterator[str]:
         )
 
 
-def _coverage(survey: _Survey) -> Iterator[str]:
+def _over_image(survey: _Survey) -> Iterator[str]:
     if missing := survey.missing:
         yield f"Few corners or none in {_places(missing)} of the image. Hold the board there, near to the edges"
     reach, end = survey.reach, survey.image_reach
@@ -398,9 +395,6 @@ def _coverage(survey: _Survey) -> Iterator[str]:
             f"Corners reach {_degrees(reach)} from the axis, and the image {_degrees(end)}: beyond what was seen the "
             "lens is a guess. Hold the board nearer to the corners of the image"
         )
-
-
-def _pattern(survey: _Survey) -> Iterator[str]:
     rms = survey.calibration.rms
     if rms > survey.rounding and (share := survey.pattern_share) > _PATTERN_SHARE:
         yield (
@@ -444,10 +438,6 @@ def check_determined(
         f"{owner}: {what} {_listed(open_ones or free)} undetermined{why}. Take 10 to 20 views. {_TILTED}, or hold "
         f"parameters: fixed={tuple(hold)}"
     )
-
-
-def _named(calibration: Calibration, rows: list[int]) -> str:
-    return named([calibration.views[row] for row in rows])
 
 
 def _listed(names: Sequence[str]) -> str:

@@ -157,7 +157,9 @@ def dict_of(one: Camera | Extrinsics) -> dict[str, Any]:
 
 
 def _entry(one: Camera | Extrinsics, lossy: Lossy, name: str) -> dict[str, Any]:
-    first, second = _rows(*(getattr(one, key) for key in one.tensor_names))
+    tensors = [getattr(one, key) for key in one.tensor_names]
+    batch = broadcast_shapes(*(t.shape[:-1] for t in tensors))
+    first, second = (t if t.ndim == 1 else t.expand(*batch, -1) for t in tensors)
     if isinstance(one, Extrinsics):
         return {"rotation": _values(lossy, name, first), "translation": _values(lossy, name, second)}
     entry: dict[str, Any] = {"model": one.key, "intrinsics": _values(lossy, name, first)}
@@ -167,12 +169,6 @@ def _entry(one: Camera | Extrinsics, lossy: Lossy, name: str) -> dict[str, Any]:
     if one.image_size is not None:
         entry["image_size"] = list(one.image_size)
     return entry
-
-
-def _rows(*tensors: Tensor) -> list[Tensor]:
-    """Tensors (*B, n) with equal batch dims, or with none."""
-    batch = broadcast_shapes(*(t.shape[:-1] for t in tensors))
-    return [t if t.ndim == 1 else t.expand(*batch, -1) for t in tensors]
 
 
 def _values(lossy: Lossy, name: str, tensor: Tensor) -> Sequence[Any]:

@@ -32,10 +32,9 @@ from camtorch.io import (
     ros,
     woodscape,
 )
-from camtorch.io._errors import CameraFileError
 from camtorch.io.parsing import parse_mapping, path_of, read_bytes
 from camtorch.io.protocol import ContentFormat, KeyFormat, Names, WrittenFormat
-from camtorch.io.record import Record
+from camtorch.io.record import CameraFileError, Record
 from camtorch.io.writing import Lossy, replacing
 from camtorch.values.arguments import LEFT
 

@@ -22,7 +22,7 @@ _KIND = re.compile(rb"(?:<\?xml[^>]*>\s*)?<(?:calibration>|document\b.{,400}?<ch
 # type of a sensor, or projection of a calibration -> key, its coefficients by Metashape's names
 _MODELS = {
     "frame": ("brown_conrady", ("k1", "k2", "p2", "p1", "k3")),
-    "fisheye": ("thin_prism_fisheye", ("k1", "k2", "p2", "p1", "k3", "k4")),
+    "fisheye": ("thin_prism_fisheye", ("k1", "k2", "p2", "p1", "k3", "k4", "", "")),  # it has no thin prism
 }
 _MODELS["equidistant_fisheye"] = _MODELS["fisheye"]  # as it is called from version 2.3 on
 _UNKNOWN = ("b2", "k4", "p3", "p4")
@@ -91,10 +91,8 @@ def _camera(record: Record) -> Camera:
             record[name].fail(f"{value[name]:g}, which no model here has; optimise the cameras without it")
     f = record["f"].number()
     cx, cy = ((side - 1) / 2 + value.get(c, 0.0) for c, side in (("cx", width), ("cy", height)))
-    distortion = [value.get(name, 0.0) for name in names] + [0.0] * (8 if len(names) > 5 else 5)
-    return record.camera(
-        key, [f + value.get("b1", 0.0), f, cx, cy], distortion[: 8 if len(names) > 5 else 5], (height, width)
-    )
+    distortion = [value.get(name, 0.0) for name in names]
+    return record.camera(key, [f + value.get("b1", 0.0), f, cx, cy], distortion, (height, width))
 
 
 def _numbers(record: Record, count: int) -> list[float]:

@@ -7,16 +7,20 @@ functions raise CameraFileError for what they refuse.
 from __future__ import annotations
 
 import ast
+import contextlib
+import io
 import json
 import os
 import re
+import zipfile
+import zlib
 from collections.abc import Iterable
 from typing import Any, NoReturn
 from xml.etree import ElementTree
 
-from camtorch.io._errors import CameraFileError
-from camtorch.io.npz import parse_archive
-from camtorch.io.record import repeated
+import numpy as np
+
+from camtorch.io.record import CameraFileError, repeated
 
 Path = str | os.PathLike[str]
 
@@ -31,6 +35,9 @@ _BYTES_PER_UNIT = 4  # of the file, where there are more
 _FEW_NODES = 1 << 14  # elements and attributes of XML
 _BYTES_PER_NODE = 16  # of the file, where there are more
 _START = 1 << 16  # of a text, where its kind shows
+_MOST_ARRAYS = 1000
+_LARGEST_ARRAY = 1 << 16  # bytes; that of a camera has 14 numbers
+_SIZES = ("image_size", "imagesize", "img_size", "imgsize", "size", "resolution")
 _WORD = re.compile(r'"([^"]*)"|(\S+)')
 
 # how files begin that people pass by mistake
@@ -87,7 +94,7 @@ def parse_mapping(path: Path, content: bytes) -> dict[str, Any]:
     Refused are unknown kinds, a key twice, tags other than `!!opencv-matrix`, and more values than a camera has.
     """
     try:
-        keys = parse_archive(path, content) if content.startswith(b"PK\3\4") else _from_text(path, content)
+        keys = _from_archive(path, content) if content.startswith(b"PK\3\4") else _from_text(path, content)
     except (RecursionError, MemoryError):
         raise CameraFileError(path, "content", "nested too deeply") from None
     if not isinstance(keys, dict):
@@ -146,6 +153,42 @@ def _with_floats(value: Any) -> Any:
     if isinstance(value, (list, tuple)):
         return list(map(_with_floats, value))
     return float(value) if type(value) is int else value
+
+
+# -- archives, as `numpy.savez(path, K=K, D=D)` writes them; pickled objects are not read
+
+
+def arrays_of(content: bytes, largest: int) -> dict[str, np.ndarray | None]:
+    """Return arrays of numbers by their names; None for damaged or larger ones, and for objects.
+
+    A damaged archive raises BadZipFile, zlib.error, OSError, EOFError, ValueError, RuntimeError, NotImplementedError.
+    """
+    if content.count(b"PK\1\2") > _MOST_ARRAYS:
+        raise ValueError(f"more than {_MOST_ARRAYS} arrays")
+    arrays: dict[str, np.ndarray | None] = {}
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        for entry in archive.infolist():
+            name = entry.filename.removesuffix(".npy")
+            array = None
+            if entry.file_size <= largest:
+                with archive.open(entry) as file, contextlib.suppress(ValueError, MemoryError):
+                    array = np.lib.format.read_array(file, allow_pickle=False)
+            arrays[name] = array if array is not None and array.dtype.kind in "fiub" else None
+    return arrays
+
+
+def _from_archive(path: Path, content: bytes) -> dict[str, Any]:
+    """Return the keys of an archive, arrays as lists; refuse damaged ones, and sizes whose order is not known."""
+    try:
+        arrays = arrays_of(content, _LARGEST_ARRAY)
+    except (zipfile.BadZipFile, zlib.error, OSError, EOFError, ValueError, RuntimeError, NotImplementedError) as error:
+        raise CameraFileError(path, "content", f"no archive of NumPy's: {error}") from None
+    keys = {name: None if array is None else array.astype(np.float64).tolist() for name, array in arrays.items()}
+    for name, value in keys.items():
+        if name.lower() in _SIZES and isinstance(value, list) and len(value) == 2 and value[0] != value[1]:
+            either = f"{value[0]:g} {value[1]:g} may be (width, height) or (height, width)"
+            raise CameraFileError(path, name, f"{either}; save image_width and image_height")
+    return keys
 
 
 # -- XML, in which OpenCV has keys in <opencv_storage>, and sequences as words or as elements called _

@@ -22,17 +22,8 @@ ORIENTATION = 0x0112  # the Exif tag, also of TIFF
 _WIDTH, _HEIGHT = 256, 257  # tags of TIFF
 _DEEP = ("I;16", "I;16B", "I;16L", "I;16N", "I")
 _T = Image.Transpose
-_TURNS = (
-    _T.FLIP_LEFT_RIGHT,
-    _T.ROTATE_180,
-    _T.FLIP_TOP_BOTTOM,
-    _T.TRANSPOSE,
-    _T.ROTATE_90,
-    _T.TRANSVERSE,
-    _T.ROTATE_270,
-)
-_BACK = dict(enumerate(_TURNS, 2))
-"""By orientation, what undoes the turn."""
+_TURNS = _T.FLIP_LEFT_RIGHT, _T.ROTATE_180, _T.FLIP_TOP_BOTTOM, _T.TRANSPOSE, _T.ROTATE_90, _T.TRANSVERSE, _T.ROTATE_270
+_BACK = dict(enumerate(_TURNS, 2))  # by orientation, what undoes the turn
 
 
 class ImageFileError(OSError, ValueError):

@@ -63,11 +63,8 @@ def from_matrices(place: Place, rows: Any, undo: bool = False) -> Extrinsics:
     rotations, translations = as_float64(rows)[..., :3, :3], as_float64(rows)[..., :3, 3]
     error, det = rotation_error(rotations).flatten(), torch.linalg.det(rotations).flatten()
     right = (error < _ORTHOGONAL) & (det > 0)
-    _check(
-        place,
-        right,
-        lambda row: f"no rotation: R R^T misses the identity by {error[row]:.2g}, and det R = {det[row]:.6g}",
-    )
+    why = "no rotation: R R^T misses the identity by {:.2g}, and det R = {:.6g}"
+    _check(place, right, lambda row: why.format(error[row], det[row]))
     return pose(place, rotation_vector(rotations), translations, undo)
 
 
@@ -93,9 +90,7 @@ def from_quaternions(place: Place, values: Any, undo: bool = False) -> Extrinsic
     return pose(place, quaternion_vector(quaternions), translations, undo)
 
 
-@torch.no_grad()
-def in_float64(extrinsics: Extrinsics, undo: bool = False) -> Extrinsics:
-    """Return a copy in float64, or the pose that undoes it."""
+def _in_float64(extrinsics: Extrinsics, undo: bool) -> Extrinsics:
     rotation, translation = (t.detach().double().cpu() for t in (extrinsics.rotation, extrinsics.translation))
     copy = Extrinsics(rotation[..., None], translation)
     return copy.inverse() if undo else copy
@@ -104,13 +99,13 @@ def in_float64(extrinsics: Extrinsics, undo: bool = False) -> Extrinsics:
 @torch.no_grad()
 def matrices(extrinsics: Extrinsics, undo: bool = False) -> Tensor:
     """Return the (*B, 4, 4) matrices of a pose, or of the one that undoes it, in float64."""
-    return in_float64(extrinsics, undo).matrix() + 0.0  # which makes -0.0 zero
+    return _in_float64(extrinsics, undo).matrix() + 0.0  # which makes -0.0 zero
 
 
 @torch.no_grad()
 def quaternions(extrinsics: Extrinsics, undo: bool = False) -> Tensor:
     """Return the quaternions w, x, y, z and translations (*B, 7) of a pose, or of the one that undoes it."""
-    there = in_float64(extrinsics, undo)
+    there = _in_float64(extrinsics, undo)
     return torch.cat((vector_quaternion(there.rotation), there.translation), -1) + 0.0
 
 
@@ -128,8 +123,7 @@ def all_of(rig: Rig, lossy: Lossy) -> Extrinsics:
     for name in rig.extrinsics:
         row = rig.extrinsics.row(name)
         if row is None or not all(map(math.isfinite, rows[row])):
-            rotation, translation = lossy.pose(name, rig.extrinsics[name])
-            values.append([*rotation, *translation])
+            values.append([number for vector in lossy.pose(name, rig.extrinsics[name]) for number in vector])
         else:
             values.append(rows[row])
     rotations, translations = as_float64(values).reshape(-1, 6).tensor_split(2, -1)

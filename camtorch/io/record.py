@@ -14,7 +14,6 @@ import torch
 from torch import nn
 
 from camtorch.cameras.camera import Camera, as_model
-from camtorch.io._errors import CameraFileError
 from camtorch.models import MODELS
 from camtorch.values.arguments import LEFT
 
@@ -22,6 +21,22 @@ LARGEST_SIDE = 1 << 20
 _MOST_CAMERAS = 20_000
 _SHOWN = 8
 _LONGEST_NUMBER = 400  # no double needs as many characters
+
+
+class CameraFileError(ValueError):
+    """A calibration file that cannot be used.
+
+    Args:
+        path: the file.
+        place: the line or the key where reading stopped.
+        reason: what is wrong there, and where possible what to do.
+    """
+
+    def __init__(self, path: str | os.PathLike[str], place: str, reason: object):
+        super().__init__(str(path), place, str(reason))
+
+    def __str__(self) -> str:
+        return "{}: {}: {}".format(*self.args)
 
 
 class Record:

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.rig import Rig
-from camtorch.io._errors import CameraFileError
+from camtorch.io.record import CameraFileError
 from camtorch.poses.extrinsics import Extrinsics
 
 _PART = re.compile(r"[.]([0-9a-f]{16})[0-9a-f]{8}[.]part")

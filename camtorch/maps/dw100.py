@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from camtorch.io._errors import CameraFileError
+from camtorch.io.record import CameraFileError
 from camtorch.maps.exact import Exact, Floats
 from camtorch.maps.mesh import Mesh, Table, held, rounded, table
 

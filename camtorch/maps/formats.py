@@ -11,8 +11,8 @@ from typing import Any, Literal, TypedDict
 
 from typing_extensions import Unpack
 
-from camtorch.io._errors import CameraFileError
 from camtorch.io.parsing import path_of, read_bytes
+from camtorch.io.record import CameraFileError
 from camtorch.io.writing import as_json, replacing
 from camtorch.maps.dw100 import DW100
 from camtorch.maps.exact import Exact

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from camtorch.io._errors import CameraFileError
+from camtorch.io.record import CameraFileError
 from camtorch.maps.exact import Bools, Exact, Floats
 from camtorch.maps.lookup import LookupMap
 from camtorch.maps.protocol import SIZES, MapFormat, checked

@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from camtorch.io._errors import CameraFileError
-from camtorch.io.npz import arrays_of
+from camtorch.io.parsing import arrays_of
+from camtorch.io.record import CameraFileError
 from camtorch.maps.exact import Exact
 from camtorch.maps.lookup import LookupMap
 from camtorch.maps.protocol import MOST_PIXELS, SIZES, MapFormat, checked
