@@ -313,7 +313,7 @@ def test_a_lens_that_must_be_searched_is_whole():
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("driver", "sources", "jobs"),
-    [("geometry_fuzz.c", ["geometry.c"], 1500), ("poses_fuzz.c", ["poses.c", "consensus.c", "views.c"], 4000)],
+    [("geometry_fuzz.c", ["geometry.c"], 800), ("poses_fuzz.c", ["poses.c", "consensus.c", "views.c"], 4000)],
 )
 def test_no_read_outside_and_nothing_undefined(fuzzed, variant, driver, sources, jobs):
     fuzzed(driver, sources, variant, 1, jobs)

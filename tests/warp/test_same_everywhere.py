@@ -13,7 +13,8 @@ from pretended import tensors_of, try_cases
 REFUSED = {"BoxCrop", "Compose: size, shutter", "RandomMount, shift", "RandomShutter"}
 """Calls that torch.compile refuses."""
 INSIDE = ("Compose: mount", "Compose: crop, mount", "Compose: flip, lens", "RandomMount", "RandomLens", "RandomCamera")
-NOT_EXPORTED = (*INSIDE, *REFUSED, "FaceNormalizer", "CanonicalCamera", "CameraHead", "labels: Plane")
+LONG = ("labels: ShutterWarp", "Reproject, sweep", "losses.rays")
+NOT_EXPORTED = (*INSIDE, *REFUSED, *LONG, "FaceNormalizer", "CanonicalCamera", "CameraHead", "labels: Plane")
 """Calls that torch.export refuses, or takes longest for."""
 QUICK = {"Warp, bilinear, zeros", "views.ring", "Resize, antialias", "HorizontalFlip", "Compose: crop, turn, size"}
 every = pytest.mark.parametrize("name", slow_unless(QUICK.__contains__, [n for n in cases.CASES if n not in REFUSED]))
