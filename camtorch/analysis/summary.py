@@ -48,9 +48,8 @@ class Summary:
             ("coefficients", ", ".join(texts) or "none"),
         ]
         low, high = (math.degrees(angle) for angle in self.valid_angle)
-        rows.append(
-            ("valid rays", f"up to {low:.1f} degrees from the axis" + (f", {high:.1f} in places" * (high > low + 0.1)))
-        )
+        furthest = f", {high:.1f} in places" if high > low + 0.1 else ""
+        rows.append(("valid rays", f"up to {low:.1f} degrees from the axis{furthest}"))
         if self.fov is not None and self.seen is not None and self.corners is not None:
             wide, tall, across = (f"{angle:.1f}" for angle in self.fov)
             rows.append(("field of view", f"{wide} horizontal, {tall} vertical, {across} diagonal degrees"))

@@ -195,16 +195,9 @@ def adjust(
     """
     problem = Bundle(sights, state, free, loss, loss_scale)
     counts = torch.stack([(s.weights > 0).sum((-1, -2)) for s in problem.sights]).sum(0)
-    spare = (2 * counts - problem.unknowns).clamp(min=1)
-    found = minimise(
-        problem,
-        problem.flat(state),
-        tolerance=settled / spare,
-        tiny=_NOTHING**2 * counts,
-        steps=steps,
-        damping=damping,
-        progress=progress,
-    )
+    tolerance, tiny = settled / (2 * counts - problem.unknowns).clamp(min=1), _NOTHING**2 * counts
+    flat = problem.flat(state)
+    found = minimise(problem, flat, tolerance=tolerance, tiny=tiny, steps=steps, damping=damping, progress=progress)
     looks = problem.looks(found.state, torch.arange(len(found.cost), device=found.cost.device))
     return Adjusted(
         problem.state(found.state),
@@ -233,9 +226,8 @@ def minima(
     camera = remade(_template(model, parameters), intrinsics=parameters[:, :4], distortion=parameters[:, 4:])
     if (made := compiled_of([camera], pixels)) is not None:
         search = compiled_poses.Search(steps, SETTLED, _NOTHING, FIRST_DAMPING, *loss)
-        rotations, translations, cost = compiled_poses.refined(
-            made[0][0], points, pixels, weights, (poses.rotations[:, 0], poses.translations[:, 0]), search
-        )
+        start = poses.rotations[:, 0], poses.translations[:, 0]
+        rotations, translations, cost = compiled_poses.refined(made[0][0], points, pixels, weights, start, search)
         return Poses(rotations[:, None], translations[:, None]), cost
     sight = Sight(model, points[:, None], pixels[:, None], weights[:, None])
     found = posed(sight, parameters, poses, loss=loss[0], loss_scale=loss[1], steps=steps)

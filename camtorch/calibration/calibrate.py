@@ -251,9 +251,7 @@ class Search:
                 first = start_from_nothing(seen, asked.kind, asked.count, size, fixed, self.loss, self.loss_scale)
             first = first.of(torch.arange(1, device=seen.pixels.device))
         else:
-            given = [
-                t.detach().to(seen.pixels).reshape(1, -1) for t in (asked.start.intrinsics, asked.start.distortion)
-            ]
+            given = [t.detach().to(seen.pixels).reshape(1, -1) for t in asked.start._tensors]
             first = poses_for(torch.cat(given, -1), seen, asked.kind, size)
         adjusted = optimum(first)
         for _ in range(_SECOND_LOOKS):
@@ -281,16 +279,12 @@ class Search:
         first = state.of(torch.zeros(len(starts), dtype=torch.long, device=starts.device))
         parameters = tuple(starts if c == camera else p for c, p in enumerate(first.parameters))
         others = self.adjusted(sights, first._replace(parameters=parameters), free)
-        ends = (
-            (others.state.parameters[camera], state.parameters[camera]),
-            (others.cost, adjusted.cost),
-            (others.converged, adjusted.converged),
-        )
+        ends = [(found.state.parameters[camera], found.cost, found.converged) for found in (others, adjusted)]
         best = others.cost.argmin()[None]
         variance = adjusted.cost / (2 * sum(int((sight.weights > 0).sum()) for sight in sights))
         if bool(others.cost[best] < adjusted.cost - _AS_GOOD * variance):  # one as good is no reason to leave the first
             adjusted = self.adjusted(sights, others.state.of(best), free, steps=STEPS)
-        return adjusted, Optima(*map(torch.cat, ends))
+        return adjusted, Optima(*map(torch.cat, zip(*ends, strict=True)))
 
 
 def _seen_from(state: State, camera: int) -> Poses:

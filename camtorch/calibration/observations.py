@@ -220,10 +220,8 @@ def _as_array(value: Any, size: int, name: str, owner: str) -> Array:
     """A float64 array; None among the numbers of a list is NaN."""
     if isinstance(value, (list, tuple)):
         try:
-            rows = [
-                [math.nan] * size if v is None else v.numpy(force=True) if isinstance(v, Tensor) else v for v in value
-            ]
-            value = np.asarray(rows, np.float64)
+            plain = [v.numpy(force=True) if isinstance(v, Tensor) else v for v in value]
+            value = np.asarray([[math.nan] * size if v is None else v for v in plain], np.float64)
         except (TypeError, ValueError) as error:
             raise type(error)(f"{owner}: {name} must be rows of {size} numbers; got {shown(value)}: {error}") from None
     values = as_values(value, name, owner, value.device if isinstance(value, Tensor) else torch.device("cpu"))

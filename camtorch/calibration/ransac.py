@@ -127,9 +127,8 @@ class _Search(NamedTuple):
         samples, count = numbers.shape
         for part in rows.split(max(1, _AT_ONCE // (12 * samples * count))):
             lines, every = self.lines.of(part), part[:, None, None]
-            is_seen = torch.zeros_like(self.order[part], dtype=torch.bool).scatter(
-                1, self.order[part], torch.arange(count, device=rows.device) < self.counts[part, None]
-            )
+            first = torch.arange(count, device=rows.device) < self.counts[part, None]
+            is_seen = torch.zeros_like(first).scatter(1, self.order[part], first)
             four = torch.where(is_seen[:, None], numbers, -1.0).topk(4).indices
             points, rays = (t[every, four].flatten(0, 1) for t in (self.lines.points, self.lines.measures[:, 2]))
             found = poses_from_rays(points, rays, torch.ones_like(rays[..., 0]))

@@ -70,11 +70,10 @@ def poses_from_rays(points: Tensor, rays: Tensor, weights: Tensor) -> RayPoses:
         (rows,) = chosen.nonzero(as_tuple=True)
         if len(rows):
             some = _Distances(*(t[rows] for t in distances))
-            rotations[rows] = (
-                some.descended(_planar_starts(rays[rows], weights[rows], some), _STEPS)
-                if chosen is flat
-                else _rotations_in_space(local[rows], rays[rows], weights[rows], some)
-            )
+            if chosen is flat:
+                rotations[rows] = some.descended(_planar_starts(rays[rows], weights[rows], some), _STEPS)
+            else:
+                rotations[rows] = _rotations_in_space(local[rows], rays[rows], weights[rows], some)
     translations = distances.translations(rotations)
     placed = local[:, None] @ rotations.mT + translations[:, :, None]
     cosines = (normalize(placed, dim=-1) * rays[:, None]).sum(-1)
@@ -93,10 +92,8 @@ def poses_from_rays(points: Tensor, rays: Tensor, weights: Tensor) -> RayPoses:
     # the trace of the turn between them
     same = (rotations[:, 0] * rotations[:, 1]).sum((-1, -2)) > 1 + 2 * math.cos(_SAME)
     valid = torch.stack((valid[:, 0], valid[:, 1] & ~same), -1)
-    eye = torch.eye(3, dtype=points.dtype, device=points.device)
-    return RayPoses(
-        torch.where(finite[..., None, None], rotations, eye), torch.where(finite[..., None], translations, 0.0), valid
-    )
+    rotations = torch.where(finite[..., None, None], rotations, torch.eye(3).to(rotations))
+    return RayPoses(rotations, torch.where(finite[..., None], translations, 0.0), valid)
 
 
 def _frame(direction: Tensor) -> Tensor:

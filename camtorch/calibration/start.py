@@ -79,16 +79,16 @@ def start_from_nothing(
     the middle of the image. The loss, in px, is that of the adjustment, and decides where several cameras are nearly as
     good.
     """
-    few = _few(observations, image_size)
+    few, free = _few(observations, image_size), _free(model, count, fixed)
     lens = first = _unified(few, image_size, fixed)
     bounds = [model.fit_bounds.get(name, ()) for name in model.names_of(count) or ()]
     if bounds and all(ends is None for ends in bounds):
         # what keeps the shape that it starts with takes that of a good lens
-        free = _free(KannalaBrandt, 4, fixed)
-        lens = _refined(_fitted(lens, few, KannalaBrandt, 4, fixed), few, free, ("cauchy", lens.scale)).of(slice(1))
+        good = _fitted(lens, few, KannalaBrandt, 4, fixed)
+        lens = _refined(good, few, _free(KannalaBrandt, 4, fixed), ("cauchy", lens.scale)).of(slice(1))
     lens = _fitted(lens, few, model, count, fixed)
     if few is not observations or len(lens.parameters) > 1 or bool(lens.lost(few).any()):
-        lens = _refined(lens, few, _free(model, count, fixed), (loss, loss_scale))
+        lens = _refined(lens, few, free, (loss, loss_scale))
         one = lens.of(slice(1))
         lost = int(one.lost(few).sum())
         if lost > (_LOST * int(few.seen.sum()) if one.scale <= _ERRS * first.scale else 0):
@@ -104,14 +104,8 @@ def start_from_nothing(
     if len(lens.parameters) == 1:
         return state
     lens = lens._replace(boards=state.boards.expand(len(lens.parameters)))
-    found = adjust(
-        [_sight(model, observations)],
-        lens.state,
-        _free(model, count, fixed),
-        loss=loss,
-        loss_scale=loss_scale,
-        steps=_MANY_STEPS,
-    )
+    sights = [_sight(model, observations)]
+    found = adjust(sights, lens.state, free, loss=loss, loss_scale=loss_scale, steps=_MANY_STEPS)
     return found.state.of(found.cost.argmin()[None])
 
 

@@ -69,9 +69,8 @@ def triangulate(
         TypeError: no cameras, extrinsics or numbers. ValueError: shapes and numbers that do not fit, cameras with
             further batch dims, fewer than two.
     """
-    seen_at = as_tensor(
-        pixels, "pixels", "triangulate", pixels.device if isinstance(pixels, Tensor) else torch.device("cpu")
-    )
+    device = pixels.device if isinstance(pixels, Tensor) else torch.device("cpu")
+    seen_at = as_tensor(pixels, "pixels", "triangulate", device)
     if seen_at.ndim < 2 or seen_at.shape[-1] != 2:
         raise ValueError(f"triangulate: pixels must be (C, *N, 2); got shape {tuple(seen_at.shape)}")
     count, *shape = seen_at.shape[:-1]
@@ -172,18 +171,10 @@ def _solved(task: _Task, rays: Tensor) -> tuple[Tensor, Tensor]:
     sights = [Sight(camera, corner, *of_camera) for camera, *of_camera in seen_by]
     held = tuple(torch.zeros(p.shape[-1], dtype=torch.bool, device=p.device) for p in parameters)
     problem = Bundle(sights, state, Free(held, (False,) * len(sights), "positions"), None, 1.0)
-    found = minimise(
-        problem,
-        problem.flat(state),
-        tolerance=_SETTLED / (2 * views - 3).clamp(min=1),
-        tiny=_NOTHING**2 * views,
-        going=views >= 2,
-        steps=_STEPS,
-        damping=_DAMPING,
-    )
-    (step, _), _ = problem.linearised(found.state, torch.arange(count, device=start.device)).step(
-        torch.zeros_like(found.cost)
-    )
+    flat, tolerance, tiny = problem.flat(state), _SETTLED / (2 * views - 3).clamp(min=1), _NOTHING**2 * views
+    found = minimise(problem, flat, tolerance=tolerance, tiny=tiny, going=views >= 2, steps=_STEPS, damping=_DAMPING)
+    system = problem.linearised(found.state, torch.arange(count, device=start.device))
+    (step, _), _ = system.step(torch.zeros_like(found.cost))
     points = (found.state[1][:, 0] - shift) @ first
     valid = found.converged & (views >= 2) & _is_ahead(points, positions, rays, task.seen)
     valid &= step[:, 0].norm(dim=-1) <= _FLEEING * (points - middle).norm(dim=-1)

@@ -30,15 +30,13 @@ def run(arguments: argparse.Namespace) -> None:
         print(save_map(warp, output, arguments.format, **{name: getattr(arguments, name) for name in _OPTIONS}))
 
 
-def _warp(arguments: argparse.Namespace) -> Warp:
-    camera = read_camera(arguments.camera, arguments.name, arguments.from_model, arguments.camera_size)
+def _warp(given: argparse.Namespace) -> Warp:
+    camera = read_camera(given.camera, given.name, given.from_model, given.camera_size)
     if camera.image_size is None:
-        raise ValueError(f"{arguments.camera} states no image size; --camera-size WxH says it")
-    if arguments.target is None:
-        return Dewarp(
-            camera, projection=arguments.projection, fov=arguments.fov, image_size=arguments.size, tolerance=0
-        )
+        raise ValueError(f"{given.camera} states no image size; --camera-size WxH says it")
+    if given.target is None:
+        return Dewarp(camera, projection=given.projection, fov=given.fov, image_size=given.size, tolerance=0)
     for name in ("fov", "size"):
-        if getattr(arguments, name) is not None:
-            raise ValueError(f"--{name} is for a dewarping; --target {arguments.target} says it")
-    return Warp(camera, read_camera(arguments.target), tolerance=0)
+        if getattr(given, name) is not None:
+            raise ValueError(f"--{name} is for a dewarping; --target {given.target} says it")
+    return Warp(camera, read_camera(given.target), tolerance=0)

@@ -329,9 +329,8 @@ def _images_content(lossy: Lossy, rig: Rig, identities: dict[str, int], path: st
     entries = []
     for name, values in zip(rig.extrinsics, poses.quaternions(poses.all_of(rig, lossy)).tolist(), strict=True):
         if not name or "\0" in name or (not binary and (name.split() != [name])):
-            lossy.fail(
-                repr(name), "an image name that COLMAP does not read" + " from text; .bin takes it" * (not binary)
-            )
+            hint = "" if binary else " from text; .bin takes it"
+            lossy.fail(repr(name), f"an image name that COLMAP does not read{hint}")
         entries.append((name, identities[rig.images.get(name, name)], values))
     if os.path.exists(path) and _read_images(path)[2]:
         Record(path, None).fail("holds the points of images, which would be lost; write to another folder")

@@ -126,9 +126,8 @@ def _read(path: str, content: bytes, format: str | None) -> tuple[Rig, str]:
         raise CameraFileError(path, "content", _OPENMVG)
     shown = ", ".join(f"{key!r:.30}" for key in list(keys)[:5]) or "none"
     if "fx" in keys:
-        shown += (
-            "; a camera of numbers is ct.BrownConrady([fx, fy, cx, cy], [k1, k2, p1, p2], image_size=(height, width))"
-        )
+        way = "ct.BrownConrady([fx, fy, cx, cy], [k1, k2, p1, p2], image_size=(height, width))"
+        shown += f"; a camera of numbers is {way}"
     raise CameraFileError(path, "content", f"no format that is known here has the keys {shown}")
 
 
@@ -216,6 +215,5 @@ def _format_of(rig: Rig, path: str) -> str:
     if meant := [pattern for pattern in patterns if fnmatch.fnmatchcase(file, pattern)]:
         return patterns[max(meant, key=len)]
     may = f"it may be {', '.join(formats)}" if formats else f"written are {', '.join(sorted(WRITTEN))}"
-    raise ValueError(
-        f"{path}: the name does not say the format; {may}. Say which, as in format='kalibr' or --format kalibr"
-    )
+    hint = "Say which, as in format='kalibr' or --format kalibr"
+    raise ValueError(f"{path}: the name does not say the format; {may}. {hint}")

@@ -36,9 +36,8 @@ _OF_A_CAMERA = ("camera_model", "is_fisheye", *_CORE, *_RADIAL, *_TANGENTIAL, "d
 
 def matches(keys: dict[str, Any]) -> bool:
     """Whether these are the keys of such a file."""
-    return (isinstance(keys.get("frames"), list) and "camtorch" not in keys) or any(
-        key in keys for key in ("fl_x", "camera_angle_x", "x_fov")
-    )
+    has_frames = isinstance(keys.get("frames"), list) and "camtorch" not in keys
+    return has_frames or any(key in keys for key in ("fl_x", "camera_angle_x", "x_fov"))
 
 
 def parse(record: Record) -> Rig:

@@ -47,9 +47,8 @@ def read(path: str, content: bytes) -> Rig:
         distortion = [] if lens is None else lens.numbers()
         if lens is not None and len(distortion) == 6 and distortion.pop():
             lens.fail("a sixth coefficient, of fisheyes, whose formula nuImages does not say")
-        cameras[name] = sensor.camera(
-            "brown_conrady" if distortion else "pinhole", intrinsics, distortion, None, lens=lens
-        )
+        key = "brown_conrady" if distortion else "pinhole"
+        cameras[name] = sensor.camera(key, intrinsics, distortion, None, lens=lens)
     if not cameras:
         return Rig({})
     values = [[*sensor["rotation"].numbers(4), *sensor["translation"].numbers(3)] for sensor in sensors]

@@ -46,11 +46,9 @@ def read(path: str, content: bytes) -> Rig:
         count = first.whole(1, _MOST_TERMS, f"number of coefficients up to {_MOST_TERMS}")
         if len(terms) != count + 1:
             terms.fail(f"{len(terms) - 1} coefficients where the line says {count}")
-    height, width = (
-        (side.side() for side in size)
-        if len(size) == 2
-        else size.fail(f"not a height and a width, but {len(size)} numbers")
-    )
+    if len(size) != 2:
+        size.fail(f"not a height and a width, but {len(size)} numbers")
+    height, width = (side.side() for side in size)
     values = polynomial.numbers()[1:], centre.numbers(2), affine.numbers(3)
     try:
         return Rig({"camera": OCamCalib.from_ocamcalib(*map(poses.as_float64, values), image_size=(height, width))})

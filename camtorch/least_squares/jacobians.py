@@ -63,9 +63,8 @@ def sensor_jacobians(
     # a table for each point would be dear: where the other direction is searched, derivatives go forward
     jacobians = (_forward if isinstance(chart, Inverted) else _backward)(camera, k, rays, furthest)
     # where a derivative is no number, as at the end of a chart, a step goes without it
-    return jacobians._replace(
-        by_ray=jacobians.by_ray.nan_to_num(0.0, 0.0, 0.0), by_k=jacobians.by_k.nan_to_num(0.0, 0.0, 0.0)
-    )
+    by_ray, by_k = (slopes.nan_to_num(0.0, 0.0, 0.0) for slopes in (jacobians.by_ray, jacobians.by_k))
+    return SensorJacobians(jacobians.points, by_ray, by_k)
 
 
 def _backward(camera: CameraLike | type[CameraLike], k: Tensor, rays: Tensor, furthest: float) -> SensorJacobians:
@@ -106,6 +105,5 @@ def _forward(camera: CameraLike | type[CameraLike], k: Tensor, rays: Tensor, fur
     values = [part.primal[::count] for part in parts]
     tangents = [torch.zeros_like(part.primal) if part.tangent is None else part.tangent for part in parts]
     by_all = torch.stack(tangents, 1).unflatten(0, (len(k), count)).transpose(1, 2)
-    return SensorJacobians(
-        SensorPoints(values[0], values[1], seen.covered[::count]), by_all[:, :, :3], by_all[:, :, 3:]
-    )
+    points = SensorPoints(values[0], values[1], seen.covered[::count])
+    return SensorJacobians(points, by_all[:, :, :3], by_all[:, :, 3:])

@@ -95,9 +95,8 @@ def _draw_uncertainty(ax: Axes, calibration: Calibration, head: str) -> None:
     if values.count():
         # bounds from 1, 2, 5, 10, ... around most values
         low, high = (math.log10(max(value, 1e-6)) for value in np.quantile(values.compressed(), (0.01, 0.97)))
-        ladder = [
-            float(f"{digit}e{power}") for power in range(math.floor(low), math.ceil(high) + 1) for digit in (1, 2, 5)
-        ]
+        powers = range(math.floor(low), math.ceil(high) + 1)
+        ladder = [float(f"{digit}e{power}") for power in powers for digit in (1, 2, 5)]
         first = max(i for i, bound in enumerate(ladder) if i == 0 or bound <= 10**low)
         last = next((i for i, bound in enumerate(ladder) if bound >= 10**high and i > first), len(ladder) - 1)
         bounds = ladder[first : min(last, first + _BANDS) + 1]
