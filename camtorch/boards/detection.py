@@ -197,10 +197,7 @@ def _aprilgrid(cv2: Any, board: AprilGrid, grey: Grey) -> Pixels:
 
 
 def _consistent(cv2: Any, board: AprilGrid, tags: dict[int, Pixels]) -> dict[int, Pixels]:
-    """Return the tags that lie where their neighbours put them, with their corners clockwise from the board's top left.
-
-    OpenCV begins at the top left of a tag's code as its dictionary has it, which a board may hold turned.
-    """
+    """Return the tags that lie where their neighbours put them, their corners clockwise from the board's top left."""
     places = {tag: board.points()[board.corners_of(tag), :2].astype(np.float32) for tag in tags}
     reach = 2.1 * board.square * (1 + board.spacing)
     pairs = [(a, b) for a, b in itertools.permutations(tags, 2) if np.linalg.norm(places[a][0] - places[b][0]) < reach]
@@ -214,6 +211,7 @@ def _consistent(cv2: Any, board: AprilGrid, tags: dict[int, Pixels]) -> dict[int
         side = np.linalg.norm(tags[b] - np.roll(tags[b], 1, 0), axis=1).mean()
         return float(np.linalg.norm((x, y) / w - tags[b].mean(0)) / side) if w > 0 else math.inf
 
+    # OpenCV begins at the top left of a tag's code as its dictionary has it, which a board may hold turned
     errors = np.array([[error(turn, *pair) for pair in pairs] for turn in range(4)])
     turn = int(np.median(errors, axis=1).argmin())
     seconds = np.array(pairs)[:, 1]

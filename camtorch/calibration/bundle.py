@@ -73,26 +73,19 @@ class Poses(NamedTuple):
 
 
 class Prior(NamedTuple):
-    """What is known of a camera's parameters p before it sees anything: root @ (p - centre) is as if it were residuals.
+    """What is known of a camera's parameters p before it sees anything: root @ (p - centre) counts as residuals."""
 
-    centre: (P,). root: (R, P), in pixels.
-    """
-
-    centre: Tensor
-    root: Tensor
+    centre: Tensor  # (P,)
+    root: Tensor  # (R, P), in pixels
 
 
 class Sight(NamedTuple):
-    """What one camera sees, of B problems, V views and N points each; leading dims may be 1.
+    """What one camera sees, of B problems, V views and N points each; leading dims may be 1."""
 
-    points: (B, V, N, 3) in the board's frame. pixels: (B, V, N, 2). weights: (B, V, N) of the squares, 0 for unseen,
-    where the others are any finite numbers. model: the class, or a camera of it. prior: or None.
-    """
-
-    model: type[Camera] | Camera
-    points: Tensor
-    pixels: Tensor
-    weights: Tensor
+    model: type[Camera] | Camera  # the class, or a camera of it
+    points: Tensor  # (B, V, N, 3) in the board's frame
+    pixels: Tensor  # (B, V, N, 2)
+    weights: Tensor  # (B, V, N) of the squares, 0 for unseen, where the others are any finite numbers
     prior: Prior | None = None
 
     def mapped(self, change: Callable[[Tensor], Tensor]) -> Sight:
@@ -102,17 +95,12 @@ class Sight(NamedTuple):
 
 
 class State(NamedTuple):
-    """What is looked for. A point of a board is at `mount(board(point))` for a camera.
+    """What is looked for. A point of a board is at `mount(board(point))` for a camera."""
 
-    parameters: of each camera (B, 4 + n), fx, fy, cx, cy and the coefficients. mounts: a pose for each camera, from the
-    frame of the first one, whose own it leaves as it is unless it learns. boards: for each view. bend: (B, 2), how far
-    the middle of a board's edges lies behind the plane, see `bent`.
-    """
-
-    parameters: tuple[Tensor, ...]
-    mounts: Poses
-    boards: Poses
-    bend: Tensor
+    parameters: tuple[Tensor, ...]  # of each camera (B, 4 + n), fx, fy, cx, cy and the coefficients
+    mounts: Poses  # of each camera, from the frame of the first one, whose own does nothing unless it learns
+    boards: Poses  # of each view
+    bend: Tensor  # (B, 2), how far the middle of a board's edges lies behind the plane, see `bent`
 
     @classmethod
     def of_one(cls, parameters: Tensor, boards: Poses) -> State:
@@ -127,32 +115,24 @@ class State(NamedTuple):
 
 
 class Free(NamedTuple):
-    """What learns.
+    """What learns."""
 
-    parameters: of each camera (4 + n,) bool. mounts: of each camera. boards: "poses", or "positions" for their
-    translations alone. bend: the shape of the board.
-    """
-
-    parameters: tuple[Tensor, ...]
-    mounts: tuple[bool, ...]
-    boards: str = "poses"
-    bend: bool = False
+    parameters: tuple[Tensor, ...]  # of each camera (4 + n,) bool
+    mounts: tuple[bool, ...]  # of each camera
+    boards: str = "poses"  # or "positions" for their translations alone
+    bend: bool = False  # the shape of the board
 
 
 @dataclass(frozen=True)
 class Adjusted:
-    """An optimum, or where the search ended.
-
-    residuals: of each camera (B, V, N, 2), projected minus observed. valid: (B, V, N) bool, of the points of any weight
-    that have a pixel. weights: (B, V, N) those of the squares at the end, of a robust loss too. cost: (B,).
-    """
+    """An optimum, or where the search ended."""
 
     state: State
-    cost: Tensor
-    converged: Tensor
-    residuals: tuple[Tensor, ...]
-    valid: tuple[Tensor, ...]
-    weights: tuple[Tensor, ...]
+    cost: Tensor  # (B,)
+    converged: Tensor  # (B,)
+    residuals: tuple[Tensor, ...]  # of each camera (B, V, N, 2), projected minus observed
+    valid: tuple[Tensor, ...]  # (B, V, N) bool, of the points of any weight that have a pixel
+    weights: tuple[Tensor, ...]  # (B, V, N) of the squares at the end, of a robust loss too
     problem: Bundle
 
     @cached_property
@@ -211,17 +191,9 @@ def adjust(
 
 
 def minima(
-    model: type[Camera] | Camera,
-    parameters: Tensor,
-    poses: Poses,
-    seen: Observations,
-    loss: tuple[str | None, float],
-    steps: int,
+    model: type[Camera], parameters: Tensor, poses: Poses, seen: Observations, loss: tuple[str, float], steps: int
 ) -> tuple[Poses, Tensor]:
-    """The poses (K, 1) of least cost near given ones, each a problem of its own, and these costs (K,).
-
-    parameters: (1 or K, 4 + n). seen: of K views.
-    """
+    """The poses (K, 1) of least cost near given ones, each a problem of its own, and these costs (K,)."""
     points, pixels, weights = seen.points, seen.pixels, seen.seen.to(seen.pixels)
     camera = remade(_template(model, parameters), intrinsics=parameters[:, :4], distortion=parameters[:, 4:])
     if (made := compiled_of([camera], pixels)) is not None:

@@ -184,10 +184,7 @@ def middle_of(seen: Sequence[Observations]) -> Tensor:
 
 @dataclass
 class Search:
-    """The search for one camera: its model, what it saw, and the loss.
-
-    The boards are taken about their middle, where a pose's turn and its shift hardly depend on each other.
-    """
+    """The search for one camera: its model, what it saw, and the loss."""
 
     owner: str  # who asks, and which camera it is, for messages
     asked: Model
@@ -218,7 +215,7 @@ class Search:
 
     @cached_property
     def seen(self) -> Observations:
-        """What was given, with the boards about their middle."""
+        """What was given, the boards about their middle, where a pose's turn and shift hardly depend on each other."""
         points = torch.where(self.given.seen[..., None], self.given.points - self.middle, 0.0)
         return self.given._replace(points=points)
 
@@ -313,16 +310,13 @@ class Optima(NamedTuple):
 
 
 class Results(NamedTuple):
-    """Of all cameras of a problem: the optimum, what belongs to each, and of all corners px.
-
-    noise: (), what makes the covariance; without a loss it is sigma.
-    """
+    """Of all cameras of a problem: the optimum, what belongs to each, and of all corners px."""
 
     adjusted: Adjusted
     cameras: list[Calibration]
     rms: float
     sigma: float
-    noise: Tensor
+    noise: Tensor  # (), what makes the covariance; without a loss it is sigma
 
 
 def results(searches: Sequence[Search], adjusted: Adjusted, free: Free) -> Results:
@@ -399,8 +393,7 @@ def noise_of(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """The inliers, bool (V, N), sigma, and the noise that makes the covariance; without a loss both are one number.
 
-    Sigma is that of all residuals, with a robust loss that of the inliers, which are shorter than max(3 loss_scale,
-    3 sigma of the inliers). Where a corner is not valid nothing fits. free: the number of parameters that were free.
+    Sigma is that of all residuals, with a robust loss that of the inliers, see `Calibration`. free: of the parameters.
     """
 
     def sigma_of(lengths: Tensor) -> Tensor:

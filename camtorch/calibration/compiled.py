@@ -100,17 +100,13 @@ def solved(
 
 
 class Look(NamedTuple):
-    """What a camera makes of a state; see `Bundle.look`.
+    """What a camera makes of a state; see `Bundle.look`."""
 
-    residuals: (B, V, N, 2). valid, weights: (B, V, N), the weights of the squares. cost: (B, V). triangles: those of
-    `Equations`, without priors, where compiled code made them in passing.
-    """
-
-    residuals: Tensor
-    valid: Tensor
-    weights: Tensor
-    cost: Tensor
-    triangles: tuple[Tensor, Tensor] | None = None
+    residuals: Tensor  # (B, V, N, 2)
+    valid: Tensor  # (B, V, N)
+    weights: Tensor  # (B, V, N), of the squares
+    cost: Tensor  # (B, V)
+    triangles: tuple[Tensor, Tensor] | None = None  # those of `Equations`, without priors, if compiled code made them
 
 
 def seen(

@@ -101,11 +101,10 @@ def as_rig_observations(
 
 
 def repeats(cameras: Sequence[Observations], residuals: Sequence[Tensor]) -> Tensor:
-    """The rows of views that show another one again, its errors included: a file saved anew, a frame that stands still.
+    """Return (R,) views that show an earlier one again with its errors, as a file saved anew and a frozen frame do.
 
     Where the noise of two views is independent, corners differ by at least as much as both are wrong by; in such a pair
-    they differ by less than a third of that. Images taken one after the other from a tripod have noise of their own.
-    Returned are all but the first of each group that is alike, (R,). residuals: of each camera (V, N, 2).
+    they differ by less than a third of that. residuals: of each camera (V, N, 2).
     """
     seen = torch.cat([one.seen for one in cameras], -1)
     pixels = torch.cat([one.pixels for one in cameras], 1)
@@ -123,11 +122,7 @@ def repeats(cameras: Sequence[Observations], residuals: Sequence[Tensor]) -> Ten
 def _observed(
     object_points: Points, image_points: Mapping[str, Points], image_sizes: Mapping[str, Any], owner: str
 ) -> dict[str, tuple[Observations, Layout]]:
-    """What cameras see, by their names; the name of a camera that is no part of a rig is empty.
-
-    Views without corners are left out, and those that have the same corners in all cameras as an earlier one, in any
-    order: noise makes those of no two photographs equal.
-    """
+    """What cameras see, by their names, "" of one alone; without views that have no corners, or those of another."""
     labels = {name: f"image_points[{name!r}]" if name else "image_points" for name in image_points}
     given = {name: _in_views(image_points[name], 2, label, owner) for name, label in labels.items()}
     boards, *_ = _in_views(object_points, 3, "object_points", owner)
@@ -187,10 +182,7 @@ def _observed(
 def _in_views(
     value: Points, size: int, name: str, owner: str
 ) -> tuple[list[Array | None], list[tuple[int, ...] | None], bool]:
-    """Points (n, size) of each view and the shapes they came in, None for no points; whether they were one array.
-
-    Image points have a dim for views, or are in a list; object points may be one set.
-    """
+    """Points (n, size) of each view and the shapes they came in, None for no points; whether they were one array."""
     parts: list[Array | None] = []
     if isinstance(value, (list, tuple)):
         parts = [None if p is None else _as_array(p, size, f"{name}[{i}]", owner) for i, p in enumerate(value)]

@@ -28,10 +28,9 @@ _Agreement = struct.Struct("12qdq").pack  # `Agreement` of native/consensus.h
 
 
 class _Lines(NamedTuple):
-    """Points and the rays that shall see them, of B rows, as far as distances in px go.
+    """Points and the rays that shall see them, of B rows.
 
-    A pose sees a point away from its ray by about the ray's slope times the point, over the point's depth on the ray:
-    exact where the distance is zero, and right to some parts of a hundred within a few px.
+    A pose sees a point away from its ray by about the ray's slope times the point, over the point's depth on the ray.
     """
 
     points: Tensor  # (B, N, 3)

@@ -126,10 +126,7 @@ def _moments(rays: Tensor, points: Tensor, weights: Tensor) -> Tensor:
 
 
 def _homography(sight: Tensor, distances: _Distances) -> Tensor:
-    """(B, 3, 3): of the plane's points (x, y, 1) to their rays, by the least distances at the scale that is seen best.
-
-    sight: (B, 3) about where the points are.
-    """
+    """(B, 3, 3): of the plane's points (x, y, 1) to their rays; sight (B, 3) is about where the points are."""
     # the first two columns' entries across the line of sight and, of which narrow views tell little, along it
     frame = _frame(sight)
     basis = torch.stack((frame.mT, torch.zeros_like(frame)), -1)

@@ -123,11 +123,7 @@ def poses_for(
 
 
 def other_poses(found: Adjusted, observations: Observations, model: type[Camera], image_size: tuple[int, int]) -> State:
-    """The state of an optimum, B = 1, with better poses of the views that have them; itself where none has.
-
-    While the camera was not known, a view may have taken the wrong one of the two poses that a plane seems to have, or
-    have been led astray by outliers.
-    """
+    """The state of an optimum, B = 1, with better poses of the views that have them; itself where none has."""
     state = found.state
     lens = _Lens(model, state.parameters[0], state.boards, _LEAST_SCALE, image_size)
     errors = _lengths(found.residuals[0], found.valid[0], observations.seen)[0]
@@ -153,10 +149,7 @@ def other_cameras(
     model: type[Camera],
     image_size: tuple[int, int],
 ) -> Tensor | None:
-    """(S, 4 + n) nearly the same camera all along the valley of its model, see `_ALONG`; None where it has none.
-
-    parameters: (1, 4 + n) at an optimum. learns: (4 + n,) bool. boards: (1, V), in the frame of the camera.
-    """
+    """(S, 4 + n) nearly the same camera (1, 4 + n) along the valley of its model, see `_ALONG`; None without one."""
     count = parameters.shape[-1] - 4
     names = ("fx", "fy", "cx", "cy", *(model.names_of(count) or ()))
     along, _ = _ALONG.get(model.key, ("", ()))
@@ -202,10 +195,7 @@ class _Lens(NamedTuple):
     def adjusted(
         self, few: Observations, free: Free, steps: int, worst: float, loss: tuple[str | None, float] | None = None
     ) -> _Lens:
-        """Nearer to what they saw, the best first, without those whose cost is above the least by the factor `worst`.
-
-        loss: name and scale; Cauchy's of the scale here if left out.
-        """
+        """Nearer to what they saw, the best first, without those whose cost is above `worst` times the least."""
         name, scale = loss or ("cauchy", self.scale)
         settled = _NEARLY if loss is None else SETTLED
         sight = _sight(self.model, few)
@@ -282,8 +272,7 @@ def _posed(
 ) -> tuple[Poses, Tensor]:
     """Poses (B, V) in closed form for cameras (B,), and the errors in px, (B, V, N); NaN for what is not seen.
 
-    Each round goes without the outliers of the one before, for views to which that made a difference. begun: what the
-    first round finds, where it is known.
+    Each round goes without the outliers of the one before. begun: what the first round finds, where it is known.
     """
     rays, has_ray = _rays(camera, some)
     shape = has_ray.shape
@@ -352,10 +341,7 @@ def _lengths(residuals: Tensor, valid: Tensor, seen: Tensor) -> Tensor:
 
 
 def _turned(lens: _Lens, some: Observations, errors: Tensor) -> _Lens:
-    """With the best of the poses that each view may have under a single camera: a plane has two that look alike.
-
-    errors: (1, V, N) of the poses that the lens has.
-    """
+    """With the best pose of each view under a single camera: a plane has two that look alike; errors (1, V, N)."""
     camera = lens.camera
     old, errors = _resampled(camera, lens.boards, some, errors)
     rays, has_ray = (t[0] for t in _rays(camera, some))

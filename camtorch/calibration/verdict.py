@@ -263,10 +263,7 @@ class _Survey:
 
     @property
     def loose_focal(self) -> float:
-        """The standard deviation of the focal length at the axis over itself: the worse of both.
-
-        In some models a coefficient does nearly what the parameter called focal length does.
-        """
+        """The standard deviation of the focal length at the axis, which is no parameter, over itself: the worse one."""
         spread, near = self.calibration.spread, 1e-4
         camera = fixed_camera(spread.model, spread.parameters[:, :4], spread.parameters[:, 4:])
         rays = spread.parameters.new_tensor([[0.0, 0, 1], [near, 0, 1], [0, near, 1]])
@@ -410,8 +407,7 @@ def check_determined(
     """Raise a ValueError if the views of a camera leave it open, as those of boards that are all parallel do.
 
     It is open if corners that are wrong by a tenth of a pixel leave the projections of what was seen uncertain by a
-    fiftieth of the extent of the corners: a matter of where the boards were, which corners without noise cannot hide.
-    Several views that no camera fits are wrong, not open: they get warnings. found: of noise of 1 px.
+    fiftieth of the extent of the corners. Views that no camera fits get warnings instead. found: of noise of 1 px.
     """
     found = found.scaled(adjusted.cost.new_full((1,), _USUAL_NOISE))
     seen = sight.weights[0] > 0

@@ -25,8 +25,7 @@ def read_rig(
 ) -> Rig:
     """Read the cameras of a file, of `LENS` and the name of a real lens, or of `GUESS` and a field of view.
 
-    `name` is the only camera wanted; `model` is of OpenCV's files, which may not state it; `size` is for cameras whose
-    file does not state it. If `stated`, a file that leaves the model open is refused.
+    `name` is the only camera wanted; `model` and `size` are what a file may not state. `stated`: refuse an open model.
     """
     if str(path).startswith(LENS):
         words = str(path).removeprefix(LENS)
@@ -96,10 +95,9 @@ def _one(path: Path, rig: Rig, name: str | None = None) -> Camera:
 def read_for_images(
     images: Sequence[Path], size_of: Callable[[Path], Size | None], arguments: argparse.Namespace
 ) -> Camera:
-    """Read the camera that took images, by the options `--camera`, `--lens` or `--guess-fov`; see `fitting`.
+    """Read the camera that took images, by `--camera`, `--lens` or `--guess-fov`; it must fit one of them.
 
-    If its file states no size, it is for the first image that has one, for which a lens is chosen, or guessed, too. A
-    camera that fits none of the images is an error.
+    If its file states no size, it is for the first image that has one, for which a lens is chosen, or guessed, too.
     """
     path: Path | None = arguments.camera
     sized = ((image, size) for image in images if (size := size_of(image)))

@@ -67,9 +67,7 @@ class Dewarping:
 
 @torch.no_grad()
 def _facts(warp: Dewarp) -> dict[str, Any]:
-    """Return facts about new images: which part of 64 x 64 places in them shows something, `filled`; and which part of
-    as many in the old image they show, `shown`.
-    """
+    """Return facts about new images: the part of 64 x 64 places that shows something, and of the old that is shown."""
     source, target = warp.source, warp.target
     part = torch.tensor([source.width / 64, source.height / 64])
     lattice = (source.resize(64, 64).pixel_grid() + 0.5) * part - 0.5

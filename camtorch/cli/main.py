@@ -48,11 +48,10 @@ class _Version(argparse.Action):
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line `argv`, by default the process's own.
+    """Run the command line `argv`, by default the process's own, and return the exit status.
 
-    Returns:
-        The exit status: 0; 1 if some of many files failed; 2 after an error, which is one line on stderr; 130 after an
-        interrupt; 141 if nobody reads what is printed.
+    It is 0; 1 if some of many files failed; 2 after an error, which is one line on stderr; 130 after an interrupt; 141
+    if nobody reads what is printed.
     """
     try:
         arguments = make_parser().parse_args(argv)

@@ -50,10 +50,7 @@ def prepare(module: str) -> None:
 def each(work: Work, pairs: Sequence[Pair], count: int, done: Callable[[], object]) -> list[Outcome]:
     """Return what becomes of pairs by `count` processes; a single one is this process. `done` is called after each.
 
-    Processes end at once after an error or an interrupt.
-
-    Raises:
-        ChildProcessError: If a process was killed.
+    Processes end at once after an error or an interrupt; a ChildProcessError says that one was killed.
     """
     if count == 1:
         outcomes = []

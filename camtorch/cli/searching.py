@@ -28,10 +28,7 @@ Views = dict[str, dict[str, ImageCorners]]  # view -> camera -> what its image s
 def find_views(
     cameras: Mapping[str, Sequence[Path]], board: Board, unit: str
 ) -> tuple[Views, dict[str, tuple[int, int]]]:
-    """Return the views of a board that a calibration can use, and the (height, width) of each camera, "" for one alone.
-
-    What was found is printed, and a note names each image that is left out, with the reason; too few are a ValueError.
-    """
+    """Return the views of a board that a calibration can use, and each camera's (height, width), "" for one alone."""
     if len(cameras) == 1:
         ((name, paths),) = cameras.items()
         images = _search(board, [(path, None) for path in paths if not videos.is_video(path)])
@@ -76,10 +73,7 @@ def _search(board: Board, images: Sequence[Image]) -> list[ImageCorners]:
 
 
 def take_together(cameras: Mapping[str, Sequence[Path]]) -> dict[str, dict[str, Path]]:
-    """Return view -> camera -> image for images that were taken together.
-
-    They have one name, else the same last number in it, else the same place in their order, if there are as many.
-    """
+    """Return view -> camera -> image of images of one name, else the same last number in it, else the same place."""
     if film := next((path for paths in cameras.values() for path in paths if videos.is_video(path)), None):
         raise ValueError(f"{film}: videos are for one camera: nothing tells which frames of two are of one moment")
     keys: tuple[Callable[[Path], str | None], ...] = (lambda path: path.stem, _last_number)

@@ -46,8 +46,8 @@ def find(words: Sequence[str], suffixes: Collection[str], output: Path) -> list[
     """Return the files that words mean, each once, in natural order, and their places below the folder of outputs.
 
     Words are files of any suffix; patterns, as a quoted 'in/**/*.jpg'; and folders with all folders in them, whose tree
-    is kept; if there are several words, folders keep their names as well. Names that begin with a dot are left out, as
-    is the folder of outputs within a folder that is read. Links are followed. A word without a file is a ValueError.
+    is kept; if there are several words, folders keep their names as well. Names that begin with a dot, and the folder
+    of outputs within a folder that is read, are left out. A word without a file is a ValueError.
     """
     files: dict[str, tuple[Path, Path]] = {}
     out = os.path.realpath(output)
@@ -99,8 +99,8 @@ def _is_below(path: str, folder: str) -> bool:
 def to_make(pairs: Sequence[Pair], others: Iterable[Path], *, resume: bool, force: bool) -> list[Pair]:
     """Return the pairs whose files are to be made; with `resume` those that are there are left out.
 
-    An empty file is what a loss of power leaves of one that was there, and is made again. It is a ValueError if files
-    would be written over each other, or over one that is read, also one of `others`; or if one is there already.
+    An empty file, as a loss of power leaves it, is made again. It is a ValueError if files would be written over each
+    other, or over one that is read, also one of `others`; or if one is there already.
     """
     read = {os.path.realpath(path): path for path in (*(source for source, _ in pairs), *others)}
     written: dict[str, Path] = {}

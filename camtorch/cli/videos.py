@@ -91,10 +91,7 @@ def _rate(stream: Any) -> Fraction:
 
 
 def _decoded(container: Any, stream: Any, *others: Any) -> Iterator[tuple[Any, Any]]:
-    """Yield (frame, None) of a stream and (None, packet) of others in the order in which they are stored.
-
-    Frames have time stamps that grow.
-    """
+    """Yield (frame, None) of a stream, time stamps growing, and (None, packet) of others, as they are stored."""
     last, count, step = None, 0, 1 / _rate(stream)
     for packet in container.demux(stream, *others):
         if packet.stream is not stream:
@@ -129,8 +126,7 @@ def remake(
 ) -> dict[str, Any]:
     """Write a video of warped frames, whole or not at all; return facts about the warp, and "frames", their number.
 
-    Time stamps, sound, subtitles, the rotation with which it is shown, and the meaning of colours are those of the
-    source. Frames are warped as nearly all are stored, in YUV of eight bits in 4:2:0, which is half the work of RGB.
+    Frames are warped as nearly all are stored, in YUV of eight bits in 4:2:0, which is half the work of RGB.
     `warp_of` returns the warp for frames of a (height, width) with its facts; `done` is called after each frame.
     """
     with _opened(source) as (container, stream):

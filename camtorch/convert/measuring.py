@@ -49,8 +49,7 @@ def reference(camera: CameraLike, image_size: tuple[int, int] | None, limit: flo
 def measure(target: CameraLike, k: Tensor, exact: Tensor, source: Reference) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Return rms, max_error, max_angle and valid_fraction (C,) of cameras (C,), of coefficients (C, n).
 
-    The root of the mean square is that of the lattice's nodes. The largest error is searched: from the highest peaks
-    among the nodes upwards, and on the rim of the largest angle.
+    The largest error is searched: from the highest peaks among the nodes upwards, and on the rim of the largest angle.
     """
 
     def compared(rays: views.SampledRays) -> tuple[Tensor, Tensor]:

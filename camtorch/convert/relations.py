@@ -35,10 +35,7 @@ def default_count(model: Model, source: CameraLike, models: Models) -> int:
 def carry_over(
     source: CameraLike, values: Tensor, model: Model, names: tuple[str, ...], models: Models
 ) -> tuple[Tensor, Tensor] | None:
-    """The coefficients (C, n) of a camera as those of a related model, and whether nothing is lost: bool (C,).
-
-    values: (C, its own n). models: those that may lie between, by key. None: the models are not related.
-    """
+    """The coefficients (C, n) of a camera as those of a related model, and whether nothing is lost; or None."""
     if (steps := _path(type(source), model, models)) is None:
         return None
     result = values.new_tensor(model.ideal(len(names))).repeat(len(values), 1)

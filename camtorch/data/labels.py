@@ -171,10 +171,9 @@ _TYPES = {1: "i1", 2: "u1", 3: "<i2", 4: "<u2", 5: "<i4", 6: "<u4", 7: "<f4", 9:
 
 
 def _matlab(path: Path) -> dict[str, np.ndarray[Any, Any]]:
-    """Return the arrays of numbers of a file of Matlab 5 to 7 by their names.
+    """Return the arrays of numbers of a file of Matlab 5 to 7 by their names. Source: MAT-File Format, The MathWorks.
 
-    Not by scipy, whose reader ends the process at some damaged files. Source: MAT-File Format, The MathWorks; elements
-    of a kind and a number of bytes, the matrices among them compressed or not.
+    Not by scipy, whose reader ends the process at some damaged files.
     """
     with path.open("rb") as file:
         content = file.read(_LARGEST)
@@ -280,10 +279,7 @@ def _video_frame(path: Path, number: int) -> Tensor | None:
 def _find(
     samples: Samples, place: object, name: Any, folders: Sequence[str] = (), suffixes: Sequence[str] = ("",)
 ) -> Path:
-    """Return the image of a name and one of some suffixes: in `samples.images`, or beside the file that names it.
-
-    With `folders`, which data sets have for their images, it may also be in one of these, or up to `_UP` higher.
-    """
+    """Return an image: in `samples.images`, or beside the file that names it, also in `folders` there and higher up."""
     parts = PurePosixPath(name if isinstance(name, str) and "\0" not in name else "")
     if parts.is_absolute() or ".." in parts.parts or not parts.name:
         raise ValueError(f"{place}: the name of a file within the folder of images was expected; got {name!r:.60}")

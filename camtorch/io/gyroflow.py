@@ -20,9 +20,7 @@ def matches(keys: dict[str, Any]) -> bool:
 
 
 def parse(record: Record) -> Rig:
-    """The camera of the images that were calibrated, with the centre that was found, which Gyroflow leaves out of
-    account where `asymmetrical` is not set. Images stretched, cropped or of a computed lens are refused.
-    """
+    """The camera of the images that were calibrated, with the centre that was found, `asymmetrical` or not."""
     for key in (*_STRETCHES, "crop", "digital_lens"):
         if key in record and record[key].value not in (1.0, None):
             record[key].fail(f"{record[key].value!r:.60}, which no model here has")

@@ -55,8 +55,7 @@ def read_stored(path: Path) -> tuple[Tensor, int | None]:
 
     Pixels are (C, H, W) uint8 with C = 1 grey, 2 grey and alpha, 3 RGB or 4 RGBA, also of other kinds (palette, CMYK);
     or (1, H, W) uint16 of deep grey images. It warns of what is left out: the lower bits of deep colours, which Pillow
-    does not read, and all images but the first. An ImageFileError says that there is no such file, no image, a damaged
-    one, floating-point pixels, or more than 16 bits.
+    does not read, and all images but the first. An ImageFileError says what cannot be read, and why.
     """
     with _opened(path) as opened:
         count, tiles = getattr(opened, "n_frames", 1), getattr(opened, "tile", ())
@@ -83,10 +82,7 @@ def read_stored(path: Path) -> tuple[Tensor, int | None]:
 
 
 def as_jpeg(image: Any, size: tuple[int, int], name: str, owner: str, side: int, quality: int) -> bytes:
-    """Return a JPEG file of an image of any kind that users pass, whose (height, width) must be `size`.
-
-    Its longer side is no more than `side` pixels. An ImageFileError says that the image cannot be read.
-    """
+    """Return a JPEG file, up to `side` pixels wide or high, of an image of any kind whose (height, width) is `size`."""
     with contextlib.ExitStack() as stack:
         if isinstance(image, (str, bytes, os.PathLike)):
             image = stack.enter_context(_opened(Path(os.fsdecode(image))))

@@ -13,16 +13,15 @@ from camtorch.native.library import library
 
 
 class Equations(NamedTuple):
-    """Triangles of the linearised problem; the unknowns are six numbers a view, and G that all views share.
+    """Triangles of the linearised problem; the unknowns are L numbers a view, and G that all views share.
 
-    A row of `view`, (B, V, L, L + G + 1), says: view[:L] * step of the view + view[L:-1] * shared step = -view[-1], and
-    one of `shared`, (B, G + 1, G + 1), what is left of all views. `columns`: (G,) names of the shared unknowns, pairs
-    of the camera (-1 for the board's bend) and the index of a parameter, 4 + n and on for its mount.
+    A row of `view` says: view[:L] * step of the view + view[L:-1] * shared step = -view[-1]. `columns` are names of the
+    shared unknowns: the camera (-1 for the board's bend) and the index of a parameter, 4 + n and on for its mount.
     """
 
-    view: Tensor
-    shared: Tensor
-    columns: tuple[tuple[int, int], ...] = ()
+    view: Tensor  # (B, V, L, L + G + 1)
+    shared: Tensor  # (B, G + 1, G + 1): what is left of all views
+    columns: tuple[tuple[int, int], ...] = ()  # (G,)
 
     @property
     def decrement(self) -> Tensor:

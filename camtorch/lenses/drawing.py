@@ -37,11 +37,7 @@ class Lenses(NamedTuple):
 
 @cache
 def _good() -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Sizes (N, 2) of (height, width), intrinsics and distortion (N, 4), and `Lenses.reach`.
-
-    Of lenses that are neither stretched nor reprojected, with square pixels, a principal point about the image's
-    middle, and a reprojection error of less than a pixel.
-    """
+    """Sizes (N, 2) of (height, width), intrinsics and distortion (N, 4), and `Lenses.reach`, of lenses to draw from."""
     texts, numbers = columns()
     table = torch.from_numpy(numbers)
     sides = [[float(side) for side in texts[name]] for name in ("height", "width")]
@@ -60,10 +56,7 @@ def _good() -> tuple[Tensor, Tensor, Tensor, Tensor]:
 
 
 def covering(intrinsics: Tensor, reach: Tensor, size: tuple[int, int]) -> Tensor:
-    """Return the factor (*B,), at least 1, on focal lengths with which all pixels of an image have rays.
-
-    `reach` (*B,) is the radius of the image at the lens's fold in focal lengths.
-    """
+    """Return the factor (*B,), at least 1, on focal lengths with which all pixels have rays; reach as of `Lenses`."""
     fx, fy, cx, cy = intrinsics.unbind(-1)
     height, width = size
     across = torch.maximum(cx + 0.5, width - 0.5 - cx) / fx

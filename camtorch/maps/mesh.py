@@ -167,9 +167,8 @@ def held(path: str, format: str, mesh: Mesh, low: Floats, high: Floats, *, clip:
 def rounded(mesh: Mesh, exact: Exact, parts: int, low: Floats, high: Floats) -> np.ndarray:
     """Return the nodes in whole parts of a pixel, (n, m, 2) int64, so that the largest error at shown pixels is small.
 
-    Each is one of the two next to the exact value, along each axis, within low and high in pixels. Between nodes a bend
-    is cut off, by an eighth of its second difference, so nodes round towards its outside; then those about the largest
-    error round as is best there, until that helps no more.
+    Each is one of the two next to the exact value, within low and high in pixels. Bends are cut off between nodes, so
+    nodes round towards the outside; then those about the largest error round as is best there, while that helps.
     """
     values, least, most = mesh.nodes * parts, low * parts, high * parts
     total = np.zeros_like(mesh.nodes)  # of the second differences along both axes; at the ends those next to them

@@ -54,10 +54,7 @@ class Limits:
         self.is_radial: bool = len(lens.stages) == 0 or lens.is_radial
 
     def disc(self, k: Tensor, radius: Tensor) -> Tensor:
-        """Return the disc of another lens that shows, near the axis, what that of the lens given shows.
-
-        Coefficients that scale the whole image, as the xi of `DoubleSphere`, so leave the field of view nearly alone.
-        """
+        """Return the disc of another lens that shows, near the axis, what that of the lens given shows."""
         if not self.bends:
             return radius
         given, other = (_angles(self.model.optics(columns(w))[0], _AT_AXIS * radius) for w in (self.given, k))

@@ -43,10 +43,7 @@ class Prior:
         return self.model.names_of(len(self.lens)) or ()
 
     def scales(self, discs: Tensor) -> Tensor:
-        """Return how much a coefficient changes for 1, (K, n), with discs of radii (K,); 0 for what changes nothing.
-
-        That moves the rim by a tenth of its distance from the axis, by a hundredth in what is lopsided.
-        """
+        """Return what of a coefficient moves the rim of discs (K,) by `_RIM`, (K, n); 0 for what changes nothing."""
         turn = discs.new_tensor(_TURNS)
         a, b = ((discs[:, None] * c).reshape(-1, 1) for c in (turn.cos(), turn.sin()))
         k = self.lens.expand(len(a), -1)
@@ -69,10 +66,7 @@ class Prior:
 def prior_of(
     asked: Model, image_size: tuple[int, int], centre: float, aspect: float, fov: Sequence[float] | None, owner: str
 ) -> Prior:
-    """Return the prior of a model, or of a camera to start from, and the discs that a range of fields of view takes.
-
-    `aspect` is by how much the logarithm of fy / fx may change; centre and fov are those of `CameraHead`.
-    """
+    """Return the prior of a `CameraHead`; `aspect` is by how much the logarithm of fy / fx may change."""
     degrees, start, given, ratio = _as_fov(fov, owner), asked.start, None, 0.0
     middle = [(side - 1) / 2 for side in image_size[::-1]]
     if start is not None:

@@ -96,9 +96,7 @@ class Rectification(GeometryModule):
 
     @property
     def baseline(self) -> Tensor:
-        """(*B,) the right camera's place on the axis of the rectified left one; negative where it stands to the left
-        (above).
-        """
+        """(*B,) the right camera's place on the axis of the rectified left one; negative to the left (above)."""
         return _frame(self.extrinsics, self.vertical, self.align)[2]
 
     @property
@@ -334,10 +332,7 @@ def rectify(
 
 
 def _frame(extrinsics: Extrinsics, vertical: bool, align: Align) -> tuple[Tensor, Tensor, Tensor]:
-    """Return rotations (*B, 3, 3) of both cameras to their common frame, and the right one's place (*B,), in float64.
-
-    With a graph if the extrinsics learn.
-    """
+    """Return rotations (*B, 3, 3) of both cameras to their common frame, and the right one's place (*B,), float64."""
     vector, translation = extrinsics.rotation.double(), extrinsics.translation.double()
     length = torch.linalg.vector_norm(translation, dim=-1)
     if known_false(length > 0):

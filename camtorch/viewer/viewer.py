@@ -147,11 +147,10 @@ def _constructor(kind: type[Camera]) -> str:
 
 @cache
 def _lenses() -> dict[str, Any]:
-    """The collection of real lenses, packed: names and numbers by Deflate, numbers rounded to parts of a pixel.
+    """The collection of real lenses, packed by Deflate; integers lie byte by byte, sign last, lowest bytes first.
 
-    A number is kept as an integer: focal lengths and centres in steps of `_FOCAL` pixels, fy and the centre relative to
-    fx and to the middle; k1 ... k4 by what they move a point at the corner of an image of an equidistant lens, in steps
-    of `_BEND`. Integers are laid out byte by byte, sign last, lowest bytes first.
+    Focal lengths and centres are in steps of `_FOCAL` pixels, fy and the centre relative to fx and to the middle; k1 to
+    k4 are what they move a point at the corner of an image of an equidistant lens, in steps of `_BEND`.
     """
     texts, numbers = columns()
     exists = np.minimum(numbers[0], numbers[1]) > 0  # a few have gone astray
