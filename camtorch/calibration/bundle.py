@@ -10,13 +10,14 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 from torch.nn.utils.parametrize import type_before_parametrizations
 
 from camtorch.calibration import compiled as compiled_poses
+from camtorch.calibration.observations import Observations
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.opaque import fixed_camera
 from camtorch.convert.fitting import bounds
@@ -28,9 +29,6 @@ from camtorch.projection import compiled
 from camtorch.projection.evaluation import compiled_of
 from camtorch.projection.rows import Cameras
 from camtorch.values.module import remade
-
-if TYPE_CHECKING:
-    from camtorch.calibration.observations import Observations
 
 LOSSES = ("huber", "cauchy")
 SETTLED = 1e-10  # of the variance: the squared distance to the optimum, in standard deviations, that ends a search

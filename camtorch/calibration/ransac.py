@@ -67,8 +67,7 @@ class _Lines(NamedTuple):
         across = torch.linalg.cross(turned[:, :, None].expand_as(slopes), slopes)
         columns = torch.cat((across, slopes), -1).flatten(2, 3)
         normal = columns.mT @ columns
-        size = normal.diagonal(dim1=-2, dim2=-1)
-        normal = normal + torch.diag_embed(1e-9 * size + 1e-300)
+        normal = normal + torch.diag_embed(1e-9 * normal.diagonal(dim1=-2, dim2=-1) + 1e-300)
         step = -torch.linalg.solve_ex(normal, columns.mT @ seen.flatten(2)[..., None])[0]
         return torch.cat((small_turn(step[..., :3, 0]) @ poses[..., :3], poses[..., 3:] + step[..., 3:, :]), -1)
 

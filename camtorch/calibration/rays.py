@@ -50,8 +50,7 @@ def poses_from_rays(points: Tensor, rays: Tensor, weights: Tensor) -> RayPoses:
     seen = torch.isfinite(points.sum(-1) + rays.sum(-1) + weights) & (weights > 0)
     points, rays = torch.where(seen[..., None], points, 0.0), torch.where(seen[..., None], rays, 0.0)
     weights = torch.where(seen, weights, 0.0)
-    total = weights.sum(-1).clamp(min=_TINY)
-    weights = weights / total[:, None]
+    weights = weights / weights.sum(-1, keepdim=True).clamp(min=_TINY)
     centre = (weights[..., None] * points).sum(-2)
     centred = torch.where(weights[..., None] > 0, points - centre[:, None], 0.0)
     variances, axes = torch.linalg.eigh((weights[..., None] * centred).mT @ centred)
@@ -188,8 +187,7 @@ class _Distances(NamedTuple):
             mapped = (slopes.flatten(1, 2) @ self.form).view_as(slopes)
             gradient = mapped @ rotations.flatten(2)[..., None]
             normal = mapped @ slopes.mT
-            scale = normal.diagonal(dim1=-2, dim2=-1).sum(-1)
-            normal = normal + (damping * scale + _TINY)[..., None, None] * eye
+            normal = normal + (damping * normal.diagonal(dim1=-2, dim2=-1).sum(-1) + _TINY)[..., None, None] * eye
             turned = small_turn(-torch.linalg.solve_ex(normal, gradient)[0][..., 0]) @ rotations
             turned_costs = self.of_rotations(turned)
             better = turned_costs < costs

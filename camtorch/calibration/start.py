@@ -4,21 +4,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from camtorch.calibration.bundle import SETTLED, Adjusted, Free, Poses, Sight, State, adjust, minima
+from camtorch.calibration.observations import Observations
 from camtorch.calibration.rays import poses_from_rays
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.opaque import fixed_camera
 from camtorch.convert import fitting, views
 from camtorch.models import UCM, KannalaBrandt
 from camtorch.rays.lattices import angles_from_axis
-
-if TYPE_CHECKING:
-    from camtorch.calibration.observations import Observations
 
 # Lenses that are tried. The unified camera is a perspective one for 0, a stereographic one for 1/2, and nearly an
 # equidistant or equisolid one for 0.65; degrees from the axis, at the seen pixel that is furthest from the middle

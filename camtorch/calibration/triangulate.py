@@ -166,9 +166,8 @@ def _solved(task: _Task, rays: Tensor) -> tuple[Tensor, Tensor]:
         Poses.none(count, 1, start)._replace(translations=(start @ first.mT + shift)[:, None]),
         start.new_zeros(count, 2),
     )
-    corner = start.new_zeros(count, 1, 1, 3)
     seen_by = zip(task.cameras, pixels[..., None, None, :], seen[..., None, None], strict=True)
-    sights = [Sight(camera, corner, *of_camera) for camera, *of_camera in seen_by]
+    sights = [Sight(camera, start.new_zeros(count, 1, 1, 3), *of_camera) for camera, *of_camera in seen_by]
     held = tuple(torch.zeros(p.shape[-1], dtype=torch.bool, device=p.device) for p in parameters)
     problem = Bundle(sights, state, Free(held, (False,) * len(sights), "positions"), None, 1.0)
     flat, tolerance, tiny = problem.flat(state), _SETTLED / (2 * views - 3).clamp(min=1), _NOTHING**2 * views

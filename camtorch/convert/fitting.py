@@ -183,8 +183,7 @@ class _Fit:
         slope, values = (slopes @ residuals[..., None])[:, free, 0], parameters[:, free]
         # what would leave its bounds stays there, so that the others can move on
         held = (values <= self.low[rows][:, free]) & (slope > 0) | (values >= self.high[rows][:, free]) & (slope < 0)
-        columns = torch.cat((slopes[:, free], residuals[:, None]), 1).mT
-        triangle = torch.linalg.qr(padded(columns), mode="r").R
+        triangle = torch.linalg.qr(padded(torch.cat((slopes[:, free], residuals[:, None]), 1).mT), mode="r").R
         none = triangle.new_zeros(len(rows), 0, 0, triangle.shape[-1])
         return System(Equations(none, triangle), 0, held)
 

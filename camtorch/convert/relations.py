@@ -4,18 +4,15 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterator, Mapping
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from camtorch.projection.camera_like import CameraLike
 
-if TYPE_CHECKING:
-    Model = type[CameraLike]
-    Models = Mapping[str, Model]
-    Step = tuple[Model, Mapping[str, str]]
-    """A model, and what the coefficients of the one before are called there; those left out are lost."""
+Model = type[CameraLike]
+Models = Mapping[str, Model]
+Step = tuple[Model, Mapping[str, str]]  # a model, and the names there of the coefficients before; others are lost
 
 _MANY = 33
 

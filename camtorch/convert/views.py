@@ -10,15 +10,7 @@ from torch import Tensor
 
 from camtorch.convert.fitting import Observations
 from camtorch.projection.camera_like import CameraLike
-from camtorch.rays.lattices import (
-    angles_from_axis,
-    image_edges,
-    pixel_lattice,
-    polar_rays,
-    ray_fan,
-    reach,
-    slopes_at_axis,
-)
+from camtorch.rays import lattices
 
 _ANGLES, _AZIMUTHS, _RADII = 180, 16, 64  # at which a camera is looked at as a whole
 _END_AHEAD = math.radians(87)  # of rays, for a camera without an image that does not see sideways
@@ -43,7 +35,7 @@ class SampledRays(NamedTuple):
     @property
     def angles(self) -> Tensor:
         """(C, N) radians from the axis."""
-        return angles_from_axis(self.rays)
+        return lattices.angles_from_axis(self.rays)
 
 
 class Lattice(NamedTuple):
@@ -61,7 +53,7 @@ class Lattice(NamedTuple):
 
     def nodes(self) -> Tensor:
         """(C, side^2, 2)."""
-        return pixel_lattice(self.low, self.high, self.side, self.side).flatten(1, 2)
+        return lattices.pixel_lattice(self.low, self.high, self.side, self.side).flatten(1, 2)
 
     def between(self, places: Tensor) -> Tensor:
         """Places (C, N, 2), brought back to where the lattice ends; azimuths go round."""
@@ -73,10 +65,10 @@ class Lattice(NamedTuple):
         if self.are_pixels:
             rays, found = camera.unproject(places)
         else:
-            rays = polar_rays(*places.unbind(-1))
+            rays = lattices.polar_rays(*places.unbind(-1))
             found = torch.ones_like(rays[..., 0], dtype=torch.bool)
         pixels, valid = camera.project(rays)
-        return SampledRays(rays, pixels, valid & found & (angles_from_axis(rays) <= self.limit * (1 + 1e-12)))
+        return SampledRays(rays, pixels, valid & found & (lattices.angles_from_axis(rays) <= self.limit * (1 + 1e-12)))
 
 
 def lattice(camera: CameraLike, image_size: tuple[int, int] | None, side: int, limit: float) -> Lattice:
@@ -88,9 +80,9 @@ def lattice(camera: CameraLike, image_size: tuple[int, int] | None, side: int, l
         first, last = (torch.full_like(most, (i + 0.25) * 2 * math.pi / side) for i in (0, side - 1))
         low, high = torch.cat((torch.zeros_like(most), first), -1), torch.cat((most, last), -1)
         return Lattice(low, high, side, False, limit)
-    low, high = (corner.expand(count, 2) for corner in image_edges(image_size, camera.intrinsics))
+    low, high = (corner.expand(count, 2) for corner in lattices.image_edges(image_size, camera.intrinsics))
     if limit < math.pi:
-        ring, valid = camera.project(ray_fan(low.new_full((count, 1), limit), 64).flatten(1, 2))
+        ring, valid = camera.project(lattices.ray_fan(low.new_full((count, 1), limit), 64).flatten(1, 2))
         closed = valid.all(-1)[:, None] & (limit < math.pi / 2)
         least, most = (torch.where(closed, end, whole) for end, whole in ((ring.amin(1), low), (ring.amax(1), high)))
         inside = (least < high) & (most > low)
@@ -108,7 +100,7 @@ def sample_with_rings(camera: CameraLike, image_size: tuple[int, int] | None, si
     """`sample`, and rays on circles around the axis, over which the errors of a radial lens change."""
     whole = sample(camera, image_size, side, limit)
     reach = torch.where(whole.valid, whole.angles, 0.0).amax(-1, keepdim=True)
-    rings = seen(camera, image_size, ray_fan(reach * torch.linspace(0, 1, _RADII, **_like(camera)), _AZIMUTHS))
+    rings = seen(camera, image_size, lattices.ray_fan(reach * torch.linspace(0, 1, _RADII, **_like(camera)), _AZIMUTHS))
     return SampledRays(*(torch.cat(pair, 1) for pair in zip(whole, rings, strict=True)))
 
 
@@ -117,7 +109,7 @@ def seen(camera: CameraLike, image_size: tuple[int, int] | None, fan: Tensor) ->
     rays = fan.flatten(1, 2)
     pixels, valid = camera.project(rays)
     if image_size is not None:
-        low, high = image_edges(image_size, pixels)
+        low, high = lattices.image_edges(image_size, pixels)
         valid = valid & (pixels >= low).all(-1) & (pixels <= high).all(-1)
     return SampledRays(rays, pixels, valid)
 
@@ -129,24 +121,23 @@ def _reach(camera: CameraLike, limit: float) -> Tensor:
     def covers(rays: Tensor) -> Tensor:
         return camera.project(rays.expand(len(camera.intrinsics), *rays.shape[-3:]))[1]
 
-    ends = reach(covers, azimuths, steps=_ANGLES, rounds=1).amax(-1, keepdim=True)
+    ends = lattices.reach(covers, azimuths, steps=_ANGLES, rounds=1).amax(-1, keepdim=True)
     return torch.where(ends < math.pi / 2, ends.clamp(max=_END_AHEAD), ends).clamp(max=limit)
 
 
 def focal_at_axis(camera: CameraLike) -> Tensor:
     """(C, 4): the focal lengths at the axis, and the pixel of the axis."""
-    slopes = slopes_at_axis(camera.optics, camera.distortion)
     stated = camera.intrinsics
     fair = torch.isfinite(stated).all(-1) & (stated[:, :2] > 0).all(-1)
     stated = torch.where(fair[:, None], stated, stated.new_tensor([1.0, 1, 0, 0]))
-    return torch.cat((stated[:, :2] * slopes, stated[:, 2:]), -1)
+    return torch.cat((stated[:, :2] * lattices.slopes_at_axis(camera.optics, camera.distortion), stated[:, 2:]), -1)
 
 
 def radii(camera: CameraLike, slopes: Tensor, reach: Tensor) -> tuple[Tensor, Tensor]:
     """Angles and radii as `Camera.fit_start` gets them; reach: (C,) the last angle, 0 where nothing is seen."""
     steps = torch.arange(1, _RADII + 1, **_like(camera)) / _RADII
     angles = torch.where(reach > 0, reach, 1.0)[:, None] * steps
-    pixels, valid = camera.project(ray_fan(angles, _AZIMUTHS))
+    pixels, valid = camera.project(lattices.ray_fan(angles, _AZIMUTHS))
     plane = (pixels - slopes[:, None, None, 2:]) / slopes[:, None, None, :2]
     radii = (torch.linalg.vector_norm(plane, dim=-1) * valid).sum(-1) / valid.sum(-1).clamp(min=1)
     growth = radii.diff(dim=-1, prepend=torch.zeros_like(radii[:, :1]))

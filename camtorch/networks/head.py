@@ -142,8 +142,7 @@ class CameraHead(GeometryModule):
 
     def forward(self, features: Tensor) -> Camera:
         """The cameras (*B) of features (*B, features)."""
-        owner = type(self).__name__
-        features = as_coordinates(features, "features", self.linear.in_features, owner, form="*B")
+        features = as_coordinates(features, "features", self.linear.in_features, type(self).__name__, form="*B")
         device = features.device.type
         with torch.autocast(device, enabled=False) if torch.amp.is_autocast_available(device) else nullcontext():
             return self.camera(self.linear(features.to(self.linear.weight.dtype)))

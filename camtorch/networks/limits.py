@@ -4,17 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
+from camtorch.cameras.camera import Camera
 from camtorch.optics.backprojection import FURTHEST, Inverted
+from camtorch.optics.charts import Chart
 from camtorch.values.arguments import columns
-
-if TYPE_CHECKING:
-    from camtorch.cameras.camera import Camera
-    from camtorch.optics.charts import Chart
 
 BEYOND = 1.02  # how much further out than the image is asked, where its rim is safe from rounding
 _NODES = 48  # of Chebyshev: what a polynomial of t = radius^2 is between them is hardly more than on them

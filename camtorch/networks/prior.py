@@ -5,18 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
+from camtorch.calibration.calibrate import Model
+from camtorch.cameras.camera import Camera
 from camtorch.networks.limits import BEYOND
 from camtorch.rays.lattices import focal_for
 from camtorch.values.arguments import check_degrees, columns, shown
-
-if TYPE_CHECKING:
-    from camtorch.calibration.calibrate import Model
-    from camtorch.cameras.camera import Camera
 
 _FOV = 40.0, 120.0
 _LONGER, _SHORTER = 1.5, (1.5, 1.25, 1.1, 1.05)  # than a given camera's; the first that leaves its corners rays
