@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
@@ -56,3 +56,22 @@ def learns(modules: Sequence[BatchedModule], *tensors: Tensor) -> bool:
     """Whether a graph shall lead to any of them."""
     held = [getattr(module, name) for module in modules for name in module.tensor_names]
     return torch.is_grad_enabled() and any(t.requires_grad for t in (*held, *tensors))
+
+
+def attached(objective: Callable[[Tensor], Tensor], optimum: Tensor, valid: Tensor) -> Tensor:
+    """Return the optimum (B, K) with a graph, for first derivatives by whatever the objective depends on.
+
+    By the implicit function theorem: the gradient of the objective, of costs (B,), stays zero when an optimum moves, so
+    one step by Newton's method, with the exact Hessian, has its derivatives. Rows that are not valid get no gradient.
+    """
+    with torch.enable_grad():
+        unknowns = optimum.detach().requires_grad_()
+        (gradient,) = torch.autograd.grad(objective(unknowns).sum(), unknowns, create_graph=True)
+        slopes = [torch.autograd.grad(one.sum(), unknowns, retain_graph=True)[0] for one in gradient.unbind(-1)]
+        eye = torch.eye(optimum.shape[-1], dtype=optimum.dtype, device=optimum.device)
+        hessian = torch.where(valid[:, None, None], torch.stack(slopes, -2).detach(), eye)
+        inverse, failed = torch.linalg.inv_ex(hessian)
+        fine = valid & (failed == 0) & torch.isfinite(inverse).all(-1).all(-1)
+        inverse = torch.where(fine[:, None, None], inverse, 0.0)
+        step = (inverse @ gradient[..., None])[..., 0]
+        return optimum.detach() - (step - step.detach())

@@ -51,11 +51,9 @@ class Poses(NamedTuple):
         return Poses(*(t[index] if dim == 0 else t[:, index] for t in self))
 
     def expand(self, batch: int) -> Poses:
-        """A batch of the same."""
         return Poses(*(t.expand(batch, *t.shape[1:]) for t in self))
 
     def with_views(self, index: Tensor, other: Poses) -> Poses:
-        """With others for some of the views."""
         return Poses(*(t.index_copy(1, index, new) for t, new in zip(self, other, strict=True)))
 
     @classmethod
@@ -107,7 +105,6 @@ class State(NamedTuple):
         return cls((parameters,), Poses.none(batch, 1, parameters), boards, parameters.new_zeros(batch, 2))
 
     def of(self, rows: Tensor) -> State:
-        """Those of some problems, given by numbers."""
         parameters = tuple(p[rows] for p in self.parameters)
         return State(parameters, self.mounts.of(rows), self.boards.of(rows), self.bend[rows])
 
@@ -136,7 +133,6 @@ class Adjusted:
     @cached_property
     @torch.no_grad()
     def equations(self) -> Equations:
-        """There, linearised."""
         return self.problem.equations(self.problem.flat(self.state))
 
     @cached_property
@@ -286,7 +282,6 @@ class Bundle:
         return (*state.boards, *state.mounts, state.bend, *[p.expand(batch, -1) for p in state.parameters])
 
     def state(self, flat: Sequence[Tensor]) -> State:
-        """The other way."""
         return State(tuple(flat[5:]), Poses(*flat[2:4]), Poses(*flat[:2]), flat[4])
 
     def _of_columns(self, parameters: Sequence[Tensor], other: float) -> Tensor:
@@ -310,7 +305,6 @@ class Bundle:
         return turned, first, first @ mounts.rotations[:, c, None].mT + mounts.translations[:, c, None, None]
 
     def camera(self, c: int, state: State) -> Camera:
-        """As it is in a state."""
         parameters = state.parameters[c]
         return self.fixed[c] or remade(self.cameras[c], intrinsics=parameters[:, :4], distortion=parameters[:, 4:])
 
@@ -353,12 +347,10 @@ class Bundle:
         return look.valid & camera.project(self.points(c, state, self.sights[c])[-1])[1]
 
     def sight(self, c: int, rows: Tensor | None) -> Sight:
-        """Of some problems."""
         sight = self.sights[c]
         return sight if rows is None or len(rows) == len(sight.weights) else sight.mapped(lambda t: t[rows])
 
     def cost(self, flat: Sequence[Tensor], rows: Tensor) -> Tensor:
-        """(R,)."""
         total = torch.cat([look.cost for look in self.looks(flat, rows)], -1).sum(-1)
         for sight, parameters in zip(self.sights, flat[5:], strict=True):
             if sight.prior:
@@ -366,7 +358,6 @@ class Bundle:
         return total.nan_to_num(torch.inf, torch.inf)
 
     def linearised(self, flat: Sequence[Tensor], rows: Tensor) -> System:
-        """At a state."""
         equations = self.equations(flat, rows)
         held = torch.zeros(len(rows), len(self.columns), dtype=torch.bool, device=flat[1].device)
         if self.is_bounded:
@@ -378,7 +369,6 @@ class Bundle:
         return System(equations, self.width, held)
 
     def equations(self, flat: Sequence[Tensor], rows: Tensor | None = None) -> Equations:
-        """The triangles of a state."""
         rows = torch.arange(len(flat[0]), device=flat[0].device) if rows is None else rows
         state, width, total = self.state(flat), self.width, len(self.columns)
         looks, parts = self.looks(flat, rows), []
@@ -478,7 +468,6 @@ class Bundle:
 
 
 def _of_rows(values: Tensor, rows: Tensor) -> Tensor:
-    """Those of some problems."""
     return values if len(rows) == len(values) else values[rows]
 
 

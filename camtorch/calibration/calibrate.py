@@ -47,7 +47,6 @@ class Model:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of all parameters."""
         return (*INTRINSICS, *(self.kind.names_of(self.count) or ()))
 
     def camera(self, parameters: Tensor, image_size: tuple[int, int] | None) -> Camera:
@@ -221,7 +220,6 @@ class Search:
 
     @property
     def sight(self) -> Sight:
-        """It as one problem."""
         seen = self.seen
         weights = seen.seen[None].to(seen.pixels)
         return Sight(self.asked.kind, seen.points[None], seen.pixels[None], weights, prior=self.prior)
@@ -260,7 +258,6 @@ class Search:
         return adjusted
 
     def adjusted(self, sights: Sequence[Sight], state: State, free: Free, **options: Any) -> Adjusted:
-        """The optimum near a state."""
         return adjust(sights, state, free, loss=self.loss, loss_scale=self.loss_scale, **options)
 
     def other_optima(

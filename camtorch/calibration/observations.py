@@ -41,7 +41,6 @@ class Observations(NamedTuple):
     seen: Tensor  # (V, N) bool
 
     def of(self, views: Tensor) -> Observations:
-        """Those of some views, given by numbers or by a mask."""
         return Observations(*(t[views] for t in self))
 
 

@@ -10,14 +10,13 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from camtorch.calibration.batches import as_tensor, as_vectors, learns, root_of, rows_of
+from camtorch.calibration.batches import as_tensor, as_vectors, attached, learns, root_of, rows_of
 from camtorch.calibration.bundle import Poses, Sight, posed
 from camtorch.calibration.compiled import Search, Solved, solved
 from camtorch.calibration.ransac import consensus
 from camtorch.calibration.rays import poses_from_rays
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.mixed import Mixed
-from camtorch.least_squares.implicit import attached
 from camtorch.poses.extrinsics import Extrinsics
 from camtorch.poses.rotations import rotation_matrix, rotation_vector, skew_matrix
 from camtorch.projection.evaluation import compiled_of
@@ -59,7 +58,6 @@ class Pose(_Pose):
     noise of the variance that the inliers leave, the sum of squares over 2 N - 6; NaN where invalid. No graph."""
 
     def __new__(cls, extrinsics: Extrinsics, rms: Tensor, valid: Tensor, inliers: Tensor, covariance: Tensor) -> Pose:
-        """All five."""
         pose = super().__new__(cls, extrinsics, rms, valid)
         pose.inliers, pose.covariance = inliers, covariance
         return pose
@@ -183,7 +181,6 @@ class _Given(NamedTuple):
 
     @classmethod
     def of(cls, camera: Camera, object_points: Numbers, pixels: Numbers, weights: Numbers | None) -> _Given:
-        """What `solve_pnp` takes."""
         owner = "solve_pnp"
         if not isinstance(camera, Camera):
             raise TypeError(f"{owner}: camera must be a camera, as ct.KannalaBrandt(...); got {no_camera(camera)}")
@@ -245,7 +242,6 @@ class _Task(NamedTuple):
 
     @classmethod
     def of(cls, given: _Given) -> _Task:
-        """With graphs where there are."""
         points, pixels = given.points.expand(len(given.pixels), -1, -1), given.pixels
         weights = torch.ones_like(pixels[..., 0]) if given.weights is None else given.weights
         with torch.no_grad():

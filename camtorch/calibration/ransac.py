@@ -38,7 +38,6 @@ class _Lines(NamedTuple):
     threshold: float
 
     def of(self, rows: Tensor | slice) -> _Lines:
-        """Some rows."""
         return _Lines(self.points[rows], self.measures[rows], self.threshold)
 
     def forms(self) -> Tensor:

@@ -150,7 +150,6 @@ class _Distances(NamedTuple):
 
     @classmethod
     def between(cls, local: Tensor, rays: Tensor, weights: Tensor) -> _Distances:
-        """Of points and rays (B, N, 3)."""
         form = _moments(rays, local, weights).transpose(2, 3).reshape(-1, 9, 9)
         eye = torch.eye(3, dtype=rays.dtype, device=rays.device)
         weighted = weights[..., None] * rays

@@ -195,7 +195,6 @@ class _Alone(NamedTuple):
 
 
 def _alone(search: Search) -> _Alone:
-    """What one camera says."""
     has_pose = search.given.seen.any(-1)
     state = replace(search, given=search.given.of(has_pose)).alone().state
     (rows,) = has_pose.nonzero(as_tuple=True)

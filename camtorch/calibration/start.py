@@ -170,7 +170,6 @@ class _Lens(NamedTuple):
 
     @property
     def state(self) -> State:
-        """Where an adjustment starts."""
         return State.of_one(self.parameters, self.boards)
 
     @property
@@ -187,7 +186,6 @@ class _Lens(NamedTuple):
         return some.seen & ~valid.view(-1, *some.seen.shape)
 
     def of(self, rows: Tensor | slice) -> _Lens:
-        """Some of them."""
         return self._replace(parameters=self.parameters[rows], boards=self.boards.of(rows))
 
     def adjusted(

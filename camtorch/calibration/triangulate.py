@@ -9,10 +9,9 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from camtorch.calibration.batches import as_tensor, learns, root_of, rows_of
+from camtorch.calibration.batches import as_tensor, attached, learns, root_of, rows_of
 from camtorch.calibration.bundle import Bundle, Free, Poses, Sight, State
 from camtorch.cameras.camera import Camera
-from camtorch.least_squares.implicit import attached
 from camtorch.least_squares.levenberg_marquardt import minimise
 from camtorch.poses.extrinsics import Extrinsics
 from camtorch.values.arguments import Numbers, check_devices, hinting, working_dtype

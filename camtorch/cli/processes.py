@@ -77,7 +77,6 @@ def each(work: Work, pairs: Sequence[Pair], count: int, done: Callable[[], objec
 
 
 def _begin(pickled: bytes) -> None:
-    """Prepare a new process."""
     global _work
     import torch
 

@@ -32,7 +32,6 @@ class Observations(NamedTuple):
     weights: Tensor
 
     def of(self, rows: Tensor) -> Observations:
-        """Those of some rows."""
         return Observations(*(t[rows] for t in self))
 
 

@@ -34,7 +34,6 @@ class Reference(NamedTuple):
         return torch.where(self.rays.valid, self.rays.angles, 0.0).amax(-1)
 
     def of(self, camera: CameraLike, rows: Tensor) -> Reference:
-        """That of some rows, and their cameras."""
         return Reference(camera, self.image_size, self.lattice.of(rows), self.rays.of(rows), self.all_rays.of(rows))
 
 

@@ -24,7 +24,6 @@ class SampledRays(NamedTuple):
     valid: Tensor
 
     def of(self, rows: Tensor) -> SampledRays:
-        """Those of some rows."""
         return SampledRays(*(t[rows] for t in self))
 
     @property
@@ -48,7 +47,6 @@ class Lattice(NamedTuple):
     limit: float  # radians from the axis, beyond which rays do not count
 
     def of(self, rows: Tensor) -> Lattice:
-        """That of some rows."""
         return self._replace(low=self.low[rows], high=self.high[rows])
 
     def nodes(self) -> Tensor:

@@ -199,7 +199,6 @@ class MapBatches(Mover):
         return result
 
     def _row(self, row: dict[str, Any]) -> Sample:
-        """What has changed in a row."""
         values = [row.pop(name) for name in self._keys]
         values = [value.item() if isinstance(value, np.generic) else value for value in values]
         key: Key | None = tuple(values) if len(values) > 1 else values[0] if values else None

@@ -128,7 +128,6 @@ class _File:
         return named
 
     def camera(self, model: str | None, name: str) -> Camera:
-        """The camera of a name."""
         key, lens, xi = self.matrices[name], self.lenses.get(name), self.xis.get(name)
         intrinsics = self.record[key].intrinsics()
         distortion = self.record[lens].flat() if lens else []

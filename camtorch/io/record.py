@@ -64,7 +64,6 @@ class Record:
         return "nothing" if self.value is None else f"{self.value!r:.60}"
 
     def keys(self) -> list[str]:
-        """The keys of a mapping."""
         self._check(dict, "not keys and values")
         return list(self.value)
 
@@ -98,7 +97,6 @@ class Record:
         return len(self.value)
 
     def text(self) -> str:
-        """A text."""
         self._check(str, "no text")
         return str(self.value)
 
@@ -198,7 +196,6 @@ class Record:
         return [fx, fy, cx, cy]
 
     def model(self, key: str) -> type[Camera]:
-        """The model of that key."""
         if key.partition(":")[0] not in MODELS:
             known = ", ".join(sorted(MODELS))
             self.fail(f"needs the camera model {key!r:.60}, which this camtorch does not have; it has {known}. {LEFT}")

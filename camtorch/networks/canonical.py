@@ -173,7 +173,6 @@ class CanonicalCamera(SampleTransform):
         return moved
 
     def _change(self, camera: Camera, count: int) -> Change:
-        """From the cameras to those with the focal length."""
         height, width = camera.height, camera.width
         size = self.image_size or (height, width)
         if self.image_size is None:

@@ -36,7 +36,6 @@ class Prior:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the coefficients."""
         return self.model.names_of(len(self.lens)) or ()
 
     def scales(self, discs: Tensor) -> Tensor:

@@ -361,7 +361,6 @@ def _frame(extrinsics: Extrinsics, vertical: bool, align: Align) -> tuple[Tensor
 
 
 def _unit(axis: int, like: Tensor) -> Tensor:
-    """(3,)."""
     return like.new_tensor([float(i == axis) for i in range(3)])
 
 
