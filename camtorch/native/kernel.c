@@ -370,70 +370,38 @@ INLINE V8 gathered(const char *from, const int64_t *at, int type) {
     return type == FLOAT32 ? floats : float8(whole);
 }
 
-/* True from one half on, as bytes */
-INLINE I8 truth8(V8 value) { return -(value >= every8(0.5f)); }
-
 #if defined(__AVX2__)
 
-/* Bytes of eight neighbouring squares that lie within sixteen columns and four rows: read as a whole, then picked */
-typedef struct {
-    int64_t at;            /* of the first byte of the first row */
-    int64_t below;         /* from it to the second row */
-    __m256i pick;          /* of a row, the two neighbours of every square as 16 bits each */
-    __m256i second, third; /* which squares begin in the second row or below it, and in the third */
-    __m256i weights;       /* of the neighbours, in 2^-14 */
-    int rows;              /* two, three or four */
-} Window;
-
-INLINE int window_of(const Job *job, const Squares *at, Window *window) {
-    const int32_t x0 = at->x[0], x7 = at->x[7], y0 = at->y[0], y7 = at->y[7];
-    const int32_t x = x0 < x7 ? x0 : x7, y = y0 < y7 ? y0 : y7;
-    const __m256i dx = _mm256_sub_epi32((__m256i)at->x, _mm256_set1_epi32(x));
-    const __m256i dy = _mm256_sub_epi32((__m256i)at->y, _mm256_set1_epi32(y));
-    const __m256i one = _mm256_set1_epi32(1), fifteen = _mm256_set1_epi32(-16);
-    /* none of 0 ... 14 columns and 0, 1, 2 rows */
-    const __m256i far_down = _mm256_and_si256(_mm256_or_si256(dy, _mm256_add_epi32(dy, one)), _mm256_set1_epi32(-4));
-    const __m256i far_across = _mm256_and_si256(_mm256_or_si256(dx, _mm256_add_epi32(dx, one)), fifteen);
-    const __m256i far = _mm256_or_si256(far_down, far_across);
-    if (!_mm256_testz_si256(far, far) || x + 16 > job->source_width) return 0;
-    window->second = _mm256_cmpgt_epi32(dy, _mm256_setzero_si256());
-    window->third = _mm256_cmpgt_epi32(dy, one);
-    window->rows = _mm256_testz_si256(dy, dy) ? 2 : _mm256_testz_si256(window->third, window->third) ? 3 : 4;
-    window->at = (int64_t)y * job->source_strides[2] + x;
-    window->below = job->source_strides[2];
-    /* bytes d, none, d + 1, none */
-    window->pick = _mm256_add_epi32(_mm256_or_si256(dx, _mm256_slli_epi32(dx, 16)), _mm256_set1_epi32((int32_t)0x80018000));
-    const __m256i right = _mm256_cvtps_epi32(_mm256_mul_ps((__m256)at->u, _mm256_set1_ps(16384)));
-    const __m256i left = _mm256_sub_epi32(_mm256_set1_epi32(16384), right);
-    window->weights = _mm256_or_si256(left, _mm256_slli_epi32(right, 16));
-    return 1;
-}
-
-INLINE __m256i row16(const uint8_t *from) {
-    return _mm256_broadcastsi128_si256(_mm_loadu_si128((const __m128i *)from));
-}
-
-/* The eight samples, times 2^14 */
-INLINE V8 window_bytes(const uint8_t *plane, const Window *window, V8 v) {
-    const uint8_t *from = plane + window->at;
-    __m256i upper = _mm256_shuffle_epi8(row16(from), window->pick);
-    __m256i lower = _mm256_shuffle_epi8(row16(from + window->below), window->pick);
-    if (window->rows > 2) {
-        const __m256i third = _mm256_shuffle_epi8(row16(from + 2 * window->below), window->pick);
-        upper = _mm256_blendv_epi8(upper, lower, window->second);
-        lower = _mm256_blendv_epi8(lower, third, window->second);
-        if (window->rows > 3) {
-            const __m256i fourth = _mm256_shuffle_epi8(row16(from + 3 * window->below), window->pick);
-            upper = _mm256_blendv_epi8(upper, third, window->third);
-            lower = _mm256_blendv_epi8(lower, fourth, window->third);
-        }
-    }
-    const V8 above = (V8)_mm256_cvtepi32_ps(_mm256_madd_epi16(upper, window->weights));
-    const V8 below = (V8)_mm256_cvtepi32_ps(_mm256_madd_epi16(lower, window->weights));
-    return above * (1 - v) + below * v;
+/* Four times eight bytes, of any places */
+INLINE __m256i quarters(const char *a, const char *b, const char *c, const char *d) {
+#define EVERYWHERE(from) _mm256_castpd_si256(_mm256_broadcast_sd((const double *)(from)))
+    const __m256i first = _mm256_blend_epi32(EVERYWHERE(a), EVERYWHERE(b), 0x0c);
+    const __m256i second = _mm256_blend_epi32(EVERYWHERE(c), EVERYWHERE(d), 0xc0);
+#undef EVERYWHERE
+    return _mm256_blend_epi32(first, second, 0xf0);
 }
 
 #endif
+
+/* Eight pairs of neighbours in a row, between which `part` lies */
+INLINE V8 between_pairs(const char *from, const int64_t *at, V8 part, int type) {
+    V8 left, right;
+#if defined(__AVX2__)
+    if (type == FLOAT32) {
+#define PAIR(i) from + 4 * at[i]
+        const __m256 even = _mm256_castsi256_ps(quarters(PAIR(0), PAIR(1), PAIR(4), PAIR(5)));
+        const __m256 odd = _mm256_castsi256_ps(quarters(PAIR(2), PAIR(3), PAIR(6), PAIR(7)));
+#undef PAIR
+        left = (V8)_mm256_shuffle_ps(even, odd, 0x88), right = (V8)_mm256_shuffle_ps(even, odd, 0xdd);
+        return left * (1 - part) + right * part;
+    }
+#endif
+    left = gathered(from, at, type), right = gathered(from + size_of(type), at, type);
+    return left * (1 - part) + right * part;
+}
+
+/* True from one half on, as bytes */
+INLINE I8 truth8(V8 value) { return -(value >= every8(0.5f)); }
 
 /* Where eight pixels lie in memory, from the first one of the image on, in elements */
 INLINE void offsets_of(const Job *job, I8 x, I8 y, int64_t *offsets) {
@@ -454,22 +422,10 @@ INLINE void bilinear_planes(const Span *span, Squares at, int type) {
     const char *plane = span->source;
     char *result = span->result;
     int64_t offsets[STEP], c;
-#if defined(__AVX2__)
-    Window window;
-    if (type == UINT8 && window_of(job, &at, &window)) {
-        for (c = 0; c < job->channels; c++, plane += from, result += to) {
-            const V8 value = window_bytes((const uint8_t *)plane, &window, at.v);
-            ask_below(plane + window.at, below);
-            store_bytes(result, rounded8(value * every8(1.0f / 16384)), span->pixels);
-        }
-        return;
-    }
-#endif
     offsets_of(job, at.x, at.y, offsets);
     for (c = 0; c < job->channels; c++, plane += from, result += to) {
-        const char *lower = plane + below * bytes;
-        const V8 above = gathered(plane, offsets, type) * (1 - at.u) + gathered(plane + bytes, offsets, type) * at.u;
-        const V8 under = gathered(lower, offsets, type) * (1 - at.u) + gathered(lower + bytes, offsets, type) * at.u;
+        const V8 above = between_pairs(plane, offsets, at.u, type);
+        const V8 under = between_pairs(plane + below * bytes, offsets, at.u, type);
         const V8 value = above * (1 - at.v) + under * at.v;
         ask_below(plane + offsets[0] * bytes, below * bytes);
         if (type == FLOAT32) store_floats(result, value, span->pixels);
@@ -515,55 +471,6 @@ INLINE void bilinear_interleaved(const Span *span, Squares at, int type) {
     offsets_of(job, at.x, at.y, offsets);
     ask_below(span->source + offsets[0] * bytes, below);
     ask_below(span->source + offsets[STEP - 1] * bytes, below);
-#if defined(__AVX2__)
-    if (type == UINT8) {
-        /* two pixels at a time: their channels' pairs of neighbours, as 16 bits each */
-        const __m256i pick = channels == 3
-            ? _mm256_setr_epi8(0, -1, 3, -1, 1, -1, 4, -1, 2, -1, 5, -1, -1, -1, -1, -1,
-                               0, -1, 3, -1, 1, -1, 4, -1, 2, -1, 5, -1, -1, -1, -1, -1)
-            : _mm256_setr_epi8(0, -1, 4, -1, 1, -1, 5, -1, 2, -1, 6, -1, 3, -1, 7, -1,
-                               0, -1, 4, -1, 1, -1, 5, -1, 2, -1, 6, -1, 3, -1, 7, -1);
-        const __m256i right_part = _mm256_cvtps_epi32(_mm256_mul_ps((__m256)at.u, _mm256_set1_ps(16384)));
-        const __m256i left_part = _mm256_sub_epi32(_mm256_set1_epi32(16384), right_part);
-        const __m256i weights = _mm256_or_si256(left_part, _mm256_slli_epi32(right_part, 16));
-        const __m256 down = _mm256_mul_ps((__m256)at.v, _mm256_set1_ps(1.0f / 16384));
-        const __m256 up = _mm256_sub_ps(_mm256_set1_ps(1.0f / 16384), down);
-        __m256i made[STEP / 2];
-        uint8_t packed[32 + 4];
-#define TWO(k)                                                                                                         \
-    {                                                                                                                  \
-        const char *a = span->source + offsets[2 * k], *b = span->source + offsets[2 * k + 1];                         \
-        const __m256i which = _mm256_setr_epi32(2 * k, 2 * k, 2 * k, 2 * k, 2 * k + 1, 2 * k + 1, 2 * k + 1, 2 * k + 1); \
-        const __m256i upper = _mm256_inserti128_si256(_mm256_castsi128_si256(_mm_loadl_epi64((const __m128i *)a)),      \
-                                                      _mm_loadl_epi64((const __m128i *)b), 1);                         \
-        const __m256i lower = _mm256_inserti128_si256(                                                                 \
-            _mm256_castsi128_si256(_mm_loadl_epi64((const __m128i *)(a + below))),                                     \
-            _mm_loadl_epi64((const __m128i *)(b + below)), 1);                                                         \
-        const __m256i w = _mm256_permutevar8x32_epi32(weights, which);                                                 \
-        const __m256 above = _mm256_cvtepi32_ps(_mm256_madd_epi16(_mm256_shuffle_epi8(upper, pick), w));               \
-        const __m256 under = _mm256_cvtepi32_ps(_mm256_madd_epi16(_mm256_shuffle_epi8(lower, pick), w));               \
-        made[k] = _mm256_cvtps_epi32(_mm256_add_ps(_mm256_mul_ps(above, _mm256_permutevar8x32_ps(up, which)),          \
-                                                   _mm256_mul_ps(under, _mm256_permutevar8x32_ps(down, which))));      \
-    }
-        TWO(0) TWO(1) TWO(2) TWO(3)
-#undef TWO
-        /* packing goes by halves: pixels 0 2 4 6 and 1 3 5 7, four bytes each */
-        const __m256i bytes4 = _mm256_packus_epi16(_mm256_packs_epi32(made[0], made[1]), _mm256_packs_epi32(made[2], made[3]));
-        const __m256i ordered = _mm256_permutevar8x32_epi32(bytes4, _mm256_setr_epi32(0, 4, 1, 5, 2, 6, 3, 7));
-        if (channels == 4) {
-            memcpy(packed, &ordered, 32);
-        } else {
-            const __m256i dense = _mm256_shuffle_epi8(ordered, _mm256_setr_epi8(
-                0, 1, 2, 4, 5, 6, 8, 9, 10, 12, 13, 14, -1, -1, -1, -1,
-                0, 1, 2, 4, 5, 6, 8, 9, 10, 12, 13, 14, -1, -1, -1, -1));
-            _mm_storeu_si128((__m128i *)packed, _mm256_castsi256_si128(dense));
-            _mm_storeu_si128((__m128i *)(packed + 12), _mm256_extracti128_si256(dense, 1));
-        }
-        if (span->pixels == STEP) memcpy(span->result, packed, (size_t)(channels == 4 ? 32 : 24));
-        else memcpy(span->result, packed, (size_t)n);
-        return;
-    }
-#endif
     for (i = 0; i < STEP; i++) {
         const char *upper = span->source + offsets[i] * bytes, *lower = upper + below;
         const V4 u = every4(at.u[i]), v = every4(at.v[i]);
@@ -659,6 +566,15 @@ INLINE void nearest8(const Span *span, V8 u, V8 v, int type) {
     }
 }
 
+/* Whether eight pixels lie beyond what zeros reach, or have no position */
+INLINE int shows_nothing(const Job *job, V8 u, V8 v, int mode) {
+    const float reach = job->padding != ZEROS ? INFINITY : mode == BICUBIC ? 2 : 1;
+    const V8 low = every8(-reach);
+    const V8 right = every8((float)(job->source_width - 1) + reach);
+    const V8 below = every8((float)(job->source_height - 1) + reach);
+    return all8(~((u >= low) & (u <= right) & (v >= low) & (v <= below)));
+}
+
 INLINE void eight(const Span *span, const float *at_u, const float *at_v, int type, int mode, int layout) {
     const Job *job = span->job;
     V8 u = load8(at_u), v = load8(at_v);
@@ -696,12 +612,7 @@ INLINE void eight(const Span *span, const float *at_u, const float *at_v, int ty
             return;
         }
     }
-    /* beyond `reach` of zeros nothing is shown, nor what has no position */
-    const float reach = job->padding != ZEROS ? INFINITY : mode == BICUBIC ? 2 : 1;
-    const V8 low = every8(-reach);
-    const V8 right = every8((float)(job->source_width - 1) + reach);
-    const V8 below = every8((float)(job->source_height - 1) + reach);
-    if (all8(~((u >= low) & (u <= right) & (v >= low) & (v <= below)))) {
+    if (shows_nothing(job, u, v, mode)) {
         show_nothing(span, type);
         return;
     }
@@ -742,8 +653,8 @@ static const float WEIGHTS[4][STEP] = {EIGHT(ROW0), EIGHT(ROW1), EIGHT(ROW2), EI
 
 /* Of pixels of a row, in pixels of the source; NaN where there is none */
 typedef struct {
-    _Alignas(64) float u[CHUNK];
-    float v[CHUNK];
+    _Alignas(64) float u[CHUNK + STEP];
+    float v[CHUNK + STEP];
 } Chunk;
 
 /* Lines of pixels between the nodes of a row each, the four that the rows of a cell lie between: that of the i-th row of
@@ -842,15 +753,407 @@ static void grid_positions(const Job *job, int64_t b, int64_t y, int64_t x, int6
     }
 }
 
-/* -- sixteen pixels at a time, whose neighbours are picked out of whole registers */
+/* Pixels i ... n - 1 of a row; `first`: where that at 0 is written */
+INLINE void eights(Span *span, char *first, const Chunk *at, int64_t i, int64_t n, int type, int mode, int layout) {
+    const int64_t step = span->job->result_strides[3] * size_of(type);
+    for (; i < n; i += STEP) {
+        span->result = first + i * step, span->pixels = n - i < STEP ? n - i : STEP;
+        eight(span, at->u + i, at->v + i, type, mode, layout);
+    }
+}
 
-#if WIDE
+/* -- bytes by fixed point: positions in 2^-16 of a pixel, results in 2^-8 of a grey level */
+
+#if defined(__AVX2__)
 
 /* Where images lie, of the kinds that are known here, strides in elements */
 typedef struct {
     const char *source;
     int64_t channels, from_plane, below, to_plane, width, height;
-} Wide;
+} Image;
+
+/* A constant that stays in its register, where compilers would make it anew each time */
+INLINE __m256i kept(__m256i constant) {
+    __asm__("" : "+x"(constant));
+    return constant;
+}
+
+typedef struct {
+    __m256i sum, difference, half;
+} Weights;
+
+INLINE Weights kept_weights(void) {
+    return (Weights){kept(_mm256_set1_epi16(0x4040)), kept(_mm256_set1_epi16(0x40c0)), kept(_mm256_set1_epi16(128))};
+}
+
+/* Between the two bytes of each word, at 2 t - 1 in 2^-15; the result in 2^-7 */
+INLINE __m256i across16(const Weights *by, __m256i pairs, __m256i t) {
+    const __m256i difference = _mm256_maddubs_epi16(pairs, by->difference);
+    return _mm256_add_epi16(_mm256_maddubs_epi16(pairs, by->sum), _mm256_mulhrs_epi16(difference, t));
+}
+
+/* Between two such results, in the upper bytes of words */
+INLINE __m256i down16(const Weights *by, __m256i a, __m256i b, __m256i t) {
+    const __m256i sum = _mm256_add_epi16(_mm256_add_epi16(a, b), by->half);
+    return _mm256_add_epi16(sum, _mm256_mulhrs_epi16(_mm256_sub_epi16(b, a), t));
+}
+
+/* Of bytes of 32 bits each, those of eight pixels with so many channels in the order of the pixels: from two registers of
+ * words, whose upper bytes they are, the first pixels of each half in the first one */
+INLINE void store_eight(char *result, __m256i first, __m256i second, const int pixel) {
+    const __m256i bytes = _mm256_packus_epi16(_mm256_srli_epi16(first, 8), _mm256_srli_epi16(second, 8));
+    if (pixel == 4) {
+        _mm256_storeu_si256((__m256i *)result, bytes);
+        return;
+    }
+    const __m256i dense = _mm256_shuffle_epi8(bytes, _mm256_setr_epi64x(0x0908060504020100, 0x0e0d0c0a, 0x0908060504020100, 0x0e0d0c0a));
+    const __m256i ordered = _mm256_permutevar8x32_epi32(dense, _mm256_setr_epi32(0, 1, 2, 4, 5, 6, 7, 7));
+    _mm_storeu_si128((__m128i *)result, _mm256_castsi256_si128(ordered));
+    _mm_storel_epi64((__m128i *)(result + 16), _mm256_extracti128_si256(ordered, 1));
+}
+
+/* Where windows of sixteen columns and some rows begin that hold the neighbours of eight pixels each, as the first and
+ * last of them tell; positions from there on are numbers from 128 on */
+typedef struct {
+    _Alignas(32) float u[CHUNK / STEP + STEP], v[CHUNK / STEP + STEP];
+    int32_t at[CHUNK / STEP + STEP]; /* in elements */
+} Windows;
+
+enum { FIVE_ROWS = 5 };
+
+/* The lesser one of x at the begin of each eight and of the next ones, less what those in between may go further, from 0
+ * to `last`, which a number that is none is */
+INLINE I8 begins(const float *x, int64_t last) {
+#define TWO(i) _mm_unpacklo_ps(_mm_loadu_ps(x + STEP * (i)), _mm_loadu_ps(x + STEP * ((i) + 1)))
+    const __m256 first = _mm256_set_m128(_mm_movelh_ps(TWO(4), TWO(6)), _mm_movelh_ps(TWO(0), TWO(2)));
+#undef TWO
+    const __m256 turned = _mm256_permutevar8x32_ps(first, _mm256_setr_epi32(1, 2, 3, 4, 5, 6, 7, 0));
+    const __m256 next = _mm256_blend_ps(turned, _mm256_broadcast_ss(x + STEP * STEP), 0x80);
+    const __m256 least = _mm256_sub_ps(_mm256_min_ps(first, next), _mm256_set1_ps(1 / 64.0f));
+    return whole8((V8)_mm256_max_ps(_mm256_min_ps(least, _mm256_set1_ps((float)last)), _mm256_setzero_ps()));
+}
+
+NOT_INLINE void windows_of(const Image *image, const Chunk *at, int64_t i, int64_t n, Windows *windows) {
+    int64_t j;
+    for (j = i / STEP; j < n / STEP; j += STEP) {
+        const I8 x = begins(at->u + STEP * j, image->width - 16), y = begins(at->v + STEP * j, image->height - FIVE_ROWS);
+        const I8 begin = y * (int32_t)image->below + x;
+        const V8 from_u = 128 - float8(x), from_v = 128 - float8(y);
+        memcpy(windows->u + j, &from_u, sizeof from_u), memcpy(windows->v + j, &from_v, sizeof from_v);
+        memcpy(windows->at + j, &begin, sizeof begin);
+    }
+}
+
+/* Positions of 0 ... 3 and 8 ... 11 */
+INLINE __m256 fours(const float *x) {
+    return _mm256_insertf128_ps(_mm256_castps128_ps256(_mm_loadu_ps(x)), _mm_loadu_ps(x + 8), 1);
+}
+
+/* The upper halves of numbers of both: those of 0, 4, 1, 5, 2, 6, 3, 7 of either half */
+INLINE __m256i uppers(__m256i a, __m256i b) { return _mm256_blend_epi16(_mm256_srli_epi32(a, 16), b, 0xaa); }
+
+/* The lower ones, parts t of a pixel, as 2 t - 1 in 2^-15 */
+INLINE __m256i lowers(__m256i a, __m256i b) {
+    return _mm256_xor_si256(_mm256_blend_epi16(a, _mm256_slli_epi32(b, 16), 0xaa), _mm256_set1_epi16((short)0x8000));
+}
+
+/* Of words, the lower bytes twice */
+INLINE __m256i doubled(__m256i words) {
+    return _mm256_shuffle_epi8(words, _mm256_setr_epi64x(0x0606040402020000, 0x0e0e0c0c0a0a0808, 0x0606040402020000, 0x0e0e0c0c0a0a0808));
+}
+
+/* Bytes of sixteen pixels in that order: the upper ones of words, or the lower ones of the nearest pixels */
+INLINE void store_sixteen(char *result, __m256i words, const int mode) {
+    const __m256i order = mode == NEAREST ? _mm256_setr_epi64x(0x0e0a06020c080400, -1, 0x0e0a06020c080400, -1)
+                                          : _mm256_setr_epi64x(0x0f0b07030d090501, -1, 0x0f0b07030d090501, -1);
+    const __m256i bytes = _mm256_permute4x64_epi64(_mm256_shuffle_epi8(words, order), 0x08);
+    _mm_storeu_si128((__m128i *)result, _mm256_castsi256_si128(bytes));
+}
+
+/* Eight pairs of bytes of any places: four and, eight later, four */
+INLINE __m128i eight_pairs(const char *from, const int32_t *at) {
+    __m128i pairs = _mm_setzero_si128();
+#define PAIR(i, from_there)                                                                                            \
+    do {                                                                                                               \
+        int16_t pair;                                                                                                  \
+        memcpy(&pair, from + at[from_there], sizeof pair);                                                             \
+        pairs = _mm_insert_epi16(pairs, pair, i);                                                                      \
+    } while (0)
+    PAIR(0, 0);
+    PAIR(1, 1);
+    PAIR(2, 2);
+    PAIR(3, 3);
+    PAIR(4, 8);
+    PAIR(5, 9);
+    PAIR(6, 10);
+    PAIR(7, 11);
+#undef PAIR
+    return pairs;
+}
+
+/* Of two rows, sixteen columns each */
+INLINE __m256i two_rows(const char *a, const char *b) {
+    return _mm256_inserti128_si256(_mm256_castsi128_si256(_mm_loadu_si128((const __m128i *)a)),
+                                   _mm_loadu_si128((const __m128i *)b), 1);
+}
+
+/* Of sixteen pixels: which bytes of a row they are read from, and parts of a pixel; of each half in the order 0, 4, 1, 5, 2,
+ * 6, 3, 7 */
+typedef struct {
+    __m256i pick, row, part_u, part_v;
+    const char *first, *second; /* where their windows begin */
+} Sixteen;
+
+INLINE void rows_of_planes(const Image *image, char *result, const Sixteen *at, const Weights *by,
+                           const int rows, const int mode) {
+    const char *first = at->first, *second = at->second;
+    __m256i below[FIVE_ROWS];
+    int64_t c;
+    int k;
+    for (k = 0; k < rows - 1; k++) below[k] = _mm256_cmpgt_epi16(at->row, _mm256_set1_epi16((short)(0x4300 + k)));
+    for (c = 0; c < image->channels; c++, first += image->from_plane, second += image->from_plane, result += image->to_plane) {
+        __m256i made[FIVE_ROWS], upper, lower, value;
+        ask_below(first, image->below);
+        for (k = 0; k < rows; k++)
+            made[k] = _mm256_shuffle_epi8(two_rows(first + k * image->below, second + k * image->below), at->pick);
+        upper = made[0], lower = made[1];
+        if (mode == NEAREST) {
+            for (k = 1; k < rows; k++) upper = _mm256_blendv_epi8(upper, made[k], below[k - 1]);
+            value = upper;
+        } else {
+            for (k = 0; k < rows - 2; k++) {
+                upper = _mm256_blendv_epi8(upper, made[k + 1], below[k]);
+                lower = _mm256_blendv_epi8(lower, made[k + 2], below[k]);
+            }
+            value = down16(by, across16(by, upper, at->part_u), across16(by, lower, at->part_u), at->part_v);
+        }
+        store_sixteen(result, value, mode);
+    }
+}
+
+/* Pixels i ... n - 1 of planes, sixteen at a time, up to the first ones that do not lie in their windows, and where these
+ * begin */
+INLINE int64_t sixteens(const Image *image, const Windows *windows, char *first, const Chunk *chunk, int64_t i, int64_t n,
+                        const int mode) {
+    const __m256i halves = kept(_mm256_setr_epi32(0, 0, 0, 0, 1, 1, 1, 1)), begin = kept(_mm256_set1_epi16(0x4300));
+    const __m256i nothing = _mm256_set1_epi16((short)0x8000), right = _mm256_set1_epi16(0x0100);
+    const int beyond = mode == NEAREST ? 1 : 2;
+    const __m256i columns = kept(_mm256_set1_epi16((short)(16 - beyond))), three = kept(_mm256_set1_epi16((short)(3 - beyond)));
+    const Weights weights = kept_weights();
+    for (; n - i >= 16; i += 16) {
+        const float *u = chunk->u + i, *v = chunk->v + i;
+        Sixteen at;
+#define NUMBERS(x, from)                                                                                               \
+    _mm256_castps_si256(_mm256_add_ps(mode == NEAREST ? _mm256_round_ps(fours(x), 0) : fours(x),                       \
+                                      _mm256_permutevar8x32_ps(_mm256_loadu_ps(from + i / STEP), halves)))
+        const __m256i u0 = NUMBERS(u, windows->u), u1 = NUMBERS(u + 4, windows->u);
+        const __m256i v0 = NUMBERS(v, windows->v), v1 = NUMBERS(v + 4, windows->v);
+#undef NUMBERS
+        const __m256i column = uppers(u0, u1);
+        at.row = uppers(v0, v1), at.part_u = lowers(u0, u1), at.part_v = lowers(v0, v1);
+        at.pick = mode == NEAREST ? _mm256_or_si256(doubled(column), nothing) : _mm256_add_epi8(doubled(column), right);
+        at.first = image->source + windows->at[i / STEP], at.second = image->source + windows->at[i / STEP + 1];
+        const __m256i far = _mm256_subs_epu16(_mm256_sub_epi16(column, begin), columns);
+        const __m256i row = _mm256_sub_epi16(at.row, begin);
+        const __m256i low = _mm256_or_si256(far, _mm256_subs_epu16(row, three));
+        if (_mm256_testz_si256(low, low)) {
+            rows_of_planes(image, first + i, &at, &weights, 3, mode);
+        } else {
+            const __m256i lower = _mm256_or_si256(far, _mm256_subs_epu16(row, _mm256_set1_epi16((short)(FIVE_ROWS - beyond))));
+            if (!_mm256_testz_si256(lower, lower)) break;
+            rows_of_planes(image, first + i, &at, &weights, FIVE_ROWS, mode);
+        }
+    }
+    return i;
+}
+
+NOT_INLINE int64_t sixteens_of(const Image *image, const Windows *windows, char *first, const Chunk *at, int64_t i, int64_t n,
+                               int mode) {
+    return mode == NEAREST ? sixteens(image, windows, first, at, i, n, NEAREST) : sixteens(image, windows, first, at, i, n, BILINEAR);
+}
+
+/* -- eight pixels, each of which is read by itself: its neighbours and their channels are eight bytes of a row */
+
+#define EIGHTS 0x0808080808080808
+
+/* A byte of the 32 bits of each pixel, or the word that begins with it, for the bytes of its neighbours: of pixels 0, 1, 4
+ * and 5 for the first half of the result, and of the others */
+INLINE __m256i spread(__m256i pixels, const int half, const int byte, const int words) {
+    const int64_t each = 0x0101010101010101, first = (8 * half + byte) * each + (words ? 0x0100010001000100 : 0);
+    return _mm256_shuffle_epi8(pixels, _mm256_setr_epi64x(first, first + 4 * each, first, first + 4 * each));
+}
+
+/* Of the neighbours of a pixel: the bytes that belong together */
+INLINE __m256i neighbours(const int pixel) {
+    return _mm256_set1_epi64x(pixel == 4 ? 0x0703060205010400 : 0x0000050204010300);
+}
+
+/* Parts of a pixel across and down, side by side, from 2 t - 1 = -1 on in 2^-15 */
+INLINE __m256i parts(__m256i x, __m256i y) {
+    return _mm256_xor_si256(_mm256_blend_epi16(x, _mm256_slli_epi32(y, 16), 0xaa), _mm256_set1_epi16((short)0x8000));
+}
+
+INLINE __m256i in_fixed_point(__m256 x) { return _mm256_cvtps_epi32(_mm256_mul_ps(x, _mm256_set1_ps(65536))); }
+
+/* Pixels i ... n - 1 of three or four channels side by side, eight at a time, up to the first ones of which some do not lie
+ * on the image, and where these begin */
+INLINE int64_t interleaved(const Image *image, char *first, const Chunk *at, int64_t i, int64_t n, const int pixel) {
+    /* eight bytes of three channels are a part of a third pixel */
+    const uint32_t right = (uint32_t)(image->width - (pixel == 3 ? 3 : 2)), bottom = (uint32_t)(image->height - 2);
+    const __m256i last = kept(_mm256_set1_epi32((int32_t)(bottom << 16 | right)));
+    const __m256i steps = kept(_mm256_set1_epi32((int32_t)(image->below << 16 | pixel)));
+    const __m256i pick = kept(_mm256_add_epi8(neighbours(pixel), _mm256_setr_epi64x(0, EIGHTS, 0, EIGHTS)));
+    const Weights weights = kept_weights();
+    const char *upper = image->source, *lower = upper + image->below;
+    for (; n - i >= STEP; i += STEP) {
+        const __m256i x = in_fixed_point(_mm256_loadu_ps(at->u + i)), y = in_fixed_point(_mm256_loadu_ps(at->v + i));
+        const __m256i square = _mm256_blend_epi16(_mm256_srli_epi32(x, 16), y, 0xaa), part = parts(x, y);
+        if (_mm256_movemask_epi8(_mm256_cmpeq_epi16(_mm256_min_epu16(square, last), square)) != -1) break;
+        __m256i made[2];
+        _Alignas(32) int32_t o[STEP];
+        int k;
+        _mm256_store_si256((__m256i *)o, _mm256_madd_epi16(square, steps));
+        __asm__("" : "+m"(o)); /* one by one they are loaded faster than taken out of a register */
+        ask_below(upper + o[0], image->below), ask_below(upper + o[STEP - 1], image->below);
+        for (k = 0; k < 2; k++) {
+            const int64_t a = o[2 * k], b = o[2 * k + 1], c = o[2 * k + 4], d = o[2 * k + 5];
+            const __m256i above = _mm256_shuffle_epi8(quarters(upper + a, upper + b, upper + c, upper + d), pick);
+            const __m256i under = _mm256_shuffle_epi8(quarters(lower + a, lower + b, lower + c, lower + d), pick);
+            const __m256i t = spread(part, k, 0, 1);
+            made[k] = down16(&weights, across16(&weights, above, t), across16(&weights, under, t), spread(part, k, 2, 1));
+        }
+        store_eight(first + i * pixel, made[0], made[1], pixel);
+    }
+    return i;
+}
+
+NOT_INLINE int64_t eights_of(const Image *image, char *first, const Chunk *at, int64_t i, int64_t n, int pixel) {
+    return pixel == 3 ? interleaved(image, first, at, i, n, 3) : interleaved(image, first, at, i, n, 4);
+}
+
+/* Positions in fixed point, between the pixels beyond the first and last ones, where `fill` lies */
+INLINE __m256i held(const Job *job, __m256 given, int64_t side, const int mode) {
+    const float beyond = job->padding == ZEROS;
+    const __m256 x = mode == NEAREST ? _mm256_round_ps(given, 0) : given;
+    const __m256 on = _mm256_min_ps(_mm256_max_ps(x, _mm256_set1_ps(-beyond)), _mm256_set1_ps((float)(side - 1) + beyond));
+    return in_fixed_point(_mm256_blendv_ps(on, _mm256_set1_ps(-1), _mm256_cmp_ps(x, x, _CMP_UNORD_Q)));
+}
+
+/* Sixteen pixels of planes anywhere, with `fill` in the place of what lies off the image */
+INLINE void any_sixteen(const Job *job, const Image *image, char *result, const float *u, const float *v, const int mode) {
+    const __m256i zero = _mm256_setzero_si256(), one = _mm256_set1_epi16(1), right = _mm256_set1_epi16((short)(image->width - 2));
+    const __m256i bottom = _mm256_set1_epi16((short)(image->height - 1)), steps = _mm256_set1_epi32((int32_t)(image->below << 16 | 1));
+    const __m256i u0 = held(job, fours(u), image->width, mode), u1 = held(job, fours(u + 4), image->width, mode);
+    const __m256i v0 = held(job, fours(v), image->height, mode), v1 = held(job, fours(v + 4), image->height, mode);
+    const __m256i x = uppers(u0, u1), y = uppers(v0, v1), next = _mm256_add_epi16(y, one);
+    const __m256i begin = _mm256_max_epi16(_mm256_min_epi16(x, right), zero);
+    /* where in the two bytes that are read a pixel begins, and which of them are its own */
+    const __m256i off = doubled(_mm256_sub_epi16(x, begin)), where = _mm256_add_epi8(off, _mm256_set1_epi16(0x0100));
+    const __m256i there = _mm256_cmpeq_epi8(_mm256_min_epu8(where, _mm256_set1_epi8(1)), where);
+    const __m256i pick = _mm256_add_epi8(off, _mm256_setr_epi64x(0x0706050403020100, 0x0f0e0d0c0b0a0908, 0x0706050403020100, 0x0f0e0d0c0b0a0908));
+    const Weights weights = kept_weights();
+    const char *plane = image->source;
+    __m256i shown[2];
+    _Alignas(32) int32_t o[2][16];
+    int64_t c;
+    int k;
+    for (k = 0; k < 2; k++) {
+        const __m256i wanted = k ? next : y, row = _mm256_max_epi16(_mm256_min_epi16(wanted, bottom), zero);
+        shown[k] = _mm256_and_si256(there, _mm256_cmpeq_epi16(row, wanted));
+        _mm256_store_si256((__m256i *)o[k], _mm256_madd_epi16(_mm256_unpacklo_epi16(begin, row), steps));
+        _mm256_store_si256((__m256i *)o[k] + 1, _mm256_madd_epi16(_mm256_unpackhi_epi16(begin, row), steps));
+    }
+    for (c = 0; c < image->channels; c++, plane += image->from_plane, result += image->to_plane) {
+        const __m256i fill = _mm256_set1_epi8(((const char *)job->fill_elements)[c]);
+        __m256i rows[2];
+        for (k = 0; k < 2; k++) {
+            const __m256i read = _mm256_set_m128i(eight_pairs(plane, o[k] + 4), eight_pairs(plane, o[k]));
+            rows[k] = _mm256_blendv_epi8(fill, _mm256_shuffle_epi8(read, pick), shown[k]);
+            rows[k] = across16(&weights, rows[k], lowers(u0, u1));
+        }
+        store_sixteen(result, down16(&weights, rows[0], rows[1], lowers(v0, v1)), BILINEAR);
+    }
+}
+
+/* Eight pixels of three or four channels side by side likewise */
+INLINE void any_eight(const Job *job, const Image *image, char *result, const float *u, const float *v, const int pixel) {
+    const __m256i zero = _mm256_setzero_si256(), one = _mm256_set1_epi32(1), seven = _mm256_set1_epi8(7);
+    const __m256i at_u = held(job, _mm256_loadu_ps(u), image->width, BILINEAR), x = _mm256_srai_epi32(at_u, 16);
+    const __m256i at_v = held(job, _mm256_loadu_ps(v), image->height, BILINEAR), y = _mm256_srai_epi32(at_v, 16);
+    const __m256i next = _mm256_add_epi32(y, one), bottom = _mm256_set1_epi32((int32_t)image->height - 1);
+    const __m256i upper = _mm256_max_epi32(_mm256_min_epi32(y, bottom), zero);
+    const __m256i lower = _mm256_max_epi32(_mm256_min_epi32(next, bottom), zero);
+    const __m256i byte = _mm256_mullo_epi32(x, _mm256_set1_epi32(pixel)), below = _mm256_set1_epi32((int32_t)image->below);
+    const __m256i last = _mm256_set1_epi32((int32_t)image->width * pixel - 8), part = parts(at_u, at_v);
+    const __m256i begin = _mm256_max_epi32(_mm256_min_epi32(byte, last), zero);
+    /* of each pixel, a byte each: where in the eight bytes it begins, and which of its rows are there */
+    __m256i marks = _mm256_and_si256(_mm256_sub_epi32(byte, begin), _mm256_set1_epi32(0xff)), made[2];
+    marks = _mm256_or_si256(marks, _mm256_and_si256(_mm256_cmpeq_epi32(upper, y), _mm256_set1_epi32(0xff00)));
+    marks = _mm256_or_si256(marks, _mm256_and_si256(_mm256_cmpeq_epi32(lower, next), _mm256_set1_epi32(0xff0000)));
+    const Weights weights = kept_weights();
+    const uint8_t *fill = (const uint8_t *)job->fill_elements;
+    uint64_t filled = 0;
+    _Alignas(32) int32_t o[2][STEP];
+    int k, row;
+    for (k = 0; k < pixel; k++) filled |= (uint64_t)(fill[k] * 0x0101u) << 16 * k;
+    const __m256i fills = _mm256_set1_epi64x((int64_t)filled);
+    _mm256_store_si256((__m256i *)o[0], _mm256_add_epi32(_mm256_mullo_epi32(upper, below), begin));
+    _mm256_store_si256((__m256i *)o[1], _mm256_add_epi32(_mm256_mullo_epi32(lower, below), begin));
+    for (k = 0; k < 2; k++) {
+        const __m256i where = _mm256_add_epi8(neighbours(pixel), spread(marks, k, 0, 0));
+        const __m256i there = _mm256_cmpeq_epi8(_mm256_min_epu8(where, seven), where), t = spread(part, k, 0, 1);
+        const __m256i pick = _mm256_add_epi8(where, _mm256_setr_epi64x(0, EIGHTS, 0, EIGHTS));
+        __m256i rows[2];
+        for (row = 0; row < 2; row++) {
+            const int32_t *i = o[row] + 2 * k;
+            const char *from = image->source;
+            const __m256i read = _mm256_shuffle_epi8(quarters(from + i[0], from + i[1], from + i[4], from + i[5]), pick);
+            const __m256i shown = _mm256_and_si256(there, spread(marks, k, row + 1, 0));
+            rows[row] = across16(&weights, _mm256_blendv_epi8(fills, read, shown), t);
+        }
+        made[k] = down16(&weights, rows[0], rows[1], spread(part, k, 2, 1));
+    }
+    store_eight(result, made[0], made[1], pixel);
+}
+
+NOT_INLINE void anywhere(const Job *job, const Image *image, char *result, const float *u, const float *v, int pixel, int mode) {
+    if (pixel == 3) any_eight(job, image, result, u, v, 3);
+    else if (pixel == 4) any_eight(job, image, result, u, v, 4);
+    else if (mode == NEAREST) any_sixteen(job, image, result, u, v, NEAREST);
+    else any_sixteen(job, image, result, u, v, BILINEAR);
+}
+
+/* Pixels i ... n - 1 of a row of at least 16; the last ones of them may be made from a lower one on */
+INLINE void fixed_point(Span *span, const Image *image, char *first, const Chunk *at, int64_t i, int64_t n, int mode,
+                        int pixel) {
+    const Job *job = span->job;
+    const uint8_t *fill = (const uint8_t *)job->fill_elements;
+    const int64_t step = pixel == 1 ? 16 : STEP;
+    const float across = fabsf(at->u[n - 1] - at->u[i]), down = fabsf(at->v[n - 1] - at->v[i]), length = (float)(n - i) / STEP;
+    /* whether windows hold some, and whether what lies off the image is a byte */
+    int near = pixel == 1 ? across < 13 * length && down < 4 * length && image->width >= 16 && image->height >= FIVE_ROWS
+                          : image->width > 2 && image->height > 1;
+    int fits = job->padding != REFLECTION;
+    int64_t c;
+    Windows windows;
+    for (c = 0; c < image->channels && mode == BILINEAR && job->padding == ZEROS; c++) fits &= job->fill[c] == (float)fill[c];
+    if (near && pixel == 1) windows_of(image, at, i, n, &windows);
+    while (i < n) {
+        if (near && pixel == 1) i = sixteens_of(image, &windows, first, at, i, n, mode);
+        else if (near) i = eights_of(image, first, at, i, n, pixel);
+        if (i >= n) return;
+        if (n - i < step) i = n - step;
+        if (fits) anywhere(job, image, first + i * pixel, at->u + i, at->v + i, pixel, mode);
+        else eights(span, first, at, i, i + step, pixel == 1 && mode == NEAREST ? BYTES1 : UINT8, mode, pixel == 1 ? PLANES : INTERLEAVED);
+        i += step;
+    }
+}
+
+#endif
+
+/* -- sixteen pixels at a time, whose neighbours are picked out of whole registers */
+
+#if WIDE
 
 /* Squares that begin within four rows, and lie within a part of these that registers hold */
 typedef struct {
@@ -861,7 +1164,7 @@ typedef struct {
 INLINE int32_t whole(float x) { return _mm_cvttss_si32(_mm_set_ss(x)); }
 
 /* Whether squares of positions at (x, y) are all `good` and lie in so many rows and 32 elements of each */
-INLINE int in_window(const Wide *image, const float *u, const float *v, __m512i x, __m512i y, __mmask16 good,
+INLINE int in_window(const Image *image, const float *u, const float *v, __m512i x, __m512i y, __mmask16 good,
                      const int rows, WideWindow *window) {
     const int64_t x0 = whole(u[0]), x15 = whole(u[15]), y0 = whole(v[0]), y15 = whole(v[15]);
     const int64_t column = x0 < x15 ? x0 : x15, row = y0 < y15 ? y0 : y15;
@@ -881,7 +1184,7 @@ INLINE int rows_of_sixteen(const float *v) {
     return first == last ? 2 : (first < last ? first + 1 == last : last + 1 == first) ? 3 : 5;
 }
 
-INLINE void floats_of_sixteen(const Wide *image, char *result, const WideWindow *window, __m512 u, __m512 v,
+INLINE void floats_of_sixteen(const Image *image, char *result, const WideWindow *window, __m512 u, __m512 v,
                               const int rows) {
     const float *from = (const float *)image->source + window->begin;
     const __m512 one = _mm512_set1_ps(1);
@@ -906,7 +1209,7 @@ INLINE void floats_of_sixteen(const Wide *image, char *result, const WideWindow 
 }
 
 /* Whether there is such a way, and the pixels of floats are made */
-INLINE int sixteen(const Wide *image, char *result, const float *at_u, const float *at_v) {
+INLINE int sixteen(const Image *image, char *result, const float *at_u, const float *at_v) {
     const int32_t right = (int32_t)image->width - 1, bottom = (int32_t)image->height - 1;
     const __m512 u = _mm512_loadu_ps(at_u), v = _mm512_loadu_ps(at_v);
     const int rows = rows_of_sixteen(at_v);
@@ -928,7 +1231,7 @@ INLINE int sixteen(const Wide *image, char *result, const float *at_u, const flo
 }
 
 /* Of four bytes each that are moved: whether all lie on the image, and are made */
-INLINE int nearest_of_sixteen(const Wide *image, char *result, const float *at_u, const float *at_v) {
+INLINE int nearest_of_sixteen(const Image *image, char *result, const float *at_u, const float *at_v) {
     const __m512 u = _mm512_loadu_ps(at_u), v = _mm512_loadu_ps(at_v), zero = _mm512_setzero_ps();
     const char *from = image->source;
     __mmask16 good = _mm512_cmp_ps_mask(u, zero, _CMP_GE_OQ);
@@ -968,7 +1271,7 @@ typedef struct {
 } Place;
 
 /* Positions hardly go any further between three of 32. Pixels of one element or of three. */
-INLINE void places_of(const Wide *image, const float *u, const float *v, int64_t n, const int pixel, const int registers,
+INLINE void places_of(const Image *image, const float *u, const float *v, int64_t n, const int pixel, const int registers,
                       Place *places) {
     const int64_t most = 64 * registers / pixel;
     const float last = (float)(image->width - most);
@@ -1019,7 +1322,7 @@ INLINE __m512i found(const char *from, const __mmask64 *held, __m512i pick, cons
 
 /* Whether all lie there, and those that are `wanted` are made: pixels of one byte or of three, in rows of so many
  * registers. Positions are rounded to 2^-16. */
-INLINE int bytes_at(const Wide *image, const Place *place, char *result, const float *u, const float *v, const int pixel,
+INLINE int bytes_at(const Image *image, const Place *place, char *result, const float *u, const float *v, const int pixel,
                     const int registers, const int mode, __mmask32 wanted) {
     const int64_t rows = place->rows;
     int64_t c;
@@ -1101,7 +1404,7 @@ INLINE int bytes_at(const Wide *image, const Place *place, char *result, const f
 }
 
 /* Pixels of which some lie off the image, or at its very last ones: whether they are made */
-NOT_INLINE int bytes_at_rim(const Span *span, const Wide *image, const float *u, const float *v, const int pixel) {
+NOT_INLINE int bytes_at_rim(const Span *span, const Image *image, const float *u, const float *v, const int pixel) {
     const int registers = pixel == 1 ? 2 : 4;
     const float right = (float)(image->width - 1), bottom = (float)(image->height - 1);
     const __m512 zero = _mm512_setzero_ps(), last_u = _mm512_set1_ps(right), last_v = _mm512_set1_ps(bottom);
@@ -1135,23 +1438,13 @@ NOT_INLINE int bytes_at_rim(const Span *span, const Wide *image, const float *u,
 
 #endif
 
-/* Pixels i ... n - 1 of a row; `first`: where that at 0 is written */
-INLINE void eights(Span *span, char *first, const Chunk *at, int64_t i, int64_t n, int type, int mode, int layout) {
-    const int64_t step = span->job->result_strides[3] * size_of(type);
-    for (; i < n; i += STEP) {
-        span->result = first + i * step, span->pixels = n - i < STEP ? n - i : STEP;
-        eight(span, at->u + i, at->v + i, type, mode, layout);
-    }
-}
-
 #if WIDE
 
-INLINE void wide_bytes(Span *span, const Wide *image, char *first, const Chunk *at, int64_t n, const int pixel,
-                       const int registers, int mode) {
+INLINE void wide_bytes(Span *span, const Image *image, char *first, const Chunk *at, int64_t i, int64_t n,
+                       const int pixel, const int registers, int mode) {
     Place places[CHUNK / 32], *place = places;
-    int64_t i;
-    places_of(image, at->u, at->v, n, pixel, registers, places);
-    for (i = 0; i < n; i += 32, place++) {
+    places_of(image, at->u + i, at->v + i, n - i, pixel, registers, places);
+    for (; i < n; i += 32, place++) {
         const float *u = at->u + i, *v = at->v + i;
         span->result = first + i * pixel, span->pixels = 32;
         if (bytes_at(image, place, span->result, u, v, pixel, registers, mode, ~0u)) continue;
@@ -1161,47 +1454,70 @@ INLINE void wide_bytes(Span *span, const Wide *image, char *first, const Chunk *
     }
 }
 
-/* How many of n pixels of a row are made so, the first of them */
-INLINE int64_t wide(Span *span, char *first, const Chunk *at, int64_t n, int type, int mode, int layout) {
+/* Makes pixels i ... n - 1 of a row, up to the one that it returns */
+INLINE int64_t wide(Span *span, char *first, const Chunk *at, int64_t i, int64_t n, int type, int mode, int layout) {
     const Job *job = span->job;
     const int64_t *from = job->source_strides, *to = job->result_strides;
-    const Wide image = {span->source, job->channels, from[1], from[2], to[1], job->source_width, job->source_height};
+    const Image image = {span->source, job->channels, from[1], from[2], to[1], job->source_width, job->source_height};
     const int in_planes = layout == PLANES || (mode == NEAREST && from[3] == 1 && to[3] == 1);
-    int64_t i;
     if (mode == BILINEAR && type == FLOAT32 && in_planes && image.width >= 32 && image.height >= 5) {
-        for (i = 0; n - i >= 16; i += 16)
+        for (; n - i >= 16; i += 16)
             if (!sixteen(&image, first + 4 * i, at->u + i, at->v + i))
                 eights(span, first, at, i, i + 16, FLOAT32, BILINEAR, PLANES);
         return i;
     }
     if (mode == NEAREST && type == BYTES4 && in_planes && llabs(image.below) * image.height + image.width < INT32_MAX) {
-        for (i = 0; n - i >= 16; i += 16)
+        for (; n - i >= 16; i += 16)
             if (!nearest_of_sixteen(&image, first + 4 * i, at->u + i, at->v + i))
                 eights(span, first, at, i, i + 16, BYTES4, NEAREST, SCATTERED);
         return i;
     }
-    if (!(mode == BILINEAR ? type == UINT8 : mode == NEAREST && type == BYTES1) || n < 32) return 0;
-    if (!in_planes && !(layout == INTERLEAVED && job->channels == 3)) return 0;
+    if (!(mode == BILINEAR ? type == UINT8 : mode == NEAREST && type == BYTES1) || n - i < 32) return i;
+    if (!in_planes && !(layout == INTERLEAVED && job->channels == 3)) return i;
     /* how far 32 pixels go */
-    const int64_t across = llabs((int64_t)whole(at->u[n - 1]) - whole(at->u[0])) * 32 / n + 5;
-    const int64_t down = llabs((int64_t)whole(at->v[n - 1]) - whole(at->v[0])) * 32 / n;
-    if (down > MOST_ROWS || across > (in_planes ? 128 : 85)) return 0;
-    n = n / 32 * 32;
-    if (in_planes && across <= 64) wide_bytes(span, &image, first, at, n, 1, 1, mode);
-    else if (in_planes) wide_bytes(span, &image, first, at, n, 1, 2, mode);
-    else if (across <= 42) wide_bytes(span, &image, first, at, n, 3, 2, BILINEAR);
-    else wide_bytes(span, &image, first, at, n, 3, 4, BILINEAR);
+    const int64_t across = llabs((int64_t)whole(at->u[n - 1]) - whole(at->u[i])) * 32 / (n - i) + 5;
+    const int64_t down = llabs((int64_t)whole(at->v[n - 1]) - whole(at->v[i])) * 32 / (n - i);
+    if (down > MOST_ROWS || across > (in_planes ? 128 : 85)) return i;
+    n = i + (n - i) / 32 * 32;
+    if (in_planes && across <= 64) wide_bytes(span, &image, first, at, i, n, 1, 1, mode);
+    else if (in_planes) wide_bytes(span, &image, first, at, i, n, 1, 2, mode);
+    else if (across <= 42) wide_bytes(span, &image, first, at, i, n, 3, 2, BILINEAR);
+    else wide_bytes(span, &image, first, at, i, n, 3, 4, BILINEAR);
     return n;
 }
 
 #endif
 
 INLINE void chunk(Span *span, char *first, const Chunk *at, int64_t n, int type, int mode, int layout) {
-    int64_t made = 0;
-#if WIDE
-    made = wide(span, first, at, n, type, mode, layout);
+    int64_t i = 0;
+#if VECTORS
+    const Job *job = span->job;
+    const int64_t step = job->result_strides[3] * size_of(type);
+    int64_t end = (n + STEP - 1) / STEP * STEP;
+    while (i < n && shows_nothing(job, load8(at->u + i), load8(at->v + i), mode)) i += STEP;
+    while (end > i && shows_nothing(job, load8(at->u + end - STEP), load8(at->v + end - STEP), mode)) end -= STEP;
+    span->result = first, span->pixels = i < n ? i : n;
+    if (i) show_nothing(span, type);
+    if (i >= n) return;
+    span->result = first + end * step, span->pixels = n - end;
+    if (end < n) show_nothing(span, type), n = end;
 #endif
-    eights(span, first, at, made, n, type, mode, layout);
+#if WIDE
+    i = wide(span, first, at, i, n, type, mode, layout);
+    if (i >= n) return;
+#endif
+#if defined(__AVX2__)
+    const int64_t *from = job->source_strides, *to = job->result_strides;
+    const Image image = {span->source, job->channels, from[1], from[2], to[1], job->source_width, job->source_height};
+    const int in_planes = layout == PLANES || (mode == NEAREST && from[3] == 1 && to[3] == 1);
+    const int pixel = in_planes ? 1 : layout == INTERLEAVED ? (int)job->channels : 0;
+    if ((mode == BILINEAR ? type == UINT8 : mode == NEAREST && type == BYTES1) && pixel && n >= 16 && image.below >= 0 &&
+        image.below < 32768 && image.width >= 8 && image.width < 32767 && image.height < 32767) {
+        fixed_point(span, &image, first, at, i, n, mode, pixel);
+        return;
+    }
+#endif
+    eights(span, first, at, i, n, type, mode, layout);
 }
 
 /* -- tiles */
@@ -1215,10 +1531,11 @@ INLINE void tile(const Job *job, int64_t b, int64_t from, int64_t to, int type, 
     span.job = job;
     span.source = (const char *)job->source + b * job->source_strides[0] * size_of(type);
     for (x = 0; x < job->width; x += CHUNK) {
-        const int64_t n = job->width - x < CHUNK ? job->width - x : CHUNK;
+        const int64_t n = job->width - x < CHUNK ? job->width - x : CHUNK, filled = (n + STEP - 1) / STEP * STEP;
         for (y = from; y < to; y++) {
             if (job->nodes) lattice_positions(job, b, y, x, n, from, &lines, &at);
             else grid_positions(job, b, y, x, n, &at);
+            at.u[filled] = at.u[filled - 1], at.v[filled] = at.v[filled - 1];
             chunk(&span, (char *)job->result + (b * strides[0] + y * strides[2] + x * strides[3]) * size_of(type), &at, n,
                   type, mode, layout);
         }
