@@ -1,4 +1,6 @@
-/* The entry points: each is that of the best variant that this CPU can run. */
+/* The entry points: each is that of the best variant that this CPU can run, or of the one that was asked for. */
+#include <string.h>
+
 #include "consensus.h"
 #include "geometry.h"
 #include "poses.h"
@@ -6,14 +8,14 @@
 #include "small.h"
 
 #ifdef HAS_AVX512
-#define IF_AVX512(code) code
+#define IF_AVX512(...) __VA_ARGS__
 #else
-#define IF_AVX512(code)
+#define IF_AVX512(...)
 #endif
 #ifdef HAS_AVX2
-#define IF_AVX2(code) code
+#define IF_AVX2(...) __VA_ARGS__
 #else
-#define IF_AVX2(code)
+#define IF_AVX2(...)
 #endif
 
 /* What it is, its name, and what it is given */
@@ -36,8 +38,10 @@
 EACH_ENTRY(DECLARED)
 
 enum { BASELINE, AVX2, AVX512 };
+static const char *const NAMES[] = {"baseline", IF_AVX2([AVX2] = "avx2", ) IF_AVX512([AVX512] = "avx512")};
+static int chosen = -1; /* no variant yet */
 
-static int variant(void) {
+static int best(void) {
 #if defined(HAS_AVX512) || defined(HAS_AVX2)
     __builtin_cpu_init();
 #endif
@@ -52,12 +56,25 @@ static int variant(void) {
     return BASELINE;
 }
 
+static int variant(void) {
+    int now = __atomic_load_n(&chosen, __ATOMIC_RELAXED);
+    if (now < 0) __atomic_store_n(&chosen, now = best(), __ATOMIC_RELAXED);
+    return now;
+}
+
+/* Uses the variant of that name from now on; 0 if this CPU cannot run it, or the library has none */
+EXPORTED int32_t camtorch_use(const char *name) {
+    for (int i = best(); i >= 0; i--)
+        if (NAMES[i] && !strcmp(NAMES[i], name)) {
+            __atomic_store_n(&chosen, i, __ATOMIC_RELAXED);
+            return 1;
+        }
+    return 0;
+}
+
 EXPORTED unsigned camtorch_sources(void) { return SOURCES; }
 
-EXPORTED const char *camtorch_variant(void) {
-    static const char *const names[] = {"baseline", "avx2", "avx512"};
-    return names[variant()];
-}
+EXPORTED const char *camtorch_variant(void) { return NAMES[variant()]; }
 
 #define CALLED(result, name, type)                                                                                     \
     EXPORTED result camtorch_##name(type given) {                                                                      \

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import ctypes
 import functools
+import os
 import warnings
 from pathlib import Path
 from typing import NamedTuple
 
-from camtorch.native.build import LIBRARY, REASON, checksum, switched_off
+from camtorch.native.build import LIBRARY, REASON, VARIANTS, checksum, switched_off
 
 _HERE = Path(__file__).resolve().parent
 _BUILD = "python -m camtorch.native.build"
@@ -37,6 +38,10 @@ def _find() -> _Found:
     if here is not None and here != _sources(library):  # None: packed into something that leaves sources out
         why = "not used (built from other sources than those beside it)"
         return _Found(None, f"{why}; `{_BUILD}` or `pip install -e .` builds it again", stale=True)
+    wanted = os.environ.get("CAMTORCH_CPU", "").strip().lower()
+    if wanted and not library.camtorch_use(wanted.encode()):
+        names = ", ".join(name for name in VARIANTS if library.camtorch_use(name.encode()))
+        raise ValueError(f"CAMTORCH_CPU must be one of {names} on this CPU; got {wanted!r}. Unset it to use the best")
     library.camtorch_variant.restype = ctypes.c_char_p
     return _Found(library, library.camtorch_variant().decode())
 

@@ -20,6 +20,17 @@ def variant(request):
     return {"fuzzed": building.VARIANTS[name]}
 
 
+@pytest.fixture(params=building.VARIANTS)
+def each_variant(request):
+    """The variants that this CPU runs, one after the other in the place of the one that is used."""
+    native = library()
+    used = native.camtorch_variant()
+    if not native.camtorch_use(request.param.encode()):
+        pytest.skip("this CPU does not run it")
+    yield request.param
+    native.camtorch_use(used)
+
+
 @pytest.fixture
 def fuzzed(tmp_path):
     """Builds a driver, and sources of the library for some variants, with sanitizers, and runs random jobs."""

@@ -15,7 +15,7 @@ import torch
 import camtorch as ct
 from camtorch.native import build as building
 from camtorch.native import sampler
-from camtorch.native.library import library, native_available
+from camtorch.native.library import _find, library, native_available
 from camtorch.values.dtypes import widen
 from camtorch.warp import grid as positions
 from camtorch.warp import routes, sampling
@@ -165,6 +165,7 @@ def fills(dtype, channels):
     return (0.0,), (1.0,), (outside,), tuple(float(c) - 1.5 for c in range(channels))
 
 
+@pytest.mark.usefixtures("each_variant")
 @pytest.mark.parametrize("padding", PADDINGS)
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("dtype", INTEGERS + FLOATS)
@@ -191,6 +192,7 @@ def test_every_image_is_sampled_as_torch_does(dtype, mode, padding):
 SIZES = [(1, 1), (1, 2), (2, 1), (2, 2), (1, 9), (9, 1), (3, 2), (5, 7), (8, 8), (31, 33)]
 
 
+@pytest.mark.usefixtures("each_variant")
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("dtype", [torch.uint8, torch.float32])
 def test_every_size_is_sampled_as_torch_does(dtype, mode):
@@ -210,6 +212,7 @@ def gentle(count, size, source, zoom=1.0, turn=0.1):
     return (zoom * at * 2 / torch.tensor(source[::-1])).float()
 
 
+@pytest.mark.usefixtures("each_variant")
 @pytest.mark.parametrize("padding", PADDINGS)
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("dtype", [torch.uint8, torch.float32])
@@ -226,6 +229,7 @@ def test_rows_that_read_rows_are_sampled_as_torch_does(dtype, mode, padding):
         both(hwc(images) if i % 2 else images, where, mode, padding, (1.0,))
 
 
+@pytest.mark.usefixtures("each_variant")
 @pytest.mark.parametrize("dtype", [torch.uint8, torch.float32])
 def test_every_layout_of_a_grid(dtype):
     source, target = (23, 37), (13, 30)
@@ -249,6 +253,7 @@ def test_every_layout_of_a_grid(dtype):
     assert torch.equal(one[1], both(images[:1], Sampling(base[1:2], mapped[:1], None), "bilinear", "border")[0])
 
 
+@pytest.mark.usefixtures("each_variant")
 @pytest.mark.parametrize("padding", PADDINGS)
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("dtype", [torch.uint8, torch.float32])
@@ -274,6 +279,7 @@ def test_positions_that_are_far_or_no_numbers(dtype, mode, padding):
                 assert ((result[:, :, 0, 0].double() - edge).abs() <= 1e-6 * extent(dtype)).all()
 
 
+@pytest.mark.usefixtures("each_variant")
 @pytest.mark.parametrize("source", [(3, 20000), (20000, 3), (1, 20000)])
 def test_wide_images(source):
     """Twenty thousand pixels along a side, where float32 holds a thousandth of one."""
@@ -292,6 +298,15 @@ def runs_here():
     return names[: names.index(library().camtorch_variant().decode()) + 1]
 
 
+def test_the_environment_forces_a_variant(each_variant, monkeypatch):
+    library().camtorch_use(b"baseline")
+    monkeypatch.setenv("CAMTORCH_CPU", each_variant.upper())
+    assert _find.__wrapped__().state == each_variant
+    monkeypatch.setenv("CAMTORCH_CPU", "avx3")
+    with pytest.raises(ValueError, match=r"CAMTORCH_CPU must be one of baseline.* on this CPU; got 'avx3'"):
+        _find.__wrapped__()
+
+
 @pytest.mark.slow
 def test_no_read_outside_and_nothing_undefined_in_any_variant(fuzzed):
     variants = {name: building.VARIANTS[name] for name in runs_here()}
@@ -303,6 +318,7 @@ def kept(warp):
     return routes.positions(warp, "kept")
 
 
+@pytest.mark.usefixtures("each_variant")
 def test_lattices_of_a_batch_of_cameras_and_images():
     rotations = ct.augment.mount_rotation(torch.tensor([0.0, 10.0, 40.0]), torch.tensor(0.0), torch.tensor(5.0))
     source = ct.KannalaBrandt([100.0, 100, 80, 60], [0.02, -0.01, 0.004, -0.001], image_size=(120, 160))
