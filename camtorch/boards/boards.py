@@ -33,8 +33,8 @@ class Board:
 
     @property
     def is_symmetric(self) -> bool:
-        """Whether it looks the same after a turn, so that its first point is ambiguous."""
-        return False
+        """Whether it looks the same after a turn, so that its first point is ambiguous, as some chessboards do."""
+        return isinstance(self, Chessboard) and (self.columns + self.rows) % 2 == 0  # a turn keeps black and white
 
     def points(self) -> NDArray[np.float64]:
         """Return the points (N, 3), row by row from the top left."""
@@ -58,10 +58,6 @@ class Chessboard(Board):
 
     kind = "chessboard"
     counted = "inner corners"
-
-    @property
-    def is_symmetric(self) -> bool:
-        return (self.columns + self.rows) % 2 == 0  # else a half turn exchanges black and white
 
     def _places(self, count: int) -> NDArray[np.float64]:
         return np.arange(float(count))

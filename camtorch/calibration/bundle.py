@@ -1,7 +1,7 @@
 """Bundle adjustment: the cameras, their mounts and the poses of boards under which least is left of what was seen.
 
 Each view is reduced to a triangle by QR before it meets the others: its own six numbers are eliminated, as by a Schur
-complement, without the squares of a normal equation. Time and memory grow with the number of views, not faster.
+complement, without the squares of a normal equation.
 """
 
 from __future__ import annotations
@@ -162,10 +162,8 @@ def adjust(
 ) -> Adjusted:
     """The state of least squares near a given one, for each of B problems, whose cameras see the same views.
 
-    A point that was seen and has no pixel, because the camera's field of view ends before it, counts as far away: no
-    step is taken that loses points. On the way a lens may go on behind its end, see `Camera.searched`; what lies there
-    in the end is not valid. The loss is one of `LOSSES` or None, of the length of each residual in px, see
-    `robust`. progress: called after each step with its number and the costs (B,).
+    A point that was seen and has no pixel counts as far away: no step is taken that loses points. On the way a lens may
+    go on behind its end, see `Camera.searched`; what lies there in the end is not valid. loss: see `robust`, in px.
     """
     problem = Bundle(sights, state, free, loss, loss_scale)
     counts = torch.stack([(s.weights > 0).sum((-1, -2)) for s in problem.sights]).sum(0)
@@ -294,9 +292,7 @@ class Bundle:
 
     def points(self, c: int, state: State, sight: Sight) -> tuple[Tensor, Tensor, Tensor]:
         """(B, V, N, 3): those of the board as it lies, in the frame of the first camera, in that of this one."""
-        points = sight.points
-        if self.is_bent:
-            points = bent(points, state.bend)[0]
+        points = bent(sight.points, state.bend)[0] if self.is_bent else sight.points
         turned = points @ state.boards.rotations.mT
         first = turned + state.boards.translations[:, :, None]
         if c == 0 and not self.free.mounts[0]:

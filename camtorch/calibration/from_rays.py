@@ -91,8 +91,7 @@ def fit(
             ) from None
         if bool((given < 0).any()) or not bool(torch.isfinite(given).all()):
             raise ValueError(f"{owner}: weights must be finite, and not negative; got down to {float(given.min()):.4g}")
-        # of squares: the fit weighs errors
-        flat_weights = flat_weights * given.sqrt()
+        flat_weights = flat_weights * given.sqrt()  # of squares: the fit weighs errors
     axis = flat_rays.new_tensor([0.0, 0.0, 1.0])
     unit = torch.where(good[..., None], flat_rays / torch.where(good[..., None], lengths, 1.0), axis)
     seen = fitting.Observations(unit, torch.where(good[..., None], flat_pixels, 0.0), flat_weights)

@@ -120,8 +120,7 @@ def solve_pnp(
         found = _compiled(given, threshold) or _searched(given, threshold)
     vectors, translations, rms = found.vectors, found.translations, found.rms
     if learns([given.camera], *(t for t in given[1:4] if t is not None)):
-        # the poses and the root mean squares with their derivatives
-        task = _Task.of(given)
+        task = _Task.of(given)  # the poses and the root mean squares with their derivatives
         task = task._replace(weights=torch.where(found.inliers, task.weights, 0.0))
         middles = task.middles[..., None]
         centred = found.translations + (rotation_matrix(found.vectors) @ middles)[..., 0]
@@ -221,12 +220,11 @@ class _Given(NamedTuple):
 
 def _compiled(given: _Given, threshold: float | None) -> Solved | None:
     """By compiled code, where there is any for the camera."""
-    points, pixels, weights = (None if t is None else t.detach() for t in given[1:4])
-    if points is None or pixels is None or not len(pixels) or (made := compiled_of([given.camera], pixels)) is None:
+    points, pixels = given.points.detach(), given.pixels.detach()
+    if not len(pixels) or (made := compiled_of([given.camera], pixels)) is None:
         return None
-    start = None
-    if threshold is not None:
-        start = _consensus(_Task.of(given), threshold)
+    weights = None if given.weights is None else given.weights.detach()
+    start = None if threshold is None else _consensus(_Task.of(given), threshold)
     return solved(made[0][0], points, pixels, weights, _SEARCH, start, threshold or 0.0)
 
 

@@ -74,12 +74,10 @@ class _Lines(NamedTuple):
 def consensus(points: Tensor, rays: Tensor, slopes: Tensor, seen: Tensor, threshold: float) -> tuple[Tensor, Tensor]:
     """Return the poses, camera from object, of least squared distances of points from rays, each cut at a threshold.
 
-    Few points are drawn (by a generator of its own, the same for all rows, whose results so do not depend on each
-    other), as often as it takes to meet some without an outlier several times, judged by how many points agree with the
-    best pose so far, but not fewer than six. Three of them have up to four poses (native/consensus.c), four have
-    those of their rays (`poses_from_rays`). All are compared, and the best fitted to the points near them: O. Chum,
-    J. Matas and J. Kittler, Locally Optimized RANSAC, DAGM 2003, with the cut squares of P. Torr and A. Zisserman,
-    MLESAC, CVIU 2000.
+    Few points are drawn (by a generator of its own, the same for all rows), as often as it takes to meet some without
+    an outlier several times, judged by how many agree with the best pose so far. Three of them have up to four poses
+    (native/consensus.c), four those of their rays (`poses_from_rays`). The best are fitted to the points near them: O.
+    Chum, J. Matas and J. Kittler, Locally Optimized RANSAC, DAGM 2003; P. Torr and A. Zisserman, MLESAC, CVIU 2000.
 
     Points (B, N, 3) are finite, rays (B, N, 3) of unit length; slopes (B, N, 2, 3) are the pixels by the rays, across
     them; what is not `seen`, bool (B, N), has no part in it. The threshold is in px.

@@ -32,17 +32,15 @@ def poses_from_rays(points: Tensor, rays: Tensor, weights: Tensor) -> RayPoses:
     """The poses, camera from object, in which known points lie on rays; the least angles first.
 
     With the best translation put in, the sum of the points' squared distances from their rays is a quadratic form of
-    the rotation's entries (C.-P. Lu, G. Hager and E. Mjolsness, TPAMI 2000). Its minima are descended to in a fixed
-    number of steps, whose cost does not grow with the points. Points on a plane, whichever it is, have up to two, whose
-    normals mirror each other at the line of sight: the starts are the two rotations that the homography between plane
-    and rays leaves (T. Collins and A. Bartoli, Infinitesimal Plane-Based Pose Estimation, IJCV 2014, here on rays).
-    Points in space have one as a rule: the starts are the linear solution, the view from afar, and right-angled turns.
+    the rotation's entries (C.-P. Lu, G. Hager and E. Mjolsness, TPAMI 2000), whose minima are descended to in a fixed
+    number of steps. Points on a plane have up to two, whose normals mirror each other at the line of sight: the starts
+    are the two rotations that the homography between plane and rays leaves (T. Collins and A. Bartoli, Infinitesimal
+    Plane-Based Pose Estimation, IJCV 2014, here on rays). Points in space have one as a rule: the starts are the linear
+    solution, the view from afar, and right-angled turns. Nothing is divided by z: rays may have any angle.
 
-    Nothing is divided by z, so that rays may have any angle from the optical axis.
-
-    Points and unit rays are (B, N, 3), weights (B, N) not negative, 0 for what is not seen. There are two poses
-    a row, S = 2. A pose is valid if four points or more are seen that are not on a line, everything is finite, and most
-    of what is seen lies ahead on its rays; the second one if it is another minimum. Others are finite and mean nothing.
+    Points and unit rays are (B, N, 3), weights (B, N) not negative, 0 for unseen; S = 2. A pose is valid if four points
+    or more are seen that are on no line, everything is finite, and most lie ahead on their rays; the second one if it
+    is another minimum. Others are finite and mean nothing.
     """
     if can_search(points, rays, weights):
         return RayPoses(*from_rays(points, rays, weights))
@@ -56,8 +54,7 @@ def poses_from_rays(points: Tensor, rays: Tensor, weights: Tensor) -> RayPoses:
     variances, axes = torch.linalg.eigh((weights[..., None] * centred).mT @ centred)
     extent = variances.clamp(min=0.0).sqrt()
     size = extent[:, 2].clamp(min=_TINY)
-    # from the plane's frame, or that of the points' main axes, in units of their extent
-    axes = axes.flip(-1)
+    axes = axes.flip(-1)  # from the plane's frame, or that of the points' main axes, in units of their extent
     axes = torch.cat((axes[..., :2], torch.linalg.cross(axes[..., 0], axes[..., 1])[..., None]), -1)
     local = centred @ axes / size[:, None, None]
     enough = ((weights > 0).sum(-1) >= 4) & (extent[:, 1] > _FLAT * size)

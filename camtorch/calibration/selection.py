@@ -83,10 +83,9 @@ def select(
 ) -> Selection:
     """Find the model that predicts views best that it was not fitted to, and of about equals the simplest.
 
-    The views are dealt into five parts, or as many as there are. A camera is fitted to all parts but one, and on that
-    one only the poses are; so each view is held out once. The model with the smallest error is taken, or one with fewer
-    coefficients if it is worse by no more than 1 %, or by no more than 5 % and the standard error of
-    the difference by views.
+    Each of five parts of the views is held out once: a camera is fitted to the others, and on that part only the poses
+    are. The model with the smallest error is taken, or one with fewer coefficients if it is worse by no more than 1 %,
+    or by no more than 5 % and the standard error of the difference by views.
 
     Arguments are those of `calibrate`; names in `fixed` that a model does not have are left out, and progress is called
     with the part that is done. candidates: models and their numbers of coefficients.

@@ -72,10 +72,8 @@ def start_from_nothing(
 
     Unified cameras of all widths are tried, their axis in the middle of the image: the rays of the pixels give poses in
     closed form, and those a score. The best few are refined together, and the model is fitted to what is best then,
-    from several starts. Errors count by the loss of Cauchy, in units of those that most corners have, so that gross
-    ones do not matter. Parameters that are `fixed` are held: coefficients as in `Camera.ideal`, the principal point in
-    the middle of the image. The loss, in px, is that of the adjustment, and decides where several cameras are nearly as
-    good.
+    from several starts, with the loss of Cauchy. Parameters that are `fixed` are held: coefficients as in
+    `Camera.ideal`, the principal point in the middle. The loss, in px, decides between cameras nearly as good.
     """
     few, free = _few(observations, image_size), _free(model, count, fixed)
     lens = first = _unified(few, image_size, fixed)

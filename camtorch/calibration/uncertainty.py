@@ -25,14 +25,13 @@ class Spread(NamedTuple):
     """How the noise of the corners moves a camera and its frame, of B problems.
 
     Independent numbers of variance 1 move the P = 4 + n parameters, the frame's turn (a rotation vector, radians) and
-    its shift by the rows of `factor` (B, P + 6, K). The turn and the shift are those of the mean over the boards, each
-    carried along by its own pose: a calibration finds the lens and the poses together, and where it gets one wrong it
-    makes up for it by the other. model: the class. parameters: (B, P).
+    its shift by the rows of `factor`. The turn and the shift are those of the mean over the boards, each carried along
+    by its own pose: where a calibration gets the lens wrong it makes up for it by the poses.
     """
 
     model: type[Camera]
-    parameters: Tensor
-    factor: Tensor
+    parameters: Tensor  # (B, P)
+    factor: Tensor  # (B, P + 6, K)
 
     @property
     def covariance(self) -> Tensor:
@@ -49,9 +48,8 @@ class Spread(NamedTuple):
     def of_pixels(self, pixels: Tensor, distance: Tensor) -> Tensor:
         """(B, M, 2, 2) covariances, in px^2, of where points are seen that lie at pixels; NaN where one has no ray.
 
-        What is seen is taken into the frame of every board by its pose, and back by the pose that the noise made of it;
-        the mean of all these is projected by the camera that the noise made: mrcal's mean-pcam.
-        distance: (B, M) from the camera; infinite for directions.
+        Points go to the frame of every board by its pose, back by the pose that the noise made of it, and their mean is
+        projected by the camera that the noise made: mrcal's mean-pcam. distance: (B, M) from the camera, or infinite.
         """
         parts = zip(pixels.split(_PIXELS, 1), distance.split(_PIXELS, 1), strict=True)
         return torch.cat([self._of_pixels(*part) for part in parts], 1)
@@ -112,12 +110,9 @@ def spread(adjusted: Adjusted, model: type[Camera], camera: int) -> Spread:
 def noise_under(loss: str | None, loss_scale: float, residuals: Tensor, seen: Tensor, free: float) -> Tensor:
     """(*B,) px per coordinate: the noise that makes the covariance of a weighted problem that of its optimum.
 
-    Without a loss it is sqrt(sum of squares / (2 N - free)). A robust loss with weights w of squares pulls with the
-    force w r, which gives way by the mean of w + s dw/ds where residuals of squared length s move, and by the mean of w
-    in the weighted problem: this is sqrt(mean(w^2 r^2) mean(w)) / mean(w + s dw/ds), the scale of an M-estimator. It
-    holds where outliers fall on all corners alike, and they widen the intervals of a Huber loss as they widen its
-    estimates; of a view that is nothing but outliers it knows nothing.
-    residuals: (*B, V, N, 2). free: how many parameters were free, poses included.
+    Without a loss it is sqrt(sum of squares / (2 N - free)). With weights w of the squares s of a robust loss it is
+    sqrt(mean(w^2 s) mean(w)) / mean(w + s dw/ds), the scale of an M-estimator, which holds where outliers fall on all
+    corners alike. residuals: (*B, V, N, 2). free: how many parameters were free, poses included.
     """
     squares = residuals.square().sum(-1)
     _, weights = robust(loss, loss_scale, squares)
@@ -132,10 +127,7 @@ def noise_under(loss: str | None, loss_scale: float, residuals: Tensor, seen: Te
 
 
 def shared_factor(equations: Equations) -> Tensor:
-    """(B, G, G) F, of which F F^T times the variance of the noise is the covariance of what all views share.
-
-    A combination of the unknowns that the data leave open has a variance that is huge, but no infinity.
-    """
+    """(B, G, G) F, of which F F^T times the variance of the noise is the covariance, huge if open, of the shared."""
     triangle: Tensor = equations.shared[:, :-1, :-1]
     if not triangle.shape[-1]:
         return triangle

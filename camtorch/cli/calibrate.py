@@ -52,8 +52,7 @@ def run(arguments: argparse.Namespace) -> None:
             "Another --model, or --loss huber where some corners are wrong, may help"
         )
     names = list(views) if isinstance(result, RigCalibration) else [of_view[""].path.name for of_view in views.values()]
-    # a text with names of views for their numbers, and options for arguments of `ct.calibrate`
-    text = repr(result)
+    text = repr(result)  # a text with names of views for their numbers, and options for arguments of `ct.calibrate`
     numbered = r"\b([Vv]iews? )(\d+(?:, \d+)*)"
     text = re.sub(numbered, lambda m: m[1] + re.sub(r"\d+", lambda n: names[int(n[0])], m[2]), text)
     text = re.sub(r'fixed=\("(.*?)",?\)', lambda m: f"--fixed {m[1].replace(chr(34), '').replace(' ', '')}", text)

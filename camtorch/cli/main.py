@@ -1,7 +1,4 @@
-"""The command line `camtorch`: how a command is carried out, and how errors are shown.
-
-The modules of a command are imported when it runs: torch takes a second, which `--help` and a wrong option save.
-"""
+"""The command line `camtorch`: how a command is carried out, and how errors are shown."""
 
 from __future__ import annotations
 
@@ -58,7 +55,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         module = f"camtorch.cli.{arguments.command}"
         if arguments.command == "dewarp" and arguments.jobs != 1 and commands.are_several(arguments.image):
             processes.prepare(module)  # they import what they need while this one does
-        command = importlib.import_module(module)
+        command = importlib.import_module(module)  # torch takes a second, which `--help` and a wrong option save
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", UserWarning)
             status: int = command.run(arguments) or 0

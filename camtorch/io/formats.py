@@ -1,8 +1,6 @@
 """`load` and `save`: each format is asked whether a file is its own; none is known here but by its module.
 
 To add a format, write one file beside this one, as `protocol.py` says, and name it in one of the lists below.
-`Record` reads values, with errors that say where they stand; `parsing.decoded` gives the text of a content; `poses`
-has rotations; `writing.Lossy` says what would be lost.
 """
 
 from __future__ import annotations

@@ -23,8 +23,7 @@ from camtorch.values.arguments import check_path, shown, warn
 
 NAMES = Names("opencv", "OpenCV", (".yml", ".yaml", ".json", ".xml"), ("*.xml",))
 
-# the end of the key is the camera's name, as in M1, D1 or cameraMatrix_left
-_NAMES = r"\d*|left|right"
+_NAMES = r"\d*|left|right"  # the end of the key is the camera's name, as in M1, D1 or cameraMatrix_left
 _MATRIX = re.compile(rf"(?:K|M|(?i:mtx|camera_?matrix|intrinsic_?matrix))_?({_NAMES})")
 _DISTORTION = re.compile(
     rf"(?:[Dd]|(?i:dist(?:ortion)?(?:_?coef(?:f|fs|s|ficients?)?(?:_?mat)?|_?param(?:s|eters)?)?))_?({_NAMES})"

@@ -107,8 +107,7 @@ def _from_text(path: Path, content: bytes) -> Any:
     # a brace, perhaps after comments, and a key in quotes unlike JSON's; one regular expression would be slow
     start = re.sub(r"#[^\n]*", "", text[:_START]).split()[:2]
     if re.match(r"\{(?:'|\"(?:lens_?model|distortion_model)\")", "".join(start)):
-        # a Python literal, as mrcal writes it, as JSON would have it
-        text = _OPTIMIZATION_INPUTS.sub(r"\1''", text)
+        text = _OPTIMIZATION_INPUTS.sub(r"\1''", text)  # a Python literal, as mrcal writes it, as JSON would have it
         _check_length(path, text, _LARGEST_LITERAL, "a Python literal")
         try:
             return _with_floats(ast.literal_eval(ast.parse(text, mode="eval")))

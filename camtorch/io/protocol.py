@@ -12,22 +12,13 @@ from camtorch.io.writing import Lossy
 
 @dataclass(frozen=True)
 class Names:
-    """What a format and its files are called.
+    """What a format and its files are called."""
 
-    Args:
-        format: its key in `camtorch.load` and `camtorch.save`.
-        title: what errors call it.
-        suffixes: those of the files that are written, with the dot; content says what a file to read is.
-        patterns: names of files, as fnmatch has them, that are written in this format if no other is asked for; of
-            several formats the one with the longest pattern that fits is taken.
-        in_folder: files that stand for the folder they are in, the first that is there.
-    """
-
-    format: str
-    title: str
-    suffixes: tuple[str, ...] = ()
-    patterns: tuple[str, ...] = ()
-    in_folder: tuple[str, ...] = ()
+    format: str  # its key in `camtorch.load` and `camtorch.save`
+    title: str  # what errors call it
+    suffixes: tuple[str, ...] = ()  # of the files that are written, with the dot; content says what a file to read is
+    patterns: tuple[str, ...] = ()  # names, as fnmatch has them, that mean this format; of several the longest counts
+    in_folder: tuple[str, ...] = ()  # files that stand for the folder they are in, the first that is there
 
 
 class Format(Protocol):

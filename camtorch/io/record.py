@@ -103,9 +103,7 @@ class Record:
     def number(self) -> float:
         """A finite number."""
         number = math.nan
-        if isinstance(self.value, float):
-            number = self.value
-        elif isinstance(self.value, str) and len(self.value) <= _LONGEST_NUMBER:
+        if isinstance(self.value, float) or (isinstance(self.value, str) and len(self.value) <= _LONGEST_NUMBER):
             with contextlib.suppress(ValueError):
                 number = float(self.value)
         if not math.isfinite(number):

@@ -64,9 +64,7 @@ def minimise(
     damping: float = FIRST_DAMPING,
     progress: Callable[[int, Tensor], None] | None = None,
 ) -> Minimum:
-    """The states of least cost near those given.
-
-    No problem depends on another: those that have settled are left alone, so that each goes the way it would go alone.
+    """The states of least cost near those given; no problem depends on another.
 
     A step that promises less than rounding does to a cost cannot be judged by the cost: it is the last one, and taken
     unless the cost grows by more than that.

@@ -1,9 +1,8 @@
 """The collection of real lenses: its entries, read when the first one is wanted.
 
-It is a file of the package with the numbers' own bits, columns side by side, a third smaller than as text. Text is
-compressed by LZMA, a seventh smaller than by Deflate; for the numbers, whose low bits are noise, it gains nothing and
-takes longer to read. fy is kept as its difference to fx, the principal point to the image's middle, each with its sign
-as the lowest bit, and the bytes of a column one plane after another.
+The file has the numbers' own bits, columns side by side; text is compressed by LZMA. fy is kept as its difference to
+fx, the principal point to the image's middle, each with its sign as the lowest bit, and the bytes of a column one plane
+after another.
 """
 
 from __future__ import annotations

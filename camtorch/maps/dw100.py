@@ -36,9 +36,8 @@ class DW100(Table):
         """See `Table`; raise a CameraFileError for sizes and positions that the hardware does not take."""
         for what, size in (("source", exact.source_size), ("target", exact.target_size)):
             if any(not low <= side <= high for low, side, high in zip(_SMALLEST, size, _LARGEST, strict=True)):
-                raise CameraFileError(
-                    path, f"{what} size", f"{size[1]}x{size[0]}; the DW100 takes 176x144 to 4096x3072 pixels"
-                )
+                reason = f"{size[1]}x{size[0]}; the DW100 takes 176x144 to 4096x3072 pixels"
+                raise CameraFileError(path, f"{what} size", reason)
         low, high = np.zeros(2), np.full(2, _MOST / _PARTS)
         mesh = held(path, self.name, mesh, low, high, clip=bool(options.get("clip")))
         parts = rounded(mesh, exact, _PARTS, low, high)

@@ -79,8 +79,7 @@ def _model(exact: Exact, dtype: str) -> Any:
         constants["fill"] = fill
     if blended:
         images = add("Sub", images, "fill")
-    # all channels of all images as those of one: the grid is read once
-    flat = add("Reshape", images, "planes")
+    flat = add("Reshape", images, "planes")  # all channels of all images as those of one: the grid is read once
     options = {"mode": warp.mode, "padding_mode": warp.padding_mode, "align_corners": 0}
     sampled = add("GridSample", flat, "grid", **options)
     leading = add("Slice", add("Shape", "images"), "first", "third")

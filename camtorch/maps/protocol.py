@@ -15,19 +15,12 @@ _LONGEST = 1 << 16  # pixels along a side
 
 
 class MapFormat(ABC):
-    """A format: one object a format, in `camtorch.maps.formats`.
+    """A format: one object a format, in `camtorch.maps.formats`."""
 
-    Attributes:
-        name: its key in `save_map`.
-        suffixes: of its files; the first format that has a suffix is meant by it. None of a bare table.
-        options: the names of those that `save_map` takes for it.
-        described: whether its files say nothing of themselves, so that a description is written beside them.
-    """
-
-    name: str
-    suffixes: tuple[str, ...] = ()
-    options: tuple[str, ...] = ()
-    described = False
+    name: str  # its key in `save_map`
+    suffixes: tuple[str, ...] = ()  # of its files; the first format that has a suffix is meant by it
+    options: tuple[str, ...] = ()  # the names of those that `save_map` takes for it
+    described = False  # whether its files say nothing of themselves, so that a description is written beside them
 
     @abstractmethod
     def encode(self, path: str, exact: Exact, options: Mapping[str, Any]) -> tuple[bytes, dict[str, Any]]:

@@ -37,8 +37,7 @@ class MapReport:
     """What whoever uses the map has to know beside, such as `step`, `nodes` or `block_size`."""
 
     def __getattr__(self, name: str) -> Any:
-        # a fact is an attribute
-        if name in (facts := self.__dict__.get("facts", {})):
+        if name in (facts := self.__dict__.get("facts", {})):  # a fact is an attribute
             return facts[name]
         raise AttributeError(f"MapReport of {self.__dict__.get('format')} has no {name!r}; it has {', '.join(facts)}")
 

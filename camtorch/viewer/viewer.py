@@ -1,8 +1,7 @@
 """A page that shows a lens live, in one HTML file that needs nothing else, `write_viewer`.
 
-The page is in the files beside this one: `formulas.js` has the camera models, `drawing.js` what is seen and moved,
-`presets.json` a real camera of every model. Here they become one text, with the camera, the photograph, and the
-collection of real lenses.
+The files beside this one become one text, with the camera, the photograph and the collection of real lenses:
+`formulas.js` has the camera models, `drawing.js` what is seen and moved, `presets.json` a real camera of every model.
 """
 
 from __future__ import annotations
