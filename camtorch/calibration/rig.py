@@ -155,7 +155,6 @@ def calibrate_rig(
     rotations, translations = (t[0] for t in state.boards)
     posed = zip(observed, *(t[0] for t in state.mounts), strict=True)
     mounts = {name: Extrinsics(rotation_vector(r).unsqueeze(-1), t) for name, r, t in posed}
-    # the deviations (6,) of each camera's pose by its name; zeros for the first one
     names = list(observed)
     std = torch.linalg.vector_norm(shared_factor(found.adjusted.equations)[0] * found.noise, dim=-1)
     stds = {name: std.new_zeros(6) for name in names}

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from camtorch.io.record import CameraFileError
-from camtorch.maps.exact import Exact, Floats
+from camtorch.maps.lookup import Exact, Floats
 from camtorch.maps.mesh import Mesh, Table, held, rounded, table
 
 _PARTS = 16

@@ -15,8 +15,7 @@ from camtorch.io.parsing import path_of, read_bytes
 from camtorch.io.record import CameraFileError
 from camtorch.io.writing import as_json, replacing
 from camtorch.maps.dw100 import DW100
-from camtorch.maps.exact import Exact
-from camtorch.maps.lookup import LookupMap
+from camtorch.maps.lookup import Exact, LookupMap
 from camtorch.maps.onnx import ONNX
 from camtorch.maps.opencv import OpenCV
 from camtorch.maps.protocol import SIZES, MapFormat

@@ -12,8 +12,7 @@ import numpy as np
 import torch
 
 from camtorch.io.record import CameraFileError
-from camtorch.maps.exact import Bools, Exact, Floats
-from camtorch.maps.lookup import LookupMap
+from camtorch.maps.lookup import Bools, Exact, Floats, LookupMap
 from camtorch.maps.protocol import SIZES, MapFormat, checked
 from camtorch.values.arguments import as_whole
 

@@ -13,8 +13,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from camtorch.maps.exact import Exact
-from camtorch.maps.lookup import OUTSIDE, LookupMap
+from camtorch.maps.lookup import OUTSIDE, Exact, LookupMap
 from camtorch.maps.protocol import MapFormat, checked
 from camtorch.values.arguments import imported
 

@@ -20,8 +20,7 @@ import torch
 
 from camtorch.io.parsing import arrays_of
 from camtorch.io.record import CameraFileError
-from camtorch.maps.exact import Exact
-from camtorch.maps.lookup import LookupMap
+from camtorch.maps.lookup import Exact, LookupMap
 from camtorch.maps.protocol import MOST_PIXELS, SIZES, MapFormat, checked
 
 _NOWHERE = -32768

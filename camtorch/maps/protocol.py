@@ -6,8 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from typing import Any
 
-from camtorch.maps.exact import Exact
-from camtorch.maps.lookup import LookupMap
+from camtorch.maps.lookup import Exact, LookupMap
 
 MOST_PIXELS = 1 << 26  # of a map that is read: 8192 x 8192
 SIZES = "source_height", "source_width", "target_height", "target_width"  # what files and descriptions call them

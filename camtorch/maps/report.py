@@ -7,8 +7,7 @@ from typing import Any
 
 import torch
 
-from camtorch.maps.exact import Exact
-from camtorch.maps.lookup import LookupMap
+from camtorch.maps.lookup import Exact, LookupMap
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from camtorch.io.record import CameraFileError
-from camtorch.maps.exact import Exact, Floats
+from camtorch.maps.lookup import Exact, Floats
 from camtorch.maps.mesh import Mesh, Table, held, rounded, table
 from camtorch.values.arguments import as_image_size
 

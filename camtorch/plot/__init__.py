@@ -3,7 +3,6 @@ by default new ones, and returns them; `calibration` and `portrait` return a Fig
 says how to install it.
 """
 
-from camtorch.plot.calibrations import calibration
-from camtorch.plot.cameras import difference, distortion_field, portrait, radius_curve, rig
+from camtorch.plot.figures import calibration, difference, distortion_field, portrait, radius_curve, rig
 
 __all__ = ["calibration", "difference", "distortion_field", "portrait", "radius_curve", "rig"]
