@@ -24,6 +24,9 @@ def tables(path):
     return [(name, [row.split(" => ") for row in rows.splitlines()]) for name, rows in tables]
 
 
+FAULTS = tables(FILES / "faults.txt")
+
+
 def load(name):
     return ct.load(FILES / name)
 

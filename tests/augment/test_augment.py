@@ -199,7 +199,9 @@ def test_replay_is_bit_identical(name, tmp_path):
     first = augmentation(batch, draw=draw)
     equal(first, augmentation(batch, draw=again))
     equal(first, copy.deepcopy(augmentation)(batch, draw=draw))
-    equal(first, pickle.loads(pickle.dumps(augmentation))(batch, draw=draw))
+    copied = pickle.loads(pickle.dumps(augmentation))
+    assert (copied.last, repr(copied)) == (None, repr(augmentation))
+    equal(first, copied(batch, draw=draw))
     labels = {k: v for k, v in batch.items() if k in ("keypoints", "camera", "gaze")}
     alone = augmentation(labels, draw=draw)
     assert torch.equal(alone["keypoints"], first["keypoints"])

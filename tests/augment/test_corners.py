@@ -1,6 +1,5 @@
 """Corners of the augmentations where they once were wrong."""
 
-import copy
 import math
 
 import numpy as np
@@ -41,8 +40,6 @@ def test_a_face_goes_back_to_the_camera_it_came_from(camera):
     back = normalizer.inverse(normalizer(turned))
     for name in ("gaze", "keypoints", "rotation", "head_pose"):
         torch.testing.assert_close(back[name], turned[name], atol=2e-4, rtol=1e-5)
-    with pytest.raises(ValueError, match="head_pose must hold rotation matrices"):
-        normalizer(head_pose=2 * pose, camera=camera)
     with pytest.raises(TypeError, match="head_pose must be one tensor for all samples; got a list"):
         normalizer(head_pose=list(pose), camera=camera)
 
@@ -81,8 +78,6 @@ def test_a_gate_of_numbers_is_a_gate(camera):
         assert not torch.equal(out[0], points[0])
     with pytest.raises(ValueError, match=r"draw\['yaw'\] must be finite"):
         mount(keypoints=points, draw={**draw, "yaw": torch.tensor([math.nan, 0.0])})
-    with pytest.raises(ValueError, match="the draw lacks apply, yaw"):
-        mount(keypoints=points, draw={})
     with pytest.raises(ValueError, match="count must not be negative; got -1"):
         mount.draw(-1)
 
@@ -124,14 +119,6 @@ def test_what_inference_mode_saw_can_be_inverted_in_training(camera):
     weight = torch.ones(1, requires_grad=True)
     mount.inverse(image=image * weight)["image"].sum().backward()
     assert torch.isfinite(weight.grad).all()
-
-
-def test_copies_of_what_a_learning_camera_made():
-    camera = ct.Pinhole([60.0, 60.0, 39.5, 29.5], image_size=SIZE)
-    mount = RandomMount()
-    out = mount(image=torch.rand(1, 3, *SIZE), camera=camera)
-    assert copy.deepcopy(out["camera"]).image_size == SIZE
-    assert copy.deepcopy(mount.last).target.image_size == SIZE
 
 
 def test_fields_that_only_sound_like_geometry(camera):

@@ -264,15 +264,18 @@ def test_an_image_is_the_same_in_every_batch(antialias):
 
 
 @pytest.mark.parametrize("side", [12, 30, 90])
-def test_small_images_are_smoothed_before_a_lens(side):
-    lens = ct.Pinhole([200.0, 200, 159.5, 119.5], image_size=(240, 320))
-    augment = A.Compose([A.RandomMount(yaw=5, pitch=5, camera=lens), A.Resize((side, side))])
-    image = torch.zeros(1, 1, 240, 320)
+def test_images_that_shrink_are_smoothed_before_and_after_a_lens(side):
+    lens = ct.Pinhole([200.0, 200, 159.5, 119.5], image_size=(240, 320)).requires_grad_(False)
+    mount, resize = A.RandomMount(yaw=5, pitch=5), A.Resize((side, side))
+    image, inner = torch.zeros(1, 1, 240, 320), slice(side // 3, -side // 3)
     image[..., ::2] = 1
-    for images in (image, image.repeat(4, 1, 1, 1)):  # one sample, and a batch
-        out = augment(image=images, generator=torch.Generator().manual_seed(0))["image"]
-        seen = out[..., side // 3 : -side // 3, side // 3 : -side // 3]
-        assert (seen - 0.5).abs().max() < 0.1  # stripes are grey from afar
+    for parts in ([mount, resize], [resize, mount]):
+        for images in (image, image.repeat(4, 1, 1, 1)):  # one sample, and a batch
+            for antialias in (None, False):
+                chain = A.Compose(parts, camera=lens, antialias=antialias)
+                seen = chain(image=images, generator=torch.Generator().manual_seed(0))["image"][..., inner, inner]
+                # stripes are grey from afar
+                assert seen.std() > 0.2 if antialias is False else (seen - 0.5).abs().max() < 0.1
 
 
 def test_a_chain_shows_what_its_last_camera_sees():
@@ -359,16 +362,6 @@ def test_light_and_colours_go_through_edits():
     assert expected.float().std() > 10
     with pytest.raises(ValueError, match="chromatic and vignetting of RandomLens would be seen through another lens"):
         A.Compose([shade, A.RandomMount()])
-
-
-def test_large_images_are_smoothed_before_a_lens():
-    lens = camera(ct.Pinhole, torch.float32, (480, 640))
-    stripes = (torch.arange(640) % 2 * 255).to(torch.uint8).expand(1, 1, 480, 640)
-    chain = A.Compose([A.Resize(120), A.RandomMount(roll=(10, 10), yaw=0, pitch=0)], camera=lens)
-    inner = chain(image=stripes)["image"][..., 30:-30, 30:-30].float()
-    assert (inner - 127.5).abs().max() < 3
-    rough = A.Compose(chain.parts, antialias=False, camera=lens)(image=stripes)["image"][..., 30:-30, 30:-30].float()
-    assert rough.std() > 40
 
 
 # -- landmarks
@@ -542,6 +535,8 @@ def test_cameras_of_several_models():
 
 
 def test_wrong_arguments_are_told():
+    image, size = torch.rand(2, 1, *SIZE), r"RandomCrop: the box \(50, 50\) must lie within the image, .* \(48, 64\)"
+    draw = {"apply": torch.ones(2, dtype=torch.bool), "times": torch.tensor([0.1, 0.3])}
     for make, text in (
         (lambda: A.Pad(), "give either padding or size"),
         (lambda: A.Pad(-1), "none negative"),
@@ -549,29 +544,18 @@ def test_wrong_arguments_are_told():
         (lambda: A.Resize((0, 3)), "Resize: size must be positive"),
         (lambda: A.Rotate90(0.5), "times must be a whole number"),
         (lambda: A.RandomResizedCrop(20, scale=(0.5, 2.0)), "scale must lie within"),
-        (lambda: A.HorizontalFlip(prob=0.3), "unknown keyword 'prob'"),
         (lambda: A.HorizontalFlip(min_filled=0.3), "unknown keyword .min_filled.; .*Augmentation has it"),
         (lambda: A.HorizontalFlip(lateral_axis="left"), "lateral_axis must be"),
         (lambda: A.Compose([]), "no augmentations"),
         (lambda: A.Compose([torch.nn.Identity()]), "must be a list of augmentations of camtorch; got Identity"),
         (lambda: A.Compose([A.Resize(3, mode="nearest")]), "mode='nearest' of Resize goes to Compose itself"),
         (lambda: A.Compose([A.HorizontalFlip(landmarks="ibug68"), A.VerticalFlip()]), "the same landmarks"),
+        (lambda: A.RandomCrop(50)(image=image), size),
+        (lambda: A.Resize(20, p=0.5)(image=image), "with p < 1 images must keep their size"),
+        (lambda: A.Rotate90()(image=image, draw=draw), "same_on_batch=True turns all alike"),
     ):
         with pytest.raises((TypeError, ValueError), match=text):
             make()
-    image = torch.rand(2, 1, *SIZE)
-    with pytest.raises(
-        ValueError, match=r"RandomCrop: the box \(50, 50\) must lie within the image, which is \(48, 64\)"
-    ):
-        A.RandomCrop(50)(image=image)
-    with pytest.raises(ValueError, match="with p < 1 images must keep their size"):
-        A.Resize(20, p=0.5)(image=image)
-    turn = A.Rotate90()
-    draw = {"apply": torch.ones(2, dtype=torch.bool), "times": torch.tensor([0.1, 0.3])}
-    with pytest.raises(ValueError, match="same_on_batch=True turns all alike"):
-        turn(image=image, draw=draw)
-    with pytest.raises(ValueError, match="a quarter turn of the image has no camera of this model"):
-        A.Rotate90(1)(image=image, camera=ct.Cylindrical([20.0, 20, 32, 24], image_size=SIZE).requires_grad_(False))
 
 
 @pytest.mark.parametrize("name", ["CenterCrop", "RandomCrop", "RandomResizedCrop"])

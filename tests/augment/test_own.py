@@ -70,7 +70,5 @@ def test_one_s_own_has_all_that_others_have():
 def test_what_it_gets_wrong_is_told():
     with pytest.raises(ValueError, match=r"Range: low and high must be finite, with low <= high; got 2, 1"):
         ct.augment.Range(2, 1)
-    with pytest.raises(TypeError, match="Upright: unknown keyword 'leen'; did you mean 'lean'"):
-        Upright(3.0, leen=4.0)
     with pytest.raises(NotImplementedError):
         ct.augment.Augmentation(camera=camera())(keypoints=torch.zeros(1, 2))

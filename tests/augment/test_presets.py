@@ -7,9 +7,6 @@ import camtorch as ct
 from camtorch.augment import PRESETS, RandomCamera, RandomLens
 from camtorch.warp.boxes import along_edges
 
-WHOLE = [name for name in PRESETS if name != "aria"]
-"""Of Aria's, the calibrated polynomial folds before the corners: they lie beyond what the lens lights."""
-
 
 def rim(size):
     """(N, 2): the outer edges of an image, a point on every pixel edge."""
@@ -23,23 +20,15 @@ def source(size):
 
 
 @pytest.mark.parametrize("size", [(480, 640), (400, 640)])
-@pytest.mark.parametrize("name", WHOLE)
+@pytest.mark.parametrize("name", PRESETS)
 def test_every_draw_around_a_preset_has_a_ray_for_every_point_of_its_image(name, size):
-    for augmentation in (RandomCamera(name, camera=source(size)), RandomLens(name, camera=source(size))):
+    """Or, of Aria's, which folds before the corners, for every point for which the preset itself has one."""
+    none, edge = dict.fromkeys(("focal", "centre")), rim(size)
+    still = RandomLens(name, camera=source(size), distortion=None, **none)
+    seen = still.change(None, still.draw(1)).target.unproject(edge[None])[1]
+    assert seen.all() or name == "aria"
+    more = [kind(name, camera=source(size)) for kind in (RandomLens, RandomCamera) if name != "aria"]
+    for augmentation in (RandomLens(name, camera=source(size), **none), *more):
         target = augmentation.change(None, augmentation.draw(64, torch.Generator().manual_seed(0))).target
-        edge = rim(size)
-        assert target.unproject(edge.expand(64, -1, -1))[1].all()
-
-
-@pytest.mark.slow
-def test_a_drawn_lens_loses_no_pixel_that_its_like_has():
-    """Where a calibrated lens itself ends within the image, too."""
-    size, none = (240, 320), {"focal": (1, 1), "centre": (0, 0)}
-    for name in PRESETS:
-        still, drawn = (RandomLens(name, camera=source(size), distortion=d, **none) for d in (None, 0.2))
-        draw = drawn.draw(16, torch.Generator().manual_seed(0))
-        before, after = (a.change(None, draw).target.rays()[1] for a in (still, drawn))
-        lost = (before & ~after).flatten(1).sum(1)
-        assert lost.max() <= 1e-4 * after[0].numel(), name  # a line of them may be hit by less than a tenth of a pixel
-        lenses = drawn.change(None, draw).target.distortion
-        assert (lenses != lenses[:1]).any(-1).sum() > 12, name
+        assert (target.unproject(edge.expand(64, -1, -1))[1] | ~seen).all()
+        assert len(target.distortion.unique(dim=0)) > 48

@@ -1,7 +1,5 @@
 """Augmentations in the workers of a DataLoader."""
 
-import pickle
-
 import numpy as np
 import pytest
 import torch
@@ -76,16 +74,3 @@ def test_workers_differ_and_runs_repeat(arrays):
     # the first two batches are of different workers
     assert len(moved) >= COUNT - 3
     assert len(moved.flatten(1).unique(dim=0)) == len(moved)
-
-
-def test_an_augmentation_pickles_with_its_options():
-    for one in (augmentation(p=0.5, fill=0.3), ct.augment.RandomLens("dms90"), ct.augment.FaceNormalizer(focal=40)):
-        assert repr(pickle.loads(pickle.dumps(one))) == repr(one)
-    first = augmentation(camera=camera())
-    image, draw = torch.rand(1, *SIZE), first.draw(1)
-    before = first(image=image, draw=draw)
-    second = pickle.loads(pickle.dumps(first))
-    assert second.last is None
-    assert torch.equal(second(image=image, draw=draw)["image"], before["image"])
-    copy = pickle.loads(pickle.dumps(ct.augment.numpy.Transform(first)))
-    assert np.array_equal(copy(image=image[0].numpy(), draw=draw)["image"], before["image"][0].numpy())

@@ -16,13 +16,12 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from rigs import FILES, SAMPLES
+from rigs import FAULTS, FILES, SAMPLES
 
 import camtorch as ct
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*4 coefficients and no fisheye_model")
 CAMERA = "1 PINHOLE 640 480 500 500 320 240\n"
-IMAGE = "1 1 0 0 0 0 0 0 1 a.jpg\n\n"
 BINARY = struct.pack("<QIiQQ4d", 1, 1, 1, 4, 4, 1, 1, 1, 1)
 GIGANTIC = struct.pack("<Q", 1 << 60)
 
@@ -135,57 +134,30 @@ def array(shape, data=b"", descr="<f8"):
     return content.getvalue() + data
 
 
+def spelled(content):
+    """The content of a row of faults.txt."""
+    return content.replace("$CAM", CAM).replace("$K", K).replace(r"\n", "\n")
+
+
 @pytest.mark.parametrize(
     ("name", "content", "reason"),
     [
-        ("a.yaml", "K: !!python/object/apply:os.system ['true']", "line 1: .*nothing is constructed"),
-        ("a.yaml", "K: !!binary aGVsbG8=", "nothing is constructed"),
+        *((name, spelled(text), told) for name, rows in FAULTS if name != "camera.yml" for text, told in rows),
         ("a.yaml", "a0: &a0 [1, 2]\n" + LAUGHS, "too many values"),
-        ("a.yaml", "a: &a {b: *a}", "nothing is called"),
-        ("a.yaml", "a: *b", "undefined alias|nothing is called"),
         ("a.yaml", "[" * 200, "nested too deeply"),
         ("a.yaml", "[" * 100_000, "nest|deep"),  # newer parsers count levels themselves
         ("a.yaml", "a: " * 300, "line 1"),
-        ("a.yaml", "? [a]\n: 1", "a key that is no text"),
-        ("a.yaml", f"K: {K}\n---\nK: {K}", "a second document"),
         ("a.yaml", f"K: {K[:-2]}{'9' * 1_000_000}]", "no finite number"),
-        ("a.yaml", f"cam0: {CAM}\ncam0: {CAM}", "line 2: the key 'cam0' stands there twice"),
-        ("a.yaml", f"cam0: {CAM}\ncam2: {CAM}", "not numbered from cam0 on: cam0, cam2"),
-        ("a.yaml", f"cam0: {CAM.replace('pinhole', 'fish')}", "cam0: 'fish-none' is not known here; known are pin"),
-        ("a.yaml", f"cam0: {CAM.replace('[4, 4]', '[4, 1e30]')}", r"cam0.resolution\[1\]: 1e\+30 is no number of"),
-        ("a.yaml", f"cam0: {CAM.replace('[1, 1,', '[1, .nan,')}", r"cam0.intrinsics\[1\]: '.nan' is no finite number"),
         ("a.json", '{"a":' * 10_000, "deep"),
-        ("a.json", '{"camtorch": 1, "cameras": {}}', "cameras: none"),
-        ("a.json", '{"camtorch": 2, "cameras": {}}', "2 is no version that this camtorch reads"),
-        (
-            "a.json",
-            '{"camtorch": 1, "cameras": {"a": {"model": "x", "intrinsics": [1]}}}',
-            "needs the camera model 'x', .* docs/leaving",
-        ),
-        ("a.json", '{"camtorch": 1, "cameras": {"a": 1, "a": 2}}', "the key 'a' stands there twice"),
-        ("a.json", '{"camera_angle_x": 5e-324, "w": 4, "h": 4}', "camera_angle_x: 5e-324 is no angle"),
         ("a.json", '[{"sensor_token": ' + "[" * 100_000, "nested too deeply"),
-        ("a.json", '[{"sensor_token": "a", "camera_intrinsic": 1}]', r"camera_intrinsic: no list, but 1\.0"),
         ("a.json", OWN % ([[[1, 1, 1, 1]]] * 3000, [[[0.0]] * 3000]), "batch dims that differ"),
-        ("a.json", '{"hello": 1}', "no format that is known here has the keys 'hello'"),
-        ("a.json", '{"fx": 9, "fy": 9, "cx": 4, "cy": 4}', r"'cy'; a camera of numbers is ct.Br.*\(\[fx,"),
         ("a.json", '{"\\n\\u0000": {"K": 1}}', "no format that is known here"),
-        ("a.xml", '<!DOCTYPE x [<!ENTITY a "b">]>' + XML.format("&a;"), "line 1: a document type"),
-        ("a.xml", XML.format("&a;"), "line 1: not XML"),
         ("a.xml", XML.format("<a>" * 100_000), "too many elements"),
-        ("a.xml", XML.format(f"<K>{K[1:-1]}</K><K>1</K>"), "opencv_storage: the key 'K' stands there twice"),
-        ("a.xml", "<html></html>", "<html> where <opencv_storage> belongs"),
         ("a.xml", "<calibration>" + '<a b="1"/>' * 20_000 + "</calibration>", "too many elements"),
-        ("a.yml", "\n%TAG !a! b\n---\na: 1\n", "YAML directives"),
-        ("a.cameramodel", "{'lensmodel': __import__('os').system('true')}", "something else than texts"),
         ("a.cameramodel", "{'lensmodel': " + "[" * 30_000, "line 1: too many nested"),
-        ("a.cameramodel", "{'lensmodel': 'X', 'imagersize': [4, 4]}", "'X' is not known here; known .* docs/leaving"),
-        ("a.cameramodel", "{'lensmodel': [1, 2,],\n'b': (1, 2,), }\n#\n}", "line 4: unmatched '}'"),
-        ("a.cameramodel", "{'lensmodel': 1,\n'b': 'x'", "line 1: '{' was never closed"),
         ("a.cameramodel", "{'lensmodel': " + "1+" * 16_000 + "1}", "something else|deep"),
         ("a.cameramodel", "{'lensmodel': " + "-" * 30_000 + "1}", "deep"),
         ("a.cameramodel", "{'lensmodel': 'x', 'more': '" + "x" * 40_000 + "'}", "size: more than 32 KiB"),
-        ("a.cameramodel", "{'lensmodel': 1, []: 3}", "something else than texts"),
         ("a.npz", archive(data__pkl=b"x"), "content: no format that is known here has the keys 'data.pkl'"),
         ("a.npz", archive(K__npy=b"x"), "K: is neither an OpenCV matrix nor a list of numbers"),
         ("a.npz", archive(K__npy=array((1 << 40,))), "K: is neither"),
@@ -200,22 +172,11 @@ def array(shape, data=b"", descr="<f8"):
         ("a.p", b"\x89PNG\r\n\x1a\n", "byte 0: an image, where a file of a calibration is wanted"),
         ("a.p", b"\x89HDF\r\n\x1a\n", "byte 0: a file of HDF5 or MATLAB"),
         ("a.p", b"\xfe\xfd\xfc", "byte 0: not text"),
-        ("a.p", "{'K': [500, 0, 320, 0, 500, 240, 0, 0]}", "K: a camera matrix has 3 x 3 numbers"),
-        ("cameras.txt", CAMERA * 2, "line 2: a second camera has the id 1"),
-        ("cameras.txt", CAMERA.replace("PINHOLE", "FISH"), "the model 'FISH' is not known here; known are"),
-        ("cameras.txt", CAMERA.replace("240", ""), "line 1: 3 parameters; PINHOLE has 4"),
-        ("cameras.txt", CAMERA.replace("240", "1e400"), "line 1.*'1e400' is no finite number"),
         ("cameras.bin", GIGANTIC, "byte 0: 1152921504606846976 cameras, for which the file is too"),
         ("cameras.bin", struct.pack("<QIiQQ", 1, 1, 99, 4, 4), "byte 8: the model 99 is not known here"),
         ("cameras.bin", struct.pack("<QIiQQ4d", 1, 1, 1, 4, 4, 1, 1, math.nan, 1), "not finite"),
         ("cameras.bin", struct.pack("<QIiQQ4d", 1, 1, 1, 1 << 60, 4, 1, 1, 1, 1), "no number of pixels"),
         ("cameras.bin", BINARY + b"x", "1 bytes after the last camera"),
-        ("images.txt", IMAGE * 2, "line 3: a second image is called 'a.jpg'"),
-        ("images.txt", IMAGE.replace(" 1 a", " 7 a"), "line 1: its camera 7 is not in cameras.txt"),
-        ("images.txt", IMAGE.replace("1 1 0", "1 2 0"), "line 1: a quaternion of length 2, which is no rotation"),
-        ("images.txt", IMAGE.replace("0 1 a", "1e300 1 a"), "line 1: a number beyond 1e[+]100"),
-        ("images.txt", "1 1 0 0\n", "line 1: less than IMAGE_ID"),
-        ("images.txt", IMAGE.replace("1 1 0", "1 x 0"), "line 1: seven numbers and the id of a camera were expected"),
         ("images.txt", b"\xff\xfe\n", "line 1: not text"),
         ("images.bin", GIGANTIC, "for which the file is too small"),
         ("images.bin", struct.pack("<QI7dI", 1, 1, 1, *[0] * 6, 1) + b"a\0" + GIGANTIC, "for which the file is too"),

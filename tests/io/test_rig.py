@@ -39,8 +39,6 @@ def test_it_is_a_mapping_of_names():
     assert "cam1" not in rig
     with pytest.raises(KeyError, match="cam1"):
         rig["cam1"]
-    with pytest.raises(KeyError):
-        rig.cameras["cam1"]
     assert rig.extrinsics.get("cam1") is None
 
 

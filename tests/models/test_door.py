@@ -75,7 +75,6 @@ WRONG = [
     (lambda: from_changed(2, 0, 0.5), ValueError, r"KannalaBrandt.*K.*0\.5"),
     (lambda: from_changed(1, 0, 0.75), ValueError, r"KannalaBrandt.*K.*0\.75"),
     (lambda: from_changed(0, 0, -300.0), ValueError, r"KannalaBrandt.*focal.*-300\.0"),
-    (lambda: ct.Pinhole.from_matrix(K[:2]), ValueError, r"Pinhole.*K.*\(2, 3\)"),
     (lambda: ct.Pinhole.from_matrix("K"), TypeError, "K"),
     # sizes
     (lambda: of_size(640), TypeError, r"^KannalaBrandt: image_size .*height.*640"),
@@ -143,7 +142,6 @@ WRONG = [
     (lambda: LENS.replace(intrinsics=[1.0, 2.0]), ValueError, r"KannalaBrandt: intrinsics must be \(\*B, 4\)"),
     (lambda: LENS.replace([-1.0, 1.0, 0.0, 0.0]), ValueError, "focal lengths must be positive; got fx, fy = .-1.0"),
     (lambda: LENS.replace(distortion=[[]]), ValueError, r"distortion must be \(\*B, n\)"),
-    (lambda: LENS.replace([[1.0, 1, 0, 0]] * 2, [[0.0] * 4] * 3), ValueError, "do not fit together"),
     (lambda: LENS.replace(image_size=(0, 3)), ValueError, r"image_size must be positive .*\(0, 3\)"),
     (lambda: LENS.replace(intrinsics="f"), TypeError, "intrinsics must be numbers"),
     (lambda: PAIR.expand(3), ValueError, r"batch dims \(2,\) do not expand to \(3,\)"),
@@ -176,18 +174,12 @@ WRONG = [
     (lambda: ct.Mixed.from_matrix(torch.eye(3)), TypeError, r"ct.Mixed\(\[...\]\)"),
     (lambda: ct.Mixed.from_fov(60, image_size=SIZE), TypeError, r"ct.Mixed\(\[...\]\)"),
     (lambda: ct.save(MIXED, "mixed.json"), TypeError, "files hold cameras by name"),
-    (
-        lambda: ct.calibrate(MIXED, torch.rand(9, 3), 40 * torch.rand(2, 9, 2), image_size=SIZE),
-        TypeError,
-        "camera model",
-    ),
     (lambda: MIXED.project(torch.rand(3, 5, 3)), ValueError, r"points must be .* with batch dims \*B = \(2,\)"),
     (lambda: ct.solve_pnp(MIXED, torch.rand(5, 12, 3), torch.rand(2, 12, 2)), ValueError, r"takes .* \(\) or \(2,\)"),
     (lambda: MIXED.plucker(POSE(torch.rand(3, 3), torch.rand(3, 3))), ValueError, "of extrinsics do not fit those of"),
     (lambda: CAMERA.plucker(EYE), TypeError, r"Extrinsics.from_matrix\(T\)"),
     (lambda: MIXED.perspective_field((0, 0, 0)), ValueError, "gravity must have a direction"),
     # poses
-    (lambda: POSE([0.0, 0.0], [0.0, 0.0, 0.0]), ValueError, r"rotation .*\(2,\)"),
     (lambda: POSE([0.0, 0.0, 0.0], [0.0, NAN, 0.0]), ValueError, "translation .*finite"),
     (lambda: POSE(torch.zeros(2, 3), torch.zeros(3, 3)), ValueError, "do not fit"),
     (lambda: FROM(EYE[:3, :3]), ValueError, r"\(3, 3\).*from_matrix\(R, t\)"),
@@ -197,7 +189,6 @@ WRONG = [
     (lambda: POSE(RVEC, TVEC)(torch.zeros(4, 2)), ValueError, r"points_world .*\(4, 2\)"),
     (lambda: POSE(R, np.zeros((3, 3))), ValueError, r"from_matrix\(rotation, tr.*rotation\[\.\.\., None\]"),
     (lambda: POSE(np.ones((3, 3)), TVEC), ValueError, r"rotation matrices.*rotation\[\.\.\., None\]"),
-    (lambda: POSE(-R, TVEC), ValueError, "rotation matrices.*det"),
     (lambda: FROM(RVEC, TVEC), ValueError, r"\(3,\).*Extrinsics\(rotation, translation\)"),
     (lambda: POSE(RVEC, np.zeros((4, 1))), ValueError, r"translation .*\(4, 1\)"),
     (lambda: POSE(torch.nn.Parameter(torch.zeros(3, 1)), TVEC), ValueError, r"Parameter rotation .*\(3, 1\)"),
@@ -217,7 +208,6 @@ WRONG = [
     (lambda: ct.vignetting(MIXED, torch.ones(3)), ValueError, "one for each of 2 cameras"),
     (lambda: REPROJECTION(LENS, UV, torch.rand(9, 3)), ValueError, r"pixels \(17, 2\) of target and \(9, 2\)"),
     (lambda: FLIP(image=IMAGE, keypoints=torch.rand(17, 3)), ValueError, r"\[..., 2\] goes in as keypoints_valid"),
-    (lambda: FLIP(image=IMAGE, keypoints=torch.rand(68, 2)), ValueError, r"landmarks=\{'keypoints': 'ibug68'\}"),
 ]
 
 

@@ -110,19 +110,14 @@ def test_woodscape_from_its_numbers():
     torch.testing.assert_close(made.distortion, published.distortion)
 
 
-BREAKS = [
-    (ct.EUCM, (0.5, 0.0), "beta > 0"),
-    (ct.DoubleSphere, (-1.0, 0.5), "xi > -1"),
-    (ct.Mei, (-1.5, 0.0, 0.0, 0.0, 0.0), "xi > -1"),
-    (ct.FOV, (math.pi,), "omega < pi"),
-]
+BREAKS = [(ct.EUCM, (0.5, 0.0)), (ct.DoubleSphere, (-1.0, 0.5)), (ct.Mei, (-1.5, *[0.0] * 4)), (ct.FOV, (math.pi,))]
 
 
 @pytest.mark.filterwarnings("ignore:.*became unusable")
-@pytest.mark.parametrize(("model", "coefficients", "text"), BREAKS)
-def test_coefficients_without_a_formula(model, coefficients, text):
+@pytest.mark.parametrize(("model", "coefficients"), BREAKS)
+def test_coefficients_without_a_formula(model, coefficients):
     """Refused at the door; where learning ended there, all is invalid, and finite."""
-    with pytest.raises(ValueError, match=text):
+    with pytest.raises(ValueError, match=f"the formula needs {model.defined_text}; got"):
         camera(model, *coefficients)
     learnt = model(INTRINSICS)
     with torch.no_grad():

@@ -210,26 +210,21 @@ def test_rows_are_independent_and_a_bad_one_is_alone():
 REFUSED = [
     ("pinhole", {"image_size": None}, "image_size=(height, width)"),
     ("equirectangular", {}, "panorama"),
-    ("pinhole", {"fov": (0.7, 2.0)}, "radians"),
     ("pinhole", {"fov": (120, 40)}, "from the least to the greatest"),
     ("pinhole", {"fov": (90, 190)}, "no rays for the corners"),
     ("orthographic_fisheye", {"fov": None}, "A narrower fov"),
     ("pinhole", {"fixed": "fx"}, "fov=(90, 90)"),
-    ("pinhole", {"fixed": ("k1",)}, "Pinhole has fx, fy, cx, cy"),
-    ("brown_conrady", {"count": 6}, "4, 5, 8, 12 or 14"),
-    ("kannala_brant", {}, "did you mean"),
     ("pinhole", {"centre": 0.7}, "below 0.5"),
     (CAMERAS[0], {"image_size": (48, 64)}, "images of (480, 640)"),
     (CAMERAS[0], {"fov": (20, 30)}, "not within"),
     (ct.KannalaBrandt([200.0, 200, 320, 240], [-0.2, 0, 0, 0], image_size=SIZE), {}, "a crop's camera"),
     ("pinhole", {"fov": 90}, "as (40, 120); got 90"),
-    (torch.nn.Linear, {}, "camera model"),
 ]
 
 
 @pytest.mark.parametrize(("model", "options", "said"), REFUSED)
 def test_what_is_refused(model, options, said):
-    error = TypeError if model is torch.nn.Linear or options == {"fov": 90} else ValueError
+    error = TypeError if options == {"fov": 90} else ValueError
     with pytest.raises(error, match=f"CameraHead.*{re.escape(said)}"):
         ct.CameraHead(16, model, **{"image_size": None if isinstance(model, ct.Camera) else SIZE, **options})
 

@@ -142,7 +142,6 @@ REFUSED = [
     (lambda: ct.CanonicalCamera(0.0), "focal must be positive"),
     (lambda: ct.CanonicalCamera(50.0, scales="labels"), '"depth" or "image"; got \'labels\''),
     (lambda: ct.CanonicalCamera(50.0, image_size=(4, 4)), "images keep their size"),
-    (lambda: DEPTH(depth=torch.ones(SIZE)), "no camera"),
     (lambda: DEPTH(depth=torch.ones(SIZE, dtype=torch.int16), camera=camera()), "floating point"),
     (lambda: IMAGES.inverse(depth=torch.ones(SIZE), camera=camera()), "source_camera as it came out"),
     (lambda: IMAGES(image=torch.rand(2, 3, *SIZE), camera=SEVERAL), "image_size="),
