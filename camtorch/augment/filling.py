@@ -32,12 +32,9 @@ def filled(source: Camera, target: Camera, rotation: Tensor | None) -> Tensor:
 
 
 def _points(camera: Camera) -> Tensor:
-    """Return the pixels (N, 2) that `filled` looks at, those of the rim at the end.
-
-    They are spread evenly without rows, which a rim might run along: multiples of the inverse powers of the root of x^3
-    = x + 1, modulo 1.
-    """
+    """Return the pixels (N, 2) that `filled` looks at, spread evenly without rows, and those of the rim at the end."""
     height, width = camera.height, camera.width
+    # a rim might run along rows; so multiples of the inverse powers of the root of x^3 = x + 1, modulo 1
     steps = torch.arange(1, _POINTS + 1, dtype=torch.float64)[:, None]
     spread = (steps / torch.tensor([_ROOT, _ROOT**2], dtype=torch.float64)).frac()
     corners = spread.new_tensor([[0, 0], [1, 0], [1, 1], [0, 1]])
@@ -71,11 +68,7 @@ def scaled(camera: Camera, factor: Tensor) -> Camera:
 
 
 def enough(source: Camera, target: Camera, rotation: Tensor | None, share: float) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the factor (*B,) on focal lengths and the rotation (*B, 3, 3) that fill `share`, and the part filled.
-
-    The target zooms, up to four times, and then turns less far. The part is below `share` if the source does not see
-    its axis.
-    """
+    """Return the zoom (*B,) and the rotation (*B, 3, 3), turned less far, that fill `share`, and the part filled."""
     share = min(share + _CARE, 1.0)
     with torch.no_grad():
         if rotation is None:

@@ -171,10 +171,7 @@ class Mirroring:
     def swapped(
         self, name: str, kind: str | None, value: Tensor, mirrored: Tensor, flags: bool, faces: set[tuple[int, ...]]
     ) -> Tensor:
-        """Return landmarks (B, *F, N, ...), mirrored rows in their order in a mirror.
-
-        kind None: what does not move, (B, N, ...), or of `faces` (F, N) (B, F, N, ...). flags: without coordinates.
-        """
+        """Return landmarks (B, *F, N, ...), mirrored rows in their new order; kind None: of what does not move."""
         if kind is None and value.ndim < 2:
             raise ValueError(
                 f"{self.owner}: {name} has a table of landmarks, and must be (B, N, ...); got {shown(value)}"

@@ -15,14 +15,7 @@ from typing_extensions import Self, TypeVar
 from camtorch.cameras.catalogue import Catalogue
 from camtorch.cameras.editing import Editable
 from camtorch.cameras.freezing import PREFIX, Freezable, with_frozen
-from camtorch.cameras.numbers import (
-    at_a_glance,
-    camera_of_fov,
-    checked_numbers,
-    described,
-    numbers_of_matrix,
-    replaced,
-)
+from camtorch.cameras.numbers import at_a_glance, camera_of_fov, checked_numbers, described, numbers_of_matrix, replaced
 from camtorch.convert.result import Conversion
 from camtorch.evaluate.kept import Kept
 from camtorch.evaluate.known import is_predicted
@@ -189,8 +182,6 @@ class Camera(Freezable, Editable):
         """
         return camera_of_fov(cls, fov, image_size, axis, distortion)
 
-    # -- as a file and as plain values; camtorch.io imports this file, and is imported when it is needed
-
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Camera:  # no Self, which jsonargparse takes for no class
         """Return the camera of a calibration file that has one camera, in float64 and frozen.
@@ -204,22 +195,7 @@ class Camera(Freezable, Editable):
         Raises:
             ValueError: If the file cannot be used, has several cameras, or one of another model than this class.
         """
-        camera: Camera = importlib.import_module("camtorch.io.formats").load_camera(cls, path)
-        return camera
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the camera as plain numbers, strings and lists, as camtorch's JSON has it.
-
-        Returns:
-            The keys model, intrinsics, distortion_names and distortion if there is any, image_size, and "dtype":
-            "float32" unless it is float64. `from_dict` gives the same numbers, to the last bit; whether they learn is
-            not kept.
-
-        Raises:
-            TypeError: If it is a `Mixed`, or a model without a key. ValueError: If a number is not finite.
-        """
-        values: dict[str, Any] = importlib.import_module("camtorch.io.camtorch_json").dict_of(self)
-        return values
+        return cast("Camera", importlib.import_module("camtorch.io.formats").load_camera(cls, path))
 
     @classmethod
     def from_dict(cls, d: Mapping[str, Any]) -> Camera:
@@ -231,8 +207,7 @@ class Camera(Freezable, Editable):
         Raises:
             ValueError: If a key is missing, unknown or has a wrong value, or the model is another than this class.
         """
-        camera: Camera = importlib.import_module("camtorch.io.camtorch_json").made_of(cls, d, Camera)
-        return camera
+        return cast("Camera", importlib.import_module("camtorch.io.camtorch_json").made_of(cls, d))
 
     def replace(
         self,
@@ -269,8 +244,7 @@ class Camera(Freezable, Editable):
         """The (*B, 3, 3) camera matrix."""
         fx, fy, cx, cy = self.intrinsics.expand(*self.batch_shape, 4).unbind(-1)
         zero, one = torch.zeros_like(fx), torch.ones_like(fx)
-        matrix: Tensor = torch.stack((fx, zero, cx, zero, fy, cy, zero, zero, one), -1).unflatten(-1, (3, 3))
-        return matrix
+        return torch.unflatten(torch.stack((fx, zero, cx, zero, fy, cy, zero, zero, one), -1), -1, (3, 3))
 
     fx: Tensor = _intrinsic(0, "(*B,) the horizontal focal length in pixels; gradients go to `intrinsics`.")
     fy: Tensor = _intrinsic(1, "(*B,) the vertical focal length in pixels.")
@@ -487,9 +461,6 @@ class Camera(Freezable, Editable):
 
         return explain(self, points)
 
-    # -- the camera of an edited image. It has no Parameters of its own while the original learns: its intrinsics are
-    # made from the original's, and that is where gradients go. From a frozen camera, or under no_grad, it is a copy.
-
     def convert(
         self,
         model: type[Model] | str,
@@ -529,16 +500,8 @@ class Camera(Freezable, Editable):
         """
         from camtorch.convert.conversion import convert  # a room that few calls need
 
-        return convert(
-            self,
-            cast("type[Model]", as_model(model, f"{type(self).__name__}.convert")),
-            MODELS,
-            count=count,
-            image_size=image_size,
-            max_angle=max_angle,
-            tolerance=tolerance,
-            **options,
-        )
+        options |= {"count": count, "image_size": image_size, "max_angle": max_angle, "tolerance": tolerance}
+        return convert(self, cast("type[Model]", as_model(model, f"{type(self).__name__}.convert")), MODELS, **options)
 
     def __dir__(self) -> list[str]:
         """Return what users call: not what a model states, nor what modules are made of."""

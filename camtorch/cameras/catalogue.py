@@ -84,8 +84,7 @@ class Catalogue(MutableMapping[str, KindT]):
         if isinstance(model, str):
             key, *texts = model.split(":")
             if texts and key in self:
-                variant: KindT = functools.reduce(lambda kind, text: kind.variant(text), texts, cast("Any", self[key]))
-                return variant
+                return functools.reduce(lambda kind, text: cast("KindT", kind.variant(text)), texts, self[key])
             if model not in self:
                 keys = {name.lower(): key for key, cls in self.items() for name in (key, cls.__name__)} | _ELSEWHERE
                 close = difflib.get_close_matches(model.lower(), keys, 1)

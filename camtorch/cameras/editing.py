@@ -31,18 +31,6 @@ def quarter_turns(image_size: tuple[int, int]) -> tuple[tuple[tuple[int, int, in
     )
 
 
-def check_crop(camera: CameraLike, corner: tuple[int, int], size: tuple[int, int]) -> None:
-    """Raise a ValueError if a part, its corner (top, left) and its size, holds no pixel of the camera's image."""
-    known = camera.image_size
-    if known is None:
-        return
-    if any(at >= end or at + side <= 0 for at, side, end in zip(corner, size, known, strict=True)):
-        raise ValueError(
-            f"{type(camera).__name__}.crop: (top, left, height, width) = {(*corner, *size)} holds no pixel of the "
-            f"image (height, width) = {known}"
-        )
-
-
 def edited_by(camera: CameraT, matrix: Sequence[Sequence[float]], size: Sequence[int]) -> CameraT:
     """Return the camera of an image whose pixels all move by one map (2, 3); it learns where the camera does."""
     new_size = as_image_size(size, type(camera).__name__)
@@ -52,11 +40,7 @@ def edited_by(camera: CameraT, matrix: Sequence[Sequence[float]], size: Sequence
 
 
 def edited(camera: CameraT, matrix: Tensor | Sequence[Sequence[float]], image_size: tuple[int, int] | None) -> CameraT:
-    """Return the camera of an image whose pixels move by a map each; batch dims broadcast.
-
-    matrix: (*B, 2, 3), from pixels (u, v, 1) to those of the edited image: a quarter turn clockwise or none, flips,
-    scales, and a shift. Raises a ValueError if the model has no quarter turn.
-    """
+    """Return the camera of an image whose pixels move by a `matrix` each, (*B, 2, 3): quarter turns, flips, scales."""
     if camera.is_mixed:
         return cast("CameraT", cast("Any", camera).by_groups(lambda group: edited(group, matrix, image_size)))
     own, given = camera.intrinsics, [matrix] if isinstance(matrix, Tensor) else []
@@ -69,8 +53,7 @@ def edited(camera: CameraT, matrix: Tensor | Sequence[Sequence[float]], image_si
     fx, fy, cx, cy = split(own, xp)
     focal = abs(a) * fx + abs(b) * fy, abs(c) * fx + abs(d) * fy
     centre = a * cx + b * cy + left, c * cx + d * cy + top
-    turned = b != 0
-    turns = turned
+    turns = turned = b != 0
     if isinstance(matrix, Tensor):  # asked where it was drawn, so that no device is waited for
         turns = np.any(turned) if xp is np else not known_true(matrix[..., 0, 1] == 0)
     distortion = _edited_distortion(camera, a - b, c + d, turned if turns else None)
@@ -129,7 +112,12 @@ class Editable(CameraLike):
         """
         top, left = (as_whole(v, name, "crop") for v, name in ((top, "top"), (left, "left")))
         as_image_size((height, width), f"{type(self).__name__}.crop")
-        check_crop(self, (top, left), (height, width))
+        size = self.image_size
+        if size and (top >= size[0] or left >= size[1] or top + height <= 0 or left + width <= 0):
+            raise ValueError(
+                f"{type(self).__name__}.crop: (top, left, height, width) = {(top, left, height, width)} holds no pixel "
+                f"of the image (height, width) = {size}"
+            )
         return edited_by(self, ((1, 0, -left), (0, 1, -top)), (height, width))
 
     def pad(self, left: int, right: int, top: int, bottom: int) -> Self:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, cast
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -31,16 +31,12 @@ class _Masked:
 
 
 def with_frozen(tensor: Tensor, frozen: Tensor) -> Tensor:
-    """The Parameter, of which what is frozen is as it was, and has no gradient; of another tensor the like of it.
-
-    An optimizer's weight decay and momentum move values that have no gradient, which go back as soon as they are
-    looked at.
-    """
+    """Return the Parameter, of which what is frozen is as it was, and has no gradient; of another tensor the like."""
     learns = frozen.isnan()
     if not is_parameter(tensor) or not may_write(tensor):
         return torch.where(learns, tensor, frozen)
     values = torch.where(learns, tensor.detach(), frozen)
-    if not torch.equal(values, tensor.detach()):
+    if not torch.equal(values, tensor.detach()):  # an optimizer's weight decay and momentum move it without a gradient
         tensor.data.copy_(values)
     if tensor.requires_grad and not _hooks_of(tensor):
         tensor.register_hook(_Masked(learns))
@@ -111,29 +107,27 @@ class Freezable(CameraLike):
         Args:
             names: "fx", "fy", "cx", "cy", and of `distortion_names`; all parameters if there are none.
         """
-        _freeze(cast(CameraLike, self), names, True)
+        _freeze(self, names, True)
         return self
 
     def unfreeze(self, *names: str) -> Self:
         """Let parameters that were frozen learn again, from the values that they have; all of them for no name."""
-        _freeze(cast(CameraLike, self), names, False)
+        _freeze(self, names, False)
         return self
 
     def _save_to_state_dict(self, destination: Any, prefix: str, keep_vars: bool) -> None:
         super()._save_to_state_dict(destination, prefix, keep_vars)
         # it shares the memory of the Parameters, which are as they were frozen once they were looked at
-        camera = cast(CameraLike, self)
-        for tensor, _ in _tensors_of(camera):
-            getattr(camera, tensor)
-        if (names := frozen_names(camera)) and hasattr(destination, "_metadata"):
+        for tensor, _ in _tensors_of(self):
+            getattr(self, tensor)
+        if (names := frozen_names(self)) and hasattr(destination, "_metadata"):
             destination._metadata[prefix[:-1]]["frozen"] = names
 
     def _load_from_state_dict(self, *arguments: Any) -> None:
         super()._load_from_state_dict(*arguments)
         # what is frozen has the values of the state, and what the state says is frozen too
-        camera = cast(CameraLike, self)
-        names = {*frozen_names(camera), *arguments[2].get("frozen", ())}
-        for tensor, _ in _tensors_of(camera):
-            camera._buffers.pop(PREFIX + tensor, None)
+        names = {*frozen_names(self), *arguments[2].get("frozen", ())}
+        for tensor, _ in _tensors_of(self):
+            self._buffers.pop(PREFIX + tensor, None)
         if names:
-            _freeze(camera, sorted(names), True)
+            _freeze(self, sorted(names), True)

@@ -62,10 +62,7 @@ def checked_numbers(
 
 
 def at_a_glance(model: type[CameraLike], intrinsics: Any, distortion: Any, size: Any) -> _Checked | None:
-    """As `checked_numbers`, Parameters of a single camera, if all is right at a glance; None where that is not enough.
-
-    It is of lists of numbers, and of plain tensors.
-    """
+    """As `checked_numbers`, of lists and plain tensors of one camera that are right at a glance; None of all else."""
     if not (model.always_defined and are_free(*[value for value in (intrinsics, distortion) if type(value) is Tensor])):
         return None
     made: list[Tensor] = []
@@ -238,14 +235,11 @@ def _column_hint(distortion: Tensor) -> str:
 
 
 def numbers_of_matrix(
-    model: type[CameraLike],
-    K: Numbers,  # noqa: N803
-    distortion: Numbers | None,
-    ignore_skew: bool,
+    model: type[CameraLike], matrix: Numbers, distortion: Numbers | None, ignore_skew: bool
 ) -> tuple[Tensor] | tuple[Tensor, Tensor]:
     """Intrinsics, and distortion where it is given, of a matrix K; see `Camera.from_matrix`."""
     owner = model.__name__
-    K = as_real(K, "K", owner)  # noqa: N806
+    K = as_real(matrix, "K", owner)  # noqa: N806
     if K.shape[-2:] != (3, 3):
         hint = ". Of larger ones it is K[..., :3, :3]" if min(K.shape[-2:], default=0) >= 3 else ""
         raise ValueError(f"{owner}: K must be (*B, 3, 3); got shape {tuple(K.shape)}{hint}")

@@ -47,9 +47,7 @@ def opaque(shapes: Function) -> Callable[[Function], Function]:
     """A function of cameras of known image_size, tensors, None, floats, strings and pairs of whole numbers.
 
     While it is compiled cameras arrive without their graphs, and none of its results may share memory with an argument.
-
-    Args:
-        shapes: makes empty tensors like its results, of the same arguments with `CameraNumbers` for cameras.
+    shapes: makes empty tensors like its results, of the same arguments with `CameraNumbers` for cameras.
     """
 
     def decorate(function: Function) -> Function:
@@ -100,7 +98,7 @@ def _arguments(
     arguments: list[Any] = []
     for kind, _, text in (line.partition(" ") for line in kinds.split("\n")):
         if kind == "camera":
-            arguments.append(camera(text, next(numbers), next(numbers), (next(sides), next(sides))))
+            arguments.append(camera(CLASSES[text], next(numbers), next(numbers), (next(sides), next(sides))))
         elif kind == "tensor":
             arguments.append(next(numbers))
         elif kind == "float":
@@ -116,18 +114,13 @@ def _arguments(
 def _computed(
     name: str, kinds: str, tensors: Sequence[Tensor], sizes: Sequence[int], floats: Sequence[float]
 ) -> list[Tensor]:
-    def camera(model: str, *numbers: Any) -> Camera:
-        return fixed_camera(CLASSES[model], *numbers)
-
-    return list(_function(name)[0](*_arguments(kinds, tensors, sizes, floats, camera)))
+    return list(_function(name)[0](*_arguments(kinds, tensors, sizes, floats, fixed_camera)))
 
 
 @_computed.register_fake
 def _(name: str, kinds: str, tensors: Sequence[Tensor], sizes: Sequence[int], floats: Sequence[float]) -> list[Tensor]:
-    def numbers(_: str, *values: Any) -> CameraNumbers:
-        return CameraNumbers(*values)
-
-    return list(_function(name)[1](*_arguments(kinds, tensors, sizes, floats, numbers)))
+    arguments = _arguments(kinds, tensors, sizes, floats, lambda _, *numbers: CameraNumbers(*numbers))
+    return list(_function(name)[1](*arguments))
 
 
 @_computed.register_vmap

@@ -23,15 +23,8 @@ _OF_CAMERAS = ("intrinsics", "distortion", "image_size")  # beside what their cl
 class NamedModules(nn.Module, MutableMapping[str, M]):
     """Modules by name, in order: a mapping as `nn.ModuleDict`, whose names may have dots, as those of files do.
 
-    Args:
-        kind: the class of the modules.
-        modules: name -> module, also another `NamedModules`, with which this one then shares its modules.
-        names: of the rows of `batch`.
-        batch: a module with one batch dim, each row of which is a module of its own name: 200,000 of them take no more
-            time than one. `mapping[name]` is `batch[row]`, made when it is asked for.
-
-    Raises:
-        TypeError: names that are no strings, modules of another class. ValueError: rows and names that do not fit.
+    Rows of a `batch`, of one batch dim, have `names`: 200,000 of them take no more time than one, as `mapping[name]` is
+    `batch[row]`, made when it is asked for. With another `NamedModules` this one shares its modules.
     """
 
     batch: M | None

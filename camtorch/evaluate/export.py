@@ -68,10 +68,7 @@ def of_points(k: Tensor, camera: Tensor) -> tuple[Tensor, ...]:
 def repeat(
     step: Callable[..., tuple[Tensor, ...]], moves: Tensor, state: Sequence[Tensor], most: int
 ) -> tuple[Tensor, ...]:
-    """Return moves and state after at most so many steps; a step maps both to new ones of the same shapes and dtypes.
-
-    `moves`, bool, keeps the loop going while any of it is set. An exported program records a loop.
-    """
+    """Return moves and state after at most so many steps to new ones, while any of `moves`, bool, is set."""
     if not is_portable_export():
         for _ in range(most):
             if not bool(moves.any()):

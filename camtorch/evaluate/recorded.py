@@ -108,10 +108,7 @@ CLASSES = _Classes()
 
 
 def register(entry: type) -> str:
-    """The name under which a class is known from now on.
-
-    A class of the same name, made by a function that was called again, gets a name of its own.
-    """
+    """Return the name under which a class is known from now on: with a number, if another one has it already."""
     wanted = name = f"{entry.__module__}.{entry.__qualname__}"
     count = 2
     while name in CLASSES:

@@ -26,10 +26,8 @@ NAMES = Names("camtorch", "camtorch", (".json",), ("*.json",))
 _VERSION = 1
 _DEEPEST_BATCH = 8
 _DTYPES = {"float32": torch.float32, "float64": torch.float64}
-_KEYS: dict[type, tuple[str, ...]] = {
-    Camera: ("model", "intrinsics", "distortion_names", "distortion", "image_size", "dtype"),
-    Extrinsics: ("rotation", "translation", "dtype"),
-}
+_OF_CAMERAS = "model", "intrinsics", "distortion_names", "distortion", "image_size", "dtype"
+_OF_POSES = "rotation", "translation", "dtype"
 
 
 def matches(keys: dict[str, Any]) -> bool:
@@ -57,14 +55,15 @@ def parse(record: Record) -> Rig:
     return Rig(cameras, {name: _pose(*vectors) for name, vectors in extrinsics.items()}, images=images)
 
 
-def made_of(kind: type[Made], d: Mapping[str, Any], base: type[Camera | Extrinsics]) -> Made:
+def made_of(kind: type[Made], d: Mapping[str, Any]) -> Made:
     """Return the camera or the pose of a dict as `dict_of` makes it, frozen; a CameraFileError names a wrong key."""
     record = Record(f"{kind.__name__}.from_dict", _plain(d))
-    known = _KEYS[base]
+    is_camera = issubclass(kind, Camera)
+    known = _OF_CAMERAS if is_camera else _OF_POSES
     for key in record.keys():  # noqa: SIM118
         if key not in known:
             record[key].fail(f"is not known; known are {', '.join(known)}")
-    made: Any = _camera(record) if base is Camera else _pose(*_vectors(record))
+    made: Any = _camera(record) if is_camera else _pose(*_vectors(record))
     if not isinstance(made, kind):
         record["model"].fail(f"a {type(made).__name__}, which is no {kind.__name__}; ct.Camera.from_dict takes any")
     dtype = _DTYPES[one_of(record["dtype"], _DTYPES)] if "dtype" in record else torch.float64

@@ -55,11 +55,7 @@ def _sources(library: ctypes.CDLL) -> int | None:
 
 @functools.cache
 def library() -> ctypes.CDLL | None:
-    """The library, loaded at first use; calls into it hold no lock of Python's.
-
-    None where it is turned off (`CAMTORCH_NATIVE=0`), was not built, does not load, or was built from other sources
-    than lie here, as after a `git pull`, which is a warning: these files may call it otherwise than it expects.
-    """
+    """Return the library, loaded at first use, or None where there is none to use; its calls hold no lock of Python."""
     found = _find()
     if found.stale:
         warnings.warn(f"camtorch's native sampler is {found.state}", RuntimeWarning, stacklevel=2)

@@ -21,10 +21,7 @@ some back to the system, and in a worker of a DataLoader a third of the time of 
 
 
 def empty(shape: tuple[int, ...], dtype: torch.dtype, layout: torch.memory_format) -> Tensor:
-    """As `torch.empty`, on the CPU, of at least `LEAST` bytes, and of memory that is kept where there are large pages.
-
-    As long as it, a view of it, or an array on its memory lives, nobody else gets that. Its storage cannot be resized.
-    """
+    """Return `torch.empty` on the CPU, in memory of large pages that nobody else gets while anything on it lives."""
     size, strides = _place(shape, dtype, layout)
     block = _block(size)
     if block is None:

@@ -188,12 +188,10 @@ def classify(
     tolerance: float,
     padding: str,
 ) -> tuple[Tensor, int]:
-    """Which cells (B, n, m) of a lattice are `EMPTY`, `CUBIC`, `DOUBT` or `TODO`, int32; and how many are `TODO` or in
-    `DOUBT` in the image with the most of them. There is a library.
+    """Return which cells (B, n, m) of a lattice are `EMPTY`, `CUBIC`, `DOUBT` or `TODO`; and the most open of an image.
 
     Positions are `nodes` (B, 2, n + 5, m + 5) of float32 and `mapped` (B, n + 5, m + 5) bool, the last two dims without
-    gaps; `rim` (B, 2 (w + h)) bool, contiguous, says which pixels are mapped of the target's top row, bottom row, left
-    column and right column. `size` (h, w) is that of the target; the tolerance is in pixels of the source.
+    gaps; `rim` (B, 2 (w + h)) bool, contiguous: the target's top row, bottom row, left column and right column.
     """
     native = library()
     assert native is not None  # who calls has looked

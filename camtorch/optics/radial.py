@@ -275,10 +275,9 @@ class RadiusTable(RadialFactor):
 
 
 def _slopes(steps: Tensor, secants: Tensor) -> Tensor:
-    """(*B, N) of the pieces -> (*B, N + 1): the slopes of the cubic spline at the nodes, made to ascend where it does.
+    """Return the slopes (*B, N + 1) at the nodes of a cubic spline of pieces (*B, N), made to ascend where it does.
 
-    The equations of a spline with two continuous derivatives; at the origin its second one is zero, as its mirror
-    image wants it, and the last two pieces are one polynomial. Then Hyman's filter.
+    At the origin its second derivative is zero, and the last two pieces are one polynomial. Then Hyman's filter.
     """
     before, after = steps[..., :-1], steps[..., 1:]
     both = before[..., -1:] + after[..., -1:]

@@ -48,10 +48,7 @@ def within(fold: Tensor) -> Tensor:
 
 
 def first_loss(orientation: Tensor, spared: Tensor | None = None) -> Tensor:
-    """(*B, A, S) -> (*B, A): the node, with a fraction at a dip, where it is first lost; S where it never is.
-
-    spared: bool, the nodes next to which no dip is assumed.
-    """
+    """Return the node (*B, A) of (*B, A, S) where it is first lost, or dips off what is `spared`; S for never."""
     before, here, after = orientation[..., :-2], orientation[..., 1:-1], orientation[..., 2:]
     bend, tilt = before - 2 * here + after, before - after
     bend_safe = torch.where(bend > 0, bend, 1.0)
@@ -65,10 +62,9 @@ def first_loss(orientation: Tensor, spared: Tensor | None = None) -> Tensor:
 
 
 def fold_of(radial: RadialFactor, sampled: Callable[[], Tensor], end: float | Tensor, most: float) -> Tensor:
-    """(C, 1): the smallest radius at which a radial factor is no longer regular, or the end.
+    """Return the least radius (C, 1) at which a factor is irregular or its image above `most`, or the end.
 
     sampled: makes the radii (RADII,), ascending, at which it is followed outwards where it has no closed form.
-    most: the largest image that is a number to calculate with.
     """
     if radial.fold is not None:
         return radial.fold.clamp(max=end)
@@ -172,10 +168,7 @@ class InverseTable:
     steps: Tensor
 
     def __init__(self, table: Tensor, *, is_constant: bool = False):
-        """table: (C, 2 + 2 nodes): its last squared radius, the largest one that has a point, factors and steps.
-
-        is_constant: whether its parts are to be no views.
-        """
+        """table: as of `tabulate`. is_constant: whether its parts are to be no views."""
         self.is_constant = is_constant
         parts = table[..., :1], table[..., 1:2], table[..., 2 : 2 + _NODES], table[..., 2 + _NODES :]
         self.reach2, self.most2, self.values, self.steps = (p.clone() for p in parts) if is_constant else parts
@@ -193,13 +186,9 @@ class InverseTable:
 
 
 def solve(radial: RadialFactor, table: InverseTable, r2: Tensor) -> tuple[Tensor, Tensor]:
-    """The factor s by which the inverse of a radial factor scales points of squared radius r2, and whether that is it.
-
-    Newton's method for s R(r2 s^2) = 1, which does not know of an axis, r2 up to `InverseTable.most2`. The second is
-    positive where the last step was so short that the next one would be nothing.
-    """
+    """Return the factor by which the inverse scales points of squared radius r2, and what is positive if that is it."""
     scale, converged = table(r2), None
-    for _ in range(MOST_STEPS):
+    for _ in range(MOST_STEPS):  # of Newton's method for s R(r2 s^2) = 1, which does not know of an axis
         t = r2 * scale * scale
         factor, slope = radial.derivatives(t, 1)
         step = (1 - scale * factor) / torch.addcmul(factor, t, slope, value=2)
@@ -212,10 +201,9 @@ def solve(radial: RadialFactor, table: InverseTable, r2: Tensor) -> tuple[Tensor
 
 
 def bracketed(radial: RadialFactor, r2: Tensor, inner2: Tensor) -> Tensor:
-    """The factor of `solve` of single points (M,), each with its own coefficients and its own fold.
+    """Return the factor of `solve` of single points (M,), each with its own coefficients and its own fold.
 
-    Steps of Cauchy's method, to the root of the local parabola: of third order, and at the fold too, where Newton's
-    method crawls. They stay in a bracket that every other step halves, so that no kink holds them up.
+    By Cauchy's method, to the root of the local parabola: of third order at the fold too, where Newton's method crawls.
     """
     eps = torch.finfo(r2.dtype).eps
     wanted, high = r2.sqrt(), inner2.sqrt().expand_as(r2)
@@ -246,11 +234,7 @@ def bracketed(radial: RadialFactor, r2: Tensor, inner2: Tensor) -> Tensor:
 
 
 class RadialInverse:
-    """The inverse of a radial factor, graph-free: for charts whose formula leads the other way.
-
-    radial: the factor. inner2: the squared radius of its fold. most2: that of the fold's image, infinite where there is
-    none; both in the shape of the parameters.
-    """
+    """The inverse of a factor, graph-free. inner2: the squared radius of its fold; most2: of the fold's image."""
 
     factor: type[RadialFactor]
     radial: RadialFactor

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, cast
 
 import numpy as np
 import torch
@@ -114,7 +114,7 @@ class Extrinsics(BatchedModule):
         Raises:
             ValueError: another shape, a last row that is not (0, 0, 0, 1), an R that is not a rotation.
         """
-        given: Any = matrix
+        given: Any
         given, translation = _pair(matrix) if translation is None else (matrix, translation)
         if translation is not None:
             rotation = as_real(given, "rotation", "Extrinsics")
@@ -138,11 +138,6 @@ class Extrinsics(BatchedModule):
         check_rotation(rotation, "matrix", "Extrinsics")
         return cls(rotation_vector(rotation).unsqueeze(-1), translation)
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return rotation and translation as plain lists, with "dtype": "float32" unless it is float64."""
-        values: dict[str, Any] = importlib.import_module("camtorch.io.camtorch_json").dict_of(self)
-        return values
-
     @classmethod
     def from_dict(cls, d: Mapping[str, Any]) -> Extrinsics:
         """Return the frozen pose of a dict as `to_dict` makes it.
@@ -150,8 +145,7 @@ class Extrinsics(BatchedModule):
         Raises:
             ValueError: If a key is missing, unknown or has a wrong value.
         """
-        pose: Extrinsics = importlib.import_module("camtorch.io.camtorch_json").made_of(cls, d, Extrinsics)
-        return pose
+        return cast("Extrinsics", importlib.import_module("camtorch.io.camtorch_json").made_of(cls, d))
 
     def inverse(self) -> Extrinsics:
         """World from camera."""
@@ -241,8 +235,7 @@ def head_rotation(angles: Numbers) -> Tensor:
         *(cp * sr, cp * cr, sp),
         *(-sy * cr - cy * sp * sr, sy * sr - cy * sp * cr, cy * cp),
     )
-    matrix: Tensor = torch.stack(rows, -1).unflatten(-1, (3, 3))
-    return matrix
+    return torch.unflatten(torch.stack(rows, -1), -1, (3, 3))
 
 
 def _are_matrices(rotation: Tensor, translation: Tensor) -> bool:

@@ -16,11 +16,7 @@ _NEARLY = 1e-3  # by which R R^T may miss the identity
 
 
 def rotation_matrix(rotation: Tensor) -> Tensor:
-    """(*B, 3) rotation vectors to (*B, 3, 3) matrices.
-
-    Rodrigues' formula with sin(angle)/angle and (1 - cos(angle))/angle^2 as analytic functions of the squared angle.
-    kornia's axis_angle_to_rotation_matrix is off by 7e-14 at 0.01 radians, and its derivatives by more.
-    """
+    """Return matrices (*B, 3, 3) of rotation vectors (*B, 3): Rodrigues' formula, analytic in the squared angle."""
     x, y, z = rotation.unbind(-1)
     xx, yy, zz = x * x, y * y, z * z
     angle2 = xx + yy + zz
@@ -28,8 +24,7 @@ def rotation_matrix(rotation: Tensor) -> Tensor:
     xy, yz, zx = c * x * y, c * y * z, c * z * x
     x, y, z = s * x, s * y, s * z
     rows = (1 - c * (yy + zz), xy - z, zx + y, xy + z, 1 - c * (zz + xx), yz - x, zx - y, yz + x, 1 - c * (xx + yy))
-    matrix: Tensor = torch.stack(rows, -1).unflatten(-1, (3, 3))
-    return matrix
+    return torch.unflatten(torch.stack(rows, -1), -1, (3, 3))
 
 
 def small_turn(rotation: Tensor) -> Tensor:
@@ -56,11 +51,7 @@ def nearest_rotation(matrices: Tensor) -> Tensor:
 
 
 def rotation_vector(matrix: Tensor) -> Tensor:
-    """(*B, 3, 3) rotation matrices to (*B, 3) rotation vectors with an angle up to pi.
-
-    By Shepperd's method: of the four columns of 4 q q^T, q being the unit quaternion, that with the largest diagonal
-    element is a multiple of q without cancellation.
-    """
+    """Return rotation vectors (*B, 3) with an angle up to pi of rotation matrices (*B, 3, 3), by Shepperd's method."""
     (a, b, c), (d, e, f), (g, h, i) = (row.unbind(-1) for row in matrix.unbind(-2))
     x, y, z, xy, yz, zx = h - f, c - g, d - b, b + d, f + h, c + g
     products = (
@@ -69,6 +60,7 @@ def rotation_vector(matrix: Tensor) -> Tensor:
         *(y, xy, 1 - a + e - i, yz),
         *(z, zx, yz, 1 - a - e + i),
     )
+    # of 4 q q^T, q the unit quaternion: the column of the largest diagonal element has no cancellation
     columns = torch.stack(products, -1).unflatten(-1, (4, 4))
     largest = columns.detach().diagonal(dim1=-2, dim2=-1).argmax(-1)
     return quaternion_vector(columns.take_along_dim(largest[..., None, None], -2).squeeze(-2))
@@ -89,15 +81,11 @@ def vector_quaternion(rotation: Tensor) -> Tensor:
 
 
 def rotate_planes(matrix: Tensor, planes: tuple[Tensor, ...], whole: Tensor | None = None) -> Tensor:
-    """Apply (*B, 3, 3) to three planes (*B, N): (3, *B, N). By components, which autocast leaves in their precision.
-
-    A point that is not finite becomes NaN, which has no part in the gradient of the matrix. `whole` is the tensor that
-    the planes are taken from, where there is one.
-    """
+    """Apply (*B, 3, 3) to three planes (*B, N), or to those of `whole`: (3, *B, N), NaN where a point is not finite."""
     x, y, z = planes
     matrix = matrix[(None,) * (x.ndim + 1 - matrix.ndim)]
     a, b, c = matrix.movedim((-1, -2), (0, 1)).unsqueeze(-1).unbind(0)
-    # a sum shows what is not finite: the whole planes are looked at once
+    # by components, which autocast leaves in their precision; a sum of whole planes shows what is not finite
     sums = [plane.detach().sum() for plane in (planes if whole is None else (whole,))]
     if x.is_cpu and known_true(torch.isfinite(sums[0] if len(sums) == 1 else torch.stack(sums))):
         return torch.addcmul(torch.addcmul(a * x, b, y), c, z)
@@ -182,8 +170,8 @@ def mount_rotation(yaw: Tensor, pitch: Tensor, roll: Tensor) -> Tensor:
         check_devices("mount_rotation", **given)
         shapes = ", ".join(f"{name} {tuple(value.shape)}" for name, value in given.items())
         raise ValueError(f"mount_rotation: the angles must be of one shape (*B,); got {shapes}") from None
-    matrix: Tensor = torch.stack(mount_elements(angles.cos().unbind(), angles.sin().unbind()), -1).unflatten(-1, (3, 3))
-    return matrix
+    elements = mount_elements(angles.cos().unbind(), angles.sin().unbind())
+    return torch.unflatten(torch.stack(elements, -1), -1, (3, 3))
 
 
 def mount_elements(cosines: Sequence[Any], sines: Sequence[Any]) -> tuple[Any, ...]:

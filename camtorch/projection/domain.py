@@ -44,9 +44,8 @@ class Domain:
     """The lenses of cameras (C,), graph-free, and their domains.
 
     A point (a, b) of the chart's plane is in the domain if its lens is regular all the way from the centre: up to the
-    fold of a radial lens, and of one whose other stages change distances little on the image of the radial one. Of
-    others it is known from bounds of their terms how far out they certainly are; the azimuths are followed only when a
-    point lies further out.
+    fold of a radial lens, and of one whose other stages change distances little. Of others bounds of their terms say
+    how far out they certainly are; the azimuths are followed only when a point lies further out.
     """
 
     optics: Optics
@@ -120,8 +119,7 @@ class Domain:
     def circle2(self) -> Tensor:
         """(C, 1): the squared radius of a circle of the image beyond which there is nothing, infinite where unknown.
 
-        Where it is finite the domain ends at the fold of a first, radial stage: those after it keep `_LEAST_SLOPE` on
-        its image. There the image has a limit that is found once, and the inverse goes stage by stage.
+        Finite where the domain ends at the fold of a first, radial stage: then the inverse goes stage by stage.
         """
         if self.lens.rest is None:
             return self.k.new_full((self.k.shape[0], 1), torch.inf)
@@ -149,10 +147,7 @@ class Domain:
 
     @_per_camera
     def inner2(self) -> Tensor:
-        """(C, 1): the squared radius up to which the lens is certainly regular; the fold itself where that is a circle.
-
-        It is one for radial lenses, and for those that are inverted stage by stage.
-        """
+        """(C, 1): the squared radius up to which the lens is certainly regular; of a fold that is a circle, its own."""
         if self.lens.is_radial or self.all_stagewise:
             inner = self._fold.to(self.k.dtype)
         else:
@@ -164,10 +159,7 @@ class Domain:
 
     @_per_camera
     def limits2(self) -> Tensor:
-        """(C, azimuths): the squared radius, up to the next azimuth, before which the orientation decides.
-
-        Zero where that is known of every radius.
-        """
+        """(C, azimuths): the squared radius, up to the next azimuth, before which the orientation decides; or 0."""
         if self.all_stagewise:
             return self.k.new_zeros(self.k.shape[0], AZIMUTHS)
         limits2 = self._followed[0]
@@ -213,9 +205,7 @@ class Domain:
 
 
 def regular(lens: Lens, a: Tensor, b: Tensor, to_edge: bool = True) -> Tensor:
-    """Positive where the lens is regular at the point itself, which is no further out than it goes, and its inverse has
-    a derivative. to_edge: not beyond where it ends, either.
-    """
+    """Return what is positive where a lens is regular, up to its edge or beyond, so that its inverse is smooth."""
     at = lens.at(a, b)
     edge = at.edge if to_edge else None
     least = at.orientation if edge is None else torch.minimum(at.orientation, edge)

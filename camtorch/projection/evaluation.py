@@ -62,9 +62,8 @@ def evaluate_rows(
 ) -> tuple[Tensor, Tensor]:
     """Return planes (size, C, N), and valid (C, N), of rows (C, N, size) seen by cameras of this model.
 
-    The one place that decides the regime: the compiled geometry on a CPU where torch neither traces nor transforms,
-    else the formula, recorded by torch. lead: the batch dims that C counts. cameras_of: what is kept of the tensors,
-    if others than this camera are meant.
+    The one place that decides the regime: compiled, or recorded by torch. lead: the batch dims that C counts.
+    cameras_of: what is kept of the tensors, if others than this camera are meant.
     """
     intrinsics, distortion = per_row(tensors[0], lead, rows), per_row(tensors[1], lead, rows)
     inputs = rows, intrinsics, distortion
@@ -89,8 +88,7 @@ def evaluate_rows(
 def compiled_of(cameras: Sequence[CameraLike], *values: Tensor) -> tuple[list[Native], bool] | None:
     """Return the compiled geometry of cameras, each (B,) or single, and whether any of them is a batch.
 
-    None if `evaluate_rows` would take another regime for values of the dtype of the first, if the result would have a
-    graph, and of cameras of several models, or behind a shutter.
+    None if `evaluate_rows` would record values of the dtype of the first, for several models, and behind a shutter.
     """
     pairs, dtype, is_batch, inputs = [], values[0].dtype, False, [*values]
     for camera in cameras:

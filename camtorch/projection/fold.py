@@ -30,11 +30,9 @@ _SPAN = 12  # how many azimuths the rim may go on from one to the next, and besi
 def limits_and_extent(optics: Optics, k: Tensor) -> tuple[Tensor, Extent]:
     """Follow lenses of coefficients (C, n) that are not radial outwards on azimuths of the chart's plane. Graph-free.
 
-    Returns (C, azimuths), the squared radius, up to the next azimuth, before which the orientation decides; and the
-    extents. The orientation (positive where the lens is regular) is lost at the first node where it is not positive,
-    or at the bottom of a parabola through three nodes that dips below zero between them. Up to there it changes its
-    sign once at the most, so that its value at the point itself tells exactly on which side of the fold the point lies.
-    Such a lens mostly folds where its radial factor does: there the radii are dense.
+    Returns the squared radius (C, azimuths), up to the next azimuth, before which the orientation decides, and extents.
+    The orientation is lost at the first node where it is not positive, or at the bottom of a parabola through three
+    nodes that dips below zero. Up to there it changes its sign once at the most: its value at a point tells the side.
     """
     chart, lens = optics(columns(k))
     radii = _around(lens.radial, chart, chart.radii(_RADII, k)).expand(k.shape[0], -1)
@@ -58,9 +56,7 @@ def limits_and_extent(optics: Optics, k: Tensor) -> tuple[Tensor, Extent]:
 
 
 def _followed(chart: Chart, lens: Lens, radii: Tensor, a: Tensor, b: Tensor) -> tuple[Tensor, ...]:
-    """At which node the lens is lost on the azimuths of directions (M,), how far out the lens sends
-    each radius, the largest of that, and where it sends the last point.
-    """
+    """Return on azimuths (M,) the node where a lens is lost, how far it sends radii, the furthest, its last point."""
     a, b = a.unsqueeze(-1), b.unsqueeze(-1)
     at = lens.at(a * radii, b * radii)
     lost = _lost(lens, a, b, radii, at.orientation)
@@ -92,10 +88,7 @@ class Extent(NamedTuple):
     furthest: Tensor
 
     def start(self, camera: Tensor, target: Tensor, a: Tensor, b: Tensor) -> Tensor:
-        """The radius (M,) at which the lens of each point's camera nearly reaches `target` on the azimuth of (a, b).
-
-        Looked for before the fold only: a target that is not reached ends up next to it.
-        """
+        """Return the radius (M,) before the fold at which a point's lens nearly reaches `target` towards (a, b)."""
         row = camera * AZIMUTHS + azimuth(a, b, 0.5)
         table = self.reach.flatten()
         size = self.radii.shape[-1]
@@ -125,10 +118,7 @@ def _envelope(furthest: Tensor, x: Tensor, y: Tensor) -> Tensor:
 
 
 def _lost(lens: Lens, a: Tensor, b: Tensor, radii: Tensor, orientation: Tensor) -> Tensor:
-    """(M,): `first_loss`, where dips between coarse nodes count only if a closer look finds them.
-
-    a, b: (M, 1) directions. radii, orientation: (M, S).
-    """
+    """Return `first_loss` (M,), where dips between coarse nodes (M, S) count only if a closer look finds them."""
     last = orientation.shape[-1] - 1
     steps = torch.linspace(-1, 1, _DIP, dtype=orientation.dtype, device=orientation.device)
 

@@ -22,10 +22,7 @@ INVALID_PIXEL = -1.0  # outside every image, so that `contains` is False for it 
 
 
 def _normalise(chart: Chart, x: Tensor, y: Tensor, z: Tensor) -> tuple[Planes3, Tensor]:
-    """Points as rays with their largest component near 1, and the mask of those that the chart covers.
-
-    Invalid: not finite, the origin, or not covered; the axis takes their place.
-    """
+    """Return rays, their largest component near 1, the axis for what is invalid, and the mask of those covered."""
     x_0, y_0, z_0 = x.detach(), y.detach(), z.detach()
     size = torch.maximum(torch.maximum(x_0.abs(), y_0.abs()), z_0.abs())
     # NaN fails both comparisons; nearer to the origin the derivative leaves the floating-point range

@@ -30,10 +30,7 @@ _FIRST_STEPS, _LATE_STEPS = 6, 54  # the late ones lie next to a fold, or so far
 
 
 def search(domain: Domain, camera: Tensor, u: Tensor, v: Tensor) -> Found:
-    """The point in the domain that the lens sends to (u, v), and whether there is one: planes (M,) of single points.
-
-    camera: (M,) the index of each point's camera. Takes many steps, and finds what lies next to a fold as well.
-    """
+    """Return points (M,) in the domain that the lens of a `camera` (M,) sends to (u, v), and whether there are any."""
     if domain.lens.is_radial:
         return _Search(domain, camera)(u, v)
     if domain.is_constant:
@@ -163,12 +160,10 @@ class _Search:
         return a, b
 
     def _newton(self, u: Tensor, v: Tensor, a: Tensor, b: Tensor, steps: int) -> Found:
-        """Each step is shortened until it comes nearer and stays in the domain.
+        """Return points, and which of them would still move, after steps that come nearer and stay inside.
 
         Nearer in Deuflhard's sense: the next step by the same Jacobian is shorter. Where a lens stretches one direction
         far more than the other, the residual itself would reject every good step.
-
-        Returns the points, and which of them would still move.
         """
         enough = rounding(u, v) / 8
 
@@ -197,10 +192,7 @@ class _Search:
         return a, b, active
 
     def _start(self, u: Tensor, v: Tensor) -> Planes2:
-        """The best of some points that the lens sends as far out as (u, v), each on another azimuth.
-
-        The azimuth is followed by the secant method: it is nearly that of (u, v), unless a prism dominates.
-        """
+        """Return the best of some points that the lens sends as far out as (u, v), their azimuths by secants."""
         target, wanted = (u * u + v * v).sqrt(), torch.atan2(v, u)
         extent = self.domain.extent
 

@@ -34,11 +34,7 @@ class Found(NamedTuple):
 
 
 def invert(domain: Domain, u: Tensor, v: Tensor) -> Found:
-    """The point that the lens sends to (u, v), from a table and a few steps of Newton's method.
-
-    What is solved is the solution in the domain, to rounding: the last step was so short that the next one would be
-    nothing. What is not, and yet possible, is left to `search`.
-    """
+    """Return what the lens sends to (u, v), by a table and Newton's method; what is open is left to `search`."""
     if domain.lens.is_radial:
         return _invert_radial(domain, u, v)
     if domain.all_stagewise:
@@ -63,10 +59,7 @@ def invert(domain: Domain, u: Tensor, v: Tensor) -> Found:
 
 
 def _invert_stagewise(domain: Domain, u: Tensor, v: Tensor) -> Found:
-    """The stages after the radial one first: only that one has a limit, and what it would have to reach tells at once.
-
-    Pixels beyond the image of every ray are never solved for.
-    """
+    """Invert the later stages first: the radial one alone has a limit. No pixel beyond every ray is solved for."""
     first, within = _first_image(domain, u, v)
     found = _invert_radial(domain, first.a, first.b)
     known = first.solved > 0
@@ -133,10 +126,7 @@ def attach(lens: Lens, solution: Planes2, target: Planes2, steps: int) -> Planes
 
 
 def _to_target(u: Tensor, v: Tensor, intrinsics: tuple[Tensor, ...]) -> tuple[Planes2, Tensor]:
-    """Pixels as points (p, q) of the sensor in focal lengths; the centre where the mask is 0.
-
-    Invalid: pixels that are no numbers, or so large that a square overflows.
-    """
+    """Return pixels as points (p, q) of the sensor in focal lengths; the centre for NaN or where squares overflow."""
     focal_x, focal_y, centre_x, centre_y = intrinsics
     p, q = (u - centre_x) / focal_x, (v - centre_y) / focal_y
     far = torch.maximum(p.detach().abs(), q.detach().abs())

@@ -31,10 +31,7 @@ def as_depth(depth: Numbers, kind: str, size: tuple[int, int], owner: str, devic
 
 
 def depth_scale(depth: Tensor, rays: Tensor, valid: Tensor, kind: str) -> tuple[Tensor, Tensor]:
-    """Return how far along unit rays (*B, H, W, 3) the points of depths lie, (*B, H, W), and which depths count.
-
-    depth: whatever broadcasts against the rays without their last dim. kind: one of `KINDS`.
-    """
+    """Return how far along unit rays (*B, H, W, 3) depths of a kind, which broadcast, lie; and which count."""
     z = rays[..., 2]
     ahead = valid & (z > 0) if kind == "z" else valid
     good = ahead & torch.isfinite(depth) & (depth > 0)

@@ -72,10 +72,7 @@ def over_image(
     stride: int,
     function: Callable[[Tensor], tuple[Tensor, ...]],
 ) -> tuple[Tensor, ...]:
-    """What a function makes of all pixels or patches (*B, H, W, 2) of a camera, kept where nothing of `inputs` learns.
-
-    Not of more than half a million pixels or patches.
-    """
+    """Return what a function makes of all pixels or patches (*B, H, W, 2); few are kept while no `inputs` learn."""
 
     def compute() -> tuple[Tensor, ...]:
         grid = camera.pixel_grid(stride)
@@ -152,8 +149,8 @@ def tangents(camera: CameraLike, pixels: Tensor) -> Tangents:
 def local_frames(at: Tangents) -> tuple[Tensor, Tensor, Tensor]:
     """Rotations (..., 3, 3) to local frames, pixels per unit of their planes (..., 2, 2), and valid (...) bool.
 
-    The local z axis is the ray, and x goes where the ray does as the pixel goes right. So the derivative of the plane
-    by the pixel is upper triangular, and its inverse as well. Both are identities where they are not valid.
+    The local z axis is the ray, and x goes where the ray does as the pixel goes right, so that the derivative of the
+    plane by the pixel is upper triangular. Both are identities where they are not valid.
     """
     turned = (torch.linalg.cross(at.across, at.down) * at.rays).sum(-1)
     valid = at.valid & torch.isfinite(turned) & (turned > torch.finfo(turned.dtype).tiny)

@@ -66,10 +66,7 @@ def angles_from_axis(rays: Tensor) -> Tensor:
 
 
 def slopes_at_axis(optics: Optics, k: Tensor) -> Tensor:
-    """Derivatives (C, 2) of the point on the sensor by x and y of the ray (x, y, 1), at the axis; k: (C, n).
-
-    One where the coefficients make no lens. Graph-free.
-    """
+    """Return derivatives (C, 2) of the point on the sensor by x and y of a ray (x, y, 1) at the axis, graph-free."""
 
     def to_sensor(x: Tensor, y: Tensor) -> tuple[Tensor, ...]:
         chart, lens = optics(columns(k.detach().clone()))
@@ -99,8 +96,7 @@ def reach(
 ) -> Tensor:
     """Return the angle (*B, K) up to `most` before which all rays towards azimuths (K,) are covered: 0 if none is.
 
-    covers: from unit rays (*B or nothing, K, S, 3) to bool (*B, K, S). The first round goes over everything, each later
-    one over the step of the one before in which the end lies.
+    covers: from unit rays (*B or nothing, K, S, 3) to bool (*B, K, S). Later rounds go over a step of the one before.
     """
     share = torch.linspace(0, 1, steps + 1, dtype=azimuths.dtype, device=azimuths.device)
     low, width = azimuths.new_zeros(len(azimuths), 1), most
@@ -128,10 +124,7 @@ def around_ends(share: Tensor, valid: Tensor) -> Tensor:
 
 @torch.no_grad()
 def field_of_view(camera: CameraLike) -> Tensor:
-    """(*B, 3) radians: horizontal and vertical through the principal point, and on the wider diagonal of the image.
-
-    From outer edge to outer edge, or as far as there are rays; 0 where there are none. Graph-free.
-    """
+    """Return radians (*B, 3) along lines of the image, between outer edges or as far as there are rays; graph-free."""
     low, high = image_edges(camera._size_for("field_of_view"), camera.intrinsics)
     (left, top), (right, bottom) = low, high
     cx, cy = camera.intrinsics.expand(*camera.batch_shape, 4)[..., 2:].clamp(low, high).unbind(-1)
@@ -156,11 +149,7 @@ def field_of_view(camera: CameraLike) -> Tensor:
 
 @torch.no_grad()
 def focal_for(camera: CameraLike, fov: Tensor, image_size: tuple[int, int], axis: str) -> tuple[Tensor, Tensor]:
-    """Return the focal length (*B,) at which an image with its centre on the axis has a field of view; and whether.
-
-    If none has it, it is the focal length of the widest. camera: of focal length 1 and principal point 0; float64.
-    fov: (*B,) radians between outer edges, of the wider diagonal for "diagonal".
-    """
+    """Return the focal length (*B,), of a camera of 1, with a `fov` in radians, or the widest; and whether it has."""
     height, width = image_size
     ends = {"horizontal": [(width, 0)], "vertical": [(0, height)], "diagonal": [(width, height), (width, -height)]}
     half = fov.new_tensor(ends[axis]) / 2

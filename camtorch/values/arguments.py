@@ -74,10 +74,7 @@ _INSIDE = tuple(os.path.dirname(file) + os.sep for file in (os.path.dirname(__fi
 
 
 def as_real(value: Numbers, name: str, owner: str, device: torch.device | None = None) -> Tensor:
-    """Return floating-point finite numbers: the tensor itself, or one made of an array, a list, or a list of arrays.
-
-    Lists and integers take torch's default dtype, arrays and tensors keep theirs. A tensor must be on `device`, if any.
-    """
+    """Return floating-point finite numbers: a tensor itself; lists and integers take torch's default dtype."""
     if type(value) in (list, tuple) and {float, int}.issuperset(map(type, value)):  # type: ignore[arg-type]
         value = torch.tensor(value, dtype=torch.get_default_dtype(), device=device)
     elif not isinstance(value, Tensor):

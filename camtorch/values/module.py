@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, ClassVar, ParamSpec, TypeVar, cast
@@ -200,10 +201,9 @@ class BatchedModule(GeometryModule):
         for name in self.tensor_names:
             tensor = getattr(self, name)
             try:
-                rows = tensor.expand(*self.batch_shape, tensor.shape[-1])[key]
+                tensors[name] = tensor.expand(*self.batch_shape, tensor.shape[-1])[key]
             except (IndexError, TypeError, ValueError, RuntimeError) as error:
                 raise refused_index(self, index, error) from None
-            tensors[name] = rows
         return remade(self, **tensors)
 
     def __len__(self) -> int:
@@ -256,6 +256,19 @@ class BatchedModule(GeometryModule):
         """This module with every one of its tensors (*B, n) changed by the same function."""
         return remade(self, **{name: change(getattr(self, name)) for name in self.tensor_names})
 
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain numbers, strings and lists, as camtorch's JSON has them.
+
+        Returns:
+            Of a camera the keys model, intrinsics, distortion_names and distortion if there is any, and image_size; of
+            a pose rotation and translation; and "dtype": "float32" unless it is float64. `from_dict` gives the same
+            numbers, to the last bit; whether they learn is not kept.
+
+        Raises:
+            TypeError: If it is a `Mixed`, or a model without a key. ValueError: If a number is not finite.
+        """
+        return cast("dict[str, Any]", importlib.import_module("camtorch.io.camtorch_json").dict_of(self))
+
 
 Made = TypeVar("Made", bound=BatchedModule)
 
@@ -266,10 +279,7 @@ def model_of(module: Made) -> type[Made]:
 
 
 def remade(module: Made, **changes: Any) -> Made:
-    """Return the module with other tensors and attributes, which are not checked, nor copied.
-
-    A Parameter and a tensor of a graph are kept as they are, any other tensor by a Parameter that does not learn.
-    """
+    """Return the module with other attributes and tensors, which are `fixed`, neither checked nor copied."""
     model: Any = model_of(module)
     tensors = {name: changes.pop(name) if name in changes else getattr(module, name) for name in module.tensor_names}
     if torch.compiler.is_compiling() and "image_size" in module.__dict__:

@@ -23,14 +23,11 @@ R = TypeVar("R")
 
 
 def spread(work: Callable[[], object], threads: int) -> None:
-    """Run the same function on several threads at once: on this one, and on workers that wait for such.
+    """Run work on up to so many threads at once: on this one, and on workers that wait for such.
 
-    The function takes what there is to do from somewhere, piece by piece, until nothing is left. Most of its time it
-    must not hold the GIL, and in a worker it finds the state of torch that a new thread has.
-
-    Who is needed for nothing is not waited for: a worker that has not begun when this thread's own run ends, because it
-    found no core, does not begin any more. `threads` are those at most, this one included; the first exception that any
-    run raised is raised after all have ended.
+    The function takes what there is to do from somewhere, piece by piece, mostly without the GIL. A worker that found
+    no core before this thread's own run ends does not begin any more. The first exception of any run is raised after
+    all have ended.
     """
     if threads <= 1 or sys.is_finalizing():  # a new thread would never begin
         work()

@@ -47,10 +47,7 @@ class Way(NamedTuple):
 
 
 class MirrorWarp(Warp):
-    """A `Warp` whose rotation, not checked, may be a mirror as well: `ray_target = Q ray_source`, Q orthogonal.
-
-    With antialias=None images that shrink by more than one and a half are halved before, which takes less time.
-    """
+    """A `Warp` whose rotation may be a mirror; with antialias=None it halves images that shrink by more than 1.5."""
 
     map: Map | None = None
 

@@ -65,10 +65,7 @@ def edges_of(boxes: Tensor) -> Tensor:
 
 
 def enclosing(boxes: Tensor, moved: Tensor, on_image: Tensor) -> tuple[Tensor, Tensor] | None:
-    """Return `moved_boxes` of plain boxes (..., 4) whose `edges_of` went to `moved` (..., N, 2), or not, (-1, -1).
-
-    None if one is moved in part, off the image, or turned inside out. on_image: (..., N).
-    """
+    """Return `moved_boxes` of plain boxes (..., 4) whose `edges_of` went to `moved` (..., N, 2); None if not whole."""
     places, seen, given = moved.numpy(), on_image.numpy(), boxes.numpy()
     if not seen.all() and not (seen.any(-1).all() and (seen | (places != -1).any(-1)).all()):
         return None
@@ -90,10 +87,7 @@ def lattice_of(corners: Tensor, steps: int) -> Tensor:
 
 
 def turned(lattice: Tensor, mirrored: bool = False) -> Tensor:
-    """(..., 4, 2): the corners of rectangles along the middle rows of moved lattices, about all points but (-1, -1).
-
-    mirrored: whether they go round the other way, and along their rows backwards. Without any point all are -1.
-    """
+    """Return corners (..., 4, 2) of rectangles along the middle rows of moved lattices, which a mirror turns; or -1."""
     steps = math.isqrt(lattice.shape[-2])
     middle = lattice.unflatten(-2, (steps, steps))[..., steps // 2, steps // 2 - 1 : steps // 2 + 2, :]
     found, known = (lattice != -1).any(-1), (middle != -1).any(-1)[..., [0, 2]].all(-1)

@@ -68,10 +68,7 @@ def warped(
     matrix: Tensor | None = None,
     by: Callable[..., tuple[Tensor, ...]] | None = None,
 ) -> Tensor:
-    """The images (B, C, h, w) of a warp; arguments as of `Warp`, and the padding of `on_lattice`.
-
-    By another operator than that of a `Warp`, the map of an edit is for.
-    """
+    """Return images (B, C, h, w) of a warp, or of an edit `by` another operator, which has a map; see `Warp`."""
     turned = None if rotation is None else rotation.detach()
     # numbers as words: integers of fills may be ids, which no float holds
     options = str(antialias), padding, how.mode, how.padding_mode, ",".join(map(repr, how.fill))

@@ -141,8 +141,7 @@ def middle_lines(
 ) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]]:
     """Return an image's middle row and column on a projection's plane, (*B, N, 2) and shown (*B, N), level first.
 
-    Corners would have a wide lens fill a panorama with what hardly any pixel shows. The plane, of focal length 1, is
-    cut at the limit (2,): what is beyond it shows that there is something up to it.
+    Corners would have a wide lens fill a panorama with what hardly any pixel shows. The plane is cut at the limit (2,).
     """
     found = []
     for line in (image_lattice(camera, 3, 3)[1], image_lattice(camera, 3, 3)[:, 1]):

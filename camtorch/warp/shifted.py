@@ -22,10 +22,9 @@ _MOST_GAPS = 8  # px between pixels that were neighbours, of an image that is en
 
 
 class ShiftedWarp(Warp):
-    """A warp to a camera at another place: `p_target = R (p_source - shift)`, for images whose depth is known.
+    """A warp to a camera at another place: `p_target = R (p_source - shift)`, for images of depth (B, 1, H, W).
 
-    Each ray of the target is followed to the nearest surface that the source sees; what it does not see, or has no
-    depth (B, 1, H, W), is not mapped. Pixels have the depth of their place in the source's image.
+    Each ray of the target is followed to the nearest surface that the source sees; what it does not see is not mapped.
     """
 
     is_an_operator: ClassVar[bool] = False

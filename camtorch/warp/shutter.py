@@ -280,10 +280,7 @@ class InMotion:
         return self.shutter.turned(rays, self.shutter._share(pixels, self.size), 1.0), valid
 
     def project(self, rays: Tensor) -> tuple[Tensor, Tensor]:
-        """Return pixels and valid as of a camera, not where the scene passes as fast as rows are read, or faster.
-
-        When a ray is seen depends on where: a step of Newton's method has the derivatives of the solution.
-        """
+        """Return pixels and valid, False where the scene passes as fast as rows are read, or faster."""
         rays, _ = as_points(rays, "points", 3, self.batch_shape, self.camera._tensors[:1], "Warp")
         side = self.size[1 if self.shutter.direction in ("right", "left") else 0]
 
@@ -303,7 +300,7 @@ class InMotion:
                 share = (share + step.clamp(-0.5, 0.5)).clamp(-_BEYOND, _BEYOND)
             h = 1e-4 if share.dtype == torch.float64 else 1e-2
             slope = (seen(share + h)[2] - seen(share - h)[2]) / (2 * h)
-        found = seen(share)[2]
+        found = seen(share)[2]  # a step of Newton's method from there has the derivatives of the solution
         off = found - share
         settled = (off.detach().abs() * side < _SETTLED) | (found.detach().abs() >= _BEYOND)
         settled = settled & ((1 - slope).abs() > _STILL)
