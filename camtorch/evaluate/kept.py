@@ -49,6 +49,10 @@ class Kept:
         self._kept, self.result = [(options, notes, result), *self._kept[: self.capacity - 1]], result
         return result
 
+    def is_of(self, inputs: Sequence[Tensor], options: tuple[Any, ...]) -> bool:
+        """Whether `result` is that of these inputs, whose values may be looked at, and options."""
+        return bool(self._kept) and options == self._kept[0][0] and all(map(same, inputs, self._kept[0][1]))
+
     def renew(self, compute: Callable[[], T]) -> T:
         """`compute()`, which is the result from now on."""
         if in_transform():  # what a transform makes dies with it

@@ -6,7 +6,7 @@ import ctypes
 import functools
 import math
 import struct
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
@@ -25,13 +25,11 @@ _TYPES = {torch.uint8: 0, torch.bool: 1, torch.uint16: 2, torch.float32: 3}
 _BYTES = {1: 4, 2: 5, 4: 6, 8: 7}
 _TILE = 1 << 15  # pixels of a tile, some 0.1 ms a channel
 _packed = struct.Struct("35q4iq").pack  # `Job` of sampler.h
-_Job = ctypes.c_char * struct.calcsize("35q4iq")
+_Job = ctypes.c_int64 * (struct.calcsize("35q4iq") // 8)
 CLASSIFICATION = "12q3di2q"
 """`Classification` of sampler.h."""
 _Classification = struct.Struct(CLASSIFICATION).pack
 SCRATCH = 25  # numbers of float32 for each column of a lattice and eight more
-Later = list[tuple["ctypes.Array[ctypes.c_char]", int, object]]
-"""Images that `finish` makes: how, in how many tiles, and what has to live until then."""
 _WORTH = 8  # pixels that may be copied for one that is made: interpolated one by one they would take longer
 
 
@@ -40,21 +38,8 @@ def takes(dtype: torch.dtype, mode: str) -> bool:
     return mode == "nearest" or dtype in _TYPES
 
 
-def sample(
-    images: Tensor,
-    result: Tensor,
-    mode: str,
-    padding: str,
-    fill: Sequence[float],
-    *,
-    grid: Tensor | None = None,
-    mapped: Tensor | None = None,
-    nodes: Tensor | None = None,
-    cells: Tensor | None = None,
-    exact: Tensor | None = None,
-    later: Later | None = None,
-) -> None:
-    """Write the samples of images into `result`, at the positions of a grid or of a lattice.
+class Call:
+    """A call of the sampler, ready for images of one form and positions that stay.
 
     All tensors are on the CPU and without a graph. Images (B, C, H, W) and results (B, C, h, w) are of one dtype, which
     `takes` knows, and may have any strides. `fill` has C values, of pixels that show nothing, which "zeros" blends in;
@@ -62,51 +47,73 @@ def sample(
     `grid_sample`, `mapped` (B or 1, h, w) bool says which there are; None where positions far outside say that there is
     none. Of a lattice `nodes` (B or 1, 2, n + 5, m + 5) of float32, the last two dims without gaps, are the positions
     at every eighth pixel, from the one at (-16, -16) on; `cells` (B or 1, n, m) int32, contiguous, are `EMPTY`, `CUBIC`
-    or the cell's place in `exact`, (2, K, 8, 8) of float32, contiguous: positions, NaN where there is none. `later`
-    gets what is to be done, if this is to be done by `finish`, together with other images.
+    or the cell's place in `exact`, (2, K, 8, 8) of float32, contiguous: positions, NaN where there is none.
     """
-    if library() is None or 0 in result.shape:
-        return
-    if not is_quick(images, result, mode) and math.prod(images.shape[2:]) <= _WORTH * math.prod(result.shape[2:]):
-        where = {"grid": grid, "mapped": mapped, "nodes": nodes, "cells": cells, "exact": exact}
-        together = _are_together(result, mode)
-        fits = together or result.stride(3) == 1
-        made = result if fits else torch.empty(result.shape, dtype=result.dtype, device="cpu")
+
+    def __init__(
+        self,
+        images: Tensor,
+        size: tuple[int, int],
+        mode: str,
+        padding: str,
+        fill: Sequence[float],
+        *,
+        grid: Tensor | None = None,
+        mapped: Tensor | None = None,
+        nodes: Tensor | None = None,
+        cells: Tensor | None = None,
+        exact: Tensor | None = None,
+        out: Tensor | None = None,
+    ):
+        self._make = maker(images, images.shape[0], size)
+        shape = (*images.shape[:2], *size)
+        result = _empty(shape, images.dtype, layout(images), "meta") if out is None else out
+        self._layout: torch.memory_format | None = None  # of the copies of images that lie oddly in memory
+        self._is_copied = False  # whether results lie so as well
+        if not is_quick(images, result, mode) and math.prod(images.shape[2:]) <= _WORTH * math.prod(size):
+            together = _are_together(result, mode)
+            self._layout = torch.channels_last if together else torch.contiguous_format
+            self._is_copied = not together and result.stride(3) != 1
+            result = torch.empty(result.shape, dtype=result.dtype, device="cpu") if self._is_copied else result
+            images = self._copied(images)
+        on_grid, on_lattice, masks = [0] * 6, [0] * 9, [0] * 2
+        if grid is not None:
+            on_grid = [grid.data_ptr(), _shared(grid), *grid.stride()[1:], grid.dtype == torch.float64]
+            if mapped is not None:
+                mapped = mapped.contiguous()
+                masks = [mapped.data_ptr(), _shared(mapped)]
+        if nodes is not None and cells is not None and exact is not None:
+            (_, rows, columns), at = cells.shape, (exact.data_ptr(), exact.stride(0)) if exact.shape[1] else (0, 0)
+            on_lattice = [nodes.data_ptr(), _shared(nodes), nodes.stride(1), cells.data_ptr(), _shared(cells)]
+            on_lattice += [rows, columns, *at]
+        self._tiles = 0 if 0 in result.shape else tiles_of(result)
+        if self._tiles:
+            text, kept = packed(images, result, mode, padding, fill, (*on_grid, *masks, *on_lattice))
+            self._words = _Job.from_buffer_copy(text)
+            self._holds = grid, mapped, nodes, cells, exact, kept
+
+    def _copied(self, images: Tensor) -> Tensor:
         source = images if images.stride(0) else images[:1]  # which all results show
-        source = source.clone(memory_format=torch.channels_last if together else torch.contiguous_format)
-        sample(source.expand(images.shape), made, mode, padding, fill, **where, later=None)
-        if not fits:
-            result.copy_(made)
-        return
-    on_grid, on_lattice, masks = [0] * 6, [0] * 9, [0] * 2
-    if grid is not None:
-        on_grid = [grid.data_ptr(), _shared(grid), *grid.stride()[1:], grid.dtype == torch.float64]
-        if mapped is not None:
-            mapped = mapped.contiguous()
-            masks = [mapped.data_ptr(), _shared(mapped)]
-    if nodes is not None and cells is not None and exact is not None:
-        (_, rows, columns), at = cells.shape, (exact.data_ptr(), exact.stride(0)) if exact.shape[1] else (0, 0)
-        on_lattice = [nodes.data_ptr(), _shared(nodes), nodes.stride(1), cells.data_ptr(), _shared(cells)]
-        on_lattice += [rows, columns, *at]
-    job, kept = packed(images, result, mode, padding, fill, (*on_grid, *masks, *on_lattice))
-    jobs = [] if later is None else later
-    holds = images, result, grid, mapped, nodes, cells, exact, kept
-    jobs.append((_Job.from_buffer_copy(job), tiles_of(result), holds))
-    if later is None:
-        finish(jobs)
+        assert self._layout is not None
+        return source.clone(memory_format=self._layout).expand(images.shape)
 
-
-def finish(jobs: Later) -> None:
-    """Write the samples that `sample` has left for later."""
-    native = library() if jobs else None
-    if native is None:
-        return
-
-    def work() -> None:
-        for job, _, _ in jobs:
+    def __call__(self, images: Tensor, out: Tensor | None = None) -> Tensor:
+        """Return the samples of images, written to `out` if given; that lies in memory as it did at first."""
+        result = self._make() if out is None else out
+        if not self._tiles:
+            return result
+        if self._layout is not None:
+            images = self._copied(images)
+        made = torch.empty(result.shape, dtype=result.dtype, device="cpu") if self._is_copied else result
+        job = _Job.from_buffer_copy(self._words)  # of this call alone, for several threads may be calling
+        job[0], job[1] = images.data_ptr(), made.data_ptr()
+        native, threads = library(), min(thread_count(), self._tiles)
+        assert native is not None  # who made the call has looked
+        if threads == 1:
             native.camtorch_sample(job)
-
-    spread(work, min(thread_count(), sum(tiles for _, tiles, _ in jobs)))
+        else:
+            spread(lambda: native.camtorch_sample(job), threads)
+        return result if made is result else result.copy_(made)
 
 
 def packed(
@@ -170,13 +177,18 @@ def layout(images: Tensor) -> torch.memory_format:
 
 def empty(images: Tensor, count: int, size: tuple[int, int]) -> Tensor:
     """(count, C, *size) of the dtype of images (_, C, H, W), and with the channels last in memory if they have them."""
+    return maker(images, count, size)()
+
+
+def maker(images: Tensor, count: int, size: tuple[int, int]) -> Callable[[], Tensor]:
+    """Return what makes results as of `empty`."""
     shape, dtype = (count, images.shape[1], *size), images.dtype
     make = memory.empty if math.prod(shape) * dtype.itemsize >= memory.LEAST else _empty
-    return make(shape, dtype, layout(images))
+    return functools.partial(make, shape, dtype, layout(images))
 
 
-def _empty(shape: tuple[int, ...], dtype: torch.dtype, layout: torch.memory_format) -> Tensor:
-    return torch.empty(shape, dtype=dtype, device="cpu", memory_format=layout)
+def _empty(shape: tuple[int, ...], dtype: torch.dtype, layout: torch.memory_format, device: str = "cpu") -> Tensor:
+    return torch.empty(shape, dtype=dtype, device=device, memory_format=layout)
 
 
 def classify(

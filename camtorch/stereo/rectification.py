@@ -14,7 +14,6 @@ from camtorch.cameras.camera import Camera
 from camtorch.evaluate.kept import Kept
 from camtorch.evaluate.known import known_false
 from camtorch.models import Cylindrical, Equirectangular, LatLon, Pinhole, TransverseCylindrical
-from camtorch.native.sampler import Later, finish
 from camtorch.poses.extrinsics import Extrinsics
 from camtorch.poses.rotations import rotation_matrix, skew_matrix
 from camtorch.values.arguments import (
@@ -30,10 +29,9 @@ from camtorch.values.arguments import (
     shown,
 )
 from camtorch.values.module import GeometryModule, typed_as
-from camtorch.warp import routes
 from camtorch.warp.dewarp import middle_lines
 from camtorch.warp.proxy import check_pose
-from camtorch.warp.warp import Warp, as_sized, checked
+from camtorch.warp.warp import Warp, as_sized
 
 Projection = Literal["perspective", "latlon", "cylindrical"]
 Align = Literal["mean", "opencv"]
@@ -116,12 +114,7 @@ class Rectification(GeometryModule):
 
     def forward(self, left: Tensor, right: Tensor) -> tuple[Tensor, Tensor]:
         """Both images, (B, C, H, W) each, rectified."""
-        later: Later = []  # threads share both: they are waited for once
-        of_left, of_right = (
-            routes.warped(warp, images, checked(warp, images, None, None, None), later)
-            for warp, images in zip(self._warps(), (left, right), strict=True)
-        )
-        finish(later)
+        of_left, of_right = (warp(images) for warp, images in zip(self._warps(), (left, right), strict=True))
         return of_left, of_right
 
     if TYPE_CHECKING:

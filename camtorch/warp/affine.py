@@ -21,7 +21,7 @@ from camtorch.values.dtypes import SIGNED, as_pixels, narrow, widen
 from camtorch.warp import compiled
 from camtorch.warp.grid import STEP, Lattice, Sampling, coarse, straight_lattice
 from camtorch.warp.panorama import lengths
-from camtorch.warp.routes import Route, lengthened, positions, route_of, warped
+from camtorch.warp.plan import Route, lengthened, positions, route_of, warped
 from camtorch.warp.sampling import SHRINKS, PaddingMode, Sampler, render
 from camtorch.warp.warp import Warp, checked
 

@@ -43,7 +43,7 @@ Sizes = tuple[tuple[int, int], tuple[int, int]]
 
 def _is_used_once(warp: Warp) -> bool:
     """Whether its positions come from a lattice that nobody keeps, of cameras that stand still and do not go round."""
-    if not warp.is_an_operator or warp._pinned is not None or not warp.tolerance or warp.antialias:
+    if not warp.is_an_operator or warp.is_pinned or not warp.tolerance or warp.antialias:
         return False
     return goes_round(warp.source) is None and goes_round(warp.target) is None
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, ClassVar
 
 import torch
@@ -9,14 +10,17 @@ from torch import Tensor, nn
 from typing_extensions import Self
 
 from camtorch.cameras.camera import Camera
+from camtorch.evaluate.door import in_transform
 from camtorch.evaluate.kept import Kept
+from camtorch.native.sampler import Call
 from camtorch.values.arguments import Numbers, broadcast_shapes
 from camtorch.values.module import GeometryModule
 from camtorch.warp.grid import Lattice, Sampling, locate
 from camtorch.warp.moving import moved_pixels
 from camtorch.warp.panorama import Seam, seam_of
-from camtorch.warp.sampling import Options, PaddingMode
+from camtorch.warp.sampling import Mode, Options, PaddingMode
 
+_MOST_CALLS = 8
 _SINGLE = 1e-3  # pixels: some ulps of a position in an image a thousand pixels wide, computed in float32
 
 
@@ -30,6 +34,38 @@ def _part(held: str, name: str) -> Any:
     return property(part)
 
 
+class Plan:
+    """The positions of a warp while its cameras stay, or once and for all, and calls that are ready for some images."""
+
+    def __init__(self, pinned: Sampling | Lattice | None = None, padding: PaddingMode = "zeros"):
+        """pinned: positions that serve a padding, which stay whatever becomes of the cameras."""
+        self.is_pinned, self.is_kept = pinned is not None, True
+        self.positions: dict[str, Sampling | Lattice] = {} if pinned is None else {padding: pinned}
+        self.calls: dict[tuple[object, ...], Call] = {}
+
+    def positions_for(self, padding: str, compute: Callable[[], Sampling | Lattice]) -> Sampling | Lattice:
+        """`compute()` without a graph, or its kept result; positions that are exact serve every padding."""
+        found = next(iter(self.positions.values()), None) if self.is_pinned else None
+        found = found if isinstance(found, Sampling) else self.positions.get(padding)
+        if found is not None:
+            return found
+        if not self.is_kept or in_transform():  # what a transform makes dies with it
+            return compute()
+        with torch.inference_mode(False), torch.no_grad():  # what that makes could not be used in a graph later
+            self.positions[padding] = found = compute()
+        return found
+
+    def has(self, where: Sampling | Lattice) -> bool:
+        """Whether these positions are kept."""
+        return any(where is found for found in self.positions.values())
+
+    def keep(self, form: tuple[object, ...], call: Call) -> None:
+        """Keep a call for images of a form, and those of the last few other forms."""
+        self.calls[form] = call
+        while len(self.calls) > _MOST_CALLS:
+            self.calls.pop(next(iter(self.calls)), None)
+
+
 class CameraPair(GeometryModule):
     """What a `Warp` is beside its calls: source, target, rotation and options; and where target pixels lie."""
 
@@ -38,9 +74,9 @@ class CameraPair(GeometryModule):
     batch_shape: torch.Size
     padding_mode: PaddingMode
     _tolerance: float | None
-    _memos: dict[PaddingMode, Kept]
-    _constants: Kept
-    _pinned: Sampling | Lattice | None
+    mode: Mode
+    fill: tuple[float, ...]
+    _kept: Kept
     source: Camera = _part("_modules", "source")
     target: Camera = _part("_modules", "target")
     rotation: Tensor | None = _part("_buffers", "rotation")
@@ -57,9 +93,7 @@ class CameraPair(GeometryModule):
             fill=options["fill"],
             antialias=options["antialias"],
             _tolerance=options["tolerance"],
-            _memos={},
-            _pinned=None,
-            _constants=Kept(),
+            _kept=Kept(),
         )
         seam_of(source)  # while its values may be looked at: traced code asks for it too
 
@@ -69,6 +103,18 @@ class CameraPair(GeometryModule):
         if rotation is not None and rotation.shape[:-2] != self.batch_shape:
             self.batch_shape = broadcast_shapes(self.batch_shape, rotation.shape[:-2])
         return self
+
+    @property
+    def is_pinned(self) -> bool:
+        """Whether positions stay whatever becomes of the cameras."""
+        plan: Plan | None = self._kept.result
+        return plan is not None and plan.is_pinned
+
+    @property
+    def _options(self) -> tuple[object, ...]:
+        """What positions depend on in addition to `_inputs`."""
+        source, target = self._ends
+        return source._form, target._form, self.rotation is None, self.antialias, self._tolerance
 
     @property
     def tolerance(self) -> float:

@@ -51,28 +51,16 @@ def render(
     fill: tuple[float, ...],
     kept: dict[int, Pyramid] | None = None,
     out: Tensor | None = None,
-    later: sampler.Later | None = None,
 ) -> Tensor:
     """Return the images (B, C, h, W') that a warp makes of (B or 1, C, H, W), in their dtype.
 
     Half precision is sampled in float32; integers are rounded and stay in their range, bool is true from one half on.
-    What is computed in another dtype is copied in parts. `kept` holds halves of the images for the next call, `out`
-    takes a result without a graph, and `later` what compiled code is to do by `sampler.finish`.
+    What is computed in another dtype is copied in parts. `kept` holds halves of the images for the next call, and `out`
+    takes a result without a graph.
     """
-    dtype = images.dtype
-    cameras = where.cells.shape[0] if isinstance(where, Lattice) else where.grid.shape[0]
-    count = images.shape[0] if cameras == 1 else cameras
-    images = images if cameras == 1 else images.expand(count, -1, -1, -1)
-    if isinstance(where, Sampling) and mode == "nearest":
-        where = where._replace(scale=None)
-    if isinstance(where, Sampling) and not dtype.is_floating_point:
-        where = where._replace(grid=where.grid.detach())
     how = Sampler(mode, padding_mode, fill)
-    result = _natively(images, where, how, out, later)
-    if result is None:
-        result = _by_torch(images, where, how, kept)
-        result = laid_as(images, result) if out is None else out.copy_(result)
-    return result
+    call = prepared(images, where, how, out)
+    return by_torch(images, where, how, kept, out) if call is None else call(images, out)
 
 
 def laid_as(images: Tensor, result: Tensor) -> Tensor:
@@ -82,34 +70,48 @@ def laid_as(images: Tensor, result: Tensor) -> Tensor:
     return result.contiguous(memory_format=torch.channels_last)
 
 
-def _natively(
-    images: Tensor,
-    where: Sampling | Lattice,
-    how: Sampler,
-    out: Tensor | None = None,
-    later: sampler.Later | None = None,
-) -> Tensor | None:
-    """Return what compiled code makes; None with a graph, a transform, another device or dtype, or antialiasing."""
+def prepared(images: Tensor, where: Sampling | Lattice, how: Sampler, out: Tensor | None = None) -> sampler.Call | None:
+    """Return the call of compiled code for images (B or 1, C, H, W) of this form, of which results lie like `out`.
+
+    None with a graph, a transform, another device or dtype, or antialiasing.
+    """
     mode, padding_mode, fill = how
     positions = where.nodes if isinstance(where, Lattice) else where.grid
     if not (is_eager(images, positions) and native_available() and sampler.takes(images.dtype, mode)):
         return None
-    if (isinstance(where, Sampling) and where.scale is not None) or images.requires_grad or positions.requires_grad:
+    if images.requires_grad or (positions.requires_grad and images.dtype.is_floating_point):
         return None
-    values = fill * images.shape[1] if len(fill) == 1 else fill
+    fill = fill * images.shape[1] if len(fill) == 1 else fill
+    cameras = positions.shape[0]
+    images = images if cameras == 1 else images.expand(cameras, -1, -1, -1)
     if isinstance(where, Lattice):
-        result = sampler.empty(images, images.shape[0], where.size) if out is None else out
         at = where.single
         on = {"nodes": at.nodes, "cells": at.cells, "exact": at.exact}
-        sampler.sample(images, result, mode, padding_mode, values, **on, later=later)
-        return result
-    if positions.dtype not in (torch.float32, torch.float64):
+        return sampler.Call(images, where.size, mode, padding_mode, fill, **on, out=out)
+    if positions.dtype not in (torch.float32, torch.float64) or (where.scale is not None and mode != "nearest"):
         return None
-    result = sampler.empty(images, images.shape[0], (positions.shape[1], positions.shape[2])) if out is None else out
     # in "zeros" positions far outside say that there is none
     mapped = None if padding_mode == "zeros" else where.mapped
-    sampler.sample(images, result, mode, padding_mode, values, grid=positions, mapped=mapped, later=later)
-    return result
+    size = positions.shape[1], positions.shape[2]
+    return sampler.Call(images, size, mode, padding_mode, fill, grid=positions.detach(), mapped=mapped, out=out)
+
+
+def by_torch(
+    images: Tensor,
+    where: Sampling | Lattice,
+    how: Sampler,
+    kept: dict[int, Pyramid] | None = None,
+    out: Tensor | None = None,
+) -> Tensor:
+    """What `grid_sample` makes of images (B or 1, C, H, W); see `render`."""
+    cameras = where.cells.shape[0] if isinstance(where, Lattice) else where.grid.shape[0]
+    images = images if cameras == 1 else images.expand(cameras, -1, -1, -1)
+    if isinstance(where, Sampling) and how.mode == "nearest":
+        where = where._replace(scale=None)
+    if isinstance(where, Sampling) and not images.dtype.is_floating_point:
+        where = where._replace(grid=where.grid.detach())
+    result = _by_torch(images, where, how, kept)
+    return laid_as(images, result) if out is None else out.copy_(result)
 
 
 def _by_torch(images: Tensor, where: Sampling | Lattice, how: Sampler, kept: dict[int, Pyramid] | None) -> Tensor:
@@ -276,11 +278,9 @@ def sample(images: Tensor, grid: Tensor, mode: Mode, padding_mode: PaddingMode, 
 def _sample(images: Tensor, grid: Tensor, mode: Mode, padding_mode: PaddingMode, finite: bool = False) -> Tensor:
     """On a CPU, with work for every thread, of which grid_sample gives one to each image."""
     where = Sampling(grid[:1] if grid.stride(0) == 0 else grid, images.new_empty(0), None)
-    if (
-        padding_mode == "zeros"
-        and (native := _natively(images, where, Sampler(mode, padding_mode, (0.0,)))) is not None
-    ):
-        return native
+    call = prepared(images, where, Sampler(mode, padding_mode, (0.0,))) if padding_mode == "zeros" else None
+    if call is not None:
+        return call(images)
     threads = torch.get_num_threads()
     if len(images) >= threads:
         result = F.grid_sample(images, grid, mode, padding_mode, align_corners=False)

@@ -24,7 +24,7 @@ from camtorch.values.arguments import (
     one_of,
 )
 from camtorch.values.module import typed_as
-from camtorch.warp import routes
+from camtorch.warp import plan
 from camtorch.warp.boxes import enclosed, moved_boxes
 from camtorch.warp.grid import OUTSIDE
 from camtorch.warp.pair import CameraPair
@@ -148,7 +148,10 @@ class Warp(CameraPair):
         Raises:
             ValueError: another shape or size. TypeError: no tensor, or a complex one.
         """
-        return routes.warped(self, images, checked(self, images, mode, padding_mode, fill))
+        call = plan.ready(self, images, mode, padding_mode) if fill is None else None
+        return (
+            plan.warped(self, images, checked(self, images, mode, padding_mode, fill)) if call is None else call(images)
+        )
 
     if TYPE_CHECKING:
 
@@ -189,11 +192,11 @@ class Warp(CameraPair):
             (B or 1, 1, n, W').
         """
         rows = None if rows is None else as_whole(rows, "rows", "Warp", least=1)
-        return routes.in_strips(self, images, rows, checked(self, images, mode, padding_mode, fill))
+        return plan.in_strips(self, images, rows, checked(self, images, mode, padding_mode, fill))
 
     def grid(self) -> Tensor:
         """(B or 1, H', W', 2): positions for `grid_sample(..., align_corners=False)`; -9 where there is none."""
-        where, seam = routes.by_pixel(self), self._seam
+        where, seam = plan.by_pixel(self), self._seam
         if seam is None:
             return where.grid.clone(memory_format=torch.contiguous_format)
         grid = seam.on_image(where.grid, self.source._size_for("Warp"))
@@ -201,12 +204,12 @@ class Warp(CameraPair):
 
     def valid_mask(self) -> Tensor:
         """(B or 1, 1, H', W') bool: the pixel has a ray, and the source sees it on its image."""
-        return routes.valid_mask(self)
+        return plan.valid_mask(self)
 
     def pin(self) -> Warp:
         """Have the grid computed once and for all, with its graph: for a warp whose cameras are not to change."""
-        if self._pinned is None:
-            self.__dict__["_pinned"] = routes.pinned(self)  # as nn.Module would, after some questions
+        if not self.is_pinned:
+            plan.pin(self)
         return self
 
     def transform_points(self, pixels: Numbers) -> tuple[Tensor, Tensor]:
@@ -287,9 +290,6 @@ class Warp(CameraPair):
         if lost and not self._has_shutters:
             raise ValueError(f"{type(self).__name__}: the saved warp has a {lost[0]}, which a Warp had in 0.3. {LEFT}")
         super().__setstate__(state)  # type: ignore[no-untyped-call]
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {**super().__getstate__(), "_pinned": None}
 
     def extra_repr(self) -> str:
         """Return the options, then "learns" if a camera or the rotation requires grad, else "fixed"."""

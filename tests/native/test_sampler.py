@@ -18,7 +18,7 @@ from camtorch.native import sampler
 from camtorch.native.library import _find, library, native_available
 from camtorch.values.dtypes import widen
 from camtorch.warp import grid as positions
-from camtorch.warp import routes, sampling
+from camtorch.warp import plan, sampling
 from camtorch.warp.grid import Lattice, Sampling
 
 MODES = ("nearest", "bilinear", "bicubic")
@@ -41,8 +41,8 @@ def counted():
     """How often the compiled sampler was called."""
     calls = []
     with pytest.MonkeyPatch.context() as patch:
-        original = sampler.sample
-        patch.setattr(sampler, "sample", lambda *a, **k: calls.append(1) or original(*a, **k))
+        original = sampler.Call.__call__
+        patch.setattr(sampler.Call, "__call__", lambda *a, **k: calls.append(1) or original(*a, **k))
         yield calls
 
 
@@ -315,7 +315,7 @@ def test_no_read_outside_and_nothing_undefined_in_any_variant(fuzzed):
 
 
 def kept(warp):
-    return routes.positions(warp, "kept")
+    return plan.positions(warp, "kept")
 
 
 @pytest.mark.usefixtures("each_variant")

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 import camtorch as ct
-from camtorch.warp import routes, sampling
+from camtorch.warp import plan, sampling
 
 SIZE = (90, 120)
 
@@ -65,8 +65,8 @@ def test_long_grids_are_neither_made_at_once_nor_kept(monkeypatch):
     one = ct.Warp(*pair(), fill=2.0)
     given = images(torch.uint8)
     expected, mask = one(given), one.valid_mask()
-    monkeypatch.setattr(routes, "_MOST_KEPT", 1000)
-    monkeypatch.setattr(routes, "_STRIP", 1000)
+    monkeypatch.setattr(plan, "_MOST_KEPT", 1000)
+    monkeypatch.setattr(plan, "_STRIP", 1000)
     long = ct.Warp(*pair(), fill=2.0)
     assert torch.equal(long(given), expected)
     assert torch.equal(long.valid_mask(), mask)

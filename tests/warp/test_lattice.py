@@ -8,7 +8,7 @@ import torch
 from cameras import each_kind, make, real
 
 import camtorch as ct
-from camtorch.warp.routes import by_pixel
+from camtorch.warp.plan import by_pixel
 
 TOLERANCES = (0.1, 0.01)
 

@@ -7,7 +7,7 @@ import torch
 
 import camtorch as ct
 from camtorch.native.library import native_available
-from camtorch.warp.routes import by_pixel
+from camtorch.warp.plan import by_pixel
 
 SIZE = (120, 160)
 

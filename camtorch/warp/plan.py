@@ -1,4 +1,4 @@
-"""By which route a warp finds its sampling positions and makes its images: all of them, and where one is chosen."""
+"""How a warp samples images: the route is found once for a form of call, and kept while its cameras stay."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from camtorch.evaluate.door import (
     in_jit_trace,
     in_transform,
     is_constant,
+    is_eager,
     is_exporting,
     is_for_here,
     keeps_graph,
     set_aside,
 )
 from camtorch.evaluate.export import with_values
-from camtorch.evaluate.kept import Kept
 from camtorch.evaluate.known import is_unknown
-from camtorch.native.sampler import Later, empty
+from camtorch.native.sampler import Call, empty
 from camtorch.warp import compiled
 from camtorch.warp.grid import Lattice, Sampling, scaled
-from camtorch.warp.pair import CameraPair
-from camtorch.warp.sampling import PADDINGS, PaddingMode, Pyramid, Sampler, laid_as, render
+from camtorch.warp.pair import CameraPair, Plan
+from camtorch.warp.sampling import PADDINGS, PaddingMode, Pyramid, Sampler, by_torch, laid_as, prepared, render
 
 Route = Literal["operator", "strips", "graph", "kept"]
 
@@ -42,7 +42,7 @@ def route_of(warp: CameraPair, images: Tensor | None = None) -> Route:
     * "graph": something learns, so that positions are computed anew with their graph;
     * "kept": positions without a graph, pinned or kept until an input changes.
     """
-    learns = warp._pinned is None and keeps_graph(*warp._inputs())
+    learns = not warp.is_pinned and keeps_graph(*warp._inputs())
     if images is not None:
         learns = learns and images.dtype.is_floating_point
         if not learns and _is_operator(warp) and compiled.takes(images, warp._inputs()):
@@ -52,9 +52,36 @@ def route_of(warp: CameraPair, images: Tensor | None = None) -> Route:
     return "graph" if learns else "kept"
 
 
-def warped(warp: CameraPair, images: Tensor, sampler: Sampler, later: Later | None = None) -> Tensor:
-    """The images of a warp; those given are checked. With `later`, `finish` may have to make them."""
-    route, images = route_of(warp, images), lengthened(warp, images)
+def ready(warp: CameraPair, images: object, mode: str | None, padding: str | None) -> Call | None:
+    """Return the call that an earlier one has left for images of this form, if nothing has changed since."""
+    plan: Plan | None = warp._kept.result
+    if plan is None or not plan.calls or not isinstance(images, Tensor):
+        return None
+    mode, padding = warp.mode if mode is None else mode, warp.padding_mode if padding is None else padding
+    inputs = warp._inputs()
+    if (
+        not is_eager(images, *inputs)
+        or images.requires_grad
+        or not isinstance(mode, str)
+        or not isinstance(padding, str)
+    ):
+        return None
+    call = plan.calls.get(_form(warp, images, mode, padding))
+    if call is None or plan.is_pinned:
+        return call
+    if images.dtype.is_floating_point and keeps_graph(*inputs):
+        return None
+    return call if warp._kept.is_of(inputs, warp._options) else None
+
+
+def _form(warp: CameraPair, images: Tensor, mode: str, padding: str) -> tuple[object, ...]:
+    return images.shape, images.stride(), images.dtype, mode, padding, warp.fill
+
+
+def warped(warp: CameraPair, images: Tensor, sampler: Sampler) -> Tensor:
+    """The images of a warp; those given are checked."""
+    route, given = route_of(warp, images), images
+    images = lengthened(warp, images)
     if route == "operator":
         options = warp.tolerance, warp.antialias, _reach(warp, sampler.padding_mode), sampler
         return compiled.warped(images, warp._sampled, warp.target, warp.rotation, *options)
@@ -66,7 +93,19 @@ def warped(warp: CameraPair, images: Tensor, sampler: Sampler, later: Later | No
             with torch.no_grad():
                 render(images, where, *sampler, kept, result[:, :, rows])
         return result
-    return render(images, positions(warp, route, sampler.padding_mode), *sampler, later=later)
+    where = positions(warp, route, sampler.padding_mode)
+    call = prepared(images, where, sampler)
+    if call is None:
+        return by_torch(images, where, sampler)
+    plan: Plan | None = warp._kept.result
+    if (
+        plan is not None
+        and images is given
+        and sampler.fill == warp.fill
+        and any(where is kept for kept in plan.positions.values())
+    ):
+        plan.keep(_form(warp, images, sampler.mode, sampler.padding_mode), call)
+    return call(images)
 
 
 def lengthened(warp: CameraPair, images: Tensor) -> Tensor:
@@ -87,13 +126,16 @@ def positions(warp: CameraPair, route: Route, padding: PaddingMode = "zeros") ->
     if is_exporting() and not torch.compiler.is_dynamo_compiling() and (constant := _constant(warp, padding)):
         return constant
     reach = _reach(warp, padding)
-    if warp._pinned is not None and (reach == warp.padding_mode or isinstance(warp._pinned, Sampling)):
-        return warp._pinned
+    return _plan_of(warp).positions_for(reach if warp.tolerance else "zeros", lambda: _computed(warp, reach))
 
-    (source, target), tolerance = warp._ends, warp.tolerance
-    options = source._form, target._form, warp.rotation is None, warp.antialias, tolerance
-    memo = warp._memos.setdefault(reach if tolerance else "zeros", Kept())  # what is exact serves all
-    return memo(warp._inputs(), options, lambda: _computed(warp, reach))
+
+def _plan_of(warp: CameraPair) -> Plan:
+    if warp.is_pinned:
+        pinned: Plan = warp._kept.result
+        return pinned
+    plan = warp._kept(warp._inputs(), warp._options, Plan)
+    plan.is_kept = plan is warp._kept.result
+    return plan
 
 
 def by_pixel(warp: CameraPair) -> Sampling:
@@ -153,17 +195,19 @@ def _on_image(warp: CameraPair, where: Sampling | Lattice) -> Tensor:
     return (where.mapped & source.contains(pixels)).unsqueeze(1)
 
 
-def pinned(warp: CameraPair) -> Sampling | Lattice | None:
-    """The positions that a warp keeps from now on, with their graph; None where they are not to be kept."""
+def pin(warp: CameraPair) -> None:
+    """Have a warp keep its positions from now on, with their graph, if they are to be kept at all."""
     # what a transform makes dies with it; what inference mode makes could not be used in a graph later; the operator
     # of compiled code keeps its own
     if _is_operator(warp) and compiled.takes(warp.target.intrinsics.detach(), warp._inputs()):
-        return None
+        return
     if in_transform() or torch.is_inference_mode_enabled():
-        return None
+        return
     if keeps_graph(*warp._inputs()):
-        return positions(warp, "graph")
-    return positions(warp, "kept") if is_exporting() else _computed(warp, warp.padding_mode)
+        where = positions(warp, "graph")
+    else:
+        where = positions(warp, "kept") if is_exporting() else _computed(warp, warp.padding_mode)
+    warp._kept.renew(lambda: Plan(where, warp.padding_mode))
 
 
 def _reach(warp: CameraPair, padding: PaddingMode) -> PaddingMode:
@@ -180,7 +224,7 @@ def _is_operator(warp: CameraPair) -> bool:
 def _is_long(warp: CameraPair) -> bool:
     """Whether the grid is not to be made at once, nor kept."""
     # compared first, sizes that a program leaves open would be bounded in it
-    if warp._pinned is not None or torch.compiler.is_compiling():
+    if warp.is_pinned or torch.compiler.is_compiling():
         return False
     if math.prod((*warp.batch_shape, *warp.target._size_for("Warp"))) <= _MOST_KEPT:
         return False
@@ -189,10 +233,9 @@ def _is_long(warp: CameraPair) -> bool:
 
 def _constant(warp: CameraPair, padding: PaddingMode) -> Sampling | None:
     """The positions as a constant of an exported program, unless they depend on what it is given."""
-    is_pinned = warp._pinned is not None
-    if not is_pinned and not is_constant(warp):
+    if not warp.is_pinned and not is_constant(warp):
         return None
-    with set_aside() if is_pinned else with_values(warp):
+    with set_aside() if warp.is_pinned else with_values(warp):
 
         def own() -> Sampling:
             where = positions(warp, "kept", padding)
@@ -200,7 +243,5 @@ def _constant(warp: CameraPair, padding: PaddingMode) -> Sampling | None:
             grid, mapped = (t.detach().clone(memory_format=torch.contiguous_format) for t in where[:2])
             return where._replace(grid=grid, mapped=mapped)
 
-        if is_pinned:
-            return own()
-        options = _reach(warp, padding), warp.antialias, warp.tolerance
-        return warp._constants(warp._inputs(), options, own)
+        plan = _plan_of(warp)
+        return own() if plan.is_pinned else plan.positions_for(f"constant {_reach(warp, padding)}", own)
