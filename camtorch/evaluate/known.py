@@ -56,10 +56,10 @@ def are_free(*tensors: Tensor) -> bool:
 
 def are_numbers(*tensors: Tensor) -> bool:
     """Whether nothing records what is computed of tensors, which lie in the CPU's memory and may be looked at."""
-    return are_free(*tensors) and all(type(t) in _PLAIN for t in tensors)
+    return are_free(*tensors) and _PLAIN.issuperset(map(type, tensors))
 
 
-_PLAIN = Tensor, nn.Parameter
+_PLAIN = frozenset((Tensor, nn.Parameter))
 
 
 def is_kept(value: Tensor) -> bool:

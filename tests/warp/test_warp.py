@@ -8,6 +8,7 @@ import torch
 from cameras import make
 
 import camtorch as ct
+from camtorch.native.library import native_available
 
 SIZE = (48, 64)
 
@@ -240,3 +241,27 @@ def test_transforms_of_functions():
     forward, reverse = (jacobian(lambda k: made(k).sum())(k) for jacobian in (torch.func.jacfwd, torch.func.jacrev))
     assert forward.all()
     torch.testing.assert_close(forward, reverse)
+
+
+CHANGES = {
+    "a focal length": lambda warp: warp.source.intrinsics.data[0].mul_(1.1),
+    "the turn": lambda warp: warp.turned_by(torch.eye(3)),
+    "the target": lambda warp: setattr(warp, "target", warp.source),
+    "the mode": lambda warp: setattr(warp, "mode", "nearest"),
+    "the padding": lambda warp: setattr(warp, "padding_mode", "border"),
+    "the fill": lambda warp: setattr(warp, "fill", (9.0,)),
+    "antialias": lambda warp: setattr(warp, "antialias", True),
+}
+
+
+@pytest.mark.parametrize("change", CHANGES)
+def test_a_call_that_is_ready_follows_every_change(change):
+    images = 255 * smooth(dtype=torch.float32)
+    warp, later = (ct.Warp(fisheye().float(), pinhole().float(), turn(10)).requires_grad_(False) for _ in range(2))
+    before = [warp(images) for _ in range(3)][-1]
+    assert warp._kept.result.calls or not native_available()
+    CHANGES[change](warp)
+    CHANGES[change](later)
+    after = warp(images)
+    assert torch.equal(after, later(images))
+    assert after.shape != before.shape or not torch.equal(after, before)
