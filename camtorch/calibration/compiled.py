@@ -120,8 +120,7 @@ def seen(
 ) -> Look:
     """Return what cameras (B,), or one, make of points (B, V, N, 3) whose pixels (B, V, N, 2) are known.
 
-    With triangles if `learnt` says which intrinsics, and coefficients from 4 on, learn.
-    poses: (B, V, 3, 3), (B, V, 3). weights: (B, V, N) of the squares. loss: name and scale.
+    With triangles if `learnt` says which parameters learn. poses: (B, V, 3, 3), (B, V, 3). loss: name and scale.
     """
     compiled, plan, left = library(), native.plan, c_int64(0)
     assert compiled is not None  # or nobody has a `Native`

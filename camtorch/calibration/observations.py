@@ -57,10 +57,7 @@ class Layout(NamedTuple):
     """The numbers of the views, of those that were passed, that are no new evidence: see `_observed` and `repeats`."""
 
     def restore(self, values: Tensor) -> Any:
-        """Results (V, N, k) or (V, N) in the form of the image points, NaN (of bool: False) where nothing was seen:
-
-        (V', *, k) for one tensor of V' views, or a list of a tensor (*, k) for each view.
-        """
+        """Results (V, N, k) or (V, N) in the form of the image points, NaN (of bool: False) where nothing was seen."""
         rest, empty = values.shape[2:], values.new_tensor(False if values.dtype == torch.bool else torch.nan)
         full = empty.repeat(len(self.shapes), *values.shape[1:])
         full[self.views] = torch.where(self.seen.reshape(*self.seen.shape, *[1] * len(rest)), values, empty)

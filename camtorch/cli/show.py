@@ -6,8 +6,7 @@ import argparse
 
 import numpy as np
 
-from camtorch.analysis.difference import difference
-from camtorch.analysis.summary import summarise
+from camtorch.analysis.numbers import difference, summarise
 from camtorch.cli import images, targets
 from camtorch.cli.cameras import read_other, read_rig
 from camtorch.plot.axes import require_matplotlib

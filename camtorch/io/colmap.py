@@ -252,10 +252,7 @@ def _images_from_bytes(path: str, file: BinaryIO) -> Iterator[_ImageEntry]:
 
 
 def render(rig: Rig, lossy: Lossy) -> dict[str, bytes]:
-    """The files of a rig: cameras, and images beside them where there are poses.
-
-    Each camera takes the smallest model that holds its values, and its id where its name is one.
-    """
+    """The files of a rig: cameras, each of the smallest model that holds it, and images beside them if it has poses."""
     ids = [int(name) if re.fullmatch(r"0|[1-9]\d{0,9}", name) else -1 for name in rig.cameras]
     if not all(0 <= i <= _LARGEST_ID for i in ids):
         ids = list(range(1, len(ids) + 1))

@@ -34,10 +34,7 @@ def matches(path: str, content: bytes) -> bool:
 
 
 def read(path: str, content: bytes) -> Rig:
-    """The camera of a calibration; or those of calibrated sensors by their labels, and the poses of their images.
-
-    Poses are of the world that the transform of the chunk, or of its component, says; without one, of the chunk.
-    """
+    """The camera of a calibration; or those of calibrated sensors by their labels, and the poses of their images."""
     root = parse_xml(path, decoded(path, content))
     if root.tag == "calibration":
         return Rig({"camera": _camera(Record(path, _values(root), "calibration"))})

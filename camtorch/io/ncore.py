@@ -28,11 +28,7 @@ def matches(keys: dict[str, Any]) -> bool:
 
 
 def parse(record: Record) -> Rig:
-    """The camera. Shutter and largest angle are not read; a camera behind a windshield is refused.
-
-    Of the two polynomials of an f-theta, one of which is an approximate inverse of the other, the reference is read:
-    they are up to 0.25 px apart.
-    """
+    """The camera, without shutter; of the two polynomials of an f-theta, up to 0.25 px apart, the reference is read."""
     kind = one_of(record["camera_model_type"], ("ftheta", *_PINHOLES, "opencv-fisheye"))
     values = record["camera_model_parameters"]
     camera = _f_theta(values) if kind == "ftheta" else _of_opencv(values, kind)

@@ -24,11 +24,8 @@ def matches(path: str, content: bytes) -> bool:
 
 
 def read(path: str, content: bytes) -> Rig:
-    """The cameras, without their image sizes, which stand in other tables; and their poses: camera from ego.
-
-    A camera is called by its channel, or where drives have calibrations of their own, by its token. What has no
-    intrinsics is a lidar or a radar, and left out.
-    """
+    """The cameras by their channels, or tokens, and their poses, camera from ego; image sizes stand elsewhere."""
+    # what has no intrinsics is a lidar or a radar
     sensors = [sensor for sensor in _table(path, content) if len(sensor["camera_intrinsic"])]
     Record(path, None).few(len(sensors))
     beside = os.path.join(os.path.dirname(path), "sensor.json")

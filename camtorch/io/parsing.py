@@ -158,10 +158,7 @@ def _with_floats(value: Any) -> Any:
 
 
 def arrays_of(content: bytes, largest: int) -> dict[str, np.ndarray | None]:
-    """Return arrays of numbers by their names; None for damaged or larger ones, and for objects.
-
-    A damaged archive raises BadZipFile, zlib.error, OSError, EOFError, ValueError, RuntimeError, NotImplementedError.
-    """
+    """Return arrays of numbers by their names; None for damaged or larger ones, and for objects."""
     if content.count(b"PK\1\2") > _MOST_ARRAYS:
         raise ValueError(f"more than {_MOST_ARRAYS} arrays")
     arrays: dict[str, np.ndarray | None] = {}

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 from torch.nn.utils.parametrize import type_before_parametrizations
 
-from camtorch.analysis import difference as differences
+from camtorch.analysis import numbers
 from camtorch.calibration.rig import RigCalibration
 from camtorch.calibration.verdict import Calibration
 from camtorch.cameras.camera import Camera
@@ -163,7 +163,7 @@ def difference(a: Camera, b: Camera, ax: Axes | None = None, *, remove_rotation:
     Raises:
         ValueError: a batch, no image size, or two different ones.
     """
-    compared = differences.difference(a, b, remove_rotation=remove_rotation)
+    compared = numbers.difference(a, b, remove_rotation=remove_rotation)
     height, width = a._size_for("a difference")
     ax = axes_or_new(ax)
     values = np.ma.masked_array(compared.apart.numpy(force=True), ~compared.both.numpy(force=True))
@@ -171,7 +171,7 @@ def difference(a: Camera, b: Camera, ax: Axes | None = None, *, remove_rotation:
     ax.set_facecolor(NO_RAYS)
     image = ax.imshow(values, extent=edges, cmap="magma_r", interpolation="nearest")
     _bar(ax, image, compared.apart[compared.both])
-    degrees = math.degrees(differences.angle(compared.rotation))
+    degrees = math.degrees(numbers.angle(compared.rotation))
     turned = f", turned by {degrees:.3g} degrees" if remove_rotation else ""
     ax.set_title(f"{a.key} and {b.key}: {compared}{turned}")
     return ax

@@ -11,7 +11,7 @@ from cameras import KEYS, one
 from command_line import FILES, FISHEYE, MATRIX, command, opened, refused
 
 import camtorch as ct
-from camtorch.analysis.summary import summarise
+from camtorch.analysis.numbers import summarise
 
 
 def test_show_prints_a_summary(folder, capsys):

@@ -13,7 +13,7 @@ matplotlib.use("Agg")
 from matplotlib.figure import Figure  # noqa: E402
 
 from camtorch import plot  # noqa: E402
-from camtorch.analysis.summary import summarise  # noqa: E402
+from camtorch.analysis.numbers import summarise  # noqa: E402
 from camtorch.rays.lattices import ideal, ray_fan  # noqa: E402
 
 SIZE = (480, 640)
