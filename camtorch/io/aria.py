@@ -7,8 +7,7 @@ from typing import Any
 
 from camtorch.cameras.rig import Rig
 from camtorch.io import poses
-from camtorch.io.protocol import Names
-from camtorch.io.record import Record, one_of
+from camtorch.io.record import Names, Record, one_of
 from camtorch.io.writing import Lossy, as_json
 
 NAMES = Names("aria", "Aria", (".json",))

@@ -12,8 +12,7 @@ from torch import Tensor, nn
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.rig import Rig
 from camtorch.io import poses
-from camtorch.io.protocol import Names
-from camtorch.io.record import Record, one_of
+from camtorch.io.record import Names, Record, one_of
 from camtorch.io.writing import Lossy, as_json
 from camtorch.poses.extrinsics import Extrinsics
 from camtorch.values.arguments import broadcast_shapes, is_list

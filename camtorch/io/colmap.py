@@ -20,8 +20,7 @@ from camtorch.cameras.rig import Rig
 from camtorch.io import poses
 from camtorch.io.nerfstudio import panorama
 from camtorch.io.parsing import check_ordinary, decoded
-from camtorch.io.protocol import Names
-from camtorch.io.record import Record
+from camtorch.io.record import Names, Record
 from camtorch.io.writing import Lossy, number
 
 NAMES = Names("colmap", "COLMAP", (".txt", ".bin"), ("*.txt", "*.bin"), ("cameras.bin", "cameras.txt"))

@@ -31,8 +31,8 @@ from camtorch.io import (
     woodscape,
 )
 from camtorch.io.parsing import parse_mapping, path_of, read_bytes
-from camtorch.io.protocol import ContentFormat, KeyFormat, Names, WrittenFormat
-from camtorch.io.record import CameraFileError, Record
+from camtorch.io.protocol import ContentFormat, KeyFormat, WrittenFormat
+from camtorch.io.record import CameraFileError, Names, Record
 from camtorch.io.writing import Lossy, replacing
 from camtorch.values.arguments import LEFT
 

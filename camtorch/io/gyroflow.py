@@ -5,8 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from camtorch.cameras.rig import Rig
-from camtorch.io.protocol import Names
-from camtorch.io.record import Record, one_of
+from camtorch.io.record import Names, Record, one_of
 
 NAMES = Names("gyroflow", "Gyroflow")
 

@@ -12,8 +12,7 @@ from torch import Tensor
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.rig import Rig
 from camtorch.io import poses
-from camtorch.io.protocol import Names
-from camtorch.io.record import Record
+from camtorch.io.record import Names, Record
 from camtorch.io.writing import Lossy, listed
 from camtorch.poses.extrinsics import Extrinsics
 

@@ -13,8 +13,7 @@ from camtorch.cameras.camera import Camera
 from camtorch.cameras.rig import Rig
 from camtorch.io import poses
 from camtorch.io.parsing import decoded, parse_xml
-from camtorch.io.protocol import Names
-from camtorch.io.record import Record, one_of
+from camtorch.io.record import Names, Record, one_of
 
 NAMES = Names("metashape", "Metashape")
 

@@ -7,8 +7,7 @@ from typing import Any
 
 from camtorch.cameras.rig import Rig
 from camtorch.io import poses
-from camtorch.io.protocol import Names
-from camtorch.io.record import Record
+from camtorch.io.record import Names, Record
 from camtorch.io.writing import Lossy, number
 from camtorch.models import Splined
 from camtorch.poses.extrinsics import Extrinsics

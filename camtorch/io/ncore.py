@@ -8,8 +8,7 @@ import numpy as np
 
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.rig import Rig
-from camtorch.io.protocol import Names
-from camtorch.io.record import Record, one_of
+from camtorch.io.record import Names, Record, one_of
 from camtorch.models import FTheta, FThetaBackward
 from camtorch.values.arguments import LEFT
 

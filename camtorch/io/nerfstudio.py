@@ -11,8 +11,7 @@ import numpy as np
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.rig import Rig
 from camtorch.io import poses
-from camtorch.io.protocol import Names
-from camtorch.io.record import Record, one_of
+from camtorch.io.record import Names, Record, one_of
 from camtorch.io.writing import Lossy, as_json
 
 NAMES = Names("nerfstudio", "Nerfstudio", (".json",), ("transforms*.json",), ("transforms.json",))

@@ -10,8 +10,7 @@ from camtorch.cameras.camera import Camera
 from camtorch.cameras.rig import Rig
 from camtorch.io import poses
 from camtorch.io.parsing import decoded, parse_json, read_bytes
-from camtorch.io.protocol import Names
-from camtorch.io.record import Record
+from camtorch.io.record import Names, Record
 
 NAMES = Names("nuscenes", "nuScenes")
 

@@ -11,8 +11,7 @@ import re
 from camtorch.cameras.rig import Rig
 from camtorch.io import poses
 from camtorch.io.parsing import decoded
-from camtorch.io.protocol import Names
-from camtorch.io.record import CameraFileError, Record
+from camtorch.io.record import CameraFileError, Names, Record
 from camtorch.models import OCamCalib
 
 NAMES = Names("ocamcalib", "OCamCalib")

@@ -14,8 +14,7 @@ from camtorch.cameras.numbers import warn_of_order
 from camtorch.cameras.rig import Rig
 from camtorch.io import poses
 from camtorch.io.parsing import parse_mapping, read_bytes
-from camtorch.io.protocol import Names
-from camtorch.io.record import Record
+from camtorch.io.record import Names, Record
 from camtorch.io.writing import Lossy, number
 from camtorch.models import MODELS
 from camtorch.poses.extrinsics import Extrinsics

@@ -2,23 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any, Protocol
 
 from camtorch.cameras.rig import Rig
-from camtorch.io.record import Record
+from camtorch.io.record import Names, Record
 from camtorch.io.writing import Lossy
-
-
-@dataclass(frozen=True)
-class Names:
-    """What a format and its files are called."""
-
-    format: str  # its key in `camtorch.load` and `camtorch.save`
-    title: str  # what errors call it
-    suffixes: tuple[str, ...] = ()  # of the files that are written, with the dot; content says what a file to read is
-    patterns: tuple[str, ...] = ()  # names, as fnmatch has them, that mean this format; of several the longest counts
-    in_folder: tuple[str, ...] = ()  # files that stand for the folder they are in, the first that is there
 
 
 class Format(Protocol):

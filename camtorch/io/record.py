@@ -1,4 +1,4 @@
-"""What stands in a file, with the place where it stands for the errors."""
+"""What stands in a file, with the place where it stands for the errors; and what a format of files is called."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import math
 import os
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator
+from dataclasses import dataclass
 from itertools import islice
 from typing import Any, NoReturn
 
@@ -21,6 +22,17 @@ LARGEST_SIDE = 1 << 20
 _MOST_CAMERAS = 20_000
 _SHOWN = 8
 _LONGEST_NUMBER = 400  # no double needs as many characters
+
+
+@dataclass(frozen=True)
+class Names:
+    """What a format and its files are called."""
+
+    format: str  # its key in `camtorch.load` and `camtorch.save`
+    title: str  # what errors call it
+    suffixes: tuple[str, ...] = ()  # of the files that are written, with the dot; content says what a file to read is
+    patterns: tuple[str, ...] = ()  # names, as fnmatch has them, that mean this format; of several the longest counts
+    in_folder: tuple[str, ...] = ()  # files that stand for the folder they are in, the first that is there
 
 
 class CameraFileError(ValueError):

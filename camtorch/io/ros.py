@@ -6,8 +6,7 @@ import json
 from typing import Any
 
 from camtorch.cameras.rig import Rig
-from camtorch.io.protocol import Names
-from camtorch.io.record import Record, one_of
+from camtorch.io.record import Names, Record, one_of
 from camtorch.io.writing import Lossy, listed
 
 NAMES = Names("ros", "ROS camera_info", (".yaml", ".yml"), ("*camera_info*", "*camerainfo*"))

@@ -6,8 +6,7 @@ from typing import Any
 
 from camtorch.cameras.rig import Rig
 from camtorch.io import poses
-from camtorch.io.protocol import Names
-from camtorch.io.record import Record, one_of
+from camtorch.io.record import Names, Record, one_of
 
 NAMES = Names("woodscape", "WoodScape")
 _POWERS = ("k1", "k2", "k3", "k4")
