@@ -69,7 +69,7 @@ class BoxCrop(Augmentation):
         """The camera that looks at `values["box"]`, (*B, 4); see `Augmentation.new_camera`."""
         box = values["box"]
         rows = box.reshape(-1, 4)
-        check_extents(rows, source, "boxes", self._name)
+        check_extents(rows, source, self._name)
         intrinsics, rotation = looking_at(source, rows, self.image_size, self.margin, self._name)
         intrinsics, rotation = (t[0] if box.ndim == 1 else t for t in (intrinsics, rotation))
         if "zoom" in values:

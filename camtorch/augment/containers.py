@@ -147,11 +147,8 @@ def camera_of(params: Params, own: Camera, device: torch.device | None) -> Camer
 
 def kind_of_camera(camera: Camera) -> list[int]:
     """Model, number of coefficients and image_size as integers, for params hold tensors only."""
-    return [
-        zlib.crc32(type_before_parametrizations(camera).__name__.encode()),
-        camera.distortion.shape[-1],
-        *(camera.image_size or (0, 0)),
-    ]
+    model = type_before_parametrizations(camera).__name__
+    return [zlib.crc32(model.encode()), camera.distortion.shape[-1], *(camera.image_size or (0, 0))]
 
 
 def _fields(container: Any, sample: Sample, ours: list[InContainers], single: bool) -> tuple[Sample, dict[str, str]]:

@@ -108,13 +108,9 @@ def change_by(edits: Sequence[tuple[Edit, Mapping[str, Any]]], camera: Camera, o
                 matrix = one if matrix is None else after(one, matrix)
         if matrix is None:
             return Part(rows, None, source)
-        if (
-            isinstance(matrix, Tensor)
-            and matrix.ndim == 3
-            and not source.batch_shape
-            and known_true(matrix == matrix[:1])
-        ):
-            matrix = matrix[0]  # one map serves the whole batch
+        may_be_one = isinstance(matrix, Tensor) and matrix.ndim == 3 and not source.batch_shape
+        if may_be_one and known_true(as_tensor(matrix) == as_tensor(matrix)[:1]):
+            matrix = as_tensor(matrix)[0]  # one map serves the whole batch
         warp = AffineWarp(source, edited(source, matrix, size), matrix, _turn(matrix, source), **options)
         return Part(rows, warp, source)
 

@@ -14,16 +14,13 @@ from camtorch.augment.change import Change, Part, alone
 from camtorch.augment.sample import Sample, SampleOptions, SampleTransform, on_samples
 from camtorch.cameras.camera import Camera
 from camtorch.evaluate.known import known_false
-from camtorch.models import Pinhole
 from camtorch.poses.rotations import check_rotation, rotation_matrix
 from camtorch.values.arguments import as_known_size, as_number, no_camera, shown
-from camtorch.values.module import remade, typed_as
+from camtorch.values.module import typed_as
+from camtorch.warp.views import pinhole
 from camtorch.warp.warp import Warp
 
 _ODD = 50.0  # times the distance: no face is meant to be so much nearer or farther; units differ
-
-
-_VIRTUAL = Pinhole([1.0, 1.0, 0.0, 0.0]).detach()
 
 
 class FaceNormalizer(SampleTransform):
@@ -119,7 +116,7 @@ class FaceNormalizer(SampleTransform):
         rotation = torch.stack((torch.linalg.cross(down, forward), down, forward), -2)
         focal = (self.focal / self.distance * distance).expand(-1, 2)
         intrinsics = torch.cat((focal, focal.new_tensor(self.axis).expand(len(focal), 2)), -1)
-        target = remade(_VIRTUAL, intrinsics=intrinsics, distortion=intrinsics[..., :0], image_size=self.image_size)
+        target = pinhole(intrinsics, self.image_size)
         return Change(len(centre), [Part(None, Warp(camera, target, rotation, **self.options), camera)])
 
     @on_samples

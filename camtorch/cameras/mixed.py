@@ -66,8 +66,7 @@ class Mixed(Camera):
     """What it was made of: single cameras and batches."""
 
     def __init__(self, cameras: Iterable[Camera], *, order: Sequence[int] | None = None):
-        members = _members(cameras)
-        _check_sizes(members, "Mixed")
+        members = _members(cameras, "Mixed")
         given = [(i, row) for i, camera in enumerate(members) for row in range(_count(camera))]
         super(Camera, self).__init__()  # it has no numbers of its own
         self.cameras = nn.ModuleList(members)
@@ -324,9 +323,7 @@ def cat(cameras: Iterable[Camera], *_more: object) -> Camera:
     """
     if _more:
         raise TypeError(f"cat: the cameras go in as one list, cat([a, b]); got {1 + len(_more)} arguments")
-    members = _members(cameras, "cat")
-    _check_sizes(members, "cat")
-    groups = Mixed(members).groups
+    groups = Mixed(_members(cameras, "cat")).groups
     return groups[0][1] if len(groups) == 1 else Mixed.of_groups(groups)
 
 
@@ -344,7 +341,7 @@ def _among_used(
     return used, tuple(first[i] + row for i, row in places)
 
 
-def _members(cameras: Any, owner: str = "Mixed") -> list[Camera]:
+def _members(cameras: Any, owner: str) -> list[Camera]:
     """What a batch is made of, as users pass it."""
     if isinstance(cameras, Camera):
         cameras = [cameras]
@@ -367,6 +364,12 @@ def _members(cameras: Any, owner: str = "Mixed") -> list[Camera]:
     devices = list(dict.fromkeys(str(camera.intrinsics.device) for camera in members))
     if len(devices) > 1:
         raise ValueError(f"{owner}: the cameras are on {' and '.join(devices)}; camera.to(device) brings them together")
+    sizes = list(dict.fromkeys(camera.image_size for camera in members))
+    if len(sizes) > 1:
+        raise ValueError(
+            f"{owner}: the images of a batch are of one size; got cameras of {', '.join(map(str, sizes))} (height, "
+            "width). camera.resize, .crop and .pad give the camera of an edited image"
+        )
     return members
 
 
@@ -378,15 +381,6 @@ def _as_order(order: Sequence[int], count: int) -> list[int]:
     if not places or min(places) < 0 or max(places) >= count:
         raise ValueError(f"Mixed: order must be places among {count} cameras, from 0; got {places}")
     return places
-
-
-def _check_sizes(members: list[Camera], owner: str) -> None:
-    sizes = list(dict.fromkeys(camera.image_size for camera in members))
-    if len(sizes) > 1:
-        raise ValueError(
-            f"{owner}: the images of a batch are of one size; got cameras of {', '.join(map(str, sizes))} (height, "
-            "width). camera.resize, .crop and .pad give the camera of an edited image"
-        )
 
 
 def kind(camera: Camera) -> tuple[type[Camera], int, tuple[int, int] | None]:

@@ -16,7 +16,7 @@ import sys
 import sysconfig
 import tempfile
 import zlib
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -63,23 +63,14 @@ def checksum(sources: str | os.PathLike[str] = _HERE) -> int | None:
     return zlib.crc32(b"\0".join(texts)) if texts else None
 
 
-def build(
-    directory: str | os.PathLike[str] | None = None,
-    *,
-    sources: str | os.PathLike[str] | None = None,
-    extra: Sequence[str] = (),
-    compiler: str | None = None,
-    variants: Collection[str] = VARIANTS,
-) -> Path:
+def build(directory: str | os.PathLike[str] | None = None, *, sources: str | os.PathLike[str] | None = None) -> Path:
     """Compile the library, and put it in its place when it is whole: processes may be running the one that is there.
+
+    The compiler, which takes GCC's options, is the environment's CC, else the first of cc, gcc and clang that is there.
 
     Args:
         directory: where the library goes; by default where camtorch looks for it.
         sources: the folder of `kernel.c` and `dispatch.c`; by default this file's.
-        extra: more words for the compiler, which compiles and links with them.
-        compiler: its command, of what takes GCC's options; by default the environment's CC, else the first of cc, gcc
-            and clang that is there.
-        variants: for which CPUs, of `VARIANTS`; less those that the compiler does not know.
 
     Returns:
         The path of the library.
@@ -88,14 +79,14 @@ def build(
         BuildError: there is no compiler, or it fails.
         OSError: `directory` cannot be written; on Windows also while a process has the library loaded.
     """
-    command = _compiler(compiler)
+    command = _compiler()
     here = _HERE if sources is None else Path(sources).absolute()
     target = (_HERE if directory is None else Path(directory).absolute()) / LIBRARY
     # beside the target: a file is renamed in one step on one file system only
     with tempfile.TemporaryDirectory(prefix="_building", dir=target.parent) as folder:
 
         def compiled(source: Path, name: str, flags: Sequence[str], defined: Sequence[str] = ()) -> str:
-            words = [*_FLAGS, *flags, *(f"-D{word}" for word in defined), *extra, "-c", str(source), "-o", f"{name}.o"]
+            words = [*_FLAGS, *flags, *(f"-D{word}" for word in defined), "-c", str(source), "-o", f"{name}.o"]
             _run([*command, *words], folder)
             return f"{name}.o"
 
@@ -109,7 +100,7 @@ def build(
                 return not flags  # without any: the true reason comes with the sources
             return True
 
-        known = {name: flags for name, flags in VARIANTS.items() if name in variants and accepts(flags)}
+        known = {name: flags for name, flags in VARIANTS.items() if accepts(flags)}
         has = [f"HAS_{name.upper()}" for name in known if name != "baseline"]
         has.append(f"SOURCES={checksum(here)}u")
         units: list[tuple[Path, str, tuple[str, ...], list[str]]] = [(here / "dispatch.c", "dispatch", (), has)]
@@ -122,7 +113,7 @@ def build(
         with ThreadPoolExecutor(os.cpu_count()) as pool:
             objects = list(pool.map(lambda unit: compiled(*unit), units))
         libraries = [] if sys.platform == "win32" else ["-lm"]
-        _run([*command, "-shared", *extra, "-o", LIBRARY, *objects, *libraries], folder)
+        _run([*command, "-shared", "-o", LIBRARY, *objects, *libraries], folder)
         os.replace(Path(folder, LIBRARY), target)
     return target
 
@@ -144,13 +135,13 @@ def _run(command: list[str], folder: str) -> None:
         raise BuildError(f"{(done.stderr + done.stdout).strip()}\n(of {shlex.join(command)})")
 
 
-def _compiler(named: str | None) -> list[str]:
+def _compiler() -> list[str]:
     """The words of its command, which may have options as in CC="ccache gcc"."""
-    named = named or os.environ.get("CC", "").strip()
+    named = os.environ.get("CC", "").strip()
     if named:
         words = [named] if shutil.which(named) else shlex.split(named)
         if shutil.which(words[0]) is None:
-            raise BuildError(f"the C compiler {words[0]!r}, which CC or the caller names, is not there")
+            raise BuildError(f"the C compiler {words[0]!r}, which CC names, is not there")
         return words
     names = ("gcc", "clang") if sys.platform == "win32" else ("cc", "gcc", "clang")
     for name in names:

@@ -188,8 +188,6 @@ class PlanarAt(StageAt):
     """A `Planar` stage at points m = (a, b)."""
 
     stage: Planar
-    a: Tensor
-    b: Tensor
     t: Tensor
     factor: Tensor
     slope: Tensor

@@ -85,7 +85,7 @@ class Extrinsics(BatchedModule):
     def forward(self, points_world: Numbers) -> Tensor:
         """World points (*B, *N, 3) to the camera frame, same shape."""
         parameters = (self.rotation, self.translation)
-        rows, lead, restore = as_rows(points_world, "points_world", 3, self.batch_shape, parameters, "Extrinsics")
+        rows, lead, restore = as_rows(points_world, "points_world", self.batch_shape, parameters, "Extrinsics")
         rotation, translation = (t.expand(*lead, 3).reshape(-1, 3) for t in parameters)
         turned = rotate_planes(rotation_matrix(rotation), rows.unbind(-1))
         return restore(turned + translation.mT.unsqueeze(-1))

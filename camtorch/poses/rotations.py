@@ -147,7 +147,7 @@ def turn(rotation: Tensor | None, rays: Tensor, name: str) -> Tensor:
     """Apply a rotation, if there is one, to (*B, *N, 3); `name` is what an error calls them."""
     if rotation is None:
         return rays
-    rows, lead, restore = as_rows(rays, name, 3, rotation.shape[:-2], (rotation,), "Warp")
+    rows, lead, restore = as_rows(rays, name, rotation.shape[:-2], (rotation,), "Warp")
     rotation = rotation.to(rows.dtype).expand(*lead, 3, 3).reshape(-1, 3, 3)
     return restore(rotate_planes(rotation, rows.unbind(-1), rows))
 

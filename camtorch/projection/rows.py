@@ -192,9 +192,8 @@ class Traced(NamedTuple):
 
     def optics(self, distortion: Tensor) -> tuple[Chart, Lens]:
         """Those of the coefficients as a graph has them; of a constant camera they are made already."""
-        return (
-            (self.domain.chart, self.domain.lens) if self.domain.is_constant else self.model.optics(columns(distortion))
-        )
+        domain = self.domain
+        return (domain.chart, domain.lens) if domain.is_constant else self.model.optics(columns(distortion))
 
 
 def replace(mask: Tensor, plane: Tensor, value: float) -> Tensor:

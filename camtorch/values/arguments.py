@@ -415,16 +415,16 @@ def as_points(
 
 
 def as_rows(
-    values: Numbers, name: str, size: int, batch: torch.Size, parameters: Sequence[Tensor], owner: str
+    values: Numbers, name: str, batch: torch.Size, parameters: Sequence[Tensor], owner: str
 ) -> tuple[Tensor, torch.Size, Callable[[Tensor], Tensor]]:
-    """Return (*B, *N, size) as rows (C, N, size), one a camera; *B; and what makes (*B, *N, count) of (count, C, N)."""
-    values, lead = as_points(values, name, size, batch, parameters, owner)
+    """Return (*B, *N, 3) as rows (C, N, 3), one a camera; *B; and what makes (*B, *N, count) of (count, C, N)."""
+    values, lead = as_points(values, name, 3, batch, parameters, owner)
     shape = values.shape[:-1]
 
     def restore(planes: Tensor) -> Tensor:
         return planes.reshape((len(planes), *shape)).movedim(0, -1)
 
-    return values.reshape(math.prod(lead), math.prod(shape[len(batch) :]), size), lead, restore
+    return values.reshape(math.prod(lead), math.prod(shape[len(batch) :]), 3), lead, restore
 
 
 def columns(parameters: Tensor) -> tuple[Tensor, ...]:

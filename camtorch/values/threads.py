@@ -125,10 +125,9 @@ if hasattr(os, "register_at_fork"):  # not on Windows
     os.register_at_fork(after_in_child=_forked)
 
 
-#
-# Each of its operations is split among them and waits until all have done their part: for milliseconds, where another
-# process has the core of one. To a chain of a hundred operations that happens a hundred times. So such chains run on
-# one thread, or on several that each do a part of their own.
+# Each of torch's operations is split among threads and waits until all have done their part: for milliseconds, where
+# another process has the core of one. To a chain of a hundred operations that happens a hundred times. So such chains
+# run on one thread, or on several that each do a part of their own.
 
 
 def on_one_thread(function: Callable[P, R]) -> Callable[P, R]:

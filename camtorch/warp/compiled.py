@@ -97,19 +97,10 @@ _located = Kept(2)  # masks are warped after their images, and cameras may be st
 
 @opaque(warp_shapes)
 def _warp(
-    images: Tensor,
-    source: Camera,
-    target: Camera,
-    rotation: Tensor | None,
-    tolerance: float,
-    antialias: str,
-    padding: str,
-    mode: str,
-    padding_mode: str,
-    fill: str,
-    is_last: str,
+    images: Tensor, source: Camera, target: Camera, rotation: Tensor | None, tolerance: float, *options: str
 ) -> tuple[Tensor]:
-    """The images (B, C, h, w), plane by plane or with their channels last in memory."""
+    """The images (B, C, h, w), plane by plane or with their channels last in memory; options as of `warped`."""
+    antialias, padding, mode, padding_mode, fill, is_last = options
 
     def positions() -> Sampling | Lattice:
         every = range(target._size_for("Warp")[0])

@@ -6,16 +6,16 @@ import math
 from typing import cast
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from typing_extensions import Unpack
 
 from camtorch.cameras.camera import Camera
 from camtorch.evaluate.known import as_own, known_false, values_of
-from camtorch.models import Pinhole
 from camtorch.poses.extrinsics import Extrinsics
 from camtorch.values.arguments import Numbers, as_batch, as_coordinates, as_number, as_real, shown
 from camtorch.warp.proxy import ProxyWarp, beside
 from camtorch.warp.sampling import WarpOptions
+from camtorch.warp.views import pinhole
 
 _GRAZING = 1e-9  # the cosine of a ray to the plane's normal from which on it does not meet the plane
 
@@ -155,10 +155,8 @@ class BirdsEye(PlaneWarp):
         # a camera that looks straight down from one unit above the origin
         like = camera.intrinsics.detach() if isinstance(camera, Camera) else torch.zeros(1)
         focal = 1 / resolution
-        down = Pinhole(
-            nn.Parameter(like.new_tensor([focal, focal, -x[0] * focal - 0.5, y[1] * focal - 0.5]), requires_grad=False),
-            image_size=(size[0], size[1]),
-        )
+        intrinsics = like.new_tensor([focal, focal, -x[0] * focal - 0.5, y[1] * focal - 0.5])
+        down = pinhole(intrinsics, (size[0], size[1]))
         super().__init__(camera, down, extrinsics, (0.0, 0.0, 1.0), 1.0, **options)
         self.x, self.y, self.resolution = x, y, resolution
 

@@ -104,12 +104,8 @@ class Reproject(GeometryModule):
         """
         owner = "Reproject"
         size = self.source._size_for(owner)
-        if (
-            not isinstance(images, Tensor)
-            or images.is_complex()
-            or images.ndim != 4
-            or tuple(images.shape[-2:]) != size
-        ):
+        is_batch = isinstance(images, Tensor) and not images.is_complex() and images.ndim == 4
+        if not is_batch or tuple(images.shape[-2:]) != size:
             what = f"{images.dtype} {tuple(images.shape)}" if isinstance(images, Tensor) else type(images).__name__
             raise ValueError(
                 f"{owner}: images must be a tensor (B, C, H, W) of real numbers, of the source's image_size {size}; "

@@ -223,8 +223,8 @@ class ShutterWarp(MirrorWarp):
     def inverse(self) -> Warp:
         """Return the warp from target to source. It puts on the shutter that this one undoes, and the other way."""
         rotation = None if self.rotation is None else self.rotation.mT
-        shutters = {"shutter": self.target_shutter, "target_shutter": self.shutter}
-        return self.between(self.target, self.source, rotation, **self.options, **shutters)
+        options = {**self.options, "shutter": self.target_shutter, "target_shutter": self.shutter}
+        return self.between(self.target, self.source, rotation, **options)
 
     def between(self, source: Camera, target: Camera, rotation: Tensor | None, **options: Any) -> Warp:
         """See `Warp.between`; the shutters stay unless the options have others."""

@@ -177,8 +177,7 @@ def _views(
     size = as_whole(size, "size", owner, least=1)
     focal, centre = size / 2 / math.tan(fov / 2), (size - 1) / 2
     intrinsics = camera.intrinsics.detach().new_tensor([focal, focal, centre, centre])
-    view = Pinhole(nn.Parameter(intrinsics, requires_grad=False), image_size=(size, size))
-    return Views(camera, view, rotations.to(intrinsics), names, mode)
+    return Views(camera, pinhole(intrinsics, (size, size)), rotations.to(intrinsics), names, mode)
 
 
 def look_at(camera: Camera, boxes: Numbers, image_size: Sequence[int], *, margin: float = 0.25) -> Warp:
@@ -215,7 +214,7 @@ def look_at(camera: Camera, boxes: Numbers, image_size: Sequence[int], *, margin
         raise ValueError(f"{owner}: {len(given)} boxes do not fit a camera of batch dims {batch}")
     size = as_known_size(image_size, owner)
     rows = given if given.ndim == 2 else given.expand(*(batch or (1,)), 4)
-    check_extents(rows, camera, "boxes", owner)
+    check_extents(rows, camera, owner)
     intrinsics, rotation = looking_at(camera, rows, size, as_margin(margin, owner), owner)
     if given.ndim == 1 and not batch:
         intrinsics, rotation = intrinsics[0], rotation[0]
@@ -237,9 +236,9 @@ def pinhole(intrinsics: Tensor, size: tuple[int, int]) -> Pinhole:
     return remade(_VIRTUAL, intrinsics=intrinsics, distortion=intrinsics[..., :0], image_size=size)
 
 
-def check_extents(boxes: Tensor, camera: Camera, name: str, owner: str) -> None:
+def check_extents(boxes: Tensor, camera: Camera, owner: str) -> None:
     """Raise a ValueError unless boxes (B, 4) are finite, have an extent, and are on the camera's image."""
-    check_boxes(boxes, name, owner)
+    check_boxes(boxes, "boxes", owner)
     limits = boxes.new_tensor((camera.width, camera.height)) - 0.5
     low, high = boxes.split(2, -1)
     for wrong, what in (
@@ -249,7 +248,7 @@ def check_extents(boxes: Tensor, camera: Camera, name: str, owner: str) -> None:
     ):
         if bool(wrong.any()):
             i = int(wrong.nonzero()[0])
-            raise ValueError(f"{owner}: {name} {what}; got {name}[{i}] = {boxes[i].tolist()}")
+            raise ValueError(f"{owner}: boxes {what}; got boxes[{i}] = {boxes[i].tolist()}")
 
 
 @torch.no_grad()

@@ -36,7 +36,7 @@ def fuzzed(tmp_path):
     """Builds a driver, and sources of the library for some variants, with sanitizers, and runs random jobs."""
 
     def run(driver, sources, variants, first, jobs):
-        command = [*building._compiler(None), "-std=gnu11", "-g1", "-Wno-psabi", f"-I{building._HERE}", *SANITIZERS]
+        command = [*building._compiler(), "-std=gnu11", "-g1", "-Wno-psabi", f"-I{building._HERE}", *SANITIZERS]
         (tmp_path / "empty.c").write_text("int main(void) { return 0; }\n")
         if subprocess.run([*command, "empty.c", "-o", "empty"], cwd=tmp_path, capture_output=True).returncode:
             pytest.skip(f"{command[0]} has no sanitizers")
