@@ -132,8 +132,7 @@ def gather(words: Iterable[str]) -> list[Path]:
     """Return images, each once, in natural order, of files, folders (not those in them), and patterns."""
     found: dict[str, Path] = {}
     for word in words:
-        path = Path(word)
-        if path.is_dir():
+        if (path := Path(word)).is_dir():
             paths = [p for p in path.iterdir() if p.suffix.lower() in IMAGES and p.is_file()]
             if not paths:
                 raise ValueError(f"{word}: a folder without images")

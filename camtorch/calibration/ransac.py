@@ -37,9 +37,6 @@ class _Lines(NamedTuple):
     measures: Tensor  # (B, 3, N, 3): the slopes of u and v by the ray, px, and the ray; zeros for what is unseen
     threshold: float
 
-    def of(self, rows: Tensor | slice) -> _Lines:
-        return _Lines(self.points[rows], self.measures[rows], self.threshold)
-
     def forms(self) -> Tensor:
         """(B, 12, 3 N): what makes of [R t] the measures of all points."""
         points = pad(self.points, (0, 1), value=1.0)
@@ -121,11 +118,12 @@ class _Search(NamedTuple):
         """One for some rows, by numbers (H, N)."""
         samples, count = numbers.shape
         for part in rows.split(max(1, _AT_ONCE // (12 * samples * count))):
-            lines, every = self.lines.of(part), part[:, None, None]
+            lines = _Lines(self.lines.points[part], self.lines.measures[part], self.lines.threshold)
             first = torch.arange(count, device=rows.device) < self.counts[part, None]
             is_seen = torch.zeros_like(first).scatter(1, self.order[part], first)
             four = torch.where(is_seen[:, None], numbers, -1.0).topk(4).indices
-            points, rays = (t[every, four].flatten(0, 1) for t in (self.lines.points, self.lines.measures[:, 2]))
+            given = self.lines.points, self.lines.measures[:, 2]
+            points, rays = (t[part[:, None, None], four].flatten(0, 1) for t in given)
             found = poses_from_rays(points, rays, torch.ones_like(rays[..., 0]))
             poses = torch.cat((found.rotations, found.translations[..., None]), -1)
             poses = torch.where(found.valid[..., None, None], poses, torch.nan)

@@ -147,8 +147,7 @@ def _many(arguments: argparse.Namespace) -> int:
 
 def _target(source: Path, target: Path, suffix: str | None) -> Path:
     """Return `target` with the suffix of what is made of a file."""
-    is_video = videos.is_video(source)
-    if is_video:
+    if is_video := videos.is_video(source):
         target = target.with_suffix(videos.written_suffix(source))
     if suffix is not None and is_video == videos.is_video(Path("any" + suffix)):
         target = target.with_suffix(suffix)

@@ -119,8 +119,7 @@ _ATTRIBUTES = ("pose", "expression", "illumination", "make_up", "occlusion", "bl
 
 def _wflw_sample(samples: Samples, entry: tuple[str, bytes]) -> Sample:
     place = f"{samples.path}, {entry[0]}"
-    words = _text(entry[1], place).strip().split(maxsplit=206)
-    if len(words) not in (197, 207):
+    if len(words := _text(entry[1], place).strip().split(maxsplit=206)) not in (197, 207):
         what = "98 points, a box, six attributes and the name of an image are 207 words"
         raise ValueError(f"{place}: {what}, or 197 without box and attributes; got {len(words)}")
     sample: Sample = {"keypoints": _numbers(words[:196], place, "points", 98, 2)}

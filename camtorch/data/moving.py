@@ -279,8 +279,7 @@ class MapSamples(Mover):
             )
         if self._seeded is not None and self._key not in sample:
             raise ValueError(f"{owner}: no {self._key!r} to name the sample; it has {', '.join(map(str, sample))}")
-        labels = sample.get(self._labels, {})
-        if not isinstance(labels, Mapping):
+        if not isinstance(labels := sample.get(self._labels, {}), Mapping):
             raise TypeError(
                 f"{owner}: {self._labels} must be an object of labels; got {type(labels).__name__}"
                 + (". Undecoded ones are decoded by .decode()" if isinstance(labels, bytes) else "")

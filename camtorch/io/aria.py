@@ -76,10 +76,7 @@ def render(rig: Rig, lossy: Lossy) -> str:
                     "Params": [*(fx, fy)[:focals], cx, cy, *lossy.at_most(name, camera, distortion, (count,))],
                 },
                 "SerialNumber": "0",
-                "T_Device_Camera": {
-                    "Translation": translation,
-                    "UnitQuaternion": [w, [x, y, z]],
-                },
+                "T_Device_Camera": {"Translation": translation, "UnitQuaternion": [w, [x, y, z]]},
             }
         )
     whole = {

@@ -42,8 +42,7 @@ def parse(record: Record) -> Rig:
     extrinsics: dict[str, tuple[Tensor, Tensor]] = {}
     images: dict[str, str] = {}
     for name in record["extrinsics"].keys() if "extrinsics" in record else ():
-        entry = record["extrinsics"][name]
-        if "camera" in entry:
+        if "camera" in (entry := record["extrinsics"][name]):
             images[name] = entry["camera"].text()
         if images.get(name, name) not in cameras:
             entry.fail(f"of the camera {images.get(name, name)!r:.60}, which is not in the file")

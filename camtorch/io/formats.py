@@ -1,6 +1,6 @@
 """`load` and `save`: each format is asked whether a file is its own; none is known here but by its module.
 
-To add a format, write one file beside this one, as `protocol.py` says, and name it in one of the lists below.
+To add a format, write one file beside this one, as the protocols say, and name it in one of the lists below them.
 """
 
 from __future__ import annotations
@@ -8,7 +8,7 @@ from __future__ import annotations
 import codecs
 import fnmatch
 import os
-from typing import Any, TypeVar
+from typing import Any, Protocol, TypeVar
 
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.rig import Rig
@@ -31,12 +31,39 @@ from camtorch.io import (
     woodscape,
 )
 from camtorch.io.parsing import parse_mapping, path_of, read_bytes
-from camtorch.io.protocol import ContentFormat, KeyFormat, WrittenFormat
 from camtorch.io.record import CameraFileError, Names, Record
 from camtorch.io.writing import Lossy, replacing
 from camtorch.values.arguments import LEFT
 
 Kind = TypeVar("Kind", bound=Camera)
+
+
+class Format(Protocol):
+    """Any module of a format. What it cannot read or hold is a CameraFileError, as of `record.fail`."""
+
+    @property
+    def NAMES(self) -> Names: ...  # noqa: N802
+
+
+class KeyFormat(Format, Protocol):
+    """A module that reads keys and values, of YAML, JSON, XML, Python literals or NumPy archives, in float64."""
+
+    def matches(self, keys: dict[str, Any]) -> bool: ...
+    def parse(self, record: Record) -> Rig: ...
+
+
+class ContentFormat(Format, Protocol):
+    """A module that reads files of any other kind, with the files beside them, in float64."""
+
+    def matches(self, path: str, content: bytes) -> bool: ...
+    def read(self, path: str, content: bytes) -> Rig: ...
+
+
+class WrittenFormat(Format, Protocol):
+    """A module that writes: the text of a file; or the contents of files that are no text, or several, by paths."""
+
+    def render(self, rig: Rig, lossy: Lossy) -> str | dict[str, bytes]: ...
+
 
 # read, in the order in which they are asked
 _BY_CONTENT: tuple[ContentFormat, ...] = (colmap, metashape, nuscenes, ocamcalib)

@@ -34,8 +34,7 @@ def matches(path: str, content: bytes) -> bool:
 
 def read(path: str, content: bytes) -> Rig:
     """The camera of a calibration; or those of calibrated sensors by their labels, and the poses of their images."""
-    root = parse_xml(path, decoded(path, content))
-    if root.tag == "calibration":
+    if (root := parse_xml(path, decoded(path, content))).tag == "calibration":
         return Rig({"camera": _camera(Record(path, _values(root), "calibration"))})
     if len(chunks := root.findall("chunk")) != 1:
         Record(path, None, "document").fail(f"{len(chunks)} chunks; one is read, so export each to a file of its own")

@@ -246,8 +246,7 @@ def calibration(calibration: Calibration | RigCalibration) -> Figure:
         pixels, errors = (t.double().numpy(force=True) for t in (camera.observations.pixels, camera.point_residuals))
         head = f"{printable(name)}: " if name else ""
         _draw_residuals(left, camera, pixels[inliers], errors[inliers], head)
-        outliers = pixels[seen.numpy(force=True) & ~inliers]
-        if len(outliers):
+        if len(outliers := pixels[seen.numpy(force=True) & ~inliers]):
             label = f"{len(outliers):,} outlier{'s' * (len(outliers) > 1)}"
             left.plot(*outliers.T, "x", color=COLOURS[1], markersize=4, label=label, zorder=5)
             left.legend(loc="lower right", framealpha=0.8)
