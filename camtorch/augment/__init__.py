@@ -23,10 +23,10 @@ from camtorch.augment.edits import (
 )
 from camtorch.augment.face import FaceNormalizer
 from camtorch.augment.face_model import face_points
+from camtorch.augment.kinds import from_pitch_yaw, to_pitch_yaw
 from camtorch.augment.landmarks import LANDMARKS
 from camtorch.augment.presets import PRESETS, Preset
 from camtorch.augment.random_camera import RandomCamera, RandomLens, RandomMount
-from camtorch.augment.sample import from_pitch_yaw, to_pitch_yaw
 from camtorch.augment.shutter import RandomShutter
 from camtorch.poses.rotations import mount_rotation
 from camtorch.values.arguments import LEFT

@@ -25,7 +25,8 @@ from torch.nn.utils.parametrize import type_before_parametrizations
 from camtorch import augment
 from camtorch.augment.augmentation import Augmentation
 from camtorch.augment.change import Change
-from camtorch.augment.sample import OWN, KeepsCamera, Sample, Single, detached, is_text, kind_of, on_samples
+from camtorch.augment.kinds import OWN, is_text, kind_of
+from camtorch.augment.sample import KeepsCamera, Sample, Single, detached, on_samples
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.mixed import collate_cameras
 from camtorch.evaluate.private import pytree

@@ -23,9 +23,10 @@ from kornia.geometry.keypoints import Keypoints
 from torch import Tensor
 
 from camtorch.augment import box_crop, compose, edits, random_camera
-from camtorch.augment.augmentation import Augmentation, check_front_end, check_single
+from camtorch.augment.augmentation import Augmentation
 from camtorch.augment.change import Change
 from camtorch.augment.containers import KIND, InContainers, Params, camera_of, kind_of_camera, with_boxes, with_cameras
+from camtorch.augment.front_end import check_front_end, check_single
 from camtorch.augment.sample import detached, on_samples
 from camtorch.cameras.camera import Camera
 from camtorch.evaluate.kept import Kept

@@ -16,9 +16,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from camtorch.augment.augmentation import Augmentation, FrontEnd, check_front_end
+from camtorch.augment.augmentation import Augmentation
 from camtorch.augment.face import FaceNormalizer
-from camtorch.augment.sample import _ALIASES, IMAGES, KINDS, OWN, Sample, Single, kind_of
+from camtorch.augment.front_end import FrontEnd, check_front_end
+from camtorch.augment.kinds import ALIASES, IMAGES, KINDS, OWN, kind_of
+from camtorch.augment.sample import Sample, Single
 from camtorch.cameras.camera import Camera
 from camtorch.warp.arrays import as_array, as_planes, as_tensor, plain
 
@@ -135,7 +137,7 @@ class Transform(FrontEnd):
             tensor = as_tensor(value, name, _OWNER)
             return {name: tensor}, lambda moved: plain(moved[name]).astype(value.dtype, copy=False)
         many = isinstance(value, (list, tuple))
-        if not many and name not in _ALIASES:
+        if not many and name not in ALIASES:
             value = np.asarray(value, bool) if name.endswith(_VALID) else value
             return {name: as_planes(value, name, _OWNER, size)}, lambda moved: as_array(moved[name], value)
         key = f"{kind}_{name}"  # which begins with its kind, and is known to the augmentation

@@ -18,8 +18,8 @@ from typing_extensions import Unpack
 from camtorch.augment.augmentation import Augmentation, FilledOptions, Range, as_range
 from camtorch.augment.change import Part, View
 from camtorch.augment.filling import enough, scaled
+from camtorch.augment.kinds import Named
 from camtorch.augment.presets import PRESETS, PresetName
-from camtorch.augment.sample import Named
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.numbers import joined, split
 from camtorch.cameras.opaque import CameraNumbers, opaque

@@ -9,7 +9,7 @@ import functools
 import inspect
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, ClassVar, ParamSpec, TypedDict, TypeVar, cast, get_args, get_origin, get_type_hints
 
 import numpy as np
@@ -19,26 +19,36 @@ from typing_extensions import Unpack
 
 from camtorch.augment.change import Change, View, alone, as_one
 from camtorch.augment.clips import Clips
+from camtorch.augment.kinds import (
+    CHECKED,
+    IMAGES,
+    KEEP,
+    KINDS,
+    OWN,
+    Named,
+    as_tensor,
+    check,
+    check_values,
+    is_batch,
+    kind_of,
+    move_pixels,
+    moves,
+    tell_of_parts,
+)
 from camtorch.augment.landmarks import Mirroring, exchanged
 from camtorch.cameras.camera import Camera
-from camtorch.evaluate.known import are_numbers, in_worker, known_false, known_true
+from camtorch.evaluate.known import are_numbers, in_worker
 from camtorch.evaluate.private import pytree
 from camtorch.models import Pinhole
-from camtorch.poses.rotations import are_rotations, check_rotation, rotation_matrix, rotation_vector
 from camtorch.values.arguments import (
     GUESS_CAMERA,
     LEFT,
-    as_coordinates,
     as_flag,
     as_mapping,
     as_number,
-    check_angles,
-    check_boxes,
     check_devices,
-    check_radians,
     hinting,
     no_camera,
-    warn,
 )
 from camtorch.values.threads import on_one_thread
 from camtorch.warp.at_once import at_once, batch_at_once
@@ -50,8 +60,6 @@ R = TypeVar("R")
 
 Sample = dict[str, Any]
 """Name -> value; see `Augmentation`."""
-Named = dict[str, tuple[str, Any]]
-"""Name -> (kind, tensor or list of tensors)."""
 
 
 class Single(dict[str, Any]):
@@ -62,266 +70,7 @@ class Frames(Single):
     """A single sample whose values may have leading dims, as those of clips have: all of them move by one change."""
 
 
-KEEP = "keep"
-IMAGES = ("image", "mask", "depth", "distance")
-
-
-Move = Callable[[Change, Tensor, Mapping[str, float]], Any]
-
-
-@dataclass(frozen=True)
-class Field:
-    """A kind of data."""
-
-    dims: int  # the least number of dims of a single sample
-    most_dims: int  # the most
-    last: tuple[int, ...]  # what its last dim may be; empty: anything
-    shape: str  # in words, of a batch
-    move: Move  # (change, batch, options) -> batch, or (batch, valid)
-    decides: bool = False  # whether its number of dims tells a batch from a single sample
-
-
-def _planes(move: Move) -> Move:
-    """Of masks and the like, which also come without channels, (B, H, W)."""
-
-    def of(change: Change, value: Tensor, options: Mapping[str, float]) -> Tensor:
-        moved: Tensor = move(change, value.unsqueeze(1) if value.ndim == 3 else value, options)
-        return moved.squeeze(1) if value.ndim == 3 else moved
-
-    return of
-
-
-def _pose(change: Change, pose: Tensor, options: Mapping[str, float]) -> Tensor:
-    turned = change.rays(pose[..., :3, :], _columns, _columns)
-    turned = torch.cat((turned[..., :3], change.positions(pose[..., :3, 3]).to(turned)[..., None]), -1)
-    top = _mirrored_head(change, turned, options)
-    return torch.cat((top, pose[..., 3:, :].to(top)), -2)
-
-
-def _mirrored_head(change: Change, matrix: Tensor, options: Mapping[str, float]) -> Tensor:
-    """Columns (B, 3, n) of turned heads: in a mirror a head's left side is its right one, and its turn no mirror."""
-    mirrored = change.mirrored
-    if mirrored is None:
-        return matrix
-    lateral = torch.arange(matrix.shape[-1], device=matrix.device) == options.get("lateral", 0)
-    return torch.where(mirrored.to(matrix.device)[:, None, None] & lateral, -matrix, matrix)
-
-
-def _columns(matrix: Tensor) -> Tensor:
-    return matrix.mT
-
-
-def _rotation_vector(change: Change, rvec: Tensor, options: Mapping[str, float]) -> Tensor:
-    if change.mirrored is None:
-        return change.rays(rvec, lambda r: rotation_matrix(r).mT, lambda columns: rotation_vector(columns.mT))
-    turned = _mirrored_head(change, change.rays(rotation_matrix(rvec), _columns, _columns), options)
-    eye = torch.eye(3, dtype=change.rotation.dtype, device=change.rotation.device)
-    still = (change.rotation == eye).all(-1).all(-1).to(rvec.device)
-    return torch.where(still.unsqueeze(-1), rvec.to(turned), rotation_vector(turned))
-
-
-_MANY = 16
-_ROUNDING = 0.01
 _MOST_FORMS = 16  # of samples that a transform remembers
-
-
-def _positions(change: Change, points: Tensor, options: Mapping[str, float]) -> Tensor:
-    return change.positions(points)
-
-
-def _pixels(change: Change, pixels: Tensor, options: Mapping[str, float]) -> tuple[Tensor, Tensor]:
-    return change.points(pixels)
-
-
-_DIRECTIONS = Field(
-    1, _MANY, (3,), "(B, *N, 3) directions of the camera frame", lambda change, rays, _: change.rays(rays)
-)
-_POSE = Field(2, 2, (4,), "(B, 4, 4) or (B, 3, 4), camera from head", _pose)
-_MASKS = "(B, C, H, W) or (B, H, W)"
-_DEPTHS = "(B, 1, H, W) or (B, H, W), along"
-_PITCH_YAW = "(B, *N, 2) pitch and yaw of a gaze in radians"
-KINDS = {
-    "image": Field(3, 3, (), "(B, C, H, W)", lambda change, images, _: change.images(images), True),
-    "mask": Field(2, 3, (), _MASKS, _planes(lambda change, masks, given: change.labels(masks, given["mask_fill"]))),
-    "depth": Field(2, 3, (), f"{_DEPTHS} z", _planes(lambda change, depth, _: change.depth(depth))),
-    "distance": Field(2, 3, (), f"{_DEPTHS} the ray", _planes(lambda change, distance, _: change.distance(distance))),
-    "keypoints": Field(2, 3, (2,), "(B, N, 2) or (B, F, N, 2) pixels x, y", _pixels, True),
-    "polygons": Field(3, 3, (2,), "(B, M, K, 2) corners x, y", _pixels, True),
-    "boxes": Field(2, 2, (4,), "(B, M, 4) pixels x1, y1, x2, y2", lambda change, boxes, _: change.boxes(boxes), True),
-    "landmarks": Field(2, 3, (2, 3), "(B, N, 2) pixels or (B, N, 3) points of the camera frame", _pixels, True),
-    "points": Field(1, _MANY, (3,), "(B, *N, 3) points of the camera frame", _positions),
-    "gaze": _DIRECTIONS,
-    "directions": _DIRECTIONS,
-    "pitch_yaw": Field(1, _MANY, (2,), _PITCH_YAW, lambda c, angles, _: c.rays(angles, from_pitch_yaw, to_pitch_yaw)),
-    "head_pose": _POSE,
-    "pose": _POSE,
-    "rvec": Field(1, 1, (3,), "(B, 3), a rotation vector, camera from head", _rotation_vector),
-    "tvec": Field(1, 1, (3,), "(B, 3), a point of the camera frame", _positions),
-    "rotation": Field(2, 2, (3,), "(B, 3, 3), turned so far", lambda c, turn, _: c.rays(turn, _columns, _columns)),
-}
-_CHECKED = ("boxes", "rvec", "head_pose", "pose", "pitch_yaw")
-"""Whose values are checked, not their shape alone."""
-_ALIASES = {"images": "image", "masks": "mask", "bboxes": "boxes", "point": "points", "face_center": "points"}
-OWN = ("camera", "source_camera", "source_rotation", "scale")  # these come with a change and do not move
-
-
-_RANKS = {kind: (not field.decides, i) for i, (kind, field) in enumerate(KINDS.items())}
-
-
-def kind_of(name: str, value: object, own: Mapping[str, str], owner: str, single: bool = False) -> str | None:
-    """Return the key in `KINDS` of a field, None if it stays; numbers of an unknown name may be geometry: an error."""
-    if not isinstance(name, str):
-        raise TypeError(f"{owner}: a sample must have strings for names; got {name!r:.80}")
-    if name in own:
-        return None if own[name] == KEEP else own[name]
-    if name.endswith("_valid"):
-        return None
-    base = name if name in KINDS else _ALIASES.get(name)
-    # no image_path, mask_id, of one sample or of a batch
-    if base is None and isinstance(value, (Tensor, np.ndarray, list, tuple)) and not is_text(value):
-        begins = sorted((k for k in KINDS if name.startswith(k + "_")), key=len)  # compilers know no max by a key
-        base = begins[-1] if begins else None
-    if base is None and _may_be_geometry(name, value, single):
-        if isinstance(value, Mapping):
-            raise ValueError(
-                f"{owner}: {name!r} holds real numbers in a dict, and fields move only at the top of samples. Put them "
-                f"there, or leave the dict as it is by fields={{{name!r}: '{KEEP}'}}"
-            )
-        close = _close_to(name)
-        meant = f"Did you mean {close[0]!r}? " if close else ""
-        raise ValueError(
-            f"{owner}: {name!r} holds real numbers, and whether they move with the camera is not known. {meant}"
-            f"fields={{{name!r}: KIND}} says so, where KIND is {', '.join(KINDS)} or {KEEP}"
-        )
-    return base
-
-
-def is_text(value: Any) -> bool:
-    """Whether it holds strings, at least one and in lists of any depth, and nothing else."""
-    texts = pytree.tree_leaves(value.tolist() if isinstance(value, np.ndarray) and value.dtype.kind in "OSU" else value)
-    return len(texts) > 0 and all(isinstance(text, (str, bytes)) for text in texts)
-
-
-@functools.lru_cache(64)
-def _close_to(name: str) -> list[str]:
-    return ["mask"] if name.startswith("seg") else difflib.get_close_matches(name, KINDS, 1)
-
-
-def _may_be_geometry(name: str, value: Any, single: bool, above: int = 0) -> bool:
-    """Whether it holds real numbers, or whole ones of more than a row a sample or with such a name; not one alone.
-
-    above: the number of lists around it, which count as dims.
-    """
-    if isinstance(value, Mapping):
-        return any(_may_be_geometry(str(key), item, single) for key, item in value.items())
-    if isinstance(value, np.ndarray) and value.dtype == object:
-        value = value.tolist()
-    if isinstance(value, (list, tuple)):
-        return any(_may_be_geometry(name, item, single, above + 1) for item in value)
-    if isinstance(value, (np.ndarray, np.generic)):
-        whole, known = value.dtype.kind in "iub", value.dtype.kind in "iubfcV"
-    elif isinstance(value, Tensor):
-        whole, known = not (value.is_floating_point() or value.is_complex()), True
-    else:
-        whole, known = not isinstance(value, float), isinstance(value, (int, float))
-    dims, row = above + getattr(value, "ndim", 0), 1 if single else 2
-    return known and (dims > (row if whole else 0) or (dims == row and bool(_close_to(name))))
-
-
-def moves(kind: str, value: Tensor) -> Move:
-    """How values of a kind move."""
-    return _positions if kind == "landmarks" and value.shape[-1] == 3 else KINDS[kind].move
-
-
-def as_tensor(value: object, name: str, kind: str, owner: str) -> Tensor:
-    """Return the value of a field as a tensor of real numbers."""
-    if isinstance(value, np.ndarray) and value.dtype.kind in "fiub":
-        value = torch.from_numpy(value)
-    if not isinstance(value, Tensor) or value.dtype.is_complex:
-        what = f"dtype {value.dtype}" if isinstance(value, (Tensor, np.ndarray)) else type(value).__name__
-        plain = isinstance(value, (list, tuple, int, float))
-        hint = ". Plain numbers go in as torch.tensor(numbers); a list has a tensor for each sample"
-        raise TypeError(
-            f"{owner}: {name} must be a tensor of real numbers, {KINDS[kind].shape}; got {what}"
-            f"{hint if plain else _hint(name)}"
-        )
-    if kind not in IMAGES and not value.dtype.is_floating_point:
-        value = value.to(torch.get_default_dtype())  # whole pixels do not stay whole
-    return value
-
-
-def _hint(name: str) -> str:
-    return "" if name in KINDS else f". If it is something else, fields={{{name!r}: '{KEEP}'}} leaves it as it is"
-
-
-def check(kind: str, name: str, value: Tensor, batched: bool, owner: str) -> None:
-    """Raise a ValueError unless a kind takes this shape."""
-    field = KINDS[kind]
-    dims = value.ndim - batched
-    least, most = field.dims, field.most_dims
-    if not least <= dims <= most or (field.last and value.shape[-1] not in field.last):
-        what = field.shape if batched else field.shape.replace("(B, ", "(")
-        hint = _hint(name)
-        if kind in ("rvec", "tvec") and value.shape[-2:] == (3, 1):
-            hint = f". OpenCV's column goes in as {name}[..., 0]"
-        if kind == "image" and value.ndim == 5:
-            hint = f". The frames of clips go in as a batch, by {name}.flatten(0, 1)"
-        if kind == "keypoints" and value.ndim and value.shape[-1] == 3:
-            hint = f". Of x, y and visibility, [..., 2] goes in as {name}_valid=..., a flag for each"
-        raise ValueError(f"{owner}: {name} must be {what}; got shape {tuple(value.shape)}{hint}")
-    if kind in ("head_pose", "pose") and value.shape[-2] not in (3, 4):
-        raise ValueError(f"{owner}: {name} must be {field.shape}; got shape {tuple(value.shape)}")
-
-
-def check_values(kind: str, name: str, value: Tensor, owner: str) -> None:
-    """Raise a ValueError for plain labels in another form than that of their kind; what is NaN is in none."""
-    if kind == "boxes":
-        form = getattr(getattr(value, "format", None), "value", "XYXY")  # of torchvision's BoundingBoxes
-        if form != "XYXY":
-            raise ValueError(
-                f"{owner}: {name} must be x1, y1, x2, y2; got BoundingBoxes of the format {form}, which "
-                "camtorch.augment.torchvision.Transform takes"
-            )
-        check_boxes(value, name, owner)
-    elif kind == "rvec":
-        check_radians(value, name, owner)
-    elif kind in ("head_pose", "pose") and value.is_cpu and not value.requires_grad:
-        rotations = value[..., :3, :3]
-        wrong = ~are_rotations(rotations) & torch.isfinite(rotations).flatten(-2).all(-1)
-        if known_false(~wrong):
-            check_rotation(rotations[wrong][:1], name, owner)
-    elif kind == "pitch_yaw" and value.is_cpu and not value.requires_grad:
-        # with room for the rounding of half precision
-        beyond = value.abs() > value.new_tensor([math.pi / 2, math.pi]) * (1 + _ROUNDING)
-        if known_false(~beyond):
-            pitch, yaw = value[beyond.any(-1)][0].tolist()
-            raise ValueError(
-                f"{owner}: {name} must be radians, pitch within pi / 2 and yaw within pi; got {pitch:.6g}, {yaw:.6g}. "
-                "Degrees are converted by torch.deg2rad() or math.radians()"
-            )
-
-
-def _tell_of_parts(name: str, boxes: Tensor, owner: str) -> None:
-    """Warn of boxes that all lie between the centres of the first pixels, as parts of an image's sides do."""
-    if boxes.is_cpu and known_true((boxes == boxes.clamp(0, 1)).all() & (boxes % 1 != 0).any()):
-        warn(
-            f"{owner}: {name} must be pixels x1, y1, x2, y2, and all of these lie within [0, 1], as parts of an "
-            "image's width and height do: times width and height, less 0.5, those are pixels"
-        )
-
-
-def is_batch(named: Named, camera: object) -> bool:
-    """Whether name -> (kind, value) is a batch: the first image, pixels or boxes says, else cameras, else any field."""
-    if isinstance(camera, (list, tuple)):
-        return True
-    for kind, value in sorted(named.values(), key=lambda pair: _RANKS[pair[0]]):
-        if isinstance(value, (list, tuple)):
-            return True
-        if KINDS[kind].decides:
-            return bool(value.ndim > KINDS[kind].dims)
-    if isinstance(camera, Camera) and camera.batch_shape:
-        return True
-    return any(value.ndim > KINDS[kind].dims for kind, value in named.values())
 
 
 class Unknown(Pinhole):
@@ -553,7 +302,7 @@ class SampleTransform(KeepsCamera, nn.Module):
         own, batched, count = known
         if not predicted:
             for name, found in own:
-                if found in _CHECKED:
+                if found in CHECKED:
                     check_values(found, name, sample[name], self._name)
         named = {name: (found, sample[name] if batched else sample[name].unsqueeze(0)) for name, found in own}
         return named, batched, count, camera
@@ -596,7 +345,7 @@ class SampleTransform(KeepsCamera, nn.Module):
                 if not predicted:
                     check_values(found, which, item, self._name)
                     if found == "boxes" and "image" in named:
-                        _tell_of_parts(which, item, self._name)
+                        tell_of_parts(which, item, self._name)
             value = items if several else value if batched else value.unsqueeze(0)
             own = len(items) if several else items[0].shape[0] if batched else 1
             named[name], count = (found, value), own if count < 0 else count
@@ -830,7 +579,7 @@ def together(
             hows[name] = Sampler("nearest", "zeros", (mask_fill,))
         elif is_single and found == "boxes" and isinstance(part.moves, View) and are_numbers(value):
             hows |= {name: None} if value.dtype == part.moves.distortion.dtype else {}
-        elif is_single and found != "boxes" and moves(found, value) is _pixels:
+        elif is_single and found != "boxes" and moves(found, value) is move_pixels:
             hows[name] = None
     fields = (named[name] for name in hows)
     values = [edges_of(value) if found == "boxes" else value for found, value in fields]
@@ -856,23 +605,3 @@ def together(
         else:
             results[name] = result if result.dtype == value.dtype else _in_range(result, value.dtype), valid
     return results
-
-
-def from_pitch_yaw(angles: Tensor) -> Tensor:
-    """Unit gaze vectors (..., 3) of pitch and yaw (..., 2) in radians, as in MPIIGaze and ETH-XGaze.
-
-    Zero looks into the camera, along -z. Source: Zhang et al., ETH-XGaze, 2020, and its code.
-
-    Raises:
-        ValueError: another shape, plain angles of more than a turn, which are degrees.
-    """
-    angles = as_coordinates(angles, "angles", 2, "from_pitch_yaw")
-    check_angles(angles, "from_pitch_yaw")
-    pitch, yaw = angles.unbind(-1)
-    return torch.stack((-pitch.cos() * yaw.sin(), -pitch.sin(), -pitch.cos() * yaw.cos()), -1)
-
-
-def to_pitch_yaw(gaze: Tensor) -> Tensor:
-    """Pitch and yaw (..., 2) in radians of gaze vectors (..., 3): pitch = asin(-y), yaw = atan2(-x, -z)."""
-    x, y, z = as_coordinates(gaze, "gaze", 3, "to_pitch_yaw").unbind(-1)
-    return torch.stack((torch.atan2(-y, torch.hypot(x, z)), torch.atan2(-x, -z)), -1)

@@ -16,9 +16,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from camtorch.augment.augmentation import Augmentation, FrontEnd, camera_of_sample, check_front_end
+from camtorch.augment.augmentation import Augmentation
 from camtorch.augment.change import Change
-from camtorch.augment.sample import IMAGES, KEEP, KINDS, OWN, Frames, as_tensor, detached, kind_of, on_samples
+from camtorch.augment.front_end import FrontEnd, camera_of_sample, check_front_end
+from camtorch.augment.kinds import IMAGES, KEEP, KINDS, OWN, as_tensor, kind_of
+from camtorch.augment.sample import Frames, detached, on_samples
 from camtorch.cameras.camera import Camera
 from camtorch.evaluate.private import pytree
 from camtorch.warp.arrays import as_planes_of

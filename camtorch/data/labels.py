@@ -20,8 +20,9 @@ from PIL import Image
 from torch import Tensor
 from torch.utils.data import Dataset
 
+from camtorch.augment.kinds import KINDS
 from camtorch.augment.landmarks import LANDMARKS, TableLike
-from camtorch.augment.sample import KINDS, Sample
+from camtorch.augment.sample import Sample
 from camtorch.cameras.camera import Camera
 from camtorch.data.columns import camera_of
 from camtorch.io.photographs import load_stored

@@ -12,8 +12,9 @@ from torch import Tensor
 from camtorch.augment.augmentation import Augmentation
 from camtorch.augment.change import Part
 from camtorch.augment.face import FaceNormalizer
+from camtorch.augment.kinds import IMAGES, KEEP, KINDS, kind_of
 from camtorch.augment.numpy import Transform
-from camtorch.augment.sample import IMAGES, KEEP, KINDS, Sample, kind_of
+from camtorch.augment.sample import Sample
 from camtorch.cameras.camera import Camera
 from camtorch.data.columns import PARTS, camera_of, to_columns
 from camtorch.data.seeded import Key, Seeded

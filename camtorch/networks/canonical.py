@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 
 from camtorch.augment.change import Change, Part, alone, as_one, by_kinds
-from camtorch.augment.sample import Named, Sample, SampleTransform, on_samples
+from camtorch.augment.kinds import Named
+from camtorch.augment.sample import Sample, SampleTransform, on_samples
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.editing import edited
 from camtorch.cameras.mixed import Mixed

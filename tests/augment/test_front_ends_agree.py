@@ -12,7 +12,7 @@ from torchvision_stand_in import torchvision_of
 import camtorch as ct
 import camtorch.augment.numpy
 from camtorch.augment import BoxCrop, Compose, HorizontalFlip, Pad, RandomCamera, RandomMount, RandomResizedCrop
-from camtorch.augment.sample import _ALIASES, IMAGES, KINDS
+from camtorch.augment.kinds import ALIASES, IMAGES, KINDS
 
 SIZE = 48, 64
 EDITS = {
@@ -208,4 +208,4 @@ def test_front_ends_name_no_fields(front_end):
     with open(source, encoding="utf-8") as file:
         tree = ast.parse(file.read())
     texts = {node.value for node in ast.walk(tree) if isinstance(node, ast.Constant)}
-    assert texts & {*KINDS, *_ALIASES} <= THEIR_OWN[front_end]
+    assert texts & {*KINDS, *ALIASES} <= THEIR_OWN[front_end]
