@@ -102,14 +102,11 @@ class Summary:
     """Numbers of a single camera; those of the image are None for a camera without image size."""
 
     camera: Camera
-    valid_angle: tuple[float, float]
-    """Radians from the axis up to which rays are valid, on the azimuths where that is least and greatest."""
-    fov: tuple[float, float, float] | None = None
-    """Degrees: horizontal and vertical through the principal point, and on the wider diagonal of the image, from
-    outer edge to outer edge or as far as there are rays."""
+    valid_angle: tuple[float, float]  # radians from the axis up to which rays are valid, on the worst and best azimuth
+    fov: tuple[float, float, float] | None = None  # degrees, see `Camera.fov`
     seen: float | None = None  # the part of the image that has rays
+    # for each of CORNERS how many pixels right and down distortion moves what is there, or why that has no answer
     corners: tuple[tuple[float, float] | str, ...] | None = None
-    """For each of CORNERS how many pixels right and down distortion moves what is there, or why that has no answer."""
 
     def lines(self) -> list[str]:
         """For people: a label and its numbers on each line."""

@@ -21,8 +21,7 @@ from camtorch.io.photographs import read_stored
 from camtorch.values.arguments import as_number, shown, warn
 
 _OWNER = "find_board"
-IMAGES = frozenset({".bmp", ".jpeg", ".jpg", ".pgm", ".png", ".ppm", ".tif", ".tiff", ".webp"})
-"""Suffixes, in lower case, of images in folders, and of those that are written."""
+IMAGES = frozenset({".bmp", ".jpeg", ".jpg", ".pgm", ".png", ".ppm", ".tif", ".tiff", ".webp"})  # read, and written
 _NAMED = 6  # images left out, in the warning
 _RGB = 0.299, 0.587, 0.114
 _EITHER_WAY = 0.2065, 0.587, 0.2065  # of RGB or BGR: boards are black and white
@@ -181,9 +180,8 @@ def _grey_of(image: Any, weights: Sequence[float], name: str = "image") -> NDArr
     """Return the grey values (H, W) of an array (H, W, C) or a tensor (C, H, W), colours by their weights."""
     array = image.detach().cpu().numpy() if isinstance(image, torch.Tensor) else image
     if array.ndim not in (2, 3) or (array.ndim == 3 and not _has_channels(image)) or not array.size:
-        raise ValueError(
-            f"{_OWNER}: {name} must be an array (H, W) or (H, W, C), or a tensor (C, H, W); got {tuple(image.shape)}"
-        )
+        forms = "an array (H, W) or (H, W, C), or a tensor (C, H, W)"
+        raise ValueError(f"{_OWNER}: {name} must be {forms}; got {tuple(image.shape)}")
     if array.ndim == 3 and isinstance(image, torch.Tensor):
         array = np.moveaxis(array, 0, -1)
     if array.dtype.kind == "f":

@@ -96,9 +96,8 @@ def as_model(
     if start is not None and model.smoothness() is not None:
         fixed = (*fixed, *INTRINSICS)  # a surface does what these do as well
     if unknown := [name for name in fixed if not isinstance(name, str) or name not in names]:
-        raise ValueError(
-            f"{owner}: fixed names {', '.join(map(repr, unknown))}; {model.__name__} has {', '.join(names)}"
-        )
+        wrong = ", ".join(map(repr, unknown))
+        raise ValueError(f"{owner}: fixed names {wrong}; {model.__name__} has {', '.join(names)}")
     if start is not None:
         fixed = *fixed, *frozen_names(start)
     if start is None and {"fx", "fy"} & set(fixed):

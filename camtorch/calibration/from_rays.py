@@ -86,9 +86,8 @@ def fit(
         try:
             given = given.expand(shape).reshape(good.shape)
         except RuntimeError:
-            raise ValueError(
-                f"{owner}: weights must broadcast against the rays {tuple(shape)}; got {tuple(given.shape)}"
-            ) from None
+            wanted = f"weights must broadcast against the rays {tuple(shape)}"
+            raise ValueError(f"{owner}: {wanted}; got {tuple(given.shape)}") from None
         if bool((given < 0).any()) or not bool(torch.isfinite(given).all()):
             raise ValueError(f"{owner}: weights must be finite, and not negative; got down to {float(given.min()):.4g}")
         flat_weights = flat_weights * given.sqrt()  # of squares: the fit weighs errors

@@ -47,14 +47,12 @@ class Observations(NamedTuple):
 class Layout(NamedTuple):
     """The form in which the image points of one camera came."""
 
-    shapes: tuple[tuple[int, ...], ...]
-    """Of each view that was passed, without the last dim; where it was None, (N,) of its object points."""
+    shapes: tuple[tuple[int, ...], ...]  # of each view that was passed, without the last dim; of None its points' (N,)
     stacked: bool  # whether they were one tensor or array, not a list
     views: Tensor  # (V,) the numbers of the views that have corners, of those that were passed
     seen: Tensor  # (V, N) of the observations
     image_size: tuple[int, int]  # (height, width)
-    copies: tuple[int, ...]
-    """The numbers of the views, of those that were passed, that are no new evidence: see `_observed` and `repeats`."""
+    copies: tuple[int, ...]  # the numbers of passed views that are no new evidence: see `_observed` and `repeats`
 
     def restore(self, values: Tensor) -> Any:
         """Results (V, N, k) or (V, N) in the form of the image points, NaN (of bool: False) where nothing was seen."""
@@ -85,9 +83,8 @@ def as_rig_observations(
     """Return what each camera of a rig sees of the same boards, by name in the order of the models."""
     for argument, given in {"models": models, "image_points": image_points, "image_sizes": image_sizes}.items():
         if not isinstance(given, Mapping) or not all(isinstance(name, str) for name in given):
-            raise TypeError(
-                f"{owner}: {argument} must map names of cameras to theirs; got {type(given).__name__} {shown(given)}"
-            )
+            got = f"{type(given).__name__} {shown(given)}"
+            raise TypeError(f"{owner}: {argument} must map names of cameras to theirs; got {got}")
         if not given or set(given) != set(models):
             raise ValueError(
                 f"{owner}: models, image_points and image_sizes must name the same cameras; {argument} has "

@@ -190,9 +190,8 @@ class _Given(NamedTuple):
         given = None if weights is None else as_tensor(weights, "weights", owner, device)
         shapes = f"object_points {tuple(points.shape)} and pixels {tuple(seen_at.shape)}"
         if points.shape[-2] != count:
-            raise ValueError(
-                f"{owner}: {shapes} are not the same number of points. Rows of fewer points are padded with NaN pixels"
-            )
+            hint = "Rows of fewer points are padded with NaN pixels"
+            raise ValueError(f"{owner}: {shapes} are not the same number of points. {hint}")
         if count < _LEAST:
             raise ValueError(f"{owner}: it takes {_LEAST} points at least; got {shapes}")
         if given is not None:

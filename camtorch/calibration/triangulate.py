@@ -106,9 +106,8 @@ def _listed(modules: Sequence[M] | M, name: str, kind: type[M], count: int) -> l
         if not isinstance(module, kind):
             raise TypeError(f"triangulate: {name} must be {kind.__name__} in a list; got a {type(module).__name__}")
         if module.batch_shape:
-            raise ValueError(
-                f"triangulate: {name} must have no batch dims of their own; got one with {tuple(module.batch_shape)}"
-            )
+            own = tuple(module.batch_shape)
+            raise ValueError(f"triangulate: {name} must have no batch dims of their own; got one with {own}")
     return listed
 
 

@@ -155,9 +155,8 @@ def uncertainty(spread: Spread, pixels: Numbers, distance: Numbers = math.inf) -
     distance = as_values(distance, "distance", owner, like.device).detach().to(like)
     shape = pixels.shape[:-1]
     if not bool((distance > 0).all()):
-        raise ValueError(
-            f"{owner}: distance must be positive, in the unit of the board, or math.inf; got {distance.tolist()}"
-        )
+        got = distance.tolist()
+        raise ValueError(f"{owner}: distance must be positive, in the unit of the board, or math.inf; got {got}")
     try:
         distance = distance.expand(shape)
     except RuntimeError:

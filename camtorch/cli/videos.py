@@ -17,8 +17,7 @@ from camtorch.io.writing import replacing
 from camtorch.values.arguments import imported
 from camtorch.warp.warp import Warp
 
-WRITTEN = {".mp4": "mp4", ".m4v": "mp4", ".mov": "mov", ".mkv": "matroska", ".webm": "webm"}
-"""What ffmpeg calls the formats of files with these suffixes, in lower case."""
+WRITTEN = {".mp4": "mp4", ".m4v": "mp4", ".mov": "mov", ".mkv": "matroska", ".webm": "webm"}  # as ffmpeg calls them
 FORMATS = frozenset({*WRITTEN, ".avi", ".mts", ".ts"})  # suffixes of what is read
 # encoders with their options; how x264 weighs blocks by what refers to them (mbtree) is not the same each time
 _CODECS = {"libx264": {"crf": "18", "mbtree": "0"}, "libvpx-vp9": {"crf": "24", "b": "0"}, "ffv1": dict[str, str]()}

@@ -8,8 +8,7 @@ import re
 from collections.abc import Callable
 from pathlib import Path
 
-LENS, GUESS = "lens:", "guess:"
-"""What begins the name of a real lens, and a guessed field of view in degrees, in the place of a calibration file."""
+LENS, GUESS = "lens:", "guess:"  # in the place of a calibration file, before a real lens, or a guess in degrees
 _LARGEST_SIDE = 32768  # pixels
 _UNITS = {"mm": 1e-3, "cm": 1e-2, "in": 0.0254, "m": 1.0}
 _WrongWord = argparse.ArgumentTypeError

@@ -275,9 +275,8 @@ class MapSamples(Mover):
         """
         owner = self._owner
         if not isinstance(sample, Mapping):
-            raise TypeError(
-                f"{owner}: a sample must be a dict of entries, before .to_tuple; got {type(sample).__name__}"
-            )
+            kind = type(sample).__name__
+            raise TypeError(f"{owner}: a sample must be a dict of entries, before .to_tuple; got {kind}")
         if self._seeded is not None and self._key not in sample:
             raise ValueError(f"{owner}: no {self._key!r} to name the sample; it has {', '.join(map(str, sample))}")
         if not isinstance(labels := sample.get(self._labels, {}), Mapping):

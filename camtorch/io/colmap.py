@@ -189,8 +189,7 @@ def _read_images(path: str) -> tuple[dict[str, str], np.ndarray, bool, Callable[
     return images, np.array(values).reshape(-1, 7), has_points, record
 
 
-_ImageEntry = tuple[int, Iterable[float], str, str, bool]
-"""The place of an image, its pose, the id of its camera, its name, and whether it has points."""
+_ImageEntry = tuple[int, Iterable[float], str, str, bool]  # place, pose, id of the camera, name, whether it has points
 
 
 def _images_from_text(path: str, file: BinaryIO) -> Iterator[_ImageEntry]:

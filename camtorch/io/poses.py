@@ -16,13 +16,11 @@ from camtorch.io.writing import Lossy
 from camtorch.poses.extrinsics import Extrinsics
 from camtorch.poses.rotations import quaternion_vector, rotation_error, rotation_vector, vector_quaternion
 
-Place = Record | Callable[[int], Record]
-"""Where a pose stands in a file, for errors; of a batch of poses a function of the row."""
+Place = Record | Callable[[int], Record]  # where a pose stands in a file; of a batch of poses a function of the row
 
 _ORTHOGONAL = 1e-3  # as Extrinsics.from_matrix
 _FARTHEST = 1e100
-UPRIGHT = np.array([1.0, -1.0, -1.0, 1.0])
-"""The axes of a camera that looks along -z, y up, by ours: a factor of the columns of a matrix, world from camera."""
+UPRIGHT = np.array([1.0, -1.0, -1.0, 1.0])  # times columns, world from camera: axes of one that looks along -z, y up
 
 
 def as_float64(values: Any) -> Tensor:

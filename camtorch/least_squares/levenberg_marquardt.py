@@ -77,9 +77,8 @@ def minimise(
     every = torch.arange(len(state[0]), device=device)
     # of each problem a number or two: NumPy takes a fraction of the time that torch does
     cost, own_rounding = (t.numpy(force=True).copy() for t in (problem.cost(state, every), problem.rounding))
-    parts, least = (
-        np.broadcast_to(t.numpy(force=True) if isinstance(t, Tensor) else t, cost.shape) for t in (tolerance, tiny)
-    )
+    given = (t.numpy(force=True) if isinstance(t, Tensor) else t for t in (tolerance, tiny))
+    parts, least = (np.broadcast_to(t, cost.shape) for t in given)
     weights, growth, converged = np.full_like(cost, damping), np.full_like(cost, 4.0), cost <= least
     is_going = np.isfinite(cost) & ~converged & (True if going is None else going.numpy(force=True))
     system = None

@@ -23,10 +23,8 @@ from camtorch.maps.report import MapReport, measure
 from camtorch.maps.ti_ldc import TILDC
 from camtorch.warp.warp import Warp
 
-# in the order in which they are asked
-_FORMATS: dict[str, MapFormat] = {
-    format.name: format for format in (OpenCV("opencv"), OpenCV("opencv_fixed"), DW100(), TILDC(), ONNX())
-}
+_ALL = OpenCV("opencv"), OpenCV("opencv_fixed"), DW100(), TILDC(), ONNX()  # in the order in which they are asked
+_FORMATS: dict[str, MapFormat] = {format.name: format for format in _ALL}
 FORMATS = tuple(_FORMATS)
 
 _LARGEST_FILE = 1 << 31

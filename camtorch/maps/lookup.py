@@ -26,8 +26,7 @@ _FAR = 100.0  # positions beyond are drawn in, as by `Warp`: float32 does not ho
 class Exact:
     """Positions on the source's image by pixels of the target, as the cameras say: no lattice, nothing rounded."""
 
-    positions: Floats
-    """(H', W', 2): x and y in pixels of the source for every pixel of the target; finite, on its image or off."""
+    positions: Floats  # (H', W', 2): x and y in pixels of the source; finite, on its image or off
     mapped: Bools  # (H', W'): the pixel has a ray, and the source maps it, on its image or off
     shown: Bools  # (H', W'): the pixel shows something of the source's image, as `Warp.valid_mask`
 
@@ -119,9 +118,8 @@ class LookupMap:
         size = self.source_size
         if not isinstance(images, Tensor) or images.is_complex() or images.is_sparse or images.shape[2:] != size:
             what = f"{images.dtype} {tuple(images.shape)}" if isinstance(images, Tensor) else type(images).__name__
-            raise ValueError(
-                f"LookupMap: images must be a dense tensor (B, C, {size[0]}, {size[1]}) of real numbers; got {what}"
-            )
+            form = f"(B, C, {size[0]}, {size[1]})"
+            raise ValueError(f"LookupMap: images must be a dense tensor {form} of real numbers; got {what}")
         values = widen(images)
         grid = self.grid().to(values).expand(len(values), -1, -1, -1)
         return narrow(F.grid_sample(values, grid, mode, padding_mode, align_corners=False), images.dtype)

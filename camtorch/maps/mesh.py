@@ -30,8 +30,7 @@ class Mesh:
 
     step: int
     nodes: Floats  # (n, m, 2), x and y in pixels of the source
-    needed: Bools | None = None
-    """(n, m): nodes of blocks with a pixel that the warp shows; None for a mesh that was read."""
+    needed: Bools | None = None  # (n, m): nodes of blocks with a pixel that the warp shows; None if the mesh was read
 
     @property
     def places(self) -> Floats:

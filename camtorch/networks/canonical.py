@@ -190,9 +190,8 @@ class CanonicalCamera(SampleTransform):
             scale = self.scale(source).double()
             zero = torch.zeros_like(scale)
             # the middle, from outer edge to outer edge, stays in the middle
-            left, top = (
-                (new - 1) / 2 - (old - 1) / 2 * scale for new, old in zip(size[::-1], (width, height), strict=True)
-            )
+            sides = zip(size[::-1], (width, height), strict=True)
+            left, top = ((new - 1) / 2 - (old - 1) / 2 * scale for new, old in sides)
             matrix = torch.stack((scale, zero, left, zero, scale, top), -1).unflatten(-1, (2, 3))
             options = {**self.options, "antialias": self.antialias}
             return Part(rows, AffineWarp(source, edited(source, matrix, size), matrix, None, **options), source)

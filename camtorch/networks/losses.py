@@ -228,9 +228,8 @@ def _reduced(
         try:
             values, weighing = values * given, weighing * given
         except RuntimeError:
-            raise ValueError(
-                f"{owner}: weights must broadcast against {tuple(valid.shape)}; got {tuple(given.shape)}"
-            ) from None
+            wanted = f"weights must broadcast against {tuple(valid.shape)}"
+            raise ValueError(f"{owner}: {wanted}; got {tuple(given.shape)}") from None
     if not isinstance(reduction, str) or reduction not in ("mean", "none"):
         raise ValueError(f'{owner}: reduction must be "mean" or "none"; got {shown(reduction)}')
     if reduction == "none":

@@ -31,8 +31,7 @@ class Prior:
     focal: float  # the geometric mean of fx and fy
     aspect: float  # log(fy / fx)
     middle: list[float]  # cx, cy
-    discs: tuple[float, float, float]
-    """Radii on the chart's plane of the farthest corner: at the greatest focal length, at `focal`, and at the least."""
+    discs: tuple[float, float, float]  # radii of the farthest corner, at the greatest focal length, `focal`, the least
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -17,13 +17,11 @@ if TYPE_CHECKING:
     from camtorch.cameras.camera import Camera
 
 INK, GREY, PALE = "#2b2a2e", "#8a8378", "#efe9dd"
-COLOURS = ("#1e64f0", "#e21d48", "#0b8a5f", "#b86e00", "#7a3fc2", "#5a6472")
-"""Of what is told apart by its name, as cameras are; the second one is also that of marks."""
-NO_RAYS = "#d9d4ca"
-"""Of pixels without a value."""
+COLOURS = ("#1e64f0", "#e21d48", "#0b8a5f", "#b86e00", "#7a3fc2", "#5a6472")  # of cameras; the second also of marks
+NO_RAYS = "#d9d4ca"  # of pixels without a value
+# matplotlib's maps, and the part of each from the palest colour to the darkest
 _LEVELS = {"counts": ("Blues", 0.2, 0.75), "residuals": ("viridis", 0.85, 0.05), "uncertainty": ("magma", 0.95, 0.2)}
 _LEVELS |= {"distortion": ("viridis_r", 0.15, 1)}
-"""matplotlib's maps, and the part of each from the palest colour to the darkest."""
 
 
 def require_matplotlib() -> None:
@@ -35,9 +33,8 @@ def axes_or_new(ax: Axes | None) -> Axes:
     """Return the Axes, or new ones in a figure of their own; raise a TypeError for anything else."""
     if ax is not None:
         if not hasattr(ax, "get_figure"):
-            raise TypeError(
-                f"plot: ax must be Axes of matplotlib; got {type(ax).__name__}. Several cameras are one list, [a, b]"
-            )
+            hint = "Several cameras are one list, [a, b]"
+            raise TypeError(f"plot: ax must be Axes of matplotlib; got {type(ax).__name__}. {hint}")
         return ax
     require_matplotlib()
     from matplotlib import pyplot  # which chooses how figures are shown: not before it has to

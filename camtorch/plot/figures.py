@@ -237,9 +237,8 @@ def calibration(calibration: Calibration | RigCalibration) -> Figure:
     from matplotlib import pyplot
 
     cameras = getattr(calibration, "cameras", None) or {"": calibration}
-    figure, axes = pyplot.subplots(
-        len(cameras), 2, squeeze=False, figsize=(12.4, 5.2 * len(cameras)), layout="constrained"
-    )
+    size = 12.4, 5.2 * len(cameras)
+    figure, axes = pyplot.subplots(len(cameras), 2, squeeze=False, figsize=size, layout="constrained")
     for (name, camera), (left, right) in zip(cameras.items(), axes, strict=True):
         seen = camera.observations.seen & camera.point_residuals.isfinite().all(-1)
         inliers = (seen & camera.point_inliers).numpy(force=True)

@@ -344,9 +344,8 @@ def _frame(extrinsics: Extrinsics, vertical: bool, align: Align) -> tuple[Tensor
     view = rotation[..., 2, :] + _unit(2, rotation)
     ahead = view - (view * along).sum(-1, keepdim=True) * along
     if known_false(torch.linalg.vector_norm(ahead, dim=-1) > _PARALLEL):
-        raise ValueError(
-            "rectify: the cameras look along their baseline, or away from each other: no direction lies before both"
-        )
+        why = "no direction lies before both"
+        raise ValueError(f"rectify: the cameras look along their baseline, or away from each other: {why}")
     ahead = normalize(ahead, dim=-1)
     third = torch.linalg.cross(along, ahead, dim=-1) if vertical else torch.linalg.cross(ahead, along, dim=-1)
     turned = torch.stack((third, along, ahead) if vertical else (along, third, ahead), -2)
