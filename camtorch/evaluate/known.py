@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 from torch.utils.data import get_worker_info
 
-from camtorch.evaluate.door import in_graph, in_transform, is_concrete, is_eager, is_recorded, keeps_graph, may_look
+from camtorch.evaluate.door import in_graph, in_transform, is_concrete, is_eager, keeps_graph, may_look
 
 
 def known_false(condition: Tensor) -> bool:
@@ -32,11 +32,6 @@ def are_plain(*tensors: Tensor) -> bool:
 def are_known(*tensors: Tensor) -> bool:
     """Return whether the values of all tensors may be looked at."""
     return all(map(is_concrete, tensors))
-
-
-def may_write(tensor: Tensor) -> bool:
-    """Return whether values may be replaced where they are: nothing has recorded them."""
-    return not is_unknown(tensor) and not is_recorded()
 
 
 def with_derivatives_of(source: Tensor, value: Tensor) -> Tensor:

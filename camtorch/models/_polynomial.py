@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from types import MappingProxyType
 from typing import ClassVar, cast
 
 import torch
@@ -119,3 +120,14 @@ class FreePolynomial(Camera):
     def _scaled(cls, coefficients: Tensor) -> tuple[Tensor, Tensor]:
         """The focal length, and coefficients in units of it."""
         raise NotImplementedError
+
+
+class Sheared(FreePolynomial):
+    """What models with NVIDIA's linear part have beside the polynomial: d and e, which come first."""
+
+    shear_names: ClassVar[tuple[str, ...]] = ("d", "e")
+    distortion_names: tuple[str, ...] = (*shear_names, *FreePolynomial.distortion_names)
+    default_count = 5
+    fit_counts: ClassVar[tuple[int, ...]] = (5, 7, 9)
+    odd_in_x = odd_in_y = frozenset(shear_names)
+    quarter_turn = MappingProxyType({"d": "-e", "e": "-d"})

@@ -1,12 +1,11 @@
 """The f-theta fisheye camera: r is a free polynomial of the angle, r = theta (1 + k2 theta + k3 theta^2 + ...)."""
 
 from collections.abc import Sequence
-from types import MappingProxyType
 from typing import ClassVar
 
 from torch import Tensor
 
-from camtorch.models._polynomial import FreePolynomial
+from camtorch.models._polynomial import FreePolynomial, Sheared
 from camtorch.optics import Chart, Equidistant, Lens, Planar, RadiusPolynomial, Shear
 
 
@@ -41,7 +40,7 @@ class FTheta(FreePolynomial):
         return coefficients[..., :1], coefficients[..., 1:] / coefficients[..., :1]
 
 
-class FThetaSheared(FTheta):
+class FThetaSheared(Sheared, FTheta):
     """NVIDIA's f-theta camera with all of its linear part: of `FTheta`'s (x, y), (u, v) = f (x + e y, d x + y) + c.
 
     The [[c, d], [e, 1]] of files comes in through `from_polynomial`: d here is their e, e is their d / c, and c is
@@ -53,12 +52,6 @@ class FThetaSheared(FTheta):
     """
 
     key = "f_theta_sheared"
-    shear_names: ClassVar[tuple[str, ...]] = ("d", "e")
-    distortion_names: tuple[str, ...] = (*shear_names, *FTheta.distortion_names)
-    default_count = 5
-    fit_counts: ClassVar[tuple[int, ...]] = (5, 7, 9)
-    odd_in_x = odd_in_y = frozenset(shear_names)
-    quarter_turn = MappingProxyType({"d": "-e", "e": "-d"})
     special_cases = (("f_theta", tuple(f"k{i}" for i in range(2, 33))),)
 
     @staticmethod

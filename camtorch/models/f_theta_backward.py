@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from types import MappingProxyType
-from typing import ClassVar
 
 from torch import Tensor
 
-from camtorch.models._polynomial import FreePolynomial
+from camtorch.models._polynomial import FreePolynomial, Sheared
 from camtorch.optics import Chart, Inverted, Lens, RadiusPolynomial, Shear
 
 
@@ -38,7 +36,7 @@ class FThetaBackward(FreePolynomial):
         return focal, coefficients[..., 1:] * focal ** coefficients.new_tensor(list(powers))
 
 
-class FThetaBackwardSheared(FThetaBackward):
+class FThetaBackwardSheared(Sheared, FThetaBackward):
     """`FThetaBackward` with all of NVIDIA's linear part: (u, v) = f (x + e y, d x + y) + c.
 
     Distortion: d e k2 k3 ..., d and e as of `FThetaSheared`, then those of `FThetaBackward`, at least one; 5 if left
@@ -46,12 +44,6 @@ class FThetaBackwardSheared(FThetaBackward):
     """
 
     key = "f_theta_backward_sheared"
-    shear_names: ClassVar[tuple[str, ...]] = ("d", "e")
-    distortion_names: tuple[str, ...] = (*shear_names, *FThetaBackward.distortion_names)
-    default_count = 5
-    fit_counts: ClassVar[tuple[int, ...]] = (5, 7, 9)
-    odd_in_x = odd_in_y = frozenset(shear_names)
-    quarter_turn = MappingProxyType({"d": "-e", "e": "-d"})
     special_cases = (("f_theta_backward", tuple(f"k{i}" for i in range(2, 33))),)
 
     @staticmethod

@@ -38,60 +38,6 @@ def newton_step(jacobian: Jacobian, du: Tensor, dv: Tensor) -> Planes3:
     return da * reciprocal, db * reciprocal, reciprocal
 
 
-class Stage:
-    """A planar map (a, b) -> (u, v) that is regular at the centre. A new one states its formula, `__call__`.
-
-    All else has defaults, by autograd or from samples, which a stage that is to be fast replaces by its own.
-    """
-
-    parameters: tuple[Tensor, ...] = ()
-    """What the formula learns: columns that broadcast against planes.
-
-    The formula reads them here, and nothing else that depends on the coefficients.
-    """
-    code: ClassVar[int | None] = None
-    """That of native/geometry.h, stated by a class itself: a subclass is something else. None: only Python has it."""
-    radial: RadialFactor | None = None
-    """What of a first stage is tabulated, to start the inverse from."""
-    is_radial = False
-    """Whether that is the whole stage."""
-    is_affine = False
-    """Whether lines stay lines, and parallels parallel: then its inverse is never left open."""
-
-    def __call__(self, a: Tensor, b: Tensor) -> Planes2:
-        """Where points are sent."""
-        raise NotImplementedError
-
-    def at(self, a: Tensor, b: Tensor, order: int = 1, t: Tensor | None = None) -> StageAt:
-        """The stage at points; order 0 leaves out what derivatives need, t = a^2 + b^2 if it is known."""
-        return StageAt(self, a, b)
-
-    def lower_bound(self, radius: Tensor) -> Planes2:
-        """Return bounds on circles of ascending radii (*C, S).
-
-        Positive where the orientation is certainly positive on the whole circle; and how far from the centre its points
-        go at the most. By default both are read off points of the circle, with what they may miss in between.
-        """
-        turn = torch.arange(_DIRECTIONS, dtype=radius.dtype, device=radius.device) * (2 * math.pi / _DIRECTIONS)
-        a, b = ((radius.unsqueeze(-1) * c).flatten(-2) for c in (torch.cos(turn), torch.sin(turn)))
-        at = self.at(a, b)
-        shape = (radius.shape[-1], _DIRECTIONS)
-        orientation, distance = at.orientation.unflatten(-1, shape), torch.hypot(*at.value).unflatten(-1, shape)
-        least, furthest = orientation.amin(-1), distance.amax(-1)
-        missed = (orientation - orientation.roll(1, -1)).abs().amax(-1)
-        return least - missed / 2, furthest + (distance - distance.roll(1, -1)).abs().amax(-1) / 2
-
-    def start(self, u: Tensor, v: Tensor) -> Planes2:
-        """A point near the one that is sent to (u, v), where to start the search for it."""
-        a, b = u, v
-        for _ in range(2):
-            at = self.at(a, b)
-            x, y = at.value
-            da, db, _ = newton_step(at.jacobian, u - x, v - y)
-            a, b = a + da, b + db
-        return a, b
-
-
 class StageAt:
     """A stage at points (a, b)."""
 
@@ -131,6 +77,61 @@ class StageAt:
         # a turn by half a circle has a positive determinant too: the trace tells it from a regular map
         orientation = torch.minimum(torch.addcmul(ua * vb, ub, va, value=-1), ua + vb)
         return orientation if margin is None else torch.minimum(orientation, margin)
+
+
+class Stage:
+    """A planar map (a, b) -> (u, v) that is regular at the centre. A new one states its formula, `__call__`.
+
+    All else has defaults, by autograd or from samples, which a stage that is to be fast replaces by its own.
+    """
+
+    parameters: tuple[Tensor, ...] = ()
+    """What the formula learns: columns that broadcast against planes.
+
+    The formula reads them here, and nothing else that depends on the coefficients.
+    """
+    code: ClassVar[int | None] = None
+    """That of native/geometry.h, stated by a class itself: a subclass is something else. None: only Python has it."""
+    _at: ClassVar[type[StageAt]] = StageAt
+    radial: RadialFactor | None = None
+    """What of a first stage is tabulated, to start the inverse from."""
+    is_radial = False
+    """Whether that is the whole stage."""
+    is_affine = False
+    """Whether lines stay lines, and parallels parallel: then its inverse is never left open."""
+
+    def __call__(self, a: Tensor, b: Tensor) -> Planes2:
+        """Where points are sent."""
+        raise NotImplementedError
+
+    def at(self, a: Tensor, b: Tensor, order: int = 1, t: Tensor | None = None) -> StageAt:
+        """The stage at points; order 0 leaves out what derivatives need, t = a^2 + b^2 if it is known."""
+        return self._at(self, a, b)
+
+    def lower_bound(self, radius: Tensor) -> Planes2:
+        """Return bounds on circles of ascending radii (*C, S).
+
+        Positive where the orientation is certainly positive on the whole circle; and how far from the centre its points
+        go at the most. By default both are read off points of the circle, with what they may miss in between.
+        """
+        turn = torch.arange(_DIRECTIONS, dtype=radius.dtype, device=radius.device) * (2 * math.pi / _DIRECTIONS)
+        a, b = ((radius.unsqueeze(-1) * c).flatten(-2) for c in (torch.cos(turn), torch.sin(turn)))
+        at = self.at(a, b)
+        shape = (radius.shape[-1], _DIRECTIONS)
+        orientation, distance = at.orientation.unflatten(-1, shape), torch.hypot(*at.value).unflatten(-1, shape)
+        least, furthest = orientation.amin(-1), distance.amax(-1)
+        missed = (orientation - orientation.roll(1, -1)).abs().amax(-1)
+        return least - missed / 2, furthest + (distance - distance.roll(1, -1)).abs().amax(-1) / 2
+
+    def start(self, u: Tensor, v: Tensor) -> Planes2:
+        """A point near the one that is sent to (u, v), where to start the search for it."""
+        a, b = u, v
+        for _ in range(2):
+            at = self.at(a, b)
+            x, y = at.value
+            da, db, _ = newton_step(at.jacobian, u - x, v - y)
+            a, b = a + da, b + db
+        return a, b
 
 
 @dataclass
@@ -249,45 +250,6 @@ class PlanarAt(StageAt):
         return self.stage.radial.margin(self.t) if self.stage.radial else None
 
 
-class Homography(Stage):
-    """The projective map of a matrix, given row by row: (a, b, 1) becomes (x, y, w), and the point x / w, y / w."""
-
-    code: ClassVar[int | None] = 17
-
-    def __init__(self, *matrix: Tensor):
-        self.parameters: tuple[Tensor, ...] = matrix
-
-    def at(self, a: Tensor, b: Tensor, order: int = 1, t: Tensor | None = None) -> HomographyAt:
-        """The stage at points."""
-        return HomographyAt(self, a, b)
-
-    def lower_bound(self, radius: Tensor) -> Planes2:
-        """See `Planar.lower_bound`; here the bound is one of the orientation itself."""
-        h00, h01, h02, h10, h11, h12, h20, h21, h22 = self.parameters
-        slope = torch.hypot(h20, h21)
-        nearest = h22 - slope * radius
-        size = torch.maximum(torch.hypot(h00, h10), torch.hypot(h01, h11)) * math.sqrt(2)
-        # past the horizon nothing is certain
-        seen = (size * radius + torch.hypot(h02, h12)) / torch.where(nearest > 0, nearest, torch.nan)
-        minors = self._adjugate()
-        turned = h20 * minors[2] + h21 * minors[5] + h22 * minors[8]
-        return torch.minimum(torch.minimum(nearest, turned), h00 + h11 - slope * seen), seen
-
-    def start(self, u: Tensor, v: Tensor) -> Planes2:
-        """The point that is sent to (u, v)."""
-        r00, r01, r02, r10, r11, r12, r20, r21, r22 = self._adjugate()
-        reciprocal = 1 / (r20 * u + r21 * v + r22)
-        return (r00 * u + r01 * v + r02) * reciprocal, (r10 * u + r11 * v + r12) * reciprocal
-
-    def _adjugate(self) -> tuple[Tensor, ...]:
-        h00, h01, h02, h10, h11, h12, h20, h21, h22 = self.parameters
-        return (
-            *(h11 * h22 - h12 * h21, h02 * h21 - h01 * h22, h01 * h12 - h02 * h11),
-            *(h12 * h20 - h10 * h22, h00 * h22 - h02 * h20, h02 * h10 - h00 * h12),
-            *(h10 * h21 - h11 * h20, h01 * h20 - h00 * h21, h00 * h11 - h01 * h10),
-        )
-
-
 class HomographyAt(StageAt):
     """A `Homography` at points."""
 
@@ -320,6 +282,42 @@ class HomographyAt(StageAt):
         return self.depth
 
 
+class Homography(Stage):
+    """The projective map of a matrix, given row by row: (a, b, 1) becomes (x, y, w), and the point x / w, y / w."""
+
+    code: ClassVar[int | None] = 17
+    _at = HomographyAt
+
+    def __init__(self, *matrix: Tensor):
+        self.parameters: tuple[Tensor, ...] = matrix
+
+    def lower_bound(self, radius: Tensor) -> Planes2:
+        """See `Planar.lower_bound`; here the bound is one of the orientation itself."""
+        h00, h01, h02, h10, h11, h12, h20, h21, h22 = self.parameters
+        slope = torch.hypot(h20, h21)
+        nearest = h22 - slope * radius
+        size = torch.maximum(torch.hypot(h00, h10), torch.hypot(h01, h11)) * math.sqrt(2)
+        # past the horizon nothing is certain
+        seen = (size * radius + torch.hypot(h02, h12)) / torch.where(nearest > 0, nearest, torch.nan)
+        minors = self._adjugate()
+        turned = h20 * minors[2] + h21 * minors[5] + h22 * minors[8]
+        return torch.minimum(torch.minimum(nearest, turned), h00 + h11 - slope * seen), seen
+
+    def start(self, u: Tensor, v: Tensor) -> Planes2:
+        """The point that is sent to (u, v)."""
+        r00, r01, r02, r10, r11, r12, r20, r21, r22 = self._adjugate()
+        reciprocal = 1 / (r20 * u + r21 * v + r22)
+        return (r00 * u + r01 * v + r02) * reciprocal, (r10 * u + r11 * v + r12) * reciprocal
+
+    def _adjugate(self) -> tuple[Tensor, ...]:
+        h00, h01, h02, h10, h11, h12, h20, h21, h22 = self.parameters
+        return (
+            *(h11 * h22 - h12 * h21, h02 * h21 - h01 * h22, h01 * h12 - h02 * h11),
+            *(h12 * h20 - h10 * h22, h00 * h22 - h02 * h20, h02 * h10 - h00 * h12),
+            *(h10 * h21 - h11 * h20, h01 * h20 - h00 * h21, h00 * h11 - h01 * h10),
+        )
+
+
 class Tilt(Homography):
     """The homography of a sensor tilted by (tau_x, tau_y) radians.
 
@@ -336,10 +334,20 @@ class Tilt(Homography):
         super().__init__(cx, zero, zero, -sx * sy, cy, zero, sy, -cy * sx, cy * cx)
 
 
+class ShearAt(StageAt):
+    """A `Shear` at points."""
+
+    @property
+    def jacobian(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        d, e = (w + torch.zeros_like(self.a) for w in self.stage.parameters)
+        return torch.ones_like(d), e, d, torch.ones_like(e)
+
+
 class Shear(Stage):
     """(x + e y, d x + y): a sensor out of line with the lens."""
 
     code: ClassVar[int | None] = 18
+    _at = ShearAt
     is_affine = True
 
     def __init__(self, d: Tensor, e: Tensor):
@@ -349,10 +357,6 @@ class Shear(Stage):
         d, e = self.parameters
         return a + e * b, b + d * a
 
-    def at(self, a: Tensor, b: Tensor, order: int = 1, t: Tensor | None = None) -> ShearAt:
-        """The stage at points."""
-        return ShearAt(self, a, b)
-
     def lower_bound(self, radius: Tensor) -> tuple[Tensor, Tensor]:
         d, e = self.parameters
         # of the symmetric part the eigenvalues are 1 + (d + e) / 2 and 1 - (d + e) / 2
@@ -361,15 +365,6 @@ class Shear(Stage):
     def start(self, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
         d, e = self.parameters
         return (u - e * v) / (1 - d * e), (v - d * u) / (1 - d * e)
-
-
-class ShearAt(StageAt):
-    """A `Shear` at points."""
-
-    @property
-    def jacobian(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        d, e = (w + torch.zeros_like(self.a) for w in self.stage.parameters)
-        return torch.ones_like(d), e, d, torch.ones_like(e)
 
 
 class Lens:

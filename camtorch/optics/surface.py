@@ -17,98 +17,6 @@ from camtorch.optics.lens import Jacobian, Planes2, Stage, StageAt
 BEHIND = 1e-4  # cells past its edge that belong to a surface, so that what lies on the edge is on it in any rounding
 
 
-class Surface(Stage):
-    """(a, b) -> (a, b) + du(a, b), du a uniform B-spline surface of order 2 (quadratic) or 3 (cubic).
-
-    Control point (i, j) of the grid, i < columns, j < rows, stands at (a, b) = ((i - (columns - 1) / 2) / sa + ca,
-    (j - (rows - 1) / 2) / sb + cb). The surface ends where one more control point would have a part in it: 1 control
-    point (order 3) or 1/2 (order 2) from the outermost ones. Behind that edge, where nothing is valid, the outermost
-    pieces go on. Source: mrcal.c, `sample_bspline_surface_cubic` and `..._quadratic`.
-
-    Args:
-        controls: 2 columns rows coefficients, columns that broadcast against planes: du_a and du_b of point (0, 0), of
-            (1, 0), ...: those of (i, j) at 2 (j columns + i).
-        columns: control points along a, more than the order.
-        rows: along b.
-        order: 2 or 3.
-        cells: (sa, sb), how many lie on a unit of a and of b, positive.
-        centre: (ca, cb), the middle of the grid. The origin of the plane has to be on the surface.
-        behind: cells past its edge that belong to it.
-    """
-
-    code: ClassVar[int | None] = 19
-
-    columns: int
-    rows: int
-    order: int
-    cells: tuple[float, float]
-    centre: tuple[float, float]
-    behind: float
-
-    def __init__(
-        self,
-        controls: Sequence[Tensor],
-        columns: int,
-        rows: int,
-        *,
-        order: int = 3,
-        cells: tuple[float, float],
-        centre: tuple[float, float] = (0.0, 0.0),
-        behind: float = BEHIND,
-    ):
-        self.columns, self.rows, self.order, self.behind = columns, rows, order, behind
-        self.cells, self.centre = cells, centre
-        self.parameters: tuple[Tensor, ...] = tuple(controls)
-
-    def __call__(self, a: Tensor, b: Tensor) -> Planes2:
-        return self.at(a, b).value
-
-    def at(self, a: Tensor, b: Tensor, order: int = 1, t: Tensor | None = None) -> SurfaceAt:
-        """The stage at points."""
-        return SurfaceAt(self, a, b)
-
-    def lower_bound(self, radius: Tensor) -> Planes2:
-        """See `Stage.lower_bound`: slopes of a spline lie between those of the lines from control point to control
-        point, and it between these, of those that have a part in it within the circle.
-        """
-        grid = torch.stack(self.parameters, -1).unflatten(-1, (self.rows, self.columns, 2))
-        sizes = self.columns, self.rows
-
-        def nearest(more_a: int, more_b: int) -> Tensor:
-            """(P,): how far from the origin it begins what differences along a or b have a part in."""
-            reach = (self.order + 1) / 2
-            sides = []
-            for size, more, s, c in zip(sizes, (more_a, more_b), self.cells, self.centre, strict=True):
-                middle = torch.arange(size - more, dtype=radius.dtype, device=radius.device) - (size - 1 - more) / 2
-                sides.append(((middle / s + c).abs() - (reach - more / 2) / s).clamp(min=0))
-            return torch.hypot(sides[0].unsqueeze(-2), sides[1].unsqueeze(-1)).flatten(-2)
-
-        def most(values: Tensor, begin: Tensor) -> Tensor:
-            """(*C, S): the largest of (*C, 1, P) that begin before each radius; 0 if all are less."""
-            values = torch.where(begin <= radius.unsqueeze(-1), values.flatten(-2), 0.0)
-            return values.amax(-1)
-
-        along, down = grid.diff(dim=-2) * self.cells[0], grid.diff(dim=-3) * self.cells[1]
-        here, there = nearest(1, 0), nearest(0, 1)
-        steepest = torch.maximum(most(-along[..., 0], here), most(-down[..., 1], there))
-        across = (most(along[..., 1].abs(), here) + most(down[..., 0].abs(), there)) / 2
-        edge = [(n - self.order) / 2 / s - abs(c) for n, s, c in zip(sizes, self.cells, self.centre, strict=True)]
-        inside = min(edge) - radius
-        far = radius + most(torch.hypot(*grid.unbind(-1)), nearest(0, 0))
-        return torch.where(inside > 0, 1 - steepest - across, inside.clamp(max=-1e-3)), far
-
-    def start(self, u: Tensor, v: Tensor) -> Planes2:
-        """A point near the one that is sent to (u, v)."""
-        (sa, sb), (ca, cb) = self.cells, self.centre
-        half_a, half_b = (self.columns - self.order) / 2 / sa, (self.rows - self.order) / 2 / sb
-        a, b = u, v
-        for _ in range(3):  # on the surface, behind which it may be anywhere
-            a, b = a.clamp(ca - half_a, ca + half_a), b.clamp(cb - half_b, cb + half_b)
-            x, y = self.at(a, b).value
-            a, b = a + u - x, b + v - y
-        return a, b
-
-
 class SurfaceAt(StageAt):
     """A `Surface` at points."""
 
@@ -173,3 +81,92 @@ class SurfaceAt(StageAt):
         (sa, sb), (ca, cb) = stage.cells, stage.centre
         across = (stage.columns - stage.order) / 2 + stage.behind - ((self.a - ca) * sa).abs()
         return torch.minimum(across, (stage.rows - stage.order) / 2 + stage.behind - ((self.b - cb) * sb).abs())
+
+
+class Surface(Stage):
+    """(a, b) -> (a, b) + du(a, b), du a uniform B-spline surface of order 2 (quadratic) or 3 (cubic).
+
+    Control point (i, j) of the grid, i < columns, j < rows, stands at (a, b) = ((i - (columns - 1) / 2) / sa + ca,
+    (j - (rows - 1) / 2) / sb + cb). The surface ends where one more control point would have a part in it: 1 control
+    point (order 3) or 1/2 (order 2) from the outermost ones. Behind that edge, where nothing is valid, the outermost
+    pieces go on. Source: mrcal.c, `sample_bspline_surface_cubic` and `..._quadratic`.
+
+    Args:
+        controls: 2 columns rows coefficients, columns that broadcast against planes: du_a and du_b of point (0, 0), of
+            (1, 0), ...: those of (i, j) at 2 (j columns + i).
+        columns: control points along a, more than the order.
+        rows: along b.
+        order: 2 or 3.
+        cells: (sa, sb), how many lie on a unit of a and of b, positive.
+        centre: (ca, cb), the middle of the grid. The origin of the plane has to be on the surface.
+        behind: cells past its edge that belong to it.
+    """
+
+    code: ClassVar[int | None] = 19
+    _at = SurfaceAt
+
+    columns: int
+    rows: int
+    order: int
+    cells: tuple[float, float]
+    centre: tuple[float, float]
+    behind: float
+
+    def __init__(
+        self,
+        controls: Sequence[Tensor],
+        columns: int,
+        rows: int,
+        *,
+        order: int = 3,
+        cells: tuple[float, float],
+        centre: tuple[float, float] = (0.0, 0.0),
+        behind: float = BEHIND,
+    ):
+        self.columns, self.rows, self.order, self.behind = columns, rows, order, behind
+        self.cells, self.centre = cells, centre
+        self.parameters: tuple[Tensor, ...] = tuple(controls)
+
+    def __call__(self, a: Tensor, b: Tensor) -> Planes2:
+        return self.at(a, b).value
+
+    def lower_bound(self, radius: Tensor) -> Planes2:
+        """See `Stage.lower_bound`: slopes of a spline lie between those of the lines from control point to control
+        point, and it between these, of those that have a part in it within the circle.
+        """
+        grid = torch.stack(self.parameters, -1).unflatten(-1, (self.rows, self.columns, 2))
+        sizes = self.columns, self.rows
+
+        def nearest(more_a: int, more_b: int) -> Tensor:
+            """(P,): how far from the origin it begins what differences along a or b have a part in."""
+            reach = (self.order + 1) / 2
+            sides = []
+            for size, more, s, c in zip(sizes, (more_a, more_b), self.cells, self.centre, strict=True):
+                middle = torch.arange(size - more, dtype=radius.dtype, device=radius.device) - (size - 1 - more) / 2
+                sides.append(((middle / s + c).abs() - (reach - more / 2) / s).clamp(min=0))
+            return torch.hypot(sides[0].unsqueeze(-2), sides[1].unsqueeze(-1)).flatten(-2)
+
+        def most(values: Tensor, begin: Tensor) -> Tensor:
+            """(*C, S): the largest of (*C, 1, P) that begin before each radius; 0 if all are less."""
+            values = torch.where(begin <= radius.unsqueeze(-1), values.flatten(-2), 0.0)
+            return values.amax(-1)
+
+        along, down = grid.diff(dim=-2) * self.cells[0], grid.diff(dim=-3) * self.cells[1]
+        here, there = nearest(1, 0), nearest(0, 1)
+        steepest = torch.maximum(most(-along[..., 0], here), most(-down[..., 1], there))
+        across = (most(along[..., 1].abs(), here) + most(down[..., 0].abs(), there)) / 2
+        edge = [(n - self.order) / 2 / s - abs(c) for n, s, c in zip(sizes, self.cells, self.centre, strict=True)]
+        inside = min(edge) - radius
+        far = radius + most(torch.hypot(*grid.unbind(-1)), nearest(0, 0))
+        return torch.where(inside > 0, 1 - steepest - across, inside.clamp(max=-1e-3)), far
+
+    def start(self, u: Tensor, v: Tensor) -> Planes2:
+        """A point near the one that is sent to (u, v)."""
+        (sa, sb), (ca, cb) = self.cells, self.centre
+        half_a, half_b = (self.columns - self.order) / 2 / sa, (self.rows - self.order) / 2 / sb
+        a, b = u, v
+        for _ in range(3):  # on the surface, behind which it may be anywhere
+            a, b = a.clamp(ca - half_a, ca + half_a), b.clamp(cb - half_b, cb + half_b)
+            x, y = self.at(a, b).value
+            a, b = a + u - x, b + v - y
+        return a, b
