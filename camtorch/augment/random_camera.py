@@ -32,7 +32,7 @@ from camtorch.poses.rotations import mount_elements
 from camtorch.projection.compiled import project, project_numbers, unproject
 from camtorch.projection.evaluation import rows_of
 from camtorch.projection.native_cameras import Native
-from camtorch.projection.rows import Cameras, single_native
+from camtorch.projection.rows import CameraRows, single_native
 from camtorch.rays.lattices import field_of_view, pixel_lattice, polar_rays, reach
 from camtorch.values.arguments import LEFT, as_image_size, broadcast_shapes, check_degrees, warn
 from camtorch.values.module import remade
@@ -612,7 +612,7 @@ def _seen_through(
     lens: Camera, intrinsics: Tensor, distortion: Tensor, values: Tensor, way: Callable[[Native, Tensor], Any]
 ) -> tuple[Tensor, Tensor]:
     """What lenses of other numbers, (C, 4) and (C, n), make of pixels or rays (C, N, size); way: which of both."""
-    made = Cameras(type_before_parametrizations(lens), intrinsics, distortion)
+    made = CameraRows(type_before_parametrizations(lens), intrinsics, distortion)
     if made.native is None or not are_free(values, intrinsics, distortion):
         camera = remade(lens, intrinsics=intrinsics, distortion=distortion)
         return camera.project(values) if way is project else camera.unproject(values)

@@ -27,7 +27,7 @@ from camtorch.least_squares.levenberg_marquardt import FIRST_DAMPING, minimise, 
 from camtorch.poses.rotations import small_turn
 from camtorch.projection import compiled
 from camtorch.projection.evaluation import compiled_of
-from camtorch.projection.rows import Cameras
+from camtorch.projection.rows import CameraRows
 from camtorch.values.module import remade
 
 LOSSES = ("huber", "cauchy")
@@ -309,7 +309,7 @@ class Bundle:
         state, sight = self.state(flat), self.sight(c, rows)
         if self.is_plain and len(state.bend):
             parameters = state.parameters[0][: 1 if self.are_shared[0] else None]
-            native = Cameras(type(self.cameras[0]), parameters[:, :4], parameters[:, 4:]).native
+            native = CameraRows(type(self.cameras[0]), parameters[:, :4], parameters[:, 4:]).native
             assert native is not None  # it was there for the first ones
             own = self.learnt[0][1].tolist()
             has_triangles = native.plan.places is not None or all(i < 4 for i in own)

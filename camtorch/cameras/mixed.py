@@ -25,7 +25,7 @@ from camtorch.values.arguments import Numbers, as_image_size, as_points, no_came
 from camtorch.values.module import refused_index, remade
 
 if TYPE_CHECKING:
-    from camtorch.projection.rows import Cameras, Direction
+    from camtorch.projection.rows import CameraRows, Direction
 
 
 class _Group(NamedTuple):
@@ -176,7 +176,7 @@ class Mixed(Camera):
         rows: Tensor,
         lead: torch.Size,
         tensors: Sequence[Tensor],
-        cameras_of: Callable[[Tensor, Tensor], Cameras] | None = None,
+        cameras_of: Callable[[Tensor, Tensor], CameraRows] | None = None,
     ) -> tuple[Tensor, Tensor]:
         results = []
         for n, (group, pair) in enumerate(zip(self._groups, self._pairs(tensors), strict=True)):
@@ -193,11 +193,11 @@ class Mixed(Camera):
         planes, valid = zip(*results, strict=True)
         return self._in_order(torch.cat(planes, 1), 1), self._in_order(torch.cat(valid))
 
-    def _watch(self, n: int) -> Callable[[Tensor, Tensor], Cameras]:
+    def _watch(self, n: int) -> Callable[[Tensor, Tensor], CameraRows]:
         """The cameras of a group, kept until a value changes; its members say what is wrong with them."""
         group = self._groups[n]
 
-        def cameras(intrinsics: Tensor, distortion: Tensor) -> Cameras:
+        def cameras(intrinsics: Tensor, distortion: Tensor) -> CameraRows:
             found = kept_cameras(group.memo, group.model, intrinsics, distortion)
             if found.usable is not None:
                 for member in map(self._member, group.members):

@@ -17,7 +17,7 @@ from camtorch.evaluate.export import portable_export, with_values
 from camtorch.evaluate.kept import Kept, same
 from camtorch.evaluate.known import are_free
 from camtorch.projection.camera_like import CameraLike
-from camtorch.projection.rows import Cameras, Direction, unusable
+from camtorch.projection.rows import CameraRows, Direction, unusable
 from camtorch.values.arguments import Numbers, as_points, warn
 
 if TYPE_CHECKING:
@@ -58,7 +58,7 @@ def evaluate_rows(
     rows: Tensor,
     lead: torch.Size,
     tensors: Sequence[Tensor],
-    cameras_of: Callable[[Tensor, Tensor], Cameras] | None = None,
+    cameras_of: Callable[[Tensor, Tensor], CameraRows] | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Return planes (size, C, N), and valid (C, N), of rows (C, N, size) seen by cameras of this model.
 
@@ -123,7 +123,7 @@ class _Native(Function):
         rows: Tensor,
         intrinsics: Tensor,
         distortion: Tensor,
-        cameras: Cameras,
+        cameras: CameraRows,
         model: type[CameraLike],
         direction: Direction,
     ) -> tuple[Tensor, Tensor]:
@@ -156,7 +156,7 @@ class _Native(Function):
         return by_rows, *cameras.cotangents(sums, wanted[1:3]), None, None, None
 
 
-def rows_of(camera: CameraLike, intrinsics: Tensor, distortion: Tensor) -> Cameras:
+def rows_of(camera: CameraLike, intrinsics: Tensor, distortion: Tensor) -> CameraRows:
     """The rows' cameras, kept until a value changes."""
     cameras = kept_cameras(camera._memo, type(camera), intrinsics, distortion)
     # on another device a look would wait for it
@@ -178,9 +178,9 @@ def rows_of(camera: CameraLike, intrinsics: Tensor, distortion: Tensor) -> Camer
     return cameras
 
 
-def kept_cameras(memo: Kept, model: type[CameraLike], intrinsics: Tensor, distortion: Tensor) -> Cameras:
+def kept_cameras(memo: Kept, model: type[CameraLike], intrinsics: Tensor, distortion: Tensor) -> CameraRows:
     """The cameras (C,) of one model, kept in a memo until a value changes."""
-    cameras: Cameras | None = memo.result
+    cameras: CameraRows | None = memo.result
     if cameras is not None:
         for now, (then, mark) in zip((intrinsics, distortion), cameras.notes, strict=True):
             if mark is not None:
@@ -193,7 +193,7 @@ def kept_cameras(memo: Kept, model: type[CameraLike], intrinsics: Tensor, distor
                 break
         else:
             return cameras
-    return memo.renew(lambda: Cameras(model, intrinsics, distortion))
+    return memo.renew(lambda: CameraRows(model, intrinsics, distortion))
 
 
 def per_row(parameters: Tensor, lead: torch.Size, rows: Tensor) -> Tensor:

@@ -12,7 +12,7 @@ from camtorch.optics.charts import Planes3, floor_of
 from camtorch.projection import compiled
 from camtorch.projection.camera_like import CameraLike
 from camtorch.projection.native_cameras import Native
-from camtorch.projection.rows import Cameras, Direction, Traced, replace, to_mask
+from camtorch.projection.rows import CameraRows, Direction, Traced, replace, to_mask
 from camtorch.values.arguments import columns
 
 if TYPE_CHECKING:
@@ -41,7 +41,7 @@ def _formula(
     points: Tensor,
     intrinsics: Tensor,
     distortion: Tensor,
-    cameras: Cameras | None,
+    cameras: CameraRows | None,
     order: int = 2,
 ) -> tuple[Tensor, Tensor]:
     """Points (C, N, 3) to pixels (2, C, N), and valid (C, N); see `Direction.formula`."""

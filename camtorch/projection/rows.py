@@ -28,7 +28,7 @@ Planes2 = tuple[Tensor, Tensor]
 _MOST_LOOKED_AT = 512  # numbers that are looked at one by one
 
 
-class Cameras:
+class CameraRows:
     """Cameras (C,) of one model, each of which sees one row: the values of their parameters, and their domain.
 
     A camera that learning drove to NaN, to a focal length that is not positive or to coefficients without a formula is
@@ -62,7 +62,7 @@ class Cameras:
         """That of the lenses."""
         return _domain(self._model, self.k, self._learns)
 
-    def with_all_tables(self) -> Cameras:
+    def with_all_tables(self) -> CameraRows:
         """The same with all that a graph may ask for."""
         made = copy.copy(self)
         made.domain = self.domain.with_all_tables()
@@ -172,7 +172,7 @@ class Traced(NamedTuple):
     usable: Tensor | None
 
     @classmethod
-    def of(cls, model: type[CameraLike], intrinsics: Tensor, distortion: Tensor, cameras: Cameras | None) -> Traced:
+    def of(cls, model: type[CameraLike], intrinsics: Tensor, distortion: Tensor, cameras: CameraRows | None) -> Traced:
         """cameras: those of the parameters, if their values may be looked at."""
         if cameras is not None:
             domain, usable = cameras.domain, cameras.usable

@@ -15,7 +15,7 @@ from camtorch.projection import compiled
 from camtorch.projection.camera_like import CameraLike
 from camtorch.projection.native_cameras import Native
 from camtorch.projection.ops import search_in_place, search_open
-from camtorch.projection.rows import Cameras, Direction, Planes2, Traced, replace, to_mask
+from camtorch.projection.rows import CameraRows, Direction, Planes2, Traced, replace, to_mask
 from camtorch.projection.solve import search
 from camtorch.values.arguments import columns
 
@@ -140,7 +140,7 @@ def _formula(
     pixels: Tensor,
     intrinsics: Tensor,
     distortion: Tensor,
-    cameras: Cameras | None,
+    cameras: CameraRows | None,
     order: int = 2,
 ) -> tuple[Tensor, Tensor]:
     """Pixels (C, N, 2) to rays (3, C, N), and valid (C, N); see `Direction.formula`."""

@@ -13,7 +13,7 @@ from camtorch.optics import Equidistant, Lens, Stage
 from camtorch.projection import compiled as geometry
 from camtorch.projection import native_cameras
 from camtorch.projection.project import PROJECT
-from camtorch.projection.rows import Cameras
+from camtorch.projection.rows import CameraRows
 from camtorch.projection.unproject import UNPROJECT
 from camtorch.values.arguments import columns
 
@@ -34,7 +34,7 @@ def native(camera):
     """A camera's, or a batch's (C,)."""
     intrinsics = camera.intrinsics.detach().reshape(-1, 4)
     distortion = camera.distortion.detach().reshape(len(intrinsics), -1)
-    found = Cameras(type(camera), intrinsics, distortion).native
+    found = CameraRows(type(camera), intrinsics, distortion).native
     assert found is not None
     return found
 
@@ -43,7 +43,7 @@ def formula_of(camera, direction, values):
     """What the recorded formula says, (N, size), and of which it is valid; with a graph to the camera's parameters."""
     intrinsics, distortion = camera.intrinsics[None], camera.distortion[None]
     planes, valid = direction.formula(
-        type(camera), values[None], intrinsics, distortion, Cameras(type(camera), intrinsics, distortion)
+        type(camera), values[None], intrinsics, distortion, CameraRows(type(camera), intrinsics, distortion)
     )
     return planes[:, 0].mT, valid[0]
 
