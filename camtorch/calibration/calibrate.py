@@ -330,8 +330,7 @@ def results(searches: Sequence[Search], adjusted: Adjusted, free: Free) -> Resul
     views = torch.stack([one.seen.any(-1) for one in given]).any(0)
     parameters = unknowns(sights, adjusted, int(views.sum()))
     inliers, sigma, noise = noise_of(residuals, seen, valid, searches[0].loss, searches[0].loss_scale, parameters)
-    # views that repeat others widen what is uncertain as if there were so many less
-    again = repeats(given, [r[0] for r in adjusted.residuals])
+    again = repeats(given, [r[0] for r in adjusted.residuals])  # which widen uncertainty as if views were missing
     noise = noise * math.sqrt(len(views) / (len(views) - len(again)))
     cameras, state = [], adjusted.state
     for c, (search, own) in enumerate(zip(searches, inliers.split(len(views)), strict=True)):
@@ -359,9 +358,8 @@ def results(searches: Sequence[Search], adjusted: Adjusted, free: Free) -> Resul
             loss=search.loss,
             index=c,
         )
+        camera.twins = () if (ends := optima[c]) is None else ends.twins(camera)
         cameras.append(camera)
-    for camera, ends in zip(cameras, optima, strict=True):
-        camera.twins = () if ends is None else ends.twins(camera)
     return Results(adjusted, cameras, rms_of(residuals, seen), float(sigma), noise)
 
 

@@ -186,9 +186,7 @@ def _run(
         *(len(points), batch, count, task, _LOSSES.index(search.loss), search.steps),
         *(search.loss_scale, search.settled, search.nothing, search.damping, threshold),
         *(0 if t is None else t.data_ptr() for t in results),
-        *[0] * (8 - len(results)),
-        addressof(counters),
-        addressof(counters) + 8,
+        *(*[0] * (8 - len(results)), addressof(counters), addressof(counters) + 8),
     )
     threads = min(thread_count(), batch, 1 + batch * count // _SHARED) if batch > 1 else 1
     spread(lambda: compiled.camtorch_poses(call), threads)

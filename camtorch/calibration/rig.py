@@ -150,8 +150,7 @@ def calibrate_rig(
     first = _joined(sights, [_alone(search) for search in searches], free)
     adjusted = searches[0].adjusted(sights, first, free, steps=STEPS, progress=told)
     found = results(searches, adjusted, free)
-    cameras = dict(zip(observed, found.cameras, strict=True))
-    state = found.adjusted.state
+    cameras, state = dict(zip(observed, found.cameras, strict=True)), found.adjusted.state
     rotations, translations = (t[0] for t in state.boards)
     posed = zip(observed, *(t[0] for t in state.mounts), strict=True)
     mounts = {name: Extrinsics(rotation_vector(r).unsqueeze(-1), t) for name, r, t in posed}

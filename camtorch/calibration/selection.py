@@ -42,7 +42,6 @@ class Trial:
 
     model: str
     count: int
-    calibration: Calibration | None  # by all views, or None where that failed
     rms: float  # px per point of all views together, NaN where it failed
     held_out: float  # px per point of views that the camera was not fitted to, only their poses; NaN where it failed
     errors: Array  # (V,) mean squared of each view, held out
@@ -103,8 +102,7 @@ def select(
         names = [name for name in fixed if name in (*INTRINSICS, *(MODELS[model].names_of(count) or ()))]
         options = {"fixed": names, "loss": loss, "loss_scale": loss_scale}
         try:
-            numbers = np.arange(len(weights))
-            errors = np.full(len(numbers), np.nan)
+            numbers, errors = np.arange(len(weights)), np.full(len(weights), np.nan)
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", UserWarning)  # a trial: what is amiss is in its numbers
                 whole = calibrated(numbers, model, count=count, **options)
@@ -118,9 +116,9 @@ def select(
             held_out = math.sqrt(float((weights * errors).sum() / weights.sum()))
             if not math.isfinite(held_out):
                 raise ValueError("views that it was not fitted to are lost")
-            trials.append(Trial(model, count, whole, whole.rms, held_out, errors))
+            trials.append(Trial(model, count, whole.rms, held_out, errors))
         except ValueError as error:
-            trials.append(Trial(model, count, None, math.nan, math.nan, np.full(len(pixels), np.nan), str(error)))
+            trials.append(Trial(model, count, math.nan, math.nan, np.full(len(pixels), np.nan), str(error)))
         if progress is not None:
             progress(number / len(tried))
     if not (fitted := [trial for trial in trials if not trial.reason]):
@@ -128,9 +126,8 @@ def select(
     least = min(fitted, key=lambda trial: trial.held_out)
 
     def as_good(trial: Trial) -> bool:
-        more = trial.errors - least.errors
+        more, worse = trial.errors - least.errors, trial.held_out / max(least.held_out, _NOTHING) - 1
         noise = float(more.std()) / math.sqrt(len(more))
-        worse = trial.held_out / max(least.held_out, _NOTHING) - 1
         return worse <= _WORSE or (worse <= _MUCH_WORSE and float(more.mean()) <= noise)
 
     best = min(filter(as_good, fitted), key=lambda trial: trial.count)  # of as many the first, which is better known

@@ -51,12 +51,11 @@ def run(arguments: argparse.Namespace) -> None:
             line += f"; median {compared.median:.3g} px, {100 * compared.within(1):.3g} % of the image within 1 px"
         print(line)
     if output is not None:
-        which = name if name != "camera" else camera.key
         from matplotlib.backends.backend_agg import FigureCanvasAgg
 
         from camtorch import plot
 
-        title = f"{path.name}: {which}, {camera.width} x {camera.height}"
+        title = f"{path.name}: {name if name != 'camera' else camera.key}, {camera.width} x {camera.height}"
         canvas = FigureCanvasAgg(plot.portrait(camera, other, title=title))
         canvas.draw()
         images.write(output, np.array(canvas.buffer_rgba())[..., :3])

@@ -45,9 +45,8 @@ def folder(text: str | None, suffixes: Collection[str]) -> Path:
 def find(words: Sequence[str], suffixes: Collection[str], output: Path) -> list[tuple[Path, Path]]:
     """Return the files that words mean, each once, in natural order, and their places below the folder of outputs.
 
-    Words are files of any suffix; patterns, as a quoted 'in/**/*.jpg'; and folders with all folders in them, whose tree
-    is kept; if there are several words, folders keep their names as well. Names that begin with a dot, and the folder
-    of outputs within a folder that is read, are left out. A word without a file is a ValueError.
+    Words are files of any suffix; patterns, as a quoted 'in/**/*.jpg'; and folders, whose tree is kept, by their names
+    if there are several words. Names that begin with a dot, and the folder of outputs within one, are left out.
     """
     files: dict[str, tuple[Path, Path]] = {}
     out = os.path.realpath(output)

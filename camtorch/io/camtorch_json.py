@@ -161,8 +161,7 @@ def _entry(one: Camera | Extrinsics, lossy: Lossy, name: str) -> dict[str, Any]:
         return {"rotation": _values(lossy, name, first), "translation": _values(lossy, name, second)}
     entry: dict[str, Any] = {"model": one.key, "intrinsics": _values(lossy, name, first)}
     if second.shape[-1]:
-        entry["distortion_names"] = list(one.distortion_names)
-        entry["distortion"] = _values(lossy, name, second)
+        entry |= {"distortion_names": list(one.distortion_names), "distortion": _values(lossy, name, second)}
     if one.image_size is not None:
         entry["image_size"] = list(one.image_size)
     return entry

@@ -68,8 +68,7 @@ def covering(intrinsics: Tensor, reach: Tensor, size: tuple[int, int]) -> Tensor
 def lenses_for(size: tuple[int, int], fov: tuple[float, float] | None) -> Lenses:
     """Return the lenses whose images of a size have a horizontal field of view in a range, in degrees; None: all.
 
-    A calibrated image is scaled until it covers the new one, and cropped evenly. If pixels then have no ray, the focal
-    lengths grow until they have.
+    A calibrated image is scaled to cover the new one, and cropped evenly; focal lengths grow until pixels have rays.
     """
     sizes, intrinsics, distortion, reach = _good()
     new = sizes.new_tensor(size)

@@ -56,8 +56,8 @@ class MapReport:
 
 def measure(path: str, read: LookupMap, exact: Exact, files: tuple[str, ...], facts: dict[str, Any]) -> MapReport:
     """Return the report on a map that was read back."""
-    off, shown = read._off(exact), torch.from_numpy(exact.shown)
-    error = off[shown]
+    shown = torch.from_numpy(exact.shown)
+    error = read._off(exact)[shown]
     return MapReport(
         path=path,
         format=read.format,
