@@ -195,8 +195,7 @@ class Search:
 
     def __post_init__(self) -> None:
         kind, start = self.asked.kind, self.asked.start
-        smooth = kind.smoothness()
-        if smooth is None or start is None:
+        if start is None or (smooth := kind.smoothness()) is None:
             return
         # where nothing is seen a surface goes on as the start does
         like = self.given.pixels
@@ -385,10 +384,7 @@ def rms_of(residuals: Tensor, seen: Tensor) -> float:
 def noise_of(
     residuals: Tensor, seen: Tensor, valid: Tensor, loss: str | None, loss_scale: float, free: float
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """The inliers, bool (V, N), sigma, and the noise that makes the covariance; without a loss both are one number.
-
-    Sigma is that of all residuals, with a robust loss that of the inliers, see `Calibration`. free: of the parameters.
-    """
+    """The inliers, bool (V, N), sigma, see `Calibration`, and the noise that makes the covariance; free: parameters."""
 
     def sigma_of(lengths: Tensor) -> Tensor:
         return (lengths.square().sum() / max(2 * len(lengths) - free, 1)).sqrt()

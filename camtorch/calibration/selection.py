@@ -105,8 +105,7 @@ def select(
             numbers, errors = np.arange(len(weights)), np.full(len(weights), np.nan)
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", UserWarning)  # a trial: what is amiss is in its numbers
-                whole = calibrated(numbers, model, count=count, **options)
-                if not whole.converged:
+                if not (whole := calibrated(numbers, model, count=count, **options)).converged:
                     raise ValueError("no optimum was found")
                 for fold in range(min(_FOLDS, len(numbers))):
                     out = numbers % min(_FOLDS, len(numbers)) == fold

@@ -95,10 +95,7 @@ def _one(path: Path, rig: Rig, name: str | None = None) -> Camera:
 def read_for_images(
     images: Sequence[Path], size_of: Callable[[Path], Size | None], arguments: argparse.Namespace
 ) -> Camera:
-    """Read the camera that took images, by `--camera`, `--lens` or `--guess-fov`; it must fit one of them.
-
-    If its file states no size, it is for the first image that has one, for which a lens is chosen, or guessed, too.
-    """
+    """Read the camera that took images, by `--camera`, `--lens` or `--guess-fov`, for the size of the first if open."""
     path: Path | None = arguments.camera
     sized = ((image, size) for image in images if (size := size_of(image)))
     first, size = next(sized, (images[0], None))

@@ -17,8 +17,7 @@ def run(arguments: argparse.Namespace) -> None:
     """Carry it out."""
     if (arguments.new is None) == (arguments.output is None):
         raise ValueError("which file is the new one? camtorch convert IN -o OUT")
-    path = arguments.new or arguments.output
-    if not path.is_dir():  # some formats are folders
+    if not (path := arguments.new or arguments.output).is_dir():  # some formats are folders
         targets.check(path, force=arguments.force, inputs=_read(arguments.input))
     angle = arguments.max_angle
     if angle is not None and not 0 < angle <= 180:

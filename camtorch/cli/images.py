@@ -26,10 +26,7 @@ def check_kind(path: Path, *, is_video: bool = False) -> None:
 
 
 def write(path: Path, pixels: NDArray[Any], *, orientation: int | None = None, synced: bool = True) -> None:
-    """Write (H, W, C) uint8 or (H, W, 1) uint16, whole or not at all, with missing folders; `synced` as of `replacing`.
-
-    It warns if the file type does not hold the Exif orientation; an ImageFileError says why nothing was written.
-    """
+    """Write (H, W, C) uint8 or (H, W, 1) uint16, whole or not at all, with missing folders, as `replacing` does."""
     image = Image.fromarray(pixels[..., 0] if pixels.shape[-1] == 1 else pixels)
     kind = Image.registered_extensions()[path.suffix.lower()]
     options: dict[str, Any] = {"quality": 95}

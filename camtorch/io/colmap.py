@@ -259,8 +259,7 @@ def render(rig: Rig, lossy: Lossy) -> dict[str, bytes]:
     for name, camera in rig.cameras.items():
         height, width = lossy.size(name, camera)
         entries.append((identities[name], *_smallest(lossy, name, camera), width, height))
-    path = lossy.path
-    if not path.endswith(NAMES.suffixes):  # a folder that is not there yet
+    if not (path := lossy.path).endswith(NAMES.suffixes):  # a folder that is not there yet
         path = os.path.join(path, "cameras.txt")
     binary = path.endswith(".bin")
     contents = {path: (_as_bytes if binary else _as_text)(entries)}

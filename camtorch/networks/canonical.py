@@ -73,8 +73,7 @@ class CanonicalCamera(SampleTransform):
         **options: Any,
     ):
         super().__init__(antialias=antialias, **options)
-        focal = as_number(focal, "focal", self._name)
-        if not 0 < focal < math.inf:
+        if not 0 < (focal := as_number(focal, "focal", self._name)) < math.inf:
             raise ValueError(f"{self._name}: focal must be positive pixels; got {focal!r}")
         if not isinstance(scales, str) or scales not in ("depth", "image"):
             raise ValueError(f'{self._name}: scales must be "depth" or "image"; got {shown(scales)}')

@@ -38,7 +38,6 @@ from camtorch.rays.lattices import angles_from_axis, followed, ideal, image_latt
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.cm import ScalarMappable
     from matplotlib.figure import Figure
 else:  # it is optional, and takes a second: for those who ask for hints at runtime
     Axes = Figure = Any
@@ -167,9 +166,8 @@ def difference(a: Camera, b: Camera, ax: Axes | None = None, *, remove_rotation:
     height, width = a._size_for("a difference")
     ax = axes_or_new(ax)
     values = np.ma.masked_array(compared.apart.numpy(force=True), ~compared.both.numpy(force=True))
-    edges = draw_frame(ax, height, width)
     ax.set_facecolor(NO_RAYS)
-    image = ax.imshow(values, extent=edges, cmap="magma_r", interpolation="nearest")
+    image = ax.imshow(values, extent=draw_frame(ax, height, width), cmap="magma_r", interpolation="nearest")
     _bar(ax, image, compared.apart[compared.both])
     degrees = math.degrees(numbers.angle(compared.rotation))
     turned = f", turned by {degrees:.3g} degrees" if remove_rotation else ""
@@ -312,7 +310,7 @@ def portrait(camera: Camera, other: Camera | None = None, *, title: str = "") ->
     return figure
 
 
-def _bar(ax: Axes, mappable: ScalarMappable, values: Tensor) -> None:
+def _bar(ax: Axes, mappable: Any, values: Tensor) -> None:
     """Colours for the range of values, without the few largest if they are far from the others."""
     most, many = (float(values.max()), float(values.quantile(0.98))) if values.numel() else (0.0, 0.0)
     cut = most > 4 * many > _FAINT
