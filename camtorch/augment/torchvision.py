@@ -38,9 +38,7 @@ except Exception as error:  # a binary that does not match fails with a RuntimeE
 
 _OWNER = "torchvision.Transform"
 _KINDS = {PIL.Image.Image: "image", tv_tensors.Image: "image", tv_tensors.Video: "image", tv_tensors.Mask: "mask"}
-_KINDS |= {tv_tensors.BoundingBoxes: "boxes"}
-if hasattr(tv_tensors, "KeyPoints"):  # since torchvision 0.23
-    _KINDS[tv_tensors.KeyPoints] = "keypoints"
+_KINDS |= {tv_tensors.BoundingBoxes: "boxes", tv_tensors.KeyPoints: "keypoints"}
 _TURNED, _STEPS = "polygons", 33  # rotated boxes move as points all over them, so many along each side
 _HELD = Tensor, np.ndarray
 

@@ -64,17 +64,12 @@ class Domain:
         """Of single points (M,), each seen by the camera of that index."""
         return self.optics(of_points(self.k, camera))
 
-    def _set(self, **tables: object) -> None:
-        """Tables that are not cached at first use: a compiler cannot follow the lock of a cached property."""
-        for name, table in tables.items():
-            setattr(self, name, table)
-
     def with_tables(self, inner2: Tensor, limits2: Tensor, table: Tensor) -> Domain:
-        """The same domain with tables that were made elsewhere."""
-        usual2 = inner2.clamp(max=self.chart.usual_end(self.k.dtype) ** 2)
-        inverse = InverseTable(table) if self.lens.radial else None
-        self._set(inner2=inner2, usual2=usual2, limits2=limits2, inverse=inverse)
-        self._set(stagewise=None, all_stagewise=False)  # which takes a look
+        """The same domain with tables that were made elsewhere: a compiler cannot follow a cached property's lock."""
+        self.inner2, self.limits2 = inner2, limits2
+        self.usual2 = inner2.clamp(max=self.chart.usual_end(self.k.dtype) ** 2)
+        self.inverse = InverseTable(table) if self.lens.radial else None
+        self.stagewise, self.all_stagewise = None, False  # which takes a look
         return self
 
     def with_all_tables(self) -> Domain:
@@ -87,12 +82,12 @@ class Domain:
             return made
         tables = ["inner2", "usual2", *(["circle2"] if self.lens.rest is not None else [])]
         tables += [] if self.lens.is_radial else ["limits2"]
-        made._set(**{name: getattr(self, name).clone() for name in tables})
-        made._set(stagewise=self.stagewise, all_stagewise=self.all_stagewise, inverse=None)
-        if self.inverse is not None:
-            made.__dict__["inverse"] = InverseTable(self.table, is_constant=True)
+        for name in tables:
+            setattr(made, name, getattr(self, name).clone())
+        made.stagewise, made.all_stagewise = self.stagewise, self.all_stagewise
+        made.inverse = None if self.inverse is None else InverseTable(self.table, is_constant=True)
         if not (self.lens.is_radial or self.all_stagewise):
-            made._set(extent=self.extent)
+            made.extent = self.extent
         return made
 
     @cached_property

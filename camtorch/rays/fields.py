@@ -46,18 +46,14 @@ def patch_centres(size: tuple[int, int], stride: int, like: Tensor, owner: str) 
     if any(side % step for side in size):
         height, width = size
         fewer, more = ([(side + extra) // step * step for side in size] for extra in (0, step - 1))
-        pads = more[1] - width, more[0] - height
-        if not all(fewer):
-            raise ValueError(
-                f"{owner}: patches of stride {step} are larger than images of {size} (height, width). What is done to "
-                f"the image first is done to the camera: .resize({more[0]}, {more[1]}), or "
-                f".pad(0, {pads[0]}, 0, {pads[1]}) where it is padded at the right and at the bottom"
-            )
+        pad = f".pad(0, {more[1] - width}, 0, {more[0] - height}) where it is padded at the right and at the bottom"
+        what, ways = "are larger than", f".resize({more[0]}, {more[1]}), or {pad}"
+        if all(fewer):
+            crop = f".crop(0, 0, {fewer[0]}, {fewer[1]}) where a convolution drops the rest"
+            what, ways = "do not fill", f"{crop}, {pad}, or .resize({fewer[0]}, {fewer[1]})"
         raise ValueError(
-            f"{owner}: patches of stride {step} do not fill images of {size} (height, width). What is done to the "
-            f"image first is done to the camera: .crop(0, 0, {fewer[0]}, {fewer[1]}) where a convolution drops the "
-            f"rest, .pad(0, {pads[0]}, 0, {pads[1]}) where it is padded at the right and at the bottom, or "
-            f".resize({fewer[0]}, {fewer[1]})"
+            f"{owner}: patches of stride {step} {what} images of {size} (height, width). What is done to the image "
+            f"first is done to the camera: {ways}"
         )
     middle = (step - 1) / 2
     rows, columns = (torch.arange(side // step, dtype=like.dtype, device=like.device) * step + middle for side in size)

@@ -181,9 +181,8 @@ class BirdsEye(PlaneWarp):
 
     def to_ground(self, pixels: Tensor) -> Tensor:
         """Pixels (..., 2) of the image from above to x and y on the ground."""
-        u, v = as_coordinates(pixels, "pixels", 2, "BirdsEye").unbind(-1)
-        step = self.resolution
-        return torch.stack((self.x[0] + (u + 0.5) * step, self.y[1] - (v + 0.5) * step), -1)
+        u, v = (as_coordinates(pixels, "pixels", 2, "BirdsEye") + 0.5).unbind(-1)
+        return torch.stack((self.x[0] + u * self.resolution, self.y[1] - v * self.resolution), -1)
 
     def from_ground(self, points: Tensor) -> Tensor:
         """The other way: x and y on the ground, (..., 2), to pixels."""

@@ -157,8 +157,7 @@ def ring(
     count, pitch = as_whole(count, "count", "ring", least=1), as_number(pitch, "pitch", "ring")
     seen = float(as_sized(camera, "camera", "ring").field_of_view.detach()[..., 0].max())
     step = seen / count
-    widest = math.radians(150)
-    wide = min(_OVERLAP * step, widest) if fov is None else math.radians(as_fov(fov, "ring", 180))
+    wide = min(_OVERLAP * step, math.radians(150)) if fov is None else math.radians(as_fov(fov, "ring", 180))
     yaws = torch.rad2deg((torch.arange(count, dtype=torch.float64) - (count - 1) / 2) * step)
     rotations = mount_rotation(yaws, torch.full_like(yaws, pitch), torch.zeros_like(yaws))
     return _views(camera, size, wide, rotations, tuple(f"{yaw:.4g} degrees" for yaw in yaws.tolist()), mode, "ring")
