@@ -2,25 +2,21 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from typing import Any, TypeVar
 
 import torch
-from torch import Tensor, nn
-from torch.nn.utils.parametrize import type_before_parametrizations
+from torch import Tensor
 
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.editing import edited
 from camtorch.cameras.mixed import Mixed
-from camtorch.cameras.numbers import joined
 from camtorch.evaluate.known import are_numbers, known_false, known_true
 from camtorch.poses.rotations import turn
 from camtorch.projection.evaluation import rows_of
 from camtorch.projection.native_cameras import Native
-from camtorch.projection.rows import single_native
 from camtorch.values.dtypes import narrow, widen
 from camtorch.values.module import remade
 from camtorch.warp.affine import AffineWarp, MirrorWarp, after
@@ -44,17 +40,17 @@ def _as_is(camera: Camera, rows: Tensor) -> Tensor:
 
 
 @dataclass
-class View:
-    """The new camera of a single sample as plain numbers, of which modules are made when somebody asks for them."""
+class Drawn:
+    """New cameras as compiled code wrote their numbers, of which modules are made when somebody asks for them."""
 
-    base: Camera  # of whose model and dtype it is
-    intrinsics: Sequence[float]
-    distortion: Tensor  # (n,)
+    base: Camera  # of whose model they are
+    intrinsics: Tensor  # (4,) of one, or (B, 4)
+    distortion: Tensor  # (n,) of one, or (B, n)
     image_size: tuple[int, int]
-    rotation: Tensor | None  # (3, 3), or None
-    options: Options  # of the warp that leads to it
-    start: Native | None = None  # the camera before, for compiled code
-    lens: Native | None = None  # one of the same lens as the new camera, if there is one already
+    rotation: Tensor | None  # (3, 3) or (B, 3, 3), or None
+    options: Options  # of the warp that leads to them
+    start: Native | None  # the cameras before, for compiled code
+    native: Native | None = None  # these ones, of one
     made: Warp | None = field(default=None, init=False)  # the warp, once somebody has asked for it
 
     @cached_property
@@ -63,21 +59,12 @@ class View:
         return self.camera()
 
     def camera(self) -> Camera:
-        """A new one."""
+        """Return a new module."""
         if torch.is_inference_mode_enabled():  # what that makes could not be used in a graph later
             with torch.inference_mode(False), torch.no_grad():
                 return self.camera()
-        numbers = nn.Parameter(joined(self.intrinsics, self.base.intrinsics, math), requires_grad=False)
         k = self.distortion.detach().clone()
-        k = nn.Parameter(k, requires_grad=False) if k.shape[0] else k
-        return remade(self.base, intrinsics=numbers, distortion=k, image_size=self.image_size)
-
-    def native(self) -> Native | None:
-        """The camera for compiled code, if that knows the model."""
-        intrinsics = joined(self.intrinsics, self.base.intrinsics, math)
-        if self.lens is not None:
-            return self.lens.before(intrinsics[None])
-        return single_native(type_before_parametrizations(self.base), intrinsics, self.distortion)
+        return remade(self.base, intrinsics=self.intrinsics.clone(), distortion=k, image_size=self.image_size)
 
     def warp(self, source: Camera) -> Warp:
         """From the camera before."""
@@ -91,7 +78,7 @@ class Part:
     """Rows of a batch that move by one warp, or stay as they are."""
 
     rows: list[int] | None  # which samples of the batch, or None for all
-    moves: Warp | View | None  # by what; None: nothing happens to these rows
+    moves: Warp | Drawn | None  # by what; None: nothing happens to these rows
     camera: Camera  # before the change; the warp's source
     shades: tuple[Warp, Warp] | None = None  # how red and blue move, where they do not move as green
     light: Tensor | None = None  # (n or 1, 1, H', W'): what the lens lets through
@@ -100,7 +87,7 @@ class Part:
     def warp(self) -> Warp:
         """By which these rows move, if they do."""
         assert self.moves is not None
-        return self.moves.warp(self.camera) if isinstance(self.moves, View) else self.moves
+        return self.moves.warp(self.camera) if isinstance(self.moves, Drawn) else self.moves
 
     @property
     def target(self) -> Camera:
@@ -115,13 +102,13 @@ class Part:
     @property
     def image_size(self) -> tuple[int, int]:
         """(height, width) after the change."""
-        return self.moves.image_size if isinstance(self.moves, View) else self.target._size_for("Warp")
+        return self.moves.image_size if isinstance(self.moves, Drawn) else self.target._size_for("Warp")
 
     def between(self) -> tuple[Native, Native, Tensor | None] | None:
         """Both cameras and the rotation for compiled code; None where it takes more than that."""
-        if not isinstance(self.moves, View):
+        if not isinstance(self.moves, Drawn):
             return None if self.moves is None or self.shades or self.light is not None else between_of(self.moves)
-        start, end = self.moves.start, self.moves.native()
+        start, end = self.moves.start, self.moves.native
         return None if start is None or end is None else (start, end, self.moves.rotation)
 
     def by(self, change: Callable[[Warp], Warp]) -> Part:
@@ -152,7 +139,7 @@ def _joined(a: Part, b: Part) -> Part:
         return a
     if a.moves is None:
         return replace(b, rows=a.rows, camera=a.camera)
-    if not isinstance(b.moves, View) and b.moves.keeps_lens:
+    if not isinstance(b.moves, Drawn) and b.moves.keeps_lens:
         return a.by(b.moves.follow)
     first, rotation = a.moves.rotation, b.moves.rotation  # (3, 3) or (B, 3, 3): the first turn, then the second
     if first is not None and rotation is not None:
@@ -165,8 +152,8 @@ def _joined(a: Part, b: Part) -> Part:
                 "Compose: the colours or the light of one lens would be seen through another; chromatic and vignetting "
                 "go to the last lens of a chain"
             )
-        if isinstance(b.moves, View) and not a.camera.batch_shape:
-            start = a.moves.start if isinstance(a.moves, View) else _single(a.camera)
+        if isinstance(b.moves, Drawn) and not a.camera.batch_shape:
+            start = a.moves.start if isinstance(a.moves, Drawn) else _single(a.camera)
             return replace(b, rows=a.rows, camera=a.camera, moves=replace(b.moves, rotation=rotation, start=start))
         moved = b.by(lambda warp: MirrorWarp(a.camera, warp.target, rotation))
         return replace(moved, rows=a.rows, camera=a.camera)
@@ -226,7 +213,7 @@ class Change:
     @property
     def single(self) -> Camera:
         """The camera after, of a change of one sample; its own, not that of the change."""
-        if isinstance(view := self.parts[0].moves, View):
+        if isinstance(view := self.parts[0].moves, Drawn):
             return view.camera()
         return (self.target[0] if self.gate is not None else alone(self.parts[0].target)).clone()
 
@@ -234,7 +221,7 @@ class Change:
     def single_rotation(self) -> Tensor:
         """(3, 3): the rotation of a change of one sample, of its own memory."""
         view = self.parts[0].moves
-        if not isinstance(view, View):
+        if not isinstance(view, Drawn):
             return self.rotation[0].clone()
         return (_no_turn(view.distortion.dtype) if view.rotation is None else view.rotation).clone()
 
@@ -275,7 +262,7 @@ class Change:
     def mirrored(self) -> Tensor | None:
         """(count,) bool: which samples are seen in a mirror; None if none is."""
         moves = [part.moves for part in self.parts]
-        turns = [each.rotation if isinstance(each, (View, MirrorWarp)) else None for each in moves]
+        turns = [each.rotation if isinstance(each, (Drawn, MirrorWarp)) else None for each in moves]
         if all(turn is None for turn in turns):
             return None
         device = self.parts[0].camera.intrinsics.device
@@ -320,7 +307,7 @@ class Change:
             return make(warp.source, warp.target, warp.rotation, **options)
 
         parts = [
-            replace(p, moves=replace(p.moves, options=options)) if isinstance(p.moves, View) else p.by(optioned)
+            replace(p, moves=replace(p.moves, options=options)) if isinstance(p.moves, Drawn) else p.by(optioned)
             for p in self.parts
         ]
         return Change(self.count, parts, mixed=self.mixed, gate=self.gate)

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor, nn
 from typing_extensions import Unpack
 
-from camtorch.augment.change import Change, View, alone, as_one
+from camtorch.augment.change import Change, Drawn, alone, as_one
 from camtorch.augment.clips import Clips
 from camtorch.augment.kinds import (
     CHECKED,
@@ -209,7 +209,8 @@ class SampleTransform(KeepsCamera, nn.Module):
         known = [*_keywords(cls)]  # type: ignore[arg-type]  # a class can be hashed
         close = difflib.get_close_matches(word, [*known, *cls.other_words], 1)
         meant = f"did you mean {cls.other_words.get(close[0], close[0])!r}? Known" if close else "known"
-        has = next((base.__name__ for base in cls.__mro__[1:-2] if word in _keywords(base)), None)
+        kin = (one for base in cls.__mro__[1:-2] for one in (base, *base.__subclasses__()))
+        has = next((one.__name__ for one in kin if word in _keywords(one)), None)
         return f"{meant} are {', '.join(known)}" + (f". {has} has it" if has else "")
 
     mirroring: Mirroring | None = None  # what changes places where an augmentation mirrors; None: it never does
@@ -577,7 +578,7 @@ def together(
             hows[name] = Sampler(mode, padding_mode, fill)
         elif found == "mask":
             hows[name] = Sampler("nearest", "zeros", (mask_fill,))
-        elif is_single and found == "boxes" and isinstance(part.moves, View) and are_numbers(value):
+        elif is_single and found == "boxes" and isinstance(part.moves, Drawn) and are_numbers(value):
             hows |= {name: None} if value.dtype == part.moves.distortion.dtype else {}
         elif is_single and found != "boxes" and moves(found, value) is move_pixels:
             hows[name] = None

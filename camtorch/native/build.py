@@ -28,7 +28,7 @@ _SUFFIX = {"win32": "dll", "darwin": "dylib"}.get(sys.platform, "so")
 LIBRARY = f"_sampler.{_MACHINE}.{_SUFFIX}"
 
 # what is compiled for each kind of CPU
-_KERNELS = ("kernel.c", "geometry.c", "consensus.c", "poses.c", "views.c")
+_KERNELS = ("kernel.c", "geometry.c", "draws.c", "consensus.c", "poses.c", "views.c")
 
 # where installation says in one line why it built no library
 REASON = "_sampler.reason.txt"

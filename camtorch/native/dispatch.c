@@ -2,6 +2,7 @@
 #include <string.h>
 
 #include "consensus.h"
+#include "draws.h"
 #include "geometry.h"
 #include "poses.h"
 #include "sampler.h"
@@ -26,6 +27,7 @@
     ENTRY(int64_t, moves, const Move *)                                                                                \
     ENTRY(int64_t, lattices, const Lattices *)                                                                         \
     ENTRY(void, domain, const Domain *)                                                                                \
+    ENTRY(int64_t, draws, Draws *)                                                                                     \
     ENTRY(void, consensus, const Agreement *)                                                                          \
     ENTRY(void, poses, const Poses *)                                                                                  \
     ENTRY(void, views, const Views *)                                                                                  \

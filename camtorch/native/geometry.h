@@ -60,6 +60,31 @@ typedef struct {
     const void *chart_inner2, *chart_most2, *chart_table;
 } Cameras;
 
+/* One of several cameras, or the one for all */
+static inline Cameras only(const Cameras *all, int64_t at) {
+    Cameras one = *all;
+    if (all->cameras == 1) return one;
+    one.cameras = 1;
+    const int64_t width = all->is_double ? sizeof(double) : sizeof(float);
+#define MOVED(field, size) if (one.field) one.field = (const void *)((const char *)one.field + at * (size) * width)
+    MOVED(intrinsics, 4);
+    MOVED(parameters, all->parameter_count);
+    MOVED(constants, all->constant_count);
+    MOVED(inner2, 1);
+    MOVED(usual2, 1);
+    MOVED(limits2, AZIMUTHS);
+    MOVED(extent, EXTENT);
+    MOVED(table, 2 + 2 * NODES);
+    MOVED(circle2, 1);
+    MOVED(chart_inner2, 1);
+    MOVED(chart_most2, 1);
+    MOVED(chart_table, 2 + 2 * NODES);
+#undef MOVED
+    if (one.usable) one.usable += at;
+    if (one.stagewise) one.stagewise += at;
+    return one;
+}
+
 /* What is asked for of lenses (c), or of the factors of inverted charts; what is not wanted is NULL. Results are float
    or double */
 typedef struct {

@@ -6,30 +6,6 @@
 
 #include "geometry.h"
 
-/* One of several cameras, in double precision; or the one for all */
-static inline Cameras only(const Cameras *all, int64_t at) {
-    Cameras one = *all;
-    if (all->cameras == 1) return one;
-    one.cameras = 1;
-#define MOVED(field, size) if (one.field) one.field = (const void *)((const double *)one.field + at * (size))
-    MOVED(intrinsics, 4);
-    MOVED(parameters, all->parameter_count);
-    MOVED(constants, all->constant_count);
-    MOVED(inner2, 1);
-    MOVED(usual2, 1);
-    MOVED(limits2, AZIMUTHS);
-    MOVED(extent, EXTENT);
-    MOVED(table, 2 + 2 * NODES);
-    MOVED(circle2, 1);
-    MOVED(chart_inner2, 1);
-    MOVED(chart_most2, 1);
-    MOVED(chart_table, 2 + 2 * NODES);
-#undef MOVED
-    if (one.usable) one.usable += at;
-    if (one.stagewise) one.stagewise += at;
-    return one;
-}
-
 /* From the rays alone, two poses a row; nearest to the pixels, from a pose; that, with all that comes before and after it:
    from nothing; from a pose, by the points near it */
 enum { FROM_RAYS, REFINED, SOLVED, AGREED };

@@ -32,7 +32,7 @@ _HAS_XI, _HAS_ALPHA, _HAS_BETA, _TRANSVERSE = 1, 2, 4, 8
 _TANGENTIAL, _PRISM = 1, 2
 
 
-def _fields(text: str, **others: type) -> tuple[tuple[str, type], ...]:
+def fields(text: str, **others: type) -> tuple[tuple[str, type], ...]:
     """Those of a struct, by name: *pointers, numbers of 64 bits, and `others` of their own types."""
     return tuple((w.lstrip("*"), others.get(w, c_void_p if w[0] == "*" else c_int64)) for w in text.split())
 
@@ -48,19 +48,19 @@ class _Part(ctypes.Structure):
     )
 
 
-class _Cameras(ctypes.Structure):
+class CamerasStruct(ctypes.Structure):
     """`Cameras` of geometry.h."""
 
-    _fields_ = _fields(
+    _fields_ = fields(
         "*parts part_count is_double cameras *intrinsics *parameters parameter_count *constants constant_count *usable "
         "*inner2 *usual2 *limits2 *extent *table *stagewise *circle2 *chart_inner2 *chart_most2 *chart_table"
     )
 
 
-class _Domain(ctypes.Structure):
+class DomainStruct(ctypes.Structure):
     """`Domain` of geometry.h."""
 
-    _fields_ = _fields(
+    _fields_ = fields(
         "*parts part_count is_double cameras *parameters parameter_count *constants constant_count is_chart is_radial "
         "*ends *usual_ends *folds most *radii *coarse *even *inner2 *usual2 *circle2 *table *limits2 *extent "
         "*stagewise",
@@ -113,6 +113,10 @@ class Plan:
             self._ends[dtype] = end, usual_end
         return end, usual_end
 
+    def has_fixed_ends(self, dtype: torch.dtype) -> bool:
+        """Whether the chart of all cameras ends at one radius, once `ends` has been asked for."""
+        return dtype in self._ends
+
     def radii(self, chart: Callable[[], Chart], count: int, like: Tensor) -> Tensor:
         """The radii of the chart of some cameras, as `Chart.radii` has them, in double precision."""
         key = like.dtype, count
@@ -141,7 +145,7 @@ class Lenses:
     plan: Plan
     cameras: int
     dtype: torch.dtype
-    struct: _Cameras
+    struct: CamerasStruct
     """What it has of them; pointers that are not set are of what is not yet known."""
     _kept: list[object]
 
@@ -149,7 +153,7 @@ class Lenses:
         """See `native_of`."""
         self.plan, self._optics_of, self._k, self._kept = plan, optics_of, k, [k]
         self._slow_domain, self.cameras, self.dtype = domain, len(k), k.dtype
-        self.struct = struct = _Cameras()
+        self.struct = struct = CamerasStruct()
         struct.parts, struct.part_count, struct.parameter_count = addressof(plan.parts), plan.count, plan.parameters
         struct.is_double, struct.cameras = self.dtype == torch.float64, self.cameras
         self._parameters = plan.parameters_of(optics_of, k) if plan.parameters else k
@@ -162,13 +166,24 @@ class Lenses:
         if plan.has_stages:
             self._add_domain(tables)
 
+    @classmethod
+    def known(
+        cls, plan: Plan, optics_of: Optics, k: Tensor, domain: Callable[[], Domain], struct: CamerasStruct, room: object
+    ) -> Lenses:
+        """Return lenses whose parameters and domains have been found: those that `struct` points to, in `room`."""
+        made = cls.__new__(cls)
+        made.plan, made._optics_of, made._k, made._kept = plan, optics_of, k, [k, room]
+        made._slow_domain, made.cameras, made.dtype, made.struct = domain, len(k), k.dtype, struct
+        made._parameters = plan.parameters_of(optics_of, k)
+        return made
+
     def _optics(self) -> tuple[Chart, Lens]:
         return self._optics_of(columns(self._k.double()))
 
     @functools.cached_property
-    def _domain(self) -> _Domain:
+    def asked(self) -> DomainStruct:
         """What it is asked with; its optics are of double precision."""
-        made, plan = _Domain(), self.plan
+        made, plan = DomainStruct(), self.plan
         known = plan.places is not None or not plan.parameters
         parameters = self._parameters if known else plan.parameters_of(self._optics_of, self._k.double())
         made.parts, made.part_count = addressof(plan.parts), plan.count
@@ -195,7 +210,7 @@ class Lenses:
 
     def _ask(self, wanted: dict[str, int]) -> None:
         """Fill in what of the domain is wanted: names and where it goes."""
-        asked = _Domain.from_buffer_copy(self._domain)  # several threads may ask at once
+        asked = DomainStruct.from_buffer_copy(self.asked)  # several threads may ask at once
         for name, place in wanted.items():
             setattr(asked, name, place)
         entry("camtorch_domain", None)(byref(asked))
@@ -226,6 +241,12 @@ class Lenses:
         for name, place in wanted.items():
             setattr(self.struct, name, place)
 
+    def radii_wanted(self) -> dict[str, Tensor]:
+        """Return the radii on which lenses are followed, by their names in a request."""
+        names = {"radii": _RADII, "even": _FOLLOWED, "coarse": _FOLLOWED // 2}
+        chart, like = self._optics()[0], self._k.double()
+        return {name: self.plan.radii(lambda: chart, count, like) for name, count in names.items()}
+
     def inverse_table(self) -> int:
         """What the inverse of the radial factor starts from; it is made when it is first asked for."""
         if self.struct.table is None:
@@ -238,13 +259,11 @@ class Lenses:
         """The limits of each azimuth, and where the lens sends it: asked for only when a point lies far out."""
         struct = self.struct
         if struct.limits2 is None:
-            chart, like = self._optics()[0], self._k.double()
             wanted = {"limits2": self._new(_AZIMUTHS), "extent": self._new(_EXTENT)}
             wanted |= {name: place for name in ("circle2", "stagewise") if (place := getattr(struct, name)) is not None}
-            for name, count in (("radii", _RADII), ("even", _FOLLOWED), ("coarse", _FOLLOWED // 2)):
-                wanted[name] = self._keep(self.plan.radii(lambda: chart, count, like))
+            wanted |= {name: self._keep(radii) for name, radii in self.radii_wanted().items()}
             if self.plan.is_chart:
-                wanted["ends"] = self._keep_ends(chart.end(self.dtype))
+                wanted["ends"] = self._keep_ends(self._optics()[0].end(self.dtype))
             self._ask(wanted)
             struct.extent, struct.limits2 = wanted["extent"], wanted["limits2"]
         return struct.limits2, struct.extent
@@ -268,11 +287,21 @@ _lenses: dict[tuple[object, ...], Lenses] = {}
 
 
 def _lenses_of(plan: Plan, optics_of: Optics, k: Tensor, domain: Callable[[], Domain], tables: bool) -> Lenses:
-    """Those of these values: of the last ones that were asked for, or new ones."""
+    """Return those of these values: of the last ones that were asked for, or new ones."""
     if k.numel() > _LONGEST:
         return Lenses(plan, optics_of, k, domain, tables)
     key = plan, k.dtype, k.shape, k.numpy().tobytes()
     found = _lenses.pop(key, None) or Lenses(plan, optics_of, k, domain, tables)
+    return _keep(key, found)
+
+
+def keep_lenses(lenses: Lenses, k: Tensor) -> None:
+    """Keep lenses that were made elsewhere for those who ask for cameras of their coefficients (C, n)."""
+    if k.numel() <= _LONGEST:
+        _keep((lenses.plan, k.dtype, k.shape, k.numpy().tobytes()), lenses)
+
+
+def _keep(key: tuple[object, ...], found: Lenses) -> Lenses:
     _lenses[key] = found  # the last one
     while len(_lenses) > _MOST_LENSES:
         _lenses.pop(next(iter(_lenses)), None)
@@ -283,7 +312,7 @@ class Native:
     """Cameras (C,) of one model as the compiled geometry takes them."""
 
     plan: Plan
-    struct: _Cameras
+    struct: CamerasStruct
     cameras: int
     dtype: torch.dtype
     parameters: int
@@ -291,7 +320,7 @@ class Native:
 
     def __init__(self, lenses: Lenses, intrinsics: Tensor, usable: Tensor | None):
         """See `native_of`."""
-        self._lenses, self.plan, self.struct = lenses, lenses.plan, _Cameras.from_buffer_copy(lenses.struct)
+        self.lenses, self.plan, self.struct = lenses, lenses.plan, CamerasStruct.from_buffer_copy(lenses.struct)
         self._kept = intrinsics.contiguous(), None if usable is None else (usable > 0).contiguous()
         self.cameras, self.dtype, self.parameters = intrinsics.shape[0], intrinsics.dtype, lenses.plan.parameters
         self.struct.intrinsics, self.struct.usable = map(address, self._kept)
@@ -299,16 +328,16 @@ class Native:
 
     def before(self, intrinsics: Tensor) -> Native:
         """The same lenses with other intrinsics (C, 4), all usable."""
-        return Native(self._lenses, intrinsics, None)
+        return Native(self.lenses, intrinsics, None)
 
     def add_table(self) -> None:
         """Have what the inverse of a radial factor starts from."""
         if self.plan.has_factor and self.struct.table is None:
-            self.struct.table = self._lenses.inverse_table()
+            self.struct.table = self.lenses.inverse_table()
 
     def follow(self) -> None:
         """Have the limits of each azimuth, and where it is sent."""
-        self.struct.limits2, self.struct.extent = self._lenses.followed()
+        self.struct.limits2, self.struct.extent = self.lenses.followed()
 
 
 def native_of(

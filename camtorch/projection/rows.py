@@ -60,7 +60,7 @@ class CameraRows:
     @cached_property
     def domain(self) -> Domain:
         """That of the lenses."""
-        return _domain(self._model, self.k, self._learns)
+        return domain_for(self._model, self.k, self._learns)
 
     def with_all_tables(self) -> CameraRows:
         """The same with all that a graph may ask for."""
@@ -71,7 +71,7 @@ class CameraRows:
     @cached_property
     def native(self) -> Native | None:
         """For the compiled geometry, None where it has not got this model, or is not there."""
-        domain = partial(_domain, self._model, self.k, self._learns)
+        domain = partial(domain_for, self._model, self.k, self._learns)
         return native_of(self._model.optics, self.intrinsics, self.k, self.usable, domain)
 
     def cotangents(self, sums: Tensor | None, wanted: Sequence[bool]) -> tuple[Tensor | None, Tensor | None]:
@@ -97,10 +97,11 @@ class CameraRows:
 def single_native(model: type[CameraLike], intrinsics: Tensor, k: Tensor) -> Native | None:
     """A camera of numbers (4,) and (n,) that are known to be usable, for the compiled geometry, if that knows it."""
     k = k.detach()[None]
-    return native_of(model.optics, intrinsics[None], k, None, partial(_domain, model, k, False), tables=True)
+    return native_of(model.optics, intrinsics[None], k, None, partial(domain_for, model, k, False), tables=True)
 
 
-def _domain(model: type[CameraLike], k: Tensor, learns: bool) -> Domain:
+def domain_for(model: type[CameraLike], k: Tensor, learns: bool) -> Domain:
+    """Return the domain of lenses (C, n) of a model, kept unless they learn."""
     # what learns will not be seen again
     return Domain(model.optics, k) if learns else domain_of(model._model, k, model.optics)
 

@@ -26,7 +26,7 @@ def shares(augmentation, count=24, seed=0, **fields):
 
 @pytest.fixture
 def untold(monkeypatch):
-    monkeypatch.setattr("camtorch.augment.random_camera._told", set())
+    monkeypatch.setattr("camtorch.augment.drawer._told", set())
 
 
 # -- the warning

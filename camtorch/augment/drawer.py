@@ -1,0 +1,362 @@
+"""What random cameras share: the ranges they draw from, and the new camera that a draw makes, by formulas of torch."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from difflib import get_close_matches
+from typing import Any, ClassVar, Literal
+
+import torch
+from torch import Tensor
+from typing_extensions import Unpack
+
+from camtorch.augment.augmentation import Augmentation, FilledOptions, Range, as_range
+from camtorch.augment.change import Drawn, Part
+from camtorch.augment.drawing import Start
+from camtorch.augment.filling import enough, scaled
+from camtorch.augment.jitter import DRAWN, jittered
+from camtorch.augment.presets import PRESETS
+from camtorch.cameras.camera import Camera
+from camtorch.evaluate.kept import Kept
+from camtorch.evaluate.known import are_numbers, known_false, with_derivatives_of
+from camtorch.lenses.drawing import covering, drawn
+from camtorch.models import MODELS, KannalaBrandt
+from camtorch.optics.radial_inverse import precise
+from camtorch.poses.rotations import mount_elements
+from camtorch.rays.lattices import field_of_view
+from camtorch.values.arguments import LEFT, as_image_size, broadcast_shapes, check_degrees, warn
+from camtorch.values.module import remade
+from camtorch.warp.panorama import PANORAMAS
+from camtorch.warp.vignetting import vignetting
+from camtorch.warp.warp import Warp
+
+RangeLike = float | Sequence[float]
+Auto = RangeLike | Literal["auto"] | None
+
+_REAL = "real"
+_TURNS = "yaw", "pitch", "roll"
+_LESS = 0.9  # of the least field of view that was asked for: below that a warning says so
+_TINY, _HUGE = 1e-3, 1e3
+_LIMITS: dict[str, dict[str, Any]] = {
+    "yaw": {"least": -180, "most": 180},
+    "pitch": {"least": -180, "most": 180},
+    "roll": {"least": -180, "most": 180},
+    "zoom": {"least": _TINY, "most": _HUGE, "around": 1},
+    "lens": {},
+    "fov": {"least": _TINY, "most": 360},
+    "focal": {"least": _TINY, "most": _HUGE, "around": 1},
+    "centre": {"least": -1, "most": 1, "size": 2},
+    "distortion": {"least": -1, "most": 1, "size": DRAWN},
+    "crop": {"least": _TINY, "most": 1},
+    "place": {"size": 2},
+    "chromatic": {"least": -0.5, "most": 0.5, "size": 2},
+    "vignetting": {"least": 0, "most": 1},
+    "cos4": {"least": -2, "most": 2},
+}
+"""Of each range, in the order in which they are drawn."""
+_EXACT = "fov", "crop", "vignetting", "cos4"
+"""A single number of these means just that number."""
+_AUTO = "focal", "centre", "distortion", "crop"
+_told: set[tuple[object, ...]] = set()
+
+
+class LensOptions(FilledOptions, total=False):
+    """Options that `RandomMount` and `RandomLens` have in common; see `RandomCamera`."""
+
+    chromatic: RangeLike | None
+    vignetting: RangeLike | None
+    cos4: RangeLike | None
+    image_size: Sequence[int] | None
+
+
+class CameraDrawer(Augmentation):
+    """Another camera in the same place; see `RandomCamera`.
+
+    Args:
+        like: see `RandomCamera`.
+        given: name -> range, of those of `RandomCamera`.
+        chromatic, vignetting, cos4, image_size, options: see `RandomCamera`.
+    """
+
+    other_words: ClassVar[Mapping[str, str]] = {
+        **dict.fromkeys(("preset", "model", "lens"), "like"),
+        **{"center": "centre", "size": "image_size"},
+    }
+    beside_the_camera: ClassVar[frozenset[str]] = frozenset({"chromatic", "vignetting", "cos4"})
+    _usual_ranges: ClassVar[Mapping[str, RangeLike]] = {}
+    """The ranges that "auto" stands for, of lenses that are not drawn from real ones."""
+    like: Camera | None
+
+    def __init__(
+        self,
+        like: Camera | str | None,
+        given: Mapping[str, Any],
+        *,
+        chromatic: RangeLike | None = None,
+        vignetting: RangeLike | None = None,
+        cos4: RangeLike | None = None,
+        image_size: Sequence[int] | None = None,
+        **options: Unpack[FilledOptions],
+    ):
+        super().__init__(**options)
+        fov = given.get("fov")
+        self.fov = "source" if isinstance(fov, str) and fov == "source" else None
+        self._memo = Kept(8)
+        self.image_size: tuple[int, int] | None = as_image_size(image_size, self._name)
+        self._is_real = isinstance(like, str) and like == _REAL
+        self.like = None if self._is_real else _as_like(like, self._name)
+        if self.like is not None and self.like.image_size is None and fov is None:
+            raise ValueError(f"{self._name}: like={like!r} says nothing of the field of view; give fov=(low, high)")
+        usual = {} if self._is_real else self._usual_ranges
+        values = {n: usual.get(n) if n in _AUTO and isinstance(v, str) and v == "auto" else v for n, v in given.items()}
+        values |= {"chromatic": chromatic, "vignetting": vignetting, "cos4": cos4}
+        values |= {"fov": None} if self.fov else {}
+        values |= {"lens": (0, 1)} if self._is_real else {}
+        values |= {"place": (0, 1)} if values.get("crop") is not None else {}
+        self.ranges: dict[str, Range] = {}
+        for name, limit in _LIMITS.items():
+            if (value := values.get(name)) is not None:
+                value = (value, value) if name in _EXACT and isinstance(value, (int, float)) else value
+                self.ranges[name] = as_range(value, name, self._name, **limit)
+        if "fov" in self.ranges:
+            check_degrees(self.ranges["fov"].low, fov, self._name)
+        among = self.ranges.pop("fov", None) if self._is_real else None
+        self._among = None if among is None else (among.low, among.high)
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        if "rates" in state["ranges"]:
+            raise ValueError(f"{type(self).__name__}: the saved augmentation draws a rolling shutter. {LEFT}")
+        super().__setstate__(state)  # type: ignore[no-untyped-call]
+
+    def new_camera(self, source: Camera, values: Mapping[str, Tensor]) -> tuple[Camera, Tensor | None]:
+        """The new camera and its turn, by formulas of torch; see `Augmentation.new_camera`."""
+        base, sized, reach = self._base(source, values.get("lens"))
+        height, width = size = self._size_of(source)
+        fx, fy, cx, cy = (_as_wide(base, sized, values["fov"], width) if "fov" in values else sized).unbind(-1)
+        for name in ("focal", "zoom"):
+            if name in values:
+                fx, fy = fx * values[name], fy * values[name]
+        if "centre" in values:
+            right, down = values["centre"].unbind(-1)
+            cx, cy = cx + right * width, cy + down * height
+        if reach is not None:
+            factor = covering(_joined((fx, fy, cx, cy), base.intrinsics), reach, size)
+            fx, fy = fx * factor, fy * factor
+        distortion = base.distortion
+        if "distortion" in values and distortion.shape[-1]:
+            drawn_to = remade(base, intrinsics=_joined((fx, fy, cx, cy), distortion), image_size=size).detach()
+            amounts = values["distortion"].to(distortion)
+            distortion = jittered(drawn_to, amounts, self._nominal(base, sized, size, values))
+            distortion = with_derivatives_of(base.distortion, distortion)
+        if "crop" in values:  # a part of the image, enlarged to the full size
+            share, (right, down) = values["crop"], values["place"].unbind(-1)
+            left, top = (1 - share) * right * width, (1 - share) * down * height
+            fx, fy, cx, cy = fx / share, fy / share, (cx + 0.5 - left) / share - 0.5, (cy + 0.5 - top) / share - 0.5
+        intrinsics = _joined((fx, fy, cx, cy), distortion)
+        target = remade(base, intrinsics=intrinsics, distortion=distortion, image_size=size)
+        none = next((0 * values[name] for name in _TURNS if name in values), None)
+        if none is None:
+            return target, None
+        angles = [torch.deg2rad(values.get(name, none)) for name in _TURNS]
+        elements = mount_elements([angle.cos() for angle in angles], [angle.sin() for angle in angles])
+        return target, _joined(elements, source.intrinsics).unflatten(-1, (3, 3))
+
+    def _new_camera(self, source: Camera, values: Mapping[str, Any]) -> tuple[Camera, Tensor | None]:
+        made = self._drawn(source, values)
+        if made is not None:
+            return made.camera(), made.rotation
+        if type(self).new_camera is not CameraDrawer.new_camera:
+            return super()._new_camera(source, values)
+        like = precise(source.intrinsics.detach())
+        return self.new_camera(source, {name: torch.as_tensor(value).to(like) for name, value in values.items()})
+
+    def _drawn(self, source: Camera, values: Mapping[str, Any]) -> Drawn | None:
+        """Return what compiled code makes of a draw; None where something is recorded, or it does not know a model."""
+        if type(self).new_camera is not CameraDrawer.new_camera or source.batch_shape == (0,):
+            return None
+        like = self._held("like")
+        tensors = (*source._tensors, *(() if like is None else like._tensors))
+        if not are_numbers(*tensors) or any(isinstance(value, Tensor) for value in values.values()):
+            return None
+
+        def start() -> Start | None:
+            base, sized, reach = self._base(source.detach().clone(), values.get("lens"))
+            moves = "distortion" in values and base.distortion.shape[-1] > 0
+            nominal = self._nominal(base, sized, size, values) if moves else None
+            return Start.of(source, base, sized, reach, size, [*values], nominal)
+
+        size = self._size_of(source)
+        key = "start", type(source), source.image_size, size, *values, self.ranges.get("fov")
+        found = start() if self._is_real else self._memo(tensors, key, start)
+        own = like is None and not self._is_real
+        return None if found is None else found.drawn(values, source if own else found.base, self.options)
+
+    def _part(self, rows: list[int] | None, source: Camera, draw: Mapping[str, Any]) -> Part:
+        simple = self.options["tolerance"] and not self.options["antialias"] and not self.min_filled
+        simple = simple and self.beside_the_camera.isdisjoint(self.ranges) and not source.batch_shape
+        round_images = isinstance(source, PANORAMAS) or isinstance(self._held("like"), PANORAMAS)
+        if simple and not round_images and not isinstance(draw["apply"], Tensor):
+            values = self._values(source, draw)
+            made = self._drawn(source, values)
+            if made is not None and made.start is not None and made.native is not None:
+                return Part(rows, made, source)
+        return super()._part(rows, source, draw)
+
+    def _warp(self, source: Camera, target: Camera, rotation: Tensor | None) -> Warp:
+        return Warp.unchecked(source, target, self.options).turned_by(rotation)
+
+    def _seen_through(self, warp: Warp, values: Mapping[str, Tensor]) -> tuple[tuple[Warp, Warp] | None, Tensor | None]:
+        shades = light = None
+        if "chromatic" in values:
+            red, blue = (scaled(warp.target, 1 + values["chromatic"][..., i]) for i in (0, 1))
+            shades = self._warp(warp.source, red, warp.rotation), self._warp(warp.source, blue, warp.rotation)
+        if "vignetting" in values:
+            # (B or 1, 1, H, W): it is lost by the square of the distance, so much in the farthest corner
+            height, width = warp.target.height, warp.target.width
+            cx, cy = warp.target.intrinsics.detach()[..., 2:].reshape(-1, 2, 1, 1).unbind(1)
+            grid = warp.target.pixel_grid()
+            square = (grid[..., 0] - cx) ** 2 + (grid[..., 1] - cy) ** 2
+            reach = [torch.maximum(c, side - 1 - c) for c, side in ((cx, width), (cy, height))]
+            farthest = (reach[0] ** 2 + reach[1] ** 2).clamp(min=1e-12)
+            light = (1 - values["vignetting"].reshape(-1, 1, 1) * square / farthest).unsqueeze(1)
+        if "cos4" in values:
+            natural = vignetting(warp.target, values["cos4"])
+            light = natural if light is None else light * natural
+        return shades, light
+
+    def _tell_of_zoom(self, source: Camera, target: Camera, factor: Tensor, found: Tensor) -> None:
+        """Warn, once a process, if `min_filled`, and not a draw, zoomed to less than the `fov` that was asked for."""
+        asked = self._among[0] if self._among else self.ranges["fov"].low if "fov" in self.ranges else None
+        share = self.min_filled or 0.0
+        key = self._name, asked, share
+        if asked is None or key in _told or not known_false(factor <= 1):
+            return
+        made = _across(target)
+        least = torch.minimum(_across(scaled(target, 1 / factor)), torch.full_like(made, asked))
+        # what cannot be filled at all has a warning of its own
+        less = (made < _LESS * least) & (factor > 1) & (found >= share)
+        if not bool(less.any()):
+            return
+        _told.add(key)
+        warn(
+            f"{self._name}: asked for fov={asked:g} degrees at least, an image is {float(made[less].min()):.0f} wide: "
+            f"min_filled={share:g} zooms until so much of it is filled, and the camera of the images, "
+            f"{float(source.fov[..., 0].max()):.0f} degrees wide, shows no more where the new one looks. fov='source' "
+            "asks for what it has; with min_filled=0 the rest stays empty"
+        )
+
+    def _size_of(self, source: Camera) -> tuple[int, int]:
+        """(height, width) of the new images."""
+        return self.image_size or (source.height, source.width)
+
+    def _base(self, source: Camera, share: Any) -> tuple[Camera, Tensor, Tensor | None]:
+        """Return whose lens the new cameras have, its intrinsics (*B, 4) before their images, and how far it reaches.
+
+        share: of "real" lenses, which one. The reach (*B,) is that of `lenses.drawing.Lenses`.
+        """
+        size, like, reach = self._size_of(source), self._held("like"), None
+        base = source if like is None else like
+        dtype, device = torch.promote_types(source.intrinsics.dtype, torch.float32), source.intrinsics.device
+        if self._is_real:
+            intrinsics, k, reach = drawn(torch.as_tensor(share, dtype=dtype, device=device), size, self._among)
+            base = remade(_ANY, intrinsics=intrinsics, distortion=k, image_size=size)
+        if any(t.dtype != dtype or t.device != device for t in base._tensors):
+            base = base.each(lambda t: t.to(device, dtype))
+        sized = _sized(base, size) if self.fov is None else precise(self._from_source(source, base, size))
+        return base, sized, reach
+
+    def _nominal(self, base: Camera, sized: Tensor, size: tuple[int, int], values: Mapping[str, Any]) -> Tensor:
+        """(*B, 4): graph-free intrinsics of the lens, with the field of view in the middle of the range."""
+        if "fov" not in values:
+            return sized.detach().to(base.intrinsics.dtype)
+
+        def made() -> Tensor:
+            middle = precise(base.intrinsics).new_tensor(self.ranges["fov"].middle)
+            return _as_wide(base, sized, middle, size[1]).detach().to(base.intrinsics.dtype)
+
+        return self._memo(base._tensors, ("nominal", type(base), base.image_size, size, self.ranges["fov"]), made)
+
+    def _from_source(self, source: Camera, base: Camera, size: tuple[int, int]) -> Tensor:
+        """(*B, 4): intrinsics of the lens at most as wide as its like and as images of the source fill all of."""
+
+        def narrowed() -> Tensor:
+            sized = _sized(base, size)
+            if base.image_size is None:
+                sized = _as_wide(base, sized, torch.rad2deg(field_of_view(source)[..., 0]), size[1])
+            whole = remade(base, intrinsics=sized.to(base.intrinsics.dtype), image_size=size)
+            return scaled(whole, enough(source, whole, None, 1.0)[0]).intrinsics.detach()
+
+        key = "source", type(source), source.image_size, size
+        return self._memo(source._tensors + base._tensors, key, narrowed)
+
+
+def _joined(numbers: Sequence[Tensor], like: Tensor) -> Tensor:
+    """Return (*B, n) of n tensors (*B,), in the dtype of another."""
+    return torch.stack(torch.broadcast_tensors(*numbers), -1).to(like.dtype)
+
+
+def _sized(base: Camera, size: tuple[int, int]) -> Tensor:
+    """Return intrinsics (*B, 4) in float64 of a lens before an image of another size, as wide as it was.
+
+    The old image is scaled to the new width, and cropped or padded evenly to the new height.
+    """
+    fx, fy, cx, cy = precise(base.intrinsics).unbind(-1)
+    across, down = (size[1] - 1) / 2, (size[0] - 1) / 2
+    if base.image_size is None:
+        cx, cy = cx + across, cy + down
+    elif base.image_size != size:
+        height, width = base.image_size
+        scale = size[1] / width
+        fx, fy = fx * scale, fy * scale
+        cx, cy = (cx - (width - 1) / 2) * scale + across, (cy - (height - 1) / 2) * scale + down
+    return torch.stack((fx, fy, cx, cy), -1)
+
+
+def _as_wide(base: Camera, sized: Tensor, fov: Tensor, width: int) -> Tensor:
+    """Return intrinsics (*B, 4) with the focal lengths by which the lens is as wide as a `fov` (*B,) in degrees."""
+    half = fov * (math.pi / 360)
+    sine, cosine = half.sin(), half.cos()
+    rays = torch.stack([_joined((end, 0 * sine, cosine), base.intrinsics) for end in (-sine, sine)], -2)
+    if base.batch_shape:
+        rays = rays.expand(*broadcast_shapes(rays.shape, (*base.batch_shape, 2, 3)))
+    pixels, valid = base.project(rays)
+    if known_false(valid):
+        raise ValueError(f"fov: a {base.key} lens of these coefficients does not reach {float(fov.max()):g} degrees")
+    ratio = width / (pixels[..., 1, 0] - pixels[..., 0, 0])
+    focal = precise(base.intrinsics)[..., :2] * ratio.unsqueeze(-1)
+    return torch.cat(torch.broadcast_tensors(focal, sized[..., 2:]), -1)
+
+
+_ANY = KannalaBrandt([1.0, 1.0, 0.0, 0.0]).detach()
+
+
+def _as_like(like: Camera | str | None, owner: str) -> Camera | None:
+    if like is None or isinstance(like, Camera):
+        if like is not None and like.batch_shape:
+            raise ValueError(f"{owner}: like must be a single camera; got batch dims {tuple(like.batch_shape)}")
+        return like
+    if isinstance(like, str) and like in PRESETS:
+        return PRESETS[like].camera()
+    if isinstance(like, str) and like in MODELS:
+        return MODELS[like]([1.0, 1.0, 0.0, 0.0]).detach()
+    close = get_close_matches(like, [_REAL, *PRESETS, *MODELS], 1) if isinstance(like, str) else []
+    raise ValueError(
+        f"{owner}: like must be a Camera, 'real', a preset ({', '.join(PRESETS)}) or a model ({', '.join(MODELS)}); "
+        f"got {like!r}" + (f". Did you mean {close[0]!r}?" if close else "")
+    )
+
+
+def _across(camera: Camera) -> Tensor:
+    """(*B,) degrees between the left and the right edge of the image, at the height of the principal point."""
+    cy = camera.intrinsics[..., 3].detach()
+    u = torch.stack((torch.full_like(cy, -0.5), torch.full_like(cy, camera.width - 0.5)), -1)
+    pixels = torch.stack((u, cy[..., None].expand_as(u)), -1)
+    with torch.no_grad():
+        rays = camera.unproject(pixels.expand(*camera.batch_shape, 2, 2))[0]
+    return torch.atan2(rays[..., 0].abs(), rays[..., 2]).sum(-1).rad2deg()
+
+
+def _pair(value: RangeLike | str | None) -> RangeLike | str | None:
+    """A single number of these means just that number."""
+    return (value, value) if isinstance(value, (int, float)) else value

@@ -1,0 +1,170 @@
+"""Lenses like a given one: coefficients move by what they do to the image, as far as it stays invertible."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from functools import lru_cache
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from camtorch.cameras.camera import Camera
+from camtorch.cameras.opaque import CameraNumbers, opaque
+from camtorch.rays.lattices import pixel_lattice, polar_rays, reach
+from camtorch.values.arguments import broadcast_shapes
+from camtorch.values.module import remade
+from camtorch.warp.boxes import along_edges
+
+DRAWN = 16
+"""How many coefficients have a draw of their own; more take turns."""
+PARTS = 1.0, -1.0, 0.5, -0.5, 0.25, -0.25, 0.125, -0.125
+"""Of a step, in the order in which they are tried."""
+_SMALL = 0.1  # decentering, prism and tilt, whose images are lopsided, move less than radial terms: as in real lenses
+_STEP = 1e-4
+_SIDE = 9
+_EDGE_SAMPLES = 32
+_AZIMUTHS = 128
+_ANGLES = 64
+_MOST_MEASURED = 64  # lenses
+
+
+def jittered(camera: Camera, amounts: Tensor, nominal: Tensor) -> Tensor:
+    """Return distortion coefficients (*B, n) of lenses like that of `camera`, moved by amounts (*B, 16).
+
+    Every coefficient moves until it has moved the image's rim by its amount, a share of the distance from the centre to
+    the corner of a lens of `nominal` intrinsics; together at most by the largest amount. Where the new lens could not
+    be inverted on the rim of what the old one shows, they move as far the other way; or half as far, and so on; or
+    stay.
+    """
+    with torch.no_grad():
+        return _jittered(camera, amounts, nominal)[0]
+
+
+def _shapes(camera: CameraNumbers, amounts: Tensor, nominal: Tensor) -> tuple[Tensor]:
+    return (amounts.new_empty(*amounts.shape[:-1], camera.distortion.shape[-1]),)
+
+
+@opaque(_shapes)
+def _jittered(camera: Camera, amounts: Tensor, nominal: Tensor) -> tuple[Tensor]:
+    count = camera.distortion.shape[-1]
+    measured = measured_once(sensitivity, camera, camera.distortion, nominal).to(amounts).reshape(-1, count)
+    steps = amounts.reshape(-1, DRAWN).repeat(1, -(-count // DRAWN))[:, :count] * measured
+    lens = remade(camera, intrinsics=camera.intrinsics.reshape(-1, 4), distortion=camera.distortion.reshape(-1, count))
+    rim, given = _rim(lens), lens.distortion.expand_as(steps)
+    if len(rim) < len(steps):
+        rim = rim.expand(len(steps), -1, -1)
+    result, done = given, None
+    for part in PARTS:
+        candidate, defined = defined_or(camera, given + part * steps, given)
+        tried = remade(lens, intrinsics=lens.intrinsics.expand(len(candidate), 4), distortion=candidate)
+        fits = tried.unproject(rim)[1].all(-1)
+        fits = fits if defined is None else fits & defined
+        if done is None and bool(fits.all()):  # mostly the first step does
+            return (candidate.view(*amounts.shape[:-1], count),)
+        done = torch.zeros_like(fits) if done is None else done
+        result = torch.where((fits & ~done).unsqueeze(-1), candidate, result)
+        done |= fits
+        if bool(done.all()):
+            break
+    return (result.view(*amounts.shape[:-1], count).clone(),)
+
+
+_measured: dict[tuple[object, ...], Tensor] = {}
+
+
+def measured_once(measure: Callable[..., Tensor], camera: Camera, *inputs: Tensor) -> Tensor:
+    """Return `measure(camera, *inputs)`, for which these tensors and the size of images are all that counts, kept."""
+    values = [(t.dtype, t.shape, t.device, t.detach().cpu().numpy().tobytes()) for t in inputs]
+    key = measure, type(camera), camera.image_size, *values
+    found = _measured.pop(key, None)
+    if found is None:
+        with torch.inference_mode(False), torch.no_grad():  # what inference mode makes could not be used in a graph
+            found = measure(camera, *[t.detach().clone() for t in inputs])
+    _measured[key] = found  # the last one
+    while len(_measured) > _MOST_MEASURED:
+        _measured.pop(next(iter(_measured)), None)
+    return found
+
+
+def sensitivity(camera: Camera, distortion: Tensor, nominal: Tensor) -> Tensor:
+    """Return (*B, n): by how much to change each coefficient so that the rim moves from centre to corner."""
+    count, size = distortion.shape[-1], camera._size_for("its sensitivity")
+    batch = broadcast_shapes(nominal.shape[:-1], distortion.shape[:-1])
+    intrinsics, k = (
+        t.detach().double().expand(*batch, t.shape[-1]).reshape(-1, t.shape[-1]) for t in (nominal, distortion)
+    )
+    pixels = _over(size).to(k.device).expand(len(k), -1, -1)
+    rays, seen = remade(camera, intrinsics=intrinsics, distortion=k).unproject(pixels)
+    # each coefficient less, then each more; the same lenses stand before any part of an image
+    change = _STEP * torch.eye(count, dtype=torch.float64, device=k.device)
+    lenses, _ = defined_or(camera, k[:, None] + torch.cat((-change, change)), k[:, None])
+    many = [t.repeat_interleave(2 * count, 0) for t in (intrinsics, rays)]
+    ends, valid = remade(camera, intrinsics=many[0], distortion=lenses.flatten(0, 1)).project(many[1])
+    # (B, less and more, n, N, 2), and plain arithmetic on a few numbers
+    places, known = (t.unflatten(0, (-1, 2, count)).cpu().numpy() for t in (ends, valid))
+    moved = np.linalg.norm(places[:, 1] - places[:, 0], axis=-1) / (2 * _STEP)
+    most = np.where(known.all(1) & seen.cpu().numpy()[:, None], moved, 0.0).max(-1)
+    odd = camera.odd_in_x | camera.odd_in_y
+    lopsided = np.array([name in odd for name in camera.distortion_names], bool)
+    share = np.where(lopsided, np.float32(_SMALL), np.float32(1)) / np.float32(max((~lopsided).sum(), 1))
+    corner = math.hypot(size[1] / 2, size[0] / 2)
+    measured = share * np.where(most > 0, corner / most.clip(min=1e-30), 0.0)
+    return torch.from_numpy(measured.reshape(*batch, count)).to(k.device)
+
+
+@lru_cache(maxsize=16)
+def _over(size: tuple[int, int]) -> Tensor:
+    """Return (N, 2) in float64: pixels in even steps over images of a size, to their outer edges."""
+    with torch.inference_mode(False):
+        edges = torch.tensor([[-0.5, -0.5], [size[1] - 0.5, size[0] - 0.5]], dtype=torch.float64)
+        return pixel_lattice(edges[0], edges[1], _SIDE, _SIDE).flatten(0, 1)
+
+
+def defined_or(camera: Camera, distortion: Tensor, otherwise: Tensor) -> tuple[Tensor, Tensor | None]:
+    """Return coefficients (*B, n), others where the model has no formula for them; and where, (*B,), None: nowhere."""
+    sense = camera.defined(distortion.unbind(-1))
+    if sense is None:
+        return distortion, None
+    return torch.where((sense > 0).unsqueeze(-1), distortion, otherwise), sense > 0
+
+
+def _rim(camera: Camera) -> Tensor:
+    """Return (C, N, 2): pixels of the outline of what cameras show of the image; the principal point for the rest.
+
+    A lens that is invertible on the image's edges and where it ends on the image is so inside.
+    """
+    edges = border(camera._size_for("its rim"), camera.intrinsics.dtype).to(camera.intrinsics.device)
+    rim = edges.expand(*camera.batch_shape, *edges.shape)
+    if not bool(camera.unproject(rim)[1].all()):
+        focal, centre = camera.intrinsics[:, None, :2], camera.intrinsics[:, None, 2:]
+        # edited images have different intrinsics, and few kinds of coefficients
+        lenses, which = camera.distortion.detach().unique(dim=0, return_inverse=True)
+        ends = measured_once(lens_ends, camera, lenses).to(focal)[which] * focal + centre
+        ends = torch.where(camera.contains(ends).unsqueeze(-1), ends, rim[:, :1])
+        rim = torch.cat((rim, ends.expand(len(rim), -1, -1)), 1)
+        rim = torch.where(camera.unproject(rim)[1].unsqueeze(-1), rim, centre)
+    return rim
+
+
+@lru_cache(maxsize=16)
+def border(size: tuple[int, int], dtype: torch.dtype) -> Tensor:
+    """Return (N, 2): pixels along the outer edges of images of a size."""
+    height, width = size
+    with torch.inference_mode(False):
+        corners = torch.tensor([[0, 0], [width, 0], [width, height], [0, height]], dtype=torch.float64) - 0.5
+        return along_edges(corners, _EDGE_SAMPLES).to(dtype)
+
+
+def lens_ends(camera: Camera, distortion: Tensor) -> Tensor:
+    """Return (*B, K, 2): in focal lengths, the last point along every azimuth that a lens of coefficients maps."""
+    ones = distortion.new_tensor([1.0, 1.0, 0.0, 0.0]).double()
+    plane = remade(camera, intrinsics=ones, distortion=distortion.detach().double())
+    azimuths = torch.linspace(0, 2 * math.pi, _AZIMUTHS + 1, dtype=torch.float64, device=ones.device)[:-1]
+
+    def seen(rays: Tensor) -> tuple[Tensor, Tensor]:
+        return plane.project(rays.expand(*plane.batch_shape, *rays.shape[-3:]))
+
+    ends = reach(lambda rays: seen(rays)[1], azimuths, steps=_ANGLES, rounds=2)
+    return seen(polar_rays(ends, azimuths).unsqueeze(-2))[0].squeeze(-2)

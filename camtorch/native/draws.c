@@ -1,0 +1,187 @@
+/* New cameras of drawn values. augment/drawer.py has the same formulas, recorded by torch, and says why. */
+#include "draws.h"
+
+#include <math.h>
+#include <string.h>
+
+#include "small.h"
+
+#define PI 3.14159265358979323846
+#define FOLD 0.98 /* of the image's radius at the end of a lens; see lenses/drawing.py */
+
+int64_t THIS(geometry)(const Rows *);
+void THIS(domain)(const Domain *);
+
+static double number(const void *from, int64_t at, int64_t is_double) {
+    return is_double ? ((const double *)from)[at] : ((const float *)from)[at];
+}
+
+static void put(void *to, int64_t at, double value, int64_t is_double) {
+    if (is_double) ((double *)to)[at] = value;
+    else ((float *)to)[at] = (float)value;
+}
+
+/* Where the numbers of a camera lie, `size` of each */
+static void *row(const Draws *d, const void *all, int64_t camera, int64_t size) {
+    return (char *)all + camera * size * (int64_t)(d->made.is_double ? sizeof(double) : sizeof(float));
+}
+
+static double drawn(const Draws *d, int kind, int size, int64_t camera, int i, double otherwise) {
+    return d->first[kind] < 0 ? otherwise : d->values[d->first[kind] * d->cameras + camera * size + i];
+}
+
+/* Points (n, 3) to pixels, or pixels (n, 2) to rays; how many wait for limits */
+static int64_t evaluate(const Cameras *one, int64_t direction, int64_t n, const void *rows, void *results, uint8_t *valid) {
+    const int64_t is_back = direction == UNPROJECT;
+    const Rows call = {.cameras = one, .rows = rows, .row_strides = {0, 3 - is_back, 1}, .results = results,
+                       .result_strides = {0, 2 + is_back, 1}, .valid = valid, .count = n, .tile = n, .direction = direction};
+    return THIS(geometry)(&call);
+}
+
+static int all(const uint8_t *valid, int64_t n) { return !memchr(valid, 0, (size_t)n); }
+
+/* The largest distance of a corner from the principal point, by each focal length */
+static double farthest(const Draws *d, const double *f) {
+    return hypot(fmax(f[2] + 0.5, d->width - 0.5 - f[2]) / f[0], fmax(f[3] + 0.5, d->height - 0.5 - f[3]) / f[1]);
+}
+
+/* fx, fy, cx, cy before any crop */
+static int64_t place(const Draws *d, int64_t c, double *f) {
+    const int64_t is_double = d->made.is_double, each = d->is_each ? c : 0;
+    memcpy(f, d->sized + 4 * each, 4 * sizeof *f);
+    if (d->first[WIDTH] >= 0) { /* between rays to both sides of the axis */
+        const double half = drawn(d, WIDTH, 1, c, 0, 0) * (PI / 360), x = sin(half), z = cos(half);
+        const double ends[6] = {-x, 0, z, x, 0, z};
+        double points[6], pixels[4];
+        uint8_t valid[2];
+        const Cameras base = only(d->base, c);
+        for (int i = 0; i < 6; i++) put(points, i, ends[i], is_double);
+        if (evaluate(&base, PROJECT, 2, points, pixels, valid)) return LEFT_BASE;
+        if (!all(valid, 2)) return TOO_WIDE;
+        const double wide = number(pixels, 2, is_double) - number(pixels, 0, is_double);
+        for (int i = 0; i < 2; i++) f[i] = number(base.intrinsics, i, is_double) * d->width / wide;
+    }
+    const double larger = drawn(d, FOCAL, 1, c, 0, 1) * drawn(d, ZOOM, 1, c, 0, 1);
+    f[0] *= larger, f[1] *= larger;
+    f[2] += drawn(d, CENTRE, 2, c, 0, 0) * d->width, f[3] += drawn(d, CENTRE, 2, c, 1, 0) * d->height;
+    if (d->reach) { /* all pixels have rays */
+        const double factor = fmax(farthest(d, f) / (FOLD * d->reach[each]), 1);
+        f[0] *= factor, f[1] *= factor;
+    }
+    return 0;
+}
+
+/* Pixels of the outline of what the base shows of the image; the principal point for the rest. Their number, or less than
+   zero the flag of what is left */
+static int64_t outline(const Draws *d, int64_t c, const double *f, const void *intrinsics, void *rim) {
+    const int64_t is_double = d->made.is_double, each = d->is_each ? c : 0;
+    memcpy(rim, d->border, (size_t)((char *)row(d, rim, 1, 2 * RIM) - (char *)rim));
+    Cameras base = only(d->base, c);
+    double rays[6 * RIM];
+    uint8_t valid[2 * RIM];
+    base.intrinsics = intrinsics;
+    if (evaluate(&base, UNPROJECT, RIM, rim, rays, valid)) return -LEFT_BASE;
+    if (all(valid, RIM)) return RIM;
+    if (!d->ends) return -LEFT_ENDS;
+    for (int i = 0; i < RIM; i++) {
+        const double *end = d->ends + 2 * (each * RIM + i), u = end[0] * f[0] + f[2], v = end[1] * f[1] + f[3];
+        const int shown = u >= -0.5 && u <= d->width - 0.5 && v >= -0.5 && v <= d->height - 0.5;
+        put(rim, 2 * (RIM + i), shown ? u : number(rim, 0, is_double), is_double);
+        put(rim, 2 * (RIM + i) + 1, shown ? v : number(rim, 1, is_double), is_double);
+    }
+    if (evaluate(&base, UNPROJECT, 2 * RIM, rim, rays, valid)) return -LEFT_BASE;
+    for (int i = 0; i < 2 * RIM; i++)
+        if (!valid[i]) put(rim, 2 * i, f[2], is_double), put(rim, 2 * i + 1, f[3], is_double);
+    return 2 * RIM;
+}
+
+/* What is to be known of a new lens, or its limits alone */
+static void ask(const Draws *d, Cameras *lens, const double *parameters, int limits) {
+    Domain asked = d->domain;
+    if (!lens->inner2) return; /* it has no stages */
+    asked.cameras = 1, asked.parameters = parameters;
+    asked.circle2 = (void *)lens->circle2, asked.stagewise = (uint8_t *)lens->stagewise;
+    if (limits) asked.limits2 = (void *)lens->limits2, asked.extent = (void *)lens->extent;
+    else asked.inner2 = (void *)lens->inner2, asked.usual2 = (void *)lens->usual2, asked.table = (void *)lens->table;
+    THIS(domain)(&asked);
+}
+
+/* Coefficients that move by drawn amounts: as far, or a part of it, as leaves the outline of the image invertible */
+static int64_t bend(Draws *d, int64_t c, const double *f) {
+    static const double parts[TRIES + 1] = {1, -1, 0.5, -0.5, 0.25, -0.25, 0.125, -0.125, 0};
+    const int64_t is_double = d->made.is_double, each = d->is_each ? c : 0, wide = d->made.parameter_count;
+    const Cameras made = only(&d->made, c);
+    const void *given = row(d, d->coefficients, each, d->count);
+    void *k = row(d, d->distortion, c, d->count);
+    double rim[4 * RIM], rays[6 * RIM], parameters[wide];
+    uint8_t valid[2 * RIM];
+    for (int i = 0; i < 4; i++) put((void *)made.intrinsics, i, f[i], is_double);
+    const int64_t n = outline(d, c, f, made.intrinsics, rim);
+    if (n < 0) return -n;
+    for (int i = 0; i <= TRIES; i++) {
+        const int64_t at = c * TRIES + i;
+        Cameras lens = made;
+        int followed = 0;
+        if (d->tries && i < TRIES) {
+            if (d->allowed && !d->allowed[at]) continue;
+            lens = only(d->tries, at), lens.intrinsics = made.intrinsics;
+            memcpy(k, row(d, d->tried, at, d->count), (size_t)((char *)row(d, k, 1, d->count) - (char *)k));
+        } else {
+            for (int j = 0; j < d->count; j++) {
+                const double step = drawn(d, DISTORTION, AMOUNTS, c, j % AMOUNTS, 0) * d->sensitivity[each * d->count + j];
+                put(k, j, number(given, j, is_double) + parts[i] * step, is_double);
+            }
+        }
+        if (!d->tries) {
+            for (int j = 0; j < wide; j++) {
+                parameters[j] = number(k, d->places[j], is_double);
+                put((void *)lens.parameters, j, parameters[j], is_double);
+            }
+            ask(d, &lens, parameters, 0);
+            lens.limits2 = lens.extent = NULL;
+        }
+        if (i == TRIES) break; /* as it was */
+        if (evaluate(&lens, UNPROJECT, n, rim, rays, valid)) {
+            if (d->tries || !made.limits2) return LEFT_LENS;
+            lens.limits2 = made.limits2, lens.extent = made.extent;
+            ask(d, &lens, parameters, followed = 1);
+            evaluate(&lens, UNPROJECT, n, rim, rays, valid);
+        }
+        if (!all(valid, n)) continue;
+        d->followed += followed;
+        break;
+    }
+    return 0;
+}
+
+/* `mount_rotation`, of degrees */
+static void turned(const Draws *d, int64_t c) {
+    const double a = drawn(d, YAW, 1, c, 0, 0) * (PI / 180), b = drawn(d, PITCH, 1, c, 0, 0) * (PI / 180);
+    const double lean = drawn(d, ROLL, 1, c, 0, 0) * (PI / 180), ca = cos(a), sa = sin(a), cb = cos(b), sb = sin(b);
+    const double cc = cos(lean), sc = sin(lean), right = sa * sb, ahead = ca * sb;
+    const double elements[9] = {ca * cc + right * sc, cb * sc, ahead * sc - sa * cc,
+                                right * cc - ca * sc, cb * cc, sa * sc + ahead * cc, sa * cb, -sb, ca * cb};
+    for (int i = 0; i < 9; i++) put(row(d, d->rotations, c, 9), i, elements[i], d->made.is_double);
+}
+
+/* Makes the cameras; flags of what is left */
+int64_t THIS(draws)(Draws *d) {
+    int64_t left = d->followed = 0;
+    for (int64_t c = 0; c < d->cameras; c++) {
+        double f[4];
+        int64_t here = place(d, c, f);
+        if (!here && d->distortion) here = bend(d, c, f);
+        left |= here;
+        if (here) continue;
+        const double share = drawn(d, CROP, 1, c, 0, 1); /* a part of the image, enlarged to the full size */
+        const double from[2] = {(1 - share) * drawn(d, PLACE, 2, c, 0, 0) * d->width,
+                                (1 - share) * drawn(d, PLACE, 2, c, 1, 0) * d->height};
+        for (int i = 0; i < 2; i++) f[i] /= share, f[2 + i] = (f[2 + i] + 0.5 - from[i]) / share - 0.5;
+        for (int i = 0; i < 4; i++) {
+            put(row(d, d->made.intrinsics, c, 4), i, f[i], d->made.is_double);
+            left |= isfinite(f[i]) && (i > 1 || f[i] > 0) ? 0 : NO_CAMERA;
+        }
+        if (d->rotations) turned(d, c);
+    }
+    return left;
+}

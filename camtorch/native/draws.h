@@ -1,0 +1,42 @@
+/* What Python hands to the making of drawn cameras. augment/drawing.py has the same fields. */
+#ifndef CAMTORCH_DRAWS_H
+#define CAMTORCH_DRAWS_H
+
+#include "geometry.h"
+
+/* Kinds of values that are drawn of a camera; of CENTRE and PLACE two, of DISTORTION as many as AMOUNTS, else one */
+enum { YAW, PITCH, ROLL, ZOOM, WIDTH, FOCAL, CENTRE, DISTORTION, CROP, PLACE, DRAWN_KINDS };
+enum { AMOUNTS = 16 };
+enum { TRIES = 8 }; /* of steps of the coefficients, before they stay as they are */
+enum { RIM = 128 }; /* pixels along the edges of the image, and points of the plane along the end of a lens */
+/* What is left to do: the limits of azimuths of the base, and of new lenses, and the ends of the base; or why there are no
+   cameras: the lens does not reach that far, and a focal length is not positive, or a number not finite */
+enum { LEFT_BASE = 1, LEFT_LENS = 2, LEFT_ENDS = 4, TOO_WIDE = 8, NO_CAMERA = 16 };
+
+/* Cameras (c) like others that move by drawn values. What is not wanted is NULL; numbers whose type is void are of that of
+   the cameras */
+typedef struct {
+    const double *values;        /* kind after kind, of each (c) or (c, size) */
+    int64_t first[DRAWN_KINDS];  /* how many values of a camera come before those of a kind; -1: it is not drawn */
+    int64_t cameras, count;      /* count: of coefficients */
+    double height, width;        /* of the new image */
+    int64_t is_each;             /* whether what follows up to `ends` is (c, ...), or one for all */
+    const double *sized;         /* (4): intrinsics of the base before the new image */
+    const double *reach;         /* how far out the base sends the place where it folds, in focal lengths */
+    const void *coefficients;    /* (count) of the base */
+    const double *sensitivity;   /* (count): by how much to change each, so that the rim moves from centre to corner */
+    const double *ends;          /* (RIM, 2): where the base ends, in focal lengths; NULL: not yet known */
+    const Cameras *base;         /* (c), or one for all, with its own intrinsics */
+    const void *border;          /* (RIM, 2): pixels */
+    const int64_t *places;       /* which coefficients the parameters of the lens are */
+    Domain domain;               /* of one new lens: what is asked, without its parameters and results */
+    const Cameras *tries;        /* (c TRIES): new lenses that were made elsewhere, and their (count) coefficients; or NULL */
+    const void *tried;
+    const uint8_t *allowed;      /* (c TRIES): which of those have a formula; NULL: all */
+    Cameras made;                /* the new cameras, and what is known of them; without `tries` of new lenses all of it */
+    void *distortion;            /* (c, count), if coefficients move */
+    void *rotations;             /* (c, 9), if cameras turn */
+    int64_t followed;            /* of how many new lenses `limits2` and `extent` are */
+} Draws;
+
+#endif

@@ -1,0 +1,50 @@
+"""Cameras that compiled code makes of drawn numbers are those of the formulas that torch records, and known as well."""
+
+import pytest
+import torch
+from cameras import KEYS, slow_unless, spread
+
+import camtorch as ct
+from camtorch.native.library import native_available
+from camtorch.projection import native_cameras
+
+A = ct.augment
+pytestmark = pytest.mark.skipif(not native_available(), reason="no compiled library")
+AUGMENTATIONS = {
+    "mount": lambda: A.RandomMount(zoom=0.2, fov=(40, 60)),
+    "lens": lambda: A.RandomLens(),
+    "bent": lambda: A.RandomLens(distortion=1.0, focal=None, centre=0.2),
+    "camera": lambda: A.RandomCamera(crop=(0.5, 1), image_size=(90, 140)),
+    "family": lambda: A.RandomCamera("kannala_brandt", fov=(50, 130), distortion=0.1),
+    "source": lambda: A.RandomCamera("fisheye624", fov="source", yaw=None),
+    "real": lambda: A.RandomLens("real", fov=(60, 120), centre=0.1, distortion=0.2),
+}
+CASES = [(key, name, dtype) for key in KEYS for name in AUGMENTATIONS for dtype in (torch.float32, torch.float64)]
+EACH_LENS = {"mount", "lens", "bent"}
+
+
+@pytest.mark.parametrize("count", [1, 4])
+@pytest.mark.parametrize(
+    ("key", "name", "dtype"),
+    slow_unless(lambda case: case[1] in EACH_LENS or case[0] in ("brown_conrady", "mei"), CASES),
+)
+def test_as_the_formula(key, name, dtype, count):
+    source = spread(key, torch.float32).requires_grad_(False).resize(120, 160).to(dtype)
+    augmentation = AUGMENTATIONS[name]()
+    draw = augmentation.draw(count, torch.Generator().manual_seed(count))
+    change = augmentation.change(source, draw)
+    values = {name: value if count > 1 else value[0] for name, value in draw.items() if name != "apply"}
+    expected, rotation = augmentation.new_camera(source, values)
+    found = change.target if count > 1 else change.target[0]
+    assert type(found) is type(expected)
+    assert found.image_size == expected.image_size
+    exact = {"rtol": 1e-6, "atol": 1e-6} if dtype == torch.float32 else {"rtol": 1e-12, "atol": 1e-12}
+    torch.testing.assert_close(found.intrinsics, expected.intrinsics, **exact)
+    torch.testing.assert_close(found.distortion, expected.distortion.expand_as(found.distortion), **exact)
+    if rotation is not None:
+        torch.testing.assert_close(change.rotation, rotation.expand_as(change.rotation), **exact)
+    pixels = found.pixel_grid(10).reshape(-1, 2).expand(*found.batch_shape, -1, 2)
+    known = found.unproject(pixels)
+    native_cameras._lenses.clear()  # what the draw found of the lenses
+    for one, other in zip(known, found.clone().unproject(pixels), strict=True):
+        assert torch.equal(one, other)
