@@ -47,9 +47,7 @@ def _part_shown(
     source: Camera, target: Camera, pixels: Tensor, rotation: Tensor | None, zoom: Tensor | None = None
 ) -> Tensor:
     """`filled`, as told by the pixels, of a target whose focal lengths are times a zoom (*B,)."""
-    shapes = [camera.batch_shape for camera in (source, target)]
-    if rotation is not None:
-        shapes.append(rotation.shape[:-2])
+    shapes = [source.batch_shape, target.batch_shape, *([] if rotation is None else [rotation.shape[:-2]])]
     if zoom is not None:  # where the camera sees them as it is
         shapes.append(zoom.shape)
         centre = target.intrinsics[..., None, 2:]

@@ -229,8 +229,7 @@ class CameraAugmentation(InContainers, GeometricAugmentationBase2D):
         return transform
 
     def __getstate__(self) -> dict[str, Any]:
-        state: dict[str, Any] = detached(self.__dict__)  # params of a graph could be neither copied nor pickled
-        return state
+        return cast("dict[str, Any]", detached(self.__dict__))  # params of a graph could be neither copied nor pickled
 
     def __repr__(self) -> str:
         ranges = "".join(f"{name}={interval}, " for name, interval in self.augmentation.ranges.items())

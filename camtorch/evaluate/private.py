@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch.utils import _pytree
@@ -21,8 +21,7 @@ def while_loop(condition: Callable[..., Any], body: Callable[..., Any], state: t
     # not imported with torch
     from torch._higher_order_ops.while_loop import while_loop as loop
 
-    result: tuple[Any, ...] = loop(condition, body, state)
-    return result
+    return cast("tuple[Any, ...]", loop(condition, body, state))
 
 
 def collate(batch: Any, functions: dict[Any, Callable[..., Any]]) -> Any:

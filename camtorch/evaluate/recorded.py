@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import torch
 from torch import Tensor
@@ -90,8 +90,7 @@ def order_of(order: int, *inputs: Tensor) -> int:
 def without_keeping(function: Callable[..., Result], *inputs: Tensor) -> Result:
     """`function(*inputs)`; where that is compiled, backward computes it again from the inputs, which alone are kept."""
     if torch.compiler.is_compiling() and torch.is_grad_enabled() and any(t.requires_grad for t in inputs):
-        result: Result = checkpoint(function, *inputs, use_reentrant=False, preserve_rng_state=False)
-        return result
+        return cast("Result", checkpoint(function, *inputs, use_reentrant=False, preserve_rng_state=False))
     return function(*inputs)
 
 

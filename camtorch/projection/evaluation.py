@@ -169,11 +169,10 @@ def rows_of(camera: CameraLike, intrinsics: Tensor, distortion: Tensor) -> Camer
             name = parametrize.type_before_parametrizations(camera).__name__
             where = f" of camera {int(bad[0, 0])} in the batch" if len(cameras.given[0]) > 1 else ""
             keeps = "; focal lengths stay positive after torch.nn.utils.parametrize.register_parametrization(camera, "
-            keeps = f'{keeps}"intrinsics", PositiveFocal()), which is in camtorch.networks.parametrize'
-            keeps = keeps if found[0] == "intrinsics" else ""
+            keeps += '"intrinsics", PositiveFocal()), which is in camtorch.networks.parametrize'
             warn(
-                f"{name}: {found[0]}{where} became unusable: {found[1]}. All its results are invalid "
-                f"and its gradients zero from here on. A smaller learning rate keeps it from there{keeps}",
+                f"{name}: {found[0]}{where} became unusable: {found[1]}. All its results are invalid and its gradients "
+                f"zero from here on. A smaller learning rate keeps it from there{keeps * (found[0] == 'intrinsics')}"
             )
     return cameras
 

@@ -118,8 +118,7 @@ def _inside(warp: CameraPair, corners: Tensor, like: Tensor) -> tuple[Tensor, Te
 def corners_of(boxes: Tensor) -> Tensor:
     """(..., 4, 2): the corners of boxes (..., 4) of x1 y1 x2 y2, clockwise from (x1, y1)."""
     x1, y1, x2, y2 = boxes.unbind(-1)
-    corners: Tensor = torch.stack((x1, y1, x2, y1, x2, y2, x1, y2), -1).unflatten(-1, (4, 2))
-    return corners
+    return torch.unflatten(torch.stack((x1, y1, x2, y1, x2, y2, x1, y2), -1), -1, (4, 2))
 
 
 def in_order(boxes: Tensor) -> Tensor:
