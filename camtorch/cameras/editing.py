@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from typing_extensions import Self
 
-from camtorch.cameras.numbers import joined, split, warn_of_exchange
+from camtorch.cameras.numbers import stack_numbers, unstack_numbers, warn_of_exchange
 from camtorch.evaluate.known import are_numbers, known_false, known_true
 from camtorch.optics.radial_inverse import precise
 from camtorch.projection.camera_like import CameraLike
@@ -50,14 +50,15 @@ def edited(camera: CameraT, matrix: Tensor | Sequence[Sequence[float]], image_si
         maps: Any = matrix.detach().double().numpy() if xp is np else precise(matrix.to(own.device))
         rows = [[maps[..., i, j] for j in range(3)] for i in range(2)]
     (a, b, left), (c, d, top) = rows
-    fx, fy, cx, cy = split(own, xp)
+    fx, fy, cx, cy = unstack_numbers(own, xp)
     focal = abs(a) * fx + abs(b) * fy, abs(c) * fx + abs(d) * fy
     centre = a * cx + b * cy + left, c * cx + d * cy + top
     turns = turned = b != 0
     if isinstance(matrix, Tensor):  # asked where it was drawn, so that no device is waited for
         turns = np.any(turned) if xp is np else not known_true(matrix[..., 0, 1] == 0)
     distortion = _edited_distortion(camera, a - b, c + d, turned if turns else None)
-    return remade(camera, intrinsics=joined((*focal, *centre), own, xp), distortion=distortion, image_size=image_size)
+    intrinsics = stack_numbers((*focal, *centre), own, xp)
+    return remade(camera, intrinsics=intrinsics, distortion=distortion, image_size=image_size)
 
 
 def _edited_distortion(camera: CameraLike, across: Any, down: Any, on_side: Any) -> Tensor:

@@ -197,7 +197,7 @@ def as_numbers_of(camera: CameraLike, value: Numbers, name: str) -> Tensor:
     return torch.as_tensor(np.asarray(value, dtype=np.float64)).to(camera.intrinsics)
 
 
-def split(intrinsics: Tensor, xp: Any) -> Sequence[Any]:
+def unstack_numbers(intrinsics: Tensor, xp: Any) -> Sequence[Any]:
     """fx, fy, cx, cy of intrinsics (*B, 4) in float64, as tensors, or as numbers and arrays."""
     if xp is torch:
         return precise(intrinsics).unbind(-1)
@@ -207,17 +207,14 @@ def split(intrinsics: Tensor, xp: Any) -> Sequence[Any]:
 _FLOATS = {float, np.float64}
 
 
-def joined(numbers: Sequence[Any], like: Tensor, xp: Any) -> Tensor:
+def stack_numbers(numbers: Sequence[Any], like: Tensor, xp: Any) -> Tensor:
     """(*B, n) of n tensors (*B,); or of numbers and arrays, in the dtype of a tensor."""
     if xp is torch:
         return torch.stack(torch.broadcast_tensors(*numbers), -1).to(like.dtype)
     kind = np.float64 if like.dtype == torch.float64 else np.float32
     if _FLOATS.issuperset(map(type, numbers)):
         return torch.from_numpy(np.array(numbers, kind))
-    made = np.empty((*np.broadcast(*numbers).shape, len(numbers)), kind)
-    for i, number in enumerate(numbers):
-        made[..., i] = number
-    return torch.from_numpy(made)
+    return torch.from_numpy(np.stack(np.broadcast_arrays(*numbers), -1).astype(kind, copy=False))
 
 
 def _is_column(model: type[CameraLike], distortion: Tensor) -> bool:
