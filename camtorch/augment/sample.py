@@ -51,7 +51,7 @@ from camtorch.values.arguments import (
     no_camera,
 )
 from camtorch.values.threads import on_one_thread
-from camtorch.warp.at_once import at_once, batch_at_once
+from camtorch.warp.at_once import at_once
 from camtorch.warp.boxes import edges_of, enclosing
 from camtorch.warp.sampling import Options, Sampler, as_options
 
@@ -70,6 +70,7 @@ class Frames(Single):
     """A single sample whose values may have leading dims, as those of clips have: all of them move by one change."""
 
 
+_MANY = 1 << 15  # coordinates of a batch from which on threads share them
 _MOST_FORMS = 16  # of samples that a transform remembers
 
 
@@ -557,14 +558,12 @@ def _in_range(values: Tensor, dtype: torch.dtype) -> Tensor:
 def together(
     change: Change, named: Named, mask_fill: float = 0.0, lateral: float = 0, batched: bool = True
 ) -> dict[str, tuple[Tensor, Tensor | None]]:
-    """What moves by one compiled call, and its validity: images and pixels of a batch of one, images of another.
+    """What moves by one compiled call, and its validity: images, pixels, and of a single sample boxes.
 
     batched: whether the results have a batch dim, as `named` has; those of a batch of one may do without.
     """
     part, is_single = change.parts[0], change.count == 1
     if part.moves is None or part.rows is not None or change.gate is not None:
-        return {}
-    if not is_single and (part.shades is not None or part.light is not None):
         return {}
     options = part.moves.options
     mode, padding_mode, fill = options["mode"], options["padding_mode"], options["fill"]
@@ -580,16 +579,10 @@ def together(
             hows[name] = Sampler("nearest", "zeros", (mask_fill,))
         elif is_single and found == "boxes" and isinstance(part.moves, Drawn) and are_numbers(value):
             hows |= {name: None} if value.dtype == part.moves.distortion.dtype else {}
-        elif is_single and found != "boxes" and moves(found, value) is move_pixels:
+        elif found != "boxes" and moves(found, value) is move_pixels and (is_single or value.numel() < _MANY):
             hows[name] = None
     fields = (named[name] for name in hows)
     values = [edges_of(value) if found == "boxes" else value for found, value in fields]
-    if not is_single:
-        wide = [value if value.ndim == 4 else value.unsqueeze(1) for value in values]
-        pairs = [(value, how) for value, how in zip(wide, hows.values(), strict=True) if how is not None]
-        images = batch_at_once(part.warp, pairs)
-        found_images = zip(hows, values, images or (), strict=False)
-        return {n: (image if value.ndim == 4 else image.squeeze(1), None) for n, value, image in found_images}
     between = part.between() if values else None
     if between is None:
         return {}

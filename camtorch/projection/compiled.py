@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import ctypes
 import functools
 import operator
 import struct
 import threading
 from collections.abc import Callable, Sequence
-from ctypes import addressof, c_bool, c_double, c_float, c_int64, create_string_buffer
+from ctypes import addressof, c_bool, c_double, c_float, c_int64
 from itertools import accumulate
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -19,15 +20,14 @@ from camtorch.native.sampler import CLASSIFICATION, PADDINGS, SCRATCH
 from camtorch.projection.native_cameras import Native, address, entry
 from camtorch.values.threads import spread, thread_count
 
-if TYPE_CHECKING:
-    pass
-
 PROJECT, UNPROJECT, PROJECT_VJP, UNPROJECT_VJP = range(4)
 _TILE = 1 << 14  # points of a tile, some 30 us
 _SHARED = 1 << 15  # points that threads are woken for
 _Rows = struct.Struct("20q").pack  # `Rows` of geometry.h
 packed_move: Callable[..., bytes] = struct.Struct("8q2d12q").pack  # `Move` of geometry.h
-packed_lattices: Callable[..., bytes] = struct.Struct(f"8q2d12q{CLASSIFICATION}6q").pack  # `Lattices`
+_LATTICES = struct.Struct(f"8q2d12q{CLASSIFICATION}6q")  # `Lattices`
+packed_lattices: Callable[..., bytes] = _LATTICES.pack
+LATTICE_WORDS = _LATTICES.size // 8
 POSITIONS, PIXELS, ON_IMAGE = range(3)
 LEFT_FROM, LEFT_TO, LEFT_MOST = 1, 2, 4
 _NO_ROWS = (0, 0, 0, 0)
@@ -114,15 +114,55 @@ def unproject_vjp(
     return results, None if sums is None else sums.sum(1).to(native.dtype)
 
 
-class Lattices(NamedTuple):
-    """What `sampler.sample` takes of the positions of cameras (C,)."""
+class Lattices:
+    """Lattices of cameras (C,), from probes (1, N, 2) at their nodes and at the rim: `Lattices` of geometry.h.
+
+    See `warp.grid.on_lattice`. size: (h, w) of the target. tolerance: in pixels of the source, which has images of
+    `source_size`. room: makes memory of so many bytes. Images that are sampled in the same call find the lattices at
+    `places`, the fields of `Job` of sampler.h.
+    """
 
     nodes: Tensor
-    """(C, 2, n + 5, m + 5)."""
+    """(C, 2, N), of which the first (n + 5) (m + 5) are the nodes."""
     cells: Tensor
     """(C, n, m) int32."""
-    exact: Tensor
-    """(2, K, 8, 8), NaN where there is none."""
+
+    def __init__(
+        self,
+        probes: Tensor,
+        size: tuple[int, int],
+        source_size: tuple[int, int],
+        tolerance: float,
+        padding: str,
+        cameras: int,
+        first_row: int = 0,
+        room: Callable[[int], Tensor] = lambda count: torch.empty(count, dtype=torch.uint8, device="cpu"),
+    ):
+        dtype, count, is_double = probes.dtype, probes.shape[1], probes.dtype == torch.float64
+        n, m = (-(-side // 8) for side in size)
+        nodes, self._most = (n + 5) * (m + 5), cameras * n * m
+        self.nodes = torch.empty(cameras, 2, count, dtype=dtype, device="cpu")
+        self.cells = torch.empty(cameras, n, m, dtype=torch.int32, device="cpu")
+        # exact positions, of which parts are written; nodes in float32; scratch; what is mapped
+        sizes = 128 * self._most * dtype.itemsize, 8 * cameras * nodes * is_double, 4 * SCRATCH * cameras * (m + 8)
+        self._room, self._probes, self.counters = room(sum(sizes) + cameras * count), probes, (c_int64 * 2)()
+        exact, narrow, scratch, valid = accumulate(sizes, initial=self._room.data_ptr())
+        at, cells, used = self.nodes.data_ptr(), self.cells.data_ptr(), addressof(self.counters)
+        rows = *rows_of(probes), at, 2 * count, 1, count, valid, count, count, used
+        asked = at, 2 * count, count, valid, count, valid + nodes, count, cameras, n, m, *size
+        how = *source_size, tolerance, PADDINGS[padding], cells, scratch
+        given = 0, 0, 0, 0, 1, 3, cameras, POSITIONS, *source_size
+        more = first_row, narrow if is_double else 0, exact, used + 8, 0, 0
+        self.words = (c_int64 * LATTICE_WORDS).from_buffer_copy(packed_lattices(*given, *rows, *asked, *how, *more))
+        in_float = (narrow, 2 * nodes, nodes) if is_double else (at, 2 * count, count)
+        self.places = *in_float, cells, n * m, n, m, exact, 64 * self._most * (1 + is_double)
+
+    def found(self) -> tuple[Tensor, Tensor, Tensor]:
+        """`nodes` (C, 2, n + 5, m + 5), `cells`, and `exact` (2, K, 8, 8), NaN where there is none."""
+        (cameras, n, m), dtype, most = self.cells.shape, self.nodes.dtype, self._most
+        nodes = self.nodes.as_strided((cameras, 2, n + 5, m + 5), (*self.nodes.stride()[:2], m + 5, 1))
+        exact = self._room[: 128 * most * dtype.itemsize].view(dtype).view(2, most, 8, 8)
+        return nodes, self.cells, exact[:, : self.counters[1]].clone()
 
 
 class Between:
@@ -157,61 +197,42 @@ class Between:
         rows = *rows_of(pixels), result.data_ptr(), 2 * count, 2, 1, valid.data_ptr(), count, _TILE
         call = packed_move(*self._given, form, *self._size, *rows, addressof(_kept.counters))
         tiles = -(-count // _TILE) * self.cameras
-        self._run("camtorch_moves", call, tiles if self.cameras * count >= _SHARED else 1)
+        self._run("camtorch_moves", call, tiles if self.cameras * count >= _SHARED else 1, _kept.counters)
         return result, valid
 
     def lattices(
-        self,
-        probes: Tensor,
-        size: tuple[int, int],
-        first_row: int,
-        tolerance: float,
-        padding: str,
-        jobs: Callable[[tuple[int, ...]], list[bytes]] = lambda on_lattice: [],
-    ) -> Lattices | None:
-        """Return positions from probes (1, N, 2) at nodes and at the rim, None if most cells would have their own.
+        self, probes: Tensor, size: tuple[int, int], first_row: int, tolerance: float, padding: str
+    ) -> tuple[Tensor, Tensor, Tensor] | None:
+        """Return what `Lattices` finds, None if most cells would have positions of their own."""
+        made = Lattices(probes, size, self._size, tolerance, padding, self.cameras, first_row, _kept_memory)
+        made.words[:7] = self._given
+        return None if self._run("camtorch_lattices", made.words, self.cameras, made.counters) else made.found()
 
-        See `warp.grid.on_lattice`. size: (h, w) of the target. tolerance: in pixels of the source. jobs: `Job` of
-        sampler.h, of images (C, ...) that are sampled in the same call, by where the lattices lie; of float32 alone.
-        """
-        cameras, dtype, count = self.cameras, self._start.dtype, probes.shape[1]
-        n, m = (-(-side // 8) for side in size)
-        nodes, most, is_double = (n + 5) * (m + 5), cameras * n * m, dtype == torch.float64
-        result = torch.empty(cameras, 2, count, dtype=dtype, device="cpu")
-        cells = torch.empty(cameras, n, m, dtype=torch.int32, device="cpu")
-        # for this call alone: exact positions, of which parts are written; nodes in float32; scratch; what is mapped
-        sizes = 128 * most * dtype.itemsize, 8 * cameras * nodes * is_double, 4 * SCRATCH * cameras * (m + 8)
-        kept = _kept_memory(sum(sizes) + cameras * count)
-        exact, narrow, scratch, valid = accumulate(sizes, initial=kept.data_ptr())
-        at, used = result.data_ptr(), addressof(_kept.counters)
-        rows = *rows_of(probes), at, 2 * count, 1, count, valid, count, count, used
-        asked = at, 2 * count, count, valid, count, valid + nodes, count, cameras, n, m, *size
-        how = *self._size, tolerance, PADDINGS[padding], cells.data_ptr(), scratch
-        made = jobs((at, 2 * count, count, cells.data_ptr(), n * m, n, m, exact, 64 * most))
-        images = create_string_buffer(b"".join(made))
-        more = first_row, narrow if is_double else 0, exact, used + 8, addressof(images), len(made)
-        call = packed_lattices(*self._given, POSITIONS, *self._size, *rows, *asked, *how, *more)
-        if self._run("camtorch_lattices", call, cameras):
-            return None
-        if count := _kept.counters[1]:
-            found = kept[: sizes[0]].view(dtype).view(2, most, 8, 8)[:, :count].clone()
-        else:
-            found = torch.empty(2, 0, 8, 8, dtype=dtype, device="cpu")
-        return Lattices(result.as_strided((cameras, 2, n + 5, m + 5), (*result.stride()[:2], m + 5, 1)), cells, found)
+    def _run(self, name: str, call: object, tiles: int, counters: ctypes.Array[c_int64]) -> int:
+        """Flags of what is not made. counters: of the call, its next tile and the number of places."""
+        threads = min(thread_count(), tiles) if tiles > 1 else 1
+        return run_and_follow(entry(name, c_int64), call, threads, counters, self._start, self._end)
 
-    def _run(self, name: str, call: bytes, tiles: int) -> int:
-        """Flags of what is not made. call: whose next tile, and number of places, are this thread's counters."""
-        run, threads, counters = entry(name, c_int64), min(thread_count(), tiles) if tiles > 1 else 1, _kept.counters
-        while True:
-            left: list[int] = []
-            counters[:] = [0, 0]
-            spread(lambda: left.append(run(call)), threads)  # noqa: B023 (which is called at once)
-            flags = functools.reduce(operator.or_, left)
-            if not flags & (LEFT_FROM | LEFT_TO):
-                return flags
-            for flag, native in ((LEFT_FROM, self._start), (LEFT_TO, self._end)):
-                if flags & flag:
-                    native.follow()
+
+def run_and_follow(
+    run: Callable[[object], int],
+    call: object,
+    threads: int,
+    counters: ctypes.Array[c_int64],
+    start: Native,
+    end: Native,
+) -> int:
+    """Return flags of what a call leaves undone, other than to follow azimuths of the cameras: then it is repeated."""
+    while True:
+        left: list[int] = []
+        counters[:] = [0, 0]
+        spread(lambda: left.append(run(call)), threads)  # noqa: B023 (which is called at once)
+        flags = functools.reduce(operator.or_, left)
+        if not flags & (LEFT_FROM | LEFT_TO):
+            return flags
+        for flag, native in ((LEFT_FROM, start), (LEFT_TO, end)):
+            if flags & flag:
+                native.follow()
 
 
 class _Kept(threading.local):

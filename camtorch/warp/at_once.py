@@ -14,44 +14,47 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from camtorch.evaluate.kept import Kept
 from camtorch.evaluate.known import are_free
 from camtorch.native import memory, sampler
 from camtorch.native.library import library
-from camtorch.projection import compiled
-from camtorch.projection.compiled import LEFT_FROM, LEFT_MOST, LEFT_TO, POSITIONS, Between
+from camtorch.projection.compiled import (
+    LATTICE_WORDS,
+    LEFT_FROM,
+    LEFT_MOST,
+    LEFT_TO,
+    ON_IMAGE,
+    POSITIONS,
+    Between,
+    Lattices,
+    packed_move,
+    rows_of,
+    run_and_follow,
+)
 from camtorch.projection.evaluation import compiled_of
-from camtorch.projection.native_cameras import Native
+from camtorch.projection.native_cameras import Native, entry
 from camtorch.values.threads import spread, thread_count
 from camtorch.warp.grid import FEWEST, MOST_KEPT, STEP, coarse, kept_probes
-from camtorch.warp.moving import between
 from camtorch.warp.panorama import goes_round
 from camtorch.warp.sampling import PADDINGS, SHRINKS, SURELY, Options, Sampler
 
 if TYPE_CHECKING:
     from camtorch.warp.warp import Warp
 
-_HEAD, _LATTICE, _MOVE, _JOB = 5, 46, 22, 38  # words of the structures of C
+_HEAD, _MOVE, _JOB = 5, 22, 38  # words of the structures of C
 _MOST = 4  # forms of samples that a thread keeps calls of
 _FEW = 2  # tiles of an image that one thread makes alone
 _EVEN = 4  # samples a thread from which on it matters little that the last ones leave some threads idle
-_ALIGNED = 64
 _PIXELS = 1 << 3  # flags of what is left of pixels are times this
 
 Sizes = tuple[tuple[int, int], tuple[int, int]]
 """(height, width) of the source's image, and of the target's."""
 
 
-def _is_used_once(warp: Warp) -> bool:
-    """Whether its positions come from a lattice that nobody keeps, of cameras that stand still and do not go round."""
-    if not warp.is_an_operator or warp.is_pinned or not warp.tolerance or warp.antialias:
-        return False
-    return goes_round(warp.source) is None and goes_round(warp.target) is None
-
-
 def between_of(warp: Warp) -> tuple[Native, Native, Tensor | None] | None:
-    """Return source, target and rotation of a single warp for compiled code; None where it has to go step by step."""
+    """Return source, target and rotation of a warp for compiled code; None where it has to go step by step."""
     source, target, rotation = warp.source, warp.target, warp.rotation
-    if warp.batch_shape or not _is_used_once(warp):
+    if not warp.is_an_operator or warp.is_pinned or goes_round(source) is not None or goes_round(target) is not None:
         return None
     made = compiled_of((source, target), target.intrinsics, *(() if rotation is None else (rotation,)))
     return None if made is None else (*made[0], rotation)  # type: ignore[return-value]
@@ -63,21 +66,11 @@ def _has_lattice(size: tuple[int, int]) -> bool:
     return min(n, m) >= FEWEST and (n + 5) * (m + 5) <= MOST_KEPT
 
 
-def _result(image: Tensor, how: Sampler, count: int, size: tuple[int, int]) -> Tensor | None:
-    """What (count, C, h, w) samples of an image go to; None where they lie too oddly in memory, or are none."""
-    result = sampler.empty(image, count, size)
-    takes = 0 not in result.shape and sampler.takes(image.dtype, how.mode)
-    return result if takes and sampler.is_quick(image, result, how.mode) else None
-
-
-def _job(image: Tensor, result: Tensor, how: Sampler, on_lattice: tuple[int, ...]) -> tuple[bytes, object]:
-    fill = how.fill * image.shape[1] if len(how.fill) == 1 else how.fill
-    return sampler.packed(image, result, how.mode, how.padding_mode, fill, (0,) * 8 + on_lattice)
-
-
-def _smooth(images: Sequence[tuple[Tensor, Sampler]]) -> bool:
-    """Whether a warp that decides for itself might halve one of them."""
-    return any(how.mode != "nearest" and image.dtype != torch.bool for image, how in images)
+def _result(images: Tensor, how: Sampler, size: tuple[int, int]) -> Tensor | None:
+    """What samples of images (B, C, H, W) go to; None where they lie too oddly in memory, or are none."""
+    result = sampler.empty(images, len(images), size)
+    takes = 0 not in result.shape and sampler.takes(images.dtype, how.mode)
+    return result if takes and sampler.is_quick(images, result, how.mode) else None
 
 
 @functools.lru_cache(maxsize=16)
@@ -103,48 +96,9 @@ def _surely_keeps_size(back: Between, sizes: Sizes) -> bool:
     return bool((total < SURELY * SHRINKS * step * np.maximum(count, 1)).all())
 
 
-def batch_at_once(warp: Warp, images: Sequence[tuple[Tensor, Sampler]]) -> list[Tensor] | None:
-    """Return images (B, C, H, W) of a warp of B cameras that is used once: each thread takes whole samples.
-
-    None where lattices do not do, images lie oddly in memory or shrink, threads would idle, or something is traced.
-    """
-    tensors = [image for image, _ in images]
-    if not images or not are_free(*tensors):
-        return None
-    cameras, threads = math.prod(warp.batch_shape), thread_count()
-    if cameras < 2 or (cameras % threads and cameras < _EVEN * threads):
-        return None
-    if not _is_used_once(warp) or warp.target.intrinsics.dtype != torch.float32:
-        return None
-    if torch.is_grad_enabled() and any(t.requires_grad for t in (*tensors, *warp._inputs())):
-        return None
-    sizes, rotation = (warp.source._size_for("Warp"), warp.target._size_for("Warp")), warp.rotation
-    found = [_result(image, how, cameras, sizes[1]) for image, how in images]
-    results = [result for result in found if result is not None]
-    if len(results) < len(images) or not _has_lattice(sizes[1]):
-        return None
-    back = between(warp.target, warp.source, None if rotation is None else rotation.mT, warp.target.intrinsics)
-    if back is None or back.cameras != cameras:
-        return None
-    if warp._decides and _smooth(images) and not _surely_keeps_size(back, sizes):
-        return None
-    kept: list[object] = []  # what jobs point to
-
-    def jobs(on_lattice: tuple[int, ...]) -> list[bytes]:
-        pairs = zip(images, results, strict=True)
-        packed = [_job(image, result, how, on_lattice) for (image, how), result in pairs]
-        kept.extend(holds for _, holds in packed)
-        return [job for job, _ in packed]
-
-    padding = PADDINGS[max(PADDINGS.index(how.padding_mode) for _, how in images)]
-    probes = kept_probes(range(sizes[1][0]), sizes[1][1], torch.float32)
-    made = back.lattices(probes, sizes[1], 0, warp.tolerance, padding, jobs)
-    return None if made is None else results
-
-
 class _Calls(threading.local):
     def __init__(self) -> None:
-        self.kept: dict[object, _Call] = {}
+        self.kept = Kept(_MOST)
 
 
 _calls = _Calls()
@@ -160,34 +114,34 @@ def at_once(
     hows: Sequence[Sampler | None],
     batched: bool = True,
 ) -> list[tuple[Tensor, Tensor | None]] | None:
-    """Return the images of a sample and its pixels, with a batch dim of one or without; and which pixels are valid.
+    """Return images and pixels of samples, with a batch dim or, of a single one, without; and which pixels are valid.
 
-    None where a lattice does not do, images shrink, lie oddly in memory, or something is traced. Values are images (1,
-    C, H, W), masks (1, H, W) as well, and, where `hows` has None, pixels (1, *N, 2) of the source's image.
+    None where a lattice does not do, images shrink, lie oddly in memory, threads would idle, or something is traced.
+    Values are images (B, C, H, W), masks (B, H, W) as well, and, where `hows` has None, pixels (B, *N, 2) of the
+    source's image. Of a batch each thread takes whole samples.
     """
-    tolerance, antialias = options["tolerance"], options["antialias"]
-    if not tolerance or antialias or not are_free(*values):
+    tolerance, antialias, count = options["tolerance"], options["antialias"], values[0].shape[0]
+    turns = 1 if rotation is None else rotation.numel() // 9
+    if not tolerance or antialias or max(source.cameras, target.cameras, turns) != count or not are_free(*values):
         return None
+    if count > 1:
+        threads = thread_count()
+        if source.dtype != torch.float32 or (count % threads and count < _EVEN * threads):
+            return None
     if rotation is not None and (rotation.dtype != source.dtype or not rotation.is_contiguous()):
         rotation = rotation.detach().to(source.dtype).contiguous()
     forms = [(t.shape, t.stride(), t.dtype, how) for t, how in zip(values, hows, strict=True)]
     key = (sizes, source.dtype, tolerance, batched, *forms)
-    call = _calls.kept.pop(key, None) or _Call.of(sizes, source.dtype, tolerance, values, hows, batched)
-    if call is None:
-        return None
-    _calls.kept[key] = call  # the last one
-    while len(_calls.kept) > _MOST:
-        del _calls.kept[next(iter(_calls.kept))]
-    return call(source, target, rotation, values, antialias is None)
+    call = _calls.kept((), key, lambda: _Call.of(sizes, source.dtype, tolerance, values, hows, batched))
+    return None if call is None else call(source, target, rotation, values, antialias is None)
 
 
 def _maker(ndim: int, image: Tensor, size: tuple[int, int], batched: bool) -> Callable[[], Tensor]:
-    """What makes the place for the samples of an image (1, C, H, W), which as a mask may come as (1, H, W)."""
-    like = torch.empty_strided(image.shape, image.stride(), dtype=image.dtype, device="meta")
+    """What makes the place for the samples of images (B, C, H, W), which as masks may come as (B, H, W)."""
+    make = sampler.maker(image, image.shape[0], size)
 
     def made() -> Tensor:
-        result = sampler.empty(like, 1, size)
-        result = result if ndim == 4 else result.squeeze(1)
+        result = make() if ndim == 4 else make().squeeze(1)
         return result if batched else result.squeeze(0)
 
     shape = made()
@@ -217,15 +171,15 @@ class _Call:
             if how is None:
                 if torch.promote_types(value.dtype, dtype) != dtype:
                     return None
-                pixels.append(value.to(dtype).reshape(1, -1, 2))
+                pixels.append(value.to(dtype).reshape(len(value), -1, 2))
                 makers.append(None)
                 continue
             image = value if value.ndim == 4 else value.unsqueeze(1)
-            if _result(image, how, 1, sizes[1]) is None:
+            if _result(image, how, sizes[1]) is None:
                 return None
             images.append((image, how))
             makers.append(_maker(value.ndim, image, sizes[1], batched))
-        return cls(sizes, dtype, tolerance, images, pixels, makers, batched)
+        return cls(sizes, dtype, tolerance, images, pixels, makers, batched, len(values[0]))
 
     def __init__(
         self,
@@ -236,56 +190,44 @@ class _Call:
         pixels: Sequence[Tensor],
         makers: Sequence[Callable[[], Tensor] | None],
         batched: bool,
+        count: int,
     ):
-        source_size, size = sizes
-        n, m = (math.ceil(side / STEP) for side in size)
-        probes = kept_probes(range(size[0]), size[1], dtype)
-        count, nodes, wide = probes.shape[1], (n + 5) * (m + 5), dtype.itemsize
-        is_double = dtype == torch.float64
-        parts = [2 * count * wide, 4 * n * m, count, 128 * n * m * wide, 8 * nodes * is_double]
-        parts += [4 * sampler.SCRATCH * (m + 8), 8]
-        places = [-(-part // _ALIGNED) * _ALIGNED for part in parts]
+        probes = kept_probes(range(sizes[1][0]), sizes[1][1], dtype)
+        padding = PADDINGS[max((PADDINGS.index(how.padding_mode) for _, how in images), default=0)]
         with torch.inference_mode(False):
-            room = torch.empty(sum(places), dtype=torch.uint8, device="cpu")
-        at, cells, valid, exact, narrow, scratch, used = itertools.accumulate(places[:-1], initial=room.data_ptr())
+            self._lattices = Lattices(probes, sizes[1], sizes[0], tolerance, padding, count)
         jobs, kept = [], []
-        plane = 64 * n * m * (2 if is_double else 1)
-        on_lattice = narrow if is_double else at, 0, nodes if is_double else count, cells, 0, n, m, exact, plane
         for image, how in images:
-            job, holds = _job(image, sampler.empty(image, 1, size), how, on_lattice)
+            fill = how.fill * image.shape[1] if len(how.fill) == 1 else how.fill
+            result = sampler.empty(image, count, sizes[1])
+            places = (0,) * 8 + self._lattices.places
+            job, holds = sampler.packed(image, result, how.mode, how.padding_mode, fill, places)
             jobs.append(job)
             kept.append(holds)
-        reach = max((sampler.PADDINGS[how.padding_mode] for _, how in images), default=0)
-        rows = compiled.rows_of(probes)
-        move = [0, 0, 0, 0, 1, 3, 1, compiled.POSITIONS, *source_size, *rows]
-        move += [at, 2 * count, 1, count, valid, count, count, 0]
-        asked = at, 2 * count, count, valid, count, valid + nodes, count, 1, n, m, *size, *source_size, tolerance
-        lattice = compiled.packed_lattices(
-            *move, *asked, reach, cells, scratch, 0, narrow if is_double else 0, exact, used, 0, 0
-        )
-        moves = [
-            compiled.packed_move(
-                *(0, 0, 0, 0, 3, 1, 1, compiled.ON_IMAGE, *size),
-                *compiled.rows_of(given),
-                *(0, 0, 2, 1, 0, given.shape[1], max(given.shape[1], 1), 0),
-            )
-            for given in pixels
-        ]
-        start = 8 * (_HEAD + _LATTICE)
-        text = bytes(8 * _HEAD) + lattice + b"".join(moves) + b"".join(jobs)
-        assert len(text) == start + 8 * (_MOVE * len(moves) + _JOB * len(jobs))
+        moves = []
+        for given in pixels:
+            many = given.shape[1]
+            rows = *rows_of(given), 0, 2 * many, 2, 1, 0, many, max(many, 1), 0
+            moves.append(packed_move(0, 0, 0, 0, 3, 1, count, ON_IMAGE, *sizes[1], *rows))
+        text = bytes(8 * _HEAD) + bytes(self._lattices.words) + b"".join(moves) + b"".join(jobs)
         self._words = (ctypes.c_int64 * (len(text) // 8)).from_buffer_copy(text)
-        first_move, self._first_job = _HEAD + _LATTICE, _HEAD + _LATTICE + _MOVE * len(moves)
+        first_move = _HEAD + LATTICE_WORDS
+        self._first_job = first_move + _MOVE * len(moves)
+        assert len(self._words) == self._first_job + _JOB * len(jobs)
         here = ctypes.addressof(self._words)
-        self._words[:_HEAD] = [here + 8 * self._first_job, len(jobs), 1, here + start, len(moves)]
-        self._moves, self._jobs = bool(moves), len(jobs)
+        of_jobs = here + 8 * self._first_job, len(jobs)
+        self._words[:_HEAD] = [*of_jobs, 1, here + 8 * first_move, len(moves)]
+        if count > 1:  # each as soon as its lattice is there
+            self._words[first_move - 2 : first_move] = of_jobs
+        else:
+            self._words[_HEAD + _MOVE - 1] = 0  # one thread makes the lattice, and needs no counter of those made
         # where the pointers to each value go, and what makes the results of images
         to_moves, to_jobs = itertools.count(first_move, _MOVE), itertools.count(self._first_job, _JOB)
         self._slots = [(next(to_moves if make is None else to_jobs), make) for make in makers]
-        self._tiles = max((sampler.tiles_of(sampler.empty(image, 1, size)) for image, _ in images), default=1)
-        self._sizes, self._dtype, self._lead = sizes, dtype, 0 if batched else 1
-        self._kept = room, probes, kept  # what the words point to
-        self._may_shrink = _smooth(images)
+        self._tiles = max((sampler.tiles_of(sampler.empty(image, 1, sizes[1])) for image, _ in images), default=1)
+        self._sizes, self._dtype, self._lead, self._count = sizes, dtype, 0 if batched else 1, count
+        self._moves, self._jobs, self._kept = bool(moves), len(jobs), kept
+        self._may_shrink = any(how.mode != "nearest" and image.dtype != torch.bool for image, how in images)
 
     def __call__(
         self, source: Native, target: Native, rotation: Tensor | None, values: Sequence[Tensor], decides: bool
@@ -295,31 +237,37 @@ class _Call:
             if not _surely_keeps_size(Between(target, source, turns, self._sizes[0], False), self._sizes):
                 return None
         words, turn = self._words, 0 if rotation is None else rotation.data_ptr()
+        by_camera = 9 if rotation is not None and rotation.numel() > 9 else 0
         target.add_table()
         if self._moves:
             source.add_table()
-        words[_HEAD], words[_HEAD + 1], words[_HEAD + 2] = target.pointer, source.pointer, turn
+        words[_HEAD : _HEAD + 4] = [target.pointer, source.pointer, turn, by_camera]
         results: list[tuple[Tensor, Tensor | None]] = []
         given = []  # pixels in the dtype of the cameras, for as long as the call
         for value, (at, make) in zip(values, self._slots, strict=True):
             if make is None:
                 shape = value.shape[self._lead :]
                 if value.dtype != self._dtype or value.ndim != 3:
-                    value = value.to(self._dtype).reshape(1, -1, 2)
+                    value = value.to(self._dtype).reshape(self._count, -1, 2)
                     given.append(value)
                 result = torch.empty(shape, dtype=self._dtype, device="cpu")
                 valid = torch.empty(shape[:-1], dtype=torch.bool, device="cpu")
-                words[at], words[at + 1], words[at + 2] = source.pointer, target.pointer, turn
+                words[at : at + 4] = [source.pointer, target.pointer, turn, by_camera]
                 words[at + 10], words[at + 14], words[at + 18] = value.data_ptr(), result.data_ptr(), valid.data_ptr()
                 results.append((result, valid))
             else:
                 result = make()
                 words[at], words[at + 1] = value.data_ptr(), result.data_ptr()
                 results.append((result, None))
-        native, threads = library(), min(thread_count(), self._tiles)
+        native, threads, jobs = library(), thread_count(), self._jobs
         assert native is not None  # or nobody has a `Native`
-        words[2] = is_whole = threads == 1 or self._tiles <= _FEW
-        words[1] = self._jobs
+        if self._count > 1 and jobs:
+            call, threads, counters = ctypes.byref(words, 8 * _HEAD), min(threads, self._count), self._lattices.counters
+            if run_and_follow(entry("camtorch_lattices", ctypes.c_int64), call, threads, counters, target, source):
+                return None
+            jobs = 0  # the images are made
+        words[1] = jobs
+        words[2] = is_whole = threads == 1 or self._tiles <= _FEW or not jobs
         while flags := native.camtorch_together(words):
             if flags & LEFT_MOST:
                 return None
@@ -336,5 +284,5 @@ class _Call:
                 job = words[self._first_job + i * _JOB : self._first_job + (i + 1) * _JOB]
                 run = (ctypes.c_int64 * _JOB)(*job)
                 run[_JOB - 1] = 0
-                spread(lambda: native.camtorch_sample(run), threads)  # noqa: B023 (which is called at once)
+                spread(lambda: native.camtorch_sample(run), min(threads, self._tiles))  # noqa: B023 (called at once)
         return results

@@ -305,7 +305,7 @@ def test_a_chain_is_one_resampling(monkeypatch):
         return call
 
     call = camtorch.native.sampler.Call
-    for module, name in ((call, "__call__"), (sampling, "_by_torch"), (camtorch.augment.sample, "batch_at_once")):
+    for module, name in ((call, "__call__"), (sampling, "_by_torch"), (camtorch.augment.sample, "at_once")):
         monkeypatch.setattr(module, name, watched(getattr(module, name)))
     mixture()(image=torch.randint(0, 256, (4, 3, 96, 128), dtype=torch.uint8), camera=lens)
     assert sum(made) == 1
