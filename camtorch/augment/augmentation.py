@@ -338,7 +338,7 @@ class Augmentation(SampleTransform):
         return self._change(as_one(camera), self._checked_draw(draw))
 
     def _change(self, camera: Camera, draw: Mapping[str, Any]) -> Change:
-        applied, camera = draw["apply"], alone(camera)
+        applied = draw["apply"]
         count = len(applied)
         if 0 < self.p < 1 and self.image_size not in (None, camera.image_size):
             raise ValueError(
@@ -353,7 +353,7 @@ class Augmentation(SampleTransform):
         chosen = applied if isinstance(applied, list) else applied.tolist() if looks else []
         if all(chosen):  # traced, all rows move, and a gate chooses
             return by_kinds(count, camera, part, None if looks or self.p == 1 else applied)
-        parts = []
+        parts, camera = [], alone(camera)
         for rows, group in camera.groups if isinstance(camera, Mixed) else [(list(range(count)), camera)]:
             for moves in (True, False):
                 here = [n for n, row in enumerate(rows) if chosen[row] == moves]
@@ -400,6 +400,8 @@ class Augmentation(SampleTransform):
 
     def _values(self, source: Camera, draw: Mapping[str, Any]) -> dict[str, Any]:
         """Return what was drawn, (*B,) or (*B, size), where all is alike once: one map then serves all samples."""
+        if isinstance(draw["apply"], list):  # of one sample
+            return {name: value[0] for name, value in draw.items() if name != "apply"}
         values = {name: value for name, value in draw.items() if name != "apply"}
         if not source.batch_shape and (len(draw["apply"]) == 1 or all(map(_are_alike, values.values()))):
             values = {

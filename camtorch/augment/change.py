@@ -8,7 +8,7 @@ from functools import cached_property, lru_cache
 from typing import Any, TypeVar
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.editing import edited
@@ -56,6 +56,8 @@ class Drawn:
     @cached_property
     def target(self) -> Camera:
         """The one of the change, which nobody else gets."""
+        if self.native is not None:
+            self.native.keep_lenses()
         return self.camera()
 
     def camera(self) -> Camera:
@@ -63,8 +65,9 @@ class Drawn:
         if torch.is_inference_mode_enabled():  # what that makes could not be used in a graph later
             with torch.inference_mode(False), torch.no_grad():
                 return self.camera()
-        k = self.distortion.detach().clone()
-        return remade(self.base, intrinsics=self.intrinsics.clone(), distortion=k, image_size=self.image_size)
+        numbers, k = nn.Parameter(self.intrinsics.clone(), requires_grad=False), self.distortion.clone()
+        k = nn.Parameter(k, requires_grad=False) if k.shape[-1] else k
+        return remade(self.base, intrinsics=numbers, distortion=k, image_size=self.image_size)
 
     def warp(self, source: Camera) -> Warp:
         """From the camera before."""

@@ -165,7 +165,7 @@ class CameraDrawer(Augmentation):
     def _new_camera(self, source: Camera, values: Mapping[str, Any]) -> tuple[Camera, Tensor | None]:
         made = self._drawn(source, values)
         if made is not None:
-            return made.camera(), made.rotation
+            return made.target, made.rotation
         if type(self).new_camera is not CameraDrawer.new_camera:
             return super()._new_camera(source, values)
         like = precise(source.intrinsics.detach())
@@ -173,11 +173,13 @@ class CameraDrawer(Augmentation):
 
     def _drawn(self, source: Camera, values: Mapping[str, Any]) -> Drawn | None:
         """Return what compiled code makes of a draw; None where something is recorded, or it does not know a model."""
-        if type(self).new_camera is not CameraDrawer.new_camera or source.batch_shape == (0,):
+        like, tensors = self._held("like"), source._tensors
+        if type(self).new_camera is not CameraDrawer.new_camera or isinstance(
+            next(iter(values.values()), None), Tensor
+        ):
             return None
-        like = self._held("like")
-        tensors = (*source._tensors, *(() if like is None else like._tensors))
-        if not are_numbers(*tensors) or any(isinstance(value, Tensor) for value in values.values()):
+        tensors = tensors if like is None else (*tensors, *like._tensors)
+        if not are_numbers(*tensors):
             return None
 
         def start() -> Start | None:
@@ -186,10 +188,10 @@ class CameraDrawer(Augmentation):
             nominal = self._nominal(base, sized, size, values) if moves else None
             return Start.of(source, base, sized, reach, size, [*values], nominal)
 
-        size = self._size_of(source)
+        size, own = self._size_of(source), like is None and not self._is_real
         key = "start", type(source), source.image_size, size, *values, self.ranges.get("fov")
-        found = start() if self._is_real else self._memo(tensors, key, start)
-        own = like is None and not self._is_real
+        known = None if self._is_real else self._memo.entry(tensors, key)
+        found = known[2] if known is not None else start() if self._is_real else self._memo(tensors, key, start)
         return None if found is None else found.drawn(values, source if own else found.base, self.options)
 
     def _part(self, rows: list[int] | None, source: Camera, draw: Mapping[str, Any]) -> Part:

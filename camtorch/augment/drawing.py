@@ -15,8 +15,11 @@ from torch import Tensor
 from camtorch.augment.change import Drawn
 from camtorch.augment.jitter import DRAWN, PARTS, border, defined_or, lens_ends, measured_once, sensitivity
 from camtorch.cameras.camera import Camera
+from camtorch.optics.radial_inverse import TABLE_WIDTH
 from camtorch.projection.evaluation import rows_of
 from camtorch.projection.native_cameras import (
+    AZIMUTHS,
+    EXTENT,
     CamerasStruct,
     DomainStruct,
     Lenses,
@@ -34,7 +37,6 @@ _SIZES = {"centre": 2, "distortion": DRAWN, "place": 2}
 _KINDS = "yaw", "pitch", "roll", "zoom", "fov", "focal", "centre", "distortion", "crop", "place"
 _TURNS = {"yaw", "pitch", "roll"}
 _LEFT_BASE, _LEFT_LENS, _LEFT_ENDS, _TOO_WIDE, _NO_CAMERA = 1, 2, 4, 8, 16
-_TABLE, _AZIMUTHS, _EXTENT = 2 + 2 * 1024, 336, 80 + 336 * 80 + 336  # numbers of a camera; see geometry.h
 
 
 class _Draws(ctypes.Structure):
@@ -42,7 +44,7 @@ class _Draws(ctypes.Structure):
 
     _fields_ = fields(
         "*values first cameras count height width is_each *sized *reach *coefficients *sensitivity *ends *base *border "
-        "*places domain *tries *tried *allowed made *distortion *rotations followed",
+        "*places domain *tries *tried *allowed *room made *rotations *distortion followed",
         first=c_int64 * len(_KINDS),
         height=c_double,
         width=c_double,
@@ -84,22 +86,21 @@ class Start:
         reach: see `lenses.drawing.Lenses`. names: of the values that are drawn. nominal: intrinsics (*B, 4) of the lens
         by which coefficients are measured, if they move.
         """
-        self.before, self.native, self.size = before, native, size
-        self._model, self.base, self._names = model_of(base), base, [name for name in _KINDS if name in names]
+        self.before, self.base, self.size, self._native = before, base, size, native
+        self._names = [name for name in _KINDS if name in names]
         self._rows = len(sized) if sized.ndim == 2 else native.cameras if base.batch_shape else 0
-        self._turns, self._count = not _TURNS.isdisjoint(names), base.distortion.shape[-1]
-        self.distortion = base.distortion.detach()
-        self._kept: list[Any] = []
-        call = self._call = _Draws(count=self._count, height=size[0], width=size[1], is_each=self._rows > 0)
-        at, call.first[:] = 0, [-1] * len(_KINDS)
+        self._turns, self._moves, self._knows = not _TURNS.isdisjoint(names), nominal is not None, False
+        self._distortion, self._kept = base.distortion.detach(), list[Any]()
+        count = self._distortion.shape[-1]
+        call = self._call = _Draws(count=count, height=size[0], width=size[1], is_each=self._rows > 0)
+        call.first[:] = [-1] * len(_KINDS)
+        at, self._room = 0, 13 + count
         for name in self._names:
             call.first[_KINDS.index(name)], at = at, at + _SIZES.get(name, 1)
-        call.base, call.made = native.pointer, native.struct
-        call.made.usable = call.made.limits2 = call.made.extent = None
+        native.add_table()  # which whoever unprojects asks for
+        call.base, call.made, call.made.usable = native.pointer, native.struct, None
         call.sized = self._keep(sized)
         call.reach = None if reach is None else self._keep(reach.double())
-        self._moves = nominal is not None
-        self._is_known = False
         if nominal is not None:
             self._add_coefficients(nominal)
 
@@ -110,25 +111,27 @@ class Start:
         return tensor.data_ptr()
 
     def _add_coefficients(self, nominal: Tensor) -> None:
-        call, plan, base, lenses = self._call, self.native.plan, self.base, self.native.lenses
-        lens = remade(base, image_size=self.size)
-        self._sensitivity = measured_once(sensitivity, lens, base.distortion, nominal)
-        call.sensitivity = self._keep(self._sensitivity, self._count)
-        call.coefficients = self._keep(self.distortion, self._count)
-        call.border = self._keep(border(self.size, self.native.dtype))
-        self.native.add_table()
+        call, base, native, lenses = self._call, self.base, self._native, self._native.lenses
+        plan = native.plan
+        measured = measured_once(sensitivity, remade(base, image_size=self.size), base.distortion, nominal)
+        self._sensitivity, call.sensitivity = measured, self._keep(measured, call.count)
+        call.coefficients = self._keep(self._distortion, call.count)
+        call.border = self._keep(border(self.size, native.dtype))
+        call.made.limits2 = call.made.extent = None
         if plan.places is None or plan.is_chart or plan.is_long or not base.always_defined:
-            return  # compiled code alone does not make these
-        domain = lenses.asked if plan.has_stages else DomainStruct()
-        if plan.has_stages and not plan.has_fixed_ends(self.native.dtype):
-            return
-        self._is_known, call.domain, call.places = True, domain, self._keep(plan.places)
-        for name, count in lenses.radii_wanted().items() if plan.has_stages else ():
-            setattr(call.domain, name, self._keep(count))
+            return  # others make these
+        if plan.has_stages:
+            call.domain = lenses.asked
+            if not plan.has_fixed_ends(native.dtype):
+                return
+            for name, radii in lenses.radii_wanted().items():
+                setattr(call.domain, name, self._keep(radii))
+        self._knows, call.places = True, self._keep(plan.places)
+        self._room += plan.parameters + 4 + TABLE_WIDTH
 
     def drawn(self, values: Mapping[str, Any], base: Camera, options: Options) -> Drawn:
         """Return the new cameras, modules like `base`, of values (B,) and (B, size), or numbers and lists for one."""
-        call, plan, wide = _Draws.from_buffer_copy(self._call), self.native.plan, self.native.dtype.itemsize
+        call, native = _Draws.from_buffer_copy(self._call), self._native
         given = [values[name] for name in self._names]
         several = [len(value) for value in given if isinstance(value, np.ndarray)]
         rows, is_one = self._rows or (several[0] if several else 1), not (self._rows or several)
@@ -139,75 +142,63 @@ class Start:
         elif given:
             numbers = np.concatenate(given, None)
             call.values = numbers.ctypes.data
+        room = torch.empty(rows * self._room, dtype=native.dtype, device="cpu")
         call.cameras = call.made.cameras = rows
-        sizes = {"intrinsics": 4, "rotations": 9 * self._turns, "distortion": self._count * self._moves}
-        if self._is_known:
-            sizes["parameters"] = plan.parameters
-            if plan.has_stages:
-                sizes |= {"inner2": 1, "usual2": 1, "table": _TABLE * plan.has_factor}
-                sizes |= {"circle2": plan.has_rest, "stagewise": plan.has_rest}
-        room = torch.empty(rows * sum(sizes.values()), dtype=self.native.dtype, device="cpu")
-        at, places = 0, {}
-        for name, size in sizes.items():
-            if size:
-                places[name], at = room[at : at + rows * size], at + rows * size
-                setattr(call if name in ("rotations", "distortion") else call.made, name, places[name].data_ptr())
-        tries = self._tries(values, rows, call) if self._moves and not self._is_known else None
-        run, more = entry("camtorch_draws", c_int64), None
-        while (left := run(byref(call))) & ~_NO_CAMERA:
+        call.room = room.data_ptr()
+        tries = self._tries(values, rows, call) if self._moves and not self._knows else None
+        kept = [room]
+        while (left := _run(call)) & ~_NO_CAMERA:
             if left & _TOO_WIDE:
                 widest = np.max(values["fov"])
                 raise ValueError(f"fov: a {base.key} lens of these coefficients does not reach {widest:g} degrees")
             if left & _LEFT_BASE:
-                self.native.follow()
+                native.follow()
             if left & _LEFT_ENDS:
-                lens = remade(self.base, image_size=self.size)
-                ends = measured_once(lens_ends, lens, self.distortion)
+                ends = measured_once(lens_ends, remade(self.base, image_size=self.size), self._distortion)
                 self._call.ends = call.ends = self._keep(ends, *ends.shape[-2:])
             if left & _LEFT_LENS and tries is not None:
                 tries.follow()
             elif left & _LEFT_LENS:
-                more = torch.empty(rows * (_AZIMUTHS + _EXTENT), dtype=self.native.dtype, device="cpu")
-                call.made.limits2, call.made.extent = more.data_ptr(), more.data_ptr() + rows * _AZIMUTHS * wide
-        intrinsics, distortion = places["intrinsics"].view(rows, 4), self.distortion
+                kept += [room.new_empty(rows * count) for count in (AZIMUTHS, EXTENT)]
+                call.made.limits2, call.made.extent = (tensor.data_ptr() for tensor in kept[1:])
+        if call.followed < rows and self._moves:
+            call.made.limits2 = call.made.extent = None
+        intrinsics, rotation, k = room[: 4 * rows], room[4 * rows : 13 * rows], self._distortion
         if self._moves:
-            distortion = places["distortion"].view(rows, self._count)
-            if self._is_known:
-                self._keep_lenses(call, distortion, room, more)
-        rotation = places["rotations"].view(rows, 3, 3) if self._turns else None
-        drawn = Drawn(base, intrinsics, distortion, self.size, rotation, options, self.before)
+            k = room[13 * rows : (13 + call.count) * rows].view(rows, call.count)
+        made = None
+        if not left and (self._knows or not self._moves) and (self._knows or native.cameras == rows):
+            lenses = partial(self._lenses, k) if self._knows else lambda _: native.lenses
+            made = Native.made(native, call.made, (call, kept, self), lenses)
+        elif is_one and not left:
+            made = single_native(model_of(self.base), intrinsics, k[0])
         if is_one:
-            drawn.intrinsics, drawn.rotation = intrinsics[0], None if rotation is None else rotation[0]
-            drawn.distortion = distortion[0] if self._moves else distortion
-            if left:
-                drawn.start = None
-            elif self._moves:
-                drawn.native = single_native(self._model, drawn.intrinsics, drawn.distortion)
-            else:
-                drawn.native = self.native.before(intrinsics)
-        return drawn
+            rotated, k = rotation.view(3, 3), k[0] if self._moves else k
+        else:
+            intrinsics, rotated = intrinsics.view(rows, 4), rotation.view(rows, 3, 3)
+        return Drawn(base, intrinsics, k, self.size, rotated if self._turns else None, options, self.before, made)
 
-    def _tries(self, values: Mapping[str, Any], rows: int, call: _Draws) -> Native | None:
+    def _tries(self, values: Mapping[str, Any], rows: int, call: _Draws) -> Native:
         """Make the lenses that compiled code chooses among, of a model whose domain it does not make by itself."""
         amounts = torch.as_tensor(np.asarray(values["distortion"]).reshape(-1, DRAWN))
-        steps = (amounts.repeat(1, -(-self._count // DRAWN))[:, : self._count] * self._sensitivity)[:, None]
-        given = self.distortion.double().reshape(-1, 1, self._count)
-        tried = (given + torch.tensor(PARTS, dtype=torch.float64)[:, None] * steps).to(self.native.dtype)
+        steps = (amounts.repeat(1, -(-call.count // DRAWN))[:, : call.count] * self._sensitivity)[:, None]
+        given = self._distortion.double().reshape(-1, 1, call.count)
+        tried = (given + torch.tensor(PARTS, dtype=torch.float64)[:, None] * steps).to(self._native.dtype)
         tried, allowed = defined_or(self.base, tried, given.to(tried).expand_as(tried))
-        tried = tried.reshape(rows * len(PARTS), self._count)
-        native = CameraRows(self._model, tried.new_ones(len(tried), 4), tried).native
+        tried = tried.reshape(rows * len(PARTS), call.count)
+        native = CameraRows(model_of(self.base), tried.new_ones(len(tried), 4), tried).native
         assert native is not None  # as the base has one
         native.add_table()
         call.tries, call.tried, call.allowed = native.pointer, tried.data_ptr(), address(allowed)
         call.kept = tried, allowed
         return native
 
-    def _keep_lenses(self, call: _Draws, distortion: Tensor, room: Tensor, more: Tensor | None) -> None:
-        """Keep what was found of new lenses, which whoever evaluates the cameras asks for."""
-        struct = CamerasStruct.from_buffer_copy(call.made)
-        struct.intrinsics = None
-        if more is None or call.followed < len(distortion):
-            struct.limits2 = struct.extent = None
-        domain = partial(domain_for, self._model, distortion, False)
-        lenses = Lenses.known(self.native.plan, self._model.optics, distortion, domain, struct, (room, more))
-        keep_lenses(lenses, distortion)
+    def _lenses(self, k: Tensor, made: Native) -> Lenses:
+        """Return what was found of new lenses, kept for whoever evaluates cameras of their coefficients (C, n)."""
+        model = model_of(self.base)
+        domain = partial(domain_for, model, k, False)
+        return keep_lenses(Lenses.known(made.plan, model.optics, k, domain, made), k)
+
+
+def _run(call: _Draws) -> int:
+    return int(entry("camtorch_draws", c_int64)(byref(call)))

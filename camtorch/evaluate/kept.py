@@ -33,14 +33,10 @@ class Kept:
         """`compute()` without a graph, or its kept result; it depends on the tensors `inputs` and on `options`."""
         if not is_eager(*inputs) and not all(is_concrete(t) and not has_tangent(t) for t in inputs):
             return compute()
-        known = self._kept
-        for i, entry in enumerate(known):
-            if options == entry[0] and all(map(same, inputs, entry[1])):
-                if i:  # a list of its own: another thread may be looking at this one
-                    self._kept = [entry, *known[:i], *known[i + 1 :]]
-                found: T = entry[2]
-                self.result = found
-                return found
+        if (entry := self.entry(inputs, options)) is not None:
+            found: T = entry[2]
+            self.result = found
+            return found
         if in_transform():  # what a transform makes dies with it
             return compute()
         with torch.inference_mode(False), torch.no_grad():  # what that makes could not be used in a graph later
@@ -52,6 +48,18 @@ class Kept:
     def is_of(self, inputs: Sequence[Tensor], options: tuple[Any, ...]) -> bool:
         """Whether `result` is that of these inputs, whose values may be looked at, and options."""
         return bool(self._kept) and options == self._kept[0][0] and all(map(same, inputs, self._kept[0][1]))
+
+    def entry(
+        self, inputs: Sequence[Tensor], options: tuple[Any, ...]
+    ) -> tuple[tuple[Any, ...], list[Note], Any] | None:
+        """Return what is kept of inputs whose values may be looked at: options, notes and the result."""
+        known = self._kept
+        for i, entry in enumerate(known):
+            if options == entry[0] and all(map(same, inputs, entry[1])):
+                if i:  # a list of its own: another thread may be looking at this one
+                    self._kept = [entry, *known[:i], *known[i + 1 :]]
+                return entry
+        return None
 
     def renew(self, compute: Callable[[], T]) -> T:
         """`compute()`, which is the result from now on."""

@@ -164,13 +164,34 @@ static void turned(const Draws *d, int64_t c) {
     for (int i = 0; i < 9; i++) put(row(d, d->rotations, c, 9), i, elements[i], d->made.is_double);
 }
 
+/* Where what is made lies */
+static void divide(Draws *d) {
+    const int64_t rows = d->cameras;
+    char *at = d->room;
+#define TAKE(place, size) place = (void *)at, at = row(d, at, rows, size)
+#define TAKE_KNOWN(field, size) if (d->made.field) TAKE(d->made.field, size)
+    TAKE(d->made.intrinsics, 4);
+    TAKE(d->rotations, 9);
+    TAKE(d->distortion, d->count);
+    if (!d->places) return;
+    TAKE_KNOWN(parameters, d->made.parameter_count);
+    TAKE_KNOWN(inner2, 1);
+    TAKE_KNOWN(usual2, 1);
+    TAKE_KNOWN(circle2, 1);
+    TAKE_KNOWN(stagewise, 1);
+    TAKE_KNOWN(table, 2 + 2 * NODES);
+#undef TAKE
+#undef TAKE_KNOWN
+}
+
 /* Makes the cameras; flags of what is left */
 int64_t THIS(draws)(Draws *d) {
     int64_t left = d->followed = 0;
+    divide(d);
     for (int64_t c = 0; c < d->cameras; c++) {
         double f[4];
         int64_t here = place(d, c, f);
-        if (!here && d->distortion) here = bend(d, c, f);
+        if (!here && d->sensitivity) here = bend(d, c, f);
         left |= here;
         if (here) continue;
         const double share = drawn(d, CROP, 1, c, 0, 1); /* a part of the image, enlarged to the full size */
@@ -181,7 +202,7 @@ int64_t THIS(draws)(Draws *d) {
             put(row(d, d->made.intrinsics, c, 4), i, f[i], d->made.is_double);
             left |= isfinite(f[i]) && (i > 1 || f[i] > 0) ? 0 : NO_CAMERA;
         }
-        if (d->rotations) turned(d, c);
+        turned(d, c);
     }
     return left;
 }

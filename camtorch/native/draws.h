@@ -28,14 +28,15 @@ typedef struct {
     const double *ends;          /* (RIM, 2): where the base ends, in focal lengths; NULL: not yet known */
     const Cameras *base;         /* (c), or one for all, with its own intrinsics */
     const void *border;          /* (RIM, 2): pixels */
-    const int64_t *places;       /* which coefficients the parameters of the lens are */
+    const int64_t *places;       /* which coefficients the parameters of a new lens are; NULL: none is made here */
     Domain domain;               /* of one new lens: what is asked, without its parameters and results */
     const Cameras *tries;        /* (c TRIES): new lenses that were made elsewhere, and their (count) coefficients; or NULL */
     const void *tried;
     const uint8_t *allowed;      /* (c TRIES): which of those have a formula; NULL: all */
-    Cameras made;                /* the new cameras, and what is known of them; without `tries` of new lenses all of it */
-    void *distortion;            /* (c, count), if coefficients move */
-    void *rotations;             /* (c, 9), if cameras turn */
+    void *room;                  /* for all that is made: of each camera 4 + 9 + count numbers, and, if `places` are given,
+                                    its parameters, 4, and a table */
+    Cameras made;                /* the new cameras; as given, what else the base has of its lens, which a new one then has */
+    void *rotations, *distortion; /* (c, 9) and (c, count), in `room` */
     int64_t followed;            /* of how many new lenses `limits2` and `extent` are */
 } Draws;
 

@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     from camtorch.projection.domain import Domain
 
 _MOST_PARTS, _MOST_DEGREE = 5, 64
-_RADII, _FOLLOWED, _AZIMUTHS = 512, 80, 336
-_EXTENT = _FOLLOWED + _AZIMUTHS * (_FOLLOWED + 1)
+_RADII, _FOLLOWED, AZIMUTHS = 512, 80, 336
+EXTENT = _FOLLOWED + AZIMUTHS * (_FOLLOWED + 1)
 
 _HAS_XI, _HAS_ALPHA, _HAS_BETA, _TRANSVERSE = 1, 2, 4, 8
 _TANGENTIAL, _PRISM = 1, 2
@@ -156,9 +156,8 @@ class Lenses:
         self.struct = struct = CamerasStruct()
         struct.parts, struct.part_count, struct.parameter_count = addressof(plan.parts), plan.count, plan.parameters
         struct.is_double, struct.cameras = self.dtype == torch.float64, self.cameras
-        self._parameters = plan.parameters_of(optics_of, k) if plan.parameters else k
         if plan.parameters:
-            struct.parameters = self._keep(self._parameters)
+            struct.parameters = self._keep(plan.parameters_of(optics_of, k))
         if plan.places is None and (constants := _constants(optics_of(columns(k))[1])):
             struct.constants, struct.constant_count = self._keep_columns(constants), len(constants)
         if plan.is_chart:
@@ -167,15 +166,13 @@ class Lenses:
             self._add_domain(tables)
 
     @classmethod
-    def known(
-        cls, plan: Plan, optics_of: Optics, k: Tensor, domain: Callable[[], Domain], struct: CamerasStruct, room: object
-    ) -> Lenses:
-        """Return lenses whose parameters and domains have been found: those that `struct` points to, in `room`."""
-        made = cls.__new__(cls)
-        made.plan, made._optics_of, made._k, made._kept = plan, optics_of, k, [k, room]
-        made._slow_domain, made.cameras, made.dtype, made.struct = domain, len(k), k.dtype, struct
-        made._parameters = plan.parameters_of(optics_of, k)
-        return made
+    def known(cls, plan: Plan, optics_of: Optics, k: Tensor, domain: Callable[[], Domain], made: Native) -> Lenses:
+        """Return those of cameras that compiled code made, with their parameters and domains."""
+        lenses = cls.__new__(cls)
+        lenses.plan, lenses._optics_of, lenses._k, lenses._kept = plan, optics_of, k, [k, made._kept]
+        lenses._slow_domain, lenses.cameras, lenses.dtype = domain, len(k), k.dtype
+        lenses.struct = CamerasStruct.from_buffer_copy(made.struct)
+        return lenses
 
     def _optics(self) -> tuple[Chart, Lens]:
         return self._optics_of(columns(self._k.double()))
@@ -184,8 +181,9 @@ class Lenses:
     def asked(self) -> DomainStruct:
         """What it is asked with; its optics are of double precision."""
         made, plan = DomainStruct(), self.plan
-        known = plan.places is not None or not plan.parameters
-        parameters = self._parameters if known else plan.parameters_of(self._optics_of, self._k.double())
+        # in double precision where the model computes them
+        k = self._k if plan.places is not None else self._k.double()
+        parameters = plan.parameters_of(self._optics_of, k) if plan.parameters else k
         made.parts, made.part_count = addressof(plan.parts), plan.count
         made.is_double, made.cameras, made.is_radial = self.dtype == torch.float64, self.cameras, plan.is_radial
         made.parameters, made.parameter_count = self._keep(parameters.double()), plan.parameters
@@ -259,7 +257,7 @@ class Lenses:
         """The limits of each azimuth, and where the lens sends it: asked for only when a point lies far out."""
         struct = self.struct
         if struct.limits2 is None:
-            wanted = {"limits2": self._new(_AZIMUTHS), "extent": self._new(_EXTENT)}
+            wanted = {"limits2": self._new(AZIMUTHS), "extent": self._new(EXTENT)}
             wanted |= {name: place for name in ("circle2", "stagewise") if (place := getattr(struct, name)) is not None}
             wanted |= {name: self._keep(radii) for name, radii in self.radii_wanted().items()}
             if self.plan.is_chart:
@@ -290,22 +288,17 @@ def _lenses_of(plan: Plan, optics_of: Optics, k: Tensor, domain: Callable[[], Do
     """Return those of these values: of the last ones that were asked for, or new ones."""
     if k.numel() > _LONGEST:
         return Lenses(plan, optics_of, k, domain, tables)
-    key = plan, k.dtype, k.shape, k.numpy().tobytes()
-    found = _lenses.pop(key, None) or Lenses(plan, optics_of, k, domain, tables)
-    return _keep(key, found)
+    found = _lenses.pop((plan, k.dtype, k.shape, k.numpy().tobytes()), None)
+    return keep_lenses(found or Lenses(plan, optics_of, k, domain, tables), k)
 
 
-def keep_lenses(lenses: Lenses, k: Tensor) -> None:
-    """Keep lenses that were made elsewhere for those who ask for cameras of their coefficients (C, n)."""
+def keep_lenses(lenses: Lenses, k: Tensor) -> Lenses:
+    """Keep lenses for those who ask for the same coefficients (C, n) next."""
     if k.numel() <= _LONGEST:
-        _keep((lenses.plan, k.dtype, k.shape, k.numpy().tobytes()), lenses)
-
-
-def _keep(key: tuple[object, ...], found: Lenses) -> Lenses:
-    _lenses[key] = found  # the last one
-    while len(_lenses) > _MOST_LENSES:
-        _lenses.pop(next(iter(_lenses)), None)
-    return found
+        _lenses[lenses.plan, k.dtype, k.shape, k.numpy().tobytes()] = lenses  # the last one
+        while len(_lenses) > _MOST_LENSES:
+            _lenses.pop(next(iter(_lenses)), None)
+    return lenses
 
 
 class Native:
@@ -326,9 +319,23 @@ class Native:
         self.struct.intrinsics, self.struct.usable = map(address, self._kept)
         self.pointer = addressof(self.struct)
 
-    def before(self, intrinsics: Tensor) -> Native:
-        """The same lenses with other intrinsics (C, 4), all usable."""
-        return Native(self.lenses, intrinsics, None)
+    @classmethod
+    def made(cls, base: Native, struct: CamerasStruct, room: object, lenses: Callable[[Native], Lenses]) -> Native:
+        """Return cameras that compiled code made, in `room`, like others; `lenses` when somebody asks for them."""
+        native = cls.__new__(cls)
+        native.plan, native.dtype, native.parameters = base.plan, base.dtype, base.parameters
+        native.struct, native.cameras, native.pointer = struct, struct.cameras, addressof(struct)
+        native._kept, native._make_lenses = room, lenses
+        return native
+
+    @functools.cached_property
+    def lenses(self) -> Lenses:
+        """Those of the cameras, which others may have too."""
+        return self._make_lenses(self)
+
+    def keep_lenses(self) -> None:
+        """Keep what was found of the lenses for those who ask for the same numbers."""
+        _ = self.lenses
 
     def add_table(self) -> None:
         """Have what the inverse of a radial factor starts from."""
