@@ -168,21 +168,24 @@ def test_an_independent_computation_agrees(names):
 # -- images
 
 
-@pytest.mark.parametrize("dtype", [torch.uint8, torch.float32, torch.int64, torch.bool])
+UNSIGNED = [torch.uint8, torch.uint16, torch.uint32, torch.uint64]
+
+
+@pytest.mark.parametrize("dtype", [*UNSIGNED, torch.float32, torch.int64, torch.bool])
 def test_whole_steps_copy_pixels(dtype):
-    generator = torch.Generator().manual_seed(0)
-    image = torch.randint(0, 2 if dtype == torch.bool else 200, (4, 3, *SIZE), generator=generator).to(dtype)
+    whole = torch.randint(2 if dtype == torch.bool else 200, (4, 3, *SIZE), generator=torch.Generator().manual_seed(0))
+    image, some = whole.to(dtype), A.HorizontalFlip()
     for k in range(4):
-        assert torch.equal(A.Rotate90(k)(image=image)["image"], torch.rot90(image, k, (-2, -1)))
+        assert torch.equal(A.Rotate90(k)(image=image)["image"].long(), torch.rot90(whole, k, (-2, -1)))
     padded = A.Pad((1, 2, 3, 4), fill=1)(image=image)["image"]
-    assert torch.equal(padded, F.pad(image, (1, 3, 2, 4), value=1))
+    assert torch.equal(padded.long(), F.pad(whole, (1, 3, 2, 4), value=1))
     torch.manual_seed(4)
-    some = A.HorizontalFlip()
     out = some(image=image, mask=image)
     assert 0 < some.last.mirrored.sum() < 4
-    expected = torch.where(some.last.mirrored[:, None, None, None], image.flip(-1), image)
-    assert torch.equal(out["image"], expected)
-    assert torch.equal(out["mask"], expected)
+    expected = torch.where(some.last.mirrored[:, None, None, None], whole.flip(-1), whole)
+    for name in ("image", "mask"):
+        assert out[name].dtype == dtype
+        assert torch.equal(out[name].long(), expected)
 
 
 @pytest.mark.parametrize("dtype", [torch.uint8, torch.float32])

@@ -368,7 +368,8 @@ def test_camera_and_lens_go_in_by_name(of):
 
 def test_errors_say_what_is_wrong():
     aug, own, mount = adapter.RandomMount(camera()), camera(), adapter.RandomMount
-    params, affine = aug.forward_parameters(images().shape), K.AugmentationSequential(K.RandomAffine(3.0))
+    others = aug, K.AugmentationSequential(K.RandomAffine(3.0))
+    params, affine = (one.forward_parameters(images().shape) for one in others)
 
     def given(cameras):
         return lambda: adapter.with_cameras(params, cameras)
@@ -387,10 +388,7 @@ def test_errors_say_what_is_wrong():
         (given(ct.KannalaBrandt(numbers, [0.0] * 4, image_size=SIZE)), "got KannalaBrandt"),
         (given(several(2)), r"for 3 samples.*\(2,\)"),
         (given([own, None]), "must be a Camera"),
-        (
-            lambda: adapter.with_cameras(affine.forward_parameters(images().shape), own),
-            "those of a camera augmentation",
-        ),
+        (lambda: adapter.with_cameras(affine, own), "those of a camera augmentation"),
         (lambda: aug(images(2), params=params), "3 samples, here are 2"),
     ):
         with pytest.raises((TypeError, ValueError), match=text):

@@ -371,18 +371,17 @@ def test_faults_in_arrays_name_the_file(tmp_path):
 
 
 def test_a_format_that_is_not_seen_is_an_error_that_lists_them(tmp_path):
-    with pytest.raises(FileNotFoundError, match="no file or folder"):
-        ct.data.read(tmp_path / "nowhere")
-    unknown = text(tmp_path / "unknown.json", "{}")
-    for path in (unknown, tmp_path):
-        with pytest.raises(ValueError, match=r"no known format; format= one of coco, wflw, 300w"):
-            ct.data.read(path)
-    pts(tmp_path)
-    (tmp_path / "a.mat").touch()
-    with pytest.raises(ValueError, match="seems to be of 300w and 300w_lp; format= one of"):
-        ct.data.read(tmp_path)
-    assert len(ct.data.read(tmp_path, "300w")) == 2
-    with pytest.raises(ValueError, match=r"format must be one of coco, .*; got 'lapa'\. .*docs/leaving-0\.3\.md"):
-        ct.data.read(tmp_path, "lapa")
-    with pytest.raises(ValueError, match="is a folder"):
-        ct.data.read(tmp_path, "coco")
+    unknown, unseen = text(tmp_path / "unknown.json", "{}"), r"no known format; format= one of coco, wflw, 300w"
+    (tmp_path / "empty").mkdir()
+    pts(tmp_path / "both")
+    (tmp_path / "both" / "a.mat").touch()
+    for arguments, error, told in (
+        ((tmp_path / "nowhere",), FileNotFoundError, "no file or folder"),
+        ((unknown,), ValueError, unseen),
+        ((tmp_path / "empty",), ValueError, unseen),
+        ((tmp_path / "both",), ValueError, "seems to be of 300w and 300w_lp; format= one of"),
+        ((tmp_path / "both", "coco"), ValueError, "is a folder"),
+    ):
+        with pytest.raises(error, match=told):
+            ct.data.read(*arguments)
+    assert len(ct.data.read(tmp_path / "both", "300w")) == 2

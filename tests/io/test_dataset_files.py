@@ -152,16 +152,3 @@ def test_tables_of_nuscenes_without_channels_or_with_several_drives(tmp_path):
         (tmp_path / "calibrated_sensor.json").write_text(json.dumps([table[0], table[1], {**again, **broken}]))
         with pytest.raises(ct.CameraFileError, match=reason):
             ct.load(tmp_path / "calibrated_sensor.json")
-
-
-@pytest.mark.parametrize(
-    ("name", "content", "told"),
-    [
-        ("lenses.xml", '<lensdatabase version="2"><lens/></lensdatabase>', r".* ct\.lenses\.from_lensfun"),
-        ("sfm_data.json", '{"sfm_data_version": "0.3", "views": []}', "OpenMVG's scene.* COLMAP's format"),
-    ],
-)
-def test_files_that_are_not_read_name_what_reads_them(name, content, told, tmp_path):
-    (tmp_path / name).write_text(content)
-    with pytest.raises(ct.CameraFileError, match=rf"{name}: content: {told}"):
-        ct.load(tmp_path / name)

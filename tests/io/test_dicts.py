@@ -59,15 +59,9 @@ def changed(**values):
     [
         (lambda: ct.Camera.from_dict(changed(distorsion=[1.0])), "distorsion: is not known; known are model, intr.*"),
         (lambda: ct.Camera.from_dict(changed(intrinsics=None)), "intrinsics: missing; there is 'model', .*"),
-        (
-            lambda: ct.Camera.from_dict(changed(model="kanala")),
-            "model: needs the camera model 'kanala', .*it has brown.*",
-        ),
+        (lambda: ct.Camera.from_dict(changed(model="kan")), "model: needs the camera model 'kan', .*it has brown.*"),
         (lambda: ct.Camera.from_dict(changed(distortion=[0.1])), r"distortion: numbers \(\*B, 4\); these are \(1,\)"),
-        (
-            lambda: ct.Camera.from_dict(changed(image_size=[480.5, 640])),
-            r"image_size\[0\]: 480.5 is no number of pix.*",
-        ),
+        (lambda: ct.Camera.from_dict(changed(image_size=[4.5, 6])), r"image_size\[0\]: 4.5 is no number of pix.*"),
         (lambda: ct.Pinhole.from_dict(changed()), "model: a KannalaBrandt, which is no Pinhole; .*"),
         (lambda: ct.Extrinsics.from_dict({"rotation": [0, 0, 1]}), "translation: missing; there is 'rotation'"),
         (lambda: ct.Extrinsics.from_dict({"rotation": [0, 0, "x"], "translation": [0, 0, 1]}), "rotation: not numb.*"),

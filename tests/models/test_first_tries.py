@@ -45,12 +45,6 @@ def test_what_is_told_of_each_landmark_changes_places_with_it():
         flip(image=image[0], keypoints=keypoints[0], visibility=[2] * 17)
 
 
-@pytest.mark.parametrize("dtype", [torch.uint16, torch.uint32, torch.uint64])
-def test_all_whole_numbers_are_mirrored(dtype):
-    image = torch.arange(12).view(1, 1, 3, 4) * 4000
-    assert torch.equal(A.HorizontalFlip(1.0)(image=image.to(dtype))["image"].long(), image.flip(-1))
-
-
 @pytest.mark.parametrize("model", ["pinhole", "kannala_brandt"])
 def test_heads_of_no_features_and_on_the_meta_device(model):
     head = ct.CameraHead(8, model, image_size=SIZE)

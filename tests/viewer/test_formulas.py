@@ -137,7 +137,6 @@ def test_all_lenses_are_in_the_page_within_half_a_pixel():
         (lambda: "camera.yml", TypeError, "camera of one model; got str"),
         (lambda: fisheye().expand(2), ValueError, r"a batch \(2,\)"),
         (lambda: ct.Pinhole([100.0, 100.0, 50.0, 50.0]), ValueError, "image_size"),
-        (lambda: ct.FOV([100.0, 100.0, 50.0, 50.0], [4.0], image_size=(100, 100)), ValueError, "-pi < omega < pi"),
         (lambda: ct.cat([fisheye(), ct.Pinhole([1.0, 1, 2, 3], image_size=(480, 640))]), TypeError, "Mixed"),
     ],
 )
