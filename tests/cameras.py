@@ -97,9 +97,7 @@ CALIBRATIONS = {
 
 
 # Cameras with one continuous derivative on the axis, and no second one
-NOT_ANALYTIC = {
-    *("f_theta", "f_theta_backward", "f_theta_backward_sheared", "f_theta_sheared", "ocamcalib", "woodscape")
-}
+NOT_ANALYTIC = {"ocamcalib", "woodscape", *(key for key in KEYS if key.startswith("f_theta"))}
 
 
 def constants(camera):
@@ -240,9 +238,6 @@ def fan(end_degrees, angles=45, azimuths=24) -> torch.Tensor:
 
 def pixel_lattice(camera, rows=25, columns=33) -> torch.Tensor:
     """(rows * columns, 2): pixels over the whole image, its corners included."""
-    height, width = camera.image_size
-    like = {"dtype": camera.intrinsics.dtype}
-    v, u = torch.meshgrid(
-        torch.linspace(0, height - 1, rows, **like), torch.linspace(0, width - 1, columns, **like), indexing="ij"
-    )
-    return torch.stack((u, v), -1).reshape(-1, 2)
+    sides = zip(camera.image_size, (rows, columns), strict=True)
+    v, u = (torch.linspace(0, side - 1, count, dtype=camera.intrinsics.dtype) for side, count in sides)
+    return torch.cartesian_prod(v, u).flip(-1)

@@ -25,9 +25,8 @@ def boxes_of(camera, count, seed=0):
 
 def fisheye(dtype=torch.float32):
     numbers = [200.0, 205.0, 321.0, 238.0], [0.01, -0.002, 0.001, 0.0003]
-    return ct.KannalaBrandt(*(torch.tensor(n, dtype=dtype) for n in numbers), image_size=(480, 640)).requires_grad_(
-        False
-    )
+    camera = ct.KannalaBrandt(*(torch.tensor(n, dtype=dtype) for n in numbers), image_size=(480, 640))
+    return camera.requires_grad_(False)
 
 
 @every_model

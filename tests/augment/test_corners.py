@@ -123,13 +123,8 @@ def test_what_inference_mode_saw_can_be_inverted_in_training(camera):
 
 def test_fields_that_only_sound_like_geometry(camera):
     mount = RandomMount(camera=camera)
-    sample = {
-        "keypoints": torch.zeros(1, 1, 2),
-        "image_path": "a.png",
-        "mask_path": [("a",), []],
-        "mask_id": 7,
-        "boxes_note": None,
-    }
+    sample = {"keypoints": torch.zeros(1, 1, 2), "image_path": "a.png", "mask_path": [("a",), []], "mask_id": 7}
+    sample["boxes_note"] = None
     out = mount(sample)
     assert (out["image_path"], out["mask_path"], out["mask_id"]) == ("a.png", [("a",), []], 7)
     for hidden in (

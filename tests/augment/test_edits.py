@@ -248,9 +248,8 @@ def test_chains_take_all_unsigned_integers(name, dtype):
             moved = augment(image=images[:count].to(getattr(torch, dtype)), draw=draw)["image"]
             assert moved.dtype == getattr(torch, dtype)
             assert (moved.double() - expected).abs().max() <= 1  # two roundings
-        single = camtorch.augment.numpy.Transform(augment)(
-            image=images[0].permute(1, 2, 0).numpy().astype(dtype), draw=draw
-        )
+        array = images[0].permute(1, 2, 0).numpy().astype(dtype)
+        single = camtorch.augment.numpy.Transform(augment)(image=array, draw=draw)
         assert (single["image"] == moved[0].permute(1, 2, 0).numpy()).all()
 
 

@@ -60,10 +60,8 @@ def test_each_face_moves_as_it_does_alone(name, form):
     for key in {*faces, "keypoints_pixels_valid"}:
         equal(together[key], torch.stack([one[key] for one in each], 0 if form == "single" else 1))
     if form == "single" and name != "half of them":
-        back, seen = (
-            augment.inverse(keypoints=together["keypoints"], gaze=torch.ones(2, 3)),
-            together["keypoints_valid"],
-        )
+        back = augment.inverse(keypoints=together["keypoints"], gaze=torch.ones(2, 3))
+        seen = together["keypoints_valid"]
         torch.testing.assert_close(back["keypoints"][seen], given["keypoints"][seen], atol=1e-3, rtol=0)
     # a change that exists moves them as its draw does, whatever their names
     given["pixels"] = given.pop("keypoints_pixels")

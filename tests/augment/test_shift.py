@@ -35,11 +35,8 @@ def sample_of(camera):
     rays, valid = camera.rays()
     image, distance = seen(camera, torch.zeros(3, dtype=torch.float64), rays)
     known = valid & torch.isfinite(distance)
-    return {
-        "image": torch.where(known, image, 0.0)[None],
-        "distance": torch.where(known, distance, 0.0)[None],
-        "camera": camera,
-    }
+    image, distance = (torch.where(known, values, 0.0)[None] for values in (image, distance))
+    return {"image": image, "distance": distance, "camera": camera}
 
 
 @pytest.mark.parametrize("kind", ["distance", "depth"])
@@ -55,9 +52,8 @@ def test_the_image_is_what_a_camera_there_sees(kind):
     points = points[facing]
     sample |= {"points": points, "keypoints": camera.project(points)[0], "gaze": points, "boxes": torch.empty(0, 4)}
     sample["pose"] = torch.eye(4, dtype=torch.float64)
-    augment = ct.augment.RandomMount(
-        yaw=5, pitch=5, roll=5, shift=((0.03, 0.04), (-0.03, -0.02), 0.02), valid_mask=True
-    )
+    ranges = (0.03, 0.04), (-0.03, -0.02), 0.02
+    augment = ct.augment.RandomMount(yaw=5, pitch=5, roll=5, shift=ranges, valid_mask=True)
     torch.manual_seed(1)
     out = augment(sample)
     rotation, target = out["rotation"], out["camera"]
@@ -88,9 +84,8 @@ def test_the_image_is_what_a_camera_there_sees(kind):
 def test_what_was_hidden_is_empty_and_not_valid():
     camera = lens((360, 480))
     sample = sample_of(camera)
-    augment = ct.augment.RandomMount(
-        yaw=None, pitch=None, roll=None, shift=((0.05, 0.05), (0, 0), (0, 0)), valid_mask=True, fill=-1
-    )
+    still, shift = dict.fromkeys(("yaw", "pitch", "roll")), ((0.05, 0.05), (0, 0), (0, 0))
+    augment = ct.augment.RandomMount(**still, shift=shift, valid_mask=True, fill=-1)
     out = augment(sample)
     rays, _ = camera.rays()
     shift = torch.tensor([0.05, 0, 0], dtype=torch.float64)
@@ -109,9 +104,7 @@ def test_batches_half_precision_and_arrays():
     camera = lens()
     sample = sample_of(camera)
     batch = {name: torch.stack((value, value)).float() for name, value in sample.items() if name != "camera"}
-    augment = ct.augment.RandomMount(
-        yaw=3, pitch=None, roll=None, shift=(0.02, 0.02, 0.02), p=0.5, camera=camera.float()
-    )
+    augment = ct.augment.RandomMount(yaw=3, pitch=None, roll=None, shift=(0.02,) * 3, p=0.5, camera=camera.float())
     for seed in range(4):
         torch.manual_seed(seed)
         out = augment(batch, keypoints=torch.full((2, 1, 2), 80.0), boxes=torch.tensor([[[70.0, 50, 90, 70]]] * 2))

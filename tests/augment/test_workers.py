@@ -42,14 +42,8 @@ class Samples(Dataset):
 
 
 def batches(context, arrays=False):
-    loader = DataLoader(
-        Samples(arrays),
-        batch_size=2,
-        num_workers=2,
-        multiprocessing_context=context,
-        generator=torch.Generator().manual_seed(7),
-    )
-    return list(loader)
+    options = {"num_workers": 2, "multiprocessing_context": context, "generator": torch.Generator().manual_seed(7)}
+    return list(DataLoader(Samples(arrays), batch_size=2, **options))
 
 
 # with threads, Python 3.12 and later warn of every fork

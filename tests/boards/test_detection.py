@@ -169,11 +169,7 @@ def test_bad_boards(words, options, text):
 # -- images in any form to what `ct.calibrate` takes
 
 CHESSBOARD = Chessboard(9, 6, 0.03)
-POSES = (
-    ((0.1, -0.3, 0.1), (-0.12, -0.1, 0.25)),
-    ((-0.3, 0.2, 0.0), (-0.1, -0.08, 0.3)),
-    ((0.2, 0.3, -0.1), (-0.15, -0.05, 0.28)),
-)
+POSES = [POSE, ((-0.3, 0.2, 0.0), (-0.1, -0.08, 0.3)), ((0.2, 0.3, -0.1), (-0.15, -0.05, 0.28))]
 
 
 @pytest.fixture(scope="module")

@@ -183,9 +183,7 @@ def test_gross_outliers(loss, left):
     angle = 2 * math.pi * torch.rand(13, 54, generator=generator)
     length = 5 + 55 * torch.rand(13, 54, generator=generator)
     pixels = LEFT.image_points + (wrong * length)[..., None] * torch.stack((angle.cos(), angle.sin()), -1)
-    found = ct.calibrate(
-        "brown_conrady", LEFT.object_points, pixels, image_size=LEFT.image_size, loss=loss, loss_scale=0.3
-    )
+    found = calibrate(LEFT._replace(image_points=pixels), loss=loss, loss_scale=0.3)
     assert bool(((values(found) - values(left)).abs() < 3 * left.std).all())
     assert float((~found.inliers[wrong]).double().mean()) >= 0.99
     assert float(found.inliers[~wrong].double().mean()) >= 0.98
@@ -297,9 +295,7 @@ def test_a_surface_is_learnt_to_the_noise_and_one_that_ends_before_the_corners_s
     model = ct.Splined.with_grid(columns=8, rows=7, fov_x=100)
     bumps = 0.01 * torch.randn(model.default_count, generator=draw, dtype=torch.float64)
     true = model(torch.tensor([300.0, 300, 319.5, 199.5], dtype=torch.float64), bumps, image_size=(400, 640))
-    (board, seen, _), turns, shifts = seen_by(
-        true, 14, noise=noise, columns=11, rows=8, square=0.03, near=0.15, far=0.3
-    )
+    (board, seen, _), turns, shifts = seen_by(true, 14, noise=noise, columns=11, rows=8, square=0.03, far=0.3)
     points = board @ turns.mT + shifts[:, None]
     _, valid = true.project(points * torch.tensor([1.06, 1.06, 1.0]))  # as the found one may stand a little askew
     seen[~valid] = torch.nan

@@ -42,6 +42,5 @@ def test_the_camera_is_found_where_it_is(eye, noise, angle, distance, tmp_path, 
     if hasattr(cv2, "calibrateHandEye"):  # OpenCV 4
         exec("import cv2\n" + OPENCV, found)
         theirs = ct.Extrinsics.from_matrix(found["R"], found["t"][:, 0]).inverse().matrix()
-        torch.testing.assert_close(
-            found["camera_from_hand"].matrix(), theirs, rtol=0, atol=1e-6 + 2 * distance * bool(noise)
-        )
+        near = {"rtol": 0, "atol": 1e-6 + 2 * distance * bool(noise)}
+        torch.testing.assert_close(found["camera_from_hand"].matrix(), theirs, **near)

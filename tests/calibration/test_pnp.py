@@ -159,39 +159,21 @@ def test_the_better_of_a_planes_two_minima_is_returned(fov, size, points, noise)
 
 
 FOUR = [  # in a camera's frame; from two starts none of them ended in the pose
-    ("pinhole", [600, 600, 319.5, 239.5], None, "-0.09 -0.92 6.41 0.84 1.76 5.23 -1.57 2.1 5.99 -0.89 -0.54 6.31"),
-    (
-        "brown_conrady",
-        [500, 500, 319.5, 239.5],
-        [-0.2, 0.05, 1e-3, -5e-4],
-        "0.46 1.8 4.99 0.02 -0.37 5.24 -0.3 0.56 4.96 -1.19 0.69 4.24",
-    ),
-    (
-        "kannala_brandt",
-        [200, 200, 319.5, 239.5],
-        [0.02, -0.01, 3e-3, -1e-3],
-        "2.74 3.4 7.32 1.74 5.53 5.18 1.16 4.62 6.98 -0.58 4.59 7.64",
-    ),
-    (
-        "double_sphere",
-        [200, 200, 319.5, 239.5],
-        [-0.2, 0.6],
-        "-1.09 -1.71 2.69 -0.33 -1.39 3.78 0.14 -1.47 3.92 -1.02 0.82 4.66",
-    ),
+    ("pinhole", 600, [], "-0.09 -0.92 6.41 0.84 1.76 5.23 -1.57 2.1 5.99 -0.89 -0.54 6.31"),
+    ("brown_conrady", 500, [-0.2, 0.05, 1e-3, -5e-4], "0.46 1.8 4.99 0.02 -0.37 5.24 -0.3 0.56 4.96 -1.19 0.69 4.24"),
+    ("kannala_brandt", 200, [0.02, -0.01, 3e-3, -1e-3], "2.74 3.4 7.32 1.74 5.53 5.18 1.16 4.62 6.98 -0.58 4.59 7.64"),
+    ("double_sphere", 200, [-0.2, 0.6], "-1.09 -1.71 2.69 -0.33 -1.39 3.78 0.14 -1.47 3.92 -1.02 0.82 4.66"),
 ]
 
 
 @pytest.mark.parametrize("compiled", [True, False])
-@pytest.mark.parametrize(("model", "intrinsics", "distortion", "seen"), FOUR)
-def test_four_exact_points_end_in_the_pose(model, intrinsics, distortion, seen, compiled, monkeypatch):
+@pytest.mark.parametrize(("model", "focal", "distortion", "seen"), FOUR)
+def test_four_exact_points_end_in_the_pose(model, focal, distortion, seen, compiled, monkeypatch):
     if not compiled:
         monkeypatch.setattr("camtorch.calibration.pnp._compiled", lambda given, threshold: None)
         monkeypatch.setattr("camtorch.calibration.rays.can_search", lambda *tensors: False)
-    camera = (
-        ct.MODELS[model](intrinsics, *[distortion] * bool(distortion), image_size=(480, 640))
-        .double()
-        .requires_grad_(False)
-    )
+    numbers = [focal, focal, 319.5, 239.5], *[distortion] * bool(distortion)
+    camera = ct.MODELS[model](*numbers, image_size=(480, 640)).double().requires_grad_(False)
     points = torch.tensor([float(number) for number in seen.split()]).double().view(4, 3)
     assert ct.solve_pnp(camera, points - points.mean(0).round(decimals=1), camera.project(points)[0]).rms < 1e-6
 

@@ -80,12 +80,7 @@ def test_what_is_well_is_no_warning():
 MIDDLE = ["Few corners or none in the top left", "beyond what was seen the lens is a guess"]
 PARALLEL = ["known to .* % only. All boards are parallel to within .*Tilt the board"]
 NOT_CARRIED = {
-    "corners in the middle": (
-        0.15,
-        {"count": 20, "width": 0.02, "distance": 0.8},
-        MIDDLE,
-        "up to 1.*Next, hold the bo",
-    ),
+    "corners in the middle": (0.15, {"count": 20, "width": 0.02, "distance": 0.8}, MIDDLE, "up to 1.*Next, hold"),
     "parallel boards": (0.5, {"count": 15, "tilt": 0.1}, PARALLEL, "Tilt the board"),
     "a loose principal point": (0.5, {"count": 8, "tilt": 0.15}, [r'point is known to.*fixed=\("cx", "cy"\)'], ""),
     "another model": (0.15, {"count": 25}, ["The residuals have a pattern.*brown_conrady"], ""),

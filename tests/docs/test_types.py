@@ -86,10 +86,7 @@ def is_of_others(line):
 
 @pytest.mark.slow
 def test_mypy_finds_what_is_wrong_and_no_error_on_any_page(project):
-    python, cache = (
-        project / ".venv" / "bin" / "python",
-        ROOT / ".mypy_cache" / "project",
-    )  # kept, for torch
+    python, cache = project / ".venv" / "bin" / "python", ROOT / ".mypy_cache" / "project"  # kept, for torch
     options = ["--strict", "--python-version=3.10", f"--python-executable={python}", "--config-file="]
     said = run(project, "mypy", *options, f"--cache-dir={cache}", *UNTYPED, "uses", "pages")
     assert re.search(r"\d\d+ source files", said), said

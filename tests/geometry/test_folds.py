@@ -6,7 +6,6 @@ import torch
 from cameras import DISTINCT, KEYS, axis_slope, fan, limits_of, make, nodes_of_steps, one, pixel_lattice, slow_unless
 
 import camtorch as ct
-from camtorch import lenses
 from camtorch.optics import Equidistant, Lens, Planar, Polynomial, Tilt
 from camtorch.values.arguments import columns
 
@@ -93,17 +92,6 @@ def test_a_lens_is_valid_up_to_the_first_root(name):
     before = 1e-6 if key in FROM_PIXELS else 1e-12
     assert valid_at(key, coefficients, torch.where(some, folds, 1.0) * (1 - before))[some].all()
     assert not valid_at(key, coefficients, torch.where(some, folds, 1.0) * (1 + 1e-12))[some].any()
-
-
-@pytest.mark.slow
-def test_real_lenses_are_valid_up_to_the_first_root():
-    real = [lens for lens in lenses.search("") if min(lens.intrinsics[:2]) > 0][::40]
-    assert len(real) > 200
-    coefficients = torch.tensor([lens.distortion for lens in real], dtype=torch.float64)
-    folds = folds_of(coefficients, odd, True)
-    some = folds < torch.pi
-    assert valid_at("kannala_brandt", coefficients, folds.clamp(max=3.1) * (1 - 1e-12)).all()
-    assert not valid_at("kannala_brandt", coefficients[some], folds[some] * (1 + 1e-12)).any()
 
 
 LENSES = [key for key in KEYS if one(key).distortion_names]

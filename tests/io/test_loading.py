@@ -83,7 +83,5 @@ def test_numpy_archives_of_a_fisheye(tmp_path):
 
 def test_sizes_without_an_order_are_refused(tmp_path):
     np.savez(tmp_path / "calibration.npz", K=K, D=D, image_size=[480, 640])
-    with pytest.raises(
-        ct.CameraFileError, match=r"image_size: 480 640 may be \(width, height\) or .* save image_width"
-    ):
+    with pytest.raises(ct.CameraFileError, match=r"image_size: 480 640 may be \(width, height\) or .*image_width"):
         ct.load(tmp_path / "calibration.npz")

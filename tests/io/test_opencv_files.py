@@ -70,12 +70,6 @@ def test_distortion_by_many_names(path, key):
     assert ct.load(written(path, f"K: {K}\n{key}: [[0.3, 0.1, 0, 0, 0]]")).camera.distortion.shape == (5,)
 
 
-@pytest.mark.parametrize("key", ["D1", "distCoeffs1", "camera_distortion", "distorsion", "coeffs", "d2", "xi_1"])
-def test_what_looks_like_distortion_is_not_passed_over(path, key):
-    with pytest.raises(CameraFileError, match=rf"camera.yml: {key}: looks like the distortion of a camera"):
-        ct.load(written(path, f"camera_matrix: {K}\n{key}: [0.3, 0.1, 0, 0, 0]"))
-
-
 def test_what_opencvs_own_programs_write_besides(path):
     """interactive-calibration, and others: statistics are no distortion."""
     text = f"""cameraResolution: [640, 480]
@@ -93,8 +87,6 @@ avg_reprojection_error: 0.2
     assert ct.load(written(path, f"camera_matrix: [{K[:3]}, {K[3:6]}, {K[6:]}]\n")).camera.image_size is None
     without = f"K: {K}\nundistorted_points: [1]\ndist_std_dev: [1]\ndistortion_names: [k1]\n"
     assert type(ct.load(written(path, without)).camera) is ct.Pinhole
-    with pytest.raises(CameraFileError, match="xi_left: looks like"):
-        ct.load(written(path, f"K: {K}\nD: [0, 0, 0, 0]\nxi_left: 1.2"))
 
 
 def test_arrays_of_one_dimension(tmp_path):

@@ -104,22 +104,6 @@ def test_a_row_is_the_batch_s():
     assert rig.extrinsics["images/000002.jpg"].translation[0] == 7
 
 
-@pytest.mark.parametrize(
-    ("extrinsics", "error", "says"),
-    [
-        ((["a"], ct.Extrinsics(torch.zeros(2, 3), torch.zeros(2, 3))), ValueError, r"1 names do not fit a batch"),
-        ((["a", "a"], ct.Extrinsics(torch.zeros(2, 3), torch.zeros(2, 3))), ValueError, "'a' appears twice"),
-        ((["b"], ct.Extrinsics(torch.zeros(1, 3), torch.zeros(1, 3))), ValueError, "no camera and no image.*'b'"),
-        (([1], ct.Extrinsics(torch.zeros(1, 3), torch.zeros(1, 3))), TypeError, "strings; got 1"),
-        ((["a"], None), TypeError, "got NoneType"),
-        ({"a": camera()}, TypeError, "Extrinsics; got 'a': KannalaBrandt"),
-    ],
-)
-def test_what_fits_nothing_is_refused(extrinsics, error, says):
-    with pytest.raises(error, match=says):
-        ct.Rig({"a": camera()}, extrinsics)
-
-
 def test_which_camera_is_meant():
     rig = rig_of(["left", "right"])
     assert "left: KannalaBrandt 640x480 (300, 300," in repr(rig)

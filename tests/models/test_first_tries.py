@@ -59,19 +59,6 @@ def test_vignetting_of_small_images(size):
     assert (ct.vignetting(camera)[0, 0] - exact).abs().max() < 1e-3
 
 
-@pytest.mark.slow
-def test_depth_of_canonical_cameras_and_fields_with_longer_names_are_compiled():
-    canonical, flip = ct.CanonicalCamera(100), A.HorizontalFlip(1.0, camera=LENS)
-    camera, draw = ct.WoodScape.from_fov(90, image_size=SIZE).requires_grad_(False), flip.draw(2)
-
-    def step(depth, gaze):
-        moved = flip(gaze_left=gaze, gaze_right=gaze, draw=draw)
-        return canonical(depth=depth, camera=camera)["depth"], moved["gaze_left"]
-
-    given = torch.ones(2, 1, *SIZE), torch.randn(2, 3)
-    torch.testing.assert_close(torch.compile(step, backend="eager", fullgraph=True)(*given), step(*given))
-
-
 STEREO = LENS, LENS, ct.Extrinsics([0.0] * 3, [-0.1, 0.0, 0.0])
 WIDE = {
     **{f"{key}.from_fov": lambda fov, key=key: ct.MODELS[key].from_fov(fov, image_size=SIZE) for key in ct.MODELS},

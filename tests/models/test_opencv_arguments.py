@@ -13,16 +13,8 @@ R, QUARTER = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), [0.
 RVEC, TVEC = np.array([0.1, -0.2, 0.3]), np.array([1.0, 2.0, 3.0])
 K = np.array([[300.0, 0.0, 319.5], [0.0, 310.0, 239.5], [0.0, 0.0, 1.0]])
 FISHEYE = np.array([0.01, -0.002, 0.0003, -0.0004])
-LENSES = [
-    (ct.KannalaBrandt, 4),
-    (ct.BrownConrady, 4),
-    (ct.BrownConrady, 5),
-    (ct.BrownConrady, 14),
-    (ct.Mei, 5),
-    (ct.FTheta, 3),
-    (ct.UCM, 1),
-    (ct.EUCM, 2),
-]
+LENSES = [(ct.KannalaBrandt, 4), *((ct.BrownConrady, count) for count in (4, 5, 14)), (ct.Mei, 5), (ct.FTheta, 3)]
+LENSES += [(ct.UCM, 1), (ct.EUCM, 2)]
 lenses = pytest.mark.parametrize(("model", "count"), LENSES)
 
 

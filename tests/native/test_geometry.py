@@ -42,9 +42,8 @@ def native(camera):
 def formula_of(camera, direction, values):
     """What the recorded formula says, (N, size), and of which it is valid; with a graph to the camera's parameters."""
     intrinsics, distortion = camera.intrinsics[None], camera.distortion[None]
-    planes, valid = direction.formula(
-        type(camera), values[None], intrinsics, distortion, CameraRows(type(camera), intrinsics, distortion)
-    )
+    rows = CameraRows(type(camera), intrinsics, distortion)
+    planes, valid = direction.formula(type(camera), values[None], intrinsics, distortion, rows)
     return planes[:, 0].mT, valid[0]
 
 

@@ -134,21 +134,3 @@ def test_gradients_reach_a_predicted_focal_length():
     depth = ct.CanonicalCamera(50.0).inverse(depth=torch.ones(3, 1, *SIZE), camera=cameras)["depth"]
     depth.mean().backward()
     assert head.linear.weight.grad[0].abs().min() > 0
-
-
-SEVERAL = ct.Pinhole([[30.0, 30, 31, 23], [60.0, 60, 31, 23]], image_size=SIZE).requires_grad_(False)
-DEPTH, IMAGES = ct.CanonicalCamera(50.0), ct.CanonicalCamera(50.0, scales="image")
-REFUSED = [
-    (lambda: ct.CanonicalCamera(0.0), "focal must be positive"),
-    (lambda: ct.CanonicalCamera(50.0, scales="labels"), '"depth" or "image"; got \'labels\''),
-    (lambda: ct.CanonicalCamera(50.0, image_size=(4, 4)), "images keep their size"),
-    (lambda: DEPTH(depth=torch.ones(SIZE, dtype=torch.int16), camera=camera()), "floating point"),
-    (lambda: IMAGES.inverse(depth=torch.ones(SIZE), camera=camera()), "source_camera as it came out"),
-    (lambda: IMAGES(image=torch.rand(2, 3, *SIZE), camera=SEVERAL), "image_size="),
-]
-
-
-@pytest.mark.parametrize(("call", "said"), REFUSED)
-def test_what_is_refused(call, said):
-    with pytest.raises(ValueError, match=said):
-        call()

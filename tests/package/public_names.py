@@ -22,20 +22,8 @@ import torch
 
 import camtorch as ct
 
-ROOMS = [
-    "augment",
-    "augment.kornia",
-    "augment.numpy",
-    "cabin",
-    "data",
-    "io",
-    "lenses",
-    "losses",
-    "models",
-    "optics",
-    "plot",
-    "views",
-]
+ROOMS = ["augment", "augment.kornia", "augment.numpy", "cabin", "data", "io", "lenses", "losses", "models", "optics"]
+ROOMS += ["plot", "views"]
 FRONT_ENDS = ("augment.albumentations", "augment.torchvision")
 """These are read as text, because the libraries that they need may not be installed."""
 

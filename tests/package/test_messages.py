@@ -24,7 +24,9 @@ PIXELS, RAYS = CAMERA.pixel_grid(), CAMERA.rays()[0]
 IMAGES = torch.zeros(2, 3, *SIZE)
 LEAF, EYE, HOLED = torch.ones((), requires_grad=True), np.eye(3), np.where(np.arange(160) == 7, math.nan, 0.0)
 DEEP, THREE = ct.Reproject(CAMERA, CAMERA, POSE), ct.RollingShutter(0.03, torch.zeros(3, 3))
-NORMAL = [0.1, 0.3, 1.0]
+NORMAL, SMALL, BOARDS = [0.1, 0.3, 1.0], CAMERA.resize(12, 16), ct.Extrinsics(torch.zeros(2, 3), torch.zeros(2, 3))
+CANONICAL = ct.CanonicalCamera(50.0, scales="image", camera=CAMERA)
+TWO = BATCH.replace(intrinsics=BATCH.intrinsics * torch.tensor([[1.0], [2.0]]))
 augment, at = ct.augment, ct.Extrinsics
 BOX_CROP = augment.BoxCrop((8, 8), camera=CAMERA)
 FORWARD = [model([200.0, 200, 319.5, 239.5], image_size=(480, 640)) for model in (ct.Pinhole, ct.KannalaBrandt)]
@@ -162,7 +164,26 @@ WRONG = [
     (lambda: ct.data.MapSamples(WARP, key=[]), TypeError, r"MapSamples: key must name an entry of a sample; got \[\]"),
     (lambda: ct.fit("mei", PIXELS, RAYS, weights=torch.ones(3)), ValueError, r"weights must broadcast against the"),
     (lambda: ct.fit("mei", PIXELS, RAYS, weights=-torch.ones(SIZE)), ValueError, r"weights must be .*got down to -1"),
+    (lambda: ct.losses.rays(CAMERA, torch.zeros(3)), TypeError, r"target must be a Camera; got Tensor"),
+    (lambda: ct.losses.rays(CAMERA, SMALL), ValueError, r"images of one size; got those of \(12, 16\) and \(24, 32\)"),
+    (lambda: ct.losses.rays(BATCH, CAMERA.expand(3)), ValueError, r"\(2,\) of predicted and \(3,\) of target"),
+    (lambda: ct.losses.reprojection(BATCH, torch.zeros(2, 5, 2)), TypeError, r"say nothing without the points"),
+    (lambda: ct.losses.rays(BATCH, CAMERA, reduction="sum"), ValueError, r'"mean" or "none"'),
+    (lambda: ct.losses.rays(BATCH, CAMERA, samples=0), ValueError, r"rows and columns"),
+    (lambda: ct.losses.rays(BATCH, CAMERA, weights=torch.ones(7)), ValueError, r"weights must broadcast"),
+    (lambda: ct.CanonicalCamera(0.0), ValueError, r"focal must be positive"),
+    (lambda: ct.CanonicalCamera(50.0, scales="labels"), ValueError, r"\"depth\" or \"image\"; got 'labels'"),
+    (lambda: ct.CanonicalCamera(50.0, image_size=(4, 4)), ValueError, r"images keep their size"),
+    (lambda: CANONICAL(depth=torch.ones(SIZE).short()), ValueError, r"floating point"),
+    (lambda: CANONICAL.inverse(depth=torch.ones(SIZE)), ValueError, r"source_camera as it came out"),
+    (lambda: CANONICAL(image=IMAGES, camera=TWO), ValueError, r"image_size="),
     # models, files, maps
+    (lambda: ct.Rig({"a": CAMERA}, (["a"], BOARDS)), ValueError, r"1 names do not fit a batch"),
+    (lambda: ct.Rig({"a": CAMERA}, (["a", "a"], BOARDS)), ValueError, r"'a' appears twice"),
+    (lambda: ct.Rig({"a": CAMERA}, (["b"], BOARDS[:1])), ValueError, r"no camera and no image.*'b'"),
+    (lambda: ct.Rig({"a": CAMERA}, ([1], BOARDS[:1])), TypeError, r"strings; got 1"),
+    (lambda: ct.Rig({"a": CAMERA}, (["a"], None)), TypeError, r"got NoneType"),
+    (lambda: ct.Rig({"a": CAMERA}, {"a": CAMERA}), TypeError, r"Extrinsics; got 'a': KannalaBrandt"),
     (lambda: ct.WoodScape.from_woodscape([20, 0, 0, 0], image_size=None), ValueError, r"give its image_size=\(height"),
     (lambda: ct.WoodScape.from_woodscape([20, 0, 0, 0], 3, image_size=SIZE), ValueError, r"offset must be \(2,\) ="),
     (lambda: ct.io.opencv.read(None), TypeError, r"io.opencv.read: path must name a file; got None"),
@@ -190,9 +211,7 @@ def test_wrong_calls_are_told_in_words(call, error, says):
 
 def test_boxes_that_are_parts_of_an_image_are_warned_of():
     parts = torch.tensor([[0.1, 0.2, 0.5, 0.6], [0.0, 0.5, 1.0, 1.0]])
-    with pytest.warns(
-        UserWarning, match=r"RandomMount: boxes must be pixels .* within \[0, 1\], as parts of an image's"
-    ):
+    with pytest.warns(UserWarning, match=r"RandomMount: boxes must be pixels .* \[0, 1\], as parts of an image's"):
         MOUNT(image=IMAGES[0], boxes=parts)
     for boxes in (20 * parts, parts.round(), torch.zeros(2, 4), torch.full((2, 4), math.nan)):
         MOUNT(image=IMAGES[0], boxes=boxes)

@@ -231,17 +231,6 @@ def test_field_of_view_and_size_are_as_asked(projection):
     assert both.camera_left.fov[:2].tolist() == pytest.approx([86, 57], rel=0.01)
 
 
-@pytest.mark.slow
-def test_it_is_a_graph_and_has_a_shape_on_meta():
-    left, right, extrinsics = pair()
-    found = ct.rectify(left, right, extrinsics, image_size=(24, 32))
-    images = torch.rand(1, 1, 480, 640, dtype=torch.float64)
-    expected = found(images, images)
-    compiled = torch.compile(found, fullgraph=True, backend="eager")
-    torch.testing.assert_close(compiled(images, images), expected, rtol=0, atol=1e-9)
-    assert [image.shape for image in found.to("meta")(images.to("meta"), images.to("meta"))] == [(1, 1, 24, 32)] * 2
-
-
 # -- mrcal's, by numbers that its fork drcal gave; where its image is another, in that image
 
 GOLDEN = json.loads((Path(__file__).parents[1] / "golden" / "stereo" / "drcal.json").read_text())

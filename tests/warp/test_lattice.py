@@ -75,10 +75,8 @@ def test_hard_warps_keep_their_tolerance(what):
 
 
 def test_points_of_a_pinned_warp_are_those_of_its_cameras_and_learn_with_them():
-    source, target = (
-        ct.KannalaBrandt.from_fov(150, image_size=(256, 320)),
-        ct.Pinhole.from_fov(80, image_size=(200, 240)),
-    )
+    source = ct.KannalaBrandt.from_fov(150, image_size=(256, 320))
+    target = ct.Pinhole.from_fov(80, image_size=(200, 240))
     fresh, pinned = (ct.Warp(source, target) for _ in range(2))
     pixels = torch.rand(50, 2) * torch.tensor([320.0, 256.0])
     with torch.no_grad():

@@ -35,9 +35,8 @@ def above_ground(height=2.0, pitch=35.0):
     level = torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]).double()
     down = rotation_matrix(torch.tensor([math.radians(pitch), 0, 0]).double())
     rotation = down @ level
-    return ct.Extrinsics.from_matrix(rotation, -rotation @ torch.tensor([0.5, -1.0, height]).double()).requires_grad_(
-        False
-    )
+    place = torch.tensor([0.5, -1.0, height]).double()
+    return ct.Extrinsics.from_matrix(rotation, -rotation @ place).requires_grad_(False)
 
 
 def test_of_pinholes_it_is_the_homography():
@@ -78,12 +77,8 @@ def test_a_chessboard_on_the_floor_lies_on_its_grid(dtype):
     camera, extrinsics = wide((1080, 1440)), above_ground()
     eye = ct.BirdsEye(camera.to(dtype), extrinsics.to(dtype), x=(-2, 3), y=(0, 4), resolution=0.01)
     assert (eye.target.image_size, eye.grid_points.shape) == ((400, 500), (400, 500, 2))
-    torch.testing.assert_close(
-        eye.grid_points[0, 0].double(), torch.tensor([-1.995, 3.995]).double(), rtol=0, atol=1e-6
-    )
-    torch.testing.assert_close(
-        eye.grid_points[-1, -1].double(), torch.tensor([2.995, 0.005]).double(), rtol=0, atol=1e-5
-    )
+    for at, place in ((0, [-1.995, 3.995]), (-1, [2.995, 0.005])):
+        torch.testing.assert_close(eye.grid_points[at, at].double(), torch.tensor(place).double(), rtol=0, atol=1e-5)
     corners = torch.cartesian_prod(torch.arange(-1.5, 2.6, 0.25), torch.arange(0.5, 3.6, 0.25)).to(dtype)
     ground = torch.nn.functional.pad(corners, (0, 1))
     pixels, seen = camera.project(extrinsics(ground))

@@ -49,21 +49,19 @@ def above(p):
 
 
 CAMERAS = ("focal", "lens", "wide", "turn")
+ROLLING, PLANE = (*CAMERAS, "readout", "rates"), (*CAMERAS, "shift", "normal", "distance")
+
+
+def turned(kind, p, **options):
+    return kind(source(p), target(p), rotation_matrix(p["turn"]), **options)
+
+
 # what makes a warp of numbers by name, and which of them it takes
 KINDS = {
-    "turned": (lambda p: ct.Warp(source(p), target(p), rotation_matrix(p["turn"])), CAMERAS),
-    "undone": (
-        lambda p: ct.ShutterWarp(source(p), target(p), rotation_matrix(p["turn"]), shutter=shutter(p)),
-        (*CAMERAS, "readout", "rates"),
-    ),
-    "rolling": (
-        lambda p: ct.ShutterWarp(source(p), target(p), rotation_matrix(p["turn"]), target_shutter=shutter(p)),
-        (*CAMERAS, "readout", "rates"),
-    ),
-    "plane": (
-        lambda p: ct.PlaneWarp(source(p), target(p), pose(p), p["normal"], p["distance"]),
-        (*CAMERAS, "shift", "normal", "distance"),
-    ),
+    "turned": (lambda p: turned(ct.Warp, p), CAMERAS),
+    "undone": (lambda p: turned(ct.ShutterWarp, p, shutter=shutter(p)), ROLLING),
+    "rolling": (lambda p: turned(ct.ShutterWarp, p, target_shutter=shutter(p)), ROLLING),
+    "plane": (lambda p: ct.PlaneWarp(source(p), target(p), pose(p), p["normal"], p["distance"]), PLANE),
     "above": (
         lambda p: ct.BirdsEye(source(p), above(p), x=(-1.0, 1), y=(0.5, 2), resolution=0.15),
         ("focal", "lens", "turn", "shift"),
