@@ -170,11 +170,6 @@ PROGRAMS |= {
     "CanonicalCamera, depth": moved(ct.CanonicalCamera(focal=30, camera=FISHEYE), "image", "depth"),
     "CanonicalCamera, image": moved(ct.CanonicalCamera(focal=9, scales="image", image_size=SIZE, camera=FISHEYE)),
     "CameraHead": Case(HEAD, lambda head, features, points: head(features).project(points), rand(2, 6), POINTS),
-    "fields": Case(
-        FISHEYE,
-        lambda c, pixels: (c.local_pinhole(pixels), c.plucker(POSE, 8), c.perspective_field((0, 1, 0.1), 8)),
-        PIXELS,
-    ),
     "losses.angles": Case(nn.Identity(), lambda _, a, b: losses.angles(a, b), POINTS, POINTS.flip(0)),
     "losses.rays": Case(PAIR, lambda pair: losses.rays(pair[0], pair[1])),
     "losses.reprojection": Case(PAIR, lambda pair: losses.reprojection(pair[0], pair[1])),

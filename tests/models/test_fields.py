@@ -157,6 +157,18 @@ def test_local_pinholes_in_vmap_and_with_gradients():
     assert torch.autograd.gradcheck(matrices, (pixels.clone().requires_grad_(), *numbers))
 
 
+@pytest.mark.slow
+def test_fields_in_compiled_code():
+    camera = ct.UCM.from_fov(100, image_size=(480, 640)).double().requires_grad_(False)
+    pose = ct.Extrinsics([0.1, 0.2, 0.3], [1.0, 2.0, 3.0])
+
+    def fields(pixels):
+        return *camera.local_pinhole(pixels), *camera.plucker(pose, 32), *camera.perspective_field((0, 1, 0.1), 32)
+
+    for one, wanted in zip(torch.compile(fields, fullgraph=True, backend="eager")(PIXELS), fields(PIXELS), strict=True):
+        assert torch.allclose(one, wanted, atol=1e-10)
+
+
 @pytest.mark.parametrize("level", [True, False])
 def test_latitude_and_up_are_those_of_points_that_rise(level):
     down = torch.tensor([0.0, 9.81, 0.0] if level else [0.3, 0.8, -0.5], dtype=torch.float64)

@@ -25,7 +25,7 @@ IMAGES = torch.zeros(2, 3, *SIZE)
 LEAF, EYE, HOLED = torch.ones((), requires_grad=True), np.eye(3), np.where(np.arange(160) == 7, math.nan, 0.0)
 DEEP, THREE = ct.Reproject(CAMERA, CAMERA, POSE), ct.RollingShutter(0.03, torch.zeros(3, 3))
 NORMAL, SMALL, BOARDS = [0.1, 0.3, 1.0], CAMERA.resize(12, 16), ct.Extrinsics(torch.zeros(2, 3), torch.zeros(2, 3))
-CANONICAL = ct.CanonicalCamera(50.0, scales="image", camera=CAMERA)
+CANONICAL, DEPTHS = (ct.CanonicalCamera(50.0, scales=scales, camera=CAMERA) for scales in ("image", "depth"))
 TWO = BATCH.replace(intrinsics=BATCH.intrinsics * torch.tensor([[1.0], [2.0]]))
 augment, at = ct.augment, ct.Extrinsics
 BOX_CROP = augment.BoxCrop((8, 8), camera=CAMERA)
@@ -167,14 +167,14 @@ WRONG = [
     (lambda: ct.losses.rays(CAMERA, torch.zeros(3)), TypeError, r"target must be a Camera; got Tensor"),
     (lambda: ct.losses.rays(CAMERA, SMALL), ValueError, r"images of one size; got those of \(12, 16\) and \(24, 32\)"),
     (lambda: ct.losses.rays(BATCH, CAMERA.expand(3)), ValueError, r"\(2,\) of predicted and \(3,\) of target"),
-    (lambda: ct.losses.reprojection(BATCH, torch.zeros(2, 5, 2)), TypeError, r"say nothing without the points"),
+    (lambda: ct.losses.reprojection(BATCH, torch.zeros(2, 5, 2)), ValueError, r"say nothing without the points"),
     (lambda: ct.losses.rays(BATCH, CAMERA, reduction="sum"), ValueError, r'"mean" or "none"'),
     (lambda: ct.losses.rays(BATCH, CAMERA, samples=0), ValueError, r"rows and columns"),
     (lambda: ct.losses.rays(BATCH, CAMERA, weights=torch.ones(7)), ValueError, r"weights must broadcast"),
     (lambda: ct.CanonicalCamera(0.0), ValueError, r"focal must be positive"),
     (lambda: ct.CanonicalCamera(50.0, scales="labels"), ValueError, r"\"depth\" or \"image\"; got 'labels'"),
     (lambda: ct.CanonicalCamera(50.0, image_size=(4, 4)), ValueError, r"images keep their size"),
-    (lambda: CANONICAL(depth=torch.ones(SIZE).short()), ValueError, r"floating point"),
+    (lambda: DEPTHS(depth=torch.ones(SIZE).short()), ValueError, r"floating point"),
     (lambda: CANONICAL.inverse(depth=torch.ones(SIZE)), ValueError, r"source_camera as it came out"),
     (lambda: CANONICAL(image=IMAGES, camera=TWO), ValueError, r"image_size="),
     # models, files, maps
