@@ -20,9 +20,9 @@ from camtorch.projection.native_cameras import Native
 from camtorch.values.dtypes import narrow, widen
 from camtorch.values.module import remade
 from camtorch.warp.affine import AffineWarp, MirrorWarp, after
-from camtorch.warp.at_once import between_of
 from camtorch.warp.boxes import corners_of, in_order
 from camtorch.warp.panorama import seam_of
+from camtorch.warp.plan import between_of
 from camtorch.warp.sampling import Mode, Options
 from camtorch.warp.shifted import ShiftedWarp
 from camtorch.warp.warp import Warp
@@ -109,10 +109,10 @@ class Part:
 
     def between(self) -> tuple[Native, Native, Tensor | None] | None:
         """Both cameras and the rotation for compiled code; None where it takes more than that."""
-        if not isinstance(self.moves, Drawn):
-            return None if self.moves is None or self.shades or self.light is not None else between_of(self.moves)
-        start, end = self.moves.start, self.moves.native
-        return None if start is None or end is None else (start, end, self.moves.rotation)
+        if isinstance(self.moves, Drawn) and self.moves.intrinsics.ndim == 1:
+            start, end = self.moves.start, self.moves.native
+            return None if start is None or end is None else (start, end, self.moves.rotation)
+        return None if self.moves is None or self.shades or self.light is not None else between_of(self.warp)
 
     def by(self, change: Callable[[Warp], Warp]) -> Part:
         """The part with each of its warps changed."""

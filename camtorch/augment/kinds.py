@@ -127,6 +127,9 @@ KINDS = {
     "tvec": Field(1, 1, (3,), "(B, 3), a point of the camera frame", _positions),
     "rotation": Field(2, 2, (3,), "(B, 3, 3), turned so far", lambda c, turn, _: c.rays(turn, _columns, _columns)),
 }
+TURNED = "points", "gaze", "directions", "tvec", "landmarks"
+MATRICES = "head_pose", "pose", "rotation"
+"""Whose columns turn."""
 CHECKED = ("boxes", "rvec", "head_pose", "pose", "pitch_yaw")
 """Whose values are checked, not their shape alone."""
 ALIASES = {"images": "image", "masks": "mask", "bboxes": "boxes", "point": "points", "face_center": "points"}

@@ -24,7 +24,9 @@ from camtorch.augment.kinds import (
     IMAGES,
     KEEP,
     KINDS,
+    MATRICES,
     OWN,
+    TURNED,
     Named,
     as_tensor,
     check,
@@ -51,8 +53,8 @@ from camtorch.values.arguments import (
     no_camera,
 )
 from camtorch.values.threads import on_one_thread
-from camtorch.warp.at_once import at_once
 from camtorch.warp.boxes import edges_of, enclosing
+from camtorch.warp.plan import Label, at_once
 from camtorch.warp.sampling import Options, Sampler, as_options
 
 P = ParamSpec("P")
@@ -555,10 +557,18 @@ def _in_range(values: Tensor, dtype: torch.dtype) -> Tensor:
     return values.to(dtype)
 
 
+def _is_proper(rotation: Tensor | None) -> bool:
+    """Whether (3, 3) is no mirror."""
+    if rotation is None:
+        return True
+    (a, b, c), (d, e, f), (g, h, i) = rotation.tolist()
+    return bool(a * (e * i - f * h) + b * (f * g - d * i) + c * (d * h - e * g) > 0)
+
+
 def together(
     change: Change, named: Named, mask_fill: float = 0.0, lateral: float = 0, batched: bool = True
 ) -> dict[str, tuple[Tensor, Tensor | None]]:
-    """What moves by one compiled call, and its validity: images, pixels, and of a single sample boxes.
+    """What moves by one compiled call, and its validity: images, pixels, and of a single sample boxes and what turns.
 
     batched: whether the results have a batch dim, as `named` has; those of a batch of one may do without.
     """
@@ -567,7 +577,7 @@ def together(
         return {}
     options = part.moves.options
     mode, padding_mode, fill = options["mode"], options["padding_mode"], options["fill"]
-    hows: dict[str, Sampler | None] = {}
+    moved, hows = part.moves if isinstance(part.moves, Drawn) and is_single else None, dict[str, Sampler | Label]()
     for name, (found, value) in named.items():
         if found in ("depth", "distance") or isinstance(value, list):  # which ask for positions again
             return {}
@@ -577,10 +587,15 @@ def together(
             hows[name] = Sampler(mode, padding_mode, fill)
         elif found == "mask":
             hows[name] = Sampler("nearest", "zeros", (mask_fill,))
-        elif is_single and found == "boxes" and isinstance(part.moves, Drawn) and are_numbers(value):
-            hows |= {name: None} if value.dtype == part.moves.distortion.dtype else {}
-        elif found != "boxes" and moves(found, value) is move_pixels and (is_single or value.numel() < _MANY):
-            hows[name] = None
+        elif found != "boxes" and moves(found, value) is move_pixels:
+            hows |= {name: "pixels"} if is_single or value.numel() < _MANY else {}
+        elif moved is not None and value.dtype == moved.distortion.dtype and are_numbers(value):
+            if found == "boxes":
+                hows[name] = "pixels"
+            elif found in TURNED and value.is_contiguous():
+                hows[name] = "rays"
+            elif found in MATRICES and value.is_contiguous() and _is_proper(moved.rotation):
+                hows[name] = "columns"
     fields = (named[name] for name in hows)
     values = [edges_of(value) if found == "boxes" else value for found, value in fields]
     between = part.between() if values else None

@@ -103,6 +103,27 @@ static void narrowed(double *exact, int64_t count) {
     }
 }
 
+/* As torch turns them: rounded once in each step, or, where one is not finite, twice */
+#define TURNED(R, fused)                                                                                               \
+    static void turned_##R(const Turned *given) {                                                                      \
+        const R *m = given->turn;                                                                                      \
+        const int64_t by = given->strides[0], to = given->strides[1];                                                  \
+        int all = 1;                                                                                                   \
+        for (int64_t i = 0; i < given->count; i++)                                                                     \
+            for (int k = 0; k < 3; k++) all &= isfinite(((const R *)given->rows)[i * by + k * to]) != 0;               \
+        for (int64_t i = 0; i < given->count; i++) {                                                                   \
+            const R *v = (const R *)given->rows + i * by, x = v[0], y = v[to], z = v[2 * to];                          \
+            const int known = isfinite(x) && isfinite(y) && isfinite(z);                                               \
+            for (int k = 0; k < 3; k++) {                                                                              \
+                const R *row = m + 3 * k, found = all ? fused(row[2], z, fused(row[1], y, row[0] * x))                 \
+                                                      : row[0] * x + row[1] * y + row[2] * z;                          \
+                ((R *)given->results)[i * by + k * to] = known ? found : (R)NAN;                                       \
+            }                                                                                                          \
+        }                                                                                                              \
+    }
+TURNED(float, fmaf)
+TURNED(double, fma)
+
 /* A lattice, the images that are sampled on it, and other pixels of the same cameras, in one call on this thread: in between
  * caches stay warm. Flags of what is left, as of lattices, and then nothing is made; or as of moves, LEFT_BITS higher */
 EXPORTED int64_t camtorch_together(const Together *given) {
@@ -117,5 +138,7 @@ EXPORTED int64_t camtorch_together(const Together *given) {
                      SQUARES * *lattices->used);
     for (int64_t i = 0; i < given->job_count && given->is_whole; i++) given->jobs[i].next = 0, camtorch_sample(given->jobs + i);
     for (int64_t i = 0; i < given->move_count; i++) left |= camtorch_moves(given->moves + i);
+    for (const Turned *one = given->turned; one < given->turned + given->turned_count; one++)
+        if (one->turn) (one->is_double ? turned_double : turned_float)(one);
     return left << LEFT_BITS;
 }

@@ -169,12 +169,23 @@ typedef struct {
 enum { SQUARES = STEP * STEP }; /* positions of a cell */
 enum { LEFT_BITS = 3 };
 
-/* One sample: a lattice of one camera, images that are sampled on it, in parts or whole, and pixels that move */
+/* Vectors of three numbers that turn, of the type of the rotation; NaN where one is not finite */
+typedef struct {
+    const void *turn; /* (3, 3); NULL: they stay */
+    const void *rows;
+    void *results;
+    int64_t strides[2]; /* of both, by vector and component */
+    int64_t count, is_double;
+} Turned;
+
+/* One sample: a lattice of one camera, images that are sampled on it, in parts or whole, pixels that move, and vectors */
 typedef struct {
     Job *jobs;
     int64_t job_count, is_whole; /* 0: others sample the images */
     const Move *moves;
     int64_t move_count;
+    const Turned *turned;
+    int64_t turned_count;
     Lattices lattices;
 } Together;
 

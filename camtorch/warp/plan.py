@@ -2,10 +2,17 @@
 
 from __future__ import annotations
 
+import ctypes
+import functools
 import math
-from collections.abc import Iterator
-from typing import Literal
+import struct
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from itertools import accumulate
+from itertools import count as count_from
+from typing import TYPE_CHECKING, Any, Literal
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -21,17 +28,60 @@ from camtorch.evaluate.door import (
     set_aside,
 )
 from camtorch.evaluate.export import with_values
-from camtorch.evaluate.known import is_unknown
-from camtorch.native.sampler import Call, empty
+from camtorch.evaluate.kept import Kept
+from camtorch.evaluate.known import are_free, is_unknown
+from camtorch.native import memory
+from camtorch.native.library import library
+from camtorch.native.sampler import Call, empty, is_quick, maker, packed, takes, tiles_of
+from camtorch.projection.compiled import (
+    LATTICE_WORDS,
+    LEFT_FROM,
+    LEFT_MOST,
+    LEFT_TO,
+    ON_IMAGE,
+    POSITIONS,
+    Between,
+    Lattices,
+    packed_move,
+    run_and_follow,
+)
+from camtorch.projection.evaluation import compiled_of
+from camtorch.projection.native_cameras import Native, entry
+from camtorch.values.threads import spread, thread_count
 from camtorch.warp import compiled
-from camtorch.warp.grid import Lattice, Sampling, scaled
+from camtorch.warp.grid import FEWEST, MOST_KEPT, STEP, Lattice, Sampling, coarse, kept_probes, scaled
 from camtorch.warp.pair import CameraPair, Plan
-from camtorch.warp.sampling import PADDINGS, PaddingMode, Pyramid, Sampler, by_torch, laid_as, prepared, render
+from camtorch.warp.panorama import goes_round
+from camtorch.warp.sampling import (
+    PADDINGS,
+    SHRINKS,
+    SURELY,
+    Options,
+    PaddingMode,
+    Pyramid,
+    Sampler,
+    by_torch,
+    laid_as,
+    prepared,
+    render,
+)
+
+if TYPE_CHECKING:
+    from camtorch.warp.warp import Warp
 
 Route = Literal["operator", "strips", "graph", "kept"]
+Label = Literal["pixels", "rays", "columns"]
+"""What moves beside images: pixels, directions and points of the camera frame, or columns of a matrix of those."""
+Sizes = tuple[tuple[int, int], tuple[int, int]]
+"""(height, width) of the source's image, and of the target's."""
 
 _MOST_KEPT = 1 << 25  # pixels of a grid; longer ones, of 256 MB in float32, are made by strips and not kept
 _STRIP = 1 << 21  # pixels of such a strip
+_HEAD, _WIDTHS = 7, {"pixels": 22, "turned": 7, "images": 38}  # words of the structures of C
+_MOST_FORMS = 4  # of samples that a thread keeps calls of
+_FEW = 2  # tiles of an image that one thread makes alone
+_EVEN = 4  # samples a thread from which on it matters little that the last ones leave some threads idle
+_PIXELS = 1 << 3  # flags of what is left of pixels are times this
 
 
 def route_of(warp: CameraPair, images: Tensor | None = None) -> Route:
@@ -245,3 +295,247 @@ def _constant(warp: CameraPair, padding: PaddingMode) -> Sampling | None:
 
         plan = _plan_of(warp)
         return own() if plan.is_pinned else plan.positions_for(f"constant {_reach(warp, padding)}", own)
+
+
+# -- samples: images, pixels and vectors by one call of compiled code
+
+
+def between_of(warp: Warp) -> tuple[Native, Native, Tensor | None] | None:
+    """Return source, target and rotation of a warp for compiled code; None where it has to go step by step."""
+    source, target, rotation = warp.source, warp.target, warp.rotation
+    if not warp.is_an_operator or warp.is_pinned or goes_round(source) is not None or goes_round(target) is not None:
+        return None
+    made = compiled_of((source, target), target.intrinsics, *(() if rotation is None else (rotation,)))
+    return None if made is None else (*made[0], rotation)  # type: ignore[return-value]
+
+
+def at_once(
+    source: Native,
+    target: Native,
+    rotation: Tensor | None,
+    sizes: Sizes,
+    options: Options,
+    values: Sequence[Tensor],
+    hows: Sequence[Sampler | Label],
+    batched: bool = True,
+) -> list[tuple[Tensor, Tensor | None]] | None:
+    """Return all that samples hold, with a batch dim or, of a single one, without; and of pixels which are valid.
+
+    None where a lattice does not do, images shrink, lie oddly in memory, threads would idle, or something is traced.
+    Values are images (B, C, H, W), masks (B, H, W) as well, and what `hows` says: pixels (B, *N, 2) of the source's
+    image; or of a single sample, in the dtype of the cameras, rays (1, *N, 3) and columns (1, 3 or 4, N) that turn. Of
+    a batch each thread takes whole samples.
+    """
+    tolerance, antialias, count = options["tolerance"], options["antialias"], values[0].shape[0]
+    turns = 1 if rotation is None else rotation.numel() // 9
+    if not tolerance or antialias or max(source.cameras, target.cameras, turns) != count or not are_free(*values):
+        return None
+    if count > 1:
+        threads = thread_count()
+        if source.dtype != torch.float32 or (count % threads and count < _EVEN * threads):
+            return None
+    if rotation is not None and (rotation.dtype != source.dtype or not rotation.is_contiguous()):
+        rotation = rotation.detach().to(source.dtype).contiguous()
+    given = sizes, source.dtype, tolerance, batched
+    forms = [(t.shape, t.stride(), t.dtype, how) for t, how in zip(values, hows, strict=True)]
+    call = _calls.kept((), (*given, *forms), lambda: _Together.of(*given, values, hows))
+    return None if call is None else call(source, target, rotation, values, antialias is None)
+
+
+class _Calls(threading.local):
+    def __init__(self) -> None:
+        self.kept = Kept(_MOST_FORMS)
+
+
+_calls = _Calls()
+
+
+@functools.lru_cache(maxsize=16)
+def _coarse(size: tuple[int, int], dtype: torch.dtype) -> tuple[Tensor, tuple[int, int], int]:
+    """(1, N, 2): pixels that tell how far an image shrinks, how many down and across, and their step."""
+    first, step = coarse(size)
+    with torch.inference_mode(False):
+        v, u = (torch.arange(first, side, step, dtype=dtype, device="cpu") for side in size)
+        return torch.stack(torch.meshgrid(u, v, indexing="xy"), -1).view(1, -1, 2), (len(v), len(u)), step
+
+
+def _surely_keeps_size(back: Between, sizes: Sizes) -> bool:
+    """Whether no image shrinks so far that a `MirrorWarp` would halve it; back: from the target to the source."""
+    nodes, shape, step = _coarse(sizes[1], back.dtype)
+    places = back.rows(nodes, POSITIONS)[0].numpy().reshape(-1, *shape, 2)
+    seen: np.ndarray[Any, Any] = np.all(abs(places) <= 1, axis=-1)
+    places = places * np.array([sizes[0][1] / 2, sizes[0][0] / 2], places.dtype)
+    down, across = places[:, 1:] - places[:, :-1], places[:, :, 1:] - places[:, :, :-1]
+    total, count = 0.0, 0
+    for steps, both in ((down, seen[:, 1:] & seen[:, :-1]), (across, seen[:, :, 1:] & seen[:, :, :-1])):
+        total = total + (np.hypot(steps[..., 0], steps[..., 1]) * both).sum((1, 2))
+        count = count + both.sum((1, 2))
+    return bool((total < SURELY * SHRINKS * step * np.maximum(count, 1)).all())
+
+
+def _planes(image: Tensor) -> Tensor:
+    """Images (B, C, H, W), of masks (B, H, W) as well."""
+    return image if image.ndim == 4 else image.unsqueeze(1)
+
+
+def _fits(value: Tensor, how: Sampler | Label, dtype: torch.dtype, size: tuple[int, int]) -> bool:
+    """Whether the call takes a value: images that lie too oddly in memory, or are none, go another way."""
+    if not isinstance(how, Sampler):
+        return torch.promote_types(value.dtype, dtype) == dtype
+    image = _planes(value)
+    result = empty(image, len(image), size)
+    return 0 not in result.shape and takes(image.dtype, how.mode) and is_quick(image, result, how.mode)
+
+
+def _maker(value: Tensor, size: tuple[int, int], batched: bool) -> Callable[[], Tensor]:
+    """Return what makes the place for samples of images (B, C, H, W), or masks (B, H, W)."""
+    make, is_image = maker(_planes(value), len(value), size), value.ndim == 4
+
+    def made() -> Tensor:
+        result = make() if is_image else make().squeeze(1)
+        return result if batched else result.squeeze(0)
+
+    like = made()
+    if like.nbytes >= memory.LEAST:
+        return made
+    return functools.partial(torch.empty_strided, like.shape, like.stride(), dtype=like.dtype, device="cpu")
+
+
+class _Together:
+    """`Together` of geometry.h, with all that samples of one form have in common."""
+
+    @classmethod
+    def of(
+        cls,
+        sizes: Sizes,
+        dtype: torch.dtype,
+        tolerance: float,
+        batched: bool,
+        values: Sequence[Tensor],
+        hows: Sequence[Sampler | Label],
+    ) -> _Together | None:
+        n, m = (math.ceil(side / STEP) for side in sizes[1])
+        if min(n, m) < FEWEST or (n + 5) * (m + 5) > MOST_KEPT:  # too small for a lattice, or too large to be kept
+            return None
+        fit = all(_fits(value, how, dtype, sizes[1]) for value, how in zip(values, hows, strict=True))
+        return cls(sizes, dtype, tolerance, batched, values, hows) if fit else None
+
+    def __init__(
+        self,
+        sizes: Sizes,
+        dtype: torch.dtype,
+        tolerance: float,
+        batched: bool,
+        values: Sequence[Tensor],
+        hows: Sequence[Sampler | Label],
+    ):
+        count, samplers = len(values[0]), [how for how in hows if isinstance(how, Sampler)]
+        probes = kept_probes(range(sizes[1][0]), sizes[1][1], dtype)
+        padding = PADDINGS[max((PADDINGS.index(how.padding_mode) for how in samplers), default=0)]
+        with torch.inference_mode(False):
+            self._lattices = Lattices(probes, sizes[1], sizes[0], tolerance, padding, count)
+        parts: dict[str, list[bytes]] = {"pixels": [], "turned": [], "images": []}
+        kinds: list[str] = []
+        self._makers: list[Callable[[], Tensor] | None] = []
+        self._kept: list[object] = []  # what the words point to
+        self._tiles = 1
+        for value, how in zip(values, hows, strict=True):
+            make = None
+            if isinstance(how, Sampler):
+                image, make = _planes(value), _maker(value, sizes[1], batched)
+                result = empty(image, count, sizes[1])
+                fill = how.fill * image.shape[1] if len(how.fill) == 1 else how.fill
+                place = (0,) * 8 + self._lattices.places
+                words, holds = packed(image, result, how.mode, how.padding_mode, fill, place)
+                self._kept.append(holds)
+                self._tiles = max(self._tiles, tiles_of(result[:1]))
+            elif how == "pixels":
+                many = value[0].numel() // 2
+                rows = 0, 2 * many, 2, 1, 0, 2 * many, 2, 1, 0, many, max(many, 1), 0
+                words = packed_move(0, 0, 0, 0, 3, 1, count, ON_IMAGE, *sizes[1], *rows)
+            else:
+                each = (3, 1, value.numel() // 3) if how == "rays" else (1, value.shape[-1], value.shape[-1])
+                words = struct.pack("7q", 0, 0, 0, *each, dtype == torch.float64)
+            kinds.append("images" if make is not None else "pixels" if how == "pixels" else "turned")
+            parts[kinds[-1]].append(words)
+            self._makers.append(make)
+        starts = accumulate((len(b"".join(part)) // 8 for part in parts.values()), initial=_HEAD + LATTICE_WORDS)
+        first = dict(zip(parts, starts, strict=False))
+        text = bytes(8 * _HEAD) + bytes(self._lattices.words) + b"".join(map(b"".join, parts.values()))
+        self._words = (ctypes.c_int64 * (len(text) // 8)).from_buffer_copy(text)
+        here, at = ctypes.addressof(self._words), {kind: count_from(first[kind], _WIDTHS[kind]) for kind in parts}
+        images, pixels, turned = ((here + 8 * first[kind], len(parts[kind])) for kind in ("images", "pixels", "turned"))
+        self._words[:_HEAD] = [*images, 1, *pixels, *turned]
+        if count > 1:  # each as soon as its lattice is there
+            self._words[_HEAD + LATTICE_WORDS - 2 : _HEAD + LATTICE_WORDS] = images
+        else:
+            # one thread makes the lattice, and needs no counter of those made
+            self._words[_HEAD + _WIDTHS["pixels"] - 1] = 0
+        self._slots = [(kind, next(at[kind])) for kind in kinds]  # where the pointers to each value go
+        self._first_job, self._jobs, self._has_pixels = first["images"], images[1], pixels[1] > 0
+        self._sizes, self._dtype, self._lead, self._count = sizes, dtype, 0 if batched else 1, count
+        ways = zip(values, hows, strict=True)
+        self._may_shrink = any(
+            isinstance(how, Sampler) and how.mode != "nearest" and value.dtype != torch.bool for value, how in ways
+        )
+
+    def __call__(
+        self, source: Native, target: Native, rotation: Tensor | None, values: Sequence[Tensor], decides: bool
+    ) -> list[tuple[Tensor, Tensor | None]] | None:
+        if decides and self._may_shrink:
+            turns = None if rotation is None else rotation.mT
+            if not _surely_keeps_size(Between(target, source, turns, self._sizes[0], False), self._sizes):
+                return None
+        words, turn, lead, dtype = self._words, 0 if rotation is None else rotation.data_ptr(), self._lead, self._dtype
+        by_camera = 9 if rotation is not None and rotation.numel() > 9 else 0
+        target.add_table()
+        if self._has_pixels:
+            source.add_table()
+        words[_HEAD : _HEAD + 4] = [target.pointer, source.pointer, turn, by_camera]
+        results: list[tuple[Tensor, Tensor | None]] = []
+        given = []  # pixels in the dtype of the cameras, without gaps, for as long as the call
+        for value, (kind, at), make in zip(values, self._slots, self._makers, strict=True):
+            valid = None
+            if make is not None:
+                result = make()
+                words[at], words[at + 1] = value.data_ptr(), result.data_ptr()
+            elif kind == "turned":
+                result = value[0].clone() if lead else value.clone()
+                words[at], words[at + 1], words[at + 2] = turn, value.data_ptr(), result.data_ptr()
+            else:
+                shape = value.shape[lead:]
+                if value.dtype != dtype or not value.is_contiguous():
+                    value = value.to(dtype).contiguous()
+                    given.append(value)
+                result = torch.empty(shape, dtype=dtype, device="cpu")
+                valid = torch.empty(shape[:-1], dtype=torch.bool, device="cpu")
+                words[at : at + 4] = [source.pointer, target.pointer, turn, by_camera]
+                words[at + 10], words[at + 14], words[at + 18] = value.data_ptr(), result.data_ptr(), valid.data_ptr()
+            results.append((result, valid))
+        native, threads, jobs = library(), thread_count(), self._jobs
+        assert native is not None  # or nobody has a `Native`
+        if self._count > 1 and jobs:
+            call, threads, counters = ctypes.byref(words, 8 * _HEAD), min(threads, self._count), self._lattices.counters
+            if run_and_follow(entry("camtorch_lattices", ctypes.c_int64), call, threads, counters, target, source):
+                return None
+            jobs = 0  # the images are made
+        words[1] = jobs
+        words[2] = is_whole = threads == 1 or self._tiles <= _FEW or not jobs
+        while flags := native.camtorch_together(words):
+            if flags & LEFT_MOST:
+                return None
+            # of the lattice, else of the pixels, which go the other way
+            left, (start, end) = (flags, (target, source)) if flags < _PIXELS else (flags // _PIXELS, (source, target))
+            if left & LEFT_FROM:
+                start.follow()
+            if left & LEFT_TO:
+                end.follow()
+            if flags >= _PIXELS:  # the images are made
+                words[1] = 0
+        if not is_whole:
+            for i in range(self._jobs):
+                job = words[self._first_job + i * _WIDTHS["images"] : self._first_job + (i + 1) * _WIDTHS["images"]]
+                run = (ctypes.c_int64 * len(job))(*job)
+                run[-1] = 0
+                spread(lambda: native.camtorch_sample(run), min(threads, self._tiles))  # noqa: B023 (called at once)
+        return results

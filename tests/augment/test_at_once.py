@@ -165,11 +165,19 @@ def odd_samples():
         "expanded": {"image": image[:1].expand(3, -1, -1), "keypoints": pixels[:1].expand(5, -1)},
         "masks": {"image": image[:1], "mask": image[:1] > 99, "mask_b": image[:2].int(), "mask_c": image[0].double()},
         "a batch of one": {"image": image[None], "mask": image[None, 0], "keypoints": pixels[None]},
+        "vectors": {
+            "image": image,
+            "gaze": torch.tensor([0.1, 0.2, -0.9]),
+            "points": torch.cat((torch.rand(7, 3), torch.tensor([[nan, 1.0, 2.0]]))),
+            "landmarks": torch.rand(2, 5, 3),
+            "head_pose": torch.cat((torch.eye(3), torch.rand(3, 1)), 1),
+            "rotation": torch.eye(3).mT,
+        },
         "given flags": {"image": image, "keypoints": pixels[:, None], "keypoints_valid": torch.arange(9)[:, None] % 2},
     }
 
 
-@pytest.mark.parametrize("name", ["mount", "lens", "chain that decides"])
+@pytest.mark.parametrize("name", ["mount", "lens", "chain that decides", "flipped chain"])
 @pytest.mark.parametrize("form", odd_samples())
 def test_odd_samples_as_step_by_step(form, name, monkeypatch):
     sample, camera = odd_samples()[form], example("brown_conrady", SIZE).requires_grad_(False)
