@@ -393,6 +393,17 @@ class Augmentation(SampleTransform):
             target, rotation = scaled(target, factor), None if rotation is None else turned
             self._tell_of_too_few(found, self.min_filled)
             self._tell_of_zoom(source, target, factor, found)
+        return self._between(rows, source, values, target, rotation)
+
+    def _between(
+        self,
+        rows: list[int] | None,
+        source: Camera,
+        values: Mapping[str, Any],
+        target: Camera,
+        rotation: Tensor | None,
+    ) -> Part:
+        """Return the part whose samples go from a source to a target, with what of the values is beside the cameras."""
         beside = self.beside_the_camera.intersection(values)
         more = self._like(source, {name: values[name] for name in values if name in beside}) if beside else {}
         warp = self._warp(source, target, rotation)

@@ -50,7 +50,9 @@ class Drawn:
     rotation: Tensor | None  # (3, 3) or (B, 3, 3), or None
     options: Options  # of the warp that leads to them
     start: Native | None  # the cameras before, for compiled code
-    native: Native | None = None  # these ones, of one
+    native: Native | None  # these ones; None where they have to be found
+    factor: Tensor  # (B,), on the focal lengths, that `min_filled` asks for
+    found: Tensor  # (B,): the share of each image that is filled
     made: Warp | None = field(default=None, init=False)  # the warp, once somebody has asked for it
 
     @cached_property

@@ -171,7 +171,7 @@ class CameraDrawer(Augmentation):
         like = precise(source.intrinsics.detach())
         return self.new_camera(source, {name: torch.as_tensor(value).to(like) for name, value in values.items()})
 
-    def _drawn(self, source: Camera, values: Mapping[str, Any]) -> Drawn | None:
+    def _drawn(self, source: Camera, values: Mapping[str, Any], share: float | None = None) -> Drawn | None:
         """Return what compiled code makes of a draw; None where something is recorded, or it does not know a model."""
         like, tensors = self._held("like"), source._tensors
         if type(self).new_camera is not CameraDrawer.new_camera or isinstance(
@@ -186,24 +186,28 @@ class CameraDrawer(Augmentation):
             base, sized, reach = self._base(source.detach().clone(), values.get("lens"))
             moves = "distortion" in values and base.distortion.shape[-1] > 0
             nominal = self._nominal(base, sized, size, values) if moves else None
-            return Start.of(source, base, sized, reach, size, [*values], nominal)
+            return Start.of(source, base, sized, reach, size, [*values], nominal, share)
 
         size, own = self._size_of(source), like is None and not self._is_real
-        key = "start", type(source), source.image_size, size, *values, self.ranges.get("fov")
+        key = "start", type(source), source.image_size, size, *values, self.ranges.get("fov"), share
         known = None if self._is_real else self._memo.entry(tensors, key)
         found = known[2] if known is not None else start() if self._is_real else self._memo(tensors, key, start)
         return None if found is None else found.drawn(values, source if own else found.base, self.options)
 
     def _part(self, rows: list[int] | None, source: Camera, draw: Mapping[str, Any]) -> Part:
-        simple = self.options["tolerance"] and not self.options["antialias"] and not self.min_filled
-        simple = simple and self.beside_the_camera.isdisjoint(self.ranges) and not source.batch_shape
-        round_images = isinstance(source, PANORAMAS) or isinstance(self._held("like"), PANORAMAS)
-        if simple and not round_images and not isinstance(draw["apply"], Tensor):
-            values = self._values(source, draw)
-            made = self._drawn(source, values)
-            if made is not None and made.start is not None and made.native is not None:
-                return Part(rows, made, source)
-        return super()._part(rows, source, draw)
+        values = self._values(source, draw)
+        made = self._drawn(source, values, self.min_filled)
+        if made is None:
+            return super()._part(rows, source, draw)
+        if self.min_filled:
+            self._tell_of_too_few(made.found, self.min_filled)
+            if bool((made.factor > 1).any()):
+                self._tell_of_zoom(source, made.target, made.factor, made.found)
+        simple = self.options["tolerance"] and not self.options["antialias"] and made.native is not None
+        simple = simple and made.intrinsics.ndim == 1 and self.beside_the_camera.isdisjoint(self.ranges)
+        if simple and not isinstance(source, PANORAMAS) and not isinstance(made.base, PANORAMAS):
+            return Part(rows, made, source)
+        return self._between(rows, source, values, made.target, made.rotation)
 
     def _warp(self, source: Camera, target: Camera, rotation: Tensor | None) -> Warp:
         return Warp.unchecked(source, target, self.options).turned_by(rotation)

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from camtorch.augment.change import Drawn
+from camtorch.augment.filling import looked_at, with_care
 from camtorch.augment.jitter import DRAWN, PARTS, border, defined_or, lens_ends, measured_once, sensitivity
 from camtorch.cameras.camera import Camera
 from camtorch.optics.radial_inverse import TABLE_WIDTH
@@ -36,7 +37,7 @@ from camtorch.warp.sampling import Options
 _SIZES = {"centre": 2, "distortion": DRAWN, "place": 2}
 _KINDS = "yaw", "pitch", "roll", "zoom", "fov", "focal", "centre", "distortion", "crop", "place"
 _TURNS = {"yaw", "pitch", "roll"}
-_LEFT_BASE, _LEFT_LENS, _LEFT_ENDS, _TOO_WIDE, _NO_CAMERA = 1, 2, 4, 8, 16
+_LEFT_BASE, _LEFT_LENS, _LEFT_ENDS, _TOO_WIDE, _NO_CAMERA, _LEFT_SOURCE = 1, 2, 4, 8, 16, 32
 
 
 class _Draws(ctypes.Structure):
@@ -44,10 +45,14 @@ class _Draws(ctypes.Structure):
 
     _fields_ = fields(
         "*values first cameras count height width is_each *sized *reach *coefficients *sensitivity *ends *base *border "
-        "*places domain *tries *tried *allowed *room made *rotations *distortion followed",
+        "*places domain *tries *tried *allowed share *source source_height source_width "
+        "*looked_at *factors *filled *room made *rotations *distortion followed",
         first=c_int64 * len(_KINDS),
         height=c_double,
         width=c_double,
+        share=c_double,
+        source_height=c_double,
+        source_width=c_double,
         domain=DomainStruct,
         made=CamerasStruct,
     )
@@ -66,13 +71,16 @@ class Start:
             rows_of(camera, *[t.expand(*camera.batch_shape, t.shape[-1]) for t in camera._tensors])
             for camera in (source, base)
         )
-        if cameras.native is None or cameras.usable is not None or before.usable is not None:
+        if before.native is None or cameras.native is None:
             return None
-        return cls(before.native, base, cameras.native, *numbers)
+        if cameras.usable is not None or before.usable is not None:
+            return None
+        return cls(source, before.native, base, cameras.native, *numbers)
 
     def __init__(
         self,
-        before: Native | None,
+        source: Camera,
+        before: Native,
         base: Camera,
         native: Native,
         sized: Tensor,
@@ -80,11 +88,12 @@ class Start:
         size: tuple[int, int],
         names: Sequence[str],
         nominal: Tensor | None,
+        share: float | None,
     ):
         """Of intrinsics `sized`, (4,) or (B, 4) in float64, before images of a size.
 
         reach: see `lenses.drawing.Lenses`. names: of the values that are drawn. nominal: intrinsics (*B, 4) of the lens
-        by which coefficients are measured, if they move.
+        by which coefficients are measured, if they move. share: of each image that has to be filled, if any has to.
         """
         self.before, self.base, self.size, self._native = before, base, size, native
         self._names = [name for name in _KINDS if name in names]
@@ -101,6 +110,11 @@ class Start:
         call.base, call.made, call.made.usable = native.pointer, native.struct, None
         call.sized = self._keep(sized)
         call.reach = None if reach is None else self._keep(reach.double())
+        if share:
+            call.share, call.source = with_care(share), before.pointer
+            call.source_height, call.source_width = source._size_for("min_filled")
+            call.looked_at = self._keep(looked_at(size, native.dtype))
+            before.add_table()
         if nominal is not None:
             self._add_coefficients(nominal)
 
@@ -145,6 +159,8 @@ class Start:
         room = torch.empty(rows * self._room, dtype=native.dtype, device="cpu")
         call.cameras = call.made.cameras = rows
         call.room = room.data_ptr()
+        filled = torch.empty(2, rows, dtype=torch.float64, device="cpu")
+        call.factors, call.filled = filled.data_ptr(), filled.data_ptr() + 8 * rows
         tries = self._tries(values, rows, call) if self._moves and not self._knows else None
         kept = [room]
         while (left := _run(call)) & ~_NO_CAMERA:
@@ -153,6 +169,8 @@ class Start:
                 raise ValueError(f"fov: a {base.key} lens of these coefficients does not reach {widest:g} degrees")
             if left & _LEFT_BASE:
                 native.follow()
+            if left & _LEFT_SOURCE:
+                self.before.follow()
             if left & _LEFT_ENDS:
                 ends = measured_once(lens_ends, remade(self.base, image_size=self.size), self._distortion)
                 self._call.ends = call.ends = self._keep(ends, *ends.shape[-2:])
@@ -172,11 +190,12 @@ class Start:
             made = Native.made(native, call.made, (call, kept, self), lenses)
         elif is_one and not left:
             made = single_native(model_of(self.base), intrinsics, k[0])
+        turned = rotation.view(rows, 3, 3) if self._turns else None
         if is_one:
-            rotated, k = rotation.view(3, 3), k[0] if self._moves else k
+            turned, k = None if turned is None else turned[0], k[0] if self._moves else k
         else:
-            intrinsics, rotated = intrinsics.view(rows, 4), rotation.view(rows, 3, 3)
-        return Drawn(base, intrinsics, k, self.size, rotated if self._turns else None, options, self.before, made)
+            intrinsics = intrinsics.view(rows, 4)
+        return Drawn(base, intrinsics, k, self.size, turned, options, self.before, made, filled[0], filled[1])
 
     def _tries(self, values: Mapping[str, Any], rows: int, call: _Draws) -> Native:
         """Make the lenses that compiled code chooses among, of a model whose domain it does not make by itself."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
+from functools import lru_cache, partial
 
 import torch
 from torch import Tensor
@@ -32,15 +32,20 @@ def filled(source: Camera, target: Camera, rotation: Tensor | None) -> Tensor:
 
 
 def _points(camera: Camera) -> Tensor:
-    """Return the pixels (N, 2) that `filled` looks at, spread evenly without rows, and those of the rim at the end."""
-    height, width = camera.height, camera.width
-    # a rim might run along rows; so multiples of the inverse powers of the root of x^3 = x + 1, modulo 1
-    steps = torch.arange(1, _POINTS + 1, dtype=torch.float64)[:, None]
-    spread = (steps / torch.tensor([_ROOT, _ROOT**2], dtype=torch.float64)).frac()
-    corners = spread.new_tensor([[0, 0], [1, 0], [1, 1], [0, 1]])
-    # half a pixel in, at the centres of the outermost pixels
-    rim = along_edges(corners * spread.new_tensor([width - 1, height - 1]), _RIM)
-    return torch.cat((spread * spread.new_tensor([width, height]) - 0.5, rim)).to(camera.intrinsics)
+    return looked_at((camera.height, camera.width), camera.intrinsics.dtype).to(camera.intrinsics.device)
+
+
+@lru_cache(maxsize=16)
+def looked_at(size: tuple[int, int], dtype: torch.dtype) -> Tensor:
+    """Return the pixels (N, 2) of images of a size that `filled` looks at: spread without rows, and then the rim's."""
+    height, width = size
+    with torch.inference_mode(False):
+        steps = torch.arange(1, _POINTS + 1, dtype=torch.float64, device="cpu")[:, None]
+        spread = (steps / steps.new_tensor([_ROOT, _ROOT**2])).frac()
+        corners = spread.new_tensor([[0, 0], [1, 0], [1, 1], [0, 1]])
+        # half a pixel in, at the centres of the outermost pixels
+        rim = along_edges(corners * spread.new_tensor([width - 1, height - 1]), _RIM)
+        return torch.cat((spread * spread.new_tensor([width, height]) - 0.5, rim)).to(dtype)
 
 
 def _part_shown(
@@ -67,12 +72,16 @@ def scaled(camera: Camera, factor: Tensor) -> Camera:
 
 def enough(source: Camera, target: Camera, rotation: Tensor | None, share: float) -> tuple[Tensor, Tensor, Tensor]:
     """Return the zoom (*B,) and the rotation (*B, 3, 3), turned less far, that fill `share`, and the part filled."""
-    share = min(share + _CARE, 1.0)
     with torch.no_grad():
         if rotation is None:
             rotation = torch.eye(3, dtype=target.intrinsics.dtype, device=target.intrinsics.device)
-        factor, turned, found = _enough(source.detach(), target.detach(), rotation, share)
+        factor, turned, found = _enough(source.detach(), target.detach(), rotation, with_care(share))
         return factor, turned, found
+
+
+def with_care(share: float) -> float:
+    """Return the share of points for which a share of the image is surely filled."""
+    return min(share + _CARE, 1.0)
 
 
 def _shapes(

@@ -7,9 +7,14 @@
 #include "small.h"
 
 #define PI 3.14159265358979323846
+#define NEARLY 0.999
+#define MOST_ZOOM 4.0 /* before the camera turns back */
+#define FAR_ZOOM 1000.0 /* of a camera that is not turned */
+enum { HALVINGS = 10 };
 #define FOLD 0.98 /* of the image's radius at the end of a lens; see lenses/drawing.py */
 
 int64_t THIS(geometry)(const Rows *);
+int64_t THIS(moves)(const Move *);
 void THIS(domain)(const Domain *);
 
 static double number(const void *from, int64_t at, int64_t is_double) {
@@ -107,10 +112,11 @@ static void ask(const Draws *d, Cameras *lens, const double *parameters, int lim
 }
 
 /* Coefficients that move by drawn amounts: as far, or a part of it, as leaves the outline of the image invertible */
-static int64_t bend(Draws *d, int64_t c, const double *f) {
+static int64_t bend(Draws *d, int64_t c, const double *f, Cameras *found) {
     static const double parts[TRIES + 1] = {1, -1, 0.5, -0.5, 0.25, -0.25, 0.125, -0.125, 0};
     const int64_t is_double = d->made.is_double, each = d->is_each ? c : 0, wide = d->made.parameter_count;
     const Cameras made = only(&d->made, c);
+    Cameras lens = *found;
     const void *given = row(d, d->coefficients, each, d->count);
     void *k = row(d, d->distortion, c, d->count);
     double rim[4 * RIM], rays[6 * RIM], parameters[wide];
@@ -120,8 +126,8 @@ static int64_t bend(Draws *d, int64_t c, const double *f) {
     if (n < 0) return -n;
     for (int i = 0; i <= TRIES; i++) {
         const int64_t at = c * TRIES + i;
-        Cameras lens = made;
         int followed = 0;
+        lens = d->tries ? *found : made;
         if (d->tries && i < TRIES) {
             if (d->allowed && !d->allowed[at]) continue;
             lens = only(d->tries, at), lens.intrinsics = made.intrinsics;
@@ -151,6 +157,7 @@ static int64_t bend(Draws *d, int64_t c, const double *f) {
         d->followed += followed;
         break;
     }
+    *found = lens;
     return 0;
 }
 
@@ -162,6 +169,99 @@ static void turned(const Draws *d, int64_t c) {
     const double elements[9] = {ca * cc + right * sc, cb * sc, ahead * sc - sa * cc,
                                 right * cc - ca * sc, cb * cc, sa * sc + ahead * cc, sa * cb, -sb, ca * cb};
     for (int i = 0; i < 9; i++) put(row(d, d->rotations, c, 9), i, elements[i], d->made.is_double);
+}
+
+/* The part of a turn; `rotation_vector`, and its way back, by a quaternion */
+static void turned_less(const double *m, double part, double *turn) {
+    const double x = m[7] - m[5], y = m[2] - m[6], z = m[3] - m[1], xy = m[1] + m[3], yz = m[5] + m[7], zx = m[2] + m[6];
+    const double all[4][4] = {{1 + m[0] + m[4] + m[8], x, y, z}, {x, 1 + m[0] - m[4] - m[8], xy, zx},
+                              {y, xy, 1 - m[0] + m[4] - m[8], yz}, {z, zx, yz, 1 - m[0] - m[4] + m[8]}};
+    int largest = 0;
+    for (int i = 1; i < 4; i++) largest = all[i][i] > all[largest][largest] ? i : largest;
+    const double *q = all[largest], size = sqrt(dot(q + 1, q + 1)), half = part * atan2(size, fabs(q[0]));
+    const double by = (q[0] < 0 ? -1 : 1) * sin(half) / (size > 0 ? size : 1), w = cos(half);
+    const double a = q[1] * by, b = q[2] * by, c = q[3] * by;
+    const double made[9] = {1 - 2 * (b * b + c * c), 2 * (a * b - w * c), 2 * (a * c + w * b),
+                            2 * (a * b + w * c), 1 - 2 * (a * a + c * c), 2 * (b * c - w * a),
+                            2 * (a * c - w * b), 2 * (b * c + w * a), 1 - 2 * (a * a + b * b)};
+    memcpy(turn, made, sizeof made);
+}
+
+/* The share of a new image that shows something of the source, if the camera is turned and zooms; 1 where its whole rim
+   does. Less than zero: a flag of what is left */
+static double shown(const Draws *d, int64_t c, const Cameras *lens, const double *turn, double zoom) {
+    const int64_t is_double = d->made.is_double;
+    const Cameras source = only(d->source, c);
+    double pixels[2 * LOOKED_AT], moved[2 * LOOKED_AT], turns[9];
+    uint8_t valid[LOOKED_AT];
+    for (int i = 0; i < 9; i++) put(turns, i, turn[i], is_double);
+    for (int i = 0; i < 2 * LOOKED_AT; i++) {
+        const double centre = number(lens->intrinsics, 2 + i % 2, is_double), pixel = number(d->looked_at, i, is_double);
+        put(pixels, i, centre + (pixel - centre) / zoom, is_double);
+    }
+    const Move call = {.from = lens, .to = &source, .turns = turns, .turn_strides = {0, 1, 3}, .cameras = 1, .form = ON_IMAGE,
+                       .height = d->source_height, .width = d->source_width, .rows = pixels, .row_strides = {0, 2, 1},
+                       .results = moved, .result_strides = {0, 2, 1}, .valid = valid, .count = LOOKED_AT, .tile = LOOKED_AT};
+    const int64_t left = THIS(moves)(&call);
+    if (left) return -(double)left;
+    int count = 0;
+    for (int i = 0; i < SPREAD; i++) count += valid[i];
+    const double part = count / (double)SPREAD;
+    return all(valid + SPREAD, LOOKED_AT - SPREAD) ? part : fmin(part, NEARLY);
+}
+
+/* Zooms, up to MOST_ZOOM, and then turns less far, until enough of the image shows something; `enough`. A flag of what is
+   left, as of moves */
+static int64_t fill(const Draws *d, int64_t c, const Cameras *lens) {
+    static const double parts[] = {1, 0.5, 0.25, 0};
+    double given[9], turn[9], found, best = 1;
+    int is_straight = 1;
+    for (int i = 0; i < 9; i++) {
+        given[i] = turn[i] = number(row(d, d->rotations, c, 9), i, d->made.is_double);
+        is_straight &= given[i] == (i % 4 == 0);
+    }
+    found = shown(d, c, lens, given, 1);
+    if (found < 0) return (int64_t)-found;
+    for (int i = is_straight ? 3 : 0; i < 4 && found < d->share; i++) {
+        double low = 1, high = i < 3 ? MOST_ZOOM : FAR_ZOOM, now = found;
+        const double most = high;
+        if (i && !is_straight) {
+            turned_less(given, parts[i], turn);
+            if ((now = shown(d, c, lens, turn, 1)) < 0) return (int64_t)-now;
+        }
+        if (now >= d->share) high = 1;
+        for (int count = 0; count < HALVINGS && high > 1; count++) {
+            const double middle = sqrt(low * high), here = shown(d, c, lens, turn, middle);
+            if (here < 0) return (int64_t)-here;
+            if (here >= d->share) high = middle, now = here;
+            else low = middle;
+        }
+        if (high == most && (now = shown(d, c, lens, turn, high)) < 0) return (int64_t)-now;
+        if (!(now > found)) continue;
+        found = now, best = high;
+        for (int j = 0; j < 9; j++) put(row(d, d->rotations, c, 9), j, turn[j], d->made.is_double);
+    }
+    for (int i = 0; i < 2; i++) {
+        const double focal = number(lens->intrinsics, i, d->made.is_double);
+        put((void *)lens->intrinsics, i, focal * best, d->made.is_double);
+    }
+    d->factors[c] = best, d->filled[c] = found;
+    return 0;
+}
+
+/* The same, with what it needs to know of a lens and of the source that is known already, or is found for a new lens */
+static int64_t fill_knowing(Draws *d, int64_t c, Cameras *lens) {
+    int64_t left = fill(d, c, lens);
+    if (left & LEFT_FROM && d->places && d->sensitivity && d->made.limits2) {
+        const Cameras made = only(&d->made, c);
+        double parameters[made.parameter_count];
+        for (int64_t j = 0; j < made.parameter_count; j++) parameters[j] = number(made.parameters, j, d->made.is_double);
+        lens->limits2 = made.limits2, lens->extent = made.extent;
+        ask(d, lens, parameters, 1);
+        d->followed++;
+        left = fill(d, c, lens);
+    }
+    return (left & LEFT_FROM ? d->sensitivity ? LEFT_LENS : LEFT_BASE : 0) | (left & LEFT_TO ? LEFT_SOURCE : 0);
 }
 
 /* Where what is made lies */
@@ -191,7 +291,9 @@ int64_t THIS(draws)(Draws *d) {
     for (int64_t c = 0; c < d->cameras; c++) {
         double f[4];
         int64_t here = place(d, c, f);
-        if (!here && d->sensitivity) here = bend(d, c, f);
+        Cameras lens = only(d->base, c); /* of the new camera */
+        lens.intrinsics = row(d, d->made.intrinsics, c, 4);
+        if (!here && d->sensitivity) here = bend(d, c, f, &lens);
         left |= here;
         if (here) continue;
         const double share = drawn(d, CROP, 1, c, 0, 1); /* a part of the image, enlarged to the full size */
@@ -203,6 +305,7 @@ int64_t THIS(draws)(Draws *d) {
             left |= isfinite(f[i]) && (i > 1 || f[i] > 0) ? 0 : NO_CAMERA;
         }
         turned(d, c);
+        if (d->share > 0 && !(left & NO_CAMERA)) left |= fill_knowing(d, c, &lens);
     }
     return left;
 }

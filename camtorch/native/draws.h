@@ -9,9 +9,10 @@ enum { YAW, PITCH, ROLL, ZOOM, WIDTH, FOCAL, CENTRE, DISTORTION, CROP, PLACE, DR
 enum { AMOUNTS = 16 };
 enum { TRIES = 8 }; /* of steps of the coefficients, before they stay as they are */
 enum { RIM = 128 }; /* pixels along the edges of the image, and points of the plane along the end of a lens */
-/* What is left to do: the limits of azimuths of the base, and of new lenses, and the ends of the base; or why there are no
+/* What is left to do: the limits of azimuths of the base, new lenses and the source, and the ends of the base; or why there are no
    cameras: the lens does not reach that far, and a focal length is not positive, or a number not finite */
-enum { LEFT_BASE = 1, LEFT_LENS = 2, LEFT_ENDS = 4, TOO_WIDE = 8, NO_CAMERA = 16 };
+enum { LEFT_BASE = 1, LEFT_LENS = 2, LEFT_ENDS = 4, TOO_WIDE = 8, NO_CAMERA = 16, LEFT_SOURCE = 32 };
+enum { SPREAD = 1000, LOOKED_AT = SPREAD + 64 }; /* pixels of a new image that are looked at, those of its rim at the end */
 
 /* Cameras (c) like others that move by drawn values. What is not wanted is NULL; numbers whose type is void are of that of
    the cameras */
@@ -33,6 +34,11 @@ typedef struct {
     const Cameras *tries;        /* (c TRIES): new lenses that were made elsewhere, and their (count) coefficients; or NULL */
     const void *tried;
     const uint8_t *allowed;      /* (c TRIES): which of those have a formula; NULL: all */
+    double share;                /* of each new image that has to show something of the source; 0: none has to */
+    const Cameras *source;       /* (c), or one for all, of images of that size */
+    double source_height, source_width;
+    const void *looked_at;       /* (LOOKED_AT, 2): pixels */
+    double *factors, *filled;    /* (c): on the focal lengths, for that, and the share that is filled */
     void *room;                  /* for all that is made: of each camera 4 + 9 + count numbers, and, if `places` are given,
                                     its parameters, 4, and a table */
     Cameras made;                /* the new cameras; as given, what else the base has of its lens, which a new one then has */

@@ -310,13 +310,15 @@ class Native:
     dtype: torch.dtype
     parameters: int
     pointer: int
+    _kept: object
+    _make_lenses: Callable[[Native], Lenses]
 
     def __init__(self, lenses: Lenses, intrinsics: Tensor, usable: Tensor | None):
         """See `native_of`."""
         self.lenses, self.plan, self.struct = lenses, lenses.plan, CamerasStruct.from_buffer_copy(lenses.struct)
-        self._kept = intrinsics.contiguous(), None if usable is None else (usable > 0).contiguous()
+        kept = self._kept = intrinsics.contiguous(), None if usable is None else (usable > 0).contiguous()
         self.cameras, self.dtype, self.parameters = intrinsics.shape[0], intrinsics.dtype, lenses.plan.parameters
-        self.struct.intrinsics, self.struct.usable = map(address, self._kept)
+        self.struct.intrinsics, self.struct.usable = map(address, kept)
         self.pointer = addressof(self.struct)
 
     @classmethod

@@ -5,6 +5,7 @@ import torch
 from cameras import KEYS, slow_unless, spread
 
 import camtorch as ct
+from camtorch.augment.filling import enough, scaled
 from camtorch.native.library import native_available
 from camtorch.projection import native_cameras
 
@@ -17,10 +18,13 @@ AUGMENTATIONS = {
     "camera": lambda: A.RandomCamera(crop=(0.5, 1), image_size=(90, 140)),
     "family": lambda: A.RandomCamera("kannala_brandt", fov=(50, 130), distortion=0.1),
     "source": lambda: A.RandomCamera("fisheye624", fov="source", yaw=None),
+    "filled": lambda: A.RandomMount(yaw=40, min_filled=0.9),
+    "filled lens": lambda: A.RandomLens(focal=(0.5, 0.8), distortion=0.1, min_filled=0.8),
+    "turned back": lambda: A.RandomCamera("pinhole", fov=(60, 80), yaw=(120, 130), min_filled=0.5),
     "real": lambda: A.RandomLens("real", fov=(60, 120), centre=0.1, distortion=0.2),
 }
 CASES = [(key, name, dtype) for key in KEYS for name in AUGMENTATIONS for dtype in (torch.float32, torch.float64)]
-EACH_LENS = {"mount", "lens", "bent"}
+EACH_LENS = {"mount", "lens", "bent", "filled"}
 
 
 @pytest.mark.parametrize("count", [1, 4])
@@ -28,13 +32,16 @@ EACH_LENS = {"mount", "lens", "bent"}
     ("key", "name", "dtype"),
     slow_unless(lambda case: case[1] in EACH_LENS or case[0] in ("brown_conrady", "mei"), CASES),
 )
-def test_as_the_formula(key, name, dtype, count):
+def test_as_the_formula(key, name, dtype, count, recwarn):
     source = spread(key, torch.float32).requires_grad_(False).resize(120, 160).to(dtype)
     augmentation = AUGMENTATIONS[name]()
     draw = augmentation.draw(count, torch.Generator().manual_seed(count))
     change = augmentation.change(source, draw)
     values = {name: value if count > 1 else value[0] for name, value in draw.items() if name != "apply"}
     expected, rotation = augmentation.new_camera(source, values)
+    if augmentation.min_filled:
+        factor, turned, _ = enough(source, expected, rotation, augmentation.min_filled)
+        expected, rotation = scaled(expected, factor), None if rotation is None else turned
     found = change.target if count > 1 else change.target[0]
     assert type(found) is type(expected)
     assert found.image_size == expected.image_size
