@@ -39,6 +39,7 @@ from camtorch.augment.kinds import (
 )
 from camtorch.augment.landmarks import Mirroring, exchanged
 from camtorch.cameras.camera import Camera
+from camtorch.evaluate.kept import Kept
 from camtorch.evaluate.known import are_numbers, in_worker
 from camtorch.evaluate.private import pytree
 from camtorch.models import Pinhole
@@ -73,7 +74,6 @@ class Frames(Single):
 
 
 _MANY = 1 << 15  # coordinates of a batch from which on threads share them
-_MOST_FORMS = 16  # of samples that a transform remembers
 
 
 class Unknown(Pinhole):
@@ -187,7 +187,7 @@ class SampleTransform(KeepsCamera, nn.Module):
         self.antialias: bool | None = None if antialias is None else self.options["antialias"]
         self.mask_fill: float = as_number(mask_fill, "mask_fill", self._name)
         self.valid_mask: bool = as_flag(valid_mask, "valid_mask", self._name)
-        self._forms: dict[tuple[Any, ...], tuple[list[tuple[str, str]], bool, int]] = {}
+        self._forms = Kept(16)
 
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
@@ -254,7 +254,7 @@ class SampleTransform(KeepsCamera, nn.Module):
 
     def _clips(self, sample: Sample, kinds: Mapping[str, str] | None = None) -> Clips | None:
         """Return the clips of a sample, if an image has the dims (B, T, C, H, W)."""
-        if isinstance(sample, Single) or all(getattr(value, "ndim", 0) != 5 for value in sample.values()):
+        if isinstance(sample, Single) or 5 not in [getattr(value, "ndim", 0) for value in sample.values()]:
             return None
         fields = {**self.fields, **(kinds or {})}
         given = {name: value for name, value in sample.items() if name not in OWN and value is not None}
@@ -291,19 +291,19 @@ class SampleTransform(KeepsCamera, nn.Module):
         camera = self._held("camera") if camera is None else camera
         fields = {**self.fields, **kinds} if kinds else self.fields
         form = self._form_of(sample, camera, fields)
-        if form is None or (known := self._forms.get(form)) is None:
+        known = None if form is None else self._forms.entry((), form)
+        if known is None:
             result = self._checked_batch(sample, camera, fields, predicted)
-            named, batched, count, _ = result
+            named, batched, count, own = result
             if (
                 form is not None
-                and result[3] is camera
+                and own is camera
                 and all(found in IMAGES or sample[name].dtype.is_floating_point for name, (found, _) in named.items())
             ):
-                while len(self._forms) >= _MOST_FORMS:
-                    self._forms.pop(next(iter(self._forms)), None)
-                self._forms[form] = [(name, found) for name, (found, _) in named.items()], batched, count
+                fields_of_form = [(name, found) for name, (found, _) in named.items()]
+                self._forms((), form, lambda: (fields_of_form, batched, count))
             return result
-        own, batched, count = known
+        own, batched, count = known[2]
         if not predicted:
             for name, found in own:
                 if found in CHECKED:
@@ -577,7 +577,8 @@ def together(
         return {}
     options = part.moves.options
     mode, padding_mode, fill = options["mode"], options["padding_mode"], options["fill"]
-    moved, hows = part.moves if isinstance(part.moves, Drawn) and is_single else None, dict[str, Sampler | Label]()
+    moved = part.moves if isinstance(part.moves, Drawn) and is_single else None
+    hows: dict[str, Sampler | Label] = {}
     for name, (found, value) in named.items():
         if found in ("depth", "distance") or isinstance(value, list):  # which ask for positions again
             return {}

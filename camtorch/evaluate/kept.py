@@ -31,7 +31,7 @@ class Kept:
 
     def __call__(self, inputs: Sequence[Tensor], options: tuple[Any, ...], compute: Callable[[], T]) -> T:
         """`compute()` without a graph, or its kept result; it depends on the tensors `inputs` and on `options`."""
-        if not is_eager(*inputs) and not all(is_concrete(t) and not has_tangent(t) for t in inputs):
+        if inputs and not is_eager(*inputs) and not all(is_concrete(t) and not has_tangent(t) for t in inputs):
             return compute()
         if (entry := self.entry(inputs, options)) is not None:
             found: T = entry[2]
@@ -44,10 +44,6 @@ class Kept:
             result = compute()
         self._kept, self.result = [(options, notes, result), *self._kept[: self.capacity - 1]], result
         return result
-
-    def is_of(self, inputs: Sequence[Tensor], options: tuple[Any, ...]) -> bool:
-        """Whether `result` is that of these inputs, whose values may be looked at, and options."""
-        return bool(self._kept) and options == self._kept[0][0] and all(map(same, inputs, self._kept[0][1]))
 
     def entry(
         self, inputs: Sequence[Tensor], options: tuple[Any, ...]

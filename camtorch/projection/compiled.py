@@ -7,8 +7,8 @@ import functools
 import operator
 import struct
 import threading
-from collections.abc import Callable, Sequence
-from ctypes import addressof, c_bool, c_double, c_float, c_int64
+from collections.abc import Callable
+from ctypes import addressof, c_int64
 from itertools import accumulate
 from typing import NamedTuple
 
@@ -31,15 +31,6 @@ LATTICE_WORDS = _LATTICES.size // 8
 POSITIONS, PIXELS, ON_IMAGE = range(3)
 LEFT_FROM, LEFT_TO, LEFT_MOST = 1, 2, 4
 _NO_ROWS = (0, 0, 0, 0)
-
-
-def project_numbers(native: Native, points: Sequence[float]) -> list[float] | None:
-    """x, y, z of some points to u, v of their pixels, by one camera; None where one is not valid."""
-    kind, count = (c_double if native.dtype == torch.float64 else c_float), len(points) // 3
-    given, pixels, valid = (kind * len(points))(*points), (kind * (2 * count))(), (c_bool * count)()
-    rows = addressof(given), 0, 3, 1, addressof(pixels), 0, 2, 1, addressof(valid), 0, *_NO_ROWS, 0
-    _call_and_follow(native, 1, count, PROJECT, rows)
-    return list(pixels) if all(valid) else None
 
 
 def project(native: Native, points: Tensor) -> tuple[Tensor, Tensor]:

@@ -135,10 +135,10 @@ def on_one_thread(function: Callable[P, R]) -> Callable[P, R]:
 
     @wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> R:
-        if torch.compiler.is_compiling() or in_jit_trace() or _limits is None or _mine.threads:
+        if torch.compiler.is_compiling() or _limits is None or _mine.threads:
             return function(*args, **kwargs)
         threads = torch.get_num_threads()
-        if threads == 1:
+        if threads == 1 or in_jit_trace():
             return function(*args, **kwargs)
         _mine.threads = threads
         openmp, mkl = _limits  # torch.set_num_threads reaches other threads as well

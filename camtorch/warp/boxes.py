@@ -56,12 +56,8 @@ def enclosed(warp: CameraPair, corners: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def edges_of(boxes: Tensor) -> Tensor:
-    """(..., N, 2): the points along the edges of plain boxes (..., 4) that are moved to enclose them."""
-    given = boxes.numpy()
-    start, end = given[..., None, [[0, 1], [2, 1], [2, 3], [0, 3]]], given[..., None, [[2, 1], [2, 3], [0, 3], [0, 1]]]
-    share = np.arange(_EDGE_SAMPLES, dtype=given.dtype)[:, None, None] / _EDGE_SAMPLES
-    points = (start + (end - start) * share).swapaxes(-3, -2)
-    return torch.from_numpy(points.reshape(*boxes.shape[:-1], 4 * _EDGE_SAMPLES, 2))
+    """(..., N, 2): the points along the edges of boxes (..., 4) that are moved to enclose them."""
+    return along_edges(corners_of(boxes), _EDGE_SAMPLES)
 
 
 def enclosing(boxes: Tensor, moved: Tensor, on_image: Tensor) -> tuple[Tensor, Tensor] | None:

@@ -121,7 +121,7 @@ def ready(warp: CameraPair, images: object, mode: str | None, padding: str | Non
         return call
     if images.dtype.is_floating_point and keeps_graph(*inputs):
         return None
-    return call if warp._kept.is_of(inputs, warp._options) else None
+    return None if warp._kept.entry(inputs, warp._options) is None else call
 
 
 def _form(warp: CameraPair, images: Tensor, mode: str, padding: str) -> tuple[object, ...]:
@@ -338,16 +338,12 @@ def at_once(
         rotation = rotation.detach().to(source.dtype).contiguous()
     given = sizes, source.dtype, tolerance, batched
     forms = [(t.shape, t.stride(), t.dtype, how) for t, how in zip(values, hows, strict=True)]
-    call = _calls.kept((), (*given, *forms), lambda: _Together.of(*given, values, hows))
+    calls: Kept = _calls.__dict__.setdefault("kept", Kept(_MOST_FORMS))
+    call = calls((), (*given, *forms), lambda: _Together.of(*given, values, hows))
     return None if call is None else call(source, target, rotation, values, antialias is None)
 
 
-class _Calls(threading.local):
-    def __init__(self) -> None:
-        self.kept = Kept(_MOST_FORMS)
-
-
-_calls = _Calls()
+_calls = threading.local()  # a thread's calls have memory of their own
 
 
 @functools.lru_cache(maxsize=16)
