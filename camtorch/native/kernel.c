@@ -1,8 +1,9 @@
 /* Samples images where a warp says, in tiles of rows: one variant, for the instructions that it is compiled for.
  *
- * A tile goes by columns of chunks, a chunk row by row, eight pixels at a time, or 16 or 32 (see `wide`). Their positions come from a grid or from a lattice, between whose
- * nodes lie cubics. Eight pixels that read inside of the image alone take a way without branches; all others go one
- * by one through `sample_at`, and all where tests ask for that.
+ * A tile goes by columns of chunks, a chunk row by row. Positions come from a grid or from a lattice, between whose
+ * nodes lie cubics. Pixels are made eight at a time in floats (`eight`), with AVX2 bytes in fixed point
+ * (`fixed_point`), and with AVX-512 up to 32 at a time (`wide`). What they cannot make goes one by one through
+ * `sample_at`, and so does everything in the variant without vectors, with which tests compare the others.
  */
 #include "sampler.h"
 
@@ -292,6 +293,9 @@ INLINE I8 least8(I8 a, I8 b) {
 
 /* What is not a number fails every comparison, and stays */
 INLINE V8 clamped8(V8 x, float last) {
+#if defined(__AVX2__)
+    return (V8)_mm256_max_ps(_mm256_setzero_ps(), _mm256_min_ps(_mm256_set1_ps(last), (__m256)x));
+#endif
     const I8 low = x < every8(0), high = x > every8(last);
     return (V8)(((I8)x & ~low & ~high) | ((I8)every8(last) & high));
 }
@@ -577,19 +581,8 @@ INLINE int shows_nothing(const Job *job, V8 u, V8 v, int mode) {
 
 INLINE void eight(const Span *span, const float *at_u, const float *at_v, int type, int mode, int layout) {
     const Job *job = span->job;
-    V8 u = load8(at_u), v = load8(at_v);
+    const V8 u = load8(at_u), v = load8(at_v);
     int done = 0;
-    if (job->padding == BORDER && mode != BICUBIC) {
-        u = clamped8(u, (float)(job->source_width - 1));
-        v = clamped8(v, (float)(job->source_height - 1));
-    }
-    if (job->padding == REFLECTION && mode != BICUBIC && !inside(job, u, v, 0, 0)) {
-        const V8 far = every8(2097152.0f);
-        if (all8((u > -far) & (u < far) & (v > -far) & (v < far))) {
-            u = reflected8(u, (float)job->source_width);
-            v = reflected8(v, (float)job->source_height);
-        }
-    }
     if (mode == NEAREST) {
         if (inside(job, u, v, 0, 0)) {
             nearest8(span, u, v, type);
@@ -772,7 +765,7 @@ typedef struct {
     int64_t channels, from_plane, below, to_plane, width, height;
 } Image;
 
-/* A constant that stays in its register, where compilers would make it anew each time */
+/* Keeps a constant in a register: compilers make it again for each use */
 INLINE __m256i kept(__m256i constant) {
     __asm__("" : "+x"(constant));
     return constant;
@@ -786,57 +779,59 @@ INLINE Weights kept_weights(void) {
     return (Weights){kept(_mm256_set1_epi16(0x4040)), kept(_mm256_set1_epi16(0x40c0)), kept(_mm256_set1_epi16(128))};
 }
 
-/* Between the two bytes of each word, at 2 t - 1 in 2^-15; the result in 2^-7 */
+/* Interpolates between the two bytes of each word, at 2 t - 1 in 2^-15; the result in 2^-7 */
 INLINE __m256i across16(const Weights *by, __m256i pairs, __m256i t) {
     const __m256i difference = _mm256_maddubs_epi16(pairs, by->difference);
     return _mm256_add_epi16(_mm256_maddubs_epi16(pairs, by->sum), _mm256_mulhrs_epi16(difference, t));
 }
 
-/* Between two such results, in the upper bytes of words */
+/* Interpolates between two such results; the upper bytes of words are the result */
 INLINE __m256i down16(const Weights *by, __m256i a, __m256i b, __m256i t) {
     const __m256i sum = _mm256_add_epi16(_mm256_add_epi16(a, b), by->half);
     return _mm256_add_epi16(sum, _mm256_mulhrs_epi16(_mm256_sub_epi16(b, a), t));
 }
 
-/* Of bytes of 32 bits each, those of eight pixels with so many channels in the order of the pixels: from two registers of
- * words, whose upper bytes they are, the first pixels of each half in the first one */
+/* Stores eight pixels of three or four channels: the upper bytes of words, of pixels 0, 1, 4, 5 in the first register, and of
+ * the others in the second one */
 INLINE void store_eight(char *result, __m256i first, __m256i second, const int pixel) {
     const __m256i bytes = _mm256_packus_epi16(_mm256_srli_epi16(first, 8), _mm256_srli_epi16(second, 8));
     if (pixel == 4) {
         _mm256_storeu_si256((__m256i *)result, bytes);
         return;
     }
-    const __m256i dense = _mm256_shuffle_epi8(bytes, _mm256_setr_epi64x(0x0908060504020100, 0x0e0d0c0a, 0x0908060504020100, 0x0e0d0c0a));
+    const __m256i three = _mm256_setr_epi64x(0x0908060504020100, 0x0e0d0c0a, 0x0908060504020100, 0x0e0d0c0a);
+    const __m256i dense = _mm256_shuffle_epi8(bytes, three);
     const __m256i ordered = _mm256_permutevar8x32_epi32(dense, _mm256_setr_epi32(0, 1, 2, 4, 5, 6, 7, 7));
     _mm_storeu_si128((__m128i *)result, _mm256_castsi256_si128(ordered));
     _mm_storel_epi64((__m128i *)(result + 16), _mm256_extracti128_si256(ordered, 1));
 }
 
-/* Where windows of sixteen columns and some rows begin that hold the neighbours of eight pixels each, as the first and
- * last of them tell; positions from there on are numbers from 128 on */
+/* Windows of sixteen columns and five rows, in which the neighbours of eight pixels each are expected */
 typedef struct {
-    _Alignas(32) float u[CHUNK / STEP + STEP], v[CHUNK / STEP + STEP];
-    int32_t at[CHUNK / STEP + STEP]; /* in elements */
+    _Alignas(32) float u[CHUNK / STEP + STEP], v[CHUNK / STEP + STEP]; /* 128 less their first column and row */
+    int32_t at[CHUNK / STEP + STEP];                                   /* of their first element */
 } Windows;
 
 enum { FIVE_ROWS = 5 };
+#define EIGHTS 0x0808080808080808
 
-/* The lesser one of x at the begin of each eight and of the next ones, less what those in between may go further, from 0
- * to `last`, which a number that is none is */
+/* The lesser of the first positions of eight pixels and of the next eight, less what others may lie lower; from 0 to
+ * `last`, also if it is NaN */
 INLINE I8 begins(const float *x, int64_t last) {
 #define TWO(i) _mm_unpacklo_ps(_mm_loadu_ps(x + STEP * (i)), _mm_loadu_ps(x + STEP * ((i) + 1)))
     const __m256 first = _mm256_set_m128(_mm_movelh_ps(TWO(4), TWO(6)), _mm_movelh_ps(TWO(0), TWO(2)));
 #undef TWO
     const __m256 turned = _mm256_permutevar8x32_ps(first, _mm256_setr_epi32(1, 2, 3, 4, 5, 6, 7, 0));
     const __m256 next = _mm256_blend_ps(turned, _mm256_broadcast_ss(x + STEP * STEP), 0x80);
-    const __m256 least = _mm256_sub_ps(_mm256_min_ps(first, next), _mm256_set1_ps(1 / 64.0f));
+    const __m256 least = _mm256_sub_ps(_mm256_min_ps(next, first), _mm256_set1_ps(1 / 64.0f));
     return whole8((V8)_mm256_max_ps(_mm256_min_ps(least, _mm256_set1_ps((float)last)), _mm256_setzero_ps()));
 }
 
 NOT_INLINE void windows_of(const Image *image, const Chunk *at, int64_t i, int64_t n, Windows *windows) {
     int64_t j;
-    for (j = i / STEP; j < n / STEP; j += STEP) {
-        const I8 x = begins(at->u + STEP * j, image->width - 16), y = begins(at->v + STEP * j, image->height - FIVE_ROWS);
+    for (j = i / STEP / STEP * STEP; j < n / STEP; j += STEP) {
+        const I8 x = begins(at->u + STEP * j, image->width - 16);
+        const I8 y = begins(at->v + STEP * j, image->height - FIVE_ROWS);
         const I8 begin = y * (int32_t)image->below + x;
         const V8 from_u = 128 - float8(x), from_v = 128 - float8(y);
         memcpy(windows->u + j, &from_u, sizeof from_u), memcpy(windows->v + j, &from_v, sizeof from_v);
@@ -844,74 +839,67 @@ NOT_INLINE void windows_of(const Image *image, const Chunk *at, int64_t i, int64
     }
 }
 
-/* Positions of 0 ... 3 and 8 ... 11 */
+/* Positions 0 ... 3 and 8 ... 11 */
 INLINE __m256 fours(const float *x) {
     return _mm256_insertf128_ps(_mm256_castps128_ps256(_mm_loadu_ps(x)), _mm_loadu_ps(x + 8), 1);
 }
 
-/* The upper halves of numbers of both: those of 0, 4, 1, 5, 2, 6, 3, 7 of either half */
+/* The upper 16 bits of numbers of both in turn: of such fours, pixels 0, 4, 1, 5, 2, 6, 3, 7 in each half */
 INLINE __m256i uppers(__m256i a, __m256i b) { return _mm256_blend_epi16(_mm256_srli_epi32(a, 16), b, 0xaa); }
 
-/* The lower ones, parts t of a pixel, as 2 t - 1 in 2^-15 */
+/* The lower 16 bits, which are parts t of a pixel, as 2 t - 1 in 2^-15 */
 INLINE __m256i lowers(__m256i a, __m256i b) {
     return _mm256_xor_si256(_mm256_blend_epi16(a, _mm256_slli_epi32(b, 16), 0xaa), _mm256_set1_epi16((short)0x8000));
 }
 
-/* Of words, the lower bytes twice */
+/* The lower byte of each word twice */
 INLINE __m256i doubled(__m256i words) {
-    return _mm256_shuffle_epi8(words, _mm256_setr_epi64x(0x0606040402020000, 0x0e0e0c0c0a0a0808, 0x0606040402020000, 0x0e0e0c0c0a0a0808));
+    const int64_t low = 0x0606040402020000, high = 0x0e0e0c0c0a0a0808;
+    return _mm256_shuffle_epi8(words, _mm256_setr_epi64x(low, high, low, high));
 }
 
-/* Bytes of sixteen pixels in that order: the upper ones of words, or the lower ones of the nearest pixels */
+/* Stores sixteen pixels in that order: the upper bytes of words, or of the nearest pixels the lower ones */
 INLINE void store_sixteen(char *result, __m256i words, const int mode) {
-    const __m256i order = mode == NEAREST ? _mm256_setr_epi64x(0x0e0a06020c080400, -1, 0x0e0a06020c080400, -1)
-                                          : _mm256_setr_epi64x(0x0f0b07030d090501, -1, 0x0f0b07030d090501, -1);
-    const __m256i bytes = _mm256_permute4x64_epi64(_mm256_shuffle_epi8(words, order), 0x08);
+    const int64_t order = mode == NEAREST ? 0x0e0a06020c080400 : 0x0f0b07030d090501;
+    const __m256i halves = _mm256_shuffle_epi8(words, _mm256_setr_epi64x(order, -1, order, -1));
+    const __m256i bytes = _mm256_permute4x64_epi64(halves, 0x08);
     _mm_storeu_si128((__m128i *)result, _mm256_castsi256_si128(bytes));
 }
 
-/* Eight pairs of bytes of any places: four and, eight later, four */
-INLINE __m128i eight_pairs(const char *from, const int32_t *at) {
-    __m128i pairs = _mm_setzero_si128();
-#define PAIR(i, from_there)                                                                                            \
-    do {                                                                                                               \
-        int16_t pair;                                                                                                  \
-        memcpy(&pair, from + at[from_there], sizeof pair);                                                             \
-        pairs = _mm_insert_epi16(pairs, pair, i);                                                                      \
-    } while (0)
-    PAIR(0, 0);
-    PAIR(1, 1);
-    PAIR(2, 2);
-    PAIR(3, 3);
-    PAIR(4, 8);
-    PAIR(5, 9);
-    PAIR(6, 10);
-    PAIR(7, 11);
-#undef PAIR
-    return pairs;
+INLINE int16_t two_bytes(const char *from) {
+    int16_t bytes;
+    memcpy(&bytes, from, sizeof bytes);
+    return bytes;
 }
 
-/* Of two rows, sixteen columns each */
+/* Pairs of bytes at four places, and at those eight later */
+INLINE __m128i eight_pairs(const char *from, const int32_t *at) {
+#define PAIR(i) two_bytes(from + at[i])
+    return _mm_setr_epi16(PAIR(0), PAIR(1), PAIR(2), PAIR(3), PAIR(8), PAIR(9), PAIR(10), PAIR(11));
+#undef PAIR
+}
+
+/* Sixteen bytes of each of two places */
 INLINE __m256i two_rows(const char *a, const char *b) {
     return _mm256_inserti128_si256(_mm256_castsi128_si256(_mm_loadu_si128((const __m128i *)a)),
                                    _mm_loadu_si128((const __m128i *)b), 1);
 }
 
-/* Of sixteen pixels: which bytes of a row they are read from, and parts of a pixel; of each half in the order 0, 4, 1, 5, 2,
- * 6, 3, 7 */
+/* Sixteen pixels: which bytes of a row they read, the row of their window as 0x4300 and more, and parts of a pixel */
 typedef struct {
     __m256i pick, row, part_u, part_v;
-    const char *first, *second; /* where their windows begin */
+    const char *first, *second; /* where the windows of the halves begin */
 } Sixteen;
 
-INLINE void rows_of_planes(const Image *image, char *result, const Sixteen *at, const Weights *by,
-                           const int rows, const int mode) {
+/* Makes them in each plane, from so many rows of their windows */
+INLINE void rows_of_planes(const Image *image, char *result, const Sixteen *at, const Weights *by, const int rows,
+                           const int mode) {
     const char *first = at->first, *second = at->second;
     __m256i below[FIVE_ROWS];
     int64_t c;
     int k;
     for (k = 0; k < rows - 1; k++) below[k] = _mm256_cmpgt_epi16(at->row, _mm256_set1_epi16((short)(0x4300 + k)));
-    for (c = 0; c < image->channels; c++, first += image->from_plane, second += image->from_plane, result += image->to_plane) {
+    for (c = 0; c < image->channels; c++) {
         __m256i made[FIVE_ROWS], upper, lower, value;
         ask_below(first, image->below);
         for (k = 0; k < rows; k++)
@@ -928,17 +916,19 @@ INLINE void rows_of_planes(const Image *image, char *result, const Sixteen *at, 
             value = down16(by, across16(by, upper, at->part_u), across16(by, lower, at->part_u), at->part_v);
         }
         store_sixteen(result, value, mode);
+        first += image->from_plane, second += image->from_plane, result += image->to_plane;
     }
 }
 
-/* Pixels i ... n - 1 of planes, sixteen at a time, up to the first ones that do not lie in their windows, and where these
- * begin */
-INLINE int64_t sixteens(const Image *image, const Windows *windows, char *first, const Chunk *chunk, int64_t i, int64_t n,
-                        const int mode) {
+/* Makes pixels i ... n - 1 of planes, sixteen at a time, up to the first that their windows do not hold; returns where */
+INLINE int64_t sixteens(const Image *image, const Windows *windows, char *first, const Chunk *chunk, int64_t i,
+                        int64_t n, const int mode) {
     const __m256i halves = kept(_mm256_setr_epi32(0, 0, 0, 0, 1, 1, 1, 1)), begin = kept(_mm256_set1_epi16(0x4300));
     const __m256i nothing = _mm256_set1_epi16((short)0x8000), right = _mm256_set1_epi16(0x0100);
     const int beyond = mode == NEAREST ? 1 : 2;
-    const __m256i columns = kept(_mm256_set1_epi16((short)(16 - beyond))), three = kept(_mm256_set1_epi16((short)(3 - beyond)));
+    const __m256i columns = kept(_mm256_set1_epi16((short)(16 - beyond)));
+    const __m256i three = kept(_mm256_set1_epi16((short)(3 - beyond)));
+    const __m256i five = _mm256_set1_epi16((short)(FIVE_ROWS - beyond));
     const Weights weights = kept_weights();
     for (; n - i >= 16; i += 16) {
         const float *u = chunk->u + i, *v = chunk->v + i;
@@ -959,7 +949,7 @@ INLINE int64_t sixteens(const Image *image, const Windows *windows, char *first,
         if (_mm256_testz_si256(low, low)) {
             rows_of_planes(image, first + i, &at, &weights, 3, mode);
         } else {
-            const __m256i lower = _mm256_or_si256(far, _mm256_subs_epu16(row, _mm256_set1_epi16((short)(FIVE_ROWS - beyond))));
+            const __m256i lower = _mm256_or_si256(far, _mm256_subs_epu16(row, five));
             if (!_mm256_testz_si256(lower, lower)) break;
             rows_of_planes(image, first + i, &at, &weights, FIVE_ROWS, mode);
         }
@@ -967,38 +957,31 @@ INLINE int64_t sixteens(const Image *image, const Windows *windows, char *first,
     return i;
 }
 
-NOT_INLINE int64_t sixteens_of(const Image *image, const Windows *windows, char *first, const Chunk *at, int64_t i, int64_t n,
-                               int mode) {
-    return mode == NEAREST ? sixteens(image, windows, first, at, i, n, NEAREST) : sixteens(image, windows, first, at, i, n, BILINEAR);
+NOT_INLINE int64_t sixteens_of(const Image *image, const Windows *windows, char *first, const Chunk *at, int64_t i,
+                               int64_t n, int mode) {
+    if (mode == NEAREST) return sixteens(image, windows, first, at, i, n, NEAREST);
+    return sixteens(image, windows, first, at, i, n, BILINEAR);
 }
 
-/* -- eight pixels, each of which is read by itself: its neighbours and their channels are eight bytes of a row */
+/* -- eight pixels of three or four channels, one by one: a pixel and the next one of a row are six or eight bytes */
 
-#define EIGHTS 0x0808080808080808
-
-/* A byte of the 32 bits of each pixel, or the word that begins with it, for the bytes of its neighbours: of pixels 0, 1, 4
- * and 5 for the first half of the result, and of the others */
+/* Repeats a byte of the 32 bits of a pixel, or the word that begins with it, for all that is made of the pixel: of pixels
+ * 0, 1, 4, 5 for the first half of the result, of the others for the second one */
 INLINE __m256i spread(__m256i pixels, const int half, const int byte, const int words) {
     const int64_t each = 0x0101010101010101, first = (8 * half + byte) * each + (words ? 0x0100010001000100 : 0);
     return _mm256_shuffle_epi8(pixels, _mm256_setr_epi64x(first, first + 4 * each, first, first + 4 * each));
 }
 
-/* Of the neighbours of a pixel: the bytes that belong together */
+/* Pairs the channels of a pixel with those of the next one */
 INLINE __m256i neighbours(const int pixel) {
     return _mm256_set1_epi64x(pixel == 4 ? 0x0703060205010400 : 0x0000050204010300);
 }
 
-/* Parts of a pixel across and down, side by side, from 2 t - 1 = -1 on in 2^-15 */
-INLINE __m256i parts(__m256i x, __m256i y) {
-    return _mm256_xor_si256(_mm256_blend_epi16(x, _mm256_slli_epi32(y, 16), 0xaa), _mm256_set1_epi16((short)0x8000));
-}
-
 INLINE __m256i in_fixed_point(__m256 x) { return _mm256_cvtps_epi32(_mm256_mul_ps(x, _mm256_set1_ps(65536))); }
 
-/* Pixels i ... n - 1 of three or four channels side by side, eight at a time, up to the first ones of which some do not lie
- * on the image, and where these begin */
+/* Makes pixels i ... n - 1, eight at a time, up to the first of which some lie off the image; returns where */
 INLINE int64_t interleaved(const Image *image, char *first, const Chunk *at, int64_t i, int64_t n, const int pixel) {
-    /* eight bytes of three channels are a part of a third pixel */
+    /* eight bytes hold a part of a third pixel of three channels */
     const uint32_t right = (uint32_t)(image->width - (pixel == 3 ? 3 : 2)), bottom = (uint32_t)(image->height - 2);
     const __m256i last = kept(_mm256_set1_epi32((int32_t)(bottom << 16 | right)));
     const __m256i steps = kept(_mm256_set1_epi32((int32_t)(image->below << 16 | pixel)));
@@ -1007,20 +990,19 @@ INLINE int64_t interleaved(const Image *image, char *first, const Chunk *at, int
     const char *upper = image->source, *lower = upper + image->below;
     for (; n - i >= STEP; i += STEP) {
         const __m256i x = in_fixed_point(_mm256_loadu_ps(at->u + i)), y = in_fixed_point(_mm256_loadu_ps(at->v + i));
-        const __m256i square = _mm256_blend_epi16(_mm256_srli_epi32(x, 16), y, 0xaa), part = parts(x, y);
+        const __m256i square = uppers(x, y), part = lowers(x, y);
         if (_mm256_movemask_epi8(_mm256_cmpeq_epi16(_mm256_min_epu16(square, last), square)) != -1) break;
         __m256i made[2];
         _Alignas(32) int32_t o[STEP];
         int k;
         _mm256_store_si256((__m256i *)o, _mm256_madd_epi16(square, steps));
-        __asm__("" : "+m"(o)); /* one by one they are loaded faster than taken out of a register */
         ask_below(upper + o[0], image->below), ask_below(upper + o[STEP - 1], image->below);
         for (k = 0; k < 2; k++) {
             const int64_t a = o[2 * k], b = o[2 * k + 1], c = o[2 * k + 4], d = o[2 * k + 5];
             const __m256i above = _mm256_shuffle_epi8(quarters(upper + a, upper + b, upper + c, upper + d), pick);
             const __m256i under = _mm256_shuffle_epi8(quarters(lower + a, lower + b, lower + c, lower + d), pick);
-            const __m256i t = spread(part, k, 0, 1);
-            made[k] = down16(&weights, across16(&weights, above, t), across16(&weights, under, t), spread(part, k, 2, 1));
+            const __m256i t_u = spread(part, k, 0, 1), t_v = spread(part, k, 2, 1);
+            made[k] = down16(&weights, across16(&weights, above, t_u), across16(&weights, under, t_u), t_v);
         }
         store_eight(first + i * pixel, made[0], made[1], pixel);
     }
@@ -1031,26 +1013,28 @@ NOT_INLINE int64_t eights_of(const Image *image, char *first, const Chunk *at, i
     return pixel == 3 ? interleaved(image, first, at, i, n, 3) : interleaved(image, first, at, i, n, 4);
 }
 
-/* Positions in fixed point, between the pixels beyond the first and last ones, where `fill` lies */
-INLINE __m256i held(const Job *job, __m256 given, int64_t side, const int mode) {
+/* Positions in fixed point, at most at the pixels next to the image, which are `fill`; NaN is one of them */
+INLINE __m256i held(const Job *job, __m256 x, int64_t side) {
     const float beyond = job->padding == ZEROS;
-    const __m256 x = mode == NEAREST ? _mm256_round_ps(given, 0) : given;
-    const __m256 on = _mm256_min_ps(_mm256_max_ps(x, _mm256_set1_ps(-beyond)), _mm256_set1_ps((float)(side - 1) + beyond));
-    return in_fixed_point(_mm256_blendv_ps(on, _mm256_set1_ps(-1), _mm256_cmp_ps(x, x, _CMP_UNORD_Q)));
+    const __m256 low = _mm256_set1_ps(-beyond), high = _mm256_set1_ps((float)(side - 1) + beyond);
+    const __m256 on = _mm256_min_ps(_mm256_max_ps(x, low), high), is_nan = _mm256_cmp_ps(x, x, _CMP_UNORD_Q);
+    return in_fixed_point(_mm256_blendv_ps(on, _mm256_set1_ps(-1), is_nan));
 }
 
-/* Sixteen pixels of planes anywhere, with `fill` in the place of what lies off the image */
-INLINE void any_sixteen(const Job *job, const Image *image, char *result, const float *u, const float *v, const int mode) {
-    const __m256i zero = _mm256_setzero_si256(), one = _mm256_set1_epi16(1), right = _mm256_set1_epi16((short)(image->width - 2));
-    const __m256i bottom = _mm256_set1_epi16((short)(image->height - 1)), steps = _mm256_set1_epi32((int32_t)(image->below << 16 | 1));
-    const __m256i u0 = held(job, fours(u), image->width, mode), u1 = held(job, fours(u + 4), image->width, mode);
-    const __m256i v0 = held(job, fours(v), image->height, mode), v1 = held(job, fours(v + 4), image->height, mode);
+/* Makes sixteen pixels of planes that lie anywhere: what is off the image is `fill` */
+INLINE void any_sixteen(const Job *job, const Image *image, char *result, const float *u, const float *v) {
+    const __m256i right = _mm256_set1_epi16((short)(image->width - 2)), zero = _mm256_setzero_si256();
+    const __m256i bottom = _mm256_set1_epi16((short)(image->height - 1)), one = _mm256_set1_epi16(1);
+    const __m256i steps = _mm256_set1_epi32((int32_t)(image->below << 16 | 1));
+    const __m256i u0 = held(job, fours(u), image->width), u1 = held(job, fours(u + 4), image->width);
+    const __m256i v0 = held(job, fours(v), image->height), v1 = held(job, fours(v + 4), image->height);
     const __m256i x = uppers(u0, u1), y = uppers(v0, v1), next = _mm256_add_epi16(y, one);
     const __m256i begin = _mm256_max_epi16(_mm256_min_epi16(x, right), zero);
-    /* where in the two bytes that are read a pixel begins, and which of them are its own */
+    /* where its neighbours lie in the two bytes that are read, and which of them do */
     const __m256i off = doubled(_mm256_sub_epi16(x, begin)), where = _mm256_add_epi8(off, _mm256_set1_epi16(0x0100));
     const __m256i there = _mm256_cmpeq_epi8(_mm256_min_epu8(where, _mm256_set1_epi8(1)), where);
-    const __m256i pick = _mm256_add_epi8(off, _mm256_setr_epi64x(0x0706050403020100, 0x0f0e0d0c0b0a0908, 0x0706050403020100, 0x0f0e0d0c0b0a0908));
+    const int64_t low = 0x0706050403020100, high = low + EIGHTS;
+    const __m256i pick = _mm256_add_epi8(off, _mm256_setr_epi64x(low, high, low, high));
     const Weights weights = kept_weights();
     const char *plane = image->source;
     __m256i shown[2];
@@ -1063,7 +1047,7 @@ INLINE void any_sixteen(const Job *job, const Image *image, char *result, const 
         _mm256_store_si256((__m256i *)o[k], _mm256_madd_epi16(_mm256_unpacklo_epi16(begin, row), steps));
         _mm256_store_si256((__m256i *)o[k] + 1, _mm256_madd_epi16(_mm256_unpackhi_epi16(begin, row), steps));
     }
-    for (c = 0; c < image->channels; c++, plane += image->from_plane, result += image->to_plane) {
+    for (c = 0; c < image->channels; c++) {
         const __m256i fill = _mm256_set1_epi8(((const char *)job->fill_elements)[c]);
         __m256i rows[2];
         for (k = 0; k < 2; k++) {
@@ -1072,24 +1056,22 @@ INLINE void any_sixteen(const Job *job, const Image *image, char *result, const 
             rows[k] = across16(&weights, rows[k], lowers(u0, u1));
         }
         store_sixteen(result, down16(&weights, rows[0], rows[1], lowers(v0, v1)), BILINEAR);
+        plane += image->from_plane, result += image->to_plane;
     }
 }
 
-/* Eight pixels of three or four channels side by side likewise */
+/* Makes eight pixels of three or four channels likewise */
 INLINE void any_eight(const Job *job, const Image *image, char *result, const float *u, const float *v, const int pixel) {
     const __m256i zero = _mm256_setzero_si256(), one = _mm256_set1_epi32(1), seven = _mm256_set1_epi8(7);
-    const __m256i at_u = held(job, _mm256_loadu_ps(u), image->width, BILINEAR), x = _mm256_srai_epi32(at_u, 16);
-    const __m256i at_v = held(job, _mm256_loadu_ps(v), image->height, BILINEAR), y = _mm256_srai_epi32(at_v, 16);
-    const __m256i next = _mm256_add_epi32(y, one), bottom = _mm256_set1_epi32((int32_t)image->height - 1);
-    const __m256i upper = _mm256_max_epi32(_mm256_min_epi32(y, bottom), zero);
-    const __m256i lower = _mm256_max_epi32(_mm256_min_epi32(next, bottom), zero);
-    const __m256i byte = _mm256_mullo_epi32(x, _mm256_set1_epi32(pixel)), below = _mm256_set1_epi32((int32_t)image->below);
-    const __m256i last = _mm256_set1_epi32((int32_t)image->width * pixel - 8), part = parts(at_u, at_v);
+    const __m256i at_u = held(job, _mm256_loadu_ps(u), image->width), x = _mm256_srai_epi32(at_u, 16);
+    const __m256i at_v = held(job, _mm256_loadu_ps(v), image->height), y = _mm256_srai_epi32(at_v, 16);
+    const __m256i bottom = _mm256_set1_epi32((int32_t)image->height - 1);
+    const __m256i below = _mm256_set1_epi32((int32_t)image->below);
+    const __m256i byte = _mm256_mullo_epi32(x, _mm256_set1_epi32(pixel));
+    const __m256i last = _mm256_set1_epi32((int32_t)image->width * pixel - 8), part = lowers(at_u, at_v);
     const __m256i begin = _mm256_max_epi32(_mm256_min_epi32(byte, last), zero);
-    /* of each pixel, a byte each: where in the eight bytes it begins, and which of its rows are there */
+    /* of each pixel, a byte each: where it lies in the eight bytes that are read, and which of its rows are there */
     __m256i marks = _mm256_and_si256(_mm256_sub_epi32(byte, begin), _mm256_set1_epi32(0xff)), made[2];
-    marks = _mm256_or_si256(marks, _mm256_and_si256(_mm256_cmpeq_epi32(upper, y), _mm256_set1_epi32(0xff00)));
-    marks = _mm256_or_si256(marks, _mm256_and_si256(_mm256_cmpeq_epi32(lower, next), _mm256_set1_epi32(0xff0000)));
     const Weights weights = kept_weights();
     const uint8_t *fill = (const uint8_t *)job->fill_elements;
     uint64_t filled = 0;
@@ -1097,8 +1079,12 @@ INLINE void any_eight(const Job *job, const Image *image, char *result, const fl
     int k, row;
     for (k = 0; k < pixel; k++) filled |= (uint64_t)(fill[k] * 0x0101u) << 16 * k;
     const __m256i fills = _mm256_set1_epi64x((int64_t)filled);
-    _mm256_store_si256((__m256i *)o[0], _mm256_add_epi32(_mm256_mullo_epi32(upper, below), begin));
-    _mm256_store_si256((__m256i *)o[1], _mm256_add_epi32(_mm256_mullo_epi32(lower, below), begin));
+    for (k = 0; k < 2; k++) {
+        const __m256i wanted = k ? _mm256_add_epi32(y, one) : y, mark = _mm256_set1_epi32(0xff00 << 8 * k);
+        const __m256i there = _mm256_max_epi32(_mm256_min_epi32(wanted, bottom), zero);
+        _mm256_store_si256((__m256i *)o[k], _mm256_add_epi32(_mm256_mullo_epi32(there, below), begin));
+        marks = _mm256_or_si256(marks, _mm256_and_si256(_mm256_cmpeq_epi32(there, wanted), mark));
+    }
     for (k = 0; k < 2; k++) {
         const __m256i where = _mm256_add_epi8(neighbours(pixel), spread(marks, k, 0, 0));
         const __m256i there = _mm256_cmpeq_epi8(_mm256_min_epu8(where, seven), where), t = spread(part, k, 0, 1);
@@ -1107,7 +1093,8 @@ INLINE void any_eight(const Job *job, const Image *image, char *result, const fl
         for (row = 0; row < 2; row++) {
             const int32_t *i = o[row] + 2 * k;
             const char *from = image->source;
-            const __m256i read = _mm256_shuffle_epi8(quarters(from + i[0], from + i[1], from + i[4], from + i[5]), pick);
+            const __m256i all = quarters(from + i[0], from + i[1], from + i[4], from + i[5]);
+            const __m256i read = _mm256_shuffle_epi8(all, pick);
             const __m256i shown = _mm256_and_si256(there, spread(marks, k, row + 1, 0));
             rows[row] = across16(&weights, _mm256_blendv_epi8(fills, read, shown), t);
         }
@@ -1116,36 +1103,49 @@ INLINE void any_eight(const Job *job, const Image *image, char *result, const fl
     store_eight(result, made[0], made[1], pixel);
 }
 
-NOT_INLINE void anywhere(const Job *job, const Image *image, char *result, const float *u, const float *v, int pixel, int mode) {
-    if (pixel == 3) any_eight(job, image, result, u, v, 3);
-    else if (pixel == 4) any_eight(job, image, result, u, v, 4);
-    else if (mode == NEAREST) any_sixteen(job, image, result, u, v, NEAREST);
-    else any_sixteen(job, image, result, u, v, BILINEAR);
+NOT_INLINE void anywhere(const Job *job, const Image *image, char *result, const float *u, const float *v, int pixel) {
+    if (pixel == 1) any_sixteen(job, image, result, u, v);
+    else if (pixel == 3) any_eight(job, image, result, u, v, 3);
+    else any_eight(job, image, result, u, v, 4);
 }
 
-/* Pixels i ... n - 1 of a row of at least 16; the last ones of them may be made from a lower one on */
+/* Whether 16 bits hold all places of an image, and its rows at least eight bytes */
+INLINE int is_small(const Image *image) {
+    const int has_small_steps = image->below >= 0 && image->below < 32768;
+    return has_small_steps && image->width >= 8 && image->width < 32767 && image->height < 32767;
+}
+
+/* Makes pixels i ... n - 1 that lie anywhere: whole sixteens of planes, eights of channels side by side */
+INLINE void off_windows(Span *span, const Image *image, char *first, const Chunk *at, int64_t i, int64_t n, int mode,
+                        int pixel) {
+    const uint8_t *fill = (const uint8_t *)span->job->fill_elements;
+    int fits = mode == BILINEAR && is_small(image); /* and what lies off the image is a byte */
+    int64_t c;
+    for (c = 0; c < image->channels && span->job->padding == ZEROS; c++) fits &= span->job->fill[c] == (float)fill[c];
+    for (; i < n && fits; i += pixel == 1 ? 16 : STEP)
+        anywhere(span->job, image, first + i * pixel, at->u + i, at->v + i, pixel);
+    if (mode == NEAREST) eights(span, first, at, i, n, BYTES1, NEAREST, SCATTERED);
+    else eights(span, first, at, i, n, UINT8, BILINEAR, pixel == 1 ? PLANES : INTERLEAVED);
+}
+
+/* Makes pixels i ... n - 1, at least sixteen from 0 on: some before i again, if registers would not be full */
 INLINE void fixed_point(Span *span, const Image *image, char *first, const Chunk *at, int64_t i, int64_t n, int mode,
                         int pixel) {
-    const Job *job = span->job;
-    const uint8_t *fill = (const uint8_t *)job->fill_elements;
     const int64_t step = pixel == 1 ? 16 : STEP;
-    const float across = fabsf(at->u[n - 1] - at->u[i]), down = fabsf(at->v[n - 1] - at->v[i]), length = (float)(n - i) / STEP;
-    /* whether windows hold some, and whether what lies off the image is a byte */
-    int near = pixel == 1 ? across < 13 * length && down < 4 * length && image->width >= 16 && image->height >= FIVE_ROWS
-                          : image->width > 2 && image->height > 1;
-    int fits = job->padding != REFLECTION;
-    int64_t c;
+    const float across = fabsf(at->u[n - 1] - at->u[i]), down = fabsf(at->v[n - 1] - at->v[i]);
+    /* whether windows may hold most of them */
+    const int few = across * STEP < 13 * (float)(n - i) && down * STEP < 4 * (float)(n - i);
+    const int near = pixel == 1 ? few && image->width >= 16 && image->height >= FIVE_ROWS : image->height > 1;
     Windows windows;
-    for (c = 0; c < image->channels && mode == BILINEAR && job->padding == ZEROS; c++) fits &= job->fill[c] == (float)fill[c];
     if (near && pixel == 1) windows_of(image, at, i, n, &windows);
     while (i < n) {
         if (near && pixel == 1) i = sixteens_of(image, &windows, first, at, i, n, mode);
         else if (near) i = eights_of(image, first, at, i, n, pixel);
         if (i >= n) return;
         if (n - i < step) i = n - step;
-        if (fits) anywhere(job, image, first + i * pixel, at->u + i, at->v + i, pixel, mode);
-        else eights(span, first, at, i, i + step, pixel == 1 && mode == NEAREST ? BYTES1 : UINT8, mode, pixel == 1 ? PLANES : INTERLEAVED);
-        i += step;
+        const int64_t end = near ? i + step : n - (n - i) % step;
+        off_windows(span, image, first, at, i, end, mode, pixel);
+        i = end;
     }
 }
 
@@ -1320,10 +1320,10 @@ INLINE __m512i found(const char *from, const __mmask64 *held, __m512i pick, cons
     return _mm512_mask_mov_epi8(first, _mm512_movepi8_mask(pick), second);
 }
 
-/* Whether all lie there, and those that are `wanted` are made: pixels of one byte or of three, in rows of so many
- * registers. Positions are rounded to 2^-16. */
+/* Whether all lie there, and are made: pixels of one byte or of three, in rows of so many registers. Positions are
+ * rounded to 2^-16. */
 INLINE int bytes_at(const Image *image, const Place *place, char *result, const float *u, const float *v, const int pixel,
-                    const int registers, const int mode, __mmask32 wanted) {
+                    const int registers, const int mode) {
     const int64_t rows = place->rows;
     int64_t c;
     int j, k;
@@ -1347,10 +1347,8 @@ INLINE int bytes_at(const Image *image, const Place *place, char *result, const 
     const __m512i at = _mm512_mullo_epi16(column, _mm512_set1_epi16((short)(0x0101 * pixel)));
     /* of a register of the result each: which pixels and channels its elements are */
     __m512i pick[3], t_u[3], t_v[3], begins[3], last[3], upper[3], lower[3];
-    __mmask32 stored[3];
     if (pixel == 1) {
         pick[0] = _mm512_add_epi16(at, _mm512_set1_epi16(0x0100)), t_u[0] = part_u, t_v[0] = part_v, begins[0] = row;
-        stored[0] = wanted;
     } else {
         for (k = 0; k < 3; k++) {
             const __m512i which = _mm512_loadu_si512(PIXELS + 32 * k);
@@ -1358,7 +1356,6 @@ INLINE int bytes_at(const Image *image, const Place *place, char *result, const 
             pick[k] = _mm512_add_epi16(_mm512_permutexvar_epi16(which, at), channel);
             t_u[k] = _mm512_permutexvar_epi16(which, part_u), t_v[k] = _mm512_permutexvar_epi16(which, part_v);
             begins[k] = _mm512_permutexvar_epi16(which, row);
-            stored[k] = _mm512_movepi16_mask(_mm512_permutexvar_epi16(which, _mm512_movm_epi16(wanted)));
         }
     }
     __mmask64 held[4];
@@ -1397,42 +1394,9 @@ INLINE int bytes_at(const Image *image, const Place *place, char *result, const 
             const __m512i value = between16(above, under, t_v[k]);
             const __m512i rounded = _mm512_add_epi16(value, _mm512_set1_epi16(128));
             const __m512i dense = _mm512_permutexvar_epi8(_mm512_loadu_si512(UPPER), rounded);
-            _mm256_mask_storeu_epi8(result + 32 * k, stored[k], _mm512_castsi512_si256(dense));
+            _mm256_storeu_si256((__m256i *)(result + 32 * k), _mm512_castsi512_si256(dense));
         }
     }
-    return 1;
-}
-
-/* Pixels of which some lie off the image, or at its very last ones: whether they are made */
-NOT_INLINE int bytes_at_rim(const Span *span, const Image *image, const float *u, const float *v, const int pixel) {
-    const int registers = pixel == 1 ? 2 : 4;
-    const float right = (float)(image->width - 1), bottom = (float)(image->height - 1);
-    const __m512 zero = _mm512_setzero_ps(), last_u = _mm512_set1_ps(right), last_v = _mm512_set1_ps(bottom);
-    /* the last column and row belong to the squares before them */
-    const __m512 most_u = _mm512_set1_ps(right - greater(right, 128) * 1.2e-7f);
-    const __m512 most_v = _mm512_set1_ps(bottom - greater(bottom, 128) * 1.2e-7f);
-    float on_u[32], on_v[32];
-    uint32_t inside = 0, near = 0; /* near: of the pixels that show something */
-    Place place;
-    int k;
-    if (span->job->padding == REFLECTION || right < 1 || bottom < 1) return 0;
-    for (k = 0; k < 32; k += 16) {
-        const __m512 x = _mm512_loadu_ps(u + k), y = _mm512_loadu_ps(v + k);
-        const __m512 on_x = _mm512_max_ps(_mm512_min_ps(x, last_u), zero);
-        const __m512 on_y = _mm512_max_ps(_mm512_min_ps(y, last_v), zero);
-        const __m512 off_x = _mm512_abs_ps(_mm512_sub_ps(x, on_x)), off_y = _mm512_abs_ps(_mm512_sub_ps(y, on_y));
-        const __m512 off = _mm512_max_ps(off_x, off_y);
-        const __mmask16 is = _mm512_cmp_ps_mask(x, y, _CMP_ORD_Q); /* NaN has none */
-        inside |= (uint32_t)_mm512_mask_cmp_ps_mask(is, off, zero, _CMP_EQ_OQ) << k;
-        near |= (uint32_t)_mm512_mask_cmp_ps_mask(is, off, _mm512_set1_ps(1), _CMP_LT_OQ) << k;
-        _mm512_storeu_ps(on_u + k, _mm512_min_ps(on_x, most_u));
-        _mm512_storeu_ps(on_v + k, _mm512_min_ps(on_y, most_v));
-        if (span->job->padding == BORDER) inside |= (uint32_t)is << k;
-    }
-    places_of(image, on_u, on_v, 32, pixel, registers, &place);
-    if (~inside) show_nothing(span, UINT8);
-    if (inside && !bytes_at(image, &place, span->result, on_u, on_v, pixel, registers, BILINEAR, inside)) return 0;
-    if (near & ~inside) careful(span, u, v, UINT8, BILINEAR, inside | ~near);
     return 1;
 }
 
@@ -1446,11 +1410,8 @@ INLINE void wide_bytes(Span *span, const Image *image, char *first, const Chunk 
     places_of(image, at->u + i, at->v + i, n - i, pixel, registers, places);
     for (; i < n; i += 32, place++) {
         const float *u = at->u + i, *v = at->v + i;
-        span->result = first + i * pixel, span->pixels = 32;
-        if (bytes_at(image, place, span->result, u, v, pixel, registers, mode, ~0u)) continue;
-        if (mode == NEAREST) eights(span, first, at, i, i + 32, BYTES1, NEAREST, SCATTERED);
-        else if (!bytes_at_rim(span, image, u, v, pixel))
-            eights(span, first, at, i, i + 32, UINT8, BILINEAR, pixel == 1 ? PLANES : INTERLEAVED);
+        if (!bytes_at(image, place, first + i * pixel, u, v, pixel, registers, mode))
+            off_windows(span, image, first, at, i, i + 32, mode, pixel);
     }
 }
 
@@ -1488,12 +1449,39 @@ INLINE int64_t wide(Span *span, char *first, const Chunk *at, int64_t i, int64_t
 
 #endif
 
-INLINE void chunk(Span *span, char *first, const Chunk *at, int64_t n, int type, int mode, int layout) {
+#if VECTORS
+
+/* Brings positions of n pixels along one axis onto the image, as the padding reads it; NaN stays */
+NOT_INLINE void pad(float *x, int64_t n, int64_t side, int padding, int type) {
+    /* the last pixel belongs to the square before it, as bytes are interpolated */
+    const float end = (float)(side - 1), last = type == UINT8 ? end - greater(end, 128) * 1.2e-7f : end;
+    const V8 far = every8(2097152.0f);
+    int64_t i;
+    int k;
+    for (i = 0; i < n; i += STEP) {
+        V8 at = load8(x + i);
+        if (padding == REFLECTION && !all8((at >= every8(0)) & (at <= every8(end)))) {
+            if (all8((at > -far) & (at < far))) at = reflected8(at, (float)side);
+            else
+                for (k = 0; k < STEP; k++) at[k] = at[k] == at[k] ? reflected(at[k], (float)side) : at[k];
+        }
+        at = clamped8(at, greater(last, 0));
+        memcpy(x + i, &at, sizeof at);
+    }
+}
+
+#endif
+
+INLINE void chunk(Span *span, char *first, Chunk *at, int64_t n, int type, int mode, int layout) {
     int64_t i = 0;
 #if VECTORS
     const Job *job = span->job;
     const int64_t step = job->result_strides[3] * size_of(type);
     int64_t end = (n + STEP - 1) / STEP * STEP;
+    if (job->padding != ZEROS && mode != BICUBIC) {
+        pad(at->u, n, job->source_width, job->padding, type);
+        pad(at->v, n, job->source_height, job->padding, type);
+    }
     while (i < n && shows_nothing(job, load8(at->u + i), load8(at->v + i), mode)) i += STEP;
     while (end > i && shows_nothing(job, load8(at->u + end - STEP), load8(at->v + end - STEP), mode)) end -= STEP;
     span->result = first, span->pixels = i < n ? i : n;
@@ -1511,8 +1499,8 @@ INLINE void chunk(Span *span, char *first, const Chunk *at, int64_t n, int type,
     const Image image = {span->source, job->channels, from[1], from[2], to[1], job->source_width, job->source_height};
     const int in_planes = layout == PLANES || (mode == NEAREST && from[3] == 1 && to[3] == 1);
     const int pixel = in_planes ? 1 : layout == INTERLEAVED ? (int)job->channels : 0;
-    if ((mode == BILINEAR ? type == UINT8 : mode == NEAREST && type == BYTES1) && pixel && n >= 16 && image.below >= 0 &&
-        image.below < 32768 && image.width >= 8 && image.width < 32767 && image.height < 32767) {
+    const int are_bytes = mode == BILINEAR ? type == UINT8 : mode == NEAREST && type == BYTES1;
+    if (are_bytes && pixel && n >= 16 && is_small(&image)) {
         fixed_point(span, &image, first, at, i, n, mode, pixel);
         return;
     }
