@@ -28,7 +28,7 @@ from camtorch.projection.native_cameras import (
     address,
     entry,
     fields,
-    keep_lenses,
+    lenses_of,
 )
 from camtorch.projection.rows import CameraRows, domain_for, single_native
 from camtorch.values.module import model_of, remade
@@ -216,7 +216,7 @@ class Start:
         """Return what was found of new lenses, kept for whoever evaluates cameras of their coefficients (C, n)."""
         model = model_of(self.base)
         domain = partial(domain_for, model, k, False)
-        return keep_lenses(Lenses.known(made.plan, model.optics, k, domain, made), k)
+        return lenses_of(made.plan, k, lambda: Lenses.known(made.plan, model.optics, k, domain, made))
 
 
 def _run(call: _Draws) -> int:

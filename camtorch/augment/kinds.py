@@ -7,24 +7,21 @@ import functools
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from camtorch.augment.change import Change
+from camtorch.augment.change import Change, Drawn
 from camtorch.cameras.camera import Camera
-from camtorch.evaluate.known import known_false, known_true
+from camtorch.evaluate.known import are_numbers, known_false, known_true
 from camtorch.evaluate.private import pytree
 from camtorch.poses.rotations import are_rotations, check_rotation, rotation_matrix, rotation_vector
-from camtorch.values.arguments import (
-    as_coordinates,
-    check_angles,
-    check_boxes,
-    check_radians,
-    warn,
-)
+from camtorch.values.arguments import as_coordinates, check_angles, check_boxes, check_radians, warn
+from camtorch.warp.boxes import edges_of, enclosing
+from camtorch.warp.plan import Label, at_once
+from camtorch.warp.sampling import Sampler
 
 Named = dict[str, tuple[str, Any]]
 """Name -> (kind, tensor or list of tensors)."""
@@ -90,14 +87,14 @@ def _rotation_vector(change: Change, rvec: Tensor, options: Mapping[str, float])
 
 _MANY = 16
 _ROUNDING = 0.01
+_MANY_PIXELS = 1 << 15  # coordinates of a batch from which on threads share them
 
 
 def _positions(change: Change, points: Tensor, options: Mapping[str, float]) -> Tensor:
     return change.positions(points)
 
 
-def move_pixels(change: Change, pixels: Tensor, options: Mapping[str, float]) -> tuple[Tensor, Tensor]:
-    """Move pixels (B, *N, 2); options as of every kind."""
+def _pixels(change: Change, pixels: Tensor, options: Mapping[str, float]) -> tuple[Tensor, Tensor]:
     return change.points(pixels)
 
 
@@ -113,10 +110,10 @@ KINDS = {
     "mask": Field(2, 3, (), _MASKS, _planes(lambda change, masks, given: change.labels(masks, given["mask_fill"]))),
     "depth": Field(2, 3, (), f"{_DEPTHS} z", _planes(lambda change, depth, _: change.depth(depth))),
     "distance": Field(2, 3, (), f"{_DEPTHS} the ray", _planes(lambda change, distance, _: change.distance(distance))),
-    "keypoints": Field(2, 3, (2,), "(B, N, 2) or (B, F, N, 2) pixels x, y", move_pixels, True),
-    "polygons": Field(3, 3, (2,), "(B, M, K, 2) corners x, y", move_pixels, True),
+    "keypoints": Field(2, 3, (2,), "(B, N, 2) or (B, F, N, 2) pixels x, y", _pixels, True),
+    "polygons": Field(3, 3, (2,), "(B, M, K, 2) corners x, y", _pixels, True),
     "boxes": Field(2, 2, (4,), "(B, M, 4) pixels x1, y1, x2, y2", lambda change, boxes, _: change.boxes(boxes), True),
-    "landmarks": Field(2, 3, (2, 3), "(B, N, 2) pixels or (B, N, 3) points of the camera frame", move_pixels, True),
+    "landmarks": Field(2, 3, (2, 3), "(B, N, 2) pixels or (B, N, 3) points of the camera frame", _pixels, True),
     "points": Field(1, _MANY, (3,), "(B, *N, 3) points of the camera frame", _positions),
     "gaze": _DIRECTIONS,
     "directions": _DIRECTIONS,
@@ -127,8 +124,8 @@ KINDS = {
     "tvec": Field(1, 1, (3,), "(B, 3), a point of the camera frame", _positions),
     "rotation": Field(2, 2, (3,), "(B, 3, 3), turned so far", lambda c, turn, _: c.rays(turn, _columns, _columns)),
 }
-TURNED = "points", "gaze", "directions", "tvec", "landmarks"
-MATRICES = "head_pose", "pose", "rotation"
+_TURNED = "points", "gaze", "directions", "tvec", "landmarks"
+_MATRICES = "head_pose", "pose", "rotation"
 """Whose columns turn."""
 CHECKED = ("boxes", "rvec", "head_pose", "pose", "pitch_yaw")
 """Whose values are checked, not their shape alone."""
@@ -293,6 +290,74 @@ def is_batch(named: Named, camera: object) -> bool:
     if isinstance(camera, Camera) and camera.batch_shape:
         return True
     return any(value.ndim > KINDS[kind].dims for kind, value in named.values())
+
+
+def in_range(values: Tensor, dtype: torch.dtype) -> Tensor:
+    """Return values in a dtype that may be narrower: finite values stay finite."""
+    if dtype == torch.float16 != values.dtype:
+        most = torch.finfo(dtype).max
+        values = values.clamp(-most, most)
+    return values.to(dtype)
+
+
+def _is_proper(rotation: Tensor | None) -> bool:
+    """Whether (3, 3) is no mirror."""
+    if rotation is None:
+        return True
+    (a, b, c), (d, e, f), (g, h, i) = rotation.tolist()
+    return bool(a * (e * i - f * h) + b * (f * g - d * i) + c * (d * h - e * g) > 0)
+
+
+def together(
+    change: Change, named: Named, mask_fill: float = 0.0, lateral: float = 0, batched: bool = True
+) -> dict[str, tuple[Tensor, Tensor | None]]:
+    """What moves by one compiled call, and its validity: images, pixels, and of a single sample boxes and what turns.
+
+    batched: whether the results have a batch dim, as `named` has; those of a batch of one may do without.
+    """
+    part, is_single = change.parts[0], change.count == 1
+    if part.moves is None or part.rows is not None or change.gate is not None:
+        return {}
+    options = part.moves.options
+    mode, padding_mode, fill = options["mode"], options["padding_mode"], options["fill"]
+    moved = part.moves if isinstance(part.moves, Drawn) and is_single else None
+    hows: dict[str, Sampler | Label] = {}
+    for name, (found, value) in named.items():
+        if found in ("depth", "distance") or isinstance(value, list):  # which ask for positions again
+            return {}
+        if value.ndim - 1 > KINDS[found].most_dims:  # frames
+            continue
+        if found == "image" and len(fill) in (1, value.shape[1]):
+            hows[name] = Sampler(mode, padding_mode, fill)
+        elif found == "mask":
+            hows[name] = Sampler("nearest", "zeros", (mask_fill,))
+        elif found != "boxes" and moves(found, value) is _pixels:
+            hows |= {name: "pixels"} if is_single or value.numel() < _MANY_PIXELS else {}
+        elif moved is not None and value.dtype == moved.distortion.dtype and are_numbers(value):
+            if found == "boxes":
+                hows[name] = "pixels"
+            elif found in _TURNED and value.is_contiguous():
+                hows[name] = "rays"
+            elif found in _MATRICES and value.is_contiguous() and _is_proper(moved.rotation):
+                hows[name] = "columns"
+    fields = (named[name] for name in hows)
+    values = [edges_of(value) if found == "boxes" else value for found, value in fields]
+    between = part.between() if values else None
+    if between is None:
+        return {}
+    sizes = part.camera._size_for("Warp"), part.image_size
+    made = at_once(*between, sizes, options, values, list(hows.values()), batched)
+    if made is None:
+        return {}
+    results: dict[str, tuple[Tensor, Tensor | None]] = {}
+    for name, value, (result, valid) in zip(hows, values, made, strict=True):
+        found, given = named[name]
+        if found == "boxes":
+            boxes = enclosing(given if batched else given[0], result, cast("Tensor", valid))
+            results |= {} if boxes is None else {name: boxes}
+        else:
+            results[name] = result if result.dtype == value.dtype else in_range(result, value.dtype), valid
+    return results
 
 
 def from_pitch_yaw(angles: Tensor) -> Tensor:

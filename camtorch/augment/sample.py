@@ -17,30 +17,29 @@ import torch
 from torch import Tensor, nn
 from typing_extensions import Unpack
 
-from camtorch.augment.change import Change, Drawn, alone, as_one
+from camtorch.augment.change import Change, alone, as_one
 from camtorch.augment.clips import Clips
 from camtorch.augment.kinds import (
     CHECKED,
     IMAGES,
     KEEP,
     KINDS,
-    MATRICES,
     OWN,
-    TURNED,
     Named,
     as_tensor,
     check,
     check_values,
+    in_range,
     is_batch,
     kind_of,
-    move_pixels,
     moves,
     tell_of_parts,
+    together,
 )
 from camtorch.augment.landmarks import Mirroring, exchanged
 from camtorch.cameras.camera import Camera
 from camtorch.evaluate.kept import Kept
-from camtorch.evaluate.known import are_numbers, in_worker
+from camtorch.evaluate.known import in_worker
 from camtorch.evaluate.private import pytree
 from camtorch.models import Pinhole
 from camtorch.values.arguments import (
@@ -54,9 +53,7 @@ from camtorch.values.arguments import (
     no_camera,
 )
 from camtorch.values.threads import on_one_thread
-from camtorch.warp.boxes import edges_of, enclosing
-from camtorch.warp.plan import Label, at_once
-from camtorch.warp.sampling import Options, Sampler, as_options
+from camtorch.warp.sampling import Options, as_options
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -71,9 +68,6 @@ class Single(dict[str, Any]):
 
 class Frames(Single):
     """A single sample whose values may have leading dims, as those of clips have: all of them move by one change."""
-
-
-_MANY = 1 << 15  # coordinates of a batch from which on threads share them
 
 
 class Unknown(Pinhole):
@@ -529,7 +523,7 @@ class SampleTransform(KeepsCamera, nn.Module):
         result = moves(found, value)(change, value, options)
         result, valid = result if isinstance(result, tuple) else (result, None)
         # geometry is computed in float32 at least; what came in half precision goes out in it
-        return _in_range(result, value.dtype) if value.dtype.is_floating_point else result, valid
+        return in_range(result, value.dtype) if value.dtype.is_floating_point else result, valid
 
     def _still(self, name: str, valid: Any, given: Any) -> Any:
         """Flags that come out, invalid where those given were; any number but zero is valid, as in COCO."""
@@ -547,71 +541,3 @@ class SampleTransform(KeepsCamera, nn.Module):
 def _items(value: Any) -> list[Tensor]:
     """Return a list of tensors as batches of one, a batch as the only one."""
     return [one[None] for one in value] if isinstance(value, list) else [value]
-
-
-def _in_range(values: Tensor, dtype: torch.dtype) -> Tensor:
-    """In a dtype that may be narrower: finite values stay finite."""
-    if dtype == torch.float16 != values.dtype:
-        most = torch.finfo(dtype).max
-        values = values.clamp(-most, most)
-    return values.to(dtype)
-
-
-def _is_proper(rotation: Tensor | None) -> bool:
-    """Whether (3, 3) is no mirror."""
-    if rotation is None:
-        return True
-    (a, b, c), (d, e, f), (g, h, i) = rotation.tolist()
-    return bool(a * (e * i - f * h) + b * (f * g - d * i) + c * (d * h - e * g) > 0)
-
-
-def together(
-    change: Change, named: Named, mask_fill: float = 0.0, lateral: float = 0, batched: bool = True
-) -> dict[str, tuple[Tensor, Tensor | None]]:
-    """What moves by one compiled call, and its validity: images, pixels, and of a single sample boxes and what turns.
-
-    batched: whether the results have a batch dim, as `named` has; those of a batch of one may do without.
-    """
-    part, is_single = change.parts[0], change.count == 1
-    if part.moves is None or part.rows is not None or change.gate is not None:
-        return {}
-    options = part.moves.options
-    mode, padding_mode, fill = options["mode"], options["padding_mode"], options["fill"]
-    moved = part.moves if isinstance(part.moves, Drawn) and is_single else None
-    hows: dict[str, Sampler | Label] = {}
-    for name, (found, value) in named.items():
-        if found in ("depth", "distance") or isinstance(value, list):  # which ask for positions again
-            return {}
-        if value.ndim - 1 > KINDS[found].most_dims:  # frames
-            continue
-        if found == "image" and len(fill) in (1, value.shape[1]):
-            hows[name] = Sampler(mode, padding_mode, fill)
-        elif found == "mask":
-            hows[name] = Sampler("nearest", "zeros", (mask_fill,))
-        elif found != "boxes" and moves(found, value) is move_pixels:
-            hows |= {name: "pixels"} if is_single or value.numel() < _MANY else {}
-        elif moved is not None and value.dtype == moved.distortion.dtype and are_numbers(value):
-            if found == "boxes":
-                hows[name] = "pixels"
-            elif found in TURNED and value.is_contiguous():
-                hows[name] = "rays"
-            elif found in MATRICES and value.is_contiguous() and _is_proper(moved.rotation):
-                hows[name] = "columns"
-    fields = (named[name] for name in hows)
-    values = [edges_of(value) if found == "boxes" else value for found, value in fields]
-    between = part.between() if values else None
-    if between is None:
-        return {}
-    sizes = part.camera._size_for("Warp"), part.image_size
-    made = at_once(*between, sizes, options, values, list(hows.values()), batched)
-    if made is None:
-        return {}
-    results: dict[str, tuple[Tensor, Tensor | None]] = {}
-    for name, value, (result, valid) in zip(hows, values, made, strict=True):
-        found, given = named[name]
-        if found == "boxes":
-            boxes = enclosing(given if batched else given[0], result, cast("Tensor", valid))
-            results |= {} if boxes is None else {name: boxes}
-        else:
-            results[name] = result if result.dtype == value.dtype else _in_range(result, value.dtype), valid
-    return results

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from camtorch import optics
+from camtorch.evaluate.kept import Kept
 from camtorch.native.library import library
 from camtorch.optics.backprojection import FURTHEST
 from camtorch.optics.radial_inverse import TABLE_WIDTH
@@ -136,7 +137,7 @@ class Plan:
         return torch.cat([c.expand(len(k), 1) for c in (*chart.parameters, *lens.parameters)], -1)
 
 
-_plans: dict[tuple[Optics, int], Plan | None] = {}
+_plans = Kept(64)  # by optics and number of coefficients
 
 
 class Lenses:
@@ -280,25 +281,15 @@ def _same_ends(end: float, cameras: int) -> ctypes.Array[c_double]:
     return (c_double * cameras)(*[end] * cameras)
 
 
-_MOST_LENSES, _LONGEST = 24, 512
-_lenses: dict[tuple[object, ...], Lenses] = {}
+_LONGEST = 512  # coefficients of lenses that are kept
+_lenses = Kept(24)
 
 
-def _lenses_of(plan: Plan, optics_of: Optics, k: Tensor, domain: Callable[[], Domain], tables: bool) -> Lenses:
-    """Return those of these values: of the last ones that were asked for, or new ones."""
+def lenses_of(plan: Plan, k: Tensor, make: Callable[[], Lenses]) -> Lenses:
+    """Return the lenses of coefficients (C, n): of the last ones that were asked for, or new ones."""
     if k.numel() > _LONGEST:
-        return Lenses(plan, optics_of, k, domain, tables)
-    found = _lenses.pop((plan, k.dtype, k.shape, k.numpy().tobytes()), None)
-    return keep_lenses(found or Lenses(plan, optics_of, k, domain, tables), k)
-
-
-def keep_lenses(lenses: Lenses, k: Tensor) -> Lenses:
-    """Keep lenses for those who ask for the same coefficients (C, n) next."""
-    if k.numel() <= _LONGEST:
-        _lenses[lenses.plan, k.dtype, k.shape, k.numpy().tobytes()] = lenses  # the last one
-        while len(_lenses) > _MOST_LENSES:
-            _lenses.pop(next(iter(_lenses)), None)
-    return lenses
+        return make()
+    return _lenses((), (plan, k.dtype, k.shape, k.numpy().tobytes()), make)
 
 
 class Native:
@@ -364,14 +355,17 @@ def native_of(
     """
     if library() is None or not intrinsics.is_cpu or not k.shape[0]:
         return None
-    key = optics_of, k.shape[-1]
-    if key not in _plans:
-        given = [c.clone() for c in columns(k[:1].double())]
-        chart, lens = optics_of(given)
-        parts = codes(chart, lens)
-        _plans[key] = None if parts is None else Plan(chart, lens, parts, given)
-    plan = _plans[key]
-    return None if plan is None else Native(_lenses_of(plan, optics_of, k, domain, tables), intrinsics, usable)
+    plan = _plans((), (optics_of, k.shape[-1]), lambda: _plan_of(optics_of, k))
+    if plan is None:
+        return None
+    return Native(lenses_of(plan, k, lambda: Lenses(plan, optics_of, k, domain, tables)), intrinsics, usable)
+
+
+def _plan_of(optics_of: Optics, k: Tensor) -> Plan | None:
+    given = [c.clone() for c in columns(k[:1].double())]
+    chart, lens = optics_of(given)
+    parts = codes(chart, lens)
+    return None if parts is None else Plan(chart, lens, parts, given)
 
 
 def codes(chart: Chart, lens: Lens) -> list[_Part] | None:

@@ -9,8 +9,8 @@ import torch
 import torch.nn.functional as F  # noqa: N812
 
 import camtorch as ct
+import camtorch.augment.kinds
 import camtorch.augment.numpy
-import camtorch.augment.sample
 from camtorch.poses import rotations
 from camtorch.warp import sampling
 
@@ -307,7 +307,7 @@ def test_a_chain_is_one_resampling(monkeypatch):
         return call
 
     call = camtorch.native.sampler.Call
-    for module, name in ((call, "__call__"), (sampling, "_by_torch"), (camtorch.augment.sample, "at_once")):
+    for module, name in ((call, "__call__"), (sampling, "_by_torch"), (camtorch.augment.kinds, "at_once")):
         monkeypatch.setattr(module, name, watched(getattr(module, name)))
     mixture()(image=torch.randint(0, 256, (4, 3, 96, 128), dtype=torch.uint8), camera=lens)
     assert sum(made) == 1
