@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import os
 import sys
 import time
 from pathlib import Path
@@ -10,15 +11,25 @@ try:
     import cv2
     import torch
 
-    from benchmarks import augment, calibration, cameras, folders, harness, images, points, samples
+    from benchmarks import augment, calibration, cameras, harness, images, points, samples, training
 except ModuleNotFoundError as error:
     sys.exit(f"{error}. The benchmarks need more than camtorch: pip install -e '.[benchmark]'")
 
-SUBJECTS = {
-    module.__name__.rpartition(".")[2]: module for module in (points, images, augment, samples, calibration, folders)
-}
+_MODULES = (points, images, training, augment, samples, calibration)
+SUBJECTS = {module.__name__.rpartition(".")[2]: module for module in _MODULES}
 TABLES = {table.name: table for subject in SUBJECTS.values() for table in subject.TABLES}
 _COMPILED_VERSIONS = 64  # of one function, before torch gives up; here every contestant is a version
+_LIMITS = {
+    "avx2": {
+        "ATEN_CPU_CAPABILITY": "avx2",
+        "ONEDNN_MAX_CPU_ISA": "AVX2",
+        "MKL_ENABLE_INSTRUCTIONS": "AVX2",
+        "OPENCV_CPU_DISABLE": "AVX512-SKX,AVX512-ICL",
+        "OPENCV_IPP": "avx2",
+    },
+    "avx512": {},
+}
+"""Each kind of processor -> what keeps torch, its libraries and OpenCV from using a better one."""
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -29,6 +40,7 @@ def main(arguments: list[str] | None = None) -> None:
         parser.error("--size, --threads and --repeats must be at least 1")
     if options.device == "cuda" and not torch.cuda.is_available():
         parser.error("--device cuda: torch sees no GPU here")
+    _start_again(options)
     arguments = vars(options) | {"json": str(options.json)}
     torch.set_num_threads(options.threads)
     cv2.setNumThreads(options.threads)
@@ -36,29 +48,37 @@ def main(arguments: list[str] | None = None) -> None:
     options.device = torch.device(options.device)
     options.size = options.size or (10_000 if options.quick else 1_000_000)
     options.repeats = options.repeats or (3 if options.quick else 9)
-    options.compile = options.compile and not options.quick
+    options.compile = options.compile and not (options.quick or options.no_library)
     facts = harness.machine(options.device)
     print(*(f"{name}: {fact}" for name, fact in facts.items()), sep=", ")
-    print(f"Medians of at most {options.repeats} rounds, ± the distance of their quartiles.", flush=True)
-    results: dict[str, dict[str, dict[str, harness.Figure]]] = {}
+    print(f"Medians of at most {options.repeats} rounds, with the fastest and the slowest round.", flush=True)
+    results: dict[str, dict[str, harness.Figures]] = {}
     start = time.perf_counter()
     for name in options.subject or SUBJECTS:
         for row in SUBJECTS[name].rows(options):
             results.setdefault(row.table, {})[row.name] = dict(row.figures)
         for table in SUBJECTS[name].TABLES:
             if found := results.get(table.name):
-                print(f"\n### {table.name}\n\n{table.markdown(found, spread=True)}", flush=True)
+                print(f"\n### {table.name}\n\n{table.markdown([found], spread=True)}", flush=True)
     print(f"({time.perf_counter() - start:.0f} s)")
     if options.json:
         content = {"machine": facts, "arguments": arguments, "results": results}
         options.json.write_text(json.dumps(content, indent=1) + "\n")
 
 
+def _start_again(options: harness.Options) -> None:
+    """Start this program again if a library has to be told, before it loads, which processor it runs on."""
+    told = {"CAMTORCH_CPU": options.cpu, **_LIMITS[options.cpu]} if options.cpu else {}
+    told |= {"CAMTORCH_NATIVE": "0"} if options.no_library else {}
+    if any(os.environ.get(name) != value for name, value in told.items()):
+        os.execve(sys.executable, [sys.executable, "-m", "benchmarks", *sys.argv[1:]], os.environ | told)
+
+
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks",
         description="Measure camtorch beside OpenCV, kornia and the floor of this machine: speed, memory and accuracy. "
-        "Tables go to stdout as markdown, progress to stderr. (2.0x) means twice camtorch's time.",
+        "Tables go to stdout as markdown, progress to stderr. camtorch 2.0x: the next takes twice its time.",
     )
     add = parser.add_argument
     keys = tuple(cameras.COEFFICIENTS)
@@ -67,6 +87,8 @@ def _parser() -> argparse.ArgumentParser:
     add("--model", nargs="+", choices=keys, default=[], metavar="KEY", help=f"only these models of {', '.join(keys)}")
     add("--device", choices=("cpu", "cuda"), default="cpu", help="where tensors live (default: cpu)")
     add("--threads", type=int, default=2, help="of torch and of OpenCV (default: 2)")
+    add("--cpu", choices=list(_LIMITS), help="limit everyone to this kind of processor (default: what it is)")
+    add("--no-library", action="store_true", help="camtorch alone, without its compiled library")
     add("--repeats", type=int, metavar="R", help="rounds that medians are taken of (default: 9)")
     add(
         "--seconds", type=float, default=0.6, metavar="S", help="for the rounds of a row, three at least (default: 0.6)"

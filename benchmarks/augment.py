@@ -5,10 +5,9 @@ a lens that it knows to a turned pinhole camera, and cannot do the other cases. 
 data by an affine map, which needs no camera; it takes floats only, so that uint8 is converted there and back.
 
 A chain, a resized crop, a flip and another lens, is timed beside the crop and the flip alone as torchvision's v2 makes
-them, sample by sample and with one draw for the whole batch, written here in the operators that it calls.
+them, sample by sample and with one draw for the whole batch.
 """
 
-import math
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
@@ -16,7 +15,6 @@ import cv2
 import kornia.augmentation as K  # noqa: N812 (kornia's own name for it)
 import numpy as np
 import torch
-import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
 from torch import Tensor
 
 import camtorch as ct
@@ -24,8 +22,13 @@ from benchmarks import cameras
 from benchmarks.harness import NAMES, OPENCV, OURS, Options, Row, Run, Table, measure
 from camtorch.augment import Compose, HorizontalFlip, RandomCamera, RandomLens, RandomResizedCrop
 
-AFFINE = "RandomAffine"
-BY_SAMPLE, ONE_DRAW = "torchvision, by sample", "one draw"
+try:
+    import torchvision.transforms.v2
+except (ImportError, RuntimeError):  # its binary is of another torch
+    torchvision = None
+
+AFFINE = "kornia RandomAffine"
+BY_SAMPLE, ONE_DRAW = "torchvision, by sample", "torchvision, one draw"
 BATCH, SIZE, QUICK_SIZE, LANDMARKS = 8, (480, 640), (120, 160), 68
 ANGLES = {"yaw": 10, "pitch": 10, "roll": 10, "min_filled": 0}
 CHAIN = "crop, flip, lens"
@@ -123,28 +126,11 @@ def _chains(size: tuple[int, int], options: Options) -> dict[str, Run]:
     lens = RandomLens("pinhole", fov=(65, 80), min_filled=0)
     chain = Compose([RandomResizedCrop(size), HorizontalFlip(landmarks={}), lens], camera=camera)
 
-    def by_sample() -> tuple[Tensor, Tensor]:
-        pairs = [_torchvision(image[None], points) for image, points in zip(images, landmarks, strict=True)]
-        return torch.cat([image for image, _ in pairs]), torch.stack([points for _, points in pairs])
-
-    return {
-        OURS: lambda: chain(image=images, keypoints=landmarks),
-        BY_SAMPLE: by_sample,
-        ONE_DRAW: lambda: _torchvision(images, landmarks),
-    }
-
-
-def _torchvision(images: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
-    """`RandomResizedCrop` of the images' own size and `RandomHorizontalFlip` of v2: the operators that both call."""
-    height, width = images.shape[-2:]
-    area, ratio = float(torch.empty(1).uniform_(0.08, 1.0)), torch.empty(1).uniform_(math.log(3 / 4), math.log(4 / 3))
-    w = min(width, round(math.sqrt(area * height * width * math.exp(ratio))))
-    h = min(height, round(area * height * width / w))
-    top, left = int(torch.randint(0, height - h + 1, (1,))), int(torch.randint(0, width - w + 1, (1,)))
-    images = images[..., top : top + h, left : left + w]
-    images = F.interpolate(images, (height, width), mode="bilinear", align_corners=False, antialias=True)
-    points = (points - points.new_tensor([left, top])) * points.new_tensor([width / w, height / h])
-    if float(torch.rand(1)) < 0.5:
-        images = images.flip(-1)
-        points = torch.stack((width - 1 - points[..., 0], points[..., 1]), -1)
-    return images, points
+    runs: dict[str, Run] = {OURS: lambda: chain(image=images, keypoints=landmarks)}
+    if torchvision is not None:
+        v2, tv = torchvision.transforms.v2, torchvision.tv_tensors
+        theirs = v2.Compose([v2.RandomResizedCrop(size), v2.RandomHorizontalFlip()])
+        batch = tv.Image(images), tv.KeyPoints(landmarks, canvas_size=size)
+        samples = [tuple(tv.wrap(part[i], like=part) for part in batch) for i in range(BATCH)]
+        runs |= {BY_SAMPLE: lambda: [theirs(*sample) for sample in samples], ONE_DRAW: lambda: theirs(*batch)}
+    return runs

@@ -23,8 +23,6 @@ COEFFICIENTS: dict[str, tuple[float, ...]] = {
 }
 """Models of each kind, with values as calibrations of such lenses have them; every term is at work."""
 
-TIMED_ANGLE = 75
-
 
 def intrinsics(size: tuple[int, int]) -> tuple[float, float, float, float]:
     """Return fx fy cx cy for another image, of the same field of view across."""

@@ -8,7 +8,7 @@ import platform
 import statistics
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.metadata import distributions
@@ -23,11 +23,13 @@ from camtorch.native import library
 
 Run = Callable[[], object]
 OURS, OPENCV, KORNIA = "camtorch", "OpenCV", "kornia"
+WITHOUT_LIBRARY = "camtorch without its library"
 NAMES = {"kannala_brandt": "Kannala-Brandt", "brown_conrady": "Brown-Conrady", "fisheye624": "Fisheye624"}
 """Models as rows of tables call them, where that is not the key."""
 
 _SHORTEST = 2e-3  # seconds: shorter calls are timed several at a time, as reading the clock takes a part of them
 _FEWEST = 3  # rounds
+_PEERS = ("kornia", "kornia_rs", "deltacamera", "albumentations", "albumentationsx", "torchvision")
 
 
 class Options(argparse.Namespace):
@@ -41,10 +43,15 @@ class Options(argparse.Namespace):
 
 
 class Figure(NamedTuple):
-    """What a contestant takes in one row; the spread is the distance of the quartiles over the median."""
+    """What a contestant takes in one row: the median of its rounds, the fastest of them and the slowest."""
 
     median: float
-    spread: float | None = None
+    least: float | None = None
+    most: float | None = None
+
+    def times(self, factor: float) -> "Figure":
+        """Return the figure in another unit."""
+        return Figure(*(value and value * factor for value in self))
 
 
 class Row(NamedTuple):
@@ -55,11 +62,14 @@ class Row(NamedTuple):
     figures: Mapping[str, Figure]
 
 
+Figures = Mapping[str, Figure]
+
+
 @dataclass(frozen=True)
 class Table:
     """Who is shown, and how: for each heading the best of its contestants, times `scale`.
 
-    Headings in `alone` have no "(1.5x)" beside the figure; None stands for all. `rate` means that more is better.
+    Headings in `alone` do not compete; None stands for all. A `rate` is shown as so many in a second.
     """
 
     name: str
@@ -69,26 +79,53 @@ class Table:
     alone: tuple[str, ...] | None = ()
     rate: bool = False
 
-    def markdown(self, rows: Mapping[str, Mapping[str, Figure]], *, spread: bool = False) -> str:
-        """Return the table; (1.5x) means 1.5 times camtorch's time. With `spread` as ±."""
-        lines = [f"| {self.title} | {' | '.join(self.columns)} |", "|---|" + "---:|" * len(self.columns)]
-        for name, figures in rows.items():
-            cells = [self._cell(heading, figures, spread) for heading in self.columns]
+    def markdown(self, runs: Sequence[Mapping[str, Figures]], *, spread: bool = False) -> str:
+        """Return a table of the rows of runs side by side, and who is the fastest; with `spread` from min to max."""
+        columns = {OURS: (OURS,), WITHOUT_LIBRARY: (WITHOUT_LIBRARY,), **self.columns}
+        rows = {name: [run.get(name, {}) for run in runs] for run in runs for name in run}
+        present = {who for row in rows.values() for figures in row for who in figures}
+        headings = [heading for heading, whose in columns.items() if present.intersection(whose)]
+        title = headings if self.alone is None else [*headings, "fastest"]
+        lines = [f"| {self.title} | {' | '.join(title)} |", "|---|" + "---:|" * len(title)]
+        for name, row in rows.items():
+            cells = [_joined(self._cell(columns[heading], figures, spread) for figures in row) for heading in headings]
+            if self.alone is not None:
+                cells.append(_joined(self.fastest(figures) for figures in row))
             lines.append(f"| {name} | {' | '.join(cells)} |")
         return "\n".join(lines)
 
-    def _cell(self, heading: str, figures: Mapping[str, Figure], spread: bool) -> str:
-        found = [figures[who] for who in self.columns[heading] if who in figures]
-        if not found:
-            return "-"
-        best = (max if self.rate else min)(found)
-        text = digits(best.median * self.scale)
-        if spread and best.spread is not None:
-            text += f" ±{best.spread:.0%}"
-        if heading == OURS or self.alone is None or heading in self.alone or OURS not in figures:
-            return text
-        ratio = best.median / figures[OURS].median
-        return f"{text} ({f'{ratio:.0f}' if ratio >= 9.95 else f'{ratio:.1f}'}x)"
+    def fastest(self, figures: Figures) -> str:
+        """Return who is ahead, and of whom: of camtorch, or camtorch of the next."""
+        found = {heading: best for heading, whose in self.columns.items() if (best := _best(whose, figures))}
+        ours = found.pop(OURS, None)
+        peers = {heading: best.median for heading, best in found.items() if heading not in (self.alone or ())}
+        if self.alone is None or ours is None or not peers:
+            return ""
+        ahead = min(peers, key=peers.__getitem__)
+        ratio = peers[ahead] / ours.median
+        return f"camtorch {_times(ratio)}" if ratio >= 1 else f"**{ahead} {_times(1 / ratio)}**"
+
+    def _cell(self, whose: Sequence[str], figures: Figures, spread: bool) -> str:
+        if not (best := _best(whose, figures)):
+            return ""
+        shown = [1 / value if self.rate else value * self.scale for value in best if value is not None]
+        text, *ends = (digits(value) for value in shown)
+        return f"{text} ({ends[-1 if self.rate else 0]}-{ends[0 if self.rate else -1]})" if spread and ends else text
+
+
+def _best(whose: Sequence[str], figures: Figures) -> Figure | None:
+    return min((figures[who] for who in whose if who in figures), default=None, key=lambda figure: figure.median)
+
+
+def _times(ratio: float) -> str:
+    return f"{ratio:.0f}x" if ratio >= 9.95 else f"{ratio:.2f}x" if ratio < 1.045 else f"{ratio:.1f}x"
+
+
+def _joined(cells: Iterable[str]) -> str:
+    """Return the cells of several runs as one, and who is the fastest of both once."""
+    one, *more = [cell for cell in cells if cell] or ["-"]
+    same = [other.removeprefix(f"{OURS} ") if one.startswith(OURS) else other for other in more]
+    return " / ".join([one, *same])
 
 
 def digits(value: float) -> str:
@@ -107,6 +144,7 @@ def measure(table: str, name: str, runs: Mapping[str, Run], options: Options, *,
     at a time.
     """
     calls = {}
+    runs = {WITHOUT_LIBRARY: runs[OURS]} if options.no_library else runs
     for who, run in runs.items():
         progress(f"{table}: {name}: first call of {who}")
         try:
@@ -141,10 +179,8 @@ def clocked(run: Run, device: torch.device | None = None, calls: int = 1) -> flo
 
 
 def figure(rounds: list[float]) -> Figure:
-    """Return the median and the spread of the rounds."""
-    median = statistics.median(rounds)
-    low, _, high = statistics.quantiles(rounds, n=4, method="inclusive") if len(rounds) > 1 else (median,) * 3
-    return Figure(median, (high - low) / median)
+    """Return the median of the rounds and their ends."""
+    return Figure(statistics.median(rounds), min(rounds), max(rounds))
 
 
 @contextmanager
@@ -158,6 +194,13 @@ def threads(count: int) -> Iterator[None]:
     finally:
         torch.set_num_threads(before[0])
         cv2.setNumThreads(before[1])
+
+
+def each_thread_count(most: int) -> Iterator[str]:
+    """Set one thread, then as many as there may be, and name them."""
+    for count in sorted({1, most}):
+        with threads(count):
+            yield f"{count} thread{'s' * (count > 1)}"
 
 
 def progress(text: str) -> None:
@@ -177,8 +220,7 @@ def machine(device: torch.device) -> dict[str, str | int]:
         "library": library.state(),
         "OpenCV": cv2.__version__,
     }
-    installed = {one.name: one.version for one in distributions()}
-    facts |= {name: installed.get(name, "not installed") for name in ("kornia", "deltacamera", "albumentations")}
+    facts |= {one.name: one.version for one in distributions() if one.name in _PEERS}
     return facts | ({"gpu": torch.cuda.get_device_name(device)} if device.type == "cuda" else {})
 
 

@@ -20,9 +20,7 @@ from torch import Tensor
 
 import camtorch as ct
 from benchmarks import cameras
-from benchmarks.harness import KORNIA, NAMES, OURS, Figure, Options, Row, Run, Table, measure, threads
-from benchmarks.memory import peak
-from camtorch.stereo.rectification import Rectification
+from benchmarks.harness import KORNIA, NAMES, OURS, Figure, Options, Row, Run, Table, each_thread_count, measure
 
 try:
     import deltacamera as dc
@@ -31,18 +29,15 @@ except ModuleNotFoundError:
 
 MODELS = ("kannala_brandt", "brown_conrady")
 SMALL, LARGE, QUICK = (480, 640), (720, 1280), (120, 160)
-KEPT, NEW = "kept map", "new cameras"
-DELTACAMERA, GRID_SAMPLE, CLONE = "deltacamera", "`grid_sample` alone", "clone"
+KEPT, NEW = "kept maps", "new cameras"
+DELTACAMERA, GRID_SAMPLE = "deltacamera", "`grid_sample` alone"
 OPENCV_MAPS = "OpenCV, float map", "OpenCV, fixed-point map"
 _EVERYONE = {OURS: (OURS,), "OpenCV": OPENCV_MAPS} | {who: (who,) for who in (DELTACAMERA, KORNIA, GRID_SAMPLE)}
-_PAIR = {OURS: (OURS,), "OpenCV": OPENCV_MAPS}
 TABLES = (
-    Table("images", "images, ms", {**_EVERYONE, CLONE: (CLONE,)}, alone=(CLONE,)),
-    Table("images, 1 thread", "images, 1 thread, ms", {**_EVERYONE, CLONE: (CLONE,)}, alone=(CLONE,)),
+    Table("kept maps", "kept maps, ms", _EVERYONE),
+    Table("new cameras", "new cameras, ms", _EVERYONE),
     Table("images, errors", "largest difference, grey levels", _EVERYONE, 1, None),
-    Table("images, memory", "at the peak, in sizes of the result", _EVERYONE, 1, None),
-    Table("stereo", "a pair rectified, ms", _PAIR),
-    Table("stereo, errors", "largest difference, grey levels", _PAIR, 1, None),
+    Table("stereo", "a pair rectified, ms", {OURS: (OURS,), "OpenCV": OPENCV_MAPS}),
 )
 _JUDGED = 2  # images of a batch whose errors are taken
 
@@ -50,16 +45,20 @@ _JUDGED = 2  # images of a batch whose errors are taken
 class Task:
     """Images of random noise, which no error of a position can hide in.
 
-    "kept map" is one camera for all of them, into the target that `ct.Dewarp` chose. "new cameras" are as many
-    different cameras, made anew each time, into a pinhole camera of the same K: what every peer can do.
+    "kept maps" are of one camera for all images, into the target that `ct.Dewarp` chose. "new cameras" are as
+    many different cameras, made anew each time, into a pinhole camera of the same K: what every peer can do.
+    The shape (H, W, C) is of images whose channels lie last in memory, as OpenCV's do.
     """
 
     def __init__(self, key: str, batch: int, shape: tuple[int, int, int], dtype: torch.dtype, device: torch.device):
+        channels_last = shape[-1] == 3
+        size, shape = "x".join(map(str, shape)), (shape[-1], *shape[:-1]) if channels_last else shape
         self.key, self.size, self.device = key, shape[1:], device
-        self.name = f"{NAMES[key]}, {batch} of {'x'.join(map(str, shape))} {str(dtype).removeprefix('torch.')}"
+        self.name = f"{NAMES[key]}, {batch} of {size} {str(dtype).removeprefix('torch.')}"
         generator = torch.Generator().manual_seed(0)
         bytes_ = torch.randint(256, (batch, *shape), generator=generator, dtype=torch.uint8)
-        self.images = bytes_.to(device, dtype)
+        layout = torch.channels_last if channels_last else torch.contiguous_format
+        self.images = bytes_.to(device, dtype).contiguous(memory_format=layout)
         arrays = [np.ascontiguousarray(image.permute(1, 2, 0).numpy()) for image in bytes_.to(dtype)]
         self.arrays = [array[..., 0] for array in arrays] if shape[0] == 1 else arrays
         self.dewarp = ct.Dewarp(self.camera())
@@ -76,27 +75,18 @@ class Task:
 
 
 def rows(options: Options) -> Iterator[Row]:
-    """Measure every kind of image, then pairs: speed, errors, memory."""
+    """Measure every kind of image, speed and errors; then pairs."""
     full, byte = torch.float32, torch.uint8
-    asked = [(batch, (3, *LARGE), dtype) for batch in (1, 8) for dtype in (full, byte)]
-    asked += [(8, (3, *SMALL), byte), (8, (3, *SMALL), full), (8, (1, *SMALL), byte)]
+    asked = [(1, shape, byte) for shape in ((1, *SMALL), (3, *SMALL), (*SMALL, 3), (3, *LARGE))]
+    asked += [(1, (3, *LARGE), full), (8, (3, *LARGE), byte), (8, (3, *SMALL), full), (8, (3, *LARGE), full)]
     if options.quick:
-        asked = [(1, (3, *QUICK), full), (8, (3, *QUICK), full), (8, (1, *QUICK), byte)]
+        asked = [(1, (*QUICK, 3), byte), (8, (3, *QUICK), full)]
     for key, kind in product(options.chosen(MODELS), asked):
         task = Task(key, *kind, options.device)
         for operation, runs in contestants(task).items():
-            name = f"{task.name}, {operation}"
-            yield measure("images", name, runs, options)
-            if len(task.images) == 1 or task.size != LARGE:  # the others are as wrong
-                yield Row("images, errors", name, _errors(task, operation, runs))
-            elif options.device.type == "cpu":
-                peaks = {who: peak(run) for who, run in runs.items() if who not in (CLONE, DELTACAMERA)}
-                sizes = {who: Figure(most / task.images.nbytes) for who, most in peaks.items() if most is not None}
-                yield Row("images, memory", name, sizes)
-            if options.device.type == "cpu":
-                runs.pop(KORNIA, None)  # the slowest by far
-                with threads(1):
-                    yield measure("images, 1 thread", name, runs, options)
+            for count in each_thread_count(1 if len(task.images) == 1 else options.threads):
+                yield measure(operation, f"{task.name}, {count}", runs, options)
+            yield Row("images, errors", f"{task.name}, {operation}", _errors(task, operation, runs))
     with torch.no_grad():
         for key, channels in product(options.chosen(MODELS), (1, 3)):
             yield from _pair(key, channels, options)
@@ -111,7 +101,7 @@ def _errors(task: Task, operation: str, runs: dict[str, Run]) -> dict[str, Figur
     else:
         warp = task.warp_of(task.camera(len(images), double))
     truth, inside = true_images(images, warp)
-    results = {who: as_tensor(run())[:_JUDGED] for who, run in runs.items() if who != CLONE}
+    results = {who: as_tensor(run())[:_JUDGED] for who, run in runs.items()}
     return {who: Figure((result - truth).abs()[inside].max().item()) for who, result in results.items()}
 
 
@@ -160,8 +150,6 @@ def contestants(task: Task) -> dict[str, dict[str, Run]]:
         found[KEPT][GRID_SAMPLE] = lambda: F.grid_sample(images, grid, align_corners=False)
         if task.key == "brown_conrady":  # which kornia knows; it computes its map every time
             found[NEW][KORNIA] = lambda: undistort_image(images, given.K, given.distortion)
-    for runs in found.values():
-        runs[CLONE] = images.clone
     return found
 
 
@@ -186,41 +174,20 @@ def _deltacamera(camera: ct.Camera) -> Any:
     return dc.Camera(intrinsic_matrix=camera.K.cpu().numpy(), distortion_model=model, image_shape=camera.image_size)
 
 
-def rectification(key: str, size: tuple[int, int], dtype: torch.dtype, device: torch.device) -> Rectification:
-    """Return two cameras of a model, a little turned against each other, into images of their size."""
-    camera = cameras.camera(key, device, dtype, size=size).requires_grad_(False)
+def _pair(key: str, channels: int, options: Options) -> Iterator[Row]:
+    """Two cameras of a model, a little turned against each other, into images of their size."""
+    size, device = QUICK if options.quick else LARGE, options.device
+    camera = cameras.camera(key, device, size=size).requires_grad_(False)
     extrinsics = ct.Extrinsics([0.01, -0.02, 0.015], [-0.1, 0.002, -0.001]).to(device).requires_grad_(False)
     wide = np.degrees(2 * np.arctan(size[1] / 2 / float(camera.intrinsics[0])))
-    return ct.rectify(camera, camera, extrinsics, fov=float(wide), image_size=size, align="opencv")
-
-
-def _pair(key: str, channels: int, options: Options) -> Iterator[Row]:
-    size, device = QUICK if options.quick else LARGE, options.device
-    ours = rectification(key, size, torch.float32, device)
+    ours = ct.rectify(camera, camera, extrinsics, fov=float(wide), image_size=size, align="opencv")
     generator = torch.Generator().manual_seed(0)
     images = torch.randint(256, (2, 1, channels, *size), generator=generator, dtype=torch.uint8).to(device)
     arrays = [np.ascontiguousarray(image[0].permute(1, 2, 0).cpu().numpy()) for image in images]
+    turns = [turn.cpu().numpy() for turn in (ours.rotation_left, ours.rotation_right)]
     runs: dict[str, Run] = {OURS: lambda: ours(*images)}
     for name, kind in zip(OPENCV_MAPS, (cv2.CV_32FC1, cv2.CV_16SC2), strict=True):
-        runs[name] = _remap_pair(ours, arrays, kind)
-    case = f"{NAMES[key]}, {channels}x{size[0]}x{size[1]} uint8"
-    yield measure("stereo", case, runs, options)
-    if options.threads > 1 and device.type == "cpu":
-        with threads(1):
-            yield measure("stereo", f"{case}, 1 thread", runs, options)
-    double = rectification(key, size, torch.float64, device)
-    found = [true_images(image, warp) for image, warp in zip(images, (double.left, double.right), strict=True)]
-    truth, inside = map(torch.cat, zip(*found, strict=True))
-    errors = {}
-    for name, run in runs.items():
-        pair = run()
-        made = torch.cat(pair) if isinstance(pair, tuple) else as_tensor(pair)
-        errors[name] = Figure((made.double() - truth).abs()[inside].max().item())
-    yield Row("stereo, errors", case, errors)
-
-
-def _remap_pair(found: Rectification, arrays: list[np.ndarray], kind: int) -> Run:
-    """OpenCV's maps of the same rectified cameras, made once."""
-    sides = (found.source_left, found.rotation_left), (found.source_right, found.rotation_right)
-    maps = [opencv_maps(camera, found.camera_left, turn.cpu().numpy(), kind)() for camera, turn in sides]
-    return lambda: [cv2.remap(array, *pair, cv2.INTER_LINEAR) for array, pair in zip(arrays, maps, strict=True)]
+        maps = [opencv_maps(camera, ours.camera_left, turn, kind)() for turn in turns]
+        runs[name] = partial(_remap, arrays, [lambda pair=pair: pair for pair in maps])
+    for count in each_thread_count(options.threads):
+        yield measure("stereo", f"{NAMES[key]}, {channels}x{size[0]}x{size[1]} uint8, {count}", runs, options)

@@ -1,61 +1,100 @@
-"""The tables of the page on performance, from the figures of one run: `python -m benchmarks.page RUN.json`.
+"""The tables of the page on performance, from figures of runs: `python -m benchmarks.page AVX2.json AVX512.json`.
 
-A run is what `python -m benchmarks ... --json RUN.json` writes. The page marks the place of each table that it shows,
-`<!-- points --> ... <!-- /points -->`; their figures are kept beside it, so that every number can be looked up.
+A run is what `python -m benchmarks ... --json RUN.json` writes. Runs on several kinds of processors stand side by side;
+a run with `--no-library` becomes a column of the last of them. The page marks the place of each table that it shows,
+`<!-- points --> ... <!-- /points -->`; the figures are kept beside it, so that every number can be looked up.
 """
 
 import argparse
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from benchmarks.__main__ import TABLES
-from benchmarks.harness import Figure
+from benchmarks.harness import WITHOUT_LIBRARY, Figure
 
 PAGE = Path(__file__).parent.parent / "docs" / "performance.md"
 FIGURES = PAGE.with_suffix(".json")
 _PLACE = re.compile(r"(<!-- (\w[\w, ]*) -->\n).*?(<!-- /\2 -->)", re.S)
 
 Run = Mapping[str, Any]
+_KINDS = {"avx2": "AVX2", "avx512": "AVX-512"}
 
 
-def filled(page: str, run: Run) -> str:
-    """Return a page whose tables are those of a run.
+def filled(page: str, runs: Sequence[Run]) -> str:
+    """Return a page whose tables are those of the runs.
 
     Raises:
-        ValueError: If the page has no place for a table of the run, or the run has no figures for a place.
+        ValueError: If the page has no place for a table of the runs, or the runs have no figures for a place.
     """
     places = [found[2] for found in _PLACE.finditer(page)]
-    wanted = ["machine", *run["results"]]
+    wanted = ["machine", "losses", *{name: None for run in runs for name in run["results"]}]
     if sorted(places) != sorted(wanted):
-        raise ValueError(f"the page's places must be those of the run, {sorted(wanted)}; got {sorted(places)}")
-    return _PLACE.sub(lambda match: f"{match[1]}{_text(match[2], run)}\n{match[3]}", page)
+        raise ValueError(f"the page's places must be those of the runs, {sorted(wanted)}; got {sorted(places)}")
+    special = {"machine": _machine, "losses": _losses}
+    texts = {name: special[name](runs) if name in special else _table(name, runs) for name in wanted}
+    return _PLACE.sub(lambda match: f"{match[1]}{texts[match[2]]}\n{match[3]}", page)
 
 
-def _text(name: str, run: Run) -> str:
-    if name == "machine":
-        facts = run["machine"]
-        return (
-            f"On {facts['threads']} threads of {facts['cpu']} with {facts['cores']} cores; torch {facts['torch']}, "
-            f"OpenCV {facts['OpenCV']}, kornia {facts['kornia']}, deltacamera {facts['deltacamera']}, "
-            f"Python {facts['python']}, camtorch {facts['camtorch']}, {facts['library']}."
-        )
-    rows = run["results"][name].items()
-    return TABLES[name].markdown({row: {who: Figure(*f) for who, f in figures.items()} for row, figures in rows})
+def _with_library(runs: Sequence[Run]) -> list[Run]:
+    return [run for run in runs if not run["arguments"]["no_library"]]
+
+
+def _figures(name: str, runs: Sequence[Run]) -> list[dict[str, dict[str, Figure]]]:
+    """Return the rows of a table in each run with the library; of the others one contestant joins the last of them."""
+    read = lambda run: {
+        row: {who: Figure(*figure) for who, figure in figures.items()}
+        for row, figures in run["results"].get(name, {}).items()
+    }
+    found = [read(run) for run in _with_library(runs)]
+    for run in runs:
+        if run["arguments"]["no_library"]:
+            for row, figures in read(run).items():
+                if row in found[-1] and WITHOUT_LIBRARY in figures:
+                    found[-1][row][WITHOUT_LIBRARY] = figures[WITHOUT_LIBRARY]
+    return found
+
+
+def _kind(run: Run) -> str:
+    return _KINDS.get(run["machine"]["library"], run["machine"]["library"])
+
+
+def _table(name: str, runs: Sequence[Run]) -> str:
+    kinds = " / ".join(map(_kind, _with_library(runs)))
+    return replace(TABLES[name], title=f"{TABLES[name].title}: {kinds}").markdown(_figures(name, runs))
+
+
+def _machine(runs: Sequence[Run]) -> str:
+    """Return what has to be known to compare the figures with others."""
+    facts = dict(_with_library(runs)[-1]["machine"])
+    cpu, cores, threads, _ = (facts.pop(name) for name in ("cpu", "cores", "threads", "library"))
+    return f"On {threads} threads of {cpu} with {cores} cores; {', '.join(f'{k} {v}' for k, v in facts.items())}."
+
+
+def _losses(runs: Sequence[Run]) -> str:
+    """Return a list of the rows in which somebody else is the fastest."""
+    lines = []
+    for name in dict.fromkeys(name for run in runs for name in run["results"]):
+        for run, rows in zip(_with_library(runs), _figures(name, runs), strict=True):
+            found = {row: TABLES[name].fastest(figures) for row, figures in rows.items()}
+            lines += [f"* {_kind(run)}, {name}, {row}: {who}" for row, who in found.items() if who.startswith("**")]
+    return "\n".join(sorted(lines)) or "None."
 
 
 def main(arguments: list[str] | None = None) -> None:
     """Fill the page."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.page", description=__doc__)
-    parser.add_argument("run", type=Path, help="what `python -m benchmarks ... --json` wrote")
-    run = json.loads(parser.parse_args(arguments).run.read_text())
+    parser.add_argument("runs", type=Path, nargs="+", help="what `python -m benchmarks ... --json` wrote")
+    runs = [json.loads(path.read_text()) for path in parser.parse_args(arguments).runs]
     page = PAGE.read_text()
-    run["results"] = {name: rows for name, rows in run["results"].items() if f"<!-- {name} -->" in page}
-    run["arguments"].pop("json", None)  # where it was written
-    PAGE.write_text(filled(page, run))
-    FIGURES.write_text(json.dumps(run) + "\n")
+    for run in runs:
+        run["results"] = {name: rows for name, rows in run["results"].items() if f"<!-- {name} -->" in page}
+        run["arguments"].pop("json", None)  # where it was written
+    PAGE.write_text(filled(page, runs))
+    FIGURES.write_text(json.dumps(runs) + "\n")
 
 
 if __name__ == "__main__":

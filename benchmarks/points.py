@@ -7,8 +7,6 @@ ray is projected in float64, and compared with the pixel that went in.
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import lru_cache
-from itertools import cycle
 from typing import Any
 
 import cv2
@@ -20,18 +18,14 @@ from torch import Tensor
 
 import camtorch as ct
 from benchmarks import cameras
-from benchmarks.harness import KORNIA, NAMES, OPENCV, OURS, Figure, Options, Row, Run, Table, measure
+from benchmarks.harness import KORNIA, NAMES, OPENCV, OURS, Figure, Options, Row, Run, Table, measure, threads
 from benchmarks.memory import kept_for_backward
 
-COMPILED, PLANES, COPY = "compiled", "compiled, planes", "cold copy"
-_EVERYONE = {who: (who,) for who in (OURS, COMPILED, PLANES, OPENCV, KORNIA)}
+COMPILED, FORMULA = "compiled", "its formula in torch"
+_EVERYONE = {who: (who,) for who in (OURS, COMPILED, OPENCV, KORNIA)}
 TABLES = (
-    Table(
-        "points",
-        "1M float32 points, ms",
-        {**_EVERYONE, COPY: (COPY,)},
-        alone=(COMPILED, PLANES, COPY),
-    ),
+    Table("points", "1M float32 points, ms", _EVERYONE, alone=(COMPILED,)),
+    Table("few points", "100 float32 points, us", {OURS: (OURS,), FORMULA: (FORMULA,)}, 1e6),
     Table("points, memory", "bytes a point that wait for the backward pass, input included", _EVERYONE, 1, None),
     Table("points, errors", "largest error, px, where there is an answer", _EVERYONE, 1, None),
     Table("points, lost", "% without an answer, or off by more than 1 px", _EVERYONE, 100, None),
@@ -40,7 +34,6 @@ _WITHIN_90 = ("pinhole", "brown_conrady")
 _OFF = 1.0  # pixels: an answer further off is wrong
 _COMPILED = ("kannala_brandt", "brown_conrady", "fisheye624")  # unless asked for models: each takes half a minute
 _MOST_JUDGED = 250_000  # points whose errors are taken
-_COLD_BYTES = 256 * 2**20  # a copy from memory that was not touched for so many bytes finds nothing in a cache
 
 
 @dataclass(frozen=True)
@@ -69,32 +62,43 @@ def rows(options: Options) -> Iterator[Row]:
     """Measure every model."""
     for key in options.chosen(tuple(cameras.COEFFICIENTS)):
         torch.compiler.reset()  # what was compiled for another model
-        compiled = options.compile and (key in _COMPILED or key in options.models)
+        compiled = options.compile and (key in _COMPILED or key in options.model)
         reference = cameras.camera(key, options.device, torch.float64)
-        points = cameras.points(options.size, cameras.TIMED_ANGLE, options.device)
+        points = cameras.points(options.size, 75, options.device)
         for way, source in (("project", points), ("unproject", _pixels(reference, points))):
             everyone = contestants(key, way, options.device, compiled=compiled)
             yield from _way(f"{NAMES.get(key, key)} {way}", everyone, source, options)
             for degrees in (45, 75) if key in _WITHIN_90 else (75, 100):
                 yield from _errors(f"{NAMES.get(key, key)} {way}", way, everyone, reference, degrees, options)
+    if few := options.chosen(("kannala_brandt",)):
+        lens, points = cameras.camera(*few, options.device), cameras.points(100, 90, options.device)
+        runs = {OURS: lambda: lens.project(points), FORMULA: lambda: _bare_fisheye(points, *lens.parameters())}
+        with threads(1), torch.no_grad():
+            yield measure("few points", f"{NAMES[few[0]]} project", runs, options)
+
+
+def _bare_fisheye(points: Tensor, intrinsics: Tensor, k: Tensor) -> Tensor:
+    """Project by the bare formula, which says of no point whether it is valid."""
+    radius = torch.linalg.vector_norm(points[:, :2], dim=1, keepdim=True)
+    angle = torch.atan2(radius, points[:, 2:])
+    square = angle * angle
+    scale = angle * (1 + square * (k[0] + square * (k[1] + square * (k[2] + square * k[3])))) / radius
+    return points[:, :2] * scale * intrinsics[:2] + intrinsics[2:]
 
 
 def contestants(key: str, way: str, device: torch.device, *, compiled: bool) -> Contestants:
-    """Return who can do a direction of a model, the floor of the machine last."""
+    """Return who can do a direction of a model."""
     lens = cameras.camera(key, device)
     learns = tuple(p for p in lens.parameters() if p.numel())
     masked = lambda result: torch.where(result[1][..., None], result[0], torch.nan)
     call = getattr(lens, way)
     found = {OURS: Direction(call, answer=masked, learns=learns)}
     if compiled:
-        planes = lambda points: points.T.contiguous().movedim(0, -1)
-        kinds = {COMPILED: lambda x: x} | ({PLANES: planes} if way == "project" else {})
-        for name, prepare in kinds.items():
-            found[name] = Direction(torch.compile(call, dynamic=False), prepare, masked, learns)
+        found[COMPILED] = Direction(torch.compile(call, dynamic=False), answer=masked, learns=learns)
     peers = {"kannala_brandt": _fisheye_peers, "brown_conrady": _perspective_peers}.get(key)
     if peers is not None:
         found |= {who: both[way == "unproject"] for who, both in peers(cameras.COEFFICIENTS[key], device).items()}
-    return found | {COPY: Direction(lambda run: run(), lambda x: _cold_copy(len(x), device), learns=None)}
+    return found
 
 
 def _fisheye_peers(lens: tuple[float, ...], device: torch.device) -> dict[str, tuple[Direction, Direction]]:
@@ -146,43 +150,20 @@ def _on_plane(pixels: Tensor) -> Tensor:
     return torch.nn.functional.pad(pixels, (0, 1), value=1.0)
 
 
-def _cold_copy(count: int, device: torch.device) -> Run:
-    """Copy five planes, the 12 bytes of a point and the 8 of a pixel, between places that go round a large buffer."""
-    places = cycle(zip(*_places(5 * count, device), strict=True))
-
-    def run() -> None:
-        source, target = next(places)
-        target.copy_(source)
-
-    return run
-
-
-@lru_cache(maxsize=1)
-def _places(width: int, device: torch.device) -> Tensor:
-    """(2, n, width), written to: memory that is only reserved reads as one page of zeros, which no cache would miss."""
-    return torch.ones(2, max(2, -(-_COLD_BYTES // (4 * width))), width, device=device)
-
-
 def _pixels(reference: ct.Camera, points: Tensor) -> Tensor:
     with torch.no_grad():
         return reference.project(points.double())[0].float().contiguous()
 
 
 def _way(name: str, everyone: Contestants, source: Tensor, options: Options) -> Iterator[Row]:
-    """Forward, and forward with backward; a cold copy is the floor of either."""
+    """Forward, and forward with backward."""
     inputs = {who: direction.prepare(source) for who, direction in everyone.items()}
     forward = {who: _inference(direction, inputs[who]) for who, direction in everyone.items()}
     both = {who: _learning(d, inputs[who]) for who, d in everyone.items() if d.learns is not None}
-    both[COPY] = forward[COPY]
     for text, runs in ((name, forward), (f"{name} and backward", both)):
         found, million = measure("points", text, runs, options).figures, 1e6 / len(source)
-        scaled = {who: f._replace(median=f.median * million) for who, f in found.items()}
-        yield Row("points", text, scaled)
-    kept = {
-        who: kept_for_backward(everyone[who].values, inputs[who]) / len(source)
-        for who in both
-        if who in found and who != COPY
-    }
+        yield Row("points", text, {who: figure.times(million) for who, figure in found.items()})
+    kept = {who: kept_for_backward(everyone[who].values, inputs[who]) / len(source) for who in both if who in found}
     yield Row("points, memory", name, {who: Figure(value) for who, value in kept.items()})
 
 
@@ -218,8 +199,6 @@ def _errors(
     source = points if way == "project" else truth.float().contiguous()
     errors, lost = {}, {}
     for who, direction in everyone.items():
-        if who == COPY:
-            continue
         try:
             with torch.no_grad():
                 found = direction.answer(direction.call(direction.prepare(source))).to(options.device).double()
