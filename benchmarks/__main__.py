@@ -26,6 +26,7 @@ _LIMITS = {
         "MKL_ENABLE_INSTRUCTIONS": "AVX2",
         "OPENCV_CPU_DISABLE": "AVX512-SKX,AVX512-ICL",
         "OPENCV_IPP": "avx2",
+        "NPY_DISABLE_CPU_FEATURES": "X86_V4 AVX512_ICL AVX512_SPR",
     },
     "avx512": {},
 }

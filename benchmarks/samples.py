@@ -147,7 +147,7 @@ def _bare(image: np.ndarray) -> dict[str, Run]:
     found: dict[str, Run] = {BARE_OPENCV: lambda: cv2.warpAffine(image, matrix, (width, height))}
     if kornia_rs is not None:
         numbers = tuple(matrix.ravel().tolist())
-        found[BARE_KORNIA] = lambda: kornia_rs.warp_affine(image, numbers, (height, width), "bilinear")
+        found[BARE_KORNIA] = lambda: kornia_rs.imgproc.warp_affine(image, numbers, (height, width), "bilinear")
     return found
 
 
