@@ -55,7 +55,7 @@ def main(arguments: list[str] | None = None) -> None:
     print(f"Medians of at most {options.repeats} rounds, with the fastest and the slowest round.", flush=True)
     results: dict[str, dict[str, harness.Figures]] = {}
     start = time.perf_counter()
-    for name in options.subject or SUBJECTS:
+    for name in SUBJECTS if "all" in options.subject else options.subject:
         for row in SUBJECTS[name].rows(options):
             results.setdefault(row.table, {})[row.name] = dict(row.figures)
         for table in SUBJECTS[name].TABLES:
@@ -83,7 +83,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     add = parser.add_argument
     keys = tuple(cameras.COEFFICIENTS)
-    add("subject", nargs="*", choices=list(SUBJECTS), help="default: all")
+    add("subject", nargs="*", choices=[*SUBJECTS, "all"], default="all", help="default: all")
     add("--size", type=int, metavar="N", help="points of the subject points (default: 1000000)")
     add("--model", nargs="+", choices=keys, default=[], metavar="KEY", help=f"only these models of {', '.join(keys)}")
     add("--device", choices=("cpu", "cuda"), default="cpu", help="where tensors live (default: cpu)")
@@ -91,9 +91,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--cpu", choices=list(_LIMITS), help="limit everyone to this kind of processor (default: what it is)")
     add("--no-library", action="store_true", help="camtorch alone, without its compiled library")
     add("--repeats", type=int, metavar="R", help="rounds that medians are taken of (default: 9)")
-    add(
-        "--seconds", type=float, default=0.6, metavar="S", help="for the rounds of a row, three at least (default: 0.6)"
-    )
+    add("--seconds", type=float, default=0.6, metavar="S", help="of a row's rounds, three at least (default: 0.6)")
     add("--no-compile", dest="compile", action="store_false", help="without torch.compile: about a minute a model")
     add("--json", type=Path, metavar="FILE", help="write the machine and every figure to this file")
     add("--quick", action="store_true", help="small inputs, nothing compiled: does everything work?")

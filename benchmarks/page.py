@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.__main__ import TABLES
-from benchmarks.harness import WITHOUT_LIBRARY, Figure
+from benchmarks.harness import Figure
 
 PAGE = Path(__file__).parent.parent / "docs" / "performance.md"
 FIGURES = PAGE.with_suffix(".json")
@@ -44,17 +44,16 @@ def _with_library(runs: Sequence[Run]) -> list[Run]:
 
 
 def _figures(name: str, runs: Sequence[Run]) -> list[dict[str, dict[str, Figure]]]:
-    """Return the rows of a table in each run with the library; of the others one contestant joins the last of them."""
-    read = lambda run: {
-        row: {who: Figure(*figure) for who, figure in figures.items()}
-        for row, figures in run["results"].get(name, {}).items()
-    }
-    found = [read(run) for run in _with_library(runs)]
-    for run in runs:
+    """Return the rows of a table in each run with the library; those of other runs join the last of them."""
+    found: list[dict[str, dict[str, Figure]]] = []
+    for run in sorted(runs, key=lambda run: run["arguments"]["no_library"]):
+        rows = run["results"].get(name, {})
+        rows = {row: {who: Figure(*figure) for who, figure in figures.items()} for row, figures in rows.items()}
         if run["arguments"]["no_library"]:
-            for row, figures in read(run).items():
-                if row in found[-1] and WITHOUT_LIBRARY in figures:
-                    found[-1][row][WITHOUT_LIBRARY] = figures[WITHOUT_LIBRARY]
+            for row, figures in found[-1].items():
+                figures.update(rows.get(row, {}))
+        else:
+            found.append(rows)
     return found
 
 
@@ -76,19 +75,21 @@ def _machine(runs: Sequence[Run]) -> str:
 
 def _losses(runs: Sequence[Run]) -> str:
     """Return a list of the rows in which somebody else is the fastest."""
-    lines = []
-    for name in dict.fromkeys(name for run in runs for name in run["results"]):
+    found: dict[str, list[str]] = {}
+    for name in {name: None for run in runs for name in run["results"]}:
         for run, rows in zip(_with_library(runs), _figures(name, runs), strict=True):
-            found = {row: TABLES[name].fastest(figures) for row, figures in rows.items()}
-            lines += [f"* {_kind(run)}, {name}, {row}: {who}" for row, who in found.items() if who.startswith("**")]
-    return "\n".join(sorted(lines)) or "None."
+            for row, figures in rows.items():
+                if (who := TABLES[name].fastest(figures)).startswith("**"):
+                    found.setdefault(f"* {name}, {row}: ", []).append(f"{who} ({_kind(run)})")
+    return "\n".join(row + ", ".join(whose) for row, whose in found.items()) or "None."
 
 
 def main(arguments: list[str] | None = None) -> None:
     """Fill the page."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.page", description=__doc__)
     parser.add_argument("runs", type=Path, nargs="+", help="what `python -m benchmarks ... --json` wrote")
-    runs = [json.loads(path.read_text()) for path in parser.parse_args(arguments).runs]
+    short = lambda text: float(f"{float(text):.4g}")
+    runs = [json.loads(path.read_text(), parse_float=short) for path in parser.parse_args(arguments).runs]
     page = PAGE.read_text()
     for run in runs:
         run["results"] = {name: rows for name, rows in run["results"].items() if f"<!-- {name} -->" in page}
