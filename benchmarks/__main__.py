@@ -18,7 +18,6 @@ except ModuleNotFoundError as error:
 _MODULES = (points, images, training, augment, samples, calibration)
 SUBJECTS = {module.__name__.rpartition(".")[2]: module for module in _MODULES}
 TABLES = {table.name: table for subject in SUBJECTS.values() for table in subject.TABLES}
-_COMPILED_VERSIONS = 64  # of one function, before torch gives up; here every contestant is a version
 _LIMITS = {
     "avx2": {
         "ATEN_CPU_CAPABILITY": "avx2",
@@ -26,11 +25,12 @@ _LIMITS = {
         "MKL_ENABLE_INSTRUCTIONS": "AVX2",
         "OPENCV_CPU_DISABLE": "AVX512-SKX,AVX512-ICL",
         "OPENCV_IPP": "avx2",
+        "NUMBA_CPU_FEATURES": "-avx512f",
         "NPY_DISABLE_CPU_FEATURES": "X86_V4 AVX512_ICL AVX512_SPR",
     },
     "avx512": {},
 }
-"""Each kind of processor -> what keeps torch, its libraries and OpenCV from using a better one."""
+"""Each kind of processor -> what keeps torch, OpenCV, NumPy and their libraries from using a better one."""
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -45,7 +45,7 @@ def main(arguments: list[str] | None = None) -> None:
     arguments = vars(options) | {"json": str(options.json)}
     torch.set_num_threads(options.threads)
     cv2.setNumThreads(options.threads)
-    torch._dynamo.config.recompile_limit = _COMPILED_VERSIONS
+    torch._dynamo.config.recompile_limit = 64  # versions of a function: every contestant is one
     options.device = torch.device(options.device)
     options.size = options.size or (10_000 if options.quick else 1_000_000)
     options.repeats = options.repeats or (3 if options.quick else 9)

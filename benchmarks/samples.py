@@ -167,7 +167,7 @@ class Samples(Dataset):
 
 def _loaders(options: Options) -> Iterator[Row]:
     """Epochs with two workers: drivers, then lenses; all collated as torch does, then all by `ct.augment.collate`."""
-    count = augment.BATCH * (_QUICK_BATCHES if options.quick else _BATCHES)
+    count = augment.BATCH * (_QUICK_BATCHES if options.quick or options.no_library else _BATCHES)
     for case, (how, by) in product((None, *augment.CASES[:2]), _COLLATES.items()):
         size = augment.QUICK_SIZE if options.quick else augment.SIZE if case else SIZES[0]
         drivers = [_driver(size, index) for index in range(augment.BATCH)]

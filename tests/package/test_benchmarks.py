@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks import __main__ as program
 from benchmarks import page
-from benchmarks.__main__ import SUBJECTS
-from benchmarks.harness import WITHOUT_LIBRARY, Figure, Table, figure
+from benchmarks.harness import WITHOUT_LIBRARY, Figure, Options, Table, figure
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -32,12 +32,25 @@ def test_a_quick_run_measures_everyone_and_writes_every_figure(tmp_path, subject
     assert done.returncode == 0, done.stderr[-2000:]
     assert "failed" not in done.stderr
     results = json.loads(path.read_text())["results"]
-    timed = [table.name for name in subjects for table in SUBJECTS[name].TABLES if table.alone is not None]
+    timed = [table.name for name in subjects for table in program.SUBJECTS[name].TABLES if table.alone is not None]
     for name in timed:
         assert f"### {name}\n" in done.stdout
         for row, figures in results[name].items():
             assert ours in figures, row
             assert all(math.isfinite(median) and median > 0 for median, *_ in figures.values()), row
+
+
+def test_everyone_is_limited_by_a_program_that_starts_itself_again(monkeypatch):
+    started = []
+    monkeypatch.setattr(program.os, "execve", lambda *given: started.append(given))
+    options = program._parser().parse_args(["--cpu", "avx2"], Options())
+    assert options.subject == "all"
+    program._start_again(options)
+    ((_, _, environment),) = started
+    assert {"CAMTORCH_CPU": "avx2", "ATEN_CPU_CAPABILITY": "avx2"}.items() <= environment.items()
+    monkeypatch.setattr(program.os, "environ", environment)
+    program._start_again(options)
+    assert len(started) == 1
 
 
 def test_a_table_shows_runs_side_by_side_and_who_is_the_fastest():
