@@ -31,7 +31,6 @@ AFFINE = "kornia RandomAffine"
 BY_SAMPLE, ONE_DRAW = "torchvision, by sample", "torchvision, one draw"
 BATCH, SIZE, QUICK_SIZE, LANDMARKS = 8, (480, 640), (120, 160), 68
 ANGLES = {"yaw": 10, "pitch": 10, "roll": 10, "min_filled": 0}
-CHAIN = "crop, flip, lens"
 _SHOWN = {who: (who,) for who in (OURS, AFFINE, OPENCV, BY_SAMPLE, ONE_DRAW)}
 TABLES = (Table("augment", f"{BATCH} images, ms", _SHOWN),)
 _DEGREES = np.radians(10)
@@ -67,7 +66,7 @@ def rows(options: Options) -> Iterator[Row]:
         for dtype in (torch.float32, torch.uint8):
             runs = _contestants(case, size, dtype, options.device)
             yield measure("augment", f"{case.name}, {str(dtype).removeprefix('torch.')}", runs, options)
-    yield measure("augment", f"{CHAIN}, uint8", _chains(size, options), options, shortest=_SHORTEST)
+    yield measure("augment", "crop, flip, lens, uint8", _chains(size, options), options, shortest=_SHORTEST)
 
 
 def affine_of(keys: list[str]) -> K.AugmentationSequential:

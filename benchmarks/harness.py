@@ -158,7 +158,6 @@ def measure(table: str, name: str, runs: Mapping[str, Run], options: Options, *,
     gc.disable()
     try:
         for turn in range(options.repeats):
-            progress(f"{table}: {name}: round {turn + 1} of {options.repeats}, {len(calls)} contestants")
             for who in list(calls)[:: 1 if turn % 2 == 0 else -1]:
                 if turn < _FEWEST or calls[who] * sum(rounds[who]) < share:
                     rounds[who].append(clocked(runs[who], options.device, calls[who]))

@@ -20,14 +20,13 @@ from benchmarks.harness import KORNIA, OURS, Options, Row, Run, Table, each_thre
 from benchmarks.images import GRID_SAMPLE, MODELS, QUICK, SMALL, Task
 
 TABLES = (Table("training", "forward and backward, ms", {who: (who,) for who in (OURS, KORNIA, GRID_SAMPLE)}),)
-_BATCH = 8
 
 
 def rows(options: Options) -> Iterator[Row]:
     """Measure both lenses, with one thread and with two."""
     for key in options.chosen(MODELS):
         shape = (3, *(QUICK if options.quick else SMALL))
-        task = Task(key, _BATCH, shape, torch.float32, options.device)
+        task = Task(key, 8, shape, torch.float32, options.device)
         for case, runs in _contestants(task).items():
             for count in each_thread_count(options.threads):
                 yield measure("training", f"{task.name}, to {case}, {count}", runs, options)
