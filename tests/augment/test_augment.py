@@ -178,9 +178,7 @@ def test_a_batch_is_its_samples(name):
         assert alone["camera"].batch_shape == ()
         for field, value in alone.items():
             if isinstance(value, torch.Tensor) and value.is_floating_point():
-                torch.testing.assert_close(
-                    value, out[field][i], atol=2e-3, rtol=1e-4, msg=lambda m, f=field: f"{f}: {m}"
-                )
+                torch.testing.assert_close(value, out[field][i], atol=2e-3, rtol=1e-4, msg=f"{field}: {{}}".format)
             elif isinstance(value, torch.Tensor):
                 assert value.shape == out[field][i].shape
                 assert (value != out[field][i]).float().mean() < 1e-3, field
@@ -225,24 +223,16 @@ def test_skipped_samples_stay_bit_identical(name):
         assert torch.equal(out["camera"].intrinsics[skipped][0], batch["camera"].intrinsics)
 
 
-def test_chains_carry_camera_rotation_and_validity_on():
+def test_chains_carry_validity_on():
     batch = {k: v for k, v in sample().items() if k != "depth"}
-    first, second = RandomMount(yaw=25, valid_mask=True), RandomLens("kannala_brandt", fov=(70, 90), valid_mask=True)
-    half = first(batch)
-    out = second(half)
-    torch.testing.assert_close(out["rotation"], half["rotation"], atol=1e-6, rtol=0)
-    third = RandomMount()(out)
-    torch.testing.assert_close(third["gaze"], batch["gaze"] @ third["rotation"].mT, atol=1e-6, rtol=0)
-    assert out["camera"].key == "kannala_brandt"
-    assert bool((out["keypoints_valid"] <= half["keypoints_valid"]).all())
-    lost = ~half["keypoints_valid"]
-    assert not out["keypoints_valid"][lost].any()
+    half = RandomMount(yaw=25, valid_mask=True)(batch)
+    out = RandomLens("kannala_brandt", fov=(70, 90), valid_mask=True)(half)
+    assert not out["keypoints_valid"][~half["keypoints_valid"]].any()
     warp = ct.Warp(batch["camera"], out["camera"], out["rotation"])
     # nothing is valid twice that one warp would not see, but for the rim of the image in between
     assert (out["image_valid"] & ~warp.valid_mask()).float().mean() < 0.01
-    projected, _ = out["camera"].project(out["points"])
     straight, _ = warp.transform_points(batch["camera"].project(batch["points"])[0])
-    torch.testing.assert_close(projected, straight, atol=1e-3, rtol=0)
+    torch.testing.assert_close(out["camera"].project(out["points"])[0], straight, atol=1e-3, rtol=0)
 
 
 def test_poses_turn_with_the_camera():

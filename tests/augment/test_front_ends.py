@@ -234,9 +234,8 @@ def test_rotated_boxes_turn_with_their_axis(form, monkeypatch):
             want = getattr(functional, f"{flip}_flip")(boxes)  # as torchvision itself does it
             moved = front_end.Transform(augment(p=1))(boxes)
             torch.testing.assert_close(corners(moved)[:2], corners(want)[:2], rtol=0, atol=1e-4)
-        transform = front_end.Transform(
-            ct.augment.RandomMount(yaw=15, roll=(40, 40), min_filled=0), camera(), valid=True
-        )
+        mount = ct.augment.RandomMount(yaw=15, roll=(40, 40), min_filled=0)
+        transform = front_end.Transform(mount, camera(), valid=True)
         out = transform({"boxes": boxes, "boxes_valid": torch.tensor([1, 0, 1])})
         assert out["boxes_valid"].tolist() == [True, False, False]
         ends = corners(out["boxes"])[:2].unflatten(-1, (4, 2))

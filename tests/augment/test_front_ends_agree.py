@@ -148,9 +148,7 @@ def test_all_fields_move_as_by_the_native_call(front_end, name, batch, monkeypat
     moved, want = both(front_end, augment, lens, fields, monkeypatch)
     for key in fields.keys() | {n for n in want if n.endswith("_valid") and n in moved}:
         tolerance = 1e-5 if (front_end, key) == ("albumentations", "keypoints") else 0
-        torch.testing.assert_close(
-            moved[key], want[key], rtol=0, atol=tolerance, msg=lambda text, key=key: f"{key}: {text}"
-        )
+        torch.testing.assert_close(moved[key], want[key], rtol=0, atol=tolerance, msg=f"{key}: {{}}".format)
 
 
 @pytest.mark.parametrize("front_end", FRONT_ENDS)

@@ -64,9 +64,8 @@ def test_the_image_is_what_a_camera_there_sees(kind):
     good = out["image_valid"][0]
     assert good.double().mean() > 0.8
     # pixels at the rim of the ball show both, in the two images each its own part
-    edge = torch.nn.functional.max_pool2d(distance[None, None], 3, 1, 1) + torch.nn.functional.max_pool2d(
-        -distance[None, None], 3, 1, 1
-    )
+    pool = torch.nn.functional.max_pool2d
+    edge = pool(distance[None, None], 3, 1, 1) + pool(-distance[None, None], 3, 1, 1)
     inner = good & (edge[0, 0] < 0.05)
     error = (out["image"][0] - image)[inner]
     assert -10 * (error**2).mean().log10() > 40

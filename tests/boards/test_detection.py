@@ -188,9 +188,8 @@ def test_paths_and_arrays_give_the_same_and_calibrate(views, tmp_path):
     for points, pixels, (_, true) in zip(found.object_points, found.image_points, views, strict=True):
         np.testing.assert_allclose(points, CHESSBOARD.points())
         assert np.nanmax(np.abs(pixels - true)) < 0.6
-    calibration = ct.calibrate(
-        fisheye(), found.object_points, found.image_points, image_size=found.image_size, fixed="all"
-    )
+    options = {"image_size": found.image_size, "fixed": "all"}
+    calibration = ct.calibrate(fisheye(), found.object_points, found.image_points, **options)
     assert calibration.rms < 0.6
 
 

@@ -34,9 +34,8 @@ def seen_by(camera, degrees, views, noise, seed):
     """Views of a board that takes a third to two thirds of the image."""
     wide = math.radians(min(degrees, 90.0))
     reach = 0.12 / math.tan(wide / 4)
-    seen, rotations, translations = boards.seen_by(
-        camera, views, noise=noise, near=0.9 * reach, far=2 * reach, tilt=50.0, seed=seed
-    )
+    placed = {"near": 0.9 * reach, "far": 2 * reach, "tilt": 50.0}
+    seen, rotations, translations = boards.seen_by(camera, views, noise=noise, seed=seed, **placed)
     whole = (~seen.image_points.isnan().any(-1)).sum(-1) >= 20
     return seen._replace(image_points=seen.image_points[whole]), rotations[whole], translations[whole]
 

@@ -128,9 +128,8 @@ def test_workers_that_persist_hear_of_the_epoch():
     if "fork" not in torch.multiprocessing.get_all_start_methods():
         pytest.skip("this system cannot fork")
     data = Images()
-    loader = DataLoader(
-        data, batch_size=2, num_workers=2, multiprocessing_context="fork", persistent_workers=True, shuffle=True
-    )
+    options = {"num_workers": 2, "multiprocessing_context": "fork", "persistent_workers": True}
+    loader = DataLoader(data, batch_size=2, shuffle=True, **options)
     epochs = []
     for epoch in (0, 1, 0):
         data.augment.set_epoch(epoch)
@@ -283,9 +282,8 @@ def write_shards(folder, some, count):
 
 
 def moved_shards(paths, **options):
-    handlers = [
-        wds.handle_extension("mask.png", lambda data: np.asarray(wds.autodecode.imagehandler("l8")("png", data)))
-    ]
+    read = wds.autodecode.imagehandler("l8")
+    handlers = [wds.handle_extension("mask.png", lambda data: np.asarray(read("png", data)))]
     shards = wds.WebDataset(paths, shardshuffle=False, empty_check=False).decode(*handlers, "rgb8")
     function = ct.data.MapSamples(augmentation(**options), seed=2)
     return {sample["__key__"]: sample for sample in shards.map(function)}
@@ -327,9 +325,8 @@ def test_what_comes_out_is_written_and_read_again(tmp_path):
         assert np.array_equal(back[key]["png"], sample["png"])
         assert np.array_equal(back[key]["image_valid.npy"], sample["image_valid.npy"])
         assert back[key]["json"] == sample["json"]
-        again = ct.data.MapSamples(augmentation(camera=None))(
-            {"__key__": key, "png": sample["png"], "json": sample["json"]}
-        )
+        entries = {"__key__": key, "png": sample["png"], "json": sample["json"]}
+        again = ct.data.MapSamples(augmentation(camera=None))(entries)
         assert again["json"]["camera"]["model"] == "kannala_brandt"
 
 

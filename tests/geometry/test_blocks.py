@@ -3,7 +3,7 @@
 import pytest
 import torch
 import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
-from cameras import RARE_ARE_SLOW, drawn, each_kind, fan, one, pixel_lattice, spread
+from cameras import RARE_ARE_SLOW, drawn, each_kind, fan, one
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -36,20 +36,6 @@ def test_bytes_kept_for_backward(key, method, limit):
         kept.clear()
         getattr(camera, method)(values)
     assert not kept
-
-
-@pytest.mark.parametrize("key", RARE_ARE_SLOW)
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize("end", [20, 179])
-def test_few_points_of_a_learning_camera(key, dtype, end):
-    learning = spread(key, dtype)
-    frozen, rays = learning.detach(), fan(end, 20, 12).to(dtype)
-    pixels, valid = frozen.project(rays)
-    values = pixels[valid] if end < 90 else pixel_lattice(frozen, 20, 30).to(dtype) * 1.5 - 100
-    for method, some, atol in (("project", rays, 0), ("unproject", values, 200 * torch.finfo(dtype).eps)):
-        (expected, valid), (result, found) = (getattr(camera, method)(some) for camera in (frozen, learning))
-        assert torch.equal(found, valid)
-        torch.testing.assert_close(result, expected, rtol=0, atol=atol)
 
 
 @pytest.mark.parametrize("key", RARE_ARE_SLOW)

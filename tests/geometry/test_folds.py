@@ -57,9 +57,8 @@ def first_root(polynomial):
     while polynomial[-1] == 0:
         polynomial = polynomial[:-1]
     roots = mpmath.polyroots(polynomial[::-1], maxsteps=200, extraprec=100) if len(polynomial) > 1 else []
-    return min(
-        (r.real for r in roots if abs(r.imag) < mpmath.mpf(10) ** -30 * abs(r) and r.real > 0), default=mpmath.inf
-    )
+    least = mpmath.mpf(10) ** -30
+    return min((r.real for r in roots if abs(r.imag) < least * abs(r) and r.real > 0), default=mpmath.inf)
 
 
 def folds_of(coefficients, polynomials, of_squares):

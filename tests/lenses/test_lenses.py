@@ -111,7 +111,7 @@ def source(size=(480, 640)):
 
 def rim(height, width):
     corners = torch.tensor([[-0.5, -0.5], [width - 0.5, -0.5], [width - 0.5, height - 0.5], [-0.5, height - 0.5]])
-    return along_edges(corners[None], 16)[0]
+    return along_edges(corners[None], 64)[0]
 
 
 @pytest.mark.parametrize(
@@ -133,6 +133,22 @@ def test_real_lenses_see_with_every_pixel_in_the_range(augmentation, size, fov, 
     assert wide.min() >= math.radians(low)
     assert wide.max() <= math.radians(high)
     assert len(target.intrinsics[:, 0].unique()) > (0.3 * count if fov == (100, 150) else 10)
+
+
+@pytest.mark.parametrize("size", [(480, 640), (400, 640)])
+@pytest.mark.parametrize("name", ct.augment.PRESETS)
+def test_every_draw_around_a_preset_has_a_ray_for_every_point_of_its_image(name, size):
+    """Or, of Aria's, which folds before the corners, for every point for which the preset itself has one."""
+    none, edge = dict.fromkeys(("focal", "centre")), rim(*size)
+    bent = ct.augment.RandomLens(name, camera=source(size), **none)
+    still = ct.augment.RandomLens(name, camera=source(size), distortion=None, **none)
+    seen = still.change(None, still.draw(1)).target.unproject(edge[None])[1]
+    assert seen.all() or name == "aria"
+    kinds = (ct.augment.RandomLens, ct.augment.RandomCamera) if name != "aria" else ()
+    for augmentation in (bent, *(kind(name, camera=source(size)) for kind in kinds)):
+        target = augmentation.change(None, augmentation.draw(64, torch.Generator().manual_seed(0))).target
+        assert (target.unproject(edge.expand(64, -1, -1))[1] | ~seen).all()
+        assert len(target.distortion.unique(dim=0)) > 48
 
 
 def test_a_jittered_real_lens_is_whole_too():

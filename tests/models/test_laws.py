@@ -583,9 +583,8 @@ def test_batch_equals_loop(key, batch, dims):
         assert results.shape == (*batch, *dims, 5 - values.shape[-1])
         assert (valid.shape, valid.dtype) == ((*batch, *dims), torch.bool)
         loop = [getattr(c, method)(v) for c, v in zip(cameras, values.reshape(count, *dims, -1), strict=True)]
-        torch.testing.assert_close(
-            results.reshape(count, *dims, -1), torch.stack([r for r, _ in loop]), rtol=1e-13, atol=1e-13
-        )
+        alone = torch.stack([r for r, _ in loop])
+        torch.testing.assert_close(results.reshape(count, *dims, -1), alone, rtol=1e-13, atol=1e-13)
         assert torch.equal(valid.reshape(count, *dims), torch.stack([v for _, v in loop]))
 
 

@@ -61,9 +61,8 @@ def test_pixels_are_those_of_the_formula_up_to_the_edge_and_behind_the_camera(gr
     rays = on_surface(camera, 8)
     pixels, valid = camera.project(rays)
     assert valid.all()
-    torch.testing.assert_close(
-        pixels.detach(), torch.tensor(np.array([reference(camera, p) for p in rays.numpy()])), rtol=0, atol=1e-9
-    )
+    formula = torch.tensor(np.array([reference(camera, p) for p in rays.numpy()]))
+    torch.testing.assert_close(pixels.detach(), formula, rtol=0, atol=1e-9)
     expected = torch.nn.functional.normalize(rays, dim=-1)
     for unproject in (camera.unproject, torch.func.vmap(camera.unproject)):  # native, and the formula
         back, found = unproject(pixels)

@@ -212,9 +212,8 @@ def test_any_strides_and_threads(key):
     with patch.object(geometry, "thread_count", lambda: 3):
         again = geometry.unproject(made, q[None], keeps=True)
         assert again.rays.equal(expected.rays)
-        found = geometry.unproject_vjp(
-            made, again.valid, again.solution, weight.movedim(0, -1).contiguous().movedim(-1, 0), True, True
-        )
+        turned = weight.movedim(0, -1).contiguous().movedim(-1, 0)
+        found = geometry.unproject_vjp(made, again.valid, again.solution, turned, True, True)
     assert all(a.equal(b) for a, b in zip(found, cotangents, strict=True))
 
 

@@ -12,15 +12,8 @@ PADDINGS = ("zeros", "border", "reflection")
 INTEGERS = (torch.int8, torch.uint8, torch.int16, torch.uint16, torch.int32, torch.uint32, torch.int64, torch.uint64)
 
 
-def pinhole(dtype=torch.float32, **options):
-    intrinsics = torch.tensor([30.0, 30.0, 24.5, 19.5], dtype=dtype)
-    return ct.Pinhole(intrinsics, image_size=SIZE, **options).requires_grad_(False)
-
-
-def fisheye(dtype=torch.float32, learns=False):
-    lens = torch.tensor([0.02, -0.01, 0.004, -0.001], dtype=dtype)
-    camera = ct.KannalaBrandt(torch.tensor([20.0, 20, 25, 19], dtype=dtype), lens, image_size=SIZE)
-    return camera.requires_grad_(learns)
+PINHOLE = ct.Pinhole([30.0, 30.0, 24.5, 19.5], image_size=SIZE).requires_grad_(False)
+FISHEYE = ct.KannalaBrandt([20.0, 20, 25, 19], [0.02, -0.01, 0.004, -0.001], image_size=SIZE).requires_grad_(False)
 
 
 def turn(*degrees, dtype=torch.float32):
@@ -39,7 +32,7 @@ def ids(dtype, count=1):
 @pytest.mark.parametrize("dtype", INTEGERS)
 def test_ids_come_out_exactly(dtype):
     padding_mode = PADDINGS[INTEGERS.index(dtype) % 3]
-    warp = ct.Warp(fisheye(), pinhole(), turn(70, 5, 20), mode="nearest", padding_mode=padding_mode)
+    warp = ct.Warp(FISHEYE, PINHOLE, turn(70, 5, 20), mode="nearest", padding_mode=padding_mode)
     given = ids(dtype, 2)
     # the place of each pixel, which a float holds, tells where it comes from
     place = torch.arange(SIZE[0] * SIZE[1], dtype=torch.float64).view(1, 1, *SIZE)
@@ -55,19 +48,19 @@ def test_ids_come_out_exactly(dtype):
 
 def test_ids_of_a_batch_of_cameras_and_in_transforms():
     rotations = torch.stack([turn(yaw, 0, 5) for yaw in (0, 30, 60)])
-    warp = ct.Warp(fisheye(), pinhole(), rotations, mode="nearest")
+    warp = ct.Warp(FISHEYE, PINHOLE, rotations, mode="nearest")
     given = ids(torch.int64, 3)
     result = warp(given)
     for i in range(3):
-        single = ct.Warp(fisheye(), pinhole(), rotations[i], mode="nearest")
+        single = ct.Warp(FISHEYE, PINHOLE, rotations[i], mode="nearest")
         assert torch.equal(single(given[i : i + 1])[0], result[i])
-    alone = ct.Warp(fisheye(), pinhole(), turn(20), mode="nearest")
+    alone = ct.Warp(FISHEYE, PINHOLE, turn(20), mode="nearest")
     assert torch.equal(torch.func.vmap(lambda image: alone(image[None])[0])(given), alone(given))
 
 
 @pytest.mark.parametrize(("mode", "padding_mode"), [*zip(MODES, PADDINGS, strict=True)])
 def test_wide_unsigned_integers_stay_in_range(mode, padding_mode):
-    warp = ct.Warp(fisheye(), pinhole(), mode=mode, padding_mode=padding_mode)
+    warp = ct.Warp(FISHEYE, PINHOLE, mode=mode, padding_mode=padding_mode)
     for dtype in (torch.uint16, torch.uint32, torch.uint64):
         given = torch.full((1, 1, *SIZE), torch.iinfo(dtype).max, dtype=dtype)
         result = warp(given)
@@ -80,7 +73,7 @@ def test_wide_unsigned_integers_stay_in_range(mode, padding_mode):
 @pytest.mark.parametrize("padding_mode", PADDINGS)
 def test_a_pixel_that_is_no_number_stays_in_its_neighbourhood(padding_mode, bad):
     for rotation in (None, turn(3, 2, 5), turn(0, 0, 90)):
-        warp = ct.Warp(pinhole(), pinhole(), rotation, mode="bicubic", padding_mode=padding_mode)
+        warp = ct.Warp(PINHOLE, PINHOLE, rotation, mode="bicubic", padding_mode=padding_mode)
         for row, column in ((20, 25), (0, 0), (39, 13)):
             image = torch.rand(1, 2, *SIZE, generator=torch.Generator().manual_seed(0))
             expected = warp(image)
@@ -104,16 +97,16 @@ def test_a_pixel_that_is_no_number_stays_in_its_neighbourhood(padding_mode, bad)
 def test_no_channels_and_no_images_make_none(mode, options):
     for dtype in (torch.float32, torch.uint8, torch.int64):
         for shape in ((2, 0), (0, 3), (0, 0)):
-            result = ct.Warp(fisheye(), pinhole(), mode=mode, **options)(torch.zeros(*shape, *SIZE, dtype=dtype))
+            result = ct.Warp(FISHEYE, PINHOLE, mode=mode, **options)(torch.zeros(*shape, *SIZE, dtype=dtype))
             assert (result.shape, result.dtype) == ((*shape, *SIZE), dtype)
 
 
 def test_masks_and_grids_may_be_changed():
     for warp in (
-        ct.Warp(fisheye(), pinhole()),
-        ct.Warp(fisheye(), pinhole()).pin(),
-        ct.Warp(fisheye(), pinhole(), tolerance=0.01),
-        ct.Warp(fisheye(), pinhole(), torch.stack([turn(0), turn(9)]).expand(2, 3, 3)),
+        ct.Warp(FISHEYE, PINHOLE),
+        ct.Warp(FISHEYE, PINHOLE).pin(),
+        ct.Warp(FISHEYE, PINHOLE, tolerance=0.01),
+        ct.Warp(FISHEYE, PINHOLE, torch.stack([turn(0), turn(9)]).expand(2, 3, 3)),
     ):
         grid, mask = warp.grid(), warp.valid_mask()
         expected = grid.clone(), mask.clone()
