@@ -16,9 +16,8 @@ SIZE = (480, 640)
 ROUNDING = 1e-11  # px
 
 AT_40 = {"max_angle": radians(40)}
-few_models = pytest.mark.parametrize(
-    "key", slow_unless({"fisheye624", "kannala_brandt", "division"}.__contains__, KEYS)
-)
+FEW = {"fisheye624", "kannala_brandt", "division"}
+few_models = pytest.mark.parametrize("key", slow_unless(FEW.__contains__, KEYS))
 
 
 def golden(name):
@@ -29,9 +28,8 @@ def fisheye(batch=(), seed=0, **options):
     """Plausible Kannala-Brandt cameras of about 130 degrees."""
     draw = torch.rand(*batch, 8, generator=torch.Generator().manual_seed(seed), **F64) - 0.5
     intrinsics = torch.tensor([300.0, 300, 319.5, 239.5], **F64) + 20 * draw[..., :4]
-    return ct.KannalaBrandt(
-        intrinsics, draw[..., 4:] * torch.tensor([0.1, 0.02, 0.01, 0.002]), image_size=SIZE, **options
-    )
+    distortion = draw[..., 4:] * torch.tensor([0.1, 0.02, 0.01, 0.002])
+    return ct.KannalaBrandt(intrinsics, distortion, image_size=SIZE, **options)
 
 
 def pixels_apart(source, result):

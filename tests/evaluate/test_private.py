@@ -11,6 +11,7 @@ from torch.fx.experimental.proxy_tensor import make_fx
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from camtorch.evaluate import door, private
+from camtorch.evaluate.kept import note, same
 
 # newer ones warn of what they still do
 pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit.trace` is deprecated:FutureWarning")
@@ -92,7 +93,44 @@ def test_other_parts():
     assert torch.Tensor in private.collate_functions()
     batch = private.collate([{"a": 1}, {"a": 2}], {**private.collate_functions(), int: lambda b, **_: sum(b)})
     assert batch == {"a": 3}
-    count, total = private.while_loop(
-        lambda n, t: n < 4, lambda n, t: (n + 1, t + n), (torch.tensor(0), torch.tensor(0))
-    )
+    start = torch.tensor(0), torch.tensor(0)
+    count, total = private.while_loop(lambda n, t: n < 4, lambda n, t: (n + 1, t + n), start)
     assert (int(count), int(total)) == (4, 6)
+
+
+# -- what tells whether a tensor is as it was: values on the CPU, memory and version elsewhere
+
+
+class Elsewhere(torch.Tensor):
+    """A tensor that says that it is not on the CPU."""
+
+    is_cpu = False
+
+
+class WithoutMemory(Elsewhere):
+    """Of a subclass that wraps others, as distributed tensors do."""
+
+    def untyped_storage(self):
+        return torch.empty(0).untyped_storage()
+
+
+def changed_by(kind, change):
+    tensor = torch.ones(4).as_subclass(kind)
+    noted = note(tensor)
+    assert same(tensor, noted)
+    with torch.no_grad():
+        return not same(change(tensor), noted)
+
+
+@pytest.mark.parametrize("kind", [torch.Tensor, Elsewhere, WithoutMemory])
+def test_changes_of_values_are_seen(kind):
+    assert changed_by(kind, lambda t: t.add_(1))
+    assert changed_by(kind, lambda t: torch.zeros(4).as_subclass(kind))
+    assert changed_by(kind, lambda t: t[:3])
+    assert changed_by(kind, lambda t: t.double())
+
+
+def test_what_is_equal_in_other_memory_is_looked_at_on_the_cpu_alone():
+    assert not changed_by(torch.Tensor, torch.clone)
+    assert changed_by(Elsewhere, torch.clone)
+    assert not changed_by(Elsewhere, lambda t: t[None])  # numbers of one camera come in both forms

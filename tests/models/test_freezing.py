@@ -95,9 +95,8 @@ def test_compiled_and_functional_calls_hold_it():
     moved = torch.func.functional_call(camera, other, (points,))[0]
     middle = camera.cx.detach(), 2 * camera.cx.detach()
     torch.testing.assert_close(moved[:, 0] - middle[1], want.detach()[:, 0] - middle[0])  # fx stays, cx does not
-    slope = torch.func.grad(
-        lambda values: torch.func.functional_call(camera, {"intrinsics": values}, (points,))[0].sum()
-    )
+    call = torch.func.functional_call
+    slope = torch.func.grad(lambda values: call(camera, {"intrinsics": values}, (points,))[0].sum())
     assert slope(camera.intrinsics.detach())[0] == 0
 
 

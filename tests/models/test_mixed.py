@@ -151,9 +151,8 @@ def test_parts_and_members():
 
 def test_batches_mixed_batches_and_orders_among_the_cameras():
     cameras = models()
-    batch = ct.KannalaBrandt(
-        torch.stack([c.intrinsics.detach() for c in cameras[4:]]), cameras[4].distortion.detach(), image_size=SIZE
-    )
+    intrinsics = torch.stack([c.intrinsics.detach() for c in cameras[4:]])
+    batch = ct.KannalaBrandt(intrinsics, cameras[4].distortion.detach(), image_size=SIZE)
     mixed = ct.Mixed([cameras[0], batch, ct.Mixed([cameras[1]])])
     points = torch.randn(4, 7, 3)
     pixels, _ = mixed.project(points)

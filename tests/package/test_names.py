@@ -1,13 +1,16 @@
 """Every public name of 0.3 works as before, or stands on the page about what left."""
 
+import inspect
 import json
 import pickle
 import re
+import typing
 from pathlib import Path
 
 import pytest
 import torch
-from public_names import names
+import yaml
+from public_names import FRONT_ENDS, ROOMS, names, public, room_of
 
 import camtorch as ct
 from camtorch.cli.main import make_parser
@@ -116,3 +119,70 @@ def test_a_pickled_shutter_without_an_exposure_loads():
 def test_an_error_about_an_old_name_leads_to_the_page(use):
     with pytest.raises((AttributeError, ValueError), match=re.escape(f"docs/{PAGE.name}")):
         use()
+
+
+# -- hints are types, as pydantic, jsonargparse and beartype ask for them
+
+
+def of_room(room):
+    module = (
+        pytest.importorskip(f"camtorch.{room}", exc_type=ImportError)
+        if room in FRONT_ENDS
+        else ct
+        if room == "ct"
+        else room_of(room)
+    )
+    for name in public(getattr(module, "__all__", vars(module))):
+        value = getattr(module, name)
+        if callable(value) and value.__module__.startswith("camtorch"):
+            yield name, value
+            for member in ["__init__", *public(dir(value))] if inspect.isclass(value) else ():
+                attribute = inspect.getattr_static(value, member)
+                attribute = getattr(attribute, "fget", getattr(attribute, "__func__", attribute))
+                if inspect.isfunction(attribute) and attribute.__module__.startswith("camtorch"):
+                    yield f"{name}.{member}", attribute
+
+
+@pytest.mark.parametrize("room", ["ct", *(room for room in ROOMS if room_of(room)), *FRONT_ENDS])
+def test_hints_of_all_that_is_public_are_types(room):
+    checked = 0
+    for name, value in of_room(room):
+        try:
+            assert isinstance(typing.get_type_hints(value), dict)
+        except (NameError, TypeError) as error:
+            pytest.fail(f"{room}: {name}: {error}")
+        checked += 1
+    assert checked or room == "models"
+
+
+# -- a release: one version everywhere, a changelog of one form
+
+FORMS = ROOT / ".github" / "ISSUE_TEMPLATE"
+RELEASE = r"^## \[?(\d+\.\d+\.\d+)\]? - (\d{4}-\d\d-\d\d)$"
+
+
+def test_version_and_date_are_the_same_everywhere():
+    changes = (ROOT / "CHANGELOG.md").read_text()
+    (version, date), *older = re.findall(RELEASE, changes, re.M)
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    assert version == citation["version"]
+    number, _, dev = ct.__version__.partition(".dev")
+    if dev:  # between two releases
+        assert tuple(map(int, number.split("."))) > tuple(map(int, version.split(".")))
+    else:
+        assert number == version
+    assert date == citation["date-released"].isoformat()
+    assert f'placeholder: "camtorch {version}, torch ' in (FORMS / "defect.yml").read_text()
+    order = [tuple(map(int, number.split("."))) for number, _ in ((version, date), *older)]
+    assert order == sorted(order, reverse=True)
+
+
+def test_the_changelog_has_the_sections_of_its_form():
+    text = (ROOT / "CHANGELOG.md").read_text()
+    headings = re.findall(r"^## (.+)$", text, re.M)
+    assert headings[0] == "[Unreleased]"
+    assert all(re.match(RELEASE, f"## {heading}") for heading in headings[1:])
+    kinds = {"Added", "Changed", "Deprecated", "Removed", "Fixed", "Security"}
+    assert set(re.findall(r"^### (.+)$", text, re.M)) <= kinds
+    for name in re.findall(r"^## \[(.+)\]", text, re.M):
+        assert re.search(rf"^\[{re.escape(name)}\]: https://", text, re.M), f"{name} has no link"
