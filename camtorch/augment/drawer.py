@@ -307,11 +307,13 @@ def _sized(base: Camera, size: tuple[int, int]) -> Tensor:
 
     The old image is scaled to the new width, and cropped or padded evenly to the new height.
     """
+    if base.image_size == size:
+        return precise(base.intrinsics)
     fx, fy, cx, cy = precise(base.intrinsics).unbind(-1)
     across, down = (size[1] - 1) / 2, (size[0] - 1) / 2
     if base.image_size is None:
         cx, cy = cx + across, cy + down
-    elif base.image_size != size:
+    else:
         height, width = base.image_size
         scale = size[1] / width
         fx, fy = fx * scale, fy * scale

@@ -199,10 +199,10 @@ class Start:
 
     def _tries(self, values: Mapping[str, Any], rows: int, call: _Draws) -> Native:
         """Make the lenses that compiled code chooses among, of a model whose domain it does not make by itself."""
-        amounts = torch.as_tensor(np.asarray(values["distortion"]).reshape(-1, DRAWN))
+        amounts = torch.from_numpy(np.asarray(values["distortion"]).reshape(-1, DRAWN))
         steps = (amounts.repeat(1, -(-call.count // DRAWN))[:, : call.count] * self._sensitivity)[:, None]
         given = self._distortion.double().reshape(-1, 1, call.count)
-        tried = (given + torch.tensor(PARTS, dtype=torch.float64)[:, None] * steps).to(self._native.dtype)
+        tried = (given + given.new_tensor(PARTS)[:, None] * steps).to(self._native.dtype)
         tried, allowed = defined_or(self.base, tried, given.to(tried).expand_as(tried))
         tried = tried.reshape(rows * len(PARTS), call.count)
         native = CameraRows(model_of(self.base), tried.new_ones(len(tried), 4), tried).native

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.opaque import CameraNumbers, opaque
+from camtorch.optics.radial_inverse import precise
 from camtorch.poses.rotations import rotation_matrix, rotation_vector
 from camtorch.values.arguments import broadcast_shapes
 from camtorch.values.module import remade
@@ -99,12 +100,14 @@ def _enough(source: Camera, target: Camera, rotation: Tensor, share: float) -> t
     factor = torch.ones_like(found)
     done = found >= share
     drawn = turned = rotation.expand(*found.shape, 3, 3)
+    vector = None
     straight = bool((rotation == torch.eye(3, dtype=rotation.dtype, device=rotation.device)).all())
     for part in _TURNS[-1:] if straight else _TURNS:
         if bool(done.all()):
             break
         if part != 1:
-            turned = rotation_matrix(part * rotation_vector(drawn))
+            vector = rotation_vector(precise(drawn)) if vector is None else vector
+            turned = rotation_matrix(part * vector).to(rotation.dtype)
         at_first = found if part == 1 or straight else part_shown(turned)
         zoom, now = _least_zoom(partial(part_shown, turned), at_first, share, _ZOOM if part else _FAR_ZOOM)
         better = ~done & (now > found)

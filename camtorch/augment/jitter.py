@@ -12,6 +12,7 @@ from torch import Tensor
 
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.opaque import CameraNumbers, opaque
+from camtorch.lenses.drawing import covering
 from camtorch.rays.lattices import pixel_lattice, polar_rays, reach
 from camtorch.values.arguments import broadcast_shapes
 from camtorch.values.module import remade
@@ -76,6 +77,7 @@ _measured: dict[tuple[object, ...], Tensor] = {}
 
 def measured_once(measure: Callable[..., Tensor], camera: Camera, *inputs: Tensor) -> Tensor:
     """Return `measure(camera, *inputs)`, for which these tensors and the size of images are all that counts, kept."""
+    # by values on every device: a lens lies in other memory each time
     values = [(t.dtype, t.shape, t.device, t.detach().cpu().numpy().tobytes()) for t in inputs]
     key = measure, type(camera), camera.image_size, *values
     found = _measured.pop(key, None)
@@ -137,6 +139,11 @@ def _rim(camera: Camera) -> Tensor:
     """
     edges = border(camera._size_for("its rim"), camera.intrinsics.dtype).to(camera.intrinsics.device)
     rim = edges.expand(*camera.batch_shape, *edges.shape)
+    if len(camera.distortion) == 1:  # on another device less work than to look whether all of them have rays
+        ends = measured_once(lens_ends, camera, camera.distortion)
+        least = (ends * ends).sum(-1).amin(-1).sqrt()
+        if bool((covering(camera.intrinsics, least, camera._size_for("its rim")) == 1).all()):
+            return rim
     if not bool(camera.unproject(rim)[1].all()):
         focal, centre = camera.intrinsics[:, None, :2], camera.intrinsics[:, None, 2:]
         # edited images have different intrinsics, and few kinds of coefficients

@@ -231,7 +231,9 @@ static int64_t fill(const Draws *d, int64_t c, const Cameras *lens) {
         }
         if (now >= d->share) high = 1;
         for (int count = 0; count < HALVINGS && high > 1; count++) {
-            const double middle = sqrt(low * high), here = shown(d, c, lens, turn, middle);
+            /* as torch rounds it, for what is chosen hangs on it */
+            const double middle = d->made.is_double ? sqrt(low * high) : (double)sqrtf((float)(low * high));
+            const double here = shown(d, c, lens, turn, middle);
             if (here < 0) return (int64_t)-here;
             if (here >= d->share) high = middle, now = here;
             else low = middle;
