@@ -9,8 +9,7 @@ import torch
 from torch import Tensor
 from typing_extensions import Self
 
-from camtorch.evaluate.door import is_recorded
-from camtorch.evaluate.known import is_unknown
+from camtorch.evaluate.known import may_write
 from camtorch.projection.camera_like import CameraLike
 from camtorch.values.module import is_parameter
 
@@ -34,7 +33,7 @@ class _Masked:
 def with_frozen(tensor: Tensor, frozen: Tensor) -> Tensor:
     """Return the Parameter, of which what is frozen is as it was, and has no gradient; of another tensor the like."""
     learns = frozen.isnan()
-    if not is_parameter(tensor) or is_unknown(tensor) or is_recorded():
+    if not (is_parameter(tensor) and may_write(tensor)):
         return torch.where(learns, tensor, frozen)
     values = torch.where(learns, tensor.detach(), frozen)
     if not torch.equal(values, tensor.detach()):  # an optimizer's weight decay and momentum move it without a gradient

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 from torch.utils.data import get_worker_info
 
-from camtorch.evaluate.door import in_graph, in_transform, is_concrete, is_eager, keeps_graph, may_look
+from camtorch.evaluate.door import in_graph, in_transform, is_concrete, is_eager, is_recorded, keeps_graph, may_look
 
 
 def known_false(condition: Tensor) -> bool:
@@ -22,6 +22,11 @@ def known_true(condition: Tensor) -> bool:
 def is_unknown(tensor: Tensor) -> bool:
     """Return whether values may not be looked at: traced, or within a transform, whose derivatives go forward."""
     return in_transform() or not is_concrete(tensor)
+
+
+def may_write(tensor: Tensor) -> bool:
+    """Return whether a tensor's values may be changed in place: nothing is traced, transformed or recorded."""
+    return not is_unknown(tensor) and not is_recorded()
 
 
 def are_plain(*tensors: Tensor) -> bool:
