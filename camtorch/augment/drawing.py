@@ -71,7 +71,11 @@ class Start:
             rows_of(camera, *[t.expand(*camera.batch_shape, t.shape[-1]) for t in camera._tensors])
             for camera in (source, base)
         )
-        if before.native is None or cameras.native is None:
+        if (
+            before.native is None
+            or cameras.native is None
+            or {t.dtype for t in source._tensors} != {base.intrinsics.dtype}
+        ):
             return None
         if cameras.usable is not None or before.usable is not None:
             return None
