@@ -39,7 +39,7 @@ def takes(dtype: torch.dtype, mode: str) -> bool:
 
 
 class Call:
-    """A call of the sampler, ready for images of one form and positions that stay.
+    """A call of the sampler, ready for images of one form and positions that stay; threads may share it after one call.
 
     All tensors are on the CPU and without a graph. Images (B, C, H, W) and results (B, C, h, w) are of one dtype, which
     `takes` knows, and may have any strides. `fill` has C values, of pixels that show nothing, which "zeros" blends in;
@@ -66,8 +66,8 @@ class Call:
         out: Tensor | None = None,
     ):
         self._make = maker(images, images.shape[0], size)
-        shape = (*images.shape[:2], *size)
-        result = _empty(shape, images.dtype, layout(images), "meta") if out is None else out
+        result = self._make() if out is None else out
+        self._results = [] if out is not None else [result]  # of the first call
         self._layout: torch.memory_format | None = None  # of the copies of images that lie oddly in memory
         self._is_copied = False  # whether results lie so as well
         if not is_quick(images, result, mode) and math.prod(images.shape[2:]) <= _WORTH * math.prod(size):
@@ -99,7 +99,7 @@ class Call:
 
     def __call__(self, images: Tensor, out: Tensor | None = None) -> Tensor:
         """Return the samples of images, written to `out` if given; that lies in memory as it did at first."""
-        result = self._make() if out is None else out
+        result = (self._results.pop() if self._results else self._make()) if out is None else out
         if not self._tiles:
             return result
         if self._layout is not None:
@@ -187,8 +187,8 @@ def maker(images: Tensor, count: int, size: tuple[int, int]) -> Callable[[], Ten
     return functools.partial(make, shape, dtype, layout(images))
 
 
-def _empty(shape: tuple[int, ...], dtype: torch.dtype, layout: torch.memory_format, device: str = "cpu") -> Tensor:
-    return torch.empty(shape, dtype=dtype, device=device, memory_format=layout)
+def _empty(shape: tuple[int, ...], dtype: torch.dtype, layout: torch.memory_format) -> Tensor:
+    return torch.empty(shape, dtype=dtype, device="cpu", memory_format=layout)
 
 
 def classify(

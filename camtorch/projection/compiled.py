@@ -26,7 +26,6 @@ _SHARED = 1 << 15  # points that threads are woken for
 _Rows = struct.Struct("20q").pack  # `Rows` of geometry.h
 packed_move: Callable[..., bytes] = struct.Struct("8q2d12q").pack  # `Move` of geometry.h
 _LATTICES = struct.Struct(f"8q2d12q{CLASSIFICATION}6q")  # `Lattices`
-packed_lattices: Callable[..., bytes] = _LATTICES.pack
 LATTICE_WORDS = _LATTICES.size // 8
 POSITIONS, PIXELS, ON_IMAGE = range(3)
 LEFT_FROM, LEFT_TO, LEFT_MOST = 1, 2, 4
@@ -109,8 +108,8 @@ class Lattices:
     """Lattices of cameras (C,), from probes (1, N, 2) at their nodes and at the rim: `Lattices` of geometry.h.
 
     See `warp.grid.on_lattice`. size: (h, w) of the target. tolerance: in pixels of the source, which has images of
-    `source_size`. room: makes memory of so many bytes. Images that are sampled in the same call find the lattices at
-    `places`, the fields of `Job` of sampler.h.
+    `source_size`. given: both cameras and the turns, as of `Move`. room: makes memory of so many bytes. Images that are
+    sampled in the same call find the lattices at `places`, the fields of `Job` of sampler.h.
     """
 
     nodes: Tensor
@@ -127,6 +126,7 @@ class Lattices:
         padding: str,
         cameras: int,
         first_row: int = 0,
+        given: tuple[int, ...] = (0, 0, 0, 0, 1, 3),
         room: Callable[[int], Tensor] = lambda count: torch.empty(count, dtype=torch.uint8, device="cpu"),
     ):
         dtype, count, is_double = probes.dtype, probes.shape[1], probes.dtype == torch.float64
@@ -142,9 +142,9 @@ class Lattices:
         rows = *rows_of(probes), at, 2 * count, 1, count, valid, count, count, used
         asked = at, 2 * count, count, valid, count, valid + nodes, count, cameras, n, m, *size
         how = *source_size, tolerance, PADDINGS[padding], cells, scratch
-        given = 0, 0, 0, 0, 1, 3, cameras, POSITIONS, *source_size
         more = first_row, narrow if is_double else 0, exact, used + 8, 0, 0
-        self.words = (c_int64 * LATTICE_WORDS).from_buffer_copy(packed_lattices(*given, *rows, *asked, *how, *more))
+        move = *given, cameras, POSITIONS, *source_size, *rows
+        self.words: bytes = _LATTICES.pack(*move, *asked, *how, *more)
         in_float = (narrow, 2 * nodes, nodes) if is_double else (at, 2 * count, count)
         self.places = *in_float, cells, n * m, n, m, exact, 64 * self._most * (1 + is_double)
 
@@ -195,8 +195,8 @@ class Between:
         self, probes: Tensor, size: tuple[int, int], first_row: int, tolerance: float, padding: str
     ) -> tuple[Tensor, Tensor, Tensor] | None:
         """Return what `Lattices` finds, None if most cells would have positions of their own."""
-        made = Lattices(probes, size, self._size, tolerance, padding, self.cameras, first_row, _kept_memory)
-        made.words[:7] = self._given
+        given = self._given[:-1]
+        made = Lattices(probes, size, self._size, tolerance, padding, self.cameras, first_row, given, _kept_memory)
         return None if self._run("camtorch_lattices", made.words, self.cameras, made.counters) else made.found()
 
     def _run(self, name: str, call: object, tiles: int, counters: ctypes.Array[c_int64]) -> int:

@@ -12,7 +12,6 @@ from typing_extensions import Self
 from camtorch.cameras.camera import Camera
 from camtorch.evaluate.door import in_transform
 from camtorch.evaluate.kept import Kept
-from camtorch.native.sampler import Call
 from camtorch.values.arguments import Numbers, broadcast_shapes
 from camtorch.values.module import GeometryModule
 from camtorch.warp.grid import Lattice, Sampling, locate
@@ -20,7 +19,6 @@ from camtorch.warp.moving import moved_pixels
 from camtorch.warp.panorama import Seam, seam_of
 from camtorch.warp.sampling import Mode, Options, PaddingMode
 
-_MOST_CALLS = 8
 _SINGLE = 1e-3  # pixels: some ulps of a position in an image a thousand pixels wide, computed in float32
 
 
@@ -37,11 +35,11 @@ def _part(held: str, name: str) -> Any:
 class Plan:
     """The positions of a warp while its cameras stay, or once and for all, and calls that are ready for some images."""
 
-    def __init__(self, pinned: Sampling | Lattice | None = None, padding: PaddingMode = "zeros"):
-        """pinned: positions that serve a padding, which stay whatever becomes of the cameras."""
-        self.is_pinned, self.is_kept = pinned is not None, True
-        self.positions: dict[str, Sampling | Lattice] = {} if pinned is None else {padding: pinned}
-        self.calls: dict[tuple[object, ...], Call] = {}
+    def __init__(self, positions: dict[str, Sampling | Lattice], is_pinned: bool = False):
+        """positions: by the padding that they serve. is_pinned: whether they stay whatever becomes of the cameras."""
+        self.positions, self.is_pinned = positions, is_pinned
+        self.calls = Kept(8)
+        """Calls of the sampler by forms of images."""
 
     def positions_for(self, padding: str, compute: Callable[[], Sampling | Lattice]) -> Sampling | Lattice:
         """`compute()` without a graph, or its kept result; positions that are exact serve every padding."""
@@ -49,21 +47,11 @@ class Plan:
         found = found if isinstance(found, Sampling) else self.positions.get(padding)
         if found is not None:
             return found
-        if not self.is_kept or in_transform():  # what a transform makes dies with it
+        if in_transform():  # what a transform makes dies with it
             return compute()
         with torch.inference_mode(False), torch.no_grad():  # what that makes could not be used in a graph later
             self.positions[padding] = found = compute()
         return found
-
-    def has(self, where: Sampling | Lattice) -> bool:
-        """Whether these positions are kept."""
-        return any(where is found for found in self.positions.values())
-
-    def keep(self, form: tuple[object, ...], call: Call) -> None:
-        """Keep a call for images of a form, and those of the last few other forms."""
-        self.calls[form] = call
-        while len(self.calls) > _MOST_CALLS:
-            self.calls.pop(next(iter(self.calls)), None)
 
 
 class CameraPair(GeometryModule):

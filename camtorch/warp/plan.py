@@ -105,23 +105,19 @@ def route_of(warp: CameraPair, images: Tensor | None = None) -> Route:
 def ready(warp: CameraPair, images: object, mode: str | None, padding: str | None) -> Call | None:
     """Return the call that an earlier one has left for images of this form, if nothing has changed since."""
     plan: Plan | None = warp._kept.result
-    if plan is None or not plan.calls or not isinstance(images, Tensor):
+    if plan is None or plan.calls.result is None or not isinstance(images, Tensor):
         return None
     mode, padding = warp.mode if mode is None else mode, warp.padding_mode if padding is None else padding
     inputs = warp._inputs()
-    if (
-        not is_eager(images, *inputs)
-        or images.requires_grad
-        or not isinstance(mode, str)
-        or not isinstance(padding, str)
-    ):
+    if not is_eager(images, *inputs) or images.requires_grad:
         return None
-    call = plan.calls.get(_form(warp, images, mode, padding))
-    if call is None or plan.is_pinned:
-        return call
-    if images.dtype.is_floating_point and keeps_graph(*inputs):
-        return None
-    return None if warp._kept.entry(inputs, warp._options) is None else call
+    found = plan.calls.entry((), _form(warp, images, mode, padding))
+    if found is None or not plan.is_pinned:
+        learns = images.dtype.is_floating_point and keeps_graph(*inputs)
+        if found is None or learns or warp._kept.entry(inputs, warp._options) is None:
+            return None
+    call: Call = found[2]
+    return call
 
 
 def _form(warp: CameraPair, images: Tensor, mode: str, padding: str) -> tuple[object, ...]:
@@ -143,19 +139,17 @@ def warped(warp: CameraPair, images: Tensor, sampler: Sampler) -> Tensor:
             with torch.no_grad():
                 render(images, where, *sampler, kept, result[:, :, rows])
         return result
+    plan: Plan | None = warp._kept.result
     where = positions(warp, route, sampler.padding_mode)
     call = prepared(images, where, sampler)
     if call is None:
         return by_torch(images, where, sampler)
-    plan: Plan | None = warp._kept.result
-    if (
-        plan is not None
-        and images is given
-        and sampler.fill == warp.fill
-        and any(where is kept for kept in plan.positions.values())
-    ):
-        plan.keep(_form(warp, images, sampler.mode, sampler.padding_mode), call)
-    return call(images)
+    result = call(images)
+    # most warps are used once, and keep no calls
+    is_kept = plan is not None and any(where is found for found in plan.positions.values())
+    if plan is not None and is_kept and images is given and sampler.fill == warp.fill:
+        plan.calls((), _form(warp, images, sampler.mode, sampler.padding_mode), lambda: call)
+    return result
 
 
 def lengthened(warp: CameraPair, images: Tensor) -> Tensor:
@@ -176,16 +170,14 @@ def positions(warp: CameraPair, route: Route, padding: PaddingMode = "zeros") ->
     if is_exporting() and not torch.compiler.is_dynamo_compiling() and (constant := _constant(warp, padding)):
         return constant
     reach = _reach(warp, padding)
-    return _plan_of(warp).positions_for(reach if warp.tolerance else "zeros", lambda: _computed(warp, reach))
+    key = reach if warp.tolerance else "zeros"
+    plan = _plan_of(warp, lambda: Plan({key: _computed(warp, reach)}))
+    return plan.positions_for(key, lambda: _computed(warp, reach))
 
 
-def _plan_of(warp: CameraPair) -> Plan:
-    if warp.is_pinned:
-        pinned: Plan = warp._kept.result
-        return pinned
-    plan = warp._kept(warp._inputs(), warp._options, Plan)
-    plan.is_kept = plan is warp._kept.result
-    return plan
+def _plan_of(warp: CameraPair, make: Callable[[], Plan]) -> Plan:
+    pinned: Plan = warp._kept.result
+    return pinned if warp.is_pinned else warp._kept(warp._inputs(), warp._options, make)
 
 
 def by_pixel(warp: CameraPair) -> Sampling:
@@ -257,7 +249,7 @@ def pin(warp: CameraPair) -> None:
         where = positions(warp, "graph")
     else:
         where = positions(warp, "kept") if is_exporting() else _computed(warp, warp.padding_mode)
-    warp._kept.renew(lambda: Plan(where, warp.padding_mode))
+    warp._kept.renew(lambda: Plan({warp.padding_mode: where}, is_pinned=True))
 
 
 def _reach(warp: CameraPair, padding: PaddingMode) -> PaddingMode:
@@ -281,7 +273,7 @@ def _is_long(warp: CameraPair) -> bool:
     return all(t.is_cpu and not is_unknown(t) for t in warp._inputs())
 
 
-def _constant(warp: CameraPair, padding: PaddingMode) -> Sampling | None:
+def _constant(warp: CameraPair, padding: PaddingMode) -> Sampling | Lattice | None:
     """The positions as a constant of an exported program, unless they depend on what it is given."""
     if not warp.is_pinned and not is_constant(warp):
         return None
@@ -293,7 +285,7 @@ def _constant(warp: CameraPair, padding: PaddingMode) -> Sampling | None:
             grid, mapped = (t.detach().clone(memory_format=torch.contiguous_format) for t in where[:2])
             return where._replace(grid=grid, mapped=mapped)
 
-        plan = _plan_of(warp)
+        plan = _plan_of(warp, lambda: Plan({}))
         return own() if plan.is_pinned else plan.positions_for(f"constant {_reach(warp, padding)}", own)
 
 
@@ -457,13 +449,13 @@ class _Together:
             self._makers.append(make)
         starts = accumulate((len(b"".join(part)) // 8 for part in parts.values()), initial=_HEAD + LATTICE_WORDS)
         first = dict(zip(parts, starts, strict=False))
-        text = bytes(8 * _HEAD) + bytes(self._lattices.words) + b"".join(map(b"".join, parts.values()))
+        text = bytes(8 * _HEAD) + self._lattices.words + b"".join(map(b"".join, parts.values()))
         self._words = (ctypes.c_int64 * (len(text) // 8)).from_buffer_copy(text)
         here, at = ctypes.addressof(self._words), {kind: count_from(first[kind], _WIDTHS[kind]) for kind in parts}
         images, pixels, turned = ((here + 8 * first[kind], len(parts[kind])) for kind in ("images", "pixels", "turned"))
         self._words[:_HEAD] = [*images, 1, *pixels, *turned]
         if count > 1:  # each as soon as its lattice is there
-            self._words[_HEAD + LATTICE_WORDS - 2 : _HEAD + LATTICE_WORDS] = images
+            self._words[_HEAD + LATTICE_WORDS - 2 : _HEAD + LATTICE_WORDS] = [*images]
         else:
             # one thread makes the lattice, and needs no counter of those made
             self._words[_HEAD + _WIDTHS["pixels"] - 1] = 0
