@@ -254,7 +254,7 @@ class CameraDrawer(Augmentation):
 
     def _size_of(self, source: Camera) -> tuple[int, int]:
         """(height, width) of the new images."""
-        return self.image_size or (source.height, source.width)
+        return self.image_size or source.image_size or source._size_for(self._name)
 
     def _base(self, source: Camera, share: Any) -> tuple[Camera, Tensor, Tensor | None]:
         """Return whose lens the new cameras have, its intrinsics (*B, 4) before their images, and how far it reaches.
