@@ -17,7 +17,7 @@ from camtorch.augment.change import Change, Drawn
 from camtorch.cameras.camera import Camera
 from camtorch.evaluate.known import are_numbers, known_false, known_true
 from camtorch.evaluate.private import pytree
-from camtorch.poses.rotations import are_rotations, check_rotation, rotation_matrix, rotation_vector
+from camtorch.poses.rotations import are_rotations, check_rotation, is_right, rotation_matrix, rotation_vector
 from camtorch.values.arguments import as_coordinates, check_angles, check_boxes, check_radians, warn
 from camtorch.warp.boxes import edges_of, enclosing
 from camtorch.warp.plan import Label, at_once
@@ -255,6 +255,8 @@ def check_values(kind: str, name: str, value: Tensor, owner: str) -> None:
         check_radians(value, name, owner)
     elif kind in ("head_pose", "pose") and value.is_cpu and not value.requires_grad:
         rotations = value[..., :3, :3]
+        if value.ndim == 2 and is_right(rotations):
+            return
         wrong = ~are_rotations(rotations) & torch.isfinite(rotations).flatten(-2).all(-1)
         if known_false(~wrong):
             check_rotation(rotations[wrong][:1], name, owner)

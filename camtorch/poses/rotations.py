@@ -121,7 +121,7 @@ def as_rotation(rotation: Numbers | None, owner: str) -> Tensor | None:
     """A checked rotation of a warp, (3, 3) or (B, 3, 3), or None."""
     if rotation is None:
         return None
-    if type(rotation) is Tensor and rotation.shape == (3, 3) and _is_right(rotation):
+    if type(rotation) is Tensor and rotation.shape == (3, 3) and is_right(rotation):
         return rotation if rotation.requires_grad else rotation.clone()
     rotation = as_real(rotation, "rotation", owner)
     if rotation.shape[-2:] != (3, 3) or rotation.ndim > 3:
@@ -132,7 +132,7 @@ def as_rotation(rotation: Numbers | None, owner: str) -> Tensor | None:
     return as_own(rotation)
 
 
-def _is_right(matrix: Tensor) -> bool:
+def is_right(matrix: Tensor) -> bool:
     """Whether (3, 3) is a rotation at a glance, by plain numbers, which take less time than one operator of torch."""
     if not (matrix.dtype in (torch.float32, torch.float64) and are_free(matrix)):
         return False
