@@ -94,7 +94,7 @@ def _begins_with_black(grey: Grey, grid: Pixels) -> bool:
 
 
 def _at_gradients(cv2: Any, grey: Grey, grid: Pixels) -> Pixels:
-    """Return the corners (N, 2) as found, or moved to where gradients meet, which is worse than nothing under noise.
+    """Return the corners (N, 2) moved to where gradients meet, or as found if noise makes moving worse.
 
     A lens bends rows of corners smoothly, so their third differences are noise: the least of it is taken. A corner far
     from where its rows have it, as OpenCV returns some at the ends of steep ones, is searched for there, or unseen.
@@ -205,7 +205,7 @@ def _consistent(cv2: Any, board: AprilGrid, tags: dict[int, Pixels]) -> dict[int
         return {}
 
     def error(turn: int, a: int, b: int) -> float:
-        """How far the middle of b is from where a's corners put it, in sides of b."""
+        """Return the distance of b's middle from the place predicted by a's corners, in sides of b."""
         plane = cv2.getPerspectiveTransform(places[a], np.roll(tags[a], -turn, 0).astype(np.float32))
         x, y, w = plane @ [*places[b].mean(0), 1.0]
         side = np.linalg.norm(tags[b] - np.roll(tags[b], 1, 0), axis=1).mean()

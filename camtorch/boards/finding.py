@@ -46,7 +46,7 @@ class BoardObservations(NamedTuple):
 
 
 def find_board(images: Any, board: Any, *, square: float = 1.0, **options: Any) -> BoardObservations:
-    """Find a board in images: the finder of `camtorch calibrate`, for calibrations in Python.
+    """Find a board in images, with the finder of `camtorch calibrate`, for calibrations in Python.
 
         found = ct.find_board("photos/*.jpg", "9x6", square=0.024)
         calibration = ct.calibrate(

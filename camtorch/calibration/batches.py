@@ -35,7 +35,7 @@ def as_vectors(values: Numbers, name: str, size: int, owner: str, device: torch.
 
 
 def rows_of(camera: Camera, batch: torch.Size) -> Camera:
-    """The camera in float64, with its graph: of `math.prod(batch)` rows, or of none if it is one for all of them."""
+    """Return the camera in float64 with its graph: `math.prod(batch)` rows, or no batch if it is one for all rows."""
     if not camera.batch_shape and all(t.dtype == torch.float64 for t in camera._tensors):
         return camera
     tensors = {}
@@ -48,7 +48,7 @@ def rows_of(camera: Camera, batch: torch.Size) -> Camera:
 
 
 def root_of(mean: Tensor, valid: Tensor) -> Tensor:
-    """The root of what is valid, of a perfect fit without a derivative, which it does not have; else infinite."""
+    """Return the root of a valid mean, without a derivative if the fit is perfect; infinite if not valid."""
     return torch.where(valid & (mean > 0), torch.where(mean > 0, mean, 1.0).sqrt(), torch.where(valid, 0.0, torch.inf))
 
 
@@ -59,7 +59,7 @@ def learns(modules: Sequence[BatchedModule], *tensors: Tensor) -> bool:
 
 
 def attached(objective: Callable[[Tensor], Tensor], optimum: Tensor, valid: Tensor) -> Tensor:
-    """Return the optimum (B, K) with a graph, for first derivatives by whatever the objective depends on.
+    """Return the optimum (B, K) in a graph, for first derivatives by everything that the objective depends on.
 
     By the implicit function theorem: the gradient of the objective, of costs (B,), stays zero when an optimum moves, so
     one step by Newton's method, with the exact Hessian, has its derivatives. Rows that are not valid get no gradient.

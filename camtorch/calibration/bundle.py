@@ -43,11 +43,11 @@ class Poses(NamedTuple):
     translations: Tensor
 
     def moved(self, points: Tensor) -> Tensor:
-        """(B, P, N, 3)."""
+        """Return points moved by the poses, (B, P, N, 3)."""
         return points @ self.rotations.mT + self.translations.unsqueeze(-2)
 
     def of(self, index: Tensor | slice, dim: int = 0) -> Poses:
-        """Some of them, by batch row or by view."""
+        """Return some of the poses, by batch row or by view."""
         return Poses(*(t[index] if dim == 0 else t[:, index] for t in self))
 
     def expand(self, batch: int) -> Poses:
@@ -58,12 +58,12 @@ class Poses(NamedTuple):
 
     @classmethod
     def where(cls, which: Tensor, a: Poses, b: Poses) -> Poses:
-        """Those of a where which, bool (P,), and those of b elsewhere."""
+        """Return the poses of a at which `which`, bool (P,), is true, and those of b elsewhere."""
         return cls(*(torch.where(which.view(-1, *[1] * (x.ndim - 2)), x, y) for x, y in zip(a, b, strict=True)))
 
     @classmethod
     def none(cls, batch: int, count: int, like: Tensor) -> Poses:
-        """That leave points where they are."""
+        """Return identity poses."""
         eye = torch.eye(3, dtype=like.dtype, device=like.device)
         return cls(eye.repeat(batch, count, 1, 1), like.new_zeros(batch, count, 3))
 
@@ -85,7 +85,7 @@ class Sight(NamedTuple):
     prior: Prior | None = None
 
     def mapped(self, change: Callable[[Tensor], Tensor]) -> Sight:
-        """With a change to all tensors of problems."""
+        """Return the sight with a change applied to all tensors of problems."""
         points, pixels, weights = map(change, self[1:4])
         return Sight(self.model, points, pixels, weights, self.prior)
 
@@ -100,7 +100,7 @@ class State(NamedTuple):
 
     @classmethod
     def of_one(cls, parameters: Tensor, boards: Poses) -> State:
-        """Of a single camera, parameters (1 or B, 4 + n), and flat boards in its frame."""
+        """Return the state of a single camera, parameters (1 or B, 4 + n), and flat boards in its frame."""
         batch = len(boards.translations)
         return cls((parameters,), Poses.none(batch, 1, parameters), boards, parameters.new_zeros(batch, 2))
 
@@ -160,7 +160,7 @@ def adjust(
     settled: float = SETTLED,
     progress: Callable[[int, Tensor], None] | None = None,
 ) -> Adjusted:
-    """The state of least squares near a given one, for each of B problems, whose cameras see the same views.
+    """Return the state of least squares near a given one, for each of B problems, whose cameras see the same views.
 
     A point that was seen and has no pixel counts as far away: no step is taken that loses points. On the way a lens may
     go on behind its end, see `Camera.searched`; what lies there in the end is not valid. loss: see `robust`, in px.
@@ -185,7 +185,7 @@ def adjust(
 def minima(
     model: type[Camera], parameters: Tensor, poses: Poses, seen: Observations, loss: tuple[str, float], steps: int
 ) -> tuple[Poses, Tensor]:
-    """The poses (K, 1) of least cost near given ones, each a problem of its own, and these costs (K,)."""
+    """Return the poses (K, 1) of least cost near the given ones, each a problem of its own, and their costs (K,)."""
     points, pixels, weights = seen.points, seen.pixels, seen.seen.to(seen.pixels)
     camera = remade(_template(model, parameters), intrinsics=parameters[:, :4], distortion=parameters[:, 4:])
     if (made := compiled_of([camera], pixels)) is not None:
@@ -199,13 +199,13 @@ def minima(
 
 
 def posed(sight: Sight, parameters: Tensor, poses: Poses, **options: Any) -> Adjusted:
-    """The poses (K, 1) of least cost near given ones, each a problem of its own, of a camera that is held."""
+    """Return the poses (K, 1) of least cost near the given ones, each a problem of its own, for a fixed camera."""
     free = Free((torch.zeros(parameters.shape[-1], dtype=torch.bool, device="cpu"),), (False,))
     return adjust([sight], State.of_one(parameters, poses), free, **options)
 
 
 def robust(loss: str | None, scale: float, squares: Tensor) -> tuple[Tensor, Tensor]:
-    """The cost of residuals of squared lengths, and its derivative by them: the weight of the square.
+    """Return the cost of residuals of squared lengths, and its derivative by these: the weight of the square.
 
     huber: s where s <= c^2, else 2 c sqrt(s) - c^2. cauchy: c^2 log(1 + s / c^2).
     """
@@ -219,7 +219,7 @@ def robust(loss: str | None, scale: float, squares: Tensor) -> tuple[Tensor, Ten
 
 
 def bent(points: Tensor, bend: Tensor) -> tuple[Tensor, Tensor]:
-    """Points of boards that are bent, and the two slopes of their z, (..., N, 2).
+    """Return the points of bent boards, and the two slopes of their z, (..., N, 2).
 
     z grows by bend_x (1 - x^2) + bend_y (1 - y^2), where x and y go from -1 to 1 over the points (..., N, 3) of the
     board about its middle: mrcal's paraboloid. bend: (B, 2), in the units of the points.
@@ -275,7 +275,7 @@ class Bundle:
         self.is_bounded = any(c >= 0 and i >= 4 and self.cameras[c].fit_bounds for c, i in self.columns)
 
     def flat(self, state: State) -> tuple[Tensor, ...]:
-        """As tensors (B, ...)."""
+        """Return the state as tensors (B, ...)."""
         batch = len(state.boards.translations)
         return (*state.boards, *state.mounts, state.bend, *[p.expand(batch, -1) for p in state.parameters])
 
@@ -283,7 +283,7 @@ class Bundle:
         return State(tuple(flat[5:]), Poses(*flat[2:4]), Poses(*flat[:2]), flat[4])
 
     def _of_columns(self, parameters: Sequence[Tensor], other: float) -> Tensor:
-        """(B, G): those of the shared unknowns that are parameters, and another number for the others."""
+        """Return values (B, G) of the shared unknowns that are parameters, and `other` for the rest."""
         found = parameters[0].new_full((max(map(len, parameters)), len(self.columns)), other)
         for g, (c, i) in enumerate(self.columns):
             if c >= 0 and i < parameters[c].shape[-1]:
@@ -291,7 +291,7 @@ class Bundle:
         return found
 
     def points(self, c: int, state: State, sight: Sight) -> tuple[Tensor, Tensor, Tensor]:
-        """(B, V, N, 3): those of the board as it lies, in the frame of the first camera, in that of this one."""
+        """Return points (B, V, N, 3) of the turned board, of the first camera's frame, and of this camera's frame."""
         points = bent(sight.points, state.bend)[0] if self.is_bent else sight.points
         turned = points @ state.boards.rotations.mT
         first = turned + state.boards.translations[:, :, None]
@@ -305,7 +305,7 @@ class Bundle:
         return self.fixed[c] or remade(self.cameras[c], intrinsics=parameters[:, :4], distortion=parameters[:, 4:])
 
     def look(self, c: int, flat: Sequence[Tensor], rows: Tensor | None = None) -> compiled_poses.Look:
-        """What a camera makes of a state."""
+        """Return residuals, validity, weights and costs of a camera at a state."""
         state, sight = self.state(flat), self.sight(c, rows)
         if self.is_plain and len(state.bend):
             parameters = state.parameters[0][: 1 if self.are_shared[0] else None]
@@ -325,14 +325,14 @@ class Bundle:
         return compiled_poses.Look(residuals, valid, torch.where(valid, slope * sight.weights, 0.0), cost)
 
     def looks(self, flat: Sequence[Tensor], rows: Tensor) -> list[compiled_poses.Look]:
-        """Of all cameras: those of the last state again if it is that."""
+        """Return the looks of all cameras; those of the last state are reused if it is the same."""
         given, last = (rows, *flat), self._last
         if last is None or not all(a is b or torch.equal(a, b) for a, b in zip(given, last[0], strict=True)):
             self._last = last = given, [self.look(c, flat, rows) for c in range(len(self.sights))]
         return last[1]
 
     def shown(self, c: int, flat: Sequence[Tensor], look: compiled_poses.Look) -> Tensor:
-        """(B, V, N): the points that a camera shows, and not only while it is searched."""
+        """Whether a camera has pixels for points, (B, V, N) bool, also after the search."""
         kind = _kind(self.sights[c].model)
         if kind.searched() is kind:
             return look.valid
@@ -394,7 +394,7 @@ class Bundle:
         return Equations(triangle[..., :width, :], shared, self.columns)
 
     def _rows_of_priors(self, state: State) -> list[Tensor]:
-        """(B, R, G + 1) of each."""
+        """Return the rows (B, R, G + 1) of each prior."""
         found = []
         for c, (sight, parameters) in enumerate(zip(self.sights, state.parameters, strict=True)):
             if sight.prior:
@@ -408,7 +408,7 @@ class Bundle:
         return found
 
     def rows_of(self, c: int, look: compiled_poses.Look, state: State, rows: Tensor) -> tuple[Tensor, list[int]]:
-        """The rows (B, V, 2 N, L + F + 1) of a camera, and which of the shared unknowns its F columns are."""
+        """Return rows (B, V, 2 N, L + F + 1) of a camera, and the indices of its F columns among shared unknowns."""
         sight = self.sight(c, rows)
         turned, first, points = self.points(c, state, sight)
         batch, views, count = points.shape[:3]
@@ -437,7 +437,7 @@ class Bundle:
         return (torch.cat(columns, -1) * look.weights.sqrt()[..., None, None]).flatten(2, 3), at
 
     def moved(self, flat: Sequence[Tensor], step: Sequence[Tensor], rows: Tensor) -> tuple[Tensor, ...]:
-        """The state a step further; step: of the views (R, V, L), and of what they share (R, G)."""
+        """Return the state after steps of the views (R, V, L) and of what they share (R, G)."""
         state = self.state(flat)
         of_views, shared = step
         boards, mounts, bend = state.boards, state.mounts, state.bend
@@ -472,14 +472,14 @@ def _kind(model: type[Camera] | Camera) -> type[Camera]:
 
 
 def _template(model: type[Camera] | Camera, parameters: Tensor) -> Camera:
-    """A frozen camera of the model, for others that have its number of coefficients."""
+    """Return a frozen camera of the model, a template for others with its number of coefficients."""
     made = fixed_camera(_kind(model).searched(), parameters[0, :4], parameters[0, 4:])
     made._warned = True  # a step that is refused may have gone anywhere
     return made
 
 
 def pixel_jacobians(camera: Camera, points: Tensor, learns: bool = True) -> tuple[Tensor, Tensor]:
-    """The exact derivatives of pixels by points (C, N, 3), and by the parameters of cameras (C,) if one learns.
+    """Return the exact derivatives of pixels by points (C, N, 3), and by the parameters of cameras (C,) if one learns.
 
     (C, N, 2, 3) and (C, N, 2, 4 + n): zero where there is no pixel, and of no meaning where a point is not valid.
     """

@@ -50,7 +50,7 @@ class Model:
         return (*INTRINSICS, *(self.kind.names_of(self.count) or ()))
 
     def camera(self, parameters: Tensor, image_size: tuple[int, int] | None) -> Camera:
-        """That of parameters (*B, 4 + n), in which what is frozen in the camera to start from is frozen."""
+        """Return the camera of parameters (*B, 4 + n), with the same names frozen as in the camera to start from."""
         found = self.kind(*parameters.split((4, self.count) if self.count else 4, -1), image_size=image_size)
         if self.start is not None and (frozen := frozen_names(self.start)):
             found.freeze(*frozen)
@@ -108,7 +108,7 @@ def as_model(
 def as_options(
     loss: str | None, loss_scale: float, bend: bool, progress: Callable[[int, float], None] | None, owner: str
 ) -> Callable[[int, Tensor], None] | None:
-    """Refuse what is no loss, no flag and no function; and the progress as `adjust` takes it."""
+    """Check the loss, the flag and the function, and return the progress callback for `adjust`."""
     if loss is not None and not (isinstance(loss, str) and loss in LOSSES):
         raise ValueError(f"{owner}: loss must be None or one of {LOSSES}; got {shown(loss)}")
     if not 0 < as_number(loss_scale, "loss_scale", owner) < math.inf:
@@ -137,7 +137,7 @@ def calibrate(
     bend: bool = False,
     progress: Callable[[int, float], None] | None = None,
 ) -> Calibration:
-    """The camera of a model under which known points are seen where they were seen, from nothing.
+    """Calibrate a camera of a model from known points and their pixels; no start is needed.
 
     No focal length has to be given, and angles may go beyond 90 degrees. Least squares of the distances in pixels, over
     the parameters of the camera and the poses of all views.
@@ -175,7 +175,7 @@ def calibrate(
 
 
 def middle_of(seen: Sequence[Observations]) -> Tensor:
-    """(3,) of all points of boards that were seen."""
+    """Return the middle (3,) of all points of boards that were seen."""
     points = torch.cat([s.points[s.seen] for s in seen])
     return (points.amin(0) + points.amax(0)) / 2
 
@@ -223,11 +223,11 @@ class Search:
         return Sight(self.asked.kind, seen.points[None], seen.pixels[None], weights, prior=self.prior)
 
     def free(self, bend: bool = False) -> Free:
-        """What learns where there is no other camera."""
+        """Return the unknowns that learn if there is no other camera."""
         return Free((self.asked.free.to(self.given.pixels.device),), (False,), bend=bend)
 
     def alone(self, bend: bool = False, progress: Callable[[int, Tensor], None] | None = None) -> Adjusted:
-        """The optimum by what this camera saw, with other poses where those are better by the camera found."""
+        """Return the optimum for this camera's views, with other poses if they are better for the camera found."""
         asked, seen, size = self.asked, self.seen, self.layout.image_size
 
         def optimum(state: State) -> Adjusted:
@@ -261,7 +261,7 @@ class Search:
     def other_optima(
         self, camera: int, sights: Sequence[Sight], adjusted: Adjusted, free: Free
     ) -> tuple[Adjusted, Optima | None]:
-        """An optimum, or a better one in another basin of this camera's model, and all; None where it has but one."""
+        """Return the optimum, or a better one in another basin of this model, and all (None if it has one basin)."""
         state = adjusted.state
         boards = _seen_from(state, camera)
         learns, size = free.parameters[camera].cpu(), self.layout.image_size
@@ -280,7 +280,7 @@ class Search:
 
 
 def _seen_from(state: State, camera: int) -> Poses:
-    """The boards in the frame of one camera."""
+    """Return the boards in the frame of one camera."""
     rotations, translations = (t[:, camera, None] for t in state.mounts)
     return Poses(rotations @ state.boards.rotations, state.boards.translations @ rotations[:, 0].mT + translations)
 
@@ -293,7 +293,7 @@ class Optima(NamedTuple):
     converged: Tensor
 
     def twins(self, found: Calibration) -> tuple[tuple[float, ...], ...]:
-        """The parameters of those that the noise does not tell from the one found, and that are apart from it."""
+        """Return parameters of optima as good as the one found, up to the noise, and apart from it."""
         if not found.converged:
             return ()
         as_good = self.converged & (self.cost - found.adjusted.cost[0] <= _AS_GOOD * found.sigma**2)
@@ -363,7 +363,7 @@ def results(searches: Sequence[Search], adjusted: Adjusted, free: Free) -> Resul
 
 
 def unknowns(sights: Sequence[Sight], adjusted: Adjusted, views: int) -> float:
-    """How many numbers the residuals had to tell: those that learn, without what priors tell of them."""
+    """Return the number of unknowns that residuals determine: parameters that learn, less the priors' part."""
     equations = adjusted.equations
     told = 0.0
     for c, sight in enumerate(sights):
@@ -376,7 +376,7 @@ def unknowns(sights: Sequence[Sight], adjusted: Adjusted, views: int) -> float:
 
 
 def rms_of(residuals: Tensor, seen: Tensor) -> float:
-    """Px per point."""
+    """Return the root mean square of the seen residuals, px per point."""
     lengths = torch.where(seen, torch.linalg.vector_norm(residuals, dim=-1), 0.0)
     return float((lengths.square().sum() / seen.sum().clamp(min=1)).sqrt())
 
@@ -384,7 +384,7 @@ def rms_of(residuals: Tensor, seen: Tensor) -> float:
 def noise_of(
     residuals: Tensor, seen: Tensor, valid: Tensor, loss: str | None, loss_scale: float, free: float
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """The inliers, bool (V, N), sigma, see `Calibration`, and the noise that makes the covariance; free: parameters."""
+    """Return inliers, bool (V, N), sigma (see `Calibration`) and the noise for the covariance; free: parameters."""
 
     def sigma_of(lengths: Tensor) -> Tensor:
         return (lengths.square().sum() / max(2 * len(lengths) - free, 1)).sqrt()

@@ -118,9 +118,9 @@ def seen(
     loss: tuple[str | None, float],
     learnt: Sequence[int] | None = None,
 ) -> Look:
-    """Return what cameras (B,), or one, make of points (B, V, N, 3) whose pixels (B, V, N, 2) are known.
+    """Return residuals and weights of points (B, V, N, 3) seen by cameras (B,), or one, at pixels (B, V, N, 2).
 
-    With triangles if `learnt` says which parameters learn. poses: (B, V, 3, 3), (B, V, 3). loss: name and scale.
+    Triangles are made if `learnt` lists the parameters that learn. poses: (B, V, 3, 3), (B, V, 3). loss: name, scale.
     """
     compiled, plan, left = library(), native.plan, c_int64(0)
     assert compiled is not None  # or nobody has a `Native`
@@ -152,7 +152,7 @@ def seen(
 
 
 def turned(rotations: Tensor, steps: Tensor) -> Tensor:
-    """Rotations (..., 3, 3) after the small turns of the first three numbers of steps (..., n)."""
+    """Return rotations (..., 3, 3) after small turns by the first three numbers of steps (..., n)."""
     compiled = library() if rotations.is_cpu and rotations.dtype == torch.float64 else None
     if compiled is None:
         return small_turn(steps[..., :3]) @ rotations
@@ -173,7 +173,7 @@ def _run(
     threshold: float,
     results: tuple[Tensor | None, ...],
 ) -> int:
-    """How many points wait for what is known of a lens."""
+    """Run the compiled task, and return how many points need lens values that are not known yet."""
     compiled = library()
     assert compiled is not None  # see `can_search`
     given = [None if t is None else t.contiguous() for t in (points, rays, pixels, weights)]

@@ -36,7 +36,7 @@ def fit(
     count: int | None = None,
     fixed: Collection[str] | str = (),
 ) -> Conversion[Camera]:
-    """The camera of a model that sees rays at pixels, as nearly as it can: by least squares of the distances in px.
+    """Fit a camera of a model to rays at pixels, by least squares of the distances in px.
 
     The rays may come from a network, from a table, from a lens designer's program; where they are not known, the weight
     is 0, or they are NaN. How far the result is from them is said in `Conversion.rms` and `max_error`, in px.
@@ -129,7 +129,7 @@ def fit(
 
 
 def _fixed(asked: Model, size: tuple[int, int] | None, owner: str) -> Tensor | None:
-    """(4 + n,): the values that parameters keep, NaN for those that are looked for; None if all are."""
+    """Return the values (4 + n,) that parameters keep, NaN for those to find; None if all are to be found."""
     if bool(asked.free.all()):
         return None
     if asked.start is not None:
@@ -169,7 +169,7 @@ def _unified(seen: fitting.Observations, owner: str) -> Camera:
 
 
 def _line(m: Tensor, p: Tensor, weights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Slope, offset and mean square (C,) of the line p = slope m + offset."""
+    """Return slope, offset and mean square (C,) of the line p = slope m + offset."""
     w = weights.square()
     total = w.sum(-1, keepdim=True).clamp(min=torch.finfo(w.dtype).tiny)
     middle, at = (w * m).sum(-1, keepdim=True) / total, (w * p).sum(-1, keepdim=True) / total

@@ -55,7 +55,7 @@ class Layout(NamedTuple):
     copies: tuple[int, ...]  # the numbers of passed views that are no new evidence: see `_observed` and `repeats`
 
     def restore(self, values: Tensor) -> Any:
-        """Results (V, N, k) or (V, N) in the form of the image points, NaN (of bool: False) where nothing was seen."""
+        """Return results (V, N, k) or (V, N) in the form of the image points, NaN (of bool: False) if unseen."""
         rest, empty = values.shape[2:], values.new_tensor(False if values.dtype == torch.bool else torch.nan)
         full = empty.repeat(len(self.shapes), *values.shape[1:])
         full[self.views] = torch.where(self.seen.reshape(*self.seen.shape, *[1] * len(rest)), values, empty)
@@ -94,7 +94,7 @@ def as_rig_observations(
 
 
 def repeats(cameras: Sequence[Observations], residuals: Sequence[Tensor]) -> Tensor:
-    """Return (R,) views that show an earlier one again with its errors, as a file saved anew and a frozen frame do.
+    """Return views (R,) that show an earlier one again with its errors, as a file saved twice or a frozen frame does.
 
     Where the noise of two views is independent, corners differ by at least as much as both are wrong by; in such a pair
     they differ by less than a third of that. residuals: of each camera (V, N, 2).
@@ -115,7 +115,7 @@ def repeats(cameras: Sequence[Observations], residuals: Sequence[Tensor]) -> Ten
 def _observed(
     object_points: Points, image_points: Mapping[str, Points], image_sizes: Mapping[str, Any], owner: str
 ) -> dict[str, tuple[Observations, Layout]]:
-    """What cameras see, by their names, "" of one alone; without views that have no corners, or those of another."""
+    """Return the observations of cameras by name, "" for a single one, without views that have no corners."""
     labels = {name: f"image_points[{name!r}]" if name else "image_points" for name in image_points}
     given = {name: _in_views(image_points[name], 2, label, owner) for name, label in labels.items()}
     boards, *_ = _in_views(object_points, 3, "object_points", owner)
@@ -175,7 +175,7 @@ def _observed(
 def _in_views(
     value: Points, size: int, name: str, owner: str
 ) -> tuple[list[Array | None], list[tuple[int, ...] | None], bool]:
-    """Points (n, size) of each view and the shapes they came in, None for no points; whether they were one array."""
+    """Return points (n, size) of each view, their shapes (None for no points), and whether they were one array."""
     parts: list[Array | None] = []
     if isinstance(value, (list, tuple)):
         parts = [None if p is None else _as_array(p, size, f"{name}[{i}]", owner) for i, p in enumerate(value)]
@@ -202,7 +202,7 @@ def _in_views(
 
 
 def _as_array(value: Any, size: int, name: str, owner: str) -> Array:
-    """A float64 array; None among the numbers of a list is NaN."""
+    """Return a float64 array; None among the numbers of a list becomes NaN."""
     if isinstance(value, (list, tuple)):
         try:
             plain = [v.numpy(force=True) if isinstance(v, Tensor) else v for v in value]
@@ -216,7 +216,7 @@ def _as_array(value: Any, size: int, name: str, owner: str) -> Array:
 
 
 def _padded(views: Sequence[Array | None], count: int, size: int) -> Array:
-    """(V, count, size), NaN where there is nothing."""
+    """Pad the points of views to (V, count, size) with NaN."""
     padded = np.full((len(views), count, size), np.nan)
     for row, points in zip(padded, views, strict=True):
         if points is not None:
@@ -225,19 +225,19 @@ def _padded(views: Sequence[Array | None], count: int, size: int) -> Array:
 
 
 def _ordered(rows: Array) -> Array:
-    """Rows (V, N, k) of each view in the order of their numbers, NaN last."""
+    """Sort the rows (V, N, k) of each view, NaN last."""
     return np.take_along_axis(rows, np.lexsort(np.moveaxis(rows, -1, 0))[..., None], 1)
 
 
 def _repeated(rows: Array, times: int) -> Array:
-    """(V,) whether so many of the rows (V, N, k) of a view are equal; NaN equals nothing."""
+    """Whether so many rows (V, N, k) of a view are equal, (V,); NaN equals nothing."""
     ordered = _ordered(rows)
     same: Array = (ordered[:, times - 1 :] == ordered[:, : rows.shape[1] - times + 1]).all(-1).any(-1)
     return same
 
 
 def _check_corners(points: Array, pixels: Array, seen: Array, name: str, owner: str) -> None:
-    """Refuse corners from which no pose can be told; points (V, N, 3) and pixels (V, N, 2) are NaN where padded."""
+    """Raise if corners determine no pose; points (V, N, 3) and pixels (V, N, 2) are NaN if padded."""
     number, corners = seen.sum(-1), np.where(seen[..., None], points, np.nan)
     if not number.any():
         raise ValueError(f"{owner}: {name} is NaN everywhere: no view has a corner")
@@ -262,7 +262,7 @@ def _check_corners(points: Array, pixels: Array, seen: Array, name: str, owner: 
 
 
 def _check_inside(pixels: Array, seen: Array, name: str, size: tuple[int, int], size_name: str, owner: str) -> None:
-    """Refuse pixels that are not those of such an image."""
+    """Raise if pixels do not lie in an image of this size."""
     found = pixels[seen]
     low, high = ("({:.6g}, {:.6g})".format(*end) for end in (found.min(0), found.max(0)))
     if np.abs(found).max() < _NORMALISED < min(size) / 2:
@@ -289,11 +289,11 @@ def _check_inside(pixels: Array, seen: Array, name: str, size: tuple[int, int], 
 
 
 def _views_of(views: Array) -> str:
-    """The views of a mask (V,) in words."""
+    """Return the views of a mask (V,) in words."""
     return named(np.flatnonzero(views).tolist())
 
 
 def named(views: Sequence[int]) -> str:
-    """Views by their numbers, in words."""
+    """Return views by their numbers, in words."""
     more = f" and {len(views) - _NAMED} more" if len(views) > _NAMED else ""
     return f"view{'s' * (len(views) > 1)} {', '.join(map(str, views[:_NAMED]))}{more}"

@@ -76,7 +76,7 @@ def solve_pnp(
     weights: Numbers | None = None,
     threshold: float | None = None,
 ) -> Pose:
-    """The pose, camera from object, under which known points are seen nearest to pixels: least squares in px.
+    """Return the pose, camera from object, at which known points are seen nearest to pixels: least squares in px.
 
     Any camera model, rays of any angle, four points or more, on a plane or not, and no start: closed forms on rays give
     it (`camtorch.calibration.rays`), the Levenberg-Marquardt method the optimum. Points on a plane may have two
@@ -139,7 +139,7 @@ def solve_pnp(
 def _of_each_model(
     camera: Mixed, object_points: Numbers, pixels: Numbers, weights: Numbers | None, threshold: float | None
 ) -> Pose:
-    """`solve_pnp` of each group, whose poses are put together again."""
+    """Solve the poses of each group of a mixed batch and join them."""
     owner, count, device = "solve_pnp", len(camera), camera.intrinsics.device
     points = as_vectors(object_points, "object_points", 3, owner, device)
     seen_at = as_vectors(pixels, "pixels", 2, owner, device)
@@ -158,7 +158,7 @@ def _of_each_model(
 
 
 def _fixed(rotation: Tensor, translation: Tensor) -> Extrinsics:
-    """A pose that does not learn by itself; gradients go to what it was found from."""
+    """Return a frozen pose that keeps the graph of its tensors."""
     return remade(_identity(), rotation=rotation, translation=translation)
 
 
@@ -218,7 +218,7 @@ class _Given(NamedTuple):
 
 
 def _compiled(given: _Given, threshold: float | None) -> Solved | None:
-    """By compiled code, where there is any for the camera."""
+    """Solve by compiled code, if there is any for the camera; otherwise return None."""
     points, pixels = given.points.detach(), given.pixels.detach()
     if not len(pixels) or (made := compiled_of([given.camera], pixels)) is None:
         return None
@@ -252,7 +252,7 @@ class _Task(NamedTuple):
         return cls(given.camera, points, pixels, weights, rays, middles)
 
     def cost(self, unknowns: Tensor) -> Tensor:
-        """(B,) half the sum of squares at rotation vectors and translations (B, 6)."""
+        """Return half the sum of squares (B,) at rotation vectors and translations (B, 6)."""
         seen = self.points @ rotation_matrix(unknowns[:, :3]).mT + unknowns[:, None, 3:]
         pixels, valid = self.camera.project(seen)
         squares = (pixels - self.pixels).square().sum(-1)
@@ -260,7 +260,7 @@ class _Task(NamedTuple):
 
 
 def _consensus(task: _Task, threshold: float) -> tuple[Tensor, Tensor]:
-    """The poses on which most points agree: rotations (B, 3, 3), translations (B, 3)."""
+    """Return the poses on which most points agree: rotations (B, 3, 3), translations (B, 3)."""
     # where poses are only looked for, differences are derivatives
     moves = _MOVE * torch.eye(4, 3, dtype=task.rays.dtype, device=task.rays.device)  # the last one: none
     pixels, seen = task.camera.project((task.rays[:, :, None] + moves).flatten(1, 2))
@@ -270,7 +270,7 @@ def _consensus(task: _Task, threshold: float) -> tuple[Tensor, Tensor]:
 
 
 def _searched(given: _Given, threshold: float | None) -> Solved:
-    """The same on any device, for any camera."""
+    """Solve on any device, for any camera."""
     given = given._replace(points=given.points.detach(), pixels=given.pixels.detach())
     task = _Task.of(given if given.weights is None else given._replace(weights=given.weights.detach()))
     weights = task.weights
@@ -334,7 +334,7 @@ class _Found(NamedTuple):
 
 
 def _minimum(task: _Task, rotations: Tensor, translations: Tensor, valid: Tensor) -> _Found:
-    """The minima that poses (B, ...) lead to; valid: bool (B,), those that are meant."""
+    """Return the minima near poses (B, ...); valid, bool (B,), selects the rows that count."""
     camera = task.camera
     parameters = torch.cat(camera._tensors, -1).detach()
     parameters = parameters.view(-1, parameters.shape[-1])
@@ -347,20 +347,20 @@ def _minimum(task: _Task, rotations: Tensor, translations: Tensor, valid: Tensor
 
 
 def _least(candidates: list[_Found]) -> _Found:
-    """Of each row the lowest one."""
+    """Return the candidate of least cost for each row."""
     best = torch.stack([found.costs for found in candidates]).argmin(0)
     rows = torch.arange(len(best), device=best.device)
     return _Found(*(torch.stack(parts)[best, rows] for parts in zip(*candidates, strict=True)))
 
 
 def _near(task: _Task, rotations: Tensor, translations: Tensor, threshold: float) -> Tensor:
-    """Bool (B, N): the points that are seen near their pixels."""
+    """Whether points are seen near their pixels, bool (B, N)."""
     pixels, valid = task.camera.project(task.points @ rotations.mT + translations[:, None])
     return valid & (task.weights > 0) & ((pixels - task.pixels).square().sum(-1) < threshold**2)
 
 
 def _spread(points: Tensor, inliers: Tensor) -> Tensor:
-    """(B,) bool: whether there are enough inliers, which are on no line."""
+    """Whether there are enough inliers, which lie on no line, (B,) bool."""
     weights = inliers.to(points)
     counts = weights.sum(-1)
     centred = points - (weights[..., None] * points).sum(-2, keepdim=True) / counts.clamp(min=1)[:, None, None]

@@ -38,12 +38,12 @@ class _Lines(NamedTuple):
     threshold: float
 
     def forms(self) -> Tensor:
-        """(B, 12, 3 N): what makes of [R t] the measures of all points."""
+        """Return matrices (B, 12, 3 N) that map [R t] to the measures of all points."""
         points = pad(self.points, (0, 1), value=1.0)
         return (self.measures[..., :, None] * points[:, None, :, None]).flatten(3).flatten(1, 2).mT
 
     def squares(self, poses: Tensor, forms: Tensor) -> Tensor:
-        """(B, S, N) px^2 at poses (B, S, 3, 4), at most the threshold's."""
+        """Return squared distances (B, S, N) in px^2 at poses (B, S, 3, 4), at most the threshold's square."""
         u, v, depth = (poses.flatten(2) @ forms).unflatten(2, (3, -1)).unbind(2)
         squares = (u * u).addcmul_(v, v).div_(depth * depth)
         most = self.threshold**2
@@ -51,7 +51,7 @@ class _Lines(NamedTuple):
         return least
 
     def fitted(self, poses: Tensor, forms: Tensor) -> Tensor:
-        """The poses (B, S, 3, 4) after a step of Gauss and Newton by the points near them."""
+        """Return the poses (B, S, 3, 4) after a Gauss-Newton step by the points near them."""
         measured = (poses.flatten(2) @ forms).unflatten(2, (3, -1))
         depth = measured[:, :, 2]
         near = self.squares(poses, forms) < self.threshold**2
@@ -69,7 +69,7 @@ class _Lines(NamedTuple):
 
 
 def consensus(points: Tensor, rays: Tensor, slopes: Tensor, seen: Tensor, threshold: float) -> tuple[Tensor, Tensor]:
-    """Return the poses, camera from object, of least squared distances of points from rays, each cut at a threshold.
+    """Return the poses, camera from object, of least squared distances of points from rays, clipped at a threshold.
 
     Few points are drawn (by a generator of its own, the same for all rows), as often as it takes to meet some without
     an outlier several times, judged by how many agree with the best pose so far. Three of them have up to four poses
@@ -115,7 +115,7 @@ class _Search(NamedTuple):
     agree: Tensor
 
     def round(self, rows: Tensor, numbers: Tensor) -> None:
-        """One for some rows, by numbers (H, N)."""
+        """Run a round for some rows, by random numbers (H, N)."""
         samples, count = numbers.shape
         for part in rows.split(max(1, _AT_ONCE // (12 * samples * count))):
             lines = _Lines(self.lines.points[part], self.lines.measures[part], self.lines.threshold)
@@ -141,7 +141,7 @@ class _Search(NamedTuple):
             self.agree[part] = (squares[better, index] < lines.threshold**2).sum(-1)
 
     def compiled_round(self, rows: Tensor, numbers: Tensor, compiled: ctypes.CDLL) -> None:
-        """The same by native/consensus.c."""
+        """Run a round by native/consensus.c."""
         points, measures = self.lines.points.mT.contiguous(), self.lines.measures.mT.contiguous()
         read = (points, measures, self.order, self.counts, numbers, self.best, self.costs, self.agree, rows)
         following, count = ctypes.c_int64(0), self.order.shape[-1]

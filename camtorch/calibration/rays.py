@@ -29,7 +29,7 @@ class RayPoses(NamedTuple):
 
 
 def poses_from_rays(points: Tensor, rays: Tensor, weights: Tensor) -> RayPoses:
-    """The poses, camera from object, in which known points lie on rays; the least angles first.
+    """Return the poses, camera from object, at which known points lie on rays; those with the least angles first.
 
     With the best translation put in, the sum of the points' squared distances from their rays is a quadratic form of
     the rotation's entries (C.-P. Lu, G. Hager and E. Mjolsness, TPAMI 2000), whose minima are descended to in a fixed
@@ -93,7 +93,7 @@ def poses_from_rays(points: Tensor, rays: Tensor, weights: Tensor) -> RayPoses:
 
 
 def _frame(direction: Tensor) -> Tensor:
-    """(..., 3, 3) rotations whose third column is the direction (..., 3), of unit length."""
+    """Return rotations (..., 3, 3) whose third column is the unit direction (..., 3)."""
     sign = torch.where(direction[..., 2] < 0, -1.0, 1.0)
     mirror = torch.cat((direction[..., :2], (direction[..., 2] + sign)[..., None]), -1)
     scale = 2 / mirror.square().sum(-1).clamp(min=_TINY)
@@ -103,12 +103,12 @@ def _frame(direction: Tensor) -> Tensor:
 
 
 def _sight(rays: Tensor, weights: Tensor) -> Tensor:
-    """(B, 3): the direction in the middle of rays (B, N, 3)."""
+    """Return the direction (B, 3) in the middle of rays (B, N, 3)."""
     return normalize((weights[..., None] * rays).sum(-2), dim=-1)
 
 
 def _moments(rays: Tensor, points: Tensor, weights: Tensor) -> Tensor:
-    """(B, 3, 3, 3, 3): the sum of (I - r r^T) x p p^T over points p, which is what is across their unit rays r."""
+    """Return the sums (B, 3, 3, 3, 3) of (I - r r^T) x p p^T over points p with unit rays r."""
 
     def products(vectors: Tensor) -> Tensor:
         x, y, z = vectors.unbind(-1)
@@ -122,7 +122,7 @@ def _moments(rays: Tensor, points: Tensor, weights: Tensor) -> Tensor:
 
 
 def _homography(sight: Tensor, distances: _Distances) -> Tensor:
-    """(B, 3, 3): of the plane's points (x, y, 1) to their rays; sight (B, 3) is about where the points are."""
+    """Return homographies (B, 3, 3) from the plane's points (x, y, 1) to rays; sight (B, 3) points about at them."""
     # the first two columns' entries across the line of sight and, of which narrow views tell little, along it
     frame = _frame(sight)
     basis = torch.stack((frame.mT, torch.zeros_like(frame)), -1)
@@ -160,20 +160,20 @@ class _Distances(NamedTuple):
         return cls(form - moved.mT @ solution, -solution, to_depth)
 
     def translations(self, rotations: Tensor) -> Tensor:
-        """(B, S, 3): the best to rotations (B, S, 3, 3)."""
+        """Return the best translations (B, S, 3) for rotations (B, S, 3, 3)."""
         return rotations.flatten(2) @ self.to_translation.mT
 
     def of_rotations(self, rotations: Tensor) -> Tensor:
-        """(B, S)."""
+        """Return the costs (B, S) of rotations (B, S, 3, 3)."""
         entries = rotations.flatten(2)
         return ((entries @ self.form) * entries).sum(-1)
 
     def depths(self, rotations: Tensor) -> Tensor:
-        """(B, S)."""
+        """Return the depths (B, S) for rotations (B, S, 3, 3)."""
         return (rotations.flatten(2) @ self.to_depth[..., None])[..., 0]
 
     def descended(self, rotations: Tensor, steps: int) -> Tensor:
-        """Rotations (B, S, 3, 3) after some steps of Levenberg and Marquardt: three unknowns each, and no points."""
+        """Return rotations (B, S, 3, 3) after Levenberg-Marquardt steps: three unknowns each, without the points."""
         costs = self.of_rotations(rotations)
         damping = torch.full_like(costs, 1e-2)
         eye = torch.eye(3, dtype=costs.dtype, device=costs.device)
@@ -194,7 +194,7 @@ class _Distances(NamedTuple):
 
 
 def _planar_starts(rays: Tensor, weights: Tensor, distances: _Distances) -> Tensor:
-    """(B, 2, 3, 3): the rotations that the homography leaves."""
+    """Return the two rotations (B, 2, 3, 3) that the homography allows."""
     homography = _homography(_sight(rays, weights), distances)
     frame = _frame(normalize(homography[..., 2], dim=-1))
     # across the line of sight the columns of the rotation are known up to the distance, and the larger singular value
@@ -214,7 +214,7 @@ def _planar_starts(rays: Tensor, weights: Tensor, distances: _Distances) -> Tens
 
 
 def _rotations_in_space(local: Tensor, rays: Tensor, weights: Tensor, distances: _Distances) -> Tensor:
-    """(B, 2, 3, 3): of points that are not on a plane, whose main axes are the coordinates'."""
+    """Return rotations (B, 2, 3, 3) for points in space whose main axes are the coordinate axes."""
     frame = _frame(_sight(rays, weights))
     linear = torch.linalg.eigh(distances.form).eigenvectors[..., 0].view(-1, 1, 3, 3)
     linear = torch.where(distances.depths(linear)[..., None, None] < 0, -linear, linear)
@@ -245,5 +245,5 @@ def _rotations_in_space(local: Tensor, rays: Tensor, weights: Tensor, distances:
 
 
 def _taken(values: Tensor, index: Tensor) -> Tensor:
-    """Of values (B, S, ...) those of an index (B, T)."""
+    """Return the values (B, S, ...) at an index (B, T)."""
     return torch.take_along_dim(values, index.view(*index.shape, *[1] * (values.ndim - 2)), 1)

@@ -109,7 +109,7 @@ def calibrate_rig(
     bend: bool = False,
     progress: Callable[[int, float], None] | None = None,
 ) -> RigCalibration:
-    """Cameras that see the same boards, and where they are.
+    """Calibrate cameras that see the same boards, and find where they are.
 
     Not every camera has to see every board; but each has to see some together with others, so that all are linked.
 
@@ -180,7 +180,7 @@ def calibrate_rig(
 
 
 def _of(given: Any, name: str, otherwise: Any) -> Any:
-    """What is given for one camera, by name or for all."""
+    """Return the argument of one camera, given by name or for all."""
     return given.get(name, otherwise) if isinstance(given, Mapping) else given
 
 
@@ -201,7 +201,7 @@ def _alone(search: Search) -> _Alone:
 
 
 def _joined(sights: list[Sight], alone: list[_Alone], free: Free) -> State:
-    """Where to start: mounts by what two cameras say of the same boards, boards by the camera that says it best."""
+    """Return the start: mounts by pairs that see the same boards, boards by the camera that sees each best."""
     mounts = Poses.none(1, len(alone), alone[0].parameters)
     turns, shifts = mounts.rotations[0], mounts.translations[0]
     together = torch.stack([one.has_pose for one in alone]).double()
@@ -229,7 +229,7 @@ def _joined(sights: list[Sight], alone: list[_Alone], free: Free) -> State:
 
 
 def _between(a: _Alone, b: _Alone) -> tuple[Tensor, Tensor]:
-    """The pose from camera a to b that lies in the middle of those that each of the boards gives."""
+    """Return the pose from camera a to b in the middle of those that each of the boards gives."""
     both = a.has_pose & b.has_pose
     (from_a, at_a), (from_b, at_b) = ((t[0, both] for t in one.boards) for one in (a, b))
     rotations = from_b @ from_a.mT

@@ -57,7 +57,7 @@ class Selection:
     why: str
 
     def lines(self) -> list[str]:
-        """A table, and the reason below it."""
+        """Return a table, and the reason below it."""
         rows = [("model", "coefficients", "rms fitted", "rms held out")]
         for trial in self.trials:
             values = (f"{trial.rms:.4f}", f"{trial.held_out:.4f}") if not trial.reason else ("-", "-")
@@ -80,7 +80,7 @@ def select(
     fixed: Sequence[str] = (),
     progress: Callable[[float], None] | None = None,
 ) -> Selection:
-    """Find the model that predicts views best that it was not fitted to, and of about equals the simplest.
+    """Find the model that predicts held-out views best, the simplest if several are about equal.
 
     Each of five parts of the views is held out once: a camera is fitted to the others, and on that part only the poses
     are. The model with the smallest error is taken, or one with fewer coefficients if it is worse by no more than 1 %,

@@ -112,14 +112,14 @@ def poses_for(
     image_size: tuple[int, int],
     scale: float = _LEAST_SCALE,
 ) -> State:
-    """A known camera, parameters (1, 4 + n), and the poses of all views; scale: px, from which corners count less."""
+    """Return the state of a known camera (1, 4 + n) and all views' poses; scale: px from which corners count less."""
     lens = _Lens(model, parameters, Poses.none(1, 1, parameters), scale, image_size)
     boards, errors = _posed(lens.camera, observations)
     return _turned(lens._replace(boards=boards), observations, errors).state
 
 
 def other_poses(found: Adjusted, observations: Observations, model: type[Camera], image_size: tuple[int, int]) -> State:
-    """The state of an optimum, B = 1, with better poses of the views that have them; itself where none has."""
+    """Return the state of an optimum, B = 1, with better poses for views that have them; the same state if none has."""
     state = found.state
     lens = _Lens(model, state.parameters[0], state.boards, _LEAST_SCALE, image_size)
     errors = _lengths(found.residuals[0], found.valid[0], observations.seen)[0]
@@ -145,7 +145,7 @@ def other_cameras(
     model: type[Camera],
     image_size: tuple[int, int],
 ) -> Tensor | None:
-    """(S, 4 + n) nearly the same camera (1, 4 + n) along the valley of its model, see `_ALONG`; None without one."""
+    """Return similar cameras (S, 4 + n) along the model's valley of (1, 4 + n), see `_ALONG`; None without a valley."""
     count = parameters.shape[-1] - 4
     names = ("fx", "fy", "cx", "cy", *(model.names_of(count) or ()))
     along, _ = _ALONG.get(model.key, ("", ()))
@@ -175,11 +175,11 @@ class _Lens(NamedTuple):
         return fixed_camera(self.model, self.parameters[:, :4], self.parameters[:, 4:], self.image_size)
 
     def errors(self, some: Observations) -> Tensor:
-        """(B, V, N) px, NaN for what is not seen."""
+        """Return the errors (B, V, N) in px, NaN if a corner is unseen."""
         return _errors(self.camera, self.boards, some)
 
     def lost(self, some: Observations) -> Tensor:
-        """(B, V, N) bool, the corners that were seen and have no pixel."""
+        """Whether seen corners have no pixel, (B, V, N) bool."""
         _, valid = self.camera.project(self.boards.moved(some.points).flatten(1, 2))
         return some.seen & ~valid.view(-1, *some.seen.shape)
 
@@ -189,7 +189,7 @@ class _Lens(NamedTuple):
     def adjusted(
         self, few: Observations, free: Free, steps: int, worst: float, loss: tuple[str | None, float] | None = None
     ) -> _Lens:
-        """Nearer to what they saw, the best first, without those whose cost is above `worst` times the least."""
+        """Adjust the cameras, the best first, and drop those whose cost is above `worst` times the least."""
         name, scale = loss or ("cauchy", self.scale)
         settled = _NEARLY if loss is None else SETTLED
         sight = _sight(self.model, few)
@@ -210,14 +210,14 @@ def _sight(model: type[Camera], observations: Observations) -> Sight:
 
 
 def _free(model: type[Camera], count: int, fixed: Collection[str]) -> Free:
-    """All parameters but those that are held, or that never learn."""
+    """Return the parameters that learn: all except those held by `fixed` or by the model."""
     names = ("fx", "fy", "cx", "cy", *(model.names_of(count) or ()))
     learns = [name not in fixed and model.fit_bounds.get(name, ()) is not None for name in names]
     return Free((torch.tensor(learns, device="cpu"),), (False,))
 
 
 def _few(observations: Observations, image_size: tuple[int, int]) -> Observations:
-    """Of many views those with the most corners; of many corners enough, evenly from the image's middle outwards."""
+    """Select the views with the most corners, and enough corners, evenly from the image's middle outwards."""
     if len(observations.seen) > _VIEWS:
         observations = observations.of(observations.seen.sum(-1).argsort(descending=True)[:_VIEWS].sort().values)
     points, pixels, seen = observations
@@ -233,12 +233,12 @@ def _few(observations: Observations, image_size: tuple[int, int]) -> Observation
 
 
 def _middle(image_size: tuple[int, int], like: Tensor) -> Tensor:
-    """(2,) of the image."""
+    """Return the middle (2,) of the image."""
     return like.new_tensor([(image_size[1] - 1) / 2, (image_size[0] - 1) / 2])
 
 
 def _unified(few: Observations, image_size: tuple[int, int], fixed: Collection[str]) -> _Lens:
-    """The unified camera that explains best what was seen."""
+    """Return the unified camera that best explains the observations."""
     centre = _middle(image_size, few.pixels)
     reach = torch.where(few.seen, torch.linalg.vector_norm(few.pixels - centre, dim=-1), 0.0).amax()
     tried = [(alpha, math.radians(degrees)) for alpha, angles in _TRIED.items() for degrees in angles]
@@ -264,7 +264,7 @@ def _unified(few: Observations, image_size: tuple[int, int], fixed: Collection[s
 def _posed(
     camera: Camera, some: Observations, rounds: int = _ROUNDS, begun: tuple[Poses, Tensor] | None = None
 ) -> tuple[Poses, Tensor]:
-    """Poses (B, V) in closed form for cameras (B,), and the errors in px, (B, V, N); NaN for what is not seen.
+    """Return closed-form poses (B, V) for cameras (B,), and errors (B, V, N) in px; NaN if a corner is unseen.
 
     Each round goes without the outliers of the one before. begun: what the first round finds, where it is known.
     """
@@ -294,7 +294,7 @@ def _posed(
 
 
 def _resampled(camera: Camera, boards: Poses, some: Observations, errors: Tensor) -> tuple[Poses, Tensor]:
-    """Poses (1, V) of errors (1, V, N), of which those that outliers spoilt are the best by handfuls of corners."""
+    """Return the poses (1, V), by samples of corners for views spoilt by outliers, and the errors (1, V, N)."""
     usual = errors[0].nanmedian(-1).values
     (bad,) = (usual > _BAD * usual.median().clamp(min=_LEAST_SCALE)).nonzero(as_tuple=True)
     if len(bad) == 0:
@@ -315,27 +315,27 @@ def _resampled(camera: Camera, boards: Poses, some: Observations, errors: Tensor
 
 
 def _rays(camera: Camera, some: Observations) -> tuple[Tensor, Tensor]:
-    """(B, V, N, 3) of the pixels for cameras (B,), and which there are of corners that were seen, bool (B, V, N)."""
+    """Return rays (B, V, N, 3) of the pixels for cameras (B,), and whether seen corners have them, bool (B, V, N)."""
     rays, has_ray = camera.unproject(some.pixels.flatten(0, 1).expand(len(camera.intrinsics), -1, -1))
     shape = len(rays), *some.seen.shape
     return rays.view(*shape, 3), has_ray.view(shape) & some.seen
 
 
 def _errors(camera: Camera, boards: Poses, some: Observations) -> Tensor:
-    """(B, V, N) px of as many cameras, or of one for all, NaN for what is not seen."""
+    """Return errors (B, V, N) in px for as many cameras, or for one, NaN if a corner is unseen."""
     points = boards.moved(some.points)
     pixels, valid = camera.project(points.reshape(len(camera.intrinsics), -1, 3))
     return _lengths(pixels.view(*points.shape[:-1], 2) - some.pixels, valid.view(points.shape[:-1]), some.seen)
 
 
 def _lengths(residuals: Tensor, valid: Tensor, seen: Tensor) -> Tensor:
-    """(B, V, N) px, NaN for what is not seen."""
+    """Return lengths (B, V, N) in px, NaN if a corner is unseen."""
     # components lie in planes, along which a norm would be slow
     return torch.where(seen, torch.where(valid, torch.hypot(*residuals.unbind(-1)), _NO_PIXEL), torch.nan)
 
 
 def _turned(lens: _Lens, some: Observations, errors: Tensor) -> _Lens:
-    """With the best pose of each view under a single camera: a plane has two that look alike; errors (1, V, N)."""
+    """Return a single camera with the best pose of each view: a plane has two similar ones; errors (1, V, N)."""
     camera = lens.camera
     old, errors = _resampled(camera, lens.boards, some, errors)
     rays, has_ray = (t[0] for t in _rays(camera, some))
@@ -357,13 +357,13 @@ def _turned(lens: _Lens, some: Observations, errors: Tensor) -> _Lens:
 
 
 def _refined(lens: _Lens, few: Observations, free: Free, loss: tuple[str | None, float]) -> _Lens:
-    """Cameras that explain best what was seen, the best first; those that are nearly as good."""
+    """Refine the cameras by a few steps, drop all but the nearly best, and refine the rest; the best comes first."""
     lens = lens.adjusted(few, free, _STEPS, _WORSE, loss)
     return lens if len(lens.parameters) == 1 else lens.adjusted(few, free, _MANY_STEPS, _LITTLE_WORSE, loss)
 
 
 def _fitted(lens: _Lens, few: Observations, model: type[Camera], count: int, fixed: Collection[str]) -> _Lens:
-    """Cameras (S,) of another model that see the corners, as the boards lie, where they were seen."""
+    """Fit cameras (S,) of another model to the corners, with the boards held."""
     camera = lens.camera
     slopes = views.focal_at_axis(camera)
     rays = torch.nn.functional.normalize(lens.boards.moved(few.points), dim=-1)

@@ -45,7 +45,7 @@ class Triangulation(NamedTuple):
 def triangulate(
     cameras: Sequence[Camera] | Camera, extrinsics: Sequence[Extrinsics] | Extrinsics, pixels: Numbers
 ) -> Triangulation:
-    """The points whose projections are nearest to pixels of C cameras: least squares in px, of each point by itself.
+    """Return points whose projections are nearest to pixels of C cameras: least squares in px for each point.
 
     Any camera models, rays of any angle. The start is the point nearest to the rays, the optimum the
     Levenberg-Marquardt method's.
@@ -97,7 +97,7 @@ def triangulate(
 
 
 def _listed(modules: Sequence[M] | M, name: str, kind: type[M], count: int) -> list[M]:
-    """Modules without batch dims, of a list, of a batch, or of one for all."""
+    """Return modules without batch dims, from a list, a batch, or one for all."""
     if isinstance(modules, kind):
         listed = [modules[i] for i in range(len(modules))] if modules.batch_shape else [modules] * count
     else:
@@ -121,7 +121,7 @@ class _Task(NamedTuple):
     seen: Tensor  # (C, P)
 
     def cost(self, points: Tensor) -> Tensor:
-        """(P,) half the sum of squares at points (P, 3)."""
+        """Return half the sum of squares (P,) at points (P, 3)."""
         total = torch.zeros_like(points[:, 0])
         for camera, rotation, translation, seen_at, seen in zip(*self, strict=True):
             pixels, valid = camera.project(points @ rotation.mT + translation)
@@ -131,7 +131,7 @@ class _Task(NamedTuple):
 
 @torch.no_grad()
 def _solved(task: _Task, rays: Tensor) -> tuple[Tensor, Tensor]:
-    """(P, 3): the points of least cost, and whether they are; rays: (C, P, 3) of the pixels."""
+    """Return the points of least cost (P, 3) and whether they are valid; rays: (C, P, 3) of the pixels."""
     rotations, translations, pixels = (t.detach() for t in task[1:4])
     seen, views = task.seen.to(pixels), task.seen.sum(0)
     positions, rays = -(rotations.mT @ translations[..., None])[..., 0], rays @ rotations
@@ -182,6 +182,6 @@ def _solved(task: _Task, rays: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _is_ahead(points: Tensor, positions: Tensor, rays: Tensor, seen: Tensor) -> Tensor:
-    """(P,): whether points lie ahead on the rays of all that see them."""
+    """Whether points lie ahead on the rays of all cameras that see them, (P,)."""
     along = ((points - positions[:, None]) * rays).sum(-1)
     return ((along > 0) | ~seen).all(0)

@@ -46,7 +46,7 @@ class Spread(NamedTuple):
         return deviations
 
     def of_pixels(self, pixels: Tensor, distance: Tensor) -> Tensor:
-        """(B, M, 2, 2) covariances, in px^2, of where points are seen that lie at pixels; NaN where one has no ray.
+        """Return covariances (B, M, 2, 2) in px^2 of the pixels at which points are seen; NaN if a pixel has no ray.
 
         Points go to the frame of every board by its pose, back by the pose that the noise made of it, and their mean is
         projected by the camera that the noise made: mrcal's mean-pcam. distance: (B, M) from the camera, or infinite.
@@ -65,12 +65,12 @@ class Spread(NamedTuple):
         return torch.where(known[..., None, None], moved @ moved.mT, torch.nan)
 
     def scaled(self, noise: Tensor) -> Spread:
-        """That of a noise of the corners (B,), px per coordinate, of what is that of 1."""
+        """Return the spread for corner noise (B,), px per coordinate, from the spread for noise of 1."""
         return self._replace(factor=self.factor * noise[:, None, None])
 
 
 def spread(adjusted: Adjusted, model: type[Camera], camera: int) -> Spread:
-    """That of one camera, by its number, at an optimum, where the corners' noise is 1 px per coordinate."""
+    """Return the spread of one camera, by its index, at an optimum, for corner noise of 1 px per coordinate."""
     equations, state = adjusted.equations, adjusted.state
     parameters, mounts = state.parameters[camera], state.mounts
     shared = shared_factor(equations)
@@ -108,7 +108,7 @@ def spread(adjusted: Adjusted, model: type[Camera], camera: int) -> Spread:
 
 
 def noise_under(loss: str | None, loss_scale: float, residuals: Tensor, seen: Tensor, free: float) -> Tensor:
-    """(*B,) px per coordinate: the noise that makes the covariance of a weighted problem that of its optimum.
+    """Return the noise (*B,), px per coordinate, at which a weighted problem has the covariance of its optimum.
 
     Without a loss it is sqrt(sum of squares / (2 N - free)). With weights w of the squares s of a robust loss it is
     sqrt(mean(w^2 s) mean(w)) / mean(w + s dw/ds), the scale of an M-estimator, which holds where outliers fall on all
@@ -127,7 +127,7 @@ def noise_under(loss: str | None, loss_scale: float, residuals: Tensor, seen: Te
 
 
 def shared_factor(equations: Equations) -> Tensor:
-    """(B, G, G) F, of which F F^T times the variance of the noise is the covariance, huge if open, of the shared."""
+    """Return F (B, G, G): F F^T times the noise's variance is the shared unknowns' covariance, huge if undetermined."""
     triangle: Tensor = equations.shared[:, :-1, :-1]
     if not triangle.shape[-1]:
         return triangle
@@ -142,7 +142,7 @@ def shared_factor(equations: Equations) -> Tensor:
 
 
 def worst(covariances: Tensor) -> Tensor:
-    """(..., 2, 2) -> (...): the standard deviation in the direction in which it is largest."""
+    """Return standard deviations (...) of covariances (..., 2, 2) in the direction in which they are largest."""
     a, b, c = covariances[..., 0, 0], covariances[..., 0, 1], covariances[..., 1, 1]
     return ((a + c) / 2 + torch.hypot((a - c) / 2, b)).clamp(min=0).sqrt()
 

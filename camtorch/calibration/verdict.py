@@ -114,7 +114,7 @@ class Calibration:
         return int((self.observations.seen & ~self.adjusted.valid[self.index][0]).sum())
 
     def uncertainty(self, pixels: Any, distance: float = math.inf) -> Tensor:
-        """How far the camera may be wrong about pixels, were it calibrated again from other images of such quality.
+        """Return the standard deviation of pixels if the camera were calibrated again from images of this quality.
 
         The standard deviation in the worst direction of where a point is seen, with the poses of the boards in their
         own uncertainty: mrcal's mean-pcam.
@@ -404,7 +404,7 @@ def _over_image(survey: _Survey) -> Iterator[str]:
 def check_determined(
     adjusted: Adjusted, camera: int, found: Spread, names: Sequence[str], sight: Sight, owner: str
 ) -> None:
-    """Raise a ValueError if the views of a camera leave it open, as those of boards that are all parallel do.
+    """Raise a ValueError if the views do not determine a camera, as with boards that are all parallel.
 
     It is open if corners that are wrong by a tenth of a pixel leave the projections of what was seen uncertain by a
     fiftieth of the extent of the corners. Views that no camera fits get warnings instead. found: of noise of 1 px.

@@ -36,7 +36,7 @@ def convert(
     tolerance: float,
     **options: Any,
 ) -> Conversion[CameraT]:
-    """See `Camera.convert`; models: all that there are, by key, some of which may relate the two."""
+    """Convert a camera; see `Camera.convert`. `models` has all models by key, some of which may relate the two."""
     owner = f"{type_before_parametrizations(source).__name__}.convert"
     image_size = as_image_size(image_size, owner) or source.image_size
     max_angle = None if max_angle is None else as_number(max_angle, "max_angle", owner)
@@ -103,7 +103,7 @@ class _Result(NamedTuple):
     exact: Tensor
 
     def replaced(self, rows: Tensor, other: _Result) -> _Result:
-        """With other results in the place of these rows."""
+        """Return the results with those of `other` at `rows`."""
         if len(rows) == 0:
             return self  # and as narrow as it was
         width = max(self.parameters.shape[-1], other.parameters.shape[-1])
@@ -116,13 +116,13 @@ class _Result(NamedTuple):
         return _Result(*(t[rows] for t in self))
 
     def padded(self, width: int) -> _Result:
-        """With parameters (C, width), zeros after those that there are."""
+        """Return the results with parameters (C, width), filled with zeros."""
         more = width - self.parameters.shape[-1]
         return self._replace(parameters=torch.nn.functional.pad(self.parameters, (0, more)))
 
 
 def _with_fewest_coefficients(task: _Task, counts: tuple[int, ...]) -> _Result:
-    """Each row with the first number of coefficients that keeps the tolerance; or, if none does, that is worth it."""
+    """Convert each row with the first of `counts` that keeps the tolerance, or else with the one that is worth it."""
     result = _converted(task, counts[0])
     for count in counts[1:]:
         rows = ((result.max_error > task.tolerance) & result.max_error.isfinite()).nonzero()[:, 0]

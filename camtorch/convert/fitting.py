@@ -38,7 +38,7 @@ class Observations(NamedTuple):
 def fit(
     camera: CameraLike, observations: Observations, starts: Tensor, slopes: Tensor, fixed: Tensor | None = None
 ) -> Tensor:
-    """The parameters (C, 4 + n) at which a camera sees the pixels of the rays as nearly as it can.
+    """Return the parameters (C, 4 + n) at which a camera sees rays nearest to their pixels.
 
     Rays that the camera's chart never covers do not count. No row depends on another.
 
@@ -80,7 +80,7 @@ def fit(
 def _fit_linear(
     camera: CameraLike, observations: Observations, slopes: Tensor, smooth: Tensor, fixed: Tensor | None
 ) -> Tensor:
-    """`fit` of a lens that is linear in its coefficients: at these focal lengths and pixels of the axis, at once."""
+    """Fit a lens that is linear in its coefficients in one step, at given focal lengths and pixels of the axis."""
     parameters = torch.cat((slopes, slopes.new_tensor(camera.ideal(smooth.shape[-1])).expand(len(slopes), -1)), -1)
     fixed = torch.full_like(parameters[0], torch.nan) if fixed is None else fixed
     free, parameters = fixed.isnan(), torch.where(fixed.isnan(), parameters, fixed)
@@ -96,7 +96,7 @@ def _fit_linear(
 
 
 def refine_minimax(camera: CameraLike, observations: Observations, parameters: Tensor) -> Tensor:
-    """Parameters (C, 4 + n) near those given at which the largest error is smaller; no row depends on another.
+    """Return parameters (C, 4 + n) near the given ones with a smaller largest error; no row depends on another.
 
     Lawson's algorithm: weighted least squares over and over, the weight of a square multiplied by its error each time.
     """
@@ -126,14 +126,14 @@ def refine_minimax(camera: CameraLike, observations: Observations, parameters: T
 
 
 def _distances(observations: Observations, camera: CameraLike, parameters: Tensor) -> Tensor:
-    """(C, N) pixels."""
+    """Return the distances (C, N) in pixels between projections and observations."""
     residuals = _residuals(observations, parameters, to_sensor(camera, parameters[:, 4:], observations.rays))
     distances: Tensor = torch.linalg.vector_norm(residuals, dim=1)
     return distances
 
 
 def bounds(camera: CameraLike, parameters: Tensor) -> tuple[Tensor, Tensor]:
-    """The least and the greatest parameters (C, 4 + n); a focal length stays within a factor of 1000."""
+    """Return the least and the greatest parameters (C, 4 + n); a focal length stays within a factor of 1000."""
     low, high = torch.full_like(parameters, -torch.inf), torch.full_like(parameters, torch.inf)
     low[:, :2], high[:, :2] = parameters[:, :2] * 1e-3, parameters[:, :2] * 1e3
     for i, name in enumerate(camera.distortion_names, 4):
@@ -143,14 +143,14 @@ def bounds(camera: CameraLike, parameters: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _residuals(observations: Observations, parameters: Tensor, seen: SensorPoints) -> Tensor:
-    """(C, 2, N) pixels."""
+    """Return the weighted residuals (C, 2, N) in pixels."""
     fx, fy, cx, cy = columns(parameters[:, :4])
     u, v = observations.pixels.unbind(-1)
     return torch.stack((fx * seen.a + cx - u, fy * seen.b + cy - v), 1) * observations.weights[:, None]
 
 
 def _cost(camera: CameraLike, observations: Observations, parameters: Tensor) -> Tensor:
-    """(C,) the sum of squares; infinite where a ray that counts is not covered, or the coefficients make no camera."""
+    """Return the sums of squares (C,); infinite if a weighted ray is not covered or the coefficients make no camera."""
     seen = to_sensor(camera, parameters[:, 4:], observations.rays)
     lost = (~seen.covered & (observations.weights > 0)).any(-1)
     cost = _residuals(observations, parameters, seen).square().sum((1, 2))
@@ -202,7 +202,7 @@ def _refine(
     steps: int = _MOST_STEPS,
     damping: float = FIRST_DAMPING,
 ) -> Tensor:
-    """The parameters (C, P) of least cost near those given, of the rows that are `going`."""
+    """Return the parameters (C, P) of least cost near the given ones, for rows that are `going`."""
     tiny, problem = _NOTHING**2 * observations.weights.sum(-1), _Fit(camera, observations, low, high)
     found = minimise(problem, (parameters,), tolerance=_SETTLED, tiny=tiny, going=going, steps=steps, damping=damping)
     return found.state[0]

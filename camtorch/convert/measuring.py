@@ -38,7 +38,7 @@ class Reference(NamedTuple):
 
 
 def reference(camera: CameraLike, image_size: tuple[int, int] | None, limit: float) -> Reference:
-    """The rays of cameras (C,); those count that are up to an angle from the axis."""
+    """Return the rays of cameras (C,); rays up to `limit` radians from the axis count."""
     lattice = views.lattice(camera, image_size, _SIDE, limit)
     rays = lattice.sampled(camera, lattice.nodes())
     all_rays = rays if limit == math.pi else views.sample(camera, image_size, _SIDE, math.pi)

@@ -18,7 +18,7 @@ _MANY = 33
 
 
 def default_count(model: Model, source: CameraLike, models: Models) -> int:
-    """How many coefficients the model takes to hold those of a related camera, and its own number at least."""
+    """Return the number of coefficients that holds those of a related camera, at least the model's default."""
     if isinstance(source, model):
         return len(source.distortion_names)
     if (steps := _path(type(source), model, models)) is None:
@@ -32,7 +32,7 @@ def default_count(model: Model, source: CameraLike, models: Models) -> int:
 def carry_over(
     source: CameraLike, values: Tensor, model: Model, names: tuple[str, ...], models: Models
 ) -> tuple[Tensor, Tensor] | None:
-    """The coefficients (C, n) of a camera as those of a related model, and whether nothing is lost; or None."""
+    """Return coefficients (C, n) as those of a related model, and whether nothing is lost; None if unrelated."""
     if (steps := _path(type(source), model, models)) is None:
         return None
     result = values.new_tensor(model.ideal(len(names))).repeat(len(values), 1)
@@ -46,7 +46,7 @@ def carry_over(
 
 
 def _path(start: Model, end: Model, models: Models) -> list[Step] | None:
-    """The shortest way from a model to a related one."""
+    """Return the shortest path from a model to a related one, None if there is none."""
     queue: deque[tuple[Model, list[Step]]] = deque([(start, [])])
     seen = {start}
     while queue:
@@ -70,7 +70,7 @@ def _neighbours(model: Model, models: Models) -> Iterator[Step]:
 
 
 def _renamed(name: str, steps: list[Step]) -> str | None:
-    """What a coefficient is called at the end of the way; None where it is lost on it."""
+    """Return the name of a coefficient at the end of the path; None if it is lost."""
     for _, names in steps:
         if name not in names:
             return None
@@ -79,7 +79,7 @@ def _renamed(name: str, steps: list[Step]) -> str | None:
 
 
 def _ideal_value(source: CameraLike, name: str, steps: list[Step]) -> float:
-    """The value at which the coefficient may be lost: the ideal one of the last model that has it."""
+    """Return the value at which the coefficient may be lost: the ideal one of the last model that has it."""
     model, known = type(source), source.distortion_names
     for later, names in steps:
         if name not in names:
@@ -89,5 +89,5 @@ def _ideal_value(source: CameraLike, name: str, steps: list[Step]) -> float:
 
 
 def _all_names(model: Model) -> tuple[str, ...]:
-    """The names of as many coefficients as the model takes, or of many."""
+    """Return the names of as many coefficients as the model takes, fewer than `_MANY`."""
     return max((names for names in map(model.names_of, range(_MANY)) if names is not None), key=len, default=())

@@ -50,16 +50,16 @@ class Lattice(NamedTuple):
         return self._replace(low=self.low[rows], high=self.high[rows])
 
     def nodes(self) -> Tensor:
-        """(C, side^2, 2)."""
+        """Return the nodes (C, side^2, 2)."""
         return lattices.pixel_lattice(self.low, self.high, self.side, self.side).flatten(1, 2)
 
     def between(self, places: Tensor) -> Tensor:
-        """Places (C, N, 2), brought back to where the lattice ends; azimuths go round."""
+        """Clamp places (C, N, 2) to the lattice; azimuths are not clamped."""
         inside = places.clamp(self.low[:, None], self.high[:, None])
         return inside if self.are_pixels else torch.stack((inside[..., 0], places[..., 1]), -1)
 
     def sampled(self, camera: CameraLike, places: Tensor) -> SampledRays:
-        """The rays of a camera at places (C, N, 2)."""
+        """Return the rays of a camera at places (C, N, 2)."""
         if self.are_pixels:
             rays, found = camera.unproject(places)
         else:
@@ -70,7 +70,7 @@ class Lattice(NamedTuple):
 
 
 def lattice(camera: CameraLike, image_size: tuple[int, int] | None, side: int, limit: float) -> Lattice:
-    """Over the part of the image that an angle leaves, its edges included; without an image, over all directions."""
+    """Return a lattice over the image up to the angle `limit`, edges included; over all directions without an image."""
     count = len(camera.intrinsics)
     if image_size is None:
         most = _reach(camera, limit)
@@ -89,13 +89,13 @@ def lattice(camera: CameraLike, image_size: tuple[int, int] | None, side: int, l
 
 
 def sample(camera: CameraLike, image_size: tuple[int, int] | None, side: int, limit: float) -> SampledRays:
-    """side^2 rays on the image, or in all directions, of which those count that the camera has up to an angle."""
+    """Return side^2 rays on the image or in all directions; those that the camera has up to `limit` are valid."""
     nodes = lattice(camera, image_size, side, limit)
     return nodes.sampled(camera, nodes.nodes())
 
 
 def sample_with_rings(camera: CameraLike, image_size: tuple[int, int] | None, side: int, limit: float) -> SampledRays:
-    """`sample`, and rays on circles around the axis, over which the errors of a radial lens change."""
+    """Return `sample` and rays on circles around the axis, along whose radii the errors of a radial lens change."""
     whole = sample(camera, image_size, side, limit)
     reach = torch.where(whole.valid, whole.angles, 0.0).amax(-1, keepdim=True)
     rings = seen(camera, image_size, lattices.ray_fan(reach * torch.linspace(0, 1, _RADII, **_like(camera)), _AZIMUTHS))
@@ -103,7 +103,7 @@ def sample_with_rings(camera: CameraLike, image_size: tuple[int, int] | None, si
 
 
 def seen(camera: CameraLike, image_size: tuple[int, int] | None, fan: Tensor) -> SampledRays:
-    """Rays (C, A, N, 3), of which those count that are on the image."""
+    """Return the rays (C, A * N, 3) of a fan (C, A, N, 3); those on the image are valid."""
     rays = fan.flatten(1, 2)
     pixels, valid = camera.project(rays)
     if image_size is not None:
@@ -113,7 +113,7 @@ def seen(camera: CameraLike, image_size: tuple[int, int] | None, fan: Tensor) ->
 
 
 def _reach(camera: CameraLike, limit: float) -> Tensor:
-    """(C, 1): the angle up to which a camera has rays on some azimuth."""
+    """Return the angle (C, 1) up to which a camera has rays on some azimuth."""
     azimuths = (torch.arange(_AZIMUTHS).to(camera.intrinsics) + 0.25) * (2 * math.pi / _AZIMUTHS)
 
     def covers(rays: Tensor) -> Tensor:
@@ -124,7 +124,7 @@ def _reach(camera: CameraLike, limit: float) -> Tensor:
 
 
 def focal_at_axis(camera: CameraLike) -> Tensor:
-    """(C, 4): the focal lengths at the axis, and the pixel of the axis."""
+    """Return the focal lengths at the axis and the pixel of the axis, (C, 4)."""
     stated = camera.intrinsics
     fair = torch.isfinite(stated).all(-1) & (stated[:, :2] > 0).all(-1)
     stated = torch.where(fair[:, None], stated, stated.new_tensor([1.0, 1, 0, 0]))
@@ -132,7 +132,7 @@ def focal_at_axis(camera: CameraLike) -> Tensor:
 
 
 def radii(camera: CameraLike, slopes: Tensor, reach: Tensor) -> tuple[Tensor, Tensor]:
-    """Angles and radii as `Camera.fit_start` gets them; reach: (C,) the last angle, 0 where nothing is seen."""
+    """Return angles and radii for `Camera.fit_start`; reach: (C,) the last angle, 0 if nothing is seen."""
     steps = torch.arange(1, _RADII + 1, **_like(camera)) / _RADII
     angles = torch.where(reach > 0, reach, 1.0)[:, None] * steps
     pixels, valid = camera.project(lattices.ray_fan(angles, _AZIMUTHS))

@@ -69,7 +69,7 @@ class System:
         return view.square().sum((-1, -2)) + torch.where(firm, along, 0.0).square().sum(-1)
 
     def step(self, damping: Tensor) -> tuple[tuple[Tensor, Tensor], Tensor]:
-        """Of the views (R, V, L), and of what they share (R, G); and by how much the linear problem's cost falls."""
+        """Return steps of the views (R, V, L) and of shared unknowns (R, G), and the linear cost's decrease (R,)."""
         view, shared, width = self.equations.view, self.equations.shared, self.width
         if library() is not None and shared.is_cpu and shared.dtype == torch.float64 and shared.shape[-1] <= _FEW:
             return self._compiled_step(damping)
@@ -122,7 +122,7 @@ class System:
         return (of_views, whole), self.decrement - rest
 
     def _left(self, of_views: Tensor, whole: Tensor) -> Tensor:
-        """(R,) what of the decrement a step leaves."""
+        """Return the part (R,) of the decrement that remains after a step."""
         view, shared = self.equations.view, self.equations.shared[:, :-1]
         steps = torch.cat((of_views, whole[:, None].expand(-1, view.shape[1], -1)), -1)
         mine = (view[..., :-1] @ steps[..., None])[..., 0]
@@ -131,7 +131,7 @@ class System:
 
 
 def triangle_of_few(rows: Tensor) -> Tensor:
-    """(..., L, L + 1): a triangle of rows (..., M, L + 1), of few columns that are well apart."""
+    """Return a triangle (..., L, L + 1) of rows (..., M, L + 1) with few columns that are well apart."""
     products = rows.mT @ rows
     squares, right = products[..., :-1, :-1], products[..., :-1, -1:]
     scale = squares.diagonal(dim1=-2, dim2=-1)
@@ -145,7 +145,7 @@ def triangle_of_few(rows: Tensor) -> Tensor:
 
 
 def _solved(triangle: Tensor, right: Tensor) -> Tensor:
-    """Where the triangle is zero, nothing."""
+    """Solve the triangular system; unknowns with a zero on the diagonal are zero."""
     empty = triangle.diagonal(dim1=-2, dim2=-1) == 0
     triangle = triangle + torch.diag_embed(empty.to(triangle.dtype))
     solution: Tensor = torch.linalg.solve_triangular(triangle, torch.where(empty[..., None], 0.0, right), upper=True)
@@ -153,6 +153,6 @@ def _solved(triangle: Tensor, right: Tensor) -> Tensor:
 
 
 def padded(rows: Tensor) -> Tensor:
-    """Rows (..., M, K), at least K of them."""
+    """Pad rows (..., M, K) with zeros to at least K rows."""
     missing = rows.shape[-1] - rows.shape[-2]
     return torch.nn.functional.pad(rows, (0, 0, 0, missing)) if missing > 0 else rows

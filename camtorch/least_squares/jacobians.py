@@ -34,7 +34,7 @@ class SensorJacobians(NamedTuple):
 
 
 def to_sensor(camera: CameraLike | type[CameraLike], k: Tensor, rays: Tensor) -> SensorPoints:
-    """Rays (C, N, 3) through the chart and the lens of coefficients (C, n), whether or not they lie before a fold."""
+    """Map rays (C, N, 3) through the chart and the lens of coefficients (C, n), also beyond a fold."""
     return _to_sensor(camera, columns(k), rays.unbind(-1), FURTHEST)
 
 
@@ -58,7 +58,7 @@ def _to_sensor(
 def sensor_jacobians(
     camera: CameraLike | type[CameraLike], k: Tensor, rays: Tensor, furthest: float = FURTHEST
 ) -> SensorJacobians:
-    """`to_sensor` with its exact derivatives by the rays (C, N, 3), at their length, and the coefficients (C, n)."""
+    """Return `to_sensor` with exact derivatives by rays (C, N, 3), at their length, and by coefficients (C, n)."""
     chart, _ = camera.optics(columns(k))
     # a table for each point would be dear: where the other direction is searched, derivatives go forward
     jacobians = (_forward if isinstance(chart, Inverted) else _backward)(camera, k, rays, furthest)
@@ -68,7 +68,7 @@ def sensor_jacobians(
 
 
 def _backward(camera: CameraLike | type[CameraLike], k: Tensor, rays: Tensor, furthest: float) -> SensorJacobians:
-    """Twice backward, whatever the number of coefficients, of which each point has its own."""
+    """Differentiate backward, two passes for any number of coefficients; each point has its own copy of these."""
     with torch.inference_mode(False), torch.enable_grad():
         shape = rays.shape[:-1]
         # contiguous planes, or torch's operations take several times as long; copies, or they stay those of inference
@@ -90,7 +90,7 @@ def _copied(plane: Tensor) -> Tensor:
 
 
 def _forward(camera: CameraLike | type[CameraLike], k: Tensor, rays: Tensor, furthest: float) -> SensorJacobians:
-    """Once forward, on a row more for each direction: vmap would take Python's word for many operations."""
+    """Differentiate forward in one pass, with a row for each direction: vmap is slow in Python for many operations."""
     count = k.shape[-1] + 3
     directions = torch.eye(count, dtype=k.dtype, device=k.device)
     # under inference mode there would be no derivatives

@@ -23,15 +23,15 @@ class Problem(Protocol):
     rounding: Tensor  # (B,) the sums of squares of what rounding does to the residuals, see `rounding_of`
 
     def cost(self, state: State, rows: Tensor) -> Tensor:
-        """(R,); infinite where a state cannot be."""
+        """Return the costs (R,); infinite if a state is impossible."""
         ...
 
     def linearised(self, state: State, rows: Tensor) -> System:
-        """At a state of finite cost."""
+        """Return the linearised problem at a state of finite cost."""
         ...
 
     def moved(self, state: State, step: State, rows: Tensor) -> State:
-        """The state a step further."""
+        """Return the state after a step."""
         ...
 
 
@@ -44,7 +44,7 @@ class Minimum(NamedTuple):
 
 
 def rounding_of(pixels: Tensor, weights: Tensor) -> Tensor:
-    """(B,) the weighted sums of squares of the rounding of pixels: eps of the dtype times the largest coordinate.
+    """Return the weighted sums of squares (B,) of the rounding of pixels: dtype's eps times the largest coordinate.
 
     The projections of all models are rounded by 0.2 to 0.4 of that, root mean square. weights: (B, ...) of the squares.
     """
@@ -64,7 +64,7 @@ def minimise(
     damping: float = FIRST_DAMPING,
     progress: Callable[[int, Tensor], None] | None = None,
 ) -> Minimum:
-    """The states of least cost near those given; no problem depends on another.
+    """Return the states of least cost near the given ones; no problem depends on another.
 
     A step that promises less than rounding does to a cost cannot be judged by the cost: it is the last one, and taken
     unless the cost grows by more than that.

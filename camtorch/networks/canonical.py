@@ -83,7 +83,7 @@ class CanonicalCamera(SampleTransform):
         self.image_size = as_image_size(image_size, self._name)
 
     def scale(self, camera: Camera) -> Tensor:
-        """(*B,): s of cameras (*B), `focal` by their focal length. Its gradients go to fx and fy."""
+        """Return s (*B,) for cameras (*B): `focal` divided by their focal length. Its gradients go to fx and fy."""
         if not isinstance(camera, Camera):
             raise TypeError(f"{self._name}.scale: camera must be a Camera; got {no_camera(camera)}")
         if isinstance(camera, Mixed):
@@ -95,7 +95,7 @@ class CanonicalCamera(SampleTransform):
 
     @on_samples
     def forward(self, sample: Mapping[str, Any] | None = None, **fields: Any) -> Sample:
-        """Make a sample canonical, a dict or keyword arguments, single or a batch.
+        """Make a sample canonical: a dict or keyword arguments, single or a batch.
 
         Raises:
             ValueError: no camera, images that would come out in several sizes, depth in whole numbers; and as
@@ -115,7 +115,7 @@ class CanonicalCamera(SampleTransform):
 
     @on_samples
     def inverse(self, sample: Mapping[str, Any] | None = None, **fields: Any) -> Sample:
-        """Undo it, of a sample as it came out, or of what was predicted of one.
+        """Undo the forward call for a sample that it returned, or for predictions made from one.
 
         The sample has the `camera` of the images; with "image" instead the `source_camera` as it came out.
 
@@ -142,7 +142,7 @@ class CanonicalCamera(SampleTransform):
         def __call__(self, *args: Any, **options: Any) -> Any: ...
 
     def _scaled(self, sample: Sample, named: Named, batched: bool, scale: Tensor) -> Sample:
-        """The sample with every length of the camera's frame times a factor (B,)."""
+        """Return the sample with every length of the camera's frame multiplied by `scale` (B,)."""
         moved = dict(sample)
         for name, (found, value) in named.items():
             if isinstance(value, list):
@@ -153,7 +153,7 @@ class CanonicalCamera(SampleTransform):
         return moved
 
     def _lengths(self, found: str, value: Tensor, scale: Tensor, name: str) -> Tensor:
-        """Values (*B, ...) of a kind with all lengths in them times (*B)."""
+        """Return `value` (*B, ...) of the kind `found`, with all its lengths multiplied by `scale` (*B)."""
         poses = found in ("head_pose", "pose")
         if not poses and found not in _LENGTHS and (found != "landmarks" or value.shape[-1] != 3):
             return value
@@ -198,6 +198,6 @@ class CanonicalCamera(SampleTransform):
         return by_kinds(count, camera, part)
 
     def extra_repr(self) -> str:
-        """The focal length, what is scaled, and the size of images."""
+        """Return the focal length, the scaled quantity and the size of images in words."""
         size = "" if self.image_size is None else f", image_size={self.image_size}"
         return f"focal={self.focal:g}, scales={self.scales!r}{size}"

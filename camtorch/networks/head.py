@@ -141,7 +141,7 @@ class CameraHead(GeometryModule):
         return self.camera(self._discs.new_zeros(len(self.names), dtype=self.linear.weight.dtype))
 
     def forward(self, features: Tensor) -> Camera:
-        """The cameras (*B) of features (*B, features)."""
+        """Return cameras (*B) for features (*B, features)."""
         features = as_coordinates(features, "features", self.linear.in_features, type(self).__name__, form="*B")
         device = features.device.type
         with torch.autocast(device, enabled=False) if torch.amp.is_autocast_available(device) else nullcontext():
@@ -153,8 +153,9 @@ class CameraHead(GeometryModule):
         def __call__(self, *args: Any, **options: Any) -> Any: ...
 
     def camera(self, numbers: Tensor) -> Camera:
-        """The cameras (*B) of numbers (*B, n), in the order of `names`: for a layer of one's own in the place of
-        the linear one. Beyond a million numbers are a million; what is NaN makes a camera without valid points.
+        """Return cameras (*B) for numbers (*B, n) in the order of `names`, for use with a layer of your own.
+
+        Numbers are clamped to a million either way; NaN makes a camera without valid points.
         """
         owner = f"{type(self).__name__}.camera"
         means = f", {', '.join(self.names)}"
@@ -186,7 +187,7 @@ class CameraHead(GeometryModule):
         return camera.requires_grad_(False) if isinstance(camera.intrinsics, nn.Parameter) else camera
 
     def _moves(self, limits: Limits, numbers: Tensor, disc: Tensor) -> Tensor:
-        """(R, n): what is added to the coefficients given, for numbers (R, free) and logarithms (R, 1) of discs."""
+        """Return offsets (R, n) from the given coefficients for numbers (R, free) and logarithms (R, 1) of discs."""
         none = numbers.new_zeros(len(numbers), len(limits.given))
         if not self._coefficients:
             return none
@@ -204,10 +205,10 @@ class CameraHead(GeometryModule):
         return self.model.__name__
 
     def extra_repr(self) -> str:
-        """The model, the images and the names of the numbers."""
+        """Return the model, the image size and the names of the numbers in words."""
         return f"{self.model.__name__}, image_size={self.image_size}, numbers=({' '.join(self.names)})"
 
 
 def _bounded(x: Tensor) -> Tensor:
-    """From -1 to 1: like x near zero, with gradients that fade with the third power."""
+    """Map x to -1 to 1: like x near zero, with gradients that fade with the third power."""
     return x * torch.rsqrt(1 + x * x)

@@ -25,7 +25,7 @@ __all__ = ["angles", "rays", "reprojection"]
 
 
 def angles(first: Tensor, second: Tensor) -> Tensor:
-    """(...) radians between directions (..., 3), from 0 to pi; exact to rounding for the smallest and the largest.
+    """Return the angles (...) in radians between directions (..., 3), from 0 to pi, exact to rounding at both ends.
 
     Its gradient has length 1, and is zero where it has none: between equal directions and between opposite ones. acos
     of the dot product is off by 3e-4 in float32, and its gradient is infinite there. Source: Kahan, "How futile are
@@ -73,7 +73,7 @@ def rays(
     weights: Numbers | None = None,
     reduction: Literal["mean", "none"] = "mean",
 ) -> Tensor | tuple[Tensor, Tensor]:
-    """The angles between the rays that two cameras have for the same pixels of their images.
+    """Return the angles between the rays that two cameras have for the same pixels of their images.
 
     It compares cameras of any models, whatever their numbers mean, and weighs focal length, principal point and
     distortion by what they do: in radians.
@@ -136,7 +136,7 @@ def reprojection(
     weights: Numbers | None = None,
     reduction: Literal["mean", "none"] = "mean",
 ) -> Tensor | tuple[Tensor, Tensor]:
-    """How far from where they are a camera sees points, in pixels.
+    """Return the distances in pixels between points as the predicted camera sees them and as the target does.
 
     Points that the predicted camera does not see at all do not count, and so do not pull it: `rays` does, over the
     whole image.
@@ -184,7 +184,7 @@ def reprojection(
 
 
 def _check(predicted: Camera, target: Camera, owner: str) -> torch.Size:
-    """The batch dims of two cameras."""
+    """Return the batch dims of two cameras after checking their types and shapes."""
     for camera, name in ((predicted, "predicted"), (target, "target")):
         if not isinstance(camera, Camera):
             raise TypeError(f"{owner}: {name} must be a Camera; got {no_camera(camera)}")
@@ -201,7 +201,7 @@ def _check(predicted: Camera, target: Camera, owner: str) -> torch.Size:
 def _places(
     predicted: Camera, target: Camera, samples: int | tuple[int, int], batch: Sequence[int], owner: str
 ) -> Tensor:
-    """(*B, rows, columns, 2): the middles of equal parts of the image."""
+    """Return the middles (*B, rows, columns, 2) of equal parts of the image."""
     sizes = {camera.image_size for camera in (predicted, target) if camera.image_size is not None}
     if len(sizes) != 1:
         what = f"of {' and '.join(map(str, sorted(sizes)))}" if sizes else "without an image_size"

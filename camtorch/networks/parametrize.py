@@ -15,11 +15,11 @@ class PositiveFocal(nn.Module):
     """
 
     def forward(self, unconstrained: Tensor) -> Tensor:
-        """(*B, 4) log fx, log fy, cx, cy -> (*B, 4) intrinsics."""
+        """Return intrinsics (*B, 4) for (*B, 4) log fx, log fy, cx, cy."""
         return torch.cat((unconstrained[..., :2].exp(), unconstrained[..., 2:]), -1)
 
     def right_inverse(self, intrinsics: Tensor) -> Tensor:
-        """What the intrinsics (*B, 4) are made of."""
+        """Return log fx, log fy, cx, cy (*B, 4) for intrinsics (*B, 4)."""
         return torch.cat((intrinsics[..., :2].log(), intrinsics[..., 2:]), -1)
 
 
@@ -30,10 +30,10 @@ class TiedFocal(nn.Module):
     """
 
     def forward(self, unconstrained: Tensor) -> Tensor:
-        """(*B, 3) log f, cx, cy -> (*B, 4) intrinsics."""
+        """Return intrinsics (*B, 4) for (*B, 3) log f, cx, cy."""
         focal = unconstrained[..., :1].exp()
         return torch.cat((focal, focal, unconstrained[..., 1:]), -1)
 
     def right_inverse(self, intrinsics: Tensor) -> Tensor:
-        """What intrinsics (*B, 4) of square pixels are made of."""
+        """Return log f, cx, cy (*B, 3) for intrinsics (*B, 4) of square pixels."""
         return torch.cat((intrinsics[..., :2].log().mean(-1, keepdim=True), intrinsics[..., 2:]), -1)

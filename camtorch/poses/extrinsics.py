@@ -83,7 +83,7 @@ class Extrinsics(BatchedModule):
         return broadcast_shapes(self.rotation.shape, self.translation.shape)[:-1]
 
     def forward(self, points_world: Numbers) -> Tensor:
-        """World points (*B, *N, 3) to the camera frame, same shape."""
+        """Move world points (*B, *N, 3) to the camera frame, same shape."""
         parameters = (self.rotation, self.translation)
         rows, lead, restore = as_rows(points_world, "points_world", self.batch_shape, parameters, "Extrinsics")
         rotation, translation = (t.expand(*lead, 3).reshape(-1, 3) for t in parameters)
@@ -96,7 +96,7 @@ class Extrinsics(BatchedModule):
         def __call__(self, *args: Any, **options: Any) -> Any: ...
 
     def matrix(self) -> Tensor:
-        """The (*B, 4, 4) matrix [[R, t], [0, 1]]."""
+        """Return the matrices (*B, 4, 4) [[R, t], [0, 1]]."""
         rotation, translation = (t.expand(*self.batch_shape, 3) for t in (self.rotation, self.translation))
         top = torch.cat((rotation_matrix(rotation), translation.unsqueeze(-1)), -1)
         bottom = top.new_tensor([[0.0, 0.0, 0.0, 1.0]]).expand(*self.batch_shape, 1, 4)
@@ -104,7 +104,7 @@ class Extrinsics(BatchedModule):
 
     @classmethod
     def from_matrix(cls, matrix: Numbers | tuple[Numbers, Numbers], translation: Numbers | None = None) -> Extrinsics:
-        """From matrices.
+        """Make poses from matrices.
 
         Args:
             matrix: (*B, 4, 4) or (*B, 3, 4) matrices [[R, t], ...]; or R, (*B, 3, 3), beside a translation; or both
@@ -140,7 +140,7 @@ class Extrinsics(BatchedModule):
 
     @classmethod
     def from_dict(cls, d: Mapping[str, Any]) -> Extrinsics:
-        """Return the frozen pose of a dict as `to_dict` makes it.
+        """Return the frozen pose described by a dict from `to_dict`.
 
         Raises:
             ValueError: If a key is missing, unknown or has a wrong value.
@@ -148,13 +148,13 @@ class Extrinsics(BatchedModule):
         return cast("Extrinsics", importlib.import_module("camtorch.io.camtorch_json").made_of(cls, d))
 
     def inverse(self) -> Extrinsics:
-        """World from camera."""
+        """Return the inverse pose: world from camera."""
         # what learnt may be of any length
         rotation = -self.rotation.expand(*self.batch_shape, 3)
         return learning_as(remade(self, rotation=rotation, translation=self.position), self)
 
     def compose(self, other: Extrinsics) -> Extrinsics:
-        """First `other`, then this: `a.compose(b)(p) == a(b(p))`."""
+        """Return the pose that applies `other` first, then this one: `a.compose(b)(p) == a(b(p))`."""
         if not isinstance(other, Extrinsics):
             raise TypeError(f"Extrinsics: compose takes Extrinsics; got {type(other).__name__}")
         check_devices("Extrinsics", this=self.rotation, other=other.rotation)
@@ -172,7 +172,7 @@ class Extrinsics(BatchedModule):
         return -turned_back.squeeze(-1).movedim(0, -1)
 
     def extra_repr(self) -> str:
-        """Batch, or the numbers of a single pose."""
+        """Return the batch shape, or the numbers of a single pose, in words."""
         rotation, translation = values_of(self.rotation), values_of(self.translation)
         if self.batch_shape or rotation is None or translation is None:
             return f"batch_shape={tuple(self.batch_shape)}"
@@ -180,7 +180,7 @@ class Extrinsics(BatchedModule):
 
 
 def head_angles(pose: Extrinsics | Numbers) -> Tensor:
-    """Pitch, yaw and roll (..., 3) in radians of heads that a camera sees.
+    """Return pitch, yaw and roll (..., 3) in radians for heads that a camera sees.
 
     The head's frame has x to the image's right, y down and z away from the camera when the head faces it, so that the
     identity faces the camera. R = Ry(yaw) Rx(-pitch) Rz(roll), right-handed turns about the camera's axes: the nose
@@ -221,7 +221,7 @@ def head_angles(pose: Extrinsics | Numbers) -> Tensor:
 
 
 def head_rotation(angles: Numbers) -> Tensor:
-    """Rotations (..., 3, 3), camera from head, of pitch, yaw and roll (..., 3) in radians: `head_angles` the other way.
+    """Return rotations (..., 3, 3), camera from head, for pitch, yaw and roll (..., 3) in radians: undo `head_angles`.
 
     Raises:
         TypeError: no numbers. ValueError: another shape, plain angles of more than a turn, which are degrees.
@@ -258,7 +258,7 @@ def _are_matrices(rotation: Tensor, translation: Tensor) -> bool:
 
 
 def _pair(matrix: Any) -> tuple[Any, Any]:
-    """(R, t) of such a pair, or what else it is, a list of two matrices too, and None."""
+    """Return (R, t) if `matrix` is such a pair; otherwise, also for a list of two matrices, return it and None."""
     if not isinstance(matrix, (list, tuple)) or len(matrix) != 2:
         return matrix, None
     try:

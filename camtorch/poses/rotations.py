@@ -28,7 +28,7 @@ def rotation_matrix(rotation: Tensor) -> Tensor:
 
 
 def small_turn(rotation: Tensor) -> Tensor:
-    """(*B, 3, 3) rotations of rotation vectors (*B, 3) by Cayley's formula: quick, and right to second order."""
+    """Return rotations (*B, 3, 3) for rotation vectors (*B, 3) by Cayley's formula: fast, correct to second order."""
     half = rotation / 2
     skew = skew_matrix(half)
     eye = torch.eye(3, dtype=half.dtype, device=half.device)
@@ -36,14 +36,14 @@ def small_turn(rotation: Tensor) -> Tensor:
 
 
 def skew_matrix(vectors: Tensor) -> Tensor:
-    """(*B, 3, 3) that take x to v x of vectors v (*B, 3): the cross product."""
+    """Return the matrices (*B, 3, 3) that map x to the cross product v x, for vectors v (*B, 3)."""
     eye = torch.eye(3, dtype=vectors.dtype, device=vectors.device)
     matrix: Tensor = torch.linalg.cross(vectors[..., None, :], eye.expand(*vectors.shape, 3)).mT
     return matrix
 
 
 def nearest_rotation(matrices: Tensor) -> Tensor:
-    """(*B, 3, 3) rotations R of the greatest trace of R^T M, by Kabsch's method: the nearest to M by least squares."""
+    """Return the rotations R (*B, 3, 3) nearest to M by least squares: Kabsch's method, largest trace of R^T M."""
     u, _, v = torch.linalg.svd(matrices)
     last = u[..., 2:] * torch.linalg.det(u @ v)[..., None, None]
     rotations: Tensor = torch.cat((u[..., :2], last), -1) @ v
@@ -67,14 +67,14 @@ def rotation_vector(matrix: Tensor) -> Tensor:
 
 
 def quaternion_vector(quaternion: Tensor) -> Tensor:
-    """(*B, 4) quaternions w, x, y, z of any length to (*B, 3) rotation vectors with an angle up to pi."""
+    """Return rotation vectors (*B, 3), angle up to pi, for quaternions w, x, y, z (*B, 4) of any length."""
     w, vector = quaternion[..., :1], quaternion[..., 1:]
     half = angle_per_radius((vector * vector).sum(-1, keepdim=True), w.abs())
     return torch.where(w < 0, -2 * half, 2 * half) * vector
 
 
 def vector_quaternion(rotation: Tensor) -> Tensor:
-    """(*B, 3) rotation vectors to (*B, 4) unit quaternions w, x, y, z."""
+    """Return unit quaternions w, x, y, z (*B, 4) for rotation vectors (*B, 3)."""
     half = rotation / 2
     angle2 = (half * half).sum(-1, keepdim=True)
     return torch.cat((cos_root(angle2), sinc_root(angle2) * half), -1)
@@ -106,19 +106,19 @@ def check_rotation(matrix: Tensor, name: str, owner: str, hint: str = "") -> Non
 
 
 def are_rotations(matrix: Tensor) -> Tensor:
-    """(*B) bool: which of (*B, 3, 3) are rotations, as precisely as files, or their own dtype, store them."""
+    """Whether (*B, 3, 3) are rotations, (*B) bool, as precisely as files, or their own dtype, store them."""
     values, precision = matrix.detach().double(), 4 * torch.finfo(matrix.dtype).eps
     proper: Tensor = torch.linalg.det(values) > 0
     return (rotation_error(values) < max(_NEARLY, precision)) & proper
 
 
 def rotation_error(values: Tensor) -> Tensor:
-    """(*B,): by how much R R^T of (*B, 3, 3) misses the identity."""
+    """Return the deviation (*B,) of R R^T from the identity for matrices (*B, 3, 3)."""
     return (values @ values.mT - torch.eye(3, dtype=values.dtype, device=values.device)).abs().amax((-1, -2))
 
 
 def as_rotation(rotation: Numbers | None, owner: str) -> Tensor | None:
-    """A checked rotation of a warp, (3, 3) or (B, 3, 3), or None."""
+    """Return the checked rotation of a warp, (3, 3) or (B, 3, 3), or None."""
     if rotation is None:
         return None
     if type(rotation) is Tensor and rotation.shape == (3, 3) and is_right(rotation):
@@ -153,7 +153,7 @@ def turn(rotation: Tensor | None, rays: Tensor, name: str) -> Tensor:
 
 
 def mount_rotation(yaw: Tensor, pitch: Tensor, roll: Tensor) -> Tensor:
-    """(*B, 3, 3), `ray_after = R ray_before`, of a camera that turns right, then looks up, then leans right.
+    """Return rotations (*B, 3, 3) of a camera that turns right, then up, then leans right: `ray_after = R ray_before`.
 
     The angles of heads, in radians and of another order, are those of `ct.head_rotation`.
 
@@ -175,7 +175,7 @@ def mount_rotation(yaw: Tensor, pitch: Tensor, roll: Tensor) -> Tensor:
 
 
 def mount_elements(cosines: Sequence[Any], sines: Sequence[Any]) -> tuple[Any, ...]:
-    """The nine elements, row by row, of `mount_rotation`, by the cosines and sines of yaw, pitch and roll."""
+    """Return the nine elements of `mount_rotation`, row by row, for the cosines and sines of yaw, pitch and roll."""
     (ca, cb, cc), (sa, sb, sc) = cosines, sines
     # the turn, the look and the lean multiplied out, each about the turned camera's axes, and transposed
     right, ahead = sa * sb, ca * sb

@@ -24,7 +24,7 @@ _STEPS = 256
 
 @torch.no_grad()
 def explain(camera: CameraLike, points: Numbers) -> list[str]:
-    """See `Camera.explain`."""
+    """Return one line of explanation a point; see `Camera.explain`."""
     valid = camera.project(points)[1]
     parameters = camera.intrinsics, camera.distortion
     points = as_values(points, "points", type(camera).__name__, camera.intrinsics.device)
@@ -46,7 +46,7 @@ def explain(camera: CameraLike, points: Numbers) -> list[str]:
 
 
 def _reason(camera: CameraLike, row: dict[str, Tensor], point: Tensor) -> str:
-    """Why a camera of this model with a row of usable values has no pixel for a point (3,)."""
+    """Return the reason why a camera of this model, with a row of usable values, has no pixel for a point (3,)."""
     camera = remade(camera, **row)
     shown = ", ".join(f"{value:.6g}" for value in point.tolist())
     if not bool(torch.isfinite(point).all()):
@@ -60,7 +60,7 @@ def _reason(camera: CameraLike, row: dict[str, Tensor], point: Tensor) -> str:
     chart, _ = camera.optics(columns(camera.distortion[None]))
 
     def last(covers: Callable[[Tensor], Tensor]) -> float:
-        """The angle up to which rays on this side are covered; those backwards have every azimuth."""
+        """Return the angle up to which rays on this side are covered; rays that point backwards have every azimuth."""
         x, y = ray[:2].double()
         azimuth = torch.atan2(y, x)[None]
         return float(reach(lambda rays: covers(rays.to(ray.dtype)), azimuth, most=theta, steps=_STEPS, rounds=3))

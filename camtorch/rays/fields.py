@@ -32,7 +32,7 @@ _STRAIGHT = 1e-24  # the squared sine of the angle to the vertical up to which a
 
 
 def on_image(pixels: Numbers, size: tuple[int, int], owner: str) -> Tensor:
-    """See `Camera.contains`."""
+    """Whether pixels lie on the image; see `Camera.contains`."""
     pixels = as_coordinates(pixels, "pixels", 2, owner)
     (u, v), (height, width) = pixels.unbind(-1), size
     return (u >= -0.5) & (u <= width - 0.5) & (v >= -0.5) & (v <= height - 0.5)
@@ -83,7 +83,7 @@ def over_image(
 
 
 def plucker(rays: Tensor, valid: Tensor, extrinsics: Extrinsics | None, owner: str) -> tuple[Tensor, Tensor]:
-    """Lines (*B, H, W, 6) in the world along rays (*B, H, W, 3), see `Camera.plucker`; and valid (*B, H, W)."""
+    """Return lines (*B, H, W, 6) in the world along rays (*B, H, W, 3), and valid (*B, H, W); see `Camera.plucker`."""
     if extrinsics is None:
         return torch.cat((torch.where(valid[..., None], rays, 0.0), torch.zeros_like(rays)), -1), valid
     if not isinstance(extrinsics, Extrinsics):
@@ -124,7 +124,7 @@ class Tangents(NamedTuple):
 
 
 def tangents(camera: CameraLike, pixels: Tensor) -> Tangents:
-    """Rays of pixels (*B, *N, 2) with their exact derivatives, in a graph where the camera or the pixels are in one."""
+    """Return rays of pixels (*B, *N, 2) and their exact derivatives, in a graph if the camera or pixels are in one."""
     if is_unknown(pixels):
         right, below = (pixels.new_tensor(unit).expand_as(pixels) for unit in ((1.0, 0.0), (0.0, 1.0)))
         by_u: Any = torch.func.jvp(camera.unproject, (pixels,), (right,), has_aux=True)
@@ -143,7 +143,7 @@ def tangents(camera: CameraLike, pixels: Tensor) -> Tangents:
 
 
 def local_frames(at: Tangents) -> tuple[Tensor, Tensor, Tensor]:
-    """Rotations (..., 3, 3) to local frames, pixels per unit of their planes (..., 2, 2), and valid (...) bool.
+    """Return rotations (..., 3, 3) to local frames, pixels per unit of their planes (..., 2, 2), and valid (...) bool.
 
     The local z axis is the ray, and x goes where the ray does as the pixel goes right, so that the derivative of the
     plane by the pixel is upper triangular. Both are identities where they are not valid.
@@ -162,7 +162,7 @@ def local_frames(at: Tangents) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def local_pinhole(camera: CameraLike, pixels: Numbers) -> tuple[Tensor, Tensor]:
-    """Rotations (..., 3, 3) and matrices K (..., 3, 3); see `Camera.local_pinhole`."""
+    """Return rotations (..., 3, 3) and matrices K (..., 3, 3); see `Camera.local_pinhole`."""
     owner = f"{type(camera).__name__}.local_pinhole"
     pixels, _ = as_points(pixels, "pixels", 2, camera.batch_shape, camera._tensors, owner)
     rotation, per_unit, valid = local_frames(tangents(camera, pixels))
@@ -173,7 +173,7 @@ def local_pinhole(camera: CameraLike, pixels: Numbers) -> tuple[Tensor, Tensor]:
 
 
 def perspective_field(camera: CameraLike, gravity: Numbers, stride: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Latitude (*B, H, W), up (*B, H, W, 2) and valid (*B, H, W); see `Camera.perspective_field`."""
+    """Return latitude (*B, H, W), up (*B, H, W, 2) and valid (*B, H, W); see `Camera.perspective_field`."""
     owner = f"{type(camera).__name__}.perspective_field"
     down = as_vectors(gravity, "gravity", owner)
     if known_false((down != 0).any(-1)):

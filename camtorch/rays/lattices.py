@@ -26,18 +26,18 @@ _LINE = 513  # points along a line of the image
 
 
 def image_edges(image_size: tuple[int, int], like: Tensor) -> tuple[Tensor, Tensor]:
-    """(2,) each: the outer corners (u, v) of an image at the top left, and at the bottom right."""
+    """Return the outer corners (u, v) of an image at the top left and at the bottom right, (2,) each."""
     height, width = image_size
     return like.new_full((2,), -0.5), like.new_tensor([width - 0.5, height - 0.5])
 
 
 def image_lattice(camera: CameraLike, rows: int, columns: int) -> Tensor:
-    """(rows, columns, 2): pixels in even steps from outer edge to outer edge of the image."""
+    """Return pixels (rows, columns, 2) in even steps from outer edge to outer edge of the image."""
     return pixel_lattice(*image_edges(camera._size_for("a lattice of pixels"), camera.intrinsics), rows, columns)
 
 
 def pixel_lattice(low: Tensor, high: Tensor, rows: int, columns: int) -> Tensor:
-    """(*C, rows, columns, 2): pixels in even steps from low to high, (*C, 2) each, both included."""
+    """Return pixels (*C, rows, columns, 2) in even steps from low to high, (*C, 2) each, both included."""
 
     def steps(axis: int, count: int) -> Tensor:
         share = torch.linspace(0, 1, count, dtype=low.dtype, device=low.device)
@@ -48,19 +48,19 @@ def pixel_lattice(low: Tensor, high: Tensor, rows: int, columns: int) -> Tensor:
 
 
 def ray_fan(angles: Tensor, azimuths: int) -> Tensor:
-    """(*C, K) angles from the axis -> (*C, K, azimuths, 3) rays, evenly around it; none where panoramas are cut."""
+    """Return rays (*C, K, azimuths, 3) at angles (*C, K), evenly around the axis; none lies where panoramas are cut."""
     around = (torch.arange(azimuths, device=angles.device).to(angles) + 0.25) * (2 * math.pi / azimuths)
     return polar_rays(angles[..., None], around)
 
 
 def polar_rays(angles: Tensor, azimuths: Tensor) -> Tensor:
-    """(..., 3): unit rays at angles from the axis, on azimuths, both radians (...)."""
+    """Return unit rays (..., 3) at angles from the axis and azimuths, both in radians (...)."""
     across = angles.sin()
     return torch.stack(torch.broadcast_tensors(across * azimuths.cos(), across * azimuths.sin(), angles.cos()), -1)
 
 
 def angles_from_axis(rays: Tensor) -> Tensor:
-    """(..., 3) rays -> (...) radians from the optical axis."""
+    """Return the angles (...) in radians between rays (..., 3) and the optical axis."""
     x, y, z = rays.unbind(-1)
     return torch.atan2(torch.hypot(x, y), z)
 
@@ -80,7 +80,7 @@ def slopes_at_axis(optics: Optics, k: Tensor) -> Tensor:
 
 
 def ideal(camera: CameraT) -> CameraT:
-    """The single camera of the same pixels per radian at the axis, with coefficients that do nothing."""
+    """Return a single camera with the same pixels per radian at the axis and coefficients without effect."""
     if not camera.distortion_names:
         return camera
     values = camera.distortion.new_tensor(camera.ideal(len(camera.distortion_names)))
@@ -109,13 +109,13 @@ def reach(
 
 
 def followed(camera: CameraLike, angles: Tensor, azimuths: int) -> tuple[Tensor, Tensor]:
-    """Pixels (*C, K, azimuths, 2) of a fan of ascending angles (*C, K), and whether all is valid up to there."""
+    """Return pixels (*C, K, azimuths, 2) of a fan of ascending angles (*C, K), and whether all so far are valid."""
     pixels, valid = camera.project(ray_fan(angles, azimuths))
     return pixels, valid.long().cumprod(-2).bool()
 
 
 def around_ends(share: Tensor, valid: Tensor) -> Tensor:
-    """(..., 66): finer steps around the first and the last of ascending shares (..., n) of a line that are valid."""
+    """Return shares (..., 66): finer steps around the first and last valid of ascending shares (..., n) of a line."""
     first, last = valid.long().argmax(-1, True), share.shape[-1] - 1 - valid.flip(-1).long().argmax(-1, True)
     around = [share.gather(-1, i.clamp(0, share.shape[-1] - 1)) for i in (first - 1, first, last, last + 1)]
     steps = torch.linspace(0, 1, 33).to(share)
@@ -155,7 +155,7 @@ def focal_for(camera: CameraLike, fov: Tensor, image_size: tuple[int, int], axis
     half = fov.new_tensor(ends[axis]) / 2
 
     def angle(per_pixel: Tensor) -> Tensor:
-        """(*B, K): between both ends, for (*B, K) plane units a pixel; infinite where one has no ray."""
+        """Return angles (*B, K) between both ends for (*B, K) plane units a pixel; infinite if an end has no ray."""
         toward = per_pixel[..., None, None] * half
         rays, valid = camera.unproject(torch.stack((toward, -toward), -2))
         angles = angles_from_axis(rays).sum(-1).amax(-1)

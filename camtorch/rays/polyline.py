@@ -17,7 +17,7 @@ _ROUNDS = 60
 
 
 def project_polyline(camera: CameraLike, points: Numbers, extrinsics: Extrinsics | None) -> list[Tensor]:
-    """See `Camera.project_polyline`."""
+    """Return the curves of edges in the image; see `Camera.project_polyline`."""
     owner = f"{type(camera).__name__}.project_polyline"
     if camera.batch_shape:
         raise ValueError(f"{owner}: takes a single camera; got batch dims {tuple(camera.batch_shape)}: use camera[i]")
@@ -92,7 +92,7 @@ class _Edges:
 
 
 def _region(camera: CameraLike) -> tuple[Tensor, float]:
-    """The middle of the image, and how far from it curves go on."""
+    """Return the middle of the image, and the distance from it at which curves end."""
     intrinsics = camera.intrinsics.detach().double()
     if camera.image_size is None:
         return intrinsics[2:], _FARTHEST * float(intrinsics[:2].max())

@@ -117,7 +117,7 @@ class Rectification(GeometryModule):
         return make() if learns else self._memo(inputs, (), make)
 
     def forward(self, left: Tensor, right: Tensor) -> tuple[Tensor, Tensor]:
-        """Both images, (B, C, H, W) each, rectified."""
+        """Rectify both images, (B, C, H, W) each."""
         of_left, of_right = (warp(images) for warp, images in zip(self._warps(), (left, right), strict=True))
         return of_left, of_right
 
@@ -127,12 +127,12 @@ class Rectification(GeometryModule):
         def __call__(self, *args: Any, **options: Any) -> Any: ...
 
     def valid_masks(self) -> tuple[Tensor, Tensor, Tensor]:
-        """(B or 1, 1, H, W) bool: pixels that the left camera sees, that the right one sees, that both do."""
+        """Return masks (B or 1, 1, H, W) bool of pixels that the left camera, the right one and both see."""
         left, right = (warp.valid_mask() for warp in self._warps())
         return left, right, left & right
 
     def disparity_to_points(self, disparity: Numbers, valid: Numbers | None = None) -> tuple[Tensor, Tensor]:
-        """The points of the scene that have these disparities, in the frame of the rectified left camera.
+        """Return the points of the scene with these disparities, in the frame of the rectified left camera.
 
         Args:
             disparity: (B, 1, H, W), (1, H, W) or (H, W) pixels, of the rectified left image; OpenCV's matchers give
@@ -172,7 +172,7 @@ class Rectification(GeometryModule):
         return torch.where(good[..., None], points, 0.0), good
 
     def _points(self, pixels: Tensor, d: Tensor) -> tuple[Tensor, Tensor]:
-        """Where the rays of both images meet, of pixels (*B, H, W, 2) and disparities (B, H, W)."""
+        """Intersect the rays of both images for pixels (*B, H, W, 2) and disparities (B, H, W)."""
         camera, baseline = self.camera_left.each(Tensor.double), self.baseline[..., None, None]
         good = torch.isfinite(d) & (d * baseline > 0)
         step = torch.where(good, d, 1.0).double()[..., None] * _unit(self._axis, pixels.double())[:2]
@@ -185,15 +185,15 @@ class Rectification(GeometryModule):
         return (left * scale[..., None]).to(d.dtype), good & (scale > 0) & torch.isfinite(scale)
 
     def _pixels(self) -> Tensor:
-        """All pixels, (*B, H, W, 2)."""
+        """Return all pixels, (*B, H, W, 2)."""
         return self.camera_left.pixel_grid().expand(*self.camera_left.batch_shape, -1, -1, -1)
 
     def _distance(self, points: Tensor) -> Tensor:
-        """How far points (..., 3) are from the baseline."""
+        """Return the distance of points (..., 3) from the baseline."""
         return torch.hypot(points[..., 1 - self._axis], points[..., 2])
 
     def disparity(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """The disparity of points (*B, *N, 3) of the frame of the rectified left camera, and whether both see them."""
+        """Return the disparity of points (*B, *N, 3) in the rectified left frame, and whether both cameras see them."""
         numbers, baseline = self.camera_left.intrinsics, self.baseline  # float64, which points need not become
         points, _ = as_points(points, "points", 3, baseline.shape, (numbers,), "Rectification.disparity")
         shift = baseline.to(points.dtype)[..., None] * _unit(self._axis, points)
@@ -203,7 +203,7 @@ class Rectification(GeometryModule):
 
     @torch.no_grad()
     def disparity_range(self, near: float, far: float = math.inf) -> tuple[float, float]:
-        """The least and the greatest disparity that points of a range of depths have, over all pixels and pairs.
+        """Return the least and the greatest disparity of points in a range of depths, over all pixels and pairs.
 
         Args:
             near: the least depth: z in perspective, the distance from the baseline in the panoramas about it.
@@ -223,7 +223,7 @@ class Rectification(GeometryModule):
         return float(least), float(most)
 
     def opencv(self) -> dict[str, Tensor]:
-        """R1, R2, P1, P2 and Q, as `cv2.stereoRectify` returns them, for a perspective pair without batch.
+        """Return R1, R2, P1, P2 and Q, as `cv2.stereoRectify` does, for a perspective pair without batch.
 
         Raises:
             ValueError: another projection, or a batch.
@@ -241,7 +241,7 @@ class Rectification(GeometryModule):
         return {"R1": self.rotation_left, "R2": self.rotation_right, "P1": first, "P2": first + shift, "Q": q}
 
     def extra_repr(self) -> str:
-        """How the images lie."""
+        """Return the projection, the direction of correspondence and the baseline in words."""
         baseline = self.baseline.detach()
         far = f"of {baseline.numel()} pairs" if baseline.ndim else f"{float(baseline):.6g}"
         return f"{self.projection}, {'columns' if self.vertical else 'rows'} correspond, baseline {far}"
@@ -259,7 +259,7 @@ def rectify(
     vertical: bool = False,
     align: Align = "mean",
 ) -> Rectification:
-    """Warps of two cameras' images into images whose rows correspond.
+    """Return warps of two cameras' images into images whose rows correspond.
 
     The x axis of both lies along the baseline, from left to right; both look where the two cameras look on average.
     Cameras of any models and sizes will do. Without further wishes the images show, up and down, what both see, to
@@ -381,7 +381,7 @@ def _extent(views: list[tuple[Camera, Tensor]], projection: str, vertical: bool)
 
 
 def _scale(camera: Camera, rotation: Tensor, plane: Camera, middle: Tensor) -> Tensor:
-    """(*B,) pixels of a camera per unit of the plane of a projection, at a point of it; 0 where it does not see it."""
+    """Return a camera's pixels (*B,) per unit of the projection plane at a point of it; 0 if the point is unseen."""
     offsets = _STEP * middle.new_tensor([[-1.0, 0.0], [1.0, 0.0], [0.0, -1.0], [0.0, 1.0]])
     rays, _ = plane.unproject(middle[..., None, :] + offsets)
     pixels, valid = camera.project((rays @ rotation).to(camera.intrinsics.dtype))
