@@ -1,4 +1,4 @@
-"""What a camera sees, in numbers, and how far apart two cameras show the same rays."""
+"""Numbers of a camera, and the distance of two cameras' pixels for the same rays."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from camtorch.poses.rotations import nearest_rotation
 from camtorch.rays.lattices import followed, ideal, image_lattice
 
 _LONG = 400  # pixels of the lattice along the longer side
-_ROUNDING = 1e-9  # px, far above that of two equal cameras
+_ROUNDING = 1e-9  # px, far above the rounding of two equal cameras
 _SIDE = 129  # of a lattice over the image
 _ANGLES, _AZIMUTHS = 3601, 32
 _MOST_COEFFICIENTS = 16
@@ -23,39 +23,39 @@ CORNERS = ("top left", "top right", "bottom left", "bottom right")
 
 
 class Difference(NamedTuple):
-    """Two cameras on a lattice (rows, columns) of pixels of the first one's image."""
+    """Comparison of two cameras on a lattice (rows, columns) of pixels of the first one's image."""
 
     apart: Tensor  # pixels between the pixel and where the second camera shows its ray, float64
-    both: Tensor  # bool: where both have the ray
-    rotation: Tensor  # (3, 3): by which the rays were turned
+    both: Tensor  # bool: both have the ray
+    rotation: Tensor  # (3, 3): rotation that was applied to the rays
 
     @property
     def rms(self) -> float:
-        """The root of the mean square over what both have; NaN where that is nothing."""
+        """Root of the mean square distance in pixels over common rays; NaN if there are none."""
         return float(self.apart[self.both].square().mean().sqrt())
 
     @property
     def largest(self) -> float:
-        """The largest distance in pixels; NaN where both have nothing."""
+        """Largest distance in pixels over common rays; NaN if there are none."""
         return float(self.apart[self.both].max()) if bool(self.both.any()) else math.nan
 
     @property
     def median(self) -> float:
-        """The median distance in pixels over what both have; NaN where that is nothing."""
+        """Median distance in pixels over common rays; NaN if there are none."""
         return float(self.apart[self.both].median()) if bool(self.both.any()) else math.nan
 
     def within(self, pixels: float) -> float:
-        """The part of the image, 0 to 1, that both have rays for, at most so many pixels apart."""
+        """Return the part of the image, 0 to 1, with common rays at most `pixels` apart."""
         return float((self.both & (self.apart <= pixels)).double().mean())
 
     @property
     def same(self) -> bool:
-        """Whether they are the same to rounding, where both have the ray; not where both have nothing."""
+        """Whether common rays agree up to rounding; False if there are none."""
         return self.largest < _ROUNDING
 
     @property
     def part(self) -> float:
-        """The part of the image that both have rays for."""
+        """Part of the image with common rays."""
         return float(self.both.double().mean())
 
     def __str__(self) -> str:
@@ -70,8 +70,8 @@ class Difference(NamedTuple):
 def difference(a: Camera, b: Camera, *, remove_rotation: bool = False) -> Difference:
     """Compare two single cameras over the image of the first.
 
-    `remove_rotation` first turns the rays by the one rotation that brings those of the cameras closest: two
-    calibrations of one camera may differ by where they look.
+    `remove_rotation` first rotates the rays by the rotation that brings the cameras' rays closest: two
+    calibrations of one camera may differ by their direction.
     """
     for camera in (a, b):
         if camera.batch_shape:
@@ -92,7 +92,7 @@ def difference(a: Camera, b: Camera, *, remove_rotation: bool = False) -> Differ
 
 
 def angle(rotation: Tensor) -> float:
-    """Radians by which a matrix (3, 3) turns."""
+    """Return the angle of a rotation matrix (3, 3) in radians."""
     sine = torch.linalg.matrix_norm(rotation - rotation.mT) / math.sqrt(8)
     return math.atan2(float(sine), (float(rotation.trace()) - 1) / 2)
 
@@ -104,12 +104,12 @@ class Summary:
     camera: Camera
     valid_angle: tuple[float, float]  # radians from the axis up to which rays are valid, on the worst and best azimuth
     fov: tuple[float, float, float] | None = None  # degrees, see `Camera.fov`
-    seen: float | None = None  # the part of the image that has rays
-    # for each of CORNERS how many pixels right and down distortion moves what is there, or why that has no answer
+    seen: float | None = None  # part of the image that has rays
+    # for each of CORNERS the pixels right and down by which distortion moves it, or a text if there is no answer
     corners: tuple[tuple[float, float] | str, ...] | None = None
 
     def lines(self) -> list[str]:
-        """For people: a label and its numbers on each line."""
+        """Return lines for people, each with a label and its numbers."""
         camera = self.camera
         fx, fy, cx, cy = camera.intrinsics.tolist()
         size = "not stated" if camera.image_size is None else "{1} x {0}".format(*camera.image_size)
@@ -152,7 +152,7 @@ def summarise(camera: Camera) -> Summary:
         pixels = image_lattice(camera, 2, 2).flatten(0, 1)
         rays, valid = camera.unproject(pixels)
         undistorted, covered = ideal(camera).project(rays)
-        # rounding is no distortion, and has a sign of its own
+        # rounding is no distortion; its sign must not appear
         moved = ((pixels - undistorted).double().round(decimals=6) + 0.0).tolist()
         result.corners = tuple(
             "no ray" if not valid[i] else "past the ideal projection" if not covered[i] else tuple(moved[i])

@@ -25,22 +25,22 @@ _BOARD_OPTIONS = ("marker", "legacy", "spacing", "border", "dictionary")
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Carry it out."""
+    """Run the command."""
     cameras = _cameras(arguments)
     path = arguments.output
     targets.check(path, force=arguments.force, inputs=tuple(one for paths in cameras.values() for one in paths))
     if {"fx", "fy"} & set((arguments.fixed or "").split(",")):
-        raise ValueError("--fixed: no focal length is known to be held; in Python ct.calibrate(start=camera) has one")
+        raise ValueError("--fixed: must not name a focal length; got one. In Python write ct.calibrate(start=camera)")
     candidates = _candidates(arguments)
     if arguments.board is None:
-        raise ValueError("which board? --board COLUMNSxROWS says so, as in 9x6")
+        raise ValueError("--board must be given. Write --board COLUMNSxROWS, as in 9x6")
     options = {name: value for name in _BOARD_OPTIONS if (value := getattr(arguments, name)) not in (None, False)}
     words = "{} {}x{}".format(arguments.type or "chessboard", *arguments.board)
     board = as_board(words, arguments.square or 1.0, options, "--board")
     if board.is_symmetric and len(cameras) > 1:
         note(
-            "this board looks the same after a turn: the corner nearest to the top left of an image is taken for its "
-            "first one, so hold the cameras alike. An even and an odd number of corners, as 9x6, leave no doubt"
+            "this board looks the same after a turn: the corner nearest to the top left of an image is taken as its "
+            "first one, so hold the cameras alike. An even and an odd number of corners, as in 9x6, avoid this"
         )
     views, sizes = find_views(cameras, board, "" if arguments.square is None else "m")
     if arguments.square is None:
@@ -52,7 +52,7 @@ def run(arguments: argparse.Namespace) -> None:
             "Another --model, or --loss huber where some corners are wrong, may help"
         )
     names = list(views) if isinstance(result, RigCalibration) else [of_view[""].path.name for of_view in views.values()]
-    text = repr(result)  # a text with names of views for their numbers, and options for arguments of `ct.calibrate`
+    text = repr(result)  # with names of views instead of numbers, and options instead of arguments
     numbered = r"\b([Vv]iews? )(\d+(?:, \d+)*)"
     text = re.sub(numbered, lambda m: m[1] + re.sub(r"\d+", lambda n: names[int(n[0])], m[2]), text)
     text = re.sub(r'fixed=\("(.*?)",?\)', lambda m: f"--fixed {m[1].replace(chr(34), '').replace(' ', '')}", text)
@@ -69,7 +69,7 @@ def _cameras(arguments: argparse.Namespace) -> dict[str, list[Path]]:
     """Return the images by the names of cameras, "" for a single one."""
     pair = {name: words for name in ("left", "right") if (words := getattr(arguments, name))}
     if sum(map(bool, (arguments.images, pair, arguments.rig))) > 1:
-        raise ValueError("images of one camera, --left and --right, or --rig: one of these says what to calibrate")
+        raise ValueError("give one of images of one camera, --left and --right, or --rig")
     if len(pair) == 1:
         raise ValueError(f"--{next(iter(pair))} is one of a pair: --left and --right are both needed")
     if arguments.rig:
@@ -79,19 +79,19 @@ def _cameras(arguments: argparse.Namespace) -> dict[str, list[Path]]:
                 raise ValueError(f"--rig takes NAME=IMAGE, as in cam0=folder or cam1='right*.png'; got {word!r}")
             pair.setdefault(name, []).append(images)
         if len(pair) < 2:
-            raise ValueError("--rig takes several cameras; one is calibrated without it")
+            raise ValueError("--rig must have several cameras; got one. Give its images without --rig")
     if not (pair or arguments.images):
-        raise ValueError("which images? Files, quoted patterns or folders, or a video")
+        raise ValueError("images must be given. Name files, quoted patterns, folders or a video")
     return {name: gather(words) for name, words in (pair or {"": arguments.images}).items()}
 
 
 def _candidates(arguments: argparse.Namespace) -> list[tuple[str, int]]:
-    """Return the models to try, with numbers of coefficients, that the file to be written can hold; if none, raise."""
+    """Return the models to try that the output file can hold, with numbers of coefficients; raise if none."""
     path, model, count = arguments.output, arguments.model, arguments.count
-    if arguments.format is None and path.suffix.lower() in (".yml", ".yaml"):  # which is written by several
+    if arguments.format is None and path.suffix.lower() in (".yml", ".yaml"):  # several formats have this suffix
         arguments.format = "opencv"
     if model is None and count is not None:
-        raise ValueError("--count is for a --model")
+        raise ValueError("--count needs a --model")
     tried: Sequence[tuple[str, int]] = selection.CANDIDATES
     if model is not None:
         kind = as_model(model, "--model")
@@ -100,7 +100,7 @@ def _candidates(arguments: argparse.Namespace) -> list[tuple[str, int]]:
             raise ValueError(f"--count: {model} takes {kind.counts_text()}; got {count}")
         if kind.smoothness() is not None:
             raise ValueError(
-                f"--model: {model} learns a surface over a lens that is known. In Python: fitted = ct.calibrate(...) "
+                f"--model: {model} fits a surface over a known lens. In Python: fitted = ct.calibrate(...) "
                 f"of another model, then ct.calibrate({model!r}, ..., start=fitted.camera)"
             )
     held = []
@@ -113,7 +113,7 @@ def _candidates(arguments: argparse.Namespace) -> list[tuple[str, int]]:
         except CameraFileError as error:
             failure = error
     if not held:
-        raise ValueError(f"{failure}; -o camera.json holds every model")
+        raise ValueError(f"{failure}; write -o camera.json, which holds every model")
     return held
 
 

@@ -1,4 +1,4 @@
-"""The cameras of a calibration file, by the options that say which, and of what model."""
+"""The cameras of a calibration file, chosen by options, and their model."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from camtorch.cli.terminal import note
 from camtorch.cli.words import GUESS, LENS
 from camtorch.io import load, opencv
 
-_ASPECT = 0.01  # the part by which the aspect ratios of a camera and an image may differ, as sizes are rounded
-_WIDE = 100  # degrees, horizontally, from which on lenses are rather fisheyes
+_ASPECT = 0.01  # relative tolerance of aspect ratios, because sizes are rounded
+_WIDE = 100  # horizontal degrees from which a lens is taken as a fisheye
 Size = tuple[int, int]  # (height, width)
 
 
@@ -25,14 +25,14 @@ def read_rig(
 ) -> Rig:
     """Read the cameras of a file, of `LENS` and the name of a real lens, or of `GUESS` and a field of view.
 
-    `name` is the only camera wanted; `model` and `size` are what a file may not state. `stated`: refuse an open model.
+    `name` chooses one camera; `model` and `size` complete a file without them. `stated`: refuse an ambiguous model.
     """
     if str(path).startswith(LENS):
         words = str(path).removeprefix(LENS)
         try:
             lenses.find(words)
         except ValueError as error:
-            raise ValueError(f"{error}; on images so does --guess-fov DEGREES") from None
+            raise ValueError(f"{error}; for images --guess-fov DEGREES works too") from None
         known = (size and lenses.search(words, image_size=size)) or lenses.search(words)
         others = f", the best of {len(known)} that camtorch lenses lists" if len(known) > 1 else ""
         note(f"{words}: {known[0]!r}{others}")
@@ -40,7 +40,7 @@ def read_rig(
     if str(path).startswith(GUESS):
         fov = str(path).removeprefix(GUESS)
         if size is None:
-            raise ValueError(f"{GUESS}{fov}: a field of view is one of an image, and of what size is not known here")
+            raise ValueError(f"{GUESS}{fov}: a guessed field of view needs an image size, which is unknown here")
         kind = as_model(model or ("pinhole" if float(fov) < _WIDE else "kannala_brandt"), "--model")
         guessed = kind.from_fov(float(fov), image_size=size).double().requires_grad_(False)
         focal = float(guessed.intrinsics[0])
@@ -54,7 +54,7 @@ def read_rig(
         )
     if name is not None:
         if name not in rig.cameras and name not in rig.images:
-            raise ValueError(f"{path}: no camera is called {name!r}; there are {', '.join(rig.cameras)}")
+            raise ValueError(f"{path}: name must be one of {', '.join(rig.cameras)}; got {name!r}")
         pose = {name: rig.extrinsics[name]} if name in rig.extrinsics else {}
         rig = Rig({name: rig.camera_of(name)}, pose, format=rig.format)
     for found, camera in rig.cameras.items():
@@ -72,20 +72,20 @@ def _leaves_open(path: Path) -> bool:
 
 
 def read_camera(path: Path, name: str | None = None, model: str | None = None, size: Size | None = None) -> Camera:
-    """Read the one camera of a file, or the one of that name; see `read_rig`."""
+    """Read the only camera of a file, or the one called `name`; see `read_rig`."""
     return _one(path, read_rig(path, name, model, size))
 
 
 def read_other(path: Path, name: str | None = None, model: str | None = None) -> Camera:
-    """Read the camera to compare with: the only one of its file, or the one of that name; a model if it needs one."""
+    """Read the camera to compare with: the only one of its file, or the one called `name`."""
     rig = read_rig(path, model=model if model is not None and _leaves_open(path) else None)
     return _one(path, rig, None if len(rig.cameras) == 1 else name)
 
 
 def _one(path: Path, rig: Rig, name: str | None = None) -> Camera:
-    """Return the camera of that name, or the only one."""
+    """Return the camera called `name`, or the only one."""
     if name is None and len(rig.cameras) > 1:
-        raise ValueError(f"{path}: several cameras; --name says which: {', '.join(rig.cameras)}")
+        raise ValueError(f"{path}: has several cameras; choose one with --name: {', '.join(rig.cameras)}")
     name = name or next(iter(rig.cameras))
     if (camera := rig.camera_of(name)).batch_shape:
         raise ValueError(f"{path}: {name} is a batch of {tuple(camera.batch_shape)} cameras; here one is needed")
@@ -95,14 +95,14 @@ def _one(path: Path, rig: Rig, name: str | None = None) -> Camera:
 def read_for_images(
     images: Sequence[Path], size_of: Callable[[Path], Size | None], arguments: argparse.Namespace
 ) -> Camera:
-    """Read the camera that took images, by `--camera`, `--lens` or `--guess-fov`, for the size of the first if open."""
+    """Read the camera of images by `--camera`, `--lens` or `--guess-fov`, for the first image's size if it has none."""
     path: Path | None = arguments.camera
     sized = ((image, size) for image in images if (size := size_of(image)))
     first, size = next(sized, (images[0], None))
     if path is None:
         raise ValueError(
-            f"{first}: which camera took it? --camera FILE, its calibration, says so, or --lens NAME: an image alone "
-            "does not tell; --guess-fov DEGREES guesses"
+            f"{first}: a camera must be given: --camera FILE, its calibration, or --lens NAME. An image alone "
+            "is not enough; --guess-fov DEGREES guesses"
         )
     is_file = not str(path).startswith((LENS, GUESS))
     camera = read_camera(path, arguments.name, arguments.from_model, None if is_file else size)
@@ -114,7 +114,7 @@ def read_for_images(
 
 
 def fitting(camera: Camera, path: Path, image: Path, size: Size, rescale: bool) -> Camera:
-    """Return the camera of a file for an image of that size, which the camera gets if it has none."""
+    """Return the camera of a file for an image of a size, which the camera gets if it has none."""
     if camera.image_size is None:
         camera.image_size = size
         note(f"{path} states no image size; taken to be for {_shown(size)}, as {image} is")
@@ -125,11 +125,11 @@ def fitting(camera: Camera, path: Path, image: Path, size: Size, rescale: bool) 
 
 
 def _unfitting(camera: Camera, size: Size, rescale: bool) -> str:
-    """Return why a camera is not one of images of that size, if it is not."""
+    """Return the reason why a camera does not fit images of a size, or "" if it fits."""
     if camera.image_size == size:
         return ""
     if size == (camera.width, camera.height):
-        return "width and height are exchanged, which scaling does not undo: is the photograph turned?"
+        return "width and height are exchanged, which scaling does not undo; turn the photograph"
     shapes = size[1] / size[0], camera.width / camera.height
     if max(shapes) <= (1 + _ASPECT) * min(shapes):
         return "" if rescale else "--rescale scales the camera to the image"

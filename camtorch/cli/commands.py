@@ -1,4 +1,4 @@
-"""The commands and their options. This module is light: what a command needs is imported when it runs."""
+"""The commands and their options. Imports are light: the modules of a command are imported when it runs."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from camtorch.cli import words
 Commands: TypeAlias = "argparse._SubParsersAction[Any]"
 Add: TypeAlias = Callable[..., Any]  # the method `add_argument` of a command, or of a group of its options
 _FORMAT = "of OUT; by default what its name says"
-_BOARDS = ("chessboard", "charuco", "aprilgrid")  # as `camtorch.boards` has them, which takes numpy to import
+_BOARDS = ("chessboard", "charuco", "aprilgrid")  # copied from `camtorch.boards`, whose import needs numpy
 
 
 def add_all(commands: Commands) -> None:
-    """Add the commands to a command line; each is carried out by the function `run` of the module of its name."""
+    """Add the commands to a command line; each is run by the function `run` of the module of its name."""
     for add in (_dewarp, _map, _convert, _show, _lenses, _calibrate):
         add(commands)
 
@@ -171,7 +171,7 @@ def _calibrate(commands: Commands) -> None:
 
 
 def _calibration(add: Add, of_name: str = "which camera, in a file with several", size: str = "--size") -> None:
-    """How to read a calibration that is the command's subject; `size` is the option that says for which images."""
+    """Add options for reading a calibration; `size` is the name of the option for the image size."""
     add("--name", help=of_name)
     _from_model(add)
     add(size, type=words.size, metavar="WxH", help="of images, where the file does not say")
@@ -183,7 +183,7 @@ def _from_model(add: Add, *others: str) -> None:
 
 
 def _projection(add: Add) -> None:
-    """What a dewarped image shows."""
+    """Add options for the projection of a dewarped image."""
     ways = ("perspective", "stereographic", "cylindrical", "equirectangular")
     text = "keeps lines straight (the default), shapes, upright lines; or shows all around"
     add("--projection", choices=ways, default="perspective", help=text)
@@ -193,7 +193,7 @@ def _projection(add: Add) -> None:
 
 
 def _output(add: Add, text: str, default: Path | None = None) -> None:
-    """Where the result goes."""
+    """Add options for the output file."""
     add("-o", "--output", type=words.path, default=default, metavar="OUT", help=text)
     _force(add)
 

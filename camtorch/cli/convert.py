@@ -14,9 +14,9 @@ from camtorch.io import formats
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Carry it out."""
+    """Run the command."""
     if (arguments.new is None) == (arguments.output is None):
-        raise ValueError("which file is the new one? camtorch convert IN -o OUT")
+        raise ValueError("the new file must be given. Write camtorch convert IN -o OUT")
     if not (path := arguments.new or arguments.output).is_dir():  # some formats are folders
         targets.check(path, force=arguments.force, inputs=_read(arguments.input))
     angle = arguments.max_angle
@@ -30,14 +30,14 @@ def run(arguments: argparse.Namespace) -> None:
         result = camera.convert(model, count=arguments.count, max_angle=None if angle is None else math.radians(angle))
         cameras[name] = result.camera
         part = "what the image has rays for" if camera.image_size else "its rays"
-        # of a batch, the worst of it
+        # for a batch, the worst of its cameras
         error = f"rms {float(result.rms.max()):.3g} px, at most {float(result.max_error.max()):.3g} px"
         degrees, covered = math.degrees(float(result.max_angle.min())), 100 * float(result.valid_fraction.min())
         notes.append(
             f"{path}: {name}, {camera.key} to {result.camera.key}: {'exact' if bool(result.exact.all()) else error}, "
             f"up to {degrees:.1f} degrees from the axis, {covered:.4g} % of {part}"
         )
-    # camtorch's own JSON holds every model; the format that the rig comes from may not
+    # camtorch's own JSON holds every model; the rig's own format may not
     stays = rig.format if arguments.model is None or path.suffix != ".json" else None
     changed = Rig(cameras, None if alone else rig.extrinsics, images=rig.images, format=stays)
     contents = formats.rendered(changed, path, arguments.format)
@@ -51,7 +51,7 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 def _read(path: Path) -> tuple[Path, ...]:
-    """The files that loading a path may read: all of a folder's, and COLMAP's images beside its cameras."""
+    """Return the files that loading a path may read: all of a folder's, and COLMAP's images next to its cameras."""
     if path.is_dir():
         return tuple(path.iterdir())
     return (path, *path.parent.glob("images.*")) if path.stem == "cameras" else (path,)

@@ -1,4 +1,4 @@
-"""The command `camtorch dewarp`: photographs and videos without their lens's distortion, one or many."""
+"""The command `camtorch dewarp`: remove the lens distortion of photographs and videos, one or many."""
 
 from __future__ import annotations
 
@@ -23,21 +23,21 @@ from camtorch.warp.warp import Warp
 
 _SLASHES = ("/", os.sep)
 _CALIBRATIONS = (".yml", ".yaml", ".json", ".xml")
-_TOLERANCE = 0.001  # pixels that nobody sees, for a lattice of positions also where a calibration is in float64
+_TOLERANCE = 0.001  # invisible; allows a lattice of positions for float64 calibrations too
 _MOST_KEPT = 4  # warps of images of different sizes
-_MUCH = 0.6  # of a photograph: where a dewarped one shows less, a hint names what shows more
+_MUCH = 0.6  # part of a photograph; if less is visible, a hint names wider projections
 
 
 @dataclass
 class Dewarping:
-    """Makes one file of another. The map is computed once for each size of image."""
+    """Conversion of one file to another. The map is computed once for each size of image."""
 
     camera: Camera
     arguments: argparse.Namespace
     _warps: dict[tuple[int, int], tuple[Dewarp, dict[str, Any]]] = field(default_factory=dict)
 
     def __call__(self, source: Path, target: Path, done: Callable[[], object] = lambda: None) -> dict[str, Any]:
-        """Return facts about the new camera; `done` is called after each frame of a video."""
+        """Write the dewarped file and return facts about the new camera; `done` is called after each frame."""
         if videos.is_video(source):
             codec, crf = self.arguments.codec, self.arguments.crf
             return videos.remake(source, target, lambda size: self._warp(source, size), codec, crf, done)
@@ -46,12 +46,12 @@ class Dewarping:
         warp, facts = self._warp(source, (rows, columns))
         with torch.no_grad():
             result = warp(image[None])[0].permute(1, 2, 0).contiguous()
-        del image  # of hundreds of megabytes, perhaps
+        del image  # frees hundreds of megabytes
         images.write(target, result.numpy(), orientation=orientation, synced=False)
         return facts
 
     def warp_of(self, camera: Camera) -> Dewarp:
-        """Return the warp of images of a camera."""
+        """Return the warp for images of a camera."""
         given = self.arguments
         return Dewarp(camera, projection=given.projection, fov=given.fov, image_size=given.size, tolerance=_TOLERANCE)
 
@@ -67,7 +67,7 @@ class Dewarping:
 
 @torch.no_grad()
 def _facts(warp: Dewarp) -> dict[str, Any]:
-    """Return facts about new images: the part of 64 x 64 places that shows something, and of the old that is shown."""
+    """Return facts about new images, as the filled part of the new image and the visible part of the old one."""
     source, target = warp.source, warp.target
     part = torch.tensor([source.width / 64, source.height / 64])
     lattice = (source.resize(64, 64).pixel_grid() + 0.5) * part - 0.5
@@ -84,12 +84,12 @@ def _facts(warp: Dewarp) -> dict[str, Any]:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Carry it out."""
+    """Run the command."""
     if are_several(arguments.image) or (arguments.output or "").endswith(_SLASHES):
         return _many(arguments)
     for name in ("resume", "suffix"):
         if getattr(arguments, name):
-            raise ValueError(f"--{name} is for folders: -o OUT/, with a slash, puts the new one into one")
+            raise ValueError(f"--{name} needs a folder. Write -o OUT/, with a slash")
     source = Path(arguments.image[0])
     is_video = videos.is_video(source)
     output = Path(arguments.output or f"dewarped{videos.written_suffix(source) if is_video else '.png'}")
@@ -106,16 +106,16 @@ def run(arguments: argparse.Namespace) -> int:
         facts = work(source, output)
         end = f" and shows {100 * facts['shown']:.0f} % of the photograph"
         if facts["shown"] < _MUCH and arguments.projection == "perspective" and arguments.fov is None:
-            end += "; --projection stereographic or cylindrical shows more, and --fov says how much"
+            end += "; --projection stereographic or cylindrical shows more, and --fov sets how much"
     print(f"{output}: {_described(arguments, facts)}{end}")
     return 0
 
 
 def _many(arguments: argparse.Namespace) -> int:
-    """Make all files, and print what became of them; return the exit status, 1 if any failed."""
+    """Dewarp all files, and print the results; return the exit status, 1 if any failed."""
     if any(Path(name).suffix.lower() in _CALIBRATIONS for name in arguments.image):
         raise ValueError(
-            f"{' '.join(arguments.image)}: all of them are taken for images; --camera names the calibration, and -o "
+            f"{' '.join(arguments.image)}: all are read as images. Name the calibration with --camera, and with -o "
             "the new image: camtorch dewarp photo.jpg --camera camera.yml -o straight.png"
         )
     known = IMAGES | videos.FORMATS
@@ -146,7 +146,7 @@ def _many(arguments: argparse.Namespace) -> int:
 
 
 def _target(source: Path, target: Path, suffix: str | None) -> Path:
-    """Return `target` with the suffix of what is made of a file."""
+    """Return `target` with the suffix of the file that is made from `source`."""
     if is_video := videos.is_video(source):
         target = target.with_suffix(videos.written_suffix(source))
     if suffix is not None and is_video == videos.is_video(Path("any" + suffix)):
@@ -156,20 +156,20 @@ def _target(source: Path, target: Path, suffix: str | None) -> Path:
 
 
 def _outcomes(work: Dewarping, todo: Sequence[Pair], jobs: int | None) -> list[Outcome]:
-    """Make files by processes, and return what became of each."""
+    """Dewarp files by processes, and return the outcome of each."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     targets.remove_left_over(todo)
     try:
         with bar("dewarp", len(todo), "files") as shown:
             return processes.each(work, todo, max(min(jobs or cores, len(todo)), 1), shown.update)
     except ChildProcessError as error:
-        raise ValueError(f"{error}; --resume goes on where it was broken off, --jobs 1 needs the least") from None
+        raise ValueError(f"{error}; --resume continues the run, --jobs 1 needs the least memory") from None
     finally:
         targets.remove_left_over(todo)
 
 
 def _dewarping(arguments: argparse.Namespace, sources: Sequence[Path]) -> Dewarping:
-    """Return what is done to each; the camera gets the size of the first image if its file states none."""
+    """Return the work for all files; the camera gets the size of the first image if its file has none."""
 
     def size_of(source: Path) -> tuple[int, int] | None:
         return videos.size_of(source) if videos.is_video(source) else _photographs.size_of(source)
@@ -178,7 +178,7 @@ def _dewarping(arguments: argparse.Namespace, sources: Sequence[Path]) -> Dewarp
     if any(map(videos.is_video, sources)):
         videos.require()
     if work.camera.image_size is not None:
-        work.warp_of(work.camera)  # an error of the options is one of all files
+        work.warp_of(work.camera)  # raise errors of the options before all files
     return work
 
 

@@ -18,15 +18,15 @@ _KEEP_ORIENTATION = ("JPEG", "PNG", "TIFF", "WEBP")
 
 
 def check_kind(path: Path, *, is_video: bool = False) -> None:
-    """Raise an ImageFileError if the name is of no file type that images, or videos, are written as."""
+    """Raise an ImageFileError if images, or videos, cannot be written as the path's file type."""
     known = list(videos.WRITTEN) if is_video else sorted(IMAGES)
     if path.suffix.lower() not in known:
         what, kind = path.suffix or "no suffix", "video" if is_video else "image"
-        raise ImageFileError(f"{path}: {what}: no {kind} is written as that; try {', '.join(known)}")
+        raise ImageFileError(f"{path}: the suffix of the {kind} must be one of {', '.join(known)}; got {what}")
 
 
 def write(path: Path, pixels: NDArray[Any], *, orientation: int | None = None, synced: bool = True) -> None:
-    """Write (H, W, C) uint8 or (H, W, 1) uint16, whole or not at all, with missing folders, as `replacing` does."""
+    """Write (H, W, C) uint8 or (H, W, 1) uint16 by `replacing`, and make missing folders."""
     image = Image.fromarray(pixels[..., 0] if pixels.shape[-1] == 1 else pixels)
     kind = Image.registered_extensions()[path.suffix.lower()]
     options: dict[str, Any] = {"quality": 95}
@@ -43,5 +43,5 @@ def write(path: Path, pixels: NDArray[Any], *, orientation: int | None = None, s
             reason = f"{path.suffix} files hold no image of mode {image.mode}; .png does"
         raise ImageFileError(f"{path}: {reason}") from None
     if orientation not in (None, 1) and kind not in _KEEP_ORIENTATION:
-        turned = "the Exif orientation, by which it is to be shown turned, is lost"
+        turned = "the Exif orientation, which turns the image, is lost"
         warn(f"{turned}: {path.suffix} files hold none")

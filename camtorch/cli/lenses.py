@@ -10,7 +10,7 @@ from camtorch.io import save
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Carry it out."""
+    """Run the command."""
     words, output, size = " ".join(arguments.words), arguments.output, arguments.size
     if output is not None:
         targets.check(output, force=arguments.force)

@@ -1,4 +1,4 @@
-"""The command line `camtorch`: how a command is carried out, and how errors are shown."""
+"""The command line `camtorch`: running commands and showing errors."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from camtorch.cli import commands, processes
 from camtorch.cli.terminal import lacks_memory, note, reason, say
 from camtorch.native import library
 
-_INTERRUPT, _PIPE = 128 + 2, 128 + 13  # as shells number signals
+_INTERRUPT, _PIPE = 128 + 2, 128 + 13  # shells' exit codes for signals
 
 
 class _Parser(argparse.ArgumentParser):
@@ -33,7 +33,7 @@ class _Parser(argparse.ArgumentParser):
 
 
 class _Version(argparse.Action):
-    """Prints the versions on which results depend, without importing what has them."""
+    """Action that prints the versions on which results depend, without importing the libraries."""
 
     def __call__(self, *_: object) -> NoReturn:
         try:
@@ -47,22 +47,22 @@ class _Version(argparse.Action):
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line `argv`, by default the process's own, and return the exit status.
 
-    It is 0; 1 if some of many files failed; 2 after an error, which is one line on stderr; 130 after an interrupt; 141
-    if nobody reads what is printed.
+    The status is 0; 1 if some of many files failed; 2 after an error, which is one line on stderr; 130 after an
+    interrupt; 141 if the reader of the output closed it.
     """
     try:
         arguments = make_parser().parse_args(argv)
         module = f"camtorch.cli.{arguments.command}"
         if arguments.command == "dewarp" and arguments.jobs != 1 and commands.are_several(arguments.image):
-            processes.prepare(module)  # they import what they need while this one does
-        command = importlib.import_module(module)  # torch takes a second, which `--help` and a wrong option save
+            processes.prepare(module)  # processes import in parallel with this one
+        command = importlib.import_module(module)  # torch takes a second: `--help` must not import it
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", UserWarning)
             status: int = command.run(arguments) or 0
         for warning in caught:
             note(warning.message)
         sys.stdout.flush()
-    except BrokenPipeError:  # whoever reads what is printed has enough, as `head` has
+    except BrokenPipeError:  # the reader closed the pipe, as `head` does
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return _PIPE
     except KeyboardInterrupt:
@@ -77,7 +77,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def make_parser() -> argparse.ArgumentParser:
-    """Return the parser of all options, from which the page of commands is made too."""
+    """Return the parser of all options, which also generates the page of commands."""
     parser = _Parser(prog="camtorch", description="Cameras as layers for PyTorch.")
     parser.add_argument("--version", action=_Version, nargs=0, help="show what is installed and exit")
     commands.add_all(parser.add_subparsers(title="commands", dest="command", required=True, metavar="COMMAND"))

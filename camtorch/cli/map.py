@@ -15,10 +15,10 @@ _OPTIONS = ("step", "block", "dtype", "clip")
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Carry it out."""
+    """Run the command."""
     output: Path | None = arguments.output
     if (output is None) == (arguments.check is None):
-        raise ValueError("which map? -o OUT writes one, --check MAP measures one")
+        raise ValueError("one of -o OUT, which writes a map, or --check MAP, which measures one, must be given")
     if output is not None:
         for name in files_of(output, arguments.format):
             targets.check(Path(name), force=arguments.force, inputs=(arguments.camera, arguments.target))
@@ -33,10 +33,10 @@ def run(arguments: argparse.Namespace) -> None:
 def _warp(given: argparse.Namespace) -> Warp:
     camera = read_camera(given.camera, given.name, given.from_model, given.camera_size)
     if camera.image_size is None:
-        raise ValueError(f"{given.camera} states no image size; --camera-size WxH says it")
+        raise ValueError(f"{given.camera} has no image size; add --camera-size WxH")
     if given.target is None:
         return Dewarp(camera, projection=given.projection, fov=given.fov, image_size=given.size, tolerance=0)
     for name in ("fov", "size"):
         if getattr(given, name) is not None:
-            raise ValueError(f"--{name} is for a dewarping; --target {given.target} says it")
+            raise ValueError(f"--{name} must not be given with --target {given.target}, which has its own")
     return Warp(camera, read_camera(given.target), tolerance=0)

@@ -1,4 +1,4 @@
-"""Processes that make files, one thread each, and what becomes of each file."""
+"""Processes that make files, one thread each, and the outcome of each file."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from typing import Any, TypeAlias
 
 from camtorch.cli.terminal import reason
 
-Pair: TypeAlias = tuple[Path, Path]  # a file that is read, and the file that is made of it
+Pair: TypeAlias = tuple[Path, Path]  # the source file and the target file
 Work: TypeAlias = Callable[[Path, Path], Any]  # makes a file, whole or not at all, and returns facts about it
 _HOW = "spawn" if sys.platform == "win32" else "forkserver"
 _work: Work
@@ -26,20 +26,20 @@ _work: Work
 
 @dataclass
 class Outcome:
-    """What became of a pair."""
+    """Outcome of a pair."""
 
     facts: Any = None
-    failure: str = ""  # why no file was made; empty if one was
+    failure: str = ""  # reason why no file was made, or empty
     notes: list[str] = field(default_factory=list)
 
 
 def prepare(module: str) -> None:
-    """Import a module once for all processes to come, while this process does something else."""
+    """Import a module once for all later processes, while this process continues."""
     if _HOW == "forkserver":
         from multiprocessing import forkserver
 
         multiprocessing.set_forkserver_preload([__name__, module])
-        # the server inherits the mask: an interrupt is handled here, and would show its traceback while it imports
+        # the server inherits the mask: this process handles interrupts; the server would print a traceback
         before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         try:
             forkserver.ensure_running()
@@ -48,9 +48,9 @@ def prepare(module: str) -> None:
 
 
 def each(work: Work, pairs: Sequence[Pair], count: int, done: Callable[[], object]) -> list[Outcome]:
-    """Return what becomes of pairs by `count` processes; a single one is this process. `done` is called after each.
+    """Return the outcomes of pairs by `count` processes; 1 means this process. `done` is called after each pair.
 
-    Processes end at once after an error or an interrupt; a ChildProcessError says that one was killed.
+    Processes end at once after an error or an interrupt; a killed process raises ChildProcessError.
     """
     if count == 1:
         outcomes = []
@@ -59,7 +59,7 @@ def each(work: Work, pairs: Sequence[Pair], count: int, done: Callable[[], objec
             done()
         return outcomes
     others = multiprocessing.active_children()
-    # pickled here, because multiprocessing would share the memory of tensors
+    # pickled here because multiprocessing would share the memory of tensors
     executor = ProcessPoolExecutor(count, multiprocessing.get_context(_HOW), _begin, (pickle.dumps(work),))
     try:
         futures = [executor.submit(_attempt, pair) for pair in pairs]
@@ -80,14 +80,14 @@ def _begin(pickled: bytes) -> None:
     global _work
     import torch
 
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the process that started this one handles interrupts
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent process handles interrupts
     threading.Thread(target=_end_with_parent, daemon=True).start()
     torch.set_num_threads(1)
     _work = pickle.loads(pickled)
 
 
 def _end_with_parent() -> None:
-    """End this process when its parent was killed, which could not end it."""
+    """End this process if its parent was killed and could not end it."""
     parent = multiprocessing.parent_process()
     assert parent is not None
     parent.join()
@@ -95,7 +95,7 @@ def _end_with_parent() -> None:
 
 
 def _attempt(pair: Pair, work: Work | None = None) -> Outcome:
-    """Make a file, by default by the work of this process."""
+    """Make a file by `work`, default this process's own, and return its outcome."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", UserWarning)
         try:

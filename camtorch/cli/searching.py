@@ -1,4 +1,4 @@
-"""Views of a board for `camtorch calibrate`: images that were taken together, and sharp frames of a video."""
+"""Views of a board for `camtorch calibrate`: images taken together, and sharp frames of a video."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ from camtorch.cli import videos
 from camtorch.cli.terminal import bar, note
 
 _LEAST_VIEWS = 3
-_MOMENT = 0.5  # seconds, of which the sharpest frame is taken
-_MOMENTS = 80  # from twice as many on, each two become one
-_SHARP = 0.6  # of the sharpness of the moments next to it, below which one was all motion
-_APART = 0.01  # of the image's diagonal: views whose corners are nearer on average are the same
+_MOMENT = 0.5  # seconds; the sharpest frame of each moment is used
+_MOMENTS = 80  # twice as many are merged in pairs
+_SHARP = 0.6  # of the neighbouring moments' sharpness; below it a moment is motion blur
+_APART = 0.01  # of the image's diagonal: views with a smaller mean distance of corners are the same
 
-Views = dict[str, dict[str, ImageCorners]]  # view -> camera -> what its image shows
+Views = dict[str, dict[str, ImageCorners]]  # view -> camera -> corners in its image
 
 
 def find_views(
     cameras: Mapping[str, Sequence[Path]], board: Board, unit: str
 ) -> tuple[Views, dict[str, tuple[int, int]]]:
-    """Return the views of a board that a calibration can use, and each camera's (height, width), "" for one alone."""
+    """Return the usable views of a board, and each camera's (height, width), "" for a single camera."""
     if len(cameras) == 1:
         ((name, paths),) = cameras.items()
         images = _search(board, [(path, None) for path in paths if not videos.is_video(path)])
@@ -39,7 +39,7 @@ def find_views(
         keys = [(name, view) for view, of_view in together.items() for name in of_view]
         taken = [path for of_view in together.values() for path in of_view.values()]
         if twice := [path for path, count in Counter(taken).items() if count > 1]:
-            raise ValueError(f"{twice[0]}: is given as an image of two cameras")
+            raise ValueError(f"{twice[0]}: must belong to one camera; got two")
         print(f"{len(together)} views of {', '.join(cameras)}")
         images = _search(board, [(path, None) for path in taken])
     views: Views = {view: {} for _, view in keys}
@@ -73,9 +73,9 @@ def _search(board: Board, images: Sequence[Image]) -> list[ImageCorners]:
 
 
 def take_together(cameras: Mapping[str, Sequence[Path]]) -> dict[str, dict[str, Path]]:
-    """Return view -> camera -> image of images of one name, else the same last number in it, else the same place."""
+    """Return view -> camera -> image of images with the same name, else last number, else position."""
     if film := next((path for paths in cameras.values() for path in paths if videos.is_video(path)), None):
-        raise ValueError(f"{film}: videos are for one camera: nothing tells which frames of two are of one moment")
+        raise ValueError(f"{film}: videos must be of one camera: frames of two cameras have no common time")
     keys: tuple[Callable[[Path], str | None], ...] = (lambda path: path.stem, _last_number)
     for key in keys:
         keyed = {name: {key(path): path for path in paths} for name, paths in cameras.items()}
@@ -100,11 +100,11 @@ def _last_number(path: Path) -> str | None:
     return numbers[-1].lstrip("0") or "0" if numbers else None
 
 
-_Moment = tuple[float, float, NDArray[np.uint8]]  # when a frame is shown, in seconds; its sharpness; (H, W)
+_Moment = tuple[float, float, NDArray[np.uint8]]  # time of a frame in seconds, its sharpness, pixels (H, W)
 
 
 def _search_video(path: Path, board: Board) -> list[ImageCorners]:
-    """Return sharp frames that show a board in different places, the sharper of two alike, in order of time."""
+    """Return sharp frames that show a board in different places in order of time; of two alike the sharper one."""
     moments = _sharpest(path)
     beside = [0.0, *(sharpness for _, sharpness, _ in moments), 0.0]
     sharp = [one for i, one in enumerate(moments) if one[1] >= _SHARP * max(beside[i], beside[i + 2])]

@@ -1,4 +1,4 @@
-"""The command `camtorch show`: what a calibration says, in numbers and in an image."""
+"""The command `camtorch show`: a calibration in numbers and as an image."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from camtorch.viewer.viewer import write_viewer
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Carry it out."""
+    """Run the command."""
     path, output, against = arguments.input, arguments.output, arguments.against
     html, photograph = arguments.html, arguments.image
     if output is not None:
@@ -24,19 +24,19 @@ def run(arguments: argparse.Namespace) -> None:
     if html is not None:
         targets.check(html, force=arguments.force, inputs=(path, against, photograph))
     elif photograph is not None:
-        raise ValueError("--image is for the page that --html writes")
+        raise ValueError("--image needs --html, which writes the page")
     cameras = read_rig(path, arguments.name, arguments.from_model, arguments.size).cameras
     single = any(file is not None for file in (output, against, html))
     if single and len(cameras) > 1:
-        raise ValueError(f"{path}: --name says which camera is meant: {', '.join(cameras)}")
+        raise ValueError(f"{path}: has several cameras; choose one with --name: {', '.join(cameras)}")
     ((name, camera), *_), other = cameras.items(), None
     if single and camera.image_size is None:
-        raise ValueError(f"{path} states no image size; --size says which")
+        raise ValueError(f"{path} has no image size; add --size WxH")
     if against is not None:
         other = read_other(against, arguments.name, arguments.from_model)
         if other.image_size not in (None, camera.image_size):
             sizes = f"{other.width}x{other.height}, but {path} for {camera.width}x{camera.height}"
-            raise ValueError(f"{against} is for {sizes}: cameras of one image are compared")
+            raise ValueError(f"{against} is for {sizes}: both must have the same size")
     if html is not None:
         html.parent.mkdir(parents=True, exist_ok=True)
         write_viewer(camera, html, photograph)
@@ -47,7 +47,7 @@ def run(arguments: argparse.Namespace) -> None:
     if other is not None:
         compared = difference(camera, other)
         line = f"against {against}: {compared}, over {100 * compared.part:.4g} % of the image"
-        if compared.part and not compared.same:  # a few rays at the rim may make nearly all of the rms
+        if compared.part and not compared.same:  # a few rays at the rim may dominate the rms
             line += f"; median {compared.median:.3g} px, {100 * compared.within(1):.3g} % of the image within 1 px"
         print(line)
     if output is not None:

@@ -1,4 +1,4 @@
-"""Which files a command reads and writes: what could not be written after the work is refused before it."""
+"""Input and output files of a command: output files that cannot be written are refused before the work."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from camtorch.io.writing import all_left_over
 
 
 def check(path: Path, *, force: bool, inputs: tuple[Path | None, ...] = ()) -> None:
-    """Raise a ValueError if a file cannot be written, is an input, also by a link, or exists and `force` is false."""
+    """Raise a ValueError if a file cannot be written, is an input (also by a link), or exists and `force` is false."""
     if path.is_dir():
         raise ValueError(f"{path}: is a folder; name a file in it")
     for given in inputs:
@@ -31,22 +31,22 @@ def check(path: Path, *, force: bool, inputs: tuple[Path | None, ...] = ()) -> N
 
 
 def folder(text: str | None, suffixes: Collection[str]) -> Path:
-    """Return the folder that -o names, for files of these suffixes."""
+    """Return the folder of -o, for files of these suffixes."""
     if text is None:
-        raise ValueError("into which folder? -o OUT/ names it, for several images or a folder; for one, -o out.png")
+        raise ValueError("-o must be given. Write -o OUT/ for several images, -o out.png for one")
     path = Path(text)
     if os.path.lexists(path) and not path.is_dir():
-        raise ValueError(f"{path}: is no folder, which -o names for several images or a folder of them")
+        raise ValueError(f"{path}: -o must be a folder for several images or a folder of them; got a file")
     if path.suffix.lower() in suffixes and not path.exists() and not text.endswith(("/", os.sep)):
-        raise ValueError(f"{path}: is the name of one file, but there may be several; -o OUT/ names a folder")
+        raise ValueError(f"{path}: -o must be a folder for several files; got a file name. Write -o OUT/")
     return path
 
 
 def find(words: Sequence[str], suffixes: Collection[str], output: Path) -> list[tuple[Path, Path]]:
-    """Return the files that words mean, each once, in natural order, and their places below the folder of outputs.
+    """Return the files that words mean, each once, in natural order, and their places in the folder of outputs.
 
-    Words are files of any suffix; patterns, as a quoted 'in/**/*.jpg'; and folders, whose tree is kept, by their names
-    if there are several words. Names that begin with a dot, and the folder of outputs within one, are left out.
+    Words are files of any suffix; quoted patterns, as 'in/**/*.jpg'; and folders, whose tree is kept, in a folder of
+    their name if there are several words. Names that begin with a dot, and the folder of outputs itself, are skipped.
     """
     files: dict[str, tuple[Path, Path]] = {}
     out = os.path.realpath(output)
@@ -58,13 +58,13 @@ def find(words: Sequence[str], suffixes: Collection[str], output: Path) -> list[
             files[os.path.realpath(root)] = root, Path(root.name)
             continue
         elif glob.has_magic(word):
-            # links in a circle make paths of any length to the same file: the shortest is taken last
+            # links in a circle make paths of any length to the same file: the shortest path comes last and wins
             paths = iter(sorted(map(Path, glob.iglob(word, recursive=True)), key=lambda one: -len(one.parts)))
             root = Path(*takewhile(lambda part: not glob.has_magic(part), root.parts))
         else:
             raise ValueError(f"{word}: no such file or folder")
         apart = _is_below(os.path.realpath(root), out)
-        # a link to nothing is taken, so that an error names it; a pipe is not
+        # a link to a missing file is kept, so that an error names it; a pipe is not
         found = {
             os.path.realpath(one): (one, place / one.relative_to(root))
             for one in paths
@@ -79,7 +79,7 @@ def find(words: Sequence[str], suffixes: Collection[str], output: Path) -> list[
 
 
 def _below(root: Path) -> Iterator[Path]:
-    """Yield the files in a folder and in those below it; a link to a folder that it lies in shows nothing new."""
+    """Yield the files in a folder and its subfolders; a link to a parent folder is not followed."""
 
     def refuse(error: OSError) -> None:
         raise error
@@ -96,10 +96,10 @@ def _is_below(path: str, folder: str) -> bool:
 
 
 def to_make(pairs: Sequence[Pair], others: Iterable[Path], *, resume: bool, force: bool) -> list[Pair]:
-    """Return the pairs whose files are to be made; with `resume` those that are there are left out.
+    """Return the pairs whose files must be made; with `resume` existing files are left out.
 
-    An empty file, as a loss of power leaves it, is made again. It is a ValueError if files would be written over each
-    other, or over one that is read, also one of `others`; or if one is there already.
+    An empty file, as after a loss of power, is made again. It raises a ValueError if files would overwrite each other
+    or a file that is read, also one of `others`; or if a file exists already.
     """
     read = {os.path.realpath(path): path for path in (*(source for source, _ in pairs), *others)}
     written: dict[str, Path] = {}
@@ -113,13 +113,13 @@ def to_make(pairs: Sequence[Pair], others: Iterable[Path], *, resume: bool, forc
         return [(source, target) for source, target in pairs if not (target.is_file() and target.stat().st_size)]
     if (there := [target for _, target in pairs if os.path.lexists(target)]) and not force:
         more = f", and {len(there) - 1} more of {len(pairs)}" if len(there) > 1 else ""
-        hint = "--resume goes on where a run was broken off, --force overwrites"
+        hint = "--resume continues the run, --force overwrites"
         raise ValueError(f"{there[0]}: exists already{more}; {hint}")
     return list(pairs)
 
 
 def remove_left_over(pairs: Iterable[Pair]) -> None:
-    """Remove the halves of files that a process which was killed left beside outputs."""
+    """Remove partial files that a killed process left next to outputs."""
     for path in all_left_over(os.path.realpath(target) for _, target in pairs):
         with contextlib.suppress(OSError):
             os.unlink(path)

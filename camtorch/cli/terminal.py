@@ -9,18 +9,18 @@ from typing import Any
 
 
 def say(text: str) -> None:
-    """Print one line, whatever the text; characters that would steer a terminal, as names of files may, are escaped."""
+    """Print any text in one line; control characters, as in names of files, are escaped."""
     line = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in " ".join(text.split()))
     print("camtorch:", line, file=sys.stderr, flush=True)
 
 
 def note(text: object) -> None:
-    """Print what the user should know though the work goes on."""
+    """Print a note, after which the work continues."""
     say(f"note: {text}")
 
 
 def reason(error: Exception) -> str:
-    """Return why something failed, in a line."""
+    """Return the reason of a failure in one line."""
     if lacks_memory(error):
         text = f"out of memory: {error}"
     elif isinstance(error, OSError) and error.strerror:
@@ -33,13 +33,13 @@ def reason(error: Exception) -> str:
 
 
 def lacks_memory(error: Exception) -> bool:
-    """Whether memory ran out, for which torch has no type of its own."""
+    """Whether memory ran out; torch has no type of its own for this."""
     return isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and "allocate memory" in str(error))
 
 
 def bar(what: str, total: float | None, unit: str = "", **options: Any) -> Any:
-    """Return a tqdm bar for work that takes more than a moment; a file or a pipe gets one twice a minute. Close it."""
-    from tqdm import tqdm  # type: ignore[import-untyped]  # not before: `--help` does without
+    """Return a tqdm bar for longer work; a file or a pipe gets a line twice a minute. Close it after use."""
+    from tqdm import tqdm  # type: ignore[import-untyped]  # late: `--help` does not need it
 
     delay, interval = (0.5, 0.1) if sys.stderr.isatty() else (30.0, 30.0)  # seconds
     common = {"leave": False, "smoothing": 0, "file": sys.stderr, "delay": delay, "mininterval": interval}
@@ -48,6 +48,6 @@ def bar(what: str, total: float | None, unit: str = "", **options: Any) -> Any:
 
 @contextlib.contextmanager
 def progress(what: str) -> Iterator[Callable[[float], None]]:
-    """Yield a function that shows the part that is done, from 0 to 1."""
+    """Yield a function that shows the finished part, from 0 to 1."""
     with bar(what, 1.0, bar_format="{desc}: {percentage:3.0f} %|{bar}| {remaining} left") as shown:
         yield lambda part: shown.update(part - shown.n)

@@ -1,4 +1,4 @@
-"""Videos through warps, by PyAV: time stamps, sound and subtitles stay as they are."""
+"""Videos through warps, by PyAV: time stamps, sound and subtitles are kept."""
 
 from __future__ import annotations
 
@@ -17,39 +17,39 @@ from camtorch.io.writing import replacing
 from camtorch.values.arguments import imported
 from camtorch.warp.warp import Warp
 
-WRITTEN = {".mp4": "mp4", ".m4v": "mp4", ".mov": "mov", ".mkv": "matroska", ".webm": "webm"}  # as ffmpeg calls them
-FORMATS = frozenset({*WRITTEN, ".avi", ".mts", ".ts"})  # suffixes of what is read
-# encoders with their options; how x264 weighs blocks by what refers to them (mbtree) is not the same each time
+WRITTEN = {".mp4": "mp4", ".m4v": "mp4", ".mov": "mov", ".mkv": "matroska", ".webm": "webm"}  # ffmpeg's names
+FORMATS = frozenset({*WRITTEN, ".avi", ".mts", ".ts"})  # suffixes of files that are read
+# encoders with their options; x264's weights of blocks (mbtree) are not reproducible
 _CODECS = {"libx264": {"crf": "18", "mbtree": "0"}, "libvpx-vp9": {"crf": "24", "b": "0"}, "ffv1": dict[str, str]()}
-_READ = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpegts"  # no playlists, which would have other files read
-_THREADS = 4  # of an encoder: what it makes depends on their number, and must not depend on the machine's
+_READ = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpegts"  # no playlists, which could read other files
+_THREADS = 4  # of an encoder: its output depends on their number, so fixed for all machines
 _CUT = 0.5  # seconds that may be missing at the end
-_COLOURS = ("color_range", "colorspace", "color_primaries", "color_trc")  # what the colours of a frame mean
+_COLOURS = ("color_range", "colorspace", "color_primaries", "color_trc")  # colour attributes of a frame
 
 
 def is_video(path: Path) -> bool:
-    """Whether its name says so."""
+    """Whether a path has the suffix of a video."""
     return path.suffix.lower() in FORMATS
 
 
 def written_suffix(path: Path) -> str:
-    """Return the suffix of a video that is made of another one."""
+    """Return the suffix of the video that is made from another one."""
     return path.suffix if path.suffix.lower() in WRITTEN else ".mkv"
 
 
 def require() -> Any:
-    """Return PyAV, or raise an ImportError that says how to install it."""
+    """Return PyAV; if it is missing, raise an ImportError with the line to install it."""
     return imported("av", "videos need PyAV", "video")
 
 
 @contextlib.contextmanager
 def _opened(path: Path) -> Iterator[tuple[Any, Any]]:
-    """Open a file, and yield it and its first video stream; errors of ffmpeg in the block are ValueErrors."""
+    """Open a file, and yield it and its first video stream; errors of ffmpeg in the block are raised as ValueError."""
     av = require()
     try:
         with av.open(os.fspath(path), options={"format_whitelist": _READ}) as container:
             if not container.streams.video:
-                raise ValueError(f"{path}: no video is in it")
+                raise ValueError(f"{path}: must have a video stream; got none")
             container.streams.video[0].thread_type = "AUTO"
             yield container, container.streams.video[0]
     except av.error.FFmpegError as error:
@@ -57,20 +57,20 @@ def _opened(path: Path) -> Iterator[tuple[Any, Any]]:
 
 
 def size_of(path: Path) -> tuple[int, int] | None:
-    """Return (height, width) of a video; None of anything else."""
+    """Return (height, width) of a video; None for any other file."""
     with contextlib.suppress(ValueError), _opened(path) as (_, stream):
         return stream.codec_context.height, stream.codec_context.width
     return None
 
 
 def count_of(path: Path) -> int | None:
-    """Return about how many frames it has; None if the file does not say it."""
+    """Return the approximate number of frames; None if the file has no length."""
     with _opened(path) as (container, stream):
         return stream.frames or round(_span(container)[1] * _rate(stream)) or None
 
 
 def frames(path: Path) -> Iterator[tuple[float, Any]]:
-    """Yield PyAV's frames as they are stored, each with its time in seconds from the first one."""
+    """Yield PyAV's frames as they are stored, each with its time in seconds after the first frame."""
     with _opened(path) as (container, stream):
         start = None
         for frame, _ in _decoded(container, stream):
@@ -79,9 +79,9 @@ def frames(path: Path) -> Iterator[tuple[float, Any]]:
 
 
 def _span(container: Any) -> tuple[float, float]:
-    """Return when a file begins, and how long it is, in seconds; 0 if it does not say it."""
+    """Return the start time and the length of a file in seconds; 0 if the file does not state them."""
     begin, length = ((value or 0) / 1e6 for value in (container.start_time, container.duration))
-    is_end = "matroska" in container.format.name  # which states its end instead
+    is_end = "matroska" in container.format.name  # Matroska states the end instead
     return begin, max(length - begin, 0.0) if is_end else length
 
 
@@ -90,7 +90,7 @@ def _rate(stream: Any) -> Fraction:
 
 
 def _decoded(container: Any, stream: Any, *others: Any) -> Iterator[tuple[Any, Any]]:
-    """Yield (frame, None) of a stream, time stamps growing, and (None, packet) of others, as they are stored."""
+    """Yield (frame, None) of a stream with increasing time stamps, and (None, packet) of others as stored."""
     last, count, step = None, 0, 1 / _rate(stream)
     for packet in container.demux(stream, *others):
         if packet.stream is not stream:
@@ -102,10 +102,10 @@ def _decoded(container: Any, stream: Any, *others: Any) -> Iterator[tuple[Any, A
         except require().error.InvalidDataError:
             if last is not None:
                 raise
-            continue  # a recording that begins between whole frames
+            continue  # the recording begins between key frames
         for frame in decoded:
             frame.time_base = frame.time_base or step
-            if container.format.name == "avi":  # whose stamps are those of the order in which frames are stored
+            if container.format.name == "avi":  # AVI's stamps are in storage order
                 frame.pts = round(count * step / frame.time_base)
             elif frame.pts is None:
                 frame.pts = 0 if last is None else last + round(step / frame.time_base)
@@ -123,15 +123,15 @@ def remake(
     crf: int | None = None,
     done: Callable[[], object] = lambda: None,
 ) -> dict[str, Any]:
-    """Write a video of warped frames, whole or not at all; return facts about the warp, and "frames", their number.
+    """Write a video of warped frames as a whole or not at all; return facts about the warp, and "frames", their number.
 
-    Frames are warped as nearly all are stored, in YUV of eight bits in 4:2:0, which is half the work of RGB.
+    Frames are warped in YUV of eight bits in 4:2:0, as nearly all are stored, which is half the work of RGB.
     `warp_of` returns the warp for frames of a (height, width) with its facts; `done` is called after each frame.
     """
     with _opened(source) as (container, stream):
         first = next((frame for frame, _ in _decoded(container, stream)), None)
     if first is None:
-        raise ValueError(f"{source}: no frame of it can be read")
+        raise ValueError(f"{source}: must have a readable frame; got none")
     warp, facts = warp_of((first.height, first.width))
     black = 0.0 if first.reformat(format="yuv420p").color_range == 2 else 16.0
 
@@ -178,13 +178,13 @@ def remake(
 
 
 def _planes(frame: Any) -> Iterator[np.ndarray[Any, Any]]:
-    """Yield the planes (H, W) of a frame, brightness and two colours of half the resolution; they share its memory."""
+    """Yield the planes (H, W) of a frame, brightness and two colours at half the resolution; they share its memory."""
     for plane in frame.planes:
         yield np.frombuffer(plane, np.uint8).reshape(-1, plane.line_size)[: plane.height, : plane.width]
 
 
 def _halved(camera: Camera) -> Camera:
-    """Return the camera of the colours, whose pixels are where the left ones of the image's pairs are, as in MPEG-2."""
+    """Return the camera of the colours, whose pixels lie at the left pixels of the image's pairs, as in MPEG-2."""
     height, width = (camera.height + 1) // 2, (camera.width + 1) // 2
     camera = camera.pad(0, 2 * width - camera.width, 0, 2 * height - camera.height).resize(height, width)
     shift = camera.intrinsics.new_tensor([0.0, 0.0, 0.25, 0.0])
@@ -197,11 +197,11 @@ def _new_stream(
     codec = codec or ("libvpx-vp9" if output.format.name == "webm" else "libx264")
     if codec == "libx264" and (camera.width % 2 or camera.height % 2):
         size = f"{camera.width}x{camera.height}"
-        raise ValueError(f"{target}: {size}, but {codec} wants even numbers; --size names them")
+        raise ValueError(f"{target}: size must be even for {codec}; got {size}. Set it with --size")
     try:
         stream = output.add_stream(codec, rate=rate, time_base=first.time_base)
     except ValueError as error:
-        raise ValueError(f"{target}: {error}; --codec names another encoder") from None
+        raise ValueError(f"{target}: {error}; choose another encoder with --codec") from None
     stream.width, stream.height, stream.pix_fmt = camera.width, camera.height, "yuv420p"
     like = first.reformat(format="yuv420p")
     for name in _COLOURS:
@@ -214,7 +214,7 @@ def _new_stream(
 
 
 def _copied_stream(output: Any, other: Any, source: Path, target: Path) -> Any:
-    """Return the stream of sound or subtitles in the new file."""
+    """Return the new file's stream for a stream of sound or subtitles."""
     try:
         copy = output.add_stream_from_template(other)
     except ValueError:

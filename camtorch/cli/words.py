@@ -1,4 +1,4 @@
-"""How options are read: types as argparse takes them."""
+"""Types of option values for argparse."""
 
 from __future__ import annotations
 
@@ -8,28 +8,28 @@ import re
 from collections.abc import Callable
 from pathlib import Path
 
-LENS, GUESS = "lens:", "guess:"  # in the place of a calibration file, before a real lens, or a guess in degrees
+LENS, GUESS = "lens:", "guess:"  # prefixes in place of a file: of a real lens, of a guess in degrees
 _LARGEST_SIDE = 32768  # pixels
 _UNITS = {"mm": 1e-3, "cm": 1e-2, "in": 0.0254, "m": 1.0}
 _WrongWord = argparse.ArgumentTypeError
 
 
 def path(text: str) -> Path:
-    """Return a path that a file can have."""
+    """Return the path of a file."""
     return Path(raw_path(text))
 
 
 def raw_path(text: str) -> str:
-    """Return a path as it was written: a slash at its end says that it is a folder."""
+    """Return a path as written: a slash at its end means a folder."""
     if not text or "\0" in text:
-        raise _WrongWord(f"{text!r} is no name of a file")
+        raise _WrongWord(f"the path must be a file name; got {text!r}")
     return text
 
 
 def suffix(text: str) -> str:
-    """Return a suffix, as ".png"."""
+    """Return a suffix, as in ".png"."""
     if not (text.startswith(".") and text[1:].isalnum()):
-        raise _WrongWord(f"{text!r} is no suffix, as .png is")
+        raise _WrongWord(f"must be a suffix, as in .png; got {text!r}")
     return text
 
 
@@ -37,30 +37,30 @@ def size(text: str) -> tuple[int, int]:
     """Return (height, width) of "WIDTHxHEIGHT"."""
     sides = re.fullmatch(r"0*([1-9][0-9]{0,4})[xX]0*([1-9][0-9]{0,4})", text)
     if not sides or max(map(int, sides.groups())) > _LARGEST_SIDE:
-        raise _WrongWord(f"{text!r} is not WIDTHxHEIGHT, as in 1280x720, each of 1 to {_LARGEST_SIDE} pixels")
+        raise _WrongWord(f"must be WIDTHxHEIGHT, as in 1280x720, each from 1 to {_LARGEST_SIDE} pixels; got {text!r}")
     return int(sides[2]), int(sides[1])
 
 
 def board(text: str) -> tuple[int, int]:
     """Return (columns, rows) of "COLUMNSxROWS"."""
     if not (counts := re.fullmatch(r"([0-9]{1,4})[xX]([0-9]{1,4})", text)):
-        raise _WrongWord(f"{text!r} is not COLUMNSxROWS, as in 9x6")
+        raise _WrongWord(f"must be COLUMNSxROWS, as in 9x6; got {text!r}")
     return int(counts[1]), int(counts[2])
 
 
 def count(most: int) -> Callable[[str], int]:
-    """Return what reads a whole number from 1 to `most`."""
+    """Return a parser of whole numbers from 1 to `most`."""
 
     def parse(text: str) -> int:
         if not (text.isascii() and text.isdigit() and 1 <= int(text) <= most):
-            raise _WrongWord(f"{text!r} is not a whole number from 1 to {most}")
+            raise _WrongWord(f"must be a whole number from 1 to {most}; got {text!r}")
         return int(text)
 
     return parse
 
 
 def _number(text: str) -> float:
-    """Return a number; NaN of what is none."""
+    """Return a number; NaN for other text."""
     try:
         return float(text)
     except ValueError:
@@ -68,9 +68,9 @@ def _number(text: str) -> float:
 
 
 def guess(text: str) -> Path:
-    """Return a guessed field of view in degrees, in the place of a calibration file."""
+    """Return a guessed field of view in degrees, with a prefix, in place of a calibration file."""
     if not 2 * math.pi < _number(text) <= 360:
-        raise _WrongWord(f"{text!r} is no field of view in degrees, as 120")
+        raise _WrongWord(f"must be a field of view in degrees, as in 120; got {text!r}")
     return Path(GUESS + text)
 
 
@@ -79,7 +79,5 @@ def length(text: str) -> float:
     unit = next((unit for unit in _UNITS if text.endswith(unit)), "")
     metres = _number(text.removesuffix(unit)) * _UNITS.get(unit, 1.0)
     if not 0 < metres < (math.inf if unit else 1.0):
-        raise _WrongWord(
-            f"{text!r} is no length above 0 with its unit, as 30mm, 3cm, 1in; without one it is in metres, below 1"
-        )
+        raise _WrongWord(f"must be a length with its unit, as in 30mm, 3cm, 1in, or in metres below 1; got {text!r}")
     return metres

@@ -1,6 +1,6 @@
-"""Images with their labels, sample by sample, for engines that spread them over workers: Ray Data, WebDataset, torch's.
+"""Images with their labels, one sample at a time, for loaders with workers: Ray Data, WebDataset and torch.
 
-What a sample becomes follows from the sample, its key, a seed and the epoch, whoever computes it beside whatever else.
+The result for a sample depends only on the sample, its key, a seed and the epoch, not on worker or batch.
 """
 
 from camtorch.data.columns import from_columns, to_columns

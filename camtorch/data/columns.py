@@ -16,17 +16,17 @@ PARTS = ("model", "intrinsics", "distortion", "image_size")
 
 
 def to_columns(camera: Camera, name: str = "camera") -> dict[str, Any]:
-    """A camera as numbers: `camera_model`, the key in `ct.MODELS`; `camera_intrinsics` (4,) fx, fy, cx, cy in pixels;
-    `camera_distortion` (n,); `camera_image_size` (2,), height and width.
+    """Return a camera as numbers: `camera_model`, the key in `ct.MODELS`; `camera_intrinsics` (4,) fx, fy, cx, cy;
+    `camera_distortion` (n,); `camera_image_size` (2,), height and width in pixels.
 
-    Of a batch of B cameras all have a row each: (B, 4) and so on.
+    For a batch of B cameras each value has B rows: (B, 4) and so on.
 
     Args:
-        camera: with an image_size, and one batch dim at most.
-        name: another one for "camera".
+        camera: A camera with an image_size, and at most one batch dim.
+        name: Prefix of the columns instead of "camera".
 
     Raises:
-        TypeError: no camera. ValueError: one without image_size, or of several batch dims.
+        TypeError: If `camera` is no camera. ValueError: If it has no image_size, or several batch dims.
     """
     if not isinstance(camera, Camera):
         raise TypeError(f"to_columns: camera must be a Camera; got {no_camera(camera)}")
@@ -43,17 +43,17 @@ def to_columns(camera: Camera, name: str = "camera") -> dict[str, Any]:
 
 
 def from_columns(columns: Mapping[str, Any], name: str = "camera") -> Camera | list[Camera]:
-    """The camera of a row, or those of a batch: a batch of cameras, or a list where models or sizes differ.
+    """Return the camera of a row, or of a batch: a batch of cameras, or a list if models or sizes differ.
 
     Args:
-        columns: with those of `to_columns`, and any others; `camera_distortion` may lack.
-        name: another one for "camera".
+        columns: Columns of `to_columns`, and any others; `camera_distortion` may be missing.
+        name: Prefix of the columns instead of "camera".
 
     Returns:
-        Cameras that do not learn, of the dtype of the columns.
+        Frozen cameras, with the dtype of the columns.
 
     Raises:
-        ValueError: columns that lack, or are not those of a camera.
+        ValueError: If columns are missing, or are not those of a camera.
     """
     if not isinstance(columns, Mapping):
         raise TypeError(f"from_columns: columns must be a dict of columns; got {type(columns).__name__}")
@@ -69,7 +69,7 @@ def from_columns(columns: Mapping[str, Any], name: str = "camera") -> Camera | l
 
 
 def camera_of(parts: Mapping[str, Any], owner: str) -> Camera:
-    """The frozen camera of model, intrinsics, distortion and image_size."""
+    """Return the frozen camera of model, intrinsics, distortion and image_size."""
     model = str(parts["model"])
     if model.partition(":")[0] not in MODELS:
         raise ValueError(f"{owner}: the model of a camera must be one of {', '.join(MODELS)}; got {model!r}")
@@ -80,6 +80,6 @@ def camera_of(parts: Mapping[str, Any], owner: str) -> Camera:
 
 
 def _numbers(values: Any) -> np.ndarray[Any, Any]:
-    """An array of its own; lists and arrays of objects are of float64."""
+    """Return a copy as an array; lists and arrays of objects become float64."""
     array = values.numpy() if isinstance(values, torch.Tensor) else np.asarray(values)
     return np.array(array, array.dtype if array.dtype.kind == "f" else np.float64)

@@ -31,15 +31,15 @@ from camtorch.poses.rotations import rotation_matrix
 from camtorch.values.arguments import LEFT, check_path, imported
 
 Json = dict[str, Any]
-Opened = tuple[Sequence[Any], TableLike | None]  # an entry for each sample, and the table of a mirror
+Opened = tuple[Sequence[Any], TableLike | None]  # an entry for each sample, and the table of mirrored landmarks
 
 _SUFFIXES = (".jpg", ".png", ".jpeg", ".bmp", ".JPG", ".PNG")
-_UP = 3  # folders above the labels in which images are looked for
-_UNLIKE = TypeError, KeyError, AttributeError, IndexError  # what reading JSON of another kind raises
+_UP = 3  # folders above the labels in which images are searched
+_UNLIKE = TypeError, KeyError, AttributeError, IndexError  # errors of reading JSON of another kind
 
 
 class Samples(Dataset[Sample]):
-    """The samples of a file or a folder of labels, each made when it is asked for; what `ct.data.read` returns.
+    """Samples of a file or a folder of labels, read on access, as returned by `ct.data.read`.
 
     `len(samples)`, `samples[i]` (from the end for negative i), and iteration; a data set of torch, so that
     `DataLoader`, `Subset` and `ConcatDataset` take it. No file stays open.
@@ -171,9 +171,9 @@ _TYPES = {1: "i1", 2: "u1", 3: "<i2", 4: "<u2", 5: "<i4", 6: "<u4", 7: "<f4", 9:
 
 
 def _matlab(path: Path) -> dict[str, np.ndarray[Any, Any]]:
-    """Return the arrays of numbers of a file of Matlab 5 to 7 by their names. Source: MAT-File Format, The MathWorks.
+    """Return the arrays of numbers of a file of Matlab 5 to 7 by name. Source: MAT-File Format, The MathWorks.
 
-    Not by scipy, whose reader ends the process at some damaged files.
+    scipy is not used: its reader crashes the process for some damaged files.
     """
     with path.open("rb") as file:
         content = file.read(_LARGEST)
@@ -192,7 +192,7 @@ def _matlab(path: Path) -> dict[str, np.ndarray[Any, Any]]:
 
 
 def _elements(content: bytes) -> Iterator[tuple[int, bytes]]:
-    """Yield the kind and the bytes of each element, of which small ones lie within eight bytes."""
+    """Yield the kind and the bytes of each element; small ones fit in eight bytes."""
     at = 0
     while at < len(content):
         kind, size = struct.unpack_from("<II", content, at)
@@ -253,7 +253,7 @@ def _vcd_sample(samples: Samples, entry: tuple[Json, str, str, str | None, int, 
 
 
 def _pinhole(height_px: int, width_px: int, **lens: Any) -> Camera:
-    """Return the camera of OpenLABEL's `intrinsics_pinhole`, or of VCD 4's, which says the shapes in its names."""
+    """Return the camera of OpenLABEL's `intrinsics_pinhole`, or of VCD 4's, whose names include shapes."""
     matrix = lens["camera_matrix" if "camera_matrix" in lens else "camera_matrix_3x4"]
     distortion = lens.get("distortion_coeffs", lens.get("distortion_coeffs_1xN")) or None
     K = np.reshape(matrix, (3, 4))[:, :3].astype(np.float64)  # noqa: N806
@@ -262,7 +262,7 @@ def _pinhole(height_px: int, width_px: int, **lens: Any) -> Camera:
 
 
 def _video_frame(path: Path, number: int) -> Tensor | None:
-    """Return a frame of a video of a constant rate, by its number from 0; None if it has not begun, or has ended."""
+    """Return a frame of a video with a constant rate by its number from 0; None before the begin or after the end."""
     av = imported("av", f"{path}: videos need PyAV", "video")
     errors = av.error.FFmpegError, IndexError, TypeError, ZeroDivisionError
     with _failing_at(path, "not a whole video: ", *errors), av.open(str(path)) as container:
@@ -279,7 +279,7 @@ def _video_frame(path: Path, number: int) -> Tensor | None:
 def _find(
     samples: Samples, place: object, name: Any, folders: Sequence[str] = (), suffixes: Sequence[str] = ("",)
 ) -> Path:
-    """Return an image: in `samples.images`, or beside the file that names it, also in `folders` there and higher up."""
+    """Return the path of an image in `samples.images`, or next to its labels, also in `folders` there and higher up."""
     parts = PurePosixPath(name if isinstance(name, str) and "\0" not in name else "")
     if parts.is_absolute() or ".." in parts.parts or not parts.name:
         raise ValueError(f"{place}: the name of a file within the folder of images was expected; got {name!r:.60}")
@@ -292,7 +292,7 @@ def _find(
                     return Path(file)
     where = f" or in {', '.join(map(repr, folders))} there or up to {_UP} folders above" if folders else ""
     ends = f" with one of {' '.join(suffixes[:4])}" if len(suffixes) > 1 else ""
-    hint = "; read(..., images=FOLDER) says where"
+    hint = "; give the folder with read(..., images=FOLDER)"
     raise ValueError(f"{place}: no file {name!r:.200}{ends} in {samples.images or f'{roots[0]}{where}{hint}'}")
 
 
@@ -349,7 +349,7 @@ _OF_SUFFIX = {".pts": "300w", ".mat": "300w_lp", ".txt": "wflw"}
 def read(
     path: str | os.PathLike[str], format: str | None = None, *, images: str | os.PathLike[str] | None = None
 ) -> Samples:
-    """The samples of a data set's label files, each made as it is asked for.
+    """Return the samples of a data set's label files, each read on access.
 
         samples = ct.data.read("300W/01_Indoor")
         flip = ct.augment.HorizontalFlip(landmarks=samples.landmarks)
@@ -376,18 +376,18 @@ def read(
       `frame_shift`; there is none before the video begins, after its end, and without `uri`.
 
     Args:
-        path: of a file or a folder.
-        format: one of these; by default the suffix, and of JSON its beginning, says it.
-        images: the folder of the images. By default they are looked for beside the labels, and those that labels name
+        path: Path of a file or a folder.
+        format: One of these. Default: chosen by the suffix, and for JSON by its beginning.
+        images: Folder of the images. By default they are searched next to the labels, and those that labels name
             also in folders of the data set's names, there or up to three folders above.
 
     Returns:
         Samples: `len`, `[i]`, iteration; `samples.landmarks` is the table that a mirror needs.
 
     Raises:
-        ValueError: a file that is not of the format, cut short, or in another encoding, here or when a sample is asked
-            for; the text names the file and the place. A format that is not known or not seen. FileNotFoundError: no
-            such path. ImportError: videos need PyAV, `pip install -e ".[video]"`.
+        ValueError: If a format is unknown, or a file not of it, cut short or in another encoding, also when a sample is
+            read; the text names the file and the place. FileNotFoundError: If there is no
+            such path. ImportError: If PyAV is missing for videos, `pip install -e ".[video]"`.
     """
     check_path(path, "read")
     found, folder = Path(path), None if images is None else Path(images)
@@ -404,7 +404,7 @@ def read(
 
 
 def _format_of(path: Path) -> str:
-    """Return the one format that suffixes, or the beginning of JSON, say."""
+    """Return the only format that fits the suffixes, or the beginning of JSON."""
     suffixes = {one.suffix.lower() for one in path.rglob("*")} - {".txt"} if path.is_dir() else {path.suffix.lower()}
     names = sorted(_OF_SUFFIX[suffix] for suffix in suffixes & _OF_SUFFIX.keys())
     if path.is_file() and not names:
@@ -413,5 +413,5 @@ def _format_of(path: Path) -> str:
         names = ["vcd" if keys[0] in (b"openlabel", b"vcd") else "coco"] if keys else []
     if len(names) != 1:
         seen = f"seems to be of {' and '.join(names) or 'no known format'}"
-        raise ValueError(f"read: {str(path)!r} {seen}; format= one of {', '.join(_FORMATS)} says which")
+        raise ValueError(f"read: {str(path)!r} {seen}; write format= one of {', '.join(_FORMATS)}")
     return names[0]

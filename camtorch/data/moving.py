@@ -1,4 +1,4 @@
-"""Rows and samples of arrays, moved one by one: what Ray Data's `map_batches` and WebDataset's `map` call."""
+"""Rows and samples of arrays, moved one by one, as called by Ray Data's `map_batches` and WebDataset's `map`."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ from camtorch.warp.proxy import ProxyWarp
 from camtorch.warp.warp import Warp
 
 Array: TypeAlias = "np.ndarray[Any, Any]"
-Batch = dict[str, Any]  # column -> an array or a list, of as many rows as all others
-Moves = Augmentation | FaceNormalizer | Warp  # what moves samples
+Batch = dict[str, Any]  # column -> an array or a list, all with as many rows
+Moves = Augmentation | FaceNormalizer | Warp  # transforms of samples
 _ENDINGS = ("jpg", "jpeg", "png", "webp", "ppm", "pgm", "tif", "tiff", "bmp", "npy")
 
 
 class Always(Augmentation):
-    """One warp, for every sample: the same map each time."""
+    """A single warp that is applied to every sample."""
 
     warp: Warp
 
@@ -47,7 +47,7 @@ class Always(Augmentation):
 
 
 class Mover:
-    """Moves single samples of arrays by their keys; the common part of `MapBatches` and `MapSamples`."""
+    """Common part of `MapBatches` and `MapSamples`: moves single samples of arrays by their keys."""
 
     def __init__(self, transform: Moves, seed: int, epoch: int, fields: Mapping[str, str] | None):
         self._owner = owner = type(self).__name__
@@ -67,12 +67,12 @@ class Mover:
             raise TypeError(f"{owner}: transform must be an augmentation or a Warp; got {type(transform).__name__}")
 
     def set_epoch(self, epoch: int) -> None:
-        """Draw for this epoch from now on; workers and engines that were given a copy before do not hear of it."""
+        """Set the epoch of the draws; copies that workers and engines already have are not changed."""
         if self._seeded is not None:
             self._seeded.set_epoch(epoch)
 
     def _moved(self, key: Key | None, row: Mapping[str, Any]) -> Sample:
-        """What changes of a row of arrays or lists: fields that move, what is valid of them, `rotation`, `camera`."""
+        """Return the changed fields of a row of arrays or lists: moved fields, their validity, `rotation`, `camera`."""
         try:
             moving = {name: value for name, value in row.items() if self._moves(name, value)}
             kinds = {name: kind_of(name, value, self._fields, self._owner) or "" for name, value in moving.items()}
@@ -88,23 +88,23 @@ class Mover:
             raise kind(f"{self._owner}: {which}{str(error).removeprefix(f'{self._owner}: ')}") from error
 
     def _moves(self, name: str, value: object) -> bool:
-        """Whether a value is a field that moves, or says what is valid of one."""
+        """Whether a value is a field that moves, or the validity of one."""
         if name == "camera" or value is None:
             return False
         return name.endswith("_valid") or kind_of(name, value, self._fields, self._owner) is not None
 
     def _camera(self, parts: Mapping[str, Any], fields: Sample) -> Camera:
-        """The camera of its numbers, and the size of an image where they do not say it."""
+        """Return the camera of its numbers, with the size of an image if it has none."""
         if parts.get("image_size") is None:
             images = (v for n, v in fields.items() if kind_of(n, v, self._fields, self._owner) in IMAGES)
             parts = {**parts, "image_size": next((v.shape[:2] for v in images if np.ndim(v) in (2, 3)), None)}
         if missing := [part for part in ("model", "intrinsics", "image_size") if parts.get(part) is None]:
-            raise ValueError(f"the camera has no {', '.join(missing)}; ct.data.to_columns tells all of it")
+            raise ValueError(f"the camera has no {', '.join(missing)}; ct.data.to_columns has all of it")
         return camera_of({part: _dense(part, value) for part, value in parts.items()}, self._owner)
 
 
 def _dense(name: str, value: Any, kind: str = "") -> Any:
-    """An array of numbers, or of bool for validity, where it came as lists, or as arrays in an array of objects."""
+    """Return lists, or arrays in an array of objects, as an array of numbers, or of bool for validity."""
     if isinstance(value, list):
         try:
             array = np.asarray(value, bool if name.endswith("_valid") else np.float64)
@@ -121,7 +121,7 @@ def _dense(name: str, value: Any, kind: str = "") -> Any:
 
 
 class MapBatches(Mover):
-    """Augments, or warps, batches of rows: the function of Ray Data's `map_batches`, and of whatever calls like it.
+    """Augmentation or warp of batches of rows: the function for Ray Data's `map_batches` and similar callers.
 
         rows = ray.data.read_images("images/", include_paths=True)
         rows = rows.map_batches(ct.data.MapBatches(augment, key="path", seed=0), batch_size=32)
@@ -150,7 +150,7 @@ class MapBatches(Mover):
         fields: column -> kind, for columns of other names; "keep" passes one on as it is. See `Augmentation`.
 
     Raises:
-        TypeError: nothing that moves samples. ValueError: no key for what draws.
+        TypeError: If `transform` moves no samples. ValueError: If it draws, and there is no key.
     """
 
     def __init__(
@@ -174,10 +174,10 @@ class MapBatches(Mover):
             )
 
     def __call__(self, batch: Mapping[str, Any]) -> Batch:
-        """A batch, moved row by row.
+        """Return a batch, moved row by row.
 
         Raises:
-            ValueError: columns of several lengths, no column of the key, and what the augmentation raises. TypeError:
+            ValueError: If columns differ in length, the key is missing, or an augmentation raises. TypeError: If it is
                 no dict of columns.
         """
         if not isinstance(batch, Mapping) or not all(hasattr(column, "__len__") for column in batch.values()):
@@ -214,14 +214,14 @@ def _is_objects(column: Any) -> bool:
 
 
 def _column(values: list[Any]) -> Array:
-    """Rows as one array, of objects where their shapes or types differ."""
+    """Return rows as one array, of objects if their shapes or types differ."""
     if len({(getattr(v, "shape", None), getattr(v, "dtype", type(v))) for v in values}) == 1 and values[0] is not None:
         return np.stack(values) if isinstance(values[0], np.ndarray) else np.asarray(values)
     return np.fromiter(values, object)
 
 
 class MapSamples(Mover):
-    """Augments, or warps, samples of a WebDataset pipeline, one by one: the function of its `.map`.
+    """Augmentation or warp of single samples of a WebDataset pipeline: the function for its `.map`.
 
         samples = wds.WebDataset("train-{00..15}.tar").decode("rgb8")
         samples = samples.map(ct.data.MapSamples(augment, seed=0))
@@ -248,7 +248,7 @@ class MapSamples(Mover):
         fields: name -> kind, for entries and labels of other names; "keep" passes one on as it is.
 
     Raises:
-        TypeError: nothing that moves samples.
+        TypeError: If `transform` moves no samples.
     """
 
     def __init__(
@@ -268,10 +268,10 @@ class MapSamples(Mover):
         self._key, self._labels = key, labels
 
     def __call__(self, sample: Mapping[str, Any]) -> dict[str, Any]:
-        """A sample, moved.
+        """Return a sample, moved.
 
         Raises:
-            ValueError: no key, images that are not decoded, and what the augmentation raises. TypeError: no dict.
+            ValueError: If key or decoding is missing, or the augmentation raises one. TypeError: If it is no dict.
         """
         owner = self._owner
         if not isinstance(sample, Mapping):
@@ -305,7 +305,7 @@ class MapSamples(Mover):
         return result
 
     def _field(self, entry: str, value: Any) -> str | None:
-        """The field that an entry holds, or None if it is passed on."""
+        """Return the field that an entry holds, or None if it is passed on."""
         owner, (stem, _, ending) = self._owner, entry.rpartition(".")
         if entry in self._fields or entry.startswith("__") or entry in (self._key, self._labels):
             return entry if entry in self._fields else None
@@ -327,5 +327,5 @@ class MapSamples(Mover):
 
 
 def _plain(value: Any) -> Any:
-    """Of Python's own types, as JSON takes them."""
+    """Return a value in Python's own types, as JSON needs them."""
     return value.tolist() if isinstance(value, (np.ndarray, np.generic)) else value

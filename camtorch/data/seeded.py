@@ -1,4 +1,4 @@
-"""Draws that follow from the key of a sample, and from neither its batch, nor its worker, nor what came before it."""
+"""Draws that depend only on the key of a sample, not on its batch, its worker or earlier samples."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ from camtorch.augment.sample import Sample
 from camtorch.values.arguments import as_whole
 
 Key = int | str | Sequence["int | str"]
-"""What names a sample: its index, its path, or a tuple of several of these."""
+"""Name of a sample: its index, its path, or a tuple of several of these."""
 
 
 def generator(key: Key, *, seed: int = 0, epoch: int = 0) -> torch.Generator:
-    """A generator for one sample, the same on every machine, to draw from by `augmentation(..., generator=...)`.
+    """Return a generator for one sample, the same on every machine, for `augmentation(..., generator=...)`.
 
     Args:
-        key: of the sample, the same whenever it comes; a tuple, as of a path and a number, is one key.
-        seed: of the whole run.
-        epoch: so that a sample is drawn anew in each of them.
+        key: Key of the sample, the same in each epoch; a tuple, as of a path and a number, is one key.
+        seed: Seed of the whole run.
+        epoch: Epoch, so that a sample is drawn anew in each one.
 
     Raises:
-        TypeError: a key that is neither an integer nor a string nor a tuple of them; a seed or an epoch that is no
-            integer. ValueError: a negative one.
+        TypeError: If the key is neither an integer nor a string nor a tuple of them, or seed or epoch is no
+            integer. ValueError: If seed or epoch is negative.
     """
     numbers = _number(seed, "seed"), _number(epoch, "epoch")
     digest = hashlib.blake2b(repr((*numbers, _plain(key))).encode(), digest_size=8).digest()
@@ -43,7 +43,7 @@ def _number(value: int, name: str) -> int:
 
 
 def _plain(key: object) -> object:
-    """The key of Python's own types, whatever library it comes from."""
+    """Return a key of any library as Python's own types."""
     if isinstance(key, (np.ndarray, Tensor)) and key.ndim == 0:
         key = key.item()
     if isinstance(key, (tuple, list)) and key:
@@ -59,10 +59,10 @@ def _plain(key: object) -> object:
 
 
 class Seeded:
-    """An augmentation whose draw for a sample follows from the sample's key, a seed and the epoch alone.
+    """An augmentation whose draw for a sample depends only on the sample's key, a seed and the epoch.
 
-    So it does not matter which process, rank or worker takes the sample, in which batch, after which others, or after
-    an interruption: there is no state of a generator to be saved. In a dataset, `augment(image=..., key=index)`; of a
+    Processes, ranks, workers, batches, the order of samples and interruptions do not change it, and no
+    generator state must be saved. In a dataset, `augment(image=..., key=index)`; for a
     batch, with its keys as a list or a tensor, `augment(batch, key=batch["index"])`, drawn as one by one.
 
         augment = ct.data.Seeded(ct.augment.RandomMount(camera=camera), seed=0)
@@ -71,12 +71,12 @@ class Seeded:
             for batch in loader: ...
 
     Args:
-        augmentation: an `Augmentation`, or a `Transform` of `camtorch.augment.numpy`.
-        seed: of the whole run, the same in all ranks.
-        epoch: the first.
+        augmentation: An `Augmentation`, or a `Transform` of `camtorch.augment.numpy`.
+        seed: Seed of the whole run, the same in all ranks.
+        epoch: First epoch.
 
     Raises:
-        TypeError: another kind of transform. ValueError: one that draws for whole batches (`same_on_batch`).
+        TypeError: If it is another transform. ValueError: If it draws for whole batches (`same_on_batch`).
     """
 
     augmentation: Transform | Augmentation
@@ -89,31 +89,31 @@ class Seeded:
                 f"{type(inner).__name__}"
             )
         if inner.same_on_batch:
-            raise ValueError("Seeded: same_on_batch=True draws by the batch, and here no draw depends on the batch")
+            raise ValueError("Seeded: same_on_batch must be False, because no draw depends on the batch here; got True")
         self.augmentation, self._inner = augmentation, inner
-        # in memory that processes share, for those which have begun already
+        # in shared memory, so that running processes see a new epoch
         self._numbers = torch.tensor([_number(seed, "seed"), _number(epoch, "epoch")]).share_memory_()
 
     @property
     def seed(self) -> int:
-        """Of the whole run."""
+        """Seed of the whole run."""
         return int(self._numbers[0])
 
     @property
     def epoch(self) -> int:
-        """The present one."""
+        """Current epoch."""
         return int(self._numbers[1])
 
     def set_epoch(self, epoch: int) -> None:
-        """Draw for this epoch from now on, here and in the workers of a DataLoader; between two of its iterations."""
+        """Set the epoch of the draws, also in the workers of a DataLoader; call it between two iterations."""
         self._numbers[1] = _number(epoch, "epoch")
 
     def generator(self, key: Key) -> torch.Generator:
-        """The generator of a sample."""
+        """Return the generator of a sample."""
         return generator(key, seed=self.seed, epoch=self.epoch)
 
     def draw(self, keys: Sequence[Key] | Tensor | np.ndarray[Any, Any]) -> dict[str, Tensor]:
-        """The draw of a batch of samples, `augmentation.draw` of each one by itself."""
+        """Return the draws of a batch of samples, each drawn by itself with `augmentation.draw`."""
         if not (draws := [self._inner.draw(1, self.generator(key)) for key in keys]):
             return self._inner.draw(0)
         return {name: torch.cat([draw[name] for draw in draws]) for name in draws[0]}

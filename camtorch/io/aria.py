@@ -12,7 +12,7 @@ from camtorch.io.writing import Lossy, as_json
 
 NAMES = Names("aria", "Aria", (".json",))
 
-# Projection.Name -> key, how many focal lengths, how many coefficients
+# Projection.Name -> key, number of focal lengths, number of coefficients
 _MODELS = {
     "FisheyeRadTanThinPrism": ("fisheye624", 1, 12),
     "Fisheye62": ("fisheye62", 1, 8),
@@ -23,12 +23,12 @@ _MODELS = {
 
 
 def matches(keys: dict[str, Any]) -> bool:
-    """Whether these are the keys of such a file."""
+    """Whether the keys are those of an Aria file."""
     return "CameraCalibrations" in keys
 
 
 def parse(record: Record) -> Rig:
-    """The cameras by their labels; the rig is the device. `MaxSolidAngle`, IMUs and the rest are not read."""
+    """Return the cameras by their labels; the rig is the device. `MaxSolidAngle`, IMUs and other keys are not read."""
     cameras, extrinsics = {}, {}
     record.few(len(record["CameraCalibrations"]))
     for entry in record["CameraCalibrations"]:
@@ -55,7 +55,7 @@ def parse(record: Record) -> Rig:
 
 
 def render(rig: Rig, lossy: Lossy) -> str:
-    """The text of a file that projectaria_tools reads."""
+    """Return the text of a file that projectaria_tools reads."""
     entries = []
     for name, extrinsics in lossy.all_posed(rig).items():
         camera = rig.cameras[name]
@@ -86,7 +86,7 @@ def render(rig: Rig, lossy: Lossy) -> str:
         "CameraCalibrations": entries,
         "DeviceClassInfo": {"BuildVersion": "DVT-S", "DeviceClass": "Aria"},
         "FileFormat": {"Tags": [], "Timestamp": "", "UnixTime": 0, "Version": 3},
-        # projectaria_tools takes no other origin, be there such a camera or not
+        # projectaria_tools accepts no other origin, even if the file has no such camera
         "OriginSpecification": {"ChildLabel": "camera-slam-left", "Type": "Custom"},
         "Serial": "",
     }

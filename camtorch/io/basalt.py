@@ -22,7 +22,7 @@ _MODELS = {
     "fov": ("fov", ("w",)),
     "pinhole-radtan8": ("brown_conrady", ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")),
 }
-# Calibration's own constructor: what a file must have, and a rig of cameras does not know
+# required by the constructor of Basalt's Calibration; a rig of cameras has no such values
 _IMU = {
     "calib_accel_bias": [0.0] * 9,
     "calib_gyro_bias": [0.0] * 12,
@@ -37,17 +37,17 @@ _IMU = {
 
 
 def matches(keys: dict[str, Any]) -> bool:
-    """Whether these are the keys of such a file."""
+    """Whether the keys are those of a Basalt file."""
     return isinstance(keys.get("value0"), dict)
 
 
 def parse(record: Record) -> Rig:
-    """The cameras, cam0, cam1, ...; the rig is the IMU. IMU, vignette and the valid radius `rpmax` are not read."""
+    """Return the cameras cam0, cam1, ...; the rig is the IMU. IMU, vignette and the radius `rpmax` are not read."""
     record = record["value0"]
     models, sizes, places = (list(record[key]) for key in ("intrinsics", "resolution", "T_imu_cam"))
     for key, items in (("resolution", sizes), ("T_imu_cam", places)):
         if len(items) != len(models):
-            record[key].fail(f"{len(items)} of them for {len(models)} cameras")
+            record[key].fail(f"must have one entry a camera; got {len(items)} for {len(models)} cameras")
     record.few(len(models))
     cameras, extrinsics = {}, {}
     for i, (model, size, place) in enumerate(zip(models, sizes, places, strict=True)):
@@ -61,7 +61,7 @@ def parse(record: Record) -> Rig:
 
 
 def render(rig: Rig, lossy: Lossy) -> str:
-    """The text of a file; the cameras lose their names, and the IMU is Basalt's default."""
+    """Return the text of a file; the cameras lose their names, and the IMU gets Basalt's defaults."""
     placed, models, sizes = [], [], []
     for name, extrinsics in lossy.all_posed(rig).items():
         camera = rig.cameras[name]

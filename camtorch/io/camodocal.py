@@ -11,7 +11,7 @@ NAMES = Names("camodocal", "camodocal")
 
 _GROUPS = ("mirror_parameters", "distortion_parameters", "projection_parameters")
 _RADTAN = ("k1", "k2", "p1", "p2")
-# model_type -> key, the names of the coefficients by their groups, the last one of which has the intrinsics
+# model_type -> key, names of the coefficients by their groups; the last group has the intrinsics
 _MODELS = {
     "MEI": ("mei", (("xi",), _RADTAN, ("gamma1", "gamma2", "u0", "v0"))),
     "PINHOLE": ("brown_conrady", ((), _RADTAN, ("fx", "fy", "cx", "cy"))),
@@ -20,12 +20,12 @@ _MODELS = {
 
 
 def matches(keys: dict[str, Any]) -> bool:
-    """Whether these are the keys of such a file."""
+    """Whether the keys are those of a camodocal file."""
     return "model_type" in keys and "projection_parameters" in keys
 
 
 def parse(record: Record) -> Rig:
-    """The camera by its name; where that is empty, "camera"."""
+    """Return the camera by its name, or as "camera" if the name is empty."""
     key, names = _MODELS[one_of(record["model_type"], _MODELS)]
     groups = [(record[group], there) for group, there in zip(_GROUPS, names, strict=True) if there]
     values = [group[name].number() for group, there in groups for name in there]

@@ -30,12 +30,12 @@ _OF_POSES = "rotation", "translation", "dtype"
 
 
 def matches(keys: dict[str, Any]) -> bool:
-    """Whether these are the keys of such a file."""
+    """Whether the keys are those of a camtorch file."""
     return "camtorch" in keys
 
 
 def parse(record: Record) -> Rig:
-    """The cameras, their poses and the images that they took."""
+    """Return the cameras, their poses and the names of the posed images."""
     record["camtorch"].whole(1, _VERSION, f"version that this camtorch reads, which is up to {_VERSION}")
     record["cameras"].few(len(record["cameras"].keys()))
     cameras = {name: _camera(record["cameras"][name]) for name in record["cameras"].keys()}  # noqa: SIM118
@@ -45,7 +45,7 @@ def parse(record: Record) -> Rig:
         if "camera" in (entry := record["extrinsics"][name]):
             images[name] = entry["camera"].text()
         if images.get(name, name) not in cameras:
-            entry.fail(f"of the camera {images.get(name, name)!r:.60}, which is not in the file")
+            entry.fail(f"camera must be in the file; got {images.get(name, name)!r:.60}")
         extrinsics[name] = _vectors(entry)
     if extrinsics and extrinsics.keys() == images.keys() and all(t.ndim == 1 for _, t in extrinsics.values()):
         batch = _pose(*map(torch.stack, zip(*extrinsics.values(), strict=True)))
@@ -54,7 +54,7 @@ def parse(record: Record) -> Rig:
 
 
 def made_of(kind: type[Made], d: Mapping[str, Any]) -> Made:
-    """Return the camera or the pose of a dict as `dict_of` makes it, frozen; a CameraFileError names a wrong key."""
+    """Return the camera or pose of a dict made by `dict_of`, frozen; a CameraFileError names a wrong key."""
     record = Record(f"{kind.__name__}.from_dict", _plain(d))
     is_camera = issubclass(kind, Camera)
     known = _OF_CAMERAS if is_camera else _OF_POSES
@@ -69,7 +69,7 @@ def made_of(kind: type[Made], d: Mapping[str, Any]) -> Made:
 
 
 def _plain(value: Any) -> Any:
-    """Return what JSON would give, of other mappings and sequences too, as those of configurations are."""
+    """Return a value as JSON would load it; configurations have other mappings and sequences."""
     if isinstance(value, Mapping):
         return {key: _plain(item) for key, item in value.items()}
     if is_list(value):
@@ -86,7 +86,7 @@ def _vectors(record: Record) -> tuple[Tensor, Tensor]:
 
 
 def _pose(rotation: Tensor, translation: Tensor) -> Extrinsics:
-    """Of vectors that are no matrices, and of any length, as they learnt."""
+    """Return the pose of rotation vectors of any length, as trained, which need no conversion to matrices."""
     pose = Extrinsics(torch.zeros_like(rotation[..., None]), translation)
     return remade(pose, rotation=nn.Parameter(rotation.expand(pose.rotation.shape).clone()))
 
@@ -107,32 +107,32 @@ def _camera(record: Record) -> Camera:
         size = (height, width)
     _same_batch(record, *arguments)
     try:
-        return kind(nn.Parameter(arguments[0]), *arguments[1:], image_size=size)  # what was cut out may be off centre
+        return kind(nn.Parameter(arguments[0]), *arguments[1:], image_size=size)  # crops may be off centre
     except (ValueError, TypeError) as error:
         return record.fail(error)
 
 
 def _same_batch(record: Record, *tensors: Tensor) -> None:
-    """Refuse batch dims that would grow when they are broadcast: a small file is not to take much memory."""
+    """Refuse batch dims that would grow when they are broadcast: a small file must not take much memory."""
     if len(shapes := {tuple(t.shape[:-1]) for t in tensors} - {()}) > 1:
         record.fail(f"batch dims that differ: {', '.join(map(str, sorted(shapes)))}")
 
 
 def _tensor(record: Record, last: int) -> Tensor:
-    """Numbers (*B, last), of any last dim if that is 0."""
+    """Return numbers (*B, last); any last dim is accepted if `last` is 0."""
     try:
         values = torch.tensor(record.value, dtype=torch.float64)
     except (ValueError, TypeError, RuntimeError) as error:
         record.fail(f"not numbers (*B, {last}): {error}")
     if not 0 < values.ndim <= _DEEPEST_BATCH or values.shape[-1] != (last or values.shape[-1]):
-        record.fail(f"numbers (*B, {last or 'n'}); these are {tuple(values.shape)}")
+        record.fail(f"must be numbers (*B, {last or 'n'}); got {tuple(values.shape)}")
     if not bool(values.isfinite().all()):
         record.fail("numbers that are not finite")
     return values
 
 
 def render(rig: Rig, lossy: Lossy) -> str:
-    """The text of a file. Numbers are float64, which holds those of a float32 camera exactly."""
+    """Return the text of a file. Numbers are float64, which holds those of a float32 camera exactly."""
     cameras = {name: _entry(camera, lossy, name) for name, camera in rig.cameras.items()}
     extrinsics = {name: _entry(pose, lossy, name) for name, pose in rig.extrinsics.items()}
     for name, entry in extrinsics.items():
@@ -142,12 +142,12 @@ def render(rig: Rig, lossy: Lossy) -> str:
 
 
 def dict_of(one: Camera | Extrinsics) -> dict[str, Any]:
-    """Return a camera or a pose as a file has it, and its dtype if that is not float64."""
+    """Return a camera or a pose as entries of a file, with its dtype if that is not float64."""
     owner = f"{type(one).__name__}.to_dict"
     if isinstance(one, Camera) and one.is_mixed:
-        raise TypeError(f"{owner}: a dict has one model; [camera.to_dict() for camera in mixed] has all")
+        raise TypeError(f"{owner}: camera must be of one model; got a Mixed. Write [c.to_dict() for c in mixed]")
     if isinstance(one, Camera) and not one.key:
-        raise TypeError(f"{owner}: {type(one).__name__} has no key of its own to be loaded by")
+        raise TypeError(f"{owner}: the model must have a key; got {type(one).__name__} without one")
     entry = _entry(one, Lossy(owner, NAMES.title), "numbers")
     dtype = str(functools.reduce(torch.promote_types, [getattr(one, name).dtype for name in one.tensor_names]))
     return entry if dtype == "torch.float64" else {**entry, "dtype": dtype.removeprefix("torch.")}

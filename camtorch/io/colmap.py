@@ -1,6 +1,6 @@
-"""COLMAP's cameras.txt and cameras.bin, and the poses of images.txt and images.bin beside them.
+"""COLMAP's cameras.txt and cameras.bin, and the poses of images.txt and images.bin in the same folder.
 
-Pixel centres are at 0.5 there. Poses are camera from world, as here.
+COLMAP puts pixel centres at 0.5. Its poses are camera from world, as in camtorch.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from camtorch.io.writing import Lossy, number
 
 NAMES = Names("colmap", "COLMAP", (".txt", ".bin"), ("*.txt", "*.bin"), ("cameras.bin", "cameras.txt"))
 
-# model -> id, key, how many focal lengths, how many coefficients; where a smaller model comes first
+# model -> id, key, number of focal lengths, number of coefficients; smaller models come first
 _MODELS = {
     "SIMPLE_PINHOLE": (0, "pinhole", 1, 0),
     "PINHOLE": (1, "pinhole", 2, 0),
@@ -46,11 +46,11 @@ _MODELS = {
     "EUCM": (16, "eucm", 2, 2),
     "EQUIRECTANGULAR": (17, "equirectangular", 0, 0),
 }
-# how many coefficients the camera has of a model that leaves some of them out
+# number of coefficients of the camera if a model leaves some of them out
 _COUNTS = {"SIMPLE_RADIAL": 4, "RADIAL": 4, "SIMPLE_FISHEYE": 1, "FISHEYE": 1}
 _IDS = {values[0]: name for name, values in _MODELS.items()}
 _MOST_WORDS = 32
-_LINE = re.compile(rb"^[^\S\n]*([^\s#][^\n]*)", re.MULTILINE)  # no comment
+_LINE = re.compile(rb"^[^\S\n]*([^\s#][^\n]*)", re.MULTILINE)  # skips comments
 _CAMERA = re.compile(rb"\d+\s+[A-Z][A-Z0-9_]*\s+\d+\s+\d+(?:\s|$)")
 
 _HEAD = struct.Struct("<I7dI")
@@ -59,17 +59,17 @@ _MOST_COMMENTS = 10_000  # and blank lines, before the first image or between tw
 _MOST_IMAGES = 1 << 18  # each takes some 400 bytes
 _LONGEST_NAME = 4096
 _LONGEST_LINE = 1 << 26
-_LARGEST_ID = (1 << 32) - 2  # of cameras; the one above means none
+_LARGEST_ID = (1 << 32) - 2  # of cameras; the next integer means no camera
 
 
 def matches(path: str, content: bytes) -> bool:
-    """Whether a file is a cameras.bin, by its name, or a cameras.txt: its first line without # is a camera."""
+    """Whether a file is a cameras.bin, by its name, or a cameras.txt, by its first line without #."""
     first = _LINE.search(content)
     return path.endswith(".bin") or (first is not None and _CAMERA.match(first[1]) is not None)
 
 
 def read(path: str, content: bytes) -> Rig:
-    """The cameras, called by their ids, and the poses of the images beside them, by the names of the images."""
+    """Return the cameras by their ids, and the poses of the images in the same folder by the names of the images."""
     cameras = _from_bytes(path, content) if path.endswith(".bin") else _from_text(path, content)
     beside = _images_beside(path)
     if beside is None or not os.path.exists(beside):
@@ -84,7 +84,7 @@ def read(path: str, content: bytes) -> Rig:
 
 
 def _images_beside(path: str) -> str | None:
-    """The file of poses that belongs to a file of cameras, which COLMAP calls cameras.txt or cameras.bin."""
+    """Return the path of the poses that belong to a file named cameras.txt or cameras.bin; None for other names."""
     folder, name = os.path.split(path)
     stem, suffix = os.path.splitext(name)
     return os.path.join(folder, f"images{suffix}") if stem == "cameras" else None
@@ -163,11 +163,11 @@ def _add(
     cameras[str(identity)] = record.camera(key, intrinsics, distortion, size)
 
 
-# -- images.txt and images.bin: the poses of images, whose points are passed over
+# -- images.txt and images.bin: the poses of images; points are skipped
 
 
 def _read_images(path: str) -> tuple[dict[str, str], np.ndarray, bool, Callable[[int], Record]]:
-    """Return the cameras of images by their names, poses (N, 7), whether there are points, and the places of rows."""
+    """Return camera ids by image name, poses (N, 7), whether images have points, and the function from row to place."""
     check_ordinary(path)
     unit, entries = ("byte", _images_from_bytes) if path.endswith(".bin") else ("line", _images_from_text)
     images: dict[str, str] = {}
@@ -209,7 +209,7 @@ def _images_from_text(path: str, file: BinaryIO) -> Iterator[_ImageEntry]:
         try:
             pose, camera = list(map(float, words[1:8])), int(words[8])
         except ValueError:
-            record.fail(f"seven numbers and the id of a camera were expected; got {words[1:9]!r:.100}")
+            record.fail(f"an image must have seven numbers and a camera id; got {words[1:9]!r:.100}")
         name = _text(record, words[9].strip())
         points = file.readline(_LONGEST_LINE)  # of the image; the line may be empty
         yield number, pose, str(camera), name, not (points.isspace() or not points)
@@ -250,7 +250,7 @@ def _images_from_bytes(path: str, file: BinaryIO) -> Iterator[_ImageEntry]:
 
 
 def render(rig: Rig, lossy: Lossy) -> dict[str, bytes]:
-    """The files of a rig: cameras, each of the smallest model that holds it, and images beside them if it has poses."""
+    """Return the files of a rig by path: cameras in the smallest models that hold them, and images if it has poses."""
     ids = [int(name) if re.fullmatch(r"0|[1-9]\d{0,9}", name) else -1 for name in rig.cameras]
     if not all(0 <= i <= _LARGEST_ID for i in ids):
         ids = list(range(1, len(ids) + 1))
@@ -259,7 +259,7 @@ def render(rig: Rig, lossy: Lossy) -> dict[str, bytes]:
     for name, camera in rig.cameras.items():
         height, width = lossy.size(name, camera)
         entries.append((identities[name], *_smallest(lossy, name, camera), width, height))
-    if not (path := lossy.path).endswith(NAMES.suffixes):  # a folder that is not there yet
+    if not (path := lossy.path).endswith(NAMES.suffixes):  # a folder that does not exist yet
         path = os.path.join(path, "cameras.txt")
     binary = path.endswith(".bin")
     contents = {path: (_as_bytes if binary else _as_text)(entries)}
@@ -270,7 +270,7 @@ def render(rig: Rig, lossy: Lossy) -> dict[str, bytes]:
             way = f"call the file cameras{suffix}, or name a folder"
             lossy.fail("extrinsics", f"no place: COLMAP has them in images{suffix} beside cameras, so {way}")
         contents[beside] = _images_content(lossy, rig, identities, beside, binary)
-        # COLMAP opens no folder without its points
+        # COLMAP opens a folder only if it has a file of points
         if not os.path.exists(points := os.path.join(os.path.dirname(path), f"points3D{suffix}")):
             contents[points] = struct.pack("<Q", 0) if binary else b"# Number of points: 0\n"
     elif beside is not None and os.path.exists(beside):
@@ -279,7 +279,7 @@ def render(rig: Rig, lossy: Lossy) -> dict[str, bytes]:
 
 
 def _smallest(lossy: Lossy, name: str, camera: Camera) -> tuple[str, list[float]]:
-    """The smallest model whose camera has these values and this many coefficients, and its parameters."""
+    """Return the smallest model that holds a camera's values and number of coefficients, and its parameters."""
     key, (fx, fy, cx, cy), distortion = lossy.model(name, camera, {values[1] for values in _MODELS.values()})
     if key == "equirectangular":
         height, width = lossy.size(name, camera)
@@ -319,7 +319,7 @@ def _as_bytes(entries: list[tuple[Any, ...]]) -> bytes:
 
 
 def _images_content(lossy: Lossy, rig: Rig, identities: dict[str, int], path: str, binary: bool) -> bytes:
-    """Return the file of a rig's poses; refuse to lose the points of a file that is there."""
+    """Return the file of a rig's poses; refuse to overwrite a file with points."""
     entries = []
     for name, values in zip(rig.extrinsics, poses.quaternions(poses.all_of(rig, lossy)).tolist(), strict=True):
         if not name or "\0" in name or (not binary and (name.split() != [name])):

@@ -1,6 +1,6 @@
-"""`load` and `save`: each format is asked whether a file is its own; none is known here but by its module.
+"""`load` and `save`: each format decides whether a file is its own; formats are known only by their modules.
 
-To add a format, write one file beside this one, as the protocols say, and name it in one of the lists below them.
+To add a format, write one file in this folder that follows the protocols, and name it in one of the lists below.
 """
 
 from __future__ import annotations
@@ -39,33 +39,33 @@ Kind = TypeVar("Kind", bound=Camera)
 
 
 class Format(Protocol):
-    """Any module of a format. What it cannot read or hold is a CameraFileError, as of `record.fail`."""
+    """Interface of a format's module. Values that it cannot read or hold raise CameraFileError, as by `record.fail`."""
 
     @property
     def NAMES(self) -> Names: ...  # noqa: N802
 
 
 class KeyFormat(Format, Protocol):
-    """A module that reads keys and values, of YAML, JSON, XML, Python literals or NumPy archives, in float64."""
+    """Interface of a module that reads keys and values of YAML, JSON, XML, Python literals or NumPy archives."""
 
     def matches(self, keys: dict[str, Any]) -> bool: ...
     def parse(self, record: Record) -> Rig: ...
 
 
 class ContentFormat(Format, Protocol):
-    """A module that reads files of any other kind, with the files beside them, in float64."""
+    """Interface of a module that reads other kinds of files, and files in the same folder, in float64."""
 
     def matches(self, path: str, content: bytes) -> bool: ...
     def read(self, path: str, content: bytes) -> Rig: ...
 
 
 class WrittenFormat(Format, Protocol):
-    """A module that writes: the text of a file; or the contents of files that are no text, or several, by paths."""
+    """Interface of a module that writes: the text of one file, or the contents of several or binary files by path."""
 
     def render(self, rig: Rig, lossy: Lossy) -> str | dict[str, bytes]: ...
 
 
-# read, in the order in which they are asked
+# formats that are read, in the order in which they are tried
 _BY_CONTENT: tuple[ContentFormat, ...] = (colmap, metashape, nuscenes, ocamcalib)
 _BY_KEYS: tuple[KeyFormat, ...] = (
     camtorch_json,
@@ -89,25 +89,25 @@ _OPENMVG = "OpenMVG's scene, which is not read: openMVG_main_openMVG2Colmap writ
 
 
 def load(path: str | os.PathLike[str], format: str | None = None) -> Rig:
-    """The cameras of a calibration file, in float64 and frozen, with their poses.
+    """Load the cameras of a calibration file, in float64 and frozen, with their poses.
 
-    A calibration is a measurement: nothing of it learns until `.requires_grad_()` says so.
+    A calibration is a measurement: its tensors are not trained unless you call `.requires_grad_()`.
 
     Args:
-        path: a file of OpenCV, ROS, Kalibr, COLMAP, Nerfstudio, Project Aria, Basalt, mrcal, ncore, OCamCalib,
+        path: A file of OpenCV, ROS, Kalibr, COLMAP, Nerfstudio, Project Aria, Basalt, mrcal, ncore, OCamCalib,
             WoodScape, Gyroflow, camodocal, Metashape, nuScenes or camtorch; an archive of
             `numpy.savez(path, K=K, D=D)`; or the folder of a COLMAP or Nerfstudio reconstruction. COLMAP's images
-            beside the cameras are read with them.
-        format: its format, "opencv", "ros" and so on, in small letters; found from content and name if left out.
+            in the folder of the cameras are read with them.
+        format: Its format in small letters, as in "opencv" or "ros". Default: found from content and name.
 
     Returns:
-        A `Rig`: `rig.cameras`, `rig.extrinsics` (camera from rig, or from world for posed images), `rig.camera` if
+        Rig: `rig.cameras`, `rig.extrinsics` (camera from rig, or from world for posed images), `rig.camera` if
         there is only one. Poses of images are the rows of one batch, `rig.extrinsics.batch`. Pixel centres, axes and
         directions are camtorch's, whatever the file's are. Names are the file's; one nameless camera is "camera".
 
     Raises:
-        CameraFileError: the file cannot be used; it says where and why. OSError: it cannot be opened.
-        ValueError: an unknown format. TypeError: no path.
+        CameraFileError: If the file cannot be used; the message names the place and the reason.
+        OSError: If the file cannot be opened. ValueError: If the format is unknown. TypeError: If `path` is no path.
     """
     path, format = path_of(path, "load", "calibration file"), _known(format, READ, "read")
     if os.path.isdir(path):
@@ -116,7 +116,7 @@ def load(path: str | os.PathLike[str], format: str | None = None) -> Rig:
         if found is None:
             raise CameraFileError(path, "folder", f"has none of {', '.join(names)}")
         path = os.path.join(path, found)
-    content = read_bytes(path).removeprefix(codecs.BOM_UTF8)  # which some editors put there
+    content = read_bytes(path).removeprefix(codecs.BOM_UTF8)  # some editors write this mark
     try:
         rig, format = _read(path, content, format)
     except (ArithmeticError, RecursionError, MemoryError) as error:
@@ -128,14 +128,14 @@ def load(path: str | os.PathLike[str], format: str | None = None) -> Rig:
 
 
 def load_camera(kind: type[Kind], path: str | os.PathLike[str]) -> Kind:
-    """Return the camera of a calibration file that has one, of a model."""
+    """Return the only camera of a calibration file, which must be a `kind`."""
     rig, owner = load(path), f"{kind.__name__}.load: {os.fspath(path)}"
     if len(rig.cameras) != 1:
         names = ", ".join(map(repr, rig.cameras))
-        raise ValueError(f"{owner} must have one camera; it has {names}. ct.load(path)[name] is one of them")
+        raise ValueError(f"{owner} must have one camera; got {names}. Write ct.load(path)[name]")
     if not isinstance(rig.camera, kind):
         its = type(rig.camera).__name__
-        raise ValueError(f"{owner} must have a {kind.__name__}; it has a {its}, which ct.Camera.load takes")
+        raise ValueError(f"{owner} must have a {kind.__name__}; got a {its}. Write ct.Camera.load(path)")
     return rig.camera
 
 
@@ -157,28 +157,28 @@ def _read(path: str, content: bytes, format: str | None) -> tuple[Rig, str]:
 
 
 def save(rig: Rig | Camera, path: str | os.PathLike[str], format: str | None = None) -> None:
-    """Write cameras to a calibration file; what stood there before is replaced as a whole, or stays.
+    """Write cameras to a calibration file; an existing file is replaced as a whole, or kept if writing fails.
 
-    Of the formats that `load` reads, those of data sets and of programs that make their own calibrations are read only.
+    Formats of data sets, and of programs that make their own calibrations, are read only.
 
     Args:
-        rig: a `Rig`, or one camera.
-        path: the file, which may be a link: then what it points to is replaced. With COLMAP it may be a folder, where
-            poses go to an images file beside the cameras; with Nerfstudio one that exists.
+        rig: A `Rig`, or one camera.
+        path: The file; if it is a link, the file that it points to is replaced. With COLMAP it may be a folder, and
+            poses go to an images file in the folder of the cameras; with Nerfstudio it may be a folder that exists.
         format: "opencv", "ros", "kalibr", "colmap", "nerfstudio", "aria", "basalt", "mrcal" or "camtorch". If left
-            out: the format that the rig was loaded from if its files end like this one, else what the name says
+            Default: the format that the rig was loaded from if its files end like this one, else that of the name
             (`transforms.json`, `camchain.yaml`, `camera_info.yaml`, `.cameramodel`, `.xml`, `cameras.txt`, `.bin`),
             else camtorch's own for `.json`.
 
     Raises:
-        CameraFileError: something that the format cannot hold; it says what would be lost.
-        ValueError: an unknown format, or a suffix that does not say which. OSError: it cannot be written.
+        CameraFileError: If the format cannot hold a value; the message says what would be lost.
+        ValueError: If the format is unknown, or the name does not determine it. OSError: If the file cannot be written.
     """
     write(rendered(rig, path, format), path)
 
 
 def write(contents: dict[str, bytes], path: str | os.PathLike[str]) -> None:
-    """Write what `rendered` gave for that path."""
+    """Write the files that `rendered` returned for a path."""
     for name in contents:
         folder = os.path.dirname(name)
         if os.path.normpath(folder or ".") == os.path.normpath(path):
@@ -189,26 +189,26 @@ def write(contents: dict[str, bytes], path: str | os.PathLike[str]) -> None:
 
 
 def rendered(rig: Rig | Camera, path: str | os.PathLike[str], format: str | None = None) -> dict[str, bytes]:
-    """The files that `save` writes, by their paths. Raises what it raises."""
+    """Return the files that `save` writes, by their paths; raise what `save` raises."""
     if isinstance(rig, Camera):
         rig = Rig({"camera": rig})
     if not isinstance(rig, Rig):
         part = next((name for name in ("camera", "rig") if isinstance(getattr(rig, name, None), (Camera, Rig))), None)
-        hint = f", whose .{part} it takes" if part else ""
-        raise TypeError(f"save: a Rig or a Camera can be saved; got {type(rig).__name__}{hint}")
+        hint = f". Pass its .{part}" if part else ""
+        raise TypeError(f"save: rig must be a Rig or a Camera; got {type(rig).__name__}{hint}")
     path = path_of(path, "save", "calibration file")
     if not rig.cameras:
-        raise ValueError(f"{path}: a rig without cameras, which no format holds")
+        raise ValueError(f"{path}: rig must have a camera; got none")
     for name, camera in rig.cameras.items():
         if camera.is_mixed:
             by_name = "ct.Rig({f'camera{i}': one for i, one in enumerate(camera)})"
-            raise TypeError(f"{path}: {name} is a Mixed, and files hold cameras by name: save {by_name}")
+            raise TypeError(f"{path}: {name} must be of one model; got a Mixed. Save {by_name}")
         if not camera.key:
             raise TypeError(f"{path}: {name} is a {type(camera).__name__}, which has no key of its own to be loaded by")
     format = _known(format, WRITTEN, "written") or _format_of(rig, path)
     if os.path.isdir(path):
         if not (inside := [os.path.join(path, name) for name in WRITTEN[format].in_folder]):
-            raise ValueError(f"{path}: is a folder; {format} is one file, so name it")
+            raise ValueError(f"{path}: path must be a file for {format}; got a folder. Add a name")
         path = next(filter(os.path.exists, inside), inside[-1])
     try:
         module: WrittenFormat = _MODULES[format]
@@ -228,17 +228,17 @@ def _known(format: str | None, there: dict[str, Names], done: str) -> str | None
 
 
 def _format_of(rig: Rig, path: str) -> str:
-    """The format to write: the rig's own if it may be, else the one that the name of the file means."""
+    """Return the format to write: the rig's own if the path allows it, else the one that the file name means."""
     folder, file = os.path.isdir(path), os.path.basename(path).lower()
     fitting = [n for n in WRITTEN.values() if (n.in_folder if folder else file.endswith(n.suffixes))]
     formats = sorted(names.format for names in fitting)
     if rig.format is not None and rig.format in formats:
         return rig.format
     if folder:
-        raise ValueError(f"{path}: is a folder; name a file, or say {' or '.join(f'format={f!r}' for f in formats)}")
+        raise ValueError(f"{path}: is a folder; name a file, or write {' or '.join(f'format={f!r}' for f in formats)}")
     patterns = {pattern: names.format for names in fitting for pattern in names.patterns}
     if meant := [pattern for pattern in patterns if fnmatch.fnmatchcase(file, pattern)]:
         return patterns[max(meant, key=len)]
     may = f"it may be {', '.join(formats)}" if formats else f"written are {', '.join(sorted(WRITTEN))}"
-    hint = "Say which, as in format='kalibr' or --format kalibr"
-    raise ValueError(f"{path}: the name does not say the format; {may}. {hint}")
+    hint = "Name it, as in format='kalibr' or --format kalibr"
+    raise ValueError(f"{path}: the name does not determine the format; {may}. {hint}")

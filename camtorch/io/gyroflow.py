@@ -14,15 +14,15 @@ _STRETCHES = ("input_horizontal_stretch", "input_vertical_stretch")
 
 
 def matches(keys: dict[str, Any]) -> bool:
-    """Whether these are the keys of such a file."""
+    """Whether the keys are those of a Gyroflow lens profile."""
     return "fisheye_params" in keys and "calib_dimension" in keys
 
 
 def parse(record: Record) -> Rig:
-    """The camera of the images that were calibrated, with the centre that was found, `asymmetrical` or not."""
+    """Return the camera of the calibrated images, with the measured centre, if `asymmetrical` is set or not."""
     for key in (*_STRETCHES, "crop", "digital_lens"):
         if key in record and record[key].value not in (1.0, None):
-            record[key].fail(f"{record[key].value!r:.60}, which no model here has")
+            record[key].fail(f"{record[key].value!r:.60}; must be 1.0 or null, because no model has it")
     named = "distortion_model" in record and record["distortion_model"].value is not None
     key = _MODELS[one_of(record["distortion_model"], _MODELS) if named else "opencv_fisheye"]
     matrix, coefficients = (record["fisheye_params"][name] for name in ("camera_matrix", "distortion_coeffs"))

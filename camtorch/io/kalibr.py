@@ -18,7 +18,7 @@ from camtorch.poses.extrinsics import Extrinsics
 
 NAMES = Names("kalibr", "Kalibr", (".yaml", ".yml"), ("*camchain*",))
 
-# camera_model, distortion_model -> key, how many of its coefficients stand before the intrinsics, how many after
+# camera_model, distortion_model -> key, number of coefficients before the intrinsics, number after them
 _MODELS = {
     ("pinhole", "none"): ("pinhole", 0, 0),
     ("pinhole", "radtan"): ("brown_conrady", 0, 4),
@@ -33,16 +33,16 @@ _NAME = re.compile(r"cam(\d{1,4})")
 
 
 def matches(keys: dict[str, Any]) -> bool:
-    """Whether these are the keys of such a file."""
+    """Whether the keys are those of a camchain."""
     return any(_NAME.fullmatch(key) and isinstance(value, dict) for key, value in keys.items())
 
 
 def parse(record: Record) -> Rig:
-    """The cameras; the rig is the IMU where `T_cam_imu` is given, else cam0."""
+    """Return the cameras; the rig is the IMU if `T_cam_imu` is given, else cam0."""
     numbered = sorted((int(match[1]), key) for key in record.keys() if (match := _NAME.fullmatch(key)))  # noqa: SIM118
     names = [name for _, name in numbered]
     if [number for number, _ in numbered] != list(range(len(numbered))):
-        record.fail(f"the cameras are not numbered from cam0 on: {', '.join(names):.80}")
+        record.fail(f"cameras must be numbered from cam0 on; got {', '.join(names):.80}")
     return Rig({name: _camera(record[name]) for name in names}, _extrinsics(record, names))
 
 
@@ -74,7 +74,7 @@ def _extrinsics(record: Record, names: list[str]) -> dict[str, Extrinsics]:
 
 
 def render(rig: Rig, lossy: Lossy) -> str:
-    """The text of a file; the cameras become cam0, cam1, ... in their order."""
+    """Return the text of a file; the cameras are renamed to cam0, cam1, ... in their order."""
     lossy.no_images(rig)
     posed = lossy.all_posed(rig) if rig.extrinsics or len(rig.cameras) > 1 else {}
     first = next(iter(posed.values()), None)

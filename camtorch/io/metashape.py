@@ -18,26 +18,26 @@ from camtorch.io.record import Names, Record, one_of
 NAMES = Names("metashape", "Metashape")
 
 _KIND = re.compile(rb"(?:<\?xml[^>]*>\s*)?<(?:calibration>|document\b.{,400}?<chunk\b)", re.S)
-# type of a sensor, or projection of a calibration -> key, its coefficients by Metashape's names
+# type of a sensor, or projection of a calibration -> key, Metashape's names of its coefficients
 _MODELS = {
     "frame": ("brown_conrady", ("k1", "k2", "p2", "p1", "k3")),
-    "fisheye": ("thin_prism_fisheye", ("k1", "k2", "p2", "p1", "k3", "k4", "", "")),  # it has no thin prism
+    "fisheye": ("thin_prism_fisheye", ("k1", "k2", "p2", "p1", "k3", "k4", "", "")),  # Metashape has no thin prism
 }
-_MODELS["equidistant_fisheye"] = _MODELS["fisheye"]  # as it is called from version 2.3 on
+_MODELS["equidistant_fisheye"] = _MODELS["fisheye"]  # its name from version 2.3 on
 _UNKNOWN = ("b2", "k4", "p3", "p4")
 
 
 def matches(path: str, content: bytes) -> bool:
-    """Whether this is such a file."""
+    """Whether a content is that of a Metashape file."""
     return _KIND.match(content.lstrip()) is not None
 
 
 def read(path: str, content: bytes) -> Rig:
-    """The camera of a calibration; or those of calibrated sensors by their labels, and the poses of their images."""
+    """Return the camera of a calibration; or the calibrated sensors by their labels, and the poses of their images."""
     if (root := parse_xml(path, decoded(path, content))).tag == "calibration":
         return Rig({"camera": _camera(Record(path, _values(root), "calibration"))})
     if len(chunks := root.findall("chunk")) != 1:
-        Record(path, None, "document").fail(f"{len(chunks)} chunks; one is read, so export each to a file of its own")
+        Record(path, None, "document").fail(f"must have one chunk; got {len(chunks)}. Export each to a file of its own")
     sensors = [sensor for sensor in chunks[0].iterfind("sensors/sensor") if sensor.find("calibration") is not None]
     Record(path, None, "sensors").few(len(sensors))
     names = _names(path, sensors)
@@ -55,7 +55,7 @@ def read(path: str, content: bytes) -> Rig:
 
 
 def _values(element: ElementTree.Element) -> Any:
-    """The text of an element, or its attributes and children by their names."""
+    """Return the text of an element, or its attributes and children by their names."""
     return (element.text or "").strip() or _members(element)
 
 
@@ -64,7 +64,7 @@ def _members(element: ElementTree.Element) -> dict[str, Any]:
 
 
 def _names(path: str, elements: list[ElementTree.Element]) -> list[str]:
-    """Labels; with their ids where several have the same, or none."""
+    """Return the labels, with ids added to labels that are empty or not unique."""
     labels = Counter(element.get("label", "") for element in elements)
     names = []
     for element in elements:
@@ -95,7 +95,7 @@ def _numbers(record: Record, count: int) -> list[float]:
 
 
 def _world(path: str, owner: ElementTree.Element) -> tuple[Any, float, Any]:
-    """Rotation, scale and translation to the world from a chunk or a component."""
+    """Return rotation, scale and translation to the world of a chunk or a component."""
     transform = owner.find("transform")
     record = Record(path, {} if transform is None else _values(transform), f"{owner.tag}.transform")
     rotation, scale, translation = np.eye(3), 1.0, np.zeros(3)
@@ -110,7 +110,7 @@ def _world(path: str, owner: ElementTree.Element) -> tuple[Any, float, Any]:
 
 
 def _posed(path: str, chunk: ElementTree.Element, cameras: dict[str, Camera], sensors: dict[str | None, str]) -> Rig:
-    """The rig of a chunk. Images that are not aligned, and those of sensors that are not calibrated, are left out."""
+    """Return the rig of a chunk, without images that are not aligned or whose sensors are not calibrated."""
     whole = _world(path, chunk)
     parts = {part.get("id"): _world(path, part) for part in chunk.iterfind("components/component")}
     elements = [one for one in chunk.iterfind("cameras//camera") if one.find("transform") is not None]

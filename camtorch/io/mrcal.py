@@ -28,12 +28,12 @@ _SPLINED = re.compile(r"LENSMODEL_SPLINED_STEREOGRAPHIC_order=(\d+)_Nx=(\d+)_Ny=
 
 
 def matches(keys: dict[str, Any]) -> bool:
-    """Whether these are the keys of such a file."""
+    """Whether the keys are those of a cameramodel."""
     return any(key in keys for key in ("lensmodel", "lens_model")) and "imagersize" in keys
 
 
 def parse(record: Record) -> Rig:
-    """The camera; the rig is mrcal's reference. The valid region and the optimization inputs are not read."""
+    """Return the camera; the rig is mrcal's reference. The valid region and the optimization inputs are not read."""
     name = record["lens_model" if "lens_model" in record else "lensmodel"]
     if (found := _splined(name) or _MODELS.get(name.text())) is None:
         known = ", ".join(sorted([*_MODELS, _SPLINED_NAME.format(3, 16, 11, 120)]))
@@ -50,7 +50,7 @@ def parse(record: Record) -> Rig:
 
 
 def _splined(name: Record) -> tuple[str, int] | None:
-    """The key and number of coefficients of a splined lens; None of another one."""
+    """Return the key and number of coefficients of a splined lens, or None for another lens."""
     if (found := _SPLINED.fullmatch(name.text())) is None:
         return None
     if max(map(len, found.groups())) > 4:
@@ -64,7 +64,7 @@ def _splined(name: Record) -> tuple[str, int] | None:
 
 
 def render(rig: Rig, lossy: Lossy) -> str:
-    """The text of a file."""
+    """Return the text of a file."""
     name, camera = lossy.only_camera(rig)
     lossy.no_images(rig)
     height, width = lossy.size(name, camera)
@@ -73,7 +73,7 @@ def render(rig: Rig, lossy: Lossy) -> str:
         grid = {"order": camera.order, "columns": camera.columns, "rows": camera.rows, "fov_x": camera.fov_x}
         known.add(Splined.with_grid(**grid).key)
     key, intrinsics, distortion = lossy.model(name, camera, known)
-    if key == "stereographic":  # without the polynomial
+    if key == "stereographic":  # mrcal's model has no polynomial
         distortion = lossy.at_most(name, camera, distortion, (0,))
     if isinstance(camera, Splined):
         model = _SPLINED_NAME.format(camera.order, camera.columns, camera.rows, camera.fov_x)

@@ -22,12 +22,12 @@ _PINHOLES = ("opencv-pinhole", "pinhole", "ideal-pinhole")
 
 
 def matches(keys: dict[str, Any]) -> bool:
-    """Whether these are the keys of such a file."""
+    """Whether the keys are those of an ncore file."""
     return "camera_model_type" in keys and "camera_model_parameters" in keys
 
 
 def parse(record: Record) -> Rig:
-    """The camera, without shutter; of the two polynomials of an f-theta, up to 0.25 px apart, the reference is read."""
+    """Return the camera without its shutter; of the two polynomials of an f-theta camera only the reference is read."""
     kind = one_of(record["camera_model_type"], ("ftheta", *_PINHOLES, "opencv-fisheye"))
     values = record["camera_model_parameters"]
     camera = _f_theta(values) if kind == "ftheta" else _of_opencv(values, kind)
@@ -38,17 +38,17 @@ def parse(record: Record) -> Rig:
 
 
 def _f_theta(values: Record) -> Camera:
-    """Its principal point is in pixels whose centres are integers; those of the other models lie at 0.5."""
+    """Return an f-theta camera, whose pixel centres are integers; ncore's other models have them at 0.5."""
     polynomial, kind = _POLYNOMIALS[one_of(values["reference_poly"], _POLYNOMIALS)]
     coefficients = values[polynomial]
     constant, *rest = coefficients.numbers() or [0.0]
     if constant:
         coefficients.fail(f"a constant of {constant:g}, which no model here has")
     linear = values["linear_cde"].numbers(3) if "linear_cde" in values else [0.0]
-    while len(rest) > 2 and not rest[-1]:  # which files fill up
+    while len(rest) > 2 and not rest[-1]:  # files are padded with zeros
         rest.pop()
     centre, size = np.array(values["principal_point"].numbers(2)), values["resolution"].size()
-    linear = linear if any(linear) else [1.0, 0.0, 0.0]  # as ncore takes zeros
+    linear = linear if any(linear) else [1.0, 0.0, 0.0]  # ncore reads zeros as the identity
     try:
         return kind.from_polynomial(centre, np.array(rest), linear_cde=linear, image_size=size)
     except ValueError as error:

@@ -34,13 +34,13 @@ _OF_A_CAMERA = ("camera_model", "is_fisheye", *_CORE, *_RADIAL, *_TANGENTIAL, "d
 
 
 def matches(keys: dict[str, Any]) -> bool:
-    """Whether these are the keys of such a file."""
+    """Whether the keys are those of a transforms.json."""
     has_frames = isinstance(keys.get("frames"), list) and "camtorch" not in keys
     return has_frames or any(key in keys for key in ("fl_x", "camera_angle_x", "x_fov"))
 
 
 def parse(record: Record) -> Rig:
-    """The camera of all frames, called "camera", or one for each frame; and the poses of the frames."""
+    """Return the camera of all frames as "camera", or one for each frame, and the poses of the frames."""
     cameras: dict[str, Camera] = {}
     names: dict[str, str | None] = {}  # of the images, and of the camera that they share
     found = array("d")
@@ -66,15 +66,15 @@ def parse(record: Record) -> Rig:
 
 
 def _camera(record: Record, frame: Record | None = None) -> Camera:
-    """The camera of a file, with what a frame says of its own."""
+    """Return the camera of a file, with the entries that a frame adds."""
     values = {key: record.value[key] for key in _OF_A_CAMERA if key in record}
     merged = Record(record.path, values, record.place)
     if frame is not None:
         for key in filter(frame.__contains__, _OF_A_CAMERA):
             if values.setdefault(key, frame.value[key]) != frame.value[key]:
-                record[key].fail("a frame says otherwise; Nerfstudio would take this one for all frames")
+                record[key].fail("a frame has another value, but Nerfstudio would use this one for all frames")
         merged.place = frame.place
-    model = "OPENCV_FISHEYE" if values.get("is_fisheye") is True else "OPENCV"  # as instant-ngp has it
+    model = "OPENCV_FISHEYE" if values.get("is_fisheye") is True else "OPENCV"  # instant-ngp's flag
     if "camera_model" in merged:
         model = one_of(merged["camera_model"], _MODELS)
     size = (merged["h"].side(), merged["w"].side()) if "h" in merged and "w" in merged else None
@@ -90,7 +90,7 @@ def _camera(record: Record, frame: Record | None = None) -> Camera:
 
 
 def _focal(record: Record, axis: str, side: str) -> float | None:
-    """The focal length along an axis: as such, or by the angle of the image."""
+    """Return the focal length along an axis, as given or from the field of view; None if the file has neither."""
     if f"fl_{axis}" in record:
         return record[f"fl_{axis}"].number()
     for key, unit in ((f"camera_angle_{axis}", 1.0), (f"{axis}_fov", math.pi / 180)):
@@ -103,12 +103,12 @@ def _focal(record: Record, axis: str, side: str) -> float | None:
 
 
 def _distortion(record: Record, key: str) -> tuple[str, list[float]]:
-    """Model and coefficients; those that a model does not have must be zero."""
+    """Return model and coefficients; coefficients that the model does not have must be zero."""
     if key == "fisheye624":
         return key, record["distortion_params"].numbers(12)
     there = {name: record[name].number() for name in (*_RADIAL, *_TANGENTIAL) if name in record}
     if key == "pinhole" and any(there.values()):
-        key = "brown_conrady"  # the same to Nerfstudio
+        key = "brown_conrady"  # Nerfstudio treats both alike
     names = {"pinhole": (), "kannala_brandt": ("k1", "k2", "k3", "k4")}.get(key, ("k1", "k2", "p1", "p2", "k3"))
     for name, value in there.items():
         if value and name not in names:
@@ -121,13 +121,13 @@ def _distortion(record: Record, key: str) -> tuple[str, list[float]]:
 
 
 def panorama(size: tuple[int, int]) -> list[float]:
-    """The intrinsics of the equirectangular image of the whole sphere."""
+    """Return the intrinsics of the equirectangular image of the whole sphere."""
     height, width = size
     return [width / (2 * math.pi), height / math.pi, width / 2 - 0.5, height / 2 - 0.5]
 
 
 def render(rig: Rig, lossy: Lossy) -> str:
-    """The text of a file: one camera for all, or one for each frame."""
+    """Return the text of a file: one camera for all frames, or one for each frame."""
     written = {name: _entries(lossy, name, camera) for name, camera in rig.cameras.items()}
     models = {name: entries.pop("camera_model") for name, entries in written.items()}
     if len(set(models.values())) != 1:

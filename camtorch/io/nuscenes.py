@@ -14,17 +14,17 @@ from camtorch.io.record import Names, Record
 
 NAMES = Names("nuscenes", "nuScenes")
 
-_START = 4096  # in which the first sensor shows
+_START = 4096  # the first sensor begins in these bytes
 
 
 def matches(path: str, content: bytes) -> bool:
-    """Whether this is such a file."""
+    """Whether a content is that of a `calibrated_sensor.json`."""
     return re.match(rb"\s*\[", content[:_START]) is not None and b'"sensor_token"' in content[:_START]
 
 
 def read(path: str, content: bytes) -> Rig:
-    """The cameras by their channels, or tokens, and their poses, camera from ego; image sizes stand elsewhere."""
-    # what has no intrinsics is a lidar or a radar
+    """Return the cameras by channel, or token, and their poses, camera from ego. The file has no image sizes."""
+    # sensors without intrinsics are lidars or radars
     sensors = [sensor for sensor in _table(path, content) if len(sensor["camera_intrinsic"])]
     Record(path, None).few(len(sensors))
     beside = os.path.join(os.path.dirname(path), "sensor.json")
@@ -39,10 +39,10 @@ def read(path: str, content: bytes) -> Rig:
         if name in cameras:
             sensor["token"].fail(f"a second sensor is called {name!r:.60}")
         intrinsics = sensor["camera_intrinsic"].intrinsics()
-        lens = sensor.get("camera_distortion")  # of nuImages
+        lens = sensor.get("camera_distortion")  # only in nuImages
         distortion = [] if lens is None else lens.numbers()
         if lens is not None and len(distortion) == 6 and distortion.pop():
-            lens.fail("a sixth coefficient, of fisheyes, whose formula nuImages does not say")
+            lens.fail("a sixth coefficient must be 0: nuImages does not document the formula of fisheyes")
         key = "brown_conrady" if distortion else "pinhole"
         cameras[name] = sensor.camera(key, intrinsics, distortion, None, lens=lens)
     if not cameras:

@@ -19,12 +19,12 @@ NAMES = Names("ocamcalib", "OCamCalib")
 _LINES = ("polynomial", "inverse polynomial", "centre", "affine", "image size")
 _NUMBER = re.compile(rb"[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?|[-+]?(nan|inf)", re.IGNORECASE)
 _MOST_TERMS = 64
-_START = 1 << 14  # of a file, where its kind shows
+_START = 1 << 14  # bytes in which the kind of a file is visible
 _LARGEST = 1 << 16
 
 
 def matches(path: str, content: bytes) -> bool:
-    """Whether this is such a file: comments, and a first line of as many numbers as it says."""
+    """Whether a file begins with comments and a line that counts its numbers correctly."""
     lines = [line.split() for line in content[:_START].splitlines() if line.strip()]
     numbers = next((line for line in lines if not line[0].startswith(b"#")), [b""])
     counted = re.fullmatch(rb"[1-9]\d?", numbers[0]) is not None and int(numbers[0]) == len(numbers) - 1
@@ -32,7 +32,7 @@ def matches(path: str, content: bytes) -> bool:
 
 
 def read(path: str, content: bytes) -> Rig:
-    """The one camera of a file; lines after the size, which some programs add, are not read."""
+    """Return the only camera of a file; lines after the size, which some programs add, are not read."""
     if len(content) > _LARGEST:
         raise CameraFileError(path, "size", f"{len(content)} bytes; a calibration of OCamCalib has one thousand")
     lines = [line.split() for line in decoded(path, content).splitlines()]
@@ -44,9 +44,9 @@ def read(path: str, content: bytes) -> Rig:
         first = Record(path, terms.value[0], terms.place)
         count = first.whole(1, _MOST_TERMS, f"number of coefficients up to {_MOST_TERMS}")
         if len(terms) != count + 1:
-            terms.fail(f"{len(terms) - 1} coefficients where the line says {count}")
+            terms.fail(f"must have as many coefficients as its first number; got {len(terms) - 1} for {count}")
     if len(size) != 2:
-        size.fail(f"not a height and a width, but {len(size)} numbers")
+        size.fail(f"must be a height and a width; got {len(size)} numbers")
     height, width = (side.side() for side in size)
     values = polynomial.numbers()[1:], centre.numbers(2), affine.numbers(3)
     try:

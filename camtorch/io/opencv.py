@@ -22,7 +22,7 @@ from camtorch.values.arguments import check_path, shown, warn
 
 NAMES = Names("opencv", "OpenCV", (".yml", ".yaml", ".json", ".xml"), ("*.xml",))
 
-_NAMES = r"\d*|left|right"  # the end of the key is the camera's name, as in M1, D1 or cameraMatrix_left
+_NAMES = r"\d*|left|right"  # a key ends with the camera's name, as in M1, D1 or cameraMatrix_left
 _MATRIX = re.compile(rf"(?:K|M|(?i:mtx|camera_?matrix|intrinsic_?matrix))_?({_NAMES})")
 _DISTORTION = re.compile(
     rf"(?:[Dd]|(?i:dist(?:ortion)?(?:_?coef(?:f|fs|s|ficients?)?(?:_?mat)?|_?param(?:s|eters)?)?))_?({_NAMES})"
@@ -42,42 +42,42 @@ _POSES = (("R", "T"), ("rvec", "tvec"), ("om", "T"))  # a matrix, or a rotation 
 
 
 class AmbiguousModelWarning(UserWarning):
-    """A file leaves open of which model its coefficients are."""
+    """A file whose coefficients may be those of two models."""
 
 
 def read(path: str | os.PathLike[str], model: str | None = None) -> Camera:
-    """The only camera of an OpenCV YAML, JSON or XML file, in float64 and frozen; of several `read_rig(path)[name]`.
+    """Return the only camera of an OpenCV YAML, JSON or XML file, in float64 and frozen; for several use `read_rig`.
 
     Args:
-        path: a file with a camera matrix (`camera_matrix`, `cameraMatrix`, `K`, `M`, `mtx`) and, where it has them,
+        path: A file with a camera matrix (`camera_matrix`, `cameraMatrix`, `K`, `M`, `mtx`), and optional
             distortion coefficients (`distortion_coefficients`, `distCoeffs`, `D`), `image_width` and `image_height`.
-        model: a key of `camtorch.MODELS`, for a file that leaves it open. If left out: without coefficients a pinhole,
+        model: A key of `camtorch.MODELS`, for a file that leaves it open. Default: without coefficients a pinhole,
             with a true `fisheye_model` a Kannala-Brandt, with `xi` a Mei, else a Brown-Conrady camera, with a warning
-            where 4 coefficients could be of two models.
+            if 4 coefficients could be of two models.
 
     Raises:
-        CameraFileError: no usable camera in the file, or one of another model than `model`.
-        OSError: no such file, or it cannot be opened. ValueError: an unknown model, or several cameras.
+        CameraFileError: If the file has no usable camera, or one of another model than `model`.
+        OSError: If the file cannot be opened. ValueError: If `model` is unknown, or the file has several cameras.
     """
     check_path(path, "io.opencv.read")
     return read_rig(path, model).camera
 
 
 def read_rig(path: str | os.PathLike[str], model: str | None = None) -> Rig:
-    """All cameras of such a file, and the pose of a pair, all frozen; see `read`, which says what it raises."""
+    """Return all cameras of such a file, and the pose of a pair, all frozen; raise what `read` raises."""
     check_path(path, "io.opencv.read_rig")
     if model is not None and (not isinstance(model, str) or model not in MODELS):
-        raise ValueError(f"io.opencv: unknown model {shown(model)}; known are {', '.join(sorted(MODELS))}")
+        raise ValueError(f"io.opencv: model must be one of {', '.join(sorted(MODELS))}; got {shown(model)}")
     return parse(Record(path, parse_mapping(path, read_bytes(path))), model).requires_grad_(False)
 
 
 def matches(keys: dict[str, Any]) -> bool:
-    """Whether these may be the keys of such a file."""
+    """Whether the keys may be those of an OpenCV file."""
     return any(len(key) <= _LONGEST_KEY and _MATRIX.fullmatch(key) for key in keys)
 
 
 def parse(record: Record, model: str | None = None) -> Rig:
-    """The cameras of a file, called by the ends of their keys; `X2 = R X1 + T` of a pair, R also as a vector `om`."""
+    """Return the cameras by the ends of their keys; a pair has the pose `X2 = R X1 + T`, R may be a vector `om`."""
     file = _File(record)
     names = sorted(file.matrices, key=lambda name: (name.isdigit(), int(name) if name.isdigit() else 0, name))
     record.few(len(names))
@@ -93,14 +93,14 @@ def parse(record: Record, model: str | None = None) -> Rig:
 
 
 class _File:
-    """The keys of a file, and those of matrices, distortions and xi by the names of the cameras."""
+    """The keys of a file, and the keys of matrices, distortions and xi by camera name."""
 
     def __init__(self, record: Record):
         self.record = record
-        # a pattern may take time that is quadratic in the length of a key
+        # a pattern may take quadratic time in the length of a key
         self.keys = [key for key in record.keys() if len(key) <= _LONGEST_KEY]  # noqa: SIM118
         self.matrices, self.lenses, self.xis = map(self.by_name, (_MATRIX, _DISTORTION, _XI))
-        # without what may be the distortion of a camera that has none all would be wrong in silence
+        # ignoring the distortion of a camera would make all results wrong without a warning
         orphans = [key for name, key in (self.lenses | self.xis).items() if name not in self.matrices]
         if not self.matrices.keys() <= self.lenses.keys():
             like = [k for k in self.keys if _LIKE_DISTORTION.fullmatch(k) and not _NO_DISTORTION.fullmatch(k)]
@@ -116,7 +116,7 @@ class _File:
         return next(filter(pattern.fullmatch, self.keys), None)
 
     def by_name(self, pattern: re.Pattern[str]) -> dict[str, str]:
-        """The keys of a pattern by the names of the cameras."""
+        """Return the keys that match a pattern by camera name."""
         named: dict[str, str] = {}
         for key in self.keys:
             if match := pattern.fullmatch(key):
@@ -134,14 +134,14 @@ class _File:
             distortion = [*(self.record[xi].flat() if is_matrix else [self.record[xi].number()]), *distortion]
         stated, place = (("mei",), xi) if xi else self.stated()
         if place is not None and model is not None and model not in stated:
-            self.fail(place, f"says that the model is {stated[0]}; do not name {model}, or correct the file")
+            self.fail(place, f"the file's model is {stated[0]}; got {model}. Leave it out, or correct the file")
         kind, size = model or ("mei" if xi else self.model(distortion, stated)), self.image_size()
-        if size is not None and self.find(_SIZE):  # a pair, whose order no key says
+        if size is not None and self.find(_SIZE):  # a pair of numbers, whose order no key states
             warn_of_order(torch.tensor(intrinsics), size, str(self.record.path))
         return self.record[key].camera(kind, intrinsics, distortion, size, self.record[lens or xi or key])
 
     def stated(self) -> tuple[tuple[str, ...], str | None]:
-        """The models that the flag of fisheyes leaves open, and its key; none where there is no flag."""
+        """Return the models that the fisheye flag allows, and its key; none if there is no flag."""
         if (key := self.find(_FISHEYE)) is None:
             return (), None
         if not isinstance(flag := self.record[key].value, (str, float, bool)):
@@ -150,7 +150,7 @@ class _File:
         return ("brown_conrady", "pinhole") if no else ("kannala_brandt",), key
 
     def model(self, distortion: list[float], stated: tuple[str, ...]) -> str:
-        """The model where nobody names it."""
+        """Return the model if the caller does not name one."""
         if (other := self.find(_OTHER_LENS)) is not None:
             name = "model='kannala_brandt' or --from-model kannala_brandt"
             self.fail(other, f"the file may mean another model than OpenCV's own two; name it, as in {name}")
@@ -166,12 +166,12 @@ class _File:
         return "brown_conrady" if distortion else "pinhole"
 
     def pose(self, rotation_key: str, translation_key: str) -> Extrinsics:
-        """R or a rotation vector, and T."""
+        """Return the pose of R or a rotation vector, and T."""
         rotation, translation = self.record[rotation_key].flat(), self.record[translation_key].flat()
         for key, values in ((rotation_key, rotation), (translation_key, translation)):
             count = 9 if key == "R" else 3
             if len(values) != count:
-                self.fail(key, f"{len(values)} numbers where {count} belong")
+                self.fail(key, f"must have {count} numbers; got {len(values)}")
         poses.check_near(self.record[translation_key], translation)
         if rotation_key != "R":
             return poses.pose(self.record[rotation_key], rotation, translation)
@@ -189,7 +189,7 @@ class _File:
 
 
 def render(rig: Rig, lossy: Lossy) -> str:
-    """The text of a file of one camera, or of several of which the second of two may have a pose."""
+    """Return the text of a file of one camera or several; the second of two may have a pose."""
     lossy.no_images(rig)
     names, ends = list(rig.cameras), list(rig.cameras)
     if len(names) == 1:
@@ -226,7 +226,7 @@ def _add_camera(lossy: Lossy, values: dict[str, Any], name: str, camera: Camera,
     if key == "mei":
         values[f"xi_{end}" if end else "xi"], *distortion = distortion
     fisheye = int(key == "kannala_brandt")
-    # with one flag for all, several cameras must agree, be it on a flag that is not needed
+    # one flag holds for all cameras, so they must agree even if some do not need it
     says = key != "mei" and (fisheye or len(distortion) == _FISHEYE_COUNT or end)
     if says and values.setdefault("fisheye_model", fisheye) != fisheye:
         lossy.fail(name, "a lens unlike that of the cameras before it; OpenCV's file has one fisheye_model for all")
@@ -237,7 +237,7 @@ def _add_camera(lossy: Lossy, values: dict[str, Any], name: str, camera: Camera,
 
 
 def _text(suffix: str, values: dict[str, Any]) -> str:
-    """Return numbers, and matrices as lists of rows, as `cv2.FileStorage` writes them: JSON, XML, or else YAML."""
+    """Return numbers, and matrices as lists of rows, in the format of `cv2.FileStorage`: JSON, XML, or else YAML."""
     yaml, xml, whole = ["%YAML:1.0", "---"], ['<?xml version="1.0"?>', "<opencv_storage>"], dict[str, Any]()
     for key, value in values.items():
         if not isinstance(value, list):

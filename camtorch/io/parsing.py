@@ -1,7 +1,7 @@
 """Contents of files as keys and values: YAML, JSON, OpenCV's XML, Python literals and NumPy archives, never trusted.
 
-A file that is refused, whatever it holds, has cost at most a second for 10 MB and ten times its size in memory. All
-functions raise CameraFileError for what they refuse.
+Refusing a file takes at most a second for 10 MB and ten times its size in memory. All functions raise
+CameraFileError for content that they refuse.
 """
 
 from __future__ import annotations
@@ -26,45 +26,45 @@ Path = str | os.PathLike[str]
 
 LARGEST_FILE = 1 << 24
 _LARGEST_STORAGE = 1 << 20  # of YAML and of OpenCV's XML
-_LARGEST_LITERAL = 1 << 15  # of which Python 3.10 can parse any: it crashes on deeper sums than that has room for
-_OPTIMIZATION_INPUTS = re.compile(r"('optimization_inputs'\s*:\s*)b'[^'\\\n]*'")  # megabytes, which are not read
+_LARGEST_LITERAL = 1 << 15  # short enough that no nesting crashes Python 3.10's parser
+_OPTIMIZATION_INPUTS = re.compile(r"('optimization_inputs'\s*:\s*)b'[^'\\\n]*'")  # can be megabytes; skipped
 _DEEPEST = 100
 _MOST_VALUES = 1 << 17
-_MOST_JSON_UNITS = 1 << 20  # of 32 bytes, what a number takes in memory
-_BYTES_PER_UNIT = 4  # of the file, where there are more
+_MOST_JSON_UNITS = 1 << 20  # of 32 bytes, the memory of a number
+_BYTES_PER_UNIT = 4  # of the file, for larger files
 _FEW_NODES = 1 << 14  # elements and attributes of XML
-_BYTES_PER_NODE = 16  # of the file, where there are more
-_START = 1 << 16  # of a text, where its kind shows
+_BYTES_PER_NODE = 16  # of the file, for larger files
+_START = 1 << 16  # characters in which the kind of a text is visible
 _MOST_ARRAYS = 1000
-_LARGEST_ARRAY = 1 << 16  # bytes; that of a camera has 14 numbers
+_LARGEST_ARRAY = 1 << 16  # bytes; an array of a camera has at most 14 numbers
 _SIZES = ("image_size", "imagesize", "img_size", "imgsize", "size", "resolution")
 _WORD = re.compile(r'"([^"]*)"|(\S+)')
 
-# how files begin that people pass by mistake
+# beginnings of files that people pass by mistake
 _OTHERS = (
     (rb"\x80[\x02-\x05]", "a pickle, which could run any code: not read. Save numpy.savez(path, K=K, D=D) instead"),
     (rb"\x93NUMPY", "a single array; save both by numpy.savez(path, K=K, D=D)"),
     (rb"\x89HDF", "a file of HDF5 or MATLAB, which is not read; export K and D from there"),
-    (rb"\x89PNG|\xff\xd8\xff|II\*\0|MM\0\*", "an image, where a file of a calibration is wanted"),
+    (rb"\x89PNG|\xff\xd8\xff|II\*\0|MM\0\*", "an image; pass a calibration file"),
 )
 
 
 def path_of(path: Any, owner: str, file: str = "file") -> str:
-    """Return the path of a kind of file that `owner` was given, as text; a TypeError if it is none."""
+    """Return a path as text; raise a TypeError of `owner` that names the kind of `file` if it is none."""
     try:
         name = os.fsdecode(path)
     except TypeError:
-        hint = "; it may lie beside others, so name it: file.name" if hasattr(path, "read") else ""
+        hint = ". Pass its name, file.name" if hasattr(path, "read") else ""
         raise TypeError(f"{owner}: path must be that of a {file}; got {type(path).__name__}{hint}") from None
     if "\0" in name:
-        raise CameraFileError(repr(name), "path", "a NUL character, which no path has")
+        raise CameraFileError(repr(name), "path", "must not have a NUL character")
     return name
 
 
 def check_ordinary(path: Path) -> None:
     """Refuse devices and pipes, which may have no end."""
     if os.path.exists(path) and not os.path.isfile(path) and not os.path.isdir(path):
-        raise CameraFileError(path, "content", "no ordinary file")
+        raise CameraFileError(path, "content", "must be an ordinary file")
 
 
 def read_bytes(path: Path, largest: int = LARGEST_FILE) -> bytes:
@@ -80,7 +80,7 @@ def read_bytes(path: Path, largest: int = LARGEST_FILE) -> bytes:
 
 
 def decoded(path: Path, content: bytes) -> str:
-    """Return the text of a content."""
+    """Return the text of a content in UTF-8."""
     try:
         return content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -89,32 +89,32 @@ def decoded(path: Path, content: bytes) -> str:
 
 
 def parse_mapping(path: Path, content: bytes) -> dict[str, Any]:
-    """Return the keys of a content. Values are text, lists and mappings, and JSON's are numbers.
+    """Return the keys of a content. Values are text, lists and mappings; JSON's numbers are floats.
 
-    Refused are unknown kinds, a key twice, tags other than `!!opencv-matrix`, and more values than a camera has.
+    Unknown kinds, repeated keys, tags other than `!!opencv-matrix` and too many values are refused.
     """
     try:
         keys = _from_archive(path, content) if content.startswith(b"PK\3\4") else _from_text(path, content)
     except (RecursionError, MemoryError):
         raise CameraFileError(path, "content", "nested too deeply") from None
     if not isinstance(keys, dict):
-        raise CameraFileError(path, "content", "not keys and values")
+        raise CameraFileError(path, "content", "must be keys and values")
     return keys
 
 
 def _from_text(path: Path, content: bytes) -> Any:
     text = decoded(path, content)
-    # a brace, perhaps after comments, and a key in quotes unlike JSON's; one regular expression would be slow
+    # mrcal's brace, perhaps after comments, and quoted key differ from JSON; one regular expression would be slow
     start = re.sub(r"#[^\n]*", "", text[:_START]).split()[:2]
     if re.match(r"\{(?:'|\"(?:lens_?model|distortion_model)\")", "".join(start)):
-        text = _OPTIMIZATION_INPUTS.sub(r"\1''", text)  # a Python literal, as mrcal writes it, as JSON would have it
+        text = _OPTIMIZATION_INPUTS.sub(r"\1''", text)  # mrcal's Python literal
         _check_length(path, text, _LARGEST_LITERAL, "a Python literal")
         try:
             return _with_floats(ast.literal_eval(ast.parse(text, mode="eval")))
         except SyntaxError as error:
             raise CameraFileError(path, f"line {error.lineno}" if error.lineno else "content", error.msg) from None
-        except (ValueError, TypeError):  # a list has no hash, as a key has
-            raise CameraFileError(path, "content", "something else than texts, numbers, lists and mappings") from None
+        except (ValueError, TypeError):  # a list as a key has no hash
+            raise CameraFileError(path, "content", "must have only text, numbers, lists and mappings") from None
     kind = text.lstrip()[:1]
     return parse_json(path, text) if kind == "{" else (_from_storage if kind == "<" else _from_yaml)(path, text)
 
@@ -125,17 +125,17 @@ def _check_length(path: Path, text: str, most: int, kind: str) -> None:
 
 
 def parse_json(path: Path, text: str) -> Any:
-    """Return the value of a text of JSON, all numbers floats."""
+    """Return the value of a JSON text; all numbers are floats."""
     size = text.count(",") + 3 * text.count("[") + 6 * text.count("{") + 5 * text.count(":")
     if size > max(_MOST_JSON_UNITS, len(text) // _BYTES_PER_UNIT):
         raise CameraFileError(path, "content", "too many values")
 
     def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
         if len(keys := dict(pairs)) < len(pairs):
-            raise ValueError(f"the key {repeated(key for key, _ in pairs)!r:.60} stands there twice")
+            raise ValueError(f"the key {repeated(key for key, _ in pairs)!r:.60} is there twice")
         return keys
 
-    # floats at once: no text is made of a number, and integers of any length are no work
+    # parse floats directly: huge integers cost no time, and no text is made of a number
     try:
         return json.loads(text, object_pairs_hook=unique, parse_int=float, parse_constant=float)
     except RecursionError:
@@ -158,7 +158,7 @@ def _with_floats(value: Any) -> Any:
 
 
 def arrays_of(content: bytes, largest: int) -> dict[str, np.ndarray | None]:
-    """Return arrays of numbers by their names; None for damaged or larger ones, and for objects."""
+    """Return arrays of numbers by name; None for damaged or too large arrays, and for objects."""
     if content.count(b"PK\1\2") > _MOST_ARRAYS:
         raise ValueError(f"more than {_MOST_ARRAYS} arrays")
     arrays: dict[str, np.ndarray | None] = {}
@@ -174,7 +174,7 @@ def arrays_of(content: bytes, largest: int) -> dict[str, np.ndarray | None]:
 
 
 def _from_archive(path: Path, content: bytes) -> dict[str, Any]:
-    """Return the keys of an archive, arrays as lists; refuse damaged ones, and sizes whose order is not known."""
+    """Return the keys of an archive, arrays as lists; refuse damaged ones, and sizes whose order is unknown."""
     try:
         arrays = arrays_of(content, _LARGEST_ARRAY)
     except (zipfile.BadZipFile, zlib.error, OSError, EOFError, ValueError, RuntimeError, NotImplementedError) as error:
@@ -187,11 +187,11 @@ def _from_archive(path: Path, content: bytes) -> dict[str, Any]:
     return keys
 
 
-# -- XML, in which OpenCV has keys in <opencv_storage>, and sequences as words or as elements called _
+# -- XML: OpenCV has keys in <opencv_storage>, and sequences as words or as elements called _
 
 
 def parse_xml(path: Path, text: str) -> ElementTree.Element:
-    """Return the root of a text of XML; document types, entities and very many elements are refused."""
+    """Return the root of an XML text; document types, entities and very many elements are refused."""
     if declared := re.search(r"<!(?:DOCTYPE|ENTITY|ELEMENT|ATTLIST|NOTATION)", text, re.IGNORECASE):
         line = text.count("\n", 0, declared.start()) + 1
         raise CameraFileError(path, f"line {line}", "a document type, which could define entities: not read")
@@ -210,7 +210,7 @@ def _from_storage(path: Path, text: str) -> Any:
     _check_length(path, text, _LARGEST_STORAGE, "XML")
     root = parse_xml(path, text)
     if root.tag == "lensdatabase":
-        raise CameraFileError(path, "content", "lensfun's lenses, which lensfunpy reads, for ct.lenses.from_lensfun")
+        raise CameraFileError(path, "content", "a database of lensfun; read it by lensfunpy and ct.lenses.from_lensfun")
     if root.tag != "opencv_storage":
         where = f"<{root.tag:.60}> where <opencv_storage> belongs"
         raise CameraFileError(path, "content", f"{where}: XML is read where OpenCV wrote it")
@@ -219,7 +219,7 @@ def _from_storage(path: Path, text: str) -> Any:
 
 def _keys_of(path: Path, element: ElementTree.Element) -> dict[str, Any]:
     if (twice := repeated(child.tag for child in element)) is not None:
-        raise CameraFileError(path, f"{element.tag:.60}", f"the key {twice!r:.60} stands there twice")
+        raise CameraFileError(path, f"{element.tag:.60}", f"the key {twice!r:.60} is there twice")
     return {child.tag: _value_of(path, child) for child in element}
 
 
@@ -233,15 +233,15 @@ def _value_of(path: Path, element: ElementTree.Element) -> Any:
 
 
 def _from_yaml(path: Path, text: str) -> Any:
-    import yaml  # a fiftieth of a second: only when needed
+    import yaml  # the import takes 0.02 s
 
     _check_length(path, text, _LARGEST_STORAGE, "YAML")
     text = re.sub(r"\A(\s*)%YAML[^\r\n]*", r"\1", text)  # "%YAML:1.0", as OpenCV writes it, is not YAML
-    if "\n%" in text:  # libyaml compares each with all
+    if "\n%" in text:  # libyaml compares all pairs of directives
         raise CameraFileError(path, "content", "YAML directives, which no calibration has")
     loader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
     try:
-        # events, not yaml.load: no tags, and none of YAML 1.1's ideas of what is a number
+        # parse events, not yaml.load: no tags, and no numbers by the rules of YAML 1.1
         return _Yaml(path, yaml.parse(text, loader)).document()
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
@@ -253,7 +253,7 @@ def _from_yaml(path: Path, text: str) -> Any:
 
 
 class _Yaml:
-    """Texts, lists and mappings of the events of a parser."""
+    """Text, lists and mappings from the events of a YAML parser."""
 
     def __init__(self, path: Path, events: Iterable[Any]):
         self.path, self.events = path, iter(events)
@@ -275,7 +275,7 @@ class _Yaml:
         return value
 
     def value(self, event: Any, depth: int) -> tuple[Any, int]:
-        """Return the value that begins with an event, and how many values it has for a reader who follows aliases."""
+        """Return the value that begins with an event, and its number of values after following aliases."""
         kind = type(event).__name__
         if kind == "AliasEvent":
             return self.anchors.get(event.anchor) or self.fail(event, f"nothing is called {event.anchor!r:.60}")
@@ -287,7 +287,7 @@ class _Yaml:
         return found
 
     def container(self, start: Any, is_mapping: bool, depth: int) -> tuple[Any, int]:
-        """Return a list or a mapping; its anchor is known only behind it, so that it cannot be in itself."""
+        """Return a list or a mapping; its anchor is known only after its end, so it cannot contain itself."""
         if depth >= _DEEPEST:
             self.fail(start, "nested too deeply")
         values, keys, count = list[Any](), dict[str, Any](), 1
@@ -299,9 +299,9 @@ class _Yaml:
             if not is_mapping:
                 values.append(value)
             elif not isinstance(value, str):
-                self.fail(event, "a key that is no text")
+                self.fail(event, "a key must be text")
             elif value in keys:
-                self.fail(event, f"the key {value!r:.60} stands there twice")
+                self.fail(event, f"the key {value!r:.60} is there twice")
             else:
                 keys[value], size = self.value(next(self.events), depth + 1)
                 count += size

@@ -1,4 +1,4 @@
-"""Image files as they are stored, which calibrations know. Pillow turns TIFFs by their orientation, and no others."""
+"""Image files as they are stored, as calibrations need them. Pillow turns only TIFFs by their orientation."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _WIDTH, _HEIGHT = 256, 257  # tags of TIFF
 _DEEP = ("I;16", "I;16B", "I;16L", "I;16N", "I")
 _T = Image.Transpose
 _TURNS = _T.FLIP_LEFT_RIGHT, _T.ROTATE_180, _T.FLIP_TOP_BOTTOM, _T.TRANSPOSE, _T.ROTATE_90, _T.TRANSVERSE, _T.ROTATE_270
-_BACK = dict(enumerate(_TURNS, 2))  # by orientation, what undoes the turn
+_BACK = dict(enumerate(_TURNS, 2))  # orientation -> the inverse of its turn
 
 
 class ImageFileError(OSError, ValueError):
@@ -35,7 +35,7 @@ class _NoImageFileError(ImageFileError, FileNotFoundError):
 
 
 def load_stored(image: Image.Image) -> Image.Image:
-    """Return the pixels of an opened file that is not loaded yet, as they are stored."""
+    """Return the pixels of an opened but not yet loaded file as they are stored."""
     orientation = image.getexif().get(ORIENTATION) if image.format == "TIFF" else None
     image.load()
     if orientation not in _BACK or image.getexif().get(ORIENTATION) == orientation:
@@ -44,22 +44,22 @@ def load_stored(image: Image.Image) -> Image.Image:
 
 
 def size_of(path: Path) -> tuple[int, int] | None:
-    """Return (height, width) as stored of what its first bytes say is an image; None of anything else."""
+    """Return the stored (height, width) of an image file; None for any other file."""
     with contextlib.suppress(ImageFileError), _opened(path) as image:
         return _stored_size(image)
     return None
 
 
 def read_stored(path: Path) -> tuple[Tensor, int | None]:
-    """Read an image as it is stored, and its Exif orientation, by which it is not turned.
+    """Read an image as it is stored, and its Exif orientation, which is not applied.
 
-    Pixels are (C, H, W) uint8 with C = 1 grey, 2 grey and alpha, 3 RGB or 4 RGBA, also of other kinds (palette, CMYK);
-    or (1, H, W) uint16 of deep grey images. It warns of what is left out: the lower bits of deep colours, which Pillow
-    does not read, and all images but the first. An ImageFileError says what cannot be read, and why.
+    Pixels are (C, H, W) uint8 with C = 1 grey, 2 grey and alpha, 3 RGB or 4 RGBA, also for palette, CMYK and others;
+    or (1, H, W) uint16 for deep grey images. It warns if it leaves out data: the lower bits of deep colours, which
+    Pillow does not read, and all images but the first. Other files raise ImageFileError.
     """
     with _opened(path) as opened:
         count, tiles = getattr(opened, "n_frames", 1), getattr(opened, "tile", ())
-        # of deep colours its decoders are told so, which make eight bits of them
+        # Pillow's decoder reduces deep colours to eight bits; its arguments show that
         cut = opened.mode not in _DEEP and any(re.search(r";16|65535", str(tile[3])) for tile in tiles)
         orientation = opened.getexif().get(ORIENTATION)
         image = load_stored(opened)
@@ -82,7 +82,7 @@ def read_stored(path: Path) -> tuple[Tensor, int | None]:
 
 
 def as_jpeg(image: Any, size: tuple[int, int], name: str, owner: str, side: int, quality: int) -> bytes:
-    """Return a JPEG file, up to `side` pixels wide or high, of an image of any kind whose (height, width) is `size`."""
+    """Return a JPEG file, at most `side` pixels wide and high, of an image whose (height, width) must be `size`."""
     with contextlib.ExitStack() as stack:
         if isinstance(image, (str, bytes, os.PathLike)):
             image = stack.enter_context(_opened(Path(os.fsdecode(image))))
@@ -95,8 +95,8 @@ def as_jpeg(image: Any, size: tuple[int, int], name: str, owner: str, side: int,
         height, width = _stored_size(image)
         if (height, width) != size:
             raise ValueError(
-                f"{owner}: the image {name!r} has {width} x {height} pixels, and those of the camera have "
-                f"{size[1]} x {size[0]}"
+                f"{owner}: the image {name!r} must have the size of the camera, {size[1]} x {size[0]}; "
+                f"got {width} x {height} pixels"
             )
         image.draft(None, (side, side))
         image = load_stored(image)
@@ -111,17 +111,17 @@ def as_jpeg(image: Any, size: tuple[int, int], name: str, owner: str, side: int,
 
 
 def _stored_size(image: Image.Image) -> tuple[int, int]:
-    """Return (height, width) of an image that is not loaded yet."""
+    """Return the stored (height, width) of an image that is not loaded yet."""
     tags = getattr(image, "tag_v2", {})
     return tags.get(_HEIGHT, image.height), tags.get(_WIDTH, image.width)
 
 
 @contextlib.contextmanager
 def _opened(path: Path) -> Iterator[Image.Image]:
-    """Open an image; what Pillow raises here and in the block is an ImageFileError with the path and the reason."""
+    """Open an image; raise errors of Pillow, also in the block, as ImageFileError with the path and the reason."""
     try:
         with warnings.catch_warnings():
-            # of a large photograph, which is what the user named
+            # a large photograph, named by the user, needs no warning
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)
             image = Image.open(path)
         with image:

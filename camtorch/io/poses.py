@@ -1,4 +1,4 @@
-"""Poses in files: matrices or quaternions to `Extrinsics` in float64, and back."""
+"""Conversion of poses in files, matrices or quaternions, to `Extrinsics` in float64 and back."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from camtorch.io.writing import Lossy
 from camtorch.poses.extrinsics import Extrinsics
 from camtorch.poses.rotations import quaternion_vector, rotation_error, rotation_vector, vector_quaternion
 
-Place = Record | Callable[[int], Record]  # where a pose stands in a file; of a batch of poses a function of the row
+Place = Record | Callable[[int], Record]  # place of a pose in a file; for a batch a function of the row
 
 _ORTHOGONAL = 1e-3  # as Extrinsics.from_matrix
 _FARTHEST = 1e100
-UPRIGHT = np.array([1.0, -1.0, -1.0, 1.0])  # times columns, world from camera: axes of one that looks along -z, y up
+UPRIGHT = np.array([1.0, -1.0, -1.0, 1.0])  # scales columns of world from camera: for cameras that look along -z, y up
 
 
 def as_float64(values: Any) -> Tensor:
@@ -36,12 +36,12 @@ def _check(place: Place, right: Tensor, reason: Callable[[int], str]) -> None:
 
 
 def check_near(place: Place, values: Any) -> None:
-    """Refuse (*B, n) with numbers too large to compute with."""
+    """Refuse values (*B, n) with numbers too large to compute with."""
     right = (as_float64(values).abs() <= _FARTHEST).all(-1)
     _check(place, right, lambda row: f"a number beyond {_FARTHEST:g}, or none")
 
 
-# -- reading: single poses, or a batch of them; with `undo` the pose that undoes it. All raise CameraFileError
+# -- reading: single poses, or a batch; with `undo` the inverse pose. All raise CameraFileError
 
 
 @torch.no_grad()
@@ -67,10 +67,10 @@ def from_matrices(place: Place, rows: Any, undo: bool = False) -> Extrinsics:
 
 
 def rows_of(record: Record) -> list[list[float]]:
-    """Return the 4 x 4 or 3 x 4 matrix of a pose as 4 x 4."""
+    """Return a 4 x 4 or 3 x 4 matrix of a pose as 4 x 4."""
     rows = record.rows(4 if len(record) == 4 else 3, 4)
     if rows[3:] and rows[3] != [0, 0, 0, 1]:
-        record.fail(f"the last row is not 0 0 0 1, but {rows[3]}")
+        record.fail(f"the last row must be 0 0 0 1; got {rows[3]}")
     return [*rows[:3], [0.0, 0.0, 0.0, 1.0]]
 
 
@@ -80,11 +80,11 @@ def from_rows(record: Record, undo: bool = False) -> Extrinsics:
 
 
 def from_quaternions(place: Place, values: Any, undo: bool = False) -> Extrinsics:
-    """Return the pose of (*B, 7), unit quaternions w, x, y, z and translations."""
+    """Return the pose of (*B, 7): unit quaternions w, x, y, z and translations."""
     quaternions, translations = as_float64(values).tensor_split([4], -1)
     norm = quaternions.norm(dim=-1).flatten()
     right = (norm - 1).abs() < _ORTHOGONAL
-    _check(place, right, lambda row: f"a quaternion of length {norm[row]:.6g}, which is no rotation")
+    _check(place, right, lambda row: f"a quaternion must have length 1; got {norm[row]:.6g}")
     return pose(place, quaternion_vector(quaternions), translations, undo)
 
 
@@ -96,26 +96,26 @@ def _in_float64(extrinsics: Extrinsics, undo: bool) -> Extrinsics:
 
 @torch.no_grad()
 def matrices(extrinsics: Extrinsics, undo: bool = False) -> Tensor:
-    """Return the (*B, 4, 4) matrices of a pose, or of the one that undoes it, in float64."""
-    return _in_float64(extrinsics, undo).matrix() + 0.0  # which makes -0.0 zero
+    """Return the (*B, 4, 4) matrices of a pose, or of its inverse, in float64."""
+    return _in_float64(extrinsics, undo).matrix() + 0.0  # turns -0.0 into zero
 
 
 @torch.no_grad()
 def quaternions(extrinsics: Extrinsics, undo: bool = False) -> Tensor:
-    """Return the quaternions w, x, y, z and translations (*B, 7) of a pose, or of the one that undoes it."""
+    """Return quaternions w, x, y, z and translations (*B, 7) of a pose, or of its inverse."""
     there = _in_float64(extrinsics, undo)
     return torch.cat((vector_quaternion(there.rotation), there.translation), -1) + 0.0
 
 
 def is_identity(extrinsics: Extrinsics | None) -> bool:
-    """Whether the pose does nothing, to the last bit."""
+    """Whether the pose is exactly the identity, or None."""
     return extrinsics is None or not bool(extrinsics.rotation.any() or extrinsics.translation.any())
 
 
 def all_of(rig: Rig, lossy: Lossy) -> Extrinsics:
     """Return all poses of a rig as one batch in float64, in the order of their names; batches are refused."""
     batch, rows, values = rig.extrinsics.batch, list[list[float]](), []
-    if batch is not None:  # not one by one, of many images
+    if batch is not None:  # faster than one by one for many images
         vectors = [t.detach().double().cpu().expand(len(batch), 3) for t in (batch.rotation, batch.translation)]
         rows = torch.cat(vectors, -1).tolist()
     for name in rig.extrinsics:

@@ -1,4 +1,4 @@
-"""What stands in a file, with the place where it stands for the errors; and what a format of files is called."""
+"""Values of a file with their places for errors, and the names of a format."""
 
 from __future__ import annotations
 
@@ -26,22 +26,22 @@ _LONGEST_NUMBER = 400  # no double needs as many characters
 
 @dataclass(frozen=True)
 class Names:
-    """What a format and its files are called."""
+    """Names of a format and of its files."""
 
     format: str  # its key in `camtorch.load` and `camtorch.save`
     title: str  # what errors call it
-    suffixes: tuple[str, ...] = ()  # of the files that are written, with the dot; content says what a file to read is
-    patterns: tuple[str, ...] = ()  # names, as fnmatch has them, that mean this format; of several the longest counts
-    in_folder: tuple[str, ...] = ()  # files that stand for the folder they are in, the first that is there
+    suffixes: tuple[str, ...] = ()  # of written files, with the dot; files to read are recognized by content
+    patterns: tuple[str, ...] = ()  # fnmatch patterns that mean this format; the longest match wins
+    in_folder: tuple[str, ...] = ()  # files that stand for their folder; the first that exists is used
 
 
 class CameraFileError(ValueError):
-    """A calibration file that cannot be used.
+    """Error for a calibration file that cannot be used.
 
     Args:
-        path: the file.
-        place: the line or the key where reading stopped.
-        reason: what is wrong there, and where possible what to do.
+        path: The file.
+        place: The line or the key at which reading stopped.
+        reason: The reason, and if possible what to do.
     """
 
     def __init__(self, path: str | os.PathLike[str], place: str, reason: object):
@@ -64,7 +64,7 @@ class Record:
         raise CameraFileError(self.path, self.place or "content", reason) from None
 
     def _check(self, kind: type, what: str) -> None:
-        """Raise a CameraFileError unless a value of a kind stands here."""
+        """Raise a CameraFileError unless the value is of a kind."""
         if not isinstance(self.value, kind):
             self.fail(f"{what}, but {self._found()}")
 
@@ -91,11 +91,11 @@ class Record:
         return found
 
     def get(self, key: str) -> Record | None:
-        """The value of a key, or None."""
+        """Return the record of a key, or None."""
         return Record(self.path, self.value[key], self.place_of(key)) if key in self else None
 
     def place_of(self, key: str) -> str:
-        """The place of a key; of one that would spoil the line a short form."""
+        """Return the place of a key, shortened if the key is long or not printable."""
         key = key if key.isprintable() and len(key) <= 60 else f"{key!r:.60}"
         return f"{self.place}.{key}" if self.place else key
 
@@ -113,7 +113,7 @@ class Record:
         return str(self.value)
 
     def number(self) -> float:
-        """A finite number."""
+        """Return a finite number."""
         number = math.nan
         if isinstance(self.value, float) or (isinstance(self.value, str) and len(self.value) <= _LONGEST_NUMBER):
             with contextlib.suppress(ValueError):
@@ -124,40 +124,40 @@ class Record:
         return number
 
     def whole(self, low: int, high: int, what: str) -> int:
-        """A whole number from low to high; `what` is what the error says it is not."""
+        """Return a whole number from low to high; `what` names it in the error."""
         number = self.number()
         if number != int(number) or not low <= number <= high:
             self.fail(f"{number:g} is no {what}")
         return int(number)
 
     def side(self) -> int:
-        """The width or the height of an image."""
+        """Return the width or the height of an image."""
         return self.whole(1, LARGEST_SIDE, "number of pixels")
 
     def size(self) -> tuple[int, int]:
-        """(height, width) of a list [width, height]."""
+        """Return (height, width) of a list [width, height]."""
         if len(self) != 2:
-            self.fail(f"a size is [width, height]; this has {len(self)} numbers")
+            self.fail(f"a size must be [width, height]; got {len(self)} numbers")
         width, height = (side.side() for side in self)
         return height, width
 
     def numbers(self, count: int | None = None) -> list[float]:
-        """A list of finite numbers, of that many if given."""
+        """Return a list of finite numbers, `count` of them if given."""
         if count is not None and len(self) != count:
-            self.fail(f"{len(self)} numbers where {count} belong")
+            self.fail(f"must have {count} numbers; got {len(self)}")
         plain = isinstance(self.value, list) and all(type(v) is float and math.isfinite(v) for v in self.value)
         return list(self.value) if plain else [item.number() for item in self]
 
     def rows(self, rows: int, columns: int) -> list[list[float]]:
-        """A list of lists of finite numbers."""
+        """Return a list of lists of finite numbers."""
         if len(self) != rows:
-            self.fail(f"{len(self)} rows where {rows} belong")
+            self.fail(f"must have {rows} rows; got {len(self)}")
         return [row.numbers(columns) for row in self]
 
     def flat(self) -> list[float]:
-        """The numbers of a list, of a list of rows, or of a matrix as OpenCV and ROS have it."""
+        """Return the numbers of a list, of a list of rows, or of a matrix of OpenCV or ROS."""
         if isinstance(self.value, dict):
-            name = "sizes" if "sizes" in self else "rows and cols"  # the former of any number of dimensions
+            name = "sizes" if "sizes" in self else "rows and cols"  # "sizes" for any number of dimensions
             parts = [self[key] for key in name.split(" and ")]
             sizes = [n for part in parts for n in (part.numbers() if isinstance(part.value, list) else [part.number()])]
             if len(data := self["data"]) != math.prod(sizes):
@@ -168,7 +168,7 @@ class Record:
         return [item.number() for row in self for item in (row if isinstance(row.value, list) else [row])]
 
     def few(self, count: int) -> None:
-        """Refuse a file of more cameras than anyone has: each costs some kilobytes and a tenth of a millisecond."""
+        """Refuse a file of too many cameras: each costs some kilobytes and a tenth of a millisecond."""
         if count > _MOST_CAMERAS:
             self.fail(f"{count} cameras; more than {_MOST_CAMERAS} are not read")
 
@@ -180,7 +180,7 @@ class Record:
         size: tuple[int, int] | None,
         lens: Record | None = None,
     ) -> Camera:
-        """The camera of a model of `camtorch.MODELS`, in float64; `lens` is where its distortion stands."""
+        """Return the camera of a model of `camtorch.MODELS`, in float64; `lens` is the place of its distortion."""
         kind = self.model(key)
         arguments = [torch.tensor(intrinsics, dtype=torch.float64)]
         if distortion:
@@ -189,20 +189,20 @@ class Record:
                 there.fail(f"{len(distortion)} coefficients; {kind.__name__} takes {kind.counts_text()}")
             arguments.append(torch.tensor(distortion, dtype=torch.float64))
         try:
-            return kind(nn.Parameter(arguments[0]), *arguments[1:], image_size=size)  # cut out, it may be off centre
+            return kind(nn.Parameter(arguments[0]), *arguments[1:], image_size=size)  # crops may be off centre
         except (ValueError, TypeError) as error:
             self.fail(error)
 
     def intrinsics(self) -> list[float]:
-        """The focal lengths and principal point of the camera matrix, `flat`, that stands here."""
+        """Return the focal lengths and principal point of the camera matrix at this place, read by `flat`."""
         if len(matrix := self.flat()) != 9:
-            self.fail(f"a camera matrix has 3 x 3 numbers, this has {len(matrix)}")
+            self.fail(f"a camera matrix must have 3 x 3 numbers; got {len(matrix)}")
         fx, skew, cx, below, fy, cy, *bottom = matrix
         if skew:
             place = Record(self.path, None, f"{self.place}[1]")
             place.fail(f"a skew of {skew:g}, which no model here has; write 0 there to ignore it as OpenCV does")
         if below or bottom != [0, 0, 1]:
-            self.fail(f"is not [fx, 0, cx, 0, fy, cy, 0, 0, 1], but {matrix}")
+            self.fail(f"must be [fx, 0, cx, 0, fy, cy, 0, 0, 1]; got {matrix}")
         return [fx, fy, cx, cy]
 
     def model(self, key: str) -> type[Camera]:
@@ -216,12 +216,12 @@ class Record:
 
 
 def repeated(names: Iterable[str]) -> str | None:
-    """Return the first of the names that stands there more than once."""
+    """Return the first name that occurs more than once, or None."""
     return next((name for name, count in Counter(names).items() if count > 1), None)
 
 
 def one_of(record: Record, names: Collection[str]) -> str:
-    """The text of a record, which must be one of the names."""
+    """Return the text of a record, which must be one of the names."""
     if record.text() not in names:
         record.fail(f"{record.text()!r:.60} is not known here; known are {', '.join(sorted(filter(None, names)))}")
     return record.text()

@@ -22,12 +22,12 @@ _MODELS = {
 
 
 def matches(keys: dict[str, Any]) -> bool:
-    """Whether these are the keys of such a file."""
+    """Whether the keys are those of a camera_info."""
     return "distortion_model" in keys and any(key in keys for key in ("camera_matrix", "K", "k"))
 
 
 def parse(record: Record) -> Rig:
-    """The camera of a file: K and D. R and P, the rectification of a stereo pair, are not read."""
+    """Return the camera of a file from K and D. R and P, the rectification of a stereo pair, are not read."""
     name = record["camera_name"].text() if "camera_name" in record else "camera"
     width, height = (_either(record, f"image_{side}", side).side() for side in ("width", "height"))
     intrinsics = _either(record, "camera_matrix", "K", "k").intrinsics()
@@ -35,7 +35,7 @@ def parse(record: Record) -> Rig:
     coefficients = _either(record, "distortion_coefficients", "D", "d")
     distortion = coefficients.flat()
     while len(distortion) > max(counts, default=0) and not distortion[-1]:
-        distortion.pop()  # zeros to fill a message of fixed length
+        distortion.pop()  # messages of fixed length are padded with zeros
     if not distortion:
         key = "pinhole"
     elif len(distortion) not in counts:
@@ -49,7 +49,7 @@ def _either(record: Record, *keys: str) -> Record:
 
 
 def render(rig: Rig, lossy: Lossy) -> str:
-    """The text of a file: R is the identity, and P is K."""
+    """Return the text of a file: R is the identity, and P is K."""
     name, camera = lossy.only_camera(rig)
     lossy.no_pose(rig)
     height, width = lossy.size(name, camera)

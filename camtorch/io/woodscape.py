@@ -13,18 +13,18 @@ _POWERS = ("k1", "k2", "k3", "k4")
 
 
 def matches(keys: dict[str, Any]) -> bool:
-    """Whether these are the keys of such a file."""
+    """Whether the keys are those of a WoodScape calibration."""
     return "extrinsic" in keys and isinstance(keys.get("intrinsic"), dict) and "k1" in keys["intrinsic"]
 
 
 def parse(record: Record) -> Rig:
-    """The camera by its name, with its pose: camera from vehicle."""
+    """Return the camera by its name, with its pose, camera from vehicle."""
     lens, name = record["intrinsic"], record["name"].text() if "name" in record else "camera"
     one_of(lens["model"], ("radial_poly",))
     height, width = lens["height"].side(), lens["width"].side()
     focal, *higher = (lens[power].number() for power in _POWERS)
     if focal == 0:
-        lens["k1"].fail("0, where the focal length belongs")
+        lens["k1"].fail("the focal length must not be 0")
     centre = [lens[key].number() + (side - 1) / 2 for key, side in (("cx_offset", width), ("cy_offset", height))]
     intrinsics = [focal, focal * lens["aspect_ratio"].number(), *centre]
     camera = lens.camera("woodscape", intrinsics, [k / focal for k in higher], (height, width))

@@ -1,4 +1,4 @@
-"""Writing files: as a whole or not at all (`replacing`), numbers to the last bit, and what a format cannot hold."""
+"""Writing files as a whole or not at all (`replacing`), exact numbers, and errors for values that would be lost."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ _PART = re.compile(r"[.]([0-9a-f]{16})[0-9a-f]{8}[.]part")
 
 @contextlib.contextmanager
 def replacing(*paths: str | os.PathLike[str], synced: bool = True) -> Iterator[list[IO[bytes]]]:
-    """Open files to write that take the places of `paths` at the end of the block, one after the other.
+    """Open files that replace `paths` at the end of the block, one after the other.
 
-    If the block raises, none does. All is on the disk before the first place changes; `synced=False` saves that, a
-    hundredth of a second a file. If a path is a link, the file that it points to is replaced. Files keep their rights.
+    If the block raises, no path changes. All data is on the disk before the first path changes; `synced=False` skips
+    that, a hundredth of a second a file. If a path is a link, its target is replaced. Files keep their rights.
     """
     targets = [os.path.realpath(path) for path in paths]
     with contextlib.ExitStack() as stack:
@@ -47,12 +47,12 @@ def replacing(*paths: str | os.PathLike[str], synced: bool = True) -> Iterator[l
 
 
 def _opened_beside(path: str, stack: contextlib.ExitStack) -> IO[bytes]:
-    """Open an empty file beside `path`, with the rights of the file there; the stack closes and removes it."""
+    """Open an empty file in the folder of `path` with the same rights; `stack` closes and removes it."""
     folder, mode = os.path.dirname(path), os.stat(path).st_mode if os.path.exists(path) else None
     if not os.path.isdir(folder):
         raise FileNotFoundError(errno.ENOENT, "no such folder", folder)
     if mode is not None and not stat.S_ISREG(mode):
-        raise OSError(errno.EINVAL, "no ordinary file, which could be replaced", path)
+        raise OSError(errno.EINVAL, "no ordinary file, so it cannot be replaced", path)
     name = os.path.join(folder, f".{_mark_of(path)}{secrets.token_hex(4)}.part")
     rights = 0o666 if mode is None else stat.S_IMODE(mode)  # the kernel takes the umask from both
     stack.callback(Path(name).unlink, missing_ok=True)
@@ -63,12 +63,12 @@ def _opened_beside(path: str, stack: contextlib.ExitStack) -> IO[bytes]:
 
 
 def _mark_of(path: str) -> str:
-    """Return the begin of the names of files beside a path: a hash, as a name may have the longest length there is."""
+    """Return the prefix of temporary names for a path: a hash, because a name may already have the maximum length."""
     return hashlib.blake2b(os.fsencode(os.path.basename(path)), digest_size=8).hexdigest()
 
 
 def all_left_over(paths: Iterable[str]) -> list[str]:
-    """Return the files that crashes within `replacing` left beside any of `paths`."""
+    """Return the files that crashes within `replacing` left in the folders of `paths`."""
     marks = {(os.path.dirname(path), _mark_of(path)) for path in paths}
     found = []
     for folder in {folder for folder, _ in marks}:
@@ -79,24 +79,24 @@ def all_left_over(paths: Iterable[str]) -> list[str]:
 
 
 def number(value: float) -> str:
-    """Return a number that every YAML reader takes for one, to the last bit: PyYAML reads 1e-05 as text."""
+    """Return a number exactly, in a form that every YAML reader accepts: PyYAML reads 1e-05 as text."""
     return re.sub(r"^(-?\d+)e", r"\1.0e", repr(float(value)))
 
 
 def listed(values: Sequence[float]) -> str:
-    """Return [1.0, 2.0]."""
+    """Return numbers as text, as in [1.0, 2.0]."""
     return f"[{', '.join(map(number, values))}]"
 
 
 def as_json(value: object) -> str:
-    """Return indented JSON, lists of numbers in one line."""
+    """Return indented JSON with lists of numbers in one line."""
     text = json.dumps(value, indent=2, allow_nan=False)
     return re.sub(r"\[[^\[\]{}\"]*\]", lambda match: re.sub(r"\s*\n\s*", " ", match[0]), text) + "\n"
 
 
 @dataclass(frozen=True)
 class Lossy:
-    """The values that are written to the file `path` of a format, or errors that say which of them would be lost."""
+    """Values for the file `path` of a format; values that would be lost raise errors."""
 
     path: str
     format: str
@@ -106,18 +106,18 @@ class Lossy:
         raise CameraFileError(self.path, name, reason)
 
     def size(self, name: str, camera: Camera) -> tuple[int, int]:
-        """Return the (height, width) of a camera that must have them."""
+        """Return the (height, width) of a camera, which must have them."""
         if camera.image_size is None:
-            self.fail(name, f"no image_size, which {self.format} needs")
+            self.fail(name, f"must have an image_size for {self.format}; got none")
         return camera.image_size
 
     def model(
         self, name: str, camera: Camera, known: Collection[str]
     ) -> tuple[str, tuple[float, float, float, float], list[float]]:
-        """Return the key of a single camera's model, which must be a known one, its intrinsics and its distortion."""
+        """Return key, intrinsics and distortion of a single camera, whose model must be a known one."""
         (fx, fy, cx, cy), distortion = self._single(name, camera, "cameras", camera.intrinsics, camera.distortion)
         if camera.key not in known:
-            others = f"it has for {', '.join(sorted(known))}, which camera.convert(key).camera makes of it"
+            others = f"write camera.convert(key).camera with one of {', '.join(sorted(known))}"
             self.fail(name, f"{self.format} has no name for {camera.key}; {others}")
         return camera.key, (fx, fy, cx, cy), distortion
 
@@ -131,7 +131,7 @@ class Lossy:
         return values
 
     def at_most(self, name: str, camera: Camera, distortion: list[float], counts: Sequence[int]) -> list[float]:
-        """Return the coefficients, with zeros added or left out to make their number one of `counts`."""
+        """Return the coefficients, padded with zeros or without trailing zeros, so that their number is in `counts`."""
         if len(distortion) in counts:
             return distortion
         for count in sorted(counts):
@@ -142,24 +142,24 @@ class Lossy:
         return self.fail(name, f"{len(distortion)} coefficients; {has}, so {lost} would be lost")
 
     def only_camera(self, rig: Rig) -> tuple[str, Camera]:
-        """Return the name and the camera of a rig whose format holds no more than one."""
+        """Return name and camera of a rig, which must have only one camera for this format."""
         if len(rig.cameras) != 1:
             count = f"{len(rig.cameras)} cameras; {self.format} holds one"
-            self.fail("cameras", f"{count}; on the command line --name says which")
+            self.fail("cameras", f"{count}; on the command line choose one with --name")
         return next(iter(rig.cameras.items()))
 
     def no_images(self, rig: Rig) -> None:
-        """Refuse the posed images of a format that has only cameras."""
+        """Refuse posed images if the format has only cameras."""
         if images := [name for name in rig.extrinsics if name in rig.images]:
             self.fail(images[0], f"a posed image; {self.format} holds cameras only, so its pose would be lost")
 
     def no_pose(self, rig: Rig) -> None:
-        """Refuse the pose of a format that has none."""
+        """Refuse poses if the format has none."""
         self.no_images(rig)
         for name, extrinsics in rig.extrinsics.items():
             if self.pose(name, extrinsics) != ([0.0] * 3, [0.0] * 3):
                 place = f"its extrinsics would be lost; {self.format} has no place for them"
-                self.fail(name, f"{place}. Save the camera alone; on the command line --name {name} does")
+                self.fail(name, f"{place}. Save the camera alone; on the command line add --name {name}")
 
     def pose(self, name: str, extrinsics: Extrinsics) -> tuple[list[float], list[float]]:
         """Return rotation vector and translation of a single pose."""
@@ -167,7 +167,7 @@ class Lossy:
         return vectors[0], vectors[1]
 
     def all_posed(self, rig: Rig) -> dict[str, Extrinsics]:
-        """Return a pose for each camera; a single camera without one is where the rig is."""
+        """Return a pose for each camera; a single camera without a pose is at the rig's origin."""
         self.no_images(rig)
         if len(rig.cameras) == 1 and not rig.extrinsics:
             return dict.fromkeys(rig.cameras, Extrinsics([0.0] * 3, [0.0] * 3).double())

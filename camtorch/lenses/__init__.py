@@ -1,4 +1,4 @@
-"""Lenses that exist: 9,810 calibrations of action cameras, phones, photo and cinema cameras, found by name."""
+"""Real lenses: 9,810 calibrations of action cameras, phones, photo and cinema cameras, found by name."""
 
 from camtorch.lenses.collection import Lens, find, search
 from camtorch.lenses.lensfun import from_lensfun

@@ -1,8 +1,8 @@
-"""The collection of real lenses, by words as people write them: its entries are read when the first one is wanted.
+"""The collection of real lenses, searched by words; entries are read on first use.
 
-The file has the numbers' own bits, columns side by side; text is compressed by LZMA. fy is kept as its difference to
-fx, the principal point to the image's middle, each with its sign as the lowest bit, and the bytes of a column one plane
-after another.
+Numbers in the file are exact, in columns; text is compressed by LZMA. fy is stored as its difference to
+fx, the principal point relative to the image's middle, each with its sign as the lowest bit, and the bytes of a
+column one plane after another.
 """
 
 from __future__ import annotations
@@ -25,39 +25,39 @@ from camtorch.values.arguments import GUESS_CAMERA, as_image_size
 _FILE = Path(__file__).with_name("gyroflow.npz")
 _TEXTS = "brand", "camera", "lens", "setting", "width", "height", "readout_ms", "h_stretch", "v_stretch", "digital_lens"
 _WORD = re.compile(r"\d+(?:\.\d+)?|[^\W\d_]+")
-_NO_SPACE = re.compile(r"(?<!\d) | (?!\d)")  # but between two numbers
-_ASPECT = 0.01  # the part by which aspect ratios may differ, as sizes are rounded
+_NO_SPACE = re.compile(r"(?<!\d) | (?!\d)")  # except between two numbers
+_ASPECT = 0.01  # relative tolerance of aspect ratios, because sizes are rounded
 _SHOWN = 8
 
 
 @dataclass(frozen=True, repr=False)
 class Lens:
-    """A lens on a camera, as somebody calibrated it for the collection gyroflow/lens_profiles (public domain)."""
+    """A lens on a camera, as calibrated for the collection gyroflow/lens_profiles (public domain)."""
 
     brand: str
-    """Of the camera. The names are the collection's own."""
+    """Brand of the camera. Names are the collection's own."""
     body: str
-    """The camera."""
+    """Name of the camera."""
     lens: str
-    """The lens, or the mode of a camera that has but one."""
+    """Name of the lens, or the mode of a camera with one lens."""
     setting: str
-    """What else was said: resolution, focal length of a zoom, remarks."""
+    """Further notes: resolution, focal length of a zoom, remarks."""
     image_size: tuple[int, int]
-    """(height, width) that was calibrated."""
+    """Calibrated (height, width)."""
     intrinsics: tuple[float, ...]
-    """fx, fy, cx, cy in pixels."""
+    """Intrinsics fx, fy, cx, cy in pixels."""
     distortion: tuple[float, ...]
-    """k1 ... k4 of `KannalaBrandt`."""
+    """Coefficients k1 ... k4 of `KannalaBrandt`."""
     rms: float
-    """The calibration's own reprojection error in pixels."""
+    """Reprojection error of the calibration in pixels."""
     readout_ms: float | None
-    """Milliseconds from the first row to the last of a rolling shutter, negative if it reads from the bottom up; 0 is
-    what many calibrations say that do not know. None: unknown.
+    """Milliseconds from the first row to the last of a rolling shutter, negative if it reads from the bottom up. Many
+    calibrations state 0 if it is unknown. None: unknown.
     """
     stretch: tuple[float | None, float | None]
-    """Horizontal and vertical factor by which recorded images are to be stretched; None: not stated."""
+    """Horizontal and vertical factor to stretch recorded images by; None: not stated."""
     digital: str
-    """How the camera itself reprojects images after the lens, as GoPro's SuperView; empty where it does not."""
+    """Reprojection by the camera itself, as GoPro's SuperView; empty if there is none."""
 
     @property
     def name(self) -> str:
@@ -66,7 +66,7 @@ class Lens:
 
     @property
     def is_optical(self) -> bool:
-        """Whether a lens makes such images: not stretched, not reprojected, no focal length negative, as 31 are."""
+        """Whether a lens makes such images: not stretched or reprojected, positive focal lengths (31 have negative)."""
         return is_as_seen(self.digital, self.stretch) and self._exists
 
     @property
@@ -74,18 +74,18 @@ class Lens:
         return min(self.intrinsics[:2]) > 0
 
     def camera(self) -> KannalaBrandt:
-        """The camera, in float64, with nothing to learn, as those from files.
+        """Return the camera, in float64 and frozen.
 
         Raises:
-            ValueError: its focal lengths are negative.
+            ValueError: If its focal lengths are negative.
         """
         if not self._exists:
             raise ValueError(
-                f"{self.name}: this calibration has gone astray: fx, fy = {self.intrinsics[:2]}; take another one of "
-                "lenses.search, is_optical says which"
+                f"{self.name}: focal lengths must be positive; got {self.intrinsics[:2]}. Choose another one of "
+                "lenses.search with is_optical True"
             )
         made = KannalaBrandt(
-            torch.nn.Parameter(torch.tensor(self.intrinsics, dtype=torch.float64)),  # a few are off centre
+            torch.nn.Parameter(torch.tensor(self.intrinsics, dtype=torch.float64)),  # some are off centre
             torch.tensor(self.distortion, dtype=torch.float64),
             image_size=self.image_size,
         )
@@ -105,18 +105,18 @@ class Lens:
 
 
 def is_as_seen(digital: str, stretch: tuple[float | None, float | None]) -> bool:
-    """Whether images are as the lens makes them: not reprojected and not stretched. See `Lens`."""
+    """Whether images are neither reprojected nor stretched after the lens. See `Lens`."""
     return not digital and all(factor in (None, 1.0) for factor in stretch)
 
 
 def as_number(text: str) -> float | None:
-    """A number that may be missing in the collection."""
+    """Return a number that may be missing in the collection."""
     return float(text) if text else None
 
 
 @cache
 def columns() -> tuple[dict[str, list[str]], NDArray[np.float64]]:
-    """Return the columns of text by their names, and those of numbers (9, N): fx fy cx cy k1 k2 k3 k4 rms."""
+    """Return the columns of text by name, and the columns of numbers (9, N): fx fy cx cy k1 k2 k3 k4 rms."""
     with np.load(_FILE) as file:
         text, planes = file["text"].tobytes().decode(), file["planes"]
     lines, count = text.split("\0"), planes.shape[-1]
@@ -130,7 +130,7 @@ def columns() -> tuple[dict[str, list[str]], NDArray[np.float64]]:
 
 @cache
 def entries() -> tuple[Lens, ...]:
-    """All of them, in the order of the collection."""
+    """Return all lenses, in the order of the collection."""
     texts, numbers = columns()
     rows = zip(*texts.values(), numbers.T.tolist(), strict=True)
     return tuple(
@@ -143,17 +143,17 @@ def entries() -> tuple[Lens, ...]:
 
 
 def search(words: str = "", *, image_size: Sequence[int] | None = None) -> list[Lens]:
-    """The lenses whose names have all of these words, best first; all lenses if there are none.
+    """Return the lenses whose names have all of these words, best first; all lenses if there are none.
 
-    Case, spaces and signs do not count, nor does the order of words: "A7S III", "a7sIII" and "a7s-iii" are the same; a
-    number is whole, so that HERO9 is no HERO99. Best are those that have the words in a row; then those with the least
-    beside them; then those that are neither stretched nor reprojected by the camera; then those of the smallest
+    Case, spaces, signs and the order of words do not count: "A7S III", "a7sIII" and "a7s-iii" are the same; a
+    number is whole, so HERO9 does not match HERO99. Lenses with the words in a row come first; then those with the
+    fewest other words; then those neither stretched nor reprojected by the camera; then those with the smallest
     reprojection error.
 
     Args:
-        words: of brand, camera, lens and setting, or a size: "GoPro HERO9 wide", "Laowa 7.5mm 3840x2160".
-        image_size: (height, width): only lenses that were calibrated for images of this aspect ratio, those of this
-            size first.
+        words: Words of brand, camera, lens and setting, or a size: "GoPro HERO9 wide", "Laowa 7.5mm 3840x2160".
+        image_size: (height, width): only lenses that were calibrated for images of this aspect ratio, this size
+            first.
     """
     size = as_image_size(image_size, "lenses.search")
     terms = _terms(words, "search")
@@ -171,16 +171,16 @@ def search(words: str = "", *, image_size: Sequence[int] | None = None) -> list[
 
 
 def find(words: str, *, image_size: Sequence[int] | None = None) -> KannalaBrandt:
-    """The camera of the best match of `search`, in float64, with nothing to learn.
+    """Return the camera of the best match of `search`, in float64 and frozen.
 
     Args:
-        words: see `search`, which also lists what else they may mean.
-        image_size: (height, width) of the images at hand: the camera is scaled to them. By default that of the
+        words: Words as for `search`, which also lists the other matches.
+        image_size: (height, width) of your images, to which the camera is scaled. Default: the size of the
             calibration.
 
     Raises:
-        ValueError: nothing has all of these words (the text lists the names most like them), or nothing of that aspect
-            ratio. TypeError: no text.
+        ValueError: If no lens has all of these words (the text lists similar names), or none has that aspect
+            ratio. TypeError: If `words` is no text.
     """
     if not _terms(words, "find"):
         raise ValueError(f"lenses.find: words must name a camera or a lens, as 'GoPro HERO9 wide'; got {words!r}")
@@ -211,14 +211,14 @@ def _terms(words: str, function: str) -> list[str]:
 
 
 def _pattern(term: str) -> re.Pattern[str]:
-    """A term as names may have it, its numbers whole."""
+    """Return a pattern of a term in names, with whole numbers."""
     first, last = ("(?<!\\d)" if term[0].isdigit() else ""), ("(?!\\d)" if term[-1].isdigit() else "")
     return re.compile(first + re.escape(term) + last)
 
 
 @cache
 def _texts() -> list[tuple[str, int]]:
-    """Of every entry its name and size, and how long the name is."""
+    """Return name and size, and the length of the name, of every entry."""
     names = [_squeezed(lens.name) for lens in entries()]
     sizes = [f"{lens.image_size[1]}x{lens.image_size[0]}" for lens in entries()]
     return [(f"{name} {size}", len(name)) for name, size in zip(names, sizes, strict=True)]

@@ -1,4 +1,4 @@
-"""Real lenses to draw from, brought to the size of an image, of which every pixel has a ray."""
+"""Real lenses to draw from, scaled to the size of an image so that every pixel has a ray."""
 
 from __future__ import annotations
 
@@ -15,33 +15,33 @@ from camtorch.models import KannalaBrandt
 from camtorch.projection.domain import Domain
 
 _RMS = 1.0  # pixels
-_ASPECT = 0.05  # by which pixels may differ from squares
-_CENTRE = 0.1  # of the image's sides: how far from its middle the principal point may lie
+_ASPECT = 0.05  # tolerance of the aspect ratio of pixels
+_CENTRE = 0.1  # of the image's sides: largest distance of the principal point from the middle
 FOLD = 0.98  # of the image's radius at the fold: closer to it a pixel is many degrees wide
 _PART = 256  # lenses whose tables stay in the processor's cache: eight times as fast as all at once
-_EDGE = 1e-3  # degrees: what float32 may make of a field of view
+_EDGE = 1e-3  # degrees: rounding of a field of view in float32
 
 
 class Lenses(NamedTuple):
-    """Lenses before images of one size, in float64."""
+    """Lenses for images of one size, in float64."""
 
     intrinsics: Tensor  # (N, 4)
     distortion: Tensor  # (N, 4)
     reach: Tensor  # (N,): the radius of the image at the lens's fold in focal lengths
 
     def at(self, share: Tensor) -> Lenses:
-        """Those at shares (*B,) of the way through the list, from 0 to 1."""
+        """Return the lenses at shares (*B,) of the list, from 0 to 1."""
         index = (share * len(self.reach)).long().clamp(0, len(self.reach) - 1).to(self.reach.device)
         return Lenses(*(column[index].to(share) for column in self))
 
 
 @cache
 def _good() -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Sizes (N, 2) of (height, width), intrinsics and distortion (N, 4), and `Lenses.reach`, of lenses to draw from."""
+    """Return sizes (N, 2) = (height, width), intrinsics and distortion (N, 4), and `Lenses.reach`, of good lenses."""
     texts, numbers = columns()
     table = torch.from_numpy(numbers)
     sides = [[float(side) for side in texts[name]] for name in ("height", "width")]
-    size = torch.tensor(sides, dtype=torch.float64, device=table.device)  # whatever the default device is
+    size = torch.tensor(sides, dtype=torch.float64, device=table.device)  # not on the default device
     plain = [
         is_as_seen(digital, (as_number(across), as_number(down)))
         for digital, across, down in zip(*(texts[n] for n in ("digital_lens", "h_stretch", "v_stretch")), strict=True)
@@ -56,7 +56,7 @@ def _good() -> tuple[Tensor, Tensor, Tensor, Tensor]:
 
 
 def covering(intrinsics: Tensor, reach: Tensor, size: tuple[int, int]) -> Tensor:
-    """Return the factor (*B,), at least 1, on focal lengths with which all pixels have rays; reach as of `Lenses`."""
+    """Return the factor (*B,), at least 1, of focal lengths for which all pixels have rays; reach as in `Lenses`."""
     fx, fy, cx, cy = intrinsics.unbind(-1)
     height, width = size
     across = torch.maximum(cx + 0.5, width - 0.5 - cx) / fx
@@ -66,14 +66,14 @@ def covering(intrinsics: Tensor, reach: Tensor, size: tuple[int, int]) -> Tensor
 
 @lru_cache(maxsize=16)
 def lenses_for(size: tuple[int, int], fov: tuple[float, float] | None) -> Lenses:
-    """Return the lenses whose images of a size have a horizontal field of view in a range, in degrees; None: all.
+    """Return the lenses whose horizontal field of view is in a range of degrees for images of a size; None: all.
 
-    A calibrated image is scaled to cover the new one, and cropped evenly; focal lengths grow until pixels have rays.
+    A calibrated image is scaled to cover the new one and cropped evenly; focal lengths grow until pixels have rays.
     """
     sizes, intrinsics, distortion, reach = _good()
     new = sizes.new_tensor(size)
     scale = (new / sizes).amax(-1, keepdim=True)
-    # pixels' centres are half a pixel from the edges
+    # pixel centres are half a pixel from the edges
     centre = (intrinsics[:, 2:] - (sizes.flip(-1) - 1) / 2) * scale + (new.flip(-1) - 1) / 2
     focal = intrinsics[:, :2] * scale
     focal = focal * covering(torch.cat((focal, centre), -1), reach, size)[:, None]
@@ -90,14 +90,14 @@ def lenses_for(size: tuple[int, int], fov: tuple[float, float] | None) -> Lenses
     if not bool(chosen.any()):
         widest = math.floor(float(wide.max()))
         raise ValueError(
-            f"fov: no real lens shows {fov[0]:g} to {fov[1]:g} degrees across images of (height, width) {size}; the "
-            f"widest shows {widest}. fov=(low, high) is a range of degrees"
+            f"fov: must be that of a real lens for (height, width) {size}; got {fov[0]:g} to {fov[1]:g}; the "
+            f"widest shows {widest}. Write fov=(low, high) in degrees"
         )
     return Lenses(found[chosen], distortion[chosen], reach[chosen])
 
 
 def drawn(share: Tensor, size: tuple[int, int], fov: tuple[float, float] | None) -> Lenses:
-    """The lenses at shares (*B,) of the way through those of `lenses_for`, from 0 to 1, compiled or not."""
+    """Return the lenses at shares (*B,) of the list of `lenses_for`, from 0 to 1, compiled or not."""
     low, high = (None, None) if fov is None else map(float, fov)
     return Lenses(*_drawn(share, size, low, high))
 

@@ -1,4 +1,4 @@
-"""Lenses of lensfun's database, which your own `lensfunpy` reads; nothing of it is kept here."""
+"""Lenses of lensfun's database, read by your own `lensfunpy`; camtorch includes no part of it."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from camtorch.models import Tabulated
 from camtorch.values.arguments import as_image_size, as_number
 
 _DIAGONAL = math.hypot(36, 24)  # mm, of a sensor with crop factor 1
-_ASPECTS = (3 / 2, 4 / 3, 16 / 9, 1.0)  # of the images that lenses were calibrated with, most of them the first one
+_ASPECTS = (3 / 2, 4 / 3, 16 / 9, 1.0)  # of the calibration images, the first one most often
 _NODES = 128
-_SIDE = 600  # of the image by which the aspect ratio is found
+_SIDE = 600  # of the image that determines the aspect ratio
 # LensType of lensfunpy -> the angle of a radius in focal lengths
 _ANGLES: dict[str, Any] = {
     "RECTILINEAR": np.arctan,
@@ -33,7 +33,7 @@ _FACTORS: dict[str, Any] = {
 
 
 def from_lensfun(camera: Any, lens: Any, focal_length: float, *, image_size: Sequence[int]) -> Tabulated:
-    """The camera of a lens as lensfun distorts its images, in float64, with nothing to learn.
+    """Return the camera of a lens of lensfun, in float64 and frozen.
 
     lensfun's factors of the radius, "ptlens" (a r^3 + b r^2 + c r + 1 - a - b - c), "poly3" and "poly5", may have odd
     powers, so the camera is a table, from which `camera.convert("brown_conrady", count=8)` and others say how far they
@@ -42,14 +42,14 @@ def from_lensfun(camera: Any, lens: Any, focal_length: float, *, image_size: Seq
     16:9 and 1:1 it is the one that fits lensfunpy's `Modifier`. Source: lensfun 0.3, `mod-coord.cpp`.
 
     Args:
-        camera: a `lensfunpy.Camera`, for its crop factor.
-        lens: a `lensfunpy.Lens`.
-        focal_length: in mm.
+        camera: A `lensfunpy.Camera`, for its crop factor.
+        lens: A `lensfunpy.Lens`.
+        focal_length: Focal length in mm.
         image_size: (height, width) of the photographs.
 
     Raises:
-        ValueError: lensfun knows no distortion of the lens there, or no angles, as of panoramas; a focal length of 0.
-        ImportError: lensfunpy is not installed.
+        ValueError: If lensfun has no distortion or no angles of the lens, as for panoramas, or a focal length is 0.
+        ImportError: If lensfunpy is not installed.
     """
     import lensfunpy
 
@@ -60,17 +60,17 @@ def from_lensfun(camera: Any, lens: Any, focal_length: float, *, image_size: Seq
     found = lens.interpolate_distortion(focal)
     if found is None or found.model.name not in _FACTORS or lens.type.name not in _ANGLES:
         what = f"{lens.maker} {lens.model} at {focal:g} mm, {lens.type.name.lower()}"
-        raise ValueError(f"{owner}: lensfun knows no distortion, or no angles, of {what}")
+        raise ValueError(f"{owner}: lens must have distortion and angles in lensfun; got {what}")
     height, width = size
     corner = math.hypot(width, height) / 2
-    # image corners in units of lensfun, if it calibrated with images of these aspect ratios
+    # image corners in units of lensfun, for each possible aspect ratio of the calibration images
     corners = [lens.crop_factor / camera.crop_factor * math.hypot(1, aspect) for aspect in _ASPECTS]
     small = [max(2, round(side * _SIDE / max(size))) for side in (width, height)]
     modifier = lensfunpy.Modifier(lens, camera.crop_factor, *small)
     modifier.initialize(focal, lens.min_aperture or 8.0, scale=1.0, flags=lensfunpy.ModifyFlags.DISTORTION)
     moved = modifier.apply_geometry_distortion()
     factor = _FACTORS[found.model.name]
-    if moved is not None:  # which is no distortion
+    if moved is not None:  # None means no distortion
         middle = (np.array(small) - 1) / 2
         seen = float(np.linalg.norm(moved[0, 0] - middle) / np.linalg.norm(middle))
         corners.sort(key=lambda r: abs(factor(r, *found.terms) - seen))

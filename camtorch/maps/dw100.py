@@ -25,7 +25,7 @@ _SMALLEST, _LARGEST = (144, 176), (3072, 4096)
 
 
 class DW100(Table):
-    """The format: see the module."""
+    """The format of the DW100; see the module."""
 
     name = "dw100"
     options: tuple[str, ...] = ("clip",)
@@ -33,7 +33,7 @@ class DW100(Table):
     steps: tuple[int, ...] = (16,)
 
     def pack(self, path: str, mesh: Mesh, exact: Exact, options: Mapping[str, Any]) -> tuple[bytes, dict[str, Any]]:
-        """See `Table`; raise a CameraFileError for sizes and positions that the hardware does not take."""
+        """Return the file of a mesh; raise a CameraFileError if the hardware does not support a size or position."""
         for what, size in (("source", exact.source_size), ("target", exact.target_size)):
             if any(not low <= side <= high for low, side, high in zip(_SMALLEST, size, _LARGEST, strict=True)):
                 reason = f"{size[1]}x{size[0]}; the DW100 takes 176x144 to 4096x3072 pixels"

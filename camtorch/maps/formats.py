@@ -1,6 +1,6 @@
-"""`save_map` and `load_map`: the formats of maps, none of which is known here but by its object.
+"""`save_map` and `load_map`: the formats of maps, known only by their objects.
 
-To add a format, write one file beside this one, as `protocol.py` says, and name its object below.
+To add a format, write one file in this folder, as `protocol.py` explains, and name its object below.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from camtorch.maps.report import MapReport, measure
 from camtorch.maps.ti_ldc import TILDC
 from camtorch.warp.warp import Warp
 
-_ALL = OpenCV("opencv"), OpenCV("opencv_fixed"), DW100(), TILDC(), ONNX()  # in the order in which they are asked
+_ALL = OpenCV("opencv"), OpenCV("opencv_fixed"), DW100(), TILDC(), ONNX()  # in the order in which they are tried
 _FORMATS: dict[str, MapFormat] = {format.name: format for format in _ALL}
 FORMATS = tuple(_FORMATS)
 
@@ -34,7 +34,7 @@ _KNOWN = f"known are {', '.join(FORMATS)}; docs/leaving-0.3.md says what to use 
 
 
 class MapOptions(TypedDict, total=False):
-    """What `save_map` takes besides, each for some formats."""
+    """Options of `save_map`, each for some formats."""
 
     step: int | None
     block: tuple[int, int] | None
@@ -45,21 +45,21 @@ class MapOptions(TypedDict, total=False):
 def save_map(
     warp: Warp, path: str | os.PathLike[str], format: str | None = None, **options: Unpack[MapOptions]
 ) -> MapReport:
-    """Write where each pixel of the target is taken from, for another runtime, and measure what was written.
+    """Write the source position of each target pixel for another runtime, and measure the error of the file.
 
     The file is read back, interpolated as its runtime does, and compared with the exact positions, at every pixel that
     shows the source's image. A map holds positions alone: mode, padding, fill and antialias are the runtime's, except
     for "onnx", which holds all but the last.
 
     Args:
-        warp: a single one.
-        path: of the file, replaced as a whole or not at all. Bare tables get a description beside them, PATH.json.
-        format: "opencv" (.yml, .npz), "opencv_fixed" (the same), "dw100", "ti_ldc" or "onnx"; by default what the
-            suffix says.
+        warp: A single warp.
+        path: The file, replaced as a whole or not at all. A bare table gets a description next to it, PATH.json.
+        format: "opencv" (.yml, .npz), "opencv_fixed" (the same), "dw100", "ti_ldc" or "onnx". Default: chosen by
+            the suffix.
         step: "ti_ldc": pixels of the target between the nodes of the mesh, a power of two up to 128; 8 by default.
-        block: "ti_ldc": (height, width) of the blocks of the target; by default the largest that can be had.
+        block: "ti_ldc": (height, width) of the blocks of the target; default the largest possible.
         dtype: "onnx": of the images, "float32" by default, or "uint8".
-        clip: "dw100", "ti_ldc": draw in positions that the format cannot hold, rather than refuse them.
+        clip: "dw100", "ti_ldc": clip positions that the format cannot hold, instead of refusing them.
 
     Raises:
         CameraFileError: If the format cannot hold this warp; the error says why. ValueError: If the warp is a batch,
@@ -78,9 +78,9 @@ def save_map(
             takes = f"; it takes {', '.join(chosen.options)}" if chosen.options else ""
             raise ValueError(f"save_map: {chosen.name} has no {option}{takes}")
     if chosen.suffixes and not name.lower().endswith(chosen.suffixes):
-        raise ValueError(f"{name}: files of {chosen.name} are called {', '.join(chosen.suffixes)}")
+        raise ValueError(f"{name}: suffix must be one of {', '.join(chosen.suffixes)} for {chosen.name}")
     if not (exact := Exact(warp, "save_map")).shown.any():
-        raise ValueError(f"save_map: {name}: no pixel of the target shows anything of the source's image")
+        raise ValueError(f"save_map: {name}: the target must show a part of the source's image; got none")
     content, facts = chosen.encode(name, exact, given)
     described = {"format": chosen.name, **dict(zip(SIZES, exact.source_size + exact.target_size, strict=True)), **facts}
     files = files_of(name, chosen.name)
@@ -94,14 +94,14 @@ def save_map(
 
 
 def load_map(path: str | os.PathLike[str], format: str | None = None) -> LookupMap:
-    """Read a map that `save_map` wrote: to see what it holds, and to compare it with a warp.
+    """Read a map that `save_map` wrote, to inspect it or to compare it with a warp.
 
     Args:
-        path: the file, beside which bare tables have their description.
-        format: one of those of `save_map`; found from the content, the name and the description if left out.
+        path: The file; a bare table has its description next to it.
+        format: One of the formats of `save_map`. Default: found from the content, the name and the description.
 
     Returns:
-        A `LookupMap`: `.positions`, `.map_x`, `.map_y`, `.grid()`, `.error(warp)`; called with images it warps them.
+        LookupMap: `.positions`, `.map_x`, `.map_y`, `.grid()`, `.error(warp)`; called with images it warps them.
 
     Raises:
         CameraFileError: If the file cannot be used; the error says why. OSError: If it cannot be opened. ValueError: If
@@ -114,7 +114,7 @@ def load_map(path: str | os.PathLike[str], format: str | None = None) -> LookupM
     described = _read_description(name) if chosen is None or chosen.described else {}
     chosen = chosen or _FORMATS.get(str(described.get("format")))
     if chosen is None:
-        what = f"not that of a known map, and no {name}.json says it; say format: {_KNOWN}"
+        what = f"no known map, and no {name}.json describes it; write format=...: {_KNOWN}"
         raise CameraFileError(name, "content", what)
     if described.get("format", chosen.name) != chosen.name:
         raise CameraFileError(f"{name}.json", "format", f"describes {described['format']!r:.60}, not {chosen.name}")
@@ -122,7 +122,7 @@ def load_map(path: str | os.PathLike[str], format: str | None = None) -> LookupM
         read = chosen.decode(content, described)
     except ImportError:
         raise
-    except Exception as error:  # whatever a damaged file makes of the library that reads it
+    except Exception as error:  # libraries raise any error for damaged files
         reason = f"no map of {chosen.name}: {str(error) or type(error).__name__}"
         raise CameraFileError(name, "content", reason) from None
     facts = {key: tuple(value) if isinstance(value, list) else value for key, value in described.items()}
@@ -131,19 +131,19 @@ def load_map(path: str | os.PathLike[str], format: str | None = None) -> LookupM
 
 
 def files_of(path: str | os.PathLike[str], format: str | None = None) -> tuple[str, ...]:
-    """Return the files that `save_map` writes: that of the path, and beside a bare table its description."""
+    """Return the files that `save_map` writes: the path, and for a bare table its description."""
     name = path_of(path, "save_map")
     return (name, f"{name}.json") if _chosen(name, format).described else (name,)
 
 
 def check_map(warp: Warp, path: str | os.PathLike[str], format: str | None = None) -> MapReport:
-    """Return how far a map that is there is from a warp; raise as `load_map`, and if it is between other sizes."""
+    """Return the report on the error of an existing map; raise as `load_map`, and if the sizes differ."""
     read = load_map(path, format)
     return measure(path_of(path, "check_map"), read, Exact(warp, "check_map"), (), read.facts)
 
 
 def _read_description(path: str) -> dict[str, Any]:
-    """Return what stands beside a bare table, or nothing."""
+    """Return the description of a bare table, or an empty dict."""
     if not os.path.isfile(beside := f"{path}.json"):
         return {}
     with open(beside, "rb") as file:
@@ -164,7 +164,7 @@ def _chosen(path: str, format: str | None) -> MapFormat:
     suffixes = {suffix: known for known in reversed(_FORMATS.values()) for suffix in known.suffixes}
     if suffix not in suffixes:
         raise ValueError(
-            f"{path}: the name does not say the format; names that end in {', '.join(suffixes)} do. Say which, "
+            f"{path}: the name does not determine the format; names that end in {', '.join(suffixes)} do. Name it, "
             f"as in format='dw100' or --format dw100; {_KNOWN}"
         )
     return suffixes[suffix]
@@ -172,5 +172,5 @@ def _chosen(path: str, format: str | None) -> MapFormat:
 
 def _named(format: str) -> MapFormat:
     if (found := _FORMATS.get(str(format).lower())) is None:
-        raise ValueError(f"format: {format!r} is no format of a map that is known here; {_KNOWN}")
+        raise ValueError(f"format: must be a known format of maps; got {format!r}; {_KNOWN}")
     return found

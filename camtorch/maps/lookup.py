@@ -1,4 +1,4 @@
-"""A map as it was read, and what it is measured against: positions on the source's image by pixels of the target."""
+"""A map as read, and the exact positions to compare it with: positions on the source's image for target pixels."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ Floats = npt.NDArray[np.float64]
 Bools = npt.NDArray[np.bool_]
 
 _STRIP = 1 << 19  # pixels computed at a time
-OUTSIDE = -9.0  # a position of `grid_sample` that no image reaches
-_FAR = 100.0  # positions beyond are drawn in, as by `Warp`: float32 does not hold all of them, nor do integers
+OUTSIDE = -9.0  # a position of `grid_sample` outside of all images
+_FAR = 100.0  # positions beyond are clamped, as in `Warp`: float32 and integers cannot hold all
 
 
 class Exact:
-    """Positions on the source's image by pixels of the target, as the cameras say: no lattice, nothing rounded."""
+    """Exact positions on the source's image for target pixels, computed by the cameras without lattice or rounding."""
 
     positions: Floats  # (H', W', 2): x and y in pixels of the source; finite, on its image or off
     mapped: Bools  # (H', W'): the pixel has a ray, and the source maps it, on its image or off
@@ -49,7 +49,7 @@ class Exact:
         self.shown = self.mapped & ((self.positions >= -0.5) & (self.positions <= outer)).all(-1)
 
     def at(self, columns: Floats, rows: Floats) -> tuple[Floats, Bools]:
-        """Return positions (n, m, 2) and `mapped` (n, m) where columns (m,) and rows (n,) of the target cross."""
+        """Return positions (n, m, 2) and `mapped` (n, m) at crossings of columns (m,) and rows (n,) of the target."""
         positions, mapped = np.empty((len(rows), len(columns), 2)), np.empty((len(rows), len(columns)), np.bool_)
         step = max(_STRIP // max(len(columns), 1), 1)
         for top in range(0, len(rows), step):
@@ -65,49 +65,49 @@ class Exact:
 
 @dataclass(eq=False, repr=False)
 class LookupMap:
-    """A map that was read from a file: where every pixel of the target is taken from.
+    """A map that was read from a file: the source position of every target pixel.
 
-    Meshes are interpolated as the hardware does. It is there to check a file, and to see what a runtime will make of
-    an image; `Warp` is faster and more exact.
+    Meshes are interpolated as the hardware does. Use it to check a file, and to see the images that a runtime will
+    make; `Warp` is faster and more exact.
     """
 
     positions: Tensor
-    """(H', W', 2) float64, x and y in pixels of the source; NaN where the map draws nothing."""
+    """(H', W', 2) float64, x and y in pixels of the source; NaN for pixels that the map leaves empty."""
     source_size: tuple[int, int]
-    """(height, width) of the images that it takes."""
+    """(height, width) of its input images."""
     format: str
     facts: dict[str, Any]
-    """What else the file or its description says, such as `step`, `nodes` or `block_size`."""
+    """Other facts of the file or its description, such as `step`, `nodes` or `block_size`."""
 
     @property
     def target_size(self) -> tuple[int, int]:
-        """(height, width) of the images that it makes."""
+        """(height, width) of its output images."""
         height, width = self.positions.shape[:2]
         return height, width
 
     @property
     def map_x(self) -> Tensor:
-        """(H', W') float32: the columns, as `cv2.remap` takes them."""
+        """Columns (H', W') float32, as for `cv2.remap`."""
         return self.positions[..., 0].float()
 
     @property
     def map_y(self) -> Tensor:
-        """(H', W') float32: the rows."""
+        """Rows (H', W') float32, as for `cv2.remap`."""
         return self.positions[..., 1].float()
 
     def grid(self) -> Tensor:
-        """(1, H', W', 2) float32, as of `Warp.grid`: for `grid_sample(..., align_corners=False)`, -9 for nothing."""
+        """Return the grid (1, H', W', 2) float32 for `grid_sample(..., align_corners=False)`; -9 means no position."""
         size = self.positions.new_tensor(self.source_size[::-1])
         grid = ((2 * self.positions + 1) / size - 1).nan_to_num(OUTSIDE, OUTSIDE, OUTSIDE)
         return grid.clamp(-_FAR, _FAR).float()[None]
 
     def valid_mask(self) -> Tensor:
-        """(1, 1, H', W') bool: the pixel shows something of the source's image."""
+        """Return a mask (1, 1, H', W') bool: True if the pixel shows a part of the source's image."""
         outer = self.positions.new_tensor(self.source_size[::-1]) - 0.5
         return ((self.positions >= -0.5) & (self.positions <= outer)).all(-1)[None, None]  # NaN is nowhere
 
     def __call__(self, images: Tensor, mode: str = "bilinear", padding_mode: str = "zeros") -> Tensor:
-        """Apply it to images (B, C, H, W) of the source's size, floating point, integer or bool; the dtype stays.
+        """Warp images (B, C, H, W) of the source's size; floating point, integer and bool dtypes are kept.
 
         Integers are exact up to 2^53.
         `mode` is "nearest", "bilinear" or "bicubic", `padding_mode` "zeros", "border" or "reflection".
@@ -125,10 +125,10 @@ class LookupMap:
         return narrow(F.grid_sample(values, grid, mode, padding_mode, align_corners=False), images.dtype)
 
     def error(self, warp: Warp) -> Tensor:
-        """(H', W') float64: how far it is from a warp, in pixels of the source; NaN where the warp shows nothing.
+        """Return the distance (H', W') float64 to a warp in pixels of the source; NaN if the warp shows nothing there.
 
-        Positions beyond the outermost pixel centres count as on them, as edges are repeated; where the map draws
-        nothing and the warp does, it is infinite.
+        Positions beyond the outermost pixel centres count as on them, because edges are repeated. If only the map
+        leaves a pixel empty, the distance is infinite.
 
         Raises:
             ValueError: If the warp is between images of other sizes.
@@ -139,7 +139,7 @@ class LookupMap:
         mine, wanted = (self.source_size, self.target_size), (exact.source_size, exact.target_size)
         if mine != wanted:
             raise ValueError(
-                f"LookupMap.error: the map is from images of (height, width) {mine[0]} to {mine[1]}, the warp from "
+                f"LookupMap.error: map and warp must have the same sizes; got {mine[0]} to {mine[1]}, and "
                 f"{wanted[0]} to {wanted[1]}"
             )
         limits = self.positions.new_zeros(2), self.positions.new_tensor(self.source_size[::-1]) - 1

@@ -1,4 +1,4 @@
-"""Meshes: positions at the corners of blocks of the target, and tables of them as camera chips take them."""
+"""Meshes: positions at the corners of blocks of the target, and tables of them for camera chips."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from camtorch.maps.lookup import Bools, Exact, Floats, LookupMap
 from camtorch.maps.protocol import SIZES, MapFormat, checked
 from camtorch.values.arguments import as_whole
 
-_SLACK = 0.5  # pixels: as far as a pixel that shows the image may lie beyond the outermost pixel centres
+_SLACK = 0.5  # pixels that a pixel of the image may lie beyond the outermost pixel centres
 _OUTWARDS = 1 / 32  # of the second differences by which nodes round outwards
 _MOST_STEPS = 200
 _GAIN = 1e-9  # pixels
 _NEIGHBOURS = [(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if i or j]
-_REACH = 1  # sizes of the source by which nodes that no shown pixel needs may lie off it
+_REACH = 1  # source sizes that nodes without a shown pixel may lie outside of it
 
 
 @dataclass(frozen=True)
 class Mesh:
-    """Positions at every `step` pixels of the target from the first to beyond the last, bilinear between them."""
+    """Positions at every `step` pixels of the target, from the first to beyond the last, bilinear between them."""
 
     step: int
     nodes: Floats  # (n, m, 2), x and y in pixels of the source
@@ -34,12 +34,12 @@ class Mesh:
 
     @property
     def places(self) -> Floats:
-        """(n, m, 2): x and y of the nodes in pixels of the target."""
+        """Nodes (n, m, 2), x and y in pixels of the target."""
         n, m = self.nodes.shape[:2]
         return self.step * np.stack(np.meshgrid(np.arange(m), np.arange(n)), -1).astype(np.float64)
 
     def positions(self, size: tuple[int, int]) -> Floats:
-        """Return the position (H', W', 2) of each pixel of a target of that size."""
+        """Return the position (H', W', 2) of each pixel of a target of size (height, width)."""
         (i, down), (j, across) = (divmod(np.arange(side), self.step) for side in size)
         s, t = (down / self.step)[:, None, None], (across / self.step)[:, None]
         lines = self.nodes[i] * (1 - s) + self.nodes[i + 1] * s
@@ -47,7 +47,7 @@ class Mesh:
 
 
 class Table(MapFormat):
-    """A format whose file is a bare table of a mesh: sizes and step come from the description next to it."""
+    """A format whose file is a bare table of a mesh: sizes and step are in the description next to it."""
 
     described = True
     step: int  # pixels of the target between nodes, by default
@@ -55,14 +55,14 @@ class Table(MapFormat):
 
     @abstractmethod
     def pack(self, path: str, mesh: Mesh, exact: Exact, options: Mapping[str, Any]) -> tuple[bytes, dict[str, Any]]:
-        """Return the file of a mesh, and the facts that its user needs besides its step and its number of nodes."""
+        """Return the file of a mesh, and the facts that its user needs in addition to step and number of nodes."""
 
     @abstractmethod
     def unpack(self, content: bytes, blank: Mesh) -> Floats:
         """Return the nodes (n, m, 2) of a file; `blank` has their step and their places."""
 
     def encode(self, path: str, exact: Exact, options: Mapping[str, Any]) -> tuple[bytes, dict[str, Any]]:
-        # the mesh of a warp, exact at its nodes, smoothly continued to those without a position; refuse seams
+        # the mesh is exact at its nodes and extrapolated smoothly to nodes without a position; seams are refused
         step = self._checked(as_whole(options.get("step", self.step), "step", "save_map"), "save_map")
         half, leaps = np.array(exact.source_size[::-1], np.float64) / 2, 0
         for p, shown in ((exact.positions, exact.shown), (exact.positions.swapaxes(0, 1), exact.shown.T)):
@@ -82,7 +82,7 @@ class Table(MapFormat):
         nodes, mapped = exact.at(step * np.arange(m, dtype=np.float64), step * np.arange(n, dtype=np.float64))
         sides = np.array(exact.source_size[::-1], np.float64)
         low, high = -_REACH * sides, (1 + _REACH) * sides
-        # nodes far off do not tell where to go on
+        # nodes far off are no basis for extrapolation
         nodes = _continued(np.where(needed[..., None], nodes, nodes.clip(low, high)), mapped, low, high)
         mesh = Mesh(step, nodes, needed)
         content, facts = self.pack(path, mesh, exact, options)
@@ -103,22 +103,22 @@ class Table(MapFormat):
 
 
 def table(content: bytes, dtype: str, shape: tuple[int, ...]) -> np.ndarray:
-    """Return the numbers of a table of that shape; raise a ValueError if the content has another length."""
+    """Return the numbers of a table of a shape; raise a ValueError if the content has another length."""
     expected = int(np.prod(shape, dtype=object)) * np.dtype(dtype).itemsize
     if len(content) != expected:
-        raise ValueError(f"{len(content)} bytes; {'x'.join(map(str, shape))} of {np.dtype(dtype)} are {expected}")
+        raise ValueError(f"content must have {expected} bytes; got {len(content)}")
     return np.frombuffer(content, dtype).reshape(shape)
 
 
 def _counts(step: int, size: tuple[int, int]) -> tuple[int, int]:
-    """Return how many nodes there are down and across: the last ones are not below the size."""
+    """Return the number of nodes down and across; the last nodes are at or beyond the size."""
     return -(-size[0] // step) + 1, -(-size[1] // step) + 1
 
 
 def _continued(nodes: Floats, known: Bools, low: Floats, high: Floats) -> Floats:
-    """Return nodes (n, m, 2) with those that are not known laid out from their neighbours, ring by ring.
+    """Return nodes (n, m, 2) with unknown nodes extrapolated from their neighbours, ring by ring.
 
-    The first ring, which has a part in what is shown, goes on along parabolas, those behind it along shorter lines.
+    The first ring, which affects shown pixels, follows parabolas; later rings follow shorter lines.
     """
     nodes, known = nodes.copy(), known.copy()
     n, m = known.shape
@@ -140,14 +140,14 @@ def _continued(nodes: Floats, known: Bools, low: Floats, high: Floats) -> Floats
             weight += trust
         new = ~known & (weight > 0)
         nodes[new] = (total[new] / weight[new][:, None]).clip(low, high)
-        if not new.any():  # not one is known
+        if not new.any():  # no node is known
             break
         known, first = known | new, False
     return nodes
 
 
 def held(path: str, format: str, mesh: Mesh, low: Floats, high: Floats, *, clip: bool) -> Mesh:
-    """Return the mesh, nodes drawn in to `low` and `high`; refuse, unless `clip`, if shown pixels are far beyond."""
+    """Return the mesh with nodes clipped to `low` and `high`; raise, unless `clip`, if shown pixels are far off."""
     beyond = ((mesh.nodes < low - _SLACK) | (mesh.nodes > high + _SLACK)).any(-1)
     if mesh.needed is not None and not clip and (lost := beyond & mesh.needed).any():
         worst = mesh.nodes[lost]
@@ -156,20 +156,20 @@ def held(path: str, format: str, mesh: Mesh, low: Floats, high: Floats, *, clip:
             path,
             f"{int(lost.sum())} of {int(mesh.needed.sum())} vertices",
             f"lie at x {left:.1f} to {right:.1f}, y {top:.1f} to {bottom:.1f} px of the source, which {format} does "
-            "not hold. A target that shows less beyond the edges of the source's image does without them; clip=True "
-            "(--clip) draws them in, and the report says what that costs",
+            "not hold. Choose a target that shows less beyond the edges of the source's image; or clip=True "
+            "(--clip) clips them, and the report has the error",
         )
     return replace(mesh, nodes=mesh.nodes.clip(low, high))
 
 
 def rounded(mesh: Mesh, exact: Exact, parts: int, low: Floats, high: Floats) -> np.ndarray:
-    """Return the nodes in whole parts of a pixel, (n, m, 2) int64, so that the largest error at shown pixels is small.
+    """Return the nodes (n, m, 2) int64 in `parts` of a pixel, so that the largest error at shown pixels is small.
 
-    Each is one of the two next to the exact value, within low and high in pixels. Bends are cut off between nodes, so
-    nodes round towards the outside; then those about the largest error round as is best there, while that helps.
+    Each is one of the two neighbours of the exact value, from low to high. Interpolation cuts off bends, so nodes are
+    rounded outwards first; then those near the largest error are rounded to reduce it, as long as that helps.
     """
     values, least, most = mesh.nodes * parts, low * parts, high * parts
-    total = np.zeros_like(mesh.nodes)  # of the second differences along both axes; at the ends those next to them
+    total = np.zeros_like(mesh.nodes)  # sum of second differences along both axes; the ends copy their neighbours
     for axis in (0, 1):
         if mesh.nodes.shape[axis] > 2:
             bend = np.diff(mesh.nodes, 2, axis)

@@ -23,7 +23,7 @@ _NEEDED = "onnx", "models of ONNX need onnx", "onnx"
 
 
 class ONNX(MapFormat):
-    """The format: see the module. What runtimes do in their own ways is refused."""
+    """The format of ONNX models; see the module. Features on which runtimes differ are refused."""
 
     name = "onnx"
     suffixes: tuple[str, ...] = (".onnx",)
@@ -34,7 +34,7 @@ class ONNX(MapFormat):
         if dtype not in _DTYPES:
             raise ValueError(f"save_map: dtype must be one of {_DTYPES}; got {dtype!r}")
         if warp.antialias:
-            raise ValueError("save_map: GridSample has no antialiasing; save a warp with antialias=False")
+            raise ValueError("save_map: antialias must be False for ONNX; got True. Save a warp with antialias=False")
         if warp.mode == "bicubic" and warp.padding_mode != "zeros":
             raise ValueError(
                 f"save_map: mode='bicubic' with padding_mode={warp.padding_mode!r} is not the same in every ONNX "
@@ -43,7 +43,7 @@ class ONNX(MapFormat):
         return _model(exact, dtype).SerializeToString(), {"dtype": dtype, "opset": _OPSET}
 
     def decode(self, content: bytes, described: Mapping[str, Any]) -> LookupMap:
-        """See `MapFormat`. Models are read as they are written here."""
+        """Read a model, as this module writes it; see `MapFormat`."""
         onnx = imported(*_NEEDED)
         graph = onnx.load_model_from_string(content).graph
         (grid,) = (onnx.numpy_helper.to_array(t).astype(np.float64) for t in graph.initializer if t.name == "grid")
@@ -60,7 +60,7 @@ def _model(exact: Exact, dtype: str) -> Any:
     helper, kinds = onnx.helper, onnx.TensorProto
     warp, (height, width) = exact.warp, exact.source_size
     with torch.no_grad():
-        grid = warp.grid().float().cpu().numpy()  # what the warp itself samples by
+        grid = warp.grid().float().cpu().numpy()  # the grid of the warp itself
     mapped = ~(grid == OUTSIDE).all(-1)
     fill = np.array(warp.fill, np.float32).reshape(1, -1, 1, 1)
     shapes = {"planes": [1, -1, height, width], "target_size": exact.target_size, "first": [0], "third": [2]}
@@ -72,13 +72,13 @@ def _model(exact: Exact, dtype: str) -> Any:
         return f"step{len(nodes) - 1}"
 
     images = add("Cast", "images", to=kinds.FLOAT) if dtype == "uint8" else "images"
-    blended = warp.padding_mode == "zeros" and bool(fill.any())  # the rim fades to the fill, not to zero
+    blended = warp.padding_mode == "zeros" and bool(fill.any())  # the rim fades to the fill instead of zero
     filled = warp.padding_mode != "zeros" and not mapped.all()
     if blended or filled:
         constants["fill"] = fill
     if blended:
         images = add("Sub", images, "fill")
-    flat = add("Reshape", images, "planes")  # all channels of all images as those of one: the grid is read once
+    flat = add("Reshape", images, "planes")  # all channels as one image: the grid is read once
     options = {"mode": warp.mode, "padding_mode": warp.padding_mode, "align_corners": 0}
     sampled = add("GridSample", flat, "grid", **options)
     leading = add("Slice", add("Shape", "images"), "first", "third")

@@ -24,18 +24,18 @@ from camtorch.maps.lookup import Exact, LookupMap
 from camtorch.maps.protocol import MOST_PIXELS, SIZES, MapFormat, checked
 
 _NOWHERE = -32768
-_LONGEST = 32766  # pixels: cv2.remap wants sides below SHRT_MAX
+_LONGEST = 32766  # pixels: cv2.remap needs sides below SHRT_MAX
 _PARTS = 32  # of a pixel
 _LARGEST_ARRAY = 8 * MOST_PIXELS
 # matrices in YAML, with their data in base64
 _TYPES = {"f": "<f4", "d": "<f8", "s": "<i2", "w": "<u2", "i": "<i4", "u": "u1"}
 _LETTERS = {np.dtype(code): letter for letter, code in _TYPES.items()}
-_HEADER = 24  # bytes before the data in base64, which say the type once more
+_HEADER = 24  # bytes before the data in base64, which repeat the type
 _LINE = 76  # characters of base64 in a line
 
 
 class OpenCV(MapFormat):
-    """The formats: see the module. "opencv_fixed" is in fixed point."""
+    """The formats of cv2.remap; see the module. "opencv_fixed" is in fixed point."""
 
     suffixes: tuple[str, ...] = (".yml", ".yaml", ".npz")
 
@@ -62,7 +62,7 @@ class OpenCV(MapFormat):
         return file.getvalue(), {}
 
     def matches(self, path: str, content: bytes) -> bool:
-        """See `MapFormat`. Which of the two it is the types of its matrices say."""
+        """Whether a content is such a file; see `MapFormat`. The types of the matrices decide between both."""
         return content.startswith((b"PK\3\4", b"%YAML"))
 
     def decode(self, content: bytes, described: Mapping[str, Any]) -> LookupMap:
@@ -75,14 +75,14 @@ class OpenCV(MapFormat):
         else:
             positions = np.stack((first, second), -1).astype(np.float64)
         if positions.ndim != 3 or not positions.size or positions.shape[-1] != 2:
-            raise ValueError(f"no maps of cv2.remap: {first.dtype} {first.shape} and {second.dtype} {second.shape}")
+            raise ValueError(f"not maps of cv2.remap: {first.dtype} {first.shape} and {second.dtype} {second.shape}")
         positions[(positions <= _NOWHERE).any(-1) | ~np.isfinite(positions).all(-1)] = np.nan
         size = checked("source_size", [int(arrays[key]) for key in SIZES[:2]])
         return LookupMap(torch.from_numpy(positions), size, "opencv_fixed" if is_fixed else "opencv", {})
 
 
 def _as_yaml(arrays: dict[str, np.ndarray]) -> bytes:
-    """Return what `cv2.FileStorage` reads: matrices as it writes them with WRITE_BASE64, and whole numbers."""
+    """Return a file for `cv2.FileStorage`: matrices as written with WRITE_BASE64, and whole numbers."""
     parts = [b"%YAML:1.0\n---\n"]
     for key, value in arrays.items():
         if value.ndim == 0:
@@ -108,7 +108,7 @@ _END = re.compile(rb"^\S|\Z", re.MULTILINE)
 
 
 def _from_yaml(content: bytes) -> dict[str, np.ndarray]:
-    """Return the matrices of such a file, (rows, columns[, channels]), and the whole numbers; raise if damaged."""
+    """Return the matrices of a file, (rows, columns[, channels]), and the whole numbers; raise if it is damaged."""
     arrays = {found[1].decode(): np.array(int(found[2])) for found in _NUMBER.finditer(content)}
     for found in _MATRIX.finditer(content):
         end = _END.search(content, found.end())

@@ -1,4 +1,4 @@
-"""What a format of maps provides: its names, the options that it takes, and how it is written and read."""
+"""The interface of a format of maps: its names, its options, and functions to write and read."""
 
 from __future__ import annotations
 
@@ -9,28 +9,28 @@ from typing import Any
 from camtorch.maps.lookup import Exact, LookupMap
 
 MOST_PIXELS = 1 << 26  # of a map that is read: 8192 x 8192
-SIZES = "source_height", "source_width", "target_height", "target_width"  # what files and descriptions call them
+SIZES = "source_height", "source_width", "target_height", "target_width"  # keys in files and descriptions
 _LONGEST = 1 << 16  # pixels along a side
 
 
 class MapFormat(ABC):
-    """A format: one object a format, in `camtorch.maps.formats`."""
+    """A format of maps, with one object in `camtorch.maps.formats`."""
 
     name: str  # its key in `save_map`
-    suffixes: tuple[str, ...] = ()  # of its files; the first format that has a suffix is meant by it
-    options: tuple[str, ...] = ()  # the names of those that `save_map` takes for it
-    described = False  # whether its files say nothing of themselves, so that a description is written beside them
+    suffixes: tuple[str, ...] = ()  # of its files; a suffix means the first format that has it
+    options: tuple[str, ...] = ()  # names of its options in `save_map`
+    described = False  # whether its files need a description next to them
 
     @abstractmethod
     def encode(self, path: str, exact: Exact, options: Mapping[str, Any]) -> tuple[bytes, dict[str, Any]]:
-        """Return the file of a warp, and the facts that its user needs beside it.
+        """Return the file of a warp, and the facts that its user needs.
 
         Raises:
             CameraFileError: If the format cannot hold the warp. ValueError, TypeError: If an option is bad.
         """
 
     def matches(self, path: str, content: bytes) -> bool:
-        """Whether this is such a file."""
+        """Whether a path or content is a file of this format."""
         return bool(self.suffixes) and path.lower().endswith(self.suffixes)
 
     @abstractmethod
@@ -39,9 +39,9 @@ class MapFormat(ABC):
 
 
 def checked(name: str, size: Any) -> tuple[int, int]:
-    """Return the (height, width) that a file or its description says; raise a ValueError if it is none."""
+    """Return the (height, width) of a file or its description; raise a ValueError if it is none."""
     sides = tuple(size)
     whole = all(isinstance(side, int) and 0 < side <= _LONGEST for side in sides)
     if len(sides) != 2 or not whole or sides[0] * sides[1] > MOST_PIXELS:
-        raise ValueError(f"{name} {size!r:.60} is no (height, width) of a map; at most {MOST_PIXELS} pixels")
+        raise ValueError(f"{name} must be (height, width) of at most {MOST_PIXELS} pixels; got {size!r:.60}")
     return sides[0], sides[1]

@@ -1,4 +1,4 @@
-"""What a map that was written holds, and how far it is from the warp."""
+"""The content of a written map, and its error."""
 
 from __future__ import annotations
 
@@ -12,28 +12,28 @@ from camtorch.maps.lookup import Exact, LookupMap
 
 @dataclass(frozen=True)
 class MapReport:
-    """How far a map is from the warp that it was made of, by what its own bytes say, pixel by pixel.
+    """The error of a map from its warp, measured pixel by pixel from the written bytes.
 
-    Errors are distances in pixels of the source, over the pixels where the warp shows the source's image. Positions
-    beyond the outermost pixel centres count as on them, as edges are repeated.
+    Errors are distances in pixels of the source, over the pixels at which the warp shows the source's image. Positions
+    beyond the outermost pixel centres count as on them, because edges are repeated.
     """
 
     path: str
     format: str
     source_size: tuple[int, int]
-    """(height, width) of the images that the map takes."""
+    """(height, width) of the input images."""
     target_size: tuple[int, int]
-    """(height, width) of those that it makes."""
+    """(height, width) of the output images."""
     max_error: float
     rms_error: float
     shown: int
-    """Pixels of the target that show the source's image, of which the errors are."""
+    """Number of target pixels that show the source's image, over which errors are computed."""
     stray: int
-    """Pixels that the warp leaves empty, and the map does not: a mesh goes on where rays end."""
+    """Number of pixels that the warp leaves empty and the map does not: a mesh continues where rays end."""
     files: tuple[str, ...]
-    """What was written: the map, and beside a bare table its description."""
+    """Written files: the map, and for a bare table its description."""
     facts: dict[str, Any]
-    """What whoever uses the map has to know beside, such as `step`, `nodes` or `block_size`."""
+    """Other facts that a user of the map needs, such as `step`, `nodes` or `block_size`."""
 
     def __getattr__(self, name: str) -> Any:
         if name in (facts := self.__dict__.get("facts", {})):  # a fact is an attribute
@@ -41,7 +41,7 @@ class MapReport:
         raise AttributeError(f"MapReport of {self.__dict__.get('format')} has no {name!r}; it has {', '.join(facts)}")
 
     def __str__(self) -> str:
-        """One line, as the command line prints it."""
+        """Return one line, as the command line prints it."""
         (rows, columns), (height, width) = self.source_size, self.target_size
         part = 100 * self.shown / (height * width)
         stray = f"; {self.stray} pixels are drawn that the warp leaves empty" if self.stray else ""

@@ -31,12 +31,12 @@ _ALIGNED = 16  # bytes
 _LARGEST = 8192  # pixels along a side
 _BLOCKS = ((64, 64), (32, 64), (32, 32), (16, 32), (16, 16), (8, 16), (8, 8), (4, 8), (2, 8))  # height, width
 _MOST_PADDING = 15  # four bits
-_BEFORE, _AFTER = 1, 2  # pixels beside the whole part of a position that a bicubic filter reads
+_BEFORE, _AFTER = 1, 2  # pixels around the whole part of a position that a bicubic filter reads
 _LONGEST_BLOCK = 255  # eight bits
 
 
 class TILDC(Table):
-    """The format: see the module."""
+    """The format of TI's LDC; see the module."""
 
     name = "ti_ldc"
     options: tuple[str, ...] = ("step", "block", "clip")
@@ -44,7 +44,7 @@ class TILDC(Table):
     steps: tuple[int, ...] = tuple(1 << m for m in range(8))
 
     def pack(self, path: str, mesh: Mesh, exact: Exact, options: Mapping[str, Any]) -> tuple[bytes, dict[str, Any]]:
-        """See `Table`; raise a CameraFileError for sizes, offsets or padding that the LDC does not take."""
+        """Return the file of a mesh; raise a CameraFileError if the LDC does not support a size, offset or padding."""
         block = as_image_size(options.get("block"), "save_map", "block")
         if block is not None and (block[1] % 8 or block[0] % 2 or not all(0 < s <= _LONGEST_BLOCK for s in block)):
             raise ValueError(
@@ -71,14 +71,14 @@ class TILDC(Table):
 
 
 def _pitch(columns: int) -> int:
-    """Bytes from line to line."""
+    """Return the bytes from line to line."""
     return -(-4 * columns // _ALIGNED) * _ALIGNED
 
 
 def _fetched(
     path: str, positions: Floats, source: tuple[int, int], block: tuple[int, int] | None
 ) -> tuple[tuple[int, int], int, tuple[int, int]]:
-    """Return the size of a block of the target, its padding, and the largest part of the source fetched, or raise."""
+    """Return block size, padding and the largest part of the source that is fetched; raise if no block fits."""
     drawn = positions.clip(0, np.array(source[::-1], np.float64) - 1)
     for size in _BLOCKS if block is None else (block,):
         height, width = drawn.shape[:2]

@@ -1,8 +1,8 @@
 """The camera models, one file each.
 
-The camera of parallel rays (orthographic, telecentric) is none of them: its rays do not pass one point, and a camera
-here is a map between the directions from one point and pixels. `OrthographicFisheye` has r = sin(theta), which is
-another thing.
+The camera of parallel rays (orthographic, telecentric) is not included: its rays do not pass one point, and a camera
+here is a map between the directions from one point and pixels. `OrthographicFisheye`, r = sin(theta), is
+another model.
 """
 
 import importlib
@@ -72,7 +72,7 @@ __all__ = [
     "WoodScape",
 ]
 
-# the file of each class, which is imported when the class, or its key in MODELS, is asked for: mostly of its own name
+# file of each class, imported on first use of the class or of its key in MODELS; mostly named like the class
 _FILES = {name: re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name).lower() for name in __all__ if name != "MODELS"} | {
     "FTheta": "f_theta",
     "FThetaSheared": "f_theta",
@@ -83,12 +83,12 @@ _FILES = {name: re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name).lower() for name in __
     "WoodScape": "woodscape",
 }
 _KEYS = {"LatLon": "latlon", "FThetaSheared": "f_theta_sheared", "FThetaBackwardSheared": "f_theta_backward_sheared"}
-"""Of classes whose key is not the name of the file."""
+"""Keys of classes whose key is not the name of the file."""
 
 
 MODELS.files.update(sorted((_KEYS.get(name, file), f"{__name__}.{file}") for name, file in _FILES.items()))
 
-if not TYPE_CHECKING:  # a checker knows the names, and no others
+if not TYPE_CHECKING:  # type checkers must see only the names above
 
     def __getattr__(name: str) -> Any:
         if name not in _FILES:

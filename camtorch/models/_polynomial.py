@@ -1,4 +1,4 @@
-"""What models with a polynomial of any number of coefficients share: of odd powers, or of all powers."""
+"""Common parts of models with a polynomial of any number of coefficients: of odd powers, or of all powers."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from camtorch.values.arguments import Numbers, as_batch, as_number, as_real, is_
 
 
 class OddPolynomial(Camera):
-    """The coefficients k1 k2 ... of x (1 + k1 x^2 + k2 x^4 + ...), any number of them."""
+    """Cameras with coefficients k1 k2 ... of x (1 + k1 x^2 + k2 x^4 + ...), any number of them."""
 
     distortion_names: tuple[str, ...] = ("k1", "k2", "k3", "k4")
     default_count = 4
@@ -32,14 +32,14 @@ class OddPolynomial(Camera):
 
 
 class FreePolynomial(Camera):
-    """The coefficients k2 k3 ... of x (1 + k2 x + k3 x^2 + ...), any number of them; x is the angle or the radius."""
+    """Cameras with coefficients k2 k3 ... of x (1 + k2 x + k3 x^2 + ...), any number; x is the angle or the radius."""
 
     distortion_names: tuple[str, ...] = ("k2", "k3", "k4")
     default_count = 3
     fit_counts: ClassVar[tuple[int, ...]] = (3, 5, 7)
 
     sheared: ClassVar[type[FreePolynomial] | None] = None
-    """The model that has d e too, which come first."""
+    """Model that also has d and e, as first coefficients."""
     shear_names: ClassVar[tuple[str, ...]] = ()
 
     @classmethod
@@ -61,22 +61,22 @@ class FreePolynomial(Camera):
         linear_cde: Numbers = (1.0, 0.0, 0.0),
         image_size: Sequence[int] | None = None,
     ) -> Self:
-        """From a polynomial without a leading 1: k1 theta + k2 theta^2 + ... pixels.
+        """Return the camera of a polynomial without a leading 1: k1 theta + k2 theta^2 + ... pixels.
 
         For `FThetaBackward` it is the angle, k1 d + k2 d^2 + ... of the distance d from the axis in pixels.
 
         Args:
-            centre: (*B, 2) cx, cy, the pixel of the axis.
-            coefficients: (*B, n), n >= 2: k1, k2, ...; k1 > 0 makes the focal length.
+            centre: cx, cy (*B, 2), the pixel of the axis.
+            coefficients: k1, k2, ... (*B, n), n >= 2; k1 > 0 becomes the focal length.
             aspect_ratio: fy / fx, for c = 1.
-            linear_cde: (*B, 3) c, d, e of NVIDIA's files: the pixel is [[c, d], [e, 1]] r(theta) (cos phi, sin phi)
-                from the centre. Where d or e is not zero, or learns, the camera is an `FThetaSheared`, or an
+            linear_cde: c, d, e (*B, 3) of NVIDIA's files: the pixel is [[c, d], [e, 1]] r(theta) (cos phi, sin phi)
+                from the centre. If d or e is not zero, or requires grad, the camera is an `FThetaSheared`, or an
                 `FThetaBackwardSheared`; c goes into fx.
             image_size: (height, width) in pixels.
 
         Raises:
-            ValueError: fewer than two coefficients, or a first one that is not positive; c that is not positive, c <=
-                d e, which is no camera; a model that has no d and e.
+            ValueError: If there are fewer than two coefficients, the first one or c is not positive, c <= d e (no
+                camera), or the model has no d and e.
         """
         aspect_ratio = as_number(aspect_ratio, "aspect_ratio", cls.__name__)
         centre = as_real(centre, "centre", cls.__name__)
@@ -89,18 +89,18 @@ class FreePolynomial(Camera):
         if known_false(first > 0):
             raise ValueError(
                 f"{cls.__name__}: the first coefficient, of the first power, must be positive; got {first.tolist()}. "
-                "A constant before it, which is zero, is left out"
+                "Leave out a zero constant before it"
             )
         linear = as_real(linear_cde, "linear_cde", cls.__name__, centre.device)
         if linear.ndim == 0 or linear.shape[-1] != 3:
             raise ValueError(f"{cls.__name__}: linear_cde must be (*B, 3) = c, d, e; got shape {tuple(linear.shape)}")
-        if is_list(linear_cde):  # in the precision of what it belongs to
+        if is_list(linear_cde):  # in the precision of the coefficients
             linear = torch.tensor(linear_cde, dtype=coefficients.dtype, device=coefficients.device)
         c, d, e = linear.split(1, -1)
         if known_false((c > 0) & (c > d * e)):
             raise ValueError(
-                f"{cls.__name__}: linear_cde = c, d, e must have c > 0 and c > d e; got {linear.tolist()}. Files that "
-                "have zeros mean 1, 0, 0"
+                f"{cls.__name__}: linear_cde = c, d, e must have c > 0 and c > d e; got {linear.tolist()}. In files "
+                "zeros mean 1, 0, 0"
             )
         batch = as_batch(cls.__name__, centre=centre.shape, coefficients=coefficients.shape, linear_cde=linear.shape)
         is_straight = linear_cde == (1.0, 0.0, 0.0) if isinstance(linear_cde, tuple) else False
@@ -110,7 +110,7 @@ class FreePolynomial(Camera):
         intrinsics = torch.cat(torch.broadcast_tensors(focal, centre), -1)
         kind: type[FreePolynomial] | None = cls if cls.shear_names or is_straight else cls.sheared
         if kind is None:
-            raise ValueError(f"{cls.__name__}: it has no d and e, which are {linear.tolist()}; FTheta takes them")
+            raise ValueError(f"{cls.__name__}: d and e must be 0; got {linear.tolist()}. Use FTheta, which has them")
         if kind.shear_names:
             shear = torch.cat((e, d / c), -1)
             distortion = torch.cat([w.to(focal).expand(*batch, w.shape[-1]) for w in (shear, distortion)], -1)
@@ -118,12 +118,12 @@ class FreePolynomial(Camera):
 
     @classmethod
     def _scaled(cls, coefficients: Tensor) -> tuple[Tensor, Tensor]:
-        """The focal length, and coefficients in units of it."""
+        """Return the focal length, and the coefficients in units of it."""
         raise NotImplementedError
 
 
 class Sheared(FreePolynomial):
-    """What models with NVIDIA's linear part have beside the polynomial: d and e, which come first."""
+    """Models with the coefficients d and e of NVIDIA's linear part before the polynomial."""
 
     shear_names: ClassVar[tuple[str, ...]] = ("d", "e")
     distortion_names: tuple[str, ...] = (*shear_names, *FreePolynomial.distortion_names)

@@ -9,10 +9,10 @@ from camtorch.optics import Chart, CylinderChart, Lens
 
 
 class Cylindrical(Camera):
-    """A cylindrical panorama around the y axis: vertical lines of the scene stay straight, angles past 90 degrees show.
+    """A cylindrical panorama around the y axis: vertical lines stay straight, and angles beyond 90 degrees are visible.
 
     u = fx atan2(x, z) + cx, v = fy y / hypot(x, z) + cy: fx in pixels per radian, fy in pixels per unit of height,
-    (cx, cy) the pixel of the forward direction. Valid within half a turn to either side, but for straight up and down.
+    (cx, cy) the pixel of the forward direction. Valid within half a turn to either side, except straight up and down.
 
     Distortion: none. See `Camera` for shapes, conventions and errors.
     """

@@ -15,7 +15,7 @@ class DoubleSphere(Camera):
         (a, b) = (x, y) / (alpha d' + (1 - alpha) z'),  (u, v) = f (a, b) + c
 
     A ray is valid before the pole or the fold of r: for z' > -w d', with w as in `UCM`, which this is for xi = 0; and
-    for z > -d / xi where xi > 1. Needs xi > -1; on the axis the slope is f / (1 + xi).
+    for z > -d / xi if xi > 1. Needs xi > -1; on the axis the slope is f / (1 + xi).
 
     Distortion: xi alpha. The same as Basalt `ds` and Kalibr `ds`. Source: Usenko, Demmel and Cremers, "The double
     sphere camera model", 3DV 2018, equation (40). See `Camera` for shapes, conventions and errors.

@@ -12,7 +12,7 @@ class Equirectangular(Camera):
     """An equirectangular panorama: longitude across, latitude down.
 
     u = fx atan2(x, z) + cx, v = fy atan2(y, hypot(x, z)) + cy: fx and fy in pixels per radian, (cx, cy) the pixel of
-    the forward direction. Valid within half a turn to either side, but for straight up and down.
+    the forward direction. Valid within half a turn to either side, except straight up and down.
 
     Distortion: none. COLMAP EQUIRECTANGULAR. See `Camera` for shapes, conventions and errors.
     """

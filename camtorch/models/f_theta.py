@@ -13,7 +13,7 @@ class FTheta(FreePolynomial):
     """The radially symmetric fisheye with a free polynomial: r = theta (1 + k2 theta + k3 theta^2 + ...).
 
     theta = atan2(hypot(x, y), z), so that angles past 90 degrees are real; (u, v) = f r (cos phi, sin phi) + c. The
-    coefficients are dimensionless: a polynomial in pixels comes in through `from_polynomial`, which folds its linear
+    coefficients are dimensionless: `from_polynomial` takes a polynomial in pixels, and folds its linear
     coefficient into the focal lengths. A ray is valid before the first root of dr/dtheta.
 
     With even powers of theta the camera has one continuous derivative on the axis, and no second one: that depends on

@@ -14,7 +14,7 @@ class FThetaBackward(FreePolynomial):
     """The radially symmetric fisheye with a free polynomial of the radius: theta = r (1 + k2 r + k3 r^2 + ...).
 
     r is the distance of the pixel from the axis in focal lengths, theta = atan2(hypot(x, y), z). The other direction of
-    `FTheta`: there the polynomial gives r, and its inverse is found. A ray is valid before theta ceases to ascend, and
+    `FTheta`: there the polynomial gives r, and its inverse is found. A ray is valid before theta stops ascending, and
     up to a radius of 19 focal lengths.
 
     Distortion: k2 k3 ... by the power of r, any number of them, at least one; 3 if left out. A polynomial of pixels

@@ -25,7 +25,7 @@ class FOV(Camera):
     distortion_names: tuple[str, ...] = ("omega",)
     default_count = 1
     special_cases = (("pinhole", ()),)
-    # even in omega: zero is no start
+    # the model is even in omega: its gradient is zero at zero
     fit_starts = ({"omega": 0.3}, {"omega": 0.9})
     defined_text = "-pi < omega < pi"
 

@@ -35,18 +35,18 @@ class KannalaBrandt(OddPolynomial):
     def from_general(
         cls, intrinsics: Numbers, coefficients: Numbers, *, image_size: Sequence[int] | None = None
     ) -> Self:
-        """From the paper's form r = k1 theta + k2 theta^3 + ..., which has no leading 1.
+        """Return the camera of the paper's form r = k1 theta + k2 theta^3 + ..., which has no leading 1.
 
         Args:
-            intrinsics: (*B, 4) fx, fy, cx, cy; 1, 1 for the focal lengths where the coefficients are in pixels.
-            coefficients: (*B, n), n >= 1: k1, k2, ... of the paper; k1 > 0 is folded into the focal lengths.
+            intrinsics: fx, fy, cx, cy (*B, 4); focal lengths 1, 1 if the coefficients are in pixels.
+            coefficients: k1, k2, ... (*B, n), n >= 1, of the paper; k1 > 0 is folded into the focal lengths.
             image_size: (height, width) in pixels.
 
         Source: Kannala and Brandt, "A generic camera model and calibration method for conventional,
         wide-angle, and fish-eye lenses", PAMI 2006, equation (6).
 
         Raises:
-            ValueError: no coefficients, or a first one that is not positive.
+            ValueError: If there are no coefficients, or the first one is not positive.
         """
         intrinsics = as_real(intrinsics, "intrinsics", cls.__name__)
         coefficients = as_real(coefficients, "coefficients", cls.__name__, intrinsics.device)

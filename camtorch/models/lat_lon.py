@@ -12,7 +12,7 @@ class LatLon(Camera):
     """A transverse equirectangular panorama: its poles lie left and right, and each row is a plane through the x axis.
 
     u = fx asin(x / r) + cx, v = fy atan2(y, z) + cy with r = |(x, y, z)|: fx and fy in pixels per radian, (cx, cy) the
-    pixel of the forward direction. Valid within half a turn up and down, but for straight left and right. With the
+    pixel of the forward direction. Valid within half a turn up and down, except straight left and right. With the
     baseline along x the rows of two such images correspond, at any angle.
 
     Distortion: none. mrcal LENSMODEL_LATLON. See `Camera` for shapes, conventions and errors.

@@ -16,7 +16,7 @@ class Mei(Camera):
         a' = a (1 + k1 t + k2 t^2) + 2 p1 a b + p2 (t + 2 a^2)
         b' = b (1 + k1 t + k2 t^2) + p1 (t + 2 b^2) + 2 p2 a b
 
-    (u, v) = f (a', b') + c. A ray is valid for z > -xi d (z > -d / xi where xi > 1) and before the fold of the lens.
+    (u, v) = f (a', b') + c. A ray is valid for z > -xi d (z > -d / xi if xi > 1) and before the fold of the lens.
     Needs xi > -1; on the axis the slope is f / (1 + xi).
 
     Distortion: xi k1 k2 p1 p2. The same as OpenCV `omnidir` (there without a skew here) and Kalibr `omni` with
@@ -29,7 +29,7 @@ class Mei(Camera):
     distortion_names: tuple[str, ...] = ("xi", "k1", "k2", "p1", "p2")
     default_count = 5
     special_cases = (("brown_conrady", ("k1", "k2", "p1", "p2")),)
-    # along a valley xi and the radial coefficients do nearly the same
+    # along a valley xi and the radial coefficients have nearly the same effect
     fit_starts = tuple({"xi": xi} for xi in (0.0, 1.0, 2.0))
     odd_in_x = frozenset({"p2"})
     odd_in_y = frozenset({"p1"})

@@ -19,7 +19,7 @@ from camtorch.values.arguments import Numbers, as_real
 
 
 class AngleOfAllPowers(AnglePerRadius):
-    """The radial factor theta / r of the ray (r, 0, D), D = 1 + a1 r + a2 r^2 + ..."""
+    """Radial factor theta / r of the ray (r, 0, D), D = 1 + a1 r + a2 r^2 + ..."""
 
     code: ClassVar[int | None] = 5
 
@@ -28,19 +28,19 @@ class AngleOfAllPowers(AnglePerRadius):
         self.ahead: RadialFactor = RadiusPolynomial(coefficients)
 
     def closed_fold(self) -> Tensor:
-        """The first root of D - r D', to which d(theta)/dr is in proportion."""
+        """Return the first root of D - r D', to which d(theta)/dr is proportional."""
         return first_root(*(-i * c for i, c in enumerate(self.parameters)))
 
 
 class OCamCalib(Camera):
     """The omnidirectional camera of Scaramuzza's toolbox: the point (x, y) sees along (x, y, 1 + a1 r + a2 r^2 + ...).
 
-    r = hypot(x, y); (u, v) = f (x + e y, d x + y) + c. A ray is valid before its angle from the axis ceases to ascend
+    r = hypot(x, y); (u, v) = f (x + e y, d x + y) + c. A ray is valid before its angle from the axis stops ascending
     with r, and up to a radius of 19 focal lengths. The inverse, for which the toolbox fits a second polynomial, is
     exact. With odd powers (a1 is mostly zero) the camera has one continuous derivative on the axis, and no second one.
 
-    Distortion: d e a1 a2 ... by the power of r, n >= 3 numbers; four powers if left out. What the toolbox calls ss, c,
-    d, e, with its axes and its centre, comes in through `from_ocamcalib`. Even powers alone are `Division`. Source:
+    Distortion: d e a1 a2 ... by the power of r, n >= 3 numbers; four powers if left out. `from_ocamcalib` takes ss, c,
+    d, e of the toolbox, with its axes and its centre. Even powers alone are `Division`. Source:
     Scaramuzza, Martinelli and Siegwart, "A toolbox for easily calibrating omnidirectional cameras", IROS 2006. See
     `Camera` for shapes, conventions and errors.
     """
@@ -74,16 +74,16 @@ class OCamCalib(Camera):
         *,
         image_size: Sequence[int] | None = None,
     ) -> Self:
-        """From the numbers of the toolbox: its x goes down the rows, and its z backwards where ss[0] is negative.
+        """Return the camera of the toolbox's numbers: its x goes down the rows, its z backwards if ss[0] is negative.
 
         Args:
-            polynomial: (n,) ss, n >= 2, from the constant on: z over the distance from the centre, both in pixels.
-            centre: (2,) xc, yc: row and column, counted from 0 as in `calib_results.txt`; those of MATLAB are one more.
-            affine: (3,) c, d, e: (row, column) = [[c, d], [e, 1]] (x, y) + (xc, yc).
+            polynomial: ss (n,), n >= 2, from the constant on: z over the distance from the centre, both in pixels.
+            centre: xc, yc (2,): row and column, counted from 0 as in `calib_results.txt`; MATLAB's are one more.
+            affine: c, d, e (3,): (row, column) = [[c, d], [e, 1]] (x, y) + (xc, yc).
             image_size: (height, width) in pixels.
 
         Raises:
-            ValueError: another shape; ss[0] that is zero; c that is not positive.
+            ValueError: If a shape is wrong, ss[0] is zero, or c is not positive.
         """
         owner = cls.__name__
         polynomial = as_real(polynomial, "polynomial", owner)

@@ -23,7 +23,7 @@ _VARIANT = re.compile(r"order=(\d),columns=(\d{1,3}),rows=(\d{1,3}),fov_x=(\d{1,
 
 
 class StereographicUpTo(Unified):
-    """The stereographic chart of a lens that ends within some radius."""
+    """The stereographic chart of a lens that ends within a radius."""
 
     code: ClassVar[int | None] = 3
 
@@ -66,16 +66,16 @@ class Splined(Camera):
     @classmethod
     @hinting("By name: ct.Splined.with_grid(columns=16, rows=11, fov_x=120), mrcal's Nx, Ny and fov_x_deg")
     def with_grid(cls, *, columns: int, rows: int, fov_x: float, order: int = 3) -> type[Splined]:
-        """The class of cameras of another grid: a model for `convert`, `calibrate` and files as any other.
+        """Return the class of cameras of another grid: a model for `convert`, `calibrate` and files as any other.
 
         Args:
-            columns: control points across, more than the order, up to 999.
-            rows: control points down.
-            fov_x: horizontal field of view of the surface in whole DEGREES, as mrcal's files have it, from 1 to 359.
-            order: of the spline, 2 or 3.
+            columns: Control points across, more than the order, up to 999.
+            rows: Control points down.
+            fov_x: Horizontal field of view of the surface in whole DEGREES, as in mrcal's files, from 1 to 359.
+            order: Order of the spline, 2 or 3.
 
         Raises:
-            ValueError: an order, a size of the grid or a field of view out of these ranges.
+            ValueError: If the order, a size of the grid or the field of view is out of these ranges.
         """
         owner = "Splined.with_grid"
         fov_x = int(fov_x) if isinstance(fov_x, float) and fov_x.is_integer() else fov_x
@@ -94,12 +94,12 @@ class Splined(Camera):
 
     @classmethod
     def variant(cls, text: str) -> type[Camera]:
-        if cls is not Splined:  # a grid has no other grid
+        if cls is not Splined:  # variants of a grid class do not exist
             return super().variant(text)
         found = _VARIANT.fullmatch(text)
         if found is None:
             raise ValueError(
-                f"'splined:order=3,columns=16,rows=11,fov_x=120' is how a grid is written; got {text!r:.60}"
+                f"a grid must be written as 'splined:order=3,columns=16,rows=11,fov_x=120'; got {text!r:.60}"
             )
         order, columns, rows, fov_x = map(int, found.groups())
         return cls.with_grid(order=order, columns=columns, rows=rows, fov_x=fov_x)
@@ -124,7 +124,7 @@ class Splined(Camera):
         return _searched(cls)  # type: ignore[arg-type]  # a class can be hashed
 
     def extra_repr(self) -> str:
-        """The grid in the place of its control points."""
+        """Return the fields with the grid instead of its control points."""
         parts = [f"batch_shape={tuple(self.batch_shape)}"] if self.batch_shape else []
         numbers = None if self.batch_shape else values_of(self.intrinsics)
         if numbers is not None:
@@ -138,7 +138,7 @@ class Splined(Camera):
 def _optics_of(
     order: int, columns: int, rows: int, fov_x: int, behind: float
 ) -> Callable[[Sequence[Tensor]], tuple[Chart, Lens]]:
-    """Those of a surface that ends so many cells behind its edge."""
+    """Return the optics of a surface that ends `behind` cells beyond its edge."""
     cells = (columns - order) / (4 * math.tan(math.radians(fov_x) / 4))
     last = math.hypot((columns - order) / 2 + behind, (rows - order) / 2 + behind) / cells * (1 + 1e-3)
 
@@ -151,7 +151,7 @@ def _optics_of(
 
 @cache
 def _searched(kind: type[Splined]) -> type[Splined]:
-    """Corners on the edge would hold a search that may not lose them: there the outermost pieces go on."""
+    """Return the class for a search, with longer outermost pieces: otherwise corners on the edge would hold it."""
     optics = _optics_of(kind.order, kind.columns, kind.rows, kind.fov_x, behind=1.0)
     named = {"__module__": Camera.__module__, "__qualname__": f"{kind.key}:searched", "__doc__": kind.__doc__}
     return type("Splined", (kind,), {**named, "optics": staticmethod(optics)})
@@ -178,10 +178,10 @@ def _with_grid(order: int, columns: int, rows: int, fov_x: int) -> type[Splined]
     if all(getattr(Splined, name) == value for name, value in grid.items()):
         return Splined
     text = ",".join(f"{name}={value}" for name, value in grid.items())
-    # where pickles find it
+    # a place where pickle finds it
     named = {"__module__": Camera.__module__, "__qualname__": f"{Splined.key}:{text}", "__doc__": Splined.__doc__}
     made: type[Splined] = type("Splined", (Splined,), {**named, **grid, **_of_grid(**grid)})
-    made.key = made.__qualname__  # known by what it says, without an entry in MODELS
+    made.key = made.__qualname__  # found by its text, without an entry in MODELS
     return made
 
 

@@ -1,4 +1,4 @@
-"""The camera whose r(theta) is a table, as lens vendors hand it out."""
+"""The camera whose r(theta) is a table, as provided by lens vendors."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Tabulated(Camera):
     theta = atan2(hypot(x, y), z), so that angles past 90 degrees are real. Between the nodes, and (0, 0), r is a cubic
     spline with two continuous derivatives, odd in theta, and kept monotone by Hyman's filter where the table is; at
     nodes where the filter is at work only the first derivative is continuous. A ray is valid up to the last angle, and
-    before r ceases to ascend.
+    before r stops ascending.
 
     Distortion: theta1 ... thetaN r1 ... rN, N >= 2: the angles in radians, ascending, which stay as they are (their
     gradient is zero), and the radii in units of the focal length, which learn. Equidistant if left out. A table in
@@ -65,7 +65,7 @@ class Tabulated(Camera):
     @classmethod
     def fit_start(cls, names: tuple[str, ...], angles: Tensor, radii: Tensor) -> Tensor:
         count = len(names) // 2
-        # a ray at the last node itself would be lost to rounding
+        # rounding would lose a ray at the last node itself
         nodes = angles[:, -1:] * (1 + 1e-9) * torch.arange(1, count + 1).to(angles) / count
         place = nodes / angles[:, :1]
         before = place.long().clamp(max=angles.shape[-1] - 1)
@@ -83,19 +83,19 @@ class Tabulated(Camera):
         pixels_per_unit: float = 1.0,
         image_size: Sequence[int] | None = None,
     ) -> Self:
-        """From a table of angles and image heights, in any unit of length or in pixels.
+        """Return the camera of a table of angles and image heights, in any unit of length or in pixels.
 
         The focal length becomes the slope of the table at its beginning, so that r is nearly theta there.
 
         Args:
-            centre: (2,) cx, cy, the pixel of the axis.
-            angles: (N,) ascending, in radians; a first 0 is left out, and has the height 0.
-            radii: (N,) the image heights.
-            pixels_per_unit: of length in which the heights are given.
+            centre: cx, cy (2,), the pixel of the axis.
+            angles: Ascending angles (N,) in radians; a first 0 with the height 0 is left out.
+            radii: Image heights (N,).
+            pixels_per_unit: Pixels per unit of the heights.
             image_size: (height, width) in pixels.
 
         Raises:
-            ValueError: the table has another shape, does not begin to ascend from the origin, or goes beyond half a
+            ValueError: If the table has another shape, does not ascend from the origin, or goes beyond half a
                 turn.
         """
         pixels_per_unit = as_number(pixels_per_unit, "pixels_per_unit", cls.__name__)
@@ -109,11 +109,11 @@ class Tabulated(Camera):
             angles, radii = angles[1:], radii[1:]
         if len(angles) < 2 or not (angles[0] > 0 and radii[0] > 0):
             raise ValueError(
-                f"{cls.__name__}: the table needs two nodes that ascend from the origin; got angles {angles.tolist()} "
+                f"{cls.__name__}: the table must have two nodes that ascend from (0, 0); got angles {angles.tolist()} "
                 f"and radii {radii.tolist()}"
             )
         if angles[-1] > math.pi * (1 + 1e-6):
-            raise ValueError(f"{cls.__name__}: angles are radians, up to pi; got up to {float(angles[-1])}. Degrees?")
+            raise ValueError(f"{cls.__name__}: angles must be at most pi radians; got {float(angles[-1])}. Degrees?")
         focal = radii[:1] / angles[:1]
         intrinsics = torch.cat((focal * pixels_per_unit, focal * pixels_per_unit, centre))
         return cls(intrinsics, torch.cat((angles, radii / focal)), image_size=image_size)

@@ -15,7 +15,7 @@ class UCM(Camera):
 
     A ray is valid before the pole or the fold of r: for z > -w d with w = alpha / (1 - alpha) up to alpha = 1/2, where
     the camera sees all directions but the exact backward one, and (1 - alpha) / alpha from there on. alpha = 0 is a
-    pinhole camera, 1 an orthographic fisheye. Any alpha is taken.
+    pinhole camera, 1 an orthographic fisheye. All values of alpha are allowed.
 
     Distortion: alpha. The same as Basalt `ucm`. With xi = alpha / (1 - alpha) and f (1 + xi) for f it is the model
     of Mei and Rives without its lens: `Mei`. Source: Geyer and Daniilidis, "A unifying theory for central panoramic

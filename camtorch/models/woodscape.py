@@ -44,18 +44,18 @@ class WoodScape(FTheta):
         image_size: Sequence[int],
         aspect_ratio: float = 1.0,
     ) -> Self:
-        """From the numbers of a calibration file.
+        """Return the camera of the numbers of a calibration file.
 
         Args:
             coefficients: k1, k2, k3, k4 in pixels.
-            offset: cx_offset, cy_offset: of the axis from the middle of the image, in pixels.
+            offset: cx_offset, cy_offset: offset of the axis from the middle of the image, in pixels.
             image_size: (height, width) in pixels.
-            aspect_ratio: the file's, by which it scales v.
+            aspect_ratio: Factor of v in the file.
         """
         owner = f"{cls.__name__}.from_woodscape"
         size, moved = as_image_size(image_size, owner), as_real(offset, "offset", owner)
         if size is None:
-            raise ValueError(f"{owner}: offsets are from the middle of an image; give its image_size=(height, width)")
+            raise ValueError(f"{owner}: image_size must be (height, width) for offsets from the middle; got None")
         if moved.shape != (2,):
             raise ValueError(f"{owner}: offset must be (2,) = cx_offset, cy_offset; got shape {tuple(moved.shape)}")
         centre = moved + (moved.new_tensor([size[1], size[0]]) - 1) / 2

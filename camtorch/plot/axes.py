@@ -1,4 +1,4 @@
-"""What the plots share: the palette, new Axes, the frame of an image."""
+"""Common parts of the plots: the palette, new Axes, the frame of an image."""
 
 from __future__ import annotations
 
@@ -17,45 +17,45 @@ if TYPE_CHECKING:
     from camtorch.cameras.camera import Camera
 
 INK, GREY, PALE = "#2b2a2e", "#8a8378", "#efe9dd"
-COLOURS = ("#1e64f0", "#e21d48", "#0b8a5f", "#b86e00", "#7a3fc2", "#5a6472")  # of cameras; the second also of marks
-NO_RAYS = "#d9d4ca"  # of pixels without a value
-# matplotlib's maps, and the part of each from the palest colour to the darkest
+COLOURS = ("#1e64f0", "#e21d48", "#0b8a5f", "#b86e00", "#7a3fc2", "#5a6472")  # of cameras; the second also for marks
+NO_RAYS = "#d9d4ca"  # for pixels without a value
+# matplotlib's colour maps, and the part of each from the palest colour to the darkest
 _LEVELS = {"counts": ("Blues", 0.2, 0.75), "residuals": ("viridis", 0.85, 0.05), "uncertainty": ("magma", 0.95, 0.2)}
 _LEVELS |= {"distortion": ("viridis_r", 0.15, 1)}
 
 
 def require_matplotlib() -> None:
-    """Raise an ImportError that says how to install it, unless it is there."""
+    """Raise an ImportError with the line to install matplotlib if it is missing."""
     imported("matplotlib", "plots need matplotlib", "plot")
 
 
 def axes_or_new(ax: Axes | None) -> Axes:
-    """Return the Axes, or new ones in a figure of their own; raise a TypeError for anything else."""
+    """Return the Axes, or new Axes in a figure of their own; raise a TypeError for anything else."""
     if ax is not None:
         if not hasattr(ax, "get_figure"):
             hint = "Several cameras are one list, [a, b]"
             raise TypeError(f"plot: ax must be Axes of matplotlib; got {type(ax).__name__}. {hint}")
         return ax
     require_matplotlib()
-    from matplotlib import pyplot  # which chooses how figures are shown: not before it has to
+    from matplotlib import pyplot  # late: this import chooses the backend
 
     return pyplot.subplots(layout="constrained")[1]
 
 
 def check_single(camera: Camera) -> None:
-    """Refuse a batch."""
+    """Raise a ValueError if the camera is a batch."""
     if camera.batch_shape:
         raise ValueError(f"plot: the camera must be a single one; got batch dims {tuple(camera.batch_shape)}")
 
 
 def size_of(camera: Camera) -> tuple[int, int]:
-    """(height, width) of a single camera that must have them."""
+    """Return (height, width) of a single camera, which must have them."""
     check_single(camera)
     return camera._size_for("a plot")
 
 
 def draw_frame(ax: Axes, height: int, width: int) -> tuple[float, float, float, float]:
-    """The outer edges of an image, rows downwards; returned as the `extent` of what `imshow` puts into them."""
+    """Draw the outer edges of an image, rows downwards, and return them as an `extent` for `imshow`."""
     margin = 0.02 * max(height, width)
     ax.set_xlim(-0.5 - margin, width - 0.5 + margin)
     ax.set_ylim(height - 0.5 + margin, -0.5 - margin)
@@ -66,12 +66,12 @@ def draw_frame(ax: Axes, height: int, width: int) -> tuple[float, float, float, 
 
 
 def draw_arrows(ax: Axes, *planes: np.ndarray, colours: str, **options: Any) -> Quiver:
-    """Draw arrows in the image's pixels: u and v of their starts and of their ways, and what their colours show."""
+    """Draw arrows in the image's pixels: u and v of their starts and of their lengths, and values for colours."""
     return ax.quiver(*planes, cmap=levels(colours), angles="xy", scale_units="xy", scale=1, width=0.0025, **options)
 
 
 def magnification(most: float) -> int:
-    """1, 2, 5, 10, ... up to a number."""
+    """Return the largest of 1, 2, 5, 10, ... up to a number."""
     if not 1 < most < 1e9:
         return 1
     power = int(10 ** math.floor(math.log10(most)))
@@ -79,12 +79,12 @@ def magnification(most: float) -> int:
 
 
 def printable(name: str) -> str:
-    """A name without what fonts cannot draw: control characters, halves of characters in names of files."""
+    """Return a name without characters that fonts cannot draw, as control characters and lone surrogates."""
     return "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in name)
 
 
 def levels(name: str, count: int = 256) -> ListedColormap:
-    """Colours in order, from what is little to what is much, of what `_LEVELS` names."""
+    """Return the colours of a palette of `_LEVELS`, from low to high values."""
     from matplotlib import colormaps
     from matplotlib.colors import ListedColormap
 

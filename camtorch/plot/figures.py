@@ -1,4 +1,4 @@
-"""Plots of cameras, of the difference of two, of rigs, and of calibrations: how far these can be trusted."""
+"""Plots of cameras, of the difference of two, of rigs, and of calibrations with their uncertainty."""
 
 from __future__ import annotations
 
@@ -39,32 +39,32 @@ from camtorch.rays.lattices import angles_from_axis, followed, ideal, image_latt
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-else:  # it is optional, and takes a second: for those who ask for hints at runtime
+else:  # matplotlib is optional and slow: runtime type hints must not import it
     Axes = Figure = Any
 
 _AZIMUTHS, _ANGLES = 32, 721
-_ARROWS = 15_000  # as many as an image has room for
+_ARROWS = 15_000  # the most that an image has room for
 _LATTICE = 96  # of the map of uncertainty, along the longer side
 _BANDS = 8  # of that map
-_NOTHING = 1e-6  # px: what is less is rounding, and shown as none
-_FAINT = 1e-3  # px: no colours are spent on what is less, where there is more
+_NOTHING = 1e-6  # px: less is rounding, and shown as none
+_FAINT = 1e-3  # px: smallest range of colours
 
 
 @torch.no_grad()
 def distortion_field(camera: Camera, ax: Axes | None = None, *, count: int = 21) -> Axes:
-    """Arrows from where an ideal lens would show what the image shows, to where it does; grey: pixels without rays.
+    """Draw arrows from the pixels of an ideal lens to the actual pixels; grey: pixels without rays.
 
-    The ideal lens has the same intrinsics and coefficients that do nothing: Kannala-Brandt's is equidistant,
-    Brown-Conrady's perspective. Short arrows are drawn longer, and the title
-    says so. What the ideal lens shows nowhere has a cross.
+    The ideal lens has the same intrinsics and coefficients without effect: Kannala-Brandt's is equidistant,
+    Brown-Conrady's perspective. Short arrows are drawn longer, by a factor in the title.
+    Points that the ideal lens cannot show have a cross.
 
     Args:
-        camera: one camera with an image size.
-        ax: by default new ones.
-        count: of arrows along the longer side.
+        camera: A single camera with an image size.
+        ax: Axes; default new ones.
+        count: Number of arrows along the longer side.
 
     Raises:
-        ValueError: a batch, or a camera without image size.
+        ValueError: If the camera is a batch, or has no image size.
     """
     height, width = size_of(camera)
     ax = axes_or_new(ax)
@@ -102,23 +102,23 @@ def distortion_field(camera: Camera, ax: Axes | None = None, *, count: int = 21)
 
 @torch.no_grad()
 def radius_curve(cameras: Camera | Sequence[Camera], ax: Axes | None = None, *, labels: Sequence[str] = ()) -> Axes:
-    """The distance from the principal point over the angle from the axis, as far as it is valid; then a dot.
+    """Draw the distance from the principal point over the angle from the axis, up to a dot at the last valid angle.
 
-    A band shows the azimuths where they differ. Dashed is the ideal lens. The pale part are the angles that the first
-    camera's image has.
+    A band shows the range if azimuths differ. The ideal lens is dashed. The pale part has the angles of the first
+    camera's image.
 
     Args:
-        cameras: single cameras.
-        ax: by default new ones.
-        labels: of the cameras; by default their models.
+        cameras: Single cameras.
+        ax: Axes; default new ones.
+        labels: Labels of the cameras; default their models.
 
     Raises:
-        ValueError: a batch, or not as many labels as cameras.
+        ValueError: If a camera is a batch, or the numbers of labels and cameras differ.
     """
     cameras = cameras if isinstance(cameras, Sequence) else [cameras]
     labels = labels or [camera.key for camera in cameras]
     if len(labels) != len(cameras):
-        raise ValueError(f"plot: {len(cameras)} cameras, and labels for {len(labels)}")
+        raise ValueError(f"plot: labels must be as many as cameras, {len(cameras)}; got {len(labels)}")
     ax = axes_or_new(ax)
     shown = seen = 0.0
     for i, (camera, label, colour) in enumerate(zip(cameras, labels, cycle(COLOURS), strict=False)):
@@ -126,7 +126,7 @@ def radius_curve(cameras: Camera | Sequence[Camera], ax: Axes | None = None, *, 
         angles, low, high = _radii(camera)
         ax.fill_between(np.degrees(angles), low, high, color=colour, alpha=0.25, linewidth=0, zorder=2)
         middle = [(a + b) / 2 for a, b in zip(low, high, strict=True)]
-        wide = 3.2 if i == 0 < len(cameras) - 1 else 1.5  # the later ones thinner, to show what they cover
+        wide = 3.2 if i == 0 < len(cameras) - 1 else 1.5  # later curves are thinner, to leave the first visible
         ax.plot(np.degrees(angles), middle, color=colour, label=label, linewidth=wide)
         ax.plot(np.degrees(angles[-1:]), middle[-1:], "o", color=colour, markersize=5, zorder=3)
         if i == 0 and camera.distortion_names:
@@ -141,7 +141,7 @@ def radius_curve(cameras: Camera | Sequence[Camera], ax: Axes | None = None, *, 
             corners = image_lattice(camera, 2, 2).flatten(0, 1) - camera.intrinsics[2:]
             shown = max(shown, float(torch.linalg.vector_norm(corners, dim=-1).max()))
     ax.set_xlim(0, 1.15 * seen or None)
-    ax.set_ylim(0, 1.15 * shown or None)  # tangents grow without end
+    ax.set_ylim(0, 1.15 * shown or None)  # limits for tangents, which grow without end
     ax.set(xlabel="angle from the axis, degrees", ylabel="distance from the principal point, px")
     ax.set_title("radius over angle, as far as valid")
     ax.legend(frameon=False, loc="lower right")
@@ -150,17 +150,17 @@ def radius_curve(cameras: Camera | Sequence[Camera], ax: Axes | None = None, *, 
 
 @torch.no_grad()
 def difference(a: Camera, b: Camera, ax: Axes | None = None, *, remove_rotation: bool = False) -> Axes:
-    """How far apart two cameras show the same ray, in pixels, over the image of the first; grey: one shows nothing.
+    """Draw the distance in pixels of the same ray in two cameras, over the image of the first; grey: one has no ray.
 
     Args:
-        a: the camera whose image is shown.
-        b: the other camera, of an image of the same size, or of none stated.
-        ax: by default new ones.
-        remove_rotation: whether the rays are turned first, by the one rotation that brings those of the cameras
-            closest: two calibrations of one camera may differ by where they look.
+        a: Camera whose image is shown.
+        b: The other camera, with the same image size or none.
+        ax: Axes; default new ones.
+        remove_rotation: Whether rays are rotated first, by the rotation that brings the cameras' rays
+            closest: two calibrations of one camera may differ by their direction.
 
     Raises:
-        ValueError: a batch, no image size, or two different ones.
+        ValueError: If a camera is a batch, or image sizes are missing or differ.
     """
     compared = numbers.difference(a, b, remove_rotation=remove_rotation)
     height, width = a._size_for("a difference")
@@ -177,17 +177,17 @@ def difference(a: Camera, b: Camera, ax: Axes | None = None, *, remove_rotation:
 
 @torch.no_grad()
 def rig(rig: Rig, ax: Axes | None = None) -> Axes:
-    """Where the cameras of a rig are, from above, with wedges for the horizontal fields of view.
+    """Draw the positions of the cameras of a rig from above, with wedges for the horizontal fields of view.
 
-    In the frame of the rig, z to the top. Cameras that are above each other are seen from the right instead, with
+    The frame is the rig's, z to the top. Cameras above each other are drawn from the right instead, with
     vertical fields of view, z to the right.
 
     Args:
-        rig: single cameras, of which those with a pose are shown.
-        ax: by default new ones.
+        rig: Rig of single cameras; cameras with a pose are shown.
+        ax: Axes; default new ones.
 
     Raises:
-        ValueError: no camera has a pose.
+        ValueError: If no camera has a pose.
     """
     ax = axes_or_new(ax)
     if not (names := [name for name in rig.cameras if name in rig.extrinsics]):
@@ -256,7 +256,7 @@ def _draw_residuals(ax: Axes, calibration: Calibration, pixels: np.ndarray, erro
     height, width = size_of(calibration.camera)
     draw_frame(ax, height, width)
     lengths = np.linalg.norm(errors, axis=-1)
-    # an even choice of all lengths, the longest last and so above the others
+    # an even choice of all lengths; the longest are drawn last, above the others
     some = np.argsort(lengths, kind="stable")[np.linspace(0, len(lengths) - 1, min(len(lengths), _ARROWS)).astype(int)]
     usual = float(np.quantile(lengths, 0.98)) if len(lengths) else 0.0
     longer = magnification(0.05 * max(height, width) / max(usual, 1e-9))
@@ -291,7 +291,7 @@ def _draw_uncertainty(ax: Axes, calibration: Calibration, head: str) -> None:
 
 
 def portrait(camera: Camera, other: Camera | None = None, *, title: str = "") -> Figure:
-    """What `camtorch show -o` draws: the distortion field, the radius curve, and the difference to another camera."""
+    """Draw distortion field, radius curve and the difference to another camera, as `camtorch show -o` does."""
     require_matplotlib()
     from matplotlib.figure import Figure
 
@@ -311,7 +311,7 @@ def portrait(camera: Camera, other: Camera | None = None, *, title: str = "") ->
 
 
 def _bar(ax: Axes, mappable: Any, values: Tensor) -> None:
-    """Colours for the range of values, without the few largest if they are far from the others."""
+    """Add a colour bar for the range of values, without the few largest if they are far from the others."""
     most, many = (float(values.max()), float(values.quantile(0.98))) if values.numel() else (0.0, 0.0)
     cut = most > 4 * many > _FAINT
     mappable.set_clim(0, 1.5 * many if cut else max(most, _NOTHING))
@@ -319,7 +319,7 @@ def _bar(ax: Axes, mappable: Any, values: Tensor) -> None:
 
 
 def _radii(camera: Camera) -> tuple[np.ndarray, list[float], list[float]]:
-    """Angles, and the least and the greatest radius over the azimuths that are valid up to there."""
+    """Return angles, and the least and the greatest radius over the azimuths that are valid up to there."""
     angles = torch.linspace(0, math.pi, _ANGLES).to(camera.intrinsics)
     pixels, valid = followed(camera, angles, _AZIMUTHS)
     radius = torch.linalg.vector_norm(pixels - camera.intrinsics[2:], dim=-1)

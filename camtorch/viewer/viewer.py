@@ -1,7 +1,7 @@
-"""A page that shows a lens live, in one HTML file that needs nothing else, `write_viewer`.
+"""`write_viewer`: a page that shows a lens live, in one HTML file without other files.
 
-The files beside this one become one text, with the camera, the photograph and the collection of real lenses:
-`formulas.js` has the camera models, `drawing.js` what is seen and moved, `presets.json` a real camera of every model.
+The files in this folder become one text, with the camera, the photograph and the collection of real lenses:
+`formulas.js` has the camera models, `drawing.js` the drawing and controls, `presets.json` a camera of every model.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ from camtorch.values.arguments import check_path
 from camtorch.values.module import model_of
 
 _SIDE, _QUALITY = 1920, 85  # px of the longer side of a photograph, and of its JPEG file
-_MOST_COUNT = 40  # coefficients that a model of any number of them is given in the page
-_FOCAL, _BEND = 0.25, 0.1  # px: what a focal length, a centre and a coefficient of a packed lens are rounded to
+_MOST_COUNT = 40  # most coefficients in the page for models with any number
+_FOCAL, _BEND = 0.25, 0.1  # px: rounding of focal length and centre, and of coefficients, in packed lenses
 
 
 @torch.no_grad()
@@ -40,22 +40,22 @@ def write_viewer(
     path: str | os.PathLike[str],
     image: str | os.PathLike[str] | Image.Image | NDArray[Any] | torch.Tensor | None = None,
 ) -> None:
-    """Write a page that shows a lens live: one HTML file that needs no other and no network.
+    """Write a page that shows a lens live: one HTML file without other files or network.
 
-    It shows the image with the limit of the lens's rays, the same image as another camera would have taken it, and the
-    radius over the angle; coefficients move, photographs can be dropped, other models and real lenses chosen, and the
-    lines of Python that do what is seen are there to be copied.
+    It shows the image with the limit of the lens's rays, the same image in another camera, and the
+    radius over the angle. Coefficients can be moved, photographs dropped, other models and real lenses chosen; the
+    matching lines of Python can be copied.
 
     Args:
-        camera: a single camera with image_size. The page knows the models of the gallery of models.
-        path: the file; an existing one is replaced as a whole.
-        image: a photograph that the camera took: a path, a Pillow image, an array (H, W) or (H, W, C), a tensor
+        camera: A single camera with image_size, of a model in the gallery of models.
+        path: The file; an existing one is replaced as a whole.
+        image: A photograph of the camera: a path, a Pillow image, an array (H, W) or (H, W, C), a tensor
             (C, H, W). The page keeps it at up to 1920 pixels. Without one it shows drawn scenes through the lens.
 
     Raises:
-        ValueError: a batch of cameras, no image_size, a model that the page has no formulas of, a camera without
-            pixels, an image of another size than the camera's. TypeError: no camera, no path. OSError: the file cannot
-            be written, the image cannot be read.
+        ValueError: If the camera is a batch, has no image_size, no pixels, or a model that the page has no formulas
+            of, or if the image has another size. TypeError: If there is no camera or path. OSError: If the file cannot
+            be written, or the image cannot be read.
     """
     check_path(path, "write_viewer")
     text = page(camera, image)
@@ -64,7 +64,7 @@ def write_viewer(
 
 
 def page(camera: Camera | None = None, image: Any = None) -> str:
-    """The text of the page; without a camera it begins with a preset, or with what its address says."""
+    """Return the text of the page; without a camera it begins with a preset, or the camera of its address."""
     data: dict[str, Any] = {"camera": None, "photograph": None, "models": models(), "lenses": _lenses()}
     if camera is not None:
         data["camera"] = _described(camera)
@@ -72,7 +72,7 @@ def page(camera: Camera | None = None, image: Any = None) -> str:
             name = os.fsdecode(image) if isinstance(image, (str, bytes, os.PathLike)) else "image"
             jpeg = as_jpeg(image, camera._size_for("write_viewer"), name, "write_viewer", _SIDE, _QUALITY)
             data["photograph"] = f"data:image/jpeg;base64,{base64.b64encode(jpeg).decode()}"
-    # no text of a file may end the element that it stands in
+    # escaped, because no text may end the element that contains it
     parts = {"data": json.dumps(data, allow_nan=False, separators=(",", ":")).replace("</", "<\\/")}
     parts |= {name: _file(name) for name in ("page.css", "formulas.js", "drawing.js")}
     text = _file("page.html")
@@ -88,16 +88,16 @@ def _file(name: str) -> str:
 def _described(camera: Camera) -> dict[str, Any]:
     if not isinstance(camera, Camera) or camera.is_mixed:
         has_one = isinstance(getattr(camera, "camera", None), Camera)
-        hint = ". Of a rig it takes rig.camera, or one of rig.cameras" if has_one else ""
+        hint = ". For a rig pass rig.camera, or one of rig.cameras" if has_one else ""
         raise TypeError(f"write_viewer: camera must be a camera of one model; got {type(camera).__name__}{hint}")
     if camera.batch_shape:
         shape = tuple(camera.batch_shape)
-        raise ValueError(f"write_viewer: camera must be a single one, as camera[0] is; got a batch {shape}")
+        raise ValueError(f"write_viewer: camera must be a single one, as camera[0]; got a batch {shape}")
     lens = model_of(camera)
     if lens.key not in models() and not (issubclass(lens, Splined) and re.fullmatch("splined:order[^:]*", lens.key)):
         raise ValueError(
-            f"write_viewer: the page has no formulas of {camera.key or type(camera).__name__}; it knows "
-            f"{', '.join(sorted(models()))}. camera.convert(...) makes one of these of it"
+            f"write_viewer: model must be known to the page; got {camera.key or type(camera).__name__}; known are "
+            f"{', '.join(sorted(models()))}. Convert it with camera.convert(...)"
         )
     size = camera._size_for("write_viewer")
     intrinsics, distortion = camera.intrinsics.detach().double(), camera.distortion.detach().double()
@@ -114,14 +114,14 @@ def _described(camera: Camera) -> dict[str, Any]:
 
 
 def _numbers(values: torch.Tensor) -> list[float]:
-    """As they would be written: 0.1 of float32 is 0.1, not 0.10000000149."""
+    """Return numbers as they would be written: 0.1 of float32 is 0.1, not 0.10000000149."""
     values = values.detach().cpu()
     return [float(str(value)) for value in (values if values.dtype == torch.float64 else values.float()).numpy()]
 
 
 @cache
 def models() -> dict[str, dict[str, Any]]:
-    """Of each model that the page knows: a real camera, its class, names of coefficients, and how many there may be."""
+    """Return for each model of the page a real camera, its class, names of coefficients, and their possible numbers."""
     known = {}
     for key, preset in json.loads(_file("presets.json")).items():
         kind = MODELS[key]
@@ -129,7 +129,7 @@ def models() -> dict[str, dict[str, Any]]:
         names = {n: of_count for n in counts if (of_count := kind.names_of(n))}
         known[key] = {
             "class": _constructor(kind),
-            # the table's angles come before its radii, whatever their number: the page names those itself
+            # the page itself names the coefficients of tables: angles come before radii, for any number of them
             "names": list(names[max(names)]) if names else [],
             "counts": list(names) or [0],
             "distortion": [],
@@ -146,13 +146,13 @@ def _constructor(kind: type[Camera]) -> str:
 
 @cache
 def _lenses() -> dict[str, Any]:
-    """The collection of real lenses, packed by Deflate; integers lie byte by byte, sign last, lowest bytes first.
+    """Return the collection of real lenses, packed by Deflate; integers are stored in byte planes, sign lowest.
 
     Focal lengths and centres are in steps of `_FOCAL` pixels, fy and the centre relative to fx and to the middle; k1 to
-    k4 are what they move a point at the corner of an image of an equidistant lens, in steps of `_BEND`.
+    k4 as the shift of a point at the corner of an image of an equidistant lens, in steps of `_BEND`.
     """
     texts, numbers = columns()
-    exists = np.minimum(numbers[0], numbers[1]) > 0  # a few have gone astray
+    exists = np.minimum(numbers[0], numbers[1]) > 0  # a few are not positive
     fx, fy, cx, cy, *k = numbers[:8, exists]
     width, height = (np.array(texts[side], float)[exists] for side in ("width", "height"))
     focal = np.rint(fx / _FOCAL)
@@ -180,5 +180,5 @@ def _lenses() -> dict[str, Any]:
 
 
 def _deflated(content: bytes) -> str:
-    """Raw Deflate, which browsers read by themselves, as Base64."""
+    """Return raw Deflate as Base64, which browsers can decode."""
     return base64.b64encode(zlib.compress(content, 9)[2:-4]).decode()

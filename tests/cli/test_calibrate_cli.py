@@ -151,7 +151,7 @@ def test_models_that_the_file_cannot_hold_are_not_tried(photographs, capsys, mon
     ("words", "text"),
     [
         ("a.png", "a board was found in 0 of 1 images, and 3 are needed"),
-        ("a.png --model splined", "splined learns a surface over a lens that is known"),
+        ("a.png --model splined", "splined fits a surface over a known lens"),
         pytest.param(
             "PHOTOS --model kannala_brandt --fixed q",
             "fixed names 'q'; KannalaBrandt has fx, fy",

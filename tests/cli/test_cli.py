@@ -160,7 +160,7 @@ def test_the_exif_orientation_stays_or_its_loss_is_said(folder, capsys):
     tagged("turned.jpg", 3)
     for suffix in sorted(IMAGES):
         command("dewarp", "turned.jpg", "--camera", "camera.yml", "-o", f"out{suffix}", "--size", "9x6")
-        lost = f"the Exif orientation, by which it is to be shown turned, is lost: {suffix} files hold none\n"
+        lost = f"the Exif orientation, which turns the image, is lost: {suffix} files hold none\n"
         assert (orientation_of(f"out{suffix}") == 3) != (lost in capsys.readouterr().err), suffix
 
 

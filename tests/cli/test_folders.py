@@ -119,7 +119,7 @@ def test_what_there_is_already(folder, capsys):
     command(*WORDS, "--jobs", 1)
     before = outputs()
     Path("in/cut.png").write_text("no image")  # is not looked at before what exists is refused
-    assert "out/1.png: exists already, and 4 more of 6; --resume goes on" in refused(capsys, *WORDS)
+    assert "out/1.png: exists already, and 4 more of 6; --resume continues the run" in refused(capsys, *WORDS)
     Path("in/cut.png").unlink()
     Path("in/1.png").rename("in/9.png")
     Path("out/2.jpg").write_bytes(b"")  # after a loss of power
@@ -273,7 +273,7 @@ def test_a_run_that_is_broken_off_is_one_line(folder, who):
         os.kill(max(one for one in others if os.getpgid(one) == process.pid), signal.SIGKILL)
     printed = {
         "all": "interrupted\n",
-        "one": "error: a process was killed, perhaps for lack of memory; --resume goes on",
+        "one": "error: a process was killed, perhaps for lack of memory; --resume continues the run",
     }
     out, error = process.communicate(timeout=30)
     assert (out, error.count("\n")) == ("", 1)

@@ -143,7 +143,7 @@ def test_a_folder_goes_on(folder, capsys):
 
 REFUSED = [
     ([*WORDS, "--codec", "nothing"], "--codec: invalid choice: 'nothing'"),
-    ([*WORDS, "--size", "95x64"], "out.mkv: 95x64, but libx264 wants even numbers"),
+    ([*WORDS, "--size", "95x64"], "out.mkv: size must be even for libx264; got 95x64"),
     ([*WORDS[:-1], "out.webm"], "in.mkv: its audio, mp3float, cannot be kept in .webm; .mkv takes nearly all"),
     ([*WORDS[:-1], "out.webm", "--codec", "libx264"], "does not support 'libx264' codec; --codec names another"),
     ([*WORDS[:-1], "out.png"], "out.png: .png: no video is written as that; try .mp4, .m4v"),

@@ -144,10 +144,10 @@ def test_tables_of_nuscenes_without_channels_or_with_several_drives(tmp_path):
     assert list(rig.cameras) == [tokens[0], "CAM_BACK", "another drive"]
     assert rig["another drive"].distortion.tolist() == [-0.3, 0.1, 1e-3, 2e-3, 0.01]
     for broken, reason in (
-        ({"rotation": [1, 1, 0, 0]}, r"\[2\]: a quaternion of length 1.41"),
+        ({"rotation": [1, 1, 0, 0]}, r"\[2\]: a quaternion must have length 1; got 1.41"),
         ({"camera_distortion": [0, 0, 0, 0, 0, 0.1]}, r"\[2\].camera_distortion: a sixth coefficient"),
         ({"token": tokens[0]}, r"\[2\].token: a second sensor is called"),
-        ({"camera_intrinsic": [[1, 2], [3, 4]]}, r"\[2\].camera_intrinsic: a camera matrix has 3 x 3 numbers"),
+        ({"camera_intrinsic": [[1, 2], [3, 4]]}, r"\[2\].camera_intrinsic: a camera matrix must have 3 x 3"),
     ):
         (tmp_path / "calibrated_sensor.json").write_text(json.dumps([table[0], table[1], {**again, **broken}]))
         with pytest.raises(ct.CameraFileError, match=reason):

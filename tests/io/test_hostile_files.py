@@ -169,7 +169,7 @@ def spelled(content):
         ("a.p", b"", "content: the file is empty"),
         ("a.p", pickle.dumps({"K": [1]}), "byte 0: a pickle, which could run any code: not read. .*numpy.savez"),
         ("a.p", b"\x93NUMPY\x01\0", "byte 0: a single array; save both by numpy.savez"),
-        ("a.p", b"\x89PNG\r\n\x1a\n", "byte 0: an image, where a file of a calibration is wanted"),
+        ("a.p", b"\x89PNG\r\n\x1a\n", "byte 0: an image; pass a calibration file"),
         ("a.p", b"\x89HDF\r\n\x1a\n", "byte 0: a file of HDF5 or MATLAB"),
         ("a.p", b"\xfe\xfd\xfc", "byte 0: not text"),
         ("cameras.bin", GIGANTIC, "byte 0: 1152921504606846976 cameras, for which the file is too"),
@@ -273,7 +273,7 @@ def test_pipes_are_neither_waited_for_nor_replaced(suffix, tmp_path):
     camera = ct.Pinhole([500.0, 500, 320, 240], image_size=(480, 640))
     ct.save(camera, tmp_path / f"cameras.{suffix}", "colmap")
     os.mkfifo(tmp_path / f"images.{suffix}")
-    with pytest.raises(ct.CameraFileError, match="no ordinary file"):
+    with pytest.raises(ct.CameraFileError, match="must be an ordinary file"):
         ct.load(tmp_path / f"cameras.{suffix}")
     os.mkfifo(tmp_path / "pipe.yml")
     with pytest.raises(OSError, match="no ordinary file"):

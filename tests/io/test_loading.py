@@ -44,8 +44,8 @@ def test_no_path(tmp_path):
     for call, path, error, told in (
         (ct.load, {"K": K}, TypeError, "load: path must be that of a calibration file; got dict"),
         (saved, None, TypeError, "save: path must be that of a calibration file; got NoneType"),
-        (ct.load, "camera\0.json", ct.CameraFileError, "path: a NUL character"),
-        (saved, "camera\0.json", ct.CameraFileError, "path: a NUL character"),
+        (ct.load, "camera\0.json", ct.CameraFileError, "path: must not have a NUL character"),
+        (saved, "camera\0.json", ct.CameraFileError, "path: must not have a NUL character"),
         (ct.load, tmp_path / "nowhere.yml", FileNotFoundError, r"nowhere\.yml"),
         (ct.load, tmp_path, ct.CameraFileError, r"folder: has none of cameras\.bin, cameras\.txt, transforms\.json"),
     ):

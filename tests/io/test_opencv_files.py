@@ -109,7 +109,7 @@ def test_model_argument_decides(path):
     assert type(opencv.read(path, "kannala_brandt")) is ct.KannalaBrandt
     with pytest.raises(CameraFileError, match=r"D: 4 coefficients; Pinhole takes n = 0"):
         opencv.read(path, "pinhole")
-    with pytest.raises(ValueError, match=r"unknown model 'fish'; known are brown_conrady, .*pinhole"):
+    with pytest.raises(ValueError, match=r"model must be one of brown_conrady, .*pinhole.*; got 'fish'"):
         opencv.read(path, "fish")
 
 
@@ -145,5 +145,5 @@ D4 = "D: [0.1, 0.01, 0.001, 0.0001]\n"
 def test_a_file_that_states_its_model_is_not_overruled(path, text, stated, other):
     written(path, f"K: {K}\n{text}")
     assert opencv.read(path, stated).key == opencv.read(path).key == stated
-    with pytest.raises(CameraFileError, match=f"says that the model is .*; do not name {other}, or correct"):
+    with pytest.raises(CameraFileError, match=f"file's model is .*; got {other}. Leave it out, or correct"):
         opencv.read(path, other)

@@ -236,7 +236,7 @@ REFUSED = [
     (lambda: between_pinholes((144, 176), (3080, 176)), "dw100", {}, "target size: 176x3080"),
     (lambda: between_pinholes((17, 8200), (17, 17)), "ti_ldc", {}, "8192"),
     (lambda: between_pinholes((9, 32767), (17, 17)), "opencv", {}, "32767 px"),
-    (behind, "opencv", {}, "no pixel of the target shows"),
+    (behind, "opencv", {}, "the target must show a part"),
     (batch, "opencv", {}, "a batch of 2"),
     (lambda: ct.Dewarp(fisheye(0.25), mode="bicubic", padding_mode="border"), "onnx", {}, "bicubic"),
     (lambda: ct.Dewarp(fisheye(0.25), antialias=True), "onnx", {}, "antialias"),
@@ -308,8 +308,8 @@ def test_the_name_says_the_format_or_the_error_lists_them(tmp_path):
     for name, format in (("a.yaml", "opencv"), ("a.NPZ", "opencv"), ("a.onnx", "onnx")):
         assert ct.save_map(warp, tmp_path / name).format == format
     for name, format, match in (
-        ("map.bin", None, "does not say the format"),
-        ("map.exr", None, "does not say the format"),
+        ("map.bin", None, "does not determine the format"),
+        ("map.exr", None, "does not determine the format"),
         ("map.yml", "stmap", "format: 'stmap' is no format of a map"),
     ):
         with pytest.raises(ValueError, match=match) as raised:
@@ -356,7 +356,7 @@ def test_bare_tables_have_a_description(tmp_path):
     assert report.files == (str(tmp_path / "map.bin"), str(tmp_path / "map.bin.json"))
     with pytest.raises(ct.CameraFileError, match="describes 'ti_ldc', not dw100"):
         ct.load_map(tmp_path / "map.bin", "dw100")
-    with pytest.raises(ValueError, match="from images of"):
+    with pytest.raises(ValueError, match="map and warp must have the same sizes"):
         ct.load_map(tmp_path / "map.bin").error(ct.Dewarp(fisheye(0.25)))
     (tmp_path / "map.bin").write_bytes((tmp_path / "map.bin").read_bytes()[:-4])
     with pytest.raises(ct.CameraFileError, match="bytes"):
