@@ -114,7 +114,7 @@ def load_map(path: str | os.PathLike[str], format: str | None = None) -> LookupM
     described = _read_description(name) if chosen is None or chosen.described else {}
     chosen = chosen or _FORMATS.get(str(described.get("format")))
     if chosen is None:
-        what = f"no known map, and no {name}.json describes it; write format=...: {_KNOWN}"
+        what = f"not a known map, and no {name}.json describes it; write format=...: {_KNOWN}"
         raise CameraFileError(name, "content", what)
     if described.get("format", chosen.name) != chosen.name:
         raise CameraFileError(f"{name}.json", "format", f"describes {described['format']!r:.60}, not {chosen.name}")

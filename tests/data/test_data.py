@@ -103,7 +103,7 @@ def test_a_batch_is_drawn_as_one_by_one():
     single = augment(image=images[1], key=2)
     torch.testing.assert_close(moved["image"][1], single["image"], rtol=0, atol=1e-4)
     assert augment.draw([])["yaw"].shape == (0,)
-    with pytest.raises(ValueError, match="same_on_batch=True draws by the batch"):
+    with pytest.raises(ValueError, match="same_on_batch must be False"):
         ct.data.Seeded(augmentation(same_on_batch=True))
     with pytest.raises(TypeError, match="Seeded: augmentation must be an Augmentation"):
         ct.data.Seeded(ct.Dewarp(camera()))
@@ -246,7 +246,7 @@ def test_wrong_batches_are_told():
         ({"label": [1]}, "all columns must have as many rows"),
         ({"image": some["image"][:, :12]}, r"sample 'day/0.jpg': RandomCamera: image is \(12, 32\)"),
         ({"score": np.ones((2, 3))}, "'score' holds real numbers"),
-        ({"camera_intrinsics": np.ones((2, 4))}, r"the camera has no model; ct.data.to_columns tells all of it"),
+        ({"camera_intrinsics": np.ones((2, 4))}, r"the camera has no model; ct.data.to_columns has all of it"),
         ({"camera_intrinsics": np.ones((2, 4)), "camera_model": ["x"] * 2}, "one of brown_conrady, .*; got 'x'"),
     ):
         with pytest.raises(ValueError, match=message):

@@ -371,7 +371,7 @@ def test_faults_in_arrays_name_the_file(tmp_path):
 
 
 def test_a_format_that_is_not_seen_is_an_error_that_lists_them(tmp_path):
-    unknown, unseen = text(tmp_path / "unknown.json", "{}"), r"no known format; format= one of coco, wflw, 300w"
+    unknown, unseen = text(tmp_path / "unknown.json", "{}"), r"no known format; write format= one of coco, wflw, 300w"
     (tmp_path / "empty").mkdir()
     pts(tmp_path / "both")
     (tmp_path / "both" / "a.mat").touch()
@@ -379,7 +379,7 @@ def test_a_format_that_is_not_seen_is_an_error_that_lists_them(tmp_path):
         ((tmp_path / "nowhere",), FileNotFoundError, "no file or folder"),
         ((unknown,), ValueError, unseen),
         ((tmp_path / "empty",), ValueError, unseen),
-        ((tmp_path / "both",), ValueError, "seems to be of 300w and 300w_lp; format= one of"),
+        ((tmp_path / "both",), ValueError, "seems to be of 300w and 300w_lp; write format= one of"),
         ((tmp_path / "both", "coco"), ValueError, "is a folder"),
     ):
         with pytest.raises(error, match=told):

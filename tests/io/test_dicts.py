@@ -76,7 +76,7 @@ def test_cameras_that_are_none_or_several(tmp_path):
     with pytest.raises(TypeError, match=r"Mixed\.to_dict: .* of one model; got a Mixed. Write \[c\.to_dict"):
         ct.Mixed([FISHEYE, FISHEYE]).to_dict()
     ct.save(ct.Rig({"left": FISHEYE, "right": FISHEYE}), tmp_path / "rig.json")
-    with pytest.raises(ValueError, match=r"rig.json must have one camera; it has 'left', 'right'\. ct\.load"):
+    with pytest.raises(ValueError, match=r"rig.json must have one camera; got 'left', 'right'\. Write ct\.load"):
         ct.Camera.load(tmp_path / "rig.json")
     ct.save(FISHEYE, tmp_path / "one.json")
     with pytest.raises(ValueError, match=r"^Pinhole\.load: .*one.json must have a Pinhole; it has a KannalaBrandt"):

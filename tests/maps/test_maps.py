@@ -310,7 +310,7 @@ def test_the_name_says_the_format_or_the_error_lists_them(tmp_path):
     for name, format, match in (
         ("map.bin", None, "does not determine the format"),
         ("map.exr", None, "does not determine the format"),
-        ("map.yml", "stmap", "format: 'stmap' is no format of a map"),
+        ("map.yml", "stmap", "format: must be a known format of maps; got 'stmap'"),
     ):
         with pytest.raises(ValueError, match=match) as raised:
             ct.save_map(warp, tmp_path / name, format)

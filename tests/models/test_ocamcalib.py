@@ -59,10 +59,10 @@ BAD = {
     "no focal length": (text(ss=(0.0, 0.0, 1e-3)), "must not be zero"),
     "mirrored": (text(affine=(-1.0, 0.0, 0.0)), "c must be positive"),
     "half a pixel": (text(size=(480.5, 752)), "number of pixels"),
-    "three sides": (text(size=(480, 752, 3)), "not a height and a width"),
+    "three sides": (text(size=(480, 752, 3)), "must be a height and a width"),
     "too many": (text(ss=(-200.0, *[0.0] * 80)), "number of coefficients up to 64"),
     "overflow": (text(ss=(-1e300, 0.0, 1e300)), "finite"),
-    "no affine": (text(affine=(1.0, 0.0)), "2 numbers where 3 belong"),
+    "no affine": (text(affine=(1.0, 0.0)), "must have 3 numbers; got 2"),
 }
 
 

@@ -185,7 +185,7 @@ WRONG = [
     (lambda: ct.Rig({"a": CAMERA}, ([1], BOARDS[:1])), TypeError, r"strings; got 1"),
     (lambda: ct.Rig({"a": CAMERA}, (["a"], None)), TypeError, r"got NoneType"),
     (lambda: ct.Rig({"a": CAMERA}, {"a": CAMERA}), TypeError, r"Extrinsics; got 'a': KannalaBrandt"),
-    (lambda: ct.WoodScape.from_woodscape([20, 0, 0, 0], image_size=None), ValueError, r"give its image_size=\(height"),
+    (lambda: ct.WoodScape.from_woodscape([20, 0, 0, 0], image_size=None), ValueError, r"image_size must be \(height"),
     (lambda: ct.WoodScape.from_woodscape([20, 0, 0, 0], 3, image_size=SIZE), ValueError, r"offset must be \(2,\) ="),
     (lambda: ct.io.opencv.read(None), TypeError, r"io.opencv.read: path must name a file; got None"),
     # the order of OpenCV's arguments

@@ -58,7 +58,7 @@ def test_every_model_is_shown_or_refused_by_name(key, tmp_path):
         ct.write_viewer(camera, path)
         assert f'"model":"{key}"' in path.read_text()
     else:
-        with pytest.raises(ValueError, match=f"no formulas of {key}"):
+        with pytest.raises(ValueError, match=f"known to the page; got {key}"):
             ct.write_viewer(camera, path)
         assert not path.exists()
 
