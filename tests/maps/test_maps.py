@@ -315,7 +315,7 @@ def test_the_name_says_the_format_or_the_error_lists_them(tmp_path):
         with pytest.raises(ValueError, match=match) as raised:
             ct.save_map(warp, tmp_path / name, format)
         assert all(word in str(raised.value) for word in (*FORMATS, "docs/leaving-0.3.md"))
-    with pytest.raises(ValueError, match=r"files of opencv are called \.yml"):
+    with pytest.raises(ValueError, match=r"suffix must be one of \.yml"):
         ct.save_map(warp, tmp_path / "map.png", "opencv")
 
 
