@@ -79,5 +79,5 @@ def test_cameras_that_are_none_or_several(tmp_path):
     with pytest.raises(ValueError, match=r"rig.json must have one camera; got 'left', 'right'\. Write ct\.load"):
         ct.Camera.load(tmp_path / "rig.json")
     ct.save(FISHEYE, tmp_path / "one.json")
-    with pytest.raises(ValueError, match=r"^Pinhole\.load: .*one.json must have a Pinhole; it has a KannalaBrandt"):
+    with pytest.raises(ValueError, match=r"^Pinhole\.load: .*one.json must have a Pinhole; got a KannalaBrandt"):
         ct.Pinhole.load(tmp_path / "one.json")
