@@ -77,6 +77,11 @@ is_exporting: Callable[[], bool] = torch.compiler.is_exporting
 """Whether what is traced shall run elsewhere, where there are no operators of our own."""
 
 
+def records_constants() -> bool:
+    """Whether a program is exported into which values go as constants: not while dynamo traces it."""
+    return is_exporting() and not torch.compiler.is_dynamo_compiling()
+
+
 def is_for_here() -> bool:
     """Whether what is traced is compiled for this machine."""
     return torch.compiler.is_compiling() and not is_exporting()
@@ -93,7 +98,7 @@ def keeps_graph(*tensors: Tensor) -> bool:
 
 def is_constant(module: nn.Module) -> bool:
     """Whether a module is exported whose tensors are its own, not given, and do not learn: their values are known."""
-    if not is_exporting() or torch.compiler.is_dynamo_compiling():
+    if not records_constants():
         return False
     for part in module.modules():
         own = part.__dict__.get("_own", {})
@@ -141,7 +146,7 @@ def _outside_inference() -> Iterator[None]:
 
 def converted(tensor: Tensor, dtype: torch.dtype) -> Tensor:
     """The tensor in a dtype; what becomes a constant of an exported program is converted before it is one."""
-    if not is_exporting() or torch.compiler.is_dynamo_compiling() or is_fake(tensor):
+    if not records_constants() or is_fake(tensor):
         return tensor.to(dtype)
     with set_aside():
         return tensor.to(dtype)

@@ -10,7 +10,7 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from itertools import accumulate
 from itertools import count as count_from
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -19,12 +19,12 @@ from torch import Tensor
 from camtorch.evaluate.door import (
     in_graph,
     in_jit_trace,
-    in_transform,
     is_constant,
     is_eager,
     is_exporting,
     is_for_here,
     keeps_graph,
+    records_constants,
     set_aside,
 )
 from camtorch.evaluate.export import with_values
@@ -65,9 +65,6 @@ from camtorch.warp.sampling import (
     prepared,
     render,
 )
-
-if TYPE_CHECKING:
-    from camtorch.warp.warp import Warp
 
 Route = Literal["operator", "strips", "graph", "kept"]
 Label = Literal["pixels", "rays", "columns"]
@@ -167,7 +164,7 @@ def positions(warp: CameraPair, route: Route, padding: PaddingMode = "zeros") ->
                 "before, make its map a constant"
             )
         return warp._locate(range(warp.target._size_for("Warp")[0]), padding, 0.0)
-    if is_exporting() and not torch.compiler.is_dynamo_compiling() and (constant := _constant(warp, padding)):
+    if records_constants() and (constant := _constant(warp, padding)):
         return constant
     reach = _reach(warp, padding)
     key = reach if warp.tolerance else "zeros"
@@ -243,7 +240,7 @@ def pin(warp: CameraPair) -> None:
     # of compiled code keeps its own
     if _is_operator(warp) and compiled.takes(warp.target.intrinsics.detach(), warp._inputs()):
         return
-    if in_transform() or torch.is_inference_mode_enabled():
+    if torch.is_inference_mode_enabled():
         return
     if keeps_graph(*warp._inputs()):
         where = positions(warp, "graph")
@@ -292,7 +289,7 @@ def _constant(warp: CameraPair, padding: PaddingMode) -> Sampling | Lattice | No
 # -- samples: images, pixels and vectors by one call of compiled code
 
 
-def between_of(warp: Warp) -> tuple[Native, Native, Tensor | None] | None:
+def between_of(warp: CameraPair) -> tuple[Native, Native, Tensor | None] | None:
     """Return source, target and rotation of a warp for compiled code; None where it has to go step by step."""
     source, target, rotation = warp.source, warp.target, warp.rotation
     if not warp.is_an_operator or warp.is_pinned or goes_round(source) is not None or goes_round(target) is not None:
