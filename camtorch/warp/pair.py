@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, ClassVar
 
 import torch
@@ -10,7 +11,6 @@ from torch import Tensor, nn
 from typing_extensions import Self
 
 from camtorch.cameras.camera import Camera
-from camtorch.evaluate.door import in_transform
 from camtorch.evaluate.kept import Kept
 from camtorch.values.arguments import Numbers, broadcast_shapes
 from camtorch.values.module import GeometryModule
@@ -37,21 +37,16 @@ class Plan:
 
     def __init__(self, positions: dict[str, Sampling | Lattice], is_pinned: bool = False):
         """positions: by the padding that they serve. is_pinned: whether they stay whatever becomes of the cameras."""
-        self.positions, self.is_pinned = positions, is_pinned
-        self.calls = Kept(8)
-        """Calls of the sampler by forms of images."""
+        self.is_pinned, self.positions, self.calls = is_pinned, Kept(6), Kept(8)
+        self._exact: Sampling | None = None
+        for padding in positions:
+            self.positions_for(padding, partial(positions.__getitem__, padding))
+        exact = self.positions.result
+        self._exact = exact if is_pinned and isinstance(exact, Sampling) else None
 
     def positions_for(self, padding: str, compute: Callable[[], Sampling | Lattice]) -> Sampling | Lattice:
-        """`compute()` without a graph, or its kept result; positions that are exact serve every padding."""
-        found = next(iter(self.positions.values()), None) if self.is_pinned else None
-        found = found if isinstance(found, Sampling) else self.positions.get(padding)
-        if found is not None:
-            return found
-        if in_transform():  # what a transform makes dies with it
-            return compute()
-        with torch.inference_mode(False), torch.no_grad():  # what that makes could not be used in a graph later
-            self.positions[padding] = found = compute()
-        return found
+        """Return `compute()` without a graph, or what is kept; pinned positions that are exact serve all paddings."""
+        return self.positions((), (padding,), compute) if self._exact is None else self._exact
 
 
 class CameraPair(GeometryModule):

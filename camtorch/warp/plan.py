@@ -143,7 +143,7 @@ def warped(warp: CameraPair, images: Tensor, sampler: Sampler) -> Tensor:
         return by_torch(images, where, sampler)
     result = call(images)
     # most warps are used once, and keep no calls
-    is_kept = plan is not None and any(where is found for found in plan.positions.values())
+    is_kept = plan is not None and plan.positions.result is where
     if plan is not None and is_kept and images is given and sampler.fill == warp.fill:
         plan.calls((), _form(warp, images, sampler.mode, sampler.padding_mode), lambda: call)
     return result
