@@ -16,7 +16,7 @@ INSIDE = ("Compose: mount", "Compose: crop, mount", "Compose: flip, lens", "Rand
 LONG = ("labels: ShutterWarp", "Reproject, sweep", "losses.rays")
 NOT_EXPORTED = (*INSIDE, *REFUSED, *LONG, "FaceNormalizer", "CanonicalCamera", "CameraHead", "labels: Plane")
 """Calls that torch.export refuses, or takes longest for."""
-QUICK = {"Warp, bilinear, zeros", "views.ring", "Resize, antialias", "HorizontalFlip", "Compose: crop, turn, size"}
+QUICK = {"Warp, bilinear, zeros", "views.ring", "Resize, antialias", "Compose: crop, turn, size"}
 every = pytest.mark.parametrize("name", slow_unless(QUICK.__contains__, [n for n in cases.CASES if n not in REFUSED]))
 
 
