@@ -18,7 +18,6 @@ except ModuleNotFoundError as error:
 _MODULES = (points, images, training, augment, samples, calibration)
 SUBJECTS = {module.__name__.rpartition(".")[2]: module for module in _MODULES}
 TABLES = {table.name: table for subject in SUBJECTS.values() for table in subject.TABLES}
-SECONDS = 0.6  # for a row
 _LIMITS = {
     "avx2": {
         "ATEN_CPU_CAPABILITY": "avx2",
@@ -92,7 +91,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--cpu", choices=list(_LIMITS), help="limit everyone to this kind of processor (default: what it is)")
     add("--no-library", action="store_true", help="camtorch alone, without its compiled library")
     add("--repeats", type=int, metavar="R", help="rounds that medians are taken of (default: 9)")
-    add("--seconds", type=float, default=SECONDS, metavar="S", help="of a row's rounds, three at least (default: 0.6)")
+    add("--seconds", type=float, default=0.6, metavar="S", help="of a row's rounds, three at least (default: 0.6)")
     add("--no-compile", dest="compile", action="store_false", help="without torch.compile: about a minute a model")
     add("--json", type=Path, metavar="FILE", help="write the machine and every figure to this file")
     add("--quick", action="store_true", help="small inputs, nothing compiled: does everything work?")

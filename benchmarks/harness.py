@@ -122,10 +122,10 @@ def _times(ratio: float) -> str:
 
 
 def _joined(cells: Iterable[str]) -> str:
-    """Return the cells of several runs as one, and who is the fastest of both once."""
-    one, *more = [cell for cell in cells if cell] or ["-"]
+    """Return the cells of several runs as one, and camtorch once."""
+    one, *more = [cell or "-" for cell in cells]
     same = [other.removeprefix(f"{OURS} ") if one.startswith(OURS) else other for other in more]
-    return " / ".join([one, *same])
+    return " / ".join([one, *same]) if {one, *more} != {"-"} else "-"
 
 
 def digits(value: float) -> str:

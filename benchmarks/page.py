@@ -13,7 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from benchmarks.__main__ import SECONDS, TABLES
+from benchmarks.__main__ import TABLES
 from benchmarks.harness import Figure
 
 PAGE = Path(__file__).parent.parent / "docs" / "performance.md"
@@ -21,7 +21,8 @@ FIGURES = PAGE.with_suffix(".json")
 _PLACE = re.compile(r"(<!-- (\w[\w, ]*) -->\n).*?(<!-- /\2 -->)", re.S)
 
 Run = Mapping[str, Any]
-_TRIAL = "These figures are from a short trial on a busy machine: do not quote them."
+_TRIAL = "These figures are from a short trial: do not quote them."
+_SECONDS = 0.2  # for a row, below which a run is a trial
 _KINDS = {"avx2": "AVX2", "avx512": "AVX-512"}
 
 
@@ -72,7 +73,7 @@ def _machine(runs: Sequence[Run]) -> str:
     facts = dict(_with_library(runs)[-1]["machine"])
     cpu, cores, threads, _ = (facts.pop(name) for name in ("cpu", "cores", "threads", "library"))
     text = f"On {threads} threads of {cpu} with {cores} cores; {', '.join(f'{k} {v}' for k, v in facts.items())}."
-    return f"{text} **{_TRIAL}**" if any(run["arguments"]["seconds"] < SECONDS for run in runs) else text
+    return f"{text} **{_TRIAL}**" if any(run["arguments"]["seconds"] < _SECONDS for run in runs) else text
 
 
 def _losses(runs: Sequence[Run]) -> str:

@@ -64,7 +64,7 @@ def test_a_table_shows_runs_side_by_side_and_who_is_the_fastest():
     assert table.markdown([rows, other]).splitlines() == [
         f"| ms | camtorch | {WITHOUT_LIBRARY} | OpenCV | floor | fastest |",
         "|---|---:|---:|---:|---:|---:|",
-        "| project | 2.0 / 3.0 | 9.0 | 5.0 / 2.0 | 0.1 | camtorch 2.5x / **OpenCV 1.5x** |",
+        "| project | 2.0 / 3.0 | - / 9.0 | 5.0 / 2.0 | 0.1 / - | camtorch 2.5x / **OpenCV 1.5x** |",
     ]
 
 
