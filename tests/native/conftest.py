@@ -20,7 +20,10 @@ def variant(request):
     return {"fuzzed": building.VARIANTS[name]}
 
 
-@pytest.fixture(params=building.VARIANTS)
+FASTER = [name for name in building.VARIANTS if name != "baseline"]
+
+
+@pytest.fixture(params=[pytest.param("baseline", marks=pytest.mark.slow if FASTER else ()), *FASTER])
 def each_variant(request):
     """The variants that this CPU runs, one after the other in the place of the one that is used."""
     native = library()

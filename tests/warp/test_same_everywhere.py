@@ -16,7 +16,7 @@ INSIDE = ("Compose: mount", "Compose: crop, mount", "Compose: flip, lens", "Rand
 LONG = ("labels: ShutterWarp", "Reproject, sweep", "losses.rays")
 NOT_EXPORTED = (*INSIDE, *REFUSED, *LONG, "FaceNormalizer", "CanonicalCamera", "CameraHead", "labels: Plane")
 """Calls that torch.export refuses, or takes longest for."""
-QUICK = {"Warp, bilinear, zeros", "views.ring", "Resize, antialias", "Compose: crop, turn, size"}
+QUICK = {"Warp, bilinear, zeros", "views.ring", "Resize, antialias"}
 every = pytest.mark.parametrize("name", slow_unless(QUICK.__contains__, [n for n in cases.CASES if n not in REFUSED]))
 
 
@@ -47,6 +47,7 @@ def test_exported(name):
     assert_same(list(tensors_of(exported(*inputs))), cases.answer(name))
 
 
+@pytest.mark.slow
 def test_without_the_compiled_library(tmp_path):
     command = [sys.executable, "-W", "error", cases.__file__, str(tmp_path / "answers.pt")]
     subprocess.run(command, env={**os.environ, "CAMTORCH_NATIVE": "0"}, check=True)
