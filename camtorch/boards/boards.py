@@ -128,13 +128,13 @@ def as_board(board: Any, square: float, options: dict[str, Any], owner: str) -> 
     found = kind(int(match[2]), int(match[3]), square, **options)
     if min(found.columns, found.rows) < kind.least:
         least, got = f"{kind.least}x{kind.least}", f"{found.columns}x{found.rows}"
-        raise ValueError(f"{owner}: at least {least} {kind.counted} are needed; got {got}")
+        raise ValueError(f"{owner}: a board must have at least {least} {kind.counted}; got {got}")
     if not 0 < square < float("inf"):
         raise ValueError(f"{owner}: lengths must be positive and finite; got {square:g}")
     if isinstance(found, Charuco) and not 0 < found.marker < square:
         raise ValueError(f"{owner}: a marker must be smaller than its square; got {found.marker:g} in {square:g}")
     if isinstance(found, AprilGrid) and not 0 < found.spacing <= 2:
-        raise ValueError(f"{owner}: spacing is a part of a tag's side, above 0 and at most 2; got {found.spacing:g}")
+        raise ValueError(f"{owner}: spacing must be a part of a side, above 0 and at most 2; got {found.spacing:g}")
     if isinstance(found, AprilGrid) and found.border not in (1, 2, 3):
-        raise ValueError(f"{owner}: a tag's border is 1, 2 or 3 cells; got {found.border}")
+        raise ValueError(f"{owner}: a tag's border must be 1, 2 or 3 cells; got {found.border}")
     return found

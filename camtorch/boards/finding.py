@@ -28,7 +28,7 @@ _EITHER_WAY = 0.2065, 0.587, 0.2065  # of RGB or BGR: boards are black and white
 
 
 class BoardObservations(NamedTuple):
-    """What `find_board` found: a view for each image that shows the board."""
+    """The result of `find_board`: a view for each image that shows the board."""
 
     object_points: list[NDArray[np.float64]]
     """(N, 3) each: the board's points, in units of `square`."""
@@ -68,8 +68,8 @@ def find_board(images: Any, board: Any, *, square: float = 1.0, **options: Any) 
             of tags; see `camtorch calibrate --help`.
 
     Raises:
-        ValueError: no such board or option, no images, or no image that shows the board; with what to try.
-        TypeError: something that is no image. ImportError: there is no OpenCV.
+        ValueError: If there is no such board or option, there are no images, or no image shows the board.
+        TypeError: If an image is not an image. ImportError: If OpenCV is not installed.
     """
     opencv(_OWNER)
     wanted = as_board(board, as_number(square, "square", _OWNER), options, _OWNER)
@@ -87,7 +87,7 @@ def find_board(images: Any, board: Any, *, square: float = 1.0, **options: Any) 
 
 
 class ImageCorners(NamedTuple):
-    """What one image shows of a board."""
+    """The points of a board in one image."""
 
     path: Path
     image_size: tuple[int, int]  # (height, width)
@@ -159,7 +159,7 @@ def _given(images: Any) -> list[Image]:
     if not isinstance(images, Sequence):
         raise TypeError(f"{_OWNER}: images must be paths or arrays; got {shown(images)}")
     if not images:
-        raise ValueError(f"{_OWNER}: no images")
+        raise ValueError(f"{_OWNER}: images must not be empty; got no images")
     given: list[Image] = []
     for i, one in enumerate(images):
         if isinstance(one, (str, os.PathLike)):
@@ -186,7 +186,7 @@ def _grey_of(image: Any, weights: Sequence[float], name: str = "image") -> NDArr
         array = np.moveaxis(array, 0, -1)
     if array.dtype.kind == "f":
         if float(array.max()) > 1:
-            raise ValueError(f"{_OWNER}: {name} is of floating point, from 0 to 1; got up to {float(array.max()):g}")
+            raise ValueError(f"{_OWNER}: {name} must be 0 to 1 if floating point; got up to {float(array.max()):g}")
         array = np.rint(255 * array).astype(np.uint8)
     if array.dtype not in (np.uint8, np.uint16):
         raise ValueError(f"{_OWNER}: {name} must be uint8 or uint16; got {array.dtype}")

@@ -69,14 +69,14 @@ class Poses(NamedTuple):
 
 
 class Prior(NamedTuple):
-    """What is known of a camera's parameters p before it sees anything: root @ (p - centre) counts as residuals."""
+    """The prior knowledge of a camera's parameters p: root @ (p - centre) are added to the residuals."""
 
     centre: Tensor  # (P,)
     root: Tensor  # (R, P), in pixels
 
 
 class Sight(NamedTuple):
-    """What one camera sees, of B problems, V views and N points each; leading dims may be 1."""
+    """The observations of one camera for B problems, V views and N points each; leading dims may be 1."""
 
     model: type[Camera] | Camera  # the class, or a camera of it
     points: Tensor  # (B, V, N, 3) in the board's frame
@@ -91,7 +91,7 @@ class Sight(NamedTuple):
 
 
 class State(NamedTuple):
-    """What is looked for. A point of a board is at `mount(board(point))` for a camera."""
+    """The unknowns of a search. A point of a board is at `mount(board(point))` for a camera."""
 
     parameters: tuple[Tensor, ...]  # of each camera (B, 4 + n), fx, fy, cx, cy and the coefficients
     mounts: Poses  # of each camera, from the frame of the first one, whose own does nothing unless it learns
@@ -110,7 +110,7 @@ class State(NamedTuple):
 
 
 class Free(NamedTuple):
-    """What learns."""
+    """The unknowns that learn."""
 
     parameters: tuple[Tensor, ...]  # of each camera (4 + n,) bool
     mounts: tuple[bool, ...]  # of each camera
@@ -271,7 +271,7 @@ class Bundle:
         ends = [bounds(camera, p) for camera, p in zip(self.cameras, state.parameters, strict=True)]
         self.low = self._of_columns([low for low, _ in ends], -torch.inf)
         self.high = self._of_columns([high for _, high in ends], torch.inf)
-        # that of a focal length is for what goes wrong
+        # the bound of a focal length only catches failures
         self.is_bounded = any(c >= 0 and i >= 4 and self.cameras[c].fit_bounds for c, i in self.columns)
 
     def flat(self, state: State) -> tuple[Tensor, ...]:
@@ -310,7 +310,7 @@ class Bundle:
         if self.is_plain and len(state.bend):
             parameters = state.parameters[0][: 1 if self.are_shared[0] else None]
             native = CameraRows(type(self.cameras[0]), parameters[:, :4], parameters[:, 4:]).native
-            assert native is not None  # it was there for the first ones
+            assert native is not None  # the first cameras had it
             own = self.learnt[0][1].tolist()
             has_triangles = native.plan.places is not None or all(i < 4 for i in own)
             given = sight.points, state.boards, sight.pixels, sight.weights, (self.loss, self.loss_scale)
@@ -357,7 +357,7 @@ class Bundle:
         equations = self.equations(flat, rows)
         held = torch.zeros(len(rows), len(self.columns), dtype=torch.bool, device=flat[1].device)
         if self.is_bounded:
-            # what would leave its bounds stays there, so that the others can move on
+            # parameters that would leave their bounds stay there, so that the others can move on
             view, shared = equations.view[..., self.width :], equations.shared
             slope = (view[..., :-1] * view[..., -1:]).sum((1, 2)) + (shared[..., :-1] * shared[..., -1:]).sum(1)
             values, low, high = self._of_columns(flat[5:], 0.0), _of_rows(self.low, rows), _of_rows(self.high, rows)
@@ -474,7 +474,7 @@ def _kind(model: type[Camera] | Camera) -> type[Camera]:
 def _template(model: type[Camera] | Camera, parameters: Tensor) -> Camera:
     """Return a frozen camera of the model, a template for others with its number of coefficients."""
     made = fixed_camera(_kind(model).searched(), parameters[0, :4], parameters[0, 4:])
-    made._warned = True  # a step that is refused may have gone anywhere
+    made._warned = True  # a rejected step may have gone anywhere, and must not warn
     return made
 
 

@@ -67,7 +67,7 @@ def as_model(
     """Return which camera the arguments of `calibrate` ask for."""
     if isinstance(model, Camera):
         if start is not None:
-            raise ValueError(f"{owner}: model is a camera to start from already; got start={start!r} as well")
+            raise ValueError(f"{owner}: start must be left out if model is a camera; got start={start!r}")
         start, model = model, type_before_parametrizations(model)
     model = as_kind(model, owner)
     if start is not None:
@@ -82,7 +82,7 @@ def as_model(
                 f"{type(start).__name__} with batch_shape={tuple(start.batch_shape)}"
             )
         if count not in (None, start.distortion.shape[-1]):
-            raise ValueError(f"{owner}: count={count}, and the start has {start.distortion.shape[-1]} coefficients")
+            raise ValueError(f"{owner}: count must be that of the start, {start.distortion.shape[-1]}; got {count}")
         count = start.distortion.shape[-1]
     count = model.default_count if count is None else as_whole(count, "count", owner)
     names = model.names_of(count) if 0 <= count <= max(_MANY, model.default_count) else None
@@ -94,14 +94,14 @@ def as_model(
         raise TypeError(f'{owner}: fixed must be names of parameters, as ("cx", "cy"), or "all"; got {fixed!r}')
     fixed = (names if fixed == "all" else (fixed,)) if isinstance(fixed, str) else tuple(fixed)
     if start is not None and model.smoothness() is not None:
-        fixed = (*fixed, *INTRINSICS)  # a surface does what these do as well
+        fixed = (*fixed, *INTRINSICS)  # a surface can replace these
     if unknown := [name for name in fixed if not isinstance(name, str) or name not in names]:
         wrong = ", ".join(map(repr, unknown))
         raise ValueError(f"{owner}: fixed names {wrong}; {model.__name__} has {', '.join(names)}")
     if start is not None:
         fixed = *fixed, *frozen_names(start)
     if start is None and {"fx", "fy"} & set(fixed):
-        raise ValueError(f"{owner}: a focal length is held at its value of the start; give start=a camera")
+        raise ValueError(f"{owner}: start must be a camera if a focal length is fixed; got None")
     return Model(model, count, start, torch.tensor([name not in fixed for name in names], device="cpu"))
 
 
@@ -158,8 +158,8 @@ def calibrate(
         progress: called after each step of the final search with its number and the cost.
 
     Raises:
-        ValueError: bad arguments, each with what to do; a problem that has no one solution, as a single view of a plane
-            may be.
+        ValueError: If an argument is bad, or the problem has no unique solution, like a single view of a plane
+            may have.
     """
     owner = "calibrate"
     seen, layout = as_observations(object_points, image_points, image_size, owner)
@@ -197,7 +197,7 @@ class Search:
         kind, start = self.asked.kind, self.asked.start
         if start is None or (smooth := kind.smoothness()) is None:
             return
-        # where nothing is seen a surface goes on as the start does
+        # a surface keeps the start's shape if nothing is seen
         like = self.given.pixels
         core, coefficients = (t.detach().to(like).reshape(-1) for t in (start.intrinsics, start.distortion))
         axis = like.new_tensor([[0.0, 0.0, 1.0], [_BESIDE, 0.0, 1.0]])
@@ -274,7 +274,7 @@ class Search:
         ends = [(found.state.parameters[camera], found.cost, found.converged) for found in (others, adjusted)]
         best = others.cost.argmin()[None]
         variance = adjusted.cost / (2 * sum(int((sight.weights > 0).sum()) for sight in sights))
-        if bool(others.cost[best] < adjusted.cost - _AS_GOOD * variance):  # one as good is no reason to leave the first
+        if bool(others.cost[best] < adjusted.cost - _AS_GOOD * variance):  # an equal one does not replace the first
             adjusted = self.adjusted(sights, others.state.of(best), free, steps=STEPS)
         return adjusted, Optima(*map(torch.cat, zip(*ends, strict=True)))
 

@@ -23,7 +23,7 @@ _Views = struct.Struct("16qd5q").pack  # `Views`
 
 
 class Search(NamedTuple):
-    """How a pose is looked for: at most so many steps of Levenberg and Marquardt, until so little is left to gain."""
+    """Settings of a pose search: the most Levenberg-Marquardt steps, the gain at which it ends, and the loss."""
 
     steps: int
     settled: float
@@ -100,7 +100,7 @@ def solved(
 
 
 class Look(NamedTuple):
-    """What a camera makes of a state; see `Bundle.look`."""
+    """The residuals of a camera at a state; see `Bundle.look`."""
 
     residuals: Tensor  # (B, V, N, 2)
     valid: Tensor  # (B, V, N)

@@ -38,8 +38,8 @@ def fit(
 ) -> Conversion[Camera]:
     """Fit a camera of a model to rays at pixels, by least squares of the distances in px.
 
-    The rays may come from a network, from a table, from a lens designer's program; where they are not known, the weight
-    is 0, or they are NaN. How far the result is from them is said in `Conversion.rms` and `max_error`, in px.
+    The rays may come from a network, a table or a lens designer's program; give unknown rays a weight of 0, or NaN.
+    `Conversion.rms` and `max_error` are the distances of the result from them, in px.
 
     Args:
         model: a class of cameras, its key, or a camera to start from, whose frozen parameters stay.
@@ -55,9 +55,9 @@ def fit(
         The camera, float64, and how far it is from the rays: compared are the pixels of those that count.
 
     Raises:
-        ValueError: shapes that do not fit, fewer than four rays, rays and pixels that no lens looking along z makes;
-            unknown names, a focal length that is fixed without a start, a principal point without an image_size.
-        TypeError: no model, no numbers.
+        ValueError: If shapes do not fit, there are fewer than four rays, no lens looking along z makes these rays and
+            pixels, a name is unknown, a focal length is fixed without a start, or cx or cy without an image_size.
+        TypeError: If `model` is not a model, or values are not numeric.
     """
     owner = "fit"
     asked = as_model(model, count, None, fixed, owner)
@@ -74,7 +74,7 @@ def fit(
             f"{tuple(given_pixels.shape)} and rays {tuple(given_rays.shape)}"
         )
     batch = given_rays.shape[: given_rays.ndim - 1 - dims]
-    # rows of unit rays; what is not finite, or of no length, has no weight
+    # rows of unit rays; rays that are not finite, or have no length, get no weight
     shape = given_rays.shape[:-1]
     flat_rays = given_rays.reshape(math.prod(shape[:-dims]), math.prod(shape[-dims:]), 3)
     flat_pixels = given_pixels.expand(*shape, 2).reshape(*flat_rays.shape[:2], 2)
@@ -97,7 +97,7 @@ def fit(
     counts = seen.weights > 0
     if not counts.numel() or not bool((counts.sum(-1) >= _LEAST).all()):
         raise ValueError(
-            f"{owner}: a camera takes {_LEAST} rays at least that are finite; got {counts.sum(-1).tolist()} of rays "
+            f"{owner}: rays must have at least {_LEAST} finite ones a camera; got {counts.sum(-1).tolist()} of rays "
             f"{tuple(given_rays.shape)}"
         )
     lens = _unified(seen, owner)
@@ -153,7 +153,7 @@ def _unified(seen: fitting.Observations, owner: str) -> Camera:
         weights, depth = torch.where(inside, seen.weights, 0.0), torch.where(inside, depth, 1.0)
         across, down = (_line(w / depth, p, weights) for w, p in zip((x, y), seen.pixels.unbind(-1), strict=True))
         focal, centre = (torch.stack(pair, -1) for pair in zip(across[:2], down[:2], strict=True))
-        # what it does not see shall not make it better
+        # points that it does not see must not improve its score
         share = weights.square().sum(-1) / seen.weights.square().sum(-1)
         costs.append(torch.where((focal > 0).all(-1), across[2] + down[2], torch.inf) / share.square())
         lenses.append(torch.cat((focal, centre, torch.full_like(focal[:, :1], alpha)), -1))

@@ -151,7 +151,7 @@ def _observed(
         apart = ", ".join(repr(name) for name, is_linked in zip(names, linked, strict=True) if not is_linked)
         raise ValueError(
             f"{owner}: {apart} never sees a board in the same view as {names[0]!r}, nor as a "
-            "camera that does: where it is cannot be told; take views that both see, or calibrate it alone"
+            "camera that does, so its pose is unknown. Take views that both see, or calibrate it alone"
         )
     first: dict[bytes, int] = {}
     has: Array = np.any(sees, 0)
@@ -211,7 +211,7 @@ def _as_array(value: Any, size: int, name: str, owner: str) -> Array:
             raise type(error)(f"{owner}: {name} must be rows of {size} numbers; got {shown(value)}: {error}") from None
     values = as_values(value, name, owner, value.device if isinstance(value, Tensor) else torch.device("cpu"))
     if values.is_meta:
-        raise ValueError(f"{owner}: {name} is on the device meta, and has no values")
+        raise ValueError(f"{owner}: {name} must have values; got a tensor on the device meta")
     return values.detach().double().numpy(force=True)
 
 
@@ -240,7 +240,7 @@ def _check_corners(points: Array, pixels: Array, seen: Array, name: str, owner: 
     """Raise if corners determine no pose; points (V, N, 3) and pixels (V, N, 2) are NaN if padded."""
     number, corners = seen.sum(-1), np.where(seen[..., None], points, np.nan)
     if not number.any():
-        raise ValueError(f"{owner}: {name} is NaN everywhere: no view has a corner")
+        raise ValueError(f"{owner}: {name} must have seen corners; got NaN everywhere, no view has a corner")
     known = np.nan_to_num(corners, posinf=0.0, neginf=0.0)
     reach = np.abs(known).max((1, 2))
     known = known / np.where(reach > 0, reach, 1.0)[:, None, None]

@@ -43,7 +43,7 @@ class _Pose(NamedTuple):
 
 
 class Pose(_Pose):
-    """What `solve_pnp` returns; it unpacks into the first three."""
+    """The result of `solve_pnp`; it unpacks into the first three fields."""
 
     extrinsics: Extrinsics
     """Camera from object, batch *B."""
@@ -88,7 +88,7 @@ def solve_pnp(
 
     Pose and rms have first derivatives by pixels, points, weights and the camera's parameters, by the implicit function
     theorem at the optimum, whatever led there. All is computed in float64 and returned in the widest dtype that came
-    in. It looks at values: not for torch.compile and vmap, whose batch goes in as one.
+    in. It reads values, so it does not work in torch.compile or vmap; pass vmap's batch as a batch dim.
 
     Args:
         camera: with batch dims or without; all broadcast.
@@ -106,8 +106,8 @@ def solve_pnp(
         point or a parameter is not finite, or if no minimum was found that has all seen points in the camera's view.
 
     Raises:
-        TypeError: no camera, or no numbers. ValueError: shapes that do not fit, less than four points, negative
-            weights, a threshold that is not positive.
+        TypeError: If `camera` is not a camera or values are not numeric. ValueError: If shapes do not fit, there are
+            less than four points, a weight is negative, or the threshold is not positive.
     """
     if threshold is not None:
         threshold = as_number(threshold, "threshold", "solve_pnp")
@@ -193,7 +193,7 @@ class _Given(NamedTuple):
             hint = "Rows of fewer points are padded with NaN pixels"
             raise ValueError(f"{owner}: {shapes} are not the same number of points. {hint}")
         if count < _LEAST:
-            raise ValueError(f"{owner}: it takes {_LEAST} points at least; got {shapes}")
+            raise ValueError(f"{owner}: points must be at least {_LEAST}; got {shapes}")
         if given is not None:
             if given.shape[-1:] != (count,):
                 raise ValueError(f"{owner}: weights must be (*B, N) with N = {count}; got shape {tuple(given.shape)}")
@@ -261,7 +261,7 @@ class _Task(NamedTuple):
 
 def _consensus(task: _Task, threshold: float) -> tuple[Tensor, Tensor]:
     """Return the poses on which most points agree: rotations (B, 3, 3), translations (B, 3)."""
-    # where poses are only looked for, differences are derivatives
+    # finite differences are accurate enough to search for poses
     moves = _MOVE * torch.eye(4, 3, dtype=task.rays.dtype, device=task.rays.device)  # the last one: none
     pixels, seen = task.camera.project((task.rays[:, :, None] + moves).flatten(1, 2))
     pixels, seen = pixels.unflatten(1, (-1, 4)), seen.unflatten(1, (-1, 4)).all(-1)
@@ -325,7 +325,7 @@ def _searched(given: _Given, threshold: float | None) -> Solved:
 
 
 class _Found(NamedTuple):
-    """Minima."""
+    """Minima of a search, a row each."""
 
     costs: Tensor  # (B,), infinite where there is none
     rotations: Tensor  # (B, 3, 3)

@@ -44,7 +44,7 @@ def poses_from_rays(points: Tensor, rays: Tensor, weights: Tensor) -> RayPoses:
     """
     if can_search(points, rays, weights):
         return RayPoses(*from_rays(points, rays, weights))
-    # what is not finite, which a sum shows, has weight 0; what has no weight is zero
+    # points that are not finite, which a sum shows, get weight 0; points without weight are zero
     seen = torch.isfinite(points.sum(-1) + rays.sum(-1) + weights) & (weights > 0)
     points, rays = torch.where(seen[..., None], points, 0.0), torch.where(seen[..., None], rays, 0.0)
     weights = torch.where(seen, weights, 0.0)
@@ -150,7 +150,7 @@ class _Distances(NamedTuple):
         form = _moments(rays, local, weights).transpose(2, 3).reshape(-1, 9, 9)
         eye = torch.eye(3, dtype=rays.dtype, device=rays.device)
         weighted = weights[..., None] * rays
-        # rays that are all the same do not tell the distance
+        # rays that are all the same leave the distance open
         total = (weights.sum(-1)[:, None, None] + _LEAST) * eye - weighted.mT @ rays
         along = weighted.mT @ (rays[..., :, None] * local[..., None, :]).flatten(2)
         centre = (weights[..., None] * local).sum(-2)
@@ -233,7 +233,7 @@ def _rotations_in_space(local: Tensor, rays: Tensor, weights: Tensor, distances:
     def costs(rotations: Tensor) -> Tensor:
         return torch.where(distances.depths(rotations) > 0, distances.of_rotations(rotations), torch.inf)
 
-    # four points have up to four minima near each other, which two steps do not tell apart
+    # four points have up to four minima near each other, which two steps do not separate
     few = _STARTS if bool(((weights > 0).sum(-1) <= 4).any()) else _FEW
     for count, steps in ((_STARTS, 2), (few, _STEPS)):
         rotations = distances.descended(_taken(rotations, costs(rotations).argsort(-1)[:, :count]), steps)

@@ -25,7 +25,7 @@ from camtorch.values.threads import on_one_thread
 
 @dataclass(repr=False)
 class RigCalibration:
-    """What `calibrate_rig` found. Units are pixels, and for poses those of the object points."""
+    """The result of `calibrate_rig`. Units are pixels, and for poses those of the object points."""
 
     rig: Rig
     """The cameras, float64, and for each the extrinsics: camera from the first camera."""
@@ -129,7 +129,7 @@ def calibrate_rig(
         progress: called after each step of the last search with its number and the cost.
 
     Raises:
-        ValueError: what `calibrate` refuses; names that differ; cameras that no board links.
+        ValueError: If `calibrate` raises for an argument, names differ, or no board links a camera to the others.
     """
     owner = "calibrate_rig"
     observed = as_rig_observations(object_points, image_points, image_sizes, models, owner)

@@ -38,7 +38,7 @@ _MUCH_WORSE = 0.05  # the part that is a reason, however much views differ
 
 @dataclass
 class Trial:
-    """How a model, with a number of coefficients, fares."""
+    """The errors of a model with a number of coefficients."""
 
     model: str
     count: int
@@ -50,7 +50,7 @@ class Trial:
 
 @dataclass
 class Selection:
-    """Which model was taken of those that were tried, and why, in words."""
+    """The chosen model, all trials, and the reason in words."""
 
     trials: list[Trial]
     best: Trial

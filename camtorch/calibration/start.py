@@ -79,7 +79,7 @@ def start_from_nothing(
     lens = first = _unified(few, image_size, fixed)
     bounds = [model.fit_bounds.get(name, ()) for name in model.names_of(count) or ()]
     if bounds and all(ends is None for ends in bounds):
-        # what keeps the shape that it starts with takes that of a good lens
+        # a model that keeps its start's shape takes that of a good lens
         good = _fitted(lens, few, KannalaBrandt, 4, fixed)
         lens = _refined(good, few, _free(KannalaBrandt, 4, fixed), ("cauchy", lens.scale)).of(slice(1))
     lens = _fitted(lens, few, model, count, fixed)
@@ -123,7 +123,7 @@ def other_poses(found: Adjusted, observations: Observations, model: type[Camera]
     state = found.state
     lens = _Lens(model, state.parameters[0], state.boards, _LEAST_SCALE, image_size)
     errors = _lengths(found.residuals[0], found.valid[0], observations.seen)[0]
-    # views whose errors are greater than those of many others
+    # views with greater errors than many others are doubted
     rows = errors.nanmedian(-1).values.argsort(descending=True)[:_DOUBTED]
     boards = state.boards.of(rows, 1)
     lens = lens._replace(boards=boards, scale=max(_LEAST_SCALE, 2 * float(errors.nanmedian())))
@@ -330,7 +330,7 @@ def _errors(camera: Camera, boards: Poses, some: Observations) -> Tensor:
 
 def _lengths(residuals: Tensor, valid: Tensor, seen: Tensor) -> Tensor:
     """Return lengths (B, V, N) in px, NaN if a corner is unseen."""
-    # components lie in planes, along which a norm would be slow
+    # a norm along the last dim would be slow: components lie in planes
     return torch.where(seen, torch.where(valid, torch.hypot(*residuals.unbind(-1)), _NO_PIXEL), torch.nan)
 
 

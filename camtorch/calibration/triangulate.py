@@ -29,7 +29,7 @@ _LEAST, _TINY = 1e-15, 1e-300  # added to what is divided by
 
 
 class Triangulation(NamedTuple):
-    """What `triangulate` returns."""
+    """The result of `triangulate`."""
 
     points: Tensor
     """(*N, 3) in the world's frame."""
@@ -65,8 +65,8 @@ def triangulate(
         that are parallel or diverge.
 
     Raises:
-        TypeError: no cameras, extrinsics or numbers. ValueError: shapes and numbers that do not fit, cameras with
-            further batch dims, fewer than two.
+        TypeError: If cameras, extrinsics or pixels have a wrong type. ValueError: If shapes or numbers do not fit,
+            cameras have further batch dims, or there are fewer than two.
     """
     device = pixels.device if isinstance(pixels, Tensor) else torch.device("cpu")
     seen_at = as_tensor(pixels, "pixels", "triangulate", device)
@@ -80,7 +80,7 @@ def triangulate(
             f"{len(given)} cameras, {len(poses)} extrinsics and pixels {tuple(seen_at.shape)}"
         )
     if count < 2:
-        raise ValueError(f"triangulate: it takes two cameras at least; got {count}")
+        raise ValueError(f"triangulate: cameras must be at least two; got {count}")
     check_devices("triangulate", pixels=seen_at, **{f"extrinsics[{i}]": p.rotation for i, p in enumerate(poses)})
     dtype = working_dtype(seen_at, *(t for camera in given for t in camera._tensors), *(p.rotation for p in poses))
     rows = [rows_of(camera, torch.Size()) for camera in given]

@@ -78,7 +78,7 @@ def spread(adjusted: Adjusted, model: type[Camera], camera: int) -> Spread:
     view = equations.view
     corner, right = view[..., :6], view[..., 6:-1]
     diagonal = corner.diagonal(dim1=-2, dim2=-1).abs()
-    # a view in which too little is seen has no pose to go by
+    # a view with too few corners has no usable pose
     seen = (diagonal > torch.finfo(view.dtype).eps * diagonal.amax(-1, keepdim=True)).all(-1)
     eye = torch.eye(6, dtype=view.dtype, device=view.device)
     corner = torch.where(seen[..., None, None], corner, eye)

@@ -43,7 +43,7 @@ _NOISE = "one standard deviation in the worst direction"
 
 @dataclass(repr=False)
 class Calibration:
-    """What `calibrate` found, and how far it can be trusted.
+    """The result of `calibrate`, and its uncertainty.
 
     Units are pixels, and for poses those of the object points. The pose of a view is `extrinsics[i]`; views without a
     corner have none, nor have those that are equal to others, see `views`.
@@ -144,7 +144,7 @@ class Calibration:
         if not self.converged:
             return next(_search(survey)) + "."
         middle = survey.zones[4].uncertainty
-        # the noise does not tell what the model makes of rays that no corner was near
+        # the noise does not cover errors of the model at rays far from any corner
         fine, fine_share = survey.good_within(_FINE, survey.reach + _BEYOND)
         rough, rough_share = survey.good_within(_ROUGH)
         good = f"Not for measuring: projections are known to {_px(middle)} in the middle ({_NOISE})."

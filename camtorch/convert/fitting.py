@@ -25,7 +25,7 @@ _LOST = 0.1  # the error, in focal lengths, that a ray without a pixel counts as
 
 
 class Observations(NamedTuple):
-    """What a camera shall see: rays (C, N, 3), pixels (C, N, 2) and weights of the errors (C, N), 0 for no ray."""
+    """The target of a fit: rays (C, N, 3), pixels (C, N, 2) and weights of the errors (C, N), 0 for no ray."""
 
     rays: Tensor
     pixels: Tensor
@@ -180,7 +180,7 @@ class _Fit:
         slopes = torch.cat((slopes, by_k.transpose(1, 2) * parameters[:, None, :2, None]), 1)
         slopes = (slopes * observations.weights[:, None, None]).flatten(2)
         slope, values = (slopes @ residuals[..., None])[:, free, 0], parameters[:, free]
-        # what would leave its bounds stays there, so that the others can move on
+        # parameters that would leave their bounds stay there, so that the others can move on
         held = (values <= self.low[rows][:, free]) & (slope > 0) | (values >= self.high[rows][:, free]) & (slope < 0)
         triangle = torch.linalg.qr(padded(torch.cat((slopes[:, free], residuals[:, None]), 1).mT), mode="r").R
         none = triangle.new_zeros(len(rows), 0, 0, triangle.shape[-1])

@@ -56,7 +56,7 @@ def measure(target: CameraLike, k: Tensor, exact: Tensor, source: Reference) -> 
         return torch.linalg.vector_norm(pixels - rays.pixels, dim=-1), mapped
 
     def reached(rays: views.SampledRays) -> Tensor:
-        # what was out of the reach of the fit is no part of its result
+        # rays out of the fit's reach are no part of its result
         return to_sensor(target, k, rays.rays).covered | exact[:, None]
 
     rays, angles = source.rays, source.rays.angles

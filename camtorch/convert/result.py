@@ -1,4 +1,4 @@
-"""What a conversion gives: the camera of another model, and how that differs."""
+"""The result of a conversion: the camera of another model, and its differences."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a camera sees, on a lattice over its image or in all directions: what a conversion keeps to."""
+"""The rays of a camera on a lattice over its image or in all directions, which a conversion compares."""
 
 from __future__ import annotations
 

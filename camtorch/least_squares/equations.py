@@ -15,7 +15,7 @@ from camtorch.native.library import library
 class Equations(NamedTuple):
     """Triangles of the linearised problem; the unknowns are L numbers a view, and G that all views share.
 
-    A row of `view` says: view[:L] * step of the view + view[L:-1] * shared step = -view[-1]. `columns` are names of the
+    A row of `view` means view[:L] * step of the view + view[L:-1] * shared step = -view[-1]. `columns` are names of the
     shared unknowns: the camera (-1 for the board's bend) and the index of a parameter, 4 + n and on for its mount.
     """
 
@@ -41,7 +41,7 @@ class System:
     def __init__(self, equations: Equations, width: int, held: Tensor):
         self.width = width
         of_views, own = equations.view.square().sum((1, 2)), equations.shared[:, :-1].square().sum(-2)
-        # what the unknowns of the views do as well, as a turn about the axis of a panorama does, is left to them
+        # unknowns that the views' own unknowns can replace, like a turn about a panorama's axis, are held
         held = held | (own < _NOTHING * (own + of_views[:, width:]))[:, :-1]
         self.equations, self.decrement = equations, of_views[:, -1] + own[:, -1]
         if bool(held.any()):
@@ -115,7 +115,7 @@ class System:
         left, made = c_int64(0), (of_views, whole, rest := torch.empty_like(damping))
         sizes, places = (count, views, self.width, columns), [t.data_ptr() for t in (*given, *made)]
         compiled = library()
-        assert compiled is not None  # who calls has looked
+        assert compiled is not None  # the caller checked that there is a library
         compiled.camtorch_steps(_Steps(*places[:3], *sizes, *places[3:], addressof(left)))
         if left.value:
             raise MemoryError(f"no memory for {views} views")
@@ -137,7 +137,7 @@ def triangle_of_few(rows: Tensor) -> Tensor:
     scale = squares.diagonal(dim1=-2, dim2=-1)
     scale = torch.where(scale > 0, scale, 1.0).rsqrt()
     scaled = squares * scale[..., None] * scale[..., None, :]
-    # a view in which nothing is seen, or too little, stays where it is
+    # a view with no or too few points keeps its pose
     scaled = scaled + torch.diag_embed(torch.full_like(scale, 1e-14))
     lower, _ = torch.linalg.cholesky_ex(scaled)
     turned = torch.linalg.solve_triangular(lower, scale[..., None] * right, upper=False)

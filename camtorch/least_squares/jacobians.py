@@ -62,7 +62,7 @@ def sensor_jacobians(
     chart, _ = camera.optics(columns(k))
     # a table for each point would be dear: where the other direction is searched, derivatives go forward
     jacobians = (_forward if isinstance(chart, Inverted) else _backward)(camera, k, rays, furthest)
-    # where a derivative is no number, as at the end of a chart, a step goes without it
+    # a derivative that is not finite, as at the end of a chart, is left out of the step
     by_ray, by_k = (slopes.nan_to_num(0.0, 0.0, 0.0) for slopes in (jacobians.by_ray, jacobians.by_k))
     return SensorJacobians(jacobians.points, by_ray, by_k)
 
@@ -95,7 +95,7 @@ def _forward(camera: CameraLike | type[CameraLike], k: Tensor, rays: Tensor, fur
     directions = torch.eye(count, dtype=k.dtype, device=k.device)
     # under inference mode there would be no derivatives
     with torch.inference_mode(False), warnings.catch_warnings(), forward_ad.dual_level():
-        # on its first use forward mode loads what calls the deprecated torch.jit.script
+        # on its first use forward mode loads code that calls the deprecated torch.jit.script
         warnings.simplefilter("ignore", DeprecationWarning)
         along = directions[:, None, :3].expand(-1, rays.shape[1], -1).repeat(len(rays), 1, 1)
         dual_rays = forward_ad.make_dual(rays.repeat_interleave(count, 0), along)

@@ -18,7 +18,7 @@ _GOOD, _FAIR = 0.75, 0.25  # parts of what a step promised that were kept
 
 
 class Problem(Protocol):
-    """Sums of squares to be made small, B of them; rows (R,) says which of them are meant."""
+    """B sums of squares to minimise; rows (R,) selects some of them."""
 
     rounding: Tensor  # (B,) the sums of squares of what rounding does to the residuals, see `rounding_of`
 
@@ -36,7 +36,7 @@ class Problem(Protocol):
 
 
 class Minimum(NamedTuple):
-    """Where a search ended: the state, its cost (B,), and whether nothing is left to gain, bool (B,)."""
+    """The end of a search: the state, its cost (B,), and whether it converged, bool (B,)."""
 
     state: State
     cost: Tensor

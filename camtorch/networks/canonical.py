@@ -24,9 +24,9 @@ _LENGTHS = ("depth", "distance", "points", "tvec")
 
 
 class CanonicalCamera(SampleTransform):
-    """Samples as if by cameras of one focal length, so that a network learns metric depth from cameras of many.
+    """A transform of samples to one focal length, so that a network learns metric depth from many cameras.
 
-    How large a thing of known size is in an image tells how far away it is only once the focal length is known. With
+    The size of a known object in an image determines its distance only if the focal length is known. With
     s = `focal` / the focal length of the camera, either
 
     * the depth becomes s times as large, and the image stays (`scales="depth"`); with it all that is a length of the
@@ -53,11 +53,11 @@ class CanonicalCamera(SampleTransform):
         mode, padding_mode, fill, antialias, tolerance: of images, see `Warp`; antialias=None is on where they shrink.
         fields, mask_fill, valid_mask: see `Augmentation`.
 
-    A sample has the fields of an `Augmentation`. Beside them come `scale` (B,), s, and with "image" the new `camera`,
+    A sample has the fields of an `Augmentation`. The result also has `scale` (B,), s, and with "image" the new `camera`
     and `source_camera`.
 
     Raises:
-        ValueError: a focal length that is not positive, another word for `scales`, a size beside "depth".
+        ValueError: If the focal length is not positive, `scales` is another word, or a size is given with "depth".
     """
 
     focal: float
@@ -78,7 +78,7 @@ class CanonicalCamera(SampleTransform):
         if not isinstance(scales, str) or scales not in ("depth", "image"):
             raise ValueError(f'{self._name}: scales must be "depth" or "image"; got {shown(scales)}')
         if image_size is not None and scales == "depth":
-            raise ValueError(f"{self._name}: images keep their size where depth is scaled; got image_size={image_size}")
+            raise ValueError(f'{self._name}: image_size must be None with scales="depth"; got {image_size}')
         self.focal, self.scales = focal, scales
         self.image_size = as_image_size(image_size, self._name)
 
@@ -98,7 +98,7 @@ class CanonicalCamera(SampleTransform):
         """Make a sample canonical: a dict or keyword arguments, single or a batch.
 
         Raises:
-            ValueError: no camera, images that would come out in several sizes, depth in whole numbers; and as
+            ValueError: If there is no camera, images would get several sizes, or depth is in whole numbers; and as
                 `Augmentation`.
         """
         sample = self._given(sample, fields)
@@ -120,7 +120,7 @@ class CanonicalCamera(SampleTransform):
         The sample has the `camera` of the images; with "image" instead the `source_camera` as it came out.
 
         Raises:
-            ValueError: no such camera; and as `forward`.
+            ValueError: If there is no such camera; and as `forward`.
         """
         sample = self._given(sample, fields)
         sample.pop("scale", None)
@@ -128,7 +128,7 @@ class CanonicalCamera(SampleTransform):
             named, batched, count, camera = self._batch(sample, predicted=True)
             return self._scaled(sample, named, batched, 1 / self.scale(camera).expand(count))
         if (source := sample.pop("source_camera", None)) is None:
-            raise ValueError(f"{self._name}: to go back, the sample needs source_camera as it came out")
+            raise ValueError(f"{self._name}: inverse() needs source_camera as it came out of the forward call")
         source = as_one(source)
         change = self._change(source, len(source) if source.batch_shape else 1)
         target = change.target if source.batch_shape else alone(change.target)  # a batch dim would be the sample's
@@ -168,7 +168,7 @@ class CanonicalCamera(SampleTransform):
 
     def _resized(self, sample: Sample, named: Named, batched: bool, change: Change) -> Sample:
         moved = self._moved(sample, named, batched, change)
-        if "rotation" not in sample:  # nothing turns
+        if "rotation" not in sample:  # the sample is not rotated
             del moved["rotation"]
         return moved
 

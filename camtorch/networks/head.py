@@ -26,7 +26,7 @@ _NODES = 33
 class CameraHead(GeometryModule):
     """A layer from features (*B, features) to cameras (*B), each of which has a ray for every point of its image.
 
-    A linear layer makes numbers of the features, `names` says of what, and whatever they are the camera is valid:
+    A linear layer turns features into numbers, named by `names`, and the camera is valid for any numbers:
 
     * Focal length, on a scale of logarithms, and principal point go through q(x) = x / sqrt(1 + x^2) to their ranges.
     * The coefficients are k = given + d / sqrt(1 + g^2). Here d is made of the numbers so that each 1 moves the rim of
@@ -55,9 +55,9 @@ class CameraHead(GeometryModule):
             percent.
 
     Raises:
-        ValueError: fields of view that the lens does not reach, or not with the corners of the image, or that seem to
-            be radians; panoramas; unknown names, counts that the model does not take.
-        TypeError: no model, no pair of numbers.
+        ValueError: If the lens does not reach a field of view, or not with the corners of the image, or it seems to
+            be in radians; if the model is a panorama, a name is unknown, or the model does not take the count.
+        TypeError: If `model` is not a model, or `fov` is not a pair of numbers.
     """
 
     model: type[Camera]
@@ -91,13 +91,13 @@ class CameraHead(GeometryModule):
         features = as_whole(features, "features", owner, least=1)
         names = () if not isinstance(fixed, Collection) else (fixed,) if isinstance(fixed, str) else tuple(fixed)
         if any(isinstance(name, str) and name in ("fx", "fy", "all") for name in names):
-            raise ValueError(f"{owner}: a focal length is held by its field of view, fov=(90, 90); got fixed={fixed!r}")
+            raise ValueError(f"{owner}: fixed must not name fx, fy or all; got {fixed!r}. Use fov=(90, 90)")
         asked = as_model(model, count, None, fixed, owner)
         known = None if asked.start is None else asked.start.image_size
         if (size := as_image_size(image_size, owner) or known) is None:
-            raise ValueError(f"{owner}: a camera is valid for an image; give its image_size=(height, width)")
+            raise ValueError(f"{owner}: image_size must be given; got None. Pass image_size=(height, width)")
         if known not in (None, size):
-            raise ValueError(f"{owner}: the camera is of images of {known}; got image_size={size}")
+            raise ValueError(f"{owner}: image_size must be that of the camera, {known}; got {size}")
         centre, shared_focal = as_number(centre, "centre", owner), as_flag(shared_focal, "shared_focal", owner)
         if not 0 <= centre < 0.5:
             raise ValueError(f"{owner}: centre must be a part of the image, from 0 to below 0.5; got {centre!r}")
@@ -107,7 +107,7 @@ class CameraHead(GeometryModule):
         discs = torch.linspace(least, most, _NODES, dtype=torch.float64)
         scales = prior.scales(discs.exp())
         free = asked.free.tolist()
-        # what changes nothing, as the angles of a table, is nothing to learn
+        # numbers without effect, like the angles of a table, cannot be learnt
         self._coefficients = [i for i, moves in enumerate((scales > 0).all(0).tolist()) if moves and free[4 + i]]
         self._centres = [i for i in range(2) if free[2 + i] and centre > 0]
         self.names = (

@@ -72,7 +72,7 @@ class Limits:
         radii = BEYOND * self.disc(k, radius) * share.sin()
         chart, lens = self.model.optics(columns(k))
         angles = _angles(chart, radii)
-        # what turns back needs no table to tell
+        # a lens that turns back is excluded without a table
         room = FURTHEST - radii if isinstance(chart, Inverted) else chart.on_plane(radii, torch.zeros_like(radii))
         profile = {"room": torch.minimum(room, math.pi - angles)}
         if self.bends:

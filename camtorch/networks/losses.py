@@ -92,8 +92,8 @@ def rays(
         without a gradient where they are not valid, times the weights; and valid in the same shape.
 
     Raises:
-        ValueError: images of different sizes, or none, and no pixels; another reduction.
-        TypeError: no cameras.
+        ValueError: If images have different sizes or none, and there are no pixels; if the reduction is another one.
+        TypeError: If `predicted` or `target` is not a camera.
     """
     owner = "losses.rays"
     batch = _check(predicted, target, owner)
@@ -154,7 +154,7 @@ def reprojection(
         The mean distance over points that both see, or distances (*B, *N) and valid; see `rays`.
 
     Raises:
-        ValueError: pixels without points; and as `rays`. TypeError: no cameras.
+        ValueError: If there are pixels without points; and as `rays`. TypeError: If `predicted` is not a camera.
     """
     owner = "losses.reprojection"
     if isinstance(target, Camera):
@@ -167,7 +167,7 @@ def reprojection(
     else:
         _check(predicted, predicted, owner)
         if points is None:
-            raise ValueError(f"{owner}: pixels say nothing without the points (*B, *N, 3) that are seen there")
+            raise ValueError(f"{owner}: points must be given if target is pixels; got None. Pass points (*B, *N, 3)")
         pixels = as_values(target, "target", owner, predicted.intrinsics.device)
         seen = torch.isfinite(pixels).all(-1)
         pixels = torch.where(seen.unsqueeze(-1), pixels, 0.0)
@@ -179,7 +179,7 @@ def reprojection(
             f"{owner}: pixels {tuple(pixels.shape)} of target and {tuple(found.shape)} of the points do not fit "
             "together"
         ) from None
-    # of a point without a pixel the distance has no gradient
+    # a point without a pixel has a distance without a gradient
     return _reduced(torch.linalg.vector_norm(off, dim=-1), valid & seen, weights, reduction, owner)
 
 

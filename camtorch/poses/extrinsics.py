@@ -38,17 +38,17 @@ class Extrinsics(BatchedModule):
         translation: (*B, 3): the world's origin seen from the camera. The camera stands at `position` = -R^T t.
 
     Vectors may have OpenCV's shapes: columns (*B, 3, 1), an array (1, 3), a list of V such arrays as a batch of V. A
-    tensor (1, 3) is a batch of one. What has the shape of matrices is taken as matrices where they are rotations, or
-    the translation has one dim less; where three vectors (3, 3) beside three translations form a rotation matrix, that
-    is an error that says how to say it.
+    tensor (1, 3) is a batch of one. A value with the shape of matrices is taken as matrices if they are rotations, or
+    the translation has one dim less. Three vectors (3, 3) with three translations that form a rotation matrix raise an
+    error, which shows how to pass them.
 
     Plain values become new Parameters; a tensor that requires grad is kept as it is. Gradients are exact at
     zero rotation as well.
 
     Raises:
-        ValueError: another shape, plain rotation vectors of more than two turns, which seem to be degrees, matrices
-            that are no rotations, batch dims that do not fit, NaN or infinite values.
-        TypeError: values that are not numbers.
+        ValueError: If a shape is wrong, plain rotation vectors exceed two turns, which seem to be degrees, a matrix
+            is not a rotation, batch dims do not fit, or a value is NaN or infinite.
+        TypeError: If values are not numeric.
     """
 
     tensor_names: ClassVar[tuple[str, ...]] = ("rotation", "translation")
@@ -112,7 +112,7 @@ class Extrinsics(BatchedModule):
             translation: (*B, 3), or of OpenCV's shapes.
 
         Raises:
-            ValueError: another shape, a last row that is not (0, 0, 0, 1), an R that is not a rotation.
+            ValueError: If a shape is wrong, a last row is not (0, 0, 0, 1), or an R is not a rotation.
         """
         given: Any
         given, translation = _pair(matrix) if translation is None else (matrix, translation)
@@ -149,14 +149,14 @@ class Extrinsics(BatchedModule):
 
     def inverse(self) -> Extrinsics:
         """Return the inverse pose: world from camera."""
-        # what learnt may be of any length
+        # learnt rotation vectors may have any length
         rotation = -self.rotation.expand(*self.batch_shape, 3)
         return learning_as(remade(self, rotation=rotation, translation=self.position), self)
 
     def compose(self, other: Extrinsics) -> Extrinsics:
         """Return the pose that applies `other` first, then this one: `a.compose(b)(p) == a(b(p))`."""
         if not isinstance(other, Extrinsics):
-            raise TypeError(f"Extrinsics: compose takes Extrinsics; got {type(other).__name__}")
+            raise TypeError(f"Extrinsics: other must be Extrinsics; got {type(other).__name__}")
         check_devices("Extrinsics", this=self.rotation, other=other.rotation)
         as_batch("Extrinsics", this=(*self.batch_shape, 3), other=(*other.batch_shape, 3))
         mine, its = rotation_matrix(self.rotation), rotation_matrix(other.rotation)
@@ -193,7 +193,7 @@ def head_angles(pose: Extrinsics | Numbers) -> Tensor:
         pose: camera from head: Extrinsics, a `Pose` of `ct.solve_pnp`, or matrices (..., 4, 4) or (..., 3, 3).
 
     Raises:
-        TypeError: no numbers. ValueError: another shape, matrices that are no rotations.
+        TypeError: If `pose` is not numeric. ValueError: If the shape is wrong or a matrix is not a rotation.
     """
     pose = getattr(pose, "extrinsics", pose)
     if isinstance(pose, Extrinsics):
@@ -212,7 +212,7 @@ def head_angles(pose: Extrinsics | Numbers) -> Tensor:
     straight = cosine2 <= (8 * torch.finfo(matrix.dtype).eps) ** 2
     cosine = torch.where(straight, 1.0, cosine2).sqrt()
     pitch = torch.atan2(matrix[..., 1, 2], torch.where(straight, 0.0, cosine))
-    # of a vector that is short, the direction is that of another
+    # the direction of a short vector is inaccurate, so another vector is used
     over = torch.where(straight, -matrix[..., 2, 0], matrix[..., 0, 2])
     yaw = torch.atan2(over, torch.where(straight, matrix[..., 0, 0], matrix[..., 2, 2]))
     lean = torch.where(straight, 0.0, matrix[..., 1, 0])
@@ -224,7 +224,7 @@ def head_rotation(angles: Numbers) -> Tensor:
     """Return rotations (..., 3, 3), camera from head, for pitch, yaw and roll (..., 3) in radians: undo `head_angles`.
 
     Raises:
-        TypeError: no numbers. ValueError: another shape, plain angles of more than a turn, which are degrees.
+        TypeError: If `angles` is not numeric. ValueError: If the shape is wrong, or plain angles exceed a turn.
     """
     angles = as_coordinates(angles, "angles", 3, "head_rotation", means=", pitch, yaw and roll in radians")
     check_angles(angles, "head_rotation")

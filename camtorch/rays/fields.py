@@ -1,4 +1,4 @@
-"""What networks are told of a camera, pixel by pixel: lines in the world, local pinholes, latitude and up."""
+"""Fields of a camera for networks, pixel by pixel: lines in the world, local pinholes, latitude and up."""
 
 from __future__ import annotations
 
@@ -110,7 +110,7 @@ def _broadcast(batch: torch.Size, other: torch.Size, name: str, owner: str) -> t
         return broadcast_shapes(batch, other)
     except ValueError:
         raise ValueError(
-            f"{owner}: batch dims {tuple(other)} of {name} do not fit those of the camera, {tuple(batch)}"
+            f"{owner}: batch dims of {name} must broadcast against the camera's {tuple(batch)}; got {tuple(other)}"
         ) from None
 
 

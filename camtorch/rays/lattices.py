@@ -1,4 +1,4 @@
-"""How a camera is sampled: lattices of pixels, fans of rays; and what that tells: field of view, slopes at the axis."""
+"""Samples of a camera: lattices of pixels, fans of rays; and what follows: field of view, slopes at the axis."""
 
 from __future__ import annotations
 

@@ -20,7 +20,7 @@ def project_polyline(camera: CameraLike, points: Numbers, extrinsics: Extrinsics
     """Return the curves of edges in the image; see `Camera.project_polyline`."""
     owner = f"{type(camera).__name__}.project_polyline"
     if camera.batch_shape:
-        raise ValueError(f"{owner}: takes a single camera; got batch dims {tuple(camera.batch_shape)}: use camera[i]")
+        raise ValueError(f"{owner}: camera must be single; got batch dims {tuple(camera.batch_shape)}. Use camera[i]")
     points, _ = as_points(points, "points", 3, torch.Size(), camera._tensors, owner)
     if points.ndim not in (2, 3) or points.shape[-2] < 2:
         raise ValueError(

@@ -53,13 +53,13 @@ _LARGEST = 8  # times the longest side of a camera, a side that nobody asked for
 
 
 class Rectification(GeometryModule):
-    """Two warps into images whose rows correspond, or whose columns do: what `rectify` makes.
+    """Two warps into images whose rows, or columns, correspond: the result of `rectify`.
 
     `left` and `right` are `Warp`s; the call makes both images. Disparity is u_left - u_right in pixels, v_left -
     v_right where columns correspond. Both images have the same camera, turned the same way: its x axis (y axis, where
     columns correspond) lies along the baseline, and the right one stands at `baseline` on it.
 
-    Where the cameras or the extrinsics learn, the warps are made anew each time, and gradients reach them.
+    If the cameras or the extrinsics learn, each call makes the warps again, and gradients reach them.
     """
 
     def __init__(
@@ -144,7 +144,7 @@ class Rectification(GeometryModule):
             the disparity is finite and has the sign of the baseline. What is not valid is (0, 0, 0).
 
         Raises:
-            ValueError: another shape.
+            ValueError: If a shape is wrong.
         """
         owner, camera = "disparity_to_points", self.camera_left
         size = camera._size_for(owner)
@@ -226,10 +226,10 @@ class Rectification(GeometryModule):
         """Return R1, R2, P1, P2 and Q, as `cv2.stereoRectify` does, for a perspective pair without batch.
 
         Raises:
-            ValueError: another projection, or a batch.
+            ValueError: If the projection is another one, or there is a batch.
         """
         if self.projection != "perspective" or self.extrinsics.batch_shape or self.camera_left.batch_shape:
-            raise ValueError(f"Rectification.opencv: of one perspective pair alone; this is {self.projection}")
+            raise ValueError(f"Rectification.opencv: pair must be a single perspective one; got {self.projection}")
         fx, fy, cx, cy = self.camera_left.intrinsics.unbind(-1)
         baseline, focal, zero = self.baseline, (fx, fy)[self._axis], torch.zeros_like(fx)
         first = torch.nn.functional.pad(self.camera_left.K, (0, 1))
@@ -277,10 +277,10 @@ def rectify(
             between the cameras, as `cv2.stereoRectify` does.
 
     Raises:
-        ValueError: cameras at one place, or that look along the baseline or away from each other; images of more than
+        ValueError: If cameras are at one place, or look along the baseline or away from each other; images of more than
             eight times the longest side of a camera, where no image_size is given; a projection or alignment that
             does not exist, a fov out of range or up to 2 pi, as in radians, cameras without image_size.
-        TypeError: no cameras.
+        TypeError: If `left` or `right` is not a camera.
     """
     left, right = as_sized(left, "left", "rectify"), as_sized(right, "right", "rectify")
     one_of(projection, tuple(_KINDS), "projection", "rectify")
@@ -329,7 +329,7 @@ def _frame(extrinsics: Extrinsics, vertical: bool, align: Align) -> tuple[Tensor
     vector, translation = extrinsics.rotation.double(), extrinsics.translation.double()
     length = torch.linalg.vector_norm(translation, dim=-1)
     if known_false(length > 0):
-        raise ValueError(f"rectify: the cameras stand at one place; extrinsics.translation is {translation.tolist()}")
+        raise ValueError(f"rectify: extrinsics.translation must not be zero; got {translation.tolist()}")
     axis, rotation = int(vertical), rotation_matrix(vector)
     to_middle = rotation_matrix(vector / 2) if align == "opencv" else torch.eye(3).to(rotation)
     # of the right camera, from the left: in the frame of the left one, or in the middle of both

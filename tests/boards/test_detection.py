@@ -151,7 +151,7 @@ def test_points_are_row_by_row_as_opencv_has_them(board):
 @pytest.mark.parametrize(
     ("words", "options", "text"),
     [
-        ("2x6", {}, "at least 3x3 inner corners are needed; got 2x6"),
+        ("2x6", {}, "a board must have at least 3x3 inner corners; got 2x6"),
         ("9x6", {"square": float("nan")}, "must be positive"),
         ("9x6", {"spacing": 0.3}, "a chessboard takes no option; got spacing"),
         ("charuco 5x7", {"square": 0.02, "marker": 0.03}, "a marker must be smaller than its square"),
@@ -220,7 +220,7 @@ def test_one_image_in_any_form(form):
         (np.zeros((80, 80), np.uint8), "9by6", ValueError, "charuco 5x7"),
         (np.zeros((80, 80), np.uint8), "9x6", ValueError, "in none of 1 images: image 0: no board found"),
         (np.zeros((80, 80)), "9x6", ValueError, "in none of 1 images"),
-        (np.full((80, 80), 200.0), "9x6", ValueError, "from 0 to 1; got up to 200"),
+        (np.full((80, 80), 200.0), "9x6", ValueError, "0 to 1 if floating point; got up to 200"),
         (np.zeros((80, 80), np.int32), "9x6", ValueError, "uint8 or uint16"),
         ("nowhere/*.jpg", "9x6", ValueError, "no file has such a name"),
         ("nowhere.jpg", "9x6", ValueError, "no such file"),

@@ -280,7 +280,7 @@ BAD = [
     ((LENS, SIX, SIX), {}, "pixels must be"),
     ((LENS, SEEN, SEEN), {}, "object_points must be"),
     ((LENS, SIX, SEEN[:5]), {}, "not the same number"),
-    ((LENS, SIX[:3], SEEN[:3]), {}, "4 points at least"),
+    ((LENS, SIX[:3], SEEN[:3]), {}, "points must be at least 4"),
     ((LENS, SIX.expand(2, 6, 3), SEEN.expand(3, 6, 2)), {}, "do not fit"),
     ((LENS, [SIX, SIX[:5]], SEEN), {}, "one shape"),
     ((LENS, "points", SEEN), {}, "object_points must be"),

@@ -159,7 +159,7 @@ def test_derivatives_give_the_sigmas_of_drcal():
     [
         (lambda c, e, p: (c[:2], e, p), ValueError, "as many cameras as extrinsics"),
         (lambda c, e, p: (c, e, p[:2]), ValueError, "as many cameras as extrinsics"),
-        (lambda c, e, p: (c[:1], e[:1], p[:1]), ValueError, "two cameras at least"),
+        (lambda c, e, p: (c[:1], e[:1], p[:1]), ValueError, "cameras must be at least two; got 1"),
         (lambda c, e, p: (c, e, p[..., 0]), ValueError, "pixels must be"),
         (lambda c, e, p: (c, e, [p[0], p[1], p[2][:5]]), ValueError, "one shape"),
         (lambda c, e, p: (e, e, p), TypeError, "cameras must be Camera"),

@@ -151,7 +151,7 @@ WRONG = [
     (lambda: CAMERA.project_polyline([[0.0, 0, 1]]), ValueError, "two or more"),
     (lambda: CAMERA.project_polyline([[0.0, 1], [1, 1]]), ValueError, "3"),
     (lambda: CAMERA.project_polyline([[0.0, 0, 1], [NAN, 0, 1]]), ValueError, "finite"),
-    (lambda: PAIR.project_polyline([[0.0, 0, 1], [1, 0, 1]]), ValueError, "single camera"),
+    (lambda: PAIR.project_polyline([[0.0, 0, 1], [1, 0, 1]]), ValueError, "must be single; got batch dims"),
     (lambda: CAMERA.freeze("k1"), ValueError, "'k1' is no parameter; there are fx, fy, cx, cy"),
     (lambda: MIXED.freeze("k1"), TypeError, "Mixed"),
     (lambda: parametrized().freeze("fx"), TypeError, "parametrized"),
@@ -174,7 +174,7 @@ WRONG = [
     (lambda: ct.save(MIXED, "mixed.json"), TypeError, "camera must be of one model; got a Mixed. Save ct.Rig"),
     (lambda: MIXED.project(torch.rand(3, 5, 3)), ValueError, r"points must be .* with batch dims \*B = \(2,\)"),
     (lambda: ct.solve_pnp(MIXED, torch.rand(5, 12, 3), torch.rand(2, 12, 2)), ValueError, r"takes .* \(\) or \(2,\)"),
-    (lambda: MIXED.plucker(POSE(torch.rand(3, 3), torch.rand(3, 3))), ValueError, "of extrinsics do not fit those of"),
+    (lambda: MIXED.plucker(POSE(torch.rand(3, 3), torch.rand(3, 3))), ValueError, "of extrinsics must broadcast"),
     (lambda: CAMERA.plucker(EYE), TypeError, r"Extrinsics.from_matrix\(T\)"),
     (lambda: MIXED.perspective_field((0, 0, 0)), ValueError, "gravity must have a direction"),
     # poses
