@@ -75,7 +75,7 @@ class Prior(NamedTuple):
     root: Tensor  # (R, P), in pixels
 
 
-class Sight(NamedTuple):
+class CameraObservations(NamedTuple):
     """The observations of one camera for B problems, V views and N points each; leading dims may be 1."""
 
     model: type[Camera] | Camera  # the class, or a camera of it
@@ -84,10 +84,10 @@ class Sight(NamedTuple):
     weights: Tensor  # (B, V, N) of the squares, 0 for unseen, where the others are any finite numbers
     prior: Prior | None = None
 
-    def mapped(self, change: Callable[[Tensor], Tensor]) -> Sight:
-        """Return the sight with a change applied to all tensors of problems."""
+    def mapped(self, change: Callable[[Tensor], Tensor]) -> CameraObservations:
+        """Return the observations with a change applied to all tensors of problems."""
         points, pixels, weights = map(change, self[1:4])
-        return Sight(self.model, points, pixels, weights, self.prior)
+        return CameraObservations(self.model, points, pixels, weights, self.prior)
 
 
 class State(NamedTuple):
@@ -149,7 +149,7 @@ class Adjusted:
 
 @torch.no_grad()
 def adjust(
-    sights: Sequence[Sight],
+    observed: Sequence[CameraObservations],
     state: State,
     free: Free,
     *,
@@ -162,11 +162,11 @@ def adjust(
 ) -> Adjusted:
     """Return the state of least squares near a given one, for each of B problems, whose cameras see the same views.
 
-    A point that was seen and has no pixel counts as far away: no step is taken that loses points. On the way a lens may
-    go on behind its end, see `Camera.searched`; what lies there in the end is not valid. loss: see `robust`, in px.
+    A seen point without a pixel counts as far away, so no step loses points. During the search a lens may reach beyond
+    its end, see `Camera.model_for_search`; points that lie there at the end are not valid. loss: see `robust`, in px.
     """
-    problem = Bundle(sights, state, free, loss, loss_scale)
-    counts = torch.stack([(s.weights > 0).sum((-1, -2)) for s in problem.sights]).sum(0)
+    problem = Bundle(observed, state, free, loss, loss_scale)
+    counts = torch.stack([(s.weights > 0).sum((-1, -2)) for s in problem.observed]).sum(0)
     tolerance, tiny = settled / (2 * counts - problem.unknowns).clamp(min=1), _NOTHING**2 * counts
     flat = problem.flat(state)
     found = minimise(problem, flat, tolerance=tolerance, tiny=tiny, steps=steps, damping=damping, progress=progress)
@@ -193,15 +193,15 @@ def minima(
         start = poses.rotations[:, 0], poses.translations[:, 0]
         rotations, translations, cost = compiled_poses.refined(made[0][0], points, pixels, weights, start, search)
         return Poses(rotations[:, None], translations[:, None]), cost
-    sight = Sight(model, points[:, None], pixels[:, None], weights[:, None])
-    found = posed(sight, parameters, poses, loss=loss[0], loss_scale=loss[1], steps=steps)
+    observed = CameraObservations(model, points[:, None], pixels[:, None], weights[:, None])
+    found = posed(observed, parameters, poses, loss=loss[0], loss_scale=loss[1], steps=steps)
     return found.state.boards, found.cost
 
 
-def posed(sight: Sight, parameters: Tensor, poses: Poses, **options: Any) -> Adjusted:
+def posed(observed: CameraObservations, parameters: Tensor, poses: Poses, **options: Any) -> Adjusted:
     """Return the poses (K, 1) of least cost near the given ones, each a problem of its own, for a fixed camera."""
     free = Free((torch.zeros(parameters.shape[-1], dtype=torch.bool, device="cpu"),), (False,))
-    return adjust([sight], State.of_one(parameters, poses), free, **options)
+    return adjust([observed], State.of_one(parameters, poses), free, **options)
 
 
 def robust(loss: str | None, scale: float, squares: Tensor) -> tuple[Tensor, Tensor]:
@@ -235,13 +235,15 @@ def bent(points: Tensor, bend: Tensor) -> tuple[Tensor, Tensor]:
 class Bundle:
     """The problem, for `levenberg_marquardt.minimise`: its state is flat, with the batch in front of every tensor."""
 
-    def __init__(self, sights: Sequence[Sight], state: State, free: Free, loss: str | None, loss_scale: float):
+    def __init__(
+        self, observed: Sequence[CameraObservations], state: State, free: Free, loss: str | None, loss_scale: float
+    ):
         self.free, self.loss, self.loss_scale = free, loss, loss_scale
         self._last: tuple[tuple[Tensor, ...], list[compiled_poses.Look]] | None = None
         batch = state.boards.translations.shape[0]
-        self.sights = [s.mapped(lambda t: t.expand(batch, *t.shape[1:])) for s in sights]
-        self.cameras = [_template(s.model, p) for s, p in zip(sights, state.parameters, strict=True)]
-        self.rounding = torch.stack([rounding_of(s.pixels, s.weights) for s in self.sights]).sum(0)
+        self.observed = [s.mapped(lambda t: t.expand(batch, *t.shape[1:])) for s in observed]
+        self.cameras = [_template(s.model, p) for s, p in zip(observed, state.parameters, strict=True)]
+        self.rounding = torch.stack([rounding_of(s.pixels, s.weights) for s in self.observed]).sum(0)
         # a camera that does not learn, and is that of all problems, sees them in one row
         self.are_shared = [
             len(p) == 1 and not bool(f.any()) for p, f in zip(state.parameters, free.parameters, strict=True)
@@ -263,10 +265,10 @@ class Bundle:
             self.learnt.append((at, own))
         self.is_bent = free.bend or bool((state.bend != 0).any())
         # whether one camera sees flat boards that may be anywhere, which is what compiled code knows
-        plain = len(sights) == 1 and free.boards == "poses" and not (free.mounts[0] or self.is_bent)
-        self.is_plain = plain and compiled_of(self.cameras, self.sights[0].pixels) is not None
+        plain = len(observed) == 1 and free.boards == "poses" and not (free.mounts[0] or self.is_bent)
+        self.is_plain = plain and compiled_of(self.cameras, self.observed[0].pixels) is not None
         self.width = 6 if free.boards == "poses" else 3  # of the unknowns of a view
-        views = torch.stack([(s.weights > 0).any(-1).any(0) for s in self.sights]).any(0).sum()
+        views = torch.stack([(s.weights > 0).any(-1).any(0) for s in self.observed]).any(0).sum()
         self.unknowns = len(self.columns) + self.width * int(views)
         ends = [bounds(camera, p) for camera, p in zip(self.cameras, state.parameters, strict=True)]
         self.low = self._of_columns([low for low, _ in ends], -torch.inf)
@@ -290,9 +292,9 @@ class Bundle:
                 found[:, g] = parameters[c][:, i]
         return found
 
-    def points(self, c: int, state: State, sight: Sight) -> tuple[Tensor, Tensor, Tensor]:
+    def points(self, c: int, state: State, observed: CameraObservations) -> tuple[Tensor, Tensor, Tensor]:
         """Return points (B, V, N, 3) of the turned board, of the first camera's frame, and of this camera's frame."""
-        points = bent(sight.points, state.bend)[0] if self.is_bent else sight.points
+        points = bent(observed.points, state.bend)[0] if self.is_bent else observed.points
         turned = points @ state.boards.rotations.mT
         first = turned + state.boards.translations[:, :, None]
         if c == 0 and not self.free.mounts[0]:
@@ -306,51 +308,51 @@ class Bundle:
 
     def look(self, c: int, flat: Sequence[Tensor], rows: Tensor | None = None) -> compiled_poses.Look:
         """Return residuals, validity, weights and costs of a camera at a state."""
-        state, sight = self.state(flat), self.sight(c, rows)
+        state, observed = self.state(flat), self.observed_by(c, rows)
         if self.is_plain and len(state.bend):
             parameters = state.parameters[0][: 1 if self.are_shared[0] else None]
             native = CameraRows(type(self.cameras[0]), parameters[:, :4], parameters[:, 4:]).native
             assert native is not None  # the first cameras had it
             own = self.learnt[0][1].tolist()
             has_triangles = native.plan.places is not None or all(i < 4 for i in own)
-            given = sight.points, state.boards, sight.pixels, sight.weights, (self.loss, self.loss_scale)
+            given = observed.points, state.boards, observed.pixels, observed.weights, (self.loss, self.loss_scale)
             # the next step begins here, unless this one was in vain
             return compiled_poses.seen(native, *given, own if has_triangles else None)
-        pixels, valid = self.camera(c, state).project(self.points(c, state, sight)[-1])
-        residuals = torch.where((valid & (sight.weights > 0))[..., None], pixels - sight.pixels, 0.0)
+        pixels, valid = self.camera(c, state).project(self.points(c, state, observed)[-1])
+        residuals = torch.where((valid & (observed.weights > 0))[..., None], pixels - observed.pixels, 0.0)
         u, v = residuals.unbind(-1)
         cost, slope = robust(self.loss, self.loss_scale, u * u + v * v)
         lost, _ = robust(self.loss, self.loss_scale, cost.new_tensor(_LOST**2))
-        cost = (torch.where(valid, cost, lost) * sight.weights).sum(-1)
-        return compiled_poses.Look(residuals, valid, torch.where(valid, slope * sight.weights, 0.0), cost)
+        cost = (torch.where(valid, cost, lost) * observed.weights).sum(-1)
+        return compiled_poses.Look(residuals, valid, torch.where(valid, slope * observed.weights, 0.0), cost)
 
     def looks(self, flat: Sequence[Tensor], rows: Tensor) -> list[compiled_poses.Look]:
         """Return the looks of all cameras; those of the last state are reused if it is the same."""
         given, last = (rows, *flat), self._last
         if last is None or not all(a is b or torch.equal(a, b) for a, b in zip(given, last[0], strict=True)):
-            self._last = last = given, [self.look(c, flat, rows) for c in range(len(self.sights))]
+            self._last = last = given, [self.look(c, flat, rows) for c in range(len(self.observed))]
         return last[1]
 
     def shown(self, c: int, flat: Sequence[Tensor], look: compiled_poses.Look) -> Tensor:
         """Whether a camera has pixels for points, (B, V, N) bool, also after the search."""
-        kind = _kind(self.sights[c].model)
-        if kind.searched() is kind:
+        kind = _kind(self.observed[c].model)
+        if kind.model_for_search() is kind:
             return look.valid
         state = self.state(flat)
         searched = self.camera(c, state)
         camera = fixed_camera(kind, searched.intrinsics, searched.distortion)
         camera._warned = True
-        return look.valid & camera.project(self.points(c, state, self.sights[c])[-1])[1]
+        return look.valid & camera.project(self.points(c, state, self.observed[c])[-1])[1]
 
-    def sight(self, c: int, rows: Tensor | None) -> Sight:
-        sight = self.sights[c]
-        return sight if rows is None or len(rows) == len(sight.weights) else sight.mapped(lambda t: t[rows])
+    def observed_by(self, c: int, rows: Tensor | None) -> CameraObservations:
+        one = self.observed[c]
+        return one if rows is None or len(rows) == len(one.weights) else one.mapped(lambda t: t[rows])
 
     def cost(self, flat: Sequence[Tensor], rows: Tensor) -> Tensor:
         total = torch.cat([look.cost for look in self.looks(flat, rows)], -1).sum(-1)
-        for sight, parameters in zip(self.sights, flat[5:], strict=True):
-            if sight.prior:
-                total = total + ((parameters - sight.prior.centre) @ sight.prior.root.mT).square().sum(-1)
+        for one, parameters in zip(self.observed, flat[5:], strict=True):
+            if one.prior:
+                total = total + ((parameters - one.prior.centre) @ one.prior.root.mT).square().sum(-1)
         return total.nan_to_num(torch.inf, torch.inf)
 
     def linearised(self, flat: Sequence[Tensor], rows: Tensor) -> System:
@@ -370,7 +372,7 @@ class Bundle:
         looks, parts = self.looks(flat, rows), []
         if (made := looks[0].triangles) is not None:
             view, shared = made
-            if self.sights[0].prior:
+            if self.observed[0].prior:
                 whole = torch.cat((shared, *self._rows_of_priors(state)), -2)
                 shared = torch.linalg.qr(padded(whole), mode="r").R
             return Equations(view, shared, self.columns)
@@ -379,7 +381,7 @@ class Bundle:
             if total == 0:
                 parts.append(block)
                 continue
-            if len(self.sights) > 1:  # a triangle has less rows to spread over the columns of all cameras
+            if len(self.observed) > 1:  # a triangle has less rows to spread over the columns of all cameras
                 block = torch.linalg.qr(block, mode="r").R
                 whole = block.new_zeros(*block.shape[:-1], width + total + 1)
                 whole[..., [*range(width), *(width + g for g in at), width + total]] = block
@@ -396,9 +398,9 @@ class Bundle:
     def _rows_of_priors(self, state: State) -> list[Tensor]:
         """Return the rows (B, R, G + 1) of each prior."""
         found = []
-        for c, (sight, parameters) in enumerate(zip(self.sights, state.parameters, strict=True)):
-            if sight.prior:
-                centre, root = sight.prior
+        for c, (one, parameters) in enumerate(zip(self.observed, state.parameters, strict=True)):
+            if one.prior:
+                centre, root = one.prior
                 rows = root.new_zeros(len(parameters), len(root), len(self.columns) + 1)
                 for g, (camera, i) in enumerate(self.columns):
                     if camera == c and i < len(centre):
@@ -409,8 +411,8 @@ class Bundle:
 
     def rows_of(self, c: int, look: compiled_poses.Look, state: State, rows: Tensor) -> tuple[Tensor, list[int]]:
         """Return rows (B, V, 2 N, L + F + 1) of a camera, and the indices of its F columns among shared unknowns."""
-        sight = self.sight(c, rows)
-        turned, first, points = self.points(c, state, sight)
+        observed = self.observed_by(c, rows)
+        turned, first, points = self.points(c, state, observed)
         batch, views, count = points.shape[:3]
         lead = (1, batch * views * count) if self.are_shared[c] else (batch, views * count)
         at, own = (t.tolist() for t in self.learnt[c])
@@ -432,7 +434,7 @@ class Bundle:
         if self.free.bend:
             at += [g for g, (camera, _) in enumerate(self.columns) if camera == -1]
             along = by_first @ state.boards.rotations[:, :, None, :, 2:]
-            columns.append(along * bent(sight.points, state.bend)[1][..., None, :])
+            columns.append(along * bent(observed.points, state.bend)[1][..., None, :])
         columns.append(look.residuals[..., None])
         return (torch.cat(columns, -1) * look.weights.sqrt()[..., None, None]).flatten(2, 3), at
 
@@ -473,7 +475,7 @@ def _kind(model: type[Camera] | Camera) -> type[Camera]:
 
 def _template(model: type[Camera] | Camera, parameters: Tensor) -> Camera:
     """Return a frozen camera of the model, a template for others with its number of coefficients."""
-    made = fixed_camera(_kind(model).searched(), parameters[0, :4], parameters[0, 4:])
+    made = fixed_camera(_kind(model).model_for_search(), parameters[0, :4], parameters[0, 4:])
     made._warned = True  # a rejected step may have gone anywhere, and must not warn
     return made
 

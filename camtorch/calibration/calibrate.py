@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 from torch.nn.utils.parametrize import type_before_parametrizations
 
-from camtorch.calibration.bundle import LOSSES, Adjusted, Free, Poses, Prior, Sight, State, adjust
+from camtorch.calibration.bundle import LOSSES, Adjusted, CameraObservations, Free, Poses, Prior, State, adjust
 from camtorch.calibration.observations import Layout, Observations, Points, as_observations, repeats
 from camtorch.calibration.start import other_cameras, other_poses, poses_for, start_from_nothing
 from camtorch.calibration.uncertainty import noise_under, shared_factor, spread
@@ -163,10 +163,10 @@ def calibrate(
     """
     owner = "calibrate"
     seen, layout = as_observations(object_points, image_points, image_size, owner)
-    told = as_options(loss, loss_scale, bend, progress, owner)
+    on_progress = as_options(loss, loss_scale, bend, progress, owner)
     asked = as_model(model, count, start, fixed, owner)
     search = Search(owner, asked, seen, middle_of([seen]), layout, loss, loss_scale)
-    (result,) = results([search], search.alone(bend, told), search.free(bend)).cameras
+    (result,) = results([search], search.alone(bend, on_progress), search.free(bend)).cameras
     if not result.converged:
         ends = [] if bool(result.adjusted.converged[0]) else ["the search did not end at an optimum"]
         ends += [f"{lost} corners have no pixel in it: a surface has to reach further"] if (lost := result.lost) else []
@@ -217,10 +217,10 @@ class Search:
         return self.given._replace(points=points)
 
     @property
-    def sight(self) -> Sight:
+    def observed(self) -> CameraObservations:
         seen = self.seen
         weights = seen.seen[None].to(seen.pixels)
-        return Sight(self.asked.kind, seen.points[None], seen.pixels[None], weights, prior=self.prior)
+        return CameraObservations(self.asked.kind, seen.points[None], seen.pixels[None], weights, prior=self.prior)
 
     def free(self, bend: bool = False) -> Free:
         """Return the unknowns that learn if there is no other camera."""
@@ -231,7 +231,7 @@ class Search:
         asked, seen, size = self.asked, self.seen, self.layout.image_size
 
         def optimum(state: State) -> Adjusted:
-            return self.adjusted([self.sight], state, self.free(bend), steps=STEPS, progress=progress)
+            return self.adjusted([self.observed], state, self.free(bend), steps=STEPS, progress=progress)
 
         if asked.start is None and asked.kind.smoothness() is not None:
             raise ValueError(
@@ -255,11 +255,11 @@ class Search:
             adjusted = again
         return adjusted
 
-    def adjusted(self, sights: Sequence[Sight], state: State, free: Free, **options: Any) -> Adjusted:
-        return adjust(sights, state, free, loss=self.loss, loss_scale=self.loss_scale, **options)
+    def adjusted(self, observed: Sequence[CameraObservations], state: State, free: Free, **options: Any) -> Adjusted:
+        return adjust(observed, state, free, loss=self.loss, loss_scale=self.loss_scale, **options)
 
     def other_optima(
-        self, camera: int, sights: Sequence[Sight], adjusted: Adjusted, free: Free
+        self, camera: int, observed: Sequence[CameraObservations], adjusted: Adjusted, free: Free
     ) -> tuple[Adjusted, Optima | None]:
         """Return the optimum, or a better one in another basin of this model, and all (None if it has one basin)."""
         state = adjusted.state
@@ -270,12 +270,12 @@ class Search:
             return adjusted, None
         first = state.of(torch.zeros(len(starts), dtype=torch.long, device=starts.device))
         parameters = tuple(starts if c == camera else p for c, p in enumerate(first.parameters))
-        others = self.adjusted(sights, first._replace(parameters=parameters), free)
+        others = self.adjusted(observed, first._replace(parameters=parameters), free)
         ends = [(found.state.parameters[camera], found.cost, found.converged) for found in (others, adjusted)]
         best = others.cost.argmin()[None]
-        variance = adjusted.cost / (2 * sum(int((sight.weights > 0).sum()) for sight in sights))
+        variance = adjusted.cost / (2 * sum(int((one.weights > 0).sum()) for one in observed))
         if bool(others.cost[best] < adjusted.cost - _AS_GOOD * variance):  # an equal one does not replace the first
-            adjusted = self.adjusted(sights, others.state.of(best), free, steps=STEPS)
+            adjusted = self.adjusted(observed, others.state.of(best), free, steps=STEPS)
         return adjusted, Optima(*map(torch.cat, zip(*ends, strict=True)))
 
 
@@ -316,18 +316,18 @@ class Results(NamedTuple):
 
 def results(searches: Sequence[Search], adjusted: Adjusted, free: Free) -> Results:
     """Return the results of an optimum, or of a better one in another basin of a model."""
-    sights, optima = [search.sight for search in searches], []
+    observed, optima = [search.observed for search in searches], []
     for c, search in enumerate(searches):
-        adjusted, found = search.other_optima(c, sights, adjusted, free)
+        adjusted, found = search.other_optima(c, observed, adjusted, free)
         optima.append(found)
     spreads = [spread(adjusted, search.asked.kind, c) for c, search in enumerate(searches)]
     for c, search in enumerate(searches):
-        check_determined(adjusted, c, spreads[c], search.asked.names, sights[c], search.owner)
+        check_determined(adjusted, c, spreads[c], search.asked.names, observed[c], search.owner)
     given = [search.given for search in searches]
     seen = torch.cat([one.seen for one in given])
     residuals, valid = (torch.cat([t[0] for t in of_all]) for of_all in (adjusted.residuals, adjusted.valid))
     views = torch.stack([one.seen.any(-1) for one in given]).any(0)
-    parameters = unknowns(sights, adjusted, int(views.sum()))
+    parameters = unknowns(observed, adjusted, int(views.sum()))
     inliers, sigma, noise = noise_of(residuals, seen, valid, searches[0].loss, searches[0].loss_scale, parameters)
     again = repeats(given, [r[0] for r in adjusted.residuals])  # which widen uncertainty as if views were missing
     noise = noise * math.sqrt(len(views) / (len(views) - len(again)))
@@ -362,17 +362,17 @@ def results(searches: Sequence[Search], adjusted: Adjusted, free: Free) -> Resul
     return Results(adjusted, cameras, rms_of(residuals, seen), float(sigma), noise)
 
 
-def unknowns(sights: Sequence[Sight], adjusted: Adjusted, views: int) -> float:
+def unknowns(observed: Sequence[CameraObservations], adjusted: Adjusted, views: int) -> float:
     """Return the number of unknowns that residuals determine: parameters that learn, less the priors' part."""
     equations = adjusted.equations
-    told = 0.0
-    for c, sight in enumerate(sights):
-        if sight.prior:
-            count = len(sight.prior.centre)
+    by_priors = 0.0
+    for c, one in enumerate(observed):
+        if one.prior:
+            count = len(one.prior.centre)
             which = [(g, i) for g, (camera, i) in enumerate(equations.columns) if camera == c and i < count]
             rows, own = [g for g, _ in which], [i for _, i in which]
-            told += float((sight.prior.root[:, own] @ shared_factor(equations)[0, rows]).square().sum())
-    return len(equations.columns) + 6 * views - told
+            by_priors += float((one.prior.root[:, own] @ shared_factor(equations)[0, rows]).square().sum())
+    return len(equations.columns) + 6 * views - by_priors
 
 
 def rms_of(residuals: Tensor, seen: Tensor) -> float:

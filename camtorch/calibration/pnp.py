@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from camtorch.calibration.batches import as_tensor, as_vectors, attached, learns, root_of, rows_of
-from camtorch.calibration.bundle import Poses, Sight, posed
+from camtorch.calibration.bundle import CameraObservations, Poses, posed
 from camtorch.calibration.compiled import Search, Solved, solved
 from camtorch.calibration.ransac import consensus
 from camtorch.calibration.rays import poses_from_rays
@@ -338,8 +338,8 @@ def _minimum(task: _Task, rotations: Tensor, translations: Tensor, valid: Tensor
     camera = task.camera
     parameters = torch.cat(camera._tensors, -1).detach()
     parameters = parameters.view(-1, parameters.shape[-1])
-    sight = Sight(camera, task.points[:, None], task.pixels[:, None], task.weights[:, None])
-    found = posed(sight, parameters, Poses(rotations[:, None], translations[:, None]), steps=_SEARCH.steps)
+    observed = CameraObservations(camera, task.points[:, None], task.pixels[:, None], task.weights[:, None])
+    found = posed(observed, parameters, Poses(rotations[:, None], translations[:, None]), steps=_SEARCH.steps)
     fine = found.converged & valid & ((task.weights > 0).sum(-1) >= _LEAST)
     fine = fine & (found.valid[0][:, 0] | (task.weights == 0)).all(-1)
     (turned,), (moved,) = (t.unbind(1) for t in found.state.boards)

@@ -16,7 +16,7 @@ from camtorch.poses.rotations import small_turn
 from camtorch.values.threads import spread, thread_count
 
 LEAST = 4  # points that make a pose
-_TOLD = 6  # points that agree by chance too rarely to be looked for in vain
+_CONVINCING = 6  # points that agree by chance too rarely to be looked for in vain
 _FIRST, _NEXT = 512, 1024  # samples of the rounds
 _SURE = 10.0  # samples without an outlier, to be expected, that end the search
 # samples at most: of many points of which hardly any agree there would be no end; and without compiled code
@@ -97,7 +97,7 @@ def consensus(points: Tensor, rays: Tensor, slopes: Tensor, seen: Tensor, thresh
         else:
             search.round(rows, numbers.to(points.device))
         drawn += samples
-        share, few = agree[rows].clamp(min=_TOLD).to(costs), counts[rows].clamp(min=_TOLD).to(costs)
+        share, few = agree[rows].clamp(min=_CONVINCING).to(costs), counts[rows].clamp(min=_CONVINCING).to(costs)
         share = torch.stack([(share - i) / (few - i) for i in range(size)]).prod(0)
         most = _MOST_OF_FOUR if compiled is None else _MOST
         rows = rows[drawn * share < _SURE] if drawn < most else rows[:0]

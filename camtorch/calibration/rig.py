@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from camtorch.calibration.bundle import Bundle, Free, Poses, Sight, State
+from camtorch.calibration.bundle import Bundle, CameraObservations, Free, Poses, State
 from camtorch.calibration.calibrate import STEPS, Search, as_model, as_options, middle_of, results
 from camtorch.calibration.observations import Points, as_rig_observations
 from camtorch.calibration.uncertainty import shared_factor
@@ -132,29 +132,29 @@ def calibrate_rig(
         ValueError: If `calibrate` raises for an argument, names differ, or no board links a camera to the others.
     """
     owner = "calibrate_rig"
-    observed = as_rig_observations(object_points, image_points, image_sizes, models, owner)
-    told = as_options(loss, loss_scale, bend, progress, owner)
+    by_name = as_rig_observations(object_points, image_points, image_sizes, models, owner)
+    on_progress = as_options(loss, loss_scale, bend, progress, owner)
     for given in (count, start, fixed):
-        stray = [name for name in given if name not in observed] if isinstance(given, Mapping) else []
+        stray = [name for name in given if name not in by_name] if isinstance(given, Mapping) else []
         if stray:
             unknown = ", ".join(map(repr, stray))
-            raise ValueError(f"{owner}: no camera is called {unknown}; there are {', '.join(observed)}")
-    middle, searches = middle_of([seen for seen, _ in observed.values()]), []
-    for name, (seen, layout) in observed.items():
+            raise ValueError(f"{owner}: no camera is called {unknown}; there are {', '.join(by_name)}")
+    middle, searches = middle_of([seen for seen, _ in by_name.values()]), []
+    for name, (seen, layout) in by_name.items():
         of = f"{owner}: {name}"
         asked = as_model(models[name], _of(count, name, None), _of(start, name, None), _of(fixed, name, ()), of)
         searches.append(Search(of, asked, seen, middle, layout, loss, loss_scale))
-    sights = [search.sight for search in searches]
+    observed = [search.observed for search in searches]
     learns = tuple(parameters for search in searches for parameters in search.free().parameters)
     free = Free(learns, tuple(c > 0 for c in range(len(searches))), bend=bend)
-    first = _joined(sights, [_alone(search) for search in searches], free)
-    adjusted = searches[0].adjusted(sights, first, free, steps=STEPS, progress=told)
+    first = _joined(observed, [_alone(search) for search in searches], free)
+    adjusted = searches[0].adjusted(observed, first, free, steps=STEPS, progress=on_progress)
     found = results(searches, adjusted, free)
-    cameras, state = dict(zip(observed, found.cameras, strict=True)), found.adjusted.state
+    cameras, state = dict(zip(by_name, found.cameras, strict=True)), found.adjusted.state
     rotations, translations = (t[0] for t in state.boards)
-    posed = zip(observed, *(t[0] for t in state.mounts), strict=True)
+    posed = zip(by_name, *(t[0] for t in state.mounts), strict=True)
     mounts = {name: Extrinsics(rotation_vector(r).unsqueeze(-1), t) for name, r, t in posed}
-    names = list(observed)
+    names = list(by_name)
     std = torch.linalg.vector_norm(shared_factor(found.adjusted.equations)[0] * found.noise, dim=-1)
     stds = {name: std.new_zeros(6) for name in names}
     for value, (camera, i) in zip(std, found.adjusted.equations.columns, strict=True):
@@ -200,7 +200,7 @@ def _alone(search: Search) -> _Alone:
     return _Alone(state.parameters[0], boards, has_pose)
 
 
-def _joined(sights: list[Sight], alone: list[_Alone], free: Free) -> State:
+def _joined(observed: list[CameraObservations], alone: list[_Alone], free: Free) -> State:
     """Return the start: mounts by pairs that see the same boards, boards by the camera that sees each best."""
     mounts = Poses.none(1, len(alone), alone[0].parameters)
     turns, shifts = mounts.rotations[0], mounts.translations[0]
@@ -219,9 +219,9 @@ def _joined(sights: list[Sight], alone: list[_Alone], free: Free) -> State:
     for c, one in enumerate(alone):
         own = Poses(turns[c].mT @ one.boards.rotations, (one.boards.translations - shifts[c]) @ turns[c])
         state = State(parameters, mounts, own, own.translations.new_zeros(1, 2))
-        bundle = Bundle(sights, state, free, "cauchy", 1.0)
+        bundle = Bundle(observed, state, free, "cauchy", 1.0)
         flat = bundle.flat(state)
-        cost = torch.stack([bundle.look(k, flat).cost[0] for k in range(len(sights))]).sum(0)
+        cost = torch.stack([bundle.look(k, flat).cost[0] for k in range(len(observed))]).sum(0)
         better = one.has_pose & (cost < least)
         least = torch.where(better, cost, least)
         boards = Poses.where(better, own, boards)

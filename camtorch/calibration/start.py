@@ -9,7 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from camtorch.calibration.bundle import SETTLED, Adjusted, Free, Poses, Sight, State, adjust, minima
+from camtorch.calibration.bundle import SETTLED, Adjusted, CameraObservations, Free, Poses, State, adjust, minima
 from camtorch.calibration.observations import Observations
 from camtorch.calibration.rays import poses_from_rays
 from camtorch.cameras.camera import Camera
@@ -75,7 +75,7 @@ def start_from_nothing(
     from several starts, with the loss of Cauchy. Parameters that are `fixed` are held: coefficients as in
     `Camera.ideal`, the principal point in the middle. The loss, in px, decides between cameras nearly as good.
     """
-    few, free = _few(observations, image_size), _free(model, count, fixed)
+    few, free = _subsample(observations, image_size), _free(model, count, fixed)
     lens = first = _unified(few, image_size, fixed)
     bounds = [model.fit_bounds.get(name, ()) for name in model.names_of(count) or ()]
     if bounds and all(ends is None for ends in bounds):
@@ -100,8 +100,8 @@ def start_from_nothing(
     if len(lens.parameters) == 1:
         return state
     lens = lens._replace(boards=state.boards.expand(len(lens.parameters)))
-    sights = [_sight(model, observations)]
-    found = adjust(sights, lens.state, free, loss=loss, loss_scale=loss_scale, steps=_MANY_STEPS)
+    observed = [_as_seen(model, observations)]
+    found = adjust(observed, lens.state, free, loss=loss, loss_scale=loss_scale, steps=_MANY_STEPS)
     return found.state.of(found.cost.argmin()[None])
 
 
@@ -192,8 +192,8 @@ class _Lens(NamedTuple):
         """Adjust the cameras, the best first, and drop those whose cost is above `worst` times the least."""
         name, scale = loss or ("cauchy", self.scale)
         settled = _NEARLY if loss is None else SETTLED
-        sight = _sight(self.model, few)
-        found = adjust([sight], self.state, free, loss=name, loss_scale=scale, steps=steps, settled=settled)
+        observed = _as_seen(self.model, few)
+        found = adjust([observed], self.state, free, loss=name, loss_scale=scale, steps=steps, settled=settled)
         cost, rows = found.cost.sort()
         near = cost <= worst * cost[0]
         near[1:] &= cost.diff() > _SAME * cost[:-1]
@@ -204,9 +204,9 @@ class _Lens(NamedTuple):
         return self._replace(parameters=found.state.parameters[0], boards=found.state.boards, scale=scale).of(rows)
 
 
-def _sight(model: type[Camera], observations: Observations) -> Sight:
+def _as_seen(model: type[Camera], observations: Observations) -> CameraObservations:
     points, pixels, seen = observations
-    return Sight(model, points[None], pixels[None], seen[None].to(pixels.dtype))
+    return CameraObservations(model, points[None], pixels[None], seen[None].to(pixels.dtype))
 
 
 def _free(model: type[Camera], count: int, fixed: Collection[str]) -> Free:
@@ -216,7 +216,7 @@ def _free(model: type[Camera], count: int, fixed: Collection[str]) -> Free:
     return Free((torch.tensor(learns, device="cpu"),), (False,))
 
 
-def _few(observations: Observations, image_size: tuple[int, int]) -> Observations:
+def _subsample(observations: Observations, image_size: tuple[int, int]) -> Observations:
     """Select the views with the most corners, and enough corners, evenly from the image's middle outwards."""
     if len(observations.seen) > _VIEWS:
         observations = observations.of(observations.seen.sum(-1).argsort(descending=True)[:_VIEWS].sort().values)

@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from camtorch.calibration.batches import as_tensor, attached, learns, root_of, rows_of
-from camtorch.calibration.bundle import Bundle, Free, Poses, Sight, State
+from camtorch.calibration.bundle import Bundle, CameraObservations, Free, Poses, State
 from camtorch.cameras.camera import Camera
 from camtorch.least_squares.levenberg_marquardt import minimise
 from camtorch.poses.extrinsics import Extrinsics
@@ -165,9 +165,9 @@ def _solved(task: _Task, rays: Tensor) -> tuple[Tensor, Tensor]:
         start.new_zeros(count, 2),
     )
     seen_by = zip(task.cameras, pixels[..., None, None, :], seen[..., None, None], strict=True)
-    sights = [Sight(camera, start.new_zeros(count, 1, 1, 3), *of_camera) for camera, *of_camera in seen_by]
+    observed = [CameraObservations(camera, start.new_zeros(count, 1, 1, 3), *rest) for camera, *rest in seen_by]
     held = tuple(torch.zeros(p.shape[-1], dtype=torch.bool, device=p.device) for p in parameters)
-    problem = Bundle(sights, state, Free(held, (False,) * len(sights), "positions"), None, 1.0)
+    problem = Bundle(observed, state, Free(held, (False,) * len(observed), "positions"), None, 1.0)
     flat, tolerance, tiny = problem.flat(state), _SETTLED / (2 * views - 3).clamp(min=1), _NOTHING**2 * views
     found = minimise(problem, flat, tolerance=tolerance, tiny=tiny, going=views >= 2, steps=_STEPS, damping=_DAMPING)
     system = problem.linearised(found.state, torch.arange(count, device=start.device))
@@ -176,7 +176,7 @@ def _solved(task: _Task, rays: Tensor) -> tuple[Tensor, Tensor]:
     valid = found.converged & (views >= 2) & _is_ahead(points, positions, rays, task.seen)
     valid &= step[:, 0].norm(dim=-1) <= _FLEEING * (points - middle).norm(dim=-1)
     valid &= torch.isfinite(points).all(-1)
-    for c in range(len(sights)):
+    for c in range(len(observed)):
         valid &= problem.look(c, found.state).valid[:, 0, 0] | ~task.seen[c]
     return torch.where(torch.isfinite(points), points, 0.0), valid
 

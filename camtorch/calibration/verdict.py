@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from camtorch.calibration.bundle import Adjusted, Sight, pixel_jacobians
+from camtorch.calibration.bundle import Adjusted, CameraObservations, pixel_jacobians
 from camtorch.calibration.observations import Observations, named
 from camtorch.calibration.uncertainty import Spread, uncertainty, worst
 from camtorch.cameras.camera import Camera
@@ -402,7 +402,7 @@ def _over_image(survey: _Survey) -> Iterator[str]:
 
 @torch.inference_mode()
 def check_determined(
-    adjusted: Adjusted, camera: int, found: Spread, names: Sequence[str], sight: Sight, owner: str
+    adjusted: Adjusted, camera: int, found: Spread, names: Sequence[str], observed: CameraObservations, owner: str
 ) -> None:
     """Raise a ValueError if the views do not determine a camera, as with boards that are all parallel.
 
@@ -410,12 +410,12 @@ def check_determined(
     fiftieth of the extent of the corners. Views that no camera fits get warnings instead. found: of noise of 1 px.
     """
     found = found.scaled(adjusted.cost.new_full((1,), _USUAL_NOISE))
-    seen = sight.weights[0] > 0
+    seen = observed.weights[0] > 0
     views = int(seen.any(-1).sum())
     misfit = torch.linalg.vector_norm(adjusted.residuals[camera][0], dim=-1)[seen].median()
     if views > 1 and float(misfit) > _MISFIT:
         return
-    pixels = sight.pixels[0][seen]
+    pixels = observed.pixels[0][seen]
     pixels = pixels[:: max(1, len(pixels) // 512)][None]
     sizes = worst(found.of_pixels(pixels, torch.full_like(pixels[..., 0], torch.inf)))[0]
     sizes = sizes[~sizes.isnan()]

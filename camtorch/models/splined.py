@@ -120,8 +120,8 @@ class Splined(Camera):
         return torch.cat([part.flatten(0, 2) for part in parts])
 
     @classmethod
-    def searched(cls) -> type[Camera]:
-        return _searched(cls)  # type: ignore[arg-type]  # a class can be hashed
+    def model_for_search(cls) -> type[Camera]:
+        return _model_for_search(cls)  # type: ignore[arg-type]  # a class can be hashed
 
     def extra_repr(self) -> str:
         """Return the fields with the grid instead of its control points."""
@@ -150,7 +150,7 @@ def _optics_of(
 
 
 @cache
-def _searched(kind: type[Splined]) -> type[Splined]:
+def _model_for_search(kind: type[Splined]) -> type[Splined]:
     """Return the class for a search, with longer outermost pieces: otherwise corners on the edge would hold it."""
     optics = _optics_of(kind.order, kind.columns, kind.rows, kind.fov_x, behind=1.0)
     named = {"__module__": Camera.__module__, "__qualname__": f"{kind.key}:searched", "__doc__": kind.__doc__}

@@ -96,8 +96,8 @@ class ModelSpec:
         return None
 
     @classmethod
-    def searched(cls) -> type[Any]:
-        """The model while its cameras are looked for: pixels may go on a little behind where its own end."""
+    def model_for_search(cls) -> type[Any]:
+        """Return the model used while a fit searches: its pixels may reach a little beyond the model's own."""
         return cls
 
     @classmethod

@@ -7,7 +7,7 @@ import torch
 from boards import seen_by
 
 import camtorch as ct
-from camtorch.calibration.bundle import Free, Poses, Sight, State, adjust, pixel_jacobians
+from camtorch.calibration.bundle import CameraObservations, Free, Poses, State, adjust, pixel_jacobians
 from camtorch.calibration.uncertainty import noise_under, spread, uncertainty
 from camtorch.poses.rotations import rotation_matrix
 
@@ -47,12 +47,12 @@ class Problem:
         learns = tuple(torch.tensor([name not in fixed for name in of_one]) for of_one in names)
         return Free(learns, tuple(i > 0 for i in range(len(self.cameras))), **more)
 
-    def sights(self, batch=1, noise=NOISE):
-        draw, sights = torch.Generator().manual_seed(0), []
+    def observed(self, batch=1, noise=NOISE):
+        draw, observed, shape = torch.Generator().manual_seed(0), [], (1, *self.seen[0].shape, 3)
         for camera, pixels, seen in zip(self.cameras, self.pixels, self.seen, strict=True):
             noisy = pixels + noise * torch.randn(batch, *pixels.shape, generator=draw, **F64)
-            sights.append(Sight(type(camera), self.points.expand(1, *seen.shape, 3), noisy, seen[None].double()))
-        return sights
+            observed.append(CameraObservations(type(camera), self.points.expand(shape), noisy, seen[None].double()))
+        return observed
 
 
 def test_of_a_rig_is_that_of_mrcal_by_brute_force():
@@ -64,7 +64,7 @@ def test_of_a_rig_is_that_of_mrcal_by_brute_force():
     problem = Problem(LENS, LENS, mounts=mounts, views=6)
     free = problem.free("k4", bend=True)
     state = problem.state()
-    adjusted = adjust(problem.sights(noise=0.0), state, free, steps=0)
+    adjusted = adjust(problem.observed(noise=0.0), state, free, steps=0)
     views, held = 6, [8 * c + i for c in range(2) for i in range(8) if i == 7]
 
     def moved(x):
@@ -118,12 +118,12 @@ def robustly(loss, scale, share, batch):
     """Refits with a share of gross errors: errors, and standard deviations by the noise that the loss leaves."""
     problem = Problem(LENS, views=24)
     free = problem.free()
-    (sight,) = problem.sights(batch)
+    (observed,) = problem.observed(batch)
     generator = torch.Generator().manual_seed(7)
-    bad = torch.rand(sight.pixels.shape[:-1], generator=generator) < share
-    push = 40 * (torch.rand(sight.pixels.shape, generator=generator, **F64) - 0.5)
-    sight = sight._replace(pixels=sight.pixels + bad[..., None] * push)
-    adjusted = adjust([sight], problem.state(batch), free, loss=loss, loss_scale=scale, steps=200)
+    bad = torch.rand(observed.pixels.shape[:-1], generator=generator) < share
+    push = 40 * (torch.rand(observed.pixels.shape, generator=generator, **F64) - 0.5)
+    observed = observed._replace(pixels=observed.pixels + bad[..., None] * push)
+    adjusted = adjust([observed], problem.state(batch), free, loss=loss, loss_scale=scale, steps=200)
     assert bool(adjusted.converged.all())
     unknowns = len(free.parameters[0]) + 6 * 24
     noise = noise_under(loss, scale, adjusted.residuals[0], problem.seen[0][None], unknowns)
@@ -152,8 +152,8 @@ def test_projections_are_known_where_parameters_are_not():
     camera = ct.Cylindrical(torch.tensor([120.0, 120, 320, 240], **F64), image_size=(480, 640))
     problem = Problem(camera)
     noise = torch.tensor([NOISE], **F64)
-    sights, state = problem.sights(noise=0.0), problem.state()
-    ends = (adjust(sights, state, problem.free(*names), steps=0) for names in ((), ("cx",)))
+    observed, state = problem.observed(noise=0.0), problem.state()
+    ends = (adjust(observed, state, problem.free(*names), steps=0) for names in ((), ("cx",)))
     loose, held = (spread(end, type(camera), 0).scaled(noise) for end in ends)
     assert loose.std[0, 2] > 1e6 * loose.std[0, 0]
     for distance in (0.4, math.inf):
