@@ -1,4 +1,4 @@
-"""The door: which way a call takes. Natively on a CPU where nothing is recorded, else as torch records the formula."""
+"""The way of a call: by compiled code on a CPU if nothing is recorded, else by the formula, which torch records."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from torch.autograd import forward_ad
 from torch.utils._python_dispatch import _disable_current_modes
 
 FAKE_MODE = torch._C._TorchDispatchModeKey.FAKE
-"""The key of a FakeTensorMode among the modes that are under way."""
+"""The key of a FakeTensorMode among the active modes."""
 
 _DENSE = torch._C._dispatch_keys(torch.empty(0, device="cpu"))
 _PLAIN: int = _DENSE.raw_repr()
@@ -25,8 +25,8 @@ def has_tangent(tensor: Tensor) -> bool:
 
 
 def in_transform() -> bool:
-    """Whether a transform of torch.func is under way."""
-    # for dynamo what comes out is an object, and "is not None" of any object true
+    """Whether a transform of torch.func is active."""
+    # dynamo takes the result for an object, of which "is not None" is always true
     return not isinstance(torch._C._functorch.peek_interpreter_stack(), NoneType)
 
 
@@ -36,9 +36,9 @@ def in_graph(tensor: Tensor) -> bool:
 
 
 def is_concrete(tensor: Tensor) -> bool:
-    """Whether the values may be looked at: not while a graph is traced, nor inside vmap, grad or jacfwd.
+    """Whether the values may be read: not while a graph is traced, nor inside vmap, grad or jacfwd.
 
-    Nor are there any on the meta device or in a FakeTensorMode, where modules are made of shapes alone.
+    There are none on the meta device or in a FakeTensorMode, where modules are made of shapes alone.
     """
     if _is_traced(tensor) or tensor.is_meta:
         return False
@@ -51,14 +51,14 @@ def _is_traced(tensor: Tensor) -> bool:
 
 def is_fake(tensor: Tensor) -> bool:
     """Whether a tensor is one of a FakeTensorMode, which has a shape and no values."""
-    # not imported for its name alone: that takes a third of a second
+    # the class is not imported to compare its name: that takes a third of a second
     return type(tensor) is not Tensor and type(tensor).__name__ == "FakeTensor"
 
 
 def in_memory(tensor: Tensor) -> bool:
-    """Whether the values are what lies in the CPU's memory at `data_ptr`: of no subclass that has them elsewhere.
+    """Whether the values lie in the CPU's memory at `data_ptr`: not those of a subclass that has them elsewhere.
 
-    Nor are they to be negated first, or compressed, or zero by declaration.
+    Nor do they if they are to be negated first, or compressed, or zero by declaration.
     """
     keys = torch._C._dispatch_keys(tensor)
     mine: int = keys.raw_repr()
@@ -66,24 +66,24 @@ def in_memory(tensor: Tensor) -> bool:
 
 
 def is_recorded() -> bool:
-    """Whether torch's operators are recorded, or a mode changes what they do: what goes past them would be lost."""
+    """Whether torch's operators are recorded or changed by a mode, so that a call past them would be lost."""
     return in_jit_trace() or torch._C._len_torch_dispatch_stack() > 0
 
 
 in_jit_trace: Callable[[], bool] = torch.jit.is_tracing  # type: ignore[attr-defined]
-"""Whether torch.jit.trace is at work."""
+"""Whether torch.jit.trace is running."""
 
 is_exporting: Callable[[], bool] = torch.compiler.is_exporting
-"""Whether what is traced shall run elsewhere, where there are no operators of our own."""
+"""Whether the traced program is for another runtime, which has no operators of our own."""
 
 
 def records_constants() -> bool:
-    """Whether a program is exported into which values go as constants: not while dynamo traces it."""
+    """Whether values become constants of an exported program: not while dynamo traces it."""
     return is_exporting() and not torch.compiler.is_dynamo_compiling()
 
 
 def is_for_here() -> bool:
-    """Whether what is traced is compiled for this machine."""
+    """Whether the traced program is compiled for this machine."""
     return torch.compiler.is_compiling() and not is_exporting()
 
 
@@ -97,7 +97,7 @@ def keeps_graph(*tensors: Tensor) -> bool:
 
 
 def is_constant(module: nn.Module) -> bool:
-    """Whether a module is exported whose tensors are its own, not given, and do not learn: their values are known."""
+    """Whether an exported module's tensors are its own and do not learn, so that their values are known."""
     if not records_constants():
         return False
     for part in module.modules():
@@ -116,7 +116,7 @@ def is_constant(module: nn.Module) -> bool:
 
 @contextmanager
 def set_aside() -> Iterator[None]:
-    """Nothing is traced in here: what is made of values becomes a constant of the graph that is being recorded."""
+    """Suspend tracing in here: results become constants of the graph that is being recorded."""
     flags = {name: getattr(torch.compiler, name, False) for name in ("_is_compiling_flag", "_is_exporting_flag")}
     recording = torch._C._get_tracing_state()  # of torch.jit.trace
     with torch._C.DisableTorchFunction(), _disable_current_modes(), torch.no_grad():
@@ -132,7 +132,7 @@ def set_aside() -> Iterator[None]:
 
 
 def outside_inference() -> AbstractContextManager[None]:
-    """Have tensors made in here serve a graph later, as those of inference mode could not; without a graph as yet."""
+    """Make tensors in here without a graph, but, unlike those of inference mode, so that a graph can use them later."""
     if torch.compiler.is_compiling() or not torch.is_inference_mode_enabled():
         return nullcontext()
     return _outside_inference()
@@ -145,7 +145,7 @@ def _outside_inference() -> Iterator[None]:
 
 
 def converted(tensor: Tensor, dtype: torch.dtype) -> Tensor:
-    """The tensor in a dtype; what becomes a constant of an exported program is converted before it is one."""
+    """Return the tensor in `dtype`; a constant of an exported program is converted before it is recorded."""
     if not records_constants() or is_fake(tensor):
         return tensor.to(dtype)
     with set_aside():
@@ -153,8 +153,8 @@ def converted(tensor: Tensor, dtype: torch.dtype) -> Tensor:
 
 
 def is_eager(*tensors: Tensor) -> bool:
-    """Whether nothing is traced, transformed or recorded, and all values are what lies in the CPU's memory."""
-    # asked often, and in one place: each function more would take as long as what it asks
+    """Whether nothing is traced, transformed or recorded, and all values lie in the CPU's memory."""
+    # called often, so all in one place: each further function would take as long as its question
     if (
         torch.compiler.is_compiling()
         or torch._C._functorch.peek_interpreter_stack() is not None
@@ -171,31 +171,31 @@ def is_eager(*tensors: Tensor) -> bool:
 
 
 def may_look(tensor: Tensor) -> bool:
-    """Whether the values may be looked at and that costs next to nothing, to take a shorter way with a whole block."""
+    """Whether the values may be read and that costs next to nothing, to take a shorter way with a whole block."""
     return tensor.is_cpu and is_concrete(tensor) and 0 not in tensor.shape
 
 
 class Way(NamedTuple):
-    """How a call is evaluated."""
+    """The way in which a call is evaluated."""
 
     is_native: bool
-    """By compiled code, if that has the model."""
+    """Whether compiled code evaluates the call, if it has the model."""
     learns: bool
-    """Whether derivatives are recorded of what is compiled."""
+    """Whether derivatives of compiled code are recorded."""
     is_known: bool
-    """Whether the values of the parameters may be looked at, so that what is made of them is kept."""
+    """Whether the values of the parameters may be read, so that results made of them are kept."""
     order: int
-    """Of the derivatives that the recorded formula must have exactly."""
+    """The order of the derivatives that the recorded formula must have exactly."""
     is_constant: bool = False
-    """Whether the module is a constant of the program that is exported."""
+    """Whether the module is a constant of the exported program."""
 
 
 _NATIVE, _LEARNING = Way(True, False, True, 2), Way(True, True, True, 2)
 
 
 def way_of(module: nn.Module, values: Tensor, *parameters: Tensor) -> Way:
-    """Return the way of a module's call with values and parameters; a RuntimeError where torch could record none."""
-    # asked once a call, and in one place: each function more would take as long as what it asks
+    """Return the way of a module's call with values and parameters; raise a RuntimeError if torch can record none."""
+    # called once a call, so all in one place: each further function would take as long as its question
     is_plain = not (
         torch.compiler.is_compiling()
         or torch._C._functorch.peek_interpreter_stack() is not None
@@ -209,17 +209,17 @@ def way_of(module: nn.Module, values: Tensor, *parameters: Tensor) -> Way:
     if is_plain:
         if in_jit_trace() and torch.onnx.is_in_onnx_export():
             raise RuntimeError(
-                f"{type(module).__name__}: torch.onnx.export(dynamo=False) cannot record a camera; dynamo=True can. "
-                "What a frozen camera or warp keeps is a constant: camera.rays() and warp(images), with "
+                f"{type(module).__name__}: dynamo must be True in torch.onnx.export of a camera; got False. "
+                "Results that a frozen camera or warp keeps are constants: camera.rays() and warp(images), with "
                 "requires_grad_(False) and called once before the export"
             )
         if in_memory(values) and not in_jit_trace() and torch._C._len_torch_dispatch_stack() == 0:
             return _LEARNING if learns and torch.is_grad_enabled() else _NATIVE
     is_known = all(is_concrete(t) and not has_tangent(t) for t in parameters)
-    # what is compiled has no derivatives of derivatives
+    # torch.compile records no derivatives of derivatives
     return Way(False, False, is_known, 1 if torch.compiler.is_compiling() else 2, is_constant(module))
 
 
 def is_native(values: Tensor) -> bool:
-    """Return whether compiled code may read values, of a call in which nothing is under way."""
+    """Whether compiled code may read values, in a call without tracing or transforms."""
     return in_memory(values) and not is_recorded()

@@ -18,13 +18,13 @@ _recording = False
 
 
 def is_portable_export() -> bool:
-    """Whether a camera, a constant of an exported program, is recorded without operators of our own."""
+    """Whether a camera is recorded as a constant of an exported program, without operators of our own."""
     return _recording
 
 
 @contextmanager
 def portable_export(inputs: Tensor) -> Iterator[int]:
-    """Record a camera so in here; yields the order of the derivatives by inputs that the record must have."""
+    """Record cameras like that in here; yield the order of the derivatives by `inputs` that the record must have."""
     global _recording
     before, _recording = _recording, True
     try:
@@ -33,7 +33,7 @@ def portable_export(inputs: Tensor) -> Iterator[int]:
         _recording = before
 
 
-# the optimiser of ONNX programs leaves out terms that are nearly 0 and factors that are nearly 1, to 1e-8 and 1e-5
+# the optimiser of ONNX programs drops terms that are nearly 0 and factors that are nearly 1, to 1e-8 and 1e-5
 
 
 def plus(a: Tensor, least: float) -> Tensor:
@@ -68,7 +68,7 @@ def of_points(k: Tensor, camera: Tensor) -> tuple[Tensor, ...]:
 def repeat(
     step: Callable[..., tuple[Tensor, ...]], moves: Tensor, state: Sequence[Tensor], most: int
 ) -> tuple[Tensor, ...]:
-    """Return moves and state after at most so many steps to new ones, while any of `moves`, bool, is set."""
+    """Return moves and state after at most `most` steps, which end if none of `moves`, bool, is set."""
     if not is_portable_export():
         for _ in range(most):
             if not bool(moves.any()):
@@ -88,18 +88,18 @@ def repeat(
 
 def piece_of(nodes: tuple[Tensor, ...], place: Tensor) -> Tensor:
     """Return how many of the nodes, columns that broadcast against planes, lie at or before each place."""
-    if torch.compiler.is_exporting():  # one by one: few, or the memory of all comparisons
+    if torch.compiler.is_exporting():  # one by one, as all comparisons together take memory
         return reduce(torch.add, [(node <= place).long() for node in nodes])
     table = torch.stack(nodes, -1).contiguous()
-    if not table.shape[:-1] or table.shape[-2] != 1:  # nodes of a place's own
+    if not table.shape[:-1] or table.shape[-2] != 1:  # each place has its own nodes
         return torch.searchsorted(table, place.unsqueeze(-1).contiguous(), right=True).squeeze(-1)
     table = table.squeeze(-2).expand(*place.shape[:-1], -1)
     return torch.searchsorted(table.contiguous(), place.contiguous(), right=True)
 
 
 def pick(columns: Sequence[Tensor], index: Tensor) -> Tensor:
-    """Return from each plane's own columns the one of that index."""
-    if torch.compiler.is_exporting():  # no sizes are compared, which may be unknown
+    """Return at each place the value of the column with its `index`."""
+    if torch.compiler.is_exporting():  # sizes may be unknown, and are not compared
         found = columns[0] + torch.zeros_like(index, dtype=columns[0].dtype)
         for i, column in enumerate(columns[1:], 1):
             found = torch.where(index == i, column, found)
@@ -115,7 +115,7 @@ def solve_tridiagonal(below: Tensor, main: Tensor, above: Tensor, right: Tensor)
         matrix = torch.diag_embed(main) + torch.diag_embed(above, 1) + torch.diag_embed(below, -1)
         found: Tensor = torch.linalg.solve(matrix, right.unsqueeze(-1)).squeeze(-1)
         return found
-    # by Gauss's elimination from the first to the last, and back
+    # by Gaussian elimination from the first to the last, and back
     lower, upper, pivots, values = below.unbind(-1), above.unbind(-1), [main[..., 0]], [right[..., 0]]
     for i, factor in enumerate(lower):
         share = factor / pivots[i]
@@ -135,7 +135,7 @@ def unbound(table: Tensor) -> tuple[Tensor, ...]:
 
 
 def atan2(y: Tensor, x: Tensor) -> Tensor:
-    """Return torch.atan2; ONNX's composed one is -pi at y = 0 behind, and ONNX Runtime has none in float64."""
+    """Return torch.atan2; ONNX's composed one is -pi at y = 0, x < 0, and ONNX Runtime has none in float64."""
     if not torch.compiler.is_exporting():
         return torch.atan2(y, x)
     y, x = torch.broadcast_tensors(y, x)
@@ -145,19 +145,19 @@ def atan2(y: Tensor, x: Tensor) -> Tensor:
     nearly = torch.where(behind, math.pi, torch.atan2(y.float(), x.float())).double()
     c, s = torch.cos(nearly), torch.sin(nearly)
     along = x * c + y * s
-    # what is left is about 1e-7, whose fifth power is nothing
+    # the rest is about 1e-7, whose fifth power is negligible
     rest = torch.where(along > 0, (y * c - x * s) / torch.where(along > 0, along, 1.0), 0.0)
     return nearly + (rest - rest * rest * rest / 3)
 
 
 def as_constant() -> AbstractContextManager[None]:
-    """Have what is made in here be a constant, if a camera is recorded without operators of our own."""
+    """Make constants in here, if a camera is recorded without operators of our own."""
     return set_aside() if is_portable_export() else nullcontext()
 
 
 @contextmanager
 def with_values(module: nn.Module) -> Iterator[None]:
-    """Nothing is traced in here, and a module that `is_constant` has its own tensors, to make constants from."""
+    """Suspend tracing in here, and give a module that `is_constant` its own tensors, to make constants from."""
     places: list[tuple[dict[str, Any], str, Tensor]] = []
     for part in module.modules():
         own = part.__dict__.get("_own", {})

@@ -1,4 +1,4 @@
-"""What torch records of the formula, as its compilers do best: planes, masks, kept values, classes by their names."""
+"""Forms of the formula that torch's compilers handle best: planes, masks, kept values, classes by their names."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def _transposed(points: Tensor, to_planes: bool) -> Tensor:
         return torch.stack(points.unbind(0), -1)
     planes = points.new_empty(points.shape[-1], *points.shape[:-1])
     for plane, interleaved in zip(planes, points.unbind(-1), strict=True):
-        torch.sub(interleaved, 0, out=plane)  # twice as fast as a copy, and bit for bit the same
+        torch.sub(interleaved, 0, out=plane)  # takes half the time of a copy, and gives the same bits
     return planes
 
 
@@ -41,7 +41,7 @@ _transposed.register_autograd(
 
 
 def to_planes(rows: Tensor) -> tuple[Tensor, ...]:
-    """(C, N, size) as planes (C, N). Compiled code for CPUs reads interleaved planes one by one."""
+    """Return rows (C, N, size) as planes (C, N). Compiled code for CPUs reads interleaved planes one by one."""
     interleaved = is_for_here() and rows.device.type == "cpu" and rows.stride(-2) != 1
     interleaved = interleaved and not in_transform()  # the operator has no forward mode
     return (_transposed(rows, True) if interleaved else rows.movedim(-1, 0)).unbind(0)
@@ -58,37 +58,37 @@ def _(mask: Tensor) -> Tensor:
 
 
 def positive(mask: Tensor) -> Tensor:
-    """The mask as bool. Compiled code for CPUs writes bools one by one: ten times slower than this detour."""
+    """Return the mask as bool. Compiled code for CPUs writes bools one by one: ten times slower than this detour."""
     compiled = is_for_here() and mask.device.type == "cpu"
     return _positive(mask.detach()) if compiled else mask > 0
 
 
 def as_kept(plane: Tensor) -> Tensor:
-    """The plane, for inductor to compute once: it repeats the whole expression of what is used twice while it compiles.
+    """Return the plane in a form that inductor computes once, even if it is used twice.
 
-    That grows exponentially with the depth. Of views by strides it knows that they need a place in memory.
+    Inductor repeats other expressions at each use, exponentially often with the depth; a strided view gets memory.
     """
     return torch.as_strided(plane, plane.shape, plane.stride()) if is_for_here() else plane
 
 
 def power_of_two(size: Tensor) -> Tensor:
-    """The largest one not above: to divide by it costs no bit."""
-    if torch.compiler.is_compiling():  # which leaves its vectors for bits
+    """Return the largest power of two that is not above `size`: dividing by it costs no bit."""
+    if torch.compiler.is_compiling():  # compiled code does not vectorise the reading of bits
         return size
-    if in_transform():  # torch.vmap looks at no bits before torch 2.11
+    if in_transform():  # torch.vmap cannot read bits before torch 2.11
         return size / torch.frexp(size).mantissa / 2
     exponent, integer = (0x7F800000, torch.int32) if size.dtype == torch.float32 else (0x7FF << 52, torch.int64)
     return (size.view(integer) & exponent).view(size.dtype)
 
 
 def order_of(order: int, *inputs: Tensor) -> int:
-    """Of the derivatives that a recorded inverse has to have: compiled code that does not learn needs none."""
+    """Return the order of the derivatives that a recorded inverse must have: 0 in compiled code that does not learn."""
     compiled = torch.compiler.is_compiling() and not in_transform()
     return 0 if compiled and not keeps_graph(*inputs) else order
 
 
 def without_keeping(function: Callable[..., Result], *inputs: Tensor) -> Result:
-    """`function(*inputs)`; where that is compiled, backward computes it again from the inputs, which alone are kept."""
+    """Return `function(*inputs)`; in compiled code only the inputs are kept, and backward computes it again."""
     if torch.compiler.is_compiling() and torch.is_grad_enabled() and any(t.requires_grad for t in inputs):
         return cast("Result", checkpoint(function, *inputs, use_reentrant=False, preserve_rng_state=False))
     return function(*inputs)
@@ -96,18 +96,18 @@ def without_keeping(function: Callable[..., Result], *inputs: Tensor) -> Result:
 
 class _Classes(dict[str, Any]):
     def __missing__(self, name: str) -> Any:
-        importlib.import_module(name.rpartition(".")[0])  # a saved program is loaded before what it is made of
+        importlib.import_module(name.rpartition(".")[0])  # a saved program may be loaded before its classes
         if name not in self:
             raise KeyError(name)
         return self[name]
 
 
 CLASSES = _Classes()
-"""Every class of cameras and of radial factors."""
+"""All classes of cameras and of radial factors, by name."""
 
 
 def register(entry: type) -> str:
-    """Return the name under which a class is known from now on: with a number, if another one has it already."""
+    """Register a class and return its name, with a number if another class has that name already."""
     wanted = name = f"{entry.__module__}.{entry.__qualname__}"
     count = 2
     while name in CLASSES:

@@ -1,4 +1,4 @@
-"""The compiled sampler, where there is one: which library is loaded, and why there is none."""
+"""The compiled sampler: which library is loaded, or why none is."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def _find() -> _Found:
     except OSError as error:
         return _Found(None, f"not loaded ({error}); `{_BUILD}` builds it again")
     here = checksum()
-    if here is not None and here != _sources(library):  # None: packed into something that leaves sources out
+    if here is not None and here != _sources(library):  # None if a package leaves the sources out
         why = "not used (built from other sources than those beside it)"
         return _Found(None, f"{why}; `{_BUILD}` or `pip install -e .` builds it again", stale=True)
     wanted = os.environ.get("CAMTORCH_CPU", "").strip().lower()
@@ -55,7 +55,7 @@ def _sources(library: ctypes.CDLL) -> int | None:
 
 @functools.cache
 def library() -> ctypes.CDLL | None:
-    """Return the library, loaded at first use, or None where there is none to use; its calls hold no lock of Python."""
+    """Return the library, loaded at first use, or None if there is none to use; its calls do not hold Python's lock."""
     found = _find()
     if found.stale:
         warnings.warn(f"camtorch's native sampler is {found.state}", RuntimeWarning, stacklevel=2)
@@ -63,7 +63,7 @@ def library() -> ctypes.CDLL | None:
 
 
 def state() -> str:
-    """Which variant of the library runs on this machine's CPU, "avx2" for one, or why none does."""
+    """Return the variant of the library that runs on this machine's CPU, like "avx2", or why none does."""
     return _find().state
 
 
@@ -71,7 +71,7 @@ def state() -> str:
 def native_available() -> bool:
     """Whether images are sampled by compiled code; else torch samples them, slower and to the same results.
 
-    It is not where the environment says `CAMTORCH_NATIVE=0`, or where camtorch was installed without a C compiler:
-    `camtorch --version` tells.
+    It is False if the environment has `CAMTORCH_NATIVE=0`, or if camtorch was installed without a C compiler:
+    `camtorch --version` shows the reason.
     """
     return library() is not None

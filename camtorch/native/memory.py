@@ -1,4 +1,4 @@
-"""Memory of large results, which is used again: to get what is new to a process takes as long as to sample."""
+"""Memory of large results, which is used again: memory that is new to a process takes as long to get as to sample."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ import torch
 from torch import Tensor
 
 LIMIT = 1 << 27
-"""Bytes that are kept, at most, for results to come."""
+"""The most bytes that are kept for later results."""
 LEAST = 1 << 18
-"""Bytes of a result from which on it is worth while. Of the results of a batch that die together the C library gives
-some back to the system, and in a worker of a DataLoader a third of the time of a sample went to getting them again."""
+"""The least bytes of a result that make this worth while. If results of a batch die together, the C library gives some
+back to the system, and a worker of a DataLoader spent a third of the time of a sample on getting them again."""
 
 
 def empty(shape: tuple[int, ...], dtype: torch.dtype, layout: torch.memory_format) -> Tensor:
-    """Return `torch.empty` on the CPU, in memory of large pages that nobody else gets while anything on it lives."""
+    """Return `torch.empty` on the CPU, in memory of large pages that is not used again while anything on it lives."""
     size, strides = _place(shape, dtype, layout)
     block = _block(size)
     if block is None:
@@ -32,34 +32,34 @@ def empty(shape: tuple[int, ...], dtype: torch.dtype, layout: torch.memory_forma
 def tensor_on(
     block: mmap.mmap, dtype: torch.dtype, shape: tuple[int, ...], strides: tuple[int, ...], died: Callable[[], None]
 ) -> Tensor:
-    """A tensor on the memory of a block; and what is called when it is gone."""
-    memory = (ctypes.c_char * len(block)).from_buffer(block)  # which the storage holds, and nothing else
+    """Return a tensor on the memory of a block; `died` is called when that memory is free."""
+    memory = (ctypes.c_char * len(block)).from_buffer(block)  # only the storage holds it
     weakref.finalize(memory, died).atexit = False
-    count = math.prod(shape) * dtype.itemsize  # a storage is saved as a whole, so of the tensor's bytes alone
+    count = math.prod(shape) * dtype.itemsize  # a storage is saved as a whole, so it has no bytes beyond the tensor's
     storage = torch.frombuffer(memory, dtype=torch.uint8, count=count).untyped_storage()
-    # not a view, of which there are things that cannot be done
+    # not a view, as some operations refuse views
     return torch.empty(0, dtype=dtype, device="cpu").set_(storage, 0, shape, strides)
 
 
 @functools.lru_cache(maxsize=64)
 def _place(shape: tuple[int, ...], dtype: torch.dtype, layout: torch.memory_format) -> tuple[int, tuple[int, ...]]:
-    """Bytes of whole pages, with large ones within them and not beyond, and strides."""
+    """Return the number of bytes, in whole pages so that large pages do not reach beyond, and the strides."""
     like = torch.empty(shape, dtype=dtype, device="meta", memory_format=layout)
     return -(-like.nbytes // mmap.PAGESIZE) * mmap.PAGESIZE, like.stride()
 
 
 def release() -> None:
-    """Give back to the system what is kept."""
+    """Give kept memory back to the system."""
     _idle.clear()
 
 
-# No lock: a tensor may die wherever Python collects garbage, also within these functions. What they do to the list is
-# done at once. A fork's child has pages of its own.
+# There is no lock: a tensor may die wherever Python collects garbage, also within these functions. Each of their
+# changes of the list is atomic. A fork's child has pages of its own.
 _idle: list[mmap.mmap] = []
 
 
 def _block(size: int) -> mmap.mmap | None:
-    """Of so many bytes: one that is kept, or a new one if the system has large pages, and so much memory."""
+    """Return a block of `size` bytes: a kept one, or a new one if the system has large pages and so much memory."""
     for block in tuple(_idle):
         if len(block) == size:
             try:
@@ -71,14 +71,14 @@ def _block(size: int) -> mmap.mmap | None:
         return None
     try:
         block = mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
-        block.madvise(mmap.MADV_HUGEPAGE)  # small ones, each new to the process, would take several times as long
+        block.madvise(mmap.MADV_HUGEPAGE)  # small pages, each new to the process, would take several times as long
     except OSError:
         return None
     return block
 
 
 def _keep(block: mmap.mmap) -> None:
-    """Of what is kept, the oldest goes first."""
+    """Keep a block, and drop the oldest ones if there are too many bytes."""
     _idle.append(block)
     while sum(map(len, tuple(_idle))) > LIMIT:
         with suppress(IndexError):  # another thread was here

@@ -1,4 +1,4 @@
-"""Arguments: what users pass as parameters and points, checked and brought into shape."""
+"""Checks and conversions of the numbers, sizes and options that users pass."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ from camtorch.evaluate.door import may_look
 from camtorch.evaluate.known import is_kept, is_predicted, known_false, row_of
 
 Numbers: TypeAlias = Tensor | np.ndarray[Any, Any] | np.number[Any] | float | list[Any] | tuple[Any, ...]
-"""What users pass as numbers: a tensor, an array, a number, or lists of them."""
+"""Numbers as users pass them: a tensor, an array, a number, or lists of them."""
 
-LEFT = "What left camtorch stands in docs/leaving-0.3.md"
-"""For errors on names that are not known."""
+LEFT = "docs/leaving-0.3.md lists what left camtorch"
+"""The hint of errors about unknown names."""
 
 Taken = ParamSpec("Taken")
 Result = TypeVar("Result")
@@ -31,7 +31,7 @@ Name = TypeVar("Name", bound=str)
 
 
 def hinting(hint: str) -> Callable[[Callable[Taken, Result]], Callable[Taken, Result]]:
-    """A function whose error on arguments that it does not have says what to type, as another library's order."""
+    """Return a decorator that adds `hint` to a function's error about arguments that it does not have."""
 
     def hinted(function: Callable[Taken, Result]) -> Callable[Taken, Result]:
         @functools.wraps(function)
@@ -60,7 +60,7 @@ def warn(text: str, category: type[Warning] = UserWarning) -> None:
 
 
 def imported(module: str, needs: str, extra: str, has: str = "__name__") -> Any:
-    """Return an optional module, if it `has` that; raise an ImportError that says how to install it otherwise."""
+    """Import an optional module with the attribute `has`, or raise an ImportError with the command to type."""
     try:
         found = importlib.import_module(module)
         operator.attrgetter(has)(found)
@@ -69,12 +69,12 @@ def imported(module: str, needs: str, extra: str, has: str = "__name__") -> Any:
     return found
 
 
-# torch stands between a module's caller and its forward
+# torch's frames lie between a module's caller and its forward
 _INSIDE = tuple(os.path.dirname(file) + os.sep for file in (os.path.dirname(__file__), torch.__file__))
 
 
 def as_real(value: Numbers, name: str, owner: str, device: torch.device | None = None) -> Tensor:
-    """Return floating-point finite numbers: a tensor itself; lists and integers take torch's default dtype."""
+    """Return finite floating-point numbers: a tensor itself; lists and integers take torch's default dtype."""
     if type(value) in (list, tuple) and {float, int}.issuperset(map(type, value)):  # type: ignore[arg-type]
         value = torch.tensor(value, dtype=torch.get_default_dtype(), device=device)
     elif not isinstance(value, Tensor):
@@ -100,27 +100,27 @@ def as_real(value: Numbers, name: str, owner: str, device: torch.device | None =
         wrong = (~value.detach().isfinite()).nonzero()
         first = wrong[0].tolist()
         place = f", first {name}{first} = {value[tuple(first)].item()}" if first else ""
-        raise ValueError(f"{owner}: {name} must be finite; {len(wrong)} of {value.numel()} numbers are not{place}")
+        raise ValueError(f"{owner}: {name} must be finite; got {len(wrong)} of {value.numel()} that are not{place}")
     return value
 
 
 def _check_list(value: object, name: str, owner: str) -> None:
     if isinstance(value, (list, tuple)) and any(isinstance(v, Tensor) and v.requires_grad for v in value):
-        raise TypeError(f"{owner}: {name} is a list of tensors that require grad; torch.stack them")
+        raise TypeError(f"{owner}: {name} must be a tensor; got a list of tensors that require grad. torch.stack them")
 
 
 def _check_real(value: Tensor, name: str, owner: str, device: torch.device | None) -> None:
     if value.dtype.is_complex or value.dtype == torch.bool:
         raise TypeError(f"{owner}: {name} must be real numbers; got dtype {value.dtype}")
     if value.layout is not torch.strided:
-        raise TypeError(f"{owner}: {name} must be a dense tensor; got {value.layout}, of which .to_dense() makes one")
+        raise TypeError(f"{owner}: {name} must be a dense tensor; got {value.layout}. Use .to_dense()")
     if device is not None and value.device != device:
         where = f"must be on {device}, like the other tensors; got {value.device}"
-        raise ValueError(f"{owner}: {name} {where}. .to(device) brings them together")
+        raise ValueError(f"{owner}: {name} {where}. Move it with .to(device)")
 
 
 def _as_plain(value: Numbers) -> Numbers:
-    """What torch takes without a complaint: of an array that is turned round, foreign or read-only, a copy."""
+    """Return `value` as torch accepts it: a copy of an array that is reversed, read-only or of another byte order."""
     if isinstance(value, np.ndarray) and value.dtype.kind in "fiu":
         if value.dtype.kind == "f" and value.dtype.itemsize > 8:
             return value.astype(np.float64)
@@ -142,7 +142,7 @@ def as_vectors(value: Numbers, name: str, owner: str, device: torch.device | Non
         return vectors
     else:
         hint = (
-            ". Of a quaternion it is scipy's Rotation.from_quat(xyzw).as_rotvec()" if vectors.shape[-1:] == (4,) else ""
+            ". For quaternions, use scipy's Rotation.from_quat(xyzw).as_rotvec()" if vectors.shape[-1:] == (4,) else ""
         )
         raise ValueError(f"{owner}: {name} must be (*B, 3); got shape {tuple(vectors.shape)}{hint}")
     if isinstance(value, nn.Parameter):  # the module could not own it
@@ -168,7 +168,7 @@ def as_image_size(value: Any, owner: str, name: str = "image_size") -> tuple[int
 
 
 def as_known_size(value: Any, owner: str) -> tuple[int, int]:
-    """Return (height, width) as two positive ints."""
+    """Return (height, width) as two positive ints; raise an error for None."""
     size = as_image_size(value, owner)
     if size is None:
         raise TypeError(f"{owner}: image_size must be two integers (height, width); got None")
@@ -176,29 +176,29 @@ def as_known_size(value: Any, owner: str) -> tuple[int, int]:
 
 
 def shown(value: object) -> str:
-    """What was passed, for an error: of tensors and arrays the shape, of anything else the beginning."""
+    """Return `value` as errors show it: the shape of a tensor or array, the beginning of anything else."""
     if isinstance(value, (Tensor, np.ndarray)) and value.ndim:
         return f"{type(value).__name__} of shape {tuple(value.shape)}"
     return f"{value!r:.60}"
 
 
 GUESS_CAMERA = "KannalaBrandt.from_fov(degrees, image_size=...) guesses a camera"
-"""For errors where there is none."""
+"""The hint of errors about a missing camera."""
 
 
 def no_camera(value: object) -> str:
-    """What was passed instead of a camera, for an error: of a rig and of a file with the way to theirs."""
-    if hasattr(type(value), "_way_to_cameras"):  # a Rig, whose module needs this one
+    """Return the type of what was passed instead of a camera, and how a rig, a file or a matrix leads to one."""
+    if hasattr(type(value), "_way_to_cameras"):  # a Rig, whose module imports this one
         return f"{type(value).__name__}, {value._way_to_cameras()}"  # type: ignore[attr-defined]
     if isinstance(value, os.PathLike) or (isinstance(value, str) and os.path.splitext(value)[1]):
-        return f"{type(value).__name__}; ct.load({os.fspath(value)!r:.60}).camera is that of a file"
+        return f"{type(value).__name__}; ct.load({os.fspath(value)!r:.60}).camera loads the camera of a file"
     if tuple(getattr(value, "shape", ()))[-2:] == (3, 3):
         return f"{type(value).__name__} (3, 3); ct.BrownConrady.from_matrix(K, distortion) makes a camera of a matrix K"
     return type(value).__name__
 
 
 def as_whole(value: Any, name: str, owner: str, least: int | None = None) -> int:
-    """Return a whole number, not below the least."""
+    """Return `value` as an int of at least `least`."""
     try:
         whole = operator.index(value)
     except (TypeError, RuntimeError):
@@ -209,7 +209,7 @@ def as_whole(value: Any, name: str, owner: str, least: int | None = None) -> int
 
 
 def as_flag(value: Any, name: str, owner: str) -> bool:
-    """Return True or False, of what is one of them and not "False"."""
+    """Return `value` as a bool if it is True, False, 1 or 0, and raise an error for anything else, like "False"."""
     plain = value.item() if isinstance(value, (Tensor, np.ndarray, np.generic)) and not value.ndim else value
     if isinstance(plain, int) and plain in (0, 1):
         return bool(plain)
@@ -217,7 +217,7 @@ def as_flag(value: Any, name: str, owner: str) -> bool:
 
 
 def as_number(value: Any, name: str, owner: str) -> float:
-    """Return a number, NaN and infinity among them."""
+    """Return `value` as a float, which may be NaN or infinite."""
     try:
         if isinstance(value, (str, bytes)):
             raise TypeError
@@ -227,7 +227,7 @@ def as_number(value: Any, name: str, owner: str) -> float:
 
 
 def as_part(value: Any, name: str, owner: str, kind: str = "part") -> float:
-    """Return a part of a whole, within [0, 1], as a probability is one."""
+    """Return `value` as a float if it lies within [0, 1], like a probability."""
     part = as_number(value, name, owner)
     if not 0 <= part <= 1:
         raise ValueError(f"{owner}: {name} must be a {kind} in [0, 1]; got {value!r}")
@@ -235,7 +235,7 @@ def as_part(value: Any, name: str, owner: str, kind: str = "part") -> float:
 
 
 def as_fov(value: Any, owner: str, most: float, means: str = "") -> float:
-    """Return a field of view in degrees: above 2 pi, and below `most`, or up to it where that is a whole turn."""
+    """Return a field of view in degrees: above 2 pi and below `most`, or at most 360 if `most` is 360."""
     fov = as_number(value, "fov", owner)
     if not (0 < fov < most or fov == most == 360):
         upto = "up to" if most == 360 else "below"
@@ -245,17 +245,17 @@ def as_fov(value: Any, owner: str, most: float, means: str = "") -> float:
 
 
 def check_degrees(least: float, fov: object, owner: str) -> None:
-    """Raise a ValueError if the least field of view of those given is up to 2 pi: then it seems to be in radians."""
-    if least <= 2 * math.pi * (1 + 1e-6):  # which float32 rounds up
+    """Raise a ValueError if the least of the given fields of view is at most 2 pi, and so seems to be in radians."""
+    if least <= 2 * math.pi * (1 + 1e-6):  # float32 rounds 2 pi up
         raise ValueError(
-            f"{owner}: fov is in degrees; {fov} seems to be radians: {least:.4g} are {math.degrees(least):.4g} "
-            "degrees. A camera of so narrow a view is made from its focal lengths: ct.Pinhole([fx, fy, cx, cy]), or "
-            "from_matrix(K) of any model"
+            f"{owner}: fov must be in degrees; got {fov}, which seems to be radians: {least:.4g} are "
+            f"{math.degrees(least):.4g} degrees. Make a camera of so narrow a view from its focal lengths: "
+            "ct.Pinhole([fx, fy, cx, cy]), or from_matrix(K) of any model"
         )
 
 
 def one_of(value: str, allowed: tuple[Name, ...], name: str, owner: str) -> Name:
-    """The value, if it is allowed."""
+    """Return `value` if it is one of `allowed`."""
     for known in allowed if isinstance(value, str) else ():
         if value == known:
             return known
@@ -263,7 +263,7 @@ def one_of(value: str, allowed: tuple[Name, ...], name: str, owner: str) -> Name
 
 
 def as_mapping(value: Any, name: str, owner: str, form: str) -> Mapping[Any, Any]:
-    """Return a mapping, also of what torch has instead of one; an empty one of None."""
+    """Return a mapping, also for torch's ModuleDict and ParameterDict; an empty one for None."""
     if value is None:
         return {}
     if isinstance(value, (nn.ModuleDict, nn.ParameterDict)):
@@ -274,63 +274,63 @@ def as_mapping(value: Any, name: str, owner: str, form: str) -> Mapping[Any, Any
 
 
 def is_list(value: object) -> TypeGuard[Sequence[Any]]:
-    """Whether it is a list, a tuple, or another sequence, as files of options have them; no text."""
+    """Whether `value` is a list, a tuple or another sequence, like the lists in files of options, but not a text."""
     return isinstance(value, Sequence) and not isinstance(value, (str, bytes))
 
 
 def check_path(path: Any, owner: str) -> None:
-    """Raise a TypeError for what is no path."""
+    """Raise a TypeError if `path` is neither a text nor a path."""
     if not isinstance(path, (str, os.PathLike)):
         raise TypeError(f"{owner}: path must name a file; got {shown(path)}")
 
 
 def check_boxes(boxes: Tensor, name: str, owner: str) -> None:
-    """Raise a ValueError for plain boxes (..., 4) with x2 < x1 or y2 < y1, as x, y, width, height mostly have it."""
+    """Raise a ValueError if plain boxes (..., 4) have x2 < x1 or y2 < y1, as boxes x, y, width, height mostly do."""
     if not may_look(boxes) or boxes.requires_grad:
         return
     wide = boxes if boxes.dtype.is_floating_point else boxes.double()
-    # not what rounding made of a box without extent
+    # rounding may turn a box without extent by so much
     turned = (wide[..., 2:] < wide[..., :2] - 8 * torch.finfo(wide.dtype).eps * wide[..., :2].abs()).any(-1)
     if bool(turned.any()):
         index = turned.nonzero()[0].tolist()
         place = f"[{', '.join(map(str, index))}]" if index else ""
         raise ValueError(
             f"{owner}: {name} must be x1, y1, x2, y2 (xyxy), with x1 <= x2 and y1 <= y2; got {name}{place} = "
-            f"{boxes[tuple(index)].tolist()}. Boxes x, y, width, height go in as x, y, x + width, y + height"
+            f"{boxes[tuple(index)].tolist()}. Pass boxes x, y, width, height as x, y, x + width, y + height"
         )
 
 
 def check_radians(vectors: Tensor, name: str, owner: str) -> None:
-    """Raise a ValueError for plain rotation vectors (..., 3) of more than two turns, the most of any use."""
+    """Raise a ValueError if plain rotation vectors (..., 3) have more than two turns, the most that anybody uses."""
     if not may_look(vectors) or is_kept(vectors) or is_predicted(vectors):
         return
     if bool((vectors.square().sum(-1) > (4 * math.pi) ** 2 * (1 + 1e-6)).any()):
         longest = torch.linalg.vector_norm(vectors.double(), dim=-1).nan_to_num(0.0).amax().item()
         raise ValueError(
-            f"{owner}: {name} holds rotation vectors, axis times angle in radians; an angle of {longest:.4g} seems to "
-            "be degrees, which torch.deg2rad() or math.radians() converts"
+            f"{owner}: {name} must be rotation vectors, axis times angle in radians; got an angle of {longest:.4g}, "
+            "which seems to be degrees. Use torch.deg2rad() or math.radians()"
         )
 
 
 def check_angles(angles: Tensor, owner: str) -> None:
-    """Raise a ValueError for plain angles of more than a turn, which are degrees."""
+    """Raise a ValueError if plain angles are more than a turn, as degrees are."""
     if not is_predicted(angles) and known_false(~(angles.abs() > 2 * math.pi * (1 + 1e-6))):
         raise ValueError(
-            f"{owner}: angles must be radians; {float(angles.abs().max()):.4g} seems to be degrees, which "
-            "torch.deg2rad() or math.radians() converts"
+            f"{owner}: angles must be radians; got {float(angles.abs().max()):.4g}, which seems to be degrees. "
+            "Use torch.deg2rad() or math.radians()"
         )
 
 
 def check_devices(owner: str, /, **tensors: Tensor | None) -> None:
-    """Raise a ValueError unless all are on one device."""
+    """Raise a ValueError unless all tensors are on one device."""
     devices = {name: tensor.device for name, tensor in tensors.items() if tensor is not None}
     if len(set(devices.values())) > 1:
-        where = ", ".join(f"{name} is on {device}" for name, device in devices.items())
-        raise ValueError(f"{owner}: {where}; .to(device) brings them together")
+        where = ", ".join(f"{name} on {device}" for name, device in devices.items())
+        raise ValueError(f"{owner}: tensors must be on one device; got {where}. Move them with .to(device)")
 
 
 def broadcast_shapes(*shapes: Sequence[int]) -> torch.Size:
-    """Return the shape that all shapes broadcast to. torch's own imports sympy, for a third of a second."""
+    """Return the shape that all shapes broadcast to; torch's function imports sympy, for a third of a second."""
     if shapes and shapes.count(shapes[0]) == len(shapes):
         return torch.Size(shapes[0])
     shape: list[int] = []
@@ -339,7 +339,7 @@ def broadcast_shapes(*shapes: Sequence[int]) -> torch.Size:
         for i, side in enumerate(other, len(shape) - len(other)):
             if side != shape[i] and side != 1:
                 if shape[i] != 1:
-                    raise ValueError(f"shapes {', '.join(str(tuple(s)) for s in shapes)} do not broadcast")
+                    raise ValueError(f"shapes must broadcast; got {', '.join(str(tuple(s)) for s in shapes)}")
                 shape[i] = side
     return torch.Size(shape)
 
@@ -350,11 +350,11 @@ def as_batch(owner: str, **shapes: Sequence[int]) -> torch.Size:
         return broadcast_shapes(*(shape[:-1] for shape in shapes.values()))
     except ValueError:
         named = " and ".join(f"{name} {tuple(shape)}" for name, shape in shapes.items())
-        raise ValueError(f"{owner}: the batch dims of {named} do not fit together") from None
+        raise ValueError(f"{owner}: batch dims must fit together; got {named}") from None
 
 
 def working_dtype(values: Tensor, *parameters: Tensor) -> torch.dtype:
-    """The dtype to compute in: the widest of all, at least float32; integer values take the parameters' dtype."""
+    """Return the dtype to compute in: the widest of all, at least float32; integers take the parameters' dtype."""
     dtype = torch.float32
     for tensor in (values, *parameters):
         if tensor.dtype.is_floating_point and tensor.dtype != dtype:
@@ -363,7 +363,7 @@ def working_dtype(values: Tensor, *parameters: Tensor) -> torch.dtype:
 
 
 def as_values(values: Numbers, name: str, owner: str, device: torch.device | None = None) -> Tensor:
-    """Return a tensor of real numbers, NaN and infinity among them; one that is given must be on `device`, if any."""
+    """Return real numbers, which may be NaN or infinite, as a tensor; a given tensor must be on `device`, if any."""
     if not isinstance(values, Tensor):
         _check_list(values, name, owner)
         try:
@@ -383,7 +383,7 @@ def as_coordinates(
     form: str = "...",
     means: str = "",
 ) -> Tensor:
-    """Return a tensor (..., size) of real numbers; whole ones take torch's default dtype."""
+    """Return a tensor (..., size) of real numbers; integers take torch's default dtype."""
     values = as_values(values, name, owner, device)
     if values.ndim == 0 or values.shape[-1] != size:
         raise ValueError(f"{owner}: {name} must be ({form}, {size}){means}; got shape {tuple(values.shape)}")
@@ -393,12 +393,12 @@ def as_coordinates(
 def as_points(
     values: Numbers, name: str, size: int, batch: torch.Size, parameters: Sequence[Tensor], owner: str
 ) -> tuple[Tensor, torch.Size]:
-    """Return (*B, *N, size) in the dtype to compute in and with the batch dims of `batch`; and *B."""
+    """Return points (*B, *N, size), in the dtype to compute in and expanded to the batch dims of `batch`, and *B."""
     values = as_values(values, name, owner, parameters[0].device)
     takes = f"{name} must be (*B, *N, {size}) with batch dims *B = {tuple(batch)}"
     if values.ndim == 0 or values.shape[-1] != size:
         turned = values.ndim > 1 and values.shape[-2] == size
-        hint = f". One in each column, they go in as {name}.T" if turned else ""
+        hint = f". Pass points in columns as {name}.T" if turned else ""
         raise ValueError(f"{owner}: {takes}; got shape {tuple(values.shape)}{hint}")
     lead, rest = values.shape[: len(batch)], values.shape[len(batch) : -1]
     try:
@@ -406,7 +406,7 @@ def as_points(
             raise ValueError
         lead = lead if lead == batch else broadcast_shapes(lead, batch)
     except ValueError:
-        hint = f". What all of the batch share goes in as {name}[None]" if values.ndim > 1 and len(batch) else ""
+        hint = f". Pass values that the whole batch shares as {name}[None]" if values.ndim > 1 and len(batch) else ""
         raise ValueError(f"{owner}: {takes}; got shape {tuple(values.shape)}{hint}") from None
     values = values.to(working_dtype(values, *parameters))
     if values.shape[: len(lead)] != lead:
@@ -417,7 +417,7 @@ def as_points(
 def as_rows(
     values: Numbers, name: str, batch: torch.Size, parameters: Sequence[Tensor], owner: str
 ) -> tuple[Tensor, torch.Size, Callable[[Tensor], Tensor]]:
-    """Return (*B, *N, 3) as rows (C, N, 3), one a camera; *B; and what makes (*B, *N, count) of (count, C, N)."""
+    """Return rows (C, N, 3), one a camera, of points; *B; and a function from (count, C, N) to (*B, *N, count)."""
     values, lead = as_points(values, name, 3, batch, parameters, owner)
     shape = values.shape[:-1]
 
@@ -428,6 +428,6 @@ def as_rows(
 
 
 def columns(parameters: Tensor) -> tuple[Tensor, ...]:
-    """(*B, n) -> n tensors (*B, 1), or (1,), that broadcast against planes."""
-    # what has no columns cannot be unbound once it was exported and loaded
+    """Return the columns of (*B, n): n tensors (*B, 1), or (1,), that broadcast against planes."""
+    # a tensor without columns cannot be unbound after it was exported and loaded
     return parameters.unsqueeze(-1).unbind(-2) if parameters.shape[-1] else ()

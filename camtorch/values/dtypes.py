@@ -9,28 +9,28 @@ import torch
 from torch import Tensor
 
 SIGNED = {torch.uint16: torch.int16, torch.uint32: torch.int32, torch.uint64: torch.int64}
-"""The dtypes of the same bits that torch flips and gathers: it does no unsigned ones of more than a byte."""
+"""The dtypes of the same bits that torch can flip and gather: it cannot do so for unsigned ones of more than a byte."""
 
 
 def wide_dtype(dtype: torch.dtype) -> torch.dtype:
-    """The dtype to compute in: every value, a class id too, is exact in it, up to 2^53."""
+    """Return the dtype to compute images in: every value up to 2^53 is exact in it, class ids too."""
     if dtype.is_floating_point:
         return torch.promote_types(dtype, torch.float32)
     return torch.float64 if dtype.itemsize > 2 else torch.float32
 
 
 def widen(images: Tensor) -> Tensor:
-    """In the dtype to compute in."""
+    """Return images in the dtype to compute in."""
     return images.to(wide_dtype(images.dtype))
 
 
 def narrow(values: Tensor, dtype: torch.dtype) -> Tensor:
-    """What `widen` gave, back in its dtype: integers are rounded and stay in range, bool is true from one half on."""
+    """Return values of `widen` in `dtype` again: integers are rounded and clamped, bool is true from one half on."""
     if dtype == torch.bool and values.is_floating_point():
         return values >= 0.5
     if not dtype.is_floating_point and values.is_floating_point():
         low, high = torch.iinfo(dtype).min, torch.iinfo(dtype).max
-        # the largest int64 is no float64: the next one would wrap around
+        # float64 does not have the largest int64: the next number would wrap around
         top = float(high) if int(float(high)) == high else math.nextafter(float(high), 0.0)
         values = values.round().clamp(float(low), top)
     return values.to(dtype)

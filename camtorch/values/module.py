@@ -1,4 +1,4 @@
-"""What all modules of camtorch are: parameters that hold geometry, and a memo of what follows from them."""
+"""Base classes of camtorch's modules: tensors that hold geometry, and the batch dims that they share."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ R = TypeVar("R")
 
 
 def typed_as(forward: Callable[P, R]) -> Callable[[Callable[..., Any]], Callable[P, R]]:
-    """For type checkers, of a `__call__`: it is called as `forward` is, which nn.Module's does not say."""
+    """Give a `__call__` the signature of `forward` for type checkers, as nn.Module's has none."""
     return lambda call: call
 
 
@@ -32,7 +32,7 @@ _KINDS = [type(value) for value in _CONTAINERS.values()]
 
 
 def _containers() -> Iterator[tuple[str, Any]]:
-    """The empty dicts and sets of a module, each its own."""
+    """Return the names and the empty dicts and sets of a new module."""
     return zip(_CONTAINERS, [kind() for kind in _KINDS], strict=True)
 
 
@@ -40,7 +40,7 @@ class UnsharedState(nn.Module):
     """A module whose state can be saved by safetensors, which refuses tensors that share memory."""
 
     def state_dict(self, *args: Any, **options: Any) -> Any:
-        """Return the state as `nn.Module` does; of tensors that share memory, as of one camera twice, copies."""
+        """Return the state as `nn.Module` does, but copy tensors that share memory, as of one camera twice."""
         state = super().state_dict(*args, **options)
         if self._modules and not options.get("keep_vars", False):
             seen: set[int] = set()
@@ -53,13 +53,13 @@ class UnsharedState(nn.Module):
 
 
 class GeometryModule(UnsharedState):
-    """A module whose tensors are geometry: Parameters, or tensors of a graph, never of less than float32."""
+    """A module whose tensors are geometry: Parameters, or tensors of a graph, in at least float32."""
 
-    _own: dict[str, Tensor | None]  # the tensors that were registered, also while others stand in their place
+    _own: dict[str, Tensor | None]  # the tensors that were registered, also while tracing replaces them
 
     def __init__(self, modules: Mapping[str, nn.Module | None] = MappingProxyType({}), /, **attributes: Any):
-        """With these attributes, which are no modules, and parts."""
-        if torch.compiler.is_compiling():  # which follows torch's own way, that takes 1 us an attribute
+        """Set these attributes, which are no modules, and these parts."""
+        if torch.compiler.is_compiling():  # the compiler follows only torch's way, which takes 1 us an attribute
             super().__init__()
             for name, value in (*modules.items(), *attributes.items()):
                 setattr(self, name, value)
@@ -72,22 +72,22 @@ class GeometryModule(UnsharedState):
                 (state if module is None else parts)[name] = module
 
     def register_parameter(self, name: str, param: nn.Parameter | None) -> None:
-        """As of `nn.Module`."""
+        """Register a Parameter as `nn.Module` does."""
         super().register_parameter(name, param)
         self._note(name)
 
     def register_buffer(self, name: str, tensor: Tensor | None, persistent: bool = True) -> None:
-        """As of `nn.Module`."""
+        """Register a buffer as `nn.Module` does."""
         super().register_buffer(name, tensor, persistent)
         self._note(name)
 
     def _note(self, name: str) -> None:
         if not torch.compiler.is_compiling():
-            # a dict of its own: that of the module from which this one was copied may be the same
+            # a new dict, because this module and the one that it was copied from may share the old one
             self.__dict__["_own"] = {**self.__dict__.get("_own", {}), name: getattr(self, name)}
 
     def hold(self, name: str, value: Tensor, shape: tuple[int, ...]) -> None:
-        """Register plain values as a new Parameter of that shape, a Parameter or a tensor of a graph as it is."""
+        """Register plain values as a new Parameter of `shape`, and a Parameter, or a tensor of a graph, as it is."""
         if shape[-1] == 0:  # an optimizer has nothing to learn here
             self.put(name, value if value.shape == shape and not value.requires_grad else value.detach().expand(shape))
         elif is_parameter(value):
@@ -99,7 +99,7 @@ class GeometryModule(UnsharedState):
             self.put(name, nn.Parameter((own if own.shape == shape else own.expand(shape)).clone()))
 
     def put(self, name: str, tensor: Tensor | None, persistent: bool = False) -> None:
-        """Register a Parameter, or anything else as a buffer, which a state_dict holds where it is persistent."""
+        """Register a Parameter, or anything else as a buffer, which a state_dict has if it is persistent."""
         is_learnt = tensor is not None and is_parameter(tensor)
         if torch.compiler.is_compiling():
             if is_learnt:
@@ -115,7 +115,7 @@ class GeometryModule(UnsharedState):
             state["_non_persistent_buffers_set"].add(name)
 
     def freeze_like(self, *sources: nn.Module) -> Self:
-        """Leave nothing to learn where the modules that this one was made from have nothing either."""
+        """Freeze the parameters if no tensor of `sources`, which this module was made from, requires grad."""
         tensors = [t for source in sources for t in (*source.parameters(), *source.buffers())]
         if not any(t.requires_grad for t in tensors):
             for parameter in self.parameters():
@@ -123,11 +123,11 @@ class GeometryModule(UnsharedState):
         return self
 
     def _model_name(self) -> str:
-        """What its numbers are those of: a state of another one is refused. Empty: its keys tell."""
+        """Return the model's name, by which a state of another model is refused; empty if the state's keys suffice."""
         return ""
 
     def _has_left(self, name: str) -> bool:
-        """Whether no model has this name, of a state."""
+        """Whether a state's model `name` is not a model any more."""
         return False
 
     def _save_to_state_dict(self, destination: Any, prefix: str, keep_vars: bool) -> None:
@@ -140,10 +140,10 @@ class GeometryModule(UnsharedState):
         mine, its = self._model_name(), metadata.get("model")
         if mine and its not in (None, mine):
             where = f" {prefix[:-1]}" if prefix else ""
-            errors.append(f"the state{where} is of {its}, and the module of {mine}" + f". {LEFT}" * self._has_left(its))
+            errors.append(f"the state{where} must be of {mine}; got one of {its}" + f". {LEFT}" * self._has_left(its))
             return
         super()._load_from_state_dict(*arguments)
-        # what has no values is in no state_dict, and follows what was assigned in the place of meta tensors
+        # no state_dict has an empty buffer, which follows the tensors that were assigned in place of meta tensors
         for name, buffer in self._buffers.items():
             for parameter in self.parameters(recurse=False):
                 if buffer is not None and buffer.is_meta and buffer.numel() == 0:
@@ -174,11 +174,11 @@ class GeometryModule(UnsharedState):
 
 
 class BatchedModule(GeometryModule):
-    """A module whose tensors share batch dims, which is indexed and counted by them as a tensor is."""
+    """A module whose tensors share batch dims, and which is indexed and counted by them like a tensor."""
 
     tensor_names: ClassVar[tuple[str, ...]]
-    """Of the tensors (*B, n); each may have fewer batch dims, or of size 1, where it is shared."""
-    memo_names: ClassVar[tuple[str, ...]] = ()  # of what is kept of their values, which begins empty in another module
+    """Names of the tensors (*B, n); a shared one may have fewer batch dims, or dims of size 1."""
+    memo_names: ClassVar[tuple[str, ...]] = ()  # results kept of their values, without which another module begins
 
     @property
     def batch_shape(self) -> torch.Size:
@@ -186,13 +186,13 @@ class BatchedModule(GeometryModule):
         raise NotImplementedError
 
     def __getitem__(self, index: Any) -> Self:
-        """The part of the batch that a tensor's index takes: an int, a slice, a mask, a list, or a tuple of them.
+        """Return the part of the batch at `index`, as of a tensor: an int, a slice, a mask, a list, or a tuple of them.
 
-        It has no Parameters of its own where this one learns: gradients go to this one's. Of a frozen one the part is
-        frozen, and shares its values where indexing a tensor does.
+        If this one learns, gradients of the part, which has no Parameters, go to it. The part of a frozen one is
+        frozen, and shares its values if indexing a tensor does.
 
         Raises:
-            TypeError: no batch. IndexError: an index beyond it.
+            TypeError: If it has no batch dims. IndexError: If an index is beyond them.
         """
         self._need_batch("indexed")
         key = index if isinstance(index, tuple) else (index,)
@@ -207,12 +207,12 @@ class BatchedModule(GeometryModule):
         return remade(self, **tensors)
 
     def __len__(self) -> int:
-        """The size of the first batch dim."""
+        """Return the size of the first batch dim."""
         self._need_batch("counted")
         return self.batch_shape[0]
 
     def __iter__(self) -> Iterator[Self]:
-        """Along the first batch dim."""
+        """Iterate along the first batch dim."""
         self._need_batch("iterated over")
         return (self[i] for i in range(self.batch_shape[0]))
 
@@ -221,26 +221,26 @@ class BatchedModule(GeometryModule):
 
     def _need_batch(self, what: str) -> None:
         if not self.batch_shape:
-            raise TypeError(f"{type(self).__name__}: it has no batch dims, and cannot be {what}")
+            raise TypeError(f"{type(self).__name__}: it must have batch dims to be {what}; got a single one")
 
     def detach(self) -> Self:
-        """The same values without a graph: it shares them with this one, and does not learn."""
+        """Return the same values without a graph: the new module shares them with this one, and does not learn."""
         return self.each(Tensor.detach)
 
     def clone(self) -> Self:
-        """A copy whose tensors are its own.
+        """Return a copy whose tensors are its own.
 
-        As of a tensor, gradients of the copy go to this one where it learns; the copy of a fixed one is fixed.
-        `copy.deepcopy` makes Parameters that learn by themselves.
+        As with a tensor, gradients of the copy go to this one if it learns; the copy of a fixed one is fixed.
+        `copy.deepcopy` makes independent Parameters that learn.
         """
         with outside_inference():
             return self.each(torch.clone)
 
     def expand(self, *batch: int | Sequence[int]) -> Self:
-        """The batch of shape `batch` that `torch.Tensor.expand` would give: nothing is copied, and -1 keeps a dim.
+        """Return the batch of shape `batch` as `torch.Tensor.expand` does: nothing is copied, and -1 keeps a dim.
 
         Raises:
-            ValueError: a shape that the batch dims do not expand to.
+            ValueError: If the batch dims do not expand to `batch`.
         """
         sizes: Any = batch[0] if len(batch) == 1 and isinstance(batch[0], Sequence) else batch
         if tuple(sizes) == tuple(self.batch_shape):
@@ -249,19 +249,19 @@ class BatchedModule(GeometryModule):
             return self.each(lambda t: t.expand(*self.batch_shape, t.shape[-1]).expand(*sizes, t.shape[-1]))
         except (RuntimeError, TypeError):
             raise ValueError(
-                f"{type(self).__name__}: batch dims {tuple(self.batch_shape)} do not expand to {shown(tuple(sizes))}"
+                f"{type(self).__name__}: batch must fit dims {tuple(self.batch_shape)}; got {shown(tuple(sizes))}"
             ) from None
 
     def each(self, change: Callable[[Tensor], Tensor]) -> Self:
-        """This module with every one of its tensors (*B, n) changed by the same function."""
+        """Return this module with each of its tensors (*B, n) changed by the same function."""
         return remade(self, **{name: change(getattr(self, name)) for name in self.tensor_names})
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain numbers, strings and lists, as camtorch's JSON has them.
 
         Returns:
-            Of a camera the keys model, intrinsics, distortion_names and distortion if there is any, and image_size; of
-            a pose rotation and translation; and "dtype": "float32" unless it is float64. `from_dict` gives the same
+            For a camera the keys model, intrinsics, image_size, and distortion_names and distortion if there is any;
+            for a pose rotation and translation; and "dtype": "float32" unless it is float64. `from_dict` gives the same
             numbers, to the last bit; whether they learn is not kept.
 
         Raises:
@@ -274,16 +274,16 @@ Made = TypeVar("Made", bound=BatchedModule)
 
 
 def model_of(module: Made) -> type[Made]:
-    """Its class, but of a parametrized one what it was before."""
+    """Return the module's class; for a parametrized module, the class that it had before."""
     return type_before_parametrizations(module) if "parametrizations" in module._modules else type(module)
 
 
 def remade(module: Made, **changes: Any) -> Made:
-    """Return the module with other attributes and tensors, which are `fixed`, neither checked nor copied."""
+    """Return the module with other attributes and tensors, which are `fixed`, but neither checked nor copied."""
     model: Any = model_of(module)
     tensors = {name: changes.pop(name) if name in changes else getattr(module, name) for name in module.tensor_names}
     if torch.compiler.is_compiling() and "image_size" in module.__dict__:
-        # the compiler follows a constructor, and nothing that does without
+        # the compiler follows a constructor, but no way without one
         numbers = [fixed(tensor) for tensor in tensors.values() if tensor.shape[-1]]
         return cast("Made", model(*numbers, image_size=changes.get("image_size", module.image_size)))
     made: Made = model.__new__(model)
@@ -305,21 +305,21 @@ def remade(module: Made, **changes: Any) -> Made:
 
 
 def refused_index(module: BatchedModule, index: Any, error: Exception) -> Exception:
-    """The error of an index that a batch does not take."""
+    """Return the error for an index that a batch does not take."""
     name = type(module).__name__
     if isinstance(error, IndexError):
-        return IndexError(f"{name}: {index!r} of a batch {tuple(module.batch_shape)}: {error}")
-    hint = ". Slices go forwards; a list of rows, as [2, 1, 0], need not" if isinstance(index, slice) else ""
-    return TypeError(f"{name}: a batch is indexed by whole numbers, slices and masks; got {shown(index)}{hint}")
+        return IndexError(f"{name}: index must lie within a batch {tuple(module.batch_shape)}; got {index!r}: {error}")
+    hint = ". Slices go forwards; use a list of rows like [2, 1, 0]" if isinstance(index, slice) else ""
+    return TypeError(f"{name}: index must be whole numbers, slices or masks; got {shown(index)}{hint}")
 
 
 def _widened(value: Tensor) -> Tensor:
-    """In at least float32."""
+    """Return the tensor in at least float32."""
     return value if value.dtype.itemsize >= 4 else value.to(torch.float32)
 
 
 def learning_as(made: Made, source: BatchedModule) -> Made:
-    """What was made of a module while no graph was recorded, with Parameters that learn where those of `source` do."""
+    """Return `made`, made of `source` without a graph, with Parameters that learn if those of `source` do."""
     for name in source.tensor_names:
         its = getattr(made, name)
         if isinstance(its, nn.Parameter):
@@ -328,7 +328,7 @@ def learning_as(made: Made, source: BatchedModule) -> Made:
 
 
 def fixed(tensor: Tensor) -> Tensor:
-    """A Parameter or a tensor of a graph as it is, and any other as a Parameter that does not learn, without a copy."""
+    """Return a Parameter or a tensor of a graph itself; make others Parameters that do not learn, without a copy."""
     if is_parameter(tensor):
         return tensor
     if is_kept(tensor):
@@ -336,11 +336,11 @@ def fixed(tensor: Tensor) -> Tensor:
             return tensor
         if not tensor._base.requires_grad:
             return tensor
-        # a view, taken without a graph, of what learns: torch says that it learns, and it does not
+        # a view, taken without a graph, of a tensor that learns: requires_grad is set, but it does not learn
     return nn.Parameter(tensor, requires_grad=False)
 
 
 def is_parameter(tensor: Tensor) -> bool:
-    """Whether it is an `nn.Parameter`, which torch asks a metaclass."""
+    """Whether `tensor` is an `nn.Parameter`, found out without torch's slow metaclass."""
     kind = type(tensor)
     return kind is nn.Parameter or (kind is not Tensor and isinstance(tensor, nn.Parameter))

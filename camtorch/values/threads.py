@@ -1,4 +1,4 @@
-"""Work that threads share: a caller with the workers of a pool; and work that torch shall not split among its own."""
+"""Work that a caller shares with the workers of a pool, and work that torch must not split among its own threads."""
 
 from __future__ import annotations
 
@@ -23,22 +23,21 @@ R = TypeVar("R")
 
 
 def spread(work: Callable[[], object], threads: int) -> None:
-    """Run work on up to so many threads at once: on this one, and on workers that wait for such.
+    """Run `work` on up to `threads` threads at once: on this one, and on waiting workers.
 
-    The function takes what there is to do from somewhere, piece by piece, mostly without the GIL. A worker that found
-    no core before this thread's own run ends does not begin any more. The first exception of any run is raised after
-    all have ended.
+    Each run takes piece after piece of a shared task, mostly without the GIL. A worker that found no core before this
+    thread's own run ends does not begin any more. The first exception of any run is raised after all runs have ended.
     """
     if threads <= 1 or sys.is_finalizing():  # a new thread would never begin
         work()
         return
     runs: list[_Run] = []
-    with suppress(RuntimeError):  # no more threads for this process, or, from Python 3.12 on, at its end
+    with suppress(RuntimeError):  # the process can have no more threads; from Python 3.12 on, not at its end
         runs.extend(_begin(work) for _ in range(threads - 1))
     try:
         work()
     finally:
-        # workers still write into memory that the caller's frame keeps alive, also where this one is interrupted
+        # also if it is interrupted: workers still write into memory that the caller's frame keeps alive
         begun, interruption = [run for run in runs if not run.take_back()], None
         while begun:
             try:
@@ -55,11 +54,11 @@ def spread(work: Callable[[], object], threads: int) -> None:
             raise run.error
 
 
-_idle: list[SimpleQueue[_Run | None]] = []  # of workers: where each takes what it is to do
+_idle: list[SimpleQueue[_Run | None]] = []  # the queue of each idle worker
 
 
 class _Run:
-    """Of some work on a worker, unless the thread that asks for it takes it back before that begins."""
+    """A run of some work on a worker, unless the thread that asked for it takes it back before it begins."""
 
     def __init__(self, work: Callable[[], object], worker: SimpleQueue[_Run | None]):
         self.work, self.worker, self.ticket, self.ending = work, worker, threading.Lock(), threading.Lock()
@@ -67,7 +66,7 @@ class _Run:
         self.ending.acquire()
 
     def take_back(self) -> bool:
-        """Whether the worker has not begun, and will not; it is idle then, if it has not seen so yet."""
+        """Take the run back if its worker, which is idle then, has not begun it; return whether that is so."""
         taken = self.ticket.acquire(blocking=False)
         if taken:
             _idle.append(self.worker)
@@ -79,12 +78,12 @@ class _Run:
                 self.work()
             except BaseException as error:
                 self.error = error
-            _idle.append(self.worker)  # before anybody hears of the end, who may have more to do
+            _idle.append(self.worker)  # before the waiting thread wakes up, which may have more to do
             self.ending.release()
 
 
 def _begin(work: Callable[[], object]) -> _Run:
-    """On the worker that became idle last, or on a new one."""
+    """Begin work on the worker that became idle last, or on a new one."""
     try:
         worker = _idle.pop()
     except IndexError:
@@ -103,12 +102,12 @@ _started: list[tuple[threading.Thread, SimpleQueue[_Run | None]]] = []
 def _serve(worker: SimpleQueue[_Run | None]) -> None:
     for run in iter(worker.get, None):
         run()
-        del run  # and what it worked on
+        del run  # which frees what it worked on
 
 
 @atexit.register
 def _end() -> None:
-    """A thread that wants the GIL while the interpreter ends is unwound, through torch's frames too, which aborts."""
+    """End the workers: one that waits for the GIL at exit is unwound, through torch's frames too, which aborts."""
     for _, worker in _started:
         worker.put(None)
     for thread, _ in _started:
@@ -116,7 +115,7 @@ def _end() -> None:
 
 
 def _forked() -> None:
-    """The child of a fork has none of the threads."""
+    """Forget the threads: the child of a fork has none of them."""
     _idle.clear()
     _started.clear()
 
@@ -125,13 +124,13 @@ if hasattr(os, "register_at_fork"):  # not on Windows
     os.register_at_fork(after_in_child=_forked)
 
 
-# Each of torch's operations is split among threads and waits until all have done their part: for milliseconds, where
-# another process has the core of one. To a chain of a hundred operations that happens a hundred times. So such chains
+# Each of torch's operations is split among threads and waits until all have done their part: for milliseconds, if
+# another process has the core of one. A chain of a hundred operations waits a hundred times. So such chains
 # run on one thread, or on several that each do a part of their own.
 
 
 def on_one_thread(function: Callable[P, R]) -> Callable[P, R]:
-    """Leave the operations of a function undivided on the CPU; so their results are always the same."""
+    """Return a function whose operations are not split on the CPU, so that its results are always the same."""
 
     @wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> R:
@@ -143,7 +142,7 @@ def on_one_thread(function: Callable[P, R]) -> Callable[P, R]:
         _mine.threads = threads
         openmp, mkl = _limits  # torch.set_num_threads reaches other threads as well
         openmp(1)
-        of_mkl = mkl(1)  # which splits what torch has not split
+        of_mkl = mkl(1)  # MKL splits what torch has not split
         try:
             return function(*args, **kwargs)
         finally:
@@ -155,17 +154,17 @@ def on_one_thread(function: Callable[P, R]) -> Callable[P, R]:
 
 
 def thread_count() -> int:
-    """Of torch on this thread: `torch.get_num_threads()`, also in a function that leaves operations undivided."""
+    """Return `torch.get_num_threads()`, but within an `on_one_thread` function the number outside of it."""
     return _mine.threads or torch.get_num_threads()
 
 
 class _Mine(threading.local):
     threads = 0
-    """Among how many threads operations are split before and after the function `on_one_thread`; 0 in none."""
+    """The number of threads before and after the function `on_one_thread`; 0 outside of one."""
 
 
 def _find_limits() -> tuple[Callable[[int], object], Callable[[int], int]] | None:
-    """How OpenMP, and MKL where it is used, are told among how many threads to split the work of the calling one."""
+    """Return the functions that set the calling thread's number of threads in OpenMP, and in MKL if it is used."""
     if sys.platform == "win32":
         return None
     torch_library = ctypes.CDLL(TORCH_LIBRARY)

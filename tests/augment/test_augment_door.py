@@ -139,7 +139,7 @@ def test_outlines_follow_what_a_box_cannot(camera):
         ("head_pose", torch.diag(torch.tensor([-1.0, 1.0, 1.0, 1.0])).tolist(), "head_pose.*rotation.*det R = .-1.0"),
         ("head_pose", (2 * torch.eye(4)).tolist(), "head_pose must hold rotation matrices"),
         ("pitch_yaw", [10.0, -20.0], "pitch_yaw must be radians.*got 10, -20.*deg2rad"),
-        ("rvec", [0.0, 90.0, 0.0], "rvec.*radians; an angle of 90 seems to be degrees"),
+        ("rvec", [0.0, 90.0, 0.0], "rvec.*radians; got an angle of 90, which seems to be degrees"),
     ],
 )
 def test_labels_in_another_form_are_refused_by_their_name(camera, field, value, said, listed):

@@ -131,7 +131,7 @@ def test_who_takes_it_for_a_camera_is_told_where_those_are():
         (lambda: ct.Dewarp(one), r"Dewarp: camera must be a Camera; got Rig, whose only camera is its \.camera"),
         (lambda: ct.solve_pnp(two, [], []), r"got Rig, whose cameras are rig\['left'\], rig\['right'\]$"),
         (lambda: ct.Dewarp(ct.Rig({})), "got Rig, which has no camera"),
-        (lambda: ct.Dewarp("camera.yml"), r"got str; ct\.load\('camera\.yml'\)\.camera is that of a file"),
+        (lambda: ct.Dewarp("camera.yml"), r"got str; ct\.load\('camera\.yml'\)\.camera loads the camera of a file"),
         (lambda: ct.augment.RandomMount(camera="pinhole"), "got str$"),
     ):
         with pytest.raises(TypeError, match=told):

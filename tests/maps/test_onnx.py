@@ -186,7 +186,7 @@ def test_the_exporter_of_recorded_runs_takes_no_camera(method):
             camera = fisheye()
             return camera.rays()[0] * values.sum() if method == "rays" else getattr(camera, method)(values)
 
-    with pytest.raises(RuntimeError, match=r"KannalaBrandt: .*\(dynamo=False\) cannot record a camera; dynamo=True"):
+    with pytest.raises(RuntimeError, match=r"KannalaBrandt: dynamo must be True in torch.onnx.export.*; got False"):
         legacy_onnx(Network(), (torch.rand(5, 2 + (method == "project")),))
 
 

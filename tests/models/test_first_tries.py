@@ -78,6 +78,6 @@ WIDE = {
 @pytest.mark.parametrize("door", WIDE)
 def test_a_field_of_view_is_in_degrees_at_every_door(door):
     for radians in (1, 2.1, 2 * math.pi):
-        with pytest.raises(ValueError, match=f"fov is in degrees; .*radians.* {math.degrees(radians):.4g} degrees"):
+        with pytest.raises(ValueError, match=f"must be in degrees; .*radians.* {math.degrees(radians):.4g} degrees"):
             WIDE[door](radians)
     WIDE[door](6.5 if "Camera" not in door else 60)

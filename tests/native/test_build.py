@@ -97,7 +97,7 @@ def test_an_error_is_what_the_compiler_said_and_leaves_the_library_that_was(tmp_
 
 
 def test_without_a_compiler_the_error_says_what_was_sought(tmp_path, no_compiler, monkeypatch):
-    with pytest.raises(BuildError, match="no C compiler: none of cc, gcc, clang is on the PATH"):
+    with pytest.raises(BuildError, match="no C compiler: one of cc, gcc, clang must be on the PATH"):
         build(tmp_path, sources=write(tmp_path))
     monkeypatch.setenv("CC", "my-own-cc -m64")
     with pytest.raises(BuildError, match="'my-own-cc'"):

@@ -61,7 +61,7 @@ def held(folder):
 @pytest.mark.parametrize(
     ("environment", "reason"),
     [
-        ({"PATH": "/nowhere"}, "no C compiler: none of cc, gcc, clang is on the PATH, and CC names none"),
+        ({"PATH": "/nowhere"}, "no C compiler: one of cc, gcc, clang must be on the PATH; got none"),
         ({"CAMTORCH_NATIVE": "0"}, "CAMTORCH_NATIVE=0 when it was installed"),
     ],
 )
