@@ -363,7 +363,7 @@ def _members(cameras: Any, owner: str) -> list[Camera]:
             raise ValueError(f"{owner}: cameras[{i}] has batch dims {shape}; cameras are single, or batches of one dim")
     devices = list(dict.fromkeys(str(camera.intrinsics.device) for camera in members))
     if len(devices) > 1:
-        raise ValueError(f"{owner}: the cameras are on {' and '.join(devices)}; camera.to(device) brings them together")
+        raise ValueError(f"{owner}: cameras must be on one device; got {devices}. Move them with .to(device)")
     sizes = list(dict.fromkeys(camera.image_size for camera in members))
     if len(sizes) > 1:
         raise ValueError(
