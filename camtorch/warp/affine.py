@@ -1,4 +1,4 @@
-"""Warps of edited images: mirrored ones, and those whose pixels move by crops, scales, flips and quarter turns."""
+"""Warps of edited images: mirrored images, and images whose pixels move by crops, scales, flips and quarter turns."""
 
 from __future__ import annotations
 
@@ -25,29 +25,29 @@ from camtorch.warp.plan import Route, lengthened, positions, route_of, warped
 from camtorch.warp.sampling import SHRINKS, PaddingMode, Sampler, render
 from camtorch.warp.warp import Warp, checked
 
-_MOST = 8  # times that an image is halved
-_PLAIN = (torch.uint8, torch.float32, torch.float64)  # that torch interpolates as they are
-_WHOLE = 1e-9  # pixels by which the numbers of a map may miss whole ones
-_NEARLY = 1e-6  # and those of the way back
+_MOST = 8  # an image is halved this often at most
+_PLAIN = (torch.uint8, torch.float32, torch.float64)  # torch interpolates these dtypes without a conversion
+_WHOLE = 1e-9  # pixels: a number of a map this close to a whole one counts as whole
+_NEARLY = 1e-6  # pixels: the same for the inverse map
 
 
 Rows = tuple[tuple[float, float, float], tuple[float, float, float]]
 Map = Tensor | Rows
-"""(*B, 2, 3) in float64, from pixels (u, v, 1) to others; one for all that is known while code is traced as numbers."""
+"""(*B, 2, 3) float64, from pixels (u, v, 1) to pixels; `Rows` if one map, known while code is traced, serves all."""
 
 
 class Way(NamedTuple):
-    """How an image is made: copied, or resized by torch, or, without a move and a box, halved and sampled."""
+    """The way an image is made: copied; resized by torch; or, without `move` and `box`, halved and sampled."""
 
     padding_mode: PaddingMode
     halvings: int = 0
-    move: tuple[int, ...] = ()  # of pixels by whole numbers, a map
-    box: tuple[int, ...] = ()  # of whole pixels: left, top, right, bottom
-    flips: tuple[int, ...] = ()  # dims
+    move: tuple[int, ...] = ()  # a map of pixels in whole numbers
+    box: tuple[int, ...] = ()  # left, top, right, bottom in whole pixels
+    flips: tuple[int, ...] = ()  # dims to flip
 
 
 class MirrorWarp(Warp):
-    """A `Warp` whose rotation may be a mirror; with antialias=None it halves images that shrink by more than 1.5."""
+    """A `Warp` whose rotation may be a mirror; antialias=None halves images that shrink by more than 1.5."""
 
     map: Map | None = None
 
@@ -60,7 +60,7 @@ class MirrorWarp(Warp):
         self._halvings: list[int] | None = None
 
     def forward(self, images: Tensor, **how: Any) -> Tensor:
-        """Warped images, as of `Warp.forward`, each in its own way: smaller ones of them where they shrink."""
+        """Warp images as `Warp.forward` does, each row in its own way: images that shrink are resized or halved."""
         sampler = checked(self, images, **how)
         smooth = sampler.mode != "nearest" and images.dtype != torch.bool
         called = torch.compiler.is_compiling() and not torch.onnx.is_in_onnx_export()
@@ -89,11 +89,11 @@ class MirrorWarp(Warp):
         return result
 
     def _depends(self, smooth: bool) -> bool:
-        """Whether the ways depend on what is traced."""
+        """Whether the ways depend on traced values."""
         return self._decides and smooth and self.is_an_operator and not (self.source.is_mixed or self.target.is_mixed)
 
     def _ways(self, sampler: Sampler, smooth: bool, route: Route) -> list[Way] | None:
-        """Return the ways of the rows, or one for all; None for that of any `Warp`."""
+        """Return the way of each row, or one for all; None to sample as any `Warp` does."""
         if not (self._decides and smooth and route == "kept" and are_known(self.target.intrinsics)):
             return None
         if self._halvings is None:
@@ -103,17 +103,17 @@ class MirrorWarp(Warp):
     def _made(
         self, images: Tensor, way: Way, sampler: Sampler, rows: Tensor | None = None, out: Tensor | None = None
     ) -> Tensor:
-        """Return images of one way: these rows, or all. What is not sampled may go to `out`."""
+        """Return images made in one way, of these rows or all; unless they are sampled they may be written to `out`."""
         if way.move:
             result = self._empty(images) if out is None else out
             height, width = result.shape[-2:]
             a, b, left, c, d, top = way.move
             view = images.mT if b else images
             dims = [dim for dim, sign in ((-1, a + b), (-2, c + d)) if sign < 0]
-            if dims:  # torch flips none of those without a sign
-                signed = SIGNED.get(view.dtype)  # a view by a dtype, be it the same, has no gradient
+            if dims:  # torch cannot flip unsigned dtypes
+                signed = SIGNED.get(view.dtype)  # a view by dtype, even the same one, drops the gradient
                 view = view.flip(dims) if signed is None else view.view(signed).flip(dims).view(view.dtype)
-            # of the first pixel of the view
+            # move the origin to the first pixel of the view
             left -= (view.shape[-1] - 1) * (a + b < 0)
             top -= (view.shape[-2] - 1) * (c + d < 0)
             x, y, right, bottom = max(left, 0), max(top, 0), left + view.shape[-1], top + view.shape[-2]
@@ -148,10 +148,10 @@ class MirrorWarp(Warp):
 
 
 class AffineWarp(MirrorWarp):
-    """The image of `source` edited: its pixels move by an affine map, also those that see nothing.
+    """A `Warp` that edits the image of `source`: all its pixels move by an affine map, also those without a ray.
 
-    Whole steps, flips and quarter turns copy pixels, bit by bit. `matrix`, (2, 3) or (B, 2, 3) in float64 and along the
-    axes, maps pixels (u, v, 1) of the source to those of the target, `rotation` is what that does to rays.
+    Whole steps, flips and quarter turns copy pixels bit by bit. `matrix`, (2, 3) or (B, 2, 3) float64 and along the
+    axes, maps source pixels (u, v, 1) to target pixels; `rotation` is its effect on rays.
     """
 
     is_an_operator = False
@@ -165,7 +165,7 @@ class AffineWarp(MirrorWarp):
         own = as_tensor(matrix)
         self.register_buffer("matrix", own.to(source.intrinsics.device), persistent=False)
         self.batch_shape: torch.Size = broadcast_shapes(self.batch_shape, own.shape[:-2])
-        # numbers choose the way, the same on every device: a draw's are on the CPU, and no device is waited for
+        # the way depends on numbers on the CPU alone: it is the same on every device, and waits for none
         self._numbers: list[Rows] = own.reshape(-1, 2, 3).tolist() if own is matrix and are_known(own) else []
         if not isinstance(matrix, Tensor):
             self._numbers = [matrix]
@@ -174,7 +174,7 @@ class AffineWarp(MirrorWarp):
         return {**super().__getstate__(), "map": self.map.detach() if isinstance(self.map, Tensor) else self.map}
 
     def between(self, source: Camera, target: Camera, rotation: Tensor | None, **options: Any) -> Warp:
-        """See `Warp.between`; the map of pixels stays."""
+        """Return this edit between other cameras, with the same map of pixels; see `Warp.between`."""
         return AffineWarp(source, target, self.map, rotation, **options)
 
     def rows_of(self, source: Camera, target: Camera, rotation: Tensor | None, index: list[int]) -> Warp:
@@ -182,12 +182,12 @@ class AffineWarp(MirrorWarp):
         return AffineWarp(source, target, own, rotation, **self.options)
 
     def inverse(self) -> Warp:
-        """The edit back. What it cut off stays lost."""
+        """Return the inverse edit. Pixels that this edit cut off stay lost."""
         rotation = None if self.rotation is None else self.rotation.mT
         return AffineWarp(self.target, self.source, inverted(self.map), rotation, **self.options)
 
     def pin(self) -> Warp:
-        """Nothing: copied and shrunk images ask for no positions, and the others' are kept as they are asked for."""
+        """Return this warp: copies need no sampling positions, and other positions are kept when first computed."""
         return self
 
     def _depends(self, smooth: bool) -> bool:
@@ -236,24 +236,24 @@ class AffineWarp(MirrorWarp):
 
 
 def _resized(images: Tensor, size: Sequence[int], mode: str = "bilinear", flips: tuple[int, ...] = ()) -> Tensor:
-    """Return what torch's antialiased resize makes of images, flipped."""
+    """Return images resized by torch with antialiasing, then flipped."""
     plain = images.dtype in _PLAIN
     made = F.interpolate(images if plain else widen(images), size, mode=mode, align_corners=False, antialias=True)
-    made = made.flip(flips) if flips else made  # before they are of an unsigned dtype, which has no flip
+    made = made.flip(flips) if flips else made  # flip before narrowing: unsigned dtypes have no flip
     return made if plain else narrow(made, images.dtype)
 
 
 def _way(
     rows: Rows, before: tuple[int, int], after: tuple[int, int], padding: PaddingMode, least: float, decides: bool
 ) -> Way:
-    """Return how a map edits an image of a size, to a size; resized by torch if more than `least` pixels become one."""
+    """Return how a map edits images of size `before`; torch resizes them if more than `least` pixels become one."""
     (a, b, left), (c, d, top) = rows
     whole = tuple(round(x) for x in (a, b, left, c, d, top))
     near = all(abs(x - n) < _WHOLE for x, n in zip((a, b, left, c, d, top), whole, strict=True))
     if near and abs(a) + abs(b) == abs(c) + abs(d) == 1 and padding == "zeros":
         return Way(padding, move=whole)
     (a, b, left), (c, d, top) = inverted(rows)
-    # where two opposite corners of the edited image lie, from the corner of the image's pixels
+    # two opposite corners of the edited image, from the outer corner of the source's first pixel
     corners = (-0.5, -0.5), (after[1] - 0.5, after[0] - 0.5)
     ends = [(a * u + b * v + left + 0.5, c * u + d * v + top + 0.5) for u, v in corners]
     (x, right), (y, bottom) = (sorted(places) for places in zip(*ends, strict=True))
@@ -263,20 +263,20 @@ def _way(
     if near and is_inside and b == 0 and max(abs(a), abs(d)) > least:
         return Way(padding, box=box, flips=tuple(dim for dim, sign in ((-1, a), (-2, d)) if sign < 0))
     halvings = _halved((math.hypot(a, c) + math.hypot(b, d)) / 2) if decides else 0
-    # up to the outer edges of its pixels an image ends nowhere
+    # inside of the source, up to the outer edges of its pixels, a target needs no padding
     return Way("border" if is_inside and padding == "zeros" else padding, halvings)
 
 
 def _halved(scale: float) -> int:
-    """Return how often to halve an image so that at most one and a half pixels of it come to one."""
+    """Return how often to halve an image so that at most one and a half of its pixels become one."""
     return min(max(math.ceil(math.log2(max(scale / SHRINKS, 0.5))), 0), _MOST)
 
 
 def _halvings(where: Sampling | Lattice, source: Camera) -> list[int]:
-    """For every camera, how often to halve its image, by pixels of the target in the same places for all routes."""
+    """Return for every camera how often to halve its image, measured at the same target pixels on all routes."""
     first, step = coarse(where.size if isinstance(where, Lattice) else where.grid.shape[1:3])
     if isinstance(where, Lattice) and step >= STEP:
-        planes = where.nodes[..., 2:-3, 2:-3]  # those of the target's pixels
+        planes = where.nodes[..., 2:-3, 2:-3]  # the nodes on the target's pixels
         planes = planes[..., first // STEP :: step // STEP, first // STEP :: step // STEP]
     else:
         grid = where.pixels.grid if isinstance(where, Lattice) else where.grid
@@ -298,7 +298,7 @@ def _halvings(where: Sampling | Lattice, source: Camera) -> list[int]:
 def _edited(
     images: Tensor, source: Camera, target: Camera, rotation: Tensor | None, tolerance: float, *options: Any
 ) -> tuple[Tensor]:
-    """The images of an edit, whose way its values tell; options as of `compiled.warped`."""
+    """Return the images of an edit, made in the way that its values choose; see `compiled.warped` for the options."""
     antialias, _, mode, padding_mode, fill, matrix, is_last = options
     how: Any = {"mode": mode, "padding_mode": padding_mode, "fill": ast.literal_eval(f"({fill},)")}
     how |= {"antialias": ast.literal_eval(antialias), "tolerance": tolerance}
@@ -309,12 +309,12 @@ def _edited(
 
 
 def as_tensor(matrix: Map) -> Tensor:
-    """The map (*B, 2, 3) in float64."""
+    """Return a map as a tensor (*B, 2, 3) in float64."""
     return matrix if isinstance(matrix, Tensor) else torch.tensor(matrix, dtype=torch.float64)
 
 
 def inverted(matrix: Map) -> Any:
-    """(*B, 2, 3): the maps back."""
+    """Return the inverse maps (*B, 2, 3)."""
     rows: Any = matrix.flatten(-2).unbind(-1) if isinstance(matrix, Tensor) else (*matrix[0], *matrix[1])
     a, b, left, c, d, top = rows
     scale = 1 / (a * d - b * c)
@@ -324,7 +324,7 @@ def inverted(matrix: Map) -> Any:
 
 
 def after(second: Map, first: Map) -> Map:
-    """(*B, 2, 3): the first map, then the second."""
+    """Return the maps (*B, 2, 3) that apply `first`, then `second`."""
     if isinstance(second, Tensor) or isinstance(first, Tensor):
         second, first = as_tensor(second), as_tensor(first)
         return second[..., :2] @ first + F.pad(second[..., 2:], (2, 0))
@@ -337,6 +337,6 @@ def after(second: Map, first: Map) -> Map:
 
 
 def on_rays(matrix: Tensor) -> Tensor:
-    """(*B, 3, 3): what maps of pixels do to rays, a mirror or a turn about the axis: their signs."""
+    """Return the effect (*B, 3, 3) of maps of pixels on rays, a mirror or a turn about the axis: the maps' signs."""
     signs = matrix[..., :2].sign()
     return F.pad(signs, (0, 1, 0, 1)) + signs.new_tensor([0.0, 0.0, 1.0]).diag()

@@ -1,4 +1,4 @@
-"""Arrays as tensors, in the memory of the arrays if torch can read it there, and images as arrays again."""
+"""Arrays as tensors, without a copy if torch can read their memory, and images as arrays again."""
 
 from __future__ import annotations
 
@@ -16,54 +16,54 @@ _FEW = 4  # channels
 
 
 def as_tensor(array: object, name: str, owner: str) -> Tensor:
-    """Return a tensor for reading alone, in the memory of an `array` of real numbers if torch can read it there."""
+    """Return an `array` of real numbers as a tensor to read only, without a copy if torch can read its memory."""
     if not isinstance(array, np.ndarray) or array.dtype.kind not in "biuf":
         what = f"dtype {array.dtype}" if isinstance(array, np.ndarray) else type(array).__name__
-        hint = f"; np.array({name}) makes one of it" if hasattr(array, "__array_interface__") else ""
+        hint = f". np.array({name}) makes one" if hasattr(array, "__array_interface__") else ""
         raise TypeError(f"{owner}: {name} must be a numpy array of real numbers; got {what}{hint}")
-    # torch takes neither other byte orders nor long doubles, nor strides that are negative or end within a number
+    # torch has no other byte orders or long doubles, and no strides that are negative or end within a number
     known = array.dtype.isnative and array.itemsize <= 8 and array.flags.aligned
     if not known or any(step < 0 or step % array.itemsize for step in array.strides):
         dtype = array.dtype.newbyteorder("=") if array.itemsize <= 8 else np.dtype(np.float64)
         array, given = np.empty(array.shape, dtype), array
-        # of pixels that run backwards, or whose channels do, all at once would take three times as long
+        # channel by channel is three times as fast for pixels or channels that run backwards
         apart = given.ndim == 3 and given.shape[-1] <= _FEW
         for at in [(..., channel) for channel in range(given.shape[-1])] if apart else [...]:
             array[at] = given[at]
-    elif not array.flags.writeable:  # torch warns of read-only memory, which it would only read
+    elif not array.flags.writeable:  # torch warns about read-only memory, which is only read here
         interface = {**array.__array_interface__, "data": (array.ctypes.data, False)}
         array = np.asarray(SimpleNamespace(__array_interface__=interface, owner=array))
     return torch.from_numpy(array)
 
 
 def as_planes(array: object, name: str, owner: str, size: tuple[int, int] | None = None) -> Tensor:
-    """Return an image (C, H, W) of an array (H, W, C) or (H, W), which should be of that size."""
+    """Return an array (H, W, C) or (H, W) as an image (C, H, W); raise if `size` shows that its channels come first."""
     tensor = as_tensor(array, name, owner)
     shape = tuple(tensor.shape)
     if len(shape) not in (2, 3) or (size == shape[1:] and size != shape[:2]):
-        hint = ", which has its channels first: np.moveaxis(image, 0, -1) puts them last" if len(shape) == 3 else ""
+        hint = ", with the channels first. np.moveaxis(image, 0, -1) puts them last" if len(shape) == 3 else ""
         raise ValueError(f"{owner}: {name} must be (H, W, C) or (H, W); got shape {shape}{hint}")
     return tensor.permute(2, 0, 1) if tensor.ndim == 3 else tensor[None]
 
 
 def plain(tensor: Tensor) -> Array:
-    """Return a tensor as an array, in its memory if that is the CPU's."""
+    """Return a tensor as an array, without a copy if it is on the CPU."""
     return tensor.detach().cpu().numpy()
 
 
 def as_array(image: Tensor, like: Array) -> Array:
-    """Return an image (C, H, W) in the layout and the dtype of `like`: without a copy if its channels are last too."""
+    """Return an image (C, H, W) in the layout and the dtype of `like`, without a copy if its memory has them."""
     planes = plain(image)
     return np.ascontiguousarray(planes.transpose(1, 2, 0) if like.ndim == 3 else planes[0], like.dtype)
 
 
 def as_planes_of(image: Any, name: str, owner: str) -> tuple[Tensor, Callable[[Tensor], Any]]:
-    """Return an array or a PIL image as planes (C, H, W), and what makes planes one of its kind."""
+    """Return an array or a PIL image as planes (C, H, W), and a function from planes to an image of its kind."""
     mode = None if isinstance(image, np.ndarray) else getattr(image, "mode", None)
     if mode in ("1", "P", "PA"):
         raise ValueError(
-            f"{owner}: values between those of a PIL image of mode {mode!r} mean nothing; "
-            "image.convert('RGB') makes it an image, tv_tensors.Mask(image) labels"
+            f"{owner}: {name} must be an image whose values can be averaged; got a PIL image of mode {mode!r}. "
+            "image.convert('RGB') makes one, tv_tensors.Mask(image) makes labels of it"
         )
     array = image if mode is None else np.asarray(image)
 

@@ -1,4 +1,4 @@
-"""Boxes and polygons that a warp moves: enough points along their edges to follow them where a lens bends them."""
+"""Boxes and polygons moved by a warp, which may bend their edges: points along the edges are moved."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from camtorch.values.arguments import Numbers, as_coordinates, as_values, as_who
 from camtorch.warp.pair import CameraPair
 from camtorch.warp.panorama import PANORAMAS
 
-_EDGE_SAMPLES = 64  # per edge: one of 500 px bent to a radius of 300 px is then enclosed to 0.03 px
-_ROUNDED = 1e-3  # pixels from the edges of panoramas, where rounding would take rays away
-_LATTICE = 16  # steps across and down the target, between points that are looked for in what a polygon encloses
+_EDGE_SAMPLES = 64  # per edge: this encloses 500 px bent to a radius of 300 px to 0.03 px
+_ROUNDED = 1e-3  # pixels from a panorama's edges, where rounding would cost rays
+_LATTICE = 16  # steps across and down the target, between points that are tested against a polygon
 
 
 def moved_boxes(warp: CameraPair, boxes: Numbers) -> tuple[Tensor, Tensor]:
-    """See `Warp.transform_boxes`."""
+    """Return boxes moved by a warp, and whether they are valid; see `Warp.transform_boxes`."""
     boxes = as_values(boxes, "boxes", "Warp", warp.source.intrinsics.device)
     if boxes.ndim == 0 or boxes.shape[-1] != 4:
         raise ValueError(f"Warp: boxes must be (B, *N, 4) = x1, y1, x2, y2; got shape {tuple(boxes.shape)}")
@@ -33,7 +33,7 @@ def moved_boxes(warp: CameraPair, boxes: Numbers) -> tuple[Tensor, Tensor]:
 
 
 def enclosed(warp: CameraPair, corners: Tensor) -> tuple[Tensor, Tensor]:
-    """See `Warp.enclose`."""
+    """Return the boxes that enclose moved polygons, and whether they are valid; see `Warp.enclose`."""
     corners = as_coordinates(corners, "corners", 2, "Warp", warp.source.intrinsics.device, "B, *N, K")
     if corners.ndim < 2:
         raise ValueError(f"Warp: corners must be (B, *N, K, 2); got shape {tuple(corners.shape)}")
@@ -47,7 +47,7 @@ def enclosed(warp: CameraPair, corners: Tensor) -> tuple[Tensor, Tensor]:
     plain = valid & mapped.all(-1) & (_area(corners) * _area(moved) > 0)
     if isinstance(warp.target, PANORAMAS) or not known_true(plain):
         lattice, inside = _inside(warp, corners, moved)
-        inside = inside & finite & (isinstance(warp.target, PANORAMAS) | ~plain.unsqueeze(-1))  # each row by itself
+        inside = inside & finite & (isinstance(warp.target, PANORAMAS) | ~plain.unsqueeze(-1))  # row by row
         some, valid = some | inside.any(-1), valid | inside.any(-1)
         inside = inside.unsqueeze(-1)
         low = torch.minimum(low, torch.where(inside, lattice, torch.inf).amin(-2))
@@ -56,12 +56,12 @@ def enclosed(warp: CameraPair, corners: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def edges_of(boxes: Tensor) -> Tensor:
-    """(..., N, 2): the points along the edges of boxes (..., 4) that are moved to enclose them."""
+    """Return the points (..., N, 2) along the edges of boxes (..., 4) that a warp moves to enclose them."""
     return along_edges(corners_of(boxes), _EDGE_SAMPLES)
 
 
 def enclosing(boxes: Tensor, moved: Tensor, on_image: Tensor) -> tuple[Tensor, Tensor] | None:
-    """Return `moved_boxes` of plain boxes (..., 4) whose `edges_of` went to `moved` (..., N, 2); None if not whole."""
+    """Return `moved_boxes` of plain boxes (..., 4) whose `edges_of` moved to `moved` (..., N, 2); None if not whole."""
     places, seen, given = moved.numpy(), on_image.numpy(), boxes.numpy()
     if not seen.all() and not (seen.any(-1).all() and (seen | (places != -1).any(-1)).all()):
         return None
@@ -75,7 +75,7 @@ def enclosing(boxes: Tensor, moved: Tensor, on_image: Tensor) -> tuple[Tensor, T
 
 
 def lattice_of(corners: Tensor, steps: int) -> Tensor:
-    """(..., steps * steps, 2): points all over quadrilaterals (..., 4, 2), row by row from the first edge."""
+    """Return points (..., steps * steps, 2) all over quadrilaterals (..., 4, 2), row by row from the first edge."""
     share = torch.linspace(0, 1, steps, dtype=corners.dtype, device=corners.device)[:, None]
     one, two, three, four = corners.unsqueeze(-2).unbind(-3)
     left, right = (one + (four - one) * share).unsqueeze(-2), (two + (three - two) * share).unsqueeze(-2)
@@ -83,7 +83,7 @@ def lattice_of(corners: Tensor, steps: int) -> Tensor:
 
 
 def turned(lattice: Tensor, mirrored: bool = False) -> Tensor:
-    """Return corners (..., 4, 2) of rectangles along the middle rows of moved lattices, which a mirror turns; or -1."""
+    """Return rectangles (..., 4, 2) along the middle rows of moved lattices, which a mirror turns; -1 for none."""
     steps = math.isqrt(lattice.shape[-2])
     middle = lattice.unflatten(-2, (steps, steps))[..., steps // 2, steps // 2 - 1 : steps // 2 + 2, :]
     found, known = (lattice != -1).any(-1), (middle != -1).any(-1)[..., [0, 2]].all(-1)
@@ -97,7 +97,7 @@ def turned(lattice: Tensor, mirrored: bool = False) -> Tensor:
 
 
 def _inside(warp: CameraPair, corners: Tensor, like: Tensor) -> tuple[Tensor, Tensor]:
-    """Return a lattice (N, 2) over the target, and (B, *M, N): which of its points show what polygons enclose."""
+    """Return a lattice (N, 2) over the target, and whether (B, *M, N) polygons enclose the scene at its points."""
     height, width = warp.target._size_for("Warp")
     share = torch.linspace(0, 1, _LATTICE + 1, dtype=like.dtype, device=like.device)
     if isinstance(warp.target, PANORAMAS):
@@ -112,31 +112,31 @@ def _inside(warp: CameraPair, corners: Tensor, like: Tensor) -> tuple[Tensor, Te
 
 
 def corners_of(boxes: Tensor) -> Tensor:
-    """(..., 4, 2): the corners of boxes (..., 4) of x1 y1 x2 y2, clockwise from (x1, y1)."""
+    """Return the corners (..., 4, 2) of boxes (..., 4) of x1 y1 x2 y2, clockwise from (x1, y1)."""
     x1, y1, x2, y2 = boxes.unbind(-1)
     return torch.unflatten(torch.stack((x1, y1, x2, y1, x2, y2, x1, y2), -1), -1, (4, 2))
 
 
 def in_order(boxes: Tensor) -> Tensor:
-    """(...) bool: whether boxes (..., 4) have x1 <= x2 and y1 <= y2; those of x, y, width, height seldom do."""
+    """Whether (...) boxes (..., 4) have x1 <= x2 and y1 <= y2, as boxes of x, y, width, height seldom do."""
     return (boxes[..., :2] <= boxes[..., 2:]).all(-1)
 
 
 def along_edges(corners: Tensor, samples: int) -> Tensor:
-    """(..., samples * K, 2): even steps along the edges of closed polygons (..., K, 2), the corners among them."""
+    """Return points (..., samples * K, 2) at even steps along the edges of polygons (..., K, 2), with their corners."""
     share = torch.linspace(0, 1, samples + 1, dtype=corners.dtype, device=corners.device)[:-1, None]
     start, end = corners.unsqueeze(-2), corners.roll(-1, -2).unsqueeze(-2)
     return (start + (end - start) * share).flatten(-3, -2)
 
 
 def _area(corners: Tensor) -> Tensor:
-    """(...): of polygons (..., K, 2), negative for those that go round the other way."""
+    """Return the areas (...) of polygons (..., K, 2), negative if they run counter-clockwise on the image."""
     (x, y), (next_x, next_y) = corners.unbind(-1), corners.roll(-1, -2).unbind(-1)
     return (x * next_y - next_x * y).sum(-1) / 2
 
 
 def within(corners: Tensor, points: Tensor) -> Tensor:
-    """(..., N) bool: whether points (..., N, 2) are inside closed polygons (..., K, 2), by the edges to their right."""
+    """Whether (..., N) points (..., N, 2) are inside closed polygons (..., K, 2): counts the edges to their right."""
     x, y = points.unsqueeze(-2).unbind(-1)
     x1, y1 = corners.unsqueeze(-3).unbind(-1)
     across, down = x1.roll(-1, -1) - x1, y1.roll(-1, -1) - y1
@@ -147,7 +147,7 @@ def within(corners: Tensor, points: Tensor) -> Tensor:
 
 
 def outlines(boxes: Tensor, samples: int = 16) -> Tensor:
-    """The outlines of boxes, as polygons that an augmentation moves point by point.
+    """Return the outlines of boxes, as polygons that an augmentation moves point by point.
 
     At the rim of a fisheye a box that encloses its warped outline is mostly background; the outline is not.
 
@@ -156,7 +156,7 @@ def outlines(boxes: Tensor, samples: int = 16) -> Tensor:
         samples: points on each edge.
 
     Returns:
-        (..., 4 * samples, 2).
+        polygons (..., 4 * samples, 2).
     """
     boxes = as_coordinates(boxes, "boxes", 4, "outlines", means=" = x1, y1, x2, y2")
     return along_edges(corners_of(boxes), as_whole(samples, "samples", "outlines", least=1))

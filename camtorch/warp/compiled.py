@@ -1,4 +1,4 @@
-"""What compiled code calls instead of tracing it: a warp of images, and the positions of one with a tolerance."""
+"""Operators that compiled code calls instead of tracing: a warp of images, and sampling positions with a tolerance."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ from camtorch.warp.sampling import MODES, PADDINGS, Sampler, render
 def positions(
     source: Camera, target: Camera, rotation: Tensor | None, tolerance: float, padding: str
 ) -> tuple[Tensor, Tensor]:
-    """`grid.tabulate` of all pixels, between cameras that do not learn."""
+    """Return `grid.tabulate` of all pixels, between cameras that do not learn."""
     planes, mapped = _positions(source, target, rotation, tolerance, padding)
     return planes.movedim(1, -1), mapped
 
 
 def _count(rotation: Tensor | None, *numbers: Tensor) -> int:
-    """How many cameras there are, of rotations (*B, 3, 3) and numbers (*B, n)."""
+    """Return the number of cameras, of rotations (*B, 3, 3) and numbers (*B, n)."""
     shapes = [t.shape[:-1] for t in numbers] + ([] if rotation is None else [rotation.shape[:-2]])
     return math.prod(broadcast_shapes(*shapes))
 
@@ -46,13 +46,13 @@ def _shapes(source: CameraNumbers, target: CameraNumbers, rotation: Tensor | Non
 def _positions(
     source: Camera, target: Camera, rotation: Tensor | None, tolerance: float, padding: str
 ) -> tuple[Tensor, Tensor]:
-    """The positions: planes (B or 1, 2, H', W'), and (B or 1, H', W') bool."""
+    """Return the positions, planes (B or 1, 2, H', W'), and whether they are mapped, (B or 1, H', W') bool."""
     grid, mapped = tabulate(source, target, rotation, tolerance, padding=padding)
     return grid.movedim(-1, 1).contiguous(), mapped.contiguous()
 
 
 def takes(images: Tensor, inputs: Sequence[Tensor]) -> bool:
-    """Whether the operator makes images whose positions depend on `inputs` in compiled code: on the CPU, no graph."""
+    """Whether compiled code calls the operator for positions that depend on `inputs`: on the CPU, with no graph."""
     return all(t.is_cpu and not (t.requires_grad and torch.is_grad_enabled()) for t in (images, *inputs))
 
 
@@ -68,9 +68,9 @@ def warped(
     matrix: Tensor | None = None,
     by: Callable[..., tuple[Tensor, ...]] | None = None,
 ) -> Tensor:
-    """Return images (B, C, h, w) of a warp, or of an edit `by` another operator, which has a map; see `Warp`."""
+    """Return warped images (B, C, h, w); an edit passes its `matrix` and, in `by`, its own operator. See `Warp`."""
     turned = None if rotation is None else rotation.detach()
-    # numbers as words: integers of fills may be ids, which no float holds
+    # numbers travel as strings: a fill may be an id, which no float holds
     options = str(antialias), padding, how.mode, how.padding_mode, ",".join(map(repr, how.fill))
     is_last = str(layout(images) == torch.channels_last)
     given = (*options, matrix, is_last) if by else (*options, is_last)
@@ -86,20 +86,20 @@ def laid(images: Tensor, is_last: str) -> Tensor:
 def warp_shapes(
     images: Tensor, source: CameraNumbers, target: CameraNumbers, rotation: Tensor | None, *options: Any
 ) -> tuple[Tensor]:
-    """Return the form of what an operator makes of images, between cameras of these numbers."""
+    """Return an empty tensor for an operator's result, of images between cameras of these numbers."""
     count = _count(rotation, *source[:2], *target[:2])
     result = images.new_empty(images.shape[0] if count == 1 else count, images.shape[1], *target.image_size)
     return (laid(result, options[-1]),)
 
 
-_located = Kept(2)  # masks are warped after their images, and cameras may be still
+_located = Kept(2)  # masks are warped after their images, and cameras may stay the same
 
 
 @opaque(warp_shapes)
 def _warp(
     images: Tensor, source: Camera, target: Camera, rotation: Tensor | None, tolerance: float, *options: str
 ) -> tuple[Tensor]:
-    """The images (B, C, h, w), plane by plane or with their channels last in memory; options as of `warped`."""
+    """Return images (B, C, h, w), plane by plane or with their channels last in memory; see `warped`."""
     antialias, padding, mode, padding_mode, fill, is_last = options
 
     def positions() -> Sampling | Lattice:

@@ -25,12 +25,12 @@ _WIDEST_STEREOGRAPHIC = 4 * math.tan(math.radians(55))  # beyond 220 degrees it 
 
 
 def _stereographic(intrinsics: Tensor, image_size: tuple[int, int] | None = None) -> UCM:
-    """The unified camera of alpha = 1/2: r = 2 f tan(theta / 2)."""
+    """Return a unified camera of alpha = 1/2: r = 2 f tan(theta / 2)."""
     alpha = nn.Parameter(intrinsics.new_full((*intrinsics.shape[:-1], 1), 0.5), requires_grad=False)
     return UCM(intrinsics, alpha, image_size=image_size)
 
 
-# projection: the model, and the widest and the tallest range of its plane that is chosen without being asked for
+# projection: the model, and the widest and the tallest range of its plane that is chosen without a `fov`
 _PROJECTIONS: dict[str, tuple[Callable[..., Camera], float, float]] = {
     "perspective": (Pinhole, _WIDEST_PERSPECTIVE, _WIDEST_PERSPECTIVE),
     "stereographic": (_stereographic, _WIDEST_STEREOGRAPHIC, _WIDEST_STEREOGRAPHIC),
@@ -41,36 +41,39 @@ _PLANES: dict[str, tuple[float, Callable[[float], float]]] = {
     "perspective": (180, lambda angle: 2 * math.tan(angle / 2)),
     "stereographic": (359, lambda angle: 4 * math.tan(angle / 4)),
 }
-"""Those that go on in all directions: below which fov, and how wide the plane of a fov in radians is."""
+"""Projections with an infinite plane: their limit of fov in degrees, and the plane's width for a fov in radians."""
 _LINE_SAMPLES = 257
-_SEAM = 1e-3  # radians beside it
+_SEAM = 1e-3  # radians to either side of it
 
 
 class Dewarp(Warp):
-    """Undistort images: a `Warp` from `camera` to an undistorted camera that it chooses, `dewarp.target`.
+    """A `Warp` that undistorts images: from `camera` to an undistorted camera that it chooses, `dewarp.target`.
+
+    >>> camera = ct.KannalaBrandt([80.0, 80.0, 63.5, 47.5], [0.02, -0.01, 0.0, 0.0], image_size=(96, 128))
+    >>> ct.Dewarp(camera, fov=90)(torch.zeros(8, 3, 96, 128)).shape
+    torch.Size([8, 3, 96, 128])
 
     Args:
-        camera: the camera of the given images, with image_size; with a batch dim the target gets one as well.
+        camera: the camera of the given images, with image_size; a batch of cameras gives a batch of targets.
         projection: "perspective" (straight lines stay straight; up to about 120 degrees), "stereographic" (small shapes
-            keep their form at the rim too, as faces do; wide views), "cylindrical" (vertical lines stay straight; wide
+            such as faces keep their form at the rim; wide views), "cylindrical" (vertical lines stay straight; wide
             views) or "equirectangular" (everything).
         fov: horizontal field of view of the target in degrees, centred on its axis. By default the target shows
-            what the image's middle row and column show, and never more than 120 degrees in perspective, 220 in
-            stereographic. A panorama is then as wide as the middle row, so that it has no empty sides, and a whole turn
-            where that is one; for how far it shows up and down its image_size has the say.
-        image_size: (height, width) of the target; the source's by default.
+            what the image's middle row and column show, up to 120 degrees in perspective and 220 in stereographic.
+            A panorama is then as wide as the middle row, or a whole turn, and its height follows from image_size.
+        image_size: (height, width) of the target; default: the source's.
         rotation: (3, 3) or (B, 3, 3), `ray_target = R ray_source`: where the target looks.
-        mode, padding_mode, fill, antialias, tolerance: as `Warp` takes them.
+        mode, padding_mode, fill, antialias, tolerance: as in `Warp`.
 
-    The target has square pixels, is chosen once, and does not learn. It is finite for every camera, also where the
+    The target has square pixels, is chosen once, and does not learn. It is finite for every camera, even if the
     lens folds inside the image or sees past 90 degrees.
 
     Raises:
-        ValueError: an unknown projection, a fov that is not below 180 degrees for perspective, 359 for stereographic,
-            or up to 360, one up to 2 pi, which seems to be in radians, and as `Warp`.
+        ValueError: If the projection is unknown, or fov is not below 180 degrees for perspective, below 359 for
+            stereographic, up to 360 for others, or is up to 2 pi and may be in radians; and as `Warp`.
     """
 
-    @hinting("It takes a camera, as ct.KannalaBrandt.from_matrix(K, D, image_size=size); fov says how much it shows")
+    @hinting("It takes a camera, as ct.KannalaBrandt.from_matrix(K, D, image_size=size); fov is how much it shows")
     def __init__(
         self,
         camera: Camera,
@@ -102,13 +105,13 @@ class Dewarp(Warp):
 
 
 def _fitted(camera: Camera, projection: str, size: tuple[int, int], rotation: Tensor | None) -> Tensor:
-    """(*B, 4): the target that shows what the middle row and column of the camera's image show; see `Dewarp`."""
+    """Return the intrinsics (*B, 4) of the target that shows what the image's middle row and column show."""
     model, widest, tallest = _PROJECTIONS[projection]
     plane = model(camera.intrinsics.new_tensor([1.0, 1.0, 0.0, 0.0]))
     limit = plane.intrinsics.new_tensor([widest, tallest]) / 2
     target = limit.new_tensor([size[1], size[0]])
     (across, of_across), (down, of_down) = middle_lines(camera, rotation, plane, limit, _LINE_SAMPLES)
-    if projection in _PLANES:  # either line counts both ways
+    if projection in _PLANES:  # both lines count both ways
         points, shown = torch.cat((across, down), -2), torch.cat((of_across, of_down), -1)
         shown = shown.unsqueeze(-1).expand(points.shape)
     else:  # over a pole the longitude jumps
@@ -119,7 +122,7 @@ def _fitted(camera: Camera, projection: str, size: tuple[int, int], rotation: Te
     low = torch.where(some, torch.where(shown, points, torch.inf).amin(-2), -1.0)
     high = torch.where(some, torch.where(shown, points, -torch.inf).amax(-2), 1.0)
     if projection not in _PLANES:
-        # (*B,) bool: the image shows what is on both sides of the seam of a panorama, which is then a whole turn
+        # a panorama whose seam the image shows on both sides is a whole turn
         rays = camera.intrinsics.new_tensor([[-_SEAM, 0.0, -1.0], [_SEAM, 0.0, -1.0]])
         rays = rays if rotation is None else rays @ rotation.to(rays.dtype)
         batch = broadcast_shapes(camera.batch_shape, rays.shape[:-2])
@@ -128,7 +131,7 @@ def _fitted(camera: Camera, projection: str, size: tuple[int, int], rotation: Te
         ends = torch.stack((whole, torch.zeros_like(whole)), -1)
         low, high = torch.where(ends, -limit, low), torch.where(ends, limit, high)
     extent = torch.maximum(high - low, 1e-3 * limit)
-    if projection in _PLANES:  # all that is shown fits in, unless that takes a wider image than the widest
+    if projection in _PLANES:  # all that is shown fits, unless the target would be wider than the widest
         focal = torch.maximum((target / extent).amin(-1), (target / (2 * limit)).amax(-1)).unsqueeze(-1)
     else:
         focal = (target / extent)[..., :1]
@@ -139,16 +142,16 @@ def _fitted(camera: Camera, projection: str, size: tuple[int, int], rotation: Te
 def middle_lines(
     camera: Camera, rotation: Tensor | None, plane: Camera, limit: Tensor, samples: int
 ) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]]:
-    """Return an image's middle row and column on a projection's plane, (*B, N, 2) and shown (*B, N), level first.
+    """Return the middle row and column on a projection's plane, (*B, N, 2) and shown (*B, N), the level one first.
 
-    Corners would have a wide lens fill a panorama with what hardly any pixel shows. The plane is cut at the limit (2,).
+    With corners, a wide lens would fill a panorama with rays of few pixels. Points are clamped to `limit` (2,).
     """
     found = []
     for line in (image_lattice(camera, 3, 3)[1], image_lattice(camera, 3, 3)[:, 1]):
         start, along = line[0], line[2] - line[0]
         share = torch.linspace(0, 1, samples).to(start).expand(*camera.batch_shape, samples)
         every = []
-        for _ in range(4):  # all of it, then what lies around its ends: where a lens folds, angles change fast
+        for _ in range(4):  # the whole line, then around its ends: near a fold angles change fast
             rays, has_ray = camera.unproject(start + share[..., None] * along)
             rays = rays.to(plane.intrinsics.dtype)
             points, valid = plane.project(rays if rotation is None else rays @ rotation.mT.to(rays.dtype))

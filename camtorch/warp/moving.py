@@ -26,7 +26,7 @@ def between(start: Camera, end: Camera, rotation: Tensor | None, like: Tensor) -
 def moved_pixels(
     start: Camera, end: Camera, rotation: Tensor | None, pixels: Numbers, on_image: bool = False
 ) -> tuple[Tensor, Tensor]:
-    """Return pixels (B, *N, 2), or (*N, 2), of one camera as another's, (-1, -1) for none, and whether there is one."""
+    """Return pixels (B, *N, 2) or (*N, 2) of `start` as pixels of `end`, (-1, -1) for none, and their validity."""
     if isinstance(pixels, Tensor) and pixels.ndim > 0 and pixels.shape[-1] == 2:
         ready = between(start, end, rotation, pixels)
         if ready is not None and ((pixels.ndim > 1 and pixels.shape[0] == ready.cameras) or not ready.is_batch):

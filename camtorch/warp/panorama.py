@@ -1,4 +1,4 @@
-"""Panoramas of a whole turn: images that a warp makes longer, by what lies beyond the edges that meet."""
+"""Panoramas of a whole turn: a warp extends their images beyond the edges that meet."""
 
 from __future__ import annotations
 
@@ -13,26 +13,26 @@ from camtorch.evaluate.known import values_of
 from camtorch.models import Cylindrical, Equirectangular, LatLon, TransverseCylindrical
 from camtorch.values.module import remade
 
-_NEAR = 0.05  # pixels by which a whole turn may miss the edges: a focal length of two decimals does by 0.03
-_RIM = 16  # pixels beyond an edge: what bicubic samples of images that are halved three times read
+_NEAR = 0.05  # pixels by which a whole turn may miss the edges: a focal length of two decimals misses by 0.03
+_RIM = 16  # pixels beyond an edge: bicubic samples of images halved three times read so far
 _SPHERES = Equirectangular, LatLon
 _DOWN = LatLon, TransverseCylindrical
 PANORAMAS = Equirectangular, Cylindrical, *_DOWN
 
 
 class Seam(NamedTuple):
-    """By how much images of a whole turn become longer."""
+    """Pixels by which images of a whole turn are extended."""
 
     axis: int  # 0: the turn goes across, so that left and right meet; 1: down, so that top and bottom do
     rims: tuple[int, int, int, int]  # pixels on the left, right, top and bottom
 
     def around(self, images: Tensor) -> Tensor:
-        """Return images (B, C, H, W) with the pixels that lie beyond their edges."""
+        """Return images (B, C, H, W) extended beyond their edges."""
         if self.axis:
             return Seam(0, (*self.rims[2:], *self.rims[:2])).around(images.mT).mT
         left, right, top, bottom = self.rims
         width, rows = images.shape[-1], [images]
-        # beyond a pole lies what is half a turn on, upside down
+        # beyond a pole the image goes on half a turn away, upside down
         order = torch.arange(max(top, bottom) - 1, -1, -1, device=images.device)
         if top:
             rows.insert(0, images[..., :top, :].roll(width // 2, -1)[..., order[-top:], :])
@@ -42,7 +42,7 @@ class Seam(NamedTuple):
         return torch.cat((images[..., -left:], images, images[..., :right]), -1)
 
     def before(self, camera: Camera) -> Camera:
-        """Return the camera of these longer images."""
+        """Return the camera of the extended images."""
         left, right, top, bottom = self.rims
         height, width = camera._size_for("Warp")
         intrinsics = camera.intrinsics + camera.intrinsics.new_tensor([0.0, 0.0, left, top])
@@ -50,14 +50,14 @@ class Seam(NamedTuple):
         return remade(camera, intrinsics=intrinsics, distortion=camera.distortion, image_size=size)
 
     def on_image(self, grid: Tensor, size: tuple[int, int]) -> Tensor:
-        """Return positions (..., 2) on the longer images as those on the images of a size."""
+        """Return positions (..., 2) on the extended images as positions on the images of a size."""
         (height, width), (left, right, top, bottom) = size, self.rims
         scale = grid.new_tensor([(left + width + right) / width, (top + height + bottom) / height])
         return grid * scale + grid.new_tensor([(right - left) / width, (bottom - top) / height])
 
 
 def seam_of(camera: Camera) -> Seam | None:
-    """Return by how much images of a whole turn become longer, or None; traced, what it was before."""
+    """Return how far a camera's whole-turn images are extended, or None; in traced code, the last result."""
     if not isinstance(camera, PANORAMAS):
         return None
     numbers = values_of(camera.intrinsics)
@@ -89,7 +89,7 @@ def _found(camera: Camera, numbers: Tensor) -> Seam | None:
 
 
 def goes_round(camera: Camera) -> Tensor | None:
-    """Return the numbers (C, 4) of a panorama whose images show a whole turn, or more of it; None for other cameras."""
+    """Return the numbers (C, 4) of a panorama whose images show a whole turn or more; None for other cameras."""
     if not isinstance(camera, PANORAMAS) or (numbers := values_of(camera.intrinsics)) is None:
         return None
     axis, numbers = int(isinstance(camera, _DOWN)), numbers.reshape(-1, 4)
@@ -97,7 +97,7 @@ def goes_round(camera: Camera) -> Tensor | None:
 
 
 def lengths(camera: Camera, steps: tuple[Tensor, Tensor], grid: tuple[Tensor, Tensor]) -> Tensor:
-    """Return the lengths (B, h, w) of steps on a camera's image in pixels; on a panorama as in the scene."""
+    """Return the lengths (B, h, w) of steps on a camera's image in pixels; on a panorama, as in the scene."""
     if (numbers := goes_round(camera)) is None:
         return torch.hypot(*steps)
     axis, sides = int(isinstance(camera, _DOWN)), camera._size_for("Warp")[::-1]
@@ -111,7 +111,7 @@ def lengths(camera: Camera, steps: tuple[Tensor, Tensor], grid: tuple[Tensor, Te
 
 
 def off_poles(camera: Camera, rays: Tensor) -> Tensor:
-    """Return rays (..., 3) off the poles of a sphere, for which its image has a row of pixels and its model none."""
+    """Return rays (..., 3) moved off the poles of a sphere, where its image has a row of pixels and its model none."""
     if not isinstance(camera, _SPHERES):
         return rays
     axis, planes = int(isinstance(camera, _DOWN)), list(rays.unbind(-1))
@@ -122,7 +122,7 @@ def off_poles(camera: Camera, rays: Tensor) -> Tensor:
 
 
 def within_turn(camera: Camera, pixels: Tensor) -> Tensor:
-    """Return pixels ([B,] h, w, 2), those of a whole turn as those for which the model has rays."""
+    """Return pixels ([B,] h, w, 2); those of a whole turn are wrapped to pixels for which the model has rays."""
     if seam_of(camera) is None:
         return pixels
     axis, sides = int(isinstance(camera, _DOWN)), camera._size_for("Warp")[::-1]
@@ -130,6 +130,6 @@ def within_turn(camera: Camera, pixels: Tensor) -> Tensor:
     numbers = numbers.reshape(*numbers.shape[:-1], *[1] * (pixels.ndim - numbers.ndim), 4)
     offset = planes[axis] - numbers[..., 2 + axis]
     offset = offset - (offset / sides[axis]).round() * sides[axis]
-    end = math.pi * (1 - 8 * torch.finfo(numbers.dtype).eps) * numbers[..., axis]  # itself it is rounded beyond
+    end = math.pi * (1 - 8 * torch.finfo(numbers.dtype).eps) * numbers[..., axis]  # pi itself is rounded beyond the end
     planes[axis] = numbers[..., 2 + axis] + torch.maximum(torch.minimum(offset, end), -end)
     return torch.stack(torch.broadcast_tensors(*planes), -1)

@@ -1,4 +1,4 @@
-"""Images of a plane: from where another camera stands, or from above."""
+"""Images of a plane, as another camera sees it or from above."""
 
 from __future__ import annotations
 
@@ -17,30 +17,30 @@ from camtorch.warp.proxy import ProxyWarp, beside
 from camtorch.warp.sampling import WarpOptions
 from camtorch.warp.views import pinhole
 
-_GRAZING = 1e-9  # the cosine of a ray to the plane's normal from which on it does not meet the plane
+_GRAZING = 1e-9  # a ray of a smaller cosine to the plane's normal does not meet the plane
 
 
 class PlaneWarp(ProxyWarp):
-    """The image that `target` would see of a plane, made from the image of `source`, which stands elsewhere.
+    """A `Warp` of the image of a plane, from camera `source` to camera `target` at another place.
 
-    What lies on the plane is where it should be; what rises above it is smeared, as in every image of that kind. For
+    Points on the plane are exact; objects above it are smeared, as in every such image. For
     pinholes it is the homography K_s (R + t n^T / d) K_t^-1; for other cameras it is exact as well. Points and boxes
     move along. Differentiable in both cameras, the extrinsics, the normal and the distance.
 
-    A pixel is valid where its ray meets the plane ahead, and the source sees that point, on its image and from the same
+    A pixel is valid if its ray meets the plane ahead, and the source sees that point, on its image and from the same
     side of the plane as the target.
 
     Args:
         source: the camera of the given images.
         target: the camera of the images to make.
         extrinsics: source from target, `p_source = R p_target + t`.
-        normal: (3,) or (B, 3) of the plane `normal . X = distance` in the target's frame, of any length but zero.
+        normal: (3,) or (B, 3) of the plane `normal . X = distance` in the target's frame, of any length except zero.
         distance: a number or (B,), in the unit of the extrinsics; not zero.
-        mode, padding_mode, fill, antialias: as `Warp` takes them.
+        mode, padding_mode, fill, antialias: as in `Warp`.
 
     Raises:
-        ValueError: a plane through one of the cameras, or one that the source sees from the other side; shapes that do
-            not fit, and as `Warp`. TypeError: no cameras, no extrinsics.
+        ValueError: If the plane goes through a camera, or the source sees it from the other side; if shapes do not
+            fit; and as `Warp`. TypeError: If a camera is no Camera, or extrinsics are no Extrinsics.
     """
 
     batch_shape: torch.Size
@@ -72,7 +72,7 @@ class PlaneWarp(ProxyWarp):
         self._check(owner)
 
     def _check(self, owner: str) -> None:
-        """Raise a ValueError where the plane goes through a camera, or between them."""
+        """Raise a ValueError if the plane goes through a camera, or between them."""
         known = [values for t in (*self._pose(), self.normal, self.distance) if (values := values_of(t)) is not None]
         if len(known) < 4:
             return
@@ -82,15 +82,15 @@ class PlaneWarp(ProxyWarp):
         if not bool(torch.isfinite(normal).all() & (torch.linalg.vector_norm(normal, dim=-1) > 0).all()):
             raise ValueError(f"{owner}: normal must be finite and not zero; got {self.normal.tolist()}")
         if not bool((torch.isfinite(distance) & (distance != 0)).all()):
-            raise ValueError(f"{owner}: the plane goes through the target; distance is {self.distance.tolist()}")
+            raise ValueError(f"{owner}: distance must be finite and not 0, at the target; got {self.distance.tolist()}")
         if not bool((of_source * distance > 0).all()):
             raise ValueError(
-                f"{owner}: the source, at {place.tolist()} in the target's frame, does not stand on the same side of "
-                "the plane as the target; are the extrinsics source from target?"
+                f"{owner}: source and target must be on the same side of the plane; got the source at {place.tolist()} "
+                "in the target's frame. Check that the extrinsics are source from target"
             )
 
     def _plane_of_source(self) -> tuple[Tensor, Tensor]:
-        """The normal (*B, 3) and the distance (*B,) in the source's frame."""
+        """Return the normal (*B, 3) and the distance (*B,) in the source's frame."""
         rotation, shift = self._pose()
         dtype = torch.promote_types(rotation.dtype, self.normal.dtype)
         normal = (rotation.to(dtype) @ self.normal.to(dtype)[..., None])[..., 0]
@@ -106,29 +106,29 @@ class PlaneWarp(ProxyWarp):
         return near, near.detach() > _GRAZING * torch.linalg.vector_norm(normal.detach(), dim=-1)
 
     def inverse(self) -> PlaneWarp:
-        """The warp from target to source, of the same plane. What lay outside the image stays lost."""
+        """Return the warp from target to source, of the same plane. Pixels outside the image stay lost."""
         back = Extrinsics.from_matrix(self._pose()).inverse()
         options = {name: value for name, value in self.options.items() if name != "tolerance"}
         return PlaneWarp(self.target, self.source, back, *self._plane_of_source(), **cast(WarpOptions, options))
 
 
 class BirdsEye(PlaneWarp):
-    """The ground from above, to scale, made from the image of a camera: a `PlaneWarp` of the plane z = 0.
+    """A `PlaneWarp` of the plane z = 0: the ground from above, to scale, made from a camera's image.
 
     Rows go from the largest y to the smallest, so that +y is up in the image, columns from the smallest x to the
-    largest; pixel (0, 0) is the middle of its cell. Any lens will do, past 90 degrees too.
+    largest; pixel (0, 0) is the middle of its cell. Any lens works, also beyond 90 degrees.
 
     Args:
-        camera: of the given images.
-        extrinsics: camera from ground, whose z axis points up; the camera stands above it.
-        x: (from, to), what the image shows across, in units of the ground.
-        y: (from, to), what it shows from bottom to top.
+        camera: the camera of the given images.
+        extrinsics: camera from ground, whose z axis points up; the camera is above it.
+        x: (from, to) that the image shows across, in units of the ground.
+        y: (from, to) that it shows from bottom to top.
         resolution: units of the ground per pixel.
-        mode, padding_mode, fill, antialias: as `Warp` takes them.
+        mode, padding_mode, fill, antialias: as in `Warp`.
 
     Raises:
-        ValueError: a camera on or below the ground, ranges that do not ascend, a resolution that is not positive, and
-            as `Warp`. TypeError: no camera, no extrinsics.
+        ValueError: If the camera is not above the ground, a range does not ascend, or the resolution is not positive;
+            and as `Warp`. TypeError: If camera is no Camera, or extrinsics are no Extrinsics.
     """
 
     x: tuple[float, float]
@@ -151,7 +151,7 @@ class BirdsEye(PlaneWarp):
             raise ValueError(f"BirdsEye: resolution must be positive units of the ground per pixel; got {resolution}")
         size = tuple(round((ends[1] - ends[0]) / resolution) for ends in (y, x))
         if min(size) < 1:
-            raise ValueError(f"BirdsEye: x {x} and y {y} at {resolution} units per pixel make no image")
+            raise ValueError(f"BirdsEye: x and y must span a pixel; got {x} and {y} at {resolution} units per pixel")
         # a camera that looks straight down from one unit above the origin
         like = camera.intrinsics.detach() if isinstance(camera, Camera) else torch.zeros(1)
         focal = 1 / resolution
@@ -161,31 +161,31 @@ class BirdsEye(PlaneWarp):
         self.x, self.y, self.resolution = x, y, resolution
 
     def _check(self, owner: str) -> None:
-        """Raise a ValueError where the camera is not above the ground."""
+        """Raise a ValueError if the camera is not above the ground."""
         place = self.extrinsics.position.detach()
         if known_false(place[..., 2] > 0):
             raise ValueError(
-                f"{owner}: the camera stands at {place.tolist()} on the ground, whose z points up; it has to be above. "
-                "Are the extrinsics camera from ground?"
+                f"{owner}: the camera must be above the ground, whose z points up; got position {place.tolist()}. "
+                "Check that the extrinsics are camera from ground"
             )
 
     def _pose(self) -> tuple[Tensor, Tensor]:
-        """Camera from the one that looks down from (0, 0, 1): x right, y down is -y, z down is -z of the ground."""
+        """Return camera from a camera at (0, 0, 1) that looks down: its x, y and z are the ground's x, -y and -z."""
         rotation, shift = super()._pose()
         return rotation * rotation.new_tensor([1.0, -1.0, -1.0]), shift + rotation[..., 2]
 
     @property
     def grid_points(self) -> Tensor:
-        """(H, W, 2) the ground's x and y in the middle of each pixel."""
+        """The ground's x and y (H, W, 2) in the middle of each pixel."""
         return self.to_ground(self.target.pixel_grid())
 
     def to_ground(self, pixels: Tensor) -> Tensor:
-        """Pixels (..., 2) of the image from above to x and y on the ground."""
+        """Return x and y on the ground for pixels (..., 2) of the image from above."""
         u, v = (as_coordinates(pixels, "pixels", 2, "BirdsEye") + 0.5).unbind(-1)
         return torch.stack((self.x[0] + u * self.resolution, self.y[1] - v * self.resolution), -1)
 
     def from_ground(self, points: Tensor) -> Tensor:
-        """The other way: x and y on the ground, (..., 2), to pixels."""
+        """Return pixels of the image from above for x and y (..., 2) on the ground."""
         x, y = as_coordinates(points, "points", 2, "BirdsEye").unbind(-1)
         return torch.stack(((x - self.x[0]) / self.resolution - 0.5, (self.y[1] - y) / self.resolution - 0.5), -1)
 

@@ -1,4 +1,4 @@
-"""Warps between cameras that stand at different places, by a proxy of the scene: a plane, or a sphere."""
+"""Warps between cameras at different places, with a proxy of the scene: a plane, or a sphere."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from camtorch.warp.warp import Warp
 
 
 class ProxyWarp(Warp):
-    """A `Warp` to a camera at another place, of which both see the same points of a proxy; exact, without a lattice."""
+    """A `Warp` to a camera at another place, exact for the points of a proxy that both see, without a lattice."""
 
     is_an_operator = False
 
@@ -29,7 +29,7 @@ class ProxyWarp(Warp):
         self.extrinsics = extrinsics
 
     def _pose(self) -> tuple[Tensor, Tensor]:
-        """Source from target: rotations (*B, 3, 3) and shifts (*B, 3)."""
+        """Return source from target: rotations (*B, 3, 3) and shifts (*B, 3)."""
         return rotation_matrix(self.extrinsics.rotation), self.extrinsics.translation
 
     def _nearness(self, rays: Tensor, of_source: bool) -> tuple[Tensor, Tensor]:
@@ -55,7 +55,7 @@ class ProxyWarp(Warp):
     def _move(self, pixels: Numbers, back: bool = False, on_image: bool = False) -> tuple[Tensor, Tensor]:
         source, target = (self.target, self.source) if back else (self.source, self.target)
         rays, has_ray = source.unproject(pixels)
-        # directions in which the other camera sees what the rays meet
+        # the other camera sees the points that the rays meet in these directions
         rotation, shift = (t.to(rays.dtype) for t in self._pose())
         if not back:
             rotation, shift = rotation.mT, -(rotation.mT @ shift[..., None])[..., 0]
@@ -73,23 +73,23 @@ class ProxyWarp(Warp):
 
 
 def check_pose(owner: str, extrinsics: Extrinsics, between: str, **cameras: Camera) -> torch.Size:
-    """Return the batch dim, or none, of cameras and of the pose between them."""
+    """Return the batch dim, or none, of cameras and the pose between them; raise if they do not fit."""
     if not isinstance(extrinsics, Extrinsics):
         raise TypeError(
             f"{owner}: extrinsics must be Extrinsics, {between}; got {type(extrinsics).__name__}. "
-            "Of OpenCV's R and T ct.Extrinsics.from_matrix(R, T) is one"
+            "ct.Extrinsics.from_matrix(R, T) makes one from OpenCV's R and T"
         )
     intrinsics = {name: camera.intrinsics for name, camera in cameras.items()}
     check_devices(owner, **intrinsics, extrinsics=extrinsics.rotation)
     parts = {**cameras, "extrinsics": extrinsics}
     batch = as_batch(owner, **{name: (*part.batch_shape, 1) for name, part in parts.items()})
     if len(batch) > 1:
-        raise ValueError(f"{owner}: cameras and extrinsics may have one batch dim; got {tuple(batch)}")
+        raise ValueError(f"{owner}: cameras and extrinsics must have one batch dim at most; got {tuple(batch)}")
     return batch
 
 
 def turned(rotation: Tensor, rays: Tensor) -> Tensor:
-    """Matrices (*B, 3, 3) applied to (B, *N, 3) or (*N, 3)."""
+    """Return rays (B, *N, 3) or (*N, 3), turned by rotations (*B, 3, 3)."""
     if rotation.ndim == 2:
         return rotate_planes(rotation, rays.unbind(-1)).movedim(0, -1)
     rows = rays.expand(len(rotation), *rays.shape[1:]) if len(rays) == 1 else rays
@@ -98,6 +98,6 @@ def turned(rotation: Tensor, rays: Tensor) -> Tensor:
 
 
 def beside(vectors: Tensor, rays: Tensor) -> Tensor:
-    """Vectors (3,) or (B, 3) in the dtype of rays (B, *N, 3), and in a shape that broadcasts against them."""
+    """Return vectors (3,) or (B, 3) in the dtype of rays (B, *N, 3) and in a shape that broadcasts against them."""
     vectors = vectors.to(rays.dtype)
     return vectors if vectors.ndim == 1 else vectors.view(len(vectors), *[1] * (rays.ndim - 2), 3)

@@ -1,4 +1,4 @@
-"""Images of another camera at another place, by a depth map."""
+"""Warps to a camera at another place, by a depth map."""
 
 from __future__ import annotations
 
@@ -26,25 +26,31 @@ _SNAP = {torch.float32: 4e-3, torch.float64: 1e-8}  # px, within which rounding 
 
 
 class Reproject(GeometryModule):
-    """The image that `target` would see, made from that of `source`, which stands elsewhere, by the target's depth.
+    """A warp from camera `source` to camera `target` at another place, by the target's depth.
 
-    The backward warp of depth networks and of stereo: each pixel of the target goes to its point, that to the source,
-    and takes what the source shows there. Differentiable in images, depth, extrinsics and both cameras.
+    It is the backward warp of depth networks and stereo: the depth takes each target pixel to a point, and the source's
+    image is sampled where the source sees that point. Differentiable in images, depth, extrinsics and both cameras.
 
     Convention: images (B, C, H, W) of the source, depth (B, 1, H', W') of the target in the unit of the extrinsics.
-    Cameras and extrinsics of one batch dim go sample by sample with the images.
+    Cameras and extrinsics with a batch dim go sample by sample with the images.
+
+    >>> camera = ct.Pinhole([40.0, 40.0, 31.5, 23.5], image_size=(48, 64))
+    >>> warp = ct.Reproject(camera, camera, ct.Extrinsics([0.0, 0.0, 0.0], [-0.1, 0.0, 0.0]))
+    >>> images, valid = warp(torch.zeros(2, 3, 48, 64), torch.ones(1, 1, 48, 64))
+    >>> images.shape, valid.shape
+    (torch.Size([2, 3, 48, 64]), torch.Size([2, 1, 48, 64]))
 
     Args:
         source: the camera of the given images.
         target: the camera of the images to make, and of the depth.
         extrinsics: source from target, `p_source = R p_target + t`.
-        mode: "bilinear", "nearest" or "bicubic", as `Warp` takes it.
+        mode: "bilinear", "nearest" or "bicubic", as in `Warp`.
         padding_mode: "zeros", "border" or "reflection".
         fill: the value of pixels that show nothing.
 
     Raises:
-        ValueError: cameras without image_size, batch dims that do not fit, options that do not exist.
-        TypeError: no cameras, no extrinsics.
+        ValueError: If a camera has no image_size, batch dims do not fit, or an option is unknown.
+        TypeError: If a camera is no Camera, or extrinsics are no Extrinsics.
     """
 
     source: Camera
@@ -73,7 +79,7 @@ class Reproject(GeometryModule):
         self.padding_mode = one_of(padding_mode, PADDINGS, "padding_mode", owner)
         self.fill = as_fill(fill, owner)
         self._memo = Kept()
-        seam_of(source)  # while its values may be looked at: traced code asks for it too
+        seam_of(source)  # keep it while values can be read: traced code needs it too
 
     def forward(
         self,
@@ -84,23 +90,23 @@ class Reproject(GeometryModule):
         source_depth: Numbers | None = None,
         tolerance: float = 0.02,
     ) -> tuple[Tensor, Tensor]:
-        """Images and where they show something.
+        """Return the target's images and the mask of valid pixels.
 
         Args:
             images: (B, C, H, W) of the source's image_size, or features of that size.
-            depth: (B, 1, H', W') of the target, or (B, D, H', W'): D depths to try for each pixel; planes of one depth
-                each are `torch.linspace(near, far, D).view(1, D, 1, 1).expand(1, D, H', W')`.
-            kind: what depth holds: "z" along the optical axis, or "distance" from the camera.
-            source_depth: (B, 1, H, W) of the source, of the same kind: what it does not see, because something stands
-                before it, is not valid.
-            tolerance: by which part of it a point may lie behind the source's depth.
+            depth: (B, 1, H', W') of the target, or (B, D, H', W') for D depths to try at each pixel: planes of one
+                depth each are `torch.linspace(near, far, D).view(1, D, 1, 1).expand(1, D, H', W')`.
+            kind: the kind of depth: "z" along the optical axis, or "distance" from the camera.
+            source_depth: (B, 1, H, W) of the source, of the same kind; pixels that something hides from the source are
+                then not valid.
+            tolerance: the part of the source's depth by which a point may lie behind it.
 
         Returns:
-            images (B, C, H', W'), and valid (B, 1, H', W') bool: the depth counts, see `Camera.backproject`, and the
-            source sees the point on its image. Of D > 1 depths a sweep volume (B, C, D, H', W'), and (B, 1, D, H', W').
+            images (B, C, H', W'), and valid (B, 1, H', W') bool: the depth is valid, see `Camera.backproject`, and the
+            source sees the point on its image. D > 1 depths give sweep volumes (B, C, D, H', W') and (B, 1, D, H', W').
 
         Raises:
-            ValueError: shapes that do not fit, an unknown kind. TypeError: no tensors.
+            ValueError: If shapes do not fit, or the kind is unknown. TypeError: If depth is not numeric.
         """
         owner = "Reproject"
         size = self.source._size_for(owner)
@@ -117,12 +123,12 @@ class Reproject(GeometryModule):
         counts = {"images": len(images), "depth": len(given), "cameras": self.batch_shape.numel()}
         count = max(counts.values())
         if any(n not in (1, count) for n in counts.values()):
-            raise ValueError(f"{owner}: batches do not fit: {counts}")
+            raise ValueError(f"{owner}: batch sizes must be 1 or equal; got {counts}")
         seen, valid, far = self._seen(given, kind)
         if source_depth is not None:
             valid = valid & self._shows(seen, far, source_depth, kind, as_number(tolerance, "tolerance", owner), owner)
         rows, steps = seen.shape[0], seen.shape[1]
-        # an image that stays where it is, or is shifted by whole pixels, is copied to the bit
+        # an image that is shifted by whole pixels, or not at all, is copied to the bit
         plain = steps == 1 and are_plain(seen) and known_true((seen == seen.round()).all(-1) | ~valid)
         mode: Mode = "nearest" if plain else self.mode
         if (seam := seam_of(self.source)) is not None:  # the image goes on beyond its edges
@@ -142,28 +148,28 @@ class Reproject(GeometryModule):
         def __call__(self, *args: Any, **options: Any) -> Any: ...
 
     def _seen(self, depth: Tensor, kind: str) -> tuple[Tensor, Tensor, Tensor]:
-        """Pixels of the source (B, D, H', W', 2), whether there are some, and the depth at which it sees them."""
+        """Return source pixels (B, D, H', W', 2), whether they are valid, and the depth at which they are seen."""
         rays, has_ray = self._rays()
         if rays.ndim == 3:
             rays, has_ray = rays[None], has_ray[None]
         scale, good = depth_scale(depth, rays[:, None], has_ray[:, None], kind)
         directions = turned(rotation_matrix(self.extrinsics.rotation).to(rays.dtype), rays)[:, None]
         shift = beside(self.extrinsics.translation, directions)
-        # plane by plane: several times as fast
+        # plane by plane is several times as fast
         parts = zip(shift.unbind(-1), directions.unbind(-1), strict=True)
         points = torch.stack([torch.addcmul(start, along, scale) for start, along in parts], -1)
         if self.source.batch_shape and len(points) != len(self.source.intrinsics):
             points = points.expand(len(self.source.intrinsics), *points.shape[1:])
         pixels, mapped = self.source.project(off_poles(self.source, points))
         far = points[..., 2] if kind == "z" else torch.linalg.vector_norm(points.detach(), dim=-1)
-        # pixels that rounding moved off a pixel's centre go back there, with their gradient
+        # pixels that rounding moved off a pixel's centre are moved back, with their gradient
         near = pixels.detach().round()
         off = near - pixels.detach()
         off = torch.where(off.abs() <= _SNAP.get(pixels.dtype, 0.0), off, 0.0)
         return pixels + off, mapped & good, far
 
     def _rays(self) -> tuple[Tensor, Tensor]:
-        """The target's, kept while nothing can learn."""
+        """Return the target's rays, kept while nothing can learn."""
         inputs = self.target._tensors
         if torch.is_grad_enabled() and any(t.requires_grad for t in inputs):
             return self.target.rays()
@@ -172,12 +178,12 @@ class Reproject(GeometryModule):
     def _shows(
         self, seen: Tensor, far: Tensor, source_depth: Numbers, kind: str, tolerance: float, owner: str
     ) -> Tensor:
-        """Whether the source's own depth lets it see points at its pixels."""
+        """Whether the source's depth lets it see points at its pixels."""
         size = self.source._size_for(owner)
         given = as_depth(source_depth, kind, size, f"{owner}: source_depth", seen.device).detach()
         given = (given if given.ndim == 4 else given[None, None])[:, :1]
         known = torch.isfinite(given) & (given > 0)
-        # of the four pixels around the farthest, so that the rim of a foreground hides nothing behind it that is seen
+        # the farthest of the four pixels around: the rim of a foreground then hides nothing that is seen behind it
         around = max_pool2d(pad(torch.where(known, given, torch.inf), (1, 1, 1, 1), mode="replicate"), 2, 1)
         u, v = (
             (plane.floor() + 1).long().clamp(0, side)
@@ -188,6 +194,6 @@ class Reproject(GeometryModule):
         return far.detach() <= furthest * (1 + tolerance)
 
     def extra_repr(self) -> str:
-        """The options."""
+        """Return the options."""
         options: dict[str, Any] = {"mode": self.mode, "padding_mode": self.padding_mode, "fill": self.fill}
         return ", ".join(f"{name}={value!r}" for name, value in options.items())

@@ -1,4 +1,4 @@
-"""Images of a camera that moved by a little, by the depth that its images come with."""
+"""Images of a camera that moved a little, by the depth of the images."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ from camtorch.warp.sampling import PaddingMode
 from camtorch.warp.warp import Warp
 
 _STEPS = 12  # of the search along a ray
-_CLOSE = 1e-4  # of the distance, within which a ray has met what the source sees
+_CLOSE = 1e-4  # of the distance: a ray this close has met a surface
 _EDGE = 0.05  # of the distance: neighbours that differ by more are two surfaces
-_MOST_GAPS = 8  # px between pixels that were neighbours, of an image that is enlarged
+_MOST_GAPS = 8  # px between former neighbours in an image that is enlarged
 
 
 class ShiftedWarp(Warp):
     """A warp to a camera at another place: `p_target = R (p_source - shift)`, for images of depth (B, 1, H, W).
 
-    Each ray of the target is followed to the nearest surface that the source sees; what it does not see is not mapped.
+    Each ray of the target is followed to the nearest surface that the source sees; without one it is not mapped.
     """
 
     is_an_operator: ClassVar[bool] = False
     _seam = None
     shift: Tensor
-    distance: Tensor  # (B, H, W): along the rays of the source; 0 where it is not known
+    distance: Tensor  # (B, H, W): along the rays of the source; 0 if unknown
 
     def __init__(
         self,
@@ -56,21 +56,21 @@ class ShiftedWarp(Warp):
         self._found: tuple[Tensor, Tensor] | None = None
 
     def rows_of(self, source: Camera, target: Camera, rotation: Tensor | None, index: list[int]) -> ShiftedWarp:
-        """That of these rows, whose cameras and turns are given."""
+        """Return the warp of these rows of a batch, whose cameras and rotations are given."""
         depth = self.distance[index][:, None]
         return ShiftedWarp(source, target, rotation, depth, "distance", self.shift[index], **self.options)
 
     def inverse(self) -> Warp:
         raise ValueError(
-            "RandomMount: a shift has no inverse: what the camera saw may be hidden now. Keep the sample as it was"
+            "RandomMount: a shift has no inverse, since the new camera may not see every point. Keep the given sample"
         )
 
     def transform_positions(self, points: Tensor) -> Tensor:
-        """Points (B, *N, 3) of the source's frame in the target's."""
+        """Return points (B, *N, 3) of the source's frame in the target's."""
         return self.transform_rays(points - self.shift.to(points).view(-1, *[1] * (points.ndim - 2), 3))
 
     def moved_distance(self, distance: Tensor) -> Tensor:
-        """Distances (B, 1, H, W) from the source as those from the target (B, 1, H', W'), 0 for none."""
+        """Return distances (B, 1, H, W) from the source as distances (B, 1, H', W') from the target, 0 for none."""
         seen, mapped = self._surface()
         length = _between(distance[:, 0].expand(len(seen), -1, -1), seen.to(distance))
         rays = self.source.unproject(seen)[0].to(distance)
@@ -99,7 +99,7 @@ class ShiftedWarp(Warp):
 
     @torch.no_grad()
     def _surface(self) -> tuple[Tensor, Tensor]:
-        """Where in the source's image (B, H', W', 2) each pixel of the target is seen, and whether it is."""
+        """Return the source's pixel (B, H', W', 2) that shows what each target pixel sees, and whether there is one."""
         if self._found is None:
             size = self.target._size_for("Warp")
             rays, has_ray = self.target.rays()
@@ -115,10 +115,10 @@ class ShiftedWarp(Warp):
         return self._found
 
     def _followed(self, i: int, rays: Tensor, has_ray: Tensor, far: Tensor) -> tuple[Tensor, Tensor]:
-        """Return pixels (N, 2) where rays (N, 3) of a sample from the new place meet a surface, and whether they do."""
+        """Return pixels (N, 2) where sample i's rays (N, 3) from the new place meet a surface, and whether they do."""
         source = self.source[i] if self.source.batch_shape else self.source
         seen, good = rays.new_zeros(len(rays), 2), torch.zeros_like(has_ray)
-        left = has_ray.nonzero()[:, 0]  # the rays that are not settled
+        left = has_ray.nonzero()[:, 0]  # the rays that have met no surface yet
         far, along = far[left], rays[left]
         for _ in range(_STEPS):
             at = self.shift[i] + far[:, None] * along
@@ -134,7 +134,7 @@ class ShiftedWarp(Warp):
         return seen, good
 
     def _nearest(self, size: tuple[int, int]) -> Tensor:
-        """(B, H', W'): about how far the nearest surface is that the target sees; 0 where nothing is near."""
+        """Return about how far the nearest surface is that a target pixel sees, (B, H', W'); 0 if none is near."""
         height, width = size
         rays = self.source.rays()[0]
         points = self.transform_positions((rays * self.distance[..., None]).flatten(1, 2)).view(*self.distance.shape, 3)
@@ -156,7 +156,7 @@ class ShiftedWarp(Warp):
 
 
 def _between(distance: Tensor, pixels: Tensor) -> Tensor:
-    """Return distances (B, *N) at pixels of maps (B, H, W), 0 if unknown: linear, between surfaces the nearest."""
+    """Return distances (B, *N) at pixels of maps (B, H, W), 0 if unknown: linear, or the nearest between surfaces."""
     (height, width), dtype = distance.shape[1:], torch.promote_types(distance.dtype, pixels.dtype)
     u, v = pixels.to(dtype).reshape(len(distance), pixels.shape[1:-1].numel(), 2).unbind(-1)
     on = (u >= -0.5) & (u <= width - 0.5) & (v >= -0.5) & (v <= height - 0.5)
@@ -174,5 +174,5 @@ def _between(distance: Tensor, pixels: Tensor) -> Tensor:
 
 
 def _length(vectors: Tensor) -> Tensor:
-    """(...) of (..., n): several times as fast as torch's norm over a short last dim."""
+    """Return the lengths (...) of vectors (..., n), several times as fast as torch's norm over a short last dim."""
     return torch.stack([part.square() for part in vectors.unbind(-1)]).sum(0).sqrt()

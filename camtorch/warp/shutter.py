@@ -1,4 +1,4 @@
-"""A rolling shutter: rows that are seen one after the other, by a camera that turns meanwhile."""
+"""A rolling shutter: rows are read one after the other while the camera turns."""
 
 from __future__ import annotations
 
@@ -36,29 +36,29 @@ DIRECTIONS: tuple[Direction, ...] = get_args(Direction)
 
 _LONGEST = 2.0  # seconds
 _FASTEST = 70.0  # radians per second: twice what gyroscopes measure
-_BEYOND = 1.0  # readouts from the middle of the image, half an image beyond its rim: further out time stands still
-_STEPS = 4  # of the secant method, before one of Newton's
-_SETTLED = 0.01  # pixels by which the row of a point may be off when it is said to be found
-_STILL = 1e-3  # the part of a row that a row must advance by, as the scene passes
+_BEYOND = 1.0  # readouts from the middle, half an image beyond the rim: further out, time is clamped
+_STEPS = 4  # of the secant method, before one Newton step
+_SETTLED = 0.01  # pixels: a point is found if its row is off by less
+_STILL = 1e-3  # rows per row that the readout must gain on the passing scene
 
 
 class RollingShutter(GeometryModule):
-    """Rows read one after the other, down the image, by a camera that turns at a constant rate: for `ShutterWarp`.
+    """A shutter that reads rows one after the other while the camera turns at a constant rate, for `ShutterWarp`.
 
-    Convention: `rates` are what a gyroscope in the camera measures, in its frame (x right, y down, z forward): about +x
+    Convention: `rates` are a gyroscope's measurements in the camera's frame (x right, y down, z forward): about +x
     the camera looks up, about +y it turns right, about +z it leans right, clockwise. With t = 0 in the middle of the
-    readout, when the middle of the image is read, `ray_at_0 = exp(t [rates]) ray_at_t`. All else that has no row, as
-    points in space, gaze and poses, is of that moment.
+    readout, when the middle of the image is read, `ray_at_0 = exp(t [rates]) ray_at_t`. Values without a row, such
+    as points in space, gaze and poses, are of that moment.
 
-    The turn is exact without depth. What the camera moves is left out, as it would need depth.
+    The turn is exact without depth. The camera's translation is ignored, as it would need depth.
 
     Args:
-        readout: seconds from the first row to the last (all rows times the time of one), or (B,). Negative reads the
-            other way. 0 is a global shutter.
+        readout: seconds from the first row to the last (all rows times the time of one), or (B,). Negative reads in
+            the opposite direction. 0 is a global shutter.
         rates: (3,) or (B, 3) radians per second.
         direction: in which the sensor is read: "down", "up", "right" or "left", as seen in the image.
 
-    Plain values are kept as they are and do not learn; Parameters and tensors of a graph do.
+    Plain values are kept and do not learn; Parameters and tensors of a graph do.
 
     Raises:
         ValueError: If numbers are not finite, shapes do not fit, the readout is more than two seconds (it may be
@@ -80,11 +80,11 @@ class RollingShutter(GeometryModule):
             raise ValueError(f"{owner}: readout must be a number or (B,); got shape {tuple(readout.shape)}")
         if known_false(readout.detach().abs() < _LONGEST):
             raise ValueError(
-                f"{owner}: readout is in seconds; got {readout.tolist()}, which would be milliseconds: readout / 1000"
+                f"{owner}: readout must be below 2 seconds; got {readout.tolist()}. Pass milliseconds as readout / 1000"
             )
         if known_false(rates.detach().abs() < _FASTEST):
             raise ValueError(
-                f"{owner}: rates are in radians per second; got {rates.tolist()}, which would be degrees: numpy.deg2rad"
+                f"{owner}: rates must be below 70 radians per second; got {rates.tolist()}. numpy.deg2rad takes degrees"
             )
         self.batch_shape = as_batch(owner, rates=rates.shape, readout=(*readout.shape, 1))
         if len(self.batch_shape) > 1:
@@ -94,7 +94,7 @@ class RollingShutter(GeometryModule):
         self.direction = one_of(direction, DIRECTIONS, "direction", owner)
 
     def times(self, pixels: Numbers, image_size: tuple[int, int]) -> Tensor:
-        """(*B, *N): seconds from the middle of the readout at which pixels (*B, *N, 2) of an image are seen."""
+        """Return the seconds (*B, *N) from the middle of the readout at which pixels (*B, *N, 2) are seen."""
         values = as_coordinates(pixels, "pixels", 2, "RollingShutter", self.rates.device)
         return self._times(self._share(values, as_known_size(image_size, "RollingShutter")), values.ndim)
 
@@ -105,24 +105,24 @@ class RollingShutter(GeometryModule):
         return RollingShutter(readout, rates, direction=self.direction)
 
     def detach(self) -> RollingShutter:
-        """Return the shutter of the same numbers, which do not learn."""
+        """Return the shutter with the same numbers, which do not learn."""
         return RollingShutter(self.readout.detach(), self.rates.detach(), direction=self.direction)
 
     def _share(self, pixels: Tensor, size: tuple[int, int]) -> Tensor:
-        """When pixels (..., 2) are read, in readouts from the middle one."""
+        """Return when pixels (..., 2) are read, in readouts from the middle one."""
         across = self.direction in ("right", "left")
         share = (pixels[..., 0 if across else 1] + 0.5) / size[1 if across else 0] - 0.5
         share = share.clamp(-_BEYOND, _BEYOND)
         return -share if self.direction in ("up", "left") else share
 
     def _times(self, share: Tensor, ndim: int) -> Tensor:
-        """Seconds, of shares of the readout (..., ) of points with `ndim` dims."""
+        """Return the seconds for shares of the readout (...) of points with `ndim` dims."""
         return share * _lead(self.readout.to(share.dtype), ndim - 1)
 
     def turned(self, rays: Tensor, share: Tensor, sign: float) -> Tensor:
-        """Rays (*B, *N, 3) of shares (*B, *N) of the readout, turned to its middle (sign 1) or from it (sign -1).
+        """Turn rays (*B, *N, 3) of shares (*B, *N) of the readout to its middle (sign 1) or from it (sign -1).
 
-        Rodrigues' formula; at time zero every number stays as it is.
+        Rodrigues' formula; at time zero every number is unchanged.
         """
         rates = _lead(self.rates.to(rays.dtype), rays.ndim - 1, 1)
         wx, wy, wz = ((sign * self._times(share, rays.ndim)).unsqueeze(-1) * rates).unbind(-1)
@@ -146,7 +146,7 @@ class RollingShutter(GeometryModule):
         super().__setstate__(state)  # type: ignore[no-untyped-call]
 
     def extra_repr(self) -> str:
-        """The readout, the rates and the direction."""
+        """Return the readout, the rates and the direction."""
         readout, rates = map(values_of, (self.readout, self.rates))
         if self.batch_shape or readout is None or rates is None:
             return f"batch_shape={tuple(self.batch_shape)}, direction={self.direction!r}"
@@ -154,18 +154,18 @@ class RollingShutter(GeometryModule):
 
 
 def _lead(value: Tensor, ndim: int, inner: int = 0) -> Tensor:
-    """(B, ...) before points with `ndim` leading dims; what has no batch dim serves all."""
+    """Return values (B, ...) shaped for points with `ndim` leading dims; without a batch dim they serve all points."""
     return value if value.ndim == inner else value.reshape(len(value), *[1] * (ndim - 1), *value.shape[1:])
 
 
 def _check_exposure(exposure: Tensor | None) -> None:
     """Raise if a state of 0.3 has an exposure."""
     if exposure is not None and known_false(exposure == 0):
-        raise ValueError(f"RollingShutter: the state has an exposure, and no shutter has one any more. {LEFT}")
+        raise ValueError(f"RollingShutter: the state's exposure must be 0; got {exposure.tolist()}. {LEFT}")
 
 
 class ShutterWarp(MirrorWarp):
-    """A `Warp` between cameras with rolling shutters: it undoes that of the source, and puts on that of the target.
+    """A `Warp` between cameras with rolling shutters: it undoes the source's shutter and applies the target's.
 
     Cameras and rotation are those of the middle of the readout. Images, points and boxes move by the row that sees
     them; rays turn by the rotation alone.
@@ -177,9 +177,9 @@ class ShutterWarp(MirrorWarp):
         source: the camera of the given images.
         target: the camera of the images to make.
         rotation: (3, 3) or (B, 3, 3), `ray_target = R ray_source`; None is no rotation.
-        shutter: by which the given images were taken.
-        target_shutter: by which the images to make are taken.
-        as_warp: mode, padding_mode, fill, antialias, tolerance, as `Warp` takes them.
+        shutter: the shutter by which the given images were taken.
+        target_shutter: the shutter by which the images to make are taken.
+        as_warp: mode, padding_mode, fill, antialias, tolerance, as in `Warp`.
 
     Raises:
         ValueError: If batch dims do not fit, and as `Warp`. TypeError: If a shutter is no `RollingShutter`.
@@ -221,13 +221,13 @@ class ShutterWarp(MirrorWarp):
         return _behind(self.shutter, self.source), _behind(self.target_shutter, self.target)
 
     def inverse(self) -> Warp:
-        """Return the warp from target to source. It puts on the shutter that this one undoes, and the other way."""
+        """Return the warp from target to source. It applies the shutter that this one undoes, and undoes the other."""
         rotation = None if self.rotation is None else self.rotation.mT
         options = {**self.options, "shutter": self.target_shutter, "target_shutter": self.shutter}
         return self.between(self.target, self.source, rotation, **options)
 
     def between(self, source: Camera, target: Camera, rotation: Tensor | None, **options: Any) -> Warp:
-        """See `Warp.between`; the shutters stay unless the options have others."""
+        """Return this warp between other cameras, with its shutters unless `options` have others."""
         options = {"shutter": self.shutter, "target_shutter": self.target_shutter, **options}
         return ShutterWarp(source, target, **options).turned_by(rotation)
 
@@ -253,7 +253,7 @@ def _behind(shutter: RollingShutter | None, camera: Camera) -> Camera:
 
 
 class InMotion:
-    """A camera behind a rolling shutter, as a warp sees one: rays are those of the middle of the readout."""
+    """A camera behind a rolling shutter, as a warp uses it: rays are those of the middle of the readout."""
 
     def __init__(self, camera: Camera, shutter: RollingShutter):
         self.camera = camera
@@ -273,14 +273,14 @@ class InMotion:
         return self.camera._form, self.shutter.direction
 
     def unproject(self, pixels: Numbers) -> tuple[Tensor, Tensor]:
-        """As of a camera; in closed form, for a pixel says when it is seen."""
+        """Return rays and valid, as a camera does; in closed form, as a pixel fixes the time at which it is seen."""
         pixels, _ = as_points(pixels, "pixels", 2, self.batch_shape, self.camera._tensors[:1], "Warp")
         rays, valid = self.camera.unproject(pixels)
         pixels = torch.where(valid.unsqueeze(-1), pixels, 0.0)
         return self.shutter.turned(rays, self.shutter._share(pixels, self.size), 1.0), valid
 
     def project(self, rays: Tensor) -> tuple[Tensor, Tensor]:
-        """Return pixels and valid, False where the scene passes as fast as rows are read, or faster."""
+        """Return pixels and valid, False if the scene passes as fast as rows are read, or faster."""
         rays, _ = as_points(rays, "points", 3, self.batch_shape, self.camera._tensors[:1], "Warp")
         side = self.size[1 if self.shutter.direction in ("right", "left") else 0]
 
@@ -300,7 +300,7 @@ class InMotion:
                 share = (share + step.clamp(-0.5, 0.5)).clamp(-_BEYOND, _BEYOND)
             h = 1e-4 if share.dtype == torch.float64 else 1e-2
             slope = (seen(share + h)[2] - seen(share - h)[2]) / (2 * h)
-        found = seen(share)[2]  # a step of Newton's method from there has the derivatives of the solution
+        found = seen(share)[2]  # a Newton step from there has the derivatives of the solution
         off = found - share
         settled = (off.detach().abs() * side < _SETTLED) | (found.detach().abs() >= _BEYOND)
         settled = settled & ((1 - slope).abs() > _STILL)

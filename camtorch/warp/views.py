@@ -23,19 +23,19 @@ from camtorch.warp.warp import Warp, as_sized
 __all__ = ["FACES", "Views", "cube", "look_at", "ring"]
 
 FACES = ("front", "right", "back", "left", "up", "down")
-"""Of a cube, as the camera sees them from within; its own axis goes through the middle of the front."""
-_ALONG = 65  # samples of an edge of a box, and of the steps to either side of the farthest of them
+"""Names of a cube's faces, as the camera sees them from within; its axis goes through the middle of the front."""
+_ALONG = 65  # samples of a box's edge, and then of the steps to either side of the farthest sample
 _ROUNDS = 3  # of such samples: 2e-6 of an edge
-_MORE_ROUNDS = 8  # where a lens ends on the outline, and slopes may grow without bounds
+_MORE_ROUNDS = 8  # if a lens ends on the outline, where slopes may grow without bounds
 _VIRTUAL = Pinhole([1.0, 1.0, 0.0, 0.0]).detach()
-_STRAIGHT_UP = 1e-6  # radians from the y axis: what float32 cameras leave of none
+_STRAIGHT_UP = 1e-6  # radians from the y axis: float32 cameras round zero to this
 _OVERLAP = 1.25  # the width of a view in a ring over the step to the next one
 
 
 class Views(GeometryModule):
-    """Pinhole views of one camera's image, all of the camera `view`: what `cube` and `ring` make.
+    """Pinhole views of one camera's image, all of the camera `view`, as `cube` and `ring` return them.
 
-    `views(images)` makes them, `views.back(...)` puts what a network made of them together again. `warps[i]` moves
+    `views(images)` makes the views, `views.back(...)` joins a network's results for them. `warps[i]` moves
     points and boxes to view i, `warps[i].inverse()` back; `rotations[i]`, (3, 3), is `ray_view = R ray_camera`. The
     `mode` is that of `Warp`; "nearest" for labels, there and back.
     """
@@ -61,15 +61,15 @@ class Views(GeometryModule):
         )
 
     def __len__(self) -> int:
-        """The number of views."""
+        """Return the number of views."""
         return len(self.names)
 
     def __iter__(self) -> Iterator[Warp]:
-        """Over the warps."""
+        """Iterate over the warps."""
         return iter(self.warps)  # type: ignore[arg-type]
 
     def forward(self, images: Tensor) -> Tensor:
-        """(B, C, H, W) to (B, N, C, S, S)."""
+        """Return the views (B, N, C, S, S) of images (B, C, H, W)."""
         return torch.stack([warp(images) for warp in self], 1)
 
     if TYPE_CHECKING:
@@ -78,18 +78,18 @@ class Views(GeometryModule):
         def __call__(self, *args: Any, **options: Any) -> Any: ...
 
     def valid_masks(self) -> Tensor:
-        """(1, N, 1, S, S) bool: what of each view the camera sees."""
+        """Return (1, N, 1, S, S) bool: whether the camera sees each pixel of the views."""
         return torch.stack([warp.valid_mask() for warp in self], 1)
 
     @torch.no_grad()
     def weights(self) -> Tensor:
-        """Return (N, H, W): the part of each view in the wide image, which falls to its border; they add up to 1."""
+        """Return the weights (N, H, W) of the views in the wide image, which fall to a view's border and sum to 1."""
         pixels = self.view.pixel_grid()
         ends = pixels.new_tensor([self.view.width, self.view.height])
         ramp = torch.minimum(pixels + 1, ends - pixels).amin(-1)[None, None]
-        # to one pixel beyond the outermost ones: a ray between two faces is on both
+        # weights end one pixel beyond the outermost ones: a ray between two faces is on both
         parts = [warp(ramp, mode="bilinear", padding_mode="zeros") for warp in self.backs]
-        if self.mode == "nearest":  # what a view fills in at its rim is no label
+        if self.mode == "nearest":  # a fill value at the rim of a view is no label
             masks = self.valid_masks().unbind(1)
             parts = [part * warp(mask) for part, warp, mask in zip(parts, self.backs, masks, strict=True)]
         whole = torch.cat(parts)[:, 0]
@@ -97,11 +97,11 @@ class Views(GeometryModule):
         return whole / torch.where(total > 0, total, 1.0)
 
     def back(self, views: Tensor) -> tuple[Tensor, Tensor]:
-        """Put views (B, N, C, S, S), or what was made of them, together in the wide image.
+        """Join views (B, N, C, S, S), or results for them, in the wide image.
 
-        Returns (B, C, H, W) of the same dtype, and valid (1, 1, H, W) bool: some view shows the pixel. Views are
-        averaged by their weights, and integers rounded; with mode="nearest" a pixel is that of the view with the
-        largest weight, as labels have no mean.
+        Returns (B, C, H, W) of the same dtype, and valid (1, 1, H, W) bool: a view shows the pixel. Views are averaged
+        by their weights, and integers rounded; mode="nearest" takes the pixel of the view with the largest weight, as
+        labels have no mean.
         """
         size = self.view._size_for("Views")
         if not isinstance(views, Tensor) or views.ndim != 5 or views.shape[1] != len(self) or views.shape[-2:] != size:
@@ -121,14 +121,14 @@ class Views(GeometryModule):
         return result, valid
 
     def extra_repr(self) -> str:
-        """The views."""
+        """Return the names of the views."""
         return f"{', '.join(self.names)}"
 
 
 def cube(camera: Camera, size: int | None = None, *, mode: Mode = "bilinear") -> Views:
-    """Return the six faces of a cube about a camera, of 90 degrees each: front, right, back, left, up, down.
+    """Return the six faces of a cube around a camera, of 90 degrees each: front, right, back, left, up, down.
 
-    The sides of a face have `size` pixels; by default it is as fine in its middle as the image at the axis.
+    The sides of a face have `size` pixels; by default its middle is as fine as the image at the axis.
     """
     angles = torch.tensor([[0, 0], [90, 0], [180, 0], [-90, 0], [0, 90], [0, -90]], dtype=torch.float64)
     rotations = mount_rotation(angles[:, 0], angles[:, 1], torch.zeros(6, dtype=torch.float64))
@@ -144,15 +144,15 @@ def ring(
     pitch: float = 0.0,
     mode: Mode = "bilinear",
 ) -> Views:
-    """Return `count` views side by side from left to right, over what a camera sees.
+    """Return `count` views side by side, from left to right, over a camera's field of view.
 
     Args:
-        camera: of the wide images, with image_size.
-        count: of the views.
-        fov: degrees, of a view; by default a quarter more than the step from one to the next.
-        size: pixels along the sides of a view; as fine in its middle as the image at the axis by default.
-        pitch: degrees that all look up.
-        mode: as `Warp` takes it.
+        camera: the camera of the wide images, with image_size.
+        count: number of views.
+        fov: degrees of a view; by default a quarter more than the step from one view to the next.
+        size: pixels along the sides of a view; by default its middle is as fine as the image at the axis.
+        pitch: degrees by which all views look up.
+        mode: as in `Warp`.
     """
     count, pitch = as_whole(count, "count", "ring", least=1), as_number(pitch, "pitch", "ring")
     seen = float(as_sized(camera, "camera", "ring").field_of_view.detach()[..., 0].max())
@@ -168,7 +168,7 @@ def _views(
 ) -> Views:
     as_sized(camera, "camera", owner)
     if camera.batch_shape:
-        raise ValueError(f"{owner}: takes one camera; got batch_shape={tuple(camera.batch_shape)}")
+        raise ValueError(f"{owner}: camera must be a single camera; got batch_shape={tuple(camera.batch_shape)}")
     if size is None:
         with torch.no_grad():
             slope = slopes_at_axis(camera.optics, camera.distortion[None])
@@ -180,15 +180,15 @@ def _views(
 
 
 def look_at(camera: Camera, boxes: Numbers, image_size: Sequence[int], *, margin: float = 0.25) -> Warp:
-    """Return a warp to a pinhole camera that looks at a box, as of a face detector: a crop without perspective.
+    """Return a warp to a pinhole camera that looks at a box, such as a detected face: a crop without perspective.
 
-    A plain crop of a face away from the axis is the face as seen from the side of the lens: wider, leaning, and turned
+    A plain crop of a face off the axis shows the face as seen from the side of the lens: wider, leaning, and turned
     against the same face on the axis. The new camera looks along the ray of the box's middle, and the source's y axis
     stays in its y-z plane, so that upright stays upright. Its pixels are square, its principal point is the middle of
     the image, and its focal length is the largest at which the outline of box and margin is inside the image.
 
     Args:
-        camera: of the images, of any model, with image_size; single, or a batch of B.
+        camera: the camera of the images, of any model, with image_size; single, or a batch of B.
         boxes: (B, 4) or (4,), pixels x1, y1, x2, y2 of the camera's images, whole numbers at the middles of pixels.
         image_size: (height, width) of the crop.
         margin: how far left and right move out, in widths of the box, and top and bottom, in heights.
@@ -196,11 +196,11 @@ def look_at(camera: Camera, boxes: Numbers, image_size: Sequence[int], *, margin
     Returns:
         A `Warp` to a `Pinhole` of batch (B,), or single for one box. Images (1, C, H, W) of a single camera give B
         crops. `warp.transform_points`, `.transform_rays` and so on move labels, `warp.inverse()` takes them back,
-        `warp.target` is the new camera and `warp.rotation` its turn, `ray_crop = R ray_camera`. Boxes and what follows
-        from them count as given, without gradients.
+        `warp.target` is the new camera and `warp.rotation` its turn, `ray_crop = R ray_camera`. Boxes, and all that
+        follows from them, have no gradients.
 
     Raises:
-        ValueError: boxes that cannot be looked at: the text names the box.
+        ValueError: If a box cannot be looked at; the message names it.
     """
     camera, owner = as_sized(camera, "camera", "look_at"), "look_at"
     given = as_values(boxes, "boxes", owner, camera.intrinsics.device)
@@ -210,7 +210,7 @@ def look_at(camera: Camera, boxes: Numbers, image_size: Sequence[int], *, margin
         )
     batch = tuple(camera.batch_shape)
     if len(batch) > 1 or (batch and given.ndim == 2 and len(given) != batch[0]):
-        raise ValueError(f"{owner}: {len(given)} boxes do not fit a camera of batch dims {batch}")
+        raise ValueError(f"{owner}: boxes must be one for each camera of one batch dim; got {len(given)} for {batch}")
     size = as_known_size(image_size, owner)
     rows = given if given.ndim == 2 else given.expand(*(batch or (1,)), 4)
     check_extents(rows, camera, owner)
@@ -223,15 +223,15 @@ def look_at(camera: Camera, boxes: Numbers, image_size: Sequence[int], *, margin
 
 
 def as_margin(value: object, owner: str) -> float:
-    """A checked margin around a box, in parts of its sides."""
+    """Return a checked margin around a box, as a part of its sides."""
     margin = as_number(value, "margin", owner)
     if not -0.5 < margin < math.inf:
-        raise ValueError(f"{owner}: margin must be finite, and more than -0.5, which leaves nothing; got {value!r}")
+        raise ValueError(f"{owner}: margin must be finite and more than -0.5, which leaves no box; got {value!r}")
     return margin
 
 
 def pinhole(intrinsics: Tensor, size: tuple[int, int]) -> Pinhole:
-    """A pinhole camera of intrinsics (*B, 4) that camtorch made, which do not learn."""
+    """Return a pinhole camera of valid intrinsics (*B, 4), which do not learn."""
     return remade(_VIRTUAL, intrinsics=intrinsics, distortion=intrinsics[..., :0], image_size=size)
 
 
@@ -254,26 +254,26 @@ def check_extents(boxes: Tensor, camera: Camera, owner: str) -> None:
 def looking_at(
     camera: Camera, boxes: Tensor, size: tuple[int, int], margin: float, owner: str
 ) -> tuple[Tensor, Tensor]:
-    """Intrinsics (B, 4) and rotations (B, 3, 3), in float64, of what `look_at` makes for boxes (B, 4)."""
+    """Return intrinsics (B, 4) and rotations (B, 3, 3), in float64, of the cameras of `look_at` for boxes (B, 4)."""
 
     def refuse(wrong: Tensor, what: str) -> None:
         if bool(wrong.any()):
             i = int(wrong.nonzero()[0])
-            raise ValueError(f"{owner}: box {i}, {boxes[i].tolist()}, {what}")
+            raise ValueError(f"{owner}: boxes must {what}; got boxes[{i}] = {boxes[i].tolist()}")
 
     low, high = boxes.detach().double().split(2, -1)
     axis, has_ray = camera.unproject((low + high) / 2)
-    refuse(~has_ray, "has no ray in its middle: the lens does not see there")
+    refuse(~has_ray, "have a middle that the lens sees")
     axis = axis / axis.norm(dim=-1, keepdim=True)
     across = torch.stack((axis[:, 2], torch.zeros_like(axis[:, 0]), -axis[:, 0]), -1)
     length = across.norm(dim=-1, keepdim=True)
-    refuse(length[:, 0] < _STRAIGHT_UP, "is seen along the camera's y axis, and no way up is the better one")
+    refuse(length[:, 0] < _STRAIGHT_UP, "lie off the camera's y axis, along which no direction is up")
     across = across / length
     rotation = torch.stack((across, torch.linalg.cross(axis, across), axis), -2)
     moved = margin * (high - low)
     corners = corners_of(torch.cat((low - moved, high + moved), -1))
     start, edge = corners[:, :, None, None], (corners.roll(-1, 1) - corners)[:, :, None, None]
-    # along each edge the largest slope x / z, and the largest y / z: closer and closer to where it is
+    # find the largest slopes x / z and y / z along each edge, in smaller and smaller steps
     steps = torch.linspace(-1, 1, _ALONG, dtype=low.dtype, device=low.device)
     place, half, all_seen = low.new_full((len(boxes), 4, 1), 0.5), 0.5, True
     farthest = low.new_full((len(boxes), 2), -math.inf)
@@ -283,7 +283,7 @@ def looking_at(
         turned, seen = (rays @ rotation.mT).view(*share.shape, 3), seen.view(share.shape)
         all_seen = all_seen and bool(seen.all())
         behind = (seen & (turned[..., 2] <= 1e-9)).flatten(1).any(-1)
-        refuse(behind, "has an outline 90 degrees or more from its middle")
+        refuse(behind, "have an outline less than 90 degrees from the middle")
         slopes = turned[..., :2].abs() / turned[..., 2:].clamp(min=1e-9)
         slopes = torch.where(seen[..., None], slopes, -math.inf)
         slopes = slopes.expand(-1, -1, 2, -1, -1).diagonal(dim1=2, dim2=4).mT  # (B, 4, 2, K)
@@ -292,7 +292,7 @@ def looking_at(
         if i == _ROUNDS - 1 and all_seen:
             break
         place, half = share.expand(*best.shape, -1).gather(-1, index[..., None])[..., 0], 2 * half / (_ALONG - 1)
-    refuse(~torch.isfinite(farthest).all(-1), "has no ray on its outline")
+    refuse(~torch.isfinite(farthest).all(-1), "have an outline that the lens sees")
     sides = farthest.new_tensor(size[::-1])
     focal = (sides / 2 / farthest).amin(-1, keepdim=True).expand(-1, 2)
     return torch.cat((focal, ((sides - 1) / 2).expand_as(focal)), -1), rotation

@@ -1,4 +1,4 @@
-"""Natural vignetting: how much less a lens lets through, the farther a ray is from the axis."""
+"""Natural vignetting: how much less light a lens lets through, the farther a ray is from the axis."""
 
 from __future__ import annotations
 
@@ -9,24 +9,24 @@ from camtorch.cameras.camera import Camera
 from camtorch.values.arguments import as_values
 from camtorch.warp.warp import as_sized
 
-_LEAST = 0.1  # of a cosine: from 84 degrees on the light stays as it is there
+_LEAST = 0.1  # a cosine: from 84 degrees on the light is constant
 
 
 def vignetting(camera: Camera, power: float | Tensor = 1.0) -> Tensor:
-    """(B or 1, 1, H, W): natural vignetting, the fourth power of the cosine of each pixel's angle to the axis.
+    """Return natural vignetting (B or 1, 1, H, W): the fourth power of the cosine of each pixel's angle to the axis.
 
-    `images * ct.vignetting(camera)` puts it on, `images / ct.vignetting(camera)` undoes it, of images in linear light.
-    It is 1 on the axis. From 84 degrees on it stays what it is there, 0.0001, and so it is where pixels have no ray.
+    `images * ct.vignetting(camera)` applies it to images in linear light, `images / ct.vignetting(camera)` undoes it.
+    It is 1 on the axis. From 84 degrees on, and at pixels without a ray, it is constant, 0.0001.
 
     Args:
-        camera: with image_size.
-        power: of the law, a number or (B,): 0 is no vignetting, 1 the law, -1 its inverse. Lenses made to light their
-            rim evenly, as fisheyes are, have less than 1.
+        camera: a camera with image_size.
+        power: the exponent's factor, a number or (B,): 0 is no vignetting, 1 the natural one, -1 its inverse. Lenses
+            made to light their rim evenly, such as fisheyes, have less than 1.
 
-    The angle is that of the lens, not that of a pinhole. Derivatives go to `power` alone.
+    The angle is that of the lens, not that of a pinhole. Only `power` has derivatives.
 
     Raises:
-        ValueError: a camera without image_size, powers of another number than cameras. TypeError: powers that are none.
+        ValueError: If the camera has no image_size, or powers do not fit it. TypeError: If power is not numeric.
     """
     height, width = as_sized(camera, "camera", "vignetting")._size_for("vignetting")
     with torch.no_grad():

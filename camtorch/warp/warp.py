@@ -1,4 +1,4 @@
-"""Every image operation between two cameras: one Warp."""
+"""The `Warp`: every image operation between two cameras is one."""
 
 from __future__ import annotations
 
@@ -32,51 +32,56 @@ from camtorch.warp.sampling import MODES, PADDINGS, Fill, Mode, Options, Padding
 
 
 def as_sized(camera: Camera, name: str, owner: str) -> Camera:
-    """The camera, if it is one and knows the size of its image."""
+    """Return the camera; raise if it is no camera or has no image_size."""
     if not isinstance(camera, Camera):
         raise TypeError(f"{owner}: {name} must be a Camera; got {no_camera(camera)}")
     if camera.image_size is None:
-        raise ValueError(f"{owner}: the {name} needs an image_size=(height, width)")
+        raise ValueError(f"{owner}: {name} must have an image_size=(height, width); got None")
     return camera
 
 
 class Warp(CameraPair):
-    """The image that `target` would see, made from the image of `source`, both at one place.
+    """A layer that turns images of camera `source` into images of camera `target`, both at one place.
 
-    Convention: `ray_target = R ray_source` (OpenCV's rectification R). Images are (B, C, H, W). Points, boxes and
-    rays move from source to target. A batch of cameras or rotations, of size B, goes sample by sample with
-    the images; cameras without batch dims serve all of them.
+    Convention: `ray_target = R ray_source` (OpenCV's rectification R). Images are (B, C, H, W). Points, boxes and rays
+    move from source to target. A batch of B cameras or rotations goes sample by sample with the images; a single one
+    serves all.
+
+    >>> source = ct.KannalaBrandt([80.0, 80.0, 63.5, 47.5], [0.02, -0.01, 0.0, 0.0], image_size=(96, 128))
+    >>> warp = ct.Warp(source, ct.Pinhole([60.0, 60.0, 63.5, 47.5], image_size=(96, 128)))
+    >>> images = warp(torch.zeros(8, 3, 96, 128))
+    >>> pixels, valid = warp.transform_points([[100.0, 47.5], [63.5, 47.5]])
 
     Args:
         source: the camera of the given images.
         target: the camera of the images to make; its `image_size` is theirs.
         rotation: (3, 3) or (B, 3, 3) rotation matrix; may require grad. None is no rotation.
         mode: "bilinear", "nearest" (masks, labels) or "bicubic".
-        padding_mode: "zeros", "border" or "reflection", for pixels that the source sees outside its
-            image. A pixel without a ray, or whose ray the source cannot map, always takes `fill`.
-        fill: the value of pixels that show nothing, blended in at the rim of "zeros"; one, or one for each channel.
-        antialias: where the image shrinks, a pixel takes the mean of what it covers, as wide in all directions as in
-            the widest; compiled down to a sixteenth. "nearest" does not.
-        tolerance: pixels of the source by which sampling positions may be off at most. Above zero they come from a
-            lattice of every eighth pixel, several times as fast where cameras are new, and what it does not reach is
-            computed. By default 0.001 between cameras in float32, whose rounding costs as much, and zero in
-            float64. Zero is exact; so are points, boxes and rays always, warps with a graph, and those on a GPU.
+        padding_mode: "zeros", "border" or "reflection", for pixels that the source sees outside its image. A pixel
+            without a ray, or whose ray the source cannot map, always takes `fill`.
+        fill: the value of empty pixels, blended in at the rim of "zeros"; one, or one for each channel.
+        antialias: if the image shrinks, a pixel is the mean of the area it covers, as wide in all directions as in the
+            widest; compiled down to a sixteenth. Not for "nearest".
+        tolerance: the largest error of sampling positions, in pixels of the source. Above zero they come from a lattice
+            of every eighth pixel, several times as fast for new cameras; positions out of its reach are computed. By
+            default 0.001 between cameras in float32, whose rounding costs as much, and zero in float64. Points, boxes
+            and rays, warps with a graph and warps on a GPU are always exact.
 
-    The image of a panorama of a whole turn goes on beyond its seam and its poles: of an `Equirectangular` or
-    `Cylindrical` source as wide as 2 pi, or a `LatLon` or `TransverseCylindrical` one as tall, to 0.05 pixels, all of a
-    batch. That takes a slightly larger copy of it. In a `Mixed`, or a `ShutterWarp`, it ends at its edges.
+    A panorama of a whole turn goes on beyond its seam and poles: an `Equirectangular` or `Cylindrical` source as wide
+    as 2 pi, or a `LatLon` or `TransverseCylindrical` one as tall, to 0.05 pixels, for all cameras of a batch; this
+    copies the image. In a `Mixed`, or a `ShutterWarp`, it ends at its edges.
 
-    The sampling grid is kept while nothing that it depends on can learn or has changed. In a network the cameras are
+    The sampling grid is kept until something that it depends on changes or can learn. In a network the cameras are
     part of it: `warp.requires_grad_(False)` keeps an optimizer from moving them, `warp.source.freeze("fx")` one number.
     `print(warp)` shows "learns" if a camera or the rotation requires grad, and "fixed" if none does.
 
     Raises:
-        ValueError: a mode that does not exist, cameras without image_size, a rotation of another shape or that is
-            none, batch dims that do not fit, a fill or a tolerance that is none.
-        TypeError: source or target is not a Camera.
+        ValueError: If a mode is unknown, a camera has no image_size, the rotation is no rotation or has a wrong shape,
+            batch dims do not fit, or fill or tolerance is not valid.
+        TypeError: If source or target is no Camera.
     """
 
-    _decides = False  # for itself where to antialias
+    _decides = False  # True: the warp itself chooses which images to antialias
     batch_shape: torch.Size
     mode: Mode
     padding_mode: PaddingMode
@@ -84,7 +89,7 @@ class Warp(CameraPair):
     antialias: bool
     _has_shutters: ClassVar[bool] = False
     keeps_lens: ClassVar[bool] = False
-    """Whether it may follow another warp, and is then what `follow` makes of that."""
+    """Whether it can follow another warp, as one warp that `follow` returns."""
 
     def __init__(
         self,
@@ -100,7 +105,7 @@ class Warp(CameraPair):
     ):
         options = as_options("Warp", mode, padding_mode, fill, antialias, tolerance)
         rotation = as_rotation(rotation, "Warp")
-        # how many of each a warp is between; raises what is wrong with that, and with them
+        # find the one batch dim of all, and raise if something is wrong
         as_sized(source, "source", "Warp")
         as_sized(target, "target", "Warp")
         check_devices("Warp", source=source.intrinsics, target=target.intrinsics, rotation=rotation)
@@ -109,16 +114,16 @@ class Warp(CameraPair):
         try:
             batch = broadcast_shapes(*shapes)
         except ValueError:
-            batch = torch.Size((0, 0))  # none
+            batch = torch.Size((0, 0))  # no valid batch
         if len(batch) > 1:
             got = ", ".join(map(str, shapes))
-            raise ValueError(f"Warp: source, target and rotation may each have one batch dim, of one size; got {got}")
+            raise ValueError(f"Warp: source, target and rotation must share one batch dim, or have none; got {got}")
         self._set(source, target, options, batch)
         self.turned_by(rotation)
 
     @classmethod
     def unchecked(cls, *given: Any) -> Self:
-        """A warp, without a rotation as yet, of arguments as of `_set` that are known to be right."""
+        """Return a warp, without a rotation yet, from valid arguments of `_set`."""
         warp = cls.__new__(cls)
         warp._set(*given)
         return warp
@@ -135,18 +140,18 @@ class Warp(CameraPair):
 
         Args:
             images: (B, C, H, W) of the source's image_size, floating point, integer or bool.
-            mode: instead of the warp's own, for example "nearest" for a mask.
-            padding_mode: likewise.
-            fill: likewise.
+            mode: overrides the warp's own, for example "nearest" for a mask.
+            padding_mode: overrides the warp's own.
+            fill: overrides the warp's own.
 
         Returns:
-            (B, C, H', W') of the target's image_size and of the same dtype. Images whose channels come last in memory
-            give such results. Half precision is sampled in float32; integers are rounded and stay in their range, bool
-            is true from one half on. The nearest integers are exactly those of the image. Integers and bool have no
-            gradient, and learning cameras cost them nothing.
+            (B, C, H', W') of the target's image_size and of the same dtype. Images with channels last in memory give
+            results with channels last. Half precision is sampled in float32; integers are rounded and stay in range;
+            bool is true from one half on; "nearest" copies integers exactly. Integers and bool have no gradient, and no
+            cost if cameras learn.
 
         Raises:
-            ValueError: another shape or size. TypeError: no tensor, or a complex one.
+            ValueError: If the shape or the size is wrong. TypeError: If images are no tensor, or complex.
         """
         call = plan.ready(self, images, mode, padding_mode) if fill is None else None
         return (
@@ -167,10 +172,10 @@ class Warp(CameraPair):
         padding_mode: PaddingMode | None = None,
         fill: Fill | None = None,
     ) -> Iterator[tuple[slice, Tensor, Tensor]]:
-        """Warp images by strips of the target, from top to bottom, for images so large that memory is short.
+        """Warp images by strips of the target, from top to bottom, for images too large for the memory.
 
-        Each strip has its own part of the grid, which is not kept, and of images that are not float32 or float64 it
-        copies no more than a tile of it reads. No gradients. Pixels are those of `forward`, up to the rounding of
+        Each strip has its own part of the grid, which is not kept; of images that are not float32 or float64 only
+        the part that a tile reads is copied. No gradients. Pixels are those of `forward`, up to the rounding of
         positions in float32, a thousandth of a pixel in an image 10,000 pixels wide.
 
             result = torch.empty(3, *warp.target.image_size, dtype=torch.uint8)
@@ -178,14 +183,14 @@ class Warp(CameraPair):
                 result[:, rows] = part[0]
                 progress(rows.stop / len(result[0]), filled=valid.sum())
 
-        `forward` does so by itself, on a CPU and without gradients, for grids of more than 32 million pixels.
+        On a CPU and without gradients, `forward` does this automatically for grids of more than 32 million pixels.
 
         Args:
-            images: as of `forward`.
-            rows: of a strip; by default those of two million pixels.
-            mode: as of `forward`.
-            padding_mode: as of `forward`.
-            fill: as of `forward`.
+            images: as in `forward`.
+            rows: number of rows of a strip; default: those of two million pixels.
+            mode: as in `forward`.
+            padding_mode: as in `forward`.
+            fill: as in `forward`.
 
         Yields:
             the rows of the target, a slice; these rows of `forward`'s result (B, C, n, W'); and of `valid_mask`
@@ -195,7 +200,7 @@ class Warp(CameraPair):
         return plan.in_strips(self, images, rows, checked(self, images, mode, padding_mode, fill))
 
     def grid(self) -> Tensor:
-        """(B or 1, H', W', 2): positions for `grid_sample(..., align_corners=False)`; -9 where there is none."""
+        """Return positions (B or 1, H', W', 2) for `grid_sample(..., align_corners=False)`; -9 for none."""
         where, seam = plan.by_pixel(self), self._seam
         if seam is None:
             return where.grid.clone(memory_format=torch.contiguous_format)
@@ -203,11 +208,11 @@ class Warp(CameraPair):
         return torch.where(where.mapped.unsqueeze(-1), grid, OUTSIDE)
 
     def valid_mask(self) -> Tensor:
-        """(B or 1, 1, H', W') bool: the pixel has a ray, and the source sees it on its image."""
+        """Return (B or 1, 1, H', W') bool: whether the pixel has a ray, and the source sees it on its image."""
         return plan.valid_mask(self)
 
     def pin(self) -> Warp:
-        """Have the grid computed once and for all, with its graph: for a warp whose cameras are not to change."""
+        """Compute the grid once, with its graph, for a warp whose cameras will not change; return the warp."""
         if not self.is_pinned:
             plan.pin(self)
         return self
@@ -217,7 +222,7 @@ class Warp(CameraPair):
 
         Returns:
             pixels of the same shape, and valid (B, *N) bool: the source pixel has a ray, and the target sees
-            it on its image. Pixels off the image keep their place; those without one get (-1, -1).
+            it on its image. Pixels off the image keep their place; pixels that cannot be mapped are (-1, -1).
         """
         return self._move(pixels, on_image=True)
 
@@ -225,20 +230,19 @@ class Warp(CameraPair):
         """Move boxes (B, *N, 4), or (*N, 4): x1, y1, x2, y2 in pixel-centre coordinates.
 
         Returns:
-            the boxes that enclose the moved outlines (curved: the edges are sampled), not clipped to the image, and
-            valid (B, *N) bool: some part of what the box encloses is on the target's image, if only its inside. Of an
-            outline only a part of which can be mapped, the box encloses that part and what the image shows of the
-            inside, found in steps of a sixteenth of the image. Without either, or with x2 < x1 or y2 < y1, it is
-            (-1, -1, -1, -1).
+            boxes that enclose the moved outlines, whose edges are sampled, not clipped to the image, and valid (B, *N)
+            bool: the target's image shows a part of what the box encloses. If only a part of an outline can be mapped,
+            the box encloses it and the inside that the image shows, found in steps of a sixteenth of the image. Boxes
+            that cannot be mapped, or have x2 < x1 or y2 < y1, are (-1, -1, -1, -1).
 
         Raises:
-            ValueError: x2 < x1 or y2 < y1 in plain boxes, which seem to be x, y, width, height; not in those that a
-                network predicted, in a graph or under `torch.no_grad`.
+            ValueError: If plain boxes have x2 < x1 or y2 < y1, and so may be x, y, width, height; predicted boxes, in a
+                graph or under `torch.no_grad`, are not checked.
         """
         return moved_boxes(self, boxes)
 
     def enclose(self, corners: Tensor) -> tuple[Tensor, Tensor]:
-        """As `transform_boxes`, of closed polygons (B, *N, K, 2), or (*N, K, 2)."""
+        """Move closed polygons (B, *N, K, 2), or (*N, K, 2), and return boxes as `transform_boxes` does."""
         return enclosed(self, corners)
 
     def transform_rays(self, rays: Numbers) -> Tensor:
@@ -253,12 +257,12 @@ class Warp(CameraPair):
             raise AttributeError(f"{error}. {LEFT}") from None
 
     def inverse(self) -> Warp:
-        """The warp from target to source. What lay outside the image, or between its pixels, stays lost."""
+        """Return the warp from target to source. Pixels outside the image, or between its pixels, stay lost."""
         rotation = None if self.rotation is None else self.rotation.mT
         return self.between(self.target, self.source, rotation, **self.options)
 
     def between(self, source: Camera, target: Camera, rotation: Tensor | None, **options: Any) -> Warp:
-        """A warp as this one is, mirrored or not, between other cameras."""
+        """Return a warp like this one, mirrored or not, between other cameras."""
         return Warp(source, target, rotation, **options)
 
     def detach(self) -> Warp:
@@ -271,12 +275,12 @@ class Warp(CameraPair):
         return self.between(source, target, rotation, **self.options)
 
     def follow(self, first: Warp) -> Warp:
-        """Return this warp after `first`, as one, if it keeps the lens of that."""
+        """Return this warp after `first`, as one warp that keeps the lens of `first`."""
         raise NotImplementedError
 
     @property
     def options(self) -> Options:
-        """What another Warp takes to sample in the same way."""
+        """Options with which another `Warp` samples in the same way."""
         return {
             "mode": self.mode,
             "padding_mode": self.padding_mode,
@@ -288,7 +292,7 @@ class Warp(CameraPair):
     def __setstate__(self, state: dict[str, Any]) -> None:
         lost = [name for name in ("shutter", "target_shutter") if state["_modules"].get(name) is not None]
         if lost and not self._has_shutters:
-            raise ValueError(f"{type(self).__name__}: the saved warp has a {lost[0]}, which a Warp had in 0.3. {LEFT}")
+            raise ValueError(f"{type(self).__name__}: a saved warp must have no {lost[0]}; got one of 0.3. {LEFT}")
         super().__setstate__(state)  # type: ignore[no-untyped-call]
 
     def extra_repr(self) -> str:
@@ -305,7 +309,7 @@ def checked(
     padding_mode: PaddingMode | None = None,
     fill: Fill | None = None,
 ) -> Sampler:
-    """How a warp samples images in one call, if they and its options are as `Warp.forward` wants them."""
+    """Return how a warp samples images in one call; raise if images or options are wrong."""
     expected = warp.source._size_for("Warp")
     if not isinstance(images, Tensor) or images.dtype.is_complex:
         what = getattr(images, "dtype", "") if isinstance(images, Tensor) else type(images).__name__
@@ -323,17 +327,17 @@ def checked(
         raise ValueError(f"Warp: images must be (B, C, H, W); got shape {shape}. {hint}")
     if shape[-2:] != expected:
         raise ValueError(
-            f"Warp: images are {shape[-2:]} (height, width), but the source camera's image_size is {expected}; "
-            "camera.crop makes that of a part of it, camera.resize that of another resolution"
+            f"Warp: images must have the source's image_size {expected} (height, width); got {shape[-2:]}. "
+            "camera.crop returns the camera of a part of its image, camera.resize that of another resolution"
         )
     if images.device != warp.source.intrinsics.device:
         check_devices("Warp", images=images, source=warp.source.intrinsics)
     cameras = math.prod(warp.batch_shape)
     if cameras != 1 and images.shape[0] not in (1, cameras):
-        raise ValueError(f"Warp: {images.shape[0]} images do not fit {cameras} cameras")
+        raise ValueError(f"Warp: images must be 1 or {cameras}, one for each camera; got {images.shape[0]}")
     values = warp.fill if fill is None else as_fill(fill, "Warp")
     if len(values) not in (1, shape[1]):
-        raise ValueError(f"Warp: fill has {len(values)} values, but the images have {shape[1]} channels")
+        raise ValueError(f"Warp: fill must have 1 value or {shape[1]}, one for each channel; got {len(values)}")
     return Sampler(
         warp.mode if mode is None else one_of(mode, MODES, "mode", "Warp"),
         warp.padding_mode if padding_mode is None else one_of(padding_mode, PADDINGS, "padding_mode", "Warp"),
@@ -351,7 +355,7 @@ _WAYS = {
 
 
 def _way_in(images: Any, size: tuple[int, int]) -> str:
-    """In words, how an array of images, or what numpy takes for one, becomes a tensor, and an array again."""
+    """Return a sentence on how an array of images, or a PIL image, becomes a tensor, and the result an array."""
     array = np.asarray(images)
     taken = "np.array(image)" if array is not images else "array"
     if any(step < 0 for step in array.strides):

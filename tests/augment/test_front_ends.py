@@ -121,7 +121,7 @@ def test_errors_name_the_field_and_its_shape():
     transform = ct.augment.numpy.Transform(own)
     last, first = r"{} is \(.*channels last.*{}.permute\({}\)", image.T.swapaxes(1, 2)
     for call, text, fields in (
-        (transform, r"image must be .* got shape \(3, 24, 32\), which has its channels first", {"image": first}),
+        (transform, r"image must be .* got shape \(3, 24, 32\), with the channels first", {"image": first}),
         (transform, r"image is \(23, 32\) .* image_size of camera is \(24, 32\)", {"image": image[1:]}),
         (transform, r"masks\[1\] must be .* got shape \(32,\)", {"masks": [mask, mask[0]]}),
         (transform, r"keypoints must be \(N, 2\).* got shape \(4, 1\)", {"keypoints": points[:, :1]}),
@@ -263,7 +263,7 @@ def test_what_would_not_move_or_be_misread_is_refused(vision):
         (transform, {"image": image, "gaze": [0.0, 0.0, 1.0]}, "gaze must be a tensor of real numbers"),
         (transform, tv.KeyPoints(torch.ones(1, 2), canvas_size=(5, 6)), size),
         (transform, torch.ones(3, 7, 8), r"Tensor is \(7, 8\)"),
-        (transform, PIL.Image.new("P", SIZE[::-1]), "mode 'P' mean nothing"),
+        (transform, PIL.Image.new("P", SIZE[::-1]), "mode 'P'"),
         (front_end.Transform(augmentation()), image, "no camera"),
         (two, image, r"batch dims \(2,\)"),
         (front_end.Transform, ct.augment.FaceNormalizer(), "got FaceNormalizer"),
