@@ -517,7 +517,9 @@ class Augmentation(SampleTransform):
         generator: torch.Generator | None = None,
     ) -> tuple[Sample, Change]:
         """Return a sample moved by one change, and the change; kinds: name -> kind, in addition to `fields`."""
-        named, batched, count, camera = self._batch(sample, kinds=kinds)
+        batch = self._batch(sample, kinds=kinds)
+        named, form, camera = batch
+        count = form.count
         if draw is None:
             numbers = self._numbers(count, self.p, self.same_on_batch, generator)
             change = self._change(camera, self._of_sample(numbers, named))
@@ -529,7 +531,7 @@ class Augmentation(SampleTransform):
             self.__dict__["last"] = change  # as nn.Module would, after some questions
             if count and not self._warned and "image" in [found for found, _ in named.values()]:
                 self.tell_of_empty_images(camera)
-        return self._moved(sample, named, batched, change), change
+        return self._moved(sample, batch, change), change
 
     @on_samples
     def inverse(

@@ -53,6 +53,7 @@ class Drawn:
     native: Native | None  # these ones; None where they have to be found
     factor: Tensor  # (B,), on the focal lengths, that `min_filled` asks for
     found: Tensor  # (B,): the share of each image that is filled
+    is_turn: bool = True  # of a single one: whether the rotation is no mirror
     made: Warp | None = field(default=None, init=False)  # the warp, once somebody has asked for it
 
     @cached_property
@@ -159,7 +160,8 @@ def _joined(a: Part, b: Part) -> Part:
             )
         if isinstance(b.moves, Drawn) and not a.camera.batch_shape:
             start = a.moves.start if isinstance(a.moves, Drawn) else _single(a.camera)
-            return replace(b, rows=a.rows, camera=a.camera, moves=replace(b.moves, rotation=rotation, start=start))
+            moves = replace(b.moves, rotation=rotation, start=start, is_turn=rotation is None or _is_proper(rotation))
+            return replace(b, rows=a.rows, camera=a.camera, moves=moves)
         moved = b.by(lambda warp: MirrorWarp(a.camera, warp.target, rotation))
         return replace(moved, rows=a.rows, camera=a.camera)
     edit, size = b.moves.map, b.moves.target.image_size
@@ -507,6 +509,14 @@ def as_one(camera: Camera | Sequence[Camera]) -> Camera:
 def alone(camera: Camera) -> Camera:
     """A batch of one as the camera that it holds, which serves any number of samples."""
     return camera[0] if camera.batch_shape == (1,) else camera
+
+
+def _is_proper(rotation: Tensor) -> bool:
+    """Whether the rotation (3, 3) of a single camera is no mirror; False of several."""
+    if rotation.ndim > 2:
+        return False
+    (a, b, c), (d, e, f), (g, h, i) = rotation.tolist()
+    return bool(a * (e * i - f * h) + b * (f * g - d * i) + c * (d * h - e * g) > 0)
 
 
 def _is_mirror(rotation: Tensor) -> Tensor:

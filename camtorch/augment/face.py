@@ -127,7 +127,8 @@ class FaceNormalizer(SampleTransform):
             ValueError: no head pose, and as `Augmentation`.
         """
         sample = self._given(sample, fields)
-        named, batched, _, camera = self._batch(sample)
+        batch = self._batch(sample)
+        named, camera = batch.named, batch.camera
         if not isinstance(sample.get("camera", camera), Camera):
             raise TypeError(f"{self._name}: camera must be a Camera; got {no_camera(sample['camera'])}")
         kinds = {name: value for name, (_, value) in named.items()}
@@ -142,9 +143,9 @@ class FaceNormalizer(SampleTransform):
             raise ValueError(f"{self._name}: the sample needs head_pose, or rvec and tvec; it has {', '.join(sample)}")
         centre = kinds.get("face_center", centre)
         change = self.change(camera, head, centre)
-        moved = self._moved(sample, named, batched, change)
+        moved = self._moved(sample, batch, change)
         scale = self.distance / centre.norm(dim=-1)
-        moved["scale"] = scale if batched else scale.squeeze(0)
+        moved["scale"] = scale if batch.form.batched else scale.squeeze(0)
         moved["source_camera"] = camera.clone()
         if "rotation" in sample:  # of augmentations before
             moved["source_rotation"] = sample["rotation"].clone()
@@ -162,12 +163,12 @@ class FaceNormalizer(SampleTransform):
         if missing:
             raise ValueError(f"{self._name}: to go back, the sample needs {', '.join(missing)} as they came out")
         normal, source, rotation = (sample.pop(name) for name in ("camera", "source_camera", "rotation"))
-        named, batched, count, _ = self._batch(sample, normal, predicted=True)
+        batch = self._batch(sample, normal, predicted=True)
         before = sample.get("source_rotation")
         rotation = rotation if before is None else rotation @ before.mT
         rotation = rotation if rotation.ndim == 3 else rotation.unsqueeze(0)
         warp = Warp(source, normal, rotation.to(normal.intrinsics), **self.options)
-        moved = self._moved(sample, named, batched, Change(count, [Part(None, warp, source)]).inverse())
+        moved = self._moved(sample, batch, Change(batch.form.count, [Part(None, warp, source)]).inverse())
         del moved["rotation"]
         if before is not None:
             moved["rotation"] = moved.pop("source_rotation")

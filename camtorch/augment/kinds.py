@@ -7,7 +7,7 @@ import functools
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import torch
@@ -15,13 +15,13 @@ from torch import Tensor
 
 from camtorch.augment.change import Change, Drawn
 from camtorch.cameras.camera import Camera
-from camtorch.evaluate.known import are_numbers, known_false, known_true
+from camtorch.evaluate.known import are_free, are_numbers, known_false, known_true
 from camtorch.evaluate.private import pytree
 from camtorch.poses.rotations import are_rotations, check_rotation, is_right, rotation_matrix, rotation_vector
 from camtorch.values.arguments import as_coordinates, check_angles, check_boxes, check_radians, warn
-from camtorch.warp.boxes import edges_of, enclosing
-from camtorch.warp.plan import Label, at_once
-from camtorch.warp.sampling import Sampler
+from camtorch.values.threads import thread_count
+from camtorch.warp.plan import Label, SampleCall, call_for
+from camtorch.warp.sampling import Options, Sampler
 
 Named = dict[str, tuple[str, Any]]
 """Name -> (kind, tensor or list of tensors)."""
@@ -302,27 +302,69 @@ def in_range(values: Tensor, dtype: torch.dtype) -> Tensor:
     return values.to(dtype)
 
 
-def _is_proper(rotation: Tensor | None) -> bool:
-    """Whether (3, 3) is no mirror."""
-    if rotation is None:
-        return True
-    (a, b, c), (d, e, f), (g, h, i) = rotation.tolist()
-    return bool(a * (e * i - f * h) + b * (f * g - d * i) + c * (d * h - e * g) > 0)
+class Form:
+    """What samples of one form have in common: the fields that move, by name and kind, and the call that moves them."""
+
+    def __init__(self, fields: list[tuple[str, str]], batched: bool, count: int):
+        self.fields, self.batched, self.count = fields, batched, count
+        self._settings: tuple[Any, ...] = ()
+        self._call: tuple[list[str], SampleCall | None] = [], None
+
+    def call(self, settings: tuple[Any, ...], find: Callable[[], tuple[list[str], SampleCall | None]]) -> Any:
+        """Return the call, and the names of the fields that it moves, of the last settings or as found."""
+        if settings != self._settings:
+            self._call, self._settings = find(), settings
+        return self._call
 
 
 def together(
-    change: Change, named: Named, mask_fill: float = 0.0, lateral: float = 0, batched: bool = True
+    change: Change, named: Named, form: Form, mask_fill: float = 0.0, lateral: float = 0
 ) -> dict[str, tuple[Tensor, Tensor | None]]:
     """What moves by one compiled call, and its validity: images, pixels, and of a single sample boxes and what turns.
 
-    batched: whether the results have a batch dim, as `named` has; those of a batch of one may do without.
+    The results have a batch dim, as `named` has, if samples of the form have one.
     """
-    part, is_single = change.parts[0], change.count == 1
+    part, batched = change.parts[0], form.batched
     if part.moves is None or part.rows is not None or change.gate is not None:
         return {}
-    options = part.moves.options
+    if not form.count or (between := part.between()) is None:
+        return {}
+    source, target, rotation = between
+    moved = part.moves if isinstance(part.moves, Drawn) and change.count == 1 else None
+    is_turn, options = moved is not None and moved.is_turn, part.moves.options
+    sizes = part.camera._size_for("Warp"), part.image_size
+
+    def find() -> tuple[list[str], SampleCall | None]:
+        hows = _ways(named, options, mask_fill, source.dtype if moved is not None else None, is_turn, change.count == 1)
+        values = [named[name][1] if batched else named[name][1][0] for name in hows]
+        return list(hows), call_for(sizes, source.dtype, options, values, [*hows.values()], batched) if hows else None
+
+    settings = sizes, source.dtype, options, mask_fill, moved is None, is_turn, thread_count()
+    names, call = form.call(settings, find)
+    if (
+        call is None
+        or max(source.cameras, target.cameras, 1 if rotation is None else rotation.numel() // 9) != form.count
+    ):
+        return {}
+    values = [named[name][1] if batched else named[name][1][0] for name in names]
+    made = call(source, target, rotation, values) if are_free(*values) else None
+    results: dict[str, tuple[Tensor, Tensor | None]] = {}
+    for name, value, result in zip(names, values, made or (), strict=bool(made)):
+        if result is not None:
+            moved_value, valid = result
+            same = moved_value.dtype == value.dtype
+            results[name] = moved_value if same else in_range(moved_value, value.dtype), valid
+    return results
+
+
+def _ways(
+    named: Named, options: Options, mask_fill: float, dtype: torch.dtype | None, is_turn: bool, is_single: bool
+) -> dict[str, Sampler | Label]:
+    """Return how the fields move that one call of compiled code takes.
+
+    dtype: of labels of a single sample that turn, or None. is_turn: whether the rotation is no mirror.
+    """
     mode, padding_mode, fill = options["mode"], options["padding_mode"], options["fill"]
-    moved = part.moves if isinstance(part.moves, Drawn) and is_single else None
     hows: dict[str, Sampler | Label] = {}
     for name, (found, value) in named.items():
         if found in ("depth", "distance") or isinstance(value, list):  # which ask for positions again
@@ -335,31 +377,14 @@ def together(
             hows[name] = Sampler("nearest", "zeros", (mask_fill,))
         elif found != "boxes" and moves(found, value) is _pixels:
             hows |= {name: "pixels"} if is_single or value.numel() < _MANY_PIXELS else {}
-        elif moved is not None and value.dtype == moved.distortion.dtype and are_numbers(value):
+        elif value.dtype == dtype and are_numbers(value):
             if found == "boxes":
-                hows[name] = "pixels"
+                hows[name] = "boxes"
             elif found in _TURNED and value.is_contiguous():
                 hows[name] = "rays"
-            elif found in _MATRICES and value.is_contiguous() and _is_proper(moved.rotation):
+            elif found in _MATRICES and value.is_contiguous() and is_turn:
                 hows[name] = "columns"
-    fields = (named[name] for name in hows)
-    values = [edges_of(value) if found == "boxes" else value for found, value in fields]
-    between = part.between() if values else None
-    if between is None:
-        return {}
-    sizes = part.camera._size_for("Warp"), part.image_size
-    made = at_once(*between, sizes, options, values, list(hows.values()), batched)
-    if made is None:
-        return {}
-    results: dict[str, tuple[Tensor, Tensor | None]] = {}
-    for name, value, (result, valid) in zip(hows, values, made, strict=True):
-        found, given = named[name]
-        if found == "boxes":
-            boxes = enclosing(given if batched else given[0], result, cast("Tensor", valid))
-            results |= {} if boxes is None else {name: boxes}
-        else:
-            results[name] = result if result.dtype == value.dtype else in_range(result, value.dtype), valid
-    return results
+    return hows
 
 
 def from_pitch_yaw(angles: Tensor) -> Tensor:

@@ -10,7 +10,8 @@ import inspect
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, ClassVar, ParamSpec, TypedDict, TypeVar, cast, get_args, get_origin, get_type_hints
+from threading import get_ident
+from typing import Any, ClassVar, NamedTuple, ParamSpec, TypedDict, TypeVar, cast, get_args, get_origin, get_type_hints
 
 import numpy as np
 import torch
@@ -25,6 +26,7 @@ from camtorch.augment.kinds import (
     KEEP,
     KINDS,
     OWN,
+    Form,
     Named,
     as_tensor,
     check,
@@ -68,6 +70,14 @@ class Single(dict[str, Any]):
 
 class Frames(Single):
     """A single sample whose values may have leading dims, as those of clips have: all of them move by one change."""
+
+
+class Batch(NamedTuple):
+    """The fields of samples as a batch."""
+
+    named: Named
+    form: Form
+    camera: Camera
 
 
 class Unknown(Pinhole):
@@ -275,8 +285,8 @@ class SampleTransform(KeepsCamera, nn.Module):
 
     def _batch(
         self, sample: Sample, camera: Any = None, predicted: bool = False, kinds: Mapping[str, str] | None = None
-    ) -> tuple[Named, bool, int, Camera]:
-        """Return the fields that move, as a batch; whether the sample was one; its size, and its cameras.
+    ) -> Batch:
+        """Return the fields that move, as a batch, their form, and the cameras.
 
         What samples of one form have in common is found and checked once. camera: instead of the sample's. predicted:
         values may be bad. kinds: name -> kind, in addition to `fields`.
@@ -284,45 +294,46 @@ class SampleTransform(KeepsCamera, nn.Module):
         camera = sample.get("camera") if camera is None else camera
         camera = self._held("camera") if camera is None else camera
         fields = {**self.fields, **kinds} if kinds else self.fields
-        form = self._form_of(sample, camera, fields)
-        known = None if form is None else self._forms.entry((), form)
+        key = self._form_of(sample, camera, fields)
+        known = None if key is None else self._forms.entry((), key)
         if known is None:
             result = self._checked_batch(sample, camera, fields, predicted)
-            named, batched, count, own = result
             if (
-                form is not None
-                and own is camera
-                and all(found in IMAGES or sample[name].dtype.is_floating_point for name, (found, _) in named.items())
+                key is not None
+                and result.camera is camera
+                and all(
+                    found in IMAGES or sample[name].dtype.is_floating_point for name, (found, _) in result.named.items()
+                )
             ):
-                fields_of_form = [(name, found) for name, (found, _) in named.items()]
-                self._forms((), form, lambda: (fields_of_form, batched, count))
+                self._forms((), key, lambda: result.form)
             return result
-        own, batched, count = known[2]
+        form: Form = known[2]
         if not predicted:
-            for name, found in own:
+            for name, found in form.fields:
                 if found in CHECKED:
                     check_values(found, name, sample[name], self._name)
-        named = {name: (found, sample[name] if batched else sample[name].unsqueeze(0)) for name, found in own}
-        return named, batched, count, camera
+        if form.batched:
+            return Batch({name: (found, sample[name]) for name, found in form.fields}, form, camera)
+        return Batch({name: (found, sample[name].unsqueeze(0)) for name, found in form.fields}, form, camera)
 
     def _form_of(self, sample: Sample, camera: object, fields: Mapping[str, str]) -> tuple[Any, ...] | None:
         """All that the fields of a sample are checked for but their values; None where that is more than tensors."""
         if not isinstance(camera, Camera) or camera.is_mixed:
             return None
         intrinsics, distortion = camera._tensors
-        parts: list[Any] = [type(sample), camera.image_size, intrinsics.shape, distortion.shape, intrinsics.device]
+        # each thread has calls of its own
+        parts: list[Any] = [get_ident(), type(sample), camera.image_size, intrinsics.shape, distortion.shape]
+        parts += intrinsics.dtype, intrinsics.device
         for name, value in sample.items():
             if isinstance(value, Tensor):
-                parts += name, value.shape, value.dtype, value.device
+                parts += name, type(value), value.shape, value.stride(), value.dtype, value.device
             elif value is None or isinstance(value, (str, int, float, Camera)):
                 parts += name, type(value)
             else:
                 return None
         return *parts, *fields.items()
 
-    def _checked_batch(
-        self, sample: Sample, camera: Any, fields: Mapping[str, str], predicted: bool
-    ) -> tuple[Named, bool, int, Camera]:
+    def _checked_batch(self, sample: Sample, camera: Any, fields: Mapping[str, str], predicted: bool) -> Batch:
         named = self._sorted(sample, fields)
         if not named:
             raise ValueError(f"{self._name}: the sample has no field that moves; known are {', '.join(KINDS)}")
@@ -354,7 +365,7 @@ class SampleTransform(KeepsCamera, nn.Module):
         check_devices(self._name, **held)
         device, camera = next((v.device for v in held.values()), torch.device("cpu")), alone(as_one(camera))
         camera = camera if camera.intrinsics.device == device else camera.each(lambda t: t.to(device))
-        return named, batched, count, camera
+        return Batch(named, Form([(name, found) for name, (found, _) in named.items()], batched, count), camera)
 
     def _check_cameras(self, camera: object, count: int, named: Named, batched: bool) -> None:
         several = isinstance(camera, (list, tuple))
@@ -422,21 +433,21 @@ class SampleTransform(KeepsCamera, nn.Module):
                 sample = Single(sample)  # labels of several faces, without the image that tells
         first = change.parts[0]
         camera = first.camera if first.rows is None else change.source
-        named, batched, count, _ = self._batch(sample, camera, predicted, kinds)
-        if count != change.count:
-            raise ValueError(f"{self._name}: the change is of {change.count} samples, here are {count}")
-        return self._moved(sample, named, batched, change)
+        batch = self._batch(sample, camera, predicted, kinds)
+        if batch.form.count != change.count:
+            raise ValueError(f"{self._name}: the change is of {change.count} samples, here are {batch.form.count}")
+        return self._moved(sample, batch, change)
 
-    def _moved(self, sample: Sample, named: Named, batched: bool, change: Change) -> Sample:
-        """The sample after a change; `named` holds its fields as a batch."""
-        moved = dict(sample)
+    def _moved(self, sample: Sample, batch: Batch, change: Change) -> Sample:
+        """The sample after a change."""
+        moved, named, batched = dict(sample), batch.named, batch.form.batched
         options: dict[str, float] = {"mask_fill": self.mask_fill}
         if self.mirroring is not None:
             options["lateral"] = self.mirroring.lateral
 
         known = {}
         if not self.valid_mask and sample.get("image_valid") is None:
-            known = together(change, named, **options, batched=batched)
+            known = together(change, named, batch.form, **options)
         for name, (found, value) in named.items():
             valid: Any
             if name in known:

@@ -126,11 +126,12 @@ typedef struct {
 } Rows;
 
 /* What is made of pixels that are moved: positions as of grid_sample, OUTSIDE where there is none; or pixels, -1 there, of
-   which ON_IMAGE leaves those on the image of `to` valid alone */
-enum { POSITIONS, PIXELS, ON_IMAGE };
+   which ON_IMAGE leaves those on the image of `to` valid alone. Of BOXES (n, 4), the boxes that enclose their moved outlines */
+enum { POSITIONS, PIXELS, ON_IMAGE, BOXES };
+enum { EDGE_POINTS = 64 }; /* along a side of a box; warp/boxes.py */
 /* What is left to do: pixels wait for the extent of `from`, points for the limits of `to`; most cells of a lattice want
-   exact positions */
-enum { LEFT_FROM = 1, LEFT_TO = 2, LEFT_MOST = 4 };
+   exact positions; or some box more than its outline */
+enum { LEFT_FROM = 1, LEFT_TO = 2, LEFT_MOST = 4, LEFT_BOXES = 4 };
 #define OUTSIDE (-9)
 #define FAR 100 /* beyond, positions are drawn in */
 

@@ -71,6 +71,40 @@ static int T(move_row)(const Move *move, const T(Between) *b, int64_t first, int
     return left;
 }
 
+/* The box that encloses the moved outline of another, valid where some of that is on the image. A box is left if it has no
+   extent, turns inside out, or some of its outline has no image */
+static int T(move_box)(const Move *move, const T(Between) *b, int64_t at) {
+    const R *box = (const R *)move->rows + b->index * move->row_strides[0] + at * move->row_strides[1];
+    R *made = (R *)move->results + b->index * move->result_strides[0] + at * move->result_strides[1];
+    const R x[] = {box[0], box[2], box[2], box[0], box[0]}, y[] = {box[1], box[1], box[3], box[3], box[1]};
+    const R right = (R)(move->width - 0.5), below = (R)(move->height - 0.5);
+    R before[2] = {0, 0}, start[2] = {0, 0}, area = 0;
+    int left = 0, mapped = 1, shown = 0;
+    for (int first = 0; first < 4 * EDGE_POINTS; first += BLOCK) {
+        ALIGNED R u[BLOCK], v[BLOCK];
+        ALIGNED I ok[BLOCK];
+        for (int i = 0; i < BLOCK; i++) {
+            const int side = (first + i) / EDGE_POINTS;
+            const R share = (R)((first + i) % EDGE_POINTS) / EDGE_POINTS;
+            u[i] = x[side] + (x[side + 1] - x[side]) * share, v[i] = y[side] + (y[side + 1] - y[side]) * share;
+        }
+        left |= T(by_rays)(move, b, BLOCK, BLOCK, u, v, ok);
+        if (!first) {
+            for (int i = 0; i < 2; i++) before[i] = start[i] = made[i] = made[i + 2] = i ? v[0] : u[0];
+        }
+        for (int i = 0; i < BLOCK; i++) {
+            mapped &= ok[i] != 0;
+            shown |= (u[i] >= (R)-0.5) & (u[i] <= right) & (v[i] >= (R)-0.5) & (v[i] <= below);
+            area += (before[0] - start[0]) * (v[i] - before[1]) - (before[1] - start[1]) * (u[i] - before[0]);
+            before[0] = u[i], before[1] = v[i];
+            made[0] = u[i] < made[0] ? u[i] : made[0], made[1] = v[i] < made[1] ? v[i] : made[1];
+            made[2] = u[i] > made[2] ? u[i] : made[2], made[3] = v[i] > made[3] ? v[i] : made[3];
+        }
+    }
+    move->valid[b->index * move->count + at] = (uint8_t)shown;
+    return left | (mapped && shown && area > 0 && box[2] > box[0] && box[3] > box[1] ? 0 : LEFT_BOXES);
+}
+
 static int64_t T(moves)(const Move *move) {
     const int64_t tiles = (move->count + move->tile - 1) / move->tile;
     int64_t own = 0, at;
@@ -81,7 +115,8 @@ static int64_t T(moves)(const Move *move) {
         const int64_t first = at % tiles * move->tile;
         const int64_t end = first + move->tile < move->count ? first + move->tile : move->count;
         T(between)(move, at / tiles, &b);
-        for (int64_t i = first; i < end; i += BLOCK)
+        for (int64_t i = first; i < end && move->form == BOXES; i++) left |= T(move_box)(move, &b, i);
+        for (int64_t i = first; i < end && move->form != BOXES; i += BLOCK)
             left |= T(move_row)(move, &b, i, (int)(end - i < BLOCK ? end - i : BLOCK));
     }
     return left;

@@ -10,8 +10,7 @@ import torch
 from torch import Tensor
 
 from camtorch.augment.change import Change, Part, alone, as_one, by_kinds
-from camtorch.augment.kinds import Named
-from camtorch.augment.sample import Sample, SampleTransform, on_samples
+from camtorch.augment.sample import Batch, Sample, SampleTransform, on_samples
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.editing import edited
 from camtorch.cameras.mixed import Mixed
@@ -102,15 +101,16 @@ class CanonicalCamera(SampleTransform):
                 `Augmentation`.
         """
         sample = self._given(sample, fields)
-        named, batched, count, camera = self._batch(sample)
+        batch = self._batch(sample)
+        camera, count = batch.camera, batch.form.count
         scale = self.scale(camera).expand(count)
         if self.scales == "depth":
-            moved = self._scaled(sample, named, batched, scale)
+            moved = self._scaled(sample, batch, scale)
         else:
-            moved = self._resized(sample, named, batched, self._change(camera, count))
+            moved = self._resized(sample, batch, self._change(camera, count))
             own = camera.clone()
             moved["source_camera"] = list(own) if isinstance(sample.get("camera"), (list, tuple)) else own
-        moved["scale"] = scale if batched else scale.squeeze(0)
+        moved["scale"] = scale if batch.form.batched else scale.squeeze(0)
         return moved
 
     @on_samples
@@ -125,26 +125,26 @@ class CanonicalCamera(SampleTransform):
         sample = self._given(sample, fields)
         sample.pop("scale", None)
         if self.scales == "depth":
-            named, batched, count, camera = self._batch(sample, predicted=True)
-            return self._scaled(sample, named, batched, 1 / self.scale(camera).expand(count))
+            batch = self._batch(sample, predicted=True)
+            return self._scaled(sample, batch, 1 / self.scale(batch.camera).expand(batch.form.count))
         if (source := sample.pop("source_camera", None)) is None:
             raise ValueError(f"{self._name}: inverse() needs source_camera as it came out of the forward call")
         source = as_one(source)
         change = self._change(source, len(source) if source.batch_shape else 1)
         target = change.target if source.batch_shape else alone(change.target)  # a batch dim would be the sample's
-        named, batched, count, _ = self._batch(sample, target, predicted=True)
-        change = change if change.count == count else self._change(source, count)
-        return self._resized(sample, named, batched, change.inverse())
+        batch = self._batch(sample, target, predicted=True)
+        change = change if change.count == batch.form.count else self._change(source, batch.form.count)
+        return self._resized(sample, batch, change.inverse())
 
     if TYPE_CHECKING:
 
         @typed_as(forward)
         def __call__(self, *args: Any, **options: Any) -> Any: ...
 
-    def _scaled(self, sample: Sample, named: Named, batched: bool, scale: Tensor) -> Sample:
+    def _scaled(self, sample: Sample, batch: Batch, scale: Tensor) -> Sample:
         """Return the sample with every length of the camera's frame multiplied by `scale` (B,)."""
-        moved = dict(sample)
-        for name, (found, value) in named.items():
+        moved, batched = dict(sample), batch.form.batched
+        for name, (found, value) in batch.named.items():
             if isinstance(value, list):
                 moved[name] = [self._lengths(found, v, s, name) for v, s in zip(value, scale, strict=True)]
             else:
@@ -166,8 +166,8 @@ class CanonicalCamera(SampleTransform):
         lengths[..., :3, 3] = True
         return torch.where(lengths, value * factor, value)
 
-    def _resized(self, sample: Sample, named: Named, batched: bool, change: Change) -> Sample:
-        moved = self._moved(sample, named, batched, change)
+    def _resized(self, sample: Sample, batch: Batch, change: Change) -> Sample:
+        moved = self._moved(sample, batch, change)
         if "rotation" not in sample:  # the sample is not rotated
             del moved["rotation"]
         return moved

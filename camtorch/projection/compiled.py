@@ -27,8 +27,8 @@ _Rows = struct.Struct("20q").pack  # `Rows` of geometry.h
 packed_move: Callable[..., bytes] = struct.Struct("8q2d12q").pack  # `Move` of geometry.h
 _LATTICES = struct.Struct(f"8q2d12q{CLASSIFICATION}6q")  # `Lattices`
 LATTICE_WORDS = _LATTICES.size // 8
-POSITIONS, PIXELS, ON_IMAGE = range(3)
-LEFT_FROM, LEFT_TO, LEFT_MOST = 1, 2, 4
+POSITIONS, PIXELS, ON_IMAGE, BOXES = range(4)
+LEFT_FROM, LEFT_TO, LEFT_MOST, LEFT_BOXES = 1, 2, 4, 4
 _NO_ROWS = (0, 0, 0, 0)
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -13,7 +12,7 @@ from camtorch.values.arguments import Numbers, as_coordinates, as_values, as_who
 from camtorch.warp.pair import CameraPair
 from camtorch.warp.panorama import PANORAMAS
 
-_EDGE_SAMPLES = 64  # per edge: this encloses 500 px bent to a radius of 300 px to 0.03 px
+_EDGE_SAMPLES = 64  # per edge, as in geometry.h: this encloses 500 px bent to a radius of 300 px to 0.03 px
 _ROUNDED = 1e-3  # pixels from a panorama's edges, where rounding would cost rays
 _LATTICE = 16  # steps across and down the target, between points that are tested against a polygon
 
@@ -53,25 +52,6 @@ def enclosed(warp: CameraPair, corners: Tensor) -> tuple[Tensor, Tensor]:
         low = torch.minimum(low, torch.where(inside, lattice, torch.inf).amin(-2))
         high = torch.maximum(high, torch.where(inside, lattice, -torch.inf).amax(-2))
     return torch.where(some.unsqueeze(-1), torch.cat((low, high), -1), -1.0), valid
-
-
-def edges_of(boxes: Tensor) -> Tensor:
-    """Return the points (..., N, 2) along the edges of boxes (..., 4) that a warp moves to enclose them."""
-    return along_edges(corners_of(boxes), _EDGE_SAMPLES)
-
-
-def enclosing(boxes: Tensor, moved: Tensor, on_image: Tensor) -> tuple[Tensor, Tensor] | None:
-    """Return `moved_boxes` of plain boxes (..., 4) whose `edges_of` moved to `moved` (..., N, 2); None if not whole."""
-    places, seen, given = moved.numpy(), on_image.numpy(), boxes.numpy()
-    if not seen.all() and not (seen.any(-1).all() and (seen | (places != -1).any(-1)).all()):
-        return None
-    x, y = places[..., 0], places[..., 1]
-    area = (
-        (x[..., :-1] * y[..., 1:] - x[..., 1:] * y[..., :-1]).sum(-1) + x[..., -1] * y[..., 0] - x[..., 0] * y[..., -1]
-    )
-    if not ((area > 0).all() and (given[..., 2:] > given[..., :2]).all()):
-        return None
-    return torch.from_numpy(np.concatenate((places.min(-2), places.max(-2)), -1)), on_image.any(-1)
 
 
 def lattice_of(corners: Tensor, steps: int) -> Tensor:

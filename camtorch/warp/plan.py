@@ -10,7 +10,7 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from itertools import accumulate
 from itertools import count as count_from
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -29,12 +29,14 @@ from camtorch.evaluate.door import (
 )
 from camtorch.evaluate.export import with_values
 from camtorch.evaluate.kept import Kept
-from camtorch.evaluate.known import are_free, is_unknown
+from camtorch.evaluate.known import is_unknown
 from camtorch.native import memory
 from camtorch.native.library import library
 from camtorch.native.sampler import Call, empty, is_quick, maker, packed, takes, tiles_of
 from camtorch.projection.compiled import (
+    BOXES,
     LATTICE_WORDS,
+    LEFT_BOXES,
     LEFT_FROM,
     LEFT_MOST,
     LEFT_TO,
@@ -67,8 +69,8 @@ from camtorch.warp.sampling import (
 )
 
 Route = Literal["operator", "strips", "graph", "kept"]
-Label = Literal["pixels", "rays", "columns"]
-"""What moves beside images: pixels, directions and points of the camera frame, or columns of a matrix of those."""
+Label = Literal["pixels", "boxes", "rays", "columns"]
+"""What moves beside images: pixels, boxes, directions and points of the camera frame, or columns of a matrix."""
 Sizes = tuple[tuple[int, int], tuple[int, int]]
 """(height, width) of the source's image, and of the target's."""
 
@@ -298,38 +300,39 @@ def between_of(warp: CameraPair) -> tuple[Native, Native, Tensor | None] | None:
     return None if made is None else (*made[0], rotation)  # type: ignore[return-value]
 
 
-def at_once(
-    source: Native,
-    target: Native,
-    rotation: Tensor | None,
+def call_for(
     sizes: Sizes,
+    dtype: torch.dtype,
     options: Options,
     values: Sequence[Tensor],
     hows: Sequence[Sampler | Label],
-    batched: bool = True,
-) -> list[tuple[Tensor, Tensor | None]] | None:
-    """Return all that samples hold, with a batch dim or, of a single one, without; and of pixels which are valid.
+    batched: bool,
+) -> SampleCall | None:
+    """Return the call of compiled code that moves all that samples of a form hold; a thread keeps the last ones.
 
-    None where a lattice does not do, images shrink, lie oddly in memory, threads would idle, or something is traced.
-    Values are images (B, C, H, W), masks (B, H, W) as well, and what `hows` says: pixels (B, *N, 2) of the source's
-    image; or of a single sample, in the dtype of the cameras, rays (1, *N, 3) and columns (1, 3 or 4, N) that turn. Of
-    a batch each thread takes whole samples.
+    None where a lattice does not do, images shrink or lie oddly in memory, or threads would idle: of a batch each takes
+    whole samples.
+
+    Args:
+        sizes: of both images.
+        dtype: of the cameras' numbers.
+        options: of the warp.
+        values: on the CPU and without a graph: images (B, C, H, W), masks (B, H, W) as well, and labels.
+        hows: what values are. Labels are pixels (B, *N, 2) of the source's image; of a single sample boxes too, and, in
+            the dtype of the cameras, rays (*N, 3) and columns (3 or 4, N) that turn.
+        batched: whether there is a dim B.
     """
-    tolerance, antialias, count = options["tolerance"], options["antialias"], values[0].shape[0]
-    turns = 1 if rotation is None else rotation.numel() // 9
-    if not tolerance or antialias or max(source.cameras, target.cameras, turns) != count or not are_free(*values):
+    tolerance, antialias, count = options["tolerance"], options["antialias"], len(values[0]) if batched else 1
+    if not tolerance or antialias:
         return None
     if count > 1:
         threads = thread_count()
-        if source.dtype != torch.float32 or (count % threads and count < _EVEN * threads):
+        if dtype != torch.float32 or (count % threads and count < _EVEN * threads):
             return None
-    if rotation is not None and (rotation.dtype != source.dtype or not rotation.is_contiguous()):
-        rotation = rotation.detach().to(source.dtype).contiguous()
-    given = sizes, source.dtype, tolerance, batched
+    given = sizes, dtype, tolerance, antialias is None, batched
     forms = [(t.shape, t.stride(), t.dtype, how) for t, how in zip(values, hows, strict=True)]
     calls: Kept = _calls.__dict__.setdefault("kept", Kept(_MOST_FORMS))
-    call = calls((), (*given, *forms), lambda: _Together.of(*given, values, hows))
-    return None if call is None else call(source, target, rotation, values, antialias is None)
+    return calls((), (*given, *forms), lambda: SampleCall.of(SampleForm(*given, count, values, hows)))
 
 
 _calls = threading.local()  # a thread's calls have memory of their own
@@ -358,90 +361,87 @@ def _surely_keeps_size(back: Between, sizes: Sizes) -> bool:
     return bool((total < SURELY * SHRINKS * step * np.maximum(count, 1)).all())
 
 
-def _planes(image: Tensor) -> Tensor:
-    """Images (B, C, H, W), of masks (B, H, W) as well."""
-    return image if image.ndim == 4 else image.unsqueeze(1)
+class SampleForm(NamedTuple):
+    """What samples have in common that one call serves; see `call_for`."""
+
+    sizes: Sizes
+    dtype: torch.dtype
+    tolerance: float
+    decides: bool  # whether images that shrink go another way
+    batched: bool
+    count: int
+    values: Sequence[Tensor]
+    hows: Sequence[Sampler | Label]
+
+    def images(self, value: Tensor) -> Tensor:
+        """(B, C, H, W) of an image, or a mask."""
+        value = value if self.batched else value.unsqueeze(0)
+        return value if value.ndim == 4 else value.unsqueeze(1)
+
+    def takes(self, value: Tensor, how: Sampler | Label) -> bool:
+        """Whether a call takes a value: images that lie too oddly in memory, or are none, go another way."""
+        if not isinstance(how, Sampler):
+            return torch.promote_types(value.dtype, self.dtype) == self.dtype
+        image = self.images(value)
+        result = empty(image, self.count, self.sizes[1])
+        return 0 not in result.shape and takes(image.dtype, how.mode) and is_quick(image, result, how.mode)
+
+    def maker(self, value: Tensor) -> Callable[[], Tensor]:
+        """Return what makes the place for samples of an image or a mask."""
+        make, is_image = maker(self.images(value), self.count, self.sizes[1]), value.ndim == 3 + self.batched
+
+        def made() -> Tensor:
+            result = make() if is_image else make().squeeze(1)
+            return result if self.batched else result.squeeze(0)
+
+        like = made()
+        if like.nbytes >= memory.LEAST:
+            return made
+        return functools.partial(torch.empty_strided, like.shape, like.stride(), dtype=like.dtype, device="cpu")
 
 
-def _fits(value: Tensor, how: Sampler | Label, dtype: torch.dtype, size: tuple[int, int]) -> bool:
-    """Whether the call takes a value: images that lie too oddly in memory, or are none, go another way."""
-    if not isinstance(how, Sampler):
-        return torch.promote_types(value.dtype, dtype) == dtype
-    image = _planes(value)
-    result = empty(image, len(image), size)
-    return 0 not in result.shape and takes(image.dtype, how.mode) and is_quick(image, result, how.mode)
-
-
-def _maker(value: Tensor, size: tuple[int, int], batched: bool) -> Callable[[], Tensor]:
-    """Return what makes the place for samples of images (B, C, H, W), or masks (B, H, W)."""
-    make, is_image = maker(_planes(value), len(value), size), value.ndim == 4
-
-    def made() -> Tensor:
-        result = make() if is_image else make().squeeze(1)
-        return result if batched else result.squeeze(0)
-
-    like = made()
-    if like.nbytes >= memory.LEAST:
-        return made
-    return functools.partial(torch.empty_strided, like.shape, like.stride(), dtype=like.dtype, device="cpu")
-
-
-class _Together:
+class SampleCall:
     """`Together` of geometry.h, with all that samples of one form have in common."""
 
     @classmethod
-    def of(
-        cls,
-        sizes: Sizes,
-        dtype: torch.dtype,
-        tolerance: float,
-        batched: bool,
-        values: Sequence[Tensor],
-        hows: Sequence[Sampler | Label],
-    ) -> _Together | None:
-        n, m = (math.ceil(side / STEP) for side in sizes[1])
+    def of(cls, form: SampleForm) -> SampleCall | None:
+        """Return the call, or None where it does not do."""
+        n, m = (math.ceil(side / STEP) for side in form.sizes[1])
         if min(n, m) < FEWEST or (n + 5) * (m + 5) > MOST_KEPT:  # too small for a lattice, or too large to be kept
             return None
-        fit = all(_fits(value, how, dtype, sizes[1]) for value, how in zip(values, hows, strict=True))
-        return cls(sizes, dtype, tolerance, batched, values, hows) if fit else None
+        return cls(form) if all(map(form.takes, form.values, form.hows)) else None
 
-    def __init__(
-        self,
-        sizes: Sizes,
-        dtype: torch.dtype,
-        tolerance: float,
-        batched: bool,
-        values: Sequence[Tensor],
-        hows: Sequence[Sampler | Label],
-    ):
-        count, samplers = len(values[0]), [how for how in hows if isinstance(how, Sampler)]
+    def __init__(self, form: SampleForm):
+        sizes, dtype, count, self._sizes = form.sizes, form.dtype, form.count, form.sizes
+        samplers = [how for how in form.hows if isinstance(how, Sampler)]
         probes = kept_probes(range(sizes[1][0]), sizes[1][1], dtype)
         padding = PADDINGS[max((PADDINGS.index(how.padding_mode) for how in samplers), default=0)]
         with torch.inference_mode(False):
-            self._lattices = Lattices(probes, sizes[1], sizes[0], tolerance, padding, count)
+            self._lattices = Lattices(probes, sizes[1], sizes[0], form.tolerance, padding, count)
         parts: dict[str, list[bytes]] = {"pixels": [], "turned": [], "images": []}
         kinds: list[str] = []
         self._makers: list[Callable[[], Tensor] | None] = []
         self._kept: list[object] = []  # what the words point to
         self._tiles = 1
-        for value, how in zip(values, hows, strict=True):
+        for value, how in zip(form.values, form.hows, strict=True):
             make = None
             if isinstance(how, Sampler):
-                image, make = _planes(value), _maker(value, sizes[1], batched)
+                image, make = form.images(value), form.maker(value)
                 result = empty(image, count, sizes[1])
                 fill = how.fill * image.shape[1] if len(how.fill) == 1 else how.fill
                 place = (0,) * 8 + self._lattices.places
                 words, holds = packed(image, result, how.mode, how.padding_mode, fill, place)
                 self._kept.append(holds)
                 self._tiles = max(self._tiles, tiles_of(result[:1]))
-            elif how == "pixels":
-                many = value[0].numel() // 2
-                rows = 0, 2 * many, 2, 1, 0, 2 * many, 2, 1, 0, many, max(many, 1), 0
-                words = packed_move(0, 0, 0, 0, 3, 1, count, ON_IMAGE, *sizes[1], *rows)
+            elif how in ("pixels", "boxes"):
+                each, move = (2, ON_IMAGE) if how == "pixels" else (4, BOXES)
+                many = value.numel() // (each * count) if count else 0
+                rows = 0, each * many, each, 1, 0, each * many, each, 1, 0, many, max(many, 1), 0
+                words = packed_move(0, 0, 0, 0, 3, 1, count, move, *sizes[1], *rows)
             else:
-                each = (3, 1, value.numel() // 3) if how == "rays" else (1, value.shape[-1], value.shape[-1])
-                words = struct.pack("7q", 0, 0, 0, *each, dtype == torch.float64)
-            kinds.append("images" if make is not None else "pixels" if how == "pixels" else "turned")
+                steps = (3, 1, value.numel() // 3) if how == "rays" else (1, value.shape[-1], value.shape[-1])
+                words = struct.pack("7q", 0, 0, 0, *steps, dtype == torch.float64)
+            kinds.append("images" if make else "pixels" if how in ("pixels", "boxes") else "turned")
             parts[kinds[-1]].append(words)
             self._makers.append(make)
         starts = accumulate((len(b"".join(part)) // 8 for part in parts.values()), initial=_HEAD + LATTICE_WORDS)
@@ -457,43 +457,50 @@ class _Together:
             # one thread makes the lattice, and needs no counter of those made
             self._words[_HEAD + _WIDTHS["pixels"] - 1] = 0
         self._slots = [(kind, next(at[kind])) for kind in kinds]  # where the pointers to each value go
+        self._boxes = [i for i, how in enumerate(form.hows) if how == "boxes"]
         self._first_job, self._jobs, self._has_pixels = first["images"], images[1], pixels[1] > 0
-        self._sizes, self._dtype, self._lead, self._count = sizes, dtype, 0 if batched else 1, count
-        ways = zip(values, hows, strict=True)
-        self._may_shrink = any(
+        self._dtype, self._count = dtype, count
+        ways = zip(form.values, form.hows, strict=True)
+        self._decides = form.decides and any(
             isinstance(how, Sampler) and how.mode != "nearest" and value.dtype != torch.bool for value, how in ways
         )
 
     def __call__(
-        self, source: Native, target: Native, rotation: Tensor | None, values: Sequence[Tensor], decides: bool
-    ) -> list[tuple[Tensor, Tensor | None]] | None:
-        if decides and self._may_shrink:
+        self, source: Native, target: Native, rotation: Tensor | None, values: Sequence[Tensor]
+    ) -> list[tuple[Tensor, Tensor | None] | None] | None:
+        """Return what `values`, of the form, become between two cameras, and which pixels and boxes are valid.
+
+        None where the call does not do. That of boxes alone is None if some take more than their outline.
+        """
+        dtype = self._dtype
+        if rotation is not None and (rotation.dtype != dtype or not rotation.is_contiguous()):
+            rotation = rotation.detach().to(dtype).contiguous()
+        if self._decides:
             turns = None if rotation is None else rotation.mT
             if not _surely_keeps_size(Between(target, source, turns, self._sizes[0], False), self._sizes):
                 return None
-        words, turn, lead, dtype = self._words, 0 if rotation is None else rotation.data_ptr(), self._lead, self._dtype
-        by_camera = 9 if rotation is not None and rotation.numel() > 9 else 0
+        words, turn = self._words, 0 if rotation is None else rotation.data_ptr()
+        by_camera = 9 if rotation is not None and rotation.ndim > 2 and len(rotation) > 1 else 0
         target.add_table()
         if self._has_pixels:
             source.add_table()
         words[_HEAD : _HEAD + 4] = [target.pointer, source.pointer, turn, by_camera]
-        results: list[tuple[Tensor, Tensor | None]] = []
+        results: list[tuple[Tensor, Tensor | None] | None] = []
         given = []  # pixels in the dtype of the cameras, without gaps, for as long as the call
         for value, (kind, at), make in zip(values, self._slots, self._makers, strict=True):
             valid = None
             if make is not None:
                 result = make()
-                words[at], words[at + 1] = value.data_ptr(), result.data_ptr()
+                words[at : at + 2] = [value.data_ptr(), result.data_ptr()]
             elif kind == "turned":
-                result = value[0].clone() if lead else value.clone()
-                words[at], words[at + 1], words[at + 2] = turn, value.data_ptr(), result.data_ptr()
+                result = value.clone()
+                words[at : at + 3] = [turn, value.data_ptr(), result.data_ptr()]
             else:
-                shape = value.shape[lead:]
                 if value.dtype != dtype or not value.is_contiguous():
                     value = value.to(dtype).contiguous()
                     given.append(value)
-                result = torch.empty(shape, dtype=dtype, device="cpu")
-                valid = torch.empty(shape[:-1], dtype=torch.bool, device="cpu")
+                result = torch.empty(value.shape, dtype=dtype, device="cpu")
+                valid = torch.empty(value.shape[:-1], dtype=torch.bool, device="cpu")
                 words[at : at + 4] = [source.pointer, target.pointer, turn, by_camera]
                 words[at + 10], words[at + 14], words[at + 18] = value.data_ptr(), result.data_ptr(), valid.data_ptr()
             results.append((result, valid))
@@ -517,6 +524,10 @@ class _Together:
                 end.follow()
             if flags >= _PIXELS:  # the images are made
                 words[1] = 0
+                if left == LEFT_BOXES:
+                    for i in self._boxes:
+                        results[i] = None
+                    break
         if not is_whole:
             for i in range(self._jobs):
                 job = words[self._first_job + i * _WIDTHS["images"] : self._first_job + (i + 1) * _WIDTHS["images"]]

@@ -9,10 +9,9 @@ import torch
 import torch.nn.functional as F  # noqa: N812
 
 import camtorch as ct
-import camtorch.augment.kinds
 import camtorch.augment.numpy
 from camtorch.poses import rotations
-from camtorch.warp import sampling
+from camtorch.warp import plan, sampling
 
 A = ct.augment
 SIZE = (48, 64)
@@ -307,7 +306,7 @@ def test_a_chain_is_one_resampling(monkeypatch):
         return call
 
     call = camtorch.native.sampler.Call
-    for module, name in ((call, "__call__"), (sampling, "_by_torch"), (camtorch.augment.kinds, "at_once")):
+    for module, name in ((call, "__call__"), (sampling, "_by_torch"), (plan.SampleCall, "__call__")):
         monkeypatch.setattr(module, name, watched(getattr(module, name)))
     mixture()(image=torch.randint(0, 256, (4, 3, 96, 128), dtype=torch.uint8), camera=lens)
     assert sum(made) == 1
