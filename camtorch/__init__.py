@@ -21,7 +21,7 @@ _NAMES = {
     "cameras.camera": "Camera",
     "cameras.mixed": "Mixed cat",
     "cameras.rig": "Rig",
-    "io": "CameraFileError load save",
+    "io": "CameraFileError load loads save",
     "maps.formats": "load_map save_map",
     "maps.lookup": "LookupMap",
     "models": "BrownConrady Cylindrical Division DoubleSphere EUCM Equirectangular Equisolid FOV FTheta FThetaBackward "

@@ -18,6 +18,7 @@ from camtorch.cameras.mixed import cat as cat
 from camtorch.cameras.rig import Rig as Rig
 from camtorch.io import CameraFileError as CameraFileError
 from camtorch.io import load as load
+from camtorch.io import loads as loads
 from camtorch.io import save as save
 from camtorch.maps.formats import load_map as load_map
 from camtorch.maps.formats import save_map as save_map

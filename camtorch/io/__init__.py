@@ -1,7 +1,7 @@
 """Calibration files, one file per format."""
 
 from camtorch.io import opencv
-from camtorch.io.formats import FORMATS, load, save
+from camtorch.io.formats import FORMATS, load, loads, save
 from camtorch.io.record import CameraFileError
 
-__all__ = ["FORMATS", "CameraFileError", "load", "opencv", "save"]
+__all__ = ["FORMATS", "CameraFileError", "load", "loads", "opencv", "save"]

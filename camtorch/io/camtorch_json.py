@@ -12,10 +12,11 @@ from torch import Tensor, nn
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.rig import Rig
 from camtorch.io import poses
+from camtorch.io.parsing import json_text, parse_json
 from camtorch.io.record import Names, Record, one_of
 from camtorch.io.writing import Lossy, as_json
 from camtorch.poses.extrinsics import Extrinsics
-from camtorch.values.arguments import broadcast_shapes, is_list
+from camtorch.values.arguments import broadcast_shapes
 from camtorch.values.module import BatchedModule, remade
 
 Made = TypeVar("Made", bound=BatchedModule)
@@ -55,7 +56,8 @@ def parse(record: Record) -> Rig:
 
 def made_of(kind: type[Made], d: Mapping[str, Any]) -> Made:
     """Return the camera or pose of a dict made by `dict_of`, frozen; a CameraFileError names a wrong key."""
-    record = Record(f"{kind.__name__}.from_dict", _plain(d))
+    owner = f"{kind.__name__}.from_dict"
+    record = Record(owner, parse_json(owner, json_text(owner, d)))
     is_camera = issubclass(kind, Camera)
     known = _OF_CAMERAS if is_camera else _OF_POSES
     for key in record.keys():  # noqa: SIM118
@@ -66,15 +68,6 @@ def made_of(kind: type[Made], d: Mapping[str, Any]) -> Made:
         record["model"].fail(f"a {type(made).__name__}, which is no {kind.__name__}; ct.Camera.from_dict takes any")
     dtype = _DTYPES[one_of(record["dtype"], _DTYPES)] if "dtype" in record else torch.float64
     return made.to(dtype).requires_grad_(False)
-
-
-def _plain(value: Any) -> Any:
-    """Return a value as JSON would load it; configurations have other mappings and sequences."""
-    if isinstance(value, Mapping):
-        return {key: _plain(item) for key, item in value.items()}
-    if is_list(value):
-        return [_plain(item) for item in value]
-    return float(value) if type(value) is int else value
 
 
 def _vectors(record: Record) -> tuple[Tensor, Tensor]:

@@ -63,14 +63,19 @@ _LARGEST_ID = (1 << 32) - 2  # of cameras; the next integer means no camera
 
 
 def matches(path: str, content: bytes) -> bool:
-    """Whether a file is a cameras.bin, by its name, or a cameras.txt, by its first line without #."""
+    """Whether a content is that of a cameras.bin, or of a cameras.txt, by its first line without #."""
     first = _LINE.search(content)
-    return path.endswith(".bin") or (first is not None and _CAMERA.match(first[1]) is not None)
+    return _is_binary(path, content) or (first is not None and _CAMERA.match(first[1]) is not None)
+
+
+def _is_binary(path: str, content: bytes) -> bool:
+    """Whether a file is binary by its name, or by the number of cameras with which it begins, in eight bytes."""
+    return path.endswith(".bin") or content[3:8] == bytes(5)
 
 
 def read(path: str, content: bytes) -> Rig:
     """Return the cameras by their ids, and the poses of the images in the same folder by the names of the images."""
-    cameras = _from_bytes(path, content) if path.endswith(".bin") else _from_text(path, content)
+    cameras = _from_bytes(path, content) if _is_binary(path, content) else _from_text(path, content)
     beside = _images_beside(path)
     if beside is None or not os.path.exists(beside):
         return Rig(cameras)

@@ -8,7 +8,8 @@ from __future__ import annotations
 import codecs
 import fnmatch
 import os
-from typing import Any, Protocol, TypeVar
+from collections.abc import Mapping
+from typing import IO, Any, Protocol, TypeVar
 
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.rig import Rig
@@ -30,10 +31,10 @@ from camtorch.io import (
     ros,
     woodscape,
 )
-from camtorch.io.parsing import parse_mapping, path_of, read_bytes
+from camtorch.io.parsing import LARGEST_FILE, json_text, parse_json, parse_mapping, path_of, read_bytes
 from camtorch.io.record import CameraFileError, Names, Record
 from camtorch.io.writing import Lossy, replacing
-from camtorch.values.arguments import LEFT
+from camtorch.values.arguments import LEFT, shown
 
 Kind = TypeVar("Kind", bound=Camera)
 
@@ -88,7 +89,7 @@ FORMATS = tuple(READ)
 _OPENMVG = "OpenMVG's scene, which is not read: openMVG_main_openMVG2Colmap writes it in COLMAP's format"
 
 
-def load(path: str | os.PathLike[str], format: str | None = None) -> Rig:
+def load(path: str | os.PathLike[str] | IO[str] | IO[bytes], format: str | None = None) -> Rig:
     """Load the cameras of a calibration file, in float64 and frozen, with their poses.
 
     A calibration is a measurement: its tensors are not trained unless you call `.requires_grad_()`.
@@ -97,7 +98,7 @@ def load(path: str | os.PathLike[str], format: str | None = None) -> Rig:
         path: A file of OpenCV, ROS, Kalibr, COLMAP, Nerfstudio, Project Aria, Basalt, mrcal, ncore, OCamCalib,
             WoodScape, Gyroflow, camodocal, Metashape, nuScenes or camtorch; an archive of
             `numpy.savez(path, K=K, D=D)`; or the folder of a COLMAP or Nerfstudio reconstruction. COLMAP's images
-            in the folder of the cameras are read with them.
+            in the folder of the cameras are read with them. Or an open file, of which only the content is read.
         format: Its format in small letters, as in "opencv" or "ros". Default: found from content and name.
 
     Returns:
@@ -109,20 +110,63 @@ def load(path: str | os.PathLike[str], format: str | None = None) -> Rig:
         CameraFileError: If the file cannot be used; the message names the place and the reason.
         OSError: If the file cannot be opened. ValueError: If the format is unknown. TypeError: If `path` is no path.
     """
-    path, format = path_of(path, "load", "calibration file"), _known(format, READ, "read")
+    format = _known(format, READ, "read")
+    if isinstance(path, (Mapping, list)):
+        raise TypeError(f"load: path must be that of a calibration file; got a {type(path).__name__}. Write ct.loads")
+    if not isinstance(path, (str, bytes, os.PathLike)) and hasattr(path, "read"):
+        name = getattr(path, "name", None)
+        source = f"load: {name if isinstance(name, str) else type(path).__name__}"  # in no folder, as an archive's is
+        try:
+            content = path.read(LARGEST_FILE + 1)
+        except UnicodeDecodeError as error:
+            raise CameraFileError(source, f"byte {error.start}", "not text; open the file with 'rb'") from None
+        if len(content) > LARGEST_FILE:
+            raise CameraFileError(source, "size", f"more than {LARGEST_FILE >> 20} MiB")
+        return _loaded(source, content.encode() if isinstance(content, str) else content, format)
+    path = path_of(path, "load", "calibration file")
     if os.path.isdir(path):
         names = [name for names in READ.values() for name in names.in_folder]
         found = next((name for name in names if os.path.exists(os.path.join(path, name))), None)
         if found is None:
-            raise CameraFileError(path, "folder", f"has none of {', '.join(names)}")
+            suffixes = tuple(suffix for names in READ.values() for suffix in names.suffixes)
+            there = ", ".join(repr(name) for name in sorted(os.listdir(path)) if name.endswith(suffixes))
+            hint = f". Name a file: there is {there:.200}" if there else ""
+            raise CameraFileError(path, "folder", f"has none of {', '.join(names)}{hint}")
         path = os.path.join(path, found)
-    content = read_bytes(path).removeprefix(codecs.BOM_UTF8)  # some editors write this mark
+    return _loaded(path, read_bytes(path), format)
+
+
+def loads(content: str | bytes | Mapping[str, Any] | list[Any], format: str | None = None) -> Rig:
+    """Load the cameras of a calibration that is in memory, as `load` loads those of a file.
+
+    Args:
+        content: The text or the bytes of a calibration file, or its keys and values as a parser of JSON or YAML gave
+            them; arrays and tensors may be values.
+        format: See `load`. COLMAP's poses are in a file of their own, which is not read.
+
+    Raises:
+        CameraFileError: If the content cannot be used; the message names the place and the reason.
+        ValueError: If the format is unknown. TypeError: If `content` is neither text, nor bytes, nor keys and values.
+    """
+    format = _known(format, READ, "read")
+    if isinstance(content, (Mapping, list)):
+        text = json_text("loads", content)
+        return _loaded("loads", parse_json("loads", text) if isinstance(content, Mapping) else text.encode(), format)
+    if not isinstance(content, (str, bytes)):
+        raise TypeError(f"loads: content must be text, bytes or a dict; got {shown(content)}. ct.load reads files")
+    if os.path.exists(content):
+        raise ValueError(f"loads: content must be that of a calibration file; got its path. Write ct.load({content!r})")
+    return _loaded("loads", content.encode() if isinstance(content, str) else content, format)
+
+
+def _loaded(source: str, content: bytes | dict[str, Any], format: str | None) -> Rig:
+    """Return the frozen rig of a content, or of keys and values; errors name its source."""
     try:
-        rig, format = _read(path, content, format)
+        rig, format = _read(source, content, format)
     except (ArithmeticError, RecursionError, MemoryError) as error:
-        raise CameraFileError(path, "content", f"cannot be read: {type(error).__name__}: {error}") from None
+        raise CameraFileError(source, "content", f"cannot be read: {type(error).__name__}: {error}") from None
     if not rig.cameras:
-        raise CameraFileError(path, "cameras", "none")
+        raise CameraFileError(source, "cameras", "none")
     rig.format = format
     return rig.requires_grad_(False)
 
@@ -139,11 +183,14 @@ def load_camera(kind: type[Kind], path: str | os.PathLike[str]) -> Kind:
     return rig.camera
 
 
-def _read(path: str, content: bytes, format: str | None) -> tuple[Rig, str]:
-    for by_content in _BY_CONTENT:
-        if format == by_content.NAMES.format or (format is None and by_content.matches(path, content)):
-            return by_content.read(path, content), by_content.NAMES.format
-    keys = parse_mapping(path, content)
+def _read(path: str, content: bytes | dict[str, Any], format: str | None) -> tuple[Rig, str]:
+    keys = content
+    if isinstance(content, bytes):
+        content = content.removeprefix(codecs.BOM_UTF8)  # some editors write this mark
+        for by_content in _BY_CONTENT:
+            if format == by_content.NAMES.format or (format is None and by_content.matches(path, content)):
+                return by_content.read(path, content), by_content.NAMES.format
+        keys = parse_mapping(path, content)
     for by_keys in _BY_KEYS:
         if format == by_keys.NAMES.format or (format is None and by_keys.matches(keys)):
             return by_keys.parse(Record(path, keys)), by_keys.NAMES.format

@@ -27,7 +27,7 @@ def read(path: str, content: bytes) -> Rig:
     # sensors without intrinsics are lidars or radars
     sensors = [sensor for sensor in _table(path, content) if len(sensor["camera_intrinsic"])]
     Record(path, None).few(len(sensors))
-    beside = os.path.join(os.path.dirname(path), "sensor.json")
+    beside = path.removesuffix("calibrated_sensor.json") + "sensor.json"
     channels = {}
     if os.path.exists(beside):
         channels = {sensor["token"].text(): sensor["channel"].text() for sensor in _table(beside, read_bytes(beside))}

@@ -14,13 +14,14 @@ import os
 import re
 import zipfile
 import zlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any, NoReturn
 from xml.etree import ElementTree
 
 import numpy as np
 
 from camtorch.io.record import CameraFileError, repeated
+from camtorch.values.arguments import is_list
 
 Path = str | os.PathLike[str]
 
@@ -110,11 +111,12 @@ def _from_text(path: Path, content: bytes) -> Any:
         text = _OPTIMIZATION_INPUTS.sub(r"\1''", text)  # mrcal's Python literal
         _check_length(path, text, _LARGEST_LITERAL, "a Python literal")
         try:
-            return _with_floats(ast.literal_eval(ast.parse(text, mode="eval")))
+            values = ast.literal_eval(ast.parse(text, mode="eval"))
         except SyntaxError as error:
             raise CameraFileError(path, f"line {error.lineno}" if error.lineno else "content", error.msg) from None
         except (ValueError, TypeError):  # a list as a key has no hash
             raise CameraFileError(path, "content", "must have only text, numbers, lists and mappings") from None
+        return parse_json(path, json_text(path, values))
     kind = text.lstrip()[:1]
     return parse_json(path, text) if kind == "{" else (_from_storage if kind == "<" else _from_yaml)(path, text)
 
@@ -146,12 +148,18 @@ def parse_json(path: Path, text: str) -> Any:
         raise CameraFileError(path, "content", error) from None
 
 
-def _with_floats(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {str(key): _with_floats(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return list(map(_with_floats, value))
-    return float(value) if type(value) is int else value
+def json_text(path: Path, value: Any) -> str:
+    """Return the JSON of keys and values as YAML, NumPy and configurations give them."""
+
+    def plain(value: Any) -> Any:
+        if hasattr(value, "tolist"):  # an array or a tensor
+            return value.tolist()
+        return dict(value) if isinstance(value, Mapping) else list(value) if is_list(value) else str(value)
+
+    try:
+        return json.dumps(value, default=plain)
+    except (ValueError, TypeError) as error:  # a value in itself, a key that is a tuple
+        raise CameraFileError(path, "content", error) from None
 
 
 # -- archives, as `numpy.savez(path, K=K, D=D)` writes them; pickled objects are not read

@@ -1,5 +1,8 @@
 """What people pass to `ct.load` first: paths of every kind, other people's files, NumPy archives."""
 
+import functools
+import io
+import json
 import os
 import shutil
 from pathlib import Path
@@ -7,17 +10,43 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+import yaml
 from rigs import FILES, SAMPLES, assert_same
 
 import camtorch as ct
 
 K = np.array([[500.0, 0, 320], [0, 501, 240], [0, 0, 1]])
 D = np.array([[0.3, 0.1, 0.001, -0.002, 0.05]])
+PINHOLE = functools.partial(ct.save, ct.Pinhole([500.0, 500, 320, 240]))
 
 
-@pytest.mark.parametrize("kind", [str, Path, os.fsencode])
-def test_paths_of_every_kind(kind):
-    assert ct.load(kind(str(FILES / "opencv_camera.yml"))).camera.image_size == (800, 1280)
+@pytest.mark.parametrize("name", [*SAMPLES, "nuscenes/calibrated_sensor.json"])
+@pytest.mark.parametrize(
+    "load",
+    [
+        lambda path: ct.load(str(path)),
+        lambda path: ct.load(os.fsencode(path)),
+        lambda path: ct.load(io.BytesIO(path.read_bytes())),
+        lambda path: ct.load(io.StringIO(path.read_text())),
+        lambda path: ct.loads(path.read_bytes()),
+        lambda path: ct.loads(path.read_text()),
+        lambda path: ct.loads(json.loads(path.read_bytes())),
+        lambda path: ct.loads(yaml.safe_load(path.read_bytes() if path.suffix != ".txt" else b"%")),
+    ],
+)
+def test_calibrations_from_anywhere(name, load, tmp_path):
+    (path := tmp_path / Path(name).name).write_bytes((FILES / name).read_bytes())
+    try:
+        rig = load(path)
+    except (UnicodeDecodeError, json.JSONDecodeError, yaml.YAMLError):
+        return  # a binary file, or one of another syntax
+    assert_same(rig, ct.load(path))
+
+
+def test_an_open_file_is_read_without_the_files_next_to_it(monkeypatch):
+    monkeypatch.chdir(FILES / "nuscenes")
+    with open(name := "calibrated_sensor.json") as file:
+        assert not ct.load(name).cameras.keys() & ct.load(file).cameras.keys()  # whose names stand in sensor.json
 
 
 @pytest.mark.parametrize("end", [b"\n", b"\r\n"])
@@ -36,23 +65,42 @@ def test_what_editors_do_to_a_file_is_no_fault_of_it(name, start, end, tmp_path)
     assert_same(ct.load(path), ct.load(FILES / name))
 
 
-def saved(path):
-    ct.save(ct.Pinhole([500.0, 500, 320, 240]), path)
-
-
-def test_no_path(tmp_path):
-    for call, path, error, told in (
-        (ct.load, {"K": K}, TypeError, "load: path must be that of a calibration file; got dict"),
-        (saved, None, TypeError, "save: path must be that of a calibration file; got NoneType"),
+@pytest.mark.parametrize(
+    ("call", "given", "error", "says"),
+    [
+        (ct.load, {"K": K}, TypeError, r"load: path must be that of a .* file; got a dict\. Write ct\.loads$"),
         (ct.load, "camera\0.json", ct.CameraFileError, "path: must not have a NUL character"),
-        (saved, "camera\0.json", ct.CameraFileError, "path: must not have a NUL character"),
-        (ct.load, tmp_path / "nowhere.yml", FileNotFoundError, r"nowhere\.yml"),
-        (ct.load, tmp_path, ct.CameraFileError, r"folder: has none of cameras\.bin, cameras\.txt, transforms\.json"),
-    ):
-        with pytest.raises(error, match=told) as caught:
-            call(path)
-        assert str(caught.value).isprintable()
-    with open(FILES / "opencv_camera.yml") as file, pytest.raises(TypeError, match=r"TextIOWrapper.*file\.name"):
+        (ct.load, FILES / "nowhere.yml", FileNotFoundError, r"nowhere\.yml"),
+        (
+            ct.load,
+            FILES / "nuscenes",
+            ct.CameraFileError,
+            r"txt, transforms.json\. Name a file: there is 'cal",
+        ),
+        (ct.load, io.BytesIO(b"x: 1"), ct.CameraFileError, r"^load: BytesIO: content: no format .* has the keys 'x'$"),
+        (ct.load, io.BytesIO(b" " * (1 << 25)), ct.CameraFileError, "^load: BytesIO: size: more than 16 MiB$"),
+        (
+            ct.loads,
+            str(FILES / "opencv_camera.yml"),
+            ValueError,
+            r"loads: content must .* its path. Write ct\.load\('",
+        ),
+        (ct.loads, FILES / "opencv_camera.yml", TypeError, r"bytes or a dict; got PosixPath.*\. ct\.load reads files$"),
+        (ct.loads, {(1, 2): 3}, ct.CameraFileError, "^loads: content: keys must be str"),
+        (ct.loads, {"K": K, "D": [0.1]}, ct.CameraFileError, r"^loads: D: 1 coefficients; BrownConrady takes"),
+        (PINHOLE, None, TypeError, "save: path must be that of a calibration file; got NoneType"),
+        (PINHOLE, "camera\0.json", ct.CameraFileError, "path: must not have a NUL character"),
+    ],
+)
+def test_what_is_no_calibration(call, given, error, says):
+    with pytest.raises(error, match=says) as caught:
+        call(given)
+    assert str(caught.value).isprintable()
+
+
+def test_a_binary_file_that_is_open_as_text():
+    says = r"^load: .*cameras\.bin: byte \d+: not text; open the file with 'rb'$"
+    with open(FILES / "cameras.bin", encoding="utf-8") as file, pytest.raises(ct.CameraFileError, match=says):
         ct.load(file)
 
 
