@@ -1,5 +1,5 @@
 """Cameras: one, several of several models, rigs."""
 
-# torch knows operators of saved programs, and how cameras are batched, as soon as there may be a camera
+# torch needs the operators of saved programs, and the way to batch cameras, before there is a camera
 from camtorch.cameras import mixed as mixed
 from camtorch.cameras import opaque as opaque

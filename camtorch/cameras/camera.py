@@ -47,7 +47,7 @@ def _intrinsic(index: int, doc: str) -> Any:
 
 
 def _held(name: str, doc: str) -> Any:
-    """The property of a tensor of the module, which `nn.Module.__getattr__` finds in ten times the time."""
+    """Return the property of a module's tensor, found in a tenth of the time of `nn.Module.__getattr__`."""
 
     def tensor(camera: Camera) -> Tensor:
         found: Tensor | None = camera._parameters.get(name)
@@ -68,32 +68,34 @@ def _held(name: str, doc: str) -> Any:
 class Camera(Freezable, Editable):
     """A learnable camera: `pixel = focal * lens(chart(ray)) + principal_point`.
 
-    A model states its `key`, its `distortion_names` and its `optics`; all else is done here.
+    A model states its `key`, its `distortion_names` and its `optics`; everything else is written here.
 
-    Convention: camera frame x right, y down, z forward. Pixels (u, v), u right, v down, the centre of the
-    top-left pixel is (0, 0). Image sizes are (height, width). Angles are radians, a `fov` is degrees.
+    Convention: camera frame x right, y down, z forward. Pixels (u, v), u right, v down, the centre of the top-left
+    pixel is (0, 0). Image sizes are (height, width). Angles are radians, a `fov` is degrees.
 
-    Shapes: `*B` are the camera's batch dims, `*N` any number of point dims after them. A camera without
-    batch dims takes any shape. Batch dims of size 1 broadcast.
+    Shapes: `*B` are the camera's batch dims, `*N` any number of point dims after them. A camera without batch dims
+    takes any shape. Batch dims of size 1 broadcast.
 
     Args:
         intrinsics: (*B, 4) fx, fy, cx, cy in pixels.
-        distortion: (*B, n) coefficients in the order of `distortion_names`; `ideal` ones, mostly zeros, if left out.
-        image_size: (height, width) in pixels, as `image.shape` and not OpenCV's (width, height); shared by the batch,
-            needed only where an image is concerned.
+        distortion: (*B, n) coefficients in the order of `distortion_names`; by default `ideal` ones, mostly zeros.
+        image_size: (height, width) in pixels, like `image.shape`, not OpenCV's (width, height); shared by the batch,
+            needed only if an image is concerned.
 
-    Plain values (lists, arrays, tensors) are copied into new `nn.Parameter`s of the shapes above. An `nn.Parameter`
-    and a tensor that requires grad are kept as they are, so that gradients reach the network that predicted
-    them, and a lens shared by a batch stays one.
+    Plain values (lists, arrays, tensors) are copied into new `nn.Parameter`s of these shapes. An `nn.Parameter` and a
+    tensor that requires grad are used without copying, so that gradients reach the network that predicted them.
 
-    Bad values, which are NaN or infinite, focal lengths that are not positive, or coefficients for which the formula
-    does not exist, are refused where a person gives them. In a batch that a network predicted, a tensor in a graph or
-    under `torch.no_grad`, the rows with bad values are cameras without a valid point, and the others live.
+    NaN, infinite values, focal lengths that are not positive and coefficients for which the formula does not exist
+    raise, but not in a batch that a network predicted, in a graph or under `torch.no_grad`: such rows project no valid
+    point, and the other rows are unaffected.
 
     Raises:
-        ValueError: a wrong shape or number of coefficients, bad values, an image size that is not positive.
-        TypeError: parameters that are not numbers, an image size that is not two integers; `Camera` itself, which
-            states no model.
+        ValueError: If a shape, the number of coefficients, a value or the image size is wrong.
+        TypeError: If parameters or the image size are not numeric, or for `Camera` itself, which is no model.
+
+    Example:
+        >>> ct.KannalaBrandt([300.0, 300.0, 319.5, 239.5]).project([0.0, 0.0, 1.0])[0].tolist()
+        [319.5, 239.5]
     """
 
     image_size: tuple[int, int] | None
@@ -108,16 +110,16 @@ class Camera(Freezable, Editable):
             MODELS.add(cls)
 
     @hinting(
-        "Numbers go in as lists, the size by name: ct.Pinhole([fx, fy, cx, cy], image_size=(height, width)), "
-        "ct.KannalaBrandt([fx, fy, cx, cy], [k1, k2, k3, k4]); a matrix as ct.BrownConrady.from_matrix(K, distortion)"
+        "Pass numbers as lists, the size by name: ct.Pinhole([fx, fy, cx, cy], image_size=(height, width)), "
+        "ct.KannalaBrandt([fx, fy, cx, cy], [k1, k2, k3, k4]); a matrix by ct.BrownConrady.from_matrix(K, distortion)"
     )
     def __init__(
         self, intrinsics: Numbers, distortion: Numbers | None = None, *, image_size: Sequence[int] | None = None
     ):
         if type(self).optics is Camera.optics:
             raise TypeError(
-                f"{type(self).__name__}: a camera is made by its model, as ct.KannalaBrandt(intrinsics, distortion), "
-                "or ct.KannalaBrandt.from_matrix(K, distortion) of a matrix K; ct.MODELS has all models"
+                f"{type(self).__name__}: the class must be that of a model; got {type(self).__name__}. Use "
+                "ct.KannalaBrandt(intrinsics, distortion), or from_matrix(K, distortion); ct.MODELS has all models"
             )
         given = type(self), intrinsics, distortion, image_size
         intrinsics, distortion, names, batch, size = at_a_glance(*given) or checked_numbers(*given)
@@ -140,18 +142,18 @@ class Camera(Freezable, Editable):
         image_size: Sequence[int] | None = None,
         ignore_skew: bool = False,
     ) -> Self:
-        """A camera from its matrix, as OpenCV's calibrations give it.
+        """Make a camera from its matrix, as OpenCV's calibrations give it.
 
         Args:
             K: (*B, 3, 3) [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels.
-            distortion: (*B, n) coefficients; beside a single matrix, OpenCV's (n, 1) and (1, n) are one camera's too.
-            image_size: (height, width) in pixels; OpenCV says (width, height).
-            ignore_skew: drop the skew K[0, 1], which no model here has.
+            distortion: (*B, n) coefficients; with a single matrix, OpenCV's (n, 1) and (1, n) are one camera's too.
+            image_size: (height, width) in pixels; OpenCV has (width, height).
+            ignore_skew: Drop the skew K[0, 1], which no model here has.
 
         Raises:
-            ValueError: not such a matrix, or a skew that is not zero and not to be ignored; a column (n, 1) of
-                coefficients beside a batch of matrices; 5, 8, 12 or 14 coefficients, which are those of OpenCV's
-                calibrateCamera, for a fisheye.
+            ValueError: If K is not such a matrix, or has a skew that is not ignored; if a column (n, 1) of coefficients
+                comes with a batch of matrices; or if a fisheye gets 5, 8, 12 or 14 coefficients, as of OpenCV's
+                calibrateCamera.
         """
         return cls(*numbers_of_matrix(cls, K, distortion, ignore_skew), image_size=image_size)
 
@@ -165,20 +167,19 @@ class Camera(Freezable, Editable):
         axis: Literal["horizontal", "vertical", "diagonal"] = "horizontal",
         distortion: Numbers | None = None,
     ) -> Self:
-        """A camera of a field of view given in DEGREES, for images that nothing more is known of.
+        """Make a camera from a field of view in DEGREES, for images of which nothing more is known.
 
-        Its pixels are square, its principal point is the middle of the image, and its focal length is such that
-        `field_of_view` comes out, with the distortion of the lens. What it guesses can learn.
+        The pixels are square, the principal point is the middle of the image, and the focal length gives this
+        `field_of_view` with the distortion of the lens. All of it can learn.
 
         Args:
             fov: degrees, one or (*B,), between the outer edges of the image.
             image_size: (height, width) in pixels.
-            axis: the field of view that `fov` is: "horizontal", "vertical" or "diagonal".
-            distortion: (*B, n) coefficients; those of `ideal` if left out.
+            axis: The meaning of `fov`: "horizontal", "vertical" or "diagonal".
+            distortion: (*B, n) coefficients; by default those of `ideal`.
 
         Raises:
-            ValueError: a field of view that this lens does not reach, one that seems to be in radians (up to 2 pi), an
-                unknown axis.
+            ValueError: If the lens does not reach `fov`, `fov` seems to be radians (up to 2 pi), or `axis` is unknown.
         """
         return camera_of_fov(cls, fov, image_size, axis, distortion)
 
@@ -215,11 +216,11 @@ class Camera(Freezable, Editable):
         distortion: Numbers | None = None,
         image_size: Sequence[int] | None = None,
     ) -> Self:
-        """The camera with other numbers or another image size; what is left out stays as it is, and is shared.
+        """Return the camera with other numbers or another image size; it shares everything that is left out.
 
-        Values are taken and checked as by the constructor. Plain ones become Parameters that learn where those that
-        they replace do; lists and arrays take the camera's dtype and device. An image size alone leaves the numbers as
-        they are: `resize`, `crop` and `pad` give the camera of an edited image.
+        Values are checked as by the constructor. Plain ones become Parameters that learn if those that they replace do;
+        lists and arrays take the camera's dtype and device. An image size alone does not change the numbers: `resize`,
+        `crop` and `pad` give the camera of an edited image.
 
         Args:
             intrinsics: (*B, 4).
@@ -227,7 +228,7 @@ class Camera(Freezable, Editable):
             image_size: (height, width) in pixels.
 
         Raises:
-            ValueError, TypeError: as of the constructor.
+            ValueError, TypeError: If the constructor would raise them.
         """
         return replaced(self, intrinsics, distortion, image_size)
 
@@ -253,23 +254,23 @@ class Camera(Freezable, Editable):
 
     @property
     def height(self) -> int:
-        """Of the image, in pixels; a ValueError where the camera has no image size."""
+        """The image's height in pixels; a ValueError if the camera has no image size."""
         return self._size_for("height")[0]
 
     @property
     def width(self) -> int:
-        """Of the image, in pixels; see `height`."""
+        """The image's width in pixels; see `height`."""
         return self._size_for("width")[1]
 
     def _model_name(self) -> str:
-        # a class that adds methods alone is of the model that it is made from
+        # a class that only adds methods has the model of its base
         return next(cls.__name__ for cls in type(self).__mro__ if "optics" in cls.__dict__)
 
     def _has_left(self, name: str) -> bool:
         return name not in {model.__name__ for model in MODELS.values()}
 
     def forward(self, points: Numbers) -> tuple[Tensor, Tensor]:
-        """The same as `project`."""
+        """Project points, as `project` does."""
         return self.project(points)
 
     if TYPE_CHECKING:
@@ -291,7 +292,7 @@ class Camera(Freezable, Editable):
         return evaluate_points(self, PROJECT, points, "points", 3, self.batch_shape, self._tensors)
 
     def unproject(self, pixels: Numbers) -> tuple[Tensor, Tensor]:
-        """The ray through each pixel.
+        """Return the ray through each pixel.
 
         Args:
             pixels: (*B, *N, 2).
@@ -303,20 +304,20 @@ class Camera(Freezable, Editable):
         return evaluate_points(self, UNPROJECT, pixels, "pixels", 2, self.batch_shape, self._tensors)
 
     def project_polyline(self, points: Numbers, extrinsics: Extrinsics | None = None) -> list[Tensor]:
-        """The curves that straight edges in space become: a 3D box in a fisheye's image, a lane, a horizon.
+        """Return the curves that straight edges in space become: a 3D box in a fisheye's image, a lane, a horizon.
 
         Pieces are within 0.1 px of the curve and at most 20 px long. Edges are cut where `valid` ends (not at the
         border of the image), at the seam of a panorama, and 16 times the image's larger side from its middle.
 
         Args:
-            points: (N, 3), finite, joined in their order, or (E, N, 3), E such lines, as the twelve edges (12, 2, 3) of
-                a box; of the camera's frame, or of the world's.
+            points: (N, 3), finite, joined in order, or (E, N, 3), E such lines, like the twelve edges (12, 2, 3) of
+                a box; in the camera's frame, or the world's.
             extrinsics: camera from world. The camera and its pose are single.
 
         Returns:
-            Pixels (M, 2) of each curve; none where nothing is seen. Where an edge is cut has no gradient.
+            Pixels (M, 2) of each curve; none if nothing is seen. Points at which an edge is cut have no gradient.
         """
-        from camtorch.rays.polyline import project_polyline  # a room that few calls need
+        from camtorch.rays.polyline import project_polyline  # few calls need this package
 
         return project_polyline(self, points, extrinsics)
 
@@ -324,38 +325,36 @@ class Camera(Freezable, Editable):
 
     @property
     def _tensors(self) -> tuple[Tensor, ...]:
-        """All that the camera learns, or could."""
+        """All tensors that the camera learns, or could."""
         return self.intrinsics, self.distortion
 
     def contains(self, pixels: Numbers) -> Tensor:
-        """Bool (...): whether pixels (..., 2) lie on the image, its outer pixel edges included."""
+        """Whether pixels (..., 2) lie on the image, its outer pixel edges included; bool (...)."""
         return on_image(pixels, self._size_for("contains"), type(self).__name__)
 
     def pixel_grid(self, stride: int = 1) -> Tensor:
-        """(H, W, 2): the centre of every pixel; or (H / stride, W / stride, 2): that of every patch.
+        """Return (H, W, 2), the centre of every pixel, or (H / stride, W / stride, 2), that of every patch.
 
         Args:
-            stride: of a feature map: pixels along each side of a patch. Patch i has its middle at
+            stride: Pixels along each side of a patch, as of a feature map. Patch i has its middle at
                 `stride * i + (stride - 1) / 2`, the first one of stride 16 at 7.5.
 
         Raises:
-            ValueError: no image size, or one that is not a multiple of the stride: crop, pad or resize the camera as
-                the image is.
+            ValueError: If there is no image size, or it is no multiple of the stride: edit the camera like the image.
         """
         like = self.intrinsics.new_empty(0, dtype=torch.promote_types(self.intrinsics.dtype, torch.float32))
         return patch_centres(self._size_for("pixel_grid"), stride, like, type(self).__name__)
 
     def rays(self, stride: int = 1) -> tuple[Tensor, Tensor]:
-        """The rays (*B, H, W, 3) of all pixels, and valid (*B, H, W); or of all patches, see `pixel_grid`.
+        """Return the rays (*B, H, W, 3) of all pixels, and valid (*B, H, W); or of all patches, see `pixel_grid`.
 
-        Those of up to half a million pixels or patches are kept while nothing that they depend on can learn or has
-        changed.
+        Up to half a million rays are kept while nothing that they depend on can learn or changes.
         """
         rays, valid = over_image(self, self._rays, self._tensors, stride, self.unproject)
         return rays, valid
 
     def plucker(self, extrinsics: Extrinsics | None = None, stride: int = 1) -> tuple[Tensor, Tensor]:
-        """The line in the world that every pixel or patch sees, in Pluecker coordinates.
+        """Return the line in the world that every pixel or patch sees, in Pluecker coordinates.
 
         Args:
             extrinsics: camera from world, of batch dims that broadcast with the camera's. None: the world is the
@@ -364,31 +363,31 @@ class Camera(Freezable, Editable):
 
         Returns:
             (*B, H, W, 6): the unit direction d and the moment m = position x d of the line, in the world's frame and
-            unit of length; and valid (*B, H, W) bool. Of two lines that meet d1 . m2 + d2 . m1 is zero. What is not
-            valid is zeros, without a gradient.
+            unit of length; and valid (*B, H, W) bool. For two lines that meet, d1 . m2 + d2 . m1 is zero. Invalid lines
+            are zeros without a gradient.
         """
         return plucker(*self.rays(stride), extrinsics, f"{type(self).__name__}.plucker")
 
     def local_pinhole(self, pixels: Numbers) -> tuple[Tensor, Tensor]:
-        """The pinhole camera that agrees with this one to first order around each pixel.
+        """Return the pinhole camera that agrees with this one to first order around each pixel.
 
-        A ray near that of the pixel is seen at K (R ray) / z, up to the square of its distance. So a patch can be taken
-        as an ordinary image, by a network that knows no other.
+        A ray near that of the pixel is seen at K (R ray) / z, up to the square of its distance. So a network for
+        pinhole images can take a patch as an ordinary image.
 
         Args:
             pixels: (*B, *N, 2).
 
         Returns:
-            R (*B, *N, 3, 3), `ray_local = R ray_camera`: its z axis is the ray of the pixel, its x axis the way of the
-            ray as the pixel goes right. And K (*B, *N, 3, 3), upper triangular, with the pixel as its principal point
-            and a skew where the image has one there. Both are exact, and identities where `unproject` is not valid.
+            R (*B, *N, 3, 3), `ray_local = R ray_camera`: its z axis is the ray of the pixel, its x axis the way
+            of the ray as the pixel goes right. And K (*B, *N, 3, 3), upper triangular, with the pixel as its principal
+            point and a skew if the image has one there. Both are exact, and identities if `unproject` is not valid.
         """
         return local_pinhole(self, pixels)
 
     def perspective_field(self, gravity: Numbers, stride: int = 1) -> tuple[Tensor, Tensor, Tensor]:
-        """How every pixel or patch stands to the horizon: what networks on single images read a camera's pose from.
+        """Return the relation of every pixel or patch to the horizon, from which networks read a camera's pose.
 
-        As in Jin et al., Perspective Fields for Single Image Camera Calibration, 2023, for any lens.
+        This is that of Jin et al., Perspective Fields for Single Image Camera Calibration, 2023, for any lens.
 
         Args:
             gravity: (3,) or (*B, 3), the direction in which things fall, in the camera's frame, of any length:
@@ -398,30 +397,30 @@ class Camera(Freezable, Editable):
         Returns:
             latitude (*B, H, W) in radians, of the ray above the horizon; up (*B, H, W, 2), the unit direction (u, v) in
             the image in which things rise, (0, 0) straight above and below; and valid (*B, H, W) bool, elsewhere both
-            are zeros. Kept as `rays` are.
+            are zeros. Kept like `rays`.
 
         Raises:
-            ValueError: another shape, a gravity of length zero.
+            ValueError: If gravity has another shape, or length zero.
         """
         return perspective_field(self, gravity, stride)
 
     def backproject(self, depth: Numbers, kind: Literal["z", "distance"] = "z") -> tuple[Tensor, Tensor]:
-        """The points of the camera frame that the pixels of a depth map show.
+        """Return the points of the camera frame that the pixels of a depth map show.
 
         Args:
             depth: (B, 1, H, W) of the camera's image_size, or (H, W), in any unit of length; floating point.
-            kind: what it holds: "z", the coordinate along the optical axis, as depth cameras give it, or "distance"
+            kind: "z", the coordinate along the optical axis, which depth cameras give, or "distance", that
                 from the camera, which lenses past 90 degrees need.
 
         Returns:
             points (*B, H, W, 3) in that unit, and valid (*B, H, W) bool: the depth is finite and positive, the pixel
-            has a ray, and for "z" the ray goes ahead. A camera without batch dims gives (B, H, W, 3) of B maps. What
-            is not valid is (0, 0, 0) and has no gradient.
+            has a ray, and for "z" the ray goes ahead. A camera without batch dims gives (B, H, W, 3) for B maps.
+            Invalid points are (0, 0, 0) without a gradient.
 
         Raises:
-            ValueError: another shape, integers, an unknown kind.
+            ValueError: If the shape is wrong, the depth is of integers, or the kind is unknown.
         """
-        from camtorch.rays.depth import backproject  # a room that few calls need
+        from camtorch.rays.depth import backproject  # few calls need this package
 
         return backproject(self, depth, kind)
 
@@ -431,33 +430,33 @@ class Camera(Freezable, Editable):
 
         The angle that a line of the image takes, from outer pixel edge to outer pixel edge: the row and the column
         through the principal point, and the wider of both diagonals. It is the sum of the angles from the optical axis
-        to both sides, so that it goes up to a whole turn, beyond the half where angles between rays end. Where a line
-        is not seen to its ends, because the lens folds inside the image, it is the angle between the outermost points
-        on it that have rays; 0 where none has.
+        to both sides, so that it goes up to a whole turn, beyond the half where angles between rays end. If a line is
+        not seen to its ends, because the lens folds inside the image, it is the angle between the outermost points on
+        it that have rays; 0 if none has.
 
         Raises:
-            ValueError: the camera has no image size.
+            ValueError: If the camera has no image size.
         """
         return field_of_view(self)
 
     @property
     def fov(self) -> Tensor:
-        """(*B, 3): `field_of_view` in degrees, the unit of every `fov` that camtorch is given."""
+        """(*B, 3): `field_of_view` in degrees, the unit of every argument `fov`."""
         return self.field_of_view.rad2deg()
 
     def explain(self, points: Numbers) -> list[str]:
-        """Why points have no pixel, in words; for a person, and slow.
+        """Explain in words why points have no pixel; for a person, and slow.
 
         Args:
             points: (*B, *N, 3) as for `project`.
 
         Returns:
-            A line for each point, in the order of `points.flatten(0, -2)`: "valid", or what keeps `project` from it:
+            A line for each point, in the order of `points.flatten(0, -2)`: "valid", or why `project` is not valid:
             "the camera itself is unusable: ...", "not finite: ...", "no direction: ...", "the chart does not cover it:
             ...", "beyond the fold at ... degrees: ..." or "beyond the edge of the surface at ..."; angles from the
             optical axis, along the azimuth of the point.
         """
-        from camtorch.rays.explanation import explain  # a room that few calls need
+        from camtorch.rays.explanation import explain  # few calls need this package
 
         return explain(self, points)
 
@@ -471,21 +470,21 @@ class Camera(Freezable, Editable):
         tolerance: float = 0.1,
         **options: Any,
     ) -> Conversion[Model]:
-        """The camera of another model, or number of coefficients, that comes closest to this one.
+        """Return the camera of another model, or number of coefficients, that comes closest to this one.
 
-        Where the models are related and the numbers allow, it is this camera exactly: its coefficients are taken over
-        bit by bit. Otherwise the squared pixel errors are least over the rays of this camera's image (without a size:
-        over all its rays) that are within `max_angle` and that the new model can express; where the largest error then
-        is above the tolerance, and their root mean square below, it is brought down at the expense of smaller ones. The
-        result says how good that is; a bad conversion raises no error. Rows of a batch are converted independently.
+        If the models are related and the numbers allow, it is this camera exactly, with the same bits. Otherwise it has
+        the least squared pixel errors over the rays of this camera's image (without a size: over all its rays) that are
+        within `max_angle` and that the new model can express; if the largest error is above the tolerance then, and
+        their root mean square below, it is reduced at the expense of smaller ones. A bad conversion does not raise: the
+        result has its errors. Rows of a batch are converted independently.
 
         Args:
             model: a class of cameras, or its key in `ct.MODELS`.
-            count: of coefficients, for models that leave a choice. By default the least number that holds what a
-                related camera has, the model's own at least; where that does not keep the tolerance, those of
-                `fit_counts` are tried, and taken if they keep it or halve the largest error. Rows of a batch that need
-                less have zeros.
-            image_size: (height, width) of the image, for a camera that does not say or to look at another part.
+            count: The number of coefficients, if the model leaves a choice. By default the least that holds those of a
+                related camera, at least the model's own; if that does not keep the tolerance, those of `fit_counts`
+                are tried, and taken if they keep it or halve the largest error. Rows of a batch that need fewer have
+                zeros.
+            image_size: (height, width) of the image, for a camera without one, or to use another part.
             max_angle: radians from the optical axis up to which rays matter; by default all do.
             tolerance: the largest error in pixels that is good enough.
             options: passed on to the model.
@@ -495,38 +494,38 @@ class Camera(Freezable, Editable):
             pixels, max_angle in radians, valid_fraction of the image.
 
         Raises:
-            TypeError: no camera model. ValueError: an unknown key, a count that the model does not take, a
-                `max_angle` that is not positive or beyond pi, a `tolerance` that is not positive.
+            TypeError: If `model` is no model. ValueError: If a key is unknown, the model does not take `count`, or
+                `max_angle` (up to pi) or `tolerance` is not positive.
         """
-        from camtorch.convert.conversion import convert  # a room that few calls need
+        from camtorch.convert.conversion import convert  # few calls need this package
 
         options |= {"count": count, "image_size": image_size, "max_angle": max_angle, "tolerance": tolerance}
         return convert(self, cast("type[Model]", as_model(model, f"{type(self).__name__}.convert")), MODELS, **options)
 
     def __dir__(self) -> list[str]:
-        """Return what users call: not what a model states, nor what modules are made of."""
+        """Return the names that users call, without those that a model states or that modules are made of."""
         inside = {*vars(ModelSpec), *vars(CameraLike), *dir(GeometryModule), "each", "memo_names", "tensor_names"}
         inside -= {"distortion_names", "is_mixed", *dir(nn.Module)}
         names: list[str] = super().__dir__()  # type: ignore[no-untyped-call]
         return [n for n in names if n not in inside and (n[:1] != "_" or n[:2] == "__")]
 
     def _repr_html_(self) -> str:
-        from camtorch.cameras.notebook import as_html  # which notebooks alone need
+        from camtorch.cameras.notebook import as_html  # only notebooks need it
 
         return as_html(self)
 
     def extra_repr(self) -> str:
-        """Batch, size and, for a single camera, its numbers."""
+        """Return the batch, the size and, for a single camera, its numbers as text."""
         return described(self)
 
 
 def as_model(model: type[Camera] | str, owner: str) -> type[Camera]:
-    """Return a camera model, or the one of that key in `MODELS`."""
+    """Return a camera model, or the one with that key in `MODELS`."""
     return MODELS.found(model, owner)
 
 
 def __getattr__(name: str) -> type[Camera]:
-    """The class of a variant by its key, under which it is pickled."""
+    """Return the class of a variant by its key, under which it is pickled."""
     if ":" not in name:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return as_model(name, __name__)

@@ -1,4 +1,4 @@
-"""Camera models by their keys, and what other tools call them."""
+"""Camera models by their keys, and by the names that other tools give them."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _ELSEWHERE = {
     "equidistant": "kannala_brandt",
     "omnidir": "mei",
 }
-"""What OpenCV, ROS, Kalibr and COLMAP call some of them."""
+"""Names of some models in OpenCV, ROS, Kalibr and COLMAP."""
 
 
 class Catalogue(MutableMapping[str, KindT]):
@@ -59,7 +59,7 @@ class Catalogue(MutableMapping[str, KindT]):
         return f"MODELS({', '.join(self)})"
 
     def add(self, model: Any) -> None:
-        """Check what a new model states, and know it by its key."""
+        """Check the statements of a new model, and register it under its key."""
         for name in ("optics", "defined"):
             stated = inspect.getattr_static(model, name)
             if not isinstance(stated, staticmethod):
@@ -73,14 +73,14 @@ class Catalogue(MutableMapping[str, KindT]):
             model.key = ""
             return
         known = self.get(model.key)
-        # a class that is defined again, in a notebook, takes its own place
+        # a class that is defined again, in a notebook, replaces itself
         if known is not None and (known.__module__, known.__qualname__) != (model.__module__, model.__qualname__):
             owner = f"{known.__module__}.{known.__qualname__}"
-            raise ValueError(f"{model.__name__}: the key {model.key!r} is that of {owner}; choose another")
+            raise ValueError(f"{model.__name__}: key must be unique; got {model.key!r}, which is that of {owner}")
         self[model.key] = model
 
     def found(self, model: Any, owner: str) -> KindT:
-        """Return a camera model, or the one of that key."""
+        """Return a camera model, or the one with that key."""
         if isinstance(model, str):
             key, *texts = model.split(":")
             if texts and key in self:
@@ -88,11 +88,11 @@ class Catalogue(MutableMapping[str, KindT]):
             if model not in self:
                 keys = {name.lower(): key for key, cls in self.items() for name in (key, cls.__name__)} | _ELSEWHERE
                 close = difflib.get_close_matches(model.lower(), keys, 1)
-                meant = f"did you mean {keys[close[0]]!r}? Known" if close else "known"
+                meant = f" (did you mean {keys[close[0]]!r}?)" if close else ""
                 keys_text = ", ".join(sorted(self))
-                raise ValueError(f"{owner}: there is no camera model {model!r}; {meant} are {keys_text}. {LEFT}")
+                raise ValueError(f"{owner}: model must be one of {keys_text}; got {model!r}{meant}. {LEFT}")
             return self[model]
-        if isinstance(model, type) and model.__module__ == parametrize.__name__:  # of one parametrized camera
+        if isinstance(model, type) and model.__module__ == parametrize.__name__:  # the class of one parametrized camera
             model = model.__bases__[0]
         if not (isinstance(model, type) and issubclass(model, CameraLike) and model.optics is not ModelSpec.optics):
             raise TypeError(f"{owner}: model must be a camera model, or its key in ct.MODELS; got {shown(model)}")

@@ -21,7 +21,7 @@ CameraT = TypeVar("CameraT", bound=CameraLike)
 
 
 def quarter_turns(image_size: tuple[int, int]) -> tuple[tuple[tuple[int, int, int], tuple[int, int, int]], ...]:
-    """From pixels (u, v, 1) to those of the image turned counterclockwise by 0, 1, 2 and 3 quarters: (2, 3) each."""
+    """Return the maps (2, 3) from pixels (u, v, 1) to those of the image turned counterclockwise by 0 to 3 quarters."""
     bottom, right = (side - 1 for side in image_size)
     return (
         ((1, 0, 0), (0, 1, 0)),
@@ -32,7 +32,7 @@ def quarter_turns(image_size: tuple[int, int]) -> tuple[tuple[tuple[int, int, in
 
 
 def edited_by(camera: CameraT, matrix: Sequence[Sequence[float]], size: Sequence[int]) -> CameraT:
-    """Return the camera of an image whose pixels all move by one map (2, 3); it learns where the camera does."""
+    """Return the camera of an image whose pixels all move by one map (2, 3); it learns if the camera does."""
     new_size = as_image_size(size, type(camera).__name__)
     if camera.is_mixed:
         return cast("CameraT", cast("Any", camera).by_groups(lambda group: edited_by(group, matrix, size)))
@@ -54,7 +54,7 @@ def edited(camera: CameraT, matrix: Tensor | Sequence[Sequence[float]], image_si
     focal = abs(a) * fx + abs(b) * fy, abs(c) * fx + abs(d) * fy
     centre = a * cx + b * cy + left, c * cx + d * cy + top
     turns = turned = b != 0
-    if isinstance(matrix, Tensor):  # asked where it was drawn, so that no device is waited for
+    if isinstance(matrix, Tensor):  # read where it was drawn, so as not to wait for a device
         turns = np.any(turned) if xp is np else not known_true(matrix[..., 0, 1] == 0)
     distortion = _edited_distortion(camera, a - b, c + d, turned if turns else None)
     intrinsics = stack_numbers((*focal, *centre), own, xp)
@@ -62,21 +62,21 @@ def edited(camera: CameraT, matrix: Tensor | Sequence[Sequence[float]], image_si
 
 
 def _edited_distortion(camera: CameraLike, across: Any, down: Any, on_side: Any) -> Tensor:
-    """Coefficients after a quarter turn clockwise where it is on its side, (*B,) bool, and flips by signs (*B,)."""
+    """Return coefficients after a clockwise quarter turn of rows `on_side`, (*B,) bool, and flips by signs (*B,)."""
     k, names = camera.distortion, camera.distortion_names
     if on_side is not None:
         quarter, owner = camera.quarter_turn, type(camera).__name__
         if quarter is None or not {*camera.odd_in_x, *camera.odd_in_y} <= quarter.keys():
             raise ValueError(
-                f"{owner}: a quarter turn of the image has no camera of this model. "
-                "RandomMount(roll=...) turns the camera, and convert() gives one of another model"
+                f"{owner}: the model must be the same on its side for a quarter turn; got {owner}. "
+                "Turn the camera by RandomMount(roll=...), or convert() it to another model"
             )
         if {"tau_x", "tau_y"} <= {*names}:
             tilts = camera.distortion[..., [names.index("tau_x"), names.index("tau_y")]]
             if known_false((tilts == 0).any(-1)):
                 raise ValueError(
-                    f"{owner}: a sensor tilted about both axes, tau_x, tau_y = {tilts.tolist()}, has no "
-                    "quarter turn: the model tilts about one after the other"
+                    f"{owner}: tau_x or tau_y must be 0 for a quarter turn, as the model tilts about "
+                    f"one axis after the other; got {tilts.tolist()}"
                 )
         k = torch.where(torch.as_tensor(on_side, device=k.device).unsqueeze(-1), _renamed(k, names, quarter), k)
     for sign, mirrored in ((across, camera.mirror_x), (down, camera.mirror_y)):
@@ -91,7 +91,7 @@ def _edited_distortion(camera: CameraLike, across: Any, down: Any, on_side: Any)
 
 
 def _renamed(k: Tensor, names: Sequence[str], turned: Mapping[str, str]) -> Tensor:
-    """Coefficients (*B, n) of these names, some of which others become, or these with a minus."""
+    """Return coefficients (*B, n) of these names, each replaced by the one that `turned` gives for it; "-" negates."""
     places = {name: i for i, name in enumerate(names)}
     source = [turned.get(name, name) for name in names]
     index = [places[name.removeprefix("-")] for name in source]
@@ -99,30 +99,30 @@ def _renamed(k: Tensor, names: Sequence[str], turned: Mapping[str, str]) -> Tens
 
 
 class Editable(CameraLike):
-    """The camera of an edited image.
+    """A camera that can be edited like its image: each edit returns the camera of the edited image.
 
-    It has no Parameters of its own while the original learns: its intrinsics are made from the original's, and that is
-    where gradients go. From a frozen camera, or under `no_grad`, it is a copy.
+    While the original learns, the edited camera has no Parameters of its own: its intrinsics are made from the
+    original's, where gradients go. The edited camera of a frozen one, or under `no_grad`, is a copy.
     """
 
     def crop(self, top: int, left: int, height: int, width: int) -> Self:
-        """The camera of the part of the image whose top-left pixel is (left, top); it may reach outside.
+        """Return the camera of the part of the image whose top-left pixel is (left, top); it may reach outside.
 
         Raises:
-            ValueError: a part without any pixel of the image.
+            ValueError: If the part has no pixel of the image.
         """
         top, left = (as_whole(v, name, "crop") for v, name in ((top, "top"), (left, "left")))
         as_image_size((height, width), f"{type(self).__name__}.crop")
         size = self.image_size
         if size and (top >= size[0] or left >= size[1] or top + height <= 0 or left + width <= 0):
             raise ValueError(
-                f"{type(self).__name__}.crop: (top, left, height, width) = {(top, left, height, width)} holds no pixel "
-                f"of the image (height, width) = {size}"
+                f"{type(self).__name__}.crop: (top, left, height, width) must hold a pixel of the "
+                f"image (height, width) = {size}; got {(top, left, height, width)}"
             )
         return edited_by(self, ((1, 0, -left), (0, 1, -top)), (height, width))
 
     def pad(self, left: int, right: int, top: int, bottom: int) -> Self:
-        """The camera of the image with that many more pixels on each side."""
+        """Return the camera of the image with that many more pixels on each side."""
         height, width = self._size_for("pad")
         sides = ((left, "left"), (right, "right"), (top, "top"), (bottom, "bottom"))
         left, right, top, bottom = (as_whole(value, name, "pad") for value, name in sides)
@@ -130,9 +130,9 @@ class Editable(CameraLike):
 
     @hinting("It takes camera.resize(height, width), two numbers")
     def resize(self, height: int, width: int) -> Self:
-        """The camera of the image scaled to that size; pixel edges scale, as with align_corners=False.
+        """Return the camera of the image scaled to that size; pixel edges scale, as with align_corners=False.
 
-        It warns where the new size is like the old one with height and width exchanged.
+        It warns if the new size is like the old one with height and width exchanged.
         """
         old_height, old_width = self._size_for("resize")
         as_image_size((height, width), f"{type(self).__name__}.resize")
@@ -141,22 +141,22 @@ class Editable(CameraLike):
         return edited_by(self, ((across, 0, (across - 1) / 2), (0, down, (down - 1) / 2)), (height, width))
 
     def hflip(self) -> Self:
-        """The camera that sees the scene mirrored left to right: its image is this one's, flipped."""
+        """Return the camera that sees the scene mirrored left to right: its image is this one's, flipped."""
         height, width = self._size_for("hflip")
         return edited_by(self, ((-1, 0, width - 1), (0, 1, 0)), (height, width))
 
     def vflip(self) -> Self:
-        """The camera that sees the scene mirrored top to bottom: its image is this one's, flipped."""
+        """Return the camera that sees the scene mirrored top to bottom: its image is this one's, flipped."""
         height, width = self._size_for("vflip")
         return edited_by(self, ((1, 0, 0), (0, -1, height - 1)), (height, width))
 
     def rot90(self, k: int = 1) -> Self:
-        """The camera that leans on its side: its image is this one's, turned counterclockwise k times, as torch.rot90.
+        """Return the camera whose image is this one's, turned counterclockwise k times as by torch.rot90.
 
-        It sees points turned likewise: `camera.rot90().project((y, -x, z))` is the turned pixel (v, W - 1 - u).
+        It sees turned points: `camera.rot90().project((y, -x, z))` is the turned pixel (v, W - 1 - u).
 
         Raises:
-            ValueError: a quarter turn of a model that is not the same on its side, such as a cylinder's.
+            ValueError: If a model that is not the same on its side, like a cylinder's, is turned by a quarter.
         """
         size, turns = self._size_for("rot90"), as_whole(k, "k", "rot90") % 4
         return edited_by(self, quarter_turns(size)[turns], size[::-1] if turns % 2 else size)

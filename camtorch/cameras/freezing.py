@@ -1,4 +1,4 @@
-"""Parameters of a camera that stay as they are, by name, while the others learn."""
+"""Parameters of a camera that are frozen by name, while the others learn."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from camtorch.values.module import is_parameter
 
 INTRINSICS = "fx", "fy", "cx", "cy"
 PREFIX = "_frozen_"
-"""Of the buffers of the values that stay: NaN where one learns. Derived cameras have none."""
+"""The prefix of buffers with the frozen values, NaN for each that learns. Derived cameras have none."""
 
 
 class _Masked:
-    """A hook of a Parameter: no gradient of what is frozen."""
+    """A hook of a Parameter that removes the gradients of frozen numbers."""
 
-    __torch_unserializable__ = True  # it comes anew where the copy of a camera is looked at
+    __torch_unserializable__ = True  # a copied camera makes one when its tensors are read
 
     def __init__(self, learns: Tensor):
         self.learns = learns
@@ -31,7 +31,7 @@ class _Masked:
 
 
 def with_frozen(tensor: Tensor, frozen: Tensor) -> Tensor:
-    """Return the Parameter, of which what is frozen is as it was, and has no gradient; of another tensor the like."""
+    """Return the tensor with its frozen values, which have no gradient; a Parameter gets them in place."""
     learns = frozen.isnan()
     if not (is_parameter(tensor) and may_write(tensor)):
         return torch.where(learns, tensor, frozen)
@@ -44,12 +44,12 @@ def with_frozen(tensor: Tensor, frozen: Tensor) -> Tensor:
 
 
 def _hooks_of(tensor: Tensor) -> list[int]:
-    """The keys of this file's hooks."""
+    """Return the keys of this file's hooks."""
     return [key for key, hook in (tensor._backward_hooks or {}).items() if isinstance(hook, _Masked)]
 
 
 def frozen_names(camera: CameraLike) -> tuple[str, ...]:
-    """Of all frozen parameters."""
+    """Return the names of all frozen parameters."""
     found = []
     for tensor, names in _tensors_of(camera):
         frozen = camera._buffers.get(PREFIX + tensor)
@@ -60,23 +60,23 @@ def frozen_names(camera: CameraLike) -> tuple[str, ...]:
 
 
 def _freeze(camera: CameraLike, names: Sequence[str], frozen: bool) -> None:
-    """Freeze, or let learn again, the parameters of these names; all of them for none."""
+    """Freeze the parameters of these names, or let them learn again; all of them if there are no names."""
     owner = f"{type(camera).__name__}.{'freeze' if frozen else 'unfreeze'}"
     if camera.is_mixed:
-        raise TypeError(f"{owner}: a Mixed has no parameters of its own; freeze the cameras that it is made of")
+        raise TypeError(f"{owner}: camera must be of one model; got a Mixed. Use the cameras that it is made of")
     if len(names) == 1 and isinstance(names[0], (list, tuple)):
         names = names[0]
     known = [name for _, each in _tensors_of(camera) for name in each]
     for name in names:
         if name not in known:
-            raise ValueError(f"{owner}: {name!r} is no parameter; there are {', '.join(known)}")
+            raise ValueError(f"{owner}: names must be among {', '.join(known)}; got {name!r}")
     for tensor, own in _tensors_of(camera):
         chosen = [i for i, name in enumerate(own) if not names or name in names]
         before = camera._buffers.get(PREFIX + tensor)
         if not chosen or (before is None and not frozen):
             continue
         if "parametrizations" in camera._modules and tensor in camera.parametrizations:  # type: ignore[operator]
-            raise TypeError(f"{owner}: {tensor} is parametrized; torch's remove_parametrizations makes it plain first")
+            raise TypeError(f"{owner}: {tensor} must not be parametrized; got one that is. Use remove_parametrizations")
         held = getattr(camera, tensor)
         for key in _hooks_of(held):
             del held._backward_hooks[key]
@@ -90,34 +90,34 @@ def _freeze(camera: CameraLike, names: Sequence[str], frozen: bool) -> None:
 
 
 def _tensors_of(camera: CameraLike) -> tuple[tuple[str, tuple[str, ...]], ...]:
-    """What holds them, and the names of its columns; a Mixed has none of its own."""
+    """Return the names of the tensors that hold parameters, and those of their columns; a Mixed has none of its own."""
     return () if camera.is_mixed else (("intrinsics", INTRINSICS), ("distortion", tuple(camera.distortion_names)))
 
 
 class Freezable(CameraLike):
-    """What a camera is beside its optics: a module whose parameters can be frozen by name."""
+    """A module whose parameters can be frozen by name."""
 
     def freeze(self, *names: str) -> Self:
-        """Let parameters stay as they are while the others learn: `camera.freeze("fx", "fy", "k3")`.
+        """Freeze parameters, while the others learn: `camera.freeze("fx", "fy", "k3")`.
 
         They have no gradient, and neither weight decay nor the momentum of an optimizer moves them; `ct.fit` and
-        `ct.calibrate` hold them where they start from the camera. States, pickles and `copy.deepcopy` keep them frozen;
-        what is made from the camera, as by `resize` or `clone`, sends its gradients to what learns here.
+        `ct.calibrate` hold them if they start from the camera. States, pickles and `copy.deepcopy` keep them frozen;
+        cameras made from this one, as by `resize` or `clone`, send gradients to the parameters that learn here.
 
         Args:
-            names: "fx", "fy", "cx", "cy", and of `distortion_names`; all parameters if there are none.
+            names: "fx", "fy", "cx", "cy", and those of `distortion_names`; all parameters by default.
         """
         _freeze(self, names, True)
         return self
 
     def unfreeze(self, *names: str) -> Self:
-        """Let parameters that were frozen learn again, from the values that they have; all of them for no name."""
+        """Let frozen parameters learn again, from the values that they have; all of them by default."""
         _freeze(self, names, False)
         return self
 
     def _save_to_state_dict(self, destination: Any, prefix: str, keep_vars: bool) -> None:
         super()._save_to_state_dict(destination, prefix, keep_vars)
-        # it shares the memory of the Parameters, which are as they were frozen once they were looked at
+        # the state shares the memory of the Parameters, which have their frozen values once they are read
         for tensor, _ in _tensors_of(self):
             getattr(self, tensor)
         if (names := frozen_names(self)) and hasattr(destination, "_metadata"):
@@ -125,7 +125,7 @@ class Freezable(CameraLike):
 
     def _load_from_state_dict(self, *arguments: Any) -> None:
         super()._load_from_state_dict(*arguments)
-        # what is frozen has the values of the state, and what the state says is frozen too
+        # frozen parameters take the values of the state, and those that are frozen in the state are frozen here too
         names = {*frozen_names(self), *arguments[2].get("frozen", ())}
         for tensor, _ in _tensors_of(self):
             self._buffers.pop(PREFIX + tensor, None)

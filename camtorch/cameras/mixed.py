@@ -32,9 +32,9 @@ class _Group(NamedTuple):
     """Cameras of one model and number of coefficients, which are evaluated at once."""
 
     model: type[Camera]
-    members: tuple[int, ...]  # which modules it is made of
-    counts: tuple[int | None, ...]  # how many cameras each of them is; None for a single one
-    taken: tuple[int, ...] | None  # which rows of those, one after the other; None for all of them in their order
+    members: tuple[int, ...]  # indices of the modules that it is made of
+    counts: tuple[int | None, ...]  # the number of cameras of each; None for a single one
+    taken: tuple[int, ...] | None  # the rows of those, one after the other; None for all in order
     rows: tuple[int, ...]  # the place of each in the batch, ascending
     memo: Kept
 
@@ -45,25 +45,25 @@ class Mixed(Camera):
         camera = ct.Mixed([ct.Pinhole(...), ct.KannalaBrandt(...), ct.BrownConrady(...)])
         pixels, valid = camera.project(points)  # (3, N, 3), a row for each camera
 
-    Results are to the bit those of each camera by itself. Cameras of one model and number of coefficients are
+    Results have the same bits as those of each camera alone. Cameras of one model and number of coefficients are
     evaluated together: 64 cameras of 8 models take 8 calls, however they are ordered.
 
     Args:
-        cameras: single cameras, and batches of one dim, whose rows follow each other. They are kept as they are, as in
-            an `nn.ModuleList`: what learns in them goes on learning here, and `camera[i]` is the i-th one.
-        order: which of these cameras, counted one by one, each row of the batch is; each once, in turn, by default.
+        cameras: Single cameras, and batches of one dim, whose rows follow each other. They are not copied, as in an
+            `nn.ModuleList`: their parameters go on learning here, and `camera[i]` is the i-th one.
+        order: For each row of the batch, the number of its camera, counted one by one; each once, in turn by default.
 
-    Its `intrinsics`, `K`, `fx` and so on are those of all; there is no common `distortion`. Results are of the widest
-    dtype among the cameras and the points. `groups` are the batches of one model that it is made of.
+    Its `intrinsics`, `K`, `fx` and so on are those of all cameras; there is no common `distortion`. Results have the
+    widest dtype among the cameras and the points. `groups` are the batches of one model that it is made of.
 
     Raises:
-        TypeError: what is no camera. ValueError: no cameras, more than one batch dim, images of different sizes,
-            different devices.
+        TypeError: If something is no camera. ValueError: If there are no cameras, more than one batch dim, images of
+            different sizes, or different devices.
     """
 
     is_mixed = True
     cameras: nn.ModuleList
-    """What it was made of: single cameras and batches."""
+    """The cameras that it was made of: single ones and batches."""
 
     def __init__(self, cameras: Iterable[Camera], *, order: Sequence[int] | None = None):
         members = _members(cameras, "Mixed")
@@ -90,10 +90,10 @@ class Mixed(Camera):
 
     @classmethod
     def of_groups(cls, groups: Sequence[tuple[Sequence[int], Camera]]) -> Self:
-        """The batch of which each group, (rows, cameras), fills some rows, all of them together.
+        """Return the batch whose rows the groups, (rows, cameras), fill together.
 
         Args:
-            groups: the rows of the batch, and as many cameras; as of `groups`.
+            groups: The rows of the batch, and as many cameras, like the property `groups`.
         """
         try:
             rows = [int(row) for of_group, _ in groups for row in of_group]
@@ -152,20 +152,20 @@ class Mixed(Camera):
 
     @property
     def distortion(self) -> NoReturn:  # type: ignore[override]
-        """There is none in common."""
-        self._refuse("distortion", "camera[i].distortion is that of one, and camera.groups are batches of one model")
+        """Not defined, as cameras of several models have none in common."""
+        self._refuse("distortion", "Use camera[i].distortion, or camera.groups, batches of one model")
 
     @property
     def distortion_names(self) -> NoReturn:  # type: ignore[override]
-        """See `distortion`."""
-        self._refuse("distortion", "camera[i] is one of them, and camera.groups are batches of one model")
+        """Not defined; see `distortion`."""
+        self._refuse("distortion", "Use camera[i], or camera.groups, batches of one model")
 
     @staticmethod
     def _refuse(what: str, instead: str) -> NoReturn:
-        raise TypeError(f"Mixed: cameras of several models have no {what} in common; {instead}")
+        raise TypeError(f"Mixed: cameras must be of one model to have a {what}; got several models. {instead}")
 
     def _in_order(self, tensor: Tensor, dim: int = 0) -> Tensor:
-        """Rows of the groups, one after the other along a dim, as the batch has them."""
+        """Return rows of the groups, one after the other along a dim, in the order of the batch."""
         if self._order == tuple(range(len(self._order))):
             return tensor
         return tensor.index_select(dim, torch.tensor(self._order, device=tensor.device))
@@ -194,7 +194,7 @@ class Mixed(Camera):
         return self._in_order(torch.cat(planes, 1), 1), self._in_order(torch.cat(valid))
 
     def _watch(self, n: int) -> Callable[[Tensor, Tensor], CameraRows]:
-        """The cameras of a group, kept until a value changes; its members say what is wrong with them."""
+        """Return a function that gives a group's cameras, kept until a value changes; unusable members warn."""
         group = self._groups[n]
 
         def cameras(intrinsics: Tensor, distortion: Tensor) -> CameraRows:
@@ -209,22 +209,22 @@ class Mixed(Camera):
         return cameras
 
     def explain(self, points: Numbers) -> list[str]:
-        """Why points (B, *N, 3) have no pixel, in words; see `Camera.explain`."""
+        """Explain in words why points (B, *N, 3) have no pixel; see `Camera.explain`."""
         rows, _ = as_points(points, "points", 3, self.batch_shape, (self.intrinsics,), "Mixed")
         return [line for camera, mine in zip(self, rows, strict=True) for line in camera.explain(mine)]
 
     def by_groups(self, change: Callable[[Camera], Camera]) -> Self:
-        """The batch of what `change` makes of each group."""
+        """Return the batch of the cameras that `change` returns for the groups."""
         if not callable(change):
             raise TypeError(f"Mixed: change must be a function of a camera that returns a camera; got {shown(change)}")
         return type(self).of_groups([(rows, change(camera)) for rows, camera in self.groups])
 
     def each(self, change: Callable[[Tensor], Tensor]) -> Self:
-        """The batch with all tensors (C, n) of each group changed by the same function."""
+        """Return the batch with all tensors (C, n) of each group changed by the same function."""
         return self.by_groups(lambda group: group.each(change))
 
     def expand(self, *batch: int | Sequence[int]) -> Self:
-        """As `Camera.expand`: a batch of one becomes one of many, any other one keeps its dim."""
+        """Expand like `Camera.expand`: a batch of one becomes one of many, any other one keeps its dim."""
         sizes: Any = batch[0] if len(batch) == 1 and isinstance(batch[0], Sequence) else batch
         count, size = len(self), None
         with suppress(TypeError, RuntimeError):
@@ -232,7 +232,7 @@ class Mixed(Camera):
         if size in (count, -1):
             return self
         if count != 1 or size is None or size < 1:
-            raise ValueError(f"Mixed: batch dims ({count},) do not expand to {shown(tuple(sizes))}")
+            raise ValueError(f"Mixed: batch must fit dims ({count},); got {shown(tuple(sizes))}")
         return type(self)([self.groups[0][1].expand(size)])
 
     def replace(
@@ -241,9 +241,9 @@ class Mixed(Camera):
         distortion: Numbers | None = None,
         image_size: Sequence[int] | None = None,
     ) -> Self:
-        """The batch with other intrinsics (B, 4), or another image size; see `Camera.replace`."""
+        """Return the batch with other intrinsics (B, 4), or another image size; see `Camera.replace`."""
         if distortion is not None:
-            self._refuse("distortion", "camera.by_groups(lambda group: group.replace(distortion=...)) replaces it")
+            self._refuse("distortion", "Use camera.by_groups(lambda group: group.replace(distortion=...))")
         as_image_size(image_size, "Mixed")
         if intrinsics is None:
             return self.by_groups(lambda group: group.replace(image_size=image_size))
@@ -259,16 +259,16 @@ class Mixed(Camera):
                 if here:
                     part = group if len(here) == len(rows) else group[here]
                     made = part.replace(given[[rows[n] for n in here]], None, image_size)
-                    if isinstance(made.intrinsics, nn.Parameter):  # of plain numbers
+                    if isinstance(made.intrinsics, nn.Parameter):  # made of plain numbers
                         made.intrinsics.requires_grad_(state)
                     new.append(([rows[n] for n in here], made))
         return type(self).of_groups(new)
 
     def __getitem__(self, index: Any) -> Camera:  # type: ignore[override]
-        """Of an int, that camera, as it was given where it was given alone; else the `Mixed` of a part of the batch.
+        """Return one camera for an int, itself if it was given alone; otherwise the `Mixed` of a part of the batch.
 
         Raises:
-            IndexError: beyond the batch, or of more than one dim.
+            IndexError: If the index is beyond the batch, or of more than one dim.
         """
         try:
             taken = torch.arange(len(self._places))[index]
@@ -279,22 +279,22 @@ class Mixed(Camera):
             camera = self._member(i)
             return camera[row] if camera.batch_shape else camera
         if taken.ndim > 1:
-            raise IndexError(f"Mixed: it has one batch dim, and {index!r} makes more of it")
+            raise IndexError(f"Mixed: index must leave at most one batch dim; got {index!r}")
         places = [self._places[row] for row in taken.tolist()]
         if not places:
-            raise IndexError(f"Mixed: {index!r} leaves no camera of a batch ({len(self._places)},)")
+            raise IndexError(f"Mixed: index must leave a camera of ({len(self._places)},); got {index!r}")
         members = cast("list[Camera]", list(self.cameras))
         used, order = _among_used(members, places)
         return type(self)([members[i] for i in used], order=order)
 
     def convert(self, *_: Any, **__: Any) -> NoReturn:
-        """Each group by itself: `camera.by_groups(lambda group: group.convert(model).camera)`."""
-        self._refuse("conversion", "camera.by_groups(lambda group: group.convert(model).camera) converts them all")
+        """Raise a TypeError: use `camera.by_groups(lambda group: group.convert(model).camera)`."""
+        self._refuse("conversion", "Use camera.by_groups(lambda group: group.convert(model).camera)")
 
     @classmethod
     def from_matrix(cls, *_: Any, **__: Any) -> NoReturn:
-        """Of a model."""
-        cls._refuse("constructor from numbers", "make each camera by its model, and ct.Mixed([...]) of them")
+        """Raise a TypeError: only cameras of a model are made of numbers."""
+        cls._refuse("constructor from numbers", "Make each camera by its model, and ct.Mixed([...]) of them")
 
     from_fov = from_matrix
 
@@ -309,20 +309,20 @@ class Mixed(Camera):
 
 
 def cat(cameras: Iterable[Camera], *_more: object) -> Camera:
-    """One batch of cameras, one after the other, as `torch.cat` makes of tensors; a single camera is one row.
+    """Concatenate cameras to one batch, as `torch.cat` does tensors; a single camera is one row.
 
-    Of one model and number of coefficients it is a batch of that model, of several it is a `Mixed`. What is fixed stays
+    Cameras of one model and number of coefficients become a batch of that model, others a `Mixed`. Fixed numbers stay
     fixed, and gradients go to every camera that learns.
 
     Args:
         cameras: single cameras, batches of one dim, and `Mixed` ones, whose images are of one size.
 
     Raises:
-        TypeError: what is no camera. ValueError: no cameras, more than one batch dim, images of different sizes,
-            different devices.
+        TypeError: If something is no camera. ValueError: If there are no cameras, more than one batch dim, images of
+            different sizes, or different devices.
     """
     if _more:
-        raise TypeError(f"cat: the cameras go in as one list, cat([a, b]); got {1 + len(_more)} arguments")
+        raise TypeError(f"cat: cameras must be one list, as in cat([a, b]); got {1 + len(_more)} arguments")
     groups = Mixed(_members(cameras, "cat")).groups
     return groups[0][1] if len(groups) == 1 else Mixed.of_groups(groups)
 
@@ -334,7 +334,7 @@ def _count(camera: Camera) -> int:
 def _among_used(
     members: Sequence[Camera], places: Sequence[tuple[int, int]]
 ) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """Which members hold the cameras at (member, row), and where each camera is if all of those stand in a row."""
+    """Return the members that hold the cameras at (member, row), and the cameras' places if those stand in a row."""
     used = tuple(dict.fromkeys(i for i, _ in places))
     starts = accumulate((_count(members[i]) for i in used), initial=0)
     first = dict(zip(used, starts, strict=False))
@@ -342,11 +342,11 @@ def _among_used(
 
 
 def _members(cameras: Any, owner: str) -> list[Camera]:
-    """What a batch is made of, as users pass it."""
+    """Return the single cameras and batches in a list as users pass it."""
     if isinstance(cameras, Camera):
         cameras = [cameras]
     if isinstance(cameras, Mapping):
-        raise TypeError(f"{owner}: cameras must be a list of cameras; of a dict, as rig.cameras, give list(d.values())")
+        raise TypeError(f"{owner}: cameras must be a list of cameras; got a dict. Pass list(d.values()) for a dict d")
     try:
         given = list(cameras)
     except TypeError:
@@ -356,19 +356,19 @@ def _members(cameras: Any, owner: str) -> list[Camera]:
             raise TypeError(f"{owner}: cameras[{i}] must be a Camera; got {no_camera(camera)}")
     members = [one for camera in given for one in (camera if isinstance(camera, Mixed) else (camera,))]
     if not any(map(_count, members)):
-        raise ValueError(f"{owner}: an empty list of cameras; it must hold at least one")
+        raise ValueError(f"{owner}: cameras must hold at least one; got an empty list")
     for i, camera in enumerate(members):
         if len(camera.batch_shape) > 1:
             shape = tuple(camera.batch_shape)
-            raise ValueError(f"{owner}: cameras[{i}] has batch dims {shape}; cameras are single, or batches of one dim")
+            raise ValueError(f"{owner}: cameras[{i}] must be single, or a batch of one dim; got batch dims {shape}")
     devices = list(dict.fromkeys(str(camera.intrinsics.device) for camera in members))
     if len(devices) > 1:
         raise ValueError(f"{owner}: cameras must be on one device; got {devices}. Move them with .to(device)")
     sizes = list(dict.fromkeys(camera.image_size for camera in members))
     if len(sizes) > 1:
         raise ValueError(
-            f"{owner}: the images of a batch are of one size; got cameras of {', '.join(map(str, sizes))} (height, "
-            "width). camera.resize, .crop and .pad give the camera of an edited image"
+            f"{owner}: the images of a batch must have one size; got {', '.join(map(str, sizes))} (height, "
+            "width). Use camera.resize, .crop and .pad as for the images"
         )
     return members
 
@@ -384,12 +384,12 @@ def _as_order(order: Sequence[int], count: int) -> list[int]:
 
 
 def kind(camera: Camera) -> tuple[type[Camera], int, tuple[int, int] | None]:
-    """What cameras must have in common to be rows of one batch of one model."""
+    """Return the properties that cameras must have in common to be rows of one batch of one model."""
     return type_before_parametrizations(camera), camera.distortion.shape[-1], camera.image_size
 
 
 def _joined(tensors: Sequence[Tensor], group: _Group) -> Tensor:
-    """(C, n): the same numbers of all cameras of a group; or what they share, if it is a batch that shares them."""
+    """Return (C, n), the numbers of all cameras of a group, or those that its cameras share if it is one batch."""
     if group.counts[1:] or group.taken is not None:
         if not any(group.counts):
             whole = torch.stack(list(tensors))
@@ -403,7 +403,7 @@ def _joined(tensors: Sequence[Tensor], group: _Group) -> Tensor:
 
 def collate_cameras(batch: Sequence[Camera], *, collate_fn_map: Any = None) -> Camera | list[Camera]:
     """Return single cameras as one batch, of several models if need be; others as a list."""
-    if in_worker():  # which no graph can leave
+    if in_worker():  # no graph can leave it
         batch = [camera.detach() for camera in batch]
     return list(batch) if any(camera.batch_shape for camera in batch) else cat(batch)
 

@@ -1,4 +1,4 @@
-"""What notebooks show of a camera: its numbers, and a small image of its angles."""
+"""The view of a camera in notebooks: its numbers, and a small image of its angles."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ import torch
 from camtorch.projection.camera_like import CameraLike
 
 _WIDTH = 260  # px of the image
-_CELLS = 48  # of the lattice on which pixels without rays are looked for, along the wider side
-_STEPS = 96  # around a circle
+_CELLS = 48  # along the wider side of the lattice that finds pixels without rays
+_STEPS = 96  # points around a circle
 _FEW = 7  # circles are enough
 
 
 @torch.no_grad()
 def as_html(camera: CameraLike) -> str:
-    """The text of `repr`; of a single camera with image_size also circles of equal angle, grey where it is blind."""
+    """Return `repr` as HTML, and for a single camera with image_size circles of equal angle, grey where it is blind."""
     text = f'<pre style="margin: 0">{html.escape(repr(camera))}</pre>'
     if camera.is_mixed or camera.batch_shape or camera.image_size is None:
         return text
@@ -37,7 +37,7 @@ def as_html(camera: CameraLike) -> str:
         theta = torch.full_like(turn, math.radians(angle))
         circle = torch.stack((theta.sin() * turn.cos(), theta.sin() * turn.sin(), theta.cos()), -1)
         pixels, valid = (part.cpu() for part in camera.project(circle.to(camera.intrinsics.device)))
-        # a new piece after what is not seen, and at the seam of a panorama
+        # a new piece begins after a point that is not seen, and at the seam of a panorama
         jumps = pixels.diff(dim=0).abs().amax(-1, keepdim=True)[:, 0] > max(height, width) / 4
         joined = [False, *(valid[1:] & valid[:-1] & ~jumps).tolist()]
         points = zip(joined, valid.tolist(), (pixels + 0.5).tolist(), strict=True)

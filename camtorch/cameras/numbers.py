@@ -35,17 +35,17 @@ _Checked = tuple[Tensor, Tensor, tuple[str, ...], torch.Size, tuple[int, int] | 
 _OF_CALIBRATE_CAMERA = 5, 8, 12, 14  # OpenCV's numbers of coefficients; 4 may be of its fisheye, too
 _DTYPES, _NUMBERS = (torch.float32, torch.float64), {float, int}
 _NO_BATCH = torch.Size()
-_LARGE = 1e30  # which float32 has, and NaN is not below
-_SIZE_LIKE = 32  # px; two whole coefficients of it and above are an image size
-_LOOKED_AT = 64  # cameras of a batch: numbers in a wrong order are so in all of them
+_LARGE = 1e30  # float32 can hold it, and NaN is not below it
+_SIZE_LIKE = 32  # px; two whole coefficients from here on are an image size
+_LOOKED_AT = 64  # cameras of a batch that are checked: a wrong order is in all of them
 _CENTRED, _NEAR = 0.1, 0.05
-"""Of the image's sides: how far from its middle principal points usually lie, and how near one is certainly meant."""
+"""Parts of the image's sides: how far from its middle most principal points lie, and how near one lies on purpose."""
 
 
 def checked_numbers(
     model: type[CameraLike], intrinsics: Numbers, distortion: Numbers | None, image_size: Sequence[int] | None
 ) -> _Checked:
-    """Intrinsics, distortion, its names, batch dims and image size of a camera of this model that is made of them."""
+    """Return checked intrinsics, distortion, its names, batch dims and image size of a camera of this model."""
     owner = model.__name__
     intrinsics = checked_intrinsics(model, intrinsics)
     if distortion is None:
@@ -62,7 +62,7 @@ def checked_numbers(
 
 
 def at_a_glance(model: type[CameraLike], intrinsics: Any, distortion: Any, size: Any) -> _Checked | None:
-    """As `checked_numbers`, of lists and plain tensors of one camera that are right at a glance; None of all else."""
+    """Return `checked_numbers` for lists and plain tensors of one camera that are right at a glance, or None."""
     if not (model.always_defined and are_free(*[value for value in (intrinsics, distortion) if type(value) is Tensor])):
         return None
     made: list[Tensor] = []
@@ -79,7 +79,7 @@ def at_a_glance(model: type[CameraLike], intrinsics: Any, distortion: Any, size:
         if not (tensor.dtype in _DTYPES and tensor.is_cpu and sum(map(abs, row)) < (_SIZE_LIKE if made else _LARGE)):
             return None
         if row is value:
-            tensor.numpy()[:] = row  # in half the time of torch.tensor
+            tensor.numpy()[:] = row  # takes half the time of torch.tensor
         made.append(nn.Parameter(tensor) if row else tensor)
         rows.append(row)
     names = _names_of(model, len(rows[1]))  # type: ignore[arg-type]  # a class can be hashed
@@ -99,7 +99,7 @@ def _names_of(model: type[CameraLike], count: int) -> tuple[str, ...] | None:
 
 
 def described(camera: CameraLike) -> str:
-    """Batch, size and, of a single camera, its numbers, for `repr`."""
+    """Return the batch, the size and, for a single camera, its numbers as text for `repr`."""
     parts = [f"batch_shape={tuple(camera.batch_shape)}"] if camera.batch_shape else []
     numbers = None if camera.batch_shape else values_of(torch.cat(camera._tensors, -1))
     if numbers is not None:
@@ -114,18 +114,18 @@ def described(camera: CameraLike) -> str:
 
 
 def checked_intrinsics(model: type[CameraLike], intrinsics: Numbers) -> Tensor:
-    """Return intrinsics (*B, 4) as a tensor, of a camera of this model; raise as `Camera` does."""
+    """Return the intrinsics (*B, 4) of a camera of this model as a tensor; raise as `Camera` does."""
     owner = model.__name__
     intrinsics = as_real(intrinsics, "intrinsics", owner)
     if intrinsics.ndim == 0 or intrinsics.shape[-1] != 4:
         hint = f". For a matrix K use {owner}.from_matrix" if intrinsics.shape[-2:] == (3, 3) else ""
-        hint = ". A column goes in as intrinsics[..., 0]" if intrinsics.shape[-2:] == (4, 1) else hint
+        hint = ". Pass a column as intrinsics[..., 0]" if intrinsics.shape[-2:] == (4, 1) else hint
         raise ValueError(
             f"{owner}: intrinsics must be (*B, 4) = fx, fy, cx, cy; got shape {tuple(intrinsics.shape)}{hint}"
         )
     row = row_of(intrinsics)
     if not is_predicted(intrinsics) and (known_false(intrinsics[..., :2] > 0) if row is None else min(row[:2]) <= 0):
-        hint = f". Of matrices (4, 4) use {owner}.from_matrix(K[..., :3, :3])"
+        hint = f". For matrices (4, 4) use {owner}.from_matrix(K[..., :3, :3])"
         hint = hint if intrinsics.shape[-2:] == (4, 4) else ""
         raise ValueError(
             f"{owner}: focal lengths must be positive; got fx, fy = {intrinsics[..., :2].tolist()!s:.200}{hint}"
@@ -134,16 +134,16 @@ def checked_intrinsics(model: type[CameraLike], intrinsics: Numbers) -> Tensor:
 
 
 def checked_distortion(model: type[CameraLike], distortion: Numbers, intrinsics: Tensor) -> Tensor:
-    """Return distortion (*B, n) as a tensor, of a camera of this model and intrinsics; raise as `Camera` does."""
+    """Return the distortion (*B, n) of a camera of this model and intrinsics as a tensor; raise as `Camera` does."""
     owner = model.__name__
     distortion = as_real(distortion, "distortion", owner, intrinsics.device)
     row = row_of(distortion)
     if row is not None and len(row) == 2 and min(row) >= _SIZE_LIKE and all(map(float.is_integer, row)):
-        raise ValueError(f"{owner}: distortion {row} seems to be an image size; image_size=(height, width) is one")
+        raise ValueError(f"{owner}: distortion must not be an image size; got {row}. Use image_size=(height, width)")
     if not model.distortion_names and distortion.numel():
         raise ValueError(
-            f"{owner}: it has no distortion, and got coefficients of shape {tuple(distortion.shape)}; of "
-            "OpenCV's, BrownConrady takes those of calibrateCamera, KannalaBrandt those of fisheye, Mei omnidir's"
+            f"{owner}: distortion must be left out, as the model has none; got shape {tuple(distortion.shape)}. "
+            "BrownConrady takes those of OpenCV's calibrateCamera, KannalaBrandt those of fisheye, Mei omnidir's"
         )
     known = distortion.ndim > 0 and model.names_of(distortion.shape[-1]) is not None
     in_doubt = _is_column(model, distortion) and intrinsics.shape[:-1] != distortion.shape[:-1]
@@ -157,14 +157,14 @@ def checked_distortion(model: type[CameraLike], distortion: Numbers, intrinsics:
     is_known = model.always_defined or is_predicted(distortion)
     defined = None if is_known else model.defined(distortion.unbind(-1))
     if defined is not None and known_false(defined > 0):
-        raise ValueError(f"{owner}: the formula needs {model.defined_text}; got {distortion.tolist()}")
+        raise ValueError(f"{owner}: distortion must have {model.defined_text}; got {distortion.tolist()}")
     return distortion
 
 
 def replaced(
     camera: CameraT, intrinsics: Numbers | None, distortion: Numbers | None, image_size: Sequence[int] | None
 ) -> CameraT:
-    """The camera with what is given in place of its own; see `Camera.replace`."""
+    """Return the camera with the given numbers in place of its own; see `Camera.replace`."""
     model: type[CameraT] = type_before_parametrizations(camera)
     changes: dict[str, Any] = {}
     if image_size is not None:
@@ -190,7 +190,7 @@ def replaced(
 
 
 def as_numbers_of(camera: CameraLike, value: Numbers, name: str) -> Tensor:
-    """What is no tensor takes the camera's dtype and device."""
+    """Return a tensor itself, and other numbers in the camera's dtype and on its device."""
     if isinstance(value, Tensor):
         return value
     as_real(value, name, type_before_parametrizations(camera).__name__)
@@ -198,7 +198,7 @@ def as_numbers_of(camera: CameraLike, value: Numbers, name: str) -> Tensor:
 
 
 def unstack_numbers(intrinsics: Tensor, xp: Any) -> Sequence[Any]:
-    """fx, fy, cx, cy of intrinsics (*B, 4) in float64, as tensors, or as numbers and arrays."""
+    """Return fx, fy, cx, cy of intrinsics (*B, 4) in float64, as tensors, or as numbers and arrays."""
     if xp is torch:
         return precise(intrinsics).unbind(-1)
     return intrinsics.tolist() if intrinsics.ndim == 1 else intrinsics.detach().double().numpy().T
@@ -208,7 +208,7 @@ _FLOATS = {float, np.float64}
 
 
 def stack_numbers(numbers: Sequence[Any], like: Tensor, xp: Any) -> Tensor:
-    """(*B, n) of n tensors (*B,); or of numbers and arrays, in the dtype of a tensor."""
+    """Return (*B, n) for n tensors (*B,), or for numbers and arrays, in the dtype of a tensor."""
     if xp is torch:
         return torch.stack(torch.broadcast_tensors(*numbers), -1).to(like.dtype)
     kind = np.float64 if like.dtype == torch.float64 else np.float32
@@ -218,7 +218,7 @@ def stack_numbers(numbers: Sequence[Any], like: Tensor, xp: Any) -> Tensor:
 
 
 def _is_column(model: type[CameraLike], distortion: Tensor) -> bool:
-    """Whether it may be one camera's coefficients as OpenCV's column (n, 1), n > 1."""
+    """Whether `distortion` may be one camera's coefficients as OpenCV's column (n, 1), n > 1."""
     count = max(distortion.shape[:-1], default=1) if distortion.shape[-1:] == (1,) else 1
     return count > 1 and model.names_of(count) is not None
 
@@ -226,26 +226,26 @@ def _is_column(model: type[CameraLike], distortion: Tensor) -> bool:
 def _column_hint(distortion: Tensor) -> str:
     count = max(distortion.shape)
     return (
-        f". The {count} coefficients of one lens, a column in OpenCV, are distortion[..., 0]; one coefficient of "
-        f"each of {count} cameras goes with intrinsics ({count}, 4)"
+        f". Pass the {count} coefficients of one lens, a column in OpenCV, as distortion[..., 0], and one "
+        f"coefficient of each of {count} cameras with intrinsics ({count}, 4)"
     )
 
 
 def numbers_of_matrix(
     model: type[CameraLike], matrix: Numbers, distortion: Numbers | None, ignore_skew: bool
 ) -> tuple[Tensor] | tuple[Tensor, Tensor]:
-    """Intrinsics, and distortion where it is given, of a matrix K; see `Camera.from_matrix`."""
+    """Return the intrinsics of a matrix K, and the distortion if it is given; see `Camera.from_matrix`."""
     owner = model.__name__
     K = as_real(matrix, "K", owner)  # noqa: N806
     if K.shape[-2:] != (3, 3):
-        hint = ". Of larger ones it is K[..., :3, :3]" if min(K.shape[-2:], default=0) >= 3 else ""
+        hint = ". For larger ones use K[..., :3, :3]" if min(K.shape[-2:], default=0) >= 3 else ""
         raise ValueError(f"{owner}: K must be (*B, 3, 3); got shape {tuple(K.shape)}{hint}")
     bottom, skew = K[..., 2, :].detach(), K[..., 0, 1].detach()
     if known_false(bottom == bottom.new_tensor([0, 0, 1])) or known_false(K[..., 1, 0] == 0):
         raise ValueError(f"{owner}: K must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]; got {K.tolist()}")
     if not as_flag(ignore_skew, "ignore_skew", owner) and known_false(skew == 0):
         raise ValueError(
-            f"{owner}: K has a skew K[0, 1] = {skew.tolist()}, which this model does not have; "
+            f"{owner}: K must have no skew, as the model has none; got K[0, 1] = {skew.tolist()}. "
             "ignore_skew=True drops it"
         )
     intrinsics = torch.stack((K[..., 0, 0], K[..., 1, 1], K[..., 0, 2], K[..., 1, 2]), -1)
@@ -253,21 +253,21 @@ def numbers_of_matrix(
         return (intrinsics,)
     distortion = as_real(distortion, "distortion", owner, K.device)
     if not model.distortion_names:
-        return intrinsics, distortion  # which the constructor refuses
+        return intrinsics, distortion  # the constructor raises
     if K.ndim == 2 and distortion.numel() == max(distortion.shape, default=0):
         distortion = distortion.flatten()
     elif 2 < K.ndim == distortion.ndim and distortion.shape[-2] == 1:  # OpenCV's rows (1, n), stacked
         distortion = distortion.squeeze(-2)
     elif _is_column(model, distortion):
         raise ValueError(
-            f"{owner}: distortion {tuple(distortion.shape)} beside K {tuple(K.shape)} leaves a doubt"
+            f"{owner}: distortion must fit K {tuple(K.shape)}; got shape {tuple(distortion.shape)}"
             + _column_hint(distortion)
         )
     count = distortion.shape[-1] if distortion.ndim else 0
     if count in _OF_CALIBRATE_CAMERA and (model.names_of(count) or ())[:3] == ("k1", "k2", "k3"):
         raise ValueError(
-            f"{owner}: distortion has {count} coefficients, as those of OpenCV's calibrateCamera, k1 k2 p1 "
-            f"p2 k3 ..., which are a BrownConrady's; those of its fisheye are 4. {owner}(intrinsics, "
+            f"{owner}: distortion must be OpenCV's for a fisheye, 4; got {count} coefficients, as of calibrateCamera, "
+            f"k1 k2 p1 p2 k3 .... Use BrownConrady for those; {owner}(intrinsics, "
             "distortion) takes any number"
         )
     return intrinsics, distortion
@@ -276,11 +276,11 @@ def numbers_of_matrix(
 def camera_of_fov(
     model: type[CameraT], fov: Numbers, image_size: Sequence[int], axis: str, distortion: Numbers | None
 ) -> CameraT:
-    """The camera of a field of view in degrees; see `Camera.from_fov`."""
+    """Make the camera of a field of view in degrees; see `Camera.from_fov`."""
     owner = f"{model.__name__}.from_fov"
     size = as_image_size(image_size, owner)
     if size is None:
-        raise ValueError(f"{owner}: a field of view is one of an image; give its image_size=(height, width)")
+        raise ValueError(f"{owner}: image_size must be that of the image whose fov it is; got None")
     one_of(axis, AXES, "axis", owner)
     device = distortion.device if isinstance(distortion, Tensor) else None
     fov = torch.tensor(fov, dtype=torch.float64, device=device) if isinstance(fov, (int, float)) else fov
@@ -301,14 +301,14 @@ def camera_of_fov(
     if known_false(reached):
         widest = made.fov[..., AXES.index(axis)].flatten().tolist()
         raise ValueError(
-            f"{owner}: this lens has no {axis} field of view of {degrees.tolist()} degrees; its widest is "
+            f"{owner}: {axis} fov must be within this lens's widest; got {degrees.tolist()} degrees. The widest is "
             + ", ".join(f"{angle:.5g}" for angle in widest)
         )
     return made
 
 
 def warn_of_order(intrinsics: Tensor, size: tuple[int, int], owner: str) -> None:
-    """Warn of plain numbers (*B, 4) that fit in another order only: of (width, height), or as fx, cx, fy, cy."""
+    """Warn of plain numbers (*B, 4) that fit in another order only: for (width, height), or as fx, cx, fy, cy."""
     if is_kept(intrinsics) or is_predicted(intrinsics):
         return
     row = row_of(intrinsics)
@@ -317,11 +317,11 @@ def warn_of_order(intrinsics: Tensor, size: tuple[int, int], owner: str) -> None
     if not rows or any(_off_centre(cx, cy, size) <= _CENTRED for _, _, cx, cy in rows):
         return
     given = f"fx, fy, cx, cy = {rows[0]}"
-    cut_out = "The camera of a part of an image comes from camera.crop"
+    cut_out = "For a part of an image use camera.crop"
     if all(_off_centre(cx, cy, size[::-1]) <= _NEAR for _, _, cx, cy in rows):
         warn(
-            f"{owner}: image_size={size} is (height, width), as image.shape, and the principal point of {given} is the "
-            f"middle of {size[::-1]}. OpenCV's (width, height) goes in turned round. {cut_out}",
+            f"{owner}: image_size={size} is taken as (height, width), but the principal point of {given} is the "
+            f"middle of {size[::-1]}. Exchange OpenCV's (width, height). {cut_out}",
         )
     elif all(
         _off_centre(fy, cy, size) <= _NEAR and abs(cx - fx) <= _NEAR * fx and abs(fy - fx) > _CENTRED * fx
@@ -329,12 +329,12 @@ def warn_of_order(intrinsics: Tensor, size: tuple[int, int], owner: str) -> None
     ):
         warn(
             f"{owner}: {given} have their principal point far from the middle of images of {size}, and seem to be "
-            f"fx, cx, fy, cy; both focal lengths come first. {cut_out}",
+            f"fx, cx, fy, cy. Pass both focal lengths first. {cut_out}",
         )
     elif all(20 * max(fx, fy) < min(size) and max(abs(cx - 0.5), abs(cy - 0.5)) < 0.2 for fx, fy, cx, cy in rows):
         warn(
-            f"{owner}: {given} seem to be parts of the image's width and height; in pixels fx and cx are times width, "
-            "fy and cy times height, and the principal point is less 0.5"
+            f"{owner}: {given} seem to be parts of the image's width and height. Multiply fx and cx by the width, "
+            "fy and cy by the height, and subtract 0.5 from cx and cy"
         )
 
 
@@ -343,12 +343,12 @@ def warn_of_exchange(old: tuple[int, int], new: tuple[int, int], owner: str) -> 
     turned = new[0] * old[0] / (new[1] * old[1])
     if old[0] != old[1] and abs(turned - 1) < _CENTRED / 10:
         warn(
-            f"{owner}: {new} is (height, width); an image of {old} is stretched to that, and keeps its shape as "
-            f"{new[::-1]}. The camera of the image on its side comes from camera.rot90",
+            f"{owner}: an image of (height, width) = {old} is stretched to {new}; it would keep its shape as "
+            f"{new[::-1]}. For the image on its side use camera.rot90",
         )
 
 
 def _off_centre(cx: float, cy: float, size: tuple[int, int]) -> float:
-    """How far a point is from the middle of an image, the larger one of the parts of its height and width."""
+    """Return the distance of a point from the middle of an image, the larger of the parts of its height and width."""
     height, width = size
     return max(abs(cx - (width - 1) / 2) / width, abs(cy - (height - 1) / 2) / height)

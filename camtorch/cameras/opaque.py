@@ -1,4 +1,4 @@
-"""Functions of cameras that compiled code calls as one operator, and does not look into."""
+"""Functions of cameras that compiled code calls as one operator, without tracing them."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def _ideal_camera(model: type[Camera], count: int) -> Camera:
 
 
 class CameraNumbers(NamedTuple):
-    """What is known of a camera before it has values."""
+    """The tensors and the size of a camera before it has values."""
 
     intrinsics: Tensor
     distortion: Tensor
@@ -44,10 +44,10 @@ _FUNCTIONS: dict[str, tuple[Function, Function]] = {}
 
 
 def opaque(shapes: Function) -> Callable[[Function], Function]:
-    """A function of cameras of known image_size, tensors, None, floats, strings and pairs of whole numbers.
+    """Return a decorator for functions of cameras with an image_size, tensors, None, floats, strings and pairs of ints.
 
-    While it is compiled cameras arrive without their graphs, and none of its results may share memory with an argument.
-    shapes: makes empty tensors like its results, of the same arguments with `CameraNumbers` for cameras.
+    In compiled code cameras arrive without their graphs, and no result may share memory with an argument. `shapes`
+    makes empty tensors like the results, from the same arguments with `CameraNumbers` for cameras.
     """
 
     def decorate(function: Function) -> Function:
@@ -86,7 +86,7 @@ def opaque(shapes: Function) -> Callable[[Function], Function]:
 
 
 def _function(name: str) -> tuple[Function, Function]:
-    if name not in _FUNCTIONS:  # a saved program is loaded before what it calls
+    if name not in _FUNCTIONS:  # a saved program may be loaded before its functions
         importlib.import_module(name.rpartition(".")[0])
     return _FUNCTIONS[name]
 

@@ -1,4 +1,4 @@
-"""Named cameras and where they are: what a calibration file holds."""
+"""Named cameras and their poses, as a calibration file holds them."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from camtorch.values.module import BatchedModule, UnsharedState
 
 M = TypeVar("M", bound=BatchedModule)
 _SHOWN = 8
-_OF_CAMERAS = ("intrinsics", "distortion", "image_size")  # beside what their class has
+_OF_CAMERAS = ("intrinsics", "distortion", "image_size")  # in addition to the class's
 
 
 class NamedModules(nn.Module, MutableMapping[str, M]):
-    """Modules by name, in order: a mapping as `nn.ModuleDict`, whose names may have dots, as those of files do.
+    """Modules by name, in order: a mapping like `nn.ModuleDict`, but names may have dots, as those of files do.
 
-    Rows of a `batch`, of one batch dim, have `names`: 200,000 of them take no more time than one, as `mapping[name]` is
-    `batch[row]`, made when it is asked for. With another `NamedModules` this one shares its modules.
+    With `names`, modules are the rows of a `batch` of one dim: `mapping[name]` is `batch[row]`, made at each access, so
+    that 200,000 of them take no more time than one. With another `NamedModules` this one shares its modules.
     """
 
     batch: M | None
@@ -50,27 +50,27 @@ class NamedModules(nn.Module, MutableMapping[str, M]):
         if not isinstance(batch, kind):
             raise TypeError(f"{owner}: the batch of named rows must be {owner}; got {type(batch).__name__}")
         if batch.batch_shape != (len(names),):
-            raise ValueError(f"{owner}: {len(names)} names do not fit a batch {tuple(batch.batch_shape)}")
+            raise ValueError(f"{owner}: names must be one for each row of {tuple(batch.batch_shape)}; got {len(names)}")
         for row, name in enumerate(names):
             if not isinstance(name, str):
                 raise TypeError(f"{owner}: names must be strings; got {name!r}")
             if name in self._places:
-                raise ValueError(f"{owner}: the name {name!r} appears twice")
+                raise ValueError(f"{owner}: names must be unique; got {name!r} twice")
             self._places[name] = row
         self.batch = batch
 
     def __getitem__(self, name: str) -> M:
         place = self._places.get(name) if isinstance(name, str) else None
         if place is None:
-            raise KeyError(f"no {self._kind.__name__} is called {name!r}; there are {_some(self)}")
+            raise KeyError(f"name of {self._kind.__name__} must be one of {_some(self)}; got {name!r}")
         return cast(M, self._modules[place] if isinstance(place, str) else cast(M, self.batch)[place])
 
     def __setitem__(self, name: str, module: M) -> None:
         if not isinstance(name, str) or not isinstance(module, self._kind):
-            raise TypeError(f"Rig: takes names and {self._kind.__name__}; got {name!r}: {type(module).__name__}")
+            raise TypeError(f"Rig: items must be str: {self._kind.__name__}; got {name!r}: {type(module).__name__}")
         place = self._places.get(name)
         if not isinstance(place, str):
-            # nn.Module takes no dots; a percent sign before other names than those of its attributes
+            # nn.Module takes no dots; a percent sign tells other names from its attributes
             place = name.replace("%", "%25").replace(".", "%2E")
             place = f"%{place}" if not place or hasattr(self, place) else place
             self._places[name] = place
@@ -91,11 +91,11 @@ class NamedModules(nn.Module, MutableMapping[str, M]):
         return name in self._places
 
     def row(self, name: str) -> int | None:
-        """The row of `batch` that has this name, or None for a module of its own."""
+        """Return the row of `batch` that has this name, or None for a module of its own."""
         place = self._places[name]
         return None if isinstance(place, str) else place
 
-    # a module is itself and nothing else, as the sets that nn.Module keeps of them want it
+    # compare by identity: nn.Module keeps modules in sets
     def __eq__(self, other: object) -> bool:
         return self is other
 
@@ -111,21 +111,21 @@ class NamedModules(nn.Module, MutableMapping[str, M]):
 class Rig(UnsharedState):
     """Cameras by name, and their poses.
 
-    A module: `.to`, `.float`, `state_dict` and `requires_grad_` reach all cameras and poses. And a mapping of names
-    to cameras: `rig["cam0"]`, `len(rig)`, `for name in rig`, `rig.items()`. `rig[name]` and `name in rig` take
+    It is a module: `.to`, `.float`, `state_dict` and `requires_grad_` reach all cameras and poses. It is also a mapping
+    of names to cameras: `rig["cam0"]`, `len(rig)`, `for name in rig`, `rig.items()`. `rig[name]` and `name in rig` take
     the names of images as well. `rig.cameras` and `rig.extrinsics` are mappings that may be changed.
 
     Args:
         cameras: name -> Camera.
         extrinsics: name -> Extrinsics, camera from rig, for the cameras that have a pose. For posed images the name is
-            the image's and the Extrinsics are camera from world. Or the names and one batch, a pair (names,
-            Extrinsics of batch dims (N,)): that is how a reader gives many images, whose poses are then rows of
-            `rig.extrinsics.batch` and become modules of their own only when they are asked for by name.
+            the image's and the Extrinsics are camera from world. Or a pair (names, Extrinsics of batch dims (N,)), as
+            readers give many images: the poses are rows of `rig.extrinsics.batch`, and become modules of their own only
+            when they are accessed by name.
         images: image name -> name of the camera that took it, for the extrinsics whose name is no camera's.
-        format: the file format that the rig comes from, which `camtorch.save` takes where the suffix allows it.
+        format: The file format that the rig comes from, which `camtorch.save` takes if the suffix allows it.
 
     Raises:
-        ValueError: extrinsics, or an image, without a camera. TypeError: not cameras and Extrinsics.
+        ValueError: If extrinsics, or an image, have no camera. TypeError: If something is not Camera or Extrinsics.
     """
 
     cameras: NamedModules[Camera]
@@ -153,7 +153,7 @@ class Rig(UnsharedState):
         self.format = format
         for image, name in self.images.items():
             if name not in self.cameras:
-                raise ValueError(f"Rig: the image {image!r} is of a camera {name!r}; there are {list(self.cameras)}")
+                raise ValueError(f"Rig: the camera of {image!r} must be one of {list(self.cameras)}; got {name!r}")
         for name in self.extrinsics:
             self.camera_of(name)
 
@@ -162,46 +162,46 @@ class Rig(UnsharedState):
         """The only camera.
 
         Raises:
-            ValueError: there are several, or none.
+            ValueError: If there are several, or none.
         """
         if len(self.cameras) != 1:
-            raise ValueError(f"Rig: not one camera; rig.cameras has {list(self.cameras)}")
+            raise ValueError(f"Rig: cameras must be one for rig.camera; got {list(self.cameras)}")
         return next(iter(self.cameras.values()))
 
     def camera_of(self, name: str) -> Camera:
-        """The camera of that name, or the one that took the image of that name.
+        """Return the camera of that name, or the one that took the image of that name.
 
         Raises:
-            ValueError: no such camera and no such image.
+            ValueError: If there is no such camera and no such image.
         """
         found = self.cameras.get(self.images.get(name, name)) if isinstance(name, str) else None
         if found is None:
             there = _some([*self.cameras, *self.images])
-            raise ValueError(f"Rig: no camera and no image is called {name!r}; there are {there}")
+            raise ValueError(f"Rig: name must be that of a camera or an image, {there}; got {name!r}")
         return found
 
     def between(self, left: str, right: str) -> Extrinsics:
-        """Right from left, `p_right = R p_left + t`: what `rectify` takes.
+        """Return the pose right from left, `p_right = R p_left + t`, which `rectify` takes.
 
             ct.rectify(rig["left"], rig["right"], rig.between("left", "right"))
 
-        Composed anew from `extrinsics` at each call; where these learn, gradients reach them.
+        It is composed from `extrinsics` at each call; if these learn, gradients reach them.
 
         Args:
-            left: the name of a camera, or of an image, whose pose the rig has.
-            right: that of another.
+            left: The name of a camera, or of an image, whose pose the rig has.
+            right: Another such name.
 
         Raises:
-            ValueError: no such camera, or it has no pose.
+            ValueError: If there is no such camera, or it has no pose.
         """
         for name in (left, right):
             self.camera_of(name)
             if name not in self.extrinsics:
-                raise ValueError(f"Rig: {name!r} has no pose in rig.extrinsics; there is {_some(self.extrinsics)}")
+                raise ValueError(f"Rig: name must have a pose, as {_some(self.extrinsics)} have; got {name!r}")
         return self.extrinsics[right].compose(self.extrinsics[left].inverse())
 
     def _way_to_cameras(self) -> str:
-        """Where they are, for errors about what only a camera can."""
+        """Return where the cameras are, for errors about attributes that only a camera has."""
         if len(self.cameras) == 1:
             return "whose only camera is its .camera"
         return f"whose cameras are {_some(self.cameras, 'rig[{!r}]')}" if self.cameras else "which has no camera"
@@ -212,12 +212,12 @@ class Rig(UnsharedState):
         except AttributeError:
             if name in _OF_CAMERAS or (not name.startswith("_") and hasattr(Camera, name)):
                 raise AttributeError(
-                    f"Rig: {name} is a camera's, and this is a Rig, {self._way_to_cameras()}"
+                    f"Rig: the owner of {name} must be a camera; got a Rig, {self._way_to_cameras()}"
                 ) from None
             raise
 
     def __getitem__(self, name: str) -> Camera:
-        """The same as `camera_of`, but that an unknown name is a KeyError."""
+        """Return the same as `camera_of`, but raise a KeyError for an unknown name."""
         try:
             return self.camera_of(name)
         except ValueError as error:
@@ -227,26 +227,26 @@ class Rig(UnsharedState):
         return name in self.cameras or name in self.images
 
     def __len__(self) -> int:
-        """The number of cameras."""
+        """Return the number of cameras."""
         return len(self.cameras)
 
     def __iter__(self) -> Iterator[str]:
-        """Over the names of the cameras."""
+        """Iterate over the names of the cameras."""
         return iter(self.cameras)
 
     def __bool__(self) -> bool:
         return True
 
     def keys(self) -> KeysView[str]:
-        """The names of the cameras."""
+        """Return the names of the cameras."""
         return self.cameras.keys()
 
     def values(self) -> ValuesView[Camera]:
-        """The cameras."""
+        """Return the cameras."""
         return self.cameras.values()
 
     def items(self) -> ItemsView[str, Camera]:
-        """The cameras with their names."""
+        """Return the cameras with their names."""
         return self.cameras.items()
 
     def __repr__(self) -> str:
@@ -259,7 +259,7 @@ class Rig(UnsharedState):
 
 
 def _some(names: Collection[str], form: str = "{!r}") -> str:
-    """Names in words, the first few of many."""
+    """Return names in words, the first few of many."""
     more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
     return (", ".join(map(form.format, islice(names, _SHOWN))) or "none") + more
 

@@ -1,5 +1,6 @@
 """README and documentation: every Python block runs on its own, every command runs, every public name has a page."""
 
+import doctest
 import functools
 import importlib.util
 import re
@@ -169,3 +170,19 @@ def test_the_page_of_commands_is_what_the_parser_knows():
     assert made["PAGE"].read_text(encoding="utf-8") == made["text"](), "python docs/make_commands.py makes it anew"
     for name in ("dewarp", "convert", "show", "map", "lenses", "calibrate"):
         assert f"## camtorch {name}\n" in made["text"]()
+
+
+CORE = (
+    "Camera Pinhole BrownConrady KannalaBrandt Fisheye62 Fisheye624 Extrinsics Warp Dewarp Mixed RandomMount RandomLens"
+)
+CORE += " RandomCamera Compose BoxCrop FaceNormalizer CameraHead load save calibrate solve_pnp rectify triangulate fit"
+
+
+@pytest.mark.parametrize("name", [*CORE.split(), "Reproject"])
+def test_the_example_of_a_docstring_runs(name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    text = getattr(ct, name, getattr(ct.augment, name, None)).__doc__
+    if ">>>" not in text:
+        pytest.skip(f"{name} has no example")
+    example = doctest.DocTestParser().get_doctest(text, {"ct": ct, "np": np, "torch": torch}, name, None, None)
+    assert doctest.DocTestRunner(optionflags=doctest.ELLIPSIS).run(example).failed == 0

@@ -108,11 +108,11 @@ def test_which_camera_is_meant():
     rig = rig_of(["left", "right"])
     assert "left: KannalaBrandt 640x480 (300, 300," in repr(rig)
     for call, told in (
-        (lambda: rig.camera, "not one camera"),
-        (lambda: rig.camera_of("x"), "no camera and no image is called 'x'"),
-        (lambda: ct.Rig({"a": camera()}, images={"i": "b"}), "is of a camera 'b'"),
-        (lambda: rig.between("left", "middle"), "no camera and no image is called 'middle'"),
-        (lambda: ct.Rig(rig.cameras).between("left", "right"), "'left' has no pose in rig.extrinsics"),
+        (lambda: rig.camera, "must be one for rig.camera"),
+        (lambda: rig.camera_of("x"), "that of a camera or an image.* got 'x'"),
+        (lambda: ct.Rig({"a": camera()}, images={"i": "b"}), r"camera of 'i' must be one of \['a'\]; got 'b'"),
+        (lambda: rig.between("left", "middle"), "that of a camera or an image.* got 'middle'"),
+        (lambda: ct.Rig(rig.cameras).between("left", "right"), "must have a pose, as none have; got 'left'"),
     ):
         with pytest.raises(ValueError, match=told):
             call()
@@ -122,7 +122,7 @@ def test_who_takes_it_for_a_camera_is_told_where_those_are():
     camera = ct.Pinhole.from_fov(70, image_size=(480, 640))
     one, two = ct.Rig({"left": camera}), ct.Rig({"left": camera, "right": camera})
     for name in ("project", "K", "intrinsics", "image_size"):
-        with pytest.raises(AttributeError, match=rf"{name} is a camera's, .* a Rig, whose only camera is its \.camera"):
+        with pytest.raises(AttributeError, match=rf"{name} must be a camera; .* whose only camera is its \.camera"):
             getattr(one, name)
         assert not hasattr(two, name)
     with pytest.raises(AttributeError, match="no attribute 'unknown'"):

@@ -117,7 +117,7 @@ BREAKS = [(ct.EUCM, (0.5, 0.0)), (ct.DoubleSphere, (-1.0, 0.5)), (ct.Mei, (-1.5,
 @pytest.mark.parametrize(("model", "coefficients"), BREAKS)
 def test_coefficients_without_a_formula(model, coefficients):
     """Refused at the door; where learning ended there, all is invalid, and finite."""
-    with pytest.raises(ValueError, match=f"the formula needs {model.defined_text}; got"):
+    with pytest.raises(ValueError, match=f"must have {model.defined_text}; got"):
         camera(model, *coefficients)
     learnt = model(INTRINSICS)
     with torch.no_grad():
