@@ -22,6 +22,7 @@ _NAMES = {
     "cameras.mixed": "Mixed cat",
     "cameras.rig": "Rig",
     "io": "CameraFileError load loads save",
+    "io.kornia": "from_kornia",
     "maps.formats": "load_map save_map",
     "maps.lookup": "LookupMap",
     "models": "BrownConrady Cylindrical Division DoubleSphere EUCM Equirectangular Equisolid FOV FTheta FThetaBackward "

@@ -20,6 +20,7 @@ from camtorch.io import CameraFileError as CameraFileError
 from camtorch.io import load as load
 from camtorch.io import loads as loads
 from camtorch.io import save as save
+from camtorch.io.kornia import from_kornia as from_kornia
 from camtorch.maps.formats import load_map as load_map
 from camtorch.maps.formats import save_map as save_map
 from camtorch.maps.lookup import LookupMap as LookupMap

@@ -145,7 +145,8 @@ class Camera(Freezable, Editable):
         """Make a camera from its matrix, as OpenCV's calibrations give it.
 
         Args:
-            K: (*B, 3, 3) [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels.
+            K: (*B, 3, 3) [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels, or (*B, 4, 4) with it at the top left, as
+                kornia has it.
             distortion: (*B, n) coefficients; with a single matrix, OpenCV's (n, 1) and (1, n) are one camera's too.
             image_size: (height, width) in pixels; OpenCV has (width, height).
             ignore_skew: Drop the skew K[0, 1], which no model here has.
@@ -209,6 +210,18 @@ class Camera(Freezable, Editable):
             ValueError: If a key is missing, unknown or has a wrong value, or the model is another than this class.
         """
         return cast("Camera", importlib.import_module("camtorch.io.camtorch_json").made_of(cls, d))
+
+    def to_kornia(self, extrinsics: Extrinsics | None = None) -> Any:
+        """Return the camera as kornia has it; `ct.from_kornia` takes it back. Gradients reach this camera's tensors.
+
+        Args:
+            extrinsics: Camera from world. With a pose a `Pinhole` is a `kornia.geometry.PinholeCamera`. Default: a
+                `PinholeModel`, `BrownConradyModel` or `KannalaBrandtK3` of `kornia.sensors.camera`.
+
+        Raises:
+            ValueError: If kornia has no such model, or one without a pose; without an image_size; with two batch dims.
+        """
+        return importlib.import_module("camtorch.io.kornia").to_kornia(self, extrinsics)
 
     def replace(
         self,

@@ -237,6 +237,8 @@ def numbers_of_matrix(
     """Return the intrinsics of a matrix K, and the distortion if it is given; see `Camera.from_matrix`."""
     owner = model.__name__
     K = as_real(matrix, "K", owner)  # noqa: N806
+    if K.shape[-2:] == (4, 4) and not known_false((K[..., :3, 3] == 0) & (K[..., 3, :3] == 0)):
+        K = K[..., :3, :3]  # noqa: N806
     if K.shape[-2:] != (3, 3):
         hint = ". For larger ones use K[..., :3, :3]" if min(K.shape[-2:], default=0) >= 3 else ""
         raise ValueError(f"{owner}: K must be (*B, 3, 3); got shape {tuple(K.shape)}{hint}")

@@ -30,6 +30,7 @@ POINTS, PIXELS = torch.from_numpy(points()), torch.from_numpy(pixels())
 PINHOLE, OTHERS = (ct.Pinhole.from_matrix(m, image_size=SIZE).requires_grad_(False) for m in (MATRIX, OTHER))
 LENS = ct.BrownConrady.from_matrix(MATRIX, D5, image_size=SIZE).requires_grad_(False)
 FISHEYE = ct.KannalaBrandt(NUMBERS, D4, image_size=SIZE).requires_grad_(False)
+SCALES = torch.linspace(0.9, 1.1, len(POINTS)).double()[:, None]  # for a camera of each point, as theirs have batches
 SQUARE = ct.Pinhole([75.0, 75.0, 79.5, 59.5], image_size=SIZE).requires_grad_(False)
 DEPTH = 2 + torch.rand(1, 1, *SIZE, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
 IMAGE = as_images(photograph()).double() / 255
@@ -41,6 +42,27 @@ def theirs(pose=POSE):
     intrinsics = torch.eye(4, dtype=torch.float64)[None].clone()
     intrinsics[:, :3, :3] = MATRIX
     return geometry.PinholeCamera(intrinsics, pose.matrix()[None], torch.tensor([SIZE[0]]), torch.tensor([SIZE[1]]))
+
+
+def posed(numbers):
+    """A batch of theirs from intrinsics, rotation and translation (B, 10)."""
+    matrices, sides = torch.eye(4).double().repeat(len(numbers), 1, 1), (torch.full((len(numbers),), n) for n in SIZE)
+    matrices[:, :3, :3] = ct.Pinhole(numbers[:, :4]).K
+    return geometry.PinholeCamera(matrices, ct.Extrinsics(numbers[:, 4:7], numbers[:, 7:]).matrix(), *sides)
+
+
+def both_ways(make, numbers):
+    """Pixels, and gradients of numbers: of ours made of theirs, and of theirs, itself and made of ours."""
+    theirs = make(numbers.requires_grad_())
+    ours, pose = ct.from_kornia(theirs)
+    if isinstance(theirs, geometry.PinholeCamera):
+        points = POINTS.expand(len(numbers), -1, 3)
+        found = [one.project(points) for one in (theirs, ours.to_kornia(pose))]
+    else:
+        points = POINTS
+        found = [one.project(Vector3(points)).data for one in (theirs, ours.to_kornia())]
+    found = [(p, torch.autograd.grad(p.sum(), numbers, retain_graph=True)[0]) for p in (ours(pose(points))[0], *found)]
+    return [(mine, its, 1e-8) for other in found[1:] for mine, its in zip(found[0], other, strict=True)]
 
 
 def lifted(camera=PINHOLE, depth=2.5):
@@ -148,10 +170,7 @@ def edited():
 
 
 equal("kornia.geometry", {
-    "camera.PinholeCamera": lambda: [
-        (ct.Pinhole.from_matrix(theirs().camera_matrix[0]).intrinsics, NUMBERS),
-        (ct.Extrinsics.from_matrix(theirs().extrinsics).rotation, POSE.rotation[None]),
-    ],
+    "camera.PinholeCamera": lambda: both_ways(posed, torch.cat([NUMBERS.expand(2, 4), torch.tensor(VECTORS[:2])], 1)),
     "camera.PinholeCamera.project camera.PinholeCamera.unproject": lambda: [
         (PINHOLE(POSE(POINTS))[0], theirs().project(POINTS[None])[0]),
         (POSE.inverse()(lifted()), theirs().unproject(PIXELS[None], ONE[None])[0]),
@@ -225,13 +244,13 @@ equal("kornia.geometry", {
         )[0], 1e-6,
     )],
 }, slow=True)  # fmt: skip
-EIGHT, BROWN = torch.cat([NUMBERS, TILTED[:8]]), sensors.CameraModelType.BROWN_CONRADY
+BROWN = sensors.CameraModelType.BROWN_CONRADY
 equal("kornia.sensors.camera", {
-    name: lambda ours=ours, theirs=theirs: [(ours.project(POINTS)[0], theirs.project(Vector3(POINTS)).data)]
-    for name, ours, theirs in (
-        ("CameraModel", ct.BrownConrady(NUMBERS, TILTED[:8]), sensors.CameraModel(ImageSize(*SIZE), BROWN, EIGHT)),
-        ("KannalaBrandtK3", FISHEYE, sensors.KannalaBrandtK3(ImageSize(*SIZE), NUMBERS_AND_D4)),
-        ("PinholeModel", PINHOLE, sensors.PinholeModel(ImageSize(*SIZE), NUMBERS)),
+    name: lambda make=make, numbers=numbers: both_ways(make, numbers) + both_ways(make, numbers * SCALES)
+    for name, make, numbers in (
+        ("CameraModel", lambda n: sensors.CameraModel(ImageSize(*SIZE), BROWN, n), torch.cat([NUMBERS, TILTED[:8]])),
+        ("KannalaBrandtK3", lambda n: sensors.KannalaBrandtK3(ImageSize(*SIZE), n), NUMBERS_AND_D4),
+        ("PinholeModel", lambda n: sensors.PinholeModel(ImageSize(*SIZE), n), NUMBERS),
     )
 })  # fmt: skip
 equal("kornia.augmentation", {
@@ -267,11 +286,12 @@ def behind_and_past():
     close(geometry.project_points(behind, MATRIX), geometry.project_points(-behind, MATRIX))
     assert not PINHOLE.project(behind)[1]
     weak = torch.tensor([0.01, 0.0, 0.0, 0.0], dtype=torch.float64)
-    lens = ct.KannalaBrandt(NUMBERS, weak).requires_grad_(False)
+    lens = ct.KannalaBrandt(NUMBERS, weak, image_size=SIZE).requires_grad_(False)
     ray = torch.tensor([math.sin(2), 0.0, math.cos(2)], dtype=torch.float64)
     uv, _ = lens.project(ray)
     close(camera.undistort_points_kannala_brandt(uv, torch.cat([NUMBERS, weak]))[0], -ray[0] / ray[2], 1e-6)
     close(lens.unproject(uv)[0], ray, 1e-9)
+    close(lens.to_kornia().project(Vector3(ray)).data, lens.project(-ray)[0])
 
 
 @trap

@@ -6,6 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from kornia.image import ImageSize
+from kornia.sensors.camera import Orthographic, PinholeModel
 
 import camtorch as ct
 from camtorch.augment import numpy as arrays
@@ -45,7 +47,14 @@ WRONG = [
     (lambda: ct.KannalaBrandt([300, 300, 320, 240], (480, 640)), ValueError, r"not be an image size; got \[480.0"),
     (lambda: ct.KannalaBrandt([300, 300, 320, 240], [480, 640]), ValueError, r"an image size; .* image_size=\(height"),
     (lambda: ct.Pinhole(torch.eye(4)), ValueError, r"focal lengths .* matrices \(4, 4\) use Pinhole.from_matrix\(K"),
-    (lambda: ct.Pinhole.from_matrix(torch.eye(4)), ValueError, r"got shape \(4, 4\)\. For larger ones use K\[..., :3"),
+    (lambda: ct.Pinhole.from_matrix(torch.ones(4, 4)), ValueError, r"shape \(4, 4\)\. For larger ones use K\[..., :3"),
+    (lambda: ct.from_kornia(CAMERA), TypeError, r"must be a PinholeCamera or a camera of kornia.*; got Kann"),
+    (lambda: ct.from_kornia(Orthographic(ImageSize(*SIZE), torch.ones(4))), ValueError, r"one point; got Orthographic"),
+    (lambda: ct.from_kornia(PinholeModel(ImageSize(4, 4.5), torch.ones(4))), ValueError, r"widths \[4.5\]. Pass one"),
+    (lambda: ct.Pinhole([9.0] * 4).to_kornia(), ValueError, r"Pinhole.to_kornia: camera must have an image_size;"),
+    (lambda: CAMERA.convert("fisheye62").camera.to_kornia(), ValueError, r"8 of 'fisheye62'. Write camera.convert"),
+    (lambda: GRID.to_kornia(), ValueError, r"must have one batch dim or none; got \(2, 2\)"),
+    (lambda: CAMERA.to_kornia(POSE), ValueError, r"must be None or the identity, for KannalaBrandtK3 of kornia"),
     (lambda: ct.Extrinsics([0.0, 0, 0, 1], [0.0, 0, 0]), ValueError, r"got shape \(4,\)\. For quaternions.*from_quat"),
     (lambda: ct.Pinhole([9.0] * 4, image_size=EYE), TypeError, r"\(height, width\); got ndarray of shape \(3, 3\)"),
     (lambda: ct.Extrinsics(0, 0, 1), TypeError, r"It takes ct.Extrinsics\(\[rx, ry, rz\], \[tx, ty, tz\]\)"),
