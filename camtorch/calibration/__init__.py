@@ -1,1 +1,1 @@
-"""Cameras, poses and points from what was seen: calibration, also of rigs, the pose of an object, triangulation."""
+"""Cameras, poses and points from pixels: calibration of cameras and rigs, poses of objects, triangulation."""

@@ -1,4 +1,4 @@
-"""What users pass to functions of many independent rows: tensors that keep their graphs, cameras of as many rows."""
+"""Arguments of functions of many independent rows: tensors that keep their graphs, cameras of as many rows."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from camtorch.values.module import BatchedModule, remade
 
 
 def as_tensor(values: Numbers, name: str, owner: str, device: torch.device) -> Tensor:
-    """Return a tensor of real numbers, NaN among them: of a tensor, an array, or lists, also of such of one shape."""
+    """Return a tensor of numbers, which may be NaN, from a tensor, an array, or lists, also of tensors of one shape."""
     if isinstance(values, (list, tuple)) and values and all(getattr(v, "ndim", 0) for v in values):
         parts = [as_tensor(v, f"{name}[{i}]", owner, device) for i, v in enumerate(values)]
         if len({part.shape for part in parts}) > 1:
@@ -25,7 +25,7 @@ def as_tensor(values: Numbers, name: str, owner: str, device: torch.device) -> T
 
 
 def as_vectors(values: Numbers, name: str, size: int, owner: str, device: torch.device) -> Tensor:
-    """Return (*B, N, size) from such values, or from OpenCV's (*B, N, 1, size)."""
+    """Return vectors (*B, N, size) from such values, or from OpenCV's (*B, N, 1, size)."""
     vectors = as_tensor(values, name, owner, device)
     if vectors.ndim > 2 and vectors.shape[-2] == 1 and vectors.shape[-3] > 1:
         vectors = vectors.squeeze(-2)
@@ -53,7 +53,7 @@ def root_of(mean: Tensor, valid: Tensor) -> Tensor:
 
 
 def learns(modules: Sequence[BatchedModule], *tensors: Tensor) -> bool:
-    """Whether a graph shall lead to any of them."""
+    """Whether torch records a graph for any of the modules or tensors."""
     held = [getattr(module, name) for module in modules for name in module.tensor_names]
     return torch.is_grad_enabled() and any(t.requires_grad for t in (*held, *tensors))
 
@@ -61,8 +61,8 @@ def learns(modules: Sequence[BatchedModule], *tensors: Tensor) -> bool:
 def attached(objective: Callable[[Tensor], Tensor], optimum: Tensor, valid: Tensor) -> Tensor:
     """Return the optimum (B, K) in a graph, for first derivatives by everything that the objective depends on.
 
-    By the implicit function theorem: the gradient of the objective, of costs (B,), stays zero when an optimum moves, so
-    one step by Newton's method, with the exact Hessian, has its derivatives. Rows that are not valid get no gradient.
+    By the implicit function theorem: the gradient of the objective, of costs (B,), remains zero when an optimum moves,
+    so one Newton step with the exact Hessian has its derivatives. Rows that are not valid get no gradient.
     """
     with torch.enable_grad():
         unknowns = optimum.detach().requires_grad_()

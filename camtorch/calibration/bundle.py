@@ -1,7 +1,7 @@
-"""Bundle adjustment: the cameras, their mounts and the poses of boards under which least is left of what was seen.
+"""Bundle adjustment: the cameras, their mounts and the boards' poses of least reprojection error.
 
-Each view is reduced to a triangle by QR before it meets the others: its own six numbers are eliminated, as by a Schur
-complement, without the squares of a normal equation.
+A QR reduces each view to a triangle before views are joined. It eliminates the view's own six unknowns as a Schur
+complement does, without the squares of normal equations.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ from camtorch.projection.rows import CameraRows
 from camtorch.values.module import remade
 
 LOSSES = ("huber", "cauchy")
-SETTLED = 1e-10  # of the variance: the squared distance to the optimum, in standard deviations, that ends a search
-_NOTHING = 1e-11  # px
-_LOST = 1e3  # px, that a point counts as which was seen and has no pixel
+SETTLED = 1e-10  # the squared distance to the optimum, over the variance, at which a search ends
+_NOTHING = 1e-11  # px, which counts as no error
+_LOST = 1e3  # px, the error of a seen point without a pixel
 
 
 class Poses(NamedTuple):
@@ -69,7 +69,7 @@ class Poses(NamedTuple):
 
 
 class Prior(NamedTuple):
-    """The prior knowledge of a camera's parameters p: root @ (p - centre) are added to the residuals."""
+    """Prior knowledge of a camera's parameters p: root @ (p - centre) are further residuals."""
 
     centre: Tensor  # (P,)
     root: Tensor  # (R, P), in pixels
@@ -81,7 +81,7 @@ class CameraObservations(NamedTuple):
     model: type[Camera] | Camera  # the class, or a camera of it
     points: Tensor  # (B, V, N, 3) in the board's frame
     pixels: Tensor  # (B, V, N, 2)
-    weights: Tensor  # (B, V, N) of the squares, 0 for unseen, where the others are any finite numbers
+    weights: Tensor  # (B, V, N) of the squares, 0 for unseen points, whose other numbers are any finite ones
     prior: Prior | None = None
 
     def mapped(self, change: Callable[[Tensor], Tensor]) -> CameraObservations:
@@ -94,9 +94,9 @@ class State(NamedTuple):
     """The unknowns of a search. A point of a board is at `mount(board(point))` for a camera."""
 
     parameters: tuple[Tensor, ...]  # of each camera (B, 4 + n), fx, fy, cx, cy and the coefficients
-    mounts: Poses  # of each camera, from the frame of the first one, whose own does nothing unless it learns
+    mounts: Poses  # of each camera, from the first one's frame; the first is the identity unless it learns
     boards: Poses  # of each view
-    bend: Tensor  # (B, 2), how far the middle of a board's edges lies behind the plane, see `bent`
+    bend: Tensor  # (B, 2), how far the board's middle lies behind its edges along x and y, see `bent`
 
     @classmethod
     def of_one(cls, parameters: Tensor, boards: Poses) -> State:
@@ -120,14 +120,14 @@ class Free(NamedTuple):
 
 @dataclass(frozen=True)
 class Adjusted:
-    """An optimum, or where the search ended."""
+    """The end of a search, an optimum if it converged."""
 
     state: State
     cost: Tensor  # (B,)
     converged: Tensor  # (B,)
     residuals: tuple[Tensor, ...]  # of each camera (B, V, N, 2), projected minus observed
-    valid: tuple[Tensor, ...]  # (B, V, N) bool, of the points of any weight that have a pixel
-    weights: tuple[Tensor, ...]  # (B, V, N) of the squares at the end, of a robust loss too
+    valid: tuple[Tensor, ...]  # (B, V, N) bool, whether points, of any weight, have a pixel
+    weights: tuple[Tensor, ...]  # (B, V, N) of the squares at the end, with those of a robust loss
     problem: Bundle
 
     @cached_property
@@ -138,7 +138,7 @@ class Adjusted:
     @cached_property
     @torch.no_grad()
     def held_by(self) -> int:
-        """How many points would be lost by another step: these hold a search that did not converge."""
+        """Number of points that another step would lose, which stop a search that did not converge."""
         problem, flat = self.problem, self.problem.flat(self.state)
         rows = torch.arange(len(self.cost), device=self.cost.device)
         before = problem.looks(flat, rows)
@@ -205,9 +205,9 @@ def posed(observed: CameraObservations, parameters: Tensor, poses: Poses, **opti
 
 
 def robust(loss: str | None, scale: float, squares: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the cost of residuals of squared lengths, and its derivative by these: the weight of the square.
+    """Return the costs of residuals by their squared lengths, and the derivatives: the weights of the squares.
 
-    huber: s where s <= c^2, else 2 c sqrt(s) - c^2. cauchy: c^2 log(1 + s / c^2).
+    huber: s if s <= c^2, else 2 c sqrt(s) - c^2. cauchy: c^2 log(1 + s / c^2).
     """
     c2 = scale * scale
     if loss == "huber":
@@ -219,7 +219,7 @@ def robust(loss: str | None, scale: float, squares: Tensor) -> tuple[Tensor, Ten
 
 
 def bent(points: Tensor, bend: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the points of bent boards, and the two slopes of their z, (..., N, 2).
+    """Return the points of bent boards, and the derivatives (..., N, 2) of their z by the bend.
 
     z grows by bend_x (1 - x^2) + bend_y (1 - y^2), where x and y go from -1 to 1 over the points (..., N, 3) of the
     board about its middle: mrcal's paraboloid. bend: (B, 2), in the units of the points.
@@ -233,7 +233,7 @@ def bent(points: Tensor, bend: Tensor) -> tuple[Tensor, Tensor]:
 
 
 class Bundle:
-    """The problem, for `levenberg_marquardt.minimise`: its state is flat, with the batch in front of every tensor."""
+    """The problem for `levenberg_marquardt.minimise`, whose state is a flat tuple of tensors (B, ...)."""
 
     def __init__(
         self, observed: Sequence[CameraObservations], state: State, free: Free, loss: str | None, loss_scale: float
@@ -244,7 +244,7 @@ class Bundle:
         self.observed = [s.mapped(lambda t: t.expand(batch, *t.shape[1:])) for s in observed]
         self.cameras = [_template(s.model, p) for s, p in zip(observed, state.parameters, strict=True)]
         self.rounding = torch.stack([rounding_of(s.pixels, s.weights) for s in self.observed]).sum(0)
-        # a camera that does not learn, and is that of all problems, sees them in one row
+        # a camera that does not learn, and is the same for all problems, projects all points as one row
         self.are_shared = [
             len(p) == 1 and not bool(f.any()) for p, f in zip(state.parameters, free.parameters, strict=True)
         ]
@@ -257,14 +257,14 @@ class Bundle:
             + [(c, len(free.parameters[c]) + i) for c, learns in enumerate(free.mounts) if learns for i in range(6)]
             + [(-1, i) for i in range(2) if free.bend]
         )
-        # of each camera the numbers of its columns, and of its parameters in them
+        # for each camera, the indices of its columns and of the parameters in them
         self.learnt: list[tuple[Tensor, Tensor]] = []
         for c, p in enumerate(state.parameters):
             of = [(g, i) for g, (camera, i) in enumerate(self.columns) if camera == c and i < p.shape[-1]]
             at, own = torch.tensor(of, dtype=torch.long, device=p.device).view(-1, 2).unbind(-1)
             self.learnt.append((at, own))
         self.is_bent = free.bend or bool((state.bend != 0).any())
-        # whether one camera sees flat boards that may be anywhere, which is what compiled code knows
+        # compiled code knows one camera that sees flat boards at unknown poses
         plain = len(observed) == 1 and free.boards == "poses" and not (free.mounts[0] or self.is_bent)
         self.is_plain = plain and compiled_of(self.cameras, self.observed[0].pixels) is not None
         self.width = 6 if free.boards == "poses" else 3  # of the unknowns of a view
@@ -316,7 +316,7 @@ class Bundle:
             own = self.learnt[0][1].tolist()
             has_triangles = native.plan.places is not None or all(i < 4 for i in own)
             given = observed.points, state.boards, observed.pixels, observed.weights, (self.loss, self.loss_scale)
-            # the next step begins here, unless this one was in vain
+            # triangles for the next step, which begins here unless this one is rejected
             return compiled_poses.seen(native, *given, own if has_triangles else None)
         pixels, valid = self.camera(c, state).project(self.points(c, state, observed)[-1])
         residuals = torch.where((valid & (observed.weights > 0))[..., None], pixels - observed.pixels, 0.0)
@@ -327,14 +327,14 @@ class Bundle:
         return compiled_poses.Look(residuals, valid, torch.where(valid, slope * observed.weights, 0.0), cost)
 
     def looks(self, flat: Sequence[Tensor], rows: Tensor) -> list[compiled_poses.Look]:
-        """Return the looks of all cameras; those of the last state are reused if it is the same."""
+        """Return the looks of all cameras; the last ones are reused if the state is the same."""
         given, last = (rows, *flat), self._last
         if last is None or not all(a is b or torch.equal(a, b) for a, b in zip(given, last[0], strict=True)):
             self._last = last = given, [self.look(c, flat, rows) for c in range(len(self.observed))]
         return last[1]
 
     def shown(self, c: int, flat: Sequence[Tensor], look: compiled_poses.Look) -> Tensor:
-        """Whether a camera has pixels for points, (B, V, N) bool, also after the search."""
+        """Whether a camera, of the model itself and not the one for the search, has pixels, (B, V, N) bool."""
         kind = _kind(self.observed[c].model)
         if kind.model_for_search() is kind:
             return look.valid
@@ -381,14 +381,14 @@ class Bundle:
             if total == 0:
                 parts.append(block)
                 continue
-            if len(self.observed) > 1:  # a triangle has less rows to spread over the columns of all cameras
+            if len(self.observed) > 1:  # a triangle has fewer rows to spread over the columns of all cameras
                 block = torch.linalg.qr(block, mode="r").R
                 whole = block.new_zeros(*block.shape[:-1], width + total + 1)
                 whole[..., [*range(width), *(width + g for g in at), width + total]] = block
                 block = whole
             parts.append(block)
         block = torch.cat(parts, -2)
-        if total == 0:  # no more than six columns, which squares do no harm
+        if total == 0:  # at most six columns, for which squares are accurate enough
             return Equations(triangle_of_few(block), block.new_zeros(len(block), 1, 1), ())
         triangle = torch.linalg.qr(padded(block), mode="r").R
         left = torch.cat((triangle[..., width:, width:].flatten(1, 2), *self._rows_of_priors(state)), -2)
@@ -439,7 +439,7 @@ class Bundle:
         return (torch.cat(columns, -1) * look.weights.sqrt()[..., None, None]).flatten(2, 3), at
 
     def moved(self, flat: Sequence[Tensor], step: Sequence[Tensor], rows: Tensor) -> tuple[Tensor, ...]:
-        """Return the state after steps of the views (R, V, L) and of what they share (R, G)."""
+        """Return the state after steps of the views' unknowns (R, V, L) and the shared ones (R, G)."""
         state = self.state(flat)
         of_views, shared = step
         boards, mounts, bend = state.boards, state.mounts, state.bend
@@ -483,7 +483,7 @@ def _template(model: type[Camera] | Camera, parameters: Tensor) -> Camera:
 def pixel_jacobians(camera: Camera, points: Tensor, learns: bool = True) -> tuple[Tensor, Tensor]:
     """Return the exact derivatives of pixels by points (C, N, 3), and by the parameters of cameras (C,) if one learns.
 
-    (C, N, 2, 3) and (C, N, 2, 4 + n): zero where there is no pixel, and of no meaning where a point is not valid.
+    (C, N, 2, 3) and (C, N, 2, 4 + n): zero if a point has no pixel, and without meaning if it is not valid.
     """
     made = compiled_of([camera], points)
     if made is not None and (not learns or made[0][0].plan.places is not None):

@@ -1,4 +1,4 @@
-"""One camera from what it saw of known boards: `calibrate` and its result."""
+"""The calibration of one camera from views of known boards: `calibrate`."""
 
 from __future__ import annotations
 
@@ -26,19 +26,19 @@ from camtorch.values.arguments import as_flag, as_number, as_whole, hinting, no_
 from camtorch.values.threads import on_one_thread
 
 STEPS = 300
-_MANY = 100  # coefficients
+_MANY = 100  # coefficients, at most
 _OUTLIER = 3.0  # standard deviations
 _ROUNDS = 20
-_SMOOTH = 0.02  # of a pixel of error: one of a surface's second differences, see `Camera.smoothness`
-_BESIDE = 1e-3  # radians from the axis, where a surface shows which way is right
-_SECOND_LOOKS = 3  # at the poses
-_AS_GOOD = 9.0  # variances: the difference of two costs that three standard deviations explain
-_APART, _SAME = 5.0, 1e-3  # standard deviations, and part of the parameter, of two optima
+_SMOOTH = 0.02  # the weight of a surface's second differences, in px, see `Camera.smoothness`
+_BESIDE = 1e-3  # radians from the axis: the second point that holds a surface's frame
+_SECOND_LOOKS = 3  # the most searches for better poses
+_AS_GOOD = 9.0  # variances: optima whose costs differ by less are equally good
+_APART, _SAME = 5.0, 1e-3  # standard deviations, and part of the parameter, by which two optima differ
 
 
 @dataclass(frozen=True)
 class Model:
-    """Which camera is asked for: a class, its number of coefficients, a camera to start from or None, what is held."""
+    """The camera to find: a class, its number of coefficients, a start or None, and the parameters that are free."""
 
     kind: type[Camera]
     count: int
@@ -64,10 +64,10 @@ def as_model(
     fixed: Collection[str] | str,
     owner: str,
 ) -> Model:
-    """Return which camera the arguments of `calibrate` ask for."""
+    """Return the camera that the arguments of `calibrate` ask for."""
     if isinstance(model, Camera):
         if start is not None:
-            raise ValueError(f"{owner}: start must be left out if model is a camera; got start={start!r}")
+            raise ValueError(f"{owner}: start must be left out if model is a camera; got {start!r}")
         start, model = model, type_before_parametrizations(model)
     model = as_kind(model, owner)
     if start is not None:
@@ -88,7 +88,7 @@ def as_model(
     names = model.names_of(count) if 0 <= count <= max(_MANY, model.default_count) else None
     if names is None:
         limit = f", here {_MANY} at most" if count > _MANY else ""
-        raise ValueError(f"{owner}: {model.__name__} takes {model.counts_text()}{limit}; got count={count}")
+        raise ValueError(f"{owner}: count must fit {model.__name__}, {model.counts_text()}{limit}; got {count}")
     names = (*INTRINSICS, *names)
     if not isinstance(fixed, Collection) or isinstance(fixed, Mapping):
         raise TypeError(f'{owner}: fixed must be names of parameters, as ("cx", "cy"), or "all"; got {fixed!r}')
@@ -97,11 +97,11 @@ def as_model(
         fixed = (*fixed, *INTRINSICS)  # a surface can replace these
     if unknown := [name for name in fixed if not isinstance(name, str) or name not in names]:
         wrong = ", ".join(map(repr, unknown))
-        raise ValueError(f"{owner}: fixed names {wrong}; {model.__name__} has {', '.join(names)}")
+        raise ValueError(f"{owner}: fixed must name parameters of {model.__name__}, {', '.join(names)}; got {wrong}")
     if start is not None:
         fixed = *fixed, *frozen_names(start)
     if start is None and {"fx", "fy"} & set(fixed):
-        raise ValueError(f"{owner}: start must be a camera if a focal length is fixed; got None")
+        raise ValueError(f"{owner}: start must be a camera if fx or fy is fixed; got None")
     return Model(model, count, start, torch.tensor([name not in fixed for name in names], device="cpu"))
 
 
@@ -137,29 +137,35 @@ def calibrate(
     bend: bool = False,
     progress: Callable[[int, float], None] | None = None,
 ) -> Calibration:
-    """Calibrate a camera of a model from known points and their pixels; no start is needed.
+    """Calibrate a camera of a model from known points and their pixels, without a focal length to start from.
 
-    No focal length has to be given, and angles may go beyond 90 degrees. Least squares of the distances in pixels, over
-    the parameters of the camera and the poses of all views.
+    The result has the least squared distances in pixels, over the camera's parameters and the poses of all views.
 
     Args:
-        model: a class of cameras, its key, or a camera to start from.
+        model: class of cameras, its key, or a camera to start from.
         object_points: (N, 3) for all views, (V, N, 3), or a list of (N_i, 3), in the board's frame and any unit.
         image_points: (V, N, 2) or a list of (N_i, 2), in pixels, (0, 0) the centre of the top-left one. Rows with NaN
             are unseen.
         image_size: (height, width), as `image.shape`.
-        count: of the coefficients; the model's default if left out.
+        count: number of coefficients; the model's default if left out.
         start: a camera to start from, of the model.
-        fixed: names of parameters that are held ("cx", "k3", ...) where the start has them; without a start distortion
-            at zero and the principal point in the middle of the image. "all" leaves the poses alone to be found.
-        loss: None for least squares, "huber" or "cauchy" where some corners may be wrong; of a residual's length.
-        loss_scale: px, from where a robust loss grows slower.
-        bend: whether the board may be bent: two numbers more, see `Calibration.bend`.
+        fixed: names of parameters to hold ("cx", "k3", ...) at the start's values; without a start at zero distortion,
+            and the principal point in the middle of the image. "all" finds the poses only.
+        loss: None for least squares; "huber" or "cauchy", of a residual's length, if some corners may be wrong.
+        loss_scale: px, the length from which a robust loss grows slower.
+        bend: whether the board may be bent, which adds two unknowns, see `Calibration.bend`.
         progress: called after each step of the final search with its number and the cost.
 
     Raises:
-        ValueError: If an argument is bad, or the problem has no unique solution, like a single view of a plane
-            may have.
+        ValueError: If an argument is bad, or the views do not determine the camera, as a single view of a plane.
+
+    Example:
+        >>> board = [[x, y, 0.0] for y in range(5) for x in range(6)]
+        >>> lens = ct.KannalaBrandt([300.0, 300.0, 319.5, 239.5], [0.1, 0.0, 0.0, 0.0], image_size=(480, 640))
+        >>> turns = [[0.5, 0.0, 0.0], [-0.5, 0.0, 0.0], [0.0, 0.5, 0.0], [0.0, -0.5, 0.5]]
+        >>> pixels, _ = lens.project(ct.Extrinsics(turns, [[-2.5, -2.0, 5.0]] * 4)([board]))  # (4, 30, 2)
+        >>> ct.calibrate("kannala_brandt", board, pixels, image_size=(480, 640)).rms < 0.001
+        True
     """
     owner = "calibrate"
     seen, layout = as_observations(object_points, image_points, image_size, owner)
@@ -169,29 +175,29 @@ def calibrate(
     (result,) = results([search], search.alone(bend, on_progress), search.free(bend)).cameras
     if not result.converged:
         ends = [] if bool(result.adjusted.converged[0]) else ["the search did not end at an optimum"]
-        ends += [f"{lost} corners have no pixel in it: a surface has to reach further"] if (lost := result.lost) else []
-        warn(f"{owner}: {', and '.join(ends)} (rms {result.rms:.4g} px); do not use it. See its warnings")
+        ends += [f"{lost} corners have no pixel: a surface must reach further"] if (lost := result.lost) else []
+        warn(f"{owner}: {', and '.join(ends)} (rms {result.rms:.4g} px). Do not use the result; see its warnings")
     return result
 
 
 def middle_of(seen: Sequence[Observations]) -> Tensor:
-    """Return the middle (3,) of all points of boards that were seen."""
+    """Return the middle (3,) of all seen points of boards."""
     points = torch.cat([s.points[s.seen] for s in seen])
     return (points.amin(0) + points.amax(0)) / 2
 
 
 @dataclass
 class Search:
-    """The search for one camera: its model, what it saw, and the loss."""
+    """The search for one camera: its model, observations and loss."""
 
-    owner: str  # who asks, and which camera it is, for messages
+    owner: str  # the function, and the camera's name in a rig, for messages
     asked: Model
     given: Observations
     middle: Tensor
     layout: Layout
     loss: str | None
     loss_scale: float
-    prior: Prior | None = None  # of a surface: what its start says of it
+    prior: Prior | None = None  # of a surface, from its start
 
     def __post_init__(self) -> None:
         kind, start = self.asked.kind, self.asked.start
@@ -206,13 +212,13 @@ class Search:
             (x, y), (_, right) = kind(core, coefficients).project(axis)[0]
             return torch.stack((x, y, (right - y) / _BESIDE / 10))
 
-        # a surface could do what turns of the camera do, and boards turn with it: the frame is that of the start
+        # a surface can imitate a turn of the camera, so its frame is held at the start's
         rows = _SMOOTH * float(core[:2].mean()) * smooth.to(like), torch.func.jacrev(frame)(coefficients)
         self.prior = Prior(torch.cat((core, coefficients)), torch.nn.functional.pad(torch.cat(rows), (4, 0)))
 
     @cached_property
     def seen(self) -> Observations:
-        """What was given, the boards about their middle, where a pose's turn and shift hardly depend on each other."""
+        """Observations with boards about their middle, which makes a pose's turn and shift nearly independent."""
         points = torch.where(self.given.seen[..., None], self.given.points - self.middle, 0.0)
         return self.given._replace(points=points)
 
@@ -235,12 +241,12 @@ class Search:
 
         if asked.start is None and asked.kind.smoothness() is not None:
             raise ValueError(
-                f"{self.owner}: {asked.kind.__name__} learns a surface over another lens; give start=a camera of any "
-                'model, such as calibrate("kannala_brandt", ...).camera'
+                f"{self.owner}: start must be a camera, of any model, as {asked.kind.__name__} learns a surface over "
+                'its lens; got None. Pass start=calibrate("kannala_brandt", ...).camera'
             )
         if asked.start is None:
             fixed = [name for name, free in zip(asked.names, asked.free.tolist(), strict=True) if not free]
-            with torch.inference_mode():  # a tenth less time, of what could not be used in a graph
+            with torch.inference_mode():  # takes a tenth less time, and no graph needs the result
                 first = start_from_nothing(seen, asked.kind, asked.count, size, fixed, self.loss, self.loss_scale)
             first = first.of(torch.arange(1, device=seen.pixels.device))
         else:
@@ -280,20 +286,20 @@ class Search:
 
 
 def _seen_from(state: State, camera: int) -> Poses:
-    """Return the boards in the frame of one camera."""
+    """Return the boards' poses in the frame of one camera."""
     rotations, translations = (t[:, camera, None] for t in state.mounts)
     return Poses(rotations @ state.boards.rotations, state.boards.translations @ rotations[:, 0].mT + translations)
 
 
 class Optima(NamedTuple):
-    """Where searches ended: the parameters (S, 4 + n) of one camera, the costs and whether they converged, (S,)."""
+    """The ends of S searches: parameters (S, 4 + n) of one camera, costs and whether they converged, (S,)."""
 
     parameters: Tensor
     cost: Tensor
     converged: Tensor
 
     def twins(self, found: Calibration) -> tuple[tuple[float, ...], ...]:
-        """Return parameters of optima as good as the one found, up to the noise, and apart from it."""
+        """Return parameters of other optima that are as good as the one found, up to the noise."""
         if not found.converged:
             return ()
         as_good = self.converged & (self.cost - found.adjusted.cost[0] <= _AS_GOOD * found.sigma**2)
@@ -305,13 +311,13 @@ class Optima(NamedTuple):
 
 
 class Results(NamedTuple):
-    """Of all cameras of a problem: the optimum, what belongs to each, and of all corners px."""
+    """The results of all cameras: the optimum, each camera's calibration, rms and sigma of all corners in px."""
 
     adjusted: Adjusted
     cameras: list[Calibration]
     rms: float
     sigma: float
-    noise: Tensor  # (), what makes the covariance; without a loss it is sigma
+    noise: Tensor  # (), px, which scales the covariance; without a loss it is sigma
 
 
 def results(searches: Sequence[Search], adjusted: Adjusted, free: Free) -> Results:
@@ -329,7 +335,7 @@ def results(searches: Sequence[Search], adjusted: Adjusted, free: Free) -> Resul
     views = torch.stack([one.seen.any(-1) for one in given]).any(0)
     parameters = unknowns(observed, adjusted, int(views.sum()))
     inliers, sigma, noise = noise_of(residuals, seen, valid, searches[0].loss, searches[0].loss_scale, parameters)
-    again = repeats(given, [r[0] for r in adjusted.residuals])  # which widen uncertainty as if views were missing
+    again = repeats(given, [r[0] for r in adjusted.residuals])  # widen uncertainty as if they were missing
     noise = noise * math.sqrt(len(views) / (len(views) - len(again)))
     cameras, state = [], adjusted.state
     for c, (search, own) in enumerate(zip(searches, inliers.split(len(views)), strict=True)):

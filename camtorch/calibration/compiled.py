@@ -1,4 +1,4 @@
-"""Poses by compiled code: rows to pointers, and rows to threads. The formulas are in `rays.py` and `pnp.py` as well."""
+"""Calls of compiled code for poses and views, in threads. Its formulas are those of `rays.py` and `pnp.py`."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from camtorch.values.threads import spread, thread_count
 
 _FROM_RAYS, _REFINED, _SOLVED, _AGREED = range(4)
 _LOSSES = (None, "huber", "cauchy")
-_SHARED = 1 << 9  # points of poses that a thread is woken for
-_Poses = struct.Struct("11q5d10q").pack  # `Poses` of native/poses.h
-_Views = struct.Struct("16qd5q").pack  # `Views`
+_SHARED = 1 << 9  # points of poses for each further thread
+_Poses = struct.Struct("11q5d10q").pack  # the struct `Poses` of native/poses.h
+_Views = struct.Struct("16qd5q").pack  # the struct `Views` there
 
 
 class Search(NamedTuple):
@@ -37,7 +37,7 @@ _NONE = Search(0, 0.0, 0.0, 0.0)
 
 
 class Solved(NamedTuple):
-    """Poses (B,); see `pnp.Pose`. Rms is infinite where they are not valid."""
+    """B poses, with the fields of `pnp.Pose`; rms is infinite if a pose is not valid."""
 
     vectors: Tensor
     translations: Tensor
@@ -48,12 +48,12 @@ class Solved(NamedTuple):
 
 
 def can_search(*tensors: Tensor) -> bool:
-    """Whether compiled code takes them."""
+    """Whether compiled code can search for poses of these tensors."""
     return library() is not None and all(t.is_cpu for t in tensors)
 
 
 def from_rays(points: Tensor, rays: Tensor, weights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return (B, 2, 3, 3), (B, 2, 3) and valid (B, 2) for `poses_from_rays`; points (P, N, 3) serve P rows each."""
+    """Return rotations (B, 2, 3, 3), translations and valid as `poses_from_rays` does; row b sees points[b % P]."""
     count = len(rays)
     rotations, translations = rays.new_empty(count, 2, 3, 3), rays.new_empty(count, 2, 3)
     valid = torch.empty(count, 2, dtype=torch.bool, device="cpu")
@@ -64,7 +64,7 @@ def from_rays(points: Tensor, rays: Tensor, weights: Tensor) -> tuple[Tensor, Te
 def refined(
     native: Native, points: Tensor, pixels: Tensor, weights: Tensor, start: tuple[Tensor, Tensor], search: Search
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the minima (B, 3, 3), (B, 3) that poses lead to, and costs (B,), of points (P, N, 3), pixels (B, N, 2)."""
+    """Return rotations, translations and costs (B,) of the minima near `start`; row b sees points[b % P]."""
     while True:
         rotations, translations = (t.clone(memory_format=torch.contiguous_format) for t in start)
         converged, costs = torch.empty(len(pixels), dtype=torch.bool, device="cpu"), pixels.new_empty(len(pixels))
@@ -83,7 +83,7 @@ def solved(
     start: tuple[Tensor, Tensor] | None = None,
     threshold: float = 0.0,
 ) -> Solved:
-    """Return poses of (P, N, 3), (B, N, 2), (B, N), near `start`, about the middle of what is seen, if it is given."""
+    """Return the poses of points (P, N, 3) at pixels (B, N, 2); a `start` is for points about their seen middle."""
     batch, count, _ = pixels.shape
     native.add_table()
     while True:
@@ -106,7 +106,7 @@ class Look(NamedTuple):
     valid: Tensor  # (B, V, N)
     weights: Tensor  # (B, V, N), of the squares
     cost: Tensor  # (B, V)
-    triangles: tuple[Tensor, Tensor] | None = None  # those of `Equations`, without priors, if compiled code made them
+    triangles: tuple[Tensor, Tensor] | None = None  # of `Equations`, without priors, if compiled code made them
 
 
 def seen(
@@ -123,11 +123,11 @@ def seen(
     Triangles are made if `learnt` lists the parameters that learn. poses: (B, V, 3, 3), (B, V, 3). loss: name, scale.
     """
     compiled, plan, left = library(), native.plan, c_int64(0)
-    assert compiled is not None  # or nobody has a `Native`
+    assert compiled is not None  # a `Native` exists only with the library
     valid = torch.empty(weights.shape, dtype=torch.bool, device="cpu")
     residuals, weighed, cost = (t.new_empty(t.shape) for t in (pixels, weights, weights[..., 0]))
     wanted = learnt or ()
-    if plan.places is not None and not plan.is_all:  # the place of each coefficient among the parameters
+    if plan.places is not None and not plan.is_all:  # the place of each coefficient among the camera's parameters
         at = {4 + place: 4 + i for i, place in enumerate(plan.places.tolist())}
         wanted = [at.get(number, number) for number in wanted]
     count = 0 if learnt is None else len(points)

@@ -19,8 +19,8 @@ from camtorch.values.arguments import Numbers, as_image_size, as_values
 from camtorch.values.threads import on_one_thread
 
 _ALPHAS = (0.0, 0.35, 0.5, 0.6, 0.65, 0.75)
-"""Of the unified lenses that are tried first: perspective for 0, stereographic for 1/2, nearly equidistant for 0.65."""
-_NEAREST = 0.05  # to the plane through a unified lens' centre, in units of a ray, that a point of the first fit may be
+"""The alphas of unified lenses to try first: 0 is perspective, 1/2 stereographic, 0.65 nearly equidistant."""
+_NEAREST = 0.05  # the least divisor of a unified lens, for unit rays, of points that count in the first fit
 _LEAST = 4  # rays
 
 
@@ -42,22 +42,28 @@ def fit(
     `Conversion.rms` and `max_error` are the distances of the result from them, in px.
 
     Args:
-        model: a class of cameras, its key, or a camera to start from, whose frozen parameters stay.
+        model: class of cameras, its key, or a camera to start from, whose frozen parameters keep their values.
         pixels: (*N, 2).
         rays: (*N, 3) for one camera, or (*B, *N, 3) for a batch of them, of any length, in the camera's frame.
         weights: of the squared errors, broadcast against the rays' (*B, *N); 1 if left out.
         image_size: (height, width) of the camera that is made; by default that of a camera to start from.
-        count: of the coefficients; the model's default if left out.
-        fixed: names of parameters that are held ("cx", "k3", ...) where the camera to start from has them; without
-            one distortion as in `ideal`, at zero, and the principal point in the middle of the image.
+        count: number of coefficients; the model's default if left out.
+        fixed: names of parameters to hold ("cx", "k3", ...) at the values of the camera to start from; without one
+            distortion as in `ideal`, at zero, and the principal point in the middle of the image.
 
     Returns:
-        The camera, float64, and how far it is from the rays: compared are the pixels of those that count.
+        The camera, float64, and the distances of its pixels from those of the rays with a weight.
 
     Raises:
         ValueError: If shapes do not fit, there are fewer than four rays, no lens looking along z makes these rays and
             pixels, a name is unknown, a focal length is fixed without a start, or cx or cy without an image_size.
         TypeError: If `model` is not a model, or values are not numeric.
+
+    Example:
+        >>> lens = ct.KannalaBrandt([300.0, 300.0, 319.5, 239.5], [0.1, 0.0, 0.0, 0.0], image_size=(480, 640))
+        >>> pixels = lens.pixel_grid()[::40, ::40]
+        >>> ct.fit("double_sphere", pixels, lens.unproject(pixels)[0], image_size=(480, 640))
+        Conversion(rays -> DoubleSphere: rms 0.237 px, max 1.34 px, up to 67.1 degrees, 100 % of the image)
     """
     owner = "fit"
     asked = as_model(model, count, None, fixed, owner)
@@ -97,7 +103,7 @@ def fit(
     counts = seen.weights > 0
     if not counts.numel() or not bool((counts.sum(-1) >= _LEAST).all()):
         raise ValueError(
-            f"{owner}: rays must have at least {_LEAST} finite ones a camera; got {counts.sum(-1).tolist()} of rays "
+            f"{owner}: rays must have at least {_LEAST} finite rows a camera; got {counts.sum(-1).tolist()} of rays "
             f"{tuple(given_rays.shape)}"
         )
     lens = _unified(seen, owner)
@@ -136,7 +142,7 @@ def _fixed(asked: Model, size: tuple[int, int] | None, owner: str) -> Tensor | N
         values = torch.cat([t.detach().double().reshape(-1).cpu() for t in asked.start._tensors])
     else:
         if size is None and not bool(asked.free[2:4].all()):
-            raise ValueError(f"{owner}: cx and cy are held in the middle of the image; give image_size=(height, width)")
+            raise ValueError(f"{owner}: image_size must be given if cx or cy is fixed; got None. Pass (height, width)")
         height, width = size or (1, 1)
         ideal = asked.kind.ideal(asked.count)
         values = torch.tensor([torch.nan, torch.nan, (width - 1) / 2, (height - 1) / 2, *ideal], dtype=torch.float64)
@@ -161,8 +167,8 @@ def _unified(seen: fitting.Observations, owner: str) -> Camera:
     least, best = torch.where(torch.isnan(every), torch.inf, every).min(0)
     if not bool(torch.isfinite(least).all()):
         raise ValueError(
-            f"{owner}: no camera that looks along z, with x to the right and y down, sees these rays at these pixels. "
-            "Is their frame another one (OpenGL's looks along -z, y up), or are the pixels (row, column)?"
+            f"{owner}: rays must be those of a camera that looks along z, with x right and y down; got rays that none "
+            "sees at these pixels. Negate y and z of OpenGL's rays (along -z, y up); pixels are (column, row)"
         )
     lens = torch.stack(lenses)[best, torch.arange(len(best), device=best.device)]
     return fixed_camera(UCM, lens[:, :4], lens[:, 4:], (1, 1))

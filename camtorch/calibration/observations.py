@@ -1,4 +1,4 @@
-"""What users pass to a calibration, object points and image points, as padded tensors; results in the same form."""
+"""Object points and image points of a calibration as padded tensors, and results in the form of these."""
 
 from __future__ import annotations
 
@@ -19,22 +19,22 @@ Array: TypeAlias = NDArray[Any]
 
 _LEAST_CORNERS = 4
 _FLAT = 1e-5  # the width of a set of points over its length, below which it is a line
-_ROUNDING = 1e-11  # of coordinates, which a board's origin far away leaves of its points
+_ROUNDING = 1e-11  # of coordinates: rounding of points far from the board's origin
 _LEAST_UNIT, _MOST_UNIT = 1e-30, 1e30
-_NORMALISED = 3.0  # pixels that none of an image's coordinates exceeds if they are no pixels
-_RIM = 0.02  # of the longer side: further outside the image no corner is found
-_MANY_OUTSIDE = 0.2  # of all corners, more than a robust loss would be asked to bear
-_FEW_OUTSIDE, _FEW_LEFT = 0.02, 0.2  # of all corners, of which so few are left with the sides of the image exchanged
+_NORMALISED = 3.0  # px: coordinates that all are smaller are normalised ones
+_RIM = 0.02  # of the longer side: no detector finds corners further outside the image
+_MANY_OUTSIDE = 0.2  # of all corners, more than a robust loss can bear
+_FEW_OUTSIDE, _FEW_LEFT = 0.02, 0.2  # of all corners outside, and of these with the image's sides exchanged
 _MOST_OF_A_VIEW = 0.5
-_NOWHERE = 10.0  # times the longer side: no corner at all, not even an outlier
+_NOWHERE = 10.0  # times the longer side: not even an outlier is so far outside
 _SAME_PIXEL = 3  # corners of a view at one pixel
 _SAME_ERRORS = 0.1  # the squared distance of two views over their squared residuals: 1 where noise is independent
-_SAME_NOISE = 0.1  # px, the distance of two views that saving a file anew may make
-_NAMED = 6  # views, in a message
+_SAME_NOISE = 0.1  # px, the distance of two views that saving a file again may cause
+_NAMED = 6  # views at most, in a message
 
 
 class Observations(NamedTuple):
-    """Corners of boards and where one camera sees them: float64, padded to as many as the fullest view has."""
+    """Corners of boards and their pixels in one camera: float64, padded to the number of the fullest view."""
 
     points: Tensor  # (V, N, 3) in the board's frame, 0 where padded
     pixels: Tensor  # (V, N, 2), 0 where unseen
@@ -45,9 +45,9 @@ class Observations(NamedTuple):
 
 
 class Layout(NamedTuple):
-    """The form in which the image points of one camera came."""
+    """The form of one camera's image points as they were passed."""
 
-    shapes: tuple[tuple[int, ...], ...]  # of each view that was passed, without the last dim; of None its points' (N,)
+    shapes: tuple[tuple[int, ...], ...]  # of each view that was passed, without the last dim; (N,) for None
     stacked: bool  # whether they were one tensor or array, not a list
     views: Tensor  # (V,) the numbers of the views that have corners, of those that were passed
     seen: Tensor  # (V, N) of the observations
@@ -67,9 +67,9 @@ class Layout(NamedTuple):
 def as_observations(
     object_points: Points, image_points: Points, image_size: Sequence[int], owner: str
 ) -> tuple[Observations, Layout]:
-    """Return what one camera sees, only views that have corners, and the form to bring results back to."""
+    """Return the observations of one camera, of views that have corners, and the form for its results."""
     if isinstance(image_points, Mapping):
-        raise TypeError(f"{owner}: image_points of one camera are a tensor or a list; cameras by name make a rig")
+        raise TypeError(f"{owner}: image_points must be a tensor or a list; got a mapping. Use calibrate_rig for it")
     return _observed(object_points, {"": image_points}, {"": image_size}, owner)[""]
 
 
@@ -80,15 +80,15 @@ def as_rig_observations(
     models: Mapping[str, Any],
     owner: str,
 ) -> dict[str, tuple[Observations, Layout]]:
-    """Return what each camera of a rig sees of the same boards, by name in the order of the models."""
+    """Return the observations of a rig's cameras of the same boards, by name in the order of the models."""
     for argument, given in {"models": models, "image_points": image_points, "image_sizes": image_sizes}.items():
         if not isinstance(given, Mapping) or not all(isinstance(name, str) for name in given):
             got = f"{type(given).__name__} {shown(given)}"
-            raise TypeError(f"{owner}: {argument} must map names of cameras to theirs; got {got}")
+            raise TypeError(f"{owner}: {argument} must be a mapping by names of cameras; got {got}")
         if not given or set(given) != set(models):
             raise ValueError(
-                f"{owner}: models, image_points and image_sizes must name the same cameras; {argument} has "
-                f"{list(given)}, and models {list(models)}"
+                f"{owner}: models, image_points and image_sizes must name the same cameras; got {argument} of "
+                f"{list(given)} and models of {list(models)}"
             )
     return _observed(object_points, {name: image_points[name] for name in models}, image_sizes, owner)
 
@@ -96,13 +96,13 @@ def as_rig_observations(
 def repeats(cameras: Sequence[Observations], residuals: Sequence[Tensor]) -> Tensor:
     """Return views (R,) that show an earlier one again with its errors, as a file saved twice or a frozen frame does.
 
-    Where the noise of two views is independent, corners differ by at least as much as both are wrong by; in such a pair
-    they differ by less than a third of that. residuals: of each camera (V, N, 2).
+    If the noise of two views is independent, their corners differ by at least both errors together; in such a pair they
+    differ by less than a third of that. residuals: of each camera (V, N, 2).
     """
     seen = torch.cat([one.seen for one in cameras], -1)
     pixels = torch.cat([one.pixels for one in cameras], 1)
     size = (torch.cat(list(residuals), 1).square().sum(-1) * seen).sum(-1)
-    order = pixels.sum((1, 2)).argsort(stable=True)  # where those that are alike are neighbours
+    order = pixels.sum((1, 2)).argsort(stable=True)  # similar views become neighbours
     before, after = order[:-1], order[1:]
     apart = (pixels[after] - pixels[before]).square().sum((1, 2))
     alike = (seen[after] == seen[before]).all(-1) & (apart <= _SAME_ERRORS * (size[after] + size[before]))
@@ -130,12 +130,12 @@ def _observed(
     for name, (views, *_) in given.items():
         size_label = f"image_sizes[{name!r}]" if name else "image_size"
         if (size := as_image_size(image_sizes[name], owner, size_label)) is None:
-            raise ValueError(f"{owner}: {size_label} is missing: (height, width) in pixels, as image.shape[:2]")
+            raise ValueError(f"{owner}: {size_label} must be given; got None. Pass (height, width), image.shape[:2]")
         for i, (view, length) in enumerate(zip(views, lengths, strict=True)):
             if view is not None and len(view) not in (0, length):
                 raise ValueError(
-                    f"{owner}: view {i}: object_points are {length} corners (of a chessboard its inner ones), and "
-                    f"{labels[name]}[{i}] are {len(view)}; corners that were not found are rows of NaN"
+                    f"{owner}: view {i}: {labels[name]}[{i}] must be as many corners as object_points, {length} (inner "
+                    f"ones of a chessboard); got {len(view)}. Pass rows of NaN for corners that were not found"
                 )
         of = _padded(views, max(lengths), 2)
         seen[name] = ~np.isnan(of.sum(-1))
@@ -150,8 +150,8 @@ def _observed(
     if not linked.all():
         apart = ", ".join(repr(name) for name, is_linked in zip(names, linked, strict=True) if not is_linked)
         raise ValueError(
-            f"{owner}: {apart} never sees a board in the same view as {names[0]!r}, nor as a "
-            "camera that does, so its pose is unknown. Take views that both see, or calibrate it alone"
+            f"{owner}: cameras must share views with {names[0]!r}, directly or through others; got no such view of "
+            f"{apart}. Take views that both see, or calibrate it alone"
         )
     first: dict[bytes, int] = {}
     has: Array = np.any(sees, 0)
@@ -159,7 +159,7 @@ def _observed(
     copy: Array = has & np.array([first.setdefault(row.tobytes(), i) != i for i, row in rows])
     for left_out, why in ((~has, "nothing was seen"), (copy, "the corners are those of another view")):
         if left_out.any():
-            warn(f"{owner}: left out, as {why} in {_views_of(left_out)}")
+            warn(f"{owner}: {_views_of(left_out)} left out, because {why}")
     every = [v for value in image_points.values() for v in (value if isinstance(value, (list, tuple)) else [value])]
     device = next((view.device for view in every if isinstance(view, Tensor)), torch.device("cpu"))
     kept, found = np.flatnonzero(has & ~copy), {}
@@ -179,7 +179,7 @@ def _in_views(
     parts: list[Array | None] = []
     if isinstance(value, (list, tuple)):
         parts = [None if p is None else _as_array(p, size, f"{name}[{i}]", owner) for i, p in enumerate(value)]
-    are_rows = bool(parts) and all(p is not None and p.ndim == 1 <= p.size for p in parts)  # of numbers
+    are_rows = bool(parts) and all(p is not None and p.ndim == 1 <= p.size for p in parts)  # of plain numbers
     stacked, is_one = are_rows or not isinstance(value, (list, tuple)), False
     if stacked:
         whole = _as_array(value, size, name, owner)
@@ -187,7 +187,7 @@ def _in_views(
         is_one = whole.ndim < 3 or (whole.ndim == 3 and whole.shape[1] == 1 < whole.shape[0])
         parts = [whole] if is_one else list(whole)
     if all(part is None for part in parts):
-        raise ValueError(f"{owner}: {name} has no view with points; got {shown(value)}")
+        raise ValueError(f"{owner}: {name} must have a view with points; got {shown(value)}")
     rows: list[Array | None] = []
     for i, part in enumerate(parts):
         flat = part if part is None or part.size else np.empty((0, size))
@@ -240,7 +240,7 @@ def _check_corners(points: Array, pixels: Array, seen: Array, name: str, owner: 
     """Raise if corners determine no pose; points (V, N, 3) and pixels (V, N, 2) are NaN if padded."""
     number, corners = seen.sum(-1), np.where(seen[..., None], points, np.nan)
     if not number.any():
-        raise ValueError(f"{owner}: {name} must have seen corners; got NaN everywhere, no view has a corner")
+        raise ValueError(f"{owner}: {name} must have seen corners; got NaN in all views")
     known = np.nan_to_num(corners, posinf=0.0, neginf=0.0)
     reach = np.abs(known).max((1, 2))
     known = known / np.where(reach > 0, reach, 1.0)[:, None, None]
@@ -249,13 +249,13 @@ def _check_corners(points: Array, pixels: Array, seen: Array, name: str, owner: 
     thin = spread[:, 1] <= np.maximum(_FLAT * spread[:, 2], _ROUNDING)
     odd, at_one = (reach > 0) & ((reach <= _LEAST_UNIT) | (reach >= _MOST_UNIT)), _repeated(pixels, _SAME_PIXEL)
     for wrong, words in (
-        (np.isinf(pixels).any((1, 2)), f"{name} is infinite; what is unseen is NaN"),
-        (number < _LEAST_CORNERS, f"{name} has fewer than {_LEAST_CORNERS} seen corners; leave it out, or make it NaN"),
-        ((~np.isfinite(corners).all(-1) & seen).any(-1), "object_points are not finite where image_points are"),
-        (odd, f"object_points reach {reach.max():.3g}; give them in a unit near the size of the board"),
-        (thin, "the object_points of its seen corners lie on one line, or are the same point"),
-        (_repeated(corners, 2), "object_points has a corner twice; a board has each once"),
-        (at_one, f"{name} has {_SAME_PIXEL} or more corners at one pixel; corners that were not found are NaN"),
+        (np.isinf(pixels).any((1, 2)), f"{name} must not be infinite; unseen corners are NaN"),
+        (number < _LEAST_CORNERS, f"{name} must have {_LEAST_CORNERS} or more seen corners; or leave it out"),
+        ((~np.isfinite(corners).all(-1) & seen).any(-1), "object_points must be finite where image_points are"),
+        (odd, f"object_points must be in a unit near the board's size; got up to {reach.max():.3g}"),
+        (thin, "object_points of the seen corners must not lie on one line, or be the same point"),
+        (_repeated(corners, 2), "object_points must have each corner once; got one twice"),
+        (at_one, f"{name} must not have {_SAME_PIXEL} corners at one pixel; corners that were not found are NaN"),
     ):
         if (wrong & (number > 0)).any():
             raise ValueError(f"{owner}: {_views_of(wrong & (number > 0))}: {words}")
@@ -267,13 +267,13 @@ def _check_inside(pixels: Array, seen: Array, name: str, size: tuple[int, int], 
     low, high = ("({:.6g}, {:.6g})".format(*end) for end in (found.min(0), found.max(0)))
     if np.abs(found).max() < _NORMALISED < min(size) / 2:
         raise ValueError(
-            f"{owner}: {name} reaches from {low} to {high} in an image of {size[0]} x {size[1]}: pixels are asked for, "
-            "not normalised coordinates"
+            f"{owner}: {name} must be pixels, not normalised coordinates; got {low} to {high} in an image of "
+            f"{size[0]} x {size[1]}"
         )
 
     def outside(sides: tuple[int, int], rim: float) -> Array:
         over = np.maximum(pixels - np.array(sides[::-1]) + 1.0, -pixels)
-        far: Array = (over > rim * max(size)).any(-1)  # NaN is not
+        far: Array = (over > rim * max(size)).any(-1)  # False for NaN
         return far
 
     out = outside(size, _RIM)
@@ -282,9 +282,9 @@ def _check_inside(pixels: Array, seen: Array, name: str, size: tuple[int, int], 
     views: Array = (out.sum(-1) > _MOST_OF_A_VIEW * seen.sum(-1)) | outside(size, _NOWHERE).any(-1)
     if exchanged or number > _MANY_OUTSIDE * total or views.any():
         raise ValueError(
-            f"{owner}: {number} of {total} corners of {name} lie outside the image of {size_name} {size}, in "
-            f"{_views_of(views if views.any() else out.sum(-1))}; they reach from {low} to {high}: {size_name} "
-            "is (height, width) of all images, as image.shape[:2], points are (u, v), and unseen corners NaN"
+            f"{owner}: {name} must lie in the image of {size_name} {size}; got {number} of {total} corners outside, in "
+            f"{_views_of(views if views.any() else out.sum(-1))}, from {low} to {high}. {size_name} is "
+            "(height, width) of all images, as image.shape[:2], points are (u, v), and unseen corners NaN"
         )
 
 

@@ -1,4 +1,4 @@
-"""The pose of an object whose points are known, from the pixels at which a camera sees them."""
+"""The pose of an object with known points, from the pixels at which a camera sees them."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ from camtorch.values.module import remade
 from camtorch.values.threads import on_one_thread
 
 _LEAST = 4  # points
-_FEW = 5  # points, that may have minima far from where they start
-_WORSE = 4.0  # times the least cost: what begins below that may end below it
-_MOVE = 1e-6  # of rays, whose pixels' difference is a derivative
-_THIN = 0.1  # of the extent of points: what is thinner may have the minima of a plane
-_LINE = 1e-6  # of the extent of points: less across is none
-_ROUNDS = 8  # of points that are near, and of the minimum that these have
-# A start is nearly the optimum. The squared distance to the optimum that ends a search is of the variance, in standard
-# deviations; rounding may leave so many px
+_FEW = 5  # points, which may have minima far from their start
+_WORSE = 4.0  # times the least cost: a start below that may lead to less
+_MOVE = 1e-6  # of rays, the step of finite differences
+_THIN = 0.1  # of the extent of points: thinner ones may have the minima of a plane
+_LINE = 1e-6  # of the extent of points: thinner ones are on a line
+_ROUNDS = 8  # of choosing the near points and finding their minimum
+# Starts are near the optimum. `settled` is the squared distance to it, over the variance, at which a search ends, and
+# `nothing` the px that rounding may leave
 _SEARCH = Search(steps=40, settled=1e-7, nothing=1e-9, damping=1e-8)
 
 
@@ -48,14 +48,14 @@ class Pose(_Pose):
     extrinsics: Extrinsics
     """Camera from object, batch *B."""
     rms: Tensor
-    """(*B,) px: the root of the weighted mean over the inliers of the squared distance; infinite where invalid."""
+    """(*B,) px: the root of the weighted mean over the inliers of the squared distance; infinite if invalid."""
     valid: Tensor
     """(*B,) bool."""
     inliers: Tensor
-    """(*B, N) bool: the points that the pose was found from; none where invalid."""
+    """(*B, N) bool: the points from which the pose was found; none if invalid."""
     covariance: Tensor
     """(*B, 6, 6) of (w, dt) where R = exp([w]x) R_found and t = t_found + dt, in radians and the points' unit, for
-    noise of the variance that the inliers leave, the sum of squares over 2 N - 6; NaN where invalid. No graph."""
+    noise of the inliers' variance, the sum of their squares over 2 N - 6; NaN if invalid. No graph."""
 
     def __new__(cls, extrinsics: Extrinsics, rms: Tensor, valid: Tensor, inliers: Tensor, covariance: Tensor) -> Pose:
         pose = super().__new__(cls, extrinsics, rms, valid)
@@ -76,38 +76,45 @@ def solve_pnp(
     weights: Numbers | None = None,
     threshold: float | None = None,
 ) -> Pose:
-    """Return the pose, camera from object, at which known points are seen nearest to pixels: least squares in px.
+    """Find the pose, camera from object, at which known points are seen nearest to pixels: least squares in px.
 
-    Any camera model, rays of any angle, four points or more, on a plane or not, and no start: closed forms on rays give
-    it (`camtorch.calibration.rays`), the Levenberg-Marquardt method the optimum. Points on a plane may have two
-    minima, four points more: all are refined, and the best one is returned.
+    The camera may be of any model, rays may have any angle, and four points or more may lie on a plane or not. A closed
+    form on rays gives the start (`camtorch.calibration.rays`). Points on a plane may have two minima, and four points
+    more: all are refined, and the best pose is returned.
 
-    With a threshold some points may be anywhere: poses of triples of points are compared by how many others agree
-    (RANSAC on rays, `camtorch.calibration.ransac`), and the best one is refined by these alone. The triples are always
-    the same, torch's random state is not touched. From six points that agree on, it is not chance.
+    With a threshold some points may be wrong: RANSAC on rays (`camtorch.calibration.ransac`) finds the pose on which
+    most points agree, and refines it by these alone. Samples are always the same, and torch's random state is not
+    touched. Six points or more hardly agree by chance.
 
     Pose and rms have first derivatives by pixels, points, weights and the camera's parameters, by the implicit function
-    theorem at the optimum, whatever led there. All is computed in float64 and returned in the widest dtype that came
-    in. It reads values, so it does not work in torch.compile or vmap; pass vmap's batch as a batch dim.
+    theorem at the optimum. Computation is in float64, results are in the widest dtype of the arguments. It reads
+    values, so it does not work in torch.compile or vmap; pass vmap's batch as a batch dim.
 
     Args:
-        camera: with batch dims or without; all broadcast.
+        camera: with batch dims or without; all arguments broadcast.
         object_points: (*B, N, 3) in the object's frame, in any unit; (N, 3) for one object in all rows.
-        pixels: (*B, N, 2). NaN is unseen, as is a pixel that the camera has no ray for. OpenCV's points (N, 1, 2), and
-            (N, 1, 3), are N points.
+        pixels: (*B, N, 2). A point is unseen if its pixel is NaN or has no ray. OpenCV's (N, 1, 2) are N points.
         weights: (*B, N) of the squared residuals, not negative, 0 for unseen; all 1 if left out.
-        threshold: px, how far from its pixel a point may be seen that belongs to the pose; by default all do. Three or
-            four times the standard deviation of the noise keeps nearly all that belong.
+        threshold: px, the largest distance of an inlier from its pixel; by default all points are inliers. Three or
+            four times the standard deviation of the noise keeps nearly all inliers.
 
     Returns:
-        A `Pose`: extrinsics (camera from object, batch *B), rms (*B,) in px and valid (*B,) bool; beside these three
-        its attributes inliers (*B, N) bool and covariance (*B, 6, 6). A row is invalid, its
-        pose finite and without a meaning, if less than four points are seen, or agree, or all of them on one line, if a
-        point or a parameter is not finite, or if no minimum was found that has all seen points in the camera's view.
+        A `Pose`: extrinsics (camera from object, batch *B), rms (*B,) in px and valid (*B,) bool, with the attributes
+        inliers (*B, N) bool and covariance (*B, 6, 6). A row is invalid, its pose finite and without meaning, if fewer
+        than four points are seen or agree, or all of them are on one line, if a point or a parameter is not finite, or
+        if no minimum was found that has all seen points in the camera's view.
 
     Raises:
         TypeError: If `camera` is not a camera or values are not numeric. ValueError: If shapes do not fit, there are
-            less than four points, a weight is negative, or the threshold is not positive.
+            fewer than four points, a weight is negative, or the threshold is not positive.
+
+    Example:
+        >>> camera = ct.KannalaBrandt([300.0, 300.0, 319.5, 239.5], [0.1, 0.0, 0.0, 0.0])
+        >>> corners = [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 1.0, 0.0], [0.0, 1.0, 0.0]]
+        >>> pixels, _ = camera.project(ct.Extrinsics([0.3, 0.0, 0.0], [0.1, 0.2, 5.0])(corners))
+        >>> pose, rms, valid = ct.solve_pnp(camera, corners, pixels)
+        >>> [round(value, 2) for value in pose.translation.tolist()]
+        [0.1, 0.2, 5.0]
     """
     if threshold is not None:
         threshold = as_number(threshold, "threshold", "solve_pnp")
@@ -147,7 +154,7 @@ def _of_each_model(
     fields = points, seen_at, given[..., None]
     leads = [tuple(field.shape[:-2]) for field in fields]
     if any(lead not in ((), (1,), (count,)) for lead in leads):
-        raise ValueError(f"{owner}: a Mixed of {count} cameras takes batch dims () or ({count},); got {leads}")
+        raise ValueError(f"{owner}: batch dims must be () or ({count},) with a Mixed of {count} cameras; got {leads}")
     found = []
     for rows, group in camera.groups:
         mine = [field[rows] if field.shape[:-2] == (count,) else field for field in fields]
@@ -169,7 +176,7 @@ def _identity() -> Extrinsics:
 
 
 class _Given(NamedTuple):
-    """What users pass, checked, in float64, with graphs where there are."""
+    """The arguments, checked, in float64, with their graphs."""
 
     camera: Camera  # of B rows, or of none for all
     points: Tensor  # (B or 1, N, 3)
@@ -190,10 +197,10 @@ class _Given(NamedTuple):
         given = None if weights is None else as_tensor(weights, "weights", owner, device)
         shapes = f"object_points {tuple(points.shape)} and pixels {tuple(seen_at.shape)}"
         if points.shape[-2] != count:
-            hint = "Rows of fewer points are padded with NaN pixels"
-            raise ValueError(f"{owner}: {shapes} are not the same number of points. {hint}")
+            hint = "Pad rows of fewer points with NaN pixels"
+            raise ValueError(f"{owner}: object_points and pixels must be as many points; got {shapes}. {hint}")
         if count < _LEAST:
-            raise ValueError(f"{owner}: points must be at least {_LEAST}; got {shapes}")
+            raise ValueError(f"{owner}: points must be at least {_LEAST} a row; got {shapes}")
         if given is not None:
             if given.shape[-1:] != (count,):
                 raise ValueError(f"{owner}: weights must be (*B, N) with N = {count}; got shape {tuple(given.shape)}")
@@ -204,8 +211,8 @@ class _Given(NamedTuple):
             batch = broadcast_shapes(camera.batch_shape, *leads)
         except ValueError:
             raise ValueError(
-                f"{owner}: the batch dims of {shapes}, weights {leads[2]} and the camera's "
-                f"{tuple(camera.batch_shape)} do not fit"
+                f"{owner}: batch dims must broadcast; got {shapes}, weights of {leads[2]} and a camera of "
+                f"{tuple(camera.batch_shape)}"
             ) from None
         dtype = working_dtype(points, seen_at, *camera._tensors)
 
@@ -228,7 +235,7 @@ def _compiled(given: _Given, threshold: float | None) -> Solved | None:
 
 
 class _Task(NamedTuple):
-    """B rows: what is unseen has weight 0 and is finite."""
+    """The problems of B rows, in which unseen points have weight 0 and are finite."""
 
     camera: Camera  # of B rows, or of none for all
     points: Tensor  # (B, N, 3) about their middles
@@ -243,7 +250,7 @@ class _Task(NamedTuple):
         weights = torch.ones_like(pixels[..., 0]) if given.weights is None else given.weights
         with torch.no_grad():
             rays, seen = given.camera.unproject(pixels)
-            # a sum shows what is not finite, and these powers what would not be
+            # a sum shows values that are not finite, and these powers values that would overflow
             seen = seen & torch.isfinite(points.square().sum(-1).square() + weights)
             counts = (seen & (weights > 0))[..., None]
             middles = torch.where(counts, points, 0.0).sum(-2) / counts.sum(-2).clamp(min=1)
@@ -262,7 +269,7 @@ class _Task(NamedTuple):
 def _consensus(task: _Task, threshold: float) -> tuple[Tensor, Tensor]:
     """Return the poses on which most points agree: rotations (B, 3, 3), translations (B, 3)."""
     # finite differences are accurate enough to search for poses
-    moves = _MOVE * torch.eye(4, 3, dtype=task.rays.dtype, device=task.rays.device)  # the last one: none
+    moves = _MOVE * torch.eye(4, 3, dtype=task.rays.dtype, device=task.rays.device)  # the last one is no step
     pixels, seen = task.camera.project((task.rays[:, :, None] + moves).flatten(1, 2))
     pixels, seen = pixels.unflatten(1, (-1, 4)), seen.unflatten(1, (-1, 4)).all(-1)
     slopes = ((pixels[:, :, :3] - pixels[:, :, 3:]) / _MOVE).mT
@@ -270,14 +277,14 @@ def _consensus(task: _Task, threshold: float) -> tuple[Tensor, Tensor]:
 
 
 def _searched(given: _Given, threshold: float | None) -> Solved:
-    """Solve on any device, for any camera."""
+    """Return the poses on any device, for any camera."""
     given = given._replace(points=given.points.detach(), pixels=given.pixels.detach())
     task = _Task.of(given if given.weights is None else given._replace(weights=given.weights.detach()))
     weights = task.weights
     if threshold is None:
         starts = poses_from_rays(task.points, task.rays, weights)
         found = _least([_minimum(task, *(t[:, i] for t in starts)) for i in range(2)])
-        # of points on a plane the other minimum may be one of pixels, and none of rays: of few, and of much noise
+        # the other minimum of points on a plane may be one for pixels and not for rays, with few points or much noise
         share = task.weights / task.weights.sum(-1, keepdim=True)
         centre = (share[..., None] * task.points).sum(-2)
         about = task.points - centre[:, None]
@@ -307,7 +314,7 @@ def _searched(given: _Given, threshold: float | None) -> Solved:
             found = _minimum(task, found.rotations, found.translations, _spread(task.points, near))
             before, near = near, _near(task._replace(weights=weights), found.rotations, found.translations, threshold)
         found = found._replace(costs=torch.where((near == before).all(-1), found.costs, torch.inf))
-    # with what the noise does to them, of turns and of shifts of the origin
+    # the covariance of turns and of shifts of the origin
     good = torch.isfinite(found.costs)
     inliers = (task.weights > 0) & good[:, None]
     eye = torch.eye(6, dtype=found.costs.dtype, device=found.costs.device)
@@ -327,7 +334,7 @@ def _searched(given: _Given, threshold: float | None) -> Solved:
 class _Found(NamedTuple):
     """Minima of a search, a row each."""
 
-    costs: Tensor  # (B,), infinite where there is none
+    costs: Tensor  # (B,), infinite if there is none
     rotations: Tensor  # (B, 3, 3)
     translations: Tensor  # (B, 3)
     triangles: Tensor  # (B, 6, 7): of the derivatives by turn and shift, and of the residuals
@@ -365,6 +372,6 @@ def _spread(points: Tensor, inliers: Tensor) -> Tensor:
     counts = weights.sum(-1)
     centred = points - (weights[..., None] * points).sum(-2, keepdim=True) / counts.clamp(min=1)[:, None, None]
     moments = (weights[..., None] * centred).mT @ centred
-    # of eigenvalues a > b > c, (a + b + c)^2 and 2 (a b + b c + c a)
+    # with eigenvalues a > b > c, these are (a + b + c)^2 and 2 (a b + b c + c a)
     whole = moments.diagonal(dim1=-2, dim2=-1).sum(-1).square()
     return (counts >= _LEAST) & (whole - moments.square().sum((-1, -2)) > 2 * _LINE**2 * whole)

@@ -1,4 +1,4 @@
-"""The pose on which most of the seen points agree, by samples: RANSAC on rays of any angle."""
+"""The pose on which most seen points agree, by random samples: RANSAC on rays of any angle."""
 
 from __future__ import annotations
 
@@ -15,26 +15,26 @@ from camtorch.native.library import library
 from camtorch.poses.rotations import small_turn
 from camtorch.values.threads import spread, thread_count
 
-LEAST = 4  # points that make a pose
-_CONVINCING = 6  # points that agree by chance too rarely to be looked for in vain
-_FIRST, _NEXT = 512, 1024  # samples of the rounds
-_SURE = 10.0  # samples without an outlier, to be expected, that end the search
-# samples at most: of many points of which hardly any agree there would be no end; and without compiled code
+LEAST = 4  # points that determine a pose
+_CONVINCING = 6  # points: fewer may agree by chance
+_FIRST, _NEXT = 512, 1024  # samples in the first round and in each further one
+_SURE = 10.0  # the expected number of samples without an outlier at which the search ends
+# the most samples, for points of which hardly any agree: of three points, and of four without compiled code
 _MOST, _MOST_OF_FOUR = 1 << 17, 1 << 14
-_TRIED, _STEPS = 8, 3  # the best poses of a round, and how often each is fitted to the points near it
-_AT_ONCE = 1 << 19  # numbers of a tensor
-_SHARED = 1 << 16  # points of samples that threads are woken for
+_TRIED, _STEPS = 8, 3  # the best poses of a round, and the fits of each to the points near it
+_AT_ONCE = 1 << 19  # numbers of a tensor, at most
+_SHARED = 1 << 16  # points of samples for each further thread
 _Agreement = struct.Struct("12qdq").pack  # `Agreement` of native/consensus.h
 
 
 class _Lines(NamedTuple):
-    """Points and the rays that shall see them, of B rows.
+    """B rows of points and their rays.
 
-    A pose sees a point away from its ray by about the ray's slope times the point, over the point's depth on the ray.
+    A posed point is about (the ray's slopes times the point) / (the point's depth along the ray) px from its pixel.
     """
 
     points: Tensor  # (B, N, 3)
-    measures: Tensor  # (B, 3, N, 3): the slopes of u and v by the ray, px, and the ray; zeros for what is unseen
+    measures: Tensor  # (B, 3, N, 3): the slopes of u and v by the ray, px, and the ray; zeros if unseen
     threshold: float
 
     def forms(self) -> Tensor:
@@ -71,13 +71,13 @@ class _Lines(NamedTuple):
 def consensus(points: Tensor, rays: Tensor, slopes: Tensor, seen: Tensor, threshold: float) -> tuple[Tensor, Tensor]:
     """Return the poses, camera from object, of least squared distances of points from rays, clipped at a threshold.
 
-    Few points are drawn (by a generator of its own, the same for all rows), as often as it takes to meet some without
-    an outlier several times, judged by how many agree with the best pose so far. Three of them have up to four poses
-    (native/consensus.c), four those of their rays (`poses_from_rays`). The best are fitted to the points near them: O.
-    Chum, J. Matas and J. Kittler, Locally Optimized RANSAC, DAGM 2003; P. Torr and A. Zisserman, MLESAC, CVIU 2000.
+    Samples of few points are drawn, by one generator for all rows, until several without an outlier are expected, by
+    the points that agree with the best pose so far. Three points have up to four poses (native/consensus.c), four those
+    of `poses_from_rays`. The best poses are fitted to the points near them: O. Chum, J. Matas and J. Kittler, Locally
+    Optimized RANSAC, DAGM 2003; P. Torr and A. Zisserman, MLESAC, CVIU 2000.
 
-    Points (B, N, 3) are finite, rays (B, N, 3) of unit length; slopes (B, N, 2, 3) are the pixels by the rays, across
-    them; what is not `seen`, bool (B, N), has no part in it. The threshold is in px.
+    Points (B, N, 3) are finite, rays (B, N, 3) of unit length; slopes (B, N, 2, 3) are the derivatives of pixels by
+    rays, across these; points that are not `seen`, bool (B, N), are ignored. The threshold is in px.
     """
     measures = torch.cat((slopes, rays[..., None, :]), -2).transpose(1, 2)
     lines = _Lines(points, torch.where(seen[:, None, :, None], measures, 0.0), threshold)
@@ -105,11 +105,11 @@ def consensus(points: Tensor, rays: Tensor, slopes: Tensor, seen: Tensor, thresh
 
 
 class _Search(NamedTuple):
-    """What rounds of samples read, and what they leave: the best poses (B, 3, 4), costs and points near them (B,)."""
+    """The inputs of rounds, and their results: the best poses (B, 3, 4), costs and numbers of near points (B,)."""
 
     lines: _Lines
-    order: Tensor  # (B, N), those seen first
-    counts: Tensor  # (B,), how many they are
+    order: Tensor  # (B, N), the indices of points, seen ones first
+    counts: Tensor  # (B,), the number of seen points
     best: Tensor
     costs: Tensor
     agree: Tensor

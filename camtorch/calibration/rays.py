@@ -13,15 +13,15 @@ from torch.nn.functional import normalize
 from camtorch.calibration.compiled import can_search, from_rays
 from camtorch.poses.rotations import nearest_rotation, small_turn
 
-_PAIRS = ((0, 1, 2), (1, 3, 4), (2, 4, 5))  # of symmetric matrices, the place among six entries
-_FLAT = 1e-6  # of the points' extent: less counts as none
+_PAIRS = ((0, 1, 2), (1, 3, 4), (2, 4, 5))  # where a symmetric matrix's entries are among its six numbers
+_FLAT = 1e-6  # of the points' extent: less counts as flat
 _SAME = 0.02  # radians between two rotations that are one minimum
-_STARTS, _FEW, _STEPS = 12, 4, 8  # of the search for rotations: those that are begun, and that are gone on with
-_LEAST, _TINY = 1e-15, 1e-300  # added to what is divided by
+_STARTS, _FEW, _STEPS = 12, 4, 8  # rotations to start from, those continued, and steps
+_LEAST, _TINY = 1e-15, 1e-300  # added to divisors
 
 
 class RayPoses(NamedTuple):
-    """Alternatives (B, S), best first: rotations (B, S, 3, 3), translations (B, S, 3), and whether there is one."""
+    """S poses a row, best first: rotations (B, S, 3, 3), translations (B, S, 3), and whether each is valid (B, S)."""
 
     rotations: Tensor
     translations: Tensor
@@ -31,16 +31,16 @@ class RayPoses(NamedTuple):
 def poses_from_rays(points: Tensor, rays: Tensor, weights: Tensor) -> RayPoses:
     """Return the poses, camera from object, at which known points lie on rays; those with the least angles first.
 
-    With the best translation put in, the sum of the points' squared distances from their rays is a quadratic form of
-    the rotation's entries (C.-P. Lu, G. Hager and E. Mjolsness, TPAMI 2000), whose minima are descended to in a fixed
-    number of steps. Points on a plane have up to two, whose normals mirror each other at the line of sight: the starts
-    are the two rotations that the homography between plane and rays leaves (T. Collins and A. Bartoli, Infinitesimal
-    Plane-Based Pose Estimation, IJCV 2014, here on rays). Points in space have one as a rule: the starts are the linear
-    solution, the view from afar, and right-angled turns. Nothing is divided by z: rays may have any angle.
+    With the best translation for a rotation, the sum of the points' squared distances from their rays is a quadratic
+    form of the rotation's entries (C.-P. Lu, G. Hager and E. Mjolsness, TPAMI 2000). A fixed number of steps leads to
+    its minima. Points on a plane have up to two, whose normals mirror each other at the line of sight: the starts are
+    the two rotations that the homography from plane to rays allows (T. Collins and A. Bartoli, Infinitesimal
+    Plane-Based Pose Estimation, IJCV 2014, here on rays). Points in space usually have one: further starts are the
+    linear solution, the view from afar and turns by right angles. No formula divides by z, so rays may have any angle.
 
-    Points and unit rays are (B, N, 3), weights (B, N) not negative, 0 for unseen; S = 2. A pose is valid if four points
-    or more are seen that are on no line, everything is finite, and most lie ahead on their rays; the second one if it
-    is another minimum. Others are finite and mean nothing.
+    Points and unit rays are (B, N, 3), weights (B, N) not negative, 0 for unseen; S = 2. A pose is valid if it is
+    finite, four points or more are seen, not all on a line, and most lie ahead on their rays; the second pose must also
+    be another minimum. Invalid poses are finite and have no meaning.
     """
     if can_search(points, rays, weights):
         return RayPoses(*from_rays(points, rays, weights))
@@ -54,7 +54,7 @@ def poses_from_rays(points: Tensor, rays: Tensor, weights: Tensor) -> RayPoses:
     variances, axes = torch.linalg.eigh((weights[..., None] * centred).mT @ centred)
     extent = variances.clamp(min=0.0).sqrt()
     size = extent[:, 2].clamp(min=_TINY)
-    axes = axes.flip(-1)  # from the plane's frame, or that of the points' main axes, in units of their extent
+    axes = axes.flip(-1)  # the rotation from the frame of the plane, or of the points' main axes
     axes = torch.cat((axes[..., :2], torch.linalg.cross(axes[..., 0], axes[..., 1])[..., None]), -1)
     local = centred @ axes / size[:, None, None]
     enough = ((weights > 0).sum(-1) >= 4) & (extent[:, 1] > _FLAT * size)
@@ -73,19 +73,19 @@ def poses_from_rays(points: Tensor, rays: Tensor, weights: Tensor) -> RayPoses:
     translations = distances.translations(rotations)
     placed = local[:, None] @ rotations.mT + translations[:, :, None]
     cosines = (normalize(placed, dim=-1) * rays[:, None]).sum(-1)
-    # a plane behind its rays is as near to them as the plane ahead that it is by a point reflection
+    # a plane behind its rays fits them as well as its point reflection ahead of them
     side = torch.where(flat[:, None] & ((weights[:, None] * cosines.sign()).sum(-1) < 0), -1.0, 1.0).to(cosines)
     rotations = rotations * torch.stack((side, side, torch.ones_like(side)), -1)[:, :, None]
     translations, cosines = translations * side[..., None], cosines * side[..., None]
     ahead = (weights[:, None] * cosines.sign()).sum(-1) > 0
-    # monotonous in the angles up to the half turn
+    # best first: 1 - cosine grows with the angle up to a half turn
     order = (weights[:, None] * (1 - cosines)).sum(-1).nan_to_num(torch.inf).argsort(-1)
     rotations, translations, ahead = (_taken(t, order) for t in (rotations, translations, ahead))
     rotations = rotations @ axes.mT[:, None]
     translations = translations * size[:, None, None] - (rotations @ centre[:, None, :, None])[..., 0]
     finite = torch.isfinite(rotations).all(-1).all(-1) & torch.isfinite(translations).all(-1)
     valid = finite & ahead & enough[:, None]
-    # the trace of the turn between them
+    # by the trace of the turn from one to the other
     same = (rotations[:, 0] * rotations[:, 1]).sum((-1, -2)) > 1 + 2 * math.cos(_SAME)
     valid = torch.stack((valid[:, 0], valid[:, 1] & ~same), -1)
     rotations = torch.where(finite[..., None, None], rotations, torch.eye(3).to(rotations))
@@ -103,7 +103,7 @@ def _frame(direction: Tensor) -> Tensor:
 
 
 def _sight(rays: Tensor, weights: Tensor) -> Tensor:
-    """Return the direction (B, 3) in the middle of rays (B, N, 3)."""
+    """Return the mean direction (B, 3) of rays (B, N, 3), the line of sight."""
     return normalize((weights[..., None] * rays).sum(-2), dim=-1)
 
 
@@ -122,8 +122,8 @@ def _moments(rays: Tensor, points: Tensor, weights: Tensor) -> Tensor:
 
 
 def _homography(sight: Tensor, distances: _Distances) -> Tensor:
-    """Return homographies (B, 3, 3) from the plane's points (x, y, 1) to rays; sight (B, 3) points about at them."""
-    # the first two columns' entries across the line of sight and, of which narrow views tell little, along it
+    """Return homographies (B, 3, 3) from the plane's points (x, y, 1) to rays of mean direction `sight` (B, 3)."""
+    # the first two columns' entries across the line of sight, and along it, where narrow views hardly determine them
     frame = _frame(sight)
     basis = torch.stack((frame.mT, torch.zeros_like(frame)), -1)
     basis = torch.stack((basis, basis.flip(-1)), 2).flatten(1, 2)
@@ -143,7 +143,7 @@ class _Distances(NamedTuple):
 
     form: Tensor  # (B, 9, 9)
     to_translation: Tensor  # (B, 3, 9)
-    to_depth: Tensor  # (B, 9): the points' mean distance along their rays
+    to_depth: Tensor  # (B, 9), to the points' mean distance along their rays
 
     @classmethod
     def between(cls, local: Tensor, rays: Tensor, weights: Tensor) -> _Distances:
@@ -169,11 +169,11 @@ class _Distances(NamedTuple):
         return ((entries @ self.form) * entries).sum(-1)
 
     def depths(self, rotations: Tensor) -> Tensor:
-        """Return the depths (B, S) for rotations (B, S, 3, 3)."""
+        """Return the points' mean depths (B, S) for rotations (B, S, 3, 3)."""
         return (rotations.flatten(2) @ self.to_depth[..., None])[..., 0]
 
     def descended(self, rotations: Tensor, steps: int) -> Tensor:
-        """Return rotations (B, S, 3, 3) after Levenberg-Marquardt steps: three unknowns each, without the points."""
+        """Return rotations (B, S, 3, 3) after Levenberg-Marquardt steps of three unknowns, which read no points."""
         costs = self.of_rotations(rotations)
         damping = torch.full_like(costs, 1e-2)
         eye = torch.eye(3, dtype=costs.dtype, device=costs.device)
@@ -197,8 +197,8 @@ def _planar_starts(rays: Tensor, weights: Tensor, distances: _Distances) -> Tens
     """Return the two rotations (B, 2, 3, 3) that the homography allows."""
     homography = _homography(_sight(rays, weights), distances)
     frame = _frame(normalize(homography[..., 2], dim=-1))
-    # across the line of sight the columns of the rotation are known up to the distance, and the larger singular value
-    # of that part of a rotation is one
+    # the columns' parts across the line of sight are known up to a scale: the larger singular value of such a part of
+    # a rotation is one
     across = frame[..., :2].mT @ homography[..., :2]
     (a, b), (c, d) = ((across[:, i, 0], across[:, i, 1]) for i in range(2))
     largest = (torch.hypot(a + d, b - c) + torch.hypot(a - d, b + c)) / 2
@@ -218,13 +218,13 @@ def _rotations_in_space(local: Tensor, rays: Tensor, weights: Tensor, distances:
     frame = _frame(_sight(rays, weights))
     linear = torch.linalg.eigh(distances.form).eigenvectors[..., 0].view(-1, 1, 3, 3)
     linear = torch.where(distances.depths(linear)[..., None, None] < 0, -linear, linear)
-    # from afar, the two rows across the line of sight in units of the distance
+    # from afar, the two rows across the line of sight, up to the distance
     rows = (weights[..., None] * (rays @ frame[..., :2])).mT @ local
     rows = normalize(rows / (weights[..., None] * local.square()).sum(-2).clamp(min=_TINY)[:, None], dim=-1)
     from_afar = frame @ torch.cat((rows, torch.linalg.cross(rows[:, :1], rows[:, 1:])), 1)
     nearest = nearest_rotation(torch.cat((linear, from_afar[:, None]), 1))
     planar = _planar_starts(rays, weights, distances)
-    # (24, 3, 3): the rotations that take axes to axes
+    # (24, 3, 3): the rotations that map axes to axes
     matrices = torch.eye(3, dtype=frame.dtype, device=frame.device)[torch.tensor([*permutations(range(3))])]
     signs = torch.cartesian_prod(*[frame.new_tensor([1.0, -1.0])] * 3)
     matrices = (matrices[:, None] * signs[:, None]).flatten(0, 1)

@@ -1,4 +1,4 @@
-"""Several cameras from what they saw of the same boards: `calibrate_rig` and its result."""
+"""The calibration of several cameras from views of the same boards: `calibrate_rig` and its result."""
 
 from __future__ import annotations
 
@@ -30,50 +30,50 @@ class RigCalibration:
     rig: Rig
     """The cameras, float64, and for each the extrinsics: camera from the first camera."""
     boards: Extrinsics
-    """First camera from board, of batch dims (V,)."""
+    """First camera from board, with batch dims (V,)."""
     rms: float
     """The root of the mean squared length of the residuals of all cameras, per point."""
     sigma: float
     """The standard deviation of a coordinate of a pixel, in all cameras; see `Calibration.sigma`."""
     cameras: dict[str, Calibration]
-    """What belongs to one camera, by its name: as if it had been calibrated alone, but by what all have seen."""
+    """The calibration of each camera, by name, as from `calibrate`, but from the views of all cameras."""
     mount_std: dict[str, Tensor]
-    """(6,) the standard deviations of each camera's pose: of its turn in radians, about its own axes, and its shift."""
+    """Standard deviations (6,) of each camera's pose: of its turn in radians, about its own axes, and its shift."""
     converged: bool
-    """Whether nothing was left to gain when the search ended."""
+    """Whether the search ended at an optimum."""
     bend: tuple[float, float]
-    """As in `Calibration`."""
+    """The bend of the board, as in `Calibration`."""
     views: tuple[int, ...]
-    """The numbers of the views that some camera saw, of those that were passed, without copies of others."""
+    """The indices of passed views that some camera saw, without copies of others."""
 
     @property
     def residuals(self) -> dict[str, Any]:
-        """By the name of a camera: projected minus observed, in the form of its image points, NaN where unseen."""
+        """Projected minus observed pixels, by name of the camera, in the form of its image points; NaN if unseen."""
         return {name: camera.residuals for name, camera in self.cameras.items()}
 
     @property
     def inliers(self) -> dict[str, Any]:
-        """By the name of a camera, as in `Calibration`."""
+        """Inliers by name of the camera, as in `Calibration`."""
         return {name: camera.inliers for name, camera in self.cameras.items()}
 
     @property
     def parameter_names(self) -> dict[str, tuple[str, ...]]:
-        """By the name of a camera."""
+        """Names of parameters, by name of the camera."""
         return {name: camera.parameter_names for name, camera in self.cameras.items()}
 
     @property
     def covariance(self) -> dict[str, Tensor]:
-        """By the name of a camera, (P, P) of its parameters."""
+        """Covariances (P, P) of the parameters, by name of the camera."""
         return {name: camera.covariance for name, camera in self.cameras.items()}
 
     @property
     def std(self) -> dict[str, Tensor]:
-        """By the name of a camera, (P,) of its parameters."""
+        """Standard deviations (P,) of the parameters, by name of the camera."""
         return {name: camera.std for name, camera in self.cameras.items()}
 
     @property
     def warnings(self) -> list[str]:
-        """Those of all cameras, each with the camera's name; see `Calibration.warnings`."""
+        """Warnings of all cameras, each with the camera's name; see `Calibration.warnings`."""
         return [f"{name}: {text}" for name, camera in self.cameras.items() for text in camera.warnings]
 
     def __repr__(self) -> str:
@@ -109,21 +109,21 @@ def calibrate_rig(
     bend: bool = False,
     progress: Callable[[int, float], None] | None = None,
 ) -> RigCalibration:
-    """Calibrate cameras that see the same boards, and find where they are.
+    """Calibrate cameras that see the same boards, and find their poses.
 
-    Not every camera has to see every board; but each has to see some together with others, so that all are linked.
+    A camera may miss boards, but must see some together with others, so that all cameras are linked.
 
     Args:
-        models: by the name of a camera: a class, its key, or a camera to start from. The first camera's frame is that
-            of the rig.
-        object_points: (N, 3) for all views, (V, N, 3), or a list of (N_i, 3): of the boards, the same for all cameras.
-        image_points: by the name of a camera, as `calibrate` takes them, of V views at the same times: None or NaN
-            where it did not see the board.
-        image_sizes: by the name of a camera, (height, width).
-        count: as in `calibrate`, one for all or by the name of a camera; likewise `fixed`.
-        start: by the name of a camera: cameras to start from.
-        fixed: names of parameters that are held; "all" holds a camera's intrinsics and distortion.
-        loss: as in `calibrate`; likewise the others.
+        models: a class, its key, or a camera to start from, by name of the camera. The first camera's frame is that of
+            the rig.
+        object_points: (N, 3) for all views, (V, N, 3), or a list of (N_i, 3), the same for all cameras.
+        image_points: by name of the camera, as in `calibrate`, of V views at the same times: None or NaN if it did not
+            see the board.
+        image_sizes: (height, width), by name of the camera.
+        count: as in `calibrate`, for all cameras or by name.
+        start: cameras to start from, by name.
+        fixed: as in `calibrate`, for all cameras or by name; "all" holds a camera's intrinsics and distortion.
+        loss: as in `calibrate`, like all other arguments.
         loss_scale: px.
         bend: whether the board may be bent.
         progress: called after each step of the last search with its number and the cost.
@@ -138,7 +138,7 @@ def calibrate_rig(
         stray = [name for name in given if name not in by_name] if isinstance(given, Mapping) else []
         if stray:
             unknown = ", ".join(map(repr, stray))
-            raise ValueError(f"{owner}: no camera is called {unknown}; there are {', '.join(by_name)}")
+            raise ValueError(f"{owner}: names must be those of cameras, {', '.join(by_name)}; got {unknown}")
     middle, searches = middle_of([seen for seen, _ in by_name.values()]), []
     for name, (seen, layout) in by_name.items():
         of = f"{owner}: {name}"
@@ -173,8 +173,8 @@ def calibrate_rig(
     )
     if not result.converged:
         warn(
-            f"{owner}: the search did not end at an optimum (rms {result.rms:.4g} px); do not use it. See its "
-            "warnings, and whether each view was taken by all cameras at the same moment"
+            f"{owner}: the search did not end at an optimum (rms {result.rms:.4g} px). Do not use the result; see its "
+            "warnings, and check that all cameras took each view at the same moment"
         )
     return result
 
@@ -185,7 +185,7 @@ def _of(given: Any, name: str, otherwise: Any) -> Any:
 
 
 class _Alone(NamedTuple):
-    """A camera by itself: parameters (1, 4 + n), and the poses of boards (1, V), where it has them, bool (V,)."""
+    """A camera calibrated alone: parameters (1, 4 + n), boards' poses (1, V), and whether it has these, bool (V,)."""
 
     parameters: Tensor
     boards: Poses
@@ -201,7 +201,7 @@ def _alone(search: Search) -> _Alone:
 
 
 def _joined(observed: list[CameraObservations], alone: list[_Alone], free: Free) -> State:
-    """Return the start: mounts by pairs that see the same boards, boards by the camera that sees each best."""
+    """Return the start: mounts from pairs that see the same boards, boards from the camera that sees each best."""
     mounts = Poses.none(1, len(alone), alone[0].parameters)
     turns, shifts = mounts.rotations[0], mounts.translations[0]
     together = torch.stack([one.has_pose for one in alone]).double()
@@ -229,7 +229,7 @@ def _joined(observed: list[CameraObservations], alone: list[_Alone], free: Free)
 
 
 def _between(a: _Alone, b: _Alone) -> tuple[Tensor, Tensor]:
-    """Return the pose from camera a to b in the middle of those that each of the boards gives."""
+    """Return the pose from camera a to b: of those that each board gives, the one nearest to all others."""
     both = a.has_pose & b.has_pose
     (from_a, at_a), (from_b, at_b) = ((t[0, both] for t in one.boards) for one in (a, b))
     rotations = from_b @ from_a.mT

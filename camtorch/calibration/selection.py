@@ -1,4 +1,4 @@
-"""Which model fits a lens: cross-validation over views."""
+"""The choice of a model for a lens, by cross-validation over views."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ CANDIDATES: tuple[tuple[str, int], ...] = (  # models that are tried, with their
 )
 _FOLDS = 5
 _NOTHING = 1e-6  # px: errors up to here are rounding
-_WORSE = 0.01  # the part by which an error may be larger without a reason to take more coefficients
-_MUCH_WORSE = 0.05  # the part that is a reason, however much views differ
+_WORSE = 0.01  # the part by which an error may be larger before more coefficients are taken
+_MUCH_WORSE = 0.05  # the part above which they are taken, however much views differ
 
 
 @dataclass
@@ -42,8 +42,8 @@ class Trial:
 
     model: str
     count: int
-    rms: float  # px per point of all views together, NaN where it failed
-    held_out: float  # px per point of views that the camera was not fitted to, only their poses; NaN where it failed
+    rms: float  # px per point of all views together, NaN if it failed
+    held_out: float  # px per point of held-out views, to which only poses were fitted; NaN if it failed
     errors: Array  # (V,) mean squared of each view, held out
     reason: str = ""  # why it failed, or empty
 
@@ -82,11 +82,11 @@ def select(
 ) -> Selection:
     """Find the model that predicts held-out views best, the simplest if several are about equal.
 
-    Each of five parts of the views is held out once: a camera is fitted to the others, and on that part only the poses
-    are. The model with the smallest error is taken, or one with fewer coefficients if it is worse by no more than 1 %,
-    or by no more than 5 % and the standard error of the difference by views.
+    Each of five parts of the views is held out once: a camera is fitted to the others, and only the poses to that part.
+    The model with the smallest error is chosen, or one with fewer coefficients if it is worse by at most 1 %, or by at
+    most 5 % and at most the standard error of the views' difference.
 
-    Arguments are those of `calibrate`; names in `fixed` that a model does not have are left out, and progress is called
+    Arguments are those of `calibrate`; `fixed` may name parameters that a model does not have, and `progress` is called
     with the part that is done. candidates: models and their numbers of coefficients.
     """
     seen, layout = as_observations(object_points, image_points, image_size, "select")
@@ -104,7 +104,7 @@ def select(
         try:
             numbers, errors = np.arange(len(weights)), np.full(len(weights), np.nan)
             with warnings.catch_warnings():
-                warnings.simplefilter("ignore", UserWarning)  # a trial: what is amiss is in its numbers
+                warnings.simplefilter("ignore", UserWarning)  # the numbers of a trial show what is wrong
                 if not (whole := calibrated(numbers, model, count=count, **options)).converged:
                     raise ValueError("no optimum was found")
                 for fold in range(min(_FOLDS, len(numbers))):
@@ -114,14 +114,14 @@ def select(
                     errors[out] = np.nanmean(np.square(np.asarray(posed.residuals)).sum(-1), axis=1)
             held_out = math.sqrt(float((weights * errors).sum() / weights.sum()))
             if not math.isfinite(held_out):
-                raise ValueError("views that it was not fitted to are lost")
+                raise ValueError("held-out views have corners without a pixel")
             trials.append(Trial(model, count, whole.rms, held_out, errors))
         except ValueError as error:
             trials.append(Trial(model, count, math.nan, math.nan, np.full(len(pixels), np.nan), str(error)))
         if progress is not None:
             progress(number / len(tried))
     if not (fitted := [trial for trial in trials if not trial.reason]):
-        raise ValueError(f"select: no model can be fitted; {trials[0].model}: {trials[0].reason}")
+        raise ValueError(f"select: one of candidates must fit; got none. {trials[0].model}: {trials[0].reason}")
     least = min(fitted, key=lambda trial: trial.held_out)
 
     def as_good(trial: Trial) -> bool:
@@ -129,7 +129,7 @@ def select(
         noise = float(more.std()) / math.sqrt(len(more))
         return worse <= _WORSE or (worse <= _MUCH_WORSE and float(more.mean()) <= noise)
 
-    best = min(filter(as_good, fitted), key=lambda trial: trial.count)  # of as many the first, which is better known
+    best = min(filter(as_good, fitted), key=lambda trial: trial.count)  # the first of as many, which is better known
     named = f"{best.model} with {best.count} coefficients" if best.count else best.model
     off = f"{best.held_out:.4g} px on views that it was not fitted to"
     if best is least:

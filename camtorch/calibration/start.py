@@ -1,4 +1,4 @@
-"""A calibration from nothing: about which lens took images of known boards, and from where."""
+"""The start of a calibration without a known camera: an approximate lens, and the poses of the boards."""
 
 from __future__ import annotations
 
@@ -18,45 +18,45 @@ from camtorch.convert import fitting, views
 from camtorch.models import UCM, KannalaBrandt
 from camtorch.rays.lattices import angles_from_axis
 
-# Lenses that are tried. The unified camera is a perspective one for 0, a stereographic one for 1/2, and nearly an
-# equidistant or equisolid one for 0.65; degrees from the axis, at the seen pixel that is furthest from the middle
+# The lenses tried: alpha of a unified camera (0 is perspective, 1/2 stereographic, 0.65 nearly equidistant or
+# equisolid), and the angle from the axis, in degrees, of the seen pixel that is furthest from the middle
 _TRIED = {
     0.0: (4.0, 7.0, 12.0, 18.0, 27.0, 38.0, 51.0, 66.0),
     0.5: (12.0, 26.0, 44.0, 64.0, 84.0, 106.0),
     0.65: (14.0, 28.0, 46.0, 66.0, 88.0),
 }
-_VIEWS, _POINTS = 24, 100  # that the search looks at
-_KEPT, _UNLIKE = 3, 2.0  # of the lenses tried, and up to how many times the error of the best
-_FAR = 4.0  # times that error after the first round: no lens to go on with
-_ROUNDS = 4  # of poses
-_BAD = 2.0  # times the usual error: a view whose pose may be spoilt
-_IN_DOUBT = 4.0  # times the usual error of the better pose: the other one may be it
-_HANDFULS, _HANDFUL = 48, 6  # of corners, of which a pose is made where outliers spoil that of all
-_CHANGED = 0.9  # of the usual error of a view before: then another round is worth it
-_TRIMMED = 0.8  # of the views decide: others may be spoilt
-_LEAST_SCALE = 0.5  # px, of robust weights
+_VIEWS, _POINTS = 24, 100  # at most, in a search
+_KEPT, _UNLIKE = 3, 2.0  # the most lenses kept, and their largest error over the best one's
+_FAR = 4.0  # the largest error over the best one's after the first round
+_ROUNDS = 4  # of finding poses
+_BAD = 2.0  # times the usual error: the pose of such a view may be wrong
+_IN_DOUBT = 4.0  # times the better pose's error: below it the other pose is refined as well
+_HANDFULS, _HANDFUL = 48, 6  # samples, and corners of each, if outliers spoil the pose of all corners
+_CHANGED = 0.9  # of a view's error in the round before: below it another round follows
+_TRIMMED = 0.8  # the part of the views, those with the least errors, that rank a lens
+_LEAST_SCALE = 0.5  # px, the least scale of robust weights
 _NO_PIXEL = 1e3  # px, the error of a corner without a pixel
-_OUTLIER = 3.0  # times the scale
-_LEAST_SLOPE = 1e-3  # of a lens at the axis, that a search starts from
-_WORSE, _LITTLE_WORSE = 2.0, 1.01  # than the best: costs of what is kept
-_ALIKE = 1e-3  # the relative difference of two starts, of one
-_SAME = 1e-7  # the difference of two costs, of one optimum
+_OUTLIER = 3.0  # times the scale: an outlier's error
+_LEAST_SLOPE = 1e-3  # the least slope of a lens at the axis when a search starts
+_WORSE, _LITTLE_WORSE = 2.0, 1.01  # times the least cost: cameras above it are dropped
+_ALIKE = 1e-3  # the relative difference below which two starts are one
+_SAME = 1e-7  # the relative difference below which two costs are of one optimum
 _FEW_STEPS, _STEPS, _MANY_STEPS = 6, 12, 40
-_NEARLY = 1.0  # as `SETTLED`, of a lens that another one follows
-# Coefficients with which the others make a valley that has several deepest places, and where along it to start
+_NEARLY = 1.0  # like `SETTLED`, for a lens from which another fit starts
+# Coefficients along which the cost has a valley with several minima, and the values to start from
 _ALONG = {
     "double_sphere": ("xi", (-0.3, 0.0, 0.3, 0.7)),
     "eucm": ("beta", (0.5, 1.0, 2.0)),
     "mei": ("xi", (0.0, 1.0, 2.0, 4.0)),
 }
-# Numbers of coefficients of further starts: with all of them a lens may fold just beyond the corners, and no step goes
-# across a fold
+# Numbers of coefficients of further starts: with all of them a lens may fold just beyond the corners, and no step
+# crosses a fold
 _LOW_ORDERS = (1, 4)
-_REACH = 1.1  # how much further than the data a start shall reach
-_ERRS = 1.5  # times the scale of another lens: a model that does not fit
-_DOUBTED = 50  # views whose poses are looked at again
-_OTHER = 0.05  # radians, or of the distance, between two poses that are two minima
-_LOST = 0.01  # the part of the corners without a pixel, with which a model is the wrong one
+_REACH = 1.1  # how much further than the corners a start reaches
+_ERRS = 1.5  # times the unified lens' scale: above it the model does not fit
+_DOUBTED = 50  # at most, the views whose poses are checked again
+_OTHER = 0.05  # radians, or part of the distance: poses further apart are two minima
+_LOST = 0.01  # the part of the corners without a pixel above which a model is wrong
 
 
 def start_from_nothing(
@@ -70,10 +70,10 @@ def start_from_nothing(
 ) -> State:
     """Return a camera of the model, B = 1, and the poses of all views, from which an adjustment reaches the optimum.
 
-    Unified cameras of all widths are tried, their axis in the middle of the image: the rays of the pixels give poses in
-    closed form, and those a score. The best few are refined together, and the model is fitted to what is best then,
-    from several starts, with the loss of Cauchy. Parameters that are `fixed` are held: coefficients as in
-    `Camera.ideal`, the principal point in the middle. The loss, in px, decides between cameras nearly as good.
+    Unified cameras of many widths are tried, with the axis in the middle of the image: the pixels' rays give poses in
+    closed form, whose errors rank the cameras. The best few are refined with a Cauchy loss, and the model is fitted to
+    the best one from several starts. Parameters in `fixed` are held: coefficients as in `Camera.ideal`, the principal
+    point in the middle. `loss`, with its scale in px, decides between fits that are nearly as good.
     """
     few, free = _subsample(observations, image_size), _free(model, count, fixed)
     lens = first = _unified(few, image_size, fixed)
@@ -91,8 +91,8 @@ def start_from_nothing(
             inliers = few.seen & (first.errors(few)[0] < _OUTLIER * first.scale)
             furthest = math.degrees(float(angles_from_axis(first.boards.moved(few.points))[0][inliers].amax()))
             raise ValueError(
-                f"calibrate: {one.model.__name__} has no pixels for {lost} of {int(few.seen.sum())} corners, "
-                f"seen up to about {furthest:.0f} degrees from the axis; kannala_brandt and other fisheye models do"
+                f"calibrate: model must have pixels for corners up to about {furthest:.0f} degrees from the axis; got "
+                f"{one.model.__name__}, without {lost} of {int(few.seen.sum())}. Use a fisheye, such as kannala_brandt"
             )
     state = lens.of(slice(1)).state
     if few is not observations:
@@ -145,7 +145,7 @@ def other_cameras(
     model: type[Camera],
     image_size: tuple[int, int],
 ) -> Tensor | None:
-    """Return similar cameras (S, 4 + n) along the model's valley of (1, 4 + n), see `_ALONG`; None without a valley."""
+    """Return cameras (S, 4 + n) fitted from starts along the model's valley, see `_ALONG`, or None if it has none."""
     count = parameters.shape[-1] - 4
     names = ("fx", "fy", "cx", "cy", *(model.names_of(count) or ()))
     along, _ = _ALONG.get(model.key, ("", ()))
@@ -163,7 +163,7 @@ class _Lens(NamedTuple):
     model: type[Camera]
     parameters: Tensor
     boards: Poses
-    scale: float  # px: twice the error that most corners have
+    scale: float  # px: twice the median error of corners
     image_size: tuple[int, int]
 
     @property
@@ -189,7 +189,7 @@ class _Lens(NamedTuple):
     def adjusted(
         self, few: Observations, free: Free, steps: int, worst: float, loss: tuple[str | None, float] | None = None
     ) -> _Lens:
-        """Adjust the cameras, the best first, and drop those whose cost is above `worst` times the least."""
+        """Return adjusted cameras, the best first, without doubles and costs above `worst` times the least."""
         name, scale = loss or ("cauchy", self.scale)
         settled = _NEARLY if loss is None else SETTLED
         observed = _as_seen(self.model, few)
@@ -217,7 +217,7 @@ def _free(model: type[Camera], count: int, fixed: Collection[str]) -> Free:
 
 
 def _subsample(observations: Observations, image_size: tuple[int, int]) -> Observations:
-    """Select the views with the most corners, and enough corners, evenly from the image's middle outwards."""
+    """Return the views with most corners, and enough corners of each, evenly from the image's middle outwards."""
     if len(observations.seen) > _VIEWS:
         observations = observations.of(observations.seen.sum(-1).argsort(descending=True)[:_VIEWS].sort().values)
     points, pixels, seen = observations
@@ -266,7 +266,7 @@ def _posed(
 ) -> tuple[Poses, Tensor]:
     """Return closed-form poses (B, V) for cameras (B,), and errors (B, V, N) in px; NaN if a corner is unseen.
 
-    Each round goes without the outliers of the one before. begun: what the first round finds, where it is known.
+    Each round weighs the outliers of the one before less. begun: the result of the first round, if it is known.
     """
     rays, has_ray = _rays(camera, some)
     shape = has_ray.shape
@@ -322,7 +322,7 @@ def _rays(camera: Camera, some: Observations) -> tuple[Tensor, Tensor]:
 
 
 def _errors(camera: Camera, boards: Poses, some: Observations) -> Tensor:
-    """Return errors (B, V, N) in px for as many cameras, or for one, NaN if a corner is unseen."""
+    """Return errors (B, V, N) in px for B cameras, or one for all, NaN if a corner is unseen."""
     points = boards.moved(some.points)
     pixels, valid = camera.project(points.reshape(len(camera.intrinsics), -1, 3))
     return _lengths(pixels.view(*points.shape[:-1], 2) - some.pixels, valid.view(points.shape[:-1]), some.seen)
@@ -376,7 +376,7 @@ def _fitted(lens: _Lens, few: Observations, model: type[Camera], count: int, fix
         starts = model.fit_start(names, *views.radii(camera, slopes, (_REACH * reach).clamp(max=math.pi)))[:, 0]
     is_fixed = torch.tensor([name in fixed for name in names], dtype=torch.bool, device=slopes.device)
     starts = torch.where(is_fixed, ideal, starts)
-    sets = [(starts, is_fixed)]  # and which of the coefficients stay as they start
+    sets = [(starts, is_fixed)]  # with the coefficients that are held
     along, values = _ALONG.get(model.key, ("", ()))
     order = torch.arange(len(names), device=slopes.device)
     if values and along not in fixed:
@@ -399,7 +399,7 @@ def _fitted(lens: _Lens, few: Observations, model: type[Camera], count: int, fix
     _, valid = fixed_camera(model, parameters[:, :4], begun).project(seen.rays)
     if values or not bool((valid | (seen.weights == 0)).all()):
         parameters = fitting.fit(template, seen, begun[None], slopes, fixed=held)
-    # those that are not as good as the same as an earlier one
+    # cameras that nearly equal an earlier one are dropped
     apart = (parameters[:, None] - parameters).abs() > _ALIKE * (parameters.abs() + _ALIKE)
     parameters = parameters[~(~apart.any(-1)).tril(-1).any(-1)]
     for i, name in enumerate(("cx", "cy"), 2):

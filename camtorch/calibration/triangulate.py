@@ -20,12 +20,12 @@ from camtorch.values.threads import on_one_thread
 
 M = TypeVar("M", bound=BatchedModule)
 
-_STEPS, _DAMPING = 60, 1e-8  # the first damping: the start is nearly the optimum
-_SETTLED = 1e-8  # of the variance: the squared distance to the optimum, in standard deviations, that ends a search
+_STEPS, _DAMPING = 60, 1e-8  # the first damping is low: starts are near the optimum
+_SETTLED = 1e-8  # the squared distance to the optimum, over the variance, at which a search ends
 _NOTHING = 1e-9  # px, that rounding may leave
-_FAR = 100.0  # times the extent of the cameras' positions, where rays start that seem to meet behind the cameras
-_FLEEING = 0.01  # of the distance: a point with a longer step to go is on its way to infinity
-_LEAST, _TINY = 1e-15, 1e-300  # added to what is divided by
+_FAR = 100.0  # times the extent of the cameras' positions: the start of points whose rays meet behind cameras
+_FLEEING = 0.01  # of the distance: a point with a longer next step is on its way to infinity
+_LEAST, _TINY = 1e-15, 1e-300  # added to divisors
 
 
 class Triangulation(NamedTuple):
@@ -34,8 +34,7 @@ class Triangulation(NamedTuple):
     points: Tensor
     """(*N, 3) in the world's frame."""
     rms: Tensor
-    """(*N,) px: the root of the mean, over the cameras that see the point, of the squared distance; infinite where
-    invalid."""
+    """(*N,) px: root mean square of the distances in the cameras that see the point; infinite if invalid."""
     valid: Tensor
     """(*N,) bool."""
 
@@ -45,28 +44,34 @@ class Triangulation(NamedTuple):
 def triangulate(
     cameras: Sequence[Camera] | Camera, extrinsics: Sequence[Extrinsics] | Extrinsics, pixels: Numbers
 ) -> Triangulation:
-    """Return points whose projections are nearest to pixels of C cameras: least squares in px for each point.
+    """Find the points whose projections are nearest to pixels of C cameras: least squares in px for each point.
 
-    Any camera models, rays of any angle. The start is the point nearest to the rays, the optimum the
-    Levenberg-Marquardt method's.
+    Cameras may be of any models, rays of any angle.
 
     Points and rms have first derivatives by pixels, extrinsics and the cameras' parameters, by the implicit function
-    theorem at the optimum. All is computed in float64 and returned in the widest dtype that came in. It looks at
-    values: not for torch.compile and vmap, whose batch goes in as *N.
+    theorem at the optimum. Computation is in float64, results are in the widest dtype of the arguments. It reads
+    values, so it does not work in torch.compile or vmap; pass vmap's batch as *N.
 
     Args:
-        cameras: C cameras without batch dims, in a list, or one for all; a camera with a batch of C is a list too.
-        extrinsics: C poses, camera from world, likewise.
-        pixels: (C, *N, 2); NaN is unseen, as is a pixel that its camera has no ray for.
+        cameras: C cameras without batch dims, in a list; a camera with a batch of C; or one for all.
+        extrinsics: C poses, camera from world, in the same forms.
+        pixels: (C, *N, 2); a point is unseen by a camera if its pixel is NaN or has no ray.
 
     Returns:
-        points (*N, 3) in the world's frame, rms (*N,) in px and valid (*N,) bool. Invalid, finite and without a
-        meaning, is a point that fewer than two cameras see, or whose rays do not meet in front of all of them, as rays
-        that are parallel or diverge.
+        points (*N, 3) in the world's frame, rms (*N,) in px and valid (*N,) bool. A point is invalid, finite and
+        without meaning, if fewer than two cameras see it, or its rays do not meet in front of all of them.
 
     Raises:
         TypeError: If cameras, extrinsics or pixels have a wrong type. ValueError: If shapes or numbers do not fit,
             cameras have further batch dims, or there are fewer than two.
+
+    Example:
+        >>> camera = ct.KannalaBrandt([300.0, 300.0, 319.5, 239.5], [0.1, 0.0, 0.0, 0.0])
+        >>> poses = ct.Extrinsics([[0.0, 0.0, 0.0]] * 2, [[0.0, 0.0, 0.0], [-0.1, 0.0, 0.0]])
+        >>> pixels, _ = camera.project(poses([[[0.5, 0.2, 2.0]]]))  # (2, 1, 2)
+        >>> points, rms, valid = ct.triangulate(camera, poses, pixels)  # (1, 3), (1,), (1,)
+        >>> [round(value, 3) for value in points[0].tolist()]
+        [0.5, 0.2, 2.0]
     """
     device = pixels.device if isinstance(pixels, Tensor) else torch.device("cpu")
     seen_at = as_tensor(pixels, "pixels", "triangulate", device)
@@ -76,7 +81,7 @@ def triangulate(
     given, poses = _listed(cameras, "cameras", Camera, count), _listed(extrinsics, "extrinsics", Extrinsics, count)
     if not len(given) == len(poses) == count:
         raise ValueError(
-            "triangulate: it takes as many cameras as extrinsics and as pixels (C, *N, 2) have rows; got "
+            "triangulate: cameras and extrinsics must be as many as rows of pixels (C, *N, 2); got "
             f"{len(given)} cameras, {len(poses)} extrinsics and pixels {tuple(seen_at.shape)}"
         )
     if count < 2:
@@ -112,7 +117,7 @@ def _listed(modules: Sequence[M] | M, name: str, kind: type[M], count: int) -> l
 
 
 class _Task(NamedTuple):
-    """P points that C cameras see, float64, with graphs where there are: what is unseen is finite."""
+    """P points that C cameras see, float64, with their graphs; unseen pixels are finite."""
 
     cameras: list[Camera]
     rotations: Tensor  # (C, 3, 3)
@@ -135,7 +140,7 @@ def _solved(task: _Task, rays: Tensor) -> tuple[Tensor, Tensor]:
     rotations, translations, pixels = (t.detach() for t in task[1:4])
     seen, views = task.seen.to(pixels), task.seen.sum(0)
     positions, rays = -(rotations.mT @ translations[..., None])[..., 0], rays @ rotations
-    # (P, 3): the points nearest to rays (C, P, 3) from positions (C, 3), then nearest by angle
+    # (P, 3): the points nearest to rays (C, P, 3) from positions (C, 3), by distance, then about by angle
     eye = torch.eye(3, dtype=rays.dtype, device=rays.device)
     weights, nearest = seen, seen.new_zeros(seen.shape[1], 3)
     for _ in range(2):
@@ -154,7 +159,7 @@ def _solved(task: _Task, rays: Tensor) -> tuple[Tensor, Tensor]:
     extent = (positions - positions.mean(0)).norm(dim=-1).amax()
     start = torch.where(_is_ahead(start, positions, rays, task.seen)[:, None], start, middle + _FAR * extent * ahead)
 
-    # a point is the place of a board of one corner, in the frame of the first camera
+    # a point is the position of a board with one corner, in the frame of the first camera
     first, shift = rotations[0], translations[0]
     turns = rotations @ first.mT
     parameters = tuple(torch.cat(camera._tensors, -1).detach()[None] for camera in task.cameras)

@@ -1,4 +1,4 @@
-"""How far a calibration can be trusted: what the noise of the corners does to parameters and to projections."""
+"""The uncertainty of a calibration: the effect of the corners' noise on parameters and projections."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from camtorch.least_squares.equations import Equations
 from camtorch.poses.rotations import skew_matrix
 from camtorch.values.arguments import Numbers, as_coordinates, as_values
 
-_PIXELS = 1 << 15  # that are looked at together
-# Relative to the greatest singular value. Parameters of which a camera has one too many, as the turn of a panorama and
-# its principal point, are not known at all, and its projections are: what one over this times rounding leaves of them
+_PIXELS = 1 << 15  # at once
+# Relative to the greatest singular value. Of a panorama neither the turn nor the principal point is determined, though
+# its projections are: rounding divided by this is their error
 _LEAST = 1e-9
 
 
 class Spread(NamedTuple):
-    """How the noise of the corners moves a camera and its frame, of B problems.
+    """The effect of the corners' noise on a camera and its frame, for B problems.
 
     Independent numbers of variance 1 move the P = 4 + n parameters, the frame's turn (a rotation vector, radians) and
-    its shift by the rows of `factor`. The turn and the shift are those of the mean over the boards, each carried along
-    by its own pose: where a calibration gets the lens wrong it makes up for it by the poses.
+    its shift by the rows of `factor`. Turn and shift are means over the boards, each moved by its own pose, because
+    poses compensate errors of the lens.
     """
 
     model: type[Camera]
@@ -35,21 +35,21 @@ class Spread(NamedTuple):
 
     @property
     def covariance(self) -> Tensor:
-        """(B, P, P) of the parameters; zeros for those that were fixed."""
+        """Covariance (B, P, P) of the parameters; zeros for fixed ones."""
         own = self.factor[:, : self.parameters.shape[-1]]
         return own @ own.mT
 
     @property
     def std(self) -> Tensor:
-        """(B, P)."""
+        """Standard deviations (B, P)."""
         deviations: Tensor = torch.linalg.vector_norm(self.factor[:, : self.parameters.shape[-1]], dim=-1)
         return deviations
 
     def of_pixels(self, pixels: Tensor, distance: Tensor) -> Tensor:
         """Return covariances (B, M, 2, 2) in px^2 of the pixels at which points are seen; NaN if a pixel has no ray.
 
-        Points go to the frame of every board by its pose, back by the pose that the noise made of it, and their mean is
-        projected by the camera that the noise made: mrcal's mean-pcam. distance: (B, M) from the camera, or infinite.
+        Points move to each board's frame by its pose and back by its noisy pose, and the noisy camera projects their
+        mean: mrcal's mean-pcam. distance: (B, M) from the camera, or infinite.
         """
         parts = zip(pixels.split(_PIXELS, 1), distance.split(_PIXELS, 1), strict=True)
         return torch.cat([self._of_pixels(*part) for part in parts], 1)
@@ -61,7 +61,7 @@ class Spread(NamedTuple):
         by_turn = torch.linalg.cross(rays[:, :, None].expand_as(by_ray), by_ray, dim=-1)
         slopes = torch.cat((by_parameters, by_turn, by_ray / distance[..., None, None]), -1)
         moved = slopes @ self.factor[:, None]
-        known = valid & (by_parameters[..., 0, 2] > 0)  # by cx: whether there is a pixel
+        known = valid & (by_parameters[..., 0, 2] > 0)  # the derivative by cx is 0 without a pixel
         return torch.where(known[..., None, None], moved @ moved.mT, torch.nan)
 
     def scaled(self, noise: Tensor) -> Spread:
@@ -74,7 +74,7 @@ def spread(adjusted: Adjusted, model: type[Camera], camera: int) -> Spread:
     equations, state = adjusted.equations, adjusted.state
     parameters, mounts = state.parameters[camera], state.mounts
     shared = shared_factor(equations)
-    # (B, 6, G + 6): the turn and the shift, the mean of all boards, that stem from `shared`, and from their own noise
+    # (B, 6, G + 6): turn and shift, the mean of all boards, by `shared` and by their own noise
     view = equations.view
     corner, right = view[..., :6], view[..., 6:-1]
     diagonal = corner.diagonal(dim1=-2, dim2=-1).abs()
@@ -96,7 +96,7 @@ def spread(adjusted: Adjusted, model: type[Camera], camera: int) -> Spread:
     of_own = [(g, i) for g, (c, i) in enumerate(equations.columns) if c == camera]
     own[:, [i for _, i in of_own]] = shared[:, [g for g, _ in of_own]]
     turn, shift = own[:, count : count + 3], own[:, count + 3 :]
-    # of the frame of the first camera, in that of this one
+    # the first camera's frame, moved to this camera's
     rotation = mounts.rotations[:, camera]
     none = frame.new_zeros(len(frame), 3, frame.shape[-1] - shared.shape[-1])
     turn = torch.cat((turn, none), -1) + rotation @ frame[:, :3]
@@ -111,8 +111,8 @@ def noise_under(loss: str | None, loss_scale: float, residuals: Tensor, seen: Te
     """Return the noise (*B,), px per coordinate, at which a weighted problem has the covariance of its optimum.
 
     Without a loss it is sqrt(sum of squares / (2 N - free)). With weights w of the squares s of a robust loss it is
-    sqrt(mean(w^2 s) mean(w)) / mean(w + s dw/ds), the scale of an M-estimator, which holds where outliers fall on all
-    corners alike. residuals: (*B, V, N, 2). free: how many parameters were free, poses included.
+    sqrt(mean(w^2 s) mean(w)) / mean(w + s dw/ds), the scale of an M-estimator, which is right if outliers fall on all
+    corners alike. residuals: (*B, V, N, 2). free: number of free parameters, poses included.
     """
     squares = residuals.square().sum(-1)
     _, weights = robust(loss, loss_scale, squares)
@@ -131,7 +131,7 @@ def shared_factor(equations: Equations) -> Tensor:
     triangle: Tensor = equations.shared[:, :-1, :-1]
     if not triangle.shape[-1]:
         return triangle
-    # the columns differ by many orders of magnitude, also before what poses make up for is taken out of them
+    # columns differ by many orders of magnitude, also before the part that poses compensate is removed
     own = equations.view[..., -triangle.shape[-1] - 1 : -1].square().sum((1, 2))
     scale = (own + triangle.square().sum(-2)).sqrt()
     scale = torch.where(scale > 0, scale, 1.0)
@@ -149,7 +149,7 @@ def worst(covariances: Tensor) -> Tensor:
 
 @torch.no_grad()
 def uncertainty(spread: Spread, pixels: Numbers, distance: Numbers = math.inf) -> Tensor:
-    """Return `Calibration.uncertainty` of a single problem."""
+    """Return the uncertainty of pixels for a single problem, see `Calibration.uncertainty`."""
     owner, like = "uncertainty", spread.parameters
     pixels = as_coordinates(pixels, "pixels", 2, owner, like.device).detach().to(like)
     distance = as_values(distance, "distance", owner, like.device).detach().to(like)

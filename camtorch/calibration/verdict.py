@@ -1,4 +1,4 @@
-"""What a calibration found, what it is good for and what its data do not carry: in words, each with what to do."""
+"""The result of a calibration, with its use and the limits of its data in words, and advice."""
 
 from __future__ import annotations
 
@@ -20,21 +20,21 @@ from camtorch.cameras.opaque import fixed_camera
 from camtorch.poses.extrinsics import Extrinsics
 from camtorch.rays.lattices import angles_from_axis, image_edges, image_lattice
 
-_FINE, _ROUGH = 0.5, 3.0  # px, standard deviations of projections to measure by, and to look at images
-_CELLS, _PATTERN = 32, 8  # along the longer side: of the map of uncertainty, and of that of residuals
+_FINE, _ROUGH = 0.5, 3.0  # px, standard deviations of projections for measuring, and for viewing
+_CELLS, _PATTERN = 32, 8  # cells along the longer side: of the map of uncertainty, and of residuals
 _FEW_VIEWS = 6
 _ALIKE = math.radians(30)  # the largest angle between two boards
-_LOOSE_FOCAL, _LOOSE_CENTRE = 0.01, 0.005  # standard deviations: of a focal length, and of the longer side
+_LOOSE_FOCAL, _LOOSE_CENTRE = 0.01, 0.005  # standard deviations, relative to a focal length and to the longer side
 _BEYOND = math.radians(3)
-_FISHEYE, _RIM = math.radians(60), math.radians(8)  # beyond the corners of a fisheye its image ends
-_CORNER_NOISE = 1.0  # px, more than detectors leave
+_FISHEYE, _RIM = math.radians(60), math.radians(8)  # a fisheye's image may end this far beyond its corners
+_CORNER_NOISE = 1.0  # px, more than the error of detectors
 _WORSE_VIEW = 3.0  # times the median of all views
 _PATTERN_SHARE = 0.3  # of the residuals
 _CERTAIN = 5.0  # standard deviations
 _USUAL_NOISE = 0.1  # px
-_OPEN = 0.02  # of the corners' extent: the uncertainty of projections that are not determined
+_OPEN = 0.02  # of the corners' extent: projections that are less certain are not determined
 _OPEN_COEFFICIENT = 0.1  # standard deviation
-_MISFIT = 3.0  # px, the median residual of views that no camera fits
+_MISFIT = 3.0  # px, the median residual above which no camera fits the views
 _MOST_OF_A_VIEW = 0.8  # of its corners
 
 _TILTED = "Tilt the board by 30 to 45 degrees to all sides"
@@ -45,79 +45,78 @@ _NOISE = "one standard deviation in the worst direction"
 class Calibration:
     """The result of `calibrate`, and its uncertainty.
 
-    Units are pixels, and for poses those of the object points. The pose of a view is `extrinsics[i]`; views without a
-    corner have none, nor have those that are equal to others, see `views`.
+    Units are pixels, and for poses those of the object points. `extrinsics` has the poses of `views`: without views
+    that have no corner, or equal others.
     """
 
     camera: Camera
     """The camera: float64, an ordinary module that goes on learning."""
     extrinsics: Extrinsics
-    """Camera from board, of batch dims (V,)."""
+    """Camera from board, with batch dims (V,)."""
     rms: float
     """The root of the mean squared length of the residuals, per point, as OpenCV's."""
     sigma: float
-    """The standard deviation of a coordinate of a pixel: sqrt(sum of squares / (2 N - parameters)). With a robust loss
-    that of the inliers."""
+    """The standard deviation of a pixel's coordinate: sqrt(sum of squares / (2 N - parameters)), of the inliers if the
+    loss is robust."""
     residuals: Any
-    """Projected minus observed, in the shape or the list form of the image points; NaN where nothing was seen, in
-    views left out, and where a camera that did not converge has no pixel for what was seen."""
+    """Projected minus observed, in the shape or the list form of the image points; NaN for unseen corners, views left
+    out, and corners for which a camera that did not converge has no pixel."""
     inliers: Any
     """Bool, in the same form: the residual is shorter than max(3 loss_scale, 3 sigma of the inliers)."""
     parameter_names: tuple[str, ...]
     """fx, fy, cx, cy and the names of the coefficients."""
     spread: Spread = field(repr=False)
-    """What the noise of the corners does to the parameters and the poses."""
+    """The effect of the corners' noise on the parameters and the poses."""
     converged: bool
-    """Whether nothing was left to gain when the search ended, and every corner that was seen has a pixel."""
+    """Whether the search ended at an optimum, in which every seen corner has a pixel."""
     bend: tuple[float, float]
-    """How far the middle of the board lies off the plane of its edges, along x and y; zeros unless it was asked for."""
+    """How far the middle of the board lies off the plane of its edges, along x and y; zeros without bend=True."""
     image_size: tuple[int, int]
     views: tuple[int, ...]
-    """The numbers of the views that have poses, of those that were passed."""
+    """The indices of the passed views that have poses."""
     copies: tuple[int, ...]
-    """The numbers of the views that show another one again: equal ones are left out, nearly equal ones widen the
+    """The indices of passed views that show another one again: equal ones are left out, nearly equal ones widen the
     uncertainties until they count as one."""
     observations: Observations = field(repr=False)
     adjusted: Adjusted = field(repr=False)
     point_inliers: Tensor = field(repr=False)
     """(V, N) bool, the inliers of `observations`."""
     loss: str | None = None
-    """The robust loss, if there was one."""
+    """The robust loss, if any."""
     index: int = field(default=0, repr=False)
-    """Which of the cameras that were adjusted together it is."""
+    """The index of the camera among those adjusted together."""
     twins: tuple[tuple[float, ...], ...] = field(default=(), repr=False)
-    """The parameters of other optima that fit as well, to within the noise: of such a camera projections are known
-    where corners were seen, and its parameters are not. Double spheres have them."""
+    """The parameters of other optima that fit equally well, up to the noise. Such a camera's projections are known near
+    corners, its parameters are not. Double spheres have twins."""
 
     @property
     def covariance(self) -> Tensor:
-        """(P, P) of the parameters, in their order; 0 for those that were fixed.
+        """Covariance (P, P) of the parameters, in their order; 0 for fixed ones.
 
-        With a robust loss that of the weighted problem at its optimum, by the noise that the loss leaves: intervals
-        hold where outliers fall on all corners alike, and are somewhat too narrow where they gather in some views.
+        With a robust loss it is that of the weighted problem at its optimum. Intervals are right if outliers fall on
+        all corners alike, and somewhat too narrow if they gather in some views.
         """
         return self.spread.covariance[0]
 
     @property
     def std(self) -> Tensor:
-        """(P,) the standard deviations of the parameters; 0 for those that were fixed."""
+        """Standard deviations (P,) of the parameters; 0 for fixed ones."""
         return self.spread.std[0]
 
     @property
     def point_residuals(self) -> Tensor:
-        """(V, N, 2) the residuals of `observations`."""
+        """Residuals (V, N, 2) of `observations`."""
         return self.adjusted.residuals[self.index][0]
 
     @property
     def lost(self) -> int:
-        """How many corners were seen that have no pixel in the camera, because it ends before them."""
+        """Number of seen corners without a pixel in the camera, because it ends before them."""
         return int((self.observations.seen & ~self.adjusted.valid[self.index][0]).sum())
 
     def uncertainty(self, pixels: Any, distance: float = math.inf) -> Tensor:
         """Return the standard deviation of pixels if the camera were calibrated again from images of this quality.
 
-        The standard deviation in the worst direction of where a point is seen, with the poses of the boards in their
-        own uncertainty: mrcal's mean-pcam.
+        It is that of a point's pixel in the worst direction, and includes the boards' poses: mrcal's mean-pcam.
 
         Args:
             pixels: (..., 2).
@@ -131,7 +130,7 @@ class Calibration:
     @cached_property
     @torch.no_grad()
     def warnings(self) -> list[str]:
-        """What the data do not carry, and what does not fit, in words: each with what to do."""
+        """The limits of the data and misfits, in words, each with advice."""
         survey = _Survey(self)
         finders = (_search, _residuals, _views, _parameters, _over_image)
         return [text for find in finders for text in find(survey)]
@@ -139,7 +138,7 @@ class Calibration:
     @property
     @torch.no_grad()
     def verdict(self) -> str:
-        """In words: what it is good for, up to which angle, and what to photograph next."""
+        """The use of the calibration in words, the angle up to which it is valid, and what to photograph next."""
         survey = _Survey(self)
         if not self.converged:
             return next(_search(survey)) + "."
@@ -183,7 +182,7 @@ class Calibration:
 
 
 class Zone(NamedTuple):
-    """A ninth of the image: the parts of it near corners, and with rays; px, the largest uncertainty, NaN without."""
+    """A ninth of the image: the shares of it near corners and with rays, and its largest uncertainty, px or NaN."""
 
     name: str
     share: float
@@ -192,13 +191,13 @@ class Zone(NamedTuple):
 
 
 class _Survey:
-    """Numbers of a calibration that sentences are made of, over a map (rows, columns) of the image."""
+    """Numbers of a calibration for its sentences, over a map (rows, columns) of the image."""
 
     def __init__(self, calibration: Calibration):
         self.calibration, self.seen = calibration, calibration.observations.seen
         cell = max(calibration.image_size) / _CELLS
         rows, columns = self.shape = tuple(max(1, round(side / cell)) for side in calibration.image_size)
-        # with the edges of the cells every second is a middle
+        # of the lattice of cells' edges and middles, the middles
         pixels = image_lattice(calibration.camera, 2 * rows + 1, 2 * columns + 1)[1::2, 1::2]
         rays, self.has_ray = calibration.camera.unproject(pixels)
         self.angles = torch.where(self.has_ray, angles_from_axis(rays), torch.nan)  # radians from the axis
@@ -208,14 +207,14 @@ class _Survey:
         pose = calibration.extrinsics.matrix().to(self.seen.device)
         self.points = calibration.observations.points @ pose[:, :3, :3].mT + pose[:, None, :3, 3]  # of the camera
         angles = angles_from_axis(self.points[self.seen]).sort().values
-        self.reach = float(angles[math.ceil(0.995 * len(angles)) - 1])  # but for one corner in 200, which may be wrong
+        self.reach = float(angles[math.ceil(0.995 * len(angles)) - 1])  # without one corner in 200, which may be wrong
         self.image_reach = float(self.angles.nan_to_num(0.0).amax())
-        # the lens ends beyond the circle that a fisheye shows, which corners reach
+        # a fisheye's corners reach nearly to the circle at which its image ends
         self.ends_in_the_dark = self.reach > _FISHEYE and self.image_reach > self.reach + _RIM
 
     @cached_property
     def zones(self) -> list[Zone]:
-        """Nine, by rows."""
+        """Nine zones of the image, by rows."""
         low, high = image_edges(self.calibration.image_size, self.corners)
         count = self.corners.new_tensor(self.shape[::-1])
         index = ((self.corners - low) / (high - low) * count).long().clamp(min=0)
@@ -235,14 +234,14 @@ class _Survey:
 
     @property
     def missing(self) -> list[Zone]:
-        """Where there are few corners, and the lens is much less certain than in the middle or has no rays at all."""
+        """Zones with few corners in which the lens is much less certain than in the middle, or has no rays."""
         middle = self.zones[4].uncertainty
         limit = max(_FINE, 3 * middle) if math.isfinite(middle) else _FINE
         few = (zone for zone in self.zones if zone.share < 0.5)
         return [z for z in few if (not self.ends_in_the_dark if z.rays < 0.5 else z.uncertainty > limit)]
 
     def good_within(self, limit: float, furthest: float = math.inf) -> tuple[float, float]:
-        """Return the angle from the axis up to which projections are known to `limit` px, and its part of the image."""
+        """Return the angle from the axis up to which projections are certain to `limit` px, and the image's part."""
         known = self.uncertainty.nan_to_num(torch.inf)
         bad = ~((known <= limit) & (self.angles <= furthest)) & self.has_ray
         within = self.angles < torch.where(bad, self.angles, torch.inf).amin()
@@ -250,7 +249,7 @@ class _Survey:
 
     @cached_property
     def tilt(self) -> float:
-        """Radians, the largest angle between two boards; infinite if some are no planes."""
+        """The largest angle between two boards, in radians; infinite if a board is not flat."""
         weights = self.seen.to(self.points)[..., None]
         middle = (self.points * weights).sum(1, keepdim=True) / weights.sum(1, keepdim=True).clamp(min=1)
         _, sizes, axes = torch.linalg.svd((self.points - middle) * weights, full_matrices=False)
@@ -263,7 +262,7 @@ class _Survey:
 
     @property
     def loose_focal(self) -> float:
-        """The standard deviation of the focal length at the axis, which is no parameter, over itself: the worse one."""
+        """The relative standard deviation of the focal length at the axis, which is no parameter; the larger of two."""
         spread, near = self.calibration.spread, 1e-4
         camera = fixed_camera(spread.model, spread.parameters[:, :4], spread.parameters[:, 4:])
         rays = spread.parameters.new_tensor([[0.0, 0, 1], [near, 0, 1], [0, near, 1]])
@@ -274,7 +273,7 @@ class _Survey:
 
     @property
     def pattern_share(self) -> float:
-        """The part of the residuals' size that is a mean over a part of the image; 0 if chance may have done it."""
+        """The part of the residuals that is a pattern over the image; 0 if it may be chance."""
         use = self.calibration.point_inliers
         residuals, pixels = self.calibration.point_residuals[use], self.calibration.observations.pixels[use]
         side = max(self.calibration.image_size) / _PATTERN
@@ -295,14 +294,14 @@ def _search(survey: _Survey) -> Iterator[str]:
     if lost := found.lost:
         yield (
             f"{lost} corners have no pixel in this camera, which ends before them: do not use it. "
-            "A surface has to reach further: give a wider grid"
+            "A surface must reach further: give a wider grid"
         )
     if not bool(found.adjusted.converged[0]):
         held = found.adjusted.held_by
         by = f", held by {held} corners at the end of what the camera shows, lost by another step" if held else ""
         yield (
-            f"The search did not end at an optimum{by}: do not use this camera. See whether the board's size, the "
-            "image size and the model are right, try another model first, or give start=a camera"
+            f"The search did not end at an optimum{by}: do not use this camera. Check the board's size, the image size "
+            "and the model, try another model first, or give start=a camera"
         )
 
 
@@ -310,13 +309,13 @@ def _residuals(survey: _Survey) -> Iterator[str]:
     calibration, seen, inliers = survey.calibration, survey.seen, survey.calibration.point_inliers
     if calibration.sigma > _CORNER_NOISE * max(1.0, max(calibration.image_size) / 2000):
         yield (
-            f"What is left is {_px(calibration.sigma)} per coordinate, far more than corners are wrong by: the board "
+            f"Residuals are {_px(calibration.sigma)} per coordinate, far more than the errors of corners: the board "
             "may be bent or not as described, images out of focus or smeared, or the model not that of the lens"
         )
     bad, squares = seen & ~inliers, calibration.point_residuals.square().sum(-1)
     per_view, count, total = bad.sum(-1), int(bad.sum()), int(seen.sum())
     usual = float(squares[inliers].mean()) / 2 if bool(inliers.any()) else 0.0
-    # so many lengths of normal errors are beyond three standard deviations, and none beyond six
+    # of normal errors so many are longer than three standard deviations, and none than six
     if count > 3 + 2 * math.exp(-4.5) * total or bool((squares[bad] > 36 * usual).any()):
         most = int(per_view.argmax())
         robust = "" if calibration.loss else ': loss="huber" keeps them from pulling'
@@ -327,7 +326,7 @@ def _residuals(survey: _Survey) -> Iterator[str]:
     lost = [calibration.views[i] for i in (per_view > _MOST_OF_A_VIEW * seen.sum(-1)).nonzero()[:, 0].tolist()]
     if lost and calibration.loss:
         yield (
-            f"Nearly all corners of {named(lost)} are outliers, as where they are numbered in another "
+            f"Nearly all corners of {named(lost)} are outliers, as if they were numbered in another "
             "order. Leave such views out: they make all parameters look less certain"
         )
     rms = ((squares * seen).sum(-1) / seen.sum(-1)).sqrt()
@@ -336,8 +335,8 @@ def _residuals(survey: _Survey) -> Iterator[str]:
     if worse and len(rms) >= _FEW_VIEWS:
         views = named([calibration.views[i] for i in worse])
         yield (
-            f"Worse than the others fit {views}, up to {_px(float(rms[worse].amax()))} where "
-            f"{_px(middle)} is usual: look at their corners, or leave them out"
+            f"The rms of {views} is up to {_px(float(rms[worse].amax()))}, and {_px(middle)} is usual. Look at the "
+            "corners, or leave such views out"
         )
 
 
@@ -345,13 +344,13 @@ def _views(survey: _Survey) -> Iterator[str]:
     calibration = survey.calibration
     if calibration.copies:
         yield (
-            f"Another view is shown again by {named(calibration.copies)}, as a copy of a file does: they count once. "
+            f"Copies of other views, or nearly so, are {named(calibration.copies)}: they count once. "
             "Take new photographs instead"
         )
     copies = [calibration.views.index(view) for view in calibration.copies if view in calibration.views]
     count = int(survey.seen.any(-1).sum()) - int(survey.seen[copies].any(-1).sum())
     if count < _FEW_VIEWS:
-        yield f"Few views ({count}): a bad one has nothing to be told by. Take 10 to 20. {_TILTED}"
+        yield f"Few views ({count}): a bad one cannot be detected. Take 10 to 20. {_TILTED}"
 
 
 def _parameters(survey: _Survey) -> Iterator[str]:
@@ -371,25 +370,25 @@ def _parameters(survey: _Survey) -> Iterator[str]:
         optima = [(p[0], *p[4:]) for p in (found.spread.parameters[0].tolist(), *found.twins)]
         first, *others = (", ".join(f"{n} {v:.4g}" for n, v in zip(names, p, strict=True)) for p in optima)
         yield (
-            f"The parameters are not known, though projections are where corners were seen. As well as {first} fit "
-            f"{'; '.join(others)}. Compare no parameters, or take eucm or kannala_brandt"
+            f"The parameters are not known, only projections near corners: {first} fits no better than "
+            f"{'; '.join(others)}. Do not compare parameters, or use eucm or kannala_brandt"
         )
 
 
 def _over_image(survey: _Survey) -> Iterator[str]:
     if missing := survey.missing:
-        yield f"Few corners or none in {_places(missing)} of the image. Hold the board there, near to the edges"
+        yield f"Few corners or none in {_places(missing)} of the image. Hold the board there, near the edges"
     reach, end = survey.reach, survey.image_reach
     lost = float((~survey.has_ray).double().mean())
     if lost > 0.001 and not survey.ends_in_the_dark:
         yield (
             f"The fitted lens ends inside the image: {_percent(lost)} of the pixels have no ray, beyond {_degrees(end)}"
-            f" from the axis, where corners reach {_degrees(reach)}. Take views with corners further out, or a model "
+            f" from the axis, and corners reach {_degrees(reach)}. Take views with corners further out, or use a model "
             "with fewer coefficients or of a wider lens"
         )
     if end > reach + _BEYOND and survey.good_within(_ROUGH)[0] < end:
         yield (
-            f"Corners reach {_degrees(reach)} from the axis, and the image {_degrees(end)}: beyond what was seen the "
+            f"Corners reach {_degrees(reach)} from the axis, and the image {_degrees(end)}: beyond the corners the "
             "lens is a guess. Hold the board nearer to the corners of the image"
         )
     rms = survey.calibration.rms
@@ -406,8 +405,8 @@ def check_determined(
 ) -> None:
     """Raise a ValueError if the views do not determine a camera, as with boards that are all parallel.
 
-    It is open if corners that are wrong by a tenth of a pixel leave the projections of what was seen uncertain by a
-    fiftieth of the extent of the corners. Views that no camera fits get warnings instead. found: of noise of 1 px.
+    A camera is undetermined if corner errors of 0.1 px make projections of the seen points uncertain by more than 2 %
+    of the corners' extent. Views that no camera fits get warnings instead. found: the spread for noise of 1 px.
     """
     found = found.scaled(adjusted.cost.new_full((1,), _USUAL_NOISE))
     seen = observed.weights[0] > 0
@@ -427,12 +426,10 @@ def check_determined(
     open_ones = [name for name, is_open in zip(names, (std > limits).tolist(), strict=True) if is_open]
     free = [name for name, size in zip(names, std.tolist(), strict=True) if size > 0]
     hold = [name for name in free if name not in ("fx", "fy")] or free
-    what, why = f"these {views} views leave", ", as boards that are all nearly parallel do"
-    if views == 1:
-        what, why = "a single view of this board leaves", ""
+    given = "a single view of this board" if views == 1 else f"{views} views, which may be nearly parallel"
     raise ValueError(
-        f"{owner}: {what} {_listed(open_ones or free)} undetermined{why}. Take 10 to 20 views. {_TILTED}, or hold "
-        f"parameters: fixed={tuple(hold)}"
+        f"{owner}: views must determine {_listed(open_ones or free)}; got {given}. Take 10 to 20 views. {_TILTED}, or "
+        f"hold parameters: fixed={tuple(hold)}"
     )
 
 

@@ -50,7 +50,7 @@ def convert(
     else:
         counts = (as_whole(count, "count", owner),)
     if counts[0] < 0 or model.names_of(counts[0]) is None:
-        raise ValueError(f"{owner}: {model.__name__} takes {model.counts_text()}; got count={count}")
+        raise ValueError(f"{owner}: count must fit {model.__name__}, {model.counts_text()}; got {count}")
 
     def build(parameters: Tensor) -> CameraT:
         intrinsics, distortion = parameters[..., :4], parameters[..., 4:]

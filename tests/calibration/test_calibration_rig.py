@@ -98,7 +98,7 @@ def test_exact_corners_give_the_exact_rig(noise):
 @pytest.mark.slow
 def test_views_of_different_moments_are_asked_about():
     pixels = seen(views=10)[0]
-    with pytest.warns(UserWarning, match="by all cameras at the same moment"):
+    with pytest.warns(UserWarning, match="all cameras took each view at the same moment"):
         assert not calibrated(pixels | {"right": pixels["right"].roll(1, 0)}, PAIR).converged
 
 
@@ -134,7 +134,7 @@ def test_one_camera_is_a_rig_as_well():
 
 
 def test_names_that_no_camera_has_are_refused():
-    with pytest.raises(ValueError, match=r"^calibrate_rig: no camera is called 'middle'"):
+    with pytest.raises(ValueError, match=r"^calibrate_rig: names must be those of cameras, .*; got 'middle'"):
         calibrated(seen(views=6)[0], PAIR, fixed={"middle": "all"})
 
 
@@ -144,11 +144,11 @@ def test_views_are_copies_where_all_cameras_saw_the_same():
     again = {name: torch.cat((p, p[:3])) for name, p in pixels.items()}
     noise = torch.randn(54, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     again["right"][7] += 0.3 * noise
-    with pytest.warns(UserWarning, match="those of another view in views 6, 8"):
+    with pytest.warns(UserWarning, match="views 6, 8 left out, because the corners are those of another view"):
         found = calibrated(again, PAIR)
     assert found.views == (*range(6), 7)
     assert {copy for camera in found.cameras.values() for copy in camera.copies} <= {6, 8}
-    assert any("Another view is shown again" in text for text in found.warnings)
+    assert any("Copies of other views" in text for text in found.warnings)
 
 
 @pytest.mark.slow
@@ -158,5 +158,5 @@ def test_a_single_view_names_the_camera_that_it_leaves_open():
     others = torch.arange(12) != view
     pixels["right"][others] = torch.nan
     models = {"left": "kannala_brandt", "right": "pinhole"}
-    with pytest.raises(ValueError, match=r"^calibrate_rig: right: a single view of this board leaves"):
+    with pytest.raises(ValueError, match=r"^calibrate_rig: right: views must determine .*; got a single view"):
         calibrated(pixels, models=models)

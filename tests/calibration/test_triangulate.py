@@ -157,8 +157,8 @@ def test_derivatives_give_the_sigmas_of_drcal():
 @pytest.mark.parametrize(
     ("change", "error", "says"),
     [
-        (lambda c, e, p: (c[:2], e, p), ValueError, "as many cameras as extrinsics"),
-        (lambda c, e, p: (c, e, p[:2]), ValueError, "as many cameras as extrinsics"),
+        (lambda c, e, p: (c[:2], e, p), ValueError, "cameras and extrinsics must be as many"),
+        (lambda c, e, p: (c, e, p[:2]), ValueError, "cameras and extrinsics must be as many"),
         (lambda c, e, p: (c[:1], e[:1], p[:1]), ValueError, "cameras must be at least two; got 1"),
         (lambda c, e, p: (c, e, p[..., 0]), ValueError, "pixels must be"),
         (lambda c, e, p: (c, e, [p[0], p[1], p[2][:5]]), ValueError, "one shape"),

@@ -85,7 +85,7 @@ def test_a_folder_of_photographs_becomes_a_camera(photographs, capsys):
     assert [line.split()[0] for line in out[2:10]] == ["fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4"]
     assert captured.out.count("held") == 2
     assert "fixed=" not in captured.out
-    assert "Another view is shown again by view 9.png" in captured.out
+    assert "Copies of other views, or nearly so, are view 9.png" in captured.out
     assert out[-2].strip().startswith("Good for ")
     assert out[-1] == "camera.yml: kannala_brandt"
     assert_near(ct.load("camera.yml").camera, fisheye(), 0.5)
@@ -154,7 +154,7 @@ def test_models_that_the_file_cannot_hold_are_not_tried(photographs, capsys, mon
         ("a.png --model splined", "splined fits a surface over a known lens"),
         pytest.param(
             "PHOTOS --model kannala_brandt --fixed q",
-            "fixed names 'q'; KannalaBrandt has fx, fy",
+            "fixed must name parameters of KannalaBrandt, fx, fy",
             marks=pytest.mark.slow,
         ),
     ],
