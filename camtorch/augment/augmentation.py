@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -16,7 +16,7 @@ from typing_extensions import Unpack
 from camtorch.augment.change import Change, Part, alone, as_one, by_kinds, check_sizes
 from camtorch.augment.filling import enough, filled, scaled
 from camtorch.augment.kinds import Named
-from camtorch.augment.sample import Sample, SampleOptions, SampleTransform, on_samples
+from camtorch.augment.sample import Batch, Sample, SampleOptions, SampleTransform, on_samples
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.mixed import Mixed
 from camtorch.evaluate.door import may_look
@@ -106,10 +106,13 @@ class Spans:
         self.total: int = len(self._ends)
         self.low, self.wide = np.array(self._ends, np.float64).reshape(-1, 2).T.copy()
 
-    def alone(self, shares: Sequence[float]) -> dict[str, list[Any]]:
-        """The values of one row as plain numbers, (1,) or (1, size)."""
-        values = [low + wide * share for (low, wide), share in zip(self._ends, shares, strict=True)]
-        return {n: values[at] if shape is None else [values[at]] for n, at, shape in self._places}
+    def numbers(self, shares: Sequence[float]) -> list[float]:
+        """Return the values of one row, range by range."""
+        return [low + wide * share for (low, wide), share in zip(self._ends, shares, strict=True)]
+
+    def named(self, values: Sequence[float]) -> dict[str, list[Any]]:
+        """Return the values of one row, (1,) or (1, size), by their names."""
+        return {n: [*values[at]] if shape is None else [[*values[at]]] for n, at, shape in self._places}
 
     def of(self, shares: Any) -> dict[str, Any]:
         """The values (rows,) or (rows, size) at shares (total,) of their ranges, arrays or tensors."""
@@ -131,26 +134,37 @@ def draw(
 ) -> tuple[dict[str, Any], Spans]:
     """Return `apply` (count,), true with probability p, a value (count,) or (count, size) of every range; and `spans`.
 
-    The order is kornia's: the gate, if there is a choice, then the ranges. Lists of one sample and arrays of several
-    take less time than tensors, which come where the generator is on another device, or code is compiled.
+    Lists of one sample and arrays of several take less time than tensors, which come where the generator is on another
+    device, or code is compiled.
+    """
+    rows = min(count, 1) if same else count
+    gate, shares, spans = _drawn(ranges, rows, p, generator, spans)
+    if shares.is_cpu and not torch.compiler.is_compiling():
+        if rows == count == 1:
+            applied = [p >= 1] if gate is None else gate.tolist()
+            return {"apply": applied, **spans.named(spans.numbers(shares.tolist()))}, spans
+        gate, shares = np.array([p >= 1] * rows, bool) if gate is None else gate.numpy(), shares.numpy()
+    elif gate is None:
+        gate = torch.full((rows,), p >= 1, device=shares.device)
+    values = {"apply": gate, **spans.of(shares)}
+    return (values if rows == count else {name: value[[0] * count] for name, value in values.items()}), spans
+
+
+def _drawn(
+    ranges: Mapping[str, Range], rows: int, p: float, generator: torch.Generator | None, spans: Spans | None
+) -> tuple[Any, Any, Spans]:
+    """Return the gate (rows,), or None if there is no choice, a share of each range, and the ranges, ready.
+
+    The order is kornia's: the gate first.
     """
     if not (generator is None or isinstance(generator, torch.Generator)):
         raise TypeError(f"draw: generator must be a torch.Generator, or None; got {shown(generator)}")
-    rows = min(count, 1) if same else count
     if spans is None or spans.rows != rows or spans.ranges != ranges:
         spans = Spans(ranges, rows)
-    device = _CPU if generator is None or generator.device.type == "cpu" else generator.device
-    gate: Any = torch.rand(rows, generator=generator, device=device) < p if 0 < p < 1 else None
+    device = _CPU if generator is None else generator.device
+    gate = torch.rand(rows, generator=generator, device=device) < p if 0 < p < 1 else None
     # in float64, so that what is drawn is what every precision sees
-    shares: Any = torch.rand(spans.total, generator=generator, dtype=torch.float64, device=device)
-    if device is _CPU and not torch.compiler.is_compiling():
-        if rows == count == 1:
-            return {"apply": [p >= 1] if gate is None else gate.tolist(), **spans.alone(shares.tolist())}, spans
-        gate, shares = np.array([p >= 1] * rows, bool) if gate is None else gate.numpy(), shares.numpy()
-    elif gate is None:
-        gate = torch.full((rows,), p >= 1, device=device)
-    values = {"apply": gate, **spans.of(shares)}
-    return (values if rows == count else {name: value[[0] * count] for name, value in values.items()}), spans
+    return gate, torch.rand(spans.total, generator=generator, dtype=torch.float64, device=device), spans
 
 
 class FlipOptions(SampleOptions, total=False):
@@ -265,8 +279,14 @@ class Augmentation(SampleTransform):
         self.min_filled = None if min_filled is None else as_part(min_filled, "min_filled", self._name)
         self._warned = False
         self._spans: Spans | None = None
-        self.last: Change | None = None
+        self._last: Change | Callable[[], Change] | None = None
+
+    @property
+    def last(self) -> Change | None:
         """The change of the last call: its `source`, `target` and `rotation`."""
+        if callable(made := self._last):
+            made = self.__dict__["_last"] = made()
+        return made
 
     def new_camera(self, source: Camera, values: Mapping[str, Tensor]) -> tuple[Camera, Tensor | None]:
         """The camera after the change, with an image_size, and the rotation, `ray_after = R ray_before`, or None.
@@ -310,6 +330,12 @@ class Augmentation(SampleTransform):
         """The draw as lists, arrays or tensors; see the function `draw`."""
         values, self.__dict__["_spans"] = draw(self.ranges, count, p, same_on_batch, generator, self._spans)
         return values
+
+    def _numbers_of_one(self, generator: torch.Generator | None) -> tuple[bool, list[float], Spans]:
+        """Draw for one sample: whether it is augmented, and the values of all ranges, in a row."""
+        gate, shares, spans = _drawn(self.ranges, 1, self.p, generator, self._spans)
+        self.__dict__["_spans"] = spans
+        return self.p >= 1 if gate is None else bool(gate), spans.numbers(shares.tolist()), spans
 
     def with_boxes(self, draw: Mapping[str, Any], boxes: Tensor | Sequence[Tensor] | None) -> Mapping[str, Any]:
         """Return a draw with the boxes it needs of those of samples, (B, M, 4), or (M, 4) each, or None."""
@@ -498,6 +524,11 @@ class Augmentation(SampleTransform):
                 field that might be geometry, a draw of another size. TypeError: a field that is no tensor.
         """
         sample = self._given(sample, fields)
+        numbers = None
+        if draw is None:
+            moved, numbers = self._quickly(sample, generator)
+            if moved is not None:
+                return moved
         if clips := self._clips(sample):
             own = sample.get("camera")
             own = self.camera if own is None else own
@@ -507,7 +538,14 @@ class Augmentation(SampleTransform):
             first = {n: (kind, value[::each]) for n, (kind, value) in self._sorted(frames, self.fields).items()}
             draw = {n: clips.repeated(value, f"draw[{n!r}]") for n, value in self._of_sample(drawn, first).items()}
             return clips.restored(self.forward(frames, draw=draw))
-        return self._augmented(sample, draw=draw, generator=generator)[0]
+        return self._augmented(sample, draw=draw, generator=generator, numbers=numbers)[0]
+
+    def _quickly(self, sample: Sample, generator: torch.Generator | None) -> tuple[Sample | None, Any]:
+        """Move a sample of a form that was moved before; or return None, and what was drawn for it, if anything was."""
+        return None, None
+
+    def _prepare(self, sample: Sample, batch: Batch, change: Change) -> None:
+        """Prepare for more samples of the form of one that was moved."""
 
     def _augmented(
         self,
@@ -515,23 +553,29 @@ class Augmentation(SampleTransform):
         kinds: Mapping[str, str] | None = None,
         draw: Mapping[str, Tensor] | None = None,
         generator: torch.Generator | None = None,
+        numbers: Any = None,
     ) -> tuple[Sample, Change]:
-        """Return a sample moved by one change, and the change; kinds: name -> kind, in addition to `fields`."""
+        """Return a sample moved by one change, and the change.
+
+        kinds: name -> kind, in addition to `fields`. numbers: what was drawn, if it was.
+        """
         batch = self._batch(sample, kinds=kinds)
         named, form, camera = batch
         count = form.count
         if draw is None:
-            numbers = self._numbers(count, self.p, self.same_on_batch, generator)
+            numbers = self._numbers(count, self.p, self.same_on_batch, generator) if numbers is None else numbers
             change = self._change(camera, self._of_sample(numbers, named))
         else:
             change = self.change(camera, self._of_sample(draw, named))
         if change.count != count:
             raise ValueError(f"{self._name}: the draw is for {change.count} samples, here are {count}")
         if not torch.compiler.is_compiling():
-            self.__dict__["last"] = change  # as nn.Module would, after some questions
+            self.__dict__["_last"] = change  # as nn.Module would, after some questions
             if count and not self._warned and "image" in [found for found, _ in named.values()]:
                 self.tell_of_empty_images(camera)
-        return self._moved(sample, batch, change), change
+        moved = self._moved(sample, batch, change)
+        self._prepare(sample, batch, change)
+        return moved, change
 
     @on_samples
     def inverse(
@@ -579,7 +623,7 @@ class Augmentation(SampleTransform):
         def __call__(self, *args: Any, **options: Any) -> Any: ...
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "last": None}
+        return {**self.__dict__, "_last": None}
 
     def extra_repr(self) -> str:
         """What is drawn from, and the options."""

@@ -230,7 +230,7 @@ class Change:
         view = self.parts[0].moves
         if not isinstance(view, Drawn):
             return self.rotation[0].clone()
-        return (_no_turn(view.distortion.dtype) if view.rotation is None else view.rotation).clone()
+        return (no_turn(view.distortion.dtype) if view.rotation is None else view.rotation).clone()
 
     def leads_to(self, camera: Camera | Sequence[Camera]) -> bool:
         """Whether these may be the cameras after: of their number and intrinsics, where one may look."""
@@ -531,7 +531,8 @@ def _eye(like: Tensor) -> Tensor:
 
 
 @lru_cache(maxsize=4)
-def _no_turn(dtype: torch.dtype) -> Tensor:
+def no_turn(dtype: torch.dtype) -> Tensor:
+    """Return the identity, which nobody may change."""
     with torch.inference_mode(False):
         return torch.eye(3, dtype=dtype, device="cpu")
 

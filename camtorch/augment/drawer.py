@@ -3,23 +3,26 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from difflib import get_close_matches
-from typing import Any, ClassVar, Literal
+from functools import partial
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import torch
-from torch import Tensor
-from typing_extensions import Unpack
+from torch import Tensor, nn
+from typing_extensions import Self, Unpack
 
 from camtorch.augment.augmentation import Augmentation, FilledOptions, Range, as_range
-from camtorch.augment.change import Drawn, Part
-from camtorch.augment.drawing import Start
+from camtorch.augment.change import Change, Drawn, Part, no_turn
+from camtorch.augment.drawing import One, Start
 from camtorch.augment.filling import enough, scaled
 from camtorch.augment.jitter import DRAWN, jittered
+from camtorch.augment.kinds import CHECKED, Form, check_values
 from camtorch.augment.presets import PRESETS
+from camtorch.augment.sample import Batch, Sample
 from camtorch.cameras.camera import Camera
 from camtorch.evaluate.kept import Kept
-from camtorch.evaluate.known import are_numbers, known_false, with_derivatives_of
+from camtorch.evaluate.known import are_free, are_numbers, known_false, with_derivatives_of
 from camtorch.lenses.drawing import covering, drawn
 from camtorch.models import MODELS, KannalaBrandt
 from camtorch.optics.radial_inverse import precise
@@ -28,6 +31,8 @@ from camtorch.rays.lattices import field_of_view
 from camtorch.values.arguments import LEFT, as_image_size, broadcast_shapes, check_degrees, warn
 from camtorch.values.module import remade
 from camtorch.warp.panorama import PANORAMAS
+from camtorch.warp.plan import SampleCall
+from camtorch.warp.sampling import Options
 from camtorch.warp.vignetting import vignetting
 from camtorch.warp.warp import Warp
 
@@ -173,26 +178,30 @@ class CameraDrawer(Augmentation):
 
     def _drawn(self, source: Camera, values: Mapping[str, Any], share: float | None = None) -> Drawn | None:
         """Return what compiled code makes of a draw; None where something is recorded, or it does not know a model."""
-        like, tensors = self._held("like"), source._tensors
-        if type(self).new_camera is not CameraDrawer.new_camera or isinstance(
-            next(iter(values.values()), None), Tensor
-        ):
+        if type(self).new_camera is not CameraDrawer.new_camera:
             return None
-        tensors = tensors if like is None else (*tensors, *like._tensors)
-        if not are_numbers(*tensors):
+        if isinstance(next(iter(values.values()), None), Tensor) or not are_numbers(*self._tensors_of(source)):
             return None
 
         def start() -> Start | None:
             base, sized, reach = self._base(source.detach().clone(), values.get("lens"))
-            moves = "distortion" in values and base.distortion.shape[-1] > 0
+            moves, size = "distortion" in values and base.distortion.shape[-1] > 0, self._size_of(source)
             nominal = self._nominal(base, sized, size, values) if moves else None
             return Start.of(source, base, sized, reach, size, [*values], nominal, share)
 
-        size, own = self._size_of(source), like is None and not self._is_real
-        key = "start", type(source), source.image_size, size, *values, self.ranges.get("fov"), share
-        known = None if self._is_real else self._memo.entry(tensors, key)
-        found = known[2] if known is not None else start() if self._is_real else self._memo(tensors, key, start)
+        tensors = self._tensors_of(source)
+        found = start() if self._is_real else self._memo(tensors, self._key(source, values, share), start)
+        own = self._held("like") is None and not self._is_real
         return None if found is None else found.drawn(values, source if own else found.base, self.options)
+
+    def _tensors_of(self, source: Camera) -> tuple[Tensor, ...]:
+        """Return the tensors that new cameras depend on."""
+        like = self._held("like")
+        return source._tensors if like is None else (*source._tensors, *like._tensors)
+
+    def _key(self, source: Camera, names: Iterable[str], share: float | None) -> tuple[Any, ...]:
+        """Return all else that what new cameras are drawn from depends on."""
+        return "start", type(source), source.image_size, self._size_of(source), *names, self.ranges.get("fov"), share
 
     def _part(self, rows: list[int] | None, source: Camera, draw: Mapping[str, Any]) -> Part:
         values = self._values(source, draw)
@@ -200,14 +209,81 @@ class CameraDrawer(Augmentation):
         if made is None:
             return super()._part(rows, source, draw)
         if self.min_filled:
-            self._tell_of_too_few(made.found, self.min_filled)
-            if bool((made.factor > 1).any()):
-                self._tell_of_zoom(source, made.target, made.factor, made.found)
+            self._tell_of(source, made)
         simple = self.options["tolerance"] and not self.options["antialias"] and made.native is not None
         simple = simple and made.intrinsics.ndim == 1 and self.beside_the_camera.isdisjoint(self.ranges)
         if simple and not isinstance(source, PANORAMAS) and not isinstance(made.base, PANORAMAS):
             return Part(rows, made, source)
         return self._between(rows, source, values, made.target, made.rotation)
+
+    def _tell_of(self, source: Camera, made: Drawn) -> None:
+        """Warn, once each, of what `min_filled` cannot fill, or makes of a field of view."""
+        self._tell_of_too_few(made.found, self.min_filled or 0.0)
+        if bool((made.factor > 1).any()):
+            self._tell_of_zoom(source, made.target, made.factor, made.found)
+
+    def _prepare(self, sample: Sample, batch: Batch, change: Change) -> None:
+        form, moves = batch.form, change.parts[0].moves
+        if form.is_tried or form.batched or self.valid_mask or self.mirroring is not None or self._is_real:
+            return
+        form.is_tried, (names, call) = True, form.found
+        flags = {"image_valid", *(f"{name}_valid" for name, _ in form.fields)}
+        if call is None or not call.keeps_dtypes or not isinstance(moves, Drawn) or not flags.isdisjoint(sample):
+            return
+        key = self._key(batch.camera, self.ranges, self.min_filled)
+        known = self._memo.entry(self._tensors_of(batch.camera), key)
+        if known is not None and known[2] is not None and known[2].is_quick and known[2].names == [*self.ranges]:
+            options, ranges, *more = self._settings()
+            form.ready = Ready.of(form, names, call, key, ({**options}, {**ranges}, *more))
+
+    def _settings(self) -> tuple[Any, ...]:
+        """Return what the calls for samples of a form depend on, in addition to the form and the cameras' numbers."""
+        own = self.mask_fill, self.min_filled, self.image_size, self.valid_mask, self._held("like")
+        return self.options, self.ranges, *own
+
+    def _quickly(self, sample: Sample, generator: torch.Generator | None) -> tuple[Sample | None, Any]:
+        camera = self._held("camera") if (given := sample.get("camera")) is None else given
+        key = self._form_of(sample, camera, self.fields)
+        form = None if key is None else self._forms.entry((), key)
+        ready: Ready | None = None if form is None else form[2].ready
+        if form is None or ready is None or camera is None:
+            return None, None
+        settings = self._settings()
+        if ready.settings != settings:
+            form[2].is_tried, form[2].ready = False, None
+            return None, None
+        options, *_, like = settings
+        applied, numbers, spans = self._numbers_of_one(generator)
+        tensors = camera._tensors if like is None else (*camera._tensors, *like._tensors)
+        fields = [sample[name] for name in ready.names]
+        known = self._memo.entry(tensors, ready.key) if applied and are_free(*tensors, *fields) else None
+        for name, found in ready.checked:
+            check_values(found, name, sample[name], self._name)
+        start = None if known is None else known[2]
+        one = None if start is None else start.one(numbers)
+        results = None if one is None else ready.call(start.before, one.native, one.rotation, fields)
+        if one is None or results is None or None in results:
+            return None, {"apply": [applied], **spans.named(numbers)}
+        base = camera if like is None else start.base
+        moved = dict(sample)
+        for name, (value, valid) in zip(ready.names, results, strict=True):
+            moved[name] = value
+            if valid is not None:
+                moved[f"{name}_valid"] = valid
+        self.__dict__["_last"] = partial(_change_of, start, one, base, {**options}, camera)
+        if self.min_filled:
+            self._tell_of(camera, self.last.parts[0].moves)
+        for name, found in ready.rest:
+            value, valid = self._one(self.last, found, sample[name].unsqueeze(0), {"mask_fill": self.mask_fill})
+            moved[name] = value.squeeze(0)
+            if valid is not None:
+                moved[f"{name}_valid"] = valid.squeeze(0)
+        if ready.turns:
+            moved["rotation"] = no_turn(start.dtype).clone() if one.rotation is None else one.rotation
+        k = nn.Parameter(one.distortion, requires_grad=False) if len(one.distortion) else one.distortion
+        intrinsics = nn.Parameter(one.intrinsics, requires_grad=False)
+        moved["camera"] = remade(base, intrinsics=intrinsics, distortion=k, image_size=start.size)
+        return moved, None
 
     def _warp(self, source: Camera, target: Camera, rotation: Tensor | None) -> Warp:
         return Warp.unchecked(source, target, self.options).turned_by(rotation)
@@ -295,6 +371,31 @@ class CameraDrawer(Augmentation):
 
         key = "source", type(source), source.image_size, size
         return self._memo(source._tensors + base._tensors, key, narrowed)
+
+
+class Ready(NamedTuple):
+    """What single samples of one form have in common that are moved by two calls of compiled code."""
+
+    settings: tuple[Any, ...]  # of the drawer
+    key: tuple[Any, ...]  # of the cameras to draw from
+    names: list[str]  # of the fields that the call moves
+    call: SampleCall
+    rest: list[tuple[str, str]]  # names and kinds of the other fields
+    checked: list[tuple[str, str]]  # of those whose values are checked
+    turns: bool  # whether the rotation comes out as a new field
+
+    @classmethod
+    def of(
+        cls, form: Form, names: list[str], call: SampleCall, key: tuple[Any, ...], settings: tuple[Any, ...]
+    ) -> Self:
+        """Return it for a form."""
+        rest = [(name, found) for name, found in form.fields if name not in names]
+        checked = [(name, found) for name, found in form.fields if found in CHECKED and found != "boxes"]
+        return cls(settings, key, names, call, rest, checked, all(name != "rotation" for name, _ in form.fields))
+
+
+def _change_of(start: Start, one: One, base: Camera, options: Options, camera: Camera) -> Change:
+    return Change(1, [Part(None, start.again(one, base, options), camera)])
 
 
 def _joined(numbers: Sequence[Tensor], like: Tensor) -> Tensor:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Mapping, Sequence
-from ctypes import addressof, byref, c_double, c_int64
+from ctypes import addressof, byref, c_double, c_int64, c_void_p
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -46,7 +46,8 @@ class _Draws(ctypes.Structure):
     _fields_ = fields(
         "*values first cameras count height width is_each *sized *reach *coefficients *sensitivity *ends *base *border "
         "*places domain *tries *tried *allowed share *source source_height source_width "
-        "*looked_at *factors *filled *room made *rotations *distortion followed",
+        "*looked_at *factors *filled *room made *rotations *distortion followed copies",
+        copies=c_void_p * 3,
         first=c_int64 * len(_KINDS),
         height=c_double,
         width=c_double,
@@ -100,15 +101,17 @@ class Start:
         by which coefficients are measured, if they move. share: of each image that has to be filled, if any has to.
         """
         self.before, self.base, self.size, self._native = before, base, size, native
-        self._names = [name for name in _KINDS if name in names]
+        self.names: list[str] = [name for name in _KINDS if name in names]
         self._rows = len(sized) if sized.ndim == 2 else native.cameras if base.batch_shape else 0
         self._turns, self._moves, self._knows = not _TURNS.isdisjoint(names), nominal is not None, False
+        self.dtype: torch.dtype = native.dtype
+        self._follows = False  # whether new lenses want limits
         self._distortion, self._kept = base.distortion.detach(), list[Any]()
         count = self._distortion.shape[-1]
         call = self._call = _Draws(count=count, height=size[0], width=size[1], is_each=self._rows > 0)
         call.first[:] = [-1] * len(_KINDS)
         at, self._room = 0, 13 + count
-        for name in self._names:
+        for name in self.names:
             call.first[_KINDS.index(name)], at = at, at + _SIZES.get(name, 1)
         native.add_table()  # which whoever unprojects asks for
         call.base, call.made, call.made.usable = native.pointer, native.struct, None
@@ -147,10 +150,56 @@ class Start:
         self._knows, call.places = True, self._keep(plan.places)
         self._room += plan.parameters + 4 + TABLE_WIDTH
 
+    @property
+    def is_quick(self) -> bool:
+        """Whether `one` makes a camera of most draws."""
+        return not self._rows and self._native.cameras == 1 and (self._knows or not self._moves)
+
+    def one(self, values: Sequence[float]) -> One | None:
+        """Return the only new camera of values in a row, as they were drawn; None if it wants more than one call."""
+        call, dtype = _Draws.from_buffer_copy(self._call), self.dtype
+        numbers = (c_double * (len(values) + 2))(1, 1, *values)  # after the factor, and what is filled
+        room, intrinsics = torch.empty(self._room, dtype=dtype, device="cpu"), torch.empty(4, dtype=dtype, device="cpu")
+        distortion = torch.empty(call.count, dtype=dtype, device="cpu") if self._moves else self._distortion.clone()
+        rotation = torch.empty(3, 3, dtype=dtype, device="cpu") if self._turns else None
+        call.cameras = call.made.cameras = 1
+        call.room, call.factors = room.data_ptr(), addressof(numbers)
+        call.filled, call.values = call.factors + 8, call.factors + 16
+        turns, moves = None if rotation is None else rotation.data_ptr(), distortion.data_ptr() if self._moves else None
+        call.copies = intrinsics.data_ptr(), turns, moves
+        kept = [room, *self._add_limits(call, 1)]
+        if _run(call):
+            return None
+        if not call.followed and self._moves:
+            call.made.limits2 = call.made.extent = None
+        return One(self._made(call, kept, 1), room, intrinsics, distortion, rotation, *numbers[:2])
+
+    def again(self, one: One, base: Camera, options: Options) -> Drawn:
+        """Return what was made, in memory of its own, as `drawn` does."""
+        count, k = self._call.count, self._distortion
+        intrinsics, rotation = one.room[:4], one.room[4:13].view(3, 3) if self._turns else None
+        k = one.room[13 : 13 + count] if self._moves else k
+        factor, found = (torch.tensor([value], dtype=torch.float64) for value in (one.factor, one.filled))
+        return Drawn(base, intrinsics, k, self.size, rotation, options, self.before, one.native, factor, found)
+
+    def _add_limits(self, call: _Draws, rows: int) -> list[Tensor]:
+        """Give room for the limits of new lenses, if some have wanted them."""
+        if not self._follows:
+            return []
+        kept = [torch.empty(rows * count, dtype=self._native.dtype, device="cpu") for count in (AZIMUTHS, EXTENT)]
+        call.made.limits2, call.made.extent = (tensor.data_ptr() for tensor in kept)
+        return kept
+
+    def _made(self, call: _Draws, kept: list[Tensor], rows: int) -> Native:
+        """Return the new cameras for compiled code."""
+        native = self._native
+        lenses = partial(self._lenses, kept[0], rows) if self._knows else lambda _: native.lenses
+        return Native.made(native, call.made, (call, kept, self), lenses)
+
     def drawn(self, values: Mapping[str, Any], base: Camera, options: Options) -> Drawn:
         """Return the new cameras, modules like `base`, of values (B,) and (B, size), or numbers and lists for one."""
         call, native = _Draws.from_buffer_copy(self._call), self._native
-        given = [values[name] for name in self._names]
+        given = [values[name] for name in self.names]
         several = [len(value) for value in given if isinstance(value, np.ndarray)]
         rows, is_one = self._rows or (several[0] if several else 1), not (self._rows or several)
         if is_one:
@@ -166,7 +215,7 @@ class Start:
         filled = torch.empty(2, rows, dtype=torch.float64, device="cpu")
         call.factors, call.filled = filled.data_ptr(), filled.data_ptr() + 8 * rows
         tries = self._tries(values, rows, call) if self._moves and not self._knows else None
-        kept = [room]
+        kept = [room, *self._add_limits(call, rows)]
         while (left := _run(call)) & ~_NO_CAMERA:
             if left & _TOO_WIDE:
                 widest = np.max(values["fov"])
@@ -181,8 +230,8 @@ class Start:
             if left & _LEFT_LENS and tries is not None:
                 tries.follow()
             elif left & _LEFT_LENS:
-                kept += [room.new_empty(rows * count) for count in (AZIMUTHS, EXTENT)]
-                call.made.limits2, call.made.extent = (tensor.data_ptr() for tensor in kept[1:])
+                self._follows = True
+                kept += self._add_limits(call, rows)
         if call.followed < rows and self._moves:
             call.made.limits2 = call.made.extent = None
         intrinsics, rotation, k = room[: 4 * rows], room[4 * rows : 13 * rows], self._distortion
@@ -190,8 +239,7 @@ class Start:
             k = room[13 * rows : (13 + call.count) * rows].view(rows, call.count)
         made = None
         if not left and (self._knows or not self._moves) and (self._knows or native.cameras == rows):
-            lenses = partial(self._lenses, k) if self._knows else lambda _: native.lenses
-            made = Native.made(native, call.made, (call, kept, self), lenses)
+            made = self._made(call, kept, rows)
         elif is_one and not left:
             made = single_native(model_of(self.base), intrinsics, k[0])
         turned = rotation.view(rows, 3, 3) if self._turns else None
@@ -216,11 +264,24 @@ class Start:
         call.kept = tried, allowed
         return native
 
-    def _lenses(self, k: Tensor, made: Native) -> Lenses:
-        """Return what was found of new lenses, kept for whoever evaluates cameras of their coefficients (C, n)."""
-        model = model_of(self.base)
+    def _lenses(self, room: Tensor, rows: int, made: Native) -> Lenses:
+        """Return what was found of new lenses, kept for whoever evaluates cameras of their coefficients."""
+        model, count = model_of(self.base), self._call.count
+        k = room[13 * rows : (13 + count) * rows].view(rows, count)
         domain = partial(domain_for, model, k, False)
         return lenses_of(made.plan, k, lambda: Lenses.known(made.plan, model.optics, k, domain, made))
+
+
+class One(NamedTuple):
+    """A new camera as compiled code made it; what is not native belongs to whoever gets it, but for the room."""
+
+    native: Native
+    room: Tensor
+    intrinsics: Tensor
+    distortion: Tensor
+    rotation: Tensor | None
+    factor: float
+    filled: float
 
 
 def _run(call: _Draws) -> int:

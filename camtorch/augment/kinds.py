@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import difflib
 import functools
 import math
@@ -302,19 +303,25 @@ def in_range(values: Tensor, dtype: torch.dtype) -> Tensor:
     return values.to(dtype)
 
 
+Found = tuple[list[str], SampleCall | None]
+"""The names of the fields that a call moves, and the call, if there is one."""
+
+
 class Form:
     """What samples of one form have in common: the fields that move, by name and kind, and the call that moves them."""
 
     def __init__(self, fields: list[tuple[str, str]], batched: bool, count: int):
         self.fields, self.batched, self.count = fields, batched, count
         self._settings: tuple[Any, ...] = ()
-        self._call: tuple[list[str], SampleCall | None] = [], None
+        self.found: Found = [], None
+        self.ready: Any = None  # of random cameras, which have looked whether
+        self.is_tried = False
 
-    def call(self, settings: tuple[Any, ...], find: Callable[[], tuple[list[str], SampleCall | None]]) -> Any:
+    def call(self, settings: tuple[Any, ...], find: Callable[[], Found]) -> Found:
         """Return the call, and the names of the fields that it moves, of the last settings or as found."""
         if settings != self._settings:
-            self._call, self._settings = find(), settings
-        return self._call
+            self.found, self._settings = find(), copy.deepcopy(settings)
+        return self.found
 
 
 def together(
@@ -334,7 +341,7 @@ def together(
     is_turn, options = moved is not None and moved.is_turn, part.moves.options
     sizes = part.camera._size_for("Warp"), part.image_size
 
-    def find() -> tuple[list[str], SampleCall | None]:
+    def find() -> Found:
         hows = _ways(named, options, mask_fill, source.dtype if moved is not None else None, is_turn, change.count == 1)
         values = [named[name][1] if batched else named[name][1][0] for name in hows]
         return list(hows), call_for(sizes, source.dtype, options, values, [*hows.values()], batched) if hows else None

@@ -322,7 +322,14 @@ class SampleTransform(KeepsCamera, nn.Module):
             return None
         intrinsics, distortion = camera._tensors
         # each thread has calls of its own
-        parts: list[Any] = [get_ident(), type(sample), camera.image_size, intrinsics.shape, distortion.shape]
+        parts: list[Any] = [
+            get_ident(),
+            type(sample),
+            type(camera),
+            camera.image_size,
+            intrinsics.shape,
+            distortion.shape,
+        ]
         parts += intrinsics.dtype, intrinsics.device
         for name, value in sample.items():
             if isinstance(value, Tensor):

@@ -116,7 +116,6 @@ class Transform(FrontEnd, v2.Transform):
             sample[key] = torch.as_tensor(sample[key])[..., None].repeat_interleave(_STEPS**2, -1)
         moved, change = own._augmented(sample, kinds)
         moved |= {key: moved[key].any(-1) for key in of_points}
-        own.last = change
         for i, (kind, _, back) in fields.items():
             if change.parts[0].moves is not None or not kind or type(leaves[i]) in _HELD:
                 leaves[i] = back(moved[keys[i]], change)

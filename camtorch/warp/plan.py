@@ -460,6 +460,10 @@ class SampleCall:
         self._boxes = [i for i, how in enumerate(form.hows) if how == "boxes"]
         self._first_job, self._jobs, self._has_pixels = first["images"], images[1], pixels[1] > 0
         self._dtype, self._count = dtype, count
+        self.keeps_dtypes: bool = all(
+            isinstance(how, Sampler) or value.dtype == dtype for value, how in zip(form.values, form.hows, strict=True)
+        )
+        """Whether all results are of the dtypes of the values."""
         ways = zip(form.values, form.hows, strict=True)
         self._decides = form.decides and any(
             isinstance(how, Sampler) and how.mode != "nearest" and value.dtype != torch.bool for value, how in ways

@@ -1,6 +1,7 @@
 """A single sample is made by one call of compiled code, to the very numbers that its change makes step by step."""
 
 import math
+from functools import partial
 from itertools import product
 
 import numpy as np
@@ -66,7 +67,7 @@ def sample_for(dtype):
 def test_as_step_by_step(key, name, dtype):
     camera = example(key, SIZE).to(dtype).requires_grad_(False)
     augment, sample = AUGMENTATIONS[name](), sample_for(dtype)
-    for seed in range(2):
+    for seed in range(3):
         torch.manual_seed(seed)
         out = augment(sample, camera=camera)
         change, fill = augment.last, augment.mask_fill
@@ -135,10 +136,11 @@ def test_boxes_of_a_sample_move_as_by_its_warp(name):
     rows = [first, first - 30, first + 1000, first * math.nan, first[[0, 1, 0, 1]]]
     for boxes in (torch.stack(rows[:1]), torch.stack(rows[:2]), torch.stack(rows), torch.zeros(0, 4)):
         augment = LAST[name]()
-        out = augment({**sample_for(torch.float32), "boxes": boxes}, camera=camera)
-        want, valid = augment.last.boxes(boxes[None])
-        assert torch.equal(out["boxes"], want[0])
-        assert torch.equal(out["boxes_valid"], valid[0])
+        for _ in range(2):
+            out = augment({**sample_for(torch.float32), "boxes": boxes}, camera=camera)
+            want, valid = augment.last.boxes(boxes[None])
+            assert torch.equal(out["boxes"], want[0])
+            assert torch.equal(out["boxes_valid"], valid[0])
 
 
 @pytest.mark.parametrize("lead", [(), (2,)])
@@ -183,8 +185,9 @@ def odd_samples():
 def test_odd_samples_as_step_by_step(form, name, monkeypatch):
     sample, camera = odd_samples()[form], example("brown_conrady", SIZE).requires_grad_(False)
     augment = A.RandomMount() if name == "mount" else A.RandomLens() if name == "lens" else AUGMENTATIONS[name]()
-    torch.manual_seed(0)
-    out = augment(sample, camera=camera)
+    for _ in range(2):  # of which the second is ready
+        torch.manual_seed(0)
+        out = augment(sample, camera=camera)
     monkeypatch.setattr(camtorch.augment.kinds, "call_for", lambda *given: None)
     augment._forms = Kept(16)
     torch.manual_seed(0)
@@ -200,6 +203,46 @@ def test_what_goes_at_once_makes_no_warp(name):
     augment = AUGMENTATIONS[name]()
     augment(sample, camera=camera)
     assert augment.last.parts[0].moves.made is None
+
+
+CHANGES = {
+    "options": lambda augment, camera: augment.options.update(mode="nearest"),
+    "mask_fill": lambda augment, camera: setattr(augment, "mask_fill", 5.0),
+    "range": lambda augment, camera: augment.ranges.update(yaw=A.Range(20, 30)),
+    "p": lambda augment, camera: setattr(augment, "p", 0.0),
+    "size": lambda augment, camera: setattr(augment, "image_size", (80, 70)),
+    "filled": lambda augment, camera: setattr(augment, "min_filled", 0.95),
+    "valid_mask": lambda augment, camera: setattr(augment, "valid_mask", True),
+    "keep": lambda augment, camera: augment.fields.update(mask="keep"),
+    "values": lambda augment, camera: camera.intrinsics.data.mul_(1.1),
+    "like": lambda augment, camera: augment.like is None or augment.like.distortion.data.mul_(0.5),
+    "learns": lambda augment, camera: camera.requires_grad_(True),
+    "precision": lambda augment, camera: camera.double(),
+}
+
+
+@pytest.mark.parametrize("kind", [A.RandomMount, A.RandomLens, partial(A.RandomCamera, "dms60", image_size=(90, 120))])
+@pytest.mark.parametrize("change", CHANGES)
+def test_what_is_ready_heeds_changes(change, kind):
+    """An augmentation that has moved samples of a form does what a new one does, whatever has changed since."""
+    vectors = {"boxes": torch.tensor([[20.0, 20, 60, 50]]), "gaze": torch.tensor([0.0, 0, -1]), "rvec": torch.rand(3)}
+    outs = []
+    for calls in (3, 0):
+        augment, camera = kind(min_filled=0), example("kannala_brandt", SIZE).requires_grad_(False)
+        sample = {**sample_for(torch.float32), **vectors, "pitch_yaw": torch.tensor([0.1, 0.2])}
+        for _ in range(calls):
+            augment(sample, camera=camera)
+        assert not calls or augment._forms.result.ready is not None
+        CHANGES[change](augment, camera)
+        torch.manual_seed(1)
+        outs.append(augment(sample, camera=camera))
+        back = augment.inverse(outs[-1])
+        outs[-1] |= {f"{key}_back": value for key, value in back.items() if key in vectors}
+    first, second = outs
+    assert first.keys() == second.keys()
+    for field in first.keys() - {"camera"}:
+        torch.testing.assert_close(first[field], second[field], rtol=0, atol=0)
+    torch.testing.assert_close(first["camera"].state_dict(), second["camera"].state_dict(), rtol=0, atol=0)
 
 
 def test_samples_of_any_form_follow_each_other():
