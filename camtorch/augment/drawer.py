@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from difflib import get_close_matches
 from functools import partial
-from typing import Any, ClassVar, Literal, NamedTuple
+from typing import Any, ClassVar, Literal, NamedTuple, cast
 
 import torch
 from torch import Tensor, nn
@@ -32,7 +32,6 @@ from camtorch.values.arguments import LEFT, as_image_size, broadcast_shapes, che
 from camtorch.values.module import remade
 from camtorch.warp.panorama import PANORAMAS
 from camtorch.warp.plan import SampleCall
-from camtorch.warp.sampling import Options
 from camtorch.warp.vignetting import vignetting
 from camtorch.warp.warp import Warp
 
@@ -243,14 +242,14 @@ class CameraDrawer(Augmentation):
 
     def _quickly(self, sample: Sample, generator: torch.Generator | None) -> tuple[Sample | None, Any]:
         camera = self._held("camera") if (given := sample.get("camera")) is None else given
-        key = self._form_of(sample, camera, self.fields)
-        form = None if key is None else self._forms.entry((), key)
-        ready: Ready | None = None if form is None else form[2].ready
+        key, settings = self._form_of(sample, camera, self.fields), self._settings()
+        entry = None if key is None else self._forms.entry((), key)
+        form: Form | None = None if entry is None else entry[2]
+        ready: Ready | None = None if form is None else form.ready
         if form is None or ready is None or camera is None:
             return None, None
-        settings = self._settings()
         if ready.settings != settings:
-            form[2].is_tried, form[2].ready = False, None
+            form.is_tried, form.ready = False, None
             return None, None
         options, *_, like = settings
         applied, numbers, spans = self._numbers_of_one(generator)
@@ -259,31 +258,40 @@ class CameraDrawer(Augmentation):
         known = self._memo.entry(tensors, ready.key) if applied and are_free(*tensors, *fields) else None
         for name, found in ready.checked:
             check_values(found, name, sample[name], self._name)
-        start = None if known is None else known[2]
-        one = None if start is None else start.one(numbers)
-        results = None if one is None else ready.call(start.before, one.native, one.rotation, fields)
-        if one is None or results is None or None in results:
-            return None, {"apply": [applied], **spans.named(numbers)}
-        base = camera if like is None else start.base
-        moved = dict(sample)
-        for name, (value, valid) in zip(ready.names, results, strict=True):
-            moved[name] = value
+        if known is not None:
+            start: Start = known[2]
+            one = start.one(numbers)
+            moved = None if one is None else ready.call(start.before, one.native, one.rotation, fields)
+            if one is not None and moved is not None and None not in moved:
+                base = camera if like is None else start.base
+                self.__dict__["_last"] = partial(_change_of, start, one, base, {**options}, camera)
+                return self._sample_after(sample, ready, start, one, base, moved), None
+        return None, {"apply": [applied], **spans.named(numbers)}
+
+    def _sample_after(
+        self, sample: Sample, ready: Ready, start: Start, one: One, base: Camera, moved: Iterable[Any]
+    ) -> Sample:
+        """Return a sample with the fields that a call has moved, those that take their own ways, and the new camera."""
+        result = dict(sample)
+        for name, (value, valid) in zip(ready.names, moved, strict=True):
+            result[name] = value
             if valid is not None:
-                moved[f"{name}_valid"] = valid
-        self.__dict__["_last"] = partial(_change_of, start, one, base, {**options}, camera)
-        if self.min_filled:
-            self._tell_of(camera, self.last.parts[0].moves)
-        for name, found in ready.rest:
-            value, valid = self._one(self.last, found, sample[name].unsqueeze(0), {"mask_fill": self.mask_fill})
-            moved[name] = value.squeeze(0)
-            if valid is not None:
-                moved[f"{name}_valid"] = valid.squeeze(0)
+                result[f"{name}_valid"] = valid
+        if self.min_filled or ready.rest:
+            change = cast("Change", self.last)
+            if self.min_filled:
+                self._tell_of(change.parts[0].camera, cast("Drawn", change.parts[0].moves))
+            for name, found in ready.rest:
+                value, valid = self._one(change, found, sample[name].unsqueeze(0), {"mask_fill": self.mask_fill})
+                result[name] = value.squeeze(0)
+                if valid is not None:
+                    result[f"{name}_valid"] = valid.squeeze(0)
         if ready.turns:
-            moved["rotation"] = no_turn(start.dtype).clone() if one.rotation is None else one.rotation
+            result["rotation"] = no_turn(start.dtype).clone() if one.rotation is None else one.rotation
         k = nn.Parameter(one.distortion, requires_grad=False) if len(one.distortion) else one.distortion
         intrinsics = nn.Parameter(one.intrinsics, requires_grad=False)
-        moved["camera"] = remade(base, intrinsics=intrinsics, distortion=k, image_size=start.size)
-        return moved, None
+        result["camera"] = remade(base, intrinsics=intrinsics, distortion=k, image_size=start.size)
+        return result
 
     def _warp(self, source: Camera, target: Camera, rotation: Tensor | None) -> Warp:
         return Warp.unchecked(source, target, self.options).turned_by(rotation)
@@ -394,7 +402,7 @@ class Ready(NamedTuple):
         return cls(settings, key, names, call, rest, checked, all(name != "rotation" for name, _ in form.fields))
 
 
-def _change_of(start: Start, one: One, base: Camera, options: Options, camera: Camera) -> Change:
+def _change_of(start: Start, one: One, base: Camera, options: Any, camera: Camera) -> Change:
     return Change(1, [Part(None, start.again(one, base, options), camera)])
 
 

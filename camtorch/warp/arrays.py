@@ -21,9 +21,7 @@ def as_tensor(array: object, name: str, owner: str) -> Tensor:
         what = f"dtype {array.dtype}" if isinstance(array, np.ndarray) else type(array).__name__
         hint = f". np.array({name}) makes one" if hasattr(array, "__array_interface__") else ""
         raise TypeError(f"{owner}: {name} must be a numpy array of real numbers; got {what}{hint}")
-    # torch has no other byte orders or long doubles, and no strides that are negative or end within a number
-    known = array.dtype.isnative and array.itemsize <= 8 and array.flags.aligned
-    if not known or any(step < 0 or step % array.itemsize for step in array.strides):
+    if not can_share(array):
         dtype = array.dtype.newbyteorder("=") if array.itemsize <= 8 else np.dtype(np.float64)
         array, given = np.empty(array.shape, dtype), array
         # channel by channel is three times as fast for pixels or channels that run backwards
@@ -34,6 +32,13 @@ def as_tensor(array: object, name: str, owner: str) -> Tensor:
         interface = {**array.__array_interface__, "data": (array.ctypes.data, False)}
         array = np.asarray(SimpleNamespace(__array_interface__=interface, owner=array))
     return torch.from_numpy(array)
+
+
+def can_share(array: Array) -> bool:
+    """Whether torch can read the memory of an array of real numbers."""
+    # torch has no other byte orders or long doubles, and no strides that are negative or end within a number
+    known = array.dtype.isnative and array.itemsize <= 8 and array.flags.aligned
+    return known and not any(step < 0 or step % array.itemsize for step in array.strides)
 
 
 def as_planes(array: object, name: str, owner: str, size: tuple[int, int] | None = None) -> Tensor:

@@ -8,9 +8,10 @@ import math
 import struct
 import threading
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from itertools import accumulate
 from itertools import count as count_from
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -361,7 +362,8 @@ def _surely_keeps_size(back: Between, sizes: Sizes) -> bool:
     return bool((total < SURELY * SHRINKS * step * np.maximum(count, 1)).all())
 
 
-class SampleForm(NamedTuple):
+@dataclass
+class SampleForm:
     """What samples have in common that one call serves; see `call_for`."""
 
     sizes: Sizes
