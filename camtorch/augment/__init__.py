@@ -1,6 +1,6 @@
 """Augmentations that move image, masks, landmarks, boxes, gaze and head pose together, with the camera.
 
-`camtorch.augment.kornia`, `.torchvision`, `.albumentations` and `.numpy` are the same for those libraries' pipelines.
+`camtorch.augment.kornia`, `.torchvision`, `.albumentations` and `.numpy` offer them in those libraries' pipelines.
 """
 
 from typing import TYPE_CHECKING
@@ -64,7 +64,7 @@ __all__ = [
 ]
 
 
-if not TYPE_CHECKING:  # a checker knows the names, and no others
+if not TYPE_CHECKING:  # type checkers know the names above, and no others
 
     def __getattr__(name: str) -> None:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}. {LEFT}")

@@ -31,23 +31,23 @@ _OWN = "image", "images", "mask", "masks", "bboxes", "keypoints"  # targets of p
 class Transform(FrontEnd, A.DualTransform):
     """An augmentation among those of albumentations: all that a sample holds moves by one draw.
 
-    The targets of pipelines are given and filtered as its `bbox_params` and `keypoint_params` say. A keypoint without a
-    place on the new camera becomes (-1, -1), off the image, and `remove_invisible=True` takes it away with its labels;
-    `False` keeps it there. A lost box has no area. Angles and sizes of keypoints stay as they are.
+    Targets of pipelines follow its `bbox_params` and `keypoint_params`. A keypoint without a place on the new camera
+    becomes (-1, -1), off the image: `remove_invisible=True` removes it with its labels, `False` keeps it there. A lost
+    box has no area. Angles and sizes of keypoints are not changed.
 
-    Everything else moves by its name, as in `Augmentation`: `gaze`, `head_pose`, `depth` and so on, in pixels, with
+    Other fields move by their names, as in `Augmentation`: `gaze`, `head_pose`, `depth` and so on, in pixels, with
     `<name>_valid` next to points and boxes. Numbers under an unknown name that might be geometry raise an error;
-    `fields={"lidar": "points", "logits": "keep"}` of the augmentation says what they are. A `camera` in the sample is
-    that of its images, and every sample comes out with the new one, from which the next transform of camtorch goes on.
-    Albumentations' own crops and flips do not change the camera; the edits of camtorch do.
+    `fields={"lidar": "points", "logits": "keep"}` of the augmentation gives their kinds. A `camera` in the sample is
+    that of its images; every result holds the new one, which the next transform of camtorch uses. Albumentations' own
+    crops and flips do not change the camera; the edits of camtorch do.
 
     Numbers are drawn by the generator of the pipeline, `A.Compose(..., seed=...)`, and replayed by `A.ReplayCompose`.
-    Nothing is differentiated, and volumes are not taken.
+    There are no gradients, and volumes are not supported.
 
     Args:
-        augmentation: what to do.
-        camera: of samples that hold none; by default the augmentation's. It is copied, and does not learn.
-        p: how likely a sample is augmented; by default as the augmentation says.
+        augmentation: the augmentation to apply.
+        camera: for samples that hold none; default: the augmentation's. It is copied, and does not learn.
+        p: probability that a sample is augmented; default: the augmentation's.
 
     Raises:
         TypeError: If `augmentation` is no Augmentation, or a camera is no Camera.
@@ -67,7 +67,7 @@ class Transform(FrontEnd, A.DualTransform):
 
     @property
     def targets(self) -> dict[str, Callable[..., Any]]:
-        nothing: Callable[..., Any] = self.apply  # they move together, see `apply_with_params`
+        nothing: Callable[..., Any] = self.apply  # `apply_with_params` moves all targets together
         return dict.fromkeys((*KINDS, *_OWN, *self.augmentation.fields, "camera"), nothing)
 
     def __call__(self, *args: Any, force_apply: bool = False, **data: Any) -> dict[str, Any]:
@@ -87,13 +87,13 @@ class Transform(FrontEnd, A.DualTransform):
         for i, (name, value) in enumerate(data.items()):
             target = self._additional_targets.get(name, name)
             own = name in ("camera", "applied_transforms", self.save_key) or value is None
-            if not own and not (target in _OWN[4:] and len(value) == 0):  # a name that begins with its kind is known
+            if not own and not (target in _OWN[4:] and len(value) == 0):  # a name that begins with a kind is known
                 field = name if name == target else f"{kind_of(target, value, {}, _OWNER)}_{i}"
                 places[field], fields[field] = (name, target), _given(target, value, camera)
         draw = {name: torch.from_numpy(np.array(value, np.float64)) for name, value in params["draw"].items()}
         moved = self._arrays(fields, draw=draw)
         change = self.augmentation.last
-        assert change is not None  # of this call
+        assert change is not None  # set by this call
         result = data | {name: moved[name] for name in ("camera",) if name in moved}
         for field, (name, target) in places.items():
             seen = moved.get(f"{field}_valid")
@@ -117,7 +117,7 @@ def _given(target: str, value: Any, camera: Camera) -> Any:
 
 
 def _taken(target: str, given: Any, moved: Any, seen: Any, size: tuple[int, int]) -> Any:
-    """Return a target as pipelines go on with it."""
+    """Return a moved target in the form of pipelines."""
     if target == "keypoints":
         return np.concatenate((np.nan_to_num(moved, nan=-1.0), given[:, 2:]), 1)
     if target == "bboxes":  # a lost one has no area

@@ -1,4 +1,4 @@
-"""Crops that look at a box of each sample, as of a face detector: without perspective error, labels and camera move."""
+"""Crops that look at a box of each sample, such as a face, without perspective error; labels and camera follow."""
 
 from __future__ import annotations
 
@@ -18,25 +18,29 @@ RangeLike = float | Sequence[float]
 
 
 class BoxCrop(Augmentation):
-    """What a pinhole camera sees that looks at a box of the sample: `ct.views.look_at` as an augmentation.
+    """An augmentation that crops a box of the sample by a pinhole camera that looks at it, as `ct.views.look_at`.
 
-    Landmarks, other boxes, masks, depth, gaze, head pose and the camera move along, and `inverse` takes them back. The
-    draw holds the boxes beside the numbers, as `draw["box"]` (B, 4), which `forward` takes from the sample's `boxes`;
-    for `change`, and for the first of several calls of a replay, it is put there.
+    Landmarks, other boxes, masks, depth, gaze, head pose and the camera move too, and `inverse` moves them back. A draw
+    holds the boxes as `draw["box"]` (B, 4), which `forward` takes from the sample's `boxes`; for `change`, and for the
+    first of several calls of a replay, put them there.
 
-    In a `Compose` the box moves with what comes before. Where that turned the camera so far that the box left the
-    image, the crop is of the middle of the image, and the labels say that they are not on it.
+    In a `Compose` the box moves with the parts before. If it left the image, the crop shows the middle of the image,
+    and the labels are invalid.
+
+        >>> crop = ct.augment.BoxCrop((64, 64), camera=ct.Pinhole([80.0, 80.0, 63.5, 47.5], image_size=(96, 128)))
+        >>> crop(image=torch.zeros(3, 96, 128), boxes=torch.tensor([[40.0, 30.0, 70.0, 60.0]]))["image"].shape
+        torch.Size([3, 64, 64])
 
     Args:
         image_size: (height, width) of the crop.
         margin: how far left and right move out, in widths of the box, and top and bottom, in heights.
-        index: of the box among those of a sample; -1 is the last one.
-        yaw, pitch, roll: ranges of degrees by which the camera turns away from the box, as of `RandomMount`.
-        zoom: range of the factor on the focal length; below 1 more than box and margin is seen.
+        index: index of the box among those of a sample; -1 is the last one.
+        yaw, pitch, roll: ranges of degrees by which the camera turns away from the box, as in `RandomMount`.
+        zoom: range of the factor on the focal length; below 1 more than box and margin is shown.
         options: see `Augmentation`.
 
     Raises:
-        ValueError: a sample without that box, and the boxes that `ct.views.look_at` refuses, with their place in the
+        ValueError: If a sample lacks that box, or `ct.views.look_at` refuses it; the message names its place in the
             batch.
     """
 
@@ -66,7 +70,7 @@ class BoxCrop(Augmentation):
         self.crops = {"box": as_whole(index, "index", name)}
 
     def new_camera(self, source: Camera, values: Mapping[str, Tensor]) -> tuple[Camera, Tensor | None]:
-        """The camera that looks at `values["box"]`, (*B, 4); see `Augmentation.new_camera`."""
+        """Return the camera that looks at `values["box"]`, (*B, 4); see `Augmentation.new_camera`."""
         box = values["box"]
         rows = box.reshape(-1, 4)
         check_extents(rows, source, self._name)
@@ -82,9 +86,9 @@ class BoxCrop(Augmentation):
         return pinhole(intrinsics.to(box), self.image_size), rotation.to(box)
 
     def tell_of_empty_images(self, camera: Camera) -> None:
-        """A box at the rim of the image is meant so."""
+        """Do not warn: a box at the rim of the image is intended."""
 
     def extra_repr(self) -> str:
-        """Where it looks, what is drawn from, and the options."""
+        """Return image_size, margin and index, then the ranges and the options."""
         own = f"image_size={self.image_size}, margin={self.margin:g}, index={self.crops['box']}"
         return f"{own}, {super().extra_repr()}"

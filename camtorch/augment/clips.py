@@ -13,7 +13,7 @@ from camtorch.cameras.camera import Camera
 
 @dataclass(frozen=True)
 class Clips:
-    """A sample of clips, with the names of all that is of each frame."""
+    """A sample of clips, and the names of its fields that hold a value for each frame."""
 
     sample: Mapping[str, Any]
     fields: Sequence[str]
@@ -22,7 +22,7 @@ class Clips:
     owner: str
 
     def frames(self, camera: Any) -> dict[str, Any]:
-        """Return the sample as a batch of B * T frames, each with the `camera` of its clip, if there is one."""
+        """Return the sample as a batch of B * T frames, each with the `camera` of its clip, if any."""
         flat = dict(self.sample)
         for name in self.fields:
             value = flat[name]
@@ -38,17 +38,17 @@ class Clips:
         return flat
 
     def repeated(self, value: Any, name: str) -> Any:
-        """Return what there is of each clip, (B, ...), for each of its frames; one camera serves all."""
+        """Return a value (B, ...) of each clip, repeated for each of its frames; a single camera serves all."""
         if not hasattr(value, "__len__") or (isinstance(value, Camera) and not value.batch_shape):
             return value
         clips, frames = self.shape
         if len(value) != clips:
-            raise ValueError(f"{self.owner}: {name} is of {len(value)} clips, {self.image} of {clips}")
+            raise ValueError(f"{self.owner}: {name} must be of {clips} clips, as {self.image} is; got {len(value)}")
         rows = [i for i in range(clips) for _ in range(frames)]
         return [value[i] for i in rows] if isinstance(value, (list, tuple)) else value[rows]
 
     def restored(self, moved: Mapping[str, Any]) -> dict[str, Any]:
-        """Return what came of the frames as clips; what is of all frames of a clip, once."""
+        """Return moved frames as clips; values of a whole clip, such as its camera, are returned once."""
         result = dict(moved)
         for name, value in moved.items():
             if name in ("camera", "rotation"):

@@ -1,4 +1,4 @@
-"""Batches for a DataLoader of samples that hold cameras, and labels whose number differs."""
+"""Batches for a DataLoader of samples with cameras, and with labels whose number differs."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ from camtorch.values.arguments import is_list
 
 
 def collate(samples: Sequence[object]) -> object:
-    """A batch of samples, of dicts, tuples or whatever they are: the `collate_fn` of a DataLoader.
+    """Return a batch of samples, such as dicts or tuples: the `collate_fn` of a DataLoader.
 
-    As torch's own `default_collate`, which stacks tensors, arrays and numbers; but tensors and arrays whose shapes
-    differ, such as the keypoints of several faces, come as the list of tensors that the augmentations take. Cameras
-    become a batch, or a `ct.Mixed` if they are of several models; so they do by `default_collate`. Their images are of
-    one size: augment others in the workers, one by one.
+    It works like torch's `default_collate`, which stacks tensors, arrays and numbers, except that tensors and arrays of
+    different shapes, such as the keypoints of several faces, become the list of tensors that augmentations take.
+    Cameras become a batch, or a `ct.Mixed` if they are of several models, as in `default_collate`. Their images must be
+    of one size: augment others in the workers, one by one.
 
-    In a worker on Linux, batches go into shared memory that is used again when the main process has let go of them,
-    as new memory takes as long to get as images take to be augmented; of no more bytes than were in use at once. What
-    is small goes within the message. So the storage of what arrives cannot be resized. With torch's sharing strategy
-    "file_system" all goes torch's own way.
+    In a worker on Linux, batches go into shared memory, which is used again once the main process has released it, as
+    allocating memory takes as long as augmenting images. It holds no more bytes than were in use at once. Small values
+    go within the message. The storage of the results cannot be resized. With torch's sharing strategy "file_system"
+    everything goes torch's own way.
 
     Raises:
-        TypeError: no list of samples; what cannot be collated, as by `default_collate`. ValueError: an empty list,
-            cameras whose images differ in size.
+        TypeError: If samples are no list, or cannot be collated by `default_collate` either. ValueError: If the list is
+            empty, or the cameras' images differ in size.
     """
     if not is_list(samples):
         raise TypeError(f"collate: samples must be a list of samples; got {type(samples).__name__}")
@@ -43,7 +43,7 @@ def collate(samples: Sequence[object]) -> object:
 
 
 def _tensors(batch: Sequence[Tensor], *, collate_fn_map: Any = None) -> Tensor | list[Tensor]:
-    if in_worker():  # which no graph can leave
+    if in_worker():  # no graph can leave a worker
         batch = [tensor.detach() for tensor in batch]
     if len({tensor.shape for tensor in batch}) > 1:
         return list(batch)

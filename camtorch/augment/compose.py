@@ -1,4 +1,4 @@
-"""Augmentations one after the other, which move images once."""
+"""Chains of augmentations, which sample images once."""
 
 from __future__ import annotations
 
@@ -21,33 +21,30 @@ _OF_IMAGES = ("mode", "padding_mode", "fill", "tolerance")
 
 
 class Compose(Augmentation):
-    """Augmentations one after the other, each for the camera that the one before leaves, applied all at once.
+    """A chain of augmentations, each drawn for the camera that the one before returns, applied all at once.
 
-    Images are sampled once, by the warp from the first camera to the last, and labels move exactly. `nn.Sequential`
-    of the same augmentations, with the same seed, moves labels alike, but samples images at every step, and
-    leaves black what a later step might see again: here, what is cut off on the way and seen by the last camera is
-    shown. Where all are edits no camera is needed.
+    Images are sampled once, by the warp from the first camera to the last, and labels move exactly. `nn.Sequential` of
+    the same augmentations, with the same seed, moves labels alike, but samples images at every step and cuts off pixels
+    that a later step might see again; a `Compose` shows them. If all parts are edits, no camera is needed.
 
-        augment = ct.augment.Compose(
-            [
-                ct.augment.RandomResizedCrop((480, 640), scale=(0.5, 1.0)),
-                ct.augment.HorizontalFlip(landmarks="ibug68"),
-                ct.augment.RandomLens("dms130", fov="source"),
-            ],
-            camera=camera,
-        )
+        >>> augment = ct.augment.Compose(
+        ...     [ct.augment.HorizontalFlip(landmarks="ibug68"), ct.augment.RandomLens("dms130", fov="source")],
+        ...     camera=ct.Pinhole([80.0, 80.0, 63.5, 47.5], image_size=(96, 128)),
+        ... )
+        >>> augment(image=torch.zeros(3, 96, 128), keypoints=torch.ones(68, 2))["image"].shape
+        torch.Size([3, 96, 128])
 
     Args:
-        augmentations: in the order in which they apply; a `Compose` among them, too.
-        camera: of samples that do not bring one; by default that of the first augmentation.
-        antialias: as of `Edit`: by itself where more than one and a half pixels come to one, if None.
-        options: p, same_on_batch, fields, mode, padding_mode, fill, mask_fill, valid_mask, tolerance, of all of them
-            together; see `Augmentation`. Those of the parts are p, same_on_batch, fields and what they draw.
+        augmentations: in the order in which they apply; may hold a `Compose`.
+        camera: for samples that hold none; default: that of the first augmentation that has one.
+        antialias: as in `Edit`: None antialiases if more than one and a half pixels come to one.
+        options: p, same_on_batch, fields, mode, padding_mode, fill, mask_fill, valid_mask, tolerance, of the whole
+            chain; see `Augmentation`. The parts keep their own p, same_on_batch, fields and ranges.
 
     Raises:
-        TypeError: something that is no augmentation. ValueError: none; two tables of landmarks that differ; a part that
-            wants other images than the whole; chromatic aberration or vignetting before another lens; a
-            `RandomShutter` before the last part.
+        TypeError: If a part is no augmentation. ValueError: If there is no part; if two tables of landmarks differ; if
+            a part needs other images than the whole; if chromatic aberration or vignetting come before another lens, or
+            a `RandomShutter` before the last part.
     """
 
     augmentations: nn.ModuleList
@@ -66,7 +63,7 @@ class Compose(Augmentation):
                     "Those of other libraries go before or after, in nn.Sequential or their own containers"
                 )
         if not parts:
-            raise ValueError(f"{name}: no augmentations")
+            raise ValueError(f"{name}: augmentations must hold at least one; got an empty list")
         if options.get("camera") is None:
             options["camera"] = next((part.camera for part in parts if part.camera is not None), None)
         options["fields"] = {key: value for part in parts for key, value in part.fields.items()} | dict(
@@ -88,7 +85,7 @@ class Compose(Augmentation):
         self._check_options(parts)
         mirrorings = {repr(m.key): m for part in parts if (m := part.mirroring) is not None}
         if len(mirrorings) > 1:
-            raise ValueError(f"{name}: flips of one chain need the same landmarks, lateral_axis and swap_sides")
+            raise ValueError(f"{name}: flips of one chain must have the same landmarks, lateral_axis and swap_sides")
         self.mirroring: Mirroring | None = next(iter(mirrorings.values()), None)
 
     def _check_options(self, parts: Sequence[Augmentation]) -> None:
@@ -99,29 +96,29 @@ class Compose(Augmentation):
             for key in (*_OF_IMAGES, "mask_fill"):
                 if given[key] not in ({**usual, "mask_fill": 0.0}[key], wanted[key]):
                     raise ValueError(
-                        f"{self._name}: images are sampled once, so {key}={given[key]!r} of {type(part).__name__} goes "
-                        f"to {self._name} itself"
+                        f"{self._name}: images are sampled once, so parts must have one {key}; got {given[key]!r} of "
+                        f"{type(part).__name__}. Pass it to {self._name} itself"
                     )
             drawn = {key.rpartition(".")[2] for key in part.ranges}
             if "shift_x" in drawn:
                 raise ValueError(
-                    f"{self._name}: a shift needs the depth of its own image; {type(part).__name__} with it goes before"
+                    f"{self._name}: parts must have no shift; {type(part).__name__}, which needs depth, goes before"
                 )
             if "rates" in drawn and parts[i + 1 :]:
                 raise ValueError(
-                    f"{self._name}: what comes after a rolling shutter would move its rows; {type(part).__name__} goes "
-                    "last"
+                    f"{self._name}: a rolling shutter must be last, or later parts move its rows; got it at place {i}. "
+                    f"{type(part).__name__} goes last"
                 )
             coloured = {"chromatic", "vignetting", "cos4"} & drawn
             if coloured and any(later.needs_camera and not later.keeps_lens for later in parts[i + 1 :]):
                 raise ValueError(
-                    f"{self._name}: the {' and '.join(sorted(coloured))} of {type(part).__name__} would be seen "
-                    "through another lens; only edits may follow it"
+                    f"{self._name}: parts after the {' and '.join(sorted(coloured))} of {type(part).__name__} must be "
+                    "edits; got another lens, through which it would be seen"
                 )
 
     @property
     def parts(self) -> list[Augmentation]:
-        """The augmentations, in their order."""
+        """The augmentations in their order."""
         return cast("list[Augmentation]", list(self.augmentations))
 
     def _numbers(self, count: int, p: float, same_on_batch: bool, generator: torch.Generator | None) -> dict[str, Any]:
@@ -150,7 +147,7 @@ class Compose(Augmentation):
             steps.append((part, {**own, "apply": (own["apply"] > 0.5) & draw["apply"]}))
         while steps:
             edits = []
-            while steps and isinstance(steps[0][0], Edit):  # those that follow each other are one
+            while steps and isinstance(steps[0][0], Edit):  # consecutive edits are one
                 edits.append(cast("tuple[Edit, dict[str, Any]]", steps.pop(0)))
             if edits:
                 step = change_by(edits, camera, options)
@@ -160,20 +157,20 @@ class Compose(Augmentation):
                     own |= {name: _moved(total, own[name], camera) for name in part.crops}
                 step = part._change(camera, own)
             total = step if total is None else total.then(step)
-            (first, *others) = step.parts  # one camera for all where it is one
+            (first, *others) = step.parts  # a camera of all samples stays single
             camera = step.target if others or first.rows is not None else first.target
         assert total is not None
         check_sizes((part.image_size for part in total.parts), self._name)
         return total.with_options(options)  # type: ignore[arg-type]
 
     def extra_repr(self) -> str:
-        """The options."""
+        """Return the options."""
         options = {"p": self.p, "same_on_batch": self.same_on_batch, **self.options, "antialias": self.antialias}
         return ", ".join(f"{name}={value!r}" for name, value in options.items())
 
 
 def _moved(change: Change, boxes: Any, camera: Camera) -> Tensor:
-    """Boxes (B, 4) after a change; one that left the image becomes the middle of it."""
+    """Return boxes (B, 4) after a change; a box that left the image becomes the middle of it."""
     moved, valid = (t[:, 0] for t in change.boxes(torch.as_tensor(boxes)[:, None]))
     width, height = camera.width, camera.height
     middle = moved.new_tensor([0.25 * width, 0.25 * height, 0.75 * width, 0.75 * height])

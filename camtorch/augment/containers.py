@@ -1,7 +1,7 @@
 """kornia's containers of camera augmentations: dicts move whole, and params carry cameras and boxes of the samples.
 
-kornia hands on the fields of a dict that it does not know without telling anybody. So this module wraps `forward` and
-`inverse` of its containers, and the way in which they take boxes and are copied.
+kornia passes on fields of a dict that it does not know without a warning. So this module wraps `forward` and `inverse`
+of its containers, how they take boxes, and how they are copied.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from camtorch.values.module import remade
 
 if not hasattr(GeometricAugmentationBase2D, "_gate"):
     raise ImportError(
-        "camtorch.augment.kornia needs kornia 0.9 or newer, which needs Python 3.11; installed is kornia "
+        "camtorch.augment.kornia: kornia must be 0.9 or newer, which needs Python 3.11; got kornia "
         f"{kornia.__version__}"
     )
 
@@ -52,7 +52,7 @@ class InContainers(KeepsCamera):
 
     @on_samples
     def _move_fields(self, fields: Sample, params: Params, kinds: dict[str, str], back: bool) -> Sample:
-        """Move the fields of a dict that kornia does not know; their flags come beside them."""
+        """Move the fields of a dict that kornia does not know, and return them with their flags."""
         device = next((value.device for value in fields.values() if isinstance(value, Tensor)), torch.device("cpu"))
         clips = int(params["video_batch_size"]) if "video_batch_size" in params else None
         flat = {n: v.flatten(0, 1) for n, v in fields.items()} if clips else fields
@@ -64,12 +64,12 @@ class InContainers(KeepsCamera):
 
 
 def with_boxes(params: Any, boxes: Tensor) -> Any:
-    """Params with the boxes (B, 4) that a `BoxCrop` crops, pixels x1, y1, x2, y2: of one augmentation, or a container.
+    """Return params with the boxes (B, 4) that a `BoxCrop` crops, x1, y1, x2, y2, for an augmentation or a container.
 
     `params = aug.forward_parameters(images.shape)`, then `aug(images, params=with_boxes(params, boxes))`.
 
     Raises:
-        ValueError: If the boxes have another shape or number, or nothing among the params crops.
+        ValueError: If the boxes have another shape or number, or the params are not those of a `BoxCrop`.
     """
     given = as_values(boxes, "boxes", "with_boxes")
     check_boxes(given, "boxes", "with_boxes")
@@ -82,16 +82,16 @@ def with_boxes(params: Any, boxes: Tensor) -> Any:
 
 
 def with_cameras(params: Any, cameras: Camera | Sequence[Camera]) -> Any:
-    """Params for images whose cameras differ in their numbers: of one augmentation, or the list of a container.
+    """Return params for images whose cameras differ in their numbers, for an augmentation or the list of a container.
 
     `params = aug.forward_parameters(images.shape)`, then `aug(images, params=with_cameras(params, cameras))`.
 
     Args:
-        params: they stay as they are.
-        cameras: a batch, or a list, that differ only in their numbers. Of a video, one for each clip or each frame.
+        params: the params, which are not changed.
+        cameras: a batch or list of cameras that differ only in their numbers. For a video, one for each clip or frame.
 
     Raises:
-        ValueError: If the cameras are of another kind or number, or the params of no camera augmentation.
+        ValueError: If the cameras are of another kind or number, or the params are not of a camera augmentation.
         TypeError: If they are no cameras.
     """
     if isinstance(cameras, (list, tuple)) and all(isinstance(camera, Camera) for camera in cameras):
@@ -108,11 +108,11 @@ def with_cameras(params: Any, cameras: Camera | Sequence[Camera]) -> Any:
         if len(kinds) and kinds[0].tolist() != kind:
             need, got = (f"{k[1]} coefficients and image_size {tuple(k[2:])}" for k in (kinds[0].tolist(), kind))
             raise ValueError(
-                f"with_cameras: needs the augmentation's model, {need}; got {type(cameras).__name__}, {got}"
+                f"with_cameras: cameras must be of the params' model, {need}; got {type(cameras).__name__}, {got}"
             )
         count, clips = len(kinds), int(own.get("video_batch_size", len(kinds)))
         if batch not in ((), (1,), (count,), (clips,)):
-            raise ValueError(f"with_cameras: the params are for {count} samples; got cameras of batch dims {batch}")
+            raise ValueError(f"with_cameras: cameras must be {count}, one for each sample; got batch dims {batch}")
         frames = count // clips if batch == (clips,) and clips else 1
         for key, numbers in zip(_NUMBERS, (cameras.intrinsics, cameras.distortion), strict=True):
             own[key] = numbers.expand(*(batch or (1,)), -1).repeat_interleave(frames, 0).expand(count, -1)
@@ -120,7 +120,7 @@ def with_cameras(params: Any, cameras: Camera | Sequence[Camera]) -> Any:
 
 
 def _edited(params: Any, name: str, need: str) -> tuple[Any, list[tuple[Params, str]]]:
-    """Return a copy of params, of one augmentation or a list, and where in it are those of a name; an error if none."""
+    """Return a copy of params, and the dicts in it that hold `name`, each with its key; raise if there are none."""
     result = pytree.tree_map(lambda value: value, params)
     found = [(part, key) for _, part in _parts(result) for key in part if key.rpartition(".")[2] == name]
     if not found:
@@ -147,7 +147,7 @@ def camera_of(params: Params, own: Camera, device: torch.device | None) -> Camer
 
 
 def kind_of_camera(camera: Camera) -> list[int]:
-    """Model, number of coefficients and image_size as integers, for params hold tensors only."""
+    """Return model, number of coefficients and image_size as integers, since params hold only tensors."""
     model = type_before_parametrizations(camera).__name__
     return [zlib.crc32(model.encode()), camera.distortion.shape[-1], *(camera.image_size or (0, 0))]
 
@@ -159,7 +159,7 @@ def _fields(container: Any, sample: Sample, ours: list[InContainers], single: bo
     theirs = {name: container._read_datakeys_from_dict((name,))[0] for name in sample if name not in OWN}
     given = {name: sample[name] for name, keys in theirs.items() if keys in ([], [DataKey.CLASS], [DataKey.LABEL])}
     if flags := [name for name in sample if name.endswith("_valid") and name not in given]:
-        raise ValueError(f"{owner}: kornia would not read {flags[0]} as flags. Use the augmentation's keypoints_valid")
+        raise ValueError(f"{owner}: a flag must be no kornia key; got {flags[0]}. Use its own keypoints_valid")
     kinds = {n: kind for n, v in given.items() if v is not None and (kind := kind_of(n, v, own, owner, single))}
     names = [*kinds, *(["camera"] if sample.get("camera") is not None else [])]
     known = InContainers, IntensityAugmentationBase2D
@@ -167,14 +167,14 @@ def _fields(container: Any, sample: Sample, ours: list[InContainers], single: bo
     for other in (type(module).__name__ for module in others if names):
         name = next((name for name in (other, other.removeprefix("Random")) if hasattr(augment, name)), None)
         how = f"camtorch.augment.kornia.{name}, which moves" if name else "augmentations of camtorch alone, which move"
-        raise ValueError(f"{owner}: {other} of kornia would leave {', '.join(names)} behind. Use {how} everything")
+        raise ValueError(f"{owner}: parts must move {', '.join(names)} too; got kornia's {other}. Use {how} everything")
     return {n: v for n, v in given.items() if n in kinds or n.removesuffix("_valid") in kinds or n in tables}, kinds
 
 
 def _with_fields(
     call: Callable[..., Any], self: Any, *args: Any, back: bool, params: Any = None, data_keys: Any = None
 ) -> Any:
-    """Move dicts with the fields that kornia does not know."""
+    """Move dicts together with the fields that kornia does not know."""
     if len(args) != 1 or not isinstance(args[0], dict):
         return call(self, *args, params=params, data_keys=data_keys)
     ours = [one for one in self.modules() if isinstance(one, InContainers)]
@@ -208,7 +208,7 @@ def _with_fields(
 
 
 def _lost_stay_lost(call: Callable[..., Boxes], self: Any, boxes: Any, key: DataKey) -> Boxes:
-    """Take boxes of zeros, as kornia exports lost ones, for lost: it takes none of no width."""
+    """Treat boxes of zeros, as kornia exports lost ones, as lost, since kornia takes no box without a width."""
     if not isinstance(boxes, Tensor):
         return call(self, boxes, key)
     lost = (boxes == 0).all(-1) if key is not DataKey.BBOX else (boxes == 0).all(-1).all(-1)
@@ -220,9 +220,9 @@ def _lost_stay_lost(call: Callable[..., Boxes], self: Any, boxes: Any, key: Data
 
 
 def _put(of: type[nn.Module], name: str, own: Callable[..., Any]) -> None:
-    """Put `own(call, container, *args)` in the place of a method `call` of containers with such an augmentation."""
+    """Replace a method `call` of containers that hold such an augmentation by `own(call, container, *args)`."""
     call = getattr(of, name)
-    call = getattr(call, "__wrapped__", call)  # of a module that is imported again
+    call = getattr(call, "__wrapped__", call)  # this module may be imported again
 
     @functools.wraps(call)
     def method(self: Any, *args: Any, **kwargs: Any) -> Any:

@@ -1,4 +1,4 @@
-"""Edits that everybody makes to images, with all that a sample holds: crops, sizes, flips and quarter turns."""
+"""Edits of images and their labels: crops, sizes, flips and quarter turns."""
 
 from __future__ import annotations
 
@@ -24,19 +24,19 @@ Size = int | Sequence[int]
 
 
 class Edit(Augmentation):
-    """An edit of the image, `sample -> sample`: its camera and all labels follow, or, without a camera, all labels.
+    """An edit of the image, `sample -> sample`: all labels follow, and the camera, if there is one.
 
-    Fields are those of `Augmentation`. Pixels move by an affine map, whether they have a ray or not; pixel edges
-    scale. Depth and distance keep their values. In a mirror directions, points and poses are mirrored, and
-    landmarks and fields `..._left` and `..._right` change places: `rotation` is Q of `ray_after = Q ray_before`, whose
-    determinant is then -1. Whole steps, flips and quarter turns copy pixels bit by bit.
+    Fields are those of `Augmentation`. Pixels move by an affine map, also those without a ray; pixel edges scale. Depth
+    and distance keep their values. In a mirror directions, points and poses are mirrored, and landmarks and fields
+    `..._left` and `..._right` change places: `rotation` is Q of `ray_after = Q ray_before`, with determinant -1. Whole
+    steps, flips and quarter turns copy pixels bit by bit.
 
-    One's own edit is a subclass that writes `edit`.
+    For an edit of your own, write a subclass with `edit`.
 
     Args:
         ranges: see `Augmentation`.
-        antialias: whether a pixel takes the mean of all that it covers; None: where more than one and a half pixels
-            along a side come to one.
+        antialias: whether a pixel is the mean of the area it covers; None: if more than one and a half pixels along a
+            side come to one.
         options: camera, p, same_on_batch, fields, mode, padding_mode, fill, mask_fill, valid_mask, tolerance; see
             `Augmentation`.
     """
@@ -49,15 +49,15 @@ class Edit(Augmentation):
 
     @abstractmethod
     def edit(self, size: tuple[int, int], values: Mapping[str, Tensor]) -> tuple[Map, tuple[int, int]]:
-        """The map of pixels, and the new size.
+        """Return the map of pixels, and the new size.
 
         Args:
             size: (height, width) of the image.
-            values: what was drawn, (*B,) or (*B, n) in float64, as of `Augmentation.new_camera`.
+            values: the drawn numbers, (*B,) or (*B, n) in float64, as in `Augmentation.new_camera`.
 
         Returns:
-            (*B, 2, 3) or (2, 3) in float64, from pixels (u, v, 1) to those of the new image, along its axes, or rows
-            of plain numbers, which compiled code sees; and (height, width).
+            (*B, 2, 3) or (2, 3) in float64, from pixels (u, v, 1) to those of the new image, along its axes, or rows of
+            plain numbers, which compiled code can read; and (height, width).
         """
 
     def size_after(self, size: tuple[int, int]) -> tuple[int, int]:
@@ -65,13 +65,13 @@ class Edit(Augmentation):
         return self.edit(size, nothing)[1]
 
     def tell_of_empty_images(self, camera: Camera) -> None:
-        """Nothing is empty that is not asked for."""
+        """Do not warn: an edit leaves only pixels empty that the caller asks for."""
 
     def _change(self, camera: Camera, draw: Mapping[str, Any]) -> Change:
         return change_by([(self, draw)], camera, {**self.options, "antialias": self.antialias})
 
     def map_of(self, draw: Mapping[str, Any], size: tuple[int, int]) -> tuple[Map | None, tuple[int, int]]:
-        """What a draw does to images of a size: `edit`, where it applies; None where it never does."""
+        """Return the map of a draw for images of a size, None if it never applies, and the new size."""
         applied = torch.as_tensor(draw["apply"])
         given = {name: value for name, value in draw.items() if name != "apply"}
         values = {name: torch.as_tensor(value, dtype=torch.float64) for name, value in given.items()}
@@ -79,8 +79,8 @@ class Edit(Augmentation):
         all_are = known_true(applied) or (self.p == 1 and not known_false(applied))
         if new != size and (not all_are or 0 < self.p < 1):
             raise ValueError(
-                f"{self._name}: with p < 1 images must keep their size, so that all come out alike; here they "
-                f"become {new}, and were {size}"
+                f"{self._name}: images must keep their size {size} with p < 1, so that all results have one size; "
+                f"got {new}"
             )
         if all_are:
             return matrix, new
@@ -91,12 +91,12 @@ class Edit(Augmentation):
         return torch.where(applied[:, None, None].to(matrix.device), matrix, still), new
 
     def extra_repr(self) -> str:
-        """What is drawn from, and the options."""
+        """Return the ranges and the options."""
         return super().extra_repr().replace(f"antialias={bool(self.antialias)}", f"antialias={self.antialias}")
 
 
 def change_by(edits: Sequence[tuple[Edit, Mapping[str, Any]]], camera: Camera, options: Mapping[str, Any]) -> Change:
-    """What edits and their draws, one after the other, do to images of `camera`, by warps of these options."""
+    """Return the change of `camera`'s images by edits and their draws, in order; `options` are those of warps."""
 
     def part(rows: list[int] | None, source: Camera) -> Part:
         matrix: Map | None = None
@@ -118,7 +118,7 @@ def change_by(edits: Sequence[tuple[Edit, Mapping[str, Any]]], camera: Camera, o
 
 
 def _turn(matrix: Map, source: Camera) -> Tensor | None:
-    """(*B, 3, 3): what an edit does to rays; None: nothing."""
+    """Return the effect (*B, 3, 3) of an edit on rays; None if it has none."""
     if not isinstance(matrix, Tensor) and matrix[0][0] > 0 and matrix[1][1] > 0:
         return None
     own, like = as_tensor(matrix), source.intrinsics
@@ -128,19 +128,19 @@ def _turn(matrix: Map, source: Camera) -> Tensor | None:
 
 
 def _map(across: float, left: float, down: float, top: float) -> Rows:
-    """(2, 3): (across u + left, down v + top)."""
+    """Return the map (2, 3): (across u + left, down v + top)."""
     return (across, 0.0, float(left)), (0.0, down, float(top))
 
 
 def _box_to(size: tuple[int, int], corner: Tensor, sides: Tensor) -> Tensor:
-    """Return (*B, 2, 3) from boxes, (left, top) and (width, height) of outer edges (*B, 2), to images of a size."""
+    """Return maps (*B, 2, 3) from boxes, (left, top) and (width, height) of outer edges (*B, 2), to a size."""
     scale = sides.new_tensor(size[::-1]) / sides
     shift = (0.5 - corner) * scale - 0.5
     return torch.cat((torch.diag_embed(scale), shift.unsqueeze(-1)), -1)
 
 
 class _Sized(Edit):
-    """An edit whose images come out in one size, (height, width), of which one number makes a square."""
+    """An edit with results of one size, (height, width); one number makes a square."""
 
     image_size: tuple[int, int]
 
@@ -150,13 +150,13 @@ class _Sized(Edit):
 
 
 class RandomResizedCrop(_Sized):
-    """A box of the image at random, of another size: as of torchvision, one for every sample.
+    """A random box of the image, resized: as in torchvision, with a draw for each sample.
 
     Args:
-        size: (height, width) to come out, or one number for a square.
-        scale: of the box, the part of the image's area.
-        ratio: of the box, width to height; drawn evenly in its logarithm. Where a box of that area would be wider or
-            higher than the image, it is smaller.
+        size: (height, width) of the result, or one number for a square.
+        scale: area of the box, as a part of the image's area.
+        ratio: width to height of the box, drawn evenly in its logarithm. If a box of that area would be wider or higher
+            than the image, it is smaller.
         options: see `Edit`.
     """
 
@@ -188,10 +188,10 @@ class RandomResizedCrop(_Sized):
 
 
 class RandomCrop(_Sized):
-    """A box of a size at a random place of the image.
+    """A box of one size at a random place of the image.
 
     Args:
-        size: (height, width), or one number for a square; no larger than the image. `Pad` before it makes room.
+        size: (height, width), or one number for a square; no larger than the image, which `Pad` enlarges.
         options: see `Edit`.
     """
 
@@ -201,13 +201,13 @@ class RandomCrop(_Sized):
     def edit(self, size: tuple[int, int], values: Mapping[str, Tensor]) -> tuple[Map, tuple[int, int]]:
         (height, width), new = size, self.image_size
         if new[0] > height or new[1] > width:
-            raise ValueError(f"{self._name}: the box {new} must lie within the image, which is {size}; Pad enlarges it")
+            raise ValueError(f"{self._name}: size must be within the image's {size}; got {new}. Pad enlarges the image")
         corner = (values["place"] * values["place"].new_tensor([width - new[1], height - new[0]])).round()
         return _box_to(new, corner, corner.new_tensor(new[::-1]).expand_as(corner)), new
 
 
 class CenterCrop(_Sized):
-    """The middle of the image, with `fill` around where it is smaller than that.
+    """The middle of the image, with `fill` around it if the image is smaller.
 
     Args:
         size: (height, width), or one number for a square.
@@ -223,10 +223,10 @@ class CenterCrop(_Sized):
 
 
 class Resize(Edit):
-    """The image in another size.
+    """The image at another size.
 
     Args:
-        size: (height, width); or one number, which the shorter side becomes, as of torchvision.
+        size: (height, width), or one number for the shorter side, as in torchvision.
         options: see `Edit`.
     """
 
@@ -253,8 +253,8 @@ class Pad(Edit):
     """The image with a rim of `fill`.
 
     Args:
-        padding: pixels on every side; or (across, down); or (left, top, right, bottom), as of torchvision.
-        size: instead of it (height, width) that the image is padded to, evenly on both sides.
+        padding: pixels on every side; or (across, down); or (left, top, right, bottom), as in torchvision.
+        size: instead of padding, (height, width) to which the image is padded, evenly on both sides.
         options: see `Edit`.
     """
 
@@ -263,7 +263,7 @@ class Pad(Edit):
     def __init__(self, padding: Size | None = None, *, size: Size | None = None, **options: Unpack[EditOptions]):
         super().__init__(**options)
         if (padding is None) == (size is None):
-            raise TypeError(f"{self._name}: give either padding or size; got {padding!r} and {size!r}")
+            raise TypeError(f"{self._name}: either padding or size must be given; got {padding!r} and {size!r}")
         self.least = None if size is None else _as_size(size, self._name)
         self.padding: tuple[int, ...] = ()
         if padding is not None:
@@ -272,7 +272,7 @@ class Pad(Edit):
             if len(sides) not in (1, 2, 4) or min(sides) < 0:
                 raise ValueError(
                     f"{self._name}: padding must be one number, (across, down) or (left, top, right, bottom), and none "
-                    f"negative; got {padding!r}. CenterCrop cuts off"
+                    f"negative; got {padding!r}. CenterCrop crops"
                 )
             self.padding = sides * (4 // len(sides))
 
@@ -287,13 +287,13 @@ class Pad(Edit):
 
 
 class Rotate90(Edit):
-    """The image turned by quarters, counterclockwise as by torch.rot90, and the camera with it, which leans.
+    """The image turned by quarters, counterclockwise as by torch.rot90, with its camera, which is then on its side.
 
-    Another lens follows a quarter turn where its model is the same on its side; those of cylinders and spheres are not.
+    Another lens can follow a quarter turn if its model is the same on its side; cylinders and spheres are not.
 
     Args:
-        times: how often; or (least, most), of which all are as likely. Of an image that is not square, samples of one
-            batch take either odd or even numbers: draw one for all, `same_on_batch=True`, or (0, 2) by `step=2`.
+        times: number of turns; or (least, most), each equally likely. If images are not square, samples of a batch must
+            take either odd or even numbers: draw one for all, `same_on_batch=True`, or (0, 2) by `step=2`.
         step: between the numbers.
         options: see `Edit`.
     """
@@ -309,7 +309,7 @@ class Rotate90(Edit):
         if low > high or as_whole(step, "step", name) < 1:
             raise ValueError(f"{name}: times must be (least, most), and step positive; got {times!r} and {step!r}")
         if low <= -90 or high >= 90:
-            raise ValueError(f"{name}: times counts quarter turns; got {times!r}, which would be degrees: / 90")
+            raise ValueError(f"{name}: times must be quarter turns; got {times!r}. Divide degrees by 90")
         self.times = low, high, step
         super().__init__({"times": Range(0, 1)}, **options)
 
@@ -324,15 +324,15 @@ class Rotate90(Edit):
         on_side = turns % 2
         if height != width and known_false(on_side == on_side[:1]):
             raise ValueError(
-                f"{self._name}: samples of one batch would come out in the sizes {size} and {size[::-1]}; "
-                "same_on_batch=True turns all alike, step=2 leaves images as they lie"
+                f"{self._name}: results of one batch must have one size; got {size} and {size[::-1]}. "
+                "same_on_batch=True turns all alike, step=2 keeps the size"
             )
         turned = known_false(on_side == 0) or bool(low % 2 and not known_true(on_side == 0))
         return maps[turns], size[::-1] if turned else size
 
 
 class _Flip(Edit):
-    """Args are those of `HorizontalFlip`."""
+    """A flip, whose args are those of `HorizontalFlip`."""
 
     def __init__(
         self,
@@ -348,19 +348,19 @@ class _Flip(Edit):
 
 
 class HorizontalFlip(_Flip):
-    """The image mirrored left to right, and all else as the mirror shows it.
+    """The image mirrored left to right, and all labels as the mirror shows them.
 
-    Gaze, directions, points and rotations of `rays` have x negated. A head pose becomes Q R M: the mirrored head, whose
-    own axis from side to side is mirrored back by M, so that R stays a rotation and landmark i is point i of the
+    Gaze, directions, points and rotations of `rays` have x negated. A head pose becomes Q R M, the mirrored head: M
+    mirrors the head's own axis from side to side back, so that R stays a rotation and landmark i is point i of the
     same, symmetric, model.
 
     Args:
-        p: how likely.
+        p: probability of a flip.
         landmarks: which landmarks of each face change places: one of `LANDMARKS` ("ibug68", "wflw98", "lapa106",
-            "coco17", "mediapipe468", "mediapipe478"), or for each landmark the other one's index, or pairs (left,
-            right); for all of keypoints, landmarks and points, or a dict by field, which may name what does not move,
-            as the visibility of each, too. None: all keep their order.
-        lateral_axis: "x", "y" or "z", of the head's own frame, from one side of the head to the other.
+            "coco17", "mediapipe468", "mediapipe478"), or the index of each landmark's partner, or pairs (left, right);
+            for all keypoints, landmarks and points, or a dict by field, which may also name a field that does not move,
+            such as visibility. None: all keep their order.
+        lateral_axis: "x", "y" or "z" of the head's own frame, from one side of the head to the other.
         swap_sides: whether fields named `..._left` and `..._right` change places.
         options: see `Edit`.
     """
@@ -370,7 +370,7 @@ class HorizontalFlip(_Flip):
 
 
 class VerticalFlip(_Flip):
-    """The image mirrored top to bottom. Left and right change places as well: a left hand in a mirror is a right one.
+    """The image mirrored top to bottom. Left and right change places as well: a mirrored left hand is a right one.
 
     Args are those of `HorizontalFlip`.
     """
@@ -380,7 +380,7 @@ class VerticalFlip(_Flip):
 
 
 def _as_size(size: Size, owner: str) -> tuple[int, int]:
-    """(height, width), of which one number makes a square."""
+    """Return (height, width); one number makes a square."""
     try:
         sides = tuple(size) if isinstance(size, Sequence) else (size,)
         made = as_image_size(sides * 2 if len(sides) == 1 else sides, owner, "size")

@@ -20,36 +20,41 @@ from camtorch.values.module import typed_as
 from camtorch.warp.views import pinhole
 from camtorch.warp.warp import Warp
 
-_ODD = 50.0  # times the distance: no face is meant to be so much nearer or farther; units differ
+_ODD = 50.0  # times the distance: faces so much nearer or farther mean that units differ
 
 
 class FaceNormalizer(SampleTransform):
-    """A virtual pinhole camera in the same place that looks at the face, upright with it, and as from one distance.
+    """A virtual pinhole camera that looks at the face, upright with it, as if from one distance.
 
     With c the face's centre and h the x axis of the head, both seen by the camera: z = c / |c|, y = z x h (unit),
     x = y x z, and R holds x, y, z as rows. The focal length is `focal` |c| / `distance`, so that the face is as large
     as if it were at `distance`; with S = diag(1, 1, distance / |c|) this is the published homography
     W = C S R K^-1, and it holds for every lens. Gaze and poses are turned by R and never scaled: that is the modified
     normalisation of Zhang, Sugano, Bulling: Revisiting Data Normalization for Appearance-Based Gaze Estimation, ETRA
-    2018, as of ETH-XGaze. 3D points turn and keep their true distances; their z times `scale` is
+    2018, as in ETH-XGaze. 3D points turn and keep their true distances; their z times `scale` is
     that of the published normalised space.
 
     Args:
-        camera: of samples that do not bring one.
-        focal: of the virtual camera at `distance`, in pixels.
-        distance: of the face in the normalised image, in the unit of the poses.
+        camera: for samples that hold none.
+        focal: focal length of the virtual camera at `distance`, in pixels.
+        distance: distance of the face in the normalised image, in the unit of the poses.
         image_size: (height, width) of the normalised image.
-        axis: (x, y) pixel in which the face's centre comes to lie; (width / 2, height / 2) by default, as published.
-        mode, padding_mode, fill, antialias, tolerance: of images; see `Warp`.
+        axis: (x, y) pixel of the face's centre; default (width / 2, height / 2), as published.
+        mode, padding_mode, fill, antialias, tolerance: see `Warp`.
         fields, mask_fill, valid_mask: see `Augmentation`.
 
-    The defaults are those of ETH-XGaze: focal length 960, 224 x 224 pixels, 600 millimetres; poses in metres take
+    The defaults are those of ETH-XGaze: focal length 960, 224 x 224 pixels, 600 millimetres; poses in metres need
     `distance=0.6`.
 
     A sample has the fields of an `Augmentation`, among them `head_pose` (B, 4, 4), or `rvec` and `tvec`, camera from
-    head, with the head's x axis from its right eye to its left, as the image's x axis when the face looks into the
-    camera. The face's centre is `face_center` (B, 3) if the sample has it, else the origin of the head.
-    Beside the moved fields come `scale` (B,), distance / |c|, `camera` and `rotation`.
+    head, with the head's x axis from its right eye to its left, along the image's x axis if the face looks into the
+    camera. The face's centre is `face_center` (B, 3) if the sample has it, else the origin of the head. The result also
+    holds `scale` (B,), distance / |c|, `camera` and `rotation`.
+
+        >>> normalize = ct.augment.FaceNormalizer(camera=ct.Pinhole([900.0, 900, 319.5, 239.5], image_size=(480, 640)))
+        >>> pose = {"rvec": torch.zeros(3), "tvec": torch.tensor([0.0, 0.0, 600.0])}
+        >>> normalize(image=torch.zeros(3, 480, 640), **pose)["image"].shape
+        torch.Size([3, 224, 224])
     """
 
     focal: float
@@ -80,7 +85,7 @@ class FaceNormalizer(SampleTransform):
             self.axis = as_number(given[0], "axis", self._name), as_number(given[1], "axis", self._name)
 
     def change(self, camera: Camera, head_rotation: Tensor, face_centre: Tensor) -> Change:
-        """From `camera` to the virtual one.
+        """Return the change from `camera` to the virtual camera.
 
         Args:
             camera: without batch dims, or with (B,).
@@ -88,7 +93,7 @@ class FaceNormalizer(SampleTransform):
             face_centre: (B, 3), in the camera's frame.
 
         Raises:
-            ValueError: a face in the camera, or seen along the head's x axis.
+            ValueError: If a face is at the camera, or seen along the head's x axis.
         """
         device, dtype = camera.intrinsics.device, torch.promote_types(camera.intrinsics.dtype, torch.float32)
         check_rotation(head_rotation, "the head's rotation", self._name)
@@ -102,15 +107,15 @@ class FaceNormalizer(SampleTransform):
         if known_false(usable):
             row = int((~usable).flatten().nonzero()[0])
             raise ValueError(
-                f"{self._name}: a face is at the camera, not finite, or seen along the head's x axis; sample {row} has "
-                f"its centre at {centre[row].tolist()}"
+                f"{self._name}: faces must be finite, off the camera and off the head's x axis; got sample {row} with "
+                f"the centre {centre[row].tolist()}"
             )
         scale = self.distance / distance.detach()
         if known_false((scale < _ODD) & (scale > 1 / _ODD)):
             at = ", ".join(f"{d:.4g}" for d in distance.flatten().tolist())
             raise ValueError(
-                f"{self._name}: faces are at distances of {at}, but distance={self.distance:g}; both must be in one "
-                "unit: distance=0.6 for poses in metres"
+                f"{self._name}: distance must be in the unit of the poses; got {self.distance:g} for faces at {at}. "
+                "Pass distance=0.6 for poses in metres"
             )
         down = down / size
         rotation = torch.stack((torch.linalg.cross(down, forward), down, forward), -2)
@@ -124,7 +129,7 @@ class FaceNormalizer(SampleTransform):
         """Normalise a sample, a dict or keyword arguments.
 
         Raises:
-            ValueError: no head pose, and as `Augmentation`.
+            ValueError: If there is no head pose, and as `Augmentation`.
         """
         sample = self._given(sample, fields)
         batch = self._batch(sample)
@@ -140,28 +145,28 @@ class FaceNormalizer(SampleTransform):
         elif "rvec" in kinds and ("tvec" in kinds or "face_center" in kinds):
             head, centre = rotation_matrix(kinds["rvec"]), kinds.get("tvec")
         else:
-            raise ValueError(f"{self._name}: the sample needs head_pose, or rvec and tvec; it has {', '.join(sample)}")
+            raise ValueError(f"{self._name}: a sample must have head_pose, or rvec and tvec; got {', '.join(sample)}")
         centre = kinds.get("face_center", centre)
         change = self.change(camera, head, centre)
         moved = self._moved(sample, batch, change)
         scale = self.distance / centre.norm(dim=-1)
         moved["scale"] = scale if batch.form.batched else scale.squeeze(0)
         moved["source_camera"] = camera.clone()
-        if "rotation" in sample:  # of augmentations before
+        if "rotation" in sample:  # by earlier augmentations
             moved["source_rotation"] = sample["rotation"].clone()
         return moved
 
     @on_samples
     def inverse(self, sample: Mapping[str, Any] | None = None, **fields: Any) -> Sample:
-        """Move what was predicted on a normalised sample back to the frame and the image of its source camera.
+        """Move predictions on a normalised sample back to the frame and the image of its source camera.
 
-        The sample has `camera`, `rotation` and `source_camera` as they came out (and `source_rotation`, after other
+        The sample has `camera`, `rotation` and `source_camera` as returned (and `source_rotation`, after other
         augmentations), and any other fields: gaze, keypoints, 3D points, images.
         """
         sample = self._given(sample, fields)
         missing = [name for name in ("camera", "rotation", "source_camera") if name not in sample]
         if missing:
-            raise ValueError(f"{self._name}: to go back, the sample needs {', '.join(missing)} as they came out")
+            raise ValueError(f"{self._name}: a sample to move back must have {', '.join(missing)}; got none")
         normal, source, rotation = (sample.pop(name) for name in ("camera", "source_camera", "rotation"))
         batch = self._batch(sample, normal, predicted=True)
         before = sample.get("source_rotation")
@@ -180,6 +185,6 @@ class FaceNormalizer(SampleTransform):
         def __call__(self, *args: Any, **options: Any) -> Any: ...
 
     def extra_repr(self) -> str:
-        """The virtual camera, and the options."""
+        """Return the numbers of the virtual camera, and the options."""
         options = {"focal": self.focal, "distance": self.distance, "image_size": self.image_size, **self.options}
         return ", ".join(f"{name}={value!r}" for name, value in options.items())

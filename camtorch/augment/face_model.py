@@ -1,4 +1,4 @@
-"""A generic face: where 68 landmarks lie on a head, for poses from landmarks."""
+"""A generic face: the places of 68 landmarks on a head, for poses from landmarks."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ _Points = tuple[tuple[float, float, float], ...]
 
 
 def face_points() -> Tensor:
-    """(68, 3) float64: a generic face, in metres, in the order of iBUG's 68 landmarks.
+    """Return a generic face (68, 3) in float64 and metres, in the order of iBUG's 68 landmarks.
 
-    In the head's frame of `ct.head_angles`: x to the image's right when the face looks into the camera (the person's
-    left), y down, z away from the camera, the origin midway between the eyeballs' centres. Made for camtorch of plain
-    proportions, and of nobody's face: for a person it is off by some millimetres, and the distance that comes of it
-    by as many percent as the face is larger or smaller. Your own model in that order, or a part of it, does better.
+    It is in the head's frame of `ct.head_angles`: x to the image's right if the face looks into the camera (the
+    person's left), y down, z away from the camera, the origin midway between the eyeballs' centres. It has plain
+    proportions and is nobody's face: for a person it is off by some millimetres, and a distance from it by as many
+    percent as the face is larger or smaller. Your own model in that order, or a part of it, is better.
     """
     jaw = []
     for i in range(17):  # from ear to ear under the chin
@@ -56,5 +56,5 @@ def _mirrored(points: _Points) -> _Points:
 
 
 def _across(half: _Points) -> _Points:
-    """From the person's right to the left, the middle one, which comes first, once."""
+    """Return points from the person's right to the left, of a left half whose first point is the middle."""
     return (*_mirrored(half[:0:-1]), *half)

@@ -1,4 +1,4 @@
-"""How much of a new image shows something of the old one, and the zoom and the turn with which enough of it does."""
+"""How much of a new image shows the old one, and the zoom and the rotation with which enough of it does."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from camtorch.warp.moving import moved_pixels
 
 _POINTS, _RIM = 1000, 16  # over the image, and along each of its edges
 _ROOT = 1.324717957244746
-_CARE = 0.01  # what the points may miss by
+_CARE = 0.01  # largest error of the share that points measure
 _NEARLY = 0.999
 _ZOOM = 4.0  # at most, before the camera turns back
 _FAR_ZOOM = 1000.0  # of a camera that is not turned
@@ -28,7 +28,7 @@ _HALVINGS = 10
 
 
 def filled(source: Camera, target: Camera, rotation: Tensor | None) -> Tensor:
-    """Return (*B,): the part of the target's image that shows something of the source's; 1 where its whole rim does."""
+    """Return the part (*B,) of the target's image that shows the source's image; 1 if its whole rim does."""
     return _part_shown(source, target, _points(target), rotation)
 
 
@@ -38,7 +38,7 @@ def _points(camera: Camera) -> Tensor:
 
 @lru_cache(maxsize=16)
 def looked_at(size: tuple[int, int], dtype: torch.dtype) -> Tensor:
-    """Return the pixels (N, 2) of images of a size that `filled` looks at: spread without rows, and then the rim's."""
+    """Return the pixels (N, 2) that `filled` tests on images of a size: spread over the image, then on its rim."""
     height, width = size
     with torch.inference_mode(False):
         steps = torch.arange(1, _POINTS + 1, dtype=torch.float64, device="cpu")[:, None]
@@ -52,9 +52,9 @@ def looked_at(size: tuple[int, int], dtype: torch.dtype) -> Tensor:
 def _part_shown(
     source: Camera, target: Camera, pixels: Tensor, rotation: Tensor | None, zoom: Tensor | None = None
 ) -> Tensor:
-    """`filled`, as told by the pixels, of a target whose focal lengths are times a zoom (*B,)."""
+    """Return `filled`, measured at `pixels`, for a target whose focal lengths are multiplied by a zoom (*B,)."""
     shapes = [source.batch_shape, target.batch_shape, *([] if rotation is None else [rotation.shape[:-2]])]
-    if zoom is not None:  # where the camera sees them as it is
+    if zoom is not None:  # the camera without the zoom has the same rays at other pixels
         shapes.append(zoom.shape)
         centre = target.intrinsics[..., None, 2:]
         pixels = centre + (pixels - centre) / zoom[..., None, None]
@@ -65,7 +65,7 @@ def _part_shown(
 
 
 def scaled(camera: Camera, factor: Tensor) -> Camera:
-    """The camera with focal lengths times a factor (*B,)."""
+    """Return the camera with focal lengths times a factor (*B,)."""
     one = torch.ones_like(factor)
     scale = torch.stack((factor, factor, one, one), -1)
     return remade(camera, intrinsics=camera.intrinsics * scale)
@@ -81,7 +81,7 @@ def enough(source: Camera, target: Camera, rotation: Tensor | None, share: float
 
 
 def with_care(share: float) -> float:
-    """Return the share of points for which a share of the image is surely filled."""
+    """Return the share of points for which `share` of the image is surely filled."""
     return min(share + _CARE, 1.0)
 
 
@@ -120,7 +120,7 @@ def _enough(source: Camera, target: Camera, rotation: Tensor, share: float) -> t
 def _least_zoom(
     part_shown: Callable[[Tensor], Tensor], at_first: Tensor, share: float, most: float
 ) -> tuple[Tensor, Tensor]:
-    """Return the least factor (*B,) from 1 to `most`, and the part of the image that is shown with it."""
+    """Return the least factor (*B,) from 1 to `most`, and the part of the image that is filled with it."""
     low, high = torch.ones_like(at_first), torch.full_like(at_first, most)
     high, at_high = torch.where(at_first >= share, low, high), at_first
     for _ in range(_HALVINGS):
@@ -129,6 +129,6 @@ def _least_zoom(
         is_enough = at_middle >= share
         low, high = torch.where(is_enough, low, middle), torch.where(is_enough, middle, high)
         at_high = torch.where(is_enough, at_middle, at_high)
-    if bool((high == most).any()):  # not looked at yet
+    if bool((high == most).any()):  # not measured yet
         at_high = torch.where(high == most, part_shown(high), at_high)
     return high, at_high

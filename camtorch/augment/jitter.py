@@ -1,4 +1,4 @@
-"""Lenses like a given one: coefficients move by what they do to the image, as far as it stays invertible."""
+"""Lenses like a given one: coefficients move by their effect on the image, if the lens stays invertible."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from camtorch.values.module import remade
 from camtorch.warp.boxes import along_edges
 
 DRAWN = 16
-"""How many coefficients have a draw of their own; more take turns."""
+"""Number of coefficients that have a draw of their own; more take turns."""
 PARTS = 1.0, -1.0, 0.5, -0.5, 0.25, -0.25, 0.125, -0.125
-"""Of a step, in the order in which they are tried."""
+"""Parts of a step, in the order in which they are tried."""
 _SMALL = 0.1  # decentering, prism and tilt, whose images are lopsided, move less than radial terms: as in real lenses
 _STEP = 1e-4
 _SIDE = 9
@@ -35,9 +35,9 @@ def jittered(camera: Camera, amounts: Tensor, nominal: Tensor) -> Tensor:
     """Return distortion coefficients (*B, n) of lenses like that of `camera`, moved by amounts (*B, 16).
 
     Every coefficient moves until it has moved the image's rim by its amount, a share of the distance from the centre to
-    the corner of a lens of `nominal` intrinsics; together at most by the largest amount. Where the new lens could not
-    be inverted on the rim of what the old one shows, they move as far the other way; or half as far, and so on; or
-    stay.
+    the corner of a lens of `nominal` intrinsics; together at most by the largest amount. If the new lens could not be
+    inverted on the rim of the old one's image, coefficients move as far the other way, or half as far and so on, or not
+    at all.
     """
     with torch.no_grad():
         return _jittered(camera, amounts, nominal)[0]
@@ -62,7 +62,7 @@ def _jittered(camera: Camera, amounts: Tensor, nominal: Tensor) -> tuple[Tensor]
         tried = remade(lens, intrinsics=lens.intrinsics.expand(len(candidate), 4), distortion=candidate)
         fits = tried.unproject(rim)[1].all(-1)
         fits = fits if defined is None else fits & defined
-        if done is None and bool(fits.all()):  # mostly the first step does
+        if done is None and bool(fits.all()):  # usually the first step fits
             return (candidate.view(*amounts.shape[:-1], count),)
         done = torch.zeros_like(fits) if done is None else done
         result = torch.where((fits & ~done).unsqueeze(-1), candidate, result)
@@ -76,22 +76,22 @@ _measured: dict[tuple[object, ...], Tensor] = {}
 
 
 def measured_once(measure: Callable[..., Tensor], camera: Camera, *inputs: Tensor) -> Tensor:
-    """Return `measure(camera, *inputs)`, for which these tensors and the size of images are all that counts, kept."""
-    # by values on every device: a lens lies in other memory each time
+    """Return `measure(camera, *inputs)`, kept by the inputs and the image size, on which alone it depends."""
+    # by values on every device: a lens is in other memory each time
     values = [(t.dtype, t.shape, t.device, t.detach().cpu().numpy().tobytes()) for t in inputs]
     key = measure, type(camera), camera.image_size, *values
     found = _measured.pop(key, None)
     if found is None:
-        with torch.inference_mode(False), torch.no_grad():  # what inference mode makes could not be used in a graph
+        with torch.inference_mode(False), torch.no_grad():  # a tensor of inference mode could not be used in a graph
             found = measure(camera, *[t.detach().clone() for t in inputs])
-    _measured[key] = found  # the last one
+    _measured[key] = found  # move it to the end
     while len(_measured) > _MOST_MEASURED:
         _measured.pop(next(iter(_measured)), None)
     return found
 
 
 def sensitivity(camera: Camera, distortion: Tensor, nominal: Tensor) -> Tensor:
-    """Return (*B, n): by how much to change each coefficient so that the rim moves from centre to corner."""
+    """Return how much to change each coefficient, (*B, n), so that the rim moves from centre to corner."""
     count, size = distortion.shape[-1], camera._size_for("its sensitivity")
     batch = broadcast_shapes(nominal.shape[:-1], distortion.shape[:-1])
     intrinsics, k = (
@@ -118,14 +118,14 @@ def sensitivity(camera: Camera, distortion: Tensor, nominal: Tensor) -> Tensor:
 
 @lru_cache(maxsize=16)
 def _over(size: tuple[int, int]) -> Tensor:
-    """Return (N, 2) in float64: pixels in even steps over images of a size, to their outer edges."""
+    """Return pixels (N, 2) in float64, in even steps over images of a size, to their outer edges."""
     with torch.inference_mode(False):
         edges = torch.tensor([[-0.5, -0.5], [size[1] - 0.5, size[0] - 0.5]], dtype=torch.float64)
         return pixel_lattice(edges[0], edges[1], _SIDE, _SIDE).flatten(0, 1)
 
 
 def defined_or(camera: Camera, distortion: Tensor, otherwise: Tensor) -> tuple[Tensor, Tensor | None]:
-    """Return coefficients (*B, n), others where the model has no formula for them; and where, (*B,), None: nowhere."""
+    """Return coefficients (*B, n), `otherwise` if they are not defined, and which are, (*B,), or None if all are."""
     sense = camera.defined(distortion.unbind(-1))
     if sense is None:
         return distortion, None
@@ -133,20 +133,20 @@ def defined_or(camera: Camera, distortion: Tensor, otherwise: Tensor) -> tuple[T
 
 
 def _rim(camera: Camera) -> Tensor:
-    """Return (C, N, 2): pixels of the outline of what cameras show of the image; the principal point for the rest.
+    """Return pixels (C, N, 2) on the outline of the image that lenses map; the principal point for others.
 
-    A lens that is invertible on the image's edges and where it ends on the image is so inside.
+    A lens that is invertible on the image's edges, and where it ends on the image, is invertible inside.
     """
     edges = border(camera._size_for("its rim"), camera.intrinsics.dtype).to(camera.intrinsics.device)
     rim = edges.expand(*camera.batch_shape, *edges.shape)
-    if len(camera.distortion) == 1:  # on another device less work than to look whether all of them have rays
+    if len(camera.distortion) == 1:  # less work on other devices than a check of all rays
         ends = measured_once(lens_ends, camera, camera.distortion)
         least = (ends * ends).sum(-1).amin(-1).sqrt()
         if bool((covering(camera.intrinsics, least, camera._size_for("its rim")) == 1).all()):
             return rim
     if not bool(camera.unproject(rim)[1].all()):
         focal, centre = camera.intrinsics[:, None, :2], camera.intrinsics[:, None, 2:]
-        # edited images have different intrinsics, and few kinds of coefficients
+        # edited images have different intrinsics, but few different coefficients
         lenses, which = camera.distortion.detach().unique(dim=0, return_inverse=True)
         ends = measured_once(lens_ends, camera, lenses).to(focal)[which] * focal + centre
         ends = torch.where(camera.contains(ends).unsqueeze(-1), ends, rim[:, :1])
@@ -157,7 +157,7 @@ def _rim(camera: Camera) -> Tensor:
 
 @lru_cache(maxsize=16)
 def border(size: tuple[int, int], dtype: torch.dtype) -> Tensor:
-    """Return (N, 2): pixels along the outer edges of images of a size."""
+    """Return pixels (N, 2) along the outer edges of images of a size."""
     height, width = size
     with torch.inference_mode(False):
         corners = torch.tensor([[0, 0], [width, 0], [width, height], [0, height]], dtype=torch.float64) - 0.5
@@ -165,7 +165,7 @@ def border(size: tuple[int, int], dtype: torch.dtype) -> Tensor:
 
 
 def lens_ends(camera: Camera, distortion: Tensor) -> Tensor:
-    """Return (*B, K, 2): in focal lengths, the last point along every azimuth that a lens of coefficients maps."""
+    """Return the last point (*B, K, 2), in focal lengths, along every azimuth that lenses map."""
     ones = distortion.new_tensor([1.0, 1.0, 0.0, 0.0]).double()
     plane = remade(camera, intrinsics=ones, distortion=distortion.detach().double())
     azimuths = torch.linspace(0, 2 * math.pi, _AZIMUTHS + 1, dtype=torch.float64, device=ones.device)[:-1]

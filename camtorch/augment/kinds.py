@@ -1,4 +1,4 @@
-"""The kinds of fields that a sample may have: how each is found by its name, checked, and moved."""
+"""The kinds of fields in a sample: how each is found by its name, checked, and moved."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from camtorch.warp.plan import Label, SampleCall, call_for
 from camtorch.warp.sampling import Options, Sampler
 
 Named = dict[str, tuple[str, Any]]
-"""Name -> (kind, tensor or list of tensors)."""
+"""Maps a name to (kind, tensor or list of tensors)."""
 
 
 KEEP = "keep"
@@ -37,18 +37,18 @@ Move = Callable[[Change, Tensor, Mapping[str, float]], Any]
 
 @dataclass(frozen=True)
 class Field:
-    """A kind of data."""
+    """A kind of field."""
 
     dims: int  # the least number of dims of a single sample
     most_dims: int  # the most
     last: tuple[int, ...]  # what its last dim may be; empty: anything
     shape: str  # in words, of a batch
     move: Move  # (change, batch, options) -> batch, or (batch, valid)
-    decides: bool = False  # whether its number of dims tells a batch from a single sample
+    decides: bool = False  # whether its number of dims distinguishes a batch from a sample
 
 
 def _planes(move: Move) -> Move:
-    """Of masks and the like, which also come without channels, (B, H, W)."""
+    """Return a function like `move` that also takes values without channels, (B, H, W), such as masks."""
 
     def of(change: Change, value: Tensor, options: Mapping[str, float]) -> Tensor:
         moved: Tensor = move(change, value.unsqueeze(1) if value.ndim == 3 else value, options)
@@ -65,7 +65,7 @@ def _pose(change: Change, pose: Tensor, options: Mapping[str, float]) -> Tensor:
 
 
 def _mirrored_head(change: Change, matrix: Tensor, options: Mapping[str, float]) -> Tensor:
-    """Columns (B, 3, n) of turned heads: in a mirror a head's left side is its right one, and its turn no mirror."""
+    """Return the columns (B, 3, n) of turned heads, whose sides a mirror exchanges without mirroring the pose."""
     mirrored = change.mirrored
     if mirrored is None:
         return matrix
@@ -88,7 +88,7 @@ def _rotation_vector(change: Change, rvec: Tensor, options: Mapping[str, float])
 
 _MANY = 16
 _ROUNDING = 0.01
-_MANY_PIXELS = 1 << 15  # coordinates of a batch from which on threads share them
+_MANY_PIXELS = 1 << 15  # coordinates of a batch: so many are shared by threads
 
 
 def _positions(change: Change, points: Tensor, options: Mapping[str, float]) -> Tensor:
@@ -127,9 +127,9 @@ KINDS = {
 }
 _TURNED = "points", "gaze", "directions", "tvec", "landmarks"
 _MATRICES = "head_pose", "pose", "rotation"
-"""Whose columns turn."""
+"""Kinds whose columns turn."""
 CHECKED = ("boxes", "rvec", "head_pose", "pose", "pitch_yaw")
-"""Whose values are checked, not their shape alone."""
+"""Kinds whose values are checked, in addition to their shape."""
 ALIASES = {"images": "image", "masks": "mask", "bboxes": "boxes", "point": "points", "face_center": "points"}
 OWN = ("camera", "source_camera", "source_rotation", "scale")  # these come with a change and do not move
 
@@ -138,7 +138,7 @@ _RANKS = {kind: (not field.decides, i) for i, (kind, field) in enumerate(KINDS.i
 
 
 def kind_of(name: str, value: object, own: Mapping[str, str], owner: str, single: bool = False) -> str | None:
-    """Return the key in `KINDS` of a field, None if it stays; numbers of an unknown name may be geometry: an error."""
+    """Return a field's key in `KINDS`, None if it stays; raise if its name is unknown and it may be geometry."""
     if not isinstance(name, str):
         raise TypeError(f"{owner}: a sample must have strings for names; got {name!r:.80}")
     if name in own:
@@ -146,27 +146,27 @@ def kind_of(name: str, value: object, own: Mapping[str, str], owner: str, single
     if name.endswith("_valid"):
         return None
     base = name if name in KINDS else ALIASES.get(name)
-    # no image_path, mask_id, of one sample or of a batch
+    # image_path and mask_id, of a sample or a batch, are no images or masks
     if base is None and isinstance(value, (Tensor, np.ndarray, list, tuple)) and not is_text(value):
-        begins = sorted((k for k in KINDS if name.startswith(k + "_")), key=len)  # compilers know no max by a key
+        begins = sorted((k for k in KINDS if name.startswith(k + "_")), key=len)  # compilers do not know max with a key
         base = begins[-1] if begins else None
     if base is None and _may_be_geometry(name, value, single):
         if isinstance(value, Mapping):
             raise ValueError(
                 f"{owner}: {name!r} holds real numbers in a dict, and fields move only at the top of samples. Put them "
-                f"there, or leave the dict as it is by fields={{{name!r}: '{KEEP}'}}"
+                f"there, or keep the dict with fields={{{name!r}: '{KEEP}'}}"
             )
         close = _close_to(name)
         meant = f"Did you mean {close[0]!r}? " if close else ""
         raise ValueError(
-            f"{owner}: {name!r} holds real numbers, and whether they move with the camera is not known. {meant}"
-            f"fields={{{name!r}: KIND}} says so, where KIND is {', '.join(KINDS)} or {KEEP}"
+            f"{owner}: {name!r} holds real numbers, and must have a kind, by which they move with the camera. {meant}"
+            f"Pass fields={{{name!r}: KIND}}, with KIND one of {', '.join(KINDS)} or {KEEP}"
         )
     return base
 
 
 def is_text(value: Any) -> bool:
-    """Whether it holds strings, at least one and in lists of any depth, and nothing else."""
+    """Whether a value holds strings, at least one, and nothing else, in lists of any depth."""
     texts = pytree.tree_leaves(value.tolist() if isinstance(value, np.ndarray) and value.dtype.kind in "OSU" else value)
     return len(texts) > 0 and all(isinstance(text, (str, bytes)) for text in texts)
 
@@ -177,9 +177,9 @@ def _close_to(name: str) -> list[str]:
 
 
 def _may_be_geometry(name: str, value: Any, single: bool, above: int = 0) -> bool:
-    """Whether it holds real numbers, or whole ones of more than a row a sample or with such a name; not one alone.
+    """Whether a value holds real numbers, or integers with more than a row per sample or with a name like a kind's.
 
-    above: the number of lists around it, which count as dims.
+    above: the number of lists around the value, which count as dims. A single number is no geometry.
     """
     if isinstance(value, Mapping):
         return any(_may_be_geometry(str(key), item, single) for key, item in value.items())
@@ -198,7 +198,7 @@ def _may_be_geometry(name: str, value: Any, single: bool, above: int = 0) -> boo
 
 
 def moves(kind: str, value: Tensor) -> Move:
-    """How values of a kind move."""
+    """Return the function that moves values of a kind."""
     return _positions if kind == "landmarks" and value.shape[-1] == 3 else KINDS[kind].move
 
 
@@ -220,11 +220,11 @@ def as_tensor(value: object, name: str, kind: str, owner: str) -> Tensor:
 
 
 def _hint(name: str) -> str:
-    return "" if name in KINDS else f". If it is something else, fields={{{name!r}: '{KEEP}'}} leaves it as it is"
+    return "" if name in KINDS else f". If it is something else, fields={{{name!r}: '{KEEP}'}} keeps it unchanged"
 
 
 def check(kind: str, name: str, value: Tensor, batched: bool, owner: str) -> None:
-    """Raise a ValueError unless a kind takes this shape."""
+    """Raise a ValueError if a kind does not take this shape."""
     field = KINDS[kind]
     dims = value.ndim - batched
     least, most = field.dims, field.most_dims
@@ -236,20 +236,20 @@ def check(kind: str, name: str, value: Tensor, batched: bool, owner: str) -> Non
         if kind == "image" and value.ndim == 5:
             hint = f". The frames of clips go in as a batch, by {name}.flatten(0, 1)"
         if kind == "keypoints" and value.ndim and value.shape[-1] == 3:
-            hint = f". Of x, y and visibility, [..., 2] goes in as {name}_valid=..., a flag for each"
+            hint = f". Pass visibility, [..., 2], as {name}_valid=..., a flag for each"
         raise ValueError(f"{owner}: {name} must be {what}; got shape {tuple(value.shape)}{hint}")
     if kind in ("head_pose", "pose") and value.shape[-2] not in (3, 4):
         raise ValueError(f"{owner}: {name} must be {field.shape}; got shape {tuple(value.shape)}")
 
 
 def check_values(kind: str, name: str, value: Tensor, owner: str) -> None:
-    """Raise a ValueError for plain labels in another form than that of their kind; what is NaN is in none."""
+    """Raise a ValueError if plain labels are not in the form of their kind; NaN is accepted."""
     if kind == "boxes":
         form = getattr(getattr(value, "format", None), "value", "XYXY")  # of torchvision's BoundingBoxes
         if form != "XYXY":
             raise ValueError(
-                f"{owner}: {name} must be x1, y1, x2, y2; got BoundingBoxes of the format {form}, which "
-                "camtorch.augment.torchvision.Transform takes"
+                f"{owner}: {name} must be x1, y1, x2, y2; got BoundingBoxes of the format {form}. Use "
+                "camtorch.augment.torchvision.Transform for them"
             )
         check_boxes(value, name, owner)
     elif kind == "rvec":
@@ -273,16 +273,16 @@ def check_values(kind: str, name: str, value: Tensor, owner: str) -> None:
 
 
 def tell_of_parts(name: str, boxes: Tensor, owner: str) -> None:
-    """Warn of boxes that all lie between the centres of the first pixels, as parts of an image's sides do."""
+    """Warn if all boxes lie between the centres of the first pixels, as parts of an image's sides do."""
     if boxes.is_cpu and known_true((boxes == boxes.clamp(0, 1)).all() & (boxes % 1 != 0).any()):
         warn(
-            f"{owner}: {name} must be pixels x1, y1, x2, y2, and all of these lie within [0, 1], as parts of an "
-            "image's width and height do: times width and height, less 0.5, those are pixels"
+            f"{owner}: {name} must be pixels x1, y1, x2, y2; got values within [0, 1], as parts of an image's sides. "
+            "Multiply them by width and height, and subtract 0.5"
         )
 
 
 def is_batch(named: Named, camera: object) -> bool:
-    """Whether name -> (kind, value) is a batch: the first image, pixels or boxes says, else cameras, else any field."""
+    """Whether `named` is a batch, by its first image, pixels or boxes, else by cameras, else any field."""
     if isinstance(camera, (list, tuple)):
         return True
     for kind, value in sorted(named.values(), key=lambda pair: _RANKS[pair[0]]):
@@ -296,7 +296,7 @@ def is_batch(named: Named, camera: object) -> bool:
 
 
 def in_range(values: Tensor, dtype: torch.dtype) -> Tensor:
-    """Return values in a dtype that may be narrower: finite values stay finite."""
+    """Return values in a dtype, which may be narrower: finite values stay finite."""
     if dtype == torch.float16 != values.dtype:
         most = torch.finfo(dtype).max
         values = values.clamp(-most, most)
@@ -308,7 +308,7 @@ Found = tuple[list[str], SampleCall | None]
 
 
 class Form:
-    """What samples of one form have in common: the fields that move, by name and kind, and the call that moves them."""
+    """The form of samples: the fields that move, by name and kind, and the compiled call that moves them."""
 
     def __init__(self, fields: list[tuple[str, str]], batched: bool, count: int):
         self.fields, self.batched, self.count = fields, batched, count
@@ -318,7 +318,7 @@ class Form:
         self.is_tried = False
 
     def call(self, settings: tuple[Any, ...], find: Callable[[], Found]) -> Found:
-        """Return the call, and the names of the fields that it moves, of the last settings or as found."""
+        """Return the names of fields and the call that moves them, kept for the last settings."""
         if settings != self._settings:
             self.found, self._settings = find(), copy.deepcopy(settings)
         return self.found
@@ -327,7 +327,7 @@ class Form:
 def together(
     change: Change, named: Named, form: Form, mask_fill: float = 0.0, lateral: float = 0
 ) -> dict[str, tuple[Tensor, Tensor | None]]:
-    """What moves by one compiled call, and its validity: images, pixels, and of a single sample boxes and what turns.
+    """Move fields by one compiled call, with their validity: images, pixels, and for a single sample boxes and rays.
 
     The results have a batch dim, as `named` has, if samples of the form have one.
     """
@@ -367,14 +367,14 @@ def together(
 def _ways(
     named: Named, options: Options, mask_fill: float, dtype: torch.dtype | None, is_turn: bool, is_single: bool
 ) -> dict[str, Sampler | Label]:
-    """Return how the fields move that one call of compiled code takes.
+    """Return how each field moves that one compiled call takes.
 
     dtype: of labels of a single sample that turn, or None. is_turn: whether the rotation is no mirror.
     """
     mode, padding_mode, fill = options["mode"], options["padding_mode"], options["fill"]
     hows: dict[str, Sampler | Label] = {}
     for name, (found, value) in named.items():
-        if found in ("depth", "distance") or isinstance(value, list):  # which ask for positions again
+        if found in ("depth", "distance") or isinstance(value, list):  # these need the positions again
             return {}
         if value.ndim - 1 > KINDS[found].most_dims:  # frames
             continue
@@ -395,12 +395,12 @@ def _ways(
 
 
 def from_pitch_yaw(angles: Tensor) -> Tensor:
-    """Unit gaze vectors (..., 3) of pitch and yaw (..., 2) in radians, as in MPIIGaze and ETH-XGaze.
+    """Return unit gaze vectors (..., 3) of pitch and yaw (..., 2) in radians, as in MPIIGaze and ETH-XGaze.
 
     Zero looks into the camera, along -z. Source: Zhang et al., ETH-XGaze, 2020, and its code.
 
     Raises:
-        ValueError: another shape, plain angles of more than a turn, which are degrees.
+        ValueError: If the shape is wrong, or plain angles are more than a turn and so may be degrees.
     """
     angles = as_coordinates(angles, "angles", 2, "from_pitch_yaw")
     check_angles(angles, "from_pitch_yaw")
@@ -409,6 +409,6 @@ def from_pitch_yaw(angles: Tensor) -> Tensor:
 
 
 def to_pitch_yaw(gaze: Tensor) -> Tensor:
-    """Pitch and yaw (..., 2) in radians of gaze vectors (..., 3): pitch = asin(-y), yaw = atan2(-x, -z)."""
+    """Return pitch and yaw (..., 2) in radians of gaze vectors (..., 3): pitch = asin(-y), yaw = atan2(-x, -z)."""
     x, y, z = as_coordinates(gaze, "gaze", 3, "to_pitch_yaw").unbind(-1)
     return torch.stack((torch.atan2(-y, torch.hypot(x, z)), torch.atan2(-x, -z)), -1)

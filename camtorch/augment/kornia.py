@@ -1,10 +1,10 @@
-"""The augmentations as kornia's: in AugmentationSequential and VideoSequential, for every data key, beside its own.
+"""Augmentations for kornia, in AugmentationSequential and VideoSequential, for every data key, next to kornia's own.
 
-Fields of a dict (`data_keys=None`) that kornia does not know move by their names, as in `Augmentation`, and their
-validity comes out beside them. Numbers under an unknown name that might be geometry raise an error;
-`fields={"lidar": "points", "logits": "keep"}` of the augmentation says what they are. A "camera" is the camera of the
-images and comes out as the new one. kornia's own augmentations that move pixels are refused next to such fields, as
-they would leave them behind.
+Fields of a dict (`data_keys=None`) that kornia does not know move by their names, as in `Augmentation`, and are
+returned with their validity. Numbers under an unknown name that might be geometry raise an error; `fields={"lidar":
+"points", "logits": "keep"}` of the augmentation gives their kinds. A "camera" is the camera of the images; the result
+holds the new one. Next to such fields, kornia's own augmentations that move pixels raise an error, as they would not
+move the fields.
 
 `import camtorch` does not load this module, nor kornia.
 """
@@ -37,7 +37,7 @@ from camtorch.warp.sampling import Mode
 
 Flags: TypeAlias = dict[str, Any]
 _POINTS = "keypoints"
-_BACK = "back"  # a flag of what moves back
+_BACK = "back"  # the flag for moving back
 
 
 class CameraAugmentation(InContainers, GeometricAugmentationBase2D):
@@ -47,26 +47,26 @@ class CameraAugmentation(InContainers, GeometricAugmentationBase2D):
 
     Args:
         augmentation: a `camtorch.augment.Augmentation`, for example a `RandomCamera`.
-        camera: the Camera of the images, of which this keeps a copy that does not learn; by default the augmentation's.
-            `with_cameras` gives every sample its own, which may learn.
-        p, p_batch: how likely a sample, and a batch, is augmented at all; p by default as the augmentation says.
-        same_on_batch: the same draw for the whole batch; by default as the augmentation says.
+        camera: the Camera of the images, copied without gradients; default: the augmentation's. `with_cameras` gives
+            every sample its own, which may learn.
+        p, p_batch: probability that a sample, and a batch, is augmented; the default of p is the augmentation's.
+        same_on_batch: the same draw for the whole batch; default: as in the augmentation.
         keepdim: whether images without batch dim stay without.
 
     Convention:
         - pixel coordinates are ``(x, y)`` at integer pixel centres, as in all of kornia and camtorch.
-          ``align_corners`` means nothing; ``resample`` and ``padding_mode`` can be overridden by a call.
-        - keypoints keep their count and order, ``landmarks`` of a flip apart. One without a place on the new image
-          becomes ``(-1, -1)``, and stays that in all augmentations of camtorch that follow.
-        - boxes enclose their moved outlines, which are curved, and are not clipped. A box off the new image is
-          invalid, which kornia exports as zeros; they stay zeros in ``inverse``.
-        - masks take the nearest value, the augmentation's `mask_fill` where nothing is seen, and never the colours and
-          the light of the lens. ``extra_args={DataKey.MASK: {"resample": "bilinear"}}`` is for soft ones.
+          ``align_corners`` has no effect; a call can override ``resample`` and ``padding_mode``.
+        - keypoints keep their count and order, except ``landmarks`` of a flip. A keypoint without a place on the new
+          image becomes ``(-1, -1)``, also in all later augmentations of camtorch.
+        - boxes enclose their moved outlines, which are curved, and are not clipped. A box off the new image is invalid,
+          which kornia exports as zeros; it stays zeros in ``inverse``.
+        - masks take the nearest value, or the augmentation's `mask_fill` for nothing, and never the colours and the
+          light of the lens. ``extra_args={DataKey.MASK: {"resample": "bilinear"}}`` is for soft masks.
         - in a dict (``data_keys=None``) fields that kornia does not know move by their names, see the module.
-        - the warp is no matrix: ``transform_matrix`` is NaN, also of a container that holds the augmentation. ``last``
-          and ``change(params)`` give the cameras before and after, and how far they turned.
-        - ``inverse`` takes everything back by the inverse warp. What left the image, or fell between its pixels, is
-          lost; boxes have grown; chromatic aberration and vignetting stay.
+        - the warp is no matrix: ``transform_matrix`` is NaN, also in a container that holds the augmentation. ``last``
+          and ``change(params)`` give the cameras before and after, and the rotation.
+        - ``inverse`` moves everything back by the inverse warp. Pixels that left the image, or fell between its pixels,
+          are lost; boxes have grown; chromatic aberration and vignetting stay.
         - params are tensors, drawn on the CPU wherever the module is. A replay is bit-identical.
     """
 
@@ -102,18 +102,18 @@ class CameraAugmentation(InContainers, GeometricAugmentationBase2D):
             self.flags["size"] = size
         self._kind = kind_of_camera(camera)
         self.keypoints_valid: Tensor | None = None
-        """(B, N) bool: which of the keypoints that were moved last lie on their image."""
-        # lists of masks come row by row between other labels of the batch
+        """(B, N) bool: whether the keypoints that were moved last lie on their image."""
+        # two memos: lists of masks are moved row by row between other labels of the batch
         self._memos = Kept(), Kept()
 
     # -- parameters
 
     def set_rng_device_and_dtype(self, device: torch.device, dtype: torch.dtype) -> None:
-        """Draws stay on the CPU: a seed then means the same everywhere, and params can be looked at for free."""
+        """Keep draws on the CPU: a seed then draws the same on every device, and reading params needs no wait."""
         super().set_rng_device_and_dtype(torch.device("cpu"), dtype)
 
     def generate_parameters(self, batch_shape: tuple[int, ...]) -> dict[str, Tensor]:
-        """Draw, as `Augmentation.draw` does after its gate; images must be of the camera's image_size."""
+        """Draw numbers as `Augmentation.draw` does after its gate; images must be of the camera's image_size."""
         count = batch_shape[0]
         check_single(type(self).__name__, self.camera, [("images", tuple(batch_shape[-2:]))])
         if count:
@@ -127,15 +127,15 @@ class CameraAugmentation(InContainers, GeometricAugmentationBase2D):
         return drawn
 
     def change(self, params: Params | None = None, device: torch.device | None = None) -> Change:
-        """What params, by default the last, do to a batch: `source`, `target`, `rotation`, `points(...)` and so on."""
+        """Return the change by params, by default the last: `source`, `target`, `rotation`, `points(...)` and so on."""
         params = self._params if params is None else params
         own = *self.augmentation.ranges, *self.augmentation.crops
         if missing := [name for name in ("batch_prob", *own) if name not in params]:
-            raise ValueError(f"{type(self).__name__}: the params lack {', '.join(missing)}; call it first")
+            raise ValueError(f"{type(self).__name__}: params must have {', '.join(missing)}; got none. Call it first")
         values = {"apply": self._gate(params), **{name: params[name] for name in own}}
         if self.augmentation.crops and any(known_false(~values[name].isnan()) for name in self.augmentation.crops):
             raise ValueError(
-                f"{type(self).__name__}: kornia hands on boxes after images, so that they go in before: "
+                f"{type(self).__name__}: params must hold boxes, as kornia passes boxes after images; got none. Use "
                 "params = aug.forward_parameters(images.shape), then aug(images, params=with_boxes(params, boxes))"
             )
         camera = camera_of(params, self.camera, device)
@@ -161,18 +161,18 @@ class CameraAugmentation(InContainers, GeometricAugmentationBase2D):
         with torch.autocast(value.device.type, enabled=False):
             change = self.change(params, value.device)
             if len(value) != change.count:
-                raise ValueError(f"{type(self).__name__}: params for {change.count} samples, here are {len(value)}")
+                raise ValueError(f"{type(self).__name__}: values must be {change.count} samples; got {len(value)}")
             moved = move(change.inverse() if _BACK in flags else change, value)
         moved, valid = moved if isinstance(moved, tuple) else (moved, None)
         moved = narrow(moved, value.dtype)
-        if _BACK in flags:  # what moves forth is blended by kornia
+        if _BACK in flags:  # kornia blends the forward direction
             moved = self._blend_by_prob(moved, value, self._gate(params))
         return moved, valid
 
     def _move_rows(
         self, input: Any, dims: int, params: Params, flags: Flags, move: Callable[[Change, Tensor], Any]
     ) -> tuple[Any, Tensor]:
-        """Return Keypoints or Boxes, whose data (B, ...) has so many dims or lacks the first, moved; and the valid."""
+        """Move Keypoints or Boxes, with data (B, ...) of `dims` dims or without the first; return the valid too."""
         moved, valid = self._move(input.data[(None,) * (dims - input.data.ndim)], params, flags, move)
         result = input.clone()
         result._data = moved.reshape(input.shape)
@@ -222,7 +222,7 @@ class CameraAugmentation(InContainers, GeometricAugmentationBase2D):
         return self.apply_transform_box(input, params, {_BACK: True})
 
     def compute_transformation(self, input: Tensor, params: Params, flags: Flags) -> Tensor:
-        """(B, 3, 3) of NaN: there is no matrix, and an identity would be silently wrong."""
+        """Return (B, 3, 3) of NaN: there is no matrix, and an identity would be silently wrong."""
         return torch.full((input.shape[0], 3, 3), torch.nan, device=input.device, dtype=input.dtype)
 
     def compute_inverse_transformation(self, transform: Tensor) -> Tensor:
@@ -237,7 +237,7 @@ class CameraAugmentation(InContainers, GeometricAugmentationBase2D):
 
 
 class _Random(CameraAugmentation):
-    """An augmentation of camtorch under its own name, made of its own arguments."""
+    """An augmentation of camtorch under its own name, made from its own arguments."""
 
     _wraps: Callable[..., Augmentation]
 
@@ -254,17 +254,17 @@ class _Random(CameraAugmentation):
 
 
 def _named(wraps: type[Augmentation]) -> type[_Random]:
-    """Return a class for kornia, of the name of an augmentation."""
+    """Return a class for kornia, with the name of an augmentation."""
     name, first = wraps.__name__, (wraps.__doc__ or "").partition("\n")[0]
     text = f"""`camtorch.augment.{name}` for kornia. {first}
 
     Args:
-        camera: of the images.
-        given, options: those of `camtorch.augment.{name}`; what comes first there follows the camera, or goes by name.
+        camera: the camera of the images.
+        given, options: those of `camtorch.augment.{name}`, after the camera, or by name.
         p, p_batch, same_on_batch, keepdim: see `CameraAugmentation`.
 
     Convention:
-        as `CameraAugmentation`; yaw, pitch and roll are degrees by which the camera turns, not the image.
+        see `CameraAugmentation`; yaw, pitch and roll are degrees by which the camera turns, not the image.
     """
     return type(name, (_Random,), {"_wraps": wraps, "__doc__": text, "__module__": __name__})
 

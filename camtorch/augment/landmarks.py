@@ -14,7 +14,7 @@ from camtorch.values.arguments import as_flag, as_whole, shown, warn
 
 
 def _order(count: int, *runs: tuple[int, int, int]) -> tuple[int, ...]:
-    """Of runs (first, last, total): landmark i of first ... last changes places with total - i; others stay."""
+    """Return an order with runs (first, last, total), in which i of first ... last and total - i change places."""
     order = list(range(count))
     for first, last, total in runs:
         for i in range(first, last + 1):
@@ -52,29 +52,29 @@ LANDMARKS: dict[str, tuple[int, ...]] = {
     "mediapipe468": _order(468, *_MESHES),
     "mediapipe478": _order(478, *_MESHES, (468, 468, 941), (469, 471, 945), (472, 472, 949)),  # irises
 }
-"""Name -> for every landmark, the one that it changes places with, or itself: the 68 of iBUG (300-W, dlib), the 98 of
-WFLW, the 106 of LaPa (JD-landmark; InsightFace has 106 in another order), the 17 keypoints of COCO, and MediaPipe's
-face mesh of 468 points, or of 478 with both irises."""
+"""Maps a name to the landmark that each landmark changes places with, or itself: the 68 of iBUG (300-W, dlib), the
+98 of WFLW, the 106 of LaPa (JD-landmark; InsightFace has 106 in another order), the 17 keypoints of COCO, and
+MediaPipe's face mesh of 468 points, or of 478 with both irises."""
 
 TableLike = str | Sequence[int] | Sequence[Sequence[int]]
 
 
 @dataclass(frozen=True)
 class Table:
-    """Which landmarks change places."""
+    """A table of landmarks that change places."""
 
     order: tuple[int, ...]
-    exact: bool  # whether it is of just so many landmarks; pairs alone do not say
+    exact: bool  # True: for exactly so many landmarks; pairs fit any number
 
     def of(self, count: int) -> tuple[int, ...] | None:
-        """For so many landmarks; None if it is of another number."""
+        """Return the order of `count` landmarks; None if the table is for another number."""
         if count == len(self.order):
             return self.order
         return None if self.exact or count < len(self.order) else self.order + tuple(range(len(self.order), count))
 
 
 def as_table(value: TableLike, owner: str) -> Table:
-    """Return the table that a name, an order, or a list of pairs says."""
+    """Return the table that a name, an order, or a list of pairs stands for."""
     if isinstance(value, str):
         if value not in LANDMARKS:
             raise ValueError(
@@ -102,25 +102,25 @@ def as_table(value: TableLike, owner: str) -> Table:
         fits = sorted(order) == list(range(len(order))) and all(order[i] == k for k, i in enumerate(order))
     if not fits or not order:
         raise ValueError(
-            f"{owner}: landmarks must say for each one which it changes places with, so that twice is once around, or "
-            f"be pairs without any index twice; got {value!r}"
+            f"{owner}: landmarks must hold each landmark's partner, whose partner is the landmark itself, or "
+            f"pairs that hold no index twice; got {value!r}"
         )
     return Table(tuple(order), not pairs)
 
 
 # numbers of points that hardly anything else has
 _FACES = {len(LANDMARKS[name]): name for name in ("ibug68", "wflw98", "lapa106", "mediapipe468", "mediapipe478")}
-_told: set[int] = set()  # numbers of points of which this process has warned
+_told: set[int] = set()  # numbers of points that this process has warned about
 _HOLD = ("keypoints", "landmarks", "points")  # kinds of fields that may be landmarks
 _LEFT, _RIGHT = "_left", "_right"
 
 
 class Mirroring:
-    """What a mirror changes beside places and directions: names of landmarks, of fields, and sides of heads."""
+    """Effects of a mirror on more than places and directions: on landmarks, names of fields, and sides of heads."""
 
     lateral: int  # the number of the lateral axis
-    by_name: tuple[str, ...]  # the fields that tables are given for by name
-    key: object  # equal for those that do the same
+    by_name: tuple[str, ...]  # the fields whose tables are given by name
+    key: object  # equal for equal effects
 
     def __init__(
         self,
@@ -146,35 +146,35 @@ class Mirroring:
         self.key = self._named, self._one, self.lateral, self.swap_sides
 
     def order(self, name: str, kind: str | None, count: int) -> tuple[int, ...] | None:
-        """Return the order of `count` landmarks of a field in a mirror, or None; a name may have a path before it."""
+        """Return the order of `count` landmarks of a field in a mirror, or None; a path may precede its name."""
         table = self._named.get(name.rpartition("/")[2]) if self._named is not None else self._one
         if table is None or count == 0:
             meant = _FACES.get(count) if self._named is None and kind in _HOLD[:2] else None
             if meant is not None and count not in _told:
                 _told.add(count)
                 warn(
-                    f"{self.owner}: {name} holds {count} points and mirrored faces keep their order: point 0 is then "
-                    f"on the other side. landmarks={meant!r}, if that is their order, puts them right; "
-                    "landmarks={} says that they shall keep it"
+                    f"{self.owner}: {name} holds {count} points, and mirrored faces keep their order: point 0 is then "
+                    f"on the other side. Pass landmarks={meant!r}, if that is their order, or "
+                    "landmarks={} to keep it"
                 )
             return None
         order, own = table.of(count), len(table.order)
-        # 3D points may be others
+        # 3D points may be no landmarks
         if order is None and (kind != "points" or self._named is not None):
             others = [known for known, its in LANDMARKS.items() if len(its) == count]
-            hint = f"landmarks={{{name!r}: {repr(others[0]) if others else '[(left, right), ...]'}}} says it by field"
+            hint = f"landmarks={{{name!r}: {repr(others[0]) if others else '[(left, right), ...]'}}} gives it by field"
             if not others and count % own == 0:
                 hint = f"Several faces go in as (B, F, {own}, 2): {name}.unflatten(-2, (-1, {own}))"
-            raise ValueError(f"{self.owner}: {name} holds {count} points, the table of landmarks {own}. {hint}")
+            raise ValueError(f"{self.owner}: {name} must have {own} points, as landmarks has; got {count}. {hint}")
         return order
 
     def swapped(
         self, name: str, kind: str | None, value: Tensor, mirrored: Tensor, flags: bool, faces: set[tuple[int, ...]]
     ) -> Tensor:
-        """Return landmarks (B, *F, N, ...), mirrored rows in their new order; kind None: of what does not move."""
+        """Return landmarks (B, *F, N, ...), mirrored rows in their new order; kind None: of fields that do not move."""
         if kind is None and value.ndim < 2:
             raise ValueError(
-                f"{self.owner}: {name} has a table of landmarks, and must be (B, N, ...); got {shown(value)}"
+                f"{self.owner}: {name} must be (B, N, ...), as it has a table of landmarks; got {shown(value)}"
             )
         if (kind is not None and kind not in _HOLD) or value.ndim < (2 if flags else 3):
             return value
@@ -185,13 +185,13 @@ class Mirroring:
         order = self.order(name, kind, value.shape[axis])
         if order is None:
             return value
-        if len(mirrored) != len(value):  # of what nobody else has looked at
-            raise ValueError(f"{self.owner}: {name} is of {len(value)} samples, other fields are of {len(mirrored)}")
+        if len(mirrored) != len(value):  # nothing else has checked this field
+            raise ValueError(f"{self.owner}: {name} must be of {len(mirrored)} samples, as others; got {len(value)}")
         other = value.index_select(axis, torch.tensor(order, device=value.device))
         return gated(mirrored, other, value)
 
     def sides(self, names: Iterable[str]) -> list[tuple[str, str]]:
-        """Return the fields that change places, each with its other."""
+        """Return the pairs of fields that change places."""
         found = []
         names = set(names)
         for name in sorted(names) if self.swap_sides else ():
@@ -200,15 +200,15 @@ class Mirroring:
                     other = name.removesuffix(mine) + its
                     if other not in names:
                         raise ValueError(
-                            f"{self.owner}: {name} has no {other} to change places with, and what is left becomes "
-                            "right in a mirror; swap_sides=False keeps the name"
+                            f"{self.owner}: {name} must have a {other}, with which it changes places in a mirror; got "
+                            "none. swap_sides=False keeps the name"
                         )
                     found += [(name, other)] if mine == _LEFT else []
         return found
 
 
 def exchanged(one: Any, other: Any, rows: Tensor) -> tuple[Any, Any]:
-    """Two fields of a batch, tensors or lists, with the chosen rows, (B,) bool, changed for each other's."""
+    """Exchange the chosen rows, (B,) bool, of two fields of a batch, tensors or lists, and return both."""
     if isinstance(one, Tensor) and isinstance(other, Tensor) and one.shape == other.shape:
         return gated(rows, other, one), gated(rows, one, other)
     pairs = [(b, a) if r else (a, b) for a, b, r in zip(one, other, rows.tolist(), strict=True)]

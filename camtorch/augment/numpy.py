@@ -1,4 +1,4 @@
-"""Augmentations for numpy arrays, called as those of albumentations are: one sample of keyword arguments.
+"""Augmentations for numpy arrays, called like those of albumentations: one sample of keyword arguments.
 
     transform = camtorch.augment.numpy.Transform(camtorch.augment.RandomMount(yaw=20))
     out = transform(image=image, mask=mask, keypoints=points, bboxes=boxes, gaze=gaze, camera=camera)
@@ -34,26 +34,26 @@ class Transform(FrontEnd):
 
     The fields are those of `Augmentation`, by the same names and without their batch dim:
 
-    * Images, masks and depth have their channels last, (H, W, C) or (H, W), and any real dtype. Under a plural name
-      they are lists of such arrays, or one array (N, H, W) or (N, H, W, C).
-    * Labels have the shape of a single sample, with several faces too. Lists of numbers are taken for arrays. Pixels
-      have the centre of the top-left one at (0, 0); boxes of albumentations' "pascal_voc" are these plus 0.5.
-    * The camera of the images is in the sample, or given to this or the augmentation. Edits need none.
+    * Images, masks and depth have their channels last, (H, W, C) or (H, W), and any real dtype. A plural name holds a
+      list of such arrays, or one array (N, H, W) or (N, H, W, C).
+    * Labels have the shape of a single sample, also with several faces. Lists of numbers become arrays. The centre of
+      the top-left pixel is (0, 0); boxes of albumentations' "pascal_voc" are these plus 0.5.
+    * The camera of the images is in the sample, or given to this transform or the augmentation. Edits need none.
 
-    Everything else is passed on; unknown names that hold numbers are refused, as by `Augmentation`. Arrays come out in
-    the layout and the dtype that they had, coordinates of whole numbers in float32. Validity, the new `camera` and
-    `rotation` (3, 3) come out as well. Nothing is dropped or sorted. For pipelines with `bbox_params` and
+    Other fields are passed on, except that unknown names of numbers raise an error, as in `Augmentation`. Arrays keep
+    their layout and dtype; coordinates of whole numbers become float32. The result also has the validity, the new
+    `camera` and `rotation` (3, 3). Nothing is dropped or sorted. For pipelines with `bbox_params` and
     `keypoint_params`, use the `Transform` of `camtorch.augment.albumentations`.
 
-    Numbers are drawn from torch's generator, `torch.manual_seed`, which DataLoader seeds differently in each of its
-    workers, and not from numpy's. The same seed draws the same in every front end. Nothing is differentiated.
+    Numbers are drawn from torch's generator, `torch.manual_seed`, which DataLoader seeds differently in each worker,
+    not from numpy's. The same seed draws the same in every front end. There are no gradients.
 
     Args:
-        augmentation: what to do.
-        camera: of samples that hold none; by default the augmentation's. It is copied, and does not learn.
+        augmentation: the augmentation to apply.
+        camera: for samples that hold none; default: the augmentation's. It is copied, and does not learn.
 
     Raises:
-        TypeError: If it is no augmentation, or the camera is none.
+        TypeError: If augmentation is no augmentation, or camera is no Camera.
     """
 
     _name = _OWNER
@@ -72,7 +72,7 @@ class Transform(FrontEnd):
         generator: torch.Generator | None = None,
         **fields: Any,
     ) -> Sample:
-        """Augment a sample, keyword arguments, or a dict, or both; arguments are those of `Augmentation.forward`."""
+        """Augment a sample: keyword arguments, a dict, or both; see `Augmentation.forward` for the other arguments."""
         options = {"draw": draw, "generator": generator}
         return self._moved(self.augmentation.forward, sample, fields, options, self.camera)
 
@@ -98,7 +98,7 @@ class Transform(FrontEnd):
     ) -> Sample:
         if sample is not None and not isinstance(sample, Mapping):
             raise TypeError(
-                f"{_OWNER}: the fields go in by name, as in transform(image=...); got {type(sample).__name__}"
+                f"{_OWNER}: sample must be a dict, or keywords as in transform(image=...); got {type(sample).__name__}"
             )
         sample = {**(sample or {}), **fields}
         if sample.get("camera") is None and otherwise is not None:
@@ -143,7 +143,7 @@ class Transform(FrontEnd):
         return layouts
 
     def _kind(self, name: str, value: Any, sample: Mapping[str, Any]) -> str | None:
-        """Return the kind of a field, or of the field whose validity this is; None if it stays."""
+        """Return the kind of a field, or of the field whose validity it is; None if it stays."""
         kind = kind_of(name, value, self.augmentation.fields, _OWNER, single=True)
         if kind is None and name.endswith(_VALID):
             name = name.removesuffix(_VALID)
@@ -154,7 +154,7 @@ class Transform(FrontEnd):
     def _entry(
         self, name: str, value: Any, sample: Mapping[str, Any], size: tuple[int, int] | None
     ) -> tuple[Sample, Callable[[Sample], Any]]:
-        """Return a field as tensors, and what gives them their layout back."""
+        """Return a field as tensors, and a function that restores its layout."""
         kind = None if name in OWN or value is None else self._kind(name, value, sample)
         mirroring = self.augmentation.mirroring
         if kind is None and (mirroring is None or name not in mirroring.by_name):
@@ -167,8 +167,8 @@ class Transform(FrontEnd):
         if not many and name not in ALIASES:
             value = np.asarray(value, bool) if name.endswith(_VALID) else value
             return {name: as_planes(value, name, _OWNER, size)}, lambda moved: as_array(moved[name], value)
-        key = f"{kind}_{name}"  # which begins with its kind, and is known to the augmentation
-        if not many and not len(value):  # what changes is the size, of an image without channels
+        key = f"{kind}_{name}"  # the augmentation knows a name that begins with a kind
+        if not many and not len(value):  # only the size changes; an image has no channels
             empty = torch.from_numpy(value.reshape(value.shape[:3]))
             return {key: empty}, lambda moved: np.empty((*moved[key].shape, *value.shape[3:]), value.dtype)
         tensors = {f"{key}[{i}]": as_planes(one, f"{name}[{i}]", _OWNER, size) for i, one in enumerate(value)}
@@ -219,7 +219,7 @@ def _moved_arrays(
 
 
 def _numbers(value: Any, name: str, kind: str | None) -> Any:
-    """Coordinates of floating point, flags of bool; a list of numbers is taken for an array."""
+    """Return coordinates as floating point, flags as bool, and a list of numbers as an array."""
     if kind is None or name.endswith(_VALID):
         return np.asarray(value, bool if name.endswith(_VALID) else None)
     if isinstance(value, (list, tuple)):

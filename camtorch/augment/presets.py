@@ -1,4 +1,4 @@
-"""Cameras that can be asked for by name: calibrated and typical ones, whose lens an augmentation takes."""
+"""Cameras by name: calibrated and typical ones, whose lenses augmentations use."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ class Preset:
     intrinsics: tuple[float, ...]
     distortion: tuple[float, ...]
     origin: str
-    """What was calibrated, and where the numbers were published; or that they are only typical."""
+    """The calibrated camera and the publication of its numbers; or that they are only typical."""
 
     def camera(self) -> Camera:
-        """The camera, in float32, with nothing to learn."""
+        """Return the camera, in float32, which does not learn."""
         numbers = torch.tensor(self.intrinsics), torch.tensor(self.distortion)
         return fixed_camera(MODELS[self.model], *numbers, self.image_size)
 

@@ -1,4 +1,4 @@
-"""A rolling shutter, drawn at random, before the camera of a sample."""
+"""A random rolling shutter in front of the camera of a sample."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ from camtorch.warp.shutter import DIRECTIONS, Direction, RollingShutter, Shutter
 
 
 class RandomShutter(Augmentation):
-    """The sample as a rolling shutter sees it while the camera turns: images, and labels by the row that sees them.
+    """A random rolling shutter while the camera turns: images, and labels by the row that sees them.
 
     The camera stays. Points in space, gaze and poses are those of the middle of the readout. In a `Compose` it goes
-    last, after the mount or the lens, and all is sampled once. Blur is left to others, as kornia's `RandomMotionBlur`.
+    last, after mount and lens, and images are sampled once. For blur use kornia's `RandomMotionBlur`, for example.
 
     Args:
         readout: seconds from the first row to the last: a number, or (low, high). Below 0 it reads the other way.
-        rates: degrees per second about x (up), y (right) and z (clockwise), each drawn for itself: (low, high), or a
-            number x for x to either side of 0.
-        direction: in which the sensor is read; see `RollingShutter`.
+        rates: degrees per second about x (up), y (right) and z (clockwise), each drawn separately: (low, high), or x
+            for (-x, x).
+        direction: the direction in which the sensor is read; see `RollingShutter`.
         options: camera, p, same_on_batch, fields, mode, padding_mode, fill, antialias, tolerance, mask_fill and
             valid_mask; see `Augmentation`.
 
     Raises:
         ValueError: If a range is in the wrong order or out of bounds, or the direction is unknown.
-        TypeError: If a range is none, or a keyword is unknown.
+        TypeError: If a range is not numeric, or a keyword is unknown.
     """
 
     keeps_lens: ClassVar[bool] = True
@@ -59,4 +59,4 @@ class RandomShutter(Augmentation):
         return Part(rows, ShutterWarp(source, source, target_shutter=shutter, **self.options), source)
 
     def tell_of_empty_images(self, camera: Camera) -> None:
-        """A rim may be empty, and no more."""
+        """Do not warn: only the rim may be empty."""

@@ -1,4 +1,4 @@
-"""Augmentations as a transform of torchvision.transforms.v2: tv_tensors move by their type, all else by its name.
+"""Augmentations as a transform of torchvision.transforms.v2: tv_tensors move by their type, others by their name.
 
     transform = camtorch.augment.torchvision.Transform(camtorch.augment.RandomMount(yaw=20), camera)
     image, target = transform(image, target)
@@ -32,8 +32,8 @@ try:
     from torchvision.transforms import v2
 except Exception as error:  # a binary that does not match fails with a RuntimeError
     raise ImportError(
-        "camtorch.augment.torchvision needs a torchvision that was built for the installed torch "
-        f"{torch.__version__}; importing it failed with {type(error).__name__}: {error}"
+        "camtorch.augment.torchvision: torchvision must be built for the installed torch "
+        f"{torch.__version__}; got {type(error).__name__}: {error}"
     ) from error
 
 _OWNER = "torchvision.Transform"
@@ -44,32 +44,32 @@ _HELD = Tensor, np.ndarray
 
 
 class Transform(FrontEnd, v2.Transform):
-    """An augmentation among those of v2: one draw for everything in a sample, a dict or any other nest.
+    """An augmentation as a transform of v2: one draw for everything in a sample, a dict or any other nest.
 
     Values move by their type:
 
     * `Image`, `Video` (..., C, H, W) and PIL images; all frames of a clip share the draw. `Mask` (..., H, W) takes the
       nearest value.
-    * `KeyPoints` (..., 2), in pixels whose centres are whole numbers. A point without a place on the new image
-      becomes (-1, -1), and stays that in all following transforms of camtorch.
+    * `KeyPoints` (..., 2), in pixels whose centres are whole numbers. A point without a place on the new image becomes
+      (-1, -1), also in all later transforms of camtorch.
     * `BoundingBoxes` of every format, in torchvision's coordinates between pixel edges. The new boxes enclose the old
       ones, rotated boxes along their moved x axis, and are not clamped. A box without a place becomes
       (-1, -1, -1, -1) in XYXY.
     * `Camera`, the camera of the images, becomes that of the new image. Edits, and `Compose` of edits, need none.
 
-    Plain tensors and arrays move by the name of their key, as in `Augmentation`: "gaze", "depth" and so on. An array
-    of an image is (H, W, C) or (H, W). Labels of a clip may have its leading dims. Numbers under an unknown name that
-    might be geometry raise an error; `fields={"lidar": "points", "logits": "keep"}` of the augmentation says what they
-    are. An element of a tuple is named by its place: `fields={"[1]": "keep"}`. As in v2, the first plain tensor is
-    the image if the sample has no other image and its name means nothing else.
+    Plain tensors and arrays move by the name of their key, as in `Augmentation`: "gaze", "depth" and so on. An array of
+    an image is (H, W, C) or (H, W). Labels of a clip may have its leading dims. Numbers under an unknown name that
+    might be geometry raise an error; `fields={"lidar": "points", "logits": "keep"}` of the augmentation gives their
+    kinds. The name of a tuple's element is its place: `fields={"[1]": "keep"}`. As in v2, the first plain tensor is the
+    image if the sample has no other image and its name means nothing else.
 
     `valid=True` adds a flag for each point or box of a dict: `target["keypoints_valid"]`, a bool tensor, for
-    `target["keypoints"]`: on the new image, and valid before. Flags that are in a sample already are always updated.
+    `target["keypoints"]`: on the new image, and valid before. Flags that a sample already has are always updated.
     Count, order, formats and dtypes stay; canvas_size is the new camera's. Gradients reach the inputs, not the cameras.
 
     Args:
-        augmentation: what to do.
-        camera: of samples that hold none; by default the augmentation's. It is copied, and does not learn.
+        augmentation: the augmentation to apply.
+        camera: for samples that hold none; default: the augmentation's. It is copied, and does not learn.
         valid: whether points and boxes in dicts get flags.
 
     Raises:
@@ -110,7 +110,7 @@ class Transform(FrontEnd, v2.Transform):
         kinds = {keys[i]: kind or KEEP for i, (kind, _, _) in fields.items()}
         # a graph of the camera would make the warp slower, and could not leave a DataLoader's worker
         sample = Frames({keys[i]: value for i, (_, value, _) in fields.items()}, camera=detached(camera))
-        # flags of a rotated box are flags of all its points, and one of its points is enough
+        # a rotated box has a flag for each of its points, and is valid if one of them is
         of_points = {f"{keys[i]}_valid" for i, (k, v, _) in fields.items() if k == _TURNED and v.shape[-2] == _STEPS**2}
         for key in of_points & sample.keys():
             sample[key] = torch.as_tensor(sample[key])[..., None].repeat_interleave(_STEPS**2, -1)
@@ -137,7 +137,7 @@ class Transform(FrontEnd, v2.Transform):
         for i, ((path, leaf), name) in enumerate(zip(flat, names, strict=True)):
             if leaf is None or isinstance(leaf, Camera) or name in OWN:
                 continue
-            # a list of plain numbers is looked at as one value
+            # a list of plain numbers is one value
             whole_path = (d for d, step in enumerate(reversed(path)) if not isinstance(step, pytree.SequenceKey))
             lists = 0 if getattr(leaf, "ndim", 0) else next(whole_path, len(path) - 1)
             value = functools.reduce(lambda held, _: [held], range(lists), leaf)
@@ -157,13 +157,13 @@ class Transform(FrontEnd, v2.Transform):
 
 
 def _name(path: Any) -> str:
-    """Return the last key of a path that is a word, or all of it."""
+    """Return the last key of a path that is a word, or the whole path."""
     words = [getattr(step, "key", getattr(step, "name", None)) for step in path]
     return next((word for word in reversed(words) if isinstance(word, str)), pytree.keystr(path) or "[0]")
 
 
 def _native(name: str, leaf: Any, kind: str | None) -> tuple[str | None, Any, Callable[[Any, Change], Any]]:
-    """Return the kind and the value of a leaf for the native call, and what makes a leaf of the result again."""
+    """Return the kind and the value of a leaf for the native call, and a function that makes a leaf of the result."""
     if not isinstance(leaf, Tensor) and kind in IMAGES:
         value, restored = as_planes_of(leaf, name, _OWNER)
         return kind, value, lambda new, change: restored(new)

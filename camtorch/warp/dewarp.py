@@ -49,9 +49,9 @@ _SEAM = 1e-3  # radians to either side of it
 class Dewarp(Warp):
     """A `Warp` that undistorts images: from `camera` to an undistorted camera that it chooses, `dewarp.target`.
 
-    >>> camera = ct.KannalaBrandt([80.0, 80.0, 63.5, 47.5], [0.02, -0.01, 0.0, 0.0], image_size=(96, 128))
-    >>> ct.Dewarp(camera, fov=90)(torch.zeros(8, 3, 96, 128)).shape
-    torch.Size([8, 3, 96, 128])
+        >>> camera = ct.KannalaBrandt([80.0, 80.0, 63.5, 47.5], [0.02, -0.01, 0.0, 0.0], image_size=(96, 128))
+        >>> ct.Dewarp(camera, fov=90)(torch.zeros(8, 3, 96, 128)).shape
+        torch.Size([8, 3, 96, 128])
 
     Args:
         camera: the camera of the given images, with image_size; a batch of cameras gives a batch of targets.

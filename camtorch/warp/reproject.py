@@ -34,11 +34,11 @@ class Reproject(GeometryModule):
     Convention: images (B, C, H, W) of the source, depth (B, 1, H', W') of the target in the unit of the extrinsics.
     Cameras and extrinsics with a batch dim go sample by sample with the images.
 
-    >>> camera = ct.Pinhole([40.0, 40.0, 31.5, 23.5], image_size=(48, 64))
-    >>> warp = ct.Reproject(camera, camera, ct.Extrinsics([0.0, 0.0, 0.0], [-0.1, 0.0, 0.0]))
-    >>> images, valid = warp(torch.zeros(2, 3, 48, 64), torch.ones(1, 1, 48, 64))
-    >>> images.shape, valid.shape
-    (torch.Size([2, 3, 48, 64]), torch.Size([2, 1, 48, 64]))
+        >>> camera = ct.Pinhole([40.0, 40.0, 31.5, 23.5], image_size=(48, 64))
+        >>> warp = ct.Reproject(camera, camera, ct.Extrinsics([0.0, 0.0, 0.0], [-0.1, 0.0, 0.0]))
+        >>> images, valid = warp(torch.zeros(2, 3, 48, 64), torch.ones(1, 1, 48, 64))
+        >>> images.shape, valid.shape
+        (torch.Size([2, 3, 48, 64]), torch.Size([2, 1, 48, 64]))
 
     Args:
         source: the camera of the given images.

@@ -47,10 +47,10 @@ class Warp(CameraPair):
     move from source to target. A batch of B cameras or rotations goes sample by sample with the images; a single one
     serves all.
 
-    >>> source = ct.KannalaBrandt([80.0, 80.0, 63.5, 47.5], [0.02, -0.01, 0.0, 0.0], image_size=(96, 128))
-    >>> warp = ct.Warp(source, ct.Pinhole([60.0, 60.0, 63.5, 47.5], image_size=(96, 128)))
-    >>> images = warp(torch.zeros(8, 3, 96, 128))
-    >>> pixels, valid = warp.transform_points([[100.0, 47.5], [63.5, 47.5]])
+        >>> source = ct.KannalaBrandt([80.0, 80.0, 63.5, 47.5], [0.02, -0.01, 0.0, 0.0], image_size=(96, 128))
+        >>> warp = ct.Warp(source, ct.Pinhole([60.0, 60.0, 63.5, 47.5], image_size=(96, 128)))
+        >>> images = warp(torch.zeros(8, 3, 96, 128))
+        >>> pixels, valid = warp.transform_points([[100.0, 47.5], [63.5, 47.5]])
 
     Args:
         source: the camera of the given images.

@@ -69,7 +69,7 @@ def test_options(kind, options, text):
         ({"keypoints": POINTS, "keypoints_valid": torch.ones(2)}, r"keypoints_valid must be \(2, 5\); got \[\(2,\)\]"),
         ({"keypoints": torch.zeros(2, 5, 2, dtype=torch.complex64)}, "keypoints must be a tensor of real numbers"),
         ({"keypoints": 5}, "keypoints must be a tensor of real numbers, .*; got int"),
-        ({"image": torch.zeros(2, 3, *SIZE), "stare": torch.zeros(2, 3)}, "'stare' holds real numbers, and whether"),
+        ({"image": torch.zeros(2, 3, *SIZE), "stare": torch.zeros(2, 3)}, "'stare' holds real numbers, and must have"),
         ({"label": 3}, "the sample has no field that moves; known are image, mask"),
         ({"keypoints": [torch.zeros(3, 2), torch.zeros(3)]}, r"keypoints\[1\] must be"),
     ],

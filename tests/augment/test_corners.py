@@ -138,5 +138,5 @@ def test_fields_that_only_sound_like_geometry(camera):
         assert own(sample, **hidden)[next(iter(hidden))] is next(iter(hidden.values()))
     with pytest.raises(TypeError, match="a sample must have strings for names; got 3"):
         mount({3: torch.zeros(1, 2)})
-    with pytest.raises(ValueError, match=r"fields=\{'boxes_label': 'keep'\} leaves it as it is"):
+    with pytest.raises(ValueError, match=r"fields=\{'boxes_label': 'keep'\} keeps it unchanged"):
         mount(sample, boxes_label=torch.zeros(1, 3))

@@ -130,12 +130,12 @@ def test_what_cannot_be_normalised_says_why(pinhole):
     normalizer, sample = FaceNormalizer(camera=pinhole), batch()
     sample["head_pose"][0, :3, 3] = 0
     for call, text in (
-        (lambda: normalizer(gaze=torch.rand(2, 3)), r"needs head_pose, or rvec and tvec; it has gaze"),
-        (lambda: normalizer(sample), "a face is at the camera"),
+        (lambda: normalizer(gaze=torch.rand(2, 3)), r"must have head_pose, or rvec and tvec; got gaze"),
+        (lambda: normalizer(sample), "off the camera"),
         (lambda: normalizer(head_pose=torch.rand(2, 3)), r"head_pose must be .*; got shape \(2, 3\)"),
-        (lambda: normalizer(batch()), "both must be in one unit: distance=0"),
+        (lambda: normalizer(batch()), "in the unit of the poses; .* distance=0"),
         (lambda: FaceNormalizer(distance=-1), "distance must be positive; got -1"),
-        (lambda: normalizer.inverse(gaze=torch.rand(2, 3)), "the sample needs camera, rotation, source_camera"),
+        (lambda: normalizer.inverse(gaze=torch.rand(2, 3)), "must have camera, rotation, source_camera"),
     ):
         with pytest.raises(ValueError, match=text):
             call()

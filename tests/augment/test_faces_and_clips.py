@@ -117,9 +117,9 @@ def test_clips_move_as_their_frames_by_one_draw(name, cameras, clips):
         ({"image": torch.zeros(B, 0, 3, *SIZE)}, r"image must be \(2, T > 0, ...\).* got shape \(2, 0, "),
         ({"boxes": [torch.zeros(1, 4)] * B}, r"boxes must be \(2, 3, ...\).* got list"),
         ({"keypoints": torch.zeros(B, T, 5, 2), "keypoints_valid": torch.ones(B, 5)}, "keypoints_valid must be"),
-        ({"camera": camera(3)}, "camera is of 3 clips, image of 2"),
-        ({"rotation": torch.eye(3)}, "rotation is of 3 clips, image of 2"),
-        ({"draw": A.RandomMount().draw(3)}, r"draw\['apply'\] is of 3 clips, image of 2"),
+        ({"camera": camera(3)}, "camera must be of 2 clips, .* got 3"),
+        ({"rotation": torch.eye(3)}, "rotation must be of 2 clips, .* got 3"),
+        ({"draw": A.RandomMount().draw(3)}, r"draw\['apply'\] must be of 2 clips, .* got 3"),
     ],
 )
 def test_what_does_not_fit_a_clip_is_told_by_name(fields, says):

@@ -66,7 +66,7 @@ WRONG = [
     (lambda: MOUNT(image=IMAGES[0], rvec=torch.ones(3, 1)), ValueError, r"OpenCV's column goes in as rvec\[..., 0\]"),
     (lambda: MOUNT(image=IMAGES[0], bbox=torch.tensor([[3, 4, 9, 9]])), ValueError, r"'bbox' .* Did you mean 'boxes'"),
     (lambda: MOUNT(image=IMAGES[0], seg=torch.ones(SIZE, dtype=torch.uint8)), ValueError, r"Did you mean 'mask'\?"),
-    (lambda: MOUNT(image=IMAGES, parts=torch.ones(2, 5, 2).int()), ValueError, r"'parts' .*move with the camera is"),
+    (lambda: MOUNT(image=IMAGES, parts=torch.ones(2, 5, 2).int()), ValueError, r"'parts' .*move with the camera"),
     (lambda: ct.Pinhole([LEAF] * 4), TypeError, r"Pinhole: intrinsics must be a tensor; got a list of ten"),
     (lambda: CAMERA.project([LEAF] * 3), TypeError, r"points must .*tensors that require grad. torch.stack"),
     (lambda: CAMERA.project(torch.ones(5, 3).to_sparse()), TypeError, r"points must be a dense tensor; got"),
