@@ -398,7 +398,7 @@ class Ready(NamedTuple):
     ) -> Self:
         """Return it for a form."""
         rest = [(name, found) for name, found in form.fields if name not in names]
-        checked = [(name, found) for name, found in form.fields if found in CHECKED and found != "boxes"]
+        checked = [(name, found) for name, found in rest if found in CHECKED]  # the call looks at the others
         return cls(settings, key, names, call, rest, checked, all(name != "rotation" for name, _ in form.fields))
 
 

@@ -390,7 +390,7 @@ def _ways(
             elif found in _TURNED and value.is_contiguous():
                 hows[name] = "rays"
             elif found in _MATRICES and value.is_contiguous() and is_turn:
-                hows[name] = "columns"
+                hows[name] = "columns" if found == "rotation" else "pose"
     return hows
 
 

@@ -111,7 +111,8 @@ class Transform(FrontEnd):
             form = form, size, {**own.fields}, own.mirroring
             layouts = self._forms((), form, lambda: self._layouts(sample, size))
             if layouts is not None:
-                return _moved_arrays(move, sample, options, layouts)
+                learns = not isinstance(camera, Camera) or any(t.requires_grad for t in camera._tensors)
+                return _moved_arrays(move, sample, options, layouts, learns)
         entries = {name: self._entry(name, value, sample, size) for name, value in sample.items()}
         inside = {key: tensor for tensors, _ in entries.values() for key, tensor in tensors.items()}
         with torch.no_grad():
@@ -192,9 +193,12 @@ def _form_of(sample: Sample) -> tuple[Any, ...] | None:
 
 
 def _moved_arrays(
-    move: Callable[..., Sample], sample: Sample, options: Sample, layouts: list[tuple[str, int | None]]
+    move: Callable[..., Sample], sample: Sample, options: Sample, layouts: list[tuple[str, int | None]], learns: bool
 ) -> Sample:
-    """Move a sample of arrays that torch reads where they are; see `Transform._layouts`."""
+    """Move a sample of arrays that torch reads where they are; see `Transform._layouts`.
+
+    learns: whether the camera may, of which nothing is recorded.
+    """
     given = Single()
     for name, dims in layouts:
         value = sample[name]
@@ -202,7 +206,7 @@ def _moved_arrays(
             value = torch.from_numpy(value)
             value = value.permute(2, 0, 1) if dims == 3 else value[None] if dims == 2 else value
         given[name] = value
-    with torch.no_grad():
+    with torch.no_grad() if learns else contextlib.nullcontext():
         moved = move(given, **options)
     result: Sample = {}
     for name, dims in layouts:

@@ -124,6 +124,23 @@ static void narrowed(double *exact, int64_t count) {
 TURNED(float, fmaf)
 TURNED(double, fma)
 
+/* Whether the first three vectors are the columns of a rotation, as far as they are taken for one */
+static int is_rotation(const Turned *given) {
+    double m[3][3], off = 0;
+    for (int i = 0; i < 3; i++)
+        for (int k = 0; k < 3; k++) {
+            const int64_t at = i * given->strides[0] + k * given->strides[1];
+            m[i][k] = given->is_double ? ((const double *)given->rows)[at] : ((const float *)given->rows)[at];
+        }
+    for (int i = 0; i < 3; i++)
+        for (int j = i; j < 3; j++) {
+            const double miss = fabs(m[i][0] * m[j][0] + m[i][1] * m[j][1] + m[i][2] * m[j][2] - (i == j));
+            off = miss <= off ? off : miss; /* or what is not a number */
+        }
+    const double x = m[1][1] * m[2][2] - m[1][2] * m[2][1], y = m[1][2] * m[2][0] - m[1][0] * m[2][2];
+    return off < 1e-3 && m[0][0] * x + m[0][1] * y + m[0][2] * (m[1][0] * m[2][1] - m[1][1] * m[2][0]) > 0;
+}
+
 /* A lattice, the images that are sampled on it, and other pixels of the same cameras, in one call on this thread: in between
  * caches stay warm. Flags of what is left, as of lattices, and then nothing is made; or as of moves, LEFT_BITS higher */
 EXPORTED int64_t camtorch_together(const Together *given) {
@@ -138,7 +155,9 @@ EXPORTED int64_t camtorch_together(const Together *given) {
                      SQUARES * *lattices->used);
     for (int64_t i = 0; i < given->job_count && given->is_whole; i++) given->jobs[i].next = 0, camtorch_sample(given->jobs + i);
     for (int64_t i = 0; i < given->move_count; i++) left |= camtorch_moves(given->moves + i);
-    for (const Turned *one = given->turned; one < given->turned + given->turned_count; one++)
+    for (const Turned *one = given->turned; one < given->turned + given->turned_count; one++) {
+        left |= one->is_pose && !is_rotation(one) ? LEFT_LABELS : 0;
         if (one->turn) (one->is_double ? turned_double : turned_float)(one);
+    }
     return left << LEFT_BITS;
 }

@@ -130,8 +130,8 @@ typedef struct {
 enum { POSITIONS, PIXELS, ON_IMAGE, BOXES };
 enum { EDGE_POINTS = 64 }; /* along a side of a box; warp/boxes.py */
 /* What is left to do: pixels wait for the extent of `from`, points for the limits of `to`; most cells of a lattice want
-   exact positions; or some box more than its outline */
-enum { LEFT_FROM = 1, LEFT_TO = 2, LEFT_MOST = 4, LEFT_BOXES = 4 };
+   exact positions; or some box takes more than its outline, some pose has no rotation */
+enum { LEFT_FROM = 1, LEFT_TO = 2, LEFT_MOST = 4, LEFT_LABELS = 4 };
 #define OUTSIDE (-9)
 #define FAR 100 /* beyond, positions are drawn in */
 
@@ -177,6 +177,7 @@ typedef struct {
     void *results;
     int64_t strides[2]; /* of both, by vector and component */
     int64_t count, is_double;
+    int64_t is_pose; /* whether the first three are the columns of a rotation */
 } Turned;
 
 /* One sample: a lattice of one camera, images that are sampled on it, in parts or whole, pixels that move, and vectors */

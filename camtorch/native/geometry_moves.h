@@ -102,7 +102,7 @@ static int T(move_box)(const Move *move, const T(Between) *b, int64_t at) {
         }
     }
     move->valid[b->index * move->count + at] = (uint8_t)shown;
-    return left | (mapped && shown && area > 0 && box[2] > box[0] && box[3] > box[1] ? 0 : LEFT_BOXES);
+    return left | (mapped && shown && area > 0 && box[2] > box[0] && box[3] > box[1] ? 0 : LEFT_LABELS);
 }
 
 static int64_t T(moves)(const Move *move) {

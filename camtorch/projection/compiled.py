@@ -28,7 +28,7 @@ packed_move: Callable[..., bytes] = struct.Struct("8q2d12q").pack  # `Move` of g
 _LATTICES = struct.Struct(f"8q2d12q{CLASSIFICATION}6q")  # `Lattices`
 LATTICE_WORDS = _LATTICES.size // 8
 POSITIONS, PIXELS, ON_IMAGE, BOXES = range(4)
-LEFT_FROM, LEFT_TO, LEFT_MOST, LEFT_BOXES = 1, 2, 4, 4
+LEFT_FROM, LEFT_TO, LEFT_MOST, LEFT_LABELS = 1, 2, 4, 4
 _NO_ROWS = (0, 0, 0, 0)
 
 

@@ -37,8 +37,8 @@ from camtorch.native.sampler import Call, empty, is_quick, maker, packed, takes,
 from camtorch.projection.compiled import (
     BOXES,
     LATTICE_WORDS,
-    LEFT_BOXES,
     LEFT_FROM,
+    LEFT_LABELS,
     LEFT_MOST,
     LEFT_TO,
     ON_IMAGE,
@@ -70,14 +70,15 @@ from camtorch.warp.sampling import (
 )
 
 Route = Literal["operator", "strips", "graph", "kept"]
-Label = Literal["pixels", "boxes", "rays", "columns"]
-"""What moves beside images: pixels, boxes, directions and points of the camera frame, or columns of a matrix."""
+Label = Literal["pixels", "boxes", "rays", "columns", "pose"]
+"""What moves beside images: pixels, boxes, directions and points of the camera frame, or columns of such in a matrix,
+of which those of a pose begin with a rotation."""
 Sizes = tuple[tuple[int, int], tuple[int, int]]
 """(height, width) of the source's image, and of the target's."""
 
 _MOST_KEPT = 1 << 25  # pixels of a grid; longer ones, of 256 MB in float32, are made by strips and not kept
 _STRIP = 1 << 21  # pixels of such a strip
-_HEAD, _WIDTHS = 7, {"pixels": 22, "turned": 7, "images": 38}  # words of the structures of C
+_HEAD, _WIDTHS = 7, {"pixels": 22, "turned": 8, "images": 38}  # words of the structures of C
 _MOST_FORMS = 4  # of samples that a thread keeps calls of
 _FEW = 2  # tiles of an image that one thread makes alone
 _EVEN = 4  # samples a thread from which on it matters little that the last ones leave some threads idle
@@ -421,7 +422,7 @@ class SampleCall:
         with torch.inference_mode(False):
             self._lattices = Lattices(probes, sizes[1], sizes[0], form.tolerance, padding, count)
         parts: dict[str, list[bytes]] = {"pixels": [], "turned": [], "images": []}
-        kinds: list[str] = []
+        kinds, as_they_are = list[str](), list[bool]()
         self._makers: list[Callable[[], Tensor] | None] = []
         self._kept: list[object] = []  # what the words point to
         self._tiles = 1
@@ -442,7 +443,8 @@ class SampleCall:
                 words = packed_move(0, 0, 0, 0, 3, 1, count, move, *sizes[1], *rows)
             else:
                 steps = (3, 1, value.numel() // 3) if how == "rays" else (1, value.shape[-1], value.shape[-1])
-                words = struct.pack("7q", 0, 0, 0, *steps, dtype == torch.float64)
+                words = struct.pack("8q", 0, 0, 0, *steps, dtype == torch.float64, how == "pose")
+            as_they_are.append(value.dtype == dtype and value.is_contiguous())
             kinds.append("images" if make else "pixels" if how in ("pixels", "boxes") else "turned")
             parts[kinds[-1]].append(words)
             self._makers.append(make)
@@ -458,8 +460,9 @@ class SampleCall:
         else:
             # one thread makes the lattice, and needs no counter of those made
             self._words[_HEAD + _WIDTHS["pixels"] - 1] = 0
-        self._slots = [(kind, next(at[kind])) for kind in kinds]  # where the pointers to each value go
-        self._boxes = [i for i, how in enumerate(form.hows) if how == "boxes"]
+        # where the pointers to each value go, and whether it goes in as it is
+        self._slots = [(kind, next(at[kind]), plain) for kind, plain in zip(kinds, as_they_are, strict=True)]
+        self._doubtful = [i for i, how in enumerate(form.hows) if how in ("boxes", "pose")]
         self._first_job, self._jobs, self._has_pixels = first["images"], images[1], pixels[1] > 0
         self._dtype, self._count = dtype, count
         self.keeps_dtypes: bool = all(
@@ -476,7 +479,8 @@ class SampleCall:
     ) -> list[tuple[Tensor, Tensor | None] | None] | None:
         """Return what `values`, of the form, become between two cameras, and which pixels and boxes are valid.
 
-        None where the call does not do. That of boxes alone is None if some take more than their outline.
+        None where the call does not do. Those of boxes and poses alone are None if some take more than their outline,
+        or are none.
         """
         dtype = self._dtype
         if rotation is not None and (rotation.dtype != dtype or not rotation.is_contiguous()):
@@ -493,16 +497,16 @@ class SampleCall:
         words[_HEAD : _HEAD + 4] = [target.pointer, source.pointer, turn, by_camera]
         results: list[tuple[Tensor, Tensor | None] | None] = []
         given = []  # pixels in the dtype of the cameras, without gaps, for as long as the call
-        for value, (kind, at), make in zip(values, self._slots, self._makers, strict=True):
+        for value, (kind, at, is_plain), make in zip(values, self._slots, self._makers, strict=True):
             valid = None
             if make is not None:
                 result = make()
-                words[at : at + 2] = [value.data_ptr(), result.data_ptr()]
+                words[at], words[at + 1] = value.data_ptr(), result.data_ptr()
             elif kind == "turned":
                 result = value.clone()
-                words[at : at + 3] = [turn, value.data_ptr(), result.data_ptr()]
+                words[at], words[at + 1], words[at + 2] = turn, value.data_ptr(), result.data_ptr()
             else:
-                if value.dtype != dtype or not value.is_contiguous():
+                if not is_plain:
                     value = value.to(dtype).contiguous()
                     given.append(value)
                 result = torch.empty(value.shape, dtype=dtype, device="cpu")
@@ -530,8 +534,8 @@ class SampleCall:
                 end.follow()
             if flags >= _PIXELS:  # the images are made
                 words[1] = 0
-                if left == LEFT_BOXES:
-                    for i in self._boxes:
+                if left == LEFT_LABELS:
+                    for i in self._doubtful:
                         results[i] = None
                     break
         if not is_whole:
