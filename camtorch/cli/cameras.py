@@ -11,6 +11,7 @@ from pathlib import Path
 from camtorch import lenses
 from camtorch.cameras.camera import Camera, as_model
 from camtorch.cameras.rig import Rig
+from camtorch.cli.lenses import find
 from camtorch.cli.terminal import note
 from camtorch.cli.words import GUESS, LENS
 from camtorch.io import load, opencv
@@ -29,11 +30,7 @@ def read_rig(
     """
     if str(path).startswith(LENS):
         words = str(path).removeprefix(LENS)
-        try:
-            lenses.find(words)
-        except ValueError as error:
-            raise ValueError(f"{error}; for images --guess-fov DEGREES works too") from None
-        known = (size and lenses.search(words, image_size=size)) or lenses.search(words)
+        known = (size and lenses.search(words, image_size=size)) or find(words)
         others = f", the best of {len(known)} that camtorch lenses lists" if len(known) > 1 else ""
         note(f"{words}: {known[0]!r}{others}")
         return Rig({"camera": known[0].camera()})

@@ -5,22 +5,33 @@ from __future__ import annotations
 import argparse
 
 from camtorch import lenses
-from camtorch.cli import targets
-from camtorch.io import save
 
 
 def run(arguments: argparse.Namespace) -> None:
     """Run the command."""
     words, output, size = " ".join(arguments.words), arguments.output, arguments.size
     if output is not None:
+        from camtorch.cli import targets  # the import takes a tenth of a second, as that of camtorch.io does
+
         targets.check(output, force=arguments.force)
-    camera = lenses.find(words, image_size=size)
-    found = lenses.search(words, image_size=size)
+    found = find(words, size)
     for lens in found[: arguments.n]:
         print(str(lens)[1:-1])
     if len(found) > arguments.n:
         print(f"and {len(found) - arguments.n} more; -n {len(found)} lists them all")
     if output is not None:
+        from camtorch.io import save
+
+        camera = lenses.find(words, image_size=size)
         output.parent.mkdir(parents=True, exist_ok=True)
         save(camera, output, arguments.format)
         print(f"{output}: {found[0].name}, {camera.width}x{camera.height}")
+
+
+def find(words: str, size: tuple[int, int] | None = None) -> list[lenses.Lens]:
+    """Return the lenses of a name, best first, at least one."""
+    try:
+        lenses.find(words, image_size=size)
+    except ValueError as error:
+        raise ValueError(f"{error}; on the command line --guess-fov DEGREES does") from None
+    return lenses.search(words, image_size=size)

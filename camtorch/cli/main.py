@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import gc
 import importlib
 import importlib.metadata
 import os
@@ -55,7 +56,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         module = f"camtorch.cli.{arguments.command}"
         if arguments.command == "dewarp" and arguments.jobs != 1 and commands.are_several(arguments.image):
             processes.prepare(module)  # processes import in parallel with this one
-        command = importlib.import_module(module)  # torch takes a second: `--help` must not import it
+        command = _imported(module)
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", UserWarning)
             status: int = command.run(arguments) or 0
@@ -74,6 +75,18 @@ def main(argv: Sequence[str] | None = None) -> int:
         say(f"error: {reason(error)}")
         return 2
     return status
+
+
+def _imported(module: str) -> Any:
+    """Import a command and torch: a second, which `--help` saves, and half of one more if garbage is collected."""
+    if "torch" in sys.modules:
+        return importlib.import_module(module)
+    gc.disable()
+    try:
+        return importlib.import_module(module)
+    finally:
+        gc.freeze()  # the modules stay
+        gc.enable()
 
 
 def make_parser() -> argparse.ArgumentParser:

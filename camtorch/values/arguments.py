@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import difflib
 import functools
 import importlib
+import inspect
 import math
 import operator
 import os
@@ -29,6 +31,8 @@ Taken = ParamSpec("Taken")
 Result = TypeVar("Result")
 Name = TypeVar("Name", bound=str)
 
+_CLOSE = 0.5  # as difflib has it: size and image_size are
+
 
 def hinting(hint: str) -> Callable[[Callable[Taken, Result]], Callable[Taken, Result]]:
     """Return a decorator that adds `hint` to a function's error about arguments that it does not have."""
@@ -40,8 +44,10 @@ def hinting(hint: str) -> Callable[[Callable[Taken, Result]], Callable[Taken, Re
                 return function(*args, **kwargs)
             except TypeError as error:
                 is_inner = error.__traceback__ is None or error.__traceback__.tb_next is not None
-                if any(f"unexpected keyword argument {name!r}" in str(error) for name in kwargs):
-                    raise TypeError(f"{error}. {hint}. {LEFT}") from None
+                if name := next((name for name in kwargs if f"unexpected keyword argument {name!r}" in str(error)), ""):
+                    close = difflib.get_close_matches(name, inspect.signature(function).parameters, 1, _CLOSE)
+                    meant = f"Did you mean {close[0]!r}? " if close else ""
+                    raise TypeError(f"{error}. {meant}{hint}. {LEFT}") from None
                 if is_inner:
                     raise
                 raise TypeError(f"{error}. {hint}") from None

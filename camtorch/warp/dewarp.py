@@ -14,7 +14,7 @@ from camtorch.cameras.camera import Camera
 from camtorch.models import UCM, Cylindrical, Equirectangular, Pinhole
 from camtorch.poses.rotations import as_rotation
 from camtorch.rays.lattices import around_ends, image_lattice
-from camtorch.values.arguments import as_fov, as_image_size, broadcast_shapes, check_devices, hinting, one_of
+from camtorch.values.arguments import as_fov, as_image_size, broadcast_shapes, check_devices, hinting, one_of, warn
 from camtorch.warp.sampling import TolerantOptions
 from camtorch.warp.warp import Warp, as_sized
 
@@ -42,6 +42,7 @@ _PLANES: dict[str, tuple[float, Callable[[float], float]]] = {
     "stereographic": (359, lambda angle: 4 * math.tan(angle / 4)),
 }
 """Projections with an infinite plane: their limit of fov in degrees, and the plane's width for a fov in radians."""
+_MIDDLE, _LEAST_SHARE = math.pi / 3, 0.1  # a wider fov warns: above 160 degrees in perspective, 278 in stereographic
 _LINE_SAMPLES = 257
 _SEAM = 1e-3  # radians to either side of it
 
@@ -61,6 +62,7 @@ class Dewarp(Warp):
         fov: horizontal field of view of the target in degrees, centred on its axis. By default the target shows
             what the image's middle row and column show, up to 120 degrees in perspective and 220 in stereographic.
             A panorama is then as wide as the middle row, or a whole turn, and its height follows from image_size.
+            Above 160 degrees in perspective and 278 in stereographic the rim takes nearly all pixels, which warns.
         image_size: (height, width) of the target; default: the source's.
         rotation: (3, 3) or (B, 3, 3), `ray_target = R ray_source`: where the target looks.
         mode, padding_mode, fill, antialias, tolerance: as in `Warp`.
@@ -95,6 +97,9 @@ class Dewarp(Warp):
                 height, width = size
                 most, of_plane = _PLANES.get(projection, (360, lambda angle: angle))
                 plane_width = of_plane(math.radians(as_fov(fov, "Dewarp", most, f" for {projection}")))
+                if (share := of_plane(_MIDDLE) / plane_width) < _LEAST_SHARE:
+                    got = f"fov={fov:g} leaves {share * width:.0f} of {width} columns for the middle 60 degrees"
+                    warn(f'Dewarp: {got}. Lower it, or choose projection="cylindrical" or "equirectangular"')
                 focal = camera.intrinsics.new_tensor(width / plane_width)
                 centre = camera.intrinsics.new_tensor([(width - 1) / 2, (height - 1) / 2])
                 intrinsics = torch.cat((focal.expand(2), centre))

@@ -203,6 +203,11 @@ WRONG = [
     (lambda: ct.triangulate(np.eye(3), np.eye(3), 1, 2), TypeError, r"were given\. It takes lists: ct.triangulate\("),
     (lambda: ct.rectify(*[EYE] * 4, SIZE, EYE, EYE), TypeError, r"OpenCV's .* ct.rectify\(left, right, ct.Ext"),
     (lambda: ct.Dewarp(np.eye(3), np.zeros(4)), TypeError, r"were given\. It takes a camera, as .*from_matrix\(K, D"),
+    (
+        lambda: ct.Dewarp(CAMERA, size=SIZE),
+        TypeError,
+        r"argument 'size'\. Did you mean 'image_size'\? It takes",
+    ),
     (lambda: ct.Dewarp(CAMERA, balance=0.5), TypeError, r"argument 'balance'\. It takes .* fov is how much it"),
     (lambda: ct.Pinhole.from_matrix(np.eye(3), None, SIZE), TypeError, r"given\. It takes from_matrix\(K, dist"),
     (lambda: ct.Pinhole.from_fov(90), TypeError, r"'image_size'\. It takes from_fov\(degrees, image_size="),
@@ -247,6 +252,7 @@ NARROW = ct.Pinhole([2000.0, 2000.0, 319.5, 239.5], image_size=(480, 640))
 CALLS = {
     "taken as .height, width.": lambda: ct.Pinhole([300.0, 300.0, 319.5, 239.5], image_size=(640, 480)),
     "seem to be": lambda: ct.Pinhole([600.0, 320.0, 600.0, 240.0], image_size=(480, 640)),
+    "fov=170 leaves 2 of 32 columns for the middle 60 degrees": lambda: ct.Dewarp(CAMERA, fov=170),
     "is stretched to": lambda: NARROW.resize(640, 480),
     "will show nothing": lambda: ct.augment.RandomCamera(fov=(120, 130), camera=NARROW)(image=torch.zeros(1, 480, 640)),
     "became unusable": lambda: unusable().project(torch.tensor([0.0, 0.0, 1.0])),
