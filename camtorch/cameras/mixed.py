@@ -42,9 +42,6 @@ class _Group(NamedTuple):
 class Mixed(Camera):
     """A batch of cameras of any models, one for each image: it projects, is cropped, and is warped as one camera.
 
-        camera = ct.Mixed([ct.Pinhole(...), ct.KannalaBrandt(...), ct.BrownConrady(...)])
-        pixels, valid = camera.project(points)  # (3, N, 3), a row for each camera
-
     Results have the same bits as those of each camera alone. Cameras of one model and number of coefficients are
     evaluated together: 64 cameras of 8 models take 8 calls, however they are ordered.
 
@@ -59,6 +56,10 @@ class Mixed(Camera):
     Raises:
         TypeError: If something is no camera. ValueError: If there are no cameras, more than one batch dim, images of
             different sizes, or different devices.
+
+    Example:
+        >>> camera = ct.Mixed([ct.Pinhole([300.0, 300, 319.5, 239.5]), ct.KannalaBrandt([300.0, 300, 319.5, 239.5])])
+        >>> pixels, valid = camera.project(torch.rand(2, 100, 3))  # (2, 100, 2), (2, 100): a row for each camera
     """
 
     is_mixed = True

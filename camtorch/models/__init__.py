@@ -1,8 +1,7 @@
 """The camera models, one file each.
 
 The camera of parallel rays (orthographic, telecentric) is not included: its rays do not pass one point, and a camera
-here is a map between the directions from one point and pixels. `OrthographicFisheye`, r = sin(theta), is
-another model.
+here maps the directions from one point to pixels. `OrthographicFisheye`, r = sin(theta), is another model.
 """
 
 import importlib
@@ -72,7 +71,7 @@ __all__ = [
     "WoodScape",
 ]
 
-# file of each class, imported on first use of the class or of its key in MODELS; mostly named like the class
+# the file of each class, which the first use of the class or of its key in MODELS imports
 _FILES = {name: re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name).lower() for name in __all__ if name != "MODELS"} | {
     "FTheta": "f_theta",
     "FThetaSheared": "f_theta",

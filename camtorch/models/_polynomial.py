@@ -39,7 +39,7 @@ class FreePolynomial(Camera):
     fit_counts: ClassVar[tuple[int, ...]] = (3, 5, 7)
 
     sheared: ClassVar[type[FreePolynomial] | None] = None
-    """Model that also has d and e, as first coefficients."""
+    """The model that also has d and e, as first coefficients."""
     shear_names: ClassVar[tuple[str, ...]] = ()
 
     @classmethod

@@ -21,12 +21,15 @@ class BrownConrady(Camera):
         a' = a R + 2 p1 a b + p2 (t + 2 a^2) + s1 t + s2 t^2
         b' = b R + p1 (t + 2 b^2) + 2 p2 a b + s3 t + s4 t^2
 
-    then the homography of a sensor tilted by (tau_x, tau_y) radians. A ray is valid for z > 0, before the
-    pole of R and before the fold of the map; the fold depends on the azimuth once p, s or tau are not zero.
+    then the homography of a sensor tilted by (tau_x, tau_y) radians. A ray is valid for z > 0, before the pole of R and
+    before the fold of the map; the fold depends on the azimuth if p, s or tau are not zero.
 
-    Distortion: k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4 [tau_x tau_y]]]], so 4, 5, 8, 12 or 14 coefficients; 5
-    if left out. Source: OpenCV 4 and 5, `projectPoints`. COLMAP OPENCV (4) and FULL_OPENCV (8). See `Camera`
-    for shapes, conventions and errors.
+    Distortion: k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4 [tau_x tau_y]]]]: 4, 5, 8, 12 or 14 coefficients; 5 by default.
+    COLMAP OPENCV (4) and FULL_OPENCV (8). Source: OpenCV, `projectPoints`. See `Camera` for conventions and errors.
+
+    Example:
+        >>> ct.BrownConrady([300.0, 300.0, 319.5, 239.5], [-0.25, 0.0, 0.0, 0.0]).project([0.5, 0.0, 1.0])[0].tolist()
+        [460.125, 239.5]
     """
 
     key = "brown_conrady"

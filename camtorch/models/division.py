@@ -11,10 +11,9 @@ from camtorch.optics import AnglePerRadius, Chart, Inverted, Lens, OneDivision
 class Division(Camera):
     """The division camera: the pixel f (a, b) + c sees along (a, b, D), D = 1 + lambda1 r^2 + lambda2 r^4 + ...
 
-    r^2 = a^2 + b^2.
-    A ray is valid before the angle stops ascending with r. With one term r / (1 + lambda1 r^2) = rho / z is solved in
-    closed form: the fold is at r^2 = 1 / lambda1 if lambda1 > 0, and for lambda1 < 0 all rays except the exact
-    backward one are valid. With more terms the inverse is found by Newton's method, and pixels have rays up
+    r^2 = a^2 + b^2. A ray is valid before the angle stops ascending with r. With one term r / (1 + lambda1 r^2) =
+    rho / z is solved in closed form: the fold is at r^2 = 1 / lambda1 if lambda1 > 0; if lambda1 < 0, all rays except
+    the exact backward one are valid. With more terms the inverse is found by Newton's method, and pixels have rays up
     to 19 focal lengths from the centre.
 
     Distortion: lambda1 lambda2 ..., any number of coefficients, at least one; 1 if left out. One is COLMAP DIVISION and

@@ -13,12 +13,10 @@ class EUCM(Camera):
 
         (a, b) = (x, y) / (alpha d + (1 - alpha) z),  d = sqrt(beta (x^2 + y^2) + z^2),  (u, v) = f (a, b) + c
 
-    A ray is valid before the pole or the fold of r: for z > -w d, see `UCM`, which this is for beta = 1.
-    Needs beta > 0.
+    A ray is valid before the pole or the fold of r: for z > -w d, as in `UCM`, which this is for beta = 1. beta is > 0.
 
-    Distortion: alpha beta; 0, 1 if left out, a pinhole camera. The same as Basalt `eucm`, COLMAP EUCM and Kalibr
-    `eucm`. Source: Khomutenko, Garcia and Martinet, "An enhanced unified camera model", RA-L 2016. See `Camera`
-    for shapes, conventions and errors.
+    Distortion: alpha beta; by default 0, 1, a pinhole camera. Basalt `eucm`, COLMAP EUCM, Kalibr `eucm`. Source:
+    Khomutenko, Garcia and Martinet, "An enhanced unified camera model", RA-L 2016. See `Camera` for errors.
     """
 
     key = "eucm"

@@ -20,8 +20,8 @@ class FTheta(FreePolynomial):
     the azimuth. The first one is exact there, and the second one is given as zero; everywhere else all are exact.
 
     Distortion: k2 k3 ... by the power of theta, any number of them, at least one; 3 if left out. The same as
-    `WoodScape`, which has three, and NVIDIA DriveWorks `ftheta` where its polynomial gives pixels of angles
-    (`fw-poly`); one that gives angles of pixels is `FThetaBackward`. Files of NVIDIA have a linear part beside it, for
+    `WoodScape`, which has three, and NVIDIA DriveWorks `ftheta` if its polynomial gives pixels of angles
+    (`fw-poly`); one that gives angles of pixels is `FThetaBackward`. Files of NVIDIA have a linear part, too, for
     which `from_polynomial` makes an `FThetaSheared`. See `Camera` for shapes, conventions and errors.
     """
 
@@ -43,8 +43,7 @@ class FTheta(FreePolynomial):
 class FThetaSheared(Sheared, FTheta):
     """NVIDIA's f-theta camera with all of its linear part: of `FTheta`'s (x, y), (u, v) = f (x + e y, d x + y) + c.
 
-    The [[c, d], [e, 1]] of files comes in through `from_polynomial`: d here is their e, e is their d / c, and c is
-    fx / fy.
+    `from_polynomial` takes the [[c, d], [e, 1]] of files: d here is their e, e is their d / c, and c is fx / fy.
 
     Distortion: d e k2 k3 ..., d and e of the linear part as of `OCamCalib`, then those of `FTheta`, at least one; 5 if
     left out. Source: NVIDIA's nvidia-ncore, `FThetaCameraModel`. On the axis see `FTheta`. See `Camera` for shapes,

@@ -18,7 +18,7 @@ class FThetaBackward(FreePolynomial):
     up to a radius of 19 focal lengths.
 
     Distortion: k2 k3 ... by the power of r, any number of them, at least one; 3 if left out. A polynomial of pixels
-    comes in through `from_polynomial`. The same as NVIDIA DriveWorks `ftheta` where its polynomial gives angles of
+    is taken by `from_polynomial`. The same as NVIDIA DriveWorks `ftheta` if its polynomial gives angles of
     pixels (`bw-poly`), and as nvidia-ncore's, whose linear part makes it an `FThetaBackwardSheared`. On the axis see
     `FTheta`. See `Camera` for shapes, conventions and errors.
     """

@@ -18,11 +18,14 @@ class Fisheye62(Camera):
         a' = a + p0 (2 a^2 + r^2) + 2 p1 a b
         b' = b + p1 (2 b^2 + r^2) + 2 p0 a b
 
-    (u, v) = f (a', b') + c. A ray is valid before the fold of r and, on its azimuth, before that of the tangential
-    terms.
+    (u, v) = f (a', b') + c. A ray is valid before the fold of r and, on its azimuth, that of the tangential terms.
 
     Distortion: k0 k1 k2 k3 k4 k5 p0 p1. Source: Project Aria, `Fisheye62.h`, which sends z < 0 to the pixel of the
     antipodal point; here it is the model's own. See `Camera` for shapes, conventions and errors.
+
+    Example:
+        >>> ct.KannalaBrandt([300.0, 300.0, 319.5, 239.5], [0.1, 0.0, 0.0, 0.0]).convert("fisheye62").camera
+        Fisheye62(fx=300, fy=300, cx=319.5, cy=239.5, k0=0.1, k1=0, k2=0, k3=0, k4=0, k5=0, p0=0, p1=0)
     """
 
     key = "fisheye62"

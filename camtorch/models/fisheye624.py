@@ -21,8 +21,11 @@ class Fisheye624(Camera):
     (u, v) = f (a', b') + c. A ray is valid before the fold of r and, on its azimuth, before that of the small rest.
 
     Distortion: k0 k1 k2 k3 k4 k5 p0 p1 s0 s1 s2 s3. Source: Project Aria, `FisheyeRadTanThinPrism.h`, which sends z < 0
-    to the pixel of the antipodal point; here it is the model's own. COLMAP RAD_TAN_THIN_PRISM_FISHEYE. See
-    `Camera` for shapes, conventions and errors.
+    to the pixel of the antipodal point; here it is the model's own. COLMAP RAD_TAN_THIN_PRISM_FISHEYE. See `Camera`.
+
+    Example:
+        >>> ct.Fisheye624([300.0, 300.0, 319.5, 239.5], [0.1] + 11 * [0.0]).unproject([319.5, 239.5])[0].tolist()
+        [0.0, 0.0, 1.0]
     """
 
     key = "fisheye624"

@@ -20,9 +20,12 @@ class KannalaBrandt(OddPolynomial):
     theta = atan2(hypot(x, y), z), so that angles past 90 degrees are real; (u, v) = f r (cos phi, sin phi) + c. A ray
     is valid before the first root of dr/dtheta.
 
-    Distortion: k1 k2 ..., any number of coefficients, at least one; 4 if left out. Source: OpenCV
-    `fisheye`, there with 4. The same as Aria KANNALA_BRANDT_K3, Basalt kb4, COLMAP OPENCV_FISHEYE. See `Camera`
-    for shapes, conventions and errors.
+    Distortion: k1 k2 ..., any number of coefficients, at least one; 4 by default. Source: OpenCV `fisheye`, with 4. The
+    same as Aria KANNALA_BRANDT_K3, Basalt kb4, COLMAP OPENCV_FISHEYE. See `Camera` for conventions and errors.
+
+    Example:
+        >>> ct.KannalaBrandt([300.0, 300.0, 319.5, 239.5]).project([1.0, 0.0, -1.0])[1].item()  # 135 degrees
+        True
     """
 
     key = "kannala_brandt"

@@ -40,9 +40,8 @@ class OCamCalib(Camera):
     exact. With odd powers (a1 is mostly zero) the camera has one continuous derivative on the axis, and no second one.
 
     Distortion: d e a1 a2 ... by the power of r, n >= 3 numbers; four powers if left out. `from_ocamcalib` takes ss, c,
-    d, e of the toolbox, with its axes and its centre. Even powers alone are `Division`. Source:
-    Scaramuzza, Martinelli and Siegwart, "A toolbox for easily calibrating omnidirectional cameras", IROS 2006. See
-    `Camera` for shapes, conventions and errors.
+    d, e of the toolbox, with its axes and its centre. Even powers alone are `Division`. Source: Scaramuzza, Martinelli
+    and Siegwart, "A toolbox for easily calibrating omnidirectional cameras", IROS 2006. See `Camera`.
     """
 
     key = "ocamcalib"

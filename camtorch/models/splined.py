@@ -45,13 +45,13 @@ class Splined(Camera):
     """mrcal's splined stereographic camera, `LENSMODEL_SPLINED_STEREOGRAPHIC`: (u, v) = f (m + du(m)) + c.
 
     m = 2 tan(theta / 2) (cos phi, sin phi), theta = atan2(hypot(x, y), z); du is a uniform B-spline surface of order 2
-    (quadratic) or 3 (cubic) over columns x rows control points. It follows any lens, be it symmetric or not, and knows
-    nothing where it was not fitted to anything. A ray is valid on the surface, which ends fov_x / 2 to the left and to
+    (quadratic) or 3 (cubic) over columns x rows control points. It can follow any lens, symmetric or not, and is
+    undetermined where it was not fitted. A ray is valid on the surface, which ends fov_x / 2 to the left and to
     the right of the axis and, in the plane, (rows - order) / (columns - order) as far above and below; and before a
     fold. Another grid than that of this class is a class of its own, `Splined.with_grid(...)`.
 
     Distortion: x0_0 y0_0 x1_0 y1_0 ..., du of the control points in units of the focal length, row by row: xi_j and
-    yi_j of column i and row j. Scales and shifts of the surface are also those of the intrinsics, which fits hold.
+    yi_j of column i and row j. Intrinsics could also do the surface's scales and shifts, so fits hold them.
     Sources: mrcal.c, and https://mrcal.secretsauce.net/splined-models.html. See `Camera` for shapes, conventions and
     errors.
     """
@@ -64,7 +64,7 @@ class Splined(Camera):
     quarter_turn = None
 
     @classmethod
-    @hinting("By name: ct.Splined.with_grid(columns=16, rows=11, fov_x=120), mrcal's Nx, Ny and fov_x_deg")
+    @hinting("Call ct.Splined.with_grid(columns=16, rows=11, fov_x=120), mrcal's Nx, Ny and fov_x_deg")
     def with_grid(cls, *, columns: int, rows: int, fov_x: float, order: int = 3) -> type[Splined]:
         """Return the class of cameras of another grid: a model for `convert`, `calibrate` and files as any other.
 
@@ -94,7 +94,7 @@ class Splined(Camera):
 
     @classmethod
     def variant(cls, text: str) -> type[Camera]:
-        if cls is not Splined:  # variants of a grid class do not exist
+        if cls is not Splined:  # a grid class has no variants
             return super().variant(text)
         found = _VARIANT.fullmatch(text)
         if found is None:

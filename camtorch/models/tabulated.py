@@ -20,12 +20,12 @@ class Tabulated(Camera):
 
     theta = atan2(hypot(x, y), z), so that angles past 90 degrees are real. Between the nodes, and (0, 0), r is a cubic
     spline with two continuous derivatives, odd in theta, and kept monotone by Hyman's filter where the table is; at
-    nodes where the filter is at work only the first derivative is continuous. A ray is valid up to the last angle, and
+    nodes that the filter changes only the first derivative is continuous. A ray is valid up to the last angle, and
     before r stops ascending.
 
-    Distortion: theta1 ... thetaN r1 ... rN, N >= 2: the angles in radians, ascending, which stay as they are (their
-    gradient is zero), and the radii in units of the focal length, which learn. Equidistant if left out. A table in
-    millimetres comes in through `from_table`. Source of the filter: Hyman, "Accurate monotonicity preserving cubic
+    Distortion: theta1 ... thetaN r1 ... rN, N >= 2: the angles in radians, ascending, which do not learn (their
+    gradient is zero), and the radii in units of the focal length, which do. By default equidistant. `from_table` takes
+    a table in millimetres. Source of the filter: Hyman, "Accurate monotonicity preserving cubic
     interpolation", SIAM J. Sci. Stat. Comput. 1983. See `Camera` for shapes, conventions and errors.
     """
 
@@ -95,8 +95,7 @@ class Tabulated(Camera):
             image_size: (height, width) in pixels.
 
         Raises:
-            ValueError: If the table has another shape, does not ascend from the origin, or goes beyond half a
-                turn.
+            ValueError: If the table has another shape, does not ascend from the origin, or exceeds half a turn.
         """
         pixels_per_unit = as_number(pixels_per_unit, "pixels_per_unit", cls.__name__)
         centre = as_real(centre, "centre", cls.__name__)
@@ -113,7 +112,7 @@ class Tabulated(Camera):
                 f"and radii {radii.tolist()}"
             )
         if angles[-1] > math.pi * (1 + 1e-6):
-            raise ValueError(f"{cls.__name__}: angles must be at most pi radians; got {float(angles[-1])}. Degrees?")
+            raise ValueError(f"{cls.__name__}: angles must be at most pi radians; got {float(angles[-1])}. Use radians")
         focal = radii[:1] / angles[:1]
         intrinsics = torch.cat((focal * pixels_per_unit, focal * pixels_per_unit, centre))
         return cls(intrinsics, torch.cat((angles, radii / focal)), image_size=image_size)

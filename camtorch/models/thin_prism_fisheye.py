@@ -18,7 +18,7 @@ class ThinPrismFisheye(Camera):
         a' = a (1 + k1 t + k2 t^2 + k3 t^3 + k4 t^4) + 2 p1 a b + p2 (t + 2 a^2) + sx1 t
         b' = b (1 + k1 t + k2 t^2 + k3 t^3 + k4 t^4) + p1 (t + 2 b^2) + 2 p2 a b + sy1 t
 
-    (u, v) = f (a', b') + c. A ray is valid before the fold of the map on its azimuth. Not a special case of
+    (u, v) = f (a', b') + c. A ray is valid before the fold of the map on its azimuth. It is no special case of
     `Fisheye624`, whose tangential and thin-prism terms are made of the radius after the polynomial.
 
     Distortion: k1 k2 p1 p2 k3 k4 sx1 sy1. The same as COLMAP THIN_PRISM_FISHEYE, which stops at 90 degrees. Source:

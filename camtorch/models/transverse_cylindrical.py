@@ -12,7 +12,7 @@ class TransverseCylindrical(Camera):
     """A panorama on a cylinder about the x axis: each row is a plane through that axis, angles past 90 degrees show.
 
     u = fx x / hypot(y, z) + cx, v = fy atan2(y, z) + cy: fx in pixels per unit of length along the cylinder, fy in
-    pixels per radian, (cx, cy) the pixel of the forward direction. Valid within half a turn up and down, but for
+    pixels per radian, (cx, cy) the pixel of the forward direction. Valid within half a turn up and down, except
     straight left and right. With the baseline along x the rows of two such images correspond.
 
     Distortion: none. See `Camera` for shapes, conventions and errors.

@@ -49,6 +49,10 @@ class Extrinsics(BatchedModule):
         ValueError: If a shape is wrong, plain rotation vectors exceed two turns, which seem to be degrees, a matrix
             is not a rotation, batch dims do not fit, or a value is NaN or infinite.
         TypeError: If values are not numeric.
+
+    Example:
+        >>> ct.Extrinsics([0.0, 0.0, 0.0], [0.0, 0.0, 2.0])([1.0, 2.0, 3.0]).tolist()
+        [1.0, 2.0, 5.0]
     """
 
     tensor_names: ClassVar[tuple[str, ...]] = ("rotation", "translation")

@@ -112,7 +112,7 @@ WRONG = [
     (lambda: TABLE([1.0, 2.0], [0.1], [1.0]), ValueError, "two nodes"),
     (lambda: TABLE([1.0, 2.0], [0, 0.1, 0.2], [0.1, 1, 2]), ValueError, "two nodes"),
     (lambda: TABLE([1.0, 2.0], [0.1, 0.2], [1.0]), ValueError, "shapes"),
-    (lambda: TABLE([1.0, 2.0], [10.0, 90.0], [1.0, 2.0]), ValueError, r"at most pi radians; got 90\.0. Degrees"),
+    (lambda: TABLE([1.0, 2.0], [10.0, 90.0], [1.0, 2.0]), ValueError, r"at most pi radians; got 90\.0. Use rad"),
     (lambda: ct.Tabulated(INTRINSICS, [0.3, 0.2, 1.0, 2.0]), ValueError, "ascend"),
     (lambda: OCAM([0.0, 0, 1e-3], CENTRE), ValueError, "must not be zero"),
     (lambda: OCAM([-200.0], CENTRE), ValueError, r"polynomial must be \(n,\), n >= 2"),
