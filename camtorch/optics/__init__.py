@@ -1,4 +1,4 @@
-"""What a camera model is made of: a chart from rays to a plane, and a lens of stages on that plane."""
+"""The parts of a camera model: a chart from rays to a plane, and a lens of stages on that plane."""
 
 from camtorch.optics.backprojection import Inverted
 from camtorch.optics.charts import (

@@ -1,4 +1,4 @@
-"""The chart of cameras that are given from the pixel to the angle: the other direction is found by Newton's method."""
+"""The chart of cameras that are defined from the pixel to the angle; Newton's method finds the other direction."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ FURTHEST = math.tan(math.radians(87))
 class Inverted(Chart):
     """The point (a, b) of radius r sees the angle theta = r R(r^2), R a radial factor; see `Equidistant`.
 
-    Rays are covered before theta ceases to ascend, and up to `FURTHEST`.
+    Rays are covered before theta stops ascending, and up to `FURTHEST`.
     """
 
     code: ClassVar[int | None] = 6
 
     def __init__(self, factor: type[RadialFactor], parameters: Sequence[Tensor]):
-        """factor: the class of R, whose instances are made of the parameters."""
+        """Make the chart from the class of R, whose instances are made of the parameters."""
         self.factor = factor
         self.parameters: tuple[Tensor, ...] = tuple(parameters)
         self._known: RadialInverse | None = None
@@ -38,7 +38,7 @@ class Inverted(Chart):
 
     @property
     def _inverse(self) -> RadialInverse:
-        """Graph-free, with its tables, made when first asked for; compiled code may keep nothing."""
+        """The inverse with its tables, without a graph, made at first use; compiled code may keep nothing."""
         if torch.compiler.is_compiling() and not is_portable_export():
             return RadialInverse(self.factor, self.parameters, FURTHEST)
         if self._known is None:
@@ -48,7 +48,7 @@ class Inverted(Chart):
 
     def margin(self, x: Tensor, y: Tensor, z: Tensor) -> Tensor:
         theta2 = torch.addcmul(x * x, y, y) * Equidistant().scale(x, y, z, 1) ** 2
-        # away from the fold, where the ray's own rounding would carry it across
+        # stay away from the fold, which the ray's own rounding would cross
         before = times(self._inverse.most2, 1 - 32 * torch.finfo(z.dtype).eps) - theta2
         return torch.minimum(Equidistant().margin(x, y, z), before)
 
@@ -71,7 +71,7 @@ class Inverted(Chart):
         inside = times(self._inverse.inner2, 1 - 64 * torch.finfo(a.dtype).eps) - t
         t = torch.minimum(t, self._inverse.inner2)
         theta2 = t * self._inverse.radial(t) ** 2
-        # where theta ceases to ascend its rounding is that of many radii; further from there than `margin` is
+        # where theta stops ascending its rounding is that of many radii; so further away from there than in `margin`
         before = times(self._inverse.most2, 1 - 128 * torch.finfo(a.dtype).eps)
         return torch.minimum(inside, before.clamp(max=math.pi**2) - theta2)
 

@@ -1,7 +1,7 @@
-"""Charts: a ray to a point of a plane in closed form, and back.
+"""Charts: closed-form maps from a ray to a point of a plane, and back.
 
-A chart works on component planes, not on interleaved triples. It states which rays it covers and which
-points of its plane are the image of a ray; the camera hands it nothing else, so no chart guards its own formulas.
+A chart works on component planes, not on interleaved triples. It states which rays it covers and which points of its
+plane are the image of a ray; the camera passes it only those, so no chart guards its own formulas.
 """
 
 from __future__ import annotations
@@ -23,73 +23,73 @@ _SMALLEST_RADIUS = 1e-4  # a hundredth of a degree
 
 
 def unit(x: Tensor, y: Tensor, z: Tensor) -> Planes3:
-    """The direction scaled to length one."""
+    """Return the direction scaled to length one."""
     scale = (x * x + y * y + z * z).rsqrt()
     return x * scale, y * scale, z * scale
 
 
 def floor_of(dtype: torch.dtype) -> float:
-    """A square that is nothing beside 1, and whose reciprocal's square is still a number."""
+    """Return a square that adds nothing to 1, and whose reciprocal's square is still a number."""
     return math.sqrt(torch.finfo(dtype).tiny)
 
 
 class Chart:
-    """What a camera asks of a chart. Rays arrive with their largest component near 1, and results are unit length.
+    """A map between rays and a plane. Rays arrive with their largest component near 1, and results have unit length.
 
     The axis (0, 0, 1) is covered by every chart and lies at (0, 0).
 
-    Margins are positive where something holds.
+    Margins are positive if a condition holds.
     """
 
     code: ClassVar[int | None] = None
-    """That of native/geometry.h, stated by a class itself: a subclass is something else. None: only Python has it."""
+    """The code in native/geometry.h, which a class states for itself, not for subclasses. None: only Python has it."""
     has_scale = True
     """Whether the plane point is (x, y) times a `scale`."""
 
     parameters: tuple[Tensor, ...] = ()
-    """What the formulas learn: columns that broadcast against planes.
+    """The learnable parts of the formulas: columns that broadcast against planes.
 
-    The formulas read them here, and nothing else that depends on the coefficients.
+    The formulas read them here, and nothing else depends on the coefficients.
     """
 
     def margin(self, x: Tensor, y: Tensor, z: Tensor) -> Tensor:
-        """Positive for the rays that this chart has a point for."""
+        """Return a margin, positive for rays that have a point."""
         raise NotImplementedError
 
     def scale(self, x: Tensor, y: Tensor, z: Tensor, order: int = 2) -> Tensor | None:
-        """The factor by which (x, y) become the plane point, where that is all the chart does; see `to_plane`."""
+        """Return the factor by which (x, y) become the plane point, or None if the chart does more; see `to_plane`."""
         return None
 
     def to_plane(self, x: Tensor, y: Tensor, z: Tensor, order: int = 2) -> Planes2:
-        """The plane point of covered rays; the derivatives of that order shall be exact, on the axis too."""
+        """Return the plane point of covered rays; derivatives up to that order must be exact, on the axis too."""
         scale = self.scale(x, y, z, order)
-        assert scale is not None  # a chart that has none has a `to_plane` of its own
+        assert scale is not None  # a chart without one overrides `to_plane`
         return x * scale, y * scale
 
     def on_plane(self, a: Tensor, b: Tensor) -> Tensor:
-        """Positive for the points of the plane that are the image of a ray."""
+        """Return a margin, positive for points of the plane that are the image of a ray."""
         raise NotImplementedError
 
     def to_ray(self, a: Tensor, b: Tensor, order: int = 2) -> Planes3:
-        """The unit ray of points on the plane; see `to_plane`."""
+        """Return the unit ray of points on the plane; see `to_plane`."""
         raise NotImplementedError
 
     def seen(self, a: Tensor, b: Tensor) -> Tensor | None:
-        """Positive for points where a lens begins that are the image of a ray; None where all up to `end` are."""
+        """Return a margin, positive for a lens's points that are the image of a ray; None if all up to `end` are."""
         return None
 
     def end(self, dtype: torch.dtype) -> float | Tensor:
-        """The radius on the plane at which the chart ends, one or (C, 1). Only charts that a lens follows need it."""
+        """Return the radius on the plane at which the chart ends, one or (C, 1). Only charts before a lens need it."""
         raise NotImplementedError
 
     def usual_end(self, dtype: torch.dtype) -> float | Tensor:
-        """The radius beyond which no image reaches; inverses are tabulated up to there."""
+        """Return the radius beyond which no image reaches, up to which inverses are tabulated."""
         return self.end(dtype)
 
     def radii(self, count: int, like: Tensor) -> Tensor:
-        """(count,) ascending radii from the centre of the plane to the end of the chart.
+        """Return ascending radii (count,) from the centre of the plane to the end of the chart.
 
-        Half of them in even steps of the angle, half in even ratios: a telephoto lens may fold within a degree.
+        Half of them are in even steps of the angle, half in even ratios: a telephoto lens may fold within a degree.
         """
         raise NotImplementedError
 
@@ -97,7 +97,7 @@ class Chart:
 def even_steps_and_ratios(
     count: int, steps_to: float, end: float, like: Tensor, bend: Callable[[Tensor], Tensor]
 ) -> Tensor:
-    """(count,) radii for `Chart.radii`: bend makes radii of even steps up to `steps_to`; the ratios go on to `end`."""
+    """Return radii (count,) for `Chart.radii`: `bend` of even steps up to `steps_to`, and even ratios up to `end`."""
     dtype, device = like.dtype, like.device
     steps = torch.linspace(0, steps_to, count // 2, dtype=dtype, device=device)
     powers = torch.linspace(math.log(_SMALLEST_RADIUS), math.log(end), count - count // 2, dtype=dtype, device=device)
@@ -105,10 +105,10 @@ def even_steps_and_ratios(
 
 
 class Perspective(Chart):
-    """(x/z, y/z): rays in front of the camera.
+    """(x/z, y/z): covers rays in front of the camera.
 
-    Rays within `1 / end` of 90 degrees are left out: there the ninth power of the radius, which
-    distortion polynomials reach, leaves the floating-point range.
+    Rays within `1 / end` of 90 degrees are left out: there the ninth power of the radius, which distortion polynomials
+    reach, leaves the floating-point range.
     """
 
     code: ClassVar[int | None] = 0
@@ -137,7 +137,7 @@ class Perspective(Chart):
 
 
 class Equidistant(Chart):
-    """theta (cos phi, sin phi), theta = atan2(hypot(x, y), z): every ray but the exact backward one."""
+    """theta (cos phi, sin phi), theta = atan2(hypot(x, y), z): covers every ray but the exact backward one."""
 
     code: ClassVar[int | None] = 1
 
@@ -179,12 +179,12 @@ class EquidistantUpTo(Equidistant):
 
 
 def _half_turn(dtype: torch.dtype) -> float:
-    # pi rounded to float32 is larger than pi, and seen from the other side
+    # pi rounded to float32 is larger than pi, and so would be seen from the other side
     return math.pi * (1 - torch.finfo(dtype).eps)
 
 
 class CylinderChart(Chart):
-    """(longitude, height) = (atan2(x, z), y / hypot(x, z)). Every ray but straight up and down."""
+    """(longitude, height) = (atan2(x, z), y / hypot(x, z)): covers every ray but straight up and down."""
 
     code: ClassVar[int | None] = 7
 
@@ -204,7 +204,7 @@ class CylinderChart(Chart):
 
 
 class SphereChart(Chart):
-    """(longitude, latitude) = (atan2(x, z), atan2(y, hypot(x, z))). Every ray but straight up and down."""
+    """(longitude, latitude) = (atan2(x, z), atan2(y, hypot(x, z))): covers every ray but straight up and down."""
 
     code: ClassVar[int | None] = 8
 
@@ -225,7 +225,7 @@ class SphereChart(Chart):
 
 
 class Transverse(Chart):
-    """Another chart about the x axis instead of the y axis: x and y change places, as do a and b."""
+    """Another chart about the x axis instead of the y axis: x and y are exchanged, and so are a and b."""
 
     has_scale = False
 
@@ -248,13 +248,13 @@ class Transverse(Chart):
 
 
 def _sum(z: Tensor, root: Tensor, difference: Tensor) -> Tensor:
-    """The sum z + root where difference = root^2 - z^2, without the cancellation for z < 0."""
+    """Return the sum z + root for difference = root^2 - z^2, without the cancellation for z < 0."""
     ahead = z > 0
     return torch.where(ahead, z + root, difference / torch.where(ahead, 1.0, root - z))
 
 
 class Equisolid(Chart):
-    """2 sin(theta / 2) (cos phi, sin phi): every ray but the exact backward one."""
+    """2 sin(theta / 2) (cos phi, sin phi): covers every ray but the exact backward one."""
 
     code: ClassVar[int | None] = 2
 
@@ -283,9 +283,9 @@ class Equisolid(Chart):
 
 
 class Fov(Chart):
-    """r = atan2(2 tan(omega / 2) rho, z) / omega: every ray but the exact backward one; those in front for omega = 0.
+    """r = atan2(2 tan(omega / 2) rho, z) / omega: every ray but the exact backward one; those ahead if omega = 0.
 
-    Even and analytic in omega, which lies between -pi and pi.
+    It is even and analytic in omega, which lies between -pi and pi.
     """
 
     code: ClassVar[int | None] = 4
@@ -294,7 +294,7 @@ class Fov(Chart):
         self.parameters: tuple[Tensor, ...] = (omega,)
 
     def _slope(self) -> tuple[Tensor, Tensor]:
-        """2 tan(omega / 2) / omega and the square of 2 tan(omega / 2)."""
+        """Return 2 tan(omega / 2) / omega and the square of 2 tan(omega / 2)."""
         (omega,) = self.parameters
         slope = tanc_root(omega * omega / 4)
         return slope, (omega * slope) ** 2
@@ -332,7 +332,7 @@ class OneDivision(Chart):
         self.parameters: tuple[Tensor, ...] = (coefficient,)
 
     def _below(self, x: Tensor, y: Tensor, z: Tensor) -> tuple[Tensor, Tensor]:
-        """The plane point is 2 (x, y) over the first; the second is positive before the fold."""
+        """Return the number by which 2 (x, y) is divided, and one that is positive before the fold."""
         (coefficient,) = self.parameters
         difference = -4 * coefficient * torch.addcmul(x * x, y, y)
         square = torch.addcmul(difference, z, z)
@@ -347,7 +347,7 @@ class OneDivision(Chart):
 
     def on_plane(self, a: Tensor, b: Tensor) -> Tensor:
         (coefficient,) = self.parameters
-        # away from the fold, where the ray's own rounding would carry it across; what `margin` has is its square
+        # stay away from the fold, which the ray's own rounding would cross; `margin` has the square of this
         before = 1 - 16 * torch.finfo(a.dtype).eps ** 0.5 - coefficient * torch.addcmul(a * a, b, b)
         return torch.minimum(before, Perspective().end(a.dtype) / 2 - torch.maximum(a.abs(), b.abs()))
 

@@ -1,4 +1,4 @@
-"""Derivatives by autograd, for charts, stages and radial factors that state their formula only."""
+"""Derivatives by autograd, for charts, stages and radial factors that only state their formula."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from camtorch.evaluate.known import is_unknown
 
 
 def jacobian_of(part: Any, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """du/da, du/db, dv/da, dv/db of a map (a, b) -> (u, v), such as a stage, of each point by itself. Graph-free."""
+    """Return du/da, du/db, dv/da, dv/db of a map (a, b) -> (u, v), such as a stage, at each point. Graph-free."""
     if is_unknown(a):
         one, zero = torch.ones_like(a), torch.zeros_like(a)
         (ua, va), (ub, vb) = (torch.func.jvp(part, (a, b), along)[1] for along in ((one, zero), (zero, one)))
         return ua, ub, va, vb
-    # an operator's code may run where no transform works, so by reverse mode
+    # an operator's code may run where no transform works, so reverse mode is used
     with _recorded():
         leaves = _leaf(a), _leaf(b)
         u, v = _usable(part)(*leaves)
@@ -29,7 +29,7 @@ def jacobian_of(part: Any, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor, Tensor
 
 
 def derivatives_of(part: Any, t: Tensor, order: int) -> tuple[Tensor, ...]:
-    """The value and the first `order` derivatives of a factor, of each number by itself; those are graph-free."""
+    """Return the value and the first `order` derivatives of a factor at each number; the derivatives are graph-free."""
     if order == 0:
         return (part(t),)
     if is_unknown(t):
@@ -52,7 +52,7 @@ def derivatives_of(part: Any, t: Tensor, order: int) -> tuple[Tensor, ...]:
 
 @contextmanager
 def _recorded() -> Iterator[None]:
-    """A graph for this derivative alone, whatever is recorded around it, and however that keeps its tensors."""
+    """Record a graph for this derivative alone, whatever is recorded around it and however that keeps its tensors."""
     with ExitStack() as stack:
         stack.enter_context(torch.inference_mode(False))
         stack.enter_context(torch.enable_grad())
@@ -62,7 +62,7 @@ def _recorded() -> Iterator[None]:
 
 
 def _usable(part: Any) -> Any:
-    """The stage or factor, with parameters that a graph may keep: not those that inference mode made."""
+    """Return the stage or factor with parameters that a graph may keep, unlike those made in inference mode."""
     if not any(w.is_inference() for w in getattr(part, "parameters", ())):
         return part
     usable = copy.copy(part)

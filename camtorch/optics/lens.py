@@ -1,4 +1,4 @@
-"""Lenses: planar maps close to the identity, as a chain of stages, and what they and their derivatives are at points.
+"""Lenses: planar maps close to the identity, as chains of stages, with their values and derivatives at points.
 
 A stage is built from coefficient columns that broadcast against planes of points. `Planar` holds everything that is
 polynomial or rational in the plane; `Tilt` is the homography of a tilted sensor. `stage.at(points)` has the value, the
@@ -23,13 +23,13 @@ Planes2 = tuple[Tensor, Tensor]
 Planes3 = tuple[Tensor, Tensor, Tensor]
 Jacobian = tuple[Tensor, Tensor, Tensor, Tensor]  # du/da, du/db, dv/da, dv/db
 
-_DIRECTIONS = 64  # in which a stage is looked at that states no bounds
+_DIRECTIONS = 64  # in which stages without bounds of their own are sampled
 
 
 def newton_step(jacobian: Jacobian, du: Tensor, dv: Tensor) -> Planes3:
-    """The step (da, db) that a regular Jacobian sends to (du, dv), and 1 / its determinant.
+    """Return the step (da, db) that a regular Jacobian maps to (du, dv), and 1 / its determinant.
 
-    Where it is singular some finite step; the reciprocal is 0 there, and for what is out of the floating-point range.
+    If it is singular, the step is some finite one; the reciprocal is 0 then, and outside of the floating-point range.
     """
     ua, ub, va, vb = jacobian
     determinant = torch.addcmul(ua * vb, ub, va, value=-1)
@@ -50,31 +50,31 @@ class StageAt:
 
     @property
     def value(self) -> Planes2:
-        """Where the points are sent."""
+        """The images of the points."""
         return self.stage(self.a, self.b)
 
     @property
     def jacobian(self) -> Jacobian:
-        """Graph-free."""
-        # each camera's own derivatives, also by points that all share
+        """The derivatives du/da, du/db, dv/da, dv/db, graph-free."""
+        # each camera has its own derivatives, also at points that all share
         a, b, *_ = torch.broadcast_tensors(self.a, self.b, *self.stage.parameters)
         return jacobian_of(self.stage, a, b)
 
     @property
     def margin(self) -> Tensor | None:
-        """Positive where the map is defined; None where it is so everywhere."""
+        """A margin, positive where the map is defined; None if it is defined everywhere."""
         return None
 
     @property
     def edge(self) -> Tensor | None:
-        """Positive up to where the map ends, although its formula goes on behind; None where it does not."""
+        """A margin, positive up to where the map ends although its formula goes on; None if it does not end."""
         return None
 
     @property
     def orientation(self) -> Tensor:
-        """Positive where the map is defined, regular and not turned over; `edge` has no part in it."""
+        """A margin, positive where the map is defined, regular and not turned over, whatever `edge` is."""
         (ua, ub, va, vb), margin = self.jacobian, self.margin
-        # a turn by half a circle has a positive determinant too: the trace tells it from a regular map
+        # a turn by half a circle has a positive determinant, too, but a negative trace
         orientation = torch.minimum(torch.addcmul(ua * vb, ub, va, value=-1), ua + vb)
         return orientation if margin is None else torch.minimum(orientation, margin)
 
@@ -82,37 +82,37 @@ class StageAt:
 class Stage:
     """A planar map (a, b) -> (u, v) that is regular at the centre. A new one states its formula, `__call__`.
 
-    All else has defaults, by autograd or from samples, which a stage that is to be fast replaces by its own.
+    Everything else has defaults, by autograd or from samples, which a fast stage overrides.
     """
 
     parameters: tuple[Tensor, ...] = ()
-    """What the formula learns: columns that broadcast against planes.
+    """The learnable parts of the formula: columns that broadcast against planes.
 
-    The formula reads them here, and nothing else that depends on the coefficients.
+    The formula reads them here, and nothing else depends on the coefficients.
     """
     code: ClassVar[int | None] = None
-    """That of native/geometry.h, stated by a class itself: a subclass is something else. None: only Python has it."""
+    """The code in native/geometry.h, which a class states for itself, not for subclasses. None: only Python has it."""
     _at: ClassVar[type[StageAt]] = StageAt
     radial: RadialFactor | None = None
-    """What of a first stage is tabulated, to start the inverse from."""
+    """The factor of a first stage that is tabulated, to start the inverse from."""
     is_radial = False
-    """Whether that is the whole stage."""
+    """Whether the factor is the whole stage."""
     is_affine = False
-    """Whether lines stay lines, and parallels parallel: then its inverse is never left open."""
+    """Whether lines stay lines, and parallels parallel: then Newton's method always finds its inverse."""
 
     def __call__(self, a: Tensor, b: Tensor) -> Planes2:
-        """Where points are sent."""
+        """Return the images of points."""
         raise NotImplementedError
 
     def at(self, a: Tensor, b: Tensor, order: int = 1, t: Tensor | None = None) -> StageAt:
-        """The stage at points; order 0 leaves out what derivatives need, t = a^2 + b^2 if it is known."""
+        """Return the stage at points; order 0 leaves out parts for derivatives; t = a^2 + b^2 if it is known."""
         return self._at(self, a, b)
 
     def lower_bound(self, radius: Tensor) -> Planes2:
-        """Return bounds on circles of ascending radii (*C, S).
+        """Return bounds on circles of ascending radii (*C, S): of the orientation, and of the distance.
 
-        Positive where the orientation is certainly positive on the whole circle; and how far from the centre its points
-        go at the most. By default both are read off points of the circle, with what they may miss in between.
+        The first is positive if the orientation is certainly positive on the whole circle; the second is how far from
+        the centre its points go at most. By default both are read off points of the circle, with what they may miss.
         """
         turn = torch.arange(_DIRECTIONS, dtype=radius.dtype, device=radius.device) * (2 * math.pi / _DIRECTIONS)
         a, b = ((radius.unsqueeze(-1) * c).flatten(-2) for c in (torch.cos(turn), torch.sin(turn)))
@@ -124,7 +124,7 @@ class Stage:
         return least - missed / 2, furthest + (distance - distance.roll(1, -1)).abs().amax(-1) / 2
 
     def start(self, u: Tensor, v: Tensor) -> Planes2:
-        """A point near the one that is sent to (u, v), where to start the search for it."""
+        """Return a point near the one whose image is (u, v), to start the search for it."""
         a, b = u, v
         for _ in range(2):
             at = self.at(a, b)
@@ -159,12 +159,12 @@ class Planar(Stage):
         )
 
     def at(self, a: Tensor, b: Tensor, order: int = 1, t: Tensor | None = None) -> PlanarAt:
-        """The stage at points; see `PlanarAt`."""
+        """Return the stage at points; see `PlanarAt`."""
         return PlanarAt(self, a, b, order, t)
 
     def lower_bound(self, radius: Tensor) -> Planes2:
-        """A lower bound of the eigenvalues of the Jacobian's symmetric part at that radius, and an upper bound of how
-        far from the centre the points go. Where the first is positive, so are the determinant and the trace.
+        """Return a lower bound of the eigenvalues of the Jacobian's symmetric part at a radius, and an upper bound of
+        the points' distance from the centre. If the first is positive, so are the determinant and the trace.
         """
         t = radius * radius
         least, furthest = torch.ones_like(t), radius
@@ -180,7 +180,7 @@ class Planar(Stage):
         return least, furthest
 
     def start(self, u: Tensor, v: Tensor) -> Planes2:
-        """A point near the one that a stage without a radial factor sends to (u, v)."""
+        """Return a point near the one whose image by a stage without a radial factor is (u, v)."""
         x, y = self.at(u, v, order=0).value
         return 2 * u - x, 2 * v - y
 
@@ -195,7 +195,7 @@ class PlanarAt(StageAt):
     twice_dot: Tensor
 
     def __init__(self, stage: Planar, a: Tensor, b: Tensor, order: int, t: Tensor | None):
-        """order: 1 if any derivative will be asked for. t: |m|^2, if it is known."""
+        """Prepare what the properties share: derivatives if order is 1; t is |m|^2, if it is known."""
         self.stage, self.a, self.b = stage, a, b
         self.t = torch.addcmul(a * a, b, b) if t is None else t
         if stage.radial:
@@ -234,7 +234,7 @@ class PlanarAt(StageAt):
         if stage.tangential:
             px, py = stage.tangential
             px, py = 2 * px, 2 * py
-            # the gradient of (p . m) t: its Jacobian is symmetric
+            # this is the gradient of (p . m) t, so its Jacobian is symmetric
             ua = torch.addcmul(ua + self.twice_dot, a, 2 * px)
             vb = torch.addcmul(vb + self.twice_dot, b, 2 * py)
             ub = va = torch.addcmul(torch.addcmul(ub, b, px), a, py)
@@ -278,7 +278,7 @@ class HomographyAt(StageAt):
 
     @property
     def margin(self) -> Tensor:
-        # before the horizon
+        # positive before the horizon
         return self.depth
 
 
@@ -292,19 +292,19 @@ class Homography(Stage):
         self.parameters: tuple[Tensor, ...] = matrix
 
     def lower_bound(self, radius: Tensor) -> Planes2:
-        """See `Planar.lower_bound`; here the bound is one of the orientation itself."""
+        """Return the bounds of `Planar.lower_bound`, but the first one of the orientation itself."""
         h00, h01, h02, h10, h11, h12, h20, h21, h22 = self.parameters
         slope = torch.hypot(h20, h21)
         nearest = h22 - slope * radius
         size = torch.maximum(torch.hypot(h00, h10), torch.hypot(h01, h11)) * math.sqrt(2)
-        # past the horizon nothing is certain
+        # nothing is certain past the horizon
         seen = (size * radius + torch.hypot(h02, h12)) / torch.where(nearest > 0, nearest, torch.nan)
         minors = self._adjugate()
         turned = h20 * minors[2] + h21 * minors[5] + h22 * minors[8]
         return torch.minimum(torch.minimum(nearest, turned), h00 + h11 - slope * seen), seen
 
     def start(self, u: Tensor, v: Tensor) -> Planes2:
-        """The point that is sent to (u, v)."""
+        """Return the point whose image is (u, v)."""
         r00, r01, r02, r10, r11, r12, r20, r21, r22 = self._adjugate()
         reciprocal = 1 / (r20 * u + r21 * v + r22)
         return (r00 * u + r01 * v + r02) * reciprocal, (r10 * u + r11 * v + r12) * reciprocal
@@ -344,7 +344,7 @@ class ShearAt(StageAt):
 
 
 class Shear(Stage):
-    """(x + e y, d x + y): a sensor out of line with the lens."""
+    """(x + e y, d x + y): a sensor that is not aligned with the lens."""
 
     code: ClassVar[int | None] = 18
     _at = ShearAt
@@ -359,7 +359,7 @@ class Shear(Stage):
 
     def lower_bound(self, radius: Tensor) -> tuple[Tensor, Tensor]:
         d, e = self.parameters
-        # of the symmetric part the eigenvalues are 1 + (d + e) / 2 and 1 - (d + e) / 2
+        # the eigenvalues of the symmetric part are 1 + (d + e) / 2 and 1 - (d + e) / 2
         return (1 - (d + e).abs() / 2).expand_as(radius), radius * (1 + torch.maximum(d.abs(), e.abs()))
 
     def start(self, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
@@ -377,7 +377,7 @@ class Lens:
     def __init__(self, *stages: Stage):
         self.stages = stages
         self.is_radial = len(stages) == 1 and stages[0].is_radial
-        """Whether the lens is a single radial factor: then its inverse is a matter of one variable."""
+        """Whether the lens is a single radial factor, so that its inverse has one variable."""
         self.radial = stages[0].radial if stages else None
         """The radial factor of the first stage, if it has one."""
         self.rest = Lens(*stages[1:]) if self.radial and stages[0].is_radial and len(stages) > 1 else None
@@ -385,30 +385,30 @@ class Lens:
 
     @property
     def parameters(self) -> tuple[Tensor, ...]:
-        """Those of all stages."""
+        """The parameters of all stages."""
         return tuple(p for stage in self.stages for p in stage.parameters)
 
     def __call__(self, a: Tensor, b: Tensor) -> Planes2:
         return self.at(a, b, order=0).value
 
     def at(self, a: Tensor, b: Tensor, order: int = 1, t: Tensor | None = None) -> LensAt:
-        """The lens at points; order 0 leaves out what derivatives need, t = a^2 + b^2 if it is known."""
+        """Return the lens at points; order 0 leaves out parts for derivatives; t = a^2 + b^2 if it is known."""
         return LensAt(self.stages, a, b, order, t)
 
     def lower_bound(self, radius: Tensor) -> Planes2:
-        """(*B, S) ascending radii: positive where the orientation is positive on the whole circle, and how far its
-        points go at the most; see `Stage.lower_bound`.
+        """Return the bounds of `Stage.lower_bound` for ascending radii (*B, S): positive if the orientation is positive
+        on the whole circle, and how far from the centre its points go at most.
         """
         bounds = []
         for stage in self.stages:
             least, radius = stage.lower_bound(radius)
             bounds.append(least)
-            # the next stage sees what any smaller circle becomes as well
+            # the next stage also sees the images of all smaller circles
             radius = radius.cummax(-1).values
         return torch.stack(torch.broadcast_tensors(*bounds)).amin(0), radius
 
     def start(self, u: Tensor, v: Tensor) -> Planes2:
-        """Back from (u, v), nearly, to the stage that has a radial factor, or through all of them."""
+        """Return a point near the one whose image is (u, v), at the stage with a radial factor, or the first one."""
         for stage in reversed(self.stages if self.radial is None else self.stages[1:]):
             u, v = stage.start(u, v)
         return u, v
@@ -429,7 +429,7 @@ class LensAt:
 
     @property
     def jacobian(self) -> Jacobian:
-        """Of the whole chain."""
+        """The Jacobian of the whole chain."""
         chained = self.stages[0].jacobian
         for stage in self.stages[1:]:
             ua, ub, va, vb = stage.jacobian
@@ -439,21 +439,21 @@ class LensAt:
 
     @property
     def margin(self) -> Tensor | None:
-        """The smallest of the stages: positive where the lens is defined; None where it is so everywhere."""
+        """The least margin of the stages: positive where the lens is defined; None if it is defined everywhere."""
         return _least(stage.margin for stage in self.stages)
 
     @property
     def edge(self) -> Tensor | None:
-        """The smallest of the stages: positive up to where the lens ends; None where it does not."""
+        """The least edge of the stages: positive up to where the lens ends; None if it does not."""
         return _least(stage.edge for stage in self.stages)
 
     @property
     def orientation(self) -> Tensor:
-        """The smallest of the stages: positive where the lens is defined, regular and not turned over."""
+        """The least orientation of the stages: positive where the lens is defined, regular and not turned over."""
         return functools.reduce(torch.minimum, [stage.orientation for stage in self.stages])
 
 
 def _least(margins: Iterable[Tensor | None]) -> Tensor | None:
-    """Return the smallest of those that are there."""
+    """Return the least of the margins that are not None, or None."""
     known = [margin for margin in margins if margin is not None]
     return functools.reduce(torch.minimum, known) if known else None

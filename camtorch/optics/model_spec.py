@@ -1,4 +1,4 @@
-"""What a camera model states: its coefficients and their formula, and what edits and fits have to know of them."""
+"""The statements of a camera model: its coefficients and their formula, and facts for edits and fits."""
 
 from __future__ import annotations
 
@@ -12,34 +12,34 @@ from camtorch.optics.lens import Lens
 from camtorch.values.arguments import LEFT
 
 Optics = Callable[[Sequence[Tensor]], tuple[Chart, Lens]]
-"""From coefficients, each a tensor that broadcasts against planes of points, to the chart and the lens."""
+"""A function of coefficients, tensors that broadcast against planes of points, that returns the chart and the lens."""
 
 
 class ModelSpec:
-    """What the author of a model states in a subclass of `Camera`: a `key`, `distortion_names` and `optics`.
+    """The statements of a model's author in a subclass of `Camera`: a `key`, `distortion_names` and `optics`.
 
-    All else here has a default. `defined` and `ideal` are for formulas that do not exist for all coefficients,
+    Everything else has a default. `defined` and `ideal` are for formulas that do not exist for all coefficients,
     `odd_in_x` to `quarter_turn` for lenses that are not round, `special_cases` and `fit_...` for conversions and fits.
     """
 
     distortion_names: tuple[str, ...] = ()
-    """The coefficients, in the order in which `distortion` has them."""
+    """The names of the coefficients, in the order of `distortion`."""
     key: ClassVar[str] = ""
-    """Under which `ct.MODELS` and files know the model; without one of its own a class cannot be saved."""
+    """The name of the model in `ct.MODELS` and files; a class without a key of its own cannot be saved."""
     default_count: ClassVar[int] = 0
-    """How many coefficients, those of `ideal`, a camera has that is made without distortion."""
+    """The number of coefficients, those of `ideal`, of a camera that is made without distortion."""
     defined_text: ClassVar[str] = ""
-    """In words, what `defined` asks for."""
+    """The condition of `defined` in words, like "xi > -1"."""
     always_defined: ClassVar[bool] = False
-    """Whether the formula exists for all coefficients, as it does where a model states no `defined`."""
+    """Whether the formula exists for all coefficients, which is so if a model does not state `defined`."""
     odd_in_x: ClassVar[frozenset[str]] = frozenset()
     """The coefficients that change sign when the scene is mirrored left to right."""
     odd_in_y: ClassVar[frozenset[str]] = frozenset()
-    """Likewise top to bottom."""
+    """The coefficients that change sign when the scene is mirrored top to bottom."""
     mirror_x: ClassVar[Mapping[str, str]] = {}
-    """Where more than signs change then: the coefficients that others become, {"a": "-b"} is a = -b."""
+    """Coefficients that become others, if more than signs change: {"a": "-b"} means a = -b, mirrored left to right."""
     mirror_y: ClassVar[Mapping[str, str]] = {}
-    """Likewise top to bottom."""
+    """The same mirrored top to bottom."""
     quarter_turn: ClassVar[Mapping[str, str] | None] = {}
     """The coefficients that others become when the image is turned clockwise by a quarter: {"p2": "-p1"} is p2 = -p1.
 
@@ -51,47 +51,46 @@ class ModelSpec:
     A special case is this model, at the same intrinsics, with all other coefficients as in `Camera.ideal`.
     """
     fit_bounds: ClassVar[Mapping[str, tuple[float, float] | None]] = {}
-    """The least and the greatest value of coefficients that a fit tries, where there are such; None: as it starts."""
+    """The least and the greatest value of coefficients that a fit tries, if limited; None holds the first value."""
     fit_starts: ClassVar[tuple[Mapping[str, float], ...]] = ({},)
     """Alternatives to start a fit from: the values of some coefficients, while the others are as in `Camera.ideal`."""
     fit_counts: ClassVar[tuple[int, ...]] = ()
-    """Ascending numbers of coefficients of which a fit takes the least one that is good enough; none: the default
-    one. Where there are several, further coefficients that are zero change nothing."""
+    """Ascending numbers of coefficients, of which a fit takes the least one that is good enough; by default the default
+    one. If there are several, further coefficients that are zero change nothing."""
 
-    _model: ClassVar[str]  # under which operators find the class
+    _model: ClassVar[str]  # the name by which operators find the class
 
     @staticmethod
     def optics(k: Sequence[Tensor]) -> tuple[Chart, Lens]:
-        """The chart and the lens made of the coefficients, each a tensor that broadcasts against planes of points."""
+        """Return the chart and the lens for coefficients, tensors that broadcast against planes of points."""
         raise NotImplementedError
 
     @classmethod
     def names_of(cls, count: int) -> tuple[str, ...] | None:
-        """The names of that many coefficients, or None if the model does not take so many."""
+        """Return the names of that many coefficients, or None if the model does not take so many."""
         return tuple(cls.distortion_names) if count == len(cls.distortion_names) else None
 
     @classmethod
     def ideal(cls, count: int) -> tuple[float, ...]:
-        """That many coefficients of a camera that nothing is known of. They take the place of unusable ones too."""
+        """Return the coefficients of a camera that nothing is known of. They also replace unusable ones."""
         return (0.0,) * count
 
     @staticmethod
     def defined(k: Sequence[Tensor]) -> Tensor | None:
-        """Positive where the formula exists for the coefficients, tensors of one shape; None where it always does."""
+        """Return a margin, positive if the formula exists for coefficients of one shape; None if it always does."""
         return None
 
     @classmethod
     def variant(cls, text: str) -> type[Any]:
         """Return the class of the key `key:text`, such as another grid of `Splined`; a ValueError if there is none."""
-        raise ValueError(f"{cls.__name__}: there is no variant {text!r:.60}. {LEFT}")
+        raise ValueError(f"{cls.__name__}: key must be one of ct.MODELS; got the variant {text!r:.60}. {LEFT}")
 
     @classmethod
     def smoothness(cls) -> Tensor | None:
-        """(R, n) rows whose products with the coefficients are small in a smooth lens, float64.
+        """Return rows (R, n), float64, whose products with the coefficients are small in a smooth lens, or None.
 
-        A model that states them has a lens that is linear in its coefficients, and coefficients enough to take the
-        place of the intrinsics, which fits then hold, and of coefficients that are in no row.
-        None: the coefficients are few.
+        A model that states them has a lens that is linear in its coefficients, and enough coefficients to replace the
+        intrinsics, which fits then hold, and coefficients that are in no row.
         """
         return None
 
@@ -102,19 +101,19 @@ class ModelSpec:
 
     @classmethod
     def counts_text(cls) -> str:
-        """How many coefficients the model takes, in words."""
+        """Return in words how many coefficients the model takes."""
         return f"n = {len(cls.distortion_names)} ({' '.join(cls.distortion_names) or 'none'})"
 
     @classmethod
     def fit_start(cls, names: tuple[str, ...], angles: Tensor, radii: Tensor) -> Tensor:
-        """Coefficients to start a fit from, float64; by default those of `fit_starts`.
+        """Return coefficients to start a fit from, float64; by default those of `fit_starts`.
 
         Args:
-            names: of the n coefficients.
-            angles: (C, K) radians from the axis, evenly from above 0 to the last one that is to be fitted.
-            radii: (C, K) the distance from the principal point at which the camera to be fitted sees them, in units of
-                its focal length at the axis and averaged over the azimuths; ascending. Where it sees nothing the
-                line goes on straight.
+            names: The names of the n coefficients.
+            angles: (C, K) radians from the axis, evenly from above 0 to the last one to fit.
+            radii: (C, K) the distance from the principal point at which the camera to fit sees them, in units of its
+                focal length at the axis and averaged over the azimuths; ascending. Beyond the camera's view the line
+                goes on straight.
 
         Returns:
             (S, C, n): S alternatives, of which the one that ends best is kept.

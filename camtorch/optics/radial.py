@@ -1,4 +1,4 @@
-"""Radial factors of lenses: a point m goes to m R(|m|^2). Polynomials, ratios of them, and tables."""
+"""Radial factors of lenses, which map a point m to m R(|m|^2): polynomials, ratios of them, and tables."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ from camtorch.optics.special import angle_per_radius, first_root, root
 class RadialFactor:
     """A factor R(t) of t = radius^2, 1 or near it at the centre; radius R(t) is the distorted radius.
 
-    Made of its coefficients, columns that broadcast against planes.
+    It is made of its coefficients, columns that broadcast against planes.
     """
 
     code: ClassVar[int | None] = None
-    """That of native/geometry.h, stated by a class itself: a subclass is something else. None: only Python has it."""
+    """The code in native/geometry.h, which a class states for itself, not for subclasses. None: only Python has it."""
     name: str
-    """That of the class in the registry."""
+    """The name of the class in the registry."""
     parameters: tuple[Tensor, ...]
-    """What the formula learns."""
+    """The learnable parts of the formula."""
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
@@ -36,32 +36,32 @@ class RadialFactor:
         self.parameters: tuple[Tensor, ...] = tuple(coefficients)
 
     def __call__(self, t: Tensor) -> Tensor:
-        """The factor itself: all that a new one has to state."""
+        """Return the factor: all that a new one must state."""
         raise NotImplementedError
 
     def derivatives(self, t: Tensor, order: int) -> tuple[Tensor, ...]:
-        """R and its first `order` derivatives by t, up to two."""
-        # each camera's own derivatives, also by points that all share
+        """Return R and its first `order` derivatives by t, up to two."""
+        # each camera has its own derivatives, also at points that all share
         return derivatives_of(self, torch.broadcast_tensors(t, *self.parameters)[0], order)
 
     def margin(self, t: Tensor) -> Tensor | None:
-        """Positive where the factor is defined; None where it is so everywhere."""
+        """Return a margin, positive where the factor is defined; None if it is defined everywhere."""
         return None
 
     @property
     def fold(self) -> Tensor | None:
-        """The radius at which the orientation is lost, in the shape of a parameter; None if it is to be looked for."""
+        """The radius at which the orientation is lost, in the shape of a parameter; None if it must be searched for."""
         return None
 
     def closed_fold(self) -> Tensor | None:
-        """The same of coefficients in float64 whose values are known, infinite where it is not lost.
+        """Return the fold of coefficients in float64 whose values are known, infinite if there is none.
 
-        None where it has no closed form.
+        None if it has no closed form.
         """
         return None
 
     def orientation(self, radius: Tensor) -> Tensor:
-        """Positive where the factor is defined, not turned over, and the distorted radius ascends."""
+        """Return a margin, positive where the factor is defined, not turned over, and the distorted radius ascends."""
         t = radius * radius
         factor, slope = self.derivatives(t, 1)
         least = torch.minimum(factor, factor + 2 * t * slope)
@@ -78,8 +78,8 @@ class Polynomial(RadialFactor):
         return self.derivatives(t, 0)[0]
 
     def derivatives(self, t: Tensor, order: int) -> tuple[Tensor, ...]:
-        """R and its first `order` derivatives by t: Horner's scheme, extended to the Taylor coefficients at t."""
-        # a zero stays a number until it is none: no work for what the highest powers do not have
+        """Return R and its first `order` derivatives by t by Horner's scheme, extended to Taylor coefficients at t."""
+        # a zero stays a number as long as it can: the highest powers have no such terms, and cost nothing
         taylor: list[Any] = [self.parameters[-1]] + [0.0] * order
         lower: tuple[Any, ...] = (*reversed(self.parameters[:-1]), 1.0)
         for c in lower:
@@ -99,7 +99,7 @@ class Polynomial(RadialFactor):
         return tuple(taylor)
 
     def closed_fold(self) -> Tensor:
-        """The first root of d(radius R)/d(radius)."""
+        """Return the first root of d(radius R)/d(radius)."""
         return first_root(*((2 * i + 3) * c for i, c in enumerate(self.parameters))).sqrt()
 
 
@@ -119,7 +119,7 @@ class Rational(RadialFactor):
         return self.numerator(t) / self.denominator(t)
 
     def derivatives(self, t: Tensor, order: int) -> tuple[Tensor, ...]:
-        """R and its first `order` derivatives by t, from N = R D differentiated by Leibniz' rule."""
+        """Return R and its first `order` derivatives by t, from N = R D differentiated by Leibniz' rule."""
         n, d = self.numerator.derivatives(t, order), self.denominator.derivatives(t, order)
         reciprocal = d[0].reciprocal()
         ratio: list[Tensor] = []
@@ -129,11 +129,11 @@ class Rational(RadialFactor):
         return tuple(ratio)
 
     def margin(self, t: Tensor) -> Tensor:
-        """Positive before the pole."""
+        """Return a margin, positive before the pole."""
         return self.denominator(t)
 
     def closed_fold(self) -> Tensor:
-        """The first root of N D + 2 t (N' D - N D'), the numerator of d(radius R)/d(radius), or of D."""
+        """Return the first root of N D + 2 t (N' D - N D'), the numerator of d(radius R)/d(radius), or of D."""
         n: tuple[Any, ...] = (1.0, *self.numerator.parameters)
         d: tuple[Any, ...] = (1.0, *self.denominator.parameters)
         products: list[Any] = [0.0] * (len(n) + len(d) - 1)
@@ -147,7 +147,7 @@ class RadiusPolynomial(RadialFactor):
     """The radial factor R(t) = 1 + c0 s + c1 s^2 + ... of s = radius = sqrt(t).
 
     With odd powers of s the point m R(|m|^2) has one continuous derivative at the centre, and no second one: it depends
-    on the direction from which the centre is approached. The one given there is zero, their mean.
+    on the direction from which the centre is approached. The derivative returned there is their mean, zero.
     """
 
     code: ClassVar[int | None] = 3
@@ -162,7 +162,7 @@ class RadiusPolynomial(RadialFactor):
         return self.derivatives(t, 0)[0]
 
     def derivatives(self, t: Tensor, order: int) -> tuple[Tensor, ...]:
-        """R and its first `order` derivatives by t, up to two; at the centre finite, for what is multiplied by t."""
+        """Return R and its first `order` derivatives by t, up to two, finite at the centre, as t multiplies them."""
         radius = root(t)
         factor, *by_radius = self.of_radius.derivatives(radius, order)
         if not order:
@@ -173,7 +173,7 @@ class RadiusPolynomial(RadialFactor):
         return factor, slope, (by_radius[1] - 2 * slope) / (4 * radius * radius)
 
     def closed_fold(self) -> Tensor:
-        """The first root of d(radius R)/d(radius)."""
+        """Return the first root of d(radius R)/d(radius)."""
         return first_root(*((i + 2) * c for i, c in enumerate(self.parameters)))
 
 
@@ -190,7 +190,7 @@ class AnglePerRadius(RadialFactor):
         return angle_per_radius(t, self.ahead(t))
 
     def derivatives(self, t: Tensor, order: int) -> tuple[Tensor, ...]:
-        """The factor and its first `order` derivatives by t; at the centre finite, for what is multiplied by t."""
+        """Return the factor and its first `order` derivatives by t, finite at the centre, as t multiplies them."""
         ahead, *bends = self.ahead.derivatives(t, order)
         factor = angle_per_radius(t, ahead, 1)
         if not order:
@@ -204,14 +204,14 @@ class AnglePerRadius(RadialFactor):
         return factor, slope, (by_radius - 3 * slope) / twice
 
     def closed_fold(self) -> Tensor:
-        """The first root of D - 2 t D', to which d(theta)/d(radius) is in proportion."""
+        """Return the first root of D - 2 t D', to which d(theta)/d(radius) is proportional."""
         return first_root(*(-(2 * i + 1) * c for i, c in enumerate(self.parameters))).sqrt()
 
 
 class RadiusTable(RadialFactor):
     """The radial factor R(t) = r(s) / s of s = radius = sqrt(t), r a monotone cubic spline through (0, 0) and a table.
 
-    The spline has two continuous derivatives, but for nodes at which Hyman's filter keeps it monotone (Hyman, "Accurate
+    The spline has two continuous derivatives, except at nodes that Hyman's filter changes to ascend (Hyman, "Accurate
     monotonicity preserving cubic interpolation", SIAM J. Sci. Stat. Comput. 1983). Behind its last node r turns back,
     so that the lens folds there.
     """
@@ -223,7 +223,7 @@ class RadiusTable(RadialFactor):
     cubics: tuple[tuple[Tensor, ...], ...]
 
     def __init__(self, nodes: Sequence[Tensor], values: Sequence[Tensor]):
-        """nodes: ascending radii. values: r at the nodes, as many, two at least."""
+        """Fit the spline to at least two `nodes`, ascending radii, and the `values` of r there."""
         zero = torch.zeros_like(values[0])
         self.nodes, self.end = (zero, *nodes[:-1]), nodes[-1]
         radii, heights = (torch.stack(torch.broadcast_tensors(zero, *w), -1) for w in (nodes, values))
@@ -233,18 +233,18 @@ class RadiusTable(RadialFactor):
         slopes = _slopes(steps, secants)
         before, after = slopes[..., :-1], slopes[..., 1:]
         squares = (3 * secants - 2 * before - after) / steps
-        # of the first piece it is zero, unless the filter was at work; not rounding, which the axis divides by zero
+        # it is zero in the first piece unless the filter changed it: the axis would divide its rounding by zero
         first = (squares * steps).abs() < 64 * torch.finfo(steps.dtype).eps * secants.abs()
         squares = torch.where(first & (radii[..., :-1] == 0), 0.0, squares)
         cubes = (before + after - 2 * secants) / (steps * steps)
-        # by powers of the distance from the node: those of the radius itself would cancel, the more the finer the table
+        # as powers of the distance from the node: powers of the radius would cancel, the more the finer the table
         self.cubics = tuple(unbound(power) for power in (heights[..., :-1], before, squares, cubes))
         self.parameters: tuple[Tensor, ...] = tuple(c for power in self.cubics for c in power)
 
     @property
     def fold(self) -> Tensor:
-        """The first node that r does not ascend from, or the last one."""
-        # the filter sees to it that r ascends wherever the table does
+        """The first node from which r does not ascend, or the last one."""
+        # because of the filter r ascends wherever the table does
         nodes, secants = self._table
         return nodes.gather(-1, (secants > 0).long().cumprod(-1).sum(-1, keepdim=True)).squeeze(-1)
 
@@ -252,14 +252,14 @@ class RadiusTable(RadialFactor):
         return self.derivatives(t, 0)[0]
 
     def derivatives(self, t: Tensor, order: int) -> tuple[Tensor, ...]:
-        """R and its first `order` derivatives by t, up to two; at the centre finite, for what is multiplied by t."""
+        """Return R and its first `order` derivatives by t, up to two, finite at the centre, as t multiplies them."""
         radius = root(t)
         behind = radius > self.end
         place = torch.where(behind, (2 * self.end - radius).clamp(min=0), radius)
         piece = piece_of(self.nodes[1:], place)
         offset = place - pick(self.nodes, piece)  # from the piece's node
         zeroth, first, second, third = (pick(power, piece) for power in self.cubics)
-        # on the first piece neither division nor root has a part in the derivatives of the outer terms
+        # on the first piece the derivatives of the outer terms need neither the division nor the root
         central = (piece == 0) & ~behind
         share, square = torch.where(central, 1.0, offset / radius), torch.where(central, t, offset * offset)
         factor = zeroth / radius + share * (first + offset * second + square * third)
@@ -275,9 +275,9 @@ class RadiusTable(RadialFactor):
 
 
 def _slopes(steps: Tensor, secants: Tensor) -> Tensor:
-    """Return the slopes (*B, N + 1) at the nodes of a cubic spline of pieces (*B, N), made to ascend where it does.
+    """Return the slopes (*B, N + 1) at the nodes of a cubic spline of pieces (*B, N), which ascends if the table does.
 
-    At the origin its second derivative is zero, and the last two pieces are one polynomial. Then Hyman's filter.
+    At the origin its second derivative is zero, and the last two pieces are one polynomial. Hyman's filter comes last.
     """
     before, after = steps[..., :-1], steps[..., 1:]
     both = before[..., -1:] + after[..., -1:]
@@ -289,10 +289,10 @@ def _slopes(steps: Tensor, secants: Tensor) -> Tensor:
     middle = 3 * (after * secants[..., :-1] + before * secants[..., 1:])
     right = torch.cat((3 * secants[..., :1], middle, end), -1)
     slopes = solve_tridiagonal(below, main, above, right)
-    # between pieces of different orientation there is no slope
+    # pieces of different orientation meet without a slope
     turns = torch.cat((zero > 1, secants[..., :-1] * secants[..., 1:] <= 0, zero > 1), -1)
     neighbours = torch.stack((torch.cat((secants[..., :1], secants), -1), torch.cat((secants, secants[..., -1:]), -1)))
     orientation, least = neighbours[0].sign(), neighbours.abs().amin(0)
-    # from 0 to 3 a piece is monotone; a little less, and it is flat nowhere
+    # a piece is monotone from 0 to 3; with a little less it is flat nowhere
     ascending = torch.minimum(torch.maximum(slopes * orientation, 0.25 * least), 2.5 * least) * orientation
     return torch.where(turns, 0.0, ascending)

@@ -1,4 +1,4 @@
-"""The inverse of a radial factor: where it folds, a table to start from, Newton's method, and a bracket at last."""
+"""The inverse of a radial factor: its fold, a table to start from, Newton's method, and at last a bracket."""
 
 from __future__ import annotations
 
@@ -20,35 +20,35 @@ if TYPE_CHECKING:
     from camtorch.optics.radial import RadialFactor
 
 RADII = 1024
-"""At how many radii a factor is followed to its fold."""
-_PARTS = 256  # of the interval in which a fold is looked for; twice, then the secant
+"""The number of radii at which a factor is followed to its fold."""
+_PARTS = 256  # of the interval with a fold, divided twice before the secant
 _NODES = 1024  # of the table of an inverse
 TABLE_WIDTH = 2 + 2 * _NODES
 """The number of columns of `tabulate`."""
 _LIMITING = 16  # roots of a radius, to one whose image is a number
 _HALF_WAY = 2.0  # the squared radius in the middle of the table of a lens that never folds
 MOST_STEPS = 5
-"""Of Newton's method; what then still moves is left to slower methods."""
+"""The most steps of Newton's method; slower methods finish what still moves."""
 
 
 def precise(k: Tensor) -> Tensor:
-    """In double precision, where there is one."""
+    """Return the tensor in double precision, if the device has it."""
     return k if k.device.type == "mps" else k.double()
 
 
 def short(dtype: torch.dtype) -> float:
-    """The relative length of a step of Newton's method after which the next one would be nothing."""
-    # that one is about its square
+    """Return the relative length of a step of Newton's method after which the next one is negligible."""
+    # the next step is about the square of this one
     return math.sqrt(torch.finfo(dtype).eps) / 8
 
 
 def within(fold: Tensor) -> Tensor:
-    """The squared radius up to which a lens that folds there is certainly regular."""
+    """Return the squared radius up to which a lens with this fold is certainly regular."""
     return times(fold, 1 - 4 * torch.finfo(fold.dtype).eps) ** 2
 
 
 def first_loss(orientation: Tensor, spared: Tensor | None = None) -> Tensor:
-    """Return the node (*B, A) of (*B, A, S) where it is first lost, or dips off what is `spared`; S for never."""
+    """Return the node (*B, A) at which (*B, A, S) is first lost, or dips outside of `spared`; S if never."""
     before, here, after = orientation[..., :-2], orientation[..., 1:-1], orientation[..., 2:]
     bend, tilt = before - 2 * here + after, before - after
     bend_safe = torch.where(bend > 0, bend, 1.0)
@@ -64,11 +64,11 @@ def first_loss(orientation: Tensor, spared: Tensor | None = None) -> Tensor:
 def fold_of(radial: RadialFactor, sampled: Callable[[], Tensor], end: float | Tensor, most: float) -> Tensor:
     """Return the least radius (C, 1) at which a factor is irregular or its image above `most`, or the end.
 
-    sampled: makes the radii (RADII,), ascending, at which it is followed outwards where it has no closed form.
+    `sampled` returns ascending radii (RADII,), at which it is followed outwards if it has no closed form.
     """
     if radial.fold is not None:
         return radial.fold.clamp(max=end)
-    # of numbers that are not known it is looked for
+    # it is searched for if the numbers are not known
     k = radial.parameters[0]
     known = k.dtype == torch.float64 and not k.is_meta
     if known and (fold := radial.closed_fold()) is not None:
@@ -109,7 +109,7 @@ def fold_of(radial: RadialFactor, sampled: Callable[[], Tensor], end: float | Te
     steps = torch.linspace(0, 1, _PARTS + 1, dtype=radii.dtype, device=radii.device)
     for _ in range(2):
         inner = low + (high - low) * steps
-        # the upper end counts as lost, whatever rounding says of it
+        # the upper end counts as lost, whatever its rounding is
         first = (orientation(inner) > 0).long().cumprod(-1).sum(-1, keepdim=True).clamp(1, _PARTS)
         low, high = inner.gather(-1, first - 1), inner.gather(-1, first)
     before, after = orientation(low), orientation(high)
@@ -119,14 +119,14 @@ def fold_of(radial: RadialFactor, sampled: Callable[[], Tensor], end: float | Te
 
 
 def tabulate(radial: RadialFactor, fold: Tensor, usual_end: float | Tensor) -> Tensor:
-    """(C, 2 + 2 nodes): what an `InverseTable` is made of."""
+    """Return the table (C, 2 + 2 nodes) of an `InverseTable`."""
     end = fold.clamp(max=usual_end)
     u = torch.linspace(0, 1, _NODES + 1, dtype=fold.dtype, device=fold.device)
     square = _square(u, end * end)
     factor = radial(square)
     r2 = (square * factor * factor).cummax(-1).values
     reach2 = r2[..., -1:]
-    # where the nodes' images lie, and what lies at nodes that are even there
+    # the places of the nodes' images, and the values at nodes that are even there
     at = _variable(r2, reach2)
     cell = (torch.searchsorted(at, u.expand_as(at).contiguous(), right=True) - 1).clamp(0, _NODES - 1)
     low, high = at.gather(-1, cell), at.gather(-1, cell + 1)
@@ -158,8 +158,8 @@ def _variable(r2: Tensor, top2: Tensor) -> Tensor:
 class InverseTable:
     """The factor by which the inverse of a radial factor scales a point, tabulated over the point's squared radius r2.
 
-    The table's variable is 1 - sqrt(1 - x), x = r2 / (r2 + 2) scaled to 1 at the fold: it takes the root singularity
-    at the fold out of the inverse, and is as analytic in r2 as that.
+    The table's variable is 1 - sqrt(1 - x), x = r2 / (r2 + 2) scaled to 1 at the fold: it removes the root singularity
+    at the fold from the inverse, and is as analytic in r2 as that.
     """
 
     reach2: Tensor
@@ -168,13 +168,13 @@ class InverseTable:
     steps: Tensor
 
     def __init__(self, table: Tensor, *, is_constant: bool = False):
-        """table: as of `tabulate`. is_constant: whether its parts are to be no views."""
+        """Split a `table` of `tabulate` into its parts, which are no views if `is_constant`."""
         self.is_constant = is_constant
         parts = table[..., :1], table[..., 1:2], table[..., 2 : 2 + _NODES], table[..., 2 + _NODES :]
         self.reach2, self.most2, self.values, self.steps = (p.clone() for p in parts) if is_constant else parts
 
     def __call__(self, r2: Tensor) -> Tensor:
-        """The factor for (C, N), to about 1e-6."""
+        """Return the factor for (C, N), accurate to about 1e-6."""
         position = _variable(r2, self.reach2) * _NODES
         node = as_index(position).clamp(0, _NODES - 1)
         fraction = position - node
@@ -186,13 +186,13 @@ class InverseTable:
 
 
 def solve(radial: RadialFactor, table: InverseTable, r2: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the factor by which the inverse scales points of squared radius r2, and what is positive if that is it."""
+    """Return the factor by which the inverse scales points of squared radius r2, and a number > 0 if it converged."""
     scale, converged = table(r2), None
-    for _ in range(MOST_STEPS):  # of Newton's method for s R(r2 s^2) = 1, which does not know of an axis
+    for _ in range(MOST_STEPS):  # of Newton's method for s R(r2 s^2) = 1, in which the axis is not special
         t = r2 * scale * scale
         factor, slope = radial.derivatives(t, 1)
         step = (1 - scale * factor) / torch.addcmul(factor, t, slope, value=2)
-        if converged is not None:  # what is converged stays, whatever else is in its batch
+        if converged is not None:  # a converged point does not depend on its batch
             step = torch.where(converged > 0, 0.0, step)
         scale = scale + step
         converged = short(scale.dtype) * scale - step.abs()
@@ -201,9 +201,9 @@ def solve(radial: RadialFactor, table: InverseTable, r2: Tensor) -> tuple[Tensor
 
 
 def bracketed(radial: RadialFactor, r2: Tensor, inner2: Tensor) -> Tensor:
-    """Return the factor of `solve` of single points (M,), each with its own coefficients and its own fold.
+    """Return the factor of `solve` for single points (M,), each with its own coefficients and its own fold.
 
-    By Cauchy's method, to the root of the local parabola: of third order at the fold too, where Newton's method crawls.
+    Cauchy's method steps to the root of the local parabola: of third order at the fold too, where Newton's crawls.
     """
     eps = torch.finfo(r2.dtype).eps
     wanted, high = r2.sqrt(), inner2.sqrt().expand_as(r2)
@@ -234,7 +234,7 @@ def bracketed(radial: RadialFactor, r2: Tensor, inner2: Tensor) -> Tensor:
 
 
 class RadialInverse:
-    """The inverse of a factor, graph-free. inner2: the squared radius of its fold; most2: of the fold's image."""
+    """The inverse of a factor, graph-free. inner2: the squared radius of its fold; most2: that of the fold's image."""
 
     factor: type[RadialFactor]
     radial: RadialFactor
@@ -245,7 +245,7 @@ class RadialInverse:
     most2: Tensor
 
     def __init__(self, factor: type[RadialFactor], parameters: Sequence[Tensor], end: float):
-        """Tabulate a class of factors, of coefficients (C, 1) of cameras or (M,) of single points, up to a radius."""
+        """Tabulate a class of factors, for coefficients (C, 1) of cameras or (M,) of single points, up to a radius."""
         parameters = [w.detach() for w in parameters]
         self.factor, self.radial, self.end = factor, factor(parameters), end
         self.of_points = parameters[0].ndim < 2
@@ -264,7 +264,7 @@ class RadialInverse:
         self.inner2, self.most2 = (w.reshape(parameters[0].shape).clone() for w in of_each)
 
     def __call__(self, r2: Tensor) -> Tensor:
-        """The factor by which it scales points of squared radius r2, (C, ...) or (M,), up to `most2`."""
+        """Return the factor by which it scales points of squared radius r2, (C, ...) or (M,), up to `most2`."""
         if self.of_points:
             return bracketed(self.radial, r2, self.inner2)
         rows = r2.unsqueeze(-1).flatten(1)
@@ -287,7 +287,7 @@ def _made_tables(name: str, k: Tensor, end: float) -> tuple[Tensor, Tensor]:
 
 
 def _scale(name: str, k: Tensor, inner2: Tensor, table: InverseTable, r2: Tensor) -> Tensor:
-    """`solve` of coefficients (C, n) and squared radii (C, N), `bracketed` where Newton's method leaves it open."""
+    """Return `solve` for coefficients (C, n) and squared radii (C, N), and `bracketed` if Newton's method fails."""
     scale, converged = solve(CLASSES[name](columns(k)), table, r2)
     camera, point = (~(converged > 0)).nonzero(as_tuple=True)
     if table.is_constant or len(camera):
@@ -298,11 +298,11 @@ def _scale(name: str, k: Tensor, inner2: Tensor, table: InverseTable, r2: Tensor
 
 
 def _found_inverse(name: str, k: Tensor, end: float, r2: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """The factors of coefficients (C, n) and squared radii (C, N), and `RadialInverse.inner2` and `most2`."""
+    """Return the factors for coefficients (C, n) and squared radii (C, N), and `RadialInverse.inner2` and `most2`."""
     inner2, table = _tables((k,), (name, end), lambda: _made_tables(name, k.detach(), end))
     inverse = InverseTable(table)
     scale = _scale(name, k, inner2, inverse, r2) if r2.numel() else torch.empty_like(r2)
-    # clones: who gets them may write into them
+    # clones, as the caller may write into them
     return scale, inner2.clone(), inverse.most2.clone()
 
 
@@ -310,7 +310,7 @@ _radial_inverse = torch.library.custom_op("camtorch::radial_inverse", _found_inv
 
 
 def _inverse_of(name: str, k: Tensor, end: float, r2: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    # by the operator in graphs and transforms alone: its first call imports torch's compiler, which takes seconds
+    # the operator serves graphs and transforms alone: its first call imports torch's compiler, which takes seconds
     of = _found_inverse if are_known(k, r2) else _radial_inverse
     return of(name, k, end, r2)
 
@@ -324,7 +324,7 @@ def _(name: str, k: Tensor, end: float, r2: Tensor) -> tuple[Tensor, Tensor, Ten
 def _(info: Any, in_dims: tuple[Any, ...], name: str, k: Tensor, end: float, r2: Tensor) -> Any:
     _, of_k, _, of_r2 = in_dims
     r2 = r2.expand(info.batch_size, *r2.shape) if of_r2 is None else r2.movedim(of_r2, 0)
-    if of_k is None:  # what is mapped joins the points
+    if of_k is None:  # the mapped dim joins the points
         r2 = r2.movedim(0, 1)
         found, inner2, most2 = _radial_inverse(name, k, end, r2.flatten(1))
         return (found.unflatten(1, r2.shape[1:]), inner2, most2), (1, None, None)

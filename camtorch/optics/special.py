@@ -1,10 +1,10 @@
 """Functions that are smooth where their textbook formulas divide zero by zero.
 
-Each takes the squared angle (or squared radius): in that variable the functions are analytic, so that
-values and derivatives of every order are exact on the axis and at any distance from it.
+Each takes the squared angle (or squared radius): in that variable the functions are analytic, so that values and
+derivatives of every order are exact on the axis and at any distance from it.
 
-The closed forms themselves are exact there to first order, in this sense: what cancels in their derivative by t is
-multiplied by t in the derivative by a point. With order 1 they are used as they are, at a third of the cost.
+The closed forms themselves are exact there to first order in this sense: the part of their derivative by t that
+cancels is multiplied by t in the derivative by a point. Order 1 uses them directly, at a third of the cost.
 """
 
 import math
@@ -16,8 +16,8 @@ from torch import Tensor
 
 from camtorch.evaluate.export import atan2, plus
 
-# Below these the power series is used. Its first dropped term is below 1e-21 and the closed form above
-# them still has a first derivative good to 1e-13 of the function's own scale.
+# Below these the power series is used. Its first dropped term is below 1e-21, and above them the closed form still has
+# a first derivative accurate to 1e-13 of the function's own scale.
 _SMALL_ANGLE2 = 1e-2
 _SMALL_SLOPE2 = 1e-3
 
@@ -37,8 +37,8 @@ def _blend(t: Tensor, series: list[float], closed_form: Callable[[Tensor], Tenso
 
 
 def root(square: Tensor) -> Tensor:
-    """The square root, with a finite derivative at zero."""
-    # nothing beside 1, and 1 / root^4 is still a number
+    """Return the square root, with a finite derivative at zero."""
+    # this adds nothing to 1, and 1 / root^4 is still a number
     return plus(square, torch.finfo(square.dtype).tiny ** 0.5).sqrt()
 
 
@@ -50,12 +50,12 @@ _ATAN = [(-1) ** n / (2 * n + 1) for n in range(8)]
 
 
 def cos_root(t: Tensor, order: int = 2) -> Tensor:
-    """cos(theta) of t = theta^2."""
+    """Return cos(theta) for t = theta^2."""
     return _blend(t, _COS, torch.cos) if order > 1 else torch.cos(root(t))
 
 
 def sinc_root(t: Tensor, order: int = 2) -> Tensor:
-    """sin(theta) / theta of t = theta^2."""
+    """Return sin(theta) / theta for t = theta^2."""
     if order > 1:
         return _blend(t, _SINC, lambda angle: torch.sin(angle) / angle)
     angle = root(t)
@@ -63,7 +63,7 @@ def sinc_root(t: Tensor, order: int = 2) -> Tensor:
 
 
 def cosc_root(t: Tensor) -> Tensor:
-    """(1 - cos(theta)) / theta^2 of t = theta^2."""
+    """Return (1 - cos(theta)) / theta^2 for t = theta^2."""
 
     def half_angle(angle: Tensor) -> Tensor:  # 1 - cos cancels, sin^2 of the half does not
         ratio = torch.sin(angle / 2) / angle
@@ -73,9 +73,9 @@ def cosc_root(t: Tensor) -> Tensor:
 
 
 def angle_per_radius(rho2: Tensor, z: Tensor, order: int = 2) -> Tensor:
-    """The ratio theta / rho with theta = atan2(rho, z) in [0, pi] and rho2 = rho^2; 1 / z on the axis.
+    """Return the ratio theta / rho with theta = atan2(rho, z) in [0, pi] and rho2 = rho^2; 1 / z on the axis.
 
-    Needs rho2 > 0 where z <= 0: the exact backward direction has every azimuth at once.
+    rho2 must be > 0 if z <= 0: the exact backward direction has every azimuth at once.
     """
     if order <= 1:
         rho = root(rho2)
@@ -88,17 +88,17 @@ def angle_per_radius(rho2: Tensor, z: Tensor, order: int = 2) -> Tensor:
 
 
 def tanc_root(t: Tensor) -> Tensor:
-    """tan(angle) / angle of t = angle^2."""
+    """Return tan(angle) / angle for t = angle^2."""
     return _blend(t, _TANC, lambda angle: torch.tan(angle) / angle)
 
 
 def first_root(*coefficients: Tensor) -> Tensor:
-    """The smallest t > 0 at which 1 + c0 t + c1 t^2 + ... turns negative; infinite where it does not, 0 for no numbers.
+    """Return the smallest t > 0 at which 1 + c0 t + c1 t^2 + ... turns negative; infinite if none, 0 for no numbers.
 
-    coefficients: float64, with values, of which no graph is kept. The roots of the reversed polynomial are the
-    eigenvalues of its companion matrix, which asks for no division by a highest coefficient that may be zero. They part
-    the axis into intervals of one sign each; at the root before the first negative one Newton's method finds the last
-    bits. By NumPy: for so few numbers its functions take a fraction of the time of torch's.
+    The coefficients are float64 with values, of which no graph is kept. The roots of the reversed polynomial are the
+    eigenvalues of its companion matrix, without dividing by a highest coefficient that may be zero. They divide the
+    axis into intervals of one sign each; at the root before the first negative one Newton's method finds the last
+    bits. NumPy's functions take a fraction of the time of torch's for so few numbers.
     """
     first = coefficients[0]
     c = np.stack(np.broadcast_arrays(*(w.detach().cpu().numpy() for w in coefficients)), -1)
@@ -109,9 +109,9 @@ def first_root(*coefficients: Tensor) -> Tensor:
     companion[..., range(1, degree), range(degree - 1)] = 1
     companion[..., 0, :] = -c
     powers, terms = np.arange(degree + 1), np.concatenate((np.ones_like(c[..., :1]), c), -1)
-    with np.errstate(all="ignore"):  # what is infinite or no number stands for no root
+    with np.errstate(all="ignore"):  # infinity and NaN mean no root
         roots = 1 / np.linalg.eigvals(companion)
-        # of a pair that is not real an end of an interval does no harm
+        # an end of an interval from a pair that is not real does no harm
         roots = np.sort(np.where(roots.real > 0, roots.real, np.inf), -1)
         ends = np.concatenate(((roots[..., :-1] + roots[..., 1:]) / 2, 2 * roots[..., -1:]), -1)
         ends = np.where(np.isfinite(ends), ends, 2 * roots)

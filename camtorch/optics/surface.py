@@ -14,7 +14,7 @@ from torch import Tensor
 
 from camtorch.optics.lens import Jacobian, Planes2, Stage, StageAt
 
-BEHIND = 1e-4  # cells past its edge that belong to a surface, so that what lies on the edge is on it in any rounding
+BEHIND = 1e-4  # cells past its edge that belong to a surface, so that points on its edge are on it in any rounding
 
 
 class SurfaceAt(StageAt):
@@ -24,11 +24,11 @@ class SurfaceAt(StageAt):
 
     def __init__(self, stage: Surface, a: Tensor, b: Tensor):
         super().__init__(stage, a, b)
-        # at once: torch.compile does not enter the lock that cached_property has before Python 3.12
+        # computed at once: torch.compile cannot enter the lock that cached_property has before Python 3.12
         self._patch = self._at_points()
 
     def _place(self, axis: int) -> tuple[Tensor, Tensor, Tensor]:
-        """The first of the control points that have a part in it, weights (..., order + 1), and their slopes."""
+        """Return the first of the control points that contribute, weights (..., order + 1), and their slopes."""
         stage, w = self.stage, (self.a, self.b)[axis]
         size = (stage.columns, stage.rows)[axis]
         position = (w - stage.centre[axis]) * stage.cells[axis] + (size - 1) / 2
@@ -44,12 +44,12 @@ class SurfaceAt(StageAt):
         return cell.long() - 1, torch.stack(few, -1) / 8, torch.stack((x - 0.5, -2 * x, x + 0.5), -1)
 
     def _at_points(self) -> tuple[Tensor, ...]:
-        """Control points (..., order + 1, order + 1, 2), rows first, and weights and slopes along a and b."""
+        """Return control points (..., order + 1, order + 1, 2), rows first, and weights and slopes along a and b."""
         stage = self.stage
         controls = stage.parameters
         points = torch.stack(controls, -1).unflatten(-1, (len(controls) // 2, 2)).flatten(0, -2)
         (i, wa, da), (j, wb, db) = self._place(0), self._place(1)
-        # of each camera, or point, its own
+        # each camera, or point, has its own
         first = (torch.ones_like(controls[0], dtype=torch.int64).flatten().cumsum(0) - 1).view(controls[0].shape)
         index = first * (stage.columns * stage.rows) + j * stage.columns + i
         steps = torch.arange(stage.order + 1, device=index.device)
@@ -76,7 +76,7 @@ class SurfaceAt(StageAt):
 
     @property
     def edge(self) -> Tensor:
-        """In cells."""
+        """The distance from the edge in cells."""
         stage = self.stage
         (sa, sb), (ca, cb) = stage.cells, stage.centre
         across = (stage.columns - stage.order) / 2 + stage.behind - ((self.a - ca) * sa).abs()
@@ -86,20 +86,20 @@ class SurfaceAt(StageAt):
 class Surface(Stage):
     """(a, b) -> (a, b) + du(a, b), du a uniform B-spline surface of order 2 (quadratic) or 3 (cubic).
 
-    Control point (i, j) of the grid, i < columns, j < rows, stands at (a, b) = ((i - (columns - 1) / 2) / sa + ca,
-    (j - (rows - 1) / 2) / sb + cb). The surface ends where one more control point would have a part in it: 1 control
-    point (order 3) or 1/2 (order 2) from the outermost ones. Behind that edge, where nothing is valid, the outermost
+    Control point (i, j) of the grid, i < columns, j < rows, lies at (a, b) = ((i - (columns - 1) / 2) / sa + ca,
+    (j - (rows - 1) / 2) / sb + cb). The surface ends where one more control point would contribute: 1 control point
+    (order 3) or 1/2 (order 2) from the outermost ones. Behind that edge, where nothing is valid, the outermost
     pieces go on. Source: mrcal.c, `sample_bspline_surface_cubic` and `..._quadratic`.
 
     Args:
         controls: 2 columns rows coefficients, columns that broadcast against planes: du_a and du_b of point (0, 0), of
             (1, 0), ...: those of (i, j) at 2 (j columns + i).
-        columns: control points along a, more than the order.
-        rows: along b.
+        columns: Control points along a, more than the order.
+        rows: Control points along b.
         order: 2 or 3.
-        cells: (sa, sb), how many lie on a unit of a and of b, positive.
-        centre: (ca, cb), the middle of the grid. The origin of the plane has to be on the surface.
-        behind: cells past its edge that belong to it.
+        cells: (sa, sb), the number of cells in a unit of a and of b, positive.
+        centre: (ca, cb), the middle of the grid. The origin of the plane must be on the surface.
+        behind: Cells past its edge that belong to it.
     """
 
     code: ClassVar[int | None] = 19
@@ -131,14 +131,14 @@ class Surface(Stage):
         return self.at(a, b).value
 
     def lower_bound(self, radius: Tensor) -> Planes2:
-        """See `Stage.lower_bound`: slopes of a spline lie between those of the lines from control point to control
-        point, and it between these, of those that have a part in it within the circle.
+        """Return the bounds of `Stage.lower_bound`: slopes of a spline lie between those of lines from control point to
+        control point, and the spline between these lines, for those that contribute within the circle.
         """
         grid = torch.stack(self.parameters, -1).unflatten(-1, (self.rows, self.columns, 2))
         sizes = self.columns, self.rows
 
         def nearest(more_a: int, more_b: int) -> Tensor:
-            """(P,): how far from the origin it begins what differences along a or b have a part in."""
+            """Return the distances (P,) from the origin at which differences along a or b begin to contribute."""
             reach = (self.order + 1) / 2
             sides = []
             for size, more, s, c in zip(sizes, (more_a, more_b), self.cells, self.centre, strict=True):
@@ -147,7 +147,7 @@ class Surface(Stage):
             return torch.hypot(sides[0].unsqueeze(-2), sides[1].unsqueeze(-1)).flatten(-2)
 
         def most(values: Tensor, begin: Tensor) -> Tensor:
-            """(*C, S): the largest of (*C, 1, P) that begin before each radius; 0 if all are less."""
+            """Return (*C, S), the largest of (*C, 1, P) that begin before each radius; 0 if all are less."""
             values = torch.where(begin <= radius.unsqueeze(-1), values.flatten(-2), 0.0)
             return values.amax(-1)
 
@@ -161,11 +161,11 @@ class Surface(Stage):
         return torch.where(inside > 0, 1 - steepest - across, inside.clamp(max=-1e-3)), far
 
     def start(self, u: Tensor, v: Tensor) -> Planes2:
-        """A point near the one that is sent to (u, v)."""
+        """Return a point near the one whose image is (u, v)."""
         (sa, sb), (ca, cb) = self.cells, self.centre
         half_a, half_b = (self.columns - self.order) / 2 / sa, (self.rows - self.order) / 2 / sb
         a, b = u, v
-        for _ in range(3):  # on the surface, behind which it may be anywhere
+        for _ in range(3):  # stay on the surface, behind which it may be anywhere
             a, b = a.clamp(ca - half_a, ca + half_a), b.clamp(cb - half_b, cb + half_b)
             x, y = self.at(a, b).value
             a, b = a + u - x, b + v - y

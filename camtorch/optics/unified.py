@@ -14,11 +14,11 @@ from camtorch.optics.charts import Chart, Perspective, Planes3, even_steps_and_r
 class Unified(Chart):
     """(x, y) / (alpha d' + (1 - alpha) z'), d' = sqrt(beta (x^2 + y^2) + z'^2), z' = z + xi sqrt(x^2 + y^2 + z^2).
 
-    A ray is covered before r ceases to ascend, or its pole: where the denominator, alpha z' + (1 - alpha) d' (the
-    numerator of dr/dtheta behind the shift) and 1 + xi z / d (that of the shift itself) are positive.
+    A ray is covered before r stops ascending, and before its pole: the denominator, alpha z' + (1 - alpha) d' (the
+    numerator of dr/dtheta behind the shift) and 1 + xi z / d (that of the shift itself) must be positive.
 
-    xi > -1 shifts the centre of the sphere, beta > 0 makes it an ellipsoid; any alpha will do. A part that is left
-    out is 0, 0 and 1, that is the perspective chart; a number is a part that does not learn.
+    xi > -1 shifts the centre of the sphere, beta > 0 makes it an ellipsoid; any alpha is allowed. A part that is left
+    out is 0, 0 and 1, which is the perspective chart; a number is a part that does not learn.
     """
 
     code: ClassVar[int | None] = 3
@@ -39,7 +39,7 @@ class Unified(Chart):
         return xi, alpha, parts[0] if self.has_beta else None
 
     def _shifted(self, x: Tensor, y: Tensor, z: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
-        """x^2 + y^2, z', d' and d, that one only if it is needed."""
+        """Return x^2 + y^2, z', d' and d, the last one only if it is needed."""
         xi, _, beta = self._parts()
         rho2 = torch.addcmul(x * x, y, y)
         distance = None
@@ -50,7 +50,7 @@ class Unified(Chart):
         return rho2, z, torch.addcmul(around, z, z).sqrt(), distance
 
     def _below(self, rho2: Tensor, z: Tensor, sphere: Tensor) -> Tensor:
-        """The denominator, of x^2 + y^2, z' and d'."""
+        """Return the denominator for x^2 + y^2, z' and d'."""
         _, alpha, beta = self._parts()
         if self.fixed_alpha == 0:
             return z
@@ -79,7 +79,7 @@ class Unified(Chart):
         xi, alpha, beta = self._parts()
         rho2 = torch.addcmul(a * a, b, b)
         around = rho2 if beta is None else rho2 * beta
-        # away from the fold, where the ray's own rounding would carry it across
+        # stay away from the fold, which the ray's own rounding would cross
         floor = 64 * torch.finfo(a.dtype).eps
         margin = self._most(a.dtype) / 2 - torch.maximum(a.abs(), b.abs())
         margin = torch.minimum(margin, 1 - floor - (2 * alpha - 1) * around)
@@ -98,18 +98,18 @@ class Unified(Chart):
         ahead = self._ahead(rho2 if beta is None else rho2 * beta, alpha)
         if xi is None:
             return unit(a, b, ahead)
-        # where the line from the shifted centre meets the unit sphere, on the side of the axis
+        # the line from the shifted centre meets the unit sphere here, on the side of the axis
         before = torch.addcmul(ahead * ahead, (1 - xi) * (1 + xi), rho2).sqrt()
         reach = torch.addcmul(before, xi, ahead) / torch.addcmul(rho2, ahead, ahead)
         return a * reach, b * reach, torch.addcmul(-xi, ahead, reach)
 
     @staticmethod
     def _ahead(around: Tensor, alpha: Tensor | float) -> Tensor:
-        """The z' of the ray (a, b, z') whose denominator is 1; around = beta (a^2 + b^2)."""
+        """Return the z' of the ray (a, b, z') whose denominator is 1; around = beta (a^2 + b^2)."""
         if isinstance(alpha, float) and alpha == 0:
             return torch.ones_like(around)
         root = (1 - (2 * alpha - 1) * around).sqrt()
-        # Two forms of one function: the first one divides by zero at 1/2, the second one may far from there
+        # two forms of one function: the first one divides by zero at 1/2, the second one may far from there
         if isinstance(alpha, float):
             if abs(2 * alpha - 1) > 0.5:
                 return (alpha * root + (alpha - 1)) / (2 * alpha - 1)
@@ -123,7 +123,7 @@ class Unified(Chart):
 
     @staticmethod
     def _most(dtype: torch.dtype) -> float:
-        """A radius that no image has, and whose powers are still numbers."""
+        """Return a radius that no image has, and whose powers are still numbers."""
         return Perspective().end(dtype)
 
     def end(self, dtype: torch.dtype) -> float | Tensor:

@@ -122,7 +122,7 @@ WRONG = [
     (lambda: grid(columns=3), ValueError, "columns must be from 4"),
     (lambda: grid(rows=1000), ValueError, "to 999"),
     (lambda: grid(fov_x=360), ValueError, "from 1 to 359; got 360"),
-    (lambda: ct.Splined.with_grid(16, 11, 120), TypeError, r"given\. By name: .*columns=16, rows=11, fov_x=120"),
+    (lambda: ct.Splined.with_grid(16, 11, 120), TypeError, r"given\. Call .*columns=16, rows=11, fov_x=120"),
     (lambda: grid(fov_x=170.5), TypeError, "fov_x must be a whole number; got 170.5"),
     (lambda: CAMERA.convert("splined:16x11"), ValueError, "a grid must be written as"),
     # fields of view
