@@ -1,60 +1,67 @@
-"""A generic face: the places of 68 landmarks on a head, for poses from landmarks."""
+"""A generic face: the places of landmarks on a head, for poses from landmarks."""
 
 from __future__ import annotations
 
-import math
+from pathlib import Path
 
-from torch import Tensor, tensor
+import numpy as np
+import torch
+from torch import Tensor
 
-# half a face in millimetres, the person's left one: x to the side, y down, z back from the plane of the eyeballs'
-# centres. Plain proportions of an adult: pupils 63 mm apart, cheekbones 134 mm, chin 112 mm below the eyes
-_BROW = ((11, -16, -17), (21, -22, -17), (33, -24, -13), (45, -22, -6), (55, -15, 4))  # from the middle outwards
-_EYE = ((16, 1, -7), (25, -5, -11), (37, -5, -10), (46, 0, -1), (37, 4, -9), (26, 5, -10))  # inner corner, then over
-_BRIDGE = ((0, 3, -18), (0, 14, -25), (0, 26, -34), (0, 37, -43))
-_NOSTRILS = ((0, 50, -33), (7, 48, -31), (14, 45, -25))  # from the middle outwards
-_UPPER = ((0, 65, -34), (8, 63, -33), (17, 67, -28), (26, 73, -19))
-_LOWER = ((0, 86, -31), (10, 84, -30), (19, 80, -26))
-_INNER = ((0, 72, -32), (9, 72, -30), (22, 73, -21))
-_INNER_LOWER = ((0, 75, -31), (9, 75, -29))
+from camtorch.augment.landmarks import INSIGHTFACE, LANDMARKS
+from camtorch.values.arguments import one_of
 
-_Points = tuple[tuple[float, float, float], ...]
+# points of MediaPipe's mesh
+_OVAL = (127, 234, 93, 132, 58, 172, 136, 150, 149, 176, 148, 152)  # the outline from the right ear to the chin
+_BROW = (70, 63, 105, 66, 107, 55, 65, 52, 53)  # the right one from outside: over it, and back below
+_BRIDGE = (168, 197, 195, 4)
+_WING = (244, 209, 129)  # the nose's right one, from the eye down
+_NOSTRILS = (75, 97, 2)  # from the right one to the middle
+_EYE = (33, 160, 159, 158, 133, 153, 145, 144)  # the right one from its outer corner: over it, and back below
+_MOUTH = (61, 39, 37, 0, 267, 269, 291, 405, 314, 17, 84, 181, 78, 82, 13, 312, 308, 317, 14, 87)  # outside, inside
+_IRIS = (468,)
+_JAW = {"ibug68": 17, "wflw98": 33, "lapa106": 33}  # the number of landmarks on the outline, which come first
+_RUNS = {  # name -> the first landmark of a run -> its points; the others are mirror images
+    "ibug68": {17: _BROW[:5], 27: _BRIDGE + _NOSTRILS, 36: (33, 160, 158, 133, 153, 144), 48: _MOUTH},
+    "wflw98": {33: _BROW, 51: _BRIDGE + _NOSTRILS, 60: _EYE, 76: _MOUTH, 96: _IRIS},
+    "lapa106": {33: _BROW, 51: _BRIDGE + _WING + _NOSTRILS, 66: _EYE + _IRIS, 84: _MOUTH, 104: _IRIS},
+}
+_NAMES = (*_RUNS, "insightface106", "mediapipe468", "mediapipe478")
 
 
-def face_points() -> Tensor:
-    """Return a generic face (68, 3) in float64 and metres, in the order of iBUG's 68 landmarks.
+def face_points(landmarks: str = "ibug68") -> Tensor:
+    """Return the points (K, 3) of a generic face in metres, float64, in the order of a detector's landmarks.
 
-    It is in the head's frame of `ct.head_angles`: x to the image's right if the face looks into the camera (the
-    person's left), y down, z away from the camera, the origin midway between the eyeballs' centres. It has plain
-    proportions and is nobody's face: for a person it is off by some millimetres, and a distance from it by as many
-    percent as the face is larger or smaller. Your own model in that order, or a part of it, is better.
+    They are the points of MediaPipe's canonical face model (Apache-2.0), an average adult, the same on both sides. The
+    head's frame is that of `ct.head_angles`: x to the image's right when the face looks into the camera (the person's
+    left), y down, z away from the camera, the origin midway between the eyeballs' centres. For a person the points are
+    off by some millimetres, and the distance of a pose by as many percent as the face is larger or smaller.
+
+    The outline of the jaw comes first in 68, 98 and 106 landmarks. Detectors see it where the face ends in the image,
+    which is no fixed line of the head: give it a tenth of the weight in `ct.solve_pnp`.
+
+    Args:
+        landmarks: "ibug68", "wflw98", "lapa106", "insightface106", "mediapipe468" or "mediapipe478".
+
+    Raises:
+        ValueError: If `landmarks` is another name.
+
+    Example:
+        >>> ct.augment.face_points("mediapipe478").shape
+        torch.Size([478, 3])
     """
-    jaw = []
-    for i in range(17):  # from ear to ear under the chin
-        turn = math.radians(-90 + 180 * i / 16)
-        side, below = math.sin(turn), math.cos(turn)
-        jaw.append((67 * side, 6 + 106 * below**0.8, -24 + 96 * side**2))
-    eye_over, eye_under = _EYE[:4], _EYE[4:]
-    right_eye = (*eye_over[::-1], *eye_under[::-1])
-    points = (
-        *jaw,
-        *_mirrored(_BROW[::-1]),
-        *_BROW,
-        *_BRIDGE,
-        *_across(_NOSTRILS),
-        *_mirrored(right_eye),
-        *_EYE,
-        *_across(_UPPER),
-        *reversed(_across(_LOWER)),
-        *_across(_INNER),
-        *reversed(_across(_INNER_LOWER)),
-    )
-    return tensor(points).double() / 1000
-
-
-def _mirrored(points: _Points) -> _Points:
-    return tuple((-x, y, z) for x, y, z in points)
-
-
-def _across(half: _Points) -> _Points:
-    """Return points from the person's right to the left, of a left half whose first point is the middle."""
-    return (*_mirrored(half[:0:-1]), *half)
+    name = one_of(landmarks, _NAMES, "landmarks", "face_points")
+    if name == "insightface106":
+        return face_points("lapa106")[torch.tensor(INSIGHTFACE).argsort()]
+    mesh, order = np.loadtxt(Path(__file__).with_name("mediapipe_face.txt")) / 1e5, LANDMARKS[name]
+    if name not in _RUNS:
+        return torch.from_numpy(mesh[: len(order)])
+    points, mirror, jaw = np.empty((len(order), 3)), np.array([-1, 1, 1]), _JAW[name]
+    right = mesh[list(_OVAL)]
+    outline = np.concatenate((right, (right * mirror)[-2::-1]))
+    along = np.cumsum([0, *np.linalg.norm(np.diff(outline, axis=0), axis=1)])
+    points[:jaw] = np.stack([np.interp(np.linspace(0, along[-1], jaw), along, axis) for axis in outline.T], -1)
+    for first, run in _RUNS[name].items():
+        for i, point in enumerate(run, first):
+            points[order[i]], points[i] = mesh[point] * mirror, mesh[point]
+    return torch.from_numpy(points)

@@ -53,8 +53,19 @@ LANDMARKS: dict[str, tuple[int, ...]] = {
     "mediapipe478": _order(478, *_MESHES, (468, 468, 941), (469, 471, 945), (472, 472, 949)),  # irises
 }
 """Maps a name to the landmark that each landmark changes places with, or itself: the 68 of iBUG (300-W, dlib), the
-98 of WFLW, the 106 of LaPa (JD-landmark; InsightFace has 106 in another order), the 17 keypoints of COCO, and
-MediaPipe's face mesh of 468 points, or of 478 with both irises."""
+98 of WFLW, the 106 of LaPa (JD-landmark), the same in InsightFace's order, the 17 keypoints of COCO, and MediaPipe's
+face mesh of 468 points, or of 478 with both irises."""
+
+INSIGHTFACE = (
+    *(1, *range(9, 17), *range(2, 9), 0, *range(24, 17, -1), *range(32, 24, -1), 17),  # the outline
+    *(43, 48, 49, 51, 50, 46, 47, 45, 44, 102, 103, 104, 105, 101, 100, 99, 98, 97),  # brows
+    *(72, 73, 74, 86, 75, 76, 77, 78, 79, 80, 85, 84, 83, 82, 81),  # the nose
+    *(35, 41, 40, 42, 39, 37, 33, 36, 34, 89, 95, 94, 96, 93, 91, 87, 90, 88),  # eyes
+    *(52, 64, 63, 71, 67, 68, 61, 58, 59, 53, 56, 55, 65, 66, 62, 70, 69, 57, 60, 54, 38, 92),  # the mouth, pupils
+)
+"""The number in "insightface106" of each landmark of "lapa106"."""
+_PLACES = {number: i for i, number in enumerate(INSIGHTFACE)}
+LANDMARKS["insightface106"] = tuple(INSIGHTFACE[LANDMARKS["lapa106"][_PLACES[i]]] for i in range(106))
 
 TableLike = str | Sequence[int] | Sequence[Sequence[int]]
 
@@ -109,7 +120,7 @@ def as_table(value: TableLike, owner: str) -> Table:
 
 
 # numbers of points that hardly anything else has
-_FACES = {len(LANDMARKS[name]): name for name in ("ibug68", "wflw98", "lapa106", "mediapipe468", "mediapipe478")}
+_FACES = {n: " or ".join(repr(k) for k, v in LANDMARKS.items() if len(v) == n) for n in (68, 98, 106, 468, 478)}
 _told: set[int] = set()  # numbers of points that this process has warned about
 _HOLD = ("keypoints", "landmarks", "points")  # kinds of fields that may be landmarks
 _LEFT, _RIGHT = "_left", "_right"
@@ -153,9 +164,9 @@ class Mirroring:
             if meant is not None and count not in _told:
                 _told.add(count)
                 warn(
-                    f"{self.owner}: {name} holds {count} points, and mirrored faces keep their order: point 0 is then "
-                    f"on the other side. Pass landmarks={meant!r}, if that is their order, or "
-                    "landmarks={} to keep it"
+                    f"{self.owner}: {name} holds {count} points and mirrored faces keep their order: point 0 is then "
+                    f"on the other side. landmarks={meant}, if that is their order, puts them right; "
+                    "landmarks={} says that they shall keep it"
                 )
             return None
         order, own = table.of(count), len(table.order)
@@ -176,8 +187,8 @@ class Mirroring:
             raise ValueError(
                 f"{self.owner}: {name} must be (B, N, ...), as it has a table of landmarks; got {shown(value)}"
             )
-        if (kind is not None and kind not in _HOLD) or value.ndim < (2 if flags else 3):
-            return value
+        if (kind is not None and kind not in _HOLD) or value.ndim < (2 if flags else 3) or not value.numel():
+            return value  # an image without faces may come with another number of points
         axis = value.ndim - (1 if flags else 2)
         axis -= axis > 1 and value.shape[axis] == 1  # OpenCV's (B, N, 1, 2)
         if kind is None:

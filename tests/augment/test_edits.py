@@ -426,13 +426,6 @@ def test_landmarks_by_field_and_by_pairs():
             A.HorizontalFlip(landmarks=bad)
 
 
-def test_mediapipe_by_points_that_are_well_known():
-    pairs = [(33, 263), (133, 362), (61, 291), (234, 454), (70, 300), (468, 473), (469, 476), (1, 1), (152, 152)]
-    assert all(A.LANDMARKS["mediapipe478"][one] == other for one, other in pairs)
-    assert A.LANDMARKS["mediapipe468"] == A.LANDMARKS["mediapipe478"][:468]
-    assert sum(i == k for i, k in enumerate(A.LANDMARKS["mediapipe478"])) == 28  # along the middle
-
-
 @pytest.mark.parametrize(("count", "name"), [(98, "wflw98"), (468, "mediapipe468"), (478, "mediapipe478")])
 def test_a_mirrored_face_without_a_table_is_told_once(count, name, monkeypatch):
     monkeypatch.setattr("camtorch.augment.landmarks._told", set())

@@ -1,5 +1,8 @@
 """The data normalisation of gaze estimation, against the published formulas."""
 
+import json
+from pathlib import Path
+
 import pytest
 import torch
 from cameras import spread
@@ -141,14 +144,30 @@ def test_what_cannot_be_normalised_says_why(pinhole):
             call()
 
 
-def test_the_generic_face_is_symmetric_and_of_the_size_of_a_face():
-    points = ct.augment.face_points()
-    mirrored = points[list(ct.augment.LANDMARKS["ibug68"])] * torch.tensor([-1.0, 1.0, 1.0])
-    torch.testing.assert_close(mirrored, points, atol=0, rtol=0)
-    pupils = points[[36, 37, 38, 39, 40, 41]].mean(0), points[[42, 43, 44, 45, 46, 47]].mean(0)
-    assert 0.055 < (pupils[1] - pupils[0])[0] < 0.07
-    assert points[30, 2] == points[:, 2].min()  # the tip of the nose is nearest to who looks at it
-    assert points[8, 1] == points[:, 1].max()  # and the chin the lowest
+@pytest.mark.parametrize("name", ["ibug68", "wflw98", "lapa106", "insightface106", "mediapipe468", "mediapipe478"])
+def test_the_generic_face_is_symmetric_and_of_the_size_of_a_face(name):
+    points, mirror = ct.augment.face_points(name), torch.tensor([-1.0, 1.0, 1.0])
+    torch.testing.assert_close(points[list(ct.augment.LANDMARKS[name])] * mirror, points, atol=1e-12, rtol=0)
+    torch.testing.assert_close(points[:, 0].aminmax().max.item(), 0.077, atol=1e-3, rtol=0)
+    for axis, extreme, place in ((2, 0, [0, 0.031, -0.048]), (1, 1, [0, 0.12, -0.014])):  # the nose's tip, the chin
+        found = points[points[:, axis].aminmax()[extreme] == points[:, axis]]
+        torch.testing.assert_close(found, points.new_tensor([place]), atol=1e-3, rtol=0)
     camera = ct.Pinhole.from_fov(40, image_size=(480, 640)).double()
     pose = ct.solve_pnp(camera, points, camera.project(points + torch.tensor([0.0, 0.02, 0.6]))[0])
     assert ct.head_angles(pose).abs().max() < 1e-6
+
+
+@pytest.mark.parametrize("name", ["ibug68", "wflw98", "lapa106"])
+def test_the_generic_face_lies_on_the_mean_face(name):
+    mean = torch.tensor(json.loads((Path(__file__).parents[1] / "files" / "mean_faces.json").read_text())[name])
+    front = torch.nn.functional.pad(ct.augment.face_points(name)[:, :2], (0, 1), value=1.0).float()
+    away = (front @ torch.linalg.lstsq(front, mean).solution - mean).norm(dim=1)
+    assert away.max() < 0.08
+    assert away.mean() < 0.035
+
+
+def test_insightface_by_the_landmarks_that_ibug_has():
+    order = [43, 48, 49, 51, 50, 102, 103, 104, 105, 101, 72, 73, 74, 86, 78, 79, 80, 85, 84, 35, 41, 42, 39, 37, 36]
+    order += [89, 95, 96, 93, 91, 90, 52, 64, 63, 71, 67, 68, 61, 58, 59, 53, 56, 55, 65, 66, 62, 70, 69, 57, 60, 54]
+    assert torch.equal(ct.augment.face_points("insightface106")[order], ct.augment.face_points()[17:])
+    assert [ct.augment.LANDMARKS["insightface106"][i] for i in (0, 1, 9, 16, 2, 44, 33)] == [0, 17, 25, 32, 18, 100, 87]
