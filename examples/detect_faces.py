@@ -93,7 +93,9 @@ def main(photo: str, out: str, detector: str = "mediapipe", camera: str | None =
     found = study(image, fields, landmarks, lens)
     for pose, angles, rms in zip(found.poses, found.angles.tolist(), found.rms.tolist(), strict=True):
         words = "pitch {:.0f}, yaw {:.0f}, roll {:.0f} degrees".format(*angles)
-        print(f"a face {100 * pose[:3, 3].norm():.0f} cm away: {words}; landmarks within {100 * rms:.1f} % of its width")
+        print(
+            f"a face {100 * pose[:3, 3].norm():.0f} cm away: {words}; landmarks within {100 * rms:.1f} % of its width"
+        )
     draw(image, fields, found, out)
     return found
 

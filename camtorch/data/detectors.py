@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -11,7 +12,7 @@ from camtorch.augment.sample import Sample
 from camtorch.values.arguments import as_known_size, shown
 
 
-def from_mediapipe(result: Any, image_size: tuple[int, int]) -> Sample:
+def from_mediapipe(result: Any, image_size: Sequence[int]) -> Sample:
     """Return the faces of a result of MediaPipe's face mesh.
 
     For a mirror: `landmarks="mediapipe478"`, or `"mediapipe468"` of `FaceMesh(refine_landmarks=False)`. MediaPipe's x
@@ -47,10 +48,10 @@ def from_mediapipe(result: Any, image_size: tuple[int, int]) -> Sample:
 def from_insightface(faces: Any) -> Sample:
     """Return the faces that InsightFace's `FaceAnalysis.get` found.
 
-    The landmarks are the 106 of `landmark_2d_106` if all faces have them, else the 68 of `landmark_3d_68`, else the five
-    of `kps`. For a mirror: `landmarks="insightface106"`, `"ibug68"`, or the pairs `[(0, 1), (3, 4)]`. The 106 and 68
-    count from the middle of the first pixel; boxes and `kps` count from the edge of the image, so half a pixel is taken
-    off.
+    The landmarks are the 106 of `landmark_2d_106` if all faces have them, else the 68 of `landmark_3d_68`, else the
+    five of `kps`. For a mirror: `landmarks="insightface106"`, `"ibug68"`, or the pairs `[(0, 1), (3, 4)]`. The 106 and
+    68 count from the middle of the first pixel; boxes and `kps` count from the edge of the image, so half a pixel is
+    taken off.
 
     Args:
         faces: The list, or one face of it.
@@ -80,8 +81,8 @@ def from_ultralytics(results: Any) -> Sample:
         results: The `Results` of one image, or the list of one that `model(image)` returns.
 
     Returns:
-        `boxes` (F, 4), and of a pose model `keypoints` (F, K, 2) and `keypoints_valid` (F, K), True from a confidence of
-        0.5 on.
+        `boxes` (F, 4), and of a pose model `keypoints` (F, K, 2) and `keypoints_valid` (F, K), True if the confidence
+        is at least 0.5.
 
     Raises:
         TypeError: If it is something else. ValueError: If there are several images.
