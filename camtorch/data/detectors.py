@@ -29,7 +29,10 @@ def from_mediapipe(result: Any, image_size: Sequence[int]) -> Sample:
         TypeError: If it is the result of something else, such as of MediaPipe's face detector or hands.
 
     Example:
-        >>> sample = {"image": image, **ct.data.from_mediapipe(landmarker.detect(mp_image), image.shape[-2:])}
+        >>> from types import SimpleNamespace
+        >>> nobody = SimpleNamespace(face_landmarks=[])  # or landmarker.detect(mp_image)
+        >>> {name: tuple(value.shape) for name, value in ct.data.from_mediapipe(nobody, (480, 640)).items()}
+        {'keypoints': (0, 478, 2), 'boxes': (0, 4)}
     """
     height, width = as_known_size(image_size, "from_mediapipe")
     known = [name for name in ("multi_face_landmarks", "face_landmarks") if hasattr(result, name)]
