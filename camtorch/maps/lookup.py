@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from functools import partial
+from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -13,6 +14,7 @@ import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
 from torch import Tensor
 
 from camtorch.values.dtypes import narrow, widen
+from camtorch.warp.arrays import Image, warped_alike
 from camtorch.warp.warp import Warp
 
 Floats = npt.NDArray[np.float64]
@@ -106,8 +108,8 @@ class LookupMap:
         outer = self.positions.new_tensor(self.source_size[::-1]) - 0.5
         return ((self.positions >= -0.5) & (self.positions <= outer)).all(-1)[None, None]  # NaN is nowhere
 
-    def __call__(self, images: Tensor, mode: str = "bilinear", padding_mode: str = "zeros") -> Tensor:
-        """Warp images (B, C, H, W) of the source's size; floating point, integer and bool dtypes are kept.
+    def __call__(self, images: Image, mode: str = "bilinear", padding_mode: str = "zeros") -> Image:
+        """Warp images of the source's size, and return the same kind, as `Warp` does; dtypes are kept.
 
         Integers are exact up to 2^53.
         `mode` is "nearest", "bilinear" or "bicubic", `padding_mode` "zeros", "border" or "reflection".
@@ -115,14 +117,17 @@ class LookupMap:
         Raises:
             ValueError: If the images have another shape or size.
         """
-        size = self.source_size
-        if not isinstance(images, Tensor) or images.is_complex() or images.is_sparse or images.shape[2:] != size:
-            what = f"{images.dtype} {tuple(images.shape)}" if isinstance(images, Tensor) else type(images).__name__
-            form = f"(B, C, {size[0]}, {size[1]})"
+        size, given = self.source_size, cast("Any", images)
+        if not isinstance(given, Tensor):
+            warp: Any = partial(self, mode=mode, padding_mode=padding_mode)
+            return cast("Image", warped_alike(given, size, "LookupMap", warp))
+        if given.is_complex() or given.is_sparse or given.ndim < 3 or given.shape[-2:] != size:
+            what, form = f"{given.dtype} {tuple(given.shape)}", f"(..., C, {size[0]}, {size[1]})"
             raise ValueError(f"LookupMap: images must be a dense tensor {form} of real numbers; got {what}")
-        values = widen(images)
+        values = widen(given[None].flatten(0, -4))
         grid = self.grid().to(values).expand(len(values), -1, -1, -1)
-        return narrow(F.grid_sample(values, grid, mode, padding_mode, align_corners=False), images.dtype)
+        made = narrow(F.grid_sample(values, grid, mode, padding_mode, align_corners=False), given.dtype)
+        return cast("Image", made.view(*given.shape[:-2], *self.target_size))
 
     def error(self, warp: Warp) -> Tensor:
         """Return the distance (H', W') float64 to a warp in pixels of the source; NaN if the warp shows nothing there.

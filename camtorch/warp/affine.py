@@ -23,7 +23,7 @@ from camtorch.warp.grid import STEP, Lattice, Sampling, coarse, straight_lattice
 from camtorch.warp.panorama import lengths
 from camtorch.warp.plan import Route, lengthened, positions, route_of, warped
 from camtorch.warp.sampling import SHRINKS, PaddingMode, Sampler, render
-from camtorch.warp.warp import Warp, checked
+from camtorch.warp.warp import Warp
 
 _MOST = 8  # an image is halved this often at most
 _PLAIN = (torch.uint8, torch.float32, torch.float64)  # torch interpolates these dtypes without a conversion
@@ -59,9 +59,8 @@ class MirrorWarp(Warp):
         self._decides = antialias is None
         self._halvings: list[int] | None = None
 
-    def forward(self, images: Tensor, **how: Any) -> Tensor:
-        """Warp images as `Warp.forward` does, each row in its own way: images that shrink are resized or halved."""
-        sampler = checked(self, images, **how)
+    def _warped(self, images: Tensor, sampler: Sampler) -> Tensor:
+        """Return warped images, each row in its own way: images that shrink are resized or halved."""
         smooth = sampler.mode != "nearest" and images.dtype != torch.bool
         called = torch.compiler.is_compiling() and not torch.onnx.is_in_onnx_export()
         if called and self._depends(smooth) and not keeps_graph(images, *self._inputs()):

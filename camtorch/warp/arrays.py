@@ -5,13 +5,25 @@ from __future__ import annotations
 import importlib
 from collections.abc import Callable
 from types import SimpleNamespace
-from typing import Any, TypeAlias
+from typing import Any, Protocol, TypeAlias, TypeVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
 Array: TypeAlias = "np.ndarray[Any, Any]"
+
+
+class Picture(Protocol):
+    """A PIL image, for type checkers, which need no Pillow."""
+
+    @property
+    def mode(self) -> str: ...
+
+    info: dict[str | tuple[int, int], Any]
+
+
+Image = TypeVar("Image", bound=Tensor | np.ndarray[Any, Any] | Picture)
 _FEW = 4  # channels
 
 
@@ -41,14 +53,20 @@ def can_share(array: Array) -> bool:
     return known and not any(step < 0 or step % array.itemsize for step in array.strides)
 
 
-def as_planes(array: object, name: str, owner: str, size: tuple[int, int] | None = None) -> Tensor:
-    """Return an array (H, W, C) or (H, W) as an image (C, H, W); raise if `size` shows that its channels come first."""
+def as_planes(array: object, name: str, owner: str, size: tuple[int, int] | None = None, many: bool = False) -> Tensor:
+    """Return an array (H, W, C) or (H, W) as an image (C, H, W), and if `many`, (N, H, W, C) as images (N, C, H, W).
+
+    Raise if `size` shows that its channels come first.
+    """
     tensor = as_tensor(array, name, owner)
     shape = tuple(tensor.shape)
-    if len(shape) not in (2, 3) or (size == shape[1:] and size != shape[:2]):
-        hint = ", with the channels first. np.moveaxis(image, 0, -1) puts them last" if len(shape) == 3 else ""
-        raise ValueError(f"{owner}: {name} must be (H, W, C) or (H, W); got shape {shape}{hint}")
-    return tensor.permute(2, 0, 1) if tensor.ndim == 3 else tensor[None]
+    is_known = tensor.ndim in ((2, 3, 4) if many else (2, 3))
+    if not is_known or (len(shape) > 2 and size == shape[-2:]):
+        forms = "(H, W, C), (H, W) or (N, H, W, C)" if many else "(H, W, C) or (H, W)"
+        hint = f". np.moveaxis({name}, -3, -1) puts channels last" if len(shape) > 2 else ""
+        hint += f", {name}[..., None] adds one to grey images" if hint and many else ""
+        raise ValueError(f"{owner}: {name} must be {forms}; got shape {shape}{hint}")
+    return tensor.movedim(-1, -3) if tensor.ndim > 2 else tensor[None]
 
 
 def plain(tensor: Tensor) -> Array:
@@ -57,18 +75,24 @@ def plain(tensor: Tensor) -> Array:
 
 
 def as_array(image: Tensor, like: Array) -> Array:
-    """Return an image (C, H, W) in the layout and the dtype of `like`, without a copy if its memory has them."""
+    """Return images (..., C, H, W) in the layout and the dtype of `like`, without a copy if their memory has them."""
     planes = plain(image)
-    return np.ascontiguousarray(planes.transpose(1, 2, 0) if like.ndim == 3 else planes[0], like.dtype)
+    last = (*range(planes.ndim - 3), -2, -1, -3)
+    return np.ascontiguousarray(planes.transpose(last) if like.ndim > 2 else planes[..., 0, :, :], like.dtype)
 
 
-def as_planes_of(image: Any, name: str, owner: str) -> tuple[Tensor, Callable[[Tensor], Any]]:
-    """Return an array or a PIL image as planes (C, H, W), and a function from planes to an image of its kind."""
+def as_planes_of(
+    image: Any, name: str, owner: str, size: tuple[int, int] | None = None, many: bool = False
+) -> tuple[Tensor, Callable[[Tensor], Any]]:
+    """Return an array or a PIL image as `as_planes` does, and a function from such planes to an image of its kind."""
     mode = None if isinstance(image, np.ndarray) else getattr(image, "mode", None)
+    if mode is None and not isinstance(image, np.ndarray):
+        forms = "a tensor (..., C, H, W), an array (H, W, C) or a PIL image"
+        raise TypeError(f"{owner}: {name} must be {forms}; got {type(image).__name__}")
     if mode in ("1", "P", "PA"):
         raise ValueError(
             f"{owner}: {name} must be an image whose values can be averaged; got a PIL image of mode {mode!r}. "
-            "image.convert('RGB') makes one, tv_tensors.Mask(image) makes labels of it"
+            "image.convert('RGB') makes one, np.asarray(image) or tv_tensors.Mask(image) makes labels of it"
         )
     array = image if mode is None else np.asarray(image)
 
@@ -76,8 +100,23 @@ def as_planes_of(image: Any, name: str, owner: str) -> tuple[Tensor, Callable[[T
         made = as_array(planes, array)
         if mode is None:
             return made
+        if planes.ndim > 3:
+            raise ValueError(
+                f"{owner}: {name} must be an array or a tensor, as {len(planes)} images come out; got a PIL image. "
+                "np.asarray(image) makes an array"
+            )
         new = importlib.import_module("PIL.Image").frombuffer(mode, made.shape[1::-1], made, "raw", mode, 0, 1)
         new.info |= image.info  # as Pillow's own transforms do: Exif, with the orientation
         return new
 
-    return as_planes(array, name, owner), restored
+    return as_planes(array, name, owner, size, many), restored
+
+
+def warped_alike(
+    images: Any, size: tuple[int, int], owner: str, warp: Callable[[Tensor], Tensor], device: torch.device | str = "cpu"
+) -> Any:
+    """Return an array or a PIL image, of that size, as `warp` makes it of images (N, C, H, W), without gradients."""
+    planes, restored = as_planes_of(images, "images", owner, size, many=True)
+    with torch.no_grad():
+        made = warp((planes[None] if planes.ndim == 3 else planes).to(device))
+    return restored(made[0] if planes.ndim == 3 and len(made) == 1 else made)

@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -68,9 +69,12 @@ class Views(GeometryModule):
         """Iterate over the warps."""
         return iter(self.warps)  # type: ignore[arg-type]
 
-    def forward(self, images: Tensor) -> Tensor:
-        """Return the views (B, N, C, S, S) of images (B, C, H, W)."""
-        return torch.stack([warp(images) for warp in self], 1)
+    def forward(self, images: Any) -> Any:
+        """Return the views (..., N, C, S, S) of images (..., C, H, W), or arrays of arrays, or a list of PIL images."""
+        views = [warp(images) for warp in self]
+        if isinstance(images, Tensor):
+            return torch.stack(views, -4)
+        return np.stack(views, int(images.ndim == 4)) if isinstance(images, np.ndarray) else views
 
     if TYPE_CHECKING:
 
@@ -97,21 +101,23 @@ class Views(GeometryModule):
         return whole / torch.where(total > 0, total, 1.0)
 
     def back(self, views: Tensor) -> tuple[Tensor, Tensor]:
-        """Join views (B, N, C, S, S), or results for them, in the wide image.
+        """Join views (..., N, C, S, S), or results for them, in the wide image.
 
-        Returns (B, C, H, W) of the same dtype, and valid (1, 1, H, W) bool: a view shows the pixel. Views are averaged
-        by their weights, and integers rounded; mode="nearest" takes the pixel of the view with the largest weight, as
-        labels have no mean.
+        Returns (..., C, H, W) of the same dtype, and valid (1, 1, H, W) bool, or (1, H, W) for one image: a view shows
+        the pixel. Views are averaged by their weights, and integers rounded; mode="nearest" takes the pixel of the view
+        with the largest weight, as labels have no mean.
         """
         size = self.view._size_for("Views")
-        if not isinstance(views, Tensor) or views.ndim != 5 or views.shape[1] != len(self) or views.shape[-2:] != size:
+        want = len(self), *size
+        if not isinstance(views, Tensor) or views.ndim < 4 or (views.shape[-4], *views.shape[-2:]) != want:
             raise ValueError(
-                f"Views: views must be a tensor (B, {len(self)}, C, {size[0]}, {size[1]}); got {shown(views)}"
+                f"Views: views must be a tensor (..., {len(self)}, C, {size[0]}, {size[1]}); got {shown(views)}"
             )
         weights = self.weights()[:, None]
-        valid = (weights.sum(0) > 0)[None]
+        valid = weights.sum(0) > 0
+        valid = valid if views.ndim == 4 else valid[None]
         images = views if self.mode == "nearest" else widen(views)
-        parts = [warp(images[:, i]) for i, warp in enumerate(self.backs)]
+        parts = [warp(image) for image, warp in zip(images.unbind(-4), self.backs, strict=True)]
         if self.mode != "nearest":
             shares = [torch.where(w > 0, p * w.to(p.dtype), 0.0) for p, w in zip(parts, weights, strict=True)]
             return narrow(torch.stack(shares).sum(0), views.dtype), valid

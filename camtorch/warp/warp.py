@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from functools import partial
 from typing import TYPE_CHECKING, Any, ClassVar
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 from typing_extensions import Self
@@ -25,6 +25,7 @@ from camtorch.values.arguments import (
 )
 from camtorch.values.module import typed_as
 from camtorch.warp import plan
+from camtorch.warp.arrays import Image, warped_alike
 from camtorch.warp.boxes import enclosed, moved_boxes
 from camtorch.warp.grid import OUTSIDE
 from camtorch.warp.pair import CameraPair
@@ -43,9 +44,9 @@ def as_sized(camera: Camera, name: str, owner: str) -> Camera:
 class Warp(CameraPair):
     """A layer that turns images of camera `source` into images of camera `target`, both at one place.
 
-    Convention: `ray_target = R ray_source` (OpenCV's rectification R). Images are (B, C, H, W). Points, boxes and rays
-    move from source to target. A batch of B cameras or rotations goes sample by sample with the images; a single one
-    serves all.
+    Convention: `ray_target = R ray_source` (OpenCV's rectification R). Images are tensors (..., C, H, W), NumPy arrays
+    (H, W, C) or PIL images, and the same kind comes back. Points, boxes and rays move from source to target. A batch of
+    B cameras or rotations goes sample by sample with the images; a single one serves all.
 
         >>> source = ct.KannalaBrandt([80.0, 80.0, 63.5, 47.5], [0.02, -0.01, 0.0, 0.0], image_size=(96, 128))
         >>> warp = ct.Warp(source, ct.Pinhole([60.0, 60.0, 63.5, 47.5], image_size=(96, 128)))
@@ -130,33 +131,56 @@ class Warp(CameraPair):
 
     def forward(
         self,
-        images: Tensor,
+        images: Image,
         *,
         mode: Mode | None = None,
         padding_mode: PaddingMode | None = None,
         fill: Fill | None = None,
-    ) -> Tensor:
-        """Warp images.
+    ) -> Image:
+        """Warp images, and return the same kind: a tensor, a NumPy array or a PIL image.
 
         Args:
-            images: (B, C, H, W) of the source's image_size, floating point, integer or bool.
+            images: a tensor (..., C, H, W) of the source's image_size: an image, a batch, or clips (B, T, C, H, W). Or
+                an array (H, W), (H, W, C) or (N, H, W, C), or a PIL image. Floating point, integer or bool. With
+                several cameras a tensor needs its batch dim; the camera of a clip serves all its frames.
             mode: overrides the warp's own, for example "nearest" for a mask.
             padding_mode: overrides the warp's own.
             fill: overrides the warp's own.
 
         Returns:
-            (B, C, H', W') of the target's image_size and of the same dtype. Images with channels last in memory give
+            Images of the target's image_size, of the same kind and dtype. Images with channels last in memory give
             results with channels last. Half precision is sampled in float32; integers are rounded and stay in range;
             bool is true from one half on; "nearest" copies integers exactly. Integers and bool have no gradient, and no
-            cost if cameras learn.
+            cost if cameras learn; arrays and PIL images have no gradient. Of one array B cameras make (B, H', W', C).
 
         Raises:
-            ValueError: If the shape or the size is wrong. TypeError: If images are no tensor, or complex.
+            ValueError: If the shape or the size is wrong, channels come last in a tensor or first in an array, the
+                colours of a PIL image are a palette's, or several come of one.
+            TypeError: If images are none of these kinds, or complex.
         """
-        call = plan.ready(self, images, mode, padding_mode) if fill is None else None
-        return (
-            plan.warped(self, images, checked(self, images, mode, padding_mode, fill)) if call is None else call(images)
-        )
+        call: Any = plan.ready(self, images, mode, padding_mode) if fill is None else None
+        made: Any = self._alike(images, mode, padding_mode, fill) if call is None else call(images)
+        return made  # type: ignore[no-any-return]  # of the kind of the images
+
+    def _alike(self, images: Any, mode: Mode | None, padding_mode: PaddingMode | None, fill: Fill | None) -> Any:
+        """Return what `forward` does, for images that no kept call is for."""
+        if not isinstance(images, Tensor):
+            warp = partial(self.forward, mode=mode, padding_mode=padding_mode, fill=fill)
+            return warped_alike(images, self.source._size_for("Warp"), "Warp", warp, self.source.intrinsics.device)
+        sampler = checked(self, images, mode, padding_mode, fill)
+        if images.ndim == 4:
+            return self._warped(images, sampler)
+        lead, cameras = images.shape[:-3], math.prod(self.batch_shape)
+        if cameras == 1:
+            made = self.forward(images[None].flatten(0, -4), mode=mode, padding_mode=padding_mode, fill=fill)
+            return made.view(*lead, *made.shape[1:])
+        # the frames of a clip are channels for its camera
+        each = sampler.fill if len(sampler.fill) == 1 else sampler.fill * math.prod(lead[1:])
+        return self._warped(images.flatten(1, -3), sampler._replace(fill=each)).unflatten(1, images.shape[1:-2])
+
+    def _warped(self, images: Tensor, sampler: Sampler) -> Tensor:
+        """Return the images (B, C, H', W') made of checked ones (B, C, H, W)."""
+        return plan.warped(self, images, sampler)
 
     if TYPE_CHECKING:
 
@@ -186,7 +210,7 @@ class Warp(CameraPair):
         On a CPU and without gradients, `forward` does this automatically for grids of more than 32 million pixels.
 
         Args:
-            images: as in `forward`.
+            images: (B, C, H, W), a tensor.
             rows: number of rows of a strip; default: those of two million pixels.
             mode: as in `forward`.
             padding_mode: as in `forward`.
@@ -197,6 +221,8 @@ class Warp(CameraPair):
             (B or 1, 1, n, W').
         """
         rows = None if rows is None else as_whole(rows, "rows", "Warp", least=1)
+        if isinstance(images, Tensor) and images.ndim != 4:
+            raise ValueError(f"Warp: images must be (B, C, H, W) for strips; got shape {tuple(images.shape)}")
         return plan.in_strips(self, images, rows, checked(self, images, mode, padding_mode, fill))
 
     def grid(self) -> Tensor:
@@ -312,19 +338,18 @@ def checked(
     """Return how a warp samples images in one call; raise if images or options are wrong."""
     expected = warp.source._size_for("Warp")
     if not isinstance(images, Tensor) or images.dtype.is_complex:
-        what = getattr(images, "dtype", "") if isinstance(images, Tensor) else type(images).__name__
-        hint = _way_in(images, expected) if hasattr(images, "__array_interface__") else ""
-        raise TypeError(f"Warp: images must be a tensor (B, C, H, W) of real numbers; got {what}{hint}")
-    shape = tuple(images.shape)
-    if images.ndim in (3, 4) and shape[-3:-1] == expected and shape[-2:] != expected:
-        to = "(2, 0, 1)[None]" if len(shape) == 3 else "(0, 3, 1, 2)"
+        what = images.dtype if isinstance(images, Tensor) else type(images).__name__
+        raise TypeError(f"Warp: images must be a tensor (B, C, H, W) of real numbers; got {what}")
+    shape, cameras = tuple(images.shape), math.prod(warp.batch_shape)
+    if images.ndim > 2 and shape[-3:-1] == expected and shape[-2:] != expected:
         raise ValueError(
-            f"Warp: images must be (B, C, H, W); got shape {shape}, with the channels last. "
-            f"It goes in as image.permute{to}"
+            f"Warp: images must be (..., C, H, W); got shape {shape}, with the channels last. "
+            "A tensor goes in as images.movedim(-1, -3), an array as it is"
         )
-    if images.ndim != 4:
+    if images.ndim < 3 or (images.ndim == 3 and cameras != 1):
         hint = "One image goes in as image[None], masks without channels as masks[:, None]"
-        raise ValueError(f"Warp: images must be (B, C, H, W); got shape {shape}. {hint}")
+        forms = "(..., C, H, W)" if cameras == 1 else f"(..., C, H, W) for {cameras} cameras, with a batch dim"
+        raise ValueError(f"Warp: images must be {forms}; got shape {shape}. {hint}")
     if shape[-2:] != expected:
         raise ValueError(
             f"Warp: images must have the source's image_size {expected} (height, width); got {shape[-2:]}. "
@@ -332,41 +357,13 @@ def checked(
         )
     if images.device != warp.source.intrinsics.device:
         check_devices("Warp", images=images, source=warp.source.intrinsics)
-    cameras = math.prod(warp.batch_shape)
     if cameras != 1 and images.shape[0] not in (1, cameras):
         raise ValueError(f"Warp: images must be 1 or {cameras}, one for each camera; got {images.shape[0]}")
     values = warp.fill if fill is None else as_fill(fill, "Warp")
-    if len(values) not in (1, shape[1]):
-        raise ValueError(f"Warp: fill must have 1 value or {shape[1]}, one for each channel; got {len(values)}")
+    if len(values) not in (1, shape[-3]):
+        raise ValueError(f"Warp: fill must have 1 value or {shape[-3]}, one for each channel; got {len(values)}")
     return Sampler(
         warp.mode if mode is None else one_of(mode, MODES, "mode", "Warp"),
         warp.padding_mode if padding_mode is None else one_of(padding_mode, PADDINGS, "padding_mode", "Warp"),
         values,
-    )
-
-
-_WAYS = {
-    "(H, W)": ("[None, None]", "[0, 0]"),
-    "(H, W, C)": (".permute(2, 0, 1)[None]", "[0].permute(1, 2, 0)"),
-    "(C, H, W)": ("[None]", "[0]"),
-    "(B, H, W, C)": (".permute(0, 3, 1, 2)", ".permute(0, 2, 3, 1)"),
-    "(B, C, H, W)": ("", ""),
-}
-
-
-def _way_in(images: Any, size: tuple[int, int]) -> str:
-    """Return a sentence on how an array of images, or a PIL image, becomes a tensor, and the result an array."""
-    array = np.asarray(images)
-    taken = "np.array(image)" if array is not images else "array"
-    if any(step < 0 for step in array.strides):
-        taken = "array.copy()"  # torch takes no negative strides
-    last = array.shape[-2:] != size or array.shape[-3:-1] == size
-    shape = {2: "(H, W)", 3: "(H, W, C)" if last else "(C, H, W)", 4: "(B, H, W, C)" if last else "(B, C, H, W)"}
-    if array.ndim not in shape:
-        return ""
-    there, back = _WAYS[shape[array.ndim]]
-    name = "An array" if taken != "np.array(image)" else "An image"
-    return (
-        f". {name} {shape[array.ndim]} goes in as torch.from_numpy({taken}){there}, and what comes out becomes one by "
-        f"result{back}.numpy()"
     )

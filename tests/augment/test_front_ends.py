@@ -121,7 +121,7 @@ def test_errors_name_the_field_and_its_shape():
     transform = ct.augment.numpy.Transform(own)
     last, first = r"{} is \(.*channels last.*{}.permute\({}\)", image.T.swapaxes(1, 2)
     for call, text, fields in (
-        (transform, r"image must be .* got shape \(3, 24, 32\), with the channels first", {"image": first}),
+        (transform, r"image must be .* got shape \(3, 24, 32\)\. .*np.moveaxis\(image, ", {"image": first}),
         (transform, r"image is \(23, 32\) .* image_size of camera is \(24, 32\)", {"image": image[1:]}),
         (transform, r"masks\[1\] must be .* got shape \(32,\)", {"masks": [mask, mask[0]]}),
         (transform, r"keypoints must be \(N, 2\).* got shape \(4, 1\)", {"keypoints": points[:, :1]}),

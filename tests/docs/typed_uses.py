@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import PIL.Image
 import torch
 from torch import Tensor, nn
 from typing_extensions import assert_type
@@ -62,6 +63,7 @@ def warps(camera: ct.Camera) -> None:
     images = torch.rand(1, 3, 480, 640)
     dewarp = ct.Dewarp(camera, projection="cylindrical", image_size=images.shape[-2:])
     assert_type(dewarp(images), Tensor)
+    assert_type(dewarp(PIL.Image.open("image.png").convert("RGB")), PIL.Image.Image)
     assert_type(ct.Warp(camera, camera, torch.eye(3)).inverse()(images, mode="nearest"), Tensor)
     assert_type(dewarp.transform_points(torch.rand(5, 2)), Pair)
     assert_type(dewarp.transform_boxes(torch.rand(5, 4).sort().values), Pair)

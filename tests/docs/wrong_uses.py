@@ -1,6 +1,5 @@
 """What type checkers find wrong: without an error that is ignored here, the comment that ignores it is one."""
 
-import numpy as np
 import torch
 
 import camtorch as ct
@@ -19,7 +18,7 @@ pixels: torch.Tensor = camera.project(images)  # type: ignore[assignment]  # pyr
 other: ct.Mei = camera.convert(ct.Fisheye624).camera  # type: ignore[assignment]  # pyright: ignore[reportAssignmentType]
 camera.convert(ct.Fisheye624, count="many")  # type: ignore[arg-type]  # pyright: ignore
 ct.Warp(camera)  # type: ignore[call-arg]  # pyright: ignore[reportCallIssue]
-ct.Warp(camera, camera)(np.zeros((1, 3, 480, 640)))  # type: ignore[arg-type]  # pyright: ignore[reportArgumentType]
+ct.Warp(camera, camera)("image.png")  # type: ignore[type-var]  # pyright: ignore[reportArgumentType]
 ct.Dewarp(camera, projection="flat")  # type: ignore[arg-type]  # pyright: ignore[reportArgumentType]
 ct.load(3)  # type: ignore[arg-type]  # pyright: ignore[reportArgumentType]
 ct.losses.rays(camera, camera, reduction="sum")  # type: ignore[call-overload]  # pyright: ignore

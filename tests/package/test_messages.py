@@ -4,6 +4,7 @@ import math
 from pathlib import Path
 
 import numpy as np
+import PIL.Image
 import pytest
 import torch
 from kornia.image import ImageSize
@@ -104,9 +105,12 @@ WRONG = [
     (lambda: ct.Warp(CAMERA, CAMERA, fill=(1, 2))(IMAGES), ValueError, r"fill must have 1 value or 3, .* got 2"),
     (lambda: ct.Warp(CAMERA, BATCH)(IMAGES[:1].expand(3, -1, -1, -1)), ValueError, r"images must be 1 or 2, .* got 3"),
     (lambda: WARP(IMAGES.mT), ValueError, r"\(24, 32\).*\(32, 24\)"),
-    (lambda: WARP(IMAGES[0]), ValueError, r"\(B, C, H, W\).*\(3, 24, 32\)"),
-    (lambda: WARP(IMAGES[:, 0]), ValueError, r"\(2, 24, 32\).*masks\[:, None\]"),
-    (lambda: WARP(IMAGES[0].movedim(0, -1)), ValueError, r"\(24, 32, 3\), with the channels last.*permute\(2, 0, 1\)"),
+    (lambda: WARP(["image"]), TypeError, r"must be a tensor .*, an array .* or a PIL image; got list"),
+    (lambda: WARP(IMAGES[0].numpy()), ValueError, r"got shape \(3, 24, 32\)\. .*np.moveaxis\(images, -3, -1\)"),
+    (lambda: WARP(IMAGES[:, 0].numpy()), ValueError, r"\(2, 24, 32\)\. .* images\[..., None\] adds one"),
+    (lambda: ct.Warp(CAMERA, BATCH)(IMAGES[:, 0]), ValueError, r"2 cameras.*\(2, 24, 32\).*masks\[:, None\]"),
+    (lambda: WARP(IMAGES[0].movedim(0, -1)), ValueError, r"\(24, 32, 3\), with the channels last.*movedim\(-1, -3\)"),
+    (lambda: WARP(PIL.Image.new("P", SIZE[::-1])), ValueError, r"of mode 'P'\. image.convert\('RGB'\)"),
     (lambda: WARP(IMAGES + 0j), TypeError, r"complex64"),
     (lambda: ct.Dewarp(CAMERA, projection="fisheye"), ValueError, r"one of .*'perspective'.*got 'fisheye'"),
     (lambda: ct.Dewarp(CAMERA, fov=180), ValueError, r"fov must be in degrees, above 0 and below 180 for perspective"),
