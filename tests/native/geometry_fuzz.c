@@ -76,20 +76,25 @@ static int moved(const Cameras *cameras, int64_t tile) {
     Move move = {0};
     void *turns = filled(d, 9 * c, 1, 0), *narrow = NULL, *valid = malloc((size_t)(c * n));
     int64_t following = 0, used = 0;
-    move.from = move.to = cameras, move.cameras = c, move.form = fits ? POSITIONS : below(3);
+    move.from = move.to = cameras, move.cameras = c, move.form = fits ? POSITIONS : below(4);
+    const int wide = move.form == BOXES ? 4 : 2;
     if (below(2)) {
         const int64_t back = below(2);
         move.turns = turns, move.turn_strides[0] = 9 * below(2);
         move.turn_strides[1] = back ? 1 : 3, move.turn_strides[2] = back ? 3 : 1;
     }
     move.height = 1 + (double)below(500), move.width = 1 + (double)below(500);
-    void *pixels = rows_of(d, c, n, 2, move.row_strides, 300), *results;
+    void *pixels = wide > 2 ? filled(d, 4 * c * n, 300, 0) : rows_of(d, c, n, 2, move.row_strides, 300), *results;
+    if (wide > 2) {
+        move.row_strides[0] = move.result_strides[0] = 4 * n;
+        move.row_strides[1] = move.result_strides[1] = 4, move.row_strides[2] = move.result_strides[2] = 1;
+    }
     move.rows = pixels, move.count = n, move.tile = tile, move.valid = valid;
     move.next = below(2) ? &following : NULL;
     if (fits) {
         move.result_strides[0] = 2 * n, move.result_strides[1] = 1, move.result_strides[2] = n;
         results = malloc((size_t)(2 * c * n * size));
-    } else results = rows_of(d, c, n, 2, move.result_strides, 0);
+    } else results = wide > 2 ? malloc((size_t)(4 * c * n * size)) : rows_of(d, c, n, 2, move.result_strides, 0);
     move.results = results;
     if (!fits) moves_fuzzed(&move);
     else {
@@ -112,7 +117,7 @@ static int moved(const Cameras *cameras, int64_t tile) {
         for (int64_t i = 0; !left && i < c * rows * columns; i++) fine &= cells[i] >= CELL_EMPTY && cells[i] < used;
         free(cells), free(scratch), free(exact);
     }
-    for (int64_t at = 0; at < 2 * c * n; at++) {
+    for (int64_t at = 0; at < 2 * c * n && wide == 2; at++) {
         const int64_t camera = at / (2 * n), point = at / 2 % n;
         const int64_t place = camera * move.result_strides[0] + point * move.result_strides[1] + at % 2 * move.result_strides[2];
         const double value = d ? ((double *)results)[place] : ((float *)results)[place];
