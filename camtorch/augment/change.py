@@ -112,7 +112,7 @@ class Part:
 
     def between(self) -> tuple[Native, Native, Tensor | None] | None:
         """Both cameras and the rotation for compiled code; None where it takes more than that."""
-        if isinstance(self.moves, Drawn) and self.moves.intrinsics.ndim == 1:
+        if isinstance(self.moves, Drawn):
             start, end = self.moves.start, self.moves.native
             return None if start is None or end is None else (start, end, self.moves.rotation)
         return None if self.moves is None or self.shades or self.light is not None else between_of(self.warp)
@@ -219,10 +219,18 @@ class Change:
 
     @property
     def single(self) -> Camera:
-        """The camera after, of a change of one sample; its own, not that of the change."""
+        """Return the camera after, of a change of one sample; its own, not that of the change."""
         if isinstance(view := self.parts[0].moves, Drawn):
             return view.camera()
         return (self.target[0] if self.gate is not None else alone(self.parts[0].target)).clone()
+
+    @property
+    def several(self) -> Camera:
+        """Return the cameras after, a batch of all samples; their own, not those of the change."""
+        view = self.parts[0].moves
+        if isinstance(view, Drawn) and self._order is None and not self.mixed and view.intrinsics.ndim == 2:
+            return view.camera()
+        return self.target.clone()
 
     @property
     def single_rotation(self) -> Tensor:

@@ -210,7 +210,7 @@ class CameraDrawer(Augmentation):
         if self.min_filled:
             self._tell_of(source, made)
         simple = self.options["tolerance"] and not self.options["antialias"] and made.native is not None
-        simple = simple and made.intrinsics.ndim == 1 and self.beside_the_camera.isdisjoint(self.ranges)
+        simple = simple and self.beside_the_camera.isdisjoint(self.ranges)
         if simple and not isinstance(source, PANORAMAS) and not isinstance(made.base, PANORAMAS):
             return Part(rows, made, source)
         return self._between(rows, source, values, made.target, made.rotation)

@@ -489,7 +489,7 @@ class SampleTransform(KeepsCamera, nn.Module):
             self._mirror(moved, named, change.mirrored, batched)
         if not isinstance(change.parts[0].camera, Unknown):
             # the change keeps cameras of its own, to go back by
-            target = change.target.clone() if batched else change.single
+            target = change.several if batched else change.single
             moved["camera"] = list(target) if isinstance(sample.get("camera"), (list, tuple)) else target
         return moved
 
