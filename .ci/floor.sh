@@ -3,10 +3,10 @@
 # their own. Not a part of `run`: PyPI's torch for Linux brings gigabytes of CUDA, unless PIP_EXTRA_INDEX_URL names an
 # index of those for CPUs.
 #
-# `bash .ci/floor.sh [PYTHON [FOLDER]]`: python3.10 by default; FOLDER, for the environment, is kept and used again.
+# `bash .ci/floor.sh [PYTHON [FOLDER]]`: python3.11 by default; FOLDER, for the environment, is kept and used again.
 set -euo pipefail
 cd "$(dirname "$0")/.."
-python=${1:-python3.10}
+python=${1:-python3.11}
 if [ $# -gt 1 ]; then
     environment=$2
 else
@@ -24,8 +24,7 @@ sed -n 's/^dependencies = \[\(.*\)\]$/\1/p' pyproject.toml | tr -d '" ' | tr ','
 cat "$environment/floor.txt"
 pip install --quiet -r "$environment/floor.txt" pytest hypothesis
 pip install --quiet --no-deps -e .
-# without `camtorch.augment.kornia`, which wants kornia 0.9 and says so, and without the export of inverses, whose loops
-# torch 2.10 does not take
+# without the export of inverses, whose loops torch 2.10 does not take
 pytest tests/models/test_{laws,golden,models,new_models,module,extrinsics}.py tests/io tests/warp/test_{warp,dewarp}.py \
     tests/augment/test_augment_door.py \
     --deselect 'tests/models/test_module.py::test_export[unproject-kannala_brandt]'

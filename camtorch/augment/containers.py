@@ -11,9 +11,8 @@ import zlib
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, TypeAlias
 
-import kornia
 import torch
-from kornia.augmentation import AugmentationSequential, GeometricAugmentationBase2D, IntensityAugmentationBase2D
+from kornia.augmentation import AugmentationSequential, IntensityAugmentationBase2D
 from kornia.augmentation.base import _BasicAugmentationBase
 from kornia.augmentation.container.image import ImageSequential
 from kornia.augmentation.container.params import ParamItem
@@ -32,12 +31,6 @@ from camtorch.cameras.mixed import collate_cameras
 from camtorch.evaluate.private import pytree
 from camtorch.values.arguments import as_values, check_boxes, shown
 from camtorch.values.module import remade
-
-if not hasattr(GeometricAugmentationBase2D, "_gate"):
-    raise ImportError(
-        "camtorch.augment.kornia: kornia must be 0.9 or newer, which needs Python 3.11; got kornia "
-        f"{kornia.__version__}"
-    )
 
 Params: TypeAlias = dict[str, Tensor]
 KIND = "source_kind"

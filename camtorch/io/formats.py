@@ -184,8 +184,9 @@ def load_camera(kind: type[Kind], path: str | os.PathLike[str]) -> Kind:
 
 
 def _read(path: str, content: bytes | dict[str, Any], format: str | None) -> tuple[Rig, str]:
-    keys = content
-    if isinstance(content, bytes):
+    if isinstance(content, dict):
+        keys = content
+    else:
         content = content.removeprefix(codecs.BOM_UTF8)  # some editors write this mark
         for by_content in _BY_CONTENT:
             if format == by_content.NAMES.format or (format is None and by_content.matches(path, content)):

@@ -64,7 +64,7 @@ def to_kornia(camera: Camera, extrinsics: Extrinsics | None) -> Any:
     from kornia.image import ImageSize
 
     owner, distortion = f"{type(camera).__name__}.to_kornia", camera.distortion
-    name, count = {key: known for key, *known in _LENSES.values()}.get(camera.key, ("", 0))
+    _, name, count = next((lens for lens in _LENSES.values() if lens[0] == camera.key), ("", "", 0))
     if not name or bool(distortion[..., count:].any()):
         known = "a pinhole, brown_conrady of up to 8 or kannala_brandt of up to 4 coefficients"
         way = 'camera.convert("kannala_brandt", count=4).camera'

@@ -27,7 +27,7 @@ Path = str | os.PathLike[str]
 
 LARGEST_FILE = 1 << 24
 _LARGEST_STORAGE = 1 << 20  # of YAML and of OpenCV's XML
-_LARGEST_LITERAL = 1 << 15  # short enough that no nesting crashes Python 3.10's parser
+_LARGEST_LITERAL = 1 << 15  # short enough that no nesting crashes Python's parser
 _OPTIMIZATION_INPUTS = re.compile(r"('optimization_inputs'\s*:\s*)b'[^'\\\n]*'")  # can be megabytes; skipped
 _DEEPEST = 100
 _MOST_VALUES = 1 << 17

@@ -1,5 +1,5 @@
 import copy
-import importlib
+import inspect
 import io
 import pickle
 
@@ -11,7 +11,6 @@ from kornia.geometry.boxes import Boxes
 
 import camtorch as ct
 from camtorch import augment
-from camtorch.augment import containers
 from camtorch.augment import kornia as adapter
 
 HEIGHT, WIDTH = SIZE = 96, 128
@@ -407,7 +406,17 @@ def test_gradients_reach_cameras_of_samples(key):
         assert torch.equal(one.last.rotation, twin.last.rotation)
 
 
-def test_a_kornia_too_old_is_told(monkeypatch):
-    monkeypatch.delattr("kornia.augmentation.base._AugmentationBase._gate")
-    with pytest.raises(ImportError, match=r"kornia must be 0\.9 or newer, .* got kornia "):
-        importlib.reload(containers)
+@pytest.mark.parametrize(
+    ("owner", "name", "parameters"),
+    [
+        (K.GeometricAugmentationBase2D, "_gate", "self params"),
+        (K.GeometricAugmentationBase2D, "_blend_by_prob", "transformed not_transformed to_apply"),
+        (K.AugmentationSequential, "_read_datakeys_from_dict", "self keys"),
+        (K.AugmentationSequential, "_preproc_boxes", "self arg dcate"),
+        (K.container.ImageSequential, "__getstate__", "self"),
+        (K.utils, "_transform_output_shape", "output shape reference_shape"),
+    ],
+)
+def test_private_names_of_kornia_are_as_the_front_end_takes_them(owner, name, parameters):
+    """Other tests notice changes of `_params`, and of `_data` and `_valid` of labels."""
+    assert " ".join(inspect.signature(getattr(owner, name)).parameters) == parameters

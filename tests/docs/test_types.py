@@ -73,7 +73,7 @@ def run(project, checker, *arguments):
 
 
 def pyright(project, *arguments, **settings):
-    settings = {"venvPath": ".", "venv": ".venv", "pythonVersion": "3.10", **settings}
+    settings = {"venvPath": ".", "venv": ".venv", "pythonVersion": "3.11", **settings}
     (project / "pyrightconfig.json").write_text(json.dumps(settings))
     return run(project, "pyright", *arguments)
 
@@ -87,7 +87,7 @@ def is_of_others(line):
 @pytest.mark.slow
 def test_mypy_finds_what_is_wrong_and_no_error_on_any_page(project):
     python, cache = project / ".venv" / "bin" / "python", ROOT / ".mypy_cache" / "project"  # kept, for torch
-    options = ["--strict", "--python-version=3.10", f"--python-executable={python}", "--config-file="]
+    options = ["--strict", "--python-version=3.11", f"--python-executable={python}", "--config-file="]
     said = run(project, "mypy", *options, f"--cache-dir={cache}", *UNTYPED, "uses", "pages")
     assert re.search(r"\d\d+ source files", said), said
     found = [line for line in said.splitlines() if "error:" in line]
