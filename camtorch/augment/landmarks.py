@@ -164,9 +164,9 @@ class Mirroring:
             if meant is not None and count not in _told:
                 _told.add(count)
                 warn(
-                    f"{self.owner}: {name} holds {count} points and mirrored faces keep their order: point 0 is then "
-                    f"on the other side. landmarks={meant}, if that is their order, puts them right; "
-                    "landmarks={} says that they shall keep it"
+                    f"{self.owner}: {name} holds {count} points, and mirrored faces keep their order: point 0 is then "
+                    f"on the other side. Pass landmarks={meant}, if that is their order, or "
+                    "landmarks={} to keep it"
                 )
             return None
         order, own = table.of(count), len(table.order)
