@@ -5,7 +5,7 @@
 
 from typing import TYPE_CHECKING
 
-from camtorch.augment.augmentation import Augmentation, Range
+from camtorch.augment.augmentation import Augmentation
 from camtorch.augment.box_crop import BoxCrop
 from camtorch.augment.change import Change
 from camtorch.augment.collate import collate
@@ -27,6 +27,7 @@ from camtorch.augment.kinds import from_pitch_yaw, to_pitch_yaw
 from camtorch.augment.landmarks import LANDMARKS
 from camtorch.augment.presets import PRESETS, Preset
 from camtorch.augment.random_camera import RandomCamera, RandomLens, RandomMount
+from camtorch.augment.ranges import Range
 from camtorch.augment.shutter import RandomShutter
 from camtorch.poses.rotations import mount_rotation
 from camtorch.values.arguments import LEFT

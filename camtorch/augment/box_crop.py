@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 from typing_extensions import Unpack
 
-from camtorch.augment.augmentation import Augmentation, EditOptions, as_range
+from camtorch.augment.augmentation import Augmentation, EditOptions
+from camtorch.augment.ranges import as_range
 from camtorch.cameras.camera import Camera
 from camtorch.poses.rotations import mount_rotation
 from camtorch.values.arguments import as_known_size, as_whole

@@ -10,10 +10,11 @@ import torch
 from torch import Tensor, nn
 from typing_extensions import Unpack
 
-from camtorch.augment.augmentation import Augmentation, EditOptions, Range, draw
+from camtorch.augment.augmentation import Augmentation, EditOptions
 from camtorch.augment.change import Change, check_sizes
 from camtorch.augment.edits import Edit, change_by
 from camtorch.augment.landmarks import Mirroring
+from camtorch.augment.ranges import Range, draw
 from camtorch.cameras.camera import Camera
 from camtorch.values.arguments import as_mapping
 

@@ -12,13 +12,14 @@ import torch
 from torch import Tensor, nn
 from typing_extensions import Self, Unpack
 
-from camtorch.augment.augmentation import Augmentation, FilledOptions, Range, as_range
+from camtorch.augment.augmentation import Augmentation, FilledOptions
 from camtorch.augment.change import Change, Drawn, Part, no_turn
 from camtorch.augment.drawing import One, Start
 from camtorch.augment.filling import enough, scaled
 from camtorch.augment.jitter import DRAWN, jittered
 from camtorch.augment.kinds import CHECKED, Form, check_values
 from camtorch.augment.presets import PRESETS
+from camtorch.augment.ranges import Range, as_range
 from camtorch.augment.sample import Batch, Sample
 from camtorch.cameras.camera import Camera
 from camtorch.evaluate.kept import Kept

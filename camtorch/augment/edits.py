@@ -11,9 +11,10 @@ import torch
 from torch import Tensor
 from typing_extensions import Unpack
 
-from camtorch.augment.augmentation import Augmentation, EditOptions, FlipOptions, Range, as_range
+from camtorch.augment.augmentation import Augmentation, EditOptions, FlipOptions
 from camtorch.augment.change import Change, Part, by_kinds
 from camtorch.augment.landmarks import Mirroring, TableLike
+from camtorch.augment.ranges import Range, as_range
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.editing import edited, quarter_turns
 from camtorch.evaluate.known import known_false, known_true

@@ -8,8 +8,9 @@ from typing import Any, ClassVar
 import torch
 from typing_extensions import Unpack
 
-from camtorch.augment.augmentation import Augmentation, EditOptions, as_range
+from camtorch.augment.augmentation import Augmentation, EditOptions
 from camtorch.augment.change import Part
+from camtorch.augment.ranges import as_range
 from camtorch.cameras.camera import Camera
 from camtorch.values.arguments import one_of
 from camtorch.warp.shutter import DIRECTIONS, Direction, RollingShutter, ShutterWarp

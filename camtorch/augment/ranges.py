@@ -1,0 +1,154 @@
+"""Ranges that random augmentations draw from, and draws."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from camtorch.values.arguments import as_number, shown
+
+_CPU = torch.device("cpu")
+
+
+@dataclass(frozen=True)
+class Range:
+    """Even chances between two numbers; `size` of them for each sample, or one.
+
+    Raises:
+        ValueError: NaN, infinity, or the wrong order.
+    """
+
+    low: float
+    high: float
+    size: int | None = None
+
+    def __post_init__(self) -> None:
+        low, high = as_number(self.low, "low", "Range"), as_number(self.high, "high", "Range")
+        if not -math.inf < low <= high < math.inf:
+            raise ValueError(f"Range: low and high must be finite, with low <= high; got {self.low!r}, {self.high!r}")
+
+    @property
+    def middle(self) -> float:
+        """Between both ends."""
+        return (self.low + self.high) / 2
+
+    def __str__(self) -> str:
+        return f"({self.low:g}, {self.high:g})"
+
+
+def as_range(
+    value: object,
+    name: str,
+    owner: str,
+    *,
+    around: float = 0.0,
+    least: float = -math.inf,
+    most: float = math.inf,
+    size: int | None = None,
+) -> Range:
+    """Return a checked range of (low, high); a single number x is that from `around` - x to `around` + x."""
+    try:
+        if isinstance(value, Iterable) and not isinstance(value, str):
+            low, high = map(float, value)
+        else:
+            number = as_number(value, name, owner)
+            low, high = around - number, around + number
+    except (TypeError, ValueError, RuntimeError, OverflowError):
+        raise TypeError(f"{owner}: {name} must be a range (low, high) or a number; got {shown(value)}") from None
+    if not (math.isfinite(low) and math.isfinite(high)):
+        raise ValueError(f"{owner}: {name} must be finite; got {value!r}")
+    if low > high:
+        raise ValueError(f"{owner}: {name} must be (low, high) with low <= high; got {value!r}")
+    if around == 0 and least > 0 and not isinstance(value, Iterable):
+        raise TypeError(f"{owner}: {name} must be a range (low, high); got {value!r}")
+    if low < least or high > most:
+        means = "" if isinstance(value, Iterable) else f", which stands for ({low:g}, {high:g})"
+        raise ValueError(f"{owner}: {name} must lie within [{least:g}, {most:g}]; got {value!r}{means}")
+    return Range(low, high, size)
+
+
+class Spans:
+    """Ranges, ready to draw a value of each for some samples."""
+
+    low: NDArray[np.float64]
+    wide: NDArray[np.float64]
+    _places: list[tuple[str, slice, tuple[int, int] | None]]
+    _ends: list[tuple[float, float]]
+
+    def __init__(self, ranges: Mapping[str, Range], rows: int):
+        self.ranges: dict[str, Range] = dict(ranges)
+        self.rows = rows
+        self._places, self._ends = [], []
+        for name, interval in ranges.items():
+            start, shape = len(self._ends), (rows, interval.size) if interval.size else None
+            self._ends += [(interval.low, interval.high - interval.low)] * (rows * (interval.size or 1))
+            self._places.append((name, slice(start, len(self._ends)), shape))
+        self.total: int = len(self._ends)
+        self.low, self.wide = np.array(self._ends, np.float64).reshape(-1, 2).T.copy()
+
+    def numbers(self, shares: Sequence[float]) -> list[float]:
+        """Return the values of one row, range by range."""
+        return [low + wide * share for (low, wide), share in zip(self._ends, shares, strict=True)]
+
+    def named(self, values: Sequence[float]) -> dict[str, list[Any]]:
+        """Return the values of one row, (1,) or (1, size), by their names."""
+        return {n: [*values[at]] if shape is None else [[*values[at]]] for n, at, shape in self._places}
+
+    def of(self, shares: Any) -> dict[str, Any]:
+        """The values (rows,) or (rows, size) at shares (total,) of their ranges, arrays or tensors."""
+        low: Any = self.low
+        wide: Any = self.wide
+        if isinstance(shares, Tensor):
+            low, wide = (torch.as_tensor(ends, device=shares.device) for ends in (low, wide))
+        values = low + wide * shares
+        return {n: values[at] if shape is None else values[at].reshape(shape) for n, at, shape in self._places}
+
+
+def draw(
+    ranges: Mapping[str, Range],
+    count: int,
+    p: float,
+    same: bool,
+    generator: torch.Generator | None,
+    spans: Spans | None = None,
+) -> tuple[dict[str, Any], Spans]:
+    """Return `apply` (count,), true with probability p, a value (count,) or (count, size) of every range; and `spans`.
+
+    Lists of one sample and arrays of several take less time than tensors, which come where the generator is on another
+    device, or code is compiled.
+    """
+    rows = min(count, 1) if same else count
+    gate, shares, spans = draw_shares(ranges, rows, p, generator, spans)
+    if shares.is_cpu and not torch.compiler.is_compiling():
+        if rows == count == 1:
+            applied = [p >= 1] if gate is None else gate.tolist()
+            return {"apply": applied, **spans.named(spans.numbers(shares.tolist()))}, spans
+        gate, shares = np.array([p >= 1] * rows, bool) if gate is None else gate.numpy(), shares.numpy()
+    elif gate is None:
+        gate = torch.full((rows,), p >= 1, device=shares.device)
+    values = {"apply": gate, **spans.of(shares)}
+    return (values if rows == count else {name: value[[0] * count] for name, value in values.items()}), spans
+
+
+def draw_shares(
+    ranges: Mapping[str, Range], rows: int, p: float, generator: torch.Generator | None, spans: Spans | None
+) -> tuple[Any, Any, Spans]:
+    """Return the gate (rows,), or None if there is no choice, a share of each range, and the ranges, ready.
+
+    The order is kornia's: the gate first.
+    """
+    if not (generator is None or isinstance(generator, torch.Generator)):
+        raise TypeError(f"draw: generator must be a torch.Generator, or None; got {shown(generator)}")
+    if spans is None or spans.rows != rows or spans.ranges != ranges:
+        spans = Spans(ranges, rows)
+    device = _CPU if generator is None else generator.device
+    gate = torch.rand(rows, generator=generator, device=device) < p if 0 < p < 1 else None
+    # in float64, so that what is drawn is what every precision sees
+    return gate, torch.rand(spans.total, generator=generator, dtype=torch.float64, device=device), spans
