@@ -94,7 +94,8 @@ class Augmentation(SampleTransform):
         camera: of samples that do not bring one. The augmentation keeps a copy, which does not learn, nor follow later
             changes of the camera.
         p, same_on_batch: how likely a sample is augmented at all; the same draw for the whole batch.
-        fields: name -> kind, for fields of other names; "keep" leaves one as it is.
+        fields: name -> kind, for fields of other names; "keep" leaves one as it is. A * in a name stands for any
+            characters, as in "observation.images.*"; of several that fit, the first counts.
         mode, padding_mode, fill, antialias, tolerance: of images; see `Warp`.
         mask_fill: the value of masks where nothing is seen.
         valid_mask: whether `image_valid` (B, 1, H, W) comes out: where the image shows something.

@@ -146,6 +146,8 @@ def kind_of(name: str, value: object, own: Mapping[str, str], owner: str, single
     if name.endswith("_valid"):
         return None
     base = name if name in KINDS else ALIASES.get(name)
+    if base is None and (pattern := pattern_of(name, own)) is not None:
+        return None if own[pattern] == KEEP else own[pattern]
     # image_path and mask_id, of a sample or a batch, are no images or masks
     if base is None and isinstance(value, (Tensor, np.ndarray, list, tuple)) and not is_text(value):
         begins = sorted((k for k in KINDS if name.startswith(k + "_")), key=len)  # compilers do not know max with a key
@@ -163,6 +165,15 @@ def kind_of(name: str, value: object, own: Mapping[str, str], owner: str, single
             f"Pass fields={{{name!r}: KIND}}, with KIND one of {', '.join(KINDS)} or {KEEP}"
         )
     return base
+
+
+def pattern_of(name: str, own: Mapping[str, str]) -> str | None:
+    """Return the first pattern in `own`, with a * for any characters, that a name matches."""
+    for key in own:
+        head, star, tail = key.partition("*")
+        if star and len(name) >= len(head + tail) and name.startswith(head) and name.endswith(tail):
+            return key
+    return None
 
 
 def is_text(value: Any) -> bool:

@@ -19,7 +19,7 @@ from torch import Tensor
 from camtorch.augment.augmentation import Augmentation
 from camtorch.augment.change import Change
 from camtorch.augment.front_end import FrontEnd, camera_of_sample, check_front_end
-from camtorch.augment.kinds import IMAGES, KEEP, KINDS, OWN, as_tensor, kind_of
+from camtorch.augment.kinds import IMAGES, KEEP, KINDS, OWN, as_tensor, kind_of, pattern_of
 from camtorch.augment.sample import Frames, detached, on_samples
 from camtorch.cameras.camera import Camera
 from camtorch.evaluate.private import pytree
@@ -147,7 +147,8 @@ class Transform(FrontEnd, v2.Transform):
             except ValueError as error:
                 problems[i] = error
         if IMAGES[0] not in kinds.values():
-            free = (i for i, kind in kinds.items() if not (kind or names[i] in fields or names[i].endswith("_valid")))
+            named = {name for name in names if name in fields or name.endswith("_valid") or pattern_of(name, fields)}
+            free = (i for i, kind in kinds.items() if not (kind or names[i] in named))
             first = next((i for i in free if isinstance(flat[i][1], Tensor) and flat[i][1].ndim > 1), -1)
             kinds |= {} if first < 0 else {first: IMAGES[0]}
             problems.pop(first, None)

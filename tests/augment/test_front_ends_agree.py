@@ -156,7 +156,7 @@ def test_numbers_of_unknown_names_are_refused(front_end, monkeypatch):
     batch = (2,) if front_end == "kornia" else ()
     fields = sample(*batch) | {"lidar": sample(*batch)["points"]}
     with pytest.raises(ValueError, match=r"'lidar' holds real numbers.*fields=\{'lidar': KIND\}"):
-        both(front_end, RandomMount(), camera(), fields, monkeypatch)
+        both(front_end, RandomMount(fields={"lid*dar": "points"}), camera(), fields, monkeypatch)  # it has more letters
     for name, hidden in {
         "keypts": [[10, 20], [30, 40]],
         "eyes": [np.float32(3)] * 2,
@@ -164,8 +164,11 @@ def test_numbers_of_unknown_names_are_refused(front_end, monkeypatch):
     }.items():
         with pytest.raises(ValueError, match=f"'{name}' holds real numbers"):
             both(front_end, RandomMount(), camera(), sample(*batch) | {name: hidden}, monkeypatch)
-    for kind in ("keep", "points"):
-        moved, want = both(front_end, RandomMount(fields={"lidar": kind}), camera(), fields, monkeypatch)
+    for key, kind in {"lidar": "keep", "li*ar": "points", "*": "keep"}.items():
+        # the first pattern that matches counts, and names that are known need none
+        own = {key: kind, "*dar": "gaze", "keypoints*": "keep"}
+        moved, want = both(front_end, RandomMount(fields=own), camera(), fields, monkeypatch)
+        assert not torch.equal(moved["keypoints"], fields["keypoints"])
         assert torch.equal(moved["lidar"], want["lidar"])
         assert torch.equal(moved["lidar"], fields["lidar"]) == (kind == "keep")
 
