@@ -54,6 +54,7 @@ from camtorch.values.arguments import (
     hinting,
     no_camera,
 )
+from camtorch.values.module import GeometryModule
 from camtorch.values.threads import on_one_thread
 from camtorch.warp.sampling import Options, as_options
 
@@ -101,6 +102,10 @@ class KeepsCamera:
             value = copy.deepcopy(value)
             for tensor in (*value.parameters(), *value.buffers()):
                 tensor.requires_grad_(False)
+            for part in value.modules():  # as buffers, which network.requires_grad_(True) leaves alone
+                learns = [key for key, tensor in part._parameters.items() if tensor is not None]
+                for key in learns if isinstance(part, GeometryModule) else ():
+                    part.put(key, cast("Tensor", part._parameters.pop(key)).detach(), persistent=True)
         super().__setattr__(name, value)
 
 

@@ -63,6 +63,8 @@ def test_a_given_camera_is_copied_and_does_not_learn(name, kind, monkeypatch):
         held = (BATCHES | SINGLE)[name](lens)
         cameras = [part for part in held.modules() if type(part) is type(lens)]
         before = [camera.intrinsics.clone() for camera in cameras]
+        if kind != "parametrized":  # whose Parameters are those of torch's own modules
+            held.requires_grad_(True)  # as a network that it is a part of
         optimizer = torch.optim.Adam([*nn.ModuleList([held]).parameters(), weight], lr=1.0)
         moved(held, weight)["image"].sum().backward()
         optimizer.step()
