@@ -1,1 +1,1 @@
-"""Boards that are photographed to calibrate: what they are, and finding them in images."""
+"""Calibration boards: their points, and finding them in images."""

@@ -1,6 +1,6 @@
-"""Boards that are photographed to calibrate: their points, in the board's frame.
+"""Calibration boards: their points, in the board's frame.
 
-The frame lies in the board: x right, y down, z away from the viewer, as OpenCV's; lengths in the caller's unit.
+The frame lies in the board, as OpenCV's: x right, y down, z away from the viewer. Lengths are in the caller's unit.
 """
 
 from __future__ import annotations
@@ -22,19 +22,19 @@ def opencv(owner: str) -> Any:
 
 @dataclass(frozen=True)
 class Board:
-    """What all kinds of boards have: `columns` and `rows` of what is `counted`, and the side of a `square` or tag."""
+    """The common part of all boards: `columns` and `rows` of what is `counted`, and the side of a `square` or tag."""
 
     columns: int
     rows: int
     square: float = 1.0
     kind: ClassVar[str]
     counted: ClassVar[str]
-    least: ClassVar[int] = 3  # OpenCV finds no smaller ones
+    least: ClassVar[int] = 3  # OpenCV finds no smaller boards
 
     @property
     def is_symmetric(self) -> bool:
-        """Whether it looks the same after a turn, so that its first point is ambiguous, as some chessboards do."""
-        return isinstance(self, Chessboard) and (self.columns + self.rows) % 2 == 0  # a turn keeps black and white
+        """Whether the board looks the same after a half turn, so that its first point is ambiguous."""
+        return isinstance(self, Chessboard) and (self.columns + self.rows) % 2 == 0  # a half turn keeps black and white
 
     def points(self) -> NDArray[np.float64]:
         """Return the points (N, 3), row by row from the top left."""
@@ -42,7 +42,7 @@ class Board:
         return np.stack([x, y, np.zeros_like(x)], -1).reshape(-1, 3)
 
     def _places(self, count: int) -> NDArray[np.float64]:
-        """Return where points are along a side, in squares."""
+        """Return the places of points along a side, in squares."""
         raise NotImplementedError
 
     def words(self, unit: str = "") -> str:
@@ -54,7 +54,7 @@ class Board:
 
 @dataclass(frozen=True)
 class Chessboard(Board):
-    """A chessboard, whose inner corners OpenCV counts; it has one square more each way."""
+    """A chessboard, counted by inner corners as in OpenCV; it has one square more each way."""
 
     kind = "chessboard"
     counted = "inner corners"
@@ -65,7 +65,7 @@ class Chessboard(Board):
 
 @dataclass(frozen=True)
 class Charuco(Board):
-    """OpenCV's ChArUco: a chessboard with markers in its white squares, so that a part of it is enough.
+    """OpenCV's ChArUco: a chessboard with markers in its white squares, of which a part is enough.
 
     `legacy` boards, of OpenCV before 4.6, have a white square at the top left if the rows are even.
     """
@@ -123,7 +123,7 @@ def as_board(board: Any, square: float, options: dict[str, Any], owner: str) -> 
         raise ValueError(f"{owner}: a board's type must be one of {', '.join(BOARDS)}; got {match[1]!r}")
     known = [field.name for field in fields(kind)][3:]
     if strange := sorted(set(options) - set(known)):
-        raise ValueError(f"{owner}: a {kind.kind} takes {', '.join(known) or 'no option'}; got {', '.join(strange)}")
+        raise ValueError(f"{owner}: {kind.kind} options must be {', '.join(known) or 'none'}; got {', '.join(strange)}")
     options = ({"marker": 0.75 * square} if kind is Charuco else {}) | options
     found = kind(int(match[2]), int(match[3]), square, **options)
     if min(found.columns, found.rows) < kind.least:

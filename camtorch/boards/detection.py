@@ -1,4 +1,4 @@
-"""Finding a board in an image, by OpenCV: the pixels of its points. An integer coordinate is a pixel's centre."""
+"""Detection of a board in an image by OpenCV: the pixels of its points. An integer coordinate is a pixel's centre."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from camtorch.boards.boards import AprilGrid, Board, Charuco, Chessboard, opencv
 Pixels = NDArray[np.float64]
 Grey = NDArray[np.uint8]
 
-_FEWEST = 6  # points that tell the pose of a board well
-_PIXELS = 3e6  # of an image in which chessboards are searched for; they are refined in the whole one
-_SMALL = 1.5e6  # pixels of an image that is also searched for markers at twice the size
+_FEWEST = 6  # points that determine the pose of a board well
+_PIXELS = 3e6  # at most, of an image to search for chessboards; they are refined in the whole one
+_SMALL = 1.5e6  # pixels, below which an image is also searched for markers at twice the size
 _WINDOWS = (0.2, 0.3, 0.4)  # half the sides of windows around corners, in distances to the nearest corner
-_STRAY = 0.15  # such distances between a corner and its place by its rows, from which it is wrong
+_STRAY = 0.15  # such distances, from which a corner is too far from the place expected by its rows
 
 
 def detect(board: Board, image: NDArray[Any]) -> tuple[Pixels, str]:
     """Find a board in an image (H, W) of uint8 or uint16: pixels (N, 2), NaN if unseen; or all NaN, and the reason.
 
-    A chessboard begins where black is at its top left. If that allows several orders (`board.is_symmetric`), the first
-    point is the one nearest to the image's top left corner.
+    The top left square of a chessboard is black. If several orders begin so (`board.is_symmetric`), the first point is
+    the one nearest to the image's top left corner.
     """
     cv2 = opencv("finding boards in images")
-    if image.dtype != np.uint8:  # the range that is used
+    if image.dtype != np.uint8:  # stretched from the range that is used
         low, high = np.percentile(image, (0.1, 99.9))
         image = np.clip((image.astype(np.float32) - low) * (255 / max(high - low, 1)), 0, 255)
     find: Any = {Chessboard: _chessboard, Charuco: _charuco, AprilGrid: _aprilgrid}[type(board)]
@@ -39,7 +39,7 @@ def detect(board: Board, image: NDArray[Any]) -> tuple[Pixels, str]:
     if seen.sum() < _FEWEST:
         return _nothing(board), f"only {seen.sum()} points found, of which {_FEWEST} are needed"
     if np.linalg.matrix_rank(np.diff(board.points()[seen], axis=0)) < 2:
-        return _nothing(board), "the points found lie on one line, which does not tell where the board is"
+        return _nothing(board), "the points found lie on one line, which leaves the board's pose open"
     return pixels, ""
 
 
@@ -48,7 +48,7 @@ def _nothing(board: Board) -> Pixels:
 
 
 def _refined(cv2: Any, grey: Grey, corners: Pixels, radius: float) -> Pixels:
-    """Return corners moved to where the gradients around them meet, in a window of half the side `radius`."""
+    """Return corners moved to the points at which gradients meet, in windows of half the side `radius`."""
     half = int(np.clip(round(radius), 2, 20))
     stop = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 100, 1e-4)
     refined = cv2.cornerSubPix(grey, corners.astype(np.float32).reshape(-1, 1, 2), (half, half), (-1, -1), stop)
@@ -73,18 +73,18 @@ def _chessboard(cv2: Any, board: Chessboard, grey: Grey) -> Pixels:
 
 
 def _ordered(grey: Grey, grid: Pixels) -> Pixels:
-    """Return a grid (rows, columns, 2) in the board's order, from whichever corner it was found."""
+    """Return a grid (rows, columns, 2), found from any corner, in the board's order."""
     right, down = (grid[:, -1] - grid[:, 0]).mean(0), (grid[-1] - grid[0]).mean(0)
     if right[0] * down[1] < right[1] * down[0]:  # boards are seen from the front
         grid = grid[:, ::-1]
     orders = [np.rot90(grid, k) for k in ((0, 2) if grid.shape[0] != grid.shape[1] else (0, 1, 2, 3))]
-    # a board that begins with white in every order has no better one
+    # if a board begins with white in every order, none is better
     orders = [order for order in orders if _begins_with_black(grey, order)] or orders
     return np.ascontiguousarray(min(orders, key=lambda order: float(order[0, 0].sum())))
 
 
 def _begins_with_black(grey: Grey, grid: Pixels) -> bool:
-    """Whether the squares between corners are black first, as the one at the board's top left, which they touch."""
+    """Whether the first square between corners is black, like the board's top left square, diagonal to it."""
     middles = (grid[:-1, :-1] + grid[1:, :-1] + grid[:-1, 1:] + grid[1:, 1:]) / 4
     columns, rows = np.rint(middles).astype(int).T  # (columns, rows) of the grid each
     inside = (columns >= 0) & (columns < grey.shape[1]) & (rows >= 0) & (rows < grey.shape[0])
@@ -94,10 +94,11 @@ def _begins_with_black(grey: Grey, grid: Pixels) -> bool:
 
 
 def _at_gradients(cv2: Any, grey: Grey, grid: Pixels) -> Pixels:
-    """Return the corners (N, 2) moved to where gradients meet, or as found if noise makes moving worse.
+    """Return the corners (N, 2) moved to the points at which gradients meet, or as found if noise makes that worse.
 
-    A lens bends rows of corners smoothly, so their third differences are noise: the least of it is taken. A corner far
-    from where its rows have it, as OpenCV returns some at the ends of steep ones, is searched for there, or unseen.
+    A lens bends rows of corners smoothly, so their third differences are noise, and the corners with the least of it
+    are returned. OpenCV misplaces some corners at the ends of steep rows: a corner far from the place expected by its
+    rows is searched there, or unseen.
     """
     numbers = np.arange(grid[..., 0].size).reshape(grid.shape[:2])
     runs = [line[i : i + 4] for line in (*numbers, *numbers.T) for i in range(len(line) - 3)]
@@ -131,18 +132,18 @@ def _to_nearest(pixels: Pixels) -> Pixels:
 def _dictionary(cv2: Any, name: str) -> Any:
     known = {key[5:].lower(): key for key in dir(cv2.aruco) if key.startswith("DICT_")}
     if (key := known.get(name.lower().removeprefix("dict_"))) is None:
-        raise ValueError(f"board: no dictionary of markers is called {name!r}; OpenCV has {', '.join(sorted(known))}")
+        raise ValueError(f"board: dictionary must be one of {', '.join(sorted(known))}; got {name!r}")
     return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, key))
 
 
 def _passes(cv2: Any, grey: Grey, border: int = 1) -> list[tuple[Grey, int, Any]]:
-    """Return images to search for markers, how much larger they are, and the parameters; the most promising first."""
+    """Return images to search for markers, their scales, and the parameters; the most promising first."""
     low, high = np.percentile(grey, (2, 98))
     images = [(grey, 1)]
     if grey.size < _SMALL:
         images.insert(0, (cv2.resize(grey, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC), 2))
     passes = []
-    for margin in (0.1 * float(high - low), 7.0):  # one that keeps apart what nearly touches, and OpenCV's own
+    for margin in (0.1 * float(high - low), 7.0):  # one that separates shapes that nearly touch, and OpenCV's own
         parameters = cv2.aruco.DetectorParameters()
         parameters.adaptiveThreshWinSizeMin, parameters.adaptiveThreshWinSizeMax = 5, 53
         parameters.adaptiveThreshWinSizeStep = 6
@@ -170,7 +171,7 @@ def _charuco(cv2: Any, board: Charuco, grey: Grey) -> Pixels:
 
 
 def _from_centres(cv2: Any, image: Grey, corners: Pixels) -> Pixels:
-    """Return ChArUco's corners with integers at pixels' centres: OpenCV 4 has them half a pixel further right, down."""
+    """Return ChArUco's corners with integers at pixels' centres: those of OpenCV 4 may be half a pixel off."""
     return corners + np.rint(2 * np.median(_refined(cv2, image, corners, 3) - corners, axis=0)) / 2
 
 
@@ -197,7 +198,7 @@ def _aprilgrid(cv2: Any, board: AprilGrid, grey: Grey) -> Pixels:
 
 
 def _consistent(cv2: Any, board: AprilGrid, tags: dict[int, Pixels]) -> dict[int, Pixels]:
-    """Return the tags that lie where their neighbours put them, their corners clockwise from the board's top left."""
+    """Return the tags that lie where their neighbours expect them, with corners clockwise from the board's top left."""
     places = {tag: board.points()[board.corners_of(tag), :2].astype(np.float32) for tag in tags}
     reach = 2.1 * board.square * (1 + board.spacing)
     pairs = [(a, b) for a, b in itertools.permutations(tags, 2) if np.linalg.norm(places[a][0] - places[b][0]) < reach]
@@ -211,7 +212,7 @@ def _consistent(cv2: Any, board: AprilGrid, tags: dict[int, Pixels]) -> dict[int
         side = np.linalg.norm(tags[b] - np.roll(tags[b], 1, 0), axis=1).mean()
         return float(np.linalg.norm((x, y) / w - tags[b].mean(0)) / side) if w > 0 else math.inf
 
-    # OpenCV begins at the top left of a tag's code as its dictionary has it, which a board may hold turned
+    # OpenCV begins at the top left of a tag as in its dictionary; the board may hold tags turned
     errors = np.array([[error(turn, *pair) for pair in pairs] for turn in range(4)])
     turn = int(np.median(errors, axis=1).argmin())
     seconds = np.array(pairs)[:, 1]

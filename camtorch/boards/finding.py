@@ -1,4 +1,4 @@
-"""Boards in photographs, as `ct.calibrate` takes them: `find_board`."""
+"""Finding boards in photographs for `ct.calibrate`: `find_board`."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ from camtorch.values.arguments import as_number, shown, warn
 
 _OWNER = "find_board"
 IMAGES = frozenset({".bmp", ".jpeg", ".jpg", ".pgm", ".png", ".ppm", ".tif", ".tiff", ".webp"})  # read, and written
-_NAMED = 6  # images left out, in the warning
+_NAMED = 6  # images left out that a warning names, at most
 _RGB = 0.299, 0.587, 0.114
-_EITHER_WAY = 0.2065, 0.587, 0.2065  # of RGB or BGR: boards are black and white
+_EITHER_WAY = 0.2065, 0.587, 0.2065  # for RGB and BGR, as boards are black and white
 
 
 class BoardObservations(NamedTuple):
@@ -33,11 +33,11 @@ class BoardObservations(NamedTuple):
     object_points: list[NDArray[np.float64]]
     """(N, 3) each: the board's points, in units of `square`."""
     image_points: list[NDArray[np.float64]]
-    """(N, 2) pixels each, NaN where a point was not seen."""
+    """(N, 2) pixels each, NaN for unseen points."""
     names: list[str]
-    """Of the images: their paths, or "image 3" of an array."""
+    """Paths of the images, or "image 3" for an array."""
     image_size: tuple[int, int]
-    """(height, width)."""
+    """(height, width) of the images."""
 
     def __repr__(self) -> str:
         seen = sum(int(np.isfinite(pixels[:, 0]).sum()) for pixels in self.image_points)
@@ -46,24 +46,24 @@ class BoardObservations(NamedTuple):
 
 
 def find_board(images: Any, board: Any, *, square: float = 1.0, **options: Any) -> BoardObservations:
-    """Find a board in images, with the finder of `camtorch calibrate`, for calibrations in Python.
+    """Find a board in images, as `camtorch calibrate` does, to calibrate in Python.
 
         found = ct.find_board("photos/*.jpg", "9x6", square=0.024)
         calibration = ct.calibrate(
             "kannala_brandt", found.object_points, found.image_points, image_size=found.image_size
         )
 
-    Files are taken as they are stored, and not turned by their Exif orientation, since a camera is that of stored
-    pixels. Images without the board, that cannot be read, or of another size than most are left out, and one warning
-    names them. It needs OpenCV: `pip install -e ".[calibrate]"`.
+    Files are read as stored, without their Exif orientation, since a camera describes stored pixels. Images without the
+    board, unreadable ones, and those of another size than most are left out; one warning names them. It needs OpenCV:
+    `pip install -e ".[calibrate]"`.
 
     Args:
-        images: a path, a folder, a pattern as "photos/*.jpg", or a list of these; or arrays (H, W), (H, W, C), tensors
-            (C, H, W), one, a list, or a stack of them, uint8 or uint16 (floating point is taken as 0 to 1); or a list
-            of PIL's images.
+        images: a path, a folder, a pattern such as "photos/*.jpg", or a list of these; an array (H, W) or (H, W, C) or
+            a tensor (C, H, W), a list or a stack of them, uint8, uint16 or floating point from 0 to 1; or a list of
+            Pillow images.
         board: "9x6", the inner corners of a chessboard across and down, or (9, 6); "charuco 5x7", squares; "aprilgrid
             6x6", tags.
-        square: the side of a square, or of a tag, in the unit that poses shall have.
+        square: the side of a square, or of a tag, in the unit of the poses.
         options: `marker`, `dictionary` and `legacy` of a ChArUco board, `spacing`, `border` and `dictionary` of a grid
             of tags; see `camtorch calibrate --help`.
 
@@ -77,7 +77,7 @@ def find_board(images: Any, board: Any, *, square: float = 1.0, **options: Any) 
     used, left_out = usable(found)
     if not used:
         reasons = "; ".join(f"{path}: {why}" for path, why in left_out)
-        raise ValueError(f"{_OWNER}: {wanted.words()} is in none of {len(found)} images: {reasons:.500}")
+        raise ValueError(f"{_OWNER}: images must show {wanted.words()}; got {len(found)} without. {reasons:.500}")
     if left_out:
         named = ", ".join(f"{path} ({why})" for path, why in left_out[:_NAMED])
         more = f" and {len(left_out) - _NAMED} more" if len(left_out) > _NAMED else ""
@@ -92,14 +92,14 @@ class ImageCorners(NamedTuple):
     path: Path
     image_size: tuple[int, int]  # (height, width)
     pixels: NDArray[np.float64]  # (N, 2) of the board's points, NaN if unseen
-    reason: str  # why nothing was found, or empty
+    reason: str  # why no point was found, or empty
 
 
 Image = tuple[Path, "NDArray[Any] | None"]  # the path of an image, or a name for it and its grey values (H, W)
 
 
 def search(board: Board, images: Sequence[Image], done: Callable[[], object] = lambda: None) -> list[ImageCorners]:
-    """Search images for a board by all cores; `done` is called after each."""
+    """Search images for a board on all cores, and call `done` after each."""
     found = []
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         for one in pool.map(lambda image: _search(board, *image), images):
@@ -118,7 +118,7 @@ def _search(board: Board, path: Path, grey: NDArray[Any] | None) -> ImageCorners
 
 
 def usable(found: Sequence[ImageCorners]) -> tuple[list[ImageCorners], list[tuple[Path, str]]]:
-    """Return what says something of a camera: the board, seen at the usual size; and the others, with the reason."""
+    """Return the images that show the board at the most frequent size, and the paths of the others with the reasons."""
     sizes = Counter(one.image_size for one in found if not one.reason)
     usual = sizes.most_common(1)[0][0] if sizes else (0, 0)
     other = "{1}x{0}, but most images are {3}x{2}"
@@ -128,19 +128,19 @@ def usable(found: Sequence[ImageCorners]) -> tuple[list[ImageCorners], list[tupl
 
 
 def gather(words: Iterable[str]) -> list[Path]:
-    """Return images, each once, in natural order, of files, folders (not those in them), and patterns."""
+    """Return the paths of images, each once, in natural order, for files, folders (without subfolders) and patterns."""
     found: dict[str, Path] = {}
     for word in words:
         if (path := Path(word)).is_dir():
             paths = [p for p in path.iterdir() if p.suffix.lower() in IMAGES and p.is_file()]
             if not paths:
-                raise ValueError(f"{word}: a folder without images")
+                raise ValueError(f"{word}: the folder must hold images; got none")
         elif os.path.lexists(word) or not glob.has_magic(word):
             paths = [path]
         else:
             paths = [p for p in map(Path, glob.glob(word, recursive=True)) if p.is_file()]
             if not paths:
-                raise ValueError(f"{word}: no file has such a name")
+                raise ValueError(f"{word}: the pattern must match files; got none")
         found |= {os.path.abspath(p): p for p in paths}
     return sorted(found.values(), key=natural)
 
@@ -159,12 +159,12 @@ def _given(images: Any) -> list[Image]:
     if not isinstance(images, Sequence):
         raise TypeError(f"{_OWNER}: images must be paths or arrays; got {shown(images)}")
     if not images:
-        raise ValueError(f"{_OWNER}: images must not be empty; got no images")
+        raise ValueError(f"{_OWNER}: images must not be empty; got none")
     given: list[Image] = []
     for i, one in enumerate(images):
         if isinstance(one, (str, os.PathLike)):
             given += [(path, None) for path in gather([os.fspath(one)])]
-        elif isinstance(one, torch.Tensor) or hasattr(one, "__array_interface__"):  # as images of PIL have it
+        elif isinstance(one, torch.Tensor) or hasattr(one, "__array_interface__"):  # like Pillow's images
             array = one if isinstance(one, torch.Tensor) else np.asarray(one)
             given.append((Path(f"image {i}"), _grey_of(array, _EITHER_WAY, f"images[{i}]")))
         else:

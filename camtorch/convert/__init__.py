@@ -1,1 +1,1 @@
-"""A camera as a camera of another model."""
+"""Conversion of a camera to another model."""

@@ -1,4 +1,4 @@
-"""One camera as a camera of another model, and how good that is."""
+"""Conversion of a camera to another model, with its errors."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from camtorch.projection.camera_like import CameraLike
 from camtorch.values.arguments import as_image_size, as_number, as_whole
 from camtorch.values.module import remade
 
-_FIT_SIDE = 33  # of the lattice of pixels to fit to
-_ROWS = 64  # of a batch that are worked on at a time
-_WORTH_IT = 0.5  # of the largest error before: then more coefficients are taken
+_FIT_SIDE = 33  # nodes along a side of the lattice of pixels to fit to
+_ROWS = 64  # rows of a batch that are converted together
+_WORTH_IT = 0.5  # of the largest error before: more coefficients are taken if they get below it
 
 
 @torch.no_grad()
@@ -36,7 +36,7 @@ def convert(
     tolerance: float,
     **options: Any,
 ) -> Conversion[CameraT]:
-    """Convert a camera; see `Camera.convert`. `models` has all models by key, some of which may relate the two."""
+    """Convert a camera; see `Camera.convert`. `models` has all models by key; some may relate source and target."""
     owner = f"{type_before_parametrizations(source).__name__}.convert"
     image_size = as_image_size(image_size, owner) or source.image_size
     max_angle = None if max_angle is None else as_number(max_angle, "max_angle", owner)
@@ -76,7 +76,7 @@ def convert(
 
 
 class _Task(NamedTuple):
-    """Some rows to convert."""
+    """Rows of a batch to convert, and the options."""
 
     source: Reference
     model: type[CameraLike]
@@ -105,7 +105,7 @@ class _Result(NamedTuple):
     def replaced(self, rows: Tensor, other: _Result) -> _Result:
         """Return the results with those of `other` at `rows`."""
         if len(rows) == 0:
-            return self  # and as narrow as it was
+            return self  # without padding
         width = max(self.parameters.shape[-1], other.parameters.shape[-1])
         results = _Result(*(t.clone() for t in self.padded(width)))
         for result, new in zip(results, other.padded(width), strict=True):
@@ -122,7 +122,7 @@ class _Result(NamedTuple):
 
 
 def _with_fewest_coefficients(task: _Task, counts: tuple[int, ...]) -> _Result:
-    """Convert each row with the first of `counts` that keeps the tolerance, or else with the one that is worth it."""
+    """Convert each row with the first of `counts` within the tolerance, or with the last one that halved the error."""
     result = _converted(task, counts[0])
     for count in counts[1:]:
         rows = ((result.max_error > task.tolerance) & result.max_error.isfinite()).nonzero()[:, 0]
@@ -136,7 +136,7 @@ def _with_fewest_coefficients(task: _Task, counts: tuple[int, ...]) -> _Result:
 
 
 def _reaches_as_far(angle: Tensor, before: Tensor) -> Tensor:
-    return angle >= before * (1 - 1e-9)  # measured on another batch, it is rounded otherwise
+    return angle >= before * (1 - 1e-9)  # rounding depends on the batch
 
 
 def _converted(task: _Task, count: int) -> _Result:
@@ -156,7 +156,7 @@ def _converted(task: _Task, count: int) -> _Result:
     if len(rows := (~exact).nonzero()[:, 0]):
         parameters[rows] = fit(build(parameters), samples.observations.of(rows), starts[:, rows], slopes[rows])
     result = _measured(task, parameters, exact)
-    # no camera of the model has a largest error below the least root of the mean square
+    # the largest error of any camera of the model is at least the least rms
     rows = ((result.max_error > task.tolerance) & (result.rms < task.tolerance)).nonzero()[:, 0]
     if len(rows):
         these = task.of(rows)

@@ -1,4 +1,4 @@
-"""Cameras fitted to pixels of rays, each row of a batch for itself."""
+"""Fits of cameras to rays and their pixels, each row of a batch on its own."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from camtorch.values.arguments import columns
 _MOST_STEPS = 60
 _ROUNDS = 3
 _LAWSON_ROUNDS, _LAWSON_STEPS, _PATIENCE = 40, 2, 6
-_SETTLED = 1e-8  # the part of the cost that is left to gain when the search ends
+_SETTLED = 1e-8  # the part of the cost left to gain at which a search ends
 _NOTHING, _NEARLY_NOTHING = 1e-11, 1e-9  # px
-_SMOOTH = 1e-4  # of a pixel of error: one of a surface's second differences, which decides where no pixels do
-_LEAST_SLOPE = 1e-3  # of a lens at the axis, that a fit starts from
-_LOST = 0.1  # the error, in focal lengths, that a ray without a pixel counts as, where alternatives are compared
+_SMOOTH = 1e-4  # the weight of a surface's second differences, in px, which decide where there are no pixels
+_LEAST_SLOPE = 1e-3  # the least slope of a lens at the axis when a fit starts
+_LOST = 0.1  # the error, in focal lengths, of a ray without a pixel when alternatives are compared
 
 
 class Observations(NamedTuple):
@@ -38,16 +38,16 @@ class Observations(NamedTuple):
 def fit(
     camera: CameraLike, observations: Observations, starts: Tensor, slopes: Tensor, fixed: Tensor | None = None
 ) -> Tensor:
-    """Return the parameters (C, 4 + n) at which a camera sees rays nearest to their pixels.
+    """Return the parameters (C, 4 + n) at which a camera projects rays nearest to their pixels.
 
     Rays that the camera's chart never covers do not count. No row depends on another.
 
     Args:
-        camera: gives its optics, not its numbers.
-        observations: what it shall see.
-        starts: (S, C, n) coefficients to start from; of what becomes of them the best is kept.
+        camera: Camera whose optics are used, not its numbers.
+        observations: Rays, pixels and weights to fit to.
+        starts: (S, C, n) coefficients to start from; the best result is returned.
         slopes: (C, 4) the focal lengths at the axis in x and y, and the pixel of the axis.
-        fixed: (4 + n,) values that parameters keep, NaN for those that are looked for.
+        fixed: (4 + n,) values of parameters that are held, NaN for those to find.
     """
     if (smooth := camera.smoothness()) is not None:
         return _fit_linear(camera, observations, slopes, smooth.to(slopes), fixed)
@@ -63,7 +63,7 @@ def fit(
         parameters = parameters.clamp(low, high)
         within = observations._replace(weights=torch.zeros_like(observations.weights))
         for _ in range(_ROUNDS):
-            # a chart may cover more once its coefficients fit what it covered before
+            # a chart may cover more rays after a fit to those that it covers
             weights = observations.weights * to_sensor(camera, parameters[:, 4:], observations.rays).covered
             more = (weights != within.weights).any(-1) & ~found
             within = observations._replace(weights=weights)
@@ -98,9 +98,9 @@ def _fit_linear(
 def refine_minimax(camera: CameraLike, observations: Observations, parameters: Tensor) -> Tensor:
     """Return parameters (C, 4 + n) near the given ones with a smaller largest error; no row depends on another.
 
-    Lawson's algorithm: weighted least squares over and over, the weight of a square multiplied by its error each time.
+    Lawson's algorithm: repeated weighted least squares; each time the weight of a square is multiplied by its error.
     """
-    if camera.smoothness() is not None:  # more coefficients than errors have peaks
+    if camera.smoothness() is not None:  # such a lens has more coefficients than the errors have peaks
         return parameters
     low, high = bounds(camera, parameters)
     covered = observations.weights * to_sensor(camera, parameters[:, 4:], observations.rays).covered
@@ -112,7 +112,7 @@ def refine_minimax(camera: CameraLike, observations: Observations, parameters: T
         going = stale < _PATIENCE
         if not bool(going.any()):
             break
-        # of the error itself, the weight in a square is that of its root
+        # weights are of errors, not of their squares
         weights = weights * (error / error.amax(-1, keepdim=True).clamp(min=_NOTHING)).sqrt()
         weights = weights / weights.amax(-1, keepdim=True).clamp(min=1e-30)
         weighted = observations._replace(weights=weights)
@@ -150,7 +150,7 @@ def _residuals(observations: Observations, parameters: Tensor, seen: SensorPoint
 
 
 def _cost(camera: CameraLike, observations: Observations, parameters: Tensor) -> Tensor:
-    """Return the sums of squares (C,); infinite if a weighted ray is not covered or the coefficients make no camera."""
+    """Return the sums of squares (C,); infinite if a weighted ray is not covered or the coefficients are undefined."""
     seen = to_sensor(camera, parameters[:, 4:], observations.rays)
     lost = (~seen.covered & (observations.weights > 0)).any(-1)
     cost = _residuals(observations, parameters, seen).square().sum((1, 2))
@@ -160,7 +160,7 @@ def _cost(camera: CameraLike, observations: Observations, parameters: Tensor) ->
 
 
 class _Fit:
-    """The problem, for `levenberg_marquardt.minimise`: the state is the parameters (C, P)."""
+    """The problem for `levenberg_marquardt.minimise`, whose state is the parameters (C, P)."""
 
     def __init__(self, camera: CameraLike, observations: Observations, low: Tensor, high: Tensor):
         self.camera, self.observations, self.low, self.high = camera, observations, low, high

@@ -1,4 +1,4 @@
-"""How far a camera is from the one that it was made of, in the numbers that `Conversion` states."""
+"""The errors of a converted camera, which `Conversion` states."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from camtorch.least_squares.jacobians import to_sensor
 from camtorch.projection.camera_like import CameraLike
 from camtorch.rays.lattices import ray_fan
 
-_SIDE = 193  # of the lattice of pixels to compare at
-_PEAKS, _ROUNDS, _RIM = 16, 4, 720  # that are climbed, in so many rounds; rays at the largest angle
+_SIDE = 193  # nodes along a side of the lattice of pixels to compare at
+_PEAKS, _ROUNDS, _RIM = 16, 4, 720  # peaks of errors to search from, rounds, and rays at the largest angle
 _ROUNDING = 1e-9  # px
 
 
 class Reference(NamedTuple):
-    """The rays of cameras (C,) that others are compared on: up to an angle, and all that the image has."""
+    """The rays of cameras (C,) at which others are compared: up to an angle, and all rays of the image."""
 
     camera: CameraLike
     image_size: tuple[int, int] | None
@@ -30,7 +30,7 @@ class Reference(NamedTuple):
 
     @property
     def reach(self) -> Tensor:
-        """(C,) the largest angle from the axis, up to the limit; 0 where nothing is seen."""
+        """The largest angle (C,) from the axis, up to the limit; 0 if there are no rays."""
         return torch.where(self.rays.valid, self.rays.angles, 0.0).amax(-1)
 
     def of(self, camera: CameraLike, rows: Tensor) -> Reference:
@@ -46,9 +46,9 @@ def reference(camera: CameraLike, image_size: tuple[int, int] | None, limit: flo
 
 
 def measure(target: CameraLike, k: Tensor, exact: Tensor, source: Reference) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return rms, max_error, max_angle and valid_fraction (C,) of cameras (C,), of coefficients (C, n).
+    """Return rms, max_error, max_angle and valid_fraction (C,) of cameras (C,) with coefficients k (C, n).
 
-    The largest error is searched: from the highest peaks among the nodes upwards, and on the rim of the largest angle.
+    The largest error is searched from the highest peaks among the nodes, and on the rim of the largest angle.
     """
 
     def compared(rays: views.SampledRays) -> tuple[Tensor, Tensor]:

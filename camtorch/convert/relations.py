@@ -1,4 +1,4 @@
-"""Which models are special cases of which, and what becomes of coefficients on the way from one to another."""
+"""Models that are special cases of others, and coefficients carried over from one to another."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from camtorch.projection.camera_like import CameraLike
 
 Model = type[CameraLike]
 Models = Mapping[str, Model]
-Step = tuple[Model, Mapping[str, str]]  # a model, and the names there of the coefficients before; others are lost
+Step = tuple[Model, Mapping[str, str]]  # a model, and its names by the names before; coefficients without one are lost
 
-_MANY = 33
+_MANY = 33  # more coefficients are not compared
 
 
 def default_count(model: Model, source: CameraLike, models: Models) -> int:
-    """Return the number of coefficients that holds those of a related camera, at least the model's default."""
+    """Return the least number of coefficients, from the default on, that holds most of a related camera's."""
     if isinstance(source, model):
         return len(source.distortion_names)
     if (steps := _path(type(source), model, models)) is None:
@@ -32,7 +32,7 @@ def default_count(model: Model, source: CameraLike, models: Models) -> int:
 def carry_over(
     source: CameraLike, values: Tensor, model: Model, names: tuple[str, ...], models: Models
 ) -> tuple[Tensor, Tensor] | None:
-    """Return coefficients (C, n) as those of a related model, and whether nothing is lost; None if unrelated."""
+    """Return `values` as coefficients (C, n) of a related model, and whether none is lost (C,); None if unrelated."""
     if (steps := _path(type(source), model, models)) is None:
         return None
     result = values.new_tensor(model.ideal(len(names))).repeat(len(values), 1)
@@ -79,7 +79,7 @@ def _renamed(name: str, steps: list[Step]) -> str | None:
 
 
 def _ideal_value(source: CameraLike, name: str, steps: list[Step]) -> float:
-    """Return the value at which the coefficient may be lost: the ideal one of the last model that has it."""
+    """Return the value at which losing the coefficient changes nothing: the ideal one of the last model with it."""
     model, known = type(source), source.distortion_names
     for later, names in steps:
         if name not in names:
@@ -89,5 +89,5 @@ def _ideal_value(source: CameraLike, name: str, steps: list[Step]) -> float:
 
 
 def _all_names(model: Model) -> tuple[str, ...]:
-    """Return the names of as many coefficients as the model takes, fewer than `_MANY`."""
+    """Return the names of the most coefficients that the model takes, fewer than `_MANY`."""
     return max((names for names in map(model.names_of, range(_MANY)) if names is not None), key=len, default=())

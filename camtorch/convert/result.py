@@ -15,10 +15,10 @@ CameraT = TypeVar("CameraT", bound=CameraLike, covariant=True)
 
 @dataclass
 class Conversion(Generic[CameraT]):
-    """A camera of another model and how it differs from the one that it was made of.
+    """A camera of another model, and its differences from the old camera.
 
-    Compared are the pixels at which both see the same rays, on a lattice over the image of the old camera, its outer
-    edges included; without an image, on rays in all directions. Each number has the batch shape of the camera.
+    Both cameras' pixels of the same rays are compared, on a lattice over the image of the old camera, its outer edges
+    included; without an image, on rays in all directions. Each number has the batch shape of the camera.
     """
 
     camera: CameraT
@@ -28,12 +28,12 @@ class Conversion(Generic[CameraT]):
     max_error: Tensor
     """The largest distance in pixels, up to `max_angle`."""
     max_angle: Tensor
-    """The angle from the optical axis, in radians, up to which the new camera has a pixel for each compared ray, and
-    beyond which nothing is promised: the image's largest, the one asked for, or where the new model ends."""
+    """The angle from the optical axis, in radians, up to which the new camera has a pixel for each compared ray: the
+    image's largest, the one asked for, or the end of the new model. Beyond it nothing is guaranteed."""
     valid_fraction: Tensor
-    """The part of the image, of what the old camera has rays for, that lies within `max_angle`."""
+    """The part of the image with rays of the old camera that lies within `max_angle`."""
     exact: Tensor
-    """Bool: the models are related, and the numbers were taken over bit by bit; what differs is rounding."""
+    """Bool: whether models are related and coefficients carried over bit by bit, so that only rounding differs."""
     source_name: str = "camera"
 
     def __repr__(self) -> str:

@@ -12,12 +12,12 @@ from camtorch.convert.fitting import Observations
 from camtorch.projection.camera_like import CameraLike
 from camtorch.rays import lattices
 
-_ANGLES, _AZIMUTHS, _RADII = 180, 16, 64  # at which a camera is looked at as a whole
-_END_AHEAD = math.radians(87)  # of rays, for a camera without an image that does not see sideways
+_ANGLES, _AZIMUTHS, _RADII = 180, 16, 64  # samples of a whole camera
+_END_AHEAD = math.radians(87)  # the last angle of a camera without an image that does not see sideways
 
 
 class SampledRays(NamedTuple):
-    """Rays (C, N, 3) of a camera, its pixels (C, N, 2) of them, and whether it has them, bool (C, N)."""
+    """Rays (C, N, 3) of a camera, their pixels (C, N, 2), and whether the camera has both, bool (C, N)."""
 
     rays: Tensor
     pixels: Tensor
@@ -28,12 +28,12 @@ class SampledRays(NamedTuple):
 
     @property
     def observations(self) -> Observations:
-        """What a camera fitted to it shall see."""
+        """The observations for a camera that is fitted to these rays."""
         return Observations(self.rays, self.pixels, self.valid.to(self.pixels.dtype))
 
     @property
     def angles(self) -> Tensor:
-        """(C, N) radians from the axis."""
+        """Angles (C, N) from the axis in radians."""
         return lattices.angles_from_axis(self.rays)
 
 
@@ -42,7 +42,7 @@ class Lattice(NamedTuple):
 
     low: Tensor
     high: Tensor
-    side: int  # the number of nodes along either coordinate, both ends included
+    side: int  # number of nodes along each coordinate, both ends included
     are_pixels: bool
     limit: float  # radians from the axis, beyond which rays do not count
 
@@ -74,7 +74,7 @@ def lattice(camera: CameraLike, image_size: tuple[int, int] | None, side: int, l
     count = len(camera.intrinsics)
     if image_size is None:
         most = _reach(camera, limit)
-        # no node where panoramas are cut, and the last azimuth is next to the first one
+        # no node lies on the cut of panoramas, and the last azimuth is next to the first one
         first, last = (torch.full_like(most, (i + 0.25) * 2 * math.pi / side) for i in (0, side - 1))
         low, high = torch.cat((torch.zeros_like(most), first), -1), torch.cat((most, last), -1)
         return Lattice(low, high, side, False, limit)
@@ -95,7 +95,7 @@ def sample(camera: CameraLike, image_size: tuple[int, int] | None, side: int, li
 
 
 def sample_with_rings(camera: CameraLike, image_size: tuple[int, int] | None, side: int, limit: float) -> SampledRays:
-    """Return `sample` and rays on circles around the axis, along whose radii the errors of a radial lens change."""
+    """Return `sample` with further rays on circles around the axis: errors of a radial lens change along radii."""
     whole = sample(camera, image_size, side, limit)
     reach = torch.where(whole.valid, whole.angles, 0.0).amax(-1, keepdim=True)
     rings = seen(camera, image_size, lattices.ray_fan(reach * torch.linspace(0, 1, _RADII, **_like(camera)), _AZIMUTHS))
@@ -148,5 +148,5 @@ def radii(camera: CameraLike, slopes: Tensor, reach: Tensor) -> tuple[Tensor, Te
 
 
 def _like(camera: CameraLike) -> dict[str, Any]:
-    # steps of float32 would go past half a circle
+    # steps of float32 might exceed half a circle
     return {"dtype": camera.intrinsics.dtype, "device": camera.intrinsics.device}

@@ -1,1 +1,1 @@
-"""Nonlinear least squares: the method of Levenberg and Marquardt, and the Jacobians of charts and lenses for it."""
+"""Nonlinear least squares: the Levenberg-Marquardt method, and the Jacobians of charts and lenses for it."""

@@ -1,4 +1,4 @@
-"""Linearised least squares as triangles of a QR: of what each view has for itself, and of what all of them share."""
+"""Linearised least squares as triangles of a QR: of each view's own unknowns, and of those that all views share."""
 
 from __future__ import annotations
 
@@ -13,30 +13,30 @@ from camtorch.native.library import library
 
 
 class Equations(NamedTuple):
-    """Triangles of the linearised problem; the unknowns are L numbers a view, and G that all views share.
+    """Triangles of the linearised problem, with L unknowns of each view, and G unknowns that all views share.
 
-    A row of `view` means view[:L] * step of the view + view[L:-1] * shared step = -view[-1]. `columns` are names of the
-    shared unknowns: the camera (-1 for the board's bend) and the index of a parameter, 4 + n and on for its mount.
+    A row of `view` means view[:L] * step of the view + view[L:-1] * shared step = -view[-1]. `columns` names the shared
+    unknowns by camera (-1 for the board's bend) and index of a parameter, from 4 + n on for the camera's mount.
     """
 
     view: Tensor  # (B, V, L, L + G + 1)
-    shared: Tensor  # (B, G + 1, G + 1): what is left of all views
+    shared: Tensor  # (B, G + 1, G + 1): the rest of all views
     columns: tuple[tuple[int, int], ...] = ()  # (G,)
 
     @property
     def decrement(self) -> Tensor:
-        """(B,) by how much the cost would fall if the problem were linear."""
+        """The decrease (B,) of the cost by a full step if the problem were linear."""
         return self.view[..., -1].square().sum((-1, -2)) + self.shared[:, :-1, -1].square().sum(-1)
 
 
-_NOTHING = 1e-20  # of the squares of a column: what rounding leaves of one that is a sum of others
-_FEW = 64  # shared unknowns, for which compiled code is quicker than LAPACK
-_Steps = struct.Struct("11q").pack  # `Steps` of native/poses.h
-_FIRM = 1e-4  # of the largest singular value: what is less belongs to unknowns that the data hardly determine
+_NOTHING = 1e-20  # of a column's squares: the rounding left of a column that is a sum of others
+_FEW = 64  # shared unknowns, up to which compiled code is faster than LAPACK
+_Steps = struct.Struct("11q").pack  # the struct `Steps` of native/poses.h
+_FIRM = 1e-4  # of the largest singular value: smaller ones belong to unknowns that the data hardly determine
 
 
 class System:
-    """Linear problems with their damped steps: what `levenberg_marquardt.minimise` asks for."""
+    """Linear problems with their damped steps, for `levenberg_marquardt.minimise`."""
 
     def __init__(self, equations: Equations, width: int, held: Tensor):
         self.width = width
@@ -51,13 +51,13 @@ class System:
                 torch.where(keep[:, None, width:], equations.shared, 0.0),
                 equations.columns,
             )
-            # without a column the rest is no triangle any more
+            # without a column the rest is not a triangle
             self.equations = equations._replace(shared=torch.linalg.qr(equations.shared, mode="r").R)
             self.decrement = self.equations.decrement
 
     @property
     def firm_decrement(self) -> Tensor:
-        """(R,) the decrement without combinations of unknowns that the data hardly determine."""
+        """The decrement (R,) without combinations of unknowns that the data hardly determine."""
         view, shared = self.equations.view[..., -1], self.equations.shared
         if shared.shape[-1] == 1:
             return self.decrement
@@ -131,7 +131,7 @@ class System:
 
 
 def triangle_of_few(rows: Tensor) -> Tensor:
-    """Return a triangle (..., L, L + 1) of rows (..., M, L + 1) with few columns that are well apart."""
+    """Return a triangle (..., L, L + 1) of rows (..., M, L + 1) with few, well separated columns."""
     products = rows.mT @ rows
     squares, right = products[..., :-1, :-1], products[..., :-1, -1:]
     scale = squares.diagonal(dim1=-2, dim2=-1)

@@ -1,4 +1,4 @@
-"""Where rays lie on the plane of a camera's sensor, beyond folds too, and how that depends on ray and coefficients."""
+"""Points of rays on a camera's sensor plane, also beyond folds, and their derivatives by ray and coefficients."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from camtorch.optics.backprojection import Inverted
 from camtorch.projection.camera_like import CameraLike
 from camtorch.values.arguments import columns
 
-FURTHEST = 20.0  # the furthest from the centre of a chart's plane that a fit looks: 87 degrees in perspective
+FURTHEST = 20.0  # the furthest points of a fit from the centre of a chart's plane: 87 degrees in perspective
 
 
 class SensorPoints(NamedTuple):
-    """Planes (C, N): points on the plane of the sensor, the centre where there is none, and whether there is one."""
+    """Coordinates a, b (C, N) of points on the sensor plane, 0 if there is none, and whether there is one."""
 
     a: Tensor
     b: Tensor
@@ -26,7 +26,7 @@ class SensorPoints(NamedTuple):
 
 
 class SensorJacobians(NamedTuple):
-    """`SensorPoints`, and their derivatives by rays (C, 2, 3, N) and by coefficients (C, 2, n, N), 0 where none are."""
+    """`SensorPoints`, and their derivatives by rays (C, 2, 3, N) and by coefficients (C, 2, n, N), 0 if not finite."""
 
     points: SensorPoints
     by_ray: Tensor
@@ -58,9 +58,9 @@ def _to_sensor(
 def sensor_jacobians(
     camera: CameraLike | type[CameraLike], k: Tensor, rays: Tensor, furthest: float = FURTHEST
 ) -> SensorJacobians:
-    """Return `to_sensor` with exact derivatives by rays (C, N, 3), at their length, and by coefficients (C, n)."""
+    """Return `to_sensor` with exact derivatives by rays (C, N, 3) of any length, and by coefficients (C, n)."""
     chart, _ = camera.optics(columns(k))
-    # a table for each point would be dear: where the other direction is searched, derivatives go forward
+    # an inverted chart needs a table for each row of coefficients, too many if each point is a row: forward mode then
     jacobians = (_forward if isinstance(chart, Inverted) else _backward)(camera, k, rays, furthest)
     # a derivative that is not finite, as at the end of a chart, is left out of the step
     by_ray, by_k = (slopes.nan_to_num(0.0, 0.0, 0.0) for slopes in (jacobians.by_ray, jacobians.by_k))
@@ -68,10 +68,10 @@ def sensor_jacobians(
 
 
 def _backward(camera: CameraLike | type[CameraLike], k: Tensor, rays: Tensor, furthest: float) -> SensorJacobians:
-    """Differentiate backward, two passes for any number of coefficients; each point has its own copy of these."""
+    """Differentiate backward, in two passes for any number of coefficients; each point has its own copy of these."""
     with torch.inference_mode(False), torch.enable_grad():
         shape = rays.shape[:-1]
-        # contiguous planes, or torch's operations take several times as long; copies, or they stay those of inference
+        # contiguous planes are several times as fast; copies can require grad after inference mode
         planes = [_copied(w).requires_grad_() for w in rays.detach().unbind(-1)]
         own = [_copied(c.expand(shape)).requires_grad_() for c in columns(k.detach())]
         points = _to_sensor(camera, own, planes, furthest)
@@ -93,7 +93,7 @@ def _forward(camera: CameraLike | type[CameraLike], k: Tensor, rays: Tensor, fur
     """Differentiate forward in one pass, with a row for each direction: vmap is slow in Python for many operations."""
     count = k.shape[-1] + 3
     directions = torch.eye(count, dtype=k.dtype, device=k.device)
-    # under inference mode there would be no derivatives
+    # inference mode would drop the derivatives
     with torch.inference_mode(False), warnings.catch_warnings(), forward_ad.dual_level():
         # on its first use forward mode loads code that calls the deprecated torch.jit.script
         warnings.simplefilter("ignore", DeprecationWarning)

@@ -1,4 +1,4 @@
-"""The method of Levenberg and Marquardt for a batch of problems, each of which goes its own way."""
+"""The Levenberg-Marquardt method for a batch of independent problems."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from torch import Tensor
 
 from camtorch.least_squares.equations import System
 
-State = tuple[Tensor, ...]  # what is looked for: tensors (B, ...), a row for each problem
+State = tuple[Tensor, ...]  # the unknowns: tensors (B, ...), a row for each problem
 
 FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-4, 1e-15, 1e8
-_GOOD, _FAIR = 0.75, 0.25  # parts of what a step promised that were kept
+_GOOD, _FAIR = 0.75, 0.25  # of a step's predicted decrease, achieved
 
 
 class Problem(Protocol):
     """B sums of squares to minimise; rows (R,) selects some of them."""
 
-    rounding: Tensor  # (B,) the sums of squares of what rounding does to the residuals, see `rounding_of`
+    rounding: Tensor  # (B,) the sums of squares of the residuals' rounding, see `rounding_of`
 
     def cost(self, state: State, rows: Tensor) -> Tensor:
         """Return the costs (R,); infinite if a state is impossible."""
@@ -46,13 +46,13 @@ class Minimum(NamedTuple):
 def rounding_of(pixels: Tensor, weights: Tensor) -> Tensor:
     """Return the weighted sums of squares (B,) of the rounding of pixels: dtype's eps times the largest coordinate.
 
-    The projections of all models are rounded by 0.2 to 0.4 of that, root mean square. weights: (B, ...) of the squares.
+    The rms rounding of all models' projections is 0.2 to 0.4 of that. weights: (B, ...) of the squares.
     """
     largest = torch.where(weights > 0, pixels.abs().amax(-1), 0.0).flatten(1).amax(-1)
     return (torch.finfo(pixels.dtype).eps * largest).square() * weights.flatten(1).sum(-1)
 
 
-@np.errstate(all="ignore")  # of costs that are infinite
+@np.errstate(all="ignore")  # costs may be infinite
 def minimise(
     problem: Problem,
     state: State,
@@ -66,16 +66,16 @@ def minimise(
 ) -> Minimum:
     """Return the states of least cost near the given ones; no problem depends on another.
 
-    A step that promises less than rounding does to a cost cannot be judged by the cost: it is the last one, and taken
-    unless the cost grows by more than that.
+    A step whose predicted decrease is below the rounding of the cost is the last one, and taken unless the cost grows
+    by more than that.
 
-    Of B problems `tolerance` (B,) is the part of a cost that a step has to promise, or the search has ended; costs up
-    to `tiny` (B,) are as good as none; `going` (B,) bool are those to search, all if left out. `steps` counts those
-    that were tried in vain; `damping` is the first one; `progress` gets the number of each step and the costs.
+    For B problems: a search ends if the predicted decrease is below the part `tolerance` (B,) of the cost, or the cost
+    is at most `tiny` (B,). `going` (B,) bool selects the problems to search, all by default. `steps` limits all steps,
+    rejected ones included; `damping` is the first one; `progress` gets the number of each step and the costs.
     """
     device = state[0].device
     every = torch.arange(len(state[0]), device=device)
-    # of each problem a number or two: NumPy takes a fraction of the time that torch does
+    # these are a few numbers a problem, for which NumPy is faster than torch
     cost, own_rounding = (t.numpy(force=True).copy() for t in (problem.cost(state, every), problem.rounding))
     given = (t.numpy(force=True) if isinstance(t, Tensor) else t for t in (tolerance, tiny))
     parts, least = (np.broadcast_to(t, cost.shape) for t in given)
@@ -92,7 +92,7 @@ def minimise(
             old = state if whole else tuple([t[at] for t in state])
             system = problem.linearised(old, at)
             before = cost[rows]
-            # sum((r + d)^2) - sum(r^2) is at most this, for residuals r and their rounding d
+            # an upper bound of sum((r + d)^2) - sum(r^2) for residuals r and their rounding d
             rounding = 2 * np.sqrt(before * own_rounding[rows]) + own_rounding[rows]
             enough = np.maximum(parts[rows] * before, rounding)
             last = system.decrement.numpy(force=True) <= enough

@@ -35,14 +35,14 @@ class Extrinsics(BatchedModule):
 
     Args:
         rotation: (*B, 3) rotation vectors, axis times angle in radians, or (*B, 3, 3) rotation matrices.
-        translation: (*B, 3): the world's origin seen from the camera. The camera stands at `position` = -R^T t.
+        translation: (*B, 3): the world's origin in the camera's frame. The camera's `position` is -R^T t.
 
     Vectors may have OpenCV's shapes: columns (*B, 3, 1), an array (1, 3), a list of V such arrays as a batch of V. A
     tensor (1, 3) is a batch of one. A value with the shape of matrices is taken as matrices if they are rotations, or
     the translation has one dim less. Three vectors (3, 3) with three translations that form a rotation matrix raise an
     error, which shows how to pass them.
 
-    Plain values become new Parameters; a tensor that requires grad is kept as it is. Gradients are exact at
+    Plain values become new Parameters; a tensor that requires grad is used without copying. Gradients are exact at
     zero rotation as well.
 
     Raises:
@@ -66,12 +66,12 @@ class Extrinsics(BatchedModule):
         super().__init__()
         if translation is None:
             raise TypeError(
-                f"Extrinsics: translation is missing beside rotation, a {shown(rotation)}; "
-                "ct.Extrinsics.from_matrix(T) takes a matrix (4, 4), mrcal's rt is rt[:3], rt[3:], [0.0, 0, 0] is none"
+                f"Extrinsics: translation must be given; got rotation {shown(rotation)} only. Pass [0.0, 0, 0] for "
+                "none, rt[:3], rt[3:] for mrcal's rt, and ct.Extrinsics.from_matrix(T) for a matrix (4, 4)"
             )
         device = rotation.device if isinstance(rotation, Tensor) else None
         translation = as_vectors(translation, "translation", "Extrinsics", device)
-        # columns (3, 3, 1) are vectors without a doubt
+        # columns (3, 3, 1) are always vectors
         undecided = as_real(rotation, "rotation", "Extrinsics").shape[-2:] == (3, 3)
         rotation = as_vectors(rotation, "rotation", "Extrinsics", translation.device)
         if undecided and _are_matrices(rotation, translation):
@@ -83,7 +83,7 @@ class Extrinsics(BatchedModule):
 
     @property
     def batch_shape(self) -> torch.Size:
-        """*B, the batch dims of the pose."""
+        """Batch dims *B of the pose."""
         return broadcast_shapes(self.rotation.shape, self.translation.shape)[:-1]
 
     def forward(self, points_world: Numbers) -> Tensor:
@@ -111,9 +111,9 @@ class Extrinsics(BatchedModule):
         """Make poses from matrices.
 
         Args:
-            matrix: (*B, 4, 4) or (*B, 3, 4) matrices [[R, t], ...]; or R, (*B, 3, 3), beside a translation; or both
+            matrix: (*B, 4, 4) or (*B, 3, 4) matrices [[R, t], ...]; or R, (*B, 3, 3), with a translation; or both
                 as a pair (R, t).
-            translation: (*B, 3), or of OpenCV's shapes.
+            translation: (*B, 3), or in OpenCV's shapes.
 
         Raises:
             ValueError: If a shape is wrong, a last row is not (0, 0, 0, 1), or an R is not a rotation.
@@ -124,14 +124,14 @@ class Extrinsics(BatchedModule):
             rotation = as_real(given, "rotation", "Extrinsics")
             if rotation.shape[-2:] != (3, 3):
                 raise ValueError(
-                    "Extrinsics: beside a translation the rotation must be (*B, 3, 3) matrices; got shape "
-                    f"{tuple(rotation.shape)}. Rotation vectors go into Extrinsics(rotation, translation)"
+                    "Extrinsics: rotation must be (*B, 3, 3) matrices with a translation; got shape "
+                    f"{tuple(rotation.shape)}. Pass rotation vectors to Extrinsics(rotation, translation)"
                 )
         else:
             matrix = as_real(given, "matrix", "Extrinsics")
             if matrix.shape[-2:] not in ((4, 4), (3, 4)):
                 is_turn = matrix.shape[-2:] == (3, 3)
-                hint = ". A rotation goes with its translation: from_matrix(R, t)" if is_turn else ""
+                hint = ". Pass a rotation with its translation: from_matrix(R, t)" if is_turn else ""
                 raise ValueError(
                     f"Extrinsics: matrix must be (*B, 4, 4) or (*B, 3, 4); got shape {tuple(matrix.shape)}{hint}"
                 )
@@ -171,7 +171,7 @@ class Extrinsics(BatchedModule):
 
     @property
     def position(self) -> Tensor:
-        """(*B, 3): where the camera stands in the world, -R^T t."""
+        """Position (*B, 3) of the camera in the world, -R^T t."""
         turned_back = rotate_planes(rotation_matrix(-self.rotation), self.translation.unsqueeze(-1).unbind(-2))
         return -turned_back.squeeze(-1).movedim(0, -1)
 
@@ -189,7 +189,7 @@ def head_angles(pose: Extrinsics | Numbers) -> Tensor:
     The head's frame has x to the image's right, y down and z away from the camera when the head faces it, so that the
     identity faces the camera. R = Ry(yaw) Rx(-pitch) Rz(roll), right-handed turns about the camera's axes: the nose
     points along R (0, 0, -1), whose pitch and yaw these are as of a gaze (`ct.augment.to_pitch_yaw`, the signs of
-    ETH-XGaze), and a positive roll leans clockwise in the image about that axis. Where the nose points straight up or
+    ETH-XGaze), and a positive roll leans clockwise in the image about that axis. If the nose points straight up or
     down, roll is 0. Values and gradients are finite everywhere. `camtorch.poses.rotations.mount_rotation`, which turns
     cameras, has another order: yaw, pitch, roll, in degrees.
 
@@ -207,7 +207,7 @@ def head_angles(pose: Extrinsics | Numbers) -> Tensor:
         if matrix.shape[-2:] not in ((3, 3), (4, 4)):
             raise ValueError(
                 "head_angles: pose must be Extrinsics, a Pose, (..., 4, 4) or (..., 3, 3); "
-                f"got shape {tuple(matrix.shape)}. A rotation vector goes in as ct.Extrinsics(rvec, (0, 0, 0))"
+                f"got shape {tuple(matrix.shape)}. Pass a rotation vector as ct.Extrinsics(rvec, (0, 0, 0))"
             )
         matrix = matrix[..., :3, :3]
         check_rotation(matrix, "pose", "head_angles")
@@ -243,20 +243,21 @@ def head_rotation(angles: Numbers) -> Tensor:
 
 
 def _are_matrices(rotation: Tensor, translation: Tensor) -> bool:
-    """Whether (..., 3) are rotation matrices (*B, 3, 3), and not three vectors each, beside a translation (*B, 3)."""
+    """Whether (..., 3) are rotation matrices (*B, 3, 3), not three vectors each, with a translation (*B, 3)."""
     beside = translation.ndim == rotation.ndim - 1
     if values_of(rotation) is None:
         return beside
     if bool(are_rotations(rotation).all()):
         if translation.shape[-2:] == (3, 3) and not beside:
             raise ValueError(
-                f"Extrinsics: rotation {tuple(rotation.shape)} beside translation {tuple(translation.shape)} may be "
-                "rotation matrices or three rotation vectors each, and its values are those of rotation matrices. "
-                "Matrices go into Extrinsics.from_matrix(rotation, translation), vectors in as rotation[..., None]"
+                "Extrinsics: rotation must be matrices or vectors; got an ambiguous shape "
+                f"{tuple(rotation.shape)}, three vectors each or rotation matrices, with translation "
+                f"{tuple(translation.shape)}. Use Extrinsics.from_matrix(rotation, translation) for matrices, or pass "
+                "rotation[..., None] for vectors"
             )
         return True
     if beside:
-        hint = ". Three rotation vectors that share a translation go in as rotation[..., None]"
+        hint = ". Pass three rotation vectors that share a translation as rotation[..., None]"
         check_rotation(rotation, "rotation", "Extrinsics", hint)
     return False
 
@@ -267,6 +268,6 @@ def _pair(matrix: Any) -> tuple[Any, Any]:
         return matrix, None
     try:
         shapes = [tuple(v.shape) if isinstance(v, Tensor) else np.shape(v) for v in matrix]
-    except ValueError:  # a list that is no array
+    except ValueError:  # a ragged list
         return matrix, None
     return (matrix[0], matrix[1]) if shapes[0][-2:] == (3, 3) and shapes[0] != shapes[1] else (matrix, None)

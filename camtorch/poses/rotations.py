@@ -12,7 +12,7 @@ from camtorch.evaluate.known import are_free, as_own, known_false, known_true
 from camtorch.optics.special import angle_per_radius, cos_root, cosc_root, sinc_root
 from camtorch.values.arguments import Numbers, as_real, as_rows, as_values, check_devices
 
-_NEARLY = 1e-3  # by which R R^T may miss the identity
+_NEARLY = 1e-3  # the largest deviation of R R^T from the identity
 
 
 def rotation_matrix(rotation: Tensor) -> Tensor:
@@ -60,7 +60,7 @@ def rotation_vector(matrix: Tensor) -> Tensor:
         *(y, xy, 1 - a + e - i, yz),
         *(z, zx, yz, 1 - a - e + i),
     )
-    # of 4 q q^T, q the unit quaternion: the column of the largest diagonal element has no cancellation
+    # columns of 4 q q^T, q the unit quaternion: that of the largest diagonal element has no cancellation
     columns = torch.stack(products, -1).unflatten(-1, (4, 4))
     largest = columns.detach().diagonal(dim1=-2, dim2=-1).argmax(-1)
     return quaternion_vector(columns.take_along_dim(largest[..., None, None], -2).squeeze(-2))
@@ -81,11 +81,11 @@ def vector_quaternion(rotation: Tensor) -> Tensor:
 
 
 def rotate_planes(matrix: Tensor, planes: tuple[Tensor, ...], whole: Tensor | None = None) -> Tensor:
-    """Apply (*B, 3, 3) to three planes (*B, N), or to those of `whole`: (3, *B, N), NaN where a point is not finite."""
+    """Apply (*B, 3, 3) to three planes (*B, N), or to those of `whole`: (3, *B, N), NaN if a point is not finite."""
     x, y, z = planes
     matrix = matrix[(None,) * (x.ndim + 1 - matrix.ndim)]
     a, b, c = matrix.movedim((-1, -2), (0, 1)).unsqueeze(-1).unbind(0)
-    # by components, which autocast leaves in their precision; a sum of whole planes shows what is not finite
+    # by components, whose precision autocast does not change; sums of whole planes show values that are not finite
     sums = [plane.detach().sum() for plane in (planes if whole is None else (whole,))]
     if x.is_cpu and known_true(torch.isfinite(sums[0] if len(sums) == 1 else torch.stack(sums))):
         return torch.addcmul(torch.addcmul(a * x, b, y), c, z)
@@ -100,13 +100,13 @@ def check_rotation(matrix: Tensor, name: str, owner: str, hint: str = "") -> Non
         values = matrix.detach().double()
         error = rotation_error(values).max().item()
         raise ValueError(
-            f"{owner}: {name} must hold rotation matrices; R R^T misses the identity by {error:.2g} "
+            f"{owner}: {name} must hold rotation matrices; got R R^T that misses the identity by {error:.2g}, "
             f"and det R = {torch.linalg.det(values).tolist()}{hint}"
         )
 
 
 def are_rotations(matrix: Tensor) -> Tensor:
-    """Whether (*B, 3, 3) are rotations, (*B) bool, as precisely as files, or their own dtype, store them."""
+    """Whether (*B, 3, 3) are rotations, (*B) bool, to the precision of files or of their dtype."""
     values, precision = matrix.detach().double(), 4 * torch.finfo(matrix.dtype).eps
     proper: Tensor = torch.linalg.det(values) > 0
     return (rotation_error(values) < max(_NEARLY, precision)) & proper
@@ -125,7 +125,7 @@ def as_rotation(rotation: Numbers | None, owner: str) -> Tensor | None:
         return rotation if rotation.requires_grad else rotation.clone()
     rotation = as_real(rotation, "rotation", owner)
     if rotation.shape[-2:] != (3, 3) or rotation.ndim > 3:
-        hint = ". ct.Extrinsics(vector, (0, 0, 0)).matrix()[..., :3, :3] is the matrix of a rotation vector"
+        hint = ". Pass ct.Extrinsics(vector, (0, 0, 0)).matrix()[..., :3, :3] for a rotation vector"
         hint = hint if rotation.shape[-1:] == (3,) or rotation.shape[-2:] == (3, 1) else ""
         raise ValueError(f"{owner}: rotation must be (3, 3) or (B, 3, 3); got shape {tuple(rotation.shape)}{hint}")
     check_rotation(rotation, "rotation", owner)
@@ -133,7 +133,7 @@ def as_rotation(rotation: Numbers | None, owner: str) -> Tensor | None:
 
 
 def is_right(matrix: Tensor) -> bool:
-    """Whether (3, 3) is a rotation at a glance, by plain numbers, which take less time than one operator of torch."""
+    """Whether (3, 3) is a rotation, by plain numbers, which take less time than one operator of torch."""
     if not (matrix.dtype in (torch.float32, torch.float64) and are_free(matrix)):
         return False
     (a, b, c), (d, e, f), (g, h, i) = matrix.tolist()
@@ -144,7 +144,7 @@ def is_right(matrix: Tensor) -> bool:
 
 
 def turn(rotation: Tensor | None, rays: Tensor, name: str) -> Tensor:
-    """Apply a rotation, if there is one, to (*B, *N, 3); `name` is what an error calls them."""
+    """Apply a rotation, if there is one, to rays (*B, *N, 3), which errors call `name`."""
     if rotation is None:
         return rays
     rows, lead, restore = as_rows(rays, name, rotation.shape[:-2], (rotation,), "Warp")
@@ -155,12 +155,12 @@ def turn(rotation: Tensor | None, rays: Tensor, name: str) -> Tensor:
 def mount_rotation(yaw: Tensor, pitch: Tensor, roll: Tensor) -> Tensor:
     """Return rotations (*B, 3, 3) of a camera that turns right, then up, then leans right: `ray_after = R ray_before`.
 
-    The angles of heads, in radians and of another order, are those of `ct.head_rotation`.
+    `ct.head_rotation` takes the angles of heads, in radians and in another order.
 
     Args:
-        yaw: (*B,) degrees, about the camera's y axis; pitch about its new x axis, roll about its new z axis.
-        pitch: likewise.
-        roll: likewise.
+        yaw: (*B,) degrees, about the camera's y axis.
+        pitch: (*B,) degrees, about its new x axis.
+        roll: (*B,) degrees, about its new z axis.
     """
     given = {"yaw": yaw, "pitch": pitch, "roll": roll}
     given = {name: as_values(value, name, "mount_rotation") for name, value in given.items()}
@@ -169,7 +169,7 @@ def mount_rotation(yaw: Tensor, pitch: Tensor, roll: Tensor) -> Tensor:
     except RuntimeError:
         check_devices("mount_rotation", **given)
         shapes = ", ".join(f"{name} {tuple(value.shape)}" for name, value in given.items())
-        raise ValueError(f"mount_rotation: the angles must be of one shape (*B,); got {shapes}") from None
+        raise ValueError(f"mount_rotation: angles must broadcast to one shape (*B,); got {shapes}") from None
     elements = mount_elements(angles.cos().unbind(), angles.sin().unbind())
     return torch.unflatten(torch.stack(elements, -1), -1, (3, 3))
 
@@ -177,7 +177,7 @@ def mount_rotation(yaw: Tensor, pitch: Tensor, roll: Tensor) -> Tensor:
 def mount_elements(cosines: Sequence[Any], sines: Sequence[Any]) -> tuple[Any, ...]:
     """Return the nine elements of `mount_rotation`, row by row, for the cosines and sines of yaw, pitch and roll."""
     (ca, cb, cc), (sa, sb, sc) = cosines, sines
-    # the turn, the look and the lean multiplied out, each about the turned camera's axes, and transposed
+    # the product of yaw, pitch and roll, each about the turned camera's axes, transposed
     right, ahead = sa * sb, ca * sb
     return (
         *(ca * cc + right * sc, cb * sc, ahead * sc - sa * cc),

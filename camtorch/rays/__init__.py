@@ -1,1 +1,1 @@
-"""What follows from rays: fields, depth, lines, fields of view, why a point has no pixel."""
+"""Results from rays: fields, depth, lines, fields of view, and why a point has no pixel."""

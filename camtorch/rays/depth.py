@@ -1,4 +1,4 @@
-"""Depth maps: what they may be, and how far along a pixel's ray they reach."""
+"""Depth maps: their check, and the distances along pixels' rays."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ KINDS = ("z", "distance")
 
 
 def as_depth(depth: Numbers, kind: str, size: tuple[int, int], owner: str, device: torch.device) -> Tensor:
-    """Check a depth map (B, D, H, W) or (H, W) of a size, as users pass it, and its kind."""
+    """Return a checked depth map (B, D, H, W) or (H, W) of a size, and check its kind."""
     if not isinstance(kind, str) or kind not in KINDS:
         raise ValueError(f'{owner}: kind must be "z" (along the optical axis) or "distance"; got {kind!r}')
     depth = as_values(depth, "depth", owner, device)
     if not depth.is_floating_point():
         raise ValueError(
-            f"{owner}: depth must be floating point, in units of length; got {depth.dtype}. Millimetres in uint16 are "
-            "depth.astype(np.float32) / 1000 in metres"
+            f"{owner}: depth must be floating point, in units of length; got {depth.dtype}. Pass "
+            "depth.astype(np.float32) / 1000 for millimetres in uint16"
         )
     if depth.ndim not in (2, 4) or depth.shape[-2:] != size:
-        hint = ". Maps (B, H, W) go in as depth[:, None]" if depth.ndim == 3 and depth.shape[-2:] == size else ""
+        hint = ". Pass maps (B, H, W) as depth[:, None]" if depth.ndim == 3 and depth.shape[-2:] == size else ""
         raise ValueError(
             f"{owner}: depth must be (B, 1, H, W) or (H, W) of the camera's image_size {size}; got "
             f"{tuple(depth.shape)}{hint}"
@@ -31,7 +31,7 @@ def as_depth(depth: Numbers, kind: str, size: tuple[int, int], owner: str, devic
 
 
 def depth_scale(depth: Tensor, rays: Tensor, valid: Tensor, kind: str) -> tuple[Tensor, Tensor]:
-    """Return how far along unit rays (*B, H, W, 3) depths of a kind, which broadcast, lie; and which count."""
+    """Return the distances along unit rays (*B, H, W, 3) for depths of a kind, which broadcast, and which are valid."""
     z = rays[..., 2]
     ahead = valid & (z > 0) if kind == "z" else valid
     good = ahead & torch.isfinite(depth) & (depth > 0)

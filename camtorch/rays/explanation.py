@@ -1,4 +1,4 @@
-"""Why a point has no pixel, in words."""
+"""Explanations in words why points have no pixel."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _STEPS = 256
 
 @torch.no_grad()
 def explain(camera: CameraLike, points: Numbers) -> list[str]:
-    """Return one line of explanation a point; see `Camera.explain`."""
+    """Return one line of explanation for each point; see `Camera.explain`."""
     valid = camera.project(points)[1]
     parameters = camera.intrinsics, camera.distortion
     points = as_values(points, "points", type(camera).__name__, camera.intrinsics.device)
@@ -60,7 +60,7 @@ def _reason(camera: CameraLike, row: dict[str, Tensor], point: Tensor) -> str:
     chart, _ = camera.optics(columns(camera.distortion[None]))
 
     def last(covers: Callable[[Tensor], Tensor]) -> float:
-        """Return the angle up to which rays on this side are covered; rays that point backwards have every azimuth."""
+        """Return the angle up to which rays of the point's azimuth are covered."""
         x, y = ray[:2].double()
         azimuth = torch.atan2(y, x)[None]
         return float(reach(lambda rays: covers(rays.to(ray.dtype)), azimuth, most=theta, steps=_STEPS, rounds=3))

@@ -27,8 +27,8 @@ from camtorch.values.arguments import (
 if TYPE_CHECKING:
     from camtorch.evaluate.kept import Kept
 
-_MOST_KEPT = 1 << 19  # rays, of 6 MB in float32: what every camera of a large data set may keep
-_STRAIGHT = 1e-24  # the squared sine of the angle to the vertical up to which a ray goes straight up or down
+_MOST_KEPT = 1 << 19  # rays, 6 MB in float32, at most, that each camera of a large data set keeps
+_STRAIGHT = 1e-24  # the squared sine of the angle to the vertical up to which a ray counts as vertical
 
 
 def on_image(pixels: Numbers, size: tuple[int, int], owner: str) -> Tensor:
@@ -39,21 +39,21 @@ def on_image(pixels: Numbers, size: tuple[int, int], owner: str) -> Tensor:
 
 
 def patch_centres(size: tuple[int, int], stride: int, like: Tensor, owner: str) -> Tensor:
-    """Return the middles (H / stride, W / stride, 2) of patches of stride x stride pixels, which have to fill it."""
+    """Return centres (H / stride, W / stride, 2) of patches of stride x stride pixels, which must fill the image."""
     step = as_whole(stride, "stride", owner)
     if step < 1:
         raise ValueError(f"{owner}: stride must be at least 1; got {step}")
     if any(side % step for side in size):
         height, width = size
         fewer, more = ([(side + extra) // step * step for side in size] for extra in (0, step - 1))
-        pad = f".pad(0, {more[1] - width}, 0, {more[0] - height}) where it is padded at the right and at the bottom"
-        what, ways = "are larger than", f".resize({more[0]}, {more[1]}), or {pad}"
+        pad = f".pad(0, {more[1] - width}, 0, {more[0] - height}) if it is padded at the right and at the bottom"
+        ways = f".resize({more[0]}, {more[1]}), or {pad}"
         if all(fewer):
-            crop = f".crop(0, 0, {fewer[0]}, {fewer[1]}) where a convolution drops the rest"
-            what, ways = "do not fill", f"{crop}, {pad}, or .resize({fewer[0]}, {fewer[1]})"
+            crop = f".crop(0, 0, {fewer[0]}, {fewer[1]}) if a convolution drops the rest"
+            ways = f"{crop}, {pad}, or .resize({fewer[0]}, {fewer[1]})"
         raise ValueError(
-            f"{owner}: patches of stride {step} {what} images of {size} (height, width). What is done to the image "
-            f"first is done to the camera: {ways}"
+            f"{owner}: stride must divide both sides of the image, {size} (height, width); got {step}. Edit the camera "
+            f"as the image is edited first: {ways}"
         )
     middle = (step - 1) / 2
     rows, columns = (torch.arange(side // step, dtype=like.dtype, device=like.device) * step + middle for side in size)
@@ -68,13 +68,13 @@ def over_image(
     stride: int,
     function: Callable[[Tensor], tuple[Tensor, ...]],
 ) -> tuple[Tensor, ...]:
-    """Return what a function makes of all pixels or patches (*B, H, W, 2); few are kept while no `inputs` learn."""
+    """Return the function of all pixels or patches (*B, H, W, 2); small results are kept while no `inputs` learn."""
 
     def compute() -> tuple[Tensor, ...]:
         grid = camera.pixel_grid(stride)
         return function(grid.expand(*camera.batch_shape, *grid.shape))
 
-    if is_unknown(camera.intrinsics):  # nothing is kept then, and a comparison would bound sizes that are left open
+    if is_unknown(camera.intrinsics):  # nothing is kept, and a comparison would bound symbolic sizes
         return compute()
     step = max(as_whole(stride, "stride", "pixel_grid"), 1)
     if math.prod((*camera.batch_shape, *camera._size_for("pixel_grid"))) // step**2 > _MOST_KEPT:
@@ -88,8 +88,8 @@ def plucker(rays: Tensor, valid: Tensor, extrinsics: Extrinsics | None, owner: s
         return torch.cat((torch.where(valid[..., None], rays, 0.0), torch.zeros_like(rays)), -1), valid
     if not isinstance(extrinsics, Extrinsics):
         hint = (
-            ". A matrix, camera from world, goes in as ct.Extrinsics.from_matrix(T); one of a camera's pose, world "
-            "from camera, as ct.Extrinsics.from_matrix(T).inverse()"
+            ". Pass ct.Extrinsics.from_matrix(T) for a matrix, camera from world, or "
+            "ct.Extrinsics.from_matrix(T).inverse() for a camera's pose, world from camera"
         )
         hint = hint if hasattr(extrinsics, "shape") else ""
         got = type(extrinsics).__name__
@@ -115,7 +115,7 @@ def _broadcast(batch: torch.Size, other: torch.Size, name: str, owner: str) -> t
 
 
 class Tangents(NamedTuple):
-    """Unit rays (..., 3), how they turn as the pixel goes right and down (..., 3), and valid (...) bool."""
+    """Unit rays (..., 3), their derivatives (..., 3) by the pixel to the right and down, and valid (...) bool."""
 
     rays: Tensor
     across: Tensor
@@ -124,7 +124,7 @@ class Tangents(NamedTuple):
 
 
 def tangents(camera: CameraLike, pixels: Tensor) -> Tangents:
-    """Return rays of pixels (*B, *N, 2) and their exact derivatives, in a graph if the camera or pixels are in one."""
+    """Return rays of pixels (*B, *N, 2) and their exact derivatives, with a graph if the camera or pixels have one."""
     if is_unknown(pixels):
         right, below = (pixels.new_tensor(unit).expand_as(pixels) for unit in ((1.0, 0.0), (0.0, 1.0)))
         by_u: Any = torch.func.jvp(camera.unproject, (pixels,), (right,), has_aux=True)
@@ -145,8 +145,8 @@ def tangents(camera: CameraLike, pixels: Tensor) -> Tangents:
 def local_frames(at: Tangents) -> tuple[Tensor, Tensor, Tensor]:
     """Return rotations (..., 3, 3) to local frames, pixels per unit of their planes (..., 2, 2), and valid (...) bool.
 
-    The local z axis is the ray, and x goes where the ray does as the pixel goes right, so that the derivative of the
-    plane by the pixel is upper triangular. Both are identities where they are not valid.
+    The local z axis is the ray, and x the direction in which the ray moves with a pixel to the right, so that the
+    derivative of the plane by the pixel is upper triangular. Both are identities if they are not valid.
     """
     turned = (torch.linalg.cross(at.across, at.down) * at.rays).sum(-1)
     valid = at.valid & torch.isfinite(turned) & (turned > torch.finfo(turned.dtype).tiny)

@@ -1,4 +1,4 @@
-"""Samples of a camera: lattices of pixels, fans of rays; and what follows: field of view, slopes at the axis."""
+"""Samples of a camera: lattices of pixels and fans of rays; and its field of view and slopes at the axis."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     CameraT = TypeVar("CameraT", bound=CameraLike)
 
 AXES = ("horizontal", "vertical", "diagonal")
-"""The lines of an image along which a field of view is."""
+"""The lines of an image along which a field of view is measured."""
 
 _LINE = 513  # points along a line of the image
 
@@ -48,7 +48,7 @@ def pixel_lattice(low: Tensor, high: Tensor, rows: int, columns: int) -> Tensor:
 
 
 def ray_fan(angles: Tensor, azimuths: int) -> Tensor:
-    """Return rays (*C, K, azimuths, 3) at angles (*C, K), evenly around the axis; none lies where panoramas are cut."""
+    """Return rays (*C, K, azimuths, 3) at angles (*C, K), evenly around the axis, none on the cut of panoramas."""
     around = (torch.arange(azimuths, device=angles.device).to(angles) + 0.25) * (2 * math.pi / azimuths)
     return polar_rays(angles[..., None], around)
 
@@ -86,7 +86,7 @@ def ideal(camera: CameraT) -> CameraT:
     values = camera.distortion.new_tensor(camera.ideal(len(camera.distortion_names)))
     intrinsics = camera.intrinsics.detach()
     slopes = slopes_at_axis(camera.optics, camera.distortion.detach()[None])[0]
-    # that a chart or a table has a slope of its own is no distortion; rounding is no slope
+    # the slope of a chart or a table at the axis belongs to the focal length; rounding does not
     slopes = torch.where((slopes - 1).abs() > 1e-9, slopes, 1.0)
     return remade(camera, intrinsics=torch.cat((intrinsics[:2] * slopes, intrinsics[2:])), distortion=values)
 
@@ -94,9 +94,9 @@ def ideal(camera: CameraT) -> CameraT:
 def reach(
     covers: Callable[[Tensor], Tensor], azimuths: Tensor, *, most: float = math.pi, steps: int, rounds: int
 ) -> Tensor:
-    """Return the angle (*B, K) up to `most` before which all rays towards azimuths (K,) are covered: 0 if none is.
+    """Return the angle (*B, K), at most `most`, up to which all rays towards azimuths (K,) are covered; 0 if none is.
 
-    covers: from unit rays (*B or nothing, K, S, 3) to bool (*B, K, S). Later rounds go over a step of the one before.
+    covers: from unit rays (K, S, 3) or (*B, K, S, 3) to bool (*B, K, S). Each round divides a step of the one before.
     """
     share = torch.linspace(0, 1, steps + 1, dtype=azimuths.dtype, device=azimuths.device)
     low, width = azimuths.new_zeros(len(azimuths), 1), most
@@ -109,7 +109,7 @@ def reach(
 
 
 def followed(camera: CameraLike, angles: Tensor, azimuths: int) -> tuple[Tensor, Tensor]:
-    """Return pixels (*C, K, azimuths, 2) of a fan of ascending angles (*C, K), and whether all so far are valid."""
+    """Return pixels (*C, K, azimuths, 2) of a fan of ascending angles (*C, K), and whether all up to each are valid."""
     pixels, valid = camera.project(ray_fan(angles, azimuths))
     return pixels, valid.long().cumprod(-2).bool()
 
@@ -124,7 +124,7 @@ def around_ends(share: Tensor, valid: Tensor) -> Tensor:
 
 @torch.no_grad()
 def field_of_view(camera: CameraLike) -> Tensor:
-    """Return radians (*B, 3) along lines of the image, between outer edges or as far as there are rays; graph-free."""
+    """Return angles (*B, 3) in radians along `AXES`, between outer edges or the last rays, without a graph."""
     low, high = image_edges(camera._size_for("field_of_view"), camera.intrinsics)
     (left, top), (right, bottom) = low, high
     cx, cy = camera.intrinsics.expand(*camera.batch_shape, 4)[..., 2:].clamp(low, high).unbind(-1)
@@ -134,10 +134,10 @@ def field_of_view(camera: CameraLike) -> Tensor:
     least = start.new_full(start.shape[:-2], torch.inf, dtype=torch.float64)
     most = -least
     share = torch.linspace(0, 1, _LINE).to(start).expand(*least.shape, _LINE)
-    for _ in range(4):  # all of the line, then what lies around the ends of what is seen of it
+    for _ in range(4):  # the whole line, then closer around the ends of its visible part
         rays, valid = camera.unproject(start + share[..., None] * along)
         x, y, z = rays.double().unbind(-1)
-        # from a turn to the one side to a turn to the other: more than half a circle is no angle between two rays
+        # signed angles from the axis, whose sum may exceed half a circle, unlike an angle between two rays
         forward = x * along[..., 0] + y * along[..., 1]
         angles = torch.atan2(torch.hypot(x, y).copysign(forward), z)
         least = torch.minimum(least, torch.where(valid, angles, torch.inf).amin(-1))
@@ -149,7 +149,10 @@ def field_of_view(camera: CameraLike) -> Tensor:
 
 @torch.no_grad()
 def focal_for(camera: CameraLike, fov: Tensor, image_size: tuple[int, int], axis: str) -> tuple[Tensor, Tensor]:
-    """Return the focal length (*B,), of a camera of 1, with a `fov` in radians, or the widest; and whether it has."""
+    """Return the focal length (*B,) for a `fov` in radians, or else the widest, and whether it is reached.
+
+    camera: with focal length 1.
+    """
     height, width = image_size
     ends = {"horizontal": [(width, 0)], "vertical": [(0, height)], "diagonal": [(width, height), (width, -height)]}
     half = fov.new_tensor(ends[axis]) / 2
@@ -171,5 +174,5 @@ def focal_for(camera: CameraLike, fov: Tensor, image_size: tuple[int, int], axis
         scale = low + (high - low) * share
     found = angle(torch.cat((low, high), -1))
     reached = torch.isfinite(found[..., 1]) & (found[..., 1] >= fov)
-    # panoramas end where a whole turn does
+    # panoramas end at a whole turn
     return 1 / torch.where(reached, high[..., 0], low[..., 0]), reached | (fov - found[..., 0] < 1e-6)

@@ -1,4 +1,4 @@
-"""Edges in space as the curves that a lens makes of them."""
+"""Projection of edges in space to curves in the image."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from camtorch.values.arguments import Numbers, as_points
 
 _FIRST = 32  # pieces of an edge, of equal angles, before any is divided
 _LONGEST, _NEAR = 20.0, 0.05  # px: between points, and from a piece to its curve
-_SMALLEST = 1e-11  # pieces of an edge, of its angle: where it is cut
-_FARTHEST = 16.0  # times the image: a pinhole sees what is 90 degrees from its axis infinitely far away
+_SMALLEST = 1e-11  # of an edge's angle: the least piece, at which it is cut
+_FARTHEST = 16.0  # times the image: a pinhole's pixels grow without limit towards 90 degrees from its axis
 _ROUNDS = 60
 
 
@@ -62,7 +62,7 @@ def project_polyline(camera: CameraLike, points: Numbers, extrinsics: Extrinsics
             if not bool(divided.any()):
                 break
             places = torch.cat((places, (start + step / 2)[divided])).sort().values
-        # the two ends of what stays longer belong to two curves, as those at the seam of a panorama
+        # the ends of a piece that remains longer belong to two curves, like those at the seam of a panorama
         linked = both & (length <= _LONGEST)
         ends = torch.cat((linked.new_zeros(1), linked)) != torch.cat((linked, linked.new_zeros(1)))
         runs = ends.nonzero()[:, 0].reshape(-1, 2).tolist()
@@ -70,14 +70,14 @@ def project_polyline(camera: CameraLike, points: Numbers, extrinsics: Extrinsics
 
 
 class _Edges:
-    """Straight edges between points (N, 3), of which places 0 to N - 1 go on by equal angles, seen by the camera."""
+    """Straight edges between points (N, 3); places from 0 to N - 1 advance by equal angles from the camera."""
 
     def __init__(self, points: Tensor):
         self.count = len(points) - 1
         self.start, self.way = points[:-1], points.diff(dim=0)
         with torch.no_grad():
             square = self.way.square().sum(-1).clamp(min=1e-300)
-            self.foot = -(self.start * self.way).sum(-1) / square  # where an edge is nearest to the camera
+            self.foot = -(self.start * self.way).sum(-1) / square  # of the edge, its nearest point
             self.near = ((self.start + self.foot[:, None] * self.way).norm(dim=-1) / square.sqrt()).clamp(min=1e-9)
             self.low, high = (torch.atan((end - self.foot) / self.near) for end in (0.0, 1.0))
             self.angle = high - self.low
@@ -86,7 +86,7 @@ class _Edges:
         edge = places.long().clamp(max=self.count - 1)
         share = places - edge
         along = self.foot[edge] + self.near[edge] * torch.tan(self.low[edge] + share * self.angle[edge])
-        # the ends as they are
+        # the ends exactly
         along = torch.where(share == 0, 0.0, torch.where(share == 1, 1.0, along.clamp(0, 1)))
         return self.start[edge] + along[:, None] * self.way[edge]
 

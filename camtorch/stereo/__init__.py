@@ -1,1 +1,1 @@
-"""Two cameras that look the same way: images whose rows correspond, and depth from their disparities."""
+"""Pairs of cameras: images whose rows correspond, and depth from their disparities."""

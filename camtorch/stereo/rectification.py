@@ -36,28 +36,28 @@ from camtorch.warp.warp import Warp, as_sized
 Projection = Literal["perspective", "latlon", "cylindrical"]
 Align = Literal["mean", "opencv"]
 
-_TURN = math.radians(170)  # up and down, that a panorama shows without being asked for more
-_STEEP = math.tan(math.radians(60))  # beyond it the rim of a perspective image is stretched more than fourfold
-_NEAR_POLE = math.radians(75)  # where a panorama about the baseline hardly resolves distances
+_TURN = math.radians(170)  # up and down, at most, that a panorama shows by default
+_STEEP = math.tan(math.radians(60))  # a perspective image is stretched more than fourfold beyond it
+_NEAR_POLE = math.radians(75)  # from there a panorama about the baseline hardly resolves distances
 
-# the models whose rows, and whose columns, correspond; how far their plane reaches along the baseline, and across
+# models for corresponding rows and for corresponding columns; the reach of their plane along the baseline and across it
 _KINDS: dict[str, tuple[tuple[type[Camera], type[Camera]], tuple[float, float]]] = {
     "perspective": ((Pinhole, Pinhole), (_STEEP, _STEEP)),
     "latlon": ((LatLon, Equirectangular), (_NEAR_POLE, _TURN)),
     "cylindrical": ((TransverseCylindrical, Cylindrical), (math.tan(_NEAR_POLE), _TURN)),
 }
 _LINE = 129  # points along the middle of an image
-_PARALLEL = 1e-6  # the part of the view direction across the baseline, below which there is none
-_STEP = 1e-4  # on the plane of a projection, over which its scale is measured
-_LARGEST = 8  # times the longest side of a camera, a side that nobody asked for
+_PARALLEL = 1e-6  # the part of the view direction across the baseline below which it counts as zero
+_STEP = 1e-4  # on the plane of a projection, for finite differences of its scale
+_LARGEST = 8  # times the longest side of a camera, at most, for a default image_size
 
 
 class Rectification(GeometryModule):
     """Two warps into images whose rows, or columns, correspond: the result of `rectify`.
 
-    `left` and `right` are `Warp`s; the call makes both images. Disparity is u_left - u_right in pixels, v_left -
-    v_right where columns correspond. Both images have the same camera, turned the same way: its x axis (y axis, where
-    columns correspond) lies along the baseline, and the right one stands at `baseline` on it.
+    `left` and `right` are `Warp`s; the call returns both images. Disparity is u_left - u_right in pixels, or v_left -
+    v_right if columns correspond. Both images have the same camera, turned the same way: its x axis (y axis if columns
+    correspond) lies along the baseline, and the right one stands at `baseline` on it.
 
     If the cameras or the extrinsics learn, each call makes the warps again, and gradients reach them.
     """
@@ -94,17 +94,17 @@ class Rectification(GeometryModule):
 
     @property
     def baseline(self) -> Tensor:
-        """(*B,) the right camera's place on the axis of the rectified left one; negative to the left (above)."""
+        """Position (*B,) of the right camera on the axis of the rectified left one; negative to the left (above)."""
         return _frame(self.extrinsics, self.vertical, self.align)[2]
 
     @property
     def left(self) -> Warp:
-        """From the left camera's image to its rectified one."""
+        """Warp from the left camera's image to its rectified one."""
         return self._warps()[0]
 
     @property
     def right(self) -> Warp:
-        """From the right camera's image to its rectified one."""
+        """Warp from the right camera's image to its rectified one."""
         return self._warps()[1]
 
     def _warps(self) -> tuple[Warp, ...]:
@@ -132,16 +132,16 @@ class Rectification(GeometryModule):
         return left, right, left & right
 
     def disparity_to_points(self, disparity: Numbers, valid: Numbers | None = None) -> tuple[Tensor, Tensor]:
-        """Return the points of the scene with these disparities, in the frame of the rectified left camera.
+        """Return the points of the scene for disparities, in the frame of the rectified left camera.
 
         Args:
-            disparity: (B, 1, H, W), (1, H, W) or (H, W) pixels, of the rectified left image; OpenCV's matchers give
-                sixteen times as much in integers.
+            disparity: (B, 1, H, W), (1, H, W) or (H, W) pixels, of the rectified left image; OpenCV's matchers return
+                integers, sixteen times as large.
             valid: bool, in the same shape: the disparities that count.
 
         Returns:
             points (..., 3) after the shape of the disparities, in the unit of the extrinsics, and valid in their shape:
-            the disparity is finite and has the sign of the baseline. What is not valid is (0, 0, 0).
+            whether the disparity is finite and has the sign of the baseline. Invalid points are (0, 0, 0).
 
         Raises:
             ValueError: If a shape is wrong.
@@ -154,8 +154,8 @@ class Rectification(GeometryModule):
             raise ValueError(f"{owner}: disparity must be (B, 1, H, W), (1, H, W) or (H, W) of {size}; got {shape}")
         if not d.is_floating_point():
             raise ValueError(
-                f"{owner}: disparity must be floating point pixels; got {d.dtype}. Of OpenCV's matchers "
-                "disparity.astype(np.float32) / 16 is"
+                f"{owner}: disparity must be floating point pixels; got {d.dtype}. Pass "
+                "disparity.astype(np.float32) / 16 for OpenCV's matchers"
             )
         batched = bool(self.extrinsics.batch_shape or camera.batch_shape)
         if batched and (d.ndim != 4 or len(d) not in (1, count, camera.batch_shape.numel())):
@@ -177,7 +177,7 @@ class Rectification(GeometryModule):
         good = torch.isfinite(d) & (d * baseline > 0)
         step = torch.where(good, d, 1.0).double()[..., None] * _unit(self._axis, pixels.double())[:2]
         (left, one), (right, other) = camera.unproject(pixels.double()), camera.unproject(pixels - step)
-        # in the plane of both, along the baseline and away from it
+        # both rays in their plane, along the baseline and away from it
         (a, b), (c, e) = ((rays[..., self._axis], self._distance(rays)) for rays in (left, right))
         sine = a * e - b * c
         good = good & one & other & (sine * baseline > 0)
@@ -194,7 +194,7 @@ class Rectification(GeometryModule):
 
     def disparity(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Return the disparity of points (*B, *N, 3) in the rectified left frame, and whether both cameras see them."""
-        numbers, baseline = self.camera_left.intrinsics, self.baseline  # float64, which points need not become
+        numbers, baseline = self.camera_left.intrinsics, self.baseline  # baseline is float64, points keep their dtype
         points, _ = as_points(points, "points", 3, baseline.shape, (numbers,), "Rectification.disparity")
         shift = baseline.to(points.dtype)[..., None] * _unit(self._axis, points)
         moved = points - shift.reshape(*baseline.shape, *[1] * (points.ndim - 1 - baseline.ndim), 3)
@@ -206,7 +206,7 @@ class Rectification(GeometryModule):
         """Return the least and the greatest disparity of points in a range of depths, over all pixels and pairs.
 
         Args:
-            near: the least depth: z in perspective, the distance from the baseline in the panoramas about it.
+            near: the least depth: z in perspective, the distance from the baseline in panoramas.
             far: the greatest.
         """
         near, far = (as_number(v, name, "disparity_range") for v, name in ((near, "near"), (far, "far")))
@@ -235,7 +235,7 @@ class Rectification(GeometryModule):
         first = torch.nn.functional.pad(self.camera_left.K, (0, 1))
         shift = torch.zeros_like(first)
         shift[self._axis, 3] = -focal * baseline
-        # d = f b / z, and rows of Q are x, y, f and 1 / b times it
+        # d = f b / z; the rows of Q are x, y, f and d / b, times a common factor
         q = torch.stack((zero + 1, fx / fy, zero, zero)).diag()
         q[:2, 3], q[2, 3], q[3, 2] = -torch.stack((cx, cy * fx / fy)), fx, fx / focal / baseline.to(fx.dtype)
         return {"R1": self.rotation_left, "R2": self.rotation_right, "P1": first, "P2": first + shift, "Q": q}
@@ -259,28 +259,34 @@ def rectify(
     vertical: bool = False,
     align: Align = "mean",
 ) -> Rectification:
-    """Return warps of two cameras' images into images whose rows correspond.
+    """Return warps of two cameras' images, of any models and sizes, into images whose rows correspond.
 
-    The x axis of both lies along the baseline, from left to right; both look where the two cameras look on average.
-    Cameras of any models and sizes will do. Without further wishes the images show, up and down, what both see, to
-    the sides what either does, as finely as the sharper camera sees the middle of it.
+    The x axis of both lies along the baseline, from left to right, and the view direction is the mean of the cameras'.
+    By default the images show the view of both cameras up and down, and of either one to the sides, at the finer
+    resolution of the two in the middle.
 
     Args:
         left: the first camera, with image_size.
-        right: the second one.
+        right: the second camera, with image_size.
         extrinsics: right from left, `p_right = R p_left + t`, as OpenCV's stereoCalibrate gives R and T.
         projection: "perspective" up to 120 degrees; "latlon" and "cylindrical", panoramas about the baseline, for more.
-        fov: degrees, horizontal, or (horizontal, vertical), of the rectified images, about their axis.
+        fov: degrees, horizontal or (horizontal, vertical), of the rectified images, about their axis.
         image_size: (height, width) of the rectified images.
-        vertical: for cameras that stand above each other: columns correspond, not rows.
+        vertical: whether columns correspond instead of rows, for cameras above each other.
         align: "mean" for the mean of both optical axes, orthogonal to the baseline; "opencv" halves the rotation
             between the cameras, as `cv2.stereoRectify` does.
 
     Raises:
-        ValueError: If cameras are at one place, or look along the baseline or away from each other; images of more than
-            eight times the longest side of a camera, where no image_size is given; a projection or alignment that
-            does not exist, a fov out of range or up to 2 pi, as in radians, cameras without image_size.
+        ValueError: If cameras are at one place, or look along the baseline or away from each other; if default images
+            exceed eight times the longest side of a camera, a word is unknown, a fov is out of range, or an image_size
+            is missing.
         TypeError: If `left` or `right` is not a camera.
+
+    Example:
+        >>> camera = ct.KannalaBrandt([300.0, 300.0, 319.5, 239.5], [0.1, 0.0, 0.0, 0.0], image_size=(480, 640))
+        >>> pair = ct.rectify(camera, camera, ct.Extrinsics([0.0, 0.0, 0.0], [-0.1, 0.0, 0.0]), projection="latlon")
+        >>> pair.camera_left
+        LatLon(fx=299.996, fy=299.996, cx=292, cy=226.5, image_size=(454, 585))
     """
     left, right = as_sized(left, "left", "rectify"), as_sized(right, "right", "rectify")
     one_of(projection, tuple(_KINDS), "projection", "rectify")
@@ -295,7 +301,7 @@ def rectify(
         if fov is not None:
             if len(angles) not in (1, 2):
                 raise ValueError(f"rectify: fov must be horizontal, or (horizontal, vertical) degrees; got {fov!r}")
-            high = (high - low) / 2  # as usual where no angle is given
+            high = (high - low) / 2  # the default if an angle is not given
             for i, given in enumerate(angles):
                 is_along = (i == 1) == vertical
                 most = 180 if is_along or projection == "perspective" else 360
@@ -309,11 +315,11 @@ def rectify(
             size = int(sides[1]), int(sides[0])
             if max(size) > _LARGEST * max(left.height, left.width, right.height, right.width):
                 raise ValueError(
-                    f"rectify: as fine as the sharper camera the images would be {size}; give image_size=(height, "
-                    "width), and perhaps fov. Such sizes come of cameras that look along their baseline, or of "
-                    "extrinsics that are not right from left"
+                    f"rectify: image_size must be given, as the default is too large; got {size}. Pass (height, width) "
+                    "and perhaps fov, and check that extrinsics are right from left, and that the cameras do not look "
+                    "along their baseline"
                 )
-        # square pixels, unless two angles and a size say otherwise
+        # square pixels, unless two angles and a size are given
         sides = extent.new_tensor([size[1], size[0]])
         focals = sides / extent
         if len(angles) < 2:
@@ -325,14 +331,14 @@ def rectify(
 
 
 def _frame(extrinsics: Extrinsics, vertical: bool, align: Align) -> tuple[Tensor, Tensor, Tensor]:
-    """Return rotations (*B, 3, 3) of both cameras to their common frame, and the right one's place (*B,), float64."""
+    """Return rotations (*B, 3, 3) of both cameras to the common frame, and the right one's position (*B,), float64."""
     vector, translation = extrinsics.rotation.double(), extrinsics.translation.double()
     length = torch.linalg.vector_norm(translation, dim=-1)
     if known_false(length > 0):
         raise ValueError(f"rectify: extrinsics.translation must not be zero; got {translation.tolist()}")
     axis, rotation = int(vertical), rotation_matrix(vector)
     to_middle = rotation_matrix(vector / 2) if align == "opencv" else torch.eye(3).to(rotation)
-    # of the right camera, from the left: in the frame of the left one, or in the middle of both
+    # the direction from the left camera to the right one, in the left one's frame or the middle of both
     toward = -(to_middle @ rotation.mT @ translation[..., None])[..., 0] / length[..., None]
     upright = _unit(axis, toward) if align == "opencv" else rotation[..., axis, :] + _unit(axis, rotation)
     sign = torch.where((toward * upright).sum(-1) < 0, -1.0, 1.0).to(toward)
@@ -344,8 +350,8 @@ def _frame(extrinsics: Extrinsics, vertical: bool, align: Align) -> tuple[Tensor
     view = rotation[..., 2, :] + _unit(2, rotation)
     ahead = view - (view * along).sum(-1, keepdim=True) * along
     if known_false(torch.linalg.vector_norm(ahead, dim=-1) > _PARALLEL):
-        why = "no direction lies before both"
-        raise ValueError(f"rectify: the cameras look along their baseline, or away from each other: {why}")
+        why = "got cameras that look along it, or away from each other"
+        raise ValueError(f"rectify: cameras must look to one side of their baseline; {why}")
     ahead = normalize(ahead, dim=-1)
     third = torch.linalg.cross(along, ahead, dim=-1) if vertical else torch.linalg.cross(ahead, along, dim=-1)
     turned = torch.stack((third, along, ahead) if vertical else (along, third, ahead), -2)
@@ -357,12 +363,12 @@ def _unit(axis: int, like: Tensor) -> Tensor:
 
 
 def _extent(views: list[tuple[Camera, Tensor]], projection: str, vertical: bool) -> tuple[Tensor, Tensor, Tensor]:
-    """Return lows and highs (*B, 2) on the plane, and (*B,) the focal length that loses nothing in the middle."""
+    """Return lows and highs (*B, 2) on the plane, and the focal length (*B,) with full resolution in the middle."""
     like, (models, reach) = views[0][1], _KINDS[projection]
     plane = models[vertical](like.new_tensor([1.0, 1.0, 0.0, 0.0]))
     limit = torch.tensor(reach[::-1] if vertical else reach).to(like)
     lows, highs = list[Tensor](), list[Tensor]()
-    for view in views:  # what the middle row and column of the image show
+    for view in views:  # the extent of the image's middle row and column
         lines = [(p[..., i], valid) for i, (p, valid) in enumerate(middle_lines(*view, plane, limit, _LINE))]
         lows.append(torch.stack([torch.where(valid, p, torch.inf).amin(-1) for p, valid in lines], -1))
         highs.append(torch.stack([torch.where(valid, p, -torch.inf).amax(-1) for p, valid in lines], -1))
@@ -371,12 +377,12 @@ def _extent(views: list[tuple[Camera, Tensor]], projection: str, vertical: bool)
     high = torch.where(is_across, torch.minimum(*highs), torch.maximum(*highs))
     if not bool((low < high).all()):
         raise ValueError(
-            f"rectify: no {'columns' if vertical else 'rows'} show what both cameras see; are the extrinsics right "
-            "from left?"
+            f"rectify: both cameras must see some {'columns' if vertical else 'rows'} in common; got none. Check that "
+            "extrinsics are right from left"
         )
     focal = torch.stack([_scale(*view, plane, (low + high) / 2) for view in views]).amax(0)
     if not bool((focal > 0).all()):
-        raise ValueError("rectify: neither camera sees the middle of the rectified images; give fov and image_size")
+        raise ValueError("rectify: a camera must see the images' middle; got none that does. Pass fov and image_size")
     return low, high, focal
 
 

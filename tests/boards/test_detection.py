@@ -153,12 +153,12 @@ def test_points_are_row_by_row_as_opencv_has_them(board):
     [
         ("2x6", {}, "a board must have at least 3x3 inner corners; got 2x6"),
         ("9x6", {"square": float("nan")}, "must be positive"),
-        ("9x6", {"spacing": 0.3}, "a chessboard takes no option; got spacing"),
+        ("9x6", {"spacing": 0.3}, "chessboard options must be none; got spacing"),
         ("charuco 5x7", {"square": 0.02, "marker": 0.03}, "a marker must be smaller than its square"),
         ("aprilgrid 6x6", {"spacing": 0}, "above 0 and at most 2; got 0"),
         ("aprilgrid 6x6", {"border": 0}, "1, 2 or 3 cells; got 0"),
         ("circles 6x6", {}, "one of chessboard, charuco, aprilgrid; got 'circles'"),
-        ("charuco 5x7", {"dictionary": "x"}, "no dictionary of markers is called 'x'; OpenCV has 4x4_100"),
+        ("charuco 5x7", {"dictionary": "x"}, "dictionary must be one of 4x4_100"),
     ],
 )
 def test_bad_boards(words, options, text):
@@ -218,13 +218,13 @@ def test_one_image_in_any_form(form):
     ("images", "board", "error", "message"),
     [
         (np.zeros((80, 80), np.uint8), "9by6", ValueError, "charuco 5x7"),
-        (np.zeros((80, 80), np.uint8), "9x6", ValueError, "in none of 1 images: image 0: no board found"),
-        (np.zeros((80, 80)), "9x6", ValueError, "in none of 1 images"),
+        (np.zeros((80, 80), np.uint8), "9x6", ValueError, "got 1 without. image 0: no board found"),
+        (np.zeros((80, 80)), "9x6", ValueError, "got 1 without"),
         (np.full((80, 80), 200.0), "9x6", ValueError, "0 to 1 if floating point; got up to 200"),
         (np.zeros((80, 80), np.int32), "9x6", ValueError, "uint8 or uint16"),
-        ("nowhere/*.jpg", "9x6", ValueError, "no file has such a name"),
+        ("nowhere/*.jpg", "9x6", ValueError, "the pattern must match files; got none"),
         ("nowhere.jpg", "9x6", ValueError, "no such file"),
-        ([], "9x6", ValueError, "no images"),
+        ([], "9x6", ValueError, "must not be empty"),
         ([5], "9x6", TypeError, r"images\[0\]"),
     ],
 )
