@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, TypeVar, cast
 
 import numpy as np
@@ -197,7 +197,7 @@ def as_numbers_of(camera: CameraLike, value: Numbers, name: str) -> Tensor:
     return torch.as_tensor(np.asarray(value, dtype=np.float64)).to(camera.intrinsics)
 
 
-def unstack_numbers(intrinsics: Tensor, xp: Any) -> Sequence[Any]:
+def unstack_numbers(intrinsics: Tensor, xp: Any) -> Iterable[Any]:
     """Return fx, fy, cx, cy of intrinsics (*B, 4) in float64, as tensors, or as numbers and arrays."""
     if xp is torch:
         return precise(intrinsics).unbind(-1)
