@@ -11,6 +11,7 @@ from torch import Tensor
 from typing_extensions import Unpack
 
 from camtorch.augment.change import Change, Part, alone, as_one, by_kinds, check_sizes
+from camtorch.augment.elsewhere import Elsewhere, remember_camera, twin_of
 from camtorch.augment.filling import enough, filled, scaled
 from camtorch.augment.kinds import Named
 from camtorch.augment.ranges import Range, Spans, draw, draw_shares
@@ -117,6 +118,8 @@ class Augmentation(SampleTransform):
     """Whether it may follow the colours and the light of a lens, though it needs the camera."""
     image_size: tuple[int, int] | None = None
     """Of what comes out; None: that of what comes in."""
+    drawn_on_host: bool = False
+    """Whether it makes new cameras of the numbers of others alone, so that the CPU does for samples on any device."""
     crops: Mapping[str, int]
     """Boxes that a draw needs, by their names in it: which of each sample's."""
     p: float
@@ -222,7 +225,14 @@ class Augmentation(SampleTransform):
         if camera is None:
             how = f"give one here, in the sample, or as {self._name}(camera=...)"
             raise ValueError(f"{self._name}: no camera; {how}. {GUESS_CAMERA}")
-        return self._change(as_one(camera), self._checked_draw(draw))
+        return self._changed(as_one(camera), self._checked_draw(draw))
+
+    def _changed(self, camera: Camera, draw: Mapping[str, Any]) -> Change:
+        """Return what a draw does, found on the CPU if the numbers are there, and cameras elsewhere do not learn."""
+        twin = twin_of(camera) if self.drawn_on_host else None
+        if twin is None or not all(getattr(value, "is_cpu", True) for value in draw.values()):
+            return self._change(camera, draw)
+        return Elsewhere(self._change(twin, draw), camera.intrinsics.device)
 
     def _change(self, camera: Camera, draw: Mapping[str, Any]) -> Change:
         applied = draw["apply"]
@@ -425,7 +435,7 @@ class Augmentation(SampleTransform):
         count = form.count
         if draw is None:
             numbers = self._numbers(count, self.p, self.same_on_batch, generator) if numbers is None else numbers
-            change = self._change(camera, self._of_sample(numbers, named))
+            change = self._changed(camera, self._of_sample(numbers, named))
         else:
             change = self.change(camera, self._of_sample(draw, named))
         if change.count != count:
@@ -433,9 +443,11 @@ class Augmentation(SampleTransform):
         if not torch.compiler.is_compiling():
             self.__dict__["_last"] = change  # as nn.Module would, after some questions
             if count and not self._warned and "image" in [found for found, _ in named.values()]:
-                self.tell_of_empty_images(camera)
+                self.tell_of_empty_images(change.host.source if isinstance(change, Elsewhere) else camera)
         moved = self._moved(sample, batch, change)
         self._prepare(sample, batch, change)
+        if isinstance(change, Elsewhere) and isinstance(moved.get("camera"), Camera):
+            remember_camera(moved["camera"], change.host.target if form.batched else change.host.single)
         return moved, change
 
     @on_samples

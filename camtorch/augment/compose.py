@@ -83,6 +83,7 @@ class Compose(Augmentation):
             f"{i}.{key}": index for i, part in enumerate(parts) for key, index in part.crops.items()
         }
         self.needs_camera: bool = any(part.needs_camera for part in parts)
+        self.drawn_on_host: bool = all(part.drawn_on_host for part in parts)
         self._check_options(parts)
         mirrorings = {repr(m.key): m for part in parts if (m := part.mirroring) is not None}
         if len(mirrorings) > 1:

@@ -15,6 +15,7 @@ from typing_extensions import Self, Unpack
 from camtorch.augment.augmentation import Augmentation, FilledOptions
 from camtorch.augment.change import Change, Drawn, Part, no_turn
 from camtorch.augment.drawing import One, Start
+from camtorch.augment.elsewhere import twin_of
 from camtorch.augment.filling import enough, scaled
 from camtorch.augment.jitter import DRAWN, jittered
 from camtorch.augment.kinds import CHECKED, Form, check_values
@@ -129,6 +130,16 @@ class CameraDrawer(Augmentation):
         among = self.ranges.pop("fov", None) if self._is_real else None
         self._among = None if among is None else (among.low, among.high)
 
+    @property
+    def drawn_on_host(self) -> bool:  # type: ignore[override]
+        """See `Augmentation`: not what another class draws."""
+        return type(self).new_camera is CameraDrawer.new_camera
+
+    def _like_for(self, source: Camera) -> Camera | None:
+        """Return the lens to take, where the source is if it is known there."""
+        like = self._held("like")
+        return like if like is None or not source.intrinsics.is_cpu else twin_of(like) or like
+
     def __setstate__(self, state: dict[str, Any]) -> None:
         if "rates" in state["ranges"]:
             raise ValueError(f"{type(self).__name__}: the saved augmentation draws a rolling shutter. {LEFT}")
@@ -196,7 +207,7 @@ class CameraDrawer(Augmentation):
 
     def _tensors_of(self, source: Camera) -> tuple[Tensor, ...]:
         """Return the tensors that new cameras depend on."""
-        like = self._held("like")
+        like = self._like_for(source)
         return source._tensors if like is None else (*source._tensors, *like._tensors)
 
     def _key(self, source: Camera, names: Iterable[str], share: float | None) -> tuple[Any, ...]:
@@ -346,7 +357,7 @@ class CameraDrawer(Augmentation):
 
         share: of "real" lenses, which one. The reach (*B,) is that of `lenses.drawing.Lenses`.
         """
-        size, like, reach = self._size_of(source), self._held("like"), None
+        size, like, reach = self._size_of(source), self._like_for(source), None
         base = source if like is None else like
         dtype, device = torch.promote_types(source.intrinsics.dtype, torch.float32), source.intrinsics.device
         if self._is_real:

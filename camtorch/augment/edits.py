@@ -47,6 +47,7 @@ class Edit(Augmentation):
         super().__init__(ranges, **options)
 
     needs_camera = False
+    drawn_on_host = True
 
     @abstractmethod
     def edit(self, size: tuple[int, int], values: Mapping[str, Tensor]) -> tuple[Map, tuple[int, int]]:

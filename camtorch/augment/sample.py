@@ -20,6 +20,7 @@ from typing_extensions import Unpack
 
 from camtorch.augment.change import Change, alone, as_one
 from camtorch.augment.clips import Clips
+from camtorch.augment.elsewhere import remember_camera
 from camtorch.augment.kinds import (
     CHECKED,
     IMAGES,
@@ -376,7 +377,10 @@ class SampleTransform(KeepsCamera, nn.Module):
         held = {name: v for name, (_, value) in named.items() for v in (value if isinstance(value, list) else [value])}
         check_devices(self._name, **held)
         device, camera = next((v.device for v in held.values()), torch.device("cpu")), alone(as_one(camera))
-        camera = camera if camera.intrinsics.device == device else camera.each(lambda t: t.to(device))
+        if camera.intrinsics.device != device:
+            own, camera = camera, camera.each(lambda t: t.to(device))
+            if own.intrinsics.is_cpu:
+                remember_camera(camera, own)
         return Batch(named, Form([(name, found) for name, (found, _) in named.items()], batched, count), camera)
 
     def _check_cameras(self, camera: object, count: int, named: Named, batched: bool) -> None:

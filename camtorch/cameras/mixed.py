@@ -214,6 +214,10 @@ class Mixed(Camera):
         rows, _ = as_points(points, "points", 3, self.batch_shape, (self.intrinsics,), "Mixed")
         return [line for camera, mine in zip(self, rows, strict=True) for line in camera.explain(mine)]
 
+    def of_members(self, members: Iterable[Camera]) -> Self:
+        """The batch of others of the same kinds, each in the place of one of `cameras`."""
+        return type(self)(members, order=_among_used(cast("list[Camera]", list(self.cameras)), self._places)[1])
+
     def by_groups(self, change: Callable[[Camera], Camera]) -> Self:
         """Return the batch of the cameras that `change` returns for the groups."""
         if not callable(change):

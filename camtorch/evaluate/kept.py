@@ -86,20 +86,21 @@ def note(tensor: Tensor) -> Note:
     """Return the note that `same` compares with: values on the CPU, or if a tensor has no memory or no version."""
     if tensor.is_cpu or tensor.is_inference() or (tensor.numel() and not tensor.untyped_storage().data_ptr()):
         return tensor.detach().clone(), None
-    return tensor.detach(), _mark(tensor)
+    return tensor.detach(), mark(tensor)
 
 
 def same(tensor: Tensor, noted: Note) -> bool:
     """Whether shape, dtype, device and all values are as they were noted."""
-    then, mark = noted
+    then = noted[0]
     if tensor.dtype != then.dtype or tensor.device != then.device:
         return False
-    if mark is None:
+    if noted[1] is None:
         return torch.equal(tensor, then)  # False if the shapes differ
-    return not tensor.is_inference() and mark == _mark(tensor)
+    return not tensor.is_inference() and noted[1] == mark(tensor)
 
 
-def _mark(tensor: Tensor) -> Mark:
+def mark(tensor: Tensor) -> Mark:
+    """Return where values lie, on another device, and how often they were changed in place."""
     # dims of size one differ without a reason: a camera's numbers come as (n,) and as (1, n)
-    steps = [pair for pair in zip(tensor.shape, tensor.stride(), strict=True) if pair[0] != 1]
+    steps = tuple(pair for pair in zip(tensor.shape, tensor.stride(), strict=True) if pair[0] != 1)
     return tensor.untyped_storage().data_ptr(), tensor.storage_offset(), tensor._version, steps

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import cached_property
 from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
+from camtorch.evaluate.elsewhere import sent
 from camtorch.evaluate.export import of_points, plus
 from camtorch.evaluate.kept import Kept
 from camtorch.optics.radial_inverse import RADII, InverseTable, first_loss, fold_of, precise, tabulate, within
@@ -89,6 +90,16 @@ class Domain:
         if not (self.lens.is_radial or self.all_stagewise):
             made.extent = self.extent
         return made
+
+    def found_elsewhere(self, tables: Mapping[str, Tensor]) -> Domain:
+        """The same domain with tables by their names, which are known on the CPU, and sent."""
+        for name, value in zip(tables, sent([*tables.values()], self.k.device) if tables else (), strict=True):
+            setattr(self, name, value)
+        by_stages = tables.get("stagewise")
+        self.all_stagewise = by_stages is not None and bool(by_stages.all())
+        if by_stages is None or not bool(by_stages.any()):
+            self.stagewise = None
+        return self
 
     @cached_property
     def _followed(self) -> tuple[Tensor, Extent]:

@@ -267,6 +267,21 @@ class Lenses:
             struct.extent, struct.limits2 = wanted["extent"], wanted["limits2"]
         return struct.limits2, struct.extent
 
+    def tables(self) -> dict[str, Tensor]:
+        """Return copies of all that `projection.domain.Domain` has of them by the same name, (C, n)."""
+        if self.plan.has_stages and self.plan.has_factor:
+            self.inverse_table()
+        if self.plan.has_stages and not self.plan.is_radial:
+            self.followed()
+        widths = dict.fromkeys(("inner2", "usual2", "circle2", "stagewise"), 1)
+        made = {}
+        for name, width in {**widths, "table": TABLE_WIDTH, "limits2": AZIMUTHS}.items():
+            if (place := getattr(self.struct, name)) is not None:
+                dtype = torch.bool if name == "stagewise" else self.dtype
+                memory = (ctypes.c_char * (self.cameras * width * dtype.itemsize)).from_address(place)
+                made[name] = torch.frombuffer(memory, dtype=dtype).view(self.cameras, width).clone()
+        return made
+
     def _keep(self, tensor: Tensor) -> int:
         tensor = tensor.contiguous()
         self._kept.append(tensor)

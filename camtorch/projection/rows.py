@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import torch
 from torch import Tensor
 
+from camtorch.evaluate.elsewhere import on_cpu
 from camtorch.evaluate.kept import Note, note
 from camtorch.evaluate.known import known_true
 from camtorch.projection.camera_like import CameraLike
@@ -45,13 +46,16 @@ class CameraRows:
     def __init__(self, model: type[CameraLike], intrinsics: Tensor, distortion: Tensor):
         """Of concrete values (C, 4), (C, n); or (4,), (n,) of one."""
         self._model, self._learns = model, distortion.requires_grad
+        known = on_cpu(intrinsics, distortion)
+        self._host = None if known is None else CameraRows(model, known[0], known[1])
         self.notes = note(intrinsics), note(distortion)
         first, second = (then if mark is None else then.clone() for then, mark in self.notes)
         values = first, second
         if intrinsics.ndim == 1:
             values = values[0][None], values[1][None]
         self.given, self.usable = values, None
-        if not (_are_plain(model, *values) or known_true(usable := _usable(model, *values))):
+        is_plain = _are_plain(model, *values) if self._host is None else self._host.usable is None
+        if not (is_plain or known_true(usable := _usable(model, *values))):
             ideal = _ideal(model, *values)
             values = torch.where(usable, values[0], ideal[0]), torch.where(usable, values[1], ideal[1])
             self.usable = usable.to(intrinsics.dtype)  # (C, 1)
@@ -60,6 +64,8 @@ class CameraRows:
     @cached_property
     def domain(self) -> Domain:
         """That of the lenses."""
+        if self._host is not None and (native := self._host.native) is not None:
+            return Domain(self._model.optics, self.k).found_elsewhere(native.lenses.tables())
         return domain_for(self._model, self.k, self._learns)
 
     def with_all_tables(self) -> CameraRows:

@@ -96,7 +96,8 @@ class MirrorWarp(Warp):
         if not (self._decides and smooth and route == "kept" and are_known(self.target.intrinsics)):
             return None
         if self._halvings is None:
-            self._halvings = _halvings(positions(self, "kept", sampler.padding_mode), self._sampled)
+            own = self.host or self  # no device is waited for
+            self._halvings = _halvings(positions(own, "kept", sampler.padding_mode), own._sampled)
         return [Way(sampler.padding_mode, k) for k in self._halvings] if any(self._halvings) else None
 
     def _made(

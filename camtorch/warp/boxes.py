@@ -7,6 +7,7 @@ import math
 import torch
 from torch import Tensor
 
+from camtorch.evaluate.elsewhere import sent
 from camtorch.evaluate.known import is_predicted, known_true
 from camtorch.values.arguments import Numbers, as_coordinates, as_values, as_whole, check_boxes
 from camtorch.warp.pair import CameraPair
@@ -79,12 +80,15 @@ def turned(lattice: Tensor, mirrored: bool = False) -> Tensor:
 def _inside(warp: CameraPair, corners: Tensor, like: Tensor) -> tuple[Tensor, Tensor]:
     """Return a lattice (N, 2) over the target, and whether (B, *M, N) polygons enclose the scene at its points."""
     height, width = warp.target._size_for("Warp")
-    share = torch.linspace(0, 1, _LATTICE + 1, dtype=like.dtype, device=like.device)
+    host, device = warp.host, like.device
+    share = torch.linspace(0, 1, _LATTICE + 1, dtype=like.dtype, device="cpu" if host else device)
     if isinstance(warp.target, PANORAMAS):
         share = share.clamp(_ROUNDED / height, 1 - _ROUNDED / height)
     lattice = torch.cartesian_prod(share * width, share * height) - 0.5
     with torch.no_grad():
-        shown, seen = warp._move(lattice.expand(*warp.batch_shape, *lattice.shape), back=True)
+        shown, seen = (host or warp)._move(lattice.expand(*warp.batch_shape, *lattice.shape), back=True)
+        if host is not None:
+            lattice, shown, seen = sent([lattice, shown, seen], device)
         if warp.batch_shape:
             lead = len(shown), *[1] * (corners.ndim - 3), len(lattice)
             shown, seen = shown.reshape(*lead, 2), seen.reshape(lead)

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import cached_property, lru_cache, partial, reduce
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
@@ -15,6 +15,7 @@ from torch import Tensor
 
 from camtorch.cameras.camera import Camera
 from camtorch.evaluate.door import in_jit_trace, may_look, set_aside
+from camtorch.evaluate.elsewhere import sent
 from camtorch.evaluate.known import are_free, are_plain, is_unknown
 from camtorch.native.library import native_available
 from camtorch.native.sampler import CUBIC, DOUBT, EMPTY, TODO, classify
@@ -49,6 +50,11 @@ class Sampling(NamedTuple):
         scale = None if self.scale is None else self.scale[rows]
         return Sampling(self.grid[rows], self.mapped[rows], scale)
 
+    def on(self, device: torch.device) -> Sampling:
+        """On another device, of positions on the CPU."""
+        grid, mapped, *scale = sent([t for t in self if t is not None], device)
+        return Sampling(grid, mapped, scale[0] if scale else None)
+
     def part(self, down: slice, across: slice = slice(None)) -> Sampling:
         """Of these rows and columns of the target."""
         scale = None if self.scale is None else self.scale[:, down, across]
@@ -61,15 +67,27 @@ class Lattice:
 
     Nodes begin at pixel (-16, -16); a cubic is laid through four along each axis. `cells` (B, n, m) int32 are `EMPTY`,
     `CUBIC`, or a place in `exact` (2, K, 8, 8), positions for each pixel, NaN where none is mapped.
+
+    done: (3, K) the cells of `exact`, in its order; None where `cells` may be looked at.
     """
 
     nodes: Tensor
     cells: Tensor
     exact: Tensor
     size: tuple[int, int]
+    done: Tensor | None = None
 
-    def cameras(self, rows: slice | Tensor) -> Lattice:
+    def on(self, device: torch.device) -> Lattice:
+        """On another device, of a lattice on the CPU."""
+        done = torch.stack((self.cells >= 0).nonzero(as_tuple=True))
+        exact = self.exact[:, self.cells[tuple(done)].long()]
+        nodes, cells, exact, done = sent([self.nodes, self.cells, exact, done], device)
+        return Lattice(nodes, cells, exact, self.size, done)
+
+    def cameras(self, rows: slice | Tensor) -> Lattice | Sampling:
         """Of these cameras of the batch."""
+        if self.done is not None:
+            return self.pixels.cameras(rows)
         return Lattice(self.nodes[rows], self.cells[rows], self.exact, self.size)
 
     @property
@@ -91,12 +109,12 @@ class Lattice:
             planes = interpolated(self.nodes[:, :, 1:-1, 1:-1], n, m)  # (B, 2, 8 n, 8 m)
             blocks = planes.unflatten(2, (n, STEP)).unflatten(4, (m, STEP))
             some = self.cells != EMPTY
-            camera, i, j = (~some).nonzero(as_tuple=True)
-            blocks[camera, :, i, :, j] = OUTSIDE
+            blocks.masked_fill_(~some[:, None, :, None, :, None], OUTSIDE)
             seen = some[:, :, None, :, None].expand(-1, -1, STEP, -1, STEP).flatten(3, 4).flatten(1, 2)
-            camera, i, j = (self.cells >= 0).nonzero(as_tuple=True)
+            camera, i, j = (self.cells >= 0).nonzero(as_tuple=True) if self.done is None else self.done.unbind()
             if len(camera):
-                exact = self.exact[:, self.cells[camera, i, j].long()].transpose(0, 1)  # (K, 2, 8, 8)
+                exact = self.exact if self.done is not None else self.exact[:, self.cells[camera, i, j].long()]
+                exact = exact.transpose(0, 1)  # (K, 2, 8, 8)
                 known = ~exact[:, 0].isnan()
                 blocks[camera, :, i, :, j] = torch.where(known[:, None], exact, OUTSIDE)
                 seen.unflatten(1, (n, STEP)).unflatten(3, (m, STEP))[camera, i, :, j] = known
@@ -355,24 +373,37 @@ def _compute(exact: Exact, first: int, cells: Tensor, todo: Tensor, like: Tensor
 
 def interpolated(nodes: Tensor, rows: int, columns: int) -> Tensor:
     """(B, 2, rows + 3, columns + 3) to (B, 2, 8 rows, 8 columns)."""
-    # (8, 4): of the nodes at -1, 0, 1, 2 in the cubic through them, at 0, 1/8, ..., 7/8
-    t = torch.arange(STEP, dtype=torch.float64, device=nodes.device) / STEP
-    before, at, after, beyond = t + 1, t, t - 1, t - 2
-    parts = -at * after * beyond / 6, before * after * beyond / 2, -before * at * beyond / 2, before * at * after / 6
-    weights = torch.stack(parts, -1).to(nodes.dtype)
-    terms = (nodes[:, :, i : i + rows, None] * weights[:, i, None] for i in range(4))
-    lines = reduce(torch.add, terms).flatten(2, 3)
     # torch may be told to multiply matrices in less than float32
     wide = torch.float32 if torch.get_float32_matmul_precision() == "highest" else torch.float64
-    lines = lines.to(torch.promote_types(lines.dtype, wide))
+    wide = torch.promote_types(nodes.dtype, wide)
+    weights, spread = (_weights if nodes.is_cpu else _kept_weights)(nodes.dtype, wide, nodes.device)
+    terms = (nodes[:, :, i : i + rows, None] * weights[:, i, None] for i in range(4))
+    lines = reduce(torch.add, terms).flatten(2, 3)
+    lines = lines.to(wide)
     result = nodes.new_empty(*lines.shape[:-1], columns * STEP)
     cells = _BLOCK // STEP
-    spread = lines.new_zeros(cells + 3, cells, STEP)
-    for cell in range(cells):
-        spread[cell : cell + 4, cell] = weights.T
     with torch.autocast(nodes.device.type, enabled=False):
         for first in range(0, columns, cells):
             n = min(cells, columns - first)
             block = lines[..., first : first + n + 3] @ spread[: n + 3, :n].flatten(1)
             result[..., first * STEP : (first + n) * STEP] = block
     return result
+
+
+def _weights(dtype: torch.dtype, wide: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
+    """(8, 4), of the nodes at -1, 0, 1, 2 in the cubic through them, at 0, 1/8, ..., 7/8; and those of a wide block."""
+    t = torch.arange(STEP, dtype=torch.float64, device=device) / STEP
+    before, at, after, beyond = t + 1, t, t - 1, t - 2
+    parts = -at * after * beyond / 6, before * after * beyond / 2, -before * at * beyond / 2, before * at * after / 6
+    weights, cells = torch.stack(parts, -1).to(dtype), _BLOCK // STEP
+    spread = weights.new_zeros(cells + 3, cells, STEP, dtype=wide)
+    for cell in range(cells):
+        spread[cell : cell + 4, cell] = weights.T
+    return weights, spread
+
+
+@lru_cache(maxsize=8)
+def _kept_weights(*form: Any) -> tuple[Tensor, Tensor]:
+    """Those on another device, where each operator costs its launch."""
+    with torch.inference_mode(False):
+        return _weights(*form)

@@ -60,6 +60,7 @@ class CameraPair(GeometryModule):
     mode: Mode
     fill: tuple[float, ...]
     _kept: Kept
+    _host: Kept | None = None
     source: Camera = _part("_modules", "source")
     target: Camera = _part("_modules", "target")
     rotation: Tensor | None = _part("_buffers", "rotation")
@@ -92,6 +93,18 @@ class CameraPair(GeometryModule):
         """Whether positions stay whatever becomes of the cameras."""
         plan: Plan | None = self._kept.result
         return plan is not None and plan.is_pinned
+
+    @property
+    def host(self) -> Self | None:
+        """The same warp on the CPU, where this one is on another device and was made from it."""
+        entry = None if torch.compiler.is_compiling() or self._host is None else self._host.entry(self._inputs(), ())
+        return None if entry is None else entry[2]
+
+    def follow_host(self, host: CameraPair) -> Self:
+        """This warp, whose positions are found by its like on the CPU, for as long as the cameras stay."""
+        self._host = Kept()
+        self._host(self._inputs(), (), lambda: host)
+        return self
 
     @property
     def _options(self) -> tuple[object, ...]:

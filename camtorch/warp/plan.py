@@ -189,6 +189,8 @@ def by_pixel(warp: CameraPair) -> Sampling:
 
 def _computed(warp: CameraPair, reach: PaddingMode) -> Sampling | Lattice:
     """The positions of all pixels, without a graph, which serve a padding."""
+    if warp.tolerance and not warp.antialias and (host := warp.host) is not None:
+        return positions(host, "kept", reach).on(warp.target.intrinsics.device)
     if not (_is_operator(warp) and warp.tolerance and warp.target.intrinsics.is_cpu):
         return warp._locate(range(warp.target._size_for("Warp")[0]), reach, warp.tolerance)
     grid, mapped = compiled.positions(warp._sampled, warp.target, warp.rotation, warp.tolerance, reach)

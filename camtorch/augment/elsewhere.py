@@ -1,0 +1,133 @@
+"""Changes of samples on other devices: cameras that nobody learns are drawn on the CPU, and numbers are sent."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import cast
+
+import torch
+from torch import Tensor
+
+from camtorch.augment.change import Change, Moved, Part
+from camtorch.cameras.camera import Camera
+from camtorch.cameras.mixed import Mixed
+from camtorch.evaluate.door import keeps_graph, outside_inference
+from camtorch.evaluate.elsewhere import on_cpu, remember, sent
+from camtorch.evaluate.kept import Kept
+from camtorch.evaluate.known import is_unknown
+from camtorch.native.library import native_available
+from camtorch.values.module import remade
+from camtorch.warp.affine import MirrorWarp
+from camtorch.warp.warp import Warp
+
+_twins = Kept(16)
+
+
+def twin_of(camera: Camera) -> Camera | None:
+    """Return the same camera on the CPU, read once as long as its numbers stay; None where it learns or is traced."""
+    members = cast("list[Camera]", list(camera.cameras)) if isinstance(camera, Mixed) else [camera]
+    if members[0].intrinsics.is_cpu or not native_available():
+        return None
+    tensors = [t for one in members for t in one._tensors]
+    if keeps_graph(*tensors) or any(is_unknown(t) or t.is_inference() for t in tensors):
+        return None
+
+    def made() -> Camera:
+        values = iter(on_cpu(*tensors, may_wait=True) or ())
+        twins = [remade(one, intrinsics=next(values), distortion=next(values)) for one in members]
+        return camera.of_members(twins) if isinstance(camera, Mixed) else twins[0]
+
+    return _twins(tensors, (camera._form,), made)
+
+
+def remember_camera(camera: Camera, twin: Camera) -> None:
+    """Have `twin_of` find the numbers of a camera that was made from its twin."""
+    for there, here in zip(camera._tensors, twin._tensors, strict=True):
+        remember(there, here.expand(there.shape))
+
+
+class Elsewhere(Change):
+    """A change whose cameras are computed on the CPU, of samples on another device."""
+
+    def __init__(self, host: Change, device: torch.device):
+        with outside_inference():
+            parts = _sent(host.parts, device)
+        super().__init__(host.count, parts, mixed=host.mixed)
+        self.host, self._device = host, device
+        self._wide: Change | None = None
+
+    def each(
+        self, value: Tensor, move: Callable[[Part, Tensor], Moved], stay: Callable[[Camera, Tensor], Moved]
+    ) -> Moved:
+        own = self.parts[0].camera.intrinsics.dtype
+        dtype = torch.promote_types(value.dtype, own) if value.dtype.is_floating_point else own
+        if dtype == own:
+            return super().each(value, move, stay)
+        # labels are computed in the wider dtype, and so are the cameras' tables
+        if self._wide is None:
+            host = self.host
+            parts = [_in_dtype(part, dtype) for part in host.parts]
+            self._wide = Elsewhere(Change(host.count, parts, mixed=host.mixed), self._device)
+        return self._wide.each(value, move, stay)
+
+    @property
+    def mirrored(self) -> Tensor | None:
+        mirrored = self.host.mirrored
+        return None if mirrored is None else sent([mirrored], self._device)[0]
+
+    def inverse(self) -> Change:
+        self._inverse = self._inverse or Elsewhere(self.host.inverse(), self._device)
+        return self._inverse
+
+
+def _in_dtype(part: Part, dtype: torch.dtype) -> Part:
+    camera = part.camera.each(lambda t: t.to(dtype))
+
+    def wide(warp: Warp) -> Warp:
+        target = warp.target.each(lambda t: t.to(dtype))
+        return _like(warp)(camera, target, warp.rotation, **warp.options)
+
+    return replace(part.by(wide), camera=camera)
+
+
+def _like(warp: Warp) -> Callable[..., Warp]:
+    """Return what makes another one of unchecked cameras and a rotation."""
+    return warp.between if isinstance(warp, MirrorWarp) else MirrorWarp
+
+
+def _sent(parts: Sequence[Part], device: torch.device) -> list[Part]:
+    """Return parts on a device, whose numbers go there by one copy."""
+    given: list[Tensor] = []
+    for part in parts:
+        given += [t for camera in _cameras(part) for t in camera._tensors]
+        given += [t for t in (part.rotation, part.light) if t is not None]
+    numbers = iter(sent(given, device))
+
+    def there(camera: Camera) -> Camera:
+        made = remade(camera, intrinsics=next(numbers), distortion=next(numbers))
+        remember_camera(made, camera)
+        return made
+
+    made = []
+    for part in parts:
+        source, *targets = map(there, _cameras(part))
+        rotation, light = (None if t is None else next(numbers) for t in (part.rotation, part.light))
+        if part.moves is None:
+            made.append(replace(part, camera=source))
+            continue
+        hosts = [part.warp, *(part.shades or ())]
+        first, *shades = (
+            _like(host)(source, target, rotation, **host.options).follow_host(host)
+            for host, target in zip(hosts, targets, strict=True)
+        )
+        both = (shades[0], shades[1]) if shades else None
+        made.append(replace(part, moves=first, camera=source, shades=both, light=light))
+    return made
+
+
+def _cameras(part: Part) -> list[Camera]:
+    """The cameras of a part: before, and after, of each colour."""
+    if part.moves is None:
+        return [part.camera]
+    return [part.camera, part.target, *(warp.target for warp in part.shades or ())]

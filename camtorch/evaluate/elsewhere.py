@@ -1,0 +1,68 @@
+"""Values on devices other than the CPU: those known on the CPU as well, for which nobody waits, and what is sent."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import accumulate
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from camtorch.evaluate.door import outside_inference
+from camtorch.evaluate.kept import mark
+
+_ALIGNED = 16  # bytes: where the numbers of any dtype may begin
+_MOST = 64  # tensors
+
+_known: dict[tuple[Any, ...], tuple[Tensor, Tensor]] = {}
+"""By its mark, which an edit in place changes, a tensor, so that its memory stays, and its values on the CPU."""
+
+
+def on_cpu(*tensors: Tensor, may_wait: bool = False) -> list[Tensor] | None:
+    """Return values of tensors that may be looked at, if they are known on the CPU, or if one `may_wait` for them.
+
+    None on the CPU, and of tensors of inference mode, whose edits leave no trace.
+    """
+    if any(t.is_cpu or t.is_inference() for t in tensors):
+        return None
+    unknown = [t.detach() for t in tensors if _key(t) not in _known]
+    if unknown and may_wait:
+        with outside_inference():
+            numbers = torch.cat([t.reshape(-1).view(torch.uint8) for t in unknown]).cpu()
+        for tensor, part in zip(unknown, numbers.split([t.nbytes for t in unknown]), strict=True):
+            remember(tensor, part.clone().view(tensor.dtype).view(tensor.shape))
+    elif unknown:
+        return None
+    return [_known[_key(t)][1].view(_without_repeats(t)).expand(t.shape) for t in tensors]
+
+
+def remember(tensor: Tensor, values: Tensor) -> None:
+    """Have `on_cpu` find the values of a tensor, on the CPU, without asking its device."""
+    if not tensor.is_inference():
+        _known[_key(tensor)] = tensor.detach(), values.detach().contiguous()
+    while len(_known) > _MOST:
+        _known.pop(next(iter(_known)), None)
+
+
+def _key(tensor: Tensor) -> tuple[Any, ...]:
+    # one camera's numbers are those of many that share them
+    *place, steps = mark(tensor)
+    return tensor.dtype, tensor.device, tensor.numel() > 0, *place, tuple(pair for pair in steps if pair[1])
+
+
+def _without_repeats(tensor: Tensor) -> list[int]:
+    return [size if step or not size else 1 for size, step in zip(tensor.shape, tensor.stride(), strict=True)]
+
+
+def sent(tensors: Sequence[Tensor], device: torch.device) -> list[Tensor]:
+    """Return tensors of the CPU on another device: by one copy, for which nobody waits."""
+    starts = [0, *accumulate(-(-t.nbytes // _ALIGNED) * _ALIGNED for t in tensors)]
+    places = [slice(start, start + t.nbytes) for start, t in zip(starts, tensors, strict=False)]
+    with outside_inference():
+        # copies from other memory wait for what the device has still to do
+        room = torch.empty(starts[-1], dtype=torch.uint8, device="cpu", pin_memory=device.type == "cuda")
+        for tensor, place in zip(tensors, places, strict=True):
+            room[place].view(tensor.dtype).view(tensor.shape).copy_(tensor.detach())
+        there = room.to(device, non_blocking=room.is_pinned())
+        return [there[place].view(t.dtype).view(t.shape) for t, place in zip(tensors, places, strict=True)]
