@@ -324,7 +324,7 @@ class SampleTransform(KeepsCamera, nn.Module):
 
     def _form_of(self, sample: Sample, camera: object, fields: Mapping[str, str]) -> tuple[Any, ...] | None:
         """All that the fields of a sample are checked for but their values; None where that is more than tensors."""
-        if not isinstance(camera, Camera) or camera.is_mixed:
+        if torch.compiler.is_compiling() or not isinstance(camera, Camera) or camera.is_mixed:
             return None
         intrinsics, distortion = camera._tensors
         # each thread has calls of its own
