@@ -12,6 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from camtorch.evaluate.known import are_free
 from camtorch.values.arguments import as_number, shown
 
 _CPU = torch.device("cpu")
@@ -126,7 +127,7 @@ def draw(
     """
     rows = min(count, 1) if same else count
     gate, shares, spans = draw_shares(ranges, rows, p, generator, spans)
-    if shares.is_cpu and not torch.compiler.is_compiling():
+    if are_free(shares):
         if rows == count == 1:
             applied = [p >= 1] if gate is None else gate.tolist()
             return {"apply": applied, **spans.named(spans.numbers(shares.tolist()))}, spans

@@ -42,7 +42,7 @@ from camtorch.augment.kinds import (
 from camtorch.augment.landmarks import Mirroring, exchanged
 from camtorch.cameras.camera import Camera
 from camtorch.evaluate.kept import Kept
-from camtorch.evaluate.known import in_worker
+from camtorch.evaluate.known import are_free, in_worker
 from camtorch.evaluate.private import pytree
 from camtorch.models import Pinhole
 from camtorch.values.arguments import (
@@ -324,7 +324,7 @@ class SampleTransform(KeepsCamera, nn.Module):
 
     def _form_of(self, sample: Sample, camera: object, fields: Mapping[str, str]) -> tuple[Any, ...] | None:
         """All that the fields of a sample are checked for but their values; None where that is more than tensors."""
-        if torch.compiler.is_compiling() or not isinstance(camera, Camera) or camera.is_mixed:
+        if not isinstance(camera, Camera) or camera.is_mixed or not are_free():
             return None
         intrinsics, distortion = camera._tensors
         # each thread has calls of its own
