@@ -206,7 +206,7 @@ def _render(images: Tensor, grid: Tensor, where: Sampling, levels: Pyramid, how:
     if where.scale is not None:
         result = _minified(result, levels, where.grid, where.scale, mode, beyond)
     if any(fill) or padding_mode != "zeros" or minifies:
-        value = fill[0] if len(fill) == 1 else result.new_tensor(fill)[:, None, None]
+        value = float(fill[0]) if len(fill) == 1 else result.new_tensor(fill)[:, None, None]
         if padding_mode == "zeros":
             # what part of a sample comes from the image, and not from the zeros around it
             ones = images.new_ones(1, 1, *images.shape[-2:]).expand(grid.shape[0], -1, -1, -1)

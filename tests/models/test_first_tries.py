@@ -38,7 +38,7 @@ def test_what_is_told_of_each_landmark_changes_places_with_it():
     np.testing.assert_array_equal(arrays["visibility"], swapped[0].numpy())
     still = A.HorizontalFlip(0.0, landmarks=TABLES)(image=image, keypoints=keypoints, visibility=flags)
     assert torch.equal(still["visibility"], flags)
-    for wrong, error in ((flags[0], "must be"), (flags[:1], "is of 1 samples")):
+    for wrong, error in ((flags[0], "must be"), (flags[:1], "must be of 2 samples, as others; got 1")):
         with pytest.raises(ValueError, match=error):
             flip(image=image, keypoints=keypoints, visibility=wrong)
     with pytest.raises(TypeError, match="visibility has a table"):
