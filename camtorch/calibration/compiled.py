@@ -1,4 +1,4 @@
-"""Calls of compiled code for poses and views, in threads. Its formulas are those of `rays.py` and `pnp.py`."""
+"""Calls of compiled code for poses and views, in threads; `rays.py` and `pnp.py` have the same formulas."""
 
 from __future__ import annotations
 

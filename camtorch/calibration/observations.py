@@ -28,7 +28,7 @@ _FEW_OUTSIDE, _FEW_LEFT = 0.02, 0.2  # of all corners outside, and of these with
 _MOST_OF_A_VIEW = 0.5
 _NOWHERE = 10.0  # times the longer side: not even an outlier is so far outside
 _SAME_PIXEL = 3  # corners of a view at one pixel
-_SAME_ERRORS = 0.1  # the squared distance of two views over their squared residuals: 1 where noise is independent
+_SAME_ERRORS = 0.1  # the squared distance of two views over their squared residuals, which is 1 for independent noise
 _SAME_NOISE = 0.1  # px, the distance of two views that saving a file again may cause
 _NAMED = 6  # views at most, in a message
 
@@ -36,8 +36,8 @@ _NAMED = 6  # views at most, in a message
 class Observations(NamedTuple):
     """Corners of boards and their pixels in one camera: float64, padded to the number of the fullest view."""
 
-    points: Tensor  # (V, N, 3) in the board's frame, 0 where padded
-    pixels: Tensor  # (V, N, 2), 0 where unseen
+    points: Tensor  # (V, N, 3) in the board's frame, 0 if padded
+    pixels: Tensor  # (V, N, 2), 0 if unseen
     seen: Tensor  # (V, N) bool
 
     def of(self, views: Tensor) -> Observations:
@@ -49,10 +49,10 @@ class Layout(NamedTuple):
 
     shapes: tuple[tuple[int, ...], ...]  # of each view that was passed, without the last dim; (N,) for None
     stacked: bool  # whether they were one tensor or array, not a list
-    views: Tensor  # (V,) the numbers of the views that have corners, of those that were passed
+    views: Tensor  # (V,) the indices of passed views that have corners
     seen: Tensor  # (V, N) of the observations
     image_size: tuple[int, int]  # (height, width)
-    copies: tuple[int, ...]  # the numbers of passed views that are no new evidence: see `_observed` and `repeats`
+    copies: tuple[int, ...]  # the indices of passed views without new evidence: see `_observed` and `repeats`
 
     def restore(self, values: Tensor) -> Any:
         """Return results (V, N, k) or (V, N) in the form of the image points, NaN (of bool: False) if unseen."""

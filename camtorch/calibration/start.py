@@ -54,7 +54,7 @@ _ALONG = {
 _LOW_ORDERS = (1, 4)
 _REACH = 1.1  # how much further than the corners a start reaches
 _ERRS = 1.5  # times the unified lens' scale: above it the model does not fit
-_DOUBTED = 50  # at most, the views whose poses are checked again
+_DOUBTED = 50  # the most views whose poses are checked again
 _OTHER = 0.05  # radians, or part of the distance: poses further apart are two minima
 _LOST = 0.01  # the part of the corners without a pixel above which a model is wrong
 

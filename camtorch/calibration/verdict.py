@@ -123,7 +123,7 @@ class Calibration:
             distance: from the camera, in units of the object points.
 
         Returns:
-            (...,) px; NaN where a pixel has no ray.
+            (...,) px; NaN if a pixel has no ray.
         """
         return uncertainty(self.spread, pixels, distance)
 
@@ -197,7 +197,7 @@ class _Survey:
         self.calibration, self.seen = calibration, calibration.observations.seen
         cell = max(calibration.image_size) / _CELLS
         rows, columns = self.shape = tuple(max(1, round(side / cell)) for side in calibration.image_size)
-        # of the lattice of cells' edges and middles, the middles
+        # the middles of cells
         pixels = image_lattice(calibration.camera, 2 * rows + 1, 2 * columns + 1)[1::2, 1::2]
         rays, self.has_ray = calibration.camera.unproject(pixels)
         self.angles = torch.where(self.has_ray, angles_from_axis(rays), torch.nan)  # radians from the axis
@@ -315,7 +315,7 @@ def _residuals(survey: _Survey) -> Iterator[str]:
     bad, squares = seen & ~inliers, calibration.point_residuals.square().sum(-1)
     per_view, count, total = bad.sum(-1), int(bad.sum()), int(seen.sum())
     usual = float(squares[inliers].mean()) / 2 if bool(inliers.any()) else 0.0
-    # of normal errors so many are longer than three standard deviations, and none than six
+    # so many normal errors exceed three standard deviations, and none exceeds six
     if count > 3 + 2 * math.exp(-4.5) * total or bool((squares[bad] > 36 * usual).any()):
         most = int(per_view.argmax())
         robust = "" if calibration.loss else ': loss="huber" keeps them from pulling'

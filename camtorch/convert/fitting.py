@@ -43,7 +43,7 @@ def fit(
     Rays that the camera's chart never covers do not count. No row depends on another.
 
     Args:
-        camera: Camera whose optics are used, not its numbers.
+        camera: Camera, of which only the optics are used.
         observations: Rays, pixels and weights to fit to.
         starts: (S, C, n) coefficients to start from; the best result is returned.
         slopes: (C, 4) the focal lengths at the axis in x and y, and the pixel of the axis.

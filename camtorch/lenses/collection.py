@@ -186,15 +186,15 @@ def find(words: str, *, image_size: Sequence[int] | None = None) -> KannalaBrand
         raise ValueError(f"lenses.find: words must name a camera or a lens, as 'GoPro HERO9 wide'; got {words!r}")
     if not (found := search(words)):
         near = difflib.get_close_matches(words, dict.fromkeys(lens.name for lens in entries()), _SHOWN, 0.5)
-        what = f"; the nearest are {', '.join(map(repr, near))}" if near else ""
-        raise ValueError(f"lenses.find: no lens is called {words!r}{what}. {GUESS_CAMERA}")
+        what = f". The nearest are {', '.join(map(repr, near))}" if near else ""
+        raise ValueError(f"lenses.find: words must name a known lens; got {words!r}{what}. {GUESS_CAMERA}")
     if (size := as_image_size(image_size, "lenses.find")) is None:
         return found[0].camera()
     if not (fitting := search(words, image_size=size)):
         sizes = sorted({lens.image_size for lens in found})
         raise ValueError(
-            f"lenses.find: {words!r} was not calibrated for images of the aspect ratio of {size}, but (height, width) "
-            f"{', '.join(map(str, sizes[:_SHOWN]))}; camera.crop takes a part of one. {GUESS_CAMERA}"
+            f"lenses.find: image_size must have an aspect ratio calibrated for {words!r}, (height, width) "
+            f"{', '.join(map(str, sizes[:_SHOWN]))}; got {size}. camera.crop takes a part of one. {GUESS_CAMERA}"
         )
     camera = fitting[0].camera()
     return camera if camera.image_size == size else camera.resize(*size)

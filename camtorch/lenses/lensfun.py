@@ -36,10 +36,10 @@ def from_lensfun(camera: Any, lens: Any, focal_length: float, *, image_size: Seq
     """Return the camera of a lens of lensfun, in float64 and frozen.
 
     lensfun's factors of the radius, "ptlens" (a r^3 + b r^2 + c r + 1 - a - b - c), "poly3" and "poly5", may have odd
-    powers, so the camera is a table, from which `camera.convert("brown_conrady", count=8)` and others say how far they
-    are. The focal length is what Exif says, which nobody has calibrated; the axis is in the middle of the image. r = 1
-    is half the shorter side of the images that were calibrated, whose aspect ratio lensfunpy does not say: of 3:2, 4:3,
-    16:9 and 1:1 it is the one that fits lensfunpy's `Modifier`. Source: lensfun 0.3, `mod-coord.cpp`.
+    powers, so the camera is a table; `camera.convert("brown_conrady", count=8)` and others return their error. The
+    focal length is that of Exif, which is not calibrated; the axis is in the middle of the image. r = 1 is half the
+    shorter side of the calibration images. lensfunpy does not return their aspect ratio, so the one of 3:2, 4:3, 16:9
+    and 1:1 that fits lensfunpy's `Modifier` is used. Source: lensfun 0.3, `mod-coord.cpp`.
 
     Args:
         camera: A `lensfunpy.Camera`, for its crop factor.

@@ -1,1 +1,1 @@
-"""What networks need of cameras: layers that predict them, losses, and depth that means the same behind any lens."""
+"""Cameras in networks: layers that predict cameras, losses, and metric depth for any lens."""

@@ -1,4 +1,4 @@
-"""Depth that means the same behind any lens: a canonical focal length, for the images or for the depth."""
+"""Metric depth for any lens: a canonical focal length, for the images or for the depth."""
 
 from __future__ import annotations
 
@@ -28,17 +28,16 @@ class CanonicalCamera(SampleTransform):
     The size of a known object in an image determines its distance only if the focal length is known. With
     s = `focal` / the focal length of the camera, either
 
-    * the depth becomes s times as large, and the image stays (`scales="depth"`); with it all that is a length of the
-      camera's frame: distances, 3D points and landmarks, translations of poses. The scene is scaled, and the same
-      camera sees it the same;
-    * or the image becomes s times as large, and the depth keeps its values (`scales="image"`): the lens is the same,
+    * the depth becomes s times as large (`scales="depth"`), and so do all lengths in the camera's frame: distances, 3D
+      points and landmarks, translations of poses. The scene is scaled, and its image in the camera is the same;
+    * or the image becomes s times as large (`scales="image"`), and the depth keeps its values: the lens is the same,
       with exactly that focal length, and all labels of the image move with it.
 
-    `inverse` is for what a network predicts: depth in the unit that came in, on the image that came in.
+    `inverse` moves predictions of a network back to the unit of depth, and to the image, of the original sample.
 
-    The focal length of a camera of any model is the number of pixels that it has for a radian at the axis, of fx and fy
-    the geometric mean: that of a pinhole camera, and for a lens the same by whichever model it is described. For images
-    of wide lenses it holds where the axis is; what a fisheye shows at its rim is smaller, and says so by its place.
+    The focal length of a camera of any model is its number of pixels per radian at the axis, the geometric mean of both
+    directions: that of a pinhole camera, and for a lens independent of the model. It holds at the axis of a wide lens;
+    a fisheye shows objects at its rim smaller, which a network can learn by their place.
 
     Source: Yin et al., "Metric3D: Towards zero-shot metric 3D prediction from a single image", ICCV 2023: the
     transforms of labels (CSTM_label) and of images (CSTM_image).
@@ -46,10 +45,10 @@ class CanonicalCamera(SampleTransform):
     Args:
         focal: in pixels; 1000 in Metric3D.
         scales: "depth" or "image".
-        image_size: (height, width) that images come out with, their middle in the middle; that of the image times s if
-            left out, and rounded. Batches of several focal lengths need it.
-        camera: of samples that do not bring one.
-        mode, padding_mode, fill, antialias, tolerance: of images, see `Warp`; antialias=None is on where they shrink.
+        image_size: (height, width) of the new images, with the same middle; the size of the image times s, rounded, if
+            left out. Batches of several focal lengths need it.
+        camera: for samples without one.
+        mode, padding_mode, fill, antialias, tolerance: of images, see `Warp`; antialias=None is on if they shrink.
         fields, mask_fill, valid_mask: see `Augmentation`.
 
     A sample has the fields of an `Augmentation`. The result also has `scale` (B,), s, and with "image" the new `camera`
@@ -82,7 +81,7 @@ class CanonicalCamera(SampleTransform):
         self.image_size = as_image_size(image_size, self._name)
 
     def scale(self, camera: Camera) -> Tensor:
-        """Return s (*B,) for cameras (*B): `focal` divided by their focal length. Its gradients go to fx and fy."""
+        """Return s (*B,) for cameras (*B): `focal` divided by their focal length. fx and fy get its gradients."""
         if not isinstance(camera, Camera):
             raise TypeError(f"{self._name}.scale: camera must be a Camera; got {no_camera(camera)}")
         if isinstance(camera, Mixed):
@@ -97,8 +96,8 @@ class CanonicalCamera(SampleTransform):
         """Make a sample canonical: a dict or keyword arguments, single or a batch.
 
         Raises:
-            ValueError: If there is no camera, images would get several sizes, or depth is in whole numbers; and as
-                `Augmentation`.
+            ValueError: If there is no camera, images would get several sizes, depth is in whole numbers, or
+                `Augmentation` raises for the sample.
         """
         sample = self._given(sample, fields)
         batch = self._batch(sample)
@@ -117,10 +116,10 @@ class CanonicalCamera(SampleTransform):
     def inverse(self, sample: Mapping[str, Any] | None = None, **fields: Any) -> Sample:
         """Undo the forward call for a sample that it returned, or for predictions made from one.
 
-        The sample has the `camera` of the images; with "image" instead the `source_camera` as it came out.
+        The sample has the `camera` of the images; with "image" instead the `source_camera` of the forward call.
 
         Raises:
-            ValueError: If there is no such camera; and as `forward`.
+            ValueError: If there is no such camera, or `forward` would raise.
         """
         sample = self._given(sample, fields)
         sample.pop("scale", None)
@@ -128,7 +127,7 @@ class CanonicalCamera(SampleTransform):
             batch = self._batch(sample, predicted=True)
             return self._scaled(sample, batch, 1 / self.scale(batch.camera).expand(batch.form.count))
         if (source := sample.pop("source_camera", None)) is None:
-            raise ValueError(f"{self._name}: inverse() needs source_camera as it came out of the forward call")
+            raise ValueError(f"{self._name}: source_camera must be in the sample, as forward() returned it; got none")
         source = as_one(source)
         change = self._change(source, len(source) if source.batch_shape else 1)
         target = change.target if source.batch_shape else alone(change.target)  # a batch dim would be the sample's
@@ -180,15 +179,15 @@ class CanonicalCamera(SampleTransform):
             sizes = {(max(round(height * s), 1), max(round(width * s), 1)) for s in scales}
             if len(sizes) > 1:
                 raise ValueError(
-                    f"{self._name}: images of several focal lengths would come out in the sizes {sorted(sizes)}; "
-                    "image_size=(height, width) cuts or fills them to one"
+                    f"{self._name}: image_size must be given for several focal lengths; got None, and sizes "
+                    f"{sorted(sizes)}. image_size=(height, width) cuts or fills them to one"
                 )
             size = sizes.pop() if sizes else size
 
         def part(rows: list[int] | None, source: Camera) -> Part:
             scale = self.scale(source).double()
             zero = torch.zeros_like(scale)
-            # the middle, from outer edge to outer edge, stays in the middle
+            # the middle between the outer edges remains the middle
             sides = zip(size[::-1], (width, height), strict=True)
             left, top = ((new - 1) / 2 - (old - 1) / 2 * scale for new, old in sides)
             matrix = torch.stack((scale, zero, left, zero, scale, top), -1).unflatten(-1, (2, 3))

@@ -19,7 +19,7 @@ from camtorch.values.arguments import as_coordinates, as_flag, as_image_size, as
 from camtorch.values.module import GeometryModule, typed_as
 
 _ASPECT = 0.1
-_LARGEST = 1e6  # whose square is a number, and whose gradient is nothing
+_LARGEST = 1e6  # a number whose square is finite, and whose gradient is negligible
 _NODES = 33
 
 
@@ -28,36 +28,42 @@ class CameraHead(GeometryModule):
 
     A linear layer turns features into numbers, named by `names`, and the camera is valid for any numbers:
 
-    * Focal length, on a scale of logarithms, and principal point go through q(x) = x / sqrt(1 + x^2) to their ranges.
-    * The coefficients are k = given + d / sqrt(1 + g^2). Here d is made of the numbers so that each 1 moves the rim of
-      the image by a tenth of its distance from the axis, and lopsided terms by a hundredth; d / g is as far as their
-      direction leads before the lens would fold on the image or bend beyond reason, see `Limits`.
+    * The logarithm of the focal length, and the principal point, are mapped to their ranges by x / sqrt(1 + x^2).
+    * The coefficients are k = given + d / sqrt(1 + g^2). d scales the numbers so that each 1 moves the rim of the image
+      by a tenth of its distance from the axis, and lopsided terms by a hundredth; d / g is the limit in this direction,
+      at which the lens would fold on the image or bend too much, see `Limits`.
 
-    Both are nearly linear well within their limits and come as close to them as is asked. Their gradients fade with the
-    third power of the numbers, not exponentially. Whatever the coefficients, the lens shows at the corners of the image
-    what the given one shows there at the focal length predicted: so `fov` holds for all. Of charts that have
-    coefficients themselves (`UCM`, `DoubleSphere`, `Division`, ...) it is the focal length near the axis that stays.
+    Both are nearly linear well within their limits, and can come arbitrarily close to them. Their gradients fade with
+    the third power of the numbers, not exponentially. With any coefficients the corners of the image show the same
+    rays as with the given ones at the predicted focal length, so `fov` always holds. For charts with coefficients
+    (`UCM`, `DoubleSphere`, `Division`, ...) the focal length near the axis is the same instead.
 
     The layer starts with weights of zero: every camera is then `prior`.
 
     Args:
-        features: how many.
-        model: a class of cameras or its key in `ct.MODELS`; or a camera, which then is the prior.
+        features: number of features.
+        model: class of cameras or its key in `ct.MODELS`; or a camera, which is then the prior.
         image_size: (height, width) of the images in pixels; that of a given camera if left out.
-        fov: the least and the greatest horizontal field of view in DEGREES, of the lens as given; the prior has the
-            geometric mean of both focal lengths. (40, 120) if left out; around a given camera up to 1.5 times its focal
-            length, and down to as many times less if its lens shows the corners of such images.
-        count: of coefficients, for models that leave a choice.
-        centre: how far the principal point may lie from the middle, or from that of the given camera, as a part of the
-            image's width and height.
-        fixed: names of numbers that stay as in the prior: "cx", "cy", "k3", ...
-        shared_focal: fx and fy are one number, in the ratio that they have in the prior; else that may change by ten
+        fov: least and greatest horizontal field of view in DEGREES, of the given lens; the prior has the geometric mean
+            of both focal lengths. (40, 120) if left out; for a given camera 1.5 times its focal length, and down to as
+            many times less if its lens shows the corners of such images.
+        count: number of coefficients, for models with a choice.
+        centre: largest distance of the principal point from the middle, or from that of the given camera, as a part of
+            the image's width and height.
+        fixed: names of numbers that remain as in the prior: "cx", "cy", "k3", ...
+        shared_focal: whether fx and fy are one number, in the ratio of the prior; else the ratio may change by ten
             percent.
 
     Raises:
         ValueError: If the lens does not reach a field of view, or not with the corners of the image, or it seems to
             be in radians; if the model is a panorama, a name is unknown, or the model does not take the count.
         TypeError: If `model` is not a model, or `fov` is not a pair of numbers.
+
+    Example:
+        >>> head = ct.CameraHead(256, "kannala_brandt", image_size=(480, 640), fov=(60, 120))
+        >>> cameras = head(torch.zeros(8, 256))
+        >>> cameras.batch_shape, round(float(cameras.fov[0, 0]))
+        (torch.Size([8]), 85)
     """
 
     model: type[Camera]
@@ -116,7 +122,7 @@ class CameraHead(GeometryModule):
             *(("cx", "cy")[i] for i in self._centres),
             *(prior.names[i] for i in self._coefficients),
         )
-        """Of the numbers, in their order: "focal", "aspect" if it is free, "cx", "cy", and of the coefficients."""
+        """Names of the numbers, in order: "focal", "aspect" if it is free, "cx", "cy", and those of coefficients."""
         share = (2 * given - least - most) / (most - least) if most > least else 0.0
         share = min(max(share, -1 + 1e-6), 1 - 1e-6)
         filled = Limits(asked.kind, prior.lens).filled(prior.lens[None], discs.new_full((1, 1), prior.discs[1]))
@@ -137,7 +143,7 @@ class CameraHead(GeometryModule):
 
     @property
     def prior(self) -> Camera:
-        """The camera of numbers that are all zero."""
+        """The camera for numbers that are all zero."""
         return self.camera(self._discs.new_zeros(len(self.names), dtype=self.linear.weight.dtype))
 
     def forward(self, features: Tensor) -> Camera:
@@ -153,9 +159,9 @@ class CameraHead(GeometryModule):
         def __call__(self, *args: Any, **options: Any) -> Any: ...
 
     def camera(self, numbers: Tensor) -> Camera:
-        """Return cameras (*B) for numbers (*B, n) in the order of `names`, for use with a layer of your own.
+        """Return cameras (*B) for numbers (*B, n) in the order of `names`, for use with your own layer.
 
-        Numbers are clamped to a million either way; NaN makes a camera without valid points.
+        Numbers are clamped to +- a million; NaN makes a camera without valid points.
         """
         owner = f"{type(self).__name__}.camera"
         means = f", {', '.join(self.names)}"

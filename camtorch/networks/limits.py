@@ -1,4 +1,4 @@
-"""How far the coefficients of a lens may go before it would fold, or bend beyond reason, on what an image shows."""
+"""Limits of a lens's coefficients, beyond which it would fold or bend too much on an image."""
 
 from __future__ import annotations
 
@@ -13,32 +13,32 @@ from camtorch.optics.backprojection import FURTHEST, Inverted
 from camtorch.optics.charts import Chart
 from camtorch.values.arguments import columns
 
-BEYOND = 1.02  # how much further out than the image is asked, where its rim is safe from rounding
-_NODES = 48  # of Chebyshev: what a polynomial of t = radius^2 is between them is hardly more than on them
-_KEPT = 0.02  # of the way from the lens given to where a formula ends
-_AZIMUTHS = 360  # a shear near its end has its least in a narrow sector
+BEYOND = 1.02  # times the image's radius, so that its rim is safe from rounding
+_NODES = 48  # of Chebyshev: a polynomial of t = radius^2 is hardly larger between them than at them
+_KEPT = 0.02  # of the way from the given lens to the end of a formula, which is kept free
+_AZIMUTHS = 360  # a shear near its end has its least slope in a narrow sector
 _AT_AXIS = 1e-6  # of the radius; further out a chart of a large xi or alpha may have no rays
-_FIRST, _LAST, _GRID, _NEARER = 1e-3, 1e3, 32, 3  # where the end is looked for first, and how many times nearer
-_ROUNDS, _PARTS = 5, 8  # in which it is bracketed more closely
-_STEP = 1e-6  # by which the slope of the margin at the end is taken
+_FIRST, _LAST, _GRID, _NEARER = 1e-3, 1e3, 32, 3  # the first bracket of the end, its nodes, and shifts nearer
+_ROUNDS, _PARTS = 5, 8  # of bracketing the end more closely
+_STEP = 1e-6  # relative, of finite differences of the margin
 
-# positive for a lens in the set, by the ratio of its profile to that of the lens given
+# positive for a lens in the set, by the ratio of its profile to that of the given lens
 _MARGINS: dict[str, Callable[[Tensor], Tensor]] = {
     "room": lambda ratio: ratio - _KEPT,  # positive where the chart has rays
     "turns": lambda ratio: torch.minimum(ratio / 0.25 - 1, 1 - ratio / 20.0),  # angles from node to node
     "slope": lambda ratio: ratio - 0.05,  # a lower bound in all directions
-    "reach": lambda ratio: 1 - ratio / 4.0,  # an upper bound of how many times further out points come to lie
+    "reach": lambda ratio: 1 - ratio / 4.0,  # an upper bound of the factor by which points move out
     "defined": lambda ratio: ratio - _KEPT,  # positive where the formula exists
 }
 
 
 class Limits:
-    """The coefficients with which a model is one-to-one on a disc around the axis: a set, seen from one lens in it.
+    """The set of coefficients with which a model is one-to-one on a disc around the axis, around a given lens.
 
-    It holds the lenses that, on the whole disc, have more than a twentieth of the slope of the lens given, in every
-    direction, and send no point four times as far out; charts that have coefficients are at least a quarter, and at
-    most twenty times as steep as the one given. It is convex where all terms of a lens are of one stage and linear in
-    the coefficients: polynomials, decentering, thin prisms. Elsewhere only lines from the lens given are looked at.
+    Its lenses have, on the whole disc and in every direction, more than a twentieth of the given lens's slope, and
+    move no point four times as far out; charts with coefficients are at least a quarter and at most twenty times as
+    steep as the given one. The set is convex if all terms of a lens are in one stage and linear in the coefficients:
+    polynomials, decentering, thin prisms. Otherwise only lines from the given lens are used.
 
     Coefficients are (*C, n) and radii of discs, on the plane of the chart, (*C, 1); `given` is (n,).
     """
@@ -51,7 +51,7 @@ class Limits:
         self.is_radial: bool = len(lens.stages) == 0 or lens.is_radial
 
     def disc(self, k: Tensor, radius: Tensor) -> Tensor:
-        """Return the disc of another lens that shows, near the axis, what that of the lens given shows."""
+        """Return the radius (*C, 1) of the disc that shows, near the axis, as much as that of the given lens."""
         if not self.bends:
             return radius
         given, other = (_angles(self.model.optics(columns(w))[0], _AT_AXIS * radius) for w in (self.given, k))
@@ -67,7 +67,7 @@ class Limits:
         return torch.hypot(*lens(radius * turn.cos(), radius * turn.sin())).amin(-1, keepdim=True)
 
     def _profile(self, k: Tensor, radius: Tensor) -> dict[str, Tensor]:
-        """Return a lens from the axis outwards, (*C, nodes) each, by the names in `_MARGINS` that it has."""
+        """Return the numbers of a lens from the axis outwards, (*C, nodes) each, by names of `_MARGINS`."""
         share = torch.arange(1, _NODES + 1, dtype=k.dtype, device=k.device) * (math.pi / (2 * _NODES))
         radii = BEYOND * self.disc(k, radius) * share.sin()
         chart, lens = self.model.optics(columns(k))
@@ -86,14 +86,13 @@ class Limits:
     def along(self, direction: Tensor, radius: Tensor) -> Tensor:
         """Return how many times (C, 1) a direction (C, n) may be added to the given coefficients before the set ends.
 
-        A thousand times if not before, and the first end if there are several. Its derivatives are exact, but for those
-        of higher order.
+        The result is at most a thousand, and the first end if there are several. First derivatives are exact.
         """
-        # where both terms of a hypotenuse are zero it has no gradient
+        # a hypotenuse of two zeros has no gradient
         start = self.given.to(direction) + torch.finfo(direction.dtype).tiny ** 0.5
 
         def margin(times: Tensor, direction: Tensor, radius: Tensor, given: dict[str, Tensor]) -> Tensor:
-            """Return what is positive (C, S) in the set, with the direction added so many times (C, S)."""
+            """Return the margin (C, S), positive in the set, with the direction added so many times (C, S)."""
             here = self._profile(start + times.unsqueeze(-1) * direction.unsqueeze(-2), radius.unsqueeze(-2))
             least = [_MARGINS[name](value / given[name]).nan_to_num(nan=-1.0).amin(-1) for name, value in here.items()]
             return torch.stack(torch.broadcast_tensors(*least)).amin(0)
@@ -104,8 +103,8 @@ class Limits:
             step = _STEP * times
             slope = (margin(times + step, *plain) - margin(times - step, *plain)) / (2 * step)
             ends &= slope < 0
-        # the implicit function: where the margin would change, the end moves until it does not
-        # where none was found it is that of the lens given, as elsewhere there need not be a formula to derive
+        # the implicit function theorem: the end moves so that the margin remains zero
+        # without an end, take derivatives at the given lens, since elsewhere the formula may not exist
         direction = torch.where(ends, direction, 0.0)
         there = margin(times, direction, radius, self._profile(start, radius.unsqueeze(-2)))
         moved = (there - there.detach()) / torch.where(ends, slope, 1.0)
@@ -113,9 +112,9 @@ class Limits:
 
 
 def _end(margin: Callable[[Tensor], Tensor], like: Tensor) -> tuple[Tensor, Tensor]:
-    """Return where a margin of times (C, S) is lost first, (C, 1), and whether it is."""
+    """Return the first times (C, 1) at which a margin of times (C, S) is not positive, and whether there is one."""
     nearest = torch.full_like(like[:, :1], _FIRST)
-    for _ in range(_NEARER):  # where a coefficient does next to nothing, 1 is far out in that of others
+    for _ in range(_NEARER):  # 1 may be far out for other coefficients than one with little effect
         nearest = torch.where(margin(nearest) > 0, nearest, nearest * (_FIRST / _LAST))
     share = torch.linspace(0, 1, _GRID, dtype=like.dtype, device=like.device)
     parts = torch.arange(1, _PARTS + 1, dtype=like.dtype, device=like.device) / _PARTS

@@ -27,13 +27,13 @@ __all__ = ["angles", "rays", "reprojection"]
 def angles(first: Tensor, second: Tensor) -> Tensor:
     """Return the angles (...) in radians between directions (..., 3), from 0 to pi, exact to rounding at both ends.
 
-    Its gradient has length 1, and is zero where it has none: between equal directions and between opposite ones. acos
-    of the dot product is off by 3e-4 in float32, and its gradient is infinite there. Source: Kahan, "How futile are
-    mindless assessments of roundoff in floating-point computation?", 2006, section 12.
+    The gradient has length 1, and is zero between equal or opposite directions, at which it does not exist. acos of the
+    dot product is off by 3e-4 in float32, and its gradient is infinite there. Source: Kahan, "How futile are mindless
+    assessments of roundoff in floating-point computation?", 2006, section 12.
 
     Args:
-        first: of any length but zero.
-        second: likewise; both broadcast.
+        first: of any length except zero.
+        second: of any length except zero; both broadcast.
     """
     first = as_coordinates(first, "first", 3, "angles")
     second = as_coordinates(second, "second", 3, "angles", first.device)
@@ -75,24 +75,24 @@ def rays(
 ) -> Tensor | tuple[Tensor, Tensor]:
     """Return the angles between the rays that two cameras have for the same pixels of their images.
 
-    It compares cameras of any models, whatever their numbers mean, and weighs focal length, principal point and
-    distortion by what they do: in radians.
+    It compares cameras of any models, and weighs errors of focal length, principal point and distortion by their effect
+    in radians.
 
     Args:
-        predicted: of any batch dims *B.
-        target: likewise; both broadcast.
-        samples: rows and columns of the pixels that are looked at, evenly over the image: the middles of as many equal
-            parts of it; a number for both.
-        pixels: (*B, *N, 2), those to be looked at instead.
+        predicted: with any batch dims *B.
+        target: with any batch dims *B; both broadcast.
+        samples: rows and columns of pixels to compare, evenly over the image: the middles of as many equal parts of it;
+            a number for both.
+        pixels: (*B, *N, 2), pixels to compare instead.
         weights: of the angles, broadcast against them.
-        reduction: "mean": over the angles that are valid in both, by weight. "none": all of them.
+        reduction: "mean" over the angles that are valid in both, by weight; "none" for all of them.
 
     Returns:
-        The mean, radians; 0 if nothing is valid. Or angles (*B, rows, columns), or (*B, *N) for pixels, that are 0
-        without a gradient where they are not valid, times the weights; and valid in the same shape.
+        The mean in radians, 0 if nothing is valid; or angles (*B, rows, columns), or (*B, *N) for pixels, times the
+        weights, 0 without a gradient if they are not valid, and valid in the same shape.
 
     Raises:
-        ValueError: If images have different sizes or none, and there are no pixels; if the reduction is another one.
+        ValueError: If images have different sizes or none, and there are no pixels; if the reduction is unknown.
         TypeError: If `predicted` or `target` is not a camera.
     """
     owner = "losses.rays"
@@ -136,16 +136,14 @@ def reprojection(
     weights: Numbers | None = None,
     reduction: Literal["mean", "none"] = "mean",
 ) -> Tensor | tuple[Tensor, Tensor]:
-    """Return the distances in pixels between points as the predicted camera sees them and as the target does.
+    """Return the distances in pixels between the projections of points by the predicted camera and by the target.
 
-    Points that the predicted camera does not see at all do not count, and so do not pull it: `rays` does, over the
-    whole image.
+    Points that the predicted camera does not see do not count, and do not pull it; `rays` counts the whole image.
 
     Args:
-        predicted: of batch dims *B.
-        target: the camera that sees the points where they are, or those pixels (*B, *N, 2) themselves, NaN where not
-            seen.
-        points: (*B, *N, 3) of the camera frame; the rays of the target's own image if left out, see `samples`.
+        predicted: with batch dims *B.
+        target: the camera with the true projections, or their pixels (*B, *N, 2), NaN if unseen.
+        points: (*B, *N, 3) in the camera's frame; the rays of the target's own image if left out, see `samples`.
         samples: see `rays`.
         weights: see `rays`.
         reduction: see `rays`.
@@ -154,7 +152,7 @@ def reprojection(
         The mean distance over points that both see, or distances (*B, *N) and valid; see `rays`.
 
     Raises:
-        ValueError: If there are pixels without points; and as `rays`. TypeError: If `predicted` is not a camera.
+        ValueError: If there are pixels without points, or `rays` would raise. TypeError: If `predicted` is no camera.
     """
     owner = "losses.reprojection"
     if isinstance(target, Camera):
@@ -176,8 +174,8 @@ def reprojection(
         off = found - pixels
     except RuntimeError:
         raise ValueError(
-            f"{owner}: pixels {tuple(pixels.shape)} of target and {tuple(found.shape)} of the points do not fit "
-            "together"
+            f"{owner}: pixels of target and of the points must broadcast; got {tuple(pixels.shape)} and "
+            f"{tuple(found.shape)}"
         ) from None
     # a point without a pixel has a distance without a gradient
     return _reduced(torch.linalg.vector_norm(off, dim=-1), valid & seen, weights, reduction, owner)
@@ -193,8 +191,7 @@ def _check(predicted: Camera, target: Camera, owner: str) -> torch.Size:
         return broadcast_shapes(*shapes)
     except ValueError:
         raise ValueError(
-            f"{owner}: the batch dims {tuple(shapes[0])} of predicted and {tuple(shapes[1])} of target do not fit "
-            "together"
+            f"{owner}: batch dims of predicted and target must broadcast; got {tuple(shapes[0])} and {tuple(shapes[1])}"
         ) from None
 
 
@@ -204,8 +201,8 @@ def _places(
     """Return the middles (*B, rows, columns, 2) of equal parts of the image."""
     sizes = {camera.image_size for camera in (predicted, target) if camera.image_size is not None}
     if len(sizes) != 1:
-        what = f"of {' and '.join(map(str, sorted(sizes)))}" if sizes else "without an image_size"
-        raise ValueError(f"{owner}: the cameras must be of images of one size; got those {what}")
+        what = " and ".join(map(str, sorted(sizes))) if sizes else "none"
+        raise ValueError(f"{owner}: image_size must be the same for both cameras; got {what}")
     height, width = sizes.pop()
     pair = samples if isinstance(samples, (tuple, list)) else (samples, samples)
     if len(pair) != 2 or any(as_whole(count, "samples", owner) < 1 for count in pair):

@@ -7,11 +7,11 @@ from torch import Tensor, nn
 
 
 class PositiveFocal(nn.Module):
-    """Focal lengths that no step of an optimizer makes negative: their logarithms learn, fx and fy each.
+    """Focal lengths that remain positive in every step of an optimizer: the logarithms of fx and fy learn.
 
         torch.nn.utils.parametrize.register_parametrization(camera, "intrinsics", PositiveFocal())
 
-    An optimizer's step of 0.01 is one percent of a focal length; the principal point learns as it is, in pixels.
+    An optimizer's step of 0.01 is one percent of a focal length; the principal point learns in pixels.
     """
 
     def forward(self, unconstrained: Tensor) -> Tensor:
@@ -24,7 +24,7 @@ class PositiveFocal(nn.Module):
 
 
 class TiedFocal(nn.Module):
-    """Square pixels, fx = fy: one focal length learns, as its logarithm; see `PositiveFocal`.
+    """Square pixels, fx = fy: the logarithm of one focal length learns; see `PositiveFocal`.
 
     A camera whose focal lengths differ gets their geometric mean.
     """

@@ -1,4 +1,4 @@
-"""What a `CameraHead` starts from, and the discs of the lens that its images show at the most."""
+"""The camera that a `CameraHead` starts from, and the largest discs of the lens that its images show."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from camtorch.rays.lattices import focal_for
 from camtorch.values.arguments import check_degrees, columns, shown
 
 _FOV = 40.0, 120.0
-_LONGER, _SHORTER = 1.5, (1.5, 1.25, 1.1, 1.05)  # than a given camera's; the first that leaves its corners rays
-_RIM, _LOPSIDED = 0.1, 0.1  # real lenses have a tenth as much of what is lopsided
-_TURNS = 0.0, math.pi / 4, math.pi / 2  # where what is lopsided moves most
+_LONGER, _SHORTER = 1.5, (1.5, 1.25, 1.1, 1.05)  # times a given camera's; the first with rays for the corners
+_RIM, _LOPSIDED = 0.1, 0.1  # of the rim's radius; real lenses have a tenth as much of lopsided terms
+_TURNS = 0.0, math.pi / 4, math.pi / 2  # azimuths at which lopsided terms move most
 _AZIMUTHS = 16
 
 
 @dataclass
 class Prior:
-    """A lens, and from where to where its focal length goes."""
+    """A lens, and the range of its focal length."""
 
     model: type[Camera]
     lens: Tensor  # (n,) coefficients, float64
@@ -38,7 +38,7 @@ class Prior:
         return self.model.names_of(len(self.lens)) or ()
 
     def scales(self, discs: Tensor) -> Tensor:
-        """Return what of a coefficient moves the rim of discs (K,) by `_RIM`, (K, n); 0 for what changes nothing."""
+        """Return the changes (K, n) of coefficients that move the rim of discs (K,) by `_RIM`; 0 if none does."""
         turn = discs.new_tensor(_TURNS)
         a, b = ((discs[:, None] * c).reshape(-1, 1) for c in (turn.cos(), turn.sin()))
         k = self.lens.expand(len(a), -1)
@@ -61,7 +61,7 @@ class Prior:
 def prior_of(
     asked: Model, image_size: tuple[int, int], centre: float, aspect: float, fov: Sequence[float] | None, owner: str
 ) -> Prior:
-    """Return the prior of a `CameraHead`; `aspect` is by how much the logarithm of fy / fx may change."""
+    """Return the prior of a `CameraHead`; `aspect` is the largest change of the logarithm of fy / fx."""
     degrees, start, given, ratio = _as_fov(fov, owner), asked.start, None, 0.0
     middle = [(side - 1) / 2 for side in image_size[::-1]]
     if start is not None:
@@ -74,7 +74,7 @@ def prior_of(
     for lens in _lenses(asked):
         if not asked.kind.optics(columns(lens))[0].has_scale:
             raise ValueError(
-                f"{owner}: {asked.kind.__name__} is a panorama, or has an axis of its own: no head predicts it"
+                f"{owner}: model must not be a panorama, or have an axis of its own; got {asked.kind.__name__}"
             )
         numbers = lens.new_tensor([1.0, 1.0, 0.0, 0.0]), *([lens] if len(lens) else [])
         plane = asked.kind(*numbers).requires_grad_(False)
@@ -87,15 +87,15 @@ def prior_of(
             ranges = [(longest, given or math.sqrt(longest * shortest), shortest)] if bool(reached.all()) else []
         for longest, focal_length, shortest in ranges:
             if not shortest * (1 - 1e-6) <= focal_length <= longest * (1 + 1e-6):
-                within = f"the given camera has a field of view that is not within fov={tuple(fov or ())}"
+                within = f"fov must contain that of the given camera; got {tuple(fov or ())}"
                 raise ValueError(f"{owner}: {within}")
             first, second, third = (_disc(plane, far / f) for f in (longest, focal_length, shortest))
             if first and second and third:
                 found.append(Prior(asked.kind, lens, focal_length, ratio, middle, (first, second, third)))
                 break
     if found:
-        # the first, unless coefficients do nothing there that do something elsewhere, as the omega of `FOV` at 0: then
-        # that of most coefficients of which the one that does least does most
+        # the first, unless coefficients without effect there have one elsewhere, like the omega of `FOV` at 0: then the
+        # one with most effective coefficients, and of these the one whose weakest coefficient has most effect
         scales = [prior.scales(torch.tensor(prior.discs, dtype=torch.float64)) for prior in found]
         counts = [int((scale > 0).all(0).sum()) for scale in scales]
         if counts[0] == max(counts):
@@ -106,8 +106,8 @@ def prior_of(
     )
     angles = f" with fov={degrees or _FOV}" if degrees or start is None else ""
     raise ValueError(
-        f"{owner}: {who} has no rays for the corners of images of {image_size}{angles} and a principal point moved by "
-        f"up to centre={centre} of them. A narrower fov, a smaller centre, or {other}"
+        f"{owner}: {who} must have rays for the corners of images of {image_size}, the principal point moved by up to "
+        f"centre={centre} of them; got none{angles}. Use a narrower fov, a smaller centre, or {other}"
     )
 
 
@@ -117,15 +117,15 @@ def _as_fov(fov: Sequence[float] | None, owner: str) -> tuple[float, float] | No
     try:
         low, high = (float(angle) for angle in fov)
     except (TypeError, ValueError, RuntimeError):
-        raise TypeError(f"{owner}: fov must be the least and the greatest, as (40, 120); got {shown(fov)}") from None
+        raise TypeError(f"{owner}: fov must be (least, greatest), such as (40, 120); got {shown(fov)}") from None
     if not 0 < low <= high <= 360:
-        raise ValueError(f"{owner}: fov must be degrees, from the least to the greatest; got {fov!r}")
+        raise ValueError(f"{owner}: fov must be degrees, (least, greatest); got {fov!r}")
     check_degrees(low, fov, owner)
     return low, high
 
 
 def _lenses(asked: Model) -> Iterator[Tensor]:
-    """Return the coefficients of the camera; or those of an ideal one, and those that fits of the model start from."""
+    """Yield the coefficients of the camera to start from; or of an ideal one, and of the model's starts of fits."""
     if asked.start is not None:
         yield asked.start.distortion.detach().double().reshape(-1).cpu()
         return
@@ -136,7 +136,7 @@ def _lenses(asked: Model) -> Iterator[Tensor]:
 
 
 def _disc(plane: Camera, reach: float) -> float:
-    """Return the radius of the disc of the chart's plane that is seen up to a distance from the centre, or 0."""
+    """Return the radius on the chart's plane that is seen up to a distance `reach` from the centre, or 0."""
     turn = torch.arange(_AZIMUTHS, dtype=torch.float64) * (2 * math.pi / _AZIMUTHS)
     rim = BEYOND * reach * torch.stack((turn.cos(), turn.sin()), -1)
     if not bool(plane.unproject(rim)[1].all()):

@@ -1,6 +1,5 @@
 """Plots of cameras and calibrations, by matplotlib (`pip install -e ".[plot]"`): each function draws on Axes, `ax`,
-by default new ones, and returns them; `calibration` and `portrait` return a Figure. Without matplotlib an ImportError
-says how to install it.
+by default new ones, and returns them; `calibration` and `portrait` return a Figure.
 """
 
 from camtorch.plot.figures import calibration, difference, distortion_field, portrait, radius_curve, rig

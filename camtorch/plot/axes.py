@@ -33,7 +33,7 @@ def axes_or_new(ax: Axes | None) -> Axes:
     """Return the Axes, or new Axes in a figure of their own; raise a TypeError for anything else."""
     if ax is not None:
         if not hasattr(ax, "get_figure"):
-            hint = "Several cameras are one list, [a, b]"
+            hint = "Pass several cameras as one list, [a, b]"
             raise TypeError(f"plot: ax must be Axes of matplotlib; got {type(ax).__name__}. {hint}")
         return ax
     require_matplotlib()
@@ -45,7 +45,7 @@ def axes_or_new(ax: Axes | None) -> Axes:
 def check_single(camera: Camera) -> None:
     """Raise a ValueError if the camera is a batch."""
     if camera.batch_shape:
-        raise ValueError(f"plot: the camera must be a single one; got batch dims {tuple(camera.batch_shape)}")
+        raise ValueError(f"plot: camera must be a single one; got batch dims {tuple(camera.batch_shape)}")
 
 
 def size_of(camera: Camera) -> tuple[int, int]:

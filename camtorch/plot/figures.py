@@ -191,7 +191,7 @@ def rig(rig: Rig, ax: Axes | None = None) -> Axes:
     """
     ax = axes_or_new(ax)
     if not (names := [name for name in rig.cameras if name in rig.extrinsics]):
-        raise ValueError(f"plot: the cameras of a rig need extrinsics; got a rig of {list(rig.cameras)} without")
+        raise ValueError(f"plot: rig must have extrinsics; got {list(rig.cameras)} without")
     places = torch.stack([rig.extrinsics[name].position for name in names]).double().numpy(force=True)
     spread = np.ptp(places, axis=0)
     above = spread[1] <= max(spread[0], spread[2])

@@ -187,11 +187,11 @@ def head_angles(pose: Extrinsics | Numbers) -> Tensor:
     """Return pitch, yaw and roll (..., 3) in radians for heads that a camera sees.
 
     The head's frame has x to the image's right, y down and z away from the camera when the head faces it, so that the
-    identity faces the camera. R = Ry(yaw) Rx(-pitch) Rz(roll), right-handed turns about the camera's axes: the nose
-    points along R (0, 0, -1), whose pitch and yaw these are as of a gaze (`ct.augment.to_pitch_yaw`, the signs of
-    ETH-XGaze), and a positive roll leans clockwise in the image about that axis. If the nose points straight up or
-    down, roll is 0. Values and gradients are finite everywhere. `camtorch.poses.rotations.mount_rotation`, which turns
-    cameras, has another order: yaw, pitch, roll, in degrees.
+    identity faces the camera. R = Ry(yaw) Rx(-pitch) Rz(roll), right-handed turns about the camera's axes. The nose
+    points along R (0, 0, -1), the gaze with this pitch and yaw in `ct.augment.to_pitch_yaw` (the signs of ETH-XGaze),
+    and a positive roll leans clockwise in the image about that axis. If the nose points straight up or down, roll is 0.
+    Values and gradients are finite everywhere. `camtorch.poses.rotations.mount_rotation`, which turns cameras, has
+    another order: yaw, pitch, roll, in degrees.
 
     Args:
         pose: camera from head: Extrinsics, a `Pose` of `ct.solve_pnp`, or matrices (..., 4, 4) or (..., 3, 3).

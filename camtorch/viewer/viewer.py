@@ -88,7 +88,7 @@ def _file(name: str) -> str:
 def _described(camera: Camera) -> dict[str, Any]:
     if not isinstance(camera, Camera) or camera.is_mixed:
         has_one = isinstance(getattr(camera, "camera", None), Camera)
-        hint = ". For a rig pass rig.camera, or one of rig.cameras" if has_one else ""
+        hint = ". Pass rig.camera or one of rig.cameras for a rig" if has_one else ""
         raise TypeError(f"write_viewer: camera must be a camera of one model; got {type(camera).__name__}{hint}")
     if camera.batch_shape:
         shape = tuple(camera.batch_shape)
@@ -102,7 +102,7 @@ def _described(camera: Camera) -> dict[str, Any]:
     size = camera._size_for("write_viewer")
     intrinsics, distortion = camera.intrinsics.detach().double(), camera.distortion.detach().double()
     if (trouble := unusable(camera, intrinsics, distortion)) is not None:
-        raise ValueError(f"write_viewer: this camera has no pixels: {trouble[0]}: {trouble[1]}")
+        raise ValueError(f"write_viewer: camera must have pixels; got none: {trouble[0]}: {trouble[1]}")
     return {
         "model": camera.key,
         "class": _constructor(lens),

@@ -85,9 +85,9 @@ def test_the_best_match_has_the_fewest_other_words_then_the_smallest_error():
 
 
 def test_what_is_not_there_is_answered_with_what_is_like_it():
-    with pytest.raises(ValueError, match=r"'GoPro HERO99 wide'; the nearest are .*'GoPro HERO9 Black Wide'"):
+    with pytest.raises(ValueError, match=r"'GoPro HERO99 wide'\. The nearest are .*'GoPro HERO9 Black Wide'"):
         ct.lenses.find("GoPro HERO99 wide")
-    with pytest.raises(ValueError, match=r"no lens is called 'xqzzk'\. KannalaBrandt.from_fov"):
+    with pytest.raises(ValueError, match=r"known lens; got 'xqzzk'\. KannalaBrandt.from_fov"):
         ct.lenses.find("xqzzk")
     with pytest.raises(ValueError, match="must name a camera"):
         ct.lenses.find("  ")
@@ -101,7 +101,7 @@ def test_a_lens_for_the_images_at_hand():
     assert small.image_size == (1080, 1920)
     assert torch.allclose(small.intrinsics[:2], whole.intrinsics[:2] / 2)
     assert ct.lenses.find("GoPro HERO9 Black Wide", image_size=(3984, 5312)).intrinsics[0] != whole.intrinsics[0]
-    with pytest.raises(ValueError, match="not calibrated for images of the aspect ratio"):
+    with pytest.raises(ValueError, match=r"aspect ratio calibrated for .*; got \(1000, 3000\)"):
         ct.lenses.find("GoPro HERO9 Black Wide", image_size=(1000, 3000))
 
 
@@ -196,4 +196,4 @@ def test_the_command_line_knows_them(tmp_path, monkeypatch, capsys):
     assert main(["show", "lens:GoPro HERO9 wide"]) == 0
     assert "KannalaBrandt" in capsys.readouterr().out
     assert main(["lenses", "GoPro", "HERO99"]) == 2
-    assert "the nearest are" in capsys.readouterr().err
+    assert "The nearest are" in capsys.readouterr().err

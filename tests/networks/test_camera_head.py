@@ -210,13 +210,13 @@ def test_rows_are_independent_and_a_bad_one_is_alone():
 REFUSED = [
     ("pinhole", {"image_size": None}, "image_size=(height, width)"),
     ("equirectangular", {}, "panorama"),
-    ("pinhole", {"fov": (120, 40)}, "from the least to the greatest"),
-    ("pinhole", {"fov": (90, 190)}, "no rays for the corners"),
-    ("orthographic_fisheye", {"fov": None}, "A narrower fov"),
+    ("pinhole", {"fov": (120, 40)}, "must be degrees, "),
+    ("pinhole", {"fov": (90, 190)}, "must have rays for the corners"),
+    ("orthographic_fisheye", {"fov": None}, "Use a narrower fov"),
     ("pinhole", {"fixed": "fx"}, "fov=(90, 90)"),
     ("pinhole", {"centre": 0.7}, "below 0.5"),
     (CAMERAS[0], {"image_size": (48, 64)}, "that of the camera, (480, 640)"),
-    (CAMERAS[0], {"fov": (20, 30)}, "not within"),
+    (CAMERAS[0], {"fov": (20, 30)}, "must contain that"),
     (ct.KannalaBrandt([200.0, 200, 320, 240], [-0.2, 0, 0, 0], image_size=SIZE), {}, "a crop's camera"),
     ("pinhole", {"fov": 90}, "as (40, 120); got 90"),
 ]
