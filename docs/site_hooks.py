@@ -1,10 +1,10 @@
-"""What mkdocs does beside building pages: it takes pages from the repository's root, and that of live lenses from the
-library, and lets images load lazily.
-"""
+"""Hooks of mkdocs: pages from the repository's root and the library, llms.txt, and images that load lazily."""
 
 import io
 import re
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 from urllib.parse import urljoin
 
 from mkdocs.config.defaults import MkDocsConfig
@@ -16,22 +16,34 @@ from camtorch.viewer.viewer import page as viewer_page
 
 ROOT = Path(__file__).parent.parent
 WIDE = 700  # px: more than a phone shows
-PAGES = {"CONTRIBUTING.md": "contributing.md", "CHANGELOG.md": "changelog.md"}
+PAGES = {"CONTRIBUTING.md": "contributing.md", "CHANGELOG.md": "changelog.md", "AGENTS.md": "agents.md"}
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
-    """Pages that GitHub wants in the root, with links as seen from docs/."""
+    """Add the pages that GitHub expects in the root, with links as seen from docs/, the viewer and llms.txt."""
     for source, target in PAGES.items():
         text = (ROOT / source).read_text()
         for other, page in PAGES.items():
             text = text.replace(f"]({other}", f"]({page}")
         files.append(File.generated(config, target, content=text.replace("](docs/", "](")))
     files.append(File.generated(config, "viewer.html", content=viewer_page()))
+    text = f"# {config.site_name}\n\n> {config.site_description}\n" + "\n".join(_lines(config.nav or []))
+    files.append(File.generated(config, "llms.txt", content=text + "\n"))
     return files
 
 
+def _lines(nav: list[dict[str, Any]]) -> Iterator[str]:
+    """Yield the lines of llms.txt: a heading for each section and a link for each page."""
+    for title, place in (item for entry in nav for item in entry.items()):
+        if isinstance(place, list):
+            yield f"\n## {title}\n"
+            yield from _lines(place)
+        else:
+            yield f"- [{title}]({place.removesuffix('index.md').removesuffix('.md').rstrip('/') or '.'}/)"
+
+
 def on_page_content(html: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Images load when they are scrolled to, and text stays where it is meanwhile; wide ones open by themselves."""
+    """Let images load when they are scrolled to, with their size reserved; wide images are links to themselves."""
 
     def shown(found: re.Match[str]) -> str:
         link, tag = found[1] or "", found[2]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 import tempfile
 
 import cv2
@@ -19,7 +20,7 @@ import camtorch as ct
 from camtorch.augment.sample import Sample
 from camtorch.boards.boards import Chessboard
 from camtorch.poses.rotations import mount_rotation
-from drawings.marks import INK, PAPER, marked, shown
+from drawings.marks import INK, PAPER, POINT, RIM, font, marked, shown
 from drawings.pages import EXAMPLES, IMAGES
 from drawings.sheets import drawn, in_rows, tiles
 
@@ -68,6 +69,31 @@ def overview(columns: int = 4) -> Image.Image:
         *((other, "another lens and mount") for other in others),
     ]
     return labelled(panels, columns)
+
+
+def moving(frames: int = 36) -> list[Image.Image]:
+    """Return a loop: the image of a fisheye, and of a camera whose k1 and yaw go to and fro, with its labels."""
+    lens = ct.KannalaBrandt.from_fov(190, image_size=(720, 960), distortion=[0.02, -0.01, 0.003, -0.001])
+    fisheye = rendered(lens.double().requires_grad_(False))
+    sheets, left = [], (marked(fisheye, 300, 400), "a driver by a fisheye of 190 degrees")
+    for angle in torch.linspace(0, 2 * torch.pi, frames + 1)[:-1].tolist():
+        sliders = {"k1": (0.12 - 0.16 * math.cos(angle), -0.04, 0.28), "yaw": (25 * math.sin(angle), -25.0, 25.0)}
+        k1, yaw = (value for value, _, _ in sliders.values())
+        target = ct.KannalaBrandt([270.0, 270.0, 319.5, 239.5], [k1, 0.0, 0.0, 0.0], image_size=(480, 640))
+        turn = mount_rotation(*torch.tensor([yaw, 0.0, 0.0], dtype=torch.float64))
+        view = moved(fisheye, ct.Warp(fisheye["camera"], target.double().requires_grad_(False), turn))
+        sheet = in_rows([left, (marked(view, 300, 400), "ct.Warp: image and labels by any other camera")], 2)
+        sheets.append(Image.new("RGB", (sheet.width, sheet.height + 34), PAPER))
+        sheets[-1].paste(sheet, (0, 0))
+        draw, y = ImageDraw.Draw(sheets[-1]), sheet.height + 8
+        for x, (name, (value, least, most)) in zip(
+            (left[0].width + 32, left[0].width + 232), sliders.items(), strict=True
+        ):
+            knob = x + 50 + 120 * (value - least) / (most - least)
+            draw.text((x, y - 10), name, INK, font(18))
+            draw.line((x + 50, y, x + 170, y), RIM, 4)
+            draw.ellipse((knob - 8, y - 8, knob + 8, y + 8), POINT)
+    return sheets
 
 
 def labelled(panels: list[tuple[Sample, str]], columns: int) -> Image.Image:
@@ -340,3 +366,7 @@ def main(names: list[str]) -> None:
     for name, draw in PICTURES.items():
         if not names or name in names:
             draw().save(IMAGES / f"{name}.jpg", quality=82, optimize=True)
+    if not names or "moving" in names:
+        first, *others = moving()
+        options = {"duration": 90, "loop": 0, "quality": 72, "method": 6, "kmin": 0, "kmax": 1}  # each frame whole
+        first.save(IMAGES / "moving.webp", save_all=True, append_images=others, **options)

@@ -24,9 +24,9 @@ from camtorch.cli.main import main
 
 ROOT = Path(__file__).parents[2]
 FILES = ROOT / "tests" / "files"
-PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
+PAGES = [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").rglob("*.md"))]
 
-FIRST = ("README.md", "getting-started.md", "concepts.md")  # the others are tried by the slow tests
+FIRST = ("README.md", "AGENTS.md", "getting-started.md", "concepts.md")  # the others are tried by the slow tests
 
 
 def blocks(language: str):

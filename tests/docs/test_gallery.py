@@ -125,4 +125,4 @@ def test_every_image_is_small_and_shown():
     text = "".join(page.read_text() for page in (*DOCS.rglob("*.md"), DOCS.parent / "mkdocs.yml"))
     for image in filter(Path.is_file, (DOCS / "images").rglob("*")):
         assert image.relative_to(DOCS).as_posix() in text
-        assert image.stat().st_size < 1.3 * LARGEST
+        assert image.stat().st_size < (10 if image.suffix == ".webp" else 1.3) * LARGEST
