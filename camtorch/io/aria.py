@@ -33,7 +33,7 @@ def parse(record: Record) -> Rig:
     record.few(len(record["CameraCalibrations"]))
     for entry in record["CameraCalibrations"]:
         if (name := entry["Label"].text()) in cameras:
-            entry["Label"].fail(f"a second camera is called {name!r:.60}")
+            entry["Label"].fail(f"must be unique; got {name!r:.60} twice")
         projection = entry["Projection"]
         key, focals, count = _MODELS[one_of(projection["Name"], _MODELS)]
         values = projection["Params"].numbers(focals + 2 + count)
@@ -47,7 +47,7 @@ def parse(record: Record) -> Rig:
         if "T_Device_Camera" in entry:
             place = entry["T_Device_Camera"]
             if len(quaternion := place["UnitQuaternion"]) != 2:
-                quaternion.fail(f"is not [w, [x, y, z]], but {quaternion.value!r:.60}")
+                quaternion.fail(f"must be [w, [x, y, z]]; got {quaternion.value!r:.60}")
             w, xyz = quaternion
             numbers = [w.number(), *xyz.numbers(3), *place["Translation"].numbers(3)]
             extrinsics[name] = poses.from_quaternions(quaternion, numbers, undo=True)
@@ -63,7 +63,7 @@ def render(rig: Rig, lossy: Lossy) -> str:
         key, (fx, fy, cx, cy), distortion = lossy.model(name, camera, {key for key, _, _ in _MODELS.values()})
         kind, focals, count = next((kind, f, count) for kind, (k, f, count) in _MODELS.items() if k == key)
         if focals == 1 and fx != fy:
-            lossy.fail(name, f"fx = {fx!r} and fy = {fy!r}; the model has one focal length in {lossy.format}")
+            lossy.fail(name, f"must have one focal length for {lossy.format}; got fx = {fx!r} and fy = {fy!r}")
         w, x, y, z, *translation = poses.quaternions(extrinsics, undo=True).tolist()
         entries.append(
             {

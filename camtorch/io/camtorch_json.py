@@ -62,10 +62,10 @@ def made_of(kind: type[Made], d: Mapping[str, Any]) -> Made:
     known = _OF_CAMERAS if is_camera else _OF_POSES
     for key in record.keys():  # noqa: SIM118
         if key not in known:
-            record[key].fail(f"is not known; known are {', '.join(known)}")
+            record[key].fail(f"keys must be among {', '.join(known)}; got {key!r:.60}")
     made: Any = _camera(record) if is_camera else _pose(*_vectors(record))
     if not isinstance(made, kind):
-        record["model"].fail(f"a {type(made).__name__}, which is no {kind.__name__}; ct.Camera.from_dict takes any")
+        record["model"].fail(f"must be of {kind.__name__}; got {type(made).__name__}. ct.Camera.from_dict takes any")
     dtype = _DTYPES[one_of(record["dtype"], _DTYPES)] if "dtype" in record else torch.float64
     return made.to(dtype).requires_grad_(False)
 
@@ -90,7 +90,7 @@ def _camera(record: Record) -> Camera:
     kind = record["model"].model(key)
     arguments = [_tensor(record["intrinsics"], 4)]
     if names and list(kind.names_of(len(names)) or ()) != names:
-        record["distortion_names"].fail(f"not those of {kind.__name__}, which takes {kind.counts_text()}")
+        record["distortion_names"].fail(f"must be names of {kind.__name__}, {kind.counts_text()}; got {names!r:.60}")
     if names or "distortion" in record:
         arguments.append(_tensor(record["distortion"], len(names)))
     size = None
@@ -108,7 +108,7 @@ def _camera(record: Record) -> Camera:
 def _same_batch(record: Record, *tensors: Tensor) -> None:
     """Refuse batch dims that would grow when they are broadcast: a small file must not take much memory."""
     if len(shapes := {tuple(t.shape[:-1]) for t in tensors} - {()}) > 1:
-        record.fail(f"batch dims that differ: {', '.join(map(str, sorted(shapes)))}")
+        record.fail(f"batch dims must be equal; got {', '.join(map(str, sorted(shapes)))}")
 
 
 def _tensor(record: Record, last: int) -> Tensor:
@@ -116,11 +116,11 @@ def _tensor(record: Record, last: int) -> Tensor:
     try:
         values = torch.tensor(record.value, dtype=torch.float64)
     except (ValueError, TypeError, RuntimeError) as error:
-        record.fail(f"not numbers (*B, {last}): {error}")
+        record.fail(f"must be numbers (*B, {last or 'n'}): {error}")
     if not 0 < values.ndim <= _DEEPEST_BATCH or values.shape[-1] != (last or values.shape[-1]):
         record.fail(f"must be numbers (*B, {last or 'n'}); got {tuple(values.shape)}")
     if not bool(values.isfinite().all()):
-        record.fail("numbers that are not finite")
+        record.fail("must be finite; got NaN or infinity")
     return values
 
 
@@ -162,5 +162,5 @@ def _entry(one: Camera | Extrinsics, lossy: Lossy, name: str) -> dict[str, Any]:
 
 def _values(lossy: Lossy, name: str, tensor: Tensor) -> Sequence[Any]:
     if not bool(torch.isfinite(tensor).all()):
-        lossy.fail(name, "numbers that are not finite")
+        lossy.fail(name, "numbers must be finite; got NaN or infinity")
     return tensor.detach().double().tolist()

@@ -82,7 +82,7 @@ def read(path: str, content: bytes) -> Rig:
     images, values, _, record = _read_images(beside)
     for row, camera in enumerate(images.values()):
         if camera not in cameras:
-            record(row).fail(f"its camera {camera} is not in {os.path.basename(path)}")
+            record(row).fail(f"its camera must be in {os.path.basename(path)}; got {camera}")
     if not images:
         return Rig(cameras)
     return Rig(cameras, (list(images), poses.from_quaternions(record, values)), images=images)
@@ -103,10 +103,10 @@ def _from_text(path: str, content: bytes) -> dict[str, Camera]:
         words = decoded(path, line[1]).split(maxsplit=_MOST_WORDS)
         record = Record(path, words, f"line {number}")
         if len(words) < 4:
-            record.fail(f"less than an id, a model, a width and a height: {len(words)} words")
+            record.fail(f"must be an id, a model, a width, a height and numbers; got {len(words)} words")
         first, name, width, height, *values = record
         if name.value not in _MODELS:
-            name.fail(f"the model {name.value!r:.60} is not known here; known are {', '.join(_MODELS)}")
+            name.fail(f"the model must be one of {', '.join(_MODELS)}; got {name.value!r:.60}")
         size = height.side(), width.side()
         identity = first.whole(0, _LARGEST_ID, "camera id")
         _add(cameras, identity, record, name.value, size, [value.number() for value in values])
@@ -121,25 +121,25 @@ def _from_bytes(path: str, content: bytes) -> dict[str, Camera]:
         nonlocal position
         record.place, position = f"byte {position}", position + struct.calcsize(layout)
         if position > len(content):
-            record.fail(f"the file ends here, {position - len(content)} bytes too early")
+            record.fail(f"must have {position - len(content)} bytes more; got the end of the file")
         return struct.unpack_from(layout, content, position - struct.calcsize(layout))
 
     (count,) = take("<Q")
     if count > len(content) // 24:
-        record.fail(f"{count} cameras, for which the file is too small")
+        record.fail(f"must have as many cameras as the file has room for; got {count}")
     for _ in range(count):
         identity, model, width, height = take("<IiQQ")
-        name = _IDS.get(model) or record.fail(f"the model {model} is not known here; known are {sorted(_IDS)}")
+        name = _IDS.get(model) or record.fail(f"the model must be one of {sorted(_IDS)}; got {model}")
         if identity > _LARGEST_ID:
-            record.fail(f"{identity} is no camera id")
+            record.fail(f"must be a camera id; got {identity}")
         size = Record(path, [str(width), str(height)], record.place).size()
         values = list(take(f"<{_parameters(name)}d"))
         if not all(map(math.isfinite, values)):
-            record.fail(f"parameters that are not finite: {values}")
+            record.fail(f"parameters must be finite; got {values}")
         _add(cameras, identity, record, name, size, values)
     if position < len(content):
         record.place = f"byte {position}"
-        record.fail(f"{len(content) - position} bytes after the last camera")
+        record.fail(f"must end after the last camera; got {len(content) - position} bytes more")
     return cameras
 
 
@@ -153,13 +153,13 @@ def _add(
 ) -> None:
     _, key, focals, _ = _MODELS[name]
     if str(identity) in cameras:
-        record.fail(f"a second camera has the id {identity}")
+        record.fail(f"camera ids must be unique; got {identity} twice")
     record.few(len(cameras))
     if len(values) != _parameters(name):
-        record.fail(f"{len(values)} parameters; {name} has {_parameters(name)}")
+        record.fail(f"{name} must have {_parameters(name)} parameters; got {len(values)}")
     if key == "equirectangular":
         if values != [size[1], size[0]]:
-            record.fail(f"a panorama of {values[0]:g} x {values[1]:g} in an image of {size[1]} x {size[0]}")
+            record.fail(f"a panorama must be as large as its image, {size[1]} x {size[0]}; got {values}")
         intrinsics, distortion = panorama(size), []
     else:
         cx, cy, *distortion = values[focals:]
@@ -185,9 +185,9 @@ def _read_images(path: str) -> tuple[dict[str, str], np.ndarray, bool, Callable[
         for place, pose, camera, name, with_points in entries(path, file):
             places.append(place)
             if len(images) >= _MOST_IMAGES:
-                record(-1).fail(f"more than {_MOST_IMAGES} images")
+                record(-1).fail(f"must have at most {_MOST_IMAGES} images; got more")
             if name in images:
-                record(-1).fail(f"a second image is called {name!r:.60}")
+                record(-1).fail(f"names of images must be unique; got {name!r:.60} twice")
             images[name] = camera
             values.extend(pose)
             has_points = has_points or with_points
@@ -206,11 +206,11 @@ def _images_from_text(path: str, file: BinaryIO) -> Iterator[_ImageEntry]:
         if not words or words[0].startswith(b"#"):
             passed += 1
             if passed > _MOST_COMMENTS:
-                record.fail(f"more than {_MOST_COMMENTS} lines without an image")
+                record.fail(f"must have an image every {_MOST_COMMENTS} lines; got none")
             continue
         if len(words) < 10:
             _text(record, line)
-            record.fail(f"less than IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME: {len(words)} words")
+            record.fail(f"must be IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME; got {len(words)} words")
         try:
             pose, camera = list(map(float, words[1:8])), int(words[8])
         except ValueError:
@@ -223,18 +223,18 @@ def _images_from_text(path: str, file: BinaryIO) -> Iterator[_ImageEntry]:
 
 def _text(record: Record, content: bytes) -> str:
     if len(content) > _LONGEST_NAME:
-        record.fail(f"the name of the image has no end within {_LONGEST_NAME} bytes")
+        record.fail(f"the name of an image must be at most {_LONGEST_NAME} bytes; got more")
     try:
         return content.decode()
     except UnicodeDecodeError:
-        record.fail("not text")
+        record.fail("must be text; got other bytes")
 
 
 def _images_from_bytes(path: str, file: BinaryIO) -> Iterator[_ImageEntry]:
     size = os.fstat(file.fileno()).st_size
     (count,) = struct.unpack("<Q", file.read(8).ljust(8, b"\0"))
     if size < 8 or count > (size - 8) // (_HEAD.size + 9):
-        Record(path, None, "byte 0").fail(f"{count} images, for which the file is too small")
+        Record(path, None, "byte 0").fail(f"must have as many images as the file has room for; got {count}")
     position = 8
     for _ in range(count):
         record = Record(path, None, f"byte {position}")
@@ -242,16 +242,16 @@ def _images_from_bytes(path: str, file: BinaryIO) -> Iterator[_ImageEntry]:
         block = file.read(_HEAD.size + _LONGEST_NAME + 9)
         end = block.find(b"\0", _HEAD.size)
         if end + 9 > len(block) or (end < 0 and len(block) < _HEAD.size + _LONGEST_NAME):
-            record.fail("the file ends within this image")
+            record.fail("must be a whole image; got the end of the file")
         name = _text(record, block[_HEAD.size : end] if end > 0 else block)
         _, *pose, camera = _HEAD.unpack_from(block)
         (points,) = struct.unpack_from("<Q", block, end + 1)
         if position + end + 9 + points * _POINT > size:
-            record.fail(f"{points} points, for which the file is too small")
+            record.fail(f"must have as many points as the file has room for; got {points}")
         yield position, pose, str(camera), name, points > 0
         position += end + 9 + points * _POINT
     if position < size:
-        Record(path, None, f"byte {position}").fail(f"{size - position} bytes after the last image")
+        Record(path, None, f"byte {position}").fail(f"must end after the last image; got {size - position} bytes more")
 
 
 def render(rig: Rig, lossy: Lossy) -> dict[str, bytes]:
@@ -272,14 +272,14 @@ def render(rig: Rig, lossy: Lossy) -> dict[str, bytes]:
     suffix = os.path.splitext(path)[1]
     if rig.extrinsics:
         if beside is None:
-            way = f"call the file cameras{suffix}, or name a folder"
-            lossy.fail("extrinsics", f"no place: COLMAP has them in images{suffix} beside cameras, so {way}")
+            way = f"Call the file cameras{suffix}, or name a folder"
+            lossy.fail("extrinsics", f"must be in images{suffix} next to cameras{suffix}; got another name. {way}")
         contents[beside] = _images_content(lossy, rig, identities, beside, binary)
         # COLMAP opens a folder only if it has a file of points
         if not os.path.exists(points := os.path.join(os.path.dirname(path), f"points3D{suffix}")):
             contents[points] = struct.pack("<Q", 0) if binary else b"# Number of points: 0\n"
     elif beside is not None and os.path.exists(beside):
-        lossy.fail("extrinsics", f"none, while {beside} has poses of images, which these cameras would get")
+        lossy.fail("extrinsics", f"must be given, as {beside} has poses of images; got none")
     return contents
 
 
@@ -289,7 +289,7 @@ def _smallest(lossy: Lossy, name: str, camera: Camera) -> tuple[str, list[float]
     if key == "equirectangular":
         height, width = lossy.size(name, camera)
         if [fx, fy, cx, cy] != panorama((height, width)):
-            lossy.fail(name, "a part of a panorama; COLMAP has the whole sphere only")
+            lossy.fail(name, "must be a whole sphere for COLMAP; got a part of a panorama")
         return "EQUIRECTANGULAR", [float(width), float(height)]
     fitting = [
         (len(distortion) != _COUNTS.get(model, count), _parameters(model), model, count)
@@ -298,7 +298,7 @@ def _smallest(lossy: Lossy, name: str, camera: Camera) -> tuple[str, list[float]
     ]
     if not fitting:
         lossy.at_most(name, camera, distortion, (max(count for _, k, _, count in _MODELS.values() if k == key),))
-        lossy.fail(name, f"fx = {fx!r} and fy = {fy!r}; COLMAP's model has one focal length")
+        lossy.fail(name, f"must have one focal length for COLMAP's model; got fx = {fx!r} and fy = {fy!r}")
     _, _, model, count = min(fitting)
     values = (distortion + [0.0] * count)[:count]
     return model, [*(fx, fy)[: _MODELS[model][2]], cx + 0.5, cy + 0.5, *values]
@@ -328,15 +328,15 @@ def _images_content(lossy: Lossy, rig: Rig, identities: dict[str, int], path: st
     entries = []
     for name, values in zip(rig.extrinsics, poses.quaternions(poses.all_of(rig, lossy)).tolist(), strict=True):
         if not name or "\0" in name or (not binary and (name.split() != [name])):
-            hint = "" if binary else " from text; .bin takes it"
-            lossy.fail(repr(name), f"an image name that COLMAP does not read{hint}")
+            hint = "" if binary else ". Write .bin, which holds it"
+            lossy.fail(repr(name), f"must be a name that COLMAP reads; got another{hint}")
         entries.append((name, identities[rig.images.get(name, name)], values))
     if os.path.exists(path) and _read_images(path)[2]:
-        Record(path, None).fail("holds the points of images, which would be lost; write to another folder")
+        Record(path, None).fail("must hold no points, which would be lost; got some. Write to another folder")
     folder, suffix = os.path.dirname(path), os.path.splitext(path)[1]
     for name in ("rigs", "frames"):
         if os.path.exists(os.path.join(folder, name + suffix)):
-            lossy.fail("extrinsics", f"would contradict {name}{suffix} beside them; write to another folder")
+            lossy.fail("extrinsics", f"must agree with {name}{suffix} there; got others. Write to another folder")
     if binary:
         parts = [struct.pack("<Q", len(entries))]
         for i, (name, camera, values) in enumerate(entries, 1):

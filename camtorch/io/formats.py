@@ -86,7 +86,7 @@ _MODULES: dict[str, Any] = {module.NAMES.format: module for module in (*_BY_CONT
 READ: dict[str, Names] = {format: module.NAMES for format, module in _MODULES.items()}
 WRITTEN = {format: READ[format] for format, module in _MODULES.items() if hasattr(module, "render")}
 FORMATS = tuple(READ)
-_OPENMVG = "OpenMVG's scene, which is not read: openMVG_main_openMVG2Colmap writes it in COLMAP's format"
+_OPENMVG = "must not be OpenMVG's; got its scene. openMVG_main_openMVG2Colmap writes it in COLMAP's format"
 
 
 def load(path: str | os.PathLike[str] | IO[str] | IO[bytes], format: str | None = None) -> Rig:
@@ -106,6 +106,11 @@ def load(path: str | os.PathLike[str] | IO[str] | IO[bytes], format: str | None 
         there is only one. Poses of images are the rows of one batch, `rig.extrinsics.batch`. Pixel centres, axes and
         directions are camtorch's, whatever the file's are. Names are the file's; one nameless camera is "camera".
 
+    Example:
+        >>> ct.save(ct.Pinhole([90.0, 90.0, 63.5, 47.5], image_size=(96, 128)), "camera.xml")
+        >>> ct.load("camera.xml").camera.image_size
+        (96, 128)
+
     Raises:
         CameraFileError: If the file cannot be used; the message names the place and the reason.
         OSError: If the file cannot be opened. ValueError: If the format is unknown. TypeError: If `path` is no path.
@@ -119,9 +124,9 @@ def load(path: str | os.PathLike[str] | IO[str] | IO[bytes], format: str | None 
         try:
             content = path.read(LARGEST_FILE + 1)
         except UnicodeDecodeError as error:
-            raise CameraFileError(source, f"byte {error.start}", "not text; open the file with 'rb'") from None
+            raise CameraFileError(source, f"byte {error.start}", "must be text; got bytes. Open it with 'rb'") from None
         if len(content) > LARGEST_FILE:
-            raise CameraFileError(source, "size", f"more than {LARGEST_FILE >> 20} MiB")
+            raise CameraFileError(source, "size", f"must be at most {LARGEST_FILE >> 20} MiB; got more")
         return _loaded(source, content.encode() if isinstance(content, str) else content, format)
     path = path_of(path, "load", "calibration file")
     if os.path.isdir(path):
@@ -130,8 +135,8 @@ def load(path: str | os.PathLike[str] | IO[str] | IO[bytes], format: str | None 
         if found is None:
             suffixes = tuple(suffix for names in READ.values() for suffix in names.suffixes)
             there = ", ".join(repr(name) for name in sorted(os.listdir(path)) if name.endswith(suffixes))
-            hint = f". Name a file: there is {there:.200}" if there else ""
-            raise CameraFileError(path, "folder", f"has none of {', '.join(names)}{hint}")
+            hint = f". Name a file, such as {there:.200}" if there else ""
+            raise CameraFileError(path, "folder", f"must have one of {', '.join(names)}; got none{hint}")
         path = os.path.join(path, found)
     return _loaded(path, read_bytes(path), format)
 
@@ -164,9 +169,9 @@ def _loaded(source: str, content: bytes | dict[str, Any], format: str | None) ->
     try:
         rig, format = _read(source, content, format)
     except (ArithmeticError, RecursionError, MemoryError) as error:
-        raise CameraFileError(source, "content", f"cannot be read: {type(error).__name__}: {error}") from None
+        raise CameraFileError(source, "content", f"must be readable; got {type(error).__name__}: {error}") from None
     if not rig.cameras:
-        raise CameraFileError(source, "cameras", "none")
+        raise CameraFileError(source, "cameras", "must be given; got none")
     rig.format = format
     return rig.requires_grad_(False)
 
@@ -200,8 +205,8 @@ def _read(path: str, content: bytes | dict[str, Any], format: str | None) -> tup
     shown = ", ".join(f"{key!r:.30}" for key in list(keys)[:5]) or "none"
     if "fx" in keys:
         way = "ct.BrownConrady([fx, fy, cx, cy], [k1, k2, p1, p2], image_size=(height, width))"
-        shown += f"; a camera of numbers is {way}"
-    raise CameraFileError(path, "content", f"no format that is known here has the keys {shown}")
+        shown += f". A camera of numbers is {way}"
+    raise CameraFileError(path, "content", f"keys must be those of a known format; got {shown}")
 
 
 def save(rig: Rig | Camera, path: str | os.PathLike[str], format: str | None = None) -> None:
@@ -213,13 +218,16 @@ def save(rig: Rig | Camera, path: str | os.PathLike[str], format: str | None = N
         rig: A `Rig`, or one camera.
         path: The file; if it is a link, the file that it points to is replaced. With COLMAP it may be a folder, and
             poses go to an images file in the folder of the cameras; with Nerfstudio it may be a folder that exists.
-        format: "opencv", "ros", "kalibr", "colmap", "nerfstudio", "aria", "basalt", "mrcal" or "camtorch". If left
+        format: "opencv", "ros", "kalibr", "colmap", "nerfstudio", "aria", "basalt", "mrcal" or "camtorch".
             Default: the format that the rig was loaded from if its files end like this one, else that of the name
             (`transforms.json`, `camchain.yaml`, `camera_info.yaml`, `.cameramodel`, `.xml`, `cameras.txt`, `.bin`),
             else camtorch's own for `.json`.
 
+    Example:
+        >>> ct.save(ct.Pinhole([90.0, 90.0, 63.5, 47.5], image_size=(96, 128)), "camera.json")
+
     Raises:
-        CameraFileError: If the format cannot hold a value; the message says what would be lost.
+        CameraFileError: If the format cannot hold a value; the message names the value that would be lost.
         ValueError: If the format is unknown, or the name does not determine it. OSError: If the file cannot be written.
     """
     write(rendered(rig, path, format), path)
@@ -252,7 +260,7 @@ def rendered(rig: Rig | Camera, path: str | os.PathLike[str], format: str | None
             by_name = "ct.Rig({f'camera{i}': one for i, one in enumerate(camera)})"
             raise TypeError(f"{path}: {name} must be of one model; got a Mixed. Save {by_name}")
         if not camera.key:
-            raise TypeError(f"{path}: {name} is a {type(camera).__name__}, which has no key of its own to be loaded by")
+            raise TypeError(f"{path}: {name} must be of a model with a key; got {type(camera).__name__}")
     format = _known(format, WRITTEN, "written") or _format_of(rig, path)
     if os.path.isdir(path):
         if not (inside := [os.path.join(path, name) for name in WRITTEN[format].in_folder]):
@@ -263,16 +271,16 @@ def rendered(rig: Rig | Camera, path: str | os.PathLike[str], format: str | None
         found = module.render(rig, Lossy(path, module.NAMES.title))
         return {path: found.encode()} if isinstance(found, str) else found
     except UnicodeEncodeError as error:
-        raise CameraFileError(path, "names", f"{error.object!r:.60} is no text that a file can hold") from None
+        raise CameraFileError(path, "names", f"must be text that a file can hold; got {error.object!r:.60}") from None
 
 
 def _known(format: str | None, there: dict[str, Names], done: str) -> str | None:
     name = None if format is None else str(format).lower()
     if name is None or name in there:
         return name
-    reason = f"is not {done}" if name in FORMATS else "is not known here"
+    reason = f"which is not {done}" if name in FORMATS else "which is unknown"
     left = "" if name in FORMATS else f". {LEFT}"
-    raise ValueError(f"format: {format!r} {reason}; {done} are {', '.join(sorted(there))}{left}")
+    raise ValueError(f"format must be one of {', '.join(sorted(there))}; got {format!r}, {reason}{left}")
 
 
 def _format_of(rig: Rig, path: str) -> str:
@@ -283,10 +291,10 @@ def _format_of(rig: Rig, path: str) -> str:
     if rig.format is not None and rig.format in formats:
         return rig.format
     if folder:
-        raise ValueError(f"{path}: is a folder; name a file, or write {' or '.join(f'format={f!r}' for f in formats)}")
+        raise ValueError(f"{path}: must be a file; got a folder. Write {' or '.join(f'format={f!r}' for f in formats)}")
     patterns = {pattern: names.format for names in fitting for pattern in names.patterns}
     if meant := [pattern for pattern in patterns if fnmatch.fnmatchcase(file, pattern)]:
         return patterns[max(meant, key=len)]
-    may = f"it may be {', '.join(formats)}" if formats else f"written are {', '.join(sorted(WRITTEN))}"
+    may = f"got one for {', '.join(formats)}" if formats else f"got one for none of {', '.join(sorted(WRITTEN))}"
     hint = "Name it, as in format='kalibr' or --format kalibr"
-    raise ValueError(f"{path}: the name does not determine the format; {may}. {hint}")
+    raise ValueError(f"{path}: the name must determine the format; {may}. {hint}")

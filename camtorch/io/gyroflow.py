@@ -22,7 +22,7 @@ def parse(record: Record) -> Rig:
     """Return the camera of the calibrated images, with the measured centre, if `asymmetrical` is set or not."""
     for key in (*_STRETCHES, "crop", "digital_lens"):
         if key in record and record[key].value not in (1.0, None):
-            record[key].fail(f"{record[key].value!r:.60}; must be 1.0 or null, because no model has it")
+            record[key].fail(f"must be 1.0 or null, because no model has it; got {record[key].value!r:.60}")
     named = "distortion_model" in record and record["distortion_model"].value is not None
     key = _MODELS[one_of(record["distortion_model"], _MODELS) if named else "opencv_fisheye"]
     matrix, coefficients = (record["fisheye_params"][name] for name in ("camera_matrix", "distortion_coeffs"))

@@ -49,7 +49,7 @@ def parse(record: Record) -> Rig:
 def _camera(record: Record) -> Camera:
     names = record["camera_model"].text(), record["distortion_model"].text()
     if names not in _MODELS:
-        record.fail(f"{'-'.join(names)!r:.60} is not known here; known are {', '.join(map('-'.join, _MODELS))}")
+        record.fail(f"must be one of {', '.join(map('-'.join, _MODELS))}; got {'-'.join(names)!r:.60}")
     key, before, after = _MODELS[names]
     values = record["intrinsics"].numbers(before + 4)
     coefficients = record["distortion_coeffs"] if after or "distortion_coeffs" in record else None

@@ -80,7 +80,7 @@ def to_kornia(camera: Camera, extrinsics: Extrinsics | None) -> Any:
         sides = (torch.full(matrix.shape[:1], side, device=matrix.device) for side in camera.image_size)
         return PinholeCamera(matrix, extrinsics.matrix().expand_as(matrix).to(matrix.dtype), *sides)
     if extrinsics is not None and bool((extrinsics.matrix() != torch.eye(4).to(extrinsics.rotation)).any()):
-        raise ValueError(f"{owner}: extrinsics must be None or the identity, for {name} of kornia has no pose")
+        raise ValueError(f"{owner}: extrinsics must be None or the identity for kornia's {name}; got a pose")
     vectors = camera.intrinsics, distortion[..., :count], distortion.new_zeros(max(0, count - distortion.shape[-1]))
     params = torch.cat([vector.expand(*shape, -1) for vector in vectors], -1)
     return getattr(sensors, name)(ImageSize(*camera.image_size), params)

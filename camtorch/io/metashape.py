@@ -46,7 +46,7 @@ def read(path: str, content: bytes) -> Rig:
         added = sensor.find("corrections")
         if added is not None and len(added):
             Record(path, None, f"sensor {name:.60}").fail(
-                "corrections beside its calibration, which no model here has; optimise without additional corrections"
+                "must have no corrections, as no model here has them; got some. Optimise without additional corrections"
             )
         found = sensor.findall("calibration")
         best = next((one for one in reversed(found) if one.get("class") == "adjusted"), found[-1])
@@ -71,7 +71,7 @@ def _names(path: str, elements: list[ElementTree.Element]) -> list[str]:
         label, identity = element.get("label", ""), element.get("id", "")
         names.append(label if label and labels[label] == 1 else f"{label} {identity}".strip() or element.tag)
     if len(set(names)) < len(names):
-        Record(path, None, elements[0].tag).fail("two have the same id")
+        Record(path, None, elements[0].tag).fail("ids must be unique; got one twice")
     return names
 
 
@@ -83,7 +83,7 @@ def _camera(record: Record) -> Camera:
     value = {name: record[name].number() for name in record.keys() if re.fullmatch(r"c[xy]|[bkp]\d", name)}  # noqa: SIM118
     for name in _UNKNOWN:
         if value.get(name) and name not in names:
-            record[name].fail(f"{value[name]:g}, which no model here has; optimise the cameras without it")
+            record[name].fail(f"must be 0, as no model here has it; got {value[name]:g}. Optimise without it")
     f = record["f"].number()
     cx, cy = ((side - 1) / 2 + value.get(c, 0.0) for c, side in (("cx", width), ("cy", height)))
     distortion = [value.get(name, 0.0) for name in names]
@@ -121,7 +121,7 @@ def _posed(path: str, chunk: ElementTree.Element, cameras: dict[str, Camera], se
     for name, place in zip(names, places, strict=True):
         images[name] = sensors[place["sensor_id"].text()]
         if name in cameras and name != images[name]:
-            place.fail("a sensor has this name")
+            place.fail("must have another name than sensors; got a sensor's")
         row = np.array(_numbers(place["transform"], 16)).reshape(4, 4)
         poses.check_near(place, row)
         rotation, scale, translation = parts.get(place.value.get("component_id"), whole)

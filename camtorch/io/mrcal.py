@@ -37,7 +37,7 @@ def parse(record: Record) -> Rig:
     name = record["lens_model" if "lens_model" in record else "lensmodel"]
     if (found := _splined(name) or _MODELS.get(name.text())) is None:
         known = ", ".join(sorted([*_MODELS, _SPLINED_NAME.format(3, 16, 11, 120)]))
-        name.fail(f"{name.text()!r:.60} is not known here; known are {known}. {LEFT}")
+        name.fail(f"must be one of {known}; got {name.text()!r:.60}. {LEFT}")
     key, count = found
     values = record["intrinsics"].numbers(4 + count)
     camera = record["intrinsics"].camera(key, values[:4], values[4:], record["imagersize"].size())
@@ -54,7 +54,7 @@ def _splined(name: Record) -> tuple[str, int] | None:
     if (found := _SPLINED.fullmatch(name.text())) is None:
         return None
     if max(map(len, found.groups())) > 4:
-        name.fail(f"{name.value!r:.100}: no grid of that size is read")
+        name.fail(f"a grid must have numbers of at most 4 digits; got {name.value!r:.100}")
     order, columns, rows, fov_x = map(int, found.groups())
     try:
         model = Splined.with_grid(order=order, columns=columns, rows=rows, fov_x=fov_x)

@@ -33,7 +33,7 @@ def parse(record: Record) -> Rig:
     camera = _f_theta(values) if kind == "ftheta" else _of_opencv(values, kind)
     shield = values.get("external_distortion_parameters")
     if shield is not None and shield.value is not None:
-        shield.fail(f"this camera looks through a windshield, which no model here has. {LEFT}")
+        shield.fail(f"must be null, as no model here has a windshield; got one. {LEFT}")
     return Rig({"camera": camera})
 
 
@@ -43,7 +43,7 @@ def _f_theta(values: Record) -> Camera:
     coefficients = values[polynomial]
     constant, *rest = coefficients.numbers() or [0.0]
     if constant:
-        coefficients.fail(f"a constant of {constant:g}, which no model here has")
+        coefficients.fail(f"the constant must be 0, as no model here has one; got {constant:g}")
     linear = values["linear_cde"].numbers(3) if "linear_cde" in values else [0.0]
     while len(rest) > 2 and not rest[-1]:  # files are padded with zeros
         rest.pop()

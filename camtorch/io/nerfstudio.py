@@ -52,7 +52,7 @@ def parse(record: Record) -> Rig:
     for frame, has_own in zip(frames, own, strict=True):
         name = frame["file_path"].text()
         if name in names or name in cameras:
-            frame["file_path"].fail(f"a second frame is called {name!r:.60}")
+            frame["file_path"].fail(f"must be unique; got {name!r:.60} twice")
         if has_own:
             cameras[name] = _camera(record, frame)
         names[name] = None if has_own else "camera"
@@ -72,7 +72,7 @@ def _camera(record: Record, frame: Record | None = None) -> Camera:
     if frame is not None:
         for key in filter(frame.__contains__, _OF_A_CAMERA):
             if values.setdefault(key, frame.value[key]) != frame.value[key]:
-                record[key].fail("a frame has another value, but Nerfstudio would use this one for all frames")
+                record[key].fail("must be that of all frames, as Nerfstudio uses it for all; got another in a frame")
         merged.place = frame.place
     model = "OPENCV_FISHEYE" if values.get("is_fisheye") is True else "OPENCV"  # instant-ngp's flag
     if "camera_model" in merged:
@@ -97,7 +97,7 @@ def _focal(record: Record, axis: str, side: str) -> float | None:
         if key in record:
             angle = record[key].number() * unit
             if not 1e-6 < angle < math.pi:
-                record[key].fail(f"{record[key].value} is no angle of a pinhole camera")
+                record[key].fail(f"must be an angle of a pinhole camera; got {record[key].value}")
             return record[side].side() / 2 / math.tan(angle / 2)
     return None
 
@@ -112,7 +112,7 @@ def _distortion(record: Record, key: str) -> tuple[str, list[float]]:
     names = {"pinhole": (), "kannala_brandt": ("k1", "k2", "k3", "k4")}.get(key, ("k1", "k2", "p1", "p2", "k3"))
     for name, value in there.items():
         if value and name not in names:
-            record[name].fail(f"{value:g}, which Nerfstudio does not use to undistort with this camera_model")
+            record[name].fail(f"must be 0, as Nerfstudio does not use it with this camera_model; got {value:g}")
     if key == "brown_conrady":
         if not there:
             return "pinhole", []
@@ -131,10 +131,10 @@ def render(rig: Rig, lossy: Lossy) -> str:
     written = {name: _entries(lossy, name, camera) for name, camera in rig.cameras.items()}
     models = {name: entries.pop("camera_model") for name, entries in written.items()}
     if len(set(models.values())) != 1:
-        lossy.fail("cameras", f"{', '.join(sorted(set(models.values()))) or 'none'}; a file has one camera_model")
+        lossy.fail("cameras", f"must have one camera_model; got {', '.join(sorted(set(models.values()))) or 'none'}")
     for name in rig.cameras:
         if len(rig.cameras) > 1 and name not in rig.extrinsics and name not in rig.images.values():
-            lossy.fail(name, "no extrinsics; several cameras are told apart by their frames")
+            lossy.fail(name, "must have extrinsics, as frames distinguish the cameras; got none")
     shared = len(rig.cameras) == 1 and next(iter(rig.cameras)) not in rig.extrinsics
     whole: dict[str, Any] = {"camera_model": next(iter(models.values()))}
     if shared:
@@ -152,7 +152,7 @@ def _entries(lossy: Lossy, name: str, camera: Camera) -> dict[str, Any]:
     entries: dict[str, Any] = {"camera_model": next(model for model, k in _MODELS.items() if k == key)}
     if key == "equirectangular":
         if [fx, fy, cx, cy] != panorama(size := lossy.size(name, camera)):
-            lossy.fail(name, "a part of a panorama; Nerfstudio has the whole sphere only")
+            lossy.fail(name, "must be a whole sphere for Nerfstudio; got a part of a panorama")
         return {**entries, "w": size[1], "h": size[0]}
     entries |= {"fl_x": fx, "fl_y": fy, "cx": cx + 0.5, "cy": cy + 0.5}
     if camera.image_size is not None:

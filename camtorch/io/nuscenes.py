@@ -37,12 +37,12 @@ def read(path: str, content: bytes) -> Rig:
     for sensor, channel in zip(sensors, names, strict=True):
         name = channel if channel and often[channel] == 1 else sensor["token"].text()
         if name in cameras:
-            sensor["token"].fail(f"a second sensor is called {name!r:.60}")
+            sensor["token"].fail(f"must be unique; got {name!r:.60} twice")
         intrinsics = sensor["camera_intrinsic"].intrinsics()
         lens = sensor.get("camera_distortion")  # only in nuImages
         distortion = [] if lens is None else lens.numbers()
         if lens is not None and len(distortion) == 6 and distortion.pop():
-            lens.fail("a sixth coefficient must be 0: nuImages does not document the formula of fisheyes")
+            lens.fail("a sixth coefficient must be 0, as nuImages documents no formula of fisheyes; got another")
         key = "brown_conrady" if distortion else "pinhole"
         cameras[name] = sensor.camera(key, intrinsics, distortion, None, lens=lens)
     if not cameras:

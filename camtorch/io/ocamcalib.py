@@ -34,10 +34,10 @@ def matches(path: str, content: bytes) -> bool:
 def read(path: str, content: bytes) -> Rig:
     """Return the only camera of a file; lines after the size, which some programs add, are not read."""
     if len(content) > _LARGEST:
-        raise CameraFileError(path, "size", f"{len(content)} bytes; a calibration of OCamCalib has one thousand")
+        raise CameraFileError(path, "size", f"must be at most {_LARGEST} bytes; got {len(content)}")
     lines = [line.split() for line in decoded(path, content).splitlines()]
     if len(rows := [line for line in lines if line and not line[0].startswith("#")]) < len(_LINES):
-        raise CameraFileError(path, _LINES[len(rows)], "missing")
+        raise CameraFileError(path, _LINES[len(rows)], "must be given; got no such line")
     record = Record(path, dict(zip(_LINES, rows, strict=False)))
     polynomial, inverse, centre, affine, size = (record[name] for name in _LINES)
     for terms in (polynomial, inverse):

@@ -82,7 +82,7 @@ def parse(record: Record, model: str | None = None) -> Rig:
     names = sorted(file.matrices, key=lambda name: (name.isdigit(), int(name) if name.isdigit() else 0, name))
     record.few(len(names))
     if not names:
-        file.fail("camera_matrix", "missing, also as cameraMatrix, K and M; is this a file of OpenCV's?")
+        file.fail("camera_matrix", "must be given, or cameraMatrix, K or M; got none. Is this a file of OpenCV?")
     cameras = {name or "camera": file.camera(model, name) for name in names}
     extrinsics = {}
     keys = next((keys for keys in _POSES if all(key in record for key in keys)), None)
@@ -107,7 +107,7 @@ class _File:
             known = {*self.lenses.values(), *self.xis.values()}
             orphans += [k for k in like if k not in known and isinstance(record.value[k], (list, dict))]
         if self.matrices and orphans:
-            self.fail(orphans[0], "looks like the distortion of a camera; there is none of this name")
+            self.fail(orphans[0], "must be the distortion of a camera; got no camera of this name")
 
     def fail(self, place: str, reason: object) -> NoReturn:
         Record(self.record.path, None, self.record.place_of(place)).fail(reason)
@@ -121,7 +121,7 @@ class _File:
         for key in self.keys:
             if match := pattern.fullmatch(key):
                 if match[1] in named:
-                    self.fail(key, f"one camera has this and {named[match[1]]}")
+                    self.fail(key, f"must be the only one of a camera; got {named[match[1]]} too")
                 named[match[1]] = key
         return named
 
@@ -134,7 +134,7 @@ class _File:
             distortion = [*(self.record[xi].flat() if is_matrix else [self.record[xi].number()]), *distortion]
         stated, place = (("mei",), xi) if xi else self.stated()
         if place is not None and model is not None and model not in stated:
-            self.fail(place, f"the file's model is {stated[0]}; got {model}. Leave it out, or correct the file")
+            self.fail(place, f"the model must be the file's, {stated[0]}; got {model}. Leave it out or change the file")
         kind, size = model or ("mei" if xi else self.model(distortion, stated)), self.image_size()
         if size is not None and self.find(_SIZE):  # a pair of numbers, whose order no key states
             warn_of_order(torch.tensor(intrinsics), size, str(self.record.path))
@@ -145,22 +145,22 @@ class _File:
         if (key := self.find(_FISHEYE)) is None:
             return (), None
         if not isinstance(flag := self.record[key].value, (str, float, bool)):
-            self.fail(key, "is neither true nor false")
+            self.fail(key, f"must be true or false; got {flag!r:.60}")
         no = str(flag).strip().lower() in ("", "0", "0.", "0.0", "false", "no", "off", "n")
         return ("brown_conrady", "pinhole") if no else ("kannala_brandt",), key
 
     def model(self, distortion: list[float], stated: tuple[str, ...]) -> str:
         """Return the model if the caller does not name one."""
         if (other := self.find(_OTHER_LENS)) is not None:
-            name = "model='kannala_brandt' or --from-model kannala_brandt"
-            self.fail(other, f"the file may mean another model than OpenCV's own two; name it, as in {name}")
+            name = "Write model='kannala_brandt' or --from-model kannala_brandt"
+            self.fail(other, f"must be absent, or the model be named; got a file that may mean another model. {name}")
         if "kannala_brandt" in stated:
             return "kannala_brandt"
         if len(distortion) == _FISHEYE_COUNT and not stated:
             warn(
-                f"{self.record.path}: {_FISHEYE_COUNT} coefficients and no fisheye_model: taken for brown_conrady. "
+                f"{self.record.path}: {_FISHEYE_COUNT} coefficients and no fisheye_model are read as brown_conrady. "
                 "If they come from cv2.fisheye, load them by camtorch.io.opencv.read(path, 'kannala_brandt'); "
-                "on the command line, --from-model says which",
+                "on the command line, by --from-model kannala_brandt",
                 AmbiguousModelWarning,
             )
         return "brown_conrady" if distortion else "pinhole"
@@ -184,7 +184,7 @@ class _File:
             size = self.find(_SIZE)
             return None if size is None else self.record[size].size()
         if height is None or width is None:
-            self.fail("image_height" if height is None else "image_width", "missing, while the other side is given")
+            self.fail("image_height" if height is None else "image_width", "must be given as the other side; got none")
         return self.record[height].side(), self.record[width].side()
 
 
@@ -203,7 +203,7 @@ def render(rig: Rig, lossy: Lossy) -> str:
     if len(both) == 2 and list(last) in _PAIRS and both[1] in rig.extrinsics:
         lossy.all_posed(rig)
         if not poses.is_identity(rig.extrinsics[both[0]]):
-            lossy.fail(both[0], "its extrinsics would be lost; in OpenCV's file the first camera is where the rig is")
+            lossy.fail(both[0], "must be where the rig is for OpenCV; got other extrinsics, which would be lost")
         rows = poses.matrices(rig.extrinsics[both[1]]).tolist()
         values["R"] = [row[:3] for row in rows[:3]]
         values["T"] = [row[3:] for row in rows[:3]]
@@ -217,10 +217,10 @@ def _add_camera(lossy: Lossy, values: dict[str, Any], name: str, camera: Camera,
     if camera.image_size is not None:
         values_of_size = {"image_width": camera.image_size[1], "image_height": camera.image_size[0]}
         if values and any(values.get(key) != value for key, value in values_of_size.items()):
-            lossy.fail(name, "a size unlike that of the cameras before it; OpenCV's file has one for all")
+            lossy.fail(name, "must have the size of those before it, as OpenCV's file has one for all; got another")
         values.update(values_of_size)
     elif "image_width" in values:
-        lossy.fail(name, "no image_size, unlike the cameras before it; OpenCV's file has one for all")
+        lossy.fail(name, "must have an image_size, as OpenCV's file has one for all cameras; got none")
     if key == "kannala_brandt":
         distortion = lossy.at_most(name, camera, distortion, (_FISHEYE_COUNT,))
     if key == "mei":
@@ -229,7 +229,7 @@ def _add_camera(lossy: Lossy, values: dict[str, Any], name: str, camera: Camera,
     # one flag holds for all cameras, so they must agree even if some do not need it
     says = key != "mei" and (fisheye or len(distortion) == _FISHEYE_COUNT or end)
     if says and values.setdefault("fisheye_model", fisheye) != fisheye:
-        lossy.fail(name, "a lens unlike that of the cameras before it; OpenCV's file has one fisheye_model for all")
+        lossy.fail(name, "must be a lens like those before it, as OpenCV's file has one fisheye_model; got another")
     joint = "_" if end.isalpha() else ""
     values[f"M{joint}{end}" if end else "camera_matrix"] = [[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]
     if distortion:

@@ -43,10 +43,10 @@ _WORD = re.compile(r'"([^"]*)"|(\S+)')
 
 # beginnings of files that people pass by mistake
 _OTHERS = (
-    (rb"\x80[\x02-\x05]", "a pickle, which could run any code: not read. Save numpy.savez(path, K=K, D=D) instead"),
-    (rb"\x93NUMPY", "a single array; save both by numpy.savez(path, K=K, D=D)"),
-    (rb"\x89HDF", "a file of HDF5 or MATLAB, which is not read; export K and D from there"),
-    (rb"\x89PNG|\xff\xd8\xff|II\*\0|MM\0\*", "an image; pass a calibration file"),
+    (rb"\x80[\x02-\x05]", "must be text; got a pickle, which could run code. Save numpy.savez(path, K=K, D=D) instead"),
+    (rb"\x93NUMPY", "must be text; got a single array. Save both by numpy.savez(path, K=K, D=D)"),
+    (rb"\x89HDF", "must be text; got a file of HDF5 or MATLAB. Export K and D from there"),
+    (rb"\x89PNG|\xff\xd8\xff|II\*\0|MM\0\*", "must be text; got an image. Pass a calibration file"),
 )
 
 
@@ -58,14 +58,14 @@ def path_of(path: Any, owner: str, file: str = "file") -> str:
         hint = ". Pass its name, file.name" if hasattr(path, "read") else ""
         raise TypeError(f"{owner}: path must be that of a {file}; got {type(path).__name__}{hint}") from None
     if "\0" in name:
-        raise CameraFileError(repr(name), "path", "must not have a NUL character")
+        raise CameraFileError(repr(name), "path", "must have no NUL character; got one")
     return name
 
 
 def check_ordinary(path: Path) -> None:
     """Refuse devices and pipes, which may have no end."""
     if os.path.exists(path) and not os.path.isfile(path) and not os.path.isdir(path):
-        raise CameraFileError(path, "content", "must be an ordinary file")
+        raise CameraFileError(path, "content", "must be an ordinary file; got a device or a pipe")
 
 
 def read_bytes(path: Path, largest: int = LARGEST_FILE) -> bytes:
@@ -73,10 +73,10 @@ def read_bytes(path: Path, largest: int = LARGEST_FILE) -> bytes:
     check_ordinary(path)
     with open(path, "rb") as file:
         if (size := os.fstat(file.fileno()).st_size) > largest:
-            raise CameraFileError(path, "size", f"more than {largest >> 20} MiB")
+            raise CameraFileError(path, "size", f"must be at most {largest >> 20} MiB; got {size} bytes")
         content = file.read(size)
     if not content:
-        raise CameraFileError(path, "content", "the file is empty")
+        raise CameraFileError(path, "content", "must not be empty; got no bytes")
     return content
 
 
@@ -85,7 +85,7 @@ def decoded(path: Path, content: bytes) -> str:
     try:
         return content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        reason = next((reason for start, reason in _OTHERS if re.match(start, content)), "not text")
+        reason = next((reason for start, reason in _OTHERS if re.match(start, content)), "must be text; got bytes")
         raise CameraFileError(path, f"byte {error.start}", reason) from None
 
 
@@ -99,7 +99,7 @@ def parse_mapping(path: Path, content: bytes) -> dict[str, Any]:
     except (RecursionError, MemoryError):
         raise CameraFileError(path, "content", "nested too deeply") from None
     if not isinstance(keys, dict):
-        raise CameraFileError(path, "content", "must be keys and values")
+        raise CameraFileError(path, "content", f"must be keys and values; got {type(keys).__name__}")
     return keys
 
 
@@ -115,7 +115,7 @@ def _from_text(path: Path, content: bytes) -> Any:
         except SyntaxError as error:
             raise CameraFileError(path, f"line {error.lineno}" if error.lineno else "content", error.msg) from None
         except (ValueError, TypeError):  # a list as a key has no hash
-            raise CameraFileError(path, "content", "must have only text, numbers, lists and mappings") from None
+            raise CameraFileError(path, "content", "must be text, numbers, lists and mappings; got others") from None
         return parse_json(path, json_text(path, values))
     kind = text.lstrip()[:1]
     return parse_json(path, text) if kind == "{" else (_from_storage if kind == "<" else _from_yaml)(path, text)
@@ -123,18 +123,18 @@ def _from_text(path: Path, content: bytes) -> Any:
 
 def _check_length(path: Path, text: str, most: int, kind: str) -> None:
     if len(text) > most:
-        raise CameraFileError(path, "size", f"more than {most >> 10} KiB of {kind}")
+        raise CameraFileError(path, "size", f"must be at most {most >> 10} KiB of {kind}; got {len(text)} characters")
 
 
 def parse_json(path: Path, text: str) -> Any:
     """Return the value of a JSON text; all numbers are floats."""
     size = text.count(",") + 3 * text.count("[") + 6 * text.count("{") + 5 * text.count(":")
     if size > max(_MOST_JSON_UNITS, len(text) // _BYTES_PER_UNIT):
-        raise CameraFileError(path, "content", "too many values")
+        raise CameraFileError(path, "content", "must have fewer values; got too many")
 
     def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
         if len(keys := dict(pairs)) < len(pairs):
-            raise ValueError(f"the key {repeated(key for key, _ in pairs)!r:.60} is there twice")
+            raise ValueError(f"keys must be unique; got {repeated(key for key, _ in pairs)!r:.60} twice")
         return keys
 
     # parse floats directly: huge integers cost no time, and no text is made of a number
@@ -186,12 +186,12 @@ def _from_archive(path: Path, content: bytes) -> dict[str, Any]:
     try:
         arrays = arrays_of(content, _LARGEST_ARRAY)
     except (zipfile.BadZipFile, zlib.error, OSError, EOFError, ValueError, RuntimeError, NotImplementedError) as error:
-        raise CameraFileError(path, "content", f"no archive of NumPy's: {error}") from None
+        raise CameraFileError(path, "content", f"must be an archive of numpy.savez; got a bad one: {error}") from None
     keys = {name: None if array is None else array.astype(np.float64).tolist() for name, array in arrays.items()}
     for name, value in keys.items():
         if name.lower() in _SIZES and isinstance(value, list) and len(value) == 2 and value[0] != value[1]:
-            either = f"{value[0]:g} {value[1]:g} may be (width, height) or (height, width)"
-            raise CameraFileError(path, name, f"{either}; save image_width and image_height")
+            either = f"got {value[0]:g} {value[1]:g}, (width, height) or (height, width)"
+            raise CameraFileError(path, name, f"sides must have names; {either}. Save image_width and image_height")
     return keys
 
 
@@ -202,14 +202,14 @@ def parse_xml(path: Path, text: str) -> ElementTree.Element:
     """Return the root of an XML text; document types, entities and very many elements are refused."""
     if declared := re.search(r"<!(?:DOCTYPE|ENTITY|ELEMENT|ATTLIST|NOTATION)", text, re.IGNORECASE):
         line = text.count("\n", 0, declared.start()) + 1
-        raise CameraFileError(path, f"line {line}", "a document type, which could define entities: not read")
+        raise CameraFileError(path, f"line {line}", "must have no document type, which could define entities; got one")
     if text.count("=") + text.count("<") > max(_FEW_NODES, len(text) // _BYTES_PER_NODE):
-        raise CameraFileError(path, "content", "too many elements")
+        raise CameraFileError(path, "content", "must have fewer elements; got too many")
     try:
         return ElementTree.fromstring(text)
     except ElementTree.ParseError as error:
         reason = str(error).split(":")[0]
-        raise CameraFileError(path, f"line {error.position[0]}", f"not XML: {reason}") from None
+        raise CameraFileError(path, f"line {error.position[0]}", f"must be XML; got {reason}") from None
     except (ValueError, LookupError) as error:
         raise CameraFileError(path, "content", error) from None
 
@@ -218,16 +218,16 @@ def _from_storage(path: Path, text: str) -> Any:
     _check_length(path, text, _LARGEST_STORAGE, "XML")
     root = parse_xml(path, text)
     if root.tag == "lensdatabase":
-        raise CameraFileError(path, "content", "a database of lensfun; read it by lensfunpy and ct.lenses.from_lensfun")
+        raise CameraFileError(path, "content", "must not be of lensfun; got its database. Use ct.lenses.from_lensfun")
     if root.tag != "opencv_storage":
-        where = f"<{root.tag:.60}> where <opencv_storage> belongs"
-        raise CameraFileError(path, "content", f"{where}: XML is read where OpenCV wrote it")
+        where = "must be XML of OpenCV, <opencv_storage>"
+        raise CameraFileError(path, "content", f"{where}; got <{root.tag:.60}>")
     return _keys_of(path, root)
 
 
 def _keys_of(path: Path, element: ElementTree.Element) -> dict[str, Any]:
     if (twice := repeated(child.tag for child in element)) is not None:
-        raise CameraFileError(path, f"{element.tag:.60}", f"the key {twice!r:.60} is there twice")
+        raise CameraFileError(path, f"{element.tag:.60}", f"keys must be unique; got {twice!r:.60} twice")
     return {child.tag: _value_of(path, child) for child in element}
 
 
@@ -246,7 +246,7 @@ def _from_yaml(path: Path, text: str) -> Any:
     _check_length(path, text, _LARGEST_STORAGE, "YAML")
     text = re.sub(r"\A(\s*)%YAML[^\r\n]*", r"\1", text)  # "%YAML:1.0", as OpenCV writes it, is not YAML
     if "\n%" in text:  # libyaml compares all pairs of directives
-        raise CameraFileError(path, "content", "YAML directives, which no calibration has")
+        raise CameraFileError(path, "content", "must have no YAML directives; got one")
     loader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
     try:
         # parse events, not yaml.load: no tags, and no numbers by the rules of YAML 1.1
@@ -255,7 +255,7 @@ def _from_yaml(path: Path, text: str) -> Any:
         mark = getattr(error, "problem_mark", None)
         reason = getattr(error, "problem", None) or getattr(error, "reason", None) or "no reason given"
         where = f"line {mark.line + 1}" if mark else "content"
-        raise CameraFileError(path, where, f"not readable as YAML: {reason}") from None
+        raise CameraFileError(path, where, f"must be YAML; got an error: {reason}") from None
     except (ValueError, OverflowError) as error:
         raise error if isinstance(error, CameraFileError) else CameraFileError(path, "content", error) from None
 
@@ -279,16 +279,16 @@ class _Yaml:
             if kind in _TAGS and count == 1:
                 value, _ = self.value(event, 0)
             elif count > 2 or (kind in _TAGS and getattr(event, "value", None) != ""):
-                self.fail(event, "a second document in the file")
+                self.fail(event, "must have one document; got a second one")
         return value
 
     def value(self, event: Any, depth: int) -> tuple[Any, int]:
         """Return the value that begins with an event, and its number of values after following aliases."""
         kind = type(event).__name__
         if kind == "AliasEvent":
-            return self.anchors.get(event.anchor) or self.fail(event, f"nothing is called {event.anchor!r:.60}")
+            return self.anchors.get(event.anchor) or self.fail(event, f"alias must be known; got {event.anchor!r:.60}")
         if event.tag not in _TAGS[kind]:
-            self.fail(event, f"the tag {event.tag!r:.80}: nothing is constructed here, and a matrix is keys and values")
+            self.fail(event, f"tags must be of keys and values, as nothing is constructed here; got {event.tag!r:.80}")
         found = (event.value, 1) if kind == "ScalarEvent" else self.container(event, kind == "MappingStartEvent", depth)
         if event.anchor:
             self.anchors[event.anchor] = found
@@ -307,14 +307,14 @@ class _Yaml:
             if not is_mapping:
                 values.append(value)
             elif not isinstance(value, str):
-                self.fail(event, "a key must be text")
+                self.fail(event, "a key must be text; got a list or a mapping")
             elif value in keys:
-                self.fail(event, f"the key {value!r:.60} is there twice")
+                self.fail(event, f"keys must be unique; got {value!r:.60} twice")
             else:
                 keys[value], size = self.value(next(self.events), depth + 1)
                 count += size
             if count > _MOST_VALUES:
-                self.fail(event, f"too many values: more than {_MOST_VALUES} are not read")
+                self.fail(event, f"must have at most {_MOST_VALUES} values; got more")
         return keys if is_mapping else values, count
 
 

@@ -64,16 +64,16 @@ def read_stored(path: Path) -> tuple[Tensor, int | None]:
         orientation = opened.getexif().get(ORIENTATION)
         image = load_stored(opened)
         if count > 1:
-            warn(f"{path} holds {count} images; only the first is taken")
+            warn(f"{path}: only the first of {count} images is read")
         if cut:
-            warn(f"{path} has 16 bits a colour; only the upper 8 are read")
+            warn(f"{path}: only the upper 8 of 16 bits a colour are read")
         if image.mode == "F":
-            raise ImageFileError(f"{path}: floating-point pixels; 8-bit and 16-bit images can be read")
+            raise ImageFileError(f"{path}: pixels must have 8 or 16 bits; got floating point")
         if image.mode in _DEEP:
             deep = np.asarray(image)
             low, high = deep.min(), deep.max()
             if low < 0 or high > 65535:
-                raise ImageFileError(f"{path}: pixels from {low} to {high}; 8-bit and 16-bit images can be read")
+                raise ImageFileError(f"{path}: pixels must have 8 or 16 bits; got {low} to {high}")
             return torch.from_numpy(deep.astype(np.uint16))[None], orientation
         clear = "transparency" in image.info or image.mode in ("LA", "PA", "RGBA", "RGBa", "La")
         kind = ("L" if image.mode in ("1", "L", "LA", "La") else "RGB") + ("A" if clear else "")
@@ -132,8 +132,8 @@ def _opened(path: Path) -> Iterator[Image.Image]:
         raise _NoImageFileError(f"{path}: no such file") from None
     except Image.DecompressionBombError:
         limit = 2 * (Image.MAX_IMAGE_PIXELS or 0) / 1e6
-        raise ImageFileError(f"{path}: more than {limit:.0f} million pixels, which are not read") from None
+        raise ImageFileError(f"{path}: must have at most {limit:.0f} million pixels; got more") from None
     except UnidentifiedImageError:
-        raise ImageFileError(f"{path}: not an image that Pillow can read") from None
+        raise ImageFileError(f"{path}: must be an image of Pillow; got none") from None
     except (OSError, SyntaxError, ValueError, EOFError) as error:
         raise ImageFileError(f"{path}: {getattr(error, 'strerror', None) or error}") from None

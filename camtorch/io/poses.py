@@ -38,7 +38,7 @@ def _check(place: Place, right: Tensor, reason: Callable[[int], str]) -> None:
 def check_near(place: Place, values: Any) -> None:
     """Refuse values (*B, n) with numbers too large to compute with."""
     right = (as_float64(values).abs() <= _FARTHEST).all(-1)
-    _check(place, right, lambda row: f"a number beyond {_FARTHEST:g}, or none")
+    _check(place, right, lambda row: f"numbers must be up to {_FARTHEST:g}; got a larger one, or NaN")
 
 
 # -- reading: single poses, or a batch; with `undo` the inverse pose. All raise CameraFileError
@@ -61,7 +61,7 @@ def from_matrices(place: Place, rows: Any, undo: bool = False) -> Extrinsics:
     rotations, translations = as_float64(rows)[..., :3, :3], as_float64(rows)[..., :3, 3]
     error, det = rotation_error(rotations).flatten(), torch.linalg.det(rotations).flatten()
     right = (error < _ORTHOGONAL) & (det > 0)
-    why = "no rotation: R R^T misses the identity by {:.2g}, and det R = {:.6g}"
+    why = "must be a rotation; got R R^T that misses the identity by {:.2g}, and det R = {:.6g}"
     _check(place, right, lambda row: why.format(error[row], det[row]))
     return pose(place, rotation_vector(rotations), translations, undo)
 

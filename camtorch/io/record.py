@@ -64,9 +64,9 @@ class Record:
         raise CameraFileError(self.path, self.place or "content", reason) from None
 
     def _check(self, kind: type, what: str) -> None:
-        """Raise a CameraFileError unless the value is of a kind."""
+        """Raise a CameraFileError if the value is of another kind."""
         if not isinstance(self.value, kind):
-            self.fail(f"{what}, but {self._found()}")
+            self.fail(f"must be {what}; got {self._found()}")
 
     def _found(self) -> str:
         if isinstance(self.value, dict):
@@ -76,18 +76,18 @@ class Record:
         return "nothing" if self.value is None else f"{self.value!r:.60}"
 
     def keys(self) -> list[str]:
-        self._check(dict, "not keys and values")
+        self._check(dict, "keys and values")
         return list(self.value)
 
     def __contains__(self, key: str) -> bool:
-        self._check(dict, "not keys and values")
+        self._check(dict, "keys and values")
         return key in self.value
 
     def __getitem__(self, key: str) -> Record:
         if (found := self.get(key)) is None:
-            there = ", ".join(f"{name!r:.30}" for name in islice(self.value, _SHOWN)) or "nothing"
+            there = ", ".join(f"{name!r:.30}" for name in islice(self.value, _SHOWN)) or "none"
             more = ", ..." if len(self.value) > _SHOWN else ""
-            Record(self.path, None, self.place_of(key)).fail(f"missing; there is {there}{more}")
+            Record(self.path, None, self.place_of(key)).fail(f"must be given; got keys {there}{more}")
         return found
 
     def get(self, key: str) -> Record | None:
@@ -100,16 +100,16 @@ class Record:
         return f"{self.place}.{key}" if self.place else key
 
     def __iter__(self) -> Iterator[Record]:
-        self._check(list, "no list")
+        self._check(list, "a list")
         for i, item in enumerate(self.value):
             yield Record(self.path, item, f"{self.place}[{i}]")
 
     def __len__(self) -> int:
-        self._check(list, "no list")
+        self._check(list, "a list")
         return len(self.value)
 
     def text(self) -> str:
-        self._check(str, "no text")
+        self._check(str, "text")
         return str(self.value)
 
     def number(self) -> float:
@@ -119,15 +119,14 @@ class Record:
             with contextlib.suppress(ValueError):
                 number = float(self.value)
         if not math.isfinite(number):
-            written = isinstance(self.value, (str, float))
-            self.fail(f"{self.value!r:.60} is no finite number" if written else f"is no number, but {self._found()}")
+            self.fail(f"must be a finite number; got {self._found()}")
         return number
 
     def whole(self, low: int, high: int, what: str) -> int:
         """Return a whole number from low to high; `what` names it in the error."""
         number = self.number()
         if number != int(number) or not low <= number <= high:
-            self.fail(f"{number:g} is no {what}")
+            self.fail(f"must be a {what}; got {number:g}")
         return int(number)
 
     def side(self) -> int:
@@ -161,16 +160,16 @@ class Record:
             parts = [self[key] for key in name.split(" and ")]
             sizes = [n for part in parts for n in (part.numbers() if isinstance(part.value, list) else [part.number()])]
             if len(data := self["data"]) != math.prod(sizes):
-                data.fail(f"{len(data)} numbers, where {name} say {' x '.join(f'{size:g}' for size in sizes)}")
+                data.fail(f"must have {' x '.join(f'{n:g}' for n in sizes)} numbers, by {name}; got {len(data)}")
             return data.numbers()
         if not isinstance(self.value, list):
-            self.fail("is neither an OpenCV matrix nor a list of numbers")
+            self.fail(f"must be an OpenCV matrix or a list of numbers; got {self._found()}")
         return [item.number() for row in self for item in (row if isinstance(row.value, list) else [row])]
 
     def few(self, count: int) -> None:
         """Refuse a file of too many cameras: each costs some kilobytes and a tenth of a millisecond."""
         if count > _MOST_CAMERAS:
-            self.fail(f"{count} cameras; more than {_MOST_CAMERAS} are not read")
+            self.fail(f"must have at most {_MOST_CAMERAS} cameras; got {count}")
 
     def camera(
         self,
@@ -186,7 +185,7 @@ class Record:
         if distortion:
             if not kind.names_of(len(distortion)):
                 there = self if lens is None else lens
-                there.fail(f"{len(distortion)} coefficients; {kind.__name__} takes {kind.counts_text()}")
+                there.fail(f"{kind.__name__} must have coefficients {kind.counts_text()}; got {len(distortion)}")
             arguments.append(torch.tensor(distortion, dtype=torch.float64))
         try:
             return kind(nn.Parameter(arguments[0]), *arguments[1:], image_size=size)  # crops may be off centre
@@ -200,7 +199,7 @@ class Record:
         fx, skew, cx, below, fy, cy, *bottom = matrix
         if skew:
             place = Record(self.path, None, f"{self.place}[1]")
-            place.fail(f"a skew of {skew:g}, which no model here has; write 0 there to ignore it as OpenCV does")
+            place.fail(f"skew must be 0, as no model here has one; got {skew:g}. Write 0 to ignore it as OpenCV does")
         if below or bottom != [0, 0, 1]:
             self.fail(f"must be [fx, 0, cx, 0, fy, cy, 0, 0, 1]; got {matrix}")
         return [fx, fy, cx, cy]
@@ -208,7 +207,7 @@ class Record:
     def model(self, key: str) -> type[Camera]:
         if key.partition(":")[0] not in MODELS:
             known = ", ".join(sorted(MODELS))
-            self.fail(f"needs the camera model {key!r:.60}, which this camtorch does not have; it has {known}. {LEFT}")
+            self.fail(f"must be a camera model of this camtorch, one of {known}; got {key!r:.60}. {LEFT}")
         try:
             return as_model(key, "file")
         except ValueError as error:
@@ -223,5 +222,5 @@ def repeated(names: Iterable[str]) -> str | None:
 def one_of(record: Record, names: Collection[str]) -> str:
     """Return the text of a record, which must be one of the names."""
     if record.text() not in names:
-        record.fail(f"{record.text()!r:.60} is not known here; known are {', '.join(sorted(filter(None, names)))}")
+        record.fail(f"must be one of {', '.join(sorted(filter(None, names)))}; got {record.text()!r:.60}")
     return record.text()

@@ -40,7 +40,7 @@ def parse(record: Record) -> Rig:
         key = "pinhole"
     elif len(distortion) not in counts:
         takes = " or ".join(map(str, counts)) or "none"
-        coefficients.fail(f"{len(distortion)} coefficients; {record['distortion_model'].value!r} takes {takes}")
+        coefficients.fail(f"must have {takes} for {record['distortion_model'].value!r}; got {len(distortion)}")
     return Rig({name or "camera": coefficients.camera(key, intrinsics, distortion, (height, width))})
 
 

@@ -24,7 +24,7 @@ def parse(record: Record) -> Rig:
     height, width = lens["height"].side(), lens["width"].side()
     focal, *higher = (lens[power].number() for power in _POWERS)
     if focal == 0:
-        lens["k1"].fail("the focal length must not be 0")
+        lens["k1"].fail("the focal length must not be 0; got 0")
     centre = [lens[key].number() + (side - 1) / 2 for key, side in (("cx_offset", width), ("cy_offset", height))]
     intrinsics = [focal, focal * lens["aspect_ratio"].number(), *centre]
     camera = lens.camera("woodscape", intrinsics, [k / focal for k in higher], (height, width))

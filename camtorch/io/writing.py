@@ -117,17 +117,17 @@ class Lossy:
         """Return key, intrinsics and distortion of a single camera, whose model must be a known one."""
         (fx, fy, cx, cy), distortion = self._single(name, camera, "cameras", camera.intrinsics, camera.distortion)
         if camera.key not in known:
-            others = f"write camera.convert(key).camera with one of {', '.join(sorted(known))}"
-            self.fail(name, f"{self.format} has no name for {camera.key}; {others}")
+            others = f"must be one of {', '.join(sorted(known))} for {self.format}"
+            self.fail(name, f"the model {others}; got {camera.key}. Write camera.convert(key).camera")
         return camera.key, (fx, fy, cx, cy), distortion
 
     def _single(self, name: str, owner: Camera | Extrinsics, what: str, *tensors: Tensor) -> list[list[float]]:
         """Return the finite numbers of a camera or a pose that is no batch."""
         if owner.batch_shape:
-            self.fail(name, f"a batch of {what} {tuple(owner.batch_shape)}; {self.format} holds single ones")
+            self.fail(name, f"must be single for {self.format}; got a batch of {what} {tuple(owner.batch_shape)}")
         values: list[list[float]] = [t.detach().double().tolist() for t in tensors]
         if not all(math.isfinite(v) for vector in values for v in vector):
-            self.fail(name, f"{'intrinsics or distortion' if what == 'cameras' else what} that are not finite")
+            self.fail(name, f"{'numbers' if what == 'cameras' else what} must be finite; got NaN or infinity")
         return values
 
     def at_most(self, name: str, camera: Camera, distortion: list[float], counts: Sequence[int]) -> list[float]:
@@ -138,27 +138,27 @@ class Lossy:
             if not any(distortion[count:]):
                 return (distortion + [0.0] * count)[:count]
         most, lost = max(counts), " ".join(camera.distortion_names[max(counts) :])
-        has = f"{self.format} has {most} for {camera.key}"
-        return self.fail(name, f"{len(distortion)} coefficients; {has}, so {lost} would be lost")
+        has = f"must have at most {most} coefficients for {self.format} and {camera.key}"
+        return self.fail(name, f"{has}; got {len(distortion)}, of which {lost} would be lost")
 
     def only_camera(self, rig: Rig) -> tuple[str, Camera]:
         """Return name and camera of a rig, which must have only one camera for this format."""
         if len(rig.cameras) != 1:
-            count = f"{len(rig.cameras)} cameras; {self.format} holds one"
-            self.fail("cameras", f"{count}; on the command line choose one with --name")
+            count = f"must be one for {self.format}; got {len(rig.cameras)}"
+            self.fail("cameras", f"{count}. On the command line choose one with --name")
         return next(iter(rig.cameras.items()))
 
     def no_images(self, rig: Rig) -> None:
         """Refuse posed images if the format has only cameras."""
         if images := [name for name in rig.extrinsics if name in rig.images]:
-            self.fail(images[0], f"a posed image; {self.format} holds cameras only, so its pose would be lost")
+            self.fail(images[0], f"must be a camera for {self.format}; got a posed image, whose pose would be lost")
 
     def no_pose(self, rig: Rig) -> None:
         """Refuse poses if the format has none."""
         self.no_images(rig)
         for name, extrinsics in rig.extrinsics.items():
             if self.pose(name, extrinsics) != ([0.0] * 3, [0.0] * 3):
-                place = f"its extrinsics would be lost; {self.format} has no place for them"
+                place = f"must have no extrinsics for {self.format}; got some, which would be lost"
                 self.fail(name, f"{place}. Save the camera alone; on the command line add --name {name}")
 
     def pose(self, name: str, extrinsics: Extrinsics) -> tuple[list[float], list[float]]:
@@ -173,6 +173,6 @@ class Lossy:
             return dict.fromkeys(rig.cameras, Extrinsics([0.0] * 3, [0.0] * 3).double())
         for name in rig.cameras:
             if name not in rig.extrinsics:
-                self.fail(name, f"no extrinsics, which {self.format} needs of each camera")
+                self.fail(name, f"must have extrinsics for {self.format}; got none")
             self.pose(name, rig.extrinsics[name])
         return {name: rig.extrinsics[name] for name in rig.cameras}

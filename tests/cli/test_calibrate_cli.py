@@ -94,7 +94,7 @@ def test_a_folder_of_photographs_becomes_a_camera(photographs, capsys):
     assert "truncated" in left_out.pop("7.png")
     assert left_out == {
         "5.png": "no board found",
-        "6.png": "not an image that Pillow can read",
+        "6.png": "must be an image of Pillow; got none",
         "8.png": "480x360, but most images are 640x480",
         "none.png": "no such file",
     }

@@ -158,13 +158,13 @@ def test_hostile_files_are_a_line_each(folder, capsys, monkeypatch):
     printed = capsys.readouterr()
     expected = [
         "in/me.png: Too many levels of symbolic links",
-        "in/bomb.png: more than 179 million pixels, which are not read",
+        "in/bomb.png: must have at most 179 million pixels",
         "in/cut.png: ",
         "in/large.png: is 96x65, but the camera in camera.yml is for 96x64; ",
         *(["in/locked.png: Permission denied"] if locked else []),
-        "in/nothing.png: not an image that Pillow can read",
+        "in/nothing.png: must be an image of Pillow; got none",
         "in/small.png: is 1x1, but the camera in camera.yml is for 96x64; ",
-        "in/words.jpg: not an image that Pillow can read",
+        "in/words.jpg: must be an image of Pillow; got none",
     ]
     lines = printed.err.splitlines()
     assert len(lines) == len(expected)
@@ -195,7 +195,7 @@ def test_notes_are_printed_once(folder, capsys):
         frames = [Image.new("RGB", (96, 64), colour) for colour in ("red", "blue")]
         frames[0].save(f"in/{name}.tif", save_all=True, append_images=frames[1:])
     command(*WORDS, "--jobs", 1)
-    assert capsys.readouterr().err == "camtorch: note: in/a.tif and 1 more: holds 2 images; only the first is taken\n"
+    assert capsys.readouterr().err == "camtorch: note: in/a.tif and 1 more: only the first of 2 images is read\n"
 
 
 def test_other_suffixes(folder, capsys):
@@ -232,7 +232,7 @@ def test_processes_make_the_same(folder, capsys):
     Path("in/words.jpg").write_text("no image")
     for place, jobs in (("one", 1), ("two", 2)):
         command(*WORDS[:-1], place, "--jobs", jobs, expect=1)
-        assert capsys.readouterr().err == "camtorch: error: in/words.jpg: not an image that Pillow can read\n"
+        assert capsys.readouterr().err == "camtorch: error: in/words.jpg: must be an image of Pillow; got none\n"
     assert outputs("one") == outputs("two")
 
 

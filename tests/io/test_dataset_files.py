@@ -141,7 +141,7 @@ def test_tables_of_nuscenes_without_channels_or_with_several_drives(tmp_path):
     for broken, reason in (
         ({"rotation": [1, 1, 0, 0]}, r"\[2\]: a quaternion must have length 1; got 1.41"),
         ({"camera_distortion": [0, 0, 0, 0, 0, 0.1]}, r"\[2\].camera_distortion: a sixth coefficient"),
-        ({"token": tokens[0]}, r"\[2\].token: a second sensor is called"),
+        ({"token": tokens[0]}, r"\[2\].token: must be unique; got"),
         ({"camera_intrinsic": [[1, 2], [3, 4]]}, r"\[2\].camera_intrinsic: a camera matrix must have 3 x 3"),
     ):
         with pytest.raises(ct.CameraFileError, match=reason):

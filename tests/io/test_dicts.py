@@ -57,14 +57,14 @@ def changed(**values):
 @pytest.mark.parametrize(
     ("make", "says"),
     [
-        (lambda: ct.Camera.from_dict(changed(distorsion=[1.0])), "distorsion: is not known; known are model, intr.*"),
-        (lambda: ct.Camera.from_dict(changed(intrinsics=None)), "intrinsics: missing; there is 'model', .*"),
-        (lambda: ct.Camera.from_dict(changed(model="kan")), "model: needs the camera model 'kan', .*it has brown.*"),
+        (lambda: ct.Camera.from_dict(changed(distorsion=[1.0])), "distorsion: keys must be among model, intr.*"),
+        (lambda: ct.Camera.from_dict(changed(intrinsics=None)), "intrinsics: must be given; got keys 'model', .*"),
+        (lambda: ct.Camera.from_dict(changed(model="kan")), "model: must be .*one of brown.* got 'kan'.*"),
         (lambda: ct.Camera.from_dict(changed(distortion=[0.1])), r"distortion: must be numbers \(\*B, 4\); got \(1,\)"),
-        (lambda: ct.Camera.from_dict(changed(image_size=[4.5, 6])), r"image_size\[0\]: 4.5 is no number of pix.*"),
-        (lambda: ct.Pinhole.from_dict(changed()), "model: a KannalaBrandt, which is no Pinhole; .*"),
-        (lambda: ct.Extrinsics.from_dict({"rotation": [0, 0, 1]}), "translation: missing; there is 'rotation'"),
-        (lambda: ct.Extrinsics.from_dict({"rotation": [0, 0, "x"], "translation": [0, 0, 1]}), "rotation: not numb.*"),
+        (lambda: ct.Camera.from_dict(changed(image_size=[4.5, 6])), r"image_size\[0\]: must be a number of pix.*"),
+        (lambda: ct.Pinhole.from_dict(changed()), "model: must be of Pinhole; got KannalaBrandt.*"),
+        (lambda: ct.Extrinsics.from_dict({"rotation": [0, 0, 1]}), "translation: must be given; got keys 'rotation'"),
+        (lambda: ct.Extrinsics.from_dict({"rotation": [0, "x"], "translation": [0, 0, 1]}), "rotation: must be numb.*"),
     ],
 )
 def test_a_wrong_dict_is_an_error_that_names_the_key(make, says):

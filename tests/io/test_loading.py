@@ -69,16 +69,16 @@ def test_what_editors_do_to_a_file_is_no_fault_of_it(name, start, end, tmp_path)
     ("call", "given", "error", "says"),
     [
         (ct.load, {"K": K}, TypeError, r"load: path must be that of a .* file; got a dict\. Write ct\.loads$"),
-        (ct.load, "camera\0.json", ct.CameraFileError, "path: must not have a NUL character"),
+        (ct.load, "camera\0.json", ct.CameraFileError, "path: must have no NUL character"),
         (ct.load, FILES / "nowhere.yml", FileNotFoundError, r"nowhere\.yml"),
         (
             ct.load,
             FILES / "nuscenes",
             ct.CameraFileError,
-            r"txt, transforms.json\. Name a file: there is 'cal",
+            r"txt, transforms.json; got none\. Name a file, such as 'cal",
         ),
-        (ct.load, io.BytesIO(b"x: 1"), ct.CameraFileError, r"^load: BytesIO: content: no format .* has the keys 'x'$"),
-        (ct.load, io.BytesIO(b" " * (1 << 25)), ct.CameraFileError, "^load: BytesIO: size: more than 16 MiB$"),
+        (ct.load, io.BytesIO(b"x: 1"), ct.CameraFileError, r"^load: BytesIO: content: keys must be .* got 'x'$"),
+        (ct.load, io.BytesIO(b" " * (1 << 25)), ct.CameraFileError, "load: BytesIO: size: must be at most 16 MiB"),
         (
             ct.loads,
             str(FILES / "opencv_camera.yml"),
@@ -87,9 +87,9 @@ def test_what_editors_do_to_a_file_is_no_fault_of_it(name, start, end, tmp_path)
         ),
         (ct.loads, FILES / "opencv_camera.yml", TypeError, r"bytes or a dict; got PosixPath.*\. ct\.load reads files$"),
         (ct.loads, {(1, 2): 3}, ct.CameraFileError, "^loads: content: keys must be str"),
-        (ct.loads, {"K": K, "D": [0.1]}, ct.CameraFileError, r"^loads: D: 1 coefficients; BrownConrady takes"),
+        (ct.loads, {"K": K, "D": [0.1]}, ct.CameraFileError, r"^loads: D: BrownConrady must have coefficients"),
         (PINHOLE, None, TypeError, "save: path must be that of a calibration file; got NoneType"),
-        (PINHOLE, "camera\0.json", ct.CameraFileError, "path: must not have a NUL character"),
+        (PINHOLE, "camera\0.json", ct.CameraFileError, "path: must have no NUL character"),
     ],
 )
 def test_what_is_no_calibration(call, given, error, says):
@@ -99,7 +99,7 @@ def test_what_is_no_calibration(call, given, error, says):
 
 
 def test_a_binary_file_that_is_open_as_text():
-    says = r"^load: .*cameras\.bin: byte \d+: not text; open the file with 'rb'$"
+    says = r"^load: .*cameras\.bin: byte \d+: must be text; got bytes. Open it with 'rb'$"
     with open(FILES / "cameras.bin", encoding="utf-8") as file, pytest.raises(ct.CameraFileError, match=says):
         ct.load(file)
 
@@ -131,5 +131,5 @@ def test_numpy_archives_of_a_fisheye(tmp_path):
 
 def test_sizes_without_an_order_are_refused(tmp_path):
     np.savez(tmp_path / "calibration.npz", K=K, D=D, image_size=[480, 640])
-    with pytest.raises(ct.CameraFileError, match=r"image_size: 480 640 may be \(width, height\) or .*image_width"):
+    with pytest.raises(ct.CameraFileError, match=r"image_size: .* got 480 640, \(width, height\) or .*image_width"):
         ct.load(tmp_path / "calibration.npz")

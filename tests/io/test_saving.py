@@ -22,20 +22,20 @@ def camera(key="brown_conrady", distortion=None, core=CORE, **options):
 # -- what a format cannot hold
 
 LOST = [
-    ("opencv", camera("fisheye624"), "OpenCV has no name for fisheye624"),
-    ("opencv", camera("kannala_brandt", [1e-3] * 5), "5 coefficients; OpenCV has 4 for kannala_brandt, so k5 would be"),
-    ("kalibr", camera(distortion=[0.1, 0, 0, 0, 0.2]), "Kalibr has 4 for brown_conrady, so k3 would be lost"),
+    ("opencv", camera("fisheye624"), "for OpenCV; got fisheye624"),
+    ("opencv", camera("kannala_brandt", [1e-3] * 5), "at most 4 coefficients for OpenCV.* got 5, of which k5 would be"),
+    ("kalibr", camera(distortion=[0.1, 0, 0, 0, 0.2]), "at most 4 coefficients for Kalibr .* k3 would be lost"),
     ("kalibr", camera(image_size=None), "must have an image_size for Kalibr"),
-    ("colmap", camera(distortion=[0.1] * 12), "COLMAP has 8 for brown_conrady, so s1 s2 s3 s4 would"),
+    ("colmap", camera(distortion=[0.1] * 12), "at most 8 coefficients for COLMAP .* s1 s2 s3 s4 would"),
     ("colmap", camera("equirectangular"), "a part of a panorama"),
-    ("aria", camera("fisheye624"), "fx = 500.0 and fy = 501.0; the model has one focal length in Aria"),
-    ("mrcal", camera("kannala_brandt"), r"camera.convert\(key\).camera with one of brown.* splined, "),
-    ("mrcal", ct.Rig({"a": camera(), "b": camera()}), "2 cameras; mrcal holds one"),
-    ("ros", ct.Rig({"a": camera()}, {"a": ct.Extrinsics([0, 0, 0.1], [0, 0, 0])}), "its extrinsics would be lost"),
-    ("basalt", ct.Rig({"a": camera(), "b": camera()}), "a: no extrinsics, which Basalt needs of each camera"),
-    ("opencv", ct.Rig({"1": camera(), "2": camera("kannala_brandt")}), "a lens unlike that of the cameras before it"),
-    ("opencv", ct.Rig({"1": camera(), "2": camera(image_size=(4, 4))}), "a size unlike that of the cameras before it"),
-    ("nerfstudio", ct.Rig({"1": camera(), "2": camera("pinhole")}), "a file has one camera_model"),
+    ("aria", camera("fisheye624"), "must have one focal length for Aria; got fx = 500.0"),
+    ("mrcal", camera("kannala_brandt"), r"must be one of brown.* splined, .* camera.convert\(key\)"),
+    ("mrcal", ct.Rig({"a": camera(), "b": camera()}), "must be one for mrcal; got 2"),
+    ("ros", ct.Rig({"a": camera()}, {"a": ct.Extrinsics([0, 0, 0.1], [0, 0, 0])}), "must have no extrinsics for"),
+    ("basalt", ct.Rig({"a": camera(), "b": camera()}), "a: must have extrinsics for Basalt; got none"),
+    ("opencv", ct.Rig({"1": camera(), "2": camera("kannala_brandt")}), "must be a lens like those before it"),
+    ("opencv", ct.Rig({"1": camera(), "2": camera(image_size=(4, 4))}), "must have the size of those before it"),
+    ("nerfstudio", ct.Rig({"1": camera(), "2": camera("pinhole")}), "must have one camera_model"),
     ("kalibr", camera(core=[CORE] * 2, distortion=[[0.0] * 4] * 2), r"a batch of cameras \(2,\)"),
 ]
 
@@ -52,7 +52,7 @@ def test_what_would_be_lost_is_said(format, rig, lost, tmp_path):
 def test_values_that_are_not_finite_are_not_written(format, tmp_path):
     broken = camera().requires_grad_(False)
     broken.distortion[0] = torch.nan
-    with pytest.raises(ct.CameraFileError, match="not finite"):
+    with pytest.raises(ct.CameraFileError, match="must be finite"):
         ct.save(broken, tmp_path / f"x{SUFFIXES[format]}", format)
 
 
@@ -66,7 +66,7 @@ def test_extrinsics_beyond_all_numbers_are_refused(key, shape):
     content = {"camtorch": 1, "cameras": {"a": {"model": "pinhole", "intrinsics": [500, 500, 320, 240]}}}
     assert ct.loads(content | {"extrinsics": {"a": vectors}}).extrinsics["a"].batch_shape == shape
     vectors[key] = torch.full((*shape, 3), 1e200, dtype=torch.float64)
-    with pytest.raises(ct.CameraFileError, match=rf"loads: extrinsics.a.{key}: a number beyond 1e\+100"):
+    with pytest.raises(ct.CameraFileError, match=rf"loads: extrinsics.a.{key}: numbers must be up to 1e\+100"):
         ct.loads(content | {"extrinsics": {"a": vectors}})
 
 
@@ -93,7 +93,7 @@ def test_names_that_yaml_and_json_have_to_escape(name, tmp_path):
     for path in (tmp_path / "camera_info.yaml", tmp_path / "own.json"):
         ct.save(ct.Rig({name: camera()}), path)
         assert list(ct.load(path).cameras) == [name]
-    with pytest.raises(ct.CameraFileError, match="is no text that a file can hold"):
+    with pytest.raises(ct.CameraFileError, match="must be text that a file can hold"):
         ct.save(ct.Rig({"1": camera()}, {"\ud800": ct.Extrinsics([0.0] * 3, [0.0] * 3)}, images={"\ud800": "1"}),
                 tmp_path / "cameras.txt")  # fmt: skip
 
@@ -187,9 +187,9 @@ def test_the_name_says_the_format(tmp_path):
 @pytest.mark.parametrize(
     ("rig", "arguments", "error", "told"),
     [
-        (camera(), ("a.yaml",), ValueError, "a.yaml: .* not determine the format; it may be kalibr, opencv, ros"),
-        (camera(), ("a.yaml", "ply"), ValueError, r"'ply' is not known here; written are aria.*docs/leaving-0\.3\.md"),
-        (camera(), ("a.json", "woodscape"), ValueError, "format: 'woodscape' is not written; written are aria"),
+        (camera(), ("a.yaml",), ValueError, "a.yaml: .* must determine the format; got one for kalibr, opencv, ros"),
+        (camera(), ("a.yaml", "ply"), ValueError, r"format must be one of aria.* got 'ply'.*docs/leaving-0\.3\.md"),
+        (camera(), ("a.json", "woodscape"), ValueError, "format must be one of aria.* got 'woodscape'"),
         ([camera()], ("a.json",), TypeError, "rig must be a Rig or a Camera; got list"),
         (camera().convert("kannala_brandt"), ("a.json",), TypeError, r"got Conversion\. Pass its \.camera"),
         (ct.Rig({}), ("a.json",), ValueError, "rig must have a camera; got none"),
@@ -198,7 +198,7 @@ def test_the_name_says_the_format(tmp_path):
 def test_what_cannot_be_saved_is_told(rig, arguments, error, told):
     with pytest.raises(error, match=told):
         ct.save(rig, *arguments)
-    with pytest.raises(ValueError, match="format: 'ply' is not known here; read are aria"):
+    with pytest.raises(ValueError, match=r"format must be one of aria.* got 'ply'"):
         ct.load("a.yaml", "ply")
 
 

@@ -52,10 +52,10 @@ def test_a_file_is_the_camera_of_its_numbers_which_look_along_z_or_against_it(tm
 
 
 BAD = {
-    "no size": (text().rsplit("#", 1)[0], "image size: missing"),
+    "no size": (text().rsplit("#", 1)[0], "image size: must be given"),
     "a count that is wrong": (text().replace("5 -206", "6 -206"), "polynomial"),
-    "a word": (text().replace("0.000219", "x"), "affine.*no finite number"),
-    "nan": (text().replace("-206.517", "nan"), "polynomial.*no finite number"),
+    "a word": (text().replace("0.000219", "x"), "affine.*must be a finite number"),
+    "nan": (text().replace("-206.517", "nan"), "polynomial.*must be a finite number"),
     "no focal length": (text(ss=(0.0, 0.0, 1e-3)), "must not be zero"),
     "mirrored": (text(affine=(-1.0, 0.0, 0.0)), "c must be positive"),
     "half a pixel": (text(size=(480.5, 752)), "number of pixels"),
@@ -80,6 +80,6 @@ def test_large_files_are_refused_at_once(tmp_path):
     for filling in ("# a comment\n", "0 ", "\n"):
         path.write_text(text(more=filling * ((10 << 20) // len(filling))))
         start = time.process_time()
-        with pytest.raises(ct.CameraFileError, match=r"10\d* bytes; a calibration of OCamCalib"):
+        with pytest.raises(ct.CameraFileError, match=r"at most 65536 bytes; got 10"):
             ct.load(path)
         assert time.process_time() - start < 1

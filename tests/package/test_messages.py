@@ -55,7 +55,7 @@ WRONG = [
     (lambda: ct.Pinhole([9.0] * 4).to_kornia(), ValueError, r"Pinhole.to_kornia: camera must have an image_size;"),
     (lambda: CAMERA.convert("fisheye62").camera.to_kornia(), ValueError, r"8 of 'fisheye62'. Write camera.convert"),
     (lambda: GRID.to_kornia(), ValueError, r"must have one batch dim or none; got \(2, 2\)"),
-    (lambda: CAMERA.to_kornia(POSE), ValueError, r"must be None or the identity, for KannalaBrandtK3 of kornia"),
+    (lambda: CAMERA.to_kornia(POSE), ValueError, r"must be None or the identity for kornia's KannalaBrandtK3"),
     (lambda: ct.Extrinsics([0.0, 0, 0, 1], [0.0, 0, 0]), ValueError, r"got shape \(4,\)\. For quaternions.*from_quat"),
     (lambda: ct.Pinhole([9.0] * 4, image_size=EYE), TypeError, r"\(height, width\); got ndarray of shape \(3, 3\)"),
     (lambda: ct.Extrinsics(0, 0, 1), TypeError, r"It takes ct.Extrinsics\(\[rx, ry, rz\], \[tx, ty, tz\]\)"),
