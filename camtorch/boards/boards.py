@@ -84,8 +84,7 @@ class Charuco(Board):
 class AprilGrid(Board):
     """Kalibr's grid of AprilTags; tag 0 is at the bottom left, numbers grow to the right, then up.
 
-    `spacing` is the gap between two tags in sides of a tag, `border` the black cells around a tag's code: Kalibr prints
-    2, others 1.
+    `spacing` is the gap between two tags in sides of a tag, `border` the black cells around a tag's code, Kalibr's 2.
     """
 
     spacing: float = 0.3

@@ -24,8 +24,7 @@ _STRAY = 0.15  # such distances, from which a corner is too far from the place e
 def detect(board: Board, image: NDArray[Any]) -> tuple[Pixels, str]:
     """Find a board in an image (H, W) of uint8 or uint16: pixels (N, 2), NaN if unseen; or all NaN, and the reason.
 
-    The top left square of a chessboard is black. If several orders begin so (`board.is_symmetric`), the first point is
-    the one nearest to the image's top left corner.
+    The top left square of a chessboard is black; of several such orders the one nearest the image's top left is taken.
     """
     cv2 = opencv("finding boards in images")
     if image.dtype != np.uint8:  # stretched from the range that is used
@@ -96,9 +95,8 @@ def _begins_with_black(grey: Grey, grid: Pixels) -> bool:
 def _at_gradients(cv2: Any, grey: Grey, grid: Pixels) -> Pixels:
     """Return the corners (N, 2) moved to the points at which gradients meet, or as found if noise makes that worse.
 
-    A lens bends rows of corners smoothly, so their third differences are noise, and the corners with the least of it
-    are returned. OpenCV misplaces some corners at the ends of steep rows: a corner far from the place expected by its
-    rows is searched there, or unseen.
+    A lens bends rows of corners smoothly, so their third differences are noise: the corners with the least are taken. A
+    corner far from the place expected by its rows, like some of OpenCV's in steep ones, is searched there, or unseen.
     """
     numbers = np.arange(grid[..., 0].size).reshape(grid.shape[:2])
     runs = [line[i : i + 4] for line in (*numbers, *numbers.T) for i in range(len(line) - 3)]

@@ -49,23 +49,18 @@ def find_board(images: Any, board: Any, *, square: float = 1.0, **options: Any) 
     """Find a board in images, as `camtorch calibrate` does, to calibrate in Python.
 
         found = ct.find_board("photos/*.jpg", "9x6", square=0.024)
-        calibration = ct.calibrate(
-            "kannala_brandt", found.object_points, found.image_points, image_size=found.image_size
-        )
+        points = found.object_points, found.image_points
+        calibration = ct.calibrate("kannala_brandt", *points, image_size=found.image_size)
 
     Files are read as stored, without their Exif orientation, since a camera describes stored pixels. Images without the
-    board, unreadable ones, and those of another size than most are left out; one warning names them. It needs OpenCV:
-    `pip install -e ".[calibrate]"`.
+    board, unreadable ones, and those of a rarer size are left out; one warning names them. It needs OpenCV.
 
     Args:
-        images: a path, a folder, a pattern such as "photos/*.jpg", or a list of these; an array (H, W) or (H, W, C) or
-            a tensor (C, H, W), a list or a stack of them, uint8, uint16 or floating point from 0 to 1; or a list of
-            Pillow images.
-        board: "9x6", the inner corners of a chessboard across and down, or (9, 6); "charuco 5x7", squares; "aprilgrid
-            6x6", tags.
-        square: the side of a square, or of a tag, in the unit of the poses.
-        options: `marker`, `dictionary` and `legacy` of a ChArUco board, `spacing`, `border` and `dictionary` of a grid
-            of tags; see `camtorch calibrate --help`.
+        images: A path, a folder, a pattern such as "photos/*.jpg", or a list of these; an array (H, W) or (H, W, C) or
+            a tensor (C, H, W), uint8, uint16 or floating point from 0 to 1, a stack or a list of them; Pillow images.
+        board: "9x6" or (9, 6), inner corners of a chessboard; "charuco 5x7", squares; "aprilgrid 6x6", tags.
+        square: The side of a square, or of a tag, in the unit of the poses.
+        options: `marker`, `dictionary`, `legacy` of ChArUco; `spacing`, `border`, `dictionary` of an AprilGrid.
 
     Raises:
         ValueError: If there is no such board or option, there are no images, or no image shows the board.

@@ -142,19 +142,18 @@ def calibrate(
     The result has the least squared distances in pixels, over the camera's parameters and the poses of all views.
 
     Args:
-        model: class of cameras, its key, or a camera to start from.
+        model: Class of cameras, its key, or a camera to start from.
         object_points: (N, 3) for all views, (V, N, 3), or a list of (N_i, 3), in the board's frame and any unit.
-        image_points: (V, N, 2) or a list of (N_i, 2), in pixels, (0, 0) the centre of the top-left one. Rows with NaN
-            are unseen.
+        image_points: (V, N, 2) or a list of (N_i, 2), in pixels, (0, 0) the top-left one's centre; NaN if unseen.
         image_size: (height, width), as `image.shape`.
-        count: number of coefficients; the model's default if left out.
-        start: a camera to start from, of the model.
-        fixed: names of parameters to hold ("cx", "k3", ...) at the start's values; without a start at zero distortion,
+        count: Number of coefficients; the model's default if left out.
+        start: A camera to start from, of the model.
+        fixed: Names of parameters to hold ("cx", "k3", ...) at the start's values; without a start at zero distortion,
             and the principal point in the middle of the image. "all" finds the poses only.
         loss: None for least squares; "huber" or "cauchy", of a residual's length, if some corners may be wrong.
         loss_scale: px, the length from which a robust loss grows slower.
-        bend: whether the board may be bent, which adds two unknowns, see `Calibration.bend`.
-        progress: called after each step of the final search with its number and the cost.
+        bend: Whether the board may be bent, which adds two unknowns, see `Calibration.bend`.
+        progress: Called after each step of the final search with its number and the cost.
 
     Raises:
         ValueError: If an argument is bad, or the views do not determine the camera, as a single view of a plane.

@@ -42,13 +42,13 @@ def fit(
     `Conversion.rms` and `max_error` are the distances of the result from them, in px.
 
     Args:
-        model: class of cameras, its key, or a camera to start from, whose frozen parameters keep their values.
+        model: Class of cameras, its key, or a camera to start from, whose frozen parameters keep their values.
         pixels: (*N, 2).
         rays: (*N, 3) for one camera, or (*B, *N, 3) for a batch of them, of any length, in the camera's frame.
-        weights: of the squared errors, broadcast against the rays' (*B, *N); 1 if left out.
+        weights: Weights of the squared errors, broadcast against the rays' (*B, *N); 1 if left out.
         image_size: (height, width) of the camera that is made; by default that of a camera to start from.
-        count: number of coefficients; the model's default if left out.
-        fixed: names of parameters to hold ("cx", "k3", ...) at the values of the camera to start from; without one
+        count: Number of coefficients; the model's default if left out.
+        fixed: Names of parameters to hold ("cx", "k3", ...) at the values of the camera to start from; without one
             distortion as in `ideal`, at zero, and the principal point in the middle of the image.
 
     Returns:

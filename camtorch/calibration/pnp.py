@@ -91,7 +91,7 @@ def solve_pnp(
     values, so it does not work in torch.compile or vmap; pass vmap's batch as a batch dim.
 
     Args:
-        camera: with batch dims or without; all arguments broadcast.
+        camera: Camera with or without batch dims; all arguments broadcast.
         object_points: (*B, N, 3) in the object's frame, in any unit; (N, 3) for one object in all rows.
         pixels: (*B, N, 2). A point is unseen if its pixel is NaN or has no ray. OpenCV's (N, 1, 2) are N points.
         weights: (*B, N) of the squared residuals, not negative, 0 for unseen; all 1 if left out.

@@ -114,19 +114,17 @@ def calibrate_rig(
     A camera may miss boards, but must see some together with others, so that all cameras are linked.
 
     Args:
-        models: a class, its key, or a camera to start from, by name of the camera. The first camera's frame is that of
-            the rig.
+        models: A class, its key, or a camera to start from, by name of the camera. The first one's frame is the rig's.
         object_points: (N, 3) for all views, (V, N, 3), or a list of (N_i, 3), the same for all cameras.
-        image_points: by name of the camera, as in `calibrate`, of V views at the same times: None or NaN if it did not
-            see the board.
+        image_points: By name of the camera, as in `calibrate`, of V views at the same times: None or NaN if unseen.
         image_sizes: (height, width), by name of the camera.
-        count: as in `calibrate`, for all cameras or by name.
-        start: cameras to start from, by name.
-        fixed: as in `calibrate`, for all cameras or by name; "all" holds a camera's intrinsics and distortion.
-        loss: as in `calibrate`, like all other arguments.
+        count: As in `calibrate`, for all cameras or by name.
+        start: Cameras to start from, by name.
+        fixed: As in `calibrate`, for all cameras or by name; "all" holds a camera's intrinsics and distortion.
+        loss: As in `calibrate`, like all other arguments.
         loss_scale: px.
-        bend: whether the board may be bent.
-        progress: called after each step of the last search with its number and the cost.
+        bend: Whether the board may be bent.
+        progress: Called after each step of the last search with its number and the cost.
 
     Raises:
         ValueError: If `calibrate` raises for an argument, names differ, or no board links a camera to the others.

@@ -25,8 +25,7 @@ class Spread(NamedTuple):
     """The effect of the corners' noise on a camera and its frame, for B problems.
 
     Independent numbers of variance 1 move the P = 4 + n parameters, the frame's turn (a rotation vector, radians) and
-    its shift by the rows of `factor`. Turn and shift are means over the boards, each moved by its own pose, because
-    poses compensate errors of the lens.
+    its shift by the rows of `factor`. Both are means over the boards with their own poses, which compensate the lens.
     """
 
     model: type[Camera]

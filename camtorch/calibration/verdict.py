@@ -45,8 +45,7 @@ _NOISE = "one standard deviation in the worst direction"
 class Calibration:
     """The result of `calibrate`, and its uncertainty.
 
-    Units are pixels, and for poses those of the object points. `extrinsics` has the poses of `views`: without views
-    that have no corner, or equal others.
+    Units are pixels, and for poses those of the object points. `views` are those of the poses.
     """
 
     camera: Camera
@@ -56,8 +55,7 @@ class Calibration:
     rms: float
     """The root of the mean squared length of the residuals, per point, as OpenCV's."""
     sigma: float
-    """The standard deviation of a pixel's coordinate: sqrt(sum of squares / (2 N - parameters)), of the inliers if the
-    loss is robust."""
+    """Standard deviation of a pixel's coordinate: sqrt(sum of squares / (2 N - parameters)), robust: of the inliers."""
     residuals: Any
     """Projected minus observed, in the shape or the list form of the image points; NaN for unseen corners, views left
     out, and corners for which a camera that did not converge has no pixel."""
@@ -73,10 +71,9 @@ class Calibration:
     """How far the middle of the board lies off the plane of its edges, along x and y; zeros without bend=True."""
     image_size: tuple[int, int]
     views: tuple[int, ...]
-    """The indices of the passed views that have poses."""
+    """The indices of passed views that have poses: those with corners, unlike all earlier ones."""
     copies: tuple[int, ...]
-    """The indices of passed views that show another one again: equal ones are left out, nearly equal ones widen the
-    uncertainties until they count as one."""
+    """The indices of passed views that repeat another one: left out if equal, else they widen the uncertainties."""
     observations: Observations = field(repr=False)
     adjusted: Adjusted = field(repr=False)
     point_inliers: Tensor = field(repr=False)
@@ -120,7 +117,7 @@ class Calibration:
 
         Args:
             pixels: (..., 2).
-            distance: from the camera, in units of the object points.
+            distance: Distance from the camera, in units of the object points.
 
         Returns:
             (...,) px; NaN if a pixel has no ray.

@@ -66,8 +66,7 @@ def minimise(
 ) -> Minimum:
     """Return the states of least cost near the given ones; no problem depends on another.
 
-    A step whose predicted decrease is below the rounding of the cost is the last one, and taken unless the cost grows
-    by more than that.
+    A step with a predicted decrease below the cost's rounding is the last one, taken unless the cost grows by more.
 
     For B problems: a search ends if the predicted decrease is below the part `tolerance` (B,) of the cost, or the cost
     is at most `tiny` (B,). `going` (B,) bool selects the problems to search, all by default. `steps` limits all steps,

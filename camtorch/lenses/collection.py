@@ -147,13 +147,11 @@ def search(words: str = "", *, image_size: Sequence[int] | None = None) -> list[
 
     Case, spaces, signs and the order of words do not count: "A7S III", "a7sIII" and "a7s-iii" are the same; a
     number is whole, so HERO9 does not match HERO99. Lenses with the words in a row come first; then those with the
-    fewest other words; then those neither stretched nor reprojected by the camera; then those with the smallest
-    reprojection error.
+    fewest other words; then those neither stretched nor reprojected; then those with the smallest reprojection error.
 
     Args:
         words: Words of brand, camera, lens and setting, or a size: "GoPro HERO9 wide", "Laowa 7.5mm 3840x2160".
-        image_size: (height, width): only lenses that were calibrated for images of this aspect ratio, this size
-            first.
+        image_size: (height, width): only lenses calibrated for images of this aspect ratio, this size first.
     """
     size = as_image_size(image_size, "lenses.search")
     terms = _terms(words, "search")
@@ -175,12 +173,10 @@ def find(words: str, *, image_size: Sequence[int] | None = None) -> KannalaBrand
 
     Args:
         words: Words as for `search`, which also lists the other matches.
-        image_size: (height, width) of your images, to which the camera is scaled. Default: the size of the
-            calibration.
+        image_size: (height, width) of your images, to which the camera is scaled. Default: the calibration's.
 
     Raises:
-        ValueError: If no lens has all of these words (the text lists similar names), or none has that aspect
-            ratio. TypeError: If `words` is no text.
+        ValueError: If no lens has all of these words, or none has that aspect ratio. TypeError: If `words` is no text.
     """
     if not _terms(words, "find"):
         raise ValueError(f"lenses.find: words must name a camera or a lens, as 'GoPro HERO9 wide'; got {words!r}")

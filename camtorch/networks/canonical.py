@@ -43,16 +43,15 @@ class CanonicalCamera(SampleTransform):
     transforms of labels (CSTM_label) and of images (CSTM_image).
 
     Args:
-        focal: in pixels; 1000 in Metric3D.
+        focal: Canonical focal length in pixels; 1000 in Metric3D.
         scales: "depth" or "image".
         image_size: (height, width) of the new images, with the same middle; the size of the image times s, rounded, if
             left out. Batches of several focal lengths need it.
-        camera: for samples without one.
-        mode, padding_mode, fill, antialias, tolerance: of images, see `Warp`; antialias=None is on if they shrink.
-        fields, mask_fill, valid_mask: see `Augmentation`.
+        camera: Camera for samples without one.
+        mode, padding_mode, fill, antialias, tolerance: See `Warp`; antialias=None is on if images shrink.
+        fields, mask_fill, valid_mask: See `Augmentation`.
 
-    A sample has the fields of an `Augmentation`. The result also has `scale` (B,), s, and with "image" the new `camera`
-    and `source_camera`.
+    A sample has the fields of an `Augmentation`; the result also s, `scale` (B,), and with "image" `source_camera`.
 
     Raises:
         ValueError: If the focal length is not positive, `scales` is another word, or a size is given with "depth".
@@ -96,8 +95,7 @@ class CanonicalCamera(SampleTransform):
         """Make a sample canonical: a dict or keyword arguments, single or a batch.
 
         Raises:
-            ValueError: If there is no camera, images would get several sizes, depth is in whole numbers, or
-                `Augmentation` raises for the sample.
+            ValueError: If there is no camera, images would get several sizes, or a field is wrong, see `Augmentation`.
         """
         sample = self._given(sample, fields)
         batch = self._batch(sample)

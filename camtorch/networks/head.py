@@ -41,18 +41,16 @@ class CameraHead(GeometryModule):
     The layer starts with weights of zero: every camera is then `prior`.
 
     Args:
-        features: number of features.
-        model: class of cameras or its key in `ct.MODELS`; or a camera, which is then the prior.
+        features: Number of features.
+        model: Class of cameras or its key in `ct.MODELS`; or a camera, which is then the prior.
         image_size: (height, width) of the images in pixels; that of a given camera if left out.
-        fov: least and greatest horizontal field of view in DEGREES, of the given lens; the prior has the geometric mean
+        fov: Least and greatest horizontal field of view in DEGREES, of the given lens; the prior has the geometric mean
             of both focal lengths. (40, 120) if left out; for a given camera 1.5 times its focal length, and down to as
             many times less if its lens shows the corners of such images.
-        count: number of coefficients, for models with a choice.
-        centre: largest distance of the principal point from the middle, or from that of the given camera, as a part of
-            the image's width and height.
-        fixed: names of numbers that remain as in the prior: "cx", "cy", "k3", ...
-        shared_focal: whether fx and fy are one number, in the ratio of the prior; else the ratio may change by ten
-            percent.
+        count: Number of coefficients, for models with a choice.
+        centre: Largest move of the principal point from the prior's, as a part of the image's width and height.
+        fixed: Names of numbers that remain as in the prior: "cx", "cy", "k3", ...
+        shared_focal: Whether fx and fy are one number, in the ratio of the prior; else it may change by ten percent.
 
     Raises:
         ValueError: If the lens does not reach a field of view, or not with the corners of the image, or it seems to

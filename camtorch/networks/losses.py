@@ -32,8 +32,8 @@ def angles(first: Tensor, second: Tensor) -> Tensor:
     assessments of roundoff in floating-point computation?", 2006, section 12.
 
     Args:
-        first: of any length except zero.
-        second: of any length except zero; both broadcast.
+        first: Directions of any length except zero.
+        second: Other directions; both broadcast.
     """
     first = as_coordinates(first, "first", 3, "angles")
     second = as_coordinates(second, "second", 3, "angles", first.device)
@@ -75,16 +75,14 @@ def rays(
 ) -> Tensor | tuple[Tensor, Tensor]:
     """Return the angles between the rays that two cameras have for the same pixels of their images.
 
-    It compares cameras of any models, and weighs errors of focal length, principal point and distortion by their effect
-    in radians.
+    Cameras may be of any models. Errors of focal length, principal point and distortion count by their effect.
 
     Args:
-        predicted: with any batch dims *B.
-        target: with any batch dims *B; both broadcast.
-        samples: rows and columns of pixels to compare, evenly over the image: the middles of as many equal parts of it;
-            a number for both.
+        predicted: Cameras with any batch dims *B.
+        target: Cameras with any batch dims; both broadcast.
+        samples: Rows and columns of pixels to compare, the middles of equal parts of the image; a number for both.
         pixels: (*B, *N, 2), pixels to compare instead.
-        weights: of the angles, broadcast against them.
+        weights: Weights of the angles, broadcast against them.
         reduction: "mean" over the angles that are valid in both, by weight; "none" for all of them.
 
     Returns:
@@ -141,12 +139,12 @@ def reprojection(
     Points that the predicted camera does not see do not count, and do not pull it; `rays` counts the whole image.
 
     Args:
-        predicted: with batch dims *B.
-        target: the camera with the true projections, or their pixels (*B, *N, 2), NaN if unseen.
+        predicted: Cameras with batch dims *B.
+        target: The camera with the true projections, or their pixels (*B, *N, 2), NaN if unseen.
         points: (*B, *N, 3) in the camera's frame; the rays of the target's own image if left out, see `samples`.
-        samples: see `rays`.
-        weights: see `rays`.
-        reduction: see `rays`.
+        samples: See `rays`.
+        weights: See `rays`.
+        reduction: See `rays`.
 
     Returns:
         The mean distance over points that both see, or distances (*B, *N) and valid; see `rays`.

@@ -104,8 +104,7 @@ def distortion_field(camera: Camera, ax: Axes | None = None, *, count: int = 21)
 def radius_curve(cameras: Camera | Sequence[Camera], ax: Axes | None = None, *, labels: Sequence[str] = ()) -> Axes:
     """Draw the distance from the principal point over the angle from the axis, up to a dot at the last valid angle.
 
-    A band shows the range if azimuths differ. The ideal lens is dashed. The pale part has the angles of the first
-    camera's image.
+    A band shows the range if azimuths differ. The ideal lens is dashed. The angles of the first image are pale.
 
     Args:
         cameras: Single cameras.
@@ -156,8 +155,7 @@ def difference(a: Camera, b: Camera, ax: Axes | None = None, *, remove_rotation:
         a: Camera whose image is shown.
         b: The other camera, with the same image size or none.
         ax: Axes; default new ones.
-        remove_rotation: Whether rays are rotated first, by the rotation that brings the cameras' rays
-            closest: two calibrations of one camera may differ by their direction.
+        remove_rotation: Whether to rotate rays to the other camera's first: calibrations may differ by that.
 
     Raises:
         ValueError: If a camera is a batch, or image sizes are missing or differ.
@@ -179,8 +177,7 @@ def difference(a: Camera, b: Camera, ax: Axes | None = None, *, remove_rotation:
 def rig(rig: Rig, ax: Axes | None = None) -> Axes:
     """Draw the positions of the cameras of a rig from above, with wedges for the horizontal fields of view.
 
-    The frame is the rig's, z to the top. Cameras above each other are drawn from the right instead, with
-    vertical fields of view, z to the right.
+    The frame is the rig's, z to the top; cameras above each other are drawn from the right, with vertical fields.
 
     Args:
         rig: Rig of single cameras; cameras with a pose are shown.
@@ -224,9 +221,8 @@ def rig(rig: Rig, ax: Axes | None = None) -> Axes:
 def calibration(calibration: Calibration | RigCalibration) -> Figure:
     """Draw the residuals over the image, and the uncertainty of projections; for a rig a row for each camera.
 
-    Residuals are arrows from where a corner was seen to where the camera shows it, longer by a factor that the title
-    names; crosses are outliers. The map is `calibration.uncertainty`, at infinity; dots are corners, and grey pixels
-    have no rays.
+    Residuals are arrows from the corner seen to the camera's pixel of it, longer by a factor in the title; crosses are
+    outliers. The map is `calibration.uncertainty` at infinity; dots are corners, and grey pixels have no rays.
 
     Args:
         calibration: Result of `ct.calibrate` or `ct.calibrate_rig`.

@@ -39,11 +39,9 @@ class Extrinsics(BatchedModule):
 
     Vectors may have OpenCV's shapes: columns (*B, 3, 1), an array (1, 3), a list of V such arrays as a batch of V. A
     tensor (1, 3) is a batch of one. A value with the shape of matrices is taken as matrices if they are rotations, or
-    the translation has one dim less. Three vectors (3, 3) with three translations that form a rotation matrix raise an
-    error, which shows how to pass them.
+    the translation has one dim less. An ambiguous shape raises an error, which shows how to pass the values.
 
-    Plain values become new Parameters; a tensor that requires grad is used without copying. Gradients are exact at
-    zero rotation as well.
+    Plain values become new Parameters; a tensor that requires grad is used without copying. Gradients are exact.
 
     Raises:
         ValueError: If a shape is wrong, plain rotation vectors exceed two turns, which seem to be degrees, a matrix
@@ -111,8 +109,7 @@ class Extrinsics(BatchedModule):
         """Make poses from matrices.
 
         Args:
-            matrix: (*B, 4, 4) or (*B, 3, 4) matrices [[R, t], ...]; or R, (*B, 3, 3), with a translation; or both
-                as a pair (R, t).
+            matrix: (*B, 4, 4) or (*B, 3, 4) matrices [[R, t], ...]; or R (*B, 3, 3), with a translation or in a pair.
             translation: (*B, 3), or in OpenCV's shapes.
 
         Raises:
@@ -190,11 +187,10 @@ def head_angles(pose: Extrinsics | Numbers) -> Tensor:
     identity faces the camera. R = Ry(yaw) Rx(-pitch) Rz(roll), right-handed turns about the camera's axes. The nose
     points along R (0, 0, -1), the gaze with this pitch and yaw in `ct.augment.to_pitch_yaw` (the signs of ETH-XGaze),
     and a positive roll leans clockwise in the image about that axis. If the nose points straight up or down, roll is 0.
-    Values and gradients are finite everywhere. `camtorch.poses.rotations.mount_rotation`, which turns cameras, has
-    another order: yaw, pitch, roll, in degrees.
+    Values and gradients are finite everywhere. `ct.augment.mount_rotation` has another order, in degrees.
 
     Args:
-        pose: camera from head: Extrinsics, a `Pose` of `ct.solve_pnp`, or matrices (..., 4, 4) or (..., 3, 3).
+        pose: Camera from head: Extrinsics, a `Pose` of `ct.solve_pnp`, or matrices (..., 4, 4) or (..., 3, 3).
 
     Raises:
         TypeError: If `pose` is not numeric. ValueError: If the shape is wrong or a matrix is not a rotation.

@@ -135,9 +135,8 @@ class Rectification(GeometryModule):
         """Return the points of the scene for disparities, in the frame of the rectified left camera.
 
         Args:
-            disparity: (B, 1, H, W), (1, H, W) or (H, W) pixels, of the rectified left image; OpenCV's matchers return
-                integers, sixteen times as large.
-            valid: bool, in the same shape: the disparities that count.
+            disparity: (B, 1, H, W), (1, H, W) or (H, W) pixels of the left image, 1/16 of OpenCV's integers.
+            valid: Bool, in the same shape: the disparities that count.
 
         Returns:
             points (..., 3) after the shape of the disparities, in the unit of the extrinsics, and valid in their shape:
@@ -206,8 +205,8 @@ class Rectification(GeometryModule):
         """Return the least and the greatest disparity of points in a range of depths, over all pixels and pairs.
 
         Args:
-            near: the least depth: z in perspective, the distance from the baseline in panoramas.
-            far: the greatest.
+            near: The least depth: z in perspective, the distance from the baseline in panoramas.
+            far: The greatest depth.
         """
         near, far = (as_number(v, name, "disparity_range") for v, name in ((near, "near"), (far, "far")))
         if not 0 < near < far:
@@ -262,24 +261,22 @@ def rectify(
     """Return warps of two cameras' images, of any models and sizes, into images whose rows correspond.
 
     The x axis of both lies along the baseline, from left to right, and the view direction is the mean of the cameras'.
-    By default the images show the view of both cameras up and down, and of either one to the sides, at the finer
-    resolution of the two in the middle.
+    By default images show what both cameras see up and down, and either sees to the sides, at the finer resolution.
 
     Args:
-        left: the first camera, with image_size.
-        right: the second camera, with image_size.
-        extrinsics: right from left, `p_right = R p_left + t`, as OpenCV's stereoCalibrate gives R and T.
+        left: The first camera, with image_size.
+        right: The second camera, with image_size.
+        extrinsics: Right from left, `p_right = R p_left + t`, as OpenCV's stereoCalibrate gives R and T.
         projection: "perspective" up to 120 degrees; "latlon" and "cylindrical", panoramas about the baseline, for more.
-        fov: degrees, horizontal or (horizontal, vertical), of the rectified images, about their axis.
+        fov: Degrees, horizontal or (horizontal, vertical), of the rectified images, about their axis.
         image_size: (height, width) of the rectified images.
-        vertical: whether columns correspond instead of rows, for cameras above each other.
+        vertical: Whether columns correspond instead of rows, for cameras above each other.
         align: "mean" for the mean of both optical axes, orthogonal to the baseline; "opencv" halves the rotation
             between the cameras, as `cv2.stereoRectify` does.
 
     Raises:
         ValueError: If cameras are at one place, or look along the baseline or away from each other; if default images
-            exceed eight times the longest side of a camera, a word is unknown, a fov is out of range, or an image_size
-            is missing.
+            exceed eight times a camera's side, a word is unknown, a fov is out of range, or an image_size is missing.
         TypeError: If `left` or `right` is not a camera.
 
     Example:

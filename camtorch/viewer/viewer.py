@@ -42,9 +42,8 @@ def write_viewer(
 ) -> None:
     """Write a page that shows a lens live: one HTML file without other files or network.
 
-    It shows the image with the limit of the lens's rays, the same image in another camera, and the
-    radius over the angle. Coefficients can be moved, photographs dropped, other models and real lenses chosen; the
-    matching lines of Python can be copied.
+    It shows the image with the limit of the lens's rays, the image in another camera, and the radius over the angle.
+    You can move coefficients, drop photographs, choose models and real lenses, and copy the lines of Python.
 
     Args:
         camera: A single camera with image_size, of a model in the gallery of models.
