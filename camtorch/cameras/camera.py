@@ -153,8 +153,7 @@ class Camera(Freezable, Editable):
 
         Raises:
             ValueError: If K is not such a matrix, or has a skew that is not ignored; if a column (n, 1) of coefficients
-                comes with a batch of matrices; or if a fisheye gets 5, 8, 12 or 14 coefficients, as of OpenCV's
-                calibrateCamera.
+                comes with a batch of matrices; or if a fisheye gets 5, 8, 12 or 14, as calibrateCamera gives them.
         """
         return cls(*numbers_of_matrix(cls, K, distortion, ignore_skew), image_size=image_size)
 
@@ -376,8 +375,7 @@ class Camera(Freezable, Editable):
 
         Returns:
             (*B, H, W, 6): the unit direction d and the moment m = position x d of the line, in the world's frame and
-            unit of length; and valid (*B, H, W) bool. For two lines that meet, d1 . m2 + d2 . m1 is zero. Invalid lines
-            are zeros without a gradient.
+            unit of length; and valid (*B, H, W) bool, else both are zero. d1 . m2 + d2 . m1 is 0 for lines that meet.
         """
         return plucker(*self.rays(stride), extrinsics, f"{type(self).__name__}.plucker")
 
@@ -409,8 +407,7 @@ class Camera(Freezable, Editable):
 
         Returns:
             latitude (*B, H, W) in radians, of the ray above the horizon; up (*B, H, W, 2), the unit direction (u, v) in
-            the image in which things rise, (0, 0) straight above and below; and valid (*B, H, W) bool, elsewhere both
-            are zeros. Kept like `rays`.
+            which things rise, (0, 0) straight above and below; and valid (*B, H, W) bool, else zeros. Kept like `rays`.
 
         Raises:
             ValueError: If gravity has another shape, or length zero.
@@ -494,9 +491,8 @@ class Camera(Freezable, Editable):
         Args:
             model: a class of cameras, or its key in `ct.MODELS`.
             count: The number of coefficients, if the model leaves a choice. By default the least that holds those of a
-                related camera, at least the model's own; if that does not keep the tolerance, those of `fit_counts`
-                are tried, and taken if they keep it or halve the largest error. Rows of a batch that need fewer have
-                zeros.
+                related camera, at least the model's own; if it does not keep the tolerance, those of `fit_counts` are
+                tried, and taken if they keep it or halve the largest error. Rows that need fewer have zeros.
             image_size: (height, width) of the image, for a camera without one, or to use another part.
             max_angle: radians from the optical axis up to which rays matter; by default all do.
             tolerance: the largest error in pixels that is good enough.

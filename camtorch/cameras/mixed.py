@@ -131,7 +131,7 @@ class Mixed(Camera):
         members = cast("list[Camera]", list(self.cameras._modules.values()))
         for group in self._groups:
             pairs = [members[i]._tensors for i in group.members]
-            tensors += [_joined(numbers, group) for numbers in zip(*pairs, strict=True)]
+            tensors += [_stack_group(numbers, group) for numbers in zip(*pairs, strict=True)]
         if all(t.dtype == tensors[0].dtype for t in tensors):
             return tuple(tensors)
         wide = working_dtype(tensors[0], *tensors)
@@ -393,7 +393,7 @@ def kind(camera: Camera) -> tuple[type[Camera], int, tuple[int, int] | None]:
     return type_before_parametrizations(camera), camera.distortion.shape[-1], camera.image_size
 
 
-def _joined(tensors: Sequence[Tensor], group: _Group) -> Tensor:
+def _stack_group(tensors: Sequence[Tensor], group: _Group) -> Tensor:
     """Return (C, n), the numbers of all cameras of a group, or those that its cameras share if it is one batch."""
     if group.counts[1:] or group.taken is not None:
         if not any(group.counts):

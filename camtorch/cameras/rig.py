@@ -70,7 +70,7 @@ class NamedModules(nn.Module, MutableMapping[str, M]):
             raise TypeError(f"Rig: items must be str: {self._kind.__name__}; got {name!r}: {type(module).__name__}")
         place = self._places.get(name)
         if not isinstance(place, str):
-            # nn.Module takes no dots; a percent sign tells other names from its attributes
+            # nn.Module takes no dots; a percent sign separates names from its attributes
             place = name.replace("%", "%25").replace(".", "%2E")
             place = f"%{place}" if not place or hasattr(self, place) else place
             self._places[name] = place

@@ -18,7 +18,7 @@ class Kept:
 
     On the CPU values are compared, not versions: a change through `.data`, or by functional_call, leaves no other
     trace. On another device a comparison would wait for it; there such a change is not seen. Nothing is kept while the
-    values may not be looked at. Copies and pickles begin empty.
+    values may not be read. Copies and pickles begin empty.
     """
 
     capacity: int = 1

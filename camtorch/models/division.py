@@ -13,8 +13,7 @@ class Division(Camera):
 
     r^2 = a^2 + b^2. A ray is valid before the angle stops ascending with r. With one term r / (1 + lambda1 r^2) =
     rho / z is solved in closed form: the fold is at r^2 = 1 / lambda1 if lambda1 > 0; if lambda1 < 0, all rays except
-    the exact backward one are valid. With more terms the inverse is found by Newton's method, and pixels have rays up
-    to 19 focal lengths from the centre.
+    the exact backward one are valid. More terms need Newton's method, up to 19 focal lengths from the centre.
 
     Distortion: lambda1 lambda2 ..., any number of coefficients, at least one; 1 if left out. One is COLMAP DIVISION and
     SIMPLE_DIVISION, there k. lambda1 = -1/4 is the stereographic projection. Source: Fitzgibbon, "Simultaneous

@@ -45,9 +45,8 @@ class FThetaSheared(Sheared, FTheta):
 
     `from_polynomial` takes the [[c, d], [e, 1]] of files: d here is their e, e is their d / c, and c is fx / fy.
 
-    Distortion: d e k2 k3 ..., d and e of the linear part as of `OCamCalib`, then those of `FTheta`, at least one; 5 if
-    left out. Source: NVIDIA's nvidia-ncore, `FThetaCameraModel`. On the axis see `FTheta`. See `Camera` for shapes,
-    conventions and errors.
+    Distortion: d e k2 k3 ..., d and e of the linear part like `OCamCalib`, then those of `FTheta`, at least one; 5 if
+    left out. Source: NVIDIA's nvidia-ncore, `FThetaCameraModel`. On the axis see `FTheta`, for conventions `Camera`.
     """
 
     key = "f_theta_sheared"

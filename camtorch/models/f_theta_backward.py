@@ -14,8 +14,7 @@ class FThetaBackward(FreePolynomial):
     """The radially symmetric fisheye with a free polynomial of the radius: theta = r (1 + k2 r + k3 r^2 + ...).
 
     r is the distance of the pixel from the axis in focal lengths, theta = atan2(hypot(x, y), z). The other direction of
-    `FTheta`: there the polynomial gives r, and its inverse is found. A ray is valid before theta stops ascending, and
-    up to a radius of 19 focal lengths.
+    `FTheta`: there the polynomial gives r. A ray is valid before theta stops ascending, up to 19 focal lengths.
 
     Distortion: k2 k3 ... by the power of r, any number of them, at least one; 3 if left out. A polynomial of pixels
     is taken by `from_polynomial`. The same as NVIDIA DriveWorks `ftheta` if its polynomial gives angles of
@@ -39,7 +38,7 @@ class FThetaBackward(FreePolynomial):
 class FThetaBackwardSheared(Sheared, FThetaBackward):
     """`FThetaBackward` with all of NVIDIA's linear part: (u, v) = f (x + e y, d x + y) + c.
 
-    Distortion: d e k2 k3 ..., d and e as of `FThetaSheared`, then those of `FThetaBackward`, at least one; 5 if left
+    Distortion: d e k2 k3 ..., d and e like `FThetaSheared`, then those of `FThetaBackward`, at least one; 5 if left
     out. See `Camera` for shapes, conventions and errors.
     """
 

@@ -19,7 +19,7 @@ class Mei(Camera):
     (u, v) = f (a', b') + c. A ray is valid for z > -xi d (z > -d / xi if xi > 1) and before the fold of the lens.
     Needs xi > -1; on the axis the slope is f / (1 + xi).
 
-    Distortion: xi k1 k2 p1 p2. The same as OpenCV `omnidir` (but for its skew) and Kalibr `omni` with `radtan`.
+    Distortion: xi k1 k2 p1 p2. The same as OpenCV `omnidir` (without its skew) and Kalibr `omni` with `radtan`.
     Source: Mei and Rives, "Single view point omnidirectional camera calibration from planar grids", ICRA 2007. See
     `Camera` for shapes, conventions and errors.
     """

@@ -52,8 +52,7 @@ class Splined(Camera):
 
     Distortion: x0_0 y0_0 x1_0 y1_0 ..., du of the control points in units of the focal length, row by row: xi_j and
     yi_j of column i and row j. Intrinsics could also do the surface's scales and shifts, so fits hold them.
-    Sources: mrcal.c, and https://mrcal.secretsauce.net/splined-models.html. See `Camera` for shapes, conventions and
-    errors.
+    Sources: mrcal.c, and https://mrcal.secretsauce.net/splined-models.html. See `Camera` for conventions and errors.
     """
 
     key = "splined"
@@ -66,7 +65,7 @@ class Splined(Camera):
     @classmethod
     @hinting("Call ct.Splined.with_grid(columns=16, rows=11, fov_x=120), mrcal's Nx, Ny and fov_x_deg")
     def with_grid(cls, *, columns: int, rows: int, fov_x: float, order: int = 3) -> type[Splined]:
-        """Return the class of cameras of another grid: a model for `convert`, `calibrate` and files as any other.
+        """Return the class of cameras of another grid: a model for `convert`, `calibrate` and files like any other.
 
         Args:
             columns: Control points across, more than the order, up to 999.

@@ -18,8 +18,7 @@ class WoodScape(FTheta):
     The files give rho = k1 theta + k2 theta^2 + k3 theta^3 + k4 theta^4 in pixels: see `from_woodscape`.
 
     Distortion: k2 k3 k4, each that of the file divided by its k1. Source: Yogamani et al., "WoodScape: a multi-task,
-    multi-camera fisheye dataset for autonomous driving", ICCV 2019, and its `projection.py`. See `Camera` for shapes,
-    conventions and errors.
+    multi-camera fisheye dataset for autonomous driving", ICCV 2019, and its `projection.py`. See `Camera`.
     """
 
     key = "woodscape"

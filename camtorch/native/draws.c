@@ -103,11 +103,11 @@ static int64_t outline(const Draws *d, int64_t c, const double *f, const void *i
 /* What is to be known of a new lens, or its limits alone */
 static void ask(const Draws *d, Cameras *lens, const double *parameters, int limits) {
     Domain asked = d->domain;
-    if (!lens->inner2) return; /* it has no stages */
+    if (!lens->safe_radius_sq) return; /* it has no stages */
     asked.cameras = 1, asked.parameters = parameters;
-    asked.circle2 = (void *)lens->circle2, asked.stagewise = (uint8_t *)lens->stagewise;
+    asked.image_circle_sq = (void *)lens->image_circle_sq, asked.stagewise = (uint8_t *)lens->stagewise;
     if (limits) asked.limits2 = (void *)lens->limits2, asked.extent = (void *)lens->extent;
-    else asked.inner2 = (void *)lens->inner2, asked.usual2 = (void *)lens->usual2, asked.table = (void *)lens->table;
+    else asked.safe_radius_sq = (void *)lens->safe_radius_sq, asked.image_radius_sq = (void *)lens->image_radius_sq, asked.table = (void *)lens->table;
     THIS(domain)(&asked);
 }
 
@@ -277,9 +277,9 @@ static void divide(Draws *d) {
     TAKE(d->distortion, d->count);
     if (!d->places) return;
     TAKE_KNOWN(parameters, d->made.parameter_count);
-    TAKE_KNOWN(inner2, 1);
-    TAKE_KNOWN(usual2, 1);
-    TAKE_KNOWN(circle2, 1);
+    TAKE_KNOWN(safe_radius_sq, 1);
+    TAKE_KNOWN(image_radius_sq, 1);
+    TAKE_KNOWN(image_circle_sq, 1);
     TAKE_KNOWN(stagewise, 1);
     TAKE_KNOWN(table, 2 + 2 * NODES);
 #undef TAKE

@@ -53,11 +53,11 @@ typedef struct {
        AZIMUTHS) and where it sends azimuths (c, EXTENT), or NULL: not yet known; tables of the inverse
        (c, 2 + 2 NODES), or NULL; whether it goes stage by stage (c), or NULL: none; the squared radius (c) of the circle
        that its image lies in then */
-    const void *inner2, *usual2, *limits2, *extent, *table;
+    const void *safe_radius_sq, *image_radius_sq, *limits2, *extent, *table;
     const uint8_t *stagewise;
-    const void *circle2;
+    const void *image_circle_sq;
     /* of an inverted chart: the squared radius and the squared angle of its fold, the table of its inverse */
-    const void *chart_inner2, *chart_most2, *chart_table;
+    const void *chart_safe_radius_sq, *chart_most2, *chart_table;
 } Cameras;
 
 /* One of several cameras, or the one for all */
@@ -70,13 +70,13 @@ static inline Cameras only(const Cameras *all, int64_t at) {
     MOVED(intrinsics, 4);
     MOVED(parameters, all->parameter_count);
     MOVED(constants, all->constant_count);
-    MOVED(inner2, 1);
-    MOVED(usual2, 1);
+    MOVED(safe_radius_sq, 1);
+    MOVED(image_radius_sq, 1);
     MOVED(limits2, AZIMUTHS);
     MOVED(extent, EXTENT);
     MOVED(table, 2 + 2 * NODES);
-    MOVED(circle2, 1);
-    MOVED(chart_inner2, 1);
+    MOVED(image_circle_sq, 1);
+    MOVED(chart_safe_radius_sq, 1);
     MOVED(chart_most2, 1);
     MOVED(chart_table, 2 + 2 * NODES);
 #undef MOVED
@@ -100,9 +100,9 @@ typedef struct {
     double most;                     /* the largest image that is a number to calculate with */
     const double *radii;             /* (MOST_RADII): from the centre to the end of the chart */
     const double *coarse, *even;     /* (RADII / 2), (RADII): the same, of `limits2` and `extent` */
-    void *inner2, *usual2, *circle2, *table; /* (c), (c), (c), (c, 2 + 2 NODES); see `Cameras` */
+    void *safe_radius_sq, *image_radius_sq, *image_circle_sq, *table; /* (c), (c), (c), (c, 2 + 2 NODES); see `Cameras` */
     void *limits2, *extent;                  /* (c, AZIMUTHS), (c, EXTENT): both or none */
-    uint8_t *stagewise;                      /* (c); with circle2 */
+    uint8_t *stagewise;                      /* (c); with image_circle_sq */
 } Domain;
 
 enum { PROJECT, UNPROJECT, PROJECT_VJP, UNPROJECT_VJP };

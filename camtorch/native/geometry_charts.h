@@ -35,9 +35,9 @@ typedef struct {
     const R *numbers[MOST_PARTS], *constants; /* those of the parts */
     T(Factor) factors[MOST_PARTS];
     T(Plane) planes[MOST_PARTS];
-    R fx, fy, cx, cy, inner2, usual2, circle2;
+    R fx, fy, cx, cy, safe_radius_sq, image_radius_sq, image_circle_sq;
     const R *limits2, *extent, *table;
-    R chart_inner2, chart_most2;
+    R chart_safe_radius_sq, chart_most2;
     const R *chart_table;
     T(Chart) chart;
 } T(Camera);

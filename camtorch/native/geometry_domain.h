@@ -326,7 +326,7 @@ static double first_loss(int n, const double *orientation, const uint8_t *spared
 /* -- cameras */
 
 /* The squared radius of a circle of the image beyond which there is nothing, infinite where that is not known */
-static double circle2_of(const Lens *lens, double edge) {
+static double image_circle_sq_of(const Lens *lens, double edge) {
     double radius[STEPS], least[STEPS], change = 0, certain = INFINITY, furthest = 0;
     for (int i = 0; i < STEPS; i++) radius[i] = edge * (WIDER * i / (STEPS - 1));
     bound_lens(lens, 2, STEPS, radius, least);
@@ -371,16 +371,16 @@ void THIS(domain)(const Domain *d) {
         double fold = 0, table[2 + 2 * NODES];
         const int has_factor = lens.part->factor != NO_FACTOR;
         int goes_by_stages = 0;
-        if (has_factor && (d->inner2 || d->limits2 || d->table)) fold = fold_of(&lens, d->folds ? d->folds[c] : NAN, end, d->most);
-        if (d->circle2) {
+        if (has_factor && (d->safe_radius_sq || d->limits2 || d->table)) fold = fold_of(&lens, d->folds ? d->folds[c] : NAN, end, d->most);
+        if (d->image_circle_sq) {
             double value, square = fold * fold;
             factors(&lens, 1, &square, &value, NULL);
-            const double circle2 = circle2_of(&lens, fold * value);
-            goes_by_stages = circle2 < INFINITY;
+            const double image_circle_sq = image_circle_sq_of(&lens, fold * value);
+            goes_by_stages = image_circle_sq < INFINITY;
             d->stagewise[c] = (uint8_t)goes_by_stages;
-            put(d->circle2, c, circle2, is_double);
+            put(d->image_circle_sq, c, image_circle_sq, is_double);
         }
-        if (d->inner2) {
+        if (d->safe_radius_sq) {
             double inner = fold;
             if (!d->is_chart && !d->is_radial && !goes_by_stages) {
                 double radius[MOST_RADII], least[MOST_RADII];
@@ -390,9 +390,9 @@ void THIS(domain)(const Domain *d) {
                 node = node > 0 ? node < MOST_RADII - 1 ? node : MOST_RADII - 1 : 0;
                 inner = d->radii[(int)node];
             }
-            const double inner2 = within(inner, end, is_double), usual2 = usual_end * usual_end;
-            put(d->inner2, c, inner2, is_double);
-            if (d->usual2) put(d->usual2, c, inner2 < usual2 ? inner2 : usual2, is_double);
+            const double safe_radius_sq = within(inner, end, is_double), image_radius_sq = usual_end * usual_end;
+            put(d->safe_radius_sq, c, safe_radius_sq, is_double);
+            if (d->image_radius_sq) put(d->image_radius_sq, c, safe_radius_sq < image_radius_sq ? safe_radius_sq : image_radius_sq, is_double);
         }
         if (d->limits2 && goes_by_stages) follow_nothing(d, c);
         else if (d->limits2) {

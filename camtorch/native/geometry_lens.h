@@ -487,8 +487,8 @@ static void T(solve)(const T(Factor) *of, const R *table, int n, const R *restri
 }
 
 /* The same of few points in a bracket up to the fold: Newton's steps, and every other one halves the bracket */
-static void T(bracketed)(const T(Factor) *of, R inner2, int n, const R *restrict r2, R *restrict scale) {
-    const R end = T(root)(inner2);
+static void T(bracketed)(const T(Factor) *of, R safe_radius_sq, int n, const R *restrict r2, R *restrict scale) {
+    const R end = T(root)(safe_radius_sq);
     ALIGNED R rho[BLOCK], low[BLOCK], high[BLOCK], wanted[BLOCK], width[BLOCK], t[BLOCK], factor[BLOCK], slope[BLOCK];
     ALIGNED I moves[BLOCK];
     EACH(i) {
@@ -527,7 +527,7 @@ static void T(chart_inverse)(const T(Camera) *c, int n, R *restrict theta2, R *r
         ALIGNED R some[BLOCK], made[BLOCK];
         const int filled = (count + LANES - 1) & -LANES;
         for (int i = 0; i < filled; i++) some[i] = theta2[places[i]];
-        T(bracketed)(c->factors, c->chart_inner2, filled, some, made);
+        T(bracketed)(c->factors, c->chart_safe_radius_sq, filled, some, made);
         for (int i = 0; i < count; i++) found[places[i]] = made[i];
     }
 }

@@ -19,7 +19,7 @@ static void T(prepare)(const Cameras *all, int64_t camera, T(Camera) *c) {
     c->constants = (const R *)all->constants + camera * all->constant_count;
     c->fx = intrinsics[0], c->fy = intrinsics[1], c->cx = intrinsics[2], c->cy = intrinsics[3];
     c->usable = !all->usable || all->usable[camera];
-    c->inner2 = c->usable ? INFINITY : -1;
+    c->safe_radius_sq = c->usable ? INFINITY : -1;
     c->swapped = c->parts->flags & TRANSVERSE && c->parts->kind >= CYLINDER;
     for (int j = 0; j <= c->stages; j++) T(prepare_stage)(c, j), c->ends |= c->parts[j].kind == SURFACE;
     if (c->stages) {
@@ -27,16 +27,16 @@ static void T(prepare)(const Cameras *all, int64_t camera, T(Camera) *c) {
         c->is_radial = c->stages == 1 && first->kind == PLANAR && !first->flags;
         c->by_stages = all->stagewise && all->stagewise[camera];
         c->follows = !c->is_radial && !c->by_stages;
-        c->inner2 = c->usable ? ((const R *)all->inner2)[camera] : -1;
-        c->usual2 = all->usual2 ? ((const R *)all->usual2)[camera] : c->inner2;
-        c->circle2 = all->circle2 ? ((const R *)all->circle2)[camera] : 0;
+        c->safe_radius_sq = c->usable ? ((const R *)all->safe_radius_sq)[camera] : -1;
+        c->image_radius_sq = all->image_radius_sq ? ((const R *)all->image_radius_sq)[camera] : c->safe_radius_sq;
+        c->image_circle_sq = all->image_circle_sq ? ((const R *)all->image_circle_sq)[camera] : 0;
         c->limits2 = all->limits2 ? (const R *)all->limits2 + camera * AZIMUTHS : NULL;
         c->extent = all->extent ? (const R *)all->extent + camera * EXTENT : NULL;
         c->waits = c->follows && !c->extent;
         c->table = all->table ? (const R *)all->table + camera * (2 + 2 * NODES) : NULL;
     }
     if (c->parts->kind == INVERTED) {
-        c->chart_inner2 = ((const R *)all->chart_inner2)[camera];
+        c->chart_safe_radius_sq = ((const R *)all->chart_safe_radius_sq)[camera];
         c->chart_most2 = ((const R *)all->chart_most2)[camera];
         c->chart_table = (const R *)all->chart_table + camera * (2 + 2 * NODES);
     }
@@ -115,7 +115,7 @@ typedef struct {
     ALIGNED I ok[BLOCK];
 } T(Seen);
 
-/* Of points beyond `inner2`, `ok` where the lens is regular all the way from the centre. How many of those that count
+/* Of points beyond `safe_radius_sq`, `ok` where the lens is regular all the way from the centre. How many of those that count
    wait for limits */
 static int T(beyond)(const T(Camera) *c, int count, int n, T(Seen) *s) {
     ALIGNED R a[BLOCK], b[BLOCK], u[BLOCK], v[BLOCK], least[BLOCK];
@@ -156,7 +156,7 @@ INLINE R T(step)(R ua, R ub, R va, R vb, R du, R dv, R *da, R *db) {
 
    Rays are points times `shrink`, a power of two, with their largest component from 1 to 2. No ray are those that are
    not finite, and the origin, next to which a derivative would leave the range of numbers. */
-INLINE void T(see_by)(const T(Camera) *c, const int way, const int keeps, R inner2, int n, R *restrict x, R *restrict y,
+INLINE void T(to_plane_by_way)(const T(Camera) *c, const int way, const int keeps, R safe_radius_sq, int n, R *restrict x, R *restrict y,
                       R *restrict z, R *restrict shrink, R *restrict scale, R *restrict a, R *restrict b, I *restrict ok) {
     const T(Chart) k = c->chart;
     EACH(i) {
@@ -165,7 +165,7 @@ INLINE void T(see_by)(const T(Camera) *c, const int way, const int keeps, R inne
         R u, v, by;
         I is_seen;
         T(to_plane)(k, way, p, q, r, &u, &v, &by, &is_seen);
-        is_seen &= (size > FLOOR) & (p * p + q * q + r * r < 16) & (inner2 - (u * u + v * v) > 0);
+        is_seen &= (size > FLOOR) & (p * p + q * q + r * r < 16) & (safe_radius_sq - (u * u + v * v) > 0);
         a[i] = is_seen ? u : 0, b[i] = is_seen ? v : 0, ok[i] = is_seen;
         if (keeps) {
             shrink[i] = factor, scale[i] = is_seen ? by : 1;
@@ -174,15 +174,15 @@ INLINE void T(see_by)(const T(Camera) *c, const int way, const int keeps, R inne
     }
 }
 
-static NOT_INLINE void T(see_all)(const T(Camera) *c, int keeps, R inner2, int n, R *restrict x, R *restrict y,
+static NOT_INLINE void T(to_plane_all)(const T(Camera) *c, int keeps, R safe_radius_sq, int n, R *restrict x, R *restrict y,
                                   R *restrict z, R *restrict shrink, R *restrict scale, R *restrict a, R *restrict b,
                                   I *restrict ok) {
-    if (keeps) EACH_WAY(c->way, T(see_by)(c, way, 1, inner2, n, x, y, z, shrink, scale, a, b, ok))
-    else EACH_WAY(c->way, T(see_by)(c, way, 0, inner2, n, x, y, z, shrink, scale, a, b, ok))
+    if (keeps) EACH_WAY(c->way, T(to_plane_by_way)(c, way, 1, safe_radius_sq, n, x, y, z, shrink, scale, a, b, ok))
+    else EACH_WAY(c->way, T(to_plane_by_way)(c, way, 0, safe_radius_sq, n, x, y, z, shrink, scale, a, b, ok))
 }
 
 /* An inverted chart's angles to radii */
-static void T(see_inverted)(const T(Camera) *c, int keeps, int n, T(Seen) *s) {
+static void T(to_plane_inverted)(const T(Camera) *c, int keeps, int n, T(Seen) *s) {
     const R most2 = c->chart_most2, before = most2 * (1 - 32 * EPS);
     ALIGNED R found[BLOCK], theta2[BLOCK];
     EACH(i) {
@@ -196,17 +196,17 @@ static void T(see_inverted)(const T(Camera) *c, int keeps, int n, T(Seen) *s) {
 }
 
 /* Where points are seen on the chart's plane in the lens's domain, the centre elsewhere. How many wait for limits */
-static int T(see)(const T(Camera) *c, int keeps, int count, int n, T(Seen) *s) {
+static int T(to_plane_block)(const T(Camera) *c, int keeps, int count, int n, T(Seen) *s) {
     const int swapped = c->swapped, later = c->way == INVERTED || c->follows;
-    const R inner2 = c->inner2;
+    const R safe_radius_sq = c->safe_radius_sq;
     I outside = 0;
     int waiting = 0;
-    T(see_all)(c, keeps, later ? c->usable ? INFINITY : -1 : inner2, n, swapped ? s->y : s->x, swapped ? s->x : s->y,
+    T(to_plane_all)(c, keeps, later ? c->usable ? INFINITY : -1 : safe_radius_sq, n, swapped ? s->y : s->x, swapped ? s->x : s->y,
                s->z, s->shrink, s->scale, swapped ? s->b : s->a, swapped ? s->a : s->b, s->ok);
     if (!later) return 0;
-    if (c->way == INVERTED) T(see_inverted)(c, keeps, n, s);
+    if (c->way == INVERTED) T(to_plane_inverted)(c, keeps, n, s);
     EACH(i) {
-        s->ok[i] += s->ok[i] & !(inner2 - (s->a[i] * s->a[i] + s->b[i] * s->b[i]) > 0); /* 2: beyond */
+        s->ok[i] += s->ok[i] & !(safe_radius_sq - (s->a[i] * s->a[i] + s->b[i] * s->b[i]) > 0); /* 2: beyond */
         outside |= s->ok[i];
     }
     if (!(outside & 2) && c->way != INVERTED) return 0;
@@ -225,7 +225,7 @@ static int T(see)(const T(Camera) *c, int keeps, int count, int n, T(Seen) *s) {
 
 /* Points `s` to pixels, -1 where they are not `ok`. How many wait for limits */
 static int T(pixels_of)(const T(Camera) *c, int count, int n, T(Seen) *s, R *restrict u, R *restrict v) {
-    const int waiting = T(see)(c, 0, count, n, s);
+    const int waiting = T(to_plane_block)(c, 0, count, n, s);
     const R fx = c->fx, fy = c->fy, cx = c->cx, cy = c->cy;
     if (c->is_radial) { /* most often */
         EACH(i) s->x[i] = s->a[i] * s->a[i] + s->b[i] * s->b[i];
@@ -257,7 +257,7 @@ static int T(project)(const T(Camera) *c, const Rows *rows, int64_t camera, int6
     return waiting;
 }
 
-static NOT_INLINE void T(unsee)(const T(Camera) *c, int n, const R *restrict x, const R *restrict y,
+static NOT_INLINE void T(to_plane_block_vjp)(const T(Camera) *c, int n, const R *restrict x, const R *restrict y,
                                 const R *restrict z, const R *restrict shrink, const R *restrict scale,
                                 const R *restrict by_angle, const R *restrict ga, const R *restrict gb, R *restrict gx,
                                 R *restrict gy, R *restrict gz) {
@@ -279,7 +279,7 @@ static void T(project_vjp)(const T(Camera) *c, const Rows *rows, int64_t camera,
     T(Seen) s;
     ALIGNED R gu[BLOCK], gv[BLOCK], gx[BLOCK], gy[BLOCK], gz[BLOCK], by_angle[BLOCK];
     T(load_points)(points, from, count, n, s.x, s.y, s.z);
-    T(see)(c, 1, count, n, &s);
+    T(to_plane_block)(c, 1, count, n, &s);
     const R *to_u = T(load)(cotangents, by[1], count, n, gx, 0);
     const R *to_v = T(load)(cotangents + by[2], by[1], count, n, gy, 0);
     EACH(i) {
@@ -302,7 +302,7 @@ static void T(project_vjp)(const T(Camera) *c, const Rows *rows, int64_t camera,
     if (sums) T(to_plane_sums)(c, n, s.x, s.y, s.z, s.scale, by_angle, gu, gv, sums);
     if (!rows->results) return;
     const int swapped = c->swapped;
-    T(unsee)(c, n, swapped ? s.y : s.x, swapped ? s.x : s.y, s.z, s.shrink, s.scale, by_angle, swapped ? gv : gu,
+    T(to_plane_block_vjp)(c, n, swapped ? s.y : s.x, swapped ? s.x : s.y, s.z, s.shrink, s.scale, by_angle, swapped ? gv : gu,
              swapped ? gu : gv, swapped ? gy : gx, swapped ? gx : gy, gz);
     T(store)((R *)rows->results + camera * to[0] + first * to[1], to, 3, count, gx, gy, gz);
 }
@@ -375,11 +375,11 @@ static NOT_INLINE void T(cover_of)(const T(Camera) *c, int n, R *restrict a, R *
 
 /* Of points of the plane of an inverted chart that are `ok`, those whose ray it covers for certain; the centre elsewhere */
 static void T(cover_inverted)(const T(Camera) *c, int n, R *restrict a, R *restrict b, I *restrict ok) {
-    const R inner2 = c->chart_inner2 * (1 - 64 * EPS), limit = c->chart_most2 * (1 - 128 * EPS);
+    const R safe_radius_sq = c->chart_safe_radius_sq * (1 - 64 * EPS), limit = c->chart_most2 * (1 - 128 * EPS);
     const R before = limit < (R)(PI * PI) ? limit : (R)(PI * PI);
     ALIGNED R p[BLOCK], q[BLOCK], factor[BLOCK];
     EACH(i) {
-        ok[i] &= inner2 - (a[i] * a[i] + b[i] * b[i]) > 0;
+        ok[i] &= safe_radius_sq - (a[i] * a[i] + b[i] * b[i]) > 0;
         a[i] = ok[i] ? a[i] : 0, b[i] = ok[i] ? b[i] : 0;
     }
     T(angles)(c, n, a, b, p, q, factor, NULL);
@@ -503,7 +503,7 @@ static void T(invert_radial)(const T(Camera) *c, int n, const R *restrict p, con
     }
     T(solve)(c->factors + 1, c->table, n, r2, scale, ok);
     /* a ray's rounding must not carry it across the fold */
-    const R inside2 = c->inner2 * (1 - 32 * EPS);
+    const R inside2 = c->safe_radius_sq * (1 - 32 * EPS);
     EACH(i) {
         a[i] = p[i] * scale[i], b[i] = q[i] * scale[i];
         ok[i] &= possible[i] & (inside2 - r2[i] * scale[i] * scale[i] > 0);
@@ -526,9 +526,9 @@ static void T(invert)(const T(Camera) *c, int n, const R *restrict u, const R *r
     } else if (c->by_stages) {
         ALIGNED R x[BLOCK], y[BLOCK];
         ALIGNED I known[BLOCK], within[BLOCK];
-        const R circle2 = c->circle2;
+        const R image_circle_sq = c->image_circle_sq;
         EACH(i) {
-            within[i] = circle2 - (u[i] * u[i] + v[i] * v[i]) > 0;
+            within[i] = image_circle_sq - (u[i] * u[i] + v[i] * v[i]) > 0;
             x[i] = within[i] ? u[i] : 0, y[i] = within[i] ? v[i] : 0;
         }
         T(start)(c, 2, n, x, y, p, q);
@@ -540,7 +540,7 @@ static void T(invert)(const T(Camera) *c, int n, const R *restrict u, const R *r
         }
     } else {
         const int has_table = c->table != NULL;
-        const R usual2 = c->usual2 * (1 - 32 * EPS), further = 1 + 32 * EPS;
+        const R image_radius_sq = c->image_radius_sq * (1 - 32 * EPS), further = 1 + 32 * EPS;
         T(start)(c, has_table ? 2 : 1, n, u, v, a, b);
         if (has_table) {
             ALIGNED R r2[BLOCK], scale[BLOCK];
@@ -551,7 +551,7 @@ static void T(invert)(const T(Camera) *c, int n, const R *restrict u, const R *r
         T(newton)(c, 1, n, u, v, a, b, ok, fewest);
         I outside = 0;
         EACH(i) possible[i] = ok[i]; /* converged, somewhere */
-        EACH(i) ok[i] &= usual2 - (a[i] * a[i] + b[i] * b[i]) > 0;
+        EACH(i) ok[i] &= image_radius_sq - (a[i] * a[i] + b[i] * b[i]) > 0;
         EACH(i) outside |= possible[i] & !ok[i];
         if (outside && c->ends && c->limits2) { /* no circle: much of an image lies beyond any within its edge */
             ALIGNED R x[BLOCK], y[BLOCK], least[BLOCK];

@@ -3,8 +3,8 @@
 /* Which points lie in the domain: before the fold, or before the limit of their azimuth and regular */
 static void T(contained)(const T(Camera) *c, int n, const R *restrict a, const R *restrict b, const R *restrict least,
                          I *restrict ok) {
-    const R inner2 = c->inner2;
-    EACH(i) ok[i] = inner2 - (a[i] * a[i] + b[i] * b[i]) > 0;
+    const R safe_radius_sq = c->safe_radius_sq;
+    EACH(i) ok[i] = safe_radius_sq - (a[i] * a[i] + b[i] * b[i]) > 0;
     if (!c->follows) return;
     for (int i = 0; i < n; i++)
         if (!ok[i] && least[i] > TINY) ok[i] = c->limits2[T(azimuth)(a[i], b[i], 0)] - (a[i] * a[i] + b[i] * b[i]) > 0;
@@ -97,7 +97,7 @@ static void T(damped)(const T(Camera) *c, int n, const R *restrict u, const R *r
 /* Where the first stage sends points in a bracket up to its fold; `ok` where it can */
 static void T(by_radius)(const T(Camera) *c, int n, const R *restrict u, const R *restrict v, R *restrict a,
                          R *restrict b, I *restrict ok) {
-    const R fold2 = c->inner2 * (1 - 64 * EPS), most2 = c->table[1] * (1 + 64 * EPS);
+    const R fold2 = c->safe_radius_sq * (1 - 64 * EPS), most2 = c->table[1] * (1 + 64 * EPS);
     ALIGNED R p[BLOCK], q[BLOCK], r2[BLOCK], scale[BLOCK], x[BLOCK], y[BLOCK];
     T(Jacobian) to;
     EACH(i) p[i] = u[i], q[i] = v[i], ok[i] = 1;
@@ -112,7 +112,7 @@ static void T(by_radius)(const T(Camera) *c, int n, const R *restrict u, const R
             }
         }
         EACH(i) {
-            ok[i] = (u[i] * u[i] + v[i] * v[i] <= c->circle2) & (p[i] * p[i] + q[i] * q[i] <= most2);
+            ok[i] = (u[i] * u[i] + v[i] * v[i] <= c->image_circle_sq) & (p[i] * p[i] + q[i] * q[i] <= most2);
             p[i] = ok[i] ? p[i] : 0, q[i] = ok[i] ? q[i] : 0;
         }
     }
@@ -151,7 +151,7 @@ static void T(search)(const T(Camera) *c, int n, const R *restrict u, const R *r
     }
     /* next to a fold the polished solution may lie on its other side: what counts is where its ray is seen */
     T(rays)(c, n, a, b, ok, s.x, s.y, s.z);
-    T(see)(c, 0, n, n, &s);
+    T(to_plane_block)(c, 0, n, n, &s);
     EACH(i) ok[i] &= s.ok[i] == 1;
     if (c->follows) { /* away from it, where another processor's rounding would carry the ray across */
         EACH(i) p[i] = s.a[i] * (1 + 32 * EPS), q[i] = s.b[i] * (1 + 32 * EPS);

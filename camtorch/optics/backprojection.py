@@ -68,8 +68,8 @@ class Inverted(Chart):
 
     def on_plane(self, a: Tensor, b: Tensor) -> Tensor:
         t = torch.addcmul(a * a, b, b)
-        inside = times(self._inverse.inner2, 1 - 64 * torch.finfo(a.dtype).eps) - t
-        t = torch.minimum(t, self._inverse.inner2)
+        inside = times(self._inverse.safe_radius_sq, 1 - 64 * torch.finfo(a.dtype).eps) - t
+        t = torch.minimum(t, self._inverse.safe_radius_sq)
         theta2 = t * self._inverse.radial(t) ** 2
         # where theta stops ascending its rounding is that of many radii; so further away from there than in `margin`
         before = times(self._inverse.most2, 1 - 128 * torch.finfo(a.dtype).eps)
@@ -84,11 +84,11 @@ class Inverted(Chart):
 
     def end(self, dtype: torch.dtype) -> float | Tensor:
         inverse = self._inverse
-        last = inverse.inner2.sqrt()
         # beyond half a turn a ray is seen from the other side
         most2 = (math.pi * (1 - 32 * torch.finfo(dtype).eps)) ** 2
         turned = math.pi * inverse(inverse.most2.clamp(max=most2))
-        return torch.where(inverse.inner2 * inverse.radial(inverse.inner2) ** 2 > most2, turned, last).to(dtype)
+        t = inverse.safe_radius_sq
+        return torch.where(t * inverse.radial(t) ** 2 > most2, turned, t.sqrt()).to(dtype)
 
     def radii(self, count: int, like: Tensor) -> Tensor:
         return even_steps_and_ratios(count, FURTHEST, FURTHEST, like, torch.positive)

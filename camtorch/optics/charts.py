@@ -107,8 +107,7 @@ def even_steps_and_ratios(
 class Perspective(Chart):
     """(x/z, y/z): covers rays in front of the camera.
 
-    Rays within `1 / end` of 90 degrees are left out: there the ninth power of the radius, which distortion polynomials
-    reach, leaves the floating-point range.
+    Rays within `1 / end` of 90 degrees are left out: the ninth power of the radius, as in distortions, overflows there.
     """
 
     code: ClassVar[int | None] = 0

@@ -322,8 +322,7 @@ class Tilt(Homography):
     """The homography of a sensor tilted by (tau_x, tau_y) radians.
 
     Source: OpenCV `computeTiltProjectionMatrix`: the plane point is turned by R = R_y(tau_y) R_x(tau_x) and projected
-    back along the optical axis, [[R22, 0, -R02], [0, R22, -R12], [0, 0, 1]] R. It fixes the origin; OpenCV's R_x, R_y
-    turn clockwise.
+    back along the optical axis, [[R22, 0, -R02], [0, R22, -R12], [0, 0, 1]] R; OpenCV's R_x, R_y turn clockwise.
     """
 
     code: ClassVar[int | None] = 17

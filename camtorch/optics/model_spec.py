@@ -111,9 +111,8 @@ class ModelSpec:
         Args:
             names: The names of the n coefficients.
             angles: (C, K) radians from the axis, evenly from above 0 to the last one to fit.
-            radii: (C, K) the distance from the principal point at which the camera to fit sees them, in units of its
-                focal length at the axis and averaged over the azimuths; ascending. Beyond the camera's view the line
-                goes on straight.
+            radii: (C, K) the distance from the principal point at which the camera to fit sees them, in focal lengths
+                at the axis and averaged over the azimuths; ascending. Past the camera's view the line goes on straight.
 
         Returns:
             (S, C, n): S alternatives, of which the one that ends best is kept.

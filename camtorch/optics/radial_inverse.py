@@ -200,13 +200,13 @@ def solve(radial: RadialFactor, table: InverseTable, r2: Tensor) -> tuple[Tensor
     return scale, converged
 
 
-def bracketed(radial: RadialFactor, r2: Tensor, inner2: Tensor) -> Tensor:
+def bracketed(radial: RadialFactor, r2: Tensor, safe_radius_sq: Tensor) -> Tensor:
     """Return the factor of `solve` for single points (M,), each with its own coefficients and its own fold.
 
     Cauchy's method steps to the root of the local parabola: of third order at the fold too, where Newton's crawls.
     """
     eps = torch.finfo(r2.dtype).eps
-    wanted, high = r2.sqrt(), inner2.sqrt().expand_as(r2)
+    wanted, high = r2.sqrt(), safe_radius_sq.sqrt().expand_as(r2)
 
     def ahead_of(rho: Tensor, low: Tensor, high: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         t = rho * rho
@@ -234,14 +234,14 @@ def bracketed(radial: RadialFactor, r2: Tensor, inner2: Tensor) -> Tensor:
 
 
 class RadialInverse:
-    """The inverse of a factor, graph-free. inner2: the squared radius of its fold; most2: that of the fold's image."""
+    """The inverse of a factor, graph-free, up to the squared radii of its fold and of the fold's image, `most2`."""
 
     factor: type[RadialFactor]
     radial: RadialFactor
     end: float
     of_points: bool
     k: Tensor
-    inner2: Tensor
+    safe_radius_sq: Tensor
     most2: Tensor
 
     def __init__(self, factor: type[RadialFactor], parameters: Sequence[Tensor], end: float):
@@ -253,24 +253,24 @@ class RadialInverse:
         k, rows = self.k, None
         self._table: InverseTable | None = None
         if is_portable_export():
-            inner2, table = _made_tables(factor.name, k, end)
+            safe_radius_sq, table = _made_tables(factor.name, k, end)
             self._table = InverseTable(table, is_constant=True)
             most2 = self._table.most2
         else:
             if self.of_points and len(k) > 1:
                 k, rows = k.unique(dim=0, return_inverse=True)
-            _, inner2, most2 = _inverse_of(factor.name, k, end, k.new_empty(len(k), 0))
-        of_each = [w if rows is None else w[rows] for w in (inner2, most2)]
-        self.inner2, self.most2 = (w.reshape(parameters[0].shape).clone() for w in of_each)
+            _, safe_radius_sq, most2 = _inverse_of(factor.name, k, end, k.new_empty(len(k), 0))
+        of_each = [w if rows is None else w[rows] for w in (safe_radius_sq, most2)]
+        self.safe_radius_sq, self.most2 = (w.reshape(parameters[0].shape).clone() for w in of_each)
 
     def __call__(self, r2: Tensor) -> Tensor:
         """Return the factor by which it scales points of squared radius r2, (C, ...) or (M,), up to `most2`."""
         if self.of_points:
-            return bracketed(self.radial, r2, self.inner2)
+            return bracketed(self.radial, r2, self.safe_radius_sq)
         rows = r2.unsqueeze(-1).flatten(1)
         if self._table is not None:
-            inner2 = self.inner2.reshape(-1, 1)
-            return _scale(self.factor.name, self.k, inner2, self._table, rows).view_as(r2)
+            safe_radius_sq = self.safe_radius_sq.reshape(-1, 1)
+            return _scale(self.factor.name, self.k, safe_radius_sq, self._table, rows).view_as(r2)
         found = _inverse_of(self.factor.name, self.k, self.end, rows)[0]
         return found.view_as(r2)
 
@@ -286,24 +286,24 @@ def _made_tables(name: str, k: Tensor, end: float) -> tuple[Tensor, Tensor]:
     return within(fold.to(k.dtype)), tabulate(radial, fold, end).to(k.dtype)
 
 
-def _scale(name: str, k: Tensor, inner2: Tensor, table: InverseTable, r2: Tensor) -> Tensor:
+def _scale(name: str, k: Tensor, safe_radius_sq: Tensor, table: InverseTable, r2: Tensor) -> Tensor:
     """Return `solve` for coefficients (C, n) and squared radii (C, N), and `bracketed` if Newton's method fails."""
     scale, converged = solve(CLASSES[name](columns(k)), table, r2)
     camera, point = (~(converged > 0)).nonzero(as_tuple=True)
     if table.is_constant or len(camera):
         radial = CLASSES[name](of_points(k, camera))
-        found = bracketed(radial, r2[camera, point], inner2[camera, 0])
+        found = bracketed(radial, r2[camera, point], safe_radius_sq[camera, 0])
         scale = scale.index_put((camera, point), found)
     return scale
 
 
 def _found_inverse(name: str, k: Tensor, end: float, r2: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the factors for coefficients (C, n) and squared radii (C, N), and `RadialInverse.inner2` and `most2`."""
-    inner2, table = _tables((k,), (name, end), lambda: _made_tables(name, k.detach(), end))
+    """Return the factors for coefficients (C, n) and squared radii (C, N), and two tensors of `RadialInverse`."""
+    safe_radius_sq, table = _tables((k,), (name, end), lambda: _made_tables(name, k.detach(), end))
     inverse = InverseTable(table)
-    scale = _scale(name, k, inner2, inverse, r2) if r2.numel() else torch.empty_like(r2)
+    scale = _scale(name, k, safe_radius_sq, inverse, r2) if r2.numel() else torch.empty_like(r2)
     # clones, as the caller may write into them
-    return scale, inner2.clone(), inverse.most2.clone()
+    return scale, safe_radius_sq.clone(), inverse.most2.clone()
 
 
 _radial_inverse = torch.library.custom_op("camtorch::radial_inverse", _found_inverse, mutates_args=())
@@ -326,7 +326,7 @@ def _(info: Any, in_dims: tuple[Any, ...], name: str, k: Tensor, end: float, r2:
     r2 = r2.expand(info.batch_size, *r2.shape) if of_r2 is None else r2.movedim(of_r2, 0)
     if of_k is None:  # the mapped dim joins the points
         r2 = r2.movedim(0, 1)
-        found, inner2, most2 = _radial_inverse(name, k, end, r2.flatten(1))
-        return (found.unflatten(1, r2.shape[1:]), inner2, most2), (1, None, None)
+        found, safe_radius_sq, most2 = _radial_inverse(name, k, end, r2.flatten(1))
+        return (found.unflatten(1, r2.shape[1:]), safe_radius_sq, most2), (1, None, None)
     results = _radial_inverse(name, k.movedim(of_k, 0).flatten(0, 1), end, r2.flatten(0, 1))
     return tuple(r.unflatten(0, r2.shape[:2]) for r in results), (0, 0, 0)

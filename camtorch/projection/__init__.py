@@ -1,1 +1,1 @@
-"""How every camera is evaluated: both directions, their derivatives, and where they are valid."""
+"""The evaluation of every camera: both directions, their derivatives, and where they are valid."""

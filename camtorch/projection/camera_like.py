@@ -1,4 +1,4 @@
-"""What the inside of camtorch may ask of a camera; `Camera` is one, and nothing below cameras/ imports it."""
+"""The protocol of a camera within camtorch; `Camera` is one, and no package below cameras/ imports it."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ class CameraLike(ModelSpec, BatchedModule):
     """A model with numbers: tensors, a size, a form, and both directions."""
 
     is_mixed: ClassVar[bool] = False
-    """Whether it is a batch of several models, which have no coefficients in common; see `Mixed`."""
+    """Whether it is a batch of several models, which do not share coefficients; see `Mixed`."""
     image_size: tuple[int, int] | None
     _memo: Kept
     _rays: Kept
@@ -47,10 +47,10 @@ class CameraLike(ModelSpec, BatchedModule):
 
     @property
     def _form(self) -> tuple[object, ...]:
-        """What else it is: cameras of one form and equal tensors are the same."""
+        """Everything but the tensors: cameras of one form and equal tensors are the same."""
         return type(self), self.image_size
 
     def _size_for(self, what: str) -> tuple[int, int]:
         if self.image_size is None:
-            raise ValueError(f"{type(self).__name__}: {what} needs the camera's image_size=(height, width)")
+            raise ValueError(f"{type(self).__name__}: image_size must be (height, width) for {what}; got None")
         return self.image_size

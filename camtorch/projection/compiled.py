@@ -33,7 +33,7 @@ _NO_ROWS = (0, 0, 0, 0)
 
 
 def project(native: Native, points: Tensor) -> tuple[Tensor, Tensor]:
-    """Points (C, N, 3) to pixels (2, C, N), and whether they are valid (C, N). Points may have any strides."""
+    """Return pixels (2, C, N) of points (C, N, 3) of any strides, and whether they are valid (C, N)."""
     cameras, count, _ = points.shape
     pixels = _empty((2, cameras, count), native.dtype)
     valid = torch.empty(cameras, count, dtype=torch.bool, device="cpu")
@@ -43,7 +43,7 @@ def project(native: Native, points: Tensor) -> tuple[Tensor, Tensor]:
 
 
 class Unprojected(NamedTuple):
-    """Unit rays (3, C, N), whether there is one (C, N), and points on the chart's plane (2, C, N), if asked for."""
+    """Unit rays (3, C, N), whether they exist (C, N), and points on the chart's plane (2, C, N), if needed."""
 
     rays: Tensor
     valid: Tensor
@@ -51,7 +51,7 @@ class Unprojected(NamedTuple):
 
 
 def unproject(native: Native, pixels: Tensor, keeps: bool = False) -> Unprojected:
-    """Pixels (C, N, 2) to rays. keeps: whether `unproject_vjp` is to follow."""
+    """Return rays of pixels (C, N, 2), and if `keeps`, also the results that `unproject_vjp` needs."""
     cameras, count, _ = pixels.shape
     rays = _empty((3, cameras, count), native.dtype)
     valid = torch.empty(cameras, count, dtype=torch.bool, device="cpu")
@@ -67,7 +67,7 @@ def project_vjp(
 ) -> tuple[Tensor | None, Tensor | None]:
     """Return the cotangents of points (C, N, 3), and of the cameras (C, 4 + n): intrinsics, `parameters` of the optics.
 
-    cotangents: of pixels, (2, C, N), of any strides.
+    `cotangents` are those of pixels, (2, C, N), of any strides.
     """
     cameras, count, _ = points.shape
     results = _empty((cameras, count, 3), native.dtype) if want_points else None
@@ -78,9 +78,9 @@ def project_vjp(
 
 
 def project_jacobians(native: Native, points: Tensor, by_camera: bool) -> tuple[Tensor, Tensor]:
-    """The derivatives of pixels by points (C, N, 3), and by the numbers of the cameras if asked for: see `project_vjp`.
+    """Return the derivatives of pixels by points, and, if `by_camera`, by the cameras' numbers: see `project_vjp`.
 
-    (C, N, 2, 3) and (C, N, 2, 4 + n or 0), zero where there is no pixel.
+    They are (C, N, 2, 3) and (C, N, 2, 4 + n or 0), zero if there is no pixel.
     """
     cameras, count, _ = points.shape
     by_points = torch.empty(2, cameras, count, 3, dtype=native.dtype, device="cpu")
@@ -95,7 +95,7 @@ def project_jacobians(native: Native, points: Tensor, by_camera: bool) -> tuple[
 def unproject_vjp(
     native: Native, valid: Tensor, solution: Tensor, cotangents: Tensor, want_pixels: bool, want_parameters: bool
 ) -> tuple[Tensor | None, Tensor | None]:
-    """Return the cotangents of pixels (C, N, 2), and of the cameras, of results of `unproject`; see `project_vjp`."""
+    """Return the cotangents of pixels (C, N, 2), and of the cameras, for results of `unproject`; see `project_vjp`."""
     cameras, count = valid.shape
     results = _empty((cameras, count, 2), native.dtype) if want_pixels else None
     sums = _sums(native, cameras, count) if want_parameters else None
@@ -108,12 +108,12 @@ class Lattices:
     """Lattices of cameras (C,), from probes (1, N, 2) at their nodes and at the rim: `Lattices` of geometry.h.
 
     See `warp.grid.on_lattice`. size: (h, w) of the target. tolerance: in pixels of the source, which has images of
-    `source_size`. given: both cameras and the turns, as of `Move`. room: makes memory of so many bytes. Images that are
+    `source_size`. given: both cameras and the turns, as in `Move`. room: returns memory of so many bytes. Images
     sampled in the same call find the lattices at `places`, the fields of `Job` of sampler.h.
     """
 
     nodes: Tensor
-    """(C, 2, N), of which the first (n + 5) (m + 5) are the nodes."""
+    """The nodes (C, 2, N): the first (n + 5) (m + 5) of them; the others are on the rim."""
     cells: Tensor
     """(C, n, m) int32."""
 
@@ -134,7 +134,7 @@ class Lattices:
         nodes, self._most = (n + 5) * (m + 5), cameras * n * m
         self.nodes = torch.empty(cameras, 2, count, dtype=dtype, device="cpu")
         self.cells = torch.empty(cameras, n, m, dtype=torch.int32, device="cpu")
-        # exact positions, of which parts are written; nodes in float32; scratch; what is mapped
+        # exact positions, of which parts are written; nodes in float32; scratch; valid flags of the probes
         sizes = 128 * self._most * dtype.itemsize, 8 * cameras * nodes * is_double, 4 * SCRATCH * cameras * (m + 8)
         self._room, self._probes, self.counters = room(sum(sizes) + cameras * count), probes, (c_int64 * 2)()
         exact, narrow, scratch, valid = accumulate(sizes, initial=self._room.data_ptr())
@@ -149,7 +149,7 @@ class Lattices:
         self.places = *in_float, cells, n * m, n, m, exact, 64 * self._most * (1 + is_double)
 
     def found(self) -> tuple[Tensor, Tensor, Tensor]:
-        """`nodes` (C, 2, n + 5, m + 5), `cells`, and `exact` (2, K, 8, 8), NaN where there is none."""
+        """Return `nodes` (C, 2, n + 5, m + 5), `cells`, and `exact` (2, K, 8, 8), NaN if there is no position."""
         (cameras, n, m), dtype, most = self.cells.shape, self.nodes.dtype, self._most
         nodes = self.nodes.as_strided((cameras, 2, n + 5, m + 5), (*self.nodes.stride()[:2], m + 5, 1))
         exact = self._room[: 128 * most * dtype.itemsize].view(dtype).view(2, most, 8, 8)
@@ -157,16 +157,16 @@ class Lattices:
 
 
 class Between:
-    """Cameras, and others that see their rays after a turn: pixels of the first as pixels of the others."""
+    """Cameras, and others that see their rays after a turn: maps pixels of the first to pixels of the others."""
 
     cameras: int
-    """Of each as many, or one for all."""
+    """The number of cameras of each, unless one serves all."""
     is_batch: bool
     """Whether pixels have a batch dim."""
     dtype: torch.dtype
 
     def __init__(self, start: Native, end: Native, turns: Tensor | None, size: tuple[int, int], is_batch: bool):
-        """turns: (3, 3) or (C, 3, 3), of their dtype. size: (height, width) of the others' image."""
+        """Prepare turns (3, 3) or (C, 3, 3), of the cameras' dtype, and the (height, width) of the others' image."""
         self._start, self._end, self._turns, self.is_batch = start, end, turns, is_batch
         self.dtype = start.dtype
         count, strides = (1, (0, 0)) if turns is None else (turns.numel() // 9, turns.stride())
@@ -177,10 +177,10 @@ class Between:
         self._given = start.pointer, end.pointer, address(turns), by_camera, *strides[-2:], self.cameras
 
     def rows(self, pixels: Tensor, form: int) -> tuple[Tensor, Tensor]:
-        """Pixels (C or 1, N, 2) to (C, N, 2), and valid (C, N).
+        """Return pixels (C, N, 2) of the others for pixels (C or 1, N, 2), and valid (C, N).
 
-        form: `POSITIONS` as of `grid_sample`, -9 where there is none; `PIXELS`, -1 where there is none; or `ON_IMAGE`,
-            the same, of which only those on the image are valid.
+        form: `POSITIONS` as in `grid_sample`, -9 if there is none; `PIXELS`, -1 if there is none; or `ON_IMAGE`, the
+            same, of which only those on the image are valid.
         """
         count = pixels.shape[1]
         result = torch.empty(self.cameras, count, 2, dtype=self._start.dtype, device="cpu")
@@ -194,13 +194,13 @@ class Between:
     def lattices(
         self, probes: Tensor, size: tuple[int, int], first_row: int, tolerance: float, padding: str
     ) -> tuple[Tensor, Tensor, Tensor] | None:
-        """Return what `Lattices` finds, None if most cells would have positions of their own."""
+        """Return the results of `Lattices`, or None if most cells would have positions of their own."""
         given = self._given[:-1]
         made = Lattices(probes, size, self._size, tolerance, padding, self.cameras, first_row, given, _kept_memory)
         return None if self._run("camtorch_lattices", made.words, self.cameras, made.counters) else made.found()
 
     def _run(self, name: str, call: object, tiles: int, counters: ctypes.Array[c_int64]) -> int:
-        """Flags of what is not made. counters: of the call, its next tile and the number of places."""
+        """Return flags of parts that are not made. `counters` are the call's next tile and the number of places."""
         threads = min(thread_count(), tiles) if tiles > 1 else 1
         return run_and_follow(entry(name, c_int64), call, threads, counters, self._start, self._end)
 
@@ -213,11 +213,11 @@ def run_and_follow(
     start: Native,
     end: Native,
 ) -> int:
-    """Return flags of what a call leaves undone, other than to follow azimuths of the cameras: then it is repeated."""
+    """Return flags of the parts that a call leaves undone; if azimuths must be followed first, it is repeated."""
     while True:
         left: list[int] = []
         counters[:] = [0, 0]
-        spread(lambda: left.append(run(call)), threads)  # noqa: B023 (which is called at once)
+        spread(lambda: left.append(run(call)), threads)  # noqa: B023 (called at once)
         flags = functools.reduce(operator.or_, left)
         if not flags & (LEFT_FROM | LEFT_TO):
             return flags
@@ -237,7 +237,7 @@ _MOST_KEPT = 1 << 22  # bytes
 
 
 def _kept_memory(count: int) -> Tensor:
-    """At least so many bytes, for this call of this thread: the same memory as before, unless they are many."""
+    """Return at least so many bytes for a call of this thread: the same memory as before, unless they are many."""
     if count > _MOST_KEPT:
         return torch.empty(count, dtype=torch.uint8, device="cpu")
     if _kept.memory is None or _kept.memory.shape[0] < count:
@@ -247,13 +247,13 @@ def _kept_memory(count: int) -> Tensor:
 
 
 def rows_of(pixels: Tensor) -> tuple[int, int, int, int]:
-    """Where pixels (C or 1, N, 2) lie, and their strides."""
+    """Return the address of pixels (C or 1, N, 2), and their strides."""
     camera, point, component = pixels.stride()
     return pixels.data_ptr(), camera if pixels.shape[0] > 1 else 0, point, component
 
 
 def _empty(size: tuple[int, int, int], dtype: torch.dtype) -> Tensor:
-    # of large results the first write to each page would take longer than the geometry
+    # the first write to each page of a large result would take longer than the geometry
     if size[0] * size[1] * size[2] * dtype.itemsize >= memory.LEAST:
         return memory.empty(size, dtype, torch.contiguous_format)
     return torch.empty(size, dtype=dtype, device="cpu")
@@ -269,13 +269,13 @@ def _points(results: Tensor | None) -> tuple[int, ...]:
 
 
 def _cotangents(given: Tensor, cameras: int, count: int) -> tuple[int, int, int, int]:
-    assert given.shape[1:] == (cameras, count)  # else C would read elsewhere
+    assert given.shape[1:] == (cameras, count)  # C would read elsewhere otherwise
     component, camera, point = given.stride()
     return given.data_ptr(), camera, point, component
 
 
 def _call(native: Native, cameras: int, count: int, direction: int, rows: tuple[int, ...], tile: int = _TILE) -> int:
-    """rows: what of `Rows` is between its cameras and its count."""
+    """Call the compiled geometry with `rows`, the fields of `Rows` between its cameras and its count."""
     assert cameras == native.cameras
     run, points = entry("camtorch_geometry", c_int64), cameras * count
     if points < _SHARED:
@@ -288,7 +288,7 @@ def _call(native: Native, cameras: int, count: int, direction: int, rows: tuple[
 
 
 def _call_and_follow(native: Native, cameras: int, count: int, direction: int, rows: tuple[int, ...]) -> None:
-    """Call, and again with the limits of each azimuth if a point lies so far out that they decide."""
+    """Call the geometry, and again with the limits of each azimuth if a point lies so far out that they decide."""
     if _call(native, cameras, count, direction, rows):
         native.follow()
         _call(native, cameras, count, direction, rows)

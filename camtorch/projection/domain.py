@@ -1,4 +1,4 @@
-"""The domain of a lens: where it is one-to-one, and a table to start its inverse from. Made once per set of values."""
+"""The domain of a lens: where it is one-to-one, and a table to start its inverse from, made once for its values."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ if TYPE_CHECKING:
     from camtorch.optics.model_spec import Optics
 
 _RADII = 512
-_AT_ONCE = 6  # cameras whose azimuths are followed at a time
+_AT_ONCE = 6  # cameras whose azimuths are followed together
 _STEPS = 129
-# Stages after a radial one that change distances by less than a quarter, and so by less than that move what they are
-# given, are inverted by Newton's method from anywhere: a step comes nearer by a third at least
+# Stages after a radial one that change distances by less than a quarter, and so move points by less than that, are
+# inverted by Newton's method from anywhere: a step comes nearer by at least a third
 _LEAST_SLOPE, _WIDER = 0.75, 1.25
 
 
 def _per_camera(make: Callable[[Domain], Tensor]) -> cached_property[Tensor]:
-    """A table (C, ...) that is made when it is first asked for."""
+    """Return a property with a table (C, ...) that is made at its first use."""
 
     def table(self: Domain) -> Tensor:
-        # what inference mode makes could not be used in a graph later
+        # a graph could not use tensors of inference mode later
         with torch.inference_mode(False), torch.no_grad():
             return make(self)
 
@@ -45,8 +45,8 @@ class Domain:
     """The lenses of cameras (C,), graph-free, and their domains.
 
     A point (a, b) of the chart's plane is in the domain if its lens is regular all the way from the centre: up to the
-    fold of a radial lens, and of one whose other stages change distances little. Of others bounds of their terms say
-    how far out they certainly are; the azimuths are followed only when a point lies further out.
+    fold of a radial lens, and of a lens whose other stages change distances little. For other lenses, bounds of their
+    terms give the radius up to which they certainly are; azimuths are followed only if a point lies further out.
     """
 
     optics: Optics
@@ -54,34 +54,34 @@ class Domain:
     chart: Chart
     lens: Lens
     is_constant: bool = False
-    """Whether it is a constant of an exported program that other runtimes run."""
+    """Whether the domain is a constant of an exported program for other runtimes."""
 
     def __init__(self, optics: Optics, k: Tensor):
-        """optics: a model's. k: (C, n) coefficients, in the dtype and on the device of the points."""
+        """Make the domain of a model's `optics` and coefficients (C, n), of the points' dtype and device."""
         self.optics, self.k = optics, k
         self.chart, self.lens = optics(columns(k))
 
     def optics_of(self, camera: Tensor) -> tuple[Chart, Lens]:
-        """Of single points (M,), each seen by the camera of that index."""
+        """Return the chart and lens of single points (M,), each seen by the camera of that index."""
         return self.optics(of_points(self.k, camera))
 
-    def with_tables(self, inner2: Tensor, limits2: Tensor, table: Tensor) -> Domain:
-        """The same domain with tables that were made elsewhere: a compiler cannot follow a cached property's lock."""
-        self.inner2, self.limits2 = inner2, limits2
-        self.usual2 = inner2.clamp(max=self.chart.usual_end(self.k.dtype) ** 2)
+    def with_tables(self, safe_radius_sq: Tensor, limits2: Tensor, table: Tensor) -> Domain:
+        """Return this domain with tables made elsewhere, because a compiler cannot follow a cached property's lock."""
+        self.safe_radius_sq, self.limits2 = safe_radius_sq, limits2
+        self.image_radius_sq = safe_radius_sq.clamp(max=self.chart.usual_end(self.k.dtype) ** 2)
         self.inverse = InverseTable(table) if self.lens.radial else None
-        self.stagewise, self.all_stagewise = None, False  # which takes a look
+        self.stagewise, self.all_stagewise = None, False  # which would read values
         return self
 
     def with_all_tables(self) -> Domain:
-        """The same, with all tables that a graph may ask for, of values that are known."""
-        # constants: none is a view of another
+        """Return the same with all tables that a graph may need, for values that are known."""
+        # the tables are constants: none is a view of another
         made = Domain(self.optics, self.k.clone())
         made.chart, made.lens = self.optics([c.clone() for c in columns(self.k)])
         made.is_constant = True
         if not self.lens.stages:
             return made
-        tables = ["inner2", "usual2", *(["circle2"] if self.lens.rest is not None else [])]
+        tables = ["safe_radius_sq", "image_radius_sq", *(["image_circle_sq"] if self.lens.rest is not None else [])]
         tables += [] if self.lens.is_radial else ["limits2"]
         for name in tables:
             setattr(made, name, getattr(self, name).clone())
@@ -110,22 +110,22 @@ class Domain:
 
     @cached_property
     def extent(self) -> Extent:
-        """Of all cameras."""
+        """The extents of all cameras."""
         return self._followed[1]
 
     @_per_camera
     def edge2(self) -> Tensor:
-        """(C, 1): the squared radius to which the radial factor of the first stage sends its fold, the furthest."""
+        """Return (C, 1), the furthest squared radius to which the first stage's radial factor sends its fold."""
         _, lens = self.optics(columns(precise(self.k)))
         assert lens.radial is not None
         edge = self._fold * lens.radial(self._fold * self._fold)
         return (edge * edge).to(self.k.dtype)
 
     @_per_camera
-    def circle2(self) -> Tensor:
-        """(C, 1): the squared radius of a circle of the image beyond which there is nothing, infinite where unknown.
+    def image_circle_sq(self) -> Tensor:
+        """Return (C, 1), the squared radius of the image's circle, beyond which it shows nothing; infinite if unknown.
 
-        Finite where the domain ends at the fold of a first, radial stage: then the inverse goes stage by stage.
+        It is finite if the domain ends at the fold of a first, radial stage: then the inverse goes stage by stage.
         """
         if self.lens.rest is None:
             return self.k.new_full((self.k.shape[0], 1), torch.inf)
@@ -135,25 +135,25 @@ class Domain:
         edge = self.edge2.to(k.dtype).sqrt()
         steps = torch.linspace(0, _WIDER, _STEPS, dtype=k.dtype, device=k.device)
         least, furthest = lens.rest.lower_bound(edge * steps)
-        # what changes less from radius to radius than it is large has no zero in between
+        # a number that changes less from radius to radius than it is large has no zero in between
         certain = least.amin(-1, keepdim=True) - least.diff(dim=-1).abs().amax(-1, keepdim=True)
         furthest_out = torch.where(steps <= 1 + steps[1], furthest, 0.0).amax(-1, keepdim=True)
         return torch.where(certain > _LEAST_SLOPE, furthest_out * furthest_out, torch.inf).to(self.k.dtype)
 
     @cached_property
     def stagewise(self) -> Tensor | None:
-        """(C, 1) bool: whether the inverse goes stage by stage, see `circle2`; None where that is so for no camera."""
-        stagewise = torch.isfinite(self.circle2) if self.lens.rest is not None else None
+        """Whether the inverse goes stage by stage, (C, 1), see `image_circle_sq`; None if that is so for no camera."""
+        stagewise = torch.isfinite(self.image_circle_sq) if self.lens.rest is not None else None
         return None if stagewise is None or not bool(stagewise.any()) else stagewise
 
     @cached_property
     def all_stagewise(self) -> bool:
-        """Whether it goes so for all cameras."""
+        """Whether the inverse of all cameras goes stage by stage."""
         return self.stagewise is not None and bool(self.stagewise.all())
 
     @_per_camera
-    def inner2(self) -> Tensor:
-        """(C, 1): the squared radius up to which the lens is certainly regular; of a fold that is a circle, its own."""
+    def safe_radius_sq(self) -> Tensor:
+        """Return (C, 1), the squared radius up to which the lens is certainly regular: of a circular fold, its own."""
         if self.lens.is_radial or self.all_stagewise:
             inner = self._fold.to(self.k.dtype)
         else:
@@ -165,7 +165,7 @@ class Domain:
 
     @_per_camera
     def limits2(self) -> Tensor:
-        """(C, azimuths): the squared radius, up to the next azimuth, before which the orientation decides; or 0."""
+        """Return (C, azimuths), the squared radius, up to the next one, before which the orientation decides, or 0."""
         if self.all_stagewise:
             return self.k.new_zeros(self.k.shape[0], AZIMUTHS)
         limits2 = self._followed[0]
@@ -173,17 +173,17 @@ class Domain:
 
     @_per_camera
     def _fold(self) -> Tensor:
-        """(C, 1): that of the radial factor of the first stage, in double precision where there is one."""
+        """Return (C, 1), the fold of the first stage's radial factor, in double precision if the device has it."""
         k = precise(self.k)
         chart, lens = self.optics(columns(k))
-        assert lens.radial is not None  # nobody asks for it otherwise
+        assert lens.radial is not None  # the callers checked it
         return fold_of(
             lens.radial, lambda: chart.radii(RADII, k), chart.end(self.k.dtype), torch.finfo(self.k.dtype).max ** 0.25
         )
 
     @_per_camera
     def table(self) -> Tensor:
-        """(C, 2 + 2 nodes): what `inverse` is made of."""
+        """Return the table (C, 2 + 2 nodes) of `inverse`."""
         k = precise(self.k)
         chart, lens = self.optics(columns(k))
         assert lens.radial is not None
@@ -191,17 +191,17 @@ class Domain:
 
     @cached_property
     def inverse(self) -> InverseTable | None:
-        """That of the radial factor of the first stage, if it has one."""
+        """The inverse of the first stage's radial factor, if it has one."""
         return InverseTable(self.table) if self.lens.radial else None
 
     @cached_property
-    def usual2(self) -> Tensor:
-        """(C, 1): `inner2`, but no further out than images reach."""
-        return self.inner2.clamp(max=self.chart.usual_end(self.k.dtype) ** 2)
+    def image_radius_sq(self) -> Tensor:
+        """The squared radii (C, 1) of `safe_radius_sq`, but no further out than images reach."""
+        return self.safe_radius_sq.clamp(max=self.chart.usual_end(self.k.dtype) ** 2)
 
     def margin(self, a: Tensor, b: Tensor, t: Tensor) -> Tensor:
-        """Positive for the plane points (C, N) in the domain. t: a^2 + b^2."""
-        inside = self.inner2 - t
+        """Return a margin, positive for the plane points (C, N) in the domain; t is a^2 + b^2."""
+        inside = self.safe_radius_sq - t
         if self.lens.is_radial or self.all_stagewise:
             return inside
         index = azimuth(a, b)
@@ -211,17 +211,17 @@ class Domain:
 
 
 def regular(lens: Lens, a: Tensor, b: Tensor, to_edge: bool = True) -> Tensor:
-    """Return what is positive where a lens is regular, up to its edge or beyond, so that its inverse is smooth."""
+    """Return a margin, positive where a lens is regular, up to its edge or beyond, so that its inverse is smooth."""
     at = lens.at(a, b)
     edge = at.edge if to_edge else None
     least = at.orientation if edge is None else torch.minimum(at.orientation, edge)
-    # nearer to zero the reciprocal could leave the floating-point range
+    # closer to zero the reciprocal could leave the floating-point range
     return plus(torch.nan_to_num(least, nan=-1.0), -(torch.finfo(a.dtype).tiny ** 0.25))
 
 
-_domains = Kept(24)  # of a batch of eight models before, while and after it changes
+_domains = Kept(24)  # enough for a batch of eight models before, while and after it changes
 
 
 def domain_of(model: str, k: Tensor, optics: Optics) -> Domain:
-    """The domain of these values: one of the last ones that were asked for, or a new one."""
+    """Return the domain of these values: one of the last ones used, or a new one."""
     return _domains((k,), (model,), lambda: Domain(optics, k.detach().clone()))

@@ -1,4 +1,4 @@
-"""How cameras project and unproject: which way a call takes, and what of the cameras is kept for the next one."""
+"""The evaluation of cameras: the way that a call takes, and the results kept of a camera for the next one."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ def evaluate_points(
     batch: torch.Size,
     tensors: Sequence[Tensor],
 ) -> tuple[Tensor, Tensor]:
-    """Return what a direction makes of values (*B, *N, size): see `evaluate_rows`."""
+    """Return the planes and the mask of `evaluate_rows` for values (*B, *N, size), in their shape."""
     lead, dims = batch, len(batch)
     if (
         not isinstance(values, Tensor)
         or values.dtype != tensors[0].dtype
-        or values.dtype != tensors[-1].dtype  # those of a Mixed are all alike
+        or values.dtype != tensors[-1].dtype  # the tensors of a Mixed have one dtype
         or values.device != tensors[0].device
         or values.layout is not torch.strided
         or values.ndim <= dims
@@ -60,10 +60,10 @@ def evaluate_rows(
     tensors: Sequence[Tensor],
     cameras_of: Callable[[Tensor, Tensor], CameraRows] | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Return planes (size, C, N), and valid (C, N), of rows (C, N, size) seen by cameras of this model.
+    """Return planes (size, C, N), and valid (C, N), for rows (C, N, size) seen by cameras of this model.
 
-    The one place that decides the regime: compiled, or recorded by torch. lead: the batch dims that C counts.
-    cameras_of: what is kept of the tensors, if others than this camera are meant.
+    This is the only place that decides whether a call is compiled or recorded. `lead` are the batch dims that C counts.
+    `cameras_of` returns what is kept of the tensors, if they are not this camera's.
     """
     intrinsics, distortion = per_row(tensors[0], lead, rows), per_row(tensors[1], lead, rows)
     inputs = rows, intrinsics, distortion
@@ -88,7 +88,7 @@ def evaluate_rows(
 def compiled_of(cameras: Sequence[CameraLike], *values: Tensor) -> tuple[list[Native], bool] | None:
     """Return the compiled geometry of cameras, each (B,) or single, and whether any of them is a batch.
 
-    None if `evaluate_rows` would record values of the dtype of the first, for several models, and behind a shutter.
+    None if `evaluate_rows` would record values of the first one's dtype, for several models, and with a shutter.
     """
     pairs, dtype, is_batch, inputs = [], values[0].dtype, False, [*values]
     for camera in cameras:
@@ -115,7 +115,7 @@ def compiled_of(cameras: Sequence[CameraLike], *values: Tensor) -> tuple[list[Na
 
 
 class _Native(Function):
-    """The compiled geometry, with derivatives; those of derivatives come from the formula."""
+    """The compiled geometry, with derivatives; second derivatives come from the formula."""
 
     @staticmethod
     def forward(
@@ -128,7 +128,7 @@ class _Native(Function):
         direction: Direction,
     ) -> tuple[Tensor, Tensor]:
         made = cameras.native
-        assert made is not None  # who calls has looked
+        assert made is not None  # the caller checked it
         planes, valid, kept = direction.native_keeping(made, rows)
         ctx.save_for_backward(rows, intrinsics, distortion, *kept)
         ctx.cameras, ctx.model, ctx.direction = cameras, model, direction
@@ -138,13 +138,13 @@ class _Native(Function):
 
     @staticmethod
     def backward(ctx: Any, by_planes: Tensor | None, _: Tensor | None) -> tuple[Tensor | None, ...]:
-        """The cotangents of rows and parameters; with a graph if that is asked for."""
+        """Return the cotangents of rows and parameters, with a graph if one is recorded."""
         if by_planes is None:
             return (None,) * 6
         rows, intrinsics, distortion, *kept = ctx.saved_tensors
         wanted, cameras = ctx.needs_input_grad, ctx.cameras
         if torch.is_grad_enabled() or not is_native(by_planes):
-            # by the formula, with a graph of their own
+            # use the formula, with a graph of its own
             inputs, options = (rows, intrinsics, distortion), {"create_graph": True, "materialize_grads": True}
             leaves = [t for t, needed in zip(inputs, wanted[:3], strict=True) if needed]
             with torch.enable_grad():
@@ -157,11 +157,11 @@ class _Native(Function):
 
 
 def rows_of(camera: CameraLike, intrinsics: Tensor, distortion: Tensor) -> CameraRows:
-    """The rows' cameras, kept until a value changes."""
+    """Return the rows' cameras, kept until a value changes."""
     cameras = kept_cameras(camera._memo, type(camera), intrinsics, distortion)
-    # on another device a look would wait for it
+    # reading values would wait for another device
     if cameras.usable is not None and cameras.usable.is_cpu and not camera._warned:
-        # say once that learning drove Parameters of this module to where no camera is, and no gradient leads back
+        # warn once if learning drove this module's Parameters to where no camera is, from which no gradient leads back
         bad = (cameras.usable <= 0).flatten().nonzero()
         found = unusable(camera, *(t[bad[0, 0]] for t in cameras.given)) if len(bad) else None
         if found is not None and isinstance(getattr(camera, found[0]), nn.Parameter):
@@ -172,13 +172,13 @@ def rows_of(camera: CameraLike, intrinsics: Tensor, distortion: Tensor) -> Camer
             keeps += '"intrinsics", PositiveFocal()), which is in camtorch.networks.parametrize'
             warn(
                 f"{name}: {found[0]}{where} became unusable: {found[1]}. All its results are invalid and its gradients "
-                f"zero from here on. A smaller learning rate keeps it from there{keeps * (found[0] == 'intrinsics')}"
+                f"zero from here on. Use a smaller learning rate{keeps * (found[0] == 'intrinsics')}"
             )
     return cameras
 
 
 def kept_cameras(memo: Kept, model: type[CameraLike], intrinsics: Tensor, distortion: Tensor) -> CameraRows:
-    """The cameras (C,) of one model, kept in a memo until a value changes."""
+    """Return the cameras (C,) of one model, kept in a memo until a value changes."""
     cameras: CameraRows | None = memo.result
     if cameras is not None:
         for now, (then, mark) in zip((intrinsics, distortion), cameras.notes, strict=True):
@@ -186,7 +186,7 @@ def kept_cameras(memo: Kept, model: type[CameraLike], intrinsics: Tensor, distor
                 if not same(now, (then, mark)):
                     break
                 continue
-            if now.ndim != then.ndim and now.numel() == then.numel():  # numbers of one camera
+            if now.ndim != then.ndim and now.numel() == then.numel():  # one camera has them as (n,) and as (1, n)
                 then = then[None] if now.ndim > then.ndim else then[0]
             if now.dtype != then.dtype or now.device != then.device or not torch.equal(now, then):
                 break
@@ -196,7 +196,7 @@ def kept_cameras(memo: Kept, model: type[CameraLike], intrinsics: Tensor, distor
 
 
 def per_row(parameters: Tensor, lead: torch.Size, rows: Tensor) -> Tensor:
-    """(*B, n) as (C, n), in the dtype of the rows (C, N, size)."""
+    """Return parameters (*B, n) as (C, n), in the dtype of the rows (C, N, size)."""
     if parameters.dtype != rows.dtype:
         parameters = parameters.to(rows.dtype)
     if not lead:

@@ -20,23 +20,23 @@ if TYPE_CHECKING:
 AZIMUTHS = 336  # no further apart than 1.4 degrees
 _RADII = 2048  # to find the fold of the radial factor
 _SMOOTH, _BULGE = 0.02, 0.001
-_DIP = 65  # radii at which a dip between two nodes is looked at
+_DIP = 65  # radii at which a dip between two nodes is sampled
 _COARSE, _CLOSE = 40, 40  # on each of many azimuths: over the whole chart, and around the fold of the radial factor
 _FAR = 20.0  # focal lengths: no image goes further, and there lenses may differ much between two azimuths
-_BEYOND, _ASIDE = 1.01, 4  # what an extent allows for outside of its rim and, in azimuths, beside it
-_SPAN = 12  # how many azimuths the rim may go on from one to the next, and beside it, or else it becomes a circle
+_BEYOND, _ASIDE = 1.01, 4  # what an extent allows for outside of its rim and, in azimuths, next to it
+_SPAN = 12  # azimuths that the rim may go on from one to the next, and next to it; else it is a circle
 
 
 def limits_and_extent(optics: Optics, k: Tensor) -> tuple[Tensor, Extent]:
     """Follow lenses of coefficients (C, n) that are not radial outwards on azimuths of the chart's plane. Graph-free.
 
     Returns the squared radius (C, azimuths), up to the next azimuth, before which the orientation decides, and extents.
-    The orientation is lost at the first node where it is not positive, or at the bottom of a parabola through three
-    nodes that dips below zero. Up to there it changes its sign once at the most: its value at a point tells the side.
+    The orientation is lost at the first node at which it is not positive, or at the bottom of a parabola through three
+    nodes that dips below zero. Up to there it changes its sign at most once: its value at a point shows the side.
     """
     chart, lens = optics(columns(k))
     radii = _around(lens.radial, chart, chart.radii(_RADII, k)).expand(k.shape[0], -1)
-    # each camera's azimuths are rows
+    # the azimuths of each camera are rows
     rows = radii.repeat_interleave(AZIMUTHS, 0)
     chart, lens = optics(columns(k.repeat_interleave(AZIMUTHS, 0)))
     directions = (c.repeat(k.shape[0]) for c in _directions(radii))
@@ -46,8 +46,8 @@ def limits_and_extent(optics: Optics, k: Tensor) -> tuple[Tensor, Extent]:
     # (M,): the radius between two azimuths before which the orientation decides; radii (M, S), lost (M, 2) on both
     ends = _radius_at(rows, pairs)
     nearer, further = ends.amin(-1), ends.amax(-1)
-    # Between two azimuths the fold moves smoothly, and may bulge: the orientation tells where it lies.
-    # Or it ends there: then the nearer one is on the safe side.
+    # Between two azimuths the fold moves smoothly, and may bulge: the orientation decides where it lies.
+    # If it ends there, the nearer one is on the safe side.
     smooth = (pairs.diff(dim=-1).squeeze(-1).abs() <= 1.5) | (further <= (1 + _SMOOTH) * nearer)
     limit = torch.where(smooth, further * (1 + _BULGE), nearer).unsqueeze(-1)
     limits = limit.clamp(max=chart.end(limit.dtype)).squeeze(-1).unflatten(0, (-1, AZIMUTHS))
@@ -69,7 +69,7 @@ def _followed(chart: Chart, lens: Lens, radii: Tensor, a: Tensor, b: Tensor) -> 
     x, y = lens.at(a * last, b * last, order=0).value
     before = torch.where((radii < last) & (reach < torch.inf), reach, 0.0).amax(-1, keepdim=True)
     furthest = torch.maximum((x * x + y * y).sqrt(), before)
-    # before a pole there is no end to it
+    # before a pole it has no end
     beyond = radii.gather(-1, nodes.ceil().long()).clamp(max=end)
     margin = lens.at(a * beyond, b * beyond).margin
     open_ended = furthest.isnan() if margin is None else furthest.isnan() | ~(margin > 0)
@@ -77,10 +77,10 @@ def _followed(chart: Chart, lens: Lens, radii: Tensor, a: Tensor, b: Tensor) -> 
 
 
 class Extent(NamedTuple):
-    """Where the lenses of cameras (G,) send azimuths.
+    """The reach of the lenses of cameras (G,) on their azimuths.
 
     radii: (G, radii). reach: (G, azimuths, radii), how far from the centre they go, ascending; infinite past the fold.
-    furthest: (G, azimuths) in each direction of the image no point before the fold goes further.
+    furthest: (G, azimuths), the distance that no point before the fold exceeds in each direction of the image.
     """
 
     radii: Tensor
@@ -94,15 +94,15 @@ class Extent(NamedTuple):
         size = self.radii.shape[-1]
         low = _last_not_above(table, row * size, size, target)
         near, far = table[row * size + low], table[row * size + low + 1]
-        # next to the fold only its inner side is safe to start from
+        # next to the fold only its inner side is a safe start
         fraction = torch.where(far < torch.inf, (target - near) / torch.where(far > near, far - near, 1.0), 0.0)
         inner, outer = (self.radii.flatten()[camera * size + low + i] for i in range(2))
         return inner + fraction.clamp(0, 1) * (outer - inner)
 
 
 def _envelope(furthest: Tensor, x: Tensor, y: Tensor) -> Tensor:
-    """(G, azimuths), by direction of the image, from the images (x, y) of where the azimuths end."""
-    # a regular map sends what lies inside inside: no point goes further than the outermost of the rim
+    """Return (G, azimuths), by direction of the image, from the images (x, y) of the ends of the azimuths."""
+    # a regular map sends its inside inside: no point goes further than the outermost of the rim
     here = azimuth(x.nan_to_num(0.0, 0.0, 0.0), y.nan_to_num(0.0, 0.0, 0.0)).long()
     turn = (here.roll(-1, -1) - here + AZIMUTHS // 2).remainder(AZIMUTHS) - AZIMUTHS // 2
     level = torch.maximum(furthest, furthest.roll(-1, -1))
@@ -111,14 +111,14 @@ def _envelope(furthest: Tensor, x: Tensor, y: Tensor) -> Tensor:
         between = (step >= turn.clamp(max=0) - _ASIDE) & (step <= turn.clamp(min=0) + _ASIDE)
         direction = (here + step).remainder(AZIMUTHS)
         envelope = envelope.scatter_reduce(-1, direction, torch.where(between, level, 0.0), "amax")
-    # where the rim has no end, or turns by leaps, or is not seen to go once around the centre, a circle
+    # it becomes a circle if the rim has no end, turns by leaps, or is not seen to go once around the centre
     leaps = (level == torch.inf) | (turn.abs() > _SPAN - _ASIDE) | (turn.sum(-1, keepdim=True) != AZIMUTHS)
     circle = torch.where(leaps.any(-1, keepdim=True), level.amax(-1, keepdim=True), 0.0)
     return _BEYOND * torch.maximum(envelope, circle)
 
 
 def _lost(lens: Lens, a: Tensor, b: Tensor, radii: Tensor, orientation: Tensor) -> Tensor:
-    """Return `first_loss` (M,), where dips between coarse nodes (M, S) count only if a closer look finds them."""
+    """Return `first_loss` (M,), but dips between coarse nodes (M, S) count only if a closer look finds them."""
     last = orientation.shape[-1] - 1
     steps = torch.linspace(-1, 1, _DIP, dtype=orientation.dtype, device=orientation.device)
 
@@ -135,12 +135,12 @@ def _lost(lens: Lens, a: Tensor, b: Tensor, radii: Tensor, orientation: Tensor) 
         spared_now = dips & (lens.at(a * radius, b * radius).orientation > 0).all(-1, keepdim=True)
         spared = spared.scatter(-1, node, spared.gather(-1, node) | spared_now)
         lost = first_loss(orientation, spared)
-        dips = assumed(lost) & spared_now  # of those rows that are not done
+        dips = assumed(lost) & spared_now  # in rows that are not done
     return lost
 
 
 def _directions(like: Tensor) -> tuple[Tensor, Tensor]:
-    """The unit vectors of the azimuths, in even steps along the rim of the diamond |a| + |b| = 1."""
+    """Return the unit vectors of the azimuths, in even steps along the rim of the diamond |a| + |b| = 1."""
     turn = torch.arange(AZIMUTHS, dtype=like.dtype, device=like.device) * (4 / AZIMUTHS)
     a, b = (turn - 2).abs() - 1, 1 - ((turn + 1).remainder(4) - 2).abs()
     length = torch.hypot(a, b)
@@ -148,7 +148,7 @@ def _directions(like: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def azimuth(a: Tensor, b: Tensor, offset: float = 0.0) -> Tensor:
-    """The index of the azimuth at or below that of the points; `offset` 0.5 gives the nearest one."""
+    """Return the index of the azimuth at or below that of the points; `offset` 0.5 gives the nearest one."""
     size = a.abs() + b.abs()
     across = b / torch.where(size > 0, size, 1.0)
     turn = torch.where(a < 0, 2 - across, across)
@@ -156,7 +156,7 @@ def azimuth(a: Tensor, b: Tensor, offset: float = 0.0) -> Tensor:
 
 
 def _last_not_above(table: Tensor, row: Tensor, length: int, target: Tensor) -> Tensor:
-    """The index, up to length - 2, of the last entry not above the target in the ascending row that begins at `row`."""
+    """Return the index, up to length - 2, of the last entry not above `target` in the ascending row from `row` on."""
     low, high = torch.zeros_like(row), torch.full_like(row, length - 1)
     for _ in range((length - 1).bit_length()):
         middle = (low + high) // 2
@@ -166,12 +166,12 @@ def _last_not_above(table: Tensor, row: Tensor, length: int, target: Tensor) -> 
 
 
 def _around(radial: RadialFactor | None, chart: Chart, fine: Tensor) -> Tensor:
-    """(C, radii): the chart's, and more of them the nearer to the fold of the radial factor, if it has one."""
+    """Return radii (C, radii): the chart's, and more of them close to the fold of the radial factor, if it has one."""
     if radial is None:
         return chart.radii(_COARSE + _CLOSE, fine)
     orientation = radial.orientation(fine)
     fold = _radius_at(fine.expand_as(orientation), first_loss(orientation).unsqueeze(-1))
-    # without a fold on the chart, the middle of a chart does no harm
+    # without a fold on the chart, the middle of the chart does no harm
     fold = torch.where(fold < torch.inf, fold, 1.0)
     spread = 1 + 0.5 * torch.linspace(-1, 1, _CLOSE, dtype=fine.dtype, device=fine.device) ** 3
     close = (fold * spread).clamp(max=fine[-1])
@@ -180,7 +180,7 @@ def _around(radial: RadialFactor | None, chart: Chart, fine: Tensor) -> Tensor:
 
 
 def _radius_at(radii: Tensor, position: Tensor) -> Tensor:
-    """The radii (M, P) at fractional node positions (M, P) of radii (M, S); infinite from S on."""
+    """Return the radii (M, P) at fractional node positions (M, P) of radii (M, S); infinite from S on."""
     last = radii.shape[-1] - 1
     index = position.floor().long().clamp(max=last)
     inner, outer = radii.gather(-1, index), radii.gather(-1, (index + 1).clamp(max=last))

@@ -1,4 +1,4 @@
-"""Cameras of one model as the compiled geometry takes them: codes of their parts, numbers, and tables."""
+"""Cameras of one model in the form of the compiled geometry: codes of their parts, numbers, and tables."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _TANGENTIAL, _PRISM = 1, 2
 
 
 def fields(text: str, **others: type) -> tuple[tuple[str, type], ...]:
-    """Those of a struct, by name: *pointers, numbers of 64 bits, and `others` of their own types."""
+    """Return the fields of a struct by name: *pointers, numbers of 64 bits, and `others` of their own types."""
     return tuple((w.lstrip("*"), others.get(w, c_void_p if w[0] == "*" else c_int64)) for w in text.split())
 
 
@@ -54,7 +54,8 @@ class CamerasStruct(ctypes.Structure):
 
     _fields_ = fields(
         "*parts part_count is_double cameras *intrinsics *parameters parameter_count *constants constant_count *usable "
-        "*inner2 *usual2 *limits2 *extent *table *stagewise *circle2 *chart_inner2 *chart_most2 *chart_table"
+        "*safe_radius_sq *image_radius_sq *limits2 *extent *table *stagewise *image_circle_sq "
+        "*chart_safe_radius_sq *chart_most2 *chart_table"
     )
 
 
@@ -63,14 +64,14 @@ class DomainStruct(ctypes.Structure):
 
     _fields_ = fields(
         "*parts part_count is_double cameras *parameters parameter_count *constants constant_count is_chart is_radial "
-        "*ends *usual_ends *folds most *radii *coarse *even *inner2 *usual2 *circle2 *table *limits2 *extent "
-        "*stagewise",
+        "*ends *usual_ends *folds most *radii *coarse *even *safe_radius_sq *image_radius_sq *image_circle_sq *table "
+        "*limits2 *extent *stagewise",
         most=c_double,
     )
 
 
 class Plan:
-    """What all cameras of a model and a number of coefficients have in common."""
+    """The properties that all cameras of a model and a number of coefficients have in common."""
 
     parts: ctypes.Array[_Part]
     count: int
@@ -86,13 +87,13 @@ class Plan:
     """Whether a radial factor has so many numbers that its fold is not found by a root."""
 
     def __init__(self, chart: Chart, lens: Lens, parts: Sequence[_Part], coefficients: Sequence[Tensor]):
-        """Of the optics of coefficients, columns, whatever their values."""
+        """Make the plan of optics whose coefficients are columns, whatever their values."""
         self.parts, self.count = (_Part * len(parts))(*parts), len(parts)
         parameters = (*chart.parameters, *lens.parameters)
         self.parameters = len(parameters)
         places = {id(c): i for i, c in enumerate(coefficients)}
         known = [places[id(p)] for p in parameters if id(p) in places]
-        # which coefficients the parameters are; None where the model computes some
+        # the coefficients of the parameters; None if the model computes some
         self.places = torch.tensor(known, device="cpu") if len(known) == len(parameters) else None
         self.is_all = known == list(range(len(coefficients)))
         self.is_chart = isinstance(chart, optics.Inverted)
@@ -103,7 +104,7 @@ class Plan:
         self._radii: dict[tuple[torch.dtype, int], Tensor] = {}
 
     def ends(self, chart: Callable[[], Chart], dtype: torch.dtype) -> tuple[float | Tensor, float | Tensor]:
-        """The radii at which the chart of some cameras ends, and beyond which there are no images."""
+        """Return the radii at which the chart of some cameras ends, and beyond which there are no images."""
         if self.is_chart:
             return FURTHEST, FURTHEST
         if dtype in self._ends:
@@ -115,11 +116,11 @@ class Plan:
         return end, usual_end
 
     def has_fixed_ends(self, dtype: torch.dtype) -> bool:
-        """Whether the chart of all cameras ends at one radius, once `ends` has been asked for."""
+        """Whether the chart of all cameras ends at one radius, after a call of `ends`."""
         return dtype in self._ends
 
     def radii(self, chart: Callable[[], Chart], count: int, like: Tensor) -> Tensor:
-        """The radii of the chart of some cameras, as `Chart.radii` has them, in double precision."""
+        """Return the radii of the chart of some cameras, like `Chart.radii`, in double precision."""
         key = like.dtype, count
         if key not in self._radii:
             made = chart()
@@ -130,28 +131,28 @@ class Plan:
         return self._radii[key]
 
     def parameters_of(self, optics_of: Optics, k: Tensor) -> Tensor:
-        """(C, parameters) of coefficients (C, n)."""
+        """Return the parameters (C, parameters) for coefficients (C, n)."""
         if self.places is not None:
             return k if self.is_all else k.index_select(1, self.places)
         chart, lens = optics_of(columns(k))
         return torch.cat([c.expand(len(k), 1) for c in (*chart.parameters, *lens.parameters)], -1)
 
 
-_plans = Kept(64)  # by optics and number of coefficients
+_plans = Kept(64)  # keyed by optics and number of coefficients
 
 
 class Lenses:
-    """Those of cameras (C,) as the compiled geometry takes them: numbers, and what was found of their domains."""
+    """The lenses of cameras (C,) in the form of the compiled geometry: numbers, and their domains as far as known."""
 
     plan: Plan
     cameras: int
     dtype: torch.dtype
     struct: CamerasStruct
-    """What it has of them; pointers that are not set are of what is not yet known."""
+    """The lenses' part of the struct; pointers that are not set are of values that are not known yet."""
     _kept: list[object]
 
     def __init__(self, plan: Plan, optics_of: Optics, k: Tensor, domain: Callable[[], Domain], tables: bool = False):
-        """See `native_of`."""
+        """Make the lenses; see `native_of`."""
         self.plan, self._optics_of, self._k, self._kept = plan, optics_of, k, [k]
         self._slow_domain, self.cameras, self.dtype = domain, len(k), k.dtype
         self.struct = struct = CamerasStruct()
@@ -168,7 +169,7 @@ class Lenses:
 
     @classmethod
     def known(cls, plan: Plan, optics_of: Optics, k: Tensor, domain: Callable[[], Domain], made: Native) -> Lenses:
-        """Return those of cameras that compiled code made, with their parameters and domains."""
+        """Return the lenses of cameras that compiled code made, with their parameters and domains."""
         lenses = cls.__new__(cls)
         lenses.plan, lenses._optics_of, lenses._k, lenses._kept = plan, optics_of, k, [k, made._kept]
         lenses._slow_domain, lenses.cameras, lenses.dtype = domain, len(k), k.dtype
@@ -180,9 +181,9 @@ class Lenses:
 
     @functools.cached_property
     def asked(self) -> DomainStruct:
-        """What it is asked with; its optics are of double precision."""
+        """The request for the domain, with optics in double precision."""
         made, plan = DomainStruct(), self.plan
-        # in double precision where the model computes them
+        # they are in double precision if the model computes them
         k = self._k if plan.places is not None else self._k.double()
         parameters = plan.parameters_of(self._optics_of, k) if plan.parameters else k
         made.parts, made.part_count = addressof(plan.parts), plan.count
@@ -208,7 +209,7 @@ class Lenses:
         return self._keep(end.expand(self.cameras, 1).double())
 
     def _ask(self, wanted: dict[str, int]) -> None:
-        """Fill in what of the domain is wanted: names and where it goes."""
+        """Fill in the wanted parts of the domain: names and addresses."""
         asked = DomainStruct.from_buffer_copy(self.asked)  # several threads may ask at once
         for name, place in wanted.items():
             setattr(asked, name, place)
@@ -218,21 +219,23 @@ class Lenses:
         return self._keep(torch.empty(self.cameras, columns, dtype=dtype or self.dtype, device="cpu"))
 
     def _add_chart(self) -> None:
-        """The fold and the inverse of a chart that is given the other way round."""
-        table, inner2 = torch.empty(self.cameras, TABLE_WIDTH, dtype=self.dtype, device="cpu"), self._new(1)
+        """Add the fold and the inverse of a chart that is defined in the other direction."""
+        table, safe_radius_sq = torch.empty(self.cameras, TABLE_WIDTH, dtype=self.dtype, device="cpu"), self._new(1)
         place = self._keep(table)
-        self._ask({"inner2": inner2, "table": place, "is_chart": True})
+        self._ask({"safe_radius_sq": safe_radius_sq, "table": place, "is_chart": True})
         struct = self.struct
-        struct.chart_inner2, struct.chart_table, struct.chart_most2 = inner2, place, self._keep(table[:, 1])
+        struct.chart_safe_radius_sq, struct.chart_table = safe_radius_sq, place
+        struct.chart_most2 = self._keep(table[:, 1])
 
     def _add_domain(self, tables: bool) -> None:
         plan = self.plan
-        if plan.is_chart:  # whose end is that of a search
+        if plan.is_chart:  # its end comes from a search
             domain = self._slow_domain()
-            self.struct.usual2, self.struct.inner2 = self._keep(domain.usual2), self._keep(domain.inner2)
+            self.struct.image_radius_sq = self._keep(domain.image_radius_sq)
+            self.struct.safe_radius_sq = self._keep(domain.safe_radius_sq)
             return
-        names = ["inner2", "usual2", *["circle2", "stagewise"] * plan.has_rest]
-        has_table = tables and plan.has_factor  # at once, as there will be pixels
+        names = ["safe_radius_sq", "image_radius_sq", *["image_circle_sq", "stagewise"] * plan.has_rest]
+        has_table = tables and plan.has_factor  # made now, as pixels will follow
         start, step = self._new(len(names) + TABLE_WIDTH * has_table), self.cameras * self.dtype.itemsize
         wanted = {name: start + step * i for i, name in enumerate([*names, *["table"] * has_table])}
         radii = {} if plan.is_radial else {"radii": self._keep(plan.radii(lambda: self._optics()[0], _RADII, self._k))}
@@ -247,19 +250,20 @@ class Lenses:
         return {name: self.plan.radii(lambda: chart, count, like) for name, count in names.items()}
 
     def inverse_table(self) -> int:
-        """What the inverse of the radial factor starts from; it is made when it is first asked for."""
+        """Return the address of the table for the inverse of the radial factor, made at first use."""
         if self.struct.table is None:
             table = self._new(TABLE_WIDTH)
             self._ask({"table": table})
-            self.struct.table = table  # when it is whole, for another thread may be looking
+            self.struct.table = table  # set when it is whole, as another thread may be reading
         return int(self.struct.table)
 
     def followed(self) -> tuple[int, int]:
-        """The limits of each azimuth, and where the lens sends it: asked for only when a point lies far out."""
+        """Return the addresses of the limits of each azimuth and of its extent, made if a point lies far out."""
         struct = self.struct
         if struct.limits2 is None:
             wanted = {"limits2": self._new(AZIMUTHS), "extent": self._new(EXTENT)}
-            wanted |= {name: place for name in ("circle2", "stagewise") if (place := getattr(struct, name)) is not None}
+            known = ((name, getattr(struct, name)) for name in ("image_circle_sq", "stagewise"))
+            wanted |= {name: place for name, place in known if place is not None}
             wanted |= {name: self._keep(radii) for name, radii in self.radii_wanted().items()}
             if self.plan.is_chart:
                 wanted["ends"] = self._keep_ends(self._optics()[0].end(self.dtype))
@@ -296,19 +300,19 @@ def _same_ends(end: float, cameras: int) -> ctypes.Array[c_double]:
     return (c_double * cameras)(*[end] * cameras)
 
 
-_LONGEST = 512  # coefficients of lenses that are kept
+_LONGEST = 512  # the most coefficients of lenses that are kept
 _lenses = Kept(24)
 
 
 def lenses_of(plan: Plan, k: Tensor, make: Callable[[], Lenses]) -> Lenses:
-    """Return the lenses of coefficients (C, n): of the last ones that were asked for, or new ones."""
+    """Return the lenses of coefficients (C, n): one of the last ones used, or new ones."""
     if k.numel() > _LONGEST:
         return make()
     return _lenses((), (plan, k.dtype, k.shape, k.numpy().tobytes()), make)
 
 
 class Native:
-    """Cameras (C,) of one model as the compiled geometry takes them."""
+    """Cameras (C,) of one model in the form of the compiled geometry."""
 
     plan: Plan
     struct: CamerasStruct
@@ -320,7 +324,7 @@ class Native:
     _make_lenses: Callable[[Native], Lenses]
 
     def __init__(self, lenses: Lenses, intrinsics: Tensor, usable: Tensor | None):
-        """See `native_of`."""
+        """Make the cameras; see `native_of`."""
         self.lenses, self.plan, self.struct = lenses, lenses.plan, CamerasStruct.from_buffer_copy(lenses.struct)
         kept = self._kept = intrinsics.contiguous(), None if usable is None else (usable > 0).contiguous()
         self.cameras, self.dtype, self.parameters = intrinsics.shape[0], intrinsics.dtype, lenses.plan.parameters
@@ -329,7 +333,7 @@ class Native:
 
     @classmethod
     def made(cls, base: Native, struct: CamerasStruct, room: object, lenses: Callable[[Native], Lenses]) -> Native:
-        """Return cameras that compiled code made, in `room`, like others; `lenses` when somebody asks for them."""
+        """Return cameras that compiled code made, in `room`, like others; `lenses` makes their lenses at first use."""
         native = cls.__new__(cls)
         native.plan, native.dtype, native.parameters = base.plan, base.dtype, base.parameters
         native.struct, native.cameras, native.pointer = struct, struct.cameras, addressof(struct)
@@ -338,20 +342,20 @@ class Native:
 
     @functools.cached_property
     def lenses(self) -> Lenses:
-        """Those of the cameras, which others may have too."""
+        """The lenses of the cameras, which other cameras may share."""
         return self._make_lenses(self)
 
     def keep_lenses(self) -> None:
-        """Keep what was found of the lenses for those who ask for the same numbers."""
+        """Keep the lenses for cameras of the same numbers."""
         _ = self.lenses
 
     def add_table(self) -> None:
-        """Have what the inverse of a radial factor starts from."""
+        """Set the table from which the inverse of a radial factor starts."""
         if self.plan.has_factor and self.struct.table is None:
             self.struct.table = self.lenses.inverse_table()
 
     def follow(self) -> None:
-        """Have the limits of each azimuth, and where it is sent."""
+        """Set the limits of each azimuth, and its extent."""
         self.struct.limits2, self.struct.extent = self.lenses.followed()
 
 
@@ -363,10 +367,10 @@ def native_of(
     domain: Callable[[], Domain],
     tables: bool = False,
 ) -> Native | None:
-    """Return cameras of intrinsics (C, 4) and coefficients (C, n) as the compiled geometry takes them.
+    """Return cameras of intrinsics (C, 4) and coefficients (C, n) in the form of the compiled geometry.
 
     None without a library, on another device, and if a part of the optics has no code: a user's own. usable: (C, 1),
-    None if all are. domain: for what the compiled geometry does not do. tables: whether the inverse is sure to come.
+    None if all are. domain: for parts that are not compiled. tables: whether the inverse is sure to come.
     """
     if library() is None or not intrinsics.is_cpu or not k.shape[0]:
         return None
@@ -384,7 +388,7 @@ def _plan_of(optics_of: Optics, k: Tensor) -> Plan | None:
 
 
 def codes(chart: Chart, lens: Lens) -> list[_Part] | None:
-    """What chart and lens are made of, or None where one part has no code."""
+    """Return the parts of chart and lens, or None if one part has no code."""
     parts = [_chart(chart), *map(_stage, lens.stages)]
     known = [part for part in parts if part is not None]
     return known if len(known) == len(parts) <= _MOST_PARTS else None
@@ -439,14 +443,14 @@ def _constants(lens: Lens) -> Sequence[Tensor]:
 
 @functools.cache
 def entry(name: str, result: type | None) -> ctypes._NamedFuncPointer:
-    """Return a function of the compiled library, which has to be there, with the type of its result."""
+    """Return a function of the compiled library, which must be loaded, with the type of its result."""
     found = library()
-    assert found is not None  # or nobody has a `Native`
+    assert found is not None  # else there is no `Native`
     entry: ctypes._NamedFuncPointer = getattr(found, name)
     entry.restype = result
     return entry
 
 
 def address(tensor: Tensor | None) -> int:
-    """Return where the values of a tensor lie, 0 for None."""
+    """Return the address of a tensor's values, 0 for None."""
     return 0 if tensor is None else tensor.data_ptr()

@@ -1,6 +1,6 @@
-"""What a traced graph does not look into: tables of a lens, and the search for what is left open by Newton's method.
+"""Parts that a traced graph does not follow: tables of a lens, and the search where Newton's method stays open.
 
-As operators of their own they keep compiled graphs small, and look at values inside vmap as well.
+As operators they keep compiled graphs small, and can read values inside vmap as well.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ def _domain(model: str, k: Tensor) -> Domain:
 
 @torch.library.custom_op("camtorch::tables", mutates_args=())
 def tables(model: str, k: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """`Domain.inner2`, `limits2` and `table` of coefficients (C, n); without columns where the lens needs none."""
+    """Return `safe_radius_sq`, `limits2` and `table` of a `Domain`, without columns if the lens needs none."""
     domain = _domain(model, k)
     empty = k.new_empty(len(k), 0)
-    # clones: who gets them may write into them
+    # clones, as the caller may write into them
     return (
-        domain.inner2.clone(),
+        domain.safe_radius_sq.clone(),
         empty if domain.lens.is_radial else domain.limits2.clone(),
         domain.table.clone() if domain.lens.radial else empty.clone(),
     )
@@ -48,7 +48,7 @@ def _(model: str, k: Tensor) -> tuple[Tensor, ...]:
 def search_in_place(
     model: str, k: Tensor, u: Tensor, v: Tensor, a: Tensor, b: Tensor, solved: Tensor, possible: Tensor
 ) -> None:
-    """Write into (a, b, solved) of `Found` what `search` finds of the points (C, N) not solved, but possible."""
+    """Write the results of `search` for points (C, N), possible but not solved, into (a, b, solved) of `Found`."""
     if not solved.numel() or bool(solved.amin() > 0):
         return
     camera, point = (~(solved > 0) & (possible > 0)).nonzero(as_tuple=True)
@@ -62,7 +62,7 @@ def search_in_place(
 def search_open(
     model: str, k: Tensor, u: Tensor, v: Tensor, a: Tensor, b: Tensor, solved: Tensor, possible: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """`search_in_place` into copies: vmap has no rule for what writes."""
+    """Return the results of `search_in_place` in copies: vmap has no rule for operators that write."""
     results = a.clone(), b.clone(), solved.clone()
     search_in_place(model, k, u, v, *results, possible)
     return results
@@ -86,7 +86,7 @@ def _(info: Any, in_dims: tuple[Any, ...], model: str, k: Tensor) -> Any:
 
 @search_open.register_vmap
 def _(info: Any, in_dims: tuple[Any, ...], model: str, k: Tensor, *planes: Tensor) -> Any:
-    # what is mapped joins the cameras, or the points where the cameras are not mapped
+    # the mapped dim joins the cameras, or the points if the cameras are not mapped
     cameras = in_dims[1] is not None
     rows = []
     for plane, dim in zip(planes, in_dims[2:], strict=True):

@@ -1,4 +1,4 @@
-"""Rays to pixels: the formula and what makes a point invalid, as it is recorded in graphs, and compiled."""
+"""Rays to pixels: the formula and the reasons why a point is invalid, as recorded in graphs, and compiled."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ INVALID_PIXEL = -1.0  # outside every image, so that `contains` is False for it 
 
 
 def _normalise(chart: Chart, x: Tensor, y: Tensor, z: Tensor) -> tuple[Planes3, Tensor]:
-    """Return rays, their largest component near 1, the axis for what is invalid, and the mask of those covered."""
+    """Return rays, their largest component near 1, the axis for invalid ones, and the mask of those covered."""
     x_0, y_0, z_0 = x.detach(), y.detach(), z.detach()
     size = torch.maximum(torch.maximum(x_0.abs(), y_0.abs()), z_0.abs())
-    # NaN fails both comparisons; nearer to the origin the derivative leaves the floating-point range
+    # NaN fails both comparisons; closer to the origin the derivative leaves the floating-point range
     valid = ((size > floor_of(size.dtype)) & (size < torch.inf)).to(size.dtype)
-    # a constant: the projection does not depend on the distance, so this has no part in its derivative
+    # it is a constant: the projection does not depend on the distance, so it has no part in the derivative
     shrink = as_kept(power_of_two(torch.where(valid > 0, size, 1.0)).reciprocal())
     x_0, y_0, z_0 = (torch.where(valid > 0, w, axis) * shrink for w, axis in ((x_0, 0.0), (y_0, 0.0), (z_0, 1.0)))
     x, y, z = (torch.where(valid > 0, w, axis) * shrink for w, axis in ((x, 0.0), (y, 0.0), (z, 1.0)))
@@ -44,26 +44,26 @@ def _formula(
     cameras: CameraRows | None,
     order: int = 2,
 ) -> tuple[Tensor, Tensor]:
-    """Points (C, N, 3) to pixels (2, C, N), and valid (C, N); see `Direction.formula`."""
-    usual = Traced.of(model, intrinsics, distortion, cameras)
+    """Return pixels (2, C, N) for points (C, N, 3), and valid (C, N); see `Direction.formula`."""
+    traced = Traced.of(model, intrinsics, distortion, cameras)
 
     def evaluate(x: Tensor, y: Tensor, z: Tensor, intrinsics: Tensor, distortion: Tensor) -> tuple[Tensor, Tensor]:
-        chart, lens = usual.optics(distortion)
+        chart, lens = traced.optics(distortion)
         rays, mask = _normalise(chart, x, y, z)
         a, b = chart.to_plane(*rays, order)
         if lens.stages:
             t = torch.addcmul(a * a, b, b)
-            inside = as_kept(to_mask(usual.domain.margin(a.detach(), b.detach(), t.detach())))
+            inside = as_kept(to_mask(traced.domain.margin(a.detach(), b.detach(), t.detach())))
             a, b, t = (replace(inside, w, 0.0) for w in (a, b, t))
             mask = mask * inside
             a, b = lens.at(a, b, 0, t).value
-        seen = mask if usual.usable is None else mask * usual.usable
+        seen = mask if traced.usable is None else mask * traced.usable
         focal_x, focal_y, centre_x, centre_y = columns(intrinsics)
         planes = focal_x * a + centre_x, focal_y * b + centre_y
         pixels = torch.stack([replace(seen, w, INVALID_PIXEL) for w in planes])
         return pixels, seen.expand_as(pixels[0])
 
-    pixels, mask = without_keeping(evaluate, *to_planes(points), usual.intrinsics, usual.distortion)
+    pixels, mask = without_keeping(evaluate, *to_planes(points), traced.intrinsics, traced.distortion)
     return pixels, positive(mask)
 
 

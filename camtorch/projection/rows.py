@@ -1,4 +1,4 @@
-"""The cameras that see rows of points: values of their parameters, and what was made of them once."""
+"""The cameras that see rows of points: the values of their parameters, and the results made of them once."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 Planes2 = tuple[Tensor, Tensor]
 
-_MOST_LOOKED_AT = 512  # numbers that are looked at one by one
+_MOST_LOOKED_AT = 512  # numbers that are checked one by one
 
 
 class CameraRows:
@@ -40,11 +40,11 @@ class CameraRows:
     intrinsics: Tensor
     k: Tensor
     notes: tuple[Note, Note]
-    """Of the tensors that were given."""
+    """The notes of the given tensors."""
     usable: Tensor | None
 
     def __init__(self, model: type[CameraLike], intrinsics: Tensor, distortion: Tensor):
-        """Of concrete values (C, 4), (C, n); or (4,), (n,) of one."""
+        """Take concrete values (C, 4), (C, n); or (4,), (n,) of one camera."""
         self._model, self._learns = model, distortion.requires_grad
         known = on_cpu(intrinsics, distortion)
         self._host = None if known is None else CameraRows(model, known[0], known[1])
@@ -63,31 +63,31 @@ class CameraRows:
 
     @cached_property
     def domain(self) -> Domain:
-        """That of the lenses."""
+        """The domain of the lenses."""
         if self._host is not None and (native := self._host.native) is not None:
             return Domain(self._model.optics, self.k).found_elsewhere(native.lenses.tables())
         return domain_for(self._model, self.k, self._learns)
 
     def with_all_tables(self) -> CameraRows:
-        """The same with all that a graph may ask for."""
+        """Return the same with all tables that a graph may need."""
         made = copy.copy(self)
         made.domain = self.domain.with_all_tables()
         return made
 
     @cached_property
     def native(self) -> Native | None:
-        """For the compiled geometry, None where it has not got this model, or is not there."""
+        """The cameras in the form of the compiled geometry; None if it does not have this model, or is not there."""
         domain = partial(domain_for, self._model, self.k, self._learns)
         return native_of(self._model.optics, self.intrinsics, self.k, self.usable, domain)
 
     def cotangents(self, sums: Tensor | None, wanted: Sequence[bool]) -> tuple[Tensor | None, Tensor | None]:
-        """Return those of intrinsics and distortion, if wanted, of sums (C, 4 + n): see `compiled.project_vjp`."""
+        """Return the cotangents of intrinsics and distortion, if wanted, for sums of `compiled.project_vjp`."""
         if sums is None:
             return None, None
         return sums[:, :4] if wanted[0] else None, self._of_coefficients(sums[:, 4:]) if wanted[1] else None
 
     def _of_coefficients(self, sums: Tensor) -> Tensor:
-        assert self.native is not None  # which gave the sums
+        assert self.native is not None  # it gave the sums
         plan = self.native.plan
         if plan.places is not None:
             return sums if plan.is_all else torch.zeros_like(self.k).index_add_(1, plan.places, sums)
@@ -101,19 +101,19 @@ class CameraRows:
 
 
 def single_native(model: type[CameraLike], intrinsics: Tensor, k: Tensor) -> Native | None:
-    """A camera of numbers (4,) and (n,) that are known to be usable, for the compiled geometry, if that knows it."""
+    """Return a camera of usable numbers (4,) and (n,) for the compiled geometry, if that has the model."""
     k = k.detach()[None]
     return native_of(model.optics, intrinsics[None], k, None, partial(domain_for, model, k, False), tables=True)
 
 
 def domain_for(model: type[CameraLike], k: Tensor, learns: bool) -> Domain:
     """Return the domain of lenses (C, n) of a model, kept unless they learn."""
-    # what learns will not be seen again
+    # lenses that learn will not be used again
     return Domain(model.optics, k) if learns else domain_of(model._model, k, model.optics)
 
 
 def _are_plain(model: type[CameraLike], intrinsics: Tensor, distortion: Tensor) -> bool:
-    """Whether a short look says that all are usable."""
+    """Whether a short look shows that all are usable."""
     if not intrinsics.is_cpu or not 0 < intrinsics.numel() + distortion.numel() <= _MOST_LOOKED_AT:
         return False
     if distortion.numel() and not model.always_defined and model.defined(distortion.unbind(-1)) is not None:
@@ -124,7 +124,7 @@ def _are_plain(model: type[CameraLike], intrinsics: Tensor, distortion: Tensor) 
 
 
 def _usable(model: type[CameraLike], intrinsics: Tensor, distortion: Tensor) -> Tensor:
-    """Bool (C, 1): finite, with focal lengths that are positive, and coefficients for which the formula exists."""
+    """Return whether (C, 1) numbers are finite, focal lengths positive, and the formula exists for the coefficients."""
     finite = torch.isfinite(intrinsics).all(-1) & torch.isfinite(distortion).all(-1)
     usable = finite & (intrinsics[..., :2] > 0).all(-1)
     defined = model.defined(distortion.unbind(-1)) if distortion.shape[-1] else None
@@ -132,7 +132,7 @@ def _usable(model: type[CameraLike], intrinsics: Tensor, distortion: Tensor) -> 
 
 
 def unusable(camera: CameraLike, intrinsics: Tensor, distortion: Tensor) -> tuple[str, str] | None:
-    """Why a camera of this model and these values, (4,) and (n,), has no pixels at all: the tensor, and what it has."""
+    """Return why a camera of values (4,) and (n,) has no pixels at all, as a tensor's name and a reason, or None."""
     for tensor, names, values in (
         ("intrinsics", ("fx", "fy", "cx", "cy"), intrinsics.tolist()),
         ("distortion", camera.distortion_names, distortion.tolist()),
@@ -154,23 +154,23 @@ def _ideal(model: type[CameraLike], intrinsics: Tensor, distortion: Tensor) -> t
 
 
 class Direction(NamedTuple):
-    """One direction of cameras (C,) of a model, of rows (C, N, size): as torch records it, and in compiled code."""
+    """One direction of cameras (C,) of a model, for rows (C, N, size): as torch records it, and in compiled code."""
 
     formula: Callable[..., tuple[Tensor, Tensor]]
-    """Of model, rows, intrinsics (C, 4), distortion (C, n), cameras and order, to planes (size, C, N), valid (C, N).
+    """The formula: model, rows, intrinsics (C, 4), distortion (C, n), cameras, order to planes (size, C, N), valid.
 
-    cameras: those of the parameters, if values may be looked at. order: of the derivatives that have to be exact.
+    `cameras` are those of the parameters, if values may be read; derivatives up to `order` must be exact.
     """
     native: Callable[[Native, Tensor], tuple[Any, ...]]
-    """Of compiled cameras and rows to planes, valid, and perhaps more."""
+    """The compiled call, from cameras and rows to planes, valid, and perhaps more."""
     native_keeping: Callable[[Native, Tensor], tuple[Tensor, Tensor, tuple[Tensor, ...]]]
-    """To planes, valid, and what `native_vjp` needs of the call."""
+    """The compiled call that also returns the tensors that `native_vjp` needs."""
     native_vjp: Callable[..., tuple[Tensor | None, Tensor | None]]
-    """The cotangents of rows and of the numbers of the cameras."""
+    """The compiled cotangents of rows and of the numbers of the cameras."""
 
 
 class Traced(NamedTuple):
-    """What a graph is recorded of: parameters that can be used, and what follows from their values."""
+    """The inputs of a recorded graph: parameters that can be used, and results of their values."""
 
     model: type[CameraLike]
     intrinsics: Tensor
@@ -180,7 +180,7 @@ class Traced(NamedTuple):
 
     @classmethod
     def of(cls, model: type[CameraLike], intrinsics: Tensor, distortion: Tensor, cameras: CameraRows | None) -> Traced:
-        """cameras: those of the parameters, if their values may be looked at."""
+        """Prepare parameters; `cameras` are those of the parameters, if their values may be read."""
         if cameras is not None:
             domain, usable = cameras.domain, cameras.usable
         else:
@@ -198,7 +198,7 @@ class Traced(NamedTuple):
         return cls(model, intrinsics, distortion, domain, usable)
 
     def optics(self, distortion: Tensor) -> tuple[Chart, Lens]:
-        """Those of the coefficients as a graph has them; of a constant camera they are made already."""
+        """Return the chart and lens of the coefficients in a graph, or the ready ones of a constant camera."""
         domain = self.domain
         return (domain.chart, domain.lens) if domain.is_constant else self.model.optics(columns(distortion))
 
@@ -209,5 +209,5 @@ def replace(mask: Tensor, plane: Tensor, value: float) -> Tensor:
 
 
 def to_mask(margin: Tensor) -> Tensor:
-    """Return 1 where a margin is positive, else 0, in its dtype: compiled code writes bools one by one."""
+    """Return 1 for a positive margin, else 0, in its dtype: compiled code writes bools one by one."""
     return (margin.detach() > 0).to(margin.dtype)

@@ -26,7 +26,7 @@ _CLOSE = 0.02
 _SLOWEST_TURN = 0.05
 _GIVE_UP = 1e-4
 _STAGE_STEPS = 12  # the first ones may take off no more than a third, see `domain._LEAST_SLOPE`
-_FIRST_STEPS, _LATE_STEPS = 6, 54  # the late ones lie next to a fold, or so far out that a prism dominates
+_FIRST_STEPS, _LATE_STEPS = 6, 54  # late points lie next to a fold, or so far out that a prism dominates
 
 
 def search(domain: Domain, camera: Tensor, u: Tensor, v: Tensor) -> Found:
@@ -58,20 +58,20 @@ def _search_recorded(domain: Domain, camera: Tensor, u: Tensor, v: Tensor) -> Fo
     assert domain.stagewise is not None  # as above
     stagewise = domain.stagewise[camera, 0]
     a, b = (torch.where(stagewise, *pair) for pair in zip(by_stages[:2], found[:2], strict=True))
-    return a, b, (stagewise & by_stages[2]) | (~stagewise & found[2])  # ONNX Runtime selects no bool
+    return a, b, (stagewise & by_stages[2]) | (~stagewise & found[2])  # ONNX Runtime cannot select bools
 
 
 def _by_stages(domain: Domain, camera: Tensor, u: Tensor, v: Tensor) -> Found:
-    """`search` where only the first stage, which is radial, has a limit: what it would have to reach tells at once."""
+    """Run `search` if only the first stage, a radial one, has a limit: the point that it must reach decides."""
     (p, q), within = _first_image(domain, camera, u, v)
     alone = partial(_Search, domain, is_circle=True)
     return _found_of(within, u, lambda some: alone(camera[some])(u[some], v[some], (p[some], q[some])))
 
 
 def _first_image(domain: Domain, camera: Tensor, u: Tensor, v: Tensor) -> tuple[Planes2, Tensor]:
-    """Where the first stage has to send what later ones send to (u, v), and whether it can."""
+    """Return the points that the stages after the first one send to (u, v), and whether the first one reaches them."""
     rest, table = domain.optics_of(camera)[1].rest, domain.inverse
-    assert rest is not None  # or there would be no stages to go by
+    assert rest is not None  # the caller checked it
     assert table is not None
     p, q = rest.start(u, v)
     for _ in range(_STAGE_STEPS):
@@ -80,17 +80,17 @@ def _first_image(domain: Domain, camera: Tensor, u: Tensor, v: Tensor) -> tuple[
         dp, dq, _ = newton_step(at.jacobian, u - x, v - y)
         p, q = p + dp, q + dq
     most2 = times(table.most2[camera, 0], 1 + 64 * torch.finfo(u.dtype).eps)
-    return (p, q), (u * u + v * v <= domain.circle2[camera, 0]) & (p * p + q * q <= most2)
+    return (p, q), (u * u + v * v <= domain.image_circle_sq[camera, 0]) & (p * p + q * q <= most2)
 
 
 def _within_extents(domain: Domain, camera: Tensor, u: Tensor, v: Tensor) -> Found:
-    """`search` of any other lens, for the points within the extent of what it shows."""
+    """Run `search` for any other lens, for the points within the extent of what it shows."""
     within = torch.hypot(u, v) <= domain.extent.furthest[camera, azimuth(u, v)]
     return _found_of(within, u, lambda some: _Search(domain, camera[some])(u[some], v[some]))
 
 
 def _found_of(chosen: Tensor, like: Tensor, find: Callable[[Tensor], Found], into: Found | None = None) -> Found:
-    """Return what is found of the points that are chosen, by their indices; nothing, or `into`, of the others."""
+    """Return the results of `find` for the indices of the chosen points; for others zeros, or those of `into`."""
     a, b, found = into or (torch.zeros_like(like), torch.zeros_like(like), torch.zeros_like(chosen))
     (some,) = chosen.nonzero(as_tuple=True)
     if len(some):
@@ -102,40 +102,40 @@ class _Search:
     """The lenses of single points (M,), and the inverse by bracketing and damped steps."""
 
     def __init__(self, domain: Domain, camera: Tensor, *, is_circle: bool = False, within: Tensor | None = None):
-        """is_circle: whether the fold is one, as of every radial lens. within: (M,), what a recorded search is for."""
+        """Take a domain, whose fold `is_circle` for every radial lens; a recorded search is for `within` (M,)."""
         self.domain, self.camera, self.within = domain, camera, within
         self.chart, self.lens = domain.optics_of(camera)
         self.is_circle = is_circle or self.lens.is_radial
 
     def __call__(self, u: Tensor, v: Tensor, first: Planes2 | None = None) -> Found:
-        """first: where the first stage has to send the points, if the fold is a circle; by default to (u, v)."""
+        """Search; `first` is where the first stage must send the points, if the fold is a circle; by default (u, v)."""
         a, b = self.radial(*(first or (u, v))) if self.is_circle else self.planar(u, v)
         at = self.lens.at(a, b)
         (x, y), jacobian = at.value, at.jacobian
         valid = self.contains(a, b)
         stretch = torch.maximum(jacobian[0].abs() + jacobian[1].abs(), jacobian[2].abs() + jacobian[3].abs())
         stretch = stretch * torch.maximum(a.abs(), b.abs())
-        for _ in range(2):  # what rounding left
+        for _ in range(2):  # to remove what rounding left
             da, db, _ = newton_step(jacobian, u - x, v - y)
             a, b = torch.where(valid, a + da, 0.0), torch.where(valid, b + db, 0.0)
             x, y = self.lens(a, b)
-        # next to a fold the polished solution may lie on its other side: what counts is where its ray is seen
+        # next to a fold the polished solution may lie on its other side: the place where its ray is seen counts
         ray = self.chart.to_ray(a, b, order=1)
         covered = self.chart.margin(*ray) > 0
         dx, dy, dz = (torch.where(covered, w, axis) for w, axis in zip(ray, (0, 0, 1), strict=True))
         seen = self.chart.to_plane(dx, dy, dz, order=1)
         x, y = self.lens(*seen)
         miss = torch.maximum((x - u).abs(), (y - v).abs())
-        # away from it, where another processor's rounding would carry the ray across
+        # stay away from the fold, where another processor's rounding would carry the ray across
         further = 1 + 32 * torch.finfo(u.dtype).eps
         beyond = times(seen[0], further), times(seen[1], further)
         valid = valid & covered & self.contains(*beyond) & (miss <= rounding(u, v, stretch))
         return torch.where(valid, a, 0.0), torch.where(valid, b, 0.0), valid
 
     def contains(self, a: Tensor, b: Tensor, to_edge: bool = True) -> Tensor:
-        """Bool: what `Domain.margin` says of single points; see `regular`."""
+        """Whether single points are in the domain: `Domain.margin` for them; see `regular`."""
         t = torch.addcmul(a * a, b, b)
-        inside = t < self.domain.inner2[self.camera, 0]
+        inside = t < self.domain.safe_radius_sq[self.camera, 0]
         if self.is_circle:
             return inside
         before = t < self.domain.limits2[self.camera, azimuth(a, b)]
@@ -143,13 +143,13 @@ class _Search:
 
     def radial(self, u: Tensor, v: Tensor) -> Planes2:
         # at the fold itself the root of a rounded fold may lie beyond the rounded limit
-        fold2 = times(self.domain.inner2[self.camera, 0], 1 - 64 * torch.finfo(u.dtype).eps)
+        fold2 = times(self.domain.safe_radius_sq[self.camera, 0], 1 - 64 * torch.finfo(u.dtype).eps)
         assert self.lens.radial is not None
         scale = bracketed(self.lens.radial, torch.addcmul(u * u, v, v), fold2)
         return u * scale, v * scale
 
     def planar(self, u: Tensor, v: Tensor) -> Planes2:
-        """Newton's method; the few that need many steps go on by themselves."""
+        """Run Newton's method; the few points that need many steps go on alone."""
         if self.domain.is_constant:
             return self._newton(u, v, *self._start(u, v), _FIRST_STEPS + _LATE_STEPS)[:2]
         a, b, active = self._newton(u, v, *self._start(u, v), _FIRST_STEPS)
@@ -162,8 +162,8 @@ class _Search:
     def _newton(self, u: Tensor, v: Tensor, a: Tensor, b: Tensor, steps: int) -> Found:
         """Return points, and which of them would still move, after steps that come nearer and stay inside.
 
-        Nearer in Deuflhard's sense: the next step by the same Jacobian is shorter. Where a lens stretches one direction
-        far more than the other, the residual itself would reject every good step.
+        Nearer in Deuflhard's sense means that the next step by the same Jacobian is shorter. If a lens stretches one
+        direction far more than the other, the residual itself would reject every good step.
         """
         enough = rounding(u, v) / 8
 
@@ -179,7 +179,7 @@ class _Search:
             at = self.lens.at(*trial)
             ahead = newton_step(jacobian, u - at.value[0], v - at.value[1])
             nearer = ahead[0] * ahead[0] + ahead[1] * ahead[1] < da * da + db * db
-            # on the way it may be behind the edge, where the formula goes on
+            # on the way a point may be behind the edge, where the formula goes on
             good = active & nearer & self.contains(*trial, to_edge=False)
             new = *trial, *at.value, *at.jacobian
             state = tuple(torch.where(good, n, o) for n, o in zip(new, state, strict=True))
@@ -192,7 +192,7 @@ class _Search:
         return a, b, active
 
     def _start(self, u: Tensor, v: Tensor) -> Planes2:
-        """Return the best of some points that the lens sends as far out as (u, v), their azimuths by secants."""
+        """Return the best of some points that the lens sends as far out as (u, v); secants find their azimuths."""
         target, wanted = (u * u + v * v).sqrt(), torch.atan2(v, u)
         extent = self.domain.extent
 
@@ -202,7 +202,7 @@ class _Search:
             rho = extent.start(self.camera, target, c, s)
             x, y = self.lens(rho * c, rho * s)
             error = (u - x) ** 2 + (v - y) ** 2
-            better = (error < best) & far  # what is close stays, whatever else is in its batch
+            better = (error < best) & far  # a close point does not depend on its batch
             a, b, best = (torch.where(better, n, o) for n, o in ((rho * c, a), (rho * s, b), (error, best)))
             far = far & (best > _CLOSE**2 * target * target)
             off = torch.atan2(x * v - y * u, x * u + y * v)
@@ -217,5 +217,5 @@ class _Search:
 
 
 def rounding(u: Tensor, v: Tensor, stretch: Tensor | float = 0.0) -> Tensor:
-    """How far from (u, v) rounding may leave a lens that `stretch`es the rounding of its solution by so much."""
+    """Return how far from (u, v) rounding may leave a lens that `stretch`es the rounding of its solution by so much."""
     return 32 * torch.finfo(u.dtype).eps * (1 + torch.maximum(u.abs(), v.abs()) + stretch)

@@ -1,4 +1,4 @@
-"""Pixels to rays: the inverse of the lens and what makes a pixel invalid, as it is recorded in graphs, and compiled."""
+"""Pixels to rays: the inverse of the lens and why a pixel is invalid, as recorded in graphs, and compiled."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 class Found(NamedTuple):
-    """Planes (C, N): a point of the chart's plane, positive where it is the solution, positive where one may exist."""
+    """Planes (C, N): a point of the chart's plane, positive if it is the solution, positive if one may exist."""
 
     a: Tensor
     b: Tensor
@@ -34,32 +34,32 @@ class Found(NamedTuple):
 
 
 def invert(domain: Domain, u: Tensor, v: Tensor) -> Found:
-    """Return what the lens sends to (u, v), by a table and Newton's method; what is open is left to `search`."""
+    """Return the points that the lens sends to (u, v), by a table and Newton's method; `search` finds the others."""
     if domain.lens.is_radial:
         return _invert_radial(domain, u, v)
     if domain.all_stagewise:
         return _invert_stagewise(domain, u, v)
-    # in the plane, from the inverse of the radial factor
+    # in the plane, starting from the inverse of the radial factor
     a, b = domain.lens.start(u, v)
     if domain.inverse is not None:
         # a stage may have sent a pixel far off the image out of the floating-point range
         scale = domain.inverse(torch.addcmul(a * a, b, b).nan_to_num(0.0, 0.0))
         a, b = a * scale, b * scale
     inner = _newton(domain.lens, u, v, a, b)
-    # further out than images reach a determinant may overflow, and a step seem short
-    # nor must a ray's rounding carry it across the fold
-    usual2 = times(domain.usual2, 1 - 32 * torch.finfo(u.dtype).eps)
-    inside = usual2 - torch.addcmul(inner.a * inner.a, inner.b, inner.b)
+    # further out than images reach a determinant may overflow, and a step seem short;
+    # and a ray's rounding must not carry it across the fold
+    image_radius_sq = times(domain.image_radius_sq, 1 - 32 * torch.finfo(u.dtype).eps)
+    inside = image_radius_sq - torch.addcmul(inner.a * inner.a, inner.b, inner.b)
     found = inner._replace(solved=torch.minimum(inner.solved, inside))
     if domain.stagewise is None:
         return found
-    # each camera alike, whatever else is in its batch
+    # choose for each camera, so that it does not depend on its batch
     pairs = zip(_invert_stagewise(domain, u, v), found, strict=True)
     return Found(*(torch.where(domain.stagewise, stagewise, planar) for stagewise, planar in pairs))
 
 
 def _invert_stagewise(domain: Domain, u: Tensor, v: Tensor) -> Found:
-    """Invert the later stages first: the radial one alone has a limit. No pixel beyond every ray is solved for."""
+    """Invert the later stages first, as only the radial one has a limit. Pixels beyond every ray are not solved for."""
     first, within = _first_image(domain, u, v)
     found = _invert_radial(domain, first.a, first.b)
     known = first.solved > 0
@@ -69,10 +69,10 @@ def _invert_stagewise(domain: Domain, u: Tensor, v: Tensor) -> Found:
 
 
 def _first_image(domain: Domain, u: Tensor, v: Tensor) -> tuple[Found, Tensor]:
-    """Where the first stage has to send what later ones send to (u, v); and positive within the circle of the image."""
+    """Return the points that the stages after the first one send to (u, v), and a margin of the image's circle."""
     rest = domain.lens.rest
     assert rest is not None
-    within = domain.circle2 - torch.addcmul(u * u, v, v)
+    within = domain.image_circle_sq - torch.addcmul(u * u, v, v)
     mask = to_mask(within)
     u, v = replace(mask, u, 0.0), replace(mask, v, 0.0)
     return _newton(rest, u, v, *rest.start(u, v)), within
@@ -84,11 +84,11 @@ def _invert_radial(domain: Domain, u: Tensor, v: Tensor) -> Found:
     assert radial is not None  # a radial lens has both
     assert table is not None
     possible = times(table.most2, 1 + 8 * eps) - r2
-    # what is beyond the fold would never settle
+    # points beyond the fold would never converge
     r2 = torch.minimum(replace(to_mask(possible), r2, 0.0), table.most2)
     scale, converged = solve(radial, table, r2)
     # a ray's rounding must not carry it across the fold
-    inside = times(domain.inner2, 1 - 32 * eps) - r2 * scale * scale
+    inside = times(domain.safe_radius_sq, 1 - 32 * eps) - r2 * scale * scale
     return Found(u * scale, v * scale, torch.minimum(torch.minimum(converged, inside), possible), possible)
 
 
@@ -98,7 +98,7 @@ def _newton(lens: Lens, u: Tensor, v: Tensor, a: Tensor, b: Tensor) -> Found:
         at = lens.at(a, b)
         x, y = at.value
         da, db, reciprocal = newton_step(at.jacobian, u - x, v - y)
-        if converged is not None:  # what is converged stays, whatever else is in its batch
+        if converged is not None:  # a converged point does not depend on its batch
             da, db = torch.where(converged > 0, 0.0, da), torch.where(converged > 0, 0.0, db)
         a, b = a + da, b + db
         t = torch.addcmul(a * a, b, b)
@@ -110,7 +110,7 @@ def _newton(lens: Lens, u: Tensor, v: Tensor, a: Tensor, b: Tensor) -> Found:
 def attach(lens: Lens, solution: Planes2, target: Planes2, steps: int) -> Planes2:
     """Give a graph-free solution of lens(solution) = target its derivatives, exact up to the order of `steps`.
 
-    Steps of the chord method x <- x - J^-1 (f(x) - y) with the constant Jacobian of the solution. If parameters and
+    It steps by the chord method x <- x - J^-1 (f(x) - y) with the constant Jacobian of the solution. If parameters and
     target move by d, the solution is off by O(d^2) after one step and by O(d^3) after two: its Taylor series agrees
     with that of the implicit function up to that order. The Jacobian itself never enters the graph.
     """
@@ -120,13 +120,13 @@ def attach(lens: Lens, solution: Planes2, target: Planes2, steps: int) -> Planes
     for _ in range(steps):
         x, y = lens(a, b)
         da, db, _ = newton_step((xa, xb, ya, yb), target[0] - x, target[1] - y)
-        # the value stays: next to a fold a step of what rounding left would lead across
+        # the value does not change: next to a fold, a step by the remaining rounding would lead across
         a, b = a + (da - da.detach()), b + (db - db.detach())
     return a, b
 
 
 def _to_target(u: Tensor, v: Tensor, intrinsics: tuple[Tensor, ...]) -> tuple[Planes2, Tensor]:
-    """Return pixels as points (p, q) of the sensor in focal lengths; the centre for NaN or where squares overflow."""
+    """Return pixels as points (p, q) of the sensor in focal lengths; the centre for NaN or if squares overflow."""
     focal_x, focal_y, centre_x, centre_y = intrinsics
     p, q = (u - centre_x) / focal_x, (v - centre_y) / focal_y
     far = torch.maximum(p.detach().abs(), q.detach().abs())
@@ -143,13 +143,13 @@ def _formula(
     cameras: CameraRows | None,
     order: int = 2,
 ) -> tuple[Tensor, Tensor]:
-    """Pixels (C, N, 2) to rays (3, C, N), and valid (C, N); see `Direction.formula`."""
-    usual = Traced.of(model, intrinsics, distortion, cameras)
-    domain = usual.domain
+    """Return rays (3, C, N) for pixels (C, N, 2), and valid (C, N); see `Direction.formula`."""
+    traced = Traced.of(model, intrinsics, distortion, cameras)
+    domain = traced.domain
     u, v = to_planes(pixels)
-    # the solution has no graph; `attach` gives it its derivatives
-    (p, q), mask = _to_target(u.detach(), v.detach(), columns(usual.intrinsics.detach()))
-    mask = mask if usual.usable is None else mask * usual.usable
+    # the solution has no graph; `attach` gives it derivatives
+    (p, q), mask = _to_target(u.detach(), v.detach(), columns(traced.intrinsics.detach()))
+    mask = mask if traced.usable is None else mask * traced.usable
     a, b = p, q = replace(mask, p, 0.0), replace(mask, q, 0.0)
     if domain.lens.stages:
         found = invert(domain, p, q)
@@ -169,7 +169,7 @@ def _formula(
     mask, a, b = mask * solved, replace(solved, a, 0.0), replace(solved, b, 0.0)
 
     def evaluate(u: Tensor, v: Tensor, intrinsics: Tensor, distortion: Tensor) -> Tensor:
-        chart, lens = usual.optics(distortion)
+        chart, lens = traced.optics(distortion)
         (p, q), _ = _to_target(u, v, columns(intrinsics))
         p, q = replace(mask, p, 0.0), replace(mask, q, 0.0)
         here = (p, q) if not lens.stages else attach(lens, (a, b), (p, q), order) if order else (a, b)
@@ -177,14 +177,14 @@ def _formula(
         return torch.stack([replace(mask, w, axis) for w, axis in rays])
 
     order = order_of(order, pixels, intrinsics, distortion)
-    rays = without_keeping(evaluate, u, v, usual.intrinsics, usual.distortion)
+    rays = without_keeping(evaluate, u, v, traced.intrinsics, traced.distortion)
     return rays, positive(mask.expand_as(a))
 
 
 def _keeping(native: Native, pixels: Tensor) -> tuple[Tensor, Tensor, tuple[Tensor, ...]]:
     rays, valid, solution = compiled.unproject(native, pixels, keeps=True)
     assert solution is not None  # it is asked for
-    # a copy: what is handed out belongs to the caller
+    # a copy, as the returned mask belongs to the caller
     return rays, valid, (valid.clone(), solution)
 
 
@@ -192,8 +192,8 @@ UNPROJECT = Direction(_formula, compiled.unproject, _keeping, compiled.unproject
 
 
 def _search_recorded(domain: Domain, target: Planes2, found: Found) -> Found:
-    """`search` for what is left open, as a part of an exported program."""
-    if all(stage.is_affine for stage in domain.lens.stages):  # of which nothing is
+    """Run `search` for points that are left open, as a part of an exported program."""
+    if all(stage.is_affine for stage in domain.lens.stages):  # no point is open then
         return found
     camera, point = (~(found.solved > 0) & (found.possible > 0)).nonzero(as_tuple=True)
     a, b, there = search(domain, camera, *(w[camera, point] for w in target))

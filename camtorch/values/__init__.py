@@ -1,1 +1,1 @@
-"""What everybody uses: arguments, modules, threads."""
+"""The base of all packages: arguments, modules, threads."""

@@ -88,7 +88,7 @@ WRONG = [
         (lambda name=name, given=given: getattr(BARE, name)(*given), ValueError, f"^Pinhole.*{name}.*image_size")
         for name, given in SIZED.items()
     ),
-    (lambda: BARE.width, ValueError, r"^Pinhole: width needs .*image_size"),
+    (lambda: BARE.width, ValueError, r"^Pinhole: image_size must be .* for width"),
     (lambda: BARE.fov, ValueError, "image"),
     (lambda: CAMERA.rays(stride=14), ValueError, r"got 14\. .* \.crop\(0, 0, 476, 630\) .* \.pad\(0, 4, 0, 10\)"),
     (lambda: CAMERA.rays(0), ValueError, "at least 1"),

@@ -168,7 +168,7 @@ static int fuzz(void) {
     cameras.intrinsics = KEPT(filled(d, 4 * c, 100, 300));
     cameras.parameters = KEPT(filled(d, numbers * c, share(), 0));
     cameras.constants = KEPT(filled(d, nodes * c, 1, 1)), cameras.constant_count = nodes;
-    cameras.inner2 = KEPT(filled(d, c, 2, 2)), cameras.usual2 = KEPT(filled(d, c, 2, 2));
+    cameras.safe_radius_sq = KEPT(filled(d, c, 2, 2)), cameras.image_radius_sq = KEPT(filled(d, c, 2, 2));
     if (below(2)) {
         cameras.limits2 = KEPT(filled(d, c * AZIMUTHS, 2, 2));
         cameras.extent = KEPT(filled(d, c * EXTENT, 2, 2));
@@ -177,10 +177,10 @@ static int fuzz(void) {
     if (has_table && cameras.part_count > 2 && below(2)) {
         uint8_t *by_stages = KEPT(malloc((size_t)c));
         for (i = 0; i < c; i++) by_stages[i] = (uint8_t)below(2);
-        cameras.stagewise = by_stages, cameras.circle2 = KEPT(filled(d, c, 2, 2));
+        cameras.stagewise = by_stages, cameras.image_circle_sq = KEPT(filled(d, c, 2, 2));
     }
     if (parts[0].kind == INVERTED) {
-        cameras.chart_inner2 = KEPT(filled(d, c, 2, 2)), cameras.chart_most2 = KEPT(filled(d, c, 2, 2));
+        cameras.chart_safe_radius_sq = KEPT(filled(d, c, 2, 2)), cameras.chart_most2 = KEPT(filled(d, c, 2, 2));
         cameras.chart_table = KEPT(filled(d, c * (2 + 2 * NODES), 1, 1));
     }
     const int has_factor = has_table && parts[1].factor != NO_FACTOR, many = cameras.part_count > 2;
@@ -193,10 +193,10 @@ static int fuzz(void) {
     domain.radii = KEPT(filled(1, MOST_RADII, 3, 3));
     domain.is_chart = parts[0].kind == INVERTED && below(2);
     domain.is_radial = has_factor && !many && !(parts[1].flags & (TANGENTIAL | PRISM));
-    domain.inner2 = KEPT(filled(d, c, 0, 0)), domain.usual2 = KEPT(filled(d, c, 0, 0));
+    domain.safe_radius_sq = KEPT(filled(d, c, 0, 0)), domain.image_radius_sq = KEPT(filled(d, c, 0, 0));
     domain.table = KEPT(filled(d, c * (2 + 2 * NODES), 0, 0));
     if (has_factor && many && !domain.is_chart)
-        domain.circle2 = KEPT(filled(d, c, 0, 0)), domain.stagewise = KEPT(malloc((size_t)c));
+        domain.image_circle_sq = KEPT(filled(d, c, 0, 0)), domain.stagewise = KEPT(malloc((size_t)c));
     if (cameras.part_count > 1 && !domain.is_chart && below(4) == 0) {
         domain.coarse = KEPT(filled(1, RADII / 2, 3, 3)), domain.even = KEPT(filled(1, RADII, 3, 3));
         domain.limits2 = KEPT(filled(d, c * AZIMUTHS, 0, 0)), domain.extent = KEPT(filled(d, c * EXTENT, 0, 0));
