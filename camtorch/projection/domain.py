@@ -92,7 +92,7 @@ class Domain:
         return made
 
     def found_elsewhere(self, tables: Mapping[str, Tensor]) -> Domain:
-        """The same domain with tables by their names, which are known on the CPU, and sent."""
+        """Return this domain with tables by their names, which were made on the CPU and are sent to its device."""
         for name, value in zip(tables, sent([*tables.values()], self.k.device) if tables else (), strict=True):
             setattr(self, name, value)
         by_stages = tables.get("stagewise")

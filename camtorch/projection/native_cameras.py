@@ -277,7 +277,7 @@ class Lenses:
             self.inverse_table()
         if self.plan.has_stages and not self.plan.is_radial:
             self.followed()
-        widths = dict.fromkeys(("inner2", "usual2", "circle2", "stagewise"), 1)
+        widths = dict.fromkeys(("safe_radius_sq", "image_radius_sq", "image_circle_sq", "stagewise"), 1)
         made = {}
         for name, width in {**widths, "table": TABLE_WIDTH, "limits2": AZIMUTHS}.items():
             if (place := getattr(self.struct, name)) is not None:

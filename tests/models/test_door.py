@@ -85,7 +85,7 @@ WRONG = [
     (lambda: CAMERA.crop(0, 0, 0, 10), ValueError, r"^Pinhole.*\(0, 10\)"),
     (lambda: CAMERA.pad(-700, 0, 0, 0), ValueError, r"^Pinhole.*\(480, -60\)"),
     *(
-        (lambda name=name, given=given: getattr(BARE, name)(*given), ValueError, f"^Pinhole.*{name}.*image_size")
+        (lambda name=name, given=given: getattr(BARE, name)(*given), ValueError, f"^Pinhole.*image_size.*{name}")
         for name, given in SIZED.items()
     ),
     (lambda: BARE.width, ValueError, r"^Pinhole: image_size must be .* for width"),
