@@ -153,7 +153,7 @@ class Augmentation(SampleTransform):
         return made
 
     def new_camera(self, source: Camera, values: Mapping[str, Tensor]) -> tuple[Camera, Tensor | None]:
-        """The camera after the change, with an image_size, and the rotation, `ray_after = R ray_before`, or None.
+        """Return the camera after, with an image_size, and the rotation, `ray_after = R ray_before`, or None.
 
         Args:
             source: the camera before, with an image_size; without batch dims, or with those of the values.
@@ -183,7 +183,7 @@ class Augmentation(SampleTransform):
     def drawn(
         self, count: int, p: float, same_on_batch: bool, generator: torch.Generator | None = None
     ) -> dict[str, Tensor]:
-        """`draw` with another p and same_on_batch."""
+        """Draw as `draw` does, with another p and same_on_batch."""
         numbers = self._numbers(count, p, same_on_batch, generator)
         return {
             name: torch.as_tensor(value, dtype=torch.bool if name == "apply" else torch.float64)
@@ -191,7 +191,7 @@ class Augmentation(SampleTransform):
         }
 
     def _numbers(self, count: int, p: float, same_on_batch: bool, generator: torch.Generator | None) -> dict[str, Any]:
-        """The draw as lists, arrays or tensors; see the function `draw`."""
+        """Return the draw as lists, arrays or tensors; see the function `draw`."""
         values, self.__dict__["_spans"] = draw(self.ranges, count, p, same_on_batch, generator, self._spans)
         return values
 
@@ -207,24 +207,28 @@ class Augmentation(SampleTransform):
         if not missing:
             return draw
         if boxes is None:
-            raise ValueError(f"{self._name}: the sample has no boxes, (B, M, 4) pixels x1, y1, x2, y2, to crop one of")
+            raise ValueError(
+                f"{self._name}: the sample must have boxes, (B, M, 4) pixels x1, y1, x2, y2, to crop one of; got none"
+            )
         for i, rows in enumerate(boxes):
             for index in missing.values():
                 if not -len(rows) <= index < len(rows):
-                    raise ValueError(f"{self._name}: sample {i} has {len(rows)} boxes, and none of index {index}")
+                    raise ValueError(
+                        f"{self._name}: sample {i} must have a box of index {index}; got {len(rows)} boxes"
+                    )
         chosen = {name: [rows[index] for rows in boxes] for name, index in missing.items()}
         return {**draw, **{n: torch.stack(rows) if rows else torch.empty(0, 4) for n, rows in chosen.items()}}
 
     def size_after(self, size: tuple[int, int]) -> tuple[int, int]:
-        """(height, width) of what comes out of images of a size."""
+        """Return the (height, width) of new images, of images of a size."""
         return self.image_size or size
 
     def change(self, camera: Camera | Sequence[Camera] | None, draw: Mapping[str, Tensor]) -> Change:
-        """What a draw does to images of `camera` (the augmentation's own if None): a pure function of both."""
+        """Return the change that a draw makes to images of `camera` (None: the augmentation's own)."""
         camera = self.camera if camera is None else camera
         if camera is None:
             how = f"give one here, in the sample, or as {self._name}(camera=...)"
-            raise ValueError(f"{self._name}: no camera; {how}. {GUESS_CAMERA}")
+            raise ValueError(f"{self._name}: camera must be given; got None. Please {how}. {GUESS_CAMERA}")
         return self._changed(as_one(camera), self._checked_draw(draw))
 
     def _changed(self, camera: Camera, draw: Mapping[str, Any]) -> Change:
@@ -262,12 +266,12 @@ class Augmentation(SampleTransform):
         return Change(count, parts, mixed=isinstance(camera, Mixed))
 
     def _checked_draw(self, draw: Mapping[str, Tensor]) -> Mapping[str, Any]:
-        """As arrays, where nothing records what becomes of it."""
+        """Check a draw, and return it as arrays unless it is recorded."""
         as_mapping(draw, "draw", self._name, "what draw() returns")
         missing = [name for name in ("apply", *self.ranges, *self.crops) if name not in draw]
         if missing:
             has = ", ".join(map(str, draw)) or "nothing"
-            raise ValueError(f"{self._name}: the draw lacks {', '.join(missing)}; it has {has}")
+            raise ValueError(f"{self._name}: draw must have {', '.join(missing)}; got {has}")
         sizes = {**{name: interval.size for name, interval in self.ranges.items()}, **dict.fromkeys(self.crops, 4)}
         given = {name: torch.as_tensor(draw[name]) for name in ("apply", *sizes)}
         values: dict[str, Any] = {"apply": given["apply"] > 0.5, **{name: given[name] for name in sizes}}
@@ -318,12 +322,12 @@ class Augmentation(SampleTransform):
         return values
 
     def _new_camera(self, source: Camera, values: Mapping[str, Any]) -> tuple[Camera, Tensor | None]:
-        """`new_camera` of values as drawn."""
+        """Call `new_camera` with values as drawn."""
         return self.new_camera(source, self._like(source, values))
 
     @staticmethod
     def _like(source: Camera, values: Mapping[str, Any]) -> dict[str, Tensor]:
-        """The values as tensors in the source's dtype and on its device."""
+        """Return the values as tensors in the source's dtype and on its device."""
         dtype = torch.promote_types(source.intrinsics.dtype, torch.float32)
         return {n: torch.as_tensor(value, dtype=dtype, device=source.intrinsics.device) for n, value in values.items()}
 
@@ -331,7 +335,7 @@ class Augmentation(SampleTransform):
         return Warp(source, target, rotation, **self.options)
 
     def _seen_through(self, warp: Warp, values: Mapping[str, Tensor]) -> tuple[tuple[Warp, Warp] | None, Tensor | None]:
-        """What the lens does to colours and light: `shades` and `light` of the part of a batch."""
+        """Return `shades` and `light` of a part: the effect of its lens on colours and light."""
         return None, None
 
     def _tell_of_too_few(self, found: Tensor, share: float) -> None:
@@ -340,13 +344,13 @@ class Augmentation(SampleTransform):
             return
         self._warned, few = True, int((found < share).sum())
         warn(
-            f"{self._name}: min_filled={share:g} is out of reach for {few} of {found.numel()} new images, of "
-            f"which down to {float(found.min()):.0%} shows something: the camera of the images does not see along the "
-            "axis of the new one"
+            f"{self._name}: min_filled must be within reach; got {share:g}, and of {few} of {found.numel()} new images "
+            f"down to {float(found.min()):.0%} shows something: the camera of the images does not see along the axis "
+            "of the new one. Turn it less, or use less of min_filled"
         )
 
     def _tell_of_zoom(self, source: Camera, target: Camera, factor: Tensor, found: Tensor) -> None:
-        """What `min_filled` made of a target: the factors (*B,) on its focal lengths, and the parts (*B,) filled."""
+        """Warn of a zoom by `min_filled`, of factors (*B,) on the focal lengths and filled parts (*B,)."""
 
     def tell_of_empty_images(self, camera: Camera) -> None:
         """Warn, once, if new images of such cameras will be mostly empty, as some draws apart from all others say."""
@@ -439,7 +443,7 @@ class Augmentation(SampleTransform):
         else:
             change = self.change(camera, self._of_sample(draw, named))
         if change.count != count:
-            raise ValueError(f"{self._name}: the draw is for {change.count} samples, here are {count}")
+            raise ValueError(f"{self._name}: draw must be for {count} samples; got one for {change.count}")
         if not torch.compiler.is_compiling():
             self.__dict__["_last"] = change  # as nn.Module would, after some questions
             if count and not self._warned and "image" in [found for found, _ in named.values()]:
@@ -474,16 +478,19 @@ class Augmentation(SampleTransform):
             return clips.restored(self.inverse(clips.frames(sample.get("camera")), draw=draw, camera=camera))
         change = self.last if draw is None else self.change(camera, draw)
         if change is None:
-            raise ValueError(f"{self._name}: nothing to invert; call it first, or give draw= and camera=")
+            raise ValueError(
+                f"{self._name}: inverse must have a change to invert; got none. Call it first, or give draw= and "
+                "camera="
+            )
         if "camera" in sample and not change.leads_to(sample["camera"]):
             raise ValueError(
-                f"{self._name}: the sample's camera {sample['camera']!r:.60} is not the one that this change made: "
-                "the sample is of another call, whose draw= and the camera= before it are wanted"
+                f"{self._name}: the sample's camera must be the one that this change made; got "
+                f"{sample['camera']!r:.60}. If the sample is of another call, pass its draw= and the camera= before it"
             )
         return self.moved_by(change.inverse(), sample, predicted=True)
 
     def _of_sample(self, draw: Mapping[str, Any], named: Named) -> Mapping[str, Any]:
-        """A draw with what it needs of a sample: boxes are those of that name, or the first of that kind."""
+        """Add to a draw the boxes that it needs of a sample: those named `boxes`, or the first of that kind."""
         if not self.crops:
             return draw
         found: dict[str, Any] = {name: value for name, (kind, value) in named.items() if kind == "boxes"}
@@ -499,7 +506,7 @@ class Augmentation(SampleTransform):
         return {**self.__dict__, "_last": None}
 
     def extra_repr(self) -> str:
-        """What is drawn from, and the options."""
+        """Show the ranges and the options."""
         parts = [f"{name}={interval}" for name, interval in self.ranges.items()]
         options = {"p": self.p, "same_on_batch": self.same_on_batch, **self.options, "min_filled": self.min_filled}
         return ", ".join(parts + [f"{name}={value!r}" for name, value in options.items()])

@@ -73,7 +73,7 @@ class Drawn:
         return remade(self.base, intrinsics=numbers, distortion=k, image_size=self.image_size)
 
     def warp(self, source: Camera) -> Warp:
-        """From the camera before."""
+        """Return the warp from the camera before."""
         if self.made is None:
             self.made = MirrorWarp(source, self.target, self.rotation, **self.options)
         return self.made
@@ -111,19 +111,19 @@ class Part:
         return self.moves.image_size if isinstance(self.moves, Drawn) else self.target._size_for("Warp")
 
     def between(self) -> tuple[Native, Native, Tensor | None] | None:
-        """Both cameras and the rotation for compiled code; None where it takes more than that."""
+        """Return both cameras and the rotation for compiled code; None if it takes more than that."""
         if isinstance(self.moves, Drawn):
             start, end = self.moves.start, self.moves.native
             return None if start is None or end is None else (start, end, self.moves.rotation)
         return None if self.moves is None or self.shades or self.light is not None else between_of(self.warp)
 
     def by(self, change: Callable[[Warp], Warp]) -> Part:
-        """The part with each of its warps changed."""
+        """Return the part with each of its warps changed."""
         shades = None if self.shades is None else (change(self.shades[0]), change(self.shades[1]))
         return replace(self, moves=None if self.moves is None else change(self.warp), shades=shades)
 
     def take(self, index: list[int]) -> Part:
-        """These rows of the part, as all there is."""
+        """Return these rows of the part as a part of its own."""
         camera = _rows_of(self.camera, index)
         light = self.light if self.light is None or len(self.light) == 1 else self.light[index]
 
@@ -135,7 +135,7 @@ class Part:
 
 
 def _rows_of(camera: Camera, index: list[int]) -> Camera:
-    """The cameras of these rows; one without batch dims serves all of them."""
+    """Return the cameras of these rows; one without batch dims serves all of them."""
     return camera[index] if camera.batch_shape else camera
 
 
@@ -155,8 +155,8 @@ def _joined(a: Part, b: Part) -> Part:
     if not isinstance(b.moves, AffineWarp):
         if a.shades is not None or a.light is not None:
             raise ValueError(
-                "Compose: the colours or the light of one lens would be seen through another; chromatic and vignetting "
-                "go to the last lens of a chain"
+                "Compose: chromatic and vignetting must be those of the last lens of a chain; got an earlier one, "
+                "whose colours or light would be seen through another lens"
             )
         if isinstance(b.moves, Drawn) and not a.camera.batch_shape:
             start = a.moves.start if isinstance(a.moves, Drawn) else _single(a.camera)
@@ -174,7 +174,7 @@ def _joined(a: Part, b: Part) -> Part:
 
 
 def _single(camera: Camera) -> Native | None:
-    """A single camera for compiled code; None where that does not do."""
+    """Return a single camera for compiled code; None if it cannot evaluate it."""
     if seam_of(camera) is not None or not are_numbers(*camera._tensors):
         return None
     rows = rows_of(camera, *camera._tensors)
@@ -289,12 +289,14 @@ class Change:
         return None if known_true(~rows) else rows
 
     def then(self, second: Change) -> Change:
-        """This change, and then another one of the cameras that this one ends with, by single warps.
+        """Return this change followed by one of the cameras that it ends with, by single warps.
 
         What the cameras in between did not see is seen, if the first one and the last one do.
         """
         if self.gate is not None or second.gate is not None:
-            raise ValueError("Compose: what is compiled needs p=1 of all but edits, as it may not look at draws")
+            raise ValueError(
+                "Compose: compiled code must have p=1 of all but edits, as it may not look at draws; got less"
+            )
         mixed = self.mixed or second.mixed
         if all(part.rows is None for part in (*self.parts, *second.parts)):
             return Change(self.count, [_joined(self.parts[0], second.parts[0])], mixed=mixed)
@@ -313,7 +315,7 @@ class Change:
         return Change(self.count, parts, mixed=mixed)
 
     def with_options(self, options: Options) -> Change:
-        """The change with its warps made anew by other options."""
+        """Return the change with its warps made anew by other options."""
 
         def optioned(warp: Warp) -> Warp:
             if isinstance(warp, MirrorWarp) and warp.options == options:
@@ -328,14 +330,14 @@ class Change:
         return Change(self.count, parts, mixed=self.mixed, gate=self.gate)
 
     def row(self, i: int) -> Change:
-        """The change of one sample."""
+        """Return the change of one sample."""
         for part in self.parts:
             if part.rows is None or i in part.rows:
                 return Change(1, [part.take([i if part.rows is None else part.rows.index(i)])])
-        raise IndexError(f"Change: no row {i}; it is of {self.count} samples")
+        raise IndexError(f"Change: row must be one of {self.count} samples; got {i}")
 
     def inverse(self) -> Change:
-        """The change back. What left the image stays lost, and the light of the lens stays as it is."""
+        """Return the change back. Pixels that left the image stay lost, and the light of the lens stays as it is."""
         if self._inverse is not None:  # with the maps that it has made
             return self._inverse
         parts = [
@@ -348,7 +350,7 @@ class Change:
     def each(
         self, value: Tensor, move: Callable[[Part, Tensor], Moved], stay: Callable[[Camera, Tensor], Moved]
     ) -> Moved:
-        """`move(part, rows)` of every part's rows of `value`, and `stay(camera, rows)` where nothing moves.
+        """Return `move(part, rows)` of every part's rows of `value`, and `stay(camera, rows)` if nothing moves.
 
         Both give a tensor, or a pair of tensors.
         """
@@ -368,7 +370,7 @@ class Change:
         return moved
 
     def images(self, images: Tensor, **options: Any) -> Tensor:
-        """Images (count, C, H, W), with the colours and the light of the lens; options as of `Warp.forward`."""
+        """Move images (count, C, H, W), with the colours and the light of the lens; options as of `Warp.forward`."""
 
         def move(part: Part, rows: Tensor) -> Tensor:
             warp = part.warp
@@ -384,7 +386,7 @@ class Change:
         return self.each(images, move, _as_is)
 
     def labels(self, masks: Tensor, fill: float = 0.0, mode: Mode = "nearest") -> Tensor:
-        """Masks (count, C, H, W) of any dtype, the nearest value of each; `fill` where nothing is seen."""
+        """Move masks (count, C, H, W) of any dtype by their nearest values; unseen pixels are `fill`."""
 
         def move(part: Part, rows: Tensor) -> Tensor:
             return part.warp.pin().forward(rows, mode=mode, padding_mode="zeros", fill=fill)
@@ -392,7 +394,7 @@ class Change:
         return self.each(masks, move, _as_is)
 
     def valid_mask(self) -> Tensor:
-        """(count, 1, H', W') bool: where the images show something."""
+        """Return the pixels at which the images show something, (count, 1, H', W') bool."""
         camera = self.parts[0].camera
         shape = self.count, 1, camera.height, camera.width
         everywhere = torch.ones(shape, dtype=torch.bool, device=camera.intrinsics.device)
@@ -401,7 +403,7 @@ class Change:
         )
 
     def points(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
-        """Pixels (count, *N, 2), and valid (count, *N): on the image."""
+        """Move pixels (count, *N, 2), and return valid (count, *N): on the image."""
 
         def stay(camera: Camera, rows: Tensor) -> tuple[Tensor, Tensor]:
             return rows, camera.contains(rows)
@@ -409,7 +411,7 @@ class Change:
         return self.each(pixels, lambda part, rows: part.warp.transform_points(rows), stay)
 
     def boxes(self, boxes: Tensor) -> tuple[Tensor, Tensor]:
-        """Boxes (count, *N, 4) of x1, y1, x2, y2, and valid (count, *N)."""
+        """Move boxes (count, *N, 4) of x1, y1, x2, y2, and return valid (count, *N)."""
 
         def stay(camera: Camera, rows: Tensor) -> tuple[Tensor, Tensor]:
             limits = rows.new_tensor((camera.width, camera.height)) - 0.5
@@ -419,7 +421,7 @@ class Change:
         return self.each(boxes, lambda part, rows: part.warp.transform_boxes(rows), stay)
 
     def quadrilaterals(self, corners: Tensor) -> tuple[Tensor, Tensor]:
-        """Quadrilaterals (count, *N, 4, 2): the corners of the boxes that enclose them, and valid (count, *N)."""
+        """Move quadrilaterals (count, *N, 4, 2) to corners of enclosing boxes, and return valid (count, *N)."""
 
         def move(part: Part, rows: Tensor) -> tuple[Tensor, Tensor]:
             enclosing, valid = part.warp.enclose(rows)
@@ -433,7 +435,7 @@ class Change:
     def rays(
         self, rays: Tensor, read: Callable[[Tensor], Tensor] = _same, write: Callable[[Tensor], Tensor] = _same
     ) -> Tensor:
-        """Directions and points (count, *N, 3) of the camera frame: they turn, their lengths stay.
+        """Turn directions and points (count, *N, 3) of the camera frame; their lengths stay.
 
         What has another form is read as rays, and written in its form again.
         """
@@ -452,7 +454,7 @@ class Change:
         return self.each(rays, move, _as_is)
 
     def positions(self, points: Tensor) -> Tensor:
-        """Points (count, *N, 3) of the camera frame: as `rays`, and those of a camera that moves shift."""
+        """Move points (count, *N, 3) of the camera frame: they turn, and shift if the camera moves."""
 
         def move(part: Part, rows: Tensor) -> Tensor:
             if isinstance(part.moves, ShiftedWarp):
@@ -462,7 +464,7 @@ class Change:
         return self.each(points, move, _as_is)
 
     def distance(self, distance: Tensor) -> Tensor:
-        """Distance from the camera (count, C, H, W); 0 where nothing is known."""
+        """Move distances from the camera (count, C, H, W); unknown ones are 0."""
 
         def move(part: Part, rows: Tensor) -> Tensor:
             warp = part.warp
@@ -473,13 +475,13 @@ class Change:
         return self.each(distance, move, _as_is)
 
     def depth(self, depth: Tensor) -> Tensor:
-        """Depth along z (count, 1, H, W), positive in front; 0 where nothing is known.
+        """Move depths along z (count, 1, H, W), positive in front; unknown ones are 0.
 
         Edits leave values as they are; another lens or mount sees the same distance at another depth.
         """
 
         def ahead(camera: Camera, like: Tensor) -> Tensor:
-            """(n or 1, 1, H, W): the z of every pixel's ray, 0 without one."""
+            """Return the z of every pixel's ray, (n or 1, 1, H, W); 0 without a ray."""
             rays, valid = camera.rays()
             z = (rays[..., 2] * valid).to(like)
             return z.reshape(-1, 1, *z.shape[-2:])
@@ -510,12 +512,12 @@ def by_kinds(
 
 
 def as_one(camera: Camera | Sequence[Camera]) -> Camera:
-    """One camera or a batch as it is, and a list of single ones as a batch."""
+    """Return one camera or a batch as it is, and a list of single ones as a batch."""
     return camera if isinstance(camera, Camera) else Mixed(camera)
 
 
 def alone(camera: Camera) -> Camera:
-    """A batch of one as the camera that it holds, which serves any number of samples."""
+    """Return a batch of one as the camera that it holds, which serves any number of samples."""
     return camera[0] if camera.batch_shape == (1,) else camera
 
 
@@ -528,7 +530,7 @@ def _is_proper(rotation: Tensor) -> bool:
 
 
 def _is_mirror(rotation: Tensor) -> Tensor:
-    """(*B,) bool: whether (*B, 3, 3) has a negative determinant, without the many steps of torch's own."""
+    """Whether matrices (*B, 3, 3) have a negative determinant, (*B,); torch's own takes many steps."""
     x, y, z = rotation.unbind(-2)
     negative: Tensor = (torch.linalg.cross(x, y) * z).sum(-1) < 0
     return negative
@@ -556,8 +558,8 @@ def check_sizes(sizes: Iterable[tuple[int, int]], owner: str = "Change") -> None
     found = set(sizes)
     if len(found) > 1:
         raise ValueError(
-            f"{owner}: samples of one batch would come out in the sizes {sorted(found)}; same_on_batch=True "
-            "moves all alike, with p < 1 the size must stay, and single samples may be of any size"
+            f"{owner}: samples of one batch must come out in one size; got {sorted(found)}. same_on_batch=True moves "
+            "all alike, with p < 1 the size must stay, and single samples may be of any size"
         )
 
 
@@ -567,7 +569,7 @@ def gated(gate: Tensor, moved: Tensor, kept: Tensor) -> Tensor:
 
 
 def _chosen(gate: Tensor, target: Camera, source: Camera) -> Camera:
-    """(n,) of two cameras of one kind, the target where the gate (n,) is open."""
+    """Return cameras (n,): the target if the gate (n,) is open, else the source."""
     gate = gate.to(target.intrinsics.device).unsqueeze(-1)
     return remade(
         target,
@@ -577,7 +579,7 @@ def _chosen(gate: Tensor, target: Camera, source: Camera) -> Camera:
 
 
 def _both(function: Callable[[tuple[Tensor, ...]], Tensor], *results: Moved) -> Moved:
-    """`function` of the results, or of the first and of the second ones where each is a pair."""
+    """Apply a function to the results, or to the first and to the second ones if they are pairs."""
     if isinstance(results[0], tuple):
         first, second = (function(pieces) for pieces in zip(*results, strict=True))
         return first, second

@@ -62,7 +62,7 @@ _LIMITS: dict[str, dict[str, Any]] = {
 }
 """Of each range, in the order in which they are drawn."""
 _EXACT = "fov", "crop", "vignetting", "cos4"
-"""A single number of these means just that number."""
+"""Return a single number as a range of only that number."""
 _AUTO = "focal", "centre", "distortion", "crop"
 _told: set[tuple[object, ...]] = set()
 
@@ -113,7 +113,9 @@ class CameraDrawer(Augmentation):
         self._is_real = isinstance(like, str) and like == _REAL
         self.like = None if self._is_real else _as_like(like, self._name)
         if self.like is not None and self.like.image_size is None and fov is None:
-            raise ValueError(f"{self._name}: like={like!r} says nothing of the field of view; give fov=(low, high)")
+            raise ValueError(
+                f"{self._name}: like must have an image_size, or fov be given; got like={like!r}. Pass fov=(low, high)"
+            )
         usual = {} if self._is_real else self._usual_ranges
         values = {n: usual.get(n) if n in _AUTO and isinstance(v, str) and v == "auto" else v for n, v in given.items()}
         values |= {"chromatic": chromatic, "vignetting": vignetting, "cos4": cos4}
@@ -146,7 +148,7 @@ class CameraDrawer(Augmentation):
         super().__setstate__(state)  # type: ignore[no-untyped-call]
 
     def new_camera(self, source: Camera, values: Mapping[str, Tensor]) -> tuple[Camera, Tensor | None]:
-        """The new camera and its turn, by formulas of torch; see `Augmentation.new_camera`."""
+        """Return the new camera and its turn, by formulas of torch; see `Augmentation.new_camera`."""
         base, sized, reach = self._base(source, values.get("lens"))
         height, width = size = self._size_of(source)
         fx, fy, cx, cy = (_as_wide(base, sized, values["fov"], width) if "fov" in values else sized).unbind(-1)
@@ -342,14 +344,14 @@ class CameraDrawer(Augmentation):
             return
         _told.add(key)
         warn(
-            f"{self._name}: asked for fov={asked:g} degrees at least, an image is {float(made[less].min()):.0f} wide: "
-            f"min_filled={share:g} zooms until so much of it is filled, and the camera of the images, "
-            f"{float(source.fov[..., 0].max()):.0f} degrees wide, shows no more where the new one looks. fov='source' "
-            "asks for what it has; with min_filled=0 the rest stays empty"
+            f"{self._name}: fov must be {asked:g} degrees at least; got an image {float(made[less].min()):.0f} degrees "
+            f"wide: min_filled={share:g} zooms until so much of it is filled, and the camera of the images, "
+            f"{float(source.fov[..., 0].max()):.0f} degrees wide, shows no more in that direction. Pass fov='source' "
+            "for as much as it has, or min_filled=0 to leave the rest empty"
         )
 
     def _size_of(self, source: Camera) -> tuple[int, int]:
-        """(height, width) of the new images."""
+        """Return the (height, width) of the new images."""
         return self.image_size or source.image_size or source._size_for(self._name)
 
     def _base(self, source: Camera, share: Any) -> tuple[Camera, Tensor, Tensor | None]:
@@ -369,7 +371,7 @@ class CameraDrawer(Augmentation):
         return base, sized, reach
 
     def _nominal(self, base: Camera, sized: Tensor, size: tuple[int, int], values: Mapping[str, Any]) -> Tensor:
-        """(*B, 4): graph-free intrinsics of the lens, with the field of view in the middle of the range."""
+        """Return intrinsics (*B, 4) without a graph, with the field of view in the middle of the range."""
         if "fov" not in values:
             return sized.detach().to(base.intrinsics.dtype)
 
@@ -380,7 +382,7 @@ class CameraDrawer(Augmentation):
         return self._memo(base._tensors, ("nominal", type(base), base.image_size, size, self.ranges["fov"]), made)
 
     def _from_source(self, source: Camera, base: Camera, size: tuple[int, int]) -> Tensor:
-        """(*B, 4): intrinsics of the lens at most as wide as its like and as images of the source fill all of."""
+        """Return intrinsics (*B, 4) of the lens, at most as wide as its like, whose images the source fills."""
 
         def narrowed() -> Tensor:
             sized = _sized(base, size)
@@ -451,7 +453,9 @@ def _as_wide(base: Camera, sized: Tensor, fov: Tensor, width: int) -> Tensor:
         rays = rays.expand(*broadcast_shapes(rays.shape, (*base.batch_shape, 2, 3)))
     pixels, valid = base.project(rays)
     if known_false(valid):
-        raise ValueError(f"fov: a {base.key} lens of these coefficients does not reach {float(fov.max()):g} degrees")
+        raise ValueError(
+            f"fov must be within the reach of a {base.key} lens of these coefficients; got {float(fov.max()):g} degrees"
+        )
     ratio = width / (pixels[..., 1, 0] - pixels[..., 0, 0])
     focal = precise(base.intrinsics)[..., :2] * ratio.unsqueeze(-1)
     return torch.cat(torch.broadcast_tensors(focal, sized[..., 2:]), -1)
@@ -477,7 +481,7 @@ def _as_like(like: Camera | str | None, owner: str) -> Camera | None:
 
 
 def _across(camera: Camera) -> Tensor:
-    """(*B,) degrees between the left and the right edge of the image, at the height of the principal point."""
+    """Return the degrees (*B,) from the left to the right edge of the image, at the height of the principal point."""
     cy = camera.intrinsics[..., 3].detach()
     u = torch.stack((torch.full_like(cy, -0.5), torch.full_like(cy, camera.width - 0.5)), -1)
     pixels = torch.stack((u, cy[..., None].expand_as(u)), -1)
@@ -487,5 +491,5 @@ def _across(camera: Camera) -> Tensor:
 
 
 def _pair(value: RangeLike | str | None) -> RangeLike | str | None:
-    """A single number of these means just that number."""
+    """Return a single number as a range of only that number."""
     return (value, value) if isinstance(value, (int, float)) else value

@@ -95,7 +95,7 @@ class Start:
         nominal: Tensor | None,
         share: float | None,
     ):
-        """Of intrinsics `sized`, (4,) or (B, 4) in float64, before images of a size.
+        """Start from intrinsics `sized`, (4,) or (B, 4) in float64, for images of a size.
 
         reach: see `lenses.drawing.Lenses`. names: of the values that are drawn. nominal: intrinsics (*B, 4) of the lens
         by which coefficients are measured, if they move. share: of each image that has to be filled, if any has to.
@@ -219,7 +219,9 @@ class Start:
         while (left := _run(call)) & ~_NO_CAMERA:
             if left & _TOO_WIDE:
                 widest = np.max(values["fov"])
-                raise ValueError(f"fov: a {base.key} lens of these coefficients does not reach {widest:g} degrees")
+                raise ValueError(
+                    f"fov must be within the reach of a {base.key} lens of these coefficients; got {widest:g} degrees"
+                )
             if left & _LEFT_BASE:
                 native.follow()
             if left & _LEFT_SOURCE:

@@ -127,7 +127,7 @@ def _sent(parts: Sequence[Part], device: torch.device) -> list[Part]:
 
 
 def _cameras(part: Part) -> list[Camera]:
-    """The cameras of a part: before, and after, of each colour."""
+    """Return the cameras of a part: before, and after, of each colour."""
     if part.moves is None:
         return [part.camera]
     return [part.camera, part.target, *(warp.target for warp in part.shades or ())]

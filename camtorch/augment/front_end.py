@@ -41,7 +41,7 @@ def check_single(
     for name, size in sizes:
         if size != camera.image_size:
             raise ValueError(
-                f"{owner}: {name} is {size} (height, width), but the camera's image_size is {camera.image_size}. "
+                f"{owner}: {name} must be of the camera's image_size {camera.image_size}; got {size} (height, width). "
                 "camera.resize, .crop and .pad give the camera of an edited image"
             )
     return camera.image_size
@@ -57,6 +57,6 @@ def camera_of_sample(
         camera = Unknown.of((height, width))
     if not isinstance(camera, Camera):
         how = "give one here, in the sample, or to the augmentation"
-        raise ValueError(f"{owner}: no camera; {how}; got {shown(camera)}. {GUESS_CAMERA}")
+        raise ValueError(f"{owner}: camera must be a Camera; got {shown(camera)}. Please {how}. {GUESS_CAMERA}")
     check_single(owner, camera, sizes)
     return camera

@@ -155,13 +155,13 @@ def kind_of(name: str, value: object, own: Mapping[str, str], owner: str, single
     if base is None and _may_be_geometry(name, value, single):
         if isinstance(value, Mapping):
             raise ValueError(
-                f"{owner}: {name!r} holds real numbers in a dict, and fields move only at the top of samples. Put them "
-                f"there, or keep the dict with fields={{{name!r}: '{KEEP}'}}"
+                f"{owner}: fields that move must be at the top of samples; got real numbers in the dict {name!r}. "
+                f"Put them there, or keep the dict with fields={{{name!r}: '{KEEP}'}}"
             )
         close = _close_to(name)
         meant = f"Did you mean {close[0]!r}? " if close else ""
         raise ValueError(
-            f"{owner}: {name!r} holds real numbers, and must have a kind, by which they move with the camera. {meant}"
+            f"{owner}: {name!r} must have a kind, by which its numbers move with the camera; got real numbers. {meant}"
             f"Pass fields={{{name!r}: KIND}}, with KIND one of {', '.join(KINDS)} or {KEEP}"
         )
     return base

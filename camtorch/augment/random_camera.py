@@ -125,14 +125,14 @@ class RandomMount(CameraDrawer):
         **options: Unpack[LensOptions],
     ):
         if isinstance(fov, str):
-            raise ValueError(f"{type(self).__name__}: the lens stays, so fov is a range of degrees; got {fov!r}")
+            raise ValueError(f"{type(self).__name__}: fov must be a range of degrees, as the lens stays; got {fov!r}")
         super().__init__(None, {"yaw": yaw, "pitch": pitch, "roll": roll, "zoom": zoom, "fov": fov}, **options)
         if shift is None:
             return
         if isinstance(shift, (str, int, float)) or len(shift) != len(_SHIFTS):
             raise TypeError(f"{self._name}: shift must be three lengths or ranges (dx, dy, dz); got {shift!r}")
         if "chromatic" in self.ranges:
-            raise ValueError(f"{self._name}: with shift there is no chromatic")
+            raise ValueError(f"{self._name}: chromatic must be None with shift; got a range")
         for name, each in zip(_SHIFTS, shift, strict=True):
             self.ranges[name] = as_range(each, "shift", self._name)
 
@@ -145,8 +145,8 @@ class RandomMount(CameraDrawer):
                 if found == field and isinstance(value, Tensor):
                     return {**draw, key: value if value.ndim == 4 else value[:, None]}
         raise ValueError(
-            f"{self._name}: shift moves the camera, and near things against far ones: the sample needs depth (B, 1, H, "
-            f"W) or distance; it has {', '.join(named)}. Without it yaw, pitch, roll and zoom are exact"
+            f"{self._name}: with shift the sample must have depth (B, 1, H, W) or distance, as near things shift "
+            f"against far ones; got {', '.join(named)}. Without shift, yaw, pitch, roll and zoom are exact"
         )
 
     def _checked_draw(self, draw: Mapping[str, Tensor]) -> Mapping[str, Any]:
@@ -157,7 +157,10 @@ class RandomMount(CameraDrawer):
             return super()._part(rows, source, draw)
         key = next((key for key in reversed(_DEPTHS) if key in draw), None)
         if key is None:
-            raise ValueError(f"{self._name}: shift needs the sample's depth; call the augmentation with the sample")
+            raise ValueError(
+                f"{self._name}: draw must have the sample's depth for shift; got none. Call the augmentation with "
+                "the sample"
+            )
         part = super()._part(rows, source, {name: v for name, v in draw.items() if name not in (*_SHIFTS, key)})
         shifts = [torch.as_tensor(draw[name], dtype=torch.float64) for name in _SHIFTS]
         shift = torch.stack(shifts, -1).expand(len(draw["apply"]), 3)

@@ -37,7 +37,7 @@ class Range:
 
     @property
     def middle(self) -> float:
-        """Between both ends."""
+        """The number between both ends."""
         return (self.low + self.high) / 2
 
     def __str__(self) -> str:
@@ -103,7 +103,7 @@ class Spans:
         return {n: [*values[at]] if shape is None else [[*values[at]]] for n, at, shape in self._places}
 
     def of(self, shares: Any) -> dict[str, Any]:
-        """The values (rows,) or (rows, size) at shares (total,) of their ranges, arrays or tensors."""
+        """Return the values (rows,) or (rows, size) at shares (total,) of their ranges, arrays or tensors."""
         low: Any = self.low
         wide: Any = self.wide
         if isinstance(shares, Tensor):

@@ -87,7 +87,7 @@ class Unknown(Pinhole):
 
     @classmethod
     def of(cls, size: tuple[int, int]) -> Unknown:
-        """For images of a size."""
+        """Make one for images of a size."""
         return cls(torch.tensor([1.0, 1.0, 0.0, 0.0]), image_size=size).requires_grad_(False)
 
 
@@ -191,7 +191,7 @@ class SampleTransform(KeepsCamera, nn.Module):
         self.fields: dict[str, str] = dict(as_mapping(fields, "fields", self._name, "{'lidar': 'points'}"))
         wrong = {k: v for k, v in self.fields.items() if v not in (*KINDS, KEEP)}
         if wrong:
-            raise ValueError(f"{self._name}: fields maps names to {', '.join(KINDS)} or {KEEP}; got {wrong}")
+            raise ValueError(f"{self._name}: fields must map names to {', '.join(KINDS)} or {KEEP}; got {wrong}")
         self.options: Options = as_options(self._name, mode, padding_mode, fill, antialias, tolerance)
         # None where each warp says
         self.antialias: bool | None = None if antialias is None else self.options["antialias"]
@@ -231,35 +231,36 @@ class SampleTransform(KeepsCamera, nn.Module):
     needs_camera: bool = True  # whether samples, or it, need a camera; edits do not
 
     def _camera_of(self, named: Named) -> Camera:
-        """The camera of a sample that has none, nor the augmentation."""
+        """Return the camera of a sample that has none, nor the augmentation."""
         how = f"give one as sample['camera'] or {self._name}(camera=...)"
         if self.needs_camera:
-            raise ValueError(f"{self._name}: no camera; {how}. {GUESS_CAMERA}")
+            raise ValueError(f"{self._name}: the sample must have a camera; got none. Please {how}. {GUESS_CAMERA}")
         for name, (found, value) in named.items():
             first = value[0] if isinstance(value, list) and value else value
             if found == "image" and isinstance(first, Tensor) and first.shape[-1] <= 4 < first.shape[-3:][0]:
                 raise ValueError(
-                    f"{self._name}: {name} is {tuple(first.shape)}, which seems to have its channels last; they come "
-                    f"first, (B, C, H, W), and camtorch.augment.numpy takes arrays as they are. A camera tells: {how}"
+                    f"{self._name}: {name} must have its channels first, (B, C, H, W); got {tuple(first.shape)}, which "
+                    "seems to have them last. camtorch.augment.numpy takes arrays as they are; if they are first, "
+                    f"{how}"
                 )
             if found in IMAGES:
                 items = value if isinstance(value, list) else [value]
                 self._check_one_size(name, {(one.shape[-2], one.shape[-1]) for one in items})
                 return Unknown.of((items[0].shape[-2], items[0].shape[-1]))
         raise ValueError(
-            f"{self._name}: the sample holds neither an image nor a camera, and how large the image is decides where "
-            f"labels go; {how}"
+            f"{self._name}: the sample must have an image or a camera, as labels move by the image's size; got "
+            f"{', '.join(named)}. For a camera, {how}"
         )
 
     def _held(self, name: str) -> Camera | None:
-        """A camera of its own, from the dict where it lies: `nn.Module` looks into all."""
+        """Return a camera of its own from the dict that holds it; `nn.Module` looks into all."""
         return cast("Camera | None", self._modules.get(name))
 
     def _given(self, sample: Mapping[str, object] | None, fields: Mapping[str, object]) -> Sample:
-        """The sample and the keyword arguments as one dict."""
+        """Return the sample and the keyword arguments as one dict."""
         if not (sample is None or hasattr(sample, "keys")):
             got = type(sample).__name__
-            raise TypeError(f"{self._name}: a sample is a dict of fields, or keywords, as in image=...; got {got}")
+            raise TypeError(f"{self._name}: a sample must be a dict of fields, or keywords, as in image=...; got {got}")
         return sample if isinstance(sample, Single) and not fields else {**({} if sample is None else sample), **fields}
 
     def _clips(self, sample: Sample, kinds: Mapping[str, str] | None = None) -> Clips | None:
@@ -278,7 +279,7 @@ class SampleTransform(KeepsCamera, nn.Module):
         return Clips(sample, [name for name in given if name in own], shape, images[0], self._name)
 
     def _sorted(self, sample: Sample, fields: Mapping[str, str], single: bool = False) -> Named:
-        """The fields that move."""
+        """Return the fields that move."""
         named: Named = {}
         for name, value in sample.items():
             if name in OWN or value is None:
@@ -323,7 +324,7 @@ class SampleTransform(KeepsCamera, nn.Module):
         return Batch({name: (found, sample[name].unsqueeze(0)) for name, found in form.fields}, form, camera)
 
     def _form_of(self, sample: Sample, camera: object, fields: Mapping[str, str]) -> tuple[Any, ...] | None:
-        """All that the fields of a sample are checked for but their values; None where that is more than tensors."""
+        """Return all that is checked of a sample's fields but their values; None if they are more than tensors."""
         if not isinstance(camera, Camera) or camera.is_mixed or not are_free():
             return None
         intrinsics, distortion = camera._tensors
@@ -349,7 +350,7 @@ class SampleTransform(KeepsCamera, nn.Module):
     def _checked_batch(self, sample: Sample, camera: Any, fields: Mapping[str, str], predicted: bool) -> Batch:
         named = self._sorted(sample, fields)
         if not named:
-            raise ValueError(f"{self._name}: the sample has no field that moves; known are {', '.join(KINDS)}")
+            raise ValueError(f"{self._name}: the sample must have a field that moves; got none of {', '.join(KINDS)}")
         camera = self._camera_of(named) if camera is None else camera
         batched = not isinstance(sample, Single) and is_batch(named, camera)
         if not batched:
@@ -372,7 +373,7 @@ class SampleTransform(KeepsCamera, nn.Module):
             own = len(items) if several else items[0].shape[0] if batched else 1
             named[name], count = (found, value), own if count < 0 else count
             if own != count:
-                raise ValueError(f"{self._name}: {name} is of {own} samples, other fields are of {count}")
+                raise ValueError(f"{self._name}: {name} must be of {count} samples, as other fields; got {own}")
         self._check_cameras(camera, count, named, batched)
         held = {name: v for name, (_, value) in named.items() for v in (value if isinstance(value, list) else [value])}
         check_devices(self._name, **held)
@@ -387,18 +388,23 @@ class SampleTransform(KeepsCamera, nn.Module):
         several = isinstance(camera, (list, tuple))
         cameras: list[Any] = list(camera) if several else [camera]  # type: ignore[call-overload]
         if not cameras:
-            raise ValueError(f"{self._name}: an empty list of cameras; no samples have one camera, too")
+            raise ValueError(
+                f"{self._name}: camera must be a camera or a list of some; got an empty list. Samples may be none "
+                "with one camera"
+            )
         if several and len(cameras) != count:
-            raise ValueError(f"{self._name}: {len(cameras)} cameras for {count} samples")
+            raise ValueError(f"{self._name}: camera must have one for each of {count} samples; got {len(cameras)}")
         for i, one in enumerate(cameras):
             name = f"camera[{i}]" if several else "camera"
             if not isinstance(one, Camera):
                 raise TypeError(f"{self._name}: {name} must be a Camera; got {no_camera(one)}")
             if one.image_size is None:
-                raise ValueError(f"{self._name}: {name} needs an image_size=(height, width)")
+                raise ValueError(f"{self._name}: {name} must have an image_size=(height, width); got None")
             shape = tuple(one.batch_shape)
             if shape not in ((), (1,), (count,)) or (shape and len(cameras) > 1):
-                raise ValueError(f"{self._name}: {name} has batch dims {shape}, the samples are {count}")
+                raise ValueError(
+                    f"{self._name}: {name} must have no batch dims, or those of {count} samples; got {shape}"
+                )
             for field, (found, value) in named.items():
                 if found in IMAGES:
                     shapes = [v.shape for v in value] if isinstance(value, list) else [value.shape[not batched :]]
@@ -409,8 +415,8 @@ class SampleTransform(KeepsCamera, nn.Module):
     def _check_one_size(self, name: str, sizes: set[tuple[int, int]]) -> None:
         if len(sizes) > 1:
             raise ValueError(
-                f"{self._name}: the images of a batch are of one size; got {name} of {sorted(sizes)} (height, width). "
-                "Give the samples one by one, as a DataLoader's workers do, or resize them before"
+                f"{self._name}: the images of a batch must be of one size; got {name} of {sorted(sizes)} (height, "
+                "width). Give the samples one by one, as a DataLoader's workers do, or resize them before"
             )
 
     def _check_size(self, field: str, shape: tuple[int, ...], name: str, size: tuple[int, int]) -> None:
@@ -419,11 +425,12 @@ class SampleTransform(KeepsCamera, nn.Module):
         if shape[-3:-1] == size:
             to = "0, 3, 1, 2" if len(shape) == 4 else "2, 0, 1"
             raise ValueError(
-                f"{self._name}: {field} is {shape}, with the channels last. A tensor goes in as {field}.permute({to}), "
-                f"an array as {field}.transpose({to}); camtorch.augment.numpy takes arrays as they are"
+                f"{self._name}: {field} must have its channels first; got {shape}, with the channels last. Pass "
+                f"{field}.permute({to}), of an array {field}.transpose({to}); camtorch.augment.numpy takes arrays as "
+                "they are"
             )
         raise ValueError(
-            f"{self._name}: {field} is {shape[-2:]} (height, width), but the image_size of {name} is {size}. "
+            f"{self._name}: {field} must be of {name}'s image_size {size}; got {shape[-2:]} (height, width). "
             "camera.resize, .crop and .pad give the camera of an edited image"
         )
 
@@ -451,11 +458,13 @@ class SampleTransform(KeepsCamera, nn.Module):
         camera = first.camera if first.rows is None else change.source
         batch = self._batch(sample, camera, predicted, kinds)
         if batch.form.count != change.count:
-            raise ValueError(f"{self._name}: the change is of {change.count} samples, here are {batch.form.count}")
+            raise ValueError(
+                f"{self._name}: the sample must be of {change.count}, as the change; got {batch.form.count}"
+            )
         return self._moved(sample, batch, change)
 
     def _moved(self, sample: Sample, batch: Batch, change: Change) -> Sample:
-        """The sample after a change."""
+        """Return the sample after a change."""
         moved, named, batched = dict(sample), batch.named, batch.form.batched
         options: dict[str, float] = {"mask_fill": self.mask_fill}
         if self.mirroring is not None:
@@ -484,7 +493,9 @@ class SampleTransform(KeepsCamera, nn.Module):
                 seen = torch.as_tensor(seen) != 0
                 seen = seen if batched else seen[None]
                 if len(seen) != change.count:
-                    raise ValueError(f"{self._name}: {key} is of {len(seen)} samples, other fields of {change.count}")
+                    raise ValueError(
+                        f"{self._name}: {key} must be of {change.count} samples, as other fields; got {len(seen)}"
+                    )
                 seen, _ = self._one(change, "mask", seen, {"mask_fill": 0.0})
             if key == "image_valid" and self.valid_mask and any(found == "image" for found, _ in named.values()):
                 whole = change.valid_mask()
@@ -553,7 +564,7 @@ class SampleTransform(KeepsCamera, nn.Module):
         return in_range(result, value.dtype) if value.dtype.is_floating_point else result, valid
 
     def _still(self, name: str, valid: Any, given: Any) -> Any:
-        """Flags that come out, invalid where those given were; any number but zero is valid, as in COCO."""
+        """Return the flags that come out, invalid if those given are; any number but zero is valid, as in COCO."""
         if given is None:
             return valid
         many = isinstance(valid, list)

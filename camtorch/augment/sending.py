@@ -55,7 +55,7 @@ class _Block:
         self.memory = _mapped(os.getpid(), self.file, size)
 
     def back(self, place: int) -> None:
-        """No tensor of this process is on it any more."""
+        """Take a block back of which no tensor of this process is left."""
         del _held[place]
         _away.append(self)
 
@@ -70,7 +70,7 @@ _forks = 0
 
 
 def within_message(value: Any) -> Any:
-    """What a worker sends, as it is elsewhere; if it is a small tensor, or something else that has some, by value."""
+    """Return a worker's message, with small tensors by value; elsewhere return it as it is."""
     if not in_worker():
         return value
     if _is_plain(value):
@@ -88,7 +88,7 @@ def _is_plain(value: Any) -> bool:
 
 
 def stacked(batch: Sequence[Tensor]) -> Tensor | None:
-    """A batch of tensors of one shape, ready to be sent; None where no worker asks, and where torch's own way does."""
+    """Return tensors of one shape as a batch ready to be sent; None outside of workers, and if torch's own way does."""
     first = batch[0]
     if not in_worker() or any(t.dtype != first.dtype or not _is_plain(t) for t in batch):
         return None
@@ -105,7 +105,7 @@ def stacked(batch: Sequence[Tensor]) -> Tensor | None:
 
 
 def _block(size: int) -> _Block | None:
-    """One of so many bytes that nobody has; None where the system, or the user, wants torch's own."""
+    """Return a free block of so many bytes; None if the system, or the user, wants torch's own."""
     if get_sharing_strategy() == "file_system" or not _is_open(os.getppid()):
         return None
     with _lock:
@@ -139,7 +139,7 @@ def _mapped(process: int, file: int, size: int) -> mmap.mmap:
 
 
 def _reduced(sent: _Sent) -> tuple[Callable[..., Tensor], tuple[Any, ...]]:
-    """What another process makes the tensor of."""
+    """Return the function and arguments by which another process makes the tensor."""
     block, what = _held.get(sent.data_ptr()), (sent.dtype, tuple(sent.shape))
     if sent.is_contiguous() and not sent.requires_grad:
         if block is not None and block.memory[-1] == _HOME:
@@ -169,7 +169,7 @@ def _unpacked(data: bytes, dtype: torch.dtype, shape: tuple[int, ...]) -> Tensor
 
 
 def _forked() -> None:
-    """What two processes have on it from now on is not written to again."""
+    """Forget blocks that two processes have from now on: neither may write to them."""
     global _forks
     _forks += 1
 

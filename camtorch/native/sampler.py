@@ -119,7 +119,7 @@ class Call:
 def packed(
     images: Tensor, result: Tensor, mode: str, padding: str, fill: Sequence[float], positions: Sequence[int]
 ) -> tuple[bytes, object]:
-    """`Job` of sampler.h, and what has to live as long: arguments of `sample`, and the fields of the positions."""
+    """Return `Job` of sampler.h, and the objects that must live as long, of arguments of `sample` and positions."""
     fills = _fills(tuple(fill), images.dtype)
     kind = _BYTES[images.dtype.itemsize] if mode == "nearest" else _TYPES[images.dtype]
     count, channels, height, width = result.shape
@@ -134,7 +134,7 @@ def _tile_rows(width: int) -> int:
 
 
 def tiles_of(result: Tensor) -> int:
-    """Among how many threads samples may be split."""
+    """Return the number of threads that samples may be split among."""
     count, _, height, width = result.shape
     return -(-height // _tile_rows(width)) * count
 
@@ -156,27 +156,27 @@ def _are_together(result: Tensor, mode: str) -> bool:
 
 
 def _shared(tensor: Tensor) -> int:
-    """The stride from one image's part to the next: none where there is one for all."""
+    """Return the stride from one image's part to the next: 0 if one serves all."""
     return 0 if tensor.shape[0] == 1 else tensor.stride(0)
 
 
 @functools.lru_cache(maxsize=64)
 def _fills(fill: tuple[float, ...], dtype: torch.dtype) -> tuple[int, int, Tensor, Tensor]:
-    """Where values lie in float32, and as pixels: rounded, in range, true from one half on; and who holds them."""
+    """Return the addresses of values in float32 and as pixels (rounded, in range), and their owners."""
     values = torch.tensor(fill, dtype=torch.float32, device="cpu")
     elements = as_pixels(fill, dtype)
     return values.data_ptr(), elements.data_ptr(), values, elements
 
 
 def layout(images: Tensor) -> torch.memory_format:
-    """How images (B, C, H, W) lie in memory: their channels last, or plane by plane."""
+    """Return the layout of images (B, C, H, W) in memory: channels last, or plane by plane."""
     strides = images.stride()
     last = images.shape[1] > 1 and 0 < strides[1] < strides[3]
     return torch.channels_last if last else torch.contiguous_format
 
 
 def empty(images: Tensor, count: int, size: tuple[int, int]) -> Tensor:
-    """(count, C, *size) of the dtype of images (_, C, H, W), and with the channels last in memory if they have them."""
+    """Make room (count, C, *size) in the dtype of images (_, C, H, W), and in their layout in memory."""
     return maker(images, count, size)()
 
 

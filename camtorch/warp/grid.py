@@ -46,17 +46,17 @@ class Sampling(NamedTuple):
     scale: Tensor | None  # (B or 1, h, W'): see `local_scale`; None where nobody asks for it
 
     def cameras(self, rows: slice | Tensor) -> Sampling:
-        """Of these cameras of the batch."""
+        """Return those of these cameras of the batch."""
         scale = None if self.scale is None else self.scale[rows]
         return Sampling(self.grid[rows], self.mapped[rows], scale)
 
     def on(self, device: torch.device) -> Sampling:
-        """On another device, of positions on the CPU."""
+        """Send positions from the CPU to another device."""
         grid, mapped, *scale = sent([t for t in self if t is not None], device)
         return Sampling(grid, mapped, scale[0] if scale else None)
 
     def part(self, down: slice, across: slice = slice(None)) -> Sampling:
-        """Of these rows and columns of the target."""
+        """Return those of these rows and columns of the target."""
         scale = None if self.scale is None else self.scale[:, down, across]
         return Sampling(self.grid[:, down, across], self.mapped[:, down, across], scale)
 
@@ -78,14 +78,14 @@ class Lattice:
     done: Tensor | None = None
 
     def on(self, device: torch.device) -> Lattice:
-        """On another device, of a lattice on the CPU."""
+        """Send a lattice from the CPU to another device."""
         done = torch.stack((self.cells >= 0).nonzero(as_tuple=True))
         exact = self.exact[:, self.cells[tuple(done)].long()]
         nodes, cells, exact, done = sent([self.nodes, self.cells, exact, done], device)
         return Lattice(nodes, cells, exact, self.size, done)
 
     def cameras(self, rows: slice | Tensor) -> Lattice | Sampling:
-        """Of these cameras of the batch."""
+        """Return those of these cameras of the batch."""
         if self.done is not None:
             return self.pixels.cameras(rows)
         return Lattice(self.nodes[rows], self.cells[rows], self.exact, self.size)
@@ -153,7 +153,7 @@ def scaled_rows(
 
 
 def scaled(source: Camera, grid: Tensor, mapped: Tensor) -> Sampling:
-    """Positions with the scale by which antialiasing goes."""
+    """Return positions with the scale that antialiasing uses."""
     return Sampling(grid, mapped, local_scale(grid.detach(), mapped, source))
 
 
@@ -199,27 +199,27 @@ def _native(source: Camera, target: Camera, rotation: Tensor | None, like: Tenso
 
 
 def _like(target: Camera) -> Tensor:
-    """A tensor of the dtype and on the device to compute positions in."""
+    """Return a tensor of the dtype and on the device to compute positions in."""
     like = target.intrinsics
     return like if like.dtype.itemsize >= 4 else like.float()
 
 
 def _pixels(rows: range, width: int, like: Tensor) -> Tensor:
-    """(len(rows), width, 2): the centres of the pixels."""
+    """Return the centres of the pixels, (len(rows), width, 2)."""
     v = torch.arange(rows.start, rows.stop, dtype=like.dtype, device=like.device)
     u = torch.arange(width, dtype=like.dtype, device=like.device)
     return torch.stack(torch.meshgrid(u, v, indexing="xy"), -1)
 
 
 def pixels_of_rows(target: Camera, rows: range) -> Tensor:
-    """(len(rows), W', 2): the centres of a target's pixels, in the dtype to compute positions in."""
+    """Return the centres of a target's pixels, (len(rows), W', 2), in the dtype to compute positions in."""
     return _pixels(rows, target._size_for("Warp")[1], _like(target))
 
 
 def _positions(
     source: Camera, target: Camera, rotation: Tensor | None, native: Between | None, pixels: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Where the source sees target pixels (h, w, 2) or (B, h, w, 2): see `Exact`."""
+    """Return the positions at which the source sees target pixels (h, w, 2) or (B, h, w, 2); see `Exact`."""
     if native is not None:
         rows = (pixels if pixels.ndim == 4 else pixels[None]).flatten(1, 2)
         found, mapped = native.rows(rows, POSITIONS)
@@ -319,7 +319,7 @@ def straight_lattice(matrix: Tensor, rows: range, width: int, dtype: torch.dtype
 
 
 def _probes(rows: range, width: int, like: Tensor) -> Tensor:
-    """(1, N, 2): the nodes of a lattice, and the pixels at the rim of the target, which may tell what nodes do not."""
+    """Return the nodes of a lattice, and the pixels at the rim of the target, (1, N, 2)."""
     # two more nodes on each side of the cells: one for the cubics, and both for fourth differences
     v, u = (
         (torch.arange(math.ceil(side / STEP) + 5, dtype=like.dtype, device=like.device) - 2) * STEP
@@ -336,7 +336,7 @@ def _probes(rows: range, width: int, like: Tensor) -> Tensor:
 
 @lru_cache(maxsize=8)
 def kept_probes(rows: range, width: int, dtype: torch.dtype) -> Tensor:
-    """(1, N, 2), on the CPU: the nodes of a lattice, and then the pixels at the rim of the target."""
+    """Return the nodes of a lattice, and then the pixels at the rim of the target, (1, N, 2) on the CPU."""
     with torch.inference_mode(False):
         return _probes(rows, width, torch.empty(0, dtype=dtype, device="cpu"))
 
@@ -372,7 +372,7 @@ def _compute(exact: Exact, first: int, cells: Tensor, todo: Tensor, like: Tensor
 
 
 def interpolated(nodes: Tensor, rows: int, columns: int) -> Tensor:
-    """(B, 2, rows + 3, columns + 3) to (B, 2, 8 rows, 8 columns)."""
+    """Interpolate nodes (B, 2, rows + 3, columns + 3) to pixels (B, 2, 8 rows, 8 columns)."""
     # torch may be told to multiply matrices in less than float32
     wide = torch.float32 if torch.get_float32_matmul_precision() == "highest" else torch.float64
     wide = torch.promote_types(nodes.dtype, wide)
@@ -391,7 +391,7 @@ def interpolated(nodes: Tensor, rows: int, columns: int) -> Tensor:
 
 
 def _weights(dtype: torch.dtype, wide: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
-    """(8, 4), of the nodes at -1, 0, 1, 2 in the cubic through them, at 0, 1/8, ..., 7/8; and those of a wide block."""
+    """Return weights (8, 4) of nodes at -1, 0, 1, 2 in their cubic at 0, 1/8, ..., 7/8; and of a wide block."""
     t = torch.arange(STEP, dtype=torch.float64, device=device) / STEP
     before, at, after, beyond = t + 1, t, t - 1, t - 2
     parts = -at * after * beyond / 6, before * after * beyond / 2, -before * at * beyond / 2, before * at * after / 6
@@ -404,6 +404,6 @@ def _weights(dtype: torch.dtype, wide: torch.dtype, device: torch.device) -> tup
 
 @lru_cache(maxsize=8)
 def _kept_weights(*form: Any) -> tuple[Tensor, Tensor]:
-    """Those on another device, where each operator costs its launch."""
+    """Keep the weights on another device, on which each operator costs a launch."""
     with torch.inference_mode(False):
         return _weights(*form)

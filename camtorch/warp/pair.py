@@ -23,7 +23,7 @@ _SINGLE = 1e-3  # pixels: some ulps of a position in an image a thousand pixels 
 
 
 def _part(held: str, name: str) -> Any:
-    """The property of a part of a module, in the dict where it mostly is: `nn.Module.__getattr__` looks in all."""
+    """Return a property of a module's part, read from its usual dict; `nn.Module.__getattr__` looks in all."""
 
     def part(module: nn.Module) -> Any:
         parts = module.__dict__[held]
@@ -36,7 +36,7 @@ class Plan:
     """The positions of a warp while its cameras stay, or once and for all, and calls that are ready for some images."""
 
     def __init__(self, positions: dict[str, Sampling | Lattice], is_pinned: bool = False):
-        """positions: by the padding that they serve. is_pinned: whether they stay whatever becomes of the cameras."""
+        """Keep positions by the padding that they serve; is_pinned: whether they stay if the cameras change."""
         self.is_pinned, self.positions, self.calls = is_pinned, Kept(6), Kept(8)
         self._exact: Sampling | None = None
         for padding in positions:
@@ -50,7 +50,7 @@ class Plan:
 
 
 class CameraPair(GeometryModule):
-    """What a `Warp` is beside its calls: source, target, rotation and options; and where target pixels lie."""
+    """The state of a `Warp`: source, target, rotation and options; and where target pixels lie."""
 
     is_an_operator: ClassVar[bool] = True
     """Whether compiled code calls it as one: the cameras and the rotation are all there is to it."""
@@ -82,7 +82,7 @@ class CameraPair(GeometryModule):
         seam_of(source)  # while its values may be looked at: traced code asks for it too
 
     def turned_by(self, rotation: Tensor | None) -> Self:
-        """This warp, made without a rotation, with one that is not checked: (3, 3) or (B, 3, 3)."""
+        """Give this warp, made without one, a rotation that is not checked, (3, 3) or (B, 3, 3); return the warp."""
         self.put("rotation", rotation, persistent=rotation is not None and not rotation.requires_grad)
         if rotation is not None and rotation.shape[:-2] != self.batch_shape:
             self.batch_shape = broadcast_shapes(self.batch_shape, rotation.shape[:-2])
@@ -101,14 +101,14 @@ class CameraPair(GeometryModule):
         return None if entry is None else entry[2]
 
     def follow_host(self, host: CameraPair) -> Self:
-        """This warp, whose positions are found by its like on the CPU, for as long as the cameras stay."""
+        """Have a warp like this one, on the CPU, find the positions while the cameras stay; return this warp."""
         self._host = Kept()
         self._host(self._inputs(), (), lambda: host)
         return self
 
     @property
     def _options(self) -> tuple[object, ...]:
-        """What positions depend on in addition to `_inputs`."""
+        """All that positions depend on in addition to `_inputs`."""
         source, target = self._ends
         return source._form, target._form, self.rotation is None, self.antialias, self._tolerance
 
@@ -121,13 +121,13 @@ class CameraPair(GeometryModule):
         return _SINGLE if single else 0.0
 
     def _inputs(self) -> list[Tensor]:
-        """All tensors that they depend on."""
+        """Return all tensors that positions depend on."""
         (source, target), rotation = self._ends, self.rotation
         found = [*source._tensors, *target._tensors]
         return found if rotation is None else [*found, rotation]
 
     def _locate(self, rows: range, padding: PaddingMode, tolerance: float) -> Sampling | Lattice:
-        """Those of some rows of the target, which serve a padding, within a tolerance."""
+        """Return positions of some rows of the target, which serve a padding, within a tolerance."""
         return locate(self._sampled, self._ends[1], self.rotation, tolerance, self.antialias, rows, padding)
 
     @property

@@ -86,7 +86,7 @@ _PIXELS = 1 << 3  # flags of what is left of pixels are times this
 
 
 def route_of(warp: CameraPair, images: Tensor | None = None) -> Route:
-    """The route of images, or of positions alone; the lattice and the sampler are chosen by `locate` and `render`.
+    """Return the route of images, or of positions alone; `locate` and `render` choose the lattice and the sampler.
 
     * "operator": compiled code calls one operator, and traces nothing of it;
     * "strips": the grid would be too long for memory, and is made part by part;
@@ -126,7 +126,7 @@ def _form(warp: CameraPair, images: Tensor, mode: str, padding: str) -> tuple[ob
 
 
 def warped(warp: CameraPair, images: Tensor, sampler: Sampler) -> Tensor:
-    """The images of a warp; those given are checked."""
+    """Return the images of a warp; those given are checked."""
     route, given = route_of(warp, images), images
     images = lengthened(warp, images)
     if route == "operator":
@@ -159,13 +159,13 @@ def lengthened(warp: CameraPair, images: Tensor) -> Tensor:
 
 
 def positions(warp: CameraPair, route: Route, padding: PaddingMode = "zeros") -> Sampling | Lattice:
-    """Where all pixels of the target sample the source's image, by the route "graph" or "kept"."""
+    """Return the positions at which target pixels sample the source's image, by the route "graph" or "kept"."""
     if route == "graph":
         if in_jit_trace():
             raise RuntimeError(
-                "Warp: torch.jit.trace and torch.onnx.export(dynamo=False) cannot record cameras that learn; "
-                "torch.onnx.export(dynamo=True) and torch.export can. Or warp.requires_grad_(False), and one call "
-                "before, make its map a constant"
+                "Warp: cameras must not learn in torch.jit.trace and torch.onnx.export(dynamo=False); got some that "
+                "do. Use torch.onnx.export(dynamo=True) or torch.export; or make the map a constant by "
+                "warp.requires_grad_(False) and one call before"
             )
         return warp._locate(range(warp.target._size_for("Warp")[0]), padding, 0.0)
     if records_constants() and (constant := _constant(warp, padding)):
@@ -182,13 +182,13 @@ def _plan_of(warp: CameraPair, make: Callable[[], Plan]) -> Plan:
 
 
 def by_pixel(warp: CameraPair) -> Sampling:
-    """The positions of all pixels, one by one."""
+    """Return the positions of all pixels, one by one."""
     where = positions(warp, "graph" if route_of(warp) == "graph" else "kept")
     return where.pixels if isinstance(where, Lattice) else where
 
 
 def _computed(warp: CameraPair, reach: PaddingMode) -> Sampling | Lattice:
-    """The positions of all pixels, without a graph, which serve a padding."""
+    """Return the positions of all pixels, without a graph, which serve a padding."""
     if warp.tolerance and not warp.antialias and (host := warp.host) is not None:
         return positions(host, "kept", reach).on(warp.target.intrinsics.device)
     if not (_is_operator(warp) and warp.tolerance and warp.target.intrinsics.is_cpu):
@@ -202,7 +202,7 @@ def _computed(warp: CameraPair, reach: PaddingMode) -> Sampling | Lattice:
 def strips(
     warp: CameraPair, padding: PaddingMode = "zeros", count: int | None = None
 ) -> Iterator[tuple[slice, Sampling | Lattice]]:
-    """Rows of the target, `count` at a time, and where they sample the source's image."""
+    """Yield rows of the target, `count` at a time, and their positions on the source's image."""
     height, width = warp.target._size_for("Warp")
     step = count or max(_STRIP // (max(math.prod(warp.batch_shape), 1) * width), 1)
     for top in range(0, height, step):
@@ -233,7 +233,7 @@ def valid_mask(warp: CameraPair) -> Tensor:
 
 
 def _on_image(warp: CameraPair, where: Sampling | Lattice) -> Tensor:
-    """(B or 1, 1, h, W') bool: whether the source maps pixels onto its image."""
+    """Whether the source maps pixels onto its image, (B or 1, 1, h, W')."""
     where = where.pixels if isinstance(where, Lattice) else where
     grid, source = where.grid.detach(), warp._sampled
     pixels = (grid + 1) * grid.new_tensor(source._size_for("Warp")[::-1]) / 2 - 0.5
@@ -256,7 +256,7 @@ def pin(warp: CameraPair) -> None:
 
 
 def _reach(warp: CameraPair, padding: PaddingMode) -> PaddingMode:
-    """The padding that positions are for which serve the warp's own, and this one."""
+    """Return the padding of positions that serve the warp's own padding and this one."""
     # of equal words compilers know no max by a key
     return PADDINGS[max(PADDINGS.index(warp.padding_mode), PADDINGS.index(padding))]
 
@@ -277,7 +277,7 @@ def _is_long(warp: CameraPair) -> bool:
 
 
 def _constant(warp: CameraPair, padding: PaddingMode) -> Sampling | Lattice | None:
-    """The positions as a constant of an exported program, unless they depend on what it is given."""
+    """Return the positions as a constant of an exported program; None if they depend on its inputs."""
     if not warp.is_pinned and not is_constant(warp):
         return None
     with set_aside() if warp.is_pinned else with_values(warp):
@@ -344,7 +344,7 @@ _calls = threading.local()  # a thread's calls have memory of their own
 
 @functools.lru_cache(maxsize=16)
 def _coarse(size: tuple[int, int], dtype: torch.dtype) -> tuple[Tensor, tuple[int, int], int]:
-    """(1, N, 2): pixels that tell how far an image shrinks, how many down and across, and their step."""
+    """Return pixels (1, N, 2) that show how far an image shrinks, their numbers down and across, and their step."""
     first, step = coarse(size)
     with torch.inference_mode(False):
         v, u = (torch.arange(first, side, step, dtype=dtype, device="cpu") for side in size)
@@ -367,7 +367,7 @@ def _surely_keeps_size(back: Between, sizes: Sizes) -> bool:
 
 @dataclass
 class SampleForm:
-    """What samples have in common that one call serves; see `call_for`."""
+    """The common form of samples that one call serves; see `call_for`."""
 
     sizes: Sizes
     dtype: torch.dtype
@@ -379,7 +379,7 @@ class SampleForm:
     hows: Sequence[Sampler | Label]
 
     def images(self, value: Tensor) -> Tensor:
-        """(B, C, H, W) of an image, or a mask."""
+        """Return an image or a mask as (B, C, H, W)."""
         value = value if self.batched else value.unsqueeze(0)
         return value if value.ndim == 4 else value.unsqueeze(1)
 
@@ -479,7 +479,7 @@ class SampleCall:
     def __call__(
         self, source: Native, target: Native, rotation: Tensor | None, values: Sequence[Tensor]
     ) -> list[tuple[Tensor, Tensor | None] | None] | None:
-        """Return what `values`, of the form, become between two cameras, and which pixels and boxes are valid.
+        """Move `values` of the form from one camera to another; also return which pixels and boxes are valid.
 
         None where the call does not do. Those of boxes and poses alone are None if some take more than their outline,
         or are none.

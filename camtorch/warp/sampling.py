@@ -64,7 +64,7 @@ def render(
 
 
 def laid_as(images: Tensor, result: Tensor) -> Tensor:
-    """The result with its channels last in memory if the images have them there."""
+    """Return the result with its channels last in memory if the images have them there."""
     if in_transform() or sampler.layout(images) == torch.contiguous_format:
         return result
     return result.contiguous(memory_format=torch.channels_last)
@@ -103,7 +103,7 @@ def by_torch(
     kept: dict[int, Pyramid] | None = None,
     out: Tensor | None = None,
 ) -> Tensor:
-    """What `grid_sample` makes of images (B or 1, C, H, W); see `render`."""
+    """Sample images (B or 1, C, H, W) by `grid_sample`; see `render`."""
     cameras = where.cells.shape[0] if isinstance(where, Lattice) else where.grid.shape[0]
     images = images if cameras == 1 else images.expand(cameras, -1, -1, -1)
     if isinstance(where, Sampling) and how.mode == "nearest":
@@ -115,7 +115,7 @@ def by_torch(
 
 
 def _by_torch(images: Tensor, where: Sampling | Lattice, how: Sampler, kept: dict[int, Pyramid] | None) -> Tensor:
-    """What `grid_sample` makes of B images."""
+    """Sample B images by `grid_sample`."""
     count, dtype = images.shape[0], images.dtype
     plain = are_plain(images)
     wide, finite = dtype == wide_dtype(dtype), not dtype.is_floating_point
@@ -162,7 +162,7 @@ def _levels(kept: dict[int, Pyramid] | None, i: int, images: Tensor, finite: boo
 
 
 def _render_tiles(result: Tensor, levels: Pyramid, where: Sampling, how: Sampler) -> None:
-    """One image in tiles of the target, each from a copy of what it reads."""
+    """Render an image in tiles of the target, each from a copy of the part that it reads."""
     for top in range(0, result.shape[2], _TILE):
         for left in range(0, result.shape[3], _TILE):
             down, across = slice(top, top + _TILE), slice(left, left + _TILE)
@@ -197,7 +197,7 @@ def _read(images: Tensor, where: Sampling, how: Sampler) -> tuple[Tensor, Tensor
 
 
 def _render(images: Tensor, grid: Tensor, where: Sampling, levels: Pyramid, how: Sampler) -> Tensor:
-    """Images of a dtype to compute in, or a part of them, at positions `grid` on it, filled and antialiased."""
+    """Render images of a dtype to compute in, or a part of them, at positions `grid` on it, filled and antialiased."""
     mode, padding_mode, fill = how
     minifies = where.scale is not None
     # what lies beyond the rim is left out by coverage: at small levels the rim's pixels are wide
@@ -228,7 +228,7 @@ class Pyramid:
 
     @property
     def half(self) -> Pyramid:
-        """Of a dtype to compute in."""
+        """They are of a dtype to compute in."""
         if self._half is None:  # no cached_property, whose lock compilers refuse
             self._half = self._halved()
         return self._half
@@ -276,7 +276,7 @@ def sample(images: Tensor, grid: Tensor, mode: Mode, padding_mode: PaddingMode, 
 
 
 def _sample(images: Tensor, grid: Tensor, mode: Mode, padding_mode: PaddingMode, finite: bool = False) -> Tensor:
-    """On a CPU, with work for every thread, of which grid_sample gives one to each image."""
+    """Sample on a CPU with work for every thread; grid_sample gives one thread to each image."""
     where = Sampling(grid[:1] if grid.stride(0) == 0 else grid, images.new_empty(0), None)
     call = prepared(images, where, Sampler(mode, padding_mode, (0.0,))) if padding_mode == "zeros" else None
     if call is not None:
@@ -308,7 +308,7 @@ def _sample(images: Tensor, grid: Tensor, mode: Mode, padding_mode: PaddingMode,
 def _sample_tiles(
     result: Tensor, image: Tensor, grid: Tensor, count: int, mode: Mode, padding_mode: PaddingMode
 ) -> None:
-    """One image (C, H, W) by tiles of rows that share it, and what rows are left over."""
+    """Sample an image (C, H, W) by tiles of rows, and the rows that are left over."""
     height = len(grid) // count
     tiles = count * height
     if tiles:
@@ -343,7 +343,7 @@ def _taps(position: Tensor, side: int, padding_mode: PaddingMode) -> list[tuple[
 
 
 def _padded(u: Tensor, side: int, padding_mode: PaddingMode) -> Tensor:
-    """Pixel coordinates on the image, those of what is repeated or reflected beyond it; "zeros" leaves them."""
+    """Return pixel coordinates, those off the image repeated or reflected; "zeros" leaves them."""
     if padding_mode == "zeros":
         return u
     if padding_mode == "reflection":
@@ -353,7 +353,7 @@ def _padded(u: Tensor, side: int, padding_mode: PaddingMode) -> Tensor:
 
 
 class Options(TypedDict):
-    """What a `Warp` takes by name."""
+    """The options of a `Warp`."""
 
     mode: Mode
     padding_mode: PaddingMode
@@ -363,7 +363,7 @@ class Options(TypedDict):
 
 
 class WarpOptions(TypedDict, total=False):
-    """Those of them that a user gives to every kind of warp; see `Warp`."""
+    """The options of every kind of warp; see `Warp`."""
 
     mode: Mode
     padding_mode: PaddingMode
@@ -394,7 +394,7 @@ def as_options(
 
 
 def as_fill(fill: Fill, owner: str) -> tuple[float, ...]:
-    """One value or one for each channel, as a tuple; integers, which may be ids, stay what they are."""
+    """Return one value or one for each channel as a tuple; integers, which may be ids, stay integers."""
     try:
         if isinstance(fill, (str, bytes)):
             raise TypeError
@@ -444,7 +444,7 @@ class _Sample(torch.autograd.Function):
 
 
 def _backward(gradient: Tensor, images: Tensor, grid: Tensor, ctx: Any, wanted: tuple[bool, ...]) -> tuple[Tensor, ...]:
-    """The derivatives of grid_sample by images and positions."""
+    """Return the derivatives of grid_sample by images and positions."""
     mode, padding = {"bilinear": 0, "nearest": 1, "bicubic": 2}[ctx.mode], PADDINGS.index(ctx.padding_mode)
     derivatives: tuple[Tensor, ...] = torch.ops.aten.grid_sampler_2d_backward(
         gradient, images, grid, mode, padding, False, wanted

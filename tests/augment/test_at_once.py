@@ -257,10 +257,10 @@ def test_samples_of_any_form_follow_each_other():
     boxes = np.array([[10.0, 20.0, 30.0, 40.0]])
     transform(image=image, bboxes=boxes)
     for text, fields in (
-        (r"image is .* but the image_size of camera", {"image": image[:-1]}),
+        (r"image must be of camera's image_size", {"image": image[:-1]}),
         (r"keypoints must be \(N, 2\)", {"keypoints": np.zeros((4, 3), np.float32)}),
         (r"bboxes must be x1, y1, x2, y2", {"bboxes": boxes[:, ::-1].copy()}),
-        ("holds real numbers", {"lidar": np.zeros((4, 3))}),
+        ("must have a kind", {"lidar": np.zeros((4, 3))}),
     ):
         with pytest.raises(ValueError, match=text):
             transform({"image": image, **fields})

@@ -140,8 +140,8 @@ def test_samples_without_the_box_are_refused():
     image, boxes = torch.zeros(2, 1, 480, 640), [torch.tensor([[1.0, 1, 9, 9]]), torch.empty(0, 4)]
     crop = ct.augment.BoxCrop(SIZE, camera=fisheye())
     for call, text in (
-        (lambda: crop(image=image), "no boxes"),
-        (lambda: crop(image=image, boxes=boxes), "sample 1 has 0 boxes"),
+        (lambda: crop(image=image), "must have boxes"),
+        (lambda: crop(image=image, boxes=boxes), "sample 1 must have a box of index 0; got 0 boxes"),
         (lambda: ct.augment.BoxCrop(SIZE, margin=-0.5), "margin"),
         (lambda: ct.augment.BoxCrop(SIZE, margin=float("nan")), "margin"),
     ):

@@ -488,9 +488,17 @@ def test_samples_without_a_camera():
     listed = A.HorizontalFlip(p=1.0)(image=torch.rand(2, 1, 20, 30), keypoints=[torch.zeros(n, 2) for n in (1, 2)])
     assert [k[:, 0].tolist() for k in listed["keypoints"]] == [[29.0], [29.0, 29.0]]
     for edit, fields, text in (
-        (A.HorizontalFlip(), {"keypoints": torch.zeros(1, 2)}, "HorizontalFlip: the sample holds neither an image nor"),
-        (A.Compose([A.HorizontalFlip(), A.RandomLens()]), {"image": torch.rand(1, 3, *SIZE)}, "Compose: no camera"),
-        (A.HorizontalFlip(), {"image": torch.rand(*SIZE, 3)}, "channels last"),
+        (
+            A.HorizontalFlip(),
+            {"keypoints": torch.zeros(1, 2)},
+            "HorizontalFlip: the sample must have an image or a camera",
+        ),
+        (
+            A.Compose([A.HorizontalFlip(), A.RandomLens()]),
+            {"image": torch.rand(1, 3, *SIZE)},
+            "Compose: the sample must have a camera",
+        ),
+        (A.HorizontalFlip(), {"image": torch.rand(*SIZE, 3)}, "channels first"),
     ):
         with pytest.raises(ValueError, match=text):
             edit(fields)
@@ -578,6 +586,6 @@ def test_quarter_turns_of_several_models_are_told_of_where_images_are_one_tensor
     cameras = [m.from_fov(60, image_size=(16, 24)).requires_grad_(False) for m in (ct.Pinhole, ct.KannalaBrandt)]
     draw = {"apply": torch.ones(2, dtype=torch.bool), "times": torch.tensor([0.1, 0.3])}
     change = A.Rotate90().change(cameras, draw)
-    with pytest.raises(ValueError, match=r"in the sizes \[\(16, 24\), \(24, 16\)\]; same_on_batch"):
+    with pytest.raises(ValueError, match=r"in one size; got \[\(16, 24\), \(24, 16\)\]. same_on_batch"):
         change.images(torch.rand(2, 3, 16, 24))
     assert change.points(torch.zeros(2, 5, 2))[0].shape == (2, 5, 2)

@@ -126,7 +126,7 @@ def test_what_does_not_fit_a_clip_is_told_by_name(fields, says):
     mount = A.RandomMount(camera=camera())
     with pytest.raises(ValueError, match=f"RandomMount: {says}"):
         mount(**{"image": torch.zeros(B, T, 3, *SIZE)} | fields)
-    with pytest.raises(ValueError, match="RandomMount: the change is of 3 samples, here are 6"):
+    with pytest.raises(ValueError, match="RandomMount: the sample must be of 3, as the change; got 6"):
         mount.moved_by(mount.change(None, mount.draw(3)), {"image": torch.zeros(B, T, 3, *SIZE)})
     with pytest.raises(ValueError, match=r"FaceNormalizer: image must be \(B, C, H, W\); .* image.flatten\(0, 1\)"):
         A.FaceNormalizer(camera=camera())(image=torch.zeros(B, T, 3, *SIZE), head_pose=torch.eye(4))

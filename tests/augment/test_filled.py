@@ -123,7 +123,9 @@ def test_what_cannot_be_filled_is_said():
     """The camera of a strip at the side of an image: its axis lies off the strip."""
     strip = pinhole().crop(0, 0, 120, 40)
     augmentation = RandomCamera("dms130", camera=strip, yaw=1, pitch=1, roll=1, min_filled=0.9)
-    with pytest.warns(UserWarning, match=r"min_filled=0.9 is out of reach for . of 4 new images.* does not see along"):
+    with pytest.warns(
+        UserWarning, match=r"min_filled must be within reach; got 0.9, and of . of 4 new images.* does not see along"
+    ):
         augmentation(image=torch.rand(4, 1, 120, 40))
     augmentation(image=torch.rand(4, 1, 120, 40))
     with pytest.raises(ValueError, match=r"RandomMount: min_filled must be a part in \[0, 1\]; got 90"):
@@ -145,11 +147,11 @@ ASKED = {
 def test_a_field_of_view_that_is_not_made_is_told_once(untold, name):
     options = {"camera": pinhole(60), "min_filled": 0.9}
     least = 110 if name != "a model" else 120
-    says = rf"asked for fov={least} degrees at least, an image is (\d+) wide: min_filled=0.9 .* 60 degrees wide"
+    says = rf"fov must be {least} degrees at least; got an image (\d+) degrees wide: min_filled=0.9 .* 60 degrees wide"
     with pytest.warns(UserWarning, match=says) as told:
         made = ASKED[name](**options)(keypoints=torch.rand(8, 5, 2))["camera"].fov[:, 0]
     assert made.max() < 0.9 * least
-    assert abs(int(re.search(r"(\d+) wide: ", str(told[0].message))[1]) - made.min()) < 1
+    assert abs(int(re.search(r"(\d+) degrees wide: ", str(told[0].message))[1]) - made.min()) < 1
     ASKED[name](**options)(keypoints=torch.rand(8, 5, 2))  # warnings are errors here
 
 

@@ -119,10 +119,10 @@ def test_errors_name_the_field_and_its_shape():
     image, mask, points, _ = images()
     own, one = augmentation(camera=camera()), torch.from_numpy(image)
     transform = ct.augment.numpy.Transform(own)
-    last, first = r"{} is \(.*channels last.*{}.permute\({}\)", image.T.swapaxes(1, 2)
+    last, first = r"{} must have its channels first.*channels last.*{}.permute\({}\)", image.T.swapaxes(1, 2)
     for call, text, fields in (
         (transform, r"image must be .* got shape \(3, 24, 32\)\. .*np.moveaxis\(image, ", {"image": first}),
-        (transform, r"image is \(23, 32\) .* image_size of camera is \(24, 32\)", {"image": image[1:]}),
+        (transform, r"image must be of camera's image_size \(24, 32\); got \(23, 32\)", {"image": image[1:]}),
         (transform, r"masks\[1\] must be .* got shape \(32,\)", {"masks": [mask, mask[0]]}),
         (transform, r"keypoints must be \(N, 2\).* got shape \(4, 1\)", {"keypoints": points[:, :1]}),
         (transform, "image must be a numpy array .* got dtype object", {"image": image.astype(object)}),
@@ -254,15 +254,15 @@ def test_what_would_not_move_or_be_misread_is_refused(vision):
     boxes = tv.BoundingBoxes(torch.tensor([[2.0, 3, 9, 8]]), format=tv.BoundingBoxFormat.XYWH, canvas_size=SIZE)
     transform = front_end.Transform(augmentation(), camera())
     two = front_end.Transform(augmentation(), ct.Pinhole(torch.ones(2, 4), image_size=SIZE))
-    size = r"KeyPoints is \(5, 6\) \(height, width\), but the camera's image_size is \(24, 32\)"
+    size = r"KeyPoints must be of the camera's image_size \(24, 32\); got \(5, 6\) \(height, width\)"
     for call, sample, text in (
-        (transform, (tv.Image(image), torch.ones(4, 3)), r"'\[1\]' holds real numbers.*fields="),
-        (transform, (image, image), r"'\[1\]' holds real numbers"),
-        (transform, {"image": image, "target": [torch.ones(3)]}, "'target' holds real numbers"),
+        (transform, (tv.Image(image), torch.ones(4, 3)), r"'\[1\]' must have a kind.*fields="),
+        (transform, (image, image), r"'\[1\]' must have a kind"),
+        (transform, {"image": image, "target": [torch.ones(3)]}, "'target' must have a kind"),
         (transform, {"image": image, "tvec": torch.ones(2, 4)}, "tvec must be"),
         (transform, {"image": image, "gaze": [0.0, 0.0, 1.0]}, "gaze must be a tensor of real numbers"),
         (transform, tv.KeyPoints(torch.ones(1, 2), canvas_size=(5, 6)), size),
-        (transform, torch.ones(3, 7, 8), r"Tensor is \(7, 8\)"),
+        (transform, torch.ones(3, 7, 8), r"Tensor must be of .* got \(7, 8\)"),
         (transform, PIL.Image.new("P", SIZE[::-1]), "mode 'P'"),
         (front_end.Transform(augmentation()), image, "no camera"),
         (two, image, r"batch dims \(2,\)"),

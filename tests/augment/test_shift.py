@@ -120,7 +120,7 @@ def test_without_depth_it_says_so():
     augment, whole = mount(shift=(0.02, 0.02, 0), camera=camera), torch.full((1, 120, 160), 600, dtype=torch.int32)
     out = augment(sample_of(camera))
     for call, text in (
-        (lambda: augment(image=image), "needs depth"),
+        (lambda: augment(image=image), "must have depth"),
         (lambda: augment.change(None, augment.draw(1)), "depth"),
         (lambda: augment(image=image, depth=whole), "floating point"),
         (lambda: ct.augment.Compose([augment]), "goes before"),

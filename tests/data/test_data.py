@@ -244,8 +244,8 @@ def test_wrong_batches_are_told():
     some = batch(rows(2))
     for change, message in (
         ({"label": [1]}, "all columns must have as many rows"),
-        ({"image": some["image"][:, :12]}, r"sample 'day/0.jpg': RandomCamera: image is \(12, 32\)"),
-        ({"score": np.ones((2, 3))}, "'score' holds real numbers"),
+        ({"image": some["image"][:, :12]}, r"sample 'day/0.jpg': RandomCamera: image must be of .* got \(12, 32\)"),
+        ({"score": np.ones((2, 3))}, "'score' must have a kind"),
         ({"camera_intrinsics": np.ones((2, 4))}, r"the camera has no model; ct.data.to_columns has all of it"),
         ({"camera_intrinsics": np.ones((2, 4)), "camera_model": ["x"] * 2}, "one of brown_conrady, .*; got 'x'"),
     ):
@@ -338,11 +338,11 @@ def test_wrong_samples_are_told():
         ({"jpg": torch.zeros(3, *SIZE)}, "jpg must be a numpy array; got Tensor"),
         ({"json": b"{}"}, "json must be an object of labels; got bytes. Undecoded ones"),
         ({"left.png": sample["jpg"][..., 0]}, "whether left.png moves is not known; fields={'left.png': KIND}"),
-        ({"left.png": sample["jpg"]}, "'left' holds real numbers, .* fields={'left': KIND}"),
+        ({"left.png": sample["jpg"]}, "'left' must have a kind, .* fields={'left': KIND}"),
         ({"png": sample["jpg"]}, "png and jpg both hold image"),
         ({"json": {"keypoints": [[1, 2], [3]]}}, "keypoints must be numbers in lists of one length"),
         ({"json": {"keypoints": [[10**400, 2]]}}, "keypoints must be numbers in lists of one length"),
-        ({"json": {"scores": [0.5]}}, "'scores' holds real numbers"),
+        ({"json": {"scores": [0.5]}}, "'scores' must have a kind"),
         ({"json": {"camera": {"model": "pinhole"}}}, "the camera has no intrinsics"),
     ):
         with pytest.raises((TypeError, ValueError), match=message):

@@ -204,7 +204,11 @@ WRONG = [
     (lambda: A.Rotate90(90), ValueError, "quarter turns; got 90. Divide degrees by 90"),
     (lambda: A.RandomResizedCrop(32, scale=0.5), TypeError, "scale must be a range"),
     (lambda: ct.vignetting(MIXED, torch.ones(3)), ValueError, "one for each of 2 cameras"),
-    (lambda: REPROJECTION(LENS, UV, torch.rand(9, 3)), ValueError, r"pixels \(17, 2\) of target and \(9, 2\)"),
+    (
+        lambda: REPROJECTION(LENS, UV, torch.rand(9, 3)),
+        ValueError,
+        r"pixels of target and of the points must broadcast; got \(17, 2\) and \(9, 2\)",
+    ),
     (lambda: FLIP(image=IMAGE, keypoints=torch.rand(17, 3)), ValueError, r"\[..., 2\], as keypoints_valid"),
 ]
 
