@@ -98,12 +98,12 @@ def test_cameras_and_draws(camera):
         ),
         (lambda: mount(given | {"camera": [camera]}), "camera must have one for each of 2 samples; got 1"),
         (lambda: mount(given, draw=mount.draw(3)), "draw must be for 2 samples; got one for 3"),
-        (lambda: mount(given, draw=some), "the draw lacks yaw, pitch, roll, zoom; it has apply"),
+        (lambda: mount(given, draw=some), "draw must have yaw, pitch, roll, zoom; got apply"),
         (lambda: mount(given, draw={**draw, "yaw": draw["yaw"][:, None]}), r"\['yaw'\] must be \(2,\); .* \(2, 1\)"),
-        (lambda: RandomMount().inverse(given), "nothing to invert; call it first"),
-        (lambda: zooming.inverse(samples[0]), r"Pinhole\(.*is not the one .* made: the sample is of another call"),
+        (lambda: RandomMount().inverse(given), "must have a change to invert; got none. Call it first"),
+        (lambda: zooming.inverse(samples[0]), r"must be the one that this change made; got Pinhole\(.*another call"),
         (lambda: half(given, draw=half.draw(2) | some), "with p < 1 the image_size must be that of the images"),
-        (lambda: mount(torch.zeros(1, 3, *SIZE)), r"a sample is a dict of fields, .* as in image=...; got Tensor"),
+        (lambda: mount(torch.zeros(1, 3, *SIZE)), r"a sample must be a dict of fields, .* as in image=...; got Tensor"),
     ):
         with pytest.raises((TypeError, ValueError), match=text):
             call()

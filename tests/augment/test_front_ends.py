@@ -264,7 +264,7 @@ def test_what_would_not_move_or_be_misread_is_refused(vision):
         (transform, tv.KeyPoints(torch.ones(1, 2), canvas_size=(5, 6)), size),
         (transform, torch.ones(3, 7, 8), r"Tensor must be of .* got \(7, 8\)"),
         (transform, PIL.Image.new("P", SIZE[::-1]), "mode 'P'"),
-        (front_end.Transform(augmentation()), image, "no camera"),
+        (front_end.Transform(augmentation()), image, "camera must be a Camera; got None"),
         (two, image, r"batch dims \(2,\)"),
         (front_end.Transform, ct.augment.FaceNormalizer(), "got FaceNormalizer"),
         (augmentation(camera=camera()), {"image": image, "boxes": boxes}, "boxes must be x1, y1, x2, y2; got .*XYWH"),
