@@ -48,8 +48,8 @@ def run(arguments: argparse.Namespace) -> None:
     result = _calibrated(arguments, board, views, sizes, candidates)
     if not result.converged:
         raise ValueError(
-            f"no optimum was found (rms {result.rms:.4g} px), so nothing is written: are --board and the images right? "
-            "Another --model, or --loss huber where some corners are wrong, may help"
+            f"the calibration must converge; got rms {result.rms:.4g} px, nothing is written. Check --board and the "
+            "images, or try another --model, or --loss huber if some corners are wrong"
         )
     names = list(views) if isinstance(result, RigCalibration) else [of_view[""].path.name for of_view in views.values()]
     text = repr(result)  # with names of views instead of numbers, and options instead of arguments
@@ -69,14 +69,14 @@ def _cameras(arguments: argparse.Namespace) -> dict[str, list[Path]]:
     """Return the images by the names of cameras, "" for a single one."""
     pair = {name: words for name in ("left", "right") if (words := getattr(arguments, name))}
     if sum(map(bool, (arguments.images, pair, arguments.rig))) > 1:
-        raise ValueError("give one of images of one camera, --left and --right, or --rig")
+        raise ValueError("one of IMAGE, --left with --right, and --rig must be given; got several")
     if len(pair) == 1:
-        raise ValueError(f"--{next(iter(pair))} is one of a pair: --left and --right are both needed")
+        raise ValueError(f"--left and --right must both be given; got --{next(iter(pair))} alone")
     if arguments.rig:
         for word in arguments.rig:
             name, _, images = word.partition("=")
             if not (name and images):
-                raise ValueError(f"--rig takes NAME=IMAGE, as in cam0=folder or cam1='right*.png'; got {word!r}")
+                raise ValueError(f"--rig must be NAME=IMAGE, as in cam0=folder or cam1='right*.png'; got {word!r}")
             pair.setdefault(name, []).append(images)
         if len(pair) < 2:
             raise ValueError("--rig must have several cameras; got one. Give its images without --rig")
@@ -91,16 +91,16 @@ def _candidates(arguments: argparse.Namespace) -> list[tuple[str, int]]:
     if arguments.format is None and path.suffix.lower() in (".yml", ".yaml"):  # several formats have this suffix
         arguments.format = "opencv"
     if model is None and count is not None:
-        raise ValueError("--count needs a --model")
+        raise ValueError("--model must be given with --count; got none")
     tried: Sequence[tuple[str, int]] = selection.CANDIDATES
     if model is not None:
         kind = as_model(model, "--model")
         tried = [(model, kind.default_count if count is None else count)]
         if kind.names_of(tried[0][1]) is None:
-            raise ValueError(f"--count: {model} takes {kind.counts_text()}; got {count}")
+            raise ValueError(f"--count must be {kind.counts_text()} for {model}; got {count}")
         if kind.smoothness() is not None:
             raise ValueError(
-                f"--model: {model} fits a surface over a known lens. In Python: fitted = ct.calibrate(...) "
+                f"--model must need no known lens; got {model}. In Python write fitted = ct.calibrate(...) "
                 f"of another model, then ct.calibrate({model!r}, ..., start=fitted.camera)"
             )
     held = []
@@ -113,7 +113,7 @@ def _candidates(arguments: argparse.Namespace) -> list[tuple[str, int]]:
         except CameraFileError as error:
             failure = error
     if not held:
-        raise ValueError(f"{failure}; write -o camera.json, which holds every model")
+        raise ValueError(f"{failure}. Write -o camera.json, which holds every model")
     return held
 
 

@@ -37,7 +37,7 @@ def read_rig(
     if str(path).startswith(GUESS):
         fov = str(path).removeprefix(GUESS)
         if size is None:
-            raise ValueError(f"{GUESS}{fov}: a guessed field of view needs an image size, which is unknown here")
+            raise ValueError(f"{GUESS}{fov}: image size must be known for a guess; got none")
         kind = as_model(model or ("pinhole" if float(fov) < _WIDE else "kannala_brandt"), "--model")
         guessed = kind.from_fov(float(fov), image_size=size).double().requires_grad_(False)
         focal = float(guessed.intrinsics[0])
@@ -46,8 +46,8 @@ def read_rig(
     rig = load(path) if model is None else opencv.read_rig(path, model)
     if stated and model is None and rig.format == "opencv" and _leaves_open(path):
         raise ValueError(
-            f"{path}: 4 coefficients, and it does not say of which model: --from-model kannala_brandt if they come "
-            "from cv2.fisheye, else --from-model brown_conrady"
+            f"{path}: the model of 4 coefficients must be named; got none. Write --from-model kannala_brandt if they "
+            "are from cv2.fisheye, else --from-model brown_conrady"
         )
     if name is not None:
         if name not in rig.cameras and name not in rig.images:
@@ -56,7 +56,7 @@ def read_rig(
         rig = Rig({name: rig.camera_of(name)}, pose, format=rig.format)
     for found, camera in rig.cameras.items():
         if size is not None and camera.image_size not in (None, size):
-            raise ValueError(f"{path}: {found} is for {_shown(camera.image_size)}, not {_shown(size)}")
+            raise ValueError(f"{path}: {found} must be for {_shown(size)}; got {_shown(camera.image_size)}")
         camera.image_size = camera.image_size or size
     return rig
 
@@ -82,10 +82,10 @@ def read_other(path: Path, name: str | None = None, model: str | None = None) ->
 def _one(path: Path, rig: Rig, name: str | None = None) -> Camera:
     """Return the camera called `name`, or the only one."""
     if name is None and len(rig.cameras) > 1:
-        raise ValueError(f"{path}: has several cameras; choose one with --name: {', '.join(rig.cameras)}")
+        raise ValueError(f"{path}: must have one camera; got several. Choose one with --name: {', '.join(rig.cameras)}")
     name = name or next(iter(rig.cameras))
     if (camera := rig.camera_of(name)).batch_shape:
-        raise ValueError(f"{path}: {name} is a batch of {tuple(camera.batch_shape)} cameras; here one is needed")
+        raise ValueError(f"{path}: {name} must be one camera; got a batch of {tuple(camera.batch_shape)}")
     return camera
 
 
@@ -117,7 +117,7 @@ def fitting(camera: Camera, path: Path, image: Path, size: Size, rescale: bool) 
         note(f"{path} states no image size; taken to be for {_shown(size)}, as {image} is")
     if reason := _unfitting(camera, size, rescale):
         own = _shown((camera.height, camera.width))
-        raise ValueError(f"{image} is {_shown(size)}, but the camera in {path} is for {own}; {reason}")
+        raise ValueError(f"{image}: must be {own}, as the camera in {path}; got {_shown(size)}. {reason}")
     return camera if camera.image_size == size else camera.resize(*size)
 
 
@@ -126,12 +126,12 @@ def _unfitting(camera: Camera, size: Size, rescale: bool) -> str:
     if camera.image_size == size:
         return ""
     if size == (camera.width, camera.height):
-        return "width and height are exchanged, which scaling does not undo; turn the photograph"
+        return "Width and height are exchanged, which scaling does not undo: turn the photograph"
     shapes = size[1] / size[0], camera.width / camera.height
     if max(shapes) <= (1 + _ASPECT) * min(shapes):
         return "" if rescale else "--rescale scales the camera to the image"
     return (
-        f"their aspect ratios, {shapes[0]:.4g} and {shapes[1]:.4g}, differ by more than {100 * _ASPECT:g} %: the image "
+        f"Their aspect ratios, {shapes[0]:.4g} and {shapes[1]:.4g}, differ by more than {100 * _ASPECT:g} %: the image "
         "may be cropped, which --rescale does not undo"
     )
 

@@ -13,7 +13,7 @@ from camtorch.cli import words
 
 Commands: TypeAlias = "argparse._SubParsersAction[Any]"
 Add: TypeAlias = Callable[..., Any]  # the method `add_argument` of a command, or of a group of its options
-_FORMAT = "of OUT; by default what its name says"
+_FORMAT = "of OUT; by default as its name ends"
 _BOARDS = ("chessboard", "charuco", "aprilgrid")  # copied from `camtorch.boards`, whose import needs numpy
 
 
@@ -59,7 +59,7 @@ def _dewarp(commands: Commands) -> None:
     many("--jobs", type=words.count(1024), metavar="N", help="processes; by default as many as there are cores")
     many("--suffix", type=words.suffix, metavar=".EXT", help="of new images or videos, else as the old ones")
     video = command.add_argument_group("videos (pip install -e '.[video]')").add_argument
-    text = "the encoder; libx264 by default, in .webm libvpx-vp9; ffv1 loses nothing"
+    text = "the encoder; libx264 by default, in .webm libvpx-vp9; ffv1 is lossless"
     video("--codec", choices=("libx264", "libvpx-vp9", "ffv1"), help=text)
     video("--crf", type=int, metavar="N", help="its quality, lower is better; 18 in libx264")
 
@@ -68,7 +68,7 @@ def _map(commands: Commands) -> None:
     command = commands.add_parser(
         "map",
         help="write a dewarping as a lookup table for OpenCV, ONNX, camera chips",
-        description="Write where each pixel of a dewarped image is taken from, for another runtime, and say how far "
+        description="Write where each pixel of a dewarped image is taken from, for another runtime, and print how far "
         "that is from exact: camtorch map camera.yml -o map.npz",
     )
     add = command.add_argument
@@ -78,12 +78,12 @@ def _map(commands: Commands) -> None:
     _projection(target)
     target("--target", type=words.path, metavar="FILE", help="a calibration: what that camera would see")
     file = command.add_argument_group("the map").add_argument
-    file("--format", help="opencv, opencv_fixed, dw100, ti_ldc or onnx; by default what OUT's name says")
+    file("--format", help="opencv, opencv_fixed, dw100, ti_ldc or onnx; by default as OUT ends")
     file("--step", type=int, metavar="PIXELS", help="ti_ldc: between nodes; 8 by default")
     file("--block", type=words.size, metavar="WxH", help="ti_ldc: of the new image; by default what fits")
     file("--dtype", choices=("float32", "uint8"), help="onnx: of images; float32 by default")
-    file("--clip", action="store_true", default=None, help="dw100, ti_ldc: draw in what they cannot hold")
-    file("--check", type=words.path, metavar="MAP", help="write nothing; say how far this map is from the dewarping")
+    file("--clip", action="store_true", default=None, help="dw100, ti_ldc: clip positions that they cannot hold")
+    file("--check", type=words.path, metavar="MAP", help="write nothing; print how far this map is from the dewarping")
     _output(add, "the map")
 
 
@@ -98,7 +98,7 @@ def _convert(commands: Commands) -> None:
     add("new", type=words.path, nargs="?", metavar="OUT", help="the new one")
     add("-o", "--output", type=words.path, metavar="OUT", help="the same, as of other commands")
     add("--model", metavar="KEY", help="the model of OUT; by default that of IN")
-    add("--count", type=int, metavar="N", help="of coefficients, where the model leaves a choice")
+    add("--count", type=int, metavar="N", help="of coefficients, if the model has several counts")
     add("--max-angle", type=float, metavar="DEGREES", help="from the axis, up to which rays matter")
     add("--format", help=_FORMAT)
     _calibration(add, "which camera is saved, alone and without its pose")
@@ -108,7 +108,7 @@ def _convert(commands: Commands) -> None:
 def _show(commands: Commands) -> None:
     add = commands.add_parser(
         "show",
-        help="what a calibration says, in numbers and in an image",
+        help="show a calibration in numbers and in an image",
         description="Print the cameras of a calibration file, compare two of them, or draw one: camtorch show "
         "camera.yml -o lens.png",
     ).add_argument
@@ -161,9 +161,9 @@ def _calibrate(commands: Commands) -> None:
     board("--dictionary", metavar="NAME", help="of markers, by OpenCV's name; by default 5X5_1000, or APRILTAG_36h11")
     lens = command.add_argument_group("camera").add_argument
     lens("--model", metavar="KEY", help="kannala_brandt, brown_conrady ...; by default the one that fits")
-    lens("--count", type=int, metavar="N", help="of coefficients, where the model leaves a choice")
+    lens("--count", type=int, metavar="N", help="of coefficients, if the model has several counts")
     lens("--fixed", metavar="NAMES", help="held parameters, as cx,cy (in the middle) or k3 (at 0)")
-    lens("--loss", choices=("huber", "cauchy"), help="for corners of which some are wrong")
+    lens("--loss", choices=("huber", "cauchy"), help="a robust loss, if some corners are wrong")
     lens("--loss-scale", type=float, default=1.0, metavar="PX", help="of that loss; 1 by default")
     lens("--bend", action="store_true", help="the board is not quite flat: find its bend as well")
     add("--format", help=f"{_FORMAT}, OpenCV's for .yml")
@@ -174,11 +174,11 @@ def _calibration(add: Add, of_name: str = "which camera, in a file with several"
     """Add options for reading a calibration; `size` is the name of the option for the image size."""
     add("--name", help=of_name)
     _from_model(add)
-    add(size, type=words.size, metavar="WxH", help="of images, where the file does not say")
+    add(size, type=words.size, metavar="WxH", help="of images, if the file has none")
 
 
 def _from_model(add: Add, *others: str) -> None:
-    text = "the model in the file, where that does not say it: kannala_brandt, brown_conrady ..."
+    text = "the model in the file, if it names none: kannala_brandt, brown_conrady ..."
     add("--from-model", *others, metavar="KEY", help=text)
 
 

@@ -89,7 +89,7 @@ def run(arguments: argparse.Namespace) -> int:
         return _many(arguments)
     for name in ("resume", "suffix"):
         if getattr(arguments, name):
-            raise ValueError(f"--{name} needs a folder. Write -o OUT/, with a slash")
+            raise ValueError(f"-o must be a folder for --{name}; got none. Write -o OUT/, with a slash")
     source = Path(arguments.image[0])
     is_video = videos.is_video(source)
     output = Path(arguments.output or f"dewarped{videos.written_suffix(source) if is_video else '.png'}")
@@ -115,7 +115,7 @@ def _many(arguments: argparse.Namespace) -> int:
     """Dewarp all files, and print the results; return the exit status, 1 if any failed."""
     if any(Path(name).suffix.lower() in _CALIBRATIONS for name in arguments.image):
         raise ValueError(
-            f"{' '.join(arguments.image)}: all are read as images. Name the calibration with --camera, and with -o "
+            f"{' '.join(arguments.image)}: must be images; got others. Name the calibration with --camera, and with -o "
             "the new image: camtorch dewarp photo.jpg --camera camera.yml -o straight.png"
         )
     known = IMAGES | videos.FORMATS
@@ -163,7 +163,7 @@ def _outcomes(work: Dewarping, todo: Sequence[Pair], jobs: int | None) -> list[O
         with bar("dewarp", len(todo), "files") as shown:
             return processes.each(work, todo, max(min(jobs or cores, len(todo)), 1), shown.update)
     except ChildProcessError as error:
-        raise ValueError(f"{error}; --resume continues the run, --jobs 1 needs the least memory") from None
+        raise ValueError(f"{error}. --resume continues the run, --jobs 1 needs the least memory") from None
     finally:
         targets.remove_left_over(todo)
 

@@ -33,5 +33,5 @@ def find(words: str, size: tuple[int, int] | None = None) -> list[lenses.Lens]:
     try:
         lenses.find(words, image_size=size)
     except ValueError as error:
-        raise ValueError(f"{error}; on the command line --guess-fov DEGREES does") from None
+        raise ValueError(f"{error}. On the command line write --guess-fov DEGREES") from None
     return lenses.search(words, image_size=size)

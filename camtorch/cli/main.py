@@ -27,7 +27,7 @@ class _Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         name, hint = message.partition("unrecognized arguments: ")[2].split(" ")[0], f"see {self.prog} --help"
         if os.path.splitext(name)[1] and not name.startswith("-") and not os.path.exists(name):
-            message += f"; -o {name} names what is written"
+            message += f"; -o {name} names the new file"
         elif name.startswith("-") or message.startswith("argument COMMAND: invalid choice"):
             hint += "; commands and options of 0.3 that are gone: docs/leaving-0.3.md"
         raise ValueError(f"{message} ({hint})")

@@ -33,7 +33,7 @@ def run(arguments: argparse.Namespace) -> None:
 def _warp(given: argparse.Namespace) -> Warp:
     camera = read_camera(given.camera, given.name, given.from_model, given.camera_size)
     if camera.image_size is None:
-        raise ValueError(f"{given.camera} has no image size; add --camera-size WxH")
+        raise ValueError(f"{given.camera}: must have an image size; got none. Add --camera-size WxH")
     if given.target is None:
         return Dewarp(camera, projection=given.projection, fov=given.fov, image_size=given.size, tolerance=0)
     for name in ("fov", "size"):

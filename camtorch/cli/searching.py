@@ -51,8 +51,8 @@ def find_views(
             note(f"{path} is left out: {why}")
         if len(used) < _LEAST_VIEWS:
             raise ValueError(
-                f"a board was found in {len(used)} of {len(seen)} images{f' of {name}' if name else ''}, and "
-                f"{_LEAST_VIEWS} are needed, better 20; is it {board.words()}?"
+                f"the board must be found in {_LEAST_VIEWS} images, better 20; got {len(used)} of {len(seen)}"
+                f"{f' of {name}' if name else ''}. Check that it is {board.words()}"
             )
         height, width = sizes[name] = used[0].image_size
         corners = sum(int(np.isfinite(image.pixels[:, 0]).sum()) for image in used)
@@ -75,7 +75,7 @@ def _search(board: Board, images: Sequence[Image]) -> list[ImageCorners]:
 def take_together(cameras: Mapping[str, Sequence[Path]]) -> dict[str, dict[str, Path]]:
     """Return view -> camera -> image of images with the same name, else last number, else position."""
     if film := next((path for paths in cameras.values() for path in paths if videos.is_video(path)), None):
-        raise ValueError(f"{film}: videos must be of one camera: frames of two cameras have no common time")
+        raise ValueError(f"{film}: videos must be of one camera, as frames of two have no common time; got several")
     keys: tuple[Callable[[Path], str | None], ...] = (lambda path: path.stem, _last_number)
     for key in keys:
         keyed = {name: {key(path): path for path in paths} for name, paths in cameras.items()}
@@ -88,8 +88,8 @@ def take_together(cameras: Mapping[str, Sequence[Path]]) -> dict[str, dict[str, 
     if len({len(paths) for paths in cameras.values()}) > 1:
         counts = ", ".join(f"{len(paths)} of {name}" for name, paths in cameras.items())
         raise ValueError(
-            f"{counts}: images that were taken together have the same name, or the same number last in it; or there "
-            "are as many of each, in their order"
+            "images taken together must have the same name, or the same last number, or be as many in their order; "
+            f"got {counts}"
         )
     rows = zip(*cameras.values(), strict=True)
     return {str(i): dict(zip(cameras, row, strict=True)) for i, row in enumerate(rows)}

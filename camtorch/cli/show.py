@@ -24,25 +24,25 @@ def run(arguments: argparse.Namespace) -> None:
     if html is not None:
         targets.check(html, force=arguments.force, inputs=(path, against, photograph))
     elif photograph is not None:
-        raise ValueError("--image needs --html, which writes the page")
+        raise ValueError("--html must be given with --image; got none")
     cameras = read_rig(path, arguments.name, arguments.from_model, arguments.size).cameras
     single = any(file is not None for file in (output, against, html))
     if single and len(cameras) > 1:
-        raise ValueError(f"{path}: has several cameras; choose one with --name: {', '.join(cameras)}")
+        raise ValueError(f"{path}: must have one camera; got several. Choose one with --name: {', '.join(cameras)}")
     ((name, camera), *_), other = cameras.items(), None
     if single and camera.image_size is None:
-        raise ValueError(f"{path} has no image size; add --size WxH")
+        raise ValueError(f"{path}: must have an image size; got none. Add --size WxH")
     if against is not None:
         other = read_other(against, arguments.name, arguments.from_model)
         if other.image_size not in (None, camera.image_size):
-            sizes = f"{other.width}x{other.height}, but {path} for {camera.width}x{camera.height}"
-            raise ValueError(f"{against} is for {sizes}: both must have the same size")
+            sizes = f"{other.width}x{other.height} and {camera.width}x{camera.height}"
+            raise ValueError(f"{against} and {path} must be for the same size; got {sizes}")
     if html is not None:
         html.parent.mkdir(parents=True, exist_ok=True)
         write_viewer(camera, html, photograph)
     for name, camera in cameras.items():
         if camera.batch_shape:
-            raise ValueError(f"{path}: {name} is a batch of {tuple(camera.batch_shape)} cameras; single ones are shown")
+            raise ValueError(f"{path}: {name} must be one camera; got a batch of {tuple(camera.batch_shape)}")
         print(f"{path}: {name}", *summarise(camera).lines(), sep="\n")
     if other is not None:
         compared = difference(camera, other)

@@ -17,17 +17,17 @@ from camtorch.io.writing import all_left_over
 def check(path: Path, *, force: bool, inputs: tuple[Path | None, ...] = ()) -> None:
     """Raise a ValueError if a file cannot be written, is an input (also by a link), or exists and `force` is false."""
     if path.is_dir():
-        raise ValueError(f"{path}: is a folder; name a file in it")
+        raise ValueError(f"{path}: must be a file; got a folder. Name a file in it")
     for given in inputs:
         if given is not None and path.exists() and given.exists() and path.samefile(given):
-            raise ValueError(f"{path}: would overwrite {given}, which is read; name another file")
+            raise ValueError(f"{path}: would overwrite {given}, which is read. Name another file")
     if os.path.lexists(path) and not force:
         raise ValueError(f"{path}: exists already; --force overwrites it")
     folder = next(parent for parent in path.absolute().parents if os.path.lexists(parent))
     if not folder.is_dir():
-        raise ValueError(f"{path}: {folder} is no folder")
+        raise ValueError(f"{path}: {folder} must be a folder; got a file")
     if not os.access(folder, os.W_OK):
-        raise ValueError(f"{path}: the folder {folder} cannot be written to")
+        raise ValueError(f"{path}: the folder {folder} must be writable; got one that is not")
 
 
 def folder(text: str | None, suffixes: Collection[str]) -> Path:
@@ -73,7 +73,7 @@ def find(words: Sequence[str], suffixes: Collection[str], output: Path) -> list[
             and (apart or not _is_below(os.path.realpath(one), out))
         }
         if not found:
-            raise ValueError(f"{word}: no file in there ends in {', '.join(sorted(suffixes))}")
+            raise ValueError(f"{word}: must hold files that end in {', '.join(sorted(suffixes))}; got none")
         files |= found
     return sorted(files.values(), key=lambda found: natural(found[0]))
 
@@ -107,7 +107,7 @@ def to_make(pairs: Sequence[Pair], others: Iterable[Path], *, resume: bool, forc
         if (place := os.path.realpath(target)) in written:
             raise ValueError(f"{written[place]} and {source} would both be written to {target}")
         if place in read:
-            raise ValueError(f"{target}: would overwrite {read[place]}, which is read; name another folder")
+            raise ValueError(f"{target}: would overwrite {read[place]}, which is read. Name another folder")
         written[place] = source
     if resume:
         return [(source, target) for source, target in pairs if not (target.is_file() and target.stat().st_size)]

@@ -161,7 +161,7 @@ def remake(
                 continue
             if (frame.height, frame.width) != (first.height, first.width):
                 was, now = f"{first.width}x{first.height}", f"{frame.width}x{frame.height}"
-                raise ValueError(f"{source}: its frames are {was}, then {now}")
+                raise ValueError(f"{source}: frames must have one size; got {was}, then {now}")
             end = max(end, frame.time + float(1 / _rate(stream)) - begin)
             old, made = frame.reformat(format="yuv420p"), require().VideoFrame(new.width, new.height, "yuv420p")
             for plane, pixels, target_pixels in zip(warps, _planes(old), _planes(made), strict=True):
@@ -173,7 +173,7 @@ def remake(
             done()
         output.mux(new.encode(None))
         if length - end > max(_CUT, 0.02 * length):
-            raise ValueError(f"{source}: ends after {end:.1f} of {length:.1f} seconds; it is cut off or damaged")
+            raise ValueError(f"{source}: must last {length:.1f} seconds; got {end:.1f}. It is cut off or damaged")
     return facts | {"frames": count}
 
 
@@ -201,7 +201,7 @@ def _new_stream(
     try:
         stream = output.add_stream(codec, rate=rate, time_base=first.time_base)
     except ValueError as error:
-        raise ValueError(f"{target}: {error}; choose another encoder with --codec") from None
+        raise ValueError(f"{target}: {error}. Choose another encoder with --codec") from None
     stream.width, stream.height, stream.pix_fmt = camera.width, camera.height, "yuv420p"
     like = first.reformat(format="yuv420p")
     for name in _COLOURS:
@@ -219,7 +219,7 @@ def _copied_stream(output: Any, other: Any, source: Path, target: Path) -> Any:
         copy = output.add_stream_from_template(other)
     except ValueError:
         kind = f"{other.type}, {other.codec_context.name}"
-        raise ValueError(f"{source}: its {kind}, cannot be kept in {target.suffix}; .mkv takes nearly all") from None
+        raise ValueError(f"{source}: streams must fit in {target.suffix}; got {kind}. .mkv takes nearly all") from None
     if "language" in other.metadata:
         copy.metadata["language"] = other.metadata["language"]
     return copy

@@ -36,7 +36,7 @@ class DW100(Table):
         """Return the file of a mesh; raise a CameraFileError if the hardware does not support a size or position."""
         for what, size in (("source", exact.source_size), ("target", exact.target_size)):
             if any(not low <= side <= high for low, side, high in zip(_SMALLEST, size, _LARGEST, strict=True)):
-                reason = f"{size[1]}x{size[0]}; the DW100 takes 176x144 to 4096x3072 pixels"
+                reason = f"must be 176x144 to 4096x3072 pixels for the DW100; got {size[1]}x{size[0]}"
                 raise CameraFileError(path, f"{what} size", reason)
         low, high = np.zeros(2), np.full(2, _MOST / _PARTS)
         mesh = held(path, self.name, mesh, low, high, clip=bool(options.get("clip")))

@@ -30,7 +30,7 @@ FORMATS = tuple(_FORMATS)
 _LARGEST_FILE = 1 << 31
 _LARGEST_DESCRIPTION = 1 << 16
 _NO_FACTS = ("format", *SIZES, "max_error", "rms_error")
-_KNOWN = f"known are {', '.join(FORMATS)}; docs/leaving-0.3.md says what to use for formats that left"
+_KNOWN = f"known are {', '.join(FORMATS)}; docs/leaving-0.3.md lists what to use for formats that left"
 
 
 class MapOptions(TypedDict, total=False):
@@ -75,10 +75,10 @@ def save_map(
     given = {option: value for option, value in options.items() if value is not None}
     for option in given:
         if option not in chosen.options:
-            takes = f"; it takes {', '.join(chosen.options)}" if chosen.options else ""
-            raise ValueError(f"save_map: {chosen.name} has no {option}{takes}")
+            takes = f"among {', '.join(chosen.options)}" if chosen.options else "none"
+            raise ValueError(f"save_map: options of {chosen.name} must be {takes}; got {option}")
     if chosen.suffixes and not name.lower().endswith(chosen.suffixes):
-        raise ValueError(f"{name}: suffix must be one of {', '.join(chosen.suffixes)} for {chosen.name}")
+        raise ValueError(f"{name}: suffix must be one of {', '.join(chosen.suffixes)} for {chosen.name}; got another")
     if not (exact := Exact(warp, "save_map")).shown.any():
         raise ValueError(f"save_map: {name}: the target must show a part of the source's image; got none")
     content, facts = chosen.encode(name, exact, given)
@@ -114,16 +114,16 @@ def load_map(path: str | os.PathLike[str], format: str | None = None) -> LookupM
     described = _read_description(name) if chosen is None or chosen.described else {}
     chosen = chosen or _FORMATS.get(str(described.get("format")))
     if chosen is None:
-        what = f"not a known map, and no {name}.json describes it; write format=...: {_KNOWN}"
+        what = f"must be a known map, or have {name}.json; got neither. Write format=...; {_KNOWN}"
         raise CameraFileError(name, "content", what)
     if described.get("format", chosen.name) != chosen.name:
-        raise CameraFileError(f"{name}.json", "format", f"describes {described['format']!r:.60}, not {chosen.name}")
+        raise CameraFileError(f"{name}.json", "format", f"must be {chosen.name}; got {described['format']!r:.60}")
     try:
         read = chosen.decode(content, described)
     except ImportError:
         raise
     except Exception as error:  # libraries raise any error for damaged files
-        reason = f"no map of {chosen.name}: {str(error) or type(error).__name__}"
+        reason = f"must be a map of {chosen.name}; got {str(error) or type(error).__name__}"
         raise CameraFileError(name, "content", reason) from None
     facts = {key: tuple(value) if isinstance(value, list) else value for key, value in described.items()}
     read.facts = {**{key: facts[key] for key in facts if key not in _NO_FACTS}, **read.facts}
@@ -151,9 +151,9 @@ def _read_description(path: str) -> dict[str, Any]:
     try:
         described = json.loads(content)
         if not isinstance(described, dict) or len(content) > _LARGEST_DESCRIPTION:
-            raise ValueError("no mapping, or too long")
+            raise ValueError("must be a short mapping; got another value")
     except (ValueError, RecursionError) as error:
-        raise CameraFileError(beside, "content", f"no description of a map: {error}") from None
+        raise CameraFileError(beside, "content", f"must describe a map: {error}") from None
     return described
 
 
@@ -164,7 +164,7 @@ def _chosen(path: str, format: str | None) -> MapFormat:
     suffixes = {suffix: known for known in reversed(_FORMATS.values()) for suffix in known.suffixes}
     if suffix not in suffixes:
         raise ValueError(
-            f"{path}: the name does not determine the format; names that end in {', '.join(suffixes)} do. Name it, "
+            f"{path}: the name must end in {', '.join(suffixes)} to determine the format; got another. Name it, "
             f"as in format='dw100' or --format dw100; {_KNOWN}"
         )
     return suffixes[suffix]
@@ -172,5 +172,5 @@ def _chosen(path: str, format: str | None) -> MapFormat:
 
 def _named(format: str) -> MapFormat:
     if (found := _FORMATS.get(str(format).lower())) is None:
-        raise ValueError(f"format: must be a known format of maps; got {format!r}; {_KNOWN}")
+        raise ValueError(f"format must be a known format of maps; got {format!r}; {_KNOWN}")
     return found

@@ -37,8 +37,8 @@ class Exact:
             raise TypeError(f"{owner}: warp must be a Warp; got {type(warp).__name__}")
         if (count := warp.batch_shape.numel()) != 1:
             raise ValueError(
-                f"{owner}: a map is of one warp, and this is a batch of {count}; camera[i] is one of a batch of "
-                "cameras, so take each ct.Warp(source[i], target[i], rotation[i])"
+                f"{owner}: warp must be a single one; got a batch of {count}. camera[i] is one of a batch of "
+                "cameras: write each ct.Warp(source[i], target[i], rotation[i])"
             )
         self.warp = warp
         self.source_size: tuple[int, int] = warp.source._size_for(owner)

@@ -71,8 +71,8 @@ class Table(MapFormat):
             raise CameraFileError(
                 path,
                 "mesh",
-                f"positions leap across the source beside {leaps} pixels, as at the seam of a panorama, and no mesh "
-                "does. A target that does not show the seam has one; opencv and onnx hold positions pixel by pixel",
+                f"positions must not leap, as at the seam of a panorama; got leaps beside {leaps} pixels. A target "
+                "without the seam has a mesh; opencv and onnx hold positions pixel by pixel",
             )
         n, m = _counts(step, exact.target_size)
         down, across = np.nonzero(exact.shown)
@@ -155,8 +155,8 @@ def held(path: str, format: str, mesh: Mesh, low: Floats, high: Floats, *, clip:
         raise CameraFileError(
             path,
             f"{int(lost.sum())} of {int(mesh.needed.sum())} vertices",
-            f"lie at x {left:.1f} to {right:.1f}, y {top:.1f} to {bottom:.1f} px of the source, which {format} does "
-            "not hold. Choose a target that shows less beyond the edges of the source's image; or clip=True "
+            f"must fit in {format}; got x {left:.1f} to {right:.1f}, y {top:.1f} to {bottom:.1f} px of the source. "
+            "Choose a target that shows less beyond the edges of the source's image; or clip=True "
             "(--clip) clips them, and the report has the error",
         )
     return replace(mesh, nodes=mesh.nodes.clip(low, high))

@@ -37,8 +37,8 @@ class ONNX(MapFormat):
             raise ValueError("save_map: antialias must be False for ONNX; got True. Save a warp with antialias=False")
         if warp.mode == "bicubic" and warp.padding_mode != "zeros":
             raise ValueError(
-                f"save_map: mode='bicubic' with padding_mode={warp.padding_mode!r} is not the same in every ONNX "
-                "runtime; 'bilinear' is, or padding_mode='zeros'"
+                f"save_map: padding_mode must be 'zeros' for 'bicubic', as runtimes differ; got {warp.padding_mode!r}. "
+                "Or save a warp with mode='bilinear'"
             )
         return _model(exact, dtype).SerializeToString(), {"dtype": dtype, "opset": _OPSET}
 

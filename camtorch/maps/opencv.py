@@ -45,7 +45,7 @@ class OpenCV(MapFormat):
     def encode(self, path: str, exact: Exact, options: Mapping[str, Any]) -> tuple[bytes, dict[str, Any]]:
         sides = (*exact.source_size, *exact.target_size)
         if max(sides) > _LONGEST:
-            raise CameraFileError(path, "size", f"a side of {max(sides)} px; cv2.remap takes at most {_LONGEST}")
+            raise CameraFileError(path, "size", f"sides must be at most {_LONGEST} px for cv2.remap; got {max(sides)}")
         positions = exact.positions.clip(_NOWHERE, -_NOWHERE - 1)
         positions[~exact.mapped] = _NOWHERE
         if self.name == "opencv_fixed":
@@ -75,7 +75,7 @@ class OpenCV(MapFormat):
         else:
             positions = np.stack((first, second), -1).astype(np.float64)
         if positions.ndim != 3 or not positions.size or positions.shape[-1] != 2:
-            raise ValueError(f"not maps of cv2.remap: {first.dtype} {first.shape} and {second.dtype} {second.shape}")
+            raise ValueError(f"must be cv2.remap's; got {first.dtype} {first.shape} and {second.dtype} {second.shape}")
         positions[(positions <= _NOWHERE).any(-1) | ~np.isfinite(positions).all(-1)] = np.nan
         size = checked("source_size", [int(arrays[key]) for key in SIZES[:2]])
         return LookupMap(torch.from_numpy(positions), size, "opencv_fixed" if is_fixed else "opencv", {})

@@ -52,7 +52,7 @@ class TILDC(Table):
                 f"at most {_LONGEST_BLOCK}; got {block}"
             )
         if max(*exact.source_size, *exact.target_size) > _LARGEST:
-            raise CameraFileError(path, "size", f"a side above {_LARGEST} px, which the LDC does not take")
+            raise CameraFileError(path, "size", f"sides must be at most {_LARGEST} px for the LDC; got more")
         (n, m), places = mesh.nodes.shape[:2], mesh.places
         limits = places + _LOW / _PARTS, places + _HIGH / _PARTS
         mesh = held(path, self.name, mesh, *limits, clip=bool(options.get("clip")))
@@ -96,6 +96,6 @@ def _fetched(
     raise CameraFileError(
         path,
         "pixel padding",
-        f"blocks of {size[1]}x{size[0]} need {padding} pixels of the source around what their corners say; the LDC has "
-        f"at most {_MOST_PADDING}{'' if block is None else '; smaller blocks need less'}",
+        f"blocks of {size[1]}x{size[0]} must need at most {_MOST_PADDING} pixels around their corners' positions; got "
+        f"{padding}{'' if block is None else '. Smaller blocks need less'}",
     )

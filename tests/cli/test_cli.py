@@ -42,11 +42,11 @@ def test_camera_without_size_takes_the_images(folder, capsys):
 def test_another_resolution_needs_rescale(folder, capsys):
     opened("in.png").resize((48, 32)).save("half.png")
     error = refused(capsys, "dewarp", "half.png", "--camera", "camera.yml", "-o", "out.png")
-    assert "half.png is 48x32, but the camera in camera.yml is for 96x64; --rescale" in error
+    assert "half.png: must be 96x64, as the camera in camera.yml; got 48x32. --rescale" in error
     assert "cropped" not in error
     for size, reason in (
         ((48, 48), "aspect ratios, 1 and 1.5, differ by more than 1 %: the image may be cropped"),
-        ((64, 96), "is 64x96, but the camera in camera.yml is for 96x64; width and height are exchanged"),
+        ((64, 96), "as the camera in camera.yml; got 64x96. Width and height are exchanged"),
     ):
         opened("in.png").resize(size).save("other.png")
         for words in ([], ["--rescale"]):
@@ -76,7 +76,7 @@ def test_where_the_result_goes(folder, capsys):
     Path("hard.png").hardlink_to("in.png")
     Path("camera.png").symlink_to("camera.yml")
     for name in (folder / "in.png", "link.png", "hard.png", "camera.png"):
-        assert "which is read; name another file" in refused(capsys, *words, name, "--force")
+        assert "which is read. Name another file" in refused(capsys, *words, name, "--force")
     assert Path("in.png").read_bytes() == image
 
 

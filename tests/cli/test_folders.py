@@ -72,7 +72,7 @@ def test_files_are_found_with_their_places(tree):
     assert tree("in/[1].jpg") == {"in/[1].jpg": "[1].jpg"}
     Path("in/empty").mkdir()
     for word in ("in/*gif", "in/empty"):
-        with pytest.raises(ValueError, match=r"no file in there ends in .bmp"):
+        with pytest.raises(ValueError, match=r"must hold files that end in .bmp"):
             tree(word)
     Path("in/out").mkdir()
     Path("in/out/2.JPG").write_text("made")
@@ -160,10 +160,10 @@ def test_hostile_files_are_a_line_each(folder, capsys, monkeypatch):
         "in/me.png: Too many levels of symbolic links",
         "in/bomb.png: must have at most 179 million pixels",
         "in/cut.png: ",
-        "in/large.png: is 96x65, but the camera in camera.yml is for 96x64; ",
+        "in/large.png: must be 96x64, as the camera in camera.yml; got 96x65.",
         *(["in/locked.png: Permission denied"] if locked else []),
         "in/nothing.png: must be an image of Pillow; got none",
-        "in/small.png: is 1x1, but the camera in camera.yml is for 96x64; ",
+        "in/small.png: must be 96x64, as the camera in camera.yml; got 1x1.",
         "in/words.jpg: must be an image of Pillow; got none",
     ]
     lines = printed.err.splitlines()
@@ -184,7 +184,7 @@ def test_a_camera_without_size_is_of_the_first_image(folder, capsys):
     command(*words, expect=1)
     printed = capsys.readouterr().err
     assert "note: bare.yml states no image size; taken to be for 96x64, as in/1.png is\n" in printed
-    assert "in/half.png: is 48x32, but the camera in bare.yml is for 96x64; --rescale" in printed
+    assert "in/half.png: must be 96x64, as the camera in bare.yml; got 48x32. --rescale" in printed
     command(*words, "--rescale", "--force", expect=1)
     assert opened("out/half.png").size == (48, 32)
     assert capsys.readouterr().out == "out: 6 of 7 files made; 1 failed\n"  # images of two sizes are not all alike
@@ -273,7 +273,7 @@ def test_a_run_that_is_broken_off_is_one_line(folder, who):
         os.kill(max(one for one in others if os.getpgid(one) == process.pid), signal.SIGKILL)
     printed = {
         "all": "interrupted\n",
-        "one": "error: a process was killed, perhaps for lack of memory; --resume continues the run",
+        "one": "error: a process was killed, perhaps for lack of memory. --resume continues the run",
     }
     out, error = process.communicate(timeout=30)
     assert (out, error.count("\n")) == ("", 1)

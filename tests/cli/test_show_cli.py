@@ -93,7 +93,7 @@ def test_convert_keeps_poses_and_takes_a_size(folder):
 def test_convert_of_coefficients_of_no_model_wants_it_named(folder, capsys):
     Path("open.yml").write_text((FISHEYE + MATRIX).replace("fisheye_model: 1\n", ""))
     error = refused(capsys, "convert", "open.yml", "o.json", "--model", "kannala_brandt")
-    assert "open.yml: 4 coefficients" in error
+    assert "open.yml: the model of 4 coefficients must be named" in error
     assert "--from-model kannala_brandt" in error
     assert "--from-model brown_conrady" in error
     assert not Path("o.json").exists()

@@ -118,8 +118,8 @@ def test_what_is_no_video(folder, capsys):
     ]
     for name in ("list.ts", "nothing.mp4", "words.mp4"):
         assert lines[f"in/{name}"] == "Invalid data found when processing input"
-    assert "of 1.0 seconds; it is cut off or damaged" in lines["in/cut.mkv"]
-    assert "is 48x32, but the camera in camera.yml is for 96x64" in lines["in/small.avi"]
+    assert "It is cut off or damaged" in lines["in/cut.mkv"]
+    assert "must be 96x64, as the camera in camera.yml; got 48x32" in lines["in/small.avi"]
     assert outputs().keys() == {"whole.mkv"}
     assert "1 of 7 files made" in told.out
 
@@ -144,8 +144,8 @@ def test_a_folder_goes_on(folder, capsys):
 REFUSED = [
     ([*WORDS, "--codec", "nothing"], "--codec: invalid choice: 'nothing'"),
     ([*WORDS, "--size", "95x64"], "out.mkv: size must be even for libx264; got 95x64"),
-    ([*WORDS[:-1], "out.webm"], "in.mkv: its audio, mp3float, cannot be kept in .webm; .mkv takes nearly all"),
-    ([*WORDS[:-1], "out.webm", "--codec", "libx264"], "'libx264' codec; choose another encoder with --codec"),
+    ([*WORDS[:-1], "out.webm"], "in.mkv: streams must fit in .webm; got audio, mp3float. .mkv takes nearly all"),
+    ([*WORDS[:-1], "out.webm", "--codec", "libx264"], "'libx264' codec. Choose another encoder with --codec"),
     ([*WORDS[:-1], "out.png"], "out.png: the suffix of the video must be one of .mp4, .m4v"),
     ([*WORDS[:-1], "in.mkv", "--force"], "in.mkv: would overwrite in.mkv, which is read"),
     (["dewarp", "none.mkv", *WORDS[2:]], "none.mkv: no such file"),
