@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.rig import Rig
 from camtorch.io import poses
-from camtorch.io.parsing import json_text, parse_json
+from camtorch.io.parsing import plain
 from camtorch.io.record import Names, Record, one_of
 from camtorch.io.writing import Lossy, as_json
 from camtorch.poses.extrinsics import Extrinsics
@@ -56,8 +56,7 @@ def parse(record: Record) -> Rig:
 
 def made_of(kind: type[Made], d: Mapping[str, Any]) -> Made:
     """Return the camera or pose of a dict made by `dict_of`, frozen; a CameraFileError names a wrong key."""
-    owner = f"{kind.__name__}.from_dict"
-    record = Record(owner, parse_json(owner, json_text(owner, d)))
+    record = Record(f"{kind.__name__}.from_dict", plain(d))
     is_camera = issubclass(kind, Camera)
     known = _OF_CAMERAS if is_camera else _OF_POSES
     for key in record.keys():  # noqa: SIM118

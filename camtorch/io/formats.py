@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import codecs
 import fnmatch
+import json
 import os
 from collections.abc import Mapping
 from typing import IO, Any, Protocol, TypeVar
@@ -31,7 +32,7 @@ from camtorch.io import (
     ros,
     woodscape,
 )
-from camtorch.io.parsing import LARGEST_FILE, json_text, parse_json, parse_mapping, path_of, read_bytes
+from camtorch.io.parsing import LARGEST_FILE, parse_mapping, path_of, plain, read_bytes
 from camtorch.io.record import CameraFileError, Names, Record
 from camtorch.io.writing import Lossy, replacing
 from camtorch.values.arguments import LEFT, shown
@@ -127,7 +128,7 @@ def load(path: str | os.PathLike[str] | IO[str] | IO[bytes], format: str | None 
             raise CameraFileError(source, f"byte {error.start}", "must be text; got bytes. Open it with 'rb'") from None
         if len(content) > LARGEST_FILE:
             raise CameraFileError(source, "size", f"must be at most {LARGEST_FILE >> 20} MiB; got more")
-        return _loaded(source, content.encode() if isinstance(content, str) else content, format)
+        return _loaded(source, content, format)
     path = path_of(path, "load", "calibration file")
     if os.path.isdir(path):
         names = [name for names in READ.values() for name in names.in_folder]
@@ -154,17 +155,14 @@ def loads(content: str | bytes | Mapping[str, Any] | list[Any], format: str | No
         ValueError: If the format is unknown. TypeError: If `content` is neither text, nor bytes, nor keys and values.
     """
     format = _known(format, READ, "read")
-    if isinstance(content, (Mapping, list)):
-        text = json_text("loads", content)
-        return _loaded("loads", parse_json("loads", text) if isinstance(content, Mapping) else text.encode(), format)
-    if not isinstance(content, (str, bytes)):
+    if not isinstance(content, (str, bytes, Mapping, list)):
         raise TypeError(f"loads: content must be text, bytes or a dict; got {shown(content)}. ct.load reads files")
-    if os.path.exists(content):
+    if isinstance(content, (str, bytes)) and os.path.exists(content):
         raise ValueError(f"loads: content must be that of a calibration file; got its path. Write ct.load({content!r})")
-    return _loaded("loads", content.encode() if isinstance(content, str) else content, format)
+    return _loaded("loads", content, format)
 
 
-def _loaded(source: str, content: bytes | dict[str, Any], format: str | None) -> Rig:
+def _loaded(source: str, content: str | bytes | Mapping[str, Any] | list[Any], format: str | None) -> Rig:
     """Return the frozen rig of a content, or of keys and values; errors name its source."""
     try:
         rig, format = _read(source, content, format)
@@ -188,10 +186,12 @@ def load_camera(kind: type[Kind], path: str | os.PathLike[str]) -> Kind:
     return rig.camera
 
 
-def _read(path: str, content: bytes | dict[str, Any], format: str | None) -> tuple[Rig, str]:
-    if isinstance(content, dict):
-        keys = content
+def _read(path: str, content: str | bytes | Mapping[str, Any] | list[Any], format: str | None) -> tuple[Rig, str]:
+    if isinstance(content, Mapping):
+        keys = plain(content)
     else:
+        content = json.dumps(plain(content)) if isinstance(content, list) else content
+        content = content.encode() if isinstance(content, str) else content
         content = content.removeprefix(codecs.BOM_UTF8)  # some editors write this mark
         for by_content in _BY_CONTENT:
             if format == by_content.NAMES.format or (format is None and by_content.matches(path, content)):

@@ -116,7 +116,7 @@ def _from_text(path: Path, content: bytes) -> Any:
             raise CameraFileError(path, f"line {error.lineno}" if error.lineno else "content", error.msg) from None
         except (ValueError, TypeError):  # a list as a key has no hash
             raise CameraFileError(path, "content", "must be text, numbers, lists and mappings; got others") from None
-        return parse_json(path, json_text(path, values))
+        return plain(values)
     kind = text.lstrip()[:1]
     return parse_json(path, text) if kind == "{" else (_from_storage if kind == "<" else _from_yaml)(path, text)
 
@@ -148,18 +148,18 @@ def parse_json(path: Path, text: str) -> Any:
         raise CameraFileError(path, "content", error) from None
 
 
-def json_text(path: Path, value: Any) -> str:
-    """Return the JSON of keys and values as YAML, NumPy and configurations give them."""
-
-    def plain(value: Any) -> Any:
-        if hasattr(value, "tolist"):  # an array or a tensor
-            return value.tolist()
-        return dict(value) if isinstance(value, Mapping) else list(value) if is_list(value) else str(value)
-
-    try:
-        return json.dumps(value, default=plain)
-    except (ValueError, TypeError) as error:  # a value in itself, a key that is a tuple
-        raise CameraFileError(path, "content", error) from None
+def plain(value: Any) -> Any:
+    """Return keys and values as a parser of JSON gives them; YAML, NumPy and configurations have others."""
+    kind = type(value)
+    if kind is float or kind is str:
+        return value
+    if kind is int:
+        return float(value)
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if is_list(value):
+        return list(map(plain, value))
+    return plain(value.tolist()) if hasattr(value, "tolist") else value
 
 
 # -- archives, as `numpy.savez(path, K=K, D=D)` writes them; pickled objects are not read

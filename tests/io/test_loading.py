@@ -17,6 +17,8 @@ import camtorch as ct
 
 K = np.array([[500.0, 0, 320], [0, 501, 240], [0, 0, 1]])
 D = np.array([[0.3, 0.1, 0.001, -0.002, 0.05]])
+ENDLESS: dict = {}
+ENDLESS["K"] = ENDLESS
 PINHOLE = functools.partial(ct.save, ct.Pinhole([500.0, 500, 320, 240]))
 
 
@@ -71,22 +73,12 @@ def test_what_editors_do_to_a_file_is_no_fault_of_it(name, start, end, tmp_path)
         (ct.load, {"K": K}, TypeError, r"load: path must be that of a .* file; got a dict\. Write ct\.loads$"),
         (ct.load, "camera\0.json", ct.CameraFileError, "path: must have no NUL character"),
         (ct.load, FILES / "nowhere.yml", FileNotFoundError, r"nowhere\.yml"),
-        (
-            ct.load,
-            FILES / "nuscenes",
-            ct.CameraFileError,
-            r"txt, transforms.json; got none\. Name a file, such as 'cal",
-        ),
+        (ct.load, FILES / "nuscenes", ct.CameraFileError, r"transforms.json; got none\. Name a file, such as 'cal"),
         (ct.load, io.BytesIO(b"x: 1"), ct.CameraFileError, r"^load: BytesIO: content: keys must be .* got 'x'$"),
         (ct.load, io.BytesIO(b" " * (1 << 25)), ct.CameraFileError, "load: BytesIO: size: must be at most 16 MiB"),
-        (
-            ct.loads,
-            str(FILES / "opencv_camera.yml"),
-            ValueError,
-            r"loads: content must .* its path. Write ct\.load\('",
-        ),
+        (ct.loads, str(FILES / "opencv_camera.yml"), ValueError, r"content must .* its path. Write ct\.load\('"),
         (ct.loads, FILES / "opencv_camera.yml", TypeError, r"bytes or a dict; got PosixPath.*\. ct\.load reads files$"),
-        (ct.loads, {(1, 2): 3}, ct.CameraFileError, "^loads: content: keys must be str"),
+        (ct.loads, ENDLESS, ct.CameraFileError, "^loads: content: .*RecursionError"),
         (ct.loads, {"K": K, "D": [0.1]}, ct.CameraFileError, r"^loads: D: BrownConrady must have coefficients"),
         (PINHOLE, None, TypeError, "save: path must be that of a calibration file; got NoneType"),
         (PINHOLE, "camera\0.json", ct.CameraFileError, "path: must have no NUL character"),
