@@ -260,7 +260,8 @@ class CameraDrawer(Augmentation):
         entry = None if key is None else self._forms.entry((), key)
         form: Form | None = None if entry is None else entry[2]
         ready: Ready | None = None if form is None else form.ready
-        if form is None or ready is None or camera is None:
+        # what is made in inference mode could not be used in a graph later
+        if form is None or ready is None or camera is None or torch.is_inference_mode_enabled():
             return None, None
         if ready.settings != settings:
             form.is_tried, form.ready = False, None

@@ -112,8 +112,10 @@ def test_depth_of_any_kind_of_number(camera, dtype):
     assert ((known - 100).abs() <= 1).all()  # the nearest pixel may lie half a pixel aside
 
 
-def test_what_inference_mode_saw_can_be_inverted_in_training(camera):
-    mount, image = RandomMount(camera=camera), torch.rand(1, 3, *SIZE)
+@pytest.mark.parametrize("lead", [(), (1,)])
+def test_what_inference_mode_saw_can_be_inverted_in_training(camera, lead):
+    mount, image = RandomMount(camera=camera), torch.rand(*lead, 3, *SIZE)
+    mount(image=image)
     with torch.inference_mode():
         assert not mount(image=image)["camera"].intrinsics.is_inference()
     weight = torch.ones(1, requires_grad=True)
