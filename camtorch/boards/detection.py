@@ -36,17 +36,17 @@ def detect(board: Board, image: NDArray[Any]) -> tuple[Pixels, str]:
     if not seen.any():
         return pixels, "no board found"
     if seen.sum() < _FEWEST:
-        return _nothing(board), f"only {seen.sum()} points found, of which {_FEWEST} are needed"
+        return _no_pixels(board), f"only {seen.sum()} points found, of which {_FEWEST} are needed"
     if np.linalg.matrix_rank(np.diff(board.points()[seen], axis=0)) < 2:
-        return _nothing(board), "the points found lie on one line, which leaves the board's pose open"
+        return _no_pixels(board), "the points found lie on one line, which leaves the board's pose open"
     return pixels, ""
 
 
-def _nothing(board: Board) -> Pixels:
+def _no_pixels(board: Board) -> Pixels:
     return np.full((len(board.points()), 2), np.nan)
 
 
-def _refined(cv2: Any, grey: Grey, corners: Pixels, radius: float) -> Pixels:
+def _refine(cv2: Any, grey: Grey, corners: Pixels, radius: float) -> Pixels:
     """Return corners moved to the points at which gradients meet, in windows of half the side `radius`."""
     half = int(np.clip(round(radius), 2, 20))
     stop = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 100, 1e-4)
@@ -65,13 +65,13 @@ def _chessboard(cv2: Any, board: Chessboard, grey: Grey) -> Pixels:
         flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_FAST_CHECK
         found, corners = cv2.findChessboardCorners(small, size, flags=flags)
     if not found or len(corners) != size[0] * size[1]:
-        return _nothing(board)
+        return _no_pixels(board)
     scale = np.array([grey.shape[1] / small.shape[1], grey.shape[0] / small.shape[0]])
     grid = (corners.reshape(board.rows, board.columns, 2).astype(np.float64) + 0.5) * scale - 0.5
-    return _at_gradients(cv2, grey, _ordered(grey, grid))
+    return _at_gradients(cv2, grey, _order_grid(grey, grid))
 
 
-def _ordered(grey: Grey, grid: Pixels) -> Pixels:
+def _order_grid(grey: Grey, grid: Pixels) -> Pixels:
     """Return a grid (rows, columns, 2), found from any corner, in the board's order."""
     right, down = (grid[:, -1] - grid[:, 0]).mean(0), (grid[-1] - grid[0]).mean(0)
     if right[0] * down[1] < right[1] * down[0]:  # boards are seen from the front
@@ -115,7 +115,7 @@ def _at_gradients(cv2: Any, grey: Grey, grid: Pixels) -> Pixels:
     nearest = _to_nearest(expected)
     tried = [np.where(strays[:, None], np.nan, expected)]
     for part in _WINDOWS:
-        moved = [_refined(cv2, grey, one, part * side) for one, side in zip(expected, nearest, strict=True)]
+        moved = [_refine(cv2, grey, one, part * side) for one, side in zip(expected, nearest, strict=True)]
         corners = np.concatenate(moved)
         lost = strays & (np.linalg.norm(corners - expected, axis=1) > _STRAY * nearest)
         tried.append(np.where(lost[:, None], np.nan, corners))
@@ -156,11 +156,11 @@ def _charuco(cv2: Any, board: Charuco, grey: Grey) -> Pixels:
     lengths, dictionary = (float(board.square), float(board.marker)), _dictionary(cv2, board.dictionary)
     target = cv2.aruco.CharucoBoard((board.columns, board.rows), *lengths, dictionary)
     target.setLegacyPattern(board.legacy)
-    most, count = _nothing(board), 0
+    most, count = _no_pixels(board), 0
     for image, scale, parameters in _passes(cv2, grey):
         corners, ids, *_ = cv2.aruco.CharucoDetector(target, detectorParams=parameters).detectBoard(image)
         if ids is not None and len(ids) > count:
-            most, count = _nothing(board), len(ids)
+            most, count = _no_pixels(board), len(ids)
             found = _from_centres(cv2, image, np.asarray(corners, np.float64).reshape(-1, 2))
             most[ids.ravel()] = (found + 0.5) / scale - 0.5
         if count == len(most):
@@ -170,7 +170,7 @@ def _charuco(cv2: Any, board: Charuco, grey: Grey) -> Pixels:
 
 def _from_centres(cv2: Any, image: Grey, corners: Pixels) -> Pixels:
     """Return ChArUco's corners with integers at pixels' centres: those of OpenCV 4 may be half a pixel off."""
-    return corners + np.rint(2 * np.median(_refined(cv2, image, corners, 3) - corners, axis=0)) / 2
+    return corners + np.rint(2 * np.median(_refine(cv2, image, corners, 3) - corners, axis=0)) / 2
 
 
 def _aprilgrid(cv2: Any, board: AprilGrid, grey: Grey) -> Pixels:
@@ -183,11 +183,11 @@ def _aprilgrid(cv2: Any, board: AprilGrid, grey: Grey) -> Pixels:
                 tags.setdefault(tag, (pixels.reshape(4, 2).astype(np.float64) + 0.5) / scale - 0.5)
         if len(tags) == count:
             break
-    found = _nothing(board)
-    for tag, corners in _consistent(cv2, board, tags).items():
+    found = _no_pixels(board)
+    for tag, corners in _consistent_tags(cv2, board, tags).items():
         gap = board.spacing * np.linalg.norm(corners - np.roll(corners, 1, 0), axis=1).min()
-        refined = _refined(cv2, grey, corners, 0.45 * gap)
-        doubt = np.linalg.norm(refined - _refined(cv2, grey, corners, 0.3 * gap), axis=1)
+        refined = _refine(cv2, grey, corners, 0.45 * gap)
+        doubt = np.linalg.norm(refined - _refine(cv2, grey, corners, 0.3 * gap), axis=1)
         rim = np.minimum(refined, (grey.shape[1] - 1, grey.shape[0] - 1) - refined).min(1)
         # at the rim a part of the window is missing
         good = (np.linalg.norm(refined - corners, axis=1) < max(0.4 * gap, 2)) & (doubt < 0.3) & (rim > 0.45 * gap)
@@ -195,7 +195,7 @@ def _aprilgrid(cv2: Any, board: AprilGrid, grey: Grey) -> Pixels:
     return found
 
 
-def _consistent(cv2: Any, board: AprilGrid, tags: dict[int, Pixels]) -> dict[int, Pixels]:
+def _consistent_tags(cv2: Any, board: AprilGrid, tags: dict[int, Pixels]) -> dict[int, Pixels]:
     """Return the tags that lie where their neighbours expect them, with corners clockwise from the board's top left."""
     places = {tag: board.points()[board.corners_of(tag), :2].astype(np.float32) for tag in tags}
     reach = 2.1 * board.square * (1 + board.spacing)

@@ -68,7 +68,7 @@ def find_board(images: Any, board: Any, *, square: float = 1.0, **options: Any) 
     """
     opencv(_OWNER)
     wanted = as_board(board, as_number(square, "square", _OWNER), options, _OWNER)
-    found = search(wanted, _given(images))
+    found = search(wanted, _as_images(images))
     used, left_out = usable(found)
     if not used:
         reasons = "; ".join(f"{path}: {why}" for path, why in left_out)
@@ -146,7 +146,7 @@ def natural(path: Path) -> list[tuple[int, int, str]]:
     return [(0, int(part), "") if part.isdecimal() else (1, 0, part.lower()) for part in parts]
 
 
-def _given(images: Any) -> list[Image]:
+def _as_images(images: Any) -> list[Image]:
     if isinstance(images, (str, os.PathLike)):
         images = [images]
     elif isinstance(images, (np.ndarray, torch.Tensor)):

@@ -96,7 +96,7 @@ class State(NamedTuple):
     parameters: tuple[Tensor, ...]  # of each camera (B, 4 + n), fx, fy, cx, cy and the coefficients
     mounts: Poses  # of each camera, from the first one's frame; the first is the identity unless it learns
     boards: Poses  # of each view
-    bend: Tensor  # (B, 2), how far the board's middle lies behind its edges along x and y, see `bent`
+    bend: Tensor  # (B, 2), how far the board's middle lies behind its edges along x and y, see `bend_points`
 
     @classmethod
     def of_one(cls, parameters: Tensor, boards: Poses) -> State:
@@ -141,9 +141,9 @@ class Adjusted:
         """Number of points that another step would lose, which stop a search that did not converge."""
         problem, flat = self.problem, self.problem.flat(self.state)
         rows = torch.arange(len(self.cost), device=self.cost.device)
-        before = problem.looks(flat, rows)
+        before = problem.all_errors(flat, rows)
         step, _ = problem.linearised(flat, rows).step(torch.full_like(self.cost, FIRST_DAMPING))
-        after = problem.looks(problem.moved(flat, step, rows), rows)
+        after = problem.all_errors(problem.moved(flat, step, rows), rows)
         return sum(int((a.valid & ~b.valid & (a.weights > 0)).sum()) for a, b in zip(before, after, strict=True))
 
 
@@ -170,14 +170,14 @@ def adjust(
     tolerance, tiny = settled / (2 * counts - problem.unknowns).clamp(min=1), _NOTHING**2 * counts
     flat = problem.flat(state)
     found = minimise(problem, flat, tolerance=tolerance, tiny=tiny, steps=steps, damping=damping, progress=progress)
-    looks = problem.looks(found.state, torch.arange(len(found.cost), device=found.cost.device))
+    by_camera = problem.all_errors(found.state, torch.arange(len(found.cost), device=found.cost.device))
     return Adjusted(
         problem.state(found.state),
         found.cost,
         found.converged,
-        tuple(look.residuals for look in looks),
-        tuple(problem.shown(c, found.state, look) for c, look in enumerate(looks)),
-        tuple(look.weights for look in looks),
+        tuple(errors.residuals for errors in by_camera),
+        tuple(problem.shown(c, found.state, errors) for c, errors in enumerate(by_camera)),
+        tuple(errors.weights for errors in by_camera),
         problem,
     )
 
@@ -191,14 +191,14 @@ def minima(
     if (made := compiled_of([camera], pixels)) is not None:
         search = compiled_poses.Search(steps, SETTLED, _NOTHING, FIRST_DAMPING, *loss)
         start = poses.rotations[:, 0], poses.translations[:, 0]
-        rotations, translations, cost = compiled_poses.refined(made[0][0], points, pixels, weights, start, search)
+        rotations, translations, cost = compiled_poses.refine_poses(made[0][0], points, pixels, weights, start, search)
         return Poses(rotations[:, None], translations[:, None]), cost
     observed = CameraObservations(model, points[:, None], pixels[:, None], weights[:, None])
-    found = posed(observed, parameters, poses, loss=loss[0], loss_scale=loss[1], steps=steps)
+    found = adjust_poses(observed, parameters, poses, loss=loss[0], loss_scale=loss[1], steps=steps)
     return found.state.boards, found.cost
 
 
-def posed(observed: CameraObservations, parameters: Tensor, poses: Poses, **options: Any) -> Adjusted:
+def adjust_poses(observed: CameraObservations, parameters: Tensor, poses: Poses, **options: Any) -> Adjusted:
     """Return the poses (K, 1) of least cost near the given ones, each a problem of its own, for a fixed camera."""
     free = Free((torch.zeros(parameters.shape[-1], dtype=torch.bool, device="cpu"),), (False,))
     return adjust([observed], State.of_one(parameters, poses), free, **options)
@@ -218,7 +218,7 @@ def robust(loss: str | None, scale: float, squares: Tensor) -> tuple[Tensor, Ten
     return squares, torch.ones_like(squares)
 
 
-def bent(points: Tensor, bend: Tensor) -> tuple[Tensor, Tensor]:
+def bend_points(points: Tensor, bend: Tensor) -> tuple[Tensor, Tensor]:
     """Return the points of bent boards, and the derivatives (..., N, 2) of their z by the bend.
 
     z grows by bend_x (1 - x^2) + bend_y (1 - y^2), where x and y go from -1 to 1 over the points (..., N, 3) of the
@@ -239,7 +239,7 @@ class Bundle:
         self, observed: Sequence[CameraObservations], state: State, free: Free, loss: str | None, loss_scale: float
     ):
         self.free, self.loss, self.loss_scale = free, loss, loss_scale
-        self._last: tuple[tuple[Tensor, ...], list[compiled_poses.Look]] | None = None
+        self._last: tuple[tuple[Tensor, ...], list[compiled_poses.Errors]] | None = None
         batch = state.boards.translations.shape[0]
         self.observed = [s.mapped(lambda t: t.expand(batch, *t.shape[1:])) for s in observed]
         self.cameras = [_template(s.model, p) for s, p in zip(observed, state.parameters, strict=True)]
@@ -294,7 +294,7 @@ class Bundle:
 
     def points(self, c: int, state: State, observed: CameraObservations) -> tuple[Tensor, Tensor, Tensor]:
         """Return points (B, V, N, 3) of the turned board, of the first camera's frame, and of this camera's frame."""
-        points = bent(observed.points, state.bend)[0] if self.is_bent else observed.points
+        points = bend_points(observed.points, state.bend)[0] if self.is_bent else observed.points
         turned = points @ state.boards.rotations.mT
         first = turned + state.boards.translations[:, :, None]
         if c == 0 and not self.free.mounts[0]:
@@ -306,7 +306,7 @@ class Bundle:
         parameters = state.parameters[c]
         return self.fixed[c] or remade(self.cameras[c], intrinsics=parameters[:, :4], distortion=parameters[:, 4:])
 
-    def look(self, c: int, flat: Sequence[Tensor], rows: Tensor | None = None) -> compiled_poses.Look:
+    def errors_of(self, c: int, flat: Sequence[Tensor], rows: Tensor | None = None) -> compiled_poses.Errors:
         """Return residuals, validity, weights and costs of a camera at a state."""
         state, observed = self.state(flat), self.observed_by(c, rows)
         if self.is_plain and len(state.bend):
@@ -317,39 +317,39 @@ class Bundle:
             has_triangles = native.plan.places is not None or all(i < 4 for i in own)
             given = observed.points, state.boards, observed.pixels, observed.weights, (self.loss, self.loss_scale)
             # triangles for the next step, which begins here unless this one is rejected
-            return compiled_poses.seen(native, *given, own if has_triangles else None)
+            return compiled_poses.project_views(native, *given, own if has_triangles else None)
         pixels, valid = self.camera(c, state).project(self.points(c, state, observed)[-1])
         residuals = torch.where((valid & (observed.weights > 0))[..., None], pixels - observed.pixels, 0.0)
         u, v = residuals.unbind(-1)
         cost, slope = robust(self.loss, self.loss_scale, u * u + v * v)
         lost, _ = robust(self.loss, self.loss_scale, cost.new_tensor(_LOST**2))
         cost = (torch.where(valid, cost, lost) * observed.weights).sum(-1)
-        return compiled_poses.Look(residuals, valid, torch.where(valid, slope * observed.weights, 0.0), cost)
+        return compiled_poses.Errors(residuals, valid, torch.where(valid, slope * observed.weights, 0.0), cost)
 
-    def looks(self, flat: Sequence[Tensor], rows: Tensor) -> list[compiled_poses.Look]:
-        """Return the looks of all cameras; the last ones are reused if the state is the same."""
+    def all_errors(self, flat: Sequence[Tensor], rows: Tensor) -> list[compiled_poses.Errors]:
+        """Return the errors of all cameras; the last ones are reused if the state is the same."""
         given, last = (rows, *flat), self._last
         if last is None or not all(a is b or torch.equal(a, b) for a, b in zip(given, last[0], strict=True)):
-            self._last = last = given, [self.look(c, flat, rows) for c in range(len(self.observed))]
+            self._last = last = given, [self.errors_of(c, flat, rows) for c in range(len(self.observed))]
         return last[1]
 
-    def shown(self, c: int, flat: Sequence[Tensor], look: compiled_poses.Look) -> Tensor:
+    def shown(self, c: int, flat: Sequence[Tensor], errors: compiled_poses.Errors) -> Tensor:
         """Whether a camera, of the model itself and not the one for the search, has pixels, (B, V, N) bool."""
         kind = _kind(self.observed[c].model)
         if kind.model_for_search() is kind:
-            return look.valid
+            return errors.valid
         state = self.state(flat)
         searched = self.camera(c, state)
         camera = fixed_camera(kind, searched.intrinsics, searched.distortion)
         camera._warned = True
-        return look.valid & camera.project(self.points(c, state, self.observed[c])[-1])[1]
+        return errors.valid & camera.project(self.points(c, state, self.observed[c])[-1])[1]
 
     def observed_by(self, c: int, rows: Tensor | None) -> CameraObservations:
         one = self.observed[c]
         return one if rows is None or len(rows) == len(one.weights) else one.mapped(lambda t: t[rows])
 
     def cost(self, flat: Sequence[Tensor], rows: Tensor) -> Tensor:
-        total = torch.cat([look.cost for look in self.looks(flat, rows)], -1).sum(-1)
+        total = torch.cat([errors.cost for errors in self.all_errors(flat, rows)], -1).sum(-1)
         for one, parameters in zip(self.observed, flat[5:], strict=True):
             if one.prior:
                 total = total + ((parameters - one.prior.centre) @ one.prior.root.mT).square().sum(-1)
@@ -369,15 +369,15 @@ class Bundle:
     def equations(self, flat: Sequence[Tensor], rows: Tensor | None = None) -> Equations:
         rows = torch.arange(len(flat[0]), device=flat[0].device) if rows is None else rows
         state, width, total = self.state(flat), self.width, len(self.columns)
-        looks, parts = self.looks(flat, rows), []
-        if (made := looks[0].triangles) is not None:
+        by_camera, parts = self.all_errors(flat, rows), []
+        if (made := by_camera[0].triangles) is not None:
             view, shared = made
             if self.observed[0].prior:
                 whole = torch.cat((shared, *self._rows_of_priors(state)), -2)
                 shared = torch.linalg.qr(padded(whole), mode="r").R
             return Equations(view, shared, self.columns)
-        for c, look in enumerate(looks):
-            block, at = self.rows_of(c, look, state, rows)
+        for c, errors in enumerate(by_camera):
+            block, at = self.rows_of(c, errors, state, rows)
             if total == 0:
                 parts.append(block)
                 continue
@@ -409,7 +409,7 @@ class Bundle:
                 found.append(rows)
         return found
 
-    def rows_of(self, c: int, look: compiled_poses.Look, state: State, rows: Tensor) -> tuple[Tensor, list[int]]:
+    def rows_of(self, c: int, errors: compiled_poses.Errors, state: State, rows: Tensor) -> tuple[Tensor, list[int]]:
         """Return rows (B, V, 2 N, L + F + 1) of a camera, and the indices of its F columns among shared unknowns."""
         observed = self.observed_by(c, rows)
         turned, first, points = self.points(c, state, observed)
@@ -434,9 +434,9 @@ class Bundle:
         if self.free.bend:
             at += [g for g, (camera, _) in enumerate(self.columns) if camera == -1]
             along = by_first @ state.boards.rotations[:, :, None, :, 2:]
-            columns.append(along * bent(observed.points, state.bend)[1][..., None, :])
-        columns.append(look.residuals[..., None])
-        return (torch.cat(columns, -1) * look.weights.sqrt()[..., None, None]).flatten(2, 3), at
+            columns.append(along * bend_points(observed.points, state.bend)[1][..., None, :])
+        columns.append(errors.residuals[..., None])
+        return (torch.cat(columns, -1) * errors.weights.sqrt()[..., None, None]).flatten(2, 3), at
 
     def moved(self, flat: Sequence[Tensor], step: Sequence[Tensor], rows: Tensor) -> tuple[Tensor, ...]:
         """Return the state after steps of the views' unknowns (R, V, L) and the shared ones (R, G)."""
@@ -444,7 +444,7 @@ class Bundle:
         of_views, shared = step
         boards, mounts, bend = state.boards, state.mounts, state.bend
         if self.width == 6:
-            boards = Poses(compiled_poses.turned(boards.rotations, of_views), boards.translations + of_views[..., 3:])
+            boards = Poses(compiled_poses.turn(boards.rotations, of_views), boards.translations + of_views[..., 3:])
         else:
             boards = boards._replace(translations=boards.translations + of_views)
         parameters = []

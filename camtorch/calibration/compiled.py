@@ -61,7 +61,7 @@ def from_rays(points: Tensor, rays: Tensor, weights: Tensor) -> tuple[Tensor, Te
     return rotations, translations, valid
 
 
-def refined(
+def refine_poses(
     native: Native, points: Tensor, pixels: Tensor, weights: Tensor, start: tuple[Tensor, Tensor], search: Search
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return rotations, translations and costs (B,) of the minima near `start`; row b sees points[b % P]."""
@@ -74,7 +74,7 @@ def refined(
         native.follow()
 
 
-def solved(
+def solve_poses(
     native: Native,
     points: Tensor,
     pixels: Tensor,
@@ -99,8 +99,8 @@ def solved(
         native.follow()
 
 
-class Look(NamedTuple):
-    """The residuals of a camera at a state; see `Bundle.look`."""
+class Errors(NamedTuple):
+    """The residuals of a camera at a state; see `Bundle.errors_of`."""
 
     residuals: Tensor  # (B, V, N, 2)
     valid: Tensor  # (B, V, N)
@@ -109,7 +109,7 @@ class Look(NamedTuple):
     triangles: tuple[Tensor, Tensor] | None = None  # of `Equations`, without priors, if compiled code made them
 
 
-def seen(
+def project_views(
     native: Native,
     points: Tensor,
     poses: tuple[Tensor, Tensor],
@@ -117,7 +117,7 @@ def seen(
     weights: Tensor,
     loss: tuple[str | None, float],
     learnt: Sequence[int] | None = None,
-) -> Look:
+) -> Errors:
     """Return residuals and weights of points (B, V, N, 3) seen by cameras (B,), or one, at pixels (B, V, N, 2).
 
     Triangles are made if `learnt` lists the parameters that learn. poses: (B, V, 3, 3), (B, V, 3). loss: name, scale.
@@ -148,10 +148,10 @@ def seen(
         left.value = 0
         native.follow()
         compiled.camtorch_views(call)
-    return Look(residuals, valid, weighed, cost, None if learnt is None else (view, shared))
+    return Errors(residuals, valid, weighed, cost, None if learnt is None else (view, shared))
 
 
-def turned(rotations: Tensor, steps: Tensor) -> Tensor:
+def turn(rotations: Tensor, steps: Tensor) -> Tensor:
     """Return rotations (..., 3, 3) after small turns by the first three numbers of steps (..., n)."""
     compiled = library() if rotations.is_cpu and rotations.dtype == torch.float64 else None
     if compiled is None:

@@ -69,7 +69,7 @@ def fit(
     asked = as_model(model, count, None, fixed, owner)
     start = asked.start
     size = as_image_size(image_size, owner) or (None if start is None else start.image_size)
-    kept = _fixed(asked, size, owner)
+    kept = _fixed_values(asked, size, owner)
     given_rays = as_values(rays, "rays", owner).detach().double()
     given_pixels = as_values(pixels, "pixels", owner, given_rays.device).detach().double()
     dims = given_pixels.ndim - 1
@@ -106,7 +106,7 @@ def fit(
             f"{owner}: rays must have at least {_LEAST} finite rows a camera; got {counts.sum(-1).tolist()} of rays "
             f"{tuple(given_rays.shape)}"
         )
-    lens = _unified(seen, owner)
+    lens = _fit_unified(seen, owner)
     slopes = views.focal_at_axis(lens)
     reach = torch.where(counts, angles_from_axis(seen.rays), 0.0).amax(-1)
     names = asked.kind.names_of(asked.count) or ()
@@ -134,7 +134,7 @@ def fit(
     return Conversion(camera, **{name: t.reshape(batch) for name, t in numbers.items()}, source_name="rays")
 
 
-def _fixed(asked: Model, size: tuple[int, int] | None, owner: str) -> Tensor | None:
+def _fixed_values(asked: Model, size: tuple[int, int] | None, owner: str) -> Tensor | None:
     """Return the values (4 + n,) that parameters keep, NaN for those to find; None if all are to be found."""
     if bool(asked.free.all()):
         return None
@@ -149,7 +149,7 @@ def _fixed(asked: Model, size: tuple[int, int] | None, owner: str) -> Tensor | N
     return torch.where(asked.free, torch.nan, values)
 
 
-def _unified(seen: fitting.Observations, owner: str) -> Camera:
+def _fit_unified(seen: fitting.Observations, owner: str) -> Camera:
     """Return the best of a few unified lenses (C,): their focal lengths and axis are linear in the pixels."""
     lenses, costs = [], []
     x, y, z = seen.rays.unbind(-1)
@@ -157,7 +157,7 @@ def _unified(seen: fitting.Observations, owner: str) -> Camera:
         depth = alpha + (1 - alpha) * z
         inside = depth > _NEAREST
         weights, depth = torch.where(inside, seen.weights, 0.0), torch.where(inside, depth, 1.0)
-        across, down = (_line(w / depth, p, weights) for w, p in zip((x, y), seen.pixels.unbind(-1), strict=True))
+        across, down = (_fit_line(w / depth, p, weights) for w, p in zip((x, y), seen.pixels.unbind(-1), strict=True))
         focal, centre = (torch.stack(pair, -1) for pair in zip(across[:2], down[:2], strict=True))
         # points that it does not see must not improve its score
         share = weights.square().sum(-1) / seen.weights.square().sum(-1)
@@ -174,7 +174,7 @@ def _unified(seen: fitting.Observations, owner: str) -> Camera:
     return fixed_camera(UCM, lens[:, :4], lens[:, 4:], (1, 1))
 
 
-def _line(m: Tensor, p: Tensor, weights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _fit_line(m: Tensor, p: Tensor, weights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Return slope, offset and mean square (C,) of the line p = slope m + offset."""
     w = weights.square()
     total = w.sum(-1, keepdim=True).clamp(min=torch.finfo(w.dtype).tiny)

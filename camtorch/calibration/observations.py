@@ -125,7 +125,7 @@ def _observed(
         raise ValueError(f"{owner}: all arguments must have the same views; got numbers of views {numbers}")
     boards = boards * len(next(iter(given.values()))[0]) if len(boards) == 1 else boards
     lengths = [0 if board is None else len(board) for board in boards]
-    points, sizes, pixels = _padded(boards, max(lengths), 3), {}, {}
+    points, sizes, pixels = _pad(boards, max(lengths), 3), {}, {}
     seen: dict[str, Array] = {}
     for name, (views, *_) in given.items():
         size_label = f"image_sizes[{name!r}]" if name else "image_size"
@@ -137,7 +137,7 @@ def _observed(
                     f"{owner}: view {i}: {labels[name]}[{i}] must be as many corners as object_points, {length} (inner "
                     f"ones of a chessboard); got {len(view)}. Pass rows of NaN for corners that were not found"
                 )
-        of = _padded(views, max(lengths), 2)
+        of = _pad(views, max(lengths), 2)
         seen[name] = ~np.isnan(of.sum(-1))
         sizes[name], pixels[name] = size, np.where(seen[name][..., None], of, np.nan)
         _check_corners(points, pixels[name], seen[name], labels[name], owner)
@@ -155,7 +155,7 @@ def _observed(
         )
     first: dict[bytes, int] = {}
     has: Array = np.any(sees, 0)
-    rows = enumerate(np.concatenate([_ordered(of) for of in pixels.values()], 1) + 0.0)
+    rows = enumerate(np.concatenate([_sort_rows(of) for of in pixels.values()], 1) + 0.0)
     copy: Array = has & np.array([first.setdefault(row.tobytes(), i) != i for i, row in rows])
     for left_out, why in ((~has, "nothing was seen"), (copy, "the corners are those of another view")):
         if left_out.any():
@@ -215,7 +215,7 @@ def _as_array(value: Any, size: int, name: str, owner: str) -> Array:
     return values.detach().double().numpy(force=True)
 
 
-def _padded(views: Sequence[Array | None], count: int, size: int) -> Array:
+def _pad(views: Sequence[Array | None], count: int, size: int) -> Array:
     """Pad the points of views to (V, count, size) with NaN."""
     padded = np.full((len(views), count, size), np.nan)
     for row, points in zip(padded, views, strict=True):
@@ -224,14 +224,14 @@ def _padded(views: Sequence[Array | None], count: int, size: int) -> Array:
     return padded
 
 
-def _ordered(rows: Array) -> Array:
+def _sort_rows(rows: Array) -> Array:
     """Sort the rows (V, N, k) of each view, NaN last."""
     return np.take_along_axis(rows, np.lexsort(np.moveaxis(rows, -1, 0))[..., None], 1)
 
 
-def _repeated(rows: Array, times: int) -> Array:
+def _has_repeats(rows: Array, times: int) -> Array:
     """Whether so many rows (V, N, k) of a view are equal, (V,); NaN equals nothing."""
-    ordered = _ordered(rows)
+    ordered = _sort_rows(rows)
     same: Array = (ordered[:, times - 1 :] == ordered[:, : rows.shape[1] - times + 1]).all(-1).any(-1)
     return same
 
@@ -247,14 +247,14 @@ def _check_corners(points: Array, pixels: Array, seen: Array, name: str, owner: 
     offsets = (known - known.sum(1, keepdims=True) / np.maximum(number, 1)[:, None, None]) * seen[..., None]
     spread = np.sqrt(np.linalg.eigvalsh(offsets.swapaxes(1, 2) @ offsets).clip(min=0))  # (V, 3) ascending
     thin = spread[:, 1] <= np.maximum(_FLAT * spread[:, 2], _ROUNDING)
-    odd, at_one = (reach > 0) & ((reach <= _LEAST_UNIT) | (reach >= _MOST_UNIT)), _repeated(pixels, _SAME_PIXEL)
+    odd, at_one = (reach > 0) & ((reach <= _LEAST_UNIT) | (reach >= _MOST_UNIT)), _has_repeats(pixels, _SAME_PIXEL)
     for wrong, words in (
         (np.isinf(pixels).any((1, 2)), f"{name} must not be infinite; unseen corners are NaN"),
         (number < _LEAST_CORNERS, f"{name} must have {_LEAST_CORNERS} or more seen corners; or leave it out"),
         ((~np.isfinite(corners).all(-1) & seen).any(-1), "object_points must be finite where image_points are"),
         (odd, f"object_points must be in a unit near the board's size; got up to {reach.max():.3g}"),
         (thin, "object_points of the seen corners must not lie on one line, or be the same point"),
-        (_repeated(corners, 2), "object_points must have each corner once; got one twice"),
+        (_has_repeats(corners, 2), "object_points must have each corner once; got one twice"),
         (at_one, f"{name} must not have {_SAME_PIXEL} corners at one pixel; corners that were not found are NaN"),
     ):
         if (wrong & (number > 0)).any():

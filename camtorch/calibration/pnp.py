@@ -11,8 +11,8 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from camtorch.calibration.batches import as_tensor, as_vectors, attached, learns, root_of, rows_of
-from camtorch.calibration.bundle import CameraObservations, Poses, posed
-from camtorch.calibration.compiled import Search, Solved, solved
+from camtorch.calibration.bundle import CameraObservations, Poses, adjust_poses
+from camtorch.calibration.compiled import Search, Solved, solve_poses
 from camtorch.calibration.ransac import consensus
 from camtorch.calibration.rays import poses_from_rays
 from camtorch.cameras.camera import Camera
@@ -121,10 +121,10 @@ def solve_pnp(
         if not 0 < threshold < math.inf:
             raise ValueError(f"solve_pnp: threshold must be positive, in px; got {threshold:g}")
     if isinstance(camera, Mixed):
-        return _of_each_model(camera, object_points, pixels, weights, threshold)
+        return _solve_each_model(camera, object_points, pixels, weights, threshold)
     given = _Given.of(camera, object_points, pixels, weights)
     with torch.no_grad():
-        found = _compiled(given, threshold) or _searched(given, threshold)
+        found = _solve_compiled(given, threshold) or _solve_anywhere(given, threshold)
     vectors, translations, rms = found.vectors, found.translations, found.rms
     if learns([given.camera], *(t for t in given[1:4] if t is not None)):
         task = _Task.of(given)  # the poses and the root mean squares with their derivatives
@@ -140,10 +140,10 @@ def solve_pnp(
     rms = rms.to(given.dtype).view(given.batch)
     inliers = found.inliers.view(*given.batch, found.inliers.shape[-1])
     covariance = found.covariance.to(given.dtype).view(*given.batch, 6, 6)
-    return Pose(_fixed(vectors, translations), rms, found.valid.view(given.batch), inliers, covariance)
+    return Pose(_frozen_pose(vectors, translations), rms, found.valid.view(given.batch), inliers, covariance)
 
 
-def _of_each_model(
+def _solve_each_model(
     camera: Mixed, object_points: Numbers, pixels: Numbers, weights: Numbers | None, threshold: float | None
 ) -> Pose:
     """Solve the poses of each group of a mixed batch and join them."""
@@ -161,10 +161,10 @@ def _of_each_model(
         pose = solve_pnp(group, mine[0], mine[1], weights=mine[2][..., 0], threshold=threshold)
         found.append((pose.extrinsics.rotation, pose.extrinsics.translation, *pose[1:], pose.inliers, pose.covariance))
     rotation, translation, *others = (camera._in_order(torch.cat(parts)) for parts in zip(*found, strict=True))
-    return Pose(_fixed(rotation, translation), *others)
+    return Pose(_frozen_pose(rotation, translation), *others)
 
 
-def _fixed(rotation: Tensor, translation: Tensor) -> Extrinsics:
+def _frozen_pose(rotation: Tensor, translation: Tensor) -> Extrinsics:
     """Return a frozen pose that keeps the graph of its tensors."""
     return remade(_identity(), rotation=rotation, translation=translation)
 
@@ -224,14 +224,14 @@ class _Given(NamedTuple):
         return cls(rows_of(camera, batch), points, rows(seen_at, count, 2), given, batch, dtype)
 
 
-def _compiled(given: _Given, threshold: float | None) -> Solved | None:
+def _solve_compiled(given: _Given, threshold: float | None) -> Solved | None:
     """Solve by compiled code, if there is any for the camera; otherwise return None."""
     points, pixels = given.points.detach(), given.pixels.detach()
     if not len(pixels) or (made := compiled_of([given.camera], pixels)) is None:
         return None
     weights = None if given.weights is None else given.weights.detach()
     start = None if threshold is None else _consensus(_Task.of(given), threshold)
-    return solved(made[0][0], points, pixels, weights, _SEARCH, start, threshold or 0.0)
+    return solve_poses(made[0][0], points, pixels, weights, _SEARCH, start, threshold or 0.0)
 
 
 class _Task(NamedTuple):
@@ -276,14 +276,14 @@ def _consensus(task: _Task, threshold: float) -> tuple[Tensor, Tensor]:
     return consensus(task.points, task.rays, slopes, seen & (task.weights > 0), threshold)
 
 
-def _searched(given: _Given, threshold: float | None) -> Solved:
+def _solve_anywhere(given: _Given, threshold: float | None) -> Solved:
     """Return the poses on any device, for any camera."""
     given = given._replace(points=given.points.detach(), pixels=given.pixels.detach())
     task = _Task.of(given if given.weights is None else given._replace(weights=given.weights.detach()))
     weights = task.weights
     if threshold is None:
         starts = poses_from_rays(task.points, task.rays, weights)
-        found = _least([_minimum(task, *(t[:, i] for t in starts)) for i in range(2)])
+        found = _take_best([_minimum(task, *(t[:, i] for t in starts)) for i in range(2)])
         # the other minimum of points on a plane may be one for pixels and not for rays, with few points or much noise
         share = task.weights / task.weights.sum(-1, keepdim=True)
         centre = (share[..., None] * task.points).sum(-2)
@@ -301,18 +301,18 @@ def _searched(given: _Given, threshold: float | None) -> Solved:
         near = 2 * task.cost(torch.cat((rotation_vector(turns), shifts), -1)) <= _WORSE * found.costs
         flat = flat & torch.isfinite(found.costs) & (few | near)
         if bool(flat.any()):
-            found = _least([found, _minimum(task, turns, shifts, flat)])
+            found = _take_best([found, _minimum(task, turns, shifts, flat)])
     else:
         rotations, translations = _consensus(task, threshold)
-        near, before = _near(task, rotations, translations, threshold), torch.zeros_like(weights, dtype=torch.bool)
+        near, before = _nearby(task, rotations, translations, threshold), torch.zeros_like(weights, dtype=torch.bool)
         lost, none = torch.full_like(weights[:, 0], torch.inf), weights.new_zeros(len(weights), 6, 7)
         found = _Found(lost, rotations, translations, none)
         for _ in range(_ROUNDS):
             if torch.equal(near, before):
                 break
             task = task._replace(weights=torch.where(near, weights, 0.0))
-            found = _minimum(task, found.rotations, found.translations, _spread(task.points, near))
-            before, near = near, _near(task._replace(weights=weights), found.rotations, found.translations, threshold)
+            found = _minimum(task, found.rotations, found.translations, _are_spread(task.points, near))
+            before, near = near, _nearby(task._replace(weights=weights), found.rotations, found.translations, threshold)
         found = found._replace(costs=torch.where((near == before).all(-1), found.costs, torch.inf))
     # the covariance of turns and of shifts of the origin
     good = torch.isfinite(found.costs)
@@ -346,27 +346,27 @@ def _minimum(task: _Task, rotations: Tensor, translations: Tensor, valid: Tensor
     parameters = torch.cat(camera._tensors, -1).detach()
     parameters = parameters.view(-1, parameters.shape[-1])
     observed = CameraObservations(camera, task.points[:, None], task.pixels[:, None], task.weights[:, None])
-    found = posed(observed, parameters, Poses(rotations[:, None], translations[:, None]), steps=_SEARCH.steps)
+    found = adjust_poses(observed, parameters, Poses(rotations[:, None], translations[:, None]), steps=_SEARCH.steps)
     fine = found.converged & valid & ((task.weights > 0).sum(-1) >= _LEAST)
     fine = fine & (found.valid[0][:, 0] | (task.weights == 0)).all(-1)
     (turned,), (moved,) = (t.unbind(1) for t in found.state.boards)
     return _Found(torch.where(fine, found.cost, torch.inf), turned, moved, found.equations.view[:, 0])
 
 
-def _least(candidates: list[_Found]) -> _Found:
+def _take_best(candidates: list[_Found]) -> _Found:
     """Return the candidate of least cost for each row."""
     best = torch.stack([found.costs for found in candidates]).argmin(0)
     rows = torch.arange(len(best), device=best.device)
     return _Found(*(torch.stack(parts)[best, rows] for parts in zip(*candidates, strict=True)))
 
 
-def _near(task: _Task, rotations: Tensor, translations: Tensor, threshold: float) -> Tensor:
+def _nearby(task: _Task, rotations: Tensor, translations: Tensor, threshold: float) -> Tensor:
     """Whether points are seen near their pixels, bool (B, N)."""
     pixels, valid = task.camera.project(task.points @ rotations.mT + translations[:, None])
     return valid & (task.weights > 0) & ((pixels - task.pixels).square().sum(-1) < threshold**2)
 
 
-def _spread(points: Tensor, inliers: Tensor) -> Tensor:
+def _are_spread(points: Tensor, inliers: Tensor) -> Tensor:
     """Whether there are enough inliers, which lie on no line, (B,) bool."""
     weights = inliers.to(points)
     counts = weights.sum(-1)

@@ -80,7 +80,7 @@ def poses_from_rays(points: Tensor, rays: Tensor, weights: Tensor) -> RayPoses:
     ahead = (weights[:, None] * cosines.sign()).sum(-1) > 0
     # best first: 1 - cosine grows with the angle up to a half turn
     order = (weights[:, None] * (1 - cosines)).sum(-1).nan_to_num(torch.inf).argsort(-1)
-    rotations, translations, ahead = (_taken(t, order) for t in (rotations, translations, ahead))
+    rotations, translations, ahead = (_take(t, order) for t in (rotations, translations, ahead))
     rotations = rotations @ axes.mT[:, None]
     translations = translations * size[:, None, None] - (rotations @ centre[:, None, :, None])[..., 0]
     finite = torch.isfinite(rotations).all(-1).all(-1) & torch.isfinite(translations).all(-1)
@@ -236,14 +236,14 @@ def _rotations_in_space(local: Tensor, rays: Tensor, weights: Tensor, distances:
     # four points have up to four minima near each other, which two steps do not separate
     few = _STARTS if bool(((weights > 0).sum(-1) <= 4).any()) else _FEW
     for count, steps in ((_STARTS, 2), (few, _STEPS)):
-        rotations = distances.descended(_taken(rotations, costs(rotations).argsort(-1)[:, :count]), steps)
+        rotations = distances.descended(_take(rotations, costs(rotations).argsort(-1)[:, :count]), steps)
     cost = costs(rotations)
-    best = _taken(rotations, cost.argmin(-1, keepdim=True))
+    best = _take(rotations, cost.argmin(-1, keepdim=True))
     same = (rotations * best).sum((-1, -2)) > 1 + 2 * math.cos(_SAME)
     other = torch.where(same, torch.inf, cost).argmin(-1, keepdim=True)
-    return torch.cat((best, _taken(rotations, other)), 1)
+    return torch.cat((best, _take(rotations, other)), 1)
 
 
-def _taken(values: Tensor, index: Tensor) -> Tensor:
+def _take(values: Tensor, index: Tensor) -> Tensor:
     """Return the values (B, S, ...) at an index (B, T)."""
     return torch.take_along_dim(values, index.view(*index.shape, *[1] * (values.ndim - 2)), 1)

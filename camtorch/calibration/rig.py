@@ -140,12 +140,12 @@ def calibrate_rig(
     middle, searches = middle_of([seen for seen, _ in by_name.values()]), []
     for name, (seen, layout) in by_name.items():
         of = f"{owner}: {name}"
-        asked = as_model(models[name], _of(count, name, None), _of(start, name, None), _of(fixed, name, ()), of)
+        asked = as_model(models[name], _own(count, name, None), _own(start, name, None), _own(fixed, name, ()), of)
         searches.append(Search(of, asked, seen, middle, layout, loss, loss_scale))
     observed = [search.observed for search in searches]
     learns = tuple(parameters for search in searches for parameters in search.free().parameters)
     free = Free(learns, tuple(c > 0 for c in range(len(searches))), bend=bend)
-    first = _joined(observed, [_alone(search) for search in searches], free)
+    first = _join_starts(observed, [_calibrate_alone(search) for search in searches], free)
     adjusted = searches[0].adjusted(observed, first, free, steps=STEPS, progress=on_progress)
     found = results(searches, adjusted, free)
     cameras, state = dict(zip(by_name, found.cameras, strict=True)), found.adjusted.state
@@ -177,7 +177,7 @@ def calibrate_rig(
     return result
 
 
-def _of(given: Any, name: str, otherwise: Any) -> Any:
+def _own(given: Any, name: str, otherwise: Any) -> Any:
     """Return the argument of one camera, given by name or for all."""
     return given.get(name, otherwise) if isinstance(given, Mapping) else given
 
@@ -190,7 +190,7 @@ class _Alone(NamedTuple):
     has_pose: Tensor
 
 
-def _alone(search: Search) -> _Alone:
+def _calibrate_alone(search: Search) -> _Alone:
     has_pose = search.given.seen.any(-1)
     state = replace(search, given=search.given.of(has_pose)).alone().state
     (rows,) = has_pose.nonzero(as_tuple=True)
@@ -198,7 +198,7 @@ def _alone(search: Search) -> _Alone:
     return _Alone(state.parameters[0], boards, has_pose)
 
 
-def _joined(observed: list[CameraObservations], alone: list[_Alone], free: Free) -> State:
+def _join_starts(observed: list[CameraObservations], alone: list[_Alone], free: Free) -> State:
     """Return the start: mounts from pairs that see the same boards, boards from the camera that sees each best."""
     mounts = Poses.none(1, len(alone), alone[0].parameters)
     turns, shifts = mounts.rotations[0], mounts.translations[0]
@@ -209,7 +209,7 @@ def _joined(observed: list[CameraObservations], alone: list[_Alone], free: Free)
         rest = [c for c in range(len(alone)) if c not in known]
         i, j = divmod(int(together[known][:, rest].argmax()), len(rest))
         a, b = known[i], rest[j]
-        rotation, translation = _between(alone[a], alone[b])
+        rotation, translation = _pose_between(alone[a], alone[b])
         turns[b], shifts[b] = rotation @ turns[a], rotation @ shifts[a] + translation
         known.append(b)
     parameters = tuple(one.parameters for one in alone)
@@ -219,14 +219,14 @@ def _joined(observed: list[CameraObservations], alone: list[_Alone], free: Free)
         state = State(parameters, mounts, own, own.translations.new_zeros(1, 2))
         bundle = Bundle(observed, state, free, "cauchy", 1.0)
         flat = bundle.flat(state)
-        cost = torch.stack([bundle.look(k, flat).cost[0] for k in range(len(observed))]).sum(0)
+        cost = torch.stack([bundle.errors_of(k, flat).cost[0] for k in range(len(observed))]).sum(0)
         better = one.has_pose & (cost < least)
         least = torch.where(better, cost, least)
         boards = Poses.where(better, own, boards)
     return State(parameters, mounts, boards, least.new_zeros(1, 2))
 
 
-def _between(a: _Alone, b: _Alone) -> tuple[Tensor, Tensor]:
+def _pose_between(a: _Alone, b: _Alone) -> tuple[Tensor, Tensor]:
     """Return the pose from camera a to b: of those that each board gives, the one nearest to all others."""
     both = a.has_pose & b.has_pose
     (from_a, at_a), (from_b, at_b) = ((t[0, both] for t in one.boards) for one in (a, b))

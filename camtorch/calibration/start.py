@@ -75,16 +75,16 @@ def start_from_nothing(
     the best one from several starts. Parameters in `fixed` are held: coefficients as in `Camera.ideal`, the principal
     point in the middle. `loss`, with its scale in px, decides between fits that are nearly as good.
     """
-    few, free = _subsample(observations, image_size), _free(model, count, fixed)
-    lens = first = _unified(few, image_size, fixed)
+    few, free = _subsample(observations, image_size), _free_parameters(model, count, fixed)
+    lens = first = _find_unified(few, image_size, fixed)
     bounds = [model.fit_bounds.get(name, ()) for name in model.names_of(count) or ()]
     if bounds and all(ends is None for ends in bounds):
         # a model that keeps its start's shape takes that of a good lens
-        good = _fitted(lens, few, KannalaBrandt, 4, fixed)
-        lens = _refined(good, few, _free(KannalaBrandt, 4, fixed), ("cauchy", lens.scale)).of(slice(1))
-    lens = _fitted(lens, few, model, count, fixed)
+        good = _fit_model(lens, few, KannalaBrandt, 4, fixed)
+        lens = _refine(good, few, _free_parameters(KannalaBrandt, 4, fixed), ("cauchy", lens.scale)).of(slice(1))
+    lens = _fit_model(lens, few, model, count, fixed)
     if few is not observations or len(lens.parameters) > 1 or bool(lens.lost(few).any()):
-        lens = _refined(lens, few, free, (loss, loss_scale))
+        lens = _refine(lens, few, free, (loss, loss_scale))
         one = lens.of(slice(1))
         lost = int(one.lost(few).sum())
         if lost > (_LOST * int(few.seen.sum()) if one.scale <= _ERRS * first.scale else 0):
@@ -114,8 +114,8 @@ def poses_for(
 ) -> State:
     """Return the state of a known camera (1, 4 + n) and all views' poses; scale: px from which corners count less."""
     lens = _Lens(model, parameters, Poses.none(1, 1, parameters), scale, image_size)
-    boards, errors = _posed(lens.camera, observations)
-    return _turned(lens._replace(boards=boards), observations, errors).state
+    boards, errors = _find_poses(lens.camera, observations)
+    return _choose_poses(lens._replace(boards=boards), observations, errors).state
 
 
 def other_poses(found: Adjusted, observations: Observations, model: type[Camera], image_size: tuple[int, int]) -> State:
@@ -128,7 +128,7 @@ def other_poses(found: Adjusted, observations: Observations, model: type[Camera]
     boards = state.boards.of(rows, 1)
     lens = lens._replace(boards=boards, scale=max(_LEAST_SCALE, 2 * float(errors.nanmedian())))
     with torch.inference_mode():
-        others = _turned(lens, observations.of(rows), errors[None, rows]).boards
+        others = _choose_poses(lens, observations.of(rows), errors[None, rows]).boards
     cosine = ((boards.rotations * others.rotations).sum((-1, -2)) - 1) / 2
     shift = torch.linalg.vector_norm(others.translations - boards.translations, dim=-1)
     is_other = (cosine < math.cos(_OTHER)) | (shift > _OTHER * torch.linalg.vector_norm(boards.translations, dim=-1))
@@ -153,7 +153,7 @@ def other_cameras(
         return None
     fixed = [name for name, is_free in zip(names, learns.tolist(), strict=True) if not is_free]
     lens = _Lens(model, parameters, boards, _LEAST_SCALE, image_size)
-    found = _fitted(lens, observations, model, count, fixed).parameters
+    found = _fit_model(lens, observations, model, count, fixed).parameters
     return torch.where(learns.to(found.device), found, parameters)
 
 
@@ -209,7 +209,7 @@ def _as_seen(model: type[Camera], observations: Observations) -> CameraObservati
     return CameraObservations(model, points[None], pixels[None], seen[None].to(pixels.dtype))
 
 
-def _free(model: type[Camera], count: int, fixed: Collection[str]) -> Free:
+def _free_parameters(model: type[Camera], count: int, fixed: Collection[str]) -> Free:
     """Return the parameters that learn: all except those held by `fixed` or by the model."""
     names = ("fx", "fy", "cx", "cy", *(model.names_of(count) or ()))
     learns = [name not in fixed and model.fit_bounds.get(name, ()) is not None for name in names]
@@ -237,7 +237,7 @@ def _middle(image_size: tuple[int, int], like: Tensor) -> Tensor:
     return like.new_tensor([(image_size[1] - 1) / 2, (image_size[0] - 1) / 2])
 
 
-def _unified(few: Observations, image_size: tuple[int, int], fixed: Collection[str]) -> _Lens:
+def _find_unified(few: Observations, image_size: tuple[int, int], fixed: Collection[str]) -> _Lens:
     """Return the unified camera that best explains the observations."""
     centre = _middle(image_size, few.pixels)
     reach = torch.where(few.seen, torch.linalg.vector_norm(few.pixels - centre, dim=-1), 0.0).amax()
@@ -249,19 +249,19 @@ def _unified(few: Observations, image_size: tuple[int, int], fixed: Collection[s
     lens = _Lens(UCM, parameters, Poses.none(1, 1, parameters), _LEAST_SCALE, image_size)
     begun = None
     for rounds, kept, unlike in ((1, len(tried), _FAR), (_ROUNDS, _KEPT, _UNLIKE)):
-        boards, errors = _posed(lens.camera, few, rounds, begun)
+        boards, errors = _find_poses(lens.camera, few, rounds, begun)
         by_view = errors.nanmedian(-1).values.sort(-1).values
         score = by_view[:, : math.ceil(_TRIMMED * by_view.shape[1])].mean(-1)
         score, rows = score.topk(min(kept, len(score)), largest=False)
         rows = rows[score <= unlike * score[0]]
         lens = lens._replace(boards=boards, scale=max(_LEAST_SCALE, 2 * float(score[0]))).of(rows)
         begun = lens.boards, errors[rows]
-    free = _free(UCM, 1, [name for name in fixed if name in ("cx", "cy")])
+    free = _free_parameters(UCM, 1, [name for name in fixed if name in ("cx", "cy")])
     lens = lens.adjusted(few, free, _STEPS, _WORSE).of(slice(1))
-    return _turned(lens, few, lens.errors(few))
+    return _choose_poses(lens, few, lens.errors(few))
 
 
-def _posed(
+def _find_poses(
     camera: Camera, some: Observations, rounds: int = _ROUNDS, begun: tuple[Poses, Tensor] | None = None
 ) -> tuple[Poses, Tensor]:
     """Return closed-form poses (B, V) for cameras (B,), and errors (B, V, N) in px; NaN if a corner is unseen.
@@ -293,7 +293,7 @@ def _posed(
     return boards, errors
 
 
-def _resampled(camera: Camera, boards: Poses, some: Observations, errors: Tensor) -> tuple[Poses, Tensor]:
+def _resample_poses(camera: Camera, boards: Poses, some: Observations, errors: Tensor) -> tuple[Poses, Tensor]:
     """Return the poses (1, V), by samples of corners for views spoilt by outliers, and the errors (1, V, N)."""
     usual = errors[0].nanmedian(-1).values
     (bad,) = (usual > _BAD * usual.median().clamp(min=_LEAST_SCALE)).nonzero(as_tuple=True)
@@ -334,10 +334,10 @@ def _lengths(residuals: Tensor, valid: Tensor, seen: Tensor) -> Tensor:
     return torch.where(seen, torch.where(valid, torch.hypot(*residuals.unbind(-1)), _NO_PIXEL), torch.nan)
 
 
-def _turned(lens: _Lens, some: Observations, errors: Tensor) -> _Lens:
+def _choose_poses(lens: _Lens, some: Observations, errors: Tensor) -> _Lens:
     """Return a single camera with the best pose of each view: a plane has two similar ones; errors (1, V, N)."""
     camera = lens.camera
-    old, errors = _resampled(camera, lens.boards, some, errors)
+    old, errors = _resample_poses(camera, lens.boards, some, errors)
     rays, has_ray = (t[0] for t in _rays(camera, some))
     weights = torch.where(has_ray, 1 / (1 + (errors[0] / lens.scale).square()), 0.0)
     found = poses_from_rays(some.points, rays, weights)
@@ -356,13 +356,13 @@ def _turned(lens: _Lens, some: Observations, errors: Tensor) -> _Lens:
     return lens._replace(boards=first.with_views(rows, better))
 
 
-def _refined(lens: _Lens, few: Observations, free: Free, loss: tuple[str | None, float]) -> _Lens:
+def _refine(lens: _Lens, few: Observations, free: Free, loss: tuple[str | None, float]) -> _Lens:
     """Refine the cameras by a few steps, drop all but the nearly best, and refine the rest; the best comes first."""
     lens = lens.adjusted(few, free, _STEPS, _WORSE, loss)
     return lens if len(lens.parameters) == 1 else lens.adjusted(few, free, _MANY_STEPS, _LITTLE_WORSE, loss)
 
 
-def _fitted(lens: _Lens, few: Observations, model: type[Camera], count: int, fixed: Collection[str]) -> _Lens:
+def _fit_model(lens: _Lens, few: Observations, model: type[Camera], count: int, fixed: Collection[str]) -> _Lens:
     """Fit cameras (S,) of another model to the corners, with the boards held."""
     camera = lens.camera
     slopes = views.focal_at_axis(camera)

@@ -78,7 +78,7 @@ def triangulate(
     if seen_at.ndim < 2 or seen_at.shape[-1] != 2:
         raise ValueError(f"triangulate: pixels must be (C, *N, 2); got shape {tuple(seen_at.shape)}")
     count, *shape = seen_at.shape[:-1]
-    given, poses = _listed(cameras, "cameras", Camera, count), _listed(extrinsics, "extrinsics", Extrinsics, count)
+    given, poses = _as_list(cameras, "cameras", Camera, count), _as_list(extrinsics, "extrinsics", Extrinsics, count)
     if not len(given) == len(poses) == count:
         raise ValueError(
             "triangulate: cameras and extrinsics must be as many as rows of pixels (C, *N, 2); got "
@@ -94,14 +94,14 @@ def triangulate(
     with torch.no_grad():
         rays, seen = map(torch.stack, zip(*(c.unproject(p) for c, p in zip(rows, at, strict=True)), strict=True))
     task = _Task(rows, matrices[:, :3, :3], matrices[:, :3, 3], torch.where(seen[..., None], at, 0.0), seen)
-    points, valid = _solved(task, rays)
+    points, valid = _solve(task, rays)
     if learns([*given, *poses], task.pixels):
         points = attached(task.cost, points, valid)
     rms = root_of(2 * task.cost(points) / seen.sum(0).clamp(min=1), valid)
     return Triangulation(points.to(dtype).view(*shape, 3), rms.to(dtype).view(shape), valid.view(shape))
 
 
-def _listed(modules: Sequence[M] | M, name: str, kind: type[M], count: int) -> list[M]:
+def _as_list(modules: Sequence[M] | M, name: str, kind: type[M], count: int) -> list[M]:
     """Return modules without batch dims, from a list, a batch, or one for all."""
     if isinstance(modules, kind):
         listed = [modules[i] for i in range(len(modules))] if modules.batch_shape else [modules] * count
@@ -135,7 +135,7 @@ class _Task(NamedTuple):
 
 
 @torch.no_grad()
-def _solved(task: _Task, rays: Tensor) -> tuple[Tensor, Tensor]:
+def _solve(task: _Task, rays: Tensor) -> tuple[Tensor, Tensor]:
     """Return the points of least cost (P, 3) and whether they are valid; rays: (C, P, 3) of the pixels."""
     rotations, translations, pixels = (t.detach() for t in task[1:4])
     seen, views = task.seen.to(pixels), task.seen.sum(0)
@@ -182,7 +182,7 @@ def _solved(task: _Task, rays: Tensor) -> tuple[Tensor, Tensor]:
     valid &= step[:, 0].norm(dim=-1) <= _FLEEING * (points - middle).norm(dim=-1)
     valid &= torch.isfinite(points).all(-1)
     for c in range(len(observed)):
-        valid &= problem.look(c, found.state).valid[:, 0, 0] | ~task.seen[c]
+        valid &= problem.errors_of(c, found.state).valid[:, 0, 0] | ~task.seen[c]
     return torch.where(torch.isfinite(points), points, 0.0), valid
 
 

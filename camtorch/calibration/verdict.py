@@ -157,7 +157,7 @@ class Calibration:
         tilt = f" {_TILTED}." if survey.tilt < _ALIKE else ""
         if wanted := survey.missing or sorted(loose, key=lambda zone: -zone.uncertainty)[:3]:
             near = "so near that its corners reach the edges"
-            ahead = f"Next, hold the board in {_places(wanted)} of the image, {near}.{tilt}"
+            ahead = f"Next, hold the board in {_zone_names(wanted)} of the image, {near}.{tilt}"
         elif tilt:
             ahead = f"Next:{tilt}"
         elif middle > _FINE:
@@ -374,7 +374,7 @@ def _parameters(survey: _Survey) -> Iterator[str]:
 
 def _over_image(survey: _Survey) -> Iterator[str]:
     if missing := survey.missing:
-        yield f"Few corners or none in {_places(missing)} of the image. Hold the board there, near the edges"
+        yield f"Few corners or none in {_zone_names(missing)} of the image. Hold the board there, near the edges"
     reach, end = survey.reach, survey.image_reach
     lost = float((~survey.has_ray).double().mean())
     if lost > 0.001 and not survey.ends_in_the_dark:
@@ -425,17 +425,17 @@ def check_determined(
     hold = [name for name in free if name not in ("fx", "fy")] or free
     given = "a single view of this board" if views == 1 else f"{views} views, which may be nearly parallel"
     raise ValueError(
-        f"{owner}: views must determine {_listed(open_ones or free)}; got {given}. Take 10 to 20 views. {_TILTED}, or "
+        f"{owner}: views must determine {_words(open_ones or free)}; got {given}. Take 10 to 20 views. {_TILTED}, or "
         f"hold parameters: fixed={tuple(hold)}"
     )
 
 
-def _listed(names: Sequence[str]) -> str:
+def _words(names: Sequence[str]) -> str:
     return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
 
 
-def _places(zones: Sequence[Zone]) -> str:
-    return _listed([f"the {zone.name}" for zone in zones])
+def _zone_names(zones: Sequence[Zone]) -> str:
+    return _words([f"the {zone.name}" for zone in zones])
 
 
 def _px(value: float) -> str:

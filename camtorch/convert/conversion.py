@@ -123,12 +123,12 @@ class _Result(NamedTuple):
 
 def _with_fewest_coefficients(task: _Task, counts: tuple[int, ...]) -> _Result:
     """Convert each row with the first of `counts` within the tolerance, or with the last one that halved the error."""
-    result = _converted(task, counts[0])
+    result = _convert(task, counts[0])
     for count in counts[1:]:
         rows = ((result.max_error > task.tolerance) & result.max_error.isfinite()).nonzero()[:, 0]
         if len(rows) == 0:
             break
-        other = _converted(task.of(rows), count)
+        other = _convert(task.of(rows), count)
         enough = (_WORTH_IT * result.max_error[rows]).clamp(min=task.tolerance)
         good = (other.max_error <= enough) & _reaches_as_far(other.max_angle, result.max_angle[rows])
         result = result.replaced(rows[good], other.of(good))
@@ -139,7 +139,7 @@ def _reaches_as_far(angle: Tensor, before: Tensor) -> Tensor:
     return angle >= before * (1 - 1e-9)  # rounding depends on the batch
 
 
-def _converted(task: _Task, count: int) -> _Result:
+def _convert(task: _Task, count: int) -> _Result:
     source, model, build = task.source.camera, task.model, task.build
     names = model.names_of(count) or ()
     slopes = views.focal_at_axis(source)
@@ -155,18 +155,18 @@ def _converted(task: _Task, count: int) -> _Result:
         parameters = torch.where(exact[:, None], torch.cat((source.intrinsics, taken), -1), parameters)
     if len(rows := (~exact).nonzero()[:, 0]):
         parameters[rows] = fit(build(parameters), samples.observations.of(rows), starts[:, rows], slopes[rows])
-    result = _measured(task, parameters, exact)
+    result = _measure(task, parameters, exact)
     # the largest error of any camera of the model is at least the least rms
     rows = ((result.max_error > task.tolerance) & (result.rms < task.tolerance)).nonzero()[:, 0]
     if len(rows):
         these = task.of(rows)
         observations = views.sample_with_rings(these.source.camera, task.image_size, _FIT_SIDE, task.limit).observations
-        minimax = _measured(these, refine_minimax(build(parameters), observations, parameters[rows]), exact[rows])
+        minimax = _measure(these, refine_minimax(build(parameters), observations, parameters[rows]), exact[rows])
         better = minimax.max_error < result.max_error[rows]
         better &= _reaches_as_far(minimax.max_angle, result.max_angle[rows])
         result = result.replaced(rows[better], minimax.of(better))
     return result
 
 
-def _measured(task: _Task, parameters: Tensor, exact: Tensor) -> _Result:
+def _measure(task: _Task, parameters: Tensor, exact: Tensor) -> _Result:
     return _Result(parameters, *measure(task.build(parameters), parameters[:, 4:], exact, task.source), exact)

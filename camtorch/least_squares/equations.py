@@ -96,12 +96,12 @@ class System:
             # columns differ by many orders of magnitude
             by = torch.nn.functional.pad(scale, (0, 1), value=1.0)[:, None]
             triangle = torch.linalg.qr(torch.cat((shared / by, left / by, damped), 1), mode="r").R
-            whole = -_solved(triangle[:, :rest, :rest], triangle[:, :rest, -1:])[..., 0] / scale
+            whole = -_solve(triangle[:, :rest, :rest], triangle[:, :rest, -1:])[..., 0] / scale
         else:
             whole = shared.new_zeros(len(shared), 0)
         if width:
             right = view[..., -1:] + view[..., width:-1] @ whole[:, None, :, None]
-            of_views = -_solved(view[..., :width], right)[..., 0]
+            of_views = -_solve(view[..., :width], right)[..., 0]
         else:
             of_views = view.new_zeros(*view.shape[:2], 0)
         fine = torch.isfinite(whole).all(-1) & torch.isfinite(of_views).all(-1).all(-1)
@@ -144,7 +144,7 @@ def triangle_of_few(rows: Tensor) -> Tensor:
     return torch.cat((lower.mT / scale[..., None, :], turned), -1)
 
 
-def _solved(triangle: Tensor, right: Tensor) -> Tensor:
+def _solve(triangle: Tensor, right: Tensor) -> Tensor:
     """Solve the triangular system; unknowns with a zero on the diagonal are zero."""
     empty = triangle.diagonal(dim1=-2, dim2=-1) == 0
     triangle = triangle + torch.diag_embed(empty.to(triangle.dtype))

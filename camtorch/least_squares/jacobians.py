@@ -72,8 +72,8 @@ def _backward(camera: CameraLike | type[CameraLike], k: Tensor, rays: Tensor, fu
     with torch.inference_mode(False), torch.enable_grad():
         shape = rays.shape[:-1]
         # contiguous planes are several times as fast; copies can require grad after inference mode
-        planes = [_copied(w).requires_grad_() for w in rays.detach().unbind(-1)]
-        own = [_copied(c.expand(shape)).requires_grad_() for c in columns(k.detach())]
+        planes = [_copy(w).requires_grad_() for w in rays.detach().unbind(-1)]
+        own = [_copy(c.expand(shape)).requires_grad_() for c in columns(k.detach())]
         points = _to_sensor(camera, own, planes, furthest)
         one, leaves = torch.ones(shape, dtype=rays.dtype, device=rays.device), [*planes, *own]
         slopes = [
@@ -85,7 +85,7 @@ def _backward(camera: CameraLike | type[CameraLike], k: Tensor, rays: Tensor, fu
     return SensorJacobians(points, by_all[:, :, :3], by_all[:, :, 3:])
 
 
-def _copied(plane: Tensor) -> Tensor:
+def _copy(plane: Tensor) -> Tensor:
     return plane.clone(memory_format=torch.contiguous_format)
 
 

@@ -196,14 +196,14 @@ def find(words: str, *, image_size: Sequence[int] | None = None) -> KannalaBrand
     return camera if camera.image_size == size else camera.resize(*size)
 
 
-def _squeezed(text: str) -> str:
+def _squeeze(text: str) -> str:
     return _NO_SPACE.sub("", " ".join(_WORD.findall(unicodedata.normalize("NFKC", text).casefold())))
 
 
 def _terms(words: str, function: str) -> list[str]:
     if not isinstance(words, str):
         raise TypeError(f"lenses.{function}: words must be a text; got {type(words).__name__}")
-    return [term for term in map(_squeezed, words.split()) if term]
+    return [term for term in map(_squeeze, words.split()) if term]
 
 
 def _pattern(term: str) -> re.Pattern[str]:
@@ -215,6 +215,6 @@ def _pattern(term: str) -> re.Pattern[str]:
 @cache
 def _texts() -> list[tuple[str, int]]:
     """Return name and size, and the length of the name, of every entry."""
-    names = [_squeezed(lens.name) for lens in entries()]
+    names = [_squeeze(lens.name) for lens in entries()]
     sizes = [f"{lens.image_size[1]}x{lens.image_size[0]}" for lens in entries()]
     return [(f"{name} {size}", len(name)) for name, size in zip(names, sizes, strict=True)]

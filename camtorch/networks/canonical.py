@@ -102,9 +102,9 @@ class CanonicalCamera(SampleTransform):
         camera, count = batch.camera, batch.form.count
         scale = self.scale(camera).expand(count)
         if self.scales == "depth":
-            moved = self._scaled(sample, batch, scale)
+            moved = self._scale_sample(sample, batch, scale)
         else:
-            moved = self._resized(sample, batch, self._change(camera, count))
+            moved = self._resize_sample(sample, batch, self._change(camera, count))
             own = camera.clone()
             moved["source_camera"] = list(own) if isinstance(sample.get("camera"), (list, tuple)) else own
         moved["scale"] = scale if batch.form.batched else scale.squeeze(0)
@@ -123,7 +123,7 @@ class CanonicalCamera(SampleTransform):
         sample.pop("scale", None)
         if self.scales == "depth":
             batch = self._batch(sample, predicted=True)
-            return self._scaled(sample, batch, 1 / self.scale(batch.camera).expand(batch.form.count))
+            return self._scale_sample(sample, batch, 1 / self.scale(batch.camera).expand(batch.form.count))
         if (source := sample.pop("source_camera", None)) is None:
             raise ValueError(f"{self._name}: source_camera must be in the sample, as forward() returned it; got none")
         source = as_one(source)
@@ -131,14 +131,14 @@ class CanonicalCamera(SampleTransform):
         target = change.target if source.batch_shape else alone(change.target)  # a batch dim would be the sample's
         batch = self._batch(sample, target, predicted=True)
         change = change if change.count == batch.form.count else self._change(source, batch.form.count)
-        return self._resized(sample, batch, change.inverse())
+        return self._resize_sample(sample, batch, change.inverse())
 
     if TYPE_CHECKING:
 
         @typed_as(forward)
         def __call__(self, *args: Any, **options: Any) -> Any: ...
 
-    def _scaled(self, sample: Sample, batch: Batch, scale: Tensor) -> Sample:
+    def _scale_sample(self, sample: Sample, batch: Batch, scale: Tensor) -> Sample:
         """Return the sample with every length of the camera's frame multiplied by `scale` (B,)."""
         moved, batched = dict(sample), batch.form.batched
         for name, (found, value) in batch.named.items():
@@ -163,7 +163,7 @@ class CanonicalCamera(SampleTransform):
         lengths[..., :3, 3] = True
         return torch.where(lengths, value * factor, value)
 
-    def _resized(self, sample: Sample, batch: Batch, change: Change) -> Sample:
+    def _resize_sample(self, sample: Sample, batch: Batch, change: Change) -> Sample:
         moved = self._moved(sample, batch, change)
         if "rotation" not in sample:  # the sample is not rotated
             del moved["rotation"]

@@ -169,19 +169,19 @@ class CameraHead(GeometryModule):
         first = len(self.names) - len(self._coefficients)
         given, free = rows[:, :first], rows[:, first:]
         least, most = self._discs[0].to(rows), self._discs[-1].to(rows)
-        disc = least + (most - least) * (1 + _bounded(given[:, :1] + self._start.to(rows))) / 2
+        disc = least + (most - least) * (1 + _bound(given[:, :1] + self._start.to(rows))) / 2
         lens = self._lens.to(rows)
         limits = Limits(self.model, lens)
         k = lens + self._moves(limits, free, disc)
         disc = disc.exp()
         focal = self._far.to(rows) / limits.filled(k, limits.disc(k, disc))
         half = self._ratio.to(rows) / 2
-        half = half if self.shared_focal else half + _ASPECT / 2 * _bounded(given[:, 1:2])
+        half = half if self.shared_focal else half + _ASPECT / 2 * _bound(given[:, 1:2])
         height, width = self.image_size
         centre = self._middle.to(rows).expand(len(rows), 2)
         if self._centres:
             reach = rows.new_tensor([width, height])[self._centres] * self.centre
-            moved = reach * _bounded(given[:, first - len(self._centres) :])
+            moved = reach * _bound(given[:, first - len(self._centres) :])
             index = torch.tensor(self._centres, device=rows.device)
             centre = centre + torch.zeros_like(centre).index_copy(1, index, moved)
         intrinsics = torch.cat((focal * (-half).exp(), focal * half.exp(), centre), -1).to(dtype)
@@ -213,6 +213,6 @@ class CameraHead(GeometryModule):
         return f"{self.model.__name__}, image_size={self.image_size}, numbers=({' '.join(self.names)})"
 
 
-def _bounded(x: Tensor) -> Tensor:
+def _bound(x: Tensor) -> Tensor:
     """Map x to -1 to 1: like x near zero, with gradients that fade with the third power."""
     return x * torch.rsqrt(1 + x * x)

@@ -100,7 +100,7 @@ def rays(
     else:
         places = as_values(pixels, "pixels", owner, predicted.intrinsics.device)
     (a, ours), (b, theirs) = predicted.unproject(places), target.unproject(places)
-    return _reduced(angles(a, b), ours & theirs, weights, reduction, owner)
+    return _reduce(angles(a, b), ours & theirs, weights, reduction, owner)
 
 
 @overload
@@ -176,7 +176,7 @@ def reprojection(
             f"{tuple(found.shape)}"
         ) from None
     # a point without a pixel has a distance without a gradient
-    return _reduced(torch.linalg.vector_norm(off, dim=-1), valid & seen, weights, reduction, owner)
+    return _reduce(torch.linalg.vector_norm(off, dim=-1), valid & seen, weights, reduction, owner)
 
 
 def _check(predicted: Camera, target: Camera, owner: str) -> torch.Size:
@@ -213,7 +213,7 @@ def _places(
     return torch.stack(torch.meshgrid(u, v, indexing="xy"), -1).expand(*batch, *pair, 2)
 
 
-def _reduced(
+def _reduce(
     values: Tensor, valid: Tensor, weights: Numbers | None, reduction: str, owner: str
 ) -> Tensor | tuple[Tensor, Tensor]:
     values = torch.where(valid, values, 0.0)

@@ -66,7 +66,7 @@ def page(camera: Camera | None = None, image: Any = None) -> str:
     """Return the text of the page; without a camera it begins with a preset, or the camera of its address."""
     data: dict[str, Any] = {"camera": None, "photograph": None, "models": models(), "lenses": _lenses()}
     if camera is not None:
-        data["camera"] = _described(camera)
+        data["camera"] = _describe(camera)
         if image is not None:
             name = os.fsdecode(image) if isinstance(image, (str, bytes, os.PathLike)) else "image"
             jpeg = as_jpeg(image, camera._size_for("write_viewer"), name, "write_viewer", _SIDE, _QUALITY)
@@ -84,7 +84,7 @@ def _file(name: str) -> str:
     return (resources.files(__package__) / name).read_text(encoding="utf-8")
 
 
-def _described(camera: Camera) -> dict[str, Any]:
+def _describe(camera: Camera) -> dict[str, Any]:
     if not isinstance(camera, Camera) or camera.is_mixed:
         has_one = isinstance(getattr(camera, "camera", None), Camera)
         hint = ". Pass rig.camera or one of rig.cameras for a rig" if has_one else ""
@@ -173,11 +173,11 @@ def _lenses() -> dict[str, Any]:
         "count": int(exists.sum()),
         "steps": [_FOCAL, _BEND],
         "widths": widths,
-        "names": _deflated(names.encode()),
-        "numbers": _deflated(np.concatenate(planes).tobytes()),
+        "names": _deflate(names.encode()),
+        "numbers": _deflate(np.concatenate(planes).tobytes()),
     }
 
 
-def _deflated(content: bytes) -> str:
+def _deflate(content: bytes) -> str:
     """Return raw Deflate as Base64, which browsers can decode."""
     return base64.b64encode(zlib.compress(content, 9)[2:-4]).decode()
