@@ -6,16 +6,18 @@ from pathlib import Path
 
 import dewarp_room
 import driver_monitoring
+import fisheye_depth
 import numpy as np
 import predict_camera
 import pytest
+import robot_cameras
 import stereo_room
 import surround_view
 import torch
 import train_faces
 from boards import FOLDER, ov_plane
 from PIL import Image
-from scenes import cabin, driver, faces
+from scenes import cabin, driver, faces, walls
 from scenes.cabin import CLASSES, LANDMARKS, random_drivers, render_classes
 from scenes.faces import NAMES, SIDE, SIZE, Photographs, Samples
 
@@ -81,6 +83,58 @@ def test_the_car_park_comes_back(tmp_path):
     assert shifted.square().mean() > off.square().mean()
     surround_view.draw(study, str(tmp_path / "above.png"))
     assert is_a_figure(tmp_path / "above.png")
+
+
+# -- robot_cameras
+
+
+def test_an_episode_is_what_the_robot_would_have_seen(tmp_path, monkeypatch):
+    simulated, robot, name = robot_cameras.SIMULATED, robot_cameras.ROBOT.resize(90, 120), robot_cameras.WRIST
+    robot_cameras.save_cameras(tmp_path, {name: robot.requires_grad_(False)})
+    robot = robot_cameras.load_cameras(tmp_path)[name].requires_grad_(False)
+    found = robot_cameras.study(simulated, robot, 2, 2)
+    assert found.valid.float().mean() > 0.95
+    assert found.error < 12
+    # one draw for an episode, whatever else is in the batch; another for another episode
+    augment = robot_cameras.as_robot(simulated, robot, 6)
+    batch = {
+        name: found.simulated[[0, 1, 1, 0]].unflatten(0, (2, 2)),
+        "action": torch.rand(2, 9, 7),
+        "task": ["a", "b"],
+    }
+    moved = augment({**batch, f"{name}_is_pad": torch.zeros(2, 2, dtype=torch.bool)}, key=torch.tensor([4, 17]))
+    assert torch.equal(moved[name][1], found.drawn.flip(0))
+    assert (moved[name][0] - found.drawn).abs().max() > 0.1
+    assert all(moved[key] is batch[key] for key in ("action", "task"))
+    monkeypatch.setitem(robot_cameras.MOUNT, "roll", robot_cameras.MOUNT["roll"] + 1)  # degree
+    wrong = robot_cameras.as_robot(simulated, robot)({name: found.simulated}, key=[1, 1])[name]
+    assert 255 * (wrong - found.truth)[..., found.valid].square().mean().sqrt() > 2 * found.error
+    robot_cameras.draw(found, str(tmp_path / "robot.png"))
+    assert is_a_figure(tmp_path / "robot.png")
+
+
+# -- fisheye_depth
+
+
+@pytest.mark.parametrize(("name", "least"), [("cube", 0.7), ("ring", 0.45)])
+def test_depths_of_views_are_joined_to_one_percent(name, least, tmp_path):
+    camera = fisheye_depth.CAMERA.resize(120, 120).requires_grad_(False)
+    views = ct.views.cube(camera) if name == "cube" else ct.views.ring(camera, 5, fov=100)
+    found = fisheye_depth.study(views, samples=1)
+    assert found.off.quantile(0.999) < 0.01
+    assert found.share > least
+    points = fisheye_depth.MOUNT(found.points) + torch.tensor([0.4, 0.1, 0.6])  # where the camera stands in the room
+    beyond = torch.maximum(torch.tensor(walls.LOW) - points, points - torch.tensor(walls.HIGH))
+    assert beyond.max() < 0.05
+    assert (beyond.amax(-1).abs() < 0.02).double().mean() > 0.7  # most see a wall
+    # of a network that answers by what it sees, here by the distances in an image; depths along z are none
+    slant, seen = views.view.rays()[0][..., 2], found.truth.nan_to_num(9, 9).clamp(max=9)[None, None]
+    for network, is_right in ((lambda images: images * slant, True), (lambda images: images, False)):
+        distance, valid = fisheye_depth.distances(network, views, seen)
+        off = ((distance - seen).abs() / seen)[valid].quantile(0.6)
+        assert (off < 0.01) == is_right
+    fisheye_depth.draw(found, str(tmp_path / "depth.png"))
+    assert is_a_figure(tmp_path / "depth.png")
 
 
 # -- predict_camera
