@@ -19,19 +19,20 @@ def python(code, *words, expect=0):
     return done.stdout + done.stderr
 
 
-@pytest.mark.parametrize("words", [["--version"], ["dewarp", "--help"], ["dewarp", "--fov", "x"]])
-def test_the_command_answers_without_torch(words):
+@pytest.mark.parametrize("words", [["--version"], ["dewarp", "--help"], ["dewarp", "--fov", "x"], ["lenses", "gopro"]])
+def test_the_command_imports_what_it_needs(words):
     code = """
-import sys
+import gc, sys
 from camtorch.cli.main import main
 try:
     main(sys.argv[1:])
 except SystemExit:
     pass
-heavy = {"torch", "numpy", "PIL", "yaml", "kornia", "matplotlib", "camtorch.cameras.camera"}
-print("loaded:", sorted(heavy & set(sys.modules)))
+heavy = {"PIL", "yaml", "kornia", "matplotlib", "camtorch.boards", "camtorch.io"}
+heavy |= set() if "lenses" in sys.argv else {"torch", "numpy", "camtorch.cameras.camera"}
+print("loaded:", sorted(heavy & set(sys.modules)), gc.isenabled())
 """
-    assert "loaded: []" in python(code, *words)
+    assert "loaded: [] True" in python(code, *words)
 
 
 FIRST_USES = {
