@@ -38,7 +38,7 @@ _APART, _SAME = 5.0, 1e-3  # standard deviations, and part of the parameter, by 
 
 @dataclass(frozen=True)
 class Model:
-    """The camera to find: a class, its number of coefficients, a start or None, and the parameters that are free."""
+    """The camera to find: its class, number of coefficients, start or None, and free parameters."""
 
     kind: type[Camera]
     count: int

@@ -100,7 +100,7 @@ def solve_poses(
 
 
 class Errors(NamedTuple):
-    """The residuals of a camera at a state; see `Bundle.errors_of`."""
+    """Residuals, costs and weights of a camera's observations at a state; see `Bundle.errors_of`."""
 
     residuals: Tensor  # (B, V, N, 2)
     valid: Tensor  # (B, V, N)

@@ -178,7 +178,7 @@ def _identity() -> Extrinsics:
 class _Given(NamedTuple):
     """The arguments, checked, in float64, with their graphs."""
 
-    camera: Camera  # of B rows, or of none for all
+    camera: Camera  # of B rows, or without batch dims for all
     points: Tensor  # (B or 1, N, 3)
     pixels: Tensor  # (B, N, 2)
     weights: Tensor | None  # (B, N)
@@ -237,7 +237,7 @@ def _solve_compiled(given: _Given, threshold: float | None) -> Solved | None:
 class _Task(NamedTuple):
     """The problems of B rows, in which unseen points have weight 0 and are finite."""
 
-    camera: Camera  # of B rows, or of none for all
+    camera: Camera  # of B rows, or without batch dims for all
     points: Tensor  # (B, N, 3) about their middles
     pixels: Tensor  # (B, N, 2)
     weights: Tensor  # (B, N)

@@ -40,7 +40,7 @@ class Spread(NamedTuple):
 
     @property
     def std(self) -> Tensor:
-        """Standard deviations (B, P)."""
+        """Standard deviations (B, P) of the parameters; zeros for fixed ones."""
         deviations: Tensor = torch.linalg.vector_norm(self.factor[:, : self.parameters.shape[-1]], dim=-1)
         return deviations
 

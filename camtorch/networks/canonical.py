@@ -51,7 +51,7 @@ class CanonicalCamera(SampleTransform):
         mode, padding_mode, fill, antialias, tolerance: See `Warp`; antialias=None is on if images shrink.
         fields, mask_fill, valid_mask: See `Augmentation`.
 
-    A sample has the fields of an `Augmentation`; the result also s, `scale` (B,), and with "image" `source_camera`.
+    A sample has the fields of an `Augmentation`; the result also has s as `scale` (B,), and "image" `source_camera`.
 
     Raises:
         ValueError: If the focal length is not positive, `scales` is another word, or a size is given with "depth".

@@ -84,12 +84,12 @@ class Rectification(GeometryModule):
 
     @property
     def rotation_left(self) -> Tensor:
-        """(*B, 3, 3), `ray_rectified = R ray_left`: OpenCV's R1."""
+        """Rotation (*B, 3, 3), `ray_rectified = R ray_left`: OpenCV's R1."""
         return _frame(self.extrinsics, self.vertical, self.align)[0]
 
     @property
     def rotation_right(self) -> Tensor:
-        """(*B, 3, 3), `ray_rectified = R ray_right`: OpenCV's R2."""
+        """Rotation (*B, 3, 3), `ray_rectified = R ray_right`: OpenCV's R2."""
         return _frame(self.extrinsics, self.vertical, self.align)[1]
 
     @property
