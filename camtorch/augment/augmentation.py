@@ -125,6 +125,7 @@ class Augmentation(SampleTransform):
     p: float
     same_on_batch: bool
     min_filled: float | None
+    _last: Change | Callable[[], Change] | None = None
 
     def __init__(
         self,
@@ -143,7 +144,6 @@ class Augmentation(SampleTransform):
         self.min_filled = None if min_filled is None else as_part(min_filled, "min_filled", self._name)
         self._warned = False
         self._spans: Spans | None = None
-        self._last: Change | Callable[[], Change] | None = None
 
     @property
     def last(self) -> Change | None:

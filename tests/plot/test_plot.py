@@ -147,7 +147,7 @@ def test_residuals_and_uncertainty_are_those_of_the_calibration():
     pixels[1, 10 : 10 + OUTLIERS] += torch.tensor([9.0, -12.0])
     pixels[2] = torch.nan
     options = {"image_size": corners.image_size, "loss": "cauchy", "loss_scale": 0.3}
-    with pytest.warns(UserWarning, match="nothing was seen in view 2"):
+    with pytest.warns(UserWarning, match="view 2 left out, because nothing was seen"):
         found = ct.calibrate("brown_conrady", corners.object_points, pixels, **options)
     figure = plot.calibration(found)
     figure.canvas.draw()
