@@ -59,7 +59,7 @@ def from_columns(columns: Mapping[str, Any], name: str = "camera") -> Camera | l
         raise TypeError(f"from_columns: columns must be a dict of columns; got {type(columns).__name__}")
     missing = [f"{name}_{part}" for part in ("model", "intrinsics", "image_size") if f"{name}_{part}" not in columns]
     if missing:
-        raise ValueError(f"from_columns: {', '.join(missing)} is missing; to_columns makes the columns of a camera")
+        raise ValueError(f"from_columns: columns must hold {', '.join(missing)}; got none. to_columns makes them")
     parts = {part: columns[f"{name}_{part}"] for part in PARTS if f"{name}_{part}" in columns}
     if isinstance(parts["model"], str) or np.ndim(parts["model"]) == 0:
         return camera_of(parts, "from_columns")

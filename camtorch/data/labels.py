@@ -48,9 +48,9 @@ class Samples(Dataset[Sample]):
     path: Path
     format: str
     images: Path | None
-    """The folder of the images; None: it is looked for, see `ct.data.read`."""
+    """The folder of the images; None: it is searched, see `ct.data.read`."""
     landmarks: TableLike | None
-    """Of the keypoints, which change places in a mirror: for `landmarks=` of the augmentations. None: not known."""
+    """The table of keypoints that change places in a mirror, for `landmarks=` of augmentations. None: unknown."""
 
     def __init__(self, path: Path, format: str, images: Path | None):
         self.path, self.format, self.images = path, format, images
@@ -92,7 +92,7 @@ def _coco_sample(samples: Samples, entry: tuple[int, Json | None, Json]) -> Samp
     number, image, one = entry
     place = f"{samples.path}, annotations[{number}]"
     if image is None:
-        raise ValueError(f"{place}: no image has the id {one.get('image_id')!r:.60}")
+        raise ValueError(f"{place}: image_id must be that of an image; got {one.get('image_id')!r:.60}")
     with _failing_at(place, "not as COCO has it: ", *_UNLIKE):
         stem, year = samples.path.stem, samples.path.stem.rpartition("_")[2]  # of person_keypoints_train2017
         path = _find(samples, place, image["file_name"], ("images", stem, year, f"images/{year}"))
@@ -121,7 +121,7 @@ _ATTRIBUTES = ("pose", "expression", "illumination", "make_up", "occlusion", "bl
 def _wflw_sample(samples: Samples, entry: tuple[str, bytes]) -> Sample:
     place = f"{samples.path}, {entry[0]}"
     if len(words := _text(entry[1], place).strip().split(maxsplit=206)) not in (197, 207):
-        what = "98 points, a box, six attributes and the name of an image are 207 words"
+        what = "must be 207 words, 98 points, a box, six attributes and the name of an image"
         raise ValueError(f"{place}: {what}, or 197 without box and attributes; got {len(words)}")
     sample: Sample = {"keypoints": _numbers(words[:196], place, "points", 98, 2)}
     if len(words) == 207:
@@ -135,7 +135,7 @@ def _wflw_sample(samples: Samples, entry: tuple[str, bytes]) -> Sample:
 def _files(suffix: str, path: Path) -> Opened:
     files = [path] if path.is_file() else sorted(one for one in path.rglob("*") if one.suffix.lower() == suffix)
     if not files:
-        raise ValueError(f"{path}: no {suffix} in this folder, nor beneath it")
+        raise ValueError(f"{path}: the folder must hold a {suffix} file, at any depth; got none")
     return files, "ibug68"
 
 
@@ -143,12 +143,12 @@ def _pts_sample(samples: Samples, path: Path) -> Sample:
     head, begin, rest = _text(path.read_bytes(), path).partition("{")
     body, end, _ = rest.partition("}")
     if not begin or not all(":" in line for line in head.splitlines() if line.strip()):
-        raise ValueError(f"{path}, line 1: version: 1, n_points: 68 and {{ were expected; got {head!r:.60}")
+        raise ValueError(f"{path}, line 1: must be version: 1, n_points: 68 and {{; got {head!r:.60}")
     lines = [(i, line) for i, line in enumerate(body.split("\n"), head.count("\n") + 1) if line.strip()]
     points = [_numbers(line.split(), f"{path}, line {i}", "a point", 2) for i, line in lines]
     if len(points) != 68 or not end:
         cut = "" if end else " and no }: the file is cut short"
-        raise ValueError(f"{path}, line {lines[-1][0] if lines else 1}: 68 points were expected; got {len(lines)}{cut}")
+        raise ValueError(f"{path}, line {lines[-1][0] if lines else 1}: must have 68 points; got {len(lines)}{cut}")
     return {"keypoints": torch.stack(points) - 1, "path": _find(samples, path, path.stem, (), _SUFFIXES)}
 
 
@@ -157,7 +157,7 @@ def _mat_sample(samples: Samples, path: Path) -> Sample:
     points = [array[:2].T for name in ("pt2d", "pt3d_68") if (array := arrays.get(name, _NONE)).shape[1:] == (68,)]
     pose, shapes = arrays.get("Pose_Para", _NONE).ravel(), {name: array.shape for name, array in arrays.items()}
     if not points or pose.size != 7:
-        raise ValueError(f"{path}: pt2d (2, 68) or pt3d_68 (3, 68), and Pose_Para (1, 7) were expected; got {shapes}")
+        raise ValueError(f"{path}: must hold pt2d (2, 68) or pt3d_68 (3, 68), and Pose_Para (1, 7); got {shapes}")
     # 3DDFA's matrix is Rx(-pitch) Ry(-yaw) Rz(-roll) in its own frame, y up and z out of the image
     (pitch, yaw, roll), (x, y, z), head = _numbers(pose[:3], path, "Pose_Para"), torch.eye(3), torch.eye(4)
     head[:3, :3] = rotation_matrix(-pitch * x) @ rotation_matrix(yaw * y) @ rotation_matrix(roll * z)
@@ -178,7 +178,7 @@ def _matlab(path: Path) -> dict[str, np.ndarray[Any, Any]]:
     with path.open("rb") as file:
         content = file.read(_LARGEST)
     if content[:6] != b"MATLAB" or content[126:128] != b"IM":
-        raise ValueError(f"{path}: a file of Matlab 5 to 7 was expected, of save -v7; it begins {content[:20]!r}")
+        raise ValueError(f"{path}: must be a file of Matlab 5 to 7, of save -v7; got {content[:20]!r}")
     found = {}
     with _failing_at(path, "not a whole file of Matlab: ", ValueError, struct.error, zlib.error):
         for kind, part in _elements(content[128:]):
@@ -200,7 +200,7 @@ def _elements(content: bytes) -> Iterator[tuple[int, bytes]]:
         if kind >> 16:
             kind, size, begin, after = kind & 0xFFFF, kind >> 16, at + 4, at + 8
         if begin + size > len(content):
-            raise ValueError(f"{size} bytes were expected, and {len(content) - begin} are left")
+            raise ValueError(f"an element must have {size} bytes; got {len(content) - begin}")
         yield kind, content[begin : begin + size]
         at = after
 
@@ -282,7 +282,7 @@ def _find(
     """Return the path of an image in `samples.images`, or next to its labels, also in `folders` there and higher up."""
     parts = PurePosixPath(name if isinstance(name, str) and "\0" not in name else "")
     if parts.is_absolute() or ".." in parts.parts or not parts.name:
-        raise ValueError(f"{place}: the name of a file within the folder of images was expected; got {name!r:.60}")
+        raise ValueError(f"{place}: file name must lie within the folder of images; got {name!r:.60}")
     labels = Path(place) if isinstance(place, Path) else samples.path
     roots = [labels.parent, *labels.resolve().parent.parents][: _UP + 1 if folders else 1]
     for root in [samples.images] if samples.images else roots:
@@ -292,8 +292,8 @@ def _find(
                     return Path(file)
     where = f" or in {', '.join(map(repr, folders))} there or up to {_UP} folders above" if folders else ""
     ends = f" with one of {' '.join(suffixes[:4])}" if len(suffixes) > 1 else ""
-    hint = "; give the folder with read(..., images=FOLDER)"
-    raise ValueError(f"{place}: no file {name!r:.200}{ends} in {samples.images or f'{roots[0]}{where}{hint}'}")
+    hint = "; got none there. Pass read(..., images=FOLDER)"
+    raise ValueError(f"{place}: file {name!r:.200}{ends} must be in {samples.images or f'{roots[0]}{where}{hint}'}")
 
 
 def _image_at(path: Path) -> Tensor:
@@ -356,24 +356,24 @@ def read(
         sample = flip(samples[0])
 
     A sample is a dict as augmentations take it: `image` (3, H, W) uint8, or (1, H, W) if it is grey; float32 labels in
-    pixels with the middle of the top-left one at (0, 0), in the format's own order; and `path`, of the image. A
-    sample is one face or one person; an image with two of them is in two samples.
+    pixels, the middle of the top-left one at (0, 0), in the format's own order; and the image's `path`. A sample is one
+    face or one person; an image with two of them is in two samples.
 
     * `"coco"`, a .json of keypoints: `keypoints` (N, 2), of which `keypoints_valid` are labelled, and `boxes` (1, 4)
-      x1, y1, x2, y2: COCO has them between the edges of pixels, so half a pixel is taken off. Fields of a sample in an
-      annotation, as `gaze`, and an image's `camera`, as columns of `ct.data.to_columns`, are read if they are there.
+      x1, y1, x2, y2, half a pixel less than in COCO, which has them between the edges of pixels. Fields of a sample in
+      an annotation, such as `gaze`, and an image's `camera`, as columns of `ct.data.to_columns`, are read too.
     * `"wflw"`, a list of WFLW, .txt: 98 `keypoints`, and `boxes` (1, 4) and `attributes` if the list has them.
     * `"300w"`, a .pts or a folder of such: 68 `keypoints`. The files count from (1, 1), as Matlab, as menpo takes them.
     * `"300w_lp"`, a .mat of 300W-LP or AFLW2000-3D, or a folder of such: 68 `keypoints`, of `pt2d` or else `pt3d_68`,
-      which count from (1, 1), and `head_pose` (4, 4), of which `Pose_Para` says pitch, yaw and roll. It is 3DDFA's turn
+      which count from (1, 1), and `head_pose` (4, 4) from the pitch, yaw and roll of `Pose_Para`. It is 3DDFA's turn
       (Zhu et al., Face Alignment Across Large Poses, 2016) in the frame of a camera, Rx(-pitch) Ry(yaw) Rz(roll): the
-      nose points along -z of it, up for a positive pitch, to the left of the image for a positive yaw. The fit knows no
+      nose points along -z of it, up for a positive pitch, to the left of the image for a positive yaw. The fit has no
       distance: the translation is 0.
-    * `"vcd"`, OpenLABEL 1.0 or VCD 4, .json, as the Driver Monitoring Dataset has them, a sample for each `frame` and
-      camera, `stream`: `boxes` (M, 4) and `box_names` of all objects' `bbox`; `keypoints` (N, 2) and `point_names` of
-      their `point2d`, if their `coordinate_system` is this stream or is not said; `actions`, as "gaze_zone/front";
-      `camera`, of `intrinsics_pinhole`. `image` is the frame of the stream's video (by PyAV), by the DMD's
-      `frame_shift`; there is none before the video begins, after its end, and without `uri`.
+    * `"vcd"`, OpenLABEL 1.0 or VCD 4, .json, as in the Driver Monitoring Dataset, a sample for each `frame` and camera,
+      `stream`: `boxes` (M, 4) and `box_names` of all objects' `bbox`; `keypoints` (N, 2) and `point_names` of their
+      `point2d`, if their `coordinate_system` is this stream or is missing; `actions`, such as "gaze_zone/front";
+      `camera`, from `intrinsics_pinhole`. `image` is the frame of the stream's video (by PyAV), by the DMD's
+      `frame_shift`; there is none before the video begins, after its end, or without `uri`.
 
     Args:
         path: Path of a file or a folder.
@@ -385,21 +385,21 @@ def read(
         Samples: `len`, `[i]`, iteration; `samples.landmarks` is the table that a mirror needs.
 
     Raises:
-        ValueError: If a format is unknown, or a file not of it, cut short or in another encoding, also when a sample is
-            read; the text names the file and the place. FileNotFoundError: If there is no
-            such path. ImportError: If PyAV is missing for videos, `pip install -e ".[video]"`.
+        ValueError: If a format is unknown, or a file is not of it, cut short or in another encoding, also when a sample
+            is read; the text names the file and the place. FileNotFoundError: If the path does not exist. ImportError:
+            If PyAV is missing for videos, `pip install -e ".[video]"`.
     """
     check_path(path, "read")
     found, folder = Path(path), None if images is None else Path(images)
     if format is not None and format not in _FORMATS:
         raise ValueError(f"read: format must be one of {', '.join(_FORMATS)}; got {format!r}. {LEFT}")
     if not found.exists():
-        raise FileNotFoundError(f"read: no file or folder {str(found)!r}")
+        raise FileNotFoundError(f"read: path must exist; got {str(found)!r}")
     if folder is not None and not folder.is_dir():
-        raise FileNotFoundError(f"read: no folder of images {str(images)!r}")
+        raise FileNotFoundError(f"read: images must be a folder; got {str(images)!r}")
     name = _format_of(found) if format is None else format
     if found.is_dir() and name not in ("300w", "300w_lp"):
-        raise ValueError(f"read: the labels of {name} are a file; {str(found)!r} is a folder")
+        raise ValueError(f"read: path must be a file for {name}; got the folder {str(found)!r}")
     return Samples(found, name, folder)
 
 
@@ -412,6 +412,6 @@ def _format_of(path: Path) -> str:
             keys = re.findall(rb'"(openlabel|vcd|images|annotations)"\s*:', file.read(1 << 16))
         names = ["vcd" if keys[0] in (b"openlabel", b"vcd") else "coco"] if keys else []
     if len(names) != 1:
-        seen = f"seems to be of {' and '.join(names) or 'no known format'}"
-        raise ValueError(f"read: {str(path)!r} {seen}; write format= one of {', '.join(_FORMATS)}")
+        seen = f"which seems to be of {' and '.join(names) or 'no known format'}"
+        raise ValueError(f"read: format must be one of {', '.join(_FORMATS)} for {str(path)!r}, {seen}; got none")
     return names[0]

@@ -35,7 +35,7 @@ class Always(Augmentation):
 
     def __init__(self, warp: Warp, owner: str, fields: Mapping[str, str] | None = None):
         if isinstance(warp, ProxyWarp):
-            raise TypeError(f"{owner}: {type(warp).__name__} moves images alone; call it on them, without their labels")
+            raise TypeError(f"{owner}: warp must move labels too; got {type(warp).__name__}. Call it on images alone")
         if warp.batch_shape:
             raise ValueError(f"{owner}: the warp must be a single one; got batch dims {tuple(warp.batch_shape)}")
         warp = warp.detach()
@@ -99,7 +99,7 @@ class Mover:
             images = (v for n, v in fields.items() if kind_of(n, v, self._fields, self._owner) in IMAGES)
             parts = {**parts, "image_size": next((v.shape[:2] for v in images if np.ndim(v) in (2, 3)), None)}
         if missing := [part for part in ("model", "intrinsics", "image_size") if parts.get(part) is None]:
-            raise ValueError(f"the camera has no {', '.join(missing)}; ct.data.to_columns has all of it")
+            raise ValueError(f"the camera must have {', '.join(missing)}; got none. ct.data.to_columns makes all")
         return camera_of({part: _dense(part, value) for part, value in parts.items()}, self._owner)
 
 
@@ -121,36 +121,36 @@ def _dense(name: str, value: Any, kind: str = "") -> Any:
 
 
 class MapBatches(Mover):
-    """Augmentation or warp of batches of rows: the function for Ray Data's `map_batches` and similar callers.
+    """Augmentation or warp of batches of rows: a function for Ray Data's `map_batches` and similar callers.
 
         rows = ray.data.read_images("images/", include_paths=True)
         rows = rows.map_batches(ct.data.MapBatches(augment, key="path", seed=0), batch_size=32)
 
-    Columns are arrays (B, ...), or arrays of objects where rows differ in shape, and named as the fields of an
+    Columns are arrays (B, ...), or arrays of objects if rows differ in shape, with the names of the fields of an
     `Augmentation`, without its batch dim:
 
-    * `image` (B, H, W, C) or (B, H, W), channels last, usually uint8; `mask`, `depth`, `distance` likewise.
+    * `image` (B, H, W, C) or (B, H, W), channels last, usually uint8; `mask`, `depth`, `distance` too.
     * `keypoints` (B, N, 2), `boxes` or `bboxes` (B, M, 4) x1 y1 x2 y2, `polygons`, in pixels with the centre of the
       top-left one at (0, 0); `gaze` (B, 3), `head_pose` (B, 4, 4), `rvec`, `tvec`, `points`, and all others.
     * The camera of every row as numbers, `camera_model`, `camera_intrinsics` (B, 4), `camera_distortion` (B, n) and
-      `camera_image_size` (B, 2), see `to_columns`; without them that of the augmentation, or of the warp.
+      `camera_image_size` (B, 2), see `to_columns`; by default the camera of the augmentation, or of the warp.
 
-    They come out with their layout and dtype, coordinates of whole numbers in float32, beside `keypoints_valid` (B, N)
-    and so on, `rotation` (B, 3, 3) and the columns of the new camera, of which `from_columns` makes a batch of cameras.
-    All other columns are passed on; numbers that might be geometry have to be named in `fields`.
+    Results keep their layout and dtype; coordinates of whole numbers become float32. The result also has
+    `keypoints_valid` (B, N) and so on, `rotation` (B, 3, 3) and the columns of the new camera, which `from_columns`
+    reads. Other columns are passed on; numbers that might be geometry must be named in `fields`.
 
-    Every row is computed by itself, and drawn by its key: so it comes out the same to the bit, in whatever batch, block
-    or worker, and in a loop in one process.
+    Every row is computed alone and drawn by its key: its result is the same to the bit in any batch, block or worker,
+    and in a loop in one process.
 
     Args:
         transform: an augmentation, or a `Warp` or `Dewarp`.
-        key: the column that names a row for ever, of whole numbers or strings, or a list of such columns. Only what
-            draws needs it. Paths should begin at the folder of the data set where they differ between machines.
-        seed, epoch: of what is drawn.
-        fields: column -> kind, for columns of other names; "keep" passes one on as it is. See `Augmentation`.
+        key: the column that identifies a row in every run, of whole numbers or strings, or a list of such columns, for
+            transforms that draw. Paths should be relative to the data set's folder, which may differ between machines.
+        seed, epoch: seed and epoch of the draws.
+        fields: column -> kind, for columns of other names; "keep" passes one on unchanged. See `Augmentation`.
 
     Raises:
-        TypeError: If `transform` moves no samples. ValueError: If it draws, and there is no key.
+        TypeError: If `transform` moves no samples. ValueError: If it draws, and no key is given.
     """
 
     def __init__(
@@ -168,8 +168,8 @@ class MapBatches(Mover):
             raise TypeError(f"{self._owner}: key must be the name of a column, or several in a list; got {shown(key)}")
         if self._seeded is not None and not self._keys:
             raise ValueError(
-                f'{self._owner}: key must name the column whose value names a row, as in key="path" after '
-                "read_images(..., include_paths=True): what a row draws follows from it, and not from its place; "
+                f'{self._owner}: key must name the column that identifies a row, as in key="path" after '
+                "read_images(..., include_paths=True), since the draw of a row depends on its key alone; "
                 f"got key={key!r}"
             )
 
@@ -187,14 +187,14 @@ class MapBatches(Mover):
         if len(set(counts.values())) > 1:
             raise ValueError(f"{self._owner}: all columns must have as many rows; got {counts}")
         if missing := [name for name in self._keys if name not in batch]:
-            raise ValueError(f"{self._owner}: no column {missing[0]!r} to name the rows; there are {', '.join(batch)}")
+            raise ValueError(f"{self._owner}: a batch must have the column {missing[0]!r}; got {', '.join(batch)}")
         count = max(counts.values(), default=0)
         rows = [self._row({name: column[i] for name, column in batch.items()}) for i in range(count)]
         if not rows:
             return dict(batch)
         names = list(dict.fromkeys(name for row in rows for name in row))
         result = {**batch, **{name: _column([row.get(name) for row in rows]) for name in names}}
-        for name, column in batch.items():  # of one type in all blocks
+        for name, column in batch.items():  # columns have one type in all blocks
             if name in names and _is_objects(column) and not _is_objects(result[name]):
                 result[name] = np.fromiter(result[name], object)
         return result
@@ -221,31 +221,30 @@ def _column(values: list[Any]) -> Array:
 
 
 class MapSamples(Mover):
-    """Augmentation or warp of single samples of a WebDataset pipeline: the function for its `.map`.
+    """Augmentation or warp of single samples of a WebDataset pipeline: a function for its `.map`.
 
         samples = wds.WebDataset("train-{00..15}.tar").decode("rgb8")
         samples = samples.map(ct.data.MapSamples(augment, seed=0))
 
     A sample is a dict of decoded entries:
 
-    * `jpg`, `png`, `webp` and so on: the image, a uint8 array (H, W, C) or (H, W). `mask.png`, `depth.npy`: what the
-      name says, moved as such.
+    * `jpg`, `png`, `webp` and so on: the image, a uint8 array (H, W, C) or (H, W). `mask.png`, `depth.npy` move by
+      their names.
     * `json`: an object of labels, named as the fields of an `Augmentation`, of numbers in lists or arrays:
       `keypoints` [[x, y], ...], `boxes` [[x1, y1, x2, y2], ...], `gaze` [x, y, z], `head_pose` and so on; and `camera`,
       an object of `model`, `intrinsics`, `distortion` and `image_size`, if the transform has none.
 
-    Lists come out as lists, arrays as arrays, in the same places. `keypoints_valid` and so on, `rotation` and the new
-    `camera` join the labels, so that a `ShardWriter` can write what comes out. Everything else is passed on.
+    Lists stay lists, arrays stay arrays, in the same places. `keypoints_valid` and so on, `rotation` and the new
+    `camera` join the labels, so that a `ShardWriter` can write the result. Other entries are passed on.
 
-    A sample is drawn by its key: it comes out the same to the bit from whatever shard, node or worker.
+    A sample is drawn by its key: its result is the same to the bit from any shard, node or worker.
 
     Args:
         transform: an augmentation, or a `Warp` or `Dewarp`.
-        key: the entry that names a sample for ever. Where several shards hold the same keys, something that tells
-            them apart has to be put in.
+        key: the entry that identifies a sample in every run. If several shards hold the same keys, make them different.
         labels: the entry of labels.
-        seed, epoch: of what is drawn.
-        fields: name -> kind, for entries and labels of other names; "keep" passes one on as it is.
+        seed, epoch: seed and epoch of the draws.
+        fields: name -> kind, for entries and labels of other names; "keep" passes one on unchanged.
 
     Raises:
         TypeError: If `transform` moves no samples.
@@ -278,11 +277,11 @@ class MapSamples(Mover):
             kind = type(sample).__name__
             raise TypeError(f"{owner}: a sample must be a dict of entries, before .to_tuple; got {kind}")
         if self._seeded is not None and self._key not in sample:
-            raise ValueError(f"{owner}: no {self._key!r} to name the sample; it has {', '.join(map(str, sample))}")
+            raise ValueError(f"{owner}: a sample must have {self._key!r}; got {', '.join(map(str, sample))}")
         if not isinstance(labels := sample.get(self._labels, {}), Mapping):
             raise TypeError(
                 f"{owner}: {self._labels} must be an object of labels; got {type(labels).__name__}"
-                + (". Undecoded ones are decoded by .decode()" if isinstance(labels, bytes) else "")
+                + (". Add .decode() before .map" if isinstance(labels, bytes) else "")
             )
         entry_of: dict[str, str] = {}
         for entry, value in sample.items():
@@ -313,14 +312,14 @@ class MapSamples(Mover):
         if not stem and ending in _ENDINGS and ending != "npy":
             name = "image"
         if ending in _ENDINGS and isinstance(value, (bytes, bytearray)):
-            raise ValueError(f'{owner}: {entry} is not decoded; .decode("rgb8") before .map makes arrays of images')
+            raise ValueError(f'{owner}: {entry} must be decoded; got bytes. Add .decode("rgb8") before .map')
         if self._moves(name or entry, value):
             if not isinstance(value, np.ndarray):
                 raise TypeError(f"{owner}: {entry} must be a numpy array; got {type(value).__name__}")
             return name
         if ending in _ENDINGS and np.ndim(value) >= 2 and name not in self._fields:
             raise ValueError(
-                f"{owner}: whether {entry} moves is not known; fields={{{entry!r}: KIND}} says so, where KIND is "
+                f"{owner}: {entry} must have a kind; got none. Pass fields={{{entry!r}: KIND}}, with KIND one of "
                 f"{', '.join(IMAGES)} or {KEEP}, among others"
             )
         return None

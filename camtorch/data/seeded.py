@@ -53,7 +53,7 @@ def _plain(key: object) -> object:
     if isinstance(key, str):
         return str(key)
     raise TypeError(
-        "generator: key must be what names a sample on every machine and in every run, an integer, a string or a tuple "
+        "generator: key must identify a sample on every machine and in every run: an integer, a string or a tuple "
         f"of them; got {key!r:.60}"
     )
 
@@ -61,13 +61,13 @@ def _plain(key: object) -> object:
 class Seeded:
     """An augmentation whose draw for a sample depends only on the sample's key, a seed and the epoch.
 
-    Processes, ranks, workers, batches, the order of samples and interruptions do not change it, and no
-    generator state must be saved. In a dataset, `augment(image=..., key=index)`; for a
-    batch, with its keys as a list or a tensor, `augment(batch, key=batch["index"])`, drawn as one by one.
+    Processes, ranks, workers, batches, the order of samples and interruptions do not change it, and no generator state
+    must be saved. In a dataset, write `augment(image=..., key=index)`; for a batch, pass its keys as a list or a
+    tensor, `augment(batch, key=batch["index"])`, and each sample is drawn alone.
 
         augment = ct.data.Seeded(ct.augment.RandomMount(camera=camera), seed=0)
         for epoch in range(10):
-            augment.set_epoch(epoch)  # the workers of a DataLoader hear of it, also those that persist
+            augment.set_epoch(epoch)  # also reaches persistent workers of a DataLoader
             for batch in loader: ...
 
     Args:
@@ -113,7 +113,7 @@ class Seeded:
         return generator(key, seed=self.seed, epoch=self.epoch)
 
     def draw(self, keys: Sequence[Key] | Tensor | np.ndarray[Any, Any]) -> dict[str, Tensor]:
-        """Return the draws of a batch of samples, each drawn by itself with `augmentation.draw`."""
+        """Return the draws of a batch of samples, each drawn alone with `augmentation.draw`."""
         if not (draws := [self._inner.draw(1, self.generator(key)) for key in keys]):
             return self._inner.draw(0)
         return {name: torch.cat([draw[name] for draw in draws]) for name in draws[0]}
@@ -130,7 +130,7 @@ class Seeded:
         if not many:
             return self.augmentation(sample, generator=self.generator(key), **fields)  # type: ignore[arg-type]
         if isinstance(self.augmentation, Transform):
-            raise TypeError(f"Seeded: a Transform of arrays takes one sample, and one key; got {key!r:.60}")
+            raise TypeError(f"Seeded: key must be a single one for a Transform of arrays; got {key!r:.60}")
         return self.augmentation(sample, draw=self.draw(key), **fields)  # type: ignore[arg-type]
 
     def __setstate__(self, state: dict[str, Any]) -> None:

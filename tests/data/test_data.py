@@ -80,7 +80,7 @@ def test_a_key_says_what_is_drawn_on_every_machine():
     seeds = [ct.data.generator(key, seed=s, epoch=e).initial_seed() for key in others for s in (0, 1) for e in (0, 1)]
     assert len(set(seeds)) == len(seeds)
     for key in (0.5, None, b"5", True, (), ("a", None), np.arange(2)):
-        with pytest.raises(TypeError, match="generator: key must be what names a sample"):
+        with pytest.raises(TypeError, match="generator: key must identify a sample"):
             ct.data.generator(key)
     for numbers in ({"seed": -1}, {"epoch": 1 << 63}):
         with pytest.raises(ValueError, match=r"must be 0 or more, and below 2 to the 63rd; got"):
@@ -107,7 +107,7 @@ def test_a_batch_is_drawn_as_one_by_one():
         ct.data.Seeded(augmentation(same_on_batch=True))
     with pytest.raises(TypeError, match="Seeded: augmentation must be an Augmentation"):
         ct.data.Seeded(ct.Dewarp(camera()))
-    with pytest.raises(TypeError, match="takes one sample, and one key"):
+    with pytest.raises(TypeError, match="key must be a single one"):
         ct.data.Seeded(camtorch.augment.numpy.Transform(augmentation()))(image=images.numpy(), key=[1, 2, 3])
 
 
@@ -246,21 +246,21 @@ def test_wrong_batches_are_told():
         ({"label": [1]}, "all columns must have as many rows"),
         ({"image": some["image"][:, :12]}, r"sample 'day/0.jpg': RandomCamera: image must be of .* got \(12, 32\)"),
         ({"score": np.ones((2, 3))}, "'score' must have a kind"),
-        ({"camera_intrinsics": np.ones((2, 4))}, r"the camera has no model; ct.data.to_columns has all of it"),
+        ({"camera_intrinsics": np.ones((2, 4))}, r"the camera must have model; got none. ct.data.to_columns makes all"),
         ({"camera_intrinsics": np.ones((2, 4)), "camera_model": ["x"] * 2}, "one of brown_conrady, .*; got 'x'"),
     ):
         with pytest.raises(ValueError, match=message):
             function({name: some[name] for name in ("path", "image")} | change)
-    with pytest.raises(ValueError, match="no column 'path' to name the rows; there are image"):
+    with pytest.raises(ValueError, match="must have the column 'path'; got image"):
         function({"image": some["image"]})
     with pytest.raises(TypeError, match='as of batch_format="numpy"; got list'):
         function([1])
-    with pytest.raises(ValueError, match='key must name the column whose value names a row, as in key="path"'):
+    with pytest.raises(ValueError, match='key must name the column that identifies a row, as in key="path"'):
         ct.data.MapBatches(augmentation())
     ground = ct.BirdsEye(camera(), ct.Extrinsics([2.0, 0, 0], [0, 0, 2.0]), x=(-1, 1), y=(1, 3), resolution=0.1)
     for transform, message in (
         (torch.nn.Linear(1, 1), "transform must be an augmentation or a Warp; got Linear"),
-        (ground, "BirdsEye moves images alone"),
+        (ground, "must move labels too; got BirdsEye"),
     ):
         with pytest.raises(TypeError, match=message):
             ct.data.MapBatches(transform)
@@ -334,20 +334,20 @@ def test_wrong_samples_are_told():
     function = ct.data.MapSamples(augmentation())
     sample = {"__key__": "a", "jpg": rows(1)[0]["image"], "json": {}}
     for change, message in (
-        ({"jpg": b"JFIF"}, r'jpg is not decoded; .decode\("rgb8"\) before .map'),
+        ({"jpg": b"JFIF"}, r'jpg must be decoded; got bytes. Add .decode\("rgb8"\) before .map'),
         ({"jpg": torch.zeros(3, *SIZE)}, "jpg must be a numpy array; got Tensor"),
-        ({"json": b"{}"}, "json must be an object of labels; got bytes. Undecoded ones"),
-        ({"left.png": sample["jpg"][..., 0]}, "whether left.png moves is not known; fields={'left.png': KIND}"),
+        ({"json": b"{}"}, "json must be an object of labels; got bytes. Add .decode"),
+        ({"left.png": sample["jpg"][..., 0]}, "left.png must have a kind; got none. Pass fields={'left.png': KIND}"),
         ({"left.png": sample["jpg"]}, "'left' must have a kind, .* fields={'left': KIND}"),
         ({"png": sample["jpg"]}, "png and jpg both hold image"),
         ({"json": {"keypoints": [[1, 2], [3]]}}, "keypoints must be numbers in lists of one length"),
         ({"json": {"keypoints": [[10**400, 2]]}}, "keypoints must be numbers in lists of one length"),
         ({"json": {"scores": [0.5]}}, "'scores' must have a kind"),
-        ({"json": {"camera": {"model": "pinhole"}}}, "the camera has no intrinsics"),
+        ({"json": {"camera": {"model": "pinhole"}}}, "the camera must have intrinsics"),
     ):
         with pytest.raises((TypeError, ValueError), match=message):
             function(sample | change)
-    with pytest.raises(ValueError, match="no '__key__' to name the sample; it has jpg"):
+    with pytest.raises(ValueError, match="must have '__key__'; got jpg"):
         function({"jpg": sample["jpg"]})
     with pytest.raises(TypeError, match=r"must be a dict of entries, before .to_tuple; got tuple"):
         function(("jpg",))

@@ -167,11 +167,11 @@ def test_images_may_lie_elsewhere_and_are_opened_when_their_sample_is_asked_for(
     assert torch.equal(samples[0]["image"], ct.data.read(path)[0]["image"])
     with pytest.raises(ValueError, match="elsewhere"):
         ct.data.read(path, images=elsewhere)[0]
-    with pytest.raises(FileNotFoundError, match="no folder of images"):
+    with pytest.raises(FileNotFoundError, match="images must be a folder"):
         ct.data.read(path, images=tmp_path / "none")
     for image in tmp_path.rglob("*.png"):
         image.unlink()
-    with pytest.raises(ValueError, match="no file"):
+    with pytest.raises(ValueError, match="must be in"):
         samples[0]
 
 
@@ -288,18 +288,18 @@ def message(path, index=0, format=None):
 
 
 WFLW = [
-    (lambda s: "\n".join([s[0], "", s[1][:700]]), 1, ", line 3: 98 points, a box"),
+    (lambda s: "\n".join([s[0], "", s[1][:700]]), 1, ", line 3: must be 207 words, 98 points, a box"),
     (lambda s: "\n".join([s[0], "nan " + s[1].partition(" ")[2]]), 1, ", line 2: points must be 98 x 2 finite numbers"),
     (lambda s: s[0].replace(" 0 0 1 0 0 0 ", " 0 0 2 0 0 0 "), 0, ", line 1: attributes must be 0 or 1"),
     (lambda s: s[0].replace("0--Parade", "../x"), 0, "within the folder of images"),
-    (lambda s: s[0].replace("0--Parade", 999 * "x"), 0, "line 1: no file 'xxx"),
+    (lambda s: s[0].replace("0--Parade", 999 * "x"), 0, "line 1: file 'xxx"),
     (lambda s: s[0].encode("utf-16"), 0, "line 1: not text in UTF-8"),
 ]
 PTS = [
     (lambda s: s[:300], "the file is cut short"),
-    (lambda s: s.replace("{\n", "{\n1 2\n"), "line 72: 68 points were expected; got 69"),
+    (lambda s: s.replace("{\n", "{\n1 2\n"), "line 72: must have 68 points; got 69"),
     (lambda s: s.replace("{\n", "{\n1 2 3\n"), "line 4: a point must be 2 finite numbers"),
-    (lambda s: "", "line 1: version: 1"),
+    (lambda s: "", "line 1: must be version: 1"),
     (lambda s: s.encode() + b"\xe9", "not text in UTF-8"),
 ]
 
@@ -326,8 +326,8 @@ def test_faults_in_json_name_file_and_place(tmp_path):
     path, _ = coco(tmp_path)
     whole = path.read_text(encoding="utf-8")
     for change, told in (
-        ({"image_id": 8}, "no image has the id 8"),
-        ({"image_id": "7"}, "no image has the id '7'"),
+        ({"image_id": 8}, "image_id must be that of an image; got 8"),
+        ({"image_id": "7"}, "image_id must be that of an image; got '7'"),
         ({"bbox": [1, 2, 3]}, "bbox must be 1 x 4 finite numbers"),
         ({"keypoints": [1, 2]}, "keypoints must be N x 3 finite numbers"),
         ({"keypoints": [None] * 51}, "keypoints must be N x 3 finite numbers"),
@@ -363,7 +363,7 @@ def test_faults_in_arrays_name_the_file(tmp_path):
         message(path)
     for arrays, told in (
         ({"pt2d": np.ones((2, 21)), "Pose_Para": pose}, "pt2d (2, 68) or pt3d_68 (3, 68), and"),
-        ({"pt2d": np.ones((2, 68))}, "Pose_Para (1, 7) were expected"),
+        ({"pt2d": np.ones((2, 68))}, "Pose_Para (1, 7); got"),
         ({"pt2d": np.full((2, 68), np.nan), "Pose_Para": pose}, "points must be 68 x 2 finite numbers"),
     ):
         io.savemat(path, arrays)
@@ -371,16 +371,16 @@ def test_faults_in_arrays_name_the_file(tmp_path):
 
 
 def test_a_format_that_is_not_seen_is_an_error_that_lists_them(tmp_path):
-    unknown, unseen = text(tmp_path / "unknown.json", "{}"), r"no known format; write format= one of coco, wflw, 300w"
+    unknown, unseen = text(tmp_path / "unknown.json", "{}"), r"format must be one of coco, wflw, 300w.* no known format"
     (tmp_path / "empty").mkdir()
     pts(tmp_path / "both")
     (tmp_path / "both" / "a.mat").touch()
     for arguments, error, told in (
-        ((tmp_path / "nowhere",), FileNotFoundError, "no file or folder"),
+        ((tmp_path / "nowhere",), FileNotFoundError, "path must exist"),
         ((unknown,), ValueError, unseen),
         ((tmp_path / "empty",), ValueError, unseen),
-        ((tmp_path / "both",), ValueError, "seems to be of 300w and 300w_lp; write format= one of"),
-        ((tmp_path / "both", "coco"), ValueError, "is a folder"),
+        ((tmp_path / "both",), ValueError, "seems to be of 300w and 300w_lp; got none"),
+        ((tmp_path / "both", "coco"), ValueError, "must be a file for coco"),
     ):
         with pytest.raises(error, match=told):
             ct.data.read(*arguments)

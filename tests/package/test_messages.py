@@ -172,7 +172,7 @@ WRONG = [
     # networks, data, calibration
     (lambda: ct.CameraHead(0, "mei", image_size=SIZE), ValueError, r"CameraHead: features must be at least 1; got 0"),
     (lambda: ct.data.to_columns(ct.Pinhole([1, 1, 0, 0])), ValueError, r"must have an image_size .*got image_size"),
-    (lambda: ct.data.from_columns({}), ValueError, r"from_columns: camera_model, .* is missing"),
+    (lambda: ct.data.from_columns({}), ValueError, r"from_columns: .*must hold camera_model, .*got none"),
     (lambda: ct.data.MapBatches(WARP, key=7), TypeError, r"MapBatches: key must be the name of a column.*got 7"),
     (lambda: ct.data.MapBatches(ct.Warp(BATCH, BATCH)), ValueError, r"the warp must be a single one; got batch dims"),
     (lambda: ct.data.MapSamples(WARP, key=[]), TypeError, r"MapSamples: key must name an entry of a sample; got \[\]"),
