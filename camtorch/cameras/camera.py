@@ -15,7 +15,7 @@ from typing_extensions import Self, TypeVar
 from camtorch.cameras.catalogue import Catalogue
 from camtorch.cameras.editing import Editable
 from camtorch.cameras.freezing import PREFIX, Freezable, with_frozen
-from camtorch.cameras.numbers import at_a_glance, camera_of_fov, checked_numbers, described, numbers_of_matrix, replaced
+from camtorch.cameras.numbers import camera_of_fov, check_fast, checked_numbers, described, numbers_of_matrix, replaced
 from camtorch.convert.result import Conversion
 from camtorch.evaluate.kept import Kept
 from camtorch.evaluate.known import is_predicted
@@ -46,7 +46,7 @@ def _intrinsic(index: int, doc: str) -> Any:
     return property(one, doc=doc)
 
 
-def _held(name: str, doc: str) -> Any:
+def _tensor_property(name: str, doc: str) -> Any:
     """Return the property of a module's tensor, found in a tenth of the time of `nn.Module.__getattr__`."""
 
     def tensor(camera: Camera) -> Tensor:
@@ -101,8 +101,8 @@ class Camera(Freezable, Editable):
     image_size: tuple[int, int] | None
     tensor_names: ClassVar[tuple[str, ...]] = ("intrinsics", "distortion")
     memo_names: ClassVar[tuple[str, ...]] = ("_memo", "_rays", "_fields")
-    intrinsics: Tensor = _held("intrinsics", "(*B, 4) fx, fy, cx, cy in pixels.")
-    distortion: Tensor = _held("distortion", "(*B, n) coefficients in the order of `distortion_names`.")
+    intrinsics: Tensor = _tensor_property("intrinsics", "(*B, 4) fx, fy, cx, cy in pixels.")
+    distortion: Tensor = _tensor_property("distortion", "(*B, n) coefficients in the order of `distortion_names`.")
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
@@ -122,7 +122,7 @@ class Camera(Freezable, Editable):
                 "ct.KannalaBrandt(intrinsics, distortion), or from_matrix(K, distortion); ct.MODELS has all models"
             )
         given = type(self), intrinsics, distortion, image_size
-        intrinsics, distortion, names, batch, size = at_a_glance(*given) or checked_numbers(*given)
+        intrinsics, distortion, names, batch, size = check_fast(*given) or checked_numbers(*given)
         super().__init__(
             distortion_names=names,
             image_size=size,
@@ -530,7 +530,7 @@ class Camera(Freezable, Editable):
 
 def as_model(model: type[Camera] | str, owner: str) -> type[Camera]:
     """Return a camera model, or the one with that key in `MODELS`."""
-    return MODELS.found(model, owner)
+    return MODELS.model_for(model, owner)
 
 
 def __getattr__(name: str) -> type[Camera]:

@@ -79,7 +79,7 @@ class Catalogue(MutableMapping[str, KindT]):
             raise ValueError(f"{model.__name__}: key must be unique; got {model.key!r}, which is that of {owner}")
         self[model.key] = model
 
-    def found(self, model: Any, owner: str) -> KindT:
+    def model_for(self, model: Any, owner: str) -> KindT:
         """Return a camera model, or the one with that key."""
         if isinstance(model, str):
             key, *texts = model.split(":")

@@ -56,12 +56,12 @@ def edited(camera: CameraT, matrix: Tensor | Sequence[Sequence[float]], image_si
     turns = turned = b != 0
     if isinstance(matrix, Tensor):  # read where it was drawn, so as not to wait for a device
         turns = np.any(turned) if xp is np else not known_true(matrix[..., 0, 1] == 0)
-    distortion = _edited_distortion(camera, a - b, c + d, turned if turns else None)
+    distortion = _edit_distortion(camera, a - b, c + d, turned if turns else None)
     intrinsics = stack_numbers((*focal, *centre), own, xp)
     return remade(camera, intrinsics=intrinsics, distortion=distortion, image_size=image_size)
 
 
-def _edited_distortion(camera: CameraLike, across: Any, down: Any, on_side: Any) -> Tensor:
+def _edit_distortion(camera: CameraLike, across: Any, down: Any, on_side: Any) -> Tensor:
     """Return coefficients after a clockwise quarter turn of rows `on_side`, (*B,) bool, and flips by signs (*B,)."""
     k, names = camera.distortion, camera.distortion_names
     if on_side is not None:
@@ -78,11 +78,11 @@ def _edited_distortion(camera: CameraLike, across: Any, down: Any, on_side: Any)
                     f"{owner}: tau_x or tau_y must be 0 for a quarter turn, as the model tilts about "
                     f"one axis after the other; got {tilts.tolist()}"
                 )
-        k = torch.where(torch.as_tensor(on_side, device=k.device).unsqueeze(-1), _renamed(k, names, quarter), k)
+        k = torch.where(torch.as_tensor(on_side, device=k.device).unsqueeze(-1), _rename(k, names, quarter), k)
     for sign, mirrored in ((across, camera.mirror_x), (down, camera.mirror_y)):
         if mirrored:
             flipped = torch.as_tensor(sign < 0, device=k.device).unsqueeze(-1)
-            k = torch.where(flipped, _renamed(k, names, mirrored), k)
+            k = torch.where(flipped, _rename(k, names, mirrored), k)
     for sign, odd in ((across, camera.odd_in_x), (down, camera.odd_in_y)):
         if not odd.isdisjoint(names):
             is_odd = torch.tensor([name in odd for name in names], device=k.device)
@@ -90,7 +90,7 @@ def _edited_distortion(camera: CameraLike, across: Any, down: Any, on_side: Any)
     return k.clone() if k is camera.distortion else k
 
 
-def _renamed(k: Tensor, names: Sequence[str], turned: Mapping[str, str]) -> Tensor:
+def _rename(k: Tensor, names: Sequence[str], turned: Mapping[str, str]) -> Tensor:
     """Return coefficients (*B, n) of these names, each replaced by the one that `turned` gives for it; "-" negates."""
     places = {name: i for i, name in enumerate(names)}
     source = [turned.get(name, name) for name in names]

@@ -61,7 +61,7 @@ def checked_numbers(
     return intrinsics, distortion, model.names_of(distortion.shape[-1]) or (), batch, size
 
 
-def at_a_glance(model: type[CameraLike], intrinsics: Any, distortion: Any, size: Any) -> _Checked | None:
+def check_fast(model: type[CameraLike], intrinsics: Any, distortion: Any, size: Any) -> _Checked | None:
     """Return `checked_numbers` for lists and plain tensors of one camera that are right at a glance, or None."""
     if not (model.always_defined and are_free(*[value for value in (intrinsics, distortion) if type(value) is Tensor])):
         return None

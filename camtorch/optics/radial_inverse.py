@@ -253,7 +253,7 @@ class RadialInverse:
         k, rows = self.k, None
         self._table: InverseTable | None = None
         if is_portable_export():
-            safe_radius_sq, table = _made_tables(factor.name, k, end)
+            safe_radius_sq, table = _make_tables(factor.name, k, end)
             self._table = InverseTable(table, is_constant=True)
             most2 = self._table.most2
         else:
@@ -278,7 +278,7 @@ class RadialInverse:
 _tables = Kept(8)
 
 
-def _made_tables(name: str, k: Tensor, end: float) -> tuple[Tensor, Tensor]:
+def _make_tables(name: str, k: Tensor, end: float) -> tuple[Tensor, Tensor]:
     wide = precise(k)
     radial = CLASSES[name](columns(wide))
     most = torch.finfo(k.dtype).max ** 0.25
@@ -297,21 +297,21 @@ def _scale(name: str, k: Tensor, safe_radius_sq: Tensor, table: InverseTable, r2
     return scale
 
 
-def _found_inverse(name: str, k: Tensor, end: float, r2: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _compute_inverse(name: str, k: Tensor, end: float, r2: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Return the factors for coefficients (C, n) and squared radii (C, N), and two tensors of `RadialInverse`."""
-    safe_radius_sq, table = _tables((k,), (name, end), lambda: _made_tables(name, k.detach(), end))
+    safe_radius_sq, table = _tables((k,), (name, end), lambda: _make_tables(name, k.detach(), end))
     inverse = InverseTable(table)
     scale = _scale(name, k, safe_radius_sq, inverse, r2) if r2.numel() else torch.empty_like(r2)
     # clones, as the caller may write into them
     return scale, safe_radius_sq.clone(), inverse.most2.clone()
 
 
-_radial_inverse = torch.library.custom_op("camtorch::radial_inverse", _found_inverse, mutates_args=())
+_radial_inverse = torch.library.custom_op("camtorch::radial_inverse", _compute_inverse, mutates_args=())
 
 
 def _inverse_of(name: str, k: Tensor, end: float, r2: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     # the operator serves graphs and transforms alone: its first call imports torch's compiler, which takes seconds
-    of = _found_inverse if are_known(k, r2) else _radial_inverse
+    of = _compute_inverse if are_known(k, r2) else _radial_inverse
     return of(name, k, end, r2)
 
 

@@ -148,7 +148,7 @@ class Lattices:
         in_float = (narrow, 2 * nodes, nodes) if is_double else (at, 2 * count, count)
         self.places = *in_float, cells, n * m, n, m, exact, 64 * self._most * (1 + is_double)
 
-    def found(self) -> tuple[Tensor, Tensor, Tensor]:
+    def results(self) -> tuple[Tensor, Tensor, Tensor]:
         """Return `nodes` (C, 2, n + 5, m + 5), `cells`, and `exact` (2, K, 8, 8), NaN if there is no position."""
         (cameras, n, m), dtype, most = self.cells.shape, self.nodes.dtype, self._most
         nodes = self.nodes.as_strided((cameras, 2, n + 5, m + 5), (*self.nodes.stride()[:2], m + 5, 1))
@@ -197,7 +197,7 @@ class Between:
         """Return the results of `Lattices`, or None if most cells would have positions of their own."""
         given = self._given[:-1]
         made = Lattices(probes, size, self._size, tolerance, padding, self.cameras, first_row, given, _kept_memory)
-        return None if self._run("camtorch_lattices", made.words, self.cameras, made.counters) else made.found()
+        return None if self._run("camtorch_lattices", made.words, self.cameras, made.counters) else made.results()
 
     def _run(self, name: str, call: object, tiles: int, counters: ctypes.Array[c_int64]) -> int:
         """Return flags of parts that are not made. `counters` are the call's next tile and the number of places."""

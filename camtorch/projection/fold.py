@@ -40,7 +40,7 @@ def limits_and_extent(optics: Optics, k: Tensor) -> tuple[Tensor, Extent]:
     rows = radii.repeat_interleave(AZIMUTHS, 0)
     chart, lens = optics(columns(k.repeat_interleave(AZIMUTHS, 0)))
     directions = (c.repeat(k.shape[0]) for c in _directions(radii))
-    followed = _followed(chart, lens, rows, *directions)
+    followed = _follow(chart, lens, rows, *directions)
     lost, reach, *rim = (w.unflatten(0, (-1, AZIMUTHS)) for w in followed)
     pairs = torch.stack((lost, lost.roll(-1, -1)), -1).flatten(0, 1)
     # (M,): the radius between two azimuths before which the orientation decides; radii (M, S), lost (M, 2) on both
@@ -55,11 +55,11 @@ def limits_and_extent(optics: Optics, k: Tensor) -> tuple[Tensor, Extent]:
     return limits * limits, Extent(radii, reach, torch.where(envelope < _FAR, envelope, torch.inf))
 
 
-def _followed(chart: Chart, lens: Lens, radii: Tensor, a: Tensor, b: Tensor) -> tuple[Tensor, ...]:
+def _follow(chart: Chart, lens: Lens, radii: Tensor, a: Tensor, b: Tensor) -> tuple[Tensor, ...]:
     """Return on azimuths (M,) the node where a lens is lost, how far it sends radii, the furthest, its last point."""
     a, b = a.unsqueeze(-1), b.unsqueeze(-1)
     at = lens.at(a * radii, b * radii)
-    lost = _lost(lens, a, b, radii, at.orientation)
+    lost = _find_loss(lens, a, b, radii, at.orientation)
     (x, y), end = at.value, chart.end(radii.dtype)
     reach = (x * x + y * y).sqrt()
     index = torch.arange(reach.shape[-1], dtype=reach.dtype, device=reach.device)
@@ -117,7 +117,7 @@ def _envelope(furthest: Tensor, x: Tensor, y: Tensor) -> Tensor:
     return _BEYOND * torch.maximum(envelope, circle)
 
 
-def _lost(lens: Lens, a: Tensor, b: Tensor, radii: Tensor, orientation: Tensor) -> Tensor:
+def _find_loss(lens: Lens, a: Tensor, b: Tensor, radii: Tensor, orientation: Tensor) -> Tensor:
     """Return `first_loss` (M,), but dips between coarse nodes (M, S) count only if a closer look finds them."""
     last = orientation.shape[-1] - 1
     steps = torch.linspace(-1, 1, _DIP, dtype=orientation.dtype, device=orientation.device)

@@ -38,8 +38,8 @@ def search(domain: Domain, camera: Tensor, u: Tensor, v: Tensor) -> Found:
     if domain.stagewise is None:
         return _within_extents(domain, camera, u, v)
     stagewise = domain.stagewise[camera, 0]
-    found = _found_of(stagewise, u, lambda some: _by_stages(domain, camera[some], u[some], v[some]))
-    return _found_of(~stagewise, u, lambda some: _within_extents(domain, camera[some], u[some], v[some]), found)
+    found = _find_chosen(stagewise, u, lambda some: _by_stages(domain, camera[some], u[some], v[some]))
+    return _find_chosen(~stagewise, u, lambda some: _within_extents(domain, camera[some], u[some], v[some]), found)
 
 
 def _search_recorded(domain: Domain, camera: Tensor, u: Tensor, v: Tensor) -> Found:
@@ -65,7 +65,7 @@ def _by_stages(domain: Domain, camera: Tensor, u: Tensor, v: Tensor) -> Found:
     """Run `search` if only the first stage, a radial one, has a limit: the point that it must reach decides."""
     (p, q), within = _first_image(domain, camera, u, v)
     alone = partial(_Search, domain, is_circle=True)
-    return _found_of(within, u, lambda some: alone(camera[some])(u[some], v[some], (p[some], q[some])))
+    return _find_chosen(within, u, lambda some: alone(camera[some])(u[some], v[some], (p[some], q[some])))
 
 
 def _first_image(domain: Domain, camera: Tensor, u: Tensor, v: Tensor) -> tuple[Planes2, Tensor]:
@@ -86,10 +86,10 @@ def _first_image(domain: Domain, camera: Tensor, u: Tensor, v: Tensor) -> tuple[
 def _within_extents(domain: Domain, camera: Tensor, u: Tensor, v: Tensor) -> Found:
     """Run `search` for any other lens, for the points within the extent of what it shows."""
     within = torch.hypot(u, v) <= domain.extent.furthest[camera, azimuth(u, v)]
-    return _found_of(within, u, lambda some: _Search(domain, camera[some])(u[some], v[some]))
+    return _find_chosen(within, u, lambda some: _Search(domain, camera[some])(u[some], v[some]))
 
 
-def _found_of(chosen: Tensor, like: Tensor, find: Callable[[Tensor], Found], into: Found | None = None) -> Found:
+def _find_chosen(chosen: Tensor, like: Tensor, find: Callable[[Tensor], Found], into: Found | None = None) -> Found:
     """Return the results of `find` for the indices of the chosen points; for others zeros, or those of `into`."""
     a, b, found = into or (torch.zeros_like(like), torch.zeros_like(like), torch.zeros_like(chosen))
     (some,) = chosen.nonzero(as_tuple=True)

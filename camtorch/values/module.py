@@ -93,9 +93,9 @@ class GeometryModule(UnsharedState):
         elif is_parameter(value):
             self.put(name, value)
         elif is_kept(value):
-            self.put(name, _widened(value))
+            self.put(name, _widen(value))
         else:
-            own = _widened(value)
+            own = _widen(value)
             self.put(name, nn.Parameter((own if own.shape == shape else own.expand(shape)).clone()))
 
     def put(self, name: str, tensor: Tensor | None, persistent: bool = False) -> None:
@@ -298,7 +298,7 @@ def remade(module: Made, **changes: Any) -> Made:
             if is_parameter(tensor):
                 state["_parameters"][name] = state["_own"][name] = tensor
             else:
-                made.put(name, _widened(tensor))
+                made.put(name, _widen(tensor))
         else:
             made.put(name, tensor.detach() if tensor.requires_grad else tensor)
     return made
@@ -313,7 +313,7 @@ def refused_index(module: BatchedModule, index: Any, error: Exception) -> Except
     return TypeError(f"{name}: index must be whole numbers, slices or masks; got {shown(index)}{hint}")
 
 
-def _widened(value: Tensor) -> Tensor:
+def _widen(value: Tensor) -> Tensor:
     """Return the tensor in at least float32."""
     return value if value.dtype.itemsize >= 4 else value.to(torch.float32)
 
