@@ -75,8 +75,8 @@ def draw(image: Tensor, fields: Sample, found: Study, out: str) -> None:
     figure, axes = plt.subplots(1, 1 + len(found.poses), figsize=(4 + 4 * len(found.poses), 4), layout="constrained")
     panels = [(image, fields["keypoints"].flatten(0, 1), None), *crops]
     for axis, (picture, points, angles) in zip(np.atleast_1d(axes), panels, strict=True):
-        axis.imshow(picture.permute(1, 2, 0))
-        axis.plot(*points.T, ".", color="#22d3ee", markersize=1)
+        axis.imshow(picture.permute(1, 2, 0).numpy())
+        axis.plot(*points.T.numpy(), ".", color="#22d3ee", markersize=1)
         axis.set_title("pitch {:.0f}, yaw {:.0f}, roll {:.0f} degrees".format(*angles) if angles else "found")
         axis.axis("off")
     figure.savefig(out, dpi=100)

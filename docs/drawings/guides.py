@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import json
 import math
 import tempfile
 
@@ -343,7 +344,29 @@ def head_pose() -> Image.Image:
     return drawn(figure)
 
 
+def detectors() -> Image.Image:
+    """A photograph with dlib's landmarks, far from the axis of a fisheye, in crops and augmented."""
+    found = json.loads((IMAGES.parents[1] / "tests/files/detected_faces.json").read_text())
+    image = torch.from_numpy(np.array(Image.open(EXAMPLES / "photographs/astronaut.jpg"))).permute(2, 0, 1)
+    pinhole = ct.Pinhole.from_fov(20, image_size=image.shape[1:]).requires_grad_(False)
+    lens = ct.KannalaBrandt.from_fov(160, image_size=(960, 1280)).requires_grad_(False)
+    put = ct.Warp(pinhole, lens, mount_rotation(*torch.tensor([-55.0, 25.0, 0.0])), antialias=True)
+    keypoints, _ = put.transform_points(torch.tensor(found["photograph"]["dlib"]).float())
+    boxes = torch.cat((keypoints.amin(0), keypoints.amax(0)))[None]
+    seen = {"image": put(image[None])[0], "keypoints": keypoints, "boxes": boxes, "camera": lens}
+    left, top, right, bottom = (boxes[0] + 0.5 * torch.tensor([-70, -70, 70, 70])).round().int().tolist()
+    window = {"image": seen["image"][:, top:bottom, left:right], "keypoints": keypoints - torch.tensor([left, top])}
+    crop = ct.augment.BoxCrop((256, 256), margin=0.5)(seen)
+    flip = ct.augment.HorizontalFlip(p=1.0, landmarks="ibug68")
+    torch.manual_seed(3)
+    new = ct.augment.Compose([ct.augment.RandomCamera(yaw=2, pitch=2, roll=25), flip])(crop)
+    panels = [(seen, "a fisheye of 160°"), (window, "a window of it"), (crop, "BoxCrop"), (new, "augmented, mirrored")]
+    views = [({name: view[name] for name in view if "boxes" not in name}, title) for view, title in panels]
+    return in_rows([(marked(view, 300, 400), title) for view, title in views], 4)
+
+
 PICTURES = {
+    "detectors": detectors,
     "head-pose": head_pose,
     "overview": overview,
     "overview-phone": functools.partial(overview, 2),

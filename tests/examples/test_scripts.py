@@ -4,6 +4,7 @@ import json
 import math
 from pathlib import Path
 
+import detect_faces
 import dewarp_room
 import driver_monitoring
 import fisheye_depth
@@ -52,6 +53,22 @@ def test_dewarped_is_what_the_target_would_have_seen(tmp_path, capsys):
         assert study.valid.float().mean() > 0.9
         assert study.psnr > 25
         assert len(study.keypoints) >= 12
+
+
+# -- detect_faces
+
+
+def test_a_head_is_found_by_landmarks(tmp_path, capsys, monkeypatch):
+    found = json.loads((Path(__file__).parents[1] / "files" / "detected_faces.json").read_text())["photograph"]["dlib"]
+    points = torch.tensor([found]).float()
+    fields = {"keypoints": points, "boxes": torch.cat((points.amin(1), points.amax(1)), -1)}
+    monkeypatch.setitem(detect_faces.DETECTORS, "dlib", (lambda image: fields, "ibug68"))
+    photo = detect_faces.__file__.replace("detect_faces.py", "photographs/astronaut.jpg")
+    study = detect_faces.main(photo, str(tmp_path / "faces.png"), "dlib", fov=20)
+    assert is_a_figure(tmp_path / "faces.png")
+    assert capsys.readouterr().out.startswith("a face 130 cm away: pitch -13, yaw -1, roll 3 degrees")
+    eyes = study.normalised["keypoints"][0, 36:48].unflatten(0, (2, 6)).mean(1)  # level, at the same height
+    torch.testing.assert_close(eyes, torch.tensor([[76.0, 80.0], [146.0, 80.0]]), atol=4, rtol=0)
 
 
 # -- stereo_room
