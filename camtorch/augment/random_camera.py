@@ -21,7 +21,7 @@ from camtorch.warp.shifted import ShiftedWarp
 
 _SHIFTS = "shift_x", "shift_y", "shift_z"
 _DEPTHS = {"of_depth": ("depth", "z"), "of_distance": ("distance", "distance")}
-"""In a draw, how far away things are: the field of samples that says so, and what it holds."""
+"""Names of distances in a draw, with the field of samples that holds them and its kind."""
 
 
 class RandomCamera(CameraDrawer):
@@ -30,42 +30,46 @@ class RandomCamera(CameraDrawer):
     Convention: ranges are (low, high), or a number x for x to either side of doing nothing. Angles are in
     degrees, as every `fov` in camtorch.
 
+        >>> camera = ct.KannalaBrandt([80.0, 80.0, 63.5, 47.5], [0.02, -0.01, 0.0, 0.0], image_size=(96, 128))
+        >>> augment = ct.augment.RandomCamera(yaw=(-5.0, 5.0), camera=camera)
+        >>> sorted(augment(image=torch.zeros(3, 96, 128), keypoints=torch.tensor([[60.0, 50.0]])))
+        ['camera', 'image', 'keypoints', 'keypoints_valid', 'rotation']
+
     Args:
-        like: whose lens the new camera has. None: the sample's own camera. A Camera, whose numbers are copied and do
-            not learn. The name of a preset, see `PRESETS`. A key of `ct.MODELS`, for that model with zero
-            coefficients; it needs `fov`. "real": for each sample one of 7,000 calibrated lenses (`ct.lenses`), even
-            chances for all whose images, cropped to the new shape, have a field of view in the range of `fov`. Every
-            pixel has a ray. As lenses vary enough, the "auto" of focal, centre, distortion and crop is then None.
-        camera: of samples that do not bring one.
+        like: the camera whose lens is used. None: the sample's own. A Camera, copied without gradients. The name of a
+            preset, see `PRESETS`. A key of `ct.MODELS`: that model with zero coefficients; it needs `fov`. "real": for
+            each sample one of 7,000 calibrated lenses (`ct.lenses`), drawn evenly from those whose images, cropped to
+            the new shape, have a field of view in the range of `fov`; every pixel has a ray, and "auto" of focal,
+            centre, distortion and crop is None, as lenses vary enough.
+        camera: for samples that hold none.
         yaw: degrees by which the camera turns to its right.
         pitch: degrees by which it then looks up.
-        roll: degrees by which it then leans to its right, clockwise: what it sees turns counterclockwise.
+        roll: degrees by which it then leans to its right, clockwise: the image turns counterclockwise.
         zoom: factor on the focal lengths.
         fov: horizontal field of view of the new camera in degrees, from one outer edge of the image to the other if
-            the axis is in the middle. None: that of the lens, whatever the size of the image. "source": as much of
-            that as the images fill, all of the new image as long as nothing else is drawn: the focal lengths are
-            scaled up to that. A turn then still leaves a rim empty, which `min_filled` takes away. Where `min_filled`
-            leaves less than 0.9 of the least number given here, one warning a process says so; the new camera's `fov`
-            is what came.
+            the axis is in the middle. None: that of the lens, for any size of the image. "source": as much of it as
+            the images fill, by larger focal lengths; all of the new image if nothing else is drawn. A turn then still
+            leaves an empty rim, which `min_filled` removes. If `min_filled` leaves less than 0.9 of the least number
+            given here, a process warns once; the new camera's `fov` is the result.
         focal: factor on the focal lengths, for lenses made alike; "auto" is (0.95, 1.05).
         centre: how far the principal point moves, as a part of the image's width and height; "auto" is 0.02.
-        distortion: by what part of the distance from the centre to the corner all coefficients together may move
+        distortion: the part of the distance from the centre to the corner by which all coefficients together may move
             the image's rim; see `jittered`, which also keeps the lens invertible over the image. "auto" is 0.02.
         crop: part of the image's width and height that is kept, at a random place, and enlarged to the full size;
             "auto" is (0.9, 1).
-        chromatic: lateral chromatic aberration: by what factor less one red and blue, each for itself, are larger than
-            green. Shown by images of three channels, taken as red, green, blue.
+        chromatic: lateral chromatic aberration: factor less one by which red and blue, drawn separately, are larger
+            than green, for images of three channels, red, green and blue.
         vignetting: the part of the light that is lost in the image's farthest corner; it grows with the square of
             the distance from the principal point.
-        cos4: natural vignetting: the light falls by this power of cos^4 of a pixel's angle to the axis; 1 is the law,
-            fisheyes have less, below 0 it is undone. See `ct.vignetting`.
-        image_size: (height, width) to come out; the sample's by default. Fields of view are those in width.
+        cos4: natural vignetting: power of cos^4 of a pixel's angle to the axis; 1 is natural, fisheyes have less, below
+            0 it is undone. See `ct.vignetting`.
+        image_size: (height, width) of the result; default: the sample's. Fields of view are those in width.
         options: p, same_on_batch, camera, fields, mode, padding_mode, fill, antialias, tolerance, mask_fill, valid_mask
             and min_filled; see `Augmentation`.
 
     Raises:
-        ValueError: ranges in the wrong order or out of bounds, an unknown name (the text lists those there are).
-        TypeError: ranges that are none, an unknown keyword.
+        ValueError: If a range is in the wrong order or out of bounds, or a name is unknown (the message lists all).
+        TypeError: If a range is not numeric, or a keyword is unknown.
     """
 
     like: Camera | None
@@ -107,10 +111,12 @@ class RandomMount(CameraDrawer):
     Args are those of `RandomCamera`: yaw, pitch, roll in degrees, zoom, a range of `fov`, chromatic, vignetting, cos4,
     image_size, and all options. On a pinhole camera this is the homography K' R K^-1.
 
+        >>> augment = ct.augment.RandomMount(yaw=10, camera=ct.Pinhole([80.0, 80.0, 63.5, 47.5], image_size=(96, 128)))
+        >>> sample = augment(image=torch.zeros(8, 3, 96, 128), gaze=torch.tensor([[0.0, 0.0, -1.0]] * 8))
+
     `shift=(dx, dy, dz)` also moves the camera: right, down and forward by lengths of the unit of the depth, each a
-    range, or a number for as much to either side. It is for some centimetres, and for samples that have `depth` or
-    `distance`: near things shift against far ones, which no image alone says. What stood behind something is empty and
-    not valid; pixels move by their depth, points and poses exactly, and there is no `inverse`.
+    range, or x for (-x, x). It is for some centimetres, and samples need `depth` or `distance`. Surfaces that were
+    hidden are empty and not valid; pixels move by their depth, points and poses exactly. There is no `inverse`.
     """
 
     def __init__(
@@ -169,12 +175,15 @@ class RandomMount(CameraDrawer):
 
 
 class RandomLens(CameraDrawer):
-    """Another lens before the camera, which stays where it looks.
+    """Another lens in front of the camera, which keeps its direction.
 
     Args are those of `RandomCamera`: like, fov, focal, centre, distortion, chromatic, vignetting, cos4, image_size, and
     all options; "auto" is (0.9, 1.1) for focal, 0.03 for centre and 0.05 for distortion, and None with like="real".
-    From pinhole data, `RandomLens("kannala_brandt", fov=(120, 140))` makes a fisheye's, `RandomLens("real", fov=(100,
-    150))` that of lenses that exist.
+    From pinhole data, `RandomLens("kannala_brandt", fov=(120, 140))` makes images of a fisheye, and "real" those of
+    lenses that exist.
+
+        >>> lens = ct.augment.RandomLens("real", fov=(60, 90))
+        >>> sample = lens(image=torch.zeros(3, 96, 128), camera=ct.Pinhole([50.0, 50, 64, 48], image_size=(96, 128)))
     """
 
     _usual_ranges: ClassVar[Mapping[str, RangeLike]] = {
