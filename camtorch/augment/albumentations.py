@@ -39,10 +39,9 @@ class Transform(FrontEnd, A.DualTransform):
     `<name>_valid` next to points and boxes. Numbers under an unknown name that might be geometry raise an error;
     `fields={"lidar": "points", "logits": "keep"}` of the augmentation gives their kinds. A `camera` in the sample is
     that of its images; every result holds the new one, which the next transform of camtorch uses. Albumentations' own
-    crops and flips do not change the camera; the edits of camtorch do.
-
-    Numbers are drawn by the generator of the pipeline, `A.Compose(..., seed=...)`, and replayed by `A.ReplayCompose`.
-    There are no gradients, and volumes are not supported.
+    crops and flips do not change the camera; the edits of camtorch do. Numbers are drawn by the generator of the
+    pipeline, `A.Compose(..., seed=...)`, and replayed by `A.ReplayCompose`. There are no gradients, and volumes are not
+    supported.
 
     Args:
         augmentation: the augmentation to apply.

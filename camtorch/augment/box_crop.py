@@ -23,10 +23,8 @@ class BoxCrop(Augmentation):
 
     Landmarks, other boxes, masks, depth, gaze, head pose and the camera move too, and `inverse` moves them back. A draw
     holds the boxes as `draw["box"]` (B, 4), which `forward` takes from the sample's `boxes`; for `change`, and for the
-    first of several calls of a replay, put them there.
-
-    In a `Compose` the box moves with the parts before. If it left the image, the crop shows the middle of the image,
-    and the labels are invalid.
+    first of several calls of a replay, put them there. In a `Compose` the box moves with the parts before. If it left
+    the image, the crop shows the middle of the image, and the labels are invalid.
 
         >>> crop = ct.augment.BoxCrop((64, 64), camera=ct.Pinhole([80.0, 80.0, 63.5, 47.5], image_size=(96, 128)))
         >>> crop(image=torch.zeros(3, 96, 128), boxes=torch.tensor([[40.0, 30.0, 70.0, 60.0]]))["image"].shape

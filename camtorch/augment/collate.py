@@ -23,12 +23,10 @@ def collate(samples: Sequence[object]) -> object:
     It works like torch's `default_collate`, which stacks tensors, arrays and numbers, except that tensors and arrays of
     different shapes, such as the keypoints of several faces, become the list of tensors that augmentations take.
     Cameras become a batch, or a `ct.Mixed` if they are of several models, as in `default_collate`. Their images must be
-    of one size: augment others in the workers, one by one.
-
-    In a worker on Linux, batches go into shared memory, which is used again once the main process has released it, as
-    allocating memory takes as long as augmenting images. It holds no more bytes than were in use at once. Small values
-    go within the message. The storage of the results cannot be resized. With torch's sharing strategy "file_system"
-    everything goes torch's own way.
+    of one size: augment others in the workers, one by one. In a worker on Linux, batches go into shared memory, which
+    is used again once the main process has released it, as allocating memory takes as long as augmenting images. It
+    holds no more bytes than were in use at once. Small values go within the message. The storage of the results cannot
+    be resized. With torch's sharing strategy "file_system" everything goes torch's own way.
 
     Raises:
         TypeError: If samples are no list, or cannot be collated by `default_collate` either. ValueError: If the list is

@@ -30,9 +30,7 @@ class Edit(Augmentation):
     Fields are those of `Augmentation`. Pixels move by an affine map, also those without a ray; pixel edges scale. Depth
     and distance keep their values. In a mirror directions, points and poses are mirrored, and landmarks and fields
     `..._left` and `..._right` change places: `rotation` is Q of `ray_after = Q ray_before`, with determinant -1. Whole
-    steps, flips and quarter turns copy pixels bit by bit.
-
-    For an edit of your own, write a subclass with `edit`.
+    steps, flips and quarter turns copy pixels bit by bit. For an edit of your own, write a subclass with `edit`.
 
     Args:
         ranges: see `Augmentation`.

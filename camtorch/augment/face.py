@@ -43,8 +43,7 @@ class FaceNormalizer(SampleTransform):
         mode, padding_mode, fill, antialias, tolerance: see `Warp`.
         fields, mask_fill, valid_mask: see `Augmentation`.
 
-    The defaults are those of ETH-XGaze: focal length 960, 224 x 224 pixels, 600 millimetres; poses in metres need
-    `distance=0.6`.
+    The defaults are those of ETH-XGaze, with distances in millimetres; poses in metres need `distance=0.6`.
 
     A sample has the fields of an `Augmentation`, among them `head_pose` (B, 4, 4), or `rvec` and `tvec`, camera from
     head, with the head's x axis from its right eye to its left, along the image's x axis if the face looks into the

@@ -35,10 +35,9 @@ def face_points(landmarks: str = "ibug68") -> Tensor:
     They are the points of MediaPipe's canonical face model (Apache-2.0), an average adult, the same on both sides. The
     head's frame is that of `ct.head_angles`: x to the image's right when the face looks into the camera (the person's
     left), y down, z away from the camera, the origin midway between the eyeballs' centres. For a person the points are
-    off by some millimetres, and the distance of a pose by as many percent as the face is larger or smaller.
-
-    The outline of the jaw comes first in 68, 98 and 106 landmarks. Detectors see it where the face ends in the image,
-    which is no fixed line of the head: give it a tenth of the weight in `ct.solve_pnp`.
+    off by some millimetres, and the distance of a pose by as many percent as the face is larger or smaller. The outline
+    of the jaw comes first in 68, 98 and 106 landmarks. Detectors see it where the face ends in the image, which is no
+    fixed line of the head: give it a tenth of the weight in `ct.solve_pnp`.
 
     Args:
         landmarks: "ibug68", "wflw98", "lapa106", "insightface106", "mediapipe468" or "mediapipe478".

@@ -106,8 +106,6 @@ class CameraAugmentation(InContainers, GeometricAugmentationBase2D):
         # two memos: lists of masks are moved row by row between other labels of the batch
         self._memos = Kept(), Kept()
 
-    # -- parameters
-
     def set_rng_device_and_dtype(self, device: torch.device, dtype: torch.dtype) -> None:
         """Keep draws on the CPU: a seed then draws the same on every device, and reading params needs no wait."""
         super().set_rng_device_and_dtype(torch.device("cpu"), dtype)
@@ -150,8 +148,6 @@ class CameraAugmentation(InContainers, GeometricAugmentationBase2D):
     def last(self) -> Change | None:
         """The change of the last call."""
         return self.change() if self._params else None
-
-    # -- moving, forth, or back if the flags say so
 
     @on_samples
     def _move(

@@ -43,10 +43,9 @@ class Transform(FrontEnd):
     Other fields are passed on, except that unknown names of numbers raise an error, as in `Augmentation`. Arrays keep
     their layout and dtype; coordinates of whole numbers become float32. The result also has the validity, the new
     `camera` and `rotation` (3, 3). Nothing is dropped or sorted. For pipelines with `bbox_params` and
-    `keypoint_params`, use the `Transform` of `camtorch.augment.albumentations`.
-
-    Numbers are drawn from torch's generator, `torch.manual_seed`, which DataLoader seeds differently in each worker,
-    not from numpy's. The same seed draws the same in every front end. There are no gradients.
+    `keypoint_params`, use the `Transform` of `camtorch.augment.albumentations`. Numbers are drawn from torch's
+    generator, `torch.manual_seed`, which DataLoader seeds differently in each worker, not from numpy's. The same seed
+    draws the same in every front end. There are no gradients.
 
     Args:
         augmentation: the augmentation to apply.

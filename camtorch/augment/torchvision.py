@@ -61,11 +61,10 @@ class Transform(FrontEnd, v2.Transform):
     an image is (H, W, C) or (H, W). Labels of a clip may have its leading dims. Numbers under an unknown name that
     might be geometry raise an error; `fields={"lidar": "points", "logits": "keep"}` of the augmentation gives their
     kinds. The name of a tuple's element is its place: `fields={"[1]": "keep"}`. As in v2, the first plain tensor is the
-    image if the sample has no other image and its name means nothing else.
-
-    `valid=True` adds a flag for each point or box of a dict: `target["keypoints_valid"]`, a bool tensor, for
-    `target["keypoints"]`: on the new image, and valid before. Flags that a sample already has are always updated.
-    Count, order, formats and dtypes stay; canvas_size is the new camera's. Gradients reach the inputs, not the cameras.
+    image if the sample has no other image and its name means nothing else. `valid=True` adds a flag for each point or
+    box of a dict: `target["keypoints_valid"]`, a bool tensor, for `target["keypoints"]`: on the new image, and valid
+    before. Flags that a sample already has are always updated. Count, order, formats and dtypes stay; canvas_size is
+    the new camera's. Gradients reach the inputs, not the cameras.
 
     Args:
         augmentation: the augmentation to apply.

@@ -137,10 +137,9 @@ class MapBatches(Mover):
 
     Results keep their layout and dtype; coordinates of whole numbers become float32. The result also has
     `keypoints_valid` (B, N) and so on, `rotation` (B, 3, 3) and the columns of the new camera, which `from_columns`
-    reads. Other columns are passed on; numbers that might be geometry must be named in `fields`.
-
-    Every row is computed alone and drawn by its key: its result is the same to the bit in any batch, block or worker,
-    and in a loop in one process.
+    reads. Other columns are passed on; numbers that might be geometry must be named in `fields`. Every row is computed
+    alone and drawn by its key: its result is the same to the bit in any batch, block or worker, and in a loop in one
+    process.
 
     Args:
         transform: an augmentation, or a `Warp` or `Dewarp`.
@@ -235,9 +234,8 @@ class MapSamples(Mover):
       an object of `model`, `intrinsics`, `distortion` and `image_size`, if the transform has none.
 
     Lists stay lists, arrays stay arrays, in the same places. `keypoints_valid` and so on, `rotation` and the new
-    `camera` join the labels, so that a `ShardWriter` can write the result. Other entries are passed on.
-
-    A sample is drawn by its key: its result is the same to the bit from any shard, node or worker.
+    `camera` join the labels, so that a `ShardWriter` can write the result. Other entries are passed on. A sample is
+    drawn by its key: its result is the same to the bit from any shard, node or worker.
 
     Args:
         transform: an augmentation, or a `Warp` or `Dewarp`.

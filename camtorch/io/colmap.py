@@ -168,9 +168,6 @@ def _add(
     cameras[str(identity)] = record.camera(key, intrinsics, distortion, size)
 
 
-# -- images.txt and images.bin: the poses of images; points are skipped
-
-
 def _read_images(path: str) -> tuple[dict[str, str], np.ndarray, bool, Callable[[int], Record]]:
     """Return camera ids by image name, poses (N, 7), whether images have points, and the function from row to place."""
     check_ordinary(path)

@@ -91,9 +91,7 @@ _OPENMVG = "must not be OpenMVG's; got its scene. openMVG_main_openMVG2Colmap wr
 
 
 def load(path: str | os.PathLike[str] | IO[str] | IO[bytes], format: str | None = None) -> Rig:
-    """Load the cameras of a calibration file, in float64 and frozen, with their poses.
-
-    A calibration is a measurement: its tensors are not trained unless you call `.requires_grad_()`.
+    """Load the cameras of a calibration file and their poses, in float64, frozen until you call `.requires_grad_()`.
 
     Args:
         path: A file of OpenCV, ROS, Kalibr, COLMAP, Nerfstudio, Project Aria, Basalt, mrcal, ncore, OCamCalib,

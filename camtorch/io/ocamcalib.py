@@ -1,7 +1,6 @@
 """OCamCalib's `calib_results.txt`: five lines of numbers between comments, in the order in which its C code reads them.
 
-The second line is a polynomial of the other direction, which is close to the inverse of the first one. It is not read:
-the camera inverts the first one exactly.
+The second line, a polynomial close to the inverse of the first, is not read: the camera inverts the first exactly.
 """
 
 from __future__ import annotations

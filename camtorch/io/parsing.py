@@ -1,7 +1,6 @@
 """Contents of files as keys and values: YAML, JSON, OpenCV's XML, Python literals and NumPy archives, never trusted.
 
-Refusing a file takes at most a second for 10 MB and ten times its size in memory. All functions raise
-CameraFileError for content that they refuse.
+To refuse 10 MB takes at most a second and ten times that memory. All functions raise CameraFileError to refuse.
 """
 
 from __future__ import annotations
@@ -160,9 +159,6 @@ def plain(value: Any) -> Any:
     if is_list(value):
         return list(map(plain, value))
     return plain(value.tolist()) if hasattr(value, "tolist") else value
-
-
-# -- archives, as `numpy.savez(path, K=K, D=D)` writes them; pickled objects are not read
 
 
 def arrays_of(content: bytes, largest: int) -> dict[str, np.ndarray | None]:

@@ -23,12 +23,10 @@ _GRAZING = 1e-9  # a ray of a smaller cosine to the plane's normal does not meet
 class PlaneWarp(ProxyWarp):
     """A `Warp` of the image of a plane, from camera `source` to camera `target` at another place.
 
-    Points on the plane are exact; objects above it are smeared, as in every such image. For
-    pinholes it is the homography K_s (R + t n^T / d) K_t^-1; for other cameras it is exact as well. Points and boxes
-    move along. Differentiable in both cameras, the extrinsics, the normal and the distance.
-
-    A pixel is valid if its ray meets the plane ahead, and the source sees that point, on its image and from the same
-    side of the plane as the target.
+    Points on the plane are exact; objects above it are smeared, as in every such image. For pinholes it is the
+    homography K_s (R + t n^T / d) K_t^-1; for other cameras it is exact as well. Points and boxes move along.
+    Differentiable in both cameras, the extrinsics, the normal and the distance. A pixel is valid if its ray meets the
+    plane ahead, and the source sees that point, on its image and from the same side of the plane as the target.
 
     Args:
         source: the camera of the given images.

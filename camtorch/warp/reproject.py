@@ -30,9 +30,7 @@ class Reproject(GeometryModule):
 
     It is the backward warp of depth networks and stereo: the depth takes each target pixel to a point, and the source's
     image is sampled where the source sees that point. Differentiable in images, depth, extrinsics and both cameras.
-
-    Convention: images (B, C, H, W) of the source, depth (B, 1, H', W') of the target in the unit of the extrinsics.
-    Cameras and extrinsics with a batch dim go sample by sample with the images.
+    Depth is in the unit of the extrinsics. Cameras and extrinsics of a batch dim go sample by sample with the images.
 
         >>> camera = ct.Pinhole([40.0, 40.0, 31.5, 23.5], image_size=(48, 64))
         >>> warp = ct.Reproject(camera, camera, ct.Extrinsics([0.0, 0.0, 0.0], [-0.1, 0.0, 0.0]))

@@ -50,7 +50,7 @@ class RollingShutter(GeometryModule):
     readout, when the middle of the image is read, `ray_at_0 = exp(t [rates]) ray_at_t`. Values without a row, such
     as points in space, gaze and poses, are of that moment.
 
-    The turn is exact without depth. The camera's translation is ignored, as it would need depth.
+    The turn is exact without depth; the camera's translation, which would need depth, is ignored.
 
     Args:
         readout: seconds from the first row to the last (all rows times the time of one), or (B,). Negative reads in
@@ -120,10 +120,7 @@ class RollingShutter(GeometryModule):
         return share * _lead(self.readout.to(share.dtype), ndim - 1)
 
     def turned(self, rays: Tensor, share: Tensor, sign: float) -> Tensor:
-        """Turn rays (*B, *N, 3) of shares (*B, *N) of the readout to its middle (sign 1) or from it (sign -1).
-
-        Rodrigues' formula; at time zero every number is unchanged.
-        """
+        """Turn rays (*B, *N, 3) of shares (*B, *N) to the readout's middle (sign 1) or from it (-1), by Rodrigues."""
         rates = _lead(self.rates.to(rays.dtype), rays.ndim - 1, 1)
         wx, wy, wz = ((sign * self._times(share, rays.ndim)).unsqueeze(-1) * rates).unbind(-1)
         x, y, z = rays.unbind(-1)

@@ -16,14 +16,13 @@ def vignetting(camera: Camera, power: float | Tensor = 1.0) -> Tensor:
     """Return natural vignetting (B or 1, 1, H, W): the fourth power of the cosine of each pixel's angle to the axis.
 
     `images * ct.vignetting(camera)` applies it to images in linear light, `images / ct.vignetting(camera)` undoes it.
-    It is 1 on the axis. From 84 degrees on, and at pixels without a ray, it is constant, 0.0001.
+    It is 1 on the axis. From 84 degrees on, and at pixels without a ray, it is constant, 0.0001. The angle is the
+    lens's, not a pinhole's, and only `power` has derivatives.
 
     Args:
         camera: a camera with image_size.
         power: the exponent's factor, a number or (B,): 0 is no vignetting, 1 the natural one, -1 its inverse. Lenses
             made to light their rim evenly, such as fisheyes, have less than 1.
-
-    The angle is that of the lens, not that of a pinhole. Only `power` has derivatives.
 
     Raises:
         ValueError: If the camera has no image_size, or powers do not fit it. TypeError: If power is not numeric.
