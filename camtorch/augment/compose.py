@@ -87,7 +87,7 @@ class Compose(Augmentation):
         self._check_options(parts)
         mirrorings = {repr(m.key): m for part in parts if (m := part.mirroring) is not None}
         if len(mirrorings) > 1:
-            raise ValueError(f"{name}: flips of one chain must have the same landmarks, lateral_axis and swap_sides")
+            raise ValueError(f"{name}: flips must have equal landmarks, lateral_axis and swap_sides; got others")
         self.mirroring: Mirroring | None = next(iter(mirrorings.values()), None)
 
     def _check_options(self, parts: Sequence[Augmentation]) -> None:

@@ -124,7 +124,7 @@ class Transform(FrontEnd):
         return result
 
     def _layouts(self, sample: Sample, size: tuple[int, int] | None) -> list[tuple[str, int | None]] | None:
-        """Return the names of fields, and of arrays that are images their dims, 0 of labels; None if some take more."""
+        """Return fields with the dims of image arrays, 0 for labels, None for others; None if a field needs more."""
         layouts: list[tuple[str, int | None]] = []
         mirroring = self.augmentation.mirroring
         for name, value in sample.items():
@@ -177,7 +177,7 @@ class Transform(FrontEnd):
 
 
 def _form_of(sample: Sample) -> tuple[Any, ...] | None:
-    """Return all of a sample but the values of its arrays; None where it holds more, or arrays to read only."""
+    """Return all of a sample except the values of its arrays; None if it holds others, or read-only arrays."""
     parts: list[Any] = []
     for name, value in sample.items():
         if type(value) is np.ndarray:
@@ -194,7 +194,7 @@ def _form_of(sample: Sample) -> tuple[Any, ...] | None:
 def _moved_arrays(
     move: Callable[..., Sample], sample: Sample, options: Sample, layouts: list[tuple[str, int | None]], learns: bool
 ) -> Sample:
-    """Move a sample of arrays that torch reads where they are; see `Transform._layouts`.
+    """Move a sample whose arrays torch can read without a copy; see `Transform._layouts`.
 
     learns: whether the camera may, of which nothing is recorded.
     """

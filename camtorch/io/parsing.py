@@ -164,7 +164,7 @@ def plain(value: Any) -> Any:
 def arrays_of(content: bytes, largest: int) -> dict[str, np.ndarray | None]:
     """Return arrays of numbers by name; None for damaged or too large arrays, and for objects."""
     if content.count(b"PK\1\2") > _MOST_ARRAYS:
-        raise ValueError(f"more than {_MOST_ARRAYS} arrays")
+        raise ValueError(f"must hold at most {_MOST_ARRAYS} arrays; got more")
     arrays: dict[str, np.ndarray | None] = {}
     with zipfile.ZipFile(io.BytesIO(content)) as archive:
         for entry in archive.infolist():
@@ -187,7 +187,7 @@ def _from_archive(path: Path, content: bytes) -> dict[str, Any]:
     for name, value in keys.items():
         if name.lower() in _SIZES and isinstance(value, list) and len(value) == 2 and value[0] != value[1]:
             either = f"got {value[0]:g} {value[1]:g}, (width, height) or (height, width)"
-            raise CameraFileError(path, name, f"sides must have names; {either}. Save image_width and image_height")
+            raise CameraFileError(path, name, f"its order must be known; {either}. Save image_width and image_height")
     return keys
 
 

@@ -29,7 +29,7 @@ class Names:
     """Names of a format and of its files."""
 
     format: str  # its key in `camtorch.load` and `camtorch.save`
-    title: str  # what errors call it
+    title: str  # its name in errors
     suffixes: tuple[str, ...] = ()  # of written files, with the dot; files to read are recognized by content
     patterns: tuple[str, ...] = ()  # fnmatch patterns that mean this format; the longest match wins
     in_folder: tuple[str, ...] = ()  # files that stand for their folder; the first that exists is used

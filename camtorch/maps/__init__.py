@@ -1,1 +1,1 @@
-"""Warps as lookup tables for other runtimes, one file a format, each with the error of what it holds."""
+"""Warps as lookup tables for other runtimes, one file a format, each with its error."""

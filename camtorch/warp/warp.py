@@ -163,7 +163,7 @@ class Warp(CameraPair):
         return made  # type: ignore[no-any-return]  # of the kind of the images
 
     def _alike(self, images: Any, mode: Mode | None, padding_mode: PaddingMode | None, fill: Fill | None) -> Any:
-        """Return what `forward` does, for images that no kept call is for."""
+        """Return the result of `forward` for images that no kept call fits."""
         if not isinstance(images, Tensor):
             warp = partial(self.forward, mode=mode, padding_mode=padding_mode, fill=fill)
             return warped_alike(images, self.source._size_for("Warp"), "Warp", warp, self.source.intrinsics.device)
@@ -179,7 +179,7 @@ class Warp(CameraPair):
         return self._warped(images.flatten(1, -3), sampler._replace(fill=each)).unflatten(1, images.shape[1:-2])
 
     def _warped(self, images: Tensor, sampler: Sampler) -> Tensor:
-        """Return the images (B, C, H', W') made of checked ones (B, C, H, W)."""
+        """Return the warped images (B, C, H', W') of checked images (B, C, H, W)."""
         return plan.warped(self, images, sampler)
 
     if TYPE_CHECKING:

@@ -165,7 +165,7 @@ def spelled(content):
         ("a.npz", archive(K__npy=array((9,), b"." * 72, "|O")), "K: must be an OpenCV"),
         ("a.npz", archive(K__npy=array((1 << 20,), bytes(8 << 20))), "K: must be an OpenCV"),
         ("a.npz", archive(K__npy=array((3, 3), bytes(72)))[:-30], "content: must be an archive of numpy"),
-        ("a.npz", archive(**{f"a{i}__npy": array((1,), bytes(8)) for i in range(1001)}), "more than 1000 arrays"),
+        ("a.npz", archive(**{f"a{i}__npy": array((1,), bytes(8)) for i in range(1001)}), "at most 1000 arrays"),
         ("a.p", b"", "content: must not be empty"),
         ("a.p", pickle.dumps({"K": [1]}), "byte 0: must be text; got a pickle.* numpy.savez"),
         ("a.p", b"\x93NUMPY\x01\0", "byte 0: must be text; got a single array. Save both by numpy.savez"),
