@@ -36,6 +36,8 @@ SCRIPTS = {
     "surround": "surround_view",
     "camera": "predict_camera",
     "drivers": "driver_monitoring",
+    "robots": "robot_cameras",
+    "fisheye-depth": "fisheye_depth",
 }
 """Name of the file -> the example that draws it."""
 

@@ -29,6 +29,7 @@ from camtorch.values.arguments import (
     shown,
 )
 from camtorch.values.module import GeometryModule, typed_as
+from camtorch.warp.arrays import Image
 from camtorch.warp.dewarp import middle_lines
 from camtorch.warp.proxy import check_pose
 from camtorch.warp.warp import Warp, as_sized
@@ -116,8 +117,8 @@ class Rectification(GeometryModule):
         learns = torch.is_grad_enabled() and any(t.requires_grad for t in inputs)
         return make() if learns else self._memo(inputs, (), make)
 
-    def forward(self, left: Tensor, right: Tensor) -> tuple[Tensor, Tensor]:
-        """Rectify both images, (B, C, H, W) each."""
+    def forward(self, left: Image, right: Image) -> tuple[Image, Image]:
+        """Rectify both images, of the kinds that `Warp` takes."""
         of_left, of_right = (warp(images) for warp, images in zip(self._warps(), (left, right), strict=True))
         return of_left, of_right
 
