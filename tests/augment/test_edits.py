@@ -552,7 +552,7 @@ def test_wrong_arguments_are_told():
         (lambda: A.Compose([]), "must hold at least one"),
         (lambda: A.Compose([torch.nn.Identity()]), "must be a list of augmentations of camtorch; got Identity"),
         (lambda: A.Compose([A.Resize(3, mode="nearest")]), "one mode; got 'nearest' of Resize. Pass it to Compose"),
-        (lambda: A.Compose([A.HorizontalFlip(landmarks="ibug68"), A.VerticalFlip()]), "the same landmarks"),
+        (lambda: A.Compose([A.HorizontalFlip(landmarks="ibug68"), A.VerticalFlip()]), "have equal landmarks"),
         (lambda: A.RandomCrop(50)(image=image), size),
         (lambda: A.Resize(20, p=0.5)(image=image), "images must keep their size .* with p < 1"),
         (lambda: A.Rotate90()(image=image, draw=draw), "same_on_batch=True turns all alike"),
