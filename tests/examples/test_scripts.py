@@ -11,6 +11,7 @@ import fisheye_depth
 import numpy as np
 import predict_camera
 import pytest
+import real_faces
 import robot_cameras
 import stereo_room
 import surround_view
@@ -69,6 +70,23 @@ def test_a_head_is_found_by_landmarks(tmp_path, capsys, monkeypatch):
     assert capsys.readouterr().out.startswith("a face 130 cm away: pitch -13, yaw -1, roll 3 degrees")
     eyes = study.normalised["keypoints"][0, 36:48].unflatten(0, (2, 6)).mean(1)  # level, at the same height
     torch.testing.assert_close(eyes, torch.tensor([[76.0, 80.0], [146.0, 80.0]]), atol=4, rtol=0)
+
+
+def test_the_baselines_are_the_move(monkeypatch):
+    pytest.importorskip("cv2")
+    image = torch.rand(3, 16, 16, generator=torch.Generator().manual_seed(0)).mul(255)
+    image = torch.nn.functional.interpolate(image[None], size=real_faces.SIZE, mode="bicubic")[0].clamp(0, 255).byte()
+    points = 256 + 1e3 * ct.augment.face_points(real_faces.LANDMARKS)[:, :2].float()
+    head = ct.Extrinsics([0.0, 0.0, 0.1], [0.0, 0.0, 0.6]).matrix().detach()
+    sample = {"image": image, "keypoints": points, "head_pose": head}
+    for name, most in (("mount", 8), ("mirror", 1e-2), ("normalised", 1e-2)):
+        moved = real_faces.move(sample, real_faces.MOVES[name])
+        assert (real_faces.similar(sample, moved)[1] - moved["keypoints"]).norm(dim=1).max() < most
+        if name != "mirror":
+            other = real_faces.by_opencv(sample, moved).int()
+            assert (other - moved["image"].int()).abs().float().mean() < 2
+    result = real_faces.measure([sample], lambda image: points)
+    assert result["fisheye and back"]["camtorch"][0] < 1e-4
 
 
 # -- stereo_room
