@@ -44,7 +44,7 @@ def twin_of(camera: Camera) -> Camera | None:
 def remember_camera(camera: Camera, twin: Camera) -> None:
     """Have `twin_of` find the numbers of a camera that was made from its twin."""
     for there, here in zip(camera._tensors, twin._tensors, strict=True):
-        remember(there, here.expand(there.shape))
+        remember(there, here)
 
 
 class Elsewhere(Change):

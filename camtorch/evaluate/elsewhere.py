@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from itertools import accumulate
 from typing import Any
 
@@ -26,23 +26,29 @@ def on_cpu(*tensors: Tensor, may_wait: bool = False) -> list[Tensor] | None:
     """
     if any(t.is_cpu or t.is_inference() for t in tensors):
         return None
-    unknown = [t.detach() for t in tensors if _key(t) not in _known]
+    pairs = [_known.get(_key(t)) for t in tensors]
+    unknown = [t.detach() for t, pair in zip(tensors, pairs, strict=True) if pair is None]
+    read: Iterator[Tensor] = iter(())
     if unknown and may_wait:
         with outside_inference():
             numbers = torch.cat([t.reshape(-1).view(torch.uint8) for t in unknown]).cpu()
-        for tensor, part in zip(unknown, numbers.split([t.nbytes for t in unknown]), strict=True):
-            remember(tensor, part.clone().view(tensor.dtype).view(tensor.shape))
+        parts = numbers.split([t.nbytes for t in unknown])
+        values = (part.clone().view(t.dtype).view(t.shape) for t, part in zip(unknown, parts, strict=True))
+        read = map(remember, unknown, values)
     elif unknown:
         return None
-    return [_known[_key(t)][1].view(_without_repeats(t)).expand(t.shape) for t in tensors]
+    found = zip(tensors, (next(read) if pair is None else pair[1] for pair in pairs), strict=True)
+    return [value.view(_without_repeats(t)).expand(t.shape) for t, value in found]
 
 
-def remember(tensor: Tensor, values: Tensor) -> None:
-    """Have `on_cpu` find the values of a tensor, on the CPU, without asking its device."""
+def remember(tensor: Tensor, values: Tensor) -> Tensor:
+    """Have `on_cpu` find the values of a tensor, on the CPU, without asking its device; return them without repeats."""
+    values = values.detach().expand(tensor.shape)[tuple(map(slice, _without_repeats(tensor)))].contiguous()
     if not tensor.is_inference():
-        _known[_key(tensor)] = tensor.detach(), values.detach().contiguous()
+        _known[_key(tensor)] = tensor.detach(), values
     while len(_known) > _MOST:
         _known.pop(next(iter(_known)), None)
+    return values
 
 
 def _key(tensor: Tensor) -> tuple[Any, ...]:

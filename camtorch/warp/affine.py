@@ -82,7 +82,8 @@ class MirrorWarp(Warp):
                 for i in rows:
                     self._made(images[i : i + 1], way, sampler, out=result[i : i + 1])
                 continue
-            made = self._made(images[rows], way, sampler, torch.tensor(rows, device=images.device))
+            index = torch.tensor(rows, device=images.device)
+            made = self._made(images[index], way, sampler, index)
             for row, one in zip(rows, made, strict=True):  # unsigned integers have no index_put
                 result[row] = one
         return result

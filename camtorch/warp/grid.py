@@ -7,7 +7,7 @@ from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import cached_property, lru_cache, partial, reduce
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
@@ -16,6 +16,7 @@ from torch import Tensor
 from camtorch.cameras.camera import Camera
 from camtorch.evaluate.door import in_jit_trace, may_look, set_aside
 from camtorch.evaluate.elsewhere import sent
+from camtorch.evaluate.kept import Kept
 from camtorch.evaluate.known import are_free, are_plain, is_unknown
 from camtorch.native.library import native_available
 from camtorch.native.sampler import CUBIC, DOUBT, EMPTY, TODO, classify
@@ -31,6 +32,7 @@ _STRIP = 1 << 19  # pixels
 FEWEST = 8  # cells along a side from which on a lattice pays
 STEP = 8  # pixels between the nodes of a lattice
 _BLOCK = 128  # pixels that one product interpolates: wider ones multiply with more zeros
+_kept_weights = Kept(4)  # on other devices, where each operator is a launch
 MOST_KEPT = 1 << 16  # nodes of a lattice whose pixels are kept for the next one
 
 Exact = Callable[[Tensor], tuple[Tensor, Tensor]]
@@ -374,9 +376,9 @@ def _compute(exact: Exact, first: int, cells: Tensor, todo: Tensor, like: Tensor
 def interpolated(nodes: Tensor, rows: int, columns: int) -> Tensor:
     """Interpolate nodes (B, 2, rows + 3, columns + 3) to pixels (B, 2, 8 rows, 8 columns)."""
     # torch may be told to multiply matrices in less than float32
-    wide = torch.float32 if torch.get_float32_matmul_precision() == "highest" else torch.float64
-    wide = torch.promote_types(nodes.dtype, wide)
-    weights, spread = (_weights if nodes.is_cpu else _kept_weights)(nodes.dtype, wide, nodes.device)
+    wide = nodes.dtype if torch.get_float32_matmul_precision() == "highest" else torch.float64
+    form = nodes.dtype, wide, nodes.device
+    weights, spread = _weights(*form) if nodes.is_cpu else _kept_weights((), form, lambda: _weights(*form))
     terms = (nodes[:, :, i : i + rows, None] * weights[:, i, None] for i in range(4))
     lines = reduce(torch.add, terms).flatten(2, 3)
     lines = lines.to(wide)
@@ -400,10 +402,3 @@ def _weights(dtype: torch.dtype, wide: torch.dtype, device: torch.device) -> tup
     for cell in range(cells):
         spread[cell : cell + 4, cell] = weights.T
     return weights, spread
-
-
-@lru_cache(maxsize=8)
-def _kept_weights(*form: Any) -> tuple[Tensor, Tensor]:
-    """Keep the weights on another device, on which each operator costs a launch."""
-    with torch.inference_mode(False):
-        return _weights(*form)
