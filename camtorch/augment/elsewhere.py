@@ -19,7 +19,6 @@ from camtorch.evaluate.known import is_unknown
 from camtorch.native.library import native_available
 from camtorch.values.module import remade
 from camtorch.warp.affine import MirrorWarp
-from camtorch.warp.warp import Warp
 
 _twins = Kept(16)
 
@@ -43,8 +42,13 @@ def twin_of(camera: Camera) -> Camera | None:
 
 def remember_camera(camera: Camera, twin: Camera) -> None:
     """Have `twin_of` find the numbers of a camera that was made from its twin."""
+    if isinstance(camera, Mixed) and isinstance(twin, Mixed):
+        for (_, group), (_, its) in zip(camera.groups, twin.groups, strict=True):
+            remember_camera(group, its)
+        return
     for there, here in zip(camera._tensors, twin._tensors, strict=True):
-        remember(there, here)
+        for shape in {there.shape, (*camera.batch_shape, there.shape[-1])}:  # as it is, and as it is asked for
+            remember(there.expand(shape), here.expand(shape))
 
 
 class Elsewhere(Change):
@@ -52,7 +56,7 @@ class Elsewhere(Change):
 
     def __init__(self, host: Change, device: torch.device):
         with outside_inference():
-            parts = _sent(host.parts, device)
+            parts = _remade(host.parts, lambda numbers: sent(numbers, device))
         super().__init__(host.count, parts, mixed=host.mixed)
         self.host, self._device = host, device
         self._wide: Change | None = None
@@ -66,9 +70,8 @@ class Elsewhere(Change):
             return super().each(value, move, stay)
         # labels are computed in the wider dtype, and so are the cameras' tables
         if self._wide is None:
-            host = self.host
-            parts = [_in_dtype(part, dtype) for part in host.parts]
-            self._wide = Elsewhere(Change(host.count, parts, mixed=host.mixed), self._device)
+            wide = _remade(self.host.parts, lambda numbers: [t.to(dtype) for t in numbers])
+            self._wide = Elsewhere(Change(self.host.count, wide, mixed=self.host.mixed), self._device)
         return self._wide.each(value, move, stay)
 
     @property
@@ -81,48 +84,29 @@ class Elsewhere(Change):
         return self._inverse
 
 
-def _in_dtype(part: Part, dtype: torch.dtype) -> Part:
-    camera = part.camera.each(lambda t: t.to(dtype))
-
-    def wide(warp: Warp) -> Warp:
-        target = warp.target.each(lambda t: t.to(dtype))
-        return _like(warp)(camera, target, warp.rotation, **warp.options)
-
-    return replace(part.by(wide), camera=camera)
-
-
-def _like(warp: Warp) -> Callable[..., Warp]:
-    """Return what makes another one of unchecked cameras and a rotation."""
-    return warp.between if isinstance(warp, MirrorWarp) else MirrorWarp
-
-
-def _sent(parts: Sequence[Part], device: torch.device) -> list[Part]:
-    """Return parts on a device, whose numbers go there by one copy."""
+def _remade(parts: Sequence[Part], change: Callable[[list[Tensor]], list[Tensor]]) -> list[Part]:
+    """Return parts with all their numbers changed, at once; those that go elsewhere are found where they were."""
     given: list[Tensor] = []
     for part in parts:
         given += [t for camera in _cameras(part) for t in camera._tensors]
         given += [t for t in (part.rotation, part.light) if t is not None]
-    numbers = iter(sent(given, device))
+    numbers = iter(change(given))
 
-    def there(camera: Camera) -> Camera:
+    def remade_as(camera: Camera) -> Camera:
         made = remade(camera, intrinsics=next(numbers), distortion=next(numbers))
         remember_camera(made, camera)
         return made
 
     made = []
     for part in parts:
-        source, *targets = map(there, _cameras(part))
+        source, *targets = map(remade_as, _cameras(part))
         rotation, light = (None if t is None else next(numbers) for t in (part.rotation, part.light))
-        if part.moves is None:
-            made.append(replace(part, camera=source))
-            continue
-        hosts = [part.warp, *(part.shades or ())]
-        first, *shades = (
-            _like(host)(source, target, rotation, **host.options).follow_host(host)
-            for host, target in zip(hosts, targets, strict=True)
-        )
-        both = (shades[0], shades[1]) if shades else None
-        made.append(replace(part, moves=first, camera=source, shades=both, light=light))
+        warps = []
+        for host, target in zip([part.warp, *(part.shades or ())], targets, strict=True) if targets else ():
+            make = host.between if isinstance(host, MirrorWarp) else MirrorWarp  # which checks less
+            warps.append(make(source, target, rotation, **host.options).follow_host(host))
+        shades = (warps[1], warps[2]) if part.shades else None
+        made.append(replace(part, moves=warps[0] if warps else None, camera=source, shades=shades, light=light))
     return made
 
 

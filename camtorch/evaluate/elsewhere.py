@@ -37,28 +37,20 @@ def on_cpu(*tensors: Tensor, may_wait: bool = False) -> list[Tensor] | None:
         read = map(remember, unknown, values)
     elif unknown:
         return None
-    found = zip(tensors, (next(read) if pair is None else pair[1] for pair in pairs), strict=True)
-    return [value.view(_without_repeats(t)).expand(t.shape) for t, value in found]
+    return [(next(read) if pair is None else pair[1]).view(t.shape) for t, pair in zip(tensors, pairs, strict=True)]
 
 
 def remember(tensor: Tensor, values: Tensor) -> Tensor:
-    """Have `on_cpu` find the values of a tensor, on the CPU, without asking its device; return them without repeats."""
-    values = values.detach().expand(tensor.shape)[tuple(map(slice, _without_repeats(tensor)))].contiguous()
-    if not tensor.is_inference():
-        _known[_key(tensor)] = tensor.detach(), values
+    """Have `on_cpu` find the values of a tensor, on the CPU, without asking its device."""
+    if not (tensor.is_cpu or tensor.is_inference()):
+        _known[_key(tensor)] = tensor.detach(), values.detach().contiguous()
     while len(_known) > _MOST:
         _known.pop(next(iter(_known)), None)
     return values
 
 
 def _key(tensor: Tensor) -> tuple[Any, ...]:
-    # one camera's numbers are those of many that share them
-    *place, steps = mark(tensor)
-    return tensor.dtype, tensor.device, tensor.numel() > 0, *place, tuple(pair for pair in steps if pair[1])
-
-
-def _without_repeats(tensor: Tensor) -> list[int]:
-    return [size if step or not size else 1 for size, step in zip(tensor.shape, tensor.stride(), strict=True)]
+    return tensor.dtype, tensor.device, *mark(tensor)
 
 
 def sent(tensors: Sequence[Tensor], device: torch.device) -> list[Tensor]:

@@ -102,8 +102,9 @@ class CameraPair(GeometryModule):
 
     def follow_host(self, host: CameraPair) -> Self:
         """Have a warp like this one, on the CPU, find the positions while the cameras stay; return this warp."""
-        self._host = Kept()
-        self._host(self._inputs(), (), lambda: host)
+        if not self.target.intrinsics.is_cpu:
+            self._host = Kept()
+            self._host(self._inputs(), (), lambda: host)
         return self
 
     @property
