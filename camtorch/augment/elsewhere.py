@@ -1,4 +1,4 @@
-"""Changes of samples on other devices: cameras that nobody learns are drawn on the CPU, and numbers are sent."""
+"""Changes of samples on other devices: cameras that do not learn are drawn on the CPU, and their numbers sent."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _twins = Kept(16)
 
 
 def twin_of(camera: Camera) -> Camera | None:
-    """Return the same camera on the CPU, read once as long as its numbers stay; None where it learns or is traced."""
+    """Return a copy on the CPU, kept until values change; None if it is there, learns, is traced, or lacks C code."""
     members = cast("list[Camera]", list(camera.cameras)) if isinstance(camera, Mixed) else [camera]
     if members[0].intrinsics.is_cpu or not native_available():
         return None

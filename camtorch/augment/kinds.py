@@ -138,7 +138,7 @@ _RANKS = {kind: (not field.decides, i) for i, (kind, field) in enumerate(KINDS.i
 
 
 def kind_of(name: str, value: object, own: Mapping[str, str], owner: str, single: bool = False) -> str | None:
-    """Return a field's key in `KINDS`, None if it stays; raise if its name is unknown and it may be geometry."""
+    """Return a field's key in `KINDS`, None if it is not moved; raise if it may be geometry of unknown name."""
     if not isinstance(name, str):
         raise TypeError(f"{owner}: a sample must have strings for names; got {name!r:.80}")
     if name in own:

@@ -143,7 +143,7 @@ class Transform(FrontEnd):
         return layouts
 
     def _kind(self, name: str, value: Any, sample: Mapping[str, Any]) -> str | None:
-        """Return the kind of a field, or of the field whose validity it is; None if it stays."""
+        """Return the kind of a field, or of the field whose validity it is; None if it is not moved."""
         kind = kind_of(name, value, self.augmentation.fields, _OWNER, single=True)
         if kind is None and name.endswith(_VALID):
             name = name.removesuffix(_VALID)
@@ -177,7 +177,7 @@ class Transform(FrontEnd):
 
 
 def _form_of(sample: Sample) -> tuple[Any, ...] | None:
-    """Return all of a sample except the values of its arrays; None if it holds others, or read-only arrays."""
+    """Return a key of all but the arrays' values; None if an array is read-only, or a value is of another kind."""
     parts: list[Any] = []
     for name, value in sample.items():
         if type(value) is np.ndarray:
@@ -196,7 +196,7 @@ def _moved_arrays(
 ) -> Sample:
     """Move a sample whose arrays torch can read without a copy; see `Transform._layouts`.
 
-    learns: whether the camera may, of which nothing is recorded.
+    learns: whether the camera may require grad; the sample is then moved without gradients.
     """
     given = Single()
     for name, dims in layouts:

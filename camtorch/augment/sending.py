@@ -105,7 +105,7 @@ def stacked(batch: Sequence[Tensor]) -> Tensor | None:
 
 
 def _block(size: int) -> _Block | None:
-    """Return a free block of so many bytes; None if the system, or the user, wants torch's own."""
+    """Return a free block of `size` bytes; None if the system or the user requires torch's own way of sharing."""
     if get_sharing_strategy() == "file_system" or not _is_open(os.getppid()):
         return None
     with _lock:

@@ -285,7 +285,7 @@ class Bundle:
         return State(tuple(flat[5:]), Poses(*flat[2:4]), Poses(*flat[:2]), flat[4])
 
     def _of_columns(self, parameters: Sequence[Tensor], other: float) -> Tensor:
-        """Return values (B, G) of the shared unknowns that are parameters, and `other` for the rest."""
+        """Return the value of each shared unknown (B, G) in `parameters`, or `other` for mounts and bends."""
         found = parameters[0].new_full((max(map(len, parameters)), len(self.columns)), other)
         for g, (c, i) in enumerate(self.columns):
             if c >= 0 and i < parameters[c].shape[-1]:

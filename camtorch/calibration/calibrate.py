@@ -228,11 +228,11 @@ class Search:
         return CameraObservations(self.asked.kind, seen.points[None], seen.pixels[None], weights, prior=self.prior)
 
     def free(self, bend: bool = False) -> Free:
-        """Return the unknowns that learn if there is no other camera."""
+        """Return the unknowns of a search for this camera alone; `bend` adds the board's shape."""
         return Free((self.asked.free.to(self.given.pixels.device),), (False,), bend=bend)
 
     def alone(self, bend: bool = False, progress: Callable[[int, Tensor], None] | None = None) -> Adjusted:
-        """Return the optimum for this camera's views, with other poses if they are better for the camera found."""
+        """Return the optimum for this camera's views; poses are searched again and kept if they fit it better."""
         asked, seen, size = self.asked, self.seen, self.layout.image_size
 
         def optimum(state: State) -> Adjusted:
@@ -266,7 +266,7 @@ class Search:
     def other_optima(
         self, camera: int, observed: Sequence[CameraObservations], adjusted: Adjusted, free: Free
     ) -> tuple[Adjusted, Optima | None]:
-        """Return the optimum, or a better one in another basin of this model, and all (None if it has one basin)."""
+        """Return the best optimum of this model's basins, and all of them (None if it has one basin)."""
         state = adjusted.state
         boards = _seen_from(state, camera)
         learns, size = free.parameters[camera].cpu(), self.layout.image_size
@@ -368,7 +368,7 @@ def results(searches: Sequence[Search], adjusted: Adjusted, free: Free) -> Resul
 
 
 def unknowns(observed: Sequence[CameraObservations], adjusted: Adjusted, views: int) -> float:
-    """Return the number of unknowns that residuals determine: parameters that learn, less the priors' part."""
+    """Return the number of unknowns that the residuals determine: those that learn, less the priors' share."""
     equations = adjusted.equations
     by_priors = 0.0
     for c, one in enumerate(observed):

@@ -111,7 +111,7 @@ def _same_batch(record: Record, *tensors: Tensor) -> None:
 
 
 def _tensor(record: Record, last: int) -> Tensor:
-    """Return numbers (*B, last); any last dim is accepted if `last` is 0."""
+    """Return a record's numbers, float64 (*B, last); any last dim is accepted if `last` is 0."""
     try:
         values = torch.tensor(record.value, dtype=torch.float64)
     except (ValueError, TypeError, RuntimeError) as error:

@@ -293,6 +293,6 @@ def _format_of(rig: Rig, path: str) -> str:
     patterns = {pattern: names.format for names in fitting for pattern in names.patterns}
     if meant := [pattern for pattern in patterns if fnmatch.fnmatchcase(file, pattern)]:
         return patterns[max(meant, key=len)]
-    may = f"got one for {', '.join(formats)}" if formats else f"got one for none of {', '.join(sorted(WRITTEN))}"
-    hint = "Name it, as in format='kalibr' or --format kalibr"
+    may = f"got one that fits {', '.join(formats) or 'none of ' + ', '.join(sorted(WRITTEN))}"
+    hint = "Name the format, as in format='kalibr' or --format kalibr"
     raise ValueError(f"{path}: the name must determine the format; {may}. {hint}")

@@ -279,7 +279,7 @@ class _Yaml:
         return value
 
     def value(self, event: Any, depth: int) -> tuple[Any, int]:
-        """Return the value that begins with an event, and its number of values after following aliases."""
+        """Return the value that begins with an event, and how many values it has, those behind aliases included."""
         kind = type(event).__name__
         if kind == "AliasEvent":
             return self.anchors.get(event.anchor) or self.fail(event, f"alias must be known; got {event.anchor!r:.60}")
@@ -291,7 +291,7 @@ class _Yaml:
         return found
 
     def container(self, start: Any, is_mapping: bool, depth: int) -> tuple[Any, int]:
-        """Return a list or a mapping; its anchor is known only after its end, so it cannot contain itself."""
+        """Return a list or mapping and its count of values; `value` sets its anchor last, so it never holds itself."""
         if depth >= _DEEPEST:
             self.fail(start, "nested too deeply")
         values, keys, count = list[Any](), dict[str, Any](), 1

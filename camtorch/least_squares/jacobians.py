@@ -90,7 +90,7 @@ def _copy(plane: Tensor) -> Tensor:
 
 
 def _forward(camera: CameraLike | type[CameraLike], k: Tensor, rays: Tensor, furthest: float) -> SensorJacobians:
-    """Differentiate forward in one pass, with a row for each direction: vmap is slow in Python for many operations."""
+    """Differentiate forward in one pass with a row for each derivative; vmap is slow in Python for many operations."""
     count = k.shape[-1] + 3
     directions = torch.eye(count, dtype=k.dtype, device=k.device)
     # inference mode would drop the derivatives

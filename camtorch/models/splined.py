@@ -150,7 +150,7 @@ def _optics_of(
 
 @cache
 def _model_for_search(kind: type[Splined]) -> type[Splined]:
-    """Return the class for a search, with longer outermost pieces: otherwise corners on the edge would hold it."""
+    """Return the class for a search, with longer outermost pieces: otherwise corners at the edge would block it."""
     optics = _optics_of(kind.order, kind.columns, kind.rows, kind.fov_x, behind=1.0)
     named = {"__module__": Camera.__module__, "__qualname__": f"{kind.key}:searched", "__doc__": kind.__doc__}
     return type("Splined", (kind,), {**named, "optics": staticmethod(optics)})

@@ -287,7 +287,7 @@ def _make_tables(name: str, k: Tensor, end: float) -> tuple[Tensor, Tensor]:
 
 
 def _scale(name: str, k: Tensor, safe_radius_sq: Tensor, table: InverseTable, r2: Tensor) -> Tensor:
-    """Return `solve` for coefficients (C, n) and squared radii (C, N), and `bracketed` if Newton's method fails."""
+    """Return the factors for coefficients (C, n) and r2 (C, N), by `solve`, or `bracketed` if Newton's method fails."""
     scale, converged = solve(CLASSES[name](columns(k)), table, r2)
     camera, point = (~(converged > 0)).nonzero(as_tuple=True)
     if table.is_constant or len(camera):

@@ -121,8 +121,8 @@ class Extrinsics(BatchedModule):
             rotation = as_real(given, "rotation", "Extrinsics")
             if rotation.shape[-2:] != (3, 3):
                 raise ValueError(
-                    "Extrinsics: rotation must be (*B, 3, 3) matrices with a translation; got shape "
-                    f"{tuple(rotation.shape)}. Pass rotation vectors to Extrinsics(rotation, translation)"
+                    "Extrinsics: the R of from_matrix(R, t) must be matrices (*B, 3, 3); got shape "
+                    f"{tuple(rotation.shape)}. Pass a rotation vector as Extrinsics(rotation, translation)"
                 )
         else:
             matrix = as_real(given, "matrix", "Extrinsics")
@@ -239,7 +239,7 @@ def head_rotation(angles: Numbers) -> Tensor:
 
 
 def _are_matrices(rotation: Tensor, translation: Tensor) -> bool:
-    """Whether (..., 3) are rotation matrices (*B, 3, 3), not three vectors each, with a translation (*B, 3)."""
+    """Whether `rotation` holds matrices (*B, 3, 3) and not three vectors each, by its values and `translation`."""
     beside = translation.ndim == rotation.ndim - 1
     if values_of(rotation) is None:
         return beside
@@ -259,7 +259,7 @@ def _are_matrices(rotation: Tensor, translation: Tensor) -> bool:
 
 
 def _pair(matrix: Any) -> tuple[Any, Any]:
-    """Return (R, t) if `matrix` is such a pair; otherwise, also for a list of two matrices, return it and None."""
+    """Return (R, t) if `matrix` is such a pair; otherwise (also for a list of two matrices) `matrix` and None."""
     if not isinstance(matrix, (list, tuple)) or len(matrix) != 2:
         return matrix, None
     try:

@@ -237,7 +237,7 @@ _MOST_KEPT = 1 << 22  # bytes
 
 
 def _kept_memory(count: int) -> Tensor:
-    """Return at least so many bytes for a call of this thread: the same memory as before, unless they are many."""
+    """Return at least `count` bytes: memory that calls of this thread reuse, or new memory if `count` is large."""
     if count > _MOST_KEPT:
         return torch.empty(count, dtype=torch.uint8, device="cpu")
     if _kept.memory is None or _kept.memory.shape[0] < count:

@@ -151,8 +151,8 @@ class MirrorWarp(Warp):
 class AffineWarp(MirrorWarp):
     """A `Warp` that edits the image of `source`: all its pixels move by an affine map, also those without a ray.
 
-    Whole steps, flips and quarter turns copy pixels bit by bit. `matrix`, (2, 3) or (B, 2, 3) float64 and along the
-    axes, maps source pixels (u, v, 1) to target pixels; `rotation` is its effect on rays.
+    Shifts by whole pixels, flips and quarter turns copy pixels bit by bit. `matrix`, (2, 3) or (B, 2, 3) float64 and
+    along the axes, maps source pixels (u, v, 1) to target pixels; `rotation` is its effect on rays.
     """
 
     is_an_operator = False

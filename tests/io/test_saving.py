@@ -187,7 +187,7 @@ def test_the_name_says_the_format(tmp_path):
 @pytest.mark.parametrize(
     ("rig", "arguments", "error", "told"),
     [
-        (camera(), ("a.yaml",), ValueError, "a.yaml: .* must determine the format; got one for kalibr, opencv, ros"),
+        (camera(), ("a.yaml",), ValueError, "a.yaml: .* determine the format; got one that fits kalibr, opencv, ros"),
         (camera(), ("a.yaml", "ply"), ValueError, r"format must be one of aria.* got 'ply'.*docs/leaving-0\.3\.md"),
         (camera(), ("a.json", "woodscape"), ValueError, "format must be one of aria.* got 'woodscape'"),
         ([camera()], ("a.json",), TypeError, "rig must be a Rig or a Camera; got list"),
