@@ -28,7 +28,7 @@ TOLERATED = (
     r"\"(findChessboardCornersSB|remap)\"",  # likewise
     r"\"Tensor \| None\" has no attribute|\"(isfinite|abs)\" is not a known attribute of \"None\"",  # torch's, of .grad
     r"parameter \"dataset\"|\"DataLoader\" has incompatible type|annotation for \"sampler\"",  # torch's, of DataLoader
-    r"webdataset|onnxruntime|h5py|\"ray|albumentations|torchvision|tqdm|driver_monitoring",  # no types or not there
+    r"webdataset|onnxruntime|h5py|\"ray|albumentations|mediapipe|torchvision|tqdm|driver_monitoring",  # without types
     r"\"NDArray\[float64\] \| None\"|\"allclose\"",  # pycolmap's
 )
 
