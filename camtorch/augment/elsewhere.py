@@ -26,7 +26,7 @@ _twins = Kept(16)
 def twin_of(camera: Camera) -> Camera | None:
     """Return a copy on the CPU, kept until values change; None if it is there, learns, is traced, or lacks C code."""
     members = cast("list[Camera]", list(camera.cameras)) if isinstance(camera, Mixed) else [camera]
-    if members[0].intrinsics.is_cpu or not native_available():
+    if members[0].intrinsics.is_cpu or torch.compiler.is_compiling() or not native_available():
         return None
     tensors = [t for one in members for t in one._tensors]
     if keeps_graph(*tensors) or any(is_unknown(t) or t.is_inference() for t in tensors):

@@ -380,7 +380,7 @@ class SampleTransform(KeepsCamera, nn.Module):
         device, camera = next((v.device for v in held.values()), torch.device("cpu")), alone(as_one(camera))
         if camera.intrinsics.device != device:
             own, camera = camera, camera.each(lambda t: t.to(device))
-            if own.intrinsics.is_cpu:
+            if own.intrinsics.is_cpu and not torch.compiler.is_compiling():
                 remember_camera(camera, own)
         return Batch(named, Form([(name, found) for name, (found, _) in named.items()], batched, count), camera)
 
