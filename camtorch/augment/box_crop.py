@@ -69,7 +69,7 @@ class BoxCrop(Augmentation):
         self.crops = {"box": as_whole(index, "index", name)}
 
     def new_camera(self, source: Camera, values: Mapping[str, Tensor]) -> tuple[Camera, Tensor | None]:
-        """Return the camera that looks at `values["box"]`, (*B, 4); see `Augmentation.new_camera`."""
+        """Return the camera that looks at `values["box"]`, (*B, 4), and its rotation; see `Augmentation.new_camera`."""
         box = values["box"]
         rows = box.reshape(-1, 4)
         check_extents(rows, source, self._name)

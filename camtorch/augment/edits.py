@@ -71,7 +71,7 @@ class Edit(Augmentation):
         return change_by([(self, draw)], camera, {**self.options, "antialias": self.antialias})
 
     def map_of(self, draw: Mapping[str, Any], size: tuple[int, int]) -> tuple[Map | None, tuple[int, int]]:
-        """Return the map of a draw for images of a size, None if it never applies, and the new size."""
+        """Return the map of a draw for images of a size (None if it never applies), and the new size."""
         applied = torch.as_tensor(draw["apply"])
         given = {name: value for name, value in draw.items() if name != "apply"}
         values = {name: torch.as_tensor(value, dtype=torch.float64) for name, value in given.items()}
@@ -118,7 +118,7 @@ def change_by(edits: Sequence[tuple[Edit, Mapping[str, Any]]], camera: Camera, o
 
 
 def _turn(matrix: Map, source: Camera) -> Tensor | None:
-    """Return the effect (*B, 3, 3) of an edit on rays; None if it has none."""
+    """Return the effect (*B, 3, 3) of an edit on rays; None if it leaves them unchanged."""
     if not isinstance(matrix, Tensor) and matrix[0][0] > 0 and matrix[1][1] > 0:
         return None
     own, like = as_tensor(matrix), source.intrinsics

@@ -24,7 +24,7 @@ _twins = Kept(16)
 
 
 def twin_of(camera: Camera) -> Camera | None:
-    """Return a copy on the CPU, kept until values change; None if it is there, learns, is traced, or lacks C code."""
+    """Return a copy on the CPU, kept until values change; None if it is there, learns or is traced, or without C."""
     members = cast("list[Camera]", list(camera.cameras)) if isinstance(camera, Mixed) else [camera]
     if members[0].intrinsics.is_cpu or torch.compiler.is_compiling() or not native_available():
         return None

@@ -125,7 +125,7 @@ def _over(size: tuple[int, int]) -> Tensor:
 
 
 def defined_or(camera: Camera, distortion: Tensor, otherwise: Tensor) -> tuple[Tensor, Tensor | None]:
-    """Return coefficients (*B, n), `otherwise` if they are not defined, and which are, (*B,), or None if all are."""
+    """Return coefficients (*B, n), `otherwise` for undefined ones, and which are defined, (*B,); None if all are."""
     sense = camera.defined(distortion.unbind(-1))
     if sense is None:
         return distortion, None

@@ -380,7 +380,7 @@ def _ways(
 ) -> dict[str, Sampler | Label]:
     """Return how each field moves that one compiled call takes.
 
-    dtype: of labels of a single sample that turn, or None. is_turn: whether the rotation is no mirror.
+    dtype: of labels of a single sample that turn, or None. is_turn: whether the rotation does not mirror.
     """
     mode, padding_mode, fill = options["mode"], options["padding_mode"], options["fill"]
     hows: dict[str, Sampler | Label] = {}

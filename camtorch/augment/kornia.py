@@ -168,7 +168,7 @@ class CameraAugmentation(InContainers, GeometricAugmentationBase2D):
     def _move_rows(
         self, input: Any, dims: int, params: Params, flags: Flags, move: Callable[[Change, Tensor], Any]
     ) -> tuple[Any, Tensor]:
-        """Move Keypoints or Boxes, with data (B, ...) of `dims` dims or without the first; return the valid too."""
+        """Move Keypoints or Boxes, with data (B, ...) of `dims` dims or without it; return which are valid, too."""
         moved, valid = self._move(input.data[(None,) * (dims - input.data.ndim)], params, flags, move)
         result = input.clone()
         result._data = moved.reshape(input.shape)

@@ -144,7 +144,7 @@ def project_views(
     compiled.camtorch_views(call)
     while left.value:
         if left.value < 0:
-            raise MemoryError(f"no memory for {points.shape[1]} views of {points.shape[2]} points")
+            raise MemoryError(f"no memory for {points.shape[1]} views of {points.shape[2]} points. Pass fewer")
         left.value = 0
         native.follow()
         compiled.camtorch_views(call)

@@ -227,7 +227,7 @@ def _join_starts(observed: list[CameraObservations], alone: list[_Alone], free: 
 
 
 def _pose_between(a: _Alone, b: _Alone) -> tuple[Tensor, Tensor]:
-    """Return the pose from camera a to b: of those that each board gives, the one nearest to all others."""
+    """Return the rotation and translation from camera a to b: of all boards' poses, the one nearest to the others."""
     both = a.has_pose & b.has_pose
     (from_a, at_a), (from_b, at_b) = ((t[0, both] for t in one.boards) for one in (a, b))
     rotations = from_b @ from_a.mT

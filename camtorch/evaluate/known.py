@@ -73,7 +73,7 @@ def as_own(value: Tensor) -> Tensor:
 
 
 def row_of(value: Tensor) -> list[float] | None:
-    """Return the numbers of a single short row (n,) that may be read, faster than one operator of torch."""
+    """Return the numbers of one short row (n,), fast; None for other tensors or if values may not be read."""
     return value.tolist() if value.ndim == 1 and value.shape[0] <= 64 and is_concrete(value) else None
 
 

@@ -243,7 +243,7 @@ def write(contents: dict[str, bytes], path: str | os.PathLike[str]) -> None:
 
 
 def rendered(rig: Rig | Camera, path: str | os.PathLike[str], format: str | None = None) -> dict[str, bytes]:
-    """Return the files that `save` writes, by their paths; raise what `save` raises."""
+    """Return the files that `save` writes, by their paths; raise the same errors."""
     if isinstance(rig, Camera):
         rig = Rig({"camera": rig})
     if not isinstance(rig, Rig):

@@ -141,7 +141,7 @@ class _File:
         return self.record[key].camera(kind, intrinsics, distortion, size, self.record[lens or xi or key])
 
     def stated(self) -> tuple[tuple[str, ...], str | None]:
-        """Return the models that the fisheye flag allows, and its key; none if there is no flag."""
+        """Return the models that the fisheye flag allows, and its key; no models and None if there is no flag."""
         if (key := self.find(_FISHEYE)) is None:
             return (), None
         if not isinstance(flag := self.record[key].value, (str, float, bool)):

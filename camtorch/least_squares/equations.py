@@ -118,7 +118,7 @@ class System:
         assert compiled is not None  # the caller checked that there is a library
         compiled.camtorch_steps(_Steps(*places[:3], *sizes, *places[3:], addressof(left)))
         if left.value:
-            raise MemoryError(f"no memory for {views} views")
+            raise MemoryError(f"no memory for {views} views. Pass fewer")
         return (of_views, whole), self.decrement - rest
 
     def _left(self, of_views: Tensor, whole: Tensor) -> Tensor:

@@ -110,7 +110,7 @@ def is_as_seen(digital: str, stretch: tuple[float | None, float | None]) -> bool
 
 
 def as_number(text: str) -> float | None:
-    """Return a number that may be missing in the collection."""
+    """Return the number of a text in the collection; None if the text is empty."""
     return float(text) if text else None
 
 

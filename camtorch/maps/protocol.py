@@ -39,7 +39,7 @@ class MapFormat(ABC):
 
 
 def checked(name: str, size: Any) -> tuple[int, int]:
-    """Return the (height, width) of a file or its description; raise a ValueError if it is none."""
+    """Return the (height, width) of a file or its description; raise a ValueError if it is no such pair."""
     sides = tuple(size)
     whole = all(isinstance(side, int) and 0 < side <= _LONGEST for side in sides)
     if len(sides) != 2 or not whole or sides[0] * sides[1] > MOST_PIXELS:

@@ -44,7 +44,7 @@ class TILDC(Table):
     steps: tuple[int, ...] = tuple(1 << m for m in range(8))
 
     def pack(self, path: str, mesh: Mesh, exact: Exact, options: Mapping[str, Any]) -> tuple[bytes, dict[str, Any]]:
-        """Return the file of a mesh; raise a CameraFileError if the LDC does not support a size, offset or padding."""
+        """Return the file of a mesh and its facts; raise a CameraFileError if the LDC does not support them."""
         block = as_image_size(options.get("block"), "save_map", "block")
         if block is not None and (block[1] % 8 or block[0] % 2 or not all(0 < s <= _LONGEST_BLOCK for s in block)):
             raise ValueError(

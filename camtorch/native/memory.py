@@ -59,7 +59,7 @@ _idle: list[mmap.mmap] = []
 
 
 def _block(size: int) -> mmap.mmap | None:
-    """Return a block of `size` bytes: a kept one, or a new one if the system has large pages and so much memory."""
+    """Return `size` bytes: a kept block, or a new one; None if the system lacks large pages or the memory."""
     for block in tuple(_idle):
         if len(block) == size:
             try:

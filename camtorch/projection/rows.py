@@ -101,7 +101,7 @@ class CameraRows:
 
 
 def single_native(model: type[CameraLike], intrinsics: Tensor, k: Tensor) -> Native | None:
-    """Return a camera of usable numbers (4,) and (n,) for the compiled geometry, if that has the model."""
+    """Return a camera of usable numbers (4,) and (n,) for the compiled geometry; None if that lacks the model."""
     k = k.detach()[None]
     return native_of(model.optics, intrinsics[None], k, None, partial(domain_for, model, k, False), tables=True)
 

@@ -126,7 +126,7 @@ def attach(lens: Lens, solution: Planes2, target: Planes2, steps: int) -> Planes
 
 
 def _to_target(u: Tensor, v: Tensor, intrinsics: tuple[Tensor, ...]) -> tuple[Planes2, Tensor]:
-    """Return pixels as points (p, q) of the sensor in focal lengths; the centre for NaN or if squares overflow."""
+    """Return points (p, q) of the sensor in focal lengths, and a mask: 0 for NaN and far pixels, put at the centre."""
     focal_x, focal_y, centre_x, centre_y = intrinsics
     p, q = (u - centre_x) / focal_x, (v - centre_y) / focal_y
     far = torch.maximum(p.detach().abs(), q.detach().abs())

@@ -22,7 +22,7 @@ from camtorch.warp.sampling import MODES, PADDINGS, Sampler, render
 def positions(
     source: Camera, target: Camera, rotation: Tensor | None, tolerance: float, padding: str
 ) -> tuple[Tensor, Tensor]:
-    """Return `grid.tabulate` of all pixels, between cameras that do not learn."""
+    """Return positions (B or 1, H', W', 2) of all target pixels, and whether they are mapped, without gradients."""
     planes, mapped = _positions(source, target, rotation, tolerance, padding)
     return planes.movedim(1, -1), mapped
 

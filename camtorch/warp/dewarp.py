@@ -110,7 +110,7 @@ class Dewarp(Warp):
 
 
 def _fitted(camera: Camera, projection: str, size: tuple[int, int], rotation: Tensor | None) -> Tensor:
-    """Return the intrinsics (*B, 4) of the target that shows what the image's middle row and column show."""
+    """Return the intrinsics (*B, 4) of the target that shows all of the image's middle row and column."""
     model, widest, tallest = _PROJECTIONS[projection]
     plane = model(camera.intrinsics.new_tensor([1.0, 1.0, 0.0, 0.0]))
     limit = plane.intrinsics.new_tensor([widest, tallest]) / 2

@@ -221,7 +221,7 @@ def pixels_of_rows(target: Camera, rows: range) -> Tensor:
 def _positions(
     source: Camera, target: Camera, rotation: Tensor | None, native: Between | None, pixels: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Return the positions at which the source sees target pixels (h, w, 2) or (B, h, w, 2); see `Exact`."""
+    """Return where the source sees target pixels (h, w, 2) or (B, h, w, 2), and whether it does; see `Exact`."""
     if native is not None:
         rows = (pixels if pixels.ndim == 4 else pixels[None]).flatten(1, 2)
         found, mapped = native.rows(rows, POSITIONS)

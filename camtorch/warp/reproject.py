@@ -167,7 +167,7 @@ class Reproject(GeometryModule):
         return pixels + off, mapped & good, far
 
     def _rays(self) -> tuple[Tensor, Tensor]:
-        """Return the target's rays, kept while nothing can learn."""
+        """Return the target's rays and their validity, kept while nothing can learn."""
         inputs = self.target._tensors
         if torch.is_grad_enabled() and any(t.requires_grad for t in inputs):
             return self.target.rays()
