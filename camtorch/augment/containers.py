@@ -213,7 +213,7 @@ def _lost_stay_lost(call: Callable[..., Boxes], self: Any, boxes: Any, key: Data
 
 
 def _put(of: type[nn.Module], name: str, own: Callable[..., Any]) -> None:
-    """Replace a method `call` of containers that hold such an augmentation by `own(call, container, *args)`."""
+    """Replace method `name` of the class `of` by `own(old, container, *args)`, for containers of our augmentations."""
     call = getattr(of, name)
     call = getattr(call, "__wrapped__", call)  # this module may be imported again
 

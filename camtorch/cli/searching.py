@@ -104,7 +104,7 @@ _Moment = tuple[float, float, NDArray[np.uint8]]  # time of a frame in seconds, 
 
 
 def _search_video(path: Path, board: Board) -> list[ImageCorners]:
-    """Return sharp frames that show a board in different places in order of time; of two alike the sharper one."""
+    """Return sharp frames that show the board, by time; of two with it in the same place, only the sharper one."""
     moments = _sharpest(path)
     beside = [0.0, *(sharpness for _, sharpness, _ in moments), 0.0]
     sharp = [one for i, one in enumerate(moments) if one[1] >= _SHARP * max(beside[i], beside[i + 2])]

@@ -125,7 +125,7 @@ def _as_fov(fov: Sequence[float] | None, owner: str) -> tuple[float, float] | No
 
 
 def _lenses(asked: Model) -> Iterator[Tensor]:
-    """Yield the coefficients of the camera to start from; or of an ideal one, and of the model's starts of fits."""
+    """Yield the coefficients of the camera to start from; without one, an ideal lens and the model's `fit_starts`."""
     if asked.start is not None:
         yield asked.start.distortion.detach().double().reshape(-1).cpu()
         return

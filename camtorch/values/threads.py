@@ -66,7 +66,7 @@ class _Run:
         self.ending.acquire()
 
     def take_back(self) -> bool:
-        """Take the run back if its worker, which is idle then, has not begun it; return whether that is so."""
+        """Take the run back if its worker has not begun it, and free the worker; return whether it was taken back."""
         taken = self.ticket.acquire(blocking=False)
         if taken:
             _idle.append(self.worker)
