@@ -25,11 +25,8 @@ USUAL = DISTINCT | {"brown_conrady", "fisheye62", "fov", "equisolid", "tabulated
 
 def slow_unless(quick, cases):
     """The cases of a dear test, as pytest takes them: those that are not `quick(case)` are marked slow."""
-    values = [case if isinstance(case, tuple) else (case,) for case in cases]
-    return [
-        pytest.param(*value, marks=() if quick(case) else pytest.mark.slow)
-        for case, value in zip(cases, values, strict=True)
-    ]
+    marked = [(case if isinstance(case, tuple) else (case,), () if quick(case) else pytest.mark.slow) for case in cases]
+    return [pytest.param(*values, marks=marks) for values, marks in marked]
 
 
 RARE_ARE_SLOW = slow_unless(DISTINCT.__contains__, KEYS)
@@ -152,11 +149,8 @@ def golden_camera(case):
 
 def real(key) -> dict:
     """Name -> camera, float64: the real calibrations of a model, or the one with its default coefficients."""
-    named = {
-        name: golden_camera(case)
-        for name, case in GOLDEN.items()
-        if name.startswith("mpmath") and case["family"] == key
-    }
+    cases = {name: case for name, case in GOLDEN.items() if name.startswith("mpmath") and case["family"] == key}
+    named = {name: golden_camera(case) for name, case in cases.items()}
     if key in CALIBRATIONS:
         intrinsics, distortion, size = CALIBRATIONS[key]
         return {"published": make(key, tensor([*intrinsics]), tensor([*distortion]), image_size=size)}

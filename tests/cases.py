@@ -40,9 +40,8 @@ POINTS = rand(2, 5, 3, low=-1) + torch.tensor([0, 0, 2.0])
 DEPTH = rand(2, 1, *SIZE, low=1, high=1.3)
 RAMP = 1 + (torch.arange(48.0)[:, None] / 4000 + torch.arange(64.0) / 3000).repeat(2, 1, 1, 1)
 MASK = (torch.arange(48)[:, None] // 8 + torch.arange(64) // 8).repeat(2, 1, 1)
-POSES = (
-    ct.Extrinsics(rand(2, 3, low=-0.3, high=0.3), rand(2, 3, high=0.1) + torch.tensor([0, 0, 1.0])).matrix().detach()
-)
+POSES = ct.Extrinsics(rand(2, 3, low=-0.3, high=0.3), rand(2, 3, high=0.1) + torch.tensor([0, 0, 1.0]))
+POSES = POSES.matrix().detach()
 FIELDS = {"image": IMAGES, "mask": MASK, "keypoints": PIXELS, "boxes": BOXES, "gaze": POINTS[:, 0], "head_pose": POSES}
 
 

@@ -50,11 +50,7 @@ class Compose(Augmentation):
 
     augmentations: nn.ModuleList
 
-    def __init__(
-        self,
-        augmentations: Iterable[Augmentation],
-        **options: Unpack[EditOptions],
-    ):
+    def __init__(self, augmentations: Iterable[Augmentation], **options: Unpack[EditOptions]):
         name = type(self).__name__
         parts = list(augmentations) if isinstance(augmentations, Iterable) else [augmentations]
         for part in parts:

@@ -323,7 +323,7 @@ def warn_of_order(intrinsics: Tensor, size: tuple[int, int], owner: str) -> None
     if all(_off_centre(cx, cy, size[::-1]) <= _NEAR for _, _, cx, cy in rows):
         warn(
             f"{owner}: image_size={size} is taken as (height, width), but the principal point of {given} is the "
-            f"middle of {size[::-1]}. Exchange OpenCV's (width, height). {cut_out}",
+            f"middle of {size[::-1]}. Exchange OpenCV's (width, height). {cut_out}"
         )
     elif all(
         _off_centre(fy, cy, size) <= _NEAR and abs(cx - fx) <= _NEAR * fx and abs(fy - fx) > _CENTRED * fx
@@ -331,7 +331,7 @@ def warn_of_order(intrinsics: Tensor, size: tuple[int, int], owner: str) -> None
     ):
         warn(
             f"{owner}: {given} have their principal point far from the middle of images of {size}, and seem to be "
-            f"fx, cx, fy, cy. Pass both focal lengths first. {cut_out}",
+            f"fx, cx, fy, cy. Pass both focal lengths first. {cut_out}"
         )
     elif all(20 * max(fx, fy) < min(size) and max(abs(cx - 0.5), abs(cy - 0.5)) < 0.2 for fx, fy, cx, cy in rows):
         warn(
@@ -346,7 +346,7 @@ def warn_of_exchange(old: tuple[int, int], new: tuple[int, int], owner: str) -> 
     if old[0] != old[1] and abs(turned - 1) < _CENTRED / 10:
         warn(
             f"{owner}: an image of (height, width) = {old} is stretched to {new}; it would keep its shape as "
-            f"{new[::-1]}. For the image on its side use camera.rot90",
+            f"{new[::-1]}. For the image on its side use camera.rot90"
         )
 
 

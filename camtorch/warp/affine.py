@@ -331,10 +331,7 @@ def after(second: Map, first: Map) -> Map:
         return second[..., :2] @ first + F.pad(second[..., 2:], (2, 0))
     (a, b, left), (c, d, top) = second
     (e, f, x), (g, h, y) = first
-    return (
-        (a * e + b * g, a * f + b * h, a * x + b * y + left),
-        (c * e + d * g, c * f + d * h, c * x + d * y + top),
-    )
+    return ((a * e + b * g, a * f + b * h, a * x + b * y + left), (c * e + d * g, c * f + d * h, c * x + d * y + top))
 
 
 def on_rays(matrix: Tensor) -> Tensor:

@@ -89,10 +89,7 @@ def test_further_targets_and_lists():
 def test_what_is_wrong_is_told():
     with pytest.raises(TypeError, match="augmentation must be an Augmentation; got str"):
         ct.augment.albumentations.Transform("mount")
-    with pytest.raises(
-        ValueError,
-        match=r"camera must be a Camera; got None\. Please give one here, in the sample, or to the augmentation",
-    ):
+    with pytest.raises(ValueError, match=r"camera must be a Camera; got None\. Please give one here, in the sample,"):
         A.Compose([ct.augment.albumentations.Transform(ct.augment.RandomMount())])(image=sample()["image"])
     with pytest.raises(ValueError, match=r"image must be of the camera's image_size \(48, 64\); got \(47, 64\)"):
         A.Compose([transform()])(image=sample()["image"][1:])

@@ -31,9 +31,7 @@ EACH_LENS = {"bent", "filled"}
 @pytest.mark.parametrize("count", [1, 4])
 @pytest.mark.parametrize(
     ("key", "name", "dtype"),
-    slow_unless(
-        lambda case: (case[1] in EACH_LENS and case[0] in DISTINCT) or case[0] in ("brown_conrady", "mei"), CASES
-    ),
+    slow_unless(lambda c: (c[1] in EACH_LENS and c[0] in DISTINCT) or c[0] in ("brown_conrady", "mei"), CASES),
 )
 def test_as_the_formula(key, name, dtype, count, recwarn, monkeypatch):
     source = spread(key, torch.float32).requires_grad_(False).resize(120, 160).to(dtype)

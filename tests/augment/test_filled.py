@@ -29,9 +29,6 @@ def untold(monkeypatch):
     monkeypatch.setattr("camtorch.augment.drawer._told", set())
 
 
-# -- the warning
-
-
 def test_mostly_empty_images_are_told_once_with_the_number():
     augmentation = RandomCamera("dms130", camera=pinhole())
     empty = 1 - shares(RandomCamera("dms130", camera=pinhole(), min_filled=0), 200).mean()
@@ -74,9 +71,6 @@ def test_front_ends_tell_it_too():
     with pytest.warns(UserWarning, match="will show nothing"):
         aug(torch.rand(2, 3, *SIZE))
     aug(torch.rand(2, 3, *SIZE))
-
-
-# -- min_filled
 
 
 MAKERS = {
@@ -123,9 +117,8 @@ def test_what_cannot_be_filled_is_said():
     """The camera of a strip at the side of an image: its axis lies off the strip."""
     strip = pinhole().crop(0, 0, 120, 40)
     augmentation = RandomCamera("dms130", camera=strip, yaw=1, pitch=1, roll=1, min_filled=0.9)
-    with pytest.warns(
-        UserWarning, match=r"min_filled must be within reach; got 0.9, and of . of 4 new images.* does not see along"
-    ):
+    says = r"min_filled must be within reach; got 0.9, and of . of 4 new images.* does not see along"
+    with pytest.warns(UserWarning, match=says):
         augmentation(image=torch.rand(4, 1, 120, 40))
     augmentation(image=torch.rand(4, 1, 120, 40))
     with pytest.raises(ValueError, match=r"RandomMount: min_filled must be a part in \[0, 1\]; got 90"):
@@ -153,9 +146,6 @@ def test_a_field_of_view_that_is_not_made_is_told_once(untold, name):
     assert made.max() < 0.9 * least
     assert abs(int(re.search(r"(\d+) degrees wide: ", str(told[0].message))[1]) - made.min()) < 1
     ASKED[name](**options)(keypoints=torch.rand(8, 5, 2))  # warnings are errors here
-
-
-# -- fov="source"
 
 
 @pytest.mark.parametrize("like", [*PRESETS, "kannala_brandt", "pinhole"])

@@ -26,9 +26,6 @@ def narrow(**options):
     return ct.augment.RandomCamera("pinhole", fov=60, yaw=0, pitch=0, roll=0, min_filled=0, **none, **options)
 
 
-# -- kornia
-
-
 def test_kornia_has_the_flags_of_the_keypoints_it_moved():
     aug = ct.augment.kornia.CameraAugmentation(narrow(), fisheye())
     assert aug.keypoints_valid is None
@@ -58,9 +55,6 @@ def test_what_one_augmentation_lost_the_next_ones_do_not_find():
     _, moved = seq(torch.rand(1, 1, *SIZE), POINTS[None, :1])
     assert moved.tolist() == [[[-1, -1]]]
     assert not any(aug.keypoints_valid.any() for aug in both)
-
-
-# -- torchvision
 
 
 @pytest.fixture(params=["stand-in", "real"])

@@ -117,7 +117,7 @@ def test_keypoints_keep_the_shape_of_opencv(name):
 
 def test_errors_name_the_field_and_its_shape():
     image, mask, points, _ = images()
-    own, one = augmentation(camera=camera()), torch.from_numpy(image)
+    own, one, names = augmentation(camera=camera()), torch.from_numpy(image), ("image", "image_left")
     transform = ct.augment.numpy.Transform(own)
     last, first = r"{} must have its channels first.*channels last.*{}.permute\({}\)", image.T.swapaxes(1, 2)
     for call, text, fields in (
@@ -130,12 +130,8 @@ def test_errors_name_the_field_and_its_shape():
         (transform, "keypoints must be a numpy array .* got list", {"keypoints": [[1, 2], [3]]}),
         (transform, r"transform\(image=...\); got ndarray", image),
         (ct.augment.numpy.Transform, "got str", "RandomMount"),
-        *(
-            (own, last.format(n, n, "2, 0, 1"), {n: v})
-            for n in ("image", "image_left")
-            for v in (image, one, [one, one])
-        ),
-        *((own, last.format(n, n, "0, 3, 1, 2"), {n: one[None]}) for n in ("image", "image_left")),
+        *((own, last.format(n, n, "2, 0, 1"), {n: v}) for n in names for v in (image, one, [one, one])),
+        *((own, last.format(n, n, "0, 3, 1, 2"), {n: one[None]}) for n in names),
     ):
         with pytest.raises((TypeError, ValueError), match=text):
             call(fields)

@@ -157,11 +157,8 @@ def test_numbers_of_unknown_names_are_refused(front_end, monkeypatch):
     fields = sample(*batch) | {"lidar": sample(*batch)["points"]}
     with pytest.raises(ValueError, match=r"'lidar' must have a kind.*fields=\{'lidar': KIND\}"):
         both(front_end, RandomMount(fields={"lid*dar": "points"}), camera(), fields, monkeypatch)  # it has more letters
-    for name, hidden in {
-        "keypts": [[10, 20], [30, 40]],
-        "eyes": [np.float32(3)] * 2,
-        "label_map": torch.ones(*batch, *SIZE, dtype=torch.uint8),
-    }.items():
+    label_map = torch.ones(*batch, *SIZE, dtype=torch.uint8)
+    for name, hidden in (("keypts", [[10, 20], [30, 40]]), ("eyes", [np.float32(3)] * 2), ("label_map", label_map)):
         with pytest.raises(ValueError, match=f"'{name}' must have a kind"):
             both(front_end, RandomMount(), camera(), sample(*batch) | {name: hidden}, monkeypatch)
     for key, kind in {"lidar": "keep", "li*ar": "points", "*": "keep"}.items():

@@ -79,9 +79,6 @@ def test_boxes_off_the_image_are_zeros_and_stay_that(key):
         assert (value[:, 0] != 0).all()
 
 
-# -- masks
-
-
 def test_masks_keep_class_ids_and_lists_are_warped_one_by_one():
     aug = adapter.RandomCamera(camera(), mask_fill=255, tolerance=0.0)
     seq = K.AugmentationSequential(aug, data_keys=["input", "mask", "keypoints"])
@@ -100,10 +97,8 @@ def test_masks_keep_class_ids_and_lists_are_warped_one_by_one():
 def test_same_on_batch_and_p_batch():
     same = images(1).expand(3, -1, -1, -1)
     # a container overrides what its children say
-    for one in (
-        adapter.RandomCamera(camera(), same_on_batch=True),
-        K.AugmentationSequential(adapter.RandomCamera(camera()), same_on_batch=True),
-    ):
+    all_alike = K.AugmentationSequential(adapter.RandomCamera(camera()), same_on_batch=True)
+    for one in (adapter.RandomCamera(camera(), same_on_batch=True), all_alike):
         warped = one(same)
         assert torch.equal(warped[0], warped[2])
         assert not torch.equal(warped[0], same[0])
@@ -129,16 +124,12 @@ def test_keepdim_and_images_without_batch():
     assert [v.shape for v in seq.inverse(*seq(images(2), flat))] == [(2, 1, *SIZE), flat.shape]
 
 
-# -- replay
-
-
 @pytest.mark.parametrize("p", [1.0, 0.5])
 @pytest.mark.parametrize("cls", CLASSES)
 def test_replays_are_bit_identical(cls, p):
     torch.manual_seed(9)
-    seq, fresh = (
-        K.AugmentationSequential(cls(camera(), p=p), K.RandomHorizontalFlip(p=0.5), data_keys=KEYS) for _ in range(2)
-    )
+    flip = K.RandomHorizontalFlip(p=0.5)
+    seq, fresh = (K.AugmentationSequential(cls(camera(), p=p), flip, data_keys=KEYS) for _ in range(2))
     data = batch()
     first, params = seq(*data), seq._params
     for item in params:
@@ -155,9 +146,6 @@ def test_replays_are_bit_identical(cls, p):
     seq(*data)
     assert equal(seq(*data, params=params), first)
     assert copy.deepcopy(cls(camera())).last is None
-
-
-# -- back
 
 
 @pytest.mark.parametrize("cls", CLASSES)
@@ -191,9 +179,6 @@ def test_params_can_be_edited_and_there_is_no_matrix():
     assert torch.allclose(aug.change(params).rotation, aug.last.rotation)
 
 
-# -- another size
-
-
 def test_another_output_size_reaches_the_next_child():
     seq = K.AugmentationSequential(
         adapter.RandomCamera(camera(), image_size=(60, 90)),
@@ -214,9 +199,6 @@ def test_another_output_size_reaches_the_next_child():
     torch.manual_seed(0)
     with pytest.raises(ValueError, match=r"p < 1"):
         adapter.RandomCamera(camera(), image_size=(60, 90), p=0.5)(images(8))
-
-
-# -- containers
 
 
 def test_nested_containers_and_random_apply():
@@ -312,9 +294,6 @@ def test_videos(data_format, same_on_frame, same_on_batch):
     assert (seq.inverse(warped, classes, moved, boxes)[2] - labels[0]).abs().max() < 1e-3
 
 
-# -- cameras of single samples
-
-
 def several(count=3):
     scale = torch.linspace(0.9, 1.1, count)[:, None]
     own = camera()
@@ -368,9 +347,6 @@ def test_errors_say_what_is_wrong():
     ):
         with pytest.raises((TypeError, ValueError), match=text):
             call()
-
-
-# -- dtypes, gradients, copies
 
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.bfloat16, torch.float16])

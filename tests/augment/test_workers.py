@@ -69,8 +69,6 @@ def test_workers_differ_and_runs_repeat(arrays):
     assert len(moved.flatten(1).unique(dim=0)) == len(moved)
 
 
-# -- samples that hold cameras
-
 PINHOLE = ct.Pinhole([20.0, 20.0, 15.5, 11.5], image_size=SMALL).requires_grad_(False)
 FISHEYE = ct.KannalaBrandt([18.0, 18.0, 15.5, 11.5], [0.01, 0.0, 0.0, 0.0], image_size=SMALL).requires_grad_(False)
 

@@ -17,9 +17,8 @@ SIZE = (960, 1280)
 
 def lens(fov):
     """A camera of that field of view in degrees; beyond 100 a fisheye."""
-    model, k = (
-        (ct.BrownConrady, [-0.1, 0.02, 1e-3, -5e-4]) if fov <= 100 else (ct.KannalaBrandt, [0.01, -0.004, 1e-3, 0])
-    )
+    k = [-0.1, 0.02, 1e-3, -5e-4] if fov <= 100 else [0.01, -0.004, 1e-3, 0]
+    model = ct.BrownConrady if fov <= 100 else ct.KannalaBrandt
     return model.from_fov(fov, image_size=SIZE, distortion=torch.tensor(k).double()).double().requires_grad_(False)
 
 

@@ -49,9 +49,7 @@ CASES = [
 ]
 
 
-@pytest.mark.parametrize(
-    ("problems", "fovs", "counts", "share", "least"), slow_unless(lambda case: case[0] == 10, CASES)
-)
+@pytest.mark.parametrize(("problems", "fovs", "counts", "share", "least"), slow_unless(lambda c: c[0] == 10, CASES))
 def test_outliers_do_not_matter(problems, fovs, counts, share, least):
     each = problems // (len(counts) * len(fovs))
     parts = [found_by(fov, each, points, share, seed) for points in counts for seed, fov in enumerate(fovs)]

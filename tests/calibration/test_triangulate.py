@@ -81,10 +81,7 @@ def test_gradients_are_those_of_the_optimum():
     seen = (~pixels.isnan().any(-1)).all(0).nonzero()[:1, 0]
     pixels = pixels[:, seen] + torch.randn(3, 1, 2, generator=torch.Generator().manual_seed(1)).double()
     camera, pose = cameras[0], extrinsics[1]
-    inputs = [
-        w.detach().clone().requires_grad_()
-        for w in (pixels, camera.intrinsics, camera.distortion, pose.rotation, pose.translation)
-    ]
+    inputs = [w.detach().clone().requires_grad_() for w in (pixels, *camera.parameters(), *pose.parameters())]
 
     def located(pixels, intrinsics, distortion, rotation, translation):
         mine = [ct.KannalaBrandt(intrinsics, distortion, image_size=SIZE), *cameras[1:]]

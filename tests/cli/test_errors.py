@@ -59,9 +59,6 @@ def test_a_package_that_lacks_is_named(files, monkeypatch, capsys, module, words
     assert sorted(files.iterdir()) == before
 
 
-# -- what is printed on stderr
-
-
 class Terminal(io.StringIO):
     def isatty(self):
         return True

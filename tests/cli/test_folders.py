@@ -45,9 +45,6 @@ def outputs(place="out"):
     return {str(path.relative_to(place)): path.read_bytes() for path in Path(place).rglob("*") if path.is_file()}
 
 
-# -- which files are meant
-
-
 @pytest.fixture
 def tree(tmp_path, monkeypatch):
     """Files in folders, and a function that returns which of them are found, and their places."""
@@ -91,9 +88,6 @@ def test_links(tree):
     lost = {"in/gone.jpg", "in/me.jpg"}
     assert tree("in").keys() == {"in/2.JPG", "in/10.jpg", "in/deep/1.png", "in/there/5.jpg", *lost}
     assert tree("in/**/*.jpg").keys() == {"in/10.jpg", "in/there/5.jpg", *lost}
-
-
-# -- what is made of them
 
 
 def test_a_folder_is_dewarped_as_its_images_one_by_one(folder, capsys):
@@ -206,9 +200,6 @@ def test_other_suffixes(folder, capsys):
     assert "in/1.jpg and in/1.png would both be written to out/1.png" in text
 
 
-# -- processes
-
-
 def started(*words, **options):
     """A command in a process group of its own."""
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
@@ -271,10 +262,8 @@ def test_a_run_that_is_broken_off_is_one_line(folder, who):
     else:
         others = [int(found.name) for found in Path("/proc").glob("[0-9]*")]
         os.kill(max(one for one in others if os.getpgid(one) == process.pid), signal.SIGKILL)
-    printed = {
-        "all": "interrupted\n",
-        "one": "error: a process was killed, perhaps for lack of memory. --resume continues the run",
-    }
+    killed = "error: a process was killed, perhaps for lack of memory. --resume continues the run"
+    printed = {"all": "interrupted\n", "one": killed}
     out, error = process.communicate(timeout=30)
     assert (out, error.count("\n")) == ("", 1)
     assert error.startswith(f"camtorch: {printed[who]}")

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from cameras import KEYS, one
+from cameras import KEYS, one, slow_unless
 from command_line import FILES, FISHEYE, MATRIX, command, opened, refused
 
 import camtorch as ct
@@ -157,18 +157,14 @@ def test_show_says_how_much_is_alike_where_the_rim_is_not(folder, capsys):
     before = ct.load("camera.yml").camera
     ct.save(before.convert("brown_conrady", count=8, max_angle=math.radians(60)).camera, "other.json")
     command("show", "camera.yml", "--against", "other.json")
-    found = re.search(
-        r"rms (.+) px, at most .+ px, over (.+) % of the image; median (.+) px, (.+) % of the image within 1 px\n",
-        capsys.readouterr().out,
-    )
+    says = r"rms (.+) px, at most .+ px, over (.+) % of the image; median (.+) px, (.+) % of the image within 1 px\n"
+    found = re.search(says, capsys.readouterr().out)
     rms, over, median, alike = map(float, found.groups())
     assert median < 1 < rms
     assert 50 < alike < over
 
 
-@pytest.mark.parametrize(
-    "key", [pytest.param(k, marks=[] if k in ("fisheye624", "ucm") else pytest.mark.slow) for k in KEYS]
-)
+@pytest.mark.parametrize("key", slow_unless({"fisheye624", "ucm"}.__contains__, KEYS))
 def test_every_model_has_a_summary(key):
     camera = one(key)
     summary = summarise(camera)

@@ -113,9 +113,7 @@ def test_what_is_no_video(folder, capsys):
     command("dewarp", "in", "--camera", "camera.yml", "-o", "out", "--jobs", 1, expect=1)
     told = capsys.readouterr()
     lines = dict(line.removeprefix("camtorch: error: ").split(": ", 1) for line in told.err.splitlines())
-    assert list(lines) == [
-        f"in/{name}" for name in ("cut.mkv", "list.mp4", "list.ts", "nothing.mp4", "small.avi", "words.mp4")
-    ]
+    assert " ".join(lines) == "in/cut.mkv in/list.mp4 in/list.ts in/nothing.mp4 in/small.avi in/words.mp4"
     for name in ("list.ts", "nothing.mp4", "words.mp4"):
         assert lines[f"in/{name}"] == "Invalid data found when processing input"
     assert "It is cut off or damaged" in lines["in/cut.mkv"]

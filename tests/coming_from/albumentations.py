@@ -30,12 +30,8 @@ def centroid(image):
 
 
 def theirs(*transforms, keypoints=SPOT, seed=0, remove=False):
-    pipeline = A.Compose(
-        list(transforms),
-        keypoint_params=A.KeypointParams("xy", remove_invisible=remove),
-        bbox_params=A.BboxParams("pascal_voc"),
-        seed=seed,
-    )
+    params = {"keypoint_params": A.KeypointParams("xy", remove_invisible=remove)}
+    pipeline = A.Compose(list(transforms), **params, bbox_params=A.BboxParams("pascal_voc"), seed=seed)
     return pipeline(image=blob(), keypoints=keypoints, bboxes=BOX)
 
 

@@ -226,10 +226,8 @@ equal("kornia.geometry", {
         POSE.inverse().matrix(),
     )],
     "linalg.compose_transformations linalg.relative_transformation": lambda: [
-        (first.compose(SECOND).matrix(), theirs(POSE.matrix()[None], SECOND.matrix()[None])[0])
-        for first, theirs in (
-            (POSE, geometry.compose_transformations), (POSE.inverse(), geometry.relative_transformation)
-        )
+        (p.compose(SECOND).matrix(), theirs(POSE.matrix()[None], SECOND.matrix()[None])[0])
+        for p, theirs in ((POSE, geometry.compose_transformations), (POSE.inverse(), geometry.relative_transformation))
     ],
 })  # fmt: skip
 equal("kornia.geometry", {

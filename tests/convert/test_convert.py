@@ -60,9 +60,6 @@ def check(source, result):
     assert "nan" not in repr(result)
 
 
-# -- every model
-
-
 @each_kind
 def test_to_the_same_model_is_a_copy(key):
     source = one(key)
@@ -133,9 +130,6 @@ def test_a_table_of_a_lens_that_is_nearly_radial(p):
     assert float(result.valid_fraction) == 1
 
 
-# -- related models
-
-
 def test_special_cases_are_padded_and_come_back_bit_by_bit():
     source = golden("kannala_brandt__auto_190deg_a")
     for names in (("fisheye62",), ("fisheye62", "fisheye624")):
@@ -177,9 +171,6 @@ def test_a_related_model_gets_as_many_coefficients_as_it_needs():
     assert not bool(longer.convert("fisheye62").exact)
 
 
-# -- batches
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(("target", "options"), [("brown_conrady", {"max_angle": 0.8, "count": 5}), ("latlon", {})])
 def test_a_batch_is_its_rows_one_by_one(target, options):
@@ -206,9 +197,6 @@ def test_a_row_that_is_no_camera_leaves_the_others_alone():
     assert float(after.max_error[1]) == float(after.rms[1]) == math.inf
     assert float(after.valid_fraction[1]) == float(after.max_angle[1]) == 0
     torch.testing.assert_close(after.camera.distortion[[0, 2]], before.camera.distortion[[0, 2]], rtol=1e-7, atol=1e-8)
-
-
-# -- what is asked for
 
 
 @pytest.mark.slow
@@ -290,9 +278,6 @@ def test_the_door(arguments, options, error, text):
         fisheye().convert(*arguments, **options)
 
 
-# -- the largest error is the largest
-
-
 def largest(source, result, rows=481, columns=641):
     """The largest distance on a lattice far finer than the one that a conversion looks at, and on the rim."""
     angle = float(result.max_angle)
@@ -329,9 +314,6 @@ def test_conversion_in_inference_mode(key):
     known = camera.convert(key, **options)
     with torch.inference_mode():
         torch.testing.assert_close(camera.convert(key, **options).camera.distortion, known.camera.distortion)
-
-
-# -- cameras from rays
 
 
 def seen_by(camera, step=37):

@@ -67,9 +67,6 @@ def assert_same(found, expected):
         np.testing.assert_array_equal(found[name], value, err_msg=name)
 
 
-# -- draws by keys
-
-
 def test_a_key_says_what_is_drawn_on_every_machine():
     draw = ct.augment.RandomMount().draw(1, ct.data.generator(("day/3.jpg", 1), seed=7, epoch=2))
     # pinned: what was drawn for a data set is to be drawn again by the next version
@@ -138,9 +135,6 @@ def test_workers_that_persist_hear_of_the_epoch():
         epochs.append(torch.stack([found[i] for i in range(len(data))]))
     assert torch.equal(epochs[0], epochs[2])
     assert not torch.equal(epochs[0], epochs[1])
-
-
-# -- batches of arrays
 
 
 @pytest.mark.parametrize("ragged", [False, True])
@@ -258,15 +252,10 @@ def test_wrong_batches_are_told():
     with pytest.raises(ValueError, match='key must name the column that identifies a row, as in key="path"'):
         ct.data.MapBatches(augmentation())
     ground = ct.BirdsEye(camera(), ct.Extrinsics([2.0, 0, 0], [0, 0, 2.0]), x=(-1, 1), y=(1, 3), resolution=0.1)
-    for transform, message in (
-        (torch.nn.Linear(1, 1), "transform must be an augmentation or a Warp; got Linear"),
-        (ground, "must move labels too; got BirdsEye"),
-    ):
+    linear, says = torch.nn.Linear(1, 1), "transform must be an augmentation or a Warp; got Linear"
+    for transform, message in ((linear, says), (ground, "must move labels too; got BirdsEye")):
         with pytest.raises(TypeError, match=message):
             ct.data.MapBatches(transform)
-
-
-# -- samples of WebDataset
 
 
 def write_shards(folder, some, count):

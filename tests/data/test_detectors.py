@@ -21,9 +21,8 @@ def mesh(faces, size=SIZE):
 
 def shape(points, box):
     parts = [Result(x=round(x), y=round(y)) for x, y in points.tolist()]
-    rectangle = Result(
-        **{k: lambda v=v: round(v) for k, v in zip(("left", "top", "right", "bottom"), box, strict=True)}
-    )
+    sides = zip(("left", "top", "right", "bottom"), map(round, box), strict=True)
+    rectangle = Result(**{name: lambda value=value: value for name, value in sides})
     return Result(part=parts.__getitem__, num_parts=len(parts), rect=rectangle)
 
 
@@ -34,9 +33,8 @@ def insight(points, boxes, name):
 
 
 def yolo(points, boxes):
-    return [
-        Result(boxes=Result(xyxy=boxes + 0.5), keypoints=Result(xy=points + 0.5, conf=torch.ones(points.shape[:2])))
-    ]
+    keypoints = Result(xy=points + 0.5, conf=torch.ones(points.shape[:2]))
+    return [Result(boxes=Result(xyxy=boxes + 0.5), keypoints=keypoints)]
 
 
 # name -> the number of landmarks, that of no face, what the detector gives of points and boxes, and the reader

@@ -106,10 +106,8 @@ CASES = {
     )
     for key in cameras.KEYS
 }
-CASES |= {
-    f"augment.{name}": augmented(getattr(augment, name), size=(15, 20))
-    for name in ("Resize", "RandomResizedCrop", "RandomCrop", "CenterCrop")
-}
+SIZED = "Resize", "RandomResizedCrop", "RandomCrop", "CenterCrop"
+CASES |= {f"augment.{name}": augmented(getattr(augment, name), size=(15, 20)) for name in SIZED}
 CASES |= {
     "Camera": tried(lambda c: (c.K, c.field_of_view, c.fov, c.fx, c.detach(), c.clone(), c[:1]), BATCH),
     "Camera edits": tried(lambda c: (c.crop(2, 3, 9, 9), c.pad(1, 2, 3, 4), c.rot90(), c.hflip()), BROWN),

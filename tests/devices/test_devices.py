@@ -13,15 +13,8 @@ from camtorch import augment, losses, views
 
 OTHERS = {
     *("calibrate", "calibrate_rig", "find_board", "from_kornia", "load", "loads", "load_map", "save", "save_map"),
-    *(
-        "write_viewer",
-        "LookupMap",
-        "CameraFileError",
-        "FisheyeRadTanThinPrism",
-        "augment.Augmentation",
-        "augment.Change",
-        "augment.Edit",
-    ),
+    *["write_viewer", "LookupMap", "CameraFileError", "FisheyeRadTanThinPrism"],
+    *("augment.Augmentation", "augment.Change", "augment.Edit"),
     *("augment.Preset", "augment.Range", "augment.face_points", "views.Views"),
 }
 """Names that compute on the host, of files and boards; other names of what is in the table, and its bases and parts."""

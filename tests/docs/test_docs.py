@@ -161,9 +161,8 @@ def test_every_page_is_in_the_navigation():
 
 def test_links_of_the_root_lead_somewhere():
     """The strict build of the site checks those of docs/."""
-    links = [
-        (page, link) for page in ROOT.glob("*.md") for link in re.findall(r"\]\((?!https?:)(\S+?)\)", page.read_text())
-    ]
+    form = re.compile(r"\]\((?!https?:)(\S+?)\)")
+    links = [(page, link) for page in ROOT.glob("*.md") for link in form.findall(page.read_text())]
     assert links
     for page, link in links:
         path, _, anchor = link.partition("#")
@@ -177,14 +176,11 @@ def test_links_of_the_root_lead_somewhere():
 def test_the_page_of_commands_is_what_the_parser_knows():
     made = runpy.run_path(str(ROOT / "docs" / "make_commands.py"))
     assert made["PAGE"].read_text(encoding="utf-8") == made["text"](), "python docs/make_commands.py makes it anew"
-    for name in ("dewarp", "convert", "show", "map", "lenses", "calibrate"):
-        assert f"## camtorch {name}\n" in made["text"]()
 
 
-CORE = (
-    "Camera Pinhole BrownConrady KannalaBrandt Fisheye62 Fisheye624 Extrinsics Warp Dewarp Mixed RandomMount RandomLens"
-)
-CORE += " RandomCamera Compose BoxCrop FaceNormalizer CameraHead load save calibrate solve_pnp rectify triangulate fit"
+CORE = "Camera Pinhole BrownConrady KannalaBrandt Fisheye62 Fisheye624 Extrinsics Warp Dewarp Mixed RandomMount"
+CORE += " RandomLens RandomCamera Compose BoxCrop FaceNormalizer CameraHead load save calibrate solve_pnp rectify"
+CORE += " triangulate fit"
 
 
 @pytest.mark.parametrize("name", [*CORE.split(), "Reproject"])

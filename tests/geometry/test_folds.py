@@ -154,12 +154,7 @@ def check(camera):
     ("key", "size"),
     slow_unless(
         lambda case: case[0] in DISTINCT and case[1] != "wild",
-        [
-            (key, size)
-            for key in STAGES
-            for size in ("mild", "plausible", "wild")
-            if key in DISTINCT or size == "plausible"
-        ],
+        [(k, size) for k in STAGES for size in ("mild", "plausible", "wild") if k in DISTINCT or size == "plausible"],
     ),
 )
 def test_what_is_seen_has_a_ray_up_to_the_rim(key, size):

@@ -70,9 +70,7 @@ def test_pixels_of_metashape():
 
 @pytest.mark.parametrize("where", ["component", "chunk", "nowhere"])
 def test_poses_of_metashape_are_in_the_world_that_its_transform_says(where):
-    rotation = (
-        "0.8710699454 0.3070967021 -0.3833128821 -0.4909742007 0.5658364395 -0.6623997719 0.0134716110 0.7651932691"
-    )
+    rotation = "0.8710699454 0.3070967021 -0.3833128821 -0.4909742007 0.5658364395 -0.6623997719 0.0134716110"
     text = (FILES / "metashape_cameras.xml").read_text()
     assert rotation in text
     start, end = text.index("    <components"), text.index("    <cameras")
@@ -85,7 +83,8 @@ def test_poses_of_metashape_are_in_the_world_that_its_transform_says(where):
     chunk = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]]) @ POINT + (0.5, -0.25, 2)
     world, scale = chunk, 1.0
     if where != "nowhere":
-        matrix, scale = np.array([*rotation.split(), "0.6436596744"], dtype=float).reshape(3, 3), 0.12354192447331316
+        values = [*rotation.split(), 0.7651932691, 0.6436596744]
+        matrix, scale = np.array(values, float).reshape(3, 3), 0.12354192447331316
         world = scale * matrix @ chunk + (-0.249936, -0.425683, 0.402921)
     # 1e-9: to so many digits the rotation of the file is one
     assert np.allclose(seen(rig, "fisheye.jpg", world), POINT * scale, atol=1e-9)

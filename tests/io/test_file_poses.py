@@ -40,12 +40,8 @@ def test_poses_of_kalibr(key):
 
 def test_kalibr_models(tmp_path):
     path = tmp_path / "chain.yaml"
-    models = {
-        ("omni", "radtan"): ("mei", 1, 4),
-        ("eucm", "none"): ("eucm", 2, 0),
-        ("ds", "none"): ("double_sphere", 2, 0),
-        ("pinhole", "fov"): ("fov", 0, 1),
-    }
+    models = {("omni", "radtan"): ("mei", 1, 4), ("eucm", "none"): ("eucm", 2, 0)}
+    models |= {("ds", "none"): ("double_sphere", 2, 0), ("pinhole", "fov"): ("fov", 0, 1)}
     for (projection, lens), (model, before, after) in models.items():
         first, last = [0.5, 0.6][:before], [0.01, 0.02, 0.003, 0.004][:after]
         text = f"cam0:\n  camera_model: {projection}\n  distortion_model: {lens}\n  resolution: [640, 480]\n"
@@ -132,9 +128,7 @@ def test_a_folder_of_colmap(suffix, tmp_path):
         folder.mkdir()
         ct.save(rig, folder / "cameras.bin")
     ct.save(rig, f"{folder}/", "colmap")
-    assert sorted(path.name for path in folder.iterdir()) == [
-        f"{n}.{suffix}" for n in ("cameras", "images", "points3D")
-    ]
+    assert {path.name for path in folder.iterdir()} == {f"{n}.{suffix}" for n in ("cameras", "images", "points3D")}
     again = ct.load(folder)
     assert list(again.extrinsics) == list(rig.extrinsics)
     ct.save(again, folder)
@@ -182,10 +176,8 @@ def test_any_poses_survive(first, second, tmp_path):
     camera = ct.Pinhole(float64([500, 501, 320, 240]), image_size=(480, 640))
     one, two = (ct.Extrinsics(float64(r), float64(t)) for r, t in (first, second))
     still = not any((*first[0], *first[1]))
-    for poses, holding in (
-        ({"cam0": two}, HOLDING | {"mrcal"}),
-        ({"cam0": one, "cam1": two}, HOLDING | ({"opencv"} if still else set())),
-    ):
+    both = {"cam0": one, "cam1": two}, HOLDING | ({"opencv"} if still else set())
+    for poses, holding in (({"cam0": two}, HOLDING | {"mrcal"}), both):
         rig = ct.Rig(dict.fromkeys(poses, camera), poses)
         for format, suffix in SUFFIXES.items():
             path = tmp_path / f"{len(poses)}{format}" / f"cameras{suffix}"

@@ -46,9 +46,6 @@ def test_what_was_loaded_is_written_as_any_format_that_holds_it(name, format, tm
     assert_same(first, ct.load(path))
 
 
-# -- the values of the manifest
-
-
 CASES = [
     (name, label, camera)
     for name, entry in MANIFEST.items()

@@ -50,9 +50,8 @@ def test_omnidir(tmp_path, suffix, xi):
 
 @pytest.mark.parametrize("keys", [("R", "T"), ("om", "T"), ("rvec", "tvec")])
 def test_an_omnidir_pair_is_posed_by_matrices_and_by_vectors(path, keys):
-    text = "".join(
-        f"camera_matrix_{i}: {K}\ndistortion_coefficients_{i}: [0.1, 0.01, 0.001, {i}]\nxi_{i}: {i}.5\n" for i in (1, 2)
-    )
+    of_one = "camera_matrix_{0}: {1}\ndistortion_coefficients_{0}: [0.1, 0.01, 0.001, {0}]\nxi_{0}: {0}.5\n"
+    text = "".join(of_one.format(i, K) for i in (1, 2))
     turn, shift = torch.tensor([0.1, 0.2, 0.3], dtype=torch.float64), [1.0, 2, 3]
     pose = ct.Extrinsics(turn, torch.tensor(shift, dtype=torch.float64))
     rotation = pose.matrix()[:3, :3].flatten().tolist() if keys[0] == "R" else turn.tolist()

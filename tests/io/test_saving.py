@@ -56,9 +56,6 @@ def test_values_that_are_not_finite_are_not_written(format, tmp_path):
         ct.save(broken, tmp_path / f"x{SUFFIXES[format]}", format)
 
 
-# -- what it can hold
-
-
 @pytest.mark.parametrize("key", ["rotation", "translation"])
 @pytest.mark.parametrize("shape", [(), (2,)])
 def test_extrinsics_beyond_all_numbers_are_refused(key, shape):
@@ -110,9 +107,6 @@ def test_zeros_that_fill_a_message_of_ros():
     message = text.format("plumb_bob", [0.1, 0.2, 0, 0, 0]).replace("image_", "")
     # as rostopic prints them
     assert ct.loads(message + "---\n").camera.intrinsics.tolist() == [500, 500, 320, 240]
-
-
-# -- whole or not at all
 
 
 @pytest.mark.parametrize("function", ["fsync", "open"])
@@ -167,9 +161,6 @@ def test_mode_and_links_stay(tmp_path):
     ct.save(camera(), tmp_path / "dangling.json")
     assert (tmp_path / "dangling.json").is_symlink()
     assert_same(ct.load(tmp_path / "target.json"), ct.Rig({"camera": camera()}))
-
-
-# -- which format
 
 
 NAMES = {"a.json": "camtorch", "transforms.json": "nerfstudio", "transforms_train.json": "nerfstudio"}

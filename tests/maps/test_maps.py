@@ -132,9 +132,6 @@ def test_meshes_of_a_fisheye_are_as_near_as_their_fractions_allow(format, most, 
     assert ct.save_map(warp, tmp_path / "map.bin", format).max_error <= most
 
 
-# -- onnx
-
-
 @pytest.mark.parametrize(
     ("mode", "padding", "fill", "dtype"),
     [
@@ -163,9 +160,6 @@ def test_onnx_runtime_makes_the_same_images(mode, padding, fill, dtype, tmp_path
             assert difference.mean() < 1e-4
     assert report.max_error < 1e-3
     assert ct.load_map(tmp_path / "warp.onnx").valid_mask().equal(warp.valid_mask())
-
-
-# -- where rays end
 
 
 @pytest.mark.parametrize("name", ["map.npz", "map.onnx"])
@@ -300,9 +294,6 @@ def test_blocks_that_need_more_padding_than_there_is_are_refused(tmp_path):
     assert report.pixel_padding <= 15
 
 
-# -- calls
-
-
 def test_the_name_says_the_format_or_the_error_lists_them(tmp_path):
     warp = between_pinholes((9, 9), (9, 9))
     for name, format in (("a.yaml", "opencv"), ("a.NPZ", "opencv"), ("a.onnx", "onnx")):
@@ -403,9 +394,6 @@ def test_spoiled_descriptions_are_one_kind_of_error(content, tmp_path):
     (tmp_path / "map.bin.json").write_text(content)
     with pytest.raises(ct.CameraFileError):
         ct.load_map(tmp_path / "map.bin")
-
-
-# -- the command
 
 
 def test_the_command_writes_a_map_and_measures_one(tmp_path, monkeypatch, capsys):

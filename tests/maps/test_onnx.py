@@ -52,14 +52,10 @@ def kinds(model):
     return [node.op_type for node in model.graph]
 
 
-@pytest.mark.parametrize(
-    "options",
-    [
-        {},
-        {"mode": "bicubic", "padding_mode": "border", "fill": (0.1, 0.2, 0.3)},
-        {"antialias": True, "image_size": (24, 32)},
-    ],
-)
+BICUBIC = {"mode": "bicubic", "padding_mode": "border", "fill": (0.1, 0.2, 0.3)}
+
+
+@pytest.mark.parametrize("options", [{}, BICUBIC, {"antialias": True, "image_size": (24, 32)}])
 @pytest.mark.slow
 def test_a_dewarp_with_options_and_one_without_is_a_plain_gridsample(options):
     images = smooth(2 if options else 1)
@@ -104,9 +100,8 @@ def inputs_of(camera, count=600):
     generator = torch.Generator().manual_seed(5)
     points = torch.randn(count, 3, generator=generator, dtype=torch.float64)
     points[::2, 2] = points[::2, 2].abs() + 0.3
-    points[:7] = torch.tensor(
-        [[0, 0, 0], [0, 0, -1], [0, 0, 1], [1e-8, 0, 1], [torch.nan, 0, 1], [0, torch.inf, 1], [3e8, 1e8, 5e8]]
-    )
+    strange = [torch.nan, 0, 1], [0, torch.inf, 1], [3e8, 1e8, 5e8]
+    points[:7] = torch.tensor([[0, 0, 0], [0, 0, -1], [0, 0, 1], [1e-8, 0, 1], *strange])
     sides = torch.tensor((camera.image_size or (480, 640))[::-1], dtype=torch.float64)
     pixels = (torch.rand(count, 2, generator=generator, dtype=torch.float64) * 1.4 - 0.2) * sides
     pixels[0], pixels[1] = camera.intrinsics[2:].detach(), torch.nan
@@ -117,10 +112,8 @@ def inputs_of(camera, count=600):
 def assert_agrees(camera, results, points, pixels):
     """Pixels to 1e-5 of the image or of themselves, rays to 1e-5, and valid but where rounding may decide."""
     extent = max(camera.image_size or (640,))
-    for method, values, found, valid in (
-        (camera.project, points, *results[:2]),
-        (camera.unproject, pixels, *results[2:]),
-    ):
+    both = (camera.project, points, *results[:2]), (camera.unproject, pixels, *results[2:])
+    for method, values, found, valid in both:
         expected, is_valid = method(values)
         assert torch.equal(valid[:7], is_valid[:7])
         assert (valid != is_valid).double().mean() < 0.02

@@ -69,9 +69,7 @@ def test_deferred_initialisation(key, fill):
     assert layer["camera"].intrinsics.grad.any()
 
 
-@pytest.mark.parametrize(
-    "mode", [pytest.param(FakeTensorMode, marks=pytest.mark.slow), lambda: torch.device("meta")], ids=["fake", "meta"]
-)
+@pytest.mark.parametrize("mode", [pytest.param(FakeTensorMode, marks=pytest.mark.slow), lambda: torch.device("meta")])
 def test_shapes_without_values(mode):
     expected = results(build("kannala_brandt"))
     with mode():

@@ -71,13 +71,11 @@ WRONG = [
     (lambda: ct.Pinhole(np.array(INTRINSICS)[:, None]), ValueError, r"intrinsics\[\.\.\., 0\]"),
     # matrices
     (lambda: from_changed(0, 1, 0.25), ValueError, r"KannalaBrandt.*skew.*0\.25.*ignore_skew"),
-    (lambda: from_changed(2, 2, 2.0), ValueError, r"KannalaBrandt.*K.*2\.0"),
     (lambda: from_changed(2, 0, 0.5), ValueError, r"KannalaBrandt.*K.*0\.5"),
     (lambda: from_changed(1, 0, 0.75), ValueError, r"KannalaBrandt.*K.*0\.75"),
     (lambda: from_changed(0, 0, -300.0), ValueError, r"KannalaBrandt.*focal.*-300\.0"),
     (lambda: ct.Pinhole.from_matrix("K"), TypeError, "K"),
     # sizes
-    (lambda: of_size(640), TypeError, r"^KannalaBrandt: image_size .*height.*640"),
     (lambda: of_size((480.5, 640)), TypeError, r"image_size .*height.*\(480\.5, 640\)"),
     (lambda: of_size((0, 640)), ValueError, r"image_size .*height.*\(0, 640\)"),
     (lambda: CAMERA.resize(0, 10), ValueError, r"^Pinhole.*\(0, 10\)"),
@@ -109,7 +107,6 @@ WRONG = [
     (lambda: by_cde(ct.FTheta, 1.0, 2.0, 0.6), ValueError, "c > d e"),
     (lambda: by_cde(ct.FTheta, 1.0, NAN, 0.0), ValueError, "linear_cde must be finite"),
     (lambda: by_cde(ct.WoodScape, 1.0, 0.1, 0.0), ValueError, "WoodScape: d and e must be 0"),
-    (lambda: TABLE([1.0, 2.0], [0.1], [1.0]), ValueError, "two nodes"),
     (lambda: TABLE([1.0, 2.0], [0, 0.1, 0.2], [0.1, 1, 2]), ValueError, "two nodes"),
     (lambda: TABLE([1.0, 2.0], [0.1, 0.2], [1.0]), ValueError, "shapes"),
     (lambda: TABLE([1.0, 2.0], [10.0, 90.0], [1.0, 2.0]), ValueError, r"at most pi radians; got 90\.0. Use rad"),
@@ -138,10 +135,8 @@ WRONG = [
     (lambda: PAIR[::-1], TypeError, r"got slice\(None, None, -1\)\. Slices go forwards"),
     (lambda: MIXED[::-1], TypeError, r"got slice\(None, None, -1\)\. Slices go forwards"),
     (lambda: LENS.replace(intrinsics=[1.0, 2.0]), ValueError, r"KannalaBrandt: intrinsics must be \(\*B, 4\)"),
-    (lambda: LENS.replace([-1.0, 1.0, 0.0, 0.0]), ValueError, "focal lengths must be positive; got fx, fy = .-1.0"),
     (lambda: LENS.replace(distortion=[[]]), ValueError, r"distortion must be \(\*B, n\)"),
     (lambda: LENS.replace(image_size=(0, 3)), ValueError, r"image_size must be positive .*\(0, 3\)"),
-    (lambda: LENS.replace(intrinsics="f"), TypeError, "intrinsics must be numbers"),
     (lambda: PAIR.expand(3), ValueError, r"fit dims \(2,\); got \(3,\)"),
     (lambda: ct.cat([]), ValueError, "cat: .*; got an empty list"),
     (lambda: ct.cat(LENS, LENS), TypeError, r"cat: cameras must be one list, as in cat\(\[a, b\]\)"),
@@ -204,11 +199,7 @@ WRONG = [
     (lambda: A.Rotate90(90), ValueError, "quarter turns; got 90. Divide degrees by 90"),
     (lambda: A.RandomResizedCrop(32, scale=0.5), TypeError, "scale must be a range"),
     (lambda: ct.vignetting(MIXED, torch.ones(3)), ValueError, "one for each of 2 cameras"),
-    (
-        lambda: REPROJECTION(LENS, UV, torch.rand(9, 3)),
-        ValueError,
-        r"pixels of target and of the points must broadcast; got \(17, 2\) and \(9, 2\)",
-    ),
+    (lambda: REPROJECTION(LENS, UV, torch.rand(9, 3)), ValueError, r"of target and .* must broadcast; got \(17, 2\)"),
     (lambda: FLIP(image=IMAGE, keypoints=torch.rand(17, 3)), ValueError, r"\[..., 2\], as keypoints_valid"),
 ]
 
@@ -272,9 +263,6 @@ def test_values(key, method, argument, columns):
     deep = make(key, camera.intrinsics.detach().expand(2, 3, 4), camera.distortion.detach())
     for wrong in (torch.ones(3, 7, columns), torch.ones(7, columns), torch.ones(3, 2, columns)):
         refused(ValueError, wrong, "(2, 3)", str(tuple(wrong.shape)), of=deep)
-
-
-# -- what is not refused
 
 
 @pytest.mark.parametrize("size", [(np.int64(480), np.int32(640)), [480, 640], torch.Size([480, 640])])

@@ -198,9 +198,6 @@ def test_fields_of_a_mixed_batch_are_those_of_each(keys):
             assert torch.equal(field[i], its), camera
 
 
-# -- straight edges in space as curves in the image
-
-
 def distance(points, curve):
     """(N,) of points (N, 2) to a curve (M, 2)."""
     start, way = curve[:-1], curve.diff(dim=0)

@@ -32,9 +32,8 @@ def test_what_is_told_of_each_landmark_changes_places_with_it():
     assert torch.equal(torch.stack(lists), swapped)
     one = flip(image=image[0], keypoints=keypoints[0], visibility=flags[0])
     assert torch.equal(one["visibility"], swapped[0])
-    arrays = camtorch.augment.numpy.Transform(flip)(
-        image=np.zeros((*SIZE, 3), np.uint8), keypoints=keypoints[0].numpy(), visibility=flags[0].numpy()
-    )
+    given = {"keypoints": keypoints[0].numpy(), "visibility": flags[0].numpy()}
+    arrays = camtorch.augment.numpy.Transform(flip)(image=np.zeros((*SIZE, 3), np.uint8), **given)
     np.testing.assert_array_equal(arrays["visibility"], swapped[0].numpy())
     still = A.HorizontalFlip(0.0, landmarks=TABLES)(image=image, keypoints=keypoints, visibility=flags)
     assert torch.equal(still["visibility"], flags)

@@ -2,29 +2,10 @@
 
 import math
 
+import cameras
 import pytest
 import torch
-from cameras import (
-    DISTINCT,
-    FEW_REAL,
-    KEYS,
-    NOT_ANALYTIC,
-    RANGES,
-    RARE_ARE_SLOW,
-    REAL,
-    axis_slope,
-    constants,
-    drawn,
-    each_kind,
-    every_model,
-    fan,
-    make,
-    one,
-    pixel_lattice,
-    real,
-    slow_unless,
-    spread,
-)
+from cameras import DISTINCT, KEYS, drawn, each_kind, every_model, fan, make, one, pixel_lattice, slow_unless, spread
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch.autograd import gradcheck, gradgradcheck
@@ -36,14 +17,14 @@ from camtorch.optics.charts import CylinderChart, Perspective, SphereChart, Tran
 from camtorch.optics.lens import Lens
 
 EPS = torch.finfo(torch.float64).eps
-distinct_models = pytest.mark.parametrize("key", RARE_ARE_SLOW)
-every_calibration = pytest.mark.parametrize(("key", "name"), REAL)
-few_calibrations = pytest.mark.parametrize(("key", "name"), FEW_REAL)
+distinct_models = pytest.mark.parametrize("key", cameras.RARE_ARE_SLOW)
+every_calibration = pytest.mark.parametrize(("key", "name"), cameras.REAL)
+few_calibrations = pytest.mark.parametrize(("key", "name"), cameras.FEW_REAL)
 drawn_models = pytest.mark.parametrize(
     ("key", "wild"),
     slow_unless(
         lambda case: case[0] in DISTINCT and not case[1],
-        [(key, wild) for key in KEYS for wild in (False, True)[: 1 + (key in RANGES)]],
+        [(key, wild) for key in KEYS for wild in (False, True)[: 1 + (key in cameras.RANGES)]],
     ),
     ids=lambda value: value if isinstance(value, str) else ("plausible", "wild")[value],
 )
@@ -74,9 +55,6 @@ def px_per_rad(camera, rays):
 def rad_per_px(camera, rays):
     """How far a pixel's error turns the ray."""
     return 1 / px_per_rad(camera, rays)[..., 1]
-
-
-# -- both directions
 
 
 def check_pixels_return(camera, pixels):
@@ -119,7 +97,7 @@ def check_rays_return(camera, rays, on_image=False, lost=0.0):
 
 @every_calibration
 def test_round_trips_of_calibrations(key, name):
-    camera = real(key)[name]
+    camera = cameras.real(key)[name]
     valid = check_pixels_return(camera, pixel_lattice(camera))
     assert valid.double().mean() > 0.5
     check_rays_return(camera, fan(end_degrees(camera)), on_image=True)
@@ -138,10 +116,10 @@ def test_round_trips_of_drawn_cameras(key, wild, data):
 @few_calibrations
 @pytest.mark.parametrize(("width", "limit"), [(1000, 1e-3), (4000, 1e-2)])
 def test_single_precision(key, name, width, limit):
-    camera = real(key)[name]
+    camera = cameras.real(key)[name]
     height, old_width = camera.image_size
     exact = camera.resize(round(height * width / old_width), width)
-    camera = real(key)[name].resize(round(height * width / old_width), width).float()
+    camera = cameras.real(key)[name].resize(round(height * width / old_width), width).float()
     pixels = pixel_lattice(camera)
     rays, valid = camera.unproject(pixels)
     assert rays.dtype == torch.float32
@@ -192,8 +170,8 @@ def leaves(camera):
 
 
 def learning(camera, intrinsics, distortion):
-    """The camera of other parameters, but for what it takes as constants."""
-    count = constants(camera)
+    """The camera of other parameters, but for what it takes as cameras.constants."""
+    count = cameras.constants(camera)
     if count:
         distortion = torch.cat((camera.distortion.detach()[:count], distortion[count:]))
     return make(camera.key, intrinsics, distortion)
@@ -214,7 +192,7 @@ def test_derivatives(key, camera_of, method):
     camera, values, scale = camera_of(key), near_and_far_rays() * 1.7, 1.0
     if method == "unproject":
         # pixels in units of the focal length: steps of the numerical derivative must not drown in their rounding
-        scale = camera.intrinsics[0].item() * axis_slope(key, camera.distortion.tolist())
+        scale = camera.intrinsics[0].item() * cameras.axis_slope(key, camera.distortion.tolist())
         values = near_and_far_rays()[:, :2] + camera.intrinsics.detach()[2:] / scale
     assert getattr(camera, method)(values * scale)[1].all()
 
@@ -223,7 +201,7 @@ def test_derivatives(key, camera_of, method):
 
     inputs = (values.requires_grad_(), *leaves(camera))
     assert gradcheck(function, inputs)
-    if key in NOT_ANALYTIC:
+    if key in cameras.NOT_ANALYTIC:
         inputs = (values[3:].detach().requires_grad_(), *inputs[1:])
     # along random directions: entry by entry it takes three times as long
     assert gradgradcheck(function, inputs, fast_mode=True)
@@ -235,7 +213,7 @@ def test_derivatives_at_the_axis(key, offset):
     """On the axis a camera without even terms is a pinhole camera, first derivatives included."""
     camera = spread(key)
     # a table has its slope in the lens
-    slope = 1 if key == "tabulated" else axis_slope(key, camera.distortion.tolist())
+    slope = 1 if key == "tabulated" else cameras.axis_slope(key, camera.distortion.tolist())
     fx, fy, _, _ = (slope * camera.intrinsics.detach()).tolist()
     _, lens = optics(camera)
     zero = torch.zeros((), dtype=torch.float64)
@@ -475,7 +453,7 @@ def check_no_shared_pixels(pixels, valid):
 
 @few_calibrations
 def test_fold_of_calibrations(key, name):
-    check_no_shared_pixels(*check_fold(real(key)[name]))
+    check_no_shared_pixels(*check_fold(cameras.real(key)[name]))
 
 
 @drawn_models
@@ -530,7 +508,7 @@ def rim_of(camera, azimuths):
 @both_precisions
 def test_pixels_around_the_image_of_the_fold(key, name, dtype):
     """A hair inside or outside the last pixel that has a ray: invalid, or a ray that projects there."""
-    camera = real(key)[name]
+    camera = cameras.real(key)[name]
     rim = rim_of(camera, 8)
     centre = camera.intrinsics[2:].detach()
     hair = 10.0 ** torch.linspace(-16, -3, 40, dtype=torch.float64)
@@ -560,9 +538,6 @@ def test_what_a_pixel_sees_is_seen(key, dtype, data):
     for unproject, project in ((camera.unproject, camera.project), (vmap(camera.unproject), vmap(camera.project))):
         rays, valid = unproject(pixels)
         assert project(rays)[1][valid].all()
-
-
-# -- batches
 
 
 @pytest.mark.parametrize("key", [*sorted(DISTINCT), "ocamcalib"])  # whose chart is looked up before a lens
@@ -608,8 +583,6 @@ def test_no_points_give_no_pixels(key):
     assert valid.shape == (4, 0)
 
 
-# -- edited images
-
 # the edit; what it does to the scene; where a pixel goes; and the size
 EDITS = {
     "crop": (lambda c: c.crop(20, -30, 200, 300), (1, 1), lambda u, v: (u + 30, v - 20), (200, 300)),
@@ -623,9 +596,7 @@ EDITS = {
 }
 
 
-@pytest.mark.parametrize(
-    ("key", "name"), [(key, name) for name in EDITS for key in (KEYS if "rot" in name else sorted(DISTINCT))]
-)
+@pytest.mark.parametrize(("key", "name"), [(k, n) for n in EDITS for k in (KEYS if "rot" in n else sorted(DISTINCT))])
 def test_edits(key, name):
     edit, signs, move, size = EDITS[name]
     camera, quarter = spread(key), size == (640, 480)
@@ -663,9 +634,6 @@ def test_edits(key, name):
         back = edited.rot90(1 if name == "rot270" else -1) if quarter else edit(edited)
         torch.testing.assert_close(back.intrinsics, camera.intrinsics)
         torch.testing.assert_close(back.distortion, camera.distortion, rtol=0, atol=0)
-
-
-# -- matrix and image
 
 
 @each_kind
@@ -712,9 +680,6 @@ def test_pixel_grid_and_rays(key):
     assert rays_of_two.shape == (2, 6, 8, 3)
     assert valid.shape == (2, 6, 8)
     torch.testing.assert_close(rays_of_two[1], rays)
-
-
-# -- counts of coefficients
 
 
 @every_model

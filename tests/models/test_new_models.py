@@ -84,13 +84,8 @@ class BackwardsGrown(ct.Camera):
         return Inverted(Growth, k), Lens()
 
 
-CAMERAS = {
-    Waved: (0.03, -0.01, 0.02, -0.03),
-    WavedAlone: (0.05, -0.03),
-    Grown: (-0.08,),
-    Backwards: (-0.05, 0.02, 0.8, 0.03, -0.02),
-    BackwardsGrown: (0.04,),
-}
+CAMERAS = {Waved: (0.03, -0.01, 0.02, -0.03), WavedAlone: (0.05, -0.03), Grown: (-0.08,)}
+CAMERAS |= {Backwards: (-0.05, 0.02, 0.8, 0.03, -0.02), BackwardsGrown: (0.04,)}
 every_camera = pytest.mark.parametrize("model", CAMERAS)
 
 

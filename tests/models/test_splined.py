@@ -37,9 +37,8 @@ def reference(camera, point):
     shape = camera.columns, camera.rows
     per_u = (shape[0] - camera.order) / (4 * np.tan(np.radians(camera.fov_x) / 4))
     controls = camera.distortion.detach().numpy().reshape(shape[1], shape[0], 2)
-    (i, across, n), (j, down, m) = (
-        weights(w * per_u + (count - 1) / 2, count, camera.order) for w, count in zip(u, shape, strict=True)
-    )
+    at = [(w * per_u + (count - 1) / 2, count) for w, count in zip(u, shape, strict=True)]
+    (i, across, n), (j, down, m) = (weights(*place, camera.order) for place in at)
     patch = controls[j : j + len(down), i : i + len(across)]
     du = np.einsum("j,i,jic->c", down, across, patch) / (n * m)
     focal, centre = camera.intrinsics.detach().numpy().reshape(2, 2)

@@ -52,11 +52,8 @@ def test_parts_of_a_batch_are_its_cameras(key):
     assert [[float(c.fx.detach()) for c in row] for row in batch] == batch.fx.tolist()
 
 
-OF_RADIUS = {
-    ct.Pinhole: lambda r: math.atan(r / 300),
-    ct.KannalaBrandt: lambda r: r / 300,
-    ct.Stereographic: lambda r: 2 * math.atan(r / 600),
-}
+OF_RADIUS = {ct.Pinhole: lambda r: math.atan(r / 300), ct.KannalaBrandt: lambda r: r / 300}
+OF_RADIUS |= {ct.Stereographic: lambda r: 2 * math.atan(r / 600)}
 FIELDS = [
     *(
         (model, [300.0, 300.0, (width - 1) / 2, 239.5], (480, width), [2 * angle(r) for r in half])

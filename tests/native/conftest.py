@@ -47,10 +47,8 @@ def fuzzed(tmp_path):
         for name, options in variants.items():
             words = [*building._FLAGS, *options, f"-DVARIANT={name}"]
             units += [[*words, str(building._HERE / source)] for source in sources]
-        compilers = [
-            subprocess.Popen([*command, *unit, "-O1", "-c", "-o", f"{i}.o"], cwd=tmp_path)
-            for i, unit in enumerate(units)
-        ]
+        commands = [[*command, *unit, "-O1", "-c", "-o", f"{i}.o"] for i, unit in enumerate(units)]
+        compilers = [subprocess.Popen(words, cwd=tmp_path) for words in commands]
         assert [compiler.wait() for compiler in compilers] == [0] * len(units)
         objects = [f"{i}.o" for i in range(len(units))]
         subprocess.run([*command, *objects, "-lm", "-o", "fuzz"], cwd=tmp_path, check=True)

@@ -5,7 +5,7 @@ from unittest.mock import patch
 
 import pytest
 import torch
-from cameras import KEYS, constants, every_model, fan, make, one, pixel_lattice, real, spread
+from cameras import KEYS, constants, every_model, fan, make, one, pixel_lattice, real, slow_unless, spread
 
 import camtorch as ct
 from camtorch.native.library import native_available
@@ -20,9 +20,7 @@ from camtorch.values.arguments import columns
 pytestmark = pytest.mark.skipif(not native_available(), reason="the library is not compiled here, or turned off")
 
 # one calibration of each model and the others, which take a while
-each_kind = pytest.mark.parametrize(
-    "key", [*KEYS, *(pytest.param(f"{k} others", marks=pytest.mark.slow) for k in KEYS)]
-)
+each_kind = pytest.mark.parametrize("key", slow_unless(KEYS.__contains__, [*KEYS, *(f"{k} others" for k in KEYS)]))
 each_dtype = pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
 
 # no rays, none that a chart may cover, and some that are

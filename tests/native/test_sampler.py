@@ -406,10 +406,9 @@ def default_dtype_of_double():
         torch.set_default_dtype(torch.float32)
 
 
-@pytest.mark.parametrize(
-    ("dtype", "mode"), [(torch.uint8, "bilinear"), (torch.float32, "bicubic"), (torch.float16, "nearest")]
-)
+@pytest.mark.parametrize(("dtype", "mode"), [("uint8", "bilinear"), ("float32", "bicubic"), ("float16", "nearest")])
 def test_another_default_device_or_dtype_changes_nothing(dtype, mode):
+    dtype = getattr(torch, dtype)
     images = pixels(dtype, (2, 3, 120, 160))
     for warp, layout in product(warps(), ("contiguous", "channels last", "every other channel")):
         images = LAYOUTS[layout](images)

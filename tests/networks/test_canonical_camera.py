@@ -10,12 +10,8 @@ F64 = {"dtype": torch.float64}
 
 
 def camera(key="kannala_brandt", focal=40.0):
-    lenses = {
-        "pinhole": (),
-        "kannala_brandt": ([0.02, -0.01, 0.0, 0.0],),
-        "brown_conrady": ([-0.1, 0.02, 0.001, -0.001],),
-        "double_sphere": ([-0.2, 0.6],),
-    }
+    lenses = {"pinhole": (), "kannala_brandt": ([0.02, -0.01, 0.0, 0.0],)}
+    lenses |= {"brown_conrady": ([-0.1, 0.02, 0.001, -0.001],), "double_sphere": ([-0.2, 0.6],)}
     intrinsics = torch.tensor([focal, 1.1 * focal, 30.0, 25.0], **F64)
     coefficients = (torch.tensor(k, **F64) for k in lenses[key])
     return ct.MODELS[key](intrinsics, *coefficients, image_size=SIZE).requires_grad_(False)

@@ -40,13 +40,9 @@ def test_rays_are_compared_over_the_image():
     predicted, target = cameras()
     found, valid = ct.losses.rays(predicted, target, samples=(6, 8), reduction="none")
     assert found.shape == valid.shape == (2, 6, 8)
-    pixels = torch.tensor([3.5, 3.5], dtype=torch.float64) + 8 * torch.stack(
-        torch.meshgrid(torch.arange(8), torch.arange(6), indexing="xy"), -1
-    )
-    expected = [
-        torch.acos((a * target.unproject(pixels)[0]).sum(-1).clamp(max=1))
-        for a in predicted.unproject(pixels.expand(2, 6, 8, 2))[0]
-    ]
+    pixels = 3.5 + 8 * torch.stack(torch.meshgrid(torch.arange(8), torch.arange(6), indexing="xy"), -1).double()
+    seen, rays = predicted.unproject(pixels.expand(2, 6, 8, 2))[0], target.unproject(pixels)[0]
+    expected = [torch.acos((a * rays).sum(-1).clamp(max=1)) for a in seen]
     torch.testing.assert_close(found, torch.stack(expected), rtol=1e-6, atol=1e-7)
     mean = ct.losses.rays(predicted, target, samples=(6, 8))
     torch.testing.assert_close(mean, found.mean())

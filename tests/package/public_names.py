@@ -90,11 +90,8 @@ def room_of(name):
 
 def of_modules():
     found = {"ct": ct} | {f"ct.{room}": module for room in ROOMS if (module := room_of(room)) is not None}
-    shown = [
-        (f"{prefix}.{name}", getattr(module, name))
-        for prefix, module in found.items()
-        for name in public(getattr(module, "__all__", ()))
-    ]
+    named = [(p, module, name) for p, module in found.items() for name in public(getattr(module, "__all__", ()))]
+    shown = [(f"{prefix}.{name}", getattr(module, name)) for prefix, module, name in named]
     # a class that is public in several places is listed in full at its first
     classes = {value for _, value in shown if inspect.isclass(value)}
     seen = set()

@@ -53,9 +53,7 @@ CASES = [
     node("augment.CenterCrop", size=[20, 30], padding_mode="border"),
     node("augment.Pad", padding=[1, 2]),
     node("augment.Rotate90", times=[0, 2], step=2),
-    node(
-        "augment.Compose", augmentations=[node("augment.Compose", augmentations=PARTS), node("augment.HorizontalFlip")]
-    ),
+    node("augment.Compose", augmentations=[node("augment.Compose", augmentations=PARTS), node("augment.VerticalFlip")]),
 ]
 
 

@@ -116,7 +116,6 @@ WRONG = [
     (lambda: ct.Dewarp(CAMERA, fov=180), ValueError, r"fov must be in degrees, above 0 and below 180 for perspective"),
     (lambda: ct.Dewarp(CAMERA, fov=math.nan), ValueError, r"fov"),
     (lambda: ct.Dewarp(CAMERA, image_size=(480.0, 640)), TypeError, r"image_size must be"),
-    (lambda: ct.Dewarp(CAMERA, image_size=(0, 640)), ValueError, r"image_size must be"),
     (lambda: ct.RollingShutter(33.0, [0, 0, 0]), ValueError, r"readout must be below 2 seconds; got 33.0"),
     (lambda: ct.RollingShutter(0.03, [1, math.nan, 2]), ValueError, r"rates must be finite"),
     (lambda: ct.RollingShutter(0.03, [0, 90.0, 0]), ValueError, r"rates must be below 70 radians"),
@@ -207,18 +206,13 @@ WRONG = [
     (lambda: ct.triangulate(np.eye(3), np.eye(3), 1, 2), TypeError, r"were given\. It takes lists: ct.triangulate\("),
     (lambda: ct.rectify(*[EYE] * 4, SIZE, EYE, EYE), TypeError, r"OpenCV's .* ct.rectify\(left, right, ct.Ext"),
     (lambda: ct.Dewarp(np.eye(3), np.zeros(4)), TypeError, r"were given\. It takes a camera, as .*from_matrix\(K, D"),
-    (
-        lambda: ct.Dewarp(CAMERA, size=SIZE),
-        TypeError,
-        r"argument 'size'\. Did you mean 'image_size'\? It takes",
-    ),
+    (lambda: ct.Dewarp(CAMERA, size=SIZE), TypeError, r"argument 'size'\. Did you mean 'image_size'\? It takes"),
     (lambda: ct.Dewarp(CAMERA, balance=0.5), TypeError, r"argument 'balance'\. It takes .* fov is how much it"),
     (lambda: ct.Pinhole.from_matrix(np.eye(3), None, SIZE), TypeError, r"given\. It takes from_matrix\(K, dist"),
     (lambda: ct.Pinhole.from_fov(90), TypeError, r"'image_size'\. It takes from_fov\(degrees, image_size="),
     (lambda: ct.Extrinsics(np.eye(4)), TypeError, r"translation must be given; got .*Extrinsics.from_matrix\(T"),
     (lambda: augment.from_pitch_yaw(torch.tensor([10.0, 20.0])), ValueError, r"radians; got 20, which seems"),
     (lambda: CAMERA.crop(24, 0, 8, 8), ValueError, r"crop: .* hold a pixel of .*24, 32\); got \(24, 0, 8, 8\)"),
-    (lambda: CAMERA.crop(0, -8, 8, 8), ValueError, r"crop: .* must hold a pixel"),
 ]
 
 

@@ -61,9 +61,8 @@ def words():
 @pytest.mark.parametrize(("word", "places"), [*words()])
 def test_a_word_that_left_is_nowhere_in_the_package(word, places):
     files = [ROOT / name for name in ("README.md", "pyproject.toml", "mkdocs.yml", ".ci/run")]
-    files += [
-        file for file in (ROOT / "camtorch").rglob("*") if file.suffix in (".py", ".c", ".h", ".js", ".html", ".json")
-    ]
+    kinds = {".py", ".c", ".h", ".js", ".html", ".json"}
+    files += [file for file in (ROOT / "camtorch").rglob("*") if file.suffix in kinds]
     assert len(files) > 200
     found = [str(file.relative_to(ROOT)) for file in files if word in file.read_text("utf-8").lower()]
     assert sorted(set(found) - set(places)) == []
@@ -101,9 +100,8 @@ def with_exposure(seconds=0.01):
     return shutter
 
 
-TYPED |= {
-    f"a pickle {made.__name__}": lambda made=made: copied(made()) for made in (with_shutter, with_rates, with_exposure)
-}
+MADE = with_shutter, with_rates, with_exposure
+TYPED |= {f"a pickle {made.__name__}": lambda made=made: copied(made()) for made in MADE}
 
 
 def copied(module):
@@ -125,13 +123,10 @@ def test_an_error_about_an_old_name_leads_to_the_page(use):
 
 
 def of_room(room):
-    module = (
-        pytest.importorskip(f"camtorch.{room}", exc_type=ImportError)
-        if room in FRONT_ENDS
-        else ct
-        if room == "ct"
-        else room_of(room)
-    )
+    if room in FRONT_ENDS:
+        module = pytest.importorskip(f"camtorch.{room}", exc_type=ImportError)
+    else:
+        module = ct if room == "ct" else room_of(room)
     for name in public(getattr(module, "__all__", vars(module))):
         value = getattr(module, name)
         if callable(value) and value.__module__.startswith("camtorch"):

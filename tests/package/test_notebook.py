@@ -15,9 +15,8 @@ NUMBERS = 100.0, 100.0, 99.5, 79.5
 
 
 def shown(camera):
-    text, svg = re.fullmatch(
-        r"<pre[^>]*>(.*?)</pre>(?:(<svg.*</svg>)<div>.*</div>)?", camera._repr_html_(), re.S
-    ).groups()
+    form = r"<pre[^>]*>(.*?)</pre>(?:(<svg.*</svg>)<div>.*</div>)?"
+    text, svg = re.fullmatch(form, camera._repr_html_(), re.S).groups()
     return html.unescape(text), svg and [path.get("d") for path in ElementTree.fromstring(svg).iter("path")]
 
 
@@ -28,9 +27,8 @@ def test_a_camera_shows_its_numbers_and_circles(key):
     assert text == repr(camera)
     assert len(circles) > 1
     # on a circle every point is as far from the axis
-    points = torch.tensor(
-        [[float(w) for w in p.split()] for p in re.split("[ML]", circles[0])[1:]], dtype=torch.float64
-    )
+    points = [[float(w) for w in p.split()] for p in re.split("[ML]", circles[0])[1:]]
+    points = torch.tensor(points, dtype=torch.float64)
     rays, valid = camera.unproject(points - 0.5)
     assert valid.all()
     angles = rays[:, 2].acos().rad2deg()

@@ -14,10 +14,8 @@ from camtorch.poses.rotations import rotation_matrix
 from camtorch.stereo.rectification import Rectification
 
 PROJECTIONS = ("perspective", "latlon", "cylindrical")
-LENSES = {
-    "left": ([500.0, 505, 320, 240], [-0.2, 0.05, 0.001, -0.001, 0.0]),
-    "right": ([520.0, 515, 330, 235], [-0.1, 0.02, -0.001, 0.001, 0.0]),
-}
+LENSES = {"left": ([500.0, 505, 320, 240], [-0.2, 0.05, 0.001, -0.001, 0.0])}
+LENSES |= {"right": ([520.0, 515, 330, 235], [-0.1, 0.02, -0.001, 0.001, 0.0])}
 TURN, SHIFT = [0.02, -0.05, 0.01], [-0.12, 0.005, 0.004]
 
 

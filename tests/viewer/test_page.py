@@ -21,10 +21,7 @@ from camtorch.cli.main import main
 from camtorch.viewer.viewer import models, page
 
 sync_api = pytest.importorskip("playwright.sync_api")
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.skipif(CHROMIUM is None, reason="no Chromium is installed here"),
-]
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason="no Chromium is installed here")]
 
 ARGUMENTS = [
     *("--no-sandbox", "--disable-quic", "--no-first-run"),

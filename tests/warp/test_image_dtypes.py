@@ -8,6 +8,7 @@ import camtorch as ct
 
 SIZE = (40, 50)
 MODES = ("nearest", "bilinear", "bicubic")
+OPTIONS = {"antialias": True}, {"fill": 3.0}, {"padding_mode": "border"}
 PADDINGS = ("zeros", "border", "reflection")
 INTEGERS = (torch.int8, torch.uint8, torch.int16, torch.uint16, torch.int32, torch.uint32, torch.int64, torch.uint64)
 
@@ -91,9 +92,7 @@ def test_a_pixel_that_is_no_number_stays_in_its_neighbourhood(padding_mode, bad)
                 assert (~finite).nonzero().tolist() == [[0, 0, row, column]]
 
 
-@pytest.mark.parametrize(
-    ("mode", "options"), [*zip(MODES, ({"antialias": True}, {"fill": 3.0}, {"padding_mode": "border"}), strict=True)]
-)
+@pytest.mark.parametrize(("mode", "options"), [*zip(MODES, OPTIONS, strict=True)])
 def test_no_channels_and_no_images_make_none(mode, options):
     for dtype in (torch.float32, torch.uint8, torch.int64):
         for shape in ((2, 0), (0, 3), (0, 0)):

@@ -194,10 +194,8 @@ def test_less_than_a_whole_turn_ends_at_its_edges(missing):
 def test_a_whole_turn_is_shown_wherever_it_begins(centre):
     """As a target too. Labels go where the image goes, if the model has rays for both of their pixels."""
     focal, image = 320 / (2 * math.pi), torch.rand(1, 1, 160, 320)
-    panorama, straight = (
-        ct.Equirectangular([focal, focal, middle, 79.5], image_size=(160, 320)).requires_grad_(False)
-        for middle in (centre, centre + 20)
-    )
+    middles = [focal, focal, centre, 79.5], [focal, focal, centre + 20, 79.5]
+    panorama, straight = (ct.Equirectangular(m, image_size=(160, 320)).requires_grad_(False) for m in middles)
     views = ct.views.cube(panorama, size=90)
     ones, valid = views.back(views(torch.ones_like(image)))
     assert valid.all()

@@ -1,7 +1,7 @@
 """Laws of Warp: images, labels and derivatives move together."""
 
-import itertools
 import math
+from itertools import combinations
 
 import pytest
 import torch
@@ -101,9 +101,7 @@ def lens(name):
     return make(key, intrinsics, distortion, image_size=SIZE).requires_grad_(False)
 
 
-@pytest.mark.parametrize(
-    ("source", "target"), [pair for pair in itertools.combinations(sorted(NUMBERS), 2) if pair[0] != "pinhole"]
-)
+@pytest.mark.parametrize(("source", "target"), [p for p in combinations(sorted(NUMBERS), 2) if p[0] != "pinhole"])
 def test_a_box_is_on_the_image_if_a_ray_of_the_image_comes_back_inside(source, target):
     generator, fine = torch.Generator().manual_seed(len(source) * 100 + len(target)), 4
     for angles in ((12, -8, 30), (160, 40, 10)):
@@ -161,9 +159,8 @@ def test_boxes_around_the_whole_image_are_on_it():
     torch.testing.assert_close(moved[0].detach(), torch.tensor([-0.5, -0.5, 63.5, 47.5], dtype=torch.float64))
     moved.sum().backward()
     assert bool((boxes.grad == 0).all())
-    assert not ct.Warp(circle, pinhole(dtype=torch.float64), turn(180, dtype=torch.float64)).transform_boxes(
-        [[-500.0, -500.0, 0.0, 500.0]]
-    )[1]
+    behind = ct.Warp(circle, pinhole(dtype=torch.float64), turn(180, dtype=torch.float64))
+    assert not behind.transform_boxes([[-500.0, -500.0, 0.0, 500.0]])[1]
 
 
 def test_the_grid_is_kept_until_something_changes():

@@ -75,10 +75,8 @@ def numbers(kind, batched=(), dtype=torch.float64):
     """What a kind takes; three of each that is batched."""
     found = {name: torch.tensor(NUMBERS[name], dtype=torch.float64) for name in KINDS[kind][1]}
     scales = torch.tensor([1.0, 1.1, 0.9]).double()
-    return {
-        name: (torch.stack([value * s for s in scales]) if name in batched else value).to(dtype)
-        for name, value in found.items()
-    }
+    found |= {name: torch.stack([found[name] * s for s in scales]) for name in batched}
+    return {name: value.to(dtype) for name, value in found.items()}
 
 
 def still(kind, batched=(), dtype=torch.float64):
@@ -105,9 +103,7 @@ def results(warp, images, points):
     return [warp(images), warp.valid_mask(), warp.grid(), *moved]
 
 
-@pytest.mark.parametrize(
-    ("kind", "batched"), [(kind, names) for kind in KINDS for names in (*zip(KINDS[kind][1]), KINDS[kind][1])]
-)
+@pytest.mark.parametrize(("kind", "batched"), [(k, names) for k in KINDS for names in (*zip(KINDS[k][1]), KINDS[k][1])])
 def test_a_batch_goes_one_by_one(kind, batched):
     many, images = still(kind, batched), smooth(3)
     points = torch.rand(3, 7, 2, generator=torch.Generator().manual_seed(0)).double() * 20
