@@ -245,9 +245,8 @@ class Bundle:
         self.cameras = [_template(s.model, p) for s, p in zip(observed, state.parameters, strict=True)]
         self.rounding = torch.stack([rounding_of(s.pixels, s.weights) for s in self.observed]).sum(0)
         # a camera that does not learn, and is the same for all problems, projects all points as one row
-        self.are_shared = [
-            len(p) == 1 and not bool(f.any()) for p, f in zip(state.parameters, free.parameters, strict=True)
-        ]
+        pairs = zip(state.parameters, free.parameters, strict=True)
+        self.are_shared = [len(p) == 1 and not bool(f.any()) for p, f in pairs]
         self.fixed = [
             remade(camera, intrinsics=p[0, :4], distortion=p[0, 4:]) if shared else None
             for camera, p, shared in zip(self.cameras, state.parameters, self.are_shared, strict=True)

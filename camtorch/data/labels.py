@@ -230,10 +230,8 @@ def _vcd_sample(samples: Samples, entry: tuple[Json, str, str, str | None, int, 
             path = _find(samples, place, Path(uri).name, ("" if away else str(Path(uri).parent),))
             image = _image_at(path) if path.suffix.lower() in _SUFFIXES else _video_frame(path, at)
             sample |= {} if image is None else {"image": image}
-        for kind, count, field, names in (
-            ("bbox", 4, "boxes", "box_names"),
-            ("point2d", 2, "keypoints", "point_names"),
-        ):
+        kinds = ("bbox", 4, "boxes", "box_names"), ("point2d", 2, "keypoints", "point_names")
+        for kind, count, field, names in kinds:
             items = [
                 (uid, item)
                 for uid, one in content.get("objects", {}).items()

@@ -35,9 +35,7 @@ def _note_way(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
     ctx.to_planes = inputs[1]
 
 
-_transposed.register_autograd(
-    lambda ctx, cotangent: (_transposed(cotangent, not ctx.to_planes), None), setup_context=_note_way
-)
+_transposed.register_autograd(lambda ctx, g: (_transposed(g, not ctx.to_planes), None), setup_context=_note_way)
 
 
 def to_planes(rows: Tensor) -> tuple[Tensor, ...]:

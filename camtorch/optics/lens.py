@@ -152,11 +152,8 @@ class Planar(Stage):
 
     def __post_init__(self) -> None:
         self.is_radial = len(self.tangential) == len(self.prism) == 0
-        self.parameters: tuple[Tensor, ...] = (
-            *(self.radial.parameters if self.radial else ()),
-            *self.tangential,
-            *self.prism,
-        )
+        of_radial = self.radial.parameters if self.radial else ()
+        self.parameters: tuple[Tensor, ...] = (*of_radial, *self.tangential, *self.prism)
 
     def at(self, a: Tensor, b: Tensor, order: int = 1, t: Tensor | None = None) -> PlanarAt:
         """Return the stage at points; see `PlanarAt`."""

@@ -183,10 +183,8 @@ class Reproject(GeometryModule):
         known = torch.isfinite(given) & (given > 0)
         # the farthest of the four pixels around: the rim of a foreground then hides nothing that is seen behind it
         around = max_pool2d(pad(torch.where(known, given, torch.inf), (1, 1, 1, 1), mode="replicate"), 2, 1)
-        u, v = (
-            (plane.floor() + 1).long().clamp(0, side)
-            for plane, side in zip(seen.detach().unbind(-1), size[::-1], strict=True)
-        )
+        planes = zip(seen.detach().unbind(-1), size[::-1], strict=True)
+        u, v = ((plane.floor() + 1).long().clamp(0, side) for plane, side in planes)
         rows = around.flatten(1).expand(len(seen), -1)
         furthest = rows.gather(1, (v * (size[1] + 1) + u).flatten(1)).view(seen.shape[:-1])
         return far.detach() <= furthest * (1 + tolerance)

@@ -57,9 +57,7 @@ class Views(GeometryModule):
         self.mode = mode
         self.register_buffer("rotations", rotations, persistent=False)
         self.warps = nn.ModuleList([Warp(camera, view, rotation, mode=mode) for rotation in rotations])
-        self.backs = nn.ModuleList(
-            [Warp(view, camera, rotation.mT, mode=mode, padding_mode="border") for rotation in rotations]
-        )
+        self.backs = nn.ModuleList([Warp(view, camera, r.mT, mode=mode, padding_mode="border") for r in rotations])
 
     def __len__(self) -> int:
         """Return the number of views."""
