@@ -134,6 +134,10 @@ ALIASES = {"images": "image", "masks": "mask", "bboxes": "boxes", "point": "poin
 OWN = ("camera", "source_camera", "source_rotation", "scale")  # these come with a change and do not move
 
 
+_PLACES = {
+    "roi": "boxes",
+    **dict.fromkeys(("eye", "pupil", "nose", "mouth", "corner", "center", "centre"), "keypoints"),
+}
 _RANKS = {kind: (not field.decides, i) for i, (kind, field) in enumerate(KINDS.items())}
 
 
@@ -184,7 +188,11 @@ def is_text(value: Any) -> bool:
 
 @functools.lru_cache(64)
 def _close_to(name: str) -> list[str]:
-    return ["mask"] if name.startswith("seg") else difflib.get_close_matches(name, KINDS, 1)
+    """Return the kind that a name may mean: of the whole, or of its last word, as in `face_bbox` and `left_eye`."""
+    last = name.rpartition("_")[2].removesuffix("s")
+    if name.startswith("seg") or "box" in last or last in _PLACES:
+        return ["mask" if name.startswith("seg") else "boxes" if "box" in last else _PLACES[last]]
+    return difflib.get_close_matches(name, KINDS, 1) or difflib.get_close_matches(last, KINDS, 1)
 
 
 def _may_be_geometry(name: str, value: Any, single: bool, above: int = 0) -> bool:
@@ -242,6 +250,8 @@ def check(kind: str, name: str, value: Tensor, batched: bool, owner: str) -> Non
     if not least <= dims <= most or (field.last and value.shape[-1] not in field.last):
         what = field.shape if batched else field.shape.replace("(B, ", "(")
         hint = _hint(name)
+        if kind in ("gaze", "directions") and value.ndim and value.shape[-1] == 2:
+            hint = f". Pitch and yaw in radians go in as pitch_yaw, or with fields={{{name!r}: 'pitch_yaw'}}"
         if kind in ("rvec", "tvec") and value.shape[-2:] == (3, 1):
             hint = f". OpenCV's column goes in as {name}[..., 0]"
         if kind == "image" and value.ndim == 5:
