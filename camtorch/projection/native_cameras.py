@@ -215,8 +215,8 @@ class Lenses:
             setattr(asked, name, place)
         entry("camtorch_domain", None)(byref(asked))
 
-    def _new(self, columns: int, dtype: torch.dtype | None = None) -> int:
-        return self._keep(torch.empty(self.cameras, columns, dtype=dtype or self.dtype, device="cpu"))
+    def _new(self, columns: int) -> int:
+        return self._keep(torch.empty(self.cameras, columns, dtype=self.dtype, device="cpu"))
 
     def _add_chart(self) -> None:
         """Add the fold and the inverse of a chart that is defined in the other direction."""

@@ -19,6 +19,7 @@ def camera():
 OPTIONS = [
     ({"yaw": (5, -5)}, r"yaw must be \(low, high\) with low <= high; got \(5, -5\)"),
     ({"yaw": (0, math.nan)}, "yaw must be finite"),
+    ({"yaw": (0, 1, 2)}, r"yaw must be a range \(low, high\) or a number"),
     ({"yaw": "far"}, r"yaw must be a range \(low, high\) or a number; got 'far'"),
     ({"pitch": 400}, r"pitch must lie within \[-180, 180\]"),
     ({"p": 1.5}, r"p must be a probability in \[0, 1\]; got 1.5"),
@@ -54,6 +55,7 @@ def test_options(kind, options, text):
     ("fields", "text"),
     [
         ({"keypoints": torch.zeros(2, 5, 3)}, r"keypoints must be \(B, N, 2\) or .* x, y; got shape \(2, 5, 3\)"),
+        ({"keypoints": torch.zeros(2, 2, 2, 5, 2)}, r"keypoints must be"),
         ({"boxes": torch.zeros(2, 3, 5)}, r"boxes must be \(B, M, 4\)"),
         ({"gaze": torch.zeros(2, 2)}, r"gaze must be \(B, \*N, 3\)"),
         ({"head_pose": torch.zeros(2, 3, 3)}, r"head_pose must be \(B, 4, 4\)"),

@@ -521,6 +521,7 @@ def test_wrong_arguments_are_told():
     draw = {"apply": torch.ones(2, dtype=torch.bool), "times": torch.tensor([0.1, 0.3])}
     for make, text in (
         (lambda: A.Pad(), "either padding or size"),
+        (lambda: A.Pad(-1), "none negative"),
         (lambda: A.Pad((1, 2, 3)), "padding must be one number"),
         (lambda: A.Resize((0, 3)), "Resize: size must be positive"),
         (lambda: A.Rotate90(0.5), "times must be a whole number"),

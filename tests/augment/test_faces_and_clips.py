@@ -70,13 +70,10 @@ def test_each_face_moves_as_it_does_alone(name, form):
         equal(again[key.replace("keypoints_pixels", "pixels")], together[key])
 
 
-@pytest.mark.parametrize(
-    ("name", "cameras", "clips"),
-    slow_unless(
-        lambda case: case[2] == B or case[0] == "chain",
-        list(product(AUGMENTATIONS, ("one", "own", "batch", "list"), (1, B))),
-    ),
-)
+CLIPS = list(product(AUGMENTATIONS, ("one", "own", "batch", "list"), (1, B)))
+
+
+@pytest.mark.parametrize(("name", "cameras", "clips"), slow_unless(lambda c: c[2] == B or c[0] == "chain", CLIPS))
 def test_clips_move_as_their_frames_by_one_draw(name, cameras, clips):
     augment, lens = AUGMENTATIONS[name](), camera(*[clips] * (cameras in ("batch", "list")))
     first = clips, T

@@ -271,8 +271,6 @@ def test_regions_and_shares_are_those_of_the_car_by_each_mount(name):
     torch.testing.assert_close(share, torch.tensor([1.0, 0, 0]).double(), atol=1e-6, rtol=0)
 
 
-# -- the photograph of the README
-
 PHOTOGRAPHS = Path(__file__).parents[2] / "examples" / "photographs"
 
 
@@ -296,9 +294,6 @@ def test_the_calibration_fits_the_photograph():
 
     assert bend(straight) < 1
     assert bend(seen) > 10
-
-
-# -- scenes
 
 
 def test_landmarks_are_on_the_surface_that_is_seen():

@@ -19,8 +19,6 @@ def camera(key="brown_conrady", distortion=None, core=CORE, **options):
     return ct.MODELS[key](float64(core), *arguments, **{"image_size": (480, 640)} | options)
 
 
-# -- what a format cannot hold
-
 LOST = [
     ("opencv", camera("fisheye624"), "for OpenCV; got fisheye624"),
     ("opencv", camera("kannala_brandt", [1e-3] * 5), "at most 4 coefficients for OpenCV.* got 5, of which k5 would be"),

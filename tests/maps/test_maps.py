@@ -189,9 +189,6 @@ def test_meshes_go_on_where_rays_end(format, tmp_path):
     assert max(float(moved.diff(dim=dim).abs().max()) for dim in (0, 1)) < 20
 
 
-# -- what a format cannot hold
-
-
 def upside_down():
     camera = ct.Pinhole([300.0, 300, 159.5, 119.5], image_size=(240, 320)).double().requires_grad_(False)
     return ct.Warp(camera, camera, torch.diag(torch.tensor([-1.0, -1, 1])).double())

@@ -71,6 +71,7 @@ WRONG = [
     (lambda: ct.Pinhole(np.array(INTRINSICS)[:, None]), ValueError, r"intrinsics\[\.\.\., 0\]"),
     # matrices
     (lambda: from_changed(0, 1, 0.25), ValueError, r"KannalaBrandt.*skew.*0\.25.*ignore_skew"),
+    (lambda: from_changed(2, 2, 2.0), ValueError, r"KannalaBrandt.*K.*2\.0"),
     (lambda: from_changed(2, 0, 0.5), ValueError, r"KannalaBrandt.*K.*0\.5"),
     (lambda: from_changed(1, 0, 0.75), ValueError, r"KannalaBrandt.*K.*0\.75"),
     (lambda: from_changed(0, 0, -300.0), ValueError, r"KannalaBrandt.*focal.*-300\.0"),

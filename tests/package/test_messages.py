@@ -213,6 +213,7 @@ WRONG = [
     (lambda: ct.Extrinsics(np.eye(4)), TypeError, r"translation must be given; got .*Extrinsics.from_matrix\(T"),
     (lambda: augment.from_pitch_yaw(torch.tensor([10.0, 20.0])), ValueError, r"radians; got 20, which seems"),
     (lambda: CAMERA.crop(24, 0, 8, 8), ValueError, r"crop: .* hold a pixel of .*24, 32\); got \(24, 0, 8, 8\)"),
+    (lambda: CAMERA.crop(0, -8, 8, 8), ValueError, r"crop: .* must hold a pixel"),
 ]
 
 

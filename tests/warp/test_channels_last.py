@@ -27,9 +27,6 @@ def colours(channels=3, dtype=np.uint8, size=SIZE):
     return np.random.default_rng(0).integers(0, 250, (*size, channels)).astype(dtype)
 
 
-# -- arrays at the door of augmentations
-
-
 def _read_only(array):
     array = array.copy()
     array.flags.writeable = False
@@ -124,9 +121,6 @@ def test_nothing_as_large_as_an_image_is_made_but_the_result(read_only):
     assert out["image"].shape == array.shape
 
 
-# -- images at the door of warps
-
-
 LAYOUTS = {
     "dense": lambda c: torch.from_numpy(colours(c))[None],
     "a crop": lambda c: torch.from_numpy(colours(c, size=(60, 90)))[None, 4:54, 7:77],
@@ -168,9 +162,6 @@ def test_the_rule_holds_with_gradients_and_options():
         assert bool(torch.isfinite(gradient).all())
     for option in ({"fill": (1.0, 2.0, 3.0)}, {"padding_mode": "border"}, {"padding_mode": "reflection"}):
         assert ct.Dewarp(camera())(images, **option).is_contiguous(memory_format=torch.channels_last)
-
-
-# -- images as users hold them
 
 
 def _map():
