@@ -198,15 +198,11 @@ class CameraAugmentation(InContainers, GeometricAugmentationBase2D):
         result._valid = result._valid & seen
         return result
 
-    def inverse_inputs(
-        self, input: Tensor, params: Params, flags: Flags, transform: Any = None, **kwargs: Any
-    ) -> Tensor:
-        return self.apply_transform(self.transform_tensor(input), params, {**flags, **kwargs, _BACK: True})
+    def inverse_inputs(self, input: Tensor, params: Params, flags: Flags, transform: Any = None, **more: Any) -> Tensor:
+        return self.apply_transform(self.transform_tensor(input), params, {**flags, **more, _BACK: True})
 
-    def inverse_masks(
-        self, input: Tensor, params: Params, flags: Flags, transform: Any = None, **kwargs: Any
-    ) -> Tensor:
-        shape, flags = params["forward_input_shape"], {**flags, "resample": Resample.NEAREST, **kwargs, _BACK: True}
+    def inverse_masks(self, input: Tensor, params: Params, flags: Flags, transform: Any = None, **more: Any) -> Tensor:
+        shape, flags = params["forward_input_shape"], {**flags, "resample": Resample.NEAREST, **more, _BACK: True}
         rows = self.transform_tensor(input, shape=shape, match_channel=False)
         moved = self.apply_transform_mask(rows, params, flags)
         return _transform_output_shape(moved, input.shape, reference_shape=shape) if self.keepdim else moved

@@ -31,9 +31,8 @@ def _series(t: Tensor, coefficients: list[float]) -> Tensor:
 
 def _blend(t: Tensor, series: list[float], closed_form: Callable[[Tensor], Tensor]) -> Tensor:
     small = t < _SMALL_ANGLE2
-    return torch.where(
-        small, _series(torch.where(small, t, 0.0), series), closed_form(torch.where(small, 1.0, t).sqrt())
-    )
+    large = closed_form(torch.where(small, 1.0, t).sqrt())
+    return torch.where(small, _series(torch.where(small, t, 0.0), series), large)
 
 
 def root(square: Tensor) -> Tensor:

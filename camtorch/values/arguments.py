@@ -147,9 +147,8 @@ def as_vectors(value: Numbers, name: str, owner: str, device: torch.device | Non
     elif vectors.ndim and vectors.shape[-1] == 3:
         return vectors
     else:
-        hint = (
-            ". For quaternions, use scipy's Rotation.from_quat(xyzw).as_rotvec()" if vectors.shape[-1:] == (4,) else ""
-        )
+        for_quaternions = ". For quaternions, use scipy's Rotation.from_quat(xyzw).as_rotvec()"
+        hint = for_quaternions if vectors.shape[-1:] == (4,) else ""
         raise ValueError(f"{owner}: {name} must be (*B, 3); got shape {tuple(vectors.shape)}{hint}")
     if isinstance(value, nn.Parameter):  # the module could not own it
         raise ValueError(f"{owner}: the Parameter {name} must be (*B, 3); got shape {tuple(vectors.shape)}")
