@@ -12,8 +12,8 @@ from torch import Tensor
 from camtorch.augment.change import Change, Moved, Part
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.mixed import Mixed
-from camtorch.evaluate.door import keeps_graph, outside_inference
-from camtorch.evaluate.elsewhere import on_cpu, remember, sent
+from camtorch.evaluate.door import outside_inference
+from camtorch.evaluate.elsewhere import may_read, on_cpu, remember, sent
 from camtorch.evaluate.kept import Kept
 from camtorch.evaluate.known import is_unknown
 from camtorch.native.library import native_available
@@ -26,10 +26,10 @@ _twins = Kept(16)
 def twin_of(camera: Camera) -> Camera | None:
     """Return a copy on the CPU, kept until values change; None if it is there, learns or is traced, or without C."""
     members = cast("list[Camera]", list(camera.cameras)) if isinstance(camera, Mixed) else [camera]
-    if members[0].intrinsics.is_cpu or torch.compiler.is_compiling() or not native_available():
+    if members[0].intrinsics.is_cpu or is_unknown(members[0].intrinsics) or not native_available():
         return None
     tensors = [t for one in members for t in one._tensors]
-    if keeps_graph(*tensors) or any(is_unknown(t) or t.is_inference() for t in tensors):
+    if not may_read(*tensors):
         return None
 
     def made() -> Camera:

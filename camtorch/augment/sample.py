@@ -42,7 +42,7 @@ from camtorch.augment.kinds import (
 from camtorch.augment.landmarks import Mirroring, exchanged
 from camtorch.cameras.camera import Camera
 from camtorch.evaluate.kept import Kept
-from camtorch.evaluate.known import are_free, in_worker
+from camtorch.evaluate.known import are_free, in_worker, is_unknown
 from camtorch.evaluate.private import pytree
 from camtorch.models import Pinhole
 from camtorch.values.arguments import (
@@ -380,7 +380,7 @@ class SampleTransform(KeepsCamera, nn.Module):
         device, camera = next((v.device for v in held.values()), torch.device("cpu")), alone(as_one(camera))
         if camera.intrinsics.device != device:
             own, camera = camera, camera.each(lambda t: t.to(device))
-            if own.intrinsics.is_cpu and not torch.compiler.is_compiling():
+            if own.intrinsics.is_cpu and not is_unknown(own.intrinsics):
                 remember_camera(camera, own)
         return Batch(named, Form([(name, found) for name, (found, _) in named.items()], batched, count), camera)
 

@@ -9,14 +9,20 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from camtorch.evaluate.door import outside_inference
+from camtorch.evaluate.door import keeps_graph, outside_inference
 from camtorch.evaluate.kept import mark
+from camtorch.evaluate.known import is_unknown
 
 _ALIGNED = 16  # bytes: where the numbers of any dtype may begin
 _MOST = 64  # tensors
 
 _known: dict[tuple[Any, ...], tuple[Tensor, Tensor]] = {}
 """By its mark, which an edit in place changes, a tensor, so that its memory stays, and its values on the CPU."""
+
+
+def may_read(*tensors: Tensor) -> bool:
+    """Whether tensors are numbers that nobody learns, traces or may change without a trace."""
+    return not (keeps_graph(*tensors) or any(is_unknown(t) or t.is_inference() for t in tensors))
 
 
 def on_cpu(*tensors: Tensor, may_wait: bool = False) -> list[Tensor] | None:

@@ -12,6 +12,7 @@ from typing_extensions import Self
 
 from camtorch.cameras.camera import Camera
 from camtorch.evaluate.kept import Kept
+from camtorch.evaluate.known import is_unknown
 from camtorch.values.arguments import Numbers, broadcast_shapes
 from camtorch.values.module import GeometryModule
 from camtorch.warp.grid import Lattice, Sampling, locate
@@ -97,7 +98,8 @@ class CameraPair(GeometryModule):
     @property
     def host(self) -> Self | None:
         """The same warp on the CPU, where this one is on another device and was made from it."""
-        entry = None if torch.compiler.is_compiling() or self._host is None else self._host.entry(self._inputs(), ())
+        host = None if is_unknown(self.target.intrinsics) else self._host
+        entry = None if host is None else host.entry(self._inputs(), ())
         return None if entry is None else entry[2]
 
     def follow_host(self, host: CameraPair) -> Self:
