@@ -232,7 +232,7 @@ class Augmentation(SampleTransform):
         return self._changed(as_one(camera), self._checked_draw(draw))
 
     def _changed(self, camera: Camera, draw: Mapping[str, Any]) -> Change:
-        """Return what a draw does, found on the CPU if the numbers are there, and cameras elsewhere do not learn."""
+        """Return the change of a draw, computed on the CPU if the draw is there and the camera elsewhere, unlearnt."""
         twin = twin_of(camera) if self.drawn_on_host else None
         if twin is None or not all(getattr(value, "is_cpu", True) for value in draw.values()):
             return self._change(camera, draw)

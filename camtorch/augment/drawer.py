@@ -138,7 +138,7 @@ class CameraDrawer(Augmentation):
         return type(self).new_camera is CameraDrawer.new_camera
 
     def _like_for(self, source: Camera) -> Camera | None:
-        """Return the lens to take, where the source is if it is known there."""
+        """Return `like`, on the CPU if the source is there and its numbers are known; None without `like`."""
         like = self._held("like")
         return like if like is None or not source.intrinsics.is_cpu else twin_of(like) or like
 

@@ -64,7 +64,7 @@ class Start:
 
     @classmethod
     def of(cls, source: Camera, base: Camera, *numbers: Any) -> Start | None:
-        """Return it, or None where compiled code does not know a model, or a camera is none.
+        """Return a `Start`; None if compiled code lacks a model, dtypes differ, or some numbers are no camera's.
 
         source: the camera before. base: whose lens the new ones have, single or (B,). numbers: see `__init__`.
         """

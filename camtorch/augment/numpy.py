@@ -87,7 +87,8 @@ class Transform(FrontEnd):
         options = {} if draw is None else {"draw": draw, "camera": self.camera if camera is None else camera}
         if draw is None and camera is not None:
             fields["camera"] = camera
-        return self._moved(self.augmentation.inverse, sample, fields, options)
+        with torch.no_grad():  # as the camera before may learn
+            return self._moved(self.augmentation.inverse, sample, fields, options)
 
     def __repr__(self) -> str:
         return f"Transform({self.augmentation!r})"

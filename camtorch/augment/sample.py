@@ -324,7 +324,7 @@ class SampleTransform(KeepsCamera, nn.Module):
         return Batch({name: (found, sample[name].unsqueeze(0)) for name, found in form.fields}, form, camera)
 
     def _form_of(self, sample: Sample, camera: object, fields: Mapping[str, str]) -> tuple[Any, ...] | None:
-        """Return all that is checked of a sample's fields but their values; None if they are more than tensors."""
+        """Return all that is checked of a sample but values; None if a field is no tensor or number, or of a Mixed."""
         if not isinstance(camera, Camera) or camera.is_mixed or not are_free():
             return None
         intrinsics, distortion = camera._tensors

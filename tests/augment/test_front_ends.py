@@ -86,6 +86,8 @@ def test_there_and_back():
     transform = ct.augment.numpy.Transform(ct.augment.RandomMount(), camera())
     out = transform(image=image, keypoints=points[:2], gaze=[0.0, 0.6, -0.8])
     back = transform.inverse(**out)
+    learns = ct.augment.numpy.Transform(ct.augment.RandomMount())
+    assert learns.inverse(learns(image=image.astype(np.float32), camera=camera()))["image"].dtype == np.float32
     for name, value in (("keypoints", points[:2]), ("gaze", [0, 0.6, -0.8]), ("rotation", np.eye(3))):
         np.testing.assert_allclose(back[name], value, atol=1e-3 if name == "keypoints" else 1e-6)
     draw = transform.augmentation.draw(1, torch.Generator().manual_seed(5))
