@@ -1,4 +1,4 @@
-"""What all random augmentations are: ranges to draw from, and a change of cameras that moves a whole sample."""
+"""The base of all random augmentations: ranges to draw from, and a change of cameras that moves a whole sample."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from camtorch.values.arguments import GUESS_CAMERA, as_flag, as_mapping, as_part
 from camtorch.values.module import typed_as
 from camtorch.warp.warp import Warp
 
-_FEW = 2 / 3  # of what an image shows of its own camera: with less than that, on average, a warning says so
+_FEW = 2 / 3  # of what an image shows of its own camera: with less than that, on average, it warns
 _TRIES = 8
 
 
@@ -57,7 +57,7 @@ class Augmentation(SampleTransform):
       and `distance` along the ray.
     * `keypoints` (B, N, 2), of several faces (B, F, N, 2), or OpenCV's (B, N, 1, 2); `polygons` (B, M, K, 2); `boxes`
       (B, M, 4) as x1 y1 x2 y2; all in pixels. Count and order stay. `keypoints_valid` and so on come out as bool: the
-      point lies on the new image, and was valid before if the sample says so. A box with x2 < x1 or y2 < y1 is invalid.
+      point lies on the new image, and was valid before. A box with x2 < x1 or y2 < y1 is invalid.
     * `points` (B, *N, 3) of the camera frame. `landmarks` are keypoints or points, by their last dim.
     * `gaze`, `directions` (B, *N, 3) turn by R. `pitch_yaw` (B, *N, 2) is a gaze in the angles of ETH-XGaze.
     * `head_pose`, `pose` (B, 4, 4), camera from head; or `rvec` (B, 3) and `tvec` (B, 3) of OpenCV.
@@ -69,7 +69,7 @@ class Augmentation(SampleTransform):
 
     `rotation` (B, 3, 3) comes out: `ray_after = R ray_before`, over all augmentations that the sample went through.
     Other fields stay as they are. An unknown name that holds numbers which might be geometry, also in a dict in the
-    sample, raises an error; `fields` says what it is.
+    sample, raises an error; `fields` gives its kind.
 
     Turning the camera and changing its lens move all of it exactly. Moving the camera elsewhere shifts near things
     against far ones, which takes depth: `RandomMount(shift=...)` does it for samples that have some.
@@ -465,7 +465,7 @@ class Augmentation(SampleTransform):
     ) -> Sample:
         """Move a sample back: by the last call's change, or by that of a `draw` and the `camera` before it.
 
-        What left the image stays lost; enclosing boxes have grown; chromatic aberration and vignetting stay.
+        Pixels that left the image stay lost; enclosing boxes have grown; chromatic aberration and vignetting stay.
 
         Raises:
             ValueError: nothing was called, or the sample's camera is not the one that the change made.

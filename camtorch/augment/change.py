@@ -182,7 +182,7 @@ def _single(camera: Camera) -> Native | None:
 
 
 class Change:
-    """What a draw does to a batch of `count` samples; made by an augmentation's `change`.
+    """The effect of a draw on a batch of `count` samples; made by an augmentation's `change`.
 
     Args:
         count: how many samples.
@@ -291,7 +291,7 @@ class Change:
     def then(self, second: Change) -> Change:
         """Return this change followed by one of the cameras that it ends with, by single warps.
 
-        What the cameras in between did not see is seen, if the first one and the last one do.
+        Points that the cameras in between do not see are seen if the first one and the last one see them.
         """
         if self.gate is not None or second.gate is not None:
             raise ValueError(
@@ -437,7 +437,7 @@ class Change:
     ) -> Tensor:
         """Turn directions and points (count, *N, 3) of the camera frame; their lengths stay.
 
-        What has another form is read as rays, and written in its form again.
+        Values of another form are read as rays, and written in their form again.
         """
 
         def move(part: Part, rows: Tensor) -> Tensor:

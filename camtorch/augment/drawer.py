@@ -1,4 +1,4 @@
-"""What random cameras share: the ranges they draw from, and the new camera that a draw makes, by formulas of torch."""
+"""The base of random cameras: the ranges they draw from, and the new camera that a draw makes, by formulas of torch."""
 
 from __future__ import annotations
 
@@ -397,7 +397,7 @@ class CameraDrawer(Augmentation):
 
 
 class Ready(NamedTuple):
-    """What single samples of one form have in common that are moved by two calls of compiled code."""
+    """The common state of single samples of one form that two calls of compiled code move."""
 
     settings: tuple[Any, ...]  # of the drawer
     key: tuple[Any, ...]  # of the cameras to draw from

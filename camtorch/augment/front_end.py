@@ -1,4 +1,4 @@
-"""What takes the samples of other libraries to an augmentation."""
+"""The base of front ends, which pass the samples of other libraries to an augmentation."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from camtorch.values.arguments import GUESS_CAMERA, shown
 
 
 class FrontEnd(KeepsCamera):
-    """What takes the samples of a library to an augmentation."""
+    """The base of front ends, which pass the samples of a library to an augmentation."""
 
     augmentation: Any
 

@@ -135,7 +135,7 @@ def detached(value: Any) -> Any:
 
 
 class SampleOptions(TypedDict, total=False):
-    """What every transform of samples takes; see `Augmentation`."""
+    """The options of every transform of samples; see `Augmentation`."""
 
     camera: Camera | None
     fields: Mapping[str, str] | None
@@ -295,7 +295,7 @@ class SampleTransform(KeepsCamera, nn.Module):
     ) -> Batch:
         """Return the fields that move, as a batch, their form, and the cameras.
 
-        What samples of one form have in common is found and checked once. camera: instead of the sample's. predicted:
+        The properties that samples of one form share are checked once. camera: instead of the sample's. predicted:
         values may be bad. kinds: name -> kind, in addition to `fields`.
         """
         camera = sample.get("camera") if camera is None else camera

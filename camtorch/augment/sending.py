@@ -45,7 +45,7 @@ class _Sent(Tensor):
 
 
 class _Block:
-    """Shared memory, whose last byte says whether another process has it, or has had it before a fork."""
+    """Shared memory, whose last byte is set if another process has it, or has had it before a fork."""
 
     def __init__(self, size: int):
         self.size, self.forks = size, _forks

@@ -215,7 +215,7 @@ class Mixed(Camera):
         return [line for camera, mine in zip(self, rows, strict=True) for line in camera.explain(mine)]
 
     def of_members(self, members: Iterable[Camera]) -> Self:
-        """The batch of others of the same kinds, each in the place of one of `cameras`."""
+        """Return the batch of others of the same kinds, each in the place of one of `cameras`."""
         return type(self)(members, order=_among_used(cast("list[Camera]", list(self.cameras)), self._places)[1])
 
     def by_groups(self, change: Callable[[Camera], Camera]) -> Self:

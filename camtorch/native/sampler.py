@@ -34,7 +34,7 @@ _WORTH = 8  # pixels that may be copied for one that is made: interpolated one b
 
 
 def takes(dtype: torch.dtype, mode: str) -> bool:
-    """Whether images of a dtype are sampled so, where there is a library."""
+    """Whether the library, if it is built, samples images of a dtype so."""
     return mode == "nearest" or dtype in _TYPES
 
 
@@ -43,9 +43,9 @@ class Call:
 
     All tensors are on the CPU and without a graph. Images (B, C, H, W) and results (B, C, h, w) are of one dtype, which
     `takes` knows, and may have any strides. `fill` has C values, of pixels that show nothing, which "zeros" blends in;
-    integers are those of integer images. Of a `grid` (B or 1, h, w, 2) of float32 or float64, positions as of
-    `grid_sample`, `mapped` (B or 1, h, w) bool says which there are; None where positions far outside say that there is
-    none. Of a lattice `nodes` (B or 1, 2, n + 5, m + 5) of float32, the last two dims without gaps, are the positions
+    integers are those of integer images. `grid` (B or 1, h, w, 2) of float32 or float64 has positions as of
+    `grid_sample`, and `mapped` (B or 1, h, w) bool marks those that exist; None: positions far outside mark that none
+    exists. `nodes` (B or 1, 2, n + 5, m + 5) of a lattice, float32, the last two dims without gaps, are the positions
     at every eighth pixel, from the one at (-16, -16) on; `cells` (B or 1, n, m) int32, contiguous, are `EMPTY`, `CUBIC`
     or the cell's place in `exact`, (2, K, 8, 8) of float32, contiguous: positions, NaN where there is none.
     """

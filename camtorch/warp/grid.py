@@ -275,10 +275,10 @@ def on_lattice(
 ) -> Lattice | None:
     """Return positions within `tolerance` pixels of the exact ones, from a lattice of every eighth pixel.
 
-    Where fourth differences say that cubics may miss, positions in the middle of a cell and of its sides decide. There
+    If fourth differences show that cubics may miss, positions in the middle of a cell and of its sides decide. There
     a cell's pixels come one by one, from quintics if these do not miss, else from the cameras, as at the limit of what
-    is mapped. None if that is most of the image. What ends between four nodes alone is not seen. Positions that the
-    padding needs no more of, outside of the image, keep no tolerance; for "reflection" all do.
+    is mapped. None if that is most of the image. An edge between four nodes alone is not seen. Positions outside of the
+    image that the padding does not need keep no tolerance; for "reflection" all do.
     """
     like, (height, width) = _like(target), (len(rows), target._size_for("Warp")[1])
     n, m = math.ceil(height / STEP), math.ceil(width / STEP)  # cells

@@ -481,7 +481,7 @@ class SampleCall:
     ) -> list[tuple[Tensor, Tensor | None] | None] | None:
         """Move `values` of the form from one camera to another; also return which pixels and boxes are valid.
 
-        None where the call does not do. Those of boxes and poses alone are None if some take more than their outline,
+        None if the call does not serve. Those of boxes and poses alone are None if some take more than their outline,
         or are none.
         """
         dtype = self._dtype

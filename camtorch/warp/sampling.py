@@ -55,8 +55,8 @@ def render(
     """Return the images (B, C, h, W') that a warp makes of (B or 1, C, H, W), in their dtype.
 
     Half precision is sampled in float32; integers are rounded and stay in their range, bool is true from one half on.
-    What is computed in another dtype is copied in parts. `kept` holds halves of the images for the next call, and `out`
-    takes a result without a graph.
+    Images that are computed in another dtype are copied in parts. `kept` holds halves of the images for the next call,
+    and `out` takes a result without a graph.
     """
     how = Sampler(mode, padding_mode, fill)
     call = prepared(images, where, how, out)
