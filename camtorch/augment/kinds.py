@@ -293,12 +293,23 @@ def check_values(kind: str, name: str, value: Tensor, owner: str) -> None:
             )
 
 
-def tell_of_parts(name: str, boxes: Tensor, owner: str) -> None:
-    """Warn if all boxes lie between the centres of the first pixels, as parts of an image's sides do."""
-    if boxes.is_cpu and known_true((boxes == boxes.clamp(0, 1)).all() & (boxes % 1 != 0).any()):
+def tell_of_parts(kind: str, name: str, value: Tensor, owner: str) -> None:
+    """Warn of boxes and of 3D landmarks that seem to be parts of an image's sides, as some detectors give them."""
+    is_box = kind == "boxes"
+    if not value.is_cpu or not (is_box or (kind == "landmarks" and value.shape[-1] == 3)):
+        return
+    pixels = value if is_box else value[..., :2]
+    if not known_true((pixels == pixels.clamp(0, 1)).all() & (pixels % 1 != 0).any()):
+        return
+    if is_box:
         warn(
             f"{owner}: {name} must be pixels x1, y1, x2, y2; got values within [0, 1], as parts of an image's sides. "
             "Multiply them by width and height, and subtract 0.5"
+        )
+    elif known_true((value[..., 2] <= 0).any()):
+        warn(
+            f"{owner}: {name} must be points of the camera frame, in front of it; got x and y within [0, 1] and z of 0 "
+            f"or less, as a detector's. Pass pixels, {name}[..., :2] times width and height, less 0.5"
         )
 
 

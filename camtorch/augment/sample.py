@@ -367,8 +367,8 @@ class SampleTransform(KeepsCamera, nn.Module):
                 check(found, which, frame, batched and not several, self._name)
                 if not predicted:
                     check_values(found, which, item, self._name)
-                    if found == "boxes" and "image" in named:
-                        tell_of_parts(which, item, self._name)
+                    if "image" in named:
+                        tell_of_parts(found, which, item, self._name)
             value = items if several else value if batched else value.unsqueeze(0)
             own = len(items) if several else items[0].shape[0] if batched else 1
             named[name], count = (found, value), own if count < 0 else count

@@ -128,7 +128,14 @@ class Seeded:
         """Augment a sample, a dict or keyword arguments, by its key; or a batch, by a list or a tensor of its keys."""
         many = key.ndim > 0 if isinstance(key, (Tensor, np.ndarray)) else isinstance(key, list)
         if not many:
-            return self.augmentation(sample, generator=self.generator(key), **fields)  # type: ignore[arg-type]
+            moved = self.augmentation(sample, generator=self.generator(key), **fields)  # type: ignore[arg-type]
+            rotation = moved["rotation"]
+            if rotation.ndim == 3 and len(rotation) > 1:
+                raise ValueError(
+                    f"Seeded: key must be a list, one for each of {len(rotation)} samples; got {key!r:.60}. A clip "
+                    "of one sample goes in as image[None] with key=[...]"
+                )
+            return moved
         if isinstance(self.augmentation, Transform):
             raise TypeError(f"Seeded: key must be a single one for a Transform of arrays; got {key!r:.60}")
         return self.augmentation(sample, draw=self.draw(key), **fields)  # type: ignore[arg-type]

@@ -123,6 +123,12 @@ def test_what_inference_mode_saw_can_be_inverted_in_training(camera, lead):
     assert torch.isfinite(weight.grad).all()
 
 
+@pytest.mark.parametrize(("name", "value"), [("boxes", [[0.1, 0.2, 0.5, 0.9]]), ("landmarks", [[0.4, 0.5, -0.02]] * 2)])
+def test_parts_of_an_image_are_no_labels(camera, name, value):
+    with pytest.warns(UserWarning, match=rf"{name} must be p.* within \[0, 1\].* 0\.5"):
+        RandomMount(camera=camera)({"image": torch.rand(3, *SIZE), name: torch.tensor(value)})
+
+
 def test_fields_that_only_sound_like_geometry(camera):
     mount = RandomMount(camera=camera)
     sample = {"keypoints": torch.zeros(1, 1, 2), "image_path": "a.png", "mask_path": [("a",), []], "mask_id": 7}

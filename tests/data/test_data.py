@@ -100,6 +100,8 @@ def test_a_batch_is_drawn_as_one_by_one():
     single = augment(image=images[1], key=2)
     torch.testing.assert_close(moved["image"][1], single["image"], rtol=0, atol=1e-4)
     assert augment.draw([])["yaw"].shape == (0,)
+    with pytest.raises(ValueError, match=r"key must be a list, one for each of 3 samples; got 2"):
+        augment(image=images, key=2)
     with pytest.raises(ValueError, match="same_on_batch must be False"):
         ct.data.Seeded(augmentation(same_on_batch=True))
     with pytest.raises(TypeError, match="Seeded: augmentation must be an Augmentation"):
