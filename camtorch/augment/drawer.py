@@ -489,8 +489,3 @@ def _across(camera: Camera) -> Tensor:
     with torch.no_grad():
         rays = camera.unproject(pixels.expand(*camera.batch_shape, 2, 2))[0]
     return torch.atan2(rays[..., 0].abs(), rays[..., 2]).sum(-1).rad2deg()
-
-
-def _pair(value: RangeLike | str | None) -> RangeLike | str | None:
-    """Return a single number as a range of only that number."""
-    return (value, value) if isinstance(value, (int, float)) else value
