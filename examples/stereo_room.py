@@ -71,7 +71,7 @@ def study(
     pair = ct.rectify(lens, lens, pose, projection=projection, fov=fov)  # type: ignore[arg-type]
     first, second = (image[0] for image in pair(left, right))
     disparity = match(first, second, *pair.disparity_range(near=0.45))
-    points, good = pair.disparity_to_points(disparity, pair.valid_masks()[0][0, 0])
+    points, good = pair.disparity_to_points(disparity, pair.left.valid_mask()[0, 0])
 
     room_from_rectified = LEFT.T @ pair.rotation_left.T
     rays, has_ray = pair.camera_left.rays()

@@ -21,12 +21,9 @@ from camtorch.values.arguments import (
     as_flag,
     as_fov,
     as_image_size,
-    as_number,
-    as_points,
     as_values,
     hinting,
     one_of,
-    shown,
 )
 from camtorch.values.module import GeometryModule, typed_as
 from camtorch.warp.arrays import Image
@@ -74,29 +71,28 @@ class Rectification(GeometryModule):
         align: Align,
     ):
         super().__init__()
-        self.source_left = source_left
-        self.source_right = source_right
-        self.extrinsics = extrinsics
-        self.camera_left = camera
-        self.camera_right = camera
-        self.vertical = vertical
-        self.projection, self.align = projection, align
+        self.source_left, self.source_right, self.extrinsics = source_left, source_right, extrinsics
+        self.camera_left = self.camera_right = camera
+        self.projection, self.vertical, self.align = projection, vertical, align
         self._axis, self._memo = int(vertical), Kept()
+
+    def _frame(self) -> tuple[Tensor, Tensor, Tensor]:
+        return _frame(self.extrinsics, self.vertical, self.align)
 
     @property
     def rotation_left(self) -> Tensor:
         """Rotation (*B, 3, 3), `ray_rectified = R ray_left`: OpenCV's R1."""
-        return _frame(self.extrinsics, self.vertical, self.align)[0]
+        return self._frame()[0]
 
     @property
     def rotation_right(self) -> Tensor:
         """Rotation (*B, 3, 3), `ray_rectified = R ray_right`: OpenCV's R2."""
-        return _frame(self.extrinsics, self.vertical, self.align)[1]
+        return self._frame()[1]
 
     @property
     def baseline(self) -> Tensor:
         """Position (*B,) of the right camera on the axis of the rectified left one; negative to the left (above)."""
-        return _frame(self.extrinsics, self.vertical, self.align)[2]
+        return self._frame()[2]
 
     @property
     def left(self) -> Warp:
@@ -108,10 +104,13 @@ class Rectification(GeometryModule):
         """Warp from the right camera's image to its rectified one."""
         return self._warps()[1]
 
-    def _warps(self) -> tuple[Warp, ...]:
-        def make() -> tuple[Warp, ...]:
-            sources = (self.source_left, self.rotation_left), (self.source_right, self.rotation_right)
-            return tuple(Warp(camera, self.camera_left, turn.to(camera.intrinsics.dtype)) for camera, turn in sources)
+    def _warps(self) -> tuple[Warp, Warp]:
+        def make() -> tuple[Warp, Warp]:
+            (left, right), (turn, other, _) = (self.source_left, self.source_right), self._frame()
+            return (
+                Warp(left, self.camera_left, turn.to(left.intrinsics.dtype)),
+                Warp(right, self.camera_right, other.to(right.intrinsics.dtype)),
+            )
 
         inputs = self.extrinsics.rotation, self.extrinsics.translation
         learns = torch.is_grad_enabled() and any(t.requires_grad for t in inputs)
@@ -119,18 +118,13 @@ class Rectification(GeometryModule):
 
     def forward(self, left: Image, right: Image) -> tuple[Image, Image]:
         """Rectify both images, of the kinds that `Warp` takes."""
-        of_left, of_right = (warp(images) for warp, images in zip(self._warps(), (left, right), strict=True))
-        return of_left, of_right
+        to_left, to_right = self._warps()
+        return to_left(left), to_right(right)
 
     if TYPE_CHECKING:
 
         @typed_as(forward)
         def __call__(self, *args: Any, **options: Any) -> Any: ...
-
-    def valid_masks(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Return masks (B or 1, 1, H, W) bool of pixels that the left camera, the right one and both see."""
-        left, right = (warp.valid_mask() for warp in self._warps())
-        return left, right, left & right
 
     def disparity_to_points(self, disparity: Numbers, valid: Numbers | None = None) -> tuple[Tensor, Tensor]:
         """Return the points of the scene for disparities, in the frame of the rectified left camera.
@@ -149,24 +143,20 @@ class Rectification(GeometryModule):
         owner, camera = "disparity_to_points", self.camera_left
         size = camera._size_for(owner)
         d = as_values(disparity, "disparity", owner, camera.intrinsics.device)
-        shape, count = tuple(d.shape), self.extrinsics.batch_shape.numel()
-        if d.ndim not in (2, 3, 4) or shape[-2:] != size or (d.ndim > 2 and shape[-3] != 1):
-            raise ValueError(f"{owner}: disparity must be (B, 1, H, W), (1, H, W) or (H, W) of {size}; got {shape}")
+        shape, batched = tuple(d.shape), bool(self.extrinsics.batch_shape or camera.batch_shape)
+        if d.ndim not in ((4,) if batched else (2, 3, 4)) or shape[-2:] != size or (d.ndim > 2 and shape[-3] != 1):
+            some = "" if batched else ", (1, H, W) or (H, W)"
+            raise ValueError(f"{owner}: disparity must be (B, 1, H, W){some} of {size}; got {shape}")
         if not d.is_floating_point():
             raise ValueError(
                 f"{owner}: disparity must be floating point pixels; got {d.dtype}. Pass "
                 "disparity.astype(np.float32) / 16 for OpenCV's matchers"
             )
-        batched = bool(self.extrinsics.batch_shape or camera.batch_shape)
-        if batched and (d.ndim != 4 or len(d) not in (1, count, camera.batch_shape.numel())):
-            raise ValueError(f"{owner}: disparity must be (B, 1, H, W) for {count} pairs; got {shape}")
-        try:
-            known = torch.as_tensor(True if valid is None else valid, device=d.device).to(torch.bool)
-        except (TypeError, ValueError, RuntimeError):
-            raise TypeError(f"{owner}: valid must be a mask in the shape of disparity; got {shown(valid)}") from None
+        known = torch.as_tensor(True if valid is None else valid, device=d.device).bool()
         if valid is not None and tuple(known.shape) != shape:
             raise ValueError(f"{owner}: valid must have the shape of disparity, {shape}; got {tuple(known.shape)}")
-        points, good = self._points(self._pixels(), d.reshape(-1, *size))
+        pixels = camera.pixel_grid().expand(*camera.batch_shape, -1, -1, -1)
+        points, good = self._points(pixels, d.reshape(-1, *size))
         good = good.reshape((len(good), 1, *size) if batched else shape)
         points, good = points.reshape(*good.shape, 3), good & known
         return torch.where(good[..., None], points, 0.0), good
@@ -184,22 +174,9 @@ class Rectification(GeometryModule):
         scale = torch.where(good, baseline * e / torch.where(good, sine, 1.0), 0.0)
         return (left * scale[..., None]).to(d.dtype), good & (scale > 0) & torch.isfinite(scale)
 
-    def _pixels(self) -> Tensor:
-        """Return all pixels, (*B, H, W, 2)."""
-        return self.camera_left.pixel_grid().expand(*self.camera_left.batch_shape, -1, -1, -1)
-
     def _distance(self, points: Tensor) -> Tensor:
         """Return the distance of points (..., 3) from the baseline."""
         return torch.hypot(points[..., 1 - self._axis], points[..., 2])
-
-    def disparity(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the disparity of points (*B, *N, 3) in the rectified left frame, and whether both cameras see them."""
-        numbers, baseline = self.camera_left.intrinsics, self.baseline  # baseline is float64, points keep their dtype
-        points, _ = as_points(points, "points", 3, baseline.shape, (numbers,), "Rectification.disparity")
-        shift = baseline.to(points.dtype)[..., None] * _unit(self._axis, points)
-        moved = points - shift.reshape(*baseline.shape, *[1] * (points.ndim - 1 - baseline.ndim), 3)
-        (left, one), (right, other) = self.camera_left.project(points), self.camera_right.project(moved)
-        return (left - right)[..., self._axis], one & other
 
     @torch.no_grad()
     def disparity_range(self, near: float, far: float = math.inf) -> tuple[float, float]:
@@ -209,16 +186,16 @@ class Rectification(GeometryModule):
             near: The least depth: z in perspective, the distance from the baseline in panoramas.
             far: The greatest depth.
         """
-        near, far = (as_number(v, name, "disparity_range") for v, name in ((near, "near"), (far, "far")))
         if not 0 < near < far:
             raise ValueError(f"disparity_range: depths must be 0 < near < far; got near={near}, far={far}")
-        rays, _ = self.camera_left.unproject(self._pixels())
+        rays, has_ray = self.camera_left.rays()
         rays = rays / (rays[..., 2] if self.projection == "perspective" else self._distance(rays))[..., None]
+        shift = self.baseline[..., None, None, None] * _unit(self._axis, self.baseline)
         found = [rays.new_zeros(1)] if math.isinf(far) else []
         for depth in (near, far)[: 2 - len(found)]:
-            points = depth * rays
-            disparity, seen = self.disparity(points.expand(*self.baseline.shape, *points.shape[-3:]))
-            found.append(disparity[seen])
+            seen, valid = self.camera_right.project((depth * rays - shift).to(rays.dtype))
+            disparity = (self.camera_left.pixel_grid() - seen)[..., self._axis]
+            found.append(disparity[valid & has_ray])
         least, most = torch.cat(found).aminmax()
         return float(least), float(most)
 
@@ -241,10 +218,8 @@ class Rectification(GeometryModule):
         return {"R1": self.rotation_left, "R2": self.rotation_right, "P1": first, "P2": first + shift, "Q": q}
 
     def extra_repr(self) -> str:
-        """Return the projection, the direction of correspondence and the baseline in words."""
-        baseline = self.baseline.detach()
-        far = f"of {baseline.numel()} pairs" if baseline.ndim else f"{float(baseline):.6g}"
-        return f"{self.projection}, {'columns' if self.vertical else 'rows'} correspond, baseline {far}"
+        """Return the projection and the direction of correspondence in words."""
+        return f"{self.projection}, {'columns' if self.vertical else 'rows'} correspond"
 
 
 @hinting("OpenCV's K1, D1, K2, D2, R, T are ct.rectify(left, right, ct.Extrinsics(R, T)), of cameras from_matrix(K, D)")
@@ -290,15 +265,14 @@ def rectify(
     one_of(projection, tuple(_KINDS), "projection", "rectify")
     one_of(align, ("mean", "opencv"), "align", "rectify")
     size, vertical = as_image_size(image_size, "rectify"), as_flag(vertical, "vertical", "rectify")
+    angles = [] if fov is None else list(fov) if isinstance(fov, (tuple, list)) else [fov]
+    if fov is not None and len(angles) not in (1, 2):
+        raise ValueError(f"rectify: fov must be horizontal, or (horizontal, vertical) degrees; got {fov!r}")
     check_pose("rectify", extrinsics, "right from left", left=left, right=right)
-    model = _KINDS[projection][0][vertical]
     with torch.no_grad():
         turns = _frame(extrinsics, vertical, align)
         low, high, focal = _extent([(left, turns[0]), (right, turns[1])], projection, vertical)
-        angles = [] if fov is None else list(fov) if isinstance(fov, (tuple, list)) else [fov]
-        if fov is not None:
-            if len(angles) not in (1, 2):
-                raise ValueError(f"rectify: fov must be horizontal, or (horizontal, vertical) degrees; got {fov!r}")
+        if angles:
             high = (high - low) / 2  # the default if an angle is not given
             for i, given in enumerate(angles):
                 is_along = (i == 1) == vertical
@@ -314,8 +288,7 @@ def rectify(
             if max(size) > _LARGEST * max(left.height, left.width, right.height, right.width):
                 raise ValueError(
                     f"rectify: image_size must be given, as the default is too large; got {size}. Pass (height, width) "
-                    "and perhaps fov, and check that extrinsics are right from left, and that the cameras do not look "
-                    "along their baseline"
+                    "and check that extrinsics are right from left, and that no camera looks along the baseline"
                 )
         # square pixels, unless two angles and a size are given
         sides = extent.new_tensor([size[1], size[0]])
@@ -323,7 +296,7 @@ def rectify(
         if len(angles) < 2:
             focals = (focals[..., :1] if angles else focals.amin(-1, keepdim=True)).expand_as(focals)
         intrinsics = torch.cat((focals, (sides - 1) / 2 - focals * (low + high) / 2), -1)
-        camera = model(nn.Parameter(intrinsics, requires_grad=False), image_size=size)
+        camera = _KINDS[projection][0][vertical](nn.Parameter(intrinsics, requires_grad=False), image_size=size)
     dtype = torch.promote_types(left.intrinsics.dtype, right.intrinsics.dtype)
     return Rectification(left, right, extrinsics, camera.to(dtype), projection, vertical, align)
 
@@ -367,16 +340,16 @@ def _extent(views: list[tuple[Camera, Tensor]], projection: str, vertical: bool)
     limit = torch.tensor(reach[::-1] if vertical else reach).to(like)
     lows, highs = list[Tensor](), list[Tensor]()
     for view in views:  # the extent of the image's middle row and column
-        lines = [(p[..., i], valid) for i, (p, valid) in enumerate(middle_lines(*view, plane, limit, _LINE))]
-        lows.append(torch.stack([torch.where(valid, p, torch.inf).amin(-1) for p, valid in lines], -1))
-        highs.append(torch.stack([torch.where(valid, p, -torch.inf).amax(-1) for p, valid in lines], -1))
+        (row, of_row), (column, of_column) = middle_lines(*view, plane, limit, _LINE)
+        places, valid = torch.stack((row[..., 0], column[..., 1]), -1), torch.stack((of_row, of_column), -1)
+        lows.append(torch.where(valid, places, torch.inf).amin(-2))
+        highs.append(torch.where(valid, places, -torch.inf).amax(-2))
     is_across = torch.tensor([vertical, not vertical], device=limit.device)
     low = torch.where(is_across, torch.maximum(*lows), torch.minimum(*lows))
     high = torch.where(is_across, torch.minimum(*highs), torch.maximum(*highs))
     if not bool((low < high).all()):
         raise ValueError(
-            f"rectify: both cameras must see some {'columns' if vertical else 'rows'} in common; got none. Check that "
-            "extrinsics are right from left"
+            "rectify: cameras must see a part in common; got none. Check that extrinsics are right from left"
         )
     focal = torch.stack([_scale(*view, plane, (low + high) / 2) for view in views]).amax(0)
     if not bool((focal > 0).all()):
