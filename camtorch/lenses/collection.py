@@ -1,8 +1,8 @@
 """The collection of real lenses, searched by words; entries are read on first use.
 
-Numbers are rounded to 37 significant bits (7e-12 of their size) and stored in columns; text is compressed by LZMA. fy is
-stored as its difference to fx, the principal point relative to the image's middle, each with its sign as the lowest bit,
-and the six bytes of a column one plane after another.
+Numbers are rounded to 37 significant bits (7e-12 of their size) and stored in columns; text is compressed by LZMA. fy
+is stored as its difference to fx, the principal point relative to the image's middle, each with its sign as the lowest
+bit, and the six bytes of a column one plane after another.
 """
 
 from __future__ import annotations
