@@ -48,7 +48,7 @@ class Format(Protocol):
 
 
 class KeyFormat(Format, Protocol):
-    """Interface of a module that reads keys and values of YAML, JSON, XML, Python literals or NumPy archives."""
+    """Interface of a module that reads keys and values of YAML, JSON, XML or NumPy archives."""
 
     def matches(self, keys: dict[str, Any]) -> bool: ...
     def parse(self, record: Record) -> Rig: ...

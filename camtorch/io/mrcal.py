@@ -1,4 +1,4 @@
-"""mrcal's .cameramodel, a Python literal that is read without Python."""
+"""mrcal's .cameramodel, a Python literal, read as YAML: texts have no escapes."""
 
 from __future__ import annotations
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from rigs import FILES, MANIFEST, POINT, SAMPLES, SUFFIXES, assert_same, float64, load
+from rigs import MANIFEST, POINT, SAMPLES, SUFFIXES, assert_same, float64, load
 
 import camtorch as ct
 
@@ -83,12 +83,6 @@ def test_each_model_of_colmap(entry, suffix, tmp_path):
     assert_same(ct.load(path), rig)
     if suffix == "txt":
         assert path.read_text().splitlines()[-1].split()[1] == name
-
-
-def test_texts_of_mrcal_may_have_escapes():
-    text = (FILES / "mrcal_pinhole.cameramodel").read_text()
-    noted = text.replace("{", "{\n 'note': 'C:\\\\cam, it\\'s\\n', 'other': b'\\x00',\n", 1)
-    assert_same(ct.loads(noted), load("mrcal_pinhole.cameramodel"))
 
 
 # -- what we write, read by the tools themselves
