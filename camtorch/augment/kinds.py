@@ -138,6 +138,7 @@ _PLACES = {
     "roi": "boxes",
     **dict.fromkeys(("eye", "pupil", "nose", "mouth", "corner", "center", "centre"), "keypoints"),
 }
+_ANGLES = {"yaw", "pitch", "roll"}
 _RANKS = {kind: (not field.decides, i) for i, (kind, field) in enumerate(KINDS.items())}
 
 
@@ -164,6 +165,8 @@ def kind_of(name: str, value: object, own: Mapping[str, str], owner: str, single
             )
         close = _close_to(name)
         meant = f"Did you mean {close[0]!r}? " if close else ""
+        if _is_angle(name):
+            meant = "A head's angles go in as head_pose, by ct.head_rotation(), a gaze's as pitch_yaw. "
         raise ValueError(
             f"{owner}: {name!r} must have a kind, by which its numbers move with the camera; got real numbers. {meant}"
             f"Pass fields={{{name!r}: KIND}}, with KIND one of {', '.join(KINDS)} or {KEEP}"
@@ -198,7 +201,8 @@ def _close_to(name: str) -> list[str]:
 def _may_be_geometry(name: str, value: Any, single: bool, above: int = 0) -> bool:
     """Whether a value holds real numbers, or integers with more than a row per sample or with a name like a kind's.
 
-    above: the number of lists around the value, which count as dims. A single number is no geometry.
+    above: the number of lists around the value, which count as dims. A single number is geometry if its name is an
+    angle's, as in `head_yaw`.
     """
     if isinstance(value, Mapping):
         return any(_may_be_geometry(str(key), item, single) for key, item in value.items())
@@ -213,7 +217,12 @@ def _may_be_geometry(name: str, value: Any, single: bool, above: int = 0) -> boo
     else:
         whole, known = not isinstance(value, float), isinstance(value, (int, float))
     dims, row = above + getattr(value, "ndim", 0), 1 if single else 2
-    return known and (dims > (row if whole else 0) or (dims == row and bool(_close_to(name))))
+    known_as = (dims == row and _close_to(name)) or (not whole and _is_angle(name))
+    return known and (dims > (row if whole else 0) or bool(known_as))
+
+
+def _is_angle(name: str) -> bool:
+    return not _ANGLES.isdisjoint(name.lower().split("_"))
 
 
 def moves(kind: str, value: Tensor) -> Move:
@@ -293,17 +302,22 @@ def check_values(kind: str, name: str, value: Tensor, owner: str) -> None:
             )
 
 
-def tell_of_parts(kind: str, name: str, value: Tensor, owner: str) -> None:
-    """Warn of boxes and of 3D landmarks that seem to be parts of an image's sides, as some detectors give them."""
-    is_box = kind == "boxes"
-    if not value.is_cpu or not (is_box or (kind == "landmarks" and value.shape[-1] == 3)):
+def warn_of_numbers(kind: str, name: str, value: Tensor, has_flags: bool, owner: str) -> None:
+    """Warn of labels that seem to be parts of an image's sides, as some detectors give them, or to mean "not seen"."""
+    if kind not in ("boxes", "keypoints", "landmarks") or not value.is_cpu:
         return
-    pixels = value if is_box else value[..., :2]
+    pixels = value if kind == "boxes" else value[..., :2]
+    if value.shape[-1] == 2 and not has_flags and known_true((pixels == -1).all(-1).any()):
+        warn(
+            f"{owner}: {name} has points at (-1, -1), which move as any pixels. If these are not seen, pass NaN, or "
+            f"{name}_valid=..., a flag for each"
+        )
     if not known_true((pixels == pixels.clamp(0, 1)).all() & (pixels % 1 != 0).any()):
         return
-    if is_box:
+    if value.shape[-1] != 3:
+        corners = " x1, y1, x2, y2" if kind == "boxes" else ""
         warn(
-            f"{owner}: {name} must be pixels x1, y1, x2, y2; got values within [0, 1], as parts of an image's sides. "
+            f"{owner}: {name} must be pixels{corners}; got values within [0, 1], as parts of an image's sides. "
             "Multiply them by width and height, and subtract 0.5"
         )
     elif known_true((value[..., 2] <= 0).any()):

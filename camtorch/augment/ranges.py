@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from camtorch.evaluate.known import are_free
-from camtorch.values.arguments import as_number, shown
+from camtorch.values.arguments import as_number, shown, warn
 
 _CPU = torch.device("cpu")
+_RADIANS = 0.8  # 45 degrees: a range of degrees within it is more likely in radians
 
 
 @dataclass(frozen=True)
@@ -72,6 +73,11 @@ def as_range(
     if low < least or high > most:
         means = "" if isinstance(value, Iterable) else f", which stands for ({low:g}, {high:g})"
         raise ValueError(f"{owner}: {name} must lie within [{least:g}, {most:g}]; got {value!r}{means}")
+    if most == 180 and 0 < max(-low, high) < _RADIANS:
+        warn(
+            f"{owner}: {name} is in degrees, and {shown(value)} seems to be radians. math.degrees() converts them; a "
+            "range of less than a degree is taken as it is"
+        )
     return Range(low, high, size)
 
 

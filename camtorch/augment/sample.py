@@ -36,8 +36,8 @@ from camtorch.augment.kinds import (
     is_batch,
     kind_of,
     moves,
-    tell_of_parts,
     together,
+    warn_of_numbers,
 )
 from camtorch.augment.landmarks import Mirroring, exchanged
 from camtorch.cameras.camera import Camera
@@ -368,7 +368,7 @@ class SampleTransform(KeepsCamera, nn.Module):
                 if not predicted:
                     check_values(found, which, item, self._name)
                     if "image" in named:
-                        tell_of_parts(found, which, item, self._name)
+                        warn_of_numbers(found, which, item, f"{name}_valid" in sample, self._name)
             value = items if several else value if batched else value.unsqueeze(0)
             own = len(items) if several else items[0].shape[0] if batched else 1
             named[name], count = (found, value), own if count < 0 else count

@@ -27,7 +27,7 @@ from camtorch.projection.project import PROJECT
 from camtorch.projection.unproject import UNPROJECT
 from camtorch.rays.fields import local_pinhole, on_image, over_image, patch_centres, perspective_field, plucker
 from camtorch.rays.lattices import field_of_view
-from camtorch.values.arguments import Numbers, broadcast_shapes, hinting
+from camtorch.values.arguments import Numbers, broadcast_shapes, hinting, warn
 from camtorch.values.module import GeometryModule, typed_as
 
 Model = TypeVar("Model", bound="Camera", default="Camera")
@@ -280,6 +280,20 @@ class Camera(Freezable, Editable):
 
     def _has_left(self, name: str) -> bool:
         return name not in {model.__name__ for model in MODELS.values()}
+
+    def _save_to_state_dict(self, destination: Any, prefix: str, keep_vars: bool) -> None:
+        super()._save_to_state_dict(destination, prefix, keep_vars)
+        if self.image_size is not None and hasattr(destination, "_metadata"):
+            destination._metadata[prefix[:-1]]["image_size"] = self.image_size
+
+    def _load_from_state_dict(self, *arguments: Any) -> None:
+        super()._load_from_state_dict(*arguments)
+        its = arguments[2].get("image_size")
+        if None not in (its, self.image_size) and its != self.image_size:
+            warn(
+                f"{type(self).__name__}: the state is of a camera with image_size={its}, and this one's stays "
+                f"{self.image_size}. Load it into a camera of its size, and then use camera.resize"
+            )
 
     def forward(self, points: Numbers) -> tuple[Tensor, Tensor]:
         """Project points, as `project` does."""

@@ -309,8 +309,11 @@ def camera_of_fov(
     return made
 
 
-def warn_of_order(intrinsics: Tensor, size: tuple[int, int], owner: str) -> None:
-    """Warn of plain numbers (*B, 4) that fit in another order only: for (width, height), or as fx, cx, fy, cy."""
+def warn_of_order(intrinsics: Tensor, size: tuple[int, int], owner: str, order: str = "(height, width)") -> None:
+    """Warn of plain numbers (*B, 4) that fit in another order only: sides exchanged, or as fx, cx, fy, cy.
+
+    order: how the sides were given.
+    """
     if is_kept(intrinsics) or is_predicted(intrinsics):
         return
     row = row_of(intrinsics)
@@ -319,11 +322,14 @@ def warn_of_order(intrinsics: Tensor, size: tuple[int, int], owner: str) -> None
     if not rows or any(_off_centre(cx, cy, size) <= _CENTRED for _, _, cx, cy in rows):
         return
     given = f"fx, fy, cx, cy = {rows[0]}"
+    is_file = order == "(width, height)"
+    sides = size[::-1] if is_file else size
+    how = "Write image_width and image_height" if is_file else "Exchange OpenCV's (width, height)"
     cut_out = "For a part of an image use camera.crop"
     if all(_off_centre(cx, cy, size[::-1]) <= _NEAR for _, _, cx, cy in rows):
         warn(
-            f"{owner}: image_size={size} is taken as (height, width), but the principal point of {given} is the "
-            f"middle of {size[::-1]}. Exchange OpenCV's (width, height). {cut_out}"
+            f"{owner}: image_size={sides} is taken as {order}, but the principal point of {given} is the "
+            f"middle of {sides[::-1]}. {how}. {cut_out}"
         )
     elif all(
         _off_centre(fy, cy, size) <= _NEAR and abs(cx - fx) <= _NEAR * fx and abs(fy - fx) > _CENTRED * fx
@@ -340,12 +346,12 @@ def warn_of_order(intrinsics: Tensor, size: tuple[int, int], owner: str) -> None
         )
 
 
-def warn_of_exchange(old: tuple[int, int], new: tuple[int, int], owner: str) -> None:
+def warn_of_exchange(old: tuple[int, int], new: tuple[int, int], owner: str, how: str = "stretched") -> None:
     """Warn of a new size that has the shape of the old one on its side, as (width, height) would."""
     turned = new[0] * old[0] / (new[1] * old[1])
     if old[0] != old[1] and abs(turned - 1) < _CENTRED / 10:
         warn(
-            f"{owner}: an image of (height, width) = {old} is stretched to {new}; it would keep its shape as "
+            f"{owner}: an image of (height, width) = {old} is {how} to {new}; it would keep its shape as "
             f"{new[::-1]}. For the image on its side use camera.rot90"
         )
 

@@ -137,7 +137,7 @@ class _File:
             self.fail(place, f"the model must be the file's, {stated[0]}; got {model}. Leave it out or change the file")
         kind, size = model or ("mei" if xi else self.model(distortion, stated)), self.image_size()
         if size is not None and self.find(_SIZE):  # a pair of numbers, whose order no key states
-            warn_of_order(torch.tensor(intrinsics), size, str(self.record.path))
+            warn_of_order(torch.tensor(intrinsics), size, str(self.record.path), "(width, height)")
         return self.record[key].camera(kind, intrinsics, distortion, size, self.record[lens or xi or key])
 
     def stated(self) -> tuple[tuple[str, ...], str | None]:

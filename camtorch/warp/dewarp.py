@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from typing_extensions import Unpack
 
 from camtorch.cameras.camera import Camera
+from camtorch.cameras.numbers import warn_of_exchange
 from camtorch.models import UCM, Cylindrical, Equirectangular, Pinhole
 from camtorch.poses.rotations import as_rotation
 from camtorch.rays.lattices import around_ends, image_lattice
@@ -89,6 +90,7 @@ class Dewarp(Warp):
         one_of(projection, tuple(_PROJECTIONS), "projection", "Dewarp")
         own = as_sized(camera, "camera", "Dewarp")._size_for("Dewarp")
         size = as_image_size(image_size, "Dewarp") or own
+        warn_of_exchange(own, size, "Dewarp", "warped")
         rotation = as_rotation(rotation, "Dewarp")
         check_devices("Dewarp", camera=camera.intrinsics, rotation=rotation)
         model = _PROJECTIONS[projection][0]

@@ -404,7 +404,7 @@ def test_landmarks_by_field_and_by_pairs():
     out = flip(image=image, landmarks=five, landmarks_valid=valid, points=torch.rand(2, 7, 3))
     assert torch.equal(out["landmarks"][..., 1], five[:, order, 1])
     assert out["landmarks_valid"][0].tolist() == [False, True, True, True, True]
-    listed = flip(image=image, landmarks=[five[0], torch.rand(8, 2)])
+    listed = flip(image=image, landmarks=[five[0], torch.rand(8, 2) * 40])
     assert torch.equal(listed["landmarks"][0], out["landmarks"][0])
     by_name = A.HorizontalFlip(p=1.0, landmarks={"keypoints": "coco17", "landmarks": order})
     both = by_name(image=image, landmarks=five, keypoints=body, points=torch.rand(2, 5, 3), keypoints_3=five)

@@ -44,7 +44,7 @@ def test_each_face_moves_as_it_does_alone(name, form):
         augment.mirroring = A.HorizontalFlip(landmarks=dict.fromkeys(tables, PAIRS)).mirroring
     faces = {"keypoints": torch.rand(B, count, 5, 2) * 30, "landmarks": torch.randn(B, count, 5, 3)}
     faces |= {"points": torch.randn(B, count, 5, 3), "keypoints_valid": torch.rand(B, count, 5) > 0.3}
-    faces |= {"visibility": torch.randint(3, (B, count, 5)), "keypoints_pixels": torch.rand(B, count, 5, 2)}
+    faces |= {"visibility": torch.randint(3, (B, count, 5)), "keypoints_pixels": torch.rand(B, count, 5, 2) * 9}
     image, draw = torch.rand(B, 3, *SIZE), augment.draw(1 if form == "single" else B)
     give = {"single": lambda v: v[0], "batch": lambda v: v, "list": list}[form]
 

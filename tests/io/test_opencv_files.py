@@ -30,7 +30,7 @@ def test_old_header_other_names_and_what_is_not_asked_for_may_be_nan():
 
 def test_a_pair_that_is_height_and_width_is_warned_of():
     assert ct.loads(f"K: {K}\nimage_size: [640, 480]\n").camera.image_size == (480, 640)
-    with pytest.warns(UserWarning, match=r"loads: image_size=\(640, 480\) is .* the middle of \(480, 640\)"):
+    with pytest.warns(UserWarning, match=r"loads: image_size=\(480, 640\) is .* the middle of \(640, 480\)"):
         ct.loads(f"K: {K}\nimage_size: [480, 640]\n")
 
 

@@ -222,12 +222,19 @@ def test_wrong_calls_are_told_in_words(call, error, says):
         call()
 
 
-def test_boxes_that_are_parts_of_an_image_are_warned_of():
-    parts = torch.tensor([[0.1, 0.2, 0.5, 0.6], [0.0, 0.5, 1.0, 1.0]])
-    with pytest.warns(UserWarning, match=r"RandomMount: boxes must be pixels .* \[0, 1\], as parts of an image's"):
-        MOUNT(image=IMAGES[0], boxes=parts)
-    for boxes in (20 * parts, parts.round(), torch.zeros(2, 4), torch.full((2, 4), math.nan)):
-        MOUNT(image=IMAGES[0], boxes=boxes)
+@pytest.mark.parametrize(("name", "columns"), [("boxes", 4), ("keypoints", 2), ("landmarks", 2)])
+def test_labels_that_are_parts_of_an_image_are_warned_of(name, columns):
+    parts = torch.tensor([[0.1, 0.2, 0.5, 0.6], [0.0, 0.5, 1.0, 1.0]])[:, :columns]
+    with pytest.warns(UserWarning, match=rf"RandomMount: {name} must be pixels.* \[0, 1\], as parts of an image's"):
+        MOUNT(image=IMAGES[0], **{name: parts})
+    for labels in (20 * parts, parts.round(), torch.zeros(2, columns), torch.full((2, columns), math.nan)):
+        MOUNT(image=IMAGES[0], **{name: labels})
+    lost = 20 * parts
+    lost[1] = -1.0
+    MOUNT(image=IMAGES[0], **{name: lost, f"{name}_valid": torch.tensor([True, False])})
+    if columns == 2:
+        with pytest.warns(UserWarning, match=rf"RandomMount: {name} has .*\(-1, -1\).*pass NaN, or {name}_valid"):
+            ct.augment.RandomMount(camera=CAMERA)(image=IMAGES[0], **{name: lost})
 
 
 def test_a_size_with_height_and_width_exchanged_is_warned_of():
@@ -251,6 +258,14 @@ CALLS = {
     "taken as .height, width.": lambda: ct.Pinhole([300.0, 300.0, 319.5, 239.5], image_size=(640, 480)),
     "seem to be": lambda: ct.Pinhole([600.0, 320.0, 600.0, 240.0], image_size=(480, 640)),
     "fov=170 leaves 2 of 32 columns for the middle 60 degrees": lambda: ct.Dewarp(CAMERA, fov=170),
+    "is warped to .640, 480.": lambda: ct.Dewarp(NARROW, image_size=(640, 480)),
+    "this one's stays .32, 32.": lambda: ct.Pinhole([1.0] * 4, image_size=(32, 32)).load_state_dict(
+        NARROW.state_dict()
+    ),
+    "yaw is in degrees, and 0.3 seems": lambda: ct.augment.RandomMount(yaw=0.3),
+    "as .width, height., but .* middle of .640, 480.": lambda: ct.loads(
+        {"K": NARROW.K.tolist(), "image_size": [480, 640]}
+    ),
     "is stretched to": lambda: NARROW.resize(640, 480),
     "will show nothing": lambda: ct.augment.RandomCamera(fov=(120, 130), camera=NARROW)(image=torch.zeros(1, 480, 640)),
     "became unusable": lambda: unusable().project(torch.tensor([0.0, 0.0, 1.0])),
