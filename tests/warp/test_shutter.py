@@ -147,12 +147,3 @@ def test_times_are_those_of_rows():
     assert torch.allclose(down.times(rows, (240, 320)), expected, atol=1e-15)
     assert torch.equal(shutter(direction="up").times(rows, (240, 320)), -down.times(rows, (240, 320)))
     assert torch.equal(shutter(readout=-READOUT).times(rows, (240, 320)), -down.times(rows, (240, 320)))
-
-
-def test_states_of_0_3_load():
-    made = shutter()
-    state = made.state_dict()
-    assert sorted(state) == ["rates", "readout"]
-    other = shutter(rates=(0.0, 0.0, 0.0))
-    other.load_state_dict({**state, "exposure": torch.tensor(0.0)})
-    assert torch.equal(other.rates, made.rates)
