@@ -31,12 +31,14 @@ _OF_POSES = "rotation", "translation", "dtype"
 
 
 def matches(keys: dict[str, Any]) -> bool:
-    """Whether the keys are those of a camtorch file."""
-    return "camtorch" in keys
+    """Whether the keys are those of a camtorch file, or of `camera.to_dict()`."""
+    return "camtorch" in keys or {"model", "intrinsics"} <= keys.keys() <= {*_OF_CAMERAS}
 
 
 def parse(record: Record) -> Rig:
     """Return the cameras, their poses and the names of the posed images."""
+    if "camtorch" not in record:
+        return Rig({"camera": _camera(record)})
     record["camtorch"].whole(1, _VERSION, f"version that this camtorch reads, which is up to {_VERSION}")
     record["cameras"].few(len(record["cameras"].keys()))
     cameras = {name: _camera(record["cameras"][name]) for name in record["cameras"].keys()}  # noqa: SIM118

@@ -9,6 +9,7 @@ import codecs
 import fnmatch
 import json
 import os
+import re
 from collections.abc import Mapping
 from typing import IO, Any, Protocol, TypeVar
 
@@ -87,6 +88,7 @@ _MODULES: dict[str, Any] = {module.NAMES.format: module for module in (*_BY_CONT
 READ: dict[str, Names] = {format: module.NAMES for format, module in _MODULES.items()}
 WRITTEN = {format: READ[format] for format, module in _MODULES.items() if hasattr(module, "render")}
 FORMATS = tuple(READ)
+_CONTENT = r"""\n|\{['"]|<\?|\0\0|PK\x03"""  # in no path
 _OPENMVG = "must not be OpenMVG's; got its scene. openMVG_main_openMVG2Colmap writes it in COLMAP's format"
 
 
@@ -122,11 +124,14 @@ def load(path: str | os.PathLike[str] | IO[str] | IO[bytes], format: str | None 
         source = f"load: {name if isinstance(name, str) else type(path).__name__}"  # in no folder, as an archive's is
         try:
             content = path.read(LARGEST_FILE + 1)
-        except UnicodeDecodeError as error:
-            raise CameraFileError(source, f"byte {error.start}", "must be text; got bytes. Open it with 'rb'") from None
+        except ValueError as error:  # closed, only written to, or binary and open as text
+            reason = f"must be readable; got {str(error).rstrip('.')}. Open it with 'rb'"
+            raise CameraFileError(source, "content", reason) from None
         if len(content) > LARGEST_FILE:
             raise CameraFileError(source, "size", f"must be at most {LARGEST_FILE >> 20} MiB; got more")
         return _loaded(source, content, format)
+    if isinstance(path, (str, bytes)) and re.search(_CONTENT, os.fsdecode(path)) and not os.path.exists(path):
+        raise ValueError("load: path must be that of a calibration file; got its content. Write ct.loads(content)")
     path = path_of(path, "load", "calibration file")
     if os.path.isdir(path):
         names = [name for names in READ.values() for name in names.in_folder]
@@ -145,7 +150,7 @@ def loads(content: str | bytes | Mapping[str, Any] | list[Any], format: str | No
 
     Args:
         content: The text or the bytes of a calibration file, or its keys and values as a parser of JSON or YAML gave
-            them; arrays and tensors may be values.
+            them; arrays and tensors may be values. Or the dict of `camera.to_dict()`.
         format: See `load`. COLMAP's poses are in a file of their own, which is not read.
 
     Raises:
@@ -162,9 +167,11 @@ def loads(content: str | bytes | Mapping[str, Any] | list[Any], format: str | No
 
 def _loaded(source: str, content: str | bytes | Mapping[str, Any] | list[Any], format: str | None) -> Rig:
     """Return the frozen rig of a content, or of keys and values; errors name its source."""
+    if not content:
+        raise CameraFileError(source, "content", "must not be empty; got nothing. Call file.seek(0) if it was read")
     try:
         rig, format = _read(source, content, format)
-    except (ArithmeticError, RecursionError, MemoryError) as error:
+    except (ArithmeticError, RecursionError, MemoryError, UnicodeError) as error:
         raise CameraFileError(source, "content", f"must be readable; got {type(error).__name__}: {error}") from None
     if not rig.cameras:
         raise CameraFileError(source, "cameras", "must be given; got none")

@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import io
 import json
+import math
 import os
 import re
 import zipfile
@@ -125,7 +126,7 @@ def plain(value: Any) -> Any:
     if kind is float or kind is str:
         return value
     if kind is int:
-        return float(value)
+        return float(value) if abs(value) < 1e308 else math.inf  # as JSON's
     if isinstance(value, Mapping):
         return {str(key): plain(item) for key, item in value.items()}
     if is_list(value):

@@ -45,6 +45,7 @@ def test_a_dict_is_an_entry_of_a_file(tmp_path):
     entry = json.loads((tmp_path / "camera.json").read_text())["cameras"]["camera"]
     assert entry == FISHEYE.double().to_dict()
     assert_same(ct.Camera.load(tmp_path / "camera.json"), ct.Camera.from_dict(entry))
+    assert_same(ct.loads(json.dumps(entry)).camera, ct.loads(FISHEYE.to_dict()).camera)
     assert_same(ct.KannalaBrandt.load(tmp_path / "camera.json"), FISHEYE.double())
     by_hand = {"model": "kannala_brandt", "intrinsics": [300, 300, 320, 240], "distortion": [0.1, 0.2]}
     assert ct.Camera.from_dict(by_hand).distortion.tolist() == [0.1, 0.2]

@@ -17,6 +17,7 @@ import camtorch as ct
 
 K = np.array([[500.0, 0, 320], [0, 501, 240], [0, 0, 1]])
 D = np.array([[0.3, 0.1, 0.001, -0.002, 0.05]])
+(CLOSED := io.BytesIO()).close()
 ENDLESS: dict = {}
 ENDLESS["K"] = ENDLESS
 PINHOLE = functools.partial(ct.save, ct.Pinhole([500.0, 500, 320, 240]))
@@ -69,13 +70,22 @@ def test_what_editors_do_to_a_file_is_no_fault_of_it(name, start, end, tmp_path)
     ("call", "given", "error", "says"),
     [
         (ct.load, {"K": K}, TypeError, r"load: path must be that of a .* file; got a dict\. Write ct\.loads$"),
+        (ct.load, '{"camtorch": 1}', ValueError, r"^load: path .* got its content\. Write ct\.loads\(content\)$"),
+        (ct.load, (FILES / "opencv_camera.yml").read_text(), ValueError, r"got its content\. Write ct\.loads"),
+        (ct.load, (FILES / "cameras.bin").read_bytes(), ValueError, r"got its content\. Write ct\.loads"),
+        (ct.load, CLOSED, ct.CameraFileError, r"BytesIO: content: must be readable; got .*closed file\. Open it"),
         (ct.load, "camera\0.json", ct.CameraFileError, "path: must have no NUL character"),
         (ct.load, FILES / "nowhere.yml", FileNotFoundError, r"nowhere\.yml"),
         (ct.load, FILES / "nuscenes", ct.CameraFileError, r"transforms.json; got none\. Name a file, such as 'cal"),
         (ct.load, io.BytesIO(b"x: 1"), ct.CameraFileError, r"^load: BytesIO: content: keys must be .* got 'x'$"),
+        (ct.load, io.BytesIO(), ct.CameraFileError, r"BytesIO: content: must not be empty; .* Call file.seek\(0"),
         (ct.load, io.BytesIO(b" " * (1 << 25)), ct.CameraFileError, "load: BytesIO: size: must be at most 16 MiB"),
         (ct.loads, str(FILES / "opencv_camera.yml"), ValueError, r"content must .* its path. Write ct\.load\('"),
         (ct.loads, FILES / "opencv_camera.yml", TypeError, r"bytes or a dict; got PosixPath.*\. ct\.load reads files$"),
+        (ct.loads, "", ct.CameraFileError, "^loads: content: must not be empty"),
+        (ct.loads, "\ud800", ct.CameraFileError, "^loads: content: must be readable; got UnicodeEncodeError"),
+        (ct.loads, {"K": [[10**400, 0, 1], [0, 1, 1], [0, 0, 1]]}, ct.CameraFileError, r"K\[0\]\[0\]: .* got inf"),
+        (ct.Camera.from_dict, {"model": "pinhole", "intrinsics": [10**400] * 4}, ct.CameraFileError, "must be finite"),
         (ct.loads, ENDLESS, ct.CameraFileError, "^loads: content: .*RecursionError"),
         (ct.loads, {"K": K, "D": [0.1]}, ct.CameraFileError, r"^loads: D: BrownConrady must have coefficients"),
         (PINHOLE, None, TypeError, "save: path must be that of a calibration file; got NoneType"),
@@ -88,9 +98,11 @@ def test_what_is_no_calibration(call, given, error, says):
     assert str(caught.value).isprintable()
 
 
-def test_a_binary_file_that_is_open_as_text():
-    says = r"^load: .*cameras\.bin: byte \d+: must be text; got bytes. Open it with 'rb'$"
-    with open(FILES / "cameras.bin", encoding="utf-8") as file, pytest.raises(ct.CameraFileError, match=says):
+@pytest.mark.parametrize("mode", ["r", "a", "ab"])
+def test_a_file_that_is_open_in_another_mode(mode, tmp_path):
+    path = shutil.copy(FILES / "cameras.bin", tmp_path)
+    says = r"^load: .*cameras\.bin: content: must be readable; got .*(decode|read)\b.*\. Open it with 'rb'$"
+    with open(path, mode) as file, pytest.raises(ct.CameraFileError, match=says):
         ct.load(file)
 
 
