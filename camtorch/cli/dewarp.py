@@ -158,14 +158,11 @@ def _target(source: Path, target: Path, suffix: str | None) -> Path:
 def _outcomes(work: Dewarping, todo: Sequence[Pair], jobs: int | None) -> list[Outcome]:
     """Dewarp files by processes, and return the outcome of each."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    targets.remove_left_over(todo)
     try:
         with bar("dewarp", len(todo), "files") as shown:
             return processes.each(work, todo, max(min(jobs or cores, len(todo)), 1), shown.update)
     except ChildProcessError as error:
         raise ValueError(f"{error}. --resume continues the run, --jobs 1 needs the least memory") from None
-    finally:
-        targets.remove_left_over(todo)
 
 
 def _dewarping(arguments: argparse.Namespace, sources: Sequence[Path]) -> Dewarping:

@@ -58,7 +58,6 @@ def each(work: Work, pairs: Sequence[Pair], count: int, done: Callable[[], objec
             outcomes.append(_attempt(pair, work))
             done()
         return outcomes
-    others = multiprocessing.active_children()
     # pickled here because multiprocessing would share the memory of tensors
     executor = ProcessPoolExecutor(count, multiprocessing.get_context(_HOW), _begin, (pickle.dumps(work),))
     try:
@@ -69,7 +68,7 @@ def each(work: Work, pairs: Sequence[Pair], count: int, done: Callable[[], objec
     except BrokenProcessPool:
         raise ChildProcessError("a process was killed, perhaps for lack of memory") from None
     except BaseException:
-        for process in set(multiprocessing.active_children()).difference(others):
+        for process in multiprocessing.active_children():
             process.terminate()
         raise
     finally:
@@ -81,6 +80,7 @@ def _begin(pickled: bytes) -> None:
     import torch
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent process handles interrupts
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # so that partial files are removed
     threading.Thread(target=_end_with_parent, daemon=True).start()
     torch.set_num_threads(1)
     _work = pickle.loads(pickled)
@@ -100,6 +100,8 @@ def _attempt(pair: Pair, work: Work | None = None) -> Outcome:
         warnings.simplefilter("always", UserWarning)
         try:
             facts = (work or _work)(*pair)
+        except SystemExit:  # the executor would continue
+            os._exit(1)
         except Exception as error:
             return Outcome(failure=reason(error))
     return Outcome(facts, notes=list(dict.fromkeys(str(warning.message) for warning in caught)))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import glob
 import os
 from collections.abc import Collection, Iterable, Iterator, Sequence
@@ -11,7 +10,6 @@ from pathlib import Path
 
 from camtorch.boards.finding import natural
 from camtorch.cli.processes import Pair
-from camtorch.io.writing import all_left_over
 
 
 def check(path: Path, *, force: bool, inputs: tuple[Path | None, ...] = ()) -> None:
@@ -24,10 +22,8 @@ def check(path: Path, *, force: bool, inputs: tuple[Path | None, ...] = ()) -> N
     if os.path.lexists(path) and not force:
         raise ValueError(f"{path}: exists already; --force overwrites it")
     folder = next(parent for parent in path.absolute().parents if os.path.lexists(parent))
-    if not folder.is_dir():
-        raise ValueError(f"{path}: {folder} must be a folder; got a file")
-    if not os.access(folder, os.W_OK):
-        raise ValueError(f"{path}: the folder {folder} must be writable; got one that is not")
+    if not (folder.is_dir() and os.access(folder, os.W_OK)):
+        raise ValueError(f"{path}: {folder} must be a folder that can be written; got another")
 
 
 def folder(text: str | None, suffixes: Collection[str]) -> Path:
@@ -46,7 +42,8 @@ def find(words: Sequence[str], suffixes: Collection[str], output: Path) -> list[
     """Return the files that words mean, each once, in natural order, and their places in the folder of outputs.
 
     Words are files of any suffix; quoted patterns, as 'in/**/*.jpg'; and folders, whose tree is kept, in a folder of
-    their name if there are several words. Names that begin with a dot, and the folder of outputs itself, are skipped.
+    their name if there are several words. Names that begin with a dot, links to folders in a folder, and the folder of
+    outputs itself, are skipped.
     """
     files: dict[str, tuple[Path, Path]] = {}
     out = os.path.realpath(output)
@@ -79,15 +76,13 @@ def find(words: Sequence[str], suffixes: Collection[str], output: Path) -> list[
 
 
 def _below(root: Path) -> Iterator[Path]:
-    """Yield the files in a folder and its subfolders; a link to a parent folder is not followed."""
+    """Yield the files in a folder and its subfolders."""
 
     def refuse(error: OSError) -> None:
         raise error
 
-    for name, folders, names in os.walk(root, followlinks=True, onerror=refuse):
-        real = os.path.realpath(name)
-        shown = [one for one in folders if not one.startswith(".")]
-        folders[:] = [one for one in shown if not _is_below(real, os.path.realpath(os.path.join(name, one)))]
+    for name, folders, names in os.walk(root, onerror=refuse):
+        folders[:] = [one for one in folders if not one.startswith(".")]
         yield from (Path(name, one) for one in names if not one.startswith("."))
 
 
@@ -116,10 +111,3 @@ def to_make(pairs: Sequence[Pair], others: Iterable[Path], *, resume: bool, forc
         hint = "--resume continues the run, --force overwrites"
         raise ValueError(f"{there[0]}: exists already{more}; {hint}")
     return list(pairs)
-
-
-def remove_left_over(pairs: Iterable[Pair]) -> None:
-    """Remove partial files that a killed process left next to outputs."""
-    for path in all_left_over(os.path.realpath(target) for _, target in pairs):
-        with contextlib.suppress(OSError):
-            os.unlink(path)

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 from torch import Tensor
 
 from camtorch.values.arguments import warn
@@ -28,10 +28,6 @@ _BACK = dict(enumerate(_TURNS, 2))  # orientation -> the inverse of its turn
 
 class ImageFileError(OSError, ValueError):
     """An image file that cannot be read or written. The text names the file and the reason."""
-
-
-class _NoImageFileError(ImageFileError, FileNotFoundError):
-    pass
 
 
 def load_stored(image: Image.Image) -> Image.Image:
@@ -67,13 +63,10 @@ def read_stored(path: Path) -> tuple[Tensor, int | None]:
             warn(f"{path}: only the first of {count} images is read")
         if cut:
             warn(f"{path}: only the upper 8 of 16 bits a colour are read")
-        if image.mode == "F":
-            raise ImageFileError(f"{path}: pixels must have 8 or 16 bits; got floating point")
-        if image.mode in _DEEP:
+        if image.mode in (*_DEEP, "F"):
             deep = np.asarray(image)
-            low, high = deep.min(), deep.max()
-            if low < 0 or high > 65535:
-                raise ImageFileError(f"{path}: pixels must have 8 or 16 bits; got {low} to {high}")
+            if image.mode == "F" or deep.min() < 0 or deep.max() > 65535:
+                raise ImageFileError(f"{path}: pixels must have 8 or 16 bits; got {deep.dtype}, up to {deep.max()}")
             return torch.from_numpy(deep.astype(np.uint16))[None], orientation
         clear = "transparency" in image.info or image.mode in ("LA", "PA", "RGBA", "RGBa", "La")
         kind = ("L" if image.mode in ("1", "L", "LA", "La") else "RGB") + ("A" if clear else "")
@@ -94,10 +87,8 @@ def as_jpeg(image: Any, size: tuple[int, int], name: str, owner: str, side: int,
             image = Image.fromarray(values[..., 0] if values.ndim == 3 and values.shape[-1] == 1 else values)
         height, width = _stored_size(image)
         if (height, width) != size:
-            raise ValueError(
-                f"{owner}: the image {name!r} must have the size of the camera, {size[1]} x {size[0]}; "
-                f"got {width} x {height} pixels"
-            )
+            wanted = f"{owner}: the image {name!r} must have the size of the camera, {size[1]} x {size[0]}"
+            raise ValueError(f"{wanted}; got {width} x {height} pixels")
         image.draft(None, (side, side))
         image = load_stored(image)
     if image.mode.startswith(("I", "F")):  # deep grey
@@ -121,19 +112,11 @@ def _opened(path: Path) -> Iterator[Image.Image]:
     """Open an image; raise errors of Pillow, also in the block, as ImageFileError with the path and the reason."""
     try:
         with warnings.catch_warnings():
-            # a large photograph, named by the user, needs no warning
-            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # the user names a large photograph
             image = Image.open(path)
         with image:
             yield image
     except ImageFileError:
         raise
-    except FileNotFoundError:
-        raise _NoImageFileError(f"{path}: no such file") from None
-    except Image.DecompressionBombError:
-        limit = 2 * (Image.MAX_IMAGE_PIXELS or 0) / 1e6
-        raise ImageFileError(f"{path}: must have at most {limit:.0f} million pixels; got more") from None
-    except UnidentifiedImageError:
-        raise ImageFileError(f"{path}: must be an image of Pillow; got none") from None
-    except (OSError, SyntaxError, ValueError, EOFError) as error:
+    except (OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError) as error:
         raise ImageFileError(f"{path}: {getattr(error, 'strerror', None) or error}") from None

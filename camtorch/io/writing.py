@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import hashlib
 import json
 import math
 import os
 import re
 import secrets
 import stat
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, NoReturn
@@ -22,8 +21,6 @@ from camtorch.cameras.camera import Camera
 from camtorch.cameras.rig import Rig
 from camtorch.io.record import CameraFileError
 from camtorch.poses.extrinsics import Extrinsics
-
-_PART = re.compile(r"[.]([0-9a-f]{16})[0-9a-f]{8}[.]part")
 
 
 @contextlib.contextmanager
@@ -53,29 +50,13 @@ def _opened_beside(path: str, stack: contextlib.ExitStack) -> IO[bytes]:
         raise FileNotFoundError(errno.ENOENT, "no such folder", folder)
     if mode is not None and not stat.S_ISREG(mode):
         raise OSError(errno.EINVAL, "no ordinary file, so it cannot be replaced", path)
-    name = os.path.join(folder, f".{_mark_of(path)}{secrets.token_hex(4)}.part")
+    name = os.path.join(folder, f".{secrets.token_hex(12)}.part")  # the longest name has no room for a suffix
     rights = 0o666 if mode is None else stat.S_IMODE(mode)  # the kernel takes the umask from both
     stack.callback(Path(name).unlink, missing_ok=True)
     file = open(name, "x+b", opener=lambda name, flags: os.open(name, flags, rights))  # noqa: SIM115
     if mode is not None:
         os.chmod(name, rights)
     return stack.enter_context(file)
-
-
-def _mark_of(path: str) -> str:
-    """Return the prefix of temporary names for a path: a hash, because a name may already have the maximum length."""
-    return hashlib.blake2b(os.fsencode(os.path.basename(path)), digest_size=8).hexdigest()
-
-
-def all_left_over(paths: Iterable[str]) -> list[str]:
-    """Return the files that crashes within `replacing` left in the folders of `paths`."""
-    marks = {(os.path.dirname(path), _mark_of(path)) for path in paths}
-    found = []
-    for folder in {folder for folder, _ in marks}:
-        with contextlib.suppress(FileNotFoundError, NotADirectoryError):
-            parts = [(name, match[1]) for name in os.listdir(folder or ".") if (match := _PART.fullmatch(name))]
-            found += [os.path.join(folder, name) for name, mark in parts if (folder, mark) in marks]
-    return sorted(found)
 
 
 def number(value: float) -> str:

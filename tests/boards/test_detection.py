@@ -219,7 +219,7 @@ def test_one_image_in_any_form(form):
         (np.full((80, 80), 200.0), "9x6", ValueError, "0 to 1 if floating point; got up to 200"),
         (np.zeros((80, 80), np.int32), "9x6", ValueError, "uint8 or uint16"),
         ("nowhere/*.jpg", "9x6", ValueError, "the pattern must match files; got none"),
-        ("nowhere.jpg", "9x6", ValueError, "no such file"),
+        ("nowhere.jpg", "9x6", ValueError, "No such file"),
         ([], "9x6", ValueError, "must not be empty"),
         ([5], "9x6", TypeError, r"images\[0\]"),
     ],

@@ -92,11 +92,11 @@ def test_a_folder_of_photographs_becomes_a_camera(photographs, capsys):
     assert "fisheye_model: 1" in Path("camera.yml").read_text()
     left_out = dict(re.findall(r"note: (.*) is left out: (.*)\n", captured.err))
     assert "truncated" in left_out.pop("7.png")
+    assert "cannot identify image file" in left_out.pop("6.png")
     assert left_out == {
         "5.png": "no board found",
-        "6.png": "must be an image of Pillow; got none",
         "8.png": "480x360, but most images are 640x480",
-        "none.png": "no such file",
+        "none.png": "No such file or directory",
     }
 
 

@@ -139,7 +139,7 @@ def test_all_lenses_are_in_the_page_within_half_a_pixel():
         ((ct.Pinhole([100.0, 100.0, 50.0, 50.0]),), ValueError, "image_size"),
         ((ct.cat([fisheye(), ct.Pinhole([1.0, 1, 2, 3], image_size=(480, 640))]),), TypeError, "Mixed"),
         ((fisheye(), "lens.html", np.zeros((100, 100, 3), np.uint8)), ValueError, "640 x 480"),
-        ((fisheye(), "lens.html", "none.jpg"), FileNotFoundError, "none.jpg"),
+        ((fisheye(), "lens.html", "none.jpg"), OSError, "none.jpg"),
         ((fisheye(), 3), TypeError, "path must name a file"),
     ],
 )
