@@ -72,7 +72,7 @@ def as_planes(array: object, name: str, owner: str, size: tuple[int, int] | None
 
 def plain(tensor: Tensor) -> Array:
     """Return a tensor as an array, without a copy if it is on the CPU."""
-    return tensor.detach().cpu().numpy()
+    return tensor.numpy(force=True)
 
 
 def as_array(image: Tensor, like: Array) -> Array:
