@@ -1,8 +1,8 @@
 """The collection of real lenses, searched by words; entries are read on first use.
 
-Numbers are rounded to 37 significant bits (7e-12 of their size) and stored in columns; text is compressed by LZMA. fy
-is stored as its difference to fx, the principal point relative to the image's middle, each with its sign as the lowest
-bit, and the six bytes of a column one plane after another.
+Numbers in the file are exact, in columns; text is compressed by LZMA. fy is stored as its difference to
+fx, the principal point relative to the image's middle, each with its sign as the lowest bit, and the bytes of a
+column one plane after another.
 """
 
 from __future__ import annotations
@@ -121,10 +121,8 @@ def columns() -> tuple[dict[str, list[str]], NDArray[np.float64]]:
         text, planes = file["text"].tobytes().decode(), file["planes"]
     lines, count = text.split("\0"), planes.shape[-1]
     texts = {name: lines[i * count : (i + 1) * count] for i, name in enumerate(_TEXTS)}
-    octets = np.zeros((len(planes), count, 8), np.uint8)
-    octets[..., : planes.shape[1]] = planes.transpose(0, 2, 1)
-    codes = octets.view("<i8")[..., 0].astype(np.int64)
-    bits = ((codes >> 1) ^ -(codes & 1)) << 16
+    codes = np.ascontiguousarray(planes.transpose(0, 2, 1)).view("<i8")[..., 0].astype(np.int64)
+    bits = ((codes >> 1) & np.int64(2**63 - 1)) ^ -(codes & 1)
     bits[1] += bits[0]
     bits[2:4] += (np.array([texts["width"], texts["height"]], float) / 2).view(np.int64)
     return texts, bits.view(np.float64)

@@ -18,7 +18,7 @@ from camtorch.warp.boxes import along_edges
 COLUMNS = ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4", "height", "width", "rms_px", "readout_ms")
 SAMPLE = Path(__file__).parents[1] / "files" / "lenses.csv"
 """Some rows of the collection, as they were published, with their numbers."""
-NUMBERS = "b48d5adea66f603057c3df50f3dca3f4e565c675a42b82f9d26b2a29d837b8d2"
+NUMBERS = "ad94623534940b7809d22a2b41f3526d4c7fc6e703053c5101587317b8e97c0e"
 TEXTS = "1c52d1c7241fd41fef74081697c57e0d68169f82c32077cbc7f17324b0c217b0"
 
 
@@ -27,7 +27,7 @@ def rows():
         return list(csv.DictReader(lines))
 
 
-def test_every_number_of_the_collection_is_there():
+def test_every_number_of_the_collection_is_there_to_the_bit():
     texts, numbers = columns()
     assert hashlib.sha256(numbers.astype("<f8").tobytes()).hexdigest() == NUMBERS
     by_row = [list(row) for row in zip(*texts.values(), strict=True)]
@@ -41,9 +41,7 @@ def test_an_entry_says_what_the_collection_says(row):
     texts = [row[n] for n in ("brand", "camera", "lens", "setting")]
     numbers = [float(row[n]) if row[n] else None for n in COLUMNS]
     assert [lens.brand, lens.body, lens.lens, lens.setting] == texts
-    held = [*lens.intrinsics, *lens.distortion, *lens.image_size, lens.rms]
-    assert held == pytest.approx(numbers[:-1], rel=2**-37, abs=0)
-    assert lens.readout_ms == numbers[-1]
+    assert [*lens.intrinsics, *lens.distortion, *lens.image_size, lens.rms, lens.readout_ms] == numbers
     whole = all(row[n] in ("", "1", "1.0") for n in ("h_stretch", "v_stretch"))
     assert lens.is_optical == (not row["digital_lens"] and float(row["fx"]) > 0 and whole)
     assert lens.name in repr(lens)
