@@ -66,7 +66,12 @@ def measured() -> dict[str, dict[str, dict[str, float]]]:
         camera = camera_of(height, height * 4 // 3)
         warp, image = ct.Dewarp(camera), rng.integers(256, size=(height, height * 4 // 3, 3), dtype=np.uint8)
         maps = cv2.fisheye.initUndistortRectifyMap(
-            camera.K.double().numpy(), np.array(k), np.eye(3), warp.target.K.double().numpy(), image.shape[1::-1], cv2.CV_16SC2
+            camera.K.double().numpy(),
+            np.array(k),
+            np.eye(3),
+            warp.target.K.double().numpy(),
+            image.shape[1::-1],
+            cv2.CV_16SC2,
         )
         runs = {"camtorch": lambda w=warp, i=image: w(i)}
         runs["OpenCV"] = lambda m=maps, i=image: cv2.remap(i, *m, cv2.INTER_LINEAR)
@@ -100,7 +105,11 @@ def measured() -> dict[str, dict[str, dict[str, float]]]:
         runs = {}
         for who, function in functions.items():
             loader = torch.utils.data.DataLoader(
-                Samples(function), 16, num_workers=workers, persistent_workers=workers > 0, collate_fn=ct.augment.collate
+                Samples(function),
+                16,
+                num_workers=workers,
+                persistent_workers=workers > 0,
+                collate_fn=ct.augment.collate,
             )
             runs[who] = lambda loader=loader: sum(1 for _ in loader)
         add("workers, 1,024 samples (0: none)", workers, runs)
@@ -112,7 +121,12 @@ def measured() -> dict[str, dict[str, dict[str, float]]]:
     warp, batch = ct.Dewarp(camera_of(720, 1280)), torch.randint(256, (8, 3, 720, 1280), dtype=torch.uint8)
     image = rng.integers(256, size=(720, 1280, 3), dtype=np.uint8)
     maps = cv2.fisheye.initUndistortRectifyMap(
-        warp.source.K.double().numpy(), np.array(k), np.eye(3), warp.target.K.double().numpy(), (1280, 720), cv2.CV_16SC2
+        warp.source.K.double().numpy(),
+        np.array(k),
+        np.eye(3),
+        warp.target.K.double().numpy(),
+        (1280, 720),
+        cv2.CV_16SC2,
     )
     runs = {"camtorch": lambda: warp(batch)}
     runs["OpenCV"] = lambda: [cv2.remap(image, *maps, cv2.INTER_LINEAR) for _ in range(8)]
@@ -142,7 +156,8 @@ def _floors() -> dict[str, float]:
     }
     print_peak = "; import resource; print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)"
     return {
-        name: int(subprocess.run([sys.executable, "-c", code + print_peak], capture_output=True, check=True).stdout) / 1e3
+        name: int(subprocess.run([sys.executable, "-c", code + print_peak], capture_output=True, check=True).stdout)
+        / 1e3
         for name, code in steps.items()
     }
 
@@ -177,7 +192,7 @@ def drawn(runs: dict[str, dict]) -> None:
 
 if __name__ == "__main__":
     if len(sys.argv) > 1 and sys.argv[1] == "--one":
-        json.dump(measured(), open(sys.argv[2], "w"))
+        Path(sys.argv[2]).write_text(json.dumps(measured()))
         sys.exit()
     path = DOCS / "performance-scaling.json"
     runs = {}
