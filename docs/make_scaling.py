@@ -1,7 +1,8 @@
 """The figure of cost over work on the page on performance: `python docs/make_scaling.py` writes it and its numbers.
 
 Work grows: points, pixels, images of a batch, workers. A line's slope is that between its last point and the one two
-before, on logarithmic axes: 1 where twice the work takes twice the time. Needs `pip install -e ".[benchmark]" albumentations`.
+before, on logarithmic axes: 1 where twice the work takes twice the time. It needs
+`pip install -e ".[benchmark]" albumentations`.
 """
 
 import json
